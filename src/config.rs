@@ -1,0 +1,189 @@
+//! One configuration struct: defaults < file < environment < flags.
+//!
+//! Every field is a flag `--like-this`, a variable `SEGSPLAT_LIKE_THIS` and a key `like_this` of
+//! the TOML file named by `--config`. Limits live in the file's `[limits]` table.
+
+use std::{net::SocketAddr, path::PathBuf};
+
+use clap::Args;
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    error::{Error, Result},
+    limits::Limits,
+};
+
+/// Which renderer serves views.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum RendererChoice {
+    /// A hardware adapter where there is one, else the CPU renderer. Never a software adapter.
+    #[default]
+    Auto,
+    /// The CPU renderer.
+    Cpu,
+    /// A wgpu adapter, software ones too when `adapter` names it; refuses to start without.
+    Gpu,
+}
+
+/// Execution provider of the networks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum ProviderChoice {
+    /// CUDA where the library has it and it works, else CPU; the choice is logged.
+    #[default]
+    Auto,
+    /// CPU.
+    Cpu,
+    /// CUDA; refuses to start without.
+    Cuda,
+    /// WebGPU; refuses to start without.
+    Webgpu,
+}
+
+/// What was typed or set: every field optional, merged into [`Config`].
+#[derive(Args, Clone, Debug, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ConfigArgs {
+    /// Address and port to listen on [default: 127.0.0.1:8080]
+    #[arg(long, env = "SEGSPLAT_LISTEN")]
+    pub listen: Option<SocketAddr>,
+    /// Folder of the scenes [default: ./data]
+    #[arg(long, env = "SEGSPLAT_DATA_DIR")]
+    pub data_dir: Option<PathBuf>,
+    /// Folder of the model bundle [default: found beside the executable or in ./models/embedded]
+    #[arg(long, env = "SEGSPLAT_BUNDLE")]
+    pub bundle: Option<PathBuf>,
+    /// ONNX Runtime library [default: ORT_DYLIB_PATH, beside the executable, target/ort, the system]
+    #[arg(long, env = "SEGSPLAT_ORT_LIBRARY")]
+    pub ort_library: Option<PathBuf>,
+    /// Which renderer serves views [default: auto]
+    #[arg(long, env = "SEGSPLAT_RENDERER", value_enum)]
+    pub renderer: Option<RendererChoice>,
+    /// Part of the name of the wgpu adapter to use
+    #[arg(long, env = "SEGSPLAT_ADAPTER")]
+    pub adapter: Option<String>,
+    /// Execution provider of the networks [default: auto]
+    #[arg(long, env = "SEGSPLAT_PROVIDER", value_enum)]
+    pub provider: Option<ProviderChoice>,
+    /// Threads for networks and rendering [default: the cores this process really has]
+    #[arg(long, env = "SEGSPLAT_THREADS")]
+    pub threads: Option<usize>,
+    /// Scenes made at the same time [default: 1]
+    #[arg(long, env = "SEGSPLAT_JOBS")]
+    pub jobs: Option<usize>,
+    /// Log filter in tracing's syntax [default: info]
+    #[arg(long, env = "SEGSPLAT_LOG")]
+    pub log: Option<String>,
+    /// Log lines as JSON [default: false]
+    #[arg(long, env = "SEGSPLAT_LOG_JSON", num_args = 0..=1, default_missing_value = "true")]
+    pub log_json: Option<bool>,
+    /// Caps on requests; only in the file
+    #[arg(skip)]
+    pub limits: Option<Limits>,
+}
+
+/// The configuration in force.
+#[derive(Clone, Debug, Serialize)]
+#[non_exhaustive]
+pub struct Config {
+    /// Address and port to listen on.
+    pub listen: SocketAddr,
+    /// Folder of the scenes.
+    pub data_dir: PathBuf,
+    /// Folder of the model bundle; `None`: search.
+    pub bundle: Option<PathBuf>,
+    /// ONNX Runtime library; `None`: search.
+    pub ort_library: Option<PathBuf>,
+    /// Which renderer serves views.
+    pub renderer: RendererChoice,
+    /// Part of the name of the wgpu adapter to use.
+    pub adapter: Option<String>,
+    /// Execution provider of the networks.
+    pub provider: ProviderChoice,
+    /// Threads for networks and rendering.
+    pub threads: usize,
+    /// Scenes made at the same time.
+    pub jobs: usize,
+    /// Log filter.
+    pub log: String,
+    /// Log lines as JSON.
+    pub log_json: bool,
+    /// Caps on requests.
+    pub limits: Limits,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
+            data_dir: PathBuf::from("data"),
+            bundle: None,
+            ort_library: None,
+            renderer: RendererChoice::Auto,
+            adapter: None,
+            provider: ProviderChoice::Auto,
+            threads: available_cores(),
+            jobs: 1,
+            log: "info".to_owned(),
+            log_json: false,
+            limits: Limits::default(),
+        }
+    }
+}
+
+impl Config {
+    /// Defaults, then the file's keys (if a file is named), then flags and environment.
+    ///
+    /// # Errors
+    /// `invalid_request` when the file cannot be read or parsed, or a value is out of range.
+    pub fn resolve(file: Option<&std::path::Path>, typed: ConfigArgs) -> Result<Self> {
+        let from_file = match file {
+            None => ConfigArgs::default(),
+            Some(path) => {
+                let text = fs_err::read_to_string(path)
+                    .map_err(|e| Error::invalid(format!("config file: {e}")))?;
+                toml::from_str(&text).map_err(|e| Error::invalid(format!("config file: {e}")))?
+            }
+        };
+        let d = Self::default();
+        let config = Self {
+            listen: typed.listen.or(from_file.listen).unwrap_or(d.listen),
+            data_dir: typed.data_dir.or(from_file.data_dir).unwrap_or(d.data_dir),
+            bundle: typed.bundle.or(from_file.bundle),
+            ort_library: typed.ort_library.or(from_file.ort_library),
+            renderer: typed.renderer.or(from_file.renderer).unwrap_or(d.renderer),
+            adapter: typed.adapter.or(from_file.adapter),
+            provider: typed.provider.or(from_file.provider).unwrap_or(d.provider),
+            threads: typed.threads.or(from_file.threads).unwrap_or(d.threads),
+            jobs: typed.jobs.or(from_file.jobs).unwrap_or(d.jobs),
+            log: typed.log.or(from_file.log).unwrap_or(d.log),
+            log_json: typed.log_json.or(from_file.log_json).unwrap_or(d.log_json),
+            limits: typed.limits.or(from_file.limits).unwrap_or(d.limits),
+        };
+        config.validate()?;
+        Ok(config)
+    }
+
+    fn validate(&self) -> Result<()> {
+        for (name, value, max) in [("threads", self.threads, 1024), ("jobs", self.jobs, 64)] {
+            if value == 0 || value > max {
+                return Err(Error::invalid(format!(
+                    "config: {name} is {value}; it must be 1 to {max}"
+                )));
+            }
+        }
+        if self.limits.photos_min < 2 || self.limits.photos_max < self.limits.photos_min {
+            return Err(Error::invalid(
+                "config: limits.photos_min must be at least 2 and at most photos_max",
+            ));
+        }
+        Ok(())
+    }
+}
+
+/// Cores this process may really use: the cgroup's quota (std reads v1 and v2) and affinity.
+#[must_use]
+pub fn available_cores() -> usize {
+    std::thread::available_parallelism().map_or(1, usize::from)
+}

@@ -1,0 +1,201 @@
+//! One error enum, one table: what went wrong, its stable code, and what each door says.
+//!
+//! A new code is one row of [`TABLE`]; HTTP, gRPC, the command line and `docs/errors.md` follow.
+
+use std::fmt;
+
+/// Result of everything fallible in this crate.
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+/// Stable, machine-readable kind of an error.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum ErrorCode {
+    /// The request itself is wrong: a missing part, a bad number, an impossible pose.
+    InvalidRequest,
+    /// A photo or archive cannot be read as what it claims to be.
+    PhotoUnreadable,
+    /// A stated limit is exceeded; the message names limit, value and maximum.
+    LimitExceeded,
+    /// No scene of this id.
+    SceneNotFound,
+    /// No such route, method or resource.
+    NotFound,
+    /// The scene exists but is not done.
+    SceneNotReady,
+    /// Too much work is queued; try again after the time given.
+    Overloaded,
+    /// The deadline of the call passed.
+    DeadlineExceeded,
+    /// The caller went away or asked to stop.
+    Cancelled,
+    /// The model bundle or ONNX Runtime is missing or does not match its manifest.
+    ModelUnavailable,
+    /// The store cannot be read or written now.
+    StoreUnavailable,
+    /// No usable GPU adapter where one was required.
+    GpuUnavailable,
+    /// A stored scene fails its checksum or has an unknown version.
+    SceneCorrupt,
+    /// A fault of ours.
+    Internal,
+}
+
+/// One row of the error table.
+#[derive(Clone, Copy, Debug)]
+pub struct ErrorRow {
+    /// The code.
+    pub code: ErrorCode,
+    /// Its stable snake_case name, the truth for clients.
+    pub name: &'static str,
+    /// HTTP status.
+    pub http: u16,
+    /// gRPC status number.
+    pub grpc: i32,
+    /// Exit code of the command line.
+    pub exit: u8,
+    /// Whether the same call may succeed later.
+    pub retry: bool,
+}
+
+const fn row(
+    code: ErrorCode,
+    name: &'static str,
+    http: u16,
+    grpc: i32,
+    exit: u8,
+    retry: bool,
+) -> ErrorRow {
+    ErrorRow { code, name, http, grpc, exit, retry }
+}
+
+/// The one table. gRPC numbers are those of `google.rpc.Code`.
+pub const TABLE: [ErrorRow; 14] = [
+    row(ErrorCode::InvalidRequest, "invalid_request", 400, 3, 2, false),
+    row(ErrorCode::PhotoUnreadable, "photo_unreadable", 422, 3, 2, false),
+    row(ErrorCode::LimitExceeded, "limit_exceeded", 413, 3, 2, false),
+    row(ErrorCode::SceneNotFound, "scene_not_found", 404, 5, 3, false),
+    row(ErrorCode::NotFound, "not_found", 404, 5, 3, false),
+    row(ErrorCode::SceneNotReady, "scene_not_ready", 409, 9, 4, true),
+    row(ErrorCode::Overloaded, "overloaded", 429, 8, 5, true),
+    row(ErrorCode::DeadlineExceeded, "deadline_exceeded", 504, 4, 5, true),
+    row(ErrorCode::Cancelled, "cancelled", 499, 1, 5, false),
+    row(ErrorCode::ModelUnavailable, "model_unavailable", 503, 14, 6, true),
+    row(ErrorCode::StoreUnavailable, "store_unavailable", 503, 14, 6, true),
+    row(ErrorCode::GpuUnavailable, "gpu_unavailable", 503, 14, 6, true),
+    row(ErrorCode::SceneCorrupt, "scene_corrupt", 500, 15, 7, false),
+    row(ErrorCode::Internal, "internal", 500, 13, 1, false),
+];
+
+impl ErrorCode {
+    /// The row of this code.
+    #[must_use]
+    pub fn row(self) -> &'static ErrorRow {
+        TABLE
+            .iter()
+            .find(|row| row.code == self)
+            .expect("every code has a row (tested); this is a bug")
+    }
+
+    /// Stable snake_case name.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        self.row().name
+    }
+}
+
+/// An error with its code and a message that names the input, the value and the bound.
+///
+/// The message is shown to clients: it holds no path of this machine and no source chain.
+/// The source, where there is one, is for the log.
+#[derive(Debug, thiserror::Error)]
+#[error("{message}")]
+pub struct Error {
+    code: ErrorCode,
+    message: String,
+    /// Seconds after which a retry may succeed, for `overloaded`.
+    retry_after_s: Option<u32>,
+    #[source]
+    source: Option<Box<dyn std::error::Error + Send + Sync>>,
+}
+
+impl Error {
+    /// An error of `code` with a message for the client.
+    pub fn new(code: ErrorCode, message: impl Into<String>) -> Self {
+        Self { code, message: message.into(), retry_after_s: None, source: None }
+    }
+
+    /// The same error with the cause kept for the log.
+    #[must_use]
+    pub fn caused_by(
+        mut self,
+        source: impl Into<Box<dyn std::error::Error + Send + Sync>>,
+    ) -> Self {
+        self.source = Some(source.into());
+        self
+    }
+
+    /// Says when to try again.
+    #[must_use]
+    pub fn retry_after_s(mut self, seconds: u32) -> Self {
+        self.retry_after_s = Some(seconds);
+        self
+    }
+
+    /// The request is wrong.
+    pub fn invalid(message: impl Into<String>) -> Self {
+        Self::new(ErrorCode::InvalidRequest, message)
+    }
+
+    /// A photo or archive is unreadable.
+    pub fn photo(message: impl Into<String>) -> Self {
+        Self::new(ErrorCode::PhotoUnreadable, message)
+    }
+
+    /// `what` is over a limit: "photo 3: 9200x7000 px is over 24,000,000 px".
+    pub fn limit(
+        what: impl fmt::Display,
+        value: impl fmt::Display,
+        bound: impl fmt::Display,
+    ) -> Self {
+        Self::new(ErrorCode::LimitExceeded, format!("{what}: {value} is over {bound}"))
+    }
+
+    /// A fault of ours.
+    pub fn internal(message: impl Into<String>) -> Self {
+        Self::new(ErrorCode::Internal, message)
+    }
+
+    /// The code.
+    #[must_use]
+    pub fn code(&self) -> ErrorCode {
+        self.code
+    }
+
+    /// The message for the client.
+    #[must_use]
+    pub fn message(&self) -> &str {
+        &self.message
+    }
+
+    /// Seconds after which a retry may succeed.
+    #[must_use]
+    pub fn retry_after(&self) -> Option<u32> {
+        self.retry_after_s
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::HashSet;
+
+    #[test]
+    fn names_are_unique_and_every_row_finds_itself() {
+        let names: HashSet<_> = TABLE.iter().map(|row| row.name).collect();
+        assert_eq!(names.len(), TABLE.len(), "two codes share a name");
+        for row in &TABLE {
+            assert_eq!(row.code.row().name, row.name, "row of another code");
+        }
+    }
+}

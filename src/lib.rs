@@ -1,0 +1,39 @@
+//! SegSplat Server: posed photos in, a 3D Gaussian scene out, views at any pose.
+//!
+//! # Layout: the folder is the pipeline
+//!
+//! ```text
+//! photos + cameras ─▶ api ─▶ service ─▶ jobs ─▶ pipeline ─────────────────────▶ store ─▶ scene id
+//!                                               photos ▸ capture ▸ models ▸ lift
+//! scene id + camera ─▶ api ─▶ service ─▶ store ─▶ render ─▶ colour, depth, alpha
+//! ```
+//!
+//! | layer | modules | may use |
+//! |---|---|---|
+//! | L0 nouns | [`scene`], [`error`], [`limits`], [`config`] | nothing above (`scene` uses `error`, `limits`) |
+//! | L1 verbs | [`photos`], [`capture`], [`models`], [`lift`], [`render`], [`store`] | L0; never each other |
+//! | L2 | [`pipeline`] | L1: the only place that knows the order of the stages |
+//! | L3 | [`jobs`] | `pipeline`, `store` |
+//! | L4 | [`service`] | `jobs`, `store`, `render`, `models` |
+//! | L5 | [`api`] | `service`; the only place that knows HTTP and gRPC |
+//! | L6 | `main`, [`cli`], [`eval`] | everything |
+//!
+//! `tests/it/tidy.rs` reads the `use crate::…` lines and holds the code to this table.
+//! Frames, units and orders: `docs/conventions.md`. Why things are as they are: `docs/adr/`.
+
+pub mod api;
+pub mod capture;
+pub mod cli;
+pub mod config;
+pub mod error;
+pub mod eval;
+pub mod jobs;
+pub mod lift;
+pub mod limits;
+pub mod models;
+pub mod photos;
+pub mod pipeline;
+pub mod render;
+pub mod scene;
+pub mod service;
+pub mod store;

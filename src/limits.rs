@@ -1,0 +1,74 @@
+//! Every cap in one place, with its unit and its reason. All can be set by [`crate::config`].
+
+use serde::{Deserialize, Serialize};
+
+/// Caps on what a caller may send or ask for.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+#[non_exhaustive]
+pub struct Limits {
+    /// Photos in one scene: the pipeline's time grows with their number.
+    pub photos_max: usize,
+    /// Fewest photos that give parallax.
+    pub photos_min: usize,
+    /// Bytes of one upload, all parts together.
+    pub upload_bytes_max: usize,
+    /// Bytes of one JSON part (`transforms`, `cameras`) or JSON body.
+    pub json_bytes_max: usize,
+    /// Pixels of one photo, read from the header before decoding.
+    pub photo_pixels_max: u64,
+    /// Entries in an archive, files and folders alike.
+    pub archive_entries_max: usize,
+    /// Bytes of one archive unpacked: what a zip bomb meets.
+    pub archive_unpacked_bytes_max: u64,
+    /// Length of a photo's file name in bytes.
+    pub file_name_bytes_max: usize,
+    /// Width or height of a rendered view in pixels.
+    pub view_side_max: u32,
+    /// Cameras in one `views` request.
+    pub cameras_max: usize,
+    /// Kinds of picture in one `views` request.
+    pub kinds_max: usize,
+    /// Jobs that wait; one more is refused as `overloaded`.
+    pub queued_jobs_max: usize,
+    /// Renders at work or waiting; one more is refused as `overloaded`.
+    pub queued_renders_max: usize,
+    /// Bytes of scenes kept in memory.
+    pub cache_bytes_max: u64,
+    /// Milliseconds one render may take.
+    pub render_timeout_ms: u64,
+    /// Milliseconds one scene may take.
+    pub scene_timeout_ms: u64,
+    /// Milliseconds a caller may hold a request open with `wait_ms`.
+    pub wait_ms_max: u64,
+    /// Scenes on one page of a list.
+    pub page_max: usize,
+    /// Gaussians in one scene, made or imported.
+    pub gaussians_max: usize,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            photos_max: 64,
+            photos_min: 2,
+            upload_bytes_max: 256 << 20,
+            json_bytes_max: 8 << 20,
+            photo_pixels_max: 24_000_000,
+            archive_entries_max: 1_024,
+            archive_unpacked_bytes_max: 512 << 20,
+            file_name_bytes_max: 256,
+            view_side_max: 4_096,
+            cameras_max: 64,
+            kinds_max: 8,
+            queued_jobs_max: 64,
+            queued_renders_max: 256,
+            cache_bytes_max: 4 << 30,
+            render_timeout_ms: 30_000,
+            scene_timeout_ms: 600_000,
+            wait_ms_max: 600_000,
+            page_max: 100,
+            gaussians_max: 16_777_216,
+        }
+    }
+}

@@ -1,0 +1,86 @@
+//! Gaussians and a camera in, pictures out: one model (docs/conventions.md), three renderers.
+//!
+//! [`oracle`] is the judge (f64, per pixel, no tiles), [`cpu`] the tiled product renderer,
+//! [`gpu`] the same stages in WGSL. All three take [`RenderRequest`] and give [`Frame`].
+
+pub mod constants;
+pub mod cpu;
+pub mod gpu;
+pub mod oracle;
+
+use crate::{
+    error::Result,
+    scene::{Camera, Gaussians},
+};
+
+/// Which pictures a request pays for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Kinds {
+    /// `[H, W, 3]` colour over the background.
+    pub color: bool,
+    /// `[H, W]` expected depth, world units, 0 where alpha is 0.
+    pub depth: bool,
+    /// `[H, W]` accumulated opacity.
+    pub alpha: bool,
+}
+
+impl Kinds {
+    /// Everything.
+    pub const ALL: Self = Self { color: true, depth: true, alpha: true };
+    /// Colour alone.
+    pub const COLOR: Self = Self { color: true, depth: false, alpha: false };
+}
+
+/// One view to render.
+#[derive(Clone, Copy, Debug)]
+pub struct RenderRequest {
+    /// The camera; its intrinsics carry the picture's size.
+    pub camera: Camera,
+    /// Pictures wanted.
+    pub kinds: Kinds,
+    /// Background colour, 0..1, sRGB like the photos.
+    pub background: [f32; 3],
+    /// gsplat's antialiased mode: opacity compensated for the 0.3 px² blur.
+    pub antialiased: bool,
+    /// Near plane, world units along t.z.
+    pub near: f32,
+}
+
+/// Counts of one frame.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FrameStats {
+    /// Gaussians that passed culling.
+    pub visible: u64,
+    /// Gaussian-tile pairs blended.
+    pub intersections: u64,
+}
+
+/// The pictures, row-major; `None` for kinds not asked for.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Frame {
+    /// Width, pixels.
+    pub width: u32,
+    /// Height, pixels.
+    pub height: u32,
+    /// `[H * W]` colours, not clamped above 1.
+    pub color: Option<Vec<[f32; 3]>>,
+    /// `[H * W]` expected depth, world units.
+    pub depth: Option<Vec<f32>>,
+    /// `[H * W]` accumulated opacity, 0..1.
+    pub alpha: Option<Vec<f32>>,
+    /// Counts.
+    pub stats: FrameStats,
+}
+
+/// A renderer of the one model.
+pub trait Renderer: Send + Sync {
+    /// Name for logs, `/v1/models` and benchmarks: `cpu`, or the adapter's own name.
+    fn name(&self) -> String;
+
+    /// Renders one view.
+    ///
+    /// # Errors
+    /// `limit_exceeded` when the work does not fit the device's limits, `gpu_unavailable` when the
+    /// device is lost, `internal` for a fault of ours. An empty scene is a clean background.
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame>;
+}

@@ -1,0 +1,255 @@
+//! Pinhole cameras, OpenCV frame: +x right, +y down, +z forward; pixel centres at +0.5.
+
+use glam::{DMat3, DMat4, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::error::{Error, Result};
+
+/// How far a rotation may be from orthonormal (largest entry of |R Rᵀ - I|).
+pub const ORTHONORMAL_TOLERANCE: f64 = 1e-3;
+
+/// Pinhole intrinsics in pixels of the image they belong to.
+///
+/// The centre of pixel (0, 0) is (0.5, 0.5); the principal point need not be central.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Intrinsics {
+    /// Focal length along x, pixels.
+    pub fx: f64,
+    /// Focal length along y, pixels.
+    pub fy: f64,
+    /// Principal point x, pixels.
+    pub cx: f64,
+    /// Principal point y, pixels.
+    pub cy: f64,
+    /// Image width, pixels.
+    pub width: u32,
+    /// Image height, pixels.
+    pub height: u32,
+}
+
+impl Intrinsics {
+    /// Checks that all numbers are finite, focal lengths positive and sides at least one pixel.
+    ///
+    /// # Errors
+    /// `invalid_request`, with a message that starts with `what` and names the value.
+    pub fn validated(self, what: &str) -> Result<Self> {
+        for (name, value) in [("fx", self.fx), ("fy", self.fy), ("cx", self.cx), ("cy", self.cy)] {
+            if !value.is_finite() {
+                return Err(Error::invalid(format!(
+                    "{what}: {name} is {value}, not a finite number"
+                )));
+            }
+        }
+        for (name, value) in [("fx", self.fx), ("fy", self.fy)] {
+            if value <= 0.0 {
+                return Err(Error::invalid(format!(
+                    "{what}: {name} is {value}; it must be over 0"
+                )));
+            }
+        }
+        if self.width == 0 || self.height == 0 {
+            return Err(Error::invalid(format!(
+                "{what}: {}x{} px; both sides must be at least 1",
+                self.width, self.height
+            )));
+        }
+        Ok(self)
+    }
+
+    /// Intrinsics of the image after cropping to `x, y, width, height` (pixels of this image).
+    #[must_use]
+    pub fn cropped(self, x: f64, y: f64, width: u32, height: u32) -> Self {
+        Self { cx: self.cx - x, cy: self.cy - y, width, height, ..self }
+    }
+
+    /// Intrinsics of the image resized to `width` x `height`.
+    ///
+    /// Exact with pixel centres at +0.5: coordinates scale about the image corner.
+    #[must_use]
+    pub fn resized(self, width: u32, height: u32) -> Self {
+        let sx = f64::from(width) / f64::from(self.width);
+        let sy = f64::from(height) / f64::from(self.height);
+        Self {
+            fx: self.fx * sx,
+            fy: self.fy * sy,
+            cx: self.cx * sx,
+            cy: self.cy * sy,
+            width,
+            height,
+        }
+    }
+
+    /// Pixel of a point in camera coordinates (z > 0).
+    #[must_use]
+    pub fn project(&self, point: DVec3) -> (f64, f64) {
+        (self.fx * point.x / point.z + self.cx, self.fy * point.y / point.z + self.cy)
+    }
+
+    /// Point in camera coordinates seen at pixel (u, v) at depth z.
+    #[must_use]
+    pub fn unproject(&self, u: f64, v: f64, z: f64) -> DVec3 {
+        DVec3::new((u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z, z)
+    }
+}
+
+/// A rigid camera-to-world pose in the OpenCV frame; checked at construction.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CameraToWorld(DMat4);
+
+impl CameraToWorld {
+    /// From 16 numbers, row-major. `what` names the camera in messages.
+    ///
+    /// # Errors
+    /// `invalid_request` when not finite, the last row is not (0,0,0,1), the rotation is singular,
+    /// not orthonormal within [`ORTHONORMAL_TOLERANCE`], or a reflection.
+    pub fn from_row_major(m: &[f64; 16], what: &str) -> Result<Self> {
+        if let Some(i) = m.iter().position(|v| !v.is_finite()) {
+            return Err(Error::invalid(format!(
+                "{what}: camera_to_world[{}][{}] is {}, not a finite number",
+                i / 4,
+                i % 4,
+                m[i]
+            )));
+        }
+        let last = [m[12], m[13], m[14], m[15] - 1.0];
+        if last.iter().any(|v| v.abs() > ORTHONORMAL_TOLERANCE) {
+            return Err(Error::invalid(format!(
+                "{what}: the last row of camera_to_world is [{}, {}, {}, {}]; it must be [0, 0, 0, 1]",
+                m[12], m[13], m[14], m[15]
+            )));
+        }
+        let mat = DMat4::from_cols_array(m).transpose();
+        let r = DMat3::from_mat4(mat);
+        let det = r.determinant();
+        if det.abs() < 1e-6 {
+            return Err(Error::invalid(format!(
+                "{what}: the rotation of camera_to_world is singular (determinant {det:.3e})"
+            )));
+        }
+        let gram = r * r.transpose();
+        let off = (gram - DMat3::IDENTITY)
+            .to_cols_array()
+            .iter()
+            .fold(0.0_f64, |worst, v| worst.max(v.abs()));
+        if off > ORTHONORMAL_TOLERANCE {
+            return Err(Error::invalid(format!(
+                "{what}: the rotation of camera_to_world is not orthonormal (off by {off:.3e}, at most {ORTHONORMAL_TOLERANCE:.0e})"
+            )));
+        }
+        if det < 0.0 {
+            return Err(Error::invalid(format!(
+                "{what}: camera_to_world is mirrored (determinant {det:.3})"
+            )));
+        }
+        Ok(Self::orthonormalised(mat))
+    }
+
+    /// From an OpenGL camera-to-world (x right, y up, z backwards): y and z columns flipped.
+    ///
+    /// # Errors
+    /// As [`Self::from_row_major`].
+    pub fn from_opengl_row_major(m: &[f64; 16], what: &str) -> Result<Self> {
+        let mut cv = *m;
+        for row in 0..3 {
+            cv[row * 4 + 1] = -cv[row * 4 + 1];
+            cv[row * 4 + 2] = -cv[row * 4 + 2];
+        }
+        Self::from_row_major(&cv, what)
+    }
+
+    /// A camera at `eye` that looks at `target`; `up` is up in the picture.
+    ///
+    /// # Errors
+    /// `invalid_request` when eye and target coincide or `up` is parallel to the view axis.
+    pub fn look_at(eye: DVec3, target: DVec3, up: DVec3, what: &str) -> Result<Self> {
+        if !(eye.is_finite() && target.is_finite() && up.is_finite()) {
+            return Err(Error::invalid(format!(
+                "{what}: eye, target and up must be finite numbers"
+            )));
+        }
+        let forward = (target - eye)
+            .try_normalize()
+            .ok_or_else(|| Error::invalid(format!("{what}: eye and target are the same point")))?;
+        let right = forward.cross(up).try_normalize().ok_or_else(|| {
+            Error::invalid(format!("{what}: up is zero or parallel to the view axis"))
+        })?;
+        let down = forward.cross(right);
+        Ok(Self(DMat4::from_cols(
+            right.extend(0.0),
+            down.extend(0.0),
+            forward.extend(0.0),
+            eye.extend(1.0),
+        )))
+    }
+
+    fn orthonormalised(mat: DMat4) -> Self {
+        let forward = mat.z_axis.truncate().normalize();
+        let x = mat.x_axis.truncate();
+        let right = (x - forward * forward.dot(x)).normalize();
+        let down = forward.cross(right);
+        Self(DMat4::from_cols(
+            right.extend(0.0),
+            down.extend(0.0),
+            forward.extend(0.0),
+            mat.w_axis.truncate().extend(1.0),
+        ))
+    }
+
+    /// The matrix, camera to world.
+    #[must_use]
+    pub fn matrix(&self) -> DMat4 {
+        self.0
+    }
+
+    /// World to camera.
+    #[must_use]
+    pub fn viewmat(&self) -> DMat4 {
+        self.0.inverse()
+    }
+
+    /// Rotation, camera to world.
+    #[must_use]
+    pub fn rotation(&self) -> DMat3 {
+        DMat3::from_mat4(self.0)
+    }
+
+    /// Camera centre in the world.
+    #[must_use]
+    pub fn center(&self) -> DVec3 {
+        self.0.w_axis.truncate()
+    }
+
+    /// Unit viewing axis (+z of the camera) in the world.
+    #[must_use]
+    pub fn axis(&self) -> DVec3 {
+        self.0.z_axis.truncate()
+    }
+
+    /// 16 numbers, row-major.
+    #[must_use]
+    pub fn to_row_major(&self) -> [f64; 16] {
+        self.0.transpose().to_cols_array()
+    }
+}
+
+impl Serialize for CameraToWorld {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        self.to_row_major().serialize(serializer)
+    }
+}
+
+impl<'de> Deserialize<'de> for CameraToWorld {
+    fn deserialize<D: serde::Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let numbers = <[f64; 16]>::deserialize(deserializer)?;
+        Self::from_row_major(&numbers, "camera_to_world").map_err(serde::de::Error::custom)
+    }
+}
+
+/// A pinhole camera with a pose.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Camera {
+    /// Lens, in pixels of the picture to be made or that was taken.
+    pub intrinsics: Intrinsics,
+    /// Pose, OpenCV camera-to-world.
+    pub camera_to_world: CameraToWorld,
+}

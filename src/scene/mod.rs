@@ -1,0 +1,14 @@
+//! The nouns: cameras, photos, Gaussians, reports. No IO, no threads; constructors validate and
+//! the types are trusted below.
+
+mod camera;
+mod gaussians;
+mod id;
+mod photo;
+mod report;
+
+pub use camera::{Camera, CameraToWorld, Intrinsics};
+pub use gaussians::{Gaussians, RawGaussians, SanitizeReport, SourcePixel};
+pub use id::SceneId;
+pub use photo::{Photo, PosedPhoto};
+pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};

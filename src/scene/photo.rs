@@ -1,0 +1,27 @@
+//! Photos with known cameras, as read and undistorted; nothing after this knows of distortion.
+
+use crate::scene::Camera;
+
+/// 8-bit sRGB pixels, row-major, with the pixels that have a source.
+#[derive(Clone, Debug)]
+pub struct Photo {
+    /// Width, pixels.
+    pub width: u32,
+    /// Height, pixels.
+    pub height: u32,
+    /// `[height * width * 3]`, sRGB as stored.
+    pub rgb: Vec<u8>,
+    /// `[height * width]`, false where undistortion found no source; `None` when all have one.
+    pub valid: Option<Vec<bool>>,
+}
+
+/// A photo, its camera (of the undistorted pixels, same size) and the file it came from.
+#[derive(Clone, Debug)]
+pub struct PosedPhoto {
+    /// File name as uploaded.
+    pub file: String,
+    /// Pixels.
+    pub photo: Photo,
+    /// Camera of these pixels.
+    pub camera: Camera,
+}

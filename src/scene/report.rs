@@ -1,0 +1,82 @@
+//! What a scene says of itself: counts, warnings with their figure, stage times.
+
+use serde::{Deserialize, Serialize};
+
+/// What looks wrong with a capture; the scene was made all the same.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[non_exhaustive]
+pub enum WarningCode {
+    /// OpenGL axes given as OpenCV, or the reverse.
+    AxesSwapped,
+    /// World-to-camera given for camera-to-world.
+    PoseInverted,
+    /// Intrinsics made for another resolution.
+    IntrinsicsScale,
+    /// Principal point far from the picture's centre.
+    PrincipalPointOff,
+    /// Photos share little.
+    LowOverlap,
+    /// Cameras stand too close together for the depth of the scene.
+    SmallBaseline,
+    /// Depths hit the end of the searched range.
+    DepthRangeHit,
+    /// The photos do not agree under the given poses, and no known mistake explains it.
+    PoorPoseAgreement,
+    /// Photos of the upload that were not used.
+    PhotosUnused,
+}
+
+/// One warning: what, a sentence, and the figure behind it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Warning {
+    /// What looks wrong.
+    pub code: WarningCode,
+    /// A sentence that names photo, value and bound.
+    pub message: String,
+    /// The measured figure.
+    pub value: f64,
+}
+
+/// How many Gaussians were dropped or clamped for one reason.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DropCount {
+    /// Why, snake_case: `opacity_below_1_255`, `not_finite`, `duplicate`, `out_of_reach`, …
+    pub reason: String,
+    /// How many.
+    pub count: u64,
+}
+
+/// Time of one stage.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct StageTime {
+    /// Stage name, as in progress events.
+    pub stage: String,
+    /// Wall time, milliseconds.
+    pub ms: f64,
+}
+
+/// The health report of a scene.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct HealthReport {
+    /// Photos given.
+    pub photos: u32,
+    /// Photos used.
+    pub views_used: u32,
+    /// Gaussians kept.
+    pub gaussians: u64,
+    /// Gaussians dropped or clamped, by reason.
+    pub dropped: Vec<DropCount>,
+    /// Nearest and farthest depth searched, world units, smallest near and largest far of all views.
+    pub depth_range: [f64; 2],
+    /// Median depth of the Gaussians from the input cameras, world units: the scene's extent.
+    pub median_depth: f64,
+    /// Mean share of a view's matchable pixels found in its best partner, 0..1.
+    pub overlap: f64,
+    /// Time of each stage.
+    pub stages: Vec<StageTime>,
+    /// Execution provider of the geometry network.
+    pub execution_provider: String,
+    /// What looks wrong with the capture.
+    pub warnings: Vec<Warning>,
+}

@@ -1,0 +1,1 @@
+//! One integration binary: links ONNX Runtime, wgpu and tonic once.
