@@ -1,1 +1,3 @@
 //! photos: under construction.
+
+pub use crate::scene::{Upload, UploadCameras as Cameras, UploadFile};

@@ -6,9 +6,11 @@ mod gaussians;
 mod id;
 mod photo;
 mod report;
+mod upload;
 
 pub use camera::{Camera, CameraToWorld, Intrinsics};
 pub use gaussians::{Gaussians, RawGaussians, SanitizeReport, SourcePixel};
 pub use id::SceneId;
 pub use photo::{Photo, PosedPhoto};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
+pub use upload::{Upload, UploadCameras, UploadFile};

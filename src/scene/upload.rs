@@ -1,0 +1,51 @@
+//! What a caller sends to make a scene, as bytes: camera JSON and photos, or one archive.
+
+use std::fmt;
+
+/// One photo as sent.
+#[derive(Clone, PartialEq, Eq)]
+pub struct UploadFile {
+    /// File name as sent; never joined to a path.
+    pub name: String,
+    /// The file, undecoded.
+    pub bytes: Vec<u8>,
+}
+
+impl fmt::Debug for UploadFile {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "UploadFile({:?}, {} bytes)", self.name, self.bytes.len())
+    }
+}
+
+/// The camera description as sent, undecoded JSON.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum UploadCameras {
+    /// A nerfstudio or instant-ngp `transforms.json` (OpenGL axes).
+    Transforms(Vec<u8>),
+    /// Our own `cameras` JSON (OpenCV axes).
+    Cameras(Vec<u8>),
+}
+
+/// Everything sent for one scene: cameras and photos, or an archive that holds both.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Upload {
+    /// Camera description; `None` when it is in the archive.
+    pub cameras: Option<UploadCameras>,
+    /// Photos in the order sent.
+    pub photos: Vec<UploadFile>,
+    /// A zip or tar of a folder of photos and its camera description.
+    pub archive: Option<Vec<u8>>,
+}
+
+impl Upload {
+    /// Bytes of all parts together.
+    #[must_use]
+    pub fn size_bytes(&self) -> usize {
+        let cameras = match &self.cameras {
+            Some(UploadCameras::Transforms(json) | UploadCameras::Cameras(json)) => json.len(),
+            None => 0,
+        };
+        let photos: usize = self.photos.iter().map(|photo| photo.bytes.len()).sum();
+        cameras + photos + self.archive.as_ref().map_or(0, Vec::len)
+    }
+}
