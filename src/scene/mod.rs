@@ -2,6 +2,7 @@
 //! the types are trusted below.
 
 mod camera;
+mod capture;
 mod gaussians;
 mod id;
 mod photo;
@@ -9,6 +10,7 @@ mod report;
 mod upload;
 
 pub use camera::{Camera, CameraToWorld, Intrinsics};
+pub use capture::{Capture, ViewSet};
 pub use gaussians::{Gaussians, RawGaussians, SanitizeReport, SourcePixel};
 pub use id::SceneId;
 pub use photo::{Photo, PosedPhoto};

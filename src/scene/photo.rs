@@ -24,4 +24,7 @@ pub struct PosedPhoto {
     pub photo: Photo,
     /// Camera of these pixels.
     pub camera: Camera,
+    /// Width and height that the uploaded intrinsics were made for, where these are not the
+    /// photo's: `camera` was scaled to the photo, and the capture report says so.
+    pub intrinsics_made_for: Option<[u32; 2]>,
 }
