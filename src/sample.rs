@@ -15,7 +15,7 @@ use serde_json::json;
 
 use crate::{
     error::{Error, Result},
-    scene::{Camera, CameraToWorld, Intrinsics, PosedPhoto},
+    scene::{Camera, CameraToWorld, Intrinsics, PosedPhoto, Upload, UploadCameras, UploadFile},
 };
 
 pub use room::{Room, View};
@@ -129,6 +129,7 @@ pub fn photos(options: &SampleOptions) -> Result<Vec<PosedPhoto>> {
         file: format!("images/{i:04}.png"),
         photo: room.view(&camera).photo,
         camera,
+        intrinsics_made_for: None,
     });
     Ok(posed.collect())
 }
@@ -171,11 +172,11 @@ pub fn cameras_json(photos: &[PosedPhoto]) -> Vec<u8> {
     format!("{:#}\n", json!({ "cameras": cameras })).into_bytes()
 }
 
-/// The photos as PNG files: name and bytes, in the cameras' order.
+/// The photos as PNG files, in the cameras' order.
 ///
 /// # Errors
 /// `internal` when a photo's pixels do not fill its size.
-pub fn png_files(photos: &[PosedPhoto]) -> Result<Vec<(String, Vec<u8>)>> {
+pub fn png_files(photos: &[PosedPhoto]) -> Result<Vec<UploadFile>> {
     photos
         .iter()
         .map(|posed| {
@@ -184,9 +185,22 @@ pub fn png_files(photos: &[PosedPhoto]) -> Result<Vec<(String, Vec<u8>)>> {
             PngEncoder::new(&mut bytes)
                 .write_image(&photo.rgb, photo.width, photo.height, ExtendedColorType::Rgb8)
                 .map_err(|e| Error::internal("sample: PNG encoding failed").caused_by(e))?;
-            Ok((posed.file.clone(), bytes))
+            Ok(UploadFile { name: posed.file.clone(), bytes })
         })
         .collect()
+}
+
+/// The photos and their `transforms.json` as a caller would send them.
+///
+/// # Errors
+/// As [`photos`].
+pub fn upload(options: &SampleOptions) -> Result<Upload> {
+    let posed = photos(options)?;
+    Ok(Upload {
+        cameras: Some(UploadCameras::Transforms(transforms_json(&posed))),
+        photos: png_files(&posed)?,
+        archive: None,
+    })
 }
 
 /// Writes the photos and `transforms.json` under `out_dir`, which is made where it is missing.
@@ -197,7 +211,7 @@ pub fn run(out_dir: &Path, options: &SampleOptions) -> Result<()> {
     let posed = photos(options)?;
     let failed = |e: std::io::Error| Error::invalid(format!("sample: cannot write: {e}"));
     fs_err::create_dir_all(out_dir.join("images")).map_err(failed)?;
-    for (name, bytes) in png_files(&posed)? {
+    for UploadFile { name, bytes } in png_files(&posed)? {
         fs_err::write(out_dir.join(name), bytes).map_err(failed)?;
     }
     fs_err::write(out_dir.join("transforms.json"), transforms_json(&posed)).map_err(failed)
