@@ -17,6 +17,9 @@ pub struct Limits {
     pub json_bytes_max: usize,
     /// Pixels of one photo, read from the header before decoding.
     pub photo_pixels_max: u64,
+    /// Longer side in pixels to which a photo is reduced after decoding: no stage looks closer, and
+    /// it bounds the memory of a full upload.
+    pub photo_side_kept_max: u32,
     /// Entries in an archive, files and folders alike.
     pub archive_entries_max: usize,
     /// Bytes of one archive unpacked: what a zip bomb meets.
@@ -55,6 +58,7 @@ impl Default for Limits {
             upload_bytes_max: 256 << 20,
             json_bytes_max: 8 << 20,
             photo_pixels_max: 24_000_000,
+            photo_side_kept_max: 2_048,
             archive_entries_max: 1_024,
             archive_unpacked_bytes_max: 512 << 20,
             file_name_bytes_max: 256,

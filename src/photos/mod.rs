@@ -1,3 +1,270 @@
-//! photos: under construction.
+//! Photos in: camera JSON, photo files or an archive become upright facts, [`PosedPhoto`]s.
+//!
+//! Conventions are converted here and nowhere else: OpenGL poses to OpenCV, lens distortion
+//! undone, intrinsics brought to the size of the photo. Everything that can be refused from names,
+//! numbers and headers is refused before a pixel is decoded. Pixels are taken as stored: EXIF
+//! orientation is ignored, as COLMAP ignores it.
+//!
+//! Photos sent one by one each need a camera, but the JSON may describe more cameras than photos
+//! were sent. In a folder or an archive every camera needs its photo, and files that no camera
+//! names (masks, depth maps) are left alone.
 
-pub use crate::scene::{Upload, UploadCameras as Cameras, UploadFile};
+mod archive;
+mod cameras;
+mod decode;
+mod lens;
+mod names;
+
+use std::{collections::HashSet, path::Path};
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+pub use crate::scene::{Upload, UploadCameras, UploadFile};
+use crate::{
+    error::{Error, Result},
+    limits::Limits,
+    scene::{Camera, CameraToWorld, PosedPhoto},
+};
+use cameras::{CameraEntry, PoseAxes};
+
+/// Names under which a folder or archive may hold its cameras.
+pub const CAMERA_FILES: [&str; 2] = ["transforms.json", "cameras.json"];
+
+/// How a camera is called in messages: `photo 3 ("images/0003.jpg")`.
+fn label(index: usize, file: &str) -> String {
+    let shown: String = file.chars().take(80).collect();
+    format!("photo {index} ({shown:?})")
+}
+
+/// Reads an upload into photos with cameras, in the order of the cameras.
+///
+/// An archive is unpacked in memory under the limits. See the module for what is converted.
+///
+/// # Errors
+/// `invalid_request` for missing, surplus or impossible cameras, `photo_unreadable` for files that
+/// are not what they claim, `limit_exceeded`; each names photo, value and bound.
+pub fn read(upload: &Upload, limits: &Limits) -> Result<Vec<PosedPhoto>> {
+    let total = upload.size_bytes();
+    if total > limits.upload_bytes_max {
+        return Err(Error::limit("upload bytes", total, limits.upload_bytes_max));
+    }
+    match &upload.archive {
+        Some(archive) => {
+            if !upload.photos.is_empty() || upload.cameras.is_some() {
+                return Err(Error::invalid(
+                    "send either an archive or camera JSON and photos, not both",
+                ));
+            }
+            let unpacked = archive::unpack(archive, limits)?;
+            read_parts(&unpacked, limits, Every::Camera)
+        }
+        None => read_parts(upload, limits, Every::Photo),
+    }
+}
+
+/// Reads a folder with `transforms.json` or `cameras.json` and the photos it names.
+///
+/// # Errors
+/// As [`read`]; also `invalid_request` where the folder has no camera file.
+pub fn read_dir(dir: &Path, limits: &Limits) -> Result<Vec<PosedPhoto>> {
+    read_parts(&upload_of_dir(dir, limits)?, limits, Every::Camera)
+}
+
+/// The camera file of a folder and the photos it names, as an upload.
+///
+/// # Errors
+/// `invalid_request` when there is no camera file, or a photo it names is missing or outside the
+/// folder.
+pub fn upload_of_dir(dir: &Path, limits: &Limits) -> Result<Upload> {
+    let cameras = camera_file_of_dir(dir, limits)?;
+    let entries = cameras::parse(&cameras, limits)?;
+    check_count(entries.len(), limits)?;
+    let mut photos = Vec::with_capacity(entries.len());
+    for (i, entry) in entries.iter().enumerate() {
+        let relative = names::normalise(&entry.file)
+            .ok_or_else(|| Error::invalid(outside(&label(i, &entry.file))))?;
+        let found = names::with_extensions(&relative).find(|name| dir.join(name).is_file());
+        let name = found.ok_or_else(|| {
+            Error::invalid(format!("{}: no such file in the folder", label(i, &entry.file)))
+        })?;
+        let bytes = fs_err::read(dir.join(&name)).map_err(|e| {
+            Error::photo(format!("{}: cannot be read", label(i, &entry.file))).caused_by(e)
+        })?;
+        photos.push(UploadFile { name, bytes });
+    }
+    Ok(Upload { cameras: Some(cameras), photos, archive: None })
+}
+
+fn camera_file_of_dir(dir: &Path, limits: &Limits) -> Result<UploadCameras> {
+    for name in CAMERA_FILES {
+        let path = dir.join(name);
+        let Ok(meta) = fs_err::metadata(&path) else { continue };
+        check_json_bytes(name, usize::try_from(meta.len()).unwrap_or(usize::MAX), limits)?;
+        let bytes = fs_err::read(&path)
+            .map_err(|e| Error::invalid(format!("{name}: cannot be read")).caused_by(e))?;
+        return Ok(cameras_named(name, bytes));
+    }
+    Err(Error::invalid("the folder has no transforms.json and no cameras.json"))
+}
+
+fn cameras_named(name: &str, bytes: Vec<u8>) -> UploadCameras {
+    if name == CAMERA_FILES[0] {
+        UploadCameras::Transforms(bytes)
+    } else {
+        UploadCameras::Cameras(bytes)
+    }
+}
+
+fn check_json_bytes(what: &str, bytes: usize, limits: &Limits) -> Result<()> {
+    if bytes > limits.json_bytes_max {
+        return Err(Error::limit(format!("{what}: bytes"), bytes, limits.json_bytes_max));
+    }
+    Ok(())
+}
+
+fn check_count(photos: usize, limits: &Limits) -> Result<()> {
+    match photos {
+        0 => Err(Error::invalid(format!(
+            "no photos; a scene needs {} to {}",
+            limits.photos_min, limits.photos_max
+        ))),
+        n if n < limits.photos_min => Err(Error::invalid(format!(
+            "{n} photo; a scene needs at least {} to see depth",
+            limits.photos_min
+        ))),
+        n if n > limits.photos_max => Err(Error::limit("photos", n, limits.photos_max)),
+        _ => Ok(()),
+    }
+}
+
+fn outside(what: &str) -> String {
+    format!("{what}: the path must be relative and stay inside the folder")
+}
+
+/// What must find its partner: loose photos their camera, cameras of a folder their photo.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Every {
+    Photo,
+    Camera,
+}
+
+/// A camera and the file it belongs to, before the pixels are touched.
+struct Paired<'a> {
+    entry: &'a CameraEntry,
+    file: &'a UploadFile,
+    label: String,
+}
+
+fn read_parts(upload: &Upload, limits: &Limits, every: Every) -> Result<Vec<PosedPhoto>> {
+    if every == Every::Photo {
+        check_count(upload.photos.len(), limits)?;
+    }
+    let cameras = upload.cameras.as_ref().ok_or_else(|| {
+        Error::invalid("no cameras: send a `transforms` or `cameras` part, or an archive with one")
+    })?;
+    let entries = cameras::parse(cameras, limits)?;
+    let paired = pair(&entries, &upload.photos, limits, every)?;
+    check_count(paired.len(), limits)?;
+    let poses: Vec<CameraToWorld> = paired
+        .iter()
+        .map(|p| match p.entry.axes {
+            PoseAxes::OpenGl => CameraToWorld::from_opengl_row_major(&p.entry.pose()?, &p.label),
+            PoseAxes::OpenCv => CameraToWorld::from_row_major(&p.entry.pose()?, &p.label),
+        })
+        .collect::<Result<_>>()?;
+    check_places(&poses)?;
+    let mut headers = Vec::with_capacity(paired.len());
+    for p in &paired {
+        let header = decode::header(&p.file.bytes, &p.label, limits)?;
+        let lens = p.entry.lens.at_size(header.width, header.height, &p.label)?;
+        headers.push((header, lens));
+    }
+    let read: Vec<Result<PosedPhoto>> = paired
+        .par_iter()
+        .zip(headers)
+        .zip(poses)
+        .map(|((p, (header, lens)), camera_to_world)| {
+            let raw = decode::pixels(&p.file.bytes, &header, &p.label, limits)?;
+            let photo = lens::undistort(raw, &lens);
+            let (photo, intrinsics) =
+                decode::at_most(photo, lens.intrinsics, limits.photo_side_kept_max);
+            Ok(PosedPhoto {
+                file: p.file.name.clone(),
+                photo,
+                camera: Camera { intrinsics, camera_to_world },
+                intrinsics_made_for: lens.made_for,
+            })
+        })
+        .collect();
+    read.into_iter().collect()
+}
+
+fn pair<'a>(
+    entries: &'a [CameraEntry],
+    files: &'a [UploadFile],
+    limits: &Limits,
+    every: Every,
+) -> Result<Vec<Paired<'a>>> {
+    let mut seen = HashSet::new();
+    for (i, file) in files.iter().enumerate() {
+        if file.name.len() > limits.file_name_bytes_max {
+            let what = format!("{}: bytes of the file name", label(i, &file.name));
+            return Err(Error::limit(what, file.name.len(), limits.file_name_bytes_max));
+        }
+        if names::normalise(&file.name).is_none() {
+            return Err(Error::invalid(outside(&label(i, &file.name))));
+        }
+        if !seen.insert(file.name.as_str()) {
+            return Err(Error::invalid(format!(
+                "{}: two photos have this name; send paths as in the camera file",
+                label(i, &file.name)
+            )));
+        }
+    }
+    let wanted: Vec<&str> = entries.iter().map(|e| e.file.as_str()).collect();
+    let sent: Vec<&str> = files.iter().map(|f| f.name.as_str()).collect();
+    let file_of_entry = names::matched(&wanted, &sent)?;
+    if every == Every::Photo {
+        let used: HashSet<usize> = file_of_entry.iter().flatten().copied().collect();
+        if let Some(i) = (0..files.len()).find(|i| !used.contains(i)) {
+            return Err(Error::invalid(format!(
+                "{}: no camera has this file; the camera file names {} others",
+                label(i, &files[i].name),
+                entries.len()
+            )));
+        }
+    }
+    let mut paired = Vec::with_capacity(files.len());
+    for (i, (entry, found)) in entries.iter().zip(file_of_entry).enumerate() {
+        match found {
+            Some(at) => {
+                let label = label(paired.len(), &entry.file);
+                paired.push(Paired { entry, file: &files[at], label });
+            }
+            None if every == Every::Camera => {
+                let what = label(i, &entry.file);
+                return Err(Error::invalid(format!("{what}: a camera, but no such photo")));
+            }
+            None => {}
+        }
+    }
+    Ok(paired)
+}
+
+/// Refuses cameras that all stand at one place: they see no depth.
+fn check_places(poses: &[CameraToWorld]) -> Result<()> {
+    let first = poses[0].center();
+    let spread = poses.iter().map(|p| p.center().distance(first)).fold(0.0, f64::max);
+    let reach = poses.iter().map(|p| p.center().length()).fold(0.0, f64::max);
+    // Twelve digits is what a pose in JSON carries beside an origin that far away.
+    let bound = (reach * 1e-12).max(f64::MIN_POSITIVE);
+    if spread <= bound {
+        let DVec3 { x, y, z } = first;
+        return Err(Error::invalid(format!(
+            "all {} cameras stand at one place ({x}, {y}, {z}); depth needs a baseline over 0",
+            poses.len()
+        )));
+    }
+    Ok(())
+}

@@ -1,0 +1,215 @@
+//! Zip and tar, unpacked in memory: entries counted, names checked, sizes bounded as they are read.
+
+use std::{
+    collections::HashMap,
+    io::{Cursor, Read},
+};
+
+use super::{CAMERA_FILES, cameras_named, names};
+use crate::{
+    error::{Error, Result},
+    limits::Limits,
+    scene::{Upload, UploadFile},
+};
+
+/// The cameras and files of an archive of one folder.
+///
+/// # Errors
+/// `photo_unreadable` when it is no archive or damaged, `invalid_request` for names that leave it
+/// or links, `limit_exceeded` for too many entries or bytes.
+pub(super) fn unpack(bytes: &[u8], limits: &Limits) -> Result<Upload> {
+    let files = match bytes {
+        [b'P', b'K', ..] => unzip(bytes, limits)?,
+        [0x1F, 0x8B, ..] => {
+            return Err(Error::photo("archive: compressed by gzip; send a zip or a plain tar"));
+        }
+        _ if bytes.get(257..262) == Some(b"ustar") => untar(bytes, limits)?,
+        _ => return Err(Error::photo("archive: neither a zip nor a tar file")),
+    };
+    folder(files)
+}
+
+/// Picks the camera file nearest the root; its folder is what the photos' paths are relative to.
+fn folder(mut files: HashMap<String, Vec<u8>>) -> Result<Upload> {
+    let depth = |path: &str| path.matches('/').count();
+    let mut found: Vec<&String> = files
+        .keys()
+        .filter(|path| CAMERA_FILES.contains(&path.rsplit('/').next().unwrap_or(path)))
+        .collect();
+    found.sort_by(|a, b| depth(a).cmp(&depth(b)).then(a.cmp(b)));
+    let chosen = match found[..] {
+        [] => return Err(Error::invalid("archive: no transforms.json and no cameras.json in it")),
+        [first, second, ..] if depth(first) == depth(second) => {
+            return Err(Error::invalid(format!(
+                "archive: two camera files, {first:?} and {second:?}; a scene has one"
+            )));
+        }
+        [first, ..] => first.clone(),
+    };
+    let (root, name) = match chosen.rsplit_once('/') {
+        Some((root, name)) => (format!("{root}/"), name.to_owned()),
+        None => (String::new(), chosen.clone()),
+    };
+    let json = files.remove(&chosen).unwrap_or_default();
+    let mut photos: Vec<UploadFile> = files
+        .into_iter()
+        .filter_map(|(path, bytes)| {
+            let name = path.strip_prefix(&root)?.to_owned();
+            Some(UploadFile { name, bytes })
+        })
+        .collect();
+    photos.sort_by(|a, b| a.name.cmp(&b.name));
+    Ok(Upload { cameras: Some(cameras_named(&name, json)), photos, archive: None })
+}
+
+/// Counts entries and bytes of one archive against the limits.
+struct Budget<'a> {
+    limits: &'a Limits,
+    entries: usize,
+    bytes: u64,
+}
+
+impl<'a> Budget<'a> {
+    fn new(limits: &'a Limits) -> Self {
+        Self { limits, entries: 0, bytes: 0 }
+    }
+
+    /// Counts an entry and checks its name; the path of a file to read, `None` for what is skipped.
+    fn entry(&mut self, name: &[u8], link: bool, folder: bool) -> Result<Option<String>> {
+        self.entries += 1;
+        if self.entries > self.limits.archive_entries_max {
+            let max = self.limits.archive_entries_max;
+            return Err(Error::limit("archive: entries", format!("more than {max}"), max));
+        }
+        let name = std::str::from_utf8(name).map_err(|e| {
+            Error::invalid(format!("archive: the name of entry {} is not UTF-8", self.entries))
+                .caused_by(e)
+        })?;
+        let shown: String = name.chars().take(80).collect();
+        if name.len() > self.limits.file_name_bytes_max {
+            let what = format!("archive: bytes of the name {shown:?}");
+            return Err(Error::limit(what, name.len(), self.limits.file_name_bytes_max));
+        }
+        if link {
+            return Err(Error::invalid(format!(
+                "archive: {shown:?} is a link; only files may be in it"
+            )));
+        }
+        let path = match names::normalise(name) {
+            Some(path) => path,
+            // The folder itself, as `tar -C folder .` writes it.
+            None if folder && matches!(name, "." | "./") => return Ok(None),
+            None => {
+                return Err(Error::invalid(format!(
+                    "archive: {shown:?} must be a relative path that stays inside the folder"
+                )));
+            }
+        };
+        let file = path.rsplit('/').next().unwrap_or(&path);
+        let left_by_macos = path.starts_with("__MACOSX/") || file.starts_with("._");
+        Ok((!folder && !left_by_macos).then_some(path))
+    }
+
+    /// Reads one file whole; never more than what is left of the budget, whatever its header says.
+    fn read(&mut self, path: &str, claimed: u64, from: impl Read) -> Result<Vec<u8>> {
+        let max = self.limits.archive_unpacked_bytes_max;
+        let left = max - self.bytes;
+        let over = |bytes: String| {
+            Error::limit(format!("archive: unpacked bytes at {path:?}"), bytes, max)
+        };
+        if claimed > left {
+            return Err(over((self.bytes.saturating_add(claimed)).to_string()));
+        }
+        let mut bytes = Vec::new();
+        from.take(left + 1).read_to_end(&mut bytes).map_err(|e| {
+            Error::photo(format!("archive: {path:?} is damaged or cut short")).caused_by(e)
+        })?;
+        if bytes.len() as u64 > left {
+            return Err(over(format!("more than {max}")));
+        }
+        self.bytes += bytes.len() as u64;
+        Ok(bytes)
+    }
+}
+
+fn insert(files: &mut HashMap<String, Vec<u8>>, path: String, bytes: Vec<u8>) -> Result<()> {
+    if files.contains_key(&path) {
+        return Err(Error::invalid(format!("archive: two entries are called {path:?}")));
+    }
+    files.insert(path, bytes);
+    Ok(())
+}
+
+/// Number of entries that the end record of a zip claims, so that a huge directory is never read.
+fn zip_entries_claimed(bytes: &[u8]) -> Option<usize> {
+    let tail = &bytes[bytes.len().saturating_sub(22 + 65_535)..];
+    let claims = tail.windows(22).filter(|w| w.starts_with(b"PK\x05\x06"));
+    claims.map(|w| usize::from(u16::from_le_bytes([w[10], w[11]]))).max()
+}
+
+fn unzip(bytes: &[u8], limits: &Limits) -> Result<HashMap<String, Vec<u8>>> {
+    let damaged = || Error::photo("archive: the zip is damaged or cut short");
+    let claimed = zip_entries_claimed(bytes).ok_or_else(damaged)?;
+    if claimed > limits.archive_entries_max {
+        return Err(Error::limit("archive: entries", claimed, limits.archive_entries_max));
+    }
+    let mut zip = zip::ZipArchive::new(Cursor::new(bytes)).map_err(|e| damaged().caused_by(e))?;
+    let mut budget = Budget::new(limits);
+    let mut wanted = Vec::new();
+    // All names and claims are checked before anything is unpacked.
+    let mut claimed_bytes = 0_u64;
+    for i in 0..zip.len() {
+        let entry = zip.by_index_raw(i).map_err(|e| damaged().caused_by(e))?;
+        let name = entry.name().map_err(|e| damaged().caused_by(e))?;
+        let path = budget.entry(name.as_bytes(), entry.is_symlink(), entry.is_dir())?;
+        claimed_bytes = claimed_bytes.saturating_add(entry.size());
+        if claimed_bytes > limits.archive_unpacked_bytes_max {
+            let max = limits.archive_unpacked_bytes_max;
+            return Err(Error::limit("archive: unpacked bytes", claimed_bytes, max));
+        }
+        if let Some(path) = path {
+            if entry.encrypted() {
+                return Err(Error::photo(format!("archive: {path:?} is encrypted")));
+            }
+            wanted.push((i, path));
+        }
+    }
+    let mut files = HashMap::new();
+    for (i, path) in wanted {
+        let entry = zip.by_index(i).map_err(|e| {
+            Error::photo(format!("archive: {path:?} is damaged or packed in an unknown way"))
+                .caused_by(e)
+        })?;
+        let read = budget.read(&path, entry.size(), entry)?;
+        insert(&mut files, path, read)?;
+    }
+    Ok(files)
+}
+
+fn untar(bytes: &[u8], limits: &Limits) -> Result<HashMap<String, Vec<u8>>> {
+    use tar::EntryType;
+
+    let damaged = |e| Error::photo("archive: the tar is damaged or cut short").caused_by(e);
+    let mut budget = Budget::new(limits);
+    let mut files = HashMap::new();
+    let mut tar = tar::Archive::new(Cursor::new(bytes));
+    for entry in tar.entries().map_err(damaged)? {
+        let entry = entry.map_err(damaged)?;
+        let kind = entry.header().entry_type();
+        if kind == EntryType::XGlobalHeader {
+            continue;
+        }
+        let file = matches!(kind, EntryType::Regular | EntryType::Continuous);
+        let folder = kind == EntryType::Directory;
+        let name = entry.path_bytes().into_owned();
+        if let Some(path) = budget.entry(&name, !file && !folder, folder)? {
+            let claimed = entry.size();
+            let read = budget.read(&path, claimed, entry)?;
+            if read.len() as u64 != claimed {
+                return Err(Error::photo(format!("archive: {path:?} is cut short")));
+            }
+            insert(&mut files, path, read)?;
+        }
+    }
+    Ok(files)
+}
