@@ -114,7 +114,8 @@ impl CameraToWorld {
         let last = [m[12], m[13], m[14], m[15] - 1.0];
         if last.iter().any(|v| v.abs() > ORTHONORMAL_TOLERANCE) {
             return Err(Error::invalid(format!(
-                "{what}: the last row of camera_to_world is [{}, {}, {}, {}]; it must be [0, 0, 0, 1]",
+                "{what}: the last row of camera_to_world is [{}, {}, {}, {}]; \
+                 it must be [0, 0, 0, 1]",
                 m[12], m[13], m[14], m[15]
             )));
         }
@@ -133,7 +134,8 @@ impl CameraToWorld {
             .fold(0.0_f64, |worst, v| worst.max(v.abs()));
         if off > ORTHONORMAL_TOLERANCE {
             return Err(Error::invalid(format!(
-                "{what}: the rotation of camera_to_world is not orthonormal (off by {off:.3e}, at most {ORTHONORMAL_TOLERANCE:.0e})"
+                "{what}: the rotation of camera_to_world is not orthonormal \
+                 (off by {off:.3e}, at most {ORTHONORMAL_TOLERANCE:.0e})"
             )));
         }
         if det < 0.0 {

@@ -41,7 +41,7 @@ pub struct Warning {
 /// How many Gaussians were dropped or clamped for one reason.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct DropCount {
-    /// Why, snake_case: `opacity_below_1_255`, `not_finite`, `duplicate`, `out_of_reach`, …
+    /// Why, `snake_case`: `opacity_below_1_255`, `not_finite`, `duplicate`, `out_of_reach`, …
     pub reason: String,
     /// How many.
     pub count: u64,
@@ -67,7 +67,7 @@ pub struct HealthReport {
     pub gaussians: u64,
     /// Gaussians dropped or clamped, by reason.
     pub dropped: Vec<DropCount>,
-    /// Nearest and farthest depth searched, world units, smallest near and largest far of all views.
+    /// Nearest and farthest depth searched, world units: smallest near and largest far of all.
     pub depth_range: [f64; 2],
     /// Median depth of the Gaussians from the input cameras, world units: the scene's extent.
     pub median_depth: f64,

@@ -1,0 +1,350 @@
+//! The house rules as tests: layers, confined crates, sizes, words, generated pages.
+//!
+//! The layer table is read from the first page of `src/lib.rs`, so page and code cannot part.
+
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    fmt::Write as _,
+    fs,
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use segsplat::error::TABLE;
+
+use crate::common::root;
+
+/// Folders and files that this crate's authors write by hand, with limits on length.
+const OURS: [&str; 7] =
+    ["src/", "tests/", "benches/", "shaders/", "proto/", "scripts/", "build.rs"];
+const LINE_CHARS_MAX: usize = 100;
+const FILE_LINES_MAX: usize = 600;
+const GOLDEN_BYTES_MAX: u64 = 64 << 10;
+const TREE_BYTES_MAX: u64 = 48 << 20;
+
+/// A crate's name and where it may be named.
+const CONFINED: [(&str, &[&str]); 10] = [
+    ("axum", &["src/api/http"]),
+    ("tower_http", &["src/api/http"]),
+    ("utoipa", &["src/api/http"]),
+    ("tonic", &["src/api/grpc"]),
+    ("tonic_health", &["src/api/grpc"]),
+    ("tonic_reflection", &["src/api/grpc"]),
+    ("prost", &["src/api/grpc"]),
+    ("ort", &["src/models"]),
+    ("wgpu", &["src/render/gpu"]),
+    ("clap", &["src/cli", "src/config.rs", "src/main.rs"]),
+];
+
+/// Tracked files (new ones too), relative to the root; all files where there is no git.
+fn files() -> Vec<String> {
+    let listed = Command::new("git")
+        .args(["ls-files", "-z", "--cached", "--others", "--exclude-standard"])
+        .current_dir(root())
+        .output();
+    if let Ok(output) = listed
+        && output.status.success()
+    {
+        let names = String::from_utf8(output.stdout).expect("file names are UTF-8");
+        let names = names.split('\0').filter(|name| !name.is_empty()).map(str::to_owned);
+        return names.filter(|name| root().join(name).is_file()).collect();
+    }
+    let mut found = Vec::new();
+    walk(root(), &mut found);
+    found
+}
+
+fn walk(folder: &Path, found: &mut Vec<String>) {
+    for entry in fs::read_dir(folder).expect("a readable folder") {
+        let path = entry.expect("a readable entry").path();
+        let name =
+            path.strip_prefix(root()).expect("below the root").to_string_lossy().into_owned();
+        if path.is_dir() {
+            if !["target", "data", ".git", ".venv"].contains(&name.as_str()) {
+                walk(&path, found);
+            }
+        } else {
+            found.push(name);
+        }
+    }
+}
+
+fn read(name: &str) -> String {
+    fs::read_to_string(root().join(name)).unwrap_or_else(|e| panic!("{name}: {e}"))
+}
+
+/// Files of ours with this ending, and their text.
+fn ours(ending: &str) -> Vec<(String, String)> {
+    let own = |name: &String| OURS.iter().any(|top| name.starts_with(top));
+    let named = files().into_iter().filter(own).filter(|name| name.ends_with(ending));
+    named.map(|name| (name.clone(), read(&name))).collect()
+}
+
+/// Rust text without comments and without the unit tests at its end.
+fn code_of(text: &str) -> String {
+    let code = text.split("#[cfg(test)]\nmod tests").next().unwrap_or_default();
+    let lines = code.lines().filter(|line| !line.trim_start().starts_with("//"));
+    lines.collect::<Vec<_>>().join("\n")
+}
+
+fn fail_with(faults: &[String], rule: &str) {
+    assert!(faults.is_empty(), "{rule}:\n  {}", faults.join("\n  "));
+}
+
+/// The names after each `word::` in `code`, the first of each path in `{…}` too.
+fn paths_from(code: &str, word: &str) -> BTreeSet<String> {
+    let start = format!("{word}::");
+    let mut names = BTreeSet::new();
+    for (at, _) in code.match_indices(&start) {
+        let before = code[..at].chars().next_back().unwrap_or(' ');
+        if before.is_alphanumeric() || before == '_' || before == ':' || before == '$' {
+            continue;
+        }
+        let rest = &code[at + start.len()..];
+        let ident = |s: &str| -> String {
+            s.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect()
+        };
+        let Some(list) = rest.strip_prefix('{') else {
+            names.insert(ident(rest));
+            continue;
+        };
+        let (mut depth, mut item) = (0, String::new());
+        for c in list.chars() {
+            match c {
+                '{' => depth += 1,
+                '}' if depth == 0 => break,
+                '}' => depth -= 1,
+                ',' if depth == 0 => drop(names.insert(ident(std::mem::take(&mut item).trim()))),
+                _ if depth == 0 => item.push(c),
+                _ => {}
+            }
+        }
+        names.insert(ident(item.trim()));
+    }
+    names.remove("");
+    names
+}
+
+/// For each module the modules that it may use, from the table in `src/lib.rs`.
+fn layers() -> BTreeMap<String, BTreeSet<String>> {
+    let page = read("src/lib.rs");
+    let quoted = |cell: &str| -> BTreeSet<String> {
+        cell.split('`').skip(1).step_by(2).map(str::to_owned).collect()
+    };
+    let mut rows = Vec::new();
+    for line in page.lines().filter(|line| line.starts_with("//! | L")) {
+        let cells: Vec<&str> = line.split('|').map(str::trim).collect();
+        let level = cells[1].split(' ').next().expect("a level").to_owned();
+        rows.push((level, quoted(cells[2]), cells[3].to_owned()));
+    }
+    assert!(rows.len() >= 7, "the layer table of src/lib.rs is gone");
+    let of_level = |level: &str| {
+        rows.iter().find(|row| row.0 == level).map(|row| row.1.clone()).unwrap_or_default()
+    };
+    let everything: BTreeSet<String> = rows.iter().flat_map(|row| row.1.clone()).collect();
+    let mut allowed = BTreeMap::new();
+    for (level, modules, may) in &rows {
+        for module in modules {
+            let mut uses = of_level("L0");
+            if may.contains("everything") {
+                uses = everything.clone();
+            } else if level != "L0" {
+                uses.extend(quoted(may));
+                (0..7).map(|i| format!("L{i}")).filter(|l| may.contains(l)).for_each(|l| {
+                    uses.extend(of_level(&l));
+                });
+            }
+            uses.insert(module.clone());
+            allowed.insert(module.clone(), uses);
+        }
+    }
+    allowed
+}
+
+#[test]
+fn modules_use_only_the_layers_below() {
+    let layers = layers();
+    let mut faults = Vec::new();
+    for (name, text) in ours(".rs").iter().filter(|(name, _)| name.starts_with("src/")) {
+        let parts: Vec<&str> = name.trim_end_matches(".rs").split('/').collect();
+        let module = parts[1];
+        if module == "lib" || parts.last() == Some(&"tests") {
+            continue;
+        }
+        let code = code_of(text);
+        let Some(allowed) = layers.get(module) else {
+            faults.push(format!("{name}: module {module} is not in the table of src/lib.rs"));
+            continue;
+        };
+        let mut used = paths_from(&code, "crate");
+        if module == "main" {
+            used = paths_from(&code, "segsplat");
+        } else if parts.len() == 2 || parts[2..] == ["mod"] {
+            let all: BTreeSet<&String> = layers.keys().collect();
+            used.extend(paths_from(&code, "super").into_iter().filter(|n| all.contains(n)));
+        }
+        for other in used.iter().filter(|other| layers.contains_key(*other)) {
+            if !allowed.contains(other) {
+                faults.push(format!("{name}: {module} uses {other}, which is not below it"));
+            }
+        }
+    }
+    for line in read("src/lib.rs").lines() {
+        if let Some(module) = line.strip_prefix("pub mod ").and_then(|l| l.strip_suffix(';'))
+            && !layers.contains_key(module)
+        {
+            faults.push(format!("src/lib.rs: module {module} has no row in the table"));
+        }
+    }
+    fail_with(&faults, "layers (the table in src/lib.rs)");
+}
+
+#[test]
+fn crates_stay_where_they_belong() {
+    let mut faults = Vec::new();
+    for (name, text) in ours(".rs").iter().filter(|(name, _)| name.starts_with("src/")) {
+        let code = code_of(text);
+        for (confined, homes) in CONFINED {
+            let at_home = homes.iter().any(|home| name.starts_with(home));
+            if !at_home && !paths_from(&code, confined).is_empty() {
+                faults
+                    .push(format!("{name} names {confined}, whose place is {}", homes.join(", ")));
+            }
+        }
+    }
+    fail_with(&faults, "confined crates");
+}
+
+#[test]
+fn every_shader_has_its_twin_and_names_it() {
+    let stems = |folder: &str, ending: &str| -> BTreeSet<String> {
+        let inside = |name: &String| Path::new(name).parent() == Some(Path::new(folder));
+        let stem =
+            |name: String| Path::new(&name).file_stem().map(|s| s.to_string_lossy().into_owned());
+        let wanted = files().into_iter().filter(|n| n.ends_with(ending)).filter(inside);
+        wanted.filter_map(stem).collect()
+    };
+    let (shaders, twins) = (stems("shaders", ".wgsl"), stems("src/render/cpu", ".rs"));
+    let mut faults = Vec::new();
+    for stem in &shaders {
+        let (shader, twin) = (format!("shaders/{stem}.wgsl"), format!("src/render/cpu/{stem}.rs"));
+        if !twins.contains(stem) {
+            faults.push(format!("{shader} has no twin {twin}"));
+            continue;
+        }
+        for (file, partner) in [(&shader, &twin), (&twin, &shader)] {
+            if !read(file).lines().next().is_some_and(|line| line.contains(partner.as_str())) {
+                faults.push(format!("{file}: the first line does not name {partner}"));
+            }
+        }
+    }
+    fail_with(&faults, "shaders and their CPU twins");
+}
+
+#[test]
+fn files_are_short_and_say_what_they_are() {
+    let mut faults = Vec::new();
+    for (name, text) in ["rs", "wgsl", "proto", "py", "scripts/setup"].map(ours).concat() {
+        let lines = text.lines().count();
+        if lines > FILE_LINES_MAX {
+            faults.push(format!("{name}: {lines} lines, at most {FILE_LINES_MAX}"));
+        }
+        for (i, line) in text.lines().enumerate() {
+            let chars = line.chars().count();
+            if chars > LINE_CHARS_MAX && !line.starts_with("//! |") {
+                faults.push(format!("{name}:{}: {chars} columns", i + 1));
+            }
+        }
+        if name.ends_with(".rs") && !text.starts_with("//!") {
+            faults.push(format!("{name}: the first line does not say what the file is (//!)"));
+        }
+    }
+    fail_with(&faults, "size and first line of files");
+}
+
+#[test]
+fn no_unfinished_work_and_no_path_of_a_machine() {
+    let unfinished = [concat!("to", "do!("), concat!("unimple", "mented!("), concat!("FIX", "ME")];
+    let words = [unfinished.as_slice(), &[concat!("extrin", "sics")]].concat();
+    let paths = [concat!("/wo", "rk/"), concat!("/ro", "ot/"), concat!("/ho", "me/")];
+    let mut faults = Vec::new();
+    for name in files() {
+        let Ok(text) = fs::read_to_string(root().join(&name)) else { continue };
+        let code = OURS.iter().any(|top| name.starts_with(top));
+        for (i, line) in text.lines().enumerate() {
+            let banned = words.iter().filter(|_| code).chain(&paths).find(|w| line.contains(**w));
+            if let Some(word) = banned {
+                faults.push(format!("{name}:{}: {word}", i + 1));
+            }
+        }
+    }
+    fail_with(&faults, "banned words and machine paths");
+}
+
+#[test]
+fn the_tree_stays_small() {
+    let size = |name: &String| fs::metadata(root().join(name)).map_or(0, |m| m.len());
+    let all = files();
+    let golden =
+        |name: &&String| name.starts_with("tests/golden/") && size(name) > GOLDEN_BYTES_MAX;
+    let faults: Vec<String> = all.iter().filter(golden).cloned().collect();
+    fail_with(&faults, "golden files over 64 KiB");
+    let total: u64 = all.iter().map(size).sum();
+    assert!(total <= TREE_BYTES_MAX, "the tracked tree is {total} bytes, over {TREE_BYTES_MAX}");
+}
+
+#[test]
+fn links_between_pages_lead_somewhere() {
+    let mut faults = Vec::new();
+    for name in files().into_iter().filter(|name| name.ends_with(".md")) {
+        let folder = root().join(&name).parent().map(PathBuf::from).expect("a folder");
+        for (_, rest) in read(&name).match_indices("](").map(|(at, m)| (at, at + m.len())) {
+            let link = read(&name)[rest..].split(')').next().unwrap_or_default().to_owned();
+            let target = link.split('#').next().unwrap_or_default();
+            if !target.is_empty() && !target.contains(':') && !folder.join(target).exists() {
+                faults.push(format!("{name}: {link}"));
+            }
+        }
+    }
+    fail_with(&faults, "links that lead nowhere");
+}
+
+/// The page of error codes, from the table and the comments of the codes in `src/error.rs`.
+fn errors_page() -> String {
+    let mut page = String::from(
+        "# Errors\n\nMade from the table in [`src/error.rs`](../src/error.rs) by \
+         `UPDATE_DOCS=1 cargo test --release --test it tidy`; a test holds the two together.\n\n\
+         The name is the truth for clients: HTTP answers it as `code` of the JSON body, gRPC as \
+         the\nmetadata entry `code`, the command line on standard error. gRPC numbers are those \
+         of `google.rpc.Code`.\n\n\
+         | code | HTTP | gRPC | exit | same call may succeed later | meaning |\n\
+         |---|---|---|---|---|---|\n",
+    );
+    let source = read("src/error.rs");
+    for row in &TABLE {
+        let variant = format!("    {:?},", row.code);
+        let at = source.find(&variant).expect("each code stands in the enum");
+        let mut said: Vec<&str> = Vec::new();
+        for line in source[..at].lines().rev().skip_while(|line| line.trim().is_empty()) {
+            let Some(comment) = line.trim().strip_prefix("/// ") else { break };
+            said.insert(0, comment);
+        }
+        let retry = if row.retry { "yes" } else { "no" };
+        let (name, http, grpc, exit) = (row.name, row.http, row.grpc, row.exit);
+        let meaning = said.join(" ");
+        writeln!(page, "| `{name}` | {http} | {grpc} | {exit} | {retry} | {meaning} |")
+            .expect("a string takes everything");
+    }
+    page
+}
+
+#[test]
+fn the_page_of_errors_is_the_table() {
+    let path = root().join("docs/errors.md");
+    let page = errors_page();
+    if std::env::var_os("UPDATE_DOCS").is_some() {
+        fs::write(&path, &page).expect("docs/errors.md can be written");
+    }
+    let written = fs::read_to_string(&path).unwrap_or_default();
+    assert_eq!(written, page, "docs/errors.md differs: UPDATE_DOCS=1 writes it");
+}
