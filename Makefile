@@ -1,0 +1,57 @@
+# make demo    photos to views, end to end, on generated photos (and ../shared/data if there)
+# make serve   the server on 127.0.0.1:8080; flags: make serve ARGS='--listen 0.0.0.0:8080'
+# make test    every check: format, lints, docs, all tests, in one (release) profile
+# make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
+# make test-long   the random tests with many more cases, and the slow ones
+
+SHELL := /bin/sh
+CARGO ?= cargo
+TARGET := $(or $(CARGO_TARGET_DIR),target)
+SEGSPLAT := $(TARGET)/release/segsplat
+DATA ?= $(or $(SEGSPLAT_SHARED_DATA),../shared/data)/scenes
+ARGS ?=
+# The software Vulkan adapter, where `scripts/setup --ci` found one.
+ADAPTER := if [ -f $(TARGET)/vulkan/env ]; then . $(abspath $(TARGET))/vulkan/env; fi;
+
+.PHONY: demo serve test test-long bench eval setup build fmt lint doc tests deny
+
+demo: build
+	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
+
+serve: build
+	$(SEGSPLAT) serve $(ARGS)
+
+test: fmt lint doc tests deny
+
+fmt:
+	$(CARGO) fmt --check
+
+lint:
+	$(CARGO) clippy --locked --release --all-targets -- -D warnings
+
+doc:
+	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --locked --release --lib --no-deps
+
+tests: setup
+	$(ADAPTER) $(CARGO) test --locked --release --all-targets
+	$(CARGO) test --locked --release --doc
+
+deny:
+	@if command -v cargo-deny > /dev/null; then $(CARGO) deny check licenses bans sources; \
+	else echo 'cargo-deny is not installed: licences and sources are not checked'; fi
+
+test-long: setup
+	$(ADAPTER) RUN_SLOW_TESTS=1 FUZZ_ITERS=20000 PROPTEST_CASES=2048 \
+		$(CARGO) test --locked --release --test it
+
+bench: setup
+	$(CARGO) bench --locked
+
+eval: build
+	$(SEGSPLAT) eval $(DATA) $(ARGS)
+
+build: setup
+	$(CARGO) build --locked --release
+
+setup:
+	@scripts/setup
