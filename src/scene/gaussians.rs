@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use crate::error::{Error, Result};
+use crate::error::{Error, ErrorCode, Result};
 
 /// The view and pixel (of the network's input picture) that made a Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -136,6 +136,37 @@ impl Gaussians {
             }
         }
         Ok((Self { raw: kept }, report))
+    }
+
+    /// Takes back what [`Self::into_raw`] gave, bit for bit.
+    ///
+    /// # Errors
+    /// `scene_corrupt` when a Gaussian breaks what [`Self::sanitize`] promises, or lengths disagree.
+    pub fn restore(raw: RawGaussians) -> Result<Self> {
+        let bad = |what: String| Error::new(ErrorCode::SceneCorrupt, format!("gaussians: {what}"));
+        let k = (usize::from(raw.sh_degree) + 1).pow(2);
+        let lengths = [raw.quats.len(), raw.scales.len(), raw.opacities.len()];
+        let n = raw.means.len();
+        let equal = lengths.iter().all(|&len| len == n)
+            && raw.sh_degree <= 3
+            && raw.sh.len() == n * k
+            && raw.semantic_index.len() == n
+            && raw.source.len() == n;
+        if !equal || !raw.origin.is_finite() {
+            return Err(bad(format!("arrays of unequal length, or origin {}", raw.origin)));
+        }
+        let mut report = SanitizeReport::default();
+        for i in 0..n {
+            let kept = check_one(&raw, i, k, &mut report);
+            let same = kept.is_some_and(|(quat, scale, opacity)| {
+                let turned = quat.iter().zip(&raw.quats[i]).any(|(a, b)| (a - b).abs() > 1e-5);
+                !turned && scale == raw.scales[i] && opacity.total_cmp(&raw.opacities[i]).is_eq()
+            });
+            if !same {
+                return Err(bad(format!("number {i} is out of range")));
+            }
+        }
+        Ok(Self { raw })
     }
 
     /// Number of Gaussians.

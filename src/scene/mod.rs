@@ -5,14 +5,18 @@ mod camera;
 mod capture;
 mod gaussians;
 mod id;
+mod made;
 mod photo;
 mod report;
+mod status;
 mod upload;
 
 pub use camera::{Camera, CameraToWorld, Intrinsics};
 pub use capture::{Capture, ViewSet};
 pub use gaussians::{Gaussians, RawGaussians, SanitizeReport, SourcePixel};
 pub use id::SceneId;
+pub use made::{PhotoHash, Provenance, Scene, SceneMeta};
 pub use photo::{Photo, PosedPhoto};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
+pub use status::{Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus};
 pub use upload::{Upload, UploadCameras, UploadFile};

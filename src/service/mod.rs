@@ -5,9 +5,9 @@
 mod types;
 
 pub use types::{
-    CameraSpec, CreateScene, Created, Event, Export, ExportFormat, Format, Kind, LensSpec,
-    ModelInfo, ModelsInfo, Page, PageRequest, PoseSpec, Readiness, RenderedView, SceneCamera,
-    SceneError, SceneOptions, SceneState, SceneStatus, ViewOptions, ViewSpec, ViewsSpec,
+    CameraSpec, CreateScene, Created, Export, ExportFormat, Format, Kind, LensSpec, ModelInfo,
+    ModelsInfo, Page, PageRequest, PoseSpec, Readiness, RenderedView, ViewOptions, ViewSpec,
+    ViewsSpec,
 };
 
 use std::sync::Arc;
@@ -21,7 +21,10 @@ use crate::{
     scene::SceneId,
 };
 
-pub use crate::scene::{Upload, UploadCameras, UploadFile};
+pub use crate::scene::{
+    Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, Upload, UploadCameras,
+    UploadFile,
+};
 
 /// The use cases. Cloning shares everything.
 #[derive(Clone, Debug)]

@@ -5,9 +5,8 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    error::{Error, ErrorCode},
     render::FrameStats,
-    scene::{Camera, HealthReport, SceneId, Upload},
+    scene::{Camera, SceneOptions, SceneStatus, Upload},
 };
 
 /// Everything needed to make a scene.
@@ -23,14 +22,6 @@ pub struct CreateScene {
     pub wait: Option<Duration>,
 }
 
-/// Options of a scene, kept with it.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct SceneOptions {
-    /// Views the network takes at once; `None`: what the bundle says.
-    pub max_views: Option<usize>,
-}
-
 /// Answer of a create call.
 #[derive(Clone, Debug)]
 pub struct Created {
@@ -38,147 +29,6 @@ pub struct Created {
     pub status: SceneStatus,
     /// Whether an earlier call with the same idempotency key made it.
     pub replayed: bool,
-}
-
-/// Where a scene stands.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum SceneState {
-    /// Waits for a worker.
-    Queued,
-    /// A worker makes it.
-    Running,
-    /// Made; views can be asked for.
-    Done,
-    /// Not made; `error` says why.
-    Failed,
-    /// Stopped by the caller.
-    Cancelled,
-}
-
-impl SceneState {
-    /// Whether nothing more will happen.
-    #[must_use]
-    pub fn is_final(self) -> bool {
-        matches!(self, Self::Done | Self::Failed | Self::Cancelled)
-    }
-
-    /// The state's snake_case name.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Queued => "queued",
-            Self::Running => "running",
-            Self::Done => "done",
-            Self::Failed => "failed",
-            Self::Cancelled => "cancelled",
-        }
-    }
-}
-
-/// Why a scene failed: a code of the error table and its message.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct SceneError {
-    /// Name of a row of the error table.
-    pub code: String,
-    /// Names input, value and bound.
-    pub message: String,
-}
-
-impl From<&Error> for SceneError {
-    fn from(error: &Error) -> Self {
-        Self { code: error.code().name().to_owned(), message: error.message().to_owned() }
-    }
-}
-
-impl SceneError {
-    /// The error this was; a name of no row is `internal`.
-    #[must_use]
-    pub fn to_error(&self) -> Error {
-        let row = crate::error::TABLE.iter().find(|row| row.name == self.code);
-        Error::new(row.map_or(ErrorCode::Internal, |row| row.code), self.message.clone())
-    }
-}
-
-/// An input camera of a scene and the photo it belongs to.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct SceneCamera {
-    /// File name of the photo.
-    pub file: String,
-    /// Camera of the undistorted photo, world frame of the upload.
-    #[serde(flatten)]
-    pub camera: Camera,
-}
-
-/// A scene as `GET /v1/scenes/{id}` shows it.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct SceneStatus {
-    /// Id.
-    pub id: SceneId,
-    /// State.
-    pub state: SceneState,
-    /// Stage at work while running: `photos`, `capture`, `geometry`, `lift`, `store`.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub stage: Option<String>,
-    /// Share of the whole work that is done, 0..1.
-    pub fraction: f32,
-    /// Time of the create call, milliseconds since 1970.
-    pub created_ms: u64,
-    /// Time of the last change of state, milliseconds since 1970.
-    pub updated_ms: u64,
-    /// Why it failed.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub error: Option<SceneError>,
-    /// Health report, once done.
-    #[serde(skip_serializing_if = "Option::is_none", default)]
-    pub report: Option<HealthReport>,
-    /// Input cameras, once done.
-    #[serde(skip_serializing_if = "Vec::is_empty", default)]
-    pub cameras: Vec<SceneCamera>,
-}
-
-/// What a watcher sees. The newest event is always delivered; those between may be skipped.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(tag = "event", rename_all = "snake_case")]
-pub enum Event {
-    /// Waits; `ahead` jobs go first.
-    Queued {
-        /// Jobs that go first.
-        ahead: usize,
-    },
-    /// At work.
-    Running {
-        /// Stage at work.
-        stage: String,
-        /// Share of the whole work that is done, 0..1.
-        fraction: f32,
-    },
-    /// Made. Last event.
-    Done,
-    /// Failed. Last event.
-    Failed(SceneError),
-    /// Stopped by the caller, or deleted. Last event.
-    Cancelled,
-}
-
-impl Event {
-    /// Whether no event follows.
-    #[must_use]
-    pub fn is_last(&self) -> bool {
-        matches!(self, Self::Done | Self::Failed(_) | Self::Cancelled)
-    }
-
-    /// The event's snake_case name.
-    #[must_use]
-    pub fn name(&self) -> &'static str {
-        match self {
-            Self::Queued { .. } => "queued",
-            Self::Running { .. } => "running",
-            Self::Done => "done",
-            Self::Failed(_) => "failed",
-            Self::Cancelled => "cancelled",
-        }
-    }
 }
 
 /// Which page of the list.

@@ -1,0 +1,125 @@
+//! The one container: a safetensors file whose last 32 bytes are the sha256 of all before them.
+//!
+//! Any safetensors reader opens it; the digest is the tensor `sha256`. What the arrays mean is in
+//! `__metadata__`: `kind`, `version`, and `json` with the rest. Every byte is under the digest.
+
+use std::io::{self, Write};
+
+use safetensors::{Dtype, SafeTensors, tensor::Metadata};
+use serde_json::json;
+use sha2::{Digest, Sha256};
+
+use crate::error::{Error, ErrorCode, Result};
+
+const DIGEST_BYTES: usize = 32;
+const DIGEST_NAME: &str = "sha256";
+
+/// One array to write: little-endian bytes, row-major.
+pub(super) struct Array<'a> {
+    pub(super) name: String,
+    pub(super) dtype: Dtype,
+    pub(super) shape: Vec<usize>,
+    pub(super) bytes: &'a [u8],
+}
+
+/// What a container is, before its arrays.
+pub(super) struct Label {
+    pub(super) kind: &'static str,
+    pub(super) version: u32,
+}
+
+/// Writes a container; returns the digest in hex.
+pub(super) fn write(
+    to: &mut dyn Write,
+    label: &Label,
+    meta_json: &str,
+    arrays: &[Array<'_>],
+) -> io::Result<String> {
+    let mut header = serde_json::Map::new();
+    header.insert(
+        "__metadata__".to_owned(),
+        json!({ "kind": label.kind, "version": label.version.to_string(), "json": meta_json }),
+    );
+    let mut offset = 0;
+    for array in arrays {
+        let end = offset + array.bytes.len();
+        header.insert(
+            array.name.clone(),
+            json!({ "dtype": array.dtype, "shape": array.shape, "data_offsets": [offset, end] }),
+        );
+        offset = end;
+    }
+    header.insert(
+        DIGEST_NAME.to_owned(),
+        json!({
+            "dtype": Dtype::U8,
+            "shape": [DIGEST_BYTES],
+            "data_offsets": [offset, offset + DIGEST_BYTES],
+        }),
+    );
+    let mut header = serde_json::to_vec(&header)?;
+    header.resize(header.len().next_multiple_of(8), b' ');
+
+    let mut hash = Sha256::new();
+    let length = (header.len() as u64).to_le_bytes();
+    for part in [&length[..], &header].into_iter().chain(arrays.iter().map(|a| a.bytes)) {
+        hash.update(part);
+        to.write_all(part)?;
+    }
+    let digest = hash.finalize();
+    to.write_all(&digest)?;
+    Ok(super::files::hex(&digest))
+}
+
+/// A container whose digest, kind and version are right.
+pub(super) struct Container<'a> {
+    pub(super) meta_json: String,
+    pub(super) sha256: String,
+    tensors: SafeTensors<'a>,
+}
+
+impl<'a> Container<'a> {
+    /// Checks the whole file. `what` names it in messages.
+    pub(super) fn read(file: &'a [u8], label: &Label, what: &str) -> Result<Self> {
+        let corrupt =
+            |why: String| Error::new(ErrorCode::SceneCorrupt, format!("{what} is corrupt: {why}"));
+        let split = file
+            .len()
+            .checked_sub(DIGEST_BYTES)
+            .ok_or_else(|| corrupt(format!("{} bytes are too few for a container", file.len())))?;
+        let (content, digest) = file.split_at(split);
+        if Sha256::digest(content)[..] != *digest {
+            return Err(corrupt("its checksum does not match its content".to_owned()));
+        }
+        let (_, metadata): (usize, Metadata) =
+            SafeTensors::read_metadata(file).map_err(|e| corrupt(e.to_string()))?;
+        let words = metadata.metadata().as_ref();
+        let word = |name: &str| {
+            words
+                .and_then(|words| words.get(name))
+                .ok_or_else(|| corrupt(format!("it has no {name}")))
+        };
+        if word("kind")? != label.kind || *word("version")? != label.version.to_string() {
+            return Err(corrupt(format!(
+                "it is {} version {}; this program reads {} version {}",
+                word("kind")?,
+                word("version")?,
+                label.kind,
+                label.version
+            )));
+        }
+        let meta_json = word("json")?.clone();
+        let tensors = SafeTensors::deserialize(file).map_err(|e| corrupt(e.to_string()))?;
+        Ok(Self { meta_json, sha256: super::files::hex(digest), tensors })
+    }
+
+    /// Bytes and shape of an array of the type expected.
+    pub(super) fn array(&self, name: &str, dtype: Dtype) -> Result<(Vec<usize>, &'a [u8])> {
+        let bad = |why: String| Error::new(ErrorCode::SceneCorrupt, format!("array {name}: {why}"));
+        let view = self.tensors.tensor(name).map_err(|e| bad(e.to_string()))?;
+        if view.dtype() != dtype {
+            return Err(bad(format!("type {:?}, not {dtype:?}", view.dtype())));
+        }
+        Ok((view.shape().to_vec(), view.data()))
+    }
+}

@@ -1,0 +1,295 @@
+//! A 3DGS PLY as Gaussians: attributes in any order and of any scalar type, strangers skipped.
+
+use std::io::{self, BufRead, Read};
+
+use glam::DVec3;
+
+use crate::{
+    error::{Error, Result},
+    scene::{Gaussians, RawGaussians, SanitizeReport, SourcePixel},
+};
+
+/// Longest header, bytes.
+const HEADER_BYTES_MAX: u64 = 64 << 10;
+/// Most attributes of a vertex: 62 are standard.
+const ATTRIBUTES_MAX: usize = 256;
+/// Gaussians reserved for before any is read: a header may claim anything.
+const RESERVED_MAX: usize = 65_536;
+
+/// Reads a file. `gaussians_max` bounds what the header may claim.
+///
+/// # Errors
+/// `invalid_request` when it is no binary PLY of Gaussians or is cut short, naming what is wrong;
+/// `limit_exceeded`; `store_unavailable` when reading fails. Poisoned Gaussians are no error: they
+/// are dropped or clamped and counted.
+pub fn read_ply(
+    mut from: impl BufRead,
+    gaussians_max: usize,
+) -> Result<(Gaussians, SanitizeReport)> {
+    let header = Header::read(&mut from)?;
+    if header.count > gaussians_max {
+        return Err(Error::limit("PLY: Gaussians", header.count, gaussians_max));
+    }
+    let layout = Layout::of(&header)?;
+    let mut raw = RawGaussians { sh_degree: layout.sh_degree, ..RawGaussians::default() };
+    let reserved = header.count.min(RESERVED_MAX);
+    raw.means.reserve(reserved);
+    let mut vertex = vec![0; header.stride()];
+    for i in 0..header.count {
+        from.read_exact(&mut vertex).map_err(|cause| cut_short(cause, i, header.count))?;
+        layout.push(&header, &vertex, &mut raw);
+    }
+    Gaussians::sanitize(raw)
+}
+
+fn cut_short(cause: io::Error, read: usize, count: usize) -> Error {
+    if cause.kind() == io::ErrorKind::UnexpectedEof {
+        bad(format!("the file ends after {read} of {count} Gaussians"))
+    } else {
+        super::super::files::unavailable("read the PLY", cause)
+    }
+}
+
+fn bad(why: impl std::fmt::Display) -> Error {
+    Error::invalid(format!("PLY: {why}"))
+}
+
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Scalar {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    F32,
+    F64,
+}
+
+impl Scalar {
+    fn parse(name: &str) -> Option<Self> {
+        Some(match name {
+            "char" | "int8" => Self::I8,
+            "uchar" | "uint8" => Self::U8,
+            "short" | "int16" => Self::I16,
+            "ushort" | "uint16" => Self::U16,
+            "int" | "int32" => Self::I32,
+            "uint" | "uint32" => Self::U32,
+            "float" | "float32" => Self::F32,
+            "double" | "float64" => Self::F64,
+            _ => return None,
+        })
+    }
+
+    fn size(self) -> usize {
+        match self {
+            Self::I8 | Self::U8 => 1,
+            Self::I16 | Self::U16 => 2,
+            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::F64 => 8,
+        }
+    }
+
+    /// The value at the start of `bytes`, which hold at least [`Self::size`].
+    fn value(self, bytes: &[u8], big_endian: bool) -> f64 {
+        let mut word = [0; 8];
+        let size = self.size();
+        word[..size].copy_from_slice(&bytes[..size]);
+        if big_endian {
+            word[..size].reverse();
+        }
+        let [b0, b1, b2, b3, ..] = word;
+        match self {
+            Self::I8 => f64::from(i8::from_le_bytes([b0])),
+            Self::U8 => f64::from(b0),
+            Self::I16 => f64::from(i16::from_le_bytes([b0, b1])),
+            Self::U16 => f64::from(u16::from_le_bytes([b0, b1])),
+            Self::I32 => f64::from(i32::from_le_bytes([b0, b1, b2, b3])),
+            Self::U32 => f64::from(u32::from_le_bytes([b0, b1, b2, b3])),
+            Self::F32 => f64::from(f32::from_le_bytes([b0, b1, b2, b3])),
+            Self::F64 => f64::from_le_bytes(word),
+        }
+    }
+}
+
+struct Attribute {
+    name: String,
+    scalar: Scalar,
+    offset: usize,
+}
+
+struct Header {
+    big_endian: bool,
+    count: usize,
+    attributes: Vec<Attribute>,
+}
+
+impl Header {
+    fn read(from: &mut impl BufRead) -> Result<Self> {
+        let mut from = from.by_ref().take(HEADER_BYTES_MAX);
+        let mut line = |what: &str| -> Result<String> {
+            let mut line = Vec::new();
+            from.read_until(b'\n', &mut line)
+                .map_err(|cause| super::super::files::unavailable("read the PLY", cause))?;
+            if line.last() != Some(&b'\n') {
+                return Err(bad(format!(
+                    "{what} is missing in the first {HEADER_BYTES_MAX} bytes"
+                )));
+            }
+            String::from_utf8(line)
+                .map(|text| text.trim_end().to_owned())
+                .map_err(|_not_text| bad("the header is not text"))
+        };
+        if line("the line `ply`")? != "ply" {
+            return Err(bad("the file does not begin with the line `ply`"));
+        }
+        let (mut big_endian, mut count, mut attributes) = (None, None, Vec::new());
+        let mut in_vertex = false;
+        loop {
+            let line = line("`end_header`")?;
+            let words: Vec<&str> = line.split_ascii_whitespace().collect();
+            match words[..] {
+                ["end_header"] => break,
+                [] | ["comment" | "obj_info", ..] => {}
+                ["format", "binary_little_endian", "1.0"] => big_endian = Some(false),
+                ["format", "binary_big_endian", "1.0"] => big_endian = Some(true),
+                ["format", ..] => {
+                    return Err(bad(format!("`{}`; only binary is read", shown(&line))));
+                }
+                ["element", "vertex", number] if count.is_none() => {
+                    let number = number
+                        .parse()
+                        .map_err(|e| bad(format!("number of vertices {:?}: {e}", shown(number))))?;
+                    count = Some(number);
+                    in_vertex = true;
+                }
+                // What follows the vertices is not read.
+                ["element", _, _] if count.is_some() => in_vertex = false,
+                ["element", ..] => {
+                    return Err(bad(format!("`{}` stands before the vertices", shown(&line))));
+                }
+                ["property", ..] if !in_vertex => {}
+                ["property", scalar, name] => push_attribute(&mut attributes, scalar, name)?,
+                _ => return Err(bad(format!("header line {:?} is not known", shown(&line)))),
+            }
+        }
+        Ok(Self {
+            big_endian: big_endian.ok_or_else(|| bad("the header has no `format`"))?,
+            count: count.ok_or_else(|| bad("the header has no `element vertex`"))?,
+            attributes,
+        })
+    }
+
+    fn stride(&self) -> usize {
+        self.attributes.last().map_or(0, |last| last.offset + last.scalar.size())
+    }
+
+    fn find(&self, name: &str) -> Option<usize> {
+        self.attributes.iter().position(|attribute| attribute.name == name)
+    }
+
+    fn require<const N: usize>(&self, names: [&str; N]) -> Result<[usize; N]> {
+        let mut found = [0; N];
+        for (slot, name) in found.iter_mut().zip(names) {
+            *slot = self.find(name).ok_or_else(|| bad(format!("the vertices have no `{name}`")))?;
+        }
+        Ok(found)
+    }
+
+    fn value(&self, vertex: &[u8], attribute: usize) -> f64 {
+        let Attribute { scalar, offset, .. } = self.attributes[attribute];
+        scalar.value(&vertex[offset..], self.big_endian)
+    }
+
+    #[expect(clippy::cast_possible_truncation, reason = "f64 files are narrowed")]
+    fn value_f32(&self, vertex: &[u8], attribute: usize) -> f32 {
+        self.value(vertex, attribute) as f32
+    }
+}
+
+fn push_attribute(attributes: &mut Vec<Attribute>, scalar: &str, name: &str) -> Result<()> {
+    let scalar = Scalar::parse(scalar).ok_or_else(|| {
+        bad(format!("type {:?} of {:?} is not known", shown(scalar), shown(name)))
+    })?;
+    if attributes.iter().any(|attribute| attribute.name == name) {
+        return Err(bad(format!("the vertices have {:?} twice", shown(name))));
+    }
+    if attributes.len() == ATTRIBUTES_MAX {
+        return Err(Error::limit("PLY: attributes of a vertex", "one more", ATTRIBUTES_MAX));
+    }
+    let offset = attributes.last().map_or(0, |last| last.offset + last.scalar.size());
+    attributes.push(Attribute { name: name.to_owned(), scalar, offset });
+    Ok(())
+}
+
+/// The start of a word of the file, for a message.
+fn shown(text: &str) -> String {
+    text.chars().take(80).collect()
+}
+
+/// Which attribute is what.
+struct Layout {
+    position: [usize; 3],
+    dc: [usize; 3],
+    rest: Vec<usize>,
+    opacity: [usize; 1],
+    scale: [usize; 3],
+    rotation: [usize; 4],
+    semantic_index: Option<usize>,
+    sh_degree: u8,
+}
+
+impl Layout {
+    fn of(header: &Header) -> Result<Self> {
+        let rest: Vec<usize> = (0..).map_while(|i| header.find(&format!("f_rest_{i}"))).collect();
+        let sh_degree = match rest.len() {
+            0 => 0,
+            9 => 1,
+            24 => 2,
+            45 => 3,
+            other => {
+                return Err(bad(format!("{other} `f_rest_` attributes; 0, 9, 24 or 45 are read")));
+            }
+        };
+        Ok(Self {
+            position: header.require(["x", "y", "z"])?,
+            dc: header.require(["f_dc_0", "f_dc_1", "f_dc_2"])?,
+            rest,
+            opacity: header.require(["opacity"])?,
+            scale: header.require(["scale_0", "scale_1", "scale_2"])?,
+            rotation: header.require(["rot_0", "rot_1", "rot_2", "rot_3"])?,
+            semantic_index: header.find("semantic_index"),
+            sh_degree,
+        })
+    }
+
+    fn push(&self, header: &Header, vertex: &[u8], raw: &mut RawGaussians) {
+        let value = |attribute| header.value(vertex, attribute);
+        let narrow = |attribute| header.value_f32(vertex, attribute);
+        let position = DVec3::from_array(self.position.map(value));
+        let wide = self.position.iter().any(|&i| header.attributes[i].scalar == Scalar::F64);
+        if raw.means.is_empty() && wide && position.is_finite() {
+            // f64 positions are kept near the first one, where f32 is fine enough.
+            raw.origin = position;
+        }
+        raw.means.push((position - raw.origin).as_vec3().to_array());
+        raw.quats.push(self.rotation.map(narrow));
+        #[expect(clippy::cast_possible_truncation, reason = "the scene holds f32")]
+        raw.scales.push(self.scale.map(|i| value(i).exp() as f32));
+        #[expect(clippy::cast_possible_truncation, reason = "the scene holds f32")]
+        raw.opacities.push((1.0 / (1.0 + (-value(self.opacity[0])).exp())) as f32);
+        raw.sh.push(self.dc.map(narrow));
+        let each = self.rest.len() / 3;
+        for coefficient in 0..each {
+            raw.sh.push([0, 1, 2].map(|channel| narrow(self.rest[channel * each + coefficient])));
+        }
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "the cast saturates; an index that is none becomes the background"
+        )]
+        let index = self.semantic_index.map_or(0, |i| value(i) as u16);
+        raw.semantic_index.push(index);
+        raw.source.push(SourcePixel::default());
+    }
+}

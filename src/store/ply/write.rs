@@ -1,0 +1,91 @@
+//! Gaussians as a PLY, piece by piece, so that no whole file stands in memory.
+
+use crate::scene::Gaussians;
+
+/// Gaussians a piece.
+const PIECE: usize = 16_384;
+/// Opacity 1 has no finite logit; this one reads back as 1 within f32's step.
+const OPACITY_MAX: f64 = 1.0 - 5e-8;
+
+/// Iterates over the pieces of the file: the header, then vertices.
+#[derive(Debug)]
+pub struct PlyWriter<'a> {
+    gaussians: &'a Gaussians,
+    /// Next Gaussian; `None` before the header.
+    next: Option<usize>,
+}
+
+impl<'a> PlyWriter<'a> {
+    /// A writer at the start of the file.
+    #[must_use]
+    pub fn new(gaussians: &'a Gaussians) -> Self {
+        Self { gaussians, next: None }
+    }
+}
+
+impl Iterator for PlyWriter<'_> {
+    type Item = Vec<u8>;
+
+    fn next(&mut self) -> Option<Vec<u8>> {
+        let Some(from) = self.next else {
+            self.next = Some(0);
+            return Some(header(self.gaussians).into_bytes());
+        };
+        let to = (from + PIECE).min(self.gaussians.len());
+        if from == to {
+            return None;
+        }
+        self.next = Some(to);
+        let mut piece = Vec::with_capacity((to - from) * vertex_bytes(self.gaussians));
+        for i in from..to {
+            vertex(self.gaussians, i, &mut piece);
+        }
+        Some(piece)
+    }
+}
+
+/// Size of the whole file.
+#[must_use]
+pub fn ply_size_bytes(gaussians: &Gaussians) -> u64 {
+    (header(gaussians).len() + gaussians.len() * vertex_bytes(gaussians)) as u64
+}
+
+fn vertex_bytes(gaussians: &Gaussians) -> usize {
+    4 * (3 + 3 + 3 * gaussians.sh_count() + 1 + 3 + 4) + 2
+}
+
+fn header(gaussians: &Gaussians) -> String {
+    let mut names: Vec<String> = ["x", "y", "z", "nx", "ny", "nz"].map(str::to_owned).to_vec();
+    names.extend((0..3).map(|c| format!("f_dc_{c}")));
+    names.extend((0..3 * (gaussians.sh_count() - 1)).map(|i| format!("f_rest_{i}")));
+    names.push("opacity".to_owned());
+    names.extend((0..3).map(|i| format!("scale_{i}")));
+    names.extend((0..4).map(|i| format!("rot_{i}")));
+    let floats: String = names.iter().map(|name| format!("property float {name}\n")).collect();
+    format!(
+        "ply\nformat binary_little_endian 1.0\ncomment SplatRenderMode: default\n\
+         element vertex {}\n{floats}property ushort semantic_index\nend_header\n",
+        gaussians.len()
+    )
+}
+
+fn vertex(gaussians: &Gaussians, i: usize, to: &mut Vec<u8>) {
+    let raw = gaussians.as_raw();
+    let k = gaussians.sh_count();
+    let sh = &raw.sh[i * k..(i + 1) * k];
+    #[expect(clippy::cast_possible_truncation, reason = "the format holds f32")]
+    let mut put = |value: f64| to.extend_from_slice(&(value as f32).to_le_bytes());
+    for (mean, origin) in raw.means[i].iter().zip(raw.origin.to_array()) {
+        put(f64::from(*mean) + origin);
+    }
+    (0..3).for_each(|_normal| put(0.0));
+    sh[0].iter().for_each(|&value| put(f64::from(value)));
+    for channel in 0..3 {
+        sh[1..].iter().for_each(|row| put(f64::from(row[channel])));
+    }
+    let opacity = f64::from(raw.opacities[i]).min(OPACITY_MAX);
+    put((opacity / (1.0 - opacity)).ln());
+    raw.scales[i].iter().for_each(|&scale| put(f64::from(scale).ln()));
+    raw.quats[i].iter().for_each(|&value| put(f64::from(value)));
+    to.extend_from_slice(&raw.semantic_index[i].to_le_bytes());
+}

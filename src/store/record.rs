@@ -1,0 +1,49 @@
+//! What the store keeps of a scene beside its arrays: status, request, attempts.
+
+use serde::{Deserialize, Serialize};
+
+use super::files::hex;
+use crate::{
+    error::{Error, ErrorCode, Result},
+    scene::{SceneOptions, SceneStatus},
+};
+use sha2::{Digest, Sha256};
+
+/// A scene's status and the request it came from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Record {
+    /// What callers see.
+    pub status: SceneStatus,
+    /// Options of the call.
+    pub options: SceneOptions,
+    /// Idempotency key of the call.
+    pub idempotency_key: Option<String>,
+    /// sha256 over the upload and the options, hex: what the key stands for.
+    pub request_sha256: String,
+    /// How often a worker has begun; bounds how often a scene that stops the server is retried.
+    pub attempts: u32,
+    /// sha256 of the scene container, hex, once done.
+    pub scene_sha256: Option<String>,
+}
+
+/// The record with its own checksum: a flipped digit in a number would still be JSON.
+#[derive(Serialize, Deserialize)]
+struct Sealed {
+    sha256: String,
+    record: String,
+}
+
+pub(super) fn seal(record: &Record) -> serde_json::Result<Vec<u8>> {
+    let record = serde_json::to_string(record)?;
+    serde_json::to_vec(&Sealed { sha256: hex(&Sha256::digest(&record)), record })
+}
+
+pub(super) fn unseal(file: &[u8]) -> Result<Record> {
+    let corrupt =
+        |why: String| Error::new(ErrorCode::SceneCorrupt, format!("the scene's status: {why}"));
+    let sealed: Sealed = serde_json::from_slice(file).map_err(|e| corrupt(e.to_string()))?;
+    if sealed.sha256 != hex(&Sha256::digest(&sealed.record)) {
+        return Err(corrupt("its checksum does not match its content".to_owned()));
+    }
+    serde_json::from_str(&sealed.record).map_err(|e| corrupt(e.to_string()))
+}

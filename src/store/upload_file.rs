@@ -1,0 +1,94 @@
+//! An upload as one container: what was acknowledged can be made after any restart.
+
+use std::io::{self, Write};
+
+use safetensors::Dtype;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use super::{
+    container::{self, Array, Container, Label},
+    files::hex,
+};
+use crate::{
+    error::{Error, ErrorCode, Result},
+    scene::{PhotoHash, Upload, UploadCameras, UploadFile},
+};
+
+const LABEL: Label = Label { kind: "segsplat-upload", version: 1 };
+
+#[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Part {
+    Transforms,
+    Cameras,
+    Archive,
+    Photo,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Header {
+    record: super::Record,
+    /// Part and name of each array, in order.
+    parts: Vec<(Part, String)>,
+}
+
+fn parts(upload: &Upload) -> Vec<(Part, &str, &[u8])> {
+    let cameras = upload.cameras.iter().map(|cameras| match cameras {
+        UploadCameras::Transforms(json) => (Part::Transforms, "transforms.json", &json[..]),
+        UploadCameras::Cameras(json) => (Part::Cameras, "cameras.json", &json[..]),
+    });
+    let archive = upload.archive.iter().map(|bytes| (Part::Archive, "archive", &bytes[..]));
+    let photos = upload.photos.iter().map(|p| (Part::Photo, p.name.as_str(), &p.bytes[..]));
+    cameras.chain(archive).chain(photos).collect()
+}
+
+/// Name and sha256 of every file of an upload.
+#[must_use]
+pub fn hashes(upload: &Upload) -> Vec<PhotoHash> {
+    parts(upload)
+        .into_iter()
+        .map(|(_, name, bytes)| PhotoHash {
+            file: name.to_owned(),
+            sha256: hex(&Sha256::digest(bytes)),
+        })
+        .collect()
+}
+
+pub(super) fn write(to: &mut dyn Write, upload: &Upload, record: &super::Record) -> io::Result<()> {
+    let parts = parts(upload);
+    let header = serde_json::to_string(&Header {
+        record: record.clone(),
+        parts: parts.iter().map(|(part, name, _)| (*part, (*name).to_owned())).collect(),
+    })?;
+    let arrays: Vec<_> = parts
+        .iter()
+        .enumerate()
+        .map(|(i, (_, _, bytes))| Array {
+            name: format!("part_{i}"),
+            dtype: Dtype::U8,
+            shape: vec![bytes.len()],
+            bytes,
+        })
+        .collect();
+    container::write(to, &LABEL, &header, &arrays).map(|_digest| ())
+}
+
+/// The upload and the record it was acknowledged with.
+pub(super) fn read(file: &[u8]) -> Result<(Upload, super::Record)> {
+    let container = Container::read(file, &LABEL, "the stored upload")?;
+    let header: Header = serde_json::from_str(&container.meta_json).map_err(|e| {
+        Error::new(ErrorCode::SceneCorrupt, format!("the stored upload's metadata: {e}"))
+    })?;
+    let mut upload = Upload::default();
+    for (i, (part, name)) in header.parts.into_iter().enumerate() {
+        let bytes = container.array(&format!("part_{i}"), Dtype::U8)?.1.to_vec();
+        match part {
+            Part::Transforms => upload.cameras = Some(UploadCameras::Transforms(bytes)),
+            Part::Cameras => upload.cameras = Some(UploadCameras::Cameras(bytes)),
+            Part::Archive => upload.archive = Some(bytes),
+            Part::Photo => upload.photos.push(UploadFile { name, bytes }),
+        }
+    }
+    Ok((upload, header.record))
+}
