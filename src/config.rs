@@ -54,7 +54,7 @@ pub struct ConfigArgs {
     /// Folder of the model bundle [default: found beside the executable or in ./models/embedded]
     #[arg(long, env = "SEGSPLAT_BUNDLE")]
     pub bundle: Option<PathBuf>,
-    /// ONNX Runtime library [default: ORT_DYLIB_PATH, beside the executable, target/ort, system]
+    /// ONNX Runtime library [default: `ORT_DYLIB_PATH`, beside the executable, target/ort, system]
     #[arg(long, env = "SEGSPLAT_ORT_LIBRARY")]
     pub ort_library: Option<PathBuf>,
     /// Which renderer serves views [default: auto]

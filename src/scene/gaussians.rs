@@ -97,6 +97,10 @@ impl Gaussians {
     ///
     /// # Errors
     /// `internal` when the arrays' lengths disagree or the SH degree is over 3.
+    #[expect(
+        clippy::needless_pass_by_value,
+        reason = "the unchecked arrays are given up, so that nothing uses them any more"
+    )]
     pub fn sanitize(raw: RawGaussians) -> Result<(Self, SanitizeReport)> {
         let n = raw.means.len();
         let k = (usize::from(raw.sh_degree) + 1).pow(2);

@@ -11,10 +11,10 @@ mod report;
 mod status;
 mod upload;
 
-pub use camera::{Camera, CameraToWorld, Intrinsics};
+pub use camera::{Camera, CameraToWorld, Intrinsics, ORTHONORMAL_TOLERANCE};
 pub use capture::{Capture, ViewSet};
 pub use gaussians::{Gaussians, RawGaussians, SanitizeReport, SourcePixel};
-pub use id::SceneId;
+pub use id::{SCENE_ID_CHARS, SceneId};
 pub use made::{PhotoHash, Provenance, Scene, SceneMeta};
 pub use photo::{Photo, PosedPhoto};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};

@@ -1,4 +1,11 @@
 //! One integration binary: links ONNX Runtime, wgpu and tonic once.
+#![allow(
+    clippy::panic,
+    clippy::print_stdout,
+    clippy::print_stderr,
+    clippy::unwrap_used,
+    reason = "helpers of tests are tests too"
+)]
 
 mod common;
 mod tidy;
