@@ -38,3 +38,8 @@ pub mod sample;
 pub mod scene;
 pub mod service;
 pub mod store;
+
+/// The numeric example of `docs/conventions.md`, run by the doc tests.
+#[cfg(doctest)]
+#[doc = include_str!("../docs/conventions.md")]
+pub mod conventions {}
