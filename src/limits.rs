@@ -13,6 +13,8 @@ pub struct Limits {
     pub photos_min: usize,
     /// Bytes of one upload, all parts together.
     pub upload_bytes_max: usize,
+    /// Bytes of all uploads being received; one more byte is refused as `overloaded`.
+    pub uploads_bytes_max: usize,
     /// Bytes of one JSON part (`transforms`, `cameras`) or JSON body.
     pub json_bytes_max: usize,
     /// Pixels of one photo, read from the header before decoding.
@@ -56,6 +58,7 @@ impl Default for Limits {
             photos_max: 64,
             photos_min: 2,
             upload_bytes_max: 256 << 20,
+            uploads_bytes_max: 1 << 30,
             json_bytes_max: 8 << 20,
             photo_pixels_max: 24_000_000,
             photo_side_kept_max: 2_048,

@@ -84,7 +84,7 @@ impl Service {
     ///
     /// # Errors
     /// `scene_not_found`.
-    pub fn watch(&self, id: &SceneId) -> Result<impl Stream<Item = Event> + Send + 'static> {
+    pub fn watch(&self, id: &SceneId) -> Result<impl Stream<Item = Event> + Send + use<>> {
         let _ = id;
         unfinished::<futures_util::stream::Empty<Event>>()
     }
@@ -118,7 +118,7 @@ impl Service {
         &self,
         id: &SceneId,
         spec: ViewsSpec,
-    ) -> Result<impl Stream<Item = Result<RenderedView>> + Send + 'static> {
+    ) -> Result<impl Stream<Item = Result<RenderedView>> + Send + use<>> {
         let _ = (id, spec);
         unfinished::<futures_util::stream::Empty<Result<RenderedView>>>()
     }

@@ -1,0 +1,262 @@
+//! Messages to use cases and back. What a message lacks or an enum does not know is named.
+
+use super::pb;
+use crate::{
+    api::semantics::{Semantics, SemanticsStatus, kind_unavailable},
+    error::{Error, Result},
+    scene::{CameraToWorld, HealthReport, Intrinsics},
+    service::{
+        CameraSpec, Event, ExportFormat, Format, Kind, LensSpec, ModelsInfo, PoseSpec,
+        RenderedView, SceneError, SceneState, SceneStatus, ViewOptions,
+    },
+};
+
+/// A scene with what can be asked of it by text.
+pub(super) fn scene(status: SceneStatus, models: &ModelsInfo) -> pb::Scene {
+    let semantics = SemanticsStatus::of(models);
+    let camera = |camera: crate::service::SceneCamera| pb::SceneCamera {
+        file: camera.file,
+        intrinsics: Some(intrinsics(camera.camera.intrinsics)),
+        camera_to_world: matrix(&camera.camera.camera_to_world),
+    };
+    pb::Scene {
+        id: status.id.to_string(),
+        state: state(status.state).into(),
+        stage: status.stage.unwrap_or_default(),
+        fraction: status.fraction,
+        created_ms: status.created_ms,
+        updated_ms: status.updated_ms,
+        error: status.error.map(scene_error),
+        report: status.report.map(report),
+        cameras: status.cameras.into_iter().map(camera).collect(),
+        semantics: Some(pb::SemanticsStatus {
+            available: semantics.available,
+            reason: semantics.reason,
+        }),
+    }
+}
+
+fn state(state: SceneState) -> pb::SceneState {
+    match state {
+        SceneState::Queued => pb::SceneState::Queued,
+        SceneState::Running => pb::SceneState::Running,
+        SceneState::Done => pb::SceneState::Done,
+        SceneState::Failed => pb::SceneState::Failed,
+        SceneState::Cancelled => pb::SceneState::Cancelled,
+    }
+}
+
+fn scene_error(error: SceneError) -> pb::SceneError {
+    pb::SceneError { code: error.code, message: error.message }
+}
+
+fn report(report: HealthReport) -> pb::HealthReport {
+    let [depth_near, depth_far] = report.depth_range;
+    let warning = |warning: crate::scene::Warning| pb::Warning {
+        code: serde_json::to_value(warning.code)
+            .ok()
+            .and_then(|code| code.as_str().map(str::to_owned))
+            .unwrap_or_default(),
+        message: warning.message,
+        value: warning.value,
+    };
+    let drop_count =
+        |drop: crate::scene::DropCount| pb::DropCount { reason: drop.reason, count: drop.count };
+    let stage = |time: crate::scene::StageTime| pb::StageTime { stage: time.stage, ms: time.ms };
+    pb::HealthReport {
+        photos: report.photos,
+        views_used: report.views_used,
+        gaussians: report.gaussians,
+        dropped: report.dropped.into_iter().map(drop_count).collect(),
+        depth_near,
+        depth_far,
+        median_depth: report.median_depth,
+        overlap: report.overlap,
+        stages: report.stages.into_iter().map(stage).collect(),
+        execution_provider: report.execution_provider,
+        warnings: report.warnings.into_iter().map(warning).collect(),
+    }
+}
+
+fn intrinsics(k: Intrinsics) -> pb::Intrinsics {
+    pb::Intrinsics { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, width: k.width, height: k.height }
+}
+
+fn matrix(pose: &CameraToWorld) -> Vec<f64> {
+    pose.to_row_major().to_vec()
+}
+
+/// What a watcher sees.
+pub(super) fn event(event: Event) -> pb::SceneEvent {
+    let of = |state: pb::SceneState| pb::SceneEvent { state: state.into(), ..Default::default() };
+    match event {
+        Event::Queued { ahead } => {
+            pb::SceneEvent { ahead: ahead as u64, ..of(pb::SceneState::Queued) }
+        }
+        Event::Running { stage, fraction } => {
+            pb::SceneEvent { stage, fraction, ..of(pb::SceneState::Running) }
+        }
+        Event::Done => of(pb::SceneState::Done),
+        Event::Failed(error) => {
+            pb::SceneEvent { error: Some(scene_error(error)), ..of(pb::SceneState::Failed) }
+        }
+        Event::Cancelled => of(pb::SceneState::Cancelled),
+    }
+}
+
+/// When the semantic bank is made.
+pub(super) fn semantics(number: i32) -> Result<Semantics> {
+    match known::<pb::Semantics>("semantics", number)? {
+        pb::Semantics::Unspecified | pb::Semantics::Lazy => Ok(Semantics::Lazy),
+        pb::Semantics::Eager => Ok(Semantics::Eager),
+        pb::Semantics::Off => Ok(Semantics::Off),
+    }
+}
+
+/// A camera. `what` starts the messages.
+pub(super) fn camera(camera: Option<pb::CameraSpec>, what: &str) -> Result<CameraSpec> {
+    let camera = camera.ok_or_else(|| Error::invalid(format!("{what}: no camera given")))?;
+    Ok(CameraSpec { pose: pose(camera.pose, what)?, lens: lens(camera.lens) })
+}
+
+fn pose(pose: Option<pb::camera_spec::Pose>, what: &str) -> Result<PoseSpec> {
+    use pb::camera_spec::Pose;
+    match pose {
+        None => Err(Error::invalid(format!(
+            "{what}: no pose given; give camera_to_world, or look_at, or between"
+        ))),
+        Some(Pose::CameraToWorld(matrix)) => {
+            let count = matrix.values.len();
+            let values = <[f64; 16]>::try_from(matrix.values).map_err(|_| {
+                Error::invalid(format!(
+                    "{what}: camera_to_world has {count} numbers; it must have 16"
+                ))
+            })?;
+            Ok(PoseSpec::CameraToWorld(values))
+        }
+        Some(Pose::LookAt(look)) => {
+            let (Some(eye), Some(target)) = (look.eye, look.target) else {
+                return Err(Error::invalid(format!("{what}: eye and target go together")));
+            };
+            let up = look.up.as_ref().map(vec3);
+            Ok(PoseSpec::LookAt { eye: vec3(&eye), target: vec3(&target), up })
+        }
+        Some(Pose::Between(between)) => Ok(PoseSpec::Between {
+            from: between.from as usize,
+            to: between.to as usize,
+            t: between.t,
+        }),
+    }
+}
+
+fn lens(lens: Option<pb::camera_spec::Lens>) -> LensSpec {
+    use pb::camera_spec::Lens;
+    match lens {
+        None => LensSpec::OfScene,
+        Some(Lens::Fov(fov)) => LensSpec::Fov(fov),
+        Some(Lens::Focal(f)) => LensSpec::Focal { fx: f.fx, fy: f.fy, cx: f.cx, cy: f.cy },
+    }
+}
+
+fn vec3(v: &pb::Vec3) -> [f64; 3] {
+    [v.x, v.y, v.z]
+}
+
+/// Which picture; kinds that need a text say what is missing.
+pub(super) fn kind(number: i32, models: &ModelsInfo) -> Result<Kind> {
+    match known::<pb::Kind>("kind", number)? {
+        pb::Kind::Unspecified | pb::Kind::Color => Ok(Kind::Color),
+        pb::Kind::Depth => Ok(Kind::Depth),
+        pb::Kind::Alpha => Ok(Kind::Alpha),
+        pb::Kind::Semantics => Err(kind_unavailable("semantics", models)),
+        pb::Kind::Relevancy => Err(kind_unavailable("relevancy", models)),
+        pb::Kind::Mask => Err(kind_unavailable("mask", models)),
+    }
+}
+
+/// Size, encoding and the rest.
+pub(super) fn options(options: Option<pb::ViewOptions>) -> Result<ViewOptions> {
+    let options = options.unwrap_or_default();
+    let format = match known::<pb::Format>("format", options.format)? {
+        pb::Format::Unspecified | pb::Format::Png => Format::Png,
+        pb::Format::Jpeg => Format::Jpeg,
+        pb::Format::Webp => Format::Webp,
+        pb::Format::Npy => Format::Npy,
+    };
+    #[expect(clippy::cast_possible_truncation, reason = "a colour fits f32")]
+    let background = options.background.map_or([0.0; 3], |v| [v.x as f32, v.y as f32, v.z as f32]);
+    Ok(ViewOptions {
+        width: options.width,
+        height: options.height,
+        format,
+        background,
+        antialiased: options.antialiased,
+        near: options.near,
+        deadline: None,
+    })
+}
+
+/// One encoded picture.
+pub(super) fn view(view: RenderedView) -> pb::View {
+    let kind = match view.kind {
+        Kind::Color => pb::Kind::Color,
+        Kind::Depth => pb::Kind::Depth,
+        Kind::Alpha => pb::Kind::Alpha,
+    };
+    let format = match view.format {
+        Format::Png => pb::Format::Png,
+        Format::Jpeg => pb::Format::Jpeg,
+        Format::Webp => pb::Format::Webp,
+        Format::Npy => pb::Format::Npy,
+    };
+    pb::View {
+        camera_index: u32::try_from(view.camera_index).unwrap_or(u32::MAX),
+        kind: kind.into(),
+        format: format.into(),
+        width: view.width,
+        height: view.height,
+        data: view.bytes.into(),
+        depth_scale: view.depth_scale,
+        etag: view.etag,
+        intrinsics: Some(intrinsics(view.camera.intrinsics)),
+        camera_to_world: matrix(&view.camera.camera_to_world),
+        render_ms: view.render_ms,
+        visible: view.stats.visible,
+    }
+}
+
+/// File format of an export.
+pub(super) fn export_format(number: i32) -> Result<ExportFormat> {
+    match known::<pb::ExportFormat>("format", number)? {
+        pb::ExportFormat::Unspecified | pb::ExportFormat::Ply => Ok(ExportFormat::Ply),
+    }
+}
+
+/// The enum's value of this number; proto3 lets any number through.
+fn known<E: TryFrom<i32>>(name: &str, number: i32) -> Result<E> {
+    E::try_from(number)
+        .map_err(|_| Error::invalid(format!("{name} is {number}, which is none of its values")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_a_message_lacks_is_named() {
+        let models = ModelsInfo::default();
+        let message = |error: Error| error.message().to_owned();
+        assert!(message(camera(None, "view").unwrap_err()).contains("no camera"));
+        let empty = Some(pb::CameraSpec::default());
+        assert!(message(camera(empty, "view").unwrap_err()).contains("no pose"));
+        let short = pb::CameraSpec {
+            pose: Some(pb::camera_spec::Pose::CameraToWorld(pb::Matrix { values: vec![1.0; 12] })),
+            lens: None,
+        };
+        assert!(message(camera(Some(short), "view").unwrap_err()).contains("12 numbers"));
+        assert!(message(kind(99, &models).unwrap_err()).contains("kind is 99"));
+        assert!(message(kind(6, &models).unwrap_err()).contains("kind=mask"));
+        let odd = pb::ViewOptions { format: -1, ..Default::default() };
+        assert!(message(options(Some(odd)).unwrap_err()).contains("format is -1"));
+    }
+}

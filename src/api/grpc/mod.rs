@@ -1,0 +1,75 @@
+//! The gRPC door: `segsplat.v1.SceneService`, health and reflection.
+//!
+//! Errors carry the code of the one table in metadata `segsplat-code`: several codes share one
+//! gRPC status, so the string is the truth.
+
+mod convert;
+mod scene_service;
+mod status;
+
+use futures_util::FutureExt;
+use tonic::service::Routes;
+use tonic_health::{ServingStatus, server::HealthReporter};
+
+use super::Api;
+use crate::error::{Error, Result};
+
+pub(super) use self::status::{complete, refusal, unimplemented};
+
+/// Messages and services made from `proto/segsplat/v1/scene.proto`.
+#[allow(
+    missing_docs,
+    unreachable_pub,
+    missing_debug_implementations,
+    clippy::all,
+    clippy::doc_markdown,
+    clippy::missing_errors_doc,
+    clippy::unwrap_used,
+    clippy::use_self,
+    clippy::allow_attributes_without_reason,
+    clippy::enum_glob_use,
+    clippy::semicolon_if_nothing_returned,
+    clippy::implicit_clone,
+    reason = "generated code"
+)]
+pub mod pb {
+    tonic::include_proto!("segsplat.v1");
+}
+
+/// Descriptors of `pb`, for reflection and for the test that holds the two doors together.
+pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/segsplat_descriptor.bin"));
+
+/// Largest picture sent as one message: 4096 x 4096 x 3 f32 and its headers.
+const MESSAGE_BYTES_MAX: usize = 256 << 20;
+
+/// The door as routes, to be merged with HTTP's.
+///
+/// # Errors
+/// `internal` when the descriptors are damaged.
+pub fn routes(api: Api) -> Result<Routes> {
+    // The camera JSON goes in one message with the header; all else comes in smaller pieces.
+    let decoding_max = api.service.limits().json_bytes_max + (1 << 20);
+    let scenes = pb::scene_service_server::SceneServiceServer::new(api)
+        .max_decoding_message_size(decoding_max)
+        .max_encoding_message_size(MESSAGE_BYTES_MAX);
+    let damaged = |e| Error::internal("the gRPC descriptors are damaged").caused_by(e);
+    let reflection = || {
+        tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(DESCRIPTORS)
+            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+    };
+    Ok(Routes::new(scenes)
+        .add_service(health())
+        .add_service(reflection().build_v1().map_err(damaged)?)
+        .add_service(reflection().build_v1alpha().map_err(damaged)?))
+}
+
+/// Liveness: serving as long as it answers, for the server and for the one service.
+fn health() -> tonic_health::pb::health_server::HealthServer<tonic_health::server::HealthService> {
+    let reporter = HealthReporter::new();
+    let service = tonic_health::server::HealthService::from_health_reporter(reporter.clone());
+    let name = pb::scene_service_server::SERVICE_NAME;
+    // Nobody else holds the lock yet, so this is ready at once.
+    reporter.set_service_status(name, ServingStatus::Serving).now_or_never();
+    tonic_health::pb::health_server::HealthServer::new(service)
+}

@@ -1,0 +1,220 @@
+//! `segsplat.v1.SceneService`: take apart, call the service, put together.
+
+use std::{pin::Pin, time::Duration};
+
+use futures_util::{Stream, StreamExt, stream};
+use tonic::{Request, Response, Status, Streaming};
+
+use super::{
+    convert,
+    pb::{self, create_scene_header::Cameras, create_scene_request::Part},
+    status::{logged, unreadable},
+};
+use crate::{
+    api::{
+        Api,
+        semantics::check_bundle,
+        upload::{UploadBuilder, UploadGuard},
+    },
+    error::{Error, ErrorCode, Result},
+    scene::{Upload, UploadCameras},
+    service::{CreateScene, PageRequest, SceneOptions, ViewSpec, ViewsSpec},
+};
+
+/// Longest pause between two messages of an upload.
+const PAUSE_MAX: Duration = Duration::from_secs(30);
+
+type Answer<T> = Result<Response<T>, Status>;
+type Many<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send + 'static>>;
+
+#[tonic::async_trait]
+impl pb::scene_service_server::SceneService for Api {
+    type WatchSceneStream = Many<pb::SceneEvent>;
+    type RenderViewsStream = Many<pb::View>;
+    type ExportStream = Many<pb::ExportChunk>;
+
+    async fn create_scene(
+        &self,
+        request: Request<Streaming<pb::CreateSceneRequest>>,
+    ) -> Answer<pb::Scene> {
+        let scene = create(self, request.into_inner()).await.map_err(|e| logged(&e))?;
+        Ok(Response::new(scene))
+    }
+
+    async fn watch_scene(
+        &self,
+        request: Request<pb::WatchSceneRequest>,
+    ) -> Answer<Self::WatchSceneStream> {
+        let events = async { self.service.watch(&request.get_ref().scene_id.parse()?) }.await;
+        let events = events.map_err(|e| logged(&e))?;
+        Ok(Response::new(events.map(|event| Ok(convert::event(event))).boxed()))
+    }
+
+    async fn get_scene(&self, request: Request<pb::GetSceneRequest>) -> Answer<pb::Scene> {
+        let status = async { self.service.get(&request.get_ref().scene_id.parse()?) }.await;
+        let status = status.map_err(|e| logged(&e))?;
+        Ok(Response::new(convert::scene(status, &self.service.models())))
+    }
+
+    async fn list_scenes(
+        &self,
+        request: Request<pb::ListScenesRequest>,
+    ) -> Answer<pb::ListScenesResponse> {
+        let request = request.into_inner();
+        let page = PageRequest {
+            limit: request.limit.map(|limit| limit as usize),
+            after: Some(request.after).filter(|after| !after.is_empty()),
+        };
+        let page = self.service.list(&page).map_err(|e| logged(&e))?;
+        let models = self.service.models();
+        let scenes = page.scenes.into_iter().map(|s| convert::scene(s, &models)).collect();
+        let next = page.next.unwrap_or_default();
+        Ok(Response::new(pb::ListScenesResponse { scenes, next }))
+    }
+
+    async fn delete_scene(
+        &self,
+        request: Request<pb::DeleteSceneRequest>,
+    ) -> Answer<pb::DeleteSceneResponse> {
+        let gone = async { self.service.delete(&request.get_ref().scene_id.parse()?).await }.await;
+        gone.map_err(|e| logged(&e))?;
+        Ok(Response::new(pb::DeleteSceneResponse {}))
+    }
+
+    async fn render_view(&self, request: Request<pb::RenderViewRequest>) -> Answer<pb::View> {
+        let view = render(self, request.into_inner()).await.map_err(|e| logged(&e))?;
+        Ok(Response::new(view))
+    }
+
+    async fn render_views(
+        &self,
+        request: Request<pb::RenderViewsRequest>,
+    ) -> Answer<Self::RenderViewsStream> {
+        let views = render_many(self, request.into_inner()).await.map_err(|e| logged(&e))?;
+        Ok(Response::new(views))
+    }
+
+    async fn export(&self, request: Request<pb::ExportRequest>) -> Answer<Self::ExportStream> {
+        let chunks = export(self, request.into_inner()).await.map_err(|e| logged(&e))?;
+        Ok(Response::new(chunks))
+    }
+}
+
+async fn create(api: &Api, messages: Streaming<pb::CreateSceneRequest>) -> Result<pb::Scene> {
+    let (upload, header, _guard) = receive(api, messages).await?;
+    let wait = header.wait_ms.map(Duration::from_millis);
+    let request = CreateScene {
+        upload,
+        options: SceneOptions { max_views: header.max_views.map(|views| views as usize) },
+        idempotency_key: Some(header.idempotency_key).filter(|key| !key.is_empty()),
+        wait,
+    };
+    let created = api.service.create_scene(request).await?;
+    match (&created.status.error, wait) {
+        (Some(error), Some(_)) => Err(error.to_error()),
+        _ => Ok(convert::scene(created.status, &api.service.models())),
+    }
+}
+
+async fn receive(
+    api: &Api,
+    mut messages: Streaming<pb::CreateSceneRequest>,
+) -> Result<(Upload, pb::CreateSceneHeader, UploadGuard)> {
+    let mut upload = UploadBuilder::new(api.service.limits(), &api.uploads);
+    let mut header = None;
+    loop {
+        let next = tokio::time::timeout(PAUSE_MAX, messages.message()).await.map_err(|_| {
+            Error::new(
+                ErrorCode::DeadlineExceeded,
+                format!("upload: nothing came for {} s", PAUSE_MAX.as_secs()),
+            )
+        })?;
+        let Some(message) = next.map_err(|status| unreadable(&status))? else { break };
+        let part = message.part.ok_or_else(|| Error::invalid("upload: an empty message"))?;
+        match (part, &header) {
+            (Part::Header(first), None) => header = Some(begin(api, first, &mut upload)?),
+            (Part::Header(_), Some(_)) => {
+                return Err(Error::invalid("upload: a second header"));
+            }
+            (_, None) => {
+                return Err(Error::invalid("upload: the first message must be the header"));
+            }
+            (Part::Photo(piece), Some(_)) => {
+                if !piece.name.is_empty() {
+                    upload.begin_photo(&piece.name)?;
+                }
+                upload.extend(&piece.data)?;
+            }
+            (Part::Archive(piece), Some(_)) => {
+                upload.begin_archive();
+                upload.extend(&piece)?;
+            }
+        }
+    }
+    let header = header.ok_or_else(|| Error::invalid("upload: no header, nothing was sent"))?;
+    let (upload, guard) = upload.finish()?;
+    Ok((upload, header, guard))
+}
+
+/// Checks the header and takes the camera JSON out of it.
+fn begin(
+    api: &Api,
+    mut header: pb::CreateSceneHeader,
+    upload: &mut UploadBuilder<'_>,
+) -> Result<pb::CreateSceneHeader> {
+    let models = api.service.models();
+    convert::semantics(header.semantics)?.check(&models)?;
+    check_bundle(&header.bundle, &models)?;
+    match header.cameras.take() {
+        None => {}
+        Some(Cameras::TransformsJson(json)) => {
+            upload.begin_cameras(UploadCameras::Transforms(json.into()))?;
+        }
+        Some(Cameras::CamerasJson(json)) => {
+            upload.begin_cameras(UploadCameras::Cameras(json.into()))?;
+        }
+    }
+    Ok(header)
+}
+
+async fn render(api: &Api, request: pb::RenderViewRequest) -> Result<pb::View> {
+    let id = request.scene_id.parse()?;
+    let kind = convert::kind(request.kind, &api.service.models())?;
+    if !request.text.is_empty() {
+        return Err(Error::invalid(format!("text goes with no kind={kind:?} picture")));
+    }
+    let camera = convert::camera(request.camera, "view")?;
+    let options = convert::options(request.options)?;
+    let view = api.service.render(&id, ViewSpec { camera, kind, options }).await?;
+    Ok(convert::view(view))
+}
+
+async fn render_many(api: &Api, request: pb::RenderViewsRequest) -> Result<Many<pb::View>> {
+    let id = request.scene_id.parse()?;
+    let models = api.service.models();
+    let kinds = match request.kinds.as_slice() {
+        [] => vec![crate::service::Kind::Color],
+        kinds => kinds.iter().map(|kind| convert::kind(*kind, &models)).collect::<Result<_>>()?,
+    };
+    let cameras = request.cameras.into_iter().enumerate();
+    let cameras = cameras
+        .map(|(i, camera)| convert::camera(Some(camera), &format!("camera {i}")))
+        .collect::<Result<_>>()?;
+    let options = convert::options(request.options)?;
+    let views = api.service.render_many(&id, ViewsSpec { cameras, kinds, options }).await?;
+    Ok(views.map(|view| view.map(convert::view).map_err(|e| logged(&e))).boxed())
+}
+
+async fn export(api: &Api, request: pb::ExportRequest) -> Result<Many<pb::ExportChunk>> {
+    let id = request.scene_id.parse()?;
+    let export = api.service.export(&id, convert::export_format(request.format)?).await?;
+    let first = pb::ExportChunk {
+        size_bytes: Some(export.size_bytes),
+        file_name: export.file_name.clone(),
+        ..Default::default()
+    };
+    let pieces = export
+        .into_stream()
+        .map(|data| Ok(pb::ExportChunk { data: data.into(), ..Default::default() }));
+    Ok(stream::once(async { Ok(first) }).chain(pieces).boxed())
+}

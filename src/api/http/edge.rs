@@ -1,0 +1,219 @@
+//! What every call passes on its way in and out: request id, deadline, error body, log line.
+
+use std::{
+    any::Any,
+    time::{Duration, Instant},
+};
+
+use axum::{
+    body::Body,
+    extract::Request,
+    http::{HeaderMap, HeaderValue, StatusCode, header},
+    middleware::Next,
+    response::{IntoResponse, Response},
+};
+
+use super::error::{ApiError, Fault, panic_error};
+use crate::{
+    api::{grpc, request_id},
+    error::{Error, ErrorCode},
+};
+
+/// The caller's own deadline, for handlers that hand it on.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Deadline(pub(super) Duration);
+
+/// Around every HTTP call.
+pub(super) async fn rest(mut request: Request, next: Next) -> Response {
+    let id = id_of(request.headers());
+    let (method, path) = (request.method().clone(), request.uri().path().to_owned());
+    let started = Instant::now();
+    let mut response = match deadline_of_query(request.uri().query()) {
+        Err(error) => ApiError::from(error).into_response(),
+        Ok(None) => next.run(request).await,
+        Ok(Some(deadline)) => {
+            request.extensions_mut().insert(Deadline(deadline));
+            match tokio::time::timeout(deadline, next.run(request)).await {
+                Ok(response) => response,
+                Err(_) => ApiError::from(deadline_passed(deadline)).into_response(),
+            }
+        }
+    };
+    if response.extensions().get::<Fault>().is_none() && is_bare_refusal(&response) {
+        // A refusal of the framework's own, before any handler of ours.
+        response = dress(&response);
+    }
+    let status = response.status().as_u16();
+    let ms = started.elapsed().as_secs_f64() * 1e3;
+    if let Some(fault) = response.extensions_mut().remove::<Fault>() {
+        log_fault(fault.error(), &id, &format!("{method} {path}"), ms);
+        response = fault.write(response, &id);
+    } else {
+        tracing::debug!(%method, path, status, ms, request_id = id, "served");
+    }
+    stamp(&mut response, &id);
+    response
+}
+
+/// Around every gRPC call.
+pub(super) async fn rpc(mut request: Request, next: Next) -> Response {
+    let id = id_of(request.headers());
+    if let Ok(value) = HeaderValue::from_str(&id) {
+        request.headers_mut().insert(request_id::HEADER, value);
+    }
+    let path = request.uri().path().to_owned();
+    let started = Instant::now();
+    let mut response = match deadline_of_grpc(request.headers()) {
+        None => next.run(request).await,
+        Some(deadline) => match tokio::time::timeout(deadline, next.run(request)).await {
+            Ok(response) => response,
+            Err(_) => grpc::refusal(&deadline_passed(deadline)).map(Body::new),
+        },
+    };
+    let ms = started.elapsed().as_secs_f64() * 1e3;
+    grpc::complete(response.headers_mut());
+    let status = response.headers().get("grpc-status").and_then(|v| v.to_str().ok());
+    tracing::debug!(path, status, ms, request_id = id, "served");
+    stamp(&mut response, &id);
+    response
+}
+
+/// Answer of a gRPC call that panicked.
+pub(super) fn rpc_panicked(panic: Box<dyn Any + Send + 'static>) -> Response {
+    let error = panic_error(panic);
+    log_fault(&error, "", "gRPC", 0.0);
+    grpc::refusal(&error).map(Body::new)
+}
+
+/// Answer of a gRPC service or method that is not there.
+pub(super) fn rpc_unimplemented(path: &str) -> Response {
+    grpc::unimplemented(path).map(Body::new)
+}
+
+/// Whether the caller speaks gRPC.
+pub(super) fn is_grpc(headers: &HeaderMap) -> bool {
+    headers
+        .get(header::CONTENT_TYPE)
+        .and_then(|value| value.to_str().ok())
+        .is_some_and(|value| value.starts_with("application/grpc"))
+}
+
+fn id_of(headers: &HeaderMap) -> String {
+    request_id::accept(headers.get(request_id::HEADER).and_then(|value| value.to_str().ok()))
+}
+
+fn stamp(response: &mut Response, id: &str) {
+    if let Ok(value) = HeaderValue::from_str(id) {
+        response.headers_mut().insert(request_id::HEADER, value);
+    }
+    response
+        .headers_mut()
+        .insert(header::X_CONTENT_TYPE_OPTIONS, HeaderValue::from_static("nosniff"));
+}
+
+/// An error status without a body of ours: ours is JSON, the framework's is text.
+fn is_bare_refusal(response: &Response) -> bool {
+    let ours = response
+        .headers()
+        .get(header::CONTENT_TYPE)
+        .is_some_and(|value| value.as_bytes().starts_with(b"application/json"));
+    let status = response.status();
+    (status.is_client_error() || status.is_server_error()) && !ours && !is_grpc(response.headers())
+}
+
+/// Puts a refusal of the framework's own into our shape, keeping its headers.
+fn dress(response: &Response) -> Response {
+    let error = match response.status() {
+        StatusCode::NOT_FOUND | StatusCode::METHOD_NOT_ALLOWED => {
+            Error::new(ErrorCode::NotFound, "no such route or method")
+        }
+        StatusCode::PAYLOAD_TOO_LARGE => {
+            Error::new(ErrorCode::LimitExceeded, "the body is over the limit")
+        }
+        status if status.is_client_error() => {
+            Error::invalid(format!("the request cannot be read ({status})"))
+        }
+        status => Error::internal(format!("the server answered {status}")),
+    };
+    let mut dressed = ApiError::from(error).into_response();
+    *dressed.status_mut() = response.status();
+    dressed.headers_mut().extend(response.headers().clone());
+    dressed
+}
+
+/// Faults of the caller at `info`, ours at `error` with the chain of sources.
+fn log_fault(error: &Error, id: &str, call: &str, ms: f64) {
+    let code = error.code().name();
+    let mut message = error.message().to_owned();
+    let mut source = std::error::Error::source(error);
+    while let Some(cause) = source {
+        message.push_str(": ");
+        message.push_str(&cause.to_string());
+        source = cause.source();
+    }
+    if error.code().row().http >= 500 {
+        tracing::error!(call, code, request_id = id, ms, "{message}");
+    } else {
+        tracing::info!(call, code, request_id = id, ms, "{message}");
+    }
+}
+
+fn deadline_passed(deadline: Duration) -> Error {
+    Error::new(
+        ErrorCode::DeadlineExceeded,
+        format!("the call's deadline of {} ms passed", deadline.as_millis()),
+    )
+}
+
+/// `deadline_ms=` of a query string.
+fn deadline_of_query(query: Option<&str>) -> Result<Option<Duration>, Error> {
+    let value =
+        query.unwrap_or_default().split('&').find_map(|pair| pair.strip_prefix("deadline_ms="));
+    let Some(value) = value else { return Ok(None) };
+    match value.parse::<u64>() {
+        Ok(ms) if ms > 0 => Ok(Some(Duration::from_millis(ms))),
+        _ => {
+            let shown: String = value.chars().take(40).collect();
+            Err(Error::invalid(format!(
+                "deadline_ms is {shown:?}; it must be a whole number over 0"
+            )))
+        }
+    }
+}
+
+/// `grpc-timeout`: up to eight digits and a unit of H, M, S, m, u or n; others are ignored.
+fn deadline_of_grpc(headers: &HeaderMap) -> Option<Duration> {
+    let text = headers.get("grpc-timeout")?.to_str().ok()?;
+    let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
+    let value: u64 = digits.parse().ok().filter(|_| digits.len() <= 8)?;
+    match unit {
+        "H" => Some(Duration::from_secs(value * 3_600)),
+        "M" => Some(Duration::from_secs(value * 60)),
+        "S" => Some(Duration::from_secs(value)),
+        "m" => Some(Duration::from_millis(value)),
+        "u" => Some(Duration::from_micros(value)),
+        "n" => Some(Duration::from_nanos(value)),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn grpc_timeouts_are_read_in_every_unit_and_nonsense_is_ignored() {
+        let read = |text: &str| {
+            let mut headers = HeaderMap::new();
+            headers.insert("grpc-timeout", HeaderValue::from_str(text).unwrap());
+            deadline_of_grpc(&headers)
+        };
+        assert_eq!(read("2H"), Some(Duration::from_secs(7_200)));
+        assert_eq!(read("3S"), Some(Duration::from_secs(3)));
+        assert_eq!(read("250m"), Some(Duration::from_millis(250)));
+        assert_eq!(read("5u"), Some(Duration::from_micros(5)));
+        for odd in ["", "S", "5", "5x", "-5S", "123456789S"] {
+            assert_eq!(read(odd), None, "{odd}");
+        }
+    }
+}

@@ -1,0 +1,130 @@
+//! Errors as HTTP answers: status of the one table, body `{code, message, request_id, details}`.
+
+use std::{any::Any, sync::Arc};
+
+use axum::{
+    Json,
+    extract::Request,
+    http::{HeaderValue, Method, StatusCode, Uri, header},
+    response::{IntoResponse, Response},
+};
+use serde_json::json;
+
+use super::edge;
+use crate::{
+    error::{Error, ErrorCode},
+    scene::SceneId,
+};
+
+/// An error on its way out of a handler; the edge writes the body, which holds the request's id.
+#[derive(Debug)]
+pub(super) struct ApiError {
+    error: Error,
+    status: Option<StatusCode>,
+    scene: Option<SceneId>,
+}
+
+/// What the edge needs to write the body.
+#[derive(Clone, Debug)]
+pub(super) struct Fault(Arc<ApiError>);
+
+impl ApiError {
+    /// The error with the scene it is about, for `details`.
+    pub(super) fn of_scene(error: Error, id: &SceneId) -> Self {
+        Self { scene: Some(id.clone()), ..Self::from(error) }
+    }
+}
+
+impl From<Error> for ApiError {
+    fn from(error: Error) -> Self {
+        Self { error, status: None, scene: None }
+    }
+}
+
+impl IntoResponse for ApiError {
+    fn into_response(self) -> Response {
+        let status = self.status.unwrap_or_else(|| {
+            StatusCode::from_u16(self.error.code().row().http)
+                .unwrap_or(StatusCode::INTERNAL_SERVER_ERROR)
+        });
+        let mut response = status.into_response();
+        response.extensions_mut().insert(Fault(Arc::new(self)));
+        response
+    }
+}
+
+impl Fault {
+    /// The error, for the log.
+    pub(super) fn error(&self) -> &Error {
+        &self.0.error
+    }
+
+    /// Writes body and headers into `response`.
+    pub(super) fn write(&self, response: Response, request_id: &str) -> Response {
+        let error = self.error();
+        let mut details = json!({ "retry": error.code().row().retry });
+        if let Some(seconds) = retry_after_s(error) {
+            details["retry_after_s"] = json!(seconds);
+        }
+        if let Some(scene) = &self.0.scene {
+            details["scene"] = json!(scene.as_str());
+        }
+        let body = json!({
+            "code": error.code().name(),
+            "message": error.message(),
+            "request_id": request_id,
+            "details": details,
+        });
+        let (parts, _) = response.into_parts();
+        let mut answer = (parts.status, Json(body)).into_response();
+        for (name, value) in &parts.headers {
+            if name != header::CONTENT_LENGTH && name != header::CONTENT_TYPE {
+                answer.headers_mut().insert(name, value.clone());
+            }
+        }
+        if let Some(seconds) = retry_after_s(error) {
+            answer.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+        }
+        answer
+    }
+}
+
+/// Seconds to wait before the same call may succeed, where that is known.
+pub(super) fn retry_after_s(error: &Error) -> Option<u32> {
+    error.retry_after().or_else(|| (error.code() == ErrorCode::Overloaded).then_some(1))
+}
+
+/// Answer of a path that no route has; gRPC callers get gRPC's own `UNIMPLEMENTED`.
+pub(super) async fn no_such_route(request: Request) -> Response {
+    if edge::is_grpc(request.headers()) {
+        return edge::rpc_unimplemented(request.uri().path());
+    }
+    let shown: String = request.uri().path().chars().take(80).collect();
+    let message = format!("no such route: {} {shown}", request.method());
+    ApiError::from(Error::new(ErrorCode::NotFound, message)).into_response()
+}
+
+/// Answer of a path that has other methods; axum adds `Allow`.
+pub(super) async fn method_not_allowed(method: Method, uri: Uri) -> Response {
+    let shown: String = uri.path().chars().take(80).collect();
+    let error = Error::new(ErrorCode::NotFound, format!("{shown} has no method {method}"));
+    let status = Some(StatusCode::METHOD_NOT_ALLOWED);
+    ApiError { status, ..ApiError::from(error) }.into_response()
+}
+
+/// Answer of a handler that panicked; the panic's text is for the log alone.
+pub(super) fn panicked(panic: Box<dyn Any + Send + 'static>) -> Response {
+    ApiError::from(panic_error(panic)).into_response()
+}
+
+/// The error of a panic, with its text as the source.
+pub(super) fn panic_error(panic: Box<dyn Any + Send + 'static>) -> Error {
+    let text = match panic.downcast::<String>() {
+        Ok(text) => *text,
+        Err(panic) => match panic.downcast::<&'static str>() {
+            Ok(text) => (*text).to_owned(),
+            Err(_) => "a panic without text".to_owned(),
+        },
+    };
+    Error::internal("a fault of the server; the request id finds it in the log").caused_by(text)
+}

@@ -1,0 +1,57 @@
+//! Own extractors, so that a bad id or body is answered in our shape and names what is wrong.
+
+use axum::{
+    body::Bytes,
+    extract::{FromRequest, FromRequestParts, RawPathParams, Request},
+    http::request::Parts,
+};
+use futures_util::StreamExt;
+use serde::de::DeserializeOwned;
+
+use super::error::ApiError;
+use crate::{
+    api::{Api, upload::json_over},
+    error::Error,
+    scene::SceneId,
+};
+
+/// The `{id}` of the path, checked before anything else sees it.
+#[derive(Clone, Debug)]
+pub(super) struct Id(pub(super) SceneId);
+
+impl FromRequestParts<Api> for Id {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, api: &Api) -> Result<Self, ApiError> {
+        let params = RawPathParams::from_request_parts(parts, api)
+            .await
+            .map_err(|e| Error::invalid(format!("path: {e}")))?;
+        let id = params.iter().find(|(name, _)| *name == "id").map_or("", |(_, value)| value);
+        Ok(Self(id.parse()?))
+    }
+}
+
+/// A JSON body of at most `limits.json_bytes_max`, whatever its content type says.
+#[derive(Clone, Debug)]
+pub(super) struct JsonBody<T>(pub(super) T);
+
+impl<T: DeserializeOwned> FromRequest<Api> for JsonBody<T> {
+    type Rejection = ApiError;
+
+    async fn from_request(request: Request, api: &Api) -> Result<Self, ApiError> {
+        let limits = api.service.limits();
+        let mut body = request.into_body().into_data_stream();
+        let mut bytes = Vec::new();
+        while let Some(piece) = body.next().await {
+            let piece: Bytes =
+                piece.map_err(|e| Error::invalid("body: the upload broke off").caused_by(e))?;
+            if bytes.len() + piece.len() > limits.json_bytes_max {
+                return Err(json_over("body", bytes.len() + piece.len(), limits).into());
+            }
+            bytes.extend_from_slice(&piece);
+        }
+        let value = serde_json::from_slice(&bytes)
+            .map_err(|e| Error::invalid(format!("body: not the JSON expected: {e}")))?;
+        Ok(Self(value))
+    }
+}

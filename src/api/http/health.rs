@@ -1,0 +1,47 @@
+//! Is it alive, is it ready, what is it made of.
+
+use axum::{
+    Json,
+    extract::State,
+    http::StatusCode,
+    response::{IntoResponse, Response},
+};
+
+use super::{error::ApiError, openapi, params::Params};
+use crate::{api::Api, service::ModelsInfo};
+
+/// `GET /healthz`: the process answers.
+#[utoipa::path(
+    get, path = "/healthz", operation_id = "live", tag = "server",
+    responses((status = 200, description = "It answers", body = openapi::Liveness))
+)]
+pub(super) async fn live() -> Json<serde_json::Value> {
+    Json(serde_json::json!({ "live": true }))
+}
+
+/// `GET /readyz`: 200 where new work is taken, else 503 with the same body.
+#[utoipa::path(
+    get, path = "/readyz", operation_id = "ready", tag = "server",
+    responses(
+        (status = 200, description = "New work is taken", body = openapi::Readiness),
+        (status = 503, description = "Not now", body = openapi::Readiness),
+    )
+)]
+pub(super) async fn ready(State(api): State<Api>) -> Response {
+    let readiness = api.service.ready();
+    let status = if readiness.ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
+    (status, Json(readiness)).into_response()
+}
+
+/// `GET /v1/models`
+#[utoipa::path(
+    get, path = "/v1/models", operation_id = "models", tag = "server",
+    responses((status = 200, description = "Bundle and renderer", body = openapi::Models))
+)]
+pub(super) async fn models(
+    State(api): State<Api>,
+    params: Params,
+) -> Result<Json<ModelsInfo>, ApiError> {
+    params.finish()?;
+    Ok(Json(api.service.models()))
+}

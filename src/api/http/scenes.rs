@@ -1,0 +1,182 @@
+//! Scenes: create, list, show, delete, watch.
+
+use std::{convert::Infallible, time::Duration};
+
+use axum::{
+    Json,
+    extract::{Request, State},
+    http::{HeaderMap, HeaderValue, StatusCode, header},
+    response::{
+        IntoResponse, Response,
+        sse::{self, KeepAlive, Sse},
+    },
+};
+use futures_util::{Stream, StreamExt};
+use serde::Serialize;
+
+use super::{
+    error::ApiError,
+    extract::Id,
+    openapi::{self, CreateParams, IdParam, ListParams, Scene, UploadForm},
+    params::Params,
+    receive::receive,
+};
+use crate::{
+    api::{
+        Api,
+        semantics::{Semantics, SemanticsStatus, check_bundle},
+    },
+    error::{Error, Result},
+    service::{CreateScene, Event, PageRequest, SceneOptions, SceneState, SceneStatus},
+};
+
+/// A scene as HTTP shows it.
+#[derive(Debug, Serialize)]
+pub(super) struct SceneBody {
+    #[serde(flatten)]
+    status: SceneStatus,
+    semantics: SemanticsStatus,
+}
+
+/// A page as HTTP shows it.
+#[derive(Debug, Serialize)]
+pub(super) struct PageBody {
+    scenes: Vec<SceneBody>,
+    next: Option<String>,
+}
+
+impl SceneBody {
+    fn new(api: &Api, status: SceneStatus) -> Self {
+        Self { status, semantics: SemanticsStatus::of(&api.service.models()) }
+    }
+}
+
+/// `POST /v1/scenes`
+#[utoipa::path(
+    post, path = "/v1/scenes", operation_id = "create_scene", tag = "scenes",
+    params(CreateParams, ("Idempotency-Key" = Option<String>, Header)),
+    request_body(content = UploadForm, content_type = "multipart/form-data"),
+    responses(
+        (status = 201, description = "Made", body = Scene),
+        (status = 202, description = "Taken; see Location", body = Scene),
+    )
+)]
+pub(super) async fn create(
+    State(api): State<Api>,
+    mut params: Params,
+    request: Request,
+) -> Result<Response, ApiError> {
+    let idempotency_key = idempotency_key(request.headers())?;
+    let (upload, _guard) = receive(&api, request, &mut params).await?;
+    let (options, wait) = options(&api, params)?;
+    let request = CreateScene { upload, options, idempotency_key, wait };
+    let created = api.service.create_scene(request).await?;
+    if let (Some(error), Some(_)) = (&created.status.error, wait) {
+        return Err(ApiError::of_scene(error.to_error(), &created.status.id));
+    }
+    let status = match created.status.state {
+        SceneState::Done => StatusCode::CREATED,
+        _ => StatusCode::ACCEPTED,
+    };
+    let location = format!("/v1/scenes/{}", created.status.id);
+    let body = Json(SceneBody::new(&api, created.status));
+    let mut answer = (status, [(header::LOCATION, location)], body).into_response();
+    if created.replayed {
+        answer.headers_mut().insert("idempotency-replayed", HeaderValue::from_static("true"));
+    }
+    Ok(answer)
+}
+
+/// `GET /v1/scenes`
+#[utoipa::path(
+    get, path = "/v1/scenes", operation_id = "list_scenes", tag = "scenes", params(ListParams),
+    responses((status = 200, description = "A page, newest first", body = openapi::Page))
+)]
+pub(super) async fn list(
+    State(api): State<Api>,
+    mut params: Params,
+) -> Result<Json<PageBody>, ApiError> {
+    let page = PageRequest { limit: params.whole("limit")?, after: params.text("after")? };
+    params.finish()?;
+    let page = api.service.list(&page)?;
+    let scenes = page.scenes.into_iter().map(|status| SceneBody::new(&api, status)).collect();
+    Ok(Json(PageBody { scenes, next: page.next }))
+}
+
+/// `GET /v1/scenes/{id}`
+#[utoipa::path(
+    get, path = "/v1/scenes/{id}", operation_id = "get_scene", tag = "scenes", params(IdParam),
+    responses((status = 200, description = "The scene", body = Scene))
+)]
+pub(super) async fn get(
+    State(api): State<Api>,
+    Id(id): Id,
+    params: Params,
+) -> Result<Json<SceneBody>, ApiError> {
+    params.finish()?;
+    Ok(Json(SceneBody::new(&api, api.service.get(&id)?)))
+}
+
+/// `DELETE /v1/scenes/{id}`
+#[utoipa::path(
+    delete, path = "/v1/scenes/{id}", operation_id = "delete_scene", tag = "scenes",
+    params(IdParam), responses((status = 204, description = "Gone"))
+)]
+pub(super) async fn delete(
+    State(api): State<Api>,
+    Id(id): Id,
+    params: Params,
+) -> Result<StatusCode, ApiError> {
+    params.finish()?;
+    api.service.delete(&id).await?;
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// `GET /v1/scenes/{id}/events`
+#[utoipa::path(
+    get, path = "/v1/scenes/{id}/events", operation_id = "watch_scene", tag = "scenes",
+    params(IdParam),
+    responses((
+        status = 200, content_type = "text/event-stream", body = String,
+        description = "Events queued, running, done, failed, cancelled, each with JSON data"
+    ))
+)]
+pub(super) async fn events(
+    State(api): State<Api>,
+    Id(id): Id,
+    params: Params,
+) -> Result<Sse<impl Stream<Item = Result<sse::Event, Infallible>>>, ApiError> {
+    params.finish()?;
+    let events = api.service.watch(&id)?.map(|event| Ok(sse_event(&event)));
+    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(Duration::from_secs(15))))
+}
+
+/// The event's name as SSE's `event`, the whole of it as JSON in `data`.
+fn sse_event(event: &Event) -> sse::Event {
+    let named = sse::Event::default().event(event.name());
+    let data = serde_json::to_string(event).unwrap_or_else(|_| "{}".to_owned());
+    named.data(data)
+}
+
+fn options(api: &Api, mut params: Params) -> Result<(SceneOptions, Option<Duration>)> {
+    let models = api.service.models();
+    if let Some(semantics) = params.text("semantics")? {
+        Semantics::parse(&semantics)?.check(&models)?;
+    }
+    if let Some(bundle) = params.text("bundle")? {
+        check_bundle(&bundle, &models)?;
+    }
+    let options = SceneOptions { max_views: params.whole("max_views")? };
+    let wait = params.whole::<u64>("wait_ms")?.map(Duration::from_millis);
+    params.finish()?;
+    Ok((options, wait))
+}
+
+/// 1 to 255 printable ASCII characters.
+fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>> {
+    let Some(value) = headers.get("idempotency-key") else { return Ok(None) };
+    match value.to_str() {
+        Ok(key) if (1..=255).contains(&key.len()) => Ok(Some(key.to_owned())),
+        _ => Err(Error::invalid("Idempotency-Key must be 1 to 255 printable ASCII characters")),
+    }
+}
