@@ -78,7 +78,8 @@ impl Lens {
             let Some(angle) = angle else { return Ok(None) };
             if !(angle > 0.0 && angle < std::f64::consts::PI) {
                 return Err(Error::invalid(format!(
-                    "{what}: the angle of view along {name} is {angle} rad; it must be over 0 and under pi"
+                    "{what}: the angle of view along {name} is {angle} rad; \
+                     it must be over 0 and under pi"
                 )));
             }
             Ok(Some(0.5 * f64::from(side) / (0.5 * angle).tan()))

@@ -145,7 +145,7 @@ impl Gaussians {
     /// Takes back what [`Self::into_raw`] gave, bit for bit.
     ///
     /// # Errors
-    /// `scene_corrupt` when a Gaussian breaks what [`Self::sanitize`] promises, or lengths disagree.
+    /// `scene_corrupt` when a Gaussian breaks what [`Self::sanitize`] promises, or lengths differ.
     pub fn restore(raw: RawGaussians) -> Result<Self> {
         let bad = |what: String| Error::new(ErrorCode::SceneCorrupt, format!("gaussians: {what}"));
         let k = (usize::from(raw.sh_degree) + 1).pow(2);
