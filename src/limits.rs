@@ -2,6 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
+/// Bytes of an idempotency key: what a UUID and a prefix need many times over.
+pub const IDEMPOTENCY_KEY_BYTES_MAX: usize = 256;
+
 /// Caps on what a caller may send or ask for.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]

@@ -2,29 +2,44 @@
 //!
 //! [`Service`] is a cheap clone; its calls are async and never do heavy work on the async threads.
 
+mod camera;
+mod create;
+mod encode;
+mod export;
+mod gate;
 mod types;
+mod view;
 
-pub use types::{
-    CameraSpec, CreateScene, Created, Export, ExportFormat, Format, Kind, LensSpec, ModelInfo,
-    ModelsInfo, Page, PageRequest, PoseSpec, Readiness, RenderedView, ViewOptions, ViewSpec,
-    ViewsSpec,
+use std::{fmt, sync::Arc};
+
+use futures_util::{Stream, stream};
+use tokio::sync::Semaphore;
+
+use self::{create::Keys, gate::Gate};
+pub use self::{
+    types::{
+        CameraSpec, CreateScene, Created, Export, ExportFormat, Format, Kind, LensSpec, ModelInfo,
+        ModelsInfo, Page, PageRequest, PoseSpec, Readiness, RenderedView, ViewOptions, ViewSpec,
+        ViewsSpec,
+    },
+    view::default_near,
 };
-
-use std::sync::Arc;
-
-use futures_util::Stream;
-
-use crate::{
-    config::Config,
-    error::{Error, Result},
-    limits::Limits,
-    scene::SceneId,
-};
-
 pub use crate::scene::{
     Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, Upload, UploadCameras,
     UploadFile,
 };
+use crate::{
+    config::Config,
+    error::{Error, Result},
+    jobs::{Jobs, SceneMaker},
+    limits::Limits,
+    render::Renderer,
+    scene::SceneId,
+    store::{Record, Store},
+};
+
+/// Uploads decoded at the same time: each may hold `limits.photos_max` photos in memory.
+const UPLOADS_READ_MAX: usize = 2;
 
 /// The use cases. Cloning shares everything.
 #[derive(Clone, Debug)]
@@ -32,25 +47,83 @@ pub struct Service {
     inner: Arc<Inner>,
 }
 
-#[derive(Debug)]
+/// What the service works with.
+#[derive(Clone)]
+pub struct Parts {
+    /// Turns uploads into scenes.
+    pub maker: Arc<dyn SceneMaker>,
+    /// Turns scenes into views.
+    pub renderer: Arc<dyn Renderer>,
+    /// What `/v1/models` says; the renderer and the version are filled in.
+    pub models: ModelsInfo,
+}
+
+impl fmt::Debug for Parts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Parts").field("renderer", &self.renderer.name()).finish_non_exhaustive()
+    }
+}
+
 struct Inner {
     config: Config,
+    store: Arc<Store>,
+    jobs: Jobs,
+    maker: Arc<dyn SceneMaker>,
+    renderer: Arc<dyn Renderer>,
+    models: ModelsInfo,
+    gate: Gate,
+    /// Turns at decoding uploads.
+    reading: Arc<Semaphore>,
+    keys: tokio::sync::Mutex<Keys>,
+}
+
+impl fmt::Debug for Inner {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Inner").field("config", &self.config).finish_non_exhaustive()
+    }
 }
 
 impl Service {
+    /// Opens the data folder, takes up unfinished work and starts the workers. Blocks on the disk.
+    ///
+    /// # Errors
+    /// `store_unavailable` when the folder cannot be used.
+    pub fn open(config: Config, parts: Parts) -> Result<Self> {
+        let (store, records) = Store::open(&config.data_dir, config.limits.cache_bytes_max)?;
+        let store = Arc::new(store);
+        let keys = create::keys_of(&records);
+        let jobs = Jobs::start(
+            Arc::clone(&store),
+            Arc::clone(&parts.maker),
+            records,
+            &config.limits,
+            config.jobs,
+        )?;
+        // A render uses all cores; a second one fills the gaps of the first.
+        let renders = (config.threads / 2).clamp(1, 8);
+        let models = ModelsInfo {
+            renderer: parts.renderer.name(),
+            server_version: env!("CARGO_PKG_VERSION").to_owned(),
+            ..parts.models
+        };
+        let inner = Inner {
+            store,
+            jobs,
+            maker: parts.maker,
+            renderer: parts.renderer,
+            models,
+            gate: Gate::new(renders, config.limits.queued_renders_max),
+            reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
+            keys: tokio::sync::Mutex::new(keys),
+            config,
+        };
+        Ok(Self { inner: Arc::new(inner) })
+    }
+
     /// The caps in force.
     #[must_use]
     pub fn limits(&self) -> &Limits {
         &self.inner.config.limits
-    }
-
-    /// Takes an upload, makes it safe on disk, queues it, and waits as long as asked.
-    ///
-    /// # Errors
-    /// `invalid_request`, `limit_exceeded`, `overloaded`, `store_unavailable`.
-    pub async fn create_scene(&self, request: CreateScene) -> Result<Created> {
-        let _ = request;
-        unfinished()
     }
 
     /// Where a scene stands, with its report and cameras once done.
@@ -58,26 +131,36 @@ impl Service {
     /// # Errors
     /// `scene_not_found`.
     pub fn get(&self, id: &SceneId) -> Result<SceneStatus> {
-        let _ = id;
-        unfinished()
+        Ok(self.inner.jobs.record(id)?.status)
     }
 
-    /// A page of scenes, newest first.
+    /// A page of scenes, newest first, without cameras.
     ///
     /// # Errors
     /// `invalid_request` when `after` is not a `next` of an earlier page.
     pub fn list(&self, page: &PageRequest) -> Result<Page> {
-        let _ = page;
-        unfinished()
+        let max = self.limits().page_max;
+        let limit = match page.limit {
+            Some(0) => return Err(Error::invalid(format!("limit is 0; it must be 1 to {max}"))),
+            Some(limit) => limit.min(max),
+            None => max,
+        };
+        let after = page.after.as_deref().map(parse_cursor).transpose()?;
+        let (records, more) = self.inner.jobs.page(after, limit);
+        let next = records.last().filter(|_| more).map(cursor);
+        let without_cameras = |record: Record| SceneStatus { cameras: Vec::new(), ..record.status };
+        Ok(Page { scenes: records.into_iter().map(without_cameras).collect(), next })
     }
 
-    /// Cancels the scene's job if it has one and removes everything kept of it.
+    /// Stops the scene's job if it has one and removes everything kept of it.
     ///
     /// # Errors
     /// `scene_not_found`, `store_unavailable`.
     pub async fn delete(&self, id: &SceneId) -> Result<()> {
-        let _ = id;
-        unfinished()
+        let (inner, gone) = (Arc::clone(&self.inner), id.clone());
+        create::blocking(move || inner.jobs.delete(&gone)).await??;
+        self.inner.keys.lock().await.retain(|_, (_, scene)| scene != id);
+        Ok(())
     }
 
     /// What happens to a scene, from its present state to the last event.
@@ -85,66 +168,71 @@ impl Service {
     /// # Errors
     /// `scene_not_found`.
     pub fn watch(&self, id: &SceneId) -> Result<impl Stream<Item = Event> + Send + use<>> {
-        let _ = id;
-        unfinished::<futures_util::stream::Empty<Event>>()
+        let watcher = self.inner.jobs.watch(id)?;
+        let service = self.clone();
+        let first = Some((service, watcher, true));
+        Ok(stream::unfold(first, async |state| {
+            let (service, mut watcher, first) = state?;
+            if !first && watcher.changed().await.is_err() {
+                return None;
+            }
+            let event = service.event(&watcher.borrow_and_update().status);
+            let next = (!event.is_last()).then_some((service, watcher, false));
+            Some((event, next))
+        }))
     }
 
-    /// The tag that [`Self::render`] would answer with, without rendering.
-    ///
-    /// # Errors
-    /// As [`Self::render`], but for what only rendering meets.
-    pub async fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<String> {
-        let _ = (id, spec);
-        unfinished()
-    }
-
-    /// Renders and encodes one view.
-    ///
-    /// # Errors
-    /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`, `invalid_request`,
-    /// `limit_exceeded`, `overloaded`, `deadline_exceeded`, `gpu_unavailable`.
-    pub async fn render(&self, id: &SceneId, spec: ViewSpec) -> Result<RenderedView> {
-        let _ = (id, spec);
-        unfinished()
-    }
-
-    /// Renders many cameras, each once for all kinds; pictures come camera by camera.
-    ///
-    /// The request as a whole is checked before the first picture; a later fault ends the stream.
-    ///
-    /// # Errors
-    /// As [`Self::render`].
-    pub async fn render_many(
-        &self,
-        id: &SceneId,
-        spec: ViewsSpec,
-    ) -> Result<impl Stream<Item = Result<RenderedView>> + Send + use<>> {
-        let _ = (id, spec);
-        unfinished::<futures_util::stream::Empty<Result<RenderedView>>>()
-    }
-
-    /// The scene as a file for other programs.
-    ///
-    /// # Errors
-    /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`.
-    pub async fn export(&self, id: &SceneId, format: ExportFormat) -> Result<Export> {
-        let _ = (id, format);
-        unfinished()
+    fn event(&self, status: &SceneStatus) -> Event {
+        match status.state {
+            SceneState::Queued => Event::Queued { ahead: self.inner.jobs.ahead(&status.id) },
+            SceneState::Running => Event::Running {
+                stage: status.stage.clone().unwrap_or_else(|| "photos".to_owned()),
+                fraction: status.fraction,
+            },
+            SceneState::Done => Event::Done,
+            SceneState::Cancelled => Event::Cancelled,
+            SceneState::Failed => Event::Failed(status.error.clone().unwrap_or(SceneError {
+                code: crate::error::ErrorCode::Internal.name().to_owned(),
+                message: "the reason was not kept".to_owned(),
+            })),
+        }
     }
 
     /// What makes and renders the scenes.
     #[must_use]
     pub fn models(&self) -> ModelsInfo {
-        ModelsInfo::default()
+        self.inner.models.clone()
     }
 
-    /// Whether new work is taken.
+    /// Whether new work is taken, and how much there is.
     #[must_use]
     pub fn ready(&self) -> Readiness {
-        Readiness { ready: false, jobs_queued: 0, jobs_running: 0, renders: 0 }
+        let (jobs_queued, jobs_running) = self.inner.jobs.counts();
+        Readiness {
+            ready: self.inner.jobs.is_open(),
+            jobs_queued,
+            jobs_running,
+            renders: self.inner.gate.inside(),
+        }
+    }
+
+    /// Takes no more jobs, stops those at work (the next start takes them up again). Blocks.
+    pub fn shut_down(&self) {
+        self.inner.jobs.shut_down();
     }
 }
 
-fn unfinished<T>() -> Result<T> {
-    Err(Error::internal("this call is not built in yet"))
+/// Where the next page starts: creation time and id of the last scene of this one.
+fn cursor(last: &Record) -> String {
+    format!("{}-{}", last.status.created_ms, last.status.id)
+}
+
+fn parse_cursor(text: &str) -> Result<(u64, SceneId)> {
+    let parts = text
+        .split_once('-')
+        .and_then(|(created, id)| Some((created.parse().ok()?, id.parse::<SceneId>().ok()?)));
+    parts.ok_or_else(|| {
+        let shown: String = text.chars().take(60).collect();
+        Error::invalid(format!("after is {shown:?}, not the `next` of an earlier page"))
+    })
 }

@@ -201,7 +201,7 @@ async fn render_many(api: &Api, request: pb::RenderViewsRequest) -> Result<Many<
         .map(|(i, camera)| convert::camera(Some(camera), &format!("camera {i}")))
         .collect::<Result<_>>()?;
     let options = convert::options(request.options)?;
-    let views = api.service.render_many(&id, ViewsSpec { cameras, kinds, options }).await?;
+    let views = api.service.render_many(&id, ViewsSpec { cameras, kinds, options })?;
     Ok(views.map(|view| view.map(convert::view).map_err(|e| logged(&e))).boxed())
 }
 

@@ -46,7 +46,7 @@ pub(super) async fn view(
     let mut spec = spec_of(params, accept(&headers), &api.service.models())?;
     spec.options.deadline = deadline.map(|Extension(Deadline(deadline))| deadline);
     if let Some(known) = headers.get(header::IF_NONE_MATCH).and_then(|v| v.to_str().ok()) {
-        let etag = quoted(&api.service.view_etag(&id, &spec).await?);
+        let etag = quoted(&api.service.view_etag(&id, &spec)?);
         if matches_etag(known, &etag) {
             return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
         }

@@ -1,0 +1,148 @@
+//! Every scene and where it stands; a late watcher gets the present state first.
+
+use std::{
+    collections::BTreeMap,
+    sync::{PoisonError, RwLock, RwLockReadGuard},
+};
+
+use tokio::sync::watch;
+
+use crate::{
+    scene::{SceneId, SceneState},
+    store::Record,
+};
+
+/// Newest first: creation time descending, then id.
+type Order = (std::cmp::Reverse<u64>, SceneId);
+
+/// Records of all scenes, each with a channel that keeps the newest.
+#[derive(Debug, Default)]
+pub(super) struct Board {
+    inner: RwLock<Inner>,
+}
+
+#[derive(Debug, Default)]
+struct Inner {
+    by_order: BTreeMap<Order, watch::Sender<Record>>,
+    created: std::collections::HashMap<SceneId, u64>,
+}
+
+impl Inner {
+    fn sender(&self, id: &SceneId) -> Option<&watch::Sender<Record>> {
+        let created = *self.created.get(id)?;
+        self.by_order.get(&(std::cmp::Reverse(created), id.clone()))
+    }
+}
+
+impl Board {
+    pub(super) fn insert(&self, record: Record) {
+        let mut inner = self.inner.write().unwrap_or_else(PoisonError::into_inner);
+        let (id, created) = (record.status.id.clone(), record.status.created_ms);
+        inner.created.insert(id.clone(), created);
+        inner.by_order.insert((std::cmp::Reverse(created), id), watch::Sender::new(record));
+    }
+
+    pub(super) fn find(&self, id: &SceneId) -> Option<Record> {
+        Some(self.read().sender(id)?.borrow().clone())
+    }
+
+    pub(super) fn watch(&self, id: &SceneId) -> Option<watch::Receiver<Record>> {
+        Some(self.read().sender(id)?.subscribe())
+    }
+
+    /// Changes a record and tells its watchers; gives the changed record, `None` when deleted.
+    pub(super) fn update(&self, id: &SceneId, change: impl FnOnce(&mut Record)) -> Option<Record> {
+        let inner = self.read();
+        let sender = inner.sender(id)?;
+        sender.send_modify(change);
+        let record = sender.borrow().clone();
+        Some(record)
+    }
+
+    /// Takes a scene off; its watchers see it cancelled unless it was final.
+    pub(super) fn remove(&self, id: &SceneId) -> bool {
+        let mut inner = self.inner.write().unwrap_or_else(PoisonError::into_inner);
+        let Some(created) = inner.created.remove(id) else { return false };
+        let sender = inner.by_order.remove(&(std::cmp::Reverse(created), id.clone()));
+        if let Some(sender) = sender {
+            sender.send_modify(|record| {
+                if !record.status.state.is_final() {
+                    record.status.state = SceneState::Cancelled;
+                    record.status.stage = None;
+                }
+            });
+        }
+        true
+    }
+
+    /// Up to `limit` records after the scene with that creation time and id, newest first, and
+    /// whether more follow.
+    pub(super) fn page(&self, after: Option<(u64, SceneId)>, limit: usize) -> (Vec<Record>, bool) {
+        use std::ops::Bound;
+        let start = after.map_or(Bound::Unbounded, |(created, id)| {
+            Bound::Excluded((std::cmp::Reverse(created), id))
+        });
+        let inner = self.read();
+        let mut rest = inner.by_order.range((start, Bound::Unbounded));
+        let page = rest.by_ref().take(limit).map(|(_, sender)| sender.borrow().clone()).collect();
+        (page, rest.next().is_some())
+    }
+
+    fn read(&self) -> RwLockReadGuard<'_, Inner> {
+        self.inner.read().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{SceneOptions, SceneStatus};
+
+    fn record(byte: u8, created_ms: u64) -> Record {
+        Record {
+            status: SceneStatus::new(
+                SceneId::from_bytes([byte; 16]),
+                SceneState::Queued,
+                created_ms,
+            ),
+            options: SceneOptions::default(),
+            idempotency_key: None,
+            request_sha256: String::new(),
+            attempts: 0,
+            scene_sha256: None,
+        }
+    }
+
+    #[test]
+    fn pages_go_from_the_newest_and_miss_none_when_scenes_come_and_go() {
+        let board = Board::default();
+        for (byte, created) in [(1, 10), (2, 30), (3, 20), (4, 20)] {
+            board.insert(record(byte, created));
+        }
+        let ids = |records: &[Record]| -> Vec<u8> {
+            let digits = |r: &Record| r.status.id.as_str()[..2].to_owned();
+            records.iter().map(|r| u8::from_str_radix(&digits(r), 16).unwrap()).collect()
+        };
+        let (first, more) = board.page(None, 2);
+        assert_eq!((ids(&first), more), (vec![2, 3], true));
+        let last = &first[1].status;
+        board.insert(record(9, 99));
+        board.remove(&last.id);
+        let (second, more) = board.page(Some((last.created_ms, last.id.clone())), 2);
+        assert_eq!((ids(&second), more), (vec![4, 1], false));
+    }
+
+    #[test]
+    fn a_late_watcher_sees_the_present_state_and_a_deleted_scene_ends_as_cancelled() {
+        let board = Board::default();
+        board.insert(record(1, 0));
+        let id = SceneId::from_bytes([1; 16]);
+        board.update(&id, |record| record.status.fraction = 0.5).unwrap();
+        let watcher = board.watch(&id).unwrap();
+        assert!((watcher.borrow().status.fraction - 0.5).abs() < 1e-6);
+        assert!(board.remove(&id));
+        assert_eq!(watcher.borrow().status.state, SceneState::Cancelled);
+        assert!(watcher.has_changed().is_err(), "no sender is left");
+        assert!(board.find(&id).is_none() && !board.remove(&id));
+    }
+}
