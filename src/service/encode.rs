@@ -119,7 +119,7 @@ fn picture(
     Ok(file)
 }
 
-/// NumPy's format version 1.0, C order.
+/// `NumPy`'s format version 1.0, C order.
 fn npy(values: &[f32], shape: &[u32]) -> Vec<u8> {
     let sides: Vec<String> = shape.iter().map(u32::to_string).collect();
     let mut header =

@@ -73,7 +73,7 @@ pub enum Format {
     Jpeg,
     /// 8-bit, lossless; not for depth.
     Webp,
-    /// NumPy array of little-endian f32, `[H, W, 3]` or `[H, W]`, not clamped.
+    /// `NumPy` array of little-endian f32, `[H, W, 3]` or `[H, W]`, not clamped.
     Npy,
 }
 

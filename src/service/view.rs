@@ -241,7 +241,7 @@ impl Service {
     pub fn render_many(
         &self,
         id: &SceneId,
-        spec: ViewsSpec,
+        spec: &ViewsSpec,
     ) -> Result<impl Stream<Item = Result<RenderedView>> + Send + use<>> {
         let inner = Arc::clone(&self.inner);
         let limits = &inner.config.limits;

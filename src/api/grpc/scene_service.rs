@@ -90,7 +90,7 @@ impl pb::scene_service_server::SceneService for Api {
         &self,
         request: Request<pb::RenderViewsRequest>,
     ) -> Answer<Self::RenderViewsStream> {
-        let views = render_many(self, request.into_inner()).await.map_err(|e| logged(&e))?;
+        let views = render_many(self, request.into_inner()).map_err(|e| logged(&e))?;
         Ok(Response::new(views))
     }
 
@@ -189,7 +189,7 @@ async fn render(api: &Api, request: pb::RenderViewRequest) -> Result<pb::View> {
     Ok(convert::view(view))
 }
 
-async fn render_many(api: &Api, request: pb::RenderViewsRequest) -> Result<Many<pb::View>> {
+fn render_many(api: &Api, request: pb::RenderViewsRequest) -> Result<Many<pb::View>> {
     let id = request.scene_id.parse()?;
     let models = api.service.models();
     let kinds = match request.kinds.as_slice() {
@@ -201,7 +201,7 @@ async fn render_many(api: &Api, request: pb::RenderViewsRequest) -> Result<Many<
         .map(|(i, camera)| convert::camera(Some(camera), &format!("camera {i}")))
         .collect::<Result<_>>()?;
     let options = convert::options(request.options)?;
-    let views = api.service.render_many(&id, ViewsSpec { cameras, kinds, options })?;
+    let views = api.service.render_many(&id, &ViewsSpec { cameras, kinds, options })?;
     Ok(views.map(|view| view.map(convert::view).map_err(|e| logged(&e))).boxed())
 }
 
