@@ -1,1 +1,273 @@
-//! under construction
+//! The judge: f64, pixel by pixel, no tiles, one full sort. Slow on purpose and shares no
+//! arithmetic with the renderers it judges.
+//!
+//! Thresholds make cliffs: where alpha is next to 1/255, a ray next to its end, or two depths next
+//! to each other, a renderer may fall on the other side and be right. Such pixels are marked.
+
+use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
+use rayon::prelude::*;
+
+use super::{
+    RenderRequest,
+    constants::{
+        ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FRUSTUM_MARGIN, SH_C0, SH_C1, SH_C2, SH_C3, SH_OFFSET,
+        TRANSMITTANCE_MIN,
+    },
+};
+use crate::{
+    error::Result,
+    scene::{Gaussians, Intrinsics},
+};
+
+/// Relative distance to a threshold under which a pixel counts as standing on its edge: ten times
+/// what f32 rounding moves alpha (1e-5) and a transmittance after many factors (1e-4).
+pub const CLIFF_ALPHA: f64 = 1e-4;
+/// As [`CLIFF_ALPHA`], for the transmittance at which a ray ends.
+pub const CLIFF_TRANSMITTANCE: f64 = 1e-3;
+/// Relative difference of two depths under which f32 arithmetic may swap them.
+pub const CLIFF_DEPTH: f64 = 1e-6;
+
+/// By which key the oracle sorts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum DepthKey {
+    /// t.z narrowed to f32, ties by index: the model.
+    #[default]
+    F32,
+    /// t.z in f64, to report what the narrower key changes.
+    F64,
+}
+
+/// Why a pixel may rightly differ.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Cliff {
+    /// A contribution has alpha next to 1/255.
+    pub alpha: bool,
+    /// The transmittance came next to 1e-4.
+    pub transmittance: bool,
+    /// Two neighbouring contributions have depths that f32 arithmetic may swap.
+    pub depth: bool,
+}
+
+impl Cliff {
+    /// Whether a renderer that sorts by the very key of the oracle may differ here.
+    #[must_use]
+    pub fn same_order(self) -> bool {
+        self.alpha || self.transmittance
+    }
+
+    /// Whether a renderer with depths of its own may differ here.
+    #[must_use]
+    pub fn any(self) -> bool {
+        self.alpha || self.transmittance || self.depth
+    }
+}
+
+/// One pixel.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct OraclePixel {
+    /// Colour over the background.
+    pub color: [f64; 3],
+    /// Expected depth, world units; 0 where alpha is 0.
+    pub depth: f64,
+    /// Accumulated opacity.
+    pub alpha: f64,
+    /// Edges it stands on.
+    pub cliff: Cliff,
+}
+
+/// Renders the whole picture, row-major.
+///
+/// # Errors
+/// `invalid_request` when the intrinsics are unusable.
+pub fn render(gaussians: &Gaussians, request: &RenderRequest) -> Result<Vec<OraclePixel>> {
+    let Intrinsics { width, height, .. } = request.camera.intrinsics;
+    let pixels: Vec<[u32; 2]> = (0..height).flat_map(|y| (0..width).map(move |x| [x, y])).collect();
+    render_pixels(gaussians, request, DepthKey::F32, &pixels)
+}
+
+/// Renders the pixels (column, row) given, in their order: for pictures too large to do whole.
+///
+/// Cost: pixels x Gaussians in the pixel's row.
+///
+/// # Errors
+/// `invalid_request` when the intrinsics are unusable.
+pub fn render_pixels(
+    gaussians: &Gaussians,
+    request: &RenderRequest,
+    key: DepthKey,
+    pixels: &[[u32; 2]],
+) -> Result<Vec<OraclePixel>> {
+    let lens = request.camera.intrinsics.validated("camera")?;
+    let mut splats: Vec<Splat> =
+        (0..gaussians.len()).filter_map(|i| splat(gaussians, i, request, &lens)).collect();
+    // Stable, so ties stay in the order of the index.
+    match key {
+        DepthKey::F32 => splats.sort_by(|a, b| (a.depth as f32).total_cmp(&(b.depth as f32))),
+        DepthKey::F64 => splats.sort_by(|a, b| a.depth.total_cmp(&b.depth)),
+    }
+    // Pixels of one row share the list of Gaussians that can reach the row.
+    let mut by_row: Vec<usize> = (0..pixels.len()).collect();
+    by_row.sort_by_key(|&i| pixels[i][1]);
+    let rows: Vec<&[usize]> = by_row.chunk_by(|&a, &b| pixels[a][1] == pixels[b][1]).collect();
+    let done: Vec<Vec<(usize, OraclePixel)>> = rows
+        .into_par_iter()
+        .map(|row| {
+            let y = f64::from(pixels[row[0]][1]) + 0.5;
+            let near: Vec<&Splat> =
+                splats.iter().filter(|s| (y - s.mean.y).abs() <= s.half_height).collect();
+            row.iter()
+                .map(|&i| {
+                    let center = DVec2::new(f64::from(pixels[i][0]) + 0.5, y);
+                    (i, pixel(&near, center, request.background))
+                })
+                .collect()
+        })
+        .collect();
+    let mut out = vec![OraclePixel::default(); pixels.len()];
+    for (i, pixel) in done.into_iter().flatten() {
+        out[i] = pixel;
+    }
+    Ok(out)
+}
+
+/// A Gaussian on the picture.
+#[derive(Clone, Copy, Debug)]
+struct Splat {
+    mean: DVec2,
+    conic: DMat2,
+    /// Beyond this height alpha is under 1/255 by more than the width of a cliff.
+    half_height: f64,
+    opacity: f64,
+    depth: f64,
+    color: DVec3,
+}
+
+fn splat(
+    gaussians: &Gaussians,
+    i: usize,
+    request: &RenderRequest,
+    lens: &Intrinsics,
+) -> Option<Splat> {
+    let pose = request.camera.camera_to_world;
+    let mean = DVec3::from(gaussians.means()[i].map(f64::from));
+    let from_eye = mean - (pose.center() - gaussians.origin());
+    let w = pose.rotation().transpose();
+    let t = w * from_eye;
+    if t.z < f64::from(request.near) {
+        return None;
+    }
+    let bound = |ratio: f64, focal: f64, center: f64, size: u32| {
+        let margin = f64::from(FRUSTUM_MARGIN) * 0.5 * f64::from(size) / focal;
+        let low = -center / focal - margin;
+        let high = (f64::from(size) - center) / focal + margin;
+        ratio.max(low).min(high) * t.z
+    };
+    let tx = bound(t.x / t.z, lens.fx, lens.cx, lens.width);
+    let ty = bound(t.y / t.z, lens.fy, lens.cy, lens.height);
+    // J, 2x3, as the first two rows of a 3x3.
+    let jacobian = DMat3::from_cols(
+        DVec3::new(lens.fx / t.z, 0.0, 0.0),
+        DVec3::new(0.0, lens.fy / t.z, 0.0),
+        DVec3::new(-lens.fx * tx / (t.z * t.z), -lens.fy * ty / (t.z * t.z), 0.0),
+    );
+    let [qw, qx, qy, qz] = gaussians.quats()[i].map(f64::from);
+    let r = DMat3::from_quat(DQuat::from_xyzw(qx, qy, qz, qw).normalize());
+    let s = DMat3::from_diagonal(DVec3::from(gaussians.scales()[i].map(f64::from)));
+    // S2 = J W S Wᵀ Jᵀ with S = (R s)(R s)ᵀ, as A Aᵀ: its determinant is the squared length of the
+    // cross product of A's rows, which stays exact for the longest needles.
+    let a = jacobian * w * r * s;
+    let (row0, row1) = (a.row(0), a.row(1));
+    let sharp_det = row0.cross(row1).length_squared();
+    let (xx, xy, yy) = (row0.dot(row0), row0.dot(row1), row1.dot(row1));
+    let blur = f64::from(BLUR_PX2);
+    let det = sharp_det + blur * (xx + yy) + blur * blur;
+    if det <= 0.0 || !det.is_finite() {
+        return None;
+    }
+    let mut opacity = f64::from(gaussians.opacities()[i]);
+    if request.antialiased {
+        opacity *= (sharp_det / det).max(0.0).sqrt();
+    }
+    if opacity < f64::from(ALPHA_MIN) {
+        return None;
+    }
+    let conic =
+        DMat2::from_cols(DVec2::new(yy + blur, -xy) / det, DVec2::new(-xy, xx + blur) / det);
+    let reach = 2.0 * (opacity / f64::from(ALPHA_MIN)).ln() + 1e-2;
+    let k = gaussians.sh_count();
+    Some(Splat {
+        mean: DVec2::new(lens.fx * t.x / t.z + lens.cx, lens.fy * t.y / t.z + lens.cy),
+        conic,
+        half_height: (reach * (yy + blur)).sqrt(),
+        opacity,
+        depth: t.z,
+        color: color(&gaussians.sh()[i * k..(i + 1) * k], from_eye.normalize_or_zero()),
+    })
+}
+
+/// 3DGS harmonics at a unit direction, +0.5, negatives to 0.
+fn color(sh: &[[f32; 3]], DVec3 { x, y, z }: DVec3) -> DVec3 {
+    let c1 = f64::from(SH_C1);
+    let c2 = SH_C2.map(f64::from);
+    let c3 = SH_C3.map(f64::from);
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    let basis = [
+        f64::from(SH_C0),
+        -c1 * y,
+        c1 * z,
+        -c1 * x,
+        c2[0] * x * y,
+        c2[1] * y * z,
+        c2[2] * (2.0 * zz - xx - yy),
+        c2[3] * x * z,
+        c2[4] * (xx - yy),
+        c3[0] * y * (3.0 * xx - yy),
+        c3[1] * x * y * z,
+        c3[2] * y * (4.0 * zz - xx - yy),
+        c3[3] * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+        c3[4] * x * (4.0 * zz - xx - yy),
+        c3[5] * z * (xx - yy),
+        c3[6] * x * (xx - 3.0 * yy),
+    ];
+    let sum: DVec3 =
+        sh.iter().zip(basis).map(|(&c, weight)| weight * DVec3::from(c.map(f64::from))).sum();
+    (sum + f64::from(SH_OFFSET)).max(DVec3::ZERO)
+}
+
+/// Composites the Gaussians of `near` (depth order) at one pixel centre.
+fn pixel(near: &[&Splat], center: DVec2, background: [f32; 3]) -> OraclePixel {
+    let alpha_min = f64::from(ALPHA_MIN);
+    let stop = f64::from(TRANSMITTANCE_MIN);
+    let mut transmittance = 1.0;
+    let (mut color, mut depth, mut alpha_sum) = (DVec3::ZERO, 0.0, 0.0);
+    let mut cliff = Cliff::default();
+    let mut last_depth = f64::NEG_INFINITY;
+    for splat in near {
+        let d = center - splat.mean;
+        let power = 0.5 * d.dot(splat.conic * d);
+        let alpha = (splat.opacity * (-power).exp()).min(f64::from(ALPHA_MAX));
+        cliff.alpha |= (alpha / alpha_min - 1.0).abs() < CLIFF_ALPHA;
+        if alpha < alpha_min {
+            continue;
+        }
+        cliff.depth |= splat.depth - last_depth <= CLIFF_DEPTH * splat.depth;
+        last_depth = splat.depth;
+        let next = transmittance * (1.0 - alpha);
+        cliff.transmittance |= (next / stop - 1.0).abs() < CLIFF_TRANSMITTANCE;
+        if next <= stop {
+            break;
+        }
+        let weight = alpha * transmittance;
+        color += weight * splat.color;
+        depth += weight * splat.depth;
+        alpha_sum += weight;
+        transmittance = next;
+    }
+    let background = DVec3::from(background.map(f64::from));
+    OraclePixel {
+        color: (color + (1.0 - alpha_sum) * background).into(),
+        depth: if alpha_sum > 0.0 { depth / alpha_sum } else { 0.0 },
+        alpha: alpha_sum,
+        cliff,
+    }
+}

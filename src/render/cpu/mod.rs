@@ -1,1 +1,253 @@
-//! under construction
+//! The tiled CPU renderer: the stages of the GPU renderer, one file each with the shader's stem.
+//!
+//! It serves where there is no adapter, so it is a product and not a test toy. A frame is the same
+//! to the last bit whatever the number of threads: tasks write to places fixed in advance and
+//! nothing is summed across tasks.
+
+pub mod emit_isects;
+mod lanes;
+pub mod prefix_sum;
+pub mod project;
+pub mod radix_sort;
+pub mod rasterize;
+pub mod shade;
+pub mod tile_ranges;
+pub mod tiles;
+
+use std::{
+    ops::Range,
+    sync::{Mutex, PoisonError},
+};
+
+use rayon::prelude::*;
+
+use self::{
+    project::Footprint,
+    radix_sort::{key, pack, value},
+    rasterize::{RowOut, Tile, TileScratch},
+    tiles::{Grid, count_tiles},
+};
+use super::{
+    Frame, FrameStats, RenderRequest, Renderer,
+    constants::{ISECTS_MAX, TILE_SIZE},
+    view::View,
+};
+use crate::{
+    error::{Error, Result},
+    scene::Gaussians,
+};
+
+/// Scratch with more Gaussians than this is freed after the frame instead of kept.
+const KEPT_GAUSSIANS_MAX: usize = 2 << 20;
+
+/// Renders on the processor with its own threads.
+#[derive(Debug)]
+pub struct CpuRenderer {
+    threads: rayon::ThreadPool,
+    /// Buffers between frames; one set for each frame drawn at the same time.
+    frames: Pool<FrameScratch>,
+    tiles: Pool<TileScratch>,
+    isects_max: u64,
+}
+
+impl CpuRenderer {
+    /// A renderer with `threads` threads; 0 takes the cores that the process may use.
+    ///
+    /// # Errors
+    /// `internal` when the threads cannot be started.
+    pub fn new(threads: usize) -> Result<Self> {
+        let threads = match threads {
+            0 => std::thread::available_parallelism().map_or(1, usize::from),
+            n => n,
+        };
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(threads)
+            .thread_name(|i| format!("render-{i}"))
+            .build()
+            .map_err(|error| {
+                Error::internal(format!("render: {threads} threads cannot be started"))
+                    .caused_by(error)
+            })?;
+        Ok(Self {
+            threads: pool,
+            frames: Pool::default(),
+            tiles: Pool::default(),
+            isects_max: ISECTS_MAX,
+        })
+    }
+
+    /// The same renderer with another budget of Gaussian-tile pairs, for tests of the bands.
+    #[must_use]
+    pub fn with_isects_max(mut self, isects_max: u64) -> Self {
+        self.isects_max = isects_max;
+        self
+    }
+
+    fn draw(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        let view = View::new(gaussians.origin(), request)?;
+        let mut frame = blank(&view, request);
+        let mut scratch = self.frames.take();
+        let FrameScratch { footprints, tiles_per_gauss, sorted, spare, shaded, .. } = &mut scratch;
+        project::project(gaussians, &view, request.antialiased, footprints, tiles_per_gauss);
+        sorted.clear();
+        sorted.extend((0_u32..).zip(tiles_per_gauss.iter()).filter(|&(_, &tiles)| tiles > 0).map(
+            // t.z is over 0, so its bits are in the order of its value.
+            |(i, _)| pack(footprints[i as usize].depth.to_bits(), i),
+        ));
+        radix_sort::radix_sort(sorted, spare, u32::BITS);
+        shade::shade(gaussians, &view, footprints, sorted, shaded);
+        frame.stats.visible = sorted.len() as u64;
+        let grid = Grid { width: view.width, height: view.height, tile_rows: 0..view.tiles_y() };
+        self.draw_band(&grid, request, &mut scratch, &mut frame)?;
+        if scratch.footprints.len() <= KEPT_GAUSSIANS_MAX {
+            self.frames.give(scratch);
+        }
+        Ok(frame)
+    }
+
+    /// Draws the rows of tiles of `grid`; halves them while their pairs are over the budget.
+    fn draw_band(
+        &self,
+        grid: &Grid,
+        request: &RenderRequest,
+        scratch: &mut FrameScratch,
+        frame: &mut Frame,
+    ) -> Result<()> {
+        let FrameScratch { tiles_per_gauss, sorted, spare, shaded, isect_offsets, .. } = scratch;
+        let whole = grid.tile_rows == (0..grid.height.div_ceil(TILE_SIZE));
+        let total = if whole {
+            let counts = sorted.iter().map(|&pair| tiles_per_gauss[value(pair) as usize]);
+            prefix_sum::prefix_sum(counts, isect_offsets)
+        } else {
+            prefix_sum::prefix_sum(shaded.iter().map(|f| count_tiles(f, grid)), isect_offsets)
+        };
+        let Range { start, end } = grid.tile_rows;
+        if total > self.isects_max {
+            if end - start == 1 {
+                return Err(Error::limit(
+                    "render: Gaussian-tile pairs in one row of tiles",
+                    total,
+                    self.isects_max,
+                ));
+            }
+            let middle = start.midpoint(end);
+            for tile_rows in [start..middle, middle..end] {
+                self.draw_band(&Grid { tile_rows, ..grid.clone() }, request, scratch, frame)?;
+            }
+            return Ok(());
+        }
+        frame.stats.intersections += total;
+        emit_isects::emit_isects(shaded, grid, isect_offsets, &mut scratch.isects);
+        let tile_bits = u32::BITS - (grid.tile_count() - 1).leading_zeros();
+        radix_sort::radix_sort(&mut scratch.isects, spare, tile_bits);
+        tile_ranges::tile_ranges(&scratch.isects, grid.tile_count(), &mut scratch.ranges);
+        self.rasterize(grid, request, scratch, frame);
+        Ok(())
+    }
+
+    /// Blends the tiles of a band, one task a row of tiles.
+    fn rasterize(
+        &self,
+        grid: &Grid,
+        request: &RenderRequest,
+        scratch: &FrameScratch,
+        frame: &mut Frame,
+    ) {
+        let tiles_x = grid.tiles_x();
+        let rows = band_rows(frame, grid);
+        rows.into_par_iter().with_max_len(1).enumerate().for_each(|(row, mut out)| {
+            let mut tile_scratch = self.tiles.take();
+            let y = (grid.tile_rows.start + row as u32) * TILE_SIZE;
+            for tile_x in 0..tiles_x {
+                let x = tile_x * TILE_SIZE;
+                let tile = Tile {
+                    x,
+                    y,
+                    width: TILE_SIZE.min(grid.width - x),
+                    height: TILE_SIZE.min(grid.height - y),
+                };
+                let id = row * tiles_x as usize + tile_x as usize;
+                let range = scratch.ranges[id] as usize..scratch.ranges[id + 1] as usize;
+                let isects = &scratch.isects[range];
+                debug_assert!(isects.iter().all(|&isect| key(isect) as usize == id));
+                rasterize::rasterize_tile(
+                    &scratch.shaded,
+                    isects,
+                    tile,
+                    request.background,
+                    grid.width,
+                    &mut tile_scratch,
+                    &mut out,
+                );
+            }
+            self.tiles.give(tile_scratch);
+        });
+    }
+}
+
+impl Renderer for CpuRenderer {
+    fn name(&self) -> String {
+        "cpu".to_owned()
+    }
+
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        self.threads.install(|| self.draw(gaussians, request))
+    }
+}
+
+/// Buffers of a frame, named as the stages name them.
+#[derive(Debug, Default)]
+struct FrameScratch {
+    footprints: Vec<Footprint>,
+    tiles_per_gauss: Vec<u32>,
+    sorted: Vec<u64>,
+    spare: Vec<u64>,
+    shaded: Vec<Footprint>,
+    isect_offsets: Vec<u64>,
+    isects: Vec<u64>,
+    ranges: Vec<u32>,
+}
+
+/// Things kept for the next that needs one.
+#[derive(Debug, Default)]
+struct Pool<T>(Mutex<Vec<T>>);
+
+impl<T: Default> Pool<T> {
+    fn take(&self) -> T {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default()
+    }
+
+    fn give(&self, thing: T) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(thing);
+    }
+}
+
+/// A frame of the right size; every pixel is written by a tile.
+fn blank(view: &View, request: &RenderRequest) -> Frame {
+    let pixels = view.width as usize * view.height as usize;
+    Frame {
+        width: view.width,
+        height: view.height,
+        color: request.kinds.color.then(|| vec![[0.0; 3]; pixels]),
+        depth: request.kinds.depth.then(|| vec![0.0; pixels]),
+        alpha: request.kinds.alpha.then(|| vec![0.0; pixels]),
+        stats: FrameStats::default(),
+    }
+}
+
+/// The pictures of a band, cut into rows of tiles.
+fn band_rows<'a>(frame: &'a mut Frame, grid: &Grid) -> Vec<RowOut<'a>> {
+    let stride = frame.width as usize * TILE_SIZE as usize;
+    let first = grid.tile_rows.start as usize;
+    let mut color = frame.color.as_mut().map(|all| all.chunks_mut(stride).skip(first));
+    let mut depth = frame.depth.as_mut().map(|all| all.chunks_mut(stride).skip(first));
+    let mut alpha = frame.alpha.as_mut().map(|all| all.chunks_mut(stride).skip(first));
+    grid.tile_rows
+        .clone()
+        .map(|_| RowOut {
+            color: color.as_mut().and_then(Iterator::next),
+            depth: depth.as_mut().and_then(Iterator::next),
+            alpha: alpha.as_mut().and_then(Iterator::next),
+        })
+        .collect()
+}

@@ -1,6 +1,9 @@
 //! What the test files share: where things are, and how a test says that it was skipped.
 #![allow(dead_code, reason = "not every build of the tests uses every helper")]
 
+pub(crate) mod compare;
+pub(crate) mod scenes;
+
 use std::path::{Path, PathBuf};
 
 /// The repository's root.

@@ -1,0 +1,49 @@
+//! Stage 5: one (tile, Gaussian) pair per touched tile, in depth order.
+//! Partner: `shaders/emit_isects.wgsl`
+
+use rayon::prelude::*;
+
+use super::{
+    project::Footprint,
+    radix_sort::pack,
+    tiles::{Grid, touched_tiles},
+};
+
+/// Gaussians a task.
+const CHUNK: usize = 1024;
+
+/// Writes the pairs of `shaded[i]` to `isects[isect_offsets[i]..isect_offsets[i + 1]]`.
+///
+/// Keys are tile ids counted from the first tile of the band; values index `shaded`. The caller
+/// has checked that the total fits [`crate::render::constants::ISECTS_MAX`].
+pub fn emit_isects(
+    shaded: &[Footprint],
+    grid: &Grid,
+    isect_offsets: &[u64],
+    isects: &mut Vec<u64>,
+) {
+    let total = isect_offsets.last().copied().unwrap_or(0) as usize;
+    isects.resize(total, 0);
+    // Disjoint slices, one a task, cut where the offsets say.
+    let mut tasks = Vec::with_capacity(shaded.len().div_ceil(CHUNK));
+    let mut rest = isects.as_mut_slice();
+    for (chunk, footprints) in shaded.chunks(CHUNK).enumerate() {
+        let first = chunk * CHUNK;
+        let size = isect_offsets[first + footprints.len()] - isect_offsets[first];
+        let (slice, tail) = rest.split_at_mut(size as usize);
+        tasks.push((first, footprints, slice));
+        rest = tail;
+    }
+    tasks.into_par_iter().for_each(|(first, footprints, slice)| {
+        let mut slots = slice.iter_mut();
+        for (i, footprint) in footprints.iter().enumerate() {
+            touched_tiles(footprint, grid, |tile_y, tiles| {
+                let row = (tile_y - grid.tile_rows.start) * grid.tiles_x();
+                for (tile_x, slot) in tiles.zip(&mut slots) {
+                    *slot = pack(row + tile_x, (first + i) as u32);
+                }
+            });
+        }
+        debug_assert!(slots.next().is_none(), "count and emission disagree; this is a bug");
+    });
+}

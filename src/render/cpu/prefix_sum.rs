@@ -1,0 +1,29 @@
+//! Stage 3: where each visible Gaussian's tile pairs start. Partner: `shaders/prefix_sum.wgsl`
+
+/// Exclusive prefix sum of `counts` into `offsets` (one longer); the total, in 64 bits.
+///
+/// Offsets are only meaningful while the total fits the caller's budget, which it checks first.
+pub fn prefix_sum(counts: impl Iterator<Item = u32>, offsets: &mut Vec<u64>) -> u64 {
+    offsets.clear();
+    let mut total = 0;
+    offsets.push(total);
+    for count in counts {
+        total += u64::from(count);
+        offsets.push(total);
+    }
+    total
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sums_do_not_wrap_at_32_bits() {
+        let mut offsets = vec![9];
+        let total = prefix_sum([u32::MAX, 0, u32::MAX].into_iter(), &mut offsets);
+        let max = u64::from(u32::MAX);
+        assert_eq!(offsets, [0, max, max, 2 * max], "exclusive sums");
+        assert_eq!(total, 2 * max, "total");
+    }
+}

@@ -1,0 +1,87 @@
+//! A request's camera made relative to the Gaussians' origin in f64, before anything is narrowed.
+
+use glam::{DMat3, DVec3};
+
+use super::{
+    RenderRequest,
+    constants::{FRUSTUM_MARGIN, TILE_SIZE},
+};
+use crate::error::{Error, Result};
+
+/// Camera of one frame, relative to the scene's origin.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct View {
+    /// World to camera, rotation.
+    pub rotation: DMat3,
+    /// World to camera, translation for means relative to the origin: t = rotation · mean + this.
+    pub translation: DVec3,
+    /// Camera centre relative to the origin, world axes.
+    pub center: DVec3,
+    /// Focal lengths, pixels.
+    pub focal: [f64; 2],
+    /// Principal point, pixels.
+    pub principal: [f64; 2],
+    /// Smallest t.x / t.z and t.y / t.z at which the Jacobian is taken (negative as a rule).
+    pub slope_min: [f64; 2],
+    /// Largest t.x / t.z and t.y / t.z at which the Jacobian is taken.
+    pub slope_max: [f64; 2],
+    /// Gaussians with t.z under this are dropped, world units.
+    pub near: f64,
+    /// Picture width, pixels.
+    pub width: u32,
+    /// Picture height, pixels.
+    pub height: u32,
+}
+
+impl View {
+    /// Checks the request and subtracts the origin from the camera.
+    ///
+    /// # Errors
+    /// `invalid_request` when the intrinsics are unusable, the near plane is not a finite number
+    /// over 0, or the background is not finite.
+    pub fn new(origin: DVec3, request: &RenderRequest) -> Result<Self> {
+        let lens = request.camera.intrinsics.validated("camera")?;
+        if !(request.near.is_finite() && request.near > 0.0) {
+            return Err(Error::invalid(format!(
+                "near is {}; it must be a finite number over 0",
+                request.near
+            )));
+        }
+        if let Some(value) = request.background.iter().find(|value| !value.is_finite()) {
+            return Err(Error::invalid(format!("background holds {value}, not a finite number")));
+        }
+        let pose = request.camera.camera_to_world;
+        let rotation = pose.rotation().transpose();
+        let center = pose.center() - origin;
+        let (focal, principal) = ([lens.fx, lens.fy], [lens.cx, lens.cy]);
+        let size = [f64::from(lens.width), f64::from(lens.height)];
+        // Measured from the true principal point: with an off-centre one the two sides differ.
+        let margin = |axis: usize| f64::from(FRUSTUM_MARGIN) * 0.5 * size[axis] / focal[axis];
+        let low = |axis: usize| -principal[axis] / focal[axis] - margin(axis);
+        let high = |axis: usize| (size[axis] - principal[axis]) / focal[axis] + margin(axis);
+        Ok(Self {
+            rotation,
+            translation: -(rotation * center),
+            center,
+            focal,
+            principal,
+            slope_min: [low(0), low(1)],
+            slope_max: [high(0), high(1)],
+            near: f64::from(request.near),
+            width: lens.width,
+            height: lens.height,
+        })
+    }
+
+    /// Tiles in a row of tiles.
+    #[must_use]
+    pub fn tiles_x(&self) -> u32 {
+        self.width.div_ceil(TILE_SIZE)
+    }
+
+    /// Rows of tiles.
+    #[must_use]
+    pub fn tiles_y(&self) -> u32 {
+        self.height.div_ceil(TILE_SIZE)
+    }
+}
