@@ -1,1 +1,112 @@
-//! capture: under construction.
+//! What the photos say of themselves before any network: depth ranges, overlap, wrong cameras.
+//!
+//! Neighbouring photos, reduced to some 20,000 pixels, are compared under the given cameras by a
+//! plane sweep (`sweep`). Its confident matches give each photo its depth range and each pair its
+//! overlap, in world units and with no scale assumed. How many matches there are tells whether the
+//! cameras are right: on the real scenes of the test data neighbours agree on 20 to 90 % of their
+//! matchable pixels, under wrong cameras or between strangers on less than 10 %. `diagnose` asks
+//! the same question under the usual mistakes.
+//!
+//! Measured on two cores: about 0.05 s for two photos that agree, about 2 s for 24.
+
+mod content;
+mod depth;
+mod diagnose;
+mod gray;
+mod pairs;
+mod sets;
+mod sweep;
+
+use rayon::prelude::*;
+
+use crate::{
+    error::{Error, Result},
+    scene::{Capture, PosedPhoto, Warning, WarningCode},
+};
+use gray::GrayView;
+use pairs::PairFound;
+
+pub use sets::view_sets;
+
+/// Neighbours that each photo is compared with.
+const NEIGHBORS: usize = 3;
+/// Of this many photos and more, one neighbour fewer.
+const MANY_PHOTOS: usize = 32;
+
+/// Measures a capture; photos that cannot be one scene are refused.
+///
+/// # Errors
+/// `invalid_request` for fewer than two photos, cameras all at one place, or photos that share
+/// nothing; the message names the photos and the figure.
+pub fn analyse(photos: &[PosedPhoto]) -> Result<Capture> {
+    let views = gray_views(photos)?;
+    let pairs = pairs::neighbours(&views, neighbour_count(views.len()))?;
+    let found = pairs::compare(&views, &pairs);
+    let points = depth::pooled(&views, &found);
+    let ranges = depth::ranges(&views, &points)?;
+    let mut overlap = depth::overlap(&views, &points, &found);
+    let mut warnings = made_for_warnings(photos);
+    diagnose::warnings(photos, &views, &found, &ranges, &mut overlap, &mut warnings)?;
+    Ok(Capture { near_far: ranges.near_far, overlap, median_depth: ranges.median_depth, warnings })
+}
+
+/// Depth range of each photo of `set` (indices into `photos`), measured among these alone.
+///
+/// The same as [`analyse`] gives for these photos, without the diagnosis.
+///
+/// # Errors
+/// As [`analyse`], less the refusal of photos that share nothing: these get a wide guess.
+///
+/// # Panics
+/// When an index of `set` is not one of `photos`.
+pub fn near_far(photos: &[PosedPhoto], set: &[usize]) -> Result<Vec<[f64; 2]>> {
+    let chosen: Vec<&PosedPhoto> = set.iter().map(|&i| &photos[i]).collect();
+    let views = gray_views(&chosen)?;
+    let pairs = pairs::neighbours(&views, neighbour_count(views.len()))?;
+    let found = pairs::compare(&views, &pairs);
+    Ok(depth::ranges(&views, &depth::pooled(&views, &found))?.near_far)
+}
+
+fn neighbour_count(photos: usize) -> usize {
+    if photos < MANY_PHOTOS { NEIGHBORS } else { NEIGHBORS - 1 }
+}
+
+fn gray_views<P: std::borrow::Borrow<PosedPhoto> + Sync>(photos: &[P]) -> Result<Vec<GrayView>> {
+    if photos.len() < 2 {
+        return Err(Error::invalid(format!(
+            "{} photo; a capture needs at least 2 to see depth",
+            photos.len()
+        )));
+    }
+    Ok(photos.par_iter().map(|p| GrayView::new(p.borrow())).collect())
+}
+
+/// A photo as messages call it.
+fn name(photos: &[PosedPhoto], i: usize) -> String {
+    let shown: String = photos[i].file.chars().take(80).collect();
+    format!("photo {i} ({shown:?})")
+}
+
+/// Says which intrinsics were scaled when the photos were read.
+fn made_for_warnings(photos: &[PosedPhoto]) -> Vec<Warning> {
+    let scaled = |i: usize| photos[i].intrinsics_made_for.map(|size| (i, size));
+    let all: Vec<(usize, [u32; 2])> = (0..photos.len()).filter_map(scaled).collect();
+    let Some(&(i, [w, h])) = all.first() else { return vec![] };
+    let k = photos[i].camera.intrinsics;
+    let value = f64::from(k.width) / f64::from(w);
+    let message = format!(
+        "{}: the intrinsics were made for {w}x{h} px and were scaled by {value:.4} to the photo's \
+         {}x{} px ({} of {} photos)",
+        name(photos, i),
+        k.width,
+        k.height,
+        all.len(),
+        photos.len()
+    );
+    vec![Warning { code: WarningCode::IntrinsicsScale, message, value }]
+}
+
+/// The better of the two directions' agreement of a pair.
+fn agreement(found: &PairFound) -> f64 {
+    found.agreement[0].max(found.agreement[1])
+}

@@ -1,0 +1,170 @@
+//! The small grey picture that the photos are compared in, and the pixels worth comparing.
+
+use glam::DVec3;
+
+use crate::scene::{Camera, PosedPhoto};
+
+/// Pixels of the small picture, about: 160x120 or 106x188.
+const AREA: f64 = 20_000.0;
+/// Candidates lie on a grid of this many pixels.
+pub(super) const STRIDE: usize = 2;
+/// Half side of the matching window: 7x7.
+pub(super) const RADIUS: usize = 3;
+/// Least standard deviation of a window worth matching, of full scale 1: 4/255 is over the noise
+/// of a compressed photo at this size.
+const TEXTURE_MIN: f32 = 4.0 / 255.0;
+
+/// A photo reduced to grey at matching size, with its camera and its matchable pixels.
+#[derive(Clone, Debug)]
+pub(super) struct GrayView {
+    pub(super) width: usize,
+    pub(super) height: usize,
+    /// `[height * width]`, 0..1 less the picture's mean.
+    pub(super) gray: Vec<f32>,
+    /// `[height * width]`: whether the whole window around the pixel has a source.
+    pub(super) valid: Option<Vec<bool>>,
+    /// Camera of the small picture.
+    pub(super) camera: Camera,
+    /// Matchable pixels on the grid, row by row.
+    pub(super) candidates: Vec<Candidate>,
+    /// `row_start[y]..row_start[y + 1]`: the candidates of grid row y.
+    pub(super) row_start: Vec<usize>,
+}
+
+/// A pixel whose window has texture.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Candidate {
+    /// Column, pixels of the small picture.
+    pub(super) x: u16,
+    /// Row.
+    pub(super) y: u16,
+    /// Mean of the window.
+    pub(super) mean: f32,
+    /// Sum of squared deviations of the window.
+    pub(super) energy: f32,
+}
+
+impl GrayView {
+    /// Reduces a photo by area averages and finds its matchable pixels.
+    pub(super) fn new(posed: &PosedPhoto) -> Self {
+        let photo = &posed.photo;
+        let (w0, h0) = (photo.width as usize, photo.height as usize);
+        let scale = (AREA / (w0 * h0) as f64).sqrt().min(1.0);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positive")]
+        let side = |n: usize| ((n as f64 * scale).round() as usize).max(1);
+        let (width, height) = (side(w0), side(h0));
+        let xs = spans(w0, width);
+        let ys = spans(h0, height);
+        let mut gray = vec![0.0_f32; width * height];
+        let mut holes = vec![false; width * height];
+        let mut line = vec![0.0_f32; width];
+        for (y, rows) in ys.iter().enumerate() {
+            let out = &mut gray[y * width..(y + 1) * width];
+            for &(row, row_weight) in rows {
+                let rgb = &photo.rgb[row * w0 * 3..(row + 1) * w0 * 3];
+                for (x, cols) in xs.iter().enumerate() {
+                    line[x] =
+                        cols.iter().map(|&(c, weight)| weight * luma(&rgb[c * 3..c * 3 + 3])).sum();
+                    if let Some(valid) = &photo.valid {
+                        let row = &valid[row * w0..(row + 1) * w0];
+                        holes[y * width + x] |= cols.iter().any(|&(c, _)| !row[c]);
+                    }
+                }
+                for (out, value) in out.iter_mut().zip(&line) {
+                    *out += row_weight * value;
+                }
+            }
+        }
+        let mean = gray.iter().sum::<f32>() / gray.len() as f32;
+        gray.iter_mut().for_each(|v| *v -= mean);
+        let valid = photo.valid.as_ref().map(|_| whole_windows(&holes, width, height));
+        let intrinsics = posed.camera.intrinsics.resized(width as u32, height as u32);
+        let camera = Camera { intrinsics, ..posed.camera };
+        let mut view =
+            Self { width, height, gray, valid, camera, candidates: vec![], row_start: vec![] };
+        view.find_candidates();
+        view
+    }
+
+    fn find_candidates(&mut self) {
+        let n = ((2 * RADIUS + 1) * (2 * RADIUS + 1)) as f32;
+        for grid_y in 0..self.height.div_ceil(STRIDE) {
+            self.row_start.push(self.candidates.len());
+            let y = grid_y * STRIDE;
+            if y < RADIUS || y + RADIUS >= self.height || self.width <= 2 * RADIUS {
+                continue;
+            }
+            for x in (0..self.width).step_by(STRIDE) {
+                if x < RADIUS || x + RADIUS >= self.width || !self.is_valid(x, y) {
+                    continue;
+                }
+                let (mut sum, mut squares) = (0.0_f32, 0.0_f32);
+                for row in y - RADIUS..=y + RADIUS {
+                    for v in
+                        &self.gray[row * self.width + x - RADIUS..=row * self.width + x + RADIUS]
+                    {
+                        sum += v;
+                        squares += v * v;
+                    }
+                }
+                let energy = squares - sum * sum / n;
+                if energy > n * TEXTURE_MIN * TEXTURE_MIN {
+                    let (x, y) = (x as u16, y as u16);
+                    self.candidates.push(Candidate { x, y, mean: sum / n, energy });
+                }
+            }
+        }
+        self.row_start.push(self.candidates.len());
+    }
+
+    /// Whether the window around a pixel has a source everywhere.
+    pub(super) fn is_valid(&self, x: usize, y: usize) -> bool {
+        self.valid.as_ref().is_none_or(|valid| valid[y * self.width + x])
+    }
+
+    /// Direction of a pixel's ray in camera coordinates, z = 1.
+    pub(super) fn ray(&self, x: f64, y: f64) -> DVec3 {
+        self.camera.intrinsics.unproject(x + 0.5, y + 0.5, 1.0)
+    }
+}
+
+fn luma(rgb: &[u8]) -> f32 {
+    (0.299 * f32::from(rgb[0]) + 0.587 * f32::from(rgb[1]) + 0.114 * f32::from(rgb[2])) / 255.0
+}
+
+/// For each output cell the input cells it covers and their weights, which sum to 1.
+fn spans(n0: usize, n: usize) -> Vec<Vec<(usize, f32)>> {
+    let step = n0 as f64 / n as f64;
+    (0..n)
+        .map(|i| {
+            let (from, to) = (i as f64 * step, (i + 1) as f64 * step);
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "in range")]
+            let (first, last) = (from as usize, (to.ceil() as usize).min(n0));
+            (first..last)
+                .map(|c| {
+                    let part = (to.min((c + 1) as f64) - from.max(c as f64)).max(0.0);
+                    #[expect(clippy::cast_possible_truncation, reason = "a weight of 0..1")]
+                    let weight = (part / step) as f32;
+                    (c, weight)
+                })
+                .collect()
+        })
+        .collect()
+}
+
+/// Marks the pixels whose window holds no hole.
+fn whole_windows(holes: &[bool], width: usize, height: usize) -> Vec<bool> {
+    let mut valid = vec![true; width * height];
+    for y in 0..height {
+        for x in 0..width {
+            if !holes[y * width + x] {
+                continue;
+            }
+            for row in y.saturating_sub(RADIUS)..(y + RADIUS + 1).min(height) {
+                let line = &mut valid[row * width..(row + 1) * width];
+                line[x.saturating_sub(RADIUS)..(x + RADIUS + 1).min(width)].fill(false);
+            }
+        }
+    }
+    valid
+}

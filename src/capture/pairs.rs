@@ -1,0 +1,182 @@
+//! Which photos to compare, and the comparison of a pair in both directions.
+
+use rayon::prelude::*;
+
+use super::{
+    gray::{GrayView, STRIDE},
+    sweep::{Match, Relative, Sweep, consistent, sweep},
+};
+use crate::{
+    error::{Error, Result},
+    scene::Camera,
+};
+
+/// Baselines under this share of the largest give no depth.
+const SAME_PLACE: f64 = 1e-6;
+/// Degrees between viewing axes that weigh as much as a baseline e times the usual.
+const ANGLE_SCALE: f64 = 15.0;
+
+/// Two photos compared with each other.
+#[derive(Clone, Debug)]
+pub(super) struct PairFound {
+    /// The two views, lower index first.
+    pub(super) views: [usize; 2],
+    /// Matches of the first view in the second, and the reverse; supported by their neighbours.
+    pub(super) matches: [Vec<Match>; 2],
+    /// Matched share of the candidates that could lie in the other photo, 0..1, each direction.
+    pub(super) agreement: [f64; 2],
+    /// Share of the matched candidates whose best plane was the nearest one, each direction.
+    pub(super) at_nearest: [f64; 2],
+    /// Distance between the cameras.
+    pub(super) baseline: f64,
+    /// Angle between the viewing axes, degrees.
+    pub(super) angle: f64,
+}
+
+impl PairFound {
+    /// Position of `view` in the pair.
+    pub(super) fn side(&self, view: usize) -> Option<usize> {
+        self.views.iter().position(|&v| v == view)
+    }
+}
+
+/// Distance between two cameras.
+pub(super) fn baseline(a: &Camera, b: &Camera) -> f64 {
+    a.camera_to_world.center().distance(b.camera_to_world.center())
+}
+
+/// Angle between the viewing axes of two cameras, degrees.
+fn angle(a: &Camera, b: &Camera) -> f64 {
+    let (a, b) = (a.camera_to_world.axis(), b.camera_to_world.axis());
+    a.dot(b).clamp(-1.0, 1.0).acos().to_degrees()
+}
+
+/// For each camera its most promising partners, best first: similar direction and a baseline near
+/// the usual distance of neighbours, since the depth is not known yet.
+pub(super) fn ranked(cameras: &[Camera]) -> Result<Vec<Vec<usize>>> {
+    let n = cameras.len();
+    let distances: Vec<Vec<f64>> =
+        cameras.iter().map(|a| cameras.iter().map(|b| baseline(a, b)).collect()).collect();
+    let largest = distances.iter().flatten().copied().fold(0.0, f64::max);
+    let usable = |d: f64| d > SAME_PLACE * largest && d > 0.0;
+    let mut nearest: Vec<f64> = distances
+        .iter()
+        .map(|row| row.iter().copied().filter(|&d| usable(d)).fold(f64::INFINITY, f64::min))
+        .filter(|d| d.is_finite())
+        .collect();
+    if nearest.is_empty() {
+        return Err(Error::invalid(format!(
+            "all {n} cameras stand at one place; depth needs a baseline over 0"
+        )));
+    }
+    nearest.sort_by(f64::total_cmp);
+    let usual = nearest[nearest.len() / 2];
+    Ok((0..n)
+        .map(|i| {
+            let mut cost: Vec<(f64, usize)> = (0..n)
+                .filter(|&j| j != i && usable(distances[i][j]))
+                .map(|j| {
+                    let stretch = (distances[i][j] / usual).ln();
+                    (angle(&cameras[i], &cameras[j]) / ANGLE_SCALE + stretch.abs(), j)
+                })
+                .collect();
+            cost.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            cost.into_iter().map(|(_, j)| j).collect()
+        })
+        .collect())
+}
+
+/// The pairs to compare: each view with its `count` most promising partners, each pair once.
+pub(super) fn neighbours(views: &[GrayView], count: usize) -> Result<Vec<[usize; 2]>> {
+    let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
+    let mut pairs: Vec<[usize; 2]> = ranked(&cameras)?
+        .iter()
+        .enumerate()
+        .flat_map(|(i, row)| row.iter().take(count).map(move |&j| [i.min(j), i.max(j)]))
+        .collect();
+    pairs.sort_unstable();
+    pairs.dedup();
+    Ok(pairs)
+}
+
+/// Compares each pair in both directions.
+pub(super) fn compare(views: &[GrayView], pairs: &[[usize; 2]]) -> Vec<PairFound> {
+    let sweeps: Vec<Sweep> = pairs
+        .par_iter()
+        .flat_map(|&[i, j]| [(i, j), (j, i)])
+        .map(|(i, j)| sweep(&views[i], &views[j], &Relative::new(&views[i], &views[j])))
+        .collect();
+    pairs
+        .iter()
+        .zip(sweeps.chunks_exact(2))
+        .map(|(&[i, j], sweeps)| {
+            let (a, b) = (&views[i], &views[j]);
+            let (there, back) = (Relative::new(a, b), Relative::new(b, a));
+            let first = consistent((a, b), (&there, &back), &sweeps[0], &sweeps[1]);
+            let second = consistent((b, a), (&back, &there), &sweeps[1], &sweeps[0]);
+            let matches = [supported(a, &first), supported(b, &second)];
+            let share = |count: usize, of: usize| count as f64 / of.max(1) as f64;
+            PairFound {
+                views: [i, j],
+                agreement: [0, 1].map(|s| share(matches[s].len(), sweeps[s].inside)),
+                at_nearest: [0, 1].map(|s| share(sweeps[s].at_nearest, sweeps[s].inside)),
+                matches,
+                baseline: baseline(&a.camera, &b.camera),
+                angle: angle(&a.camera, &b.camera),
+            }
+        })
+        .collect()
+}
+
+/// Compares each pair with other cameras in place of the views' own.
+pub(super) fn compare_as(
+    views: &[GrayView],
+    cameras: &[Camera],
+    pairs: &[[usize; 2]],
+) -> Vec<PairFound> {
+    let mut used: Vec<usize> = pairs.iter().flatten().copied().collect();
+    used.sort_unstable();
+    used.dedup();
+    let changed: Vec<GrayView> = used
+        .iter()
+        .map(|&i| {
+            let mut view = views[i].clone();
+            view.camera = cameras[i];
+            view
+        })
+        .collect();
+    let at = |i: usize| used.binary_search(&i).unwrap_or(0);
+    let local: Vec<[usize; 2]> = pairs.iter().map(|&[i, j]| [at(i), at(j)]).collect();
+    compare(&changed, &local)
+}
+
+/// Keeps the matches that at least two others nearby agree with: surfaces are in one piece,
+/// chance is not.
+fn supported(view: &GrayView, matches: &[Match]) -> Vec<Match> {
+    const REACH: usize = 2;
+    const NEEDED: usize = 2;
+    const PIXELS: f64 = 2.0;
+    let (cols, rows) = (view.width.div_ceil(STRIDE), view.height.div_ceil(STRIDE));
+    let mut grid = vec![f64::NAN; cols * rows];
+    let cell = |m: &Match| {
+        let at = view.candidates[m.candidate];
+        (usize::from(at.x) / STRIDE, usize::from(at.y) / STRIDE)
+    };
+    for m in matches {
+        let (x, y) = cell(m);
+        grid[y * cols + x] = m.w;
+    }
+    let enough = |m: &&Match| {
+        let (x, y) = cell(m);
+        let near = PIXELS * m.w_per_px;
+        let agreeing = (y.saturating_sub(REACH)..(y + REACH + 1).min(rows))
+            .flat_map(|row| {
+                &grid[row * cols + x.saturating_sub(REACH)..row * cols + (x + REACH + 1).min(cols)]
+            })
+            .filter(|&&w| (w - m.w).abs() <= near)
+            .count();
+        // The match itself agrees with itself.
+        agreeing > NEEDED
+    };
+    matches.iter().filter(enough).copied().collect()
+}
