@@ -1,4 +1,4 @@
-//! A bounded queue of scene ids. A place is reserved first, so that nothing acknowledged is refused.
+//! A bounded queue of scene ids. A place is reserved before a job is acknowledged.
 
 use std::{
     collections::VecDeque,

@@ -64,6 +64,8 @@ impl Gate {
 
 #[cfg(test)]
 mod tests {
+    use futures_util::FutureExt;
+
     use super::*;
 
     #[tokio::test]
@@ -71,7 +73,7 @@ mod tests {
         let gate = Gate::new(1, 2);
         let first = gate.enter().await.unwrap();
         let mut second = Box::pin(gate.enter());
-        assert!(futures_util::poll!(second.as_mut()).is_pending(), "one at a time");
+        assert!(second.as_mut().now_or_never().is_none(), "one at a time");
         let third = gate.enter().await.unwrap_err();
         assert_eq!((third.code(), third.retry_after()), (ErrorCode::Overloaded, Some(1)));
         assert_eq!(gate.inside(), 2, "the refused one is not counted");

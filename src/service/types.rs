@@ -1,6 +1,6 @@
 //! What goes into the use cases and what comes out: plain data, no transport's words.
 
-use std::time::Duration;
+use std::{fmt, time::Duration};
 
 use serde::{Deserialize, Serialize};
 
@@ -189,7 +189,7 @@ pub struct ViewsSpec {
 }
 
 /// One encoded picture.
-#[derive(Clone, Debug)]
+#[derive(Clone)]
 pub struct RenderedView {
     /// Index of its camera in the request.
     pub camera_index: usize,
@@ -213,6 +213,14 @@ pub struct RenderedView {
     pub stats: FrameStats,
     /// Time of rendering, without waiting and encoding, milliseconds.
     pub render_ms: f64,
+}
+
+impl fmt::Debug for RenderedView {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { camera_index, kind, format, width, height, bytes, .. } = self;
+        write!(f, "RenderedView(camera {camera_index}, {kind:?} as {format:?}, ")?;
+        write!(f, "{width}x{height}, {} bytes)", bytes.len())
+    }
 }
 
 /// File format of an export.

@@ -164,11 +164,14 @@ impl Inner {
             .await
             .map_err(|e| Error::internal("the render was broken off").caused_by(e))?
         };
-        tokio::time::timeout_at(deadline.into(), work).await.map_err(|elapsed| {
+        let late = || {
             let ms = started.elapsed().as_millis();
             Error::new(ErrorCode::DeadlineExceeded, format!("the view was not ready after {ms} ms"))
-                .caused_by(elapsed)
-        })?
+        };
+        if deadline <= started {
+            return Err(late());
+        }
+        tokio::time::timeout_at(deadline.into(), work).await.map_err(|_elapsed| late())?
     }
 
     fn render_here(&self, record: &Record, resolved: &Resolved) -> Result<Vec<RenderedView>> {

@@ -9,4 +9,6 @@
 
 mod common;
 mod oracle;
+mod jobs;
+mod store;
 mod tidy;

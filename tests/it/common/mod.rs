@@ -3,6 +3,7 @@
 
 pub(crate) mod compare;
 pub(crate) mod scenes;
+pub(crate) mod server;
 
 use std::path::{Path, PathBuf};
 

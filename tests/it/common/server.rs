@@ -1,0 +1,234 @@
+//! A whole server in this process: port 0, its own folder, a stand-in for the network.
+//!
+//! The stand-in reads uploads as the product does and lifts each photo to a wall at one depth, so
+//! that everything but the geometry is the product's own.
+
+use std::{
+    net::SocketAddr,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use glam::DVec3;
+use segsplat::{
+    api,
+    config::Config,
+    error::{Error, ErrorCode, Result},
+    jobs::{Made, SceneMaker, Work},
+    limits::Limits,
+    photos,
+    render::{Frame, FrameStats, RenderRequest, Renderer},
+    sample::{self, SampleOptions},
+    scene::{
+        Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SceneId, SceneStatus,
+        SourcePixel, Upload,
+    },
+    service::{CreateScene, ModelsInfo, Parts, Service},
+};
+use tempfile::TempDir;
+use tokio::{net::TcpListener, sync::oneshot, task::JoinHandle};
+
+/// Depth of the wall that the stand-in lifts each photo to, world units.
+pub(crate) const WALL_DEPTH: f64 = 3.6;
+/// How long a test waits for what must come.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A running server.
+pub(crate) struct TestServer {
+    pub(crate) addr: SocketAddr,
+    pub(crate) service: Service,
+    config: Config,
+    parts: Parts,
+    folder: TempDir,
+    stop: oneshot::Sender<()>,
+    served: JoinHandle<Result<()>>,
+}
+
+impl TestServer {
+    /// A server with the stand-in maker and the default limits.
+    pub(crate) async fn start() -> Self {
+        Self::with(|_, _| {}).await
+    }
+
+    /// A server whose limits or parts `change` sets.
+    pub(crate) async fn with(change: impl FnOnce(&mut Config, &mut Parts)) -> Self {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let mut config = Config::default();
+        config.data_dir = folder.path().join("data");
+        let mut parts = Parts {
+            maker: Arc::new(WallMaker::default()),
+            renderer: Arc::new(PointRenderer),
+            models: ModelsInfo::default(),
+        };
+        change(&mut config, &mut parts);
+        Self::serve(config, parts, folder).await
+    }
+
+    async fn serve(config: Config, parts: Parts, folder: TempDir) -> Self {
+        let service = Service::open(config.clone(), parts.clone()).expect("the folder is usable");
+        let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
+        let addr = listener.local_addr().expect("a bound listener has an address");
+        let (stop, stopped) = oneshot::channel();
+        let served = tokio::spawn(api::serve(listener, service.clone(), async {
+            let _ = stopped.await;
+        }));
+        Self { addr, service, config, parts, folder, stop, served }
+    }
+
+    /// `http://…` of a path that begins with a slash.
+    pub(crate) fn url(&self, path: &str) -> String {
+        format!("http://{}{path}", self.addr)
+    }
+
+    /// Where scenes, uploads and statuses lie.
+    pub(crate) fn data_dir(&self) -> &std::path::Path {
+        &self.config.data_dir
+    }
+
+    /// Stops the server as SIGTERM does; gives the folder so that it lives on.
+    pub(crate) async fn stop(self) -> TempDir {
+        let Self { service, stop, served, folder, .. } = self;
+        let _ = stop.send(());
+        served.await.expect("the server does not panic").expect("the server ends well");
+        tokio::task::spawn_blocking(move || service.shut_down()).await.expect("workers stop");
+        folder
+    }
+
+    /// Stops the server and starts another one on the same folder.
+    pub(crate) async fn restart(self) -> Self {
+        let (config, parts) = (self.config.clone(), self.parts.clone());
+        let folder = self.stop().await;
+        Self::serve(config, parts, folder).await
+    }
+
+    /// Makes a scene of [`upload`] and waits for it.
+    pub(crate) async fn scene(&self) -> SceneStatus {
+        let request =
+            CreateScene { upload: upload(), wait: Some(PATIENCE), ..CreateScene::default() };
+        self.service.create_scene(request).await.expect("the sample is a good upload").status
+    }
+
+    /// Waits until nothing more will happen to a scene.
+    pub(crate) async fn finished(&self, id: &SceneId) -> SceneStatus {
+        let status = self.service.wait(id, PATIENCE).await.expect("the scene is known");
+        assert!(status.state.is_final(), "still {status:?} after {PATIENCE:?}");
+        status
+    }
+}
+
+/// Three small posed photos of the sample room, as a caller sends them.
+pub(crate) fn upload() -> Upload {
+    let options = SampleOptions { photos: 3, width: 64, height: 48, seed: 5 };
+    sample::upload(&options).expect("the options are in range")
+}
+
+/// Stands in for the network. Held back while `hold` is true, so that tests see work in progress;
+/// a photo named `panic` makes it panic.
+#[derive(Debug, Default)]
+pub(crate) struct WallMaker {
+    pub(crate) hold: AtomicBool,
+}
+
+impl SceneMaker for WallMaker {
+    fn check(&self, upload: &Upload, limits: &Limits) -> Result<()> {
+        photos::read(upload, limits).map(|_| ())
+    }
+
+    fn make(&self, work: Work<'_>) -> Result<Made> {
+        let photos = photos::read(work.upload, &Limits::default())?;
+        (work.progress)("photos", 0.1);
+        (work.progress)("geometry", 0.5);
+        let begun = Instant::now();
+        while self.hold.load(Ordering::Acquire) {
+            assert!(begun.elapsed() < PATIENCE, "nobody let go of the stand-in");
+            if work.cancel.load(Ordering::Acquire) {
+                return Err(Error::new(ErrorCode::Cancelled, "stopped"));
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        assert!(!photos.iter().any(|p| p.file.contains("panic")), "on purpose");
+        let (gaussians, _) = Gaussians::sanitize(wall(&photos))?;
+        let report = HealthReport {
+            photos: photos.len() as u32,
+            views_used: photos.len() as u32,
+            gaussians: gaussians.len() as u64,
+            depth_range: [WALL_DEPTH, WALL_DEPTH],
+            median_depth: WALL_DEPTH,
+            ..HealthReport::default()
+        };
+        let cameras =
+            photos.iter().map(|p| SceneCamera { file: p.file.clone(), camera: p.camera }).collect();
+        Ok(Made { gaussians, report, cameras, bundle_sha256: "stand-in".to_owned() })
+    }
+}
+
+fn wall(photos: &[PosedPhoto]) -> RawGaussians {
+    let mut raw = RawGaussians { origin: DVec3::new(0.5, 0.0, -0.25), ..RawGaussians::default() };
+    for (view, posed) in photos.iter().enumerate() {
+        let lens = posed.camera.intrinsics;
+        let to_world = posed.camera.camera_to_world.matrix();
+        for y in (0..lens.height).step_by(2) {
+            for x in (0..lens.width).step_by(2) {
+                let at = lens.unproject(f64::from(x) + 1.0, f64::from(y) + 1.0, WALL_DEPTH);
+                let mean = to_world.transform_point3(at) - raw.origin;
+                let pixel = (y * lens.width + x) as usize * 3;
+                let rgb = &posed.photo.rgb[pixel..pixel + 3];
+                let colour = [0, 1, 2].map(|c| (f32::from(rgb[c]) / 255.0 - 0.5) / 0.282_094_8);
+                raw.means.push(mean.as_vec3().to_array());
+                raw.quats.push([1.0, 0.0, 0.0, 0.0]);
+                raw.scales.push([(WALL_DEPTH / lens.fx) as f32; 3]);
+                raw.opacities.push(0.9);
+                raw.sh.push(colour);
+                raw.semantic_index.push(view as u16);
+                raw.source.push(SourcePixel { view: view as u16, x: x as u16, y: y as u16 });
+            }
+        }
+    }
+    raw
+}
+
+/// Draws each Gaussian as the one pixel it falls on, the nearest in front.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PointRenderer;
+
+impl Renderer for PointRenderer {
+    fn name(&self) -> String {
+        "points".to_owned()
+    }
+
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        let lens = request.camera.intrinsics;
+        let viewmat = request.camera.camera_to_world.viewmat();
+        let pixels = lens.width as usize * lens.height as usize;
+        let (mut color, mut depth) = (vec![request.background; pixels], vec![0.0_f32; pixels]);
+        let mut stats = FrameStats::default();
+        for (mean, sh) in gaussians.means().iter().zip(gaussians.sh()) {
+            let world = DVec3::from_array(mean.map(f64::from)) + gaussians.as_raw().origin;
+            let at = viewmat.transform_point3(world);
+            let (u, v) = lens.project(at);
+            let inside =
+                u >= 0.0 && v >= 0.0 && u < f64::from(lens.width) && v < f64::from(lens.height);
+            if at.z <= f64::from(request.near) || !inside {
+                continue;
+            }
+            let pixel = v as usize * lens.width as usize + u as usize;
+            if depth[pixel] == 0.0 || depth[pixel] > at.z as f32 {
+                depth[pixel] = at.z as f32;
+                color[pixel] = sh.map(|v| v * 0.282_094_8 + 0.5);
+            }
+            stats.visible += 1;
+        }
+        let alpha = depth.iter().map(|&z| f32::from(u8::from(z > 0.0))).collect();
+        Ok(Frame {
+            width: lens.width,
+            height: lens.height,
+            color: request.kinds.color.then_some(color),
+            depth: request.kinds.depth.then_some(depth),
+            alpha: request.kinds.alpha.then_some(alpha),
+            stats,
+        })
+    }
+}

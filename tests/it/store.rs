@@ -1,0 +1,427 @@
+//! The store: bit for bit, whole or not at all, bad files put aside, PLY out and in.
+
+use std::{fs, io::Cursor, path::Path};
+
+use glam::DVec3;
+use segsplat::{
+    error::{ErrorCode, Result},
+    scene::{
+        Gaussians, HealthReport, Provenance, RawGaussians, SanitizeReport, Scene, SceneId,
+        SceneMeta, SceneOptions, SceneState, SceneStatus, SourcePixel, Upload, UploadCameras,
+        UploadFile,
+    },
+    store::{
+        Record, Store,
+        ply::{PlyWriter, ply_size_bytes, read_ply},
+        read_scene, write_scene,
+    },
+};
+
+/// Reproducible numbers in 0..1.
+struct Numbers(u64);
+
+impl Numbers {
+    fn next(&mut self) -> f32 {
+        self.0 =
+            self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 40) as f32 / (1_u64 << 24) as f32
+    }
+}
+
+fn gaussians(count: usize, sh_degree: u8) -> Gaussians {
+    let mut n = Numbers(u64::from(sh_degree) + 17);
+    let k = (usize::from(sh_degree) + 1).pow(2);
+    let mut raw = RawGaussians { sh_degree, ..RawGaussians::default() };
+    for i in 0..count {
+        raw.means.push([0; 3].map(|_| n.next() * 20.0 - 10.0));
+        raw.quats.push([0; 4].map(|_| n.next() * 2.0 - 1.0));
+        raw.scales.push([0; 3].map(|_| 1e-4 + n.next()));
+        raw.opacities.push(0.01 + 0.98 * n.next());
+        (0..k).for_each(|_| raw.sh.push([0; 3].map(|_| n.next() * 4.0 - 2.0)));
+        raw.semantic_index.push((n.next() * 65_535.0) as u16);
+        raw.source.push(SourcePixel { view: i as u16 % 7, x: i as u16, y: 3 });
+    }
+    Gaussians::sanitize(raw).unwrap().0
+}
+
+fn scene(id: u8, count: usize, sh_degree: u8) -> Scene {
+    let mut raw = gaussians(count, sh_degree).into_raw();
+    raw.origin = DVec3::new(512_345.678_901, -1.0 / 3.0, 1e-300);
+    let meta = SceneMeta {
+        id: SceneId::from_bytes([id; 16]),
+        created_ms: 1_700_000_000_123,
+        cameras: Vec::new(),
+        report: HealthReport { median_depth: 0.1 + 0.2, ..HealthReport::default() },
+        provenance: Provenance { bundle_sha256: "ab".repeat(32), ..Provenance::default() },
+    };
+    Scene { meta, gaussians: Gaussians::restore(raw).unwrap() }
+}
+
+fn bits(gaussians: &Gaussians) -> Vec<u32> {
+    let raw = gaussians.as_raw();
+    let floats = [
+        raw.means.as_flattened(),
+        raw.quats.as_flattened(),
+        raw.scales.as_flattened(),
+        &raw.opacities,
+        raw.sh.as_flattened(),
+    ];
+    let mut bits: Vec<u32> = floats.iter().copied().flatten().map(|v| v.to_bits()).collect();
+    bits.extend(raw.semantic_index.iter().map(|&v| u32::from(v)));
+    bits.extend(raw.source.iter().flat_map(|s| [s.view, s.x, s.y].map(u32::from)));
+    bits.extend(
+        raw.origin.to_array().iter().flat_map(|v| [v.to_bits() as u32, (v.to_bits() >> 32) as u32]),
+    );
+    bits
+}
+
+fn record(id: u8) -> Record {
+    let id = SceneId::from_bytes([id; 16]);
+    Record {
+        status: SceneStatus::new(id, SceneState::Queued, 1_700_000_000_123),
+        options: SceneOptions { max_views: Some(4) },
+        idempotency_key: Some("key".to_owned()),
+        request_sha256: "cd".repeat(32),
+        attempts: 0,
+        scene_sha256: None,
+    }
+}
+
+fn upload() -> Upload {
+    let photo =
+        |name: &str, bytes: &[u8]| UploadFile { name: name.to_owned(), bytes: bytes.to_vec() };
+    Upload {
+        cameras: Some(UploadCameras::Cameras(b"{\"cameras\":[]}".to_vec())),
+        photos: vec![photo("../../a.png", &[1, 2, 3]), photo("b", &[])],
+        archive: Some(vec![9; 1000]),
+    }
+}
+
+fn file_of(scene: &Scene) -> Vec<u8> {
+    let mut file = Vec::new();
+    write_scene(&mut file, scene).unwrap();
+    file
+}
+
+fn open(root: &Path) -> (Store, Vec<Record>) {
+    Store::open(root, 1 << 20).unwrap()
+}
+
+#[test]
+fn a_scene_comes_back_bit_for_bit() {
+    for (count, degree) in [(0, 0), (1, 3), (1000, 0), (77, 1), (50, 2)] {
+        let written = scene(1, count, degree);
+        let (back, _) = read_scene(&file_of(&written)).unwrap();
+        assert_eq!(back.meta, written.meta);
+        assert_eq!(back.gaussians.sh_degree(), degree);
+        assert_eq!(bits(&back.gaussians), bits(&written.gaussians), "{count} of degree {degree}");
+    }
+}
+
+#[test]
+fn any_safetensors_reader_opens_a_scene() {
+    let written = scene(1, 10, 1);
+    let file = file_of(&written);
+    let tensors = safetensors::SafeTensors::deserialize(&file).unwrap();
+    assert_eq!(tensors.tensor("sh").unwrap().shape(), [10, 4, 3]);
+    assert_eq!(tensors.tensor("sha256").unwrap().shape(), [32]);
+}
+
+#[test]
+fn every_truncation_and_flipped_bit_is_found() {
+    let file = file_of(&scene(1, 40, 1));
+    let corrupt = |bytes: &[u8], what: String| {
+        let error = read_scene(bytes).map(|_| ()).expect_err(&what);
+        assert_eq!(error.code(), ErrorCode::SceneCorrupt, "{what}: {error}");
+    };
+    for length in (0..file.len()).step_by(7).chain([file.len() - 1]) {
+        corrupt(&file[..length], format!("cut to {length} bytes"));
+    }
+    for at in (0..file.len()).step_by(3).chain([0, 7, 8, file.len() - 1]) {
+        let mut flipped = file.clone();
+        flipped[at] ^= 1 << (at % 8);
+        corrupt(&flipped, format!("bit flipped in byte {at}"));
+    }
+    let mut longer = file;
+    longer.push(0);
+    corrupt(&longer, "one byte more".to_owned());
+}
+
+#[test]
+fn a_bad_scene_is_put_aside_and_the_start_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let (store, _) = open(folder.path());
+    for id in [1, 2] {
+        store.put_upload(&upload(), &record(id)).unwrap();
+        store.put_scene(scene(id, 30, 0)).unwrap();
+    }
+    drop(store);
+    let id = SceneId::from_bytes([1; 16]);
+    let path = folder.path().join("scenes").join(id.as_str()).join("scene.segsplat");
+    let mut file = fs::read(&path).unwrap();
+    let middle = file.len() / 2;
+    file[middle] ^= 4;
+    fs::write(&path, file).unwrap();
+
+    let (store, records) = open(folder.path());
+    assert_eq!(records.len(), 2);
+    assert_eq!(store.scene(&id).unwrap_err().code(), ErrorCode::SceneCorrupt);
+    assert!(!path.exists() && path.with_extension("quarantined").exists());
+    assert_eq!(store.scene(&id).unwrap_err().code(), ErrorCode::SceneCorrupt, "and stays so");
+    assert!(store.scene(&SceneId::from_bytes([2; 16])).is_ok(), "its neighbour is untouched");
+}
+
+#[test]
+fn a_bad_status_is_rebuilt_from_the_scene_or_from_the_upload() {
+    let folder = tempfile::tempdir().unwrap();
+    let (store, _) = open(folder.path());
+    for id in [1, 2, 3] {
+        store.put_upload(&upload(), &record(id)).unwrap();
+    }
+    store.put_scene(scene(1, 5, 0)).unwrap();
+    drop(store);
+    let path = |id: u8, name: &str| {
+        let id = SceneId::from_bytes([id; 16]);
+        folder.path().join("scenes").join(id.as_str()).join(name)
+    };
+    for id in [1, 2, 3] {
+        let mut file = fs::read(path(id, "status.json")).unwrap();
+        let digit = file.windows(3).position(|w| w == b"123").unwrap();
+        file[digit] = b'9';
+        fs::write(path(id, "status.json"), file).unwrap();
+    }
+    fs::write(path(3, "upload.segsplat"), b"rubbish").unwrap();
+
+    let (_store, records) = open(folder.path());
+    let found = |id: u8| {
+        let id = SceneId::from_bytes([id; 16]);
+        records.iter().find(|r| r.status.id == id).unwrap()
+    };
+    assert_eq!(found(1).status.state, SceneState::Done, "the scene file says so");
+    assert!(found(1).scene_sha256.is_some());
+    assert_eq!(*found(2), record(2), "the upload holds the first record");
+    assert_eq!(found(3).status.state, SceneState::Failed);
+    assert_eq!(found(3).status.error.as_ref().unwrap().code, "scene_corrupt");
+}
+
+#[test]
+fn what_a_crash_leaves_is_nothing_or_all() {
+    let folder = tempfile::tempdir().unwrap();
+    let (store, _) = open(folder.path());
+    store.put_upload(&upload(), &record(1)).unwrap();
+    store.put_scene(scene(1, 20, 0)).unwrap();
+    drop(store);
+    let id = SceneId::from_bytes([1; 16]);
+    let scenes = folder.path().join("scenes");
+    // Killed while a new scene file, another upload and a deletion were under way.
+    fs::write(scenes.join(id.as_str()).join("scene.tmp"), b"half").unwrap();
+    for left in ["incoming", "trash"] {
+        let half = folder.path().join(left).join(SceneId::from_bytes([7; 16]).as_str());
+        fs::create_dir(&half).unwrap();
+        fs::write(half.join("upload.tmp"), b"half").unwrap();
+    }
+    fs::create_dir(scenes.join("not-an-id")).unwrap();
+
+    let (store, records) = open(folder.path());
+    assert_eq!(records.len(), 1, "the half upload was never acknowledged");
+    assert_eq!(bits(&store.scene(&id).unwrap().gaussians), bits(&scene(1, 20, 0).gaussians));
+    assert!(!scenes.join(id.as_str()).join("scene.tmp").exists());
+    for left in ["incoming", "trash"] {
+        assert_eq!(fs::read_dir(folder.path().join(left)).unwrap().count(), 0, "{left}");
+    }
+}
+
+#[test]
+fn uploads_come_back_as_sent_and_names_are_no_paths() {
+    let folder = tempfile::tempdir().unwrap();
+    let (store, _) = open(folder.path());
+    store.put_upload(&upload(), &record(1)).unwrap();
+    drop(store);
+    let (store, records) = open(folder.path());
+    assert_eq!(records, [record(1)]);
+    let id = SceneId::from_bytes([1; 16]);
+    assert_eq!(store.upload(&id).unwrap(), upload());
+    store.remove(&id).unwrap();
+    for result in [store.upload(&id).map(|_| ()), store.remove(&id), store.scene(&id).map(|_| ())] {
+        assert_eq!(result.unwrap_err().code(), ErrorCode::SceneNotFound);
+    }
+    assert!(store.put_scene(scene(1, 1, 0)).is_err(), "a deleted scene does not come back");
+}
+
+#[test]
+fn one_process_holds_a_folder() {
+    let folder = tempfile::tempdir().unwrap();
+    let (store, _) = open(folder.path());
+    let second = Store::open(folder.path(), 0).unwrap_err();
+    assert_eq!(second.code(), ErrorCode::StoreUnavailable);
+    drop(store);
+    open(folder.path());
+}
+
+fn ply_of(gaussians: &Gaussians) -> Vec<u8> {
+    PlyWriter::new(gaussians).flatten().collect()
+}
+
+fn read(file: &[u8]) -> Result<(Gaussians, SanitizeReport)> {
+    read_ply(Cursor::new(file), 100_000)
+}
+
+#[test]
+fn ply_goes_out_and_comes_in() {
+    for degree in 0..=3 {
+        let out = gaussians(20_000, degree);
+        let file = ply_of(&out);
+        assert_eq!(file.len() as u64, ply_size_bytes(&out));
+        let (back, report) = read(&file).unwrap();
+        assert_eq!(report, SanitizeReport::default());
+        let (a, b) = (out.as_raw(), back.as_raw());
+        assert_eq!((&a.means, &a.sh, &a.semantic_index), (&b.means, &b.sh, &b.semantic_index));
+        let close = |x: &[f32], y: &[f32]| {
+            assert_eq!(x.len(), y.len());
+            let worst = x.iter().zip(y).map(|(x, y)| (x - y).abs() / x.abs().max(1e-3));
+            assert!(worst.fold(0.0, f32::max) < 2e-6, "degree {degree}");
+        };
+        close(a.quats.as_flattened(), b.quats.as_flattened());
+        close(a.scales.as_flattened(), b.scales.as_flattened());
+        close(&a.opacities, &b.opacities);
+    }
+}
+
+#[test]
+fn ply_has_the_standard_attributes_in_the_standard_order() {
+    let file = ply_of(&gaussians(2, 1));
+    let text = String::from_utf8_lossy(&file);
+    let header = &text[..text.find("end_header").unwrap()];
+    let names: Vec<&str> = header
+        .lines()
+        .filter_map(|line| line.strip_prefix("property ").and_then(|l| l.split(' ').nth(1)))
+        .collect();
+    let mut want = vec!["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"];
+    let rest: Vec<String> = (0..9).map(|i| format!("f_rest_{i}")).collect();
+    want.extend(rest.iter().map(String::as_str));
+    want.extend(["opacity", "scale_0", "scale_1", "scale_2"]);
+    want.extend(["rot_0", "rot_1", "rot_2", "rot_3", "semantic_index"]);
+    assert_eq!(names, want);
+
+    // Channel-major: f_rest_1 is the second red coefficient beyond the constant one.
+    let scene = gaussians(2, 1);
+    let vertices = &file[text.find("end_header").unwrap() + "end_header\n".len()..];
+    let float = |i: usize| f32::from_le_bytes(vertices[4 * i..4 * i + 4].try_into().unwrap());
+    assert_eq!(float(9 + 1), scene.sh()[2][0]);
+    assert_eq!(float(9 + 3), scene.sh()[1][1]);
+    assert!((float(18) - (scene.opacities()[0] / (1.0 - scene.opacities()[0])).ln()).abs() < 1e-4);
+    assert!((float(19) - scene.scales()[0][0].ln()).abs() < 1e-5);
+    assert_eq!(float(22), scene.quats()[0][0], "w first");
+}
+
+fn other_ply(format: &str, endian: impl Fn(f64) -> [u8; 8]) -> Vec<u8> {
+    let names =
+        "rot_3 opacity z y x f_dc_2 f_dc_1 f_dc_0 odd scale_0 scale_1 scale_2 rot_0 rot_1 rot_2";
+    let mut file = format!("ply\r\nformat {format} 1.0\ncomment made elsewhere\nobj_info x\n");
+    file.push_str("element vertex 1\n");
+    names.split(' ').for_each(|name| file.push_str(&format!("property double {name}\n")));
+    file.push_str("element face 3\nproperty list uchar int vertex_index\nend_header\n");
+    let mut file = file.into_bytes();
+    let far = 5e6 + 0.125;
+    for value in [0.0, 0.0, 3.0, 2.0, far, 0.3, 0.2, 0.1, 99.0, -1.0, -2.0, -3.0, 2.0, 0.0, 0.0] {
+        file.extend(endian(value));
+    }
+    file
+}
+
+#[test]
+fn ply_of_other_programs_is_read() {
+    for file in [
+        other_ply("binary_little_endian", f64::to_le_bytes),
+        other_ply("binary_big_endian", f64::to_be_bytes),
+    ] {
+        let (back, _) = read(&file).unwrap();
+        let raw = back.as_raw();
+        let at = raw.origin + DVec3::from_array(raw.means[0].map(f64::from));
+        assert_eq!(at, DVec3::new(5e6 + 0.125, 2.0, 3.0), "f64 positions are kept");
+        assert_eq!(raw.sh[0], [0.1, 0.2, 0.3]);
+        assert_eq!(raw.opacities[0], 0.5);
+        assert_eq!(raw.quats[0], [1.0, 0.0, 0.0, 0.0]);
+        assert!((raw.scales[0][2] - (-3.0_f32).exp()).abs() < 1e-6);
+    }
+}
+
+#[test]
+fn poisoned_ply_is_dropped_or_clamped_with_counts() {
+    let raw = gaussians(1, 0).into_raw();
+    let one = ply_of(&Gaussians::restore(raw).unwrap());
+    let text = String::from_utf8_lossy(&one).into_owned();
+    let start = text.find("end_header").unwrap() + "end_header\n".len();
+    let header = text[..start].replace("vertex 1\n", "vertex 8\n");
+    let vertex = &one[start..];
+    // Which float of the vertex, and the poison in it.
+    let poisons: [(&[usize], f32); 8] = [
+        (&[0], f32::NAN),
+        (&[1], f32::INFINITY),
+        (&[2], 1e30),
+        (&[9], -20.0),
+        (&[10], 1e30),
+        (&[11], -1e30),
+        (&[13, 14, 15, 16], 0.0),
+        (&[6], f32::NEG_INFINITY),
+    ];
+    let mut file = header.into_bytes();
+    for (places, poison) in poisons {
+        let mut bad = vertex.to_vec();
+        for place in places {
+            bad[4 * place..4 * place + 4].copy_from_slice(&poison.to_le_bytes());
+        }
+        file.extend(bad);
+    }
+    let (back, report) = read(&file).unwrap();
+    assert!(back.is_empty(), "{} kept", back.len());
+    let want = SanitizeReport {
+        not_finite: 4,
+        too_far: 1,
+        transparent: 1,
+        zero_quat: 1,
+        zero_scale: 1,
+        ..SanitizeReport::default()
+    };
+    assert_eq!(report, want);
+}
+
+#[test]
+fn hostile_ply_is_refused_with_a_typed_error() {
+    let good = ply_of(&gaussians(3, 0));
+    let text = String::from_utf8_lossy(&good).into_owned();
+    let header_end = text.find("end_header").unwrap() + "end_header\n".len();
+    let with = |from: &str, to: &str| {
+        let mut file = text[..header_end].replace(from, to).into_bytes();
+        file.extend(&good[header_end..]);
+        file
+    };
+    let many: String = (0..300).map(|i| format!("property float a{i}\n")).collect();
+    let cases: Vec<(Vec<u8>, &str)> = vec![
+        (Vec::new(), "`ply`"),
+        (b"plyx\n".to_vec(), "does not begin"),
+        (vec![b'a'; 1 << 20], "is missing in the first"),
+        (b"ply\n\xff\xfe\n".to_vec(), "not text"),
+        (with("binary_little_endian", "ascii"), "only binary"),
+        (with("element vertex 3", "element vertex -3"), "number of vertices"),
+        (with("element vertex 3", "element vertex 99999999999999999999"), "number of vertices"),
+        (with("element vertex 3", "element vertex 100001"), "100001 is over 100000"),
+        (with("element vertex 3", "element vertex 90000"), "ends after 3 of 90000"),
+        (with("element vertex 3", "element face 3"), "before the vertices"),
+        (with("property float scale_2\n", ""), "no `scale_2`"),
+        (with("property float y", "property float x"), "twice"),
+        (with("property float y", "property quad y"), "is not known"),
+        (with("property float y", "property list uchar float y"), "is not known"),
+        (with("end_header\n", &format!("{many}end_header\n")), "is over 256"),
+        (with("end_header\n", ""), "PLY: the header"),
+        (with("property ushort semantic_index", "property float f_rest_0"), "1 `f_rest_`"),
+        (good[..good.len() - 1].to_vec(), "ends after 2 of 3"),
+    ];
+    for (file, want) in cases {
+        let error = read(&file).map(|_| ()).expect_err(want);
+        assert!(error.message().contains(want), "{:?} lacks {want:?}", error.message());
+    }
+    for length in 0..good.len() {
+        assert!(read(&good[..length]).is_err(), "cut to {length} bytes");
+    }
+}
