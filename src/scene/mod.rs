@@ -4,6 +4,7 @@
 mod camera;
 mod capture;
 mod gaussians;
+mod geometry;
 mod id;
 mod made;
 mod photo;
@@ -14,6 +15,7 @@ mod upload;
 pub use camera::{Camera, CameraToWorld, Intrinsics, ORTHONORMAL_TOLERANCE};
 pub use capture::{Capture, ViewSet};
 pub use gaussians::{Gaussians, RawGaussians, SanitizeReport, SourcePixel};
+pub use geometry::ViewGaussians;
 pub use id::{SCENE_ID_CHARS, SceneId};
 pub use made::{PhotoHash, Provenance, Scene, SceneMeta};
 pub use photo::{Photo, PosedPhoto};

@@ -1,0 +1,124 @@
+//! The model frame: the first camera is the identity, lengths are scaled as the manifest says.
+
+use glam::{DMat3, DMat4};
+
+use crate::{
+    error::{Error, Result},
+    models::Translation,
+    scene::CameraToWorld,
+};
+
+/// The similarity between the world and the model frame of one set of cameras.
+#[derive(Clone, Copy, Debug)]
+pub struct ModelFrame {
+    first: CameraToWorld,
+    /// World units in one model unit.
+    unit: f64,
+}
+
+impl ModelFrame {
+    /// The frame of `cameras`, the first of which becomes the identity.
+    ///
+    /// # Errors
+    /// `invalid_request` when there is no camera, or all stand at one place and the scale is the
+    /// largest baseline.
+    pub fn new(cameras: &[CameraToWorld], translation: Translation) -> Result<Self> {
+        let first = *cameras
+            .first()
+            .ok_or_else(|| Error::invalid("a set of views must have at least one camera"))?;
+        let unit = match translation {
+            Translation::World => 1.0,
+            Translation::LargestBaseline => largest_baseline(cameras),
+        };
+        if !unit.is_finite() || unit <= 0.0 {
+            return Err(Error::invalid(
+                "the photos were all taken at one place: without a baseline there is no depth",
+            ));
+        }
+        Ok(Self { first, unit })
+    }
+
+    /// World units in one model unit.
+    #[must_use]
+    pub fn unit(&self) -> f64 {
+        self.unit
+    }
+
+    /// The model frame's rigid pose in the world: the first camera's.
+    #[must_use]
+    pub fn pose(&self) -> CameraToWorld {
+        self.first
+    }
+
+    /// A camera's pose in the model frame.
+    #[must_use]
+    pub fn camera(&self, camera_to_world: &CameraToWorld) -> DMat4 {
+        let back = self.first.rotation().transpose();
+        let rotation: DMat3 = back * camera_to_world.rotation();
+        let center = back * (camera_to_world.center() - self.first.center()) / self.unit;
+        DMat4::from_cols(
+            rotation.x_axis.extend(0.0),
+            rotation.y_axis.extend(0.0),
+            rotation.z_axis.extend(0.0),
+            center.extend(1.0),
+        )
+    }
+}
+
+/// Largest distance between two of the cameras, world units.
+fn largest_baseline(cameras: &[CameraToWorld]) -> f64 {
+    let mut largest = 0.0_f64;
+    for (i, a) in cameras.iter().enumerate() {
+        for b in &cameras[..i] {
+            largest = largest.max(a.center().distance(b.center()));
+        }
+    }
+    largest
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use glam::DVec3;
+
+    fn cameras() -> Vec<CameraToWorld> {
+        [DVec3::new(1e5, 2.0, 3.0), DVec3::new(1e5 + 2.0, 2.5, 3.0), DVec3::new(1e5, -1.0, 3.3)]
+            .iter()
+            .map(|&eye| {
+                let target = DVec3::new(1e5, 1.0, 9.0);
+                CameraToWorld::look_at(eye, target, DVec3::NEG_Y, "test").unwrap()
+            })
+            .collect()
+    }
+
+    #[test]
+    fn the_first_camera_is_the_identity_and_the_largest_baseline_one() {
+        let cameras = cameras();
+        let frame = ModelFrame::new(&cameras, Translation::LargestBaseline).unwrap();
+        let model: Vec<DMat4> = cameras.iter().map(|c| frame.camera(c)).collect();
+        assert!(model[0].abs_diff_eq(DMat4::IDENTITY, 1e-9), "{:?}", model[0]);
+        let center = |m: &DMat4| m.w_axis.truncate();
+        let far = center(&model[1]).distance(center(&model[2]));
+        assert!((far - 1.0).abs() < 1e-9, "largest baseline {far}");
+    }
+
+    #[test]
+    fn model_points_come_back_to_the_world() {
+        let cameras = cameras();
+        let frame = ModelFrame::new(&cameras, Translation::LargestBaseline).unwrap();
+        let world = DVec3::new(1e5 + 0.3, 1.2, 7.0);
+        for camera in &cameras {
+            let seen = camera.viewmat().transform_point3(world);
+            let in_model = frame.camera(camera).transform_point3(seen / frame.unit());
+            let back = frame.pose().matrix().transform_point3(in_model * frame.unit());
+            assert!(back.distance(world) < 1e-6, "{back} is not {world}");
+        }
+    }
+
+    #[test]
+    fn cameras_at_one_place_are_refused() {
+        let one = cameras()[0];
+        assert!(ModelFrame::new(&[one, one], Translation::LargestBaseline).is_err(), "no baseline");
+        assert!(ModelFrame::new(&[one, one], Translation::World).is_ok(), "world units need none");
+    }
+}
