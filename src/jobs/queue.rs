@@ -1,4 +1,4 @@
-//! A bounded queue of scene ids. A place is reserved before a job is acknowledged.
+//! A bounded queue of scene ids. A place is reserved first: nothing acknowledged is refused.
 
 use std::{
     collections::VecDeque,

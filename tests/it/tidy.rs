@@ -315,8 +315,8 @@ fn errors_page() -> String {
         "# Errors\n\nMade from the table in [`src/error.rs`](../src/error.rs) by \
          `UPDATE_DOCS=1 cargo test --release --test it tidy`; a test holds the two together.\n\n\
          The name is the truth for clients: HTTP answers it as `code` of the JSON body, gRPC as \
-         the\nmetadata entry `segsplat-code`, the command line on standard error. gRPC numbers are those \
-         of `google.rpc.Code`.\n\n\
+         the\nmetadata entry `segsplat-code`, the command line on standard error. gRPC numbers \
+         are those of `google.rpc.Code`.\n\n\
          | code | HTTP | gRPC | exit | same call may succeed later | meaning |\n\
          |---|---|---|---|---|---|\n",
     );
