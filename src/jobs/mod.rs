@@ -4,6 +4,7 @@
 //! Invariant: what was acknowledged is made, failed with a code, or cancelled, over any restart.
 
 mod board;
+mod maker;
 mod queue;
 mod worker;
 
@@ -18,6 +19,8 @@ use std::{
 };
 
 use tokio::sync::watch;
+
+pub use self::maker::PipelineMaker;
 
 use self::{board::Board, queue::Queue, worker::Stop};
 use crate::{

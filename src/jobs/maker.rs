@@ -1,0 +1,64 @@
+//! The product's own way of making a scene: the pipeline, with its stages as one fraction.
+
+use std::sync::Arc;
+
+use crate::{
+    error::Result,
+    jobs::{Made, SceneMaker, Work},
+    limits::Limits,
+    pipeline::{self, Engine, Stage},
+    scene::Upload,
+};
+
+/// Makes scenes with an [`Engine`].
+#[derive(Debug)]
+pub struct PipelineMaker {
+    engine: Arc<Engine>,
+    limits: Limits,
+}
+
+impl PipelineMaker {
+    /// A maker that reads photos under these limits.
+    #[must_use]
+    pub fn new(engine: Arc<Engine>, limits: Limits) -> Self {
+        Self { engine, limits }
+    }
+}
+
+impl SceneMaker for PipelineMaker {
+    fn check(&self, upload: &Upload, limits: &Limits) -> Result<()> {
+        pipeline::check(upload, limits)
+    }
+
+    fn make(&self, work: Work<'_>) -> Result<Made> {
+        let progress = |stage: Stage, fraction: f32| {
+            let [from, to] = share_of(stage);
+            (work.progress)(stage.name(), from + (to - from) * fraction);
+        };
+        let made = pipeline::make(
+            &self.engine,
+            work.upload,
+            &self.limits,
+            work.options,
+            &progress,
+            work.cancel,
+        )?;
+        Ok(Made {
+            gaussians: made.gaussians,
+            report: made.report,
+            cameras: made.cameras,
+            bundle_sha256: self.engine.bundle().sha256().to_owned(),
+        })
+    }
+}
+
+/// Where a stage begins and ends in the whole, 0..1; most of the time goes to the network.
+fn share_of(stage: Stage) -> [f32; 2] {
+    match stage {
+        Stage::Photos => [0.0, 0.1],
+        Stage::Capture => [0.1, 0.2],
+        Stage::Geometry => [0.2, 0.9],
+        Stage::Lift => [0.9, 0.97],
+        Stage::Store => [0.97, 1.0],
+    }
+}
