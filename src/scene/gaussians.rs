@@ -1,5 +1,7 @@
 //! Gaussians as a struct of arrays, world frame, f32 relative to an f64 origin.
 
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use glam::DVec3;
 
 use crate::error::{Error, ErrorCode, Result};
@@ -79,7 +81,11 @@ impl SanitizeReport {
 #[derive(Clone, Debug, Default)]
 pub struct Gaussians {
     raw: RawGaussians,
+    identity: u64,
 }
+
+/// Source of [`Gaussians::identity`]; 0 is the empty default.
+static NEXT_IDENTITY: AtomicU64 = AtomicU64::new(1);
 
 impl Gaussians {
     /// Largest |coordinate| of a mean relative to the origin, world units.
@@ -139,7 +145,8 @@ impl Gaussians {
                 kept.source.push(raw.source[i]);
             }
         }
-        Ok((Self { raw: kept }, report))
+        let identity = NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed);
+        Ok((Self { raw: kept, identity }, report))
     }
 
     /// Takes back what [`Self::into_raw`] gave, bit for bit.
@@ -170,7 +177,15 @@ impl Gaussians {
                 return Err(bad(format!("number {i} is out of range")));
             }
         }
-        Ok(Self { raw })
+        Ok(Self { raw, identity: NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed) })
+    }
+
+    /// Number that no other content of this process has; clones share it, for they cannot change.
+    ///
+    /// A renderer keeps what it uploaded under this number.
+    #[must_use]
+    pub fn identity(&self) -> u64 {
+        self.identity
     }
 
     /// Number of Gaussians.
