@@ -7,6 +7,7 @@ pub mod constants;
 pub mod cpu;
 pub mod gpu;
 pub mod oracle;
+pub mod select;
 pub mod view;
 
 use crate::{

@@ -8,7 +8,9 @@
 )]
 
 mod common;
-mod oracle;
 mod jobs;
+mod oracle;
+mod shader_layout;
 mod store;
 mod tidy;
+mod twins;

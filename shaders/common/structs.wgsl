@@ -1,0 +1,108 @@
+// Every struct that crosses the border to the host; twins in src/render/gpu/buffers.rs, compared by
+// a test.
+
+// Camera of one frame relative to the scene's origin, and the band of tile rows to draw.
+struct View {
+    // Rows of the rotation world to camera; w is 0.
+    rotation_x: vec4<f32>,
+    rotation_y: vec4<f32>,
+    rotation_z: vec4<f32>,
+    // What f32 leaves out of rotation_z.
+    rotation_z_low: vec4<f32>,
+    // Camera centre relative to the origin, and what f32 leaves out of it.
+    center: vec4<f32>,
+    center_low: vec4<f32>,
+    background: vec4<f32>,
+    // Pixels.
+    focal: vec2<f32>,
+    principal: vec2<f32>,
+    // t.x / t.z and t.y / t.z between which the Jacobian is taken.
+    slope_min: vec2<f32>,
+    slope_max: vec2<f32>,
+    near: f32,
+    width: u32,
+    height: u32,
+    tiles_x: u32,
+    tiles_y: u32,
+    // Tile rows row_start..row_end are drawn.
+    row_start: u32,
+    row_end: u32,
+    gaussian_count: u32,
+    // Coefficients a Gaussian.
+    sh_count: u32,
+    antialiased: u32,
+    isect_capacity: u32,
+    // Always 0, and no compiler knows it.
+    zero: u32,
+    // First float of each picture in `pictures`, or NO_PICTURE.
+    color_start: u32,
+    depth_start: u32,
+    alpha_start: u32,
+    reserved: u32,
+}
+
+struct Gaussian {
+    mean: vec3<f32>,
+    opacity: f32,
+    // wxyz, unit.
+    quat: vec4<f32>,
+    scale: vec3<f32>,
+    reserved: f32,
+}
+
+// A Gaussian on the picture. With d = pixel - mean, half the squared Mahalanobis distance is
+// (inv_sx (d.x - slope d.y))² + (inv_sy d.y)².
+struct Footprint {
+    mean: vec2<f32>,
+    slope: f32,
+    inv_sx: f32,
+    inv_sy: f32,
+    // Half the squared distance at which alpha reaches ALPHA_MIN, with slack.
+    reach: f32,
+    opacity: f32,
+    depth: f32,
+    color: vec3<f32>,
+    // Tiles touched in the band; 0 for a dropped Gaussian.
+    tiles: u32,
+}
+
+// What one frame found out on the way: counts, and workgroups of the stages that depend on them.
+struct Plan {
+    // Gaussian-tile pairs at work: 0 when `needed` exceeds the capacity.
+    isects: u32,
+    // Pairs there are; u32::MAX when more than that.
+    needed: u32,
+    // Gaussians that touch the whole picture.
+    visible: atomic<u32>,
+    reserved: u32,
+    sort_groups: vec4<u32>,
+    range_groups: vec4<u32>,
+}
+
+// Plan as the later stages read it (an atomic cannot be bound read-only).
+struct PlanRead {
+    isects: u32,
+    needed: u32,
+    visible: u32,
+    reserved: u32,
+    sort_groups: vec4<u32>,
+    range_groups: vec4<u32>,
+}
+
+// One digit of a radix sort.
+struct SortParams {
+    // Lowest bit of the digit.
+    shift: u32,
+    // Pairs, or COUNT_FROM_PLAN.
+    count: u32,
+    reserved: vec2<u32>,
+}
+
+// One level of a prefix sum.
+struct ScanParams {
+    // Numbers, or COUNT_FROM_PLAN: the digit counts of a sort of Plan.isects pairs.
+    count: u32,
+    reserved_1: u32,
+    reserved_2: u32,
+    reserved_3: u32,
+}

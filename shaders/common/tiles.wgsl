@@ -1,0 +1,82 @@
+// The one predicate "which tiles does this Gaussian touch", for the count and for the emission.
+// Twin: src/render/cpu/tiles.rs. f32 may widen a span by a tile, which changes no pixel: the pixel
+// test stays exact.
+
+struct Extent {
+    // √reach, and half-width and half-height of the box around the footprint, pixels.
+    root: f32,
+    wide: f32,
+    tall: f32,
+    // Rounding of f32, pixels.
+    slack: vec2<f32>,
+    // Pixel rows reached; none when top > bottom.
+    top: i32,
+    bottom: i32,
+}
+
+// Pixels under this magnitude fit i32 and f32 alike.
+const PIXEL_BOUND: f32 = 16777216.0;
+
+fn to_pixel(x: f32) -> i32 {
+    return i32(clamp(x, -PIXEL_BOUND, PIXEL_BOUND));
+}
+
+// Extent of a footprint within the tile rows row_start..row_end.
+fn extent_of(footprint: Footprint, row_start: u32, row_end: u32) -> Extent {
+    let root = sqrt(footprint.reach);
+    let tall = root / footprint.inv_sy;
+    let across = root / footprint.inv_sx;
+    let lean = abs(footprint.slope) * tall;
+    let large = max(across, lean);
+    let wide = large * sqrt((across / large) * (across / large) + (lean / large) * (lean / large));
+    let slack = vec2(0.01) + 4e-6 * (abs(footprint.mean) + vec2(wide, tall));
+    let first_row = i32(row_start * TILE_SIZE);
+    let last_row = i32(min(row_end * TILE_SIZE, view.height)) - 1;
+    let top = max(to_pixel(ceil(footprint.mean.y - tall - 0.5 - slack.y)), first_row);
+    let bottom = min(to_pixel(floor(footprint.mean.y + tall - 0.5 + slack.y)), last_row);
+    return Extent(root, wide, tall, slack, top, bottom);
+}
+
+// First tile and one past the last tile touched in the row of tiles `tile_y` of the extent.
+//
+// The ellipse is convex, so a row of tiles sees one span: between its leftmost and its rightmost
+// point inside the row's band.
+fn tile_span(footprint: Footprint, extent: Extent, tile_y: i32) -> vec2<u32> {
+    let size = i32(TILE_SIZE);
+    let row_low = f32(max(tile_y * size, extent.top)) + 0.5 - footprint.mean.y;
+    let row_high = f32(min(tile_y * size + size - 1, extent.bottom)) + 0.5 - footprint.mean.y;
+    let low = clamp(row_low, -extent.tall, extent.tall);
+    let high = clamp(row_high, -extent.tall, extent.tall);
+    let peak = footprint.slope * extent.tall * (extent.tall / extent.wide);
+    let at_right = clamp(peak, low, high);
+    let at_left = clamp(-peak, low, high);
+    let right = footprint.mean.x + footprint.slope * at_right
+        + half_width(footprint, extent, at_right) + extent.slack.x;
+    let left = footprint.mean.x + footprint.slope * at_left
+        - half_width(footprint, extent, at_left) - extent.slack.x;
+    let first = max(to_pixel(ceil(left - 0.5)), 0);
+    let last = min(to_pixel(floor(right - 0.5)), i32(view.width) - 1);
+    if first > last {
+        return vec2(0u);
+    }
+    return vec2(u32(first / size), u32(last / size) + 1u);
+}
+
+fn half_width(footprint: Footprint, extent: Extent, dy: f32) -> f32 {
+    let across = dy / extent.tall;
+    return sqrt(max(0.0, 1.0 - across * across)) * (extent.root / footprint.inv_sx);
+}
+
+// Number of tiles touched in the tile rows row_start..row_end.
+fn count_tiles(footprint: Footprint, row_start: u32, row_end: u32) -> u32 {
+    let extent = extent_of(footprint, row_start, row_end);
+    var count = 0u;
+    if extent.top <= extent.bottom {
+        let size = i32(TILE_SIZE);
+        for (var tile_y = extent.top / size; tile_y <= extent.bottom / size; tile_y++) {
+            let span = tile_span(footprint, extent, tile_y);
+            count += span.y - span.x;
+        }
+    }
+    return count;
+}

@@ -1,0 +1,274 @@
+//! What crosses the border to the shaders: `repr(C)` twins of shaders/common/structs.wgsl, buffers
+//! that grow, and the scenes kept on the device.
+
+use bytemuck::{Pod, Zeroable};
+use wgpu::BufferUsages;
+
+use super::device::Gpu;
+use crate::{
+    error::{Error, ErrorCode, Result},
+    render::view::View,
+    scene::Gaussians,
+};
+
+/// `View` of the shaders: camera of one frame and the band of tile rows to draw.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
+pub struct ViewRow {
+    pub rotation_x: [f32; 4],
+    pub rotation_y: [f32; 4],
+    pub rotation_z: [f32; 4],
+    pub rotation_z_low: [f32; 4],
+    pub center: [f32; 4],
+    pub center_low: [f32; 4],
+    pub background: [f32; 4],
+    pub focal: [f32; 2],
+    pub principal: [f32; 2],
+    pub slope_min: [f32; 2],
+    pub slope_max: [f32; 2],
+    pub near: f32,
+    pub width: u32,
+    pub height: u32,
+    pub tiles_x: u32,
+    pub tiles_y: u32,
+    pub row_start: u32,
+    pub row_end: u32,
+    pub gaussian_count: u32,
+    pub sh_count: u32,
+    pub antialiased: u32,
+    pub isect_capacity: u32,
+    pub zero: u32,
+    pub color_start: u32,
+    pub depth_start: u32,
+    pub alpha_start: u32,
+    pub reserved: u32,
+}
+
+/// `Gaussian` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
+pub struct GaussianRow {
+    pub mean: [f32; 3],
+    pub opacity: f32,
+    pub quat: [f32; 4],
+    pub scale: [f32; 3],
+    pub reserved: f32,
+}
+
+/// `Footprint` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
+pub struct FootprintRow {
+    pub mean: [f32; 2],
+    pub slope: f32,
+    pub inv_sx: f32,
+    pub inv_sy: f32,
+    pub reach: f32,
+    pub opacity: f32,
+    pub depth: f32,
+    pub color: [f32; 3],
+    pub tiles: u32,
+}
+
+/// `Plan` and `PlanRead` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
+pub struct PlanRow {
+    pub isects: u32,
+    pub needed: u32,
+    pub visible: u32,
+    pub reserved: u32,
+    pub sort_groups: [u32; 4],
+    pub range_groups: [u32; 4],
+}
+
+/// `SortParams` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
+pub struct SortParams {
+    pub shift: u32,
+    pub count: u32,
+    pub reserved: [u32; 2],
+}
+
+/// `ScanParams` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
+pub struct ScanParams {
+    pub count: u32,
+    pub reserved_1: u32,
+    pub reserved_2: u32,
+    pub reserved_3: u32,
+}
+
+const _: () = assert!(size_of::<ViewRow>().is_multiple_of(16), "a uniform block");
+const _: () = assert!(size_of::<GaussianRow>() == 48, "three rows of four");
+const _: () = assert!(size_of::<FootprintRow>() == 48, "three rows of four");
+
+impl ViewRow {
+    /// The whole picture of `view`; the caller sets band, capacity and picture starts.
+    #[must_use]
+    pub fn new(view: &View, background: [f32; 3], antialiased: bool) -> Self {
+        let rotation = view.rotation;
+        let (rx, ry, rz) = (rotation.row(0), rotation.row(1), rotation.row(2));
+        let high = |v: glam::DVec3| v.as_vec3();
+        let low = |v: glam::DVec3| (v - v.as_vec3().as_dvec3()).as_vec3();
+        let row = |v: glam::Vec3| [v.x, v.y, v.z, 0.0];
+        let narrow = |v: [f64; 2]| v.map(|value| value as f32);
+        Self {
+            rotation_x: row(high(rx)),
+            rotation_y: row(high(ry)),
+            rotation_z: row(high(rz)),
+            rotation_z_low: row(low(rz)),
+            center: row(high(view.center)),
+            center_low: row(low(view.center)),
+            background: [background[0], background[1], background[2], 0.0],
+            focal: narrow(view.focal),
+            principal: narrow(view.principal),
+            slope_min: narrow(view.slope_min),
+            slope_max: narrow(view.slope_max),
+            near: view.near as f32,
+            width: view.width,
+            height: view.height,
+            tiles_x: view.tiles_x(),
+            tiles_y: view.tiles_y(),
+            row_start: 0,
+            row_end: view.tiles_y(),
+            antialiased: u32::from(antialiased),
+            ..Self::zeroed()
+        }
+    }
+}
+
+/// A buffer that is made again when it is too small. Its contents mean nothing between frames.
+#[derive(Debug)]
+pub(super) struct Slot {
+    label: &'static str,
+    usage: BufferUsages,
+    buffer: Option<wgpu::Buffer>,
+}
+
+impl Slot {
+    pub(super) const fn new(label: &'static str, usage: BufferUsages) -> Self {
+        Self { label, usage, buffer: None }
+    }
+
+    /// A storage buffer.
+    pub(super) const fn storage(label: &'static str) -> Self {
+        Self::new(label, BufferUsages::STORAGE.union(BufferUsages::COPY_SRC))
+    }
+
+    /// The buffer, at least `size_bytes` long.
+    ///
+    /// # Errors
+    /// `limit_exceeded` when the adapter cannot hold or bind as much.
+    pub(super) fn ensure(&mut self, gpu: &Gpu, size_bytes: u64) -> Result<wgpu::Buffer> {
+        if let Some(buffer) = &self.buffer
+            && buffer.size() >= size_bytes
+        {
+            return Ok(buffer.clone());
+        }
+        // Freed before its successor is asked for.
+        self.buffer = None;
+        let buffer = gpu.create_buffer(self.label, size_bytes, self.usage)?;
+        self.buffer = Some(buffer.clone());
+        Ok(buffer)
+    }
+
+    /// Bytes held.
+    pub(super) fn size_bytes(&self) -> u64 {
+        self.buffer.as_ref().map_or(0, wgpu::Buffer::size)
+    }
+}
+
+/// Gaussians on the device.
+#[derive(Clone, Debug)]
+pub(super) struct Scene {
+    identity: u64,
+    /// `[N]` of [`GaussianRow`].
+    pub(super) gaussians: wgpu::Buffer,
+    /// `[N, K, 3]` f32.
+    pub(super) sh: wgpu::Buffer,
+}
+
+impl Scene {
+    fn size_bytes(&self) -> u64 {
+        self.gaussians.size() + self.sh.size()
+    }
+
+    fn upload(gpu: &Gpu, source: &Gaussians) -> Result<Self> {
+        let rows: Vec<GaussianRow> = (0..source.len())
+            .map(|i| GaussianRow {
+                mean: source.means()[i],
+                opacity: source.opacities()[i],
+                quat: source.quats()[i],
+                scale: source.scales()[i],
+                reserved: 0.0,
+            })
+            .collect();
+        Ok(Self {
+            identity: source.identity(),
+            gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows))?,
+            sh: gpu.upload("sh", bytemuck::cast_slice(source.sh()))?,
+        })
+    }
+}
+
+/// Scenes kept on the device, most recently drawn last.
+#[derive(Debug)]
+pub(super) struct SceneCache {
+    scenes: Vec<Scene>,
+    bytes_max: u64,
+}
+
+impl SceneCache {
+    pub(super) fn new(bytes_max: u64) -> Self {
+        Self { scenes: Vec::new(), bytes_max }
+    }
+
+    /// The scene of `source`, uploaded once; others leave, least recently drawn first.
+    ///
+    /// # Errors
+    /// `limit_exceeded` when the scene does not fit the adapter's limits or memory.
+    pub(super) fn get(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<Scene> {
+        let identity = source.identity();
+        if let Some(at) = self.scenes.iter().position(|scene| scene.identity == identity) {
+            let scene = self.scenes.remove(at);
+            self.scenes.push(scene.clone());
+            return Ok(scene);
+        }
+        let scene = match Scene::upload(gpu, source) {
+            // Memory may be held by the other scenes: once without them.
+            Err(error) if error.code() == ErrorCode::LimitExceeded && !self.scenes.is_empty() => {
+                self.scenes.clear();
+                Scene::upload(gpu, source)?
+            }
+            other => other?,
+        };
+        let held = |scenes: &[Scene]| scenes.iter().map(Scene::size_bytes).sum::<u64>();
+        while !self.scenes.is_empty() && held(&self.scenes) + scene.size_bytes() > self.bytes_max {
+            self.scenes.remove(0);
+        }
+        self.scenes.push(scene.clone());
+        Ok(scene)
+    }
+
+    /// Scenes held.
+    pub(super) fn len(&self) -> usize {
+        self.scenes.len()
+    }
+}
+
+/// Narrows a count that the limits keep under 2³².
+///
+/// # Errors
+/// `limit_exceeded` with `what` and the count.
+pub(super) fn narrow(what: &str, count: usize) -> Result<u32> {
+    u32::try_from(count).map_err(|_| Error::limit(what, count, u32::MAX))
+}

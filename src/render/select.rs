@@ -1,0 +1,107 @@
+//! Which renderer serves: looks at the adapters once, says what it took, and never takes a software
+//! adapter that was not named.
+
+use std::sync::Arc;
+
+use serde::Serialize;
+
+use super::{
+    Frame, RenderRequest, Renderer,
+    cpu::CpuRenderer,
+    gpu::{GpuOptions, GpuRenderer},
+};
+use crate::{
+    config::{Config, RendererChoice},
+    error::{ErrorCode, Result},
+    scene::Gaussians,
+};
+
+/// A GPU adapter as the driver describes it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct AdapterReport {
+    /// The adapter's own name.
+    pub name: String,
+    /// `DiscreteGpu`, `IntegratedGpu`, `VirtualGpu`, `Cpu` or `Other`.
+    pub kind: String,
+    /// `vulkan`, `metal`, `dx12` or `gl`.
+    pub backend: String,
+    /// Driver and its version.
+    pub driver: String,
+    /// Whether it computes on the processor.
+    pub software: bool,
+    /// Whether it was taken.
+    pub chosen: bool,
+}
+
+/// The renderer that `config` asks for, and the adapters found on the way.
+///
+/// `auto` takes a hardware adapter or the CPU renderer; `gpu` refuses to start without an adapter; an
+/// adapter that is named must be there.
+///
+/// # Errors
+/// `gpu_unavailable` when an adapter was asked for and none fits, `internal` when threads or kernels
+/// cannot be made.
+pub fn select(config: &Config) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
+    let cpu = CpuRenderer::new(config.threads)?;
+    if config.renderer == RendererChoice::Cpu {
+        tracing::info!(renderer = "cpu", "renderer chosen as configured");
+        return Ok((Arc::new(cpu), Vec::new()));
+    }
+    let options = GpuOptions { adapter: config.adapter.clone(), ..GpuOptions::default() };
+    let (reports, gpu) = GpuRenderer::open(options);
+    for report in &reports {
+        tracing::info!(
+            adapter = report.name,
+            kind = report.kind,
+            backend = report.backend,
+            driver = report.driver,
+            software = report.software,
+            chosen = report.chosen,
+            "GPU adapter found"
+        );
+    }
+    let named = config.adapter.is_some() || config.renderer == RendererChoice::Gpu;
+    let renderer: Arc<dyn Renderer> = match gpu {
+        Ok(gpu) => {
+            tracing::info!(renderer = gpu.name(), "renderer chosen");
+            if config.renderer == RendererChoice::Gpu {
+                Arc::new(gpu)
+            } else {
+                Arc::new(WithCpu { gpu, cpu })
+            }
+        }
+        Err(error) if named => return Err(error),
+        Err(error) => {
+            tracing::info!(renderer = "cpu", reason = error.message(), "renderer chosen");
+            Arc::new(cpu)
+        }
+    };
+    Ok((renderer, reports))
+}
+
+/// A GPU renderer whose refusals the CPU renderer takes over, each said in the log.
+#[derive(Debug)]
+struct WithCpu {
+    gpu: GpuRenderer,
+    cpu: CpuRenderer,
+}
+
+impl Renderer for WithCpu {
+    fn name(&self) -> String {
+        self.gpu.name()
+    }
+
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        match self.gpu.render(gaussians, request) {
+            Err(error) if error.code() != ErrorCode::InvalidRequest => {
+                tracing::warn!(
+                    reason = error.message(),
+                    source = std::error::Error::source(&error).map(tracing::field::display),
+                    "the GPU renderer refused a frame; the CPU renderer draws it"
+                );
+                self.cpu.render(gaussians, request)
+            }
+            other => other,
+        }
+    }
+}

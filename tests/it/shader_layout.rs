@@ -1,0 +1,203 @@
+//! The shaders as the host believes them to be: valid, of the same layout, with the same numbers,
+//! each with its CPU twin.
+
+use std::{collections::BTreeMap, mem::offset_of};
+
+use naga::{Expression, Literal, Module, TypeInner};
+use segsplat::render::{
+    constants,
+    gpu::{
+        buffers::{FootprintRow, GaussianRow, PlanRow, ScanParams, SortParams, ViewRow},
+        pipelines::{self, SHADERS, Shader},
+    },
+};
+
+use crate::common::root;
+
+fn parse(shader: &Shader) -> Module {
+    naga::front::wgsl::parse_str(shader.source)
+        .unwrap_or_else(|error| panic!("{}: {}", shader.stem, error.emit_to_string(shader.source)))
+}
+
+#[test]
+fn every_shader_is_valid() {
+    for shader in &SHADERS {
+        let module = parse(shader);
+        let mut validator = naga::valid::Validator::new(
+            naga::valid::ValidationFlags::all(),
+            // No capability beyond WebGPU's floor: no subgroups, no f16, no 64-bit integers.
+            naga::valid::Capabilities::empty(),
+        );
+        validator.validate(&module).unwrap_or_else(|error| {
+            panic!("{}: {}", shader.stem, error.emit_to_string(shader.source))
+        });
+    }
+}
+
+#[test]
+fn workgroups_stay_under_the_portable_floor() {
+    for shader in &SHADERS {
+        let module = parse(shader);
+        let mut layouter = naga::proc::Layouter::default();
+        layouter.update(module.to_ctx()).expect("types have sizes");
+        for entry in &module.entry_points {
+            let [x, y, z] = entry.workgroup_size;
+            assert!(x * y * z <= 256, "{}: {} has {} invocations", shader.stem, entry.name, x * y);
+        }
+        let bytes: u32 = module
+            .global_variables
+            .iter()
+            .filter(|(_, variable)| variable.space == naga::AddressSpace::WorkGroup)
+            .map(|(_, variable)| layouter[variable.ty].size)
+            .sum();
+        assert!(bytes <= 16 << 10, "{}: {bytes} bytes of workgroup storage", shader.stem);
+        let storage = module
+            .global_variables
+            .iter()
+            .filter(|(_, v)| matches!(v.space, naga::AddressSpace::Storage { .. }))
+            .count();
+        assert!(storage <= 8, "{}: {storage} storage buffers", shader.stem);
+    }
+}
+
+/// Offset of each member of the struct `name`, and the struct's size.
+fn layout_of(module: &Module, name: &str) -> Option<(BTreeMap<String, u32>, u32)> {
+    module.types.iter().find_map(|(_, ty)| match &ty.inner {
+        TypeInner::Struct { members, span } if ty.name.as_deref() == Some(name) => {
+            let offsets = members
+                .iter()
+                .map(|member| (member.name.clone().expect("members have names"), member.offset));
+            Some((offsets.collect(), *span))
+        }
+        _ => None,
+    })
+}
+
+macro_rules! twin {
+    ($rust:ty, $wgsl:literal, [$($field:ident),* $(,)?]) => {{
+        let offsets: BTreeMap<String, u32> = [
+            $((stringify!($field).to_owned(), offset_of!($rust, $field) as u32)),*
+        ]
+        .into();
+        ($wgsl, offsets, size_of::<$rust>() as u32)
+    }};
+}
+
+#[test]
+fn structs_lie_in_memory_as_their_twins_do() {
+    let twins = [
+        twin!(
+            ViewRow,
+            "View",
+            [
+                rotation_x,
+                rotation_y,
+                rotation_z,
+                rotation_z_low,
+                center,
+                center_low,
+                background,
+                focal,
+                principal,
+                slope_min,
+                slope_max,
+                near,
+                width,
+                height,
+                tiles_x,
+                tiles_y,
+                row_start,
+                row_end,
+                gaussian_count,
+                sh_count,
+                antialiased,
+                isect_capacity,
+                zero,
+                color_start,
+                depth_start,
+                alpha_start,
+                reserved,
+            ]
+        ),
+        twin!(GaussianRow, "Gaussian", [mean, opacity, quat, scale, reserved]),
+        twin!(
+            FootprintRow,
+            "Footprint",
+            [mean, slope, inv_sx, inv_sy, reach, opacity, depth, color, tiles]
+        ),
+        twin!(PlanRow, "Plan", [isects, needed, visible, reserved, sort_groups, range_groups]),
+        twin!(PlanRow, "PlanRead", [isects, needed, visible, reserved, sort_groups, range_groups]),
+        twin!(SortParams, "SortParams", [shift, count, reserved]),
+        twin!(ScanParams, "ScanParams", [count, reserved_1, reserved_2, reserved_3]),
+    ];
+    for (name, offsets, size) in twins {
+        let mut seen = 0;
+        for shader in &SHADERS {
+            // Every shader holds every struct, whether it uses it or not.
+            let (wgsl, span) = layout_of(&parse(shader), name)
+                .unwrap_or_else(|| panic!("{}: no struct {name}", shader.stem));
+            assert_eq!(wgsl, offsets, "{}: members of {name}", shader.stem);
+            assert_eq!(span, size, "{}: size of {name}", shader.stem);
+            seen += 1;
+        }
+        assert_eq!(seen, SHADERS.len(), "{name} was looked for");
+    }
+}
+
+/// The numbers of the module-scope constant `name`, as f64.
+fn constant(module: &Module, name: &str) -> Option<Vec<f64>> {
+    let (_, constant) =
+        module.constants.iter().find(|(_, constant)| constant.name.as_deref() == Some(name))?;
+    Some(numbers(module, constant.init))
+}
+
+fn numbers(module: &Module, at: naga::Handle<Expression>) -> Vec<f64> {
+    match &module.global_expressions[at] {
+        Expression::Literal(Literal::F32(v)) => vec![f64::from(*v)],
+        Expression::Literal(Literal::U32(v)) => vec![f64::from(*v)],
+        Expression::Compose { components, .. } => {
+            components.iter().flat_map(|&part| numbers(module, part)).collect()
+        }
+        other => panic!("a constant of the kind {other:?}"),
+    }
+}
+
+#[test]
+fn constants_are_those_of_the_host() {
+    let narrow = |values: &[f32]| values.iter().map(|&v| f64::from(v)).collect::<Vec<_>>();
+    let mut wanted: Vec<(&str, Vec<f64>)> = vec![
+        ("TILE_SIZE", vec![f64::from(constants::TILE_SIZE)]),
+        ("SH_C2", narrow(&constants::SH_C2)),
+        ("SH_C3", narrow(&constants::SH_C3)),
+    ];
+    wanted.extend(constants::SHARED.iter().map(|&(name, value)| (name, narrow(&[value]))));
+    wanted.extend(pipelines::SHARED.iter().map(|&(name, value)| (name, vec![f64::from(value)])));
+    for shader in &SHADERS {
+        let module = parse(shader);
+        for (name, value) in &wanted {
+            let got = constant(&module, name)
+                .unwrap_or_else(|| panic!("{}: no constant {name}", shader.stem));
+            assert_eq!(&got, value, "{}: {name}", shader.stem);
+        }
+    }
+}
+
+#[test]
+fn every_stage_has_a_cpu_twin_and_every_file_is_used() {
+    let mut files: Vec<String> = fs_err::read_dir(root().join("shaders"))
+        .expect("the folder of shaders")
+        .filter_map(|entry| {
+            let path = entry.expect("an entry").path();
+            let wgsl = path.extension().is_some_and(|extension| extension == "wgsl");
+            wgsl.then(|| path.file_stem().expect("a stem").to_string_lossy().into_owned())
+        })
+        .collect();
+    files.sort();
+    let mut stems: Vec<_> = SHADERS.iter().map(|shader| shader.stem.to_owned()).collect();
+    stems.sort();
+    assert_eq!(files, stems, "files in shaders/ against SHADERS");
+    for stem in &stems {
+        let twin = root().join(format!("src/render/cpu/{stem}.rs"));
+        assert!(twin.is_file(), "shaders/{stem}.wgsl has no twin {}", twin.display());
+    }
+}

@@ -1,0 +1,512 @@
+//! Every stage of the GPU renderer against its CPU twin, from the same input; then whole pictures.
+//!
+//! Needs an adapter: a hardware one, else lavapipe. Without any the tests say `skipped`;
+//! `REQUIRE_GPU=1` (or CI=true) makes that a failure. The device has WebGPU's portable limits.
+
+use std::sync::OnceLock;
+
+use segsplat::{
+    error::ErrorCode,
+    render::{
+        Frame, Kinds, RenderRequest, Renderer,
+        cpu::{
+            CpuRenderer, emit_isects, prefix_sum, project,
+            project::Footprint,
+            radix_sort,
+            rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
+            shade, tile_ranges,
+            tiles::{Grid, count_tiles},
+        },
+        gpu::{
+            GpuOptions, GpuRenderer,
+            buffers::FootprintRow,
+            pipelines::{DROPPED_KEY, NO_GAUSSIAN},
+        },
+        oracle,
+        view::View,
+    },
+    scene::{Gaussians, RawGaussians},
+};
+
+use crate::common::{
+    compare::{Tolerance, compare, samples},
+    scenes::{Random, camera, checked, cloud, look, push, request, two_views},
+    skipped,
+};
+
+/// Opens an adapter with `change` made to the portable options; hardware first.
+fn open(change: impl Fn(&mut GpuOptions)) -> Option<GpuRenderer> {
+    let mut told = String::new();
+    for adapter in [None, Some("llvmpipe".to_owned())] {
+        let mut options = GpuOptions { adapter, portable: true, ..GpuOptions::default() };
+        change(&mut options);
+        match GpuRenderer::open(options).1 {
+            Ok(gpu) => return Some(gpu),
+            Err(error) => told = error.to_string(),
+        }
+    }
+    assert!(std::env::var_os("REQUIRE_GPU").is_none(), "REQUIRE_GPU is set: {told}");
+    skipped("no adapter");
+    None
+}
+
+/// The adapter that the tests share.
+fn gpu() -> Option<&'static GpuRenderer> {
+    static GPU: OnceLock<Option<GpuRenderer>> = OnceLock::new();
+    let gpu = GPU.get_or_init(|| open(|_| {})).as_ref();
+    match gpu {
+        Some(gpu) => println!("adapter: {:?}", gpu.adapter()),
+        None => println!("skipped: no adapter"),
+    }
+    gpu
+}
+
+fn cpu() -> CpuRenderer {
+    CpuRenderer::new(2).expect("two threads")
+}
+
+fn view_of(gaussians: &Gaussians, request: &RenderRequest) -> View {
+    View::new(gaussians.origin(), request).expect("a test view")
+}
+
+fn whole(view: &View) -> Grid {
+    Grid { width: view.width, height: view.height, tile_rows: 0..view.tiles_y() }
+}
+
+/// The CPU's footprints and tile counts.
+fn projected(gaussians: &Gaussians, request: &RenderRequest) -> (Vec<Footprint>, Vec<u32>) {
+    let (mut footprints, mut tiles) = (Vec::new(), Vec::new());
+    let view = view_of(gaussians, request);
+    project::project(gaussians, &view, request.antialiased, &mut footprints, &mut tiles);
+    (footprints, tiles)
+}
+
+fn to_row(footprint: &Footprint, tiles: u32) -> FootprintRow {
+    FootprintRow {
+        mean: footprint.mean.map(|v| v as f32),
+        slope: footprint.slope as f32,
+        inv_sx: footprint.inv_sx,
+        inv_sy: footprint.inv_sy,
+        reach: footprint.reach,
+        opacity: footprint.opacity,
+        depth: footprint.depth,
+        color: footprint.color,
+        tiles,
+    }
+}
+
+fn to_footprint(row: &FootprintRow) -> Footprint {
+    Footprint {
+        mean: row.mean.map(f64::from),
+        slope: f64::from(row.slope),
+        inv_sx: row.inv_sx,
+        inv_sy: row.inv_sy,
+        reach: row.reach,
+        opacity: row.opacity,
+        depth: row.depth,
+        color: row.color,
+    }
+}
+
+/// Depth order of the visible, as the CPU sorts.
+fn depth_order(footprints: &[Footprint], tiles: &[u32]) -> Vec<u64> {
+    let visible = (0..footprints.len()).filter(|&i| tiles[i] > 0);
+    let mut pairs: Vec<u64> =
+        visible.map(|i| radix_sort::pack(footprints[i].depth.to_bits(), i as u32)).collect();
+    radix_sort::radix_sort(&mut pairs, &mut Vec::new(), 32);
+    pairs
+}
+
+#[test]
+fn prefix_sum_twin() {
+    let Some(gpu) = gpu() else { return };
+    let mut random = Random(1);
+    // The last takes three levels of blocks of 2,048.
+    for count in [1, 7, 255, 256, 2_047, 2_048, 2_049, 100_000, 4_200_000] {
+        let numbers: Vec<u32> = (0..count).map(|_| (random.bits() % 900) as u32).collect();
+        let mut want = Vec::new();
+        prefix_sum::prefix_sum(numbers.iter().copied(), &mut want);
+        let want: Vec<u32> = want[..count].iter().map(|&sum| sum as u32).collect();
+        let got = gpu.prefix_sum(&numbers).expect("sums");
+        assert!(got == want, "{count} numbers: sums differ");
+    }
+    let huge = gpu.prefix_sum(&[u32::MAX - 5, 3, 3, 1, u32::MAX, 9]).expect("sums");
+    let (near, max) = (u32::MAX - 5, u32::MAX);
+    assert_eq!(huge, [0, near, near + 3, max, max, max], "sums stay at the largest number");
+}
+
+#[test]
+fn radix_sort_twin() {
+    let Some(gpu) = gpu() else { return };
+    let mut random = Random(2);
+    for (count, key_bits) in
+        [(1, 32), (255, 32), (256, 8), (2_049, 32), (70_000, 32), (300_000, 9), (70_001, 1)]
+    {
+        let mask = u32::MAX >> (32 - key_bits);
+        let keys: Vec<u32> = (0..count).map(|_| random.bits() as u32 & mask).collect();
+        let values: Vec<u32> = (0..count).collect();
+        let mut want: Vec<u64> =
+            keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v)).collect();
+        radix_sort::radix_sort(&mut want, &mut Vec::new(), key_bits);
+        let (keys, values) = gpu.radix_sort(&keys, &values, key_bits).expect("a sort");
+        let got: Vec<u64> =
+            keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v)).collect();
+        assert!(got == want, "{count} pairs of {key_bits}-bit keys: order differs");
+    }
+}
+
+#[test]
+fn project_twin() {
+    let Some(gpu) = gpu() else { return };
+    let mut turned = camera(320, 240);
+    turned.camera_to_world =
+        look(glam::DVec3::new(0.7, -0.9, -0.2), glam::DVec3::new(0.1, 0.2, 4.0));
+    for antialiased in [false, true] {
+        let gaussians = cloud(20_000, 0, 3);
+        let request = RenderRequest { antialiased, ..request(turned) };
+        let (footprints, tiles) = projected(&gaussians, &request);
+        let got = gpu.project(&gaussians, &request).expect("footprints");
+        let (mut one_sided, mut keys_apart, mut both) = (0, 0, 0_u32);
+        let (mut cpu_tiles, mut gpu_tiles) = (0_u64, 0_u64);
+        for i in 0..gaussians.len() {
+            let row = &got.footprints[i];
+            assert_eq!(got.depth_keys[i] == DROPPED_KEY, row.tiles == 0, "{i}: dropped or not");
+            if tiles[i] == 0 || row.tiles == 0 {
+                one_sided += u32::from(tiles[i] != row.tiles);
+                continue;
+            }
+            both += 1;
+            keys_apart += u32::from(got.depth_keys[i] != footprints[i].depth.to_bits());
+            (cpu_tiles, gpu_tiles) =
+                (cpu_tiles + u64::from(tiles[i]), gpu_tiles + u64::from(row.tiles));
+            assert!(row.tiles >= tiles[i], "{i}: {} tiles, not {}", row.tiles, tiles[i]);
+            let want = to_row(&footprints[i], tiles[i]);
+            let near = |name: &str, got: f32, want: f32, slack: f32| {
+                let bound = slack + 2e-5 * want.abs();
+                assert!((got - want).abs() <= bound, "{i}: {name} is {got}, not {want}");
+            };
+            for axis in 0..2 {
+                near("mean", row.mean[axis], want.mean[axis], 1e-3);
+            }
+            near("slope", row.slope, want.slope, 1e-4);
+            near("inv_sx", row.inv_sx, want.inv_sx, 0.0);
+            near("inv_sy", row.inv_sy, want.inv_sy, 0.0);
+            near("reach", row.reach, want.reach, 2e-5);
+            near("opacity", row.opacity, want.opacity, 0.0);
+        }
+        println!("{both} visible, {one_sided} on one side only, {keys_apart} keys apart");
+        println!("tiles: CPU {cpu_tiles}, GPU {gpu_tiles}");
+        assert!(both > 5_000, "{both} Gaussians of a cloud seen");
+        assert!(one_sided * 1_000 <= both, "{one_sided} of {both} seen by one renderer only");
+        // Depth decides the picture: pairs of floats make the key exact but for double rounding.
+        assert!(keys_apart * 10_000 <= both, "{keys_apart} of {both} depth keys differ");
+        assert!(gpu_tiles * 100 <= cpu_tiles * 101, "{gpu_tiles} tiles against {cpu_tiles}");
+        assert!(got.visible.abs_diff(both) <= one_sided, "{} visible, not {both}", got.visible);
+    }
+}
+
+#[test]
+fn shade_twin() {
+    let Some(gpu) = gpu() else { return };
+    for degree in 0..=3 {
+        let gaussians = cloud(3_000, degree, 4);
+        let request = request(camera(200, 150));
+        let (footprints, tiles) = projected(&gaussians, &request);
+        let order = depth_order(&footprints, &tiles);
+        let mut want = Vec::new();
+        shade::shade(&gaussians, &view_of(&gaussians, &request), &footprints, &order, &mut want);
+        let rows: Vec<_> =
+            footprints.iter().zip(&tiles).map(|(f, &tiles)| to_row(f, tiles)).collect();
+        let mut ids: Vec<u32> = order.iter().map(|&pair| radix_sort::value(pair)).collect();
+        let dropped = (0..gaussians.len() as u32).filter(|&i| tiles[i as usize] == 0);
+        ids.extend(dropped);
+        let got = gpu.shade(&gaussians, &request, &rows, &ids).expect("colours");
+        for (i, (got, want)) in got.iter().zip(&want).enumerate() {
+            assert_eq!(got.depth, want.depth, "degree {degree}, place {i}: another Gaussian");
+            for (got, want) in got.color.iter().zip(&want.color) {
+                assert!((got - want).abs() < 2e-5, "degree {degree}, place {i}: {got}, not {want}");
+            }
+        }
+        assert!(got[want.len()..].iter().all(|row| row.tiles == 0), "dropped Gaussians come last");
+    }
+}
+
+#[test]
+fn emit_isects_twin() {
+    let Some(gpu) = gpu() else { return };
+    let gaussians = cloud(8_000, 0, 5);
+    let request = request(camera(333, 222));
+    let view = view_of(&gaussians, &request);
+    let rows: Vec<_> = gpu
+        .project(&gaussians, &request)
+        .expect("footprints")
+        .footprints
+        .into_iter()
+        .filter(|row| row.tiles > 0)
+        .collect();
+    let mut offsets = Vec::new();
+    prefix_sum::prefix_sum(rows.iter().map(|row| row.tiles), &mut offsets);
+    let narrow: Vec<u32> = offsets[..rows.len()].iter().map(|&offset| offset as u32).collect();
+    let (tile_keys, ids) = gpu.emit_isects(&view, &rows, &narrow).expect("pairs");
+    let unwritten = ids.iter().filter(|&&id| id == NO_GAUSSIAN).count();
+
+    let footprints: Vec<_> = rows.iter().map(to_footprint).collect();
+    let grid = whole(&view);
+    let mut want_offsets = Vec::new();
+    prefix_sum::prefix_sum(footprints.iter().map(|f| count_tiles(f, &grid)), &mut want_offsets);
+    let mut want = Vec::new();
+    emit_isects::emit_isects(&footprints, &grid, &want_offsets, &mut want);
+
+    let got: std::collections::HashSet<u64> =
+        tile_keys.iter().zip(&ids).map(|(&tile, &id)| radix_sort::pack(tile, id)).collect();
+    println!("{} pairs, {} wanted, {unwritten} counted only", ids.len(), want.len());
+    assert_eq!(unwritten, 0, "counted and not emitted");
+    assert_eq!(got.len(), ids.len(), "a pair was emitted twice");
+    let missing = want.iter().filter(|pair| !got.contains(pair)).count();
+    assert_eq!(missing, 0, "tiles that the CPU touches and the GPU does not");
+    assert!(ids.len() * 100 <= want.len() * 101, "{} pairs against {}", ids.len(), want.len());
+    assert!(ids.is_sorted(), "pairs keep the depth order");
+    assert!(tile_keys.iter().all(|&tile| tile < grid.tile_count()), "a tile off the picture");
+}
+
+#[test]
+fn tile_ranges_twin() {
+    let Some(gpu) = gpu() else { return };
+    let gaussians = checked(RawGaussians::default());
+    let view = view_of(&gaussians, &request(camera(100, 50)));
+    let tiles = view.tiles_x() * view.tiles_y();
+    let mut random = Random(6);
+    for count in [0, 1, 5, 3_000, 100_000] {
+        let mut keys: Vec<u32> = (0..count).map(|_| random.bits() as u32 % tiles).collect();
+        // Tiles without a pair in the middle and at the end.
+        keys.retain(|&tile| tile != 3 && tile != 4 && tile + 1 != tiles);
+        keys.sort_unstable();
+        let mut want = Vec::new();
+        let pairs: Vec<u64> = keys.iter().map(|&tile| radix_sort::pack(tile, 0)).collect();
+        tile_ranges::tile_ranges(&pairs, tiles, &mut want);
+        assert_eq!(gpu.tile_ranges(&view, &keys).expect("ranges"), want, "{count} pairs");
+    }
+}
+
+#[test]
+fn rasterize_twin() {
+    let Some(gpu) = gpu() else { return };
+    let (gaussians, middle) = two_views(96, 7);
+    let request = request(middle);
+    let view = view_of(&gaussians, &request);
+    let (footprints, tiles) = projected(&gaussians, &request);
+    let order = depth_order(&footprints, &tiles);
+    let (mut shaded, mut offsets, mut isects, mut ranges) = (vec![], vec![], vec![], vec![]);
+    shade::shade(&gaussians, &view, &footprints, &order, &mut shaded);
+    let grid = whole(&view);
+    prefix_sum::prefix_sum(shaded.iter().map(|f| count_tiles(f, &grid)), &mut offsets);
+    emit_isects::emit_isects(&shaded, &grid, &offsets, &mut isects);
+    radix_sort::radix_sort(&mut isects, &mut Vec::new(), 16);
+    tile_ranges::tile_ranges(&isects, grid.tile_count(), &mut ranges);
+
+    let pixels = 96 * 96;
+    let (mut color, mut depth, mut alpha) =
+        (vec![[0.0; 3]; pixels], vec![0.0; pixels], vec![0.0; pixels]);
+    for tile_y in 0..view.tiles_y() {
+        let first = (tile_y * 16 * 96) as usize;
+        let mut out = RowOut {
+            color: Some(&mut color[first..]),
+            depth: Some(&mut depth[first..]),
+            alpha: Some(&mut alpha[first..]),
+        };
+        for tile_x in 0..view.tiles_x() {
+            let id = (tile_y * view.tiles_x() + tile_x) as usize;
+            let tile = Tile { x: tile_x * 16, y: tile_y * 16, width: 16, height: 16 };
+            rasterize_tile(
+                &shaded,
+                &isects[ranges[id] as usize..ranges[id + 1] as usize],
+                tile,
+                request.background,
+                96,
+                &mut TileScratch::default(),
+                &mut out,
+            );
+        }
+    }
+    let rows: Vec<_> = shaded.iter().map(|f| to_row(f, 1)).collect();
+    let ids: Vec<u32> = isects.iter().map(|&pair| radix_sort::value(pair)).collect();
+    let got = gpu.rasterize(&view, request.background, &rows, &ids, &ranges).expect("pictures");
+    let want = Frame {
+        width: 96,
+        height: 96,
+        color: Some(color),
+        depth: Some(depth),
+        alpha: Some(alpha),
+        ..Frame::default()
+    };
+    let got = Frame {
+        color: Some(bytemuck::cast_slice(&got[..pixels * 3]).to_vec()),
+        depth: Some(got[pixels * 3..pixels * 4].to_vec()),
+        alpha: Some(got[pixels * 4..].to_vec()),
+        ..want.clone()
+    };
+    same("rasterize alone", &got, &want, &gaussians, &request);
+}
+
+/// Pictures within 1/255; pixels further apart are few and stand at a cliff of the oracle.
+fn same(name: &str, got: &Frame, want: &Frame, gaussians: &Gaussians, request: &RenderRequest) {
+    let (got, want) = (samples(got), samples(want));
+    let apart = |i: usize| compare(&got[i..=i], &want[i..=i], &[false], Tolerance::GPU).is_err();
+    let far: Vec<usize> = (0..want.len()).filter(|&i| apart(i)).collect();
+    let width = request.camera.intrinsics.width;
+    let pixels: Vec<[u32; 2]> = far.iter().map(|&i| [i as u32 % width, i as u32 / width]).collect();
+    let truth = oracle::render_pixels(gaussians, request, oracle::DepthKey::F32, &pixels)
+        .expect("the truth");
+    let mut cliff = vec![false; want.len()];
+    for (&i, truth) in far.iter().zip(&truth) {
+        cliff[i] = truth.cliff.any();
+    }
+    let found = compare(&got, &want, &cliff, Tolerance::GPU)
+        .unwrap_or_else(|told| panic!("{name}: {told}"));
+    println!(
+        "{name}: {} Gaussians, {} px: max {:.2e}, mean {:.2e}, {} flips",
+        gaussians.len(),
+        found.pixels,
+        found.max,
+        found.mean,
+        found.flips
+    );
+}
+
+fn judge(gpu: &GpuRenderer, name: &str, gaussians: &Gaussians, request: &RenderRequest) -> Frame {
+    let got = gpu.render(gaussians, request).expect("a picture of the GPU");
+    let want = cpu().render(gaussians, request).expect("a picture of the CPU");
+    same(name, &got, &want, gaussians, request);
+    let (a, b) = (got.stats.visible, want.stats.visible);
+    assert!(a.abs_diff(b) * 1_000 <= b.max(1), "{name}: {a} visible, not {b}");
+    got
+}
+
+#[test]
+fn pictures_of_131072_gaussians_are_the_same() {
+    let Some(gpu) = gpu() else { return };
+    let (gaussians, middle) = two_views(256, 1);
+    assert_eq!(gaussians.len(), 131_072, "a Gaussian a pixel of two photos");
+    let frame = judge(gpu, "two_views 256", &gaussians, &request(middle));
+    // The second time the scene and all room are there.
+    let again = gpu.render(&gaussians, &request(middle)).expect("a picture");
+    assert!(frame == again, "two renders of one view differ");
+    judge(
+        gpu,
+        "two_views 256 antialiased",
+        &gaussians,
+        &RenderRequest { antialiased: true, ..request(middle) },
+    );
+}
+
+#[test]
+fn every_harmonic_degree_and_camera_is_the_same() {
+    let Some(gpu) = gpu() else { return };
+    for degree in 0..=3 {
+        let gaussians = cloud(3_000, degree, 10 + u64::from(degree));
+        judge(gpu, &format!("degree {degree}"), &gaussians, &request(camera(160, 120)));
+    }
+    let gaussians = cloud(4_000, 1, 21);
+    for (fx, fy, cx, cy) in
+        [(140.0, 90.0, 20.0, 100.0), (60.0, 200.0, 150.0, -10.0), (500.0, 480.0, 300.0, 60.0)]
+    {
+        let mut camera = camera(161, 119);
+        let lens = &mut camera.intrinsics;
+        (lens.fx, lens.fy, lens.cx, lens.cy) = (fx, fy, cx, cy);
+        judge(gpu, &format!("principal point {cx} {cy}"), &gaussians, &request(camera));
+    }
+}
+
+#[test]
+fn few_gaussians_are_the_same() {
+    let Some(gpu) = gpu() else { return };
+    let none = checked(RawGaussians::default());
+    let frame = judge(gpu, "none", &none, &request(camera(50, 30)));
+    assert!(frame.color.expect("colour").iter().all(|c| *c == [0.1, 0.2, 0.3]), "background");
+
+    let mut raw = RawGaussians::default();
+    let quat = Random(8).quat();
+    push(&mut raw, [0.1, 0.05, 2.0], quat, [0.2, 0.05, 0.01], 0.8, &[[1.0, -0.5, 0.3]]);
+    let one = checked(raw);
+    for side in [1, 15, 16, 17, 64] {
+        judge(gpu, &format!("one at {side} px"), &one, &request(camera(side, side)));
+    }
+    let mut away = camera(40, 40);
+    away.camera_to_world = look(glam::DVec3::ZERO, glam::DVec3::NEG_Z);
+    let frame = judge(gpu, "looking away", &one, &request(away));
+    assert_eq!(frame.stats.visible, 0, "nothing is behind the camera");
+}
+
+#[test]
+fn kinds_not_asked_for_are_not_given() {
+    let Some(gpu) = gpu() else { return };
+    let gaussians = cloud(500, 0, 9);
+    let all = gpu.render(&gaussians, &request(camera(70, 40))).expect("all kinds");
+    for (color, depth, alpha) in
+        [(true, false, false), (false, true, false), (false, false, true), (true, false, true)]
+    {
+        let kinds = Kinds { color, depth, alpha };
+        let frame = gpu
+            .render(&gaussians, &RenderRequest { kinds, ..request(camera(70, 40)) })
+            .expect("some kinds");
+        assert_eq!(frame.color, all.color.clone().filter(|_| color), "{kinds:?}");
+        assert_eq!(frame.depth, all.depth.clone().filter(|_| depth), "{kinds:?}");
+        assert_eq!(frame.alpha, all.alpha.clone().filter(|_| alpha), "{kinds:?}");
+    }
+}
+
+#[test]
+fn bands_and_growth_change_nothing() {
+    let Some(gpu) = gpu() else { return };
+    let (gaussians, middle) = two_views(64, 11);
+    let request = request(middle);
+    let want = gpu.render(&gaussians, &request).expect("a picture");
+    let total = want.stats.intersections as u32;
+    // One row of tiles of four fits, two do not.
+    let Some(small) = open(|options| options.isects_max = total / 3) else { return };
+    let got = small.render(&gaussians, &request).expect("a picture in bands");
+    assert_eq!(got.color, want.color, "colour in bands");
+    assert_eq!(got.depth, want.depth, "depth in bands");
+    assert_eq!(got.stats, want.stats, "counts in bands");
+
+    let Some(tiny) = open(|options| options.isects_max = 16) else { return };
+    let error = tiny.render(&gaussians, &request).expect_err("a row has more than 16 pairs");
+    assert_eq!(error.code(), ErrorCode::LimitExceeded, "{error}");
+    assert!(error.message().ends_with("is over 16"), "{error}");
+
+    // Large footprints: more pairs than the first guess of four a Gaussian.
+    let mut raw = RawGaussians::default();
+    let mut random = Random(12);
+    for _ in 0..2_000 {
+        let mean = [random.range(-1.0, 1.0), random.range(-1.0, 1.0), random.range(2.0, 4.0)];
+        push(&mut raw, mean, random.quat(), [0.5; 3], 0.02, &[[0.5, 0.1, -0.2]]);
+    }
+    let wide = checked(raw);
+    let frame = judge(&small, "growth", &wide, &self::request(camera(16, 16)));
+    assert!(frame.stats.intersections > 0, "something was drawn");
+    judge(gpu, "growth", &wide, &self::request(camera(200, 200)));
+}
+
+#[test]
+fn a_lost_device_is_an_error_once() {
+    let Some(gpu) = open(|_| {}) else { return };
+    let gaussians = cloud(300, 0, 13);
+    let request = request(camera(64, 64));
+    let want = gpu.render(&gaussians, &request).expect("a picture");
+    assert_eq!(gpu.scenes_held(), 1, "the scene stays on the device");
+    gpu.lose_device();
+    let error = gpu.render(&gaussians, &request).expect_err("the device is gone");
+    assert_eq!(error.code(), ErrorCode::GpuUnavailable, "{error}");
+    let got = gpu.render(&gaussians, &request).expect("the device was opened again");
+    assert!(got == want, "the picture after the loss");
+}
+
+#[test]
+fn scenes_are_uploaded_once() {
+    let Some(gpu) = open(|_| {}) else { return };
+    let (a, b) = (cloud(100, 0, 14), cloud(100, 0, 15));
+    for scene in [&a, &b, &a.clone(), &b] {
+        gpu.render(scene, &request(camera(32, 32))).expect("a picture");
+    }
+    assert_eq!(gpu.scenes_held(), 2, "clones share their upload");
+}
