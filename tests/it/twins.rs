@@ -343,7 +343,9 @@ fn rasterize_twin() {
         color: Some(bytemuck::cast_slice(&got[..pixels * 3]).to_vec()),
         depth: Some(got[pixels * 3..pixels * 4].to_vec()),
         alpha: Some(got[pixels * 4..].to_vec()),
-        ..want.clone()
+        width: 96,
+        height: 96,
+        ..Frame::default()
     };
     same("rasterize alone", &got, &want, &gaussians, &request);
 }
