@@ -7,7 +7,11 @@
     reason = "helpers of tests are tests too"
 )]
 
+mod bad_input;
 mod common;
+mod errors;
+mod grpc;
+mod http;
 mod jobs;
 mod oracle;
 mod shader_layout;

@@ -2,8 +2,10 @@
 #![allow(dead_code, reason = "not every build of the tests uses every helper")]
 
 pub(crate) mod compare;
+pub(crate) mod doors;
 pub(crate) mod scenes;
 pub(crate) mod server;
+pub(crate) mod stand;
 
 use std::path::{Path, PathBuf};
 

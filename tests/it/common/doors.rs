@@ -1,0 +1,393 @@
+//! One client for both doors, so that a case runs through each and expects the same code.
+
+use segsplat::{
+    api::grpc::pb::{self, scene_service_client::SceneServiceClient},
+    scene::{Upload, UploadCameras},
+};
+use serde_json::Value;
+use std::net::SocketAddr;
+use tonic::transport::Channel;
+
+/// Bytes of a photo or archive in one gRPC message.
+const PIECE: usize = 256 << 10;
+
+/// What a refused call said.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Fault {
+    pub(crate) code: String,
+    pub(crate) message: String,
+    /// HTTP status or gRPC number.
+    pub(crate) number: i32,
+    pub(crate) retry_after: Option<String>,
+    pub(crate) request_id: String,
+}
+
+/// One of the two doors of a server.
+#[derive(Clone, Debug)]
+pub(crate) enum Door {
+    Http { base: String, client: reqwest::Client },
+    Grpc { client: SceneServiceClient<Channel> },
+}
+
+/// Both doors of the server at `addr`.
+pub(crate) async fn both(addr: SocketAddr) -> [Door; 2] {
+    [http(addr), grpc(addr).await]
+}
+
+pub(crate) fn http(addr: SocketAddr) -> Door {
+    Door::Http { base: format!("http://{addr}"), client: reqwest::Client::new() }
+}
+
+pub(crate) async fn channel(addr: SocketAddr) -> Channel {
+    let endpoint = Channel::from_shared(format!("http://{addr}")).expect("an address is a URI");
+    endpoint.connect().await.expect("the server listens")
+}
+
+pub(crate) async fn grpc(addr: SocketAddr) -> Door {
+    let client = SceneServiceClient::new(channel(addr).await)
+        .max_decoding_message_size(512 << 20)
+        .max_encoding_message_size(512 << 20);
+    Door::Grpc { client }
+}
+
+/// A view as `RenderView` asks for it, and as query parameters.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Ask {
+    pub(crate) pairs: Vec<(&'static str, String)>,
+}
+
+impl Ask {
+    /// From the first input camera, 64x48.
+    pub(crate) fn first() -> Self {
+        Self::default().with("from", 0).with("width", 64).with("height", 48)
+    }
+
+    pub(crate) fn with(mut self, name: &'static str, value: impl ToString) -> Self {
+        self.pairs.retain(|(known, _)| *known != name);
+        self.pairs.push((name, value.to_string()));
+        self
+    }
+
+    pub(crate) fn with_numbers(self, name: &'static str, numbers: &[f64]) -> Self {
+        let texts: Vec<_> = numbers.iter().map(f64::to_string).collect();
+        self.with(name, texts.join(","))
+    }
+
+    fn get(&self, name: &str) -> Option<&str> {
+        self.pairs.iter().find(|(known, _)| *known == name).map(|(_, value)| value.as_str())
+    }
+
+    fn number<T: std::str::FromStr>(&self, name: &str) -> Option<T> {
+        self.get(name).map(|text| text.parse().ok().expect("a number that gRPC can carry"))
+    }
+
+    fn numbers(&self, name: &str) -> Option<Vec<f64>> {
+        let text = self.get(name)?;
+        Some(text.split(',').map(|n| n.parse().expect("a number")).collect())
+    }
+
+    pub(crate) fn camera(&self) -> pb::CameraSpec {
+        use pb::camera_spec::{Lens, Pose};
+        let vec3 = |name| self.numbers(name).map(|v| pb::Vec3 { x: v[0], y: v[1], z: v[2] });
+        let pose = if let Some(values) = self.numbers("camera_to_world") {
+            Some(Pose::CameraToWorld(pb::Matrix { values }))
+        } else if let Some(from) = self.number("from") {
+            let (to, t) = (self.number("to").unwrap_or(from), self.number("t").unwrap_or(0.0));
+            Some(Pose::Between(pb::Between { from, to, t }))
+        } else if self.get("eye").is_some() {
+            let (eye, target, up) = (vec3("eye"), vec3("target"), vec3("up"));
+            Some(Pose::LookAt(pb::LookAt { eye, target, up }))
+        } else {
+            None
+        };
+        let focal = |fx| {
+            let (fy, cx, cy) = (self.number("fy"), self.number("cx"), self.number("cy"));
+            Lens::Focal(pb::Focal { fx, fy, cx, cy })
+        };
+        let lens = self.number("fx").map(focal).or(self.number("fov").map(Lens::Fov));
+        pb::CameraSpec { pose, lens }
+    }
+
+    pub(crate) fn options(&self) -> pb::ViewOptions {
+        let format = match self.get("format") {
+            None => pb::Format::Unspecified,
+            Some("png") => pb::Format::Png,
+            Some("jpeg") => pb::Format::Jpeg,
+            Some("webp") => pb::Format::Webp,
+            Some("npy") => pb::Format::Npy,
+            Some(other) => panic!("format {other} is not in the proto"),
+        };
+        pb::ViewOptions {
+            width: self.number("width"),
+            height: self.number("height"),
+            format: format.into(),
+            background: self.numbers("background").map(|v| pb::Vec3 { x: v[0], y: v[1], z: v[2] }),
+            antialiased: self.get("antialiased") == Some("true"),
+            near: self.number("near"),
+        }
+    }
+
+    pub(crate) fn kind(&self) -> pb::Kind {
+        match self.get("kind") {
+            None => pb::Kind::Unspecified,
+            Some("color") => pb::Kind::Color,
+            Some("depth") => pb::Kind::Depth,
+            Some("alpha") => pb::Kind::Alpha,
+            Some("semantics") => pb::Kind::Semantics,
+            Some("relevancy") => pb::Kind::Relevancy,
+            Some("mask") => pb::Kind::Mask,
+            Some(other) => panic!("kind {other} is not in the proto"),
+        }
+    }
+}
+
+/// Options of a create call.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Options {
+    pub(crate) wait_ms: Option<u64>,
+    pub(crate) semantics: Option<&'static str>,
+    pub(crate) bundle: Option<&'static str>,
+    pub(crate) idempotency_key: Option<String>,
+}
+
+impl Options {
+    pub(crate) fn wait() -> Self {
+        Self { wait_ms: Some(120_000), ..Self::default() }
+    }
+}
+
+impl Door {
+    pub(crate) fn name(&self) -> &'static str {
+        match self {
+            Self::Http { .. } => "http",
+            Self::Grpc { .. } => "grpc",
+        }
+    }
+
+    /// The number that this door answers for a row of the error table.
+    pub(crate) fn number_of(&self, row: &segsplat::error::ErrorRow) -> i32 {
+        match self {
+            Self::Http { .. } => i32::from(row.http),
+            Self::Grpc { .. } => row.grpc,
+        }
+    }
+
+    /// Makes a scene; its id and state.
+    pub(crate) async fn create(
+        &self,
+        upload: &Upload,
+        options: &Options,
+    ) -> Result<(String, String), Fault> {
+        match self {
+            Self::Http { base, client } => {
+                let mut query: Vec<(&str, String)> = Vec::new();
+                query.extend(options.wait_ms.map(|ms| ("wait_ms", ms.to_string())));
+                query.extend(options.semantics.map(|s| ("semantics", s.to_owned())));
+                query.extend(options.bundle.map(|s| ("bundle", s.to_owned())));
+                let url = url(base, "/v1/scenes", &query);
+                let mut request = client.post(url).multipart(form(upload));
+                if let Some(key) = &options.idempotency_key {
+                    request = request.header("idempotency-key", key);
+                }
+                let scene = json(request.send().await.expect("an answer")).await?;
+                Ok((text(&scene["id"]), text(&scene["state"])))
+            }
+            Self::Grpc { client } => {
+                let messages = tokio_stream::iter(messages(upload, options));
+                let scene = client.clone().create_scene(messages).await.map_err(fault_of)?;
+                let scene = scene.into_inner();
+                let state = scene.state().as_str_name().trim_start_matches("SCENE_STATE_");
+                Ok((scene.id.clone(), state.to_lowercase()))
+            }
+        }
+    }
+
+    /// A scene's state and warning codes.
+    pub(crate) async fn get(&self, id: &str) -> Result<(String, Vec<String>), Fault> {
+        match self {
+            Self::Http { base, client } => {
+                let url = format!("{base}/v1/scenes/{id}");
+                let scene = json(client.get(url).send().await.expect("an answer")).await?;
+                let warnings = scene["report"]["warnings"].as_array().cloned().unwrap_or_default();
+                Ok((text(&scene["state"]), warnings.iter().map(|w| text(&w["code"])).collect()))
+            }
+            Self::Grpc { client } => {
+                let request = pb::GetSceneRequest { scene_id: id.to_owned() };
+                let scene = client.clone().get_scene(request).await.map_err(fault_of)?;
+                let scene = scene.into_inner();
+                let state = scene.state().as_str_name().trim_start_matches("SCENE_STATE_");
+                let warnings = scene.report.clone().unwrap_or_default().warnings;
+                let codes = warnings.into_iter().map(|warning| warning.code).collect();
+                Ok((state.to_lowercase(), codes))
+            }
+        }
+    }
+
+    pub(crate) async fn delete(&self, id: &str) -> Result<(), Fault> {
+        match self {
+            Self::Http { base, client } => {
+                let url = format!("{base}/v1/scenes/{id}");
+                bytes(client.delete(url).send().await.expect("an answer")).await.map(drop)
+            }
+            Self::Grpc { client } => {
+                let request = pb::DeleteSceneRequest { scene_id: id.to_owned() };
+                client.clone().delete_scene(request).await.map(drop).map_err(fault_of)
+            }
+        }
+    }
+
+    /// The bytes of one view.
+    pub(crate) async fn view(&self, id: &str, ask: &Ask) -> Result<Vec<u8>, Fault> {
+        match self {
+            Self::Http { base, client } => {
+                let url = url(base, &format!("/v1/scenes/{id}/view"), &ask.pairs);
+                bytes(client.get(url).send().await.expect("an answer")).await
+            }
+            Self::Grpc { client } => {
+                let request = pb::RenderViewRequest {
+                    scene_id: id.to_owned(),
+                    camera: Some(ask.camera()),
+                    kind: ask.kind().into(),
+                    options: Some(ask.options()),
+                    text: ask.get("text").unwrap_or_default().to_owned(),
+                };
+                let view = client.clone().render_view(request).await.map_err(fault_of)?;
+                Ok(view.into_inner().data.to_vec())
+            }
+        }
+    }
+
+    /// The bytes of an export.
+    pub(crate) async fn export(&self, id: &str) -> Result<Vec<u8>, Fault> {
+        match self {
+            Self::Http { base, client } => {
+                let url = format!("{base}/v1/scenes/{id}/export?format=ply");
+                bytes(client.get(url).send().await.expect("an answer")).await
+            }
+            Self::Grpc { client } => {
+                let request = pb::ExportRequest { scene_id: id.to_owned(), format: 1 };
+                let chunks = client.clone().export(request).await.map_err(fault_of)?;
+                let mut chunks = chunks.into_inner();
+                let (mut file, mut size) = (Vec::new(), None);
+                while let Some(chunk) = chunks.message().await.map_err(fault_of)? {
+                    size = size.or(chunk.size_bytes);
+                    file.extend_from_slice(&chunk.data);
+                }
+                assert_eq!(size, Some(file.len() as u64), "the size said first");
+                Ok(file)
+            }
+        }
+    }
+}
+
+/// `base` + `path` + the pairs, percent-encoded.
+pub(crate) fn url(base: &str, path: &str, pairs: &[(&str, String)]) -> reqwest::Url {
+    let mut url = reqwest::Url::parse(&format!("{base}{path}")).expect("a URL");
+    if !pairs.is_empty() {
+        url.query_pairs_mut().extend_pairs(pairs);
+    }
+    url
+}
+
+/// An upload as a multipart form.
+pub(crate) fn form(upload: &Upload) -> reqwest::multipart::Form {
+    let part = |bytes: &[u8]| reqwest::multipart::Part::bytes(bytes.to_vec());
+    // Names as curl and browsers send them, slashes and all.
+    let mut form = reqwest::multipart::Form::new().percent_encode_noop();
+    match &upload.cameras {
+        None => {}
+        Some(UploadCameras::Transforms(json)) => form = form.part("transforms", part(json)),
+        Some(UploadCameras::Cameras(json)) => form = form.part("cameras", part(json)),
+    }
+    if let Some(archive) = &upload.archive {
+        form = form.part("archive", part(archive));
+    }
+    upload.photos.iter().fold(form, |form, photo| {
+        let file = photo.name.rsplit('/').next().unwrap_or_default().to_owned();
+        form.part(photo.name.clone(), part(&photo.bytes).file_name(file))
+    })
+}
+
+/// An upload as the messages of `CreateScene`.
+pub(crate) fn messages(upload: &Upload, options: &Options) -> Vec<pb::CreateSceneRequest> {
+    use pb::{create_scene_header::Cameras, create_scene_request::Part};
+    let cameras = upload.cameras.as_ref().map(|cameras| match cameras {
+        UploadCameras::Transforms(json) => Cameras::TransformsJson(json.clone().into()),
+        UploadCameras::Cameras(json) => Cameras::CamerasJson(json.clone().into()),
+    });
+    let semantics = match options.semantics {
+        None => pb::Semantics::Unspecified,
+        Some("lazy") => pb::Semantics::Lazy,
+        Some("eager") => pb::Semantics::Eager,
+        Some("off") => pb::Semantics::Off,
+        Some(other) => panic!("semantics {other} is not in the proto"),
+    };
+    let header = pb::CreateSceneHeader {
+        cameras,
+        semantics: semantics.into(),
+        bundle: options.bundle.unwrap_or_default().to_owned(),
+        max_views: None,
+        wait_ms: options.wait_ms,
+        idempotency_key: options.idempotency_key.clone().unwrap_or_default(),
+    };
+    let mut parts = vec![Part::Header(header)];
+    for photo in &upload.photos {
+        let mut name = photo.name.clone();
+        if photo.bytes.is_empty() {
+            parts.push(Part::Photo(pb::PhotoChunk { name: name.clone(), data: Vec::new().into() }));
+        }
+        for piece in photo.bytes.chunks(PIECE) {
+            let name = std::mem::take(&mut name);
+            parts.push(Part::Photo(pb::PhotoChunk { name, data: piece.to_vec().into() }));
+        }
+    }
+    for piece in upload.archive.iter().flat_map(|archive| archive.chunks(PIECE)) {
+        parts.push(Part::Archive(piece.to_vec().into()));
+    }
+    parts.into_iter().map(|part| pb::CreateSceneRequest { part: Some(part) }).collect()
+}
+
+/// The body of a good answer, or the fault of a bad one.
+pub(crate) async fn bytes(answer: reqwest::Response) -> Result<Vec<u8>, Fault> {
+    let (status, headers) = (answer.status(), answer.headers().clone());
+    let body = answer.bytes().await.expect("a whole body").to_vec();
+    if status.is_success() || status.as_u16() == 304 {
+        return Ok(body);
+    }
+    let value: Value = serde_json::from_slice(&body).unwrap_or_else(|e| {
+        panic!("{status} without our body: {e}: {}", String::from_utf8_lossy(&body))
+    });
+    let header = |name: &str| headers.get(name).map(|v| v.to_str().unwrap().to_owned());
+    assert_eq!(Some(text(&value["request_id"])), header("x-request-id"), "two request ids");
+    assert!(value["details"].is_object(), "no details in {value}");
+    Err(Fault {
+        code: text(&value["code"]),
+        message: text(&value["message"]),
+        number: i32::from(status.as_u16()),
+        retry_after: header("retry-after"),
+        request_id: text(&value["request_id"]),
+    })
+}
+
+/// The JSON of a good answer.
+pub(crate) async fn json(answer: reqwest::Response) -> Result<Value, Fault> {
+    Ok(serde_json::from_slice(&bytes(answer).await?).expect("JSON"))
+}
+
+/// The fault of a gRPC status.
+pub(crate) fn fault_of(status: tonic::Status) -> Fault {
+    let key = |name: &str| {
+        status.metadata().get(name).map(|value| value.to_str().expect("ASCII").to_owned())
+    };
+    Fault {
+        code: key("segsplat-code").unwrap_or_else(|| panic!("no segsplat-code: {status:?}")),
+        message: status.message().to_owned(),
+        number: status.code() as i32,
+        retry_after: key("retry-after"),
+        request_id: key("x-request-id").unwrap_or_default(),
+    }
+}
+
+fn text(value: &Value) -> String {
+    value.as_str().unwrap_or_else(|| panic!("{value} is not a text")).to_owned()
+}

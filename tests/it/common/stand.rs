@@ -1,0 +1,135 @@
+//! A whole server whose scenes are made without a network: photos are read and the capture is
+//! judged by the product's own code, then the first photo stands as a board of Gaussians at the
+//! capture's median depth.
+
+use std::sync::{Arc, atomic::Ordering};
+
+use glam::DVec3;
+use segsplat::{
+    capture,
+    config::Config,
+    error::{Error, ErrorCode, Result},
+    jobs::{Made, SceneMaker, Work},
+    limits::Limits,
+    photos,
+    render::cpu::CpuRenderer,
+    sample::{self, SampleOptions},
+    scene::{Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SourcePixel, Upload},
+    service::ModelsInfo,
+};
+
+use super::server::TestServer;
+
+/// Degree 0 of the 3DGS basis.
+const SH_C0: f32 = 0.282_094_79;
+/// Gaussians along the longer side of the board.
+const BOARD: u32 = 80;
+
+/// Makes a board of the first photo.
+#[derive(Debug, Default)]
+pub(crate) struct BoardMaker {
+    /// Fails every scene with this code instead.
+    pub(crate) fails: Option<ErrorCode>,
+}
+
+impl SceneMaker for BoardMaker {
+    fn check(&self, upload: &Upload, limits: &Limits) -> Result<()> {
+        photos::read(upload, limits).map(drop)
+    }
+
+    fn make(&self, work: Work<'_>) -> Result<Made> {
+        (work.progress)("photos", 0.1);
+        if let Some(code) = self.fails {
+            return Err(Error::new(code, format!("made to fail with {}", code.name())));
+        }
+        let photos = photos::read(work.upload, &Limits::default())?;
+        (work.progress)("capture", 0.4);
+        let capture = capture::analyse(&photos)?;
+        if work.cancel.load(Ordering::Relaxed) {
+            return Err(Error::new(ErrorCode::Cancelled, "stopped"));
+        }
+        (work.progress)("lift", 0.8);
+        let (gaussians, _) = Gaussians::sanitize(board(&photos[0], capture.median_depth))?;
+        let report = HealthReport {
+            photos: u32::try_from(photos.len()).expect("few photos"),
+            views_used: u32::try_from(photos.len()).expect("few photos"),
+            gaussians: gaussians.len() as u64,
+            median_depth: capture.median_depth,
+            warnings: capture.warnings,
+            ..HealthReport::default()
+        };
+        let camera =
+            |posed: &PosedPhoto| SceneCamera { file: posed.file.clone(), camera: posed.camera };
+        let cameras = photos.iter().map(camera).collect();
+        Ok(Made { gaussians, report, cameras, bundle_sha256: String::new() })
+    }
+}
+
+/// The photo's pixels as round Gaussians at depth `z` of its camera.
+fn board(posed: &PosedPhoto, z: f64) -> RawGaussians {
+    let (photo, camera) = (&posed.photo, posed.camera);
+    let step = photo.width.max(photo.height).div_ceil(BOARD).max(1);
+    let origin = camera.camera_to_world.center();
+    let mut raw = RawGaussians { origin, ..RawGaussians::default() };
+    for y in (0..photo.height).step_by(step as usize) {
+        for x in (0..photo.width).step_by(step as usize) {
+            let at = camera.intrinsics.unproject(f64::from(x) + 0.5, f64::from(y) + 0.5, z);
+            let world = camera.camera_to_world.matrix().transform_point3(at) - origin;
+            let size = (z / camera.intrinsics.fx * f64::from(step) * 0.6) as f32;
+            let pixel = ((y * photo.width + x) * 3) as usize;
+            let rgb = |c: usize| f32::from(photo.rgb[pixel + c]) / 255.0;
+            raw.means.push(DVec3::to_array(&world).map(|v| v as f32));
+            raw.quats.push([1.0, 0.0, 0.0, 0.0]);
+            raw.scales.push([size; 3]);
+            raw.opacities.push(0.9);
+            raw.sh.push([0, 1, 2].map(|c| (rgb(c) - 0.5) / SH_C0));
+            raw.semantic_index.push(0);
+            raw.source.push(SourcePixel::default());
+        }
+    }
+    raw
+}
+
+/// A [`TestServer`] that judges captures and renders with the product's CPU renderer.
+pub(crate) struct Stand(TestServer);
+
+impl std::ops::Deref for Stand {
+    type Target = TestServer;
+
+    fn deref(&self) -> &TestServer {
+        &self.0
+    }
+}
+
+impl Stand {
+    /// A server with default limits.
+    pub(crate) async fn start() -> Self {
+        Self::with(BoardMaker::default(), |_| {}).await
+    }
+
+    /// A server with this maker and a changed configuration.
+    pub(crate) async fn with(maker: BoardMaker, change: impl FnOnce(&mut Config)) -> Self {
+        let server = TestServer::with(|config, parts| {
+            parts.maker = Arc::new(maker);
+            parts.renderer = Arc::new(CpuRenderer::new(config.threads).expect("a CPU renderer"));
+            parts.models = ModelsInfo { bundle: "board".to_owned(), ..ModelsInfo::default() };
+            change(config);
+        });
+        Self(server.await)
+    }
+
+    /// Sends the stop signal and waits for the end.
+    pub(crate) async fn stop(self) {
+        self.0.stop().await;
+    }
+}
+
+/// Three small photos of the sample room, which match each other.
+pub(crate) fn upload() -> Upload {
+    sample::upload(&options()).expect("the sample is made")
+}
+
+/// How [`upload`] is made.
+pub(crate) fn options() -> SampleOptions {
+    SampleOptions { photos: 3, width: 160, height: 120, seed: 5 }
+}

@@ -1,0 +1,211 @@
+//! One table, two doors, two descriptions: every code through both transports, the OpenAPI
+//! document against the routes and real answers, the proto against the OpenAPI document.
+
+use std::collections::BTreeSet;
+
+use segsplat::{
+    api::{grpc::DESCRIPTORS, http::routes},
+    error::TABLE,
+};
+use serde_json::{Value, json};
+
+use crate::common::{
+    doors::{Door, Options, both, form, json as body},
+    root,
+    stand::{BoardMaker, Stand, upload},
+};
+
+#[tokio::test]
+async fn every_code_comes_through_both_doors_as_its_row_says() {
+    for row in &TABLE {
+        let maker = BoardMaker { fails: Some(row.code) };
+        let stand = Stand::with(maker, |_| {}).await;
+        for door in both(stand.addr).await {
+            let fault = door.create(&upload(), &Options::wait()).await.expect_err(row.name);
+            assert_eq!(fault.code, row.name, "{}", door.name());
+            assert_eq!(fault.number, door.number_of(row), "{} of {}", row.name, door.name());
+            assert!(fault.message.contains("made to fail"), "{}", fault.message);
+            assert!(!fault.request_id.is_empty(), "no request id from {}", door.name());
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_failed_scene_keeps_its_code_and_its_views_are_refused_with_it() {
+    let maker = BoardMaker { fails: Some(segsplat::error::ErrorCode::PhotoUnreadable) };
+    let stand = Stand::with(maker, |_| {}).await;
+    for door in both(stand.addr).await {
+        let (id, _) = door.create(&upload(), &Options::default()).await.unwrap();
+        loop {
+            let (state, _) = door.get(&id).await.unwrap();
+            if state == "failed" {
+                break;
+            }
+            assert!(["queued", "running"].contains(&state.as_str()), "{state}");
+            tokio::task::yield_now().await;
+        }
+        let fault = door.view(&id, &crate::common::doors::Ask::first()).await.unwrap_err();
+        assert!(!["internal", "scene_not_found"].contains(&fault.code.as_str()), "{fault:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_full_queue_is_overloaded_and_says_when_to_come_back() {
+    let stand = Stand::with(BoardMaker::default(), |config| {
+        config.limits.queued_jobs_max = 0;
+    })
+    .await;
+    for door in both(stand.addr).await {
+        let fault = door.create(&upload(), &Options::default()).await.unwrap_err();
+        assert_eq!(fault.code, "overloaded", "{}", fault.message);
+        let seconds = fault.retry_after.expect("retry-after");
+        assert!(seconds.parse::<u32>().unwrap() > 0, "{seconds} of {}", door.name());
+    }
+}
+
+async fn document(stand: &Stand) -> Value {
+    body(reqwest::get(stand.url("/openapi.json")).await.unwrap()).await.unwrap()
+}
+
+/// `POST /v1/scenes` and so on, of the document.
+fn documented(document: &Value) -> BTreeSet<String> {
+    let paths = document["paths"].as_object().expect("paths");
+    paths
+        .iter()
+        .flat_map(|(path, item)| {
+            let methods = ["get", "post", "delete", "put", "patch", "head"];
+            let given = methods.into_iter().filter(|method| item.get(method).is_some());
+            given.map(move |method| format!("{} {path}", method.to_uppercase()))
+        })
+        .collect()
+}
+
+#[tokio::test]
+async fn the_openapi_document_has_the_routes_and_nothing_else() {
+    let stand = Stand::start().await;
+    let served: BTreeSet<_> =
+        routes().iter().map(|route| format!("{} {}", route.method, route.path)).collect();
+    assert_eq!(documented(&document(&stand).await), served);
+    // And each of them is really served: none is answered as an unknown route.
+    for route in routes() {
+        let path = route.path.replace("{id}", &"0".repeat(32));
+        let method = reqwest::Method::from_bytes(route.method.as_bytes()).unwrap();
+        let answer = reqwest::Client::new().request(method, stand.url(&path)).send().await;
+        let answer = answer.unwrap();
+        assert_ne!(answer.status(), 405, "{} {path}", route.method);
+        let text = answer.text().await.unwrap();
+        assert!(!text.contains("no such route"), "{} {path}: {text}", route.method);
+    }
+}
+
+#[tokio::test]
+async fn the_two_doors_have_the_same_calls() {
+    let stand = Stand::start().await;
+    let document = document(&stand).await;
+    let operations: BTreeSet<_> = document["paths"]
+        .as_object()
+        .unwrap()
+        .iter()
+        .filter(|(path, _)| path.starts_with("/v1/scenes"))
+        .flat_map(|(_, item)| item.as_object().unwrap().values())
+        .filter_map(|operation| operation.get("operationId"))
+        .map(|id| id.as_str().unwrap().to_owned())
+        .collect();
+    let proto = std::fs::read_to_string(root().join("proto/segsplat/v1/scene.proto")).unwrap();
+    let rpcs: BTreeSet<_> = proto
+        .lines()
+        .filter_map(|line| line.trim().strip_prefix("rpc "))
+        .map(|rest| snake(rest.split('(').next().unwrap()))
+        .collect();
+    assert_eq!(operations, rpcs, "HTTP operations and gRPC methods");
+    let descriptors = String::from_utf8_lossy(DESCRIPTORS);
+    assert!(descriptors.contains("SceneService"), "the descriptors lack the service");
+}
+
+fn snake(camel: &str) -> String {
+    let mut name = String::new();
+    for c in camel.chars() {
+        if c.is_uppercase() && !name.is_empty() {
+            name.push('_');
+        }
+        name.extend(c.to_lowercase());
+    }
+    name
+}
+
+#[tokio::test]
+async fn real_answers_have_the_fields_that_the_document_says() {
+    let stand = Stand::start().await;
+    let document = document(&stand).await;
+    let client = reqwest::Client::new();
+    let request = client.post(stand.url("/v1/scenes?wait_ms=120000")).multipart(form(&upload()));
+    let scene = body(request.send().await.unwrap()).await.unwrap();
+    let get = async |path: &str| reqwest::get(stand.url(path)).await.unwrap();
+    let mut faults = Vec::new();
+    check(&document, "Scene", &scene, &mut faults);
+    for (name, path) in [
+        ("Page", "/v1/scenes"),
+        ("Models", "/v1/models"),
+        ("Readiness", "/readyz"),
+        ("Liveness", "/healthz"),
+        ("ErrorBody", "/v1/scenes/none"),
+        ("ErrorBody", "/nothing"),
+    ] {
+        check(&document, name, &get(path).await.json().await.unwrap(), &mut faults);
+    }
+    assert!(faults.is_empty(), "{}", faults.join("\n"));
+    let mut broken = Vec::new();
+    check(&document, "Scene", &json!({ "id": "x", "colour": 1 }), &mut broken);
+    assert!(broken.len() > 3, "the check finds nothing wrong with nonsense: {broken:?}");
+}
+
+/// Compares `value` with the schema `name`: no field unknown, none missing, those below too.
+fn check(document: &Value, name: &str, value: &Value, faults: &mut Vec<String>) {
+    let schema = &document["components"]["schemas"][name];
+    let fields = schema["properties"].as_object().unwrap_or_else(|| panic!("no schema {name}"));
+    let object = value.as_object().unwrap_or_else(|| panic!("{name} is {value}"));
+    for key in object.keys().filter(|key| !fields.contains_key(*key)) {
+        faults.push(format!("{name}: `{key}` is not in the document"));
+    }
+    for key in schema["required"].as_array().into_iter().flatten() {
+        let key = key.as_str().unwrap();
+        if !object.contains_key(key) {
+            faults.push(format!("{name}: `{key}` is missing"));
+        }
+    }
+    for (key, field) in fields {
+        let Some(value) = object.get(key).filter(|value| !value.is_null()) else { continue };
+        let reference = [field, &field["items"]]
+            .into_iter()
+            .chain(field["oneOf"].as_array().into_iter().flatten());
+        let reference = reference.filter_map(|field| field["$ref"].as_str()).next();
+        let Some(reference) = reference else { continue };
+        let inner = reference.rsplit('/').next().unwrap();
+        let values = value.as_array().map_or(vec![value], |values| values.iter().collect());
+        for value in values {
+            check(document, inner, value, faults);
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_request_of_ours_is_never_answered_with_another_shape() {
+    let stand = Stand::start().await;
+    let [http, _] = both(stand.addr).await;
+    let Door::Http { base, client } = http else { panic!("the first door is HTTP") };
+    for (method, path) in [
+        ("POST", "/v1/scenes"),
+        ("POST", "/v1/scenes/00000000000000000000000000000000/views"),
+        ("PATCH", "/v1/models"),
+        ("GET", "/v1/scenes/%ff"),
+        ("GET", "/v1/scenes/x/view?width=%00"),
+        ("DELETE", "/"),
+    ] {
+        let method = reqwest::Method::from_bytes(method.as_bytes()).unwrap();
+        let request = client.request(method.clone(), format!("{base}{path}"));
+        let answer = request.body("{ not json").send().await.unwrap();
+        // `bytes` panics where the body is not ours.
+        let fault = crate::common::doors::bytes(answer).await.expect_err(path);
+        assert!(!fault.message.is_empty(), "{method} {path}");
+    }
+}

@@ -1,0 +1,320 @@
+//! The HTTP door over real sockets: a scene's life, pictures in every kind and encoding, and the
+//! manners of the protocol.
+
+use std::io::{Cursor, Read};
+
+use reqwest::{Client, StatusCode, header};
+use segsplat::scene::Upload;
+use serde_json::{Value, json};
+
+use crate::common::{
+    doors::{Fault, bytes, form, json as body},
+    stand::{Stand, upload},
+};
+
+/// Makes the sample's scene and waits for it.
+async fn made(stand: &Stand) -> String {
+    let request = Client::new().post(stand.url("/v1/scenes?wait_ms=120000"));
+    let answer = request.multipart(form(&upload())).send().await.unwrap();
+    let scene = body(answer).await.unwrap();
+    assert_eq!(scene["state"], "done", "{scene}");
+    scene["id"].as_str().unwrap().to_owned()
+}
+
+async fn get(stand: &Stand, path: &str) -> reqwest::Response {
+    Client::new().get(stand.url(path)).send().await.unwrap()
+}
+
+async fn fault(stand: &Stand, path: &str) -> Fault {
+    bytes(get(stand, path).await).await.expect_err(path)
+}
+
+#[tokio::test]
+async fn a_scene_is_made_listed_shown_and_deleted() {
+    let stand = Stand::start().await;
+    let request = Client::new().post(stand.url("/v1/scenes?wait_ms=120000"));
+    let answer = request.multipart(form(&upload())).send().await.unwrap();
+    assert_eq!(answer.status(), StatusCode::CREATED);
+    let location = answer.headers()[header::LOCATION].to_str().unwrap().to_owned();
+    let posted = body(answer).await.unwrap();
+    assert_eq!(location, format!("/v1/scenes/{}", posted["id"].as_str().unwrap()));
+
+    let shown = body(get(&stand, &location).await).await.unwrap();
+    assert_eq!(shown["state"], "done");
+    assert_eq!(shown["cameras"].as_array().unwrap().len(), 3, "cameras of three photos");
+    assert_eq!(shown["cameras"][1]["file"], "images/0001.png");
+    assert!(shown["report"]["gaussians"].as_u64().unwrap() > 100, "{}", shown["report"]);
+    assert_eq!(shown["semantics"]["available"], false);
+    assert!(shown["semantics"]["reason"].as_str().unwrap().contains("board"));
+
+    let second = made(&stand).await;
+    let page = body(get(&stand, "/v1/scenes?limit=1").await).await.unwrap();
+    assert_eq!(page["scenes"][0]["id"], Value::from(second), "newest first");
+    let next = page["next"].as_str().expect("a second page");
+    let page = body(get(&stand, &format!("/v1/scenes?limit=1&after={next}")).await).await.unwrap();
+    assert_eq!(page["scenes"][0]["id"], posted["id"]);
+    assert_eq!(page["next"], Value::Null, "a third page of two scenes");
+
+    let gone = Client::new().delete(stand.url(&location)).send().await.unwrap();
+    assert_eq!(gone.status(), StatusCode::NO_CONTENT);
+    assert_eq!(fault(&stand, &location).await.code, "scene_not_found");
+}
+
+#[tokio::test]
+async fn creating_without_waiting_is_accepted_and_events_lead_to_done() {
+    let stand = Stand::start().await;
+    let request = Client::new().post(stand.url("/v1/scenes"));
+    let answer = request.multipart(form(&upload())).send().await.unwrap();
+    assert_eq!(answer.status(), StatusCode::ACCEPTED);
+    let location = answer.headers()[header::LOCATION].to_str().unwrap().to_owned();
+    let events = get(&stand, &format!("{location}/events")).await;
+    assert_eq!(events.headers()[header::CONTENT_TYPE], "text/event-stream");
+    // The stream ends with the last event.
+    let text = events.text().await.unwrap();
+    let names: Vec<_> = text.lines().filter_map(|line| line.strip_prefix("event: ")).collect();
+    assert_eq!(names.last(), Some(&"done"), "{text}");
+    assert!(names.iter().all(|name| ["queued", "running", "done"].contains(name)), "{names:?}");
+    for data in text.lines().filter_map(|line| line.strip_prefix("data: ")) {
+        let event: Value = serde_json::from_str(data).unwrap();
+        assert!(names.contains(&event["event"].as_str().unwrap()), "{event}");
+    }
+}
+
+#[tokio::test]
+async fn every_kind_comes_in_every_encoding_it_can() {
+    let stand = Stand::start().await;
+    let id = made(&stand).await;
+    for (kind, format, media) in [
+        ("color", "png", "image/png"),
+        ("color", "jpeg", "image/jpeg"),
+        ("color", "webp", "image/webp"),
+        ("color", "npy", "application/x-npy"),
+        ("alpha", "png", "image/png"),
+        ("alpha", "npy", "application/x-npy"),
+        ("depth", "png", "image/png"),
+        ("depth", "npy", "application/x-npy"),
+    ] {
+        let case = format!("{kind} as {format}");
+        let query = format!("from=0&width=80&height=60&kind={kind}&format={format}");
+        let answer = get(&stand, &format!("/v1/scenes/{id}/view?{query}")).await;
+        assert_eq!(answer.status(), StatusCode::OK, "{case}");
+        assert_eq!(answer.headers()[header::CONTENT_TYPE], media, "{case}");
+        let scale = answer.headers().get("x-depth-scale").map(|v| v.to_str().unwrap().to_owned());
+        let picture = answer.bytes().await.unwrap();
+        if format == "npy" {
+            assert_eq!(&picture[..6], b"\x93NUMPY", "{case}");
+            let head = String::from_utf8_lossy(&picture[..128]).into_owned();
+            let shape = if kind == "color" { "(60, 80, 3)" } else { "(60, 80)" };
+            assert!(head.contains("<f4") && head.contains(shape), "{case}: {head}");
+        } else {
+            let decoded = image::load_from_memory(&picture).unwrap();
+            assert_eq!((decoded.width(), decoded.height()), (80, 60), "{case}");
+        }
+        let scaled = kind == "depth" && format == "png";
+        assert_eq!(scale.is_some_and(|s| s.parse::<f64>().unwrap() > 0.0), scaled, "{case}");
+    }
+    for format in ["jpeg", "webp"] {
+        let path = format!("/v1/scenes/{id}/view?from=0&kind=depth&format={format}");
+        assert_eq!(fault(&stand, &path).await.code, "invalid_request", "depth as {format}");
+    }
+}
+
+#[tokio::test]
+async fn the_picture_from_an_input_camera_looks_like_its_photo() {
+    let stand = Stand::start().await;
+    let id = made(&stand).await;
+    let answer = get(&stand, &format!("/v1/scenes/{id}/view?from=0&width=160&height=120")).await;
+    let view = image::load_from_memory(&answer.bytes().await.unwrap()).unwrap().to_rgb8();
+    let photo = image::load_from_memory(&upload().photos[0].bytes).unwrap().to_rgb8();
+    let error: f64 = view
+        .as_raw()
+        .iter()
+        .zip(photo.as_raw())
+        .map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2))
+        .sum::<f64>()
+        / view.as_raw().len() as f64;
+    let psnr = 10.0 * (255.0_f64.powi(2) / error).log10();
+    assert!(psnr > 18.0, "the board is {psnr:.1} dB from its photo");
+}
+
+#[tokio::test]
+async fn accept_chooses_the_encoding_and_a_known_tag_saves_the_picture() {
+    let stand = Stand::start().await;
+    let id = made(&stand).await;
+    let url = stand.url(&format!("/v1/scenes/{id}/view?from=0&width=40&height=30"));
+    let client = Client::new();
+    let first = client.get(&url).header("accept", "image/webp").send().await.unwrap();
+    assert_eq!(first.headers()[header::CONTENT_TYPE], "image/webp");
+    let tag = first.headers()[header::ETAG].clone();
+    let ask = |tag| client.get(&url).header("accept", "image/webp").header("if-none-match", tag);
+    let again = ask(tag.clone()).send().await.unwrap();
+    assert_eq!(again.status(), StatusCode::NOT_MODIFIED);
+    assert_eq!(again.headers()[header::ETAG], tag);
+    assert!(again.bytes().await.unwrap().is_empty(), "304 with a body");
+    let other = client.get(&url).header("if-none-match", tag).send().await.unwrap();
+    assert_eq!(other.status(), StatusCode::OK, "PNG under the tag of a WebP");
+    let none = client.get(&url).header("accept", "text/html").send().await.unwrap();
+    assert_eq!(bytes(none).await.unwrap_err().code, "invalid_request");
+}
+
+#[tokio::test]
+async fn many_views_come_as_parts_or_as_a_zip_and_equal_single_views() {
+    let stand = Stand::start().await;
+    let id = made(&stand).await;
+    let url = stand.url(&format!("/v1/scenes/{id}/views"));
+    let cameras = json!([{ "from": 0 }, { "from": 0, "to": 2, "t": 0.5 }]);
+    let request = json!({
+        "cameras": cameras, "kinds": ["color", "alpha"], "width": 40, "height": 30,
+    });
+    let answer = Client::new().post(&url).json(&request).send().await.unwrap();
+    let media = answer.headers()[header::CONTENT_TYPE].to_str().unwrap().to_owned();
+    let boundary = media.strip_prefix("multipart/mixed; boundary=").expect(&media).to_owned();
+    let parts = split(&answer.bytes().await.unwrap(), &boundary);
+    assert_eq!(parts.len(), 4, "two cameras of two kinds");
+
+    let mut zipped = request.clone();
+    zipped["container"] = "zip".into();
+    let answer = Client::new().post(&url).json(&zipped).send().await.unwrap();
+    assert_eq!(answer.headers()[header::CONTENT_TYPE], "application/zip");
+    let file = Cursor::new(answer.bytes().await.unwrap());
+    let mut archive = zip::ZipArchive::new(file).unwrap();
+    let names = ["view-000-color.png", "view-000-alpha.png", "view-001-color.png"];
+    for (name, part) in names.into_iter().zip(&parts) {
+        let mut stored = Vec::new();
+        archive.by_name(name).unwrap().read_to_end(&mut stored).unwrap();
+        assert_eq!(&stored, part, "{name} differs between zip and multipart");
+    }
+    assert_eq!(archive.len(), 5, "four pictures and index.json");
+
+    let path = format!("/v1/scenes/{id}/view?from=0&to=2&t=0.5&width=40&height=30");
+    let single = get(&stand, &path).await.bytes().await.unwrap();
+    assert_eq!(single, parts[2], "a single view of the same camera");
+}
+
+/// The bodies of a multipart answer.
+fn split(body: &[u8], boundary: &str) -> Vec<Vec<u8>> {
+    let mark = format!("--{boundary}").into_bytes();
+    let at: Vec<_> = (0..body.len()).filter(|&i| body[i..].starts_with(&mark)).collect();
+    at.windows(2)
+        .map(|pair| {
+            let part = &body[pair[0] + mark.len() + 2..pair[1] - 2];
+            let blank = part.windows(4).position(|four| four == b"\r\n\r\n").expect("headers");
+            part[blank + 4..].to_vec()
+        })
+        .collect()
+}
+
+#[tokio::test]
+async fn a_scene_exports_as_ply() {
+    let stand = Stand::start().await;
+    let id = made(&stand).await;
+    let answer = get(&stand, &format!("/v1/scenes/{id}/export?format=ply")).await;
+    let length = answer.headers()[header::CONTENT_LENGTH].to_str().unwrap().to_owned();
+    assert!(answer.headers()[header::CONTENT_DISPOSITION].to_str().unwrap().contains(".ply"));
+    let file = answer.bytes().await.unwrap();
+    assert_eq!(length, file.len().to_string());
+    assert!(file.starts_with(b"ply\n"), "{:?}", &file[..16]);
+    let path = format!("/v1/scenes/{id}/export?format=obj");
+    assert_eq!(fault(&stand, &path).await.code, "invalid_request");
+}
+
+#[tokio::test]
+async fn one_idempotency_key_makes_one_scene() {
+    let stand = Stand::start().await;
+    let post = async |upload: &Upload| {
+        let request = Client::new().post(stand.url("/v1/scenes?wait_ms=120000"));
+        let request = request.header("idempotency-key", "key-1").multipart(form(upload));
+        request.send().await.unwrap()
+    };
+    let first = post(&upload()).await;
+    assert!(!first.headers().contains_key("idempotency-replayed"));
+    let again = post(&upload()).await;
+    assert_eq!(again.headers()["idempotency-replayed"], "true");
+    let (first, again) = (body(first).await.unwrap(), body(again).await.unwrap());
+    assert_eq!(first["id"], again["id"], "a second scene");
+    let mut other = upload();
+    other.photos.reverse();
+    assert_eq!(bytes(post(&other).await).await.unwrap_err().code, "invalid_request");
+}
+
+#[tokio::test]
+async fn an_archive_and_options_as_text_parts_are_taken() {
+    let stand = Stand::start().await;
+    let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    let options = zip::write::SimpleFileOptions::default();
+    let whole = upload();
+    let Some(segsplat::scene::UploadCameras::Transforms(transforms)) = whole.cameras else {
+        panic!("the sample has transforms");
+    };
+    let files = whole.photos.into_iter().map(|photo| (photo.name, photo.bytes));
+    for (name, data) in files.chain([("transforms.json".to_owned(), transforms)]) {
+        zip.start_file(name, options).unwrap();
+        std::io::Write::write_all(&mut zip, &data).unwrap();
+    }
+    let archive = zip.finish().unwrap().into_inner();
+    let form = form(&Upload { archive: Some(archive), ..Upload::default() })
+        .text("semantics", "off")
+        .text("wait_ms", "120000");
+    let answer = Client::new().post(stand.url("/v1/scenes")).multipart(form).send().await.unwrap();
+    assert_eq!(answer.status(), StatusCode::CREATED);
+    assert_eq!(body(answer).await.unwrap()["cameras"].as_array().unwrap().len(), 3);
+}
+
+#[tokio::test]
+async fn unknown_paths_methods_and_parameters_are_answered_in_our_shape() {
+    let stand = Stand::start().await;
+    let missing = fault(&stand, "/v1/nothing?x=1").await;
+    assert_eq!((missing.code.as_str(), missing.number), ("not_found", 404));
+    assert!(missing.message.contains("/v1/nothing"), "{}", missing.message);
+    let answer = Client::new().put(stand.url("/v1/scenes")).send().await.unwrap();
+    let allow = answer.headers()[header::ALLOW].to_str().unwrap().to_owned();
+    assert!(allow.contains("GET") && allow.contains("POST"), "{allow}");
+    let method = bytes(answer).await.unwrap_err();
+    assert_eq!((method.code.as_str(), method.number), ("not_found", 405));
+    let unknown = fault(&stand, "/v1/scenes?limti=3").await;
+    assert_eq!(unknown.code, "invalid_request");
+    assert!(unknown.message.contains("limti") && unknown.message.contains("limit"), "{unknown:?}");
+    let not_form = Client::new().post(stand.url("/v1/scenes")).json(&json!({})).send().await;
+    let not_form = bytes(not_form.unwrap()).await.unwrap_err();
+    assert!(not_form.message.contains("multipart"), "{}", not_form.message);
+}
+
+#[tokio::test]
+async fn request_ids_are_kept_and_deadlines_end_a_call() {
+    let stand = Stand::start().await;
+    let request = Client::new().get(stand.url("/healthz")).header("x-request-id", "mine-7");
+    let answer = request.send().await.unwrap();
+    assert_eq!(answer.headers()["x-request-id"], "mine-7");
+    assert_eq!(answer.headers()[header::X_CONTENT_TYPE_OPTIONS], "nosniff");
+    let odd = fault(&stand, "/v1/scenes?deadline_ms=soon").await;
+    assert!(odd.message.contains("soon"), "{}", odd.message);
+    let request = Client::new().post(stand.url("/v1/scenes?wait_ms=60000&deadline_ms=1"));
+    let late = request.multipart(form(&upload())).send().await.unwrap();
+    let late = bytes(late).await.unwrap_err();
+    assert_eq!((late.code.as_str(), late.number), ("deadline_exceeded", 504));
+}
+
+#[tokio::test]
+async fn health_models_and_the_viewer_answer_over_http_2_as_well() {
+    let stand = Stand::start().await;
+    for client in [Client::new(), Client::builder().http2_prior_knowledge().build().unwrap()] {
+        let get = async |path: &str| client.get(stand.url(path)).send().await.unwrap();
+        assert_eq!(body(get("/healthz").await).await.unwrap()["live"], true);
+        assert_eq!(body(get("/readyz").await).await.unwrap()["ready"], true);
+        let models = body(get("/v1/models").await).await.unwrap();
+        assert_eq!((&models["bundle"], &models["renderer"]), (&"board".into(), &"cpu".into()));
+        let page = get("/").await;
+        assert!(page.headers().contains_key(header::CONTENT_SECURITY_POLICY));
+        let page = page.text().await.unwrap();
+        assert!(page.contains("/v1/scenes") && !page.contains("https://"), "the viewer page");
+    }
+}
+
+#[tokio::test]
+async fn the_stop_signal_ends_the_server_even_with_a_watcher() {
+    let stand = Stand::start().await;
+    let id = made(&stand).await;
+    let idle = get(&stand, &format!("/v1/scenes/{id}")).await;
+    assert_eq!(idle.status(), StatusCode::OK);
+    stand.stop().await;
+}
