@@ -14,6 +14,7 @@ mod grpc;
 mod http;
 mod jobs;
 mod oracle;
+mod sample;
 mod shader_layout;
 mod store;
 mod tidy;

@@ -1,0 +1,65 @@
+//! The generated photo set through the real network and the product's renderer, against its truth.
+
+use std::sync::atomic::AtomicBool;
+
+use segsplat::{
+    config::Config,
+    error::ErrorCode,
+    eval::psnr,
+    pipeline::{self, Engine},
+    render::{Kinds, RenderRequest, Renderer, cpu::CpuRenderer},
+    sample::{self, Room, SampleOptions},
+    scene::SceneOptions,
+};
+
+use crate::common::skipped;
+
+/// Measured 36.2 dB with the embedded network: the room is of a kind that it was trained on.
+const PSNR_MIN: f64 = 30.0;
+/// Measured 1.0 %.
+const DEPTH_ERROR_MAX: f64 = 0.03;
+
+#[test]
+fn the_sample_is_reconstructed_close_to_its_truth() {
+    let engine = match Engine::open(&Config::default()) {
+        Err(e) if e.code() == ErrorCode::ModelUnavailable => return skipped(e.message()),
+        engine => engine.unwrap(),
+    };
+    let options = SampleOptions { photos: 2, width: 256, height: 256, seed: 1 };
+    let photos = sample::photos(&options).unwrap();
+    let go_on = AtomicBool::new(false);
+    let made =
+        pipeline::reconstruct(&engine, &photos, &SceneOptions::default(), &|_, _| {}, &go_on)
+            .unwrap();
+    assert!(made.report.warnings.is_empty(), "{:?}", made.report.warnings);
+
+    let camera = sample::camera_at(&options, 0.0).unwrap();
+    let truth = Room::new(options.seed).view(&camera);
+    let request = RenderRequest {
+        camera,
+        kinds: Kinds::ALL,
+        background: [0.0; 3],
+        antialiased: false,
+        near: 0.01 * made.report.median_depth as f32,
+    };
+    let frame = CpuRenderer::new(0).unwrap().render(&made.gaussians, &request).unwrap();
+    let true_color: Vec<[f32; 3]> = truth
+        .photo
+        .rgb
+        .chunks(3)
+        .map(|p| [p[0], p[1], p[2]].map(|v| f32::from(v) / 255.0))
+        .collect();
+    let fidelity = psnr(&frame.color.unwrap(), &true_color, None);
+
+    let seen = frame.alpha.unwrap().into_iter().zip(frame.depth.unwrap()).zip(&truth.depth);
+    let mut errors: Vec<f64> = seen
+        .filter(|((alpha, _), _)| *alpha > 0.5)
+        .map(|((_, depth), truth)| f64::from((depth - truth).abs() / truth))
+        .collect();
+    errors.sort_by(f64::total_cmp);
+    let median = errors[errors.len() / 2];
+    println!("sample: {fidelity:.2} dB, median depth error {:.2} %", 100.0 * median);
+    assert!(errors.len() * 10 > truth.depth.len() * 9, "{} pixels are covered", errors.len());
+    assert!(fidelity > PSNR_MIN, "{fidelity:.2} dB between the photos");
+    assert!(median < DEPTH_ERROR_MAX, "median depth error {:.2} %", 100.0 * median);
+}
