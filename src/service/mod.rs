@@ -22,7 +22,7 @@ pub use self::{
         ModelsInfo, Page, PageRequest, PoseSpec, Readiness, RenderedView, ViewOptions, ViewSpec,
         ViewsSpec,
     },
-    view::default_near,
+    view::{default_near, render_scene},
 };
 pub use crate::scene::{
     Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, Upload, UploadCameras,

@@ -8,12 +8,13 @@ use tokio::sync::mpsc;
 
 use super::{
     Inner, Service, camera, encode,
-    types::{Format, Kind, RenderedView, ViewOptions, ViewSpec, ViewsSpec},
+    types::{CameraSpec, Format, Kind, RenderedView, ViewOptions, ViewSpec, ViewsSpec},
 };
 use crate::{
     error::{Error, ErrorCode, Result},
-    render::{Kinds, RenderRequest},
-    scene::{Camera, SceneId, SceneState},
+    limits::Limits,
+    render::{Kinds, RenderRequest, Renderer},
+    scene::{Camera, Scene, SceneCamera, SceneId, SceneState},
     store::Record,
 };
 
@@ -53,24 +54,70 @@ impl Resolved {
     }
 
     /// Hash of scene, renderer and request for one kind.
-    fn etag(&self, record: &Record, renderer: &str, kind: Kind) -> String {
+    fn etag(&self, scene: &str, renderer: &str, kind: Kind) -> String {
         let Self { camera, format, background, antialiased, near, .. } = self;
-        let scene = record.scene_sha256.as_deref().unwrap_or_default();
         let version = env!("CARGO_PKG_VERSION");
         // Debug prints floats so that they read back the same.
         let words = format!(
-            "{scene} {} {version} {renderer} {camera:?} {kind:?} {format:?} {background:?} \
-             {antialiased} {near:?}",
-            record.status.id
+            "{scene} {version} {renderer} {camera:?} {kind:?} {format:?} {background:?} \
+             {antialiased} {near:?}"
         );
         Sha256::digest(words)[..16].iter().map(|byte| format!("{byte:02x}")).collect()
     }
+
+    /// The pictures of all kinds; `scene_tag` tells the scene in their tags.
+    fn draw(
+        &self,
+        renderer: &dyn Renderer,
+        scene: &Scene,
+        scene_tag: &str,
+    ) -> Result<Vec<RenderedView>> {
+        let started = Instant::now();
+        let frame = renderer.render(&scene.gaussians, &self.request())?;
+        let render_ms = started.elapsed().as_secs_f64() * 1e3;
+        let name = renderer.name();
+        let view = |&kind: &Kind| -> Result<RenderedView> {
+            let encoded = encode::encode(&frame, kind, self.format)?;
+            Ok(RenderedView {
+                camera_index: self.camera_index,
+                kind,
+                format: self.format,
+                width: frame.width,
+                height: frame.height,
+                bytes: encoded.bytes,
+                depth_scale: encoded.depth_scale,
+                camera: self.camera,
+                etag: self.etag(scene_tag, &name, kind),
+                stats: frame.stats,
+                render_ms,
+            })
+        };
+        self.kinds.iter().map(view).collect()
+    }
+}
+
+/// What tells one scene from any other, in tags.
+fn scene_tag(record: &Record) -> String {
+    format!("{} {}", record.scene_sha256.as_deref().unwrap_or_default(), record.status.id)
+}
+
+/// Cameras and median depth of a record, as [`resolve`] takes them.
+fn resolve_for(
+    inner: &Inner,
+    record: &Record,
+    cameras: &[CameraSpec],
+    kinds: &[Kind],
+    options: &ViewOptions,
+) -> Result<Vec<Resolved>> {
+    let depth = record.status.report.as_ref().map_or(0.0, |report| report.median_depth);
+    resolve(&inner.config.limits, &record.status.cameras, depth, cameras, kinds, options)
 }
 
 fn resolve(
-    inner: &Inner,
-    record: &Record,
-    cameras: &[super::CameraSpec],
+    limits: &Limits,
+    inputs: &[SceneCamera],
+    median_depth: f64,
+    cameras: &[CameraSpec],
     kinds: &[Kind],
     options: &ViewOptions,
 ) -> Result<Vec<Resolved>> {
@@ -86,30 +133,43 @@ fn resolve(
             let [least, most] = NEAR_RANGE;
             return Err(Error::invalid(format!("near is {near}; it must be {least} to {most}")));
         }
-        None => default_near(record.status.report.as_ref().map_or(0.0, |r| r.median_depth)),
+        None => default_near(median_depth),
     };
-    cameras
-        .iter()
-        .enumerate()
-        .map(|(camera_index, spec)| {
-            let what = if cameras.len() == 1 {
-                "camera".to_owned()
-            } else {
-                format!("camera {camera_index}")
-            };
-            let limits = &inner.config.limits;
-            let camera = camera::resolve(spec, options, &record.status.cameras, limits, &what)?;
-            Ok(Resolved {
-                camera_index,
-                camera,
-                kinds: kinds.to_vec(),
-                format: options.format,
-                background: options.background,
-                antialiased: options.antialiased,
-                near,
-            })
+    let resolved = |(camera_index, spec)| {
+        let what = match cameras.len() {
+            1 => "camera".to_owned(),
+            _ => format!("camera {camera_index}"),
+        };
+        Ok(Resolved {
+            camera_index,
+            camera: camera::resolve(spec, options, inputs, limits, &what)?,
+            kinds: kinds.to_vec(),
+            format: options.format,
+            background: options.background,
+            antialiased: options.antialiased,
+            near,
         })
-        .collect()
+    };
+    cameras.iter().enumerate().map(resolved).collect()
+}
+
+/// Renders and encodes one view of a scene that is not in the service's store.
+///
+/// # Errors
+/// As [`Service::render`].
+pub fn render_scene(
+    renderer: &dyn Renderer,
+    scene: &Scene,
+    spec: &ViewSpec,
+    limits: &Limits,
+) -> Result<RenderedView> {
+    let meta = &scene.meta;
+    let depth = meta.report.median_depth;
+    let (cameras, kinds) = ([spec.camera], [spec.kind]);
+    let resolved = resolve(limits, &meta.cameras, depth, &cameras, &kinds, &spec.options)?;
+    let one = resolved.first().ok_or_else(|| Error::internal("one camera gave no request"))?;
+    let mut views = one.draw(renderer, scene, meta.id.as_str())?;
+    views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
 }
 
 /// The near plane of a scene whose median depth is `median_depth`, world units.
@@ -138,7 +198,7 @@ impl Inner {
     }
 
     /// The scene itself; marks it when its file turns out to be bad. Blocks on the disk.
-    pub(super) fn load(&self, id: &SceneId) -> Result<Arc<crate::scene::Scene>> {
+    pub(super) fn load(&self, id: &SceneId) -> Result<Arc<Scene>> {
         self.store.scene(id).inspect_err(|error| {
             if error.code() == ErrorCode::SceneCorrupt {
                 self.jobs.spoil(id, error);
@@ -159,7 +219,8 @@ impl Inner {
             let inner = Arc::clone(self);
             tokio::task::spawn_blocking(move || {
                 let _pass = pass;
-                inner.render_here(&record, &resolved)
+                let scene = inner.load(&record.status.id)?;
+                resolved.draw(&*inner.renderer, &scene, &scene_tag(&record))
             })
             .await
             .map_err(|e| Error::internal("the render was broken off").caused_by(e))?
@@ -172,31 +233,6 @@ impl Inner {
             return Err(late());
         }
         tokio::time::timeout_at(deadline.into(), work).await.map_err(|_elapsed| late())?
-    }
-
-    fn render_here(&self, record: &Record, resolved: &Resolved) -> Result<Vec<RenderedView>> {
-        let scene = self.load(&record.status.id)?;
-        let started = Instant::now();
-        let frame = self.renderer.render(&scene.gaussians, &resolved.request())?;
-        let render_ms = started.elapsed().as_secs_f64() * 1e3;
-        let renderer = self.renderer.name();
-        let view = |&kind: &Kind| -> Result<RenderedView> {
-            let encoded = encode::encode(&frame, kind, resolved.format)?;
-            Ok(RenderedView {
-                camera_index: resolved.camera_index,
-                kind,
-                format: resolved.format,
-                width: frame.width,
-                height: frame.height,
-                bytes: encoded.bytes,
-                depth_scale: encoded.depth_scale,
-                camera: resolved.camera,
-                etag: resolved.etag(record, &renderer, kind),
-                stats: frame.stats,
-                render_ms,
-            })
-        };
-        resolved.kinds.iter().map(view).collect()
     }
 
     fn deadline(&self, options: &ViewOptions) -> Instant {
@@ -212,8 +248,9 @@ impl Service {
     /// As [`Self::render`], but for what only rendering meets.
     pub fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<String> {
         let record = self.inner.finished(id)?;
-        let resolved = resolve(&self.inner, &record, &[spec.camera], &[spec.kind], &spec.options)?;
-        Ok(resolved[0].etag(&record, &self.inner.renderer.name(), spec.kind))
+        let resolved =
+            resolve_for(&self.inner, &record, &[spec.camera], &[spec.kind], &spec.options)?;
+        Ok(resolved[0].etag(&scene_tag(&record), &self.inner.renderer.name(), spec.kind))
     }
 
     /// Renders and encodes one view.
@@ -224,7 +261,8 @@ impl Service {
     pub async fn render(&self, id: &SceneId, spec: ViewSpec) -> Result<RenderedView> {
         let inner = &self.inner;
         let record = Arc::new(inner.finished(id)?);
-        let mut resolved = resolve(inner, &record, &[spec.camera], &[spec.kind], &spec.options)?;
+        let mut resolved =
+            resolve_for(inner, &record, &[spec.camera], &[spec.kind], &spec.options)?;
         let deadline = inner.deadline(&spec.options);
         let one = resolved.remove(0);
         inner
@@ -263,7 +301,7 @@ impl Service {
         let mut kinds = spec.kinds.clone();
         let mut seen = std::collections::HashSet::new();
         kinds.retain(|kind| seen.insert(*kind));
-        let all = resolve(&inner, &record, &spec.cameras, &kinds, &spec.options)?;
+        let all = resolve_for(&inner, &record, &spec.cameras, &kinds, &spec.options)?;
         let last = spec.options.deadline.map(|asked| Instant::now() + asked);
         let (to, pictures) = mpsc::channel(READY_MAX);
         let task = async move {

@@ -1,0 +1,122 @@
+//! `segsplat bench`: times of the stages and of a frame on generated photos, median of some runs.
+
+use std::{
+    collections::BTreeMap,
+    fmt::Write as _,
+    sync::{Arc, atomic::AtomicBool},
+    time::Instant,
+};
+
+use serde_json::json;
+
+use super::{engine, output::Output};
+use crate::{
+    config::{Config, ConfigArgs},
+    error::{Error, Result},
+    jobs::{PipelineMaker, SceneMaker, Work},
+    pipeline::Engine,
+    render::{Kinds, RenderRequest},
+    sample::{self, SampleOptions},
+    scene::SceneOptions,
+    service::default_near,
+};
+
+#[derive(Clone, Debug, clap::Args)]
+pub(super) struct Args {
+    /// Photos, 2 to 64
+    #[arg(long, default_value_t = 2)]
+    photos: usize,
+    /// Side of the square photos and views in pixels
+    #[arg(long, default_value_t = 256)]
+    side: u32,
+    /// Runs; the first one warms up and is told apart
+    #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(2..=1000))]
+    runs: u32,
+    #[command(flatten)]
+    pub(super) config: ConfigArgs,
+}
+
+pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
+    let side = args.side;
+    let options =
+        SampleOptions { photos: args.photos, width: side, height: side, ..Default::default() };
+    let upload = sample::upload(&options)?;
+    let begun = Instant::now();
+    let engine = Arc::new(Engine::open(config)?);
+    let open_ms = ms(begun);
+    let provider = engine.geometry().provider().name();
+    let renderer = engine::renderer(config)?;
+    let maker = PipelineMaker::new(engine, config.limits.clone());
+    let mut times: BTreeMap<String, Vec<f64>> = BTreeMap::new();
+    let mut gaussians = 0;
+    for i in 0..args.runs {
+        out.progress("bench", i as f32 / args.runs as f32);
+        let begun = Instant::now();
+        let made = maker.make(Work {
+            upload: &upload,
+            options: &SceneOptions::default(),
+            progress: &|_, _| {},
+            cancel: &AtomicBool::new(false),
+        })?;
+        let mut all: Vec<(String, f64)> = vec![("scene".to_owned(), ms(begun))];
+        all.extend(made.report.stages.iter().map(|s| (format!("scene: {}", s.stage), s.ms)));
+        let camera =
+            made.cameras.first().ok_or_else(|| Error::internal("a scene has no camera"))?;
+        let request = RenderRequest {
+            camera: camera.camera,
+            kinds: Kinds::COLOR,
+            background: [0.0; 3],
+            antialiased: false,
+            near: default_near(made.report.median_depth),
+        };
+        let begun = Instant::now();
+        renderer.render(&made.gaussians, &request)?;
+        all.push(("view: first".to_owned(), ms(begun)));
+        let begun = Instant::now();
+        renderer.render(&made.gaussians, &request)?;
+        all.push(("view: again".to_owned(), ms(begun)));
+        for (name, time) in all {
+            times.entry(name).or_default().push(time);
+        }
+        gaussians = made.gaussians.len();
+    }
+    out.progress("done", 1.0);
+    let rows: BTreeMap<&str, _> = times
+        .iter()
+        .map(|(name, runs)| {
+            let mut warm = runs[1..].to_vec();
+            warm.sort_by(f64::total_cmp);
+            (name.as_str(), json!({ "first_ms": runs[0], "median_ms": warm[warm.len() / 2] }))
+        })
+        .collect();
+    let mut text = format!(
+        "{} photos of {side}x{side} px, {gaussians} Gaussians, {} threads, network on {provider}, \
+         renderer {}\n  opening {open_ms:.0} ms\n  {:<20}{:>10}{:>10}\n",
+        args.photos,
+        config.threads,
+        renderer.name(),
+        "",
+        "first ms",
+        "median ms"
+    );
+    for (name, row) in &rows {
+        let value = |key: &str| row[key].as_f64().unwrap_or_default();
+        let (first, median) = (value("first_ms"), value("median_ms"));
+        let _ = writeln!(text, "  {name:<20}{first:>10.1}{median:>10.1}");
+    }
+    let value = json!({
+        "photos": args.photos,
+        "side": side,
+        "gaussians": gaussians,
+        "threads": config.threads,
+        "execution_provider": provider,
+        "renderer": renderer.name(),
+        "open_ms": open_ms,
+        "times": rows,
+    });
+    out.answer(&text, &value)
+}
+
+fn ms(since: Instant) -> f64 {
+    since.elapsed().as_secs_f64() * 1e3
+}

@@ -1,0 +1,55 @@
+//! The parts of the product, put together from a configuration.
+
+use std::sync::Arc;
+
+use crate::{
+    config::Config,
+    error::Result,
+    jobs::PipelineMaker,
+    models::Bundle,
+    pipeline::Engine,
+    render::{Renderer, select::select},
+    service::{ModelInfo, ModelsInfo, Parts},
+};
+
+/// Library, bundle, networks and renderer, as the server runs them.
+///
+/// # Errors
+/// `model_unavailable`, `gpu_unavailable`, each with what is missing.
+pub fn parts(config: &Config) -> Result<Parts> {
+    let engine = Arc::new(Engine::open(config)?);
+    let models = models_info(engine.bundle(), engine.geometry().provider().name());
+    let renderer = renderer(config)?;
+    let maker = Arc::new(PipelineMaker::new(engine, config.limits.clone()));
+    Ok(Parts { maker, renderer, models })
+}
+
+/// The renderer that the configuration asks for.
+///
+/// # Errors
+/// `gpu_unavailable` when an adapter is asked for and none fits.
+pub fn renderer(config: &Config) -> Result<Arc<dyn Renderer>> {
+    let (renderer, _adapters) = select(config)?;
+    Ok(renderer)
+}
+
+/// What a bundle says of itself.
+#[must_use]
+pub fn models_info(bundle: &Bundle, execution_provider: &str) -> ModelsInfo {
+    let geometry = bundle.geometry();
+    ModelsInfo {
+        bundle: bundle.name().to_owned(),
+        bundle_sha256: bundle.sha256().to_owned(),
+        models: vec![ModelInfo {
+            name: "geometry".to_owned(),
+            file: geometry.file.clone(),
+            sha256: geometry.sha256.clone(),
+            size_bytes: bundle.geometry_size_bytes(),
+            licence: geometry.licence.clone(),
+            views_max: geometry.views_max,
+            sizes: geometry.buckets.clone(),
+        }],
+        execution_provider: execution_provider.to_owned(),
+        ..ModelsInfo::default()
+    }
+}

@@ -1,0 +1,133 @@
+//! `segsplat reconstruct`: a folder or archive of photos and cameras becomes a scene file or PLY.
+
+use std::{
+    fmt::Write as _,
+    io::Write as _,
+    path::{Path, PathBuf},
+    sync::{Arc, atomic::AtomicBool},
+    time::Instant,
+};
+
+use serde_json::json;
+use sha2::{Digest, Sha256};
+
+use super::{
+    output::Output,
+    scene_file::{is_ply, path_of},
+};
+use crate::{
+    config::{Config, ConfigArgs},
+    error::{Error, ErrorCode, Result},
+    jobs::{PipelineMaker, SceneMaker, Work},
+    photos,
+    pipeline::Engine,
+    scene::{Provenance, Scene, SceneId, SceneMeta, SceneOptions, Upload},
+    store::{self, ply::PlyWriter, write_scene_file},
+};
+
+#[derive(Clone, Debug, clap::Args)]
+pub(super) struct Args {
+    /// Folder with transforms.json or cameras.json and its photos, or a zip or tar of one
+    photos: PathBuf,
+    /// Scene file to write; with the ending .ply a 3DGS PLY
+    #[arg(short, long, value_name = "FILE")]
+    output: PathBuf,
+    /// Views the network takes at once [default: what the bundle says]
+    #[arg(long)]
+    max_views: Option<usize>,
+    #[command(flatten)]
+    pub(super) config: ConfigArgs,
+}
+
+pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
+    let upload = upload_of(&args.photos, config)?;
+    let engine = Arc::new(Engine::open(config)?);
+    let options = SceneOptions { max_views: args.max_views };
+    let begun = Instant::now();
+    let made = PipelineMaker::new(engine, config.limits.clone()).make(Work {
+        upload: &upload,
+        options: &options,
+        progress: &|stage, fraction| out.progress(stage, fraction),
+        cancel: &AtomicBool::new(false),
+    })?;
+    let files = store::hashes(&upload);
+    let mut hash = Sha256::new();
+    files.iter().for_each(|file| hash.update(format!("{} {}\n", file.sha256, file.file)));
+    let mut id = [0; 16];
+    id.copy_from_slice(&hash.finalize()[..16]);
+    let meta = SceneMeta {
+        id: SceneId::from_bytes(id),
+        created_ms: store::now_ms(),
+        cameras: made.cameras,
+        report: made.report,
+        provenance: Provenance {
+            files,
+            bundle_sha256: made.bundle_sha256,
+            options,
+            program_version: env!("CARGO_PKG_VERSION").to_owned(),
+        },
+    };
+    let scene = Scene { meta, gaussians: made.gaussians };
+    let path = path_of(&args.output);
+    write(&path, &scene)?;
+    let total_ms = begun.elapsed().as_secs_f64() * 1e3;
+    out.progress("done", 1.0);
+    tell(&path, &scene, total_ms, out)
+}
+
+fn upload_of(path: &Path, config: &Config) -> Result<Upload> {
+    if path.is_dir() {
+        return photos::upload_of_dir(path, &config.limits);
+    }
+    let unreadable = |e: std::io::Error| {
+        Error::invalid(format!("{}: cannot be read: {}", path.display(), e.kind())).caused_by(e)
+    };
+    let size = fs_err::metadata(path).map_err(unreadable)?.len();
+    let max = config.limits.upload_bytes_max;
+    if size > max as u64 {
+        return Err(Error::limit("upload bytes", size, max));
+    }
+    let archive = fs_err::read(path).map_err(unreadable)?;
+    Ok(Upload { archive: Some(archive), ..Upload::default() })
+}
+
+fn write(path: &Path, scene: &Scene) -> Result<()> {
+    if !is_ply(path) {
+        return write_scene_file(path, scene).map(drop);
+    }
+    let write = || -> std::io::Result<()> {
+        let mut file = fs_err::File::create(path)?;
+        for piece in PlyWriter::new(&scene.gaussians) {
+            file.write_all(&piece)?;
+        }
+        file.sync_all()
+    };
+    write().map_err(|e| {
+        let what = format!("{}: cannot be written: {}", path.display(), e.kind());
+        Error::new(ErrorCode::StoreUnavailable, what).caused_by(e)
+    })
+}
+
+fn tell(path: &Path, scene: &Scene, total_ms: f64, out: &Output) -> Result<()> {
+    let report = &scene.meta.report;
+    let mut text = format!(
+        "{}: {} Gaussians of {} photos in {total_ms:.0} ms\n",
+        path.display(),
+        report.gaussians,
+        report.views_used
+    );
+    for stage in &report.stages {
+        let _ = writeln!(text, "  {:<10}{:>9.1} ms", stage.stage, stage.ms);
+    }
+    for warning in &report.warnings {
+        let _ = writeln!(text, "  warning: {}", warning.message);
+    }
+    let value = json!({
+        "output": path.display().to_string(),
+        "id": scene.meta.id,
+        "total_ms": total_ms,
+        "report": report,
+        "cameras": scene.meta.cameras,
+    });
+    out.answer(&text, &value)
+}

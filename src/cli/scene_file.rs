@@ -1,0 +1,67 @@
+//! A scene named on the command line: a scene file, a folder that holds one, or a PLY.
+
+use std::{
+    io::BufReader,
+    path::{Path, PathBuf},
+};
+
+use crate::{
+    error::{Error, Result},
+    limits::Limits,
+    scene::{DropCount, HealthReport, Provenance, Scene, SceneId, SceneMeta},
+    store::{ply::read_ply, read_scene},
+};
+
+/// Name of the scene file where a folder is named.
+const IN_FOLDER: &str = "scene.segsplat";
+
+/// A scene and where it came from.
+#[derive(Debug)]
+pub(super) struct Opened {
+    pub(super) scene: Scene,
+    /// `segsplat` or `ply`.
+    pub(super) format: &'static str,
+    /// sha256 of a scene file, hex.
+    pub(super) sha256: Option<String>,
+}
+
+/// The path of the scene file: itself, or the one in the folder.
+pub(super) fn path_of(path: &Path) -> PathBuf {
+    if path.is_dir() { path.join(IN_FOLDER) } else { path.to_owned() }
+}
+
+pub(super) fn is_ply(path: &Path) -> bool {
+    path.extension().is_some_and(|end| end.eq_ignore_ascii_case("ply"))
+}
+
+pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
+    let path = path_of(path);
+    let unreadable = |e: std::io::Error| {
+        Error::invalid(format!("{}: cannot be read: {}", path.display(), e.kind())).caused_by(e)
+    };
+    if is_ply(&path) {
+        let file = fs_err::File::open(&path).map_err(unreadable)?;
+        let (gaussians, counts) = read_ply(BufReader::new(file), limits.gaussians_max)?;
+        let dropped = counts
+            .counts()
+            .into_iter()
+            .filter(|(_, count)| *count > 0)
+            .map(|(reason, count)| DropCount { reason: reason.to_owned(), count });
+        let report = HealthReport {
+            gaussians: gaussians.len() as u64,
+            dropped: dropped.collect(),
+            ..HealthReport::default()
+        };
+        let meta = SceneMeta {
+            id: SceneId::from_bytes([0; 16]),
+            created_ms: 0,
+            cameras: Vec::new(),
+            report,
+            provenance: Provenance::default(),
+        };
+        return Ok(Opened { scene: Scene { meta, gaussians }, format: "ply", sha256: None });
+    }
+    let file = fs_err::read(&path).map_err(unreadable)?;
+    let (scene, sha256) = read_scene(&file)?;
+    Ok(Opened { scene, format: "segsplat", sha256: Some(sha256) })
+}
