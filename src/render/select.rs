@@ -35,12 +35,12 @@ pub struct AdapterReport {
 
 /// The renderer that `config` asks for, and the adapters found on the way.
 ///
-/// `auto` takes a hardware adapter or the CPU renderer; `gpu` refuses to start without an adapter; an
-/// adapter that is named must be there.
+/// `auto` takes a hardware adapter or the CPU renderer; `gpu` refuses to start without an adapter;
+/// an adapter that is named must be there.
 ///
 /// # Errors
-/// `gpu_unavailable` when an adapter was asked for and none fits, `internal` when threads or kernels
-/// cannot be made.
+/// `gpu_unavailable` when an adapter was asked for and none fits, `internal` when threads or
+/// kernels cannot be made.
 pub fn select(config: &Config) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
     let cpu = CpuRenderer::new(config.threads)?;
     if config.renderer == RendererChoice::Cpu {

@@ -1,6 +1,6 @@
 //! Adapters: which there are, which is taken, and a device whose faults become errors.
 //!
-//! A software adapter (llvmpipe, lavapipe, `SwiftShader`) is taken only when it is asked for by name.
+//! A software adapter (llvmpipe, lavapipe, `SwiftShader`) is taken only when asked for by name.
 
 use std::sync::{
     Arc, Mutex, PoisonError,
