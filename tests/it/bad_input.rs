@@ -9,6 +9,7 @@ use std::{
 
 use segsplat::scene::{Upload, UploadCameras, UploadFile};
 use serde_json::{Value, json};
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 use crate::common::{
     doors::{Ask, Door, Options, both},
@@ -238,12 +239,13 @@ async fn lives(door: &Door, after: &str) {
 #[tokio::test]
 async fn bad_uploads_are_refused_by_name_and_the_server_lives() {
     let stand = Stand::start().await;
+    let cases = uploads();
     for door in both(stand.addr).await {
         let mut messages = BTreeMap::new();
-        for (case, upload, code, words) in uploads() {
-            let fault = door.create(&upload, &Options::wait()).await.expect_err(case);
+        for (case, upload, code, words) in &cases {
+            let fault = door.create(upload, &Options::wait()).await.expect_err(case);
             let case = format!("{case} by {}", door.name());
-            assert_eq!(fault.code, code, "{case}: {}", fault.message);
+            assert_eq!(&fault.code, code, "{case}: {}", fault.message);
             for word in words {
                 assert!(fault.message.contains(word), "{case}: {:?} lacks {word:?}", fault.message);
             }
@@ -254,6 +256,55 @@ async fn bad_uploads_are_refused_by_name_and_the_server_lives() {
         }
         let (id, state) = door.create(&upload(), &Options::wait()).await.expect("a good upload");
         assert_eq!(state, "done", "{id} after all the bad ones");
+    }
+}
+
+/// Sends `head` and `body` over a bare socket and reads what is answered while it stays open.
+async fn raw(stand: &Stand, head: &str, body: &[u8]) -> String {
+    let mut socket = tokio::net::TcpStream::connect(stand.addr).await.unwrap();
+    socket.write_all(head.as_bytes()).await.unwrap();
+    socket.write_all(body).await.unwrap();
+    let mut answer = vec![0; 4096];
+    let read = socket.read(&mut answer).await.unwrap();
+    String::from_utf8_lossy(&answer[..read]).into_owned()
+}
+
+#[tokio::test]
+async fn what_is_too_big_is_refused_before_the_rest_arrives() {
+    let stand = Stand::start().await;
+    let post = "POST /v1/scenes HTTP/1.1\r\nhost: x\r\n\
+                content-type: multipart/form-data; boundary=b\r\n";
+    // The head alone tells that it is too long; nothing of the body is sent.
+    let head = format!("{post}content-length: 400000000\r\n\r\n");
+    let answer = raw(&stand, &head, b"").await;
+    assert!(answer.starts_with("HTTP/1.1 413"), "{answer}");
+    assert!(answer.contains("limit_exceeded") && answer.contains("400000000"), "{answer}");
+    // Of 200 MB of JSON the first 9 MiB are sent, and no more ever.
+    let head = format!("{post}content-length: 209715200\r\n\r\n");
+    let mut body = b"--b\r\ncontent-disposition: form-data; name=\"transforms\"\r\n\r\n".to_vec();
+    body.resize(9 << 20, b' ');
+    let answer = raw(&stand, &head, &body).await;
+    assert!(answer.starts_with("HTTP/1.1 413"), "{answer}");
+    assert!(answer.contains("transforms") && answer.contains("8388608"), "{answer}");
+    let [http, _] = both(stand.addr).await;
+    lives(&http, "uploads that never end").await;
+}
+
+#[tokio::test]
+async fn what_is_no_http_does_not_end_the_server() {
+    let stand = Stand::start().await;
+    for (head, body) in [
+        ("\u{1}\u{2}\u{3} what\r\n\r\n", &b""[..]),
+        ("GET /v1/scenes HTTP/9.9\r\n\r\n", b""),
+        ("POST /v1/scenes HTTP/1.1\r\ncontent-length: -5\r\n\r\n", b"x"),
+        ("POST /v1/scenes HTTP/1.1\r\ntransfer-encoding: chunked\r\n\r\n", b"zz\r\n"),
+        ("PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", b"\xff\xff\xff\xff\xff\xff\xff\xff\xff"),
+    ] {
+        let answer = raw(&stand, head, body).await;
+        assert!(!answer.starts_with("HTTP/1.1 2"), "{head:?} was taken: {answer}");
+        for door in both(stand.addr).await {
+            lives(&door, head).await;
+        }
     }
 }
 
