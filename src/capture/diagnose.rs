@@ -4,8 +4,10 @@
 //! bounds below were set on the real scenes of the test data, all of whose cameras are right, and
 //! on the same scenes with their cameras spoilt.
 
+use rayon::prelude::*;
+
 use super::{
-    agreement, content,
+    content,
     depth::Ranges,
     gray::GrayView,
     name,
@@ -18,22 +20,29 @@ use crate::{
 
 /// Pairs that witness for or against a mistake.
 const WITNESSES: usize = 4;
-/// Photos that agree on this share are right as given; no mistake is looked for.
-const CLEARLY_RIGHT: f64 = 0.60;
+/// Pixels of the pictures in which mistakes are looked for: a tenth of the time of the others.
+const AREA: f64 = 6_000.0;
 /// A correction must agree on this share at least,
 const ALTERNATIVE_MIN: f64 = 0.15;
-/// on this many times what the given cameras agree on,
+/// on this many times what the given cameras agree on (a small motion says little of a focal
+/// length, so there less must do),
 const ALTERNATIVE_RATIO: f64 = 1.5;
+const FOCAL_RATIO: f64 = 1.2;
 /// and by this much more.
 const ALTERNATIVE_GAIN: f64 = 0.08;
 /// With a principal point that itself speaks of another resolution, this ratio is enough.
 const IMPLIED_RATIO: f64 = 1.03;
-/// Agreement under this is chance: strangers reach it.
-const CHANCE: f64 = 0.06;
-/// Least share of corners found again, cameras aside, in photos of one thing.
-const CONTENT_MIN: f64 = 0.05;
-/// Agreement under this, between photos that look the same way, is poor.
-const POOR: f64 = 0.12;
+/// Agreement under this may be chance: strangers were seen to reach 0.11.
+const CHANCE: f64 = 0.12;
+/// Cameras that agree on little are still right where they agree on this share at least
+const DISTINCT_MIN: f64 = 0.02;
+/// and on this many times the best that wrong cameras reach; strangers reached 1.0.
+const DISTINCT_RATIO: f64 = 1.2;
+/// Least share of corners found again, cameras aside, in photos of one thing: neighbours have 0.1
+/// to 0.95, strangers 0 to 0.09, mostly 0.
+const CONTENT_MIN: f64 = 0.06;
+/// A photo among others that agrees with none of its partners on this share is not used.
+const STRAY: f64 = 0.06;
 /// Photos whose axes differ by more than this may well agree poorly.
 const POOR_ANGLE_MAX: f64 = 25.0;
 /// Principal point from the picture's centre, in sides.
@@ -44,9 +53,8 @@ const OVERLAP_MIN: f64 = 0.30;
 const BASELINE_MIN: f64 = 0.01;
 /// Share of pixels whose best plane is the nearest searched.
 const RANGE_HIT_MAX: f64 = 0.05;
-/// Ratios of focal length that are tried first, and when those do not settle it.
-const RATIOS: [f64; 2] = [0.5, 2.0];
-const MORE_RATIOS: [f64; 6] = [0.25, 1.0 / 3.0, 2.0 / 3.0, 1.5, 3.0, 4.0];
+/// Ratios of focal length that are tried.
+const RATIOS: [f64; 8] = [0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 1.5, 2.0, 3.0, 4.0];
 
 /// A usual mistake, by the correction that undoes it.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -130,15 +138,17 @@ pub(super) fn warnings(
     warnings: &mut Vec<Warning>,
 ) -> Result<()> {
     let implied = implied_scale(photos);
-    if let Some((mistake, given, corrected)) = mistaken(views, found, implied)? {
-        warnings.push(mistake.warning(photos, given, corrected));
+    let answer = asked(views, implied)?;
+    if let Some((mistake, corrected)) = answer.mistake {
+        warnings.push(mistake.warning(photos, answer.given, corrected));
         if !matches!(mistake, Mistake::Resolution(_)) {
             principal_point(photos, warnings);
         }
         return Ok(());
     }
     principal_point(photos, warnings);
-    if found.iter().all(|p| agreement(p) < CHANCE) {
+    let distinct = answer.given >= DISTINCT_MIN && answer.given >= DISTINCT_RATIO * answer.rival;
+    if !distinct && found.iter().all(|p| p.best() < CHANCE) {
         return nothing_agrees(photos, views, found, warnings);
     }
     poor_agreement(photos, found, warnings);
@@ -180,20 +190,25 @@ fn witnesses(cameras: &[Camera]) -> Result<Vec<[usize; 2]>> {
 }
 
 fn mean_agreement(found: &[PairFound]) -> f64 {
-    found.iter().map(agreement).sum::<f64>() / found.len().max(1) as f64
+    found.iter().map(PairFound::best).sum::<f64>() / found.len().max(1) as f64
 }
 
-/// The mistake that explains the photos far better than the given cameras, with both agreements.
-fn mistaken(
-    views: &[GrayView],
-    found: &[PairFound],
-    implied: Option<f64>,
-) -> Result<Option<(Mistake, f64, f64)>> {
+/// What the photos answered under the given cameras and under the usual mistakes.
+struct Asked {
+    /// Agreement under the given cameras.
+    given: f64,
+    /// Best agreement under a correction that is not called for: what chance gives here.
+    rival: f64,
+    /// The correction that explains the photos far better, and its agreement.
+    mistake: Option<(Mistake, f64)>,
+}
+
+/// Looks for a mistake that explains the photos far better than the given cameras.
+fn asked(views: &[GrayView], implied: Option<f64>) -> Result<Asked> {
+    let views: Vec<GrayView> = views.par_iter().map(|v| v.reduced(AREA)).collect();
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
     let asked = witnesses(&cameras)?;
-    let answers: Vec<PairFound> =
-        found.iter().filter(|p| asked.contains(&p.views)).cloned().collect();
-    let given = mean_agreement(&answers);
+    let given = mean_agreement(&pairs::compare(&views, &asked));
     let under = |mistake: Mistake| -> Result<(Mistake, f64)> {
         let corrected: Vec<Camera> =
             cameras.iter().map(|c| mistake.corrected(c)).collect::<Result<_>>()?;
@@ -202,36 +217,25 @@ fn mistaken(
             Mistake::Inverted | Mistake::InvertedAndAxes => witnesses(&corrected)?,
             _ => asked.clone(),
         };
-        Ok((mistake, mean_agreement(&pairs::compare_as(views, &corrected, &asked))))
+        Ok((mistake, mean_agreement(&pairs::compare_as(&views, &corrected, &asked))))
     };
     if let Some(scale) = implied {
         let (mistake, share) = under(Mistake::Resolution(scale))?;
         if share >= ALTERNATIVE_MIN && share >= IMPLIED_RATIO * given {
-            return Ok(Some((mistake, given, share)));
+            return Ok(Asked { given, rival: share, mistake: Some((mistake, share)) });
         }
     }
-    if given >= CLEARLY_RIGHT {
-        return Ok(None);
-    }
-    let wins = |share: f64| {
-        share >= ALTERNATIVE_MIN
-            && share >= ALTERNATIVE_RATIO * given
-            && share >= given + ALTERNATIVE_GAIN
+    let wins = |&(mistake, share): &(Mistake, f64)| {
+        let ratio =
+            if matches!(mistake, Mistake::Focal(_)) { FOCAL_RATIO } else { ALTERNATIVE_RATIO };
+        share >= ALTERNATIVE_MIN && share >= ratio * given && share >= given + ALTERNATIVE_GAIN
     };
-    let best_of = |mistakes: &[Mistake]| -> Result<Option<(Mistake, f64)>> {
-        let tried: Vec<(Mistake, f64)> =
-            mistakes.iter().map(|&m| under(m)).collect::<Result<_>>()?;
-        Ok(tried.into_iter().max_by(|a, b| a.1.total_cmp(&b.1)))
-    };
-    let mut usual = vec![Mistake::Axes, Mistake::Inverted, Mistake::InvertedAndAxes];
-    usual.extend(RATIOS.map(Mistake::Focal));
-    let mut best = best_of(&usual)?;
-    let settled = best.is_some_and(|(m, share)| wins(share) && !matches!(m, Mistake::Focal(_)));
-    if !settled && given < CLEARLY_RIGHT / 2.0 {
-        let more = best_of(&MORE_RATIOS.map(Mistake::Focal))?;
-        best = best.into_iter().chain(more).max_by(|a, b| a.1.total_cmp(&b.1));
-    }
-    Ok(best.filter(|&(_, share)| wins(share)).map(|(mistake, share)| (mistake, given, share)))
+    let mut tried = vec![Mistake::Axes, Mistake::Inverted, Mistake::InvertedAndAxes];
+    tried.extend(RATIOS.map(Mistake::Focal));
+    let shares: Vec<(Mistake, f64)> = tried.into_par_iter().map(under).collect::<Result<_>>()?;
+    let rival = shares.iter().map(|s| s.1).fold(0.0, f64::max);
+    let mistake = shares.into_iter().filter(wins).max_by(|a, b| a.1.total_cmp(&b.1));
+    Ok(Asked { given, rival, mistake })
 }
 
 /// No pair agrees: strangers are refused, photos that do share something are warned of.
@@ -243,10 +247,10 @@ fn nothing_agrees(
 ) -> Result<()> {
     let best = found
         .iter()
-        .max_by(|a, b| agreement(a).total_cmp(&agreement(b)))
+        .max_by(|a, b| a.best().total_cmp(&b.best()))
         .ok_or_else(|| Error::internal("a capture of two photos or more has a pair"))?;
     let [i, j] = best.views;
-    let share = agreement(best);
+    let share = best.best();
     let common = found
         .iter()
         .take(2 * WITNESSES)
@@ -281,23 +285,23 @@ fn nothing_agrees(
 }
 
 fn poor_agreement(photos: &[PosedPhoto], found: &[PairFound], warnings: &mut Vec<Warning>) {
-    let poor = |p: &&PairFound| p.angle <= POOR_ANGLE_MAX && agreement(p) < POOR;
+    let poor = |p: &&PairFound| p.angle <= POOR_ANGLE_MAX && p.best() < CHANCE;
     let close = found.iter().filter(|p| p.angle <= POOR_ANGLE_MAX).count();
     let bad: Vec<&PairFound> = found.iter().filter(poor).collect();
-    let Some(worst) = bad.iter().min_by(|a, b| agreement(a).total_cmp(&agreement(b))) else {
+    let Some(worst) = bad.iter().min_by(|a, b| a.best().total_cmp(&b.best())) else {
         return;
     };
     if 2 * bad.len() < close {
         return;
     }
-    let share = agreement(worst);
+    let share = worst.best();
     warnings.push(Warning {
         code: WarningCode::PoorPoseAgreement,
         message: format!(
             "{} of {close} pairs of photos that look the same way agree on less than {:.0} % of \
              their matchable pixels; worst are {} and {} with {:.1} %",
             bad.len(),
-            100.0 * POOR,
+            100.0 * CHANCE,
             name(photos, worst.views[0]),
             name(photos, worst.views[1]),
             100.0 * share
@@ -314,9 +318,9 @@ fn strays(
     warnings: &mut Vec<Warning>,
 ) {
     let best = |i: usize| {
-        found.iter().filter(|p| p.side(i).is_some()).map(agreement).fold(0.0_f64, f64::max)
+        found.iter().filter(|p| p.side(i).is_some()).map(PairFound::best).fold(0.0_f64, f64::max)
     };
-    let strays: Vec<usize> = (0..photos.len()).filter(|&i| best(i) < CHANCE).collect();
+    let strays: Vec<usize> = (0..photos.len()).filter(|&i| best(i) < STRAY).collect();
     let Some(&first) = strays.first() else { return };
     for &i in &strays {
         for j in (0..photos.len()).filter(|&j| j != i) {
@@ -331,7 +335,7 @@ fn strays(
              are not used; the first is {} with {:.1} %",
             strays.len(),
             photos.len(),
-            100.0 * CHANCE,
+            100.0 * STRAY,
             name(photos, first),
             100.0 * best(first)
         ),
@@ -391,7 +395,7 @@ fn low_overlap(photos: &[PosedPhoto], overlap: &[Vec<f64>], warnings: &mut Vec<W
 
 fn baselines(found: &[PairFound], ranges: &Ranges, warnings: &mut Vec<Warning>) {
     let longest =
-        found.iter().filter(|p| agreement(p) >= CHANCE).map(|p| p.baseline).fold(0.0, f64::max);
+        found.iter().filter(|p| p.best() >= STRAY).map(|p| p.baseline).fold(0.0, f64::max);
     let ratio = longest * ranges.near_tenth_w;
     if longest > 0.0 && ratio < BASELINE_MIN {
         warnings.push(Warning {

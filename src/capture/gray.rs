@@ -23,6 +23,8 @@ pub(super) struct GrayView {
     pub(super) gray: Vec<f32>,
     /// `[height * width]`: whether the whole window around the pixel has a source.
     pub(super) valid: Option<Vec<bool>>,
+    /// `[height * width]`: whether the pixel lacks a source; empty where none does.
+    holes: Vec<bool>,
     /// Camera of the small picture.
     pub(super) camera: Camera,
     /// Matchable pixels on the grid, row by row.
@@ -80,10 +82,43 @@ impl GrayView {
         let valid = photo.valid.as_ref().map(|_| whole_windows(&holes, width, height));
         let intrinsics = posed.camera.intrinsics.resized(width as u32, height as u32);
         let camera = Camera { intrinsics, ..posed.camera };
-        let mut view =
-            Self { width, height, gray, valid, camera, candidates: vec![], row_start: vec![] };
+        let (candidates, row_start) = (vec![], vec![]);
+        let mut view = Self { width, height, gray, valid, holes, camera, candidates, row_start };
         view.find_candidates();
         view
+    }
+
+    /// The same view with about `area` pixels, if it has more.
+    pub(super) fn reduced(&self, area: f64) -> Self {
+        let scale = (area / (self.width * self.height) as f64).sqrt().min(1.0);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positive")]
+        let side = |n: usize| ((n as f64 * scale).round() as usize).max(1);
+        let (width, height) = (side(self.width), side(self.height));
+        let (xs, ys) = (spans(self.width, width), spans(self.height, height));
+        let mut gray = vec![0.0_f32; width * height];
+        let mut holes = vec![false; width * height];
+        for (y, rows) in ys.iter().enumerate() {
+            for (x, cols) in xs.iter().enumerate() {
+                for &(row, row_weight) in rows {
+                    for &(col, weight) in cols {
+                        gray[y * width + x] +=
+                            row_weight * weight * self.gray[row * self.width + col];
+                        holes[y * width + x] |= !self.has_source(col, row);
+                    }
+                }
+            }
+        }
+        let valid = self.valid.as_ref().map(|_| whole_windows(&holes, width, height));
+        let intrinsics = self.camera.intrinsics.resized(width as u32, height as u32);
+        let camera = Camera { intrinsics, ..self.camera };
+        let (candidates, row_start) = (vec![], vec![]);
+        let mut view = Self { width, height, gray, valid, holes, camera, candidates, row_start };
+        view.find_candidates();
+        view
+    }
+
+    fn has_source(&self, x: usize, y: usize) -> bool {
+        self.holes.is_empty() || !self.holes[y * self.width + x]
     }
 
     fn find_candidates(&mut self) {

@@ -7,7 +7,8 @@
 //! matchable pixels, under wrong cameras or between strangers on less than 10 %. `diagnose` asks
 //! the same question under the usual mistakes.
 //!
-//! Measured on two cores: about 0.05 s for two photos that agree, about 2 s for 24.
+//! Processor time, measured: 0.06 s for the ranges of two photos, 0.2 s with the diagnosis, 3.3 s
+//! for 24 photos; all of it runs on every core that rayon has.
 
 mod content;
 mod depth;
@@ -24,7 +25,6 @@ use crate::{
     scene::{Capture, PosedPhoto, Warning, WarningCode},
 };
 use gray::GrayView;
-use pairs::PairFound;
 
 pub use sets::view_sets;
 
@@ -40,8 +40,7 @@ const MANY_PHOTOS: usize = 32;
 /// nothing; the message names the photos and the figure.
 pub fn analyse(photos: &[PosedPhoto]) -> Result<Capture> {
     let views = gray_views(photos)?;
-    let pairs = pairs::neighbours(&views, neighbour_count(views.len()))?;
-    let found = pairs::compare(&views, &pairs);
+    let found = pairs::searched(&views, neighbour_count(views.len()))?;
     let points = depth::pooled(&views, &found);
     let ranges = depth::ranges(&views, &points)?;
     let mut overlap = depth::overlap(&views, &points, &found);
@@ -62,8 +61,7 @@ pub fn analyse(photos: &[PosedPhoto]) -> Result<Capture> {
 pub fn near_far(photos: &[PosedPhoto], set: &[usize]) -> Result<Vec<[f64; 2]>> {
     let chosen: Vec<&PosedPhoto> = set.iter().map(|&i| &photos[i]).collect();
     let views = gray_views(&chosen)?;
-    let pairs = pairs::neighbours(&views, neighbour_count(views.len()))?;
-    let found = pairs::compare(&views, &pairs);
+    let found = pairs::searched(&views, neighbour_count(views.len()))?;
     Ok(depth::ranges(&views, &depth::pooled(&views, &found))?.near_far)
 }
 
@@ -104,9 +102,4 @@ fn made_for_warnings(photos: &[PosedPhoto]) -> Vec<Warning> {
         photos.len()
     );
     vec![Warning { code: WarningCode::IntrinsicsScale, message, value }]
-}
-
-/// The better of the two directions' agreement of a pair.
-fn agreement(found: &PairFound) -> f64 {
-    found.agreement[0].max(found.agreement[1])
 }

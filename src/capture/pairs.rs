@@ -16,6 +16,9 @@ const SAME_PLACE: f64 = 1e-6;
 /// Degrees between viewing axes that weigh as much as a baseline e times the usual.
 const ANGLE_SCALE: f64 = 15.0;
 
+/// A view whose best pair agrees on less looks for other partners.
+const WEAK: f64 = 0.15;
+
 /// Two photos compared with each other.
 #[derive(Clone, Debug)]
 pub(super) struct PairFound {
@@ -34,6 +37,11 @@ pub(super) struct PairFound {
 }
 
 impl PairFound {
+    /// The better of the two directions' agreement.
+    pub(super) fn best(&self) -> f64 {
+        self.agreement[0].max(self.agreement[1])
+    }
+
     /// Position of `view` in the pair.
     pub(super) fn side(&self, view: usize) -> Option<usize> {
         self.views.iter().position(|&v| v == view)
@@ -86,17 +94,38 @@ pub(super) fn ranked(cameras: &[Camera]) -> Result<Vec<Vec<usize>>> {
         .collect())
 }
 
-/// The pairs to compare: each view with its `count` most promising partners, each pair once.
-pub(super) fn neighbours(views: &[GrayView], count: usize) -> Result<Vec<[usize; 2]>> {
+/// Compares each view with its `count` most promising partners, each pair once; the few views that
+/// agree with none of these are given a second choice.
+pub(super) fn searched(views: &[GrayView], count: usize) -> Result<Vec<PairFound>> {
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
-    let mut pairs: Vec<[usize; 2]> = ranked(&cameras)?
-        .iter()
-        .enumerate()
-        .flat_map(|(i, row)| row.iter().take(count).map(move |&j| [i.min(j), i.max(j)]))
-        .collect();
+    let ranked = ranked(&cameras)?;
+    let first = unique((0..views.len()).flat_map(|i| tied(i, ranked[i].iter().take(count))));
+    let mut found = compare(views, &first);
+    let best = |i: usize, found: &[PairFound]| {
+        found.iter().filter(|p| p.side(i).is_some()).map(PairFound::best).fold(0.0, f64::max)
+    };
+    let weak: Vec<usize> = (0..views.len()).filter(|&i| best(i, &found) < WEAK).collect();
+    if !weak.is_empty() && 3 * weak.len() <= views.len() {
+        let more = weak.iter().flat_map(|&i| tied(i, ranked[i].iter().skip(count).take(2 * count)));
+        let mut second = unique(more);
+        second.retain(|pair| first.binary_search(pair).is_err());
+        found.extend(compare(views, &second));
+    }
+    Ok(found)
+}
+
+fn tied<'a>(
+    i: usize,
+    partners: impl Iterator<Item = &'a usize> + 'a,
+) -> impl Iterator<Item = [usize; 2]> + 'a {
+    partners.map(move |&j| [i.min(j), i.max(j)])
+}
+
+fn unique(pairs: impl Iterator<Item = [usize; 2]>) -> Vec<[usize; 2]> {
+    let mut pairs: Vec<[usize; 2]> = pairs.collect();
     pairs.sort_unstable();
     pairs.dedup();
-    Ok(pairs)
+    pairs
 }
 
 /// Compares each pair in both directions.

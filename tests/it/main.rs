@@ -8,6 +8,7 @@
 )]
 
 mod bad_input;
+mod capture;
 mod common;
 mod errors;
 mod grpc;
@@ -15,6 +16,7 @@ mod http;
 mod jobs;
 mod oracle;
 mod sample;
+mod photos;
 mod shader_layout;
 mod store;
 mod tidy;

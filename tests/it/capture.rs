@@ -1,0 +1,269 @@
+//! What the photos themselves say of a capture: on a room of known depth, and on real scenes with
+//! right and with spoilt cameras.
+
+use segsplat::{
+    capture,
+    limits::Limits,
+    photos,
+    sample::{self, Room, SampleOptions},
+    scene::{CameraToWorld, PosedPhoto, WarningCode},
+};
+
+use crate::common;
+
+fn options(photos: usize) -> SampleOptions {
+    SampleOptions { photos, width: 200, height: 150, seed: 3 }
+}
+
+fn scene(name: &str) -> Option<Vec<PosedPhoto>> {
+    let folder = common::shared_scene(name)?;
+    Some(photos::read_dir(&folder, &Limits::default()).unwrap())
+}
+
+fn picked(photos: &[PosedPhoto], which: &[usize]) -> Vec<PosedPhoto> {
+    which.iter().map(|&i| photos[i].clone()).collect()
+}
+
+/// Share of the depths inside the range.
+fn inside(depths: impl Iterator<Item = f64>, [near, far]: [f64; 2]) -> f64 {
+    let (mut count, mut total) = (0, 0);
+    for depth in depths {
+        total += 1;
+        count += usize::from(depth >= near && depth <= far);
+    }
+    count as f64 / f64::from(total)
+}
+
+#[test]
+fn the_depth_range_holds_the_true_depths_and_little_else() {
+    let room = Room::new(3);
+    for count in [2, 5] {
+        let posed = sample::photos(&options(count)).unwrap();
+        let capture = capture::analyse(&posed).unwrap();
+        assert_eq!(capture.warnings, [], "a right capture");
+        let set: Vec<usize> = (0..count).collect();
+        assert_eq!(capture::near_far(&posed, &set).unwrap(), capture.near_far);
+        for (posed, &[near, far]) in posed.iter().zip(&capture.near_far) {
+            let depth = room.view(&posed.camera).depth;
+            let mut depths: Vec<f64> = depth.into_iter().map(f64::from).collect();
+            let share = inside(depths.iter().copied(), [near, far]);
+            assert!(share > 0.97, "{count} photos: {share} of the pixels in {near}..{far}");
+            depths.sort_by(f64::total_cmp);
+            let (nearest, farthest) = (depths[depths.len() / 100], depths[depths.len() * 99 / 100]);
+            assert!(near > 0.6 * nearest, "near {near} for a scene from {nearest}");
+            assert!(far < 2.0 * farthest, "far {far} for a scene to {farthest}");
+            let middle = depths[depths.len() / 2];
+            let ratio = capture.median_depth / middle;
+            assert!((0.7..1.4).contains(&ratio), "median {} for {middle}", capture.median_depth);
+        }
+    }
+}
+
+#[test]
+fn depth_follows_the_unit_of_the_cameras() {
+    let posed = sample::photos(&options(2)).unwrap();
+    let near_far = capture::near_far(&posed, &[0, 1]).unwrap();
+    let scaled: Vec<PosedPhoto> = posed
+        .iter()
+        .map(|p| {
+            let mut m = p.camera.camera_to_world.to_row_major();
+            for row in 0..3 {
+                m[row * 4 + 3] = m[row * 4 + 3] * 1000.0 + 5e4;
+            }
+            let mut p = p.clone();
+            p.camera.camera_to_world = CameraToWorld::from_row_major(&m, "scaled").unwrap();
+            p
+        })
+        .collect();
+    let far_away = capture::near_far(&scaled, &[0, 1]).unwrap();
+    for (a, b) in near_far.iter().flatten().zip(far_away.iter().flatten()) {
+        assert!((b / a / 1000.0 - 1.0).abs() < 0.02, "{a} became {b}");
+    }
+}
+
+#[test]
+fn overlap_falls_with_distance_and_sets_follow_it() {
+    let posed = sample::photos(&options(9)).unwrap();
+    let capture = capture::analyse(&posed).unwrap();
+    assert!(capture.overlap[0][1] > 0.8, "{}", capture.overlap[0][1]);
+    assert!(capture.overlap[0][8] < capture.overlap[0][1]);
+    let sets = capture::view_sets(&capture, &posed, 4, 3);
+    let mut seen = [0; 9];
+    for set in &sets {
+        assert!((2..=4).contains(&set.views.len()), "{set:?}");
+        assert_eq!(set.neighbors.len(), set.views.len());
+        for (at, row) in set.neighbors.iter().enumerate() {
+            assert_eq!(row.len(), (set.views.len() - 1).min(3));
+            assert!(row.iter().all(|&n| n != at && n < set.views.len()), "{set:?}");
+        }
+        set.views.iter().for_each(|&v| seen[v] += 1);
+    }
+    assert!(seen.iter().all(|&n| n >= 1), "every photo is used: {seen:?}");
+    assert!(seen.iter().any(|&n| n >= 2), "sets overlap: {seen:?}");
+    let one = capture::view_sets(&capture, &posed, 16, 3);
+    assert_eq!(one.len(), 1);
+    assert_eq!(one[0].views.len(), 9);
+    assert_eq!(one, capture::view_sets(&capture, &posed, 16, 3), "deterministic");
+}
+
+#[test]
+fn captures_without_depth_are_refused() {
+    let posed = sample::photos(&options(2)).unwrap();
+    let one = capture::analyse(&posed[..1]).unwrap_err();
+    assert!(one.message().contains("at least 2"), "{one}");
+    let same = [posed[0].clone(), posed[0].clone()];
+    let error = capture::analyse(&same).unwrap_err();
+    assert!(error.message().contains("one place"), "{error}");
+    let mut blank = posed;
+    blank[1].photo.rgb.fill(128);
+    let error = capture::analyse(&blank).unwrap_err();
+    assert!(error.message().contains("share nothing"), "{error}");
+    assert!(error.message().contains("photo 0"), "names the photos: {error}");
+}
+
+#[test]
+fn invalid_pixels_are_never_matched() {
+    let mut posed = sample::photos(&options(2)).unwrap();
+    let want = capture::near_far(&posed, &[0, 1]).unwrap();
+    // A frame of rubbish that moves with the photo would read as a surface at infinity.
+    for p in &mut posed {
+        let (w, h) = (p.photo.width as usize, p.photo.height as usize);
+        let mut valid = vec![true; w * h];
+        for y in 0..h {
+            for x in (0..w).filter(|&x| x < 24 || y < 24 || x + 24 >= w || y + 24 >= h) {
+                let i = y * w + x;
+                valid[i] = false;
+                let v = if (x / 5 + y / 5) % 2 == 0 { 255 } else { 0 };
+                p.photo.rgb[3 * i..3 * i + 3].fill(v);
+            }
+        }
+        p.photo.valid = Some(valid);
+    }
+    let got = capture::near_far(&posed, &[0, 1]).unwrap();
+    for ([_, far], [_, want]) in got.iter().zip(&want) {
+        assert!(far < &(1.5 * want), "far {far}, without the frame {want}");
+    }
+}
+
+/// Neighbours of the real scenes, two pairs each.
+const NEIGHBORS: [(&str, [[usize; 2]; 2]); 8] = [
+    ("fox", [[12, 13], [47, 48]]),
+    ("red_kitchen", [[0, 2], [20, 21]]),
+    ("juice_box_table", [[7, 8], [12, 13]]),
+    ("coke_can", [[6, 7], [12, 13]]),
+    ("duck_toy", [[0, 8], [2, 12]]),
+    ("computer_mouse", [[6, 8], [10, 16]]),
+    ("sceaux_castle", [[2, 3], [6, 7]]),
+    ("terrace", [[8, 9], [12, 13]]),
+];
+
+#[test]
+fn real_neighbours_raise_no_false_alarm() {
+    for (name, pairs) in NEIGHBORS {
+        let Some(all) = scene(name) else { return };
+        for pair in pairs {
+            let capture = capture::analyse(&picked(&all, &pair)).unwrap();
+            assert_eq!(capture.warnings, [], "{name} {pair:?}");
+            let overlap = capture.overlap[0][1].max(capture.overlap[1][0]);
+            assert!(overlap > 0.4, "{name} {pair:?}: overlap {overlap}");
+        }
+    }
+}
+
+fn spoilt(photos: &[PosedPhoto], how: impl Fn(&mut PosedPhoto)) -> Vec<PosedPhoto> {
+    let mut photos = photos.to_vec();
+    photos.iter_mut().for_each(how);
+    photos
+}
+
+fn flipped(pose: CameraToWorld) -> CameraToWorld {
+    CameraToWorld::from_opengl_row_major(&pose.to_row_major(), "flipped").unwrap()
+}
+
+fn inverted(pose: CameraToWorld) -> CameraToWorld {
+    CameraToWorld::from_row_major(&pose.viewmat().transpose().to_cols_array(), "inverse").unwrap()
+}
+
+fn scale_k(p: &mut PosedPhoto, focal: f64, center: f64) {
+    let k = &mut p.camera.intrinsics;
+    (k.fx, k.fy) = (k.fx * focal, k.fy * focal);
+    (k.cx, k.cy) = (k.cx * center, k.cy * center);
+}
+
+#[test]
+fn the_usual_mistakes_are_named_on_real_scenes() {
+    type Spoil = fn(&mut PosedPhoto);
+    let mistakes: [(&str, WarningCode, Spoil); 6] = [
+        ("axes", WarningCode::AxesSwapped, |p| {
+            p.camera.camera_to_world = flipped(p.camera.camera_to_world);
+        }),
+        ("inverse", WarningCode::PoseInverted, |p| {
+            p.camera.camera_to_world = inverted(p.camera.camera_to_world);
+        }),
+        ("OpenGL inverse", WarningCode::PoseInverted, |p| {
+            p.camera.camera_to_world = flipped(inverted(flipped(p.camera.camera_to_world)));
+        }),
+        ("K of twice the size", WarningCode::IntrinsicsScale, |p| scale_k(p, 2.0, 2.0)),
+        ("K of half the size", WarningCode::IntrinsicsScale, |p| scale_k(p, 0.5, 0.5)),
+        ("focal length of twice the size", WarningCode::IntrinsicsScale, |p| scale_k(p, 2.0, 1.0)),
+    ];
+    let named = ["fox", "red_kitchen", "juice_box_table", "coke_can"];
+    for (name, pairs) in NEIGHBORS.iter().filter(|(name, _)| named.contains(name)) {
+        let Some(all) = scene(name) else { return };
+        let right = picked(&all, &pairs[0]);
+        for (what, code, spoil) in mistakes {
+            let capture = capture::analyse(&spoilt(&right, spoil)).unwrap();
+            let codes: Vec<WarningCode> = capture.warnings.iter().map(|w| w.code).collect();
+            assert!(codes.contains(&code), "{name}, {what}: {:?}", capture.warnings);
+            let message = &capture.warnings[0].message;
+            assert!(message.contains(" % "), "the figures are given: {message}");
+        }
+    }
+}
+
+#[test]
+fn strangers_are_refused() {
+    let (Some(fox), Some(kitchen)) = (scene("fox"), scene("red_kitchen")) else { return };
+    for (i, j) in [(12, 13), (36, 35)] {
+        let mut pair = picked(&fox, &[i, j]);
+        let stranger = &kitchen[j % kitchen.len()];
+        pair[1].photo = stranger.photo.clone();
+        pair[1].camera.intrinsics = stranger.camera.intrinsics;
+        let error = capture::analyse(&pair).unwrap_err();
+        assert!(error.message().contains("share nothing"), "{error}");
+    }
+}
+
+#[test]
+fn intrinsics_scaled_at_the_door_are_reported() {
+    let mut posed = sample::photos(&options(2)).unwrap();
+    posed[1].intrinsics_made_for = Some([400, 300]);
+    let capture = capture::analyse(&posed).unwrap();
+    assert_eq!(capture.warnings[0].code, WarningCode::IntrinsicsScale);
+    assert!((capture.warnings[0].value - 0.5).abs() < 1e-9);
+    assert!(capture.warnings[0].message.contains("400x300"), "{}", capture.warnings[0].message);
+}
+
+#[test]
+fn ranges_of_a_real_room_hold_what_a_depth_camera_saw() {
+    let Some(folder) = common::shared_scene("red_kitchen") else { return };
+    let posed = photos::read_dir(&folder, &Limits::default()).unwrap();
+    let kinect = |i: usize| -> Vec<f64> {
+        let path = folder.join(format!("depth/{i:04}.png"));
+        let depth = image::open(path).unwrap().into_luma16();
+        // The border is left out: the depth camera stands a few centimetres aside.
+        depth
+            .enumerate_pixels()
+            .filter(|(x, y, d)| d.0[0] > 0 && *x > 40 && *x < 600 && *y > 40 && *y < 440)
+            .map(|(_, _, d)| f64::from(d.0[0]) / 1000.0)
+            .collect()
+    };
+    for pair in [[0, 2], [8, 9], [16, 17], [20, 21]] {
+        let near_far = capture::near_far(&posed, &pair).unwrap();
+        for (i, range) in pair.into_iter().zip(near_far) {
+            let share = inside(kinect(i).into_iter(), range);
+            println!("red_kitchen {pair:?}, photo {i}: {share:.4} of the pixels in {range:.2?} m");
+            assert!(share > 0.93, "photo {i} of {pair:?}: {share} in {range:?}");
+        }
+    }
+}
