@@ -156,7 +156,8 @@ fn photos_and_cameras_must_fit_each_other() {
     files[1].name = "other.png".to_owned();
     let invalid = ErrorCode::InvalidRequest;
     refused(&with_transforms(&json, files.clone()), invalid, &["other.png", "no camera"]);
-    files[1].name.clone_from(&files[0].name);
+    let twin = files[0].name.clone();
+    files[1].name = twin;
     refused(&with_transforms(&json, files.clone()), invalid, &["two photos"]);
     files[1].name = "../up.png".to_owned();
     refused(&with_transforms(&json, files), invalid, &["relative"]);
@@ -280,8 +281,8 @@ fn bombs_meet_the_unpacked_bound() {
         }
     }
     let error = photos::read(&archive(lying), &limits).unwrap_err();
-    let refused = [ErrorCode::LimitExceeded, ErrorCode::PhotoUnreadable];
-    assert!(refused.contains(&error.code()), "{error}");
+    let codes = [ErrorCode::LimitExceeded, ErrorCode::PhotoUnreadable];
+    assert!(codes.contains(&error.code()), "{error}");
     let names: Vec<String> = (0..1025).map(|i| format!("{i}.txt")).collect();
     let entries: Vec<(&str, &[u8])> = names.iter().map(|n| (n.as_str(), &b""[..])).collect();
     for bytes in [zipped(&entries), tarred(&entries, tar::EntryType::Regular)] {
