@@ -9,14 +9,15 @@
 
 mod bad_input;
 mod capture;
+mod cli;
 mod common;
 mod errors;
 mod grpc;
 mod http;
 mod jobs;
 mod oracle;
-mod sample;
 mod photos;
+mod sample;
 mod shader_layout;
 mod store;
 mod tidy;

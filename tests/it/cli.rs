@@ -1,0 +1,283 @@
+//! The program itself: what it prints, where, and with which exit code.
+
+use std::{
+    io::{BufRead, BufReader},
+    path::Path,
+    process::{Child, Command, Output, Stdio},
+};
+
+use segsplat::{
+    config::Config,
+    error::ErrorCode,
+    models::Runtime,
+    scene::{
+        Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, Provenance, RawGaussians,
+        Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
+    },
+    store::{ply::PlyWriter, write_scene},
+};
+use serde_json::Value;
+
+use crate::common::skipped;
+
+fn segsplat(args: &[&str]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_segsplat"));
+    for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("SEGSPLAT_")) {
+        command.env_remove(name);
+    }
+    command.current_dir(crate::common::root()).args(args).output().expect("the program starts")
+}
+
+fn ok(args: &[&str]) -> String {
+    let output = segsplat(args);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{args:?} exited {:?}: {said}", output.status.code());
+    String::from_utf8(output.stdout).expect("answers are UTF-8")
+}
+
+fn ok_json(args: &[&str]) -> Value {
+    let answer = ok(&[args, &["--json"]].concat());
+    serde_json::from_str(&answer).unwrap_or_else(|e| panic!("{args:?}: {e}: {answer}"))
+}
+
+/// The exit code is the code's row of the table, and standard error says what was wrong.
+fn refused(args: &[&str], code: ErrorCode, want: &str) {
+    let output = segsplat(&[args, &["--json"]].concat());
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(i32::from(code.row().exit)), "{args:?}: {said}");
+    assert!(output.stdout.is_empty(), "{args:?}: an error is no answer");
+    let error: Value = serde_json::from_str(said.lines().last().unwrap_or_default())
+        .unwrap_or_else(|e| panic!("{args:?}: {e}: {said}"));
+    assert_eq!(error["code"], code.name(), "{args:?}: {said}");
+    let message = error["message"].as_str().unwrap_or_default();
+    assert!(message.contains(want), "{args:?}: {message:?} lacks {want:?}");
+}
+
+/// A red plate before a camera at the origin and one a step to its right.
+fn scene() -> Scene {
+    let mut raw = RawGaussians::default();
+    for i in 0..400_u16 {
+        let (x, y) = (f32::from(i % 20) / 10.0 - 0.95, f32::from(i / 20) / 10.0 - 0.95);
+        raw.means.push([x, y, 2.0]);
+        raw.quats.push([1.0, 0.0, 0.0, 0.0]);
+        raw.scales.push([0.08; 3]);
+        raw.opacities.push(0.95);
+        raw.sh.push([1.7, -1.7, -1.7]);
+        raw.semantic_index.push(0);
+        raw.source.push(SourcePixel::default());
+    }
+    let camera = |x: f64| {
+        let mut pose = [0.0; 16];
+        (0..4).for_each(|i| pose[i * 5] = 1.0);
+        pose[3] = x;
+        let intrinsics =
+            Intrinsics { fx: 64.0, fy: 64.0, cx: 32.0, cy: 24.0, width: 64, height: 48 };
+        let camera_to_world = CameraToWorld::from_row_major(&pose, "test").unwrap();
+        SceneCamera { file: format!("{x}.png"), camera: Camera { intrinsics, camera_to_world } }
+    };
+    let meta = SceneMeta {
+        id: SceneId::from_bytes([3; 16]),
+        created_ms: 0,
+        cameras: vec![camera(0.0), camera(0.2)],
+        report: HealthReport { median_depth: 2.0, ..HealthReport::default() },
+        provenance: Provenance::default(),
+    };
+    Scene { meta, gaussians: Gaussians::sanitize(raw).unwrap().0 }
+}
+
+/// A folder with the plate as `scene.segsplat` and `plate.ply`.
+fn files() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let mut file = Vec::new();
+    write_scene(&mut file, &scene()).unwrap();
+    std::fs::write(folder.path().join("scene.segsplat"), file).unwrap();
+    let ply: Vec<u8> = PlyWriter::new(&scene().gaussians).flatten().collect();
+    std::fs::write(folder.path().join("plate.ply"), ply).unwrap();
+    folder
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().expect("temporary paths are UTF-8")
+}
+
+const CPU: [&str; 2] = ["--renderer", "cpu"];
+
+#[test]
+fn a_scene_is_rendered_from_file_folder_and_ply() {
+    let folder = files();
+    let at = |name: &str| folder.path().join(name);
+    let eye = ["--eye", "0,0,-0.5", "--target", "0,0,2", "--fov", "40", "--width", "32"];
+    let sized = ["--height", "24"];
+    for (name, camera) in [
+        ("scene.segsplat", &["--from", "0", "--to", "1"][..]),
+        ("", &["--camera", "1"][..]),
+        ("scene.segsplat", &eye[..]),
+        ("plate.ply", &eye[..]),
+    ] {
+        let (scene, picture) = (at(name), at("x.png"));
+        let line = [&["render", text(&scene), "-o", text(&picture)], camera, &CPU, &sized].concat();
+        let answer = ok_json(&line);
+        let png = image::open(&picture).unwrap().to_rgb8();
+        assert_eq!((answer["width"].as_u64(), answer["height"].as_u64()), (Some(32), Some(24)));
+        assert_eq!(png.dimensions(), (32, 24), "{line:?}");
+        let [r, g, b] = png.get_pixel(16, 12).0;
+        assert!(r > 200 && g < 60 && b < 60, "{line:?}: the plate is red, not {r},{g},{b}");
+    }
+}
+
+#[test]
+fn depth_is_written_with_its_scale_and_as_numbers() {
+    let folder = files();
+    let (scene, png) = (folder.path().join("scene.segsplat"), folder.path().join("d.png"));
+    let npy = folder.path().join("d.npy");
+    let render = |to: &Path| {
+        let line = ["render", text(&scene), "--camera", "0", "--kind", "depth", "-o", text(to)];
+        ok_json(&[&line[..], &CPU].concat())
+    };
+    let scale = render(&png)["depth_scale"].as_f64().unwrap();
+    let step = image::open(&png).unwrap().to_luma16().get_pixel(32, 24).0[0];
+    assert!((f64::from(step) * scale - 2.0).abs() < 0.01, "{step} * {scale}");
+    assert!(render(&npy)["depth_scale"].is_null());
+    let file = std::fs::read(&npy).unwrap();
+    let middle = file.len() - 4 * (64 * 48 - (24 * 64 + 32));
+    let depth = f32::from_le_bytes(file[middle..middle + 4].try_into().unwrap());
+    assert!((depth - 2.0).abs() < 0.01, "{depth}");
+}
+
+#[test]
+fn a_scene_is_inspected_for_people_and_for_machines() {
+    let folder = files();
+    let value = ok_json(&["inspect", text(folder.path())]);
+    assert_eq!(
+        (value["gaussians"].as_u64(), value["format"].as_str()),
+        (Some(400), Some("segsplat"))
+    );
+    assert_eq!(value["meta"]["cameras"].as_array().unwrap().len(), 2);
+    let ply = folder.path().join("plate.ply");
+    assert_eq!(ok_json(&["inspect", text(&ply)])["format"], "ply");
+    let words = ok(&["inspect", text(folder.path())]);
+    assert!(words.contains("400 Gaussians") && words.contains("camera 1: 0.2.png"), "{words}");
+}
+
+#[test]
+fn errors_name_what_is_wrong_and_exit_by_the_table() {
+    let folder = files();
+    let at = |name: &str| folder.path().join(name);
+    let (good, bad, picture) = (at("scene.segsplat"), at("bad.segsplat"), at("x.png"));
+    let mut file = std::fs::read(&good).unwrap();
+    file[100] ^= 1;
+    std::fs::write(&bad, file).unwrap();
+    std::fs::write(at("bad.ply"), "ply\nformat ascii 1.0\n").unwrap();
+    refused(&["inspect", text(&bad)], ErrorCode::SceneCorrupt, "checksum");
+    refused(&["inspect", text(&at("bad.ply"))], ErrorCode::InvalidRequest, "only binary");
+    refused(&["inspect", text(&at("none"))], ErrorCode::InvalidRequest, "cannot be read");
+    let render = |rest: &[&str], code, want: &str| {
+        let line = [&["render", text(&good), "-o", text(&picture)], rest, &CPU].concat();
+        refused(&line, code, want);
+    };
+    render(&[], ErrorCode::InvalidRequest, "no camera");
+    render(&["--camera", "7"], ErrorCode::InvalidRequest, "the scene has 2 cameras");
+    render(&["--camera", "0", "--width", "0"], ErrorCode::InvalidRequest, "width is 0 px");
+    render(&["--camera", "0", "--width", "100000"], ErrorCode::LimitExceeded, "over 4096 px");
+    render(&["--eye", "0,0", "--target", "0,0,1"], ErrorCode::InvalidRequest, "2 numbers, not 3");
+    render(&["--eye", "0,0,-1", "--target", "0,0,-1"], ErrorCode::InvalidRequest, "same point");
+    let line = ["render", text(&good), "--camera", "0", "-o", text(&good), "--renderer", "cpu"];
+    refused(&line, ErrorCode::InvalidRequest, "png, jpg, webp or npy");
+    assert!(!picture.exists(), "nothing was written");
+    assert_eq!(segsplat(&["render"]).status.code(), Some(2), "usage");
+    assert_eq!(segsplat(&["--help"]).status.code(), Some(0));
+}
+
+#[test]
+fn a_sample_is_written_as_asked() {
+    let folder = tempfile::tempdir().unwrap();
+    let line = ["sample", "-o", text(folder.path()), "--photos", "3", "--size", "40x30"];
+    assert_eq!(ok_json(&line)["photos"], 3);
+    assert_eq!(std::fs::read_dir(folder.path().join("images")).unwrap().count(), 3);
+    let line = ["sample", "-o", text(folder.path()), "--photos", "65"];
+    refused(&line, ErrorCode::InvalidRequest, "65 photos");
+}
+
+/// Whether the network can run here; says `skipped` where it cannot.
+fn with_network() -> bool {
+    match Runtime::load(&Config::default()) {
+        Ok(_) => true,
+        Err(error) => {
+            skipped(&format!("no ONNX Runtime: {error}"));
+            false
+        }
+    }
+}
+
+#[test]
+fn photos_become_a_scene_that_can_be_looked_at() {
+    if !with_network() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (photos, scene) = (folder.path().join("photos"), folder.path().join("made.segsplat"));
+    ok(&["sample", "-o", text(&photos), "--photos", "2", "--size", "256x256"]);
+    let made = ok_json(&["reconstruct", text(&photos), "-o", text(&scene)]);
+    assert!(made["report"]["gaussians"].as_u64() > Some(10_000), "{made}");
+    let names: Vec<&str> = made["report"]["stages"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .filter_map(|stage| stage["stage"].as_str())
+        .collect();
+    assert_eq!(names, ["photos", "capture", "geometry", "lift"]);
+    let picture = folder.path().join("x.png");
+    let line = ["render", text(&scene), "--camera", "0", "-o", text(&picture)];
+    ok(&[&line[..], &CPU].concat());
+    let made = image::open(&picture).unwrap().to_rgb8();
+    let images = std::fs::read_dir(photos.join("images")).unwrap();
+    let first = images.map(|entry| entry.unwrap().path()).min().unwrap();
+    let truth = image::open(first).unwrap().to_rgb8();
+    let total: u64 = made.iter().zip(truth.iter()).map(|(a, b)| u64::from(a.abs_diff(*b))).sum();
+    let mean = total as f64 / truth.len() as f64;
+    assert!(mean < 12.0, "an input camera sees its own photo, not {mean} levels off");
+    let verified = ok_json(&["models", "verify"]);
+    assert_eq!(verified["verified"], true);
+}
+
+/// A child that does not outlive its test.
+struct Served(Child);
+
+impl Drop for Served {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn serve_says_where_it_listens_and_ends_at_sigterm() {
+    if !with_network() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let mut child = Served(
+        Command::new(env!("CARGO_BIN_EXE_segsplat"))
+            .current_dir(crate::common::root())
+            .args(["serve", "--listen", "127.0.0.1:0", "--json", "--data-dir"])
+            .args([text(folder.path()), "--renderer", "cpu"])
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .expect("the program starts"),
+    );
+    let mut line = String::new();
+    let stdout = child.0.stdout.take().expect("piped");
+    BufReader::new(stdout).read_line(&mut line).expect("the server speaks");
+    let said: Value = serde_json::from_str(&line).unwrap_or_else(|e| panic!("{e}: {line}"));
+    let url = said["listening"].as_str().unwrap();
+    assert!(url.starts_with("http://127.0.0.1:") && !url.ends_with(":0"), "{url}");
+    assert_eq!(said["renderer"], "cpu");
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let ready = runtime.block_on(reqwest::get(format!("{url}/readyz"))).expect("it answers");
+    assert!(ready.status().is_success(), "{}", ready.status());
+    let pid = child.0.id().to_string();
+    assert!(Command::new("kill").args(["-TERM", &pid]).status().unwrap().success());
+    assert!(child.0.wait().unwrap().success(), "a stop that was asked for is no failure");
+}
