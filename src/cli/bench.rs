@@ -1,4 +1,5 @@
-//! `segsplat bench`: times of the stages and of a frame on generated photos, median of some runs.
+//! `segsplat bench`: times of the stages and of a frame on generated photos, median of some runs;
+//! with `--gaussians`, of the renderer alone.
 
 use std::{
     collections::BTreeMap,
@@ -11,6 +12,7 @@ use serde_json::json;
 
 use super::{engine, output::Output};
 use crate::{
+    bench::{self, BenchArgs},
     config::{Config, ConfigArgs},
     error::{Error, Result},
     jobs::{PipelineMaker, SceneMaker, Work},
@@ -32,11 +34,71 @@ pub(super) struct Args {
     /// Runs; the first one warms up and is told apart
     #[arg(long, default_value_t = 5, value_parser = clap::value_parser!(u32).range(2..=1000))]
     runs: u32,
+    /// Times the renderer alone, on a generated scene of this many Gaussians
+    #[arg(long)]
+    gaussians: Option<usize>,
+    /// With --gaussians: side of the square view in pixels
+    #[arg(long, default_value_t = 256)]
+    size: u32,
+    /// With --gaussians: frames after the first
+    #[arg(long, default_value_t = 50)]
+    frames: usize,
+    /// With --gaussians: compares the picture with that of the CPU renderer
+    #[arg(long)]
+    compare: Option<Reference>,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
 }
 
+/// What a picture is compared with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Reference {
+    Cpu,
+}
+
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
+    match args.gaussians {
+        Some(gaussians) => frames(args, gaussians, config, out),
+        None => stages(args, config, out),
+    }
+}
+
+/// The renderer alone.
+fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Result<()> {
+    let (size, frames) = (args.size, args.frames);
+    let compare_cpu = args.compare.is_some();
+    let report = bench::run(&BenchArgs { gaussians, size, frames, compare_cpu }, config)?;
+    let mut text = String::new();
+    for adapter in &report.adapters {
+        let mark = if adapter.chosen { "*" } else { " " };
+        let (name, backend, driver) = (&adapter.name, &adapter.backend, &adapter.driver);
+        let _ = writeln!(text, "{mark} {name} ({}, {backend}, {driver})", adapter.kind);
+    }
+    let _ = writeln!(
+        text,
+        "{} Gaussians at {size}x{size} px on {}: open {:.1} ms, first frame {:.2} ms, \
+         median {:.3} ms, fastest {:.3} ms ({} visible, {} tile pairs)",
+        report.gaussians,
+        report.renderer,
+        report.open_ms,
+        report.first_ms,
+        report.median_ms,
+        report.min_ms,
+        report.visible,
+        report.intersections
+    );
+    if let Some(found) = &report.compared {
+        let _ = writeln!(
+            text,
+            "against the CPU renderer ({:.2} ms): max {:.2e}, mean {:.2e}, {} of {} px flipped at \
+             a cliff, {} faults",
+            found.cpu_median_ms, found.max, found.mean, found.flips, found.pixels, found.faults
+        );
+    }
+    out.answer(&text, &report)
+}
+
+fn stages(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let side = args.side;
     let options =
         SampleOptions { photos: args.photos, width: side, height: side, ..Default::default() };
