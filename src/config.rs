@@ -72,7 +72,7 @@ pub struct ConfigArgs {
     /// Scenes made at the same time [default: 1]
     #[arg(long, env = "SEGSPLAT_JOBS")]
     pub jobs: Option<usize>,
-    /// Log filter in tracing's syntax [default: info]
+    /// Log filter in tracing's syntax [default: info,ort=warn]
     #[arg(long, env = "SEGSPLAT_LOG")]
     pub log: Option<String>,
     /// Log lines as JSON [default: false]
@@ -125,7 +125,7 @@ impl Default for Config {
             provider: ProviderChoice::Auto,
             threads: available_cores(),
             jobs: 1,
-            log: "info".to_owned(),
+            log: "info,ort=warn".to_owned(),
             log_json: false,
             limits: Limits::default(),
         }

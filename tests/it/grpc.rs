@@ -86,7 +86,7 @@ async fn many_views_stream_in_order_and_equal_single_ones() {
         scene_id: id.clone(),
         cameras: vec![between(0, 0.0), between(2, 0.5)],
         kinds: vec![pb::Kind::Color.into(), pb::Kind::Depth.into()],
-        options: options.clone(),
+        options,
     };
     let mut stream = client.render_views(request).await.unwrap().into_inner();
     let mut views = Vec::new();

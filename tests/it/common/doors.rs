@@ -5,7 +5,7 @@ use segsplat::{
     scene::{Upload, UploadCameras},
 };
 use serde_json::Value;
-use std::net::SocketAddr;
+use std::{fmt::Display, net::SocketAddr};
 use tonic::transport::Channel;
 
 /// Bytes of a photo or archive in one gRPC message.
@@ -62,7 +62,7 @@ impl Ask {
         Self::default().with("from", 0).with("width", 64).with("height", 48)
     }
 
-    pub(crate) fn with(mut self, name: &'static str, value: impl ToString) -> Self {
+    pub(crate) fn with(mut self, name: &'static str, value: impl Display) -> Self {
         self.pairs.retain(|(known, _)| *known != name);
         self.pairs.push((name, value.to_string()));
         self
@@ -197,7 +197,8 @@ impl Door {
                 let scene = client.clone().create_scene(messages).await.map_err(fault_of)?;
                 let scene = scene.into_inner();
                 let state = scene.state().as_str_name().trim_start_matches("SCENE_STATE_");
-                Ok((scene.id.clone(), state.to_lowercase()))
+                let state = state.to_lowercase();
+                Ok((scene.id, state))
             }
         }
     }
@@ -216,9 +217,9 @@ impl Door {
                 let scene = client.clone().get_scene(request).await.map_err(fault_of)?;
                 let scene = scene.into_inner();
                 let state = scene.state().as_str_name().trim_start_matches("SCENE_STATE_");
-                let warnings = scene.report.clone().unwrap_or_default().warnings;
-                let codes = warnings.into_iter().map(|warning| warning.code).collect();
-                Ok((state.to_lowercase(), codes))
+                let state = state.to_lowercase();
+                let warnings = scene.report.unwrap_or_default().warnings;
+                Ok((state, warnings.into_iter().map(|warning| warning.code).collect()))
             }
         }
     }
@@ -375,6 +376,7 @@ pub(crate) async fn json(answer: reqwest::Response) -> Result<Value, Fault> {
 }
 
 /// The fault of a gRPC status.
+#[expect(clippy::needless_pass_by_value, reason = "goes into map_err as it is")]
 pub(crate) fn fault_of(status: tonic::Status) -> Fault {
     let key = |name: &str| {
         status.metadata().get(name).map(|value| value.to_str().expect("ASCII").to_owned())

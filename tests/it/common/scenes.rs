@@ -7,7 +7,7 @@ use segsplat::{
     scene::{Camera, CameraToWorld, Gaussians, Intrinsics, RawGaussians, SourcePixel},
 };
 
-/// A small seeded generator (SplitMix64), so that scenes never change with a library.
+/// A small seeded generator (`SplitMix64`), so that scenes never change with a library.
 #[derive(Clone, Debug)]
 pub(crate) struct Random(pub(crate) u64);
 
