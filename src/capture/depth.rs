@@ -13,6 +13,9 @@ use crate::error::{Error, Result};
 const QUANTILES: [f64; 2] = [0.01, 0.99];
 /// Margin on both sides, in spans of inverse depth: what the network was trained with.
 const MARGIN: f64 = 0.15;
+/// Further margin on the near side of a view none of whose matchable pixels were matched, less for
+/// a view that was matched in part: what only one photo sees is mostly what stands close.
+const UNSEEN_MARGIN: f64 = 0.25;
 /// A range is at least this share of its nearest inverse depth wide.
 const SPAN_MIN: f64 = 0.05;
 /// Farthest depth worth telling apart, in the largest baseline of the photos.
@@ -106,7 +109,10 @@ pub(super) fn ranges(views: &[GrayView], points: &[Vec<Point>]) -> Result<Ranges
             let [lo, hi] = QUANTILES.map(|q| quantile(&ws, q));
             let hi = hi.max(4.0 * farthest);
             let span = (hi - lo).max(SPAN_MIN * hi);
-            [1.0 / (hi + MARGIN * span), 1.0 / (lo - MARGIN * span).max(farthest)]
+            let candidates = views[i].candidates.len().max(1);
+            let unseen = 1.0 - (points[i].len() as f64 / candidates as f64).min(1.0);
+            let near_margin = MARGIN + UNSEEN_MARGIN * unseen;
+            [1.0 / (hi + near_margin * span), 1.0 / (lo - MARGIN * span).max(farthest)]
         })
         .collect();
     Ok(Ranges { near_far, median_depth: 1.0 / median_w.max(farthest), near_tenth_w })

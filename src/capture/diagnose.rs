@@ -273,8 +273,8 @@ fn nothing_agrees(
         code: WarningCode::PoorPoseAgreement,
         message: format!(
             "the photos show the same things but do not agree under the given cameras: at best \
-             {:.1} % of the matchable pixels, {} and {}; the poses or intrinsics are wrong in a way \
-             that no usual mistake explains",
+             {:.1} % of the matchable pixels, {} and {}; the poses or intrinsics are wrong in a \
+             way that no usual mistake explains",
             100.0 * share,
             name(photos, i),
             name(photos, j)
@@ -401,8 +401,8 @@ fn baselines(found: &[PairFound], ranges: &Ranges, warnings: &mut Vec<Warning>) 
         warnings.push(Warning {
             code: WarningCode::SmallBaseline,
             message: format!(
-                "the longest baseline of neighbouring photos, {longest:.4}, is {:.2} % of the depth \
-                 that nine tenths of the matched pixels lie beyond; under {:.0} % depth is a guess",
+                "the longest baseline of neighbouring photos, {longest:.4}, is {:.2} % of the \
+                 depth that nine tenths of the matched pixels lie beyond; under {:.0} % depth is a guess",
                 100.0 * ratio,
                 100.0 * BASELINE_MIN
             ),
