@@ -1,6 +1,6 @@
-//! Stage 1: Gaussians to footprints on the picture, and which to drop. Partner: `shaders/project.wgsl`
+//! Stage 1: Gaussians to footprints, and which to drop. Partner: `shaders/project.wgsl`
 //!
-//! In: means, quats, scales, opacities `[N]`. Out: [`Footprint`] `[N]`, where a dropped Gaussian has
+//! In: means, quats, scales, opacities `[N]`. Out: [`Footprint`] `[N]`; a dropped Gaussian has
 //! touched no tile (`tiles_per_gauss` 0). Everything is computed in f64 and narrowed at the end.
 
 use glam::{DMat3, DQuat, DVec3};

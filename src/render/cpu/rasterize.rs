@@ -1,4 +1,4 @@
-//! Stage 8: front-to-back blend of colour, expected depth and alpha. Partner: `shaders/rasterize.wgsl`
+//! Stage 8: front-to-back blend of colour, depth and alpha. Partner: `shaders/rasterize.wgsl`
 //!
 //! A tile is cut into cells of [`LANES`] pixels of one row. Gaussians are staged a batch at a time
 //! and entered in the list of each cell that their footprint meets; then each cell blends its list

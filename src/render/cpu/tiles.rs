@@ -48,7 +48,7 @@ pub fn touched_tiles(footprint: &Footprint, grid: &Grid, mut touch: impl FnMut(u
         return;
     }
     let tile = i64::from(TILE_SIZE);
-    // Height, relative to the mean, of the rightmost point of the ellipse; the leftmost is at -peak.
+    // Height, relative to the mean, of the ellipse's rightmost point; the leftmost is at -peak.
     let peak = footprint.slope * tall * tall / wide;
     let half_width = |dy: f64| {
         let across = dy / tall;
