@@ -66,7 +66,7 @@ pub(super) struct Args {
     /// Principal point y [default: the middle]
     #[arg(long, requires = "fx")]
     cy: Option<f64>,
-    /// Width in pixels [default: the photos' shape, longer side at most 640]
+    /// Width in pixels [default: the photos' shape, longer side at most 384]
     #[arg(long)]
     width: Option<u32>,
     /// Height in pixels [default: the photos' shape]

@@ -9,8 +9,9 @@ use crate::{
     scene::{Camera, CameraToWorld, Intrinsics, SceneCamera},
 };
 
-/// Longer side of a picture whose size nobody asked for, pixels.
-const DEFAULT_SIDE: f64 = 640.0;
+/// Longer side of a picture whose size nobody asked for, pixels: near what the network saw, so
+/// that the gaps between its pixels do not show.
+const DEFAULT_SIDE: f64 = 384.0;
 /// Focal lengths and principal points accepted, pixels: a view is at most some thousands wide.
 const FOCAL_RANGE: [f64; 2] = [1.0, 1e6];
 /// Vertical fields of view accepted, degrees.
@@ -268,7 +269,7 @@ mod tests {
         for (options, want) in [
             (sized(Some(250), None), (250, 200)),
             (sized(None, Some(800)), (1000, 800)),
-            (sized(None, None), (500, 400)),
+            (sized(None, None), (384, 307)),
         ] {
             let lens = resolved(&between(0.0), &options).unwrap().intrinsics;
             assert_eq!((lens.width, lens.height), want);

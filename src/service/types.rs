@@ -136,7 +136,7 @@ pub struct CameraSpec {
 #[derive(Clone, Debug, PartialEq)]
 pub struct ViewOptions {
     /// Width, pixels; `None`: from the height and the input camera's shape, longer side at
-    /// most 640 where both are missing.
+    /// most 384 where both are missing.
     pub width: Option<u32>,
     /// Height, pixels; `None`: as for the width.
     pub height: Option<u32>,
