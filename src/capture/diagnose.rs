@@ -402,7 +402,7 @@ fn baselines(found: &[PairFound], ranges: &Ranges, warnings: &mut Vec<Warning>) 
             code: WarningCode::SmallBaseline,
             message: format!(
                 "the longest baseline of neighbouring photos, {longest:.4}, is {:.2} % of \
-                 the depth that nine tenths of the matches lie beyond; under {:.0} % depth is a guess",
+                 the depth nine tenths of the matches lie beyond; under {:.0} % it is a guess",
                 100.0 * ratio,
                 100.0 * BASELINE_MIN
             ),
