@@ -142,14 +142,15 @@ fn judge(
     let near = (made.report.median_depth * NEAR_SHARE).max(1e-6) as f32;
     let request = RenderRequest {
         camera: target.camera,
-        kinds: Kinds { color: true, depth: true, alpha: false },
+        kinds: Kinds::ALL,
         background: [0.0; 3],
         antialiased: false,
         near,
     };
     let frame = renderer.render(&made.gaussians, &request)?;
-    let color: Vec<[f32; 3]> =
-        frame.color.unwrap_or_default().into_iter().map(|c| c.map(|v| v.clamp(0.0, 1.0))).collect();
+    let mut color = frame.color.unwrap_or_default();
+    made.backdrop.fill(&target.camera, &mut color, &frame.alpha.unwrap_or_default());
+    color.iter_mut().flatten().for_each(|v| *v = v.clamp(0.0, 1.0));
     let truth = metrics::to_unit(&target.photo);
     let valid = target.photo.valid.as_deref();
     let (warp, _) = hindsight_warp(

@@ -4,8 +4,11 @@
 //! checked [`Gaussians`] relative to the mean of the camera centres, and how many were dropped for
 //! which reason. Nothing is dropped uncounted.
 
+mod backdrop;
 mod fuse;
 mod sh;
+
+pub use backdrop::backdrop;
 
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;

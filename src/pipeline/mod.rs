@@ -22,8 +22,8 @@ use crate::{
     models::{Bundle, Geometry, GeometryInput, Runtime},
     photos,
     scene::{
-        Camera, Capture, Gaussians, HealthReport, PosedPhoto, SceneCamera, SceneOptions, StageTime,
-        Upload, ViewSet,
+        Backdrop, Camera, Capture, Gaussians, HealthReport, PosedPhoto, SceneCamera, SceneOptions,
+        StageTime, Upload, ViewSet,
     },
 };
 
@@ -122,6 +122,8 @@ impl Engine {
 pub struct Reconstruction {
     /// The Gaussians, world frame.
     pub gaussians: Gaussians,
+    /// The photos' colours by direction, behind everything.
+    pub backdrop: Backdrop,
     /// What the scene says of itself.
     pub report: HealthReport,
     /// The photos' files and cameras, undistorted pixels, in the photos' order.
@@ -202,8 +204,9 @@ fn finish(
         }
         Ok(views)
     })?;
-    let lifted =
-        run.stage(Stage::Lift, |_| engine.workers.install(|| lift::lift(views, &cameras)))?;
+    let (lifted, backdrop) = run.stage(Stage::Lift, |_| {
+        engine.workers.install(|| Ok((lift::lift(views, &cameras)?, lift::backdrop(photos))))
+    })?;
 
     let named = photos.iter().zip(cameras);
     let cameras =
@@ -220,7 +223,7 @@ fn finish(
         execution_provider: engine.geometry.provider().name().to_owned(),
         warnings: capture.warnings,
     };
-    Ok(Reconstruction { gaussians: lifted.gaussians, report, cameras })
+    Ok(Reconstruction { gaussians: lifted.gaussians, backdrop, report, cameras })
 }
 
 /// One scene on its way: reports, times and stops it.

@@ -1,6 +1,7 @@
 //! The nouns: cameras, photos, Gaussians, reports. No IO, no threads; constructors validate and
 //! the types are trusted below.
 
+mod backdrop;
 mod camera;
 mod capture;
 mod gaussians;
@@ -12,6 +13,7 @@ mod report;
 mod status;
 mod upload;
 
+pub use backdrop::Backdrop;
 pub use camera::{Camera, CameraToWorld, Intrinsics, ORTHONORMAL_TOLERANCE};
 pub use capture::{Capture, ViewSet};
 pub use gaussians::{Gaussians, RawGaussians, SanitizeReport, SourcePixel};

@@ -1,0 +1,137 @@
+//! What lies behind everything: the photos' colours by direction, for rays that meet no Gaussian.
+//!
+//! A small map over longitude and latitude about the world's y axis. It has no parallax and no
+//! place; the alpha of a view says honestly where it shows. Where no photo looked, the nearest
+//! colours spread (see `lift::backdrop`).
+
+use std::f64::consts::{PI, TAU};
+
+use glam::DVec3;
+
+use crate::{
+    error::{Error, ErrorCode, Result},
+    scene::Camera,
+};
+
+/// Colours by direction, sRGB as the photos are.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Backdrop {
+    /// `[HEIGHT * WIDTH]`, rows from -y to +y.
+    rgb: Vec<[u8; 3]>,
+}
+
+impl Default for Backdrop {
+    /// Black.
+    fn default() -> Self {
+        Self { rgb: vec![[0; 3]; Self::WIDTH * Self::HEIGHT] }
+    }
+}
+
+impl Backdrop {
+    /// Cells of longitude.
+    pub const WIDTH: usize = 128;
+    /// Cells of latitude.
+    pub const HEIGHT: usize = 64;
+
+    /// From `[HEIGHT * WIDTH]` colours.
+    ///
+    /// # Errors
+    /// `scene_corrupt` when the number of cells is another.
+    pub fn from_cells(rgb: Vec<[u8; 3]>) -> Result<Self> {
+        let cells = Self::WIDTH * Self::HEIGHT;
+        if rgb.len() != cells {
+            return Err(Error::new(
+                ErrorCode::SceneCorrupt,
+                format!("the backdrop has {} cells, not {cells}", rgb.len()),
+            ));
+        }
+        Ok(Self { rgb })
+    }
+
+    /// The cells, `[HEIGHT * WIDTH]`.
+    #[must_use]
+    pub fn cells(&self) -> &[[u8; 3]] {
+        &self.rgb
+    }
+
+    /// Position of a direction in the map: cells along longitude and latitude, centres at +0.5.
+    #[must_use]
+    pub fn position(direction: DVec3) -> (f64, f64) {
+        let longitude = direction.x.atan2(direction.z);
+        let flat = direction.x.hypot(direction.z);
+        let latitude = direction.y.atan2(flat);
+        ((longitude / TAU + 0.5) * Self::WIDTH as f64, (latitude / PI + 0.5) * Self::HEIGHT as f64)
+    }
+
+    /// Bilinear colour in a world direction (any length but 0), 0..1.
+    #[must_use]
+    pub fn color(&self, direction: DVec3) -> [f32; 3] {
+        let (u, v) = Self::position(direction);
+        let (u, v) = (u - 0.5, (v - 0.5).clamp(0.0, (Self::HEIGHT - 1) as f64));
+        let (u0, v0) = (u.floor(), v.floor());
+        #[expect(clippy::cast_possible_truncation, reason = "weights of 0..1")]
+        let (fu, fv) = ((u - u0) as f32, (v - v0) as f32);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "in range")]
+        let (x0, y0) = ((u0 as i64).rem_euclid(Self::WIDTH as i64) as usize, v0 as usize);
+        let (x1, y1) = ((x0 + 1) % Self::WIDTH, (y0 + 1).min(Self::HEIGHT - 1));
+        let at = |x: usize, y: usize, c: usize| f32::from(self.rgb[y * Self::WIDTH + x][c]) / 255.0;
+        std::array::from_fn(|c| {
+            let top = at(x0, y0, c) * (1.0 - fu) + at(x1, y0, c) * fu;
+            let low = at(x0, y1, c) * (1.0 - fu) + at(x1, y1, c) * fu;
+            top * (1.0 - fv) + low * fv
+        })
+    }
+
+    /// Puts the backdrop behind a view rendered over black: `color += (1 - alpha) * backdrop`.
+    ///
+    /// `color` and `alpha` are `[height * width]` of the camera's picture.
+    pub fn fill(&self, camera: &Camera, color: &mut [[f32; 3]], alpha: &[f32]) {
+        let rotation = camera.camera_to_world.rotation();
+        let width = camera.intrinsics.width.max(1) as usize;
+        for (i, (pixel, &alpha)) in color.iter_mut().zip(alpha).enumerate() {
+            if alpha >= 1.0 {
+                continue;
+            }
+            let (x, y) = ((i % width) as f64 + 0.5, (i / width) as f64 + 0.5);
+            let behind = self.color(rotation * camera.intrinsics.unproject(x, y, 1.0));
+            for (value, behind) in pixel.iter_mut().zip(behind) {
+                *value += (1.0 - alpha) * behind;
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{CameraToWorld, Intrinsics};
+
+    fn quarters() -> Backdrop {
+        let cell = |i: usize| {
+            let (x, y) = (i % Backdrop::WIDTH, i / Backdrop::WIDTH);
+            [(x * 2) as u8, (y * 4) as u8, 0]
+        };
+        Backdrop::from_cells((0..Backdrop::WIDTH * Backdrop::HEIGHT).map(cell).collect()).unwrap()
+    }
+
+    #[test]
+    fn forward_is_the_middle_and_down_is_the_last_row() {
+        let (u, v) = Backdrop::position(DVec3::Z);
+        assert_eq!((u, v), (64.0, 32.0));
+        assert!(quarters().color(DVec3::Y)[1] > 0.98, "+y is the last row");
+        assert!(quarters().color(-DVec3::Y)[1] < 0.02, "-y is the first row");
+        assert!(quarters().color(DVec3::X)[0] > quarters().color(-DVec3::X)[0], "+x is east");
+    }
+
+    #[test]
+    fn fill_shows_only_where_alpha_leaves_room() {
+        let camera = Camera {
+            intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 1.0, cy: 0.5, width: 2, height: 1 },
+            camera_to_world: CameraToWorld::look_at(DVec3::ZERO, DVec3::Z, -DVec3::Y, "c").unwrap(),
+        };
+        let white = Backdrop::from_cells(vec![[255; 3]; 128 * 64]).unwrap();
+        let mut color = vec![[0.25; 3]; 2];
+        white.fill(&camera, &mut color, &[1.0, 0.25]);
+        assert_eq!(color, vec![[0.25; 3], [1.0; 3]]);
+    }
+}
