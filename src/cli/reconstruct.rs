@@ -67,7 +67,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
             program_version: env!("CARGO_PKG_VERSION").to_owned(),
         },
     };
-    let scene = Scene { meta, gaussians: made.gaussians };
+    let scene = Scene { meta, gaussians: made.gaussians, backdrop: made.backdrop };
     let path = path_of(&args.output);
     write(&path, &scene)?;
     let total_ms = begun.elapsed().as_secs_f64() * 1e3;

@@ -75,7 +75,7 @@ pub(super) struct Args {
     /// What to draw
     #[arg(long, value_enum, default_value = "color")]
     kind: KindArg,
-    /// Background colour, each 0 to 1
+    /// Background colour, each 0 to 1 [default: the scene's backdrop]
     #[arg(long, value_name = "R,G,B", value_delimiter = ',')]
     background: Option<Vec<f32>>,
     /// Antialiased: opacity compensated for the blur of small Gaussians
@@ -146,8 +146,8 @@ fn spec(args: &Args) -> Result<ViewSpec> {
         (None, None) => LensSpec::OfScene,
     };
     let background = match &args.background {
-        Some(background) => numbers(background, "--background")?,
-        None => [0.0; 3],
+        Some(background) => Some(numbers(background, "--background")?),
+        None => None,
     };
     Ok(ViewSpec {
         camera: CameraSpec { pose, lens },

@@ -8,7 +8,7 @@ use std::{
 use crate::{
     error::{Error, Result},
     limits::Limits,
-    scene::{DropCount, HealthReport, Provenance, Scene, SceneId, SceneMeta},
+    scene::{Backdrop, DropCount, HealthReport, Provenance, Scene, SceneId, SceneMeta},
     store::{ply::read_ply, read_scene},
 };
 
@@ -59,7 +59,8 @@ pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
             report,
             provenance: Provenance::default(),
         };
-        return Ok(Opened { scene: Scene { meta, gaussians }, format: "ply", sha256: None });
+        let scene = Scene { meta, gaussians, backdrop: Backdrop::default() };
+        return Ok(Opened { scene, format: "ply", sha256: None });
     }
     let file = fs_err::read(&path).map_err(unreadable)?;
     let (scene, sha256) = read_scene(&file)?;

@@ -45,6 +45,7 @@ impl SceneMaker for PipelineMaker {
         )?;
         Ok(Made {
             gaussians: made.gaussians,
+            backdrop: made.backdrop,
             report: made.report,
             cameras: made.cameras,
             bundle_sha256: self.engine.bundle().sha256().to_owned(),

@@ -26,7 +26,9 @@ use self::{board::Board, queue::Queue, worker::Stop};
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    scene::{Gaussians, HealthReport, SceneCamera, SceneId, SceneOptions, SceneState, Upload},
+    scene::{
+        Backdrop, Gaussians, HealthReport, SceneCamera, SceneId, SceneOptions, SceneState, Upload,
+    },
     store::{Record, Store, not_found},
 };
 
@@ -54,6 +56,8 @@ impl fmt::Debug for Work<'_> {
 pub struct Made {
     /// The Gaussians.
     pub gaussians: Gaussians,
+    /// The photos' colours by direction.
+    pub backdrop: Backdrop,
     /// Health report.
     pub report: HealthReport,
     /// Cameras of the photos.

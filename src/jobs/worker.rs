@@ -141,7 +141,8 @@ impl Shared {
             },
         };
         let (report, cameras) = (meta.report.clone(), meta.cameras.clone());
-        let digest = self.store.put_scene(Scene { meta, gaussians: made.gaussians })?;
+        let scene = Scene { meta, gaussians: made.gaussians, backdrop: made.backdrop };
+        let digest = self.store.put_scene(scene)?;
         // On disk first, so that a watcher who sees `done` may pull the plug.
         let Some(mut done) = self.board.find(id) else { return Ok(()) };
         done.scene_sha256 = Some(digest);

@@ -24,7 +24,7 @@ pub fn backdrop(photos: &[PosedPhoto]) -> Backdrop {
     let seen = photos
         .par_iter()
         .map(observe)
-        .reduce(|| Level::empty(Backdrop::WIDTH, Backdrop::HEIGHT), Level::plus);
+        .reduce(|| Level::empty(Backdrop::WIDTH, Backdrop::HEIGHT), |a, b| a.plus(&b));
     let filled = fill(seen.normalised());
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..255")]
     let byte = |v: f32| v.round().clamp(0.0, 255.0) as u8;
@@ -71,10 +71,11 @@ fn fill(finest: Level) -> Level {
             let weight = out.cells[at][3];
             if weight < 1.0 {
                 let behind = coarse.between(x, y);
-                for c in 0..3 {
-                    out.cells[at][c] = out.cells[at][c] * weight + behind[c] * (1.0 - weight);
+                let cell = &mut out.cells[at];
+                for (own, behind) in cell.iter_mut().zip(behind).take(3) {
+                    *own = *own * weight + behind * (1.0 - weight);
                 }
-                out.cells[at][3] = weight.max(behind[3]);
+                cell[3] = weight.max(behind[3]);
             }
         }
     }
@@ -86,7 +87,7 @@ impl Level {
         Self { width, height, cells: vec![[0.0; 4]; width * height] }
     }
 
-    fn plus(mut self, other: Self) -> Self {
+    fn plus(mut self, other: &Self) -> Self {
         for (own, more) in self.cells.iter_mut().flatten().zip(other.cells.iter().flatten()) {
             *own += more;
         }

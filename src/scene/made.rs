@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::scene::{Gaussians, HealthReport, SceneCamera, SceneId, SceneOptions};
+use crate::scene::{Backdrop, Gaussians, HealthReport, SceneCamera, SceneId, SceneOptions};
 
 /// A photo of the upload and its hash.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,4 +48,6 @@ pub struct Scene {
     pub meta: SceneMeta,
     /// The Gaussians.
     pub gaussians: Gaussians,
+    /// The photos' colours by direction, behind everything.
+    pub backdrop: Backdrop,
 }

@@ -142,8 +142,8 @@ pub struct ViewOptions {
     pub height: Option<u32>,
     /// Encoding.
     pub format: Format,
-    /// Background colour, 0..1.
-    pub background: [f32; 3],
+    /// Background colour, 0..1; `None`: the scene's backdrop.
+    pub background: Option<[f32; 3]>,
     /// gsplat's antialiased mode.
     pub antialiased: bool,
     /// Near plane, world units; `None`: 0.01 of the scene's median depth.
@@ -158,7 +158,7 @@ impl Default for ViewOptions {
             width: None,
             height: None,
             format: Format::Png,
-            background: [0.0; 3],
+            background: None,
             antialiased: false,
             near: None,
             deadline: None,

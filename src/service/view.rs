@@ -32,7 +32,7 @@ struct Resolved {
     camera: Camera,
     kinds: Vec<Kind>,
     format: Format,
-    background: [f32; 3],
+    background: Option<[f32; 3]>,
     antialiased: bool,
     near: f32,
 }
@@ -45,12 +45,17 @@ impl Resolved {
             kinds: Kinds {
                 color: has(Kind::Color),
                 depth: has(Kind::Depth),
-                alpha: has(Kind::Alpha),
+                // What shows of the backdrop is what alpha leaves.
+                alpha: has(Kind::Alpha) || self.wants_backdrop(),
             },
-            background: self.background,
+            background: self.background.unwrap_or_default(),
             antialiased: self.antialiased,
             near: self.near,
         }
+    }
+
+    fn wants_backdrop(&self) -> bool {
+        self.background.is_none() && self.kinds.contains(&Kind::Color)
     }
 
     /// Hash of scene, renderer and request for one kind.
@@ -73,7 +78,12 @@ impl Resolved {
         scene_tag: &str,
     ) -> Result<Vec<RenderedView>> {
         let started = Instant::now();
-        let frame = renderer.render(&scene.gaussians, &self.request())?;
+        let mut frame = renderer.render(&scene.gaussians, &self.request())?;
+        if self.wants_backdrop()
+            && let (Some(color), Some(alpha)) = (&mut frame.color, &frame.alpha)
+        {
+            scene.backdrop.fill(&self.camera, color, alpha);
+        }
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
         let name = renderer.name();
         let view = |&kind: &Kind| -> Result<RenderedView> {
@@ -124,7 +134,7 @@ fn resolve(
     for kind in kinds {
         encode::check(*kind, options.format)?;
     }
-    if let Some(bad) = options.background.iter().find(|v| !(0.0..=1.0).contains(*v)) {
+    if let Some(bad) = options.background.iter().flatten().find(|v| !(0.0..=1.0).contains(*v)) {
         return Err(Error::invalid(format!("background has {bad}; its values must be 0 to 1")));
     }
     let near = match options.near {

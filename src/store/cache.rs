@@ -74,7 +74,9 @@ impl Inner {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{Gaussians, HealthReport, Provenance, RawGaussians, SceneMeta, SourcePixel};
+    use crate::scene::{
+        Backdrop, Gaussians, HealthReport, Provenance, RawGaussians, SceneMeta, SourcePixel,
+    };
 
     fn scene(id: u8, count: usize) -> Arc<Scene> {
         let raw = RawGaussians {
@@ -94,7 +96,8 @@ mod tests {
             report: HealthReport::default(),
             provenance: Provenance::default(),
         };
-        Arc::new(Scene { meta, gaussians: Gaussians::sanitize(raw).unwrap().0 })
+        let gaussians = Gaussians::sanitize(raw).unwrap().0;
+        Arc::new(Scene { meta, gaussians, backdrop: Backdrop::default() })
     }
 
     fn has(cache: &Cache, id: u8) -> bool {

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::container::{self, Array, Container, Label};
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Gaussians, RawGaussians, Scene, SceneMeta, SourcePixel},
+    scene::{Backdrop, Gaussians, RawGaussians, Scene, SceneMeta, SourcePixel},
 };
 
 const LABEL: Label = Label { kind: "segsplat-scene", version: 1 };
@@ -50,6 +50,12 @@ pub fn write_scene(to: &mut dyn Write, scene: &Scene) -> io::Result<String> {
         array("sh", Dtype::F32, &[n, k, 3], bytemuck::cast_slice(&raw.sh)),
         array("semantic_index", Dtype::U16, &[n], bytemuck::cast_slice(&raw.semantic_index)),
         array("source", Dtype::U16, &[n, 3], bytemuck::cast_slice(&source)),
+        array(
+            "backdrop",
+            Dtype::U8,
+            &[Backdrop::HEIGHT, Backdrop::WIDTH, 3],
+            bytemuck::cast_slice(scene.backdrop.cells()),
+        ),
     ];
     container::write(to, &LABEL, &header, &arrays)
 }
@@ -77,7 +83,11 @@ pub fn read_scene(file: &[u8]) -> Result<(Scene, String)> {
             .map(|[view, x, y]| SourcePixel { view, x, y })
             .collect(),
     };
-    let scene = Scene { meta: header.meta, gaussians: Gaussians::restore(raw)? };
+    let scene = Scene {
+        meta: header.meta,
+        gaussians: Gaussians::restore(raw)?,
+        backdrop: Backdrop::from_cells(rows(&container, "backdrop", Dtype::U8)?)?,
+    };
     Ok((scene, container.sha256))
 }
 

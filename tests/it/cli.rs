@@ -11,8 +11,8 @@ use segsplat::{
     error::ErrorCode,
     models::Runtime,
     scene::{
-        Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, Provenance, RawGaussians,
-        Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
+        Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, Provenance,
+        RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
     },
     store::{ply::PlyWriter, write_scene},
 };
@@ -82,7 +82,7 @@ fn scene() -> Scene {
         report: HealthReport { median_depth: 2.0, ..HealthReport::default() },
         provenance: Provenance::default(),
     };
-    Scene { meta, gaussians: Gaussians::sanitize(raw).unwrap().0 }
+    Scene { meta, gaussians: Gaussians::sanitize(raw).unwrap().0, backdrop: Backdrop::default() }
 }
 
 /// A folder with the plate as `scene.segsplat` and `plate.ply`.

@@ -180,7 +180,7 @@ async fn views_come_camera_by_camera_and_tags_tell_pictures_apart() {
     let tag = server.service.view_etag(&id, &one).unwrap();
     assert_eq!(server.service.render(&id, one.clone()).await.unwrap().etag, tag);
     let mut other = one.clone();
-    other.options.background = [0.0, 0.0, 0.5];
+    other.options.background = Some([0.0, 0.0, 0.5]);
     assert_ne!(server.service.view_etag(&id, &other).unwrap(), tag);
     let mut late = one;
     late.options.deadline = Some(Duration::ZERO);

@@ -6,9 +6,9 @@ use glam::DVec3;
 use segsplat::{
     error::{ErrorCode, Result},
     scene::{
-        Gaussians, HealthReport, Provenance, RawGaussians, SanitizeReport, Scene, SceneId,
-        SceneMeta, SceneOptions, SceneState, SceneStatus, SourcePixel, Upload, UploadCameras,
-        UploadFile,
+        Backdrop, Gaussians, HealthReport, Provenance, RawGaussians, SanitizeReport, Scene,
+        SceneId, SceneMeta, SceneOptions, SceneState, SceneStatus, SourcePixel, Upload,
+        UploadCameras, UploadFile,
     },
     store::{
         Record, Store,
@@ -54,7 +54,9 @@ fn scene(id: u8, count: usize, sh_degree: u8) -> Scene {
         report: HealthReport { median_depth: 0.1 + 0.2, ..HealthReport::default() },
         provenance: Provenance { bundle_sha256: "ab".repeat(32), ..Provenance::default() },
     };
-    Scene { meta, gaussians: Gaussians::restore(raw).unwrap() }
+    let cells = (0..Backdrop::WIDTH * Backdrop::HEIGHT).map(|i| [i as u8, id, 7]).collect();
+    let backdrop = Backdrop::from_cells(cells).unwrap();
+    Scene { meta, gaussians: Gaussians::restore(raw).unwrap(), backdrop }
 }
 
 fn bits(gaussians: &Gaussians) -> Vec<u32> {

@@ -184,7 +184,7 @@ pub(super) fn options(options: Option<pb::ViewOptions>) -> Result<ViewOptions> {
         pb::Format::Npy => Format::Npy,
     };
     #[expect(clippy::cast_possible_truncation, reason = "a colour fits f32")]
-    let background = options.background.map_or([0.0; 3], |v| [v.x as f32, v.y as f32, v.z as f32]);
+    let background = options.background.map(|v| [v.x as f32, v.y as f32, v.z as f32]);
     Ok(ViewOptions {
         width: options.width,
         height: options.height,

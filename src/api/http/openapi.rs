@@ -150,7 +150,8 @@ pub(super) struct ViewParams {
     kind: Option<String>,
     /// `png`, `jpeg`, `webp` or `npy`; else `Accept` decides, else PNG.
     format: Option<String>,
-    /// `black` (default), `white`, `#rrggbb` or three numbers of 0..1.
+    /// `backdrop` (default: the photos' colours by direction), `black`, `white`, `#rrggbb` or
+    /// three numbers of 0..1.
     background: Option<String>,
     /// Opacity compensated for the blur of the picture's pixels.
     antialiased: Option<bool>,

@@ -157,7 +157,7 @@ fn spec_of(mut params: Params, accept: Option<&str>, models: &ModelsInfo) -> Res
         width: p.whole("width")?,
         height: p.whole("height")?,
         format,
-        background: p.text("background")?.map_or(Ok([0.0; 3]), |text| background(&text))?,
+        background: p.text("background")?.map_or(Ok(None), |text| background(&text))?,
         antialiased: p.flag("antialiased")?.unwrap_or(false),
         near: p.number("near", "a number")?,
         deadline: None,
@@ -205,17 +205,19 @@ pub(super) fn format(name: &str) -> Result<Format> {
     }
 }
 
-/// A colour: `black`, `white`, `#rrggbb` or three numbers of 0..1.
-pub(super) fn background(text: &str) -> Result<[f32; 3]> {
+/// `backdrop` (none), or a colour: `black`, `white`, `#rrggbb` or three numbers of 0..1.
+pub(super) fn background(text: &str) -> Result<Option<[f32; 3]>> {
     let shown: String = text.chars().take(40).collect();
     let wrong = || {
         Error::invalid(format!(
-            "background is {shown:?}; it must be black, white, #rrggbb or three numbers of 0..1"
+            "background is {shown:?}; it must be backdrop, black, white, #rrggbb or three numbers \
+             of 0..1"
         ))
     };
     match text {
-        "black" => return Ok([0.0; 3]),
-        "white" => return Ok([1.0; 3]),
+        "backdrop" => return Ok(None),
+        "black" => return Ok(Some([0.0; 3])),
+        "white" => return Ok(Some([1.0; 3])),
         _ => {}
     }
     let mut color = [0.0; 3];
@@ -223,7 +225,7 @@ pub(super) fn background(text: &str) -> Result<[f32; 3]> {
         let digits = hex.len() == 6 && hex.bytes().all(|b| b.is_ascii_hexdigit());
         let value = u32::from_str_radix(hex, 16).ok().filter(|_| digits);
         let [_, bytes @ ..] = value.ok_or_else(wrong)?.to_be_bytes();
-        return Ok(bytes.map(|byte| f32::from(byte) / 255.0));
+        return Ok(Some(bytes.map(|byte| f32::from(byte) / 255.0)));
     }
     if text.split(',').count() != 3 {
         return Err(wrong());
@@ -231,7 +233,7 @@ pub(super) fn background(text: &str) -> Result<[f32; 3]> {
     for (channel, part) in color.iter_mut().zip(text.split(',')) {
         *channel = part.trim().parse().map_err(|_| wrong())?;
     }
-    Ok(color)
+    Ok(Some(color))
 }
 
 fn accept(headers: &HeaderMap) -> Option<&str> {
@@ -297,9 +299,9 @@ mod tests {
 
     #[test]
     fn backgrounds_are_names_hex_or_numbers() {
-        assert_eq!(background("white").unwrap(), [1.0; 3]);
-        assert_eq!(background("#ff0000").unwrap(), [1.0, 0.0, 0.0]);
-        assert_eq!(background("0, 0.5,1").unwrap(), [0.0, 0.5, 1.0]);
+        assert_eq!(background("white").unwrap(), Some([1.0; 3]));
+        assert_eq!(background("#ff0000").unwrap(), Some([1.0, 0.0, 0.0]));
+        assert_eq!(background("0, 0.5,1").unwrap(), Some([0.0, 0.5, 1.0]));
         for odd in ["", "#ff00", "#ggffff", "1,2", "a,b,c", "#+fffff"] {
             assert!(background(odd).is_err(), "{odd} was taken");
         }

@@ -122,8 +122,8 @@ fn spec_of(body: ViewsBody, models: &ModelsInfo) -> Result<ViewsSpec> {
         Some(names) => names.iter().map(|name| kind(name, models)).collect::<Result<_>>()?,
     };
     let background = match body.background {
-        None => [0.0; 3],
-        Some(BackgroundBody::Numbers(numbers)) => numbers,
+        None => None,
+        Some(BackgroundBody::Numbers(numbers)) => Some(numbers),
         Some(BackgroundBody::Text(text)) => background(&text)?,
     };
     let options = ViewOptions {

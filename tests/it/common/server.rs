@@ -23,8 +23,8 @@ use segsplat::{
     render::{Frame, FrameStats, RenderRequest, Renderer},
     sample::{self, SampleOptions},
     scene::{
-        Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SceneId, SceneStatus,
-        SourcePixel, Upload,
+        Backdrop, Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SceneId,
+        SceneStatus, SourcePixel, Upload,
     },
     service::{CreateScene, ModelsInfo, Parts, Service},
 };
@@ -161,7 +161,13 @@ impl SceneMaker for WallMaker {
         };
         let cameras =
             photos.iter().map(|p| SceneCamera { file: p.file.clone(), camera: p.camera }).collect();
-        Ok(Made { gaussians, report, cameras, bundle_sha256: "stand-in".to_owned() })
+        Ok(Made {
+            gaussians,
+            backdrop: Backdrop::default(),
+            report,
+            cameras,
+            bundle_sha256: "stand-in".to_owned(),
+        })
     }
 }
 

@@ -14,7 +14,10 @@ use segsplat::{
     photos,
     render::cpu::CpuRenderer,
     sample::{self, SampleOptions},
-    scene::{Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SourcePixel, Upload},
+    scene::{
+        Backdrop, Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SourcePixel,
+        Upload,
+    },
     service::ModelsInfo,
 };
 
@@ -61,7 +64,13 @@ impl SceneMaker for BoardMaker {
         let camera =
             |posed: &PosedPhoto| SceneCamera { file: posed.file.clone(), camera: posed.camera };
         let cameras = photos.iter().map(camera).collect();
-        Ok(Made { gaussians, report, cameras, bundle_sha256: String::new() })
+        Ok(Made {
+            gaussians,
+            backdrop: Backdrop::default(),
+            report,
+            cameras,
+            bundle_sha256: String::new(),
+        })
     }
 }
 
