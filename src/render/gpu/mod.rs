@@ -3,8 +3,8 @@
 //! A frame is one submission and one read-back. The number of Gaussian-tile pairs is known to the
 //! device alone: it sizes the later stages itself, and a frame that turns out to need more room
 //! than there is draws nothing, says how much, and is drawn again. What the adapter cannot hold at
-//! once is drawn in bands of tile rows. Nothing here ends the process: faults are errors, and a lost
-//! device is opened again at the next frame.
+//! once is drawn in bands of tile rows. Nothing here ends the process: faults are errors, and a
+//! lost device is opened again at the next frame.
 
 pub mod buffers;
 mod device;
