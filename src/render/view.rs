@@ -8,6 +8,11 @@ use super::{
 };
 use crate::error::{Error, Result};
 
+/// Pixels that a renderer agrees to draw: 3.4 GB of pictures. Callers have smaller limits.
+const PIXELS_MAX: u64 = 1 << 27;
+/// Longest side: ids of tiles stay in 16 bits a side.
+const SIDE_MAX: u32 = 1 << 18;
+
 /// Camera of one frame, relative to the scene's origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct View {
@@ -38,7 +43,7 @@ impl View {
     ///
     /// # Errors
     /// `invalid_request` when the intrinsics are unusable, the near plane is not a finite number
-    /// over 0, or the background is not finite.
+    /// over 0, or the background is not finite; `limit_exceeded` for a picture beyond memory.
     pub fn new(origin: DVec3, request: &RenderRequest) -> Result<Self> {
         let lens = request.camera.intrinsics.validated("camera")?;
         if !(request.near.is_finite() && request.near > 0.0) {
@@ -49,6 +54,14 @@ impl View {
         }
         if let Some(value) = request.background.iter().find(|value| !value.is_finite()) {
             return Err(Error::invalid(format!("background holds {value}, not a finite number")));
+        }
+        let (pixels, pixels_max) = (u64::from(lens.width) * u64::from(lens.height), PIXELS_MAX);
+        if pixels > pixels_max || lens.width.max(lens.height) > SIDE_MAX {
+            return Err(Error::limit(
+                "camera: pixels of the picture",
+                format!("{}x{}", lens.width, lens.height),
+                format!("{pixels_max} in all or {SIDE_MAX} a side"),
+            ));
         }
         let pose = request.camera.camera_to_world;
         let rotation = pose.rotation().transpose();

@@ -11,11 +11,11 @@ use segsplat::{
         Frame, Kinds, RenderRequest, Renderer,
         cpu::{
             CpuRenderer, emit_isects, prefix_sum, project,
-            project::Footprint,
+            project::{Footprint, Projected},
             radix_sort,
             rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
             shade, tile_ranges,
-            tiles::{Grid, count_tiles},
+            tiles::Grid,
         },
         gpu::{
             GpuOptions, GpuRenderer,
@@ -74,11 +74,11 @@ fn whole(view: &View) -> Grid {
 }
 
 /// The CPU's footprints and tile counts.
-fn projected(gaussians: &Gaussians, request: &RenderRequest) -> (Vec<Footprint>, Vec<u32>) {
-    let (mut footprints, mut tiles) = (Vec::new(), Vec::new());
+fn projected(gaussians: &Gaussians, request: &RenderRequest) -> Projected {
+    let mut projected = Projected::default();
     let view = view_of(gaussians, request);
-    project::project(gaussians, &view, request.antialiased, &mut footprints, &mut tiles);
-    (footprints, tiles)
+    project::project(gaussians, &view, request.antialiased, &mut projected);
+    projected
 }
 
 fn to_row(footprint: &Footprint, tiles: u32) -> FootprintRow {
@@ -109,7 +109,8 @@ fn to_footprint(row: &FootprintRow) -> Footprint {
 }
 
 /// Depth order of the visible, as the CPU sorts.
-fn depth_order(footprints: &[Footprint], tiles: &[u32]) -> Vec<u64> {
+fn depth_order(projected: &Projected) -> Vec<u64> {
+    let Projected { footprints, tiles_per_gauss: tiles, .. } = projected;
     let visible = (0..footprints.len()).filter(|&i| tiles[i] > 0);
     let mut pairs: Vec<u64> =
         visible.map(|i| radix_sort::pack(footprints[i].depth.to_bits(), i as u32)).collect();
@@ -164,7 +165,7 @@ fn project_twin() {
     for antialiased in [false, true] {
         let gaussians = cloud(20_000, 0, 3);
         let request = RenderRequest { antialiased, ..request(turned) };
-        let (footprints, tiles) = projected(&gaussians, &request);
+        let Projected { footprints, tiles_per_gauss: tiles, .. } = projected(&gaussians, &request);
         let got = gpu.project(&gaussians, &request).expect("footprints");
         let (mut one_sided, mut keys_apart, mut both) = (0, 0, 0_u32);
         let (mut cpu_tiles, mut gpu_tiles) = (0_u64, 0_u64);
@@ -211,12 +212,14 @@ fn shade_twin() {
     for degree in 0..=3 {
         let gaussians = cloud(3_000, degree, 4);
         let request = request(camera(200, 150));
-        let (footprints, tiles) = projected(&gaussians, &request);
-        let order = depth_order(&footprints, &tiles);
-        let mut want = Vec::new();
-        shade::shade(&gaussians, &view_of(&gaussians, &request), &footprints, &order, &mut want);
-        let rows: Vec<_> =
-            footprints.iter().zip(&tiles).map(|(f, &tiles)| to_row(f, tiles)).collect();
+        let mut projected = projected(&gaussians, &request);
+        let order = depth_order(&projected);
+        let tiles = projected.tiles_per_gauss.clone();
+        let footprints = projected.footprints.iter();
+        let rows: Vec<_> = footprints.zip(&tiles).map(|(f, &tiles)| to_row(f, tiles)).collect();
+        shade::shade(&gaussians, &view_of(&gaussians, &request), &mut projected);
+        let want: Vec<Footprint> =
+            order.iter().map(|&p| projected.footprints[radix_sort::value(p) as usize]).collect();
         let mut ids: Vec<u32> = order.iter().map(|&pair| radix_sort::value(pair)).collect();
         let dropped = (0..gaussians.len() as u32).filter(|&i| tiles[i as usize] == 0);
         ids.extend(dropped);
@@ -250,12 +253,13 @@ fn emit_isects_twin() {
     let (tile_keys, ids) = gpu.emit_isects(&view, &rows, &narrow).expect("pairs");
     let unwritten = ids.iter().filter(|&&id| id == NO_GAUSSIAN).count();
 
-    let footprints: Vec<_> = rows.iter().map(to_footprint).collect();
     let grid = whole(&view);
+    let footprints = Projected::of(rows.iter().map(to_footprint).collect(), &grid);
+    let in_order: Vec<u64> = (0..rows.len() as u32).map(|i| radix_sort::pack(0, i)).collect();
     let mut want_offsets = Vec::new();
-    prefix_sum::prefix_sum(footprints.iter().map(|f| count_tiles(f, &grid)), &mut want_offsets);
+    prefix_sum::prefix_sum(footprints.tiles_per_gauss.iter().copied(), &mut want_offsets);
     let mut want = Vec::new();
-    emit_isects::emit_isects(&footprints, &grid, &want_offsets, &mut want);
+    emit_isects::emit_isects(&footprints, &in_order, &grid, &want_offsets, &mut want);
 
     let got: std::collections::HashSet<u64> =
         tile_keys.iter().zip(&ids).map(|(&tile, &id)| radix_sort::pack(tile, id)).collect();
@@ -294,13 +298,14 @@ fn rasterize_twin() {
     let (gaussians, middle) = two_views(96, 7);
     let request = request(middle);
     let view = view_of(&gaussians, &request);
-    let (footprints, tiles) = projected(&gaussians, &request);
-    let order = depth_order(&footprints, &tiles);
-    let (mut shaded, mut offsets, mut isects, mut ranges) = (vec![], vec![], vec![], vec![]);
-    shade::shade(&gaussians, &view, &footprints, &order, &mut shaded);
+    let mut projected = projected(&gaussians, &request);
+    let order = depth_order(&projected);
+    let (mut offsets, mut isects, mut ranges) = (vec![], vec![], vec![]);
+    shade::shade(&gaussians, &view, &mut projected);
     let grid = whole(&view);
-    prefix_sum::prefix_sum(shaded.iter().map(|f| count_tiles(f, &grid)), &mut offsets);
-    emit_isects::emit_isects(&shaded, &grid, &offsets, &mut isects);
+    let counts = order.iter().map(|&p| projected.tiles_per_gauss[radix_sort::value(p) as usize]);
+    prefix_sum::prefix_sum(counts, &mut offsets);
+    emit_isects::emit_isects(&projected, &order, &grid, &offsets, &mut isects);
     radix_sort::radix_sort(&mut isects, &mut Vec::new(), 16);
     tile_ranges::tile_ranges(&isects, grid.tile_count(), &mut ranges);
 
@@ -318,7 +323,7 @@ fn rasterize_twin() {
             let id = (tile_y * view.tiles_x() + tile_x) as usize;
             let tile = Tile { x: tile_x * 16, y: tile_y * 16, width: 16, height: 16 };
             rasterize_tile(
-                &shaded,
+                &projected.footprints,
                 &isects[ranges[id] as usize..ranges[id + 1] as usize],
                 tile,
                 request.background,
@@ -328,7 +333,7 @@ fn rasterize_twin() {
             );
         }
     }
-    let rows: Vec<_> = shaded.iter().map(|f| to_row(f, 1)).collect();
+    let rows: Vec<_> = projected.footprints.iter().map(|f| to_row(f, 1)).collect();
     let ids: Vec<u32> = isects.iter().map(|&pair| radix_sort::value(pair)).collect();
     let got = gpu.rasterize(&view, request.background, &rows, &ids, &ranges).expect("pictures");
     let want = Frame {

@@ -4,20 +4,22 @@
 use rayon::prelude::*;
 
 use super::{
-    project::Footprint,
-    radix_sort::pack,
-    tiles::{Grid, touched_tiles},
+    project::Projected,
+    radix_sort::{pack, value},
+    tiles::Grid,
 };
 
 /// Gaussians a task.
 const CHUNK: usize = 1024;
 
-/// Writes the pairs of `shaded[i]` to `isects[isect_offsets[i]..isect_offsets[i + 1]]`.
+/// Writes the pairs of the Gaussian at place i of the depth order to
+/// `isects[isect_offsets[i]..isect_offsets[i + 1]]`.
 ///
-/// Keys are tile ids counted from the first tile of the band; values index `shaded`. The caller
-/// has checked that the total fits [`crate::render::constants::ISECTS_MAX`].
+/// Keys are tile ids counted from the first tile of the band; values are indices of Gaussians. The
+/// caller has checked that the total fits [`crate::render::constants::ISECTS_MAX`].
 pub fn emit_isects(
-    shaded: &[Footprint],
+    projected: &Projected,
+    sorted: &[u64],
     grid: &Grid,
     isect_offsets: &[u64],
     isects: &mut Vec<u64>,
@@ -25,22 +27,25 @@ pub fn emit_isects(
     let total = isect_offsets.last().copied().unwrap_or(0) as usize;
     isects.resize(total, 0);
     // Disjoint slices, one a task, cut where the offsets say.
-    let mut tasks = Vec::with_capacity(shaded.len().div_ceil(CHUNK));
+    let mut tasks = Vec::with_capacity(sorted.len().div_ceil(CHUNK));
     let mut rest = isects.as_mut_slice();
-    for (chunk, footprints) in shaded.chunks(CHUNK).enumerate() {
+    for (chunk, sorted) in sorted.chunks(CHUNK).enumerate() {
         let first = chunk * CHUNK;
-        let size = isect_offsets[first + footprints.len()] - isect_offsets[first];
+        let size = isect_offsets[first + sorted.len()] - isect_offsets[first];
         let (slice, tail) = rest.split_at_mut(size as usize);
-        tasks.push((first, footprints, slice));
+        tasks.push((sorted, slice));
         rest = tail;
     }
-    tasks.into_par_iter().for_each(|(first, footprints, slice)| {
+    tasks.into_par_iter().for_each(|(sorted, slice)| {
         let mut slots = slice.iter_mut();
-        for (i, footprint) in footprints.iter().enumerate() {
-            touched_tiles(footprint, grid, |tile_y, tiles| {
+        for &pair in sorted {
+            let id = value(pair);
+            let spans = projected.tile_spans[id as usize];
+            let footprint = &projected.footprints[id as usize];
+            spans.replay(footprint, grid, |tile_y, tiles| {
                 let row = (tile_y - grid.tile_rows.start) * grid.tiles_x();
                 for (tile_x, slot) in tiles.zip(&mut slots) {
-                    *slot = pack(row + tile_x, (first + i) as u32);
+                    *slot = pack(row + tile_x, id);
                 }
             });
         }

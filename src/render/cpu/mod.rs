@@ -22,10 +22,10 @@ use std::{
 use rayon::prelude::*;
 
 use self::{
-    project::Footprint,
+    project::Projected,
     radix_sort::{key, pack, value},
     rasterize::{RowOut, Tile, TileScratch},
-    tiles::{Grid, count_tiles},
+    tiles::Grid,
 };
 use super::{
     Frame, FrameStats, RenderRequest, Renderer,
@@ -87,19 +87,20 @@ impl CpuRenderer {
         let view = View::new(gaussians.origin(), request)?;
         let mut frame = blank(&view, request);
         let mut scratch = self.frames.take();
-        let FrameScratch { footprints, tiles_per_gauss, sorted, spare, shaded, .. } = &mut scratch;
-        project::project(gaussians, &view, request.antialiased, footprints, tiles_per_gauss);
+        let FrameScratch { projected, sorted, spare, .. } = &mut scratch;
+        project::project(gaussians, &view, request.antialiased, projected);
+        let visible = (0_u32..).zip(&projected.tiles_per_gauss).filter(|&(_, &tiles)| tiles > 0);
         sorted.clear();
-        sorted.extend((0_u32..).zip(tiles_per_gauss.iter()).filter(|&(_, &tiles)| tiles > 0).map(
-            // t.z is over 0, so its bits are in the order of its value.
-            |(i, _)| pack(footprints[i as usize].depth.to_bits(), i),
-        ));
+        // t.z is over 0, so its bits are in the order of its value.
+        sorted.extend(
+            visible.map(|(i, _)| pack(projected.footprints[i as usize].depth.to_bits(), i)),
+        );
         radix_sort::radix_sort(sorted, spare, u32::BITS);
-        shade::shade(gaussians, &view, footprints, sorted, shaded);
+        shade::shade(gaussians, &view, projected);
         frame.stats.visible = sorted.len() as u64;
         let grid = Grid { width: view.width, height: view.height, tile_rows: 0..view.tiles_y() };
         self.draw_band(&grid, request, &mut scratch, &mut frame)?;
-        if scratch.footprints.len() <= KEPT_GAUSSIANS_MAX {
+        if gaussians.len() <= KEPT_GAUSSIANS_MAX {
             self.frames.give(scratch);
         }
         Ok(frame)
@@ -113,14 +114,16 @@ impl CpuRenderer {
         scratch: &mut FrameScratch,
         frame: &mut Frame,
     ) -> Result<()> {
-        let FrameScratch { tiles_per_gauss, sorted, spare, shaded, isect_offsets, .. } = scratch;
+        let FrameScratch { projected, sorted, spare, isect_offsets, .. } = scratch;
         let whole = grid.tile_rows == (0..grid.height.div_ceil(TILE_SIZE));
-        let total = if whole {
-            let counts = sorted.iter().map(|&pair| tiles_per_gauss[value(pair) as usize]);
-            prefix_sum::prefix_sum(counts, isect_offsets)
-        } else {
-            prefix_sum::prefix_sum(shaded.iter().map(|f| count_tiles(f, grid)), isect_offsets)
-        };
+        let counts = sorted.iter().map(|&pair| {
+            let id = value(pair) as usize;
+            match whole {
+                true => projected.tiles_per_gauss[id],
+                false => projected.tile_spans[id].count(&projected.footprints[id], grid),
+            }
+        });
+        let total = prefix_sum::prefix_sum(counts, isect_offsets);
         let Range { start, end } = grid.tile_rows;
         if total > self.isects_max {
             if end - start == 1 {
@@ -137,7 +140,7 @@ impl CpuRenderer {
             return Ok(());
         }
         frame.stats.intersections += total;
-        emit_isects::emit_isects(shaded, grid, isect_offsets, &mut scratch.isects);
+        emit_isects::emit_isects(projected, sorted, grid, isect_offsets, &mut scratch.isects);
         let tile_bits = u32::BITS - (grid.tile_count() - 1).leading_zeros();
         radix_sort::radix_sort(&mut scratch.isects, spare, tile_bits);
         tile_ranges::tile_ranges(&scratch.isects, grid.tile_count(), &mut scratch.ranges);
@@ -171,7 +174,7 @@ impl CpuRenderer {
                 let isects = &scratch.isects[range];
                 debug_assert!(isects.iter().all(|&isect| key(isect) as usize == id));
                 rasterize::rasterize_tile(
-                    &scratch.shaded,
+                    &scratch.projected.footprints,
                     isects,
                     tile,
                     request.background,
@@ -198,11 +201,9 @@ impl Renderer for CpuRenderer {
 /// Buffers of a frame, named as the stages name them.
 #[derive(Debug, Default)]
 struct FrameScratch {
-    footprints: Vec<Footprint>,
-    tiles_per_gauss: Vec<u32>,
+    projected: Projected,
     sorted: Vec<u64>,
     spare: Vec<u64>,
-    shaded: Vec<Footprint>,
     isect_offsets: Vec<u64>,
     isects: Vec<u64>,
     ranges: Vec<u32>,

@@ -6,7 +6,7 @@
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 
-use super::tiles::{Grid, count_tiles};
+use super::tiles::{Grid, TileSpans};
 use crate::{
     render::{
         constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK},
@@ -43,45 +43,49 @@ pub struct Footprint {
     pub color: [f32; 3],
 }
 
-impl Footprint {
-    /// √reach, and half-width and half-height in pixels of the box around the footprint.
+/// What the stage gives, `[N]` each.
+#[derive(Debug, Default)]
+pub struct Projected {
+    /// Footprints; meaningless where dropped.
+    pub footprints: Vec<Footprint>,
+    /// Tiles touched, for the emission; meaningless where dropped.
+    pub tile_spans: Vec<TileSpans>,
+    /// Tiles touched; 0 where dropped.
+    pub tiles_per_gauss: Vec<u32>,
+}
+
+impl Projected {
+    /// Footprints from elsewhere, with the tiles that they touch.
     #[must_use]
-    pub fn extent(&self) -> (f64, f64, f64) {
-        let root = f64::from(self.reach).sqrt();
-        let tall = root / f64::from(self.inv_sy);
-        let across = root / f64::from(self.inv_sx);
-        let wide = (across * across + self.slope * self.slope * tall * tall).sqrt();
-        (root, wide, tall)
+    pub fn of(footprints: Vec<Footprint>, grid: &Grid) -> Self {
+        let touched = footprints.iter().map(|footprint| TileSpans::of(footprint, grid));
+        let (tile_spans, tiles_per_gauss) = touched.unzip();
+        Self { footprints, tile_spans, tiles_per_gauss }
     }
 }
 
 /// Projects every Gaussian; `tiles_per_gauss[i]` is 0 for one that is dropped.
-pub fn project(
-    gaussians: &Gaussians,
-    view: &View,
-    antialiased: bool,
-    footprints: &mut Vec<Footprint>,
-    tiles_per_gauss: &mut Vec<u32>,
-) {
+pub fn project(gaussians: &Gaussians, view: &View, antialiased: bool, projected: &mut Projected) {
     let count = gaussians.len();
+    let Projected { footprints, tile_spans, tiles_per_gauss } = projected;
     footprints.resize(count, Footprint::default());
+    tile_spans.resize(count, TileSpans::default());
     tiles_per_gauss.resize(count, 0);
     let grid = Grid { width: view.width, height: view.height, tile_rows: 0..view.tiles_y() };
-    footprints
+    let chunks = footprints
         .par_chunks_mut(CHUNK)
-        .zip(tiles_per_gauss.par_chunks_mut(CHUNK))
-        .enumerate()
-        .for_each(|(chunk, (footprints, tiles))| {
-            for (i, (footprint, tiles)) in footprints.iter_mut().zip(tiles).enumerate() {
-                *tiles = match project_one(gaussians, chunk * CHUNK + i, view, antialiased) {
-                    Some(projected) => {
-                        *footprint = projected;
-                        count_tiles(&projected, &grid)
-                    }
-                    None => 0,
-                };
+        .zip(tile_spans.par_chunks_mut(CHUNK))
+        .zip(tiles_per_gauss.par_chunks_mut(CHUNK));
+    chunks.enumerate().for_each(|(chunk, ((footprints, spans), tiles))| {
+        let out = footprints.iter_mut().zip(spans).zip(tiles);
+        for (i, ((footprint, spans), tiles)) in out.enumerate() {
+            *tiles = 0;
+            if let Some(seen) = project_one(gaussians, chunk * CHUNK + i, view, antialiased) {
+                *footprint = seen;
+                (*spans, *tiles) = TileSpans::of(&seen, &grid);
             }
-        });
+        }
+    });
 }
 
 /// EWA projection of Gaussian `i`; `None` when it cannot be seen.

@@ -109,7 +109,7 @@ pub struct Tile {
 ///
 /// `picture_width` is the stride of `out`, which starts at the tile's first row.
 pub fn rasterize_tile(
-    shaded: &[Footprint],
+    footprints: &[Footprint],
     isects: &[u64],
     tile: Tile,
     background: [f32; 3],
@@ -122,23 +122,23 @@ pub fn rasterize_tile(
         #[expect(unsafe_code, reason = "a call into code compiled for AVX2")]
         // SAFETY: the processor has AVX2, which was asked the line above.
         unsafe {
-            blend_avx2(shaded, isects, tile, scratch);
+            blend_avx2(footprints, isects, tile, scratch);
         }
         return store(tile, background, picture_width, scratch, out);
     }
-    blend(shaded, isects, tile, scratch);
+    blend(footprints, isects, tile, scratch);
     store(tile, background, picture_width, scratch, out);
 }
 
 /// [`blend`], compiled for 256-bit registers. No operation is fused, so the bits are the same.
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn blend_avx2(shaded: &[Footprint], isects: &[u64], tile: Tile, scratch: &mut TileScratch) {
-    blend(shaded, isects, tile, scratch);
+fn blend_avx2(footprints: &[Footprint], isects: &[u64], tile: Tile, scratch: &mut TileScratch) {
+    blend(footprints, isects, tile, scratch);
 }
 
 #[inline(always)]
-fn blend(shaded: &[Footprint], isects: &[u64], tile: Tile, scratch: &mut TileScratch) {
+fn blend(footprints: &[Footprint], isects: &[u64], tile: Tile, scratch: &mut TileScratch) {
     scratch.cells.fill(Cell::CLEAR);
     // One bit a cell: set while some ray in it goes on.
     let mut open = 0_u32;
@@ -150,7 +150,7 @@ fn blend(shaded: &[Footprint], isects: &[u64], tile: Tile, scratch: &mut TileScr
     for batch in isects.chunks(BATCH_SIZE) {
         scratch.counts.fill(0);
         for (slot, &isect) in batch.iter().enumerate() {
-            let footprint = &shaded[radix_sort::value(isect) as usize];
+            let footprint = &footprints[radix_sort::value(isect) as usize];
             scratch.staged[slot] = Staged {
                 inv_sx: footprint.inv_sx,
                 opacity: footprint.opacity,

@@ -1,11 +1,11 @@
 //! Stage 4: colour of each visible Gaussian as seen from the camera. Partner: `shaders/shade.wgsl`
 //!
-//! In: spherical harmonics and the depth order. Out: footprints with colour, in depth order.
+//! In: spherical harmonics `[N, K, 3]`. Out: the colour of each footprint that touches a tile.
 
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::{project::Footprint, radix_sort};
+use super::project::Projected;
 use crate::{
     render::{
         constants::{SH_C0, SH_C1, SH_C2, SH_C3, SH_OFFSET},
@@ -17,31 +17,33 @@ use crate::{
 /// Gaussians a task.
 const CHUNK: usize = 1024;
 
-/// Gathers the visible footprints in the order of `sorted` and gives each its colour.
-pub fn shade(
-    gaussians: &Gaussians,
-    view: &View,
-    footprints: &[Footprint],
-    sorted: &[u64],
-    shaded: &mut Vec<Footprint>,
-) {
-    shaded.resize(sorted.len(), Footprint::default());
+/// Fills in the colour of every visible footprint, in place: neighbours stay neighbours, which the
+/// rasteriser's cache needs more than depth order.
+pub fn shade(gaussians: &Gaussians, view: &View, projected: &mut Projected) {
     let coefficients = gaussians.sh_count();
-    shaded.par_chunks_mut(CHUNK).zip(sorted.par_chunks(CHUNK)).for_each(|(shaded, sorted)| {
-        for (out, &pair) in shaded.iter_mut().zip(sorted) {
-            let i = radix_sort::value(pair) as usize;
-            let sh = &gaussians.sh()[i * coefficients..(i + 1) * coefficients];
-            let toward = DVec3::from(gaussians.means()[i].map(f64::from)) - view.center;
-            *out = footprints[i];
-            out.color = color(sh, toward);
-        }
-    });
+    let chunks = projected.footprints.par_chunks_mut(CHUNK);
+    chunks.zip(projected.tiles_per_gauss.par_chunks(CHUNK)).enumerate().for_each(
+        |(chunk, (footprints, tiles))| {
+            for (k, (footprint, &tiles)) in footprints.iter_mut().zip(tiles).enumerate() {
+                if tiles > 0 {
+                    let i = chunk * CHUNK + k;
+                    let sh = &gaussians.sh()[i * coefficients..(i + 1) * coefficients];
+                    let mean = DVec3::from(gaussians.means()[i].map(f64::from));
+                    footprint.color = color(sh, mean - view.center);
+                }
+            }
+        },
+    );
 }
 
 /// Colour of harmonics `sh` (`[K, 3]`, 3DGS basis and order) seen along `toward` (any length).
 #[must_use]
 pub fn color(sh: &[[f32; 3]], toward: DVec3) -> [f32; 3] {
-    let basis = basis(toward.normalize_or_zero().as_vec3().into());
+    // Degree 0 is the same from everywhere.
+    let basis = match sh.len() {
+        1 => basis([0.0; 3]),
+        _ => basis(toward.normalize_or_zero().as_vec3().into()),
+    };
     let mut color = [SH_OFFSET; 3];
     for (coefficient, weight) in sh.iter().zip(basis) {
         for channel in 0..3 {
@@ -52,6 +54,7 @@ pub fn color(sh: &[[f32; 3]], toward: DVec3) -> [f32; 3] {
 }
 
 /// The 16 basis functions up to degree 3 at a unit direction, signs of 3DGS included.
+#[inline]
 fn basis([x, y, z]: [f32; 3]) -> [f32; 16] {
     let (xx, yy, zz) = (x * x, y * y, z * z);
     [
