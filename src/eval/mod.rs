@@ -13,7 +13,7 @@ mod warp;
 
 use std::{
     path::{Path, PathBuf},
-    sync::atomic::AtomicBool,
+    sync::atomic::{AtomicBool, AtomicUsize, Ordering},
     time::Instant,
 };
 
@@ -77,28 +77,17 @@ pub fn run(
     let config = Config { jobs: at_once, ..config.clone() };
     let engine = Engine::open(&config)?;
     let renderer = CpuRenderer::new((config.threads / at_once).max(1))?;
-    let outer = rayon::ThreadPoolBuilder::new()
-        .num_threads(at_once)
-        .build()
-        .map_err(|e| Error::internal("eval: no worker threads").caused_by(e))?;
     let mut scenes = Vec::new();
     for dir in scene_dirs(&options.dir, &options.scenes)? {
         let name = dir.file_name().unwrap_or_default().to_string_lossy().into_owned();
         let squares = squares(&dir, &config.limits)?;
         let cameras: Vec<Camera> = squares.iter().map(|p| p.camera).collect();
         let chosen: Vec<Triple> = triples(&cameras).into_iter().step_by(options.every).collect();
-        let judged: Vec<Judged> = outer.install(|| {
-            chosen
-                .par_iter()
-                .map(|triple| {
-                    judge(&engine, &renderer, &squares, triple, options.photos).map_err(|e| {
-                        Error::new(
-                            e.code(),
-                            format!("{name}, target {}: {}", squares[triple.target].file, e),
-                        )
-                    })
-                })
-                .collect::<Result<_>>()
+        let judged = each(&chosen, at_once, |triple| {
+            judge(&engine, &renderer, &squares, triple, options.photos).map_err(|e| {
+                let target = &squares[triple.target].file;
+                Error::new(e.code(), format!("{name}, target {target}: {e}")).caused_by(e)
+            })
         })?;
         if let Some(out) = &options.pictures {
             pictures::write(out, &name, &squares, &judged)?;
@@ -113,6 +102,38 @@ pub fn run(
         engine.geometry().provider().name(),
         &renderer.name(),
     ))
+}
+
+/// `work` of each item, `at_once` at a time, in the items' order.
+///
+/// Threads of its own: a rayon worker that waits for another pool takes up the next item, and
+/// then one item's time would hold another's.
+fn each<T: Sync, U: Send>(
+    items: &[T],
+    at_once: usize,
+    work: impl Fn(&T) -> Result<U> + Sync,
+) -> Result<Vec<U>> {
+    let next = AtomicUsize::new(0);
+    let found = std::thread::scope(|scope| -> Result<Vec<(usize, U)>> {
+        let one = || -> Result<Vec<(usize, U)>> {
+            let mut mine = Vec::new();
+            while let Some((i, item)) =
+                Some(next.fetch_add(1, Ordering::Relaxed)).and_then(|i| Some((i, items.get(i)?)))
+            {
+                mine.push((i, work(item)?));
+            }
+            Ok(mine)
+        };
+        let workers: Vec<_> = (0..at_once).map(|_| scope.spawn(one)).collect();
+        let mut all = Vec::new();
+        for worker in workers {
+            all.extend(worker.join().map_err(|_| Error::internal("eval: a worker panicked"))??);
+        }
+        Ok(all)
+    });
+    let mut found = found?;
+    found.sort_by_key(|(i, _)| *i);
+    Ok(found.into_iter().map(|(_, made)| made).collect())
 }
 
 /// One triple, judged, with what the picture grid shows.

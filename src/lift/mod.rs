@@ -22,6 +22,8 @@ use crate::{
     scene::{Camera, DropCount, Gaussians, RawGaussians, SourcePixel, ViewGaussians},
 };
 
+pub use fuse::FuseOptions;
+
 /// How far beyond the searched depths a Gaussian may lie: less than half of the nearest or more
 /// than twice the farthest was not measured.
 const DEPTH_SLACK: f64 = 2.0;
@@ -43,7 +45,11 @@ pub struct Lifted {
 ///
 /// # Errors
 /// `internal` when arrays disagree in length or views in SH degree.
-pub fn lift(views: Vec<ViewGaussians>, cameras: &[Camera]) -> Result<Lifted> {
+pub fn lift(
+    views: Vec<ViewGaussians>,
+    cameras: &[Camera],
+    options: &FuseOptions,
+) -> Result<Lifted> {
     let degree = views.first().map_or(0, |view| view.sh_degree);
     for view in &views {
         check_lengths(view, degree)?;
@@ -52,11 +58,10 @@ pub fn lift(views: Vec<ViewGaussians>, cameras: &[Camera]) -> Result<Lifted> {
     let views = best_of_each_photo(views, &mut counts);
     let candidate: Vec<Vec<bool>> =
         views.iter().map(|view| candidates(view, &mut counts)).collect();
-    let fates = fuse(&views, &candidate);
+    let fates = fuse(&views, &candidate, options);
     for fate in fates.iter().flatten() {
         match fate {
             Fate::Duplicate => counts.add("duplicate", 1),
-            Fate::Contradicted => counts.add("contradicted", 1),
             Fate::Keep | Fate::Absent => {}
         }
     }

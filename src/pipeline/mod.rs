@@ -205,7 +205,10 @@ fn finish(
         Ok(views)
     })?;
     let (lifted, backdrop) = run.stage(Stage::Lift, |_| {
-        engine.workers.install(|| Ok((lift::lift(views, &cameras)?, lift::backdrop(photos))))
+        engine.workers.install(|| {
+            let lifted = lift::lift(views, &cameras, &lift::FuseOptions::default())?;
+            Ok((lifted, lift::backdrop(photos)))
+        })
     })?;
 
     let named = photos.iter().zip(cameras);
