@@ -88,6 +88,12 @@ fn overlap_falls_with_distance_and_sets_follow_it() {
     assert!(capture.overlap[0][1] > 0.8, "{}", capture.overlap[0][1]);
     assert!(capture.overlap[0][8] < capture.overlap[0][1]);
     let sets = capture::view_sets(&capture, &posed, 4, 3);
+    let shared = |a: &[usize], b: &[usize]| a.iter().filter(|v| b.contains(v)).count();
+    for pair in sets.windows(2) {
+        let earlier = sets.iter().take_while(|s| *s != &pair[1]);
+        let most = earlier.map(|s| shared(&s.views, &pair[1].views)).max();
+        assert!(most >= Some(1), "a later set shares views with an earlier one: {sets:?}");
+    }
     let mut seen = [0; 9];
     for set in &sets {
         assert!((2..=4).contains(&set.views.len()), "{set:?}");
@@ -133,8 +139,10 @@ fn invalid_pixels_are_never_matched() {
             for x in (0..w).filter(|&x| x < 24 || y < 24 || x + 24 >= w || y + 24 >= h) {
                 let i = y * w + x;
                 valid[i] = false;
-                let v = if (x / 5 + y / 5) % 2 == 0 { 255 } else { 0 };
-                p.photo.rgb[3 * i..3 * i + 3].fill(v);
+                // Blocks without a rhythm: a rhythm would be refused for its rivals.
+                let block =
+                    ((x / 4) as u32 * 73 + (y / 4) as u32 * 151).wrapping_mul(2_654_435_761);
+                p.photo.rgb[3 * i..3 * i + 3].fill((block >> 24) as u8);
             }
         }
         p.photo.valid = Some(valid);
