@@ -88,7 +88,7 @@ fn poisoned_gaussians_never_make_a_bad_pixel() {
             camera.intrinsics.cx = f64::from(random.range(-1e4, 1e4));
         }
         let near = [1e-30, 0.01, 1.0, 1e30][random.bits() as usize % 4];
-        let antialiased = random.bits() % 2 == 0;
+        let antialiased = random.bits().is_multiple_of(2);
         let request = RenderRequest { near, antialiased, ..request(camera) };
         assert_clean(&cpu.render(&gaussians, &request).expect(&what), &what);
     }
