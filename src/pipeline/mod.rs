@@ -222,6 +222,7 @@ fn finish(
         depth_range: depth_range(&capture),
         median_depth: lifted.median_depth,
         overlap: mean_best_overlap(&capture),
+        network_focal_px: lifted.focal_px,
         stages: run.times,
         execution_provider: engine.geometry.provider().name().to_owned(),
         warnings: capture.warnings,

@@ -180,6 +180,23 @@ impl Gaussians {
         Ok(Self { raw, identity: NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed) })
     }
 
+    /// The same Gaussians with other scales, `[N, 3]`, clamped into range.
+    ///
+    /// # Panics
+    /// When the number of scales is another: a bug of the caller.
+    #[must_use]
+    pub fn with_scales(&self, mut scales: Vec<[f32; 3]>) -> Self {
+        assert_eq!(scales.len(), self.len(), "one scale a Gaussian; this is a bug");
+        for scale in scales.iter_mut().flatten() {
+            // NaN becomes the smallest: `clamp` would keep it.
+            *scale = scale.max(Self::SCALE_MIN).min(Self::SCALE_MAX);
+        }
+        Self {
+            raw: RawGaussians { scales, ..self.raw.clone() },
+            identity: NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed),
+        }
+    }
+
     /// Number that no other content of this process has; clones share it, for they cannot change.
     ///
     /// A renderer keeps what it uploaded under this number.

@@ -78,7 +78,9 @@ impl Resolved {
         scene_tag: &str,
     ) -> Result<Vec<RenderedView>> {
         let started = Instant::now();
-        let mut frame = renderer.render(&scene.gaussians, &self.request())?;
+        let magnified = scene.magnified(&self.camera);
+        let gaussians = magnified.as_ref().unwrap_or(&scene.gaussians);
+        let mut frame = renderer.render(gaussians, &self.request())?;
         if self.wants_backdrop()
             && let (Some(color), Some(alpha)) = (&mut frame.color, &frame.alpha)
         {

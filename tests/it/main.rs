@@ -16,6 +16,7 @@ mod fuzz;
 mod grpc;
 mod http;
 mod jobs;
+mod magnify;
 mod oracle;
 mod photos;
 mod props;

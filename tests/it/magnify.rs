@@ -1,0 +1,92 @@
+//! Views larger than the network's own pictures: no dot grid, and no change at its own size.
+
+use segsplat::{
+    render::{Kinds, RenderRequest, Renderer, constants, cpu::CpuRenderer},
+    scene::{
+        Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, LEARNT_BLUR_PX2,
+        Provenance, RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
+    },
+};
+
+const SIDE: u16 = 48;
+
+/// A camera at the origin, `zoom` times larger than the network's picture.
+fn camera(zoom: u32) -> Camera {
+    let side = f64::from(SIDE) * f64::from(zoom);
+    Camera {
+        intrinsics: Intrinsics {
+            fx: side,
+            fy: side,
+            cx: side / 2.0,
+            cy: side / 2.0,
+            width: u32::from(SIDE) * zoom,
+            height: u32::from(SIDE) * zoom,
+        },
+        camera_to_world: CameraToWorld::from_row_major(
+            &[1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1.],
+            "test",
+        )
+        .expect("the identity is a pose"),
+    }
+}
+
+/// A wall at depth 4 as a network makes it: one small Gaussian a pixel.
+fn wall() -> Scene {
+    let mut raw = RawGaussians::default();
+    let own = camera(1).intrinsics;
+    for i in 0..SIDE * SIDE {
+        let (x, y) = (i % SIDE, i / SIDE);
+        let mean = own.unproject(f64::from(x) + 0.5, f64::from(y) + 0.5, 4.0);
+        raw.means.push(mean.to_array().map(|v| v as f32));
+        raw.quats.push([1.0, 0.0, 0.0, 0.0]);
+        raw.scales.push([0.3 * 4.0 / f32::from(SIDE); 3]);
+        raw.opacities.push(0.9);
+        raw.sh.push([1.0, 0.5, 0.0]);
+        raw.semantic_index.push(0);
+        raw.source.push(SourcePixel { view: 0, x, y });
+    }
+    let report = HealthReport { network_focal_px: vec![own.fx], ..HealthReport::default() };
+    let meta = SceneMeta {
+        id: SceneId::from_bytes([1; 16]),
+        created_ms: 0,
+        cameras: vec![SceneCamera { file: "a.png".to_owned(), camera: camera(1) }],
+        report,
+        provenance: Provenance::default(),
+    };
+    let gaussians = Gaussians::sanitize(raw).expect("equal lengths").0;
+    Scene { meta, gaussians, backdrop: Backdrop::default() }
+}
+
+/// Smallest and largest alpha away from the picture's border.
+fn alpha_range(gaussians: &Gaussians, camera: Camera) -> [f32; 2] {
+    let kinds = Kinds { color: false, depth: false, alpha: true };
+    let request =
+        RenderRequest { camera, kinds, background: [0.0; 3], antialiased: false, near: 0.01 };
+    let frame = CpuRenderer::new(1).and_then(|cpu| cpu.render(gaussians, &request));
+    let frame = frame.expect("a wall renders");
+    let (width, alpha) = (frame.width as usize, frame.alpha.expect("alpha was asked for"));
+    let inner = width / 4..3 * width / 4;
+    let rows = inner.clone().flat_map(|y| inner.clone().map(move |x| y * width + x));
+    rows.fold([1.0_f32, 0.0], |[lo, hi], i| [lo.min(alpha[i]), hi.max(alpha[i])])
+}
+
+#[test]
+fn the_blur_given_back_is_the_renderers() {
+    assert_eq!(LEARNT_BLUR_PX2.to_bits(), constants::BLUR_PX2.to_bits());
+}
+
+#[test]
+fn the_networks_own_size_is_left_alone() {
+    assert!(wall().magnified(&camera(1)).is_none());
+}
+
+#[test]
+fn a_magnified_wall_has_no_dot_grid() {
+    let scene = wall();
+    let [own, _] = alpha_range(&scene.gaussians, camera(1));
+    let [gap, _] = alpha_range(&scene.gaussians, camera(4));
+    let magnified = scene.magnified(&camera(4)).expect("four times larger is magnified");
+    let [filled, _] = alpha_range(&magnified, camera(4));
+    assert!(gap < 0.5 * own, "without it the wall has gaps: {gap} against {own}");
+    assert!(filled > 0.85 * own, "with it the wall is whole: {filled} against {own}");
+}
