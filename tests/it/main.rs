@@ -13,6 +13,7 @@ mod cli;
 mod common;
 mod errors;
 mod fuzz;
+mod geometry;
 mod grpc;
 mod http;
 mod jobs;
