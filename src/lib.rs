@@ -16,7 +16,7 @@
 //! | L3 | [`jobs`] | `pipeline`, `store` |
 //! | L4 | [`service`] | `jobs`, `store`, `render`, `models` |
 //! | L5 | [`api`] | `service`; the only place that knows HTTP and gRPC |
-//! | L6 | `main`, [`cli`], [`eval`], [`bench`] | everything |
+//! | L6 | `main`, [`cli`], [`eval`], [`bench`](mod@bench) | everything |
 //!
 //! `tests/it/tidy.rs` reads the `use crate::…` lines and holds the code to this table.
 //! Frames, units and orders: `docs/conventions.md`. Why things are as they are: `docs/adr/`.
