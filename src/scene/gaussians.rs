@@ -185,10 +185,10 @@ impl Gaussians {
     /// # Panics
     /// When the number of scales is another: a bug of the caller.
     #[must_use]
+    #[expect(clippy::manual_clamp, reason = "`clamp` would keep a NaN; this makes it the smallest")]
     pub fn with_scales(&self, mut scales: Vec<[f32; 3]>) -> Self {
         assert_eq!(scales.len(), self.len(), "one scale a Gaussian; this is a bug");
         for scale in scales.iter_mut().flatten() {
-            // NaN becomes the smallest: `clamp` would keep it.
             *scale = scale.max(Self::SCALE_MIN).min(Self::SCALE_MAX);
         }
         Self {
