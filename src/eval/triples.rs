@@ -102,7 +102,12 @@ mod tests {
         let lens = Intrinsics { fx: 9., fy: 9., cx: 4., cy: 4., width: 8, height: 8 };
         (0..count)
             .map(|i| {
-                let eye = DVec3::new(i as f64 * step, 0.0, 0.0);
+                // Uneven steps: no target is as near to a middle as another.
+                let eye = DVec3::new(
+                    (i as f64 + 0.01 * (i * i) as f64 - 0.01 * i as f64) * step,
+                    0.0,
+                    0.0,
+                );
                 let pose = CameraToWorld::look_at(eye, eye + DVec3::Z, DVec3::NEG_Y, "t").unwrap();
                 Camera { intrinsics: lens, camera_to_world: pose }
             })

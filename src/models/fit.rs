@@ -175,8 +175,10 @@ mod tests {
                 let (u, v) = camera.intrinsics.project(point);
                 let at = ((y * fitted.camera.intrinsics.width + x) * 3) as usize;
                 let (red, green) = (fitted.rgb[at] * 255.0, fitted.rgb[at + 1] * 255.0);
-                assert!((f64::from(red) - (u - 0.5)).abs() < 1e-3, "{bucket:?} {red} {u}");
-                assert!((f64::from(green) - (v - 0.5)).abs() < 1e-3, "{bucket:?} {green} {v}");
+                // A reduction's weights are sampled at whole pixels, so a ramp comes back to a few
+                // hundredths; a half-pixel mistake is ten times that.
+                assert!((f64::from(red) - (u - 0.5)).abs() < 0.05, "{bucket:?} {red} {u}");
+                assert!((f64::from(green) - (v - 0.5)).abs() < 0.05, "{bucket:?} {green} {v}");
             }
             let back = fitted.camera.intrinsics.project(DVec3::new(0.2, 0.1, 1.0));
             assert!(back.0.is_finite(), "finite");
@@ -237,7 +239,7 @@ mod tests {
         assert_eq!(bucket_for(&[size(640, 480)], &buckets), Some([256, 352]));
         assert_eq!(bucket_for(&[size(360, 640)], &buckets), Some([352, 256]));
         assert_eq!(bucket_for(&[size(1920, 1080)], &buckets), Some([224, 384]));
-        let mixed = [size(640, 480), size(480, 640)];
-        assert_eq!(bucket_for(&mixed, &buckets), Some([256, 256]), "mixed orientations");
+        let mixed = [size(640, 480), size(480, 640), size(480, 640)];
+        assert_eq!(bucket_for(&mixed, &buckets), Some([352, 256]), "as most photos stand");
     }
 }
