@@ -72,6 +72,7 @@ fn report(report: HealthReport) -> pb::HealthReport {
         depth_far,
         median_depth: report.median_depth,
         overlap: report.overlap,
+        network_focal_px: report.network_focal_px,
         stages: report.stages.into_iter().map(stage).collect(),
         execution_provider: report.execution_provider,
         warnings: report.warnings.into_iter().map(warning).collect(),

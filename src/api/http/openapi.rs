@@ -264,6 +264,8 @@ pub(super) struct HealthReport {
     median_depth: f64,
     /// Mean share of a view's matchable pixels found in its best partner, 0..1.
     overlap: f64,
+    /// Focal length of each photo in the network's picture of it, pixels; 0 where it was not used.
+    network_focal_px: Vec<f64>,
     /// Time of each stage.
     stages: Vec<StageTime>,
     /// Execution provider of the geometry network.
