@@ -26,8 +26,8 @@ use crate::{
     models::fit,
     photos,
     pipeline::{Engine, reconstruct},
-    render::{Kinds, RenderRequest, Renderer, cpu::CpuRenderer},
-    scene::{Camera, Photo, PosedPhoto, SceneOptions},
+    render::{Kinds, RenderRequest, Renderer, compose, cpu::CpuRenderer},
+    scene::{Camera, Photo, PosedPhoto, Provenance, Scene, SceneId, SceneMeta, SceneOptions},
 };
 
 pub use metrics::{psnr, ssim};
@@ -163,14 +163,25 @@ fn judge(
     let near = (made.report.median_depth * NEAR_SHARE).max(1e-6) as f32;
     let request = RenderRequest {
         camera: target.camera,
-        kinds: Kinds::ALL,
+        kinds: Kinds { color: true, depth: true, alpha: false },
         background: [0.0; 3],
         antialiased: false,
         near,
     };
-    let frame = renderer.render(&made.gaussians, &request)?;
+    let scene = Scene {
+        meta: SceneMeta {
+            id: SceneId::from_bytes([0; 16]),
+            created_ms: 0,
+            cameras: made.cameras,
+            report: made.report,
+            provenance: Provenance::default(),
+        },
+        gaussians: made.gaussians,
+        backdrop: made.backdrop,
+    };
+    let frame = compose::render_scene(renderer, &scene, &request, true)?;
+    let report = scene.meta.report;
     let mut color = frame.color.unwrap_or_default();
-    made.backdrop.fill(&target.camera, &mut color, &frame.alpha.unwrap_or_default());
     color.iter_mut().flatten().for_each(|v| *v = v.clamp(0.0, 1.0));
     let truth = metrics::to_unit(&target.photo);
     let valid = target.photo.valid.as_deref();
@@ -179,19 +190,19 @@ fn judge(
         &[&squares[triple.pair[0]], &squares[triple.pair[1]]],
         triple.baseline,
     );
-    let report = TripleReport {
+    let judged = TripleReport {
         inputs: inputs.iter().map(|&i| squares[i].file.clone()).collect(),
         target: target.file.clone(),
         baseline: triple.baseline,
         psnr: psnr(&color, &truth, valid),
         ssim: ssim(&color, &truth, SIDE as usize, valid),
         warp_psnr: warp,
-        gaussians: made.report.gaussians,
-        dropped: made.report.dropped,
-        overlap: made.report.overlap,
-        depth_range: made.report.depth_range,
-        warnings: made.report.warnings,
-        stages: made.report.stages,
+        gaussians: report.gaussians,
+        dropped: report.dropped,
+        overlap: report.overlap,
+        depth_range: report.depth_range,
+        warnings: report.warnings,
+        stages: report.stages,
         total_ms: ms,
     };
     Ok(Judged {
@@ -199,7 +210,7 @@ fn judge(
         target: triple.target,
         color,
         depth: frame.depth.unwrap_or_default(),
-        report,
+        report: judged,
     })
 }
 

@@ -180,6 +180,24 @@ impl Gaussians {
         Ok(Self { raw, identity: NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed) })
     }
 
+    /// The Gaussians whose index `keep` takes, in their order.
+    #[must_use]
+    pub fn only(&self, keep: impl Fn(usize) -> bool) -> Self {
+        let (k, all) = (self.sh_count(), &self.raw);
+        let mut raw =
+            RawGaussians { origin: all.origin, sh_degree: all.sh_degree, ..Default::default() };
+        for i in (0..self.len()).filter(|&i| keep(i)) {
+            raw.means.push(all.means[i]);
+            raw.quats.push(all.quats[i]);
+            raw.scales.push(all.scales[i]);
+            raw.opacities.push(all.opacities[i]);
+            raw.sh.extend_from_slice(&all.sh[i * k..(i + 1) * k]);
+            raw.semantic_index.push(all.semantic_index[i]);
+            raw.source.push(all.source[i]);
+        }
+        Self { raw, identity: NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed) }
+    }
+
     /// The same Gaussians with other scales, `[N, 3]`, clamped into range.
     ///
     /// # Panics

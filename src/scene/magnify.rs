@@ -28,9 +28,10 @@ struct Source {
 }
 
 impl Scene {
-    /// The Gaussians for a view that magnifies them, or `None` where they are right as they are.
+    /// Gaussians of this scene for a view that magnifies them, or `None` where they are right as
+    /// they are.
     #[must_use]
-    pub fn magnified(&self, camera: &Camera) -> Option<Gaussians> {
+    pub fn magnified(&self, gaussians: &Gaussians, camera: &Camera) -> Option<Gaussians> {
         let focals = &self.meta.report.network_focal_px;
         let sources: Vec<Source> = self
             .meta
@@ -38,7 +39,7 @@ impl Scene {
             .iter()
             .zip(focals)
             .map(|(input, focal)| Source {
-                center: input.camera.camera_to_world.center() - self.gaussians.origin(),
+                center: input.camera.camera_to_world.center() - gaussians.origin(),
                 axis: input.camera.camera_to_world.axis(),
                 pixel: if *focal > 0.0 { 1.0 / focal } else { 0.0 },
             })
@@ -46,15 +47,14 @@ impl Scene {
         if sources.is_empty() {
             return None;
         }
-        let center = camera.camera_to_world.center() - self.gaussians.origin();
+        let center = camera.camera_to_world.center() - gaussians.origin();
         let axis = camera.camera_to_world.axis();
         let focal = camera.intrinsics.fx.max(camera.intrinsics.fy);
         // Variance to add, for each Gaussian.
-        let added: Vec<f32> = self
-            .gaussians
+        let added: Vec<f32> = gaussians
             .means()
             .par_iter()
-            .zip(self.gaussians.source())
+            .zip(gaussians.source())
             .map(|(mean, source)| {
                 let Some(source) = sources.get(usize::from(source.view)) else { return 0.0 };
                 let mean = DVec3::from_array(mean.map(f64::from));
@@ -73,13 +73,12 @@ impl Scene {
         if (magnified as f64) < SHARE_MIN * added.len() as f64 || magnified == 0 {
             return None;
         }
-        let scales = self
-            .gaussians
+        let scales = gaussians
             .scales()
             .par_iter()
             .zip(&added)
             .map(|(scales, added)| scales.map(|s| (s * s + added).sqrt()))
             .collect();
-        Some(self.gaussians.with_scales(scales))
+        Some(gaussians.with_scales(scales))
     }
 }

@@ -7,6 +7,7 @@ mod capture;
 mod gaussians;
 mod geometry;
 mod id;
+mod layers;
 mod made;
 mod magnify;
 mod photo;

@@ -13,7 +13,7 @@ use super::{
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    render::{Kinds, RenderRequest, Renderer},
+    render::{Kinds, RenderRequest, Renderer, compose},
     scene::{Camera, Scene, SceneCamera, SceneId, SceneState},
     store::Record,
 };
@@ -45,17 +45,12 @@ impl Resolved {
             kinds: Kinds {
                 color: has(Kind::Color),
                 depth: has(Kind::Depth),
-                // What shows of the backdrop is what alpha leaves.
-                alpha: has(Kind::Alpha) || self.wants_backdrop(),
+                alpha: has(Kind::Alpha),
             },
             background: self.background.unwrap_or_default(),
             antialiased: self.antialiased,
             near: self.near,
         }
-    }
-
-    fn wants_backdrop(&self) -> bool {
-        self.background.is_none() && self.kinds.contains(&Kind::Color)
     }
 
     /// Hash of scene, renderer and request for one kind.
@@ -78,14 +73,8 @@ impl Resolved {
         scene_tag: &str,
     ) -> Result<Vec<RenderedView>> {
         let started = Instant::now();
-        let magnified = scene.magnified(&self.camera);
-        let gaussians = magnified.as_ref().unwrap_or(&scene.gaussians);
-        let mut frame = renderer.render(gaussians, &self.request())?;
-        if self.wants_backdrop()
-            && let (Some(color), Some(alpha)) = (&mut frame.color, &frame.alpha)
-        {
-            scene.backdrop.fill(&self.camera, color, alpha);
-        }
+        let frame =
+            compose::render_scene(renderer, scene, &self.request(), self.background.is_none())?;
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
         let name = renderer.name();
         let view = |&kind: &Kind| -> Result<RenderedView> {

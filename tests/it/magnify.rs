@@ -77,7 +77,8 @@ fn the_blur_given_back_is_the_renderers() {
 
 #[test]
 fn the_networks_own_size_is_left_alone() {
-    assert!(wall().magnified(&camera(1)).is_none());
+    let scene = wall();
+    assert!(scene.magnified(&scene.gaussians, &camera(1)).is_none());
 }
 
 #[test]
@@ -85,7 +86,8 @@ fn a_magnified_wall_has_no_dot_grid() {
     let scene = wall();
     let [own, _] = alpha_range(&scene.gaussians, camera(1));
     let [gap, _] = alpha_range(&scene.gaussians, camera(4));
-    let magnified = scene.magnified(&camera(4)).expect("four times larger is magnified");
+    let magnified =
+        scene.magnified(&scene.gaussians, &camera(4)).expect("four times larger is magnified");
     let [filled, _] = alpha_range(&magnified, camera(4));
     assert!(gap < 0.5 * own, "without it the wall has gaps: {gap} against {own}");
     assert!(filled > 0.85 * own, "with it the wall is whole: {filled} against {own}");
