@@ -13,8 +13,8 @@ use crate::scene::ViewGaussians;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FuseOptions {
     /// Photos that may keep Gaussians of one surface. Networks are trained on the union of their
-    /// views, so fewer layers than three show through: measured on 8 triples of fox, red_kitchen
-    /// and coke_can with four photos, one layer loses 11 dB, two lose 2.3, three 0.2.
+    /// views, so fewer layers than three show through: measured on 8 triples of fox, `red_kitchen`
+    /// and `coke_can` with four photos, one layer loses 11 dB, two lose 2.3, three 0.2.
     pub layers: usize,
     /// Relative depth difference under which two Gaussians are one surface.
     pub same_surface: f64,
