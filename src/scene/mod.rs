@@ -12,6 +12,7 @@ mod made;
 mod magnify;
 mod photo;
 mod report;
+mod semantics;
 mod status;
 mod upload;
 
@@ -25,5 +26,8 @@ pub use made::{PhotoHash, Provenance, Scene, SceneMeta};
 pub use magnify::LEARNT_BLUR_PX2;
 pub use photo::{Photo, PosedPhoto};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
+pub use semantics::{
+    Bank, IndexMap, MaskInfo, PhotoMasks, ScoringProfile, Semantics, SemanticsReport,
+};
 pub use status::{Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus};
 pub use upload::{Upload, UploadCameras, UploadFile};

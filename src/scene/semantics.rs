@@ -1,0 +1,125 @@
+//! What a scene means: a small bank of embeddings, and the row of each Gaussian and photo pixel.
+//!
+//! Index 0 is the background and has no row; index m is row m - 1 of the bank.
+
+use serde::{Deserialize, Serialize};
+
+use crate::scene::StageTime;
+
+/// An index for each cell of a grid that is laid over a whole photo; cells need not be square.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct IndexMap {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+    /// `[height * width]`, row-major; 0 = none.
+    pub index: Vec<u16>,
+}
+
+impl IndexMap {
+    /// The index at a place of the photo, `x` and `y` as shares 0..1 of its width and height.
+    #[must_use]
+    pub fn at(&self, x: f64, y: f64) -> u16 {
+        let cell = |share: f64, cells: u32| {
+            let last = f64::from(cells.max(1) - 1);
+            (share * f64::from(cells)).floor().clamp(0.0, last) as usize
+        };
+        let at = cell(y, self.height) * self.width as usize + cell(x, self.width);
+        self.index.get(at).copied().unwrap_or(0)
+    }
+}
+
+/// One mask of a photo, as the mask network saw it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct MaskInfo {
+    /// Share of the photo's cells, 0..1, after every pixel went to one mask.
+    pub area: f64,
+    /// Predicted IoU.
+    pub predicted_iou: f32,
+    /// Stability: IoU of the mask at a stricter and a looser threshold.
+    pub stability: f32,
+    /// Where it was asked for, shares 0..1 of width and height.
+    pub point: [f32; 2],
+}
+
+/// The masks of one photo: at most one a pixel.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PhotoMasks {
+    /// Mask k of `masks` is index k + 1.
+    pub map: IndexMap,
+    /// What the network said of each.
+    pub masks: Vec<MaskInfo>,
+}
+
+/// Rows of the bank.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Bank {
+    /// Numbers a row (D).
+    pub dim: usize,
+    /// `[M * dim]`, row-major.
+    pub rows: Vec<f32>,
+}
+
+impl Bank {
+    /// Number of rows (M).
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.rows.len().checked_div(self.dim).unwrap_or(0)
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+
+    /// Row `m`, counted from 0.
+    #[must_use]
+    pub fn row(&self, m: usize) -> &[f32] {
+        &self.rows[m * self.dim..(m + 1) * self.dim]
+    }
+}
+
+/// How what the paper leaves open is decided.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ScoringProfile {
+    /// Unit centroids, a coverage floor, the bundle's canon and tau.
+    #[default]
+    Default,
+    /// Plain centroids, no coverage floor, the paper's three phrases and tau.
+    Paper,
+}
+
+/// Counts and times of making the semantics.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct SemanticsReport {
+    /// Masks of each photo.
+    pub masks: Vec<u32>,
+    /// Rows of the bank (M).
+    pub bank_size: u32,
+    /// Gaussians that have an index.
+    pub labelled: u64,
+    /// sha256 of the bundle's manifest, hex.
+    pub bundle_sha256: String,
+    /// Scoring profile it was made under.
+    pub profile: ScoringProfile,
+    /// Time of each stage: `masks`, `embed`, `bank`, `assign`.
+    pub stages: Vec<StageTime>,
+    /// Execution provider of the networks.
+    pub execution_provider: String,
+}
+
+/// What a scene means.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Semantics {
+    /// The bank.
+    pub bank: Bank,
+    /// `[N]` bank index of each Gaussian, in the order of the scene's Gaussians.
+    pub index: Vec<u16>,
+    /// Bank index maps of the photos, in the photos' order.
+    pub photos: Vec<IndexMap>,
+    /// How it went.
+    pub report: SemanticsReport,
+}
