@@ -19,7 +19,7 @@ use crate::{
         fuse::{Fate, fuse},
         sh::ShRotation,
     },
-    scene::{Camera, DropCount, Gaussians, RawGaussians, SourcePixel, ViewGaussians},
+    scene::{Camera, DropCount, Gaussians, Intrinsics, RawGaussians, SourcePixel, ViewGaussians},
 };
 
 pub use fuse::FuseOptions;
@@ -37,8 +37,8 @@ pub struct Lifted {
     pub gaussians: Gaussians,
     /// What was dropped or clamped, by reason; reasons that never happened are left out.
     pub dropped: Vec<DropCount>,
-    /// Focal length of each photo in the network's picture of it, pixels; 0 where there is none.
-    pub focal_px: Vec<f64>,
+    /// Lens of the network's picture of each photo, which `SourcePixel` counts pixels of.
+    pub lenses: Vec<Option<Intrinsics>>,
     /// Median depth of the kept Gaussians from the cameras that made them, world units.
     pub median_depth: f64,
 }
@@ -67,10 +67,10 @@ pub fn lift(
             Fate::Keep | Fate::Absent => {}
         }
     }
-    let mut focal_px = vec![0.0; cameras.len()];
+    let mut lenses = vec![None; cameras.len()];
     for view in &views {
-        if let Some(focal) = focal_px.get_mut(usize::from(view.photo)) {
-            *focal = view.camera.intrinsics.fx.min(view.camera.intrinsics.fy);
+        if let Some(lens) = lenses.get_mut(usize::from(view.photo)) {
+            *lens = Some(view.camera.intrinsics);
         }
     }
     let origin = center_of(cameras);
@@ -83,7 +83,7 @@ pub fn lift(
     for (reason, count) in report.counts() {
         counts.add(reason, count);
     }
-    Ok(Lifted { gaussians, dropped: counts.0, focal_px, median_depth: median(depths) })
+    Ok(Lifted { gaussians, dropped: counts.0, lenses, median_depth: median(depths) })
 }
 
 /// Counts by reason, in the order the reasons first came.

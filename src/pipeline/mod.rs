@@ -22,8 +22,8 @@ use crate::{
     models::{Bundle, Geometry, GeometryInput, Runtime},
     photos,
     scene::{
-        Backdrop, Camera, Capture, Gaussians, HealthReport, PosedPhoto, SceneCamera, SceneOptions,
-        StageTime, Upload, ViewSet,
+        Backdrop, Camera, Capture, Gaussians, HealthReport, Intrinsics, PosedPhoto, SceneCamera,
+        SceneOptions, StageTime, Upload, ViewSet,
     },
 };
 
@@ -211,9 +211,16 @@ fn finish(
         })
     })?;
 
-    let named = photos.iter().zip(cameras);
-    let cameras =
-        named.map(|(photo, camera)| SceneCamera { file: photo.file.clone(), camera }).collect();
+    let cameras = photos
+        .iter()
+        .zip(&lifted.lenses)
+        .map(|(photo, &network)| SceneCamera {
+            file: photo.file.clone(),
+            camera: photo.camera,
+            network,
+        })
+        .collect();
+    let focal = |lens: &Option<Intrinsics>| lens.map_or(0.0, |lens| lens.fx.min(lens.fy));
     let report = HealthReport {
         photos: count(photos.len()),
         views_used: count(used(&sets, photos.len())),
@@ -222,7 +229,7 @@ fn finish(
         depth_range: depth_range(&capture),
         median_depth: lifted.median_depth,
         overlap: mean_best_overlap(&capture),
-        network_focal_px: lifted.focal_px,
+        network_focal_px: lifted.lenses.iter().map(focal).collect(),
         stages: run.times,
         execution_provider: engine.geometry.provider().name().to_owned(),
         warnings: capture.warnings,

@@ -24,7 +24,7 @@ pub use geometry::ViewGaussians;
 pub use id::{SCENE_ID_CHARS, SceneId};
 pub use made::{PhotoHash, Provenance, Scene, SceneMeta};
 pub use magnify::LEARNT_BLUR_PX2;
-pub use photo::{Photo, PosedPhoto};
+pub use photo::{Crop, Photo, PosedPhoto};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{
     Bank, IndexMap, MaskInfo, PhotoMasks, ScoringProfile, Semantics, SemanticsReport,

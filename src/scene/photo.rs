@@ -15,6 +15,15 @@ pub struct Photo {
     pub valid: Option<Vec<bool>>,
 }
 
+/// A square cut of a photo around one thing, black elsewhere: what an image tower is shown.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Crop {
+    /// Width and height, pixels of the photo.
+    pub side: u32,
+    /// `[side * side * 3]`, sRGB as stored; 0 outside the thing and outside the photo.
+    pub rgb: Vec<u8>,
+}
+
 /// A photo, its camera (of the undistorted pixels, same size) and the file it came from.
 #[derive(Clone, Debug)]
 pub struct PosedPhoto {

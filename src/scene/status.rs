@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     error::{Error, ErrorCode, TABLE},
-    scene::{Camera, HealthReport, SceneId},
+    scene::{Camera, HealthReport, Intrinsics, SceneId},
 };
 
 /// Options of a scene, kept with it.
@@ -83,6 +83,10 @@ pub struct SceneCamera {
     /// Camera of the undistorted photo, world frame of the upload.
     #[serde(flatten)]
     pub camera: Camera,
+    /// Lens of the network's picture of the photo, same pose: what `SourcePixel` counts pixels of.
+    /// None where the photo was not used.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub network: Option<Intrinsics>,
 }
 
 /// A scene as `GET /v1/scenes/{id}` shows it.

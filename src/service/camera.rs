@@ -219,7 +219,11 @@ mod tests {
                 CameraToWorld::look_at(eye, target, DVec3::NEG_Y, "test").unwrap();
             let intrinsics =
                 Intrinsics { fx: 400.0, fy: 410.0, cx: 250.0, cy: 190.0, width: 500, height: 400 };
-            SceneCamera { file: String::new(), camera: Camera { intrinsics, camera_to_world } }
+            SceneCamera {
+                file: String::new(),
+                camera: Camera { intrinsics, camera_to_world },
+                network: None,
+            }
         };
         vec![at(0.0, 0.0), at(1.0, 0.5)]
     }

@@ -73,7 +73,11 @@ fn scene() -> Scene {
         let intrinsics =
             Intrinsics { fx: 64.0, fy: 64.0, cx: 32.0, cy: 24.0, width: 64, height: 48 };
         let camera_to_world = CameraToWorld::from_row_major(&pose, "test").unwrap();
-        SceneCamera { file: format!("{x}.png"), camera: Camera { intrinsics, camera_to_world } }
+        SceneCamera {
+            file: format!("{x}.png"),
+            camera: Camera { intrinsics, camera_to_world },
+            network: None,
+        }
     };
     let meta = SceneMeta {
         id: SceneId::from_bytes([3; 16]),

@@ -49,7 +49,7 @@ fn wall() -> Scene {
     let meta = SceneMeta {
         id: SceneId::from_bytes([1; 16]),
         created_ms: 0,
-        cameras: vec![SceneCamera { file: "a.png".to_owned(), camera: camera(1) }],
+        cameras: vec![SceneCamera { file: "a.png".to_owned(), camera: camera(1), network: None }],
         report,
         provenance: Provenance::default(),
     };

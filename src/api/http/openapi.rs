@@ -334,6 +334,8 @@ pub(super) struct SceneCamera {
     intrinsics: Intrinsics,
     /// 16 numbers, row-major, OpenCV.
     camera_to_world: Vec<f64>,
+    /// Lens of the network's picture of it; absent where the photo was not used.
+    network: Option<Intrinsics>,
 }
 
 /// A page of scenes, newest first.

@@ -159,8 +159,10 @@ impl SceneMaker for WallMaker {
             median_depth: WALL_DEPTH,
             ..HealthReport::default()
         };
-        let cameras =
-            photos.iter().map(|p| SceneCamera { file: p.file.clone(), camera: p.camera }).collect();
+        let cameras = photos
+            .iter()
+            .map(|p| SceneCamera { file: p.file.clone(), camera: p.camera, network: None })
+            .collect();
         Ok(Made {
             gaussians,
             backdrop: Backdrop::default(),

@@ -61,8 +61,11 @@ impl SceneMaker for BoardMaker {
             warnings: capture.warnings,
             ..HealthReport::default()
         };
-        let camera =
-            |posed: &PosedPhoto| SceneCamera { file: posed.file.clone(), camera: posed.camera };
+        let camera = |posed: &PosedPhoto| SceneCamera {
+            file: posed.file.clone(),
+            camera: posed.camera,
+            network: None,
+        };
         let cameras = photos.iter().map(camera).collect();
         Ok(Made {
             gaussians,
