@@ -79,7 +79,7 @@ __global__ void pack_insts(const float* in, Inst* out, int n) {
 
 __global__ void render_kernel(const float* scenes, int per, const Inst* insts, const Node* nodes,
                               const Tri* tris, Bank bank, const float* cams, int views, int W, int H,
-                              float* rgb, float* depth) {
+                              float* rgb, float* depth, int* ids) {
   int x = blockIdx.x * 16 + threadIdx.x, y = blockIdx.y * 8 + threadIdx.y, v = blockIdx.z;
   if (x >= W || y >= H) return;
   int si = v / views;
@@ -87,14 +87,16 @@ __global__ void render_kernel(const float* scenes, int per, const Inst* insts, c
   s.first = si * per; s.count = per;
   for (int k = 0; k < 3; ++k) { s.l1[k] = sp[k]; s.l2[k] = sp[3 + k]; s.c1[k] = sp[6 + k]; s.c2[k] = sp[9 + k]; }
   s.amb = sp[12];
-  float c[3], z;
-  render_pixel(s, insts, nodes, tris, bank, cams + 16LL * v, x, y, c, &z);
+  float c[3], z; int id;
+  render_pixel(s, insts, nodes, tris, bank, cams + 16LL * v, x, y, c, &z, &id);
   long long at = (long long)y * W + x, hw = (long long)H * W;
   for (int k = 0; k < 3; ++k) rgb[(v * 3LL + k) * hw + at] = c[k];
   depth[v * hw + at] = z;
+  ids[v * hw + at] = id;
 }
 
 // scenes [S,13], inst [S,I,26], nodes [n,8], tris [T,20], bank u8 [X, stride], cams [S,V,16].
+// Gives colour [S,V,3,H,W], depth [S,V,H,W] and ids [S,V,H,W] (see `part_id`).
 std::vector<torch::Tensor> render(torch::Tensor scenes, torch::Tensor inst, torch::Tensor nodes,
                                   torch::Tensor packed, torch::Tensor bank, int64_t size,
                                   int64_t levels, torch::Tensor cams, int64_t H, int64_t W) {
@@ -104,13 +106,14 @@ std::vector<torch::Tensor> render(torch::Tensor scenes, torch::Tensor inst, torc
   auto ci = inst.contiguous(), cs = scenes.contiguous(), cc = cams.contiguous();
   pack_insts<<<(S * I + 127) / 128, 128>>>(ci.data_ptr<float>(), (Inst*)insts.data_ptr<uint8_t>(), S * I);
   auto rgb = torch::empty({S, V, 3, H, W}, f), depth = torch::empty({S, V, H, W}, f);
+  auto ids = torch::empty({S, V, H, W}, f.dtype(torch::kInt32));
   Bank b; b.data = bank.data_ptr<uint8_t>(); b.size = size; b.levels = levels; b.stride = bank.size(1);
   render_kernel<<<dim3((W + 15) / 16, (H + 7) / 8, S * V), dim3(16, 8)>>>(
       cs.data_ptr<float>(), I, (const Inst*)insts.data_ptr<uint8_t>(), (const Node*)nodes.data_ptr<float>(),
       (const Tri*)packed.data_ptr<uint8_t>(), b, cc.data_ptr<float>(), V, W, H, rgb.data_ptr<float>(),
-      depth.data_ptr<float>());
+      depth.data_ptr<float>(), ids.data_ptr<int>());
   TORCH_CHECK(cudaGetLastError() == cudaSuccess, "raycast launch failed");
-  return {rgb, depth};
+  return {rgb, depth, ids};
 }
 
 torch::Tensor pack(torch::Tensor tris) {

@@ -161,9 +161,20 @@ HD V3 shade(const Scene& s, const Inst* insts, const Tri* tris, const Bank& bank
             fminf(c.z * (s.amb + s.c1[2] * k1 + s.c2[2] * k2) + sp, 1.0f));
 }
 
-// cam: camera_to_world 3x4 row-major (12) then fx fy cx cy in pixels.
+// What the pixel's centre sees: -1 for nothing, else the instance's number in its scene in the low
+// byte and, above it, 16 bits that tell parts of one instance apart (face, texture, colour).
+HD int part_id(const Scene& s, const Tri* tris, const Hit& h) {
+  if (h.inst < 0) return -1;
+  const Tri& t = tris[h.tri];
+  unsigned k = (unsigned)(t.slot + 1) * 2654435761u ^ (unsigned)(t.tex + 2) * 40503u;
+  for (int c = 0; c < 3; ++c) k = (k ^ (unsigned)(t.rgb[c] * 255.0f)) * 16777619u;
+  return (h.inst - s.first) | (int)((k ^ (k >> 16)) & 0xffffu) << 8;
+}
+
+// cam: camera_to_world 3x4 row-major (12) then fx fy cx cy in pixels. `id` may be null.
 HD void render_pixel(const Scene& s, const Inst* insts, const Node* nodes, const Tri* tris,
-                     const Bank& bank, const float* cam, int x, int y, float* rgb, float* depth) {
+                     const Bank& bank, const float* cam, int x, int y, float* rgb, float* depth,
+                     int* id) {
   V3 o = v3(cam[3], cam[7], cam[11]), acc = v3(0, 0, 0);
   float fx = cam[12], fy = cam[13], cx = cam[14], cy = cam[15];
   for (int k = 0; k < 5; ++k) {
@@ -175,8 +186,10 @@ HD void render_pixel(const Scene& s, const Inst* insts, const Node* nodes, const
     V3 d = v3(cam[0] * ix + cam[1] * iy + cam[2] * iz, cam[4] * ix + cam[5] * iy + cam[6] * iz,
               cam[8] * ix + cam[9] * iy + cam[10] * iz);
     Hit h = trace(s, insts, nodes, tris, o, d);
-    if (k == 4) *depth = fminf(h.t, 1e6f) * iz;
-    else acc = acc + shade(s, insts, tris, bank, h, o, d, iz / fx) * 0.25f;
+    if (k == 4) {
+      *depth = fminf(h.t, 1e6f) * iz;
+      if (id) *id = part_id(s, tris, h);
+    } else acc = acc + shade(s, insts, tris, bank, h, o, d, iz / fx) * 0.25f;
   }
   rgb[0] = acc.x; rgb[1] = acc.y; rgb[2] = acc.z;
 }

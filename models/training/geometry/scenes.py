@@ -175,6 +175,7 @@ class World:
         nodes, tris, roots = ext.build_bvh(torch.from_numpy(np.concatenate(rows)), ranges)
         self.nodes, self.tris, self.roots = nodes.to(device), ext.pack(tris.to(device)), roots.to(device)
         self.kinds = {k: torch.tensor([i for i, x in enumerate(kinds) if x == k], device=device) for k in set(kinds)}
+        self.first_asset = self.kinds["asset"][0]
         self.gen = torch.Generator(device=device).manual_seed(seed)
 
     # -- random helpers
@@ -215,7 +216,7 @@ class World:
         cams, K = self.rig(B, V, T, H, W, b, focus, wide)
         inst, lights = self.layout(B, room, table, relief, focus, b, cams)
         cam16 = torch.cat([cams[:, :, :3].reshape(B, V + T, 12), torch.stack([K[..., 0, 0] * W, K[..., 1, 1] * H, K[..., 0, 2] * W, K[..., 1, 2] * H], -1)], -1)
-        rgb, depth = self.ext.render(lights, inst, self.nodes, self.tris, self.bank, TEX, 8, cam16.contiguous(), H, W)
+        rgb, depth, _ = self.ext.render(lights, inst, self.nodes, self.tris, self.bank, TEX, 8, cam16.contiguous(), H, W)
         # Model frame.
         scale = torch.cdist(cams[:, :V, :3, 3], cams[:, :V, :3, 3]).flatten(1).amax(1)
         c2w = torch.linalg.inv(cams[:, :1]) @ cams
@@ -377,7 +378,7 @@ class World:
         tex = torch.where(self.coin(B, S, 6, p=0.3), proc, photo)
         one = self.coin(B, S, 1, p=0.35)
         tex = torch.where(one, tex[..., :1].expand_as(tex), tex)
-        is_asset = mesh >= self.kinds["asset"][0]
+        is_asset = mesh >= self.first_asset
         own = is_asset & self.coin(B, S, p=0.75)
         tex = torch.where(own[..., None], -2, tex)
         show = torch.where(self.coin(B, S, p=0.62), torch.ones(B, S, device=dev), self.u(B, S, hi=0.6) ** 2)
