@@ -7,6 +7,7 @@ textures.npz JPEG bytes: photographs (BSDS500, COCO, Flickr8k, CamVid, people) a
 Never packs a photo of `scenes/`: those are under evaluation (see evaluate.py).
 """
 import argparse
+import hashlib
 import io
 import json
 import os
@@ -62,7 +63,7 @@ def mesh_triangles(blob, textures, limit):
                 rgb = rgb / 255.0 if rgb.max() > 1.0 else rgb
             img = getattr(mat, "baseColorTexture", None)
             if img is not None and uv is not None:
-                key = img.tobytes()[:4096] + bytes(str(img.size), "ascii")
+                key = hashlib.sha256(img.tobytes() + bytes(str(img.size), "ascii")).digest()
                 if key not in textures:
                     textures[key] = (len(textures), jpeg(img.convert("RGB").resize((TEX, TEX), Image.BICUBIC)))
                 tex = textures[key][0]
@@ -77,6 +78,7 @@ def mesh_triangles(blob, textures, limit):
         return None
     lo, hi = p.reshape(-1, 3).min(0), p.reshape(-1, 3).max(0)
     p = (p - (lo + hi) / 2) / max((hi - lo).max() / 2, 1e-9)
+    uv = uv * [1, -1]  # trimesh counts v from the bottom, the ray caster from the picture's first row
     uv = np.nan_to_num(uv - np.floor(uv.reshape(-1, 2).min(0)))
     return p.astype(np.float16), uv.astype(np.float16), (c * 255).clip(0, 255).astype(np.uint8), t.astype(np.int16)
 
