@@ -4,18 +4,22 @@
 
 meshes.npz   named GLB assets as triangles (float16 corners and uv, colours, texture index)
 textures.npz JPEG bytes: photographs (BSDS500, COCO, Flickr8k, CamVid, people) and mesh textures
-Never packs a photo of `scenes/`: those are under evaluation (see evaluate.py).
+Never packs a photo of `scenes/`, nor a labelled photograph that is held out: those are under evaluation.
 """
 import argparse
 import hashlib
 import io
 import json
 import os
+import sys
 import tarfile
 
 import numpy as np
 import trimesh
 from PIL import Image
+
+sys.path.insert(0, os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "semantics"))
+from heldout import heldout  # noqa: E402
 
 TEX = 256
 
@@ -36,7 +40,8 @@ def square(img, rng):
 def photographs(data, rng, per_set):
     for name in ["bsds500.tar", "coco_panoptic_200.tar", "human_seg.tar", "camvid.tar", "flickr8k_1000.tar"]:
         with tarfile.open(os.path.join(data, "images", name)) as tar:
-            files = [n for n in tar.getnames() if "images/" in n and n.endswith(".jpg")]
+            files = sorted(n for n in tar.getnames() if "images/" in n and n.endswith(".jpg"))
+            files = [f for i, f in enumerate(files) if not heldout(i)]
             rng.shuffle(files)
             for f in files[: per_set.get(name, 10**9)]:
                 yield square(Image.open(tar.extractfile(f)).convert("RGB"), rng)
@@ -88,6 +93,7 @@ def main():
     ap.add_argument("--data", required=True)
     ap.add_argument("--out", required=True)
     ap.add_argument("--triangles", type=int, default=3200)
+    ap.add_argument("--flickr", type=int, default=500, help="photographs of Flickr8k among the textures")
     args = ap.parse_args()
     os.makedirs(args.out, exist_ok=True)
     rng = np.random.default_rng(7)
@@ -109,7 +115,7 @@ def main():
         counts=np.array(counts), names=np.array(names),
     )
     asset = [v[1] for v in sorted(textures.values())]
-    photos = [jpeg(p) for p in photographs(args.data, rng, {"flickr8k_1000.tar": 500})]
+    photos = [jpeg(p) for p in photographs(args.data, rng, {"flickr8k_1000.tar": args.flickr})]
     blobs = asset + extra + photos
     np.savez(
         os.path.join(args.out, "textures.npz"),

@@ -7,7 +7,7 @@ words.json   the vocabulary, and for each class which words are true of it and w
 phrases.npz  phrases for the text tower: tokens of MiniLM and of our own tokenizer
 tokenizer.json our own WordPiece tokenizer
 minilm.npz   MiniLM's weights, 8 bits a number with a scale a row; lite2.pt EfficientNet-Lite2's, fp16
-Rows with index % 10 == 9 of every set are held out (see `heldout`), and never packed for training.
+Rows with index % 10 == 9 of every set are held out (heldout.py), and never packed for training.
 """
 import argparse
 import io
@@ -23,6 +23,7 @@ from PIL import Image
 from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors, trainers
 
 import names as mesh_names
+from heldout import heldout
 from wordnet import BODILY, GENERAL, WordNet
 
 COLOURS = "red orange yellow green blue purple pink brown black white gray".split()
@@ -35,11 +36,6 @@ STUFF = {
 }
 CALTECH = {"Faces": "face", "Faces_easy": "face", "Motorbikes": "motorcycle", "airplanes": "airplane", "Leopards": "leopard", "car_side": "car", "yin_yang": "yin and yang"}
 CAMVID = ["sky", "building", "pole", "road", "pavement", "tree", "traffic sign", "fence", "car", "person", "bicycle"]
-
-
-def heldout(index):
-    """Whether the row `index` of a labelled set is kept out of training."""
-    return index % 10 == 9
 
 
 def webp(img, quality):
