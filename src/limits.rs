@@ -5,6 +5,10 @@ use serde::{Deserialize, Serialize};
 /// Bytes of an idempotency key: what a UUID and a prefix need many times over.
 pub const IDEMPOTENCY_KEY_BYTES_MAX: usize = 256;
 
+/// Rows of a semantic bank: a busy photo has a hundred masks, so this is never met by photos; it
+/// bounds what the products of all pairs of rows take.
+pub const BANK_ROWS_MAX: usize = 4_096;
+
 /// Caps on what a caller may send or ask for.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]

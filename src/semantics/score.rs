@@ -1,0 +1,563 @@
+//! Scores of a text against the bank, in the short forms that make no feature of a pixel.
+//!
+//! With a pixel's weights E over the bank's rows B, a text q and a canonical phrase c:
+//! `cos(F, q) - cos(F, c) = (E . B(q - c)) / sqrt(E^T B B^T E)`. So a text becomes one number a
+//! row and phrase, `d_c = B(q - c)`; a mask is the sign of a blend of these numbers, for any size
+//! of bank; and only a relevancy needs the norm, which no text changes.
+
+use std::sync::{Arc, OnceLock};
+
+use rayon::prelude::*;
+
+use super::{dot, norm, unit_rows};
+use crate::{
+    error::{Error, Result},
+    scene::{Bank, ScoringProfile},
+};
+
+/// Canonical phrases that one blend of four numbers carries beside the coverage.
+const GROUP: usize = 3;
+/// Pixels that a thread takes at once.
+const PIXELS_EACH: usize = 4096;
+
+/// What a text is compared to and how sharply: belongs to the model bundle and the profile.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Scoring {
+    profile: ScoringProfile,
+    canon: Vec<Vec<f32>>,
+    tau: f64,
+    coverage_floor: f64,
+}
+
+impl Scoring {
+    /// Canonical phrases as unit embeddings, sharpness, and the coverage under which a pixel means
+    /// nothing (the profile `paper` has no such floor).
+    ///
+    /// # Errors
+    /// `internal` when there is no phrase, they differ in length, or a number is out of range.
+    pub fn new(
+        profile: ScoringProfile,
+        canon: Vec<Vec<f32>>,
+        tau: f64,
+        coverage_floor: f64,
+    ) -> Result<Self> {
+        let dim = canon.first().map_or(0, Vec::len);
+        if dim == 0 || canon.iter().any(|c| c.len() != dim || c.iter().any(|v| !v.is_finite())) {
+            return Err(Error::internal(format!(
+                "scoring: {} canonical phrases, not all of {dim} finite numbers",
+                canon.len()
+            )));
+        }
+        if !(tau.is_finite() && tau > 0.0 && (0.0..=1.0).contains(&coverage_floor)) {
+            return Err(Error::internal(format!(
+                "scoring: tau {tau} must be over 0, coverage floor {coverage_floor} in 0..1"
+            )));
+        }
+        let coverage_floor = match profile {
+            ScoringProfile::Default => coverage_floor,
+            ScoringProfile::Paper => 0.0,
+        };
+        Ok(Self { profile, canon, tau, coverage_floor })
+    }
+
+    /// Coverage under which a pixel means nothing.
+    #[must_use]
+    pub fn coverage_floor(&self) -> f64 {
+        self.coverage_floor
+    }
+
+    /// The profile.
+    #[must_use]
+    pub fn profile(&self) -> ScoringProfile {
+        self.profile
+    }
+}
+
+/// Weights of each pixel over the bank, sparse: what a view was blended from.
+#[derive(Clone, Copy, Debug)]
+pub struct PixelEntries<'a> {
+    /// `[P + 1]` where each pixel's entries begin.
+    pub offsets: &'a [u32],
+    /// Bank indices, from 1.
+    pub index: &'a [u16],
+    /// Their weights.
+    pub weight: &'a [f32],
+}
+
+impl<'a> PixelEntries<'a> {
+    /// Number of pixels (P).
+    #[must_use]
+    pub fn pixels(&self) -> usize {
+        self.offsets.len().saturating_sub(1)
+    }
+
+    /// Index and weight of each entry of pixel `p`.
+    fn of(&self, p: usize) -> impl Iterator<Item = (usize, f64)> + Clone + 'a {
+        let range = self.offsets[p] as usize..self.offsets[p + 1] as usize;
+        let (index, weight) = (&self.index[range.clone()], &self.weight[range]);
+        index.iter().map(|m| usize::from(*m)).zip(weight.iter().map(|w| f64::from(*w)))
+    }
+
+    fn check(&self) -> Result<()> {
+        let last = self.offsets.last().map_or(0, |last| *last as usize);
+        let rising = self.offsets.windows(2).all(|pair| pair[0] <= pair[1]);
+        if !rising || last != self.index.len() || last != self.weight.len() {
+            return Err(Error::internal(format!(
+                "entries: {} indices and {} weights for offsets up to {last}",
+                self.index.len(),
+                self.weight.len()
+            )));
+        }
+        Ok(())
+    }
+}
+
+/// 1 / the feature's length of each pixel of a view; 0 where a pixel means nothing. Kept with the
+/// view's entries, it serves every text.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ViewNorms {
+    inverse: Vec<f32>,
+}
+
+impl ViewNorms {
+    /// Bytes held.
+    #[must_use]
+    pub fn size_bytes(&self) -> u64 {
+        (self.inverse.len() * size_of::<f32>()) as u64
+    }
+}
+
+/// A text's scores against a bank: all that a query needs of it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TextScores {
+    /// For each three canonical phrases `[M + 1]` rows of `B(q - c)`; short groups repeat their
+    /// first phrase, which changes no minimum and no sign.
+    groups: Vec<Vec<[f64; GROUP]>>,
+    /// `[M + 1]` relevancy of each row on its own.
+    entries: Vec<f32>,
+}
+
+impl TextScores {
+    /// Tables to blend, one for each three canonical phrases: `[M + 1]` rows of the coverage and
+    /// three scores. [`mask_from_blend`] reads the blended pictures.
+    #[must_use]
+    pub fn tables(&self) -> Vec<Arc<[[f32; 4]]>> {
+        #[expect(clippy::cast_possible_truncation, reason = "renderers blend f32")]
+        let row = |(m, d): (usize, &[f64; GROUP])| match m {
+            0 => [0.0; 4],
+            _ => [1.0, d[0] as f32, d[1] as f32, d[2] as f32],
+        };
+        self.groups.iter().map(|rows| rows.iter().enumerate().map(row).collect()).collect()
+    }
+
+    /// `[M + 1]` relevancy of each bank index on its own, 0..1; that of the background is 0.
+    #[must_use]
+    pub fn entries(&self) -> &[f32] {
+        &self.entries
+    }
+
+    /// Whether the text selects bank index `m`.
+    #[must_use]
+    pub fn selects(&self, m: u16) -> bool {
+        self.entries.get(usize::from(m)).is_some_and(|score| *score >= 0.5)
+    }
+
+    /// Smallest and largest blended score of a pixel's entries, and their coverage.
+    fn blend(&self, entries: impl Iterator<Item = (usize, f64)> + Clone) -> [f64; 3] {
+        let (mut least, mut most, mut coverage) = (f64::INFINITY, f64::NEG_INFINITY, 0.0);
+        for rows in &self.groups {
+            let mut sums = [0.0_f64; GROUP];
+            coverage = 0.0;
+            for (m, weight) in entries.clone() {
+                // Index 0 and indices beyond the bank have no row.
+                let Some(row) = rows.get(m).filter(|_| m > 0) else { continue };
+                coverage += weight;
+                sums.iter_mut().zip(row).for_each(|(sum, d)| *sum += weight * d);
+            }
+            for sum in sums {
+                least = least.min(sum);
+                most = most.max(sum);
+            }
+        }
+        [least, most, coverage]
+    }
+}
+
+/// Whether a pixel is selected: no blended score is under 0 and not all of them are 0.
+fn selected(least: f64, most: f64) -> bool {
+    least >= 0.0 && most > 0.0
+}
+
+/// A bank under a scoring profile, ready for texts.
+#[derive(Debug)]
+pub struct Scorer {
+    bank: Bank,
+    scoring: Arc<Scoring>,
+    /// `[M]` lengths of the rows.
+    norms: Vec<f64>,
+    /// Canonical phrase by row.
+    canon_scores: Vec<Vec<f64>>,
+    /// Lower triangle of B B^T, row by row; made when the first norm is asked for.
+    gram: OnceLock<Vec<f64>>,
+}
+
+impl Scorer {
+    /// Prepares a bank of plain centroids for a profile.
+    ///
+    /// # Errors
+    /// `internal` when the bank's rows and the canonical phrases differ in length.
+    pub fn new(bank: &Bank, scoring: Arc<Scoring>) -> Result<Self> {
+        let dim = scoring.canon[0].len();
+        if !bank.is_empty() && bank.dim != dim {
+            return Err(Error::internal(format!(
+                "scoring: rows of {} numbers, texts of {dim}",
+                bank.dim
+            )));
+        }
+        let rows = match scoring.profile {
+            ScoringProfile::Default => unit_rows(bank),
+            ScoringProfile::Paper => bank.rows.clone(),
+        };
+        let bank = Bank { dim, rows };
+        let norms = bank.rows.chunks_exact(dim).map(norm).collect();
+        let canon_scores = scoring.canon.iter().map(|c| scores(&bank, c)).collect();
+        Ok(Self { bank, scoring, norms, canon_scores, gram: OnceLock::new() })
+    }
+
+    /// How it scores.
+    #[must_use]
+    pub fn scoring(&self) -> &Scoring {
+        &self.scoring
+    }
+
+    /// Rows of the bank (M).
+    #[must_use]
+    pub fn rows(&self) -> usize {
+        self.norms.len()
+    }
+
+    /// Scores a text by its unit embedding: M dot products.
+    ///
+    /// # Errors
+    /// `internal` when the embedding's length is another or a number is not finite.
+    pub fn text(&self, embedding: &[f32]) -> Result<TextScores> {
+        if embedding.len() != self.bank.dim || embedding.iter().any(|v| !v.is_finite()) {
+            return Err(Error::internal(format!(
+                "scoring: a text of {} numbers, not {} finite ones",
+                embedding.len(),
+                self.bank.dim
+            )));
+        }
+        let own = scores(&self.bank, embedding);
+        let group = |canon: &[Vec<f64>]| -> Vec<[f64; GROUP]> {
+            let row =
+                |m: usize| std::array::from_fn(|g| own[m] - canon.get(g).unwrap_or(&canon[0])[m]);
+            std::iter::once([0.0; GROUP]).chain((0..own.len()).map(row)).collect()
+        };
+        let mut text = TextScores {
+            groups: self.canon_scores.chunks(GROUP).map(group).collect(),
+            entries: vec![0.0],
+        };
+        let alone = self.norms.iter().enumerate().map(|(m, length)| {
+            let [least, ..] = text.blend(std::iter::once((m + 1, 1.0)));
+            if *length > 0.0 { self.sharpen(least / length) } else { 0.0 }
+        });
+        let alone: Vec<f32> = alone.collect();
+        text.entries.extend(alone);
+        Ok(text)
+    }
+
+    /// The sigmoid of a difference of cosines, in the form that cannot overflow.
+    fn sharpen(&self, difference: f64) -> f32 {
+        #[expect(clippy::cast_possible_truncation, reason = "a score 0..1")]
+        let score = (1.0 / (1.0 + (-self.scoring.tau * difference).exp())) as f32;
+        score
+    }
+
+    /// Lengths of a view's features, for [`Self::relevancy`].
+    ///
+    /// # Errors
+    /// `internal` when the arrays of `entries` do not belong together.
+    pub fn norms(&self, entries: PixelEntries<'_>) -> Result<ViewNorms> {
+        entries.check()?;
+        let gram = self.gram.get_or_init(|| gram(&self.bank));
+        let rows = self.rows();
+        let inverse = (0..entries.pixels())
+            .into_par_iter()
+            .with_min_len(PIXELS_EACH)
+            .map(|p| {
+                let (mut square, mut coverage) = (0.0_f64, 0.0_f64);
+                let of = entries.of(p).filter(|(m, _)| (1..=rows).contains(m));
+                for (i, (m, weight)) in of.clone().enumerate() {
+                    coverage += weight;
+                    let mut across = 0.0;
+                    for (n, other) in of.clone().take(i) {
+                        across += other * gram[triangle(m - 1, n - 1)];
+                    }
+                    square += weight * (weight * gram[triangle(m - 1, m - 1)] + 2.0 * across);
+                }
+                if square <= 0.0 || coverage < self.scoring.coverage_floor {
+                    return 0.0;
+                }
+                #[expect(clippy::cast_possible_truncation, reason = "a relevancy is f32")]
+                let inverse = (1.0 / square.sqrt()) as f32;
+                if inverse.is_finite() { inverse } else { 0.0 }
+            })
+            .collect();
+        Ok(ViewNorms { inverse })
+    }
+
+    /// `[P]` relevancy of each pixel, 0.5 to 1, or 0 where the text does not apply.
+    ///
+    /// # Errors
+    /// `internal` when `entries` and `norms` are not of one view.
+    pub fn relevancy(
+        &self,
+        text: &TextScores,
+        entries: PixelEntries<'_>,
+        norms: &ViewNorms,
+    ) -> Result<Vec<f32>> {
+        entries.check()?;
+        if norms.inverse.len() != entries.pixels() {
+            return Err(Error::internal(format!(
+                "scoring: {} norms for {} pixels",
+                norms.inverse.len(),
+                entries.pixels()
+            )));
+        }
+        let score = |(p, inverse): (usize, &f32)| {
+            if *inverse <= 0.0 {
+                return 0.0;
+            }
+            let [least, most, _] = text.blend(entries.of(p));
+            if selected(least, most) { self.sharpen(least * f64::from(*inverse)) } else { 0.0 }
+        };
+        Ok(norms.inverse.par_iter().enumerate().with_min_len(PIXELS_EACH).map(score).collect())
+    }
+
+    /// `[P]` where the text's relevancy is 0.5 or more: no norm, no exponential.
+    ///
+    /// # Errors
+    /// `internal` when the arrays of `entries` do not belong together.
+    pub fn mask(&self, text: &TextScores, entries: PixelEntries<'_>) -> Result<Vec<bool>> {
+        entries.check()?;
+        let inside = |p: usize| {
+            let [least, most, coverage] = text.blend(entries.of(p));
+            coverage >= self.scoring.coverage_floor && selected(least, most)
+        };
+        Ok((0..entries.pixels()).into_par_iter().with_min_len(PIXELS_EACH).map(inside).collect())
+    }
+}
+
+/// `[P]` where a text applies, from the blended pictures of [`TextScores::tables`], in their order.
+#[must_use]
+pub fn mask_from_blend(pictures: &[&[[f32; 4]]], scoring: &Scoring) -> Vec<bool> {
+    let pixels = pictures.iter().map(|picture| picture.len()).min().unwrap_or(0);
+    let inside = |p: usize| {
+        let (mut least, mut most) = (f32::INFINITY, f32::NEG_INFINITY);
+        let mut coverage = 0.0;
+        for [weight, scores @ ..] in pictures.iter().map(|picture| picture[p]) {
+            coverage = weight;
+            least = scores.into_iter().fold(least, f32::min);
+            most = scores.into_iter().fold(most, f32::max);
+        }
+        f64::from(coverage) >= scoring.coverage_floor && selected(least.into(), most.into())
+    };
+    (0..pixels).into_par_iter().with_min_len(PIXELS_EACH).map(inside).collect()
+}
+
+/// `[M]` dot products of the rows with a vector.
+fn scores(bank: &Bank, with: &[f32]) -> Vec<f64> {
+    bank.rows.chunks_exact(bank.dim.max(1)).map(|row| dot(row, with)).collect()
+}
+
+/// Place of `(m, n)` in a lower triangle.
+fn triangle(m: usize, n: usize) -> usize {
+    let (row, column) = (m.max(n), m.min(n));
+    row * (row + 1) / 2 + column
+}
+
+/// Lower triangle of B B^T.
+fn gram(bank: &Bank) -> Vec<f64> {
+    let row = |m: usize| (0..=m).map(move |n| dot(bank.row(m), bank.row(n)));
+    (0..bank.len()).into_par_iter().flat_map_iter(row).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn scoring(profile: ScoringProfile, canon: &[[f32; 2]]) -> Arc<Scoring> {
+        let canon = canon.iter().map(|c| c.to_vec()).collect();
+        Arc::new(Scoring::new(profile, canon, 10.0, 0.05).unwrap())
+    }
+
+    const X: [f32; 2] = [1.0, 0.0];
+    const Y: [f32; 2] = [0.0, 1.0];
+
+    fn scorer(rows: &[[f32; 2]], profile: ScoringProfile) -> Scorer {
+        let bank = Bank { dim: 2, rows: rows.concat() };
+        Scorer::new(&bank, scoring(profile, &[Y])).unwrap()
+    }
+
+    /// Entries of pixels given as lists.
+    struct View(Vec<u32>, Vec<u16>, Vec<f32>);
+
+    fn view(pixels: &[&[(u16, f32)]]) -> View {
+        let mut view = View(vec![0], Vec::new(), Vec::new());
+        for pixel in pixels {
+            view.1.extend(pixel.iter().map(|e| e.0));
+            view.2.extend(pixel.iter().map(|e| e.1));
+            view.0.push(view.1.len() as u32);
+        }
+        view
+    }
+
+    impl View {
+        fn entries(&self) -> PixelEntries<'_> {
+            PixelEntries { offsets: &self.0, index: &self.1, weight: &self.2 }
+        }
+    }
+
+    #[test]
+    fn a_row_that_is_the_text_scores_as_the_formula_says() {
+        let scorer = scorer(&[X, Y, [3.0, 4.0]], ScoringProfile::Paper);
+        let text = scorer.text(&X).unwrap();
+        let close = |a: f32, b: f64| (f64::from(a) - b).abs() < 1e-6;
+        let sigmoid = |v: f64| 1.0 / (1.0 + (-10.0 * v).exp());
+        let entries = text.entries();
+        assert!(close(entries[1], sigmoid(1.0)) && close(entries[2], sigmoid(-1.0)));
+        assert!(close(entries[3], sigmoid(-0.2)), "a row's own length does not matter alone");
+        assert!(entries[0].to_bits() == 0 && text.selects(1) && !text.selects(2));
+        assert!(!text.selects(0) && !text.selects(4), "the background and what is no row");
+    }
+
+    #[test]
+    fn pixels_blend_their_rows_and_forget_the_rest() {
+        let scorer = scorer(&[X, Y], ScoringProfile::Paper);
+        let text = scorer.text(&X).unwrap();
+        let view =
+            view(&[&[(1, 0.4), (2, 0.3)], &[(1, 0.3), (2, 0.4)], &[], &[(9, 1.0), (0, 1.0)]]);
+        let norms = scorer.norms(view.entries()).unwrap();
+        let map = scorer.relevancy(&text, view.entries(), &norms).unwrap();
+        let want = 1.0 / (1.0 + (-10.0 * 0.1_f64 / 0.5).exp());
+        assert!((f64::from(map[0]) - want).abs() < 1e-6, "{} {want}", map[0]);
+        assert_eq!(&map[1..], [0.0, 0.0, 0.0], "under 0.5, nothing, no rows");
+        let mask = scorer.mask(&text, view.entries()).unwrap();
+        assert_eq!(mask, [true, false, false, false]);
+    }
+
+    #[test]
+    fn the_default_profile_has_unit_rows_and_a_coverage_floor_the_paper_has_neither() {
+        let rows = [[0.1, 0.0], Y];
+        let view = view(&[&[(1, 0.5), (2, 0.3)], &[(1, 0.04)], &[(1, 0.05)]]);
+        let mask = |profile| {
+            let scorer = scorer(&rows, profile);
+            let text = scorer.text(&X).unwrap();
+            let (entries, norms) = (view.entries(), scorer.norms(view.entries()).unwrap());
+            let map = scorer.relevancy(&text, entries, &norms).unwrap();
+            let mask = scorer.mask(&text, entries).unwrap();
+            let from_map: Vec<bool> = map.iter().map(|v| *v >= 0.5).collect();
+            assert_eq!(mask, from_map, "{profile:?}: two roads to one mask");
+            mask
+        };
+        assert_eq!(mask(ScoringProfile::Default), [true, false, true]);
+        assert_eq!(mask(ScoringProfile::Paper), [false, true, true]);
+    }
+
+    #[test]
+    fn opposite_rows_cancel_to_no_relevancy_and_never_nan() {
+        let scorer = scorer(&[X, [-1.0, 0.0], [0.0, 0.0]], ScoringProfile::Default);
+        let text = scorer.text(&X).unwrap();
+        let view = view(&[&[(1, 0.5), (2, 0.5)], &[(3, 1.0)], &[(1, 0.5), (3, 0.5)]]);
+        let norms = scorer.norms(view.entries()).unwrap();
+        let map = scorer.relevancy(&text, view.entries(), &norms).unwrap();
+        assert_eq!(map[..2], [0.0, 0.0]);
+        assert!(map[2] > 0.99, "a row of zeros adds coverage alone");
+        assert_eq!(scorer.mask(&text, view.entries()).unwrap(), [false, false, true]);
+    }
+
+    #[test]
+    fn the_worst_phrase_decides_and_blended_tables_say_the_same() {
+        let bank = Bank { dim: 2, rows: [X, [0.6, 0.8]].concat() };
+        for count in 1..=5_usize {
+            // Phrases turn towards X; the last is the nearest to it.
+            let canon: Vec<[f32; 2]> = (1..=count)
+                .map(|i| {
+                    let turn = 1.5 - 0.25 * i as f32;
+                    [turn.cos(), turn.sin()]
+                })
+                .collect();
+            let scoring = scoring(ScoringProfile::Default, &canon);
+            let scorer = Scorer::new(&bank, Arc::clone(&scoring)).unwrap();
+            let text = scorer.text(&X).unwrap();
+            let want = 1.0 / (1.0 + (-10.0 * (1.0 - f64::from(canon[count - 1][0]))).exp());
+            assert!((f64::from(text.entries()[1]) - want).abs() < 1e-5, "{count} phrases");
+            let tables = text.tables();
+            assert_eq!(tables.len(), count.div_ceil(3));
+            let pixels: [&[(u16, f32)]; 4] =
+                [&[(1, 0.5)], &[(2, 0.9)], &[(1, 0.2), (2, 0.3)], &[(1, 0.01)]];
+            let view = view(&pixels);
+            let blend = |table: &Arc<[[f32; 4]]>| -> Vec<[f32; 4]> {
+                let sum = |pixel: &&[(u16, f32)]| {
+                    let mut sum = [0.0; 4];
+                    for (m, weight) in *pixel {
+                        let row = table[usize::from(*m)];
+                        sum.iter_mut()
+                            .zip(row)
+                            .for_each(|(s, v): (&mut f32, f32)| *s += weight * v);
+                    }
+                    sum
+                };
+                pixels.iter().map(sum).collect()
+            };
+            let pictures: Vec<Vec<[f32; 4]>> = tables.iter().map(blend).collect();
+            let pictures: Vec<&[[f32; 4]]> = pictures.iter().map(Vec::as_slice).collect();
+            let mask = mask_from_blend(&pictures, &scoring);
+            assert_eq!(mask, scorer.mask(&text, view.entries()).unwrap(), "{count} phrases");
+            assert!(mask[0] && !mask[3], "{count} phrases: {mask:?}");
+        }
+    }
+
+    #[test]
+    fn an_empty_bank_has_no_relevancy_anywhere() {
+        let scorer = scorer(&[], ScoringProfile::Default);
+        let text = scorer.text(&X).unwrap();
+        assert_eq!((text.entries().len(), text.tables()[0].len()), (1, 1));
+        let view = view(&[&[], &[(1, 1.0)]]);
+        let norms = scorer.norms(view.entries()).unwrap();
+        assert_eq!(scorer.relevancy(&text, view.entries(), &norms).unwrap(), [0.0, 0.0]);
+        assert_eq!(scorer.mask(&text, view.entries()).unwrap(), [false, false]);
+    }
+
+    #[test]
+    fn a_great_tau_saturates_without_overflow() {
+        let canon = vec![Y.to_vec()];
+        let scoring = Scoring::new(ScoringProfile::Paper, canon, 1e6, 0.05).unwrap();
+        let bank = Bank { dim: 2, rows: [X, Y].concat() };
+        let text = Scorer::new(&bank, Arc::new(scoring)).unwrap().text(&X).unwrap();
+        assert_eq!(text.entries(), [0.0, 1.0, 0.0]);
+    }
+
+    #[test]
+    fn what_does_not_belong_together_is_refused() {
+        let new = |canon: Vec<Vec<f32>>, tau, floor| {
+            Scoring::new(ScoringProfile::Default, canon, tau, floor)
+        };
+        assert!(new(vec![], 10.0, 0.0).is_err() && new(vec![vec![]], 10.0, 0.0).is_err());
+        assert!(new(vec![X.to_vec(), vec![1.0]], 10.0, 0.0).is_err());
+        assert!(new(vec![vec![f32::NAN]], 10.0, 0.0).is_err());
+        assert!(new(vec![X.to_vec()], 0.0, 0.0).is_err());
+        assert!(new(vec![X.to_vec()], f64::NAN, 0.0).is_err());
+        assert!(new(vec![X.to_vec()], 10.0, 1.5).is_err());
+        let scorer = scorer(&[X], ScoringProfile::Default);
+        assert!(scorer.text(&[1.0]).is_err() && scorer.text(&[1.0, f32::INFINITY]).is_err());
+        let wide = Bank { dim: 3, rows: vec![1.0; 3] };
+        assert!(Scorer::new(&wide, Arc::clone(&scorer.scoring)).is_err());
+        let view = view(&[&[(1, 0.5)]]);
+        let text = scorer.text(&X).unwrap();
+        assert!(scorer.relevancy(&text, view.entries(), &ViewNorms::default()).is_err());
+        let broken = PixelEntries { offsets: &[0, 2], index: &[1], weight: &[0.5] };
+        assert!(scorer.mask(&text, broken).is_err() && scorer.norms(broken).is_err());
+    }
+}
