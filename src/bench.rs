@@ -13,7 +13,7 @@ use crate::{
     config::Config,
     error::{Error, Result},
     render::{
-        Frame, Kinds, RenderRequest, Renderer,
+        Frame, Kinds, Labels, RenderRequest, Renderer,
         cpu::CpuRenderer,
         oracle,
         select::{AdapterReport, select},
@@ -100,6 +100,7 @@ pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
     let request = RenderRequest {
         camera,
         kinds: Kinds { color: true, depth: args.compare_cpu, alpha: args.compare_cpu },
+        labels: Labels::None,
         background: [0.1, 0.2, 0.3],
         antialiased: false,
         near: 0.05,
@@ -276,6 +277,7 @@ mod tests {
         let request = RenderRequest {
             camera,
             kinds: Kinds::ALL,
+            labels: Labels::None,
             background: [0.0; 3],
             antialiased: false,
             near: 0.05,

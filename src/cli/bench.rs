@@ -17,7 +17,7 @@ use crate::{
     error::{Error, Result},
     jobs::{PipelineMaker, SceneMaker, Work},
     pipeline::Engine,
-    render::{Kinds, RenderRequest},
+    render::{Kinds, Labels, RenderRequest},
     sample::{self, SampleOptions},
     scene::SceneOptions,
     service::default_near,
@@ -127,6 +127,7 @@ fn stages(args: &Args, config: &Config, out: &Output) -> Result<()> {
         let request = RenderRequest {
             camera: camera.camera,
             kinds: Kinds::COLOR,
+            labels: Labels::None,
             background: [0.0; 3],
             antialiased: false,
             near: default_near(made.report.median_depth),

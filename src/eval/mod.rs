@@ -26,7 +26,7 @@ use crate::{
     models::fit,
     photos,
     pipeline::{Engine, reconstruct},
-    render::{Kinds, RenderRequest, Renderer, compose, cpu::CpuRenderer},
+    render::{Kinds, Labels, RenderRequest, Renderer, compose, cpu::CpuRenderer},
     scene::{Camera, Photo, PosedPhoto, Provenance, Scene, SceneId, SceneMeta, SceneOptions},
 };
 
@@ -164,6 +164,7 @@ fn judge(
     let request = RenderRequest {
         camera: target.camera,
         kinds: Kinds { color: true, depth: true, alpha: false },
+        labels: Labels::None,
         background: [0.0; 3],
         antialiased: false,
         near,

@@ -7,10 +7,12 @@ pub mod compose;
 pub mod constants;
 pub mod cpu;
 pub mod gpu;
+pub mod labels;
 pub mod oracle;
 pub mod select;
 pub mod view;
 
+pub use self::labels::{Entries, Labels};
 use crate::{
     error::Result,
     scene::{Camera, Gaussians},
@@ -32,15 +34,19 @@ impl Kinds {
     pub const ALL: Self = Self { color: true, depth: true, alpha: true };
     /// Colour alone.
     pub const COLOR: Self = Self { color: true, depth: false, alpha: false };
+    /// No picture: labels alone.
+    pub const NONE: Self = Self { color: false, depth: false, alpha: false };
 }
 
 /// One view to render.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct RenderRequest {
     /// The camera; its intrinsics carry the picture's size.
     pub camera: Camera,
     /// Pictures wanted.
     pub kinds: Kinds,
+    /// Labels wanted, from the same pass.
+    pub labels: Labels,
     /// Background colour, 0..1, sRGB like the photos.
     pub background: [f32; 3],
     /// gsplat's antialiased mode: opacity compensated for the 0.3 px² blur.
@@ -71,6 +77,10 @@ pub struct Frame {
     pub depth: Option<Vec<f32>>,
     /// `[H * W]` accumulated opacity, 0..1.
     pub alpha: Option<Vec<f32>>,
+    /// `[H * W]` rows of [`Labels::Blend`], blended.
+    pub blend: Option<Vec<[f32; 4]>>,
+    /// What [`Labels::Entries`] asks for.
+    pub entries: Option<Entries>,
     /// Counts.
     pub stats: FrameStats,
 }

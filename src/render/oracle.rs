@@ -4,11 +4,13 @@
 //! Thresholds make cliffs: where alpha is next to 1/255, a ray next to its end, or two depths next
 //! to each other, a renderer may fall on the other side and be right. Such pixels are marked.
 
+use std::collections::BTreeMap;
+
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::{
-    RenderRequest,
+    Labels, RenderRequest,
     constants::{
         ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FRUSTUM_MARGIN, SH_C0, SH_C1, SH_C2, SH_C3, SH_OFFSET,
         TRANSMITTANCE_MIN,
@@ -63,7 +65,7 @@ impl Cliff {
 }
 
 /// One pixel.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct OraclePixel {
     /// Colour over the background.
     pub color: [f64; 3],
@@ -71,6 +73,10 @@ pub struct OraclePixel {
     pub depth: f64,
     /// Accumulated opacity.
     pub alpha: f64,
+    /// Blended rows of the request's table; zeros where none was given.
+    pub blend: [f64; 4],
+    /// Weight of each index but 0, where entries were asked for.
+    pub entries: BTreeMap<u16, f64>,
     /// Edges it stands on.
     pub cliff: Cliff,
 }
@@ -118,7 +124,7 @@ pub fn render_pixels(
             row.iter()
                 .map(|&i| {
                     let center = DVec2::new(f64::from(pixels[i][0]) + 0.5, y);
-                    (i, pixel(&near, center, request.background))
+                    (i, pixel(&near, center, request))
                 })
                 .collect()
         })
@@ -140,6 +146,7 @@ struct Splat {
     opacity: f64,
     depth: f64,
     color: DVec3,
+    label: u16,
 }
 
 fn splat(
@@ -202,6 +209,7 @@ fn splat(
         opacity,
         depth: t.z,
         color: color(&gaussians.sh()[i * k..(i + 1) * k], from_eye.normalize_or_zero()),
+        label: gaussians.semantic_index()[i],
     })
 }
 
@@ -235,11 +243,13 @@ fn color(sh: &[[f32; 3]], DVec3 { x, y, z }: DVec3) -> DVec3 {
 }
 
 /// Composites the Gaussians of `near` (depth order) at one pixel centre.
-fn pixel(near: &[&Splat], center: DVec2, background: [f32; 3]) -> OraclePixel {
+fn pixel(near: &[&Splat], center: DVec2, request: &RenderRequest) -> OraclePixel {
     let alpha_min = f64::from(ALPHA_MIN);
     let stop = f64::from(TRANSMITTANCE_MIN);
     let mut transmittance = 1.0;
     let (mut color, mut depth, mut alpha_sum) = (DVec3::ZERO, 0.0, 0.0);
+    let mut blend = [0.0; 4];
+    let mut entries = BTreeMap::new();
     let mut cliff = Cliff::default();
     let mut last_depth = f64::NEG_INFINITY;
     for splat in near {
@@ -261,13 +271,26 @@ fn pixel(near: &[&Splat], center: DVec2, background: [f32; 3]) -> OraclePixel {
         color += weight * splat.color;
         depth += weight * splat.depth;
         alpha_sum += weight;
+        match &request.labels {
+            Labels::None => {}
+            Labels::Blend(table) => {
+                let row = table.get(usize::from(splat.label)).or_else(|| table.first());
+                for (sum, value) in blend.iter_mut().zip(row.into_iter().flatten()) {
+                    *sum += weight * f64::from(*value);
+                }
+            }
+            Labels::Entries if splat.label == 0 => {}
+            Labels::Entries => *entries.entry(splat.label).or_insert(0.0) += weight,
+        }
         transmittance = next;
     }
-    let background = DVec3::from(background.map(f64::from));
+    let background = DVec3::from(request.background.map(f64::from));
     OraclePixel {
         color: (color + (1.0 - alpha_sum) * background).into(),
         depth: if alpha_sum > 0.0 { depth / alpha_sum } else { 0.0 },
         alpha: alpha_sum,
+        blend,
+        entries,
         cliff,
     }
 }

@@ -43,7 +43,8 @@ impl View {
     ///
     /// # Errors
     /// `invalid_request` when the intrinsics are unusable, the near plane is not a finite number
-    /// over 0, or the background is not finite; `limit_exceeded` for a picture beyond memory.
+    /// over 0, or background or labels are not finite; `limit_exceeded` for a picture beyond
+    /// memory.
     pub fn new(origin: DVec3, request: &RenderRequest) -> Result<Self> {
         let lens = request.camera.intrinsics.validated("camera")?;
         if !(request.near.is_finite() && request.near > 0.0) {
@@ -55,6 +56,7 @@ impl View {
         if let Some(value) = request.background.iter().find(|value| !value.is_finite()) {
             return Err(Error::invalid(format!("background holds {value}, not a finite number")));
         }
+        request.labels.check()?;
         let (pixels, pixels_max) = (u64::from(lens.width) * u64::from(lens.height), PIXELS_MAX);
         if pixels > pixels_max || lens.width.max(lens.height) > SIDE_MAX {
             return Err(Error::limit(

@@ -215,6 +215,24 @@ impl Gaussians {
         }
     }
 
+    /// The same Gaussians with other bank indices, `[N]`.
+    ///
+    /// # Errors
+    /// `internal` when the number of indices is another.
+    pub fn with_semantic_index(&self, semantic_index: Vec<u16>) -> Result<Self> {
+        if semantic_index.len() != self.len() {
+            return Err(Error::internal(format!(
+                "gaussians: semantic_index has {} rows, not {}",
+                semantic_index.len(),
+                self.len()
+            )));
+        }
+        Ok(Self {
+            raw: RawGaussians { semantic_index, ..self.raw.clone() },
+            identity: NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed),
+        })
+    }
+
     /// Number that no other content of this process has; clones share it, for they cannot change.
     ///
     /// A renderer keeps what it uploaded under this number.

@@ -13,7 +13,7 @@ use super::{
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    render::{Kinds, RenderRequest, Renderer, compose},
+    render::{Kinds, Labels, RenderRequest, Renderer, compose},
     scene::{Camera, Scene, SceneCamera, SceneId, SceneState},
     store::Record,
 };
@@ -47,6 +47,7 @@ impl Resolved {
                 depth: has(Kind::Depth),
                 alpha: has(Kind::Alpha),
             },
+            labels: Labels::None,
             background: self.background.unwrap_or_default(),
             antialiased: self.antialiased,
             near: self.near,

@@ -4,7 +4,7 @@
 
 use segsplat::{
     error::ErrorCode,
-    render::{Frame, RenderRequest, Renderer, cpu::CpuRenderer},
+    render::{Frame, Labels, RenderRequest, Renderer, cpu::CpuRenderer},
     scene::{Gaussians, RawGaussians},
 };
 
@@ -138,7 +138,7 @@ fn a_request_that_cannot_be_drawn_is_refused_by_name() {
     let gaussians = cloud(10, 0, 1);
     let good = request(camera(20, 20));
     let with = |change: &dyn Fn(&mut RenderRequest)| {
-        let mut request = good;
+        let mut request = good.clone();
         change(&mut request);
         cpu.render(&gaussians, &request).expect_err("a request that cannot be drawn")
     };
@@ -150,6 +150,7 @@ fn a_request_that_cannot_be_drawn_is_refused_by_name() {
         (with(&|r| r.camera.intrinsics.fx = 0.0), "fx"),
         (with(&|r| r.camera.intrinsics.cy = f64::NAN), "cy"),
         (with(&|r| r.background[1] = f32::INFINITY), "background"),
+        (with(&|r| r.labels = Labels::Blend([[0.0, f32::NAN, 0.0, 0.0]].into())), "labels"),
     ];
     for (error, named) in invalid {
         assert_eq!(error.code(), ErrorCode::InvalidRequest, "{error}");

@@ -17,6 +17,7 @@ mod geometry;
 mod grpc;
 mod http;
 mod jobs;
+mod labels;
 mod magnify;
 mod oracle;
 mod photos;

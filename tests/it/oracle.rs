@@ -76,7 +76,7 @@ fn a_turned_and_moved_camera_agrees() {
 fn the_antialiased_mode_agrees_and_differs_from_the_plain_one() {
     let gaussians = cloud(4_000, 0, 41);
     let plain = request(camera(96, 96));
-    let smooth = RenderRequest { antialiased: true, ..plain };
+    let smooth = RenderRequest { antialiased: true, ..plain.clone() };
     judge("antialiased", &gaussians, &smooth);
     let pictures = [plain, smooth].map(|r| cpu().render(&gaussians, &r).expect("a picture").color);
     assert_ne!(pictures[0], pictures[1], "antialiased must change the picture");
@@ -141,7 +141,7 @@ fn coordinates_far_from_zero_agree_with_the_scene_at_zero() {
     raw.origin += far_off;
     let far = checked(raw);
     let here = request(camera(96, 64));
-    let mut there = here;
+    let mut there = here.clone();
     let mut pose = here.camera.camera_to_world.to_row_major();
     for axis in 0..3 {
         pose[4 * axis + 3] += far_off[axis];
@@ -159,7 +159,7 @@ fn coordinates_far_from_zero_agree_with_the_scene_at_zero() {
 fn a_wrong_renderer_is_caught() {
     let (gaussians, camera) = two_views(64, 3);
     let right = request(camera);
-    let mut wrong = right;
+    let mut wrong = right.clone();
     wrong.camera.intrinsics.cx += 0.01;
     let frame = cpu().render(&gaussians, &wrong).expect("a picture");
     let truth = oracle::render(&gaussians, &right).expect("the truth");

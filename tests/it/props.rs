@@ -88,7 +88,7 @@ proptest! {
             let q = rotation * DQuat::from_xyzw(x, y, z, w);
             moved.quats[i] = [q.w, q.x, q.y, q.z].map(|v| v as f32);
         }
-        let mut after = before;
+        let mut after = before.clone();
         let pose = glam::DMat4::from(motion) * before.camera.camera_to_world.matrix();
         after.camera.camera_to_world =
             CameraToWorld::from_row_major(&pose.transpose().to_cols_array(), "moved").unwrap();
@@ -208,7 +208,7 @@ fn only_the_kinds_asked_for_are_made_and_they_are_the_same() {
     let full = draw(&gaussians, &all);
     for bits in 0..8 {
         let kinds = Kinds { color: bits & 1 > 0, depth: bits & 2 > 0, alpha: bits & 4 > 0 };
-        let frame = draw(&gaussians, &RenderRequest { kinds, ..all });
+        let frame = draw(&gaussians, &RenderRequest { kinds, ..all.clone() });
         assert_eq!(frame.color, full.color.clone().filter(|_| kinds.color), "{kinds:?}");
         assert_eq!(frame.depth, full.depth.clone().filter(|_| kinds.depth), "{kinds:?}");
         assert_eq!(frame.alpha, full.alpha.clone().filter(|_| kinds.alpha), "{kinds:?}");

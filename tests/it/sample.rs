@@ -7,7 +7,7 @@ use segsplat::{
     error::ErrorCode,
     eval::psnr,
     pipeline::{self, Engine},
-    render::{Kinds, RenderRequest, Renderer, cpu::CpuRenderer},
+    render::{Kinds, Labels, RenderRequest, Renderer, cpu::CpuRenderer},
     sample::{self, Room, SampleOptions},
     scene::SceneOptions,
 };
@@ -38,6 +38,7 @@ fn the_sample_is_reconstructed_close_to_its_truth() {
     let request = RenderRequest {
         camera,
         kinds: Kinds::ALL,
+        labels: Labels::None,
         background: [0.0; 3],
         antialiased: false,
         near: 0.01 * made.report.median_depth as f32,

@@ -13,7 +13,7 @@ use segsplat::{
             CpuRenderer, emit_isects, prefix_sum, project,
             project::{Footprint, Projected},
             radix_sort,
-            rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
+            rasterize::{Paint, RowOut, Tile, TileScratch, rasterize_tile},
             shade, tile_ranges,
             tiles::Grid,
         },
@@ -318,6 +318,7 @@ fn rasterize_twin() {
             color: Some(&mut color[first..]),
             depth: Some(&mut depth[first..]),
             alpha: Some(&mut alpha[first..]),
+            ..RowOut::default()
         };
         for tile_x in 0..view.tiles_x() {
             let id = (tile_y * view.tiles_x() + tile_x) as usize;
@@ -326,7 +327,7 @@ fn rasterize_twin() {
                 &projected.footprints,
                 &isects[ranges[id] as usize..ranges[id + 1] as usize],
                 tile,
-                request.background,
+                &Paint::new(&request, gaussians.semantic_index()),
                 96,
                 &mut TileScratch::default(),
                 &mut out,

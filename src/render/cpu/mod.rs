@@ -24,12 +24,13 @@ use rayon::prelude::*;
 use self::{
     project::Projected,
     radix_sort::{key, pack, value},
-    rasterize::{RowOut, Tile, TileScratch},
+    rasterize::{Paint, RowOut, Tile, TileScratch},
     tiles::Grid,
 };
 use super::{
-    Frame, FrameStats, RenderRequest, Renderer,
+    Entries, Frame, FrameStats, Labels, RenderRequest, Renderer,
     constants::{ISECTS_MAX, TILE_SIZE},
+    labels::EntryRows,
     view::View,
 };
 use crate::{
@@ -96,10 +97,17 @@ impl CpuRenderer {
             visible.map(|(i, _)| pack(projected.footprints[i as usize].depth.to_bits(), i)),
         );
         radix_sort::radix_sort(sorted, spare, u32::BITS);
-        shade::shade(gaussians, &view, projected);
+        if request.kinds.color {
+            shade::shade(gaussians, &view, projected);
+        }
         frame.stats.visible = sorted.len() as u64;
         let grid = Grid { width: view.width, height: view.height, tile_rows: 0..view.tiles_y() };
-        self.draw_band(&grid, request, &mut scratch, &mut frame)?;
+        let mut band =
+            Band { paint: Paint::new(request, gaussians.semantic_index()), entries: Vec::new() };
+        self.draw_band(&grid, &mut band, &mut scratch, &mut frame)?;
+        if request.labels == Labels::Entries {
+            frame.entries = Some(Entries::join(band.entries)?);
+        }
         if gaussians.len() <= KEPT_GAUSSIANS_MAX {
             self.frames.give(scratch);
         }
@@ -110,7 +118,7 @@ impl CpuRenderer {
     fn draw_band(
         &self,
         grid: &Grid,
-        request: &RenderRequest,
+        band: &mut Band<'_>,
         scratch: &mut FrameScratch,
         frame: &mut Frame,
     ) -> Result<()> {
@@ -135,7 +143,7 @@ impl CpuRenderer {
             }
             let middle = start.midpoint(end);
             for tile_rows in [start..middle, middle..end] {
-                self.draw_band(&Grid { tile_rows, ..grid.clone() }, request, scratch, frame)?;
+                self.draw_band(&Grid { tile_rows, ..grid.clone() }, band, scratch, frame)?;
             }
             return Ok(());
         }
@@ -144,7 +152,7 @@ impl CpuRenderer {
         let tile_bits = u32::BITS - (grid.tile_count() - 1).leading_zeros();
         radix_sort::radix_sort(&mut scratch.isects, spare, tile_bits);
         tile_ranges::tile_ranges(&scratch.isects, grid.tile_count(), &mut scratch.ranges);
-        self.rasterize(grid, request, scratch, frame);
+        self.rasterize(grid, band, scratch, frame);
         Ok(())
     }
 
@@ -152,13 +160,14 @@ impl CpuRenderer {
     fn rasterize(
         &self,
         grid: &Grid,
-        request: &RenderRequest,
+        band: &mut Band<'_>,
         scratch: &FrameScratch,
         frame: &mut Frame,
     ) {
         let tiles_x = grid.tiles_x();
-        let rows = band_rows(frame, grid);
-        rows.into_par_iter().with_max_len(1).enumerate().for_each(|(row, mut out)| {
+        let paint = band.paint;
+        let rows = band_rows(frame, grid, *paint.labels() == Labels::Entries);
+        let drawn = rows.into_par_iter().with_max_len(1).enumerate().map(|(row, mut out)| {
             let mut tile_scratch = self.tiles.take();
             let y = (grid.tile_rows.start + row as u32) * TILE_SIZE;
             for tile_x in 0..tiles_x {
@@ -177,14 +186,17 @@ impl CpuRenderer {
                     &scratch.projected.footprints,
                     isects,
                     tile,
-                    request.background,
+                    &paint,
                     grid.width,
                     &mut tile_scratch,
                     &mut out,
                 );
             }
             self.tiles.give(tile_scratch);
+            out.entries
         });
+        let drawn: Vec<Option<EntryRows>> = drawn.collect();
+        band.entries.extend(drawn.into_iter().flatten());
     }
 }
 
@@ -196,6 +208,12 @@ impl Renderer for CpuRenderer {
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         self.threads.install(|| self.draw(gaussians, request))
     }
+}
+
+/// What the bands of a frame share, and their entries from top to bottom.
+struct Band<'a> {
+    paint: Paint<'a>,
+    entries: Vec<EntryRows>,
 }
 
 /// Buffers of a frame, named as the stages name them.
@@ -232,23 +250,32 @@ fn blank(view: &View, request: &RenderRequest) -> Frame {
         color: request.kinds.color.then(|| vec![[0.0; 3]; pixels]),
         depth: request.kinds.depth.then(|| vec![0.0; pixels]),
         alpha: request.kinds.alpha.then(|| vec![0.0; pixels]),
+        blend: matches!(request.labels, Labels::Blend(_)).then(|| vec![[0.0; 4]; pixels]),
+        entries: None,
         stats: FrameStats::default(),
     }
 }
 
 /// The pictures of a band, cut into rows of tiles.
-fn band_rows<'a>(frame: &'a mut Frame, grid: &Grid) -> Vec<RowOut<'a>> {
+fn band_rows<'a>(frame: &'a mut Frame, grid: &Grid, entries: bool) -> Vec<RowOut<'a>> {
     let stride = frame.width as usize * TILE_SIZE as usize;
     let first = grid.tile_rows.start as usize;
     let mut color = frame.color.as_mut().map(|all| all.chunks_mut(stride).skip(first));
     let mut depth = frame.depth.as_mut().map(|all| all.chunks_mut(stride).skip(first));
     let mut alpha = frame.alpha.as_mut().map(|all| all.chunks_mut(stride).skip(first));
+    let mut blend = frame.blend.as_mut().map(|all| all.chunks_mut(stride).skip(first));
+    let width = grid.width as usize;
     grid.tile_rows
         .clone()
-        .map(|_| RowOut {
+        .map(|tile_row| RowOut {
             color: color.as_mut().and_then(Iterator::next),
             depth: depth.as_mut().and_then(Iterator::next),
             alpha: alpha.as_mut().and_then(Iterator::next),
+            blend: blend.as_mut().and_then(Iterator::next),
+            entries: entries.then(|| {
+                let rows = TILE_SIZE.min(grid.height - tile_row * TILE_SIZE);
+                EntryRows::new(rows as usize, width)
+            }),
         })
         .collect()
 }

@@ -11,7 +11,9 @@ use super::{
 };
 use crate::{
     error::{Error, Result},
-    render::{Frame, FrameStats, Kinds, RenderRequest, constants::TILE_SIZE, view::View},
+    render::{
+        Entries, Frame, FrameStats, Kinds, Labels, RenderRequest, constants::TILE_SIZE, view::View,
+    },
 };
 
 /// Fewest Gaussian-tile pairs that room is made for.
@@ -29,6 +31,8 @@ pub(super) fn background(view: &View, request: &RenderRequest) -> Frame {
         color: request.kinds.color.then(|| vec![request.background; pixels]),
         depth: request.kinds.depth.then(|| vec![0.0; pixels]),
         alpha: request.kinds.alpha.then(|| vec![0.0; pixels]),
+        blend: matches!(request.labels, Labels::Blend(_)).then(|| vec![[0.0; 4]; pixels]),
+        entries: (request.labels == Labels::Entries).then(|| Entries::none(pixels)),
         stats: FrameStats::default(),
     }
 }

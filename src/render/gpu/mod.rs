@@ -24,9 +24,13 @@ use self::{
     recorder::Scratch,
 };
 use super::{
-    Frame, RenderRequest, Renderer, constants::ISECTS_MAX, select::AdapterReport, view::View,
+    Frame, Labels, RenderRequest, Renderer, constants::ISECTS_MAX, select::AdapterReport,
+    view::View,
 };
-use crate::{error::Result, scene::Gaussians};
+use crate::{
+    error::{Error, ErrorCode, Result},
+    scene::Gaussians,
+};
 
 /// Bytes of scenes kept on the device.
 const SCENE_BYTES_MAX: u64 = 2 << 30;
@@ -149,6 +153,12 @@ impl Renderer for GpuRenderer {
         let view = View::new(gaussians.origin(), request)?;
         if gaussians.is_empty() {
             return Ok(frame::background(&view, request));
+        }
+        if request.labels != Labels::None {
+            return Err(Error::new(
+                ErrorCode::GpuUnavailable,
+                "labels are not drawn by the GPU renderer",
+            ));
         }
         self.with_engine(|engine| {
             let count = narrow("gaussians", gaussians.len())?;

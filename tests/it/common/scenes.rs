@@ -3,7 +3,7 @@
 
 use glam::{DVec3, Quat, Vec3};
 use segsplat::{
-    render::{Kinds, RenderRequest},
+    render::{Kinds, Labels, RenderRequest},
     scene::{Camera, CameraToWorld, Gaussians, Intrinsics, RawGaussians, SourcePixel},
 };
 
@@ -80,6 +80,7 @@ pub(crate) fn request(camera: Camera) -> RenderRequest {
     RenderRequest {
         camera,
         kinds: Kinds::ALL,
+        labels: Labels::None,
         background: [0.1, 0.2, 0.3],
         antialiased: false,
         near: 0.05,

@@ -20,7 +20,7 @@ use segsplat::{
     jobs::{Made, SceneMaker, Work},
     limits::Limits,
     photos,
-    render::{Frame, FrameStats, RenderRequest, Renderer},
+    render::{Entries, Frame, FrameStats, Labels, RenderRequest, Renderer},
     sample::{self, SampleOptions},
     scene::{
         Backdrop, Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SceneId,
@@ -212,8 +212,9 @@ impl Renderer for PointRenderer {
         let viewmat = request.camera.camera_to_world.viewmat();
         let pixels = lens.width as usize * lens.height as usize;
         let (mut color, mut depth) = (vec![request.background; pixels], vec![0.0_f32; pixels]);
+        let mut labels = vec![0; pixels];
         let mut stats = FrameStats::default();
-        for (mean, sh) in gaussians.means().iter().zip(gaussians.sh()) {
+        for (i, (mean, sh)) in gaussians.means().iter().zip(gaussians.sh()).enumerate() {
             let world = DVec3::from_array(mean.map(f64::from)) + gaussians.as_raw().origin;
             let at = viewmat.transform_point3(world);
             let (u, v) = lens.project(at);
@@ -226,16 +227,35 @@ impl Renderer for PointRenderer {
             if depth[pixel] == 0.0 || depth[pixel] > at.z as f32 {
                 depth[pixel] = at.z as f32;
                 color[pixel] = sh.map(|v| v * 0.282_094_8 + 0.5);
+                labels[pixel] = gaussians.semantic_index()[i];
             }
             stats.visible += 1;
         }
-        let alpha = depth.iter().map(|&z| f32::from(u8::from(z > 0.0))).collect();
+        let alpha: Vec<f32> = depth.iter().map(|&z| f32::from(u8::from(z > 0.0))).collect();
+        let blend = match &request.labels {
+            Labels::Blend(table) => {
+                let row = |(&m, &a): (&u16, &f32)| Labels::row(table, m).map(|v| v * a);
+                Some(labels.iter().zip(&alpha).map(row).collect())
+            }
+            _ => None,
+        };
+        let entries = (request.labels == Labels::Entries).then(|| {
+            let mut entries = Entries { offsets: vec![0], ..Entries::default() };
+            for &label in &labels {
+                entries.index.extend((label != 0).then_some(label));
+                entries.offsets.push(entries.index.len() as u32);
+            }
+            entries.weight = vec![1.0; entries.index.len()];
+            entries
+        });
         Ok(Frame {
             width: lens.width,
             height: lens.height,
             color: request.kinds.color.then_some(color),
             depth: request.kinds.depth.then_some(depth),
             alpha: request.kinds.alpha.then_some(alpha),
+            blend,
+            entries,
             stats,
         })
     }
