@@ -102,7 +102,8 @@ class Decoder(nn.Module):
 
     def waves_of(self, xy):
         """[..., 2] in -1..1 -> [..., DIM]."""
-        a = (xy @ self.waves) * math.pi
+        # Not a matrix product: a coordinate must not be rounded to half precision in training.
+        a = (xy[..., :1] * self.waves[0] + xy[..., 1:] * self.waves[1]) * math.pi
         return torch.cat([a.sin(), a.cos()], -1)
 
     def grid(self, h, w, device):
@@ -121,7 +122,7 @@ class Decoder(nn.Module):
         h, w = pixel.shape[-2:]
         # As SAM's ONNX file: a coordinate is a pixel, its centre half a pixel on.
         xy = (coords + 0.5) / self.side * 2 - 1
-        at = torch.cat([F.grid_sample(m, xy.reshape(g, 1, b * n, 2).to(m.dtype), align_corners=False, padding_mode="border")[:, :, 0] for m in (pixel, coarse)], 1)
+        at = torch.cat([F.grid_sample(m, xy.reshape(g, 1, b * n, 2), align_corners=False, padding_mode="border")[:, :, 0] for m in (pixel, coarse)], 1)
         given = (labels >= 0).to(e.dtype)[..., None]
         point = self.sampled(at.transpose(1, 2)).reshape(g, b, n, DIM) + self.waves_of(xy).to(e.dtype)
         point = point * given + self.label((labels + 1).clamp(0, 2).long())
@@ -153,14 +154,15 @@ class Decoder(nn.Module):
         hidden = hidden.reshape(g, rows * HIDDEN, NARROW + 3)
         logits = direct @ flat + offset
         # What lies where, seen from the point: x, y and distance from it.
-        centre = first.repeat_interleave(LEVELS, 1).repeat_interleave(HIDDEN, 1).to(pixel.dtype)
-        grid = self.grid(h, w, pixel.device).reshape(1, h * w, 2).transpose(1, 2).to(pixel.dtype)
+        centre = first.repeat_interleave(LEVELS, 1).repeat_interleave(HIDDEN, 1)
+        grid = self.grid(h, w, pixel.device).reshape(1, h * w, 2).transpose(1, 2)
         wx, wy, wd = hidden[..., NARROW : NARROW + 1], hidden[..., NARROW + 1 : NARROW + 2], hidden[..., NARROW + 2 :]
         shift = bias.reshape(g, rows * HIDDEN, 1) - wx * centre[..., :1] - wy * centre[..., 1:]
-        spatial = torch.cat([hidden[..., :NARROW], wx, wy], -1) @ torch.cat([flat[:, :NARROW], grid.expand(g, -1, -1)], 1) + shift
-        f = first.repeat_interleave(LEVELS, 1).to(pixel.dtype)
+        seen = torch.cat([flat[:, :NARROW], grid.expand(g, -1, -1).to(flat.dtype)], 1)
+        spatial = torch.cat([hidden[..., :NARROW], wx, wy], -1) @ seen + shift.to(flat.dtype)
+        f = first.repeat_interleave(LEVELS, 1)
         d2 = (grid[:, :1].expand(g, 1, -1) - f[..., :1]) ** 2 + (grid[:, 1:] - f[..., 1:]) ** 2
-        near = torch.exp(-d2 * 12.0)
+        near = torch.exp(-d2 * 12.0).to(flat.dtype)
         hid = spatial.reshape(g, rows, HIDDEN, h * w) + wd.reshape(g, rows, HIDDEN, 1) * near[:, :, None]
         logits = logits + (out.reshape(g, rows, 1, HIDDEN) @ hid.relu())[:, :, 0]
         return logits

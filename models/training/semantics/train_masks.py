@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from PIL import Image
 
 from masks_model import LEVELS, MaskNet
-from views import Photographs, Rooms, extension
+from views import KIND, SETS, Photographs, Rooms, extension, join
 
 SIDE, PROMPTS = 512, 24
 
@@ -77,7 +77,7 @@ def iou_of(logits, target):
 
 def loss_of(net, rgb, whole, part, gen):
     coords, labels, tw, tp = prompts(whole, part, PROMPTS, gen)
-    with torch.autocast("cuda", dtype=torch.bfloat16):
+    with torch.autocast(KIND, dtype=torch.bfloat16):
         masks, iou = net(normalised(rgb).contiguous(memory_format=torch.channels_last), coords, labels)
     masks, iou = masks.float(), iou.float()
     m = masks.flatten(0, 1)
@@ -104,7 +104,7 @@ def score(net, rgb, whole, part, seed):
     gen = torch.Generator(device=rgb.device).manual_seed(seed)
     coords, labels, tw, _ = prompts(whole, part, 32, gen, exponent=0.5)
     labels[..., 1] = -1
-    with torch.autocast("cuda", dtype=torch.bfloat16):
+    with torch.autocast(KIND, dtype=torch.bfloat16):
         masks, iou = net(normalised(rgb), coords, labels)
     with_whole = iou_of(masks.float(), tw[:, :, None].expand(-1, -1, LEVELS, -1, -1))
     ok = (labels[..., 0] == 1).float()
@@ -125,7 +125,7 @@ def look(net, path, device, side=24):
     gx = (torch.arange(side, device=device) + 0.5) / side * w
     gy = (torch.arange(side, device=device) + 0.5) / side * h
     pts = torch.stack([gx[None].expand(side, side), gy[:, None].expand(side, side)], -1).reshape(1, -1, 1, 2)
-    with torch.autocast("cuda", dtype=torch.bfloat16):
+    with torch.autocast(KIND, dtype=torch.bfloat16):
         e = net.encoder(x)
         masks, iou = net.decoder.many(e, pts, torch.ones(pts.shape[:3], device=device))
     m, s = masks[0, :, 2].float(), iou[0, :, 2].float()
@@ -158,10 +158,7 @@ def main():
     ap.add_argument("--lr", type=float, default=8e-4)
     ap.add_argument("--batch", type=int, default=8)
     args = ap.parse_args()
-    dist.init_process_group("nccl")
-    rank, world = dist.get_rank(), dist.get_world_size()
-    device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
-    torch.cuda.set_device(device)
+    rank, world, device = join()
     torch.manual_seed(100 + rank), random.seed(rank), np.random.seed(rank)
     torch.backends.cuda.matmul.allow_tf32 = True
     torch.backends.cudnn.benchmark = True
@@ -177,11 +174,13 @@ def main():
     net = net.to(device).to(memory_format=torch.channels_last)
     ema = MaskNet(SIDE).to(device)
     ema.load_state_dict(net.state_dict())
+    pairs = [(a, b) for a, b in zip(ema.state_dict().values(), net.state_dict().values()) if a.is_floating_point()]
+    kept, live = [p[0] for p in pairs], [p[1] for p in pairs]
     body = list(net.encoder.body.parameters())
     ids = {id(p) for p in body}
     rest = [p for p in net.parameters() if id(p) not in ids]
     opt = torch.optim.AdamW([{"params": body, "k": 0.3}, {"params": rest, "k": 1.0}], lr=args.lr, weight_decay=0.02, betas=(0.9, 0.98))
-    model = torch.nn.parallel.DistributedDataParallel(net, device_ids=[device.index], broadcast_buffers=False)
+    model = torch.nn.parallel.DistributedDataParallel(net, device_ids=[device.index] if device.type == "cuda" else None, broadcast_buffers=False)
     os.makedirs(args.out, exist_ok=True)
     log = open(os.path.join(args.out, f"masks{rank}.jsonl"), "w")
     if rank == 0:
@@ -191,7 +190,7 @@ def main():
     def evaluate(tag):
         ema.eval()
         rows = {}
-        for source in ("coco", "bsds", "camvid", "human"):
+        for source in SETS:
             pick = [i for i, k in enumerate(held.kind) if k[0] == source]
             got = [score(ema, held.rgb[i : i + 1].float() / 255, held.whole[i : i + 1].int(), held.fine[i : i + 1].int(), i) for i in pick]
             rows[source] = [round(float(np.mean([g[c] for g in got])), 3) for c in range(3)]
@@ -231,9 +230,7 @@ def main():
         if torch.isfinite(norm):
             opt.step()
         decay = min(0.999, (step + 1) / (step + 10))
-        with torch.no_grad():
-            for a, b in zip(ema.state_dict().values(), net.state_dict().values()):
-                a.lerp_(b, 1 - decay) if a.is_floating_point() else a.copy_(b)
+        torch._foreach_lerp_(kept, live, 1 - decay)
         sums += torch.stack([loss.detach(), iou.detach(), norm.detach()])
         n += 1
         step += 1

@@ -11,6 +11,7 @@ import tarfile
 
 import numpy as np
 import torch
+import torch.distributed as dist
 import torch.nn.functional as F
 from PIL import Image
 from torch.utils.cpp_extension import load
@@ -25,6 +26,20 @@ from heldout import heldout  # noqa: E402
 
 def extension():
     return load("raycast", [os.path.join(GEOMETRY, "raycast.cu")], extra_cflags=["-O3"], extra_cuda_cflags=["-O3", "--use_fast_math"])
+
+
+# What computes: a GPU, or, to try a script out, the processor.
+KIND = "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def join():
+    """Rank, number of processes and device of this process of a torchrun."""
+    dist.init_process_group("nccl" if KIND == "cuda" else "gloo")
+    device = torch.device("cpu")
+    if KIND == "cuda":
+        device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        torch.cuda.set_device(device)
+    return dist.get_rank(), dist.get_world_size(), device
 
 
 class Rooms(World):
@@ -104,45 +119,41 @@ def _regions(label):
     return out
 
 
-def regions(data, part):
-    """(rgb, whole, part, names) of every photograph with drawn regions; `part`: "train" or "heldout"."""
+SETS = ("coco_panoptic_200", "bsds500", "camvid", "human_seg")
+
+
+def regions(data, part, sets=SETS):
+    """(set, rgb, whole, part, names) of the photographs with drawn regions; `part`: "train" or "heldout"."""
     want = part == "heldout"
+    for name in sets:
+        yield from _of_set(data, name, want)
 
-    def tar(name):
-        t = tarfile.open(os.path.join(data, name))
-        return t, sorted(n for n in t.getnames() if n.startswith("images/") and n.endswith(".jpg"))
 
-    def read(t, n):
-        return Image.open(io.BytesIO(t.extractfile(n).read()))
-
-    t, files = tar("coco_panoptic_200.tar")
-    seg = json.load(t.extractfile("segments.json"))
+def _of_set(data, name, want):
+    """One set's photographs whose `heldout` is `want`."""
+    t = tarfile.open(os.path.join(data, name + ".tar"))
+    files = sorted(n for n in t.getnames() if n.startswith("images/") and n.endswith(".jpg"))
+    read = lambda n: Image.open(io.BytesIO(t.extractfile(n).read()))
+    mask = lambda n: _fit(read(n), 512, Image.NEAREST).astype(np.int32)
+    segments = json.load(t.extractfile("segments.json")) if name == "coco_panoptic_200" else None
     for i, f in enumerate(files):
-        if heldout(i) == want:
-            m = _fit(read(t, f.replace("images", "masks").replace(".jpg", ".png")), 512, Image.NEAREST).astype(np.int32)
-            key = next(k for k in (f, os.path.basename(f), os.path.basename(f)[:-4]) if k in seg)
-            info = {s["index"]: s for s in seg[key]["segments"]}
+        if heldout(i) != want:
+            continue
+        stem = os.path.basename(f)[:-4]
+        rgb = _fit(read(f).convert("RGB"), 512, Image.BILINEAR)
+        if name == "coco_panoptic_200":
+            m = mask(f"masks/{stem}.png")
+            info = {s["index"]: s for s in segments[stem]["segments"]}
             whole = np.where(np.isin(m, [k for k, s in info.items() if not s["iscrowd"]]), m, -1)
-            yield "coco", _fit(read(t, f).convert("RGB"), 512, Image.BILINEAR), whole, None, {k: s["name"] for k, s in info.items()}
-    t, files = tar("bsds500.tar")
-    for i, f in enumerate(files):
-        if heldout(i) == want:
-            stem = os.path.basename(f)[:-4]
-            s = [_fit(read(t, f"segs/{stem}_{k}.png"), 512, Image.NEAREST).astype(np.int32) for k in (0, 2)]
-            yield "bsds", _fit(read(t, f).convert("RGB"), 512, Image.BILINEAR), _regions(s[0]), _regions(s[1]), {}
-    t, files = tar("camvid.tar")
-    for i, f in enumerate(files):
-        if heldout(i) == want:
-            m = _fit(read(t, f.replace("images", "labels").replace(".jpg", ".png")), 512, Image.NEAREST).astype(np.int32)
-            whole = _regions(m)
-            names = {int(whole[m == c][0]): c for c in np.unique(m)}
-            whole[m == 11] = -1
-            yield "camvid", _fit(read(t, f).convert("RGB"), 512, Image.BILINEAR), whole, None, {"class_of": m, **names}
-    t, files = tar("human_seg.tar")
-    for i, f in enumerate(files):
-        if heldout(i) == want:
-            m = _fit(read(t, f.replace("images", "masks").replace(".jpg", ".png")).convert("L"), 512, Image.NEAREST)
-            yield "human", _fit(read(t, f).convert("RGB"), 512, Image.BILINEAR), np.where(m > 127, 1, -1), None, {1: "person"}
+            yield name, rgb, whole, None, {k: s["name"] for k, s in info.items()}
+        elif name == "bsds500":
+            yield name, rgb, mask(f"segs/{stem}_0.png"), mask(f"segs/{stem}_2.png"), {}
+        elif name == "camvid":
+            m = mask(f"labels/{stem}.png")
+            yield name, rgb, np.where(m == 11, -1, _regions(m)), None, {"class_of": m}
+        else:
+            m = _fit(read(f"masks/{stem}.png").convert("L"), 512, Image.NEAREST)
+            yield name, rgb, np.where(m > 127, 1, -1), None, {1: "person"}
 
 
 class Photographs:
@@ -160,7 +171,7 @@ class Photographs:
         self.whole, self.fine = torch.stack(whole).to(device), torch.stack(fine).to(device)
         self.kind, self.size, self.device = kind, size, device
         self.shape = torch.tensor([k[1] for k in kind], device=device).float()
-        weight = {"coco": 3.0, "bsds": 1.0, "camvid": 0.5, "human": 1.0}
+        weight = {"coco_panoptic_200": 3.0, "bsds500": 1.0, "camvid": 0.5, "human_seg": 1.0}
         self.weight = torch.tensor([weight[k[0]] for k in kind], device=device)
         self.gen = torch.Generator(device=device).manual_seed(seed)
 
