@@ -37,18 +37,29 @@ pub fn renderer(config: &Config) -> Result<Arc<dyn Renderer>> {
 #[must_use]
 pub fn models_info(bundle: &Bundle, execution_provider: &str) -> ModelsInfo {
     let geometry = bundle.geometry();
+    let models = bundle.files().into_iter().map(|entry| {
+        let (views_max, sizes) = match entry.part {
+            "geometry" => (geometry.views_max, geometry.buckets.clone()),
+            "masks.encoder" => (1, bundle.masks().map(|m| [m.size; 2]).into_iter().collect()),
+            "image_text.image" => {
+                (1, bundle.image_text().map(|m| [m.image.size; 2]).into_iter().collect())
+            }
+            _ => (0, Vec::new()),
+        };
+        ModelInfo {
+            name: entry.part.to_owned(),
+            file: entry.file.to_owned(),
+            sha256: entry.sha256.to_owned(),
+            size_bytes: bundle.size_bytes(entry.file),
+            licence: entry.licence.to_owned(),
+            views_max,
+            sizes,
+        }
+    });
     ModelsInfo {
         bundle: bundle.name().to_owned(),
         bundle_sha256: bundle.sha256().to_owned(),
-        models: vec![ModelInfo {
-            name: "geometry".to_owned(),
-            file: geometry.file.clone(),
-            sha256: geometry.sha256.clone(),
-            size_bytes: bundle.geometry_size_bytes(),
-            licence: geometry.licence.clone(),
-            views_max: geometry.views_max,
-            sizes: geometry.buckets.clone(),
-        }],
+        models: models.collect(),
         execution_provider: execution_provider.to_owned(),
         ..ModelsInfo::default()
     }

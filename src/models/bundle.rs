@@ -14,7 +14,10 @@ use sha2::{Digest, Sha256};
 use crate::{
     config::Config,
     error::{Error, ErrorCode, Result},
-    models::SETUP_COMMAND,
+    models::{
+        SETUP_COMMAND,
+        manifest::{ImageTextManifest, MasksManifest, check_file},
+    },
 };
 
 /// Name of the manifest in a bundle's folder.
@@ -24,7 +27,7 @@ const EMBEDDED: &str = "models/embedded";
 /// Largest manifest read, bytes.
 const MANIFEST_BYTES_MAX: u64 = 1 << 20;
 /// Largest side of a bucket, pixels: `SourcePixel` counts in u16 and memory grows with the area.
-const BUCKET_SIDE_MAX: u32 = 4_096;
+pub(super) const BUCKET_SIDE_MAX: u32 = 4_096;
 
 /// A bundle whose files are those of its manifest.
 #[derive(Clone, Debug)]
@@ -40,6 +43,22 @@ struct BundleManifest {
     name: String,
     version: String,
     geometry: GeometryManifest,
+    masks: Option<MasksManifest>,
+    image_text: Option<ImageTextManifest>,
+}
+
+/// A file that the manifest names.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BundleFile<'a> {
+    /// What it is for: `geometry`, `masks.encoder`, `masks.decoder`, `image_text.image`,
+    /// `image_text.text`, `image_text.tokenizer`.
+    pub part: &'static str,
+    /// Name in the bundle's folder.
+    pub file: &'a str,
+    /// sha256 of the manifest, hex.
+    pub sha256: &'a str,
+    /// Licence of the weights.
+    pub licence: &'a str,
 }
 
 /// The rigid frame that a geometry network's outputs are in.
@@ -171,6 +190,12 @@ impl Bundle {
         let manifest: BundleManifest = toml::from_str(&text)
             .map_err(|e| unavailable(format!("model bundle: {MANIFEST}: {e}")))?;
         manifest.geometry.validate()?;
+        if let Some(masks) = &manifest.masks {
+            masks.validate()?;
+        }
+        if let Some(image_text) = &manifest.image_text {
+            image_text.validate()?;
+        }
         let bundle = Self { dir: dir.to_owned(), sha256: hex_of(text.as_bytes()), manifest };
         bundle.verify()?;
         Ok(bundle)
@@ -181,15 +206,14 @@ impl Bundle {
     /// # Errors
     /// `model_unavailable`, naming the file and both hashes.
     pub fn verify(&self) -> Result<()> {
-        let geometry = &self.manifest.geometry;
-        let path = self.geometry_path();
-        let found = sha256_of(&path).map_err(|e| missing(&geometry.file, e))?;
-        if found != geometry.sha256.to_lowercase() {
-            return Err(unavailable(format!(
-                "model bundle: {} is not the file of {MANIFEST}: sha256 {found}, not {}; restore \
-                 it (`git checkout -- {EMBEDDED}`)",
-                geometry.file, geometry.sha256
-            )));
+        for BundleFile { file, sha256, .. } in self.files() {
+            let found = sha256_of(&self.path(file)).map_err(|e| missing(file, e))?;
+            if found != sha256.to_lowercase() {
+                return Err(unavailable(format!(
+                    "model bundle: {file} is not the file of {MANIFEST}: sha256 {found}, not \
+                     {sha256}; restore it (`git checkout -- {EMBEDDED}`)"
+                )));
+            }
         }
         Ok(())
     }
@@ -218,29 +242,60 @@ impl Bundle {
         &self.manifest.geometry
     }
 
-    /// The geometry network's file.
+    /// The mask network's entry; `None`: the bundle has no semantics.
     #[must_use]
-    pub fn geometry_path(&self) -> PathBuf {
-        self.dir.join(&self.manifest.geometry.file)
+    pub fn masks(&self) -> Option<&MasksManifest> {
+        self.manifest.masks.as_ref()
     }
 
-    /// Size of the geometry network's file in bytes; 0 when it has gone.
+    /// The entry of image and text tower; `None`: the bundle has no semantics.
     #[must_use]
-    pub fn geometry_size_bytes(&self) -> u64 {
-        fs_err::metadata(self.geometry_path()).map_or(0, |meta| meta.len())
+    pub fn image_text(&self) -> Option<&ImageTextManifest> {
+        self.manifest.image_text.as_ref()
+    }
+
+    /// Every file that the manifest names, itself left out.
+    #[must_use]
+    pub fn files(&self) -> Vec<BundleFile<'_>> {
+        let BundleManifest { geometry, masks, image_text, .. } = &self.manifest;
+        let mut files = vec![BundleFile {
+            part: "geometry",
+            file: &geometry.file,
+            sha256: &geometry.sha256,
+            licence: &geometry.licence,
+        }];
+        if let Some(MasksManifest { encoder, decoder, licence, .. }) = masks {
+            let entry = |part, file, sha256| BundleFile { part, file, sha256, licence };
+            files.push(entry("masks.encoder", &encoder.file, &encoder.sha256));
+            files.push(entry("masks.decoder", &decoder.file, &decoder.sha256));
+        }
+        if let Some(ImageTextManifest { image, text, licence, .. }) = image_text {
+            let entry = |part, file, sha256| BundleFile { part, file, sha256, licence };
+            files.push(entry("image_text.image", &image.file, &image.sha256));
+            files.push(entry("image_text.text", &text.file, &text.sha256));
+            files.push(entry("image_text.tokenizer", &text.tokenizer, &text.tokenizer_sha256));
+        }
+        files
+    }
+
+    /// Where a file of [`Self::files`] lies.
+    #[must_use]
+    pub fn path(&self, file: &str) -> PathBuf {
+        self.dir.join(file)
+    }
+
+    /// Size in bytes of a file of [`Self::files`]; 0 when it has gone.
+    #[must_use]
+    pub fn size_bytes(&self, file: &str) -> u64 {
+        fs_err::metadata(self.path(file)).map_or(0, |meta| meta.len())
     }
 }
 
 impl GeometryManifest {
     fn validate(&self) -> Result<()> {
+        check_file("geometry", &self.file, &self.sha256)?;
         let wrong =
             |what: String| Err(unavailable(format!("model bundle: {MANIFEST}: geometry.{what}")));
-        if self.file.is_empty() || Path::new(&self.file).components().count() != 1 {
-            return wrong(format!("file is {:?}; it must be a plain file name", self.file));
-        }
-        if self.sha256.len() != 64 || !self.sha256.bytes().all(|b| b.is_ascii_hexdigit()) {
-            return wrong(format!("sha256 is {:?}; it must be 64 hex digits", self.sha256));
-        }
         let bad = |side: &u32| !(1..=BUCKET_SIDE_MAX).contains(side);
         if self.buckets.is_empty() || self.buckets.iter().flatten().any(bad) {
             return wrong(format!(
@@ -296,7 +351,7 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
-fn unavailable(message: String) -> Error {
+pub(super) fn unavailable(message: String) -> Error {
     Error::new(ErrorCode::ModelUnavailable, message)
 }
 
@@ -327,7 +382,7 @@ mod tests {
         let dir = fixture(|text| text);
         let bundle = Bundle::open(dir.path()).unwrap();
         assert_eq!(bundle.geometry().file, "plane.onnx", "the manifest's file");
-        assert!(bundle.geometry_size_bytes() > 100, "the file has a size");
+        assert!(bundle.size_bytes("plane.onnx") > 100, "the file has a size");
     }
 
     #[test]
@@ -360,6 +415,40 @@ mod tests {
         std::fs::remove_file(dir.path().join(MANIFEST)).unwrap();
         let error = Bundle::open(dir.path()).unwrap_err();
         assert!(error.message().contains("bundle.toml cannot be read"), "{error}");
+    }
+
+    #[test]
+    fn every_file_of_semantics_is_checked_and_its_keys_too() {
+        let from = Path::new("tests/fixtures/colours");
+        let whole = Bundle::open(from).unwrap();
+        assert_eq!(whole.files().len(), 6, "{:?}", whole.files());
+        let dir = tempfile::tempdir().unwrap();
+        for entry in whole.files() {
+            std::fs::copy(from.join(entry.file), dir.path().join(entry.file)).unwrap();
+        }
+        let text = std::fs::read_to_string(from.join(MANIFEST)).unwrap();
+        for (from, to, named) in [
+            ("adapter = \"sam\"", "adapter = \"other\"", "unknown variant"),
+            ("size = 64", "size = 0", "masks.size is 0"),
+            ("levels = [0, 1, 2]", "levels = []", "masks.levels is []"),
+            ("points_per_side = 16", "points_per_side = 1000", "masks.points_per_side is 1000"),
+            ("pred_iou_thresh = 0.7", "pred_iou_thresh = 7.0", "masks.pred_iou_thresh is 7.0"),
+            ("min_area = 0.001", "min_area = 1.5", "masks.min_area is 1.5"),
+            ("tau = 10.0", "tau = 0.0", "image_text.tau is 0.0"),
+            ("canon = [\"object\", ", "canon = [\" \", ", "image_text.canon"),
+            ("dim = 8", "dim = 0", "image_text.dim is 0"),
+            ("batch = 16", "batch = 0", "image_text.image.batch is 0"),
+            ("context = 16", "context = 0", "image_text.text.context is 0"),
+            ("\"tokenizer.json\"", "\"../tokenizer.json\"", "plain file name"),
+            ("tokenizer_sha256 = \"5", "tokenizer_sha256 = \"6", "tokenizer.json is not the file"),
+            ("sha256 = \"a5338", "sha256 = \"b5338", "masks_decoder.onnx is not the file"),
+        ] {
+            assert!(text.contains(from), "the fixture has no {from:?}");
+            std::fs::write(dir.path().join(MANIFEST), text.replace(from, to)).unwrap();
+            let error = Bundle::open(dir.path()).unwrap_err();
+            assert_eq!(error.code(), ErrorCode::ModelUnavailable, "{error}");
+            assert!(error.message().contains(named), "{to}: {error}");
+        }
     }
 
     #[test]

@@ -3,15 +3,13 @@
 use std::sync::Arc;
 
 use ort::{session::SessionInputValue, value::TensorRef};
-use tracing::{info, warn};
 
 use crate::{
     config::Config,
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
     models::{
         Bundle, GeometryManifest, ModelFrame, OutputFrame, Provider, Runtime, bucket_for, fit,
-        fit::FittedPhoto,
-        pool::{Pool, shares},
+        fit::FittedPhoto, pool::Pool,
     },
     scene::{CameraToWorld, Intrinsics, PosedPhoto, ViewGaussians},
 };
@@ -44,38 +42,10 @@ impl Geometry {
     /// # Errors
     /// `model_unavailable` when the provider asked for is not there, or the model does not load.
     pub fn open(runtime: Arc<Runtime>, bundle: &Bundle, config: &Config) -> Result<Self> {
-        let (count, threads) = shares(config.threads, config.jobs);
-        let path = bundle.geometry_path();
-        let mut refused = None;
-        for provider in runtime.candidates(config.provider)? {
-            let opened: std::result::Result<Vec<_>, _> =
-                (0..count).map(|_| runtime.session(&path, provider, threads)).collect();
-            match opened {
-                Ok(sessions) => {
-                    let name = provider.name();
-                    info!(provider = name, sessions = count, threads, "geometry network is open");
-                    return Ok(Self {
-                        manifest: bundle.geometry().clone(),
-                        pool: Pool::new(sessions),
-                        provider,
-                        _runtime: runtime,
-                    });
-                }
-                Err(e) => {
-                    warn!(provider = provider.name(), error = %e, "execution provider refused");
-                    refused = Some((provider, e));
-                }
-            }
-        }
-        let named = refused.as_ref().map_or("none", |(provider, _)| provider.name());
-        let error = Error::new(
-            ErrorCode::ModelUnavailable,
-            format!("geometry network: {named} does not open {}", bundle.geometry().file),
-        );
-        Err(match refused {
-            Some((_, cause)) => error.caused_by(cause),
-            None => error,
-        })
+        let manifest = bundle.geometry().clone();
+        let (pool, provider) =
+            Pool::open(&runtime, bundle, config, "geometry network", &manifest.file)?;
+        Ok(Self { manifest, pool, provider, _runtime: runtime })
     }
 
     /// What the manifest says of the network.

@@ -1,8 +1,9 @@
 //! The networks: a bundle with its manifest, ONNX Runtime, a pool of sessions, one adapter each.
 //!
-//! In: photos with cameras, depth ranges and neighbours. Out: [`ViewGaussians`]. A network is
-//! known only by its `bundle.toml`: names, sizes, normalisation and frames all come from there.
-//! The only module that knows `ort`.
+//! [`Geometry`]: photos with cameras, depth ranges and neighbours to [`ViewGaussians`].
+//! [`MaskNetwork`]: a photo and points in it to masks. [`ImageText`]: crops and texts to embeddings
+//! of one space. A network is known only by its `bundle.toml`: names, sizes, normalisation and
+//! frames all come from there. The only module that knows `ort`.
 //!
 //! [`ViewGaussians`]: crate::scene::ViewGaussians
 
@@ -10,11 +11,21 @@ mod bundle;
 mod fit;
 mod frame;
 mod geometry;
+mod image_text;
+mod manifest;
+mod masks;
 mod pool;
+mod resize;
 mod runtime;
 
-pub use bundle::{Bundle, GeometryManifest, OutputFrame, Translation};
+pub use bundle::{Bundle, BundleFile, GeometryManifest, OutputFrame, Translation};
 pub use fit::{FittedPhoto, bucket_for, fit};
 pub use frame::ModelFrame;
 pub use geometry::{Geometry, GeometryInput};
+pub use image_text::{ImageText, TextEmbedding};
+pub use manifest::{
+    ImageTextManifest, ImageTowerManifest, MaskAdapter, MaskDecoderManifest, MaskEncoderManifest,
+    MasksManifest, TextTowerManifest,
+};
+pub use masks::{MaskLogits, MaskNetwork, PhotoEmbedding};
 pub use runtime::{Provider, Runtime, SETUP_COMMAND};

@@ -5,7 +5,14 @@ use std::{
     sync::{Condvar, Mutex, PoisonError},
 };
 
-use ort::session::Session;
+use ort::{session::Session, value::ValueType};
+use tracing::{info, warn};
+
+use crate::{
+    config::Config,
+    error::{Error, ErrorCode, Result},
+    models::{Bundle, Provider, Runtime},
+};
 
 /// Sessions of one network, lent one at a time.
 #[derive(Debug)]
@@ -22,6 +29,42 @@ pub(super) struct Lent<'a> {
 }
 
 impl Pool {
+    /// Opens one session a concurrent job of a file of the bundle, on the first provider that takes
+    /// it; `what` names the network in messages.
+    pub(super) fn open(
+        runtime: &Runtime,
+        bundle: &Bundle,
+        config: &Config,
+        what: &'static str,
+        file: &str,
+    ) -> Result<(Self, Provider)> {
+        let (count, threads) = shares(config.threads, config.jobs);
+        let path = bundle.path(file);
+        let mut refused = None;
+        for provider in runtime.candidates(config.provider)? {
+            let opened: std::result::Result<Vec<_>, _> =
+                (0..count).map(|_| runtime.session(&path, provider, threads)).collect();
+            match opened {
+                Ok(sessions) => {
+                    let name = provider.name();
+                    info!(network = what, provider = name, sessions = count, threads, "open");
+                    return Ok((Self::new(sessions), provider));
+                }
+                Err(e) => {
+                    warn!(network = what, provider = provider.name(), error = %e, "refused");
+                    refused = Some((provider, e));
+                }
+            }
+        }
+        let named = refused.as_ref().map_or("none", |(provider, _)| provider.name());
+        let message = format!("{what}: {named} does not open {file}");
+        let error = Error::new(ErrorCode::ModelUnavailable, message);
+        Err(match refused {
+            Some((_, cause)) => error.caused_by(cause),
+            None => error,
+        })
+    }
+
     /// A pool of these sessions; at least one, or [`Self::take`] waits for ever.
     pub(super) fn new(sessions: Vec<Session>) -> Self {
         debug_assert!(!sessions.is_empty(), "an empty pool");
@@ -60,6 +103,15 @@ impl Drop for Lent<'_> {
             self.pool.idle.lock().unwrap_or_else(PoisonError::into_inner).push(session);
             self.pool.returned.notify_one();
         }
+    }
+}
+
+/// Shape of a session's input, -1 where it is free; `None` where it has no such input.
+pub(super) fn input_shape(session: &Session, name: &str) -> Option<Vec<i64>> {
+    let input = session.inputs().iter().find(|input| input.name() == name)?;
+    match input.dtype() {
+        ValueType::Tensor { shape, .. } => Some(shape.to_vec()),
+        _ => Some(Vec::new()),
     }
 }
 

@@ -276,7 +276,8 @@ pub struct ModelsInfo {
 /// One network.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ModelInfo {
-    /// What it does: `geometry`.
+    /// What it does: `geometry`, `masks.encoder`, `masks.decoder`, `image_text.image`,
+    /// `image_text.text`, `image_text.tokenizer`.
     pub name: String,
     /// File in the bundle.
     pub file: String,
@@ -286,7 +287,7 @@ pub struct ModelInfo {
     pub size_bytes: u64,
     /// Licence of the weights.
     pub licence: String,
-    /// Views it takes at once.
+    /// Photos it takes at once; 0 where it takes none.
     pub views_max: usize,
     /// Working sizes, `[height, width]`.
     pub sizes: Vec<[u32; 2]>,

@@ -10,6 +10,7 @@
 mod bad_input;
 mod capture;
 mod cli;
+mod colours;
 mod common;
 mod errors;
 mod fuzz;

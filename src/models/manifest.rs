@@ -1,0 +1,377 @@
+//! What `bundle.toml` says of the networks that semantics needs: masks, image and text towers.
+//!
+//! `models/README.md` lists every key. A section that is absent means a bundle without semantics.
+
+use std::path::Path;
+
+use serde::Deserialize;
+
+use crate::{
+    error::Result,
+    models::bundle::{BUCKET_SIDE_MAX, MANIFEST, unavailable},
+};
+
+/// Points along one side of the grid of prompts: 65,536 prompts a photo are minutes of work.
+const POINTS_PER_SIDE_MAX: u32 = 256;
+/// Prompts in one run of a decoder: their logits are in memory together.
+const POINTS_PER_BATCH_MAX: u32 = 1_024;
+/// Crops in one run of an image tower.
+const BATCH_MAX: usize = 256;
+/// Numbers of one embedding.
+const DIM_MAX: usize = 4_096;
+/// Tokens of one text.
+const CONTEXT_MAX: usize = 1_024;
+
+/// Signature of a mask network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MaskAdapter {
+    /// Segment Anything's own ONNX signature: photo resized by its longer side, padded right and
+    /// bottom; one prompt or a batch of prompts in dimension 0.
+    Sam,
+    /// `EfficientSAM`'s: photo stretched to a square, prompts in dimension 1.
+    EfficientSam,
+}
+
+/// What `bundle.toml` says of the mask network.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MasksManifest {
+    /// Signature of the two files.
+    pub adapter: MaskAdapter,
+    /// Licence of the weights.
+    pub licence: String,
+    /// Where the weights come from.
+    pub source: String,
+    /// Side in pixels of the square that the encoder takes.
+    pub size: u32,
+    /// Subtracted from the 0..1 channels.
+    pub mean: [f32; 3],
+    /// Divides them after that.
+    pub std: [f32; 3],
+    /// Which of the decoder's masks are used, from parts to the whole object.
+    pub levels: Vec<usize>,
+    /// Points along one side of the grid of prompts.
+    #[serde(default = "defaults::points_per_side")]
+    pub points_per_side: u32,
+    /// Prompts in one run of the decoder, where it takes several.
+    #[serde(default = "defaults::points_per_batch")]
+    pub points_per_batch: u32,
+    /// A mask must have more predicted IoU than this.
+    #[serde(default = "defaults::pred_iou_thresh")]
+    pub pred_iou_thresh: f32,
+    /// A mask must have at least this stability.
+    #[serde(default = "defaults::stability_score_thresh")]
+    pub stability_score_thresh: f32,
+    /// Logits between the stricter and the looser threshold, each side of 0.
+    #[serde(default = "defaults::stability_score_offset")]
+    pub stability_score_offset: f32,
+    /// Of two masks whose boxes have more IoU than this the less sure one goes.
+    #[serde(default = "defaults::nms_thresh")]
+    pub box_nms_thresh: f32,
+    /// Of two masks with more IoU than this the less sure one goes.
+    #[serde(default = "defaults::nms_thresh")]
+    pub mask_nms_thresh: f32,
+    /// Smallest mask, share of the photo.
+    #[serde(default = "defaults::min_area")]
+    pub min_area: f64,
+    /// The image encoder.
+    pub encoder: MaskEncoderManifest,
+    /// The prompt decoder.
+    pub decoder: MaskDecoderManifest,
+}
+
+/// The image encoder of a mask network.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MaskEncoderManifest {
+    /// File in the bundle's folder.
+    pub file: String,
+    /// Its sha256, hex.
+    pub sha256: String,
+    /// Input: `[1, 3, size, size]` f32.
+    pub input: String,
+    /// Output that becomes the decoder's `image_embeddings`.
+    pub output: String,
+    /// Further outputs that the decoder takes under the same names.
+    #[serde(default)]
+    pub features: Vec<String>,
+}
+
+/// The prompt decoder of a mask network, with the names of its tensors; SAM's where not given.
+/// Inputs that the file does not have are not fed.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MaskDecoderManifest {
+    /// File in the bundle's folder.
+    pub file: String,
+    /// Its sha256, hex.
+    pub sha256: String,
+    /// The encoder's output.
+    #[serde(default = "defaults::image_embeddings")]
+    pub image_embeddings: String,
+    /// `[B, N, 2]` f32 (`efficient_sam`: `[1, B, N, 2]`), x and y.
+    #[serde(default = "defaults::point_coords")]
+    pub point_coords: String,
+    /// `[B, N]` f32 (`efficient_sam`: `[1, B, N]`): 1 in, 0 out, 2 and 3 corners, -1 none.
+    #[serde(default = "defaults::point_labels")]
+    pub point_labels: String,
+    /// `[1, 1, h, w]` f32, a former mask; none is given.
+    #[serde(default = "defaults::mask_input")]
+    pub mask_input: String,
+    /// `[1]` f32, 0.
+    #[serde(default = "defaults::has_mask_input")]
+    pub has_mask_input: String,
+    /// `[2]` f32 or i64, height and width of the photo.
+    #[serde(default = "defaults::orig_im_size")]
+    pub orig_im_size: String,
+    /// `[B, K, h, w]` f32 (`efficient_sam`: `[1, B, K, h, w]`), logits.
+    #[serde(default = "defaults::low_res_masks")]
+    pub low_res_masks: String,
+    /// `[B, K]` f32 (`efficient_sam`: `[1, B, K]`).
+    #[serde(default = "defaults::iou_predictions")]
+    pub iou_predictions: String,
+}
+
+/// What `bundle.toml` says of the pair of an image and a text tower.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ImageTextManifest {
+    /// Licence of the weights.
+    pub licence: String,
+    /// Where the weights come from.
+    pub source: String,
+    /// Numbers of an embedding (D).
+    pub dim: usize,
+    /// Sharpness of the relevancy.
+    pub tau: f32,
+    /// Phrases that a text must beat.
+    pub canon: Vec<String>,
+    /// Coverage under which a pixel means nothing, 0..1.
+    #[serde(default = "defaults::coverage_floor")]
+    pub coverage_floor: f32,
+    /// The image tower.
+    pub image: ImageTowerManifest,
+    /// The text tower.
+    pub text: TextTowerManifest,
+}
+
+/// The image tower.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ImageTowerManifest {
+    /// File in the bundle's folder.
+    pub file: String,
+    /// Its sha256, hex.
+    pub sha256: String,
+    /// Input: `[B, 3, size, size]` f32.
+    pub input: String,
+    /// Output: `[B, dim]` f32, of any length.
+    pub output: String,
+    /// Side of a crop, pixels.
+    pub size: u32,
+    /// Subtracted from the 0..1 channels.
+    pub mean: [f32; 3],
+    /// Divides them after that.
+    pub std: [f32; 3],
+    /// Added around a mask's box on each side, share of the box's longer side.
+    #[serde(default)]
+    pub crop_margin: f32,
+    /// Crops in one run, where the file takes several.
+    #[serde(default = "defaults::batch")]
+    pub batch: usize,
+}
+
+/// The text tower.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TextTowerManifest {
+    /// File in the bundle's folder.
+    pub file: String,
+    /// Its sha256, hex.
+    pub sha256: String,
+    /// Tokenizer file in the bundle's folder.
+    pub tokenizer: String,
+    /// Its sha256, hex.
+    pub tokenizer_sha256: String,
+    /// Most tokens of a text; a longer one is cut.
+    pub context: usize,
+    /// Token of a word that is not known.
+    #[serde(default = "defaults::unknown")]
+    pub unknown: String,
+    /// Input: `[B, T]` i64.
+    pub input_ids: String,
+    /// Input: `[B, T]` i64, 1 for a token and 0 for padding; absent where the network has none.
+    pub attention_mask: Option<String>,
+    /// Output: `[B, dim]` f32, of any length.
+    pub output: String,
+}
+
+/// SAM's names, and the numbers that most bundles use.
+mod defaults {
+    pub(super) fn points_per_side() -> u32 {
+        32
+    }
+    pub(super) fn points_per_batch() -> u32 {
+        64
+    }
+    pub(super) fn pred_iou_thresh() -> f32 {
+        0.8
+    }
+    pub(super) fn stability_score_thresh() -> f32 {
+        0.9
+    }
+    pub(super) fn stability_score_offset() -> f32 {
+        1.0
+    }
+    pub(super) fn nms_thresh() -> f32 {
+        0.7
+    }
+    pub(super) fn min_area() -> f64 {
+        0.0005
+    }
+    pub(super) fn coverage_floor() -> f32 {
+        0.05
+    }
+    pub(super) fn batch() -> usize {
+        16
+    }
+    pub(super) fn image_embeddings() -> String {
+        "image_embeddings".to_owned()
+    }
+    pub(super) fn point_coords() -> String {
+        "point_coords".to_owned()
+    }
+    pub(super) fn point_labels() -> String {
+        "point_labels".to_owned()
+    }
+    pub(super) fn mask_input() -> String {
+        "mask_input".to_owned()
+    }
+    pub(super) fn has_mask_input() -> String {
+        "has_mask_input".to_owned()
+    }
+    pub(super) fn orig_im_size() -> String {
+        "orig_im_size".to_owned()
+    }
+    pub(super) fn low_res_masks() -> String {
+        "low_res_masks".to_owned()
+    }
+    pub(super) fn iou_predictions() -> String {
+        "iou_predictions".to_owned()
+    }
+    pub(super) fn unknown() -> String {
+        "[UNK]".to_owned()
+    }
+}
+
+/// Fails with the manifest's name, the key and what it must be.
+fn wrong<T>(key: &str, value: &dyn std::fmt::Debug, must: &str) -> Result<T> {
+    Err(unavailable(format!("model bundle: {MANIFEST}: {key} is {value:?}; it must {must}")))
+}
+
+/// A file of the bundle: its name and hash.
+pub(super) fn check_file(section: &str, file: &str, sha256: &str) -> Result<()> {
+    if file.is_empty() || Path::new(file).components().count() != 1 || file.starts_with('.') {
+        return wrong(&format!("{section}.file"), &file, "be a plain file name");
+    }
+    if sha256.len() != 64 || !sha256.bytes().all(|b| b.is_ascii_hexdigit()) {
+        return wrong(&format!("{section}.sha256"), &sha256, "be 64 hex digits");
+    }
+    Ok(())
+}
+
+/// A side in pixels and the normalisation of its channels.
+fn check_picture(section: &str, size: u32, mean: [f32; 3], std: [f32; 3]) -> Result<()> {
+    if !(1..=BUCKET_SIDE_MAX).contains(&size) {
+        return wrong(&format!("{section}.size"), &size, &format!("be 1 to {BUCKET_SIDE_MAX}"));
+    }
+    if mean.iter().any(|v| !v.is_finite()) {
+        return wrong(&format!("{section}.mean"), &mean, "hold numbers");
+    }
+    if std.iter().any(|v| !v.is_finite() || *v <= 0.0) {
+        return wrong(&format!("{section}.std"), &std, "hold numbers over 0");
+    }
+    Ok(())
+}
+
+impl MasksManifest {
+    pub(super) fn validate(&self) -> Result<()> {
+        check_file("masks.encoder", &self.encoder.file, &self.encoder.sha256)?;
+        check_file("masks.decoder", &self.decoder.file, &self.decoder.sha256)?;
+        check_picture("masks", self.size, self.mean, self.std)?;
+        if self.levels.is_empty() || self.levels.iter().any(|&level| level > 15) {
+            return wrong("masks.levels", &self.levels, "hold 1 or more of 0 to 15");
+        }
+        if !(1..=POINTS_PER_SIDE_MAX).contains(&self.points_per_side) {
+            return wrong(
+                "masks.points_per_side",
+                &self.points_per_side,
+                &format!("be 1 to {POINTS_PER_SIDE_MAX}"),
+            );
+        }
+        if !(1..=POINTS_PER_BATCH_MAX).contains(&self.points_per_batch) {
+            return wrong(
+                "masks.points_per_batch",
+                &self.points_per_batch,
+                &format!("be 1 to {POINTS_PER_BATCH_MAX}"),
+            );
+        }
+        for (key, value) in [
+            ("masks.pred_iou_thresh", self.pred_iou_thresh),
+            ("masks.stability_score_thresh", self.stability_score_thresh),
+            ("masks.box_nms_thresh", self.box_nms_thresh),
+            ("masks.mask_nms_thresh", self.mask_nms_thresh),
+        ] {
+            if !(0.0..=1.0).contains(&value) {
+                return wrong(key, &value, "be 0 to 1");
+            }
+        }
+        if !self.stability_score_offset.is_finite() || self.stability_score_offset < 0.0 {
+            return wrong("masks.stability_score_offset", &self.stability_score_offset, "be >= 0");
+        }
+        if !(0.0..1.0).contains(&self.min_area) {
+            return wrong("masks.min_area", &self.min_area, "be 0 to 1");
+        }
+        Ok(())
+    }
+}
+
+impl ImageTextManifest {
+    pub(super) fn validate(&self) -> Result<()> {
+        check_file("image_text.image", &self.image.file, &self.image.sha256)?;
+        check_file("image_text.text", &self.text.file, &self.text.sha256)?;
+        check_file("image_text.text.tokenizer", &self.text.tokenizer, &self.text.tokenizer_sha256)?;
+        check_picture("image_text.image", self.image.size, self.image.mean, self.image.std)?;
+        if !(1..=DIM_MAX).contains(&self.dim) {
+            return wrong("image_text.dim", &self.dim, &format!("be 1 to {DIM_MAX}"));
+        }
+        if !self.tau.is_finite() || self.tau <= 0.0 {
+            return wrong("image_text.tau", &self.tau, "be a number over 0");
+        }
+        if self.canon.is_empty() || self.canon.iter().any(|phrase| phrase.trim().is_empty()) {
+            return wrong("image_text.canon", &self.canon, "hold 1 or more phrases");
+        }
+        if !(0.0..=1.0).contains(&self.coverage_floor) {
+            return wrong("image_text.coverage_floor", &self.coverage_floor, "be 0 to 1");
+        }
+        if !(0.0..=4.0).contains(&self.image.crop_margin) {
+            return wrong("image_text.image.crop_margin", &self.image.crop_margin, "be 0 to 4");
+        }
+        if !(1..=BATCH_MAX).contains(&self.image.batch) {
+            return wrong(
+                "image_text.image.batch",
+                &self.image.batch,
+                &format!("be 1 to {BATCH_MAX}"),
+            );
+        }
+        if !(1..=CONTEXT_MAX).contains(&self.text.context) {
+            return wrong(
+                "image_text.text.context",
+                &self.text.context,
+                &format!("be 1 to {CONTEXT_MAX}"),
+            );
+        }
+        Ok(())
+    }
+}
