@@ -2,6 +2,7 @@
 # make serve   the server on 127.0.0.1:8080; flags: make serve ARGS='--listen 0.0.0.0:8080'
 # make test    every check: format, lints, docs, all tests, in one (release) profile
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
+# make eval-scenes   labelled scenes of held-out things, rendered to target/eval/scenes (g++, PYTHON)
 # make test-long   the random tests with many more cases, and the slow ones
 
 SHELL := /bin/sh
@@ -10,10 +11,12 @@ TARGET := $(or $(CARGO_TARGET_DIR),target)
 SEGSPLAT := $(TARGET)/release/segsplat
 DATA ?= $(or $(SEGSPLAT_SHARED_DATA),../shared/data)/scenes
 ARGS ?=
+# With numpy, pillow and trimesh; only for `make eval-scenes`.
+PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/vulkan/env ]; then . $(abspath $(TARGET))/vulkan/env; fi;
 
-.PHONY: demo serve test test-long bench eval setup build fmt lint doc tests deny
+.PHONY: demo serve test test-long bench eval eval-scenes setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -49,6 +52,10 @@ bench: setup
 
 eval: build
 	$(SEGSPLAT) eval $(DATA) $(ARGS)
+
+eval-scenes:
+	$(PYTHON) models/training/semantics/eval_scenes.py --data $(dir $(DATA)) \
+		--out $(TARGET)/eval/scenes
 
 build: setup
 	$(CARGO) build --locked --release
