@@ -35,9 +35,9 @@ impl IndexMap {
 pub struct MaskInfo {
     /// Share of the photo's cells, 0..1, after every pixel went to one mask.
     pub area: f64,
-    /// Predicted IoU.
+    /// Predicted `IoU`.
     pub predicted_iou: f32,
-    /// Stability: IoU of the mask at a stricter and a looser threshold.
+    /// Stability: `IoU` of the mask at a stricter and a looser threshold.
     pub stability: f32,
     /// Where it was asked for, shares 0..1 of width and height.
     pub point: [f32; 2],

@@ -13,6 +13,7 @@ mod crops;
 mod palette;
 mod parts;
 mod score;
+mod views;
 
 pub use self::{
     assign::{NetworkPicture, from_source, relabel},
@@ -21,6 +22,7 @@ pub use self::{
     palette::{colour, palette_table},
     parts::{Box3, Part, PartOptions, parts},
     score::{PixelEntries, Scorer, Scoring, TextScores, ViewNorms, mask_from_blend},
+    views::{Views, merge},
 };
 
 use crate::scene::Bank;

@@ -258,7 +258,7 @@ fn boxed(bounds: Bounds, origin: DVec3) -> Box3 {
 /// Orthonormal eigenvectors of a symmetric matrix, by Jacobi's rotations.
 fn principal_axes(spread: DMat3) -> [DVec3; 3] {
     let mut a = spread.to_cols_array_2d();
-    let mut v = DMat3::IDENTITY.to_cols_array_2d();
+    let mut v: [[f64; 3]; 3] = DMat3::IDENTITY.to_cols_array_2d();
     for _ in 0..32 {
         for (p, q) in [(0, 1), (0, 2), (1, 2)] {
             if a[p][q].abs() <= f64::EPSILON * (a[p][p].abs() + a[q][q].abs()) {
@@ -268,22 +268,17 @@ fn principal_axes(spread: DMat3) -> [DVec3; 3] {
             let t = theta.signum() / (theta.abs() + (theta * theta + 1.0).sqrt());
             let c = 1.0 / (t * t + 1.0).sqrt();
             let s = t * c;
-            for k in 0..3 {
-                let (kp, kq) = (a[k][p], a[k][q]);
-                (a[k][p], a[k][q]) = (c * kp - s * kq, s * kp + c * kq);
+            for numbers in a.iter_mut().chain(&mut v) {
+                let (kp, kq) = (numbers[p], numbers[q]);
+                (numbers[p], numbers[q]) = (c * kp - s * kq, s * kp + c * kq);
             }
-            for k in 0..3 {
-                let (pk, qk) = (a[p][k], a[q][k]);
-                (a[p][k], a[q][k]) = (c * pk - s * qk, s * pk + c * qk);
-            }
-            // Columns of v are the axes; glam keeps columns first.
-            for k in 0..3 {
-                let (kp, kq) = (v[p][k], v[q][k]);
-                (v[p][k], v[q][k]) = (c * kp - s * kq, s * kp + c * kq);
-            }
+            let (ap, aq) = (a[p], a[q]);
+            a[p] = std::array::from_fn(|k| c * ap[k] - s * aq[k]);
+            a[q] = std::array::from_fn(|k| s * ap[k] + c * aq[k]);
         }
     }
-    v.map(|axis| DVec3::from_array(axis).normalize_or(DVec3::X))
+    // The axes are the columns of v, whose rows were turned above.
+    [0, 1, 2].map(|k| DVec3::new(v[0][k], v[1][k], v[2][k]).normalize_or(DVec3::X))
 }
 
 /// Disjoint sets; the root of each is its smallest member.

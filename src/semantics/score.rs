@@ -163,7 +163,7 @@ impl TextScores {
     }
 
     /// Smallest and largest blended score of a pixel's entries, and their coverage.
-    fn blend(&self, entries: impl Iterator<Item = (usize, f64)> + Clone) -> [f64; 3] {
+    fn blend(&self, entries: &(impl Iterator<Item = (usize, f64)> + Clone)) -> [f64; 3] {
         let (mut least, mut most, mut coverage) = (f64::INFINITY, f64::NEG_INFINITY, 0.0);
         for rows in &self.groups {
             let mut sums = [0.0_f64; GROUP];
@@ -259,7 +259,7 @@ impl Scorer {
             entries: vec![0.0],
         };
         let alone = self.norms.iter().enumerate().map(|(m, length)| {
-            let [least, ..] = text.blend(std::iter::once((m + 1, 1.0)));
+            let [least, ..] = text.blend(&std::iter::once((m + 1, 1.0)));
             if *length > 0.0 { self.sharpen(least / length) } else { 0.0 }
         });
         let alone: Vec<f32> = alone.collect();
@@ -329,7 +329,7 @@ impl Scorer {
             if *inverse <= 0.0 {
                 return 0.0;
             }
-            let [least, most, _] = text.blend(entries.of(p));
+            let [least, most, _] = text.blend(&entries.of(p));
             if selected(least, most) { self.sharpen(least * f64::from(*inverse)) } else { 0.0 }
         };
         Ok(norms.inverse.par_iter().enumerate().with_min_len(PIXELS_EACH).map(score).collect())
@@ -342,7 +342,7 @@ impl Scorer {
     pub fn mask(&self, text: &TextScores, entries: PixelEntries<'_>) -> Result<Vec<bool>> {
         entries.check()?;
         let inside = |p: usize| {
-            let [least, most, coverage] = text.blend(entries.of(p));
+            let [least, most, coverage] = text.blend(&entries.of(p));
             coverage >= self.scoring.coverage_floor && selected(least, most)
         };
         Ok((0..entries.pixels()).into_par_iter().with_min_len(PIXELS_EACH).map(inside).collect())
@@ -479,7 +479,7 @@ mod tests {
 
     #[test]
     fn the_worst_phrase_decides_and_blended_tables_say_the_same() {
-        let bank = Bank { dim: 2, rows: [X, [0.6, 0.8]].concat() };
+        let bank = Bank { dim: 2, rows: [X, [0.6, 0.8], [-0.6, -0.8]].concat() };
         for count in 1..=5_usize {
             // Phrases turn towards X; the last is the nearest to it.
             let canon: Vec<[f32; 2]> = (1..=count)
@@ -495,8 +495,8 @@ mod tests {
             assert!((f64::from(text.entries()[1]) - want).abs() < 1e-5, "{count} phrases");
             let tables = text.tables();
             assert_eq!(tables.len(), count.div_ceil(3));
-            let pixels: [&[(u16, f32)]; 4] =
-                [&[(1, 0.5)], &[(2, 0.9)], &[(1, 0.2), (2, 0.3)], &[(1, 0.01)]];
+            let pixels: [&[(u16, f32)]; 5] =
+                [&[(1, 0.5)], &[(2, 0.9)], &[(1, 0.2), (2, 0.3)], &[(1, 0.01)], &[(3, 0.7)]];
             let view = view(&pixels);
             let blend = |table: &Arc<[[f32; 4]]>| -> Vec<[f32; 4]> {
                 let sum = |pixel: &&[(u16, f32)]| {
@@ -516,6 +516,8 @@ mod tests {
             let mask = mask_from_blend(&pictures, &scoring);
             assert_eq!(mask, scorer.mask(&text, view.entries()).unwrap(), "{count} phrases");
             assert!(mask[0] && !mask[3], "{count} phrases: {mask:?}");
+            // Far from the text, but farther from the phrases, up to the one near the text.
+            assert_eq!(mask[4], count < 4, "{count} phrases: {mask:?}");
         }
     }
 

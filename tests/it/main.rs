@@ -19,6 +19,7 @@ mod grpc;
 mod http;
 mod jobs;
 mod labels;
+mod literal;
 mod magnify;
 mod oracle;
 mod photos;
