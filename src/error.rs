@@ -21,8 +21,10 @@ pub enum ErrorCode {
     SceneNotFound,
     /// No such route, method or resource.
     NotFound,
-    /// The scene exists but is not done.
+    /// The scene exists but is not done, or its semantics are still being made.
     SceneNotReady,
+    /// A text was asked of a scene that was made with `semantics=off`.
+    SemanticsOff,
     /// Too much work is queued; try again after the time given.
     Overloaded,
     /// The deadline of the call passed.
@@ -70,13 +72,14 @@ const fn row(
 }
 
 /// The one table. gRPC numbers are those of `google.rpc.Code`.
-pub const TABLE: [ErrorRow; 14] = [
+pub const TABLE: [ErrorRow; 15] = [
     row(ErrorCode::InvalidRequest, "invalid_request", 400, 3, 2, false),
     row(ErrorCode::PhotoUnreadable, "photo_unreadable", 422, 3, 2, false),
     row(ErrorCode::LimitExceeded, "limit_exceeded", 413, 3, 2, false),
     row(ErrorCode::SceneNotFound, "scene_not_found", 404, 5, 3, false),
     row(ErrorCode::NotFound, "not_found", 404, 5, 3, false),
     row(ErrorCode::SceneNotReady, "scene_not_ready", 409, 9, 4, true),
+    row(ErrorCode::SemanticsOff, "semantics_off", 409, 9, 4, false),
     row(ErrorCode::Overloaded, "overloaded", 429, 8, 5, true),
     row(ErrorCode::DeadlineExceeded, "deadline_exceeded", 504, 4, 5, true),
     row(ErrorCode::Cancelled, "cancelled", 499, 1, 5, false),

@@ -41,6 +41,18 @@ pub struct Limits {
     pub cameras_max: usize,
     /// Kinds of picture in one `views` request.
     pub kinds_max: usize,
+    /// Texts in one `query` request, and labels in one `pick`.
+    pub texts_max: usize,
+    /// Characters of one text: more than any noun phrase needs.
+    pub text_chars_max: usize,
+    /// Milliseconds a text waits for semantics that are being made, unless it says how long.
+    pub text_wait_ms: u64,
+    /// Embeddings of texts kept in memory, those asked last: a few kilobytes each.
+    pub texts_cached_max: usize,
+    /// Bytes of views' semantic entries kept in memory, so that the next text draws nothing.
+    pub entries_cache_bytes_max: u64,
+    /// Parts of one text's selection that an answer lists, the largest first.
+    pub parts_max: usize,
     /// Jobs that wait; one more is refused as `overloaded`.
     pub queued_jobs_max: usize,
     /// Renders at work or waiting; one more is refused as `overloaded`.
@@ -75,6 +87,12 @@ impl Default for Limits {
             view_side_max: 4_096,
             cameras_max: 64,
             kinds_max: 8,
+            texts_max: 128,
+            text_chars_max: 256,
+            text_wait_ms: 120_000,
+            texts_cached_max: 4_096,
+            entries_cache_bytes_max: 512 << 20,
+            parts_max: 64,
             queued_jobs_max: 64,
             queued_renders_max: 256,
             cache_bytes_max: 4 << 30,

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::{
     config::Config,
     error::Result,
-    jobs::PipelineMaker,
+    jobs::{NoSemantics, PipelineMaker},
     models::Bundle,
     pipeline::Engine,
     render::{Renderer, select::select},
@@ -21,7 +21,7 @@ pub fn parts(config: &Config) -> Result<Parts> {
     let models = models_info(engine.bundle(), engine.geometry().provider().name());
     let renderer = renderer(config)?;
     let maker = Arc::new(PipelineMaker::new(engine, config.limits.clone()));
-    Ok(Parts { maker, renderer, models })
+    Ok(Parts { maker, semantics: Arc::new(NoSemantics), renderer, models })
 }
 
 /// The renderer that the configuration asks for.

@@ -42,7 +42,7 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let upload = upload_of(&args.photos, config)?;
     let engine = Arc::new(Engine::open(config)?);
-    let options = SceneOptions { max_views: args.max_views };
+    let options = SceneOptions { max_views: args.max_views, ..SceneOptions::default() };
     let begun = Instant::now();
     let made = PipelineMaker::new(engine, config.limits.clone()).make(Work {
         upload: &upload,
@@ -67,7 +67,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
             program_version: env!("CARGO_PKG_VERSION").to_owned(),
         },
     };
-    let scene = Scene { meta, gaussians: made.gaussians, backdrop: made.backdrop };
+    let scene = Scene::new(meta, made.gaussians, made.backdrop);
     let path = path_of(&args.output);
     write(&path, &scene)?;
     let total_ms = begun.elapsed().as_secs_f64() * 1e3;

@@ -59,7 +59,7 @@ pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
             report,
             provenance: Provenance::default(),
         };
-        let scene = Scene { meta, gaussians, backdrop: Backdrop::default() };
+        let scene = Scene::new(meta, gaussians, Backdrop::default());
         return Ok(Opened { scene, format: "ply", sha256: None });
     }
     let file = fs_err::read(&path).map_err(unreadable)?;

@@ -169,17 +169,14 @@ fn judge(
         antialiased: false,
         near,
     };
-    let scene = Scene {
-        meta: SceneMeta {
-            id: SceneId::from_bytes([0; 16]),
-            created_ms: 0,
-            cameras: made.cameras,
-            report: made.report,
-            provenance: Provenance::default(),
-        },
-        gaussians: made.gaussians,
-        backdrop: made.backdrop,
+    let meta = SceneMeta {
+        id: SceneId::from_bytes([0; 16]),
+        created_ms: 0,
+        cameras: made.cameras,
+        report: made.report,
+        provenance: Provenance::default(),
     };
+    let scene = Scene::new(meta, made.gaussians, made.backdrop);
     let frame = compose::render_scene(renderer, &scene, &request, true)?;
     let report = scene.meta.report;
     let mut color = frame.color.unwrap_or_default();

@@ -110,6 +110,7 @@ mod tests {
             request_sha256: String::new(),
             attempts: 0,
             scene_sha256: None,
+            semantics_sha256: None,
         }
     }
 

@@ -6,6 +6,7 @@
 mod board;
 mod maker;
 mod queue;
+mod semantics;
 mod worker;
 
 use std::{
@@ -20,14 +21,18 @@ use std::{
 
 use tokio::sync::watch;
 
-pub use self::maker::PipelineMaker;
+pub use self::{
+    maker::PipelineMaker,
+    semantics::{NoSemantics, Phrases, SemanticsMaker, SemanticsWork, TextEmbedding},
+};
 
 use self::{board::Board, queue::Queue, worker::Stop};
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
     scene::{
-        Backdrop, Gaussians, HealthReport, SceneCamera, SceneId, SceneOptions, SceneState, Upload,
+        Backdrop, Gaussians, HealthReport, SceneCamera, SceneId, SceneOptions, SceneState,
+        SemanticsMode, SemanticsState, Upload,
     },
     store::{Record, Store, not_found},
 };
@@ -94,6 +99,10 @@ struct Shared {
     board: Board,
     queue: Queue,
     running: Mutex<HashMap<SceneId, Arc<Stop>>>,
+    semantics: Arc<dyn SemanticsMaker>,
+    /// Scenes whose semantics were asked for.
+    asked: Queue,
+    thinking: Mutex<HashMap<SceneId, Arc<Stop>>>,
     workers: AtomicUsize,
 }
 
@@ -112,6 +121,7 @@ impl Jobs {
     pub fn start(
         store: Arc<Store>,
         maker: Arc<dyn SceneMaker>,
+        semantics: Arc<dyn SemanticsMaker>,
         mut records: Vec<Record>,
         limits: &Limits,
         workers: usize,
@@ -123,6 +133,9 @@ impl Jobs {
             board: Board::default(),
             queue: Queue::new(limits.queued_jobs_max),
             running: Mutex::default(),
+            semantics,
+            asked: Queue::new(limits.queued_jobs_max),
+            thinking: Mutex::default(),
             workers: AtomicUsize::new(workers),
         });
         records.sort_by_key(|record| record.status.created_ms);
@@ -135,20 +148,34 @@ impl Jobs {
                 record.status.stage = None;
                 record.status.fraction = 0.0;
             }
+            semantics::at_start(&mut record);
+            let eager = !unfinished
+                && record.options.semantics == SemanticsMode::Eager
+                && record.status.state == SceneState::Done
+                && record.status.semantics.state == SemanticsState::None
+                && shared.semantics.lacks().is_none();
+            if eager {
+                record.status.semantics.state = SemanticsState::Running;
+            }
             shared.board.insert(record);
-            if unfinished {
+            if eager {
+                shared.asked.push(id);
+            } else if unfinished {
                 shared.queue.push(id);
             }
         }
-        let threads = (0..workers)
-            .map(|i| {
-                let shared = Arc::clone(&shared);
-                std::thread::Builder::new()
-                    .name(format!("scene-{i}"))
-                    .spawn(move || shared.work())
-                    .map_err(|e| Error::internal("no thread can be started").caused_by(e))
-            })
+        let start = |name: String, life: fn(&Shared)| {
+            let shared = Arc::clone(&shared);
+            std::thread::Builder::new()
+                .name(name)
+                .spawn(move || life(&shared))
+                .map_err(|e| Error::internal("no thread can be started").caused_by(e))
+        };
+        let mut threads = (0..workers)
+            .map(|i| start(format!("scene-{i}"), Shared::work))
             .collect::<Result<Vec<_>>>()?;
+        // One is enough: a scene's semantics use every core already.
+        threads.push(start("semantics".to_owned(), Shared::think)?);
         Ok(Self { shared, workers: Mutex::new(threads) })
     }
 
@@ -212,8 +239,11 @@ impl Jobs {
             return Err(not_found(id));
         }
         self.shared.queue.remove(id);
-        if let Some(stop) = self.shared.lock_running().get(id) {
-            stop.by_caller();
+        self.shared.asked.remove(id);
+        for at_work in [self.shared.lock_running(), self.shared.lock_thinking()] {
+            if let Some(stop) = at_work.get(id) {
+                stop.by_caller();
+            }
         }
         self.shared.store.remove(id)
     }
@@ -239,8 +269,11 @@ impl Jobs {
     /// the next start.
     pub fn shut_down(&self) {
         self.shared.queue.close();
-        for stop in self.shared.lock_running().values() {
-            stop.by_shutdown();
+        self.shared.asked.close();
+        for at_work in [self.shared.lock_running(), self.shared.lock_thinking()] {
+            for stop in at_work.values() {
+                stop.by_shutdown();
+            }
         }
         let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
         for worker in workers.drain(..) {

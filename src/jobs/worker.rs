@@ -13,7 +13,11 @@ use std::{
 use super::{Made, Shared, Work};
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Provenance, Scene, SceneError, SceneId, SceneMeta, SceneState},
+    limits::Limits,
+    scene::{
+        Provenance, Scene, SceneError, SceneId, SceneMeta, SceneState, SemanticsMode,
+        SemanticsState, SemanticsStatus,
+    },
     store::{self, Record},
 };
 
@@ -44,6 +48,27 @@ impl Stop {
 
     pub(super) fn by_shutdown(&self) {
         self.ask(BY_SHUTDOWN);
+    }
+
+    pub(super) fn flag(&self) -> &AtomicBool {
+        &self.flag
+    }
+
+    /// The error of work that was stopped, `None` where nobody asked it to; `what` begins it.
+    pub(super) fn told(&self, limits: &Limits, what: &str) -> Option<Error> {
+        match self.reason() {
+            BY_CALLER => Some(Error::new(ErrorCode::Cancelled, format!("{what}: cancelled"))),
+            BY_TIMEOUT => {
+                let seconds = Duration::from_millis(limits.scene_timeout_ms).as_secs_f64();
+                let message = format!("{what} took longer than {seconds} s");
+                Some(Error::new(ErrorCode::DeadlineExceeded, message))
+            }
+            BY_SHUTDOWN => {
+                let message = format!("{what}: the server is stopping");
+                Some(Error::new(ErrorCode::Overloaded, message).retry_after_s(10))
+            }
+            _ => None,
+        }
     }
 
     fn reason(&self) -> u8 {
@@ -111,7 +136,11 @@ impl Shared {
     }
 
     /// Runs `make`, and asks it to stop when the time of a scene is over.
-    fn within_time(&self, stop: &Stop, make: impl FnOnce() -> Result<Made>) -> Result<Made> {
+    pub(super) fn within_time<T>(
+        &self,
+        stop: &Stop,
+        make: impl FnOnce() -> Result<T>,
+    ) -> Result<T> {
         let limit = Duration::from_millis(self.limits.scene_timeout_ms);
         let (finished, watchdog) = mpsc::channel::<()>();
         std::thread::scope(|scope| {
@@ -141,7 +170,7 @@ impl Shared {
             },
         };
         let (report, cameras) = (meta.report.clone(), meta.cameras.clone());
-        let scene = Scene { meta, gaussians: made.gaussians, backdrop: made.backdrop };
+        let scene = Scene::new(meta, made.gaussians, made.backdrop);
         let digest = self.store.put_scene(scene)?;
         // On disk first, so that a watcher who sees `done` may pull the plug.
         let Some(mut done) = self.board.find(id) else { return Ok(()) };
@@ -153,8 +182,16 @@ impl Shared {
         done.status.report = Some(report);
         done.status.cameras = cameras;
         self.store.put_record(&done)?;
+        // In one change, so that no watcher takes `done` for the end.
+        let eager = done.options.semantics == SemanticsMode::Eager;
+        if eager {
+            done.status.semantics = SemanticsStatus::new(SemanticsState::Running);
+        }
         self.board.update(id, |record| *record = done);
         tracing::info!(scene = %id, "done");
+        if eager {
+            self.asked.push(id.clone());
+        }
         Ok(())
     }
 
@@ -173,12 +210,7 @@ impl Shared {
                 }
             }
             BY_CALLER => tracing::info!(scene = %id, "cancelled"),
-            BY_TIMEOUT => {
-                let seconds = Duration::from_millis(self.limits.scene_timeout_ms).as_secs_f64();
-                let message = format!("the scene took longer than {seconds} s");
-                self.fail(id, &Error::new(ErrorCode::DeadlineExceeded, message));
-            }
-            _ => self.fail(id, error),
+            _ => self.fail(id, stop.told(&self.limits, "the scene").as_ref().unwrap_or(error)),
         }
     }
 
@@ -204,7 +236,7 @@ impl Shared {
     }
 }
 
-fn panicked(panic: &(dyn std::any::Any + Send)) -> Error {
+pub(super) fn panicked(panic: &(dyn std::any::Any + Send)) -> Error {
     let text = panic
         .downcast_ref::<&str>()
         .copied()

@@ -1,8 +1,13 @@
 //! A finished scene: its Gaussians, and what it is made of and how it went.
 
+use std::sync::Arc;
+
 use serde::{Deserialize, Serialize};
 
-use crate::scene::{Backdrop, Gaussians, HealthReport, SceneCamera, SceneId, SceneOptions};
+use crate::{
+    error::{Error, ErrorCode, Result},
+    scene::{Backdrop, Gaussians, HealthReport, SceneCamera, SceneId, SceneOptions, Semantics},
+};
 
 /// A photo of the upload and its hash.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -50,4 +55,50 @@ pub struct Scene {
     pub gaussians: Gaussians,
     /// The photos' colours by direction, behind everything.
     pub backdrop: Backdrop,
+    /// What it means, once somebody has asked; the Gaussians then carry its indices.
+    pub semantics: Option<Arc<Semantics>>,
+}
+
+impl Scene {
+    /// A scene that nobody has asked by text.
+    #[must_use]
+    pub fn new(meta: SceneMeta, gaussians: Gaussians, backdrop: Backdrop) -> Self {
+        Self { meta, gaussians, backdrop, semantics: None }
+    }
+
+    /// Bytes held by its arrays.
+    #[must_use]
+    pub fn size_bytes(&self) -> u64 {
+        let meaning = self.semantics.as_ref().map_or(0, |semantics| {
+            let photos: usize = semantics.photos.iter().map(|map| map.index.len()).sum();
+            4 * semantics.bank.rows.len() + 2 * (semantics.index.len() + photos)
+        });
+        self.gaussians.size_bytes() + meaning as u64
+    }
+
+    /// The same scene, its Gaussians carrying the indices of `semantics`.
+    ///
+    /// # Errors
+    /// `scene_corrupt` when the semantics are those of a scene with other Gaussians, or name
+    /// entries that their bank does not have.
+    pub fn with_semantics(&self, semantics: Arc<Semantics>) -> Result<Self> {
+        let (count, entries) = (semantics.index.len(), semantics.bank.len());
+        let most = semantics.index.iter().copied().max().unwrap_or(0);
+        if count != self.gaussians.len() || usize::from(most) > entries {
+            return Err(Error::new(
+                ErrorCode::SceneCorrupt,
+                format!(
+                    "semantics of {count} Gaussians and {entries} entries, highest index {most}; \
+                     the scene has {} Gaussians",
+                    self.gaussians.len()
+                ),
+            ));
+        }
+        Ok(Self {
+            meta: self.meta.clone(),
+            gaussians: self.gaussians.with_semantic_index(semantics.index.clone())?,
+            backdrop: self.backdrop.clone(),
+            semantics: Some(semantics),
+        })
+    }
 }

@@ -29,5 +29,8 @@ pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{
     Bank, IndexMap, MaskInfo, PhotoMasks, ScoringProfile, Semantics, SemanticsReport,
 };
-pub use status::{Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus};
+pub use status::{
+    Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
+    SemanticsState, SemanticsStatus,
+};
 pub use upload::{Upload, UploadCameras, UploadFile};

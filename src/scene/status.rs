@@ -4,8 +4,21 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     error::{Error, ErrorCode, TABLE},
-    scene::{Camera, HealthReport, Intrinsics, SceneId},
+    scene::{Camera, HealthReport, Intrinsics, SceneId, SemanticsReport},
 };
+
+/// When the semantics of a scene are made.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SemanticsMode {
+    /// At the first call that needs them.
+    #[default]
+    Lazy,
+    /// As soon as the scene can be viewed.
+    Eager,
+    /// Never.
+    Off,
+}
 
 /// Options of a scene, kept with it.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -13,6 +26,8 @@ use crate::{
 pub struct SceneOptions {
     /// Views the network takes at once; `None`: what the bundle says.
     pub max_views: Option<usize>,
+    /// When its semantics are made.
+    pub semantics: SemanticsMode,
 }
 
 /// Where a scene stands.
@@ -89,6 +104,83 @@ pub struct SceneCamera {
     pub network: Option<Intrinsics>,
 }
 
+/// Where the semantics of a scene stand.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SemanticsState {
+    /// Never made: the scene was asked to have none.
+    Off,
+    /// Not made yet.
+    #[default]
+    None,
+    /// Waiting for their turn, or being made.
+    Running,
+    /// Made; texts are answered at once.
+    Ready,
+    /// Not made; `error` says why. The next text tries again.
+    Failed,
+}
+
+impl SemanticsState {
+    /// The state's snake_case name.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Off => "off",
+            Self::None => "none",
+            Self::Running => "running",
+            Self::Ready => "ready",
+            Self::Failed => "failed",
+        }
+    }
+}
+
+/// What can be asked of a scene by text, and how far that is.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct SemanticsStatus {
+    /// Whether a text can be asked: at once where `ready`, else after they are made.
+    pub available: bool,
+    /// Why not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub reason: Option<String>,
+    /// Where they stand.
+    pub state: SemanticsState,
+    /// Stage at work while running: `masks`, `embed`, `bank`, `assign`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub stage: Option<String>,
+    /// Share of their making that is done, 0..1.
+    pub fraction: f32,
+    /// Entries of the bank (M), once ready.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub bank_size: Option<u32>,
+    /// Why they failed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub error: Option<SceneError>,
+    /// Counts and times, once ready.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub report: Option<SemanticsReport>,
+}
+
+impl SemanticsStatus {
+    /// Nothing but a state.
+    #[must_use]
+    pub fn new(state: SemanticsState) -> Self {
+        Self { state, ..Self::default() }
+    }
+
+    /// Made, with this report.
+    #[must_use]
+    pub fn ready(report: SemanticsReport) -> Self {
+        Self {
+            fraction: 1.0,
+            bank_size: Some(report.bank_size),
+            report: Some(report),
+            ..Self::new(SemanticsState::Ready)
+        }
+    }
+}
+
 /// A scene as `GET /v1/scenes/{id}` shows it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SceneStatus {
@@ -114,6 +206,9 @@ pub struct SceneStatus {
     /// Input cameras, once done.
     #[serde(skip_serializing_if = "Vec::is_empty", default)]
     pub cameras: Vec<SceneCamera>,
+    /// What can be asked of it by text.
+    #[serde(default)]
+    pub semantics: SemanticsStatus,
 }
 
 impl SceneStatus {
@@ -130,7 +225,14 @@ impl SceneStatus {
             error: None,
             report: None,
             cameras: Vec::new(),
+            semantics: SemanticsStatus::default(),
         }
+    }
+
+    /// Whether nothing happens to it now: neither it nor its semantics are being made.
+    #[must_use]
+    pub fn is_settled(&self) -> bool {
+        self.state.is_final() && self.semantics.state != SemanticsState::Running
     }
 }
 
@@ -143,14 +245,14 @@ pub enum Event {
         /// Jobs that go first.
         ahead: usize,
     },
-    /// At work.
+    /// At work: on the scene, or on the semantics of one that can be viewed already.
     Running {
-        /// Stage at work.
+        /// Stage at work: of the scene, or `masks`, `embed`, `bank`, `assign` of its semantics.
         stage: String,
-        /// Share of the whole work that is done, 0..1.
+        /// Share of that work that is done, 0..1.
         fraction: f32,
     },
-    /// Made. Last event.
+    /// Made, and its semantics are not at work. Last event.
     Done,
     /// Failed. Last event.
     Failed(SceneError),

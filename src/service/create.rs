@@ -11,7 +11,9 @@ use super::{
 use crate::{
     error::{Error, Result},
     limits::IDEMPOTENCY_KEY_BYTES_MAX,
-    scene::{SceneId, SceneOptions, SceneState, SceneStatus, Upload},
+    scene::{
+        SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState, Upload,
+    },
     store::{self, Record},
 };
 
@@ -38,6 +40,9 @@ impl Service {
     pub async fn create_scene(&self, request: CreateScene) -> Result<Created> {
         let CreateScene { upload, options, idempotency_key, wait } = request;
         check_request(&options, idempotency_key.as_deref(), self.limits())?;
+        if options.semantics == SemanticsMode::Eager {
+            self.inner.can_understand("semantics=eager")?;
+        }
         let (id, replayed) = match idempotency_key {
             None => (self.submit(upload, options, None).await?, false),
             Some(key) => {
@@ -72,11 +77,11 @@ impl Service {
     pub async fn wait(&self, id: &SceneId, at_most: Duration) -> Result<SceneStatus> {
         let mut watcher = self.inner.jobs.watch(id)?;
         let at_most = at_most.min(Duration::from_millis(self.limits().wait_ms_max));
-        let end = watcher.wait_for(|record| record.status.state.is_final());
+        let end = watcher.wait_for(|record| record.status.is_settled());
         // Late or deleted: either way the present state is the answer.
         let _ = tokio::time::timeout(at_most, end).await;
         let status = watcher.borrow().status.clone();
-        Ok(status)
+        Ok(self.shown(status))
     }
 
     async fn submit(
@@ -105,13 +110,18 @@ impl Inner {
     ) -> Result<SceneId> {
         self.maker.check(upload, &self.config.limits)?;
         let id = new_id();
+        let mut status = SceneStatus::new(id.clone(), SceneState::Queued, store::now_ms());
+        if options.semantics == SemanticsMode::Off {
+            status.semantics.state = SemanticsState::Off;
+        }
         let record = Record {
-            status: SceneStatus::new(id.clone(), SceneState::Queued, store::now_ms()),
+            status,
             request_sha256: request_sha256(upload, &options),
             options,
             idempotency_key: key,
             attempts: 0,
             scene_sha256: None,
+            semantics_sha256: None,
         };
         self.jobs.submit(upload, record)?;
         tracing::info!(scene = %id, photos = upload.photos.len(), "queued");

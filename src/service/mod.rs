@@ -7,6 +7,7 @@ mod create;
 mod encode;
 mod export;
 mod gate;
+mod semantics;
 mod types;
 mod view;
 
@@ -25,13 +26,13 @@ pub use self::{
     view::{default_near, render_scene},
 };
 pub use crate::scene::{
-    Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, Upload, UploadCameras,
-    UploadFile,
+    Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
+    SemanticsState, SemanticsStatus, Upload, UploadCameras, UploadFile,
 };
 use crate::{
     config::Config,
     error::{Error, Result},
-    jobs::{Jobs, SceneMaker},
+    jobs::{Jobs, SceneMaker, SemanticsMaker},
     limits::Limits,
     render::Renderer,
     scene::SceneId,
@@ -52,6 +53,8 @@ pub struct Service {
 pub struct Parts {
     /// Turns uploads into scenes.
     pub maker: Arc<dyn SceneMaker>,
+    /// Turns scenes into what they mean, and texts into embeddings.
+    pub semantics: Arc<dyn SemanticsMaker>,
     /// Turns scenes into views.
     pub renderer: Arc<dyn Renderer>,
     /// What `/v1/models` says; the renderer and the version are filled in.
@@ -69,6 +72,7 @@ struct Inner {
     store: Arc<Store>,
     jobs: Jobs,
     maker: Arc<dyn SceneMaker>,
+    semantics: Arc<dyn SemanticsMaker>,
     renderer: Arc<dyn Renderer>,
     models: ModelsInfo,
     gate: Gate,
@@ -95,6 +99,7 @@ impl Service {
         let jobs = Jobs::start(
             Arc::clone(&store),
             Arc::clone(&parts.maker),
+            Arc::clone(&parts.semantics),
             records,
             &config.limits,
             config.jobs,
@@ -110,6 +115,7 @@ impl Service {
             store,
             jobs,
             maker: parts.maker,
+            semantics: parts.semantics,
             renderer: parts.renderer,
             models,
             gate: Gate::new(renders, config.limits.queued_renders_max),
@@ -131,7 +137,7 @@ impl Service {
     /// # Errors
     /// `scene_not_found`.
     pub fn get(&self, id: &SceneId) -> Result<SceneStatus> {
-        Ok(self.inner.jobs.record(id)?.status)
+        Ok(self.shown(self.inner.jobs.record(id)?.status))
     }
 
     /// A page of scenes, newest first, without cameras.
@@ -148,7 +154,8 @@ impl Service {
         let after = page.after.as_deref().map(parse_cursor).transpose()?;
         let (records, more) = self.inner.jobs.page(after, limit);
         let next = records.last().filter(|_| more).map(cursor);
-        let without_cameras = |record: Record| SceneStatus { cameras: Vec::new(), ..record.status };
+        let without_cameras =
+            |record: Record| self.shown(SceneStatus { cameras: Vec::new(), ..record.status });
         Ok(Page { scenes: records.into_iter().map(without_cameras).collect(), next })
     }
 
@@ -183,7 +190,12 @@ impl Service {
     }
 
     fn event(&self, status: &SceneStatus) -> Event {
+        let semantics = &status.semantics;
         match status.state {
+            SceneState::Done if semantics.state == SemanticsState::Running => Event::Running {
+                stage: semantics.stage.clone().unwrap_or_else(|| "masks".to_owned()),
+                fraction: semantics.fraction,
+            },
             SceneState::Queued => Event::Queued { ahead: self.inner.jobs.ahead(&status.id) },
             SceneState::Running => Event::Running {
                 stage: status.stage.clone().unwrap_or_else(|| "photos".to_owned()),

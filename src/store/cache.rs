@@ -7,7 +7,7 @@ use std::{
 
 use crate::scene::{Scene, SceneId};
 
-/// Least-recently-used cache of scenes, bounded by the bytes of their Gaussians.
+/// Least-recently-used cache of scenes, bounded by the bytes of their arrays.
 #[derive(Debug)]
 pub(super) struct Cache {
     bytes_max: u64,
@@ -37,7 +37,7 @@ impl Cache {
 
     /// Keeps a scene; one larger than the whole cache is not kept.
     pub(super) fn insert(&self, scene: Arc<Scene>) {
-        let size = scene.gaussians.size_bytes();
+        let size = scene.size_bytes();
         self.remove(&scene.meta.id);
         if size > self.bytes_max {
             return;
@@ -66,7 +66,7 @@ impl Cache {
 impl Inner {
     fn take(&mut self, id: &SceneId) {
         if let Some((scene, _)) = self.scenes.remove(id) {
-            self.size_bytes -= scene.gaussians.size_bytes();
+            self.size_bytes -= scene.size_bytes();
         }
     }
 }
@@ -97,7 +97,7 @@ mod tests {
             provenance: Provenance::default(),
         };
         let gaussians = Gaussians::sanitize(raw).unwrap().0;
-        Arc::new(Scene { meta, gaussians, backdrop: Backdrop::default() })
+        Arc::new(Scene::new(meta, gaussians, Backdrop::default()))
     }
 
     fn has(cache: &Cache, id: u8) -> bool {

@@ -6,6 +6,7 @@
 //! DATA_DIR/scenes/ID/upload.segsplat     photos and cameras as sent, with the first record
 //! DATA_DIR/scenes/ID/status.json         the newest record, with its checksum
 //! DATA_DIR/scenes/ID/scene.segsplat      the finished scene
+//! DATA_DIR/scenes/ID/semantics.segsplat  what it means, once somebody has asked
 //! DATA_DIR/scenes/ID/*.quarantined       a file that failed its checksum
 //! DATA_DIR/trash/ID/                     being deleted; rubbish after a crash
 //! ```
@@ -20,6 +21,7 @@ mod open;
 pub mod ply;
 mod record;
 mod scene_file;
+mod semantics_file;
 mod upload_file;
 
 use std::{
@@ -35,16 +37,18 @@ use self::{cache::Cache, files::unavailable};
 pub use self::{
     record::Record,
     scene_file::{read_scene, write_scene},
+    semantics_file::{read_semantics, write_semantics},
     upload_file::hashes,
 };
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Scene, SceneId, Upload},
+    scene::{Scene, SceneId, Semantics, Upload},
 };
 
 const UPLOAD: &str = "upload.segsplat";
 const STATUS: &str = "status.json";
 const SCENE: &str = "scene.segsplat";
+const SEMANTICS: &str = "semantics.segsplat";
 const QUARANTINED: &str = "quarantined";
 
 /// Scenes of one data folder. Calls block on the disk; all are safe from any thread.
@@ -121,7 +125,31 @@ impl Store {
         Ok(digest)
     }
 
-    /// A finished scene, from memory or disk; every byte from disk is checked.
+    /// Keeps what a scene means; gives the scene that carries it and the file's sha256, hex.
+    ///
+    /// # Errors
+    /// As [`Self::scene`]; `scene_corrupt` also when they are of other Gaussians.
+    pub fn put_semantics(
+        &self,
+        id: &SceneId,
+        semantics: Semantics,
+    ) -> Result<(Arc<Scene>, String)> {
+        let scene = Arc::new(self.scene(id)?.with_semantics(Arc::new(semantics))?);
+        let mut digest = String::new();
+        files::write_atomic(&self.folder(id).join(SEMANTICS), |to| {
+            if let Some(semantics) = &scene.semantics {
+                digest = write_semantics(to, id, semantics)?;
+            }
+            Ok(())
+        })
+        .map_err(|cause| unavailable("keep the scene's semantics", cause))?;
+        self.cache.insert(Arc::clone(&scene));
+        Ok((scene, digest))
+    }
+
+    /// A finished scene, from memory or disk, with its semantics where they were made; every byte
+    /// from disk is checked. Bad semantics are put aside: the scene is whole without them.
+    ///
     ///
     /// # Errors
     /// `scene_not_found`, `scene_corrupt` (its file is then put aside), `store_unavailable`.
@@ -169,7 +197,7 @@ impl Store {
         });
         match checked {
             Ok(scene) => {
-                let scene = Arc::new(scene);
+                let scene = Arc::new(self.with_its_semantics(scene)?);
                 self.cache.insert(Arc::clone(&scene));
                 Ok(scene)
             }
@@ -179,6 +207,24 @@ impl Store {
                 Err(error)
             }
         }
+    }
+
+    /// The scene with the semantics that are kept beside it, if any are and they are sound.
+    fn with_its_semantics(&self, scene: Scene) -> Result<Scene> {
+        let id = scene.meta.id.clone();
+        let path = self.folder(&id).join(SEMANTICS);
+        let file = match fs::read(&path) {
+            Ok(file) => file,
+            Err(cause) if cause.kind() == io::ErrorKind::NotFound => return Ok(scene),
+            Err(cause) => return Err(unavailable("read the scene's semantics", cause)),
+        };
+        let checked = read_semantics(&file, &id)
+            .and_then(|(semantics, _)| scene.with_semantics(Arc::new(semantics)));
+        checked.or_else(|error| {
+            tracing::error!(scene = %id, %error, "semantics are put aside, to be made again");
+            quarantine(&path);
+            Ok(scene)
+        })
     }
 
     /// Removes everything of a scene; gone is gone at once, even if power fails.

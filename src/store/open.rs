@@ -5,8 +5,8 @@ use std::path::Path;
 use fs_err as fs;
 
 use super::{
-    Cache, QUARANTINED, Record, SCENE, STATUS, Store, UPLOAD, files::unavailable, quarantine,
-    record, scene_file, upload_file, write_record,
+    Cache, QUARANTINED, Record, SCENE, SEMANTICS, STATUS, Store, UPLOAD, files::unavailable,
+    quarantine, record, scene_file, upload_file, write_record,
 };
 use crate::{
     error::{Error, ErrorCode, Result},
@@ -88,6 +88,7 @@ fn recover_record(folder: &Path, id: &SceneId) -> Record {
             request_sha256: String::new(),
             attempts: 0,
             scene_sha256: None,
+            semantics_sha256: None,
         }
     });
     if folder.join(STATUS).exists() {
@@ -117,6 +118,7 @@ fn from_scene(folder: &Path, id: &SceneId) -> Option<Record> {
         request_sha256: String::new(),
         attempts: 1,
         scene_sha256: Some(sha256),
+        semantics_sha256: None,
     })
 }
 
@@ -130,7 +132,7 @@ fn from_upload(folder: &Path, id: &SceneId) -> Option<Record> {
 
 /// A write that a crash cut off.
 fn clear_temporary(folder: &Path) {
-    for name in [UPLOAD, STATUS, SCENE] {
+    for name in [UPLOAD, STATUS, SCENE, SEMANTICS] {
         // Absent is the rule.
         let _ = fs::remove_file(folder.join(name).with_extension(super::files::TEMPORARY));
     }

@@ -24,6 +24,9 @@ pub struct Record {
     pub attempts: u32,
     /// sha256 of the scene container, hex, once done.
     pub scene_sha256: Option<String>,
+    /// sha256 of the semantics container, hex, once they are ready.
+    #[serde(default)]
+    pub semantics_sha256: Option<String>,
 }
 
 /// The record with its own checksum: a flipped digit in a number would still be JSON.

@@ -83,16 +83,13 @@ pub fn read_scene(file: &[u8]) -> Result<(Scene, String)> {
             .map(|[view, x, y]| SourcePixel { view, x, y })
             .collect(),
     };
-    let scene = Scene {
-        meta: header.meta,
-        gaussians: Gaussians::restore(raw)?,
-        backdrop: Backdrop::from_cells(rows(&container, "backdrop", Dtype::U8)?)?,
-    };
+    let backdrop = Backdrop::from_cells(rows(&container, "backdrop", Dtype::U8)?)?;
+    let scene = Scene::new(header.meta, Gaussians::restore(raw)?, backdrop);
     Ok((scene, container.sha256))
 }
 
 /// An array as rows of `T`, copied so that alignment does not matter.
-fn rows<T: Pod>(container: &Container<'_>, name: &str, dtype: Dtype) -> Result<Vec<T>> {
+pub(super) fn rows<T: Pod>(container: &Container<'_>, name: &str, dtype: Dtype) -> Result<Vec<T>> {
     let (_, bytes) = container.array(name, dtype)?;
     if bytes.len() % size_of::<T>() != 0 {
         return Err(Error::new(

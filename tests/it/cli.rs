@@ -86,7 +86,7 @@ fn scene() -> Scene {
         report: HealthReport { median_depth: 2.0, ..HealthReport::default() },
         provenance: Provenance::default(),
     };
-    Scene { meta, gaussians: Gaussians::sanitize(raw).unwrap().0, backdrop: Backdrop::default() }
+    Scene::new(meta, Gaussians::sanitize(raw).unwrap().0, Backdrop::default())
 }
 
 /// A folder with the plate as `scene.segsplat` and `plate.ply`.

@@ -54,7 +54,7 @@ fn wall() -> Scene {
         provenance: Provenance::default(),
     };
     let gaussians = Gaussians::sanitize(raw).expect("equal lengths").0;
-    Scene { meta, gaussians, backdrop: Backdrop::default() }
+    Scene::new(meta, gaussians, Backdrop::default())
 }
 
 /// Smallest and largest alpha away from the picture's border.

@@ -7,6 +7,7 @@
     reason = "helpers of tests are tests too"
 )]
 
+mod asking;
 mod bad_input;
 mod capture;
 mod cli;

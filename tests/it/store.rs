@@ -56,7 +56,7 @@ fn scene(id: u8, count: usize, sh_degree: u8) -> Scene {
     };
     let cells = (0..Backdrop::WIDTH * Backdrop::HEIGHT).map(|i| [i as u8, id, 7]).collect();
     let backdrop = Backdrop::from_cells(cells).unwrap();
-    Scene { meta, gaussians: Gaussians::restore(raw).unwrap(), backdrop }
+    Scene::new(meta, Gaussians::restore(raw).unwrap(), backdrop)
 }
 
 fn bits(gaussians: &Gaussians) -> Vec<u32> {
@@ -81,11 +81,12 @@ fn record(id: u8) -> Record {
     let id = SceneId::from_bytes([id; 16]);
     Record {
         status: SceneStatus::new(id, SceneState::Queued, 1_700_000_000_123),
-        options: SceneOptions { max_views: Some(4) },
+        options: SceneOptions { max_views: Some(4), ..SceneOptions::default() },
         idempotency_key: Some("key".to_owned()),
         request_sha256: "cd".repeat(32),
         attempts: 0,
         scene_sha256: None,
+        semantics_sha256: None,
     }
 }
 

@@ -2,18 +2,18 @@
 
 use super::pb;
 use crate::{
-    api::semantics::{Semantics, SemanticsStatus, kind_unavailable},
+    api::semantics::kind_unavailable,
     error::{Error, Result},
-    scene::{CameraToWorld, HealthReport, Intrinsics},
+    scene::{CameraToWorld, HealthReport, Intrinsics, ScoringProfile, SemanticsReport, StageTime},
     service::{
         CameraSpec, Event, ExportFormat, Format, Kind, LensSpec, ModelsInfo, PoseSpec,
-        RenderedView, SceneError, SceneState, SceneStatus, ViewOptions,
+        RenderedView, SceneError, SceneState, SceneStatus, SemanticsMode, SemanticsState,
+        SemanticsStatus, ViewOptions,
     },
 };
 
 /// A scene with what can be asked of it by text.
-pub(super) fn scene(status: SceneStatus, models: &ModelsInfo) -> pb::Scene {
-    let semantics = SemanticsStatus::of(models);
+pub(super) fn scene(status: SceneStatus) -> pb::Scene {
     let camera = |camera: crate::service::SceneCamera| pb::SceneCamera {
         file: camera.file,
         intrinsics: Some(intrinsics(camera.camera.intrinsics)),
@@ -29,11 +29,48 @@ pub(super) fn scene(status: SceneStatus, models: &ModelsInfo) -> pb::Scene {
         error: status.error.map(scene_error),
         report: status.report.map(report),
         cameras: status.cameras.into_iter().map(camera).collect(),
-        semantics: Some(pb::SemanticsStatus {
-            available: semantics.available,
-            reason: semantics.reason,
-        }),
+        semantics: Some(semantics_status(status.semantics)),
     }
+}
+
+fn semantics_status(status: SemanticsStatus) -> pb::SemanticsStatus {
+    let state = match status.state {
+        SemanticsState::Off => pb::SemanticsState::Off,
+        SemanticsState::None => pb::SemanticsState::None,
+        SemanticsState::Running => pb::SemanticsState::Running,
+        SemanticsState::Ready => pb::SemanticsState::Ready,
+        SemanticsState::Failed => pb::SemanticsState::Failed,
+    };
+    let report = |report: SemanticsReport| pb::SemanticsReport {
+        masks: report.masks,
+        bank_size: report.bank_size,
+        labelled: report.labelled,
+        bundle_sha256: report.bundle_sha256,
+        profile: profile(report.profile).into(),
+        stages: report.stages.into_iter().map(stage_time).collect(),
+        execution_provider: report.execution_provider,
+    };
+    pb::SemanticsStatus {
+        available: status.available,
+        reason: status.reason.unwrap_or_default(),
+        state: state.into(),
+        stage: status.stage.unwrap_or_default(),
+        fraction: status.fraction,
+        bank_size: status.bank_size,
+        error: status.error.map(scene_error),
+        report: status.report.map(report),
+    }
+}
+
+fn profile(profile: ScoringProfile) -> pb::ScoringProfile {
+    match profile {
+        ScoringProfile::Default => pb::ScoringProfile::Default,
+        ScoringProfile::Paper => pb::ScoringProfile::Paper,
+    }
+}
+
+fn stage_time(time: StageTime) -> pb::StageTime {
+    pb::StageTime { stage: time.stage, ms: time.ms }
 }
 
 fn state(state: SceneState) -> pb::SceneState {
@@ -62,7 +99,6 @@ fn report(report: HealthReport) -> pb::HealthReport {
     };
     let drop_count =
         |drop: crate::scene::DropCount| pb::DropCount { reason: drop.reason, count: drop.count };
-    let stage = |time: crate::scene::StageTime| pb::StageTime { stage: time.stage, ms: time.ms };
     pb::HealthReport {
         photos: report.photos,
         views_used: report.views_used,
@@ -73,7 +109,7 @@ fn report(report: HealthReport) -> pb::HealthReport {
         median_depth: report.median_depth,
         overlap: report.overlap,
         network_focal_px: report.network_focal_px,
-        stages: report.stages.into_iter().map(stage).collect(),
+        stages: report.stages.into_iter().map(stage_time).collect(),
         execution_provider: report.execution_provider,
         warnings: report.warnings.into_iter().map(warning).collect(),
     }
@@ -106,11 +142,11 @@ pub(super) fn event(event: Event) -> pb::SceneEvent {
 }
 
 /// When the semantic bank is made.
-pub(super) fn semantics(number: i32) -> Result<Semantics> {
+pub(super) fn semantics(number: i32) -> Result<SemanticsMode> {
     match known::<pb::Semantics>("semantics", number)? {
-        pb::Semantics::Unspecified | pb::Semantics::Lazy => Ok(Semantics::Lazy),
-        pb::Semantics::Eager => Ok(Semantics::Eager),
-        pb::Semantics::Off => Ok(Semantics::Off),
+        pb::Semantics::Unspecified | pb::Semantics::Lazy => Ok(SemanticsMode::Lazy),
+        pb::Semantics::Eager => Ok(SemanticsMode::Eager),
+        pb::Semantics::Off => Ok(SemanticsMode::Off),
     }
 }
 

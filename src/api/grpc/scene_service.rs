@@ -53,7 +53,7 @@ impl pb::scene_service_server::SceneService for Api {
     async fn get_scene(&self, request: Request<pb::GetSceneRequest>) -> Answer<pb::Scene> {
         let status = async { self.service.get(&request.get_ref().scene_id.parse()?) }.await;
         let status = status.map_err(|e| logged(&e))?;
-        Ok(Response::new(convert::scene(status, &self.service.models())))
+        Ok(Response::new(convert::scene(status)))
     }
 
     async fn list_scenes(
@@ -66,8 +66,7 @@ impl pb::scene_service_server::SceneService for Api {
             after: Some(request.after).filter(|after| !after.is_empty()),
         };
         let page = self.service.list(&page).map_err(|e| logged(&e))?;
-        let models = self.service.models();
-        let scenes = page.scenes.into_iter().map(|s| convert::scene(s, &models)).collect();
+        let scenes = page.scenes.into_iter().map(convert::scene).collect();
         let next = page.next.unwrap_or_default();
         Ok(Response::new(pb::ListScenesResponse { scenes, next }))
     }
@@ -105,14 +104,17 @@ async fn create(api: &Api, messages: Streaming<pb::CreateSceneRequest>) -> Resul
     let wait = header.wait_ms.map(Duration::from_millis);
     let request = CreateScene {
         upload,
-        options: SceneOptions { max_views: header.max_views.map(|views| views as usize) },
+        options: SceneOptions {
+            max_views: header.max_views.map(|views| views as usize),
+            semantics: convert::semantics(header.semantics)?,
+        },
         idempotency_key: Some(header.idempotency_key).filter(|key| !key.is_empty()),
         wait,
     };
     let created = api.service.create_scene(request).await?;
     match (&created.status.error, wait) {
         (Some(error), Some(_)) => Err(error.to_error()),
-        _ => Ok(convert::scene(created.status, &api.service.models())),
+        _ => Ok(convert::scene(created.status)),
     }
 }
 
@@ -162,9 +164,8 @@ fn begin(
     mut header: pb::CreateSceneHeader,
     upload: &mut UploadBuilder<'_>,
 ) -> Result<pb::CreateSceneHeader> {
-    let models = api.service.models();
-    convert::semantics(header.semantics)?.check(&models)?;
-    check_bundle(&header.bundle, &models)?;
+    convert::semantics(header.semantics)?;
+    check_bundle(&header.bundle, &api.service.models())?;
     match header.cameras.take() {
         None => {}
         Some(Cameras::TransformsJson(json)) => {

@@ -70,7 +70,8 @@ pub(super) struct IdParam {
 #[into_params(parameter_in = Query)]
 #[expect(dead_code, reason = "read by the derive alone")]
 pub(super) struct CreateParams {
-    /// `lazy` (default), `eager` or `off`.
+    /// When a scene's semantics are made: `lazy` (default) with the first text, `eager` as soon as
+    /// it can be viewed, `off` never.
     semantics: Option<String>,
     /// Name of the model bundle; the loaded one by default.
     bundle: Option<String>,
@@ -240,10 +241,42 @@ pub(super) struct SceneError {
 #[derive(ToSchema)]
 #[expect(dead_code, reason = "read by the derive alone")]
 pub(super) struct SemanticsStatus {
-    /// Whether kinds that need text can be asked for now.
+    /// Whether a text can be asked: at once where `ready`, else after they are made.
     available: bool,
     /// Why not.
-    reason: String,
+    reason: Option<String>,
+    /// `off`, `none` (not made yet), `running`, `ready` or `failed`.
+    state: String,
+    /// Stage at work while running: `masks`, `embed`, `bank`, `assign`.
+    stage: Option<String>,
+    /// Share of their making that is done, 0..1.
+    fraction: f32,
+    /// Entries of the bank (M), once ready.
+    bank_size: Option<u32>,
+    /// Why they failed; the next text tries again.
+    error: Option<SceneError>,
+    /// Counts and times, once ready.
+    report: Option<SemanticsReport>,
+}
+
+/// How the making of a scene's semantics went.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "read by the derive alone")]
+pub(super) struct SemanticsReport {
+    /// Masks of each photo.
+    masks: Vec<u32>,
+    /// Entries of the bank (M).
+    bank_size: u32,
+    /// Gaussians that have an entry.
+    labelled: u64,
+    /// sha256 of the bundle's manifest, hex.
+    bundle_sha256: String,
+    /// Scoring profile they were made under.
+    profile: String,
+    /// Time of each stage.
+    stages: Vec<StageTime>,
+    /// Execution provider of the networks.
+    execution_provider: String,
 }
 
 /// Counts, figures and warnings.

@@ -12,7 +12,6 @@ use axum::{
     },
 };
 use futures_util::{Stream, StreamExt};
-use serde::Serialize;
 
 use super::{
     error::ApiError,
@@ -24,32 +23,11 @@ use super::{
 use crate::{
     api::{
         Api,
-        semantics::{Semantics, SemanticsStatus, check_bundle},
+        semantics::{check_bundle, mode},
     },
     error::{Error, Result},
-    service::{CreateScene, Event, PageRequest, SceneOptions, SceneState, SceneStatus},
+    service::{CreateScene, Event, Page, PageRequest, SceneOptions, SceneState, SceneStatus},
 };
-
-/// A scene as HTTP shows it.
-#[derive(Debug, Serialize)]
-pub(super) struct SceneBody {
-    #[serde(flatten)]
-    status: SceneStatus,
-    semantics: SemanticsStatus,
-}
-
-/// A page as HTTP shows it.
-#[derive(Debug, Serialize)]
-pub(super) struct PageBody {
-    scenes: Vec<SceneBody>,
-    next: Option<String>,
-}
-
-impl SceneBody {
-    fn new(api: &Api, status: SceneStatus) -> Self {
-        Self { status, semantics: SemanticsStatus::of(&api.service.models()) }
-    }
-}
 
 /// `POST /v1/scenes`
 #[utoipa::path(
@@ -79,7 +57,7 @@ pub(super) async fn create(
         _ => StatusCode::ACCEPTED,
     };
     let location = format!("/v1/scenes/{}", created.status.id);
-    let body = Json(SceneBody::new(&api, created.status));
+    let body = Json(created.status);
     let mut answer = (status, [(header::LOCATION, location)], body).into_response();
     if created.replayed {
         answer.headers_mut().insert("idempotency-replayed", HeaderValue::from_static("true"));
@@ -95,12 +73,10 @@ pub(super) async fn create(
 pub(super) async fn list(
     State(api): State<Api>,
     mut params: Params,
-) -> Result<Json<PageBody>, ApiError> {
+) -> Result<Json<Page>, ApiError> {
     let page = PageRequest { limit: params.whole("limit")?, after: params.text("after")? };
     params.finish()?;
-    let page = api.service.list(&page)?;
-    let scenes = page.scenes.into_iter().map(|status| SceneBody::new(&api, status)).collect();
-    Ok(Json(PageBody { scenes, next: page.next }))
+    Ok(Json(api.service.list(&page)?))
 }
 
 /// `GET /v1/scenes/{id}`
@@ -112,9 +88,9 @@ pub(super) async fn get(
     State(api): State<Api>,
     Id(id): Id,
     params: Params,
-) -> Result<Json<SceneBody>, ApiError> {
+) -> Result<Json<SceneStatus>, ApiError> {
     params.finish()?;
-    Ok(Json(SceneBody::new(&api, api.service.get(&id)?)))
+    Ok(Json(api.service.get(&id)?))
 }
 
 /// `DELETE /v1/scenes/{id}`
@@ -159,14 +135,14 @@ fn sse_event(event: &Event) -> sse::Event {
 }
 
 fn options(api: &Api, mut params: Params) -> Result<(SceneOptions, Option<Duration>)> {
-    let models = api.service.models();
-    if let Some(semantics) = params.text("semantics")? {
-        Semantics::parse(&semantics)?.check(&models)?;
-    }
+    let semantics = params.text("semantics")?.map(|text| mode(&text)).transpose()?;
     if let Some(bundle) = params.text("bundle")? {
-        check_bundle(&bundle, &models)?;
+        check_bundle(&bundle, &api.service.models())?;
     }
-    let options = SceneOptions { max_views: params.whole("max_views")? };
+    let options = SceneOptions {
+        max_views: params.whole("max_views")?,
+        semantics: semantics.unwrap_or_default(),
+    };
     let wait = params.whole::<u64>("wait_ms")?.map(Duration::from_millis);
     params.finish()?;
     Ok((options, wait))

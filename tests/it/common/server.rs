@@ -17,7 +17,7 @@ use segsplat::{
     api,
     config::Config,
     error::{Error, ErrorCode, Result},
-    jobs::{Made, SceneMaker, Work},
+    jobs::{Made, NoSemantics, SceneMaker, Work},
     limits::Limits,
     photos,
     render::{Entries, Frame, FrameStats, Labels, RenderRequest, Renderer},
@@ -26,7 +26,10 @@ use segsplat::{
         Backdrop, Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SceneId,
         SceneStatus, SourcePixel, Upload,
     },
-    service::{CreateScene, ModelsInfo, Parts, Service},
+    service::{
+        CameraSpec, CreateScene, Kind, LensSpec, ModelsInfo, Parts, PoseSpec, Service, ViewOptions,
+        ViewSpec,
+    },
 };
 use tempfile::TempDir;
 use tokio::{net::TcpListener, sync::oneshot, task::JoinHandle};
@@ -60,6 +63,7 @@ impl TestServer {
         config.data_dir = folder.path().join("data");
         let mut parts = Parts {
             maker: Arc::new(WallMaker::default()),
+            semantics: Arc::new(NoSemantics),
             renderer: Arc::new(PointRenderer),
             models: ModelsInfo::default(),
         };
@@ -123,6 +127,13 @@ impl TestServer {
 pub(crate) fn upload() -> Upload {
     let options = SampleOptions { photos: 3, width: 64, height: 48, seed: 5 };
     sample::upload(&options).expect("the options are in range")
+}
+
+/// Colour from the first input camera.
+pub(crate) fn first_view() -> ViewSpec {
+    let pose = PoseSpec::Between { from: 0, to: 1, t: 0.0 };
+    let camera = CameraSpec { pose, lens: LensSpec::OfScene };
+    ViewSpec { camera, kind: Kind::Color, options: ViewOptions::default() }
 }
 
 /// Stands in for the network. Held back while `hold` is true, so that tests see work in progress;

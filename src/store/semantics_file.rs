@@ -1,0 +1,96 @@
+//! What a scene means as one container, beside the scene's own file.
+
+use std::io::{self, Write};
+
+use safetensors::Dtype;
+use serde::{Deserialize, Serialize};
+
+use super::{
+    container::{self, Array, Container, Label},
+    scene_file::rows,
+};
+use crate::{
+    error::{Error, ErrorCode, Result},
+    scene::{Bank, IndexMap, SceneId, Semantics, SemanticsReport},
+};
+
+const LABEL: Label = Label { kind: "segsplat-semantics", version: 1 };
+
+/// What the arrays cannot say.
+#[derive(Serialize, Deserialize)]
+struct Header {
+    scene: SceneId,
+    /// Numbers a row of the bank.
+    dim: usize,
+    /// Width and height of each photo's map.
+    maps: Vec<[u32; 2]>,
+    report: SemanticsReport,
+}
+
+/// Writes the semantics of scene `id` and gives the file's sha256, hex.
+///
+/// # Errors
+/// Those of the writer.
+pub fn write_semantics(
+    to: &mut dyn Write,
+    id: &SceneId,
+    semantics: &Semantics,
+) -> io::Result<String> {
+    let bank = &semantics.bank;
+    let header = serde_json::to_string(&Header {
+        scene: id.clone(),
+        dim: bank.dim,
+        maps: semantics.photos.iter().map(|map| [map.width, map.height]).collect(),
+        report: semantics.report.clone(),
+    })?;
+    let cells: Vec<u16> = semantics.photos.iter().flat_map(|map| map.index.clone()).collect();
+    let array = |name: &str, dtype, shape: &[usize], bytes| Array {
+        name: name.to_owned(),
+        dtype,
+        shape: shape.to_vec(),
+        bytes,
+    };
+    let arrays = [
+        array("bank", Dtype::F32, &[bank.len(), bank.dim], bytemuck::cast_slice(&bank.rows)),
+        array(
+            "index",
+            Dtype::U16,
+            &[semantics.index.len()],
+            bytemuck::cast_slice(&semantics.index),
+        ),
+        array("photos", Dtype::U16, &[cells.len()], bytemuck::cast_slice(&cells)),
+    ];
+    container::write(to, &LABEL, &header, &arrays)
+}
+
+/// Reads the semantics of scene `id` and gives them with their file's sha256, hex.
+///
+/// # Errors
+/// `scene_corrupt` when any byte differs from what was written, the version is unknown, or they
+/// are another scene's.
+pub fn read_semantics(file: &[u8], id: &SceneId) -> Result<(Semantics, String)> {
+    let corrupt =
+        |why: String| Error::new(ErrorCode::SceneCorrupt, format!("the semantics file: {why}"));
+    let container = Container::read(file, &LABEL, "the semantics file")?;
+    let header: Header =
+        serde_json::from_str(&container.meta_json).map_err(|e| corrupt(e.to_string()))?;
+    if header.scene != *id {
+        return Err(corrupt(format!("it is of scene {}, not of {id}", header.scene)));
+    }
+    let bank = Bank { dim: header.dim, rows: rows(&container, "bank", Dtype::F32)? };
+    if bank.rows.len() != bank.len() * bank.dim || bank.rows.iter().any(|v| !v.is_finite()) {
+        return Err(corrupt("the bank has no whole number of finite rows".to_owned()));
+    }
+    let mut cells = &rows::<u16>(&container, "photos", Dtype::U16)?[..];
+    let mut photos = Vec::new();
+    for [width, height] in header.maps {
+        let size = width as usize * height as usize;
+        let (own, rest) = cells
+            .split_at_checked(size)
+            .ok_or_else(|| corrupt(format!("a map of {width}x{height} cells is cut short")))?;
+        photos.push(IndexMap { width, height, index: own.to_vec() });
+        cells = rest;
+    }
+    let index = rows(&container, "index", Dtype::U16)?;
+    Ok((Semantics { bank, index, photos, report: header.report }, container.sha256))
+}

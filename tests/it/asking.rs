@@ -1,0 +1,198 @@
+//! Asking a scene by text: when its semantics are made, how often, what is told meanwhile, and
+//! what is refused.
+
+use std::{
+    sync::{Arc, atomic::Ordering},
+    time::Duration,
+};
+
+use futures_util::{StreamExt, future::join_all};
+use segsplat::{
+    error::ErrorCode,
+    scene::{Event, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState},
+    service::CreateScene,
+};
+
+use crate::common::{
+    meaning::PhotoMeaning,
+    server::{PATIENCE, TestServer, upload},
+};
+
+/// A server with the stand-in for the semantic networks, and the stand-in.
+async fn server() -> (TestServer, Arc<PhotoMeaning>) {
+    let meaning = Arc::new(PhotoMeaning::default());
+    let given = Arc::clone(&meaning);
+    let server = TestServer::with(|_, parts| parts.semantics = given).await;
+    (server, meaning)
+}
+
+async fn scene(server: &TestServer, semantics: SemanticsMode) -> SceneStatus {
+    let options = SceneOptions { semantics, ..SceneOptions::default() };
+    let request =
+        CreateScene { upload: upload(), options, wait: Some(PATIENCE), ..CreateScene::default() };
+    server.service.create_scene(request).await.expect("a good upload").status
+}
+
+fn stand(server: &TestServer, id: &SceneId) -> SemanticsState {
+    server.service.get(id).unwrap().semantics.state
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn lazy_semantics_are_made_by_the_first_who_asks_and_once_however_many_ask() {
+    let (server, meaning) = server().await;
+    let status = scene(&server, SemanticsMode::Lazy).await;
+    assert_eq!((status.state, status.semantics.state), (SceneState::Done, SemanticsState::None));
+    assert!(status.semantics.available);
+    assert_eq!(meaning.made.load(Ordering::Acquire), 0, "nobody has asked");
+    meaning.hold.store(true, Ordering::Release);
+    let id = &status.id;
+    let ask = || server.service.understand(id, Some(PATIENCE));
+    let all = join_all((0..20).map(|_| ask()));
+    let let_go = async {
+        while stand(&server, id) != SemanticsState::Running {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+        meaning.hold.store(false, Ordering::Release);
+    };
+    let (answers, ()) = tokio::join!(all, let_go);
+    for answer in answers {
+        let semantics = answer.unwrap().semantics;
+        assert_eq!((semantics.state, semantics.bank_size), (SemanticsState::Ready, Some(3)));
+    }
+    ask().await.unwrap();
+    assert_eq!(meaning.made.load(Ordering::Acquire), 1, "20 callers at once, and one later");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_scene_stays_done_while_its_semantics_run_and_watchers_see_their_stages() {
+    let (server, meaning) = server().await;
+    let id = scene(&server, SemanticsMode::Lazy).await.id;
+    meaning.hold.store(true, Ordering::Release);
+    let late = server.service.understand(&id, Some(Duration::ZERO)).await.unwrap_err();
+    assert_eq!((late.code(), late.retry_after()), (ErrorCode::SceneNotReady, Some(2)));
+    assert!(late.message().contains("are being made"), "{late}");
+    let mut events = std::pin::pin!(server.service.watch(&id).unwrap());
+    while !matches!(events.next().await, Some(Event::Running { stage, fraction })
+        if stage == "masks" && fraction > 0.2)
+    {}
+    let status = server.service.get(&id).unwrap();
+    assert_eq!((status.state, status.semantics.state), (SceneState::Done, SemanticsState::Running));
+    assert_eq!(status.semantics.stage.as_deref(), Some("masks"));
+    let view = server.service.view_etag(&id, &crate::common::server::first_view());
+    assert!(view.is_ok(), "it can be viewed meanwhile");
+    meaning.hold.store(false, Ordering::Release);
+    let rest: Vec<Event> = events.collect().await;
+    assert_eq!(rest.last(), Some(&Event::Done));
+    let status = server.service.get(&id).unwrap();
+    assert_eq!(status.semantics.state, SemanticsState::Ready);
+    assert_eq!(status.semantics.report.unwrap().masks, [1, 1, 1]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn eager_semantics_come_with_the_scene_and_watchers_do_not_leave_before() {
+    let (server, meaning) = server().await;
+    meaning.hold.store(true, Ordering::Release);
+    let options = SceneOptions { semantics: SemanticsMode::Eager, ..SceneOptions::default() };
+    let request = CreateScene { upload: upload(), options, ..CreateScene::default() };
+    let id = server.service.create_scene(request).await.unwrap().status.id;
+    let mut events = std::pin::pin!(server.service.watch(&id).unwrap());
+    loop {
+        match events.next().await {
+            Some(Event::Running { stage, .. }) if stage == "masks" => break,
+            Some(Event::Done) | None => panic!("the end came before the semantics"),
+            _ => {}
+        }
+    }
+    assert_eq!(server.service.get(&id).unwrap().state, SceneState::Done, "it can be viewed");
+    meaning.hold.store(false, Ordering::Release);
+    let rest: Vec<Event> = events.collect().await;
+    assert_eq!(rest.last(), Some(&Event::Done));
+    let other = scene(&server, SemanticsMode::Eager).await;
+    assert_eq!(other.semantics.state, SemanticsState::Ready, "who waits waits for both");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn off_and_a_bundle_without_networks_are_refused_each_with_its_code() {
+    let (server, meaning) = server().await;
+    let off = scene(&server, SemanticsMode::Off).await;
+    assert_eq!((off.semantics.state, off.semantics.available), (SemanticsState::Off, false));
+    let error = server.service.understand(&off.id, None).await.unwrap_err();
+    assert_eq!(error.code(), ErrorCode::SemanticsOff);
+    assert!(error.message().contains("semantics=off"), "{error}");
+    assert_eq!(meaning.made.load(Ordering::Acquire), 0);
+
+    let lacking = PhotoMeaning { lack: Some("no text tower"), ..PhotoMeaning::default() };
+    let server = TestServer::with(|_, parts| parts.semantics = Arc::new(lacking)).await;
+    let lazy = scene(&server, SemanticsMode::Lazy).await;
+    assert!(!lazy.semantics.available);
+    assert!(lazy.semantics.reason.unwrap().contains("no text tower"));
+    let error = server.service.understand(&lazy.id, None).await.unwrap_err();
+    assert_eq!(error.code(), ErrorCode::ModelUnavailable);
+    let options = SceneOptions { semantics: SemanticsMode::Eager, ..SceneOptions::default() };
+    let request = CreateScene { upload: upload(), options, ..CreateScene::default() };
+    let error = server.service.create_scene(request).await.unwrap_err();
+    assert_eq!(error.code(), ErrorCode::ModelUnavailable, "eager is refused at the door");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn semantics_that_fail_say_why_and_the_next_text_tries_again() {
+    let (server, meaning) = server().await;
+    let id = scene(&server, SemanticsMode::Lazy).await.id;
+    *meaning.fails.lock().unwrap() = Some(ErrorCode::LimitExceeded);
+    let error = server.service.understand(&id, None).await.unwrap_err();
+    assert_eq!(error.code(), ErrorCode::LimitExceeded);
+    let status = server.service.get(&id).unwrap();
+    assert_eq!((status.state, status.semantics.state), (SceneState::Done, SemanticsState::Failed));
+    assert_eq!(status.semantics.error.unwrap().code, "limit_exceeded");
+    *meaning.fails.lock().unwrap() = None;
+    let status = server.service.understand(&id, None).await.unwrap();
+    assert_eq!(status.semantics.state, SemanticsState::Ready);
+    assert_eq!(meaning.made.load(Ordering::Acquire), 2);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn semantics_are_kept_over_a_restart_and_made_again_when_their_file_is_bad() {
+    let (server, meaning) = server().await;
+    let id = scene(&server, SemanticsMode::Lazy).await.id;
+    server.service.understand(&id, None).await.unwrap();
+    let server = server.restart().await;
+    assert_eq!(stand(&server, &id), SemanticsState::Ready);
+    server.service.understand(&id, None).await.unwrap();
+    assert_eq!(meaning.made.load(Ordering::Acquire), 1, "read from their file");
+    let server = server.restart().await;
+    let folder = server.data_dir().join("scenes").join(id.as_str());
+    let mut file = std::fs::read(folder.join("semantics.segsplat")).unwrap();
+    let middle = file.len() / 2;
+    file[middle] ^= 1;
+    std::fs::write(folder.join("semantics.segsplat"), file).unwrap();
+    let status = server.service.understand(&id, None).await.unwrap();
+    assert_eq!(status.semantics.state, SemanticsState::Ready);
+    assert_eq!(meaning.made.load(Ordering::Acquire), 2, "made again");
+    assert!(folder.join("semantics.quarantined").exists(), "the bad file is put aside");
+    assert!(folder.join("semantics.segsplat").exists(), "the new one is kept");
+    // A lost status is found again in the file.
+    let server = server.restart().await;
+    std::fs::remove_file(folder.join("status.json")).unwrap();
+    let server = server.restart().await;
+    server.service.understand(&id, None).await.unwrap();
+    assert_eq!(meaning.made.load(Ordering::Acquire), 2);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn deleting_a_scene_stops_its_semantics_and_tells_who_waits() {
+    let (server, meaning) = server().await;
+    let id = scene(&server, SemanticsMode::Lazy).await.id;
+    meaning.hold.store(true, Ordering::Release);
+    let waits = server.service.understand(&id, Some(PATIENCE));
+    let deletes = async {
+        while stand(&server, &id) != SemanticsState::Running {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+        server.service.delete(&id).await.unwrap();
+    };
+    let (told, ()) = tokio::join!(waits, deletes);
+    assert_eq!(told.unwrap_err().code(), ErrorCode::SceneNotFound);
+    meaning.hold.store(false, Ordering::Release);
+    let other = scene(&server, SemanticsMode::Eager).await;
+    assert_eq!(other.semantics.state, SemanticsState::Ready, "the next scene has its turn");
+}

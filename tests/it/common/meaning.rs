@@ -1,0 +1,102 @@
+//! Stands in for the semantic networks: the photo that a Gaussian came from is what it means.
+//!
+//! Entry m of the bank is photo m - 1; the texts "photo 0", "photo 1", ... name them, any other
+//! word is a direction of its own, and words that begin with `?` are unknown.
+
+use std::{
+    sync::atomic::{AtomicBool, AtomicUsize, Ordering},
+    time::{Duration, Instant},
+};
+
+use segsplat::{
+    error::{Error, ErrorCode, Result},
+    jobs::{Phrases, SemanticsMaker, SemanticsWork, TextEmbedding},
+    scene::{Bank, IndexMap, Semantics, SemanticsReport},
+};
+
+use super::server::PATIENCE;
+
+/// Numbers of an embedding.
+pub(crate) const DIM: usize = 16;
+
+/// The stand-in, and what it was asked.
+#[derive(Debug, Default)]
+pub(crate) struct PhotoMeaning {
+    /// Held back while true.
+    pub(crate) hold: AtomicBool,
+    /// Fails with this code while set.
+    pub(crate) fails: std::sync::Mutex<Option<ErrorCode>>,
+    /// What the bundle is said to lack.
+    pub(crate) lack: Option<&'static str>,
+    /// Scenes made.
+    pub(crate) made: AtomicUsize,
+    /// Texts embedded.
+    pub(crate) embedded: AtomicUsize,
+}
+
+fn axis(at: usize) -> Vec<f32> {
+    let mut row = vec![0.0; DIM];
+    row[at % DIM] = 1.0;
+    row
+}
+
+impl SemanticsMaker for PhotoMeaning {
+    fn lacks(&self) -> Option<String> {
+        self.lack.map(str::to_owned)
+    }
+
+    fn phrases(&self) -> Result<Phrases> {
+        let canon = ["object", "things", "stuff"].map(str::to_owned).to_vec();
+        Ok(Phrases { canon, tau: 10.0, coverage_floor: 0.05 })
+    }
+
+    fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
+        self.embedded.fetch_add(texts.len(), Ordering::AcqRel);
+        let embed = |text: &String| {
+            let photo = text.strip_prefix("photo ").and_then(|n| n.parse::<usize>().ok());
+            let row = match photo {
+                Some(photo) if photo < 8 => axis(photo),
+                _ => axis(8 + text.bytes().map(usize::from).sum::<usize>() % 8),
+            };
+            let unknown = usize::from(text.starts_with('?'));
+            TextEmbedding { row, tokens: 1, unknown, cut: false }
+        };
+        Ok(texts.iter().map(embed).collect())
+    }
+
+    fn make(&self, work: SemanticsWork<'_>) -> Result<Semantics> {
+        self.made.fetch_add(1, Ordering::AcqRel);
+        (work.progress)("masks", 0.25);
+        let begun = Instant::now();
+        while self.hold.load(Ordering::Acquire) {
+            assert!(begun.elapsed() < PATIENCE, "nobody let go of the stand-in");
+            if work.cancel.load(Ordering::Acquire) {
+                return Err(Error::new(ErrorCode::Cancelled, "stopped"));
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        if let Some(code) = *self.fails.lock().expect("no panic holds it") {
+            return Err(Error::new(code, "made to fail"));
+        }
+        (work.progress)("assign", 0.75);
+        let photos = work.scene.meta.cameras.len();
+        assert!(!work.upload.photos.is_empty(), "the photos are kept with the scene");
+        let index: Vec<u16> =
+            work.scene.gaussians.source().iter().map(|source| source.view + 1).collect();
+        let report = SemanticsReport {
+            masks: vec![1; photos],
+            bank_size: photos as u32,
+            labelled: index.len() as u64,
+            bundle_sha256: "stand-in".to_owned(),
+            ..SemanticsReport::default()
+        };
+        let rows = (0..photos).flat_map(axis).collect();
+        let map = |photo: usize| IndexMap { width: 1, height: 1, index: vec![photo as u16 + 1] };
+        Ok(Semantics {
+            bank: Bank { dim: DIM, rows },
+            index,
+            photos: (0..photos).map(map).collect(),
+            report,
+        })
+    }
+}
