@@ -1,5 +1,6 @@
-// Stage 8: front-to-back blend of a tile's Gaussians: colour, alpha, expected depth.
+// Stage 8: front-to-back blend of a tile's Gaussians: colour, alpha, expected depth, labels.
 // Twin: src/render/cpu/rasterize.rs
+// What label_of, add_label and store_labels do is one of common/labels_*.wgsl.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> shaded: array<Footprint>;
@@ -10,7 +11,7 @@
 
 // mean - tile corner, slope, inv_sx
 var<workgroup> shapes: array<vec4<f32>, 256>;
-// inv_sy, opacity, depth
+// inv_sy, opacity, depth, label
 var<workgroup> weights: array<vec4<f32>, 256>;
 var<workgroup> colors: array<vec4<f32>, 256>;
 var<workgroup> done_count: atomic<u32>;
@@ -27,6 +28,9 @@ fn main(
     let x = tile.x * TILE_SIZE + at.x;
     let y = tile.y * TILE_SIZE + at.y;
     let inside = x < view.width && y + view.row_start * TILE_SIZE < view.height;
+    let at_pixel = y * view.width + x;
+    let with_color = view.color_start != NO_PICTURE;
+    let with_depth = view.depth_start != NO_PICTURE;
     let tile_id = tile.y * view.tiles_x + tile.x;
     let start = ranges[tile_id];
     let end = ranges[tile_id + 1u];
@@ -64,8 +68,11 @@ fn main(
             } else {
                 let one = shaded[id];
                 shapes[local] = vec4(one.mean - corner, one.slope, one.inv_sx);
-                weights[local] = vec4(one.inv_sy, one.opacity, one.depth, 0.0);
-                colors[local] = vec4(one.color, 0.0);
+                // A label has 16 bits: exact as f32.
+                weights[local] = vec4(one.inv_sy, one.opacity, one.depth, f32(label_of(id)));
+                if with_color {
+                    colors[local] = vec4(one.color, 0.0);
+                }
             }
         }
         workgroupBarrier();
@@ -91,28 +98,33 @@ fn main(
                     break;
                 }
                 let share = alpha * transmittance;
-                color += share * colors[k].xyz;
-                depth += share * weight.z;
+                if with_color {
+                    color += share * colors[k].xyz;
+                }
+                if with_depth {
+                    depth += share * weight.z;
+                }
+                add_label(u32(weight.w), share, at_pixel);
                 alpha_sum += share;
                 transmittance = left;
             }
         }
     }
     if inside {
-        let at_pixel = y * view.width + x;
         let alpha = min(alpha_sum, 1.0);
-        if view.color_start != NO_PICTURE {
+        if with_color {
             let out = color + (1.0 - alpha) * view.background.xyz;
             let first = view.color_start + at_pixel * 3u;
             pictures[first] = out.x;
             pictures[first + 1u] = out.y;
             pictures[first + 2u] = out.z;
         }
-        if view.depth_start != NO_PICTURE {
+        if with_depth {
             pictures[view.depth_start + at_pixel] = select(0.0, depth / alpha_sum, alpha_sum > 0.0);
         }
         if view.alpha_start != NO_PICTURE {
             pictures[view.alpha_start + at_pixel] = alpha;
         }
+        store_labels(at_pixel);
     }
 }

@@ -1,4 +1,5 @@
-// Stage 4: colour of each visible Gaussian as seen from the camera, gathered in depth order.
+// Stage 4: colour of each visible Gaussian as seen from the camera, where it is wanted; footprints
+// gathered in depth order.
 // Twin: src/render/cpu/shade.rs
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -24,7 +25,7 @@ fn main(
     }
     let id = ids[i];
     var footprint = footprints[id];
-    if footprint.tiles > 0u {
+    if footprint.tiles > 0u && view.color_start != NO_PICTURE {
         let toward = (gaussians[id].mean - view.center.xyz) - view.center_low.xyz;
         let direction = normalize(toward);
         var color = vec3(SH_OFFSET);

@@ -38,7 +38,13 @@ struct View {
     color_start: u32,
     depth_start: u32,
     alpha_start: u32,
-    reserved: u32,
+    blend_start: u32,
+    // Rows of the table that is blended.
+    label_rows: u32,
+    // Entries that a pixel has room for.
+    entry_slots: u32,
+    reserved_1: u32,
+    reserved_2: u32,
 }
 
 struct Gaussian {

@@ -82,9 +82,11 @@ impl SanitizeReport {
 pub struct Gaussians {
     raw: RawGaussians,
     identity: u64,
+    /// Shared by Gaussians that differ in their bank indices only.
+    shape: u64,
 }
 
-/// Source of [`Gaussians::identity`]; 0 is the empty default.
+/// Source of [`Gaussians::identity`] and [`Gaussians::shape_identity`]; 0 is the empty default.
 static NEXT_IDENTITY: AtomicU64 = AtomicU64::new(1);
 
 impl Gaussians {
@@ -98,6 +100,11 @@ impl Gaussians {
     pub const OPACITY_MIN: f32 = 1.0 / 255.0;
     /// Largest |coefficient| of a spherical harmonic.
     pub const SH_MAX: f32 = 1e4;
+
+    fn new(raw: RawGaussians) -> Self {
+        let identity = NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed);
+        Self { raw, identity, shape: identity }
+    }
 
     /// Drops what can never be drawn, clamps what is out of range, counts both.
     ///
@@ -145,8 +152,7 @@ impl Gaussians {
                 kept.source.push(raw.source[i]);
             }
         }
-        let identity = NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed);
-        Ok((Self { raw: kept, identity }, report))
+        Ok((Self::new(kept), report))
     }
 
     /// Takes back what [`Self::into_raw`] gave, bit for bit.
@@ -177,7 +183,7 @@ impl Gaussians {
                 return Err(bad(format!("number {i} is out of range")));
             }
         }
-        Ok(Self { raw, identity: NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed) })
+        Ok(Self::new(raw))
     }
 
     /// The Gaussians whose index `keep` takes, in their order.
@@ -195,7 +201,7 @@ impl Gaussians {
             raw.semantic_index.push(all.semantic_index[i]);
             raw.source.push(all.source[i]);
         }
-        Self { raw, identity: NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed) }
+        Self::new(raw)
     }
 
     /// The same Gaussians with other scales, `[N, 3]`, clamped into range.
@@ -209,10 +215,7 @@ impl Gaussians {
         for scale in scales.iter_mut().flatten() {
             *scale = scale.max(Self::SCALE_MIN).min(Self::SCALE_MAX);
         }
-        Self {
-            raw: RawGaussians { scales, ..self.raw.clone() },
-            identity: NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed),
-        }
+        Self::new(RawGaussians { scales, ..self.raw.clone() })
     }
 
     /// The same Gaussians with other bank indices, `[N]`.
@@ -230,6 +233,7 @@ impl Gaussians {
         Ok(Self {
             raw: RawGaussians { semantic_index, ..self.raw.clone() },
             identity: NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed),
+            shape: self.shape,
         })
     }
 
@@ -239,6 +243,12 @@ impl Gaussians {
     #[must_use]
     pub fn identity(&self) -> u64 {
         self.identity
+    }
+
+    /// As [`Self::identity`], but shared by Gaussians that differ in `semantic_index` only.
+    #[must_use]
+    pub fn shape_identity(&self) -> u64 {
+        self.shape
     }
 
     /// Number of Gaussians.

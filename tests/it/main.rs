@@ -19,6 +19,7 @@ mod geometry;
 mod grpc;
 mod http;
 mod jobs;
+mod label_twins;
 mod labels;
 mod literal;
 mod magnify;

@@ -35,7 +35,7 @@ use crate::common::{
 };
 
 /// Opens an adapter with `change` made to the portable options; hardware first.
-fn open(change: impl Fn(&mut GpuOptions)) -> Option<GpuRenderer> {
+pub(crate) fn open(change: impl Fn(&mut GpuOptions)) -> Option<GpuRenderer> {
     let mut told = String::new();
     for adapter in [None, Some("llvmpipe".to_owned())] {
         let mut options = GpuOptions { adapter, portable: true, ..GpuOptions::default() };
@@ -51,7 +51,7 @@ fn open(change: impl Fn(&mut GpuOptions)) -> Option<GpuRenderer> {
 }
 
 /// The adapter that the tests share.
-fn gpu() -> Option<&'static GpuRenderer> {
+pub(crate) fn gpu() -> Option<&'static GpuRenderer> {
     static GPU: OnceLock<Option<GpuRenderer>> = OnceLock::new();
     let gpu = GPU.get_or_init(|| open(|_| {})).as_ref();
     match gpu {

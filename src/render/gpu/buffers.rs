@@ -42,7 +42,11 @@ pub struct ViewRow {
     pub color_start: u32,
     pub depth_start: u32,
     pub alpha_start: u32,
-    pub reserved: u32,
+    pub blend_start: u32,
+    pub label_rows: u32,
+    pub entry_slots: u32,
+    pub reserved_1: u32,
+    pub reserved_2: u32,
 }
 
 /// `Gaussian` of the shaders.
@@ -190,16 +194,43 @@ impl Slot {
 /// Gaussians on the device.
 #[derive(Clone, Debug)]
 pub(super) struct Scene {
-    identity: u64,
+    shape: u64,
     /// `[N]` of [`GaussianRow`].
     pub(super) gaussians: wgpu::Buffer,
     /// `[N, K, 3]` f32.
     pub(super) sh: wgpu::Buffer,
+    /// Uploaded when labels are first asked for.
+    labels: Option<SceneLabels>,
+}
+
+/// Bank indices on the device.
+#[derive(Clone, Debug)]
+pub(super) struct SceneLabels {
+    identity: u64,
+    /// `[N]` u16, two a word.
+    pub(super) index: wgpu::Buffer,
+    /// Different indices but 0: no pixel sees more.
+    pub(super) distinct: u32,
+}
+
+impl SceneLabels {
+    fn upload(gpu: &Gpu, source: &Gaussians) -> Result<Self> {
+        let index = source.semantic_index();
+        let mut seen = vec![false; 1 << u16::BITS];
+        index.iter().for_each(|&m| seen[usize::from(m)] = true);
+        let distinct = seen[1..].iter().filter(|seen| **seen).count() as u32;
+        // Uploads are whole words.
+        let mut padded = index.to_vec();
+        padded.resize(index.len().next_multiple_of(2), 0);
+        let index = gpu.upload("bank indices", bytemuck::cast_slice(&padded))?;
+        Ok(Self { identity: source.identity(), index, distinct })
+    }
 }
 
 impl Scene {
     fn size_bytes(&self) -> u64 {
-        self.gaussians.size() + self.sh.size()
+        let labels = self.labels.as_ref().map_or(0, |labels| labels.index.size());
+        self.gaussians.size() + self.sh.size() + labels
     }
 
     fn upload(gpu: &Gpu, source: &Gaussians) -> Result<Self> {
@@ -213,9 +244,10 @@ impl Scene {
             })
             .collect();
         Ok(Self {
-            identity: source.identity(),
+            shape: source.shape_identity(),
             gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows))?,
             sh: gpu.upload("sh", bytemuck::cast_slice(source.sh()))?,
+            labels: None,
         })
     }
 }
@@ -237,8 +269,8 @@ impl SceneCache {
     /// # Errors
     /// `limit_exceeded` when the scene does not fit the adapter's limits or memory.
     pub(super) fn get(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<Scene> {
-        let identity = source.identity();
-        if let Some(at) = self.scenes.iter().position(|scene| scene.identity == identity) {
+        let shape = source.shape_identity();
+        if let Some(at) = self.scenes.iter().position(|scene| scene.shape == shape) {
             let scene = self.scenes.remove(at);
             self.scenes.push(scene.clone());
             return Ok(scene);
@@ -257,6 +289,24 @@ impl SceneCache {
         }
         self.scenes.push(scene.clone());
         Ok(scene)
+    }
+
+    /// The bank indices of `source`, whose scene was the last one asked for; uploaded once, and
+    /// alone when they are all that changed.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub(super) fn labels(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<SceneLabels> {
+        let scene = self.scenes.last_mut().filter(|scene| scene.shape == source.shape_identity());
+        let held = scene.as_ref().and_then(|scene| scene.labels.as_ref());
+        if let Some(labels) = held.filter(|labels| labels.identity == source.identity()) {
+            return Ok(labels.clone());
+        }
+        let labels = SceneLabels::upload(gpu, source)?;
+        if let Some(scene) = scene {
+            scene.labels = Some(labels.clone());
+        }
+        Ok(labels)
     }
 
     /// Scenes held.

@@ -27,10 +27,7 @@ use super::{
     Frame, Labels, RenderRequest, Renderer, constants::ISECTS_MAX, select::AdapterReport,
     view::View,
 };
-use crate::{
-    error::{Error, ErrorCode, Result},
-    scene::Gaussians,
-};
+use crate::{error::Result, scene::Gaussians};
 
 /// Bytes of scenes kept on the device.
 const SCENE_BYTES_MAX: u64 = 2 << 30;
@@ -154,18 +151,16 @@ impl Renderer for GpuRenderer {
         if gaussians.is_empty() {
             return Ok(frame::background(&view, request));
         }
-        if request.labels != Labels::None {
-            return Err(Error::new(
-                ErrorCode::GpuUnavailable,
-                "labels are not drawn by the GPU renderer",
-            ));
-        }
         self.with_engine(|engine| {
             let count = narrow("gaussians", gaussians.len())?;
             let sh_count = gaussians.sh_count() as u32;
             let scene = engine.scenes.get(&engine.gpu, gaussians)?;
             let mut row = ViewRow::new(&view, request.background, request.antialiased);
             (row.gaussian_count, row.sh_count) = (count, sh_count);
+            let labels = match request.labels {
+                Labels::None => None,
+                _ => Some(engine.scenes.labels(&engine.gpu, gaussians)?),
+            };
             let mut drawing = Drawing {
                 gpu: &engine.gpu,
                 kernels: &engine.kernels,
@@ -173,11 +168,15 @@ impl Renderer for GpuRenderer {
                 scene: &scene,
                 row,
                 kinds: request.kinds,
+                wanted: &request.labels,
+                labels: labels.as_ref(),
                 isects_max: self.options.isects_max,
                 frame: frame::background(&view, request),
+                entries: Vec::new(),
+                entries_max: 0,
             };
             drawing.rows(0..view.tiles_y())?;
-            Ok(drawing.frame)
+            drawing.finish()
         })
     }
 }

@@ -38,7 +38,7 @@ pub const SHARED: [(&str, u32); 8] = [
 /// One stage's shader: its file's stem and its whole source, common parts first.
 #[derive(Clone, Copy, Debug)]
 pub struct Shader {
-    /// Stem of shaders/*.wgsl and of its twin src/render/cpu/*.rs.
+    /// Stem of shaders/*.wgsl and of its twin src/render/cpu/*.rs; variants share it.
     pub stem: &'static str,
     /// WGSL.
     pub source: &'static str,
@@ -60,14 +60,16 @@ macro_rules! shader {
 }
 
 /// Every shader, in the order of the stages.
-pub const SHADERS: [Shader; 7] = [
+pub const SHADERS: [Shader; 9] = [
     shader!("project", "camera", "tiles"),
     shader!("radix_sort"),
     shader!("prefix_sum"),
     shader!("shade", "sh"),
     shader!("emit_isects", "tiles"),
     shader!("tile_ranges"),
-    shader!("rasterize"),
+    shader!("rasterize", "labels_none"),
+    shader!("rasterize", "labels_index", "labels_blend"),
+    shader!("rasterize", "labels_index", "labels_entries"),
 ];
 
 /// The compiled kernels.
@@ -83,6 +85,8 @@ pub(super) struct Kernels {
     pub(super) emit_isects: wgpu::ComputePipeline,
     pub(super) tile_ranges: wgpu::ComputePipeline,
     pub(super) rasterize: wgpu::ComputePipeline,
+    pub(super) rasterize_blend: wgpu::ComputePipeline,
+    pub(super) rasterize_entries: wgpu::ComputePipeline,
 }
 
 impl Kernels {
@@ -91,15 +95,24 @@ impl Kernels {
     /// # Errors
     /// `internal` when the driver refuses one.
     pub(super) fn compile(gpu: &Gpu) -> Result<Self> {
-        let [project, radix_sort, prefix_sum, shade, emit_isects, tile_ranges, rasterize] = SHADERS
-            .map(|shader| {
-                gpu.scoped(shader.stem, || {
-                    gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
-                        label: Some(shader.stem),
-                        source: wgpu::ShaderSource::Wgsl(Cow::Borrowed(shader.source)),
-                    })
+        let [
+            project,
+            radix_sort,
+            prefix_sum,
+            shade,
+            emit_isects,
+            tile_ranges,
+            rasterize,
+            rasterize_blend,
+            rasterize_entries,
+        ] = SHADERS.map(|shader| {
+            gpu.scoped(shader.stem, || {
+                gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
+                    label: Some(shader.stem),
+                    source: wgpu::ShaderSource::Wgsl(Cow::Borrowed(shader.source)),
                 })
-            });
+            })
+        });
         let (radix_sort, prefix_sum, emit_isects) = (radix_sort?, prefix_sum?, emit_isects?);
         let compile = |module: &wgpu::ShaderModule, entry: &'static str| {
             gpu.scoped(entry, || {
@@ -128,6 +141,8 @@ impl Kernels {
             emit_isects: compile(&emit_isects, "main")?,
             tile_ranges: compile(&tile_ranges?, "main")?,
             rasterize: compile(&rasterize?, "main")?,
+            rasterize_blend: compile(&rasterize_blend?, "main")?,
+            rasterize_entries: compile(&rasterize_entries?, "main")?,
         })
     }
 }

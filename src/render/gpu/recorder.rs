@@ -17,6 +17,8 @@ const PARAMS_MAX: usize = 64;
 /// Levels of a prefix sum: 2048³ numbers are more than any buffer holds.
 const SCAN_LEVELS: usize = 3;
 const RADIX_BITS: u32 = 8;
+/// Entries a pixel that room is made for at first: what a pixel at an edge sees of a room.
+pub(super) const ENTRY_SLOTS_MIN: u32 = 8;
 
 /// How many pairs a sort has: known now, or known to the plan on the device.
 #[derive(Clone, Copy, Debug)]
@@ -48,6 +50,10 @@ pub(super) struct Scratch {
     digit_counts: Slot,
     scan_sums: [Slot; SCAN_LEVELS],
     pub(super) ranges: Slot,
+    pub(super) table: Slot,
+    pub(super) entries: Slot,
+    /// Entries a pixel that the last views needed.
+    pub(super) entry_slots: u32,
     pub(super) pictures: Slot,
     pub(super) staging: Slot,
 }
@@ -71,6 +77,9 @@ impl Default for Scratch {
             digit_counts: Slot::storage("digit counts"),
             scan_sums: [const { Slot::storage("block sums") }; SCAN_LEVELS],
             ranges: Slot::storage("tile ranges"),
+            table: Slot::new("label table", BufferUsages::STORAGE | BufferUsages::COPY_DST),
+            entries: Slot::storage("entry slots"),
+            entry_slots: ENTRY_SLOTS_MIN,
             pictures: Slot::storage("pictures"),
             staging: Slot::new("staging", BufferUsages::MAP_READ | BufferUsages::COPY_DST),
         }
@@ -101,6 +110,15 @@ fn pairs(slots: &mut [Slot; 4], gpu: &Gpu, count: u32) -> Result<Pairs> {
         keys: [k0.ensure(gpu, bytes)?, k1.ensure(gpu, bytes)?],
         values: [v0.ensure(gpu, bytes)?, v1.ensure(gpu, bytes)?],
     })
+}
+
+/// What rasterize binds for the labels wanted: the Gaussians in depth order, their bank indices,
+/// and the table or the slots.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum LabelBuffers<'a> {
+    None,
+    Blend { depth_ids: &'a wgpu::Buffer, index: &'a wgpu::Buffer, table: &'a wgpu::Buffer },
+    Entries { depth_ids: &'a wgpu::Buffer, index: &'a wgpu::Buffer, slots: &'a wgpu::Buffer },
 }
 
 /// Workgroups of a dispatch.
@@ -166,7 +184,7 @@ impl<'a> Recorder<'a> {
         copies: &[(&wgpu::Buffer, u64, &wgpu::Buffer, u64, u64)],
     ) -> wgpu::SubmissionIndex {
         drop(self.pass.take());
-        for &(from, from_offset, to, to_offset, size) in copies {
+        for &(from, from_offset, to, to_offset, size) in copies.iter().filter(|copy| copy.4 > 0) {
             self.encoder.copy_buffer_to_buffer(from, from_offset, to, to_offset, Some(size));
         }
         if !self.params.is_empty() {
@@ -397,6 +415,7 @@ impl<'a> Recorder<'a> {
     }
 
     /// Stage 8 over `tiles` (columns, rows).
+    #[expect(clippy::too_many_arguments, reason = "the buffers of the stage, one a binding")]
     pub(super) fn rasterize(
         &mut self,
         view: &wgpu::Buffer,
@@ -404,14 +423,22 @@ impl<'a> Recorder<'a> {
         isect_ids: &wgpu::Buffer,
         ranges: &wgpu::Buffer,
         pictures: &wgpu::Buffer,
+        labels: &LabelBuffers<'_>,
         tiles: [u32; 2],
     ) {
-        self.dispatch(
-            &self.kernels.rasterize,
-            None,
-            &[(0, view), (1, shaded), (2, isect_ids), (3, ranges), (4, pictures)],
-            &Groups::Grid(tiles[0], tiles[1]),
-        );
+        let mut buffers = vec![(0, view), (1, shaded), (2, isect_ids), (3, ranges), (4, pictures)];
+        let kernel = match *labels {
+            LabelBuffers::None => &self.kernels.rasterize,
+            LabelBuffers::Blend { depth_ids, index, table } => {
+                buffers.extend([(5, depth_ids), (6, index), (7, table)]);
+                &self.kernels.rasterize_blend
+            }
+            LabelBuffers::Entries { depth_ids, index, slots } => {
+                buffers.extend([(5, depth_ids), (6, index), (7, slots)]);
+                &self.kernels.rasterize_entries
+            }
+        };
+        self.dispatch(kernel, None, &buffers, &Groups::Grid(tiles[0], tiles[1]));
     }
 }
 

@@ -8,7 +8,7 @@ use super::{
     device::Gpu,
     pipelines::NO_PICTURE,
     readback,
-    recorder::{PairCount, Pairs, Recorder, footprint_bytes},
+    recorder::{LabelBuffers, PairCount, Pairs, Recorder, footprint_bytes},
 };
 use crate::{
     error::Result,
@@ -216,7 +216,8 @@ impl GpuRenderer {
             let pictures = engine.scratch.pictures.ensure(&engine.gpu, size as u64)?;
             let mut stages = recorder(engine, 1)?;
             let tiles = [view.tiles_x(), view.tiles_y()];
-            stages.rasterize(&uniform, &shaded, &ids, &ranges, &pictures, tiles);
+            let labels = LabelBuffers::None;
+            stages.rasterize(&uniform, &shaded, &ids, &ranges, &pictures, &labels, tiles);
             let [pictures] = finish(stages, [(&pictures, size)])?;
             Ok(cast(&pictures))
         })
@@ -228,9 +229,10 @@ fn view_row(gaussians: &Gaussians, request: &RenderRequest) -> Result<ViewRow> {
     Ok(ViewRow {
         gaussian_count: narrow("gaussians", gaussians.len())?,
         sh_count: gaussians.sh_count() as u32,
-        color_start: NO_PICTURE,
+        color_start: 0,
         depth_start: NO_PICTURE,
         alpha_start: NO_PICTURE,
+        blend_start: NO_PICTURE,
         ..ViewRow::new(&view, request.background, request.antialiased)
     })
 }
