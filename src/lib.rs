@@ -11,7 +11,7 @@
 //! | layer | modules | may use |
 //! |---|---|---|
 //! | L0 nouns | [`scene`], [`error`], [`limits`], [`config`] | nothing above (`scene` uses `error`, `limits`) |
-//! | L1 verbs | [`photos`], [`capture`], [`models`], [`lift`], [`semantics`], [`render`], [`store`], [`sample`] | L0; never each other |
+//! | L1 verbs | [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`render`], [`store`], [`sample`] | L0; never each other |
 //! | L2 | [`pipeline`] | L1: the only place that knows the order of the stages |
 //! | L3 | [`jobs`] | `pipeline`, `store` |
 //! | L4 | [`service`] | `jobs`, `store`, `render`, `models` |
@@ -37,6 +37,7 @@ pub mod pipeline;
 pub mod render;
 pub mod sample;
 pub mod scene;
+pub mod segment;
 pub mod semantics;
 pub mod service;
 pub mod store;

@@ -38,7 +38,6 @@ pub struct MaskNetwork {
 /// A photo as the encoder saw it.
 #[derive(Clone, Debug)]
 pub struct PhotoEmbedding {
-    /// `[width, height]` of the part of the encoder's square that the photo fills, pixels.
     resized: [u32; 2],
     /// Name for the decoder, shape and data.
     tensors: Vec<(String, Vec<usize>, Vec<f32>)>,
@@ -73,11 +72,10 @@ struct Takes {
 }
 
 impl PhotoEmbedding {
-    /// Share of the encoder's square that the photo fills, `[width, height]`, 0..1.
+    /// `[width, height]` of the part of the encoder's square that the photo fills, pixels.
     #[must_use]
-    pub fn filled(&self, network: &MaskNetwork) -> [f64; 2] {
-        let side = f64::from(network.manifest.size);
-        self.resized.map(|filled| f64::from(filled) / side)
+    pub fn resized(&self) -> [u32; 2] {
+        self.resized
     }
 }
 

@@ -4,6 +4,8 @@
 //! stages from photos to Gaussians, [`make`] the same from an upload. The caller stores the scene,
 //! under the stage name [`Stage::Store`].
 
+pub mod masks;
+
 use std::{
     fmt,
     sync::{

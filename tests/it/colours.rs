@@ -50,7 +50,7 @@ fn a_mask_lies_where_the_point_was_whatever_the_photos_shape() {
     let network = MaskNetwork::open(runtime, &bundle(), &Config::default()).unwrap().unwrap();
     for (width, height) in [(64, 64), (128, 64), (96, 192), (250, 130)] {
         let embedding = network.encode(&photo(width, height)).unwrap();
-        let filled = embedding.filled(&network);
+        let filled = embedding.resized().map(|v| f64::from(v) / 64.0);
         let points = [[0.25, 0.5], [0.75, 0.5], [0.5, 0.1]];
         let many: Vec<[f32; 2]> = points.iter().copied().cycle().take(150).collect();
         let masks = network.decode(&embedding, &many).unwrap();

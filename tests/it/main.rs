@@ -27,6 +27,7 @@ mod oracle;
 mod photos;
 mod props;
 mod sample;
+mod segment;
 mod shader_layout;
 mod store;
 mod tidy;

@@ -1,0 +1,72 @@
+//! Whole objects, and one mask a pixel.
+
+use crate::{
+    scene::{IndexMap, MaskInfo, Photo, PhotoMasks},
+    segment::{Bitset, Frame, Proposal, Proposals, Settings, judge::blank},
+};
+
+/// Most masks of a photo: an index is a u16, and 0 is none.
+const MASKS_MAX: usize = u16::MAX as usize;
+
+/// The index map of what was found, masks by area, the largest first.
+///
+/// A part goes where it lies in the mask of a whole; of what is left, small things lie on large
+/// ones. A mask of which too little is left to see goes.
+pub(super) fn one_a_pixel(
+    found: &Proposals,
+    frame: Frame,
+    photo: &Photo,
+    settings: &Settings,
+) -> PhotoMasks {
+    let mut wholes = wholes(&found.masks, settings.part_thresh);
+    wholes.sort_by_key(|&at| found.masks[at].area);
+    let scale = if settings.full_resolution { 1 } else { settings.map_scale.max(1) as usize };
+    let [width, height] = [found.width * scale, found.height * scale];
+    let cells = width * height;
+    let resample = (scale > 1).then(|| frame.to_map([width, height]));
+    let blank = blank(photo, [width, height]);
+    let mut taken = blank.unwrap_or_else(|| Bitset::empty(cells));
+    let mut kept: Vec<(usize, Bitset)> = Vec::new();
+    for at in wholes {
+        let proposal = &found.masks[at];
+        let mut mask = match &resample {
+            Some(to) => Bitset::over(&to.apply(&proposal.logits.spread(frame.grid)), 0.0),
+            None => proposal.mask.clone(),
+        };
+        mask.subtract(&taken);
+        let left = mask.count();
+        if left > 0 && f64::from(left) >= settings.min_area * cells as f64 {
+            taken.add(&mask);
+            kept.push((at, mask));
+        }
+    }
+    kept.reverse();
+    kept.truncate(MASKS_MAX);
+    let mut map = PhotoMasks::default();
+    let mut index = vec![0_u16; cells];
+    for (k, (at, mask)) in (1..).zip(&kept) {
+        mask.cells().for_each(|cell| index[cell] = k);
+        let proposal = &found.masks[*at];
+        map.masks.push(MaskInfo {
+            area: f64::from(mask.count()) / cells as f64,
+            predicted_iou: proposal.predicted_iou,
+            stability: proposal.stability,
+            point: proposal.point,
+        });
+    }
+    let narrow = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
+    map.map = IndexMap { width: narrow(width), height: narrow(height), index };
+    map
+}
+
+/// Positions of the masks that are not a part of a more whole one.
+fn wholes(masks: &[Proposal], part_thresh: f64) -> Vec<usize> {
+    let is_part = |part: &Proposal| {
+        masks.iter().any(|whole| {
+            whole.level > part.level
+                && whole.area > part.area
+                && f64::from(whole.mask.common(&part.mask)) >= part_thresh * f64::from(part.area)
+        })
+    };
+    (0..masks.len()).filter(|&at| !is_part(&masks[at])).collect()
+}

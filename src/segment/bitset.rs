@@ -1,0 +1,171 @@
+//! A mask as bits, and its box.
+
+/// A set of cells of a grid, row-major, one bit a cell.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Bitset {
+    words: Vec<u64>,
+    cells: usize,
+}
+
+/// Columns and rows of a mask, first and last included; as Segment Anything has boxes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Box2 {
+    /// First column.
+    pub x0: u32,
+    /// First row.
+    pub y0: u32,
+    /// Last column.
+    pub x1: u32,
+    /// Last row.
+    pub y1: u32,
+}
+
+impl Bitset {
+    /// No cell of `cells`.
+    #[must_use]
+    pub fn empty(cells: usize) -> Self {
+        Self { words: vec![0; cells.div_ceil(64)], cells }
+    }
+
+    /// The cells whose value is over `threshold`.
+    #[must_use]
+    pub fn over(values: &[f32], threshold: f32) -> Self {
+        let word = |chunk: &[f32]| {
+            let bit = |(i, v): (usize, &f32)| u64::from(*v > threshold) << i;
+            chunk.iter().enumerate().map(bit).fold(0, |word, bit| word | bit)
+        };
+        Self { words: values.chunks(64).map(word).collect(), cells: values.len() }
+    }
+
+    /// Number of cells of the grid.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.cells
+    }
+
+    /// Whether the grid has no cell.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.cells == 0
+    }
+
+    /// Whether a cell is in the set.
+    #[must_use]
+    pub fn has(&self, cell: usize) -> bool {
+        self.words.get(cell / 64).is_some_and(|word| word >> (cell % 64) & 1 == 1)
+    }
+
+    /// Takes a cell out.
+    pub fn remove(&mut self, cell: usize) {
+        if let Some(word) = self.words.get_mut(cell / 64) {
+            *word &= !(1 << (cell % 64));
+        }
+    }
+
+    /// Adds all cells of another set of the same grid.
+    pub fn add(&mut self, other: &Self) {
+        self.words.iter_mut().zip(&other.words).for_each(|(a, b)| *a |= b);
+    }
+
+    /// Takes out all cells of another set of the same grid.
+    pub fn subtract(&mut self, other: &Self) {
+        self.words.iter_mut().zip(&other.words).for_each(|(a, b)| *a &= !b);
+    }
+
+    /// Cells in the set.
+    #[must_use]
+    pub fn count(&self) -> u32 {
+        self.words.iter().map(|word| word.count_ones()).sum()
+    }
+
+    /// Cells in both sets.
+    #[must_use]
+    pub fn common(&self, other: &Self) -> u32 {
+        self.words.iter().zip(&other.words).map(|(a, b)| (a & b).count_ones()).sum()
+    }
+
+    /// The cells of the set, ascending.
+    pub fn cells(&self) -> impl Iterator<Item = usize> + '_ {
+        self.words.iter().enumerate().flat_map(|(at, &word)| {
+            std::iter::successors((word != 0).then_some(word), |w| {
+                let rest = w & (w - 1);
+                (rest != 0).then_some(rest)
+            })
+            .map(move |w| at * 64 + w.trailing_zeros() as usize)
+        })
+    }
+
+    /// The smallest box around the set in a grid of this width; all 0 around nothing.
+    #[must_use]
+    pub fn bounds(&self, width: usize) -> Box2 {
+        let mut bounds: Option<Box2> = None;
+        for cell in self.cells() {
+            let (x, y) = (narrow(cell % width.max(1)), narrow(cell / width.max(1)));
+            bounds = Some(match bounds {
+                None => Box2 { x0: x, y0: y, x1: x, y1: y },
+                Some(b) => Box2 { x0: b.x0.min(x), y0: b.y0, x1: b.x1.max(x), y1: y },
+            });
+        }
+        bounds.unwrap_or_default()
+    }
+}
+
+impl Box2 {
+    /// Area between the first and the last columns and rows, as Segment Anything counts it.
+    fn area(self) -> u64 {
+        u64::from(self.x1 - self.x0) * u64::from(self.y1 - self.y0)
+    }
+
+    /// Intersection over union of two boxes, as torchvision counts it; 0 where both are empty.
+    #[must_use]
+    pub fn iou(self, other: Self) -> f32 {
+        let overlap =
+            |a0: u32, a1: u32, b0: u32, b1: u32| u64::from(a1.min(b1).saturating_sub(a0.max(b0)));
+        let common = overlap(self.x0, self.x1, other.x0, other.x1)
+            * overlap(self.y0, self.y1, other.y0, other.y1);
+        let all = self.area() + other.area() - common;
+        if all == 0 { 0.0 } else { common as f32 / all as f32 }
+    }
+}
+
+fn narrow(n: usize) -> u32 {
+    u32::try_from(n).unwrap_or(u32::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn set(cells: usize, of: &[usize]) -> Bitset {
+        let values: Vec<f32> =
+            (0..cells).map(|i| if of.contains(&i) { 1.0 } else { -1.0 }).collect();
+        Bitset::over(&values, 0.0)
+    }
+
+    #[test]
+    fn sets_count_meet_and_part() {
+        let (a, b) = (set(130, &[0, 63, 64, 129]), set(130, &[63, 100, 129]));
+        assert_eq!((a.count(), b.count(), a.common(&b)), (4, 3, 2), "counts");
+        assert_eq!(a.cells().collect::<Vec<_>>(), [0, 63, 64, 129], "cells");
+        let mut both = a.clone();
+        both.add(&b);
+        assert_eq!(both.count(), 5, "union");
+        both.subtract(&a);
+        assert_eq!(both.cells().collect::<Vec<_>>(), [100], "difference");
+        both.remove(100);
+        assert_eq!(both, Bitset::empty(130), "nothing is left");
+        assert!(a.has(64) && !a.has(65) && !a.has(4_000), "membership");
+    }
+
+    #[test]
+    fn boxes_are_those_of_segment_anything() {
+        let mask = set(48, &[9, 10, 18, 29]);
+        let found = mask.bounds(8);
+        assert_eq!(found, Box2 { x0: 1, y0: 1, x1: 5, y1: 3 }, "inclusive corners");
+        assert_eq!(Bitset::empty(48).bounds(8), Box2::default(), "around nothing");
+        // torchvision.ops.box_iou([[1,1,5,3]], [[3,1,5,4]]) = 4 / (8 + 6 - 4)
+        let other = Box2 { x0: 3, y0: 1, x1: 5, y1: 4 };
+        assert!((found.iou(other) - 0.4).abs() < 1e-6, "{}", found.iou(other));
+        assert_eq!(Box2::default().iou(Box2::default()), 0.0, "two empty boxes");
+    }
+}

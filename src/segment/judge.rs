@@ -1,0 +1,189 @@
+//! Which of a decoder's masks are good: predicted IoU, stability, area.
+
+use half::f16;
+use rayon::prelude::*;
+
+use crate::{
+    error::{Error, Result},
+    scene::Photo,
+    segment::{Bitset, Box2, Decoded, Frame, Proposal, Settings, frame::Resample},
+};
+
+/// Judges the masks of one photo.
+#[derive(Debug)]
+pub(super) struct Judge {
+    frame: Frame,
+    levels: usize,
+    /// To the photo's pixels; `None`: the decoder's cells that lie over the photo, as they are.
+    resample: Option<Resample>,
+    map: [usize; 2],
+    /// Cells without a source in the photo.
+    blank: Option<Bitset>,
+    settings: Settings,
+}
+
+/// A part of a decoder's grid of logits.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Patch {
+    at: Box2,
+    values: Vec<f16>,
+}
+
+impl Judge {
+    /// Knows the grid from the first answer.
+    pub(super) fn new(
+        (side, resized): (u32, [u32; 2]),
+        first: &Decoded,
+        photo: &Photo,
+        settings: &Settings,
+    ) -> Result<Self> {
+        let frame = Frame { grid: first.grid, side, resized };
+        let inside = resized.iter().all(|&v| v > 0 && v <= side);
+        if first.grid.contains(&0) || first.levels == 0 || !inside {
+            return Err(Error::internal(format!(
+                "masks: the decoder answers {} levels on {frame:?}",
+                first.levels
+            )));
+        }
+        let resample = settings.full_resolution.then(|| frame.to_photo(photo));
+        let map = resample.as_ref().map_or_else(|| frame.cells(), Resample::size);
+        let blank = blank(photo, map);
+        Ok(Self { frame, levels: first.levels, resample, map, blank, settings: settings.clone() })
+    }
+
+    pub(super) fn frame(&self) -> Frame {
+        self.frame
+    }
+
+    /// `[width, height]` of the masks.
+    pub(super) fn map(&self) -> [usize; 2] {
+        self.map
+    }
+
+    /// The masks that pass, in the order of points and levels; of each point only the most whole
+    /// one where `wholes` is set.
+    pub(super) fn pass(
+        &self,
+        decoded: &Decoded,
+        points: &[[f32; 2]],
+        wholes: bool,
+    ) -> Result<Vec<Proposal>> {
+        let cells = self.frame.grid[0] * self.frame.grid[1];
+        let count = points.len() * self.levels;
+        if decoded.grid != self.frame.grid
+            || decoded.levels != self.levels
+            || decoded.logits.len() != count * cells
+            || decoded.predicted_iou.len() != count
+        {
+            return Err(Error::internal(format!(
+                "masks: {} points are answered by {} levels on {:?}, {} logits and {} IoUs",
+                points.len(),
+                decoded.levels,
+                decoded.grid,
+                decoded.logits.len(),
+                decoded.predicted_iou.len()
+            )));
+        }
+        let of_point = |(i, point): (usize, &[f32; 2])| -> Vec<Proposal> {
+            let mask = |level: usize| {
+                let at = i * self.levels + level;
+                let logits = &decoded.logits[at * cells..(at + 1) * cells];
+                self.judge(logits, decoded.predicted_iou[at], level, *point, wholes)
+            };
+            if wholes {
+                (0..self.levels).rev().find_map(mask).into_iter().collect()
+            } else {
+                (0..self.levels).filter_map(mask).collect()
+            }
+        };
+        let each: Vec<Vec<Proposal>> = points.par_iter().enumerate().map(of_point).collect();
+        Ok(each.into_iter().flatten().collect())
+    }
+
+    fn judge(
+        &self,
+        logits: &[f32],
+        predicted_iou: f32,
+        level: usize,
+        point: [f32; 2],
+        keep_logits: bool,
+    ) -> Option<Proposal> {
+        let s = &self.settings;
+        if predicted_iou.is_nan() || predicted_iou <= s.pred_iou_thresh {
+            return None;
+        }
+        let values = match &self.resample {
+            Some(resample) => resample.apply(logits),
+            None => cropped(logits, self.frame.grid[0], self.map),
+        };
+        let over = |threshold: f32| values.iter().filter(|v| **v > threshold).count();
+        let (strict, loose) = (over(s.stability_score_offset), over(-s.stability_score_offset));
+        let stability = if loose == 0 { 0.0 } else { strict as f32 / loose as f32 };
+        if stability < s.stability_score_thresh {
+            return None;
+        }
+        let mut mask = Bitset::over(&values, 0.0);
+        if let Some(blank) = &self.blank {
+            mask.subtract(blank);
+        }
+        let area = mask.count();
+        let share = f64::from(area) / values.len() as f64;
+        if share < s.min_area || share > s.max_area {
+            return None;
+        }
+        let bounds = mask.bounds(self.map[0]);
+        let fine = keep_logits && self.resample.is_none() && s.map_scale > 1;
+        let logits =
+            if fine { Patch::new(logits, self.frame.grid, bounds) } else { Patch::default() };
+        Some(Proposal { mask, area, bounds, level, predicted_iou, stability, point, logits })
+    }
+}
+
+impl Patch {
+    /// The box and one cell around it, within the grid.
+    fn new(logits: &[f32], [width, height]: [usize; 2], bounds: Box2) -> Self {
+        let last = |cells: usize| u32::try_from(cells).unwrap_or(u32::MAX).saturating_sub(1);
+        let at = Box2 {
+            x0: bounds.x0.saturating_sub(1),
+            y0: bounds.y0.saturating_sub(1),
+            x1: (bounds.x1 + 1).min(last(width)),
+            y1: (bounds.y1 + 1).min(last(height)),
+        };
+        let columns = at.x0 as usize..=at.x1 as usize;
+        let rows = logits.chunks_exact(width).take(at.y1 as usize + 1).skip(at.y0 as usize);
+        let values = rows.flat_map(|row| row[columns.clone()].iter().map(|v| f16::from_f32(*v)));
+        Self { at, values: values.collect() }
+    }
+
+    /// The whole grid, outside where nothing is known.
+    pub(super) fn spread(&self, [width, height]: [usize; 2]) -> Vec<f32> {
+        let mut grid = vec![-1.0; width * height];
+        let columns = (self.at.x1 - self.at.x0 + 1) as usize;
+        let rows = grid.chunks_exact_mut(width).skip(self.at.y0 as usize);
+        for (row, values) in rows.zip(self.values.chunks_exact(columns)) {
+            let out = row.iter_mut().skip(self.at.x0 as usize);
+            out.zip(values).for_each(|(out, v)| *out = v.to_f32());
+        }
+        grid
+    }
+}
+
+/// The left top of a grid.
+fn cropped(logits: &[f32], grid_width: usize, [width, height]: [usize; 2]) -> Vec<f32> {
+    let rows = logits.chunks_exact(grid_width).take(height);
+    rows.flat_map(|row| &row[..width]).copied().collect()
+}
+
+/// Cells of a map whose middle has no source in the photo.
+pub(super) fn blank(photo: &Photo, [width, height]: [usize; 2]) -> Option<Bitset> {
+    let valid = photo.valid.as_ref()?;
+    let middle = |i: usize, cells: usize, pixels: u32| (2 * i + 1) * pixels as usize / (2 * cells);
+    let missing = |cell: usize| {
+        let x = middle(cell % width, width, photo.width);
+        let y = middle(cell / width, height, photo.height);
+        !valid.get(y * photo.width as usize + x).copied().unwrap_or(true)
+    };
+    let values: Vec<f32> =
+        (0..width * height).map(|cell| f32::from(u8::from(missing(cell)))).collect();
+    Some(Bitset::over(&values, 0.5))
+}

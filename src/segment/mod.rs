@@ -1,0 +1,238 @@
+//! Everything in a photo as masks: a grid of points is decoded, good masks stay, one a pixel.
+//!
+//! [`proposals`] is Segment Anything's everything-mode up to the end of its filters and NMS;
+//! [`everything`] goes on to whole objects and one mask a pixel. What need not be computed is a
+//! switch of [`Settings`] each: masks are judged on the decoder's own coarse grid, points are not
+//! asked for where a mask lies already, and points known from other photos are asked for first.
+//! The decoder itself is behind [`PromptDecoder`]: this module knows no network.
+
+mod assign;
+mod bitset;
+mod frame;
+mod judge;
+mod nms;
+mod prompts;
+
+use std::sync::atomic::{AtomicBool, Ordering};
+
+pub use bitset::{Bitset, Box2};
+pub use frame::Frame;
+
+use self::{judge::Judge, prompts::Prompts};
+use crate::{
+    error::{Error, ErrorCode, Result},
+    scene::{Photo, PhotoMasks},
+};
+
+/// Masks of a batch of points, as logits: over 0 is inside.
+#[derive(Clone, Debug, Default)]
+pub struct Decoded {
+    /// Masks a point (K), from parts to the whole.
+    pub levels: usize,
+    /// `[width, height]` of the grid.
+    pub grid: [usize; 2],
+    /// `[B * K * height * width]`.
+    pub logits: Vec<f32>,
+    /// `[B * K]`.
+    pub predicted_iou: Vec<f32>,
+}
+
+/// A photo that points can be asked of.
+pub trait PromptDecoder: Sync {
+    /// Points that are best asked together.
+    fn batch(&self) -> usize;
+
+    /// Side in pixels of the square that the network saw, and `[width, height]` of the photo in it.
+    fn placed(&self) -> (u32, [u32; 2]);
+
+    /// Masks of each point; points are shares 0..1 of the photo's width and height.
+    ///
+    /// # Errors
+    /// What the network says.
+    fn decode(&self, points: &[[f32; 2]]) -> Result<Decoded>;
+}
+
+/// A point worth asking for, known from elsewhere: where a mask of another photo reappears.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Seed {
+    /// Shares 0..1 of width and height.
+    pub point: [f32; 2],
+}
+
+/// Thresholds and switches.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Settings {
+    /// Points along one side of the grid.
+    pub points_per_side: u32,
+    /// A mask must have more predicted IoU than this.
+    pub pred_iou_thresh: f32,
+    /// A mask must have at least this stability.
+    pub stability_score_thresh: f32,
+    /// Logits between the stricter and the looser threshold, each side of 0.
+    pub stability_score_offset: f32,
+    /// Of two masks whose boxes have more IoU than this the less sure one goes.
+    pub box_nms_thresh: f32,
+    /// Of two masks with more IoU than this the less sure one goes; 1 switches it off.
+    pub mask_nms_thresh: f32,
+    /// Smallest mask, share of the photo.
+    pub min_area: f64,
+    /// Largest mask, share of the photo: a mask of everything says nothing.
+    pub max_area: f64,
+    /// A part goes where at least this share of it lies in the mask of a whole.
+    pub part_thresh: f64,
+    /// Cells of the index map along each side of a cell of logits, 1 and up.
+    pub map_scale: u32,
+    /// Judge masks at the photo's own pixels, as Segment Anything does, and not on the coarse grid.
+    pub full_resolution: bool,
+    /// Do not ask where a mask lies already.
+    pub skip_covered: bool,
+    /// Ask at the seeds first.
+    pub use_seeds: bool,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            points_per_side: 32,
+            pred_iou_thresh: 0.8,
+            stability_score_thresh: 0.9,
+            stability_score_offset: 1.0,
+            box_nms_thresh: 0.7,
+            mask_nms_thresh: 0.7,
+            min_area: 0.0005,
+            max_area: 0.95,
+            part_thresh: 0.85,
+            map_scale: 2,
+            full_resolution: false,
+            skip_covered: true,
+            use_seeds: true,
+        }
+    }
+}
+
+impl Settings {
+    /// These thresholds, but everything computed as Segment Anything does: full resolution, every
+    /// point of the grid, no NMS of masks, no bounds on areas.
+    #[must_use]
+    pub fn exact(&self) -> Self {
+        Self {
+            mask_nms_thresh: 1.0,
+            min_area: 0.0,
+            max_area: 1.0,
+            full_resolution: true,
+            skip_covered: false,
+            use_seeds: false,
+            ..self.clone()
+        }
+    }
+}
+
+/// A mask that passed.
+#[derive(Clone, Debug, Default)]
+pub struct Proposal {
+    /// Its cells.
+    pub mask: Bitset,
+    /// How many they are.
+    pub area: u32,
+    /// Around them.
+    pub bounds: Box2,
+    /// Which of the decoder's masks it is, from parts to the whole.
+    pub level: usize,
+    /// Predicted IoU.
+    pub predicted_iou: f32,
+    /// Stability.
+    pub stability: f32,
+    /// Where it was asked for, shares 0..1.
+    pub point: [f32; 2],
+    /// Logits of its box and one cell around it, where a finer map is wanted.
+    logits: judge::Patch,
+}
+
+/// The masks of a photo that passed.
+#[derive(Clone, Debug, Default)]
+pub struct Proposals {
+    /// Columns of the masks' grid, which lies over the whole photo.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// The masks, surest first.
+    pub masks: Vec<Proposal>,
+    /// Points that were asked for.
+    pub asked: usize,
+}
+
+/// All masks of a photo that pass the filters and NMS, parts and wholes alike.
+///
+/// # Errors
+/// `cancelled`; `internal` when the decoder fails or its answer has no sense.
+pub fn proposals(
+    decoder: &dyn PromptDecoder,
+    photo: &Photo,
+    settings: &Settings,
+    seeds: &[Seed],
+    cancel: &AtomicBool,
+) -> Result<Proposals> {
+    let mut found = passed(decoder, photo, settings, seeds, cancel, false)?.0;
+    found.suppress(settings);
+    Ok(found)
+}
+
+/// What is in a photo: whole objects, at most one a pixel.
+///
+/// # Errors
+/// `cancelled`; `internal` when the decoder fails or its answer has no sense.
+pub fn everything(
+    decoder: &dyn PromptDecoder,
+    photo: &Photo,
+    settings: &Settings,
+    seeds: &[Seed],
+    cancel: &AtomicBool,
+) -> Result<PhotoMasks> {
+    let (mut found, frame) = passed(decoder, photo, settings, seeds, cancel, true)?;
+    found.suppress(settings);
+    let Some(frame) = frame else { return Ok(PhotoMasks::default()) };
+    Ok(assign::one_a_pixel(&found, frame, photo, settings))
+}
+
+impl Proposals {
+    /// NMS over boxes, then over masks.
+    fn suppress(&mut self, settings: &Settings) {
+        let kept = nms::suppress(&self.masks, settings.box_nms_thresh, settings.mask_nms_thresh);
+        self.masks = kept.into_iter().map(|at| std::mem::take(&mut self.masks[at])).collect();
+    }
+}
+
+/// The masks that pass the filters, in the order asked; of each point only the most whole one
+/// where `wholes` is set.
+fn passed(
+    decoder: &dyn PromptDecoder,
+    photo: &Photo,
+    settings: &Settings,
+    seeds: &[Seed],
+    cancel: &AtomicBool,
+    wholes: bool,
+) -> Result<(Proposals, Option<Frame>)> {
+    let seeds = if settings.use_seeds { seeds } else { &[] };
+    let mut prompts = Prompts::new(settings, seeds);
+    let mut found = Proposals::default();
+    let mut judge: Option<Judge> = None;
+    loop {
+        let points = prompts.next(decoder.batch());
+        if points.is_empty() {
+            return Ok((found, judge.map(|judge| judge.frame())));
+        }
+        if cancel.load(Ordering::Relaxed) {
+            return Err(Error::new(ErrorCode::Cancelled, "masks: the scene was cancelled"));
+        }
+        let decoded = decoder.decode(&points)?;
+        let judge = match &mut judge {
+            Some(judge) => judge,
+            none => none.insert(Judge::new(decoder.placed(), &decoded, photo, settings)?),
+        };
+        let masks = judge.pass(&decoded, &points, wholes)?;
+        found.asked += points.len();
+        [found.width, found.height] = judge.map();
+        prompts.cover(&masks, judge.map(), decoded.levels);
+        found.masks.extend(masks);
+    }
+}

@@ -1,0 +1,215 @@
+//! Everything-mode over a decoder that knows what is in the picture: flat shapes on each other.
+
+use std::sync::{
+    Mutex,
+    atomic::{AtomicBool, Ordering},
+};
+
+use segsplat::{
+    error::{ErrorCode, Result},
+    scene::{Photo, PhotoMasks},
+    segment::{Decoded, PromptDecoder, Seed, Settings, everything, proposals},
+};
+
+/// Cells of the grid each way; the photo fills its upper three quarters.
+const GRID: usize = 64;
+const FILLED: f64 = 0.75;
+
+/// Boxes `[x0, y0, x1, y1]` in shares of the photo, later ones lie on earlier ones.
+struct Shapes {
+    boxes: Vec<[f64; 4]>,
+    asked: Mutex<Vec<[f32; 2]>>,
+}
+
+impl Shapes {
+    fn new(boxes: &[[f64; 4]]) -> Self {
+        Self { boxes: boxes.to_vec(), asked: Mutex::default() }
+    }
+
+    fn top(&self, u: f64, v: f64) -> Option<usize> {
+        let has = |b: &[f64; 4]| (b[0]..b[2]).contains(&u) && (b[1]..b[3]).contains(&v);
+        self.boxes.iter().rposition(has)
+    }
+}
+
+impl PromptDecoder for Shapes {
+    fn batch(&self) -> usize {
+        64
+    }
+
+    fn placed(&self) -> (u32, [u32; 2]) {
+        (256, [256, 192])
+    }
+
+    /// Levels: the shape near the point, nearer the whole, the whole. Nothing under the point: a
+    /// mask that is not sure of itself.
+    fn decode(&self, points: &[[f32; 2]]) -> Result<Decoded> {
+        self.asked.lock().unwrap().extend(points);
+        let mut decoded = Decoded { levels: 3, grid: [GRID; 2], ..Decoded::default() };
+        for point in points {
+            let [px, py] = point.map(f64::from);
+            let shape = self.top(px, py);
+            for radius in [0.06, 0.12, 9.0] {
+                for y in 0..GRID {
+                    for x in 0..GRID {
+                        let u = (x as f64 + 0.5) / GRID as f64;
+                        let v = (y as f64 + 0.5) / GRID as f64 / FILLED;
+                        let near = (u - px).hypot(v - py) < radius;
+                        let inside = near && v < 1.0 && self.top(u, v) == shape;
+                        let sure = if shape.is_some() { 20.0 } else { 0.5 };
+                        decoded.logits.push(if inside { sure } else { -20.0 });
+                    }
+                }
+                let iou = if radius > 1.0 { 0.95 } else { 0.85 };
+                decoded.predicted_iou.push(iou);
+            }
+        }
+        Ok(decoded)
+    }
+}
+
+fn photo() -> Photo {
+    Photo { width: 320, height: 240, rgb: vec![0; 320 * 240 * 3], valid: None }
+}
+
+fn run(shapes: &Shapes, settings: &Settings, seeds: &[Seed]) -> PhotoMasks {
+    everything(shapes, &photo(), settings, seeds, &AtomicBool::new(false)).unwrap()
+}
+
+/// A table, a mug on it, a picture on the wall behind; the wall itself is nothing.
+fn room() -> Shapes {
+    Shapes::new(&[[0.1, 0.5, 0.9, 0.95], [0.4, 0.6, 0.48, 0.7], [0.6, 0.1, 0.8, 0.3]])
+}
+
+/// The share of the photo's places at which two maps say the same things, up to numbering.
+fn agreement(a: &PhotoMasks, b: &PhotoMasks) -> f64 {
+    let places = (0..200).flat_map(|y| (0..200).map(move |x| (x, y)));
+    let at = |masks: &PhotoMasks, (x, y): (u32, u32)| {
+        let share = |v: u32| (f64::from(v) + 0.5) / 200.0;
+        let index = masks.map.at(share(x), share(y));
+        index.checked_sub(1).map(|k| (masks.masks[usize::from(k)].area * 50.0).round() as u32)
+    };
+    places.filter(|&p| at(a, p) == at(b, p)).count() as f64 / 40_000.0
+}
+
+#[test]
+fn each_thing_is_one_mask_and_small_ones_lie_on_large_ones() {
+    let masks = run(&room(), &Settings::default(), &[]);
+    assert_eq!((masks.map.width, masks.map.height), (128, 96), "twice the cells over the photo");
+    assert_eq!(masks.masks.len(), 3, "{:?}", masks.masks);
+    let area = |k: usize| masks.masks[k].area;
+    assert!(area(0) > area(1) && area(1) > area(2), "the largest first: {:?}", masks.masks);
+    assert!((area(0) - (0.8 * 0.45 - 0.008)).abs() < 0.02, "the table: {}", area(0));
+    for (u, v, index) in
+        [(0.2, 0.8, 1), (0.44, 0.65, 3), (0.7, 0.2, 2), (0.3, 0.2, 0), (0.05, 0.7, 0)]
+    {
+        assert_eq!(masks.map.at(u, v), index, "({u}, {v})");
+    }
+    let counted: usize = masks.map.index.iter().filter(|&&k| k > 0).count();
+    let shares: f64 = masks.masks.iter().map(|mask| mask.area).sum();
+    let all = masks.map.index.len() as f64;
+    assert!((counted as f64 / all - shares).abs() < 1e-9, "areas are those of the map");
+}
+
+#[test]
+fn each_skip_leaves_the_masks_as_they_are_and_asks_less() {
+    let all = Settings { skip_covered: false, ..Settings::default() };
+    let (full, fast) = (room(), room());
+    let slow = run(&full, &all, &[]);
+    assert_eq!(full.asked.lock().unwrap().len(), 1024, "every point of the grid");
+    let quick = run(&fast, &Settings::default(), &[]);
+    let asked = fast.asked.lock().unwrap().len();
+    assert!(asked < 800, "{asked} points with what is covered left out");
+    assert!(agreement(&slow, &quick) > 0.999, "covered: {}", agreement(&slow, &quick));
+    let fine = Settings { full_resolution: true, ..all.clone() };
+    let fine = run(&room(), &fine, &[]);
+    assert_eq!((fine.map.width, fine.map.height), (320, 240), "the photo's own pixels");
+    assert!(agreement(&slow, &fine) > 0.97, "full resolution: {}", agreement(&slow, &fine));
+    let seeds: Vec<Seed> =
+        [[0.2, 0.8], [0.44, 0.65], [0.7, 0.2]].map(|point| Seed { point }).to_vec();
+    let seeded = room();
+    let with = run(&seeded, &Settings::default(), &seeds);
+    assert!(agreement(&slow, &with) > 0.999, "seeds: {}", agreement(&slow, &with));
+    assert_eq!(
+        seeded.asked.lock().unwrap()[..3],
+        seeds.iter().map(|s| s.point).collect::<Vec<_>>()[..]
+    );
+    let off = room();
+    run(&off, &Settings { use_seeds: false, ..Settings::default() }, &seeds);
+    assert_eq!(off.asked.lock().unwrap().len(), asked, "seeds that are switched off");
+}
+
+#[test]
+fn proposals_are_parts_and_wholes_above_the_thresholds() {
+    let settings = Settings::default().exact();
+    let found = proposals(&room(), &photo(), &settings, &[], &AtomicBool::new(false)).unwrap();
+    assert_eq!((found.width, found.height, found.asked), (320, 240, 1024), "full resolution");
+    let wholes = found.masks.iter().filter(|mask| mask.level == 2).count();
+    assert!(wholes == 3 && found.masks.len() > 20, "{wholes} of {}", found.masks.len());
+    assert!(found.masks.windows(2).all(|m| m[0].predicted_iou >= m[1].predicted_iou), "order");
+    assert!(found.masks.iter().all(|mask| mask.stability >= 0.9), "what is not sure went");
+    let strict = Settings { pred_iou_thresh: 0.9, ..settings };
+    let found = proposals(&room(), &photo(), &strict, &[], &AtomicBool::new(false)).unwrap();
+    assert_eq!(found.masks.len(), 3, "only the wholes predict so much");
+}
+
+#[test]
+fn a_picture_of_nothing_has_no_masks_and_a_mask_of_everything_is_none() {
+    let empty = run(&Shapes::new(&[]), &Settings::default(), &[]);
+    assert!(empty.masks.is_empty() && empty.map.index.iter().all(|&k| k == 0), "nothing");
+    let whole = run(&Shapes::new(&[[0.0, 0.0, 1.0, 1.0]]), &Settings::default(), &[]);
+    assert!(whole.masks.iter().all(|mask| mask.area < 0.95), "{:?}", whole.masks);
+}
+
+#[test]
+fn pixels_without_a_source_are_in_no_mask() {
+    let mut blank = photo();
+    blank.valid = Some((0..320 * 240).map(|at| at % 320 >= 160).collect());
+    let cancel = AtomicBool::new(false);
+    let masks = everything(&room(), &blank, &Settings::default(), &[], &cancel).unwrap();
+    assert_eq!(masks.map.at(0.3, 0.8), 0, "the left half has no source");
+    assert_ne!(masks.map.at(0.7, 0.8), 0, "the right half has");
+}
+
+#[test]
+fn a_cancelled_scene_stops_and_a_senseless_decoder_is_named() {
+    let cancel = AtomicBool::new(true);
+    let error = everything(&room(), &photo(), &Settings::default(), &[], &cancel).unwrap_err();
+    assert_eq!(error.code(), ErrorCode::Cancelled, "{error}");
+    cancel.store(false, Ordering::Relaxed);
+
+    struct Broken(Decoded, [u32; 2]);
+    impl PromptDecoder for Broken {
+        fn batch(&self) -> usize {
+            8
+        }
+        fn placed(&self) -> (u32, [u32; 2]) {
+            (64, self.1)
+        }
+        fn decode(&self, _: &[[f32; 2]]) -> Result<Decoded> {
+            Ok(self.0.clone())
+        }
+    }
+    let whole =
+        Decoded { levels: 1, grid: [4, 4], logits: vec![1.0; 8 * 16], predicted_iou: vec![1.0; 8] };
+    let short = Decoded { logits: vec![1.0; 7], ..whole.clone() };
+    let flat = Decoded { grid: [0, 4], ..whole.clone() };
+    let none = Decoded { levels: 0, ..whole.clone() };
+    for (decoded, placed) in
+        [(short, [64, 64]), (flat, [64, 64]), (none, [64, 64]), (whole, [65, 0])]
+    {
+        let broken = Broken(decoded, placed);
+        let error = everything(&broken, &photo(), &Settings::default(), &[], &cancel).unwrap_err();
+        assert_eq!(error.code(), ErrorCode::Internal, "{error}");
+        assert!(error.message().starts_with("masks:"), "{error}");
+    }
+    let poison = Decoded {
+        levels: 1,
+        grid: [4, 4],
+        logits: vec![f32::NAN; 8 * 16],
+        predicted_iou: vec![f32::NAN; 8],
+    };
+    let settings = Settings { points_per_side: 4, ..Settings::default() };
+    let masks = everything(&Broken(poison, [64, 64]), &photo(), &settings, &[], &cancel).unwrap();
+    assert!(masks.masks.is_empty(), "numbers that are none are no masks");
+}
