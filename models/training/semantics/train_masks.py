@@ -207,7 +207,7 @@ def main():
         log.flush()
 
     done = False
-    next_eval = 0.34
+    next_eval = 0.5
     while not done:
         t = (time.time() - begin) / args.seconds
         stop = torch.tensor([float(t >= 1)], device=device)
@@ -243,7 +243,7 @@ def main():
         if t > next_eval and rank == 0:
             evaluate(f"at {t:.2f}")
         if t > next_eval:
-            next_eval += 0.33
+            next_eval += 9
     if rank == 0:
         state = {k: v.half().cpu() if v.is_floating_point() else v.cpu() for k, v in ema.state_dict().items()}
         torch.save(state, os.path.join(args.out, "masks.pt"))

@@ -3,7 +3,7 @@
     python train_text.py --pack PACK --out OUT --seconds S --space OUT/space.pt --more T
 
 First MiniLM's own embeddings of words, phrases, captions and glosses; when `space.pt` (from
-train_words.py) is there, the turned space, with the canon phrases where the image tower put them.
+train_words.py) is there (it waits for it), the turned space, with the canon phrases where the image tower put them.
 """
 import argparse
 import json
@@ -77,6 +77,9 @@ def main():
             canon = F.normalize(space["canon"], dim=-1)
             stage, began = 1, now
             weight[:3] = 60.0
+        if stage == 0 and now > args.seconds:
+            time.sleep(0.5)
+            continue
         if stage == 1 and now > began + args.more:
             break
         if stage == 0:

@@ -309,7 +309,7 @@ def main():
     centred = F.normalize(words.words - words.words.mean(0), dim=-1)
     if rank == 0:
         print("ready", round(time.time() - start, 1), "photos", len(pictures.photos), "segments", len(pictures.segments), flush=True)
-    begin, step, sums, n, done, next_eval = time.time(), 0, torch.zeros(6, device=device), 0, False, 0.2
+    begin, step, sums, n, done, next_eval = time.time(), 0, torch.zeros(6, device=device), 0, False, 0.4
 
     @torch.no_grad()
     def evaluate(tag):
@@ -410,7 +410,7 @@ def main():
             sums.zero_()
             n = 0
         if t > next_eval:
-            next_eval += 0.26
+            next_eval += 0.7
             if rank == 0:
                 evaluate(f"at {t:.2f}")
     if rank == 0:
