@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::{
     config::Config,
     error::Result,
-    jobs::{NoSemantics, PipelineMaker},
+    jobs::{PipelineMaker, PipelineSemantics},
     models::Bundle,
     pipeline::Engine,
     render::{Renderer, select::select},
@@ -20,8 +20,9 @@ pub fn parts(config: &Config) -> Result<Parts> {
     let engine = Arc::new(Engine::open(config)?);
     let models = models_info(engine.bundle(), engine.geometry().provider().name());
     let renderer = renderer(config)?;
-    let maker = Arc::new(PipelineMaker::new(engine, config.limits.clone()));
-    Ok(Parts { maker, semantics: Arc::new(NoSemantics), renderer, models })
+    let maker = Arc::new(PipelineMaker::new(Arc::clone(&engine), config.limits.clone()));
+    let semantics = Arc::new(PipelineSemantics::new(engine, config.limits.clone()));
+    Ok(Parts { maker, semantics, renderer, models })
 }
 
 /// The renderer that the configuration asks for.

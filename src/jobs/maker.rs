@@ -1,13 +1,17 @@
-//! The product's own way of making a scene: the pipeline, with its stages as one fraction.
+//! The product's own way of making a scene and its meaning: the pipeline, with its stages as one
+//! fraction.
 
 use std::sync::Arc;
 
 use crate::{
     error::Result,
-    jobs::{Made, SceneMaker, Work},
+    jobs::{Made, Phrases, SceneMaker, SemanticsMaker, SemanticsWork, TextEmbedding, Work},
     limits::Limits,
-    pipeline::{self, Engine, Stage},
-    scene::Upload,
+    pipeline::{
+        self, Engine, Stage,
+        semantics::{SemanticsOptions, SemanticsStage, Watch, understand_upload},
+    },
+    scene::{Semantics, Upload},
 };
 
 /// Makes scenes with an [`Engine`].
@@ -61,5 +65,57 @@ fn share_of(stage: Stage) -> [f32; 2] {
         Stage::Geometry => [0.2, 0.9],
         Stage::Lift => [0.9, 0.97],
         Stage::Store => [0.97, 1.0],
+    }
+}
+
+/// Makes what scenes mean with an [`Engine`], whose networks are opened at the first use.
+#[derive(Debug)]
+pub struct PipelineSemantics {
+    engine: Arc<Engine>,
+    limits: Limits,
+}
+
+impl PipelineSemantics {
+    /// A maker that reads photos under these limits.
+    #[must_use]
+    pub fn new(engine: Arc<Engine>, limits: Limits) -> Self {
+        Self { engine, limits }
+    }
+}
+
+impl SemanticsMaker for PipelineSemantics {
+    fn lacks(&self) -> Option<String> {
+        self.engine.lacks_semantics().map(str::to_owned)
+    }
+
+    fn phrases(&self) -> Result<Phrases> {
+        let towers = self.engine.image_text()?;
+        let manifest = towers.manifest();
+        Ok(Phrases {
+            canon: manifest.canon.clone(),
+            tau: manifest.tau,
+            coverage_floor: manifest.coverage_floor,
+        })
+    }
+
+    fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
+        let embedded = self.engine.image_text()?.embed_texts(texts)?;
+        let texts = embedded.into_iter().map(|text| TextEmbedding {
+            row: text.row,
+            tokens: text.tokens,
+            unknown: text.unknown,
+            cut: text.cut,
+        });
+        Ok(texts.collect())
+    }
+
+    fn make(&self, work: SemanticsWork<'_>) -> Result<Semantics> {
+        let progress = |stage: SemanticsStage, fraction: f32| {
+            let [from, to] = stage.share();
+            (work.progress)(stage.name(), from + (to - from) * fraction);
+        };
+        let watch = Watch { progress: &progress, cancel: work.cancel };
+        let options = SemanticsOptions::default();
+        understand_upload(&self.engine, work.upload, &self.limits, work.scene, &options, watch)
     }
 }

@@ -22,7 +22,7 @@ use std::{
 use tokio::sync::watch;
 
 pub use self::{
-    maker::PipelineMaker,
+    maker::{PipelineMaker, PipelineSemantics},
     semantics::{NoSemantics, Phrases, SemanticsMaker, SemanticsWork, TextEmbedding},
 };
 

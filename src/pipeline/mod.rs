@@ -2,9 +2,11 @@
 //!
 //! [`Engine`] holds what is opened once (library, bundle, sessions); [`reconstruct`] is the list of
 //! stages from photos to Gaussians, [`make`] the same from an upload. The caller stores the scene,
-//! under the stage name [`Stage::Store`].
+//! under the stage name [`Stage::Store`]. What the scene means comes when somebody asks, or at
+//! once: [`semantics`].
 
 pub mod masks;
+pub mod semantics;
 
 use std::{
     fmt,
@@ -75,6 +77,7 @@ pub struct Engine {
     bundle: Bundle,
     geometry: Geometry,
     workers: rayon::ThreadPool,
+    lazy: semantics::LazyNetworks,
 }
 
 impl Engine {
@@ -91,7 +94,8 @@ impl Engine {
             .thread_name(|i| format!("pipeline-{i}"))
             .build()
             .map_err(|e| Error::internal("pipeline: no worker threads").caused_by(e))?;
-        Ok(Self { runtime, bundle, geometry, workers })
+        let lazy = semantics::LazyNetworks::new(config);
+        Ok(Self { runtime, bundle, geometry, workers, lazy })
     }
 
     /// The library.

@@ -2,8 +2,7 @@
 //! that the Gaussians themselves give.
 //!
 //! In: Gaussians with the pixels that made them, the cameras and the photos' bank index maps. Out:
-//! votes for an index of each Gaussian, indices that are one thing seen from two sides, and places
-//! where a later photo shows what an earlier one has masked.
+//! votes for an index of each Gaussian, and indices that are one thing seen from two sides.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -152,30 +151,6 @@ impl<'a> Views<'a> {
         }
         group.into_iter().map(|g| u16::try_from(g).unwrap_or(u16::MAX)).collect()
     }
-
-    /// Places of photo `to`, shares of its sides, that show the masks of photo `from`: for each
-    /// mask the visible Gaussian nearest to the middle of those that are visible. `map` is the
-    /// mask map of photo `from`.
-    #[must_use]
-    pub fn seeds(&self, from: usize, to: usize, map: &IndexMap) -> Vec<[f64; 2]> {
-        let (Some(Some(source)), Some(Some(target))) = (self.views.get(from), self.views.get(to))
-        else {
-            return Vec::new();
-        };
-        let mut pictures = vec![None; self.views.len()];
-        pictures[from] = Some(source.picture);
-        let mut maps = vec![IndexMap::default(); self.views.len()];
-        maps[from] = map.clone();
-        let pixels = super::from_source(self.gaussians.source(), &pictures, &maps);
-        let count = pixels.iter().copied().max().map_or(0, usize::from);
-        let mut seen: Vec<Vec<[f64; 2]>> = vec![Vec::new(); count + 1];
-        for (i, mask) in pixels.iter().enumerate().filter(|(_, mask)| **mask > 0) {
-            if let Some(place) = target.shows(world(self.gaussians, i)) {
-                seen[usize::from(*mask)].push(place);
-            }
-        }
-        seen.into_iter().filter_map(|places| middle(&places)).collect()
-    }
 }
 
 fn world(gaussians: &Gaussians, i: usize) -> DVec3 {
@@ -197,14 +172,6 @@ fn winner(own: u16, mut votes: Vec<u16>) -> u16 {
 fn cosine(bank: &Bank, a: usize, b: usize) -> f64 {
     let lengths = super::norm(bank.row(a)) * super::norm(bank.row(b));
     if lengths > 0.0 { super::dot(bank.row(a), bank.row(b)) / lengths } else { 0.0 }
-}
-
-/// The place nearest to the mean of all.
-fn middle(places: &[[f64; 2]]) -> Option<[f64; 2]> {
-    let count = places.len() as f64;
-    let mean = [0, 1].map(|axis| places.iter().map(|place| place[axis]).sum::<f64>() / count);
-    let far = |place: &[f64; 2]| (place[0] - mean[0]).powi(2) + (place[1] - mean[1]).powi(2);
-    places.iter().copied().min_by(|a, b| far(a).total_cmp(&far(b)))
 }
 
 /// A bank and its indices after groups of rows have become one row each: the mean over their
@@ -374,19 +341,5 @@ mod tests {
         assert_eq!(merged.rows, [0.875, 0.125, 0.0, 0.6]);
         let (same, becomes) = merge(&bank, &[3, 1, 1, 1], &[0, 1, 2, 3, 4]);
         assert_eq!((same.rows, becomes), (bank.rows, vec![0, 1, 2, 3, 4]));
-    }
-
-    #[test]
-    fn seeds_lie_in_the_middle_of_what_the_later_photo_shows() {
-        let gaussians = wall(2, |_| 10.0);
-        let views = Views::new(&gaussians, &cameras(2));
-        let mut masks = map(16, 1);
-        (0..20).for_each(|y| masks.index[y * 20] = 2);
-        let seeds = views.seeds(0, 1, &masks);
-        // Columns 16 to 19 of photo 0 are columns 14 to 17 of photo 1; column 0 is out of it.
-        assert_eq!(seeds.len(), 1);
-        assert!((seeds[0][0] - 16.0 / 20.0).abs() <= 0.51 / 20.0, "{seeds:?}");
-        assert!((seeds[0][1] - 0.5).abs() <= 0.51 / 20.0, "{seeds:?}");
-        assert!(views.seeds(0, 5, &masks).is_empty(), "no such photo");
     }
 }

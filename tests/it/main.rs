@@ -32,3 +32,4 @@ mod shader_layout;
 mod store;
 mod tidy;
 mod twins;
+mod understand;

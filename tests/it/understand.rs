@@ -1,0 +1,327 @@
+//! The stages that give a scene its meaning, with stand-ins for the networks and with the
+//! fixture's small ones.
+
+use std::{
+    path::Path,
+    sync::{
+        Mutex,
+        atomic::{AtomicBool, Ordering},
+    },
+};
+
+use segsplat::{
+    config::Config,
+    error::{ErrorCode, Result},
+    pipeline::{
+        Engine, reconstruct,
+        semantics::{
+            SceneParts, SemanticsOptions, SemanticsStage, SemanticsTools, Watch, understand,
+            understand_with,
+        },
+    },
+    sample::{self, SampleOptions},
+    scene::{
+        Camera, CameraToWorld, Crop, Gaussians, IndexMap, Intrinsics, MaskInfo, Photo, PhotoMasks,
+        PosedPhoto, RawGaussians, SceneCamera, SceneOptions, ScoringProfile, Semantics,
+        SourcePixel,
+    },
+    semantics::Scorer,
+};
+
+use crate::common::skipped;
+
+static NO_CANCEL: AtomicBool = AtomicBool::new(false);
+const SIDE: u32 = 16;
+
+fn lens(scale: u32) -> Intrinsics {
+    let (size, focal) = (SIDE * scale, f64::from(SIDE * scale));
+    Intrinsics { fx: focal, fy: focal, cx: focal / 2.0, cy: focal / 2.0, width: size, height: size }
+}
+
+/// Two photos of a wall: red to the left, green to the right. The network saw half their size.
+struct Wall {
+    photos: Vec<PosedPhoto>,
+    cameras: Vec<SceneCamera>,
+    gaussians: Gaussians,
+}
+
+fn wall() -> Wall {
+    let pose = |v: u32| {
+        let x = f64::from(v) * 0.25;
+        let pose = [1., 0., 0., x, 0., 1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1.];
+        CameraToWorld::from_row_major(&pose, "test").unwrap()
+    };
+    let camera = |v| Camera { intrinsics: lens(2), camera_to_world: pose(v) };
+    let file = |v: u32| format!("{v}.png");
+    let photo = |v: u32| {
+        let edge = SIDE - 2 * v;
+        let row = (0..2 * SIDE).flat_map(|x| if x < edge { [200, 10, 10] } else { [10, 200, 10] });
+        let rgb: Vec<u8> = row.collect::<Vec<u8>>().repeat(2 * SIDE as usize);
+        let photo = Photo { width: 2 * SIDE, height: 2 * SIDE, rgb, valid: None };
+        PosedPhoto { file: file(v), photo, camera: camera(v), intrinsics_made_for: None }
+    };
+    let input = |v| SceneCamera { file: file(v), camera: camera(v), network: Some(lens(1)) };
+    let mut raw = RawGaussians::default();
+    for v in 0..2_u16 {
+        for (x, y) in (0..SIDE).flat_map(|y| (0..SIDE).map(move |x| (x, y))) {
+            let at = lens(1).unproject(f64::from(x) + 0.5, f64::from(y) + 0.5, 4.0);
+            raw.means.push([at.x as f32 + 0.25 * f32::from(v), at.y as f32, 4.0]);
+            raw.source.push(SourcePixel { view: v, x: x as u16, y: y as u16 });
+        }
+    }
+    let n = raw.means.len();
+    raw.quats = vec![[1.0, 0.0, 0.0, 0.0]; n];
+    raw.scales = vec![[0.1; 3]; n];
+    raw.opacities = vec![0.9; n];
+    raw.sh = vec![[0.0; 3]; n];
+    raw.semantic_index = vec![0; n];
+    Wall {
+        photos: (0..2).map(photo).collect(),
+        cameras: (0..2).map(input).collect(),
+        gaussians: Gaussians::sanitize(raw).unwrap().0,
+    }
+}
+
+impl Wall {
+    fn parts(&self) -> SceneParts<'_> {
+        SceneParts { photos: &self.photos, cameras: &self.cameras, gaussians: &self.gaussians }
+    }
+}
+
+/// Masks 1 and 2 of each photo: its two colours, on a grid of 32 columns; photo 1 counts from
+/// the right.
+fn two_masks(v: u32) -> PhotoMasks {
+    let edge = SIDE - 2 * v;
+    let order = if v == 0 { [1, 2] } else { [2, 1] };
+    let row: Vec<u16> = (0..2 * SIDE).map(|x| order[usize::from(x >= edge)]).collect();
+    let map = IndexMap { width: 2 * SIDE, height: 4, index: row.repeat(4) };
+    PhotoMasks { map, masks: vec![MaskInfo::default(); 2] }
+}
+
+/// Mean colour of what is not black, unit length.
+fn colour_of(crops: &[Crop]) -> Result<Vec<f32>> {
+    let mean = |crop: &Crop| {
+        let mut sum = [0.0_f32; 3];
+        for pixel in crop.rgb.chunks_exact(3) {
+            sum.iter_mut().zip(pixel).for_each(|(s, v)| *s += f32::from(*v));
+        }
+        let length = sum.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-9);
+        sum.map(|v| v / length)
+    };
+    Ok(crops.iter().flat_map(mean).collect())
+}
+
+type Masks<'a> = &'a (dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> + Sync);
+type Embed<'a> = &'a (dyn Fn(&[Crop]) -> Result<Vec<f32>> + Sync);
+
+fn tools<'a>(masks: Masks<'a>, embed: Embed<'a>) -> SemanticsTools<'a> {
+    SemanticsTools { masks, embed, dim: 3, crop_margin: 0.1, batch: 3 }
+}
+
+fn made(wall: &Wall, tools: &SemanticsTools<'_>, options: SemanticsOptions) -> Result<Semantics> {
+    let watch = Watch { progress: &|_, _| (), cancel: &NO_CANCEL };
+    understand_with(tools, &wall.parts(), &options, watch)
+}
+
+#[test]
+fn each_gaussian_takes_the_bank_row_of_its_pixel() {
+    let wall = wall();
+    let told = Mutex::new(Vec::new());
+    let masks: Masks<'_> = &|progress| {
+        progress(0.5);
+        Ok((0..2).map(two_masks).collect())
+    };
+    let watch = Watch {
+        progress: &|stage: SemanticsStage, fraction| {
+            told.lock().unwrap().push((stage.name(), fraction));
+        },
+        cancel: &NO_CANCEL,
+    };
+    let options = SemanticsOptions::default();
+    let made = understand_with(&tools(masks, &colour_of), &wall.parts(), &options, watch).unwrap();
+    assert_eq!((made.bank.len(), made.bank.dim), (2, 3), "four masks of two colours");
+    assert_eq!(made.report.masks, [2, 2]);
+    assert_eq!((made.report.bank_size, made.report.labelled), (2, 512));
+    let stages: Vec<&str> = made.report.stages.iter().map(|s| s.stage.as_str()).collect();
+    assert_eq!(stages, ["masks", "embed", "bank", "assign"]);
+    let red = made.index[0];
+    let green = 3 - red;
+    assert!((1..=2).contains(&red));
+    for (i, source) in wall.gaussians.source().iter().enumerate() {
+        let edge = SIDE as u16 / 2 - source.view;
+        let want = if source.x < edge { red } else { green };
+        assert_eq!(made.index[i], want, "{source:?}");
+    }
+    assert_eq!(made.photos[1].index[..2], [red, red]);
+    assert_eq!(made.photos[1].index[14], green, "photo 1 turns green at column 14 of 32");
+    let row = made.bank.row(usize::from(red) - 1);
+    assert!(row[0] > 0.9 && row[1] < 0.2, "{row:?} is red");
+    let told = told.into_inner().unwrap();
+    assert!(told.contains(&("masks", 0.5)) && told.contains(&("assign", 1.0)), "{told:?}");
+    let parts: Vec<&str> = told.iter().map(|t| t.0).collect();
+    assert!(parts.is_sorted_by_key(|name| stages.iter().position(|s| s == name)), "{parts:?}");
+}
+
+#[test]
+fn a_photo_without_masks_and_a_scene_without_any_are_legal() {
+    let wall = wall();
+    let one: Masks<'_> = &|_| Ok(vec![two_masks(0), PhotoMasks::default()]);
+    let options = SemanticsOptions { votes: true, ..SemanticsOptions::default() };
+    let half = made(&wall, &tools(one, &colour_of), options).unwrap();
+    assert_eq!(half.report.masks, [2, 0]);
+    assert!(half.index[..256].iter().all(|m| *m > 0), "photo 0 has its own");
+    let plain = made(&wall, &tools(one, &colour_of), SemanticsOptions::default()).unwrap();
+    assert!(plain.index[256..].iter().all(|m| *m == 0), "photo 1 has none");
+    let filled = half.index[256..].iter().filter(|m| **m > 0).count();
+    assert!(filled > 200, "photo 0 votes for what photo 1 also shows: {filled}");
+    let none: Masks<'_> = &|_| Ok(vec![PhotoMasks::default(); 2]);
+    let empty = made(&wall, &tools(none, &colour_of), options).unwrap();
+    assert_eq!((empty.bank.len(), empty.bank.dim, empty.report.labelled), (0, 3, 0));
+    assert_eq!(empty.index, vec![0; 512]);
+}
+
+#[test]
+fn masks_that_mean_nothing_stay_background() {
+    let wall = wall();
+    let masks: Masks<'_> = &|_| {
+        let mut masks: Vec<PhotoMasks> = (0..2).map(two_masks).collect();
+        masks[0].masks.push(MaskInfo::default());
+        Ok(masks)
+    };
+    // Green crops get no embedding.
+    let embed: Embed<'_> = &|crops| {
+        let mut rows = colour_of(crops)?;
+        rows.chunks_exact_mut(3).filter(|row| row[1] > 0.5).for_each(|row| row.fill(0.0));
+        Ok(rows)
+    };
+    let made = made(&wall, &tools(masks, embed), SemanticsOptions::default()).unwrap();
+    assert_eq!((made.bank.len(), made.report.masks[0]), (1, 3));
+    assert_eq!((made.index[0], made.index[15]), (1, 0), "red has a row, green has none");
+}
+
+#[test]
+fn two_sides_of_one_thing_are_joined_only_when_asked() {
+    let wall = wall();
+    // Each photo has one mask over all; photo 1's embedding leans another way.
+    let whole = || PhotoMasks {
+        map: IndexMap { width: 1, height: 1, index: vec![1] },
+        masks: vec![MaskInfo::default()],
+    };
+    let masks: Masks<'_> = &|_| Ok(vec![whole(), whole()]);
+    let called = AtomicBool::new(false);
+    let embed: Embed<'_> = &|crops| {
+        assert_eq!(crops.len(), 1);
+        let second = called.fetch_xor(true, Ordering::Relaxed);
+        Ok(if second { vec![0.6, 0.8, 0.0] } else { vec![1.0, 0.0, 0.0] })
+    };
+    // 1.2 masks a photo make two rows.
+    let with = |merge| SemanticsOptions { merge, ..SemanticsOptions::default() };
+    let apart = made(&wall, &tools(masks, embed), with(None)).unwrap();
+    assert_eq!((apart.bank.len(), apart.index[0] == apart.index[300]), (2, false));
+    let strict = made(&wall, &tools(masks, embed), with(Some(0.7))).unwrap();
+    assert_eq!(strict.bank.len(), 2, "the rows' cosine is 0.6");
+    let joined = made(&wall, &tools(masks, embed), with(Some(0.5))).unwrap();
+    assert_eq!((joined.bank.len(), joined.report.bank_size), (1, 1));
+    assert!(joined.index.iter().all(|m| *m == 1));
+    assert_eq!(joined.photos[1].index, [1]);
+    assert_eq!(joined.bank.rows, [0.8, 0.4, 0.0], "the mean of both");
+}
+
+#[test]
+fn wrong_answers_and_wrong_scenes_are_refused_by_name() {
+    let good = wall();
+    let masks: Masks<'_> = &|_| Ok((0..2).map(two_masks).collect());
+    let fails = |wall: &Wall, tools: &SemanticsTools<'_>| {
+        made(wall, tools, SemanticsOptions::default()).unwrap_err()
+    };
+    let few: Masks<'_> = &|_| Ok(vec![two_masks(0)]);
+    let error = fails(&good, &tools(few, &colour_of));
+    assert!(error.message().contains("masks of 1 photos, not of 2"), "{error}");
+    let error = fails(&good, &tools(masks, &|_| Ok(vec![1.0])));
+    assert!(error.message().contains("1 numbers for 2 crops"), "{error}");
+    let mut other = wall();
+    other.photos[1].file = "x.png".to_owned();
+    assert_eq!(fails(&other, &tools(masks, &colour_of)).code(), ErrorCode::Internal);
+    let mut old = wall();
+    old.cameras.iter_mut().for_each(|c| c.network = None);
+    let error = fails(&old, &tools(masks, &colour_of));
+    assert_eq!(error.code(), ErrorCode::InvalidRequest);
+    let stop = AtomicBool::new(true);
+    let watch = Watch { progress: &|_, _| (), cancel: &stop };
+    let options = SemanticsOptions::default();
+    let error = understand_with(&tools(masks, &colour_of), &good.parts(), &options, watch);
+    assert_eq!(error.unwrap_err().code(), ErrorCode::Cancelled);
+}
+
+fn engine(threads: usize) -> Option<Engine> {
+    let mut config = Config::default();
+    config.bundle = Some(Path::new("tests/fixtures/colours").to_owned());
+    config.threads = threads;
+    config.jobs = 1;
+    match Engine::open(&config) {
+        Err(e) if e.code() == ErrorCode::ModelUnavailable => {
+            skipped(e.message());
+            None
+        }
+        engine => Some(engine.unwrap()),
+    }
+}
+
+fn understood(engine: &Engine, wall: &Wall) -> Semantics {
+    let watch = Watch { progress: &|_, _| (), cancel: &NO_CANCEL };
+    understand(engine, &wall.parts(), &SemanticsOptions::default(), watch).unwrap()
+}
+
+#[test]
+fn the_bundles_networks_give_a_bank_that_words_select_and_the_same_one_every_time() {
+    let Some(engine) = engine(1) else { return };
+    let wall = wall();
+    assert_eq!(engine.lacks_semantics(), None);
+    let made = understood(&engine, &wall);
+    assert!(made.report.masks.iter().all(|count| *count >= 2), "{:?}", made.report);
+    assert_eq!(made.report.bundle_sha256, engine.bundle().sha256());
+    assert_eq!(made.report.execution_provider, "cpu");
+    // The same photos, another process's worth of sessions, one thread each.
+    let again = understood(&self::engine(1).unwrap(), &wall);
+    let bits = |of: &Semantics| of.bank.rows.iter().map(|v| v.to_bits()).collect::<Vec<u32>>();
+    assert_eq!(bits(&made), bits(&again), "the bank, bit for bit");
+    assert_eq!((&made.index, &made.photos), (&again.index, &again.photos));
+
+    let scoring = engine.scoring(ScoringProfile::Default).unwrap();
+    let scorer = Scorer::new(&made.bank, scoring.into()).unwrap();
+    let towers = engine.image_text().unwrap();
+    let mut right = 0;
+    for (word, is_red) in [("red", true), ("green", false)] {
+        let text = towers.embed_texts(&[word.to_owned()]).unwrap().remove(0);
+        let scores = scorer.text(&text.row).unwrap();
+        for (m, source) in made.index.iter().zip(wall.gaussians.source()) {
+            let red = source.x < SIDE as u16 / 2 - source.view;
+            right += usize::from(scores.selects(*m) == (red == is_red));
+        }
+    }
+    assert!(right > 1000, "{right} of 1024 Gaussians answer to their colour and no other");
+}
+
+#[test]
+fn a_scene_of_the_pipeline_says_which_pixels_made_it() {
+    let Some(engine) = engine(2) else { return };
+    let options = SampleOptions { photos: 3, width: 96, height: 64, seed: 4 };
+    let photos = sample::photos(&options).unwrap();
+    let made = reconstruct(&engine, &photos, &SceneOptions::default(), &|_, _| (), &NO_CANCEL);
+    let made = made.unwrap();
+    let network = made.cameras[0].network.unwrap();
+    assert_eq!((network.width, network.height), (48, 32), "the bundle's bucket of this shape");
+    assert!((network.fx - made.report.network_focal_px[0]).abs() < 1e-9, "square pixels");
+    let parts = SceneParts { photos: &photos, cameras: &made.cameras, gaussians: &made.gaussians };
+    let watch = Watch { progress: &|_, _| (), cancel: &NO_CANCEL };
+    let meant = understand(&engine, &parts, &SemanticsOptions::default(), watch).unwrap();
+    assert_eq!(meant.index.len(), made.gaussians.len());
+    assert_eq!(meant.photos.len(), 3);
+    for (m, source) in meant.index.iter().zip(made.gaussians.source()) {
+        // The picture is the whole photo at half its size.
+        let at = |v: u16, size: u32| (f64::from(v) + 0.5) / f64::from(size);
+        let map = &meant.photos[usize::from(source.view)];
+        assert_eq!(*m, map.at(at(source.x, 48), at(source.y, 32)), "{source:?}");
+    }
+    assert!(meant.report.labelled > 0, "{:?}", meant.report);
+}
