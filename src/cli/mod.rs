@@ -51,7 +51,7 @@ enum Command {
     /// The model bundle and ONNX Runtime
     Models(models::Args),
     /// Score scene folders against photos that were held out
-    Eval(measure::EvalArgs),
+    Eval(Box<measure::EvalArgs>),
     /// Time the stages on generated photos
     Bench(bench::Args),
     /// Write a small generated photo set with exact cameras
@@ -65,7 +65,7 @@ impl Command {
             Self::Reconstruct(args) => args.config.clone(),
             Self::Render(args) => args.config.clone(),
             Self::Models(args) => args.config.clone(),
-            Self::Eval(args) => args.config.clone(),
+            Self::Eval(args) => args.config().clone(),
             Self::Bench(args) => args.config.clone(),
             Self::Inspect(_) | Self::Sample(_) => ConfigArgs::default(),
         }

@@ -1,4 +1,5 @@
-//! How good the scenes are on posed photographs: `segsplat eval DIR`.
+//! How good the scenes are on posed photographs: `segsplat eval DIR`; what texts select in them:
+//! [`semantics`]; whether images find their names: [`words`].
 //!
 //! Every triple (two inputs, a target between them) goes through the product's own road:
 //! undistortion, capture analysis, the shipped network, lifting, the CPU renderer. Beside PSNR and
@@ -8,8 +9,10 @@
 mod metrics;
 mod pictures;
 mod report;
+pub mod semantics;
 mod triples;
 mod warp;
+pub mod words;
 
 use std::{
     path::{Path, PathBuf},
@@ -248,15 +251,20 @@ fn scene_dirs(dir: &Path, wanted: &[String]) -> Result<Vec<PathBuf>> {
         }
     }
     found.sort();
+    only_named(found, wanted, "scene folder with a transforms.json")
+}
+
+/// The folders of these names; all of them where none is named.
+fn only_named(mut found: Vec<PathBuf>, wanted: &[String], what: &str) -> Result<Vec<PathBuf>> {
     let named = |path: &PathBuf, name: &String| path.file_name().is_some_and(|n| *n == **name);
     if let Some(missing) = wanted.iter().find(|name| !found.iter().any(|path| named(path, name))) {
-        return Err(Error::invalid(format!("eval: no scene folder is called {missing:?}")));
+        return Err(Error::invalid(format!("eval: no {what} is called {missing:?}")));
     }
     if !wanted.is_empty() {
         found.retain(|path| wanted.iter().any(|name| named(path, name)));
     }
     if found.is_empty() {
-        return Err(Error::invalid("eval: no scene folder with a transforms.json there"));
+        return Err(Error::invalid(format!("eval: no {what} there")));
     }
     Ok(found)
 }

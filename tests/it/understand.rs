@@ -305,7 +305,7 @@ fn the_bundles_networks_give_a_bank_that_words_select_and_the_same_one_every_tim
 #[test]
 fn a_scene_of_the_pipeline_says_which_pixels_made_it() {
     let Some(engine) = engine(2) else { return };
-    let options = SampleOptions { photos: 3, width: 120, height: 64, seed: 4 };
+    let options = SampleOptions { photos: 3, width: 96, height: 64, seed: 4 };
     let photos = sample::photos(&options).unwrap();
     let made = reconstruct(&engine, &photos, &SceneOptions::default(), &|_, _| (), &NO_CANCEL);
     let made = made.unwrap();
@@ -318,10 +318,10 @@ fn a_scene_of_the_pipeline_says_which_pixels_made_it() {
     assert_eq!(meant.index.len(), made.gaussians.len());
     assert_eq!(meant.photos.len(), 3);
     for (m, source) in meant.index.iter().zip(made.gaussians.source()) {
-        // The picture is the photo without 12 columns on each side, at half its size.
-        let (x, y) = (2.0 * f64::from(source.x) + 13.0, 2.0 * f64::from(source.y) + 1.0);
+        // The picture is the whole photo at half its size.
+        let at = |v: u16, size: u32| (f64::from(v) + 0.5) / f64::from(size);
         let map = &meant.photos[usize::from(source.view)];
-        assert_eq!(*m, map.at(x / 120.0, y / 64.0), "{source:?}");
+        assert_eq!(*m, map.at(at(source.x, 48), at(source.y, 32)), "{source:?}");
     }
     assert!(meant.report.labelled > 0, "{:?}", meant.report);
 }

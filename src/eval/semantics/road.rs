@@ -1,0 +1,250 @@
+//! From photos and texts to what each text says of each pixel of the target: the product's road,
+//! and the flat one without 3D.
+
+use std::sync::{
+    Arc,
+    atomic::{AtomicBool, Ordering},
+};
+
+use super::{report::TargetReport, tally::TextMap};
+use crate::{
+    error::{Error, Result},
+    models::ImageText,
+    pipeline::{
+        Engine, masks, reconstruct,
+        semantics::{SceneParts, SemanticsOptions, Watch, understand},
+    },
+    render::{Entries, Kinds, Labels, RenderRequest, compose, cpu::CpuRenderer},
+    scene::{
+        Bank, Camera, Crop, PhotoMasks, PosedPhoto, Provenance, Scene, SceneId, SceneMeta,
+        SceneOptions, ScoringProfile, SemanticsReport, StageTime,
+    },
+    semantics::{Cutter, PixelEntries, Scorer, Scoring},
+};
+
+/// Near plane as a share of the scene's median depth, as the service renders.
+const NEAR_SHARE: f64 = 0.01;
+
+/// What every target is seen with.
+pub(super) struct Road<'a> {
+    engine: &'a Engine,
+    renderer: &'a CpuRenderer,
+    towers: Arc<ImageText>,
+    understanding: SemanticsOptions,
+    /// Profile, how it scores, and its canonical phrases.
+    scorings: Vec<(ScoringProfile, Arc<Scoring>)>,
+}
+
+/// One target, seen from its inputs.
+pub(super) struct Seen {
+    /// The view's colours, for pictures.
+    pub(super) color: Vec<[f32; 3]>,
+    scene: Rows,
+    flat: Rows,
+    semantics: SemanticsReport,
+    stages: Vec<StageTime>,
+    warnings: usize,
+}
+
+/// A bank and the weights of each pixel of the target over it.
+struct Rows {
+    bank: Bank,
+    entries: Entries,
+}
+
+impl<'a> Road<'a> {
+    pub(super) fn open(
+        engine: &'a Engine,
+        renderer: &'a CpuRenderer,
+        understanding: SemanticsOptions,
+    ) -> Result<Self> {
+        let scorings = super::PROFILES
+            .into_iter()
+            .map(|profile| Ok((profile, Arc::new(engine.scoring(profile)?))))
+            .collect::<Result<_>>()?;
+        let towers = engine.image_text()?;
+        Ok(Self { engine, renderer, towers, understanding, scorings })
+    }
+
+    pub(super) fn understanding(&self) -> &SemanticsOptions {
+        &self.understanding
+    }
+
+    /// Unit embeddings of texts.
+    pub(super) fn texts(&self, texts: &[String]) -> Result<Vec<Vec<f32>>> {
+        Ok(self.towers.embed_texts(texts)?.into_iter().map(|text| text.row).collect())
+    }
+
+    fn scoring(&self, profile: ScoringProfile) -> Result<Arc<Scoring>> {
+        let found = self.scorings.iter().find(|(of, _)| *of == profile);
+        found
+            .map(|(_, scoring)| Arc::clone(scoring))
+            .ok_or_else(|| Error::internal("eval: a profile that was not opened"))
+    }
+
+    /// Makes the scene of `inputs` and looks at it from the target's camera.
+    pub(super) fn see(
+        &self,
+        photos: &[PosedPhoto],
+        target: usize,
+        inputs: &[usize],
+    ) -> Result<Seen> {
+        let given: Vec<PosedPhoto> = inputs.iter().map(|&i| photos[i].clone()).collect();
+        let cancel = AtomicBool::new(false);
+        let made = reconstruct(self.engine, &given, &SceneOptions::default(), &|_, _| (), &cancel)?;
+        let parts =
+            SceneParts { photos: &given, cameras: &made.cameras, gaussians: &made.gaussians };
+        let watch = Watch { progress: &|_, _| (), cancel: &cancel };
+        let meaning = understand(self.engine, &parts, &self.understanding, watch)?;
+        let gaussians = made.gaussians.with_semantic_index(meaning.index)?;
+        #[expect(clippy::cast_possible_truncation, reason = "a near plane needs no f64")]
+        let near = (made.report.median_depth * NEAR_SHARE).max(1e-6) as f32;
+        let request = RenderRequest {
+            camera: photos[target].camera,
+            kinds: Kinds::COLOR,
+            labels: Labels::Entries,
+            background: [0.0; 3],
+            antialiased: false,
+            near,
+        };
+        let warnings = made.report.warnings.len();
+        let stages = made.report.stages.clone();
+        let meta = SceneMeta {
+            id: SceneId::from_bytes([0; 16]),
+            created_ms: 0,
+            cameras: made.cameras,
+            report: made.report,
+            provenance: Provenance::default(),
+        };
+        let scene = Scene::new(meta, gaussians, made.backdrop);
+        let frame = compose::render_scene(self.renderer, &scene, &request, true)?;
+        let entries =
+            frame.entries.ok_or_else(|| Error::internal("eval: the view has no entries"))?;
+        Ok(Seen {
+            color: frame.color.unwrap_or_default(),
+            scene: Rows { bank: meaning.bank, entries },
+            flat: self.flat(&given[0], &photos[target].camera, &cancel)?,
+            semantics: meaning.report,
+            stages,
+            warnings,
+        })
+    }
+
+    /// The masks of one photo, each with a row of its own, laid over a picture of the size of the
+    /// target.
+    fn flat(&self, photo: &PosedPhoto, target: &Camera, cancel: &AtomicBool) -> Result<Rows> {
+        let network = self.engine.masks()?;
+        let settings = masks::settings(network.manifest());
+        let found = masks::photo_masks(
+            &network,
+            std::slice::from_ref(photo),
+            None,
+            &settings,
+            &|_| (),
+            cancel,
+        )?;
+        let none = PhotoMasks::default();
+        let masks = found.first().unwrap_or(&none);
+        let cutter = Cutter::new(&photo.photo, masks);
+        let manifest = self.towers.manifest();
+        let margin = f64::from(manifest.image.crop_margin);
+        let cut = |k: usize| cutter.cut(k, margin).unwrap_or(Crop { side: 1, rgb: vec![0; 3] });
+        let mut rows = Vec::new();
+        let all: Vec<usize> = (0..masks.masks.len()).collect();
+        for batch in all.chunks(manifest.image.batch.max(1)) {
+            if cancel.load(Ordering::Relaxed) {
+                break;
+            }
+            let crops: Vec<Crop> = batch.iter().map(|k| cut(*k)).collect();
+            rows.extend(self.towers.embed_images(&crops)?);
+        }
+        let lens = target.intrinsics;
+        let mut entries = Entries { offsets: vec![0], ..Entries::default() };
+        for y in 0..lens.height {
+            for x in 0..lens.width {
+                let share = |at: u32, of: u32| (f64::from(at) + 0.5) / f64::from(of);
+                let index = masks.map.at(share(x, lens.width), share(y, lens.height));
+                if index > 0 {
+                    entries.index.push(index);
+                    entries.weight.push(1.0);
+                }
+                entries.offsets.push(u32::try_from(entries.index.len()).unwrap_or(u32::MAX));
+            }
+        }
+        Ok(Rows { bank: Bank { dim: manifest.dim, rows }, entries })
+    }
+}
+
+impl Seen {
+    /// What each text says of each pixel of the view of the scene.
+    pub(super) fn scene_maps(
+        &self,
+        road: &Road<'_>,
+        profile: ScoringProfile,
+        texts: &[Vec<f32>],
+    ) -> Result<Vec<TextMap>> {
+        self.scene.maps(&road.scoring(profile)?, texts)
+    }
+
+    /// What each text says of each pixel of the nearest photo, taken for the target.
+    pub(super) fn flat_maps(
+        &self,
+        road: &Road<'_>,
+        profile: ScoringProfile,
+        texts: &[Vec<f32>],
+    ) -> Result<Vec<TextMap>> {
+        self.flat.maps(&road.scoring(profile)?, texts)
+    }
+
+    pub(super) fn report(
+        &self,
+        photos: &[PosedPhoto],
+        target: usize,
+        inputs: &[usize],
+    ) -> TargetReport {
+        let weight: f64 = self.scene.entries.weight.iter().map(|w| f64::from(*w)).sum();
+        TargetReport {
+            target: photos[target].file.clone(),
+            inputs: inputs.iter().map(|&i| photos[i].file.clone()).collect(),
+            semantics: self.semantics.clone(),
+            stages: self.stages.clone(),
+            coverage: weight / self.scene.entries.pixels().max(1) as f64,
+            warnings: self.warnings,
+        }
+    }
+}
+
+impl Rows {
+    /// The product's masks, and scores by which texts can be compared at a pixel.
+    ///
+    /// At one pixel all texts share the feature's length, so the smallest `E . B(q - c)` over the
+    /// phrases orders them as their relevancies do.
+    fn maps(&self, scoring: &Arc<Scoring>, texts: &[Vec<f32>]) -> Result<Vec<TextMap>> {
+        let scorer = Scorer::new(&self.bank, Arc::clone(scoring))?;
+        let of = &self.entries;
+        let entries = PixelEntries { offsets: &of.offsets, index: &of.index, weight: &of.weight };
+        let map = |text: &Vec<f32>| -> Result<TextMap> {
+            let scores = scorer.text(text)?;
+            let tables = scores.tables();
+            let score = |p: usize| {
+                let mut sums = vec![[0.0_f64; 4]; tables.len()];
+                for (index, weight) in of.pixel(p) {
+                    for (sum, table) in sums.iter_mut().zip(&tables) {
+                        let row = table.get(usize::from(index)).copied().unwrap_or_default();
+                        sum.iter_mut()
+                            .zip(row)
+                            .for_each(|(sum, v)| *sum += f64::from(weight) * f64::from(v));
+                    }
+                }
+                let known = sums.first().is_some_and(|sum| sum[0] > 0.0);
+                let least = sums.iter().flat_map(|sum| &sum[1..]).copied();
+                if known { least.fold(f64::INFINITY, f64::min) } else { f64::NEG_INFINITY }
+            };
+            Ok(TextMap {
+                score: (0..of.pixels()).map(score).collect(),
+                mask: scorer.mask(&scores, entries)?,
+            })
+        };
+        texts.iter().map(map).collect()
+    }
+}
