@@ -27,6 +27,7 @@ def main():
     ap.add_argument("--space", required=True)
     ap.add_argument("--more", type=float, default=80)
     ap.add_argument("--lr", type=float, default=1.5e-3)
+    ap.add_argument("--init", help="text.pt of an earlier run")
     args = ap.parse_args()
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     torch.manual_seed(7)
@@ -42,8 +43,10 @@ def main():
     held[: named + 3] = False
     rows = torch.arange(count, device=device)[~held]
     weight = torch.ones(len(rows), device=device)
-    weight[: named + 3] = 8.0
+    weight[: named + 3] = 16.0
     net = TextTower().to(device)
+    if args.init:
+        net.load_state_dict({k: v.float() for k, v in torch.load(args.init, map_location=device).items()})
     ema = {k: v.clone() for k, v in net.state_dict().items()}
     opt = torch.optim.AdamW(net.parameters(), lr=args.lr, weight_decay=0.02, betas=(0.9, 0.98))
     begin, step, stage, canon = time.time(), 0, 0, None
@@ -76,7 +79,7 @@ def main():
             net.turn.copy_(space["turn"])
             canon = F.normalize(space["canon"], dim=-1)
             stage, began = 1, now
-            weight[:3] = 60.0
+            weight[:3] = 200.0
         if stage == 0 and now > args.seconds:
             time.sleep(0.5)
             continue
@@ -86,7 +89,7 @@ def main():
             share = min(now / args.seconds, 1.0)
             lr = args.lr * min(1, (step + 1) / 300) * (0.1 + 0.9 * (0.5 + 0.5 * math.cos(math.pi * share)))
         else:
-            lr = args.lr * 0.25 * (0.5 + 0.5 * math.cos(math.pi * (now - began) / args.more))
+            lr = args.lr * (0.6 if args.init else 0.25) * min(1, (step + 1) / 300) * (0.5 + 0.5 * math.cos(math.pi * (now - began) / args.more))
         for group in opt.param_groups:
             group["lr"] = lr
         pick = rows[torch.multinomial(weight, 2048, True)]
@@ -101,7 +104,7 @@ def main():
             want = torch.where((pick < 3)[:, None], canon[pick.clamp(max=2)], want)
         loss = (1 - (got * want).sum(1)).mean()
         sim = want @ want.T
-        loss = loss + 2 * ((got @ got.T - sim) ** 2).mean() + 0.05 * F.cross_entropy(got @ want.T * 30, torch.arange(len(pick), device=device))
+        loss = loss + 4 * ((got @ got.T - sim) ** 2).mean() + 0.05 * F.cross_entropy(got @ want.T * 30, torch.arange(len(pick), device=device))
         opt.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)

@@ -258,6 +258,10 @@ def main():
     ap.add_argument("--pack", required=True)
     ap.add_argument("--out", required=True)
     ap.add_argument("--seconds", type=float, required=True)
+    ap.add_argument("--init", help="words.pt of an earlier run; with it the space is that run's and stays")
+    ap.add_argument("--space", help="space.pt of that run")
+    ap.add_argument("--back", type=float, default=0.0, help="share of the way back from --init to EfficientNet-Lite2 where the run starts")
+    ap.add_argument("--look", help="uint8 crops [K,3,S,S] (torch.save) to show words of, never trained on")
     ap.add_argument("--lr", type=float, default=4e-4)
     ap.add_argument("--batch", type=int, nargs=3, default=[160, 64, 48])
     args = ap.parse_args()
@@ -285,6 +289,14 @@ def main():
         tower.out.weight.copy_((names.T @ (fc - fc.mean(0))) / 60)
         tower.out.bias.zero_()
     space = Space(words)
+    if args.init:
+        begun = {k[6:]: v.float() if v.is_floating_point() else v for k, v in torch.load(args.init, map_location="cpu").items()}
+        first = tower.state_dict()
+        tower.load_state_dict({k: v + args.back * (first[k] - v) if v.is_floating_point() else v for k, v in begun.items()})
+        space.load_state_dict(torch.load(args.space, map_location=device))
+        space.turn.requires_grad_(False)
+        space.canon.requires_grad_(False)
+    fc = teacher.requires_grad_(False)._fc
     both = nn.ModuleDict({"tower": tower, "space": space}).to(device)
 
     class All(nn.Module):
@@ -294,19 +306,31 @@ def main():
 
         def forward(self, x):
             with torch.autocast(KIND, dtype=torch.bfloat16):
-                f = self.both["tower"](x)
-            return f, self.both["space"](words.words), F.normalize(self.both["space"].canon, dim=-1), self.both["space"].scale.exp()
+                features = self.both["tower"].body.head(x)
+                f = self.both["tower"].embed(features)
+                # Features as EfficientNet-Lite2 would have of each of its thousand classes: pictures of
+                # most of them are not here, what it knows of them is in its last matrix.
+                n = torch.randint(0, 1000, (384,), device=x.device)
+                base = features.detach()[torch.randint(0, len(features), (384,), device=x.device)].float()
+                push = 6 + 8 * torch.rand(384, 1, device=x.device)
+                made = (0.6 * base + push * fc.weight[n] / fc.weight[n].square().sum(1, keepdim=True)).clamp(min=0)
+                g = self.both["tower"].embed(made)
+                said = fc(features).float()
+            return f, g, n, said, self.both["space"](words.words), F.normalize(self.both["space"].canon, dim=-1), self.both["space"].scale.exp()
 
     net = All().to(memory_format=torch.channels_last)
     ema = {k: v.detach().clone() for k, v in both.state_dict().items()}
     live = [v for v in both.state_dict().values() if v.is_floating_point()]
     kept = [ema[k] for k, v in both.state_dict().items() if v.is_floating_point()]
     heads = [p for n, p in both.named_parameters() if not n.startswith("tower.body")]
+    heads = [p for p in heads if p.requires_grad]
     opt = torch.optim.AdamW([{"params": list(tower.body.parameters()), "k": 0.5, "weight_decay": 0.03}, {"params": heads, "k": 2.0, "weight_decay": 0.0}], lr=args.lr, betas=(0.9, 0.99))
     model = torch.nn.parallel.DistributedDataParallel(net, device_ids=[device.index] if device.type == "cuda" else None, broadcast_buffers=False)
     os.makedirs(args.out, exist_ok=True)
     log = open(os.path.join(args.out, f"words{rank}.jsonl"), "w")
     centred = F.normalize(words.words - words.words.mean(0), dim=-1)
+    if rank == 0 and args.init:
+        print("from", args.init, "back", args.back, flush=True)
     if rank == 0:
         print("ready", round(time.time() - start, 1), "photos", len(pictures.photos), "segments", len(pictures.segments), flush=True)
     begin, step, sums, n, done, next_eval = time.time(), 0, torch.zeros(6, device=device), 0, False, 0.4
@@ -350,8 +374,18 @@ def main():
         print(tag, json.dumps(out), flush=True)
         log.write(json.dumps({"step": step, "held": out}) + "\n")
         log.flush()
+        if args.look:
+            crops = torch.load(args.look, map_location=device).float() / 255
+            with torch.autocast(KIND, dtype=torch.bfloat16):
+                f = tower(normalised(crops))
+            for i, row in enumerate(f.float()):
+                score = t[: words.data["named"]] @ row
+                print(i, f"canon {float((canon @ row).max()):.2f}", [(words.data["words"][j], round(float(score[j]), 2)) for j in score.topk(7).indices.tolist()], flush=True)
         both.load_state_dict(keep)
 
+    if rank == 0 and args.init:
+        evaluate("start")
+    begin = time.time()
     while not done:
         t = (time.time() - begin) / args.seconds
         stop = torch.tensor([float(t >= 1)], device=device)
@@ -363,7 +397,7 @@ def main():
         x, keep, cls = pictures.batch(*args.batch)
         with torch.no_grad(), torch.autocast(KIND, dtype=torch.bfloat16):
             opinion = teacher._fc(teacher.head(normalised(x).contiguous(memory_format=torch.channels_last))).float()
-        f, tw, canon, scale = model(normalised(x * keep).contiguous(memory_format=torch.channels_last))
+        f, g, made_of, said, tw, canon, scale = model(normalised(x * keep).contiguous(memory_format=torch.channels_last))
         named = cls != words.nothing
         cos = f @ tw.T
         # 1: which of the names.
@@ -380,18 +414,27 @@ def main():
         is_cut = torch.arange(len(cls), device=device) >= args.batch[0]
         truth[:, words.colours] = torch.where(is_cut[:, None], colour, -1).to(truth.dtype)
         pos, neg = (truth == 1).float(), (truth == 0).float()
-        p_loss = (F.softplus(-margin) * pos).sum(1) / pos.sum(1).clamp(min=1)
+        # Half of what is true is the name itself, half what it is a kind of.
+        itself = F.one_hot(words.own_words[want], pos.shape[1]) * named[:, None] * pos
+        rest = pos - itself
+        p_loss = F.softplus(-margin) * (itself + rest / rest.sum(1, keepdim=True).clamp(min=1))
+        p_loss = p_loss.sum(1) / 2
         # Thousands of words are false of a picture: those that come near count most.
         near = neg * (margin.detach().sigmoid() + 0.01)
         n_loss = (F.softplus(margin) * near).sum(1) / near.sum(1).clamp(min=1e-3)
-        bce = (p_loss + 2 * n_loss).mean()
+        bce = (2 * p_loss + 1.5 * n_loss).mean()
         # 3: the teacher's opinion of the whole picture.
         kd = F.kl_div((scale[0] * cos[:, words.thousand]).log_softmax(-1), (opinion / 1.5).softmax(-1), reduction="none").sum(-1)
         kd = (kd * torch.where(is_cut, 0.3, 1.0)).mean()
+        # The features stay what the teacher's last matrix can read, and its classes keep their names.
+        kd = kd + 0.5 * F.kl_div((said / 1.5).log_softmax(-1), (opinion / 1.5).softmax(-1), reduction="none").sum(-1).mean()
+        made_cos = g @ tw[words.thousand].T
+        made_margin = made_cos.gather(1, made_of[:, None])[:, 0] - (g @ canon.T).amax(1)
+        made_loss = F.cross_entropy(scale[0] * made_cos, made_of) + F.softplus(-made_margin * scale[1].clamp(max=40)).mean()
         # 4: what was near stays near.
         pick = torch.randint(0, len(tw), (768,), device=device)
         keep_near = ((tw[pick] @ tw[pick].T - centred[pick] @ centred[pick].T) ** 2).mean()
-        loss = ce + bce + 0.7 * kd + 8 * keep_near
+        loss = ce + bce + 0.7 * kd + 0.4 * made_loss + 8 * keep_near
         opt.zero_grad(set_to_none=True)
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(both.parameters(), 2.0)

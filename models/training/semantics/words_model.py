@@ -24,8 +24,11 @@ class ImageTower(nn.Module):
         self.drop = nn.Dropout(0.1)
         self.out = nn.Linear(1280, SPACE)
 
+    def embed(self, features):
+        return F.normalize(self.out(self.drop(features)).float(), dim=-1)
+
     def forward(self, x):
-        return F.normalize(self.out(self.drop(self.body.head(x))).float(), dim=-1)
+        return self.embed(self.body.head(x))
 
 
 class TextTower(nn.Module):
