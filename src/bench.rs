@@ -2,9 +2,10 @@
 //! with `--gaussians`.
 //!
 //! The scene is what two photos give: a Gaussian a pixel on a wavy surface with steps, seen by two
-//! cameras a fifth of the depth apart, drawn from between them.
+//! cameras a fifth of the depth apart, drawn from between them. Its Gaussians carry bank indices in
+//! patches, as things are: `--labels` times labels beside colour.
 
-use std::time::Instant;
+use std::{collections::BTreeMap, time::Instant};
 
 use glam::{DVec3, Quat, Vec3};
 use serde::Serialize;
@@ -37,6 +38,20 @@ pub struct BenchArgs {
     pub frames: usize,
     /// Whether to compare with the CPU renderer.
     pub compare_cpu: bool,
+    /// Labels to time beside colour.
+    pub labels: Option<BenchLabels>,
+    /// Rows of the bank (M): indices that occur in the scene.
+    pub bank: u16,
+}
+
+/// Labels that a bench times.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BenchLabels {
+    /// Four numbers of a table's row, blended.
+    Blend,
+    /// The sparse weights of every index.
+    Entries,
 }
 
 /// What was measured.
@@ -66,9 +81,33 @@ pub struct BenchReport {
     pub intersections: u64,
     /// Difference to the CPU renderer, where it was asked for.
     pub compared: Option<Compared>,
+    /// Times of labels, where they were asked for.
+    pub labels: Option<LabelTimes>,
 }
 
-/// How a picture differs from the CPU renderer's: colour, alpha, and depth relative to depth.
+/// What labels cost beside colour: medians of frames drawn in turn.
+#[derive(Clone, Debug, Serialize)]
+pub struct LabelTimes {
+    /// Labels timed.
+    pub labels: BenchLabels,
+    /// Rows of the bank.
+    pub bank: u16,
+    /// Colour alone.
+    pub color_ms: f64,
+    /// Labels alone.
+    pub labels_ms: f64,
+    /// Colour and labels in one pass.
+    pub both_ms: f64,
+    /// `labels_ms / color_ms`.
+    pub ratio: f64,
+    /// Entries of the view; 0 for a blend.
+    pub entries: usize,
+    /// Difference to the labels of the CPU renderer, where it was asked for.
+    pub compared: Option<Compared>,
+}
+
+/// How a picture differs from the CPU renderer's: colour, alpha, labels, and depth relative to
+/// depth.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Compared {
     /// Pixels compared.
@@ -122,6 +161,10 @@ pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
     } else {
         None
     };
+    let labels = match args.labels {
+        Some(labels) => Some(label_times(&*renderer, &gaussians, &request, args, labels, config)?),
+        None => None,
+    };
     Ok(BenchReport {
         renderer: renderer.name(),
         adapters,
@@ -135,6 +178,7 @@ pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
         visible: frame.stats.visible,
         intersections: frame.stats.intersections,
         compared,
+        labels,
     })
 }
 
@@ -159,20 +203,101 @@ fn times(
     Ok(times)
 }
 
+/// Draws colour, labels and both in turn, so that a noisy machine is as noisy to each.
+fn label_times(
+    renderer: &dyn Renderer,
+    gaussians: &Gaussians,
+    request: &RenderRequest,
+    args: &BenchArgs,
+    labels: BenchLabels,
+    config: &Config,
+) -> Result<LabelTimes> {
+    let mut random = Random(2);
+    let wanted = match labels {
+        BenchLabels::Entries => Labels::Entries,
+        BenchLabels::Blend => Labels::Blend(
+            (0..=args.bank)
+                .map(|m| [(); 4].map(|()| if m == 0 { 0.0 } else { random.range(-1.0, 1.0) }))
+                .collect(),
+        ),
+    };
+    let with = |kinds, labels| RenderRequest { kinds, labels, ..request.clone() };
+    let alone = with(Kinds::NONE, wanted.clone());
+    let requests = [with(Kinds::COLOR, Labels::None), alone.clone(), with(Kinds::COLOR, wanted)];
+    let mut runs = [const { Vec::new() }; 3];
+    // The first round warms up.
+    for round in 0..=args.frames {
+        for (request, times) in requests.iter().zip(&mut runs) {
+            let begun = Instant::now();
+            renderer.render(gaussians, request)?;
+            if round > 0 {
+                times.push(ms(begun));
+            }
+        }
+    }
+    let [color_ms, labels_ms, both_ms] = runs.map(|mut times| {
+        times.sort_by(f64::total_cmp);
+        times[times.len() / 2]
+    });
+    let frame = renderer.render(gaussians, &alone)?;
+    let compared = match args.compare_cpu {
+        true => {
+            let want = CpuRenderer::new(config.threads)?.render(gaussians, &alone)?;
+            Some(compare(&frame, &want, gaussians, &alone)?)
+        }
+        false => None,
+    };
+    Ok(LabelTimes {
+        labels,
+        bank: args.bank,
+        color_ms,
+        labels_ms,
+        both_ms,
+        ratio: labels_ms / color_ms,
+        entries: frame.entries.map_or(0, |entries| entries.index.len()),
+        compared,
+    })
+}
+
 /// Largest difference of each pixel over its channels; a NaN is infinitely far.
 fn differences(got: &Frame, want: &Frame) -> Vec<f32> {
-    let empty = Vec::new();
-    let colors = |frame: &Frame| frame.color.clone().unwrap_or_default();
-    let (got_color, want_color) = (colors(got), colors(want));
-    let depths = (got.depth.as_ref().unwrap_or(&empty), want.depth.as_ref().unwrap_or(&empty));
-    let alphas = (got.alpha.as_ref().unwrap_or(&empty), want.alpha.as_ref().unwrap_or(&empty));
-    (0..want_color.len())
+    fn pair<'a, T>(
+        got: Option<&'a Vec<T>>,
+        want: Option<&'a Vec<T>>,
+    ) -> Option<(&'a [T], &'a [T])> {
+        Some((got?.as_slice(), want?.as_slice()))
+    }
+    let colors = pair(got.color.as_ref(), want.color.as_ref());
+    let depths = pair(got.depth.as_ref(), want.depth.as_ref());
+    let alphas = pair(got.alpha.as_ref(), want.alpha.as_ref());
+    let blends = pair(got.blend.as_ref(), want.blend.as_ref());
+    let entries = got.entries.as_ref().zip(want.entries.as_ref());
+    let pixels = want.width as usize * want.height as usize;
+    (0..pixels)
         .map(|i| {
-            let [r, g, b] = [0, 1, 2].map(|k| got_color[i][k] - want_color[i][k]);
-            let depth = (depths.0[i] - depths.1[i]) / depths.1[i].abs().max(1.0);
-            [r, g, b, depth, alphas.0[i] - alphas.1[i]].into_iter().fold(0.0, |worst: f32, d| {
-                if d.is_nan() { f32::INFINITY } else { worst.max(d.abs()) }
-            })
+            let mut worst = 0.0_f32;
+            let mut add = |difference: f32| {
+                let d = if difference.is_nan() { f32::INFINITY } else { difference.abs() };
+                worst = worst.max(d);
+            };
+            if let Some((got, want)) = colors {
+                (0..3).for_each(|k| add(got[i][k] - want[i][k]));
+            }
+            if let Some((got, want)) = depths {
+                add((got[i] - want[i]) / want[i].abs().max(1.0));
+            }
+            if let Some((got, want)) = alphas {
+                add(got[i] - want[i]);
+            }
+            if let Some((got, want)) = blends {
+                (0..4).for_each(|k| add(got[i][k] - want[i][k]));
+            }
+            if let Some((got, want)) = entries {
+                let mut sums: BTreeMap<u16, f32> = got.pixel(i).collect();
+                want.pixel(i).for_each(|(m, weight)| *sums.entry(m).or_default() -= weight);
+                sums.into_values().for_each(&mut add);
+            }
+            worst
         })
         .collect()
 }
@@ -227,6 +352,7 @@ pub fn scene(args: &BenchArgs) -> Result<(Gaussians, Camera)> {
     let mut random = Random(1);
     let side = (args.gaussians / 2).isqrt() as u32;
     let photo = lens(side);
+    let patches = f64::from(args.bank).sqrt().ceil();
     let mut raw = RawGaussians::default();
     for shift in [-0.4, 0.4] {
         for i in 0..side * side {
@@ -245,7 +371,10 @@ pub fn scene(args: &BenchArgs) -> Result<(Gaussians, Camera)> {
                 [s * 9.0, t * 7.0, (s + t) * 5.0]
                     .map(|phase| 1.2 * phase.sin() as f32 + random.range(-0.2, 0.2)),
             );
-            raw.semantic_index.push(0);
+            // The same patches in both photos: (s, t) is the place on the surface.
+            let patch = |share: f64| (share.clamp(0.0, 0.999) * patches).floor();
+            let label = (patch(s) + patches * patch(t)) as usize % usize::from(args.bank.max(1));
+            raw.semantic_index.push(if args.bank == 0 { 0 } else { 1 + label as u16 });
             raw.source.push(SourcePixel::default());
         }
     }
@@ -266,12 +395,23 @@ mod tests {
 
     #[test]
     fn a_wrong_pixel_is_a_fault_and_nan_is_far() {
-        let args = BenchArgs { gaussians: 800, size: 24, frames: 1, compare_cpu: true };
+        let args = BenchArgs {
+            gaussians: 800,
+            size: 24,
+            frames: 1,
+            compare_cpu: true,
+            labels: Some(BenchLabels::Entries),
+            bank: 24,
+        };
         let config = Config { renderer: RendererChoice::Cpu, threads: 1, ..Config::default() };
         let report = run(&args, &config).expect("a bench of the CPU against itself");
         let compared = report.compared.expect("a comparison");
         assert_eq!((compared.max, compared.flips, compared.faults), (0.0, 0, 0), "itself");
         assert!(report.visible > 0, "the scene is seen");
+        let labels = report.labels.expect("labels were timed");
+        let compared = labels.compared.expect("labels were compared");
+        assert_eq!((compared.max, compared.flips, compared.faults), (0.0, 0, 0), "itself");
+        assert!(labels.entries > 24, "{} entries", labels.entries);
 
         let (gaussians, camera) = scene(&args).expect("a scene");
         let request = RenderRequest {
@@ -290,6 +430,20 @@ mod tests {
             got.color.as_mut().expect("colour")[100][1] += wrong;
             let found = compare(&got, &want, &gaussians, &request).expect("a comparison");
             assert_eq!(found.flips + found.faults, 1, "{wrong}: {found:?}");
+        }
+        for labels in [Labels::Entries, Labels::Blend([[1.0; 4]; 25].into())] {
+            let request = RenderRequest { labels, kinds: Kinds::NONE, ..request.clone() };
+            let want = CpuRenderer::new(1).and_then(|cpu| cpu.render(&gaussians, &request));
+            let want = want.expect("labels");
+            let mut got = want.clone();
+            if let Some(blend) = &mut got.blend {
+                blend[7][3] += 0.5;
+            }
+            if let Some(entries) = &mut got.entries {
+                entries.index[0] += 1;
+            }
+            let found = compare(&got, &want, &gaussians, &request).expect("a comparison");
+            assert_eq!(found.flips + found.faults, 1, "a wrong label: {found:?}");
         }
     }
 }

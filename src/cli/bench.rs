@@ -12,7 +12,7 @@ use serde_json::json;
 
 use super::{engine, output::Output};
 use crate::{
-    bench::{self, BenchArgs},
+    bench::{self, BenchArgs, BenchLabels, LabelTimes},
     config::{Config, ConfigArgs},
     error::{Error, Result},
     jobs::{PipelineMaker, SceneMaker, Work},
@@ -46,6 +46,12 @@ pub(super) struct Args {
     /// With --gaussians: compares the picture with that of the CPU renderer
     #[arg(long)]
     compare: Option<Reference>,
+    /// With --gaussians: times these labels beside colour
+    #[arg(long)]
+    labels: Option<LabelArg>,
+    /// With --labels: entries of the semantic bank that the scene has
+    #[arg(long, default_value_t = 24)]
+    bank: u16,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
 }
@@ -54,6 +60,15 @@ pub(super) struct Args {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Reference {
     Cpu,
+}
+
+/// Labels to time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum LabelArg {
+    /// Four numbers a pixel: what a text's mask takes
+    Blend,
+    /// The sparse weights of all entries
+    Entries,
 }
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
@@ -67,7 +82,12 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
 fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Result<()> {
     let (size, frames) = (args.size, args.frames);
     let compare_cpu = args.compare.is_some();
-    let report = bench::run(&BenchArgs { gaussians, size, frames, compare_cpu }, config)?;
+    let labels = args.labels.map(|labels| match labels {
+        LabelArg::Blend => BenchLabels::Blend,
+        LabelArg::Entries => BenchLabels::Entries,
+    });
+    let wanted = BenchArgs { gaussians, size, frames, compare_cpu, labels, bank: args.bank };
+    let report = bench::run(&wanted, config)?;
     let mut text = String::new();
     for adapter in &report.adapters {
         let mark = if adapter.chosen { "*" } else { " " };
@@ -94,6 +114,23 @@ fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Resul
              a cliff, {} faults",
             found.cpu_median_ms, found.max, found.mean, found.flips, found.pixels, found.faults
         );
+    }
+    if let Some(times) = &report.labels {
+        let LabelTimes { labels, bank, color_ms, labels_ms, both_ms, ratio, entries, compared } =
+            times;
+        let _ = writeln!(
+            text,
+            "{labels:?} of a bank of {bank}: colour alone {color_ms:.3} ms, labels alone \
+             {labels_ms:.3} ms ({ratio:.2}x), both {both_ms:.3} ms, {entries} entries"
+        );
+        if let Some(found) = compared {
+            let _ = writeln!(
+                text,
+                "  against the CPU renderer: max {:.2e}, mean {:.2e}, {} of {} px flipped at a \
+                 cliff, {} faults",
+                found.max, found.mean, found.flips, found.pixels, found.faults
+            );
+        }
     }
     out.answer(&text, &report)
 }
