@@ -9,6 +9,12 @@ pub const IDEMPOTENCY_KEY_BYTES_MAX: usize = 256;
 /// bounds what the products of all pairs of rows take.
 pub const BANK_ROWS_MAX: usize = 4_096;
 
+/// Bytes of layers kept for views to come: three camera sets of a scene of sixteen photos.
+pub const LAYER_BYTES_MAX: u64 = 512 << 20;
+
+/// Bytes of magnified Gaussians kept for views to come: thirty views of a scene of two photos.
+pub const MAGNIFIED_BYTES_MAX: u64 = 256 << 20;
+
 /// Caps on what a caller may send or ask for.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]

@@ -23,7 +23,7 @@ pub fn render_scene(
     let layers = scene.layers(&request.camera);
     let draw = |gaussians, request: &RenderRequest| {
         let magnified = scene.magnified(gaussians, &request.camera);
-        renderer.render(magnified.as_ref().unwrap_or(gaussians), request)
+        renderer.render(magnified.as_deref().unwrap_or(gaussians), request)
     };
     let backdrop = backdrop && request.kinds.color;
     if layers.is_none() && !backdrop {
@@ -31,7 +31,7 @@ pub fn render_scene(
     }
     let mut bare = RenderRequest { background: [0.0; 3], ..request.clone() };
     bare.kinds.alpha = true;
-    let mut frame = match &layers {
+    let mut frame = match layers.as_deref() {
         None => draw(&scene.gaussians, &bare)?,
         Some([front, behind]) => {
             let mut frame = draw(front, &bare)?;

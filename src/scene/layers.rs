@@ -4,17 +4,26 @@
 //! time at a slightly other depth, and the nearest of these wins. So a view is made from the few
 //! photos taken closest to it, and the rest is drawn behind, where those saw nothing.
 
-use crate::scene::{Camera, Gaussians, Scene};
+use std::sync::Arc;
+
+use crate::{
+    limits::LAYER_BYTES_MAX,
+    scene::{Camera, Gaussians, Scene, copies::Copies},
+};
 
 /// Photos that make a view together: as many as the network is trained to compose.
 const FRONT_PHOTOS: usize = 4;
 /// What a turn of one radian costs against a step of one median depth.
 const TURN_COST: f64 = 0.5;
 
+/// Front and behind, by the photos in front.
+static LAYERS: Copies<Arc<[Gaussians; 2]>> = Copies::new(LAYER_BYTES_MAX);
+
 impl Scene {
     /// The Gaussians in front and behind for a camera, or `None` where few photos made the scene.
+    /// Cameras with the same photos in front get the same copies, while those are kept.
     #[must_use]
-    pub fn layers(&self, camera: &Camera) -> Option<[Gaussians; 2]> {
+    pub fn layers(&self, camera: &Camera) -> Option<Arc<[Gaussians; 2]>> {
         let focals = &self.meta.report.network_focal_px;
         let depth = self.meta.report.median_depth;
         let used = focals.iter().filter(|focal| **focal > 0.0).count();
@@ -43,6 +52,11 @@ impl Scene {
             let view = usize::from(self.gaussians.source()[i].view);
             front.get(view).copied().unwrap_or(false)
         };
-        Some([self.gaussians.only(in_front), self.gaussians.only(|i| !in_front(i))])
+        let key = (self.gaussians.identity(), front.iter().map(|&f| u64::from(f)).collect());
+        Some(LAYERS.get(key, || {
+            let layers = [self.gaussians.only(in_front), self.gaussians.only(|i| !in_front(i))];
+            let size = layers.iter().map(Gaussians::size_bytes).sum();
+            (Arc::new(layers), size)
+        }))
     }
 }

@@ -7,10 +7,15 @@
 //! source pixel in the world, a variance of `0.3 w² (1 - 1/p²)`, so that the sum of both is what
 //! the network learnt. Views at the network's own size are untouched, bit for bit.
 
+use std::sync::Arc;
+
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::scene::{Camera, Gaussians, Scene};
+use crate::{
+    limits::MAGNIFIED_BYTES_MAX,
+    scene::{Camera, Gaussians, Scene, copies::Copies},
+};
 
 /// The renderer's blur, px² (`render::constants::BLUR_PX2`; a test holds them equal).
 pub const LEARNT_BLUR_PX2: f32 = 0.3;
@@ -18,6 +23,9 @@ pub const LEARNT_BLUR_PX2: f32 = 0.3;
 const OWN_SIZE: f64 = 1.25;
 /// Share of magnified Gaussians under which a view is left alone.
 const SHARE_MIN: f64 = 1e-3;
+
+/// Answers by Gaussians, photos and camera.
+static MAGNIFIED: Copies<Option<Arc<Gaussians>>> = Copies::new(MAGNIFIED_BYTES_MAX);
 
 /// Where a photo's Gaussians came from: camera centre and axis, and 1 / focal length in pixels of
 /// the network's picture; 0 where nothing is known.
@@ -27,11 +35,19 @@ struct Source {
     pixel: f64,
 }
 
+/// Where a view looks from, relative to the origin, and its larger focal length in pixels.
+#[derive(Clone, Copy)]
+struct Eye {
+    center: DVec3,
+    axis: DVec3,
+    focal: f64,
+}
+
 impl Scene {
     /// Gaussians of this scene for a view that magnifies them, or `None` where they are right as
-    /// they are.
+    /// they are. The same camera gets the same copy, while it is kept.
     #[must_use]
-    pub fn magnified(&self, gaussians: &Gaussians, camera: &Camera) -> Option<Gaussians> {
+    pub fn magnified(&self, gaussians: &Gaussians, camera: &Camera) -> Option<Arc<Gaussians>> {
         let focals = &self.meta.report.network_focal_px;
         let sources: Vec<Source> = self
             .meta
@@ -47,38 +63,54 @@ impl Scene {
         if sources.is_empty() {
             return None;
         }
-        let center = camera.camera_to_world.center() - gaussians.origin();
-        let axis = camera.camera_to_world.axis();
-        let focal = camera.intrinsics.fx.max(camera.intrinsics.fy);
-        // Variance to add, for each Gaussian.
-        let added: Vec<f32> = gaussians
-            .means()
-            .par_iter()
-            .zip(gaussians.source())
-            .map(|(mean, source)| {
-                let Some(source) = sources.get(usize::from(source.view)) else { return 0.0 };
-                let mean = DVec3::from_array(mean.map(f64::from));
-                let width = (mean - source.center).dot(source.axis).max(0.0) * source.pixel;
-                let depth = (mean - center).dot(axis);
-                let p = width * focal / depth / OWN_SIZE;
-                if depth <= 0.0 || p <= 1.0 || !p.is_finite() {
-                    return 0.0;
-                }
-                #[expect(clippy::cast_possible_truncation, reason = "scales are f32")]
-                let variance = (width * width * (1.0 - 1.0 / (p * p))) as f32;
-                LEARNT_BLUR_PX2 * variance
-            })
-            .collect();
-        let magnified = added.iter().filter(|v| **v > 0.0).count();
-        if (magnified as f64) < SHARE_MIN * added.len() as f64 || magnified == 0 {
-            return None;
-        }
-        let scales = gaussians
-            .scales()
-            .par_iter()
-            .zip(&added)
-            .map(|(scales, added)| scales.map(|s| (s * s + added).sqrt()))
-            .collect();
-        Some(gaussians.with_scales(scales))
+        let eye = Eye {
+            center: camera.camera_to_world.center() - gaussians.origin(),
+            axis: camera.camera_to_world.axis(),
+            focal: camera.intrinsics.fx.max(camera.intrinsics.fy),
+        };
+        let place = |center: DVec3, axis: DVec3, last: f64| {
+            [center.to_array(), axis.to_array()].into_iter().flatten().chain([last])
+        };
+        let photos = sources.iter().flat_map(|s| place(s.center, s.axis, s.pixel));
+        let bits = place(eye.center, eye.axis, eye.focal).chain(photos).map(f64::to_bits);
+        MAGNIFIED.get((gaussians.identity(), bits.collect()), || {
+            let copy = magnify(gaussians, &sources, eye).map(Arc::new);
+            let size = copy.as_ref().map_or(0, |copy| copy.size_bytes());
+            (copy, size)
+        })
     }
+}
+
+/// The Gaussians with what the blur lost given back, or `None` where next to none lost any.
+fn magnify(gaussians: &Gaussians, sources: &[Source], eye: Eye) -> Option<Gaussians> {
+    // Variance to add, for each Gaussian.
+    let added: Vec<f32> = gaussians
+        .means()
+        .par_iter()
+        .zip(gaussians.source())
+        .map(|(mean, source)| {
+            let Some(source) = sources.get(usize::from(source.view)) else { return 0.0 };
+            let mean = DVec3::from_array(mean.map(f64::from));
+            let width = (mean - source.center).dot(source.axis).max(0.0) * source.pixel;
+            let depth = (mean - eye.center).dot(eye.axis);
+            let p = width * eye.focal / depth / OWN_SIZE;
+            if depth <= 0.0 || p <= 1.0 || !p.is_finite() {
+                return 0.0;
+            }
+            #[expect(clippy::cast_possible_truncation, reason = "scales are f32")]
+            let variance = (width * width * (1.0 - 1.0 / (p * p))) as f32;
+            LEARNT_BLUR_PX2 * variance
+        })
+        .collect();
+    let magnified = added.iter().filter(|v| **v > 0.0).count();
+    if (magnified as f64) < SHARE_MIN * added.len() as f64 || magnified == 0 {
+        return None;
+    }
+    let scales = gaussians
+        .scales()
+        .par_iter()
+        .zip(&added)
+        .map(|(scales, added)| scales.map(|s| (s * s + added).sqrt()))
+        .collect();
+    Some(gaussians.with_scales(scales))
 }

@@ -4,6 +4,7 @@
 mod backdrop;
 mod camera;
 mod capture;
+mod copies;
 mod gaussians;
 mod geometry;
 mod id;

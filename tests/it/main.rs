@@ -13,6 +13,7 @@ mod capture;
 mod cli;
 mod colours;
 mod common;
+mod compose;
 mod errors;
 mod fuzz;
 mod geometry;
