@@ -14,7 +14,7 @@
 //! | L1 verbs | [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`render`], [`store`], [`sample`] | L0; never each other |
 //! | L2 | [`pipeline`] | L1: the only place that knows the order of the stages |
 //! | L3 | [`jobs`] | `pipeline`, `store` |
-//! | L4 | [`service`] | `jobs`, `store`, `render`, `models` |
+//! | L4 | [`service`] | `jobs`, `store`, `render`, `semantics`, `models` |
 //! | L5 | [`api`] | `service`; the only place that knows HTTP and gRPC |
 //! | L6 | `main`, [`cli`], [`eval`], [`bench`](mod@bench) | everything |
 //!

@@ -55,6 +55,8 @@ pub struct Limits {
     pub text_wait_ms: u64,
     /// Embeddings of texts kept in memory, those asked last: a few kilobytes each.
     pub texts_cached_max: usize,
+    /// Bytes of banks kept in memory ready to be scored.
+    pub scorers_cache_bytes_max: u64,
     /// Bytes of views' semantic entries kept in memory, so that the next text draws nothing.
     pub entries_cache_bytes_max: u64,
     /// Parts of one text's selection that an answer lists, the largest first.
@@ -97,6 +99,7 @@ impl Default for Limits {
             text_chars_max: 256,
             text_wait_ms: 120_000,
             texts_cached_max: 4_096,
+            scorers_cache_bytes_max: 512 << 20,
             entries_cache_bytes_max: 512 << 20,
             parts_max: 64,
             queued_jobs_max: 64,

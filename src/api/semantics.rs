@@ -2,7 +2,8 @@
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    service::{ModelsInfo, SemanticsMode},
+    scene::ScoringProfile,
+    service::{Boxes, Kind, MaskFormat, ModelsInfo, SemanticsMode},
 };
 
 /// When the semantics are made, from `lazy`, `eager` or `off`.
@@ -11,10 +12,7 @@ pub(super) fn mode(text: &str) -> Result<SemanticsMode> {
         "lazy" => Ok(SemanticsMode::Lazy),
         "eager" => Ok(SemanticsMode::Eager),
         "off" => Ok(SemanticsMode::Off),
-        other => {
-            let shown: String = other.chars().take(40).collect();
-            Err(Error::invalid(format!("semantics is {shown:?}; it must be lazy, eager or off")))
-        }
+        other => wrong("semantics", other, "lazy, eager or off"),
     }
 }
 
@@ -30,13 +28,47 @@ pub(super) fn check_bundle(asked: &str, models: &ModelsInfo) -> Result<()> {
     ))
 }
 
-/// The error of a picture kind that needs the semantic bank.
-pub(super) fn kind_unavailable(kind: &str, models: &ModelsInfo) -> Error {
-    Error::new(
-        ErrorCode::ModelUnavailable,
-        format!(
-            "kind={kind}: bundle {:?} has no semantic networks; ask for color, depth or alpha",
-            models.bundle
-        ),
-    )
+/// The picture kind named `name`.
+pub(super) fn kind(name: &str) -> Result<Kind> {
+    let known = Kind::ALL.into_iter().find(|kind| kind.name() == name);
+    known.ok_or_else(|| {
+        let shown: String = name.chars().take(40).collect();
+        Error::invalid(format!(
+            "kind is {shown:?}; it must be color, depth, alpha, semantics, relevancy or mask"
+        ))
+    })
+}
+
+/// How texts are scored, from `default` (also where nothing is said) or `paper`.
+pub(super) fn profile(text: Option<&str>) -> Result<ScoringProfile> {
+    match text {
+        None | Some("default") => Ok(ScoringProfile::Default),
+        Some("paper") => Ok(ScoringProfile::Paper),
+        Some(other) => wrong("profile", other, "default or paper"),
+    }
+}
+
+/// Which boxes hold the parts, from `oriented`, `aligned` or `none`.
+pub(super) fn boxes(text: &str) -> Result<Boxes> {
+    match text {
+        "oriented" => Ok(Boxes::Oriented),
+        "aligned" => Ok(Boxes::Aligned),
+        "none" => Ok(Boxes::None),
+        other => wrong("boxes", other, "oriented, aligned or none"),
+    }
+}
+
+/// How masks are given, from `rle`, `png` or `none`.
+pub(super) fn mask(text: &str) -> Result<MaskFormat> {
+    match text {
+        "rle" => Ok(MaskFormat::Rle),
+        "png" => Ok(MaskFormat::Png),
+        "none" => Ok(MaskFormat::None),
+        other => wrong("mask", other, "rle, png or none"),
+    }
+}
+
+fn wrong<T>(name: &str, value: &str, must: &str) -> Result<T> {
+    let shown: String = value.chars().take(40).collect();
+    Err(Error::invalid(format!("{name} is {shown:?}; it must be {must}")))
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::{
     config::Config,
     error::Result,
-    jobs::{PipelineMaker, PipelineSemantics},
+    jobs::{NoSemantics, PipelineMaker, PipelineSemantics, SemanticsMaker},
     models::Bundle,
     pipeline::Engine,
     render::{Renderer, select::select},
@@ -23,6 +23,18 @@ pub fn parts(config: &Config) -> Result<Parts> {
     let maker = Arc::new(PipelineMaker::new(Arc::clone(&engine), config.limits.clone()));
     let semantics = Arc::new(PipelineSemantics::new(engine, config.limits.clone()));
     Ok(Parts { maker, semantics, renderer, models })
+}
+
+/// What answers texts; opens library and bundle only where it is `needed`.
+///
+/// # Errors
+/// `model_unavailable`.
+pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticsMaker>> {
+    if !needed {
+        return Ok(Arc::new(NoSemantics));
+    }
+    let engine = Arc::new(Engine::open(config)?);
+    Ok(Arc::new(PipelineSemantics::new(engine, config.limits.clone())))
 }
 
 /// The renderer that the configuration asks for.

@@ -4,11 +4,13 @@
 //! errors go to standard error. The exit code of an error is its row of the error table.
 
 mod bench;
+mod camera;
 pub mod engine;
 mod inspect;
 mod measure;
 mod models;
 mod output;
+mod query;
 mod reconstruct;
 mod render;
 mod scene_file;
@@ -46,6 +48,8 @@ enum Command {
     Reconstruct(reconstruct::Args),
     /// Render a view of a scene
     Render(Box<render::Args>),
+    /// Ask a scene by text: where is it, in space and in a view
+    Query(Box<query::Args>),
     /// Say what is in a scene file
     Inspect(inspect::Args),
     /// The model bundle and ONNX Runtime
@@ -64,6 +68,7 @@ impl Command {
             Self::Serve(args) => args.config.clone(),
             Self::Reconstruct(args) => args.config.clone(),
             Self::Render(args) => args.config.clone(),
+            Self::Query(args) => args.config.clone(),
             Self::Models(args) => args.config.clone(),
             Self::Eval(args) => args.config().clone(),
             Self::Bench(args) => args.config.clone(),
@@ -109,6 +114,7 @@ fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
         Command::Serve(args) => serve::run(args, config, out),
         Command::Reconstruct(args) => reconstruct::run(args, &config, out),
         Command::Render(args) => render::run(args, &config, out),
+        Command::Query(args) => query::run(args, &config, out),
         Command::Inspect(args) => inspect::run(args, &config, out),
         Command::Models(args) => models::run(args, &config, out),
         Command::Eval(args) => measure::eval(args, &config, out),

@@ -13,16 +13,16 @@ use sha2::{Digest, Sha256};
 
 use super::{
     output::Output,
-    scene_file::{is_ply, path_of},
+    scene_file::{is_ply, path_of, semantics_path},
 };
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
-    jobs::{PipelineMaker, SceneMaker, Work},
+    jobs::{PipelineMaker, PipelineSemantics, SceneMaker, SemanticsMaker, SemanticsWork, Work},
     photos,
     pipeline::Engine,
-    scene::{Provenance, Scene, SceneId, SceneMeta, SceneOptions, Upload},
-    store::{self, ply::PlyWriter, write_scene_file},
+    scene::{Provenance, Scene, SceneId, SceneMeta, SceneOptions, SemanticsMode, Upload},
+    store::{self, ply::PlyWriter, write_scene_file, write_semantics_file},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -35,6 +35,9 @@ pub(super) struct Args {
     /// Views the network takes at once [default: what the bundle says]
     #[arg(long)]
     max_views: Option<usize>,
+    /// Make what texts are asked of too, in a file beside the scene's: `eager`; `off` makes none
+    #[arg(long, value_parser = semantics, default_value = "off")]
+    semantics: SemanticsMode,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
 }
@@ -42,13 +45,26 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let upload = upload_of(&args.photos, config)?;
     let engine = Arc::new(Engine::open(config)?);
-    let options = SceneOptions { max_views: args.max_views, ..SceneOptions::default() };
+    let options = SceneOptions { max_views: args.max_views, semantics: args.semantics };
+    let eager = args.semantics == SemanticsMode::Eager;
+    if eager && is_ply(&args.output) {
+        return Err(Error::invalid(
+            "--semantics eager: a PLY has no place for them; write a scene",
+        ));
+    }
     let begun = Instant::now();
+    let thinker = PipelineSemantics::new(Arc::clone(&engine), config.limits.clone());
+    if let (true, Some(lack)) = (eager, thinker.lacks()) {
+        let message = format!("--semantics eager: the bundle has {lack}");
+        return Err(Error::new(ErrorCode::ModelUnavailable, message));
+    }
+    let progress = |stage: &str, fraction: f32| out.progress(stage, fraction);
+    let cancel = AtomicBool::new(false);
     let made = PipelineMaker::new(engine, config.limits.clone()).make(Work {
         upload: &upload,
         options: &options,
-        progress: &|stage, fraction| out.progress(stage, fraction),
-        cancel: &AtomicBool::new(false),
+        progress: &progress,
+        cancel: &cancel,
     })?;
     let files = store::hashes(&upload);
     let mut hash = Sha256::new();
@@ -67,9 +83,18 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
             program_version: env!("CARGO_PKG_VERSION").to_owned(),
         },
     };
-    let scene = Scene::new(meta, made.gaussians, made.backdrop);
+    let mut scene = Scene::new(meta, made.gaussians, made.backdrop);
     let path = path_of(&args.output);
     write(&path, &scene)?;
+    if eager {
+        let (upload, progress) = (&upload, &progress);
+        let work = SemanticsWork { upload, scene: &scene, progress, cancel: &cancel };
+        let semantics = Arc::new(thinker.make(work)?);
+        write_semantics_file(&semantics_path(&path), &scene.meta.id, &semantics)?;
+        scene = scene.with_semantics(semantics)?;
+    } else if !is_ply(&path) {
+        forget(&semantics_path(&path))?;
+    }
     let total_ms = begun.elapsed().as_secs_f64() * 1e3;
     out.progress("done", 1.0);
     tell(&path, &scene, total_ms, out)
@@ -89,6 +114,25 @@ fn upload_of(path: &Path, config: &Config) -> Result<Upload> {
     }
     let archive = fs_err::read(path).map_err(unreadable)?;
     Ok(Upload { archive: Some(archive), ..Upload::default() })
+}
+
+/// Removes the semantics of a scene that was written over.
+fn forget(path: &Path) -> Result<()> {
+    match fs_err::remove_file(path) {
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
+            let what = format!("{}: cannot be removed: {}", path.display(), e.kind());
+            Err(Error::new(ErrorCode::StoreUnavailable, what).caused_by(e))
+        }
+        _ => Ok(()),
+    }
+}
+
+fn semantics(name: &str) -> Result<SemanticsMode, String> {
+    match name {
+        "eager" => Ok(SemanticsMode::Eager),
+        "off" => Ok(SemanticsMode::Off),
+        _ => Err("eager or off".to_owned()),
+    }
 }
 
 fn write(path: &Path, scene: &Scene) -> Result<()> {
@@ -119,6 +163,17 @@ fn tell(path: &Path, scene: &Scene, total_ms: f64, out: &Output) -> Result<()> {
     for stage in &report.stages {
         let _ = writeln!(text, "  {:<10}{:>9.1} ms", stage.stage, stage.ms);
     }
+    let semantics = scene.semantics.as_ref().map(|semantics| &semantics.report);
+    if let Some(semantics) = semantics {
+        for stage in &semantics.stages {
+            let _ = writeln!(text, "  {:<10}{:>9.1} ms", stage.stage, stage.ms);
+        }
+        let _ = writeln!(
+            text,
+            "  semantics: {} entries, {} Gaussians have one",
+            semantics.bank_size, semantics.labelled
+        );
+    }
     for warning in &report.warnings {
         let _ = writeln!(text, "  warning: {}", warning.message);
     }
@@ -127,6 +182,7 @@ fn tell(path: &Path, scene: &Scene, total_ms: f64, out: &Output) -> Result<()> {
         "id": scene.meta.id,
         "total_ms": total_ms,
         "report": report,
+        "semantics": semantics,
         "cameras": scene.meta.cameras,
     });
     out.answer(&text, &value)

@@ -1,23 +1,24 @@
 //! `segsplat render`: one view of a scene file or PLY as a picture.
 
-use std::path::{Path, PathBuf};
+use std::{
+    path::{Path, PathBuf},
+    sync::Arc,
+};
 
-use clap::ValueEnum;
 use serde_json::json;
 
-use super::{engine, output::Output, scene_file};
+use super::{
+    camera::{CameraArgs, no_camera, numbers},
+    engine,
+    output::Output,
+    scene_file,
+};
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
-    service::{CameraSpec, Format, Kind, LensSpec, PoseSpec, ViewOptions, ViewSpec, render_scene},
+    scene::ScoringProfile,
+    service::{Ask, Format, Kind, Local, ViewOptions, ViewSpec},
 };
-
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum KindArg {
-    Color,
-    Depth,
-    Alpha,
-}
 
 #[derive(Clone, Debug, clap::Args)]
 #[command(allow_negative_numbers = true)]
@@ -27,63 +28,20 @@ pub(super) struct Args {
     /// Picture to write; its ending (png, jpg, webp, npy) is the format
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Stand where this input camera stood (its index)
-    #[arg(long, value_name = "INDEX", group = "pose")]
-    camera: Option<usize>,
-    /// Stand between this input camera ...
-    #[arg(long, value_name = "INDEX", group = "pose")]
-    from: Option<usize>,
-    /// ... and this one
-    #[arg(long, value_name = "INDEX", requires = "from")]
-    to: Option<usize>,
-    /// 0 at `from`, 1 at `to`
-    #[arg(long, default_value_t = 0.5)]
-    t: f64,
-    /// Stand here: x,y,z in the world of the photos
-    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', group = "pose", requires = "target")]
-    eye: Option<Vec<f64>>,
-    /// Look at this point
-    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', requires = "eye")]
-    target: Option<Vec<f64>>,
-    /// Up in the picture [default: as in the photos]
-    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', requires = "eye")]
-    up: Option<Vec<f64>>,
-    /// 16 numbers, row-major, OpenCV camera-to-world
-    #[arg(long, value_name = "M00,...,M33", value_delimiter = ',', group = "pose")]
-    camera_to_world: Option<Vec<f64>>,
-    /// Vertical field of view in degrees [default: the photos' lens]
-    #[arg(long, conflicts_with = "fx")]
-    fov: Option<f64>,
-    /// Focal length along x in pixels of the picture
+    #[command(flatten)]
+    camera: CameraArgs,
+    /// What to draw: color, depth, alpha, semantics, relevancy or mask
+    #[arg(long, default_value = "color", value_parser = kind)]
+    kind: Kind,
+    /// What to look for, for relevancy and mask
     #[arg(long)]
-    fx: Option<f64>,
-    /// Focal length along y [default: fx]
-    #[arg(long, requires = "fx")]
-    fy: Option<f64>,
-    /// Principal point x [default: the middle]
-    #[arg(long, requires = "fx")]
-    cx: Option<f64>,
-    /// Principal point y [default: the middle]
-    #[arg(long, requires = "fx")]
-    cy: Option<f64>,
-    /// Width in pixels [default: the photos' shape, longer side at most 384]
+    text: Option<String>,
+    /// Score the text as the paper does
     #[arg(long)]
-    width: Option<u32>,
-    /// Height in pixels [default: the photos' shape]
-    #[arg(long)]
-    height: Option<u32>,
-    /// What to draw
-    #[arg(long, value_enum, default_value = "color")]
-    kind: KindArg,
+    paper: bool,
     /// Background colour, each 0 to 1 [default: the scene's backdrop]
     #[arg(long, value_name = "R,G,B", value_delimiter = ',')]
     background: Option<Vec<f32>>,
-    /// Antialiased: opacity compensated for the blur of small Gaussians
-    #[arg(long)]
-    antialiased: bool,
-    /// Near plane in world units [default: 0.01 of the scene's median depth]
-    #[arg(long)]
-    near: Option<f32>,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
 }
@@ -92,7 +50,9 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let spec = spec(args)?;
     let opened = scene_file::open(&args.scene, &config.limits)?;
     let renderer = engine::renderer(config)?;
-    let view = render_scene(&*renderer, &opened.scene, &spec, &config.limits)?;
+    let semantics = engine::semantics(config, spec.kind.needs_semantics())?;
+    let local = Local::new(semantics, Arc::clone(&renderer), config.limits.clone());
+    let view = local.render(&opened.scene, &spec)?;
     fs_err::write(&args.output, &view.bytes).map_err(|e| {
         let what = format!("{}: cannot be written: {}", args.output.display(), e.kind());
         Error::new(ErrorCode::StoreUnavailable, what).caused_by(e)
@@ -123,54 +83,26 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
 }
 
 fn spec(args: &Args) -> Result<ViewSpec> {
-    let pose = if let Some(index) = args.camera {
-        PoseSpec::Between { from: index, to: index, t: 0.0 }
-    } else if let Some(from) = args.from {
-        PoseSpec::Between { from, to: args.to.unwrap_or(from), t: args.t }
-    } else if let (Some(eye), Some(target)) = (&args.eye, &args.target) {
-        PoseSpec::LookAt {
-            eye: numbers(eye, "--eye")?,
-            target: numbers(target, "--target")?,
-            up: args.up.as_ref().map(|up| numbers(up, "--up")).transpose()?,
-        }
-    } else if let Some(matrix) = &args.camera_to_world {
-        PoseSpec::CameraToWorld(numbers(matrix, "--camera-to-world")?)
-    } else {
-        return Err(Error::invalid(
-            "no camera: give --camera, --from and --to, --eye and --target, or --camera-to-world",
-        ));
-    };
-    let lens = match (args.fx, args.fov) {
-        (Some(fx), _) => LensSpec::Focal { fx, fy: args.fy, cx: args.cx, cy: args.cy },
-        (None, Some(fov)) => LensSpec::Fov(fov),
-        (None, None) => LensSpec::OfScene,
-    };
     let background = match &args.background {
         Some(background) => Some(numbers(background, "--background")?),
         None => None,
     };
+    let profile = if args.paper { ScoringProfile::Paper } else { ScoringProfile::Default };
     Ok(ViewSpec {
-        camera: CameraSpec { pose, lens },
-        kind: match args.kind {
-            KindArg::Color => Kind::Color,
-            KindArg::Depth => Kind::Depth,
-            KindArg::Alpha => Kind::Alpha,
-        },
+        camera: args.camera.spec()?.ok_or_else(no_camera)?,
+        kind: args.kind,
         options: ViewOptions {
-            width: args.width,
-            height: args.height,
             format: format_of(&args.output)?,
             background,
-            antialiased: args.antialiased,
-            near: args.near,
-            deadline: None,
+            ..args.camera.options()
         },
+        ask: Ask { text: args.text.clone(), profile, wait: None },
     })
 }
 
-fn numbers<T: Copy, const N: usize>(given: &[T], name: &str) -> Result<[T; N]> {
-    <[T; N]>::try_from(given)
-        .map_err(|_count| Error::invalid(format!("{name} has {} numbers, not {N}", given.len())))
+fn kind(name: &str) -> Result<Kind, String> {
+    let known = Kind::ALL.into_iter().find(|kind| kind.name() == name);
+    known.ok_or_else(|| Kind::ALL.map(Kind::name).join(", "))
 }
 
 fn format_of(path: &Path) -> Result<Format> {

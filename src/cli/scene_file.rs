@@ -3,13 +3,14 @@
 use std::{
     io::BufReader,
     path::{Path, PathBuf},
+    sync::Arc,
 };
 
 use crate::{
     error::{Error, Result},
     limits::Limits,
     scene::{Backdrop, DropCount, HealthReport, Provenance, Scene, SceneId, SceneMeta},
-    store::{ply::read_ply, read_scene},
+    store::{ply::read_ply, read_scene, read_semantics},
 };
 
 /// Name of the scene file where a folder is named.
@@ -23,6 +24,14 @@ pub(super) struct Opened {
     pub(super) format: &'static str,
     /// sha256 of a scene file, hex.
     pub(super) sha256: Option<String>,
+}
+
+/// Where the semantics of a scene file lie: beside it, as the server keeps them.
+pub(super) fn semantics_path(scene: &Path) -> PathBuf {
+    if scene.file_name().is_some_and(|name| name == IN_FOLDER) {
+        return scene.with_file_name("semantics.segsplat");
+    }
+    scene.with_extension("semantics.segsplat")
 }
 
 /// The path of the scene file: itself, or the one in the folder.
@@ -63,6 +72,18 @@ pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
         return Ok(Opened { scene, format: "ply", sha256: None });
     }
     let file = fs_err::read(&path).map_err(unreadable)?;
-    let (scene, sha256) = read_scene(&file)?;
+    let (mut scene, sha256) = read_scene(&file)?;
+    let beside = semantics_path(&path);
+    match fs_err::read(&beside) {
+        Ok(file) => {
+            let (semantics, _) = read_semantics(&file, &scene.meta.id)?;
+            scene = scene.with_semantics(Arc::new(semantics))?;
+        }
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {}
+        Err(e) => {
+            let what = format!("{}: cannot be read: {}", beside.display(), e.kind());
+            return Err(Error::invalid(what).caused_by(e));
+        }
+    }
     Ok(Opened { scene, format: "segsplat", sha256: Some(sha256) })
 }

@@ -152,14 +152,22 @@ impl Jobs {
         Ok(())
     }
 
-    /// Takes back that the semantics of a scene are ready: their file is gone.
-    pub fn lose_semantics(&self, id: &SceneId) {
+    /// Takes back that the semantics of a scene are ready: their file is gone, or they were made by
+    /// networks that are no longer loaded. Blocks on the disk.
+    ///
+    /// # Errors
+    /// `store_unavailable`.
+    pub fn lose_semantics(&self, id: &SceneId) -> Result<()> {
+        let mut lost = Ok(());
         self.shared.board.update(id, |record| {
+            // Under the record's lock, so that no newer ones are lost.
             if record.status.semantics.state == SemanticsState::Ready {
+                lost = self.shared.store.drop_semantics(id);
                 record.status.semantics = SemanticsStatus::default();
                 record.semantics_sha256 = None;
             }
         });
+        lost
     }
 }
 

@@ -136,6 +136,49 @@ pub fn render_pixels(
     Ok(out)
 }
 
+/// What one Gaussian adds to a pixel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Contribution {
+    /// Its number.
+    pub gaussian: usize,
+    /// Depth of its centre, world units.
+    pub depth: f64,
+    /// alpha T, 0..1.
+    pub weight: f64,
+}
+
+/// What each Gaussian adds to one pixel (column, row), front to back.
+///
+/// # Errors
+/// `invalid_request` when the intrinsics are unusable.
+pub fn contributions(
+    gaussians: &Gaussians,
+    request: &RenderRequest,
+    pixel: [u32; 2],
+) -> Result<Vec<Contribution>> {
+    let lens = request.camera.intrinsics.validated("camera")?;
+    let [x, y] = pixel.map(|at| f64::from(at) + 0.5);
+    let center = DVec2::new(x, y);
+    let mut near: Vec<(usize, Splat)> = (0..gaussians.len())
+        .into_par_iter()
+        .filter_map(|i| Some((i, splat(gaussians, i, request, &lens)?)))
+        .filter(|(_, splat)| splat.alpha(center) >= f64::from(ALPHA_MIN))
+        .collect();
+    near.sort_by(|a, b| (a.1.depth as f32).total_cmp(&(b.1.depth as f32)));
+    let mut transmittance = 1.0;
+    let mut found = Vec::new();
+    for (gaussian, splat) in near {
+        let alpha = splat.alpha(center);
+        let next = transmittance * (1.0 - alpha);
+        if next <= f64::from(TRANSMITTANCE_MIN) {
+            break;
+        }
+        found.push(Contribution { gaussian, depth: splat.depth, weight: alpha * transmittance });
+        transmittance = next;
+    }
+    Ok(found)
+}
+
 /// A Gaussian on the picture.
 #[derive(Clone, Copy, Debug)]
 struct Splat {
@@ -147,6 +190,15 @@ struct Splat {
     depth: f64,
     color: DVec3,
     label: u16,
+}
+
+impl Splat {
+    /// Alpha at a place of the picture.
+    fn alpha(&self, at: DVec2) -> f64 {
+        let d = at - self.mean;
+        let power = 0.5 * d.dot(self.conic * d);
+        (self.opacity * (-power).exp()).min(f64::from(ALPHA_MAX))
+    }
 }
 
 fn splat(
@@ -253,9 +305,7 @@ fn pixel(near: &[&Splat], center: DVec2, request: &RenderRequest) -> OraclePixel
     let mut cliff = Cliff::default();
     let mut last_depth = f64::NEG_INFINITY;
     for splat in near {
-        let d = center - splat.mean;
-        let power = 0.5 * d.dot(splat.conic * d);
-        let alpha = (splat.opacity * (-power).exp()).min(f64::from(ALPHA_MAX));
+        let alpha = splat.alpha(center);
         cliff.alpha |= (alpha / alpha_min - 1.0).abs() < CLIFF_ALPHA;
         if alpha < alpha_min {
             continue;

@@ -159,7 +159,10 @@ impl TextScores {
     /// Whether the text selects bank index `m`.
     #[must_use]
     pub fn selects(&self, m: u16) -> bool {
-        self.entries.get(usize::from(m)).is_some_and(|score| *score >= 0.5)
+        // By the rule of the masks, so that a tie selects in space what it selects in a view.
+        let known = m > 0 && usize::from(m) < self.entries.len();
+        let [least, most, _] = self.blend(&std::iter::once((usize::from(m), 1.0)));
+        known && selected(least, most)
     }
 
     /// Smallest and largest blended score of a pixel's entries, and their coverage.

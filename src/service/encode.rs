@@ -9,6 +9,7 @@ use super::types::{Format, Kind};
 use crate::{
     error::{Error, Result},
     render::Frame,
+    semantics::colour,
 };
 
 const JPEG_QUALITY: u8 = 90;
@@ -22,17 +23,58 @@ pub(super) struct Encoded {
     pub(super) depth_scale: Option<f64>,
 }
 
+/// What texts find in a view, a value a pixel.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Layer<'a> {
+    /// Entries of the bank; a picture shows their colours.
+    Entries(&'a [u16]),
+    /// 0..1.
+    Relevancy(&'a [f32]),
+    /// Black or white.
+    Mask(&'a [bool]),
+}
+
+/// A layer as a file: entries in their colours (as NPY their numbers), the others in grey.
+pub(super) fn layer(layer: Layer<'_>, width: u32, height: u32, format: Format) -> Result<Vec<u8>> {
+    if format == Format::Npy {
+        let values: Vec<f32> = match layer {
+            Layer::Entries(entries) => entries.iter().map(|m| f32::from(*m)).collect(),
+            Layer::Relevancy(scores) => scores.to_vec(),
+            Layer::Mask(mask) => mask.iter().map(|on| f32::from(u8::from(*on))).collect(),
+        };
+        return Ok(npy(&values, &[height, width]));
+    }
+    let grey: Vec<u8> = match layer {
+        Layer::Entries(entries) => {
+            let colours: Vec<f32> = entries.iter().flat_map(|m| colour(*m)).collect();
+            return picture(&levels(&colours), width, height, ExtendedColorType::Rgb8, format);
+        }
+        Layer::Relevancy(scores) => levels(scores),
+        Layer::Mask(mask) => mask.iter().map(|on| if *on { 255 } else { 0 }).collect(),
+    };
+    if format == Format::Webp {
+        // WebP knows no grey.
+        let rgb: Vec<u8> = grey.iter().flat_map(|&v| [v; 3]).collect();
+        return picture(&rgb, width, height, ExtendedColorType::Rgb8, format);
+    }
+    picture(&grey, width, height, ExtendedColorType::L8, format)
+}
+
 /// Refuses pairs of kind and format that would lose the picture.
 pub(super) fn check(kind: Kind, format: Format) -> Result<()> {
     match (kind, format) {
         (Kind::Depth, Format::Jpeg | Format::Webp) => Err(Error::invalid(
             "depth does not fit 8 bits: ask for png (16-bit, with its scale) or npy (float32)",
         )),
+        (Kind::Mask | Kind::Semantics, Format::Jpeg) => Err(Error::invalid(format!(
+            "kind={} does not survive JPEG: ask for png, webp or npy",
+            kind.name()
+        ))),
         _ => Ok(()),
     }
 }
 
-/// One kind of a frame as a file.
+/// One kind of a frame as a file: colour, depth or alpha.
 ///
 /// Colour and alpha are clamped to 0..1 and rounded to the nearest of 256 levels, except as NPY.
 pub(super) fn encode(frame: &Frame, kind: Kind, format: Format) -> Result<Encoded> {
@@ -73,6 +115,7 @@ pub(super) fn encode(frame: &Frame, kind: Kind, format: Format) -> Result<Encode
             let bytes = picture(&steps, width, height, ExtendedColorType::L16, format)?;
             Ok(Encoded { bytes, depth_scale: Some(scale) })
         }
+        Kind::Semantics | Kind::Relevancy | Kind::Mask => Err(missing()),
     }
 }
 

@@ -2,15 +2,19 @@
 
 use std::sync::Arc;
 
+use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
 
 use super::{
     Service,
-    types::{Export, ExportFormat},
+    create::blocking,
+    local::select,
+    texts,
+    types::{Ask, Export, ExportFormat},
 };
 use crate::{
-    error::{Error, Result},
-    scene::SceneId,
+    error::Result,
+    scene::{Gaussians, SceneId},
     store::ply::{PlyWriter, ply_size_bytes},
 };
 
@@ -18,32 +22,51 @@ use crate::{
 const PIECES_MAX: usize = 4;
 
 impl Service {
-    /// The scene as a file for other programs.
+    /// The scene, or what a text selects of it, as a file for other programs.
     ///
     /// # Errors
-    /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`.
-    pub async fn export(&self, id: &SceneId, format: ExportFormat) -> Result<Export> {
-        let inner = Arc::clone(&self.inner);
-        let record = inner.finished(id)?;
-        let scene = tokio::task::spawn_blocking({
-            let id = id.clone();
-            move || inner.load(&id)
-        })
-        .await
-        .map_err(|e| Error::internal("reading the scene was broken off").caused_by(e))??;
+    /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; with a text also what
+    /// [`Service::query`] says.
+    pub async fn export(&self, id: &SceneId, format: ExportFormat, ask: &Ask) -> Result<Export> {
         let ExportFormat::Ply = format;
-        let size_bytes = ply_size_bytes(&scene.gaussians);
+        let inner = Arc::clone(&self.inner);
+        let Some(text) = &ask.text else {
+            let record = inner.finished(id)?;
+            let asked = id.clone();
+            let scene = blocking(move || inner.load(&asked)).await??;
+            let digest = record.scene_sha256.unwrap_or_default();
+            let etag = format!("{}-ply", digest.get(..32).unwrap_or(id.as_str()));
+            let size_bytes = ply_size_bytes(&scene.gaussians);
+            let (to, chunks) = mpsc::channel(PIECES_MAX);
+            tokio::task::spawn_blocking(move || send(&scene.gaussians, &to));
+            return Ok(Export { file_name: format!("{id}.ply"), size_bytes, etag, chunks });
+        };
+        inner.can_understand("text")?;
+        let text = texts::checked(text, "text", self.limits())?;
+        let understood = inner.understood(id, "text", ask.wait).await?;
+        let tag = understood.tag();
+        let words = format!("{tag} {text:?} {:?}", ask.profile);
+        let etag: String =
+            Sha256::digest(words)[..16].iter().map(|byte| format!("{byte:02x}")).collect();
+        let profile = ask.profile;
+        let chosen = blocking(move || {
+            let (scene, semantics) = (&understood.scene, &understood.semantics);
+            select(&inner.asker, scene, semantics, &tag, text, profile)
+        })
+        .await??;
+        let size_bytes = ply_size_bytes(&chosen);
         let (to, chunks) = mpsc::channel(PIECES_MAX);
-        tokio::task::spawn_blocking(move || {
-            for piece in PlyWriter::new(&scene.gaussians) {
-                // Whoever stopped listening wants no more.
-                if to.blocking_send(piece).is_err() {
-                    return;
-                }
-            }
-        });
-        let digest = record.scene_sha256.unwrap_or_default();
-        let etag = format!("{}-ply", digest.get(..32).unwrap_or(id.as_str()));
-        Ok(Export { file_name: format!("{id}.ply"), size_bytes, etag, chunks })
+        tokio::task::spawn_blocking(move || send(&chosen, &to));
+        let etag = format!("{etag}-ply");
+        Ok(Export { file_name: format!("{id}-part.ply"), size_bytes, etag, chunks })
+    }
+}
+
+fn send(gaussians: &Gaussians, to: &mpsc::Sender<Vec<u8>>) {
+    for piece in PlyWriter::new(gaussians) {
+        // Whoever stopped listening wants no more.
+        if to.blocking_send(piece).is_err() {
+            return;
+        }
     }
 }

@@ -2,12 +2,20 @@
 //!
 //! [`Service`] is a cheap clone; its calls are async and never do heavy work on the async threads.
 
+mod asker;
+mod base64;
 mod camera;
 mod create;
 mod encode;
 mod export;
 mod gate;
+mod local;
+mod lru;
+mod pick;
+mod query;
+mod rle;
 mod semantics;
+mod texts;
 mod types;
 mod view;
 
@@ -16,14 +24,17 @@ use std::{fmt, sync::Arc};
 use futures_util::{Stream, stream};
 use tokio::sync::Semaphore;
 
-use self::{create::Keys, gate::Gate};
+use self::{asker::Asker, create::Keys, gate::Gate};
 pub use self::{
+    local::Local,
+    rle::Rle,
     types::{
-        CameraSpec, CreateScene, Created, Export, ExportFormat, Format, Kind, LensSpec, ModelInfo,
-        ModelsInfo, Page, PageRequest, PoseSpec, Readiness, RenderedView, ViewOptions, ViewSpec,
-        ViewsSpec,
+        Ask, Boxes, CameraSpec, CreateScene, Created, Export, ExportFormat, Format, Kind, Label,
+        LensSpec, MaskFormat, ModelInfo, ModelsInfo, Page, PageRequest, Part3, Peak, PickSpec,
+        Picked, PoseSpec, QueryAnswer, QuerySpec, Readiness, RenderedView, TextResult, TextView,
+        TextWarning, ViewOptions, ViewSpec, ViewsSpec,
     },
-    view::{default_near, render_scene},
+    view::default_near,
 };
 pub use crate::scene::{
     Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
@@ -72,7 +83,7 @@ struct Inner {
     store: Arc<Store>,
     jobs: Jobs,
     maker: Arc<dyn SceneMaker>,
-    semantics: Arc<dyn SemanticsMaker>,
+    asker: Asker,
     renderer: Arc<dyn Renderer>,
     models: ModelsInfo,
     gate: Gate,
@@ -115,7 +126,7 @@ impl Service {
             store,
             jobs,
             maker: parts.maker,
-            semantics: parts.semantics,
+            asker: Asker::new(parts.semantics, &config.limits),
             renderer: parts.renderer,
             models,
             gate: Gate::new(renders, config.limits.queued_renders_max),

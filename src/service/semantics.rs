@@ -4,7 +4,7 @@
 
 use std::{sync::Arc, time::Duration};
 
-use super::{Inner, Service, create::blocking};
+use super::{Inner, Service, create::blocking, view::scene_tag};
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{Scene, SceneId, SceneStatus, Semantics, SemanticsMode, SemanticsState},
@@ -22,10 +22,23 @@ pub(super) struct Understood {
     pub(super) semantics: Arc<Semantics>,
 }
 
+impl Understood {
+    /// Tells scene and semantics from any others.
+    pub(super) fn tag(&self) -> String {
+        meaning_tag(&self.record)
+    }
+}
+
+/// Tells a scene and its semantics from any others.
+pub(super) fn meaning_tag(record: &Record) -> String {
+    let semantics = record.semantics_sha256.as_deref().unwrap_or_default();
+    format!("{} {semantics}", scene_tag(record))
+}
+
 impl Inner {
     /// Refuses what the loaded bundle cannot do; `what` was asked.
     pub(super) fn can_understand(&self, what: &str) -> Result<()> {
-        let Some(lack) = self.semantics.lacks() else { return Ok(()) };
+        let Some(lack) = self.asker.lacks() else { return Ok(()) };
         Err(Error::new(
             ErrorCode::ModelUnavailable,
             format!(
@@ -47,6 +60,22 @@ impl Inner {
                 record.status.id
             ),
         ))
+    }
+
+    /// The scene with what it means; `None` where that must be made again: its file was put aside,
+    /// or other networks made it, whose embeddings no text of these can be compared with.
+    fn loaded_semantics(&self, id: &SceneId) -> Result<Option<(Arc<Scene>, Arc<Semantics>)>> {
+        let scene = self.load(id)?;
+        let loaded = &self.models.bundle_sha256;
+        if let Some(semantics) = scene.semantics.clone() {
+            let made_by = &semantics.report.bundle_sha256;
+            if made_by == loaded || made_by.is_empty() {
+                return Ok(Some((scene, semantics)));
+            }
+            tracing::info!(scene = %id, made_by, "semantics of another bundle are made again");
+        }
+        self.jobs.lose_semantics(id)?;
+        Ok(None)
     }
 
     /// The scene with what it means, which is made now where it was not before.
@@ -85,12 +114,10 @@ impl Inner {
                 _ => return Err(not_yet(&record.status, what)),
             }
             let (inner, asked) = (Arc::clone(self), id.clone());
-            let scene = blocking(move || inner.load(&asked)).await??;
-            if let Some(semantics) = scene.semantics.clone() {
+            let found = blocking(move || inner.loaded_semantics(&asked)).await??;
+            if let Some((scene, semantics)) = found {
                 return Ok(Understood { record: Arc::new(record), scene, semantics });
             }
-            // Their file was put aside: they are made again.
-            self.jobs.lose_semantics(id);
         }
     }
 }
@@ -121,7 +148,7 @@ impl Service {
 
     /// A status with what can be asked of the scene by text now.
     pub(super) fn shown(&self, mut status: SceneStatus) -> SceneStatus {
-        let lack = self.inner.semantics.lacks();
+        let lack = self.inner.asker.lacks();
         let bundle = &self.inner.models.bundle;
         let reason = match (status.semantics.state, lack) {
             (SemanticsState::Off, _) => Some("the scene was made with semantics=off".to_owned()),

@@ -4,9 +4,10 @@ use std::{fmt, time::Duration};
 
 use serde::{Deserialize, Serialize};
 
+use super::{base64, rle::Rle};
 use crate::{
     render::FrameStats,
-    scene::{Camera, SceneOptions, SceneStatus, Upload},
+    scene::{Camera, SceneOptions, SceneStatus, ScoringProfile, Upload},
 };
 
 /// Everything needed to make a scene.
@@ -60,6 +61,54 @@ pub enum Kind {
     Depth,
     /// Accumulated opacity, 0..1.
     Alpha,
+    /// A fixed colour for each entry of the semantic bank, black where there is none.
+    Semantics,
+    /// How well each pixel fits a text, 0..1.
+    Relevancy,
+    /// Where the relevancy is at least 0.5.
+    Mask,
+}
+
+impl Kind {
+    /// Every kind.
+    pub const ALL: [Self; 6] =
+        [Self::Color, Self::Depth, Self::Alpha, Self::Semantics, Self::Relevancy, Self::Mask];
+
+    /// The kind's snake_case name.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Color => "color",
+            Self::Depth => "depth",
+            Self::Alpha => "alpha",
+            Self::Semantics => "semantics",
+            Self::Relevancy => "relevancy",
+            Self::Mask => "mask",
+        }
+    }
+
+    /// Whether it answers a text.
+    #[must_use]
+    pub fn takes_text(self) -> bool {
+        matches!(self, Self::Relevancy | Self::Mask)
+    }
+
+    /// Whether it needs to know what the scene means.
+    #[must_use]
+    pub fn needs_semantics(self) -> bool {
+        self == Self::Semantics || self.takes_text()
+    }
+}
+
+/// What is asked by text, and how it is scored.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Ask {
+    /// The text; for kinds and exports that take one.
+    pub text: Option<String>,
+    /// How it is scored.
+    pub profile: ScoringProfile,
+    /// How long to wait for semantics that are being made; `None`: `limits.text_wait_ms`.
+    pub wait: Option<Duration>,
 }
 
 /// How a picture is encoded.
@@ -175,6 +224,8 @@ pub struct ViewSpec {
     pub kind: Kind,
     /// Size, encoding and the rest.
     pub options: ViewOptions,
+    /// What is asked by text.
+    pub ask: Ask,
 }
 
 /// Many cameras and kinds; each camera is rendered once for all kinds.
@@ -186,6 +237,191 @@ pub struct ViewsSpec {
     pub kinds: Vec<Kind>,
     /// Size, encoding and the rest.
     pub options: ViewOptions,
+    /// What is asked by text.
+    pub ask: Ask,
+}
+
+/// Which boxes hold the parts of a selection.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Boxes {
+    /// Turned along the part's own axes.
+    #[default]
+    Oriented,
+    /// Along the axes of the world.
+    Aligned,
+    /// No parts and no boxes.
+    None,
+}
+
+/// How a query's masks are given.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MaskFormat {
+    /// COCO's compressed run lengths.
+    #[default]
+    Rle,
+    /// 8-bit grey PNG, 0 or 255.
+    Png,
+    /// Area, box and peak alone.
+    None,
+}
+
+/// Many texts asked of a scene, in 3D and, with a camera, in one view.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct QuerySpec {
+    /// The texts.
+    pub texts: Vec<String>,
+    /// View to answer in; none: 3D alone.
+    pub camera: Option<CameraSpec>,
+    /// Size and the rest of that view; the encoding does not count.
+    pub options: ViewOptions,
+    /// Boxes of the parts.
+    pub boxes: Boxes,
+    /// Masks of the view.
+    pub mask: MaskFormat,
+    /// Whether the view's relevancy is given too, as an 8-bit grey PNG.
+    pub relevancy: bool,
+    /// How texts are scored.
+    pub profile: ScoringProfile,
+    /// How long to wait for semantics that are being made; `None`: `limits.text_wait_ms`.
+    pub wait: Option<Duration>,
+}
+
+/// What a query found.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct QueryAnswer {
+    /// Entries of the scene's bank (M).
+    pub bank_size: u32,
+    /// How texts were scored.
+    pub profile: ScoringProfile,
+    /// Camera of the view.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub camera: Option<Camera>,
+    /// Time of drawing the view for all texts; 0 where it was still known.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub render_ms: Option<f64>,
+    /// One result a text, in their order.
+    pub results: Vec<TextResult>,
+}
+
+/// What a text found.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct TextResult {
+    /// The text, without blanks around it.
+    pub text: String,
+    /// `[M]` relevancy of each entry of the bank, 0..1; entry m is the m-th, counted from 1.
+    pub scores: Vec<f32>,
+    /// Entries selected: those of relevancy 0.5 and more.
+    pub entries: Vec<u16>,
+    /// Gaussians selected.
+    pub gaussians: u64,
+    /// Connected parts of the selection, the largest first.
+    pub parts: Vec<Part3>,
+    /// What makes the answer doubtful.
+    pub warnings: Vec<TextWarning>,
+    /// What it found in the view.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub view: Option<TextView>,
+}
+
+/// Something that makes the answer to a text doubtful.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct TextWarning {
+    /// Stable snake_case code: `unknown_words`, `text_cut`.
+    pub code: String,
+    /// A sentence.
+    pub message: String,
+}
+
+/// A connected part of a selection and its box, world frame of the upload.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Part3 {
+    /// Gaussians.
+    pub gaussians: u64,
+    /// Centre of the box.
+    pub center: [f64; 3],
+    /// Unit axes of the box, one a row.
+    pub axes: [[f64; 3]; 3],
+    /// Full lengths along the axes, world units.
+    pub size: [f64; 3],
+}
+
+/// What a text found in a view.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct TextView {
+    /// Mask as run lengths.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub mask_rle: Option<Rle>,
+    /// Mask as a PNG; base64 in JSON.
+    #[serde(skip_serializing_if = "Option::is_none", serialize_with = "base64::optional")]
+    pub mask_png: Option<Vec<u8>>,
+    /// Relevancy as a PNG; base64 in JSON.
+    #[serde(skip_serializing_if = "Option::is_none", serialize_with = "base64::optional")]
+    pub relevancy_png: Option<Vec<u8>>,
+    /// Pixels of the mask.
+    pub area: u64,
+    /// Left, top, width and height of the mask, pixels.
+    pub bbox: Option<[u32; 4]>,
+    /// Where the relevancy is highest; none where it is 0 everywhere.
+    pub peak: Option<Peak>,
+}
+
+/// The pixel of the highest relevancy.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Peak {
+    /// Column.
+    pub x: u32,
+    /// Row.
+    pub y: u32,
+    /// Relevancy, 0..1.
+    pub relevancy: f32,
+}
+
+/// What lies under a pixel of a view.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PickSpec {
+    /// Camera.
+    pub camera: CameraSpec,
+    /// Across, pixels of the picture; the first pixel is 0 to 1.
+    pub x: f64,
+    /// Down, pixels.
+    pub y: f64,
+    /// Size and the rest of the view.
+    pub options: ViewOptions,
+    /// Texts to name the entry with; none: semantics are not made for it.
+    pub labels: Vec<String>,
+    /// How labels are scored.
+    pub profile: ScoringProfile,
+    /// How long to wait for semantics that are being made; `None`: `limits.text_wait_ms`.
+    pub wait: Option<Duration>,
+}
+
+/// What was found under a pixel.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Picked {
+    /// Accumulated opacity, 0..1.
+    pub alpha: f32,
+    /// Expected depth along the camera's axis, world units; none where nothing is.
+    pub depth: Option<f64>,
+    /// Point at that depth, world frame of the upload.
+    pub point: Option<[f64; 3]>,
+    /// The Gaussian that adds most, counted from 0 in the scene's order.
+    pub gaussian: Option<u64>,
+    /// Its entry of the bank, counted from 1; none where the scene is not understood yet, or the
+    /// Gaussian is background.
+    pub entry: Option<u16>,
+    /// The labels asked for, the best first.
+    pub labels: Vec<Label>,
+}
+
+/// A text and how well it names an entry.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Label {
+    /// The text.
+    pub text: String,
+    /// Relevancy, 0..1; under 0.5 it does not name it.
+    pub relevancy: f32,
 }
 
 /// One encoded picture.

@@ -7,14 +7,20 @@ use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
 
 use super::{
-    Inner, Service, camera, encode,
-    types::{CameraSpec, Format, Kind, RenderedView, ViewOptions, ViewSpec, ViewsSpec},
+    Inner, Service,
+    asker::{Asked, Asker, SeenView},
+    camera,
+    encode::{self, Layer},
+    semantics::{Understood, meaning_tag},
+    texts,
+    types::{Ask, CameraSpec, Format, Kind, RenderedView, ViewOptions, ViewSpec, ViewsSpec},
 };
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    render::{Kinds, Labels, RenderRequest, Renderer, compose},
-    scene::{Camera, Scene, SceneCamera, SceneId, SceneState},
+    render::{Frame, Kinds, Labels, RenderRequest, Renderer, compose},
+    scene::{Camera, Scene, SceneCamera, SceneId, SceneState, Semantics},
+    semantics::{Scorer, mask_from_blend},
     store::Record,
 };
 
@@ -27,7 +33,7 @@ const READY_MAX: usize = 2;
 
 /// A request with nothing left open: equal ones give equal pictures.
 #[derive(Clone, Debug)]
-struct Resolved {
+pub(super) struct Resolved {
     camera_index: usize,
     camera: Camera,
     kinds: Vec<Kind>,
@@ -37,16 +43,57 @@ struct Resolved {
     near: f32,
 }
 
+/// What the text kinds of a view are answered from.
+pub(super) struct Told<'a> {
+    asker: &'a Asker,
+    scorer: Arc<Scorer>,
+    /// What the kinds that take a text were asked.
+    text: Option<Asked>,
+    /// Tells scene and semantics.
+    tag: String,
+}
+
+impl<'a> Told<'a> {
+    pub(super) fn new(
+        asker: &'a Asker,
+        semantics: &Semantics,
+        tag: String,
+        ask: &Ask,
+    ) -> Result<Self> {
+        let scorer = asker.scorer(&tag, semantics, ask.profile)?;
+        let text = asker.ask(&scorer, ask.text.as_slice())?.pop();
+        Ok(Self { asker, scorer, text, tag })
+    }
+
+    fn text(&self) -> Result<&Asked> {
+        self.text.as_ref().ok_or_else(|| Error::internal("a text kind without a text"))
+    }
+}
+
+/// What a view's text kinds are read from.
+enum Source {
+    /// Entries, which answer every text.
+    Seen(Arc<SeenView>),
+    /// A blend that answers this one.
+    Blend(Vec<[f32; 4]>),
+}
+
 impl Resolved {
-    fn request(&self) -> RenderRequest {
-        let has = |kind| self.kinds.contains(&kind);
+    pub(super) fn camera(&self) -> Camera {
+        self.camera
+    }
+
+    /// Tells E of this view from that of any other; its pixels do not depend on the background.
+    pub(super) fn seen_key(&self, tag: &str, renderer: &str) -> String {
+        let Self { camera, antialiased, near, .. } = self;
+        format!("{tag} {renderer} {camera:?} {antialiased} {near:?}")
+    }
+
+    /// A request of these pictures without labels.
+    pub(super) fn labels_request(&self, kinds: Kinds) -> RenderRequest {
         RenderRequest {
             camera: self.camera,
-            kinds: Kinds {
-                color: has(Kind::Color),
-                depth: has(Kind::Depth),
-                alpha: has(Kind::Alpha),
-            },
+            kinds,
             labels: Labels::None,
             background: self.background.unwrap_or_default(),
             antialiased: self.antialiased,
@@ -54,16 +101,65 @@ impl Resolved {
         }
     }
 
-    /// Hash of scene, renderer and request for one kind.
-    fn etag(&self, scene: &str, renderer: &str, kind: Kind) -> String {
+    fn kinds(&self) -> Kinds {
+        let has = |kind| self.kinds.contains(&kind);
+        Kinds { color: has(Kind::Color), depth: has(Kind::Depth), alpha: has(Kind::Alpha) }
+    }
+
+    /// Hash of scene, renderer and request for one kind; `asked` tells what was asked by text.
+    fn etag(&self, scene: &str, renderer: &str, kind: Kind, asked: &str) -> String {
         let Self { camera, format, background, antialiased, near, .. } = self;
         let version = env!("CARGO_PKG_VERSION");
         // Debug prints floats so that they read back the same.
         let words = format!(
             "{scene} {version} {renderer} {camera:?} {kind:?} {format:?} {background:?} \
-             {antialiased} {near:?}"
+             {antialiased} {near:?} {asked}"
         );
         Sha256::digest(words)[..16].iter().map(|byte| format!("{byte:02x}")).collect()
+    }
+
+    /// One drawing for the pixel kinds and, where they are not known any more, for the labels.
+    fn drawn(
+        &self,
+        renderer: &dyn Renderer,
+        scene: &Scene,
+        told: Option<&Told<'_>>,
+    ) -> Result<(Frame, Option<Source>)> {
+        let mut request = self.labels_request(self.kinds());
+        let mut known = None;
+        if let Some(told) = told {
+            let key = self.seen_key(&told.tag, &renderer.name());
+            known = told.asker.known_view(&key).map(Source::Seen);
+            if known.is_none() {
+                request.labels = self.labels(told);
+            }
+        }
+        let nothing = request.kinds == Kinds::NONE && request.labels == Labels::None;
+        if let (true, Some(Source::Seen(seen))) = (nothing, &known) {
+            let frame = Frame { width: seen.width, height: seen.height, ..Frame::default() };
+            return Ok((frame, known));
+        }
+        let mut frame =
+            compose::render_scene(renderer, scene, &request, self.background.is_none())?;
+        if let (Some(told), Some(entries)) = (told, frame.entries.take()) {
+            let key = self.seen_key(&told.tag, &renderer.name());
+            known =
+                Some(Source::Seen(told.asker.keep_view(key, frame.width, frame.height, entries)));
+        } else if let Some(blend) = frame.blend.take() {
+            known = Some(Source::Blend(blend));
+        }
+        Ok((frame, known))
+    }
+
+    /// A mask alone is the blend of a few numbers; all else needs E.
+    fn labels(&self, told: &Told<'_>) -> Labels {
+        let mask_alone =
+            self.kinds.iter().all(|kind| !kind.needs_semantics() || *kind == Kind::Mask);
+        let tables = told.text.as_ref().map(|text| text.scores.tables()).unwrap_or_default();
+        match <[_; 1]>::try_from(tables) {
+            Ok([table]) if mask_alone => Labels::Blend(table),
+            _ => Labels::Entries,
+        }
     }
 
     /// The pictures of all kinds; `scene_tag` tells the scene in their tags.
@@ -72,39 +168,74 @@ impl Resolved {
         renderer: &dyn Renderer,
         scene: &Scene,
         scene_tag: &str,
+        told: Option<&Told<'_>>,
+        asked: &str,
     ) -> Result<Vec<RenderedView>> {
         let started = Instant::now();
-        let frame =
-            compose::render_scene(renderer, scene, &self.request(), self.background.is_none())?;
+        let (frame, source) = self.drawn(renderer, scene, told)?;
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
         let name = renderer.name();
         let view = |&kind: &Kind| -> Result<RenderedView> {
-            let encoded = encode::encode(&frame, kind, self.format)?;
+            let (bytes, depth_scale) = match (kind.needs_semantics(), told, &source) {
+                (true, Some(told), Some(source)) => {
+                    (self.answer(kind, told, source, &frame)?, None)
+                }
+                _ => {
+                    let encoded = encode::encode(&frame, kind, self.format)?;
+                    (encoded.bytes, encoded.depth_scale)
+                }
+            };
+            let asked = if kind.needs_semantics() { asked } else { "" };
             Ok(RenderedView {
                 camera_index: self.camera_index,
                 kind,
                 format: self.format,
                 width: frame.width,
                 height: frame.height,
-                bytes: encoded.bytes,
-                depth_scale: encoded.depth_scale,
+                bytes,
+                depth_scale,
                 camera: self.camera,
-                etag: self.etag(scene_tag, &name, kind),
+                etag: self.etag(scene_tag, &name, kind, asked),
                 stats: frame.stats,
                 render_ms,
             })
         };
         self.kinds.iter().map(view).collect()
     }
+
+    fn answer(
+        &self,
+        kind: Kind,
+        told: &Told<'_>,
+        source: &Source,
+        frame: &Frame,
+    ) -> Result<Vec<u8>> {
+        let file = |layer| encode::layer(layer, frame.width, frame.height, self.format);
+        match (kind, source) {
+            (Kind::Mask, Source::Blend(blend)) => {
+                file(Layer::Mask(&mask_from_blend(&[blend.as_slice()], told.scorer.scoring())))
+            }
+            (Kind::Mask, Source::Seen(seen)) => {
+                file(Layer::Mask(&told.scorer.mask(&told.text()?.scores, seen.entries())?))
+            }
+            (Kind::Relevancy, Source::Seen(seen)) => {
+                file(Layer::Relevancy(&seen.relevancy(&told.scorer, &told.text()?.scores)?))
+            }
+            (Kind::Semantics, Source::Seen(seen)) => {
+                file(Layer::Entries(&seen.strongest(&told.scorer)))
+            }
+            _ => Err(Error::internal(format!("kind={} was not drawn", kind.name()))),
+        }
+    }
 }
 
 /// What tells one scene from any other, in tags.
-fn scene_tag(record: &Record) -> String {
+pub(super) fn scene_tag(record: &Record) -> String {
     format!("{} {}", record.scene_sha256.as_deref().unwrap_or_default(), record.status.id)
 }
 
 /// Cameras and median depth of a record, as [`resolve`] takes them.
-fn resolve_for(
+pub(super) fn resolve_for(
     inner: &Inner,
     record: &Record,
     cameras: &[CameraSpec],
@@ -155,23 +286,55 @@ fn resolve(
     cameras.iter().enumerate().map(resolved).collect()
 }
 
-/// Renders and encodes one view of a scene that is not in the service's store.
-///
-/// # Errors
-/// As [`Service::render`].
-pub fn render_scene(
-    renderer: &dyn Renderer,
+/// One camera of a scene that is not in the service's store.
+pub(super) fn resolve_one(
     scene: &Scene,
-    spec: &ViewSpec,
+    camera: CameraSpec,
+    kind: Kind,
+    options: &ViewOptions,
     limits: &Limits,
-) -> Result<RenderedView> {
+) -> Result<Resolved> {
     let meta = &scene.meta;
     let depth = meta.report.median_depth;
-    let (cameras, kinds) = ([spec.camera], [spec.kind]);
-    let resolved = resolve(limits, &meta.cameras, depth, &cameras, &kinds, &spec.options)?;
-    let one = resolved.first().ok_or_else(|| Error::internal("one camera gave no request"))?;
-    let mut views = one.draw(renderer, scene, meta.id.as_str())?;
-    views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
+    let mut all = resolve(limits, &meta.cameras, depth, &[camera], &[kind], options)?;
+    all.pop().ok_or_else(|| Error::internal("one camera gave no request"))
+}
+
+impl Resolved {
+    /// The first picture, of a scene that is not in the service's store.
+    pub(super) fn draw_one(
+        &self,
+        renderer: &dyn Renderer,
+        scene: &Scene,
+        told: Option<&Told<'_>>,
+    ) -> Result<RenderedView> {
+        let mut views = self.draw(renderer, scene, scene.meta.id.as_str(), told, "")?;
+        views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
+    }
+}
+
+/// Refuses a text without a kind that takes one, and such a kind without a text; gives the text
+/// checked.
+pub(super) fn check_ask(kinds: &[Kind], ask: &Ask, limits: &Limits) -> Result<Ask> {
+    let takes = kinds.iter().find(|kind| kind.takes_text());
+    let text = match (&ask.text, takes) {
+        (None, None) => None,
+        (Some(text), Some(_)) => Some(texts::checked(text, "text", limits)?),
+        (None, Some(kind)) => {
+            return Err(Error::invalid(format!(
+                "kind={} needs text: what to look for",
+                kind.name()
+            )));
+        }
+        (Some(_), None) => {
+            let names: Vec<_> = kinds.iter().map(|kind| kind.name()).collect();
+            return Err(Error::invalid(format!(
+                "text goes with kind=relevancy and kind=mask, not with {}",
+                names.join(", ")
+            )));
+        }
+    };
+    Ok(Ask { text, ..ask.clone() })
 }
 
 /// The near plane of a scene whose median depth is `median_depth`, world units.
@@ -208,28 +371,71 @@ impl Inner {
         })
     }
 
+    /// What the text kinds of a request need, `None` where it has none of them.
+    async fn about(
+        self: &Arc<Self>,
+        id: &SceneId,
+        kinds: &[Kind],
+        ask: Ask,
+    ) -> Result<Option<Arc<About>>> {
+        let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) else { return Ok(None) };
+        let what = format!("kind={}", kind.name());
+        let understood = self.understood(id, &what, ask.wait).await?;
+        Ok(Some(Arc::new(About { understood, ask })))
+    }
+
+    /// Checks what a request asks by text, the bundle first: without networks no text is any good.
+    fn checked_ask(&self, kinds: &[Kind], ask: &Ask) -> Result<Ask> {
+        if let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) {
+            self.can_understand(&format!("kind={}", kind.name()))?;
+        }
+        check_ask(kinds, ask, &self.config.limits)
+    }
+
     /// Renders on a blocking thread within the deadline; encodes each kind.
     async fn render_one(
         self: &Arc<Self>,
         record: Arc<Record>,
         resolved: Resolved,
+        about: Option<Arc<About>>,
         deadline: Instant,
     ) -> Result<Vec<RenderedView>> {
+        let inner = Arc::clone(self);
+        let work = move || {
+            let Some(about) = about else {
+                let scene = inner.load(&record.status.id)?;
+                return resolved.draw(&*inner.renderer, &scene, &scene_tag(&record), None, "");
+            };
+            let Understood { scene, semantics, .. } = &about.understood;
+            let tag = about.understood.tag();
+            let asked = asked_words(&tag, &about.ask);
+            let told = Told::new(&inner.asker, semantics, tag, &about.ask)?;
+            let tag = scene_tag(&record);
+            resolved.draw(&*inner.renderer, scene, &tag, Some(&told), &asked)
+        };
+        self.within(deadline, "the view", work).await
+    }
+
+    /// Does heavy work on a blocking thread, in its turn and within the deadline.
+    pub(super) async fn within<T: Send + 'static>(
+        &self,
+        deadline: Instant,
+        what: &str,
+        work: impl FnOnce() -> Result<T> + Send + 'static,
+    ) -> Result<T> {
         let started = Instant::now();
         let work = async {
             let pass = self.gate.enter().await?;
-            let inner = Arc::clone(self);
             tokio::task::spawn_blocking(move || {
                 let _pass = pass;
-                let scene = inner.load(&record.status.id)?;
-                resolved.draw(&*inner.renderer, &scene, &scene_tag(&record))
+                work()
             })
             .await
-            .map_err(|e| Error::internal("the render was broken off").caused_by(e))?
+            .map_err(|e| Error::internal("the work was broken off").caused_by(e))?
         };
         let late = || {
             let ms = started.elapsed().as_millis();
-            Error::new(ErrorCode::DeadlineExceeded, format!("the view was not ready after {ms} ms"))
+            Error::new(ErrorCode::DeadlineExceeded, format!("{what} was not ready after {ms} ms"))
         };
         if deadline <= started {
             return Err(late());
@@ -237,38 +443,60 @@ impl Inner {
         tokio::time::timeout_at(deadline.into(), work).await.map_err(|_elapsed| late())?
     }
 
-    fn deadline(&self, options: &ViewOptions) -> Instant {
+    pub(super) fn deadline(&self, options: &ViewOptions) -> Instant {
         let most = std::time::Duration::from_millis(self.config.limits.render_timeout_ms);
         Instant::now() + options.deadline.map_or(most, |asked| asked.min(most))
     }
 }
 
+/// What text kinds of one request are answered from.
+struct About {
+    understood: Understood,
+    ask: Ask,
+}
+
+/// What was asked by text, in tags.
+fn asked_words(tag: &str, ask: &Ask) -> String {
+    format!("{tag} {:?} {:?}", ask.text, ask.profile)
+}
+
 impl Service {
-    /// The tag that [`Self::render`] would answer with, without rendering.
+    /// The tag that [`Self::render`] would answer with, without rendering; `None` where it needs
+    /// semantics that are not made yet.
     ///
     /// # Errors
     /// As [`Self::render`], but for what only rendering meets.
-    pub fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<String> {
-        let record = self.inner.finished(id)?;
-        let resolved =
-            resolve_for(&self.inner, &record, &[spec.camera], &[spec.kind], &spec.options)?;
-        Ok(resolved[0].etag(&scene_tag(&record), &self.inner.renderer.name(), spec.kind))
+    pub fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<Option<String>> {
+        let inner = &self.inner;
+        let ask = inner.checked_ask(&[spec.kind], &spec.ask)?;
+        let record = inner.finished(id)?;
+        let resolved = resolve_for(inner, &record, &[spec.camera], &[spec.kind], &spec.options)?;
+        let asked = match (spec.kind.needs_semantics(), &record.semantics_sha256) {
+            (false, _) => String::new(),
+            (true, Some(_)) => asked_words(&meaning_tag(&record), &ask),
+            (true, None) => return Ok(None),
+        };
+        let name = inner.renderer.name();
+        Ok(Some(resolved[0].etag(&scene_tag(&record), &name, spec.kind, &asked)))
     }
 
     /// Renders and encodes one view.
     ///
     /// # Errors
     /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`, `invalid_request`,
-    /// `limit_exceeded`, `overloaded`, `deadline_exceeded`, `gpu_unavailable`.
+    /// `limit_exceeded`, `overloaded`, `deadline_exceeded`, `gpu_unavailable`; for kinds that need
+    /// semantics also what [`Service::query`] says.
     pub async fn render(&self, id: &SceneId, spec: ViewSpec) -> Result<RenderedView> {
         let inner = &self.inner;
+        let kinds = [spec.kind];
+        let ask = inner.checked_ask(&kinds, &spec.ask)?;
         let record = Arc::new(inner.finished(id)?);
-        let mut resolved =
-            resolve_for(inner, &record, &[spec.camera], &[spec.kind], &spec.options)?;
+        let mut resolved = resolve_for(inner, &record, &[spec.camera], &kinds, &spec.options)?;
+        let about = inner.about(id, &kinds, ask).await?;
         let deadline = inner.deadline(&spec.options);
         let one = resolved.remove(0);
         inner
-            .render_one(record, one, deadline)
+            .render_one(record, one, about, deadline)
             .await?
             .pop()
             .ok_or_else(|| Error::internal("a render gave no picture"))
@@ -303,14 +531,28 @@ impl Service {
         let mut kinds = spec.kinds.clone();
         let mut seen = std::collections::HashSet::new();
         kinds.retain(|kind| seen.insert(*kind));
+        let ask = inner.checked_ask(&kinds, &spec.ask)?;
+        if kinds.iter().any(|kind| kind.needs_semantics()) {
+            Inner::may_be_asked(&record, "views")?;
+        }
         let all = resolve_for(&inner, &record, &spec.cameras, &kinds, &spec.options)?;
         let last = spec.options.deadline.map(|asked| Instant::now() + asked);
         let (to, pictures) = mpsc::channel(READY_MAX);
+        let id = id.clone();
         let task = async move {
+            let about = match inner.about(&id, &kinds, ask).await {
+                Ok(about) => about,
+                Err(error) => {
+                    // Whoever stopped listening needs no reason.
+                    let _ = to.send(Err(error)).await;
+                    return;
+                }
+            };
             for one in all {
                 let each = inner.deadline(&ViewOptions::default());
                 let deadline = last.map_or(each, |last| last.min(each));
-                let views = inner.render_one(Arc::clone(&record), one, deadline).await;
+                let views =
+                    inner.render_one(Arc::clone(&record), one, about.clone(), deadline).await;
                 let (views, failed) = match views {
                     Ok(views) => (views.into_iter().map(Ok).collect(), false),
                     Err(error) => (vec![Err(error)], true),

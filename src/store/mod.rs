@@ -227,6 +227,21 @@ impl Store {
         })
     }
 
+    /// Forgets what a scene means, as when the networks that said so are no longer loaded.
+    ///
+    /// # Errors
+    /// `store_unavailable`.
+    pub fn drop_semantics(&self, id: &SceneId) -> Result<()> {
+        self.cache.remove(id);
+        let path = self.folder(id).join(SEMANTICS);
+        match fs::remove_file(&path).and_then(|()| files::sync_parent(&path)) {
+            Err(cause) if cause.kind() != io::ErrorKind::NotFound => {
+                Err(unavailable("forget the scene's semantics", cause))
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// Removes everything of a scene; gone is gone at once, even if power fails.
     ///
     /// # Errors
@@ -265,6 +280,15 @@ pub fn write_scene_file(path: &Path, scene: &Scene) -> Result<String> {
     })
     .map_err(|cause| unavailable("write the scene file", cause))?;
     Ok(digest)
+}
+
+/// Writes what a scene means to any path, whole or not at all; for the command line.
+///
+/// # Errors
+/// `store_unavailable`.
+pub fn write_semantics_file(path: &Path, id: &SceneId, semantics: &Semantics) -> Result<()> {
+    files::write_atomic(path, |to| write_semantics(to, id, semantics).map(drop))
+        .map_err(|cause| unavailable("write the semantics file", cause))
 }
 
 fn write_record(folder: &Path, record: &Record) -> io::Result<()> {

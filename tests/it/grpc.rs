@@ -87,6 +87,7 @@ async fn many_views_stream_in_order_and_equal_single_ones() {
         cameras: vec![between(0, 0.0), between(2, 0.5)],
         kinds: vec![pb::Kind::Color.into(), pb::Kind::Depth.into()],
         options,
+        ..Default::default()
     };
     let mut stream = client.render_views(request).await.unwrap().into_inner();
     let mut views = Vec::new();
@@ -114,7 +115,8 @@ async fn an_export_comes_in_pieces_that_start_with_its_size() {
     let stand = Stand::start().await;
     let mut client = client(&stand).await;
     let scene_id = made(&mut client).await.id;
-    let request = pb::ExportRequest { scene_id, format: pb::ExportFormat::Ply.into() };
+    let format = pb::ExportFormat::Ply.into();
+    let request = pb::ExportRequest { scene_id, format, ..Default::default() };
     let mut chunks = client.export(request).await.unwrap().into_inner();
     let first = chunks.message().await.unwrap().unwrap();
     assert!(first.file_name.ends_with(".ply"), "{}", first.file_name);

@@ -8,14 +8,17 @@ use std::{
 use futures_util::StreamExt;
 use segsplat::{
     error::ErrorCode,
-    scene::{Event, SceneState},
+    scene::{Event, SceneState, ScoringProfile},
     service::{
-        CameraSpec, CreateScene, ExportFormat, Kind, LensSpec, PageRequest, PoseSpec, ViewOptions,
-        ViewSpec, ViewsSpec,
+        Ask, CameraSpec, CreateScene, ExportFormat, Kind, LensSpec, PageRequest, PoseSpec,
+        ViewOptions, ViewsSpec,
     },
 };
 
-use crate::common::server::{PATIENCE, TestServer, WallMaker, upload};
+use crate::common::server::{PATIENCE, TestServer, WallMaker, first_view, upload};
+
+/// Nothing is asked by text.
+const ASK: Ask = Ask { text: None, profile: ScoringProfile::Default, wait: None };
 
 fn request() -> CreateScene {
     CreateScene { upload: upload(), ..CreateScene::default() }
@@ -106,8 +109,7 @@ async fn what_was_acknowledged_is_made_after_a_restart() {
     for id in [&running, &queued] {
         assert_eq!(server.finished(id).await.state, SceneState::Done);
     }
-    let view =
-        ViewSpec { camera: first_camera(), kind: Kind::Color, options: ViewOptions::default() };
+    let view = first_view();
     let before = server.service.render(&running, view.clone()).await.unwrap();
     let server = server.restart().await;
     let after = server.service.render(&running, view).await.unwrap();
@@ -169,6 +171,7 @@ async fn views_come_camera_by_camera_and_tags_tell_pictures_apart() {
         cameras: vec![first_camera(); 3],
         kinds: vec![Kind::Depth, Kind::Color, Kind::Depth],
         options: ViewOptions::default(),
+        ask: Ask::default(),
     };
     let views: Vec<_> = server.service.render_many(&id, &spec).unwrap().collect().await;
     let order: Vec<_> =
@@ -176,9 +179,9 @@ async fn views_come_camera_by_camera_and_tags_tell_pictures_apart() {
     assert_eq!(order.len(), 6, "a kind named twice is drawn once");
     assert_eq!(order[..3], [(0, Kind::Depth), (0, Kind::Color), (1, Kind::Depth)]);
 
-    let one = ViewSpec { camera: first_camera(), kind: Kind::Color, options: spec.options.clone() };
+    let one = first_view();
     let tag = server.service.view_etag(&id, &one).unwrap();
-    assert_eq!(server.service.render(&id, one.clone()).await.unwrap().etag, tag);
+    assert_eq!(server.service.render(&id, one.clone()).await.unwrap().etag, tag.clone().unwrap());
     let mut other = one.clone();
     other.options.background = Some([0.0, 0.0, 0.5]);
     assert_ne!(server.service.view_etag(&id, &other).unwrap(), tag);
@@ -202,7 +205,7 @@ async fn a_scene_spoiled_on_disk_says_so_and_the_server_lives() {
     let middle = file.len() / 2;
     file[middle] ^= 1;
     std::fs::write(&path, file).unwrap();
-    let export = || server.service.export(&id, ExportFormat::Ply);
+    let export = || server.service.export(&id, ExportFormat::Ply, &ASK);
     assert_eq!(export().await.unwrap_err().code(), ErrorCode::SceneCorrupt);
     let status = server.service.get(&id).unwrap();
     assert_eq!(
@@ -210,7 +213,7 @@ async fn a_scene_spoiled_on_disk_says_so_and_the_server_lives() {
         (SceneState::Failed, "scene_corrupt")
     );
     let server = server.restart().await;
-    let again = server.service.export(&id, ExportFormat::Ply).await.unwrap_err();
+    let again = server.service.export(&id, ExportFormat::Ply, &ASK).await.unwrap_err();
     assert_eq!(again.code(), ErrorCode::SceneCorrupt, "also after a restart");
     assert_eq!(server.scene().await.state, SceneState::Done);
 }
@@ -219,7 +222,7 @@ async fn a_scene_spoiled_on_disk_says_so_and_the_server_lives() {
 async fn an_export_has_the_size_it_says() {
     let server = TestServer::start().await;
     let id = server.scene().await.id;
-    let mut export = server.service.export(&id, ExportFormat::Ply).await.unwrap();
+    let mut export = server.service.export(&id, ExportFormat::Ply, &ASK).await.unwrap();
     let (size, mut got) = (export.size_bytes, 0);
     while let Some(chunk) = export.next_chunk().await {
         got += chunk.len() as u64;

@@ -2,13 +2,12 @@
 
 use super::pb;
 use crate::{
-    api::semantics::kind_unavailable,
     error::{Error, Result},
     scene::{CameraToWorld, HealthReport, Intrinsics, ScoringProfile, SemanticsReport, StageTime},
     service::{
-        CameraSpec, Event, ExportFormat, Format, Kind, LensSpec, ModelsInfo, PoseSpec,
-        RenderedView, SceneError, SceneState, SceneStatus, SemanticsMode, SemanticsState,
-        SemanticsStatus, ViewOptions,
+        CameraSpec, Event, ExportFormat, Format, Kind, LensSpec, PoseSpec, RenderedView,
+        SceneError, SceneState, SceneStatus, SemanticsMode, SemanticsState, SemanticsStatus,
+        ViewOptions,
     },
 };
 
@@ -62,7 +61,7 @@ fn semantics_status(status: SemanticsStatus) -> pb::SemanticsStatus {
     }
 }
 
-fn profile(profile: ScoringProfile) -> pb::ScoringProfile {
+pub(super) fn profile(profile: ScoringProfile) -> pb::ScoringProfile {
     match profile {
         ScoringProfile::Default => pb::ScoringProfile::Default,
         ScoringProfile::Paper => pb::ScoringProfile::Paper,
@@ -115,11 +114,11 @@ fn report(report: HealthReport) -> pb::HealthReport {
     }
 }
 
-fn intrinsics(k: Intrinsics) -> pb::Intrinsics {
+pub(super) fn intrinsics(k: Intrinsics) -> pb::Intrinsics {
     pb::Intrinsics { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, width: k.width, height: k.height }
 }
 
-fn matrix(pose: &CameraToWorld) -> Vec<f64> {
+pub(super) fn matrix(pose: &CameraToWorld) -> Vec<f64> {
     pose.to_row_major().to_vec()
 }
 
@@ -195,19 +194,19 @@ fn lens(lens: Option<pb::camera_spec::Lens>) -> LensSpec {
     }
 }
 
-fn vec3(v: &pb::Vec3) -> [f64; 3] {
+pub(super) fn vec3(v: &pb::Vec3) -> [f64; 3] {
     [v.x, v.y, v.z]
 }
 
-/// Which picture; kinds that need a text say what is missing.
-pub(super) fn kind(number: i32, models: &ModelsInfo) -> Result<Kind> {
+/// Which picture.
+pub(super) fn kind(number: i32) -> Result<Kind> {
     match known::<pb::Kind>("kind", number)? {
         pb::Kind::Unspecified | pb::Kind::Color => Ok(Kind::Color),
         pb::Kind::Depth => Ok(Kind::Depth),
         pb::Kind::Alpha => Ok(Kind::Alpha),
-        pb::Kind::Semantics => Err(kind_unavailable("semantics", models)),
-        pb::Kind::Relevancy => Err(kind_unavailable("relevancy", models)),
-        pb::Kind::Mask => Err(kind_unavailable("mask", models)),
+        pb::Kind::Semantics => Ok(Kind::Semantics),
+        pb::Kind::Relevancy => Ok(Kind::Relevancy),
+        pb::Kind::Mask => Ok(Kind::Mask),
     }
 }
 
@@ -239,6 +238,9 @@ pub(super) fn view(view: RenderedView) -> pb::View {
         Kind::Color => pb::Kind::Color,
         Kind::Depth => pb::Kind::Depth,
         Kind::Alpha => pb::Kind::Alpha,
+        Kind::Semantics => pb::Kind::Semantics,
+        Kind::Relevancy => pb::Kind::Relevancy,
+        Kind::Mask => pb::Kind::Mask,
     };
     let format = match view.format {
         Format::Png => pb::Format::Png,
@@ -270,7 +272,7 @@ pub(super) fn export_format(number: i32) -> Result<ExportFormat> {
 }
 
 /// The enum's value of this number; proto3 lets any number through.
-fn known<E: TryFrom<i32>>(name: &str, number: i32) -> Result<E> {
+pub(super) fn known<E: TryFrom<i32>>(name: &str, number: i32) -> Result<E> {
     E::try_from(number)
         .map_err(|_| Error::invalid(format!("{name} is {number}, which is none of its values")))
 }
@@ -281,7 +283,6 @@ mod tests {
 
     #[test]
     fn what_a_message_lacks_is_named() {
-        let models = ModelsInfo::default();
         let message = |error: Error| error.message().to_owned();
         assert!(message(camera(None, "view").unwrap_err()).contains("no camera"));
         let empty = Some(pb::CameraSpec::default());
@@ -291,8 +292,8 @@ mod tests {
             lens: None,
         };
         assert!(message(camera(Some(short), "view").unwrap_err()).contains("12 numbers"));
-        assert!(message(kind(99, &models).unwrap_err()).contains("kind is 99"));
-        assert!(message(kind(6, &models).unwrap_err()).contains("kind=mask"));
+        assert!(message(kind(99).unwrap_err()).contains("kind is 99"));
+        assert_eq!(kind(6).unwrap(), Kind::Mask);
         let odd = pb::ViewOptions { format: -1, ..Default::default() };
         assert!(message(options(Some(odd)).unwrap_err()).contains("format is -1"));
     }

@@ -6,7 +6,7 @@ use futures_util::{Stream, StreamExt, stream};
 use tonic::{Request, Response, Status, Streaming};
 
 use super::{
-    convert,
+    ask, convert,
     pb::{self, create_scene_header::Cameras, create_scene_request::Part},
     status::{logged, unreadable},
 };
@@ -91,6 +91,26 @@ impl pb::scene_service_server::SceneService for Api {
     ) -> Answer<Self::RenderViewsStream> {
         let views = render_many(self, request.into_inner()).map_err(|e| logged(&e))?;
         Ok(Response::new(views))
+    }
+
+    async fn query(&self, request: Request<pb::QueryRequest>) -> Answer<pb::QueryResponse> {
+        let found = async {
+            let request = request.into_inner();
+            let id = request.scene_id.parse()?;
+            Ok(self.service.query(&id, ask::query(request)?).await?)
+        };
+        let found = found.await.map_err(|e: Error| logged(&e))?;
+        Ok(Response::new(ask::answer(found)))
+    }
+
+    async fn pick(&self, request: Request<pb::PickRequest>) -> Answer<pb::PickResponse> {
+        let found = async {
+            let request = request.into_inner();
+            let id = request.scene_id.parse()?;
+            Ok(self.service.pick(&id, ask::pick(request)?).await?)
+        };
+        let found = found.await.map_err(|e: Error| logged(&e))?;
+        Ok(Response::new(ask::picked(found)))
     }
 
     async fn export(&self, request: Request<pb::ExportRequest>) -> Answer<Self::ExportStream> {
@@ -180,35 +200,34 @@ fn begin(
 
 async fn render(api: &Api, request: pb::RenderViewRequest) -> Result<pb::View> {
     let id = request.scene_id.parse()?;
-    let kind = convert::kind(request.kind, &api.service.models())?;
-    if !request.text.is_empty() {
-        return Err(Error::invalid(format!("text goes with no kind={kind:?} picture")));
-    }
+    let kind = convert::kind(request.kind)?;
+    let ask = ask::ask(request.text, request.profile, request.semantics_wait_ms)?;
     let camera = convert::camera(request.camera, "view")?;
     let options = convert::options(request.options)?;
-    let view = api.service.render(&id, ViewSpec { camera, kind, options }).await?;
+    let view = api.service.render(&id, ViewSpec { camera, kind, options, ask }).await?;
     Ok(convert::view(view))
 }
 
 fn render_many(api: &Api, request: pb::RenderViewsRequest) -> Result<Many<pb::View>> {
     let id = request.scene_id.parse()?;
-    let models = api.service.models();
+    let ask = ask::ask(request.text, request.profile, request.semantics_wait_ms)?;
     let kinds = match request.kinds.as_slice() {
         [] => vec![crate::service::Kind::Color],
-        kinds => kinds.iter().map(|kind| convert::kind(*kind, &models)).collect::<Result<_>>()?,
+        kinds => kinds.iter().map(|kind| convert::kind(*kind)).collect::<Result<_>>()?,
     };
     let cameras = request.cameras.into_iter().enumerate();
     let cameras = cameras
         .map(|(i, camera)| convert::camera(Some(camera), &format!("camera {i}")))
         .collect::<Result<_>>()?;
     let options = convert::options(request.options)?;
-    let views = api.service.render_many(&id, &ViewsSpec { cameras, kinds, options })?;
+    let views = api.service.render_many(&id, &ViewsSpec { cameras, kinds, options, ask })?;
     Ok(views.map(|view| view.map(convert::view).map_err(|e| logged(&e))).boxed())
 }
 
 async fn export(api: &Api, request: pb::ExportRequest) -> Result<Many<pb::ExportChunk>> {
     let id = request.scene_id.parse()?;
-    let export = api.service.export(&id, convert::export_format(request.format)?).await?;
+    let ask = ask::ask(request.text, request.profile, request.semantics_wait_ms)?;
+    let export = api.service.export(&id, convert::export_format(request.format)?, &ask).await?;
     let first = pb::ExportChunk {
         size_bytes: Some(export.size_bytes),
         file_name: export.file_name.clone(),

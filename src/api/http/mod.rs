@@ -2,6 +2,7 @@
 //!
 //! [`routes`] is the list of calls; `/openapi.json` is held to it by `tests/it/errors.rs`.
 
+mod ask;
 mod edge;
 mod error;
 mod extract;
@@ -11,6 +12,7 @@ mod params;
 mod receive;
 mod render;
 mod scenes;
+mod schemas;
 mod viewer;
 mod views;
 
@@ -69,6 +71,8 @@ pub fn routes() -> Vec<Route> {
         get("/v1/scenes/{id}/events", scenes::events),
         get("/v1/scenes/{id}/view", render::view),
         post("/v1/scenes/{id}/views", views::views),
+        post("/v1/scenes/{id}/query", ask::query),
+        get("/v1/scenes/{id}/pick", ask::pick),
         get("/v1/scenes/{id}/export", render::export),
         get("/v1/models", health::models),
         get("/healthz", health::live),

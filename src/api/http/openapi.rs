@@ -7,7 +7,7 @@ use utoipa::{
     openapi::{self, RefOr, Response, content::ContentBuilder, response::ResponseBuilder},
 };
 
-use super::{health, render, scenes, viewer, views};
+use super::{ask, health, render, scenes, viewer, views};
 
 /// `GET /openapi.json`
 #[utoipa::path(
@@ -20,16 +20,20 @@ pub(super) async fn document() -> Json<openapi::OpenApi> {
 
 #[derive(OpenApi)]
 #[openapi(
-    info(title = "SegSplat Server", description = "Posed photos in, views at any pose out."),
+    info(
+        title = "SegSplat Server",
+        description = "Posed photos in; views at any pose, and answers to texts, out."
+    ),
     paths(
         scenes::create, scenes::list, scenes::get, scenes::delete, scenes::events, render::view,
-        views::views, render::export, health::models, health::live, health::ready, document,
-        viewer::index,
+        views::views, ask::query, ask::pick, render::export, health::models, health::live,
+        health::ready, document, viewer::index,
     ),
     components(schemas(ErrorBody)),
     tags(
         (name = "scenes", description = "Make, list, show, watch and delete scenes"),
         (name = "views", description = "Pictures and files of a scene"),
+        (name = "texts", description = "Where is it? A scene asked by text"),
         (name = "server", description = "Health, models, this document"),
     ),
     modifiers(&EveryCall),
@@ -146,8 +150,8 @@ pub(super) struct ViewParams {
     width: Option<u32>,
     /// Height, pixels.
     height: Option<u32>,
-    /// `color` (default), `depth` or `alpha`; `semantics`, `relevancy` and `mask` need a bundle
-    /// with semantic networks.
+    /// `color` (default), `depth`, `alpha`, `semantics` (a fixed colour for each entry of the
+    /// bank), `relevancy` or `mask` (of a text).
     kind: Option<String>,
     /// `png`, `jpeg`, `webp` or `npy`; else `Accept` decides, else PNG.
     format: Option<String>,
@@ -160,8 +164,12 @@ pub(super) struct ViewParams {
     near: Option<f32>,
     /// `exact` or `fast`; both are exact now.
     quality: Option<String>,
-    /// Text, for kinds that need one.
+    /// What to look for, for `relevancy` and `mask`.
     text: Option<String>,
+    /// How the text is scored: `default`, or `paper`.
+    profile: Option<String>,
+    /// Milliseconds to wait for semantics that are being made; 0 answers `scene_not_ready` at once.
+    wait_ms: Option<u64>,
     /// Milliseconds after which the call is given up.
     deadline_ms: Option<u64>,
 }
@@ -173,6 +181,12 @@ pub(super) struct ViewParams {
 pub(super) struct ExportParams {
     /// `ply` (default).
     format: Option<String>,
+    /// Writes only what this text selects.
+    text: Option<String>,
+    /// How the text is scored: `default`, or `paper`.
+    profile: Option<String>,
+    /// Milliseconds to wait for semantics that are being made.
+    wait_ms: Option<u64>,
 }
 
 /// Every error.
@@ -417,7 +431,7 @@ pub(super) struct CameraFields {
 pub(super) struct ViewsRequest {
     /// Cameras.
     cameras: Vec<CameraFields>,
-    /// `color`, `depth`, `alpha`; colour by default.
+    /// As in `render_view`; colour by default.
     kinds: Option<Vec<String>>,
     /// Width of every picture, pixels.
     width: Option<u32>,
@@ -431,6 +445,12 @@ pub(super) struct ViewsRequest {
     antialiased: Option<bool>,
     /// Near plane, world units.
     near: Option<f32>,
+    /// What to look for, for `relevancy` and `mask`.
+    text: Option<String>,
+    /// How the text is scored: `default`, or `paper`.
+    profile: Option<String>,
+    /// Milliseconds to wait for semantics that are being made.
+    wait_ms: Option<u64>,
     /// `multipart` or `zip`; else `Accept` decides, else multipart.
     container: Option<String>,
 }

@@ -46,6 +46,13 @@ impl Params {
         Ok(Some(value))
     }
 
+    /// Every value of `name`, in their order.
+    pub(super) fn texts(&mut self, name: &'static str) -> Vec<String> {
+        self.asked.push(name);
+        let mine = |pair: &mut (String, String)| pair.0 == name;
+        self.pairs.extract_if(.., mine).map(|(_, value)| value).collect()
+    }
+
     /// The value of `name` as a number; `what` says which: "a whole number".
     pub(super) fn number<T: FromStr>(
         &mut self,
@@ -138,6 +145,15 @@ mod tests {
         assert!(message(p.numbers::<3>("up").unwrap_err()).contains("\"x\""));
         assert_eq!(p.number::<f64>("t", "a number").unwrap(), Some(0.5));
         assert_eq!(p.whole::<u32>("height").unwrap(), None);
+        p.finish().unwrap();
+    }
+
+    #[test]
+    fn a_list_takes_every_value_in_order_and_leaves_the_rest() {
+        let mut p = params(&[("label", "cup"), ("x", "1"), ("label", "a table")]);
+        assert_eq!(p.texts("label"), ["cup", "a table"]);
+        assert_eq!(p.texts("label"), [""; 0]);
+        assert_eq!(p.whole::<u32>("x").unwrap(), Some(1));
         p.finish().unwrap();
     }
 

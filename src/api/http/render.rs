@@ -1,6 +1,6 @@
 //! One rendered view, and the scene as a file.
 
-use std::convert::Infallible;
+use std::{convert::Infallible, time::Duration};
 
 use axum::{
     Extension,
@@ -19,9 +19,13 @@ use super::{
     params::Params,
 };
 use crate::{
-    api::{Api, camera::CameraFields, semantics::kind_unavailable},
+    api::{
+        Api,
+        camera::CameraFields,
+        semantics::{kind, profile},
+    },
     error::{Error, Result},
-    service::{ExportFormat, Format, Kind, ModelsInfo, RenderedView, ViewOptions, ViewSpec},
+    service::{Ask, ExportFormat, Format, Kind, RenderedView, ViewOptions, ViewSpec},
 };
 
 /// `GET /v1/scenes/{id}/view`
@@ -43,11 +47,11 @@ pub(super) async fn view(
     headers: HeaderMap,
     params: Params,
 ) -> Result<Response, ApiError> {
-    let mut spec = spec_of(params, accept(&headers), &api.service.models())?;
+    let mut spec = spec_of(params, accept(&headers))?;
     spec.options.deadline = deadline.map(|Extension(Deadline(deadline))| deadline);
     if let Some(known) = headers.get(header::IF_NONE_MATCH).and_then(|v| v.to_str().ok()) {
-        let etag = quoted(&api.service.view_etag(&id, &spec)?);
-        if matches_etag(known, &etag) {
+        let etag = api.service.view_etag(&id, &spec)?.map(|etag| quoted(&etag));
+        if let Some(etag) = etag.filter(|etag| matches_etag(known, etag)) {
             return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
         }
     }
@@ -80,8 +84,9 @@ pub(super) async fn export(
             return Err(Error::invalid(format!("format is {shown:?}; it must be ply")).into());
         }
     };
+    let ask = ask(&mut params)?;
     params.finish()?;
-    let export = api.service.export(&id, format).await?;
+    let export = api.service.export(&id, format, &ask).await?;
     let etag = quoted(&export.etag);
     let known = headers.get(header::IF_NONE_MATCH).and_then(|v| v.to_str().ok());
     if known.is_some_and(|known| matches_etag(known, &etag)) {
@@ -132,9 +137,9 @@ pub(super) fn content_type(format: Format) -> &'static str {
     }
 }
 
-fn spec_of(mut params: Params, accept: Option<&str>, models: &ModelsInfo) -> Result<ViewSpec> {
-    let p = &mut params;
-    let fields = CameraFields {
+/// The camera's fields, as separate parameters.
+pub(super) fn camera_fields(p: &mut Params) -> Result<CameraFields> {
+    Ok(CameraFields {
         camera_to_world: p.numbers("camera_to_world")?,
         eye: p.numbers("eye")?,
         target: p.numbers("target")?,
@@ -147,8 +152,22 @@ fn spec_of(mut params: Params, accept: Option<&str>, models: &ModelsInfo) -> Res
         cx: p.number("cx", "a number")?,
         cy: p.number("cy", "a number")?,
         fov: p.number("fov", "a number of degrees")?,
-    };
-    let kind = kind(p.text("kind")?.as_deref().unwrap_or("color"), models)?;
+    })
+}
+
+/// What is asked by text.
+fn ask(p: &mut Params) -> Result<Ask> {
+    Ok(Ask {
+        text: p.text("text")?,
+        profile: profile(p.text("profile")?.as_deref())?,
+        wait: p.whole::<u64>("wait_ms")?.map(Duration::from_millis),
+    })
+}
+
+fn spec_of(mut params: Params, accept: Option<&str>) -> Result<ViewSpec> {
+    let p = &mut params;
+    let fields = camera_fields(p)?;
+    let kind = kind(p.text("kind")?.as_deref().unwrap_or("color"))?;
     let format = match p.text("format")? {
         Some(name) => format(&name)?,
         None => negotiate(accept, kind)?,
@@ -162,9 +181,7 @@ fn spec_of(mut params: Params, accept: Option<&str>, models: &ModelsInfo) -> Res
         near: p.number("near", "a number")?,
         deadline: None,
     };
-    if p.text("text")?.is_some() {
-        return Err(Error::invalid(format!("text goes with no kind={kind:?} picture")));
-    }
+    let ask = ask(p)?;
     if let Some(quality) = p.text("quality")?
         && !["exact", "fast"].contains(&quality.as_str())
     {
@@ -172,23 +189,7 @@ fn spec_of(mut params: Params, accept: Option<&str>, models: &ModelsInfo) -> Res
         return Err(Error::invalid(format!("quality is {shown:?}; it must be exact or fast")));
     }
     params.finish()?;
-    Ok(ViewSpec { camera: fields.spec("view")?, kind, options })
-}
-
-/// The picture kind named `name`.
-pub(super) fn kind(name: &str, models: &ModelsInfo) -> Result<Kind> {
-    match name {
-        "color" => Ok(Kind::Color),
-        "depth" => Ok(Kind::Depth),
-        "alpha" => Ok(Kind::Alpha),
-        "semantics" | "relevancy" | "mask" => Err(kind_unavailable(name, models)),
-        other => {
-            let shown: String = other.chars().take(40).collect();
-            Err(Error::invalid(format!(
-                "kind is {shown:?}; it must be color, depth, alpha, semantics, relevancy or mask"
-            )))
-        }
-    }
+    Ok(ViewSpec { camera: fields.spec("view")?, kind, options, ask })
 }
 
 /// The encoding named `name`.
@@ -243,12 +244,13 @@ fn accept(headers: &HeaderMap) -> Option<&str> {
 /// The encoding of `Accept` with the highest weight that fits the kind; PNG where any will do.
 fn negotiate(accept: Option<&str>, kind: Kind) -> Result<Format> {
     let Some(accept) = accept else { return Ok(Format::Png) };
+    let lossy = !matches!(kind, Kind::Depth | Kind::Semantics | Kind::Mask);
     let mut best: Option<(f32, Format)> = None;
     for range in accept.split(',') {
         let mut pieces = range.split(';').map(str::trim);
         let format = match pieces.next().unwrap_or_default() {
             "image/png" | "image/*" | "*/*" => Format::Png,
-            "image/jpeg" if kind != Kind::Depth => Format::Jpeg,
+            "image/jpeg" if lossy => Format::Jpeg,
             "image/webp" if kind != Kind::Depth => Format::Webp,
             "application/x-npy" => Format::Npy,
             _ => continue,
@@ -263,9 +265,10 @@ fn negotiate(accept: Option<&str>, kind: Kind) -> Result<Format> {
     best.map(|(_, format)| format).ok_or_else(|| {
         let shown: String = accept.chars().take(80).collect();
         Error::invalid(format!(
-            "Accept is {shown:?}; a {} picture can be image/png{}, application/x-npy",
-            if kind == Kind::Depth { "depth" } else { "colour or alpha" },
-            if kind == Kind::Depth { "" } else { ", image/jpeg, image/webp" },
+            "Accept is {shown:?}; a kind={} picture can be image/png{}{}, application/x-npy",
+            kind.name(),
+            if lossy { ", image/jpeg" } else { "" },
+            if kind == Kind::Depth { "" } else { ", image/webp" },
         ))
     })
 }

@@ -3,6 +3,7 @@
 use std::{
     io::{self, Write},
     sync::{Arc, Mutex, PoisonError},
+    time::Duration,
 };
 
 use axum::{
@@ -22,12 +23,16 @@ use super::{
     extract::{Id, JsonBody},
     openapi::{IdParam, ViewsRequest},
     params::Params,
-    render::{background, content_type, format, kind, view_headers},
+    render::{background, content_type, format, view_headers},
 };
 use crate::{
-    api::{Api, camera::CameraFields},
+    api::{
+        Api,
+        camera::CameraFields,
+        semantics::{kind, profile},
+    },
     error::{Error, Result},
-    service::{Format, Kind, ModelsInfo, RenderedView, ViewOptions, ViewsSpec},
+    service::{Ask, Format, Kind, RenderedView, ViewOptions, ViewsSpec},
 };
 
 /// Between the parts of a multipart answer; the pictures' own bytes cannot hold it by accident.
@@ -46,6 +51,9 @@ pub(super) struct ViewsBody {
     #[serde(default)]
     antialiased: bool,
     near: Option<f32>,
+    text: Option<String>,
+    profile: Option<String>,
+    wait_ms: Option<u64>,
     container: Option<String>,
 }
 
@@ -82,7 +90,7 @@ pub(super) async fn views(
 ) -> Result<Response, ApiError> {
     params.finish()?;
     let container = container(body.container.as_deref(), &headers)?;
-    let mut spec = spec_of(body, &api.service.models())?;
+    let mut spec = spec_of(body)?;
     spec.options.deadline = deadline.map(|Extension(Deadline(deadline))| deadline);
     let pictures = api.service.render_many(&id, &spec)?.boxed();
     Ok(match container {
@@ -113,13 +121,13 @@ fn container(asked: Option<&str>, headers: &HeaderMap) -> Result<Container> {
     }
 }
 
-fn spec_of(body: ViewsBody, models: &ModelsInfo) -> Result<ViewsSpec> {
+fn spec_of(body: ViewsBody) -> Result<ViewsSpec> {
     let cameras = body.cameras.iter().enumerate();
     let cameras =
         cameras.map(|(i, fields)| fields.spec(&format!("camera {i}"))).collect::<Result<_>>()?;
     let kinds = match body.kinds {
         None => vec![Kind::Color],
-        Some(names) => names.iter().map(|name| kind(name, models)).collect::<Result<_>>()?,
+        Some(names) => names.iter().map(|name| kind(name)).collect::<Result<_>>()?,
     };
     let background = match body.background {
         None => None,
@@ -135,16 +143,12 @@ fn spec_of(body: ViewsBody, models: &ModelsInfo) -> Result<ViewsSpec> {
         near: body.near,
         deadline: None,
     };
-    Ok(ViewsSpec { cameras, kinds, options })
-}
-
-/// The name of a kind, as asked for.
-fn kind_name(kind: Kind) -> &'static str {
-    match kind {
-        Kind::Color => "color",
-        Kind::Depth => "depth",
-        Kind::Alpha => "alpha",
-    }
+    let ask = Ask {
+        text: body.text,
+        profile: profile(body.profile.as_deref())?,
+        wait: body.wait_ms.map(Duration::from_millis),
+    };
+    Ok(ViewsSpec { cameras, kinds, options, ask })
 }
 
 /// `view-003-depth.png`
@@ -155,7 +159,7 @@ fn file_name(view: &RenderedView) -> String {
         Format::Webp => "webp",
         Format::Npy => "npy",
     };
-    format!("view-{:03}-{}.{extension}", view.camera_index, kind_name(view.kind))
+    format!("view-{:03}-{}.{extension}", view.camera_index, view.kind.name())
 }
 
 /// Parts with the headers of a single view; a fault ends it with a part that holds the error.
@@ -229,7 +233,7 @@ fn index_entry(name: &str, view: &RenderedView) -> serde_json::Value {
     serde_json::json!({
         "file": name,
         "camera_index": view.camera_index,
-        "kind": kind_name(view.kind),
+        "kind": view.kind.name(),
         "content_type": content_type(view.format),
         "camera": view.camera,
         "depth_scale": view.depth_scale,

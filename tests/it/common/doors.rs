@@ -251,6 +251,7 @@ impl Door {
                     kind: ask.kind().into(),
                     options: Some(ask.options()),
                     text: ask.get("text").unwrap_or_default().to_owned(),
+                    ..Default::default()
                 };
                 let view = client.clone().render_view(request).await.map_err(fault_of)?;
                 Ok(view.into_inner().data.to_vec())
@@ -266,7 +267,8 @@ impl Door {
                 bytes(client.get(url).send().await.expect("an answer")).await
             }
             Self::Grpc { client } => {
-                let request = pb::ExportRequest { scene_id: id.to_owned(), format: 1 };
+                let request =
+                    pb::ExportRequest { scene_id: id.to_owned(), format: 1, ..Default::default() };
                 let chunks = client.clone().export(request).await.map_err(fault_of)?;
                 let mut chunks = chunks.into_inner();
                 let (mut file, mut size) = (Vec::new(), None);
@@ -276,6 +278,116 @@ impl Door {
                 }
                 assert_eq!(size, Some(file.len() as u64), "the size said first");
                 Ok(file)
+            }
+        }
+    }
+}
+
+/// What a text found, as far as both doors say the same.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Found {
+    pub(crate) gaussians: u64,
+    pub(crate) parts: usize,
+    pub(crate) warnings: Vec<String>,
+    pub(crate) area: Option<u64>,
+    pub(crate) rle: Option<String>,
+}
+
+impl Door {
+    /// Asks texts, with a camera where one is given.
+    pub(crate) async fn query(
+        &self,
+        id: &str,
+        texts: &[&str],
+        ask: Option<&Ask>,
+        wait_ms: Option<u64>,
+    ) -> Result<Vec<Found>, Fault> {
+        match self {
+            Self::Http { base, client } => {
+                let mut body = serde_json::json!({ "texts": texts, "wait_ms": wait_ms });
+                if let Some(ask) = ask {
+                    let mut camera = serde_json::Map::new();
+                    for (name, value) in &ask.pairs {
+                        let value: Value = serde_json::from_str(value).expect("a number");
+                        if ["width", "height"].contains(name) {
+                            body[*name] = value;
+                        } else {
+                            camera.insert((*name).to_owned(), value);
+                        }
+                    }
+                    body["camera"] = camera.into();
+                }
+                let request = client.post(format!("{base}/v1/scenes/{id}/query")).json(&body);
+                let answer = json(request.send().await.expect("an answer")).await?;
+                let found = |one: &Value| Found {
+                    gaussians: one["gaussians"].as_u64().expect("a count"),
+                    parts: one["parts"].as_array().expect("a list").len(),
+                    warnings: one["warnings"]
+                        .as_array()
+                        .expect("a list")
+                        .iter()
+                        .map(|warning| text(&warning["code"]))
+                        .collect(),
+                    area: one["view"]["area"].as_u64(),
+                    rle: one["view"]["mask_rle"]["counts"].as_str().map(str::to_owned),
+                };
+                Ok(answer["results"].as_array().expect("a list").iter().map(found).collect())
+            }
+            Self::Grpc { client } => {
+                let request = pb::QueryRequest {
+                    scene_id: id.to_owned(),
+                    texts: texts.iter().map(|&text| text.to_owned()).collect(),
+                    camera: ask.map(Ask::camera),
+                    options: ask.map(Ask::options),
+                    semantics_wait_ms: wait_ms,
+                    ..Default::default()
+                };
+                let answer = client.clone().query(request).await.map_err(fault_of)?.into_inner();
+                let found = |one: pb::TextResult| Found {
+                    gaussians: one.gaussians,
+                    parts: one.parts.len(),
+                    warnings: one.warnings.into_iter().map(|warning| warning.code).collect(),
+                    area: one.view.as_ref().map(|view| view.area),
+                    rle: one.view.map(|view| view.mask_rle),
+                };
+                Ok(answer.results.into_iter().map(found).collect())
+            }
+        }
+    }
+
+    /// What lies under a pixel: the Gaussian, its entry, the labels from the best.
+    pub(crate) async fn pick(
+        &self,
+        id: &str,
+        ask: &Ask,
+        at: [f64; 2],
+        labels: &[&str],
+    ) -> Result<(Option<u64>, Option<u64>, Vec<String>), Fault> {
+        let [x, y] = at;
+        match self {
+            Self::Http { base, client } => {
+                let mut pairs = ask.pairs.clone();
+                pairs.extend([("x", x.to_string()), ("y", y.to_string())]);
+                pairs.extend(labels.iter().map(|label| ("label", (*label).to_owned())));
+                let url = url(base, &format!("/v1/scenes/{id}/pick"), &pairs);
+                let picked = json(client.get(url).send().await.expect("an answer")).await?;
+                let labels = picked["labels"].as_array().expect("a list");
+                let labels = labels.iter().map(|label| text(&label["text"])).collect();
+                Ok((picked["gaussian"].as_u64(), picked["entry"].as_u64(), labels))
+            }
+            Self::Grpc { client } => {
+                let request = pb::PickRequest {
+                    scene_id: id.to_owned(),
+                    camera: Some(ask.camera()),
+                    x,
+                    y,
+                    options: Some(ask.options()),
+                    labels: labels.iter().map(|&label| label.to_owned()).collect(),
+                    ..Default::default()
+                };
+                let picked = client.clone().pick(request).await.map_err(fault_of)?.into_inner();
+                let labels = picked.labels.into_iter().map(|label| label.text).collect();
+                Ok((picked.gaussian, picked.entry.map(u64::from), labels))
             }
         }
     }

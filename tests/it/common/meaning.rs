@@ -87,7 +87,6 @@ impl SemanticsMaker for PhotoMeaning {
             masks: vec![1; photos],
             bank_size: photos as u32,
             labelled: index.len() as u64,
-            bundle_sha256: "stand-in".to_owned(),
             ..SemanticsReport::default()
         };
         let rows = (0..photos).flat_map(axis).collect();

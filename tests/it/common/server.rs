@@ -7,7 +7,7 @@ use std::{
     net::SocketAddr,
     sync::{
         Arc,
-        atomic::{AtomicBool, Ordering},
+        atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     time::{Duration, Instant},
 };
@@ -27,8 +27,8 @@ use segsplat::{
         SceneStatus, SourcePixel, Upload,
     },
     service::{
-        CameraSpec, CreateScene, Kind, LensSpec, ModelsInfo, Parts, PoseSpec, Service, ViewOptions,
-        ViewSpec,
+        Ask, CameraSpec, CreateScene, Kind, LensSpec, ModelsInfo, Parts, PoseSpec, Service,
+        ViewOptions, ViewSpec,
     },
 };
 use tempfile::TempDir;
@@ -133,7 +133,7 @@ pub(crate) fn upload() -> Upload {
 pub(crate) fn first_view() -> ViewSpec {
     let pose = PoseSpec::Between { from: 0, to: 1, t: 0.0 };
     let camera = CameraSpec { pose, lens: LensSpec::OfScene };
-    ViewSpec { camera, kind: Kind::Color, options: ViewOptions::default() }
+    ViewSpec { camera, kind: Kind::Color, options: ViewOptions::default(), ask: Ask::default() }
 }
 
 /// Stands in for the network. Held back while `hold` is true, so that tests see work in progress;
@@ -207,6 +207,40 @@ fn wall(photos: &[PosedPhoto]) -> RawGaussians {
         }
     }
     raw
+}
+
+/// [`PointRenderer`] that counts what it drew.
+#[derive(Debug, Default)]
+pub(crate) struct CountingRenderer {
+    /// Views drawn.
+    pub(crate) drawn: AtomicUsize,
+    /// Those with blended labels.
+    pub(crate) blends: AtomicUsize,
+    /// Those with entries.
+    pub(crate) entries: AtomicUsize,
+}
+
+impl CountingRenderer {
+    /// Views drawn, those with blended labels, those with entries.
+    pub(crate) fn counts(&self) -> [usize; 3] {
+        [&self.drawn, &self.blends, &self.entries].map(|count| count.load(Ordering::Acquire))
+    }
+}
+
+impl Renderer for CountingRenderer {
+    fn name(&self) -> String {
+        PointRenderer.name()
+    }
+
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        self.drawn.fetch_add(1, Ordering::AcqRel);
+        match request.labels {
+            Labels::None => {}
+            Labels::Blend(_) => drop(self.blends.fetch_add(1, Ordering::AcqRel)),
+            Labels::Entries => drop(self.entries.fetch_add(1, Ordering::AcqRel)),
+        }
+        PointRenderer.render(gaussians, request)
+    }
 }
 
 /// Draws each Gaussian as the one pixel it falls on, the nearest in front.

@@ -1,0 +1,171 @@
+//! `segsplat query`: texts asked of a scene file that was made with its semantics.
+
+use std::{
+    fmt::Write as _,
+    path::{Path, PathBuf},
+};
+
+use clap::ValueEnum;
+
+use super::{camera::CameraArgs, engine, output::Output, scene_file};
+use crate::{
+    config::{Config, ConfigArgs},
+    error::{Error, ErrorCode, Result},
+    scene::ScoringProfile,
+    service::{Boxes, Local, MaskFormat, QueryAnswer, QuerySpec, TextResult},
+    store::ply::PlyWriter,
+};
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum BoxesArg {
+    Oriented,
+    Aligned,
+    None,
+}
+
+#[derive(Clone, Debug, clap::Args)]
+#[command(allow_negative_numbers = true)]
+pub(super) struct Args {
+    /// Scene file, or a folder with one
+    scene: PathBuf,
+    /// What to look for; several texts are asked at once
+    #[arg(required = true)]
+    texts: Vec<String>,
+    /// Mask of the view (.png), or the Gaussians selected (.ply); of several texts one file each
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+    /// Boxes of the parts
+    #[arg(long, value_enum, default_value = "oriented")]
+    boxes: BoxesArg,
+    /// Score texts as the paper does
+    #[arg(long)]
+    paper: bool,
+    #[command(flatten)]
+    camera: CameraArgs,
+    #[command(flatten)]
+    pub(super) config: ConfigArgs,
+}
+
+pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
+    let ending = args.output.as_deref().map(ending_of).transpose()?;
+    let camera = args.camera.spec()?;
+    if ending == Some(Ending::Png) && camera.is_none() {
+        return Err(super::camera::no_camera());
+    }
+    let profile = if args.paper { ScoringProfile::Paper } else { ScoringProfile::Default };
+    let spec = QuerySpec {
+        texts: args.texts.clone(),
+        camera,
+        options: args.camera.options(),
+        boxes: match args.boxes {
+            BoxesArg::Oriented => Boxes::Oriented,
+            BoxesArg::Aligned => Boxes::Aligned,
+            BoxesArg::None => Boxes::None,
+        },
+        mask: if ending == Some(Ending::Png) { MaskFormat::Png } else { MaskFormat::Rle },
+        profile,
+        ..QuerySpec::default()
+    };
+    let opened = scene_file::open(&args.scene, &config.limits)?;
+    let semantics = engine::semantics(config, true)?;
+    let local = Local::new(semantics, engine::renderer(config)?, config.limits.clone());
+    let answer = local.query(&opened.scene, &spec)?;
+    let mut text = String::new();
+    for (i, found) in answer.results.iter().enumerate() {
+        tell(&mut text, found);
+        let Some(output) = &args.output else { continue };
+        let path = numbered(output, i, answer.results.len());
+        match ending {
+            Some(Ending::Ply) => {
+                let chosen = local.select(&opened.scene, &found.text, profile)?;
+                let file: Vec<u8> = PlyWriter::new(&chosen).flatten().collect();
+                write(&path, &file)?;
+            }
+            _ => {
+                let mask = found.view.as_ref().and_then(|view| view.mask_png.as_deref());
+                write(&path, mask.unwrap_or_default())?;
+            }
+        }
+        let _ = writeln!(text, "  written to {}", path.display());
+    }
+    out.answer(&text, &without_pictures(answer))
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Ending {
+    Png,
+    Ply,
+}
+
+fn ending_of(path: &Path) -> Result<Ending> {
+    let end = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+    match end.as_str() {
+        "png" => Ok(Ending::Png),
+        "ply" => Ok(Ending::Ply),
+        _ => Err(Error::invalid(format!(
+            "{}: the ending says what is written: png (the mask) or ply (the Gaussians)",
+            path.display()
+        ))),
+    }
+}
+
+/// `mask.png` of one text, `mask-2.png` of the third of several.
+fn numbered(path: &Path, i: usize, count: usize) -> PathBuf {
+    if count == 1 {
+        return path.to_owned();
+    }
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    let end = path.extension().unwrap_or_default().to_string_lossy();
+    path.with_file_name(format!("{stem}-{i}.{end}"))
+}
+
+fn write(path: &Path, file: &[u8]) -> Result<()> {
+    fs_err::write(path, file).map_err(|e| {
+        let what = format!("{}: cannot be written: {}", path.display(), e.kind());
+        Error::new(ErrorCode::StoreUnavailable, what).caused_by(e)
+    })
+}
+
+fn tell(text: &mut String, found: &TextResult) {
+    // Writing to a string does not fail.
+    let best = found.scores.iter().copied().fold(0.0, f32::max);
+    let _ = writeln!(
+        text,
+        "{:?}: {} Gaussians in {} parts, {} of {} entries, best score {best:.2}",
+        found.text,
+        found.gaussians,
+        found.parts.len(),
+        found.entries.len(),
+        found.scores.len(),
+    );
+    for part in &found.parts {
+        let [x, y, z] = part.center;
+        let [a, b, c] = part.size;
+        let _ = writeln!(
+            text,
+            "  part of {} at {x:.3}, {y:.3}, {z:.3}: {a:.3} x {b:.3} x {c:.3}",
+            part.gaussians
+        );
+    }
+    if let Some(view) = &found.view {
+        let _ = match (view.bbox, view.peak) {
+            (Some([left, top, width, height]), Some(peak)) => writeln!(
+                text,
+                "  in view: {} px in {width}x{height} at {left},{top}; peak {:.2} at {},{}",
+                view.area, peak.relevancy, peak.x, peak.y
+            ),
+            _ => writeln!(text, "  not in view"),
+        };
+    }
+    for warning in &found.warnings {
+        let _ = writeln!(text, "  warning {}: {}", warning.code, warning.message);
+    }
+}
+
+/// What was written to files needs no second copy in the answer.
+fn without_pictures(mut answer: QueryAnswer) -> QueryAnswer {
+    for view in answer.results.iter_mut().filter_map(|found| found.view.as_mut()) {
+        view.mask_png = None;
+    }
+    answer
+}

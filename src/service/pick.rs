@@ -1,0 +1,149 @@
+//! What lies under a pixel: the ray's own Gaussians, one by one, as the renderers blend them.
+
+use std::sync::Arc;
+
+use super::{
+    Inner, Service,
+    semantics::Understood,
+    texts,
+    types::{Kind, Label, PickSpec, Picked},
+    view::{Resolved, resolve_for},
+};
+use crate::{
+    error::{Error, Result},
+    render::{
+        Kinds, RenderRequest,
+        oracle::{Contribution, contributions},
+    },
+    scene::{Gaussians, Scene, SceneId},
+};
+
+/// Share of the light that reaches what is behind, under which nothing is looked for there.
+const THROUGH_MIN: f64 = 0.01;
+
+/// The Gaussians that a pixel sees, by their number in the scene, front to back.
+fn seen_at(scene: &Scene, request: &RenderRequest, pixel: [u32; 2]) -> Result<Vec<Contribution>> {
+    let camera = &request.camera;
+    let along = |gaussians: &Gaussians| {
+        let magnified = scene.magnified(gaussians, camera);
+        contributions(magnified.as_deref().unwrap_or(gaussians), request, pixel)
+    };
+    let layers = scene.layers(camera);
+    let Some([front, behind]) = layers.as_deref() else { return along(&scene.gaussians) };
+    let numbered = |layer: &Gaussians, mut found: Vec<Contribution>| {
+        // A layer holds whole photos, in the scene's order.
+        let views: std::collections::HashSet<u16> =
+            layer.source().iter().map(|source| source.view).collect();
+        let all = scene.gaussians.source().iter().enumerate();
+        let numbers: Vec<usize> =
+            all.filter(|(_, source)| views.contains(&source.view)).map(|(i, _)| i).collect();
+        for one in &mut found {
+            one.gaussian = numbers.get(one.gaussian).copied().unwrap_or(one.gaussian);
+        }
+        found
+    };
+    let mut found = numbered(front, along(front)?);
+    let through = 1.0 - found.iter().map(|one| one.weight).sum::<f64>();
+    if through > THROUGH_MIN {
+        let under = numbered(behind, along(behind)?);
+        found.extend(
+            under.into_iter().map(|one| Contribution { weight: one.weight * through, ..one }),
+        );
+    }
+    Ok(found)
+}
+
+/// Depth, point and Gaussian of a pixel of a view.
+pub(super) fn pick(scene: &Scene, view: &Resolved, x: f64, y: f64) -> Result<Picked> {
+    let request = view.labels_request(Kinds::NONE);
+    let lens = request.camera.intrinsics;
+    let pixel = [(x, lens.width, "x", "wide"), (y, lens.height, "y", "high")];
+    let mut whole = [0; 2];
+    for (whole, (value, size, name, side)) in whole.iter_mut().zip(pixel) {
+        if !(0.0..f64::from(size)).contains(&value) {
+            return Err(Error::invalid(format!(
+                "{name} is {value}; the picture is {size} px {side}"
+            )));
+        }
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked")]
+        let at = value.floor() as u32;
+        *whole = at;
+    }
+    let found = seen_at(scene, &request, whole)?;
+    let alpha: f64 = found.iter().map(|one| one.weight).sum();
+    #[expect(clippy::cast_possible_truncation, reason = "0 to 1")]
+    let mut picked = Picked { alpha: alpha as f32, ..Picked::default() };
+    if alpha <= 0.0 {
+        return Ok(picked);
+    }
+    let depth = found.iter().map(|one| one.weight * one.depth).sum::<f64>() / alpha;
+    let [u, v] = whole.map(|at| f64::from(at) + 0.5);
+    let point = lens.unproject(u, v, depth);
+    let world = request.camera.camera_to_world.matrix().transform_point3(point);
+    picked.depth = Some(depth);
+    picked.point = Some(world.to_array());
+    let strongest = found.iter().max_by(|a, b| a.weight.total_cmp(&b.weight));
+    if let Some(one) = strongest {
+        picked.gaussian = Some(one.gaussian as u64);
+        let entry = scene.gaussians.semantic_index().get(one.gaussian).copied().unwrap_or(0);
+        picked.entry = Some(entry).filter(|&m| m > 0 && scene.semantics.is_some());
+    }
+    Ok(picked)
+}
+
+impl Inner {
+    fn labels(
+        &self,
+        understood: &Understood,
+        spec: &PickSpec,
+        labels: &[String],
+        entry: u16,
+    ) -> Result<Vec<Label>> {
+        let tag = understood.tag();
+        let scorer = self.asker.scorer(&tag, &understood.semantics, spec.profile)?;
+        let asked = self.asker.ask(&scorer, labels)?.into_iter();
+        let score = |scores: &[f32]| scores.get(usize::from(entry)).copied().unwrap_or(0.0);
+        let mut named: Vec<Label> = asked
+            .map(|one| Label { relevancy: score(one.scores.entries()), text: one.text })
+            .collect();
+        named.sort_by(|a, b| b.relevancy.total_cmp(&a.relevancy));
+        Ok(named)
+    }
+}
+
+impl Service {
+    /// What lies under a pixel of a view: depth, point, Gaussian, entry of the bank, and how well
+    /// the labels given name it. Without labels no semantics are made for it.
+    ///
+    /// # Errors
+    /// As [`Service::query`] where labels are given, else as [`Service::render`].
+    pub async fn pick(&self, id: &SceneId, spec: PickSpec) -> Result<Picked> {
+        let inner = &self.inner;
+        let record = inner.finished(id)?;
+        let cameras = [spec.camera];
+        let view = resolve_for(inner, &record, &cameras, &[Kind::Alpha], &spec.options)?.pop();
+        let view = view.ok_or_else(|| Error::internal("one camera gave no request"))?;
+        let (labels, understood) = if spec.labels.is_empty() {
+            (Vec::new(), None)
+        } else {
+            inner.can_understand("labels")?;
+            let labels = texts::all_checked(&spec.labels, "labels", self.limits())?;
+            (labels, Some(inner.understood(id, "labels", spec.wait).await?))
+        };
+        let deadline = inner.deadline(&spec.options);
+        let (work, id) = (Arc::clone(inner), id.clone());
+        inner
+            .within(deadline, "the pick", move || {
+                let scene = match &understood {
+                    Some(understood) => Arc::clone(&understood.scene),
+                    None => work.load(&id)?,
+                };
+                let mut picked = pick(&scene, &view, spec.x, spec.y)?;
+                if let (Some(understood), Some(entry)) = (&understood, picked.entry) {
+                    picked.labels = work.labels(understood, &spec, &labels, entry)?;
+                }
+                Ok(picked)
+            })
+            .await
+    }
+}

@@ -1,0 +1,400 @@
+//! What texts find: in space, in a view, under a pixel, in an export; how often a view is drawn
+//! for them; and what each bad text is told by both doors.
+
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, atomic::Ordering},
+    time::Duration,
+};
+
+use segsplat::{
+    error::ErrorCode,
+    scene::{SceneId, SceneOptions, ScoringProfile, SemanticsMode, SemanticsState},
+    service::{
+        Ask as AskText, Boxes, CreateScene, ExportFormat, Format, Kind, MaskFormat, PickSpec,
+        QuerySpec, Rle, ViewOptions, ViewSpec,
+    },
+};
+
+use crate::common::{
+    doors::{Ask, both, bytes, json},
+    meaning::PhotoMeaning,
+    server::{CountingRenderer, PATIENCE, TestServer, first_view, upload},
+};
+
+struct Fixture {
+    server: TestServer,
+    meaning: Arc<PhotoMeaning>,
+    renderer: Arc<CountingRenderer>,
+}
+
+async fn fixture() -> Fixture {
+    let meaning = Arc::new(PhotoMeaning::default());
+    let renderer = Arc::new(CountingRenderer::default());
+    let (given, drawing) = (Arc::clone(&meaning), Arc::clone(&renderer));
+    let server = TestServer::with(|_, parts| {
+        parts.semantics = given;
+        parts.renderer = drawing;
+    });
+    Fixture { server: server.await, meaning, renderer }
+}
+
+impl Fixture {
+    async fn scene(&self, semantics: SemanticsMode) -> SceneId {
+        let options = SceneOptions { semantics, ..SceneOptions::default() };
+        let wait = Some(PATIENCE);
+        let request = CreateScene { upload: upload(), options, wait, ..CreateScene::default() };
+        self.server.service.create_scene(request).await.expect("a good upload").status.id
+    }
+}
+
+fn texts(texts: &[&str]) -> Vec<String> {
+    texts.iter().map(|&text| text.to_owned()).collect()
+}
+
+fn in_view(asked: &[&str]) -> QuerySpec {
+    let view = first_view();
+    QuerySpec { texts: texts(asked), camera: Some(view.camera), ..QuerySpec::default() }
+}
+
+fn view(kind: Kind, text: Option<&str>, format: Format) -> ViewSpec {
+    let ask = AskText { text: text.map(str::to_owned), ..AskText::default() };
+    let options = ViewOptions { format, ..ViewOptions::default() };
+    ViewSpec { kind, options, ask, ..first_view() }
+}
+
+/// Whether each pixel of an 8-bit grey PNG is white; black is the only other value.
+fn white(png: &[u8]) -> Vec<bool> {
+    let picture = image::load_from_memory(png).unwrap().to_luma8();
+    picture
+        .pixels()
+        .map(|p| match p.0[0] {
+            0 => false,
+            255 => true,
+            other => panic!("a mask with {other}"),
+        })
+        .collect()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_text_finds_its_gaussians_in_space_and_in_a_view() {
+    let Fixture { server, meaning, .. } = &fixture().await;
+    let fixture = &server.service;
+    let status = server.scene().await;
+    let spec = QuerySpec {
+        mask: MaskFormat::Png,
+        relevancy: true,
+        ..in_view(&["photo 1", " photo 7 ", "photo 0"])
+    };
+    let answer = fixture.query(&status.id, spec.clone()).await.unwrap();
+    assert_eq!((answer.bank_size, answer.results.len()), (3, 3));
+    let [one, absent, first] = &answer.results[..] else { panic!("three texts") };
+    let each = status.report.unwrap().gaussians / 3;
+    assert_eq!((one.entries.as_slice(), one.gaussians), (&[2_u16][..], each));
+    assert!(one.scores[1] > 0.99 && one.scores[0] < 0.51 && one.scores.len() == 3);
+    assert!((absent.text.as_str(), absent.gaussians, absent.parts.len()) == ("photo 7", 0, 0));
+    let part = &one.parts[0];
+    assert!(part.gaussians <= each && part.size.iter().all(|side| *side >= 0.0), "{part:?}");
+    // The wall stands at one depth of camera 1 and is as wide as its photo there.
+    assert!(part.center[2].is_finite() && part.size[0] > 0.1, "{part:?}");
+
+    let camera = answer.camera.unwrap().intrinsics;
+    let seen = first.view.as_ref().unwrap();
+    let mask = white(seen.mask_png.as_ref().unwrap());
+    assert_eq!(mask.len(), (camera.width * camera.height) as usize);
+    assert_eq!(mask.iter().filter(|on| **on).count() as u64, seen.area);
+    assert!(seen.area > 0, "photo 0 is what camera 0 sees");
+    let [left, top, width, height] = seen.bbox.unwrap();
+    assert!(left + width <= camera.width && top + height <= camera.height);
+    let inside = |i: usize| {
+        let (x, y) = (i as u32 % camera.width, i as u32 / camera.width);
+        (left..left + width).contains(&x) && (top..top + height).contains(&y)
+    };
+    assert!(mask.iter().enumerate().all(|(i, on)| !on || inside(i)), "a pixel outside its box");
+    let peak = seen.peak.unwrap();
+    assert!(mask[(peak.y * camera.width + peak.x) as usize] && peak.relevancy > 0.99);
+    let relevancy = image::load_from_memory(seen.relevancy_png.as_ref().unwrap()).unwrap();
+    let relevancy = relevancy.to_luma8();
+    assert!(mask.iter().zip(relevancy.pixels()).all(|(on, p)| *on == (p.0[0] > 127)));
+    let nothing = absent.view.as_ref().unwrap();
+    assert_eq!((nothing.area, nothing.bbox, nothing.peak), (0, None, None));
+
+    let spec = QuerySpec { mask: MaskFormat::Rle, boxes: Boxes::None, ..spec };
+    let answer = fixture.query(&status.id, spec).await.unwrap();
+    let rle = answer.results[2].view.as_ref().unwrap().mask_rle.clone();
+    assert_eq!(rle.unwrap(), Rle::encode(&mask, camera.width, camera.height));
+    assert!(answer.results[0].parts.is_empty(), "no boxes were asked for");
+    assert_eq!(meaning.made.load(Ordering::Acquire), 1);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_hundred_texts_take_one_drawing_and_a_known_view_takes_none() {
+    let fixture = fixture().await;
+    let id = fixture.scene(SemanticsMode::Lazy).await;
+    let hundred: Vec<String> = (0..100).map(|i| format!("text {i}")).collect();
+    let spec = QuerySpec { texts: hundred.clone(), ..in_view(&[]) };
+    let service = &fixture.server.service;
+    let answer = service.query(&id, spec.clone()).await.unwrap();
+    assert_eq!((answer.results.len(), fixture.renderer.counts()), (100, [1, 0, 1]));
+    assert!(answer.render_ms.unwrap() > 0.0);
+    // 100 texts and the three canonical phrases.
+    assert_eq!(fixture.meaning.embedded.load(Ordering::Acquire), 103);
+    let again = service.query(&id, spec).await.unwrap();
+    assert_eq!(again.render_ms, Some(0.0));
+    assert_eq!(again.results, answer.results);
+    service.query(&id, in_view(&["photo 2"])).await.unwrap();
+    for (kind, text) in [(Kind::Mask, Some("photo 0")), (Kind::Relevancy, Some("new"))] {
+        service.render(&id, view(kind, text, Format::Png)).await.unwrap();
+    }
+    service.render(&id, view(Kind::Semantics, None, Format::Png)).await.unwrap();
+    assert_eq!(fixture.renderer.counts(), [1, 0, 1], "E of the view answers every text");
+    assert_eq!(fixture.meaning.embedded.load(Ordering::Acquire), 106, "three new words");
+    let paper = QuerySpec { profile: ScoringProfile::Paper, ..in_view(&["photo 2"]) };
+    let paper = service.query(&id, paper).await.unwrap();
+    assert_eq!((paper.profile, paper.render_ms), (ScoringProfile::Paper, Some(0.0)));
+    let wide = ViewOptions { width: Some(40), ..ViewOptions::default() };
+    let other = QuerySpec { options: wide, ..in_view(&["photo 2"]) };
+    service.query(&id, other).await.unwrap();
+    assert_eq!(fixture.renderer.counts(), [2, 0, 2], "another size is another view");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_mask_alone_is_a_blend_and_equals_the_mask_of_the_entries() {
+    let fixture = fixture().await;
+    let id = fixture.scene(SemanticsMode::Lazy).await;
+    let service = &fixture.server.service;
+    let mask = || view(Kind::Mask, Some("photo 0"), Format::Png);
+    assert_eq!(service.view_etag(&id, &mask()).unwrap(), None, "nobody knows it yet");
+    let blended = service.render(&id, mask()).await.unwrap();
+    assert_eq!(fixture.renderer.counts(), [1, 1, 0]);
+    assert!(white(&blended.bytes).contains(&true) && white(&blended.bytes).contains(&false));
+    service.query(&id, in_view(&["photo 1"])).await.unwrap();
+    let kept = service.render(&id, mask()).await.unwrap();
+    assert_eq!((kept.bytes, &kept.etag), (blended.bytes, &blended.etag));
+    assert_eq!(fixture.renderer.counts(), [2, 1, 1]);
+    assert_eq!(service.view_etag(&id, &mask()).unwrap().unwrap(), blended.etag);
+    let mut other = mask();
+    other.ask.text = Some("photo 1".to_owned());
+    assert_ne!(service.view_etag(&id, &other).unwrap().unwrap(), blended.etag);
+
+    let numbers = service.render(&id, view(Kind::Semantics, None, Format::Npy)).await.unwrap();
+    let entries: Vec<f32> =
+        numbers.bytes[128..].chunks(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
+    assert!(entries.iter().all(|m| [0.0, 1.0, 2.0, 3.0].contains(m)));
+    let own: Vec<bool> = entries.iter().map(|m| (m - 1.0).abs() < 0.5).collect();
+    let mask = service.render(&id, mask()).await.unwrap();
+    assert_eq!(white(&mask.bytes), own, "photo 0 is entry 1");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_pick_tells_depth_point_gaussian_entry_and_labels() {
+    let fixture = fixture().await;
+    let id = fixture.scene(SemanticsMode::Lazy).await;
+    let service = &fixture.server.service;
+    let pick = |labels: &[&str]| PickSpec {
+        camera: first_view().camera,
+        x: 30.5,
+        y: 20.5,
+        options: ViewOptions::default(),
+        labels: texts(labels),
+        profile: ScoringProfile::Default,
+        wait: None,
+    };
+    let bare = service.pick(&id, pick(&[])).await.unwrap();
+    assert!(bare.alpha > 0.5 && bare.gaussian.is_some(), "{bare:?}");
+    assert_eq!((bare.entry, bare.labels.len()), (None, 0));
+    let state = service.get(&id).unwrap().semantics.state;
+    assert_eq!(state, SemanticsState::None, "a pick without labels asks for no semantics");
+    let named = service.pick(&id, pick(&["photo 2", "photo 0", "photo 1"])).await.unwrap();
+    assert_eq!((named.gaussian, named.depth), (bare.gaussian, bare.depth));
+    let entry = named.entry.unwrap();
+    assert_eq!(named.labels[0].text, format!("photo {}", entry - 1), "the best label first");
+    assert!(named.labels[0].relevancy > 0.99 && named.labels[1].relevancy < 0.51);
+    // The point lies at the depth, and the view from there sees it at the pixel.
+    let camera = service.get(&id).unwrap().cameras[0].camera;
+    let at = camera.camera_to_world.viewmat().transform_point3(named.point.unwrap().into());
+    assert!((at.z - named.depth.unwrap()).abs() < 1e-9);
+    let (u, v) = camera.intrinsics.project(at);
+    assert!((u - 30.5).abs() < 1e-6 && (v - 20.5).abs() < 1e-6, "{u} {v}");
+    let outside = PickSpec { x: 64.0, ..pick(&[]) };
+    let error = service.pick(&id, outside).await.unwrap_err();
+    assert_eq!(error.message(), "x is 64; the picture is 64 px wide");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_export_of_a_text_holds_what_it_selects() {
+    let fixture = fixture().await;
+    let id = fixture.scene(SemanticsMode::Lazy).await;
+    let service = &fixture.server.service;
+    let export = async |text: Option<&str>| {
+        let ask = AskText { text: text.map(str::to_owned), ..AskText::default() };
+        let mut export = service.export(&id, ExportFormat::Ply, &ask).await.unwrap();
+        let (size, etag) = (export.size_bytes, export.etag.clone());
+        let mut file = Vec::new();
+        while let Some(piece) = export.next_chunk().await {
+            file.extend(piece);
+        }
+        assert_eq!(size, file.len() as u64);
+        let count = String::from_utf8_lossy(&file[..400])
+            .lines()
+            .find_map(|line| line.strip_prefix("element vertex ")?.parse::<u64>().ok())
+            .expect("a PLY with vertices");
+        (count, etag)
+    };
+    let (all, whole) = export(None).await;
+    let (part, etag) = export(Some("photo 2")).await;
+    assert_eq!(part * 3, all);
+    assert_ne!(etag, whole);
+    assert_eq!(export(Some("photo 7")).await.0, 0, "a text that selects nothing");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn bad_texts_are_told_each_what_is_wrong_by_both_doors() {
+    let fixture = fixture().await;
+    let id = fixture.scene(SemanticsMode::Lazy).await.to_string();
+    let off = fixture.scene(SemanticsMode::Off).await.to_string();
+    let long = "x".repeat(10_000);
+    let many: Vec<&str> = vec!["chair"; 129];
+    fixture.server.service.understand(&id.parse().unwrap(), None).await.unwrap();
+    let cases: Vec<(&str, &str, Vec<&str>, &str, &str)> = vec![
+        ("empty", &id, vec!["chair", ""], "invalid_request", "texts[1] is empty"),
+        ("no texts", &id, vec![], "invalid_request", "give 1 to 128"),
+        ("long", &id, vec![&long], "limit_exceeded", "10000 characters is over 256"),
+        ("control", &id, vec!["a\u{1b}b"], "invalid_request", "U+001B at 1"),
+        ("129 texts", &id, many, "limit_exceeded", "texts: 129 is over 128"),
+        ("off", &off, vec!["chair"], "semantics_off", "semantics=off"),
+    ];
+    for door in both(fixture.server.addr).await {
+        let mut messages = BTreeMap::new();
+        for (case, id, texts, code, words) in &cases {
+            let fault = door.query(id, texts, None, None).await.expect_err(case);
+            let case = format!("{case} by {}", door.name());
+            assert_eq!(&fault.code, code, "{case}: {}", fault.message);
+            assert!(fault.message.contains(words), "{case}: {:?} lacks {words:?}", fault.message);
+            if let Some(other) = messages.insert(fault.message.clone(), case.clone()) {
+                panic!("{case} and {other} say the same");
+            }
+        }
+        let view = Ask::first();
+        let found = door.query(&id, &["🦊", "кресло", "?zzz"], Some(&view), None).await.unwrap();
+        assert!(found.iter().all(|one| one.gaussians == 0 && one.area == Some(0)), "{found:?}");
+        assert_eq!(found[2].warnings, ["unknown_words"], "it knows no word of it");
+        assert!(found[0].warnings.is_empty());
+        let found = door.query(&id, &["photo 0"], Some(&view), None).await.unwrap();
+        assert!(found[0].gaussians > 0 && found[0].parts > 0 && found[0].area > Some(0));
+        for (ask, words) in [
+            (view.clone().with("kind", "mask"), "kind=mask needs text"),
+            (
+                view.clone().with("kind", "mask").with("text", "a").with("format", "jpeg"),
+                "does not survive JPEG",
+            ),
+        ] {
+            let fault = door.view(&id, &ask).await.expect_err(words);
+            assert_eq!(fault.code, "invalid_request");
+            assert!(fault.message.contains(words), "{}", fault.message);
+        }
+        let (gaussian, entry, labels) =
+            door.pick(&id, &view, [32.0, 24.0], &["photo 1", "photo 0"]).await.unwrap();
+        assert!(gaussian.is_some() && entry.is_some() && labels.len() == 2);
+        let fault = door.pick(&id, &view, [-1.0, 2.0], &[]).await.unwrap_err();
+        assert!(fault.message.contains("x is -1"), "{}", fault.message);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_query_while_semantics_run_waits_or_is_told_how_far_they_are() {
+    let fixture = fixture().await;
+    fixture.meaning.hold.store(true, Ordering::Release);
+    let id = fixture.scene(SemanticsMode::Lazy).await.to_string();
+    for door in both(fixture.server.addr).await {
+        let fault = door.query(&id, &["photo 0"], None, Some(0)).await.unwrap_err();
+        assert_eq!(fault.code, "scene_not_ready", "{}", fault.message);
+        assert!(fault.message.contains("are being made"), "{}", fault.message);
+        assert_eq!(fault.retry_after.as_deref(), Some("2"), "{}", door.name());
+        let view = Ask::first().with("width", 32);
+        door.view(&id, &view).await.expect("it can be viewed meanwhile");
+    }
+    let [http, grpc] = both(fixture.server.addr).await;
+    let let_go = async {
+        tokio::time::sleep(Duration::from_millis(50)).await;
+        fixture.meaning.hold.store(false, Ordering::Release);
+    };
+    let (a, b, ()) = tokio::join!(
+        http.query(&id, &["photo 0"], None, None),
+        grpc.query(&id, &["photo 0"], None, None),
+        let_go
+    );
+    assert_eq!(a.unwrap(), b.unwrap(), "both doors say the same");
+    assert_eq!(fixture.meaning.made.load(Ordering::Acquire), 1);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_bundle_without_a_text_tower_says_so_to_every_text_call() {
+    let meaning = PhotoMeaning { lack: Some("no text tower"), ..PhotoMeaning::default() };
+    let server = TestServer::with(|_, parts| parts.semantics = Arc::new(meaning)).await;
+    let id = server.scene().await.id;
+    for door in both(server.addr).await {
+        let view = Ask::first().with("kind", "mask");
+        let faults = [
+            door.query(id.as_str(), &["chair"], None, None).await.unwrap_err(),
+            door.view(id.as_str(), &view).await.unwrap_err(),
+            door.pick(id.as_str(), &Ask::first(), [3.0, 3.0], &["chair"]).await.unwrap_err(),
+        ];
+        for fault in faults {
+            assert_eq!(fault.code, "model_unavailable", "{}", fault.message);
+            assert!(fault.message.contains("no text tower"), "{}", fault.message);
+        }
+    }
+    let export = format!("/v1/scenes/{id}/export?text=chair");
+    let fault = bytes(reqwest::get(server.url(&export)).await.unwrap()).await.unwrap_err();
+    assert_eq!(fault.code, ErrorCode::ModelUnavailable.name());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn http_gives_pictures_of_texts_as_files_and_in_json() {
+    let fixture = fixture().await;
+    let id = fixture.scene(SemanticsMode::Eager).await;
+    let server = &fixture.server;
+    let client = reqwest::Client::new();
+    let path = format!("/v1/scenes/{id}/view?from=0&width=32&height=24&kind=mask&text=photo+0");
+    let first = client.get(server.url(&path)).send().await.unwrap();
+    assert_eq!(first.headers()["content-type"], "image/png");
+    let tag = first.headers()["etag"].clone();
+    let again = client.get(server.url(&path)).header("if-none-match", tag).send().await.unwrap();
+    assert_eq!(again.status(), 304);
+    let picky = client.get(server.url(&path)).header("accept", "image/jpeg").send().await.unwrap();
+    assert!(bytes(picky).await.unwrap_err().message.contains("kind=mask"));
+
+    let url = server.url(&format!("/v1/scenes/{id}/views"));
+    let body = serde_json::json!({
+        "cameras": [{ "from": 0 }], "kinds": ["color", "mask", "semantics"], "text": "photo 0",
+        "width": 32, "height": 24, "container": "zip",
+    });
+    let before = fixture.renderer.counts()[0];
+    let answer = client.post(url).json(&body).send().await.unwrap();
+    let file = std::io::Cursor::new(answer.bytes().await.unwrap());
+    let names: Vec<String> = zip::ZipArchive::new(file)
+        .unwrap()
+        .file_names()
+        .map(|name| name.unwrap().into_owned())
+        .collect();
+    assert!(names.contains(&"view-000-mask.png".to_owned()), "{names:?}");
+    assert_eq!(fixture.renderer.counts()[0], before + 1, "one drawing for three kinds");
+
+    let url = server.url(&format!("/v1/scenes/{id}/query"));
+    let body = serde_json::json!({
+        "texts": ["photo 0"], "camera": { "from": 0 }, "width": 32, "height": 24, "mask": "png",
+        "boxes": "aligned",
+    });
+    let answer = json(client.post(url.clone()).json(&body).send().await.unwrap()).await.unwrap();
+    let found = &answer["results"][0];
+    assert!(found["view"]["mask_png"].as_str().unwrap().starts_with("iVBOR"), "{found}");
+    assert_eq!(found["parts"][0]["axes"][0], serde_json::json!([1.0, 0.0, 0.0]));
+    for (key, value) in [("boxes", "round"), ("mask", "gif"), ("profile", "best")] {
+        let mut body = body.clone();
+        body[key] = value.into();
+        let fault = bytes(client.post(url.clone()).json(&body).send().await.unwrap()).await;
+        let fault = fault.unwrap_err();
+        assert!(fault.message.starts_with(key) && fault.message.contains(value), "{fault:?}");
+    }
+}
