@@ -1,5 +1,6 @@
 """Photos to views, end to end: starts the server on a free port of loopback, posts photos, asks
-for views at new poses, writes them as PNG, prints where, and stops the server.
+for views at new poses and for a thing by text, writes views and mask as PNG, prints where, and
+stops the server.
 
 Run by `make demo`. Uses generated photos, and real ones where the shared data is found. Needs
 nothing beside Python's own library.
@@ -7,6 +8,7 @@ nothing beside Python's own library.
 
 import argparse
 import array
+import base64
 import json
 import os
 import signal
@@ -22,6 +24,8 @@ from pathlib import Path
 
 # Real scenes: name, frames to post (by position in transforms.json).
 REAL = [("fox", [0, 1, 2, 3]), ("red_kitchen", [0, 1]), ("sceaux_castle", [4, 5, 6])]
+# What each scene is asked for.
+TEXTS = {"sample": "box", "fox": "fox", "red_kitchen": "cup", "sceaux_castle": "castle"}
 # Where between the first two cameras to look from.
 BETWEEN = [0.0, 0.5, 1.0]
 READY_S, SCENE_S = 60, 300
@@ -118,8 +122,28 @@ def show(server: str, name: str, folder: Path, frames: list[int] | None, out: Pa
           f"after {time.monotonic() - begun:.1f} s ({stages})")
     for warning in report.get("warnings", []):
         print(f"  warning {warning['code']}: {warning['message']}")
+    if scene.get("semantics", {}).get("available"):
+        written += ask(f"{server}/v1/scenes/{scene['id']}", name, out)
+    else:
+        print(f"  no texts: {scene.get('semantics', {}).get('reason')}")
     for path in written:
         print(f"  {path}")
+
+
+def ask(scene: str, name: str, out: Path) -> list[Path]:
+    """Asks the scene for a thing by text; writes its mask between the first two cameras."""
+    text = TEXTS[name]
+    begun = time.monotonic()
+    body = {"texts": [text], "camera": {"from": 0, "to": 1, "t": 0.5}, "mask": "png"}
+    answer = json.loads(call(f"{scene}/query", json.dumps(body).encode(), "application/json"))
+    found = answer["results"][0]
+    path = out / f"{name}_050_mask.png"
+    path.write_bytes(base64.b64decode(found["view"]["mask_png"]))
+    seconds = time.monotonic() - begun
+    print(f"  {text!r}: {found['gaussians']} Gaussians in {len(found['parts'])} parts, "
+          f"{found['view']['area']} px in view, best score {max(found['scores'], default=0):.2f}, "
+          f"after {seconds:.1f} s (bank of {answer['bank_size']})")
+    return [path]
 
 
 def wait_ready(server: str, process: subprocess.Popen, log: Path) -> None:
