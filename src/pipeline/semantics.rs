@@ -86,10 +86,13 @@ impl Default for SemanticsOptions {
     }
 }
 
+/// The masks of each photo; is told how to report its fraction, 0..1.
+pub type MasksOfPhotos<'a> = dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> + Sync + 'a;
+
 /// What gives masks and embeddings.
 pub struct SemanticsTools<'a> {
     /// The masks of each photo; is told how to report its fraction, 0..1.
-    pub masks: &'a (dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> + Sync),
+    pub masks: &'a MasksOfPhotos<'a>,
     /// `[crops * dim]` unit embeddings.
     pub embed: &'a (dyn Fn(&[Crop]) -> Result<Vec<f32>> + Sync),
     /// Numbers of an embedding.
