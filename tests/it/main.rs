@@ -16,6 +16,7 @@ mod colours;
 mod common;
 mod compose;
 mod errors;
+mod evaluate;
 mod fuzz;
 mod geometry;
 mod grpc;
