@@ -4,7 +4,10 @@ use std::path::PathBuf;
 
 use serde_json::json;
 
-use super::output::Output;
+use super::{
+    masks::{self, MasksArgs},
+    output::Output,
+};
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
@@ -46,6 +49,8 @@ enum EvalWhat {
     Semantics(SemanticsArgs),
     /// Score whether labelled images find their names
     Words(WordsArgs),
+    /// Say what each skip of the mask stage changes in masks and time
+    Masks(MasksArgs),
 }
 
 impl EvalArgs {
@@ -54,6 +59,7 @@ impl EvalArgs {
             None => &self.config,
             Some(EvalWhat::Semantics(args)) => &args.config,
             Some(EvalWhat::Words(args)) => &args.config,
+            Some(EvalWhat::Masks(args)) => &args.config,
         }
     }
 }
@@ -141,6 +147,7 @@ pub(super) fn eval(args: &EvalArgs, config: &Config, out: &Output) -> Result<()>
     let dir = match (&args.what, &args.dir) {
         (Some(EvalWhat::Semantics(args)), _) => return score_semantics(args, config, out),
         (Some(EvalWhat::Words(args)), _) => return score_words(args, config, out),
+        (Some(EvalWhat::Masks(args)), _) => return masks::run(args, config, out),
         (None, Some(dir)) => dir.clone(),
         (None, None) => return Err(Error::invalid("eval: it takes a folder")),
     };

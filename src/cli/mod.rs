@@ -7,6 +7,7 @@ mod bench;
 mod camera;
 pub mod engine;
 mod inspect;
+mod masks;
 mod measure;
 mod models;
 mod output;

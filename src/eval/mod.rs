@@ -6,6 +6,7 @@
 //! SSIM stands the *hindsight warp*: the best PSNR that a constant-depth warp of either input
 //! reaches when the depth is chosen knowing the answer.
 
+pub mod masks;
 mod metrics;
 mod pictures;
 mod report;

@@ -145,10 +145,10 @@ impl ImageText {
         let cut = whole.len() > context;
         let mut ids: Vec<i64> = whole.iter().take(context).map(|&id| i64::from(id)).collect();
         // The end marker stays at the end of a text that is cut: towers read the sentence there.
-        if cut && special.last() == Some(&1) {
-            if let (Some(last), Some(end)) = (ids.last_mut(), whole.last()) {
-                *last = i64::from(*end);
-            }
+        if let (true, Some(1), Some(last), Some(end)) =
+            (cut, special.last(), ids.last_mut(), whole.last())
+        {
+            *last = i64::from(*end);
         }
         let mut there = vec![1_i64; ids.len()];
         let length = self.tokens.unwrap_or(ids.len());

@@ -74,7 +74,7 @@ pub(super) fn resize(
     out
 }
 
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped to 8 bits")]
+#[expect(clippy::cast_sign_loss, reason = "clamped to 8 bits")]
 fn narrow(sum: i32) -> u8 {
     (sum >> WEIGHT_BITS).clamp(0, 255) as u8
 }

@@ -43,14 +43,14 @@ impl Frame {
     }
 
     /// To a map of `[width, height]` cells over the whole photo, in one step.
-    pub(super) fn to_map(&self, map: [usize; 2]) -> Resample {
+    pub(super) fn to_map(self, map: [usize; 2]) -> Resample {
         let filled = self.filled();
         let axis = |axis: usize| Axis::direct(self.grid[axis], filled[axis], map[axis]);
         Resample { grid: self.grid, columns: axis(0), rows: axis(1) }
     }
 
     /// To the photo's pixels as Segment Anything does: first to the square, then to the photo.
-    pub(super) fn to_photo(&self, photo: &Photo) -> Resample {
+    pub(super) fn to_photo(self, photo: &Photo) -> Resample {
         let size = [photo.width as usize, photo.height as usize];
         // A grid finer than the square has no second step to take.
         if self.grid.iter().any(|&cells| cells > self.side as usize) {
