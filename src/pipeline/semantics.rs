@@ -31,6 +31,9 @@ const PAPER_CANON: [&str; 3] = ["object", "things", "stuff"];
 /// Sharpness of the profile `paper`.
 const PAPER_TAU: f64 = 10.0;
 
+/// How alike two rows must be to become one, where two photos show them on one surface.
+const MERGE_COSINE_MIN: f64 = 0.7;
+
 /// A stage of giving a scene its meaning, in order.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum SemanticsStage {
@@ -82,7 +85,7 @@ pub struct SemanticsOptions {
 
 impl Default for SemanticsOptions {
     fn default() -> Self {
-        Self { seeds: true, votes: false, merge: None }
+        Self { seeds: true, votes: true, merge: Some(MERGE_COSINE_MIN) }
     }
 }
 
@@ -300,8 +303,7 @@ pub fn understand_with(
         embed(tools, parts.photos, &masks, watch)
     })?;
     let mut labels = timed(&mut times, SemanticsStage::Bank, watch, || {
-        let used = masks.iter().filter(|of| !of.masks.is_empty()).count();
-        let clusters = semantics::bank(&embedded.rows, tools.dim, used)?;
+        let clusters = semantics::bank(&embedded.rows, tools.dim, parts.photos.len())?;
         Ok(label(&masks, &embedded.of, clusters))
     })?;
     let index = timed(&mut times, SemanticsStage::Assign, watch, || {

@@ -12,6 +12,8 @@ use crate::scene::{Bank, CameraToWorld, Gaussians, IndexMap, SceneCamera};
 
 /// Relative difference of depth under which a photo shows a Gaussian.
 const SAME_SURFACE: f64 = 0.03;
+/// Gaussians whose votes are in memory together.
+const PART: usize = 1 << 16;
 
 /// A photo as its Gaussians know it.
 struct View {
@@ -84,33 +86,27 @@ impl<'a> Views<'a> {
         Self { gaussians, views }
     }
 
-    /// `[N, V]` what each photo says of each Gaussian, row by row: 0 where it does not show it, or
-    /// shows it without an index. The photo that made it is asked through `own`.
-    fn said(&self, own: &[u16], maps: &[IndexMap]) -> Vec<Vec<u16>> {
-        (0..self.gaussians.len())
-            .into_par_iter()
-            .with_min_len(1024)
-            .map(|i| {
-                let at = world(self.gaussians, i);
-                let source = usize::from(self.gaussians.source()[i].view);
-                let look = |(v, view): (usize, &Option<View>)| {
-                    if v == source {
-                        return own[i];
-                    }
-                    let place = view.as_ref().and_then(|view| view.shows(at));
-                    place.zip(maps.get(v)).map_or(0, |([x, y], map)| map.at(x, y))
-                };
-                self.views.iter().enumerate().map(look).collect()
-            })
-            .collect()
+    /// `[V]` what each photo says of Gaussian `i`: 0 where it does not show it, or shows it without
+    /// an index. The photo that made it says what `own` does.
+    fn said(&self, i: usize, own: &[u16], maps: &[IndexMap]) -> Vec<u16> {
+        let at = world(self.gaussians, i);
+        let source = usize::from(self.gaussians.source()[i].view);
+        let look = |(v, view): (usize, &Option<View>)| {
+            if v == source {
+                return own[i];
+            }
+            let place = view.as_ref().and_then(|view| view.shows(at));
+            place.zip(maps.get(v)).map_or(0, |([x, y], map)| map.at(x, y))
+        };
+        self.views.iter().enumerate().map(look).collect()
     }
 
     /// `[N]` the index that most photos give each Gaussian. Photos without an index for it do not
     /// vote; its own photo wins a tie it is part of, the smallest index any other.
     #[must_use]
     pub fn vote(&self, own: &[u16], maps: &[IndexMap]) -> Vec<u16> {
-        let said = self.said(own, maps);
-        own.par_iter().zip(said).map(|(own, votes)| winner(*own, votes)).collect()
+        let vote = |(i, of): (usize, &u16)| winner(*of, self.said(i, own, maps));
+        own.par_iter().enumerate().with_min_len(1024).map(vote).collect()
     }
 
     /// Which bank indices are one thing seen from two sides, as the smallest index of each group:
@@ -126,12 +122,17 @@ impl<'a> Views<'a> {
     ) -> Vec<u16> {
         let rows = bank.len() + 1;
         let mut pairs = vec![0_u32; rows * rows];
-        for (i, votes) in self.said(own, maps).into_iter().enumerate() {
-            let source = usize::from(self.gaussians.source()[i].view);
-            for (v, other) in votes.into_iter().enumerate() {
-                let (a, b) = (usize::from(own[i]), usize::from(other));
-                if v != source && a > 0 && b > 0 && a < rows && b < rows {
-                    pairs[a * rows + b] += 1;
+        for start in (0..own.len()).step_by(PART) {
+            let part = start..own.len().min(start + PART);
+            let said: Vec<Vec<u16>> =
+                part.clone().into_par_iter().map(|i| self.said(i, own, maps)).collect();
+            for (i, votes) in part.zip(said) {
+                let source = usize::from(self.gaussians.source()[i].view);
+                for (v, other) in votes.into_iter().enumerate() {
+                    let (a, b) = (usize::from(own[i]), usize::from(other));
+                    if v != source && a > 0 && b > 0 && a < rows && b < rows {
+                        pairs[a * rows + b] += 1;
+                    }
                 }
             }
         }

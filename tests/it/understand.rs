@@ -170,7 +170,8 @@ fn a_photo_without_masks_and_a_scene_without_any_are_legal() {
     let half = made(&wall, &tools(one, &colour_of), options).unwrap();
     assert_eq!(half.report.masks, [2, 0]);
     assert!(half.index[..256].iter().all(|m| *m > 0), "photo 0 has its own");
-    let plain = made(&wall, &tools(one, &colour_of), SemanticsOptions::default()).unwrap();
+    let alone = SemanticsOptions { votes: false, ..options };
+    let plain = made(&wall, &tools(one, &colour_of), alone).unwrap();
     assert!(plain.index[256..].iter().all(|m| *m == 0), "photo 1 has none");
     let filled = half.index[256..].iter().filter(|m| **m > 0).count();
     assert!(filled > 200, "photo 0 votes for what photo 1 also shows: {filled}");
@@ -305,7 +306,7 @@ fn the_bundles_networks_give_a_bank_that_words_select_and_the_same_one_every_tim
 #[test]
 fn a_scene_of_the_pipeline_says_which_pixels_made_it() {
     let Some(engine) = engine(2) else { return };
-    let options = SampleOptions { photos: 3, width: 96, height: 64, seed: 4 };
+    let options = SampleOptions { photos: 3, width: 120, height: 64, seed: 4 };
     let photos = sample::photos(&options).unwrap();
     let made = reconstruct(&engine, &photos, &SceneOptions::default(), &|_, _| (), &NO_CANCEL);
     let made = made.unwrap();
@@ -314,14 +315,15 @@ fn a_scene_of_the_pipeline_says_which_pixels_made_it() {
     assert!((network.fx - made.report.network_focal_px[0]).abs() < 1e-9, "square pixels");
     let parts = SceneParts { photos: &photos, cameras: &made.cameras, gaussians: &made.gaussians };
     let watch = Watch { progress: &|_, _| (), cancel: &NO_CANCEL };
-    let meant = understand(&engine, &parts, &SemanticsOptions::default(), watch).unwrap();
+    let alone = SemanticsOptions { votes: false, ..SemanticsOptions::default() };
+    let meant = understand(&engine, &parts, &alone, watch).unwrap();
     assert_eq!(meant.index.len(), made.gaussians.len());
     assert_eq!(meant.photos.len(), 3);
     for (m, source) in meant.index.iter().zip(made.gaussians.source()) {
-        // The picture is the whole photo at half its size.
-        let at = |v: u16, size: u32| (f64::from(v) + 0.5) / f64::from(size);
+        // The picture is the photo without 12 columns on each side, at half its size.
+        let (x, y) = (2.0 * f64::from(source.x) + 13.0, 2.0 * f64::from(source.y) + 1.0);
         let map = &meant.photos[usize::from(source.view)];
-        assert_eq!(*m, map.at(at(source.x, 48), at(source.y, 32)), "{source:?}");
+        assert_eq!(*m, map.at(x / 120.0, y / 64.0), "{source:?}");
     }
     assert!(meant.report.labelled > 0, "{:?}", meant.report);
 }
