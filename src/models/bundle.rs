@@ -441,7 +441,7 @@ mod tests {
             ("context = 16", "context = 0", "image_text.text.context is 0"),
             ("\"tokenizer.json\"", "\"../tokenizer.json\"", "plain file name"),
             ("tokenizer_sha256 = \"5", "tokenizer_sha256 = \"6", "tokenizer.json is not the file"),
-            ("sha256 = \"a5338", "sha256 = \"b5338", "masks_decoder.onnx is not the file"),
+            ("sha256 = \"cc519", "sha256 = \"dc519", "masks_decoder.onnx is not the file"),
         ] {
             assert!(text.contains(from), "the fixture has no {from:?}");
             std::fs::write(dir.path().join(MANIFEST), text.replace(from, to)).unwrap();

@@ -1,13 +1,24 @@
 //! Stand-in mask, image and text networks whose answers are known: masks by colour, words by
 //! colour. What the adapters feed and read must make them right for any shape of photo.
 
-use std::{path::Path, sync::Arc};
+use std::{
+    path::Path,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+};
 
 use segsplat::{
     config::Config,
     error::ErrorCode,
-    models::{Bundle, ImageText, MaskNetwork, Runtime},
-    scene::{Crop, Photo},
+    models::{Bundle, ImageText, MaskLogits, MaskNetwork, Runtime},
+    pipeline::masks,
+    scene::{
+        Camera, CameraToWorld, Crop, Gaussians, Intrinsics, Photo, PosedPhoto, RawGaussians,
+        SourcePixel,
+    },
+    segment::Seed,
 };
 
 use crate::common::skipped;
@@ -76,6 +87,148 @@ fn a_mask_lies_where_the_point_was_whatever_the_photos_shape() {
         assert!(area(6) < area(7) && area(7) < area(8), "levels grow on the wall");
         assert!(masks.predicted_iou.iter().all(|v| (0.5..=1.0).contains(v)), "IoUs are fed labels");
     }
+}
+
+/// The bundle with another decoder in the first one's place, and other lines in its manifest.
+fn with_decoder(file: &str, sha256: &str, changes: &[(&str, &str)]) -> (tempfile::TempDir, Bundle) {
+    let from = Path::new("tests/fixtures/colours");
+    let dir = tempfile::tempdir().unwrap();
+    let whole = bundle();
+    for entry in whole.files() {
+        std::fs::copy(from.join(entry.file), dir.path().join(entry.file)).unwrap();
+    }
+    std::fs::copy(from.join(file), dir.path().join(file)).unwrap();
+    let mut text = std::fs::read_to_string(from.join("bundle.toml")).unwrap();
+    let decoder = whole.files()[2];
+    let own = [(decoder.file, file), (decoder.sha256, sha256)];
+    for (old, new) in own.iter().chain(changes) {
+        assert!(text.contains(old), "no {old:?} in the manifest");
+        text = text.replace(old, new);
+    }
+    std::fs::write(dir.path().join("bundle.toml"), text).unwrap();
+    let opened = Bundle::open(dir.path()).unwrap();
+    (dir, opened)
+}
+
+#[test]
+fn every_signature_of_a_decoder_gives_the_same_masks() {
+    let Some(runtime) = runtime() else { return };
+    let config = Config::default();
+    // Segment Anything's own export: one prompt a run, a former mask, four masks.
+    let (_kept, export) = with_decoder(
+        "masks_decoder_export.onnx",
+        "c32cc07bb8cd0e52986983c3150501ecf0ed219bf6544cc11d5064cc74b92d6a",
+        &[("levels = [0, 1, 2]", "levels = [1, 2, 3]")],
+    );
+    let (_kept2, efficient) = with_decoder(
+        "masks_decoder_efficient.onnx",
+        "6000b740b2ed30d6008540076d9b404e10fe3095558d49b90483435f38245d92",
+        &[
+            ("adapter = \"sam\"", "adapter = \"efficient_sam\""),
+            ("point_coords = \"point_coords\"", "point_coords = \"batched_point_coords\""),
+            ("point_labels = \"point_labels\"", "point_labels = \"batched_point_labels\""),
+            ("low_res_masks = \"low_res_masks\"", "low_res_masks = \"output_masks\""),
+        ],
+    );
+    let points = [[0.25_f32, 0.5], [0.76, 0.52], [0.5, 0.1]];
+    let masks = |bundle: &Bundle, width, height| {
+        let network = MaskNetwork::open(Arc::clone(&runtime), bundle, &config).unwrap().unwrap();
+        let embedding = network.encode(&photo(width, height)).unwrap();
+        (embedding.resized(), network.decode(&embedding, &points).unwrap())
+    };
+    let (_, own) = masks(&bundle(), 64, 64);
+    for (name, bundle) in [("export", &export), ("efficient", &efficient)] {
+        let (_, found) = masks(bundle, 64, 64);
+        assert_eq!((found.prompts, found.levels, found.grid), (3, 3, [32, 32]), "{name}");
+        assert_eq!(found.logits.len(), own.logits.len(), "{name}");
+        // EfficientSAM adds no half pixel: places differ by half a pixel, colours do not.
+        let whole = |of: &MaskLogits| {
+            let level = |p: usize| of.logits[(p * 3 + 2) * 1024..][..1024].to_vec();
+            (0..3).flat_map(level).collect::<Vec<f32>>()
+        };
+        let pairs = whole(&own).into_iter().zip(whole(&found));
+        let off = pairs.map(|(a, b)| (a - b).abs());
+        assert!(off.fold(0.0, f32::max) < 1e-4, "{name}: logits of the wholes");
+        for (a, b) in own.predicted_iou.iter().zip(&found.predicted_iou) {
+            assert!((a - b).abs() < 0.02, "{name}: {:?}", found.predicted_iou);
+        }
+    }
+    // A photo that is not square is padded by one adapter and stretched by the other.
+    let (padded, _) = masks(&export, 128, 64);
+    let (stretched, found) = masks(&efficient, 128, 64);
+    assert_eq!((padded, stretched), ([64, 32], [64, 64]), "the part that the photo fills");
+    let at =
+        |u: f64, v: f64| found.logits[2 * 1024 + (v * 32.0) as usize * 32 + (u * 32.0) as usize];
+    assert!(at(0.25, 0.7) > 0.0 && at(0.25, 0.8) < 0.0 && at(0.75, 0.5) < 0.0, "the red box");
+}
+
+#[test]
+fn a_decoder_of_another_signature_is_refused_by_name() {
+    let Some(runtime) = runtime() else { return };
+    let (_kept, wrong) = with_decoder(
+        "masks_decoder_efficient.onnx",
+        "6000b740b2ed30d6008540076d9b404e10fe3095558d49b90483435f38245d92",
+        &[],
+    );
+    let error = MaskNetwork::open(runtime, &wrong, &Config::default()).unwrap_err();
+    assert_eq!(error.code(), ErrorCode::ModelUnavailable, "{error}");
+    assert!(error.message().contains("point_coords"), "{error}");
+}
+
+/// A posed photo that sees the fixture's plane (z = 4 of the first camera) from `x`.
+fn posed(photo: Photo, x: f64) -> PosedPhoto {
+    let (w, h) = (f64::from(photo.width), f64::from(photo.height));
+    let (width, height) = (photo.width, photo.height);
+    let lens = Intrinsics { fx: w, fy: w, cx: w / 2.0, cy: h / 2.0, width, height };
+    let mut pose = glam::DMat4::IDENTITY.to_cols_array();
+    pose[3] = x;
+    let camera_to_world = CameraToWorld::from_row_major(&pose, "test").unwrap();
+    let camera = Camera { intrinsics: lens, camera_to_world };
+    PosedPhoto { file: format!("{x}.png"), photo, camera, intrinsics_made_for: None }
+}
+
+#[test]
+fn photos_give_masks_and_seeds_say_where_they_reappear() {
+    let Some(runtime) = runtime() else { return };
+    let network = MaskNetwork::open(runtime, &bundle(), &Config::default()).unwrap().unwrap();
+    let settings = masks::settings(network.manifest());
+    assert!((settings.pred_iou_thresh - 0.7).abs() < 1e-6, "the bundle's thresholds");
+    let photos = [posed(photo(64, 64), 0.0), posed(photo(64, 64), 0.25)];
+    let cancel = AtomicBool::new(false);
+    let found = masks::photo_masks(&network, &photos, None, &settings, &|_| (), &cancel).unwrap();
+    for masks in &found {
+        assert_eq!(masks.masks.len(), 3, "wall and two boxes: {:?}", masks.masks);
+        let at = |u, v| masks.map.at(u, v);
+        let (wall, red, green) = (at(0.5, 0.1), at(0.25, 0.5), at(0.75, 0.5));
+        assert_eq!(wall, 1, "the wall is the largest");
+        assert!(red > 1 && green > 1 && red != green, "{red} {green}");
+    }
+    // A Gaussian on the plane at every fourth pixel of the first photo.
+    let mut raw = RawGaussians::default();
+    for at in (0..64 * 64).step_by(4) {
+        let (x, y) = (f64::from(at % 64) + 0.5, f64::from(at / 64) + 0.5);
+        let place = photos[0].camera.intrinsics.unproject(x, y, 4.0);
+        raw.means.push(place.as_vec3().to_array());
+        raw.quats.push([1.0, 0.0, 0.0, 0.0]);
+        raw.scales.push([0.1; 3]);
+        raw.opacities.push(0.9);
+        raw.sh.push([0.0; 3]);
+        raw.semantic_index.push(0);
+        raw.source.push(SourcePixel::default());
+    }
+    let (gaussians, _) = Gaussians::sanitize(raw).unwrap();
+    let seeds = masks::seeds(&gaussians, &photos, &found[..1], 1);
+    assert_eq!(seeds.len(), 3, "one a mask: {seeds:?}");
+    // The second camera stands 0.25 to the right: all lies 0.25 / 4 of the width to the left.
+    for (u, v) in [(0.25 - 0.0625, 0.5), (0.75 - 0.0625, 0.5)] {
+        let near =
+            |seed: &Seed| (seed.point[0] - u).abs() < 0.06 && (seed.point[1] - v).abs() < 0.06;
+        assert!(seeds.iter().any(near), "no seed near ({u}, {v}): {seeds:?}");
+    }
+    assert!(masks::seeds(&gaussians, &photos, &[], 0).is_empty(), "the first photo has none");
+    cancel.store(true, Ordering::Relaxed);
+    let error = masks::photo_masks(&network, &photos, None, &settings, &|_| (), &cancel);
+    assert_eq!(error.unwrap_err().code(), ErrorCode::Cancelled, "cancelled");
 }
 
 fn crop(colour: [u8; 3], side: u32) -> Crop {
