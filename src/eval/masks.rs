@@ -192,10 +192,7 @@ fn roads(product: &Settings, short: bool) -> Vec<Road> {
         Road { batch: Some(1), ..road("one point a run", slow.clone()) },
         road("coarse logits", Settings { full_resolution: false, ..slow.clone() }),
         road("covered points", Settings { skip_covered: true, ..slow.clone() }),
-        road(
-            "covered points, seeds",
-            Settings { skip_covered: true, use_seeds: true, ..slow.clone() },
-        ),
+        road("covered points, seeds", Settings { skip_covered: true, use_seeds: true, ..slow }),
         road("all skips but seeds", Settings { use_seeds: false, ..product.clone() }),
         all,
     ]
@@ -318,8 +315,8 @@ struct DumpedMask {
 /// where not covered.
 fn dump(network: &MaskNetwork, posed: &PosedPhoto, roads: &[Road], to: &Path) -> Result<()> {
     let exact = roads[0].settings.exact();
-    let coarse = Settings { full_resolution: false, ..exact.clone() };
-    let covered = Settings { skip_covered: true, ..coarse.clone() };
+    let coarse = Settings { full_resolution: false, ..exact };
+    let covered = Settings { skip_covered: true, ..coarse };
     // The other code is not told which pixels undistortion left without a source.
     let photo = &Photo { valid: None, ..posed.photo.clone() };
     let never = AtomicBool::new(false);

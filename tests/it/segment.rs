@@ -121,7 +121,7 @@ fn each_skip_leaves_the_masks_as_they_are_and_asks_less() {
     let asked = fast.asked.lock().unwrap().len();
     assert!(asked < 800, "{asked} points with what is covered left out");
     assert!(agreement(&slow, &quick) > 0.999, "covered: {}", agreement(&slow, &quick));
-    let fine = Settings { full_resolution: true, ..all.clone() };
+    let fine = Settings { full_resolution: true, ..all };
     let fine = run(&room(), &fine, &[]);
     assert_eq!((fine.map.width, fine.map.height), (320, 240), "the photo's own pixels");
     assert!(agreement(&slow, &fine) > 0.97, "full resolution: {}", agreement(&slow, &fine));

@@ -81,7 +81,7 @@ fn result(found: TextResult) -> pb::TextResult {
         scores: found.scores,
         entries: found.entries.into_iter().map(u32::from).collect(),
         gaussians: found.gaussians,
-        parts: found.parts.into_iter().map(part).collect(),
+        parts: found.parts.iter().map(part).collect(),
         warnings: found.warnings.into_iter().map(warning).collect(),
         view: found.view.map(view),
     }
@@ -91,11 +91,11 @@ fn point([x, y, z]: [f64; 3]) -> pb::Vec3 {
     pb::Vec3 { x, y, z }
 }
 
-fn part(part: Part3) -> pb::Part {
+fn part(part: &Part3) -> pb::Part {
     pb::Part {
         gaussians: part.gaussians,
         center: Some(point(part.center)),
-        axes: part.axes.into_iter().map(point).collect(),
+        axes: part.axes.iter().copied().map(point).collect(),
         size: Some(point(part.size)),
     }
 }

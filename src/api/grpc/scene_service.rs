@@ -97,7 +97,7 @@ impl pb::scene_service_server::SceneService for Api {
         let found = async {
             let request = request.into_inner();
             let id = request.scene_id.parse()?;
-            Ok(self.service.query(&id, ask::query(request)?).await?)
+            self.service.query(&id, ask::query(request)?).await
         };
         let found = found.await.map_err(|e: Error| logged(&e))?;
         Ok(Response::new(ask::answer(found)))
@@ -107,7 +107,7 @@ impl pb::scene_service_server::SceneService for Api {
         let found = async {
             let request = request.into_inner();
             let id = request.scene_id.parse()?;
-            Ok(self.service.pick(&id, ask::pick(request)?).await?)
+            self.service.pick(&id, ask::pick(request)?).await
         };
         let found = found.await.map_err(|e: Error| logged(&e))?;
         Ok(Response::new(ask::picked(found)))

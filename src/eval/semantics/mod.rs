@@ -138,7 +138,7 @@ fn judge(
         }
         targets.push(seen.report(&scene.photos, frame.photo, &inputs));
         if options.pictures.is_some() {
-            shown.push(pictures::Shown::new(scene, frame, seen.color, picture));
+            shown.push(pictures::Shown::new(scene, frame, &seen.color, &picture));
         }
     }
     if let Some(out) = &options.pictures {

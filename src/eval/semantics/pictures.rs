@@ -30,8 +30,8 @@ impl Shown {
     pub(super) fn new(
         scene: &LabelledScene,
         frame: &LabelledFrame,
-        color: Vec<[f32; 3]>,
-        maps: Vec<Vec<TextMap>>,
+        color: &[[f32; 3]],
+        maps: &[Vec<TextMap>],
     ) -> Self {
         let photo = &scene.photos[frame.photo].photo;
         let asked: Vec<usize> =
@@ -59,7 +59,7 @@ impl Shown {
                 tint(p, class.and_then(|class| asked.iter().position(|a| *a == class)))
             }),
         ];
-        for maps in &maps {
+        for maps in maps {
             let classes = &maps[..asked.len().min(maps.len())];
             cells.push(picture(&|p| tint(p, super::tally::best_selected(classes, p))));
         }

@@ -76,7 +76,7 @@ impl SemanticsEvalReport {
         road: &Road<'_>,
     ) -> Self {
         let over = |profile: usize, of: fn(&Judgement) -> &Scores| {
-            Scores::mean(scenes.iter().filter_map(move |s| s.judgements.get(profile)).map(of))
+            Scores::mean(&scenes.iter().filter_map(move |s| s.judgements.get(profile)).map(of))
         };
         let judgements = super::PROFILES
             .iter()

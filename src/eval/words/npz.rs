@@ -1,4 +1,4 @@
-//! Just enough of NumPy's `.npz` to read labelled photographs: JPEG files one after another.
+//! Just enough of `NumPy`'s `.npz` to read labelled photographs: JPEG files one after another.
 
 use std::{
     fs::File,
