@@ -269,8 +269,8 @@ fn blend(work: &Work<'_>, scratch: &mut TileScratch) {
         (0, false) => blend_channels::<0, false>(work, scratch),
         (1, false) => blend_channels::<1, false>(work, scratch),
         (3, false) => blend_channels::<3, false>(work, scratch),
-        // Four alone compile to shuffles of four instead of lanes of eight, a quarter slower; a fifth
-        // that stays 0 does not.
+        // Four alone compile to shuffles of four instead of lanes of eight, a quarter slower; with
+        // a fifth that stays 0 they do not.
         (4 | 5, false) => blend_channels::<5, false>(work, scratch),
         (7, false) => blend_channels::<7, false>(work, scratch),
         (_, false) => blend_channels::<CHANNELS, false>(work, scratch),
