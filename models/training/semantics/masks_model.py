@@ -138,16 +138,11 @@ class Decoder(nn.Module):
             t = cross(t.reshape(g, b * m, DIM), keys, values).reshape(g * b, m, DIM)
             t = feed(t)
         params = torch.stack([write(t[:, 1 + k]) for k, write in enumerate(self.write)], 1).reshape(g, b * LEVELS, -1)
-        first = self.first_inside(xy, labels)
-        return self.masks(pixel, params, first).reshape(g, b, LEVELS, h, w), self.iou(t[:, 0]).reshape(g, b, LEVELS).sigmoid()
-
-    @staticmethod
-    def first_inside(xy, labels):
-        """The first point's place [G,B,2]."""
-        return xy[:, :, 0]
+        return self.masks(pixel, params, xy[:, :, 0]).reshape(g, b, LEVELS, h, w), self.iou(t[:, 0]).reshape(g, b, LEVELS).sigmoid()
 
     def masks(self, pixel, params, first):
-        g, c, h, w = pixel.shape
+        """Logits [G, B * levels, h * w]; `first` [G,B,2] is where each prompt's first point lies, -1..1."""
+        g, _, h, w = pixel.shape
         rows = params.shape[1]
         flat = pixel.flatten(2)
         direct, hidden, bias, out, offset = params.split([PIXEL, (NARROW + 3) * HIDDEN, HIDDEN, HIDDEN, 1], -1)
