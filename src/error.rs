@@ -25,8 +25,14 @@ pub enum ErrorCode {
     SceneNotReady,
     /// A text was asked of a scene that was made with `semantics=off`.
     SemanticsOff,
+    /// No key was shown, or one that nobody knows.
+    Unauthenticated,
+    /// The key may not do this: its scope is too narrow.
+    PermissionDenied,
     /// Too much work is queued; try again after the time given.
     Overloaded,
+    /// The server is stopping; another one, or the next, takes the call.
+    Stopping,
     /// The deadline of the call passed.
     DeadlineExceeded,
     /// The caller went away or asked to stop.
@@ -72,7 +78,7 @@ const fn row(
 }
 
 /// The one table. gRPC numbers are those of `google.rpc.Code`.
-pub const TABLE: [ErrorRow; 15] = [
+pub const TABLE: [ErrorRow; 18] = [
     row(ErrorCode::InvalidRequest, "invalid_request", 400, 3, 2, false),
     row(ErrorCode::PhotoUnreadable, "photo_unreadable", 422, 3, 2, false),
     row(ErrorCode::LimitExceeded, "limit_exceeded", 413, 3, 2, false),
@@ -80,7 +86,10 @@ pub const TABLE: [ErrorRow; 15] = [
     row(ErrorCode::NotFound, "not_found", 404, 5, 3, false),
     row(ErrorCode::SceneNotReady, "scene_not_ready", 409, 9, 4, true),
     row(ErrorCode::SemanticsOff, "semantics_off", 409, 9, 4, false),
+    row(ErrorCode::Unauthenticated, "unauthenticated", 401, 16, 8, false),
+    row(ErrorCode::PermissionDenied, "permission_denied", 403, 7, 8, false),
     row(ErrorCode::Overloaded, "overloaded", 429, 8, 5, true),
+    row(ErrorCode::Stopping, "stopping", 503, 14, 6, true),
     row(ErrorCode::DeadlineExceeded, "deadline_exceeded", 504, 4, 5, true),
     row(ErrorCode::Cancelled, "cancelled", 499, 1, 5, false),
     row(ErrorCode::ModelUnavailable, "model_unavailable", 503, 14, 6, true),

@@ -10,7 +10,7 @@
 //!
 //! | layer | modules | may use |
 //! |---|---|---|
-//! | L0 nouns | [`scene`], [`error`], [`limits`], [`config`] | nothing above (`scene` uses `error`, `limits`) |
+//! | L0 nouns | [`scene`], [`error`], [`limits`], [`keys`], [`config`] | nothing above (`scene` uses `error`, `limits`) |
 //! | L1 verbs | [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`render`], [`store`], [`sample`] | L0; never each other |
 //! | L2 | [`pipeline`] | L1: the only place that knows the order of the stages |
 //! | L3 | [`jobs`] | `pipeline`, `store` |
@@ -29,6 +29,7 @@ pub mod config;
 pub mod error;
 pub mod eval;
 pub mod jobs;
+pub mod keys;
 pub mod lift;
 pub mod limits;
 pub mod models;

@@ -75,16 +75,25 @@ impl Board {
         true
     }
 
-    /// Up to `limit` records after the scene with that creation time and id, newest first, and
-    /// whether more follow.
-    pub(super) fn page(&self, after: Option<(u64, SceneId)>, limit: usize) -> (Vec<Record>, bool) {
+    /// Up to `limit` records of those to `show`, after the scene with that creation time and id,
+    /// newest first, and whether more follow.
+    pub(super) fn page(
+        &self,
+        after: Option<(u64, SceneId)>,
+        limit: usize,
+        show: impl Fn(&Record) -> bool,
+    ) -> (Vec<Record>, bool) {
         use std::ops::Bound;
         let start = after.map_or(Bound::Unbounded, |(created, id)| {
             Bound::Excluded((std::cmp::Reverse(created), id))
         });
         let inner = self.read();
-        let mut rest = inner.by_order.range((start, Bound::Unbounded));
-        let page = rest.by_ref().take(limit).map(|(_, sender)| sender.borrow().clone()).collect();
+        let mut rest = inner
+            .by_order
+            .range((start, Bound::Unbounded))
+            .map(|(_, sender)| sender.borrow())
+            .filter(|record| show(record));
+        let page = rest.by_ref().take(limit).map(|record| record.clone()).collect();
         (page, rest.next().is_some())
     }
 
@@ -105,6 +114,7 @@ mod tests {
                 SceneState::Queued,
                 created_ms,
             ),
+            owner: (byte % 2 == 0).then(|| "even".to_owned()),
             options: SceneOptions::default(),
             idempotency_key: None,
             request_sha256: String::new(),
@@ -124,13 +134,18 @@ mod tests {
             let digits = |r: &Record| r.status.id.as_str()[..2].to_owned();
             records.iter().map(|r| u8::from_str_radix(&digits(r), 16).unwrap()).collect()
         };
-        let (first, more) = board.page(None, 2);
+        let (first, more) = board.page(None, 2, |_| true);
         assert_eq!((ids(&first), more), (vec![2, 3], true));
         let last = &first[1].status;
         board.insert(record(9, 99));
         board.remove(&last.id);
-        let (second, more) = board.page(Some((last.created_ms, last.id.clone())), 2);
+        let (second, more) = board.page(Some((last.created_ms, last.id.clone())), 2, |_| true);
         assert_eq!((ids(&second), more), (vec![4, 1], false));
+        let (own, more) = board.page(None, 1, |record| record.owner.is_some());
+        assert_eq!((ids(&own), more), (vec![2], true), "more of one's own");
+        let after = Some((own[0].status.created_ms, own[0].status.id.clone()));
+        let (own, more) = board.page(after, 1, |record| record.owner.is_some());
+        assert_eq!((ids(&own), more), (vec![4], false), "others' scenes are no more");
     }
 
     #[test]

@@ -217,11 +217,16 @@ impl Jobs {
         self.shared.board.watch(id).ok_or_else(|| not_found(id))
     }
 
-    /// Up to `limit` records, newest first, after the scene of that creation time and id; and
-    /// whether more follow.
+    /// Up to `limit` records of those to `show`, newest first, after the scene of that creation
+    /// time and id; and whether more follow.
     #[must_use]
-    pub fn page(&self, after: Option<(u64, SceneId)>, limit: usize) -> (Vec<Record>, bool) {
-        self.shared.board.page(after, limit)
+    pub fn page(
+        &self,
+        after: Option<(u64, SceneId)>,
+        limit: usize,
+        show: impl Fn(&Record) -> bool,
+    ) -> (Vec<Record>, bool) {
+        self.shared.board.page(after, limit, show)
     }
 
     /// Jobs that go before a waiting one, 0 for any other.

@@ -10,6 +10,7 @@ use super::{
 };
 use crate::{
     error::{Error, Result},
+    keys::Caller,
     limits::IDEMPOTENCY_KEY_BYTES_MAX,
     scene::{
         SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState, Upload,
@@ -17,14 +18,14 @@ use crate::{
     store::{self, Record},
 };
 
-/// Digest of what a key was used for, and the scene it made.
-pub(super) type Keys = HashMap<String, (String, SceneId)>;
+/// By owner and key: digest of what the key was used for, and the scene it made.
+pub(super) type Keys = HashMap<(Option<String>, String), (String, SceneId)>;
 
 /// The keys of the scenes kept.
 pub(super) fn keys_of(records: &[Record]) -> Keys {
     let entry = |record: &Record| {
         let value = (record.request_sha256.clone(), record.status.id.clone());
-        Some((record.idempotency_key.clone()?, value))
+        Some(((record.owner.clone(), record.idempotency_key.clone()?), value))
     };
     records.iter().filter_map(entry).collect()
 }
@@ -49,7 +50,8 @@ impl Service {
                 // Held to the end, so that two calls with one key cannot both be the first.
                 let mut keys = self.inner.keys.lock().await;
                 let (upload, digest) = digest(upload, options.clone()).await?;
-                match keys.get(&key) {
+                let name = (self.caller.owner().map(str::to_owned), key);
+                match keys.get(&name) {
                     Some((known, id)) if *known == digest => (id.clone(), true),
                     Some((_, id)) => {
                         return Err(Error::invalid(format!(
@@ -57,8 +59,8 @@ impl Service {
                         )));
                     }
                     None => {
-                        let id = self.submit(upload, options, Some(key.clone())).await?;
-                        keys.insert(key, (digest, id.clone()));
+                        let id = self.submit(upload, options, Some(name.1.clone())).await?;
+                        keys.insert(name, (digest, id.clone()));
                         (id, false)
                     }
                 }
@@ -75,6 +77,7 @@ impl Service {
     /// # Errors
     /// `scene_not_found`.
     pub async fn wait(&self, id: &SceneId, at_most: Duration) -> Result<SceneStatus> {
+        self.sees(id)?;
         let mut watcher = self.inner.jobs.watch(id)?;
         let at_most = at_most.min(Duration::from_millis(self.limits().wait_ms_max));
         let end = watcher.wait_for(|record| record.status.is_settled());
@@ -90,12 +93,12 @@ impl Service {
         options: SceneOptions,
         key: Option<String>,
     ) -> Result<SceneId> {
-        let inner = Arc::clone(&self.inner);
+        let (inner, caller) = (Arc::clone(&self.inner), self.caller.clone());
         let turn = Arc::clone(&inner.reading).acquire_owned().await;
         let turn = turn.map_err(|e| Error::internal("no upload is read now").caused_by(e))?;
         blocking(move || {
             let _turn = turn;
-            inner.submit_here(&upload, options, key)
+            inner.submit_here(&upload, options, key, &caller)
         })
         .await?
     }
@@ -107,6 +110,7 @@ impl Inner {
         upload: &Upload,
         options: SceneOptions,
         key: Option<String>,
+        caller: &Caller,
     ) -> Result<SceneId> {
         self.maker.check(upload, &self.config.limits)?;
         let id = new_id();
@@ -117,6 +121,7 @@ impl Inner {
         let record = Record {
             status,
             request_sha256: request_sha256(upload, &options),
+            owner: caller.owner().map(str::to_owned),
             options,
             idempotency_key: key,
             attempts: 0,

@@ -44,19 +44,23 @@ use crate::{
     config::Config,
     error::{Error, Result},
     jobs::{Jobs, SceneMaker, SemanticsMaker},
+    keys::Caller,
     limits::Limits,
     render::Renderer,
     scene::SceneId,
-    store::{Record, Store},
+    store::{Record, Store, not_found},
 };
 
 /// Uploads decoded at the same time: each may hold `limits.photos_max` photos in memory.
 const UPLOADS_READ_MAX: usize = 2;
 
-/// The use cases. Cloning shares everything.
+/// The use cases, for one caller. Cloning shares everything.
+///
+/// A scene that the caller may not see is in no way different from one that does not exist.
 #[derive(Clone, Debug)]
 pub struct Service {
     inner: Arc<Inner>,
+    caller: Caller,
 }
 
 /// What the service works with.
@@ -134,7 +138,24 @@ impl Service {
             keys: tokio::sync::Mutex::new(keys),
             config,
         };
-        Ok(Self { inner: Arc::new(inner) })
+        Ok(Self { inner: Arc::new(inner), caller: Caller::All })
+    }
+
+    /// The same service for another caller.
+    #[must_use]
+    pub fn for_caller(&self, caller: Caller) -> Self {
+        Self { inner: Arc::clone(&self.inner), caller }
+    }
+
+    /// The record of a scene that this caller sees.
+    fn record(&self, id: &SceneId) -> Result<Record> {
+        let record = self.inner.jobs.record(id)?;
+        if self.caller.sees(record.owner.as_deref()) { Ok(record) } else { Err(not_found(id)) }
+    }
+
+    /// Refuses a scene that is not there for this caller.
+    fn sees(&self, id: &SceneId) -> Result<()> {
+        self.record(id).map(drop)
     }
 
     /// The caps in force.
@@ -148,7 +169,7 @@ impl Service {
     /// # Errors
     /// `scene_not_found`.
     pub fn get(&self, id: &SceneId) -> Result<SceneStatus> {
-        Ok(self.shown(self.inner.jobs.record(id)?.status))
+        Ok(self.shown(self.record(id)?.status))
     }
 
     /// A page of scenes, newest first, without cameras.
@@ -163,7 +184,8 @@ impl Service {
             None => max,
         };
         let after = page.after.as_deref().map(parse_cursor).transpose()?;
-        let (records, more) = self.inner.jobs.page(after, limit);
+        let (records, more) =
+            self.inner.jobs.page(after, limit, |record| self.caller.sees(record.owner.as_deref()));
         let next = records.last().filter(|_| more).map(cursor);
         let without_cameras =
             |record: Record| self.shown(SceneStatus { cameras: Vec::new(), ..record.status });
@@ -175,6 +197,7 @@ impl Service {
     /// # Errors
     /// `scene_not_found`, `store_unavailable`.
     pub async fn delete(&self, id: &SceneId) -> Result<()> {
+        self.sees(id)?;
         let (inner, gone) = (Arc::clone(&self.inner), id.clone());
         create::blocking(move || inner.jobs.delete(&gone)).await??;
         self.inner.keys.lock().await.retain(|_, (_, scene)| scene != id);
@@ -186,6 +209,7 @@ impl Service {
     /// # Errors
     /// `scene_not_found`.
     pub fn watch(&self, id: &SceneId) -> Result<impl Stream<Item = Event> + Send + use<>> {
+        self.sees(id)?;
         let watcher = self.inner.jobs.watch(id)?;
         let service = self.clone();
         let first = Some((service, watcher, true));

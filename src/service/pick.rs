@@ -118,6 +118,7 @@ impl Service {
     /// # Errors
     /// As [`Service::query`] where labels are given, else as [`Service::render`].
     pub async fn pick(&self, id: &SceneId, spec: PickSpec) -> Result<Picked> {
+        self.sees(id)?;
         let inner = &self.inner;
         let record = inner.finished(id)?;
         let cameras = [spec.camera];

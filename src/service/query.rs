@@ -191,6 +191,7 @@ impl Service {
     /// semantics are not ready in time, `semantics_off`, `model_unavailable`, `overloaded`,
     /// `deadline_exceeded`, and whatever the making of the semantics failed with.
     pub async fn query(&self, id: &SceneId, spec: QuerySpec) -> Result<QueryAnswer> {
+        self.sees(id)?;
         let inner = &self.inner;
         inner.can_understand("query")?;
         let texts = texts::all_checked(&spec.texts, "texts", self.limits())?;

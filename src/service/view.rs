@@ -467,6 +467,7 @@ impl Service {
     /// # Errors
     /// As [`Self::render`], but for what only rendering meets.
     pub fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<Option<String>> {
+        self.sees(id)?;
         let inner = &self.inner;
         let ask = inner.checked_ask(&[spec.kind], &spec.ask)?;
         let record = inner.finished(id)?;
@@ -487,6 +488,7 @@ impl Service {
     /// `limit_exceeded`, `overloaded`, `deadline_exceeded`, `gpu_unavailable`; for kinds that need
     /// semantics also what [`Service::query`] says.
     pub async fn render(&self, id: &SceneId, spec: ViewSpec) -> Result<RenderedView> {
+        self.sees(id)?;
         let inner = &self.inner;
         let kinds = [spec.kind];
         let ask = inner.checked_ask(&kinds, &spec.ask)?;
@@ -514,6 +516,7 @@ impl Service {
         id: &SceneId,
         spec: &ViewsSpec,
     ) -> Result<impl Stream<Item = Result<RenderedView>> + Send + use<>> {
+        self.sees(id)?;
         let inner = Arc::clone(&self.inner);
         let limits = &inner.config.limits;
         for (what, count, max) in [

@@ -83,6 +83,7 @@ fn recover_record(folder: &Path, id: &SceneId) -> Record {
                 error: Some(SceneError::from(&error)),
                 ..SceneStatus::new(id.clone(), SceneState::Failed, now)
             },
+            owner: None,
             options: crate::scene::SceneOptions::default(),
             idempotency_key: None,
             request_sha256: String::new(),
@@ -113,6 +114,8 @@ fn from_scene(folder: &Path, id: &SceneId) -> Option<Record> {
             cameras: meta.cameras,
             ..SceneStatus::new(id.clone(), SceneState::Done, meta.created_ms)
         },
+        // Without the upload nobody but an admin sees it: better than the wrong owner.
+        owner: first_record(folder, id).and_then(|record| record.owner),
         options: meta.provenance.options,
         idempotency_key: None,
         request_sha256: String::new(),
@@ -126,6 +129,11 @@ fn from_upload(folder: &Path, id: &SceneId) -> Option<Record> {
     if folder.join(SCENE).with_extension(QUARANTINED).exists() {
         return None;
     }
+    first_record(folder, id)
+}
+
+/// The record that the upload was kept with.
+fn first_record(folder: &Path, id: &SceneId) -> Option<Record> {
     let (_, record) = upload_file::read(&fs::read(folder.join(UPLOAD)).ok()?).ok()?;
     (record.status.id == *id).then_some(record)
 }

@@ -14,6 +14,9 @@ use sha2::{Digest, Sha256};
 pub struct Record {
     /// What callers see.
     pub status: SceneStatus,
+    /// Whose it is: the owner named by the key of the call; `None` where no key was asked for.
+    #[serde(default)]
+    pub owner: Option<String>,
     /// Options of the call.
     pub options: SceneOptions,
     /// Idempotency key of the call.

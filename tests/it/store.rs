@@ -81,6 +81,7 @@ fn record(id: u8) -> Record {
     let id = SceneId::from_bytes([id; 16]);
     Record {
         status: SceneStatus::new(id, SceneState::Queued, 1_700_000_000_123),
+        owner: Some("somebody".to_owned()),
         options: SceneOptions { max_views: Some(4), ..SceneOptions::default() },
         idempotency_key: Some("key".to_owned()),
         request_sha256: "cd".repeat(32),
@@ -202,6 +203,7 @@ fn a_bad_status_is_rebuilt_from_the_scene_or_from_the_upload() {
     };
     assert_eq!(found(1).status.state, SceneState::Done, "the scene file says so");
     assert!(found(1).scene_sha256.is_some());
+    assert_eq!(found(1).owner.as_deref(), Some("somebody"), "the upload says whose it is");
     assert_eq!(*found(2), record(2), "the upload holds the first record");
     assert_eq!(found(3).status.state, SceneState::Failed);
     assert_eq!(found(3).status.error.as_ref().unwrap().code, "scene_corrupt");
