@@ -14,7 +14,7 @@ use crate::{
     config::Config,
     error::{Error, Result},
     render::{
-        Frame, Kinds, Labels, RenderRequest, Renderer,
+        Frame, Kinds, Labels, Quality, RenderRequest, Renderer,
         cpu::CpuRenderer,
         oracle,
         select::{AdapterReport, select},
@@ -143,6 +143,8 @@ pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
         background: [0.1, 0.2, 0.3],
         antialiased: false,
         near: 0.05,
+        quality: Quality::Exact,
+        crop: None,
     };
     let begun = Instant::now();
     let (renderer, adapters) = select(config)?;
@@ -421,6 +423,8 @@ mod tests {
             background: [0.0; 3],
             antialiased: false,
             near: 0.05,
+            quality: Quality::Exact,
+            crop: None,
         };
         let want = CpuRenderer::new(1)
             .and_then(|cpu| cpu.render(&gaussians, &request))

@@ -3,7 +3,7 @@
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::ScoringProfile,
-    service::{Boxes, Kind, MaskFormat, ModelsInfo, SemanticsMode},
+    service::{Boxes, Kind, MaskFormat, ModelsInfo, Quality, SemanticsMode},
 };
 
 /// When the semantics are made, from `lazy`, `eager` or `off`.
@@ -37,6 +37,15 @@ pub(super) fn kind(name: &str) -> Result<Kind> {
             "kind is {shown:?}; it must be color, depth, alpha, semantics, relevancy or mask"
         ))
     })
+}
+
+/// How closely to render, from `exact` (also where nothing is said) or `fast`.
+pub(super) fn quality(text: Option<&str>) -> Result<Quality> {
+    let Some(name) = text else { return Ok(Quality::default()) };
+    match Quality::ALL.into_iter().find(|quality| quality.name() == name) {
+        Some(quality) => Ok(quality),
+        None => wrong("quality", name, "exact or fast"),
+    }
 }
 
 /// How texts are scored, from `default` (also where nothing is said) or `paper`.

@@ -17,7 +17,7 @@ use crate::{
     error::{Error, Result},
     jobs::{PipelineMaker, SceneMaker, Work},
     pipeline::Engine,
-    render::{Kinds, Labels, RenderRequest},
+    render::{Kinds, Labels, Quality, RenderRequest},
     sample::{self, SampleOptions},
     scene::SceneOptions,
     service::default_near,
@@ -168,6 +168,8 @@ fn stages(args: &Args, config: &Config, out: &Output) -> Result<()> {
             background: [0.0; 3],
             antialiased: false,
             near: default_near(made.report.median_depth),
+            quality: Quality::Exact,
+            crop: None,
         };
         let begun = Instant::now();
         renderer.render(&made.gaussians, &request)?;

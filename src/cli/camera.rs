@@ -2,7 +2,7 @@
 
 use crate::{
     error::{Error, Result},
-    service::{CameraSpec, LensSpec, PoseSpec, ViewOptions},
+    service::{CameraSpec, LensSpec, PoseSpec, Quality, ViewOptions},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -58,6 +58,15 @@ pub(super) struct CameraArgs {
     /// Near plane in world units [default: 0.01 of the scene's median depth]
     #[arg(long)]
     near: Option<f32>,
+    /// exact, or fast within a stated error
+    #[arg(long, default_value = "exact", value_parser = quality)]
+    quality: Quality,
+}
+
+/// A quality by its name.
+pub(super) fn quality(name: &str) -> Result<Quality, String> {
+    let known = Quality::ALL.into_iter().find(|quality| quality.name() == name);
+    known.ok_or_else(|| Quality::ALL.map(Quality::name).join(", "))
 }
 
 impl CameraArgs {
@@ -93,6 +102,7 @@ impl CameraArgs {
             height: self.height,
             antialiased: self.antialiased,
             near: self.near,
+            quality: self.quality,
             ..ViewOptions::default()
         }
     }

@@ -16,7 +16,7 @@ use super::{
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
-    scene::ScoringProfile,
+    scene::{Region, ScoringProfile},
     service::{Ask, Format, Kind, Local, ViewOptions, ViewSpec},
 };
 
@@ -42,6 +42,9 @@ pub(super) struct Args {
     /// Background colour, each 0 to 1 [default: the scene's backdrop]
     #[arg(long, value_name = "R,G,B", value_delimiter = ',')]
     background: Option<Vec<f32>>,
+    /// Draw only this part of the picture, pixels
+    #[arg(long, value_name = "X,Y,WIDTH,HEIGHT", value_delimiter = ',')]
+    crop: Option<Vec<u32>>,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
 }
@@ -87,6 +90,13 @@ fn spec(args: &Args) -> Result<ViewSpec> {
         Some(background) => Some(numbers(background, "--background")?),
         None => None,
     };
+    let crop = match &args.crop {
+        Some(crop) => {
+            let [x, y, width, height] = numbers(crop, "--crop")?;
+            Some(Region { x, y, width, height })
+        }
+        None => None,
+    };
     let profile = if args.paper { ScoringProfile::Paper } else { ScoringProfile::Default };
     Ok(ViewSpec {
         camera: args.camera.spec()?.ok_or_else(no_camera)?,
@@ -94,6 +104,7 @@ fn spec(args: &Args) -> Result<ViewSpec> {
         options: ViewOptions {
             format: format_of(&args.output)?,
             background,
+            crop,
             ..args.camera.options()
         },
         ask: Ask { text: args.text.clone(), profile, wait: None },

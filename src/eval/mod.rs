@@ -30,7 +30,7 @@ use crate::{
     models::fit,
     photos,
     pipeline::{Engine, reconstruct},
-    render::{Kinds, Labels, RenderRequest, Renderer, compose, cpu::CpuRenderer},
+    render::{Kinds, Labels, Quality, RenderRequest, Renderer, compose, cpu::CpuRenderer},
     scene::{Camera, Photo, PosedPhoto, Provenance, Scene, SceneId, SceneMeta, SceneOptions},
 };
 
@@ -172,6 +172,8 @@ fn judge(
         background: [0.0; 3],
         antialiased: false,
         near,
+        quality: Quality::Exact,
+        crop: None,
     };
     let meta = SceneMeta {
         id: SceneId::from_bytes([0; 16]),

@@ -3,7 +3,7 @@
 use crate::{
     error::Result,
     render::{Frame, RenderRequest, Renderer},
-    scene::Scene,
+    scene::{Camera, Scene},
 };
 
 /// Alpha from which a pixel needs nothing behind it.
@@ -43,7 +43,8 @@ pub fn render_scene(
     };
     if let (Some(color), Some(alpha)) = (&mut frame.color, &frame.alpha) {
         if backdrop {
-            scene.backdrop.fill(&request.camera, color, alpha);
+            let seen = Camera { intrinsics: request.lens(), ..request.camera };
+            scene.backdrop.fill(&seen, color, alpha);
         } else {
             for (pixel, alpha) in color.iter_mut().zip(alpha) {
                 for (value, behind) in pixel.iter_mut().zip(request.background) {

@@ -15,7 +15,7 @@ pub mod view;
 pub use self::labels::{Entries, Labels};
 use crate::{
     error::Result,
-    scene::{Camera, Gaussians},
+    scene::{Camera, Gaussians, Intrinsics, Region},
 };
 
 /// Which pictures a request pays for.
@@ -38,11 +38,39 @@ impl Kinds {
     pub const NONE: Self = Self { color: false, depth: false, alpha: false };
 }
 
+/// How closely a renderer keeps to the model; `docs/conventions.md` bounds what `Fast` may differ.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Quality {
+    /// f32 all through.
+    #[default]
+    Exact,
+    /// Faster where a renderer has a faster way, else the same.
+    Fast,
+}
+
+impl Quality {
+    /// All, the default first.
+    pub const ALL: [Self; 2] = [Self::Exact, Self::Fast];
+
+    /// The name that callers give.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Exact => "exact",
+            Self::Fast => "fast",
+        }
+    }
+}
+
 /// One view to render.
 #[derive(Clone, Debug)]
 pub struct RenderRequest {
-    /// The camera; its intrinsics carry the picture's size.
+    /// The camera; its intrinsics carry the whole picture's size.
     pub camera: Camera,
+    /// The part of the picture that is drawn; `None`: all of it. Its pixels are those of the whole
+    /// picture, to the rounding of f32.
+    pub crop: Option<Region>,
     /// Pictures wanted.
     pub kinds: Kinds,
     /// Labels wanted, from the same pass.
@@ -53,6 +81,17 @@ pub struct RenderRequest {
     pub antialiased: bool,
     /// Near plane, world units along t.z.
     pub near: f32,
+    /// How closely to keep to the model.
+    pub quality: Quality,
+}
+
+impl RenderRequest {
+    /// Intrinsics of the picture that comes out: those of the part, where one is asked for.
+    #[must_use]
+    pub fn lens(&self) -> Intrinsics {
+        let whole = self.camera.intrinsics;
+        self.crop.map_or(whole, |crop| whole.part(crop))
+    }
 }
 
 /// Counts of one frame.

@@ -86,12 +86,13 @@ pub struct OraclePixel {
 /// # Errors
 /// `invalid_request` when the intrinsics are unusable.
 pub fn render(gaussians: &Gaussians, request: &RenderRequest) -> Result<Vec<OraclePixel>> {
-    let Intrinsics { width, height, .. } = request.camera.intrinsics;
+    let Intrinsics { width, height, .. } = request.lens();
     let pixels: Vec<[u32; 2]> = (0..height).flat_map(|y| (0..width).map(move |x| [x, y])).collect();
     render_pixels(gaussians, request, DepthKey::F32, &pixels)
 }
 
-/// Renders the pixels (column, row) given, in their order: for pictures too large to do whole.
+/// Renders the pixels (column, row of the part drawn) given, in their order: for pictures too
+/// large to do whole.
 ///
 /// Cost: pixels x Gaussians in the pixel's row.
 ///
@@ -104,6 +105,7 @@ pub fn render_pixels(
     pixels: &[[u32; 2]],
 ) -> Result<Vec<OraclePixel>> {
     let lens = request.camera.intrinsics.validated("camera")?;
+    let corner = request.crop.map_or([0, 0], |crop| [crop.x, crop.y]);
     let mut splats: Vec<Splat> =
         (0..gaussians.len()).filter_map(|i| splat(gaussians, i, request, &lens)).collect();
     // Stable, so ties stay in the order of the index.
@@ -118,12 +120,12 @@ pub fn render_pixels(
     let done: Vec<Vec<(usize, OraclePixel)>> = rows
         .into_par_iter()
         .map(|row| {
-            let y = f64::from(pixels[row[0]][1]) + 0.5;
+            let y = f64::from(pixels[row[0]][1] + corner[1]) + 0.5;
             let near: Vec<&Splat> =
                 splats.iter().filter(|s| (y - s.mean.y).abs() <= s.half_height).collect();
             row.iter()
                 .map(|&i| {
-                    let center = DVec2::new(f64::from(pixels[i][0]) + 0.5, y);
+                    let center = DVec2::new(f64::from(pixels[i][0] + corner[0]) + 0.5, y);
                     (i, pixel(&near, center, request))
                 })
                 .collect()
@@ -147,7 +149,7 @@ pub struct Contribution {
     pub weight: f64,
 }
 
-/// What each Gaussian adds to one pixel (column, row), front to back.
+/// What each Gaussian adds to one pixel of the whole picture (column, row), front to back.
 ///
 /// # Errors
 /// `invalid_request` when the intrinsics are unusable.

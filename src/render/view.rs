@@ -24,7 +24,7 @@ pub struct View {
     pub center: DVec3,
     /// Focal lengths, pixels.
     pub focal: [f64; 2],
-    /// Principal point, pixels.
+    /// Principal point, pixels of the part drawn.
     pub principal: [f64; 2],
     /// Smallest t.x / t.z and t.y / t.z at which the Jacobian is taken (negative as a rule).
     pub slope_min: [f64; 2],
@@ -32,9 +32,9 @@ pub struct View {
     pub slope_max: [f64; 2],
     /// Gaussians with t.z under this are dropped, world units.
     pub near: f64,
-    /// Picture width, pixels.
+    /// Width of the part drawn, pixels.
     pub width: u32,
-    /// Picture height, pixels.
+    /// Height of the part drawn, pixels.
     pub height: u32,
 }
 
@@ -47,6 +47,10 @@ impl View {
     /// memory.
     pub fn new(origin: DVec3, request: &RenderRequest) -> Result<Self> {
         let lens = request.camera.intrinsics.validated("camera")?;
+        let drawn = match request.crop {
+            None => lens,
+            Some(crop) => lens.part(crop.inside(lens.width, lens.height, "camera")?),
+        };
         if !(request.near.is_finite() && request.near > 0.0) {
             return Err(Error::invalid(format!(
                 "near is {}; it must be a finite number over 0",
@@ -57,11 +61,11 @@ impl View {
             return Err(Error::invalid(format!("background holds {value}, not a finite number")));
         }
         request.labels.check()?;
-        let (pixels, pixels_max) = (u64::from(lens.width) * u64::from(lens.height), PIXELS_MAX);
-        if pixels > pixels_max || lens.width.max(lens.height) > SIDE_MAX {
+        let (pixels, pixels_max) = (u64::from(drawn.width) * u64::from(drawn.height), PIXELS_MAX);
+        if pixels > pixels_max || drawn.width.max(drawn.height) > SIDE_MAX {
             return Err(Error::limit(
                 "camera: pixels of the picture",
-                format!("{}x{}", lens.width, lens.height),
+                format!("{}x{}", drawn.width, drawn.height),
                 format!("{pixels_max} in all or {SIDE_MAX} a side"),
             ));
         }
@@ -70,7 +74,8 @@ impl View {
         let center = pose.center() - origin;
         let (focal, principal) = ([lens.fx, lens.fy], [lens.cx, lens.cy]);
         let size = [f64::from(lens.width), f64::from(lens.height)];
-        // Measured from the true principal point: with an off-centre one the two sides differ.
+        // Measured from the true principal point: with an off-centre one the two sides differ. And
+        // of the whole picture: a part shows what the whole shows there.
         let margin = |axis: usize| f64::from(FRUSTUM_MARGIN) * 0.5 * size[axis] / focal[axis];
         let low = |axis: usize| -principal[axis] / focal[axis] - margin(axis);
         let high = |axis: usize| (size[axis] - principal[axis]) / focal[axis] + margin(axis);
@@ -79,12 +84,12 @@ impl View {
             translation: -(rotation * center),
             center,
             focal,
-            principal,
+            principal: [drawn.cx, drawn.cy],
             slope_min: [low(0), low(1)],
             slope_max: [high(0), high(1)],
             near: f64::from(request.near),
-            width: lens.width,
-            height: lens.height,
+            width: drawn.width,
+            height: drawn.height,
         })
     }
 

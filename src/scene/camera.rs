@@ -62,6 +62,12 @@ impl Intrinsics {
         Self { cx: self.cx - x, cy: self.cy - y, width, height, ..self }
     }
 
+    /// Intrinsics of the part `crop` of this image.
+    #[must_use]
+    pub fn part(self, crop: Region) -> Self {
+        self.cropped(f64::from(crop.x), f64::from(crop.y), crop.width, crop.height)
+    }
+
     /// Intrinsics of the image resized to `width` x `height`.
     ///
     /// Exact with pixel centres at +0.5: coordinates scale about the image corner.
@@ -89,6 +95,39 @@ impl Intrinsics {
     #[must_use]
     pub fn unproject(&self, u: f64, v: f64, z: f64) -> DVec3 {
         DVec3::new((u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z, z)
+    }
+}
+
+/// A part of a picture, pixels of the whole one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Region {
+    /// First column.
+    pub x: u32,
+    /// First row.
+    pub y: u32,
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
+impl Region {
+    /// Refuses a part that is empty or not inside a picture of `width` x `height`.
+    ///
+    /// # Errors
+    /// `invalid_request`, with a message that starts with `what` and names the numbers.
+    pub fn inside(self, width: u32, height: u32, what: &str) -> Result<Self> {
+        let Self { x, y, width: w, height: h } = self;
+        let fits = |at: u32, size: u32, whole: u32| {
+            size > 0 && u64::from(at) + u64::from(size) <= u64::from(whole)
+        };
+        if fits(x, w, width) && fits(y, h, height) {
+            return Ok(self);
+        }
+        Err(Error::invalid(format!(
+            "{what}: crop is {w}x{h} px at {x},{y}; it must be at least 1x1 px and lie inside the \
+             picture of {width}x{height} px"
+        )))
     }
 }
 

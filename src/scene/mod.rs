@@ -18,7 +18,7 @@ mod status;
 mod upload;
 
 pub use backdrop::Backdrop;
-pub use camera::{Camera, CameraToWorld, Intrinsics, ORTHONORMAL_TOLERANCE};
+pub use camera::{Camera, CameraToWorld, Intrinsics, ORTHONORMAL_TOLERANCE, Region};
 pub use capture::{Capture, ViewSet};
 pub use gaussians::{Gaussians, RawGaussians, SanitizeReport, SourcePixel};
 pub use geometry::ViewGaussians;

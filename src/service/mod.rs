@@ -36,6 +36,7 @@ pub use self::{
     },
     view::default_near,
 };
+pub use crate::render::Quality;
 pub use crate::scene::{
     Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
     SemanticsState, SemanticsStatus, Upload, UploadCameras, UploadFile,

@@ -7,7 +7,7 @@ use super::{
     semantics::Understood,
     texts,
     types::{Kind, Label, PickSpec, Picked},
-    view::{Resolved, resolve_for},
+    view::{Resolved, refuse_crop, resolve_for},
 };
 use crate::{
     error::{Error, Result},
@@ -120,6 +120,7 @@ impl Service {
     pub async fn pick(&self, id: &SceneId, spec: PickSpec) -> Result<Picked> {
         self.sees(id)?;
         let inner = &self.inner;
+        refuse_crop(&spec.options, "pick")?;
         let record = inner.finished(id)?;
         let cameras = [spec.camera];
         let view = resolve_for(inner, &record, &cameras, &[Kind::Alpha], &spec.options)?.pop();

@@ -15,7 +15,7 @@ use super::{
     types::{
         Boxes, Format, Kind, MaskFormat, Part3, Peak, QueryAnswer, QuerySpec, TextResult, TextView,
     },
-    view::{Resolved, resolve_for},
+    view::{Resolved, refuse_crop, resolve_for},
 };
 use crate::{
     error::Result,
@@ -194,6 +194,7 @@ impl Service {
         self.sees(id)?;
         let inner = &self.inner;
         inner.can_understand("query")?;
+        refuse_crop(&spec.options, "query")?;
         let texts = texts::all_checked(&spec.texts, "texts", self.limits())?;
         let record = inner.finished(id)?;
         let view = match spec.camera {

@@ -6,8 +6,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{base64, rle::Rle};
 use crate::{
-    render::FrameStats,
-    scene::{Camera, SceneOptions, SceneStatus, ScoringProfile, Upload},
+    render::{FrameStats, Quality},
+    scene::{Camera, Region, SceneOptions, SceneStatus, ScoringProfile, Upload},
 };
 
 /// Everything needed to make a scene.
@@ -197,6 +197,10 @@ pub struct ViewOptions {
     pub antialiased: bool,
     /// Near plane, world units; `None`: 0.01 of the scene's median depth.
     pub near: Option<f32>,
+    /// The part of the picture that is drawn and sent; `None`: all of it. For views alone.
+    pub crop: Option<Region>,
+    /// How closely to keep to the rendering model.
+    pub quality: Quality,
     /// The caller's own deadline; never over `limits.render_timeout_ms`.
     pub deadline: Option<Duration>,
 }
@@ -210,6 +214,8 @@ impl Default for ViewOptions {
             background: None,
             antialiased: false,
             near: None,
+            crop: None,
+            quality: Quality::Exact,
             deadline: None,
         }
     }

@@ -18,8 +18,8 @@ use super::{
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    render::{Frame, Kinds, Labels, RenderRequest, Renderer, compose},
-    scene::{Camera, Scene, SceneCamera, SceneId, SceneState, Semantics},
+    render::{Frame, Kinds, Labels, Quality, RenderRequest, Renderer, compose},
+    scene::{Camera, Intrinsics, Region, Scene, SceneCamera, SceneId, SceneState, Semantics},
     semantics::{Scorer, mask_from_blend},
     store::Record,
 };
@@ -41,6 +41,8 @@ pub(super) struct Resolved {
     background: Option<[f32; 3]>,
     antialiased: bool,
     near: f32,
+    crop: Option<Region>,
+    quality: Quality,
 }
 
 /// What the text kinds of a view are answered from.
@@ -83,21 +85,30 @@ impl Resolved {
         self.camera
     }
 
+    /// The camera of the picture that comes out.
+    fn seen(&self) -> Camera {
+        let whole = self.camera.intrinsics;
+        let intrinsics = self.crop.map_or(whole, |crop| whole.part(crop));
+        Camera { intrinsics, ..self.camera }
+    }
+
     /// Tells E of this view from that of any other; its pixels do not depend on the background.
     pub(super) fn seen_key(&self, tag: &str, renderer: &str) -> String {
-        let Self { camera, antialiased, near, .. } = self;
-        format!("{tag} {renderer} {camera:?} {antialiased} {near:?}")
+        let Self { camera, antialiased, near, crop, quality, .. } = self;
+        format!("{tag} {renderer} {camera:?} {antialiased} {near:?} {crop:?} {quality:?}")
     }
 
     /// A request of these pictures without labels.
     pub(super) fn labels_request(&self, kinds: Kinds) -> RenderRequest {
         RenderRequest {
             camera: self.camera,
+            crop: self.crop,
             kinds,
             labels: Labels::None,
             background: self.background.unwrap_or_default(),
             antialiased: self.antialiased,
             near: self.near,
+            quality: self.quality,
         }
     }
 
@@ -108,12 +119,12 @@ impl Resolved {
 
     /// Hash of scene, renderer and request for one kind; `asked` tells what was asked by text.
     fn etag(&self, scene: &str, renderer: &str, kind: Kind, asked: &str) -> String {
-        let Self { camera, format, background, antialiased, near, .. } = self;
+        let Self { camera, format, background, antialiased, near, crop, quality, .. } = self;
         let version = env!("CARGO_PKG_VERSION");
         // Debug prints floats so that they read back the same.
         let words = format!(
             "{scene} {version} {renderer} {camera:?} {kind:?} {format:?} {background:?} \
-             {antialiased} {near:?} {asked}"
+             {antialiased} {near:?} {crop:?} {quality:?} {asked}"
         );
         Sha256::digest(words)[..16].iter().map(|byte| format!("{byte:02x}")).collect()
     }
@@ -194,7 +205,7 @@ impl Resolved {
                 height: frame.height,
                 bytes,
                 depth_scale,
-                camera: self.camera,
+                camera: self.seen(),
                 etag: self.etag(scene_tag, &name, kind, asked),
                 stats: frame.stats,
                 render_ms,
@@ -226,6 +237,14 @@ impl Resolved {
             }
             _ => Err(Error::internal(format!("kind={} was not drawn", kind.name()))),
         }
+    }
+}
+
+/// Refuses a part of a picture where the whole view is what is asked about.
+pub(super) fn refuse_crop(options: &ViewOptions, call: &str) -> Result<()> {
+    match options.crop {
+        None => Ok(()),
+        Some(_) => Err(Error::invalid(format!("crop goes with views, not with {call}"))),
     }
 }
 
@@ -273,14 +292,18 @@ fn resolve(
             1 => "camera".to_owned(),
             _ => format!("camera {camera_index}"),
         };
+        let camera = camera::resolve(spec, options, inputs, limits, &what)?;
+        let Intrinsics { width, height, .. } = camera.intrinsics;
         Ok(Resolved {
             camera_index,
-            camera: camera::resolve(spec, options, inputs, limits, &what)?,
+            camera,
             kinds: kinds.to_vec(),
             format: options.format,
             background: options.background,
             antialiased: options.antialiased,
             near,
+            crop: options.crop.map(|crop| crop.inside(width, height, &what)).transpose()?,
+            quality: options.quality,
         })
     };
     cameras.iter().enumerate().map(resolved).collect()

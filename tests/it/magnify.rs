@@ -1,7 +1,7 @@
 //! Views larger than the network's own pictures: no dot grid, and no change at its own size.
 
 use segsplat::{
-    render::{Kinds, Labels, RenderRequest, Renderer, constants, cpu::CpuRenderer},
+    render::{Kinds, Labels, Quality, RenderRequest, Renderer, constants, cpu::CpuRenderer},
     scene::{
         Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, LEARNT_BLUR_PX2,
         Provenance, RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
@@ -67,6 +67,8 @@ fn alpha_range(gaussians: &Gaussians, camera: Camera) -> [f32; 2] {
         background: [0.0; 3],
         antialiased: false,
         near: 0.01,
+        quality: Quality::Exact,
+        crop: None,
     };
     let frame = CpuRenderer::new(1).and_then(|cpu| cpu.render(gaussians, &request));
     let frame = frame.expect("a wall renders");

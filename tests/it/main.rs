@@ -15,6 +15,7 @@ mod colour_words;
 mod colours;
 mod common;
 mod compose;
+mod crop;
 mod errors;
 mod evaluate;
 mod fuzz;

@@ -7,7 +7,7 @@ use segsplat::{
     error::ErrorCode,
     eval::psnr,
     pipeline::{self, Engine},
-    render::{Kinds, Labels, RenderRequest, Renderer, cpu::CpuRenderer},
+    render::{Kinds, Labels, Quality, RenderRequest, Renderer, cpu::CpuRenderer},
     sample::{self, Room, SampleOptions},
     scene::SceneOptions,
 };
@@ -42,6 +42,8 @@ fn the_sample_is_reconstructed_close_to_its_truth() {
         background: [0.0; 3],
         antialiased: false,
         near: 0.01 * made.report.median_depth as f32,
+        quality: Quality::Exact,
+        crop: None,
     };
     let frame = CpuRenderer::new(0).unwrap().render(&made.gaussians, &request).unwrap();
     let true_color: Vec<[f32; 3]> = truth

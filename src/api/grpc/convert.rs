@@ -3,9 +3,11 @@
 use super::pb;
 use crate::{
     error::{Error, Result},
-    scene::{CameraToWorld, HealthReport, Intrinsics, ScoringProfile, SemanticsReport, StageTime},
+    scene::{
+        CameraToWorld, HealthReport, Intrinsics, Region, ScoringProfile, SemanticsReport, StageTime,
+    },
     service::{
-        CameraSpec, Event, ExportFormat, Format, Kind, LensSpec, PoseSpec, RenderedView,
+        CameraSpec, Event, ExportFormat, Format, Kind, LensSpec, PoseSpec, Quality, RenderedView,
         SceneError, SceneState, SceneStatus, SemanticsMode, SemanticsState, SemanticsStatus,
         ViewOptions,
     },
@@ -228,6 +230,16 @@ pub(super) fn options(options: Option<pb::ViewOptions>) -> Result<ViewOptions> {
         background,
         antialiased: options.antialiased,
         near: options.near,
+        crop: options.crop.map(|crop| Region {
+            x: crop.x,
+            y: crop.y,
+            width: crop.width,
+            height: crop.height,
+        }),
+        quality: match known::<pb::Quality>("quality", options.quality)? {
+            pb::Quality::Unspecified | pb::Quality::Exact => Quality::Exact,
+            pb::Quality::Fast => Quality::Fast,
+        },
         deadline: None,
     })
 }

@@ -162,7 +162,10 @@ pub(super) struct ViewParams {
     antialiased: Option<bool>,
     /// Near plane, world units.
     near: Option<f32>,
-    /// `exact` or `fast`; both are exact now.
+    /// The part of the picture that is drawn: first column, first row, width and height in pixels
+    /// of the whole, four whole numbers separated by commas.
+    crop: Option<String>,
+    /// `exact` (default) or `fast`.
     quality: Option<String>,
     /// What to look for, for `relevancy` and `mask`.
     text: Option<String>,
@@ -445,6 +448,10 @@ pub(super) struct ViewsRequest {
     antialiased: Option<bool>,
     /// Near plane, world units.
     near: Option<f32>,
+    /// The part of every picture that is drawn: first column, first row, width, height.
+    crop: Option<[u32; 4]>,
+    /// `exact` (default) or `fast`.
+    quality: Option<String>,
     /// What to look for, for `relevancy` and `mask`.
     text: Option<String>,
     /// How the text is scored: `default`, or `paper`.

@@ -82,6 +82,22 @@ impl Params {
         &mut self,
         name: &'static str,
     ) -> Result<Option<[f64; N]>> {
+        self.list(name, "numbers")
+    }
+
+    /// The value of `name` as exactly `N` comma-separated whole numbers of at least 0.
+    pub(super) fn wholes<const N: usize>(
+        &mut self,
+        name: &'static str,
+    ) -> Result<Option<[u32; N]>> {
+        self.list(name, "whole numbers")
+    }
+
+    fn list<T: FromStr + Copy + Default, const N: usize>(
+        &mut self,
+        name: &'static str,
+        what: &str,
+    ) -> Result<Option<[T; N]>> {
         let Some(value) = self.text(name)? else { return Ok(None) };
         let count = value.split(',').count();
         if count != N {
@@ -89,9 +105,9 @@ impl Params {
                 "{name} has {count} numbers; it must have {N}, separated by commas"
             )));
         }
-        let mut numbers = [0.0; N];
+        let mut numbers = [T::default(); N];
         for (number, text) in numbers.iter_mut().zip(value.split(',')) {
-            *number = parse(name, text.trim(), "numbers")?;
+            *number = parse(name, text.trim(), what)?;
         }
         Ok(Some(numbers))
     }

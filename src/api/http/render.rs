@@ -22,9 +22,10 @@ use crate::{
     api::{
         Api,
         camera::CameraFields,
-        semantics::{kind, profile},
+        semantics::{kind, profile, quality},
     },
     error::{Error, Result},
+    scene::Region,
     service::{Ask, ExportFormat, Format, Kind, RenderedView, ViewOptions, ViewSpec},
 };
 
@@ -179,17 +180,18 @@ fn spec_of(mut params: Params, accept: Option<&str>) -> Result<ViewSpec> {
         background: p.text("background")?.map_or(Ok(None), |text| background(&text))?,
         antialiased: p.flag("antialiased")?.unwrap_or(false),
         near: p.number("near", "a number")?,
+        crop: p.wholes("crop")?.map(crop),
+        quality: quality(p.text("quality")?.as_deref())?,
         deadline: None,
     };
     let ask = ask(p)?;
-    if let Some(quality) = p.text("quality")?
-        && !["exact", "fast"].contains(&quality.as_str())
-    {
-        let shown: String = quality.chars().take(40).collect();
-        return Err(Error::invalid(format!("quality is {shown:?}; it must be exact or fast")));
-    }
     params.finish()?;
     Ok(ViewSpec { camera: fields.spec("view")?, kind, options, ask })
+}
+
+/// A part of a picture from its first column, first row, width and height.
+pub(super) fn crop([x, y, width, height]: [u32; 4]) -> Region {
+    Region { x, y, width, height }
 }
 
 /// The encoding named `name`.

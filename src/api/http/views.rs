@@ -23,13 +23,13 @@ use super::{
     extract::{Id, JsonBody},
     openapi::{IdParam, ViewsRequest},
     params::Params,
-    render::{background, content_type, format, view_headers},
+    render::{background, content_type, crop, format, view_headers},
 };
 use crate::{
     api::{
         Api,
         camera::CameraFields,
-        semantics::{kind, profile},
+        semantics::{kind, profile, quality},
     },
     error::{Error, Result},
     service::{Ask, Format, Kind, RenderedView, ViewOptions, ViewsSpec},
@@ -51,6 +51,8 @@ pub(super) struct ViewsBody {
     #[serde(default)]
     antialiased: bool,
     near: Option<f32>,
+    crop: Option<[u32; 4]>,
+    quality: Option<String>,
     text: Option<String>,
     profile: Option<String>,
     wait_ms: Option<u64>,
@@ -141,6 +143,8 @@ fn spec_of(body: ViewsBody) -> Result<ViewsSpec> {
         background,
         antialiased: body.antialiased,
         near: body.near,
+        crop: body.crop.map(crop),
+        quality: quality(body.quality.as_deref())?,
         deadline: None,
     };
     let ask = Ask {

@@ -14,7 +14,7 @@ use crate::{
         Engine, masks, reconstruct,
         semantics::{SceneParts, SemanticsOptions, Watch, understand},
     },
-    render::{Entries, Kinds, Labels, RenderRequest, compose, cpu::CpuRenderer},
+    render::{Entries, Kinds, Labels, Quality, RenderRequest, compose, cpu::CpuRenderer},
     scene::{
         Bank, Camera, Crop, PhotoMasks, PosedPhoto, Provenance, Scene, SceneId, SceneMeta,
         SceneOptions, ScoringProfile, SemanticsReport, StageTime,
@@ -106,6 +106,8 @@ impl<'a> Road<'a> {
             background: [0.0; 3],
             antialiased: false,
             near,
+            quality: Quality::Exact,
+            crop: None,
         };
         let warnings = made.report.warnings.len();
         let stages = made.report.stages.clone();

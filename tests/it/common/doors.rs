@@ -124,6 +124,17 @@ impl Ask {
             background: self.numbers("background").map(|v| pb::Vec3 { x: v[0], y: v[1], z: v[2] }),
             antialiased: self.get("antialiased") == Some("true"),
             near: self.number("near"),
+            crop: self.numbers("crop").map(|v| {
+                let [x, y, width, height] = [0, 1, 2, 3].map(|k| v[k] as u32);
+                pb::Region { x, y, width, height }
+            }),
+            quality: match self.get("quality") {
+                None => pb::Quality::Unspecified,
+                Some("exact") => pb::Quality::Exact,
+                Some("fast") => pb::Quality::Fast,
+                Some(other) => panic!("quality {other} is not in the proto"),
+            }
+            .into(),
         }
     }
 

@@ -3,7 +3,7 @@
 
 use glam::{DVec3, Quat, Vec3};
 use segsplat::{
-    render::{Kinds, Labels, RenderRequest},
+    render::{Kinds, Labels, Quality, RenderRequest},
     scene::{Camera, CameraToWorld, Gaussians, Intrinsics, RawGaussians, SourcePixel},
 };
 
@@ -84,6 +84,8 @@ pub(crate) fn request(camera: Camera) -> RenderRequest {
         background: [0.1, 0.2, 0.3],
         antialiased: false,
         near: 0.05,
+        quality: Quality::Exact,
+        crop: None,
     }
 }
 
