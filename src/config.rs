@@ -72,6 +72,30 @@ pub struct ConfigArgs {
     /// Scenes made at the same time [default: 1]
     #[arg(long, env = "SEGSPLAT_JOBS")]
     pub jobs: Option<usize>,
+    /// File of API keys (TOML, made by `segsplat keys new`); read again at SIGHUP
+    #[arg(long, env = "SEGSPLAT_KEYS", value_name = "FILE")]
+    pub keys: Option<PathBuf>,
+    /// Serve other machines without asking for a key [default: only this machine]
+    #[arg(long, env = "SEGSPLAT_ANONYMOUS", num_args = 0..=1, default_missing_value = "true")]
+    pub anonymous: Option<bool>,
+    /// Show /metrics to callers without an admin's key [default: false]
+    #[arg(long, env = "SEGSPLAT_OPEN_METRICS", num_args = 0..=1, default_missing_value = "true")]
+    pub open_metrics: Option<bool>,
+    /// Certificate chain (PEM): serve TLS, with --tls-key; read again at SIGHUP
+    #[arg(long, env = "SEGSPLAT_TLS_CERT", value_name = "FILE")]
+    pub tls_cert: Option<PathBuf>,
+    /// Private key of the certificate (PEM)
+    #[arg(long, env = "SEGSPLAT_TLS_KEY", value_name = "FILE")]
+    pub tls_key: Option<PathBuf>,
+    /// Origins whose pages may call, as `https://example.org`, or * for all [default: none]
+    #[arg(long, env = "SEGSPLAT_CORS_ORIGINS", value_delimiter = ',', value_name = "ORIGINS")]
+    pub cors_origins: Option<Vec<String>>,
+    /// Milliseconds to serve on, not ready, after SIGTERM, so that balancers look away [default: 0]
+    #[arg(long, env = "SEGSPLAT_DRAIN_NOTICE_MS")]
+    pub drain_notice_ms: Option<u64>,
+    /// Milliseconds that open calls get to end after that [default: 10000]
+    #[arg(long, env = "SEGSPLAT_DRAIN_MS")]
+    pub drain_ms: Option<u64>,
     /// Log filter in tracing's syntax [default: info,ort=warn]
     #[arg(long, env = "SEGSPLAT_LOG")]
     pub log: Option<String>,
@@ -105,6 +129,22 @@ pub struct Config {
     pub threads: usize,
     /// Scenes made at the same time.
     pub jobs: usize,
+    /// File of API keys; `None`: nobody is asked for one.
+    pub keys: Option<PathBuf>,
+    /// Serve other machines without asking for a key.
+    pub anonymous: bool,
+    /// Show `/metrics` to callers without an admin's key.
+    pub open_metrics: bool,
+    /// Certificate chain, PEM; `None`: no TLS.
+    pub tls_cert: Option<PathBuf>,
+    /// Private key of the certificate, PEM.
+    pub tls_key: Option<PathBuf>,
+    /// Origins whose pages may call.
+    pub cors_origins: Vec<String>,
+    /// Milliseconds to serve on, not ready, after the stop signal.
+    pub drain_notice_ms: u64,
+    /// Milliseconds that open calls get to end after that.
+    pub drain_ms: u64,
     /// Log filter.
     pub log: String,
     /// Log lines as JSON.
@@ -125,6 +165,14 @@ impl Default for Config {
             provider: ProviderChoice::Auto,
             threads: available_cores(),
             jobs: 1,
+            keys: None,
+            anonymous: false,
+            open_metrics: false,
+            tls_cert: None,
+            tls_key: None,
+            cors_origins: Vec::new(),
+            drain_notice_ms: 0,
+            drain_ms: 10_000,
             log: "info,ort=warn".to_owned(),
             log_json: false,
             limits: Limits::default(),
@@ -157,12 +205,38 @@ impl Config {
             provider: typed.provider.or(from_file.provider).unwrap_or(d.provider),
             threads: typed.threads.or(from_file.threads).unwrap_or(d.threads),
             jobs: typed.jobs.or(from_file.jobs).unwrap_or(d.jobs),
+            keys: typed.keys.or(from_file.keys),
+            anonymous: typed.anonymous.or(from_file.anonymous).unwrap_or(d.anonymous),
+            open_metrics: typed.open_metrics.or(from_file.open_metrics).unwrap_or(d.open_metrics),
+            tls_cert: typed.tls_cert.or(from_file.tls_cert),
+            tls_key: typed.tls_key.or(from_file.tls_key),
+            cors_origins: typed.cors_origins.or(from_file.cors_origins).unwrap_or(d.cors_origins),
+            drain_notice_ms: typed
+                .drain_notice_ms
+                .or(from_file.drain_notice_ms)
+                .unwrap_or(d.drain_notice_ms),
+            drain_ms: typed.drain_ms.or(from_file.drain_ms).unwrap_or(d.drain_ms),
             log: typed.log.or(from_file.log).unwrap_or(d.log),
             log_json: typed.log_json.or(from_file.log_json).unwrap_or(d.log_json),
             limits: typed.limits.or(from_file.limits).unwrap_or(d.limits),
         };
         config.validate()?;
         Ok(config)
+    }
+
+    /// Refuses to let other machines in without a key, unless that is asked for.
+    ///
+    /// # Errors
+    /// `invalid_request`.
+    pub fn check_doors(&self) -> Result<()> {
+        if self.keys.is_some() || self.anonymous || self.listen.ip().is_loopback() {
+            return Ok(());
+        }
+        Err(Error::invalid(format!(
+            "listen: {} is open to other machines and no keys are configured; give --keys FILE \
+             (segsplat keys new), or --anonymous to let anybody in",
+            self.listen
+        )))
     }
 
     fn validate(&self) -> Result<()> {
@@ -177,6 +251,14 @@ impl Config {
             return Err(Error::invalid(
                 "config: limits.photos_min must be at least 2 and at most photos_max",
             ));
+        }
+        if self.limits.key_requests_per_s == 0 || self.limits.key_inflight_max == 0 {
+            return Err(Error::invalid(
+                "config: limits.key_requests_per_s and key_inflight_max must be over 0",
+            ));
+        }
+        if self.tls_cert.is_some() != self.tls_key.is_some() {
+            return Err(Error::invalid("config: tls_cert and tls_key go together"));
         }
         Ok(())
     }

@@ -73,10 +73,38 @@ pub struct Limits {
     pub scene_timeout_ms: u64,
     /// Milliseconds a caller may hold a request open with `wait_ms`.
     pub wait_ms_max: u64,
+    /// Requests a second of one API key that says no number of its own; a second's worth at once.
+    pub key_requests_per_s: u32,
+    /// Calls of one API key that may be open at the same time, where it says no number of its own.
+    pub key_inflight_max: usize,
     /// Scenes on one page of a list.
     pub page_max: usize,
     /// Gaussians in one scene, made or imported.
     pub gaussians_max: usize,
+}
+
+impl Limits {
+    /// Names of the caps that size something made at start: a changed one needs a restart.
+    #[must_use]
+    pub fn changed_for_next_start(&self, new: &Self) -> Vec<&'static str> {
+        let mut names = Vec::new();
+        macro_rules! compare {
+            ($($field:ident),*) => {
+                $(if self.$field != new.$field { names.push(stringify!($field)); })*
+            };
+        }
+        compare!(
+            uploads_bytes_max,
+            texts_cached_max,
+            scorers_cache_bytes_max,
+            entries_cache_bytes_max,
+            queued_jobs_max,
+            queued_renders_max,
+            cache_bytes_max,
+            scene_timeout_ms
+        );
+        names
+    }
 }
 
 impl Default for Limits {
@@ -108,6 +136,8 @@ impl Default for Limits {
             render_timeout_ms: 30_000,
             scene_timeout_ms: 600_000,
             wait_ms_max: 600_000,
+            key_requests_per_s: 500,
+            key_inflight_max: 128,
             page_max: 100,
             gaussians_max: 16_777_216,
         }

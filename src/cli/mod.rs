@@ -6,7 +6,9 @@
 mod bench;
 mod camera;
 pub mod engine;
+mod health;
 mod inspect;
+mod keys;
 mod masks;
 mod measure;
 mod models;
@@ -44,7 +46,11 @@ struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Serve HTTP and gRPC on one port
-    Serve(serve::Args),
+    Serve(Box<serve::Args>),
+    /// Make API keys and hash them
+    Keys(keys::Args),
+    /// Ask a running server whether it is ready
+    Health(Box<health::Args>),
     /// Make a scene of a folder (or archive) of photos and their cameras
     Reconstruct(reconstruct::Args),
     /// Render a view of a scene
@@ -67,13 +73,14 @@ impl Command {
     fn config_args(&self) -> ConfigArgs {
         match self {
             Self::Serve(args) => args.config.clone(),
+            Self::Health(args) => args.config.clone(),
             Self::Reconstruct(args) => args.config.clone(),
             Self::Render(args) => args.config.clone(),
             Self::Query(args) => args.config.clone(),
             Self::Models(args) => args.config.clone(),
             Self::Eval(args) => args.config().clone(),
             Self::Bench(args) => args.config.clone(),
-            Self::Inspect(_) | Self::Sample(_) => ConfigArgs::default(),
+            Self::Inspect(_) | Self::Sample(_) | Self::Keys(_) => ConfigArgs::default(),
         }
     }
 }
@@ -112,7 +119,13 @@ fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
     }
     start_log(&config)?;
     match &cli.command {
-        Command::Serve(args) => serve::run(args, config, out),
+        Command::Serve(args) => {
+            let (file, typed) = (cli.config.clone(), args.config.clone());
+            let read_again = move || Config::resolve(file.as_deref(), typed.clone());
+            serve::run(args, config, read_again, out)
+        }
+        Command::Keys(args) => keys::run(args, out),
+        Command::Health(args) => health::run(args, &config, out),
         Command::Reconstruct(args) => reconstruct::run(args, &config, out),
         Command::Render(args) => render::run(args, &config, out),
         Command::Query(args) => query::run(args, &config, out),

@@ -7,7 +7,7 @@ use tokio::net::TcpListener;
 
 use super::{engine, output::Output};
 use crate::{
-    api,
+    api::Doors,
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
     service::Service,
@@ -22,18 +22,26 @@ pub(super) struct Args {
     print_config: bool,
 }
 
-pub(super) fn run(args: &Args, config: Config, out: &Output) -> Result<()> {
+/// `read_again` gives the configuration as the files say now.
+pub(super) fn run(
+    args: &Args,
+    config: Config,
+    read_again: impl Fn() -> Result<Config> + Send + 'static,
+    out: &Output,
+) -> Result<()> {
     if args.print_config {
         let text = serde_json::to_string_pretty(&config)
             .map_err(|e| Error::internal("the configuration is no JSON").caused_by(e))?;
         return out.answer(&text, &config);
     }
+    config.check_doors()?;
     let parts = engine::parts(&config)?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
         .map_err(|e| Error::internal("the async runtime does not start").caused_by(e))?;
     let (models, data_dir) = (parts.models.clone(), config.data_dir.clone());
+    let scheme = if config.tls_cert.is_some() { "https" } else { "http" };
     let (renderer, listen) = (parts.renderer.name(), config.listen);
     let service = Service::open(config, parts)?;
     let served = runtime.block_on(async {
@@ -43,6 +51,7 @@ pub(super) fn run(args: &Args, config: Config, out: &Output) -> Result<()> {
         let address = listener
             .local_addr()
             .map_err(|e| Error::internal("the listener has no address").caused_by(e))?;
+        let doors = Doors::new(service.clone())?;
         let provider = &models.execution_provider;
         let (bundle, sha256) = (&models.bundle, models.bundle_sha256.get(..12).unwrap_or_default());
         tracing::info!(
@@ -54,20 +63,46 @@ pub(super) fn run(args: &Args, config: Config, out: &Output) -> Result<()> {
             data_dir = %data_dir.display(),
             "serving HTTP and gRPC"
         );
-        let mut text = format!("listening on http://{address}\n");
+        let mut text = format!("listening on {scheme}://{address}\n");
         let _ = write!(text, "renderer {renderer}, network on {provider}, bundle {bundle}");
         let answer = json!({
-            "listening": format!("http://{address}"),
+            "listening": format!("{scheme}://{address}"),
             "renderer": renderer,
             "execution_provider": provider,
             "bundle": bundle,
         });
         out.answer(&text, &answer)?;
-        api::serve(listener, service.clone(), stop_signal()?).await
+        reload_at_hangup(doors.clone(), read_again)?;
+        doors.serve(listener, stop_signal()?).await
     });
     tracing::info!("stopping: jobs at work are queued again for the next start");
     service.shut_down();
     served
+}
+
+/// Puts keys, limits and certificate in force again at each SIGHUP.
+#[cfg_attr(not(unix), expect(clippy::unnecessary_wraps, reason = "signals are unix"))]
+fn reload_at_hangup(
+    doors: Doors,
+    read_again: impl Fn() -> Result<Config> + Send + 'static,
+) -> Result<()> {
+    #[cfg(unix)]
+    {
+        use tokio::signal::unix::{SignalKind, signal};
+        let mut hangup = signal(SignalKind::hangup()).map_err(|e| {
+            Error::new(ErrorCode::Internal, "signals cannot be watched").caused_by(e)
+        })?;
+        tokio::spawn(async move {
+            while hangup.recv().await.is_some() {
+                if let Err(error) = read_again().and_then(|config| doors.reload(&config)) {
+                    tracing::error!(%error, "nothing is read again: the old values stay in force");
+                }
+            }
+        });
+    }
+    #[cfg(not(unix))]
+    drop((doors, read_again));
+    Ok(())
 }
 
 /// Resolves at the first SIGTERM or Ctrl-C.

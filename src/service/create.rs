@@ -40,7 +40,7 @@ impl Service {
     /// `invalid_request`, `photo_unreadable`, `limit_exceeded`, `overloaded`, `store_unavailable`.
     pub async fn create_scene(&self, request: CreateScene) -> Result<Created> {
         let CreateScene { upload, options, idempotency_key, wait } = request;
-        check_request(&options, idempotency_key.as_deref(), self.limits())?;
+        check_request(&options, idempotency_key.as_deref(), &self.limits())?;
         if options.semantics == SemanticsMode::Eager {
             self.inner.can_understand("semantics=eager")?;
         }
@@ -112,7 +112,7 @@ impl Inner {
         key: Option<String>,
         caller: &Caller,
     ) -> Result<SceneId> {
-        self.maker.check(upload, &self.config.limits)?;
+        self.maker.check(upload, &self.limits())?;
         let id = new_id();
         let mut status = SceneStatus::new(id.clone(), SceneState::Queued, store::now_ms());
         if options.semantics == SemanticsMode::Off {

@@ -43,7 +43,7 @@ impl Service {
             return Ok(Export { file_name: format!("{id}.ply"), size_bytes, etag, chunks });
         };
         inner.can_understand("text")?;
-        let text = texts::checked(text, "text", self.limits())?;
+        let text = texts::checked(text, "text", &self.limits())?;
         let understood = inner.understood(id, "text", ask.wait).await?;
         let tag = understood.tag();
         let words = format!("{tag} {text:?} {:?}", ask.profile);

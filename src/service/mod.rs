@@ -19,7 +19,10 @@ mod texts;
 mod types;
 mod view;
 
-use std::{fmt, sync::Arc};
+use std::{
+    fmt,
+    sync::{Arc, PoisonError, RwLock},
+};
 
 use futures_util::{Stream, stream};
 use tokio::sync::Semaphore;
@@ -85,6 +88,8 @@ impl fmt::Debug for Parts {
 
 struct Inner {
     config: Config,
+    /// Caps in force: those of the configuration, or newer ones.
+    limits: RwLock<Arc<Limits>>,
     store: Arc<Store>,
     jobs: Jobs,
     maker: Arc<dyn SceneMaker>,
@@ -100,6 +105,12 @@ struct Inner {
 impl fmt::Debug for Inner {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Inner").field("config", &self.config).finish_non_exhaustive()
+    }
+}
+
+impl Inner {
+    fn limits(&self) -> Arc<Limits> {
+        Arc::clone(&self.limits.read().unwrap_or_else(PoisonError::into_inner))
     }
 }
 
@@ -137,6 +148,7 @@ impl Service {
             gate: Gate::new(renders, config.limits.queued_renders_max),
             reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
             keys: tokio::sync::Mutex::new(keys),
+            limits: RwLock::new(Arc::new(config.limits.clone())),
             config,
         };
         Ok(Self { inner: Arc::new(inner), caller: Caller::All })
@@ -161,8 +173,22 @@ impl Service {
 
     /// The caps in force.
     #[must_use]
-    pub fn limits(&self) -> &Limits {
-        &self.inner.config.limits
+    pub fn limits(&self) -> Arc<Limits> {
+        self.inner.limits()
+    }
+
+    /// The configuration of the start.
+    #[must_use]
+    pub fn config(&self) -> &Config {
+        &self.inner.config
+    }
+
+    /// Puts other caps in force; names those that only the next start can follow.
+    #[must_use]
+    pub fn reload(&self, limits: Limits) -> Vec<&'static str> {
+        let later = self.inner.config.limits.changed_for_next_start(&limits);
+        *self.inner.limits.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(limits);
+        later
     }
 
     /// Where a scene stands, with its report and cameras once done.

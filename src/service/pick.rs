@@ -129,7 +129,7 @@ impl Service {
             (Vec::new(), None)
         } else {
             inner.can_understand("labels")?;
-            let labels = texts::all_checked(&spec.labels, "labels", self.limits())?;
+            let labels = texts::all_checked(&spec.labels, "labels", &self.limits())?;
             (labels, Some(inner.understood(id, "labels", spec.wait).await?))
         };
         let deadline = inner.deadline(&spec.options);

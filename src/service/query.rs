@@ -195,7 +195,7 @@ impl Service {
         let inner = &self.inner;
         inner.can_understand("query")?;
         refuse_crop(&spec.options, "query")?;
-        let texts = texts::all_checked(&spec.texts, "texts", self.limits())?;
+        let texts = texts::all_checked(&spec.texts, "texts", &self.limits())?;
         let record = inner.finished(id)?;
         let view = match spec.camera {
             Some(camera) => {
@@ -213,7 +213,7 @@ impl Service {
                 let ground = Ground {
                     asker: &work.asker,
                     renderer: &*work.renderer,
-                    limits: &work.config.limits,
+                    limits: &work.limits(),
                     scene,
                     semantics,
                     tag: &understood.tag(),

@@ -90,7 +90,7 @@ impl Inner {
         let record = self.finished(id)?;
         self.can_understand(what)?;
         Self::may_be_asked(&record, what)?;
-        let limits = &self.config.limits;
+        let limits = &self.limits();
         let wait = wait.unwrap_or(Duration::from_millis(limits.text_wait_ms));
         let until =
             tokio::time::Instant::now() + wait.min(Duration::from_millis(limits.wait_ms_max));

@@ -262,7 +262,7 @@ pub(super) fn resolve_for(
     options: &ViewOptions,
 ) -> Result<Vec<Resolved>> {
     let depth = record.status.report.as_ref().map_or(0.0, |report| report.median_depth);
-    resolve(&inner.config.limits, &record.status.cameras, depth, cameras, kinds, options)
+    resolve(&inner.limits(), &record.status.cameras, depth, cameras, kinds, options)
 }
 
 fn resolve(
@@ -412,7 +412,7 @@ impl Inner {
         if let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) {
             self.can_understand(&format!("kind={}", kind.name()))?;
         }
-        check_ask(kinds, ask, &self.config.limits)
+        check_ask(kinds, ask, &self.limits())
     }
 
     /// Renders on a blocking thread within the deadline; encodes each kind.
@@ -467,7 +467,7 @@ impl Inner {
     }
 
     pub(super) fn deadline(&self, options: &ViewOptions) -> Instant {
-        let most = std::time::Duration::from_millis(self.config.limits.render_timeout_ms);
+        let most = std::time::Duration::from_millis(self.limits().render_timeout_ms);
         Instant::now() + options.deadline.map_or(most, |asked| asked.min(most))
     }
 }
@@ -541,7 +541,7 @@ impl Service {
     ) -> Result<impl Stream<Item = Result<RenderedView>> + Send + use<>> {
         self.sees(id)?;
         let inner = Arc::clone(&self.inner);
-        let limits = &inner.config.limits;
+        let limits = &inner.limits();
         for (what, count, max) in [
             ("cameras", spec.cameras.len(), limits.cameras_max),
             ("kinds", spec.kinds.len(), limits.kinds_max),

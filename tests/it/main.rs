@@ -7,6 +7,7 @@
     reason = "helpers of tests are tests too"
 )]
 
+mod access;
 mod asking;
 mod bad_input;
 mod capture;
@@ -25,6 +26,7 @@ mod http;
 mod jobs;
 mod label_twins;
 mod labels;
+mod life;
 mod literal;
 mod magnify;
 mod oracle;
@@ -36,5 +38,6 @@ mod shader_layout;
 mod store;
 mod texts;
 mod tidy;
+mod tls;
 mod twins;
 mod understand;

@@ -12,7 +12,7 @@ use futures_util::FutureExt;
 use tonic::service::Routes;
 use tonic_health::{ServingStatus, server::HealthReporter};
 
-use super::Api;
+use super::{Api, life::Life};
 use crate::error::{Error, Result};
 
 pub(super) use self::status::{complete, refusal, unimplemented};
@@ -47,9 +47,13 @@ const MESSAGE_BYTES_MAX: usize = 256 << 20;
 ///
 /// # Errors
 /// `internal` when the descriptors are damaged.
+///
+/// # Panics
+/// Outside of a tokio runtime.
 pub fn routes(api: Api) -> Result<Routes> {
     // The camera JSON goes in one message with the header; all else comes in smaller pieces.
     let decoding_max = api.service.limits().json_bytes_max + (1 << 20);
+    let life = api.life.clone();
     let scenes = pb::scene_service_server::SceneServiceServer::new(api)
         .max_decoding_message_size(decoding_max)
         .max_encoding_message_size(MESSAGE_BYTES_MAX);
@@ -60,17 +64,25 @@ pub fn routes(api: Api) -> Result<Routes> {
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
     Ok(Routes::new(scenes)
-        .add_service(health())
+        .add_service(health(life))
         .add_service(reflection().build_v1().map_err(damaged)?)
         .add_service(reflection().build_v1alpha().map_err(damaged)?))
 }
 
-/// Liveness: serving as long as it answers, for the server and for the one service.
-fn health() -> tonic_health::pb::health_server::HealthServer<tonic_health::server::HealthService> {
+/// Serving until the server is told to stop, for the server and for the one service.
+fn health(
+    life: Life,
+) -> tonic_health::pb::health_server::HealthServer<tonic_health::server::HealthService> {
     let reporter = HealthReporter::new();
     let service = tonic_health::server::HealthService::from_health_reporter(reporter.clone());
     let name = pb::scene_service_server::SERVICE_NAME;
     // Nobody else holds the lock yet, so this is ready at once.
     reporter.set_service_status(name, ServingStatus::Serving).now_or_never();
+    tokio::spawn(async move {
+        life.ending().await;
+        for name in ["", name] {
+            reporter.set_service_status(name, ServingStatus::NotServing).await;
+        }
+    });
     tonic_health::pb::health_server::HealthServer::new(service)
 }

@@ -17,6 +17,7 @@ use crate::{
         upload::{UploadBuilder, UploadGuard},
     },
     error::{Error, ErrorCode, Result},
+    keys::Caller,
     scene::{Upload, UploadCameras},
     service::{CreateScene, PageRequest, SceneOptions, ViewSpec, ViewsSpec},
 };
@@ -37,7 +38,8 @@ impl pb::scene_service_server::SceneService for Api {
         &self,
         request: Request<Streaming<pb::CreateSceneRequest>>,
     ) -> Answer<pb::Scene> {
-        let scene = create(self, request.into_inner()).await.map_err(|e| logged(&e))?;
+        let api = called(self, &request)?;
+        let scene = create(&api, request.into_inner()).await.map_err(|e| logged(&e))?;
         Ok(Response::new(scene))
     }
 
@@ -45,13 +47,15 @@ impl pb::scene_service_server::SceneService for Api {
         &self,
         request: Request<pb::WatchSceneRequest>,
     ) -> Answer<Self::WatchSceneStream> {
-        let events = async { self.service.watch(&request.get_ref().scene_id.parse()?) }.await;
+        let api = called(self, &request)?;
+        let events = async { api.service.watch(&request.get_ref().scene_id.parse()?) }.await;
         let events = events.map_err(|e| logged(&e))?;
         Ok(Response::new(events.map(|event| Ok(convert::event(event))).boxed()))
     }
 
     async fn get_scene(&self, request: Request<pb::GetSceneRequest>) -> Answer<pb::Scene> {
-        let status = async { self.service.get(&request.get_ref().scene_id.parse()?) }.await;
+        let api = called(self, &request)?;
+        let status = async { api.service.get(&request.get_ref().scene_id.parse()?) }.await;
         let status = status.map_err(|e| logged(&e))?;
         Ok(Response::new(convert::scene(status)))
     }
@@ -60,12 +64,13 @@ impl pb::scene_service_server::SceneService for Api {
         &self,
         request: Request<pb::ListScenesRequest>,
     ) -> Answer<pb::ListScenesResponse> {
+        let api = called(self, &request)?;
         let request = request.into_inner();
         let page = PageRequest {
             limit: request.limit.map(|limit| limit as usize),
             after: Some(request.after).filter(|after| !after.is_empty()),
         };
-        let page = self.service.list(&page).map_err(|e| logged(&e))?;
+        let page = api.service.list(&page).map_err(|e| logged(&e))?;
         let scenes = page.scenes.into_iter().map(convert::scene).collect();
         let next = page.next.unwrap_or_default();
         Ok(Response::new(pb::ListScenesResponse { scenes, next }))
@@ -75,13 +80,15 @@ impl pb::scene_service_server::SceneService for Api {
         &self,
         request: Request<pb::DeleteSceneRequest>,
     ) -> Answer<pb::DeleteSceneResponse> {
-        let gone = async { self.service.delete(&request.get_ref().scene_id.parse()?).await }.await;
+        let api = called(self, &request)?;
+        let gone = async { api.service.delete(&request.get_ref().scene_id.parse()?).await }.await;
         gone.map_err(|e| logged(&e))?;
         Ok(Response::new(pb::DeleteSceneResponse {}))
     }
 
     async fn render_view(&self, request: Request<pb::RenderViewRequest>) -> Answer<pb::View> {
-        let view = render(self, request.into_inner()).await.map_err(|e| logged(&e))?;
+        let api = called(self, &request)?;
+        let view = render(&api, request.into_inner()).await.map_err(|e| logged(&e))?;
         Ok(Response::new(view))
     }
 
@@ -89,34 +96,46 @@ impl pb::scene_service_server::SceneService for Api {
         &self,
         request: Request<pb::RenderViewsRequest>,
     ) -> Answer<Self::RenderViewsStream> {
-        let views = render_many(self, request.into_inner()).map_err(|e| logged(&e))?;
+        let api = called(self, &request)?;
+        let views = render_many(&api, request.into_inner()).map_err(|e| logged(&e))?;
         Ok(Response::new(views))
     }
 
     async fn query(&self, request: Request<pb::QueryRequest>) -> Answer<pb::QueryResponse> {
+        let api = called(self, &request)?;
         let found = async {
             let request = request.into_inner();
             let id = request.scene_id.parse()?;
-            self.service.query(&id, ask::query(request)?).await
+            api.service.query(&id, ask::query(request)?).await
         };
         let found = found.await.map_err(|e: Error| logged(&e))?;
         Ok(Response::new(ask::answer(found)))
     }
 
     async fn pick(&self, request: Request<pb::PickRequest>) -> Answer<pb::PickResponse> {
+        let api = called(self, &request)?;
         let found = async {
             let request = request.into_inner();
             let id = request.scene_id.parse()?;
-            self.service.pick(&id, ask::pick(request)?).await
+            api.service.pick(&id, ask::pick(request)?).await
         };
         let found = found.await.map_err(|e: Error| logged(&e))?;
         Ok(Response::new(ask::picked(found)))
     }
 
     async fn export(&self, request: Request<pb::ExportRequest>) -> Answer<Self::ExportStream> {
-        let chunks = export(self, request.into_inner()).await.map_err(|e| logged(&e))?;
+        let api = called(self, &request)?;
+        let chunks = export(&api, request.into_inner()).await.map_err(|e| logged(&e))?;
         Ok(Response::new(chunks))
     }
+}
+
+/// The doors' state for the caller of this request, whom the edge has let in.
+fn called<T>(api: &Api, request: &Request<T>) -> Result<Api, Status> {
+    // Without the edge nobody was asked for a key, so nobody is let in.
+    let caller = request.extensions().get::<Caller>();
+    let caller = caller.ok_or_else(|| logged(&Error::internal("the call was not let in")))?;
+    Ok(api.for_caller(caller))
 }
 
 async fn create(api: &Api, messages: Streaming<pb::CreateSceneRequest>) -> Result<pb::Scene> {
@@ -142,7 +161,8 @@ async fn receive(
     api: &Api,
     mut messages: Streaming<pb::CreateSceneRequest>,
 ) -> Result<(Upload, pb::CreateSceneHeader, UploadGuard)> {
-    let mut upload = UploadBuilder::new(api.service.limits(), &api.uploads);
+    let limits = api.service.limits();
+    let mut upload = UploadBuilder::new(&limits, &api.uploads);
     let mut header = None;
     loop {
         let next = tokio::time::timeout(PAUSE_MAX, messages.message()).await.map_err(|_| {

@@ -2,20 +2,20 @@
 
 use std::time::Duration;
 
-use axum::{Extension, Json, extract::State};
+use axum::{Extension, Json};
 use serde::Deserialize;
 
 use super::{
     edge::Deadline,
     error::ApiError,
-    extract::{Id, JsonBody},
+    extract::{Called, Id, JsonBody},
     openapi::IdParam,
     params::Params,
     render::camera_fields,
     schemas::{PickAnswer, PickParams, QueryBody as QueryRequest, QueryResult},
 };
 use crate::{
-    api::{Api, camera::CameraFields, semantics},
+    api::{camera::CameraFields, semantics},
     error::Error,
     service::{Boxes, MaskFormat, PickSpec, Picked, QueryAnswer, QuerySpec, ViewOptions},
 };
@@ -47,7 +47,7 @@ pub(super) struct QueryBody {
     responses((status = 200, description = "What each text found", body = QueryResult))
 )]
 pub(super) async fn query(
-    State(api): State<Api>,
+    Called(api): Called,
     Id(id): Id,
     deadline: Option<Extension<Deadline>>,
     params: Params,
@@ -81,7 +81,7 @@ pub(super) async fn query(
     responses((status = 200, description = "What lies under the pixel", body = PickAnswer))
 )]
 pub(super) async fn pick(
-    State(api): State<Api>,
+    Called(api): Called,
     Id(id): Id,
     deadline: Option<Extension<Deadline>>,
     mut params: Params,

@@ -7,16 +7,27 @@ use std::{
 
 use axum::{
     body::Body,
-    extract::Request,
-    http::{HeaderMap, HeaderValue, StatusCode, header},
+    extract::{Request, State},
+    http::{HeaderMap, HeaderValue, Method, StatusCode, header},
     middleware::Next,
     response::{IntoResponse, Response},
 };
+use tracing::{Instrument, field::Empty};
 
-use super::error::{ApiError, Fault, panic_error};
+use super::{
+    error::{ApiError, Fault, panic_error},
+    held::hold,
+};
 use crate::{
-    api::{grpc, request_id},
+    api::{
+        Api,
+        access::{self, Pass},
+        grpc,
+        life::Inside,
+        request_id,
+    },
     error::{Error, ErrorCode},
+    keys::Scope,
 };
 
 /// The caller's own deadline, for handlers that hand it on.
@@ -24,9 +35,20 @@ use crate::{
 pub(super) struct Deadline(pub(super) Duration);
 
 /// Around every HTTP call.
-pub(super) async fn rest(mut request: Request, next: Next) -> Response {
+pub(super) async fn rest(request: Request, next: Next) -> Response {
     let id = id_of(request.headers());
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
+    let span = tracing::info_span!("http", %method, path, request_id = id, key = Empty);
+    rest_within(request, next, id, method, path).instrument(span).await
+}
+
+async fn rest_within(
+    mut request: Request,
+    next: Next,
+    id: String,
+    method: Method,
+    path: String,
+) -> Response {
     let started = Instant::now();
     let mut response = match deadline_of_query(request.uri().query()) {
         Err(error) => ApiError::from(error).into_response(),
@@ -46,34 +68,100 @@ pub(super) async fn rest(mut request: Request, next: Next) -> Response {
     let status = response.status().as_u16();
     let ms = started.elapsed().as_secs_f64() * 1e3;
     if let Some(fault) = response.extensions_mut().remove::<Fault>() {
-        log_fault(fault.error(), &id, &format!("{method} {path}"), ms);
+        log_fault(fault.error(), &format!("{method} {path}"), ms);
         response = fault.write(response, &id);
     } else {
-        tracing::debug!(%method, path, status, ms, request_id = id, "served");
+        tracing::debug!(status, ms, "served");
     }
     stamp(&mut response, &id);
     response
 }
 
+/// Around each route that needs a scope: lets the caller in, or not.
+pub(super) async fn guard(
+    State((api, scope)): State<(Api, Scope)>,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    let held = check_origin(&api, &request).and_then(|()| let_in(&api, scope, &mut request));
+    match held {
+        Ok(held) => hold(next.run(request).await, held),
+        Err(error) => ApiError::from(error).into_response(),
+    }
+}
+
+/// Refuses pages of other origins where no key is asked for: a browser on this machine would let
+/// any page of the web in.
+fn check_origin(api: &Api, request: &Request) -> Result<(), Error> {
+    let Some(origin) = request.headers().get(header::ORIGIN) else { return Ok(()) };
+    if api.access.asks() {
+        return Ok(());
+    }
+    let origin = origin.to_str().unwrap_or_default();
+    let host = request.headers().get(header::HOST).and_then(|host| host.to_str().ok());
+    let host = host.or_else(|| request.uri().authority().map(|host| host.as_str()));
+    let own = origin.split_once("://").map(|(_, host)| host);
+    let named = &api.service.config().cors_origins;
+    if (own.is_some() && own == host) || named.iter().any(|name| name == "*" || name == origin) {
+        return Ok(());
+    }
+    let shown: String = origin.chars().take(80).collect();
+    Err(Error::new(
+        ErrorCode::PermissionDenied,
+        format!("a page of {shown:?} calls; name it in cors_origins to let it"),
+    ))
+}
+
+/// Asks for the key and counts the call in; what it gives is held until the answer is sent.
+fn let_in(api: &Api, scope: Scope, request: &mut Request) -> Result<(Inside, Pass), Error> {
+    let inside = api.life.enter()?;
+    let shown = request.headers_mut().remove(header::AUTHORIZATION);
+    let shown = shown.as_ref().map(|value| value.to_str().unwrap_or_default());
+    let pass = api.access.admit(shown, scope)?;
+    if let Some(key) = &pass.key {
+        tracing::Span::current().record("key", &**key);
+    }
+    request.extensions_mut().insert(pass.caller.clone());
+    Ok((inside, pass))
+}
+
 /// Around every gRPC call.
-pub(super) async fn rpc(mut request: Request, next: Next) -> Response {
+pub(super) async fn rpc(State(api): State<Api>, request: Request, next: Next) -> Response {
     let id = id_of(request.headers());
+    let path = request.uri().path().to_owned();
+    let span = tracing::info_span!("grpc", path, request_id = id, key = Empty);
+    rpc_within(api, request, next, id, path).instrument(span).await
+}
+
+async fn rpc_within(
+    api: Api,
+    mut request: Request,
+    next: Next,
+    id: String,
+    path: String,
+) -> Response {
     if let Ok(value) = HeaderValue::from_str(&id) {
         request.headers_mut().insert(request_id::HEADER, value);
     }
-    let path = request.uri().path().to_owned();
     let started = Instant::now();
-    let mut response = match deadline_of_grpc(request.headers()) {
-        None => next.run(request).await,
-        Some(deadline) => match tokio::time::timeout(deadline, next.run(request)).await {
-            Ok(response) => response,
-            Err(_) => grpc::refusal(&deadline_passed(deadline)).map(Body::new),
-        },
+    let held = access::of_rpc(&path).map(|scope| let_in(&api, scope, &mut request)).transpose();
+    let mut response = match (held, deadline_of_grpc(request.headers())) {
+        (Err(error), _) => {
+            log_fault(&error, &path, 0.0);
+            grpc::refusal(&error).map(Body::new)
+        }
+        (Ok(held), None) => hold(next.run(request).await, held),
+        (Ok(held), Some(deadline)) => {
+            match tokio::time::timeout(deadline, next.run(request)).await {
+                Ok(response) => hold(response, held),
+                Err(_) => grpc::refusal(&deadline_passed(deadline)).map(Body::new),
+            }
+        }
     };
     let ms = started.elapsed().as_secs_f64() * 1e3;
     grpc::complete(response.headers_mut());
     let status = response.headers().get("grpc-status").and_then(|v| v.to_str().ok());
-    tracing::debug!(path, status, ms, request_id = id, "served");
+    tracing::debug!(status, ms, "served");
     stamp(&mut response, &id);
     response
 }
@@ -81,7 +169,7 @@ pub(super) async fn rpc(mut request: Request, next: Next) -> Response {
 /// Answer of a gRPC call that panicked.
 pub(super) fn rpc_panicked(panic: Box<dyn Any + Send + 'static>) -> Response {
     let error = panic_error(panic);
-    log_fault(&error, "", "gRPC", 0.0);
+    log_fault(&error, "gRPC", 0.0);
     grpc::refusal(&error).map(Body::new)
 }
 
@@ -142,7 +230,7 @@ fn dress(response: &Response) -> Response {
 }
 
 /// Faults of the caller at `info`, ours at `error` with the chain of sources.
-fn log_fault(error: &Error, id: &str, call: &str, ms: f64) {
+fn log_fault(error: &Error, call: &str, ms: f64) {
     let code = error.code().name();
     let mut message = error.message().to_owned();
     let mut source = std::error::Error::source(error);
@@ -152,9 +240,9 @@ fn log_fault(error: &Error, id: &str, call: &str, ms: f64) {
         source = cause.source();
     }
     if error.code().row().http >= 500 {
-        tracing::error!(call, code, request_id = id, ms, "{message}");
+        tracing::error!(call, code, ms, "{message}");
     } else {
-        tracing::info!(call, code, request_id = id, ms, "{message}");
+        tracing::info!(call, code, ms, "{message}");
     }
 }
 

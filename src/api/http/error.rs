@@ -82,6 +82,10 @@ impl Fault {
                 answer.headers_mut().insert(name, value.clone());
             }
         }
+        if error.code() == ErrorCode::Unauthenticated {
+            let asks = HeaderValue::from_static("Bearer realm=\"segsplat\"");
+            answer.headers_mut().insert(header::WWW_AUTHENTICATE, asks);
+        }
         if let Some(seconds) = retry_after_s(error) {
             answer.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from(seconds));
         }

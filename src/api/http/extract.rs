@@ -12,6 +12,7 @@ use super::error::ApiError;
 use crate::{
     api::{Api, upload::json_over},
     error::Error,
+    keys::Caller,
     scene::SceneId,
 };
 
@@ -31,6 +32,21 @@ impl FromRequestParts<Api> for Id {
     }
 }
 
+/// The doors' state for the caller of this request, whom the edge has let in.
+#[derive(Clone, Debug)]
+pub(super) struct Called(pub(super) Api);
+
+impl FromRequestParts<Api> for Called {
+    type Rejection = ApiError;
+
+    async fn from_request_parts(parts: &mut Parts, api: &Api) -> Result<Self, ApiError> {
+        // Without the edge nobody was asked for a key, so nobody is let in.
+        let caller = parts.extensions.get::<Caller>();
+        let caller = caller.ok_or_else(|| Error::internal("the call was not let in"))?;
+        Ok(Self(api.for_caller(caller)))
+    }
+}
+
 /// A JSON body of at most `limits.json_bytes_max`, whatever its content type says.
 #[derive(Clone, Debug)]
 pub(super) struct JsonBody<T>(pub(super) T);
@@ -46,7 +62,7 @@ impl<T: DeserializeOwned> FromRequest<Api> for JsonBody<T> {
             let piece: Bytes =
                 piece.map_err(|e| Error::invalid("body: the upload broke off").caused_by(e))?;
             if bytes.len() + piece.len() > limits.json_bytes_max {
-                return Err(json_over("body", bytes.len() + piece.len(), limits).into());
+                return Err(json_over("body", bytes.len() + piece.len(), &limits).into());
             }
             bytes.extend_from_slice(&piece);
         }

@@ -7,7 +7,7 @@ use axum::{
     response::{IntoResponse, Response},
 };
 
-use super::{error::ApiError, openapi, params::Params};
+use super::{error::ApiError, extract::Called, openapi, params::Params};
 use crate::{api::Api, service::ModelsInfo};
 
 /// `GET /healthz`: the process answers.
@@ -28,7 +28,8 @@ pub(super) async fn live() -> Json<serde_json::Value> {
     )
 )]
 pub(super) async fn ready(State(api): State<Api>) -> Response {
-    let readiness = api.service.ready();
+    let mut readiness = api.service.ready();
+    readiness.ready &= !api.life.is_ending();
     let status = if readiness.ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
     (status, Json(readiness)).into_response()
 }
@@ -39,7 +40,7 @@ pub(super) async fn ready(State(api): State<Api>) -> Response {
     responses((status = 200, description = "Bundle and renderer", body = openapi::Models))
 )]
 pub(super) async fn models(
-    State(api): State<Api>,
+    Called(api): Called,
     params: Params,
 ) -> Result<Json<ModelsInfo>, ApiError> {
     params.finish()?;

@@ -3,20 +3,22 @@
 //! [`routes`] is the list of calls; `/openapi.json` is held to it by `tests/it/errors.rs`.
 
 mod ask;
+mod cors;
 mod edge;
 mod error;
 mod extract;
 mod health;
+mod held;
 mod openapi;
 mod params;
 mod receive;
 mod render;
 mod scenes;
 mod schemas;
+mod serve;
+mod tls;
 mod viewer;
 mod views;
-
-use std::{future::Future, time::Duration};
 
 use axum::{
     Router,
@@ -24,19 +26,13 @@ use axum::{
     handler::Handler,
     middleware,
     routing::{self, MethodRouter},
-    serve::ListenerExt,
 };
-use tokio::{net::TcpListener, sync::watch};
 use tower_http::catch_panic::CatchPanicLayer;
 
 use super::{Api, grpc};
-use crate::{
-    error::{Error, Result},
-    service::Service,
-};
+use crate::{error::Result, keys::Scope};
 
-/// How long open calls may go on after the stop signal.
-const GRACE: Duration = Duration::from_secs(10);
+pub use self::serve::{Doors, serve};
 
 /// One call of the HTTP door.
 #[derive(Clone, Debug)]
@@ -45,56 +41,72 @@ pub struct Route {
     pub method: &'static str,
     /// Path with `{id}` where an id goes.
     pub path: &'static str,
+    /// What a key must be good for; `None`: nobody is asked.
+    pub scope: Option<Scope>,
     handler: MethodRouter<Api>,
 }
 
-fn get<H: Handler<T, Api>, T: 'static>(path: &'static str, handler: H) -> Route {
-    Route { method: "GET", path, handler: routing::get(handler) }
+fn get<H: Handler<T, Api>, T: 'static>(
+    path: &'static str,
+    scope: impl Into<Option<Scope>>,
+    handler: H,
+) -> Route {
+    Route { method: "GET", path, scope: scope.into(), handler: routing::get(handler) }
 }
 
-fn post<H: Handler<T, Api>, T: 'static>(path: &'static str, handler: H) -> Route {
-    Route { method: "POST", path, handler: routing::post(handler) }
+fn post<H: Handler<T, Api>, T: 'static>(path: &'static str, scope: Scope, handler: H) -> Route {
+    Route { method: "POST", path, scope: Some(scope), handler: routing::post(handler) }
 }
 
-fn delete<H: Handler<T, Api>, T: 'static>(path: &'static str, handler: H) -> Route {
-    Route { method: "DELETE", path, handler: routing::delete(handler) }
+fn delete<H: Handler<T, Api>, T: 'static>(path: &'static str, scope: Scope, handler: H) -> Route {
+    Route { method: "DELETE", path, scope: Some(scope), handler: routing::delete(handler) }
 }
 
 /// Every call of the HTTP door.
 #[must_use]
 pub fn routes() -> Vec<Route> {
+    use Scope::{Read, Write};
     vec![
-        post("/v1/scenes", scenes::create),
-        get("/v1/scenes", scenes::list),
-        get("/v1/scenes/{id}", scenes::get),
-        delete("/v1/scenes/{id}", scenes::delete),
-        get("/v1/scenes/{id}/events", scenes::events),
-        get("/v1/scenes/{id}/view", render::view),
-        post("/v1/scenes/{id}/views", views::views),
-        post("/v1/scenes/{id}/query", ask::query),
-        get("/v1/scenes/{id}/pick", ask::pick),
-        get("/v1/scenes/{id}/export", render::export),
-        get("/v1/models", health::models),
-        get("/healthz", health::live),
-        get("/readyz", health::ready),
-        get("/openapi.json", openapi::document),
-        get("/", viewer::index),
+        post("/v1/scenes", Write, scenes::create),
+        get("/v1/scenes", Read, scenes::list),
+        get("/v1/scenes/{id}", Read, scenes::get),
+        delete("/v1/scenes/{id}", Write, scenes::delete),
+        get("/v1/scenes/{id}/events", Read, scenes::events),
+        get("/v1/scenes/{id}/view", Read, render::view),
+        post("/v1/scenes/{id}/views", Read, views::views),
+        post("/v1/scenes/{id}/query", Read, ask::query),
+        get("/v1/scenes/{id}/pick", Read, ask::pick),
+        get("/v1/scenes/{id}/export", Read, render::export),
+        get("/v1/models", Read, health::models),
+        get("/healthz", None, health::live),
+        get("/readyz", None, health::ready),
+        get("/openapi.json", None, openapi::document),
+        get("/", None, viewer::index),
     ]
 }
 
 /// Both doors as one router.
-///
-/// # Errors
-/// `internal` when the gRPC descriptors are damaged.
-pub fn app(service: Service) -> Result<Router> {
-    let api = Api::new(service);
+fn app(api: &Api) -> Result<Router> {
     let rpc = grpc::routes(api.clone())?.prepare().into_axum_router().reset_fallback();
+    let guarded = |route: Route| match route.scope {
+        None => (route.path, route.handler),
+        Some(scope) => {
+            let guard = middleware::from_fn_with_state((api.clone(), scope), edge::guard);
+            (route.path, route.handler.route_layer(guard))
+        }
+    };
     let rest = routes()
         .into_iter()
-        .fold(Router::new(), |router, route| router.route(route.path, route.handler))
+        .map(guarded)
+        .fold(Router::new(), |router, (path, handler)| router.route(path, handler))
         .method_not_allowed_fallback(error::method_not_allowed)
-        .with_state(api);
-    Ok(rest_edge(rest.fallback(error::no_such_route)).merge(rpc_edge(rpc)))
+        .with_state(api.clone());
+    let rest = rest_edge(rest.fallback(error::no_such_route));
+    let both = rest.merge(rpc_edge(rpc, api.clone()));
+    Ok(match cors::layer(&api.service.config().cors_origins)? {
+        Some(cors) => both.layer(cors),
+        None => both,
+    })
 }
 
 /// What surrounds every HTTP call: request id, deadline, one error shape, a net for panics.
@@ -106,44 +118,10 @@ fn rest_edge(router: Router) -> Router {
 }
 
 /// The same for every gRPC call.
-fn rpc_edge(router: Router) -> Router {
-    router.layer(CatchPanicLayer::custom(edge::rpc_panicked)).layer(middleware::from_fn(edge::rpc))
-}
-
-/// Serves both doors on `listener` until `stop` resolves; open calls get ten seconds to end.
-///
-/// # Errors
-/// `internal` when the listener fails.
-pub async fn serve(
-    listener: TcpListener,
-    service: Service,
-    stop: impl Future<Output = ()> + Send + 'static,
-) -> Result<()> {
-    let app = app(service)?;
-    // Nagle's algorithm against delayed acknowledgements costs a unary call 45 ms.
-    let listener = listener.tap_io(|stream| {
-        if let Err(error) = stream.set_nodelay(true) {
-            tracing::debug!(%error, "TCP_NODELAY refused");
-        }
-    });
-    let (stopped, mut stopping) = watch::channel(false);
-    let graceful = axum::serve(listener, app).with_graceful_shutdown(async move {
-        stop.await;
-        stopped.send_replace(true);
-    });
-    let late = async move {
-        // An error means that the sender is gone: the server has ended by itself.
-        if stopping.wait_for(|&stopped| stopped).await.is_err() {
-            std::future::pending::<()>().await;
-        }
-        tokio::time::sleep(GRACE).await;
-    };
-    tokio::select! {
-        ended = graceful.into_future() => {
-            ended.map_err(|e| Error::internal("the listener failed").caused_by(e))
-        }
-        () = late => Ok(()),
-    }
+fn rpc_edge(router: Router, api: Api) -> Router {
+    router
+        .layer(CatchPanicLayer::custom(edge::rpc_panicked))
+        .layer(middleware::from_fn_with_state(api, edge::rpc))
 }
 
 #[cfg(test)]
@@ -187,7 +165,9 @@ mod tests {
 
     #[tokio::test]
     async fn a_panic_in_a_grpc_call_is_an_internal_status() {
-        let router = rpc_edge(Router::new().route("/boom", routing::get(boom)));
+        let router = Router::new()
+            .route("/boom", routing::get(boom))
+            .layer(CatchPanicLayer::custom(edge::rpc_panicked));
         let (status, headers, _) = call(router, "/boom").await;
         assert_eq!(status, StatusCode::OK);
         assert_eq!(headers["grpc-status"], "13");

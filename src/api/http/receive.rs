@@ -62,7 +62,8 @@ async fn parts(
     form: &mut Multipart,
     params: &mut Params,
 ) -> Result<(Upload, UploadGuard)> {
-    let mut upload = UploadBuilder::new(api.service.limits(), &api.uploads);
+    let limits = api.service.limits();
+    let mut upload = UploadBuilder::new(&limits, &api.uploads);
     loop {
         let next = tokio::time::timeout(PAUSE_MAX, form.next_field()).await.map_err(|_| pause())?;
         let Some(mut field) = next.map_err(broken)? else { break };

@@ -5,7 +5,6 @@ use std::{convert::Infallible, time::Duration};
 use axum::{
     Extension,
     body::Body,
-    extract::State,
     http::{HeaderMap, HeaderValue, StatusCode, header},
     response::{IntoResponse, Response},
 };
@@ -14,13 +13,12 @@ use futures_util::StreamExt;
 use super::{
     edge::Deadline,
     error::ApiError,
-    extract::Id,
+    extract::{Called, Id},
     openapi::{ExportParams, IdParam, ViewParams},
     params::Params,
 };
 use crate::{
     api::{
-        Api,
         camera::CameraFields,
         semantics::{kind, profile, quality},
     },
@@ -42,7 +40,7 @@ use crate::{
     )
 )]
 pub(super) async fn view(
-    State(api): State<Api>,
+    Called(api): Called,
     Id(id): Id,
     deadline: Option<Extension<Deadline>>,
     headers: HeaderMap,
@@ -73,7 +71,7 @@ pub(super) async fn view(
     ))
 )]
 pub(super) async fn export(
-    State(api): State<Api>,
+    Called(api): Called,
     Id(id): Id,
     headers: HeaderMap,
     mut params: Params,

@@ -4,7 +4,7 @@ use std::{convert::Infallible, time::Duration};
 
 use axum::{
     Json,
-    extract::{Request, State},
+    extract::Request,
     http::{HeaderMap, HeaderValue, StatusCode, header},
     response::{
         IntoResponse, Response,
@@ -15,7 +15,7 @@ use futures_util::{Stream, StreamExt};
 
 use super::{
     error::ApiError,
-    extract::Id,
+    extract::{Called, Id},
     openapi::{self, CreateParams, IdParam, ListParams, Scene, UploadForm},
     params::Params,
     receive::receive,
@@ -40,7 +40,7 @@ use crate::{
     )
 )]
 pub(super) async fn create(
-    State(api): State<Api>,
+    Called(api): Called,
     mut params: Params,
     request: Request,
 ) -> Result<Response, ApiError> {
@@ -70,10 +70,7 @@ pub(super) async fn create(
     get, path = "/v1/scenes", operation_id = "list_scenes", tag = "scenes", params(ListParams),
     responses((status = 200, description = "A page, newest first", body = openapi::Page))
 )]
-pub(super) async fn list(
-    State(api): State<Api>,
-    mut params: Params,
-) -> Result<Json<Page>, ApiError> {
+pub(super) async fn list(Called(api): Called, mut params: Params) -> Result<Json<Page>, ApiError> {
     let page = PageRequest { limit: params.whole("limit")?, after: params.text("after")? };
     params.finish()?;
     Ok(Json(api.service.list(&page)?))
@@ -85,7 +82,7 @@ pub(super) async fn list(
     responses((status = 200, description = "The scene", body = Scene))
 )]
 pub(super) async fn get(
-    State(api): State<Api>,
+    Called(api): Called,
     Id(id): Id,
     params: Params,
 ) -> Result<Json<SceneStatus>, ApiError> {
@@ -99,7 +96,7 @@ pub(super) async fn get(
     params(IdParam), responses((status = 204, description = "Gone"))
 )]
 pub(super) async fn delete(
-    State(api): State<Api>,
+    Called(api): Called,
     Id(id): Id,
     params: Params,
 ) -> Result<StatusCode, ApiError> {
@@ -118,7 +115,7 @@ pub(super) async fn delete(
     ))
 )]
 pub(super) async fn events(
-    State(api): State<Api>,
+    Called(api): Called,
     Id(id): Id,
     params: Params,
 ) -> Result<Sse<impl Stream<Item = Result<sse::Event, Infallible>>>, ApiError> {

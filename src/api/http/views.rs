@@ -9,7 +9,6 @@ use std::{
 use axum::{
     Extension,
     body::{Body, Bytes},
-    extract::State,
     http::{HeaderMap, header},
     response::{IntoResponse, Response},
 };
@@ -20,14 +19,13 @@ use zip::{CompressionMethod, ZipWriter, write::SimpleFileOptions};
 use super::{
     edge::Deadline,
     error::ApiError,
-    extract::{Id, JsonBody},
+    extract::{Called, Id, JsonBody},
     openapi::{IdParam, ViewsRequest},
     params::Params,
     render::{background, content_type, crop, format, view_headers},
 };
 use crate::{
     api::{
-        Api,
         camera::CameraFields,
         semantics::{kind, profile, quality},
     },
@@ -83,7 +81,7 @@ enum Container {
     ))
 )]
 pub(super) async fn views(
-    State(api): State<Api>,
+    Called(api): Called,
     Id(id): Id,
     deadline: Option<Extension<Deadline>>,
     headers: HeaderMap,

@@ -6,7 +6,11 @@ use segsplat::{
 };
 use serde_json::Value;
 use std::{fmt::Display, net::SocketAddr};
-use tonic::transport::Channel;
+use tonic::{
+    Status,
+    service::{Interceptor, interceptor::InterceptedService},
+    transport::Channel,
+};
 
 /// Bytes of a photo or archive in one gRPC message.
 const PIECE: usize = 256 << 10;
@@ -26,7 +30,36 @@ pub(crate) struct Fault {
 #[derive(Clone, Debug)]
 pub(crate) enum Door {
     Http { base: String, client: reqwest::Client },
-    Grpc { client: SceneServiceClient<Channel> },
+    Grpc { client: SceneServiceClient<Keyed> },
+}
+
+/// A channel whose calls show a key.
+pub(crate) type Keyed = InterceptedService<Channel, Bearer>;
+
+/// Shows a key with each gRPC call, or none.
+#[derive(Clone, Debug)]
+pub(crate) struct Bearer(Option<String>);
+
+impl Interceptor for Bearer {
+    fn call(&mut self, mut request: tonic::Request<()>) -> Result<tonic::Request<()>, Status> {
+        if let Some(key) = &self.0 {
+            let value = format!("Bearer {key}").parse().expect("keys are ASCII");
+            request.metadata_mut().insert("authorization", value);
+        }
+        Ok(request)
+    }
+}
+
+/// Both doors of the server at `addr`, with this key shown at each call.
+pub(crate) async fn both_with(addr: SocketAddr, key: Option<&str>) -> [Door; 2] {
+    let mut headers = reqwest::header::HeaderMap::new();
+    if let Some(key) = key {
+        headers.insert("authorization", format!("Bearer {key}").parse().expect("ASCII"));
+    }
+    let client = reqwest::Client::builder().default_headers(headers).build().expect("a client");
+    let bearer = Bearer(key.map(str::to_owned));
+    let keyed = SceneServiceClient::with_interceptor(channel(addr).await, bearer);
+    [Door::Http { base: format!("http://{addr}"), client }, Door::Grpc { client: keyed }]
 }
 
 /// Both doors of the server at `addr`.
@@ -44,7 +77,7 @@ pub(crate) async fn channel(addr: SocketAddr) -> Channel {
 }
 
 pub(crate) async fn grpc(addr: SocketAddr) -> Door {
-    let client = SceneServiceClient::new(channel(addr).await)
+    let client = SceneServiceClient::with_interceptor(channel(addr).await, Bearer(None))
         .max_decoding_message_size(512 << 20)
         .max_encoding_message_size(512 << 20);
     Door::Grpc { client }

@@ -1,0 +1,136 @@
+//! One port for both doors: plain or TLS, and an orderly end.
+
+use std::{future::Future, time::Duration};
+
+use axum::{
+    Router,
+    serve::{Listener, ListenerExt},
+};
+use tokio::{net::TcpListener, sync::watch};
+
+use super::{app, tls::Tls};
+use crate::{
+    api::Api,
+    config::Config,
+    error::{Error, Result},
+    service::Service,
+};
+
+/// How long connections without a call may take to close.
+const CLOSING: Duration = Duration::from_millis(200);
+
+/// Both doors, ready to be served. Cloning shares everything.
+#[derive(Clone, Debug)]
+pub struct Doors {
+    api: Api,
+    app: Router,
+    tls: Option<Tls>,
+}
+
+impl Doors {
+    /// The doors of `service`: keys, certificate and limits of its configuration.
+    ///
+    /// # Errors
+    /// `invalid_request` when keys, certificate or origins cannot be used.
+    ///
+    /// # Panics
+    /// Outside of a tokio runtime.
+    pub fn new(service: Service) -> Result<Self> {
+        let tls = Tls::new(service.config())?;
+        let api = Api::new(service)?;
+        Ok(Self { app: app(&api)?, api, tls })
+    }
+
+    /// Puts keys, limits and certificate of `config` in force. What is wrong changes nothing.
+    ///
+    /// # Errors
+    /// `invalid_request` when keys or certificate cannot be used.
+    pub fn reload(&self, config: &Config) -> Result<()> {
+        if let Some(tls) = &self.tls {
+            tls.reload(config)?;
+        }
+        self.api.reload(config)
+    }
+
+    /// Serves on `listener` until `stop` resolves, then drains: not ready any more, after
+    /// `drain_notice_ms` no new calls, open ones get `drain_ms` to end.
+    ///
+    /// # Errors
+    /// `internal` when the listener fails.
+    pub async fn serve(
+        self,
+        listener: TcpListener,
+        stop: impl Future<Output = ()> + Send + 'static,
+    ) -> Result<()> {
+        // Nagle's algorithm against delayed acknowledgements costs a unary call 45 ms.
+        let listener = listener.tap_io(|stream| {
+            if let Err(error) = stream.set_nodelay(true) {
+                tracing::debug!(%error, "TCP_NODELAY refused");
+            }
+        });
+        match &self.tls {
+            None => run(listener, self.app, self.api, stop).await,
+            Some(tls) => run(tls.listen(listener)?, self.app, self.api, stop).await,
+        }
+    }
+}
+
+/// Serves both doors of `service` on `listener` until `stop` resolves.
+///
+/// # Errors
+/// As [`Doors::new`] and [`Doors::serve`].
+pub async fn serve(
+    listener: TcpListener,
+    service: Service,
+    stop: impl Future<Output = ()> + Send + 'static,
+) -> Result<()> {
+    Doors::new(service)?.serve(listener, stop).await
+}
+
+async fn run<L: Listener>(
+    listener: L,
+    app: Router,
+    api: Api,
+    stop: impl Future<Output = ()> + Send + 'static,
+) -> Result<()>
+where
+    L::Addr: std::fmt::Debug,
+{
+    let (emptied, mut empty) = watch::channel(false);
+    let graceful = axum::serve(listener, app).with_graceful_shutdown(async move {
+        stop.await;
+        drain(&api).await;
+        emptied.send_replace(true);
+    });
+    let late = async move {
+        // An error means that the sender is gone: the server has ended by itself.
+        if empty.wait_for(|&empty| empty).await.is_err() {
+            std::future::pending::<()>().await;
+        }
+        tokio::time::sleep(CLOSING).await;
+    };
+    tokio::select! {
+        ended = graceful.into_future() => {
+            ended.map_err(|e| Error::internal("the listener failed").caused_by(e))
+        }
+        () = late => Ok(()),
+    }
+}
+
+/// First not ready, then nobody new, then those inside leave.
+async fn drain(api: &Api) {
+    let config = api.service.config();
+    api.life.stop_being_ready();
+    if config.drain_notice_ms > 0 {
+        tracing::info!(ms = config.drain_notice_ms, "not ready any more; serving on");
+        tokio::time::sleep(Duration::from_millis(config.drain_notice_ms)).await;
+    }
+    api.life.drain();
+    let inside = api.life.inside();
+    if inside > 0 {
+        tracing::info!(inside, ms = config.drain_ms, "draining");
+    }
+    if !api.life.empty(Duration::from_millis(config.drain_ms)).await {
+        tracing::warn!(inside = api.life.inside(), "calls are cut off: their time is over");
+    }
+}

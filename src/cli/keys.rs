@@ -1,0 +1,122 @@
+//! `segsplat keys`: new API keys, and the hashes that the server keeps of them.
+
+use std::{
+    io::{Read as _, Write as _},
+    path::{Path, PathBuf},
+};
+
+use clap::Subcommand;
+use serde_json::json;
+
+use super::output::Output;
+use crate::{
+    error::{Error, ErrorCode, Result},
+    keys::{self, Keys, Scope},
+};
+
+/// Longest key read from standard input.
+const KEY_BYTES_MAX: u64 = 4_096;
+
+#[derive(Clone, Debug, clap::Args)]
+pub(super) struct Args {
+    #[command(subcommand)]
+    action: Action,
+}
+
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum ScopeName {
+    /// Look at scenes, ask them, export them
+    Read,
+    /// Also make and delete scenes
+    Write,
+    /// Also see everybody's scenes and the metrics
+    Admin,
+}
+
+#[derive(Clone, Debug, Subcommand)]
+enum Action {
+    /// Make a key: it is shown once; the keys file gets its hash
+    New {
+        /// Name of the key, for log and metrics
+        name: String,
+        /// What it may do
+        #[arg(long, value_enum, default_value = "write")]
+        scope: ScopeName,
+        /// Whose scenes it makes and sees; keys of one owner share them [default: NAME]
+        #[arg(long)]
+        owner: Option<String>,
+        /// Keys file to add it to; without one its entry is printed
+        #[arg(long, value_name = "FILE")]
+        file: Option<PathBuf>,
+    },
+    /// Read a key from standard input and print its hash
+    Hash,
+}
+
+pub(super) fn run(args: &Args, out: &Output) -> Result<()> {
+    match &args.action {
+        Action::New { name, scope, owner, file } => {
+            let scope = match scope {
+                ScopeName::Read => Scope::Read,
+                ScopeName::Write => Scope::Write,
+                ScopeName::Admin => Scope::Admin,
+            };
+            new(name, scope, owner.as_deref(), file.as_deref(), out)
+        }
+        Action::Hash => {
+            let mut key = String::new();
+            std::io::stdin()
+                .take(KEY_BYTES_MAX)
+                .read_to_string(&mut key)
+                .map_err(|e| Error::invalid("the key is not text").caused_by(e))?;
+            let hash = keys::hash(key.trim());
+            out.answer(&hash, &json!({ "sha256": hash }))
+        }
+    }
+}
+
+fn new(
+    name: &str,
+    scope: Scope,
+    owner: Option<&str>,
+    file: Option<&Path>,
+    out: &Output,
+) -> Result<()> {
+    keys::check_name("name", name)?;
+    owner.map_or(Ok(()), |owner| keys::check_name("owner", owner))?;
+    let key = keys::generate()?;
+    let owner_line = owner.map(|owner| format!("owner = \"{owner}\"\n")).unwrap_or_default();
+    let (scope, sha256) = (scope.name(), keys::hash(&key));
+    let entry = format!(
+        "[[key]]\nname = \"{name}\"\n{owner_line}sha256 = \"{sha256}\"\nscopes = [\"{scope}\"]\n"
+    );
+    let value = json!({ "name": name, "key": key, "sha256": sha256, "scope": scope });
+    let Some(path) = file else {
+        return out.answer(&format!("{key}\n\nfor the keys file:\n\n{entry}"), &value);
+    };
+    add(path, &entry)?;
+    out.answer(&key, &value)
+}
+
+/// Adds an entry to a keys file, which stays readable by its owner alone, or is not changed.
+fn add(path: &Path, entry: &str) -> Result<()> {
+    let before = match fs_err::read_to_string(path) {
+        Ok(text) => text,
+        Err(cause) if cause.kind() == std::io::ErrorKind::NotFound => String::new(),
+        Err(cause) => return Err(Error::invalid(format!("keys file: {cause}")).caused_by(cause)),
+    };
+    let gap = if before.is_empty() || before.ends_with("\n\n") { "" } else { "\n" };
+    let text = format!("{before}{gap}{entry}");
+    Keys::parse(&text)?;
+    let mut options = fs_err::OpenOptions::new();
+    options.create(true).append(true);
+    #[cfg(unix)]
+    {
+        use fs_err::os::unix::fs::OpenOptionsExt;
+        options.mode(0o600);
+    }
+    options
+        .open(path)
+        .and_then(|mut file| file.write_all(format!("{gap}{entry}").as_bytes()))
+        .map_err(|e| Error::new(ErrorCode::StoreUnavailable, format!("keys file: {e}")))
+}

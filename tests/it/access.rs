@@ -1,0 +1,277 @@
+//! Who is let in: a table of caller, call and expected code, run through both doors.
+
+use std::path::Path;
+
+use reqwest::{Client, StatusCode, header};
+use segsplat::{
+    api::grpc::{DESCRIPTORS, pb},
+    api::http::routes,
+    error::TABLE,
+    keys::{Scope, hash},
+};
+
+use crate::common::{
+    doors::{Ask, Door, Fault, Options, both, both_with, bytes, fault_of},
+    stand::{BoardMaker, Stand, upload},
+};
+
+/// Every call, named as the gRPC methods are, and what it needs.
+const CALLS: [(&str, Scope); 10] = [
+    ("CreateScene", Scope::Write),
+    ("ListScenes", Scope::Read),
+    ("GetScene", Scope::Read),
+    ("WatchScene", Scope::Read),
+    ("RenderView", Scope::Read),
+    ("RenderViews", Scope::Read),
+    ("Query", Scope::Read),
+    ("Pick", Scope::Read),
+    ("Export", Scope::Read),
+    ("DeleteScene", Scope::Write),
+];
+
+/// Callers: name, owner, scope. The key is the name twice.
+const KEYS: [(&str, &str, &str); 4] = [
+    ("reader", "a", "read"),
+    ("writer", "a", "write"),
+    ("stranger", "b", "write"),
+    ("boss", "boss", "admin"),
+];
+
+fn secret(name: &str) -> String {
+    format!("{name}-{name}")
+}
+
+fn write_keys(path: &Path, rest: &str) {
+    let entry = |(name, owner, scope): &(&str, &str, &str)| {
+        let sha256 = hash(&secret(name));
+        format!(
+            "[[key]]\nname = \"{name}\"\nowner = \"{owner}\"\nsha256 = \"{sha256}\"\n\
+             scopes = [\"{scope}\"]\n{rest}\n"
+        )
+    };
+    std::fs::write(path, KEYS.iter().map(entry).collect::<String>()).unwrap();
+}
+
+/// A server that asks for keys.
+async fn guarded(rest: &str) -> (tempfile::TempDir, Stand) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("keys.toml");
+    write_keys(&path, rest);
+    let stand = Stand::with(BoardMaker::default(), |config| config.keys = Some(path)).await;
+    (folder, stand)
+}
+
+/// Makes one call; the code of the refusal, or `ok`.
+async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
+    let view = Ask::first();
+    match (name, door) {
+        ("CreateScene", _) => door.create(&upload(), &Options::wait()).await.map(drop),
+        ("GetScene", _) => door.get(id).await.map(drop),
+        ("DeleteScene", _) => door.delete(id).await,
+        ("RenderView", _) => door.view(id, &view).await.map(drop),
+        ("Export", _) => door.export(id).await.map(drop),
+        ("Query", _) => door.query(id, &["box"], None, None).await.map(drop),
+        (_, Door::Http { base, client }) => {
+            let request = match name {
+                "ListScenes" => client.get(format!("{base}/v1/scenes")),
+                "WatchScene" => client.get(format!("{base}/v1/scenes/{id}/events")),
+                "Pick" => client.get(format!("{base}/v1/scenes/{id}/pick?from=0&x=9&y=9")),
+                "RenderViews" => client
+                    .post(format!("{base}/v1/scenes/{id}/views"))
+                    .body("{\"cameras\":[{\"from\":0}],\"width\":32,\"height\":24}"),
+                other => panic!("{other} is not a call"),
+            };
+            bytes(request.send().await.unwrap()).await.map(drop)
+        }
+        (_, Door::Grpc { client }) => {
+            let (mut client, scene_id) = (client.clone(), id.to_owned());
+            let camera = view.camera();
+            let answer = match name {
+                "ListScenes" => {
+                    client.list_scenes(pb::ListScenesRequest::default()).await.map(drop)
+                }
+                "WatchScene" => {
+                    client.watch_scene(pb::WatchSceneRequest { scene_id }).await.map(drop)
+                }
+                "Pick" => {
+                    let camera = Some(camera);
+                    let at =
+                        pb::PickRequest { scene_id, camera, x: 9.0, y: 9.0, ..Default::default() };
+                    client.pick(at).await.map(drop)
+                }
+                "RenderViews" => {
+                    let cameras = vec![camera];
+                    let many = pb::RenderViewsRequest { scene_id, cameras, ..Default::default() };
+                    client.render_views(many).await.map(drop)
+                }
+                other => panic!("{other} is not a call"),
+            };
+            answer.map_err(fault_of)
+        }
+    }
+}
+
+fn code(answer: &Result<(), Fault>) -> &str {
+    answer.as_ref().map_or_else(|fault| fault.code.as_str(), |()| "ok")
+}
+
+#[tokio::test]
+async fn each_caller_may_make_each_call_or_not_over_both_doors() {
+    let (_folder, stand) = guarded("").await;
+    let callers: [(&str, Option<String>); 6] = [
+        ("nobody", None),
+        ("a liar", Some("segsplat_0000".to_owned())),
+        ("reader", Some(secret("reader"))),
+        ("writer", Some(secret("writer"))),
+        ("stranger", Some(secret("stranger"))),
+        ("boss", Some(secret("boss"))),
+    ];
+    let makers = both_with(stand.addr, Some(&secret("writer"))).await;
+    for (caller, key) in callers {
+        for (i, door) in both_with(stand.addr, key.as_deref()).await.iter().enumerate() {
+            let (id, _) = makers[i].create(&upload(), &Options::wait()).await.unwrap();
+            for (name, scope) in CALLS {
+                let what = format!("{caller} calls {name} over {}", door.name());
+                let answer = call(door, name, &id).await;
+                let of_scene = !["CreateScene", "ListScenes"].contains(&name);
+                let want = match caller {
+                    "nobody" | "a liar" => "unauthenticated",
+                    "reader" if scope == Scope::Write => "permission_denied",
+                    "stranger" if of_scene => "scene_not_found",
+                    // This server's maker knows no texts; the caller was let in.
+                    _ if name == "Query" => "model_unavailable",
+                    _ => "ok",
+                };
+                assert_eq!(code(&answer), want, "{what}: {answer:?}");
+                if let Err(fault) = answer {
+                    let row = TABLE.iter().find(|row| row.name == want).unwrap();
+                    assert_eq!(fault.number, door.number_of(row), "{what}");
+                    assert!(key.as_ref().is_none_or(|key| !fault.message.contains(key)), "{what}");
+                }
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn anothers_scene_is_as_one_that_does_not_exist() {
+    let (_folder, stand) = guarded("").await;
+    let own = both_with(stand.addr, Some(&secret("writer"))).await;
+    let (id, _) = own[0].create(&upload(), &Options::wait()).await.unwrap();
+    let unknown = "0123456789abcdef".repeat(2);
+    let strangers = both_with(stand.addr, Some(&secret("stranger"))).await;
+    for door in &strangers {
+        for (name, _) in
+            CALLS.iter().filter(|(name, _)| !["CreateScene", "ListScenes"].contains(name))
+        {
+            let there = call(door, name, &id).await.expect_err(name);
+            let absent = call(door, name, &unknown).await.expect_err(name);
+            let message = absent.message.replace(&unknown, &id);
+            let same = Fault { message, request_id: there.request_id.clone(), ..absent };
+            assert_eq!(there, same, "{name} over {}", door.name());
+        }
+    }
+    // Lists, and keys that make a call be made once, are each owner's own.
+    let http = |name: &str| {
+        let request = Client::new().get(stand.url("/v1/scenes"));
+        request.bearer_auth(secret(name)).send()
+    };
+    for (name, count) in [("reader", 1), ("writer", 1), ("stranger", 0), ("boss", 1)] {
+        let page: serde_json::Value = http(name).await.unwrap().json().await.unwrap();
+        assert_eq!(page["scenes"].as_array().unwrap().len(), count, "{name}: {page}");
+    }
+    let once = Options { idempotency_key: Some("k".to_owned()), ..Options::wait() };
+    let (first, _) = own[0].create(&upload(), &once).await.unwrap();
+    let (again, _) = own[1].create(&upload(), &once).await.unwrap();
+    let (other, _) = strangers[0].create(&upload(), &once).await.unwrap();
+    assert_eq!(first, again);
+    assert_ne!(first, other, "a key of another owner gave away a scene");
+}
+
+#[test]
+fn every_call_of_both_doors_has_its_scope_in_the_table() {
+    let text: String = DESCRIPTORS.iter().map(|&b| char::from(b)).collect();
+    for (name, _) in CALLS {
+        assert!(text.contains(name), "{name} is no method");
+    }
+    let proto =
+        std::fs::read_to_string(crate::common::root().join("proto/segsplat/v1/scene.proto"));
+    let proto = proto.unwrap();
+    let rpcs = proto.lines().filter(|line| line.trim().starts_with("rpc ")).count();
+    assert_eq!(rpcs, CALLS.len(), "a method is missing from this table");
+    let open: Vec<_> =
+        routes().iter().filter(|r| r.scope.is_none()).map(|route| route.path).collect();
+    assert_eq!(open, ["/healthz", "/readyz", "/openapi.json", "/"], "routes without a key");
+    let writes: Vec<_> = routes()
+        .iter()
+        .filter(|route| route.scope == Some(Scope::Write))
+        .map(|route| format!("{} {}", route.method, route.path))
+        .collect();
+    assert_eq!(writes, ["POST /v1/scenes", "DELETE /v1/scenes/{id}"]);
+}
+
+#[tokio::test]
+async fn a_key_gets_its_share_and_others_theirs() {
+    let (_folder, stand) = guarded("requests_per_s = 2").await;
+    let reader = both_with(stand.addr, Some(&secret("reader"))).await;
+    let mut refused = 0;
+    for door in reader.iter().cycle().take(8) {
+        if let Err(fault) = call(door, "ListScenes", "").await {
+            assert_eq!(fault.code, "overloaded", "{fault:?}");
+            assert!(fault.retry_after.is_some_and(|s| s.parse::<u32>().unwrap() >= 1));
+            refused += 1;
+        }
+    }
+    assert!(refused > 0, "eight calls at once at two a second");
+    let boss = both_with(stand.addr, Some(&secret("boss"))).await;
+    assert_eq!(code(&call(&boss[0], "ListScenes", "").await), "ok", "another key's share");
+}
+
+#[tokio::test]
+async fn without_a_key_http_says_how_to_show_one_and_health_asks_none() {
+    let (_folder, stand) = guarded("").await;
+    let client = Client::new();
+    let answer = client.get(stand.url("/v1/scenes")).send().await.unwrap();
+    assert_eq!(answer.status(), StatusCode::UNAUTHORIZED);
+    assert!(answer.headers()[header::WWW_AUTHENTICATE].to_str().unwrap().starts_with("Bearer"));
+    for path in ["/healthz", "/readyz", "/openapi.json", "/"] {
+        assert_eq!(client.get(stand.url(path)).send().await.unwrap().status(), 200, "{path}");
+    }
+    // The whole upload is not read first.
+    let never = tokio_stream::pending::<Result<Vec<u8>, std::io::Error>>();
+    let request = client.post(stand.url("/v1/scenes")).body(reqwest::Body::wrap_stream(never));
+    let request = request.header("content-type", "multipart/form-data; boundary=x");
+    assert_eq!(request.send().await.unwrap().status(), StatusCode::UNAUTHORIZED);
+}
+
+#[tokio::test]
+async fn only_named_origins_may_call_from_a_page() {
+    let stand = Stand::with(BoardMaker::default(), |config| {
+        config.cors_origins = vec!["https://ours.example".to_owned()];
+    })
+    .await;
+    let client = Client::new();
+    let ask =
+        |origin: &'static str| client.get(stand.url("/v1/scenes")).header("origin", origin).send();
+    let ours = ask("https://ours.example").await.unwrap();
+    assert_eq!(ours.status(), 200);
+    assert_eq!(ours.headers()["access-control-allow-origin"], "https://ours.example");
+    let exposed = ours.headers()["access-control-expose-headers"].to_str().unwrap();
+    assert!(exposed.contains("x-depth-scale"), "{exposed}");
+    let theirs = ask("https://theirs.example").await.unwrap();
+    assert!(theirs.headers().get("access-control-allow-origin").is_none());
+    assert_eq!(bytes(theirs).await.unwrap_err().code, "permission_denied");
+    let preflight = client
+        .request(reqwest::Method::OPTIONS, stand.url("/v1/scenes"))
+        .header("origin", "https://ours.example")
+        .header("access-control-request-method", "POST")
+        .header("access-control-request-headers", "authorization");
+    let preflight = preflight.send().await.unwrap();
+    assert!(preflight.status().is_success(), "{preflight:?}");
+    let own = format!("http://{}", stand.addr);
+    let own = client.get(stand.url("/v1/scenes")).header("origin", own).send().await.unwrap();
+    assert_eq!(own.status(), 200, "the server's own page");
+    for door in both(stand.addr).await {
+        assert_eq!(code(&call(&door, "ListScenes", "").await), "ok");
+    }
+}

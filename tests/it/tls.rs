@@ -1,0 +1,97 @@
+//! TLS: one port, HTTP/1.1, HTTP/2 and gRPC by ALPN; slow handshakes hold nobody up.
+
+use std::path::PathBuf;
+
+use reqwest::{Certificate, Client, Version};
+use tokio::net::TcpStream;
+
+use crate::common::stand::{BoardMaker, Stand};
+
+struct Files {
+    folder: tempfile::TempDir,
+    root: Certificate,
+}
+
+impl Files {
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+}
+
+/// A certificate for `localhost`, signed by itself.
+fn files() -> Files {
+    let folder = tempfile::tempdir().unwrap();
+    let made = rcgen::generate_simple_self_signed(vec!["localhost".to_owned()]).unwrap();
+    std::fs::write(folder.path().join("cert.pem"), made.cert.pem()).unwrap();
+    std::fs::write(folder.path().join("key.pem"), made.signing_key.serialize_pem()).unwrap();
+    let root = Certificate::from_pem(made.cert.pem().as_bytes()).unwrap();
+    Files { folder, root }
+}
+
+async fn stand(files: &Files) -> Stand {
+    let (cert, key) = (files.path("cert.pem"), files.path("key.pem"));
+    Stand::with(BoardMaker::default(), |config| {
+        config.tls_cert = Some(cert);
+        config.tls_key = Some(key);
+    })
+    .await
+}
+
+#[tokio::test]
+async fn one_port_speaks_http_1_http_2_and_grpc_over_tls() {
+    let files = files();
+    let stand = stand(&files).await;
+    let url = |path: &str| format!("https://localhost:{}{path}", stand.addr.port());
+    let trusting = || Client::builder().tls_certs_only([files.root.clone()]);
+    // Nobody speaks on these two; the others are served all the same.
+    let silent = [TcpStream::connect(stand.addr).await, TcpStream::connect(stand.addr).await];
+
+    let first = trusting().http1_only().build().unwrap();
+    let answer = first.get(url("/readyz")).send().await.unwrap();
+    assert_eq!((answer.status().as_u16(), answer.version()), (200, Version::HTTP_11));
+    let second = trusting().build().unwrap();
+    let answer = second.get(url("/readyz")).send().await.unwrap();
+    assert_eq!((answer.status().as_u16(), answer.version()), (200, Version::HTTP_2));
+
+    // An empty ListScenesRequest: not compressed, 0 bytes.
+    let call = second.post(url("/segsplat.v1.SceneService/ListScenes")).body(vec![0_u8; 5]);
+    let call = call.header("content-type", "application/grpc").header("te", "trailers");
+    let answer = call.send().await.unwrap();
+    assert_eq!(answer.headers()["content-type"], "application/grpc");
+    assert!(answer.headers().get("grpc-status").is_none_or(|status| status == "0"));
+    assert_eq!(answer.bytes().await.unwrap()[0], 0, "a message");
+
+    let plain = Client::new().get(format!("http://{}/readyz", stand.addr)).send().await;
+    assert!(plain.is_err(), "plain HTTP is answered on a TLS port");
+    let strange = Client::builder().tls_certs_only([]).build().unwrap();
+    assert!(strange.get(url("/readyz")).send().await.is_err(), "the certificate is not checked");
+    drop(silent);
+    stand.stop().await;
+}
+
+#[tokio::test]
+async fn a_certificate_that_cannot_be_used_is_named_and_its_key_is_not_shown() {
+    let files = files();
+    for (name, text, want) in [
+        ("cert.pem", "rubbish", "tls_cert"),
+        ("key.pem", "-----BEGIN PRIVATE KEY-----\nSECRET\n-----END PRIVATE KEY-----", "tls_key"),
+    ] {
+        let good = std::fs::read(files.path(name)).unwrap();
+        std::fs::write(files.path(name), text).unwrap();
+        let mut config = segsplat::config::Config::default();
+        config.data_dir = files.path("data");
+        config.tls_cert = Some(files.path("cert.pem"));
+        config.tls_key = Some(files.path("key.pem"));
+        let parts = segsplat::service::Parts {
+            maker: std::sync::Arc::new(BoardMaker::default()),
+            semantics: std::sync::Arc::new(segsplat::jobs::NoSemantics),
+            renderer: std::sync::Arc::new(crate::common::server::PointRenderer),
+            models: segsplat::service::ModelsInfo::default(),
+        };
+        let service = segsplat::service::Service::open(config, parts).unwrap();
+        let error = segsplat::api::Doors::new(service).err().expect("refused");
+        assert!(error.message().contains(want), "{error}");
+        assert!(!error.message().contains("SECRET"), "{error}");
+        std::fs::write(files.path(name), good).unwrap();
+    }
+}
