@@ -166,8 +166,7 @@ mod tests {
         let path = folder.path().join("keys.toml");
         let text = format!("[[key]]\nname = \"a\"\nsha256 = \"{}\"\n{rest}", hash("secret"));
         std::fs::write(&path, text).unwrap();
-        let mut config = Config::default();
-        config.keys = Some(path);
+        let config = Config { keys: Some(path), ..Config::default() };
         let access = Access::new(&config).unwrap();
         (folder, config, access)
     }

@@ -114,7 +114,7 @@ mod tests {
                 SceneState::Queued,
                 created_ms,
             ),
-            owner: (byte % 2 == 0).then(|| "even".to_owned()),
+            owner: byte.is_multiple_of(2).then(|| "even".to_owned()),
             options: SceneOptions::default(),
             idempotency_key: None,
             request_sha256: String::new(),
