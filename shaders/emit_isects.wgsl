@@ -1,64 +1,35 @@
 // Stage 5: one (tile, Gaussian) pair per touched tile, in depth order.
 // Twin: src/render/cpu/emit_isects.rs
-//
-// plan runs first: it holds the total against the capacity and sizes the stages that follow.
 
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> shaded: array<Footprint>;
-@group(0) @binding(2) var<storage, read> isect_offsets: array<u32>;
-@group(0) @binding(3) var<storage, read_write> plan: Plan;
-@group(0) @binding(4) var<storage, read_write> tile_keys: array<u32>;
-@group(0) @binding(5) var<storage, read_write> isect_ids: array<u32>;
+@group(0) @binding(1) var<storage, read_write> plans: array<Plan>;
+@group(0) @binding(2) var<storage, read> footprints: array<Footprint>;
+@group(0) @binding(3) var<storage, read> tiles: array<u32>;
+// Gaussians in depth order: [2][views][N].
+@group(0) @binding(4) var<storage, read> depth_ids: array<u32>;
+// First place of each block: [views][blocks].
+@group(0) @binding(5) var<storage, read> block_sums: array<u32>;
+@group(0) @binding(6) var<storage, read_write> tile_keys: array<u32>;
+@group(0) @binding(7) var<storage, read_write> isect_ids: array<u32>;
 
-fn groups_for(blocks: u32) -> vec4<u32> {
-    let x = min(blocks, GROUPS_X_MAX);
-    if x == 0u {
-        return vec4(0u, 1u, 1u, 0u);
-    }
-    return vec4(x, (blocks + x - 1u) / x, 1u, 0u);
-}
+// First place of each Gaussian of the block, and one past the last.
+var<workgroup> offsets: array<u32, 1025>;
+var<workgroup> sums: array<u32, 256>;
+var<workgroup> rows: array<u32, 16>;
 
-@compute @workgroup_size(1)
-fn make_plan() {
-    var needed = 0u;
-    if view.gaussian_count > 0u {
-        let last = view.gaussian_count - 1u;
-        let before = isect_offsets[last];
-        let tiles = shaded[last].tiles;
-        needed = select(before + tiles, 0xffffffffu, before > 0xffffffffu - tiles);
-    }
-    let isects = select(needed, 0u, needed > view.isect_capacity);
-    plan.needed = needed;
-    plan.isects = isects;
-    plan.sort_groups = groups_for((isects + SORT_BLOCK - 1u) / SORT_BLOCK);
-    plan.range_groups = groups_for((isects + WORKGROUP_SIZE) / WORKGROUP_SIZE);
-}
-
-@compute @workgroup_size(256)
-fn main(
-    @builtin(workgroup_id) group: vec3<u32>,
-    @builtin(num_workgroups) groups: vec3<u32>,
-    @builtin(local_invocation_index) local: u32,
-) {
-    let i = (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
-    if i >= view.gaussian_count || plan.isects == 0u {
-        return;
-    }
-    let footprint = shaded[i];
-    if footprint.tiles == 0u {
-        return;
-    }
-    var slot = isect_offsets[i];
-    let end = slot + footprint.tiles;
-    let extent = extent_of(footprint, view.row_start, view.row_end);
+fn emit_one(id: u32, start: u32, count: u32) {
+    let total = views[which].gaussian_count;
+    let footprint = footprints[which * total + id];
+    var slot = start;
+    let end = slot + count;
+    let extent = extent_of(footprint, views[which].row_start, views[which].row_end);
     if extent.top <= extent.bottom {
         let size = i32(TILE_SIZE);
         for (var tile_y = extent.top / size; tile_y <= extent.bottom / size; tile_y++) {
             let span = tile_span(footprint, extent, tile_y);
-            let row = (u32(tile_y) - view.row_start) * view.tiles_x;
+            let row = (u32(tile_y) - views[which].row_start) * views[which].tiles_x;
             for (var tile_x = span.x; tile_x < span.y && slot < end; tile_x++) {
                 tile_keys[slot] = row + tile_x;
-                isect_ids[slot] = i;
+                isect_ids[slot] = id;
                 slot++;
             }
         }
@@ -67,5 +38,71 @@ fn main(
     for (; slot < end; slot++) {
         tile_keys[slot] = 0u;
         isect_ids[slot] = NO_GAUSSIAN;
+    }
+}
+
+@compute @workgroup_size(256)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    which = group.z;
+    let total = views[which].gaussian_count;
+    let blocks = (total + SCAN_BLOCK - 1u) / SCAN_BLOCK;
+    let block = group.y * groups.x + group.x;
+    // No pairs where there is no room for them.
+    let count = select(0u, atomicLoad(&plans[which].sorted), plans[which].isects > 0u);
+    let half = atomicLoad(&plans[0].passes) & 1u;
+    let ids = (half * groups.z + which) * total;
+    for (var k = local; k < SCAN_BLOCK; k += WORKGROUP_SIZE) {
+        let i = block * SCAN_BLOCK + k;
+        var touched = 0u;
+        if i < count {
+            touched = tiles[which * total + depth_ids[ids + i]];
+        }
+        offsets[k] = touched;
+    }
+    workgroupBarrier();
+    var sum = 0u;
+    for (var k = 0u; k < 4u; k++) {
+        sum += offsets[local * 4u + k];
+    }
+    sums[local] = sum;
+    workgroupBarrier();
+    if local < 16u {
+        sum = 0u;
+        for (var k = 0u; k < 16u; k++) {
+            sum += sums[local * 16u + k];
+        }
+        rows[local] = sum;
+    }
+    workgroupBarrier();
+    var before = 0u;
+    if block < blocks {
+        before = block_sums[which * blocks + block];
+    }
+    for (var k = 0u; k < local / 16u; k++) {
+        before += rows[k];
+    }
+    for (var k = local & 0xf0u; k < local; k++) {
+        before += sums[k];
+    }
+    for (var k = 0u; k < 4u; k++) {
+        let touched = offsets[local * 4u + k];
+        offsets[local * 4u + k] = before;
+        before += touched;
+    }
+    if local == WORKGROUP_SIZE - 1u {
+        offsets[SCAN_BLOCK] = before;
+    }
+    workgroupBarrier();
+    for (var k = local; k < SCAN_BLOCK; k += WORKGROUP_SIZE) {
+        let i = block * SCAN_BLOCK + k;
+        if i < count {
+            let id = depth_ids[ids + i];
+            let start = which * views[which].isect_capacity + offsets[k];
+            emit_one(id, start, offsets[k + 1u] - offsets[k]);
+        }
     }
 }

@@ -1,79 +1,115 @@
-// Stage 3, and inside the sorts: exclusive prefix sum, in place, that stays at u32::MAX instead of
-// wrapping. Twin: src/render/cpu/prefix_sum.rs (there in 64 bits)
+// Stage 3: where each Gaussian's tile pairs start, in depth order: sums of blocks here, the rest in
+// emit_isects. Twin: src/render/cpu/prefix_sum.rs (there in 64 bits)
 //
-// scan_blocks sums each block and leaves its total in block_sums; the host scans those in turn;
-// add_blocks adds them back. Adding that saturates is associative, so the order does not matter.
+// sum_blocks adds up the tiles of each block; scan_sums makes first places of the sums, holds the
+// total against the room there is, and sizes the stages that follow.
 
-@group(0) @binding(0) var<uniform> params: ScanParams;
-@group(0) @binding(1) var<storage, read> plan: PlanRead;
-@group(0) @binding(2) var<storage, read_write> numbers: array<u32>;
-@group(0) @binding(3) var<storage, read_write> block_sums: array<u32>;
-
-const NUMBERS_EACH: u32 = 8u;
+@group(0) @binding(1) var<storage, read_write> plans: array<Plan>;
+// Gaussians in depth order: [2][views][N].
+@group(0) @binding(2) var<storage, read> depth_ids: array<u32>;
+@group(0) @binding(3) var<storage, read> tiles: array<u32>;
+// [views][blocks]
+@group(0) @binding(4) var<storage, read_write> block_sums: array<u32>;
+@group(0) @binding(5) var<storage, read_write> groups_of: array<atomic<u32>>;
 
 var<workgroup> sums: array<u32, 256>;
+var<workgroup> rows: array<u32, 16>;
 
-fn add(a: u32, b: u32) -> u32 {
-    return select(a + b, 0xffffffffu, a > 0xffffffffu - b);
-}
-
-fn number_count() -> u32 {
-    let digits = ((plan.isects + SORT_BLOCK - 1u) / SORT_BLOCK) * WORKGROUP_SIZE;
-    return select(params.count, digits, params.count == COUNT_FROM_PLAN);
+fn blocks_of(count: u32) -> u32 {
+    return (count + SCAN_BLOCK - 1u) / SCAN_BLOCK;
 }
 
 @compute @workgroup_size(256)
-fn scan_blocks(
+fn sum_blocks(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let count = number_count();
+    which = group.z;
+    let total = views[which].gaussian_count;
+    let count = atomicLoad(&plans[which].sorted);
     let block = group.y * groups.x + group.x;
-    let first = block * SCAN_BLOCK + local * NUMBERS_EACH;
-    var mine: array<u32, NUMBERS_EACH>;
+    let half = atomicLoad(&plans[0].passes) & 1u;
+    let first = (half * groups.z + which) * total;
     var sum = 0u;
-    for (var k = 0u; k < NUMBERS_EACH; k++) {
-        mine[k] = sum;
-        if first + k < count {
-            sum = add(sum, numbers[first + k]);
+    for (var k = local; k < SCAN_BLOCK; k += WORKGROUP_SIZE) {
+        let i = block * SCAN_BLOCK + k;
+        if i < count {
+            sum = add(sum, tiles[which * total + depth_ids[first + i]]);
         }
     }
     sums[local] = sum;
     workgroupBarrier();
-    for (var step = 1u; step < WORKGROUP_SIZE; step *= 2u) {
-        var before = 0u;
-        if local >= step {
-            before = sums[local - step];
+    if local < 16u {
+        for (var k = local + 16u; k < WORKGROUP_SIZE; k += 16u) {
+            sum = add(sum, sums[k]);
         }
-        workgroupBarrier();
-        sums[local] = add(sums[local], before);
-        workgroupBarrier();
+        rows[local] = sum;
     }
-    var before = 0u;
-    if local > 0u {
-        before = sums[local - 1u];
-    }
-    for (var k = 0u; k < NUMBERS_EACH; k++) {
-        if first + k < count {
-            numbers[first + k] = add(before, mine[k]);
+    workgroupBarrier();
+    if local == 0u && block < blocks_of(total) {
+        for (var k = 1u; k < 16u; k++) {
+            sum = add(sum, rows[k]);
         }
-    }
-    if local == WORKGROUP_SIZE - 1u && block < arrayLength(&block_sums) {
-        block_sums[block] = sums[local];
+        block_sums[which * blocks_of(total) + block] = sum;
     }
 }
 
+fn ask_groups(row: u32, blocks: u32, view_count: u32) {
+    let x = min(blocks, GROUPS_X_MAX);
+    if x > 0u {
+        atomicMax(&groups_of[row * 4u], x);
+        atomicMax(&groups_of[row * 4u + 1u], (blocks + x - 1u) / x);
+        atomicMax(&groups_of[row * 4u + 2u], view_count);
+    }
+}
+
+// One workgroup a view.
 @compute @workgroup_size(256)
-fn add_blocks(
+fn scan_sums(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    let count = number_count();
-    let block = group.y * groups.x + group.x;
-    let first = block * SCAN_BLOCK;
-    for (var i = first + local; i < min(count, first + SCAN_BLOCK); i += WORKGROUP_SIZE) {
-        numbers[i] = add(numbers[i], block_sums[block]);
+    which = group.z;
+    let blocks = blocks_of(views[which].gaussian_count);
+    let start = which * blocks;
+    let each = (blocks + WORKGROUP_SIZE - 1u) / WORKGROUP_SIZE;
+    let first = min(local * each, blocks);
+    let end = min(first + each, blocks);
+    var sum = 0u;
+    for (var block = first; block < end; block++) {
+        sum = add(sum, block_sums[start + block]);
+    }
+    sums[local] = sum;
+    workgroupBarrier();
+    let mine = sum;
+    if local < 16u {
+        sum = 0u;
+        for (var k = 0u; k < 16u; k++) {
+            sum = add(sum, sums[local * 16u + k]);
+        }
+        rows[local] = sum;
+    }
+    workgroupBarrier();
+    var before = 0u;
+    for (var k = 0u; k < local / 16u; k++) {
+        before = add(before, rows[k]);
+    }
+    for (var k = local & 0xf0u; k < local; k++) {
+        before = add(before, sums[k]);
+    }
+    if local == WORKGROUP_SIZE - 1u {
+        let needed = add(before, mine);
+        let isects = select(needed, 0u, needed > views[which].isect_capacity);
+        plans[which].needed = needed;
+        plans[which].isects = isects;
+        ask_groups(GROUPS_TILES, (isects + SORT_BLOCK - 1u) / SORT_BLOCK, groups.z);
+        ask_groups(GROUPS_RANGES, (isects + WORKGROUP_SIZE) / WORKGROUP_SIZE, groups.z);
+    }
+    for (var block = first; block < end; block++) {
+        let count = block_sums[start + block];
+        block_sums[start + block] = before;
+        before = add(before, count);
     }
 }

@@ -1,32 +1,71 @@
 // Stages 2 and 6: one digit (8 bits) of a stable radix sort of (key, value) pairs.
 // Twin: src/render/cpu/radix_sort.rs
 //
-// histogram counts the digits of each block; prefix_sum turns the counts (digit by digit, in each
-// digit block by block) into first places; scatter moves the pairs. No subgroups: the rank of a
-// pair among equals of its round is a count of bits in a mask of 256.
+// histogram counts the digits of each block; spine turns the counts of a digit into places within
+// it, block by block; scatter moves the pairs. No subgroups: the rank of a pair among equals of its
+// round is a count of bits in a mask of 128.
+//
+// The first digit of the depth sort leaves dropped Gaussians behind, and its pairs have no values
+// yet: they are the places in memory, so that equal depths stay in the order of the scene. Keys are
+// taken relative to the least one: digits that are then 0 for all are not sorted at all.
 
-@group(0) @binding(0) var<uniform> params: SortParams;
-@group(0) @binding(1) var<storage, read> plan: PlanRead;
-@group(0) @binding(2) var<storage, read> keys_in: array<u32>;
-@group(0) @binding(3) var<storage, read> values_in: array<u32>;
-@group(0) @binding(4) var<storage, read_write> keys_out: array<u32>;
-@group(0) @binding(5) var<storage, read_write> values_out: array<u32>;
-@group(0) @binding(6) var<storage, read_write> digit_counts: array<u32>;
+@group(0) @binding(1) var<uniform> params: SortParams;
+@group(0) @binding(2) var<storage, read_write> plans: array<Plan>;
+// [2][views][stride]: a digit is sorted from one half to the other.
+@group(0) @binding(3) var<storage, read_write> keys: array<u32>;
+@group(0) @binding(4) var<storage, read_write> values: array<u32>;
+// [views][digit][block], then [views][digit] totals.
+@group(0) @binding(5) var<storage, read_write> digit_counts: array<u32>;
+@group(0) @binding(6) var<storage, read_write> groups_of: array<atomic<u32>>;
 
-// Words of a mask of WORKGROUP_SIZE bits.
-const MASK_WORDS: u32 = 8u;
+const DIGITS: u32 = 256u;
+// Words of a mask of SORT_SIZE bits.
+const MASK_WORDS: u32 = 4u;
+const MASK: u32 = 1024u;
 
 var<workgroup> counts: array<atomic<u32>, 256>;
-// Word w of digit d's mask is masks[w * 256 + d].
-var<workgroup> masks: array<atomic<u32>, 2048>;
-var<workgroup> places: array<u32, 256>;
+// Word w of digit d's mask of round r is masks[(r % 3) * MASK + w * DIGITS + d].
+var<workgroup> masks: array<atomic<u32>, 3072>;
+// First place of each digit in rounds of even and odd number.
+var<workgroup> places: array<u32, 512>;
+var<workgroup> sums: array<u32, 256>;
+
+fn stride() -> u32 {
+    return select(views[which].gaussian_count, views[which].isect_capacity, params.by_tile != 0u);
+}
+
+fn is_first() -> bool {
+    return params.by_tile == 0u && params.pass_at == 0u;
+}
 
 fn pair_count() -> u32 {
-    return select(params.count, plan.isects, params.count == COUNT_FROM_PLAN);
+    if params.by_tile != 0u {
+        return plans[which].isects;
+    }
+    if params.pass_at == 0u {
+        return views[which].gaussian_count;
+    }
+    return atomicLoad(&plans[which].sorted);
+}
+
+fn least_key() -> u32 {
+    return select(0u, atomicLoad(&plans[which].key_min), is_first());
+}
+
+fn blocks_of(count: u32) -> u32 {
+    return (count + SORT_BLOCK - 1u) / SORT_BLOCK;
+}
+
+fn counts_start() -> u32 {
+    return which * DIGITS * blocks_of(stride());
+}
+
+fn totals_start(view_count: u32) -> u32 {
+    return view_count * DIGITS * blocks_of(stride()) + which * DIGITS;
 }
 
 fn digit_of(key: u32) -> u32 {
-    return (key >> params.shift) & 255u;
+    return (key >> params.shift) & (DIGITS - 1u);
 }
 
 @compute @workgroup_size(256)
@@ -35,70 +74,199 @@ fn histogram(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
+    which = group.z;
     let count = pair_count();
-    let blocks = (count + SORT_BLOCK - 1u) / SORT_BLOCK;
+    let blocks = blocks_of(count);
     let block = group.y * groups.x + group.x;
+    let first = ((params.pass_at & 1u) * groups.z + which) * stride();
+    let least = least_key();
+    let drops = is_first();
     atomicStore(&counts[local], 0u);
     workgroupBarrier();
     if block < blocks {
         let end = min(count, (block + 1u) * SORT_BLOCK);
         for (var i = block * SORT_BLOCK + local; i < end; i += WORKGROUP_SIZE) {
-            atomicAdd(&counts[digit_of(keys_in[i])], 1u);
+            let key = keys[first + i];
+            if !(drops && key == DROPPED_KEY) {
+                atomicAdd(&counts[digit_of(key - least)], 1u);
+            }
         }
     }
     workgroupBarrier();
     if block < blocks {
-        digit_counts[local * blocks + block] = atomicLoad(&counts[local]);
+        digit_counts[counts_start() + local * blocks + block] = atomicLoad(&counts[local]);
     }
 }
 
+// One workgroup a digit.
 @compute @workgroup_size(256)
+fn spine(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    which = group.z;
+    let digit = group.x;
+    let blocks = blocks_of(pair_count());
+    let each = (blocks + WORKGROUP_SIZE - 1u) / WORKGROUP_SIZE;
+    let row = counts_start() + digit * blocks;
+    let first = min(local * each, blocks);
+    let end = min(first + each, blocks);
+    var sum = 0u;
+    for (var block = first; block < end; block++) {
+        sum += digit_counts[row + block];
+    }
+    sums[local] = sum;
+    workgroupBarrier();
+    let mine = sum;
+    if local < 16u {
+        sum = 0u;
+        for (var k = 0u; k < 16u; k++) {
+            sum += sums[local * 16u + k];
+        }
+        places[local] = sum;
+    }
+    workgroupBarrier();
+    var before = 0u;
+    for (var k = 0u; k < local / 16u; k++) {
+        before += places[k];
+    }
+    for (var k = local & 0xf0u; k < local; k++) {
+        before += sums[k];
+    }
+    if local == WORKGROUP_SIZE - 1u {
+        let total = before + mine;
+        digit_counts[totals_start(groups.z) + digit] = total;
+        if is_first() && total > 0u {
+            atomicAdd(&plans[which].sorted, total);
+        }
+    }
+    for (var block = first; block < end; block++) {
+        let count = digit_counts[row + block];
+        digit_counts[row + block] = before;
+        before += count;
+    }
+    // The digits that are left: as many as the view with the widest range of depths needs.
+    if is_first() && digit == 0u && local == 0u {
+        let low = atomicLoad(&plans[which].key_min);
+        let high = atomicLoad(&plans[which].key_max);
+        let bits = select(0u, 32u - countLeadingZeros(high - low), low < high);
+        let passes = max(1u, (bits + 7u) / 8u);
+        atomicMax(&plans[0].passes, passes);
+        let x = min(blocks, GROUPS_X_MAX);
+        for (var at = 1u; at < 4u; at++) {
+            let by_block = (GROUPS_DEPTH + at - 1u) * 4u;
+            let by_digit = (GROUPS_DIGITS + at - 1u) * 4u;
+            atomicMax(&groups_of[by_block], x);
+            atomicMax(&groups_of[by_block + 1u], (blocks + x - 1u) / x);
+            atomicMax(&groups_of[by_digit], DIGITS);
+            atomicMax(&groups_of[by_digit + 1u], 1u);
+            if at < passes {
+                atomicMax(&groups_of[by_block + 2u], groups.z);
+                atomicMax(&groups_of[by_digit + 2u], groups.z);
+            }
+        }
+    }
+}
+
+@compute @workgroup_size(128)
 fn scatter(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
+    which = group.z;
     let count = pair_count();
-    let blocks = (count + SORT_BLOCK - 1u) / SORT_BLOCK;
+    let blocks = blocks_of(count);
     let block = group.y * groups.x + group.x;
-    if block < blocks {
-        places[local] = digit_counts[local * blocks + block];
-    }
-    for (var word = 0u; word < MASK_WORDS; word++) {
-        atomicStore(&masks[word * 256u + local], 0u);
+    let from_half = params.pass_at & 1u;
+    let from_start = (from_half * groups.z + which) * stride();
+    let to_start = ((1u - from_half) * groups.z + which) * stride();
+    let least = least_key();
+    let drops = is_first();
+
+    let totals = totals_start(groups.z);
+    sums[local] = digit_counts[totals + local];
+    sums[local + SORT_SIZE] = digit_counts[totals + local + SORT_SIZE];
+    for (var k = local; k < 3u * MASK; k += SORT_SIZE) {
+        atomicStore(&masks[k], 0u);
     }
     workgroupBarrier();
+    if local < 16u {
+        var sum = 0u;
+        for (var k = 0u; k < 16u; k++) {
+            sum += sums[local * 16u + k];
+        }
+        places[256u + local] = sum;
+    }
+    workgroupBarrier();
+    for (var digit = local; digit < DIGITS; digit += SORT_SIZE) {
+        var before = 0u;
+        for (var k = 0u; k < digit / 16u; k++) {
+            before += places[256u + k];
+        }
+        for (var k = digit & 0xf0u; k < digit; k++) {
+            before += sums[k];
+        }
+        if block < blocks {
+            before += digit_counts[counts_start() + digit * blocks + block];
+        }
+        places[digit] = before;
+    }
+    // Sums of sixteen stand where the odd rounds' places will: all must have read them.
+    workgroupBarrier();
+
+    let word = (local / 32u) * DIGITS;
+    let bit = 1u << (local % 32u);
+    let first = block * SORT_BLOCK + local;
+    let end = select(0u, min(count, (block + 1u) * SORT_BLOCK), block < blocks);
+    var next_key = DROPPED_KEY;
+    if first < end {
+        next_key = keys[from_start + first];
+    }
+    var cleared = 0u;
+    var clears = false;
     // Every invocation takes every round: barriers stand in uniform control flow.
-    for (var round = 0u; round < SORT_BLOCK / WORKGROUP_SIZE; round++) {
-        let i = block * SORT_BLOCK + round * WORKGROUP_SIZE + local;
-        let valid = block < blocks && i < count;
-        let my_word = local / 32u;
-        let my_bit = 1u << (local % 32u);
-        var key = 0u;
+    for (var round = 0u; round < SORT_BLOCK / SORT_SIZE; round++) {
+        let i = first + round * SORT_SIZE;
+        let key = next_key - least;
+        let valid = i < end && !(drops && next_key == DROPPED_KEY);
+        let digit = digit_of(key);
+        let mask = (round % 3u) * MASK;
+        var value = i;
         if valid {
-            key = keys_in[i];
-            atomicOr(&masks[my_word * 256u + digit_of(key)], my_bit);
-        }
-        workgroupBarrier();
-        if valid {
-            let digit = digit_of(key);
-            var rank = countOneBits(atomicLoad(&masks[my_word * 256u + digit]) & (my_bit - 1u));
-            for (var word = 0u; word < my_word; word++) {
-                rank += countOneBits(atomicLoad(&masks[word * 256u + digit]));
+            atomicOr(&masks[mask + word + digit], bit);
+            if !drops {
+                value = values[from_start + i];
             }
-            let place = places[digit] + rank;
-            keys_out[place] = key;
-            values_out[place] = values_in[i];
+        }
+        // On its way while the others arrive.
+        if i + SORT_SIZE < end {
+            next_key = keys[from_start + i + SORT_SIZE];
         }
         workgroupBarrier();
-        // Here an invocation looks after the digit of its own number.
-        var taken = 0u;
-        for (var word = 0u; word < MASK_WORDS; word++) {
-            let at = word * 256u + local;
-            taken += countOneBits(atomicLoad(&masks[at]));
-            atomicStore(&masks[at], 0u);
+        // One barrier a round: masks of three rounds and places of two take turns.
+        let now = (round & 1u) * 256u;
+        if valid {
+            var rank = countOneBits(atomicLoad(&masks[mask + word + digit]) & (bit - 1u));
+            for (var w = 0u; w < word; w += DIGITS) {
+                rank += countOneBits(atomicLoad(&masks[mask + w + digit]));
+            }
+            let place = to_start + places[now + digit] + rank;
+            keys[place] = key;
+            values[place] = value;
         }
-        places[local] += taken;
-        workgroupBarrier();
+        for (var owned = local; owned < DIGITS; owned += SORT_SIZE) {
+            var taken = places[now + owned];
+            for (var w = 0u; w < MASK; w += DIGITS) {
+                taken += countOneBits(atomicLoad(&masks[mask + w + owned]));
+            }
+            places[256u - now + owned] = taken;
+        }
+        if clears {
+            atomicStore(&masks[cleared], 0u);
+        }
+        clears = valid;
+        cleared = mask + word + digit;
     }
 }

@@ -60,7 +60,7 @@ pub struct ConfigArgs {
     /// Which renderer serves views [default: auto]
     #[arg(long, env = "SEGSPLAT_RENDERER", value_enum)]
     pub renderer: Option<RendererChoice>,
-    /// Part of the name of the wgpu adapter to use
+    /// Part of the name of the wgpu adapter to use; several with commas between
     #[arg(long, env = "SEGSPLAT_ADAPTER")]
     pub adapter: Option<String>,
     /// Execution provider of the networks [default: auto]
@@ -121,7 +121,7 @@ pub struct Config {
     pub ort_library: Option<PathBuf>,
     /// Which renderer serves views.
     pub renderer: RendererChoice,
-    /// Part of the name of the wgpu adapter to use.
+    /// Part of the name of the wgpu adapter to use, or of several, with commas between.
     pub adapter: Option<String>,
     /// Execution provider of the networks.
     pub provider: ProviderChoice,

@@ -67,6 +67,8 @@ pub struct Limits {
     pub queued_renders_max: usize,
     /// Bytes of scenes kept in memory.
     pub cache_bytes_max: u64,
+    /// Bytes of scenes kept on one GPU device: what a card of 8 GB has to spare beside its frames.
+    pub device_scene_bytes_max: u64,
     /// Milliseconds one render may take.
     pub render_timeout_ms: u64,
     /// Milliseconds one scene may take.
@@ -133,6 +135,7 @@ impl Default for Limits {
             queued_jobs_max: 64,
             queued_renders_max: 256,
             cache_bytes_max: 4 << 30,
+            device_scene_bytes_max: 2 << 30,
             render_timeout_ms: 30_000,
             scene_timeout_ms: 600_000,
             wait_ms_max: 600_000,

@@ -3,7 +3,7 @@
 
 // x, in a form that no compiler can fuse or reorder with its neighbours.
 fn opaque(x: f32) -> f32 {
-    return bitcast<f32>(bitcast<u32>(x) ^ view.zero);
+    return bitcast<f32>(bitcast<u32>(x) ^ views[which].zero);
 }
 
 // a + b and its rounding error (Knuth).
@@ -27,22 +27,22 @@ fn two_product(a: f32, b: f32) -> vec2<f32> {
 
 // A point in camera space; z is exact to the last bit of f32 but for double rounding.
 fn camera_point(mean: vec3<f32>) -> vec3<f32> {
-    let dx = two_sum(mean.x, -view.center.x);
-    let dy = two_sum(mean.y, -view.center.y);
-    let dz = two_sum(mean.z, -view.center.z);
+    let dx = two_sum(mean.x, -views[which].center.x);
+    let dy = two_sum(mean.y, -views[which].center.y);
+    let dz = two_sum(mean.z, -views[which].center.z);
     let d = vec3(dx.x, dy.x, dz.x);
-    let d_low = vec3(dx.y, dy.y, dz.y) - view.center_low.xyz;
-    let rz = view.rotation_z;
+    let d_low = vec3(dx.y, dy.y, dz.y) - views[which].center_low.xyz;
+    let rz = views[which].rotation_z;
     let px = two_product(rz.x, d.x);
     let py = two_product(rz.y, d.y);
     let pz = two_product(rz.z, d.z);
     let xy = two_sum(px.x, py.x);
     let xyz = two_sum(xy.x, pz.x);
     let low = px.y + py.y + pz.y + xy.y + xyz.y
-        + dot(rz.xyz, d_low) + dot(view.rotation_z_low.xyz, d);
+        + dot(rz.xyz, d_low) + dot(views[which].rotation_z_low.xyz, d);
     return vec3(
-        dot(view.rotation_x.xyz, d) + dot(view.rotation_x.xyz, d_low),
-        dot(view.rotation_y.xyz, d) + dot(view.rotation_y.xyz, d_low),
+        dot(views[which].rotation_x.xyz, d) + dot(views[which].rotation_x.xyz, d_low),
+        dot(views[which].rotation_y.xyz, d) + dot(views[which].rotation_y.xyz, d_low),
         opaque(xyz.x + low),
     );
 }

@@ -17,14 +17,21 @@ const SH_OFFSET: f32 = 0.5;
 // Numbers of the kernels: the same list as src/render/gpu/pipelines.rs.
 // Invocations of a workgroup, the portable floor; also the values of a radix digit.
 const WORKGROUP_SIZE: u32 = 256u;
-// Pairs that one workgroup sorts, in rounds of WORKGROUP_SIZE.
+// Views that one submission draws at most: the workgroup's z says which.
+const VIEWS_MAX: u32 = 8u;
+// Invocations of a workgroup that moves pairs, and the pairs that it moves.
+const SORT_SIZE: u32 = 128u;
 const SORT_BLOCK: u32 = 2048u;
-// Numbers that one workgroup sums.
-const SCAN_BLOCK: u32 = 2048u;
+// Gaussians whose tile pairs one workgroup emits.
+const SCAN_BLOCK: u32 = 1024u;
 // Workgroups along x at most; more go to y.
 const GROUPS_X_MAX: u32 = 32768u;
-// Count that means "as many as Plan.isects says".
-const COUNT_FROM_PLAN: u32 = 0xffffffffu;
+// Rows of four numbers in `groups_of`: digits 1 to 3 of the depth sort by blocks, then by digit
+// values; the tile sort; tile_ranges.
+const GROUPS_DEPTH: u32 = 0u;
+const GROUPS_DIGITS: u32 = 3u;
+const GROUPS_TILES: u32 = 6u;
+const GROUPS_RANGES: u32 = 7u;
 // Depth key of a dropped Gaussian: after every finite depth.
 const DROPPED_KEY: u32 = 0xffffffffu;
 // Value of a pair that was counted and not emitted: blends nothing.

@@ -7,18 +7,26 @@ var<private> blended: vec4<f32>;
 // An index beyond the table counts as 0.
 fn label_of(id: u32) -> u32 {
     let index = index_of(id);
-    return select(0u, index, index < view.label_rows);
+    return select(0u, index, index < views[which].label_rows);
 }
 
-fn add_label(label: u32, share: f32, pixel: u32) {
-    blended += share * table[label];
+fn label_row(label: u32) -> vec4<f32> {
+    return table[views[which].table_start + label];
+}
+
+// The row is staged where no colour takes its place.
+fn add_label(label: u32, paint: vec4<f32>, painted: bool, share: f32, pixel: u32) {
+    if painted {
+        blended += share * label_row(label);
+    } else {
+        blended += share * paint;
+    }
 }
 
 fn store_labels(pixel: u32) {
-    let first = view.blend_start + pixel * 4u;
+    let first = views[which].blend_start + pixel * 4u;
     pictures[first] = blended.x;
     pictures[first + 1u] = blended.y;
     pictures[first + 2u] = blended.z;
     pictures[first + 3u] = blended.w;
 }
-

@@ -18,26 +18,31 @@ fn end_run(pixel: u32) {
     if run_index == 0u {
         return;
     }
-    let rows = min(view.row_end * TILE_SIZE, view.height) - view.row_start * TILE_SIZE;
-    let pixels = rows * view.width;
-    let held = min(used, view.entry_slots);
+    let bottom = min(views[which].row_end * TILE_SIZE, views[which].height);
+    let rows = bottom - views[which].row_start * TILE_SIZE;
+    let pixels = rows * views[which].width;
+    let held = min(used, views[which].entry_slots);
     for (var slot = 0u; slot < held; slot++) {
-        let at = pixels * (1u + 2u * slot) + pixel;
+        let at = views[which].slot_start + pixels * (1u + 2u * slot) + pixel;
         if slots[at] == run_index {
             let sum = bitcast<f32>(slots[at + pixels]) + run_weight;
             slots[at + pixels] = bitcast<u32>(sum);
             return;
         }
     }
-    if used < view.entry_slots {
-        let at = pixels * (1u + 2u * used) + pixel;
+    if used < views[which].entry_slots {
+        let at = views[which].slot_start + pixels * (1u + 2u * used) + pixel;
         slots[at] = run_index;
         slots[at + pixels] = bitcast<u32>(run_weight);
     }
     used++;
 }
 
-fn add_label(label: u32, share: f32, pixel: u32) {
+fn label_row(label: u32) -> vec4<f32> {
+    return vec4(0.0);
+}
+
+fn add_label(label: u32, paint: vec4<f32>, painted: bool, share: f32, pixel: u32) {
     if label == 0u {
         return;
     }
@@ -51,6 +56,5 @@ fn add_label(label: u32, share: f32, pixel: u32) {
 
 fn store_labels(pixel: u32) {
     end_run(pixel);
-    slots[pixel] = used;
+    slots[views[which].slot_start + pixel] = used;
 }
-

@@ -4,7 +4,10 @@ fn label_of(id: u32) -> u32 {
     return 0u;
 }
 
-fn add_label(label: u32, share: f32, pixel: u32) {}
+fn label_row(label: u32) -> vec4<f32> {
+    return vec4(0.0);
+}
+
+fn add_label(label: u32, paint: vec4<f32>, painted: bool, share: f32, pixel: u32) {}
 
 fn store_labels(pixel: u32) {}
-

@@ -1,7 +1,7 @@
 // Every struct that crosses the border to the host; twins in src/render/gpu/buffers.rs, compared by
 // a test.
 
-// Camera of one frame relative to the scene's origin, and the band of tile rows to draw.
+// Camera of one view relative to the scene's origin, and the band of tile rows to draw.
 struct View {
     // Rows of the rotation world to camera; w is 0.
     rotation_x: vec4<f32>,
@@ -39,10 +39,15 @@ struct View {
     depth_start: u32,
     alpha_start: u32,
     blend_start: u32,
-    // Rows of the table that is blended.
+    // Rows of the table that is blended, and where they start in `table`.
     label_rows: u32,
-    // Entries that a pixel has room for.
+    table_start: u32,
+    // Entries that a pixel has room for, and where they start in `slots`.
     entry_slots: u32,
+    slot_start: u32,
+    // First number in `ranges`, and first sorted tile pair.
+    range_start: u32,
+    pair_start: u32,
     reserved_1: u32,
     reserved_2: u32,
 }
@@ -67,12 +72,9 @@ struct Footprint {
     reach: f32,
     opacity: f32,
     depth: f32,
-    color: vec3<f32>,
-    // Tiles touched in the band; 0 for a dropped Gaussian.
-    tiles: u32,
 }
 
-// What one frame found out on the way: counts, and workgroups of the stages that depend on them.
+// What one view found out on the way.
 struct Plan {
     // Gaussian-tile pairs at work: 0 when `needed` exceeds the capacity.
     isects: u32,
@@ -80,35 +82,23 @@ struct Plan {
     needed: u32,
     // Gaussians that touch the whole picture.
     visible: atomic<u32>,
+    // Gaussians that touch the band: those sorted by depth.
+    sorted: atomic<u32>,
+    // Least and largest depth key of them.
+    key_min: atomic<u32>,
+    key_max: atomic<u32>,
+    // Digits that the depth sort takes; in the first view's plan, for all views of the batch.
+    passes: atomic<u32>,
     reserved: u32,
-    sort_groups: vec4<u32>,
-    range_groups: vec4<u32>,
-}
-
-// Plan as the later stages read it (an atomic cannot be bound read-only).
-struct PlanRead {
-    isects: u32,
-    needed: u32,
-    visible: u32,
-    reserved: u32,
-    sort_groups: vec4<u32>,
-    range_groups: vec4<u32>,
 }
 
 // One digit of a radix sort.
 struct SortParams {
     // Lowest bit of the digit.
     shift: u32,
-    // Pairs, or COUNT_FROM_PLAN.
-    count: u32,
-    reserved: vec2<u32>,
-}
-
-// One level of a prefix sum.
-struct ScanParams {
-    // Numbers, or COUNT_FROM_PLAN: the digit counts of a sort of Plan.isects pairs.
-    count: u32,
-    reserved_1: u32,
-    reserved_2: u32,
-    reserved_3: u32,
+    // Digits sorted before this one.
+    pass_at: u32,
+    // 0 sorts Gaussians by depth, 1 tile pairs by tile.
+    by_tile: u32,
+    reserved: u32,
 }

@@ -31,7 +31,7 @@ fn extent_of(footprint: Footprint, row_start: u32, row_end: u32) -> Extent {
     let wide = large * sqrt((across / large) * (across / large) + (lean / large) * (lean / large));
     let slack = vec2(0.01) + 4e-6 * (abs(footprint.mean) + vec2(wide, tall));
     let first_row = i32(row_start * TILE_SIZE);
-    let last_row = i32(min(row_end * TILE_SIZE, view.height)) - 1;
+    let last_row = i32(min(row_end * TILE_SIZE, views[which].height)) - 1;
     let top = max(to_pixel(ceil(footprint.mean.y - tall - 0.5 - slack.y)), first_row);
     let bottom = min(to_pixel(floor(footprint.mean.y + tall - 0.5 + slack.y)), last_row);
     return Extent(root, wide, tall, slack, top, bottom);
@@ -55,7 +55,7 @@ fn tile_span(footprint: Footprint, extent: Extent, tile_y: i32) -> vec2<u32> {
     let left = footprint.mean.x + footprint.slope * at_left
         - half_width(footprint, extent, at_left) - extent.slack.x;
     let first = max(to_pixel(ceil(left - 0.5)), 0);
-    let last = min(to_pixel(floor(right - 0.5)), i32(view.width) - 1);
+    let last = min(to_pixel(floor(right - 0.5)), i32(views[which].width) - 1);
     if first > last {
         return vec2(0u);
     }

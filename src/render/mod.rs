@@ -64,7 +64,7 @@ impl Quality {
 }
 
 /// One view to render.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct RenderRequest {
     /// The camera; its intrinsics carry the whole picture's size.
     pub camera: Camera,
@@ -124,6 +124,24 @@ pub struct Frame {
     pub stats: FrameStats,
 }
 
+/// Time of one dispatch, by the device's own clock.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct StageTime {
+    /// Kernel.
+    pub stage: &'static str,
+    /// Milliseconds.
+    pub ms: f64,
+}
+
+/// Times of one frame on a device, by its own clock.
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
+pub struct DeviceTimes {
+    /// From before the first stage to after the last, no stage marked between: milliseconds.
+    pub total_ms: f64,
+    /// Every dispatch of another frame, in order.
+    pub stages: Vec<StageTime>,
+}
+
 /// A renderer of the one model.
 pub trait Renderer: Send + Sync {
     /// Name for logs, `/v1/models` and benchmarks: `cpu`, or the adapter's own name.
@@ -135,4 +153,16 @@ pub trait Renderer: Send + Sync {
     /// `limit_exceeded` when the work does not fit the device's limits, `gpu_unavailable` when the
     /// device is lost, `internal` for a fault of ours. An empty scene is a clean background.
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame>;
+
+    /// Renders one view for the times of it on the device; `None` where none keeps them.
+    ///
+    /// # Errors
+    /// As [`Self::render`].
+    fn device_times(
+        &self,
+        _gaussians: &Gaussians,
+        _request: &RenderRequest,
+    ) -> Result<Option<DeviceTimes>> {
+        Ok(None)
+    }
 }

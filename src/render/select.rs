@@ -6,7 +6,7 @@ use std::sync::Arc;
 use serde::Serialize;
 
 use super::{
-    Frame, RenderRequest, Renderer,
+    DeviceTimes, Frame, RenderRequest, Renderer,
     cpu::CpuRenderer,
     gpu::{GpuOptions, GpuRenderer},
 };
@@ -42,13 +42,29 @@ pub struct AdapterReport {
 /// `gpu_unavailable` when an adapter was asked for and none fits, `internal` when threads or
 /// kernels cannot be made.
 pub fn select(config: &Config) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
+    select_with(config, GpuOptions::default())
+}
+
+/// As [`select`], with options for the GPU renderer; the adapter is the configured one.
+///
+/// # Errors
+/// As [`select`].
+pub fn select_with(
+    config: &Config,
+    options: GpuOptions,
+) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
     let cpu = CpuRenderer::new(config.threads)?;
     if config.renderer == RendererChoice::Cpu {
         tracing::info!(renderer = "cpu", "renderer chosen as configured");
         return Ok((Arc::new(cpu), Vec::new()));
     }
-    let options = GpuOptions { adapter: config.adapter.clone(), ..GpuOptions::default() };
-    let (reports, gpu) = GpuRenderer::open(options);
+    let options = GpuOptions {
+        adapter: config.adapter.clone(),
+        waiting_max: config.limits.queued_renders_max,
+        scene_bytes_max: config.limits.device_scene_bytes_max,
+        ..options
+    };
+    let (reports, gpu) = GpuRenderer::open(&options);
     for report in &reports {
         tracing::info!(
             adapter = report.name,
@@ -103,5 +119,12 @@ impl Renderer for WithCpu {
             }
             other => other,
         }
+    }
+    fn device_times(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+    ) -> Result<Option<DeviceTimes>> {
+        self.gpu.device_times(gaussians, request)
     }
 }

@@ -31,6 +31,7 @@ mod literal;
 mod magnify;
 mod oracle;
 mod photos;
+mod pool;
 mod props;
 mod sample;
 mod segment;

@@ -7,7 +7,7 @@ use naga::{Expression, Literal, Module, TypeInner};
 use segsplat::render::{
     constants,
     gpu::{
-        buffers::{FootprintRow, GaussianRow, PlanRow, ScanParams, SortParams, ViewRow},
+        buffers::{FootprintRow, GaussianRow, PlanRow, SortParams, ViewRow},
         pipelines::{self, SHADERS, Shader},
     },
 };
@@ -118,21 +118,23 @@ fn structs_lie_in_memory_as_their_twins_do() {
                 alpha_start,
                 blend_start,
                 label_rows,
+                table_start,
                 entry_slots,
+                slot_start,
+                range_start,
+                pair_start,
                 reserved_1,
                 reserved_2,
             ]
         ),
         twin!(GaussianRow, "Gaussian", [mean, opacity, quat, scale, reserved]),
+        twin!(FootprintRow, "Footprint", [mean, slope, inv_sx, inv_sy, reach, opacity, depth]),
         twin!(
-            FootprintRow,
-            "Footprint",
-            [mean, slope, inv_sx, inv_sy, reach, opacity, depth, color, tiles]
+            PlanRow,
+            "Plan",
+            [isects, needed, visible, sorted, key_min, key_max, passes, reserved]
         ),
-        twin!(PlanRow, "Plan", [isects, needed, visible, reserved, sort_groups, range_groups]),
-        twin!(PlanRow, "PlanRead", [isects, needed, visible, reserved, sort_groups, range_groups]),
-        twin!(SortParams, "SortParams", [shift, count, reserved]),
-        twin!(ScanParams, "ScanParams", [count, reserved_1, reserved_2, reserved_3]),
+        twin!(SortParams, "SortParams", [shift, pass_at, by_tile, reserved]),
     ];
     for (name, offsets, size) in twins {
         let mut seen = 0;

@@ -44,7 +44,11 @@ pub struct ViewRow {
     pub alpha_start: u32,
     pub blend_start: u32,
     pub label_rows: u32,
+    pub table_start: u32,
     pub entry_slots: u32,
+    pub slot_start: u32,
+    pub range_start: u32,
+    pub pair_start: u32,
     pub reserved_1: u32,
     pub reserved_2: u32,
 }
@@ -73,21 +77,28 @@ pub struct FootprintRow {
     pub reach: f32,
     pub opacity: f32,
     pub depth: f32,
-    pub color: [f32; 3],
-    pub tiles: u32,
 }
 
-/// `Plan` and `PlanRead` of the shaders.
+/// `Plan` of the shaders.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
 #[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
 pub struct PlanRow {
     pub isects: u32,
     pub needed: u32,
     pub visible: u32,
+    pub sorted: u32,
+    pub key_min: u32,
+    pub key_max: u32,
+    pub passes: u32,
     pub reserved: u32,
-    pub sort_groups: [u32; 4],
-    pub range_groups: [u32; 4],
+}
+
+impl Default for PlanRow {
+    /// Before the first stage.
+    fn default() -> Self {
+        Self { key_min: u32::MAX, ..Self::zeroed() }
+    }
 }
 
 /// `SortParams` of the shaders.
@@ -96,24 +107,14 @@ pub struct PlanRow {
 #[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
 pub struct SortParams {
     pub shift: u32,
-    pub count: u32,
-    pub reserved: [u32; 2],
-}
-
-/// `ScanParams` of the shaders.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
-pub struct ScanParams {
-    pub count: u32,
-    pub reserved_1: u32,
-    pub reserved_2: u32,
-    pub reserved_3: u32,
+    pub pass_at: u32,
+    pub by_tile: u32,
+    pub reserved: u32,
 }
 
 const _: () = assert!(size_of::<ViewRow>().is_multiple_of(16), "a uniform block");
 const _: () = assert!(size_of::<GaussianRow>() == 48, "three rows of four");
-const _: () = assert!(size_of::<FootprintRow>() == 48, "three rows of four");
+const _: () = assert!(size_of::<FootprintRow>() == 32, "two rows of four");
 
 impl ViewRow {
     /// The whole picture of `view`; the caller sets band, capacity and picture starts.
@@ -165,7 +166,8 @@ impl Slot {
 
     /// A storage buffer.
     pub(super) const fn storage(label: &'static str) -> Self {
-        Self::new(label, BufferUsages::STORAGE.union(BufferUsages::COPY_SRC))
+        let copied = BufferUsages::COPY_SRC.union(BufferUsages::COPY_DST);
+        Self::new(label, BufferUsages::STORAGE.union(copied))
     }
 
     /// The buffer, at least `size_bytes` long.
@@ -184,17 +186,16 @@ impl Slot {
         self.buffer = Some(buffer.clone());
         Ok(buffer)
     }
-
-    /// Bytes held.
-    pub(super) fn size_bytes(&self) -> u64 {
-        self.buffer.as_ref().map_or(0, wgpu::Buffer::size)
-    }
 }
 
 /// Gaussians on the device.
 #[derive(Clone, Debug)]
 pub(super) struct Scene {
     shape: u64,
+    /// Number of Gaussians.
+    pub(super) count: u32,
+    /// Coefficients a Gaussian.
+    pub(super) sh_count: u32,
     /// `[N]` of [`GaussianRow`].
     pub(super) gaussians: wgpu::Buffer,
     /// `[N, K, 3]` f32.
@@ -245,6 +246,8 @@ impl Scene {
             .collect();
         Ok(Self {
             shape: source.shape_identity(),
+            count: narrow("gaussians", source.len())?,
+            sh_count: source.sh_count() as u32,
             gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows))?,
             sh: gpu.upload("sh", bytemuck::cast_slice(source.sh()))?,
             labels: None,
@@ -279,6 +282,7 @@ impl SceneCache {
             // Memory may be held by the other scenes: once without them.
             Err(error) if error.code() == ErrorCode::LimitExceeded && !self.scenes.is_empty() => {
                 self.scenes.clear();
+                gpu.forget();
                 Scene::upload(gpu, source)?
             }
             other => other?,
@@ -286,6 +290,7 @@ impl SceneCache {
         let held = |scenes: &[Scene]| scenes.iter().map(Scene::size_bytes).sum::<u64>();
         while !self.scenes.is_empty() && held(&self.scenes) + scene.size_bytes() > self.bytes_max {
             self.scenes.remove(0);
+            gpu.forget();
         }
         self.scenes.push(scene.clone());
         Ok(scene)
@@ -307,6 +312,17 @@ impl SceneCache {
             scene.labels = Some(labels.clone());
         }
         Ok(labels)
+    }
+
+    /// What tells the scenes held.
+    pub(super) fn shapes(&self) -> Vec<u64> {
+        self.scenes.iter().map(|scene| scene.shape).collect()
+    }
+
+    /// Gives up all scenes.
+    pub(super) fn clear(&mut self, gpu: &Gpu) {
+        self.scenes.clear();
+        gpu.forget();
     }
 
     /// Scenes held.

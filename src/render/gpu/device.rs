@@ -4,11 +4,12 @@
 
 use std::sync::{
     Arc, Mutex, PoisonError,
-    atomic::{AtomicBool, Ordering},
+    atomic::{AtomicBool, AtomicU64, Ordering},
 };
 
 use wgpu::{BufferUsages, ErrorFilter};
 
+use super::profile;
 use crate::{
     error::{Error, ErrorCode, Result},
     render::select::AdapterReport,
@@ -30,6 +31,9 @@ const WORKGROUP_BYTES: u32 = 16 << 10;
 fn list(backends: wgpu::Backends) -> Vec<(wgpu::Adapter, AdapterReport)> {
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
         backends,
+        // The kernels size their own dispatches within the limits: wgpu need not look at each.
+        flags: wgpu::InstanceFlags::from_build_config()
+            .difference(wgpu::InstanceFlags::VALIDATION_INDIRECT_CALL),
         ..wgpu::InstanceDescriptor::new_without_display_handle()
     });
     pollster::block_on(instance.enumerate_adapters(backends))
@@ -68,22 +72,23 @@ fn rank(report: &AdapterReport, adapter: &wgpu::Adapter) -> Option<u32> {
     }
 }
 
-/// Adapters found, and the one taken: by part of its name, else the best hardware one.
+/// Adapters found, and those taken, the best first: by parts of their names, else all hardware
+/// ones.
 ///
 /// OpenGL is looked at only for a named adapter: it is never better than the others.
 pub(super) fn choose(
     name: Option<&str>,
-) -> (Vec<AdapterReport>, Result<(wgpu::Adapter, AdapterReport)>) {
+) -> (Vec<AdapterReport>, Result<Vec<(wgpu::Adapter, AdapterReport)>>) {
     let mut found = list(wgpu::Backends::VULKAN | wgpu::Backends::METAL | wgpu::Backends::DX12);
-    let mut at = pick(&found, name);
-    if at.is_none() && name.is_some() {
+    let mut taken = pick(&found, name);
+    if taken.is_empty() && name.is_some() {
         found.extend(list(wgpu::Backends::GL));
-        at = pick(&found, name);
+        taken = pick(&found, name);
     }
-    let mut reports: Vec<_> = found.iter().map(|(_, report)| report.clone()).collect();
-    if let Some(at) = at {
-        reports[at].chosen = true;
-        let chosen = (found.swap_remove(at).0, reports[at].clone());
+    taken.iter().for_each(|&at| found[at].1.chosen = true);
+    let reports: Vec<_> = found.iter().map(|(_, report)| report.clone()).collect();
+    if !taken.is_empty() {
+        let chosen = taken.into_iter().map(|at| found[at].clone()).collect();
         return (reports, Ok(chosen));
     }
     let names: Vec<_> = reports.iter().map(|report| format!("{:?}", report.name)).collect();
@@ -97,21 +102,28 @@ pub(super) fn choose(
     (reports, Err(Error::new(ErrorCode::GpuUnavailable, message)))
 }
 
-fn pick(found: &[(wgpu::Adapter, AdapterReport)], name: Option<&str>) -> Option<usize> {
-    match name {
-        Some(name) => {
-            let name = match name.to_lowercase().as_str() {
-                // Mesa's Vulkan driver of that name calls its adapter llvmpipe.
-                "lavapipe" => "llvmpipe".to_owned(),
-                name => name.to_owned(),
-            };
-            found.iter().position(|(_, report)| report.name.to_lowercase().contains(&name))
-        }
-        None => (0..found.len())
-            .filter_map(|at| rank(&found[at].1, &found[at].0).map(|rank| (rank, at)))
-            .min()
-            .map(|(_, at)| at),
+/// Places of the adapters to use. `name` may hold several names, with commas between.
+fn pick(found: &[(wgpu::Adapter, AdapterReport)], name: Option<&str>) -> Vec<usize> {
+    let Some(names) = name else {
+        let ranked = |at: usize| rank(&found[at].1, &found[at].0).map(|rank| (rank, at));
+        let mut ranked: Vec<_> = (0..found.len()).filter_map(ranked).collect();
+        ranked.sort_unstable();
+        return ranked.into_iter().map(|(_, at)| at).collect();
+    };
+    let mut taken = Vec::new();
+    for name in names.split(',').map(|name| name.trim().to_lowercase()) {
+        let name = match name.as_str() {
+            "" => continue,
+            // Mesa's Vulkan driver of that name calls its adapter llvmpipe.
+            "lavapipe" => "llvmpipe",
+            name => name,
+        };
+        let called = |at: &usize| found[*at].1.name.to_lowercase().contains(name);
+        let new: Vec<_> =
+            (0..found.len()).filter(called).filter(|at| !taken.contains(at)).collect();
+        taken.extend(new);
     }
+    taken
 }
 
 /// What went wrong outside of any error scope.
@@ -127,13 +139,18 @@ impl Faults {
     }
 }
 
-/// A device and its queue. Nothing that goes wrong on it ends the process.
-#[derive(Debug)]
+/// A device and its queue. Nothing that goes wrong on it ends the process. Clones are the same
+/// device.
+#[derive(Clone, Debug)]
 pub(super) struct Gpu {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
     /// Bytes one storage binding may span.
     pub(super) binding_bytes_max: u64,
+    /// Whether it takes the times of its stages.
+    pub(super) has_times: bool,
+    /// Buffers made so far.
+    generation: Arc<AtomicU64>,
     faults: Arc<Faults>,
 }
 
@@ -168,8 +185,10 @@ impl Gpu {
         let limits = if portable { wgpu::Limits::default() } else { offered };
         let binding_bytes_max =
             limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) & !0xff;
+        let has_times = adapter.features().contains(profile::FEATURES);
         let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("segsplat"),
+            required_features: (profile::FEATURES | wgpu::Features::SUBGROUP) & adapter.features(),
             required_limits: limits,
             ..Default::default()
         }))
@@ -186,12 +205,30 @@ impl Gpu {
                 lost.report(message);
             }
         });
-        Ok(Self { device, queue, binding_bytes_max, faults })
+        let generation = Arc::default();
+        Ok(Self { device, queue, binding_bytes_max, has_times, generation, faults })
+    }
+
+    /// Tells when a buffer was made or given up: what was made of buffers is to be made anew.
+    pub(super) fn generation(&self) -> u64 {
+        self.generation.load(Ordering::Acquire)
+    }
+
+    /// Says that buffers are no longer wanted, see [`Self::generation`].
+    pub(super) fn forget(&self) {
+        self.generation.fetch_add(1, Ordering::AcqRel);
     }
 
     /// Whether the device is gone for good.
     pub(super) fn is_lost(&self) -> bool {
         self.faults.lost.load(Ordering::Acquire)
+    }
+
+    /// Ends the device as a driver's fault would.
+    pub(super) fn lose(&self) {
+        self.faults.lost.store(true, Ordering::Release);
+        self.faults.report("lost on purpose".to_owned());
+        self.device.destroy();
     }
 
     /// Declares the device gone: it did not answer.
@@ -263,6 +300,7 @@ impl Gpu {
                 self.binding_bytes_max,
             ));
         }
+        self.forget();
         self.scoped(label, || {
             self.device.create_buffer(&wgpu::BufferDescriptor {
                 label: Some(label),
@@ -290,7 +328,6 @@ impl Gpu {
     }
 }
 
-/// One buffer of `bytes` in an error's way: see [`Gpu::scoped`].
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -306,7 +343,7 @@ mod tests {
     #[test]
     fn software_is_never_taken_unasked() {
         let (_, chosen) = choose(None);
-        if let Ok((_, report)) = chosen {
+        for (_, report) in chosen.into_iter().flatten() {
             assert!(!report.software, "{report:?} was taken without being named");
         }
     }

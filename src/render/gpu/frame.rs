@@ -1,4 +1,5 @@
-//! One frame: its bands, the room for its Gaussian-tile pairs, its pictures read back.
+//! One submission: the views of a batch, the room for their Gaussian-tile pairs, their pictures
+//! read back; and the bands of a view that does not fit at once.
 
 use std::ops::Range;
 
@@ -6,13 +7,15 @@ use super::{
     buffers::{PlanRow, Scene, SceneLabels, ViewRow},
     device::Gpu,
     pipelines::{Kernels, NO_PICTURE},
+    profile::Marks,
     readback,
-    recorder::{ENTRY_SLOTS_MIN, LabelBuffers, PairCount, Recorder, Scratch, footprint_bytes},
+    recorder::{LabelBuffers, Recorder, SceneBuffers, sorted_half, tile_bits},
+    scratch::{ENTRY_SLOTS_MIN, Need, Scratch},
 };
 use crate::{
     error::{Error, Result},
     render::{
-        Entries, Frame, FrameStats, Kinds, Labels, RenderRequest,
+        Entries, Frame, FrameStats, Kinds, Labels, RenderRequest, StageTime,
         constants::TILE_SIZE,
         labels::{BLEND_WIDTH, EntryRows},
         view::View,
@@ -25,6 +28,8 @@ const ISECT_CAPACITY_MIN: u32 = 1 << 16;
 const ATTEMPTS_MAX: u32 = 3;
 /// How much more room for entries is made when it does not suffice.
 const ENTRY_SLOTS_GROWTH: u32 = 4;
+/// Bytes of a tile pair: key and Gaussian, each in two halves.
+const PAIR_BYTES_A_BUFFER: u64 = 8;
 const PLAN_BYTES: u64 = size_of::<PlanRow>() as u64;
 
 /// A frame without Gaussians.
@@ -42,7 +47,7 @@ pub(super) fn background(view: &View, request: &RenderRequest) -> Frame {
     }
 }
 
-/// Where each picture of a band starts in the buffer of pictures, in floats; and its entry slots.
+/// What a band of a view takes in the buffers of its batch.
 struct Layout {
     color: u32,
     depth: u32,
@@ -53,23 +58,10 @@ struct Layout {
     pixels: u64,
     /// Entries a pixel has room for; 0 where none are wanted.
     slots: u32,
+    tiles: u32,
 }
 
 impl Layout {
-    fn new(kinds: Kinds, labels: &Labels, pixels: u64, slots: u32) -> Self {
-        let mut floats = 0;
-        let mut take = |wanted: bool, channels: u64| {
-            let start = if wanted { floats as u32 } else { NO_PICTURE };
-            floats += if wanted { channels * pixels } else { 0 };
-            start
-        };
-        let color = take(kinds.color, 3);
-        let depth = take(kinds.depth, 1);
-        let alpha = take(kinds.alpha, 1);
-        let blend = take(matches!(labels, Labels::Blend(_)), BLEND_WIDTH as u64);
-        Self { color, depth, alpha, blend, floats, pixels, slots }
-    }
-
     fn picture_bytes(&self) -> u64 {
         self.floats * 4
     }
@@ -90,212 +82,350 @@ enum Outcome {
     Slots,
 }
 
-/// A frame being drawn.
-pub(super) struct Drawing<'a> {
+/// What frames are drawn with.
+pub(super) struct Tools<'a> {
     pub(super) gpu: &'a Gpu,
     pub(super) kernels: &'a Kernels,
     pub(super) scratch: &'a mut Scratch,
     pub(super) scene: &'a Scene,
-    pub(super) row: ViewRow,
-    pub(super) kinds: Kinds,
-    pub(super) wanted: &'a Labels,
     /// The scene's bank indices, where labels are wanted.
     pub(super) labels: Option<&'a SceneLabels>,
     pub(super) isects_max: u32,
-    pub(super) frame: Frame,
-    /// Entries of the bands drawn, from top to bottom.
-    pub(super) entries: Vec<EntryRows>,
-    /// Most entries of a pixel in them.
-    pub(super) entries_max: u32,
+    pub(super) marks: Option<&'a mut Marks>,
+    /// Times of the last submission, where marks are set.
+    pub(super) times: Vec<StageTime>,
 }
 
-impl Drawing<'_> {
+/// A frame being drawn, band by band from top to bottom.
+pub(super) struct Drawing<'a> {
+    row: ViewRow,
+    kinds: Kinds,
+    wanted: &'a Labels,
+    frame: Frame,
+    /// Entries of the bands drawn.
+    entries: Vec<EntryRows>,
+    /// Most entries of a pixel in them.
+    entries_max: u32,
+}
+
+impl<'a> Drawing<'a> {
+    pub(super) fn new(view: &View, request: &'a RenderRequest, scene: &Scene) -> Self {
+        let mut row = ViewRow::new(view, request.background, request.antialiased);
+        (row.gaussian_count, row.sh_count) = (scene.count, scene.sh_count);
+        let pixels = view.width as usize * view.height as usize;
+        let kinds = request.kinds;
+        let frame = Frame {
+            width: view.width,
+            height: view.height,
+            color: kinds.color.then(|| Vec::with_capacity(pixels)),
+            depth: kinds.depth.then(|| Vec::with_capacity(pixels)),
+            alpha: kinds.alpha.then(|| Vec::with_capacity(pixels)),
+            blend: matches!(request.labels, Labels::Blend(_)).then(|| Vec::with_capacity(pixels)),
+            entries: None,
+            stats: FrameStats::default(),
+        };
+        let wanted = &request.labels;
+        Self { row, kinds, wanted, frame, entries: Vec::new(), entries_max: 0 }
+    }
+
     /// The frame of all bands.
-    pub(super) fn finish(mut self) -> Result<Frame> {
+    pub(super) fn finish(mut self, scratch: &mut Scratch) -> Result<Frame> {
         if *self.wanted == Labels::Entries {
             // The next view needs about as much; one odd view makes room for itself alone.
-            self.scratch.entry_slots = self.entries_max.next_power_of_two().max(ENTRY_SLOTS_MIN);
+            scratch.entry_slots = self.entries_max.next_power_of_two().max(ENTRY_SLOTS_MIN);
             self.frame.entries = Some(Entries::join(self.entries)?);
         }
         Ok(self.frame)
     }
 
-    /// Draws the tile rows `rows`; halves them while they are over a limit of the adapter.
-    pub(super) fn rows(&mut self, rows: Range<u32>) -> Result<()> {
+    /// All rows of tiles.
+    pub(super) fn whole(&self) -> Range<u32> {
+        0..self.row.tiles_y
+    }
+
+    fn layout(&self, rows: &Range<u32>, slots: u32) -> Layout {
         let pixel_rows = (rows.end * TILE_SIZE).min(self.row.height) - rows.start * TILE_SIZE;
         let pixels = u64::from(pixel_rows) * u64::from(self.row.width);
-        let layout = Layout::new(self.kinds, self.wanted, pixels, self.entry_slots());
+        let mut floats = 0;
+        let mut take = |wanted: bool, channels: u64| {
+            let start = if wanted { floats as u32 } else { NO_PICTURE };
+            floats += if wanted { channels * pixels } else { 0 };
+            start
+        };
+        let color = take(self.kinds.color, 3);
+        let depth = take(self.kinds.depth, 1);
+        let alpha = take(self.kinds.alpha, 1);
+        let blend = take(matches!(self.wanted, Labels::Blend(_)), BLEND_WIDTH as u64);
         let tiles = self.row.tiles_x * (rows.end - rows.start);
+        Layout { color, depth, alpha, blend, floats, pixels, slots, tiles }
+    }
+
+    /// Rows of the table that is blended; an empty one is a row of zeros.
+    fn table(&self) -> &[[f32; BLEND_WIDTH]] {
+        match self.wanted {
+            Labels::Blend(table) if table.is_empty() => &[[0.0; BLEND_WIDTH]],
+            Labels::Blend(table) => &table[..table.len().min(1 << u16::BITS)],
+            _ => &[],
+        }
+    }
+
+    /// Takes a band out of what was read back.
+    fn store(&mut self, layout: &Layout, pictures: &[u8], slots: &[u32]) {
+        let pixels = layout.pixels as usize;
+        let part = |start: u32, channels: usize| {
+            let start = start as usize * 4;
+            &pictures[start..start + pixels * channels * 4]
+        };
+        let frame = &mut self.frame;
+        if let Some(color) = &mut frame.color {
+            color.extend_from_slice(bytemuck::cast_slice(part(layout.color, 3)));
+        }
+        if let Some(depth) = &mut frame.depth {
+            depth.extend_from_slice(bytemuck::cast_slice(part(layout.depth, 1)));
+        }
+        if let Some(alpha) = &mut frame.alpha {
+            alpha.extend_from_slice(bytemuck::cast_slice(part(layout.alpha, 1)));
+        }
+        if let Some(blend) = &mut frame.blend {
+            blend.extend_from_slice(bytemuck::cast_slice(part(layout.blend, BLEND_WIDTH)));
+        }
+        if layout.slots > 0 {
+            self.entries.push(entry_rows(slots, layout, self.row.width as usize));
+        }
+    }
+}
+
+impl Tools<'_> {
+    /// Draws the tile rows `rows`; halves them while they are over a limit of the adapter.
+    pub(super) fn rows(&mut self, drawing: &mut Drawing<'_>, rows: Range<u32>) -> Result<()> {
+        let layout = drawing.layout(&rows, self.entry_slots(drawing));
         let single = rows.end - rows.start == 1;
         let bytes = layout.picture_bytes() + layout.slot_bytes();
         let bytes_max = self.gpu.binding_bytes_max - PLAN_BYTES;
-        if single || bytes.max((u64::from(tiles) + 1) * 4) <= bytes_max {
-            match self.band(&rows, &layout, tiles)? {
+        if single || bytes.max((u64::from(layout.tiles) + 1) * 4) <= bytes_max {
+            match self.band(drawing, &rows, &layout)? {
                 Outcome::Drawn => return Ok(()),
                 // Whether the band still fits is asked again; slots grow to a bound.
-                Outcome::Slots => return self.rows(rows),
+                Outcome::Slots => return self.rows(drawing, rows),
                 Outcome::Pairs(needed) if single => {
                     return Err(Error::limit(
                         "render: Gaussian-tile pairs in one row of tiles",
                         needed,
-                        self.capacity_max(),
+                        self.capacity_max(1),
                     ));
                 }
                 Outcome::Pairs(_) => {}
             }
         }
         let middle = rows.start.midpoint(rows.end);
-        self.rows(rows.start..middle)?;
-        self.rows(middle..rows.end)
+        self.rows(drawing, rows.start..middle)?;
+        self.rows(drawing, middle..rows.end)
+    }
+
+    /// Draws whole views in one submission, each as if it were alone; which of them are drawn. The
+    /// others need more room than was guessed, or do not fit beside each other.
+    pub(super) fn together(&mut self, drawings: &mut [Drawing<'_>]) -> Result<Vec<bool>> {
+        let layouts: Vec<_> = drawings
+            .iter()
+            .map(|drawing| drawing.layout(&drawing.whole(), self.entry_slots(drawing)))
+            .collect();
+        let sum = |bytes: fn(&Layout) -> u64| layouts.iter().map(bytes).sum::<u64>();
+        let bytes = sum(Layout::picture_bytes) + sum(Layout::slot_bytes);
+        let views = drawings.len() as u32;
+        let capacity = self.capacity(views);
+        if bytes + PLAN_BYTES * u64::from(views) > self.gpu.binding_bytes_max {
+            return Ok(vec![false; drawings.len()]);
+        }
+        let bands: Vec<_> = drawings.iter().map(Drawing::whole).collect();
+        let ended = self.attempt(drawings, &bands, &layouts, capacity)?;
+        Ok(ended.into_iter().map(|(_, drawn)| drawn).collect())
     }
 
     /// Entries to make room for: as many as the last views needed, never more than there can be.
-    fn entry_slots(&self) -> u32 {
-        match (self.wanted, self.labels) {
+    fn entry_slots(&self, drawing: &Drawing<'_>) -> u32 {
+        match (drawing.wanted, self.labels) {
             (Labels::Entries, Some(labels)) => self.scratch.entry_slots.min(labels.distinct.max(1)),
             _ => 0,
         }
     }
 
-    fn capacity_max(&self) -> u32 {
-        let bound = u32::try_from(self.gpu.binding_bytes_max / 4).unwrap_or(u32::MAX);
-        self.isects_max.min(bound)
+    fn capacity_max(&self, views: u32) -> u32 {
+        let bound = self.gpu.binding_bytes_max / (PAIR_BYTES_A_BUFFER * u64::from(views));
+        self.isects_max.min(u32::try_from(bound).unwrap_or(u32::MAX))
+    }
+
+    /// Tile pairs to make room for in each of `views` views.
+    fn capacity(&self, views: u32) -> u32 {
+        let guess = self.scene.count.saturating_mul(4).max(ISECT_CAPACITY_MIN);
+        // A quarter more: the next camera sees about as much.
+        let seen = self.scratch.isects.saturating_add(self.scratch.isects / 4);
+        guess.max(seen).min(self.capacity_max(views))
     }
 
     /// Draws one band into the frame.
-    fn band(&mut self, rows: &Range<u32>, layout: &Layout, tiles: u32) -> Result<Outcome> {
-        let capacity_max = self.capacity_max();
-        let guess = self.row.gaussian_count.saturating_mul(4).max(ISECT_CAPACITY_MIN);
-        let mut capacity = self.scratch.isect_capacity().max(guess).min(capacity_max);
+    fn band(
+        &mut self,
+        drawing: &mut Drawing<'_>,
+        rows: &Range<u32>,
+        layout: &Layout,
+    ) -> Result<Outcome> {
+        let capacity_max = self.capacity_max(1);
+        let mut capacity = self.capacity(1);
         for _ in 0..ATTEMPTS_MAX {
-            let (plan, entries) = self.attempt(rows, layout, tiles, capacity)?;
-            if plan.needed <= capacity {
-                if entries > layout.slots {
-                    self.scratch.entry_slots = layout.slots.saturating_mul(ENTRY_SLOTS_GROWTH);
-                    return Ok(Outcome::Slots);
-                }
-                self.entries_max = self.entries_max.max(entries);
-                let stats = &mut self.frame.stats;
-                stats.visible = stats.visible.max(u64::from(plan.visible));
-                stats.intersections += u64::from(plan.isects);
+            let (alone, bands) = (std::slice::from_mut(drawing), std::slice::from_ref(rows));
+            let layouts = std::slice::from_ref(layout);
+            let ended = self.attempt(alone, bands, layouts, capacity)?;
+            let Some(&(needed, drawn)) = ended.first() else { break };
+            if drawn {
                 return Ok(Outcome::Drawn);
             }
-            if plan.needed > capacity_max {
-                return Ok(Outcome::Pairs(plan.needed));
+            if needed <= capacity {
+                return Ok(Outcome::Slots);
             }
-            // A quarter more: the next camera sees about as much.
-            capacity = plan.needed.saturating_add(plan.needed / 4).min(capacity_max);
+            if needed > capacity_max {
+                return Ok(Outcome::Pairs(needed));
+            }
+            capacity = self.capacity(1);
         }
         Err(Error::internal("render: the need of tile pairs grew from one attempt to the next"))
     }
 
-    /// All stages over one band, with room for `capacity` pairs; also the most entries of a pixel.
+    /// All stages over one band of each view, with room for `capacity` pairs a view; the pairs that
+    /// each needs, and whether it was drawn.
     fn attempt(
         &mut self,
-        rows: &Range<u32>,
-        layout: &Layout,
-        tiles: u32,
+        drawings: &mut [Drawing<'_>],
+        bands: &[Range<u32>],
+        layouts: &[Layout],
         capacity: u32,
-    ) -> Result<(PlanRow, u32)> {
-        let (gpu, scratch, scene) = (self.gpu, &mut *self.scratch, self.scene);
-        let count = self.row.gaussian_count;
-        // An empty table is one row of zeros.
-        let table = match self.wanted {
-            Labels::Blend(table) if table.is_empty() => &[[0.0; BLEND_WIDTH]],
-            Labels::Blend(table) => &table[..table.len().min(1 << u16::BITS)],
-            _ => &[],
-        };
-        let label_rows = table.len() as u32;
-        let table_bytes: &[u8] = bytemuck::cast_slice(table);
-        let row = ViewRow {
-            row_start: rows.start,
-            row_end: rows.end,
-            isect_capacity: capacity,
-            color_start: layout.color,
-            depth_start: layout.depth,
-            alpha_start: layout.alpha,
-            blend_start: layout.blend,
-            label_rows,
-            entry_slots: layout.slots,
-            ..self.row
-        };
-        let (picture_bytes, slot_bytes) = (layout.picture_bytes(), layout.slot_bytes());
-        let total_bytes = PLAN_BYTES + picture_bytes + slot_bytes;
-        let view = scratch.view.ensure(gpu, size_of::<ViewRow>() as u64)?;
-        let footprints = scratch.footprints.ensure(gpu, footprint_bytes(count))?;
-        let shaded = scratch.shaded.ensure(gpu, footprint_bytes(count))?;
-        let isect_offsets = scratch.isect_offsets.ensure(gpu, u64::from(count) * 4)?;
-        let depth_pairs = scratch.depth_pairs(gpu, count)?;
-        let isect_pairs = scratch.isect_pairs(gpu, capacity)?;
-        let ranges = scratch.ranges.ensure(gpu, (u64::from(tiles) + 1) * 4)?;
-        let pictures = scratch.pictures.ensure(gpu, picture_bytes)?;
-        let staging = scratch.staging.ensure(gpu, total_bytes)?;
-        let table = scratch.table.ensure(gpu, table_bytes.len() as u64)?;
-        let slots = scratch.entries.ensure(gpu, slot_bytes)?;
-        let submission = gpu.scoped("render", || {
-            gpu.queue.write_buffer(&view, 0, bytemuck::bytes_of(&row));
-            if !table_bytes.is_empty() {
-                gpu.queue.write_buffer(&table, 0, table_bytes);
-            }
-            let mut stages = Recorder::new(gpu, self.kernels, scratch, count.max(capacity))?;
-            stages.project(&view, &scene.gaussians, &footprints, &depth_pairs, count);
-            let by_depth = stages.sort(&depth_pairs, PairCount::Known(count), u32::BITS);
-            let ids = &depth_pairs.values[by_depth];
-            let depth_ids = ids;
-            let offsets = &isect_offsets;
-            stages.shade(
-                &view,
-                &scene.gaussians,
-                &scene.sh,
-                &footprints,
-                ids,
-                &shaded,
-                offsets,
-                count,
-            );
-            stages.prefix_sum(offsets, count);
-            stages.emit_isects(&view, &shaded, offsets, &isect_pairs, count);
-            let tile_bits = u32::BITS - (tiles - 1).leading_zeros();
-            let by_tile = stages.sort(&isect_pairs, PairCount::Planned(capacity), tile_bits);
-            stages.tile_ranges(&view, &isect_pairs.keys[by_tile], &ranges);
-            let grid = [row.tiles_x, rows.end - rows.start];
-            let ids = &isect_pairs.values[by_tile];
-            let labels = match (self.wanted, self.labels) {
-                (Labels::Blend(_), Some(SceneLabels { index, .. })) => {
-                    LabelBuffers::Blend { depth_ids, index, table: &table }
-                }
-                (Labels::Entries, Some(SceneLabels { index, .. })) => {
-                    LabelBuffers::Entries { depth_ids, index, slots: &slots }
-                }
-                _ => LabelBuffers::None,
+    ) -> Result<Vec<(u32, bool)>> {
+        let views = drawings.len() as u32;
+        let most_tiles = layouts.iter().map(|layout| layout.tiles).max().unwrap_or(1);
+        let bits = tile_bits(most_tiles);
+        let pair_half = sorted_half(bits) * views * capacity;
+        let mut rows = Vec::with_capacity(drawings.len());
+        let mut grid = [0; 2];
+        let (mut floats, mut slot_words, mut ranges) = (0_u64, 0_u64, 0_u32);
+        let mut table: Vec<[f32; BLEND_WIDTH]> = Vec::new();
+        for (i, ((drawing, band), layout)) in drawings.iter().zip(bands).zip(layouts).enumerate() {
+            let after = |start: u32| match start {
+                NO_PICTURE => NO_PICTURE,
+                start => start + floats as u32,
             };
-            stages.rasterize(&view, &shaded, ids, &ranges, &pictures, &labels, grid);
-            let plan = stages.plan.clone();
-            Ok(stages.submit(&[
-                (&plan, 0, &staging, 0, PLAN_BYTES),
-                (&pictures, 0, &staging, PLAN_BYTES, picture_bytes),
-                (&slots, 0, &staging, PLAN_BYTES + picture_bytes, slot_bytes),
-            ]))
-        })??;
-        let first = rows.start as usize * (TILE_SIZE * row.width) as usize;
-        readback::read(gpu, submission, &staging, total_bytes, |bytes| {
-            let (plan, rest) = bytes.split_at(PLAN_BYTES as usize);
-            let (pictures, slots) = rest.split_at(picture_bytes as usize);
-            let plan: PlanRow = bytemuck::pod_read_unaligned(plan);
-            let mut entries = 0;
-            if plan.needed <= capacity {
-                let slots: &[u32] = bytemuck::cast_slice(slots);
-                let counts = &slots[..slots.len().min(layout.pixels as usize)];
-                entries = counts.iter().copied().max().unwrap_or(0);
-                if entries <= layout.slots {
-                    store(&mut self.frame, layout, pictures, first);
-                    if layout.slots > 0 {
-                        self.entries.push(entry_rows(slots, layout, row.width as usize));
-                    }
-                }
+            rows.push(ViewRow {
+                row_start: band.start,
+                row_end: band.end,
+                isect_capacity: capacity,
+                color_start: after(layout.color),
+                depth_start: after(layout.depth),
+                alpha_start: after(layout.alpha),
+                blend_start: after(layout.blend),
+                label_rows: drawing.table().len() as u32,
+                table_start: table.len() as u32,
+                entry_slots: layout.slots,
+                slot_start: slot_words as u32,
+                range_start: ranges,
+                pair_start: pair_half + i as u32 * capacity,
+                ..drawing.row
+            });
+            grid = [grid[0].max(drawing.row.tiles_x), grid[1].max(band.end - band.start)];
+            floats += layout.floats;
+            slot_words += layout.slot_bytes() / 4;
+            ranges += layout.tiles + 1;
+            table.extend_from_slice(drawing.table());
+        }
+        let plan_bytes = PLAN_BYTES * u64::from(views);
+        let (picture_bytes, slot_bytes) = (floats * 4, slot_words * 4);
+        let staging_bytes = plan_bytes + picture_bytes + slot_bytes;
+        let (gpu, scene) = (self.gpu, self.scene);
+        let colored = drawings.iter().any(|drawing| drawing.kinds.color);
+        let deep = drawings.iter().any(|drawing| drawing.kinds.depth);
+        let shades = colored && scene.sh_count != 1;
+        let room = self.scratch.room(
+            gpu,
+            &Need {
+                views,
+                count: scene.count,
+                capacity,
+                ranges,
+                shades,
+                picture_bytes,
+                table_bytes: size_of_val(table.as_slice()) as u64,
+                slot_bytes,
+                staging_bytes,
+            },
+        )?;
+        let buffers =
+            SceneBuffers { gaussians: &scene.gaussians, sh: &scene.sh, sh_count: scene.sh_count };
+        let labels = match (drawings.first().map(|drawing| drawing.wanted), self.labels) {
+            (Some(Labels::Blend(_)), Some(labels)) => LabelBuffers::Blend { index: &labels.index },
+            (Some(Labels::Entries), Some(labels)) => LabelBuffers::Entries { index: &labels.index },
+            _ => LabelBuffers::None,
+        };
+        let bindings = &mut self.scratch.bindings;
+        let (kernels, marks) = (self.kernels, self.marks.as_deref_mut());
+        let submission = gpu.scoped("render", || {
+            room.begin(gpu, &rows);
+            if !table.is_empty() {
+                gpu.queue.write_buffer(&room.table, 0, bytemuck::cast_slice(&table));
             }
-            (plan, entries)
-        })
+            let sizes = (views, scene.count);
+            let mut stages = Recorder::new(gpu, kernels, bindings, &room, sizes, marks);
+            stages.project(buffers);
+            if shades {
+                stages.shade(buffers);
+            }
+            stages.depth_sort();
+            stages.prefix_sum();
+            stages.emit_isects();
+            stages.tile_sort(bits);
+            stages.tile_ranges();
+            stages.rasterize(buffers, &labels, (colored, deep), grid);
+            stages.submit(&[
+                (&room.plans, 0, &room.staging, 0, plan_bytes),
+                (&room.pictures, 0, &room.staging, plan_bytes, picture_bytes),
+                (&room.slots, 0, &room.staging, plan_bytes + picture_bytes, slot_bytes),
+            ])
+        })??;
+        if let Some(marks) = &self.marks {
+            self.times = marks.read(gpu, submission.clone())?;
+        }
+        let (mut most_isects, mut more_slots) = (0, None);
+        let ended = readback::read(gpu, submission, &room.staging, staging_bytes, |bytes| {
+            let (plans, rest) = bytes.split_at(plan_bytes as usize);
+            let (mut pictures, slots) = rest.split_at(picture_bytes as usize);
+            let mut slots: &[u32] = bytemuck::cast_slice(slots);
+            let plans: Vec<PlanRow> = bytemuck::pod_collect_to_vec(plans);
+            let mut ended = Vec::with_capacity(plans.len());
+            for ((drawing, layout), plan) in drawings.iter_mut().zip(layouts).zip(plans) {
+                let mine;
+                let mine_slots;
+                (mine, pictures) = pictures.split_at(layout.picture_bytes() as usize);
+                (mine_slots, slots) = slots.split_at(layout.slot_bytes() as usize / 4);
+                most_isects = most_isects.max(plan.needed);
+                if plan.needed > capacity {
+                    ended.push((plan.needed, false));
+                    continue;
+                }
+                let counts = &mine_slots[..mine_slots.len().min(layout.pixels as usize)];
+                let entries = counts.iter().copied().max().unwrap_or(0);
+                if entries > layout.slots {
+                    more_slots = Some(layout.slots.saturating_mul(ENTRY_SLOTS_GROWTH));
+                    ended.push((plan.needed, false));
+                    continue;
+                }
+                drawing.store(layout, mine, mine_slots);
+                drawing.entries_max = drawing.entries_max.max(entries);
+                let stats = &mut drawing.frame.stats;
+                stats.visible = stats.visible.max(u64::from(plan.visible));
+                stats.intersections += u64::from(plan.isects);
+                ended.push((plan.needed, true));
+            }
+            ended
+        })?;
+        self.scratch.isects = most_isects;
+        self.scratch.entry_slots = more_slots.unwrap_or(self.scratch.entry_slots);
+        Ok(ended)
     }
 }
 
@@ -318,26 +448,4 @@ fn entry_rows(slots: &[u32], layout: &Layout, width: usize) -> EntryRows {
         }
     }
     rows
-}
-
-/// Copies the pictures of a band to the frame, from pixel `first` on.
-fn store(frame: &mut Frame, layout: &Layout, pictures: &[u8], first: usize) {
-    let pixels = layout.pixels as usize;
-    let part = |start: u32, channels: usize| {
-        let start = start as usize * 4;
-        &pictures[start..start + pixels * channels * 4]
-    };
-    let copy = |out: &mut [u8], from: &[u8]| out[..from.len()].copy_from_slice(from);
-    if let Some(color) = &mut frame.color {
-        copy(bytemuck::cast_slice_mut(&mut color[first..]), part(layout.color, 3));
-    }
-    if let Some(depth) = &mut frame.depth {
-        copy(bytemuck::cast_slice_mut(&mut depth[first..]), part(layout.depth, 1));
-    }
-    if let Some(alpha) = &mut frame.alpha {
-        copy(bytemuck::cast_slice_mut(&mut alpha[first..]), part(layout.alpha, 1));
-    }
-    if let Some(blend) = &mut frame.blend {
-        copy(bytemuck::cast_slice_mut(&mut blend[first..]), part(layout.blend, BLEND_WIDTH));
-    }
 }

@@ -3,147 +3,161 @@
 //! A frame is one submission and one read-back. The number of Gaussian-tile pairs is known to the
 //! device alone: it sizes the later stages itself, and a frame that turns out to need more room
 //! than there is draws nothing, says how much, and is drawn again. What the adapter cannot hold at
-//! once is drawn in bands of tile rows. Nothing here ends the process: faults are errors, and a
-//! lost device is opened again at the next frame.
+//! once is drawn in bands of tile rows. Views of one scene that are wanted at once are one
+//! submission. Nothing here ends the process: faults are errors, and what was being drawn when a
+//! device was lost is drawn on a new one.
 
 pub mod buffers;
 mod device;
 mod frame;
 pub mod pipelines;
+mod pool;
+mod profile;
 mod readback;
 mod recorder;
+mod scratch;
 pub mod stages;
+mod station;
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::path::PathBuf;
 
-use self::{
-    buffers::{SceneCache, ViewRow, narrow},
-    device::Gpu,
-    frame::Drawing,
-    pipelines::Kernels,
-    recorder::Scratch,
-};
+use self::station::{Engine, Station};
 use super::{
-    Frame, Labels, RenderRequest, Renderer, constants::ISECTS_MAX, select::AdapterReport,
+    DeviceTimes, Frame, RenderRequest, Renderer, constants::ISECTS_MAX, select::AdapterReport,
     view::View,
 };
-use crate::{error::Result, scene::Gaussians};
+use crate::{
+    error::{ErrorCode, Result},
+    limits::Limits,
+    scene::Gaussians,
+};
 
-/// Bytes of scenes kept on the device.
-const SCENE_BYTES_MAX: u64 = 2 << 30;
 /// How a GPU renderer is opened.
 #[derive(Clone, Debug)]
 pub struct GpuOptions {
-    /// Part of the adapter's name; `None` takes the best hardware adapter, never a software one.
+    /// Parts of adapters' names, with commas between; `None` takes every hardware adapter, never a
+    /// software one.
     pub adapter: Option<String>,
     /// Asks for WebGPU's portable floor instead of all that the adapter has: 128 MiB a binding,
     /// 8 storage buffers a stage, 16 KiB of workgroup storage.
     pub portable: bool,
     /// Gaussian-tile pairs held at once; more are drawn in bands.
     pub isects_max: u32,
+    /// Views that wait for one device.
+    pub waiting_max: usize,
+    /// Bytes of scenes kept on one device.
+    pub scene_bytes_max: u64,
+    /// Folder whose files stand in for the built-in shaders: to try changes without a build.
+    pub shaders: Option<PathBuf>,
+    /// Has every index and loop of the shaders checked by code of its own.
+    pub checked: bool,
 }
 
 impl Default for GpuOptions {
     fn default() -> Self {
-        Self { adapter: None, portable: false, isects_max: ISECTS_MAX as u32 }
+        let limits = Limits::default();
+        Self {
+            adapter: None,
+            portable: false,
+            isects_max: ISECTS_MAX as u32,
+            waiting_max: limits.queued_renders_max,
+            scene_bytes_max: limits.device_scene_bytes_max,
+            shaders: None,
+            checked: false,
+        }
     }
 }
 
-/// Renders with compute shaders, one frame at a time.
+/// Renders with compute shaders on one or more devices, which callers share.
 #[derive(Debug)]
 pub struct GpuRenderer {
-    options: GpuOptions,
-    report: AdapterReport,
-    /// `None` after the device was lost.
-    engine: Mutex<Option<Engine>>,
-}
-
-/// A device with what was compiled and kept on it.
-#[derive(Debug)]
-struct Engine {
-    gpu: Gpu,
-    kernels: Kernels,
-    scratch: Scratch,
-    scenes: SceneCache,
-}
-
-impl Engine {
-    fn open(options: &GpuOptions) -> (Vec<AdapterReport>, Result<(Self, AdapterReport)>) {
-        let (reports, chosen) = device::choose(options.adapter.as_deref());
-        let opened = chosen.and_then(|(adapter, report)| {
-            let gpu = Gpu::open(&adapter, options.portable)?;
-            let kernels = Kernels::compile(&gpu)?;
-            let scenes = SceneCache::new(SCENE_BYTES_MAX);
-            Ok((Self { gpu, kernels, scratch: Scratch::default(), scenes }, report))
-        });
-        (reports, opened)
-    }
+    stations: Vec<Station>,
 }
 
 impl GpuRenderer {
-    /// Opens the adapter that `options` name and compiles the kernels; also which adapters there
-    /// are.
+    /// Opens the adapters that `options` name and compiles the kernels; also which adapters there
+    /// are. Of several, those that refuse are left out.
     ///
     /// # Errors
-    /// `gpu_unavailable` when no adapter fits or it refuses, `internal` when a kernel does not
+    /// `gpu_unavailable` when no adapter fits or all refuse, `internal` when a kernel does not
     /// compile.
-    pub fn open(options: GpuOptions) -> (Vec<AdapterReport>, Result<Self>) {
-        let (reports, opened) = Engine::open(&options);
-        let renderer = opened.map(|(engine, report)| Self {
-            options,
-            report,
-            engine: Mutex::new(Some(engine)),
+    pub fn open(options: &GpuOptions) -> (Vec<AdapterReport>, Result<Self>) {
+        let (mut reports, chosen) = device::choose(options.adapter.as_deref());
+        let opened = chosen.and_then(|chosen| {
+            let (mut stations, mut refused) = (Vec::new(), None);
+            for (adapter, report) in chosen {
+                match Station::open(adapter, report.clone(), options) {
+                    Ok(station) => stations.push(station),
+                    Err(error) => {
+                        tracing::warn!(
+                            adapter = report.name,
+                            reason = error.message(),
+                            "a GPU adapter is left out"
+                        );
+                        let same = |other: &&mut AdapterReport| **other == report;
+                        reports.iter_mut().find(same).into_iter().for_each(|r| r.chosen = false);
+                        refused = Some(error);
+                    }
+                }
+            }
+            match refused {
+                Some(error) if stations.is_empty() => Err(error),
+                _ => Ok(Self { stations }),
+            }
         });
-        (reports, renderer)
+        (reports, opened)
     }
 
-    /// The adapter in use.
+    /// The first adapter in use.
     #[must_use]
     pub fn adapter(&self) -> &AdapterReport {
-        &self.report
+        self.stations[0].adapter()
     }
 
-    /// Scenes kept on the device now.
+    /// Devices in use.
+    #[must_use]
+    pub fn devices(&self) -> usize {
+        self.stations.len()
+    }
+
+    /// Scenes kept on all devices now.
     #[must_use]
     pub fn scenes_held(&self) -> usize {
-        self.lock().as_ref().map_or(0, |engine| engine.scenes.len())
+        self.stations.iter().map(Station::scenes_held).sum()
     }
 
-    /// Ends the device as a driver's fault would, for tests of the recovery.
-    pub fn lose_device(&self) {
-        if let Some(engine) = self.lock().as_ref() {
-            engine.gpu.device.destroy();
-            let _ = engine.gpu.give_up("lost on purpose".to_owned());
-        }
+    /// Submissions so far, and views drawn by them.
+    #[must_use]
+    pub fn submissions(&self) -> (u64, u64) {
+        let both = self.stations.iter().map(Station::submissions);
+        both.fold((0, 0), |sum, one| (sum.0 + one.0, sum.1 + one.1))
     }
 
-    fn lock(&self) -> MutexGuard<'_, Option<Engine>> {
-        self.engine.lock().unwrap_or_else(PoisonError::into_inner)
+    /// Ends the devices as a driver's fault would, at once, whatever runs on them; their adapters
+    /// stay. For tests of the recovery.
+    pub fn lose_devices(&self) {
+        self.stations.iter().for_each(Station::lose_device);
     }
 
-    /// Runs `work` on the device, opened again if it was lost.
+    /// The device to draw `gaussians` on: the one that holds them, unless it has a submission's
+    /// worth of views more to draw than the one with the fewest.
+    fn station(&self, gaussians: &Gaussians) -> &Station {
+        let least = self.stations.iter().min_by_key(|station| station.waiting());
+        let least = least.unwrap_or(&self.stations[0]);
+        let shape = gaussians.shape_identity();
+        let room = least.waiting() + pipelines::VIEWS_MAX as usize;
+        let holds = |station: &&Station| station.holds(shape) && station.waiting() <= room;
+        self.stations.iter().find(holds).unwrap_or(least)
+    }
+
     fn with_engine<T>(&self, work: impl FnOnce(&mut Engine) -> Result<T>) -> Result<T> {
-        let mut slot = self.lock();
-        let engine = match &mut *slot {
-            Some(engine) => engine,
-            None => {
-                let (engine, _) = Engine::open(&self.options).1?;
-                tracing::warn!(adapter = self.report.name, "the GPU device was opened again");
-                slot.insert(engine)
-            }
-        };
-        let result = work(engine);
-        if engine.gpu.is_lost() {
-            tracing::error!(adapter = self.report.name, "the GPU device was lost");
-            *slot = None;
-        }
-        result
+        self.stations[0].with_engine(work)
     }
 }
 
 impl Renderer for GpuRenderer {
     fn name(&self) -> String {
-        self.report.name.clone()
+        self.adapter().name.clone()
     }
 
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
@@ -151,32 +165,28 @@ impl Renderer for GpuRenderer {
         if gaussians.is_empty() {
             return Ok(frame::background(&view, request));
         }
-        self.with_engine(|engine| {
-            let count = narrow("gaussians", gaussians.len())?;
-            let sh_count = gaussians.sh_count() as u32;
-            let scene = engine.scenes.get(&engine.gpu, gaussians)?;
-            let mut row = ViewRow::new(&view, request.background, request.antialiased);
-            (row.gaussian_count, row.sh_count) = (count, sh_count);
-            let labels = match request.labels {
-                Labels::None => None,
-                _ => Some(engine.scenes.labels(&engine.gpu, gaussians)?),
-            };
-            let mut drawing = Drawing {
-                gpu: &engine.gpu,
-                kernels: &engine.kernels,
-                scratch: &mut engine.scratch,
-                scene: &scene,
-                row,
-                kinds: request.kinds,
-                wanted: &request.labels,
-                labels: labels.as_ref(),
-                isects_max: self.options.isects_max,
-                frame: frame::background(&view, request),
-                entries: Vec::new(),
-                entries_max: 0,
-            };
-            drawing.rows(0..view.tiles_y())?;
-            drawing.finish()
-        })
+        let station = self.station(gaussians);
+        match station.render(gaussians, request) {
+            // Lost for good: the others serve.
+            Err(error) if error.code() == ErrorCode::GpuUnavailable => {
+                let other = |other: &&Station| !std::ptr::eq(*other, station);
+                match self.stations.iter().find(other) {
+                    Some(other) => other.render(gaussians, request),
+                    None => Err(error),
+                }
+            }
+            other => other,
+        }
+    }
+
+    fn device_times(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+    ) -> Result<Option<DeviceTimes>> {
+        if gaussians.is_empty() {
+            return Ok(None);
+        }
+        self.station(gaussians).device_times(gaussians, request)
     }
 }

@@ -1,20 +1,30 @@
 //! The shaders, put together of shaders/*.wgsl, and their compiled kernels.
 
-use std::borrow::Cow;
+use std::{borrow::Cow, path::Path, sync::OnceLock};
 
 use super::device::Gpu;
-use crate::error::Result;
+use crate::error::{Error, Result};
 
 /// Invocations of a workgroup: WebGPU's portable floor, and the values of a radix digit.
 pub const WORKGROUP_SIZE: u32 = 256;
+/// Views that one submission draws at most.
+pub const VIEWS_MAX: u32 = 8;
+/// Invocations of a workgroup that moves pairs.
+pub const SORT_SIZE: u32 = 128;
 /// Pairs that one workgroup sorts.
 pub const SORT_BLOCK: u32 = 2048;
-/// Numbers that one workgroup sums.
-pub const SCAN_BLOCK: u32 = 2048;
+/// Gaussians whose tile pairs one workgroup emits.
+pub const SCAN_BLOCK: u32 = 1024;
 /// Workgroups along x at most; more go to y. Under the portable 65,535.
 pub const GROUPS_X_MAX: u32 = 32_768;
-/// Count that means "as many as `Plan.isects` says".
-pub const COUNT_FROM_PLAN: u32 = u32::MAX;
+/// First row of workgroup counts of digits 1 to 3 of the depth sort, by blocks.
+pub const GROUPS_DEPTH: u32 = 0;
+/// The same, by values of the digit.
+pub const GROUPS_DIGITS: u32 = 3;
+/// Row of workgroup counts of the tile sort.
+pub const GROUPS_TILES: u32 = 6;
+/// Row of workgroup counts of the tile ranges.
+pub const GROUPS_RANGES: u32 = 7;
 /// Depth key of a dropped Gaussian.
 pub const DROPPED_KEY: u32 = u32::MAX;
 /// Value of a pair that was counted and not emitted.
@@ -24,12 +34,17 @@ pub const NO_PICTURE: u32 = u32::MAX;
 
 /// The kernels' numbers by the name they have in WGSL, beside
 /// [`crate::render::constants::SHARED`].
-pub const SHARED: [(&str, u32); 8] = [
+pub const SHARED: [(&str, u32); 13] = [
     ("WORKGROUP_SIZE", WORKGROUP_SIZE),
+    ("VIEWS_MAX", VIEWS_MAX),
+    ("SORT_SIZE", SORT_SIZE),
     ("SORT_BLOCK", SORT_BLOCK),
     ("SCAN_BLOCK", SCAN_BLOCK),
     ("GROUPS_X_MAX", GROUPS_X_MAX),
-    ("COUNT_FROM_PLAN", COUNT_FROM_PLAN),
+    ("GROUPS_DEPTH", GROUPS_DEPTH),
+    ("GROUPS_DIGITS", GROUPS_DIGITS),
+    ("GROUPS_TILES", GROUPS_TILES),
+    ("GROUPS_RANGES", GROUPS_RANGES),
     ("DROPPED_KEY", DROPPED_KEY),
     ("NO_GAUSSIAN", NO_GAUSSIAN),
     ("NO_PICTURE", NO_PICTURE),
@@ -40,18 +55,28 @@ pub const SHARED: [(&str, u32); 8] = [
 pub struct Shader {
     /// Stem of shaders/*.wgsl and of its twin src/render/cpu/*.rs; variants share it.
     pub stem: &'static str,
+    /// Files under shaders/, in their order.
+    pub files: &'static [&'static str],
     /// WGSL.
     pub source: &'static str,
 }
 
-/// The source of a stage: constants, structs, then the named parts, then the stage itself.
+/// The source of a stage: constants, structs, views, then the named parts, then the stage itself.
 macro_rules! shader {
     ($stem:literal $(, $part:literal)*) => {
         Shader {
             stem: $stem,
+            files: &[
+                "common/constants.wgsl",
+                "common/structs.wgsl",
+                "common/views.wgsl",
+                $(concat!("common/", $part, ".wgsl"),)*
+                concat!($stem, ".wgsl"),
+            ],
             source: concat!(
                 include_str!("../../../shaders/common/constants.wgsl"),
                 include_str!("../../../shaders/common/structs.wgsl"),
+                include_str!("../../../shaders/common/views.wgsl"),
                 $(include_str!(concat!("../../../shaders/common/", $part, ".wgsl")),)*
                 include_str!(concat!("../../../shaders/", $stem, ".wgsl")),
             ),
@@ -72,77 +97,172 @@ pub const SHADERS: [Shader; 9] = [
     shader!("rasterize", "labels_index", "labels_entries"),
 ];
 
+/// Kernels, in the order of [`KERNELS`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(super) enum Kernel {
+    Project,
+    Histogram,
+    Spine,
+    Scatter,
+    SumBlocks,
+    ScanSums,
+    Shade,
+    EmitIsects,
+    TileRanges,
+    Rasterize(Raster),
+}
+
+/// What a kernel of rasterize is made for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(super) struct Raster {
+    pub(super) color: bool,
+    pub(super) depth: bool,
+    pub(super) labels: RasterLabels,
+}
+
+/// Labels that a kernel of rasterize blends, in the order of [`SHADERS`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(super) enum RasterLabels {
+    None,
+    Blend,
+    Entries,
+}
+
+/// Name in measurements, place in [`SHADERS`] and entry point of every kernel but rasterize.
+const KERNELS: [(&str, usize, &str); 9] = [
+    ("project", 0, "main"),
+    ("histogram", 1, "histogram"),
+    ("spine", 1, "spine"),
+    ("scatter", 1, "scatter"),
+    ("sum_blocks", 2, "sum_blocks"),
+    ("scan_sums", 2, "scan_sums"),
+    ("shade", 3, "main"),
+    ("emit_isects", 4, "main"),
+    ("tile_ranges", 5, "main"),
+];
+/// Place in [`SHADERS`] of rasterize without labels.
+const RASTERIZE: usize = 6;
+/// Sets of pictures, each a kernel of rasterize, by labels.
+const PICTURES: usize = 4;
+
+impl Kernel {
+    fn place(self) -> Option<usize> {
+        Some(match self {
+            Self::Project => 0,
+            Self::Histogram => 1,
+            Self::Spine => 2,
+            Self::Scatter => 3,
+            Self::SumBlocks => 4,
+            Self::ScanSums => 5,
+            Self::Shade => 6,
+            Self::EmitIsects => 7,
+            Self::TileRanges => 8,
+            Self::Rasterize(_) => return None,
+        })
+    }
+
+    /// Name in measurements.
+    pub(super) fn name(self) -> &'static str {
+        self.place().map_or("rasterize", |place| KERNELS[place].0)
+    }
+}
+
 /// The compiled kernels.
 #[derive(Debug)]
 pub(super) struct Kernels {
-    pub(super) project: wgpu::ComputePipeline,
-    pub(super) histogram: wgpu::ComputePipeline,
-    pub(super) scatter: wgpu::ComputePipeline,
-    pub(super) scan_blocks: wgpu::ComputePipeline,
-    pub(super) add_blocks: wgpu::ComputePipeline,
-    pub(super) shade: wgpu::ComputePipeline,
-    pub(super) make_plan: wgpu::ComputePipeline,
-    pub(super) emit_isects: wgpu::ComputePipeline,
-    pub(super) tile_ranges: wgpu::ComputePipeline,
-    pub(super) rasterize: wgpu::ComputePipeline,
-    pub(super) rasterize_blend: wgpu::ComputePipeline,
-    pub(super) rasterize_entries: wgpu::ComputePipeline,
+    modules: Vec<wgpu::ShaderModule>,
+    pipelines: Vec<wgpu::ComputePipeline>,
+    /// Made when first wanted: a server that is asked for colour needs one of twelve.
+    rasterize: [OnceLock<wgpu::ComputePipeline>; 3 * PICTURES],
 }
 
 impl Kernels {
-    /// Compiles every kernel.
+    /// Compiles every kernel, from the files in `folder` where one is named.
     ///
     /// # Errors
-    /// `internal` when the driver refuses one.
-    pub(super) fn compile(gpu: &Gpu) -> Result<Self> {
-        let [
-            project,
-            radix_sort,
-            prefix_sum,
-            shade,
-            emit_isects,
-            tile_ranges,
-            rasterize,
-            rasterize_blend,
-            rasterize_entries,
-        ] = SHADERS.map(|shader| {
-            gpu.scoped(shader.stem, || {
-                gpu.device.create_shader_module(wgpu::ShaderModuleDescriptor {
-                    label: Some(shader.stem),
-                    source: wgpu::ShaderSource::Wgsl(Cow::Borrowed(shader.source)),
+    /// `internal` when the driver refuses one, `invalid_request` when a file cannot be read.
+    pub(super) fn compile(gpu: &Gpu, folder: Option<&Path>, checked: bool) -> Result<Self> {
+        let modules = SHADERS
+            .iter()
+            .map(|shader| {
+                let source = source_of(shader, folder)?;
+                gpu.scoped(shader.stem, || {
+                    let described = wgpu::ShaderModuleDescriptor {
+                        label: Some(shader.stem),
+                        source: wgpu::ShaderSource::Wgsl(source),
+                    };
+                    if checked {
+                        return gpu.device.create_shader_module(described);
+                    }
+                    let checks = wgpu::ShaderRuntimeChecks::unchecked();
+                    // SAFETY: the shaders are our own. Every index is held against a count that
+                    // the host has made room for, and every loop ends; the twin tests run them
+                    // with the checks too.
+                    #[expect(unsafe_code, reason = "the checks cost a fifth of a frame")]
+                    unsafe {
+                        gpu.device.create_shader_module_trusted(described, checks)
+                    }
                 })
             })
-        });
-        let (radix_sort, prefix_sum, emit_isects) = (radix_sort?, prefix_sum?, emit_isects?);
-        let compile = |module: &wgpu::ShaderModule, entry: &'static str| {
-            gpu.scoped(entry, || {
-                gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-                    label: Some(entry),
-                    layout: None,
-                    module,
-                    entry_point: Some(entry),
-                    // Every shader writes its workgroup memory before it reads it.
-                    compilation_options: wgpu::PipelineCompilationOptions {
-                        zero_initialize_workgroup_memory: false,
-                        ..Default::default()
-                    },
-                    cache: None,
-                })
-            })
-        };
-        Ok(Self {
-            project: compile(&project?, "main")?,
-            histogram: compile(&radix_sort, "histogram")?,
-            scatter: compile(&radix_sort, "scatter")?,
-            scan_blocks: compile(&prefix_sum, "scan_blocks")?,
-            add_blocks: compile(&prefix_sum, "add_blocks")?,
-            shade: compile(&shade?, "main")?,
-            make_plan: compile(&emit_isects, "make_plan")?,
-            emit_isects: compile(&emit_isects, "main")?,
-            tile_ranges: compile(&tile_ranges?, "main")?,
-            rasterize: compile(&rasterize?, "main")?,
-            rasterize_blend: compile(&rasterize_blend?, "main")?,
-            rasterize_entries: compile(&rasterize_entries?, "main")?,
-        })
+            .collect::<Result<Vec<_>>>()?;
+        let pipelines = KERNELS
+            .iter()
+            .map(|&(name, module, entry)| pipeline(gpu, name, &modules[module], entry, &[]))
+            .collect::<Result<_>>()?;
+        Ok(Self { modules, pipelines, rasterize: [const { OnceLock::new() }; 3 * PICTURES] })
     }
+
+    /// The pipeline of a kernel.
+    ///
+    /// # Errors
+    /// `internal` when the driver refuses one that is wanted for the first time.
+    pub(super) fn get(&self, gpu: &Gpu, kernel: Kernel) -> Result<&wgpu::ComputePipeline> {
+        let Kernel::Rasterize(raster) = kernel else {
+            return Ok(&self.pipelines[kernel.place().unwrap_or_default()]);
+        };
+        let labels = raster.labels as usize;
+        let at = labels * PICTURES + usize::from(raster.color) * 2 + usize::from(raster.depth);
+        if self.rasterize[at].get().is_none() {
+            let constants = [
+                ("WITH_COLOR", f64::from(u8::from(raster.color))),
+                ("WITH_DEPTH", f64::from(u8::from(raster.depth))),
+            ];
+            let module = &self.modules[RASTERIZE + labels];
+            let made = pipeline(gpu, "rasterize", module, "main", &constants)?;
+            return Ok(self.rasterize[at].get_or_init(|| made));
+        }
+        self.rasterize[at].get().ok_or_else(|| Error::internal("a kernel was made and is gone"))
+    }
+}
+
+fn pipeline(
+    gpu: &Gpu,
+    name: &'static str,
+    module: &wgpu::ShaderModule,
+    entry: &str,
+    constants: &[(&str, f64)],
+) -> Result<wgpu::ComputePipeline> {
+    gpu.scoped(name, || {
+        gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some(name),
+            layout: None,
+            module,
+            entry_point: Some(entry),
+            compilation_options: wgpu::PipelineCompilationOptions {
+                constants,
+                // Every shader writes its workgroup memory before it reads it.
+                zero_initialize_workgroup_memory: false,
+            },
+            cache: None,
+        })
+    })
+}
+
+fn source_of(shader: &Shader, folder: Option<&Path>) -> Result<Cow<'static, str>> {
+    let Some(folder) = folder else { return Ok(Cow::Borrowed(shader.source)) };
+    let read = |file: &&str| {
+        fs_err::read_to_string(folder.join(file))
+            .map_err(|e| Error::invalid(format!("shaders: {file} cannot be read")).caused_by(e))
+    };
+    Ok(Cow::Owned(shader.files.iter().map(read).collect::<Result<String>>()?))
 }

@@ -6,9 +6,12 @@ use super::{
     Engine, GpuRenderer,
     buffers::{FootprintRow, PlanRow, ViewRow, narrow},
     device::Gpu,
-    pipelines::NO_PICTURE,
+    pipelines::{
+        GROUPS_RANGES, GROUPS_TILES, GROUPS_X_MAX, NO_PICTURE, SORT_BLOCK, WORKGROUP_SIZE,
+    },
     readback,
-    recorder::{LabelBuffers, PairCount, Pairs, Recorder, footprint_bytes},
+    recorder::{Copy, LabelBuffers, Recorder, SceneBuffers, sorted_half},
+    scratch::{Need, Room},
 };
 use crate::{
     error::Result,
@@ -19,15 +22,17 @@ use crate::{
 /// What `project` gives.
 #[derive(Clone, Debug)]
 pub struct Projected {
-    /// `[N]`; `tiles` is 0 for a dropped Gaussian.
+    /// `[N]`; means nothing for a dropped Gaussian.
     pub footprints: Vec<FootprintRow>,
+    /// `[N]` tiles touched, 0 for a dropped Gaussian.
+    pub tiles: Vec<u32>,
     /// `[N]` bits of t.z, or `DROPPED_KEY`.
     pub depth_keys: Vec<u32>,
     /// Gaussians that touch the picture.
     pub visible: u32,
 }
 
-/// Keys and values, or tiles and places in depth order.
+/// Keys and values, or tiles and Gaussians.
 pub type KeysValues = (Vec<u32>, Vec<u32>);
 
 impl GpuRenderer {
@@ -36,62 +41,104 @@ impl GpuRenderer {
     /// # Errors
     /// As [`crate::render::Renderer::render`].
     pub fn project(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Projected> {
-        let view_row = view_row(gaussians, request)?;
+        let row = view_row(gaussians, request)?;
         self.with_engine(|engine| {
-            let count = narrow("gaussians", gaussians.len())?;
             let scene = engine.scenes.get(&engine.gpu, gaussians)?;
-            let view = uniform(engine, &view_row)?;
-            let footprints =
-                engine.scratch.footprints.ensure(&engine.gpu, footprint_bytes(count))?;
-            let pairs = engine.scratch.depth_pairs(&engine.gpu, count)?;
-            let mut stages = recorder(engine, count)?;
-            stages.project(&view, &scene.gaussians, &footprints, &pairs, count);
-            let plan = stages.plan.clone();
+            let room = room(engine, &row, 0)?;
             let n = gaussians.len();
-            let parts = [(&footprints, n * 48), (&pairs.keys[0], n * 4), (&plan, 48)];
-            let [footprints, depth_keys, plan] = finish(stages, parts)?;
-            let plan: Vec<PlanRow> = cast(&plan);
+            let parts = [
+                (&room.footprints, 0, n * 32),
+                (&room.tiles, 0, n * 4),
+                (&room.depth_keys, 0, n * 4),
+                (&room.plans, 0, size_of::<PlanRow>()),
+            ];
+            let buffers = SceneBuffers {
+                gaussians: &scene.gaussians,
+                sh: &scene.sh,
+                sh_count: scene.sh_count,
+            };
+            let [footprints, tiles, depth_keys, plans] =
+                run(engine, &room, &row, parts, |stages| stages.project(buffers))?;
             Ok(Projected {
                 footprints: cast(&footprints),
+                tiles: cast(&tiles),
                 depth_keys: cast(&depth_keys),
-                visible: plan[0].visible,
+                visible: cast::<PlanRow>(&plans)[0].visible,
             })
         })
     }
 
-    /// Stages 2 and 6: a stable sort by the lowest `key_bits` bits.
+    /// Stage 2: the order of `keys` that are not `DROPPED_KEY`; equal ones stay as they lie.
+    ///
+    /// # Errors
+    /// As [`crate::render::Renderer::render`].
+    pub fn depth_sort(&self, keys: &[u32]) -> Result<Vec<u32>> {
+        self.with_engine(|engine| {
+            let count = narrow("keys", keys.len())?;
+            let row = ViewRow { gaussian_count: count, ..ViewRow::zeroed() };
+            let room = room(engine, &row, 0)?;
+            let kept = || keys.iter().copied().filter(|&key| key != super::pipelines::DROPPED_KEY);
+            let plan = PlanRow {
+                key_min: kept().min().unwrap_or(u32::MAX),
+                key_max: kept().max().unwrap_or(0),
+                ..PlanRow::default()
+            };
+            let half = keys.len() * 4;
+            let parts = [(&room.depth_ids, 0, 2 * half), (&room.plans, 0, size_of::<PlanRow>())];
+            let write = |gpu: &Gpu| {
+                gpu.queue.write_buffer(&room.depth_keys, 0, bytemuck::cast_slice(keys));
+                gpu.queue.write_buffer(&room.plans, 0, bytemuck::bytes_of(&plan));
+            };
+            let [ids, plans] =
+                run_from(engine, &room, &row, parts, write, |stages| stages.depth_sort())?;
+            let plan = cast::<PlanRow>(&plans)[0];
+            let first = (plan.passes as usize & 1) * keys.len();
+            Ok(cast::<u32>(&ids)[first..first + plan.sorted as usize].to_vec())
+        })
+    }
+
+    /// Stage 6: a stable sort by the lowest `key_bits` bits.
     ///
     /// # Errors
     /// As [`crate::render::Renderer::render`].
     pub fn radix_sort(&self, keys: &[u32], values: &[u32], key_bits: u32) -> Result<KeysValues> {
         self.with_engine(|engine| {
             let count = narrow("pairs", keys.len())?;
-            let pairs = upload_pairs(&engine.gpu, keys, values)?;
-            let mut stages = recorder(engine, count)?;
-            let at = stages.sort(&pairs, PairCount::Known(count), key_bits);
-            let size = keys.len() * 4;
-            let parts = [(&pairs.keys[at], size), (&pairs.values[at], size)];
-            let [keys, values] = finish(stages, parts)?;
+            let row = ViewRow { gaussian_count: 1, isect_capacity: count, ..ViewRow::zeroed() };
+            let room = room(engine, &row, 0)?;
+            let (half, start) = (keys.len() * 4, sorted_half(key_bits) as usize * keys.len() * 4);
+            let parts = [(&room.tile_keys, start, half), (&room.isect_ids, start, half)];
+            let write = |gpu: &Gpu| {
+                gpu.queue.write_buffer(&room.tile_keys, 0, bytemuck::cast_slice(keys));
+                gpu.queue.write_buffer(&room.isect_ids, 0, bytemuck::cast_slice(values));
+                plan_pairs(gpu, &room, count);
+            };
+            let [keys, values] =
+                run_from(engine, &room, &row, parts, write, |stages| stages.tile_sort(key_bits))?;
             Ok((cast(&keys), cast(&values)))
         })
     }
 
-    /// Stage 3: exclusive sums that stay at `u32::MAX`.
+    /// Stage 3: of `numbers`, the sum before each block of `SCAN_BLOCK`, and the whole sum; sums
+    /// stay at `u32::MAX`.
     ///
     /// # Errors
     /// As [`crate::render::Renderer::render`].
-    pub fn prefix_sum(&self, numbers: &[u32]) -> Result<Vec<u32>> {
+    pub fn prefix_sum(&self, numbers: &[u32]) -> Result<(Vec<u32>, u32)> {
         self.with_engine(|engine| {
             let count = narrow("numbers", numbers.len())?;
-            let buffer = engine.gpu.upload("numbers", bytemuck::cast_slice(numbers))?;
-            let mut stages = recorder(engine, count)?;
-            stages.prefix_sum(&buffer, count);
-            let [sums] = finish(stages, [(&buffer, numbers.len() * 4)])?;
-            Ok(cast(&sums))
+            let row = ViewRow { gaussian_count: count, ..ViewRow::zeroed() };
+            let room = room(engine, &row, 0)?;
+            let blocks = numbers.len().div_ceil(super::pipelines::SCAN_BLOCK as usize);
+            let parts = [(&room.block_sums, 0, blocks * 4), (&room.plans, 0, size_of::<PlanRow>())];
+            let write = |gpu: &Gpu| in_order(gpu, &room, numbers);
+            let [sums, plans] =
+                run_from(engine, &room, &row, parts, write, |stages| stages.prefix_sum())?;
+            Ok((cast(&sums), cast::<PlanRow>(&plans)[0].needed))
         })
     }
 
-    /// Stage 4: `ids` in depth order.
+    /// Stage 4: colours of the Gaussians that touch `tiles` tiles; the others' mean nothing.
     ///
     /// # Errors
     /// As [`crate::render::Renderer::render`].
@@ -99,63 +146,55 @@ impl GpuRenderer {
         &self,
         gaussians: &Gaussians,
         request: &RenderRequest,
-        footprints: &[FootprintRow],
-        ids: &[u32],
-    ) -> Result<Vec<FootprintRow>> {
-        let view_row = view_row(gaussians, request)?;
+        tiles: &[u32],
+    ) -> Result<Vec<[f32; 3]>> {
+        let row = view_row(gaussians, request)?;
         self.with_engine(|engine| {
-            let count = view_row.gaussian_count;
             let scene = engine.scenes.get(&engine.gpu, gaussians)?;
-            let view = uniform(engine, &view_row)?;
-            let footprints = engine.gpu.upload("footprints", bytemuck::cast_slice(footprints))?;
-            let ids = engine.gpu.upload("ids", bytemuck::cast_slice(ids))?;
-            let shaded = engine.scratch.shaded.ensure(&engine.gpu, footprint_bytes(count))?;
-            let offsets = engine.scratch.isect_offsets.ensure(&engine.gpu, u64::from(count) * 4)?;
-            let mut stages = recorder(engine, count)?;
-            stages.shade(
-                &view,
-                &scene.gaussians,
-                &scene.sh,
-                &footprints,
-                &ids,
-                &shaded,
-                &offsets,
-                count,
-            );
-            let size = footprint_bytes(count) as usize;
-            let [shaded] = finish(stages, [(&shaded, size)])?;
-            Ok(cast(&shaded))
+            let room = room(engine, &row, 0)?;
+            let parts = [(&room.colors, 0, gaussians.len() * 12)];
+            let write = |gpu: &Gpu| {
+                gpu.queue.write_buffer(&room.tiles, 0, bytemuck::cast_slice(tiles));
+            };
+            let buffers = SceneBuffers {
+                gaussians: &scene.gaussians,
+                sh: &scene.sh,
+                sh_count: scene.sh_count,
+            };
+            let [colors] =
+                run_from(engine, &room, &row, parts, write, |stages| stages.shade(buffers))?;
+            Ok(cast(&colors))
         })
     }
 
-    /// Stage 5: the pairs of `shaded`, whose `tiles` add up to `isect_offsets`.
+    /// Stages 3 and 5: the pairs of `footprints`, which are in depth order and touch `tiles` tiles.
     ///
     /// # Errors
     /// As [`crate::render::Renderer::render`].
     pub fn emit_isects(
         &self,
         view: &View,
-        shaded: &[FootprintRow],
-        isect_offsets: &[u32],
+        footprints: &[FootprintRow],
+        tiles: &[u32],
     ) -> Result<KeysValues> {
         self.with_engine(|engine| {
-            let count = narrow("footprints", shaded.len())?;
-            let last = shaded.last().map_or(0, |footprint| footprint.tiles);
-            let total = isect_offsets.last().map_or(0, |offset| offset + last);
+            let total: u32 = tiles.iter().sum();
             let row = ViewRow {
-                gaussian_count: count,
+                gaussian_count: narrow("footprints", footprints.len())?,
                 isect_capacity: total,
                 ..ViewRow::new(view, [0.0; 3], false)
             };
-            let view = uniform(engine, &row)?;
-            let shaded = engine.gpu.upload("footprints", bytemuck::cast_slice(shaded))?;
-            let offsets = engine.gpu.upload("offsets", bytemuck::cast_slice(isect_offsets))?;
-            let pairs = engine.scratch.isect_pairs(&engine.gpu, total)?;
-            let mut stages = recorder(engine, count.max(total))?;
-            stages.emit_isects(&view, &shaded, &offsets, &pairs, count);
+            let room = room(engine, &row, 0)?;
             let size = total as usize * 4;
-            let parts = [(&pairs.keys[0], size), (&pairs.values[0], size)];
-            let [keys, ids] = finish(stages, parts)?;
+            let parts = [(&room.tile_keys, 0, size), (&room.isect_ids, 0, size)];
+            let write = |gpu: &Gpu| {
+                in_order(gpu, &room, tiles);
+                gpu.queue.write_buffer(&room.footprints, 0, bytemuck::cast_slice(footprints));
+            };
+            let [keys, ids] = run_from(engine, &room, &row, parts, write, |stages| {
+                stages.prefix_sum();
+                stages.emit_isects();
+            })?;
             Ok((cast(&keys), cast(&ids)))
         })
     }
@@ -172,18 +211,15 @@ impl GpuRenderer {
                 isect_capacity: count,
                 ..ViewRow::new(view, [0.0; 3], false)
             };
-            let uniform = uniform(engine, &row)?;
-            // One Gaussian that touches as many tiles makes the plan.
-            let one = FootprintRow { tiles: count, ..FootprintRow::zeroed() };
-            let shaded = engine.gpu.upload("footprints", bytemuck::bytes_of(&one))?;
-            let offsets = engine.gpu.upload("offsets", &[0; 4])?;
-            let keys = engine.gpu.upload("tile keys", bytemuck::cast_slice(tile_keys))?;
+            let room = room(engine, &row, 0)?;
             let size = (view.tiles_x() * view.tiles_y() + 1) as usize * 4;
-            let ranges = engine.scratch.ranges.ensure(&engine.gpu, size as u64)?;
-            let mut stages = recorder(engine, count)?;
-            stages.make_plan(&uniform, &shaded, &offsets);
-            stages.tile_ranges(&uniform, &keys, &ranges);
-            let [ranges] = finish(stages, [(&ranges, size)])?;
+            let parts = [(&room.ranges, 0, size)];
+            let write = |gpu: &Gpu| {
+                gpu.queue.write_buffer(&room.tile_keys, 0, bytemuck::cast_slice(tile_keys));
+                plan_pairs(gpu, &room, count);
+            };
+            let [ranges] =
+                run_from(engine, &room, &row, parts, write, |stages| stages.tile_ranges())?;
             Ok(cast(&ranges))
         })
     }
@@ -196,29 +232,36 @@ impl GpuRenderer {
         &self,
         view: &View,
         background: [f32; 3],
-        shaded: &[FootprintRow],
+        footprints: &[FootprintRow],
+        colors: &[[f32; 3]],
         isect_ids: &[u32],
         ranges: &[u32],
     ) -> Result<Vec<f32>> {
         self.with_engine(|engine| {
             let pixels = view.width * view.height;
             let row = ViewRow {
+                gaussian_count: narrow("footprints", footprints.len())?,
+                isect_capacity: narrow("tile pairs", isect_ids.len())?,
                 color_start: 0,
                 depth_start: pixels * 3,
                 alpha_start: pixels * 4,
                 ..ViewRow::new(view, background, false)
             };
-            let uniform = uniform(engine, &row)?;
-            let shaded = engine.gpu.upload("footprints", bytemuck::cast_slice(shaded))?;
-            let ids = engine.gpu.upload("ids", bytemuck::cast_slice(isect_ids))?;
-            let ranges = engine.gpu.upload("ranges", bytemuck::cast_slice(ranges))?;
             let size = pixels as usize * 20;
-            let pictures = engine.scratch.pictures.ensure(&engine.gpu, size as u64)?;
-            let mut stages = recorder(engine, 1)?;
+            let room = room(engine, &row, size)?;
+            let parts = [(&room.pictures, 0, size)];
+            let write = |gpu: &Gpu| {
+                gpu.queue.write_buffer(&room.footprints, 0, bytemuck::cast_slice(footprints));
+                gpu.queue.write_buffer(&room.colors, 0, bytemuck::cast_slice(colors));
+                gpu.queue.write_buffer(&room.isect_ids, 0, bytemuck::cast_slice(isect_ids));
+                gpu.queue.write_buffer(&room.ranges, 0, bytemuck::cast_slice(ranges));
+            };
+            let (gaussians, sh) = (&room.footprints, &room.colors);
+            let buffers = SceneBuffers { gaussians, sh, sh_count: 0 };
             let tiles = [view.tiles_x(), view.tiles_y()];
-            let labels = LabelBuffers::None;
-            stages.rasterize(&uniform, &shaded, &ids, &ranges, &pictures, &labels, tiles);
-            let [pictures] = finish(stages, [(&pictures, size)])?;
+            let [pictures] = run_from(engine, &room, &row, parts, write, |stages| {
+                stages.rasterize(buffers, &LabelBuffers::None, (true, true), tiles);
+            })?;
             Ok(cast(&pictures))
         })
     }
@@ -237,43 +280,87 @@ fn view_row(gaussians: &Gaussians, request: &RenderRequest) -> Result<ViewRow> {
     })
 }
 
-fn uniform(engine: &mut Engine, row: &ViewRow) -> Result<wgpu::Buffer> {
-    let view = engine.scratch.view.ensure(&engine.gpu, size_of::<ViewRow>() as u64)?;
-    engine.gpu.queue.write_buffer(&view, 0, bytemuck::bytes_of(row));
-    Ok(view)
+fn room(engine: &mut Engine, row: &ViewRow, picture_bytes: usize) -> Result<Room> {
+    let need = Need {
+        views: 1,
+        count: row.gaussian_count,
+        capacity: row.isect_capacity,
+        ranges: row.tiles_x * row.tiles_y + 1,
+        shades: true,
+        picture_bytes: picture_bytes as u64,
+        ..Need::default()
+    };
+    engine.scratch.room(&engine.gpu, &need)
 }
 
-fn recorder(engine: &mut Engine, numbers_max: u32) -> Result<Recorder<'_>> {
-    Recorder::new(&engine.gpu, &engine.kernels, &mut engine.scratch, numbers_max)
+/// `tiles` as the counts of Gaussians that lie in depth order.
+fn in_order(gpu: &Gpu, room: &Room, tiles: &[u32]) {
+    let ids: Vec<u32> = (0..tiles.len() as u32).collect();
+    let plan = PlanRow { sorted: tiles.len() as u32, ..PlanRow::default() };
+    gpu.queue.write_buffer(&room.tiles, 0, bytemuck::cast_slice(tiles));
+    gpu.queue.write_buffer(&room.depth_ids, 0, bytemuck::cast_slice(&ids));
+    gpu.queue.write_buffer(&room.plans, 0, bytemuck::bytes_of(&plan));
 }
 
-fn upload_pairs(gpu: &Gpu, keys: &[u32], values: &[u32]) -> Result<Pairs> {
-    let [keys, values] = [keys, values].map(bytemuck::cast_slice);
-    Ok(Pairs {
-        keys: [gpu.upload("keys", keys)?, gpu.upload("keys", keys)?],
-        values: [gpu.upload("values", values)?, gpu.upload("values", values)?],
-    })
+/// The plan of `count` pairs, as `scan_sums` makes it.
+fn plan_pairs(gpu: &Gpu, room: &Room, count: u32) {
+    let plan = PlanRow { isects: count, needed: count, ..PlanRow::default() };
+    gpu.queue.write_buffer(&room.plans, 0, bytemuck::bytes_of(&plan));
+    let blocks = [
+        (GROUPS_TILES, count.div_ceil(SORT_BLOCK)),
+        (GROUPS_RANGES, (count + WORKGROUP_SIZE) / WORKGROUP_SIZE),
+    ];
+    for (at, blocks) in blocks {
+        let x = blocks.clamp(1, GROUPS_X_MAX);
+        let groups = [x, blocks.div_ceil(x), 1, 0];
+        gpu.queue.write_buffer(&room.groups, u64::from(at) * 16, bytemuck::cast_slice(&groups));
+    }
 }
 
-/// Submits, and reads the first bytes of each buffer.
-fn finish<const N: usize>(
-    stages: Recorder<'_>,
-    parts: [(&wgpu::Buffer, usize); N],
+/// Part of a buffer: first byte, bytes.
+type Part<'a> = (&'a wgpu::Buffer, usize, usize);
+
+fn run<const N: usize>(
+    engine: &mut Engine,
+    room: &Room,
+    row: &ViewRow,
+    parts: [Part<'_>; N],
+    record: impl FnOnce(&mut Recorder<'_>),
 ) -> Result<[Vec<u8>; N]> {
-    let gpu = stages.gpu;
-    let total = parts.iter().map(|part| part.1 as u64).sum::<u64>();
+    run_from(engine, room, row, parts, |_| {}, record)
+}
+
+/// Writes inputs, runs what is recorded, and reads parts of buffers.
+fn run_from<const N: usize>(
+    engine: &mut Engine,
+    room: &Room,
+    row: &ViewRow,
+    parts: [Part<'_>; N],
+    write: impl FnOnce(&Gpu),
+    record: impl FnOnce(&mut Recorder<'_>),
+) -> Result<[Vec<u8>; N]> {
+    let gpu = &engine.gpu;
+    let total = parts.iter().map(|part| part.2 as u64).sum::<u64>();
     let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
     let staging = gpu.create_buffer("staging", total, usage)?;
     let mut at = 0;
-    let copies = parts.map(|(buffer, size)| {
+    let copies: [Copy<'_>; N] = parts.map(|(buffer, first, size)| {
         let to = at;
         at += size as u64;
-        (buffer, 0, &staging, to, size as u64)
+        (buffer, first as u64, &staging, to, size as u64)
     });
-    let submission = gpu.scoped("stage", || stages.submit(&copies))?;
+    let submission = gpu.scoped("stage", || {
+        room.begin(gpu, std::slice::from_ref(row));
+        write(gpu);
+        let bindings = &mut engine.scratch.bindings;
+        let sizes = (1, row.gaussian_count);
+        let mut stages = Recorder::new(gpu, &engine.kernels, bindings, room, sizes, None);
+        record(&mut stages);
+        stages.submit(&copies)
+    })??;
     readback::read(gpu, submission, &staging, total.max(4), |bytes| {
         let mut rest = bytes;
-        parts.map(|(_, size)| {
+        parts.map(|(_, _, size)| {
             let (part, tail) = rest.split_at(size);
             rest = tail;
             part.to_vec()

@@ -1,0 +1,144 @@
+//! The devices that callers share: views drawn together, devices lost, memory and limits met.
+//! Adapter and skipping are those of `twins`.
+
+use std::{sync::Barrier, time::Duration, time::Instant};
+
+use segsplat::{
+    error::ErrorCode,
+    render::{Frame, Kinds, Labels, RenderRequest, Renderer, gpu::GpuRenderer},
+    scene::Gaussians,
+};
+
+use crate::{
+    common::scenes::{camera, cloud, request},
+    labels::{labelled, table},
+    twins::open,
+};
+
+/// Views of one scene that differ in camera, size and kinds.
+fn requests(count: u32, labels: &Labels) -> Vec<RenderRequest> {
+    (0..count)
+        .map(|i| {
+            let mut one = request(camera(40 + 13 * (i % 5), 30 + 7 * (i % 4)));
+            one.camera.intrinsics.fx += f64::from(i);
+            one.antialiased = i % 3 == 1;
+            one.kinds = Kinds { color: i % 4 != 3, depth: i % 2 == 0, alpha: true };
+            one.labels = labels.clone();
+            one
+        })
+        .collect()
+}
+
+/// Draws all at once, each on a thread of its own.
+fn at_once(gpu: &GpuRenderer, scene: &Gaussians, wanted: &[RenderRequest]) -> Vec<Frame> {
+    let start = Barrier::new(wanted.len());
+    std::thread::scope(|scope| {
+        let threads: Vec<_> = wanted
+            .iter()
+            .map(|one| {
+                scope.spawn(|| {
+                    start.wait();
+                    gpu.render(scene, one).expect("a view among others")
+                })
+            })
+            .collect();
+        threads.into_iter().map(|thread| thread.join().expect("a caller")).collect()
+    })
+}
+
+#[test]
+fn views_drawn_together_are_those_drawn_alone() {
+    let Some(gpu) = open(|_| {}) else { return };
+    for labels in [Labels::None, Labels::Blend(table(9, 3)), Labels::Entries] {
+        let scene = labelled(2_000, 8, 61);
+        let wanted = requests(16, &labels);
+        let alone: Vec<_> =
+            wanted.iter().map(|one| gpu.render(&scene, one).expect("a view alone")).collect();
+        let before = gpu.submissions();
+        for (i, (got, want)) in at_once(&gpu, &scene, &wanted).iter().zip(&alone).enumerate() {
+            assert!(got == want, "view {i} among others, {labels:?}");
+        }
+        let (submissions, views) = gpu.submissions();
+        let (submissions, views) = (submissions - before.0, views - before.1);
+        println!("{views} views in {submissions} submissions");
+        assert_eq!(views, 16, "no two views are equal");
+        assert!(submissions < 16, "some views shared a submission");
+    }
+    // Degree 2: colours of each camera are its own.
+    let scene = cloud(1_500, 2, 62);
+    let wanted = requests(12, &Labels::None);
+    let alone: Vec<_> = wanted.iter().map(|one| gpu.render(&scene, one).expect("alone")).collect();
+    assert!(at_once(&gpu, &scene, &wanted) == alone, "colours of higher degrees");
+}
+
+#[test]
+fn equal_requests_are_drawn_once() {
+    let Some(gpu) = open(|_| {}) else { return };
+    let scene = cloud(20_000, 0, 63);
+    let one = request(camera(320, 240));
+    let want = gpu.render(&scene, &one).expect("a view");
+    let before = gpu.submissions().1;
+    let wanted = vec![one; 16];
+    assert!(at_once(&gpu, &scene, &wanted).iter().all(|got| *got == want), "all got it");
+    let drawn = gpu.submissions().1 - before;
+    println!("{drawn} of 16 drawn");
+    assert!(drawn < 16, "equal views were drawn {drawn} times");
+}
+
+#[test]
+fn a_device_lost_under_sixteen_requests_loses_none_of_them() {
+    let Some(gpu) = open(|_| {}) else { return };
+    let scene = cloud(30_000, 0, 64);
+    let wanted = requests(16, &Labels::None);
+    let alone: Vec<_> = wanted.iter().map(|one| gpu.render(&scene, one).expect("alone")).collect();
+    let start = Barrier::new(wanted.len() + 1);
+    let (gpu, scene, begin) = (&gpu, &scene, &start);
+    for wait_ms in [0, 3, 10] {
+        std::thread::scope(|scope| {
+            let threads: Vec<_> = wanted
+                .iter()
+                .map(|one| {
+                    scope.spawn(move || {
+                        begin.wait();
+                        gpu.render(scene, one)
+                    })
+                })
+                .collect();
+            begin.wait();
+            std::thread::sleep(Duration::from_millis(wait_ms));
+            gpu.lose_devices();
+            for (i, (thread, want)) in threads.into_iter().zip(&alone).enumerate() {
+                let got = thread.join().expect("a caller").expect("an answer");
+                assert!(got == *want, "view {i} after the loss");
+            }
+        });
+    }
+    gpu.lose_devices();
+    let begun = Instant::now();
+    assert!(gpu.render(scene, &wanted[0]).expect("a view") == alone[0], "the next view");
+    println!("served again after {:?}", begun.elapsed());
+}
+
+#[test]
+fn scenes_leave_by_bytes_and_come_again() {
+    let (a, b) = (cloud(1_000, 0, 65), cloud(1_000, 0, 66));
+    // Room for one of them: 48 bytes a Gaussian and 12 of colour.
+    let Some(gpu) = open(|options| options.scene_bytes_max = 100_000) else { return };
+    let one = request(camera(48, 32));
+    let want = gpu.render(&a, &one).expect("a view");
+    gpu.render(&b, &one).expect("a view of the other");
+    assert_eq!(gpu.scenes_held(), 1, "the first has left");
+    assert!(gpu.render(&a, &one).expect("a view again") == want, "it came again");
+}
+
+#[test]
+fn what_no_buffer_holds_is_refused_with_the_figures() {
+    let Some(gpu) = open(|options| options.portable = true) else { return };
+    // 2.8 million Gaussians of 48 bytes are over the portable 128 MiB of a binding.
+    let scene = cloud(2_800_000, 0, 67);
+    let error = gpu.render(&scene, &request(camera(16, 16))).expect_err("too many");
+    assert_eq!(error.code(), ErrorCode::LimitExceeded, "{error}");
+    assert!(error.message().contains("134400000 is over 134217728"), "{error}");
+    let small = cloud(100, 0, 68);
+    gpu.render(&small, &request(camera(16, 16))).expect("others are drawn");
+}
