@@ -5,21 +5,26 @@
 //! cameras a fifth of the depth apart, drawn from between them. Its Gaussians carry bank indices in
 //! patches, as things are: `--labels` times labels beside colour.
 
-use std::{collections::BTreeMap, time::Instant};
+mod generated;
 
-use glam::{DVec3, Quat, Vec3};
+use std::{collections::BTreeMap, path::PathBuf, time::Instant};
+
+use glam::DVec3;
 use serde::Serialize;
 
+pub use self::generated::scene;
+use self::generated::{Random, dump};
 use crate::{
     config::Config,
     error::{Error, Result},
     render::{
-        Frame, Kinds, Labels, Quality, RenderRequest, Renderer,
+        DeviceTimes, Frame, Kinds, Labels, Quality, RenderRequest, Renderer, StageTime,
         cpu::CpuRenderer,
+        gpu::GpuOptions,
         oracle,
-        select::{AdapterReport, select},
+        select::{AdapterReport, select_with},
     },
-    scene::{Camera, CameraToWorld, Gaussians, Intrinsics, RawGaussians, SourcePixel},
+    scene::{Camera, CameraToWorld, Gaussians},
 };
 
 /// Pixels apart by more than this are looked at by the oracle: one level of an 8-bit picture.
@@ -28,12 +33,22 @@ pub const DIFFERENCE_MAX: f32 = 1.0 / 255.0;
 pub const GAUSSIANS_MAX: usize = 16 << 20;
 
 /// What to time.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct BenchArgs {
     /// Gaussians, 2 and more; rounded down to two square photos.
     pub gaussians: usize,
-    /// Side of the square picture, pixels.
+    /// Height of the picture, pixels; the field of view is that of a square one of this side.
     pub size: u32,
+    /// Width of the picture, pixels.
+    pub width: u32,
+    /// Callers that draw views of their own at once, beside one alone; 0 times none.
+    pub callers: usize,
+    /// Folder whose files stand in for the GPU renderer's shaders.
+    pub shaders: Option<PathBuf>,
+    /// Whether the GPU renderer's shaders check themselves.
+    pub checked: bool,
+    /// File to write scene, camera and the renderer's picture to, for other renderers.
+    pub dump: Option<PathBuf>,
     /// Frames after the first.
     pub frames: usize,
     /// Whether to compare with the CPU renderer.
@@ -65,6 +80,8 @@ pub struct BenchReport {
     pub gaussians: usize,
     /// Side of the picture, pixels.
     pub size: u32,
+    /// Width of the picture, pixels.
+    pub width: u32,
     /// Frames timed.
     pub frames: usize,
     /// Opening the renderer: adapter, device, kernels, threads.
@@ -79,10 +96,25 @@ pub struct BenchReport {
     pub visible: u64,
     /// Gaussian-tile pairs.
     pub intersections: u64,
+    /// The device's own times of colour, medians; `None` on the CPU.
+    pub device: Option<DeviceTimes>,
+    /// Views a second by callers, where they were asked for.
+    pub callers: Option<CallerTimes>,
     /// Difference to the CPU renderer, where it was asked for.
     pub compared: Option<Compared>,
     /// Times of labels, where they were asked for.
     pub labels: Option<LabelTimes>,
+}
+
+/// What many callers of one scene get.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct CallerTimes {
+    /// Callers at once.
+    pub callers: usize,
+    /// Views a second of one caller.
+    pub one_per_s: f64,
+    /// Views a second of all of them.
+    pub all_per_s: f64,
 }
 
 /// What labels cost beside colour: medians of frames drawn in turn.
@@ -100,6 +132,10 @@ pub struct LabelTimes {
     pub both_ms: f64,
     /// `labels_ms / color_ms`.
     pub ratio: f64,
+    /// The device's own times of labels alone, medians.
+    pub device: Option<DeviceTimes>,
+    /// The same of colour, depth and labels together.
+    pub device_all: Option<DeviceTimes>,
     /// Entries of the view; 0 for a blend.
     pub entries: usize,
     /// Difference to the labels of the CPU renderer, where it was asked for.
@@ -127,9 +163,13 @@ pub struct Compared {
 /// Renders the scene of `args` with the renderer that `config` asks for.
 ///
 /// # Errors
-/// `invalid_request` when `args` are out of range, and those of [`select`] and of the renderer.
+/// `invalid_request` when `args` are out of range, and those of [`select_with`] and of the
+/// renderer.
 pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
-    if !(2..=GAUSSIANS_MAX).contains(&args.gaussians) || args.size == 0 || args.frames == 0 {
+    if !(2..=GAUSSIANS_MAX).contains(&args.gaussians)
+        || args.size.min(args.width) == 0
+        || args.frames == 0
+    {
         return Err(Error::invalid(format!(
             "bench: {} Gaussians at {} px, {} frames; there must be 2 to {GAUSSIANS_MAX}, 1 and 1",
             args.gaussians, args.size, args.frames
@@ -147,12 +187,30 @@ pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
         crop: None,
     };
     let begun = Instant::now();
-    let (renderer, adapters) = select(config)?;
+    let options = GpuOptions {
+        shaders: args.shaders.clone(),
+        checked: args.checked,
+        ..GpuOptions::default()
+    };
+    let (renderer, adapters) = select_with(config, options)?;
     let open_ms = ms(begun);
     let begun = Instant::now();
     let frame = renderer.render(&gaussians, &request)?;
     let first_ms = ms(begun);
+    if let Some(path) = &args.dump {
+        dump(path, &gaussians, &request, &frame)?;
+    }
     let times = times(&*renderer, &gaussians, &request, args.frames)?;
+    let device = device_times(&*renderer, &gaussians, &request, args.frames)?;
+    let callers = match args.callers {
+        0 => None,
+        callers => Some(caller_times(&*renderer, &gaussians, &request, callers, args.frames)?),
+    };
+    let labels = match args.labels {
+        Some(labels) => Some(label_times(&*renderer, &gaussians, &request, args, labels, config)?),
+        None => None,
+    };
+    // After the times: a GPU that waits meanwhile lowers its clocks.
     let compared = if args.compare_cpu {
         let cpu = CpuRenderer::new(config.threads)?;
         let want = cpu.render(&gaussians, &request)?;
@@ -163,15 +221,12 @@ pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
     } else {
         None
     };
-    let labels = match args.labels {
-        Some(labels) => Some(label_times(&*renderer, &gaussians, &request, args, labels, config)?),
-        None => None,
-    };
     Ok(BenchReport {
         renderer: renderer.name(),
         adapters,
         gaussians: gaussians.len(),
         size: args.size,
+        width: args.width,
         frames: args.frames,
         open_ms,
         first_ms,
@@ -179,6 +234,8 @@ pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
         min_ms: times[0],
         visible: frame.stats.visible,
         intersections: frame.stats.intersections,
+        device,
+        callers,
         compared,
         labels,
     })
@@ -205,6 +262,67 @@ fn times(
     Ok(times)
 }
 
+/// Medians of the device's own times over `frames` frames.
+fn device_times(
+    renderer: &dyn Renderer,
+    gaussians: &Gaussians,
+    request: &RenderRequest,
+    frames: usize,
+) -> Result<Option<DeviceTimes>> {
+    let mut runs = Vec::with_capacity(frames);
+    for _ in 0..frames {
+        match renderer.device_times(gaussians, request)? {
+            Some(times) => runs.push(times),
+            None => return Ok(None),
+        }
+    }
+    let middle = |mut times: Vec<f64>| {
+        times.sort_by(f64::total_cmp);
+        times[times.len() / 2]
+    };
+    let stages = runs[0].stages.iter().enumerate().map(|(i, stage)| {
+        let of_stage = runs.iter().filter_map(|run| run.stages.get(i)).map(|stage| stage.ms);
+        StageTime { stage: stage.stage, ms: middle(of_stage.collect()) }
+    });
+    let total_ms = middle(runs.iter().map(|run| run.total_ms).collect());
+    Ok(Some(DeviceTimes { total_ms, stages: stages.collect() }))
+}
+
+/// Views a second of one caller and of `callers` at once, each view from a place of its own.
+fn caller_times(
+    renderer: &dyn Renderer,
+    gaussians: &Gaussians,
+    request: &RenderRequest,
+    callers: usize,
+    frames: usize,
+) -> Result<CallerTimes> {
+    let views = |caller: usize| -> Result<()> {
+        for frame in 0..frames {
+            let place = 1e-4 * (caller * frames + frame) as f64;
+            let at = request.camera.camera_to_world.center() + DVec3::X * place;
+            let camera_to_world = CameraToWorld::look_at(at, at + DVec3::Z, DVec3::NEG_Y, "bench")?;
+            let camera = Camera { camera_to_world, ..request.camera };
+            renderer.render(gaussians, &RenderRequest { camera, ..request.clone() })?;
+        }
+        Ok(())
+    };
+    let rate = |callers: usize| -> Result<f64> {
+        let begun = Instant::now();
+        std::thread::scope(|scope| {
+            let threads: Vec<_> =
+                (0..callers).map(|caller| scope.spawn(move || views(caller))).collect();
+            threads.into_iter().try_for_each(|thread| {
+                thread.join().map_err(|_| Error::internal("a caller of the bench panicked"))?
+            })
+        })?;
+        Ok((callers * frames) as f64 / begun.elapsed().as_secs_f64())
+    };
+    // The first round makes room.
+    rate(callers)?;
+    let (one_per_s, all_per_s) = (rate(1)?, rate(callers)?);
+    Ok(CallerTimes { callers, one_per_s, all_per_s })
+}
+
 /// Draws colour, labels and both in turn, so that a noisy machine is as noisy to each.
 fn label_times(
     renderer: &dyn Renderer,
@@ -225,6 +343,7 @@ fn label_times(
     };
     let with = |kinds, labels| RenderRequest { kinds, labels, ..request.clone() };
     let alone = with(Kinds::NONE, wanted.clone());
+    let all = with(Kinds { color: true, depth: true, alpha: false }, wanted.clone());
     let requests = [with(Kinds::COLOR, Labels::None), alone.clone(), with(Kinds::COLOR, wanted)];
     let mut runs = [const { Vec::new() }; 3];
     // The first round warms up.
@@ -241,6 +360,8 @@ fn label_times(
         times.sort_by(f64::total_cmp);
         times[times.len() / 2]
     });
+    let device = device_times(renderer, gaussians, &alone, args.frames)?;
+    let device_all = device_times(renderer, gaussians, &all, args.frames)?;
     let frame = renderer.render(gaussians, &alone)?;
     let compared = match args.compare_cpu {
         true => {
@@ -256,6 +377,8 @@ fn label_times(
         labels_ms,
         both_ms,
         ratio: labels_ms / color_ms,
+        device,
+        device_all,
         entries: frame.entries.map_or(0, |entries| entries.index.len()),
         compared,
     })
@@ -327,69 +450,6 @@ fn compare(
     })
 }
 
-/// A small seeded generator (splitmix64): the same scene on every machine.
-struct Random(u64);
-
-impl Random {
-    fn range(&mut self, low: f32, high: f32) -> f32 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let mut z = self.0;
-        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        low + (high - low) * (((z ^ (z >> 31)) >> 40) as f32 / (1_u64 << 24) as f32)
-    }
-}
-
-/// The scene and the camera between its two photos.
-///
-/// # Errors
-/// `internal` when the scene is no set of Gaussians.
-pub fn scene(args: &BenchArgs) -> Result<(Gaussians, Camera)> {
-    let lens = |side: u32| {
-        let size = f64::from(side);
-        let focal = 0.5 * size / 30.0_f64.to_radians().tan();
-        let center = 0.5 * size;
-        Intrinsics { fx: focal, fy: focal, cx: center, cy: center, width: side, height: side }
-    };
-    let mut random = Random(1);
-    let side = (args.gaussians / 2).isqrt() as u32;
-    let photo = lens(side);
-    let patches = f64::from(args.bank).sqrt().ceil();
-    let mut raw = RawGaussians::default();
-    for shift in [-0.4, 0.4] {
-        for i in 0..side * side {
-            let (u, v) = (f64::from(i % side) + 0.5, f64::from(i / side) + 0.5);
-            let (s, t) = (u / f64::from(side) + 0.1 * shift, v / f64::from(side));
-            let step = if (s * 5.0).fract() + (t * 4.0).fract() < 0.7 { -1.2 } else { 0.0 };
-            let z = 4.0 + 0.8 * (6.0 * s).sin() * (5.0 * t).cos() + step;
-            let pixel = (z / photo.fx) as f32;
-            let axis = Vec3::from_array([(); 3].map(|()| random.range(-1.0, 1.0)));
-            let turn = Quat::from_axis_angle(axis.normalize_or(Vec3::Z), random.range(-3.1, 3.1));
-            raw.means.push((photo.unproject(u, v, z) + DVec3::X * shift).as_vec3().into());
-            raw.quats.push([turn.w, turn.x, turn.y, turn.z]);
-            raw.scales.push([0.5, 0.5, 0.15].map(|k| pixel * k * random.range(0.6, 1.8)));
-            raw.opacities.push(random.range(0.15, 0.98));
-            raw.sh.push(
-                [s * 9.0, t * 7.0, (s + t) * 5.0]
-                    .map(|phase| 1.2 * phase.sin() as f32 + random.range(-0.2, 0.2)),
-            );
-            // The same patches in both photos: (s, t) is the place on the surface.
-            let patch = |share: f64| (share.clamp(0.0, 0.999) * patches).floor();
-            let label = (patch(s) + patches * patch(t)) as usize % usize::from(args.bank.max(1));
-            raw.semantic_index.push(if args.bank == 0 { 0 } else { 1 + label as u16 });
-            raw.source.push(SourcePixel::default());
-        }
-    }
-    let camera_to_world = CameraToWorld::look_at(
-        DVec3::new(0.07, -0.03, 0.0),
-        DVec3::new(0.0, 0.0, 4.0),
-        DVec3::NEG_Y,
-        "bench",
-    )?;
-    let (gaussians, _) = Gaussians::sanitize(raw)?;
-    Ok((gaussians, Camera { intrinsics: lens(args.size), camera_to_world }))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -400,6 +460,11 @@ mod tests {
         let args = BenchArgs {
             gaussians: 800,
             size: 24,
+            width: 24,
+            callers: 2,
+            shaders: None,
+            dump: None,
+            checked: false,
             frames: 1,
             compare_cpu: true,
             labels: Some(BenchLabels::Entries),

@@ -4,6 +4,7 @@
 use std::{
     collections::BTreeMap,
     fmt::Write as _,
+    path::PathBuf,
     sync::{Arc, atomic::AtomicBool},
     time::Instant,
 };
@@ -12,12 +13,12 @@ use serde_json::json;
 
 use super::{engine, output::Output};
 use crate::{
-    bench::{self, BenchArgs, BenchLabels, LabelTimes},
+    bench::{self, BenchArgs, BenchLabels, CallerTimes, LabelTimes},
     config::{Config, ConfigArgs},
     error::{Error, Result},
     jobs::{PipelineMaker, SceneMaker, Work},
     pipeline::Engine,
-    render::{Kinds, Labels, Quality, RenderRequest},
+    render::{DeviceTimes, Kinds, Labels, Quality, RenderRequest},
     sample::{self, SampleOptions},
     scene::SceneOptions,
     service::default_near,
@@ -37,9 +38,24 @@ pub(super) struct Args {
     /// Times the renderer alone, on a generated scene of this many Gaussians
     #[arg(long)]
     gaussians: Option<usize>,
-    /// With --gaussians: side of the square view in pixels
+    /// With --gaussians: side of the square view in pixels, its height with --width
     #[arg(long, default_value_t = 256)]
     size: u32,
+    /// With --gaussians: width of the view in pixels [default: its height]
+    #[arg(long)]
+    width: Option<u32>,
+    /// With --gaussians: also times this many callers at once
+    #[arg(long, default_value_t = 0)]
+    callers: usize,
+    /// With --gaussians: folder whose files stand in for the shaders
+    #[arg(long, hide = true)]
+    shaders: Option<PathBuf>,
+    /// With --gaussians: has the shaders check every index and loop
+    #[arg(long, hide = true)]
+    checked: bool,
+    /// With --gaussians: file to write the scene, the camera and the picture to (safetensors)
+    #[arg(long)]
+    dump: Option<PathBuf>,
     /// With --gaussians: frames after the first
     #[arg(long, default_value_t = 50)]
     frames: usize,
@@ -86,7 +102,20 @@ fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Resul
         LabelArg::Blend => BenchLabels::Blend,
         LabelArg::Entries => BenchLabels::Entries,
     });
-    let wanted = BenchArgs { gaussians, size, frames, compare_cpu, labels, bank: args.bank };
+    let width = args.width.unwrap_or(size);
+    let wanted = BenchArgs {
+        gaussians,
+        size,
+        width,
+        callers: args.callers,
+        shaders: args.shaders.clone(),
+        dump: args.dump.clone(),
+        checked: args.checked,
+        frames,
+        compare_cpu,
+        labels,
+        bank: args.bank,
+    };
     let report = bench::run(&wanted, config)?;
     let mut text = String::new();
     for adapter in &report.adapters {
@@ -96,7 +125,7 @@ fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Resul
     }
     let _ = writeln!(
         text,
-        "{} Gaussians at {size}x{size} px on {}: open {:.1} ms, first frame {:.2} ms, \
+        "{} Gaussians at {width}x{size} px on {}: open {:.1} ms, first frame {:.2} ms, \
          median {:.3} ms, fastest {:.3} ms ({} visible, {} tile pairs)",
         report.gaussians,
         report.renderer,
@@ -107,6 +136,16 @@ fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Resul
         report.visible,
         report.intersections
     );
+    if let Some(times) = &report.device {
+        device(&mut text, "colour", times);
+    }
+    if let Some(CallerTimes { callers, one_per_s, all_per_s }) = &report.callers {
+        let _ = writeln!(
+            text,
+            "one caller {one_per_s:.0} views/s, {callers} callers {all_per_s:.0} views/s ({:.2}x)",
+            all_per_s / one_per_s
+        );
+    }
     if let Some(found) = &report.compared {
         let _ = writeln!(
             text,
@@ -116,14 +155,20 @@ fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Resul
         );
     }
     if let Some(times) = &report.labels {
-        let LabelTimes { labels, bank, color_ms, labels_ms, both_ms, ratio, entries, compared } =
-            times;
+        let LabelTimes { labels, bank, color_ms, labels_ms, both_ms, ratio, entries, .. } = times;
         let _ = writeln!(
             text,
             "{labels:?} of a bank of {bank}: colour alone {color_ms:.3} ms, labels alone \
              {labels_ms:.3} ms ({ratio:.2}x), both {both_ms:.3} ms, {entries} entries"
         );
-        if let Some(found) = compared {
+        for (name, times) in
+            [("labels alone", &times.device), ("colour, depth and labels", &times.device_all)]
+        {
+            if let Some(times) = times {
+                device(&mut text, name, times);
+            }
+        }
+        if let Some(found) = &times.compared {
             let _ = writeln!(
                 text,
                 "  against the CPU renderer: max {:.2e}, mean {:.2e}, {} of {} px flipped at a \
@@ -133,6 +178,14 @@ fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Resul
         }
     }
     out.answer(&text, &report)
+}
+
+fn device(text: &mut String, name: &str, times: &DeviceTimes) {
+    let _ = write!(text, "{name} on the device: {:.3} ms;", times.total_ms);
+    for stage in &times.stages {
+        let _ = write!(text, " {} {:.3}", stage.stage, stage.ms);
+    }
+    text.push('\n');
 }
 
 fn stages(args: &Args, config: &Config, out: &Output) -> Result<()> {
