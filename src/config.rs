@@ -96,6 +96,9 @@ pub struct ConfigArgs {
     /// Milliseconds that open calls get to end after that [default: 10000]
     #[arg(long, env = "SEGSPLAT_DRAIN_MS")]
     pub drain_ms: Option<u64>,
+    /// Collector of traces, OTLP over HTTP, as `http://host:4318` [default: what OTEL_* name]
+    #[arg(long, env = "SEGSPLAT_OTLP", value_name = "URL")]
+    pub otlp: Option<String>,
     /// Log filter in tracing's syntax [default: info,ort=warn]
     #[arg(long, env = "SEGSPLAT_LOG")]
     pub log: Option<String>,
@@ -145,6 +148,8 @@ pub struct Config {
     pub drain_notice_ms: u64,
     /// Milliseconds that open calls get to end after that.
     pub drain_ms: u64,
+    /// Collector of traces; `None`: what the `OTEL_*` variables say.
+    pub otlp: Option<String>,
     /// Log filter.
     pub log: String,
     /// Log lines as JSON.
@@ -173,6 +178,7 @@ impl Default for Config {
             cors_origins: Vec::new(),
             drain_notice_ms: 0,
             drain_ms: 10_000,
+            otlp: None,
             log: "info,ort=warn".to_owned(),
             log_json: false,
             limits: Limits::default(),
@@ -216,6 +222,7 @@ impl Config {
                 .or(from_file.drain_notice_ms)
                 .unwrap_or(d.drain_notice_ms),
             drain_ms: typed.drain_ms.or(from_file.drain_ms).unwrap_or(d.drain_ms),
+            otlp: typed.otlp.or(from_file.otlp),
             log: typed.log.or(from_file.log).unwrap_or(d.log),
             log_json: typed.log_json.or(from_file.log_json).unwrap_or(d.log_json),
             limits: typed.limits.or(from_file.limits).unwrap_or(d.limits),

@@ -10,7 +10,7 @@
 //!
 //! | layer | modules | may use |
 //! |---|---|---|
-//! | L0 nouns | [`scene`], [`error`], [`limits`], [`keys`], [`config`] | nothing above (`scene` uses `error`, `limits`) |
+//! | L0 nouns | [`scene`], [`error`], [`limits`], [`keys`], [`config`], [`telemetry`] | nothing above (`scene` uses `error`, `limits`) |
 //! | L1 verbs | [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`render`], [`store`], [`sample`] | L0; never each other |
 //! | L2 | [`pipeline`] | L1: the only place that knows the order of the stages |
 //! | L3 | [`jobs`] | `pipeline`, `store` |
@@ -42,6 +42,7 @@ pub mod segment;
 pub mod semantics;
 pub mod service;
 pub mod store;
+pub mod telemetry;
 
 /// The numeric example of `docs/conventions.md`, run by the doc tests.
 #[cfg(doctest)]

@@ -20,27 +20,38 @@ use crate::{
     keys::{Caller, Keys, Scope},
 };
 
-/// What the gRPC methods of the one service need; the HTTP routes say it themselves, and a test
-/// holds the two together.
-const RPCS: [(&str, Scope); 10] = [
-    ("CreateScene", Scope::Write),
-    ("DeleteScene", Scope::Write),
-    ("Export", Scope::Read),
-    ("GetScene", Scope::Read),
-    ("ListScenes", Scope::Read),
-    ("Pick", Scope::Read),
-    ("Query", Scope::Read),
-    ("RenderView", Scope::Read),
-    ("RenderViews", Scope::Read),
-    ("WatchScene", Scope::Read),
+/// The gRPC methods of the one service: name in metrics and what each needs. The HTTP routes say it
+/// themselves, and a test holds the two together.
+const RPCS: [(&str, &str, Scope); 10] = [
+    ("CreateScene", "create_scene", Scope::Write),
+    ("DeleteScene", "delete_scene", Scope::Write),
+    ("Export", "export", Scope::Read),
+    ("GetScene", "get_scene", Scope::Read),
+    ("ListScenes", "list_scenes", Scope::Read),
+    ("Pick", "pick", Scope::Read),
+    ("Query", "query", Scope::Read),
+    ("RenderView", "render_view", Scope::Read),
+    ("RenderViews", "render_views", Scope::Read),
+    ("WatchScene", "watch_scene", Scope::Read),
 ];
 
-/// What a gRPC path needs; `None` for health and reflection, which tell nothing of scenes.
-pub(super) fn of_rpc(path: &str) -> Option<Scope> {
-    let method = path.strip_prefix("/segsplat.v1.SceneService/")?;
+/// Name in metrics of calls that are none of ours: health, reflection, unknown routes.
+pub(super) const OTHER: &str = "other";
+
+/// Name in metrics of a gRPC path, and what it needs; health and reflection, which tell nothing of
+/// scenes, need nothing.
+pub(super) fn of_rpc(path: &str) -> (&'static str, Option<Scope>) {
+    let Some(method) = path.strip_prefix("/segsplat.v1.SceneService/") else {
+        return (OTHER, None);
+    };
     // A method added without a row here is nobody's but the admin's.
-    let row = RPCS.iter().find(|(name, _)| *name == method);
-    Some(row.map_or(Scope::Admin, |(_, scope)| *scope))
+    let row = RPCS.iter().find(|(name, ..)| *name == method);
+    row.map_or((OTHER, Some(Scope::Admin)), |(_, call, scope)| (call, Some(*scope)))
+}
+
+/// Names in metrics of all gRPC calls.
+pub(super) fn rpc_calls() -> impl Iterator<Item = &'static str> {
+    RPCS.iter().map(|(_, call, _)| *call).chain([OTHER])
 }
 
 /// Leave to call; gives its place back when dropped.
@@ -194,6 +205,16 @@ mod tests {
         ] {
             assert_eq!(code(&access, shown, scope), want, "{shown:?} for {scope:?}");
         }
+    }
+
+    #[test]
+    fn a_method_without_a_row_is_the_admins() {
+        let of = |method: &str| of_rpc(&format!("/segsplat.v1.SceneService/{method}"));
+        assert_eq!(of("Pick"), ("pick", Some(Scope::Read)));
+        assert_eq!(of("DeleteScene"), ("delete_scene", Some(Scope::Write)));
+        assert_eq!(of("Nothing"), (OTHER, Some(Scope::Admin)));
+        assert_eq!(of_rpc("/grpc.health.v1.Health/Check"), (OTHER, None));
+        assert_eq!(rpc_calls().count(), RPCS.len() + 1);
     }
 
     #[test]

@@ -10,7 +10,10 @@ use std::{
 
 use tokio::sync::{Notify, watch};
 
-use crate::error::{Error, ErrorCode, Result};
+use crate::{
+    error::{Error, ErrorCode, Result},
+    telemetry::meter,
+};
 
 /// When a caller who was turned away may come back, seconds: to the next server, not this one.
 const RETRY_AFTER_S: u32 = 1;
@@ -34,6 +37,7 @@ pub(super) struct Inside(Life);
 impl Drop for Inside {
     fn drop(&mut self) {
         self.0.0.inside.fetch_sub(1, Ordering::AcqRel);
+        meter::inflight(-1.0);
         self.0.0.left.notify_waiters();
     }
 }
@@ -43,6 +47,7 @@ impl Life {
     pub(super) fn enter(&self) -> Result<Inside> {
         // Counted first, so that a drain that begins between the two lines waits for it.
         self.0.inside.fetch_add(1, Ordering::AcqRel);
+        meter::inflight(1.0);
         let inside = Inside(self.clone());
         if self.is_draining() {
             return Err(Error::new(ErrorCode::Stopping, "the server is stopping; call again")

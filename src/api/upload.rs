@@ -12,6 +12,7 @@ use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
     scene::{Upload, UploadCameras, UploadFile},
+    telemetry::meter,
 };
 
 /// Bytes that all uploads in flight may hold together.
@@ -25,6 +26,11 @@ impl UploadBudget {
     /// A budget of `max` bytes.
     pub(super) fn new(max: usize) -> Self {
         Self { held: Arc::default(), max }
+    }
+
+    /// Bytes held now.
+    pub(super) fn held_bytes(&self) -> usize {
+        self.held.load(Ordering::Relaxed)
     }
 }
 
@@ -171,6 +177,7 @@ impl<'a> UploadBuilder<'a> {
     fn account(&mut self, bytes: usize) -> Result<()> {
         let guard = &mut self.guard;
         guard.held += bytes;
+        meter::uploaded(bytes);
         let all = guard.budget.held.fetch_add(bytes, Ordering::Relaxed) + bytes;
         if guard.held > self.limits.upload_bytes_max {
             return Err(Error::limit(

@@ -26,7 +26,8 @@ use clap::{Parser, Subcommand};
 use self::output::Output;
 use crate::{
     config::{Config, ConfigArgs},
-    error::{Error, Result},
+    error::Result,
+    telemetry,
 };
 
 /// Posed photos in; a 3D Gaussian scene and views at any pose out.
@@ -117,7 +118,8 @@ fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
     if quiet {
         "warn".clone_into(&mut config.log);
     }
-    start_log(&config)?;
+    // Answers stand alone on standard output; the spans that are left go out at the end.
+    let _spans = telemetry::start(&config)?;
     match &cli.command {
         Command::Serve(args) => {
             let (file, typed) = (cli.config.clone(), args.config.clone());
@@ -135,15 +137,4 @@ fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
         Command::Bench(args) => bench::run(args, &config, out),
         Command::Sample(args) => measure::sample(args, out),
     }
-}
-
-/// The log goes to standard error, so that answers stand alone on standard output.
-fn start_log(config: &Config) -> Result<()> {
-    let filter = tracing_subscriber::EnvFilter::try_new(&config.log)
-        .map_err(|e| Error::invalid(format!("log: {:?} is no filter: {e}", config.log)))?;
-    let log = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
-    let started = if config.log_json { log.json().try_init() } else { log.try_init() };
-    // Already started: a test runs commands in one process.
-    drop(started);
-    Ok(())
 }

@@ -20,6 +20,7 @@ use crate::{
         SemanticsStatus, Upload,
     },
     store::Record,
+    telemetry::meter,
 };
 
 /// A scene whose meaning is asked for, and how its making tells where it is.
@@ -194,6 +195,7 @@ impl Shared {
             }
             let outcome = catch_unwind(AssertUnwindSafe(|| self.understand(&id, &stop)))
                 .unwrap_or_else(|panic| Err(panicked(&*panic)));
+            meter::job("semantics", stop.outcome(outcome.is_ok()));
             if let Err(error) = outcome {
                 self.give_up(&id, &stop, &error);
             }

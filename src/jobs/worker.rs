@@ -19,6 +19,7 @@ use crate::{
         SemanticsState, SemanticsStatus,
     },
     store::{self, Record},
+    telemetry::meter,
 };
 
 /// Starts of one job before it is given up: a scene that kills the server must not do so forever.
@@ -71,6 +72,16 @@ impl Stop {
         }
     }
 
+    /// How the work ended, for metrics.
+    pub(super) fn outcome(&self, done: bool) -> &'static str {
+        match (done, self.reason()) {
+            (true, _) => "done",
+            (false, BY_CALLER) => "cancelled",
+            (false, BY_SHUTDOWN) => "requeued",
+            (false, _) => "failed",
+        }
+    }
+
     fn reason(&self) -> u8 {
         self.reason.load(Ordering::Acquire)
     }
@@ -94,6 +105,7 @@ impl Shared {
             // Whatever `make` panics with, its half-made values die with it.
             let outcome = catch_unwind(AssertUnwindSafe(|| self.run(&id, &stop)))
                 .unwrap_or_else(|panic| Err(panicked(&*panic)));
+            meter::job("scene", stop.outcome(outcome.is_ok()));
             if let Err(error) = outcome {
                 self.settle(&id, &stop, &error);
             }
@@ -110,6 +122,8 @@ impl Shared {
         }) else {
             return Ok(());
         };
+        let waited_ms = record.status.updated_ms.saturating_sub(record.status.created_ms);
+        meter::stage("wait", Duration::from_millis(waited_ms).as_secs_f64());
         if record.attempts > ATTEMPTS_MAX {
             return Err(Error::internal(format!(
                 "given up: the server stopped {ATTEMPTS_MAX} times while making this scene"

@@ -29,6 +29,7 @@ use crate::{
         Backdrop, Camera, Capture, Gaussians, HealthReport, Intrinsics, PosedPhoto, SceneCamera,
         SceneOptions, StageTime, Upload, ViewSet,
     },
+    telemetry::meter,
 };
 
 /// A stage of making a scene, in order.
@@ -257,6 +258,7 @@ impl Run<'_> {
         let start = Instant::now();
         let done = work(self)?;
         let ms = start.elapsed().as_secs_f64() * 1e3;
+        meter::stage(stage.name(), ms / 1e3);
         self.times.push(StageTime { stage: stage.name().to_owned(), ms });
         (self.progress)(stage, 1.0);
         Ok(done)

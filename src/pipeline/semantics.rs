@@ -24,6 +24,7 @@ use crate::{
         ScoringProfile, Semantics, SemanticsReport, StageTime, Upload,
     },
     semantics::{self, Clusters, Cutter, NetworkPicture, Scoring, Views},
+    telemetry::meter,
 };
 
 /// Canonical phrases of the profile `paper`.
@@ -350,6 +351,7 @@ fn timed<T>(
     let start = Instant::now();
     let done = work()?;
     let ms = start.elapsed().as_secs_f64() * 1e3;
+    meter::stage(stage.name(), ms / 1e3);
     times.push(StageTime { stage: stage.name().to_owned(), ms });
     (watch.progress)(stage, 1.0);
     Ok(done)

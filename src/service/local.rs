@@ -8,7 +8,7 @@ use super::{
     query::{Ground, gaussians_of, selected},
     texts,
     types::{Kind, PickSpec, Picked, QueryAnswer, QuerySpec, RenderedView, ViewSpec},
-    view::{Told, check_ask, resolve_one},
+    view::{Told, resolve_one},
 };
 use crate::{
     error::{Error, ErrorCode, Result},
@@ -60,7 +60,7 @@ impl Local {
     /// # Errors
     /// As there; `semantics_off` where the scene has no semantics.
     pub fn render(&self, scene: &Scene, spec: &ViewSpec) -> Result<RenderedView> {
-        let ask = check_ask(&[spec.kind], &spec.ask, &self.limits)?;
+        let ask = texts::check_ask(&[spec.kind], &spec.ask, &self.limits)?;
         let view = resolve_one(scene, spec.camera, spec.kind, &spec.options, &self.limits)?;
         let told = if spec.kind.needs_semantics() {
             let semantics = self.semantics(scene, &format!("kind={}", spec.kind.name()))?;

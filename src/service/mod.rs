@@ -290,6 +290,12 @@ impl Service {
         }
     }
 
+    /// Bytes of scenes in memory.
+    #[must_use]
+    pub fn cached_bytes(&self) -> u64 {
+        self.inner.store.cached_bytes()
+    }
+
     /// Takes no more jobs, stops those at work (the next start takes them up again). Blocks.
     pub fn shut_down(&self) {
         self.inner.jobs.shut_down();

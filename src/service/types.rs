@@ -455,6 +455,8 @@ pub struct RenderedView {
     pub stats: FrameStats,
     /// Time of rendering, without waiting and encoding, milliseconds.
     pub render_ms: f64,
+    /// Time of encoding, milliseconds.
+    pub encode_ms: f64,
 }
 
 impl fmt::Debug for RenderedView {

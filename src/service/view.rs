@@ -22,6 +22,7 @@ use crate::{
     scene::{Camera, Intrinsics, Region, Scene, SceneCamera, SceneId, SceneState, Semantics},
     semantics::{Scorer, mask_from_blend},
     store::Record,
+    telemetry::meter,
 };
 
 /// Near plane where none is asked for, as a share of the scene's median depth.
@@ -185,8 +186,10 @@ impl Resolved {
         let started = Instant::now();
         let (frame, source) = self.drawn(renderer, scene, told)?;
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
+        meter::stage("render", render_ms / 1e3);
         let name = renderer.name();
         let view = |&kind: &Kind| -> Result<RenderedView> {
+            let encoding = Instant::now();
             let (bytes, depth_scale) = match (kind.needs_semantics(), told, &source) {
                 (true, Some(told), Some(source)) => {
                     (self.answer(kind, told, source, &frame)?, None)
@@ -196,6 +199,8 @@ impl Resolved {
                     (encoded.bytes, encoded.depth_scale)
                 }
             };
+            let encode_ms = encoding.elapsed().as_secs_f64() * 1e3;
+            meter::stage("encode", encode_ms / 1e3);
             let asked = if kind.needs_semantics() { asked } else { "" };
             Ok(RenderedView {
                 camera_index: self.camera_index,
@@ -209,6 +214,7 @@ impl Resolved {
                 etag: self.etag(scene_tag, &name, kind, asked),
                 stats: frame.stats,
                 render_ms,
+                encode_ms,
             })
         };
         self.kinds.iter().map(view).collect()
@@ -336,30 +342,6 @@ impl Resolved {
     }
 }
 
-/// Refuses a text without a kind that takes one, and such a kind without a text; gives the text
-/// checked.
-pub(super) fn check_ask(kinds: &[Kind], ask: &Ask, limits: &Limits) -> Result<Ask> {
-    let takes = kinds.iter().find(|kind| kind.takes_text());
-    let text = match (&ask.text, takes) {
-        (None, None) => None,
-        (Some(text), Some(_)) => Some(texts::checked(text, "text", limits)?),
-        (None, Some(kind)) => {
-            return Err(Error::invalid(format!(
-                "kind={} needs text: what to look for",
-                kind.name()
-            )));
-        }
-        (Some(_), None) => {
-            let names: Vec<_> = kinds.iter().map(|kind| kind.name()).collect();
-            return Err(Error::invalid(format!(
-                "text goes with kind=relevancy and kind=mask, not with {}",
-                names.join(", ")
-            )));
-        }
-    };
-    Ok(Ask { text, ..ask.clone() })
-}
-
 /// The near plane of a scene whose median depth is `median_depth`, world units.
 #[must_use]
 pub fn default_near(median_depth: f64) -> f32 {
@@ -387,7 +369,10 @@ impl Inner {
 
     /// The scene itself; marks it when its file turns out to be bad. Blocks on the disk.
     pub(super) fn load(&self, id: &SceneId) -> Result<Arc<Scene>> {
-        self.store.scene(id).inspect_err(|error| {
+        let started = Instant::now();
+        let scene = self.store.scene(id);
+        meter::stage("load", started.elapsed().as_secs_f64());
+        scene.inspect_err(|error| {
             if error.code() == ErrorCode::SceneCorrupt {
                 self.jobs.spoil(id, error);
             }
@@ -412,7 +397,7 @@ impl Inner {
         if let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) {
             self.can_understand(&format!("kind={}", kind.name()))?;
         }
-        check_ask(kinds, ask, &self.limits())
+        texts::check_ask(kinds, ask, &self.limits())
     }
 
     /// Renders on a blocking thread within the deadline; encodes each kind.
@@ -449,9 +434,11 @@ impl Inner {
         let started = Instant::now();
         let work = async {
             let pass = self.gate.enter().await?;
+            meter::stage("queue", started.elapsed().as_secs_f64());
+            let span = tracing::Span::current();
             tokio::task::spawn_blocking(move || {
                 let _pass = pass;
-                work()
+                span.in_scope(work)
             })
             .await
             .map_err(|e| Error::internal("the work was broken off").caused_by(e))?

@@ -54,6 +54,10 @@ impl Cache {
         inner.scenes.insert(scene.meta.id.clone(), (scene, now));
     }
 
+    pub(super) fn size_bytes(&self) -> u64 {
+        self.lock().size_bytes
+    }
+
     pub(super) fn remove(&self, id: &SceneId) {
         self.lock().take(id);
     }

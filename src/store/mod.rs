@@ -67,6 +67,12 @@ impl Store {
         self.root.join("scenes").join(id.as_str())
     }
 
+    /// Bytes of scenes in memory.
+    #[must_use]
+    pub fn cached_bytes(&self) -> u64 {
+        self.cache.size_bytes()
+    }
+
     /// Keeps an upload and its first record: all of it or nothing, safe on disk on return.
     ///
     /// # Errors

@@ -12,7 +12,7 @@ use segsplat::{
 
 use crate::common::{
     doors::{Ask, Door, Fault, Options, both, both_with, bytes, fault_of},
-    stand::{BoardMaker, Stand, upload},
+    server::{TestServer, upload},
 };
 
 /// Every call, named as the gRPC methods are, and what it needs.
@@ -53,11 +53,11 @@ fn write_keys(path: &Path, rest: &str) {
 }
 
 /// A server that asks for keys.
-async fn guarded(rest: &str) -> (tempfile::TempDir, Stand) {
+async fn guarded(rest: &str) -> (tempfile::TempDir, TestServer) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("keys.toml");
     write_keys(&path, rest);
-    let stand = Stand::with(BoardMaker::default(), |config| config.keys = Some(path)).await;
+    let stand = TestServer::with(|config, _| config.keys = Some(path)).await;
     (folder, stand)
 }
 
@@ -246,7 +246,7 @@ async fn without_a_key_http_says_how_to_show_one_and_health_asks_none() {
 
 #[tokio::test]
 async fn only_named_origins_may_call_from_a_page() {
-    let stand = Stand::with(BoardMaker::default(), |config| {
+    let stand = TestServer::with(|config, _| {
         config.cors_origins = vec!["https://ours.example".to_owned()];
     })
     .await;

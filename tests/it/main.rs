@@ -37,6 +37,7 @@ mod sample;
 mod segment;
 mod shader_layout;
 mod store;
+mod telemetry;
 mod texts;
 mod tidy;
 mod tls;

@@ -12,7 +12,7 @@ use axum::{
     middleware::Next,
     response::{IntoResponse, Response},
 };
-use tracing::{Instrument, field::Empty};
+use tracing::{Instrument, Span, field::Empty};
 
 use super::{
     error::{ApiError, Fault, panic_error},
@@ -28,17 +28,23 @@ use crate::{
     },
     error::{Error, ErrorCode},
     keys::Scope,
+    telemetry::{self, meter},
 };
 
 /// The caller's own deadline, for handlers that hand it on.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Deadline(pub(super) Duration);
 
+/// Name of the call that gave an answer, for metrics.
+#[derive(Clone, Copy, Debug)]
+struct Call(&'static str);
+
 /// Around every HTTP call.
 pub(super) async fn rest(request: Request, next: Next) -> Response {
     let id = id_of(request.headers());
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
     let span = tracing::info_span!("http", %method, path, request_id = id, key = Empty);
+    follow(&span, request.headers());
     rest_within(request, next, id, method, path).instrument(span).await
 }
 
@@ -66,28 +72,54 @@ async fn rest_within(
         response = dress(&response);
     }
     let status = response.status().as_u16();
-    let ms = started.elapsed().as_secs_f64() * 1e3;
-    if let Some(fault) = response.extensions_mut().remove::<Fault>() {
+    let took = started.elapsed();
+    let ms = took.as_secs_f64() * 1e3;
+    let call = response.extensions().get::<Call>().map_or(access::OTHER, |Call(name)| name);
+    let fault = response.extensions_mut().remove::<Fault>();
+    let code = fault.as_ref().map_or("ok", |fault| fault.error().code().name());
+    meter::answered("http", call, code, took);
+    if let Some(fault) = fault {
         log_fault(fault.error(), &format!("{method} {path}"), ms);
         response = fault.write(response, &id);
     } else {
         tracing::debug!(status, ms, "served");
     }
     stamp(&mut response, &id);
+    time(&mut response, ms);
     response
 }
 
-/// Around each route that needs a scope: lets the caller in, or not.
+/// Makes the call a part of the caller's own trace.
+fn follow(span: &Span, headers: &HeaderMap) {
+    if let Some(parent) = headers.get("traceparent").and_then(|value| value.to_str().ok()) {
+        telemetry::follow(span, parent);
+    }
+}
+
+/// Adds the whole time to those of the stages.
+fn time(response: &mut Response, ms: f64) {
+    if let Ok(value) = HeaderValue::from_str(&format!("total;dur={ms:.2}")) {
+        response.headers_mut().append("server-timing", value);
+    }
+}
+
+/// Around each route: lets the caller in, or not, and says which call it is.
 pub(super) async fn guard(
-    State((api, scope)): State<(Api, Scope)>,
+    State((api, call, scope)): State<(Api, &'static str, Option<Scope>)>,
     mut request: Request,
     next: Next,
 ) -> Response {
-    let held = check_origin(&api, &request).and_then(|()| let_in(&api, scope, &mut request));
-    match held {
-        Ok(held) => hold(next.run(request).await, held),
-        Err(error) => ApiError::from(error).into_response(),
-    }
+    let held = scope.map(|scope| {
+        check_origin(&api, &request)?;
+        let_in(&api, scope, &mut request)
+    });
+    let mut response = match held {
+        None => next.run(request).await,
+        Some(Ok(held)) => hold(next.run(request).await, held),
+        Some(Err(error)) => ApiError::from(error).into_response(),
+    };
+    response.extensions_mut().insert(Call(call));
+    response
 }
 
 /// Refuses pages of other origins where no key is asked for: a browser on this machine would let
@@ -119,7 +151,7 @@ fn let_in(api: &Api, scope: Scope, request: &mut Request) -> Result<(Inside, Pas
     let shown = shown.as_ref().map(|value| value.to_str().unwrap_or_default());
     let pass = api.access.admit(shown, scope)?;
     if let Some(key) = &pass.key {
-        tracing::Span::current().record("key", &**key);
+        Span::current().record("key", &**key);
     }
     request.extensions_mut().insert(pass.caller.clone());
     Ok((inside, pass))
@@ -130,6 +162,7 @@ pub(super) async fn rpc(State(api): State<Api>, request: Request, next: Next) ->
     let id = id_of(request.headers());
     let path = request.uri().path().to_owned();
     let span = tracing::info_span!("grpc", path, request_id = id, key = Empty);
+    follow(&span, request.headers());
     rpc_within(api, request, next, id, path).instrument(span).await
 }
 
@@ -144,7 +177,8 @@ async fn rpc_within(
         request.headers_mut().insert(request_id::HEADER, value);
     }
     let started = Instant::now();
-    let held = access::of_rpc(&path).map(|scope| let_in(&api, scope, &mut request)).transpose();
+    let (call, scope) = access::of_rpc(&path);
+    let held = scope.map(|scope| let_in(&api, scope, &mut request)).transpose();
     let mut response = match (held, deadline_of_grpc(request.headers())) {
         (Err(error), _) => {
             log_fault(&error, &path, 0.0);
@@ -158,11 +192,14 @@ async fn rpc_within(
             }
         }
     };
-    let ms = started.elapsed().as_secs_f64() * 1e3;
+    let took = started.elapsed();
+    let ms = took.as_secs_f64() * 1e3;
     grpc::complete(response.headers_mut());
-    let status = response.headers().get("grpc-status").and_then(|v| v.to_str().ok());
-    tracing::debug!(status, ms, "served");
+    let text = |name| response.headers().get(name).and_then(|value| value.to_str().ok());
+    meter::answered("grpc", call, text("segsplat-code").unwrap_or("ok"), took);
+    tracing::debug!(status = text("grpc-status"), ms, "served");
     stamp(&mut response, &id);
+    time(&mut response, ms);
     response
 }
 

@@ -3,12 +3,16 @@
 use axum::{
     Json,
     extract::State,
-    http::StatusCode,
+    http::{StatusCode, header},
     response::{IntoResponse, Response},
 };
 
 use super::{error::ApiError, extract::Called, openapi, params::Params};
-use crate::{api::Api, service::ModelsInfo};
+use crate::{
+    api::Api,
+    service::ModelsInfo,
+    telemetry::meter::{self, Levels},
+};
 
 /// `GET /healthz`: the process answers.
 #[utoipa::path(
@@ -32,6 +36,27 @@ pub(super) async fn ready(State(api): State<Api>) -> Response {
     readiness.ready &= !api.life.is_ending();
     let status = if readiness.ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
     (status, Json(readiness)).into_response()
+}
+
+/// `GET /metrics`
+#[utoipa::path(
+    get, path = "/metrics", operation_id = "metrics", tag = "server",
+    responses((
+        status = 200, content_type = "text/plain", body = String,
+        description = "Metrics in the text format of Prometheus; needs an admin's key"
+    ))
+)]
+pub(super) async fn metrics(State(api): State<Api>) -> Result<Response, ApiError> {
+    let readiness = api.service.ready();
+    let text = meter::text(Levels {
+        ready: readiness.ready && !api.life.is_ending(),
+        jobs_queued: readiness.jobs_queued,
+        jobs_running: readiness.jobs_running,
+        renders: readiness.renders,
+        cache_bytes: api.service.cached_bytes(),
+        uploads_held_bytes: api.uploads.held_bytes(),
+    })?;
+    Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], text).into_response())
 }
 
 /// `GET /v1/models`

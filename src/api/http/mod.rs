@@ -29,10 +29,13 @@ use axum::{
 };
 use tower_http::catch_panic::CatchPanicLayer;
 
-use super::{Api, grpc};
-use crate::{error::Result, keys::Scope};
+use super::{Api, access, grpc};
+use crate::{error::Result, keys::Scope, telemetry::meter};
 
 pub use self::serve::{Doors, serve};
+
+/// Name of the one call that the configuration can open.
+const METRICS: &str = "metrics";
 
 /// One call of the HTTP door.
 #[derive(Clone, Debug)]
@@ -41,6 +44,8 @@ pub struct Route {
     pub method: &'static str,
     /// Path with `{id}` where an id goes.
     pub path: &'static str,
+    /// Name in metrics: that of the gRPC method where there is one.
+    pub call: &'static str,
     /// What a key must be good for; `None`: nobody is asked.
     pub scope: Option<Scope>,
     handler: MethodRouter<Api>,
@@ -48,52 +53,69 @@ pub struct Route {
 
 fn get<H: Handler<T, Api>, T: 'static>(
     path: &'static str,
+    call: &'static str,
     scope: impl Into<Option<Scope>>,
     handler: H,
 ) -> Route {
-    Route { method: "GET", path, scope: scope.into(), handler: routing::get(handler) }
+    Route { method: "GET", path, call, scope: scope.into(), handler: routing::get(handler) }
 }
 
-fn post<H: Handler<T, Api>, T: 'static>(path: &'static str, scope: Scope, handler: H) -> Route {
-    Route { method: "POST", path, scope: Some(scope), handler: routing::post(handler) }
+fn post<H: Handler<T, Api>, T: 'static>(
+    path: &'static str,
+    call: &'static str,
+    scope: Scope,
+    handler: H,
+) -> Route {
+    Route { method: "POST", path, call, scope: Some(scope), handler: routing::post(handler) }
 }
 
-fn delete<H: Handler<T, Api>, T: 'static>(path: &'static str, scope: Scope, handler: H) -> Route {
-    Route { method: "DELETE", path, scope: Some(scope), handler: routing::delete(handler) }
+fn delete<H: Handler<T, Api>, T: 'static>(
+    path: &'static str,
+    call: &'static str,
+    scope: Scope,
+    handler: H,
+) -> Route {
+    Route { method: "DELETE", path, call, scope: Some(scope), handler: routing::delete(handler) }
 }
 
 /// Every call of the HTTP door.
 #[must_use]
 pub fn routes() -> Vec<Route> {
-    use Scope::{Read, Write};
+    use Scope::{Admin, Read, Write};
     vec![
-        post("/v1/scenes", Write, scenes::create),
-        get("/v1/scenes", Read, scenes::list),
-        get("/v1/scenes/{id}", Read, scenes::get),
-        delete("/v1/scenes/{id}", Write, scenes::delete),
-        get("/v1/scenes/{id}/events", Read, scenes::events),
-        get("/v1/scenes/{id}/view", Read, render::view),
-        post("/v1/scenes/{id}/views", Read, views::views),
-        post("/v1/scenes/{id}/query", Read, ask::query),
-        get("/v1/scenes/{id}/pick", Read, ask::pick),
-        get("/v1/scenes/{id}/export", Read, render::export),
-        get("/v1/models", Read, health::models),
-        get("/healthz", None, health::live),
-        get("/readyz", None, health::ready),
-        get("/openapi.json", None, openapi::document),
-        get("/", None, viewer::index),
+        post("/v1/scenes", "create_scene", Write, scenes::create),
+        get("/v1/scenes", "list_scenes", Read, scenes::list),
+        get("/v1/scenes/{id}", "get_scene", Read, scenes::get),
+        delete("/v1/scenes/{id}", "delete_scene", Write, scenes::delete),
+        get("/v1/scenes/{id}/events", "watch_scene", Read, scenes::events),
+        get("/v1/scenes/{id}/view", "render_view", Read, render::view),
+        post("/v1/scenes/{id}/views", "render_views", Read, views::views),
+        post("/v1/scenes/{id}/query", "query", Read, ask::query),
+        get("/v1/scenes/{id}/pick", "pick", Read, ask::pick),
+        get("/v1/scenes/{id}/export", "export", Read, render::export),
+        get("/v1/models", "models", Read, health::models),
+        get("/metrics", METRICS, Admin, health::metrics),
+        get("/healthz", "live", None, health::live),
+        get("/readyz", "ready", None, health::ready),
+        get("/openapi.json", "openapi", None, openapi::document),
+        get("/", "viewer", None, viewer::index),
     ]
 }
 
 /// Both doors as one router.
 fn app(api: &Api) -> Result<Router> {
     let rpc = grpc::routes(api.clone())?.prepare().into_axum_router().reset_fallback();
-    let guarded = |route: Route| match route.scope {
-        None => (route.path, route.handler),
-        Some(scope) => {
-            let guard = middleware::from_fn_with_state((api.clone(), scope), edge::guard);
-            (route.path, route.handler.route_layer(guard))
-        }
+    // Before the first call, so that every metric is there.
+    meter::handle()?;
+    access::rpc_calls().for_each(|call| meter::register_call("grpc", call));
+    meter::register_call("http", access::OTHER);
+    let guarded = |route: Route| {
+        meter::register_call("http", route.call);
+        let open = route.call == METRICS && api.service.config().open_metrics;
+        let scope = route.scope.filter(|_| !open);
+        let state = (api.clone(), route.call, scope);
+        let guard = middleware::from_fn_with_state(state, edge::guard);
+        (route.path, route.handler.route_layer(guard))
     };
     let rest = routes()
         .into_iter()

@@ -27,7 +27,7 @@ pub(super) async fn document() -> Json<openapi::OpenApi> {
     paths(
         scenes::create, scenes::list, scenes::get, scenes::delete, scenes::events, render::view,
         views::views, ask::query, ask::pick, render::export, health::models, health::live,
-        health::ready, document, viewer::index,
+        health::ready, health::metrics, document, viewer::index,
     ),
     components(schemas(ErrorBody)),
     tags(

@@ -113,7 +113,10 @@ pub(super) fn view_headers(view: &RenderedView) -> HeaderMap {
         ("content-type", content_type(view.format).to_owned()),
         ("etag", quoted(&view.etag)),
         ("cache-control", "private, no-cache".to_owned()),
-        ("server-timing", format!("render;dur={:.2}", view.render_ms)),
+        (
+            "server-timing",
+            format!("render;dur={:.2}, encode;dur={:.2}", view.render_ms, view.encode_ms),
+        ),
         ("x-camera-to-world", pose),
         ("x-intrinsics", lens),
     ];

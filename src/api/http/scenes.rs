@@ -26,6 +26,7 @@ use crate::{
         semantics::{check_bundle, mode},
     },
     error::{Error, Result},
+    scene::StageTime,
     service::{CreateScene, Event, Page, PageRequest, SceneOptions, SceneState, SceneStatus},
 };
 
@@ -56,13 +57,23 @@ pub(super) async fn create(
         SceneState::Done => StatusCode::CREATED,
         _ => StatusCode::ACCEPTED,
     };
+    let times = created.status.report.as_ref().map(|report| server_timing(&report.stages));
     let location = format!("/v1/scenes/{}", created.status.id);
     let body = Json(created.status);
     let mut answer = (status, [(header::LOCATION, location)], body).into_response();
+    if let Some(value) = times.and_then(|times| HeaderValue::from_str(&times).ok()) {
+        answer.headers_mut().insert("server-timing", value);
+    }
     if created.replayed {
         answer.headers_mut().insert("idempotency-replayed", HeaderValue::from_static("true"));
     }
     Ok(answer)
+}
+
+/// `stage;dur=ms` of each stage.
+fn server_timing(stages: &[StageTime]) -> String {
+    let times = stages.iter().map(|time| format!("{};dur={:.2}", time.stage, time.ms));
+    times.collect::<Vec<_>>().join(", ")
 }
 
 /// `GET /v1/scenes`

@@ -14,8 +14,11 @@ use crate::{
     config::Config,
     error::{Error, Result},
     service::Service,
+    telemetry::meter,
 };
 
+/// How often measured times are added up.
+const UPKEEP: Duration = Duration::from_secs(5);
 /// How long connections without a call may take to close.
 const CLOSING: Duration = Duration::from_millis(200);
 
@@ -96,6 +99,16 @@ async fn run<L: Listener>(
 where
     L::Addr: std::fmt::Debug,
 {
+    // What was measured is added up now and then, or it would grow where nobody asks for it.
+    let upkeep = tokio::spawn(async {
+        let mut every = tokio::time::interval(UPKEEP);
+        loop {
+            every.tick().await;
+            if let Ok(handle) = meter::handle() {
+                handle.run_upkeep();
+            }
+        }
+    });
     let (emptied, mut empty) = watch::channel(false);
     let graceful = axum::serve(listener, app).with_graceful_shutdown(async move {
         stop.await;
@@ -109,12 +122,14 @@ where
         }
         tokio::time::sleep(CLOSING).await;
     };
-    tokio::select! {
+    let served = tokio::select! {
         ended = graceful.into_future() => {
             ended.map_err(|e| Error::internal("the listener failed").caused_by(e))
         }
         () = late => Ok(()),
-    }
+    };
+    upkeep.abort();
+    served
 }
 
 /// First not ready, then nobody new, then those inside leave.

@@ -4,6 +4,7 @@
 pub(crate) mod compare;
 pub(crate) mod doors;
 pub(crate) mod meaning;
+pub(crate) mod process;
 pub(crate) mod scenes;
 pub(crate) mod server;
 pub(crate) mod stand;

@@ -6,7 +6,7 @@
 use std::{
     net::SocketAddr,
     sync::{
-        Arc,
+        Arc, LazyLock,
         atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     time::{Duration, Instant},
@@ -125,8 +125,11 @@ impl TestServer {
 
 /// Three small posed photos of the sample room, as a caller sends them.
 pub(crate) fn upload() -> Upload {
-    let options = SampleOptions { photos: 3, width: 64, height: 48, seed: 5 };
-    sample::upload(&options).expect("the options are in range")
+    static MADE: LazyLock<Upload> = LazyLock::new(|| {
+        let options = SampleOptions { photos: 3, width: 64, height: 48, seed: 5 };
+        sample::upload(&options).expect("the options are in range")
+    });
+    MADE.clone()
 }
 
 /// Colour from the first input camera.

@@ -2,7 +2,7 @@
 //! judged by the product's own code, then the first photo stands as a board of Gaussians at the
 //! capture's median depth.
 
-use std::sync::{Arc, atomic::Ordering};
+use std::sync::{Arc, LazyLock, atomic::Ordering};
 
 use glam::DVec3;
 use segsplat::{
@@ -138,7 +138,9 @@ impl Stand {
 
 /// Three small photos of the sample room, which match each other.
 pub(crate) fn upload() -> Upload {
-    sample::upload(&options()).expect("the sample is made")
+    static MADE: LazyLock<Upload> =
+        LazyLock::new(|| sample::upload(&options()).expect("the sample is made"));
+    MADE.clone()
 }
 
 /// How [`upload`] is made.
