@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use crate::{
     config::Config,
-    error::Result,
+    error::{Error, Result},
     jobs::{NoSemantics, PipelineMaker, PipelineSemantics, SemanticsMaker},
     models::Bundle,
     pipeline::Engine,
@@ -17,9 +17,17 @@ use crate::{
 /// # Errors
 /// `model_unavailable`, `gpu_unavailable`, each with what is missing.
 pub fn parts(config: &Config) -> Result<Parts> {
-    let engine = Arc::new(Engine::open(config)?);
+    // Side by side: one waits for a graphics driver where there is one, the other for a network.
+    let (engine, renderer) = std::thread::scope(|scope| {
+        let renderer = scope.spawn(|| renderer(config));
+        let engine = Engine::open(config);
+        let renderer = renderer.join().unwrap_or_else(|_| {
+            Err(Error::internal("the renderer's start was broken off: a fault of the program"))
+        });
+        (engine, renderer)
+    });
+    let (engine, renderer) = (Arc::new(engine?), renderer?);
     let models = models_info(engine.bundle(), engine.geometry().provider().name());
-    let renderer = renderer(config)?;
     let maker = Arc::new(PipelineMaker::new(Arc::clone(&engine), config.limits.clone()));
     let semantics = Arc::new(PipelineSemantics::new(engine, config.limits.clone()));
     Ok(Parts { maker, semantics, renderer, models })
