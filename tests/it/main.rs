@@ -26,6 +26,7 @@ mod http;
 mod jobs;
 mod label_twins;
 mod labels;
+mod licences;
 mod life;
 mod literal;
 mod magnify;
