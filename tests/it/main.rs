@@ -20,6 +20,7 @@ mod crop;
 mod errors;
 mod evaluate;
 mod fuzz;
+mod fuzz_input;
 mod geometry;
 mod grpc;
 mod http;
