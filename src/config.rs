@@ -51,6 +51,22 @@ pub struct ConfigArgs {
     /// Folder of the scenes [default: ./data]
     #[arg(long, env = "SEGSPLAT_DATA_DIR")]
     pub data_dir: Option<PathBuf>,
+    /// Bucket that replicas share, `s3://BUCKET/PREFIX`; its keys are `AWS_ACCESS_KEY_ID` and
+    /// `AWS_SECRET_ACCESS_KEY` of the environment [default: the data folder]
+    #[arg(long, env = "SEGSPLAT_STORE")]
+    pub store: Option<String>,
+    /// URL of an S3-compatible server [default: Amazon's]
+    #[arg(long, env = "SEGSPLAT_S3_ENDPOINT")]
+    pub s3_endpoint: Option<String>,
+    /// Region of the bucket [default: `AWS_REGION`, else us-east-1]
+    #[arg(long, env = "SEGSPLAT_S3_REGION")]
+    pub s3_region: Option<String>,
+    /// Whether the S3 endpoint may be plain http [default: false]
+    #[arg(long, env = "SEGSPLAT_S3_ALLOW_HTTP", num_args = 0..=1, default_missing_value = "true")]
+    pub s3_allow_http: Option<bool>,
+    /// Keep the photos of finished scenes; lazy semantics need them [default: true]
+    #[arg(long, env = "SEGSPLAT_KEEP_PHOTOS", num_args = 0..=1, default_missing_value = "true")]
+    pub keep_photos: Option<bool>,
     /// Folder of the model bundle [default: found beside the executable or in ./models/embedded]
     #[arg(long, env = "SEGSPLAT_BUNDLE")]
     pub bundle: Option<PathBuf>,
@@ -118,6 +134,16 @@ pub struct Config {
     pub listen: SocketAddr,
     /// Folder of the scenes.
     pub data_dir: PathBuf,
+    /// Bucket that replicas share, `s3://BUCKET/PREFIX`; `None`: the data folder.
+    pub store: Option<String>,
+    /// URL of an S3-compatible server; `None`: Amazon's.
+    pub s3_endpoint: Option<String>,
+    /// Region of the bucket; `None`: the environment's.
+    pub s3_region: Option<String>,
+    /// Whether the S3 endpoint may be plain http.
+    pub s3_allow_http: bool,
+    /// Whether the photos of finished scenes are kept.
+    pub keep_photos: bool,
     /// Folder of the model bundle; `None`: search.
     pub bundle: Option<PathBuf>,
     /// ONNX Runtime library; `None`: search.
@@ -163,6 +189,11 @@ impl Default for Config {
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 8080)),
             data_dir: PathBuf::from("data"),
+            store: None,
+            s3_endpoint: None,
+            s3_region: None,
+            s3_allow_http: false,
+            keep_photos: true,
             bundle: None,
             ort_library: None,
             renderer: RendererChoice::Auto,
@@ -204,6 +235,14 @@ impl Config {
         let config = Self {
             listen: typed.listen.or(from_file.listen).unwrap_or(d.listen),
             data_dir: typed.data_dir.or(from_file.data_dir).unwrap_or(d.data_dir),
+            store: typed.store.or(from_file.store),
+            s3_endpoint: typed.s3_endpoint.or(from_file.s3_endpoint),
+            s3_region: typed.s3_region.or(from_file.s3_region),
+            s3_allow_http: typed
+                .s3_allow_http
+                .or(from_file.s3_allow_http)
+                .unwrap_or(d.s3_allow_http),
+            keep_photos: typed.keep_photos.or(from_file.keep_photos).unwrap_or(d.keep_photos),
             bundle: typed.bundle.or(from_file.bundle),
             ort_library: typed.ort_library.or(from_file.ort_library),
             renderer: typed.renderer.or(from_file.renderer).unwrap_or(d.renderer),
@@ -246,7 +285,24 @@ impl Config {
         )))
     }
 
+    /// Bucket and prefix of the shared store; `None` where scenes are in the data folder.
+    ///
+    /// # Errors
+    /// `invalid_request` when it is no `s3://BUCKET/PREFIX`.
+    pub fn bucket(&self) -> Result<Option<(&str, &str)>> {
+        let Some(store) = &self.store else { return Ok(None) };
+        let place = store.strip_prefix("s3://").unwrap_or_default();
+        let (bucket, prefix) = place.split_once('/').unwrap_or((place, ""));
+        if bucket.is_empty() {
+            return Err(Error::invalid(format!(
+                "config: store is {store:?}; it must be s3://BUCKET or s3://BUCKET/PREFIX"
+            )));
+        }
+        Ok(Some((bucket, prefix.trim_matches('/'))))
+    }
+
     fn validate(&self) -> Result<()> {
+        self.bucket()?;
         for (name, value, max) in [("threads", self.threads, 1024), ("jobs", self.jobs, 64)] {
             if value == 0 || value > max {
                 return Err(Error::invalid(format!(

@@ -79,6 +79,19 @@ pub struct Limits {
     pub key_requests_per_s: u32,
     /// Calls of one API key that may be open at the same time, where it says no number of its own.
     pub key_inflight_max: usize,
+    /// Milliseconds one call to the store may take.
+    pub store_timeout_ms: u64,
+    /// Milliseconds between two looks for what a crash left in the store.
+    pub sweep_every_ms: u64,
+    /// Milliseconds for which a replica believes what it read of a scene made elsewhere.
+    pub record_fresh_ms: u64,
+    /// Milliseconds between two heartbeats of a replica.
+    pub replica_beat_ms: u64,
+    /// Milliseconds without a heartbeat after which others make a replica's scenes.
+    pub replica_lease_ms: u64,
+    /// Resident bytes of the process beyond which uploads are refused as `overloaded`; 0: four
+    /// fifths of what the machine or the container has.
+    pub memory_bytes_max: u64,
     /// Scenes on one page of a list.
     pub page_max: usize,
     /// Gaussians in one scene, made or imported.
@@ -141,6 +154,12 @@ impl Default for Limits {
             wait_ms_max: 600_000,
             key_requests_per_s: 500,
             key_inflight_max: 128,
+            store_timeout_ms: 60_000,
+            sweep_every_ms: 600_000,
+            record_fresh_ms: 1_000,
+            replica_beat_ms: 2_000,
+            replica_lease_ms: 10_000,
+            memory_bytes_max: 0,
             page_max: 100,
             gaussians_max: 16_777_216,
         }

@@ -18,7 +18,10 @@ use super::{
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
-    jobs::{PipelineMaker, PipelineSemantics, SceneMaker, SemanticsMaker, SemanticsWork, Work},
+    jobs::{
+        PipelineMaker, PipelineSemantics, SceneMaker, SemanticsMaker, SemanticsWork, Work,
+        content_sha256,
+    },
     photos,
     pipeline::Engine,
     scene::{Provenance, Scene, SceneId, SceneMeta, SceneOptions, SemanticsMode, Upload},
@@ -77,6 +80,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         cameras: made.cameras,
         report: made.report,
         provenance: Provenance {
+            content_sha256: content_sha256(&files, &options, &made.bundle_sha256),
             files,
             bundle_sha256: made.bundle_sha256,
             options,

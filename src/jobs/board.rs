@@ -42,6 +42,48 @@ impl Board {
         inner.by_order.insert((std::cmp::Reverse(created), id), watch::Sender::new(record));
     }
 
+    /// Takes a record as it was found in the store; who watches the scene sees the change.
+    pub(super) fn put(&self, record: Record) {
+        let change = |sender: &watch::Sender<Record>| {
+            sender.send_if_modified(|known| {
+                let changed = *known != record;
+                known.clone_from(&record);
+                changed
+            });
+        };
+        // In its own statement, so that the lock ends before `insert` takes it.
+        let known = self.read().sender(&record.status.id).map(change).is_some();
+        if !known {
+            self.insert(record);
+        }
+    }
+
+    /// Ids of all scenes for which `is` holds.
+    pub(super) fn ids(&self, is: impl Fn(&Record) -> bool) -> Vec<SceneId> {
+        let inner = self.read();
+        let of = |sender: &watch::Sender<Record>| {
+            let record = sender.borrow();
+            is(&record).then(|| record.status.id.clone())
+        };
+        inner.by_order.values().filter_map(of).collect()
+    }
+
+    /// Unfinished scenes that somebody watches.
+    pub(super) fn watched(&self) -> Vec<SceneId> {
+        let inner = self.read();
+        let watched = inner.by_order.values().filter(|sender| sender.receiver_count() > 0);
+        let open = |sender: &watch::Sender<Record>| {
+            let record = sender.borrow();
+            (!record.status.state.is_final()).then(|| record.status.id.clone())
+        };
+        watched.filter_map(open).collect()
+    }
+
+    /// Watchers of a scene.
+    pub(super) fn watchers(&self, id: &SceneId) -> usize {
+        self.read().sender(id).map_or(0, watch::Sender::receiver_count)
+    }
+
     pub(super) fn find(&self, id: &SceneId) -> Option<Record> {
         Some(self.read().sender(id)?.borrow().clone())
     }
@@ -105,23 +147,12 @@ impl Board {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{SceneOptions, SceneStatus};
+    use crate::scene::SceneStatus;
 
     fn record(byte: u8, created_ms: u64) -> Record {
-        Record {
-            status: SceneStatus::new(
-                SceneId::from_bytes([byte; 16]),
-                SceneState::Queued,
-                created_ms,
-            ),
-            owner: byte.is_multiple_of(2).then(|| "even".to_owned()),
-            options: SceneOptions::default(),
-            idempotency_key: None,
-            request_sha256: String::new(),
-            attempts: 0,
-            scene_sha256: None,
-            semantics_sha256: None,
-        }
+        let id = SceneId::from_bytes([byte; 16]);
+        let status = SceneStatus::new(id, SceneState::Queued, created_ms);
+        Record { owner: byte.is_multiple_of(2).then(|| "even".to_owned()), ..Record::new(status) }
     }
 
     #[test]

@@ -30,6 +30,10 @@ impl PipelineMaker {
 }
 
 impl SceneMaker for PipelineMaker {
+    fn identity(&self) -> String {
+        self.engine.bundle().sha256().to_owned()
+    }
+
     fn check(&self, upload: &Upload, limits: &Limits) -> Result<()> {
         pipeline::check(upload, limits)
     }

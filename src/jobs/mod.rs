@@ -4,19 +4,22 @@
 //! Invariant: what was acknowledged is made, failed with a code, or cancelled, over any restart.
 
 mod board;
+mod keeper;
 mod maker;
+mod peers;
 mod queue;
 mod semantics;
 mod worker;
 
 use std::{
-    collections::HashMap,
+    collections::{HashMap, HashSet},
     fmt,
     sync::{
-        Arc, Mutex, PoisonError,
-        atomic::{AtomicBool, AtomicUsize, Ordering},
+        Arc, Condvar, Mutex, PoisonError,
+        atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering},
     },
     thread::JoinHandle,
+    time::Instant,
 };
 
 use tokio::sync::watch;
@@ -24,17 +27,22 @@ use tokio::sync::watch;
 pub use self::{
     maker::{PipelineMaker, PipelineSemantics},
     semantics::{NoSemantics, Phrases, SemanticsMaker, SemanticsWork, TextEmbedding},
+    worker::content_sha256,
 };
 
-use self::{board::Board, queue::Queue, worker::Stop};
+use self::{
+    board::Board,
+    queue::{Full, Queue},
+    worker::Stop,
+};
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
     scene::{
         Backdrop, Gaussians, HealthReport, SceneCamera, SceneId, SceneOptions, SceneState,
-        SemanticsMode, SemanticsState, Upload,
+        SemanticsMode, SemanticsState, SemanticsStatus, Upload,
     },
-    store::{Record, Store, not_found},
+    store::{KeyUse, Record, Store, not_found},
 };
 
 /// What a job asks for, and how it tells where it is.
@@ -73,6 +81,11 @@ pub struct Made {
 
 /// Turns an upload into a scene: the pipeline, or a stand-in of a test.
 pub trait SceneMaker: Send + Sync {
+    /// What else than upload and options decides the scene: the networks, by their hash.
+    fn identity(&self) -> String {
+        String::new()
+    }
+
     /// Refuses an upload that cannot be made, before it is acknowledged. On the calling thread.
     ///
     /// # Errors
@@ -104,6 +117,36 @@ struct Shared {
     asked: Queue,
     thinking: Mutex<HashMap<SceneId, Arc<Stop>>>,
     workers: AtomicUsize,
+    /// Whether the photos of finished scenes are kept.
+    keep_photos: bool,
+    /// Name of this process among those that share the store.
+    replica: String,
+    /// Scenes that this process works on, or is to.
+    mine: Mutex<HashSet<SceneId>>,
+    /// When scenes made elsewhere were last read.
+    fresh: Mutex<HashMap<SceneId, Instant>>,
+    listed: Mutex<Listed>,
+    /// Content hashes being made, and their end.
+    making: Mutex<HashSet<String>>,
+    made: Condvar,
+    /// Milliseconds that the last scenes took, smoothed; 0: none was made yet.
+    scene_ms: AtomicU64,
+    stopping: Mutex<bool>,
+    stopped: Condvar,
+}
+
+/// What the store listed last, and when.
+#[derive(Debug, Default)]
+struct Listed {
+    stamps: HashMap<SceneId, String>,
+    at: Option<Instant>,
+}
+
+/// An unfinished record as it stands before anybody makes it.
+fn requeued(record: &mut Record) {
+    record.status.state = SceneState::Queued;
+    record.status.stage = None;
+    record.status.fraction = 0.0;
 }
 
 impl fmt::Debug for Jobs {
@@ -114,7 +157,7 @@ impl fmt::Debug for Jobs {
 
 impl Jobs {
     /// Starts `workers` threads and queues again what was queued or running when the program
-    /// last stopped.
+    /// last stopped. `keep_photos`: whether the photos of finished scenes are kept.
     ///
     /// # Errors
     /// `internal` when a thread cannot be started.
@@ -124,7 +167,7 @@ impl Jobs {
         semantics: Arc<dyn SemanticsMaker>,
         mut records: Vec<Record>,
         limits: &Limits,
-        workers: usize,
+        (workers, keep_photos): (usize, bool),
     ) -> Result<Self> {
         let shared = Arc::new(Shared {
             store,
@@ -137,6 +180,16 @@ impl Jobs {
             asked: Queue::new(limits.queued_jobs_max),
             thinking: Mutex::default(),
             workers: AtomicUsize::new(workers),
+            keep_photos,
+            replica: replica_name(),
+            mine: Mutex::default(),
+            fresh: Mutex::default(),
+            listed: Mutex::default(),
+            making: Mutex::default(),
+            made: Condvar::new(),
+            scene_ms: AtomicU64::new(0),
+            stopping: Mutex::default(),
+            stopped: Condvar::new(),
         });
         records.sort_by_key(|record| record.status.created_ms);
         for mut record in records {
@@ -144,9 +197,7 @@ impl Jobs {
             let unfinished = !record.status.state.is_final();
             if unfinished {
                 tracing::info!(scene = %id, attempts = record.attempts, "queued again");
-                record.status.state = SceneState::Queued;
-                record.status.stage = None;
-                record.status.fraction = 0.0;
+                requeued(&mut record);
             }
             semantics::at_start(&mut record);
             let eager = !unfinished
@@ -157,11 +208,15 @@ impl Jobs {
             if eager {
                 record.status.semantics.state = SemanticsState::Running;
             }
+            let owner = record.owner.clone();
             shared.board.insert(record);
+            if eager || unfinished {
+                shared.hold(&id);
+            }
             if eager {
-                shared.asked.push(id);
+                shared.asked.push(id, owner.as_deref());
             } else if unfinished {
-                shared.queue.push(id);
+                shared.queue.push(id, owner.as_deref());
             }
         }
         let start = |name: String, life: fn(&Shared)| {
@@ -176,29 +231,126 @@ impl Jobs {
             .collect::<Result<Vec<_>>>()?;
         // One is enough: a scene's semantics use every core already.
         threads.push(start("semantics".to_owned(), Shared::think)?);
+        threads.push(start("housekeeper".to_owned(), Shared::keep_house)?);
+        if shared.store.is_shared() {
+            threads.push(start("peers".to_owned(), Shared::live_with_peers)?);
+        }
         Ok(Self { shared, workers: Mutex::new(threads) })
     }
 
-    /// Makes an upload safe on disk and queues it. Blocks on the disk.
+    /// Makes an upload safe on disk and queues it; gives its id, or that of the scene which an
+    /// earlier call with the same idempotency key made. Blocks on the store.
     ///
     /// # Errors
-    /// `overloaded` when the queue is full or the server stops, `store_unavailable`.
-    pub fn submit(&self, upload: &Upload, record: Record) -> Result<()> {
-        let place = self.shared.queue.reserve().ok_or_else(|| self.overloaded())?;
-        self.shared.store.put_upload(upload, &record)?;
+    /// `invalid_request` when the key was used for another upload, `overloaded` when the queue is
+    /// full or the server stops, `store_unavailable`.
+    pub fn submit(&self, upload: &Upload, mut record: Record) -> Result<SceneId> {
+        // First, so that a full queue still answers for what it holds.
+        if let Some(earlier) = self.earlier(&record)? {
+            return Ok(earlier);
+        }
+        let shared = &self.shared;
+        let place =
+            shared.queue.reserve(record.owner.as_deref()).map_err(|full| self.overloaded(full))?;
+        if shared.store.is_shared() {
+            record.replica = Some(shared.replica.clone());
+        }
         let id = record.status.id.clone();
-        self.shared.board.insert(record);
-        place.fill(id);
-        Ok(())
+        shared.hold(&id);
+        let kept = || -> Result<Option<SceneId>> {
+            if let Some(other) = self.use_key(&record)? {
+                return Ok(Some(other));
+            }
+            shared.store.put_upload(upload, &record).inspect_err(|_| {
+                if let Some(key) = &record.idempotency_key {
+                    // One that stays leads to no scene, and is looked through.
+                    let _ = shared.store.forget_key(record.owner.as_deref(), key);
+                }
+            })?;
+            Ok(None)
+        };
+        if let Some(other) = kept().inspect_err(|_| shared.done_with(&id))? {
+            shared.done_with(&id);
+            return Ok(other);
+        }
+        shared.board.insert(record);
+        place.fill(id.clone());
+        Ok(id)
     }
 
-    fn overloaded(&self) -> Error {
-        if self.shared.queue.is_closed() {
-            return Error::new(ErrorCode::Overloaded, "the server is stopping").retry_after_s(10);
+    /// The scene that an earlier call with this record's idempotency key made.
+    fn earlier(&self, record: &Record) -> Result<Option<SceneId>> {
+        let Some(key) = &record.idempotency_key else { return Ok(None) };
+        let owner = record.owner.as_deref();
+        let Some(used) = self.shared.store.key_use(owner, key)? else { return Ok(None) };
+        self.refresh(&used.id)?;
+        if self.shared.board.find(&used.id).is_none() {
+            // Deleted, or never acknowledged.
+            self.shared.store.forget_key(owner, key)?;
+            return Ok(None);
         }
-        let max = self.shared.limits.queued_jobs_max;
-        Error::new(ErrorCode::Overloaded, format!("{max} scenes wait already, the most that may"))
-            .retry_after_s(15)
+        self.replayed(record, used).map(Some)
+    }
+
+    /// Notes the use of the record's key; gives the scene of a call that was faster.
+    fn use_key(&self, record: &Record) -> Result<Option<SceneId>> {
+        let Some(key) = &record.idempotency_key else { return Ok(None) };
+        let store = &self.shared.store;
+        let id = record.status.id.clone();
+        let new = KeyUse { id: id.clone(), request_sha256: record.request_sha256.clone() };
+        // The scene is announced before the key leads to it.
+        store.announce(record)?;
+        match store.use_key(record.owner.as_deref(), key, &new) {
+            Ok(None) => Ok(None),
+            Ok(Some(used)) => {
+                store.drop_pending(&id)?;
+                self.replayed(record, used).map(Some)
+            }
+            Err(error) => {
+                let _ = store.drop_pending(&id);
+                Err(error)
+            }
+        }
+    }
+
+    /// The scene of an earlier use of a key, if it was for the same request.
+    fn replayed(&self, record: &Record, used: KeyUse) -> Result<SceneId> {
+        let id = used.id;
+        if used.request_sha256 != record.request_sha256 {
+            return Err(Error::invalid(format!(
+                "the idempotency key was used for another upload (scene {id})"
+            )));
+        }
+        let known = self.shared.board.find(&id);
+        let over = known.is_some_and(|known| known.status.state.is_final());
+        if !over && self.shared.store.is_shared() && !self.shared.store.was_acknowledged(&id)? {
+            // Another replica is writing it, and may fail yet: nothing is acknowledged for it.
+            let message = format!("the first call with this idempotency key (scene {id}) is open");
+            return Err(Error::new(ErrorCode::Overloaded, message).retry_after_s(1));
+        }
+        Ok(id)
+    }
+
+    fn overloaded(&self, full: Full) -> Error {
+        let (message, seconds) = match full {
+            Full::Closed => ("the server is stopping".to_owned(), 10),
+            Full::All(max) => {
+                (format!("{max} scenes wait already, the most that may"), self.next_place_s())
+            }
+            Full::Share(max) => {
+                let message = format!("{max} scenes of this key wait already, the most that may");
+                (message, self.next_place_s())
+            }
+        };
+        Error::new(ErrorCode::Overloaded, message).retry_after_s(seconds)
+    }
+
+    /// Seconds until a place is likely to be free: what one scene took of late, over all workers.
+    fn next_place_s(&self) -> u32 {
+        let ms = self.shared.scene_ms.load(Ordering::Relaxed);
+        let workers = self.shared.workers.load(Ordering::Relaxed).max(1) as u64;
+        let seconds = if ms == 0 { 15 } else { (ms / workers).div_ceil(1_000) };
+        u32::try_from(seconds.clamp(1, 60)).unwrap_or(60)
     }
 
     /// The newest record of a scene.
@@ -240,17 +392,40 @@ impl Jobs {
     /// # Errors
     /// `scene_not_found`, `store_unavailable`.
     pub fn delete(&self, id: &SceneId) -> Result<()> {
-        if !self.shared.board.remove(id) {
-            return Err(not_found(id));
-        }
-        self.shared.queue.remove(id);
-        self.shared.asked.remove(id);
-        for at_work in [self.shared.lock_running(), self.shared.lock_thinking()] {
-            if let Some(stop) = at_work.get(id) {
+        let shared = &self.shared;
+        let record = self.record(id)?;
+        shared.queue.remove(id);
+        shared.asked.remove(id);
+        let mut at_work = false;
+        for working in [shared.lock_running(), shared.lock_thinking()] {
+            if let Some(stop) = working.get(id) {
                 stop.by_caller();
+                at_work = true;
             }
         }
-        self.shared.store.remove(id)
+        if let Err(error) = shared.store.remove(&record) {
+            // It is there still, but nobody makes it any more.
+            shared.board.update(id, |record| {
+                if !record.status.state.is_final() {
+                    record.status.state = SceneState::Cancelled;
+                    record.status.stage = None;
+                }
+                if record.status.semantics.state == SemanticsState::Running {
+                    record.status.semantics = SemanticsStatus::default();
+                }
+            });
+            return Err(error);
+        }
+        if !at_work {
+            shared.done_with(id);
+        }
+        if shared.board.remove(id) { Ok(()) } else { Err(not_found(id)) }
+    }
+
+    /// Watchers of a scene, callers who wait for it among them.
+    #[must_use]
+    pub fn watchers(&self, id: &SceneId) -> usize {
+        self.shared.board.watchers(id)
     }
 
     /// Marks a finished scene as failed: its file turned out to be bad.
@@ -275,6 +450,7 @@ impl Jobs {
     pub fn shut_down(&self) {
         self.shared.queue.close();
         self.shared.asked.close();
+        self.shared.end_rest();
         for at_work in [self.shared.lock_running(), self.shared.lock_thinking()] {
             for stop in at_work.values() {
                 stop.by_shutdown();
@@ -287,6 +463,25 @@ impl Jobs {
             }
         }
     }
+}
+
+impl Shared {
+    /// From now on this process works on the scene, and its board is the truth about it.
+    fn hold(&self, id: &SceneId) {
+        self.mine.lock().unwrap_or_else(PoisonError::into_inner).insert(id.clone());
+    }
+
+    /// This process writes nothing of the scene any more.
+    fn done_with(&self, id: &SceneId) {
+        self.mine.lock().unwrap_or_else(PoisonError::into_inner).remove(id);
+    }
+}
+
+/// Tells this process from every other that uses the store.
+fn replica_name() -> String {
+    use std::hash::BuildHasher;
+    let random = || std::hash::RandomState::new().hash_one(std::process::id());
+    format!("{:016x}{:016x}", random(), random())
 }
 
 impl Drop for Jobs {

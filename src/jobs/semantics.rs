@@ -138,7 +138,8 @@ impl Jobs {
         if !wanted(&self.record(id)?) {
             return Ok(());
         }
-        let place = shared.asked.reserve().ok_or_else(|| self.overloaded())?;
+        let owner = self.record(id)?.owner;
+        let place = shared.asked.reserve(owner.as_deref()).map_err(|full| self.overloaded(full))?;
         let mut first = false;
         shared.board.update(id, |record| {
             // Looked at again under the record's lock: of many callers one is the first.
@@ -148,6 +149,7 @@ impl Jobs {
             }
         });
         if first {
+            shared.hold(id);
             place.fill(id.clone());
         }
         Ok(())
@@ -200,6 +202,7 @@ impl Shared {
                 self.give_up(&id, &stop, &error);
             }
             self.lock_thinking().remove(&id);
+            self.done_with(&id);
         }
     }
 
@@ -234,12 +237,21 @@ impl Shared {
         ready.semantics_sha256 = digest.or(ready.semantics_sha256);
         self.store.put_record(&ready)?;
         let bank_size = ready.status.semantics.bank_size;
+        let eager = ready.options.semantics == SemanticsMode::Eager;
         self.board.update(id, |record| *record = ready);
         tracing::info!(scene = %id, bank_size, "semantics ready");
+        if eager && !self.keep_photos {
+            self.store.drop_upload(id)?;
+        }
         Ok(())
     }
 
     fn give_up(&self, id: &SceneId, stop: &Stop, error: &Error) {
+        if stop.is_by_caller() {
+            // The scene is being deleted: who waits is told that, not that its semantics failed.
+            tracing::info!(scene = %id, "its semantics are cancelled");
+            return;
+        }
         let error = stop.told(&self.limits, "the scene's semantics").unwrap_or_else(|| {
             Error::new(error.code(), format!("the scene's semantics: {}", error.message()))
         });

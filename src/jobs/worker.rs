@@ -7,16 +7,18 @@ use std::{
         atomic::{AtomicBool, AtomicU8, Ordering},
         mpsc::{self, RecvTimeoutError},
     },
-    time::Duration,
+    time::{Duration, Instant},
 };
+
+use sha2::{Digest, Sha256};
 
 use super::{Made, Shared, Work};
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
     scene::{
-        Provenance, Scene, SceneError, SceneId, SceneMeta, SceneState, SemanticsMode,
-        SemanticsState, SemanticsStatus,
+        PhotoHash, Provenance, Scene, SceneError, SceneId, SceneMeta, SceneOptions, SceneState,
+        SemanticsMode, SemanticsReport, SemanticsState, SemanticsStatus,
     },
     store::{self, Record},
     telemetry::meter,
@@ -45,6 +47,10 @@ impl Stop {
 
     pub(super) fn by_caller(&self) {
         self.ask(BY_CALLER);
+    }
+
+    pub(super) fn is_by_caller(&self) -> bool {
+        self.reason() == BY_CALLER
     }
 
     pub(super) fn by_shutdown(&self) {
@@ -87,6 +93,43 @@ impl Stop {
     }
 }
 
+/// A scene that is kept, and what its record is to say.
+struct Finished {
+    meta: SceneMeta,
+    digest: String,
+    semantics: Option<(String, SemanticsReport)>,
+}
+
+/// Leave to make some content; ends when dropped.
+struct Turn<'a> {
+    shared: &'a Shared,
+    content: String,
+}
+
+impl Drop for Turn<'_> {
+    fn drop(&mut self) {
+        let mut making = self.shared.making.lock().unwrap_or_else(PoisonError::into_inner);
+        making.remove(&self.content);
+        drop(making);
+        self.shared.made.notify_all();
+    }
+}
+
+/// Everything that decides what a scene is, as one hash, hex: photos and cameras in their order,
+/// options, the maker's identity (the bundle's hash) and the program's version.
+#[must_use]
+pub fn content_sha256(files: &[PhotoHash], options: &SceneOptions, maker: &str) -> String {
+    let mut hash = Sha256::new();
+    // Lengths keep names and hashes apart.
+    for file in files {
+        hash.update((file.file.len() as u64).to_le_bytes());
+        hash.update(&file.file);
+        hash.update(&file.sha256);
+    }
+    hash.update(format!("{options:?} {maker} {}", env!("CARGO_PKG_VERSION")));
+    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
 impl Shared {
     pub(super) fn lock_running(
         &self,
@@ -110,11 +153,16 @@ impl Shared {
                 self.settle(&id, &stop, &error);
             }
             self.lock_running().remove(&id);
+            let semantics = self.board.find(&id).map(|record| record.status.semantics.state);
+            if semantics != Some(SemanticsState::Running) {
+                self.done_with(&id);
+            }
         }
         self.workers.fetch_sub(1, Ordering::Relaxed);
     }
 
     fn run(&self, id: &SceneId, stop: &Stop) -> Result<()> {
+        let begun = Instant::now();
         let Some(record) = self.board.update(id, |record| {
             record.attempts += 1;
             record.status.state = SceneState::Running;
@@ -130,7 +178,19 @@ impl Shared {
             )));
         }
         self.store.put_record(&record)?;
+        if record.attempts > 1
+            && let Some(made) = self.made_before(id)?
+        {
+            return self.finish(&record, made);
+        }
         let upload = self.store.upload(id)?;
+        let files = store::hashes(&upload);
+        let content = content_sha256(&files, &record.options, &self.maker.identity());
+        let _turn = self.turn(&content, stop);
+        if let Some(known) = self.made_of(&content, &record)? {
+            tracing::info!(scene = %id, of = %known.meta.id, "made before of the same content");
+            return self.copy(&record, &known);
+        }
         let progress = |stage: &str, fraction: f32| {
             self.board.update(id, |record| {
                 record.status.stage = Some(stage.to_owned());
@@ -145,8 +205,13 @@ impl Shared {
                 cancel: &stop.flag,
             })
         })?;
+        drop(upload);
         progress("store", 0.99);
-        self.keep(&record, store::hashes(&upload), made)
+        let took = u64::try_from(begun.elapsed().as_millis()).unwrap_or(u64::MAX);
+        let before = self.scene_ms.load(Ordering::Relaxed);
+        let smoothed = if before == 0 { took } else { (3 * before + took) / 4 };
+        self.scene_ms.store(smoothed.max(1), Ordering::Relaxed);
+        self.keep(&record, files, content, made)
     }
 
     /// Runs `make`, and asks it to stop when the time of a scene is over.
@@ -169,10 +234,15 @@ impl Shared {
         })
     }
 
-    fn keep(&self, record: &Record, files: Vec<crate::scene::PhotoHash>, made: Made) -> Result<()> {
-        let id = &record.status.id;
+    fn keep(
+        &self,
+        record: &Record,
+        files: Vec<PhotoHash>,
+        content_sha256: String,
+        made: Made,
+    ) -> Result<()> {
         let meta = SceneMeta {
-            id: id.clone(),
+            id: record.status.id.clone(),
             created_ms: record.status.created_ms,
             cameras: made.cameras,
             report: made.report,
@@ -180,31 +250,115 @@ impl Shared {
                 files,
                 bundle_sha256: made.bundle_sha256,
                 options: record.options.clone(),
+                content_sha256,
                 program_version: env!("CARGO_PKG_VERSION").to_owned(),
             },
         };
-        let (report, cameras) = (meta.report.clone(), meta.cameras.clone());
-        let scene = Scene::new(meta, made.gaussians, made.backdrop);
+        let scene = Scene::new(meta.clone(), made.gaussians, made.backdrop);
         let digest = self.store.put_scene(scene)?;
+        self.finish(record, Finished { meta, digest, semantics: None })
+    }
+
+    /// Keeps under this record what was made of the same content before.
+    fn copy(&self, record: &Record, known: &Scene) -> Result<()> {
+        let id = &record.status.id;
+        let meta = SceneMeta {
+            id: id.clone(),
+            created_ms: record.status.created_ms,
+            ..known.meta.clone()
+        };
+        let semantics = known.semantics.clone();
+        let mut scene = known.clone();
+        scene.meta = meta.clone();
+        let digest = self.store.put_scene(scene)?;
+        let semantics = match semantics {
+            Some(semantics) => {
+                let report = semantics.report.clone();
+                Some((self.store.put_semantics(id, (*semantics).clone())?.1, report))
+            }
+            None => None,
+        };
+        self.finish(record, Finished { meta, digest, semantics })
+    }
+
+    /// What an earlier attempt had made and kept, before it was cut off.
+    fn made_before(&self, id: &SceneId) -> Result<Option<Finished>> {
+        match self.store.scene(id) {
+            Ok(scene) => {
+                let digest = self.store.scene_digest(id)?;
+                Ok(digest.map(|digest| Finished {
+                    meta: scene.meta.clone(),
+                    digest,
+                    semantics: None,
+                }))
+            }
+            Err(e) if matches!(e.code(), ErrorCode::SceneNotFound | ErrorCode::SceneCorrupt) => {
+                Ok(None)
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    /// The finished scene of this content and owner, where there is one and it is sound.
+    fn made_of(&self, content: &str, record: &Record) -> Result<Option<Arc<Scene>>> {
+        let owner = record.owner.as_deref();
+        let Some(id) = self.store.scene_of_content(owner, content)? else { return Ok(None) };
+        if id == record.status.id {
+            return Ok(None);
+        }
+        // Whatever is wrong with it, this one can be made.
+        let scene = self.store.scene(&id).ok();
+        Ok(scene.filter(|scene| scene.meta.provenance.content_sha256 == content))
+    }
+
+    /// Waits until no other worker here makes the same content.
+    fn turn(&self, content: &str, stop: &Stop) -> Turn<'_> {
+        let mut making = self.making.lock().unwrap_or_else(PoisonError::into_inner);
+        while making.contains(content) && !stop.flag.load(Ordering::Acquire) {
+            let waited = self.made.wait_timeout(making, Duration::from_millis(50));
+            making = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        making.insert(content.to_owned());
+        Turn { shared: self, content: content.to_owned() }
+    }
+
+    /// The scene is kept: its record is, then its watchers are told.
+    fn finish(&self, record: &Record, finished: Finished) -> Result<()> {
+        let id = &record.status.id;
+        let Finished { meta, digest, semantics } = finished;
         // On disk first, so that a watcher who sees `done` may pull the plug.
         let Some(mut done) = self.board.find(id) else { return Ok(()) };
         done.scene_sha256 = Some(digest);
+        let content = meta.provenance.content_sha256;
+        done.content_sha256 = Some(content.clone()).filter(|hash| !hash.is_empty());
+        done.replica = None;
         done.status.state = SceneState::Done;
         done.status.stage = None;
         done.status.fraction = 1.0;
         done.status.updated_ms = store::now_ms();
-        done.status.report = Some(report);
-        done.status.cameras = cameras;
+        done.status.report = Some(meta.report);
+        done.status.cameras = meta.cameras;
+        if let Some((digest, report)) = semantics {
+            done.semantics_sha256 = Some(digest);
+            done.status.semantics = SemanticsStatus::ready(report);
+        }
         self.store.put_record(&done)?;
+        if !content.is_empty() {
+            self.store.put_content(done.owner.as_deref(), &content, id)?;
+        }
         // In one change, so that no watcher takes `done` for the end.
-        let eager = done.options.semantics == SemanticsMode::Eager;
+        let ready = done.status.semantics.state == SemanticsState::Ready;
+        let eager = done.options.semantics == SemanticsMode::Eager && !ready;
         if eager {
             done.status.semantics = SemanticsStatus::new(SemanticsState::Running);
         }
+        let owner = done.owner.clone();
         self.board.update(id, |record| *record = done);
         tracing::info!(scene = %id, "done");
         if eager {
-            self.asked.push(id.clone());
+            self.asked.push(id.clone(), owner.as_deref());
+        } else if !self.keep_photos {
+            self.store.drop_upload(id)?;
         }
         Ok(())
     }

@@ -27,6 +27,9 @@ pub struct Provenance {
     pub bundle_sha256: String,
     /// Options of the call.
     pub options: SceneOptions,
+    /// sha256 over all of these, hex: two scenes with the same one are the same.
+    #[serde(default)]
+    pub content_sha256: String,
     /// Version of the program.
     pub program_version: String,
 }

@@ -1,6 +1,6 @@
 //! Creating a scene: check, make safe on disk, queue, wait as long as asked.
 
-use std::{collections::HashMap, hash::BuildHasher, sync::Arc, time::Duration};
+use std::{hash::BuildHasher, sync::Arc, time::Duration};
 
 use sha2::{Digest, Sha256};
 
@@ -18,58 +18,72 @@ use crate::{
     store::{self, Record},
 };
 
-/// By owner and key: digest of what the key was used for, and the scene it made.
-pub(super) type Keys = HashMap<(Option<String>, String), (String, SceneId)>;
+/// Locks that calls with one idempotency key share with few others.
+pub(super) const KEY_LOCKS: usize = 16;
 
-/// The keys of the scenes kept.
-pub(super) fn keys_of(records: &[Record]) -> Keys {
-    let entry = |record: &Record| {
-        let value = (record.request_sha256.clone(), record.status.id.clone());
-        Some(((record.owner.clone(), record.idempotency_key.clone()?), value))
-    };
-    records.iter().filter_map(entry).collect()
+/// What a create call waits with: where its caller goes away before the id was told, and nobody
+/// else watches the scene, nobody wants it.
+struct Waiting {
+    service: Service,
+    id: Option<SceneId>,
+}
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        let (Some(id), Ok(runtime)) = (self.id.take(), tokio::runtime::Handle::try_current())
+        else {
+            return;
+        };
+        let service = self.service.clone();
+        runtime.spawn(async move {
+            let jobs = &service.inner.jobs;
+            let open = jobs.record(&id).is_ok_and(|record| !record.status.state.is_final());
+            if open && jobs.watchers(&id) == 0 {
+                tracing::info!(scene = %id, "its caller went away before it had an id");
+                if let Err(error) = service.delete(&id).await {
+                    tracing::warn!(scene = %id, %error, "it cannot be dropped");
+                }
+            }
+        });
+    }
 }
 
 impl Service {
     /// Takes an upload, makes it safe on disk, queues it, and waits as long as asked.
     ///
     /// What is wrong with photos and cameras themselves is answered here; what only the pipeline
-    /// finds becomes the scene's error.
+    /// finds becomes the scene's error. A caller who goes away while waiting, without an
+    /// idempotency key, has the scene dropped: its id was told to nobody.
     ///
     /// # Errors
     /// `invalid_request`, `photo_unreadable`, `limit_exceeded`, `overloaded`, `store_unavailable`.
     pub async fn create_scene(&self, request: CreateScene) -> Result<Created> {
-        let CreateScene { upload, options, idempotency_key, wait } = request;
+        let CreateScene { upload, mut options, idempotency_key, wait } = request;
         check_request(&options, idempotency_key.as_deref(), &self.limits())?;
         if options.semantics == SemanticsMode::Eager {
             self.inner.can_understand("semantics=eager")?;
         }
-        let (id, replayed) = match idempotency_key {
-            None => (self.submit(upload, options, None).await?, false),
-            Some(key) => {
-                // Held to the end, so that two calls with one key cannot both be the first.
-                let mut keys = self.inner.keys.lock().await;
-                let (upload, digest) = digest(upload, options.clone()).await?;
-                let name = (self.caller.owner().map(str::to_owned), key);
-                match keys.get(&name) {
-                    Some((known, id)) if *known == digest => (id.clone(), true),
-                    Some((_, id)) => {
-                        return Err(Error::invalid(format!(
-                            "the idempotency key was used for another upload (scene {id})"
-                        )));
-                    }
-                    None => {
-                        let id = self.submit(upload, options, Some(name.1.clone())).await?;
-                        keys.insert(name, (digest, id.clone()));
-                        (id, false)
-                    }
-                }
-            }
-        };
-        if let Some(wait) = wait {
-            self.wait(&id, wait).await?;
+        if options.semantics == SemanticsMode::Lazy && !self.inner.config.keep_photos {
+            // Without photos there is no later.
+            let can = self.inner.can_understand("semantics").is_ok();
+            options.semantics = if can { SemanticsMode::Eager } else { SemanticsMode::Off };
         }
-        Ok(Created { status: self.get(&id)?, replayed })
+        self.inner.memory.admit(upload.size_bytes())?;
+        let keyed = idempotency_key.is_some();
+        let one_at_a_time = match &idempotency_key {
+            Some(key) => Some(self.inner.key_lock(key).lock().await),
+            None => None,
+        };
+        let (id, replayed) = self.submit(upload, options, idempotency_key).await?;
+        drop(one_at_a_time);
+        if let Some(wait) = wait {
+            let unknown = (!keyed && !replayed).then(|| id.clone());
+            let mut waiting = Waiting { service: self.clone(), id: unknown };
+            let waited = self.wait(&id, wait).await;
+            waiting.id = None;
+            waited?;
+        }
+        Ok(Created { status: self.get(&id).await?, replayed })
     }
 
     /// Waits until nothing more will happen to the scene, at most `limits.wait_ms_max`.
@@ -77,7 +91,7 @@ impl Service {
     /// # Errors
     /// `scene_not_found`.
     pub async fn wait(&self, id: &SceneId, at_most: Duration) -> Result<SceneStatus> {
-        self.sees(id)?;
+        self.sees(id).await?;
         let mut watcher = self.inner.jobs.watch(id)?;
         let at_most = at_most.min(Duration::from_millis(self.limits().wait_ms_max));
         let end = watcher.wait_for(|record| record.status.is_settled());
@@ -92,7 +106,7 @@ impl Service {
         upload: Upload,
         options: SceneOptions,
         key: Option<String>,
-    ) -> Result<SceneId> {
+    ) -> Result<(SceneId, bool)> {
         let (inner, caller) = (Arc::clone(&self.inner), self.caller.clone());
         let turn = Arc::clone(&inner.reading).acquire_owned().await;
         let turn = turn.map_err(|e| Error::internal("no upload is read now").caused_by(e))?;
@@ -111,7 +125,7 @@ impl Inner {
         options: SceneOptions,
         key: Option<String>,
         caller: &Caller,
-    ) -> Result<SceneId> {
+    ) -> Result<(SceneId, bool)> {
         self.maker.check(upload, &self.limits())?;
         let id = new_id();
         let mut status = SceneStatus::new(id.clone(), SceneState::Queued, store::now_ms());
@@ -119,18 +133,24 @@ impl Inner {
             status.semantics.state = SemanticsState::Off;
         }
         let record = Record {
-            status,
             request_sha256: request_sha256(upload, &options),
             owner: caller.owner().map(str::to_owned),
             options,
             idempotency_key: key,
-            attempts: 0,
-            scene_sha256: None,
-            semantics_sha256: None,
+            ..Record::new(status)
         };
-        self.jobs.submit(upload, record)?;
-        tracing::info!(scene = %id, photos = upload.photos.len(), "queued");
-        Ok(id)
+        let made = self.jobs.submit(upload, record)?;
+        let replayed = made != id;
+        if !replayed {
+            tracing::info!(scene = %id, photos = upload.photos.len(), "queued");
+        }
+        Ok((made, replayed))
+    }
+
+    /// Held by a call with this key, so that two of them cannot both be the first.
+    fn key_lock(&self, key: &str) -> &tokio::sync::Mutex<()> {
+        let place = Sha256::digest(key)[0] as usize % KEY_LOCKS;
+        &self.key_locks[place]
     }
 }
 
@@ -142,14 +162,6 @@ pub(super) async fn blocking<T: Send + 'static>(
     tokio::task::spawn_blocking(move || span.in_scope(work))
         .await
         .map_err(|e| Error::internal("the work was broken off").caused_by(e))
-}
-
-async fn digest(upload: Upload, options: SceneOptions) -> Result<(Upload, String)> {
-    blocking(move || {
-        let digest = request_sha256(&upload, &options);
-        (upload, digest)
-    })
-    .await
 }
 
 fn request_sha256(upload: &Upload, options: &SceneOptions) -> String {

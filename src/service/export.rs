@@ -28,7 +28,7 @@ impl Service {
     /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; with a text also what
     /// [`Service::query`] says.
     pub async fn export(&self, id: &SceneId, format: ExportFormat, ask: &Ask) -> Result<Export> {
-        self.sees(id)?;
+        self.sees(id).await?;
         let ExportFormat::Ply = format;
         let inner = Arc::clone(&self.inner);
         let Some(text) = &ask.text else {

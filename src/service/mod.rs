@@ -11,6 +11,7 @@ mod export;
 mod gate;
 mod local;
 mod lru;
+mod memory;
 mod pick;
 mod query;
 mod rle;
@@ -27,7 +28,7 @@ use std::{
 use futures_util::{Stream, stream};
 use tokio::sync::Semaphore;
 
-use self::{asker::Asker, create::Keys, gate::Gate};
+use self::{asker::Asker, gate::Gate, memory::Memory};
 pub use self::{
     local::Local,
     rle::Rle,
@@ -52,7 +53,7 @@ use crate::{
     limits::Limits,
     render::Renderer,
     scene::SceneId,
-    store::{Record, Store, not_found},
+    store::{Place, Record, Store, not_found},
 };
 
 /// Uploads decoded at the same time: each may hold `limits.photos_max` photos in memory.
@@ -99,7 +100,8 @@ struct Inner {
     gate: Gate,
     /// Turns at decoding uploads.
     reading: Arc<Semaphore>,
-    keys: tokio::sync::Mutex<Keys>,
+    key_locks: [tokio::sync::Mutex<()>; create::KEY_LOCKS],
+    memory: Memory,
 }
 
 impl fmt::Debug for Inner {
@@ -115,21 +117,30 @@ impl Inner {
 }
 
 impl Service {
-    /// Opens the data folder, takes up unfinished work and starts the workers. Blocks on the disk.
+    /// Opens the store that the configuration names, takes up unfinished work and starts the
+    /// workers. Blocks on the store.
     ///
     /// # Errors
-    /// `store_unavailable` when the folder cannot be used.
+    /// `store_unavailable` when the store cannot be used.
     pub fn open(config: Config, parts: Parts) -> Result<Self> {
-        let (store, records) = Store::open(&config.data_dir, config.limits.cache_bytes_max)?;
+        let place = Place::of(&config)?;
+        Self::open_at(&place, config, parts)
+    }
+
+    /// As [`Self::open`], with the scenes of this place.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn open_at(place: &Place, config: Config, parts: Parts) -> Result<Self> {
+        let (store, records) = Store::open_at(place, &config.limits)?;
         let store = Arc::new(store);
-        let keys = create::keys_of(&records);
         let jobs = Jobs::start(
             Arc::clone(&store),
             Arc::clone(&parts.maker),
             Arc::clone(&parts.semantics),
             records,
             &config.limits,
-            config.jobs,
+            (config.jobs, config.keep_photos),
         )?;
         // A render uses all cores; a second one fills the gaps of the first.
         let renders = (config.threads / 2).clamp(1, 8);
@@ -147,7 +158,8 @@ impl Service {
             models,
             gate: Gate::new(renders, config.limits.queued_renders_max),
             reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
-            keys: tokio::sync::Mutex::new(keys),
+            key_locks: Default::default(),
+            memory: Memory::new(config.limits.memory_bytes_max),
             limits: RwLock::new(Arc::new(config.limits.clone())),
             config,
         };
@@ -161,14 +173,18 @@ impl Service {
     }
 
     /// The record of a scene that this caller sees.
-    fn record(&self, id: &SceneId) -> Result<Record> {
+    async fn record(&self, id: &SceneId) -> Result<Record> {
+        if self.inner.jobs.may_be_stale(id) {
+            let (inner, id) = (Arc::clone(&self.inner), id.clone());
+            create::blocking(move || inner.jobs.refresh(&id)).await??;
+        }
         let record = self.inner.jobs.record(id)?;
         if self.caller.sees(record.owner.as_deref()) { Ok(record) } else { Err(not_found(id)) }
     }
 
     /// Refuses a scene that is not there for this caller.
-    fn sees(&self, id: &SceneId) -> Result<()> {
-        self.record(id).map(drop)
+    async fn sees(&self, id: &SceneId) -> Result<()> {
+        self.record(id).await.map(drop)
     }
 
     /// The caps in force.
@@ -195,15 +211,15 @@ impl Service {
     ///
     /// # Errors
     /// `scene_not_found`.
-    pub fn get(&self, id: &SceneId) -> Result<SceneStatus> {
-        Ok(self.shown(self.record(id)?.status))
+    pub async fn get(&self, id: &SceneId) -> Result<SceneStatus> {
+        Ok(self.shown(self.record(id).await?.status))
     }
 
     /// A page of scenes, newest first, without cameras.
     ///
     /// # Errors
     /// `invalid_request` when `after` is not a `next` of an earlier page.
-    pub fn list(&self, page: &PageRequest) -> Result<Page> {
+    pub async fn list(&self, page: &PageRequest) -> Result<Page> {
         let max = self.limits().page_max;
         let limit = match page.limit {
             Some(0) => return Err(Error::invalid(format!("limit is 0; it must be 1 to {max}"))),
@@ -211,6 +227,10 @@ impl Service {
             None => max,
         };
         let after = page.after.as_deref().map(parse_cursor).transpose()?;
+        let inner = Arc::clone(&self.inner);
+        if inner.store.is_shared() {
+            create::blocking(move || inner.jobs.refresh_all()).await??;
+        }
         let (records, more) =
             self.inner.jobs.page(after, limit, |record| self.caller.sees(record.owner.as_deref()));
         let next = records.last().filter(|_| more).map(cursor);
@@ -224,19 +244,17 @@ impl Service {
     /// # Errors
     /// `scene_not_found`, `store_unavailable`.
     pub async fn delete(&self, id: &SceneId) -> Result<()> {
-        self.sees(id)?;
+        self.sees(id).await?;
         let (inner, gone) = (Arc::clone(&self.inner), id.clone());
-        create::blocking(move || inner.jobs.delete(&gone)).await??;
-        self.inner.keys.lock().await.retain(|_, (_, scene)| scene != id);
-        Ok(())
+        create::blocking(move || inner.jobs.delete(&gone)).await?
     }
 
     /// What happens to a scene, from its present state to the last event.
     ///
     /// # Errors
     /// `scene_not_found`.
-    pub fn watch(&self, id: &SceneId) -> Result<impl Stream<Item = Event> + Send + use<>> {
-        self.sees(id)?;
+    pub async fn watch(&self, id: &SceneId) -> Result<impl Stream<Item = Event> + Send + use<>> {
+        self.sees(id).await?;
         let watcher = self.inner.jobs.watch(id)?;
         let service = self.clone();
         let first = Some((service, watcher, true));

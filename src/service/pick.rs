@@ -118,7 +118,7 @@ impl Service {
     /// # Errors
     /// As [`Service::query`] where labels are given, else as [`Service::render`].
     pub async fn pick(&self, id: &SceneId, spec: PickSpec) -> Result<Picked> {
-        self.sees(id)?;
+        self.sees(id).await?;
         let inner = &self.inner;
         refuse_crop(&spec.options, "pick")?;
         let record = inner.finished(id)?;

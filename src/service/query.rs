@@ -191,7 +191,7 @@ impl Service {
     /// semantics are not ready in time, `semantics_off`, `model_unavailable`, `overloaded`,
     /// `deadline_exceeded`, and whatever the making of the semantics failed with.
     pub async fn query(&self, id: &SceneId, spec: QuerySpec) -> Result<QueryAnswer> {
-        self.sees(id)?;
+        self.sees(id).await?;
         let inner = &self.inner;
         inner.can_understand("query")?;
         refuse_crop(&spec.options, "query")?;

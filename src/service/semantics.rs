@@ -142,7 +142,7 @@ impl Service {
     /// `scene_not_found`, `scene_not_ready` also when they are still being made after that time,
     /// `semantics_off`, `model_unavailable`, `overloaded`, and whatever their making failed with.
     pub async fn understand(&self, id: &SceneId, wait: Option<Duration>) -> Result<SceneStatus> {
-        self.sees(id)?;
+        self.sees(id).await?;
         let understood = self.inner.understood(id, "semantics", wait).await?;
         Ok(self.shown(understood.record.status.clone()))
     }

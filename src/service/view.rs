@@ -476,8 +476,8 @@ impl Service {
     ///
     /// # Errors
     /// As [`Self::render`], but for what only rendering meets.
-    pub fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<Option<String>> {
-        self.sees(id)?;
+    pub async fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<Option<String>> {
+        self.sees(id).await?;
         let inner = &self.inner;
         let ask = inner.checked_ask(&[spec.kind], &spec.ask)?;
         let record = inner.finished(id)?;
@@ -498,7 +498,7 @@ impl Service {
     /// `limit_exceeded`, `overloaded`, `deadline_exceeded`, `gpu_unavailable`; for kinds that need
     /// semantics also what [`Service::query`] says.
     pub async fn render(&self, id: &SceneId, spec: ViewSpec) -> Result<RenderedView> {
-        self.sees(id)?;
+        self.sees(id).await?;
         let inner = &self.inner;
         let kinds = [spec.kind];
         let ask = inner.checked_ask(&kinds, &spec.ask)?;
@@ -521,12 +521,12 @@ impl Service {
     ///
     /// # Errors
     /// As [`Self::render`].
-    pub fn render_many(
+    pub async fn render_many(
         &self,
         id: &SceneId,
         spec: &ViewsSpec,
     ) -> Result<impl Stream<Item = Result<RenderedView>> + Send + use<>> {
-        self.sees(id)?;
+        self.sees(id).await?;
         let inner = Arc::clone(&self.inner);
         let limits = &inner.limits();
         for (what, count, max) in [

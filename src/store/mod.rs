@@ -1,43 +1,55 @@
-//! Scenes on disk and in memory: uploads and statuses in, scenes out, nothing acknowledged lost.
+//! Scenes kept and in memory: uploads and statuses in, scenes out, nothing acknowledged lost.
 //!
 //! ```text
-//! DATA_DIR/lock                          held by the one process that uses the folder
-//! DATA_DIR/incoming/ID/                  an upload being written; rubbish after a crash
-//! DATA_DIR/scenes/ID/upload.segsplat     photos and cameras as sent, with the first record
-//! DATA_DIR/scenes/ID/status.json         the newest record, with its checksum
-//! DATA_DIR/scenes/ID/scene.segsplat      the finished scene
-//! DATA_DIR/scenes/ID/semantics.segsplat  what it means, once somebody has asked
-//! DATA_DIR/scenes/ID/*.quarantined       a file that failed its checksum
-//! DATA_DIR/trash/ID/                     being deleted; rubbish after a crash
+//! scenes/ID/upload.segsplat     photos and cameras as sent, with the first record
+//! scenes/ID/scene.segsplat      the finished scene
+//! scenes/ID/semantics.segsplat  what it means, once somebody has asked
+//! scenes/ID/status.json         the record of what is over: done or failed
+//! scenes/ID/*.quarantined       an object that failed its checksum
+//! pending/ID                    the record of what is not over; gone once there is a status
+//! keys/HASH  contents/HASH      scene of an idempotency key, and of a content hash
+//! replicas/R claims/ID.R deleted/ID   only where replicas share the store: see `shared`
 //! ```
 //!
-//! Files appear by rename, folders too, each after an fsync: a file is there whole or not at all.
-//! Every byte read is under a checksum. A bad file is put aside, and the start goes on.
+//! An object is there whole or not at all, and every byte read is under a checksum. A scene exists
+//! while it has a status or a pending record; what has neither is rubbish that a sweep removes.
+//! A bad object is put aside, and the start goes on.
 
 mod cache;
 mod container;
 mod files;
+mod index;
+mod objects;
 mod open;
 pub mod ply;
 mod record;
 mod scene_file;
 mod semantics_file;
+mod shared;
+mod sweep;
 mod upload_file;
 
 use std::{
     collections::HashMap,
-    io,
-    path::{Path, PathBuf},
-    sync::{Arc, Mutex, PoisonError},
+    path::Path,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    time::Instant,
 };
 
 use fs_err as fs;
+use object_store::path::Path as Name;
 
-use self::{cache::Cache, files::unavailable};
+use self::{
+    cache::Cache,
+    objects::{Objects, unavailable},
+};
 pub use self::{
+    index::KeyUse,
+    open::Place,
     record::Record,
     scene_file::{read_scene, write_scene},
     semantics_file::{read_semantics, write_semantics},
+    shared::Beat,
     upload_file::hashes,
 };
 use crate::{
@@ -51,20 +63,39 @@ const SCENE: &str = "scene.segsplat";
 const SEMANTICS: &str = "semantics.segsplat";
 const QUARANTINED: &str = "quarantined";
 
-/// Scenes of one data folder. Calls block on the disk; all are safe from any thread.
+/// The scenes of one folder or bucket. Calls block on it; all are safe from any thread.
 #[derive(Debug)]
 pub struct Store {
-    root: PathBuf,
+    objects: Objects,
+    /// Whether other processes use the same objects.
+    shared: bool,
     cache: Cache,
     /// One lock a scene being read, so that many callers read it once.
     reading: Mutex<HashMap<SceneId, Arc<Mutex<()>>>>,
+    /// Scenes deleted here: what a job still writes of one is removed again.
+    gone: Mutex<HashMap<SceneId, Instant>>,
     /// Dropped with the store: another process may then use the folder.
-    _lock: fs::File,
+    _lock: Option<fs::File>,
+}
+
+fn of(id: &SceneId, name: &str) -> Name {
+    Name::from(format!("scenes/{id}/{name}"))
+}
+
+fn pending(id: &SceneId) -> Name {
+    Name::from(format!("pending/{id}"))
+}
+
+fn aside(name: &str) -> String {
+    let stem = name.rsplit_once('.').map_or(name, |(stem, _)| stem);
+    format!("{stem}.{QUARANTINED}")
 }
 
 impl Store {
-    fn folder(&self, id: &SceneId) -> PathBuf {
-        self.root.join("scenes").join(id.as_str())
+    /// Whether other processes use the same scenes.
+    #[must_use]
+    pub fn is_shared(&self) -> bool {
+        self.shared
     }
 
     /// Bytes of scenes in memory.
@@ -73,27 +104,32 @@ impl Store {
         self.cache.size_bytes()
     }
 
-    /// Keeps an upload and its first record: all of it or nothing, safe on disk on return.
+    /// Keeps the first record of a scene, before anything else of it.
+    ///
+    /// # Errors
+    /// `store_unavailable`.
+    pub fn announce(&self, record: &Record) -> Result<()> {
+        self.put_sealed(pending(&record.status.id), record)
+    }
+
+    /// Keeps an upload and its first record: all of it or nothing, safe on return.
     ///
     /// # Errors
     /// `store_unavailable`.
     pub fn put_upload(&self, upload: &Upload, record: &Record) -> Result<()> {
         let id = &record.status.id;
-        let incoming = self.root.join("incoming").join(id.as_str());
-        let write = || -> io::Result<()> {
-            fs::create_dir(&incoming)?;
-            files::write_atomic(&incoming.join(UPLOAD), |to| {
-                upload_file::write(to, upload, record)
-            })?;
-            write_record(&incoming, record)?;
-            let folder = self.folder(id);
-            fs::rename(&incoming, &folder)?;
-            files::sync_parent(&folder)
+        let keep = || -> Result<()> {
+            let mut file = Vec::with_capacity(upload.size_bytes() + (64 << 10));
+            upload_file::write(&mut file, upload, record)
+                .map_err(|e| Error::internal("the upload cannot be packed").caused_by(e))?;
+            // The record first: an upload without one is rubbish, however the call ends.
+            self.announce(record)?;
+            self.objects.put(of(id, UPLOAD), file).map_err(|e| unavailable("keep the upload", e))
         };
-        write().map_err(|cause| {
-            // What is left is cleared at the next start.
-            let _ = fs::remove_dir_all(&incoming);
-            unavailable("keep the upload", cause)
+        keep().inspect_err(|_| {
+            // What cannot be removed now is removed at the next start.
+            let _ = self.objects.delete(pending(id));
+            let _ = self.objects.delete(of(id, UPLOAD));
         })
     }
 
@@ -102,32 +138,66 @@ impl Store {
     /// # Errors
     /// `scene_not_found` when it is not kept, `scene_corrupt`, `store_unavailable`.
     pub fn upload(&self, id: &SceneId) -> Result<Upload> {
-        let file = self.read(id, UPLOAD, "the upload")?;
+        let file = self.get(id, UPLOAD, "read the upload")?.ok_or_else(|| not_found(id))?;
         Ok(upload_file::read(&file)?.0)
+    }
+
+    /// Forgets photos and cameras of a scene; what needs them can then not be made.
+    ///
+    /// # Errors
+    /// `store_unavailable`.
+    pub fn drop_upload(&self, id: &SceneId) -> Result<()> {
+        let deleted = self.objects.delete(of(id, UPLOAD));
+        deleted.map(drop).map_err(|e| unavailable("forget the photos", e))
     }
 
     /// Keeps a newer record.
     ///
     /// # Errors
-    /// `store_unavailable`, also when the scene was deleted.
+    /// `store_unavailable`; `scene_not_found` when the scene was deleted.
     pub fn put_record(&self, record: &Record) -> Result<()> {
-        write_record(&self.folder(&record.status.id), record)
-            .map_err(|cause| unavailable("keep the scene's status", cause))
+        let id = &record.status.id;
+        if record.status.state.is_final() {
+            self.put_sealed(of(id, STATUS), record)?;
+            self.unless_deleted(id)?;
+            self.end_pending(id)
+        } else {
+            self.put_sealed(pending(id), record)?;
+            self.unless_deleted(id)
+        }
+    }
+
+    fn put_sealed(&self, path: Name, record: &Record) -> Result<()> {
+        let sealed = record::seal(record)
+            .map_err(|e| Error::internal("the scene's status cannot be written").caused_by(e))?;
+        self.objects.put(path, sealed).map_err(|e| unavailable("keep the scene's status", e))
     }
 
     /// Keeps a finished scene, also in memory; gives the sha256 of its file, hex.
     ///
+    /// Where another replica was faster, its file stays and is the scene.
+    ///
     /// # Errors
-    /// `store_unavailable`, also when the scene was deleted.
+    /// `store_unavailable`; `scene_not_found` when the scene was deleted.
     pub fn put_scene(&self, scene: Scene) -> Result<String> {
-        let path = self.folder(&scene.meta.id).join(SCENE);
-        let mut digest = String::new();
-        files::write_atomic(&path, |to| {
-            digest = write_scene(to, &scene)?;
-            Ok(())
-        })
-        .map_err(|cause| unavailable("keep the scene", cause))?;
-        self.cache.insert(Arc::new(scene));
+        let id = scene.meta.id.clone();
+        let mut file = Vec::with_capacity(scene.gaussians.size_bytes() as usize + (64 << 10));
+        let mut digest = write_scene(&mut file, &scene)
+            .map_err(|e| Error::internal("the scene cannot be packed").caused_by(e))?;
+        let mut scene = Arc::new(scene);
+        let failed = |e| unavailable("keep the scene", e);
+        if !self.shared {
+            self.objects.put(of(&id, SCENE), file).map_err(failed)?;
+        } else if !self.objects.create(of(&id, SCENE), file.clone()).map_err(failed)? {
+            match self.get(&id, SCENE, "read the scene")?.map(|theirs| read_scene(&theirs)) {
+                Some(Ok((theirs, sha256))) if theirs.meta.id == id => {
+                    (scene, digest) = (Arc::new(theirs), sha256);
+                }
+                _ => self.objects.put(of(&id, SCENE), file).map_err(failed)?,
+            }
+        }
+        self.unless_deleted(&id)?;
+        self.cache.insert(scene);
         Ok(digest)
     }
 
@@ -140,22 +210,20 @@ impl Store {
         id: &SceneId,
         semantics: Semantics,
     ) -> Result<(Arc<Scene>, String)> {
-        let scene = Arc::new(self.scene(id)?.with_semantics(Arc::new(semantics))?);
-        let mut digest = String::new();
-        files::write_atomic(&self.folder(id).join(SEMANTICS), |to| {
-            if let Some(semantics) = &scene.semantics {
-                digest = write_semantics(to, id, semantics)?;
-            }
-            Ok(())
-        })
-        .map_err(|cause| unavailable("keep the scene's semantics", cause))?;
+        let semantics = Arc::new(semantics);
+        let scene = Arc::new(self.scene(id)?.with_semantics(Arc::clone(&semantics))?);
+        let mut file = Vec::new();
+        let digest = write_semantics(&mut file, id, &semantics)
+            .map_err(|e| Error::internal("the semantics cannot be packed").caused_by(e))?;
+        let kept = self.objects.put(of(id, SEMANTICS), file);
+        kept.map_err(|e| unavailable("keep the scene's semantics", e))?;
+        self.unless_deleted(id)?;
         self.cache.insert(Arc::clone(&scene));
         Ok((scene, digest))
     }
 
-    /// A finished scene, from memory or disk, with its semantics where they were made; every byte
-    /// from disk is checked. Bad semantics are put aside: the scene is whole without them.
-    ///
+    /// A finished scene, from memory or the store, with its semantics where they were made; every
+    /// byte read is checked. Bad semantics are put aside: the scene is whole without them.
     ///
     /// # Errors
     /// `scene_not_found`, `scene_corrupt` (its file is then put aside), `store_unavailable`.
@@ -181,15 +249,32 @@ impl Store {
         scene
     }
 
+    /// sha256 of a scene's file as it is kept, hex; `None` where there is none that is sound.
+    ///
+    /// # Errors
+    /// `store_unavailable`.
+    pub fn scene_digest(&self, id: &SceneId) -> Result<Option<String>> {
+        let file = self.get(id, SCENE, "read the scene")?;
+        Ok(file.and_then(|file| read_scene(&file).ok()).map(|(_, sha256)| sha256))
+    }
+
+    /// Forgets the copy of a scene in memory: the next call reads what the store has.
+    pub fn forget(&self, id: &SceneId) {
+        self.cache.remove(id);
+    }
+
     fn read_scene(&self, id: &SceneId) -> Result<Arc<Scene>> {
-        let folder = self.folder(id);
-        if !folder.join(SCENE).exists() && folder.join(SCENE).with_extension(QUARANTINED).exists() {
-            return Err(Error::new(
-                ErrorCode::SceneCorrupt,
-                format!("scene {id} failed its checksum and was put aside"),
-            ));
-        }
-        let file = self.read(id, SCENE, "the scene")?;
+        let Some(file) = self.get(id, SCENE, "read the scene")? else {
+            let put_aside = self.objects.exists(of(id, &aside(SCENE)));
+            return Err(if put_aside.map_err(|e| unavailable("read the scene", e))? {
+                Error::new(
+                    ErrorCode::SceneCorrupt,
+                    format!("scene {id} failed its checksum and was put aside"),
+                )
+            } else {
+                not_found(id)
+            });
+        };
         let checked = read_scene(&file).and_then(|(scene, _)| {
             if scene.meta.id == *id {
                 Ok(scene)
@@ -209,7 +294,7 @@ impl Store {
             }
             Err(error) => {
                 tracing::error!(scene = %id, error = %error, "a scene file is put aside");
-                quarantine(&folder.join(SCENE));
+                self.quarantine(id, SCENE);
                 Err(error)
             }
         }
@@ -218,17 +303,14 @@ impl Store {
     /// The scene with the semantics that are kept beside it, if any are and they are sound.
     fn with_its_semantics(&self, scene: Scene) -> Result<Scene> {
         let id = scene.meta.id.clone();
-        let path = self.folder(&id).join(SEMANTICS);
-        let file = match fs::read(&path) {
-            Ok(file) => file,
-            Err(cause) if cause.kind() == io::ErrorKind::NotFound => return Ok(scene),
-            Err(cause) => return Err(unavailable("read the scene's semantics", cause)),
+        let Some(file) = self.get(&id, SEMANTICS, "read the scene's semantics")? else {
+            return Ok(scene);
         };
         let checked = read_semantics(&file, &id)
             .and_then(|(semantics, _)| scene.with_semantics(Arc::new(semantics)));
         checked.or_else(|error| {
             tracing::error!(scene = %id, %error, "semantics are put aside, to be made again");
-            quarantine(&path);
+            self.quarantine(&id, SEMANTICS);
             Ok(scene)
         })
     }
@@ -239,38 +321,84 @@ impl Store {
     /// `store_unavailable`.
     pub fn drop_semantics(&self, id: &SceneId) -> Result<()> {
         self.cache.remove(id);
-        let path = self.folder(id).join(SEMANTICS);
-        match fs::remove_file(&path).and_then(|()| files::sync_parent(&path)) {
-            Err(cause) if cause.kind() != io::ErrorKind::NotFound => {
-                Err(unavailable("forget the scene's semantics", cause))
-            }
-            _ => Ok(()),
-        }
+        let deleted = self.objects.delete(of(id, SEMANTICS));
+        deleted.map(drop).map_err(|e| unavailable("forget the scene's semantics", e))
     }
 
     /// Removes everything of a scene; gone is gone at once, even if power fails.
     ///
     /// # Errors
-    /// `scene_not_found`, `store_unavailable`.
-    pub fn remove(&self, id: &SceneId) -> Result<()> {
-        let folder = self.folder(id);
-        let trash = self.root.join("trash").join(id.as_str());
-        match fs::rename(&folder, &trash) {
-            Ok(()) => {}
-            Err(e) if e.kind() == io::ErrorKind::NotFound => return Err(not_found(id)),
-            Err(cause) => return Err(unavailable("delete the scene", cause)),
+    /// `scene_not_found`, `store_unavailable`: it may then be there still, whole.
+    pub fn remove(&self, record: &Record) -> Result<()> {
+        let id = &record.status.id;
+        let failed = |e| unavailable("delete the scene", e);
+        self.lock_gone().insert(id.clone(), Instant::now());
+        let unmake = || -> Result<bool> {
+            if self.shared {
+                self.put_tombstone(id)?;
+            }
+            // What makes it a scene goes first: the rest is rubbish from then on.
+            let status = self.objects.delete(of(id, STATUS)).map_err(failed)?;
+            Ok(self.objects.delete(pending(id)).map_err(failed)? || status)
+        };
+        let was_there = unmake().inspect_err(|_| {
+            self.lock_gone().remove(id);
+        })?;
+        if !was_there {
+            return Err(not_found(id));
         }
         self.cache.remove(id);
-        files::sync_parent(&folder)
-            .and_then(|()| fs::remove_dir_all(&trash))
-            .map_err(|cause| unavailable("delete the scene", cause))
+        // The next sweep takes what cannot be removed now: the scene is gone all the same.
+        if let Err(error) = self.purge(id).and_then(|()| self.unlink(record)) {
+            tracing::warn!(scene = %id, %error, "left-overs of a deleted scene stay for a sweep");
+        }
+        Ok(())
     }
 
-    fn read(&self, id: &SceneId, name: &str, what: &str) -> Result<Vec<u8>> {
-        fs::read(self.folder(id).join(name)).map_err(|cause| match cause.kind() {
-            io::ErrorKind::NotFound => not_found(id),
-            _ => unavailable(&format!("read {what}"), cause),
-        })
+    /// Takes back what was just written where the scene has been deleted meanwhile.
+    fn unless_deleted(&self, id: &SceneId) -> Result<()> {
+        let here = self.lock_gone().contains_key(id);
+        let deleted = here || self.shared && self.has_tombstone(id)?;
+        if !deleted {
+            return Ok(());
+        }
+        for path in [of(id, STATUS), pending(id)] {
+            let deleted = self.objects.delete(path);
+            deleted.map_err(|e| unavailable("remove a deleted scene", e))?;
+        }
+        self.purge(id)?;
+        self.cache.remove(id);
+        Err(not_found(id))
+    }
+
+    /// Removes all objects under a scene's name.
+    fn purge(&self, id: &SceneId) -> Result<()> {
+        let failed = |e| unavailable("remove a deleted scene", e);
+        for object in self.objects.list(&format!("scenes/{id}")).map_err(failed)? {
+            self.objects.delete(object.path).map_err(failed)?;
+        }
+        Ok(())
+    }
+
+    /// The scene is over: there is a status.
+    fn end_pending(&self, id: &SceneId) -> Result<()> {
+        let ended = self.objects.delete(pending(id));
+        ended.map(drop).map_err(|e| unavailable("keep the scene's status", e))?;
+        if self.shared { self.drop_claims(id) } else { Ok(()) }
+    }
+
+    fn get(&self, id: &SceneId, name: &str, what: &str) -> Result<Option<Vec<u8>>> {
+        self.objects.get(of(id, name)).map_err(|e| unavailable(what, e))
+    }
+
+    fn quarantine(&self, id: &SceneId, name: &str) {
+        if let Err(error) = self.objects.rename(of(id, name), of(id, &aside(name))) {
+            tracing::error!(scene = %id, %error, "a bad object cannot be put aside");
+        }
+    }
+
+    fn lock_gone(&self) -> MutexGuard<'_, HashMap<SceneId, Instant>> {
+        self.gone.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -284,7 +412,7 @@ pub fn write_scene_file(path: &Path, scene: &Scene) -> Result<String> {
         digest = write_scene(to, scene)?;
         Ok(())
     })
-    .map_err(|cause| unavailable("write the scene file", cause))?;
+    .map_err(|cause| files::unavailable("write the scene file", cause))?;
     Ok(digest)
 }
 
@@ -294,19 +422,7 @@ pub fn write_scene_file(path: &Path, scene: &Scene) -> Result<String> {
 /// `store_unavailable`.
 pub fn write_semantics_file(path: &Path, id: &SceneId, semantics: &Semantics) -> Result<()> {
     files::write_atomic(path, |to| write_semantics(to, id, semantics).map(drop))
-        .map_err(|cause| unavailable("write the semantics file", cause))
-}
-
-fn write_record(folder: &Path, record: &Record) -> io::Result<()> {
-    let sealed = record::seal(record)?;
-    files::write_atomic(&folder.join(STATUS), |to| to.write_all(&sealed))
-}
-
-fn quarantine(path: &Path) {
-    let aside = path.with_extension(QUARANTINED);
-    if let Err(error) = fs::rename(path, &aside).and_then(|()| files::sync_parent(path)) {
-        tracing::error!(%error, "a bad file cannot be put aside");
-    }
+        .map_err(|cause| files::unavailable("write the semantics file", cause))
 }
 
 /// Milliseconds since 1970.

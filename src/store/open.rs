@@ -1,147 +1,287 @@
-//! Opening a data folder: one process only, rubbish cleared, every scene accounted for.
+//! Opening a folder or a bucket, and finding every scene in it, whatever a crash left.
 
-use std::path::Path;
+use std::{
+    collections::HashSet,
+    path::{Path, PathBuf},
+    sync::Arc,
+    time::Duration,
+};
 
 use fs_err as fs;
+use object_store::{
+    ClientOptions, ObjectStore, RetryConfig, aws::AmazonS3Builder, local::LocalFileSystem,
+    prefix::PrefixStore,
+};
 
 use super::{
-    Cache, QUARANTINED, Record, SCENE, SEMANTICS, STATUS, Store, UPLOAD, files::unavailable,
-    quarantine, record, scene_file, upload_file, write_record,
+    Cache, Objects, Record, SCENE, STATUS, Store, UPLOAD, aside, files, of, pending, record,
+    scene_file, unavailable, upload_file,
 };
 use crate::{
+    config::Config,
     error::{Error, ErrorCode, Result},
+    limits::Limits,
     scene::{SceneError, SceneId, SceneState, SceneStatus},
 };
+
+/// How often a call to S3 is tried again, within `limits.store_timeout_ms`.
+const S3_RETRIES_MAX: usize = 4;
+
+/// All that a store puts into its folder or bucket lies under these.
+const PREFIXES: [&str; 7] =
+    ["scenes", "pending", "keys", "contents", "replicas", "claims", "deleted"];
+
+/// Where scenes are kept.
+#[derive(Clone, Debug)]
+pub enum Place {
+    /// A folder that this process alone uses.
+    Folder(PathBuf),
+    /// Objects that other replicas use too.
+    Shared(Arc<dyn ObjectStore>),
+    /// Objects that this process alone uses.
+    Own(Arc<dyn ObjectStore>),
+}
+
+impl Place {
+    /// What the configuration names: an S3-compatible bucket, else the data folder.
+    ///
+    /// # Errors
+    /// `invalid_request` when the bucket cannot be used as it is named.
+    pub fn of(config: &Config) -> Result<Self> {
+        let Some((bucket, prefix)) = config.bucket()? else {
+            return Ok(Self::Folder(config.data_dir.clone()));
+        };
+        let timeout = Duration::from_millis(config.limits.store_timeout_ms);
+        let client = ClientOptions::new()
+            .with_allow_http(config.s3_allow_http)
+            .with_connect_timeout(timeout.min(Duration::from_secs(5)))
+            .with_timeout(timeout);
+        // Keys come from the environment alone, by the names that every S3 tool knows.
+        let mut builder = AmazonS3Builder::from_env()
+            .with_bucket_name(bucket)
+            .with_client_options(client)
+            .with_retry(RetryConfig {
+                max_retries: S3_RETRIES_MAX,
+                retry_timeout: timeout,
+                ..RetryConfig::default()
+            });
+        if let Some(endpoint) = &config.s3_endpoint {
+            builder = builder.with_endpoint(endpoint);
+        }
+        if let Some(region) = &config.s3_region {
+            builder = builder.with_region(region);
+        }
+        let s3 = builder.build().map_err(|e| {
+            Error::invalid(format!("config: store s3://{bucket} cannot be used")).caused_by(e)
+        })?;
+        Ok(Self::Shared(if prefix.is_empty() {
+            Arc::new(s3)
+        } else {
+            Arc::new(PrefixStore::new(s3, prefix))
+        }))
+    }
+}
 
 impl Store {
     /// Opens a folder, made where missing, and gives the record of every scene in it.
     ///
-    /// A scene whose status is bad gets it back from its scene file or its upload; one that has
+    /// # Errors
+    /// As [`Self::open_at`].
+    pub fn open(root: &Path, cache_bytes_max: u64) -> Result<(Self, Vec<Record>)> {
+        let limits = Limits { cache_bytes_max, ..Limits::default() };
+        Self::open_at(&Place::Folder(root.to_owned()), &limits)
+    }
+
+    /// Opens a place, and gives the record of every scene in it; none where replicas share it,
+    /// which look scenes up as they are asked for.
+    ///
+    /// A scene whose record is bad gets it back from its scene file or its upload; one that has
     /// neither is reported as failed with `scene_corrupt`.
     ///
     /// # Errors
-    /// `store_unavailable` when the folder cannot be used or another process uses it.
-    pub fn open(root: &Path, cache_bytes_max: u64) -> Result<(Self, Vec<Record>)> {
-        let prepare = || -> std::io::Result<fs::File> {
-            for folder in ["scenes", "incoming", "trash"] {
-                fs::create_dir_all(root.join(folder))?;
+    /// `store_unavailable` when the place cannot be used, or another process uses the folder.
+    pub fn open_at(place: &Place, limits: &Limits) -> Result<(Self, Vec<Record>)> {
+        let timeout = Duration::from_millis(limits.store_timeout_ms);
+        let (objects, shared, lock) = match place {
+            Place::Folder(root) => {
+                let lock = lock(root)?;
+                // Of a folder that holds other things too, only what is ours.
+                PREFIXES.iter().for_each(|ours| clear_cut_off(&root.join(ours)));
+                let (folder, local) = local(root)?;
+                (Objects::new(Arc::new(local), Some(folder), timeout)?, false, Some(lock))
             }
-            fs::OpenOptions::new().create(true).truncate(false).write(true).open(root.join("lock"))
+            Place::Shared(store) => (Objects::new(Arc::clone(store), None, timeout)?, true, None),
+            Place::Own(store) => (Objects::new(Arc::clone(store), None, timeout)?, false, None),
         };
-        let lock = prepare().map_err(|cause| unavailable("open the data folder", cause))?;
-        lock.file().try_lock().map_err(|cause| {
-            Error::new(ErrorCode::StoreUnavailable, "another process uses the data folder")
-                .caused_by(cause)
-        })?;
         let store = Self {
-            root: root.to_owned(),
-            cache: Cache::new(cache_bytes_max),
+            objects,
+            shared,
+            cache: Cache::new(limits.cache_bytes_max),
             reading: std::sync::Mutex::default(),
+            gone: std::sync::Mutex::default(),
             _lock: lock,
         };
-        let records = store.recover().map_err(|cause| unavailable("read its folder", cause))?;
+        let records = if shared {
+            // Only to know now, and not at the first call, whether it can be used.
+            store.beats()?;
+            Vec::new()
+        } else {
+            store.recover()?
+        };
         Ok((store, records))
     }
 
-    fn recover(&self) -> std::io::Result<Vec<Record>> {
-        for rubbish in ["incoming", "trash"] {
-            for entry in fs::read_dir(self.root.join(rubbish))? {
-                let path = entry?.path();
-                if let Err(error) = fs::remove_dir_all(&path) {
-                    tracing::warn!(%error, "a left-over folder cannot be removed");
+    /// The record of every scene; what was never acknowledged is removed.
+    fn recover(&self) -> Result<Vec<Record>> {
+        let unfinished: HashSet<SceneId> =
+            self.unfinished()?.into_iter().map(|(id, _)| id).collect();
+        let mut ids: Vec<SceneId> = self.stamps()?.into_iter().map(|(id, _)| id).collect();
+        ids.sort();
+        let failed = |e| unavailable("read the scenes", e);
+        let statuses =
+            self.objects.get_all(ids.iter().map(|id| of(id, STATUS)).collect()).map_err(failed)?;
+        let mut records = Vec::with_capacity(ids.len());
+        for (id, status) in ids.iter().zip(statuses) {
+            match status.as_deref().and_then(|file| sound(id, file)) {
+                Some(record) => {
+                    // Where a crash came between the status and the end of the pending record.
+                    if unfinished.contains(id) {
+                        self.objects.delete(pending(id)).map_err(failed)?;
+                    }
+                    records.push(record);
                 }
+                None if status.is_none() && !self.was_acknowledged(id)? => self.drop_pending(id)?,
+                None => records.extend(find_record(self, id)?),
             }
-        }
-        let mut records = Vec::new();
-        for entry in fs::read_dir(self.root.join("scenes"))? {
-            let entry = entry?;
-            let id = entry.file_name().to_str().and_then(|name| name.parse::<SceneId>().ok());
-            let Some(id) = id else {
-                tracing::warn!("the data folder holds something that is no scene; left alone");
-                continue;
-            };
-            records.push(recover_record(&entry.path(), &id));
         }
         Ok(records)
     }
 }
 
-/// The record of the scene in `folder`, from whatever of it is sound.
-fn recover_record(folder: &Path, id: &SceneId) -> Record {
-    clear_temporary(folder);
-    let status = fs::read(folder.join(STATUS)).map_err(|e| unavailable("read a status", e));
-    let error = match status.and_then(|file| record::unseal(&file)) {
-        Ok(record) if record.status.id == *id => return record,
+fn lock(root: &Path) -> Result<fs::File> {
+    let prepare = || -> std::io::Result<fs::File> {
+        fs::create_dir_all(root)?;
+        fs::OpenOptions::new().create(true).truncate(false).write(true).open(root.join("lock"))
+    };
+    let lock = prepare().map_err(|cause| files::unavailable("open the data folder", cause))?;
+    lock.file().try_lock().map_err(|cause| {
+        Error::new(ErrorCode::StoreUnavailable, "another process uses the data folder")
+            .caused_by(cause)
+    })?;
+    Ok(lock)
+}
+
+fn local(root: &Path) -> Result<(PathBuf, LocalFileSystem)> {
+    let folder = fs::canonicalize(root)
+        .map_err(|cause| files::unavailable("open the data folder", cause))?;
+    let local = LocalFileSystem::new_with_prefix(&folder)
+        .map_err(|fault| unavailable("open the data folder", fault))?;
+    Ok((folder, local.with_fsync(true).with_automatic_cleanup(true)))
+}
+
+/// Removes what a crash cut off and no listing shows: staging files, `NAME#NUMBER`, and folders of
+/// which nothing is left.
+fn clear_cut_off(folder: &Path) {
+    let is_staged = |name: &std::ffi::OsStr| {
+        let number = name.to_str().and_then(|name| name.rsplit_once('#'));
+        number.is_some_and(|(_, number)| number.bytes().all(|byte| byte.is_ascii_digit()))
+    };
+    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        // What stays is in nobody's way; a folder with anything in it stays.
+        if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
+            clear_cut_off(&entry.path());
+            let _ = fs::remove_dir(entry.path());
+        } else if is_staged(&entry.file_name()) {
+            let _ = fs::remove_file(entry.path());
+        }
+    }
+}
+
+/// The record in a file, where it is whole and of this scene.
+pub(super) fn sound(id: &SceneId, file: &[u8]) -> Option<Record> {
+    record::unseal(file).ok().filter(|record| record.status.id == *id)
+}
+
+/// The newest record of a scene: its status, else what is pending, else what can be rebuilt.
+pub(super) fn find_record(store: &Store, id: &SceneId) -> Result<Option<Record>> {
+    let failed = |e| unavailable("read a status", e);
+    let mut found = store.objects.get(of(id, STATUS)).map_err(failed)?;
+    let is_status = found.is_some();
+    if !is_status {
+        found = store.objects.get(pending(id)).map_err(failed)?;
+    }
+    let Some(file) = found else { return Ok(None) };
+    let error = match record::unseal(&file) {
+        Ok(record) if record.status.id == *id => return Ok(Some(record)),
         Ok(_) => Error::new(ErrorCode::SceneCorrupt, "the scene's status is another scene's"),
         Err(error) => error,
     };
     tracing::error!(scene = %id, error = %error, "a scene's status is bad; rebuilding it");
-    let record = from_scene(folder, id).or_else(|| from_upload(folder, id)).unwrap_or_else(|| {
-        let now = super::now_ms();
-        Record {
-            status: SceneStatus {
-                error: Some(SceneError::from(&error)),
-                ..SceneStatus::new(id.clone(), SceneState::Failed, now)
-            },
-            owner: None,
-            options: crate::scene::SceneOptions::default(),
-            idempotency_key: None,
-            request_sha256: String::new(),
-            attempts: 0,
-            scene_sha256: None,
-            semantics_sha256: None,
-        }
-    });
-    if folder.join(STATUS).exists() {
-        quarantine(&folder.join(STATUS));
-    }
-    if let Err(error) = write_record(folder, &record) {
+    let rebuilt = match from_scene(store, id)? {
+        Some(record) => record,
+        None => match from_upload(store, id)? {
+            Some(record) => record,
+            None => lost(id, &error),
+        },
+    };
+    let put_aside = if is_status {
+        store.objects.rename(of(id, STATUS), of(id, &aside(STATUS)))
+    } else {
+        Ok(true)
+    };
+    let kept = put_aside
+        .map_err(|e| unavailable("put a bad status aside", e))
+        .and_then(|_| store.put_record(&rebuilt));
+    if let Err(error) = kept {
         tracing::error!(scene = %id, %error, "the rebuilt status cannot be written");
     }
-    record
+    Ok(Some(rebuilt))
 }
 
-fn from_scene(folder: &Path, id: &SceneId) -> Option<Record> {
-    let (scene, sha256) = scene_file::read_scene(&fs::read(folder.join(SCENE)).ok()?).ok()?;
+fn lost(id: &SceneId, error: &Error) -> Record {
+    let status = SceneStatus {
+        error: Some(SceneError::from(error)),
+        ..SceneStatus::new(id.clone(), SceneState::Failed, super::now_ms())
+    };
+    Record::new(status)
+}
+
+fn from_scene(store: &Store, id: &SceneId) -> Result<Option<Record>> {
+    let Some(file) = store.get(id, SCENE, "read the scene")? else { return Ok(None) };
+    let Ok((scene, sha256)) = scene_file::read_scene(&file) else { return Ok(None) };
     let meta = scene.meta;
     if meta.id != *id {
-        return None;
+        return Ok(None);
     }
-    Some(Record {
-        status: SceneStatus {
-            fraction: 1.0,
-            report: Some(meta.report),
-            cameras: meta.cameras,
-            ..SceneStatus::new(id.clone(), SceneState::Done, meta.created_ms)
-        },
-        // Without the upload nobody but an admin sees it: better than the wrong owner.
-        owner: first_record(folder, id).and_then(|record| record.owner),
+    let status = SceneStatus {
+        fraction: 1.0,
+        report: Some(meta.report),
+        cameras: meta.cameras,
+        ..SceneStatus::new(id.clone(), SceneState::Done, meta.created_ms)
+    };
+    // Without the upload nobody but an admin sees it: better than the wrong owner.
+    let owner = first_record(store, id)?.and_then(|record| record.owner);
+    Ok(Some(Record {
+        owner,
         options: meta.provenance.options,
-        idempotency_key: None,
-        request_sha256: String::new(),
         attempts: 1,
         scene_sha256: Some(sha256),
-        semantics_sha256: None,
-    })
+        content_sha256: Some(meta.provenance.content_sha256).filter(|hash| !hash.is_empty()),
+        ..Record::new(status)
+    }))
 }
 
-fn from_upload(folder: &Path, id: &SceneId) -> Option<Record> {
-    if folder.join(SCENE).with_extension(QUARANTINED).exists() {
-        return None;
+fn from_upload(store: &Store, id: &SceneId) -> Result<Option<Record>> {
+    let bad = store.objects.exists(of(id, &aside(SCENE)));
+    if bad.map_err(|e| unavailable("look for a bad scene", e))? {
+        return Ok(None);
     }
-    first_record(folder, id)
+    first_record(store, id)
 }
 
 /// The record that the upload was kept with.
-fn first_record(folder: &Path, id: &SceneId) -> Option<Record> {
-    let (_, record) = upload_file::read(&fs::read(folder.join(UPLOAD)).ok()?).ok()?;
-    (record.status.id == *id).then_some(record)
-}
-
-/// A write that a crash cut off.
-fn clear_temporary(folder: &Path) {
-    for name in [UPLOAD, STATUS, SCENE, SEMANTICS] {
-        // Absent is the rule.
-        let _ = fs::remove_file(folder.join(name).with_extension(super::files::TEMPORARY));
-    }
+fn first_record(store: &Store, id: &SceneId) -> Result<Option<Record>> {
+    let Some(file) = store.get(id, UPLOAD, "read the upload")? else { return Ok(None) };
+    let record = upload_file::read(&file).ok().map(|(_, record)| record);
+    Ok(record.filter(|record| record.status.id == *id))
 }

@@ -30,6 +30,31 @@ pub struct Record {
     /// sha256 of the semantics container, hex, once they are ready.
     #[serde(default)]
     pub semantics_sha256: Option<String>,
+    /// sha256 over photos, cameras, options, bundle and program, hex: what the scene is made of.
+    #[serde(default)]
+    pub content_sha256: Option<String>,
+    /// The replica that makes it, where replicas share the store.
+    #[serde(default)]
+    pub replica: Option<String>,
+}
+
+impl Record {
+    /// A record of which nothing but the status is known.
+    #[must_use]
+    pub fn new(status: SceneStatus) -> Self {
+        Self {
+            status,
+            owner: None,
+            options: SceneOptions::default(),
+            idempotency_key: None,
+            request_sha256: String::new(),
+            attempts: 0,
+            scene_sha256: None,
+            semantics_sha256: None,
+            content_sha256: None,
+            replica: None,
+        }
+    }
 }
 
 /// The record with its own checksum: a flipped digit in a number would still be JSON.

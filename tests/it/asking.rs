@@ -33,8 +33,8 @@ async fn scene(server: &TestServer, semantics: SemanticsMode) -> SceneStatus {
     server.service.create_scene(request).await.expect("a good upload").status
 }
 
-fn stand(server: &TestServer, id: &SceneId) -> SemanticsState {
-    server.service.get(id).unwrap().semantics.state
+async fn stand(server: &TestServer, id: &SceneId) -> SemanticsState {
+    server.service.get(id).await.unwrap().semantics.state
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -49,7 +49,7 @@ async fn lazy_semantics_are_made_by_the_first_who_asks_and_once_however_many_ask
     let ask = || server.service.understand(id, Some(PATIENCE));
     let all = join_all((0..20).map(|_| ask()));
     let let_go = async {
-        while stand(&server, id) != SemanticsState::Running {
+        while stand(&server, id).await != SemanticsState::Running {
             tokio::time::sleep(Duration::from_millis(2)).await;
         }
         meaning.hold.store(false, Ordering::Release);
@@ -71,19 +71,19 @@ async fn the_scene_stays_done_while_its_semantics_run_and_watchers_see_their_sta
     let late = server.service.understand(&id, Some(Duration::ZERO)).await.unwrap_err();
     assert_eq!((late.code(), late.retry_after()), (ErrorCode::SceneNotReady, Some(2)));
     assert!(late.message().contains("are being made"), "{late}");
-    let mut events = std::pin::pin!(server.service.watch(&id).unwrap());
+    let mut events = std::pin::pin!(server.service.watch(&id).await.unwrap());
     while !matches!(events.next().await, Some(Event::Running { stage, fraction })
         if stage == "masks" && fraction > 0.2)
     {}
-    let status = server.service.get(&id).unwrap();
+    let status = server.service.get(&id).await.unwrap();
     assert_eq!((status.state, status.semantics.state), (SceneState::Done, SemanticsState::Running));
     assert_eq!(status.semantics.stage.as_deref(), Some("masks"));
-    let view = server.service.view_etag(&id, &crate::common::server::first_view());
+    let view = server.service.view_etag(&id, &crate::common::server::first_view()).await;
     assert!(view.is_ok(), "it can be viewed meanwhile");
     meaning.hold.store(false, Ordering::Release);
     let rest: Vec<Event> = events.collect().await;
     assert_eq!(rest.last(), Some(&Event::Done));
-    let status = server.service.get(&id).unwrap();
+    let status = server.service.get(&id).await.unwrap();
     assert_eq!(status.semantics.state, SemanticsState::Ready);
     assert_eq!(status.semantics.report.unwrap().masks, [1, 1, 1]);
 }
@@ -95,7 +95,7 @@ async fn eager_semantics_come_with_the_scene_and_watchers_do_not_leave_before() 
     let options = SceneOptions { semantics: SemanticsMode::Eager, ..SceneOptions::default() };
     let request = CreateScene { upload: upload(), options, ..CreateScene::default() };
     let id = server.service.create_scene(request).await.unwrap().status.id;
-    let mut events = std::pin::pin!(server.service.watch(&id).unwrap());
+    let mut events = std::pin::pin!(server.service.watch(&id).await.unwrap());
     loop {
         match events.next().await {
             Some(Event::Running { stage, .. }) if stage == "masks" => break,
@@ -103,7 +103,7 @@ async fn eager_semantics_come_with_the_scene_and_watchers_do_not_leave_before() 
             _ => {}
         }
     }
-    assert_eq!(server.service.get(&id).unwrap().state, SceneState::Done, "it can be viewed");
+    assert_eq!(server.service.get(&id).await.unwrap().state, SceneState::Done, "it can be viewed");
     meaning.hold.store(false, Ordering::Release);
     let rest: Vec<Event> = events.collect().await;
     assert_eq!(rest.last(), Some(&Event::Done));
@@ -141,7 +141,7 @@ async fn semantics_that_fail_say_why_and_the_next_text_tries_again() {
     *meaning.fails.lock().unwrap() = Some(ErrorCode::LimitExceeded);
     let error = server.service.understand(&id, None).await.unwrap_err();
     assert_eq!(error.code(), ErrorCode::LimitExceeded);
-    let status = server.service.get(&id).unwrap();
+    let status = server.service.get(&id).await.unwrap();
     assert_eq!((status.state, status.semantics.state), (SceneState::Done, SemanticsState::Failed));
     assert_eq!(status.semantics.error.unwrap().code, "limit_exceeded");
     *meaning.fails.lock().unwrap() = None;
@@ -156,7 +156,7 @@ async fn semantics_are_kept_over_a_restart_and_made_again_when_their_file_is_bad
     let id = scene(&server, SemanticsMode::Lazy).await.id;
     server.service.understand(&id, None).await.unwrap();
     let server = server.restart().await;
-    assert_eq!(stand(&server, &id), SemanticsState::Ready);
+    assert_eq!(stand(&server, &id).await, SemanticsState::Ready);
     server.service.understand(&id, None).await.unwrap();
     assert_eq!(meaning.made.load(Ordering::Acquire), 1, "read from their file");
     let server = server.restart().await;
@@ -170,9 +170,9 @@ async fn semantics_are_kept_over_a_restart_and_made_again_when_their_file_is_bad
     assert_eq!(meaning.made.load(Ordering::Acquire), 2, "made again");
     assert!(folder.join("semantics.quarantined").exists(), "the bad file is put aside");
     assert!(folder.join("semantics.segsplat").exists(), "the new one is kept");
-    // A lost status is found again in the file.
+    // What a bad status said is found again in the files.
     let server = server.restart().await;
-    std::fs::remove_file(folder.join("status.json")).unwrap();
+    std::fs::write(folder.join("status.json"), b"rubbish").unwrap();
     let server = server.restart().await;
     server.service.understand(&id, None).await.unwrap();
     assert_eq!(meaning.made.load(Ordering::Acquire), 2);
@@ -185,7 +185,7 @@ async fn deleting_a_scene_stops_its_semantics_and_tells_who_waits() {
     meaning.hold.store(true, Ordering::Release);
     let waits = server.service.understand(&id, Some(PATIENCE));
     let deletes = async {
-        while stand(&server, &id) != SemanticsState::Running {
+        while stand(&server, &id).await != SemanticsState::Running {
             tokio::time::sleep(Duration::from_millis(2)).await;
         }
         server.service.delete(&id).await.unwrap();

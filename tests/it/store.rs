@@ -1,6 +1,6 @@
 //! The store: bit for bit, whole or not at all, bad files put aside, PLY out and in.
 
-use std::{fs, io::Cursor, path::Path};
+use std::{fs, io::Cursor, path::Path, time::Duration};
 
 use glam::DVec3;
 use segsplat::{
@@ -11,7 +11,7 @@ use segsplat::{
         UploadCameras, UploadFile,
     },
     store::{
-        Record, Store,
+        KeyUse, Record, Store,
         ply::{PlyWriter, ply_size_bytes, read_ply},
         read_scene, write_scene,
     },
@@ -79,15 +79,13 @@ fn bits(gaussians: &Gaussians) -> Vec<u32> {
 
 fn record(id: u8) -> Record {
     let id = SceneId::from_bytes([id; 16]);
+    let status = SceneStatus::new(id, SceneState::Queued, 1_700_000_000_123);
     Record {
-        status: SceneStatus::new(id, SceneState::Queued, 1_700_000_000_123),
         owner: Some("somebody".to_owned()),
         options: SceneOptions { max_views: Some(4), ..SceneOptions::default() },
         idempotency_key: Some("key".to_owned()),
         request_sha256: "cd".repeat(32),
-        attempts: 0,
-        scene_sha256: None,
-        semantics_sha256: None,
+        ..Record::new(status)
     }
 }
 
@@ -175,65 +173,90 @@ fn a_bad_scene_is_put_aside_and_the_start_goes_on() {
     assert!(store.scene(&SceneId::from_bytes([2; 16])).is_ok(), "its neighbour is untouched");
 }
 
+fn id(byte: u8) -> SceneId {
+    SceneId::from_bytes([byte; 16])
+}
+
+fn done(byte: u8) -> Record {
+    let mut record = record(byte);
+    record.status.state = SceneState::Done;
+    record
+}
+
 #[test]
 fn a_bad_status_is_rebuilt_from_the_scene_or_from_the_upload() {
     let folder = tempfile::tempdir().unwrap();
     let (store, _) = open(folder.path());
-    for id in [1, 2, 3] {
-        store.put_upload(&upload(), &record(id)).unwrap();
+    for byte in [1, 2, 3, 4] {
+        store.put_upload(&upload(), &record(byte)).unwrap();
     }
     store.put_scene(scene(1, 5, 0)).unwrap();
+    for byte in [1, 3] {
+        store.put_record(&done(byte)).unwrap();
+    }
     drop(store);
-    let path = |id: u8, name: &str| {
-        let id = SceneId::from_bytes([id; 16]);
-        folder.path().join("scenes").join(id.as_str()).join(name)
-    };
-    for id in [1, 2, 3] {
-        let mut file = fs::read(path(id, "status.json")).unwrap();
+    let scenes = folder.path().join("scenes");
+    let status = |byte: u8| scenes.join(id(byte).as_str()).join("status.json");
+    let pending = |byte: u8| folder.path().join("pending").join(id(byte).as_str());
+    for path in [status(1), pending(2), status(3), pending(4)] {
+        let mut file = fs::read(&path).unwrap();
         let digit = file.windows(3).position(|w| w == b"123").unwrap();
         file[digit] = b'9';
-        fs::write(path(id, "status.json"), file).unwrap();
+        fs::write(&path, file).unwrap();
     }
-    fs::write(path(3, "upload.segsplat"), b"rubbish").unwrap();
+    for byte in [3, 4] {
+        fs::write(scenes.join(id(byte).as_str()).join("upload.segsplat"), b"rubbish").unwrap();
+    }
 
     let (_store, records) = open(folder.path());
-    let found = |id: u8| {
-        let id = SceneId::from_bytes([id; 16]);
-        records.iter().find(|r| r.status.id == id).unwrap()
-    };
+    let found = |byte: u8| records.iter().find(|r| r.status.id == id(byte)).unwrap();
     assert_eq!(found(1).status.state, SceneState::Done, "the scene file says so");
+    assert_eq!(found(1).owner.as_deref(), Some("somebody"), "it stays its owner's");
     assert!(found(1).scene_sha256.is_some());
-    assert_eq!(found(1).owner.as_deref(), Some("somebody"), "the upload says whose it is");
     assert_eq!(*found(2), record(2), "the upload holds the first record");
-    assert_eq!(found(3).status.state, SceneState::Failed);
-    assert_eq!(found(3).status.error.as_ref().unwrap().code, "scene_corrupt");
+    for byte in [3, 4] {
+        assert_eq!(found(byte).status.state, SceneState::Failed);
+        assert_eq!(found(byte).status.error.as_ref().unwrap().code, "scene_corrupt");
+    }
 }
 
 #[test]
 fn what_a_crash_leaves_is_nothing_or_all() {
     let folder = tempfile::tempdir().unwrap();
     let (store, _) = open(folder.path());
-    store.put_upload(&upload(), &record(1)).unwrap();
-    store.put_scene(scene(1, 20, 0)).unwrap();
-    drop(store);
-    let id = SceneId::from_bytes([1; 16]);
-    let scenes = folder.path().join("scenes");
-    // Killed while a new scene file, another upload and a deletion were under way.
-    fs::write(scenes.join(id.as_str()).join("scene.tmp"), b"half").unwrap();
-    for left in ["incoming", "trash"] {
-        let half = folder.path().join(left).join(SceneId::from_bytes([7; 16]).as_str());
-        fs::create_dir(&half).unwrap();
-        fs::write(half.join("upload.tmp"), b"half").unwrap();
+    for byte in [1, 2, 3] {
+        store.put_upload(&upload(), &record(byte)).unwrap();
     }
-    fs::create_dir(scenes.join("not-an-id")).unwrap();
+    store.put_scene(scene(1, 20, 0)).unwrap();
+    store.put_record(&done(1)).unwrap();
+    drop(store);
+    let path = |name: &str| folder.path().join(name);
+    let of = |byte: u8, name: &str| path("scenes").join(id(byte).as_str()).join(name);
+    // Killed while a file was written, after a status and before the pending record went, before an
+    // upload was kept, and in the middle of a deletion.
+    fs::write(of(1, "scene.segsplat#1"), b"half").unwrap();
+    fs::write(path("pending").join(id(1).as_str()), b"late").unwrap();
+    fs::remove_file(of(2, "upload.segsplat")).unwrap();
+    fs::remove_file(path("pending").join(id(3).as_str())).unwrap();
+    fs::create_dir_all(path("keys")).unwrap();
+    let key = serde_json::json!({ "id": id(3), "request_sha256": "" });
+    fs::write(path("keys").join("ab".repeat(32)), key.to_string()).unwrap();
+    fs::create_dir(path("scenes").join(id(4).as_str())).unwrap();
+    fs::create_dir(path("scenes").join("not-an-id")).unwrap();
+    let not_ours = [path("scenes").join("not-an-id/note"), path("notes#1")];
+    not_ours.iter().for_each(|file| fs::write(file, b"somebody's").unwrap());
 
     let (store, records) = open(folder.path());
-    assert_eq!(records.len(), 1, "the half upload was never acknowledged");
-    assert_eq!(bits(&store.scene(&id).unwrap().gaussians), bits(&scene(1, 20, 0).gaussians));
-    assert!(!scenes.join(id.as_str()).join("scene.tmp").exists());
-    for left in ["incoming", "trash"] {
-        assert_eq!(fs::read_dir(folder.path().join(left)).unwrap().count(), 0, "{left}");
-    }
+    let states: Vec<_> = records.iter().map(|r| (r.status.id.clone(), r.status.state)).collect();
+    assert_eq!(states, [(id(1), SceneState::Done)], "the others were never acknowledged");
+    assert_eq!(bits(&store.scene(&id(1)).unwrap().gaussians), bits(&scene(1, 20, 0).gaussians));
+    assert!(!of(1, "scene.segsplat#1").exists());
+    assert_eq!(store.sweep(Duration::ZERO).unwrap(), 2, "an upload and a key of nobody");
+    assert!(of(1, "scene.segsplat").exists() && of(1, "upload.segsplat").exists());
+    assert!(!path("scenes").join(id(3).as_str()).exists() && !path("keys").exists());
+    assert!(!path("scenes").join(id(4).as_str()).exists(), "an empty folder");
+    assert!(not_ours.iter().all(|file| file.exists()), "what is not ours is left alone");
+    assert_eq!(store.sweep(Duration::ZERO).unwrap(), 0);
 }
 
 #[test]
@@ -244,13 +267,41 @@ fn uploads_come_back_as_sent_and_names_are_no_paths() {
     drop(store);
     let (store, records) = open(folder.path());
     assert_eq!(records, [record(1)]);
-    let id = SceneId::from_bytes([1; 16]);
+    let id = id(1);
     assert_eq!(store.upload(&id).unwrap(), upload());
-    store.remove(&id).unwrap();
-    for result in [store.upload(&id).map(|_| ()), store.remove(&id), store.scene(&id).map(|_| ())] {
+    store.remove(&record(1)).unwrap();
+    let again = store.remove(&record(1));
+    for result in [store.upload(&id).map(|_| ()), again, store.scene(&id).map(|_| ())] {
         assert_eq!(result.unwrap_err().code(), ErrorCode::SceneNotFound);
     }
-    assert!(store.put_scene(scene(1, 1, 0)).is_err(), "a deleted scene does not come back");
+    for late in [store.put_scene(scene(1, 1, 0)).map(|_| ()), store.put_record(&done(1))] {
+        assert_eq!(late.unwrap_err().code(), ErrorCode::SceneNotFound, "it does not come back");
+    }
+    let left = |name: &str| fs::read_dir(folder.path().join(name)).map_or(0, Iterator::count);
+    assert_eq!((left("scenes"), left("pending")), (0, 0), "nothing is left of it");
+}
+
+#[test]
+fn a_key_and_a_content_lead_to_their_owners_scene_only() {
+    let folder = tempfile::tempdir().unwrap();
+    let (store, _) = open(folder.path());
+    let of = |byte: u8| KeyUse { id: id(byte), request_sha256: "cd".repeat(32) };
+    let (ann, bob) = (Some("ann"), Some("bob"));
+    assert_eq!(store.use_key(ann, "k", &of(1)).unwrap(), None);
+    assert_eq!(store.use_key(ann, "k", &of(2)).unwrap(), Some(of(1)), "the first counts");
+    assert_eq!(store.use_key(bob, "k", &of(3)).unwrap(), None, "nobody else's key");
+    assert_eq!(store.use_key(None, "k", &of(4)).unwrap(), None);
+    store.forget_key(ann, "k").unwrap();
+    assert_eq!(
+        (store.key_use(ann, "k").unwrap(), store.key_use(bob, "k").unwrap()),
+        (None, Some(of(3)))
+    );
+
+    store.put_content(ann, "ab", &id(1)).unwrap();
+    assert_eq!(store.scene_of_content(ann, "ab").unwrap(), Some(id(1)));
+    for (owner, hash) in [(bob, "ab"), (None, "ab"), (ann, "ac")] {
+        assert_eq!(store.scene_of_content(owner, hash).unwrap(), None, "{owner:?} {hash}");
+    }
 }
 
 #[test]

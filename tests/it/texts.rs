@@ -164,7 +164,7 @@ async fn a_mask_alone_is_a_blend_and_equals_the_mask_of_the_entries() {
     let id = fixture.scene(SemanticsMode::Lazy).await;
     let service = &fixture.server.service;
     let mask = || view(Kind::Mask, Some("photo 0"), Format::Png);
-    assert_eq!(service.view_etag(&id, &mask()).unwrap(), None, "nobody knows it yet");
+    assert_eq!(service.view_etag(&id, &mask()).await.unwrap(), None, "nobody knows it yet");
     let blended = service.render(&id, mask()).await.unwrap();
     assert_eq!(fixture.renderer.counts(), [1, 1, 0]);
     assert!(white(&blended.bytes).contains(&true) && white(&blended.bytes).contains(&false));
@@ -172,10 +172,10 @@ async fn a_mask_alone_is_a_blend_and_equals_the_mask_of_the_entries() {
     let kept = service.render(&id, mask()).await.unwrap();
     assert_eq!((kept.bytes, &kept.etag), (blended.bytes, &blended.etag));
     assert_eq!(fixture.renderer.counts(), [2, 1, 1]);
-    assert_eq!(service.view_etag(&id, &mask()).unwrap().unwrap(), blended.etag);
+    assert_eq!(service.view_etag(&id, &mask()).await.unwrap().unwrap(), blended.etag);
     let mut other = mask();
     other.ask.text = Some("photo 1".to_owned());
-    assert_ne!(service.view_etag(&id, &other).unwrap().unwrap(), blended.etag);
+    assert_ne!(service.view_etag(&id, &other).await.unwrap().unwrap(), blended.etag);
 
     let numbers = service.render(&id, view(Kind::Semantics, None, Format::Npy)).await.unwrap();
     let entries: Vec<f32> =
@@ -203,7 +203,7 @@ async fn a_pick_tells_depth_point_gaussian_entry_and_labels() {
     let bare = service.pick(&id, pick(&[])).await.unwrap();
     assert!(bare.alpha > 0.5 && bare.gaussian.is_some(), "{bare:?}");
     assert_eq!((bare.entry, bare.labels.len()), (None, 0));
-    let state = service.get(&id).unwrap().semantics.state;
+    let state = service.get(&id).await.unwrap().semantics.state;
     assert_eq!(state, SemanticsState::None, "a pick without labels asks for no semantics");
     let named = service.pick(&id, pick(&["photo 2", "photo 0", "photo 1"])).await.unwrap();
     assert_eq!((named.gaussian, named.depth), (bare.gaussian, bare.depth));
@@ -211,7 +211,7 @@ async fn a_pick_tells_depth_point_gaussian_entry_and_labels() {
     assert_eq!(named.labels[0].text, format!("photo {}", entry - 1), "the best label first");
     assert!(named.labels[0].relevancy > 0.99 && named.labels[1].relevancy < 0.51);
     // The point lies at the depth, and the view from there sees it at the pixel.
-    let camera = service.get(&id).unwrap().cameras[0].camera;
+    let camera = service.get(&id).await.unwrap().cameras[0].camera;
     let at = camera.camera_to_world.viewmat().transform_point3(named.point.unwrap().into());
     assert!((at.z - named.depth.unwrap()).abs() < 1e-9);
     let (u, v) = camera.intrinsics.project(at);

@@ -48,14 +48,14 @@ impl pb::scene_service_server::SceneService for Api {
         request: Request<pb::WatchSceneRequest>,
     ) -> Answer<Self::WatchSceneStream> {
         let api = called(self, &request)?;
-        let events = async { api.service.watch(&request.get_ref().scene_id.parse()?) }.await;
+        let events = async { api.service.watch(&request.get_ref().scene_id.parse()?).await }.await;
         let events = events.map_err(|e| logged(&e))?;
         Ok(Response::new(events.map(|event| Ok(convert::event(event))).boxed()))
     }
 
     async fn get_scene(&self, request: Request<pb::GetSceneRequest>) -> Answer<pb::Scene> {
         let api = called(self, &request)?;
-        let status = async { api.service.get(&request.get_ref().scene_id.parse()?) }.await;
+        let status = async { api.service.get(&request.get_ref().scene_id.parse()?).await }.await;
         let status = status.map_err(|e| logged(&e))?;
         Ok(Response::new(convert::scene(status)))
     }
@@ -70,7 +70,7 @@ impl pb::scene_service_server::SceneService for Api {
             limit: request.limit.map(|limit| limit as usize),
             after: Some(request.after).filter(|after| !after.is_empty()),
         };
-        let page = api.service.list(&page).map_err(|e| logged(&e))?;
+        let page = api.service.list(&page).await.map_err(|e| logged(&e))?;
         let scenes = page.scenes.into_iter().map(convert::scene).collect();
         let next = page.next.unwrap_or_default();
         Ok(Response::new(pb::ListScenesResponse { scenes, next }))
@@ -97,7 +97,7 @@ impl pb::scene_service_server::SceneService for Api {
         request: Request<pb::RenderViewsRequest>,
     ) -> Answer<Self::RenderViewsStream> {
         let api = called(self, &request)?;
-        let views = render_many(&api, request.into_inner()).map_err(|e| logged(&e))?;
+        let views = render_many(&api, request.into_inner()).await.map_err(|e| logged(&e))?;
         Ok(Response::new(views))
     }
 
@@ -228,7 +228,7 @@ async fn render(api: &Api, request: pb::RenderViewRequest) -> Result<pb::View> {
     Ok(convert::view(view))
 }
 
-fn render_many(api: &Api, request: pb::RenderViewsRequest) -> Result<Many<pb::View>> {
+async fn render_many(api: &Api, request: pb::RenderViewsRequest) -> Result<Many<pb::View>> {
     let id = request.scene_id.parse()?;
     let ask = ask::ask(request.text, request.profile, request.semantics_wait_ms)?;
     let kinds = match request.kinds.as_slice() {
@@ -240,7 +240,7 @@ fn render_many(api: &Api, request: pb::RenderViewsRequest) -> Result<Many<pb::Vi
         .map(|(i, camera)| convert::camera(Some(camera), &format!("camera {i}")))
         .collect::<Result<_>>()?;
     let options = convert::options(request.options)?;
-    let views = api.service.render_many(&id, &ViewsSpec { cameras, kinds, options, ask })?;
+    let views = api.service.render_many(&id, &ViewsSpec { cameras, kinds, options, ask }).await?;
     Ok(views.map(|view| view.map(convert::view).map_err(|e| logged(&e))).boxed())
 }
 

@@ -49,7 +49,7 @@ pub(super) async fn view(
     let mut spec = spec_of(params, accept(&headers))?;
     spec.options.deadline = deadline.map(|Extension(Deadline(deadline))| deadline);
     if let Some(known) = headers.get(header::IF_NONE_MATCH).and_then(|v| v.to_str().ok()) {
-        let etag = api.service.view_etag(&id, &spec)?.map(|etag| quoted(&etag));
+        let etag = api.service.view_etag(&id, &spec).await?.map(|etag| quoted(&etag));
         if let Some(etag) = etag.filter(|etag| matches_etag(known, etag)) {
             return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
         }

@@ -84,7 +84,7 @@ fn server_timing(stages: &[StageTime]) -> String {
 pub(super) async fn list(Called(api): Called, mut params: Params) -> Result<Json<Page>, ApiError> {
     let page = PageRequest { limit: params.whole("limit")?, after: params.text("after")? };
     params.finish()?;
-    Ok(Json(api.service.list(&page)?))
+    Ok(Json(api.service.list(&page).await?))
 }
 
 /// `GET /v1/scenes/{id}`
@@ -98,7 +98,7 @@ pub(super) async fn get(
     params: Params,
 ) -> Result<Json<SceneStatus>, ApiError> {
     params.finish()?;
-    Ok(Json(api.service.get(&id)?))
+    Ok(Json(api.service.get(&id).await?))
 }
 
 /// `DELETE /v1/scenes/{id}`
@@ -131,7 +131,7 @@ pub(super) async fn events(
     params: Params,
 ) -> Result<Sse<impl Stream<Item = Result<sse::Event, Infallible>>>, ApiError> {
     params.finish()?;
-    let events = api.service.watch(&id)?.map(|event| Ok(sse_event(&event)));
+    let events = api.service.watch(&id).await?.map(|event| Ok(sse_event(&event)));
     Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(Duration::from_secs(15))))
 }
 

@@ -92,7 +92,7 @@ pub(super) async fn views(
     let container = container(body.container.as_deref(), &headers)?;
     let mut spec = spec_of(body)?;
     spec.options.deadline = deadline.map(|Extension(Deadline(deadline))| deadline);
-    let pictures = api.service.render_many(&id, &spec)?.boxed();
+    let pictures = api.service.render_many(&id, &spec).await?.boxed();
     Ok(match container {
         Container::Multipart => {
             let kind = format!("multipart/mixed; boundary={BOUNDARY}");

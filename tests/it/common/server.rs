@@ -30,6 +30,7 @@ use segsplat::{
         Ask, CameraSpec, CreateScene, Kind, LensSpec, ModelsInfo, Parts, PoseSpec, Service,
         ViewOptions, ViewSpec,
     },
+    store::Place,
 };
 use tempfile::TempDir;
 use tokio::{net::TcpListener, sync::oneshot, task::JoinHandle};
@@ -43,6 +44,7 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 pub(crate) struct TestServer {
     pub(crate) addr: SocketAddr,
     pub(crate) service: Service,
+    place: Place,
     config: Config,
     parts: Parts,
     folder: TempDir,
@@ -58,6 +60,15 @@ impl TestServer {
 
     /// A server whose limits or parts `change` sets.
     pub(crate) async fn with(change: impl FnOnce(&mut Config, &mut Parts)) -> Self {
+        Self::placed(None, change).await
+    }
+
+    /// As [`Self::with`], its scenes at this place.
+    pub(crate) async fn at(place: &Place, change: impl FnOnce(&mut Config, &mut Parts)) -> Self {
+        Self::placed(Some(place.clone()), change).await
+    }
+
+    async fn placed(place: Option<Place>, change: impl FnOnce(&mut Config, &mut Parts)) -> Self {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let mut config = Config::default();
         config.data_dir = folder.path().join("data");
@@ -68,18 +79,20 @@ impl TestServer {
             models: ModelsInfo::default(),
         };
         change(&mut config, &mut parts);
-        Self::serve(config, parts, folder).await
+        let place = place.unwrap_or_else(|| Place::Folder(config.data_dir.clone()));
+        Self::serve(place, config, parts, folder).await
     }
 
-    async fn serve(config: Config, parts: Parts, folder: TempDir) -> Self {
-        let service = Service::open(config.clone(), parts.clone()).expect("the folder is usable");
+    async fn serve(place: Place, config: Config, parts: Parts, folder: TempDir) -> Self {
+        let service = Service::open_at(&place, config.clone(), parts.clone());
+        let service = service.expect("the place is usable");
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
         let addr = listener.local_addr().expect("a bound listener has an address");
         let (stop, stopped) = oneshot::channel();
         let served = tokio::spawn(api::serve(listener, service.clone(), async {
             let _ = stopped.await;
         }));
-        Self { addr, service, config, parts, folder, stop, served }
+        Self { addr, service, place, config, parts, folder, stop, served }
     }
 
     /// `http://…` of a path that begins with a slash.
@@ -103,9 +116,9 @@ impl TestServer {
 
     /// Stops the server and starts another one on the same folder.
     pub(crate) async fn restart(self) -> Self {
-        let (config, parts) = (self.config.clone(), self.parts.clone());
+        let (config, parts, place) = (self.config.clone(), self.parts.clone(), self.place.clone());
         let folder = self.stop().await;
-        Self::serve(config, parts, folder).await
+        Self::serve(place, config, parts, folder).await
     }
 
     /// Makes a scene of [`upload`] and waits for it.
@@ -144,6 +157,8 @@ pub(crate) fn first_view() -> ViewSpec {
 #[derive(Debug, Default)]
 pub(crate) struct WallMaker {
     pub(crate) hold: AtomicBool,
+    /// Scenes made.
+    pub(crate) made: AtomicUsize,
 }
 
 impl SceneMaker for WallMaker {
@@ -152,6 +167,7 @@ impl SceneMaker for WallMaker {
     }
 
     fn make(&self, work: Work<'_>) -> Result<Made> {
+        self.made.fetch_add(1, Ordering::AcqRel);
         let photos = photos::read(work.upload, &Limits::default())?;
         (work.progress)("photos", 0.1);
         (work.progress)("geometry", 0.5);
