@@ -1,8 +1,10 @@
 //! What the test files share: where things are, and how a test says that it was skipped.
 #![allow(dead_code, reason = "not every build of the tests uses every helper")]
 
+pub(crate) mod cluster;
 pub(crate) mod compare;
 pub(crate) mod doors;
+pub(crate) mod faults;
 pub(crate) mod meaning;
 pub(crate) mod process;
 pub(crate) mod scenes;

@@ -1,0 +1,312 @@
+//! A store that fails, tears, stalls, fills up and rots: what was acknowledged stays as it was, or
+//! says that it is bad.
+
+use std::{
+    collections::{BTreeMap, HashSet},
+    path::Path,
+    sync::{Arc, atomic::Ordering},
+    time::Duration,
+};
+
+use object_store::{ObjectStore, local::LocalFileSystem};
+use segsplat::{
+    error::ErrorCode,
+    sample::{self, SampleOptions},
+    scene::{SceneId, SceneState, ScoringProfile, Upload},
+    service::{Ask, CreateScene, ExportFormat, PageRequest, Service},
+    store::Place,
+};
+
+use crate::common::{
+    faults::{FaultStore, Wrong},
+    process::long,
+    server::{PATIENCE, TestServer, WallMaker},
+};
+
+/// Nothing is asked by text.
+const ASK: Ask = Ask { text: None, profile: ScoringProfile::Default, wait: None };
+
+/// Reproducible numbers.
+struct Random(u64);
+
+impl Random {
+    fn below(&mut self, n: usize) -> usize {
+        self.0 =
+            self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 33) as usize % n
+    }
+}
+
+fn upload(seed: u64) -> Upload {
+    let options = SampleOptions { photos: 2, width: 48, height: 32, seed };
+    sample::upload(&options).expect("in range")
+}
+
+fn request(seed: u64) -> CreateScene {
+    CreateScene { upload: upload(seed), wait: Some(PATIENCE), ..CreateScene::default() }
+}
+
+async fn export(service: &Service, id: &SceneId) -> Result<Vec<u8>, ErrorCode> {
+    let export = service.export(id, ExportFormat::Ply, &ASK).await;
+    let mut export = export.map_err(|error| error.code())?;
+    let mut file = Vec::new();
+    while let Some(piece) = export.next_chunk().await {
+        file.extend(piece);
+    }
+    Ok(file)
+}
+
+/// Ids of all scenes that the server lists.
+async fn listed(service: &Service) -> HashSet<SceneId> {
+    let (mut ids, mut page) = (HashSet::new(), PageRequest::default());
+    loop {
+        let found = service.list(&page).await.unwrap();
+        ids.extend(found.scenes.into_iter().map(|scene| scene.id));
+        match found.next {
+            Some(next) => page.after = Some(next),
+            None => return ids,
+        }
+    }
+}
+
+/// Scene ids in the names and pointers under a folder.
+fn kept(data: &Path) -> HashSet<SceneId> {
+    let mut ids = HashSet::new();
+    for prefix in ["scenes", "pending"] {
+        for entry in std::fs::read_dir(data.join(prefix)).into_iter().flatten() {
+            ids.extend(entry.unwrap().file_name().to_str().and_then(|name| name.parse().ok()));
+        }
+    }
+    for entry in std::fs::read_dir(data.join("contents")).into_iter().flatten() {
+        let json: serde_json::Value =
+            serde_json::from_slice(&std::fs::read(entry.unwrap().path()).unwrap()).unwrap();
+        ids.extend(json["id"].as_str().and_then(|id| id.parse().ok()));
+    }
+    ids
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_store_that_fails_tears_and_stalls_loses_nothing_it_acknowledged() {
+    let folder = tempfile::tempdir().unwrap();
+    let local = LocalFileSystem::new_with_prefix(folder.path()).unwrap();
+    let local: Arc<dyn ObjectStore> = Arc::new(local.with_automatic_cleanup(true));
+    let faults = Arc::new(FaultStore::new(local, Duration::from_millis(120)));
+    let place = Place::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
+    let mut server = TestServer::at(&place, |config, _| {
+        config.limits.store_timeout_ms = 60;
+        config.limits.cache_bytes_max = 100_000;
+    })
+    .await;
+
+    let mut random = Random(5);
+    let mut whole: BTreeMap<SceneId, Vec<u8>> = BTreeMap::new();
+    let (mut gone, mut doomed) = (HashSet::new(), HashSet::new());
+    let (steps, mut refused) = (if long() { 3_000 } else { 120 }, 0);
+    for step in 0..steps {
+        let mut dice = Random(step as u64);
+        faults.plan(move |what, _| match (dice.below(100), what) {
+            (0..=5, _) => Some(Wrong::Fails),
+            (6..=8, _) => Some(Wrong::Lost),
+            (9..=11, "put") => Some(Wrong::Tears),
+            (12, _) => Some(Wrong::Stalls),
+            _ => None,
+        });
+        let ids: Vec<SceneId> = whole.keys().cloned().collect();
+        match (random.below(10), ids.get(random.below(ids.len().max(1)))) {
+            (0..=4, _) | (_, None) => match server.service.create_scene(request(step as u64)).await
+            {
+                Ok(created) if created.status.state == SceneState::Done => {
+                    let id = created.status.id;
+                    faults.plan(|_, _| None);
+                    let file = export(&server.service, &id).await.expect("it was made");
+                    whole.insert(id, file);
+                }
+                Ok(created) => {
+                    let code = created.status.error.expect("why it failed").code;
+                    assert!(["store_unavailable", "scene_corrupt"].contains(&&*code), "{code}");
+                    refused += 1;
+                }
+                Err(error) => {
+                    assert_eq!(error.code(), ErrorCode::StoreUnavailable, "{error}");
+                    refused += 1;
+                }
+            },
+            (5..=7, Some(id)) => match export(&server.service, id).await {
+                Ok(file) => assert!(file == whole[id], "{id} changed"),
+                Err(code) => assert_eq!(code, ErrorCode::StoreUnavailable, "{id}"),
+            },
+            (_, Some(id)) => {
+                whole.remove(id);
+                match server.service.delete(id).await {
+                    Ok(()) => drop(gone.insert(id.clone())),
+                    Err(error) => {
+                        assert_eq!(error.code(), ErrorCode::StoreUnavailable, "{error}");
+                        doomed.insert(id.clone());
+                    }
+                }
+            }
+        }
+        if step % 40 == 39 {
+            faults.plan(|_, _| None);
+            server = server.restart().await;
+        }
+    }
+    faults.plan(|_, _| None);
+    // Beyond the longest stall: what was late has come.
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    let server = server.restart().await;
+    for (id, file) in &whole {
+        let now = export(&server.service, id).await;
+        assert!(now.as_ref() == Ok(file), "{id} is lost or changed: {:?}", now.map(|f| f.len()));
+    }
+    for id in &gone {
+        assert_eq!(export(&server.service, id).await, Err(ErrorCode::SceneNotFound), "{id}");
+    }
+    let there = listed(&server.service).await;
+    for _ in 0..100 {
+        if kept(folder.path()).is_subset(&there) {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    let left: Vec<_> = kept(folder.path()).difference(&there).cloned().collect();
+    assert_eq!(left, [], "left over after a sweep");
+    println!(
+        "{steps} calls, {} faults: {refused} creates refused, {} scenes whole, {} gone, {} whose \
+         deletion failed",
+        faults.wrongs.load(Ordering::Relaxed),
+        whole.len(),
+        gone.len(),
+        doomed.len(),
+    );
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_full_store_refuses_uploads_serves_what_it_has_and_recovers_by_deleting() {
+    let folder = tempfile::tempdir().unwrap();
+    let local = LocalFileSystem::new_with_prefix(folder.path()).unwrap();
+    let local: Arc<dyn ObjectStore> = Arc::new(local.with_automatic_cleanup(true));
+    let faults = Arc::new(FaultStore::new(local, Duration::ZERO));
+    let place = Place::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
+    let server = TestServer::at(&place, |_, _| {}).await;
+    let mut whole = Vec::new();
+    for seed in 0..3 {
+        let id = server.service.create_scene(request(seed)).await.unwrap().status.id;
+        let file = export(&server.service, &id).await.unwrap();
+        whole.push((id, file));
+    }
+    faults.plan(|what, _| (what == "put").then_some(Wrong::Full));
+    let refused = server.service.create_scene(request(9)).await.unwrap_err();
+    assert_eq!(refused.code(), ErrorCode::StoreUnavailable, "{refused}");
+    assert!(refused.message().contains("no storage space"), "{refused}");
+    assert!(refused.retry_after().is_some(), "an overload code says when to come back");
+    for (id, file) in &whole {
+        assert!(export(&server.service, id).await.as_ref() == Ok(file), "{id}");
+    }
+    let (id, _) = whole.remove(0);
+    server.service.delete(&id).await.expect("deleting makes room, so it needs none");
+    faults.plan(|_, _| None);
+    let server = server.restart().await;
+    assert_eq!(
+        server.service.create_scene(request(9)).await.unwrap().status.state,
+        SceneState::Done
+    );
+    for (id, file) in &whole {
+        assert!(export(&server.service, id).await.as_ref() == Ok(file), "{id}");
+    }
+    assert_eq!(export(&server.service, &id).await, Err(ErrorCode::SceneNotFound));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_flipped_bit_is_reported_or_repaired_and_harms_no_neighbour() {
+    let mut server = TestServer::with(|_, _| {}).await;
+    let scenes = if long() { 60 } else { 8 };
+    let mut whole = Vec::new();
+    for seed in 0..scenes {
+        let id = server.service.create_scene(request(seed)).await.unwrap().status.id;
+        let file = export(&server.service, &id).await.unwrap();
+        whole.push((id, file));
+    }
+    let mut random = Random(11);
+    let (mut reported, mut repaired) = (0, 0);
+    for round in 0..scenes as usize / 2 {
+        let hurt = whole[2 * round].0.clone();
+        let folder = server.data_dir().join("scenes").join(hurt.as_str());
+        let name = ["scene.segsplat", "status.json", "upload.segsplat"][round % 3];
+        let mut file = std::fs::read(folder.join(name)).unwrap();
+        let at = random.below(file.len());
+        file[at] ^= 1 << random.below(8);
+        std::fs::write(folder.join(name), file).unwrap();
+        server = server.restart().await;
+        for (id, file) in &whole {
+            match export(&server.service, id).await {
+                Ok(now) => {
+                    assert!(now == *file, "{id} changed");
+                    repaired += usize::from(*id == hurt);
+                }
+                Err(code) => {
+                    assert_eq!(code, ErrorCode::SceneCorrupt, "{id}");
+                    let earlier = whole.iter().take(2 * round + 1).any(|(hurt, _)| hurt == id);
+                    assert!(earlier, "{id} was not touched");
+                    reported += usize::from(*id == hurt);
+                }
+            }
+        }
+    }
+    assert!(reported > 0 && repaired > 0, "{reported} reported, {repaired} repaired");
+    println!("{} bits flipped: {reported} reported, {repaired} without harm", reported + repaired);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_same_content_is_computed_once_for_an_owner() {
+    let maker = Arc::new(WallMaker::default());
+    let given = Arc::clone(&maker);
+    let server = TestServer::with(|config, parts| {
+        parts.maker = given;
+        config.jobs = 3;
+    })
+    .await;
+    let both = [request(1), request(1), request(2)].map(|r| server.service.create_scene(r));
+    let made = futures_util::future::try_join_all(both).await.unwrap();
+    assert_eq!(maker.made.load(Ordering::Acquire), 2, "two contents, three scenes");
+    let files = futures_util::future::join_all(
+        made.iter().map(|created| export(&server.service, &created.status.id)),
+    )
+    .await;
+    assert!(files[0] == files[1] && files[0] != files[2]);
+    server.service.delete(&made[0].status.id).await.unwrap();
+    assert!(export(&server.service, &made[1].status.id).await == files[1], "the copy is its own");
+
+    let ann = server.service.for_caller(segsplat::keys::Caller::Owner("ann".into()));
+    ann.create_scene(request(2)).await.unwrap();
+    assert_eq!(maker.made.load(Ordering::Acquire), 3, "nobody else's scene answers for it");
+    ann.create_scene(request(2)).await.unwrap();
+    assert_eq!(maker.made.load(Ordering::Acquire), 3);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn work_is_dropped_when_its_only_caller_goes_away() {
+    let maker = Arc::new(WallMaker::default());
+    maker.hold.store(true, Ordering::Release);
+    let given = Arc::clone(&maker);
+    let server = TestServer::with(|_, parts| parts.maker = given).await;
+    let client = reqwest::Client::new();
+    let call = client
+        .post(server.url("/v1/scenes?wait_ms=60000"))
+        .multipart(crate::common::doors::form(&upload(1)))
+        .timeout(Duration::from_millis(700));
+    assert!(call.send().await.is_err(), "the caller gives up");
+    for _ in 0..200 {
+        if listed(&server.service).await.is_empty() {
+            break;
+        }
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    assert_eq!(listed(&server.service).await, HashSet::new(), "nobody wants it");
+    let known = CreateScene { wait: None, ..request(2) };
+    let id = server.service.create_scene(known).await.unwrap().status.id;
+    let waiting = server.service.wait(&id, Duration::from_millis(50)).await.unwrap();
+    assert!(!waiting.state.is_final(), "who has the id may come back");
+    maker.hold.store(false, Ordering::Release);
+    assert_eq!(server.finished(&id).await.state, SceneState::Done);
+}

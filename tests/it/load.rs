@@ -1,0 +1,226 @@
+//! The program under more load than it can carry, and for long: it answers what it can, refuses the
+//! rest by its code, stays alive, and does not grow.
+
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use reqwest::Client;
+use segsplat::{
+    sample::{self, SampleOptions},
+    scene::Upload,
+};
+use serde_json::json;
+
+use crate::common::process::{self, Process, Start, can_serve, long};
+
+/// The budget of the loaded server.
+const MEMORY_BYTES_MAX: u64 = 512 << 20;
+
+fn upload(seed: u64, photos: usize, width: u32, height: u32) -> Upload {
+    sample::upload(&SampleOptions { photos, width, height, seed }).expect("in range")
+}
+
+/// A server with these limits.
+fn server(folder: &std::path::Path, limits: &str) -> Process {
+    let config = folder.join("segsplat.toml");
+    std::fs::write(&config, format!("[limits]\n{limits}\n")).expect("written");
+    let start = Start::on(&folder.join("data")).bundle("colours");
+    start.arg("--config").arg(&config.display().to_string()).start()
+}
+
+async fn made(client: &Client, server: &Process, upload: &Upload) -> String {
+    let (status, said) = process::create(client, &server.url, upload, 120_000, None).await.unwrap();
+    assert_eq!((status, said["state"].as_str()), (201, Some("done")), "{said}");
+    said["id"].as_str().unwrap().to_owned()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn memory_stays_as_it_is_over_many_scenes_of_many_shapes() {
+    if !can_serve() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    // Small, so that what the cache holds is no growth.
+    let server = server(folder.path(), "cache_bytes_max = 4000000");
+    let client = Client::new();
+    let shapes = [(2, 64, 48), (3, 48, 96), (2, 320, 240), (5, 96, 64), (4, 160, 160)];
+    let uploads: Vec<_> = (0..20)
+        .map(|i| {
+            let (photos, width, height) = shapes[i as usize % shapes.len()];
+            upload(i, photos, width, height)
+        })
+        .collect();
+    let (all, settled, most) = if long() { (1_000, 100, 1.05) } else { (60, 30, 1.25) };
+    let mut at = 0;
+    for i in 0..all {
+        let id = made(&client, &server, &uploads[i % uploads.len()]).await;
+        let view = format!("/v1/scenes/{id}/view?from=0&to=1&t=0.5&width=64&height=48");
+        process::bytes(&client, &server.url(&view)).await.unwrap().expect("a view");
+        // Each is made anew: the next of this content finds none to copy.
+        let gone = process::delete(&client, &server.url(&format!("/v1/scenes/{id}"))).await;
+        assert!([200, 204].contains(&gone.unwrap()));
+        if i + 1 == settled {
+            at = server.resident();
+        }
+    }
+    let end = server.resident();
+    let grown = end as f64 / at as f64;
+    println!(
+        "{all} creates: {} MiB resident after {settled}, {} MiB at the end, x {grown:.3}",
+        at >> 20,
+        end >> 20
+    );
+    assert!(grown <= most, "resident memory grew {grown:.3} times");
+}
+
+/// What some callers met.
+#[derive(Debug, Default)]
+struct Met {
+    good: usize,
+    refused: usize,
+    times: Vec<Duration>,
+}
+
+/// The call that a random number stands for; its status. Of twenty calls one makes a scene, one
+/// lists, four ask by text and fourteen look.
+async fn call(client: &Client, server: &Process, ids: &[String], made: &[Upload], n: u64) -> u16 {
+    let id = &ids[(n >> 33) as usize % ids.len()];
+    match (n >> 40) % 20 {
+        0 => {
+            let upload = &made[(n >> 50) as usize % made.len()];
+            let made = process::create(client, &server.url, upload, 60_000, None).await;
+            let (status, said) = made.expect("an answer");
+            if let Some(id) = said["id"].as_str() {
+                let url = server.url(&format!("/v1/scenes/{id}"));
+                process::delete(client, &url).await.expect("an answer");
+            }
+            status
+        }
+        1 => process::get(client, &server.url("/v1/scenes?limit=5")).await.expect("an answer").0,
+        2..=5 => {
+            let url = server.url(&format!("/v1/scenes/{id}/query"));
+            let words = ["red", "green", "blue", "yellow"];
+            let body = json!({ "texts": [words[(n >> 50) as usize % words.len()]] });
+            process::post(client, &url, &body).await.expect("an answer").0
+        }
+        _ => {
+            let t = (n >> 20) % 1_000;
+            let view = format!("/v1/scenes/{id}/view?from=0&to=1&t=0.{t:03}&width=96&height=72");
+            let view = process::bytes(client, &server.url(&view)).await.expect("an answer");
+            view.map_or_else(|status| status, |_| 200)
+        }
+    }
+}
+
+/// `callers` for so long: each the next call as soon as it has an answer, and the same again after
+/// a pause where it was refused, so that what is answered keeps its mix.
+async fn press(server: &Arc<Process>, ids: &Arc<Vec<String>>, callers: u64, time: Duration) -> Met {
+    let uploads: Arc<Vec<_>> = Arc::new((0..8).map(|i| upload(50 + i, 2, 64, 48)).collect());
+    let until = Instant::now() + time;
+    let calls = (0..callers).map(|seed| {
+        let (server, ids, uploads) = (Arc::clone(server), Arc::clone(ids), Arc::clone(&uploads));
+        tokio::spawn(async move {
+            let next = |n: u64| {
+                n.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407)
+            };
+            let (client, mut met, mut n) = (Client::new(), Met::default(), next(seed));
+            while Instant::now() < until {
+                let begun = Instant::now();
+                match call(&client, &server, &ids, &uploads, n).await {
+                    200..=202 => {
+                        met.good += 1;
+                        met.times.push(begun.elapsed());
+                        n = next(n);
+                    }
+                    429 | 503 => {
+                        met.refused += 1;
+                        // Ruder than Retry-After says, kinder than a loop.
+                        tokio::time::sleep(Duration::from_millis(100)).await;
+                    }
+                    other => panic!("{other} is no answer for a good call"),
+                }
+            }
+            met
+        })
+    });
+    let mut all = Met::default();
+    for call in calls.collect::<Vec<_>>() {
+        let met = call.await.expect("a caller met what it must not");
+        all.good += met.good;
+        all.refused += met.refused;
+        all.times.extend(met.times);
+    }
+    all.times.sort();
+    all
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn ten_times_the_load_takes_little_of_what_is_answered() {
+    if !can_serve() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let limits = format!(
+        "queued_renders_max = 16\nqueued_jobs_max = 4\ncache_bytes_max = 64000000\n\
+         memory_bytes_max = {MEMORY_BYTES_MAX}"
+    );
+    let server = Arc::new(server(folder.path(), &limits));
+    let client = Client::new();
+    let mut ids = Vec::new();
+    for seed in 0..4 {
+        let id = made(&client, &server, &upload(seed, 2, 160, 120)).await;
+        // Its meaning is made now, so that every text below is answered at once.
+        let url = server.url(&format!("/v1/scenes/{id}/query"));
+        let asked = json!({ "texts": ["red"], "wait_ms": 60_000 });
+        let (status, said) = process::post(&client, &url, &asked).await.unwrap();
+        assert_eq!(status, 200, "{said}");
+        ids.push(id);
+    }
+    let ids = Arc::new(ids);
+    // What a machine with other work on it can hold is no measure.
+    let (each, least) = if long() { (120, 0.9) } else { (3, 0.2) };
+    let stop = Arc::new(AtomicBool::new(false));
+    let alive = tokio::spawn({
+        let (server, stop) = (Arc::clone(&server), Arc::clone(&stop));
+        async move {
+            let (client, mut slowest, mut most) = (Client::new(), Duration::ZERO, 0);
+            while !stop.load(Ordering::Acquire) {
+                let begun = Instant::now();
+                let live = client.get(server.url("/healthz")).send().await.expect("alive");
+                assert_eq!(live.status().as_u16(), 200);
+                slowest = slowest.max(begun.elapsed());
+                most = most.max(server.resident());
+                tokio::time::sleep(Duration::from_millis(50)).await;
+            }
+            (slowest, most)
+        }
+    });
+    press(&server, &ids, 6, Duration::from_secs(1)).await;
+    let time = Duration::from_secs(each);
+    let peak = press(&server, &ids, 6, time).await;
+    // In the long form ten minutes in all, beside the peak's two.
+    let crowd = press(&server, &ids, 64, if long() { time * 5 } else { time }).await;
+    stop.store(true, Ordering::Release);
+    let (slowest, most) = alive.await.expect("liveness stays 200");
+    let per_s = |met: &Met, time: Duration| met.good as f64 / time.as_secs_f64();
+    let (best, now) = (per_s(&peak, time), per_s(&crowd, if long() { time * 5 } else { time }));
+    let at = |met: &Met, share: f64| met.times[(met.times.len() as f64 * share) as usize];
+    println!(
+        "6 callers: {best:.1}/s, p50 {:?}, p99 {:?}; 64 callers: {now:.1}/s ({:.2} of that), p50 \
+         {:?}, p99 {:?}, {} refused; liveness at most {slowest:?}; at most {} MiB resident",
+        at(&peak, 0.5),
+        at(&peak, 0.99),
+        now / best,
+        at(&crowd, 0.5),
+        at(&crowd, 0.99),
+        crowd.refused,
+        most >> 20,
+    );
+    assert!(most <= MEMORY_BYTES_MAX, "{most} bytes resident of {MEMORY_BYTES_MAX}");
+    assert!(now >= least * best, "{now:.1}/s of {best:.1}/s");
+}
