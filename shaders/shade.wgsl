@@ -10,8 +10,6 @@
 // [views][N, 3], flattened.
 @group(0) @binding(4) var<storage, read_write> colors: array<f32>;
 
-const COLOR_MAX: f32 = 1e30;
-
 @compute @workgroup_size(256)
 fn main(
     @builtin(workgroup_id) group: vec3<u32>,
@@ -32,8 +30,7 @@ fn main(
         let at = (i * count + k) * 3u;
         color += sh_basis(k, direction) * vec3(sh[at], sh[at + 1u], sh[at + 2u]);
     }
-    // Finite, whatever the harmonics are: rasterize multiplies it by 0.
-    color = clamp(color, vec3(0.0), vec3(COLOR_MAX));
+    color = max(color, vec3(0.0));
     let at = (which * total + i) * 3u;
     colors[at] = color.x;
     colors[at + 1u] = color.y;

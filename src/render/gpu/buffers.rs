@@ -296,13 +296,13 @@ impl SceneCache {
         Ok(scene)
     }
 
-    /// The bank indices of `source`, whose scene was the last one asked for; uploaded once, and
-    /// alone when they are all that changed.
+    /// The bank indices of `source`, uploaded once, and alone when they are all that changed.
     ///
     /// # Errors
     /// As [`Self::get`].
     pub(super) fn labels(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<SceneLabels> {
-        let scene = self.scenes.last_mut().filter(|scene| scene.shape == source.shape_identity());
+        let shape = source.shape_identity();
+        let scene = self.scenes.iter_mut().find(|scene| scene.shape == shape);
         let held = scene.as_ref().and_then(|scene| scene.labels.as_ref());
         if let Some(labels) = held.filter(|labels| labels.identity == source.identity()) {
             return Ok(labels.clone());
@@ -323,11 +323,6 @@ impl SceneCache {
     pub(super) fn clear(&mut self, gpu: &Gpu) {
         self.scenes.clear();
         gpu.forget();
-    }
-
-    /// Scenes held.
-    pub(super) fn len(&self) -> usize {
-        self.scenes.len()
     }
 }
 

@@ -224,11 +224,11 @@ impl Gpu {
         self.faults.lost.load(Ordering::Acquire)
     }
 
-    /// Ends the device as a driver's fault would.
+    /// Has everyone who uses the device see it lost. It is not destroyed: someone may be reading
+    /// its memory.
     pub(super) fn lose(&self) {
         self.faults.lost.store(true, Ordering::Release);
         self.faults.report("lost on purpose".to_owned());
-        self.device.destroy();
     }
 
     /// Declares the device gone: it did not answer.

@@ -3,6 +3,9 @@
 
 use std::ops::Range;
 
+use bytemuck::Pod;
+use rayon::prelude::*;
+
 use super::{
     buffers::{PlanRow, Scene, SceneLabels, ViewRow},
     device::Gpu,
@@ -31,6 +34,8 @@ const ENTRY_SLOTS_GROWTH: u32 = 4;
 /// Bytes of a tile pair: key and Gaussian, each in two halves.
 const PAIR_BYTES_A_BUFFER: u64 = 8;
 const PLAN_BYTES: u64 = size_of::<PlanRow>() as u64;
+/// From so many bytes on a picture is copied by all cores.
+const PARALLEL_BYTES: usize = 4 << 20;
 
 /// A frame without Gaussians.
 pub(super) fn background(view: &View, request: &RenderRequest) -> Frame {
@@ -80,6 +85,18 @@ enum Outcome {
     Pairs(u32),
     /// A pixel has more entries than room; there is more room now.
     Slots,
+}
+
+/// One view's band as it was read back: pictures and slots beside what they belong to.
+type Part<'a, 'b> = (&'a mut Drawing<'b>, &'a Layout, PlanRow, &'a [u8], &'a [u32]);
+
+/// How one view of a submission ended.
+struct Ended {
+    /// Tile pairs that there are.
+    needed: u32,
+    drawn: bool,
+    /// Entries a pixel to make room for, where there were more than room.
+    more_slots: Option<u32>,
 }
 
 /// What frames are drawn with.
@@ -169,7 +186,34 @@ impl<'a> Drawing<'a> {
         }
     }
 
-    /// Takes a band out of what was read back.
+    /// Takes a band out of what was read back, if there was room for all of it.
+    fn take(
+        &mut self,
+        layout: &Layout,
+        plan: PlanRow,
+        capacity: u32,
+        pictures: &[u8],
+        slots: &[u32],
+    ) -> Ended {
+        let needed = plan.needed;
+        if needed > capacity {
+            return Ended { needed, drawn: false, more_slots: None };
+        }
+        let counts = &slots[..slots.len().min(layout.pixels as usize)];
+        let entries = counts.iter().copied().max().unwrap_or(0);
+        if entries > layout.slots {
+            let more_slots = Some(layout.slots.saturating_mul(ENTRY_SLOTS_GROWTH));
+            return Ended { needed, drawn: false, more_slots };
+        }
+        self.store(layout, pictures, slots);
+        self.entries_max = self.entries_max.max(entries);
+        let stats = &mut self.frame.stats;
+        stats.visible = stats.visible.max(u64::from(plan.visible));
+        stats.intersections += u64::from(plan.isects);
+        Ended { needed, drawn: true, more_slots: None }
+    }
+
+    /// Takes the pictures and entries of a band out of what was read back.
     fn store(&mut self, layout: &Layout, pictures: &[u8], slots: &[u32]) {
         let pixels = layout.pixels as usize;
         let part = |start: u32, channels: usize| {
@@ -178,16 +222,16 @@ impl<'a> Drawing<'a> {
         };
         let frame = &mut self.frame;
         if let Some(color) = &mut frame.color {
-            color.extend_from_slice(bytemuck::cast_slice(part(layout.color, 3)));
+            append(color, part(layout.color, 3));
         }
         if let Some(depth) = &mut frame.depth {
-            depth.extend_from_slice(bytemuck::cast_slice(part(layout.depth, 1)));
+            append(depth, part(layout.depth, 1));
         }
         if let Some(alpha) = &mut frame.alpha {
-            alpha.extend_from_slice(bytemuck::cast_slice(part(layout.alpha, 1)));
+            append(alpha, part(layout.alpha, 1));
         }
         if let Some(blend) = &mut frame.blend {
-            blend.extend_from_slice(bytemuck::cast_slice(part(layout.blend, BLEND_WIDTH)));
+            append(blend, part(layout.blend, BLEND_WIDTH));
         }
         if layout.slots > 0 {
             self.entries.push(entry_rows(slots, layout, self.row.width as usize));
@@ -390,42 +434,41 @@ impl Tools<'_> {
         if let Some(marks) = &self.marks {
             self.times = marks.read(gpu, submission.clone())?;
         }
-        let (mut most_isects, mut more_slots) = (0, None);
         let ended = readback::read(gpu, submission, &room.staging, staging_bytes, |bytes| {
             let (plans, rest) = bytes.split_at(plan_bytes as usize);
             let (mut pictures, slots) = rest.split_at(picture_bytes as usize);
             let mut slots: &[u32] = bytemuck::cast_slice(slots);
             let plans: Vec<PlanRow> = bytemuck::pod_collect_to_vec(plans);
-            let mut ended = Vec::with_capacity(plans.len());
+            let mut parts = Vec::with_capacity(plans.len());
             for ((drawing, layout), plan) in drawings.iter_mut().zip(layouts).zip(plans) {
-                let mine;
-                let mine_slots;
+                let (mine, mine_slots);
                 (mine, pictures) = pictures.split_at(layout.picture_bytes() as usize);
                 (mine_slots, slots) = slots.split_at(layout.slot_bytes() as usize / 4);
-                most_isects = most_isects.max(plan.needed);
-                if plan.needed > capacity {
-                    ended.push((plan.needed, false));
-                    continue;
-                }
-                let counts = &mine_slots[..mine_slots.len().min(layout.pixels as usize)];
-                let entries = counts.iter().copied().max().unwrap_or(0);
-                if entries > layout.slots {
-                    more_slots = Some(layout.slots.saturating_mul(ENTRY_SLOTS_GROWTH));
-                    ended.push((plan.needed, false));
-                    continue;
-                }
-                drawing.store(layout, mine, mine_slots);
-                drawing.entries_max = drawing.entries_max.max(entries);
-                let stats = &mut drawing.frame.stats;
-                stats.visible = stats.visible.max(u64::from(plan.visible));
-                stats.intersections += u64::from(plan.isects);
-                ended.push((plan.needed, true));
+                parts.push((drawing, layout, plan, mine, mine_slots));
             }
-            ended
+            let take = |(drawing, layout, plan, mine, mine_slots): Part<'_, '_>| {
+                drawing.take(layout, plan, capacity, mine, mine_slots)
+            };
+            match parts.len() {
+                1 => parts.into_iter().map(take).collect(),
+                _ => parts.into_par_iter().map(take).collect::<Vec<_>>(),
+            }
         })?;
+        let most_isects = ended.iter().map(|ended| ended.needed).max().unwrap_or(0);
+        let more_slots = ended.iter().filter_map(|ended| ended.more_slots).max();
         self.scratch.isects = most_isects;
         self.scratch.entry_slots = more_slots.unwrap_or(self.scratch.entry_slots);
-        Ok(ended)
+        Ok(ended.into_iter().map(|ended| (ended.needed, ended.drawn)).collect())
+    }
+}
+
+/// Copies `bytes` to the end of `to`; many by all cores, for most of the time goes into new pages.
+fn append<T: Pod + Send + Sync>(to: &mut Vec<T>, bytes: &[u8]) {
+    let values: &[T] = bytemuck::cast_slice(bytes);
+    if bytes.len() < PARALLEL_BYTES {
+        to.extend_from_slice(values);
+    } else {
+        to.par_extend(values.par_iter().with_min_len(PARALLEL_BYTES / 16).copied());
     }
 }
 

@@ -133,8 +133,8 @@ impl GpuRenderer {
         both.fold((0, 0), |sum, one| (sum.0 + one.0, sum.1 + one.1))
     }
 
-    /// Ends the devices as a driver's fault would, at once, whatever runs on them; their adapters
-    /// stay. For tests of the recovery.
+    /// Has every device seen as lost at once, whatever runs on it; the adapters stay. For tests of
+    /// the recovery.
     pub fn lose_devices(&self) {
         self.stations.iter().for_each(Station::lose_device);
     }

@@ -2,15 +2,15 @@
 //!
 //! A caller puts its request into a bounded queue and waits. The caller whose request is first
 //! draws it, and with it every waiting request that fits one submission: of the same scene, drawn
-//! by the same kernels. A request equal to one that waits or is being drawn is not drawn again:
-//! its caller gets a copy. There is no thread besides the callers' own, so that nothing that they
-//! lend has to be owned.
+//! by the same kernels. A request equal to one that waits or is being drawn is not drawn again: its
+//! caller gets a copy. There is no thread besides the callers' own, so that nothing that they lend
+//! has to be owned.
 
 use std::{
     collections::VecDeque,
     sync::{
         Arc, Condvar, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicUsize, Ordering},
+        atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     time::{Duration, Instant},
 };
@@ -20,8 +20,11 @@ use crate::{
     render::{Frame, Kinds, RenderRequest},
 };
 
-/// How long a caller waits for those that were drawn with the last one to come again: well under
-/// what a submission of its own would cost them.
+/// Callers that draw at once. Two were slower on an H200: the second's submission waited for the
+/// first's pictures all the same, and both were half as large.
+pub(super) const TURNS: usize = 1;
+/// How long a caller waits for others of the crowd to come again: well under what a submission of
+/// its own would cost them.
 const GATHER: Duration = Duration::from_micros(150);
 
 /// One request in the queue.
@@ -31,8 +34,13 @@ pub(super) struct Job {
     scene: u64,
     pub(super) request: RenderRequest,
     answer: Mutex<Option<Result<Frame>>>,
-    /// Callers that have not taken the answer yet.
+    /// Told when there is an answer, or the turn to draw.
+    changed: Condvar,
+    /// Whether it is its caller's turn.
+    leads: AtomicBool,
+    /// Callers that have not taken the answer yet; with none left it is gone.
     takers: AtomicUsize,
+    answered: AtomicBool,
 }
 
 impl Job {
@@ -53,10 +61,33 @@ impl Job {
 
     pub(super) fn answer(&self, answer: Result<Frame>) {
         *lock(&self.answer) = Some(answer);
+        self.answered.store(true, Ordering::Release);
+        self.changed.notify_all();
     }
 
-    fn answered(&self) -> bool {
-        lock(&self.answer).is_some()
+    /// One more taker, unless the last has been there.
+    fn share(&self) -> bool {
+        let more = |takers| (takers > 0).then_some(takers + 1);
+        self.takers.fetch_update(Ordering::AcqRel, Ordering::Acquire, more).is_ok()
+    }
+
+    fn lead(&self) {
+        // Under the lock, so that nobody looks before it and waits after it.
+        let _answer = lock(&self.answer);
+        self.leads.store(true, Ordering::Release);
+        self.changed.notify_all();
+    }
+
+    /// Waits for the answer, or the turn of the caller that brought the request; which of them.
+    fn wait(&self, mine: bool) -> bool {
+        let mut answer = lock(&self.answer);
+        while answer.is_none() {
+            if mine && self.leads.load(Ordering::Acquire) {
+                return true;
+            }
+            answer = self.changed.wait(answer).unwrap_or_else(PoisonError::into_inner);
+        }
+        false
     }
 
     /// The answer, for one of those who share it; the last of them gets it itself.
@@ -79,47 +110,68 @@ struct Waiting {
     jobs: VecDeque<Arc<Job>>,
     /// Being drawn.
     drawn: Vec<Arc<Job>>,
-    busy: bool,
-    /// Views of the last submission.
-    last_views: usize,
+    /// Callers whose turn it is. There are [`TURNS`] while anyone waits for one.
+    turns: usize,
+    /// Requests at once, lately.
+    crowd: usize,
+}
+
+impl Waiting {
+    fn len(&self) -> usize {
+        self.jobs.len() + self.drawn.len()
+    }
+
+    /// Gives free turns to those who have waited longest, but for those who will be drawn with one
+    /// whose turn it is already.
+    fn hand_on(&mut self) {
+        while self.turns < TURNS {
+            let leads = |job: &&Arc<Job>| job.leads.load(Ordering::Acquire);
+            let joins = |job: &Arc<Job>| self.jobs.iter().filter(leads).any(|led| led.joins(job));
+            let next = self.jobs.iter().find(|job| !leads(job) && !joins(job));
+            let Some(job) = next else { break };
+            self.turns += 1;
+            job.lead();
+        }
+    }
 }
 
 /// The requests of one device.
 #[derive(Debug)]
 pub(super) struct Queue {
     waiting: Mutex<Waiting>,
-    changed: Condvar,
+    /// Told when a request has come.
+    arrived: Condvar,
     waiting_max: usize,
 }
 
-/// Ends a turn, also when its work panics: nobody waits for ever.
+/// One caller's drawing; its end, also by a panic, leaves nobody waiting for ever.
 struct Turn<'a> {
     queue: &'a Queue,
+    batch: Vec<Arc<Job>>,
 }
 
 impl Drop for Turn<'_> {
     fn drop(&mut self) {
-        let mut waiting = lock(&self.queue.waiting);
-        for job in std::mem::take(&mut waiting.drawn) {
-            if !job.answered() {
-                job.answer(Err(Error::internal("a drawing was broken off")));
-            }
+        let open = |job: &&Arc<Job>| !job.answered.load(Ordering::Acquire);
+        for job in self.batch.iter().filter(open) {
+            job.answer(Err(Error::internal("a drawing was broken off")));
         }
-        waiting.busy = false;
-        drop(waiting);
-        self.queue.changed.notify_all();
+        let mut waiting = lock(&self.queue.waiting);
+        let mine = |job: &Arc<Job>| self.batch.iter().any(|other| Arc::ptr_eq(job, other));
+        waiting.drawn.retain(|job| !mine(job));
+        waiting.turns -= 1;
+        waiting.hand_on();
     }
 }
 
 impl Queue {
     pub(super) fn new(waiting_max: usize) -> Self {
-        Self { waiting: Mutex::default(), changed: Condvar::new(), waiting_max }
+        Self { waiting: Mutex::default(), arrived: Condvar::new(), waiting_max }
     }
 
     /// Requests that wait or are being drawn.
     pub(super) fn len(&self) -> usize {
-        let waiting = lock(&self.waiting);
-        waiting.jobs.len() + waiting.drawn.len()
+        lock(&self.waiting).len()
     }
 
     /// Draws `request` of `scene`, alone or with others: `draw` answers every job it is given, of
@@ -134,75 +186,71 @@ impl Queue {
         views_max: usize,
         draw: impl FnOnce(&[Arc<Job>]),
     ) -> Result<Frame> {
-        let mut waiting = lock(&self.waiting);
-        let known = waiting.jobs.iter().chain(&waiting.drawn);
-        let known = known.into_iter().find(|job| job.equals(scene, request)).cloned();
-        let mine = known.is_none();
-        let job = match known {
-            Some(job) => {
-                job.takers.fetch_add(1, Ordering::AcqRel);
-                job
-            }
-            None if waiting.jobs.len() >= self.waiting_max => {
-                return Err(Error::new(
-                    ErrorCode::Overloaded,
-                    format!("{} views wait for the GPU already", waiting.jobs.len()),
-                )
-                .retry_after_s(1));
-            }
-            None => {
-                let (answer, takers) = (Mutex::new(None), AtomicUsize::new(1));
-                let job = Arc::new(Job { scene, request: request.clone(), answer, takers });
-                waiting.jobs.push_back(Arc::clone(&job));
-                self.changed.notify_all();
-                job
-            }
-        };
-        loop {
-            if job.answered() {
-                drop(waiting);
-                return job.take();
-            }
-            let first = waiting.jobs.front().is_some_and(|first| Arc::ptr_eq(first, &job));
-            if mine && first && !waiting.busy {
-                break;
-            }
-            waiting = self.changed.wait(waiting).unwrap_or_else(PoisonError::into_inner);
+        let (job, mine) = self.enter(scene, request)?;
+        if job.wait(mine) {
+            let turn = self.gather(&job, views_max);
+            draw(&turn.batch);
         }
-        waiting.busy = true;
-        let turn = Turn { queue: self };
-        let batch = self.gather(waiting, &job, views_max);
-        draw(&batch);
-        drop(turn);
         job.take()
     }
 
-    /// The requests to draw with `job`, which is the first of the queue.
-    fn gather<'a>(
-        &'a self,
-        mut waiting: MutexGuard<'a, Waiting>,
-        job: &Arc<Job>,
-        views_max: usize,
-    ) -> Vec<Arc<Job>> {
-        let fit = |waiting: &Waiting| waiting.jobs.iter().filter(|other| job.joins(other)).count();
-        let expected = waiting.last_views.min(views_max);
+    /// The job of `request`, and whether it is new.
+    fn enter(&self, scene: u64, request: &RenderRequest) -> Result<(Arc<Job>, bool)> {
+        let mut waiting = lock(&self.waiting);
+        let mut known = waiting.jobs.iter().chain(&waiting.drawn);
+        if let Some(job) = known.find(|job| job.equals(scene, request) && job.share()) {
+            return Ok((Arc::clone(job), false));
+        }
+        if waiting.jobs.len() >= self.waiting_max {
+            return Err(Error::new(
+                ErrorCode::Overloaded,
+                format!("{} views wait for the GPU already", waiting.jobs.len()),
+            )
+            .retry_after_s(1));
+        }
+        let job = Arc::new(Job {
+            scene,
+            request: request.clone(),
+            answer: Mutex::default(),
+            changed: Condvar::new(),
+            leads: AtomicBool::new(false),
+            takers: AtomicUsize::new(1),
+            answered: AtomicBool::new(false),
+        });
+        waiting.jobs.push_back(Arc::clone(&job));
+        waiting.crowd = waiting.crowd.max(waiting.len());
+        waiting.hand_on();
+        self.arrived.notify_all();
+        Ok((job, true))
+    }
+
+    /// The requests to draw with `job`, whose turn it is.
+    fn gather(&self, job: &Arc<Job>, views_max: usize) -> Turn<'_> {
+        let fits = |other: &Arc<Job>| {
+            let led = other.leads.load(Ordering::Acquire);
+            Arc::ptr_eq(other, job) || (!led && job.joins(other))
+        };
+        let mut waiting = lock(&self.waiting);
+        // Each turn's share of the crowd.
+        let expected = waiting.crowd.div_ceil(TURNS).min(views_max);
         let until = Instant::now() + GATHER;
-        while expected > 1 && fit(&waiting) < expected {
+        while waiting.jobs.iter().filter(|other| fits(other)).count() < expected {
             let Some(left) = until.checked_duration_since(Instant::now()) else { break };
-            let woken = self.changed.wait_timeout(waiting, left);
+            let woken = self.arrived.wait_timeout(waiting, left);
             waiting = woken.unwrap_or_else(PoisonError::into_inner).0;
         }
-        let mut batch = Vec::new();
+        let mut batch = vec![Arc::clone(job)];
         waiting.jobs.retain(|other| {
-            let taken = batch.len() < views_max && job.joins(other);
+            let taken = batch.len() < views_max && fits(other) && !Arc::ptr_eq(other, job);
             if taken {
                 batch.push(Arc::clone(other));
             }
-            !taken
+            !taken && !Arc::ptr_eq(other, job)
         });
-        waiting.last_views = batch.len();
-        waiting.drawn.clone_from(&batch);
-        batch
+        waiting.crowd = waiting.len().max(waiting.crowd.saturating_sub(1)).max(1);
+        waiting.drawn.extend_from_slice(&batch);
+        waiting.hand_on();
+        Turn { queue: self, batch }
     }
 }
 
@@ -243,16 +291,19 @@ mod tests {
     fn waiting_requests_of_a_scene_are_drawn_together_and_equal_ones_once() {
         let queue = Queue::new(64);
         let batches = Mutex::new(Vec::new());
-        let gate = std::sync::Barrier::new(2);
+        let gate = std::sync::Barrier::new(1 + TURNS);
         std::thread::scope(|scope| {
-            // Holds the device until everyone else waits.
-            scope.spawn(|| {
-                queue.render(9, &request(1.0), 8, |jobs| {
-                    gate.wait();
-                    gate.wait();
-                    jobs.iter().for_each(|job| job.answer(Ok(frame(job))));
-                })
-            });
+            // They hold all turns until everyone else waits.
+            for other in 0..TURNS as u64 {
+                let (queue, gate) = (&queue, &gate);
+                scope.spawn(move || {
+                    queue.render(90 + other, &request(1.0), 8, |jobs| {
+                        gate.wait();
+                        gate.wait();
+                        jobs.iter().for_each(|job| job.answer(Ok(frame(job))));
+                    })
+                });
+            }
             gate.wait();
             let near = [2.0, 3.0, 2.0, 4.0, 5.0, 3.0];
             for (i, near) in near.into_iter().enumerate() {
@@ -267,7 +318,7 @@ mod tests {
                     assert_eq!(got.unwrap().depth, Some(vec![near]), "view {i}");
                 });
             }
-            while queue.len() < 1 + 5 {
+            while queue.len() < TURNS + 5 {
                 std::thread::yield_now();
             }
             // Whoever asks for a view that waits already has joined by now or will find it drawn.
@@ -280,16 +331,72 @@ mod tests {
     }
 
     #[test]
+    fn a_request_that_was_answered_and_taken_is_drawn_again() {
+        let queue = Queue::new(64);
+        let (gate, again) = (std::sync::Barrier::new(1 + TURNS), AtomicBool::new(false));
+        let draw = |jobs: &[Arc<Job>]| jobs.iter().for_each(|job| job.answer(Ok(frame(job))));
+        std::thread::scope(|scope| {
+            for other in 0..TURNS as u64 {
+                let (queue, gate) = (&queue, &gate);
+                scope.spawn(move || {
+                    queue.render(90 + other, &request(1.0), 8, |jobs| {
+                        gate.wait();
+                        gate.wait();
+                        draw(jobs);
+                    })
+                });
+            }
+            gate.wait();
+            // Two views that are drawn together, by a caller who goes on after the answers.
+            let callers: Vec<_> = [2.0, 3.0]
+                .map(|near| {
+                    let (queue, again) = (&queue, &again);
+                    let asked = queue.len() + 1;
+                    let caller = scope.spawn(move || {
+                        queue.render(7, &request(near), 8, |jobs| {
+                            draw(jobs);
+                            let begun = Instant::now();
+                            while jobs.len() == 2
+                                && !again.load(Ordering::Acquire)
+                                && begun.elapsed() < Duration::from_secs(5)
+                            {
+                                std::thread::yield_now();
+                            }
+                        })
+                    });
+                    while queue.len() < asked {
+                        std::thread::yield_now();
+                    }
+                    caller
+                })
+                .into();
+            gate.wait();
+            let mut callers = callers.into_iter();
+            let (first, second) = (callers.next().unwrap(), callers.next().unwrap());
+            assert!(second.join().unwrap().is_ok(), "answered while the first still draws");
+            let got = queue.render(7, &request(3.0), 8, draw);
+            again.store(true, Ordering::Release);
+            assert_eq!(got.unwrap().depth, Some(vec![3.0]), "drawn again");
+            assert!(first.join().unwrap().is_ok());
+        });
+    }
+
+    #[test]
     fn a_full_queue_and_a_broken_drawing_are_errors_for_all_who_wait() {
         let queue = Queue::new(1);
-        let gate = std::sync::Barrier::new(2);
+        let gate = std::sync::Barrier::new(1 + TURNS);
         std::thread::scope(|scope| {
-            let broken = scope.spawn(|| {
-                queue.render(1, &request(1.0), 8, |_| {
-                    gate.wait();
-                    gate.wait();
+            let broken: Vec<_> = (0..TURNS as u64)
+                .map(|other| {
+                    let (queue, gate) = (&queue, &gate);
+                    scope.spawn(move || {
+                        queue.render(other, &request(1.0), 8, |_| {
+                            gate.wait();
+                            gate.wait();
+                        })
+                    })
                 })
-            });
+                .collect();
             gate.wait();
             let second = scope.spawn(|| {
                 let answer = |jobs: &[Arc<Job>]| {
@@ -297,14 +404,16 @@ mod tests {
                 };
                 queue.render(1, &request(2.0), 8, answer)
             });
-            while queue.len() < 2 {
+            while queue.len() < TURNS + 1 {
                 std::thread::yield_now();
             }
             let third = queue.render(1, &request(3.0), 8, |_| {}).unwrap_err();
             assert_eq!((third.code(), third.retry_after()), (ErrorCode::Overloaded, Some(1)));
             gate.wait();
-            let error = broken.join().unwrap().unwrap_err();
-            assert_eq!(error.code(), ErrorCode::Internal, "nobody answered it");
+            for broken in broken {
+                let error = broken.join().unwrap().unwrap_err();
+                assert_eq!(error.code(), ErrorCode::Internal, "nobody answered it");
+            }
             assert!(second.join().unwrap().is_ok(), "the next one is drawn");
         });
     }

@@ -43,7 +43,7 @@ impl GpuRenderer {
     pub fn project(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Projected> {
         let row = view_row(gaussians, request)?;
         self.with_engine(|engine| {
-            let scene = engine.scenes.get(&engine.gpu, gaussians)?;
+            let (scene, _) = engine.scene(gaussians, false)?;
             let room = room(engine, &row, 0)?;
             let n = gaussians.len();
             let parts = [
@@ -150,7 +150,7 @@ impl GpuRenderer {
     ) -> Result<Vec<[f32; 3]>> {
         let row = view_row(gaussians, request)?;
         self.with_engine(|engine| {
-            let scene = engine.scenes.get(&engine.gpu, gaussians)?;
+            let (scene, _) = engine.scene(gaussians, false)?;
             let room = room(engine, &row, 0)?;
             let parts = [(&room.colors, 0, gaussians.len() * 12)];
             let write = |gpu: &Gpu| {
@@ -290,7 +290,7 @@ fn room(engine: &mut Engine, row: &ViewRow, picture_bytes: usize) -> Result<Room
         picture_bytes: picture_bytes as u64,
         ..Need::default()
     };
-    engine.scratch.room(&engine.gpu, &need)
+    engine.scratch.room(&engine.on.gpu, &need)
 }
 
 /// `tiles` as the counts of Gaussians that lie in depth order.
@@ -339,7 +339,7 @@ fn run_from<const N: usize>(
     write: impl FnOnce(&Gpu),
     record: impl FnOnce(&mut Recorder<'_>),
 ) -> Result<[Vec<u8>; N]> {
-    let gpu = &engine.gpu;
+    let gpu = &engine.on.gpu;
     let total = parts.iter().map(|part| part.2 as u64).sum::<u64>();
     let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
     let staging = gpu.create_buffer("staging", total, usage)?;
@@ -354,7 +354,7 @@ fn run_from<const N: usize>(
         write(gpu);
         let bindings = &mut engine.scratch.bindings;
         let sizes = (1, row.gaussian_count);
-        let mut stages = Recorder::new(gpu, &engine.kernels, bindings, room, sizes, None);
+        let mut stages = Recorder::new(gpu, &engine.on.kernels, bindings, room, sizes, None);
         record(&mut stages);
         stages.submit(&copies)
     })??;

@@ -7,11 +7,11 @@ use std::sync::{
 
 use super::{
     GpuOptions,
-    buffers::SceneCache,
+    buffers::{Scene, SceneCache, SceneLabels},
     device::Gpu,
     frame::{Drawing, Tools},
     pipelines::{Kernels, VIEWS_MAX},
-    pool::{Job, Queue},
+    pool::{Job, Queue, TURNS},
     profile::Marks,
     scratch::Scratch,
 };
@@ -28,13 +28,47 @@ const OPENED_MAX: u32 = 3;
 /// Gaussians of all views of one submission: beyond it a view fills a device alone.
 const BATCH_GAUSSIANS: usize = 4 << 20;
 
-/// A device with what was compiled and kept on it.
+/// A device with what was compiled and kept on it; clones are the same one.
+#[derive(Clone, Debug)]
+pub(super) struct Opened {
+    pub(super) gpu: Gpu,
+    pub(super) kernels: Arc<Kernels>,
+    scenes: Arc<Mutex<SceneCache>>,
+}
+
+/// A device, for one who draws on it, and room of his own.
 #[derive(Debug)]
 pub(super) struct Engine {
-    pub(super) gpu: Gpu,
-    pub(super) kernels: Kernels,
+    pub(super) on: Opened,
     pub(super) scratch: Scratch,
-    pub(super) scenes: SceneCache,
+}
+
+impl Engine {
+    /// The scene of `gaussians`, and its bank indices where they are wanted.
+    ///
+    /// # Errors
+    /// As [`SceneCache::get`].
+    pub(super) fn scene(
+        &self,
+        gaussians: &Gaussians,
+        labelled: bool,
+    ) -> Result<(Scene, Option<SceneLabels>)> {
+        let mut scenes = lock(&self.on.scenes);
+        let scene = scenes.get(&self.on.gpu, gaussians)?;
+        let labels = match labelled {
+            true => Some(scenes.labels(&self.on.gpu, gaussians)?),
+            false => None,
+        };
+        Ok((scene, labels))
+    }
+}
+
+/// The device of a station and the rooms that nobody uses.
+#[derive(Debug, Default)]
+struct Held {
+    /// `None` after the device was lost.
+    opened: Option<Opened>,
+    idle: Vec<Scratch>,
 }
 
 /// One adapter.
@@ -43,12 +77,9 @@ pub(super) struct Station {
     options: GpuOptions,
     adapter: wgpu::Adapter,
     report: AdapterReport,
-    /// `None` after the device was lost.
-    engine: Mutex<Option<Engine>>,
-    /// The engine's device, for those who do not wait for the engine.
-    current: Mutex<Option<Gpu>>,
-    /// The engine's scenes, likewise.
-    held: Mutex<Vec<u64>>,
+    held: Mutex<Held>,
+    /// What tells the device's scenes, for those who do not wait for an upload.
+    shapes: Mutex<Vec<u64>>,
     queue: Queue,
     submissions: AtomicU64,
     views: AtomicU64,
@@ -68,25 +99,22 @@ impl Station {
             options: options.clone(),
             adapter,
             report,
-            engine: Mutex::default(),
-            current: Mutex::default(),
             held: Mutex::default(),
+            shapes: Mutex::default(),
             queue: Queue::new(options.waiting_max),
             submissions: AtomicU64::new(0),
             views: AtomicU64::new(0),
         };
-        let engine = station.new_engine()?;
-        *lock(&station.engine) = Some(engine);
+        lock(&station.held).opened = Some(station.open_device()?);
         Ok(station)
     }
 
-    fn new_engine(&self) -> Result<Engine> {
+    fn open_device(&self) -> Result<Opened> {
         let gpu = Gpu::open(&self.adapter, self.options.portable)?;
         let kernels =
             Kernels::compile(&gpu, self.options.shaders.as_deref(), self.options.checked)?;
-        *lock(&self.current) = Some(gpu.clone());
         let scenes = SceneCache::new(self.options.scene_bytes_max);
-        Ok(Engine { gpu, kernels, scratch: Scratch::default(), scenes })
+        Ok(Opened { gpu, kernels: Arc::new(kernels), scenes: Arc::new(Mutex::new(scenes)) })
     }
 
     pub(super) fn adapter(&self) -> &AdapterReport {
@@ -94,12 +122,12 @@ impl Station {
     }
 
     pub(super) fn scenes_held(&self) -> usize {
-        lock(&self.engine).as_ref().map_or(0, |engine| engine.scenes.len())
+        lock(&self.shapes).len()
     }
 
     /// Whether the scene of that shape was here when the last view was drawn.
     pub(super) fn holds(&self, shape: u64) -> bool {
-        lock(&self.held).contains(&shape)
+        lock(&self.shapes).contains(&shape)
     }
 
     /// Views that wait or are being drawn.
@@ -111,39 +139,48 @@ impl Station {
         (self.submissions.load(Ordering::Relaxed), self.views.load(Ordering::Relaxed))
     }
 
-    /// Ends the device as a driver's fault would, whatever runs on it.
+    /// Has everyone see the device lost, whatever runs on it.
     pub(super) fn lose_device(&self) {
-        if let Some(gpu) = lock(&self.current).as_ref() {
-            gpu.lose();
+        if let Some(opened) = &lock(&self.held).opened {
+            opened.gpu.lose();
         }
     }
 
     /// Runs `work` on the device, opened again if it was lost.
     pub(super) fn with_engine<T>(&self, work: impl FnOnce(&mut Engine) -> Result<T>) -> Result<T> {
-        let mut slot = lock(&self.engine);
-        if slot.as_ref().is_some_and(|engine| engine.gpu.is_lost()) {
-            self.give_up(&mut slot);
-        }
-        let engine = match &mut *slot {
-            Some(engine) => engine,
-            None => {
-                let engine = self.new_engine()?;
-                tracing::warn!(adapter = self.report.name, "the GPU device was opened again");
-                slot.insert(engine)
-            }
-        };
-        let result = work(engine);
-        *lock(&self.held) = engine.scenes.shapes();
-        if engine.gpu.is_lost() {
-            self.give_up(&mut slot);
+        let mut engine = self.engine()?;
+        let result = work(&mut engine);
+        *lock(&self.shapes) = lock(&engine.on.scenes).shapes();
+        let mut held = lock(&self.held);
+        if engine.on.gpu.is_lost() {
+            self.give_up(&mut held);
+        } else if held.idle.len() < TURNS {
+            held.idle.push(engine.scratch);
         }
         result
     }
 
-    fn give_up(&self, slot: &mut Option<Engine>) {
-        tracing::error!(adapter = self.report.name, "the GPU device was lost");
-        lock(&self.held).clear();
-        *slot = None;
+    fn engine(&self) -> Result<Engine> {
+        let mut held = lock(&self.held);
+        self.give_up(&mut held);
+        let on = match &held.opened {
+            Some(opened) => opened.clone(),
+            None => {
+                let opened = self.open_device()?;
+                tracing::warn!(adapter = self.report.name, "the GPU device was opened again");
+                held.opened.insert(opened).clone()
+            }
+        };
+        Ok(Engine { on, scratch: held.idle.pop().unwrap_or_default() })
+    }
+
+    /// Lets go of the device if it is lost.
+    fn give_up(&self, held: &mut Held) {
+        if held.opened.as_ref().is_some_and(|opened| opened.gpu.is_lost()) {
+            tracing::error!(adapter = self.report.name, "the GPU device was lost");
+            *held = Held::default();
+            lock(&self.shapes).clear();
+        }
     }
 
     /// Runs `work` as [`Self::with_engine`], once more on a new device each time one is lost.
@@ -201,7 +238,8 @@ impl Station {
         match drawn {
             // Memory may be held by other scenes and by larger views: once without them.
             Err(error) if error.code() == ErrorCode::LimitExceeded => self.persistently(|engine| {
-                engine.scenes.clear(&engine.gpu);
+                lock(&self.held).idle.clear();
+                lock(&engine.on.scenes).clear(&engine.on.gpu);
                 engine.scratch = Scratch::default();
                 self.one(engine, gaussians, &job.request, None)
             }),
@@ -221,20 +259,16 @@ impl Station {
             .iter()
             .map(|request| View::new(gaussians.origin(), request))
             .collect::<Result<_>>()?;
-        let scene = engine.scenes.get(&engine.gpu, gaussians)?;
         let labelled = requests.first().is_some_and(|one| one.labels != Labels::None);
-        let labels = match labelled {
-            true => Some(engine.scenes.labels(&engine.gpu, gaussians)?),
-            false => None,
-        };
+        let (scene, labels) = engine.scene(gaussians, labelled)?;
         let mut drawings: Vec<_> = views
             .iter()
             .zip(requests)
             .map(|(view, request)| Drawing::new(view, request, &scene))
             .collect();
         let mut tools = Tools {
-            gpu: &engine.gpu,
-            kernels: &engine.kernels,
+            gpu: &engine.on.gpu,
+            kernels: &engine.on.kernels,
             scratch: &mut engine.scratch,
             scene: &scene,
             labels: labels.as_ref(),
@@ -259,14 +293,10 @@ impl Station {
         marks: Option<&mut Marks>,
     ) -> Result<(Frame, Vec<StageTime>)> {
         let view = View::new(gaussians.origin(), request)?;
-        let scene = engine.scenes.get(&engine.gpu, gaussians)?;
-        let labels = match request.labels {
-            Labels::None => None,
-            _ => Some(engine.scenes.labels(&engine.gpu, gaussians)?),
-        };
+        let (scene, labels) = engine.scene(gaussians, request.labels != Labels::None)?;
         let mut tools = Tools {
-            gpu: &engine.gpu,
-            kernels: &engine.kernels,
+            gpu: &engine.on.gpu,
+            kernels: &engine.on.kernels,
             scratch: &mut engine.scratch,
             scene: &scene,
             labels: labels.as_ref(),
@@ -291,11 +321,11 @@ impl Station {
         request: &RenderRequest,
     ) -> Result<Option<DeviceTimes>> {
         self.with_engine(|engine| {
-            if !engine.gpu.has_times {
+            if !engine.on.gpu.has_times {
                 return Ok(None);
             }
             let mut times = |each| -> Result<Vec<StageTime>> {
-                let mut marks = Marks::new(&engine.gpu, each)?;
+                let mut marks = Marks::new(&engine.on.gpu, each)?;
                 Ok(self.one(engine, gaussians, request, Some(&mut marks))?.1)
             };
             let total_ms = times(false)?.iter().map(|stage| stage.ms).sum();
