@@ -36,6 +36,7 @@ mod load;
 mod magnify;
 mod oracle;
 mod photos;
+mod pitfalls;
 mod pool;
 mod props;
 mod replicas;
