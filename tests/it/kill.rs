@@ -21,6 +21,9 @@ use crate::common::{
     skipped,
 };
 
+/// Scenes beyond which callers rather delete than make.
+const SCENES_MAX: usize = 60;
+
 /// What was acknowledged of a scene.
 #[derive(Clone, Debug, Default)]
 struct Known {
@@ -76,6 +79,10 @@ async fn caller(server: Arc<Process>, ledger: Ledger, uploads: Arc<Vec<Upload>>,
             let ledger = ledger.lock().unwrap();
             ledger.iter().filter(|(_, known)| !known.doomed).map(|(id, _)| id.clone()).collect()
         };
+        // So many that a check of them all stays short.
+        if ids.len() > SCENES_MAX {
+            deletions = 1;
+        }
         let one = ids.get(random.below(ids.len().max(1) as u64) as usize);
         let dice = if deletions > 0 { 39 } else { random.below(40) };
         deletions -= i32::from(deletions > 0);
