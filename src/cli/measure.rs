@@ -11,7 +11,7 @@ use super::{
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
-    eval::{self, EvalOptions, EvalReport, semantics, words},
+    eval::{self, EvalOptions, EvalReport, density, semantics, words},
     sample::{self, SampleOptions},
 };
 
@@ -49,6 +49,8 @@ enum EvalWhat {
     Semantics(SemanticsArgs),
     /// Score whether labelled images find their names
     Words(WordsArgs),
+    /// Say what thinning costs and saves
+    Density(DensityArgs),
     /// Say what each skip of the mask stage changes in masks and time
     Masks(MasksArgs),
 }
@@ -59,6 +61,7 @@ impl EvalArgs {
             None => &self.config,
             Some(EvalWhat::Semantics(args)) => &args.config,
             Some(EvalWhat::Words(args)) => &args.config,
+            Some(EvalWhat::Density(args)) => &args.config,
             Some(EvalWhat::Masks(args)) => &args.config,
         }
     }
@@ -111,6 +114,31 @@ struct WordsArgs {
     config: ConfigArgs,
 }
 
+#[derive(Clone, Debug, clap::Args)]
+struct DensityArgs {
+    /// A scene folder (with transforms.json), or a folder of scene folders
+    dir: PathBuf,
+    /// Only these scenes, by name, separated by commas [default: all]
+    #[arg(long, value_delimiter = ',')]
+    scenes: Vec<String>,
+    /// Photos in: 2 (the pair) or 4 (the pair and the next two nearest to the target)
+    #[arg(long, default_value_t = 2)]
+    photos: usize,
+    #[command(flatten)]
+    config: ConfigArgs,
+}
+
+fn compare_densities(args: &DensityArgs, config: &Config, out: &Output) -> Result<()> {
+    let options = density::DensityEval {
+        dir: args.dir.clone(),
+        scenes: args.scenes.clone(),
+        photos: args.photos,
+    };
+    out.line(&density::DensityReport::heading());
+    let reports = density::run(config, &options, &|scene| out.line(&scene.to_string()))?;
+    out.answer("", &reports)
+}
+
 fn score_semantics(args: &SemanticsArgs, config: &Config, out: &Output) -> Result<()> {
     let mut understanding = semantics::understanding();
     understanding.seeds = args.seeds;
@@ -147,6 +175,7 @@ pub(super) fn eval(args: &EvalArgs, config: &Config, out: &Output) -> Result<()>
     let dir = match (&args.what, &args.dir) {
         (Some(EvalWhat::Semantics(args)), _) => return score_semantics(args, config, out),
         (Some(EvalWhat::Words(args)), _) => return score_words(args, config, out),
+        (Some(EvalWhat::Density(args)), _) => return compare_densities(args, config, out),
         (Some(EvalWhat::Masks(args)), _) => return masks::run(args, config, out),
         (None, Some(dir)) => dir.clone(),
         (None, None) => return Err(Error::invalid("eval: it takes a folder")),

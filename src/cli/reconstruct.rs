@@ -24,7 +24,7 @@ use crate::{
     },
     photos,
     pipeline::Engine,
-    scene::{Provenance, Scene, SceneId, SceneMeta, SceneOptions, SemanticsMode, Upload},
+    scene::{Density, Provenance, Scene, SceneId, SceneMeta, SceneOptions, SemanticsMode, Upload},
     store::{self, ply::PlyWriter, write_scene_file, write_semantics_file},
 };
 
@@ -41,6 +41,9 @@ pub(super) struct Args {
     /// Make what texts are asked of too, in a file beside the scene's: `eager`; `off` makes none
     #[arg(long, value_parser = semantics, default_value = "off")]
     semantics: SemanticsMode,
+    /// Gaussians kept: `thinned`, one for up to 16 neighbours where the photos are flat, or `full`
+    #[arg(long, value_parser = |name: &str| Density::named(name), default_value = "thinned")]
+    density: Density,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
 }
@@ -48,7 +51,11 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let upload = upload_of(&args.photos, config)?;
     let engine = Arc::new(Engine::open(config)?);
-    let options = SceneOptions { max_views: args.max_views, semantics: args.semantics };
+    let options = SceneOptions {
+        max_views: args.max_views,
+        semantics: args.semantics,
+        density: args.density,
+    };
     let eager = args.semantics == SemanticsMode::Eager;
     if eager && is_ply(&args.output) {
         return Err(Error::invalid(

@@ -1,11 +1,12 @@
-//! How good the scenes are on posed photographs: `segsplat eval DIR`; what texts select in them:
-//! [`semantics`]; whether images find their names: [`words`].
+//! How good the scenes are on posed photographs: `segsplat eval DIR`; what thinning costs them:
+//! [`density`]; what texts select in them: [`semantics`]; whether images find their names: [`words`].
 //!
 //! Every triple (two inputs, a target between them) goes through the product's own road:
 //! undistortion, capture analysis, the shipped network, lifting, the CPU renderer. Beside PSNR and
 //! SSIM stands the *hindsight warp*: the best PSNR that a constant-depth warp of either input
 //! reaches when the depth is chosen knowing the answer.
 
+pub mod density;
 pub mod masks;
 mod metrics;
 mod pictures;
@@ -29,7 +30,7 @@ use crate::{
     limits::Limits,
     models::fit,
     photos,
-    pipeline::{Engine, reconstruct},
+    pipeline::{Engine, Reconstruction, reconstruct},
     render::{Kinds, Labels, Quality, RenderRequest, Renderer, compose, cpu::CpuRenderer},
     scene::{Camera, Photo, PosedPhoto, Provenance, Scene, SceneId, SceneMeta, SceneOptions},
 };
@@ -163,26 +164,11 @@ fn judge(
         reconstruct(engine, &given, &SceneOptions::default(), &|_, _| (), &AtomicBool::new(false))?;
     let ms = start.elapsed().as_secs_f64() * 1e3;
     let target = &squares[triple.target];
-    #[expect(clippy::cast_possible_truncation, reason = "a near plane needs no f64")]
-    let near = (made.report.median_depth * NEAR_SHARE).max(1e-6) as f32;
     let request = RenderRequest {
-        camera: target.camera,
         kinds: Kinds { color: true, depth: true, alpha: false },
-        labels: Labels::None,
-        background: [0.0; 3],
-        antialiased: false,
-        near,
-        quality: Quality::Exact,
-        crop: None,
+        ..view_request(target.camera, made.report.median_depth)
     };
-    let meta = SceneMeta {
-        id: SceneId::from_bytes([0; 16]),
-        created_ms: 0,
-        cameras: made.cameras,
-        report: made.report,
-        provenance: Provenance::default(),
-    };
-    let scene = Scene::new(meta, made.gaussians, made.backdrop);
+    let scene = scene_of(made);
     let frame = compose::render_scene(renderer, &scene, &request, true)?;
     let report = scene.meta.report;
     let mut color = frame.color.unwrap_or_default();
@@ -216,6 +202,34 @@ fn judge(
         depth: frame.depth.unwrap_or_default(),
         report: judged,
     })
+}
+
+/// A colour view as the service draws it; `median_depth` is the scene's.
+fn view_request(camera: Camera, median_depth: f64) -> RenderRequest {
+    #[expect(clippy::cast_possible_truncation, reason = "a near plane needs no f64")]
+    let near = (median_depth * NEAR_SHARE).max(1e-6) as f32;
+    RenderRequest {
+        camera,
+        kinds: Kinds { color: true, depth: false, alpha: false },
+        labels: Labels::None,
+        background: [0.0; 3],
+        antialiased: false,
+        near,
+        quality: Quality::Exact,
+        crop: None,
+    }
+}
+
+/// A scene of a reconstruction that nobody stores.
+fn scene_of(made: Reconstruction) -> Scene {
+    let meta = SceneMeta {
+        id: SceneId::from_bytes([0; 16]),
+        created_ms: 0,
+        cameras: made.cameras,
+        report: made.report,
+        provenance: Provenance::default(),
+    };
+    Scene::new(meta, made.gaussians, made.backdrop)
 }
 
 /// The photos of a scene folder, undistorted, cropped to their short side, [`SIDE`] pixels square.

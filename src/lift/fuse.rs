@@ -37,6 +37,8 @@ pub(super) enum Fate {
     Absent,
     /// The surface has enough layers already.
     Duplicate,
+    /// A neighbour says it too since thinning.
+    Merged,
 }
 
 /// A view with what fusion asks of it at every pixel.

@@ -7,6 +7,7 @@
 mod backdrop;
 mod fuse;
 mod sh;
+mod thin;
 
 pub use backdrop::backdrop;
 
@@ -23,6 +24,7 @@ use crate::{
 };
 
 pub use fuse::FuseOptions;
+pub use thin::ThinOptions;
 
 /// How far beyond the searched depths a Gaussian may lie: less than half of the nearest or more
 /// than twice the farthest was not measured.
@@ -43,27 +45,35 @@ pub struct Lifted {
     pub median_depth: f64,
 }
 
-/// Lifts and fuses. `cameras` are all cameras of the scene; their mean centre is the origin.
+/// Lifts, fuses and thins. `cameras` are all cameras of the scene; their mean centre is the origin.
 ///
 /// # Errors
 /// `internal` when arrays disagree in length or views in SH degree.
 pub fn lift(
     views: Vec<ViewGaussians>,
     cameras: &[Camera],
-    options: &FuseOptions,
+    fusing: &FuseOptions,
+    thinning: Option<&ThinOptions>,
 ) -> Result<Lifted> {
     let degree = views.first().map_or(0, |view| view.sh_degree);
     for view in &views {
         check_lengths(view, degree)?;
     }
     let mut counts = Counts::default();
-    let views = best_of_each_photo(views, &mut counts);
+    let mut views = best_of_each_photo(views, &mut counts);
     let candidate: Vec<Vec<bool>> =
         views.iter().map(|view| candidates(view, &mut counts)).collect();
-    let fates = fuse(&views, &candidate, options);
+    let mut fates = fuse(&views, &candidate, fusing);
+    if let Some(thinning) = thinning {
+        views
+            .par_iter_mut()
+            .zip(&mut fates)
+            .for_each(|(view, fates)| thin::thin(view, fates, thinning));
+    }
     for fate in fates.iter().flatten() {
         match fate {
             Fate::Duplicate => counts.add("duplicate", 1),
+            Fate::Merged => counts.add("merged", 1),
             Fate::Keep | Fate::Absent => {}
         }
     }

@@ -26,8 +26,8 @@ use crate::{
     models::{Bundle, Geometry, GeometryInput, Runtime},
     photos,
     scene::{
-        Backdrop, Camera, Capture, Gaussians, HealthReport, Intrinsics, PosedPhoto, SceneCamera,
-        SceneOptions, StageTime, Upload, ViewSet,
+        Backdrop, Camera, Capture, Density, Gaussians, HealthReport, Intrinsics, PosedPhoto,
+        SceneCamera, SceneOptions, StageTime, Upload, ViewSet,
     },
     telemetry::meter,
 };
@@ -214,7 +214,12 @@ fn finish(
     })?;
     let (lifted, backdrop) = run.stage(Stage::Lift, |_| {
         engine.workers.install(|| {
-            let lifted = lift::lift(views, &cameras, &lift::FuseOptions::default())?;
+            let thinning = match options.density {
+                Density::Thinned => Some(lift::ThinOptions::default()),
+                Density::Full => None,
+            };
+            let fusing = lift::FuseOptions::default();
+            let lifted = lift::lift(views, &cameras, &fusing, thinning.as_ref())?;
             Ok((lifted, lift::backdrop(photos)))
         })
     })?;

@@ -14,7 +14,7 @@ pub const BLUR_PX2: f32 = 0.3;
 /// beyond it the affine approximation of the perspective map explodes.
 pub const FRUSTUM_MARGIN: f32 = 0.3;
 /// Spherical harmonics of degree 0: 1 / (2 √π).
-pub const SH_C0: f32 = 0.282_094_79;
+pub const SH_C0: f32 = crate::scene::SH_C0;
 /// Degree 1: √(3 / 4π).
 pub const SH_C1: f32 = 0.488_602_51;
 /// Degree 2, 3DGS order: xy, yz, 3z²-1 form, xz, x²-y².

@@ -1,6 +1,6 @@
 //! Pinhole cameras, OpenCV frame: +x right, +y down, +z forward; pixel centres at +0.5.
 
-use glam::{DMat3, DMat4, DVec3};
+use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
@@ -221,6 +221,15 @@ impl CameraToWorld {
             forward.extend(0.0),
             eye.extend(1.0),
         )))
+    }
+
+    /// The pose at share `t` of the way, 0..1: centres on a line, rotations by the shortest turn.
+    #[must_use]
+    pub fn between(from: &Self, to: &Self, t: f64) -> Self {
+        let [a, b] = [from, to].map(|pose| DQuat::from_mat3(&pose.rotation()));
+        let turn = a.slerp(b, t).normalize();
+        let center = from.center().lerp(to.center(), t);
+        Self::orthonormalised(DMat4::from_rotation_translation(turn, center))
     }
 
     fn orthonormalised(mat: DMat4) -> Self {

@@ -6,6 +6,9 @@ use glam::DVec3;
 
 use crate::error::{Error, ErrorCode, Result};
 
+/// Spherical harmonics of degree 0: 1 / (2 √π).
+pub const SH_C0: f32 = 0.282_094_79;
+
 /// The view and pixel (of the network's input picture) that made a Gaussian.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SourcePixel {

@@ -1,6 +1,7 @@
 //! The nouns: cameras, photos, Gaussians, reports. No IO, no threads; constructors validate and
 //! the types are trusted below.
 
+mod axes;
 mod backdrop;
 mod camera;
 mod capture;
@@ -17,10 +18,11 @@ mod semantics;
 mod status;
 mod upload;
 
+pub use axes::principal_axes;
 pub use backdrop::Backdrop;
 pub use camera::{Camera, CameraToWorld, Intrinsics, ORTHONORMAL_TOLERANCE, Region};
 pub use capture::{Capture, ViewSet};
-pub use gaussians::{Gaussians, RawGaussians, SanitizeReport, SourcePixel};
+pub use gaussians::{Gaussians, RawGaussians, SH_C0, SanitizeReport, SourcePixel};
 pub use geometry::ViewGaussians;
 pub use id::{SCENE_ID_CHARS, SceneId};
 pub use made::{PhotoHash, Provenance, Scene, SceneMeta};
@@ -31,7 +33,7 @@ pub use semantics::{
     Bank, IndexMap, MaskInfo, PhotoMasks, ScoringProfile, Semantics, SemanticsReport,
 };
 pub use status::{
-    Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
+    Density, Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
     SemanticsState, SemanticsStatus,
 };
 pub use upload::{Upload, UploadCameras, UploadFile};

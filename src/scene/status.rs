@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::{
-    error::{Error, ErrorCode, TABLE},
+    error::{Error, ErrorCode, Result, TABLE},
     scene::{Camera, HealthReport, Intrinsics, SceneId, SemanticsReport},
 };
 
@@ -20,6 +20,31 @@ pub enum SemanticsMode {
     Off,
 }
 
+/// How many of a network's Gaussians a scene keeps.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Density {
+    /// One for up to 16 neighbours where the pictures are flat: same views within a stated error.
+    #[default]
+    Thinned,
+    /// One a pixel.
+    Full,
+}
+
+impl Density {
+    /// The density of a snake_case name.
+    ///
+    /// # Errors
+    /// `invalid_request` for any other.
+    pub fn named(name: &str) -> Result<Self> {
+        match name {
+            "thinned" => Ok(Self::Thinned),
+            "full" => Ok(Self::Full),
+            _ => Err(Error::invalid(format!("density is {name:?}; it must be thinned or full"))),
+        }
+    }
+}
+
 /// Options of a scene, kept with it.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -28,6 +53,8 @@ pub struct SceneOptions {
     pub max_views: Option<usize>,
     /// When its semantics are made.
     pub semantics: SemanticsMode,
+    /// How many of its Gaussians are kept.
+    pub density: Density,
 }
 
 /// Where a scene stands.

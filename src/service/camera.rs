@@ -1,6 +1,6 @@
 //! A camera as asked for becomes a camera: pose, lens, size; every number checked against a bound.
 
-use glam::{DMat4, DQuat, DVec3};
+use glam::DVec3;
 
 use super::types::{CameraSpec, LensSpec, PoseSpec, ViewOptions};
 use crate::{
@@ -49,7 +49,7 @@ pub(super) fn resolve(
         mixed(&fitted(&from.intrinsics, width, height), &fitted(&to.intrinsics, width, height), t);
     Ok(Camera {
         intrinsics: lens(&spec.lens, between, what)?,
-        camera_to_world: interpolated(&from.camera_to_world, &to.camera_to_world, t, what)?,
+        camera_to_world: CameraToWorld::between(&from.camera_to_world, &to.camera_to_world, t),
     })
 }
 
@@ -90,18 +90,6 @@ fn pose(spec: &CameraSpec, inputs: &[SceneCamera], what: &str) -> Result<CameraT
 fn mean_up(inputs: &[SceneCamera]) -> DVec3 {
     let sum: DVec3 = inputs.iter().map(|c| -c.camera.camera_to_world.rotation().y_axis).sum();
     sum.try_normalize().unwrap_or(DVec3::NEG_Y)
-}
-
-fn interpolated(
-    from: &CameraToWorld,
-    to: &CameraToWorld,
-    t: f64,
-    what: &str,
-) -> Result<CameraToWorld> {
-    let (a, b) = (DQuat::from_mat3(&from.rotation()), DQuat::from_mat3(&to.rotation()));
-    let rotation = a.slerp(b, t).normalize();
-    let matrix = DMat4::from_rotation_translation(rotation, from.center().lerp(to.center(), t));
-    CameraToWorld::from_row_major(&matrix.transpose().to_cols_array(), what)
 }
 
 fn size(

@@ -42,7 +42,7 @@ pub use self::{
 };
 pub use crate::render::Quality;
 pub use crate::scene::{
-    Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
+    Density, Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
     SemanticsState, SemanticsStatus, Upload, UploadCameras, UploadFile,
 };
 use crate::{

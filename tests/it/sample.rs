@@ -9,13 +9,15 @@ use segsplat::{
     pipeline::{self, Engine},
     render::{Kinds, Labels, Quality, RenderRequest, Renderer, cpu::CpuRenderer},
     sample::{self, Room, SampleOptions},
-    scene::SceneOptions,
+    scene::{Density, SceneOptions},
 };
 
 use crate::common::skipped;
 
 /// Measured 36.2 dB with the embedded network: the room is of a kind that it was trained on.
 const PSNR_MIN: f64 = 30.0;
+/// Measured 45.2 dB: a thinned scene is drawn as the full one is.
+const THINNED_PSNR_MIN: f64 = 42.0;
 /// Measured 1.0 %.
 const DEPTH_ERROR_MAX: f64 = 0.03;
 
@@ -65,4 +67,40 @@ fn the_sample_is_reconstructed_close_to_its_truth() {
     assert!(errors.len() * 10 > truth.depth.len() * 9, "{} pixels are covered", errors.len());
     assert!(fidelity > PSNR_MIN, "{fidelity:.2} dB between the photos");
     assert!(median < DEPTH_ERROR_MAX, "median depth error {:.2} %", 100.0 * median);
+}
+
+#[test]
+fn a_thinned_sample_is_drawn_as_the_full_one_by_fewer_gaussians() {
+    let engine = match Engine::open(&Config::default()) {
+        Err(e) if e.code() == ErrorCode::ModelUnavailable => return skipped(e.message()),
+        engine => engine.unwrap(),
+    };
+    let sample = SampleOptions { photos: 2, width: 256, height: 256, seed: 1 };
+    let photos = sample::photos(&sample).unwrap();
+    let renderer = CpuRenderer::new(0).unwrap();
+    let [(full, all, none), (thinned, left, merged)] =
+        [Density::Full, Density::Thinned].map(|density| {
+            let options = SceneOptions { density, ..SceneOptions::default() };
+            let go_on = AtomicBool::new(false);
+            let made =
+                pipeline::reconstruct(&engine, &photos, &options, &|_, _| {}, &go_on).unwrap();
+            let request = RenderRequest {
+                camera: sample::camera_at(&sample, 0.0).unwrap(),
+                kinds: Kinds { color: true, depth: false, alpha: false },
+                labels: Labels::None,
+                background: [0.0; 3],
+                antialiased: false,
+                near: 0.01 * made.report.median_depth as f32,
+                quality: Quality::Exact,
+                crop: None,
+            };
+            let merged = made.report.dropped.iter().find(|d| d.reason == "merged").map(|d| d.count);
+            let frame = renderer.render(&made.gaussians, &request).unwrap();
+            (frame.color.unwrap(), made.gaussians.len() as u64, merged)
+        });
+    let fidelity = psnr(&thinned, &full, None);
+    println!("sample: {all} Gaussians thinned to {left}, {fidelity:.2} dB");
+    assert_eq!((none, merged), (None, Some(all - left)), "every Gaussian is kept or counted");
+    assert!(left * 10 < all * 8, "{left} of {all} left");
+    assert!(fidelity > THINNED_PSNR_MIN, "{fidelity:.2} dB");
 }

@@ -7,9 +7,9 @@ use crate::{
         CameraToWorld, HealthReport, Intrinsics, Region, ScoringProfile, SemanticsReport, StageTime,
     },
     service::{
-        CameraSpec, Event, ExportFormat, Format, Kind, LensSpec, PoseSpec, Quality, RenderedView,
-        SceneError, SceneState, SceneStatus, SemanticsMode, SemanticsState, SemanticsStatus,
-        ViewOptions,
+        CameraSpec, Density, Event, ExportFormat, Format, Kind, LensSpec, PoseSpec, Quality,
+        RenderedView, SceneError, SceneState, SceneStatus, SemanticsMode, SemanticsState,
+        SemanticsStatus, ViewOptions,
     },
 };
 
@@ -148,6 +148,13 @@ pub(super) fn semantics(number: i32) -> Result<SemanticsMode> {
         pb::Semantics::Unspecified | pb::Semantics::Lazy => Ok(SemanticsMode::Lazy),
         pb::Semantics::Eager => Ok(SemanticsMode::Eager),
         pb::Semantics::Off => Ok(SemanticsMode::Off),
+    }
+}
+
+pub(super) fn density(number: i32) -> Result<Density> {
+    match known::<pb::Density>("density", number)? {
+        pb::Density::Unspecified | pb::Density::Thinned => Ok(Density::Thinned),
+        pb::Density::Full => Ok(Density::Full),
     }
 }
 

@@ -146,6 +146,7 @@ async fn create(api: &Api, messages: Streaming<pb::CreateSceneRequest>) -> Resul
         options: SceneOptions {
             max_views: header.max_views.map(|views| views as usize),
             semantics: convert::semantics(header.semantics)?,
+            density: convert::density(header.density)?,
         },
         idempotency_key: Some(header.idempotency_key).filter(|key| !key.is_empty()),
         wait,

@@ -81,6 +81,9 @@ pub(super) struct CreateParams {
     bundle: Option<String>,
     /// Views the network takes at once.
     max_views: Option<u32>,
+    /// Gaussians kept: `thinned` (default), one for up to 16 neighbours where the photos are flat,
+    /// or `full`, one a pixel.
+    density: Option<String>,
     /// Milliseconds to wait for the scene before answering.
     wait_ms: Option<u64>,
     /// Milliseconds after which the call is given up.

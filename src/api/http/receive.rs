@@ -23,7 +23,7 @@ const DRAIN_TIME_MAX: Duration = Duration::from_secs(20);
 /// Longest text option.
 const OPTION_BYTES_MAX: usize = 256;
 /// Options that may come as text parts as well as in the query string.
-const OPTIONS: [&str; 4] = ["semantics", "bundle", "max_views", "wait_ms"];
+const OPTIONS: [&str; 5] = ["semantics", "bundle", "max_views", "density", "wait_ms"];
 
 /// Reads the parts of `request`; text parts that are options go to `params`.
 pub(super) async fn receive(

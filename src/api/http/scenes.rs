@@ -27,7 +27,9 @@ use crate::{
     },
     error::{Error, Result},
     scene::StageTime,
-    service::{CreateScene, Event, Page, PageRequest, SceneOptions, SceneState, SceneStatus},
+    service::{
+        CreateScene, Density, Event, Page, PageRequest, SceneOptions, SceneState, SceneStatus,
+    },
 };
 
 /// `POST /v1/scenes`
@@ -147,8 +149,10 @@ fn options(api: &Api, mut params: Params) -> Result<(SceneOptions, Option<Durati
     if let Some(bundle) = params.text("bundle")? {
         check_bundle(&bundle, &api.service.models())?;
     }
+    let density = params.text("density")?.map(|text| Density::named(&text)).transpose()?;
     let options = SceneOptions {
         max_views: params.whole("max_views")?,
+        density: density.unwrap_or_default(),
         semantics: semantics.unwrap_or_default(),
     };
     let wait = params.whole::<u64>("wait_ms")?.map(Duration::from_millis);

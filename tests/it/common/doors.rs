@@ -484,6 +484,7 @@ pub(crate) fn messages(upload: &Upload, options: &Options) -> Vec<pb::CreateScen
         semantics: semantics.into(),
         bundle: options.bundle.unwrap_or_default().to_owned(),
         max_views: None,
+        density: pb::Density::Unspecified.into(),
         wait_ms: options.wait_ms,
         idempotency_key: options.idempotency_key.clone().unwrap_or_default(),
     };
