@@ -59,6 +59,8 @@ pub struct Limits {
     pub scorers_cache_bytes_max: u64,
     /// Bytes of views' semantic entries kept in memory, so that the next text draws nothing.
     pub entries_cache_bytes_max: u64,
+    /// Memory of the connected pieces of scenes that were asked for boxes, bytes.
+    pub pieces_cache_bytes_max: u64,
     /// Parts of one text's selection that an answer lists, the largest first.
     pub parts_max: usize,
     /// Jobs that wait; one more is refused as `overloaded`.
@@ -144,6 +146,7 @@ impl Default for Limits {
             texts_cached_max: 4_096,
             scorers_cache_bytes_max: 512 << 20,
             entries_cache_bytes_max: 512 << 20,
+            pieces_cache_bytes_max: 128 << 20,
             parts_max: 64,
             queued_jobs_max: 64,
             queued_renders_max: 256,

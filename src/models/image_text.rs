@@ -1,6 +1,6 @@
 //! The image tower and the text tower: crops and texts to unit embeddings of one space.
 
-use std::sync::Arc;
+use std::{collections::BTreeMap, sync::Arc};
 
 use ort::{session::SessionInputValue, value::TensorRef};
 use tokenizers::Tokenizer;
@@ -32,6 +32,20 @@ pub struct ImageText {
     texts: Option<usize>,
     provider: Provider,
     _runtime: Arc<Runtime>,
+}
+
+/// Texts a run of the text tower where its file leaves that free.
+const TEXTS_A_RUN: usize = 64;
+
+/// A text in the tokenizer's ids.
+struct Tokens {
+    /// With markers of begin and end, cut to the network's context.
+    ids: Vec<i64>,
+    /// Tokens, markers left out.
+    count: usize,
+    /// How many of them the tokenizer does not know.
+    unknown: usize,
+    cut: bool,
 }
 
 /// What a text means.
@@ -117,27 +131,49 @@ impl ImageText {
         Ok(rows)
     }
 
-    /// The embedding of each text, the same whatever the others are.
+    /// The embedding of each text. Texts of one length run together; a row depends on the others
+    /// by rounding at most, and with the embedded bundle by no bit.
     ///
     /// # Errors
     /// `invalid_request` when a text holds nothing that the tower reads; `internal` when the
     /// network fails or answers with another shape than its manifest says.
     pub fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
-        texts.iter().enumerate().map(|(i, text)| self.embed_text(i, text)).collect()
+        let read: Vec<Tokens> = texts.iter().map(|text| self.read(text)).collect::<Result<_>>()?;
+        let mut by_length: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+        for (i, tokens) in read.iter().enumerate() {
+            by_length.entry(self.tokens.unwrap_or(tokens.ids.len())).or_default().push(i);
+        }
+        let mut rows = vec![Vec::new(); texts.len()];
+        for (length, alike) in by_length {
+            for batch in alike.chunks(self.texts.unwrap_or(TEXTS_A_RUN)) {
+                let found = self.run_texts(batch.iter().map(|&i| &read[i]), length)?;
+                for (&i, row) in batch.iter().zip(found.chunks_exact(self.manifest.dim)) {
+                    rows[i] = row.to_vec();
+                }
+            }
+        }
+        let embedding = |(row, Tokens { count, unknown, cut, .. })| TextEmbedding {
+            row,
+            tokens: count,
+            unknown,
+            cut,
+        };
+        Ok(rows.into_iter().zip(read).map(embedding).collect())
     }
 
-    fn embed_text(&self, at: usize, text: &str) -> Result<TextEmbedding> {
+    /// A text as the text tower reads it.
+    fn read(&self, text: &str) -> Result<Tokens> {
         let tower = &self.manifest.text;
         let context = self.tokens.map_or(tower.context, |fixed| fixed.min(tower.context));
         let encoding = self.tokenizer.encode_fast(text, true).map_err(|e| {
-            Error::invalid(format!("texts[{at}] cannot be read by the tokenizer: {e}"))
+            Error::invalid(format!("text {text:?} cannot be read by the tokenizer: {e}"))
         })?;
         let special = encoding.get_special_tokens_mask();
         let words = || encoding.get_ids().iter().zip(special).filter(|(_, s)| **s == 0);
-        let tokens = words().count();
-        if tokens == 0 {
+        let count = words().count();
+        if count == 0 {
             return Err(Error::invalid(format!(
-                "texts[{at}] holds nothing that this bundle's text tower reads; write words"
+                "text {text:?} holds nothing that the text tower reads; write words"
             )));
         }
         let unknown = words().filter(|(id, _)| self.unknown == Some(**id)).count();
@@ -150,12 +186,31 @@ impl ImageText {
         {
             *last = i64::from(*end);
         }
-        let mut there = vec![1_i64; ids.len()];
-        let length = self.tokens.unwrap_or(ids.len());
-        ids.resize(length, self.padding());
-        there.resize(length, 0);
-        let count = self.texts.unwrap_or(1);
-        let (ids, there) = (ids.repeat(count), there.repeat(count));
+        Ok(Tokens { ids, count, unknown, cut })
+    }
+
+    /// Rows of texts of at most `length` ids, in one run; a file of fixed batch gets its last one
+    /// filled up, and the rows of that follow the others.
+    fn run_texts<'a>(
+        &self,
+        texts: impl Iterator<Item = &'a Tokens>,
+        length: usize,
+    ) -> Result<Vec<f32>> {
+        let tower = &self.manifest.text;
+        let (mut ids, mut there) = (Vec::new(), Vec::new());
+        let mut count = 0;
+        for text in texts {
+            count += 1;
+            ids.extend(&text.ids);
+            ids.resize(count * length, self.padding());
+            there.resize((count - 1) * length + text.ids.len(), 1_i64);
+            there.resize(count * length, 0);
+        }
+        if let Some(fixed) = self.texts {
+            count = fixed;
+            ids = ids.into_iter().cycle().take(count * length).collect();
+            there = there.into_iter().cycle().take(count * length).collect();
+        }
         let view = |data| {
             let input = TensorRef::from_array_view(([count, length], data));
             Ok::<_, Error>(SessionInputValue::from(input.map_err(fault("text tower"))?))
@@ -166,9 +221,7 @@ impl ImageText {
         }
         let mut session = self.text.take();
         let outputs = session.run(inputs).map_err(fault("text tower"))?;
-        let mut row = self.rows(outputs.get(&tower.output), count, "text tower")?;
-        row.truncate(self.manifest.dim);
-        Ok(TextEmbedding { row, tokens, unknown, cut })
+        self.rows(outputs.get(&tower.output), count, "text tower")
     }
 
     /// Id that fills up a text.

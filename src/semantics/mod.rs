@@ -20,7 +20,7 @@ pub use self::{
     bank::{Clusters, bank, rows_wanted},
     crops::Cutter,
     palette::{colour, palette_table},
-    parts::{Box3, Part, PartOptions, parts},
+    parts::{Box3, Part, PartOptions, Pieces},
     score::{PixelEntries, Scorer, Scoring, TextScores, ViewNorms, mask_from_blend},
     views::{Views, merge},
 };

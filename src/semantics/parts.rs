@@ -1,15 +1,17 @@
 //! What a text selects in space: connected parts of Gaussians, each with its boxes.
 //!
+//! A text selects whole entries of the bank. So the Gaussians of each entry are joined to pieces
+//! once a scene, with which pieces touch, and the parts of a text are joined from pieces.
+//!
 //! Two Gaussians touch when pixels next to each other made them at nearly one depth, or when they
 //! lie within a few of their own spacings of each other: a spacing is the width of a pixel of the
 //! network's picture at the Gaussian's depth, so that near and far things are joined alike.
 
-use std::collections::HashMap;
-
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;
+use rustc_hash::FxHashMap;
 
-use crate::scene::{Gaussians, SceneCamera};
+use crate::scene::{Gaussians, SceneCamera, principal_axes};
 
 /// How Gaussians are joined to parts.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -56,39 +58,122 @@ pub struct Part {
     pub aligned: Box3,
 }
 
-/// Connected parts of the `selected` Gaussians, the largest first, small ones left out.
-///
-/// `cameras` are the scene's; they say how far apart Gaussians of one surface lie.
-#[must_use]
-pub fn parts(
-    gaussians: &Gaussians,
-    cameras: &[SceneCamera],
-    selected: &[u32],
-    options: &PartOptions,
-) -> Vec<Part> {
-    let mut chosen: Vec<u32> =
-        selected.iter().copied().filter(|&i| (i as usize) < gaussians.len()).collect();
-    chosen.sort_unstable();
-    chosen.dedup();
-    let sites = sites(gaussians, cameras, &chosen);
-    let mut sets = Sets::new(chosen.len());
-    join_pixels(&mut sets, gaussians, &chosen, &sites, options.same_depth);
-    join_cells(&mut sets, &sites, options.reach);
-    let mut members: HashMap<u32, Vec<u32>> = HashMap::new();
-    for (at, i) in chosen.iter().enumerate() {
-        members.entry(sets.root(at)).or_default().push(*i);
-    }
-    let share = options.share_min * chosen.len() as f64;
-    let mut found: Vec<Vec<u32>> = members
-        .into_values()
-        .filter(|part| part.len() >= options.count_min && part.len() as f64 >= share)
-        .collect();
-    // The first Gaussian of each part is another, so the order is the same every time.
-    found.sort_by_key(|part| (std::cmp::Reverse(part.len()), part.first().copied()));
-    found.into_iter().map(|part| describe(gaussians, part, options.trim)).collect()
+/// The Gaussians of each bank entry in connected pieces, and which pieces touch.
+#[derive(Clone, Debug, Default)]
+pub struct Pieces {
+    /// Entry of each piece.
+    entry: Vec<u16>,
+    /// Gaussians of each piece, ascending.
+    members: Vec<Vec<u32>>,
+    /// Pieces of different entries that touch, each pair once, the lower first.
+    touching: Vec<[u32; 2]>,
 }
 
-/// Where a selected Gaussian is, relative to the scene's origin.
+impl Pieces {
+    /// The pieces of all Gaussians that have an entry.
+    ///
+    /// `cameras` are the scene's; they say how far apart Gaussians of one surface lie.
+    #[must_use]
+    pub fn new(gaussians: &Gaussians, cameras: &[SceneCamera], options: &PartOptions) -> Self {
+        let index = gaussians.semantic_index();
+        let chosen: Vec<u32> =
+            index.iter().zip(0_u32..).filter(|(m, _)| **m > 0).map(|(_, i)| i).collect();
+        let sites = sites(gaussians, cameras, &chosen);
+        let mut bonds = Bonds {
+            entry: chosen.iter().map(|&i| index[i as usize]).collect(),
+            sets: Sets::new(chosen.len()),
+            across: Vec::new(),
+        };
+        join_pixels(&mut bonds, gaussians, &chosen, &sites, options.same_depth);
+        join_cells(&mut bonds, &sites, options.reach);
+
+        let mut pieces = Self::default();
+        let mut piece_of = vec![0_u32; chosen.len()];
+        for (at, i) in chosen.iter().enumerate() {
+            // The root is the smallest member, so it comes first.
+            let root = bonds.sets.root(at) as usize;
+            if root == at {
+                piece_of[at] = u32::try_from(pieces.entry.len()).unwrap_or(u32::MAX);
+                pieces.entry.push(bonds.entry[at]);
+                pieces.members.push(Vec::new());
+            }
+            piece_of[at] = piece_of[root];
+            pieces.members[piece_of[at] as usize].push(*i);
+        }
+        let piece = |at: u32| piece_of[at as usize];
+        let across = bonds.across.into_iter().map(|[a, b]| [piece(a), piece(b)]);
+        pieces.touching = across.map(|[a, b]| [a.min(b), a.max(b)]).collect();
+        pieces.touching.sort_unstable();
+        pieces.touching.dedup();
+        pieces
+    }
+
+    /// Connected parts of the Gaussians of some `entries`, the largest first, small ones left out.
+    /// `gaussians` are those that the pieces were made of.
+    #[must_use]
+    pub fn parts(
+        &self,
+        gaussians: &Gaussians,
+        entries: &[u16],
+        options: &PartOptions,
+    ) -> Vec<Part> {
+        let chosen = |piece: usize| entries.contains(&self.entry[piece]);
+        let mut sets = Sets::new(self.entry.len());
+        for [a, b] in self.touching.iter().map(|pair| pair.map(|piece| piece as usize)) {
+            if chosen(a) && chosen(b) {
+                sets.join(a, b);
+            }
+        }
+        let mut joined: FxHashMap<u32, Vec<usize>> = FxHashMap::default();
+        let mut total = 0;
+        for piece in (0..self.entry.len()).filter(|piece| chosen(*piece)) {
+            joined.entry(sets.root(piece)).or_default().push(piece);
+            total += self.members[piece].len();
+        }
+        let least = (options.share_min * total as f64).max(options.count_min as f64);
+        let mut found: Vec<Vec<u32>> = joined
+            .into_values()
+            .map(|pieces| -> Vec<u32> {
+                let members = pieces.into_iter().flat_map(|piece| &self.members[piece]);
+                members.copied().collect()
+            })
+            .filter(|part| part.len() as f64 >= least)
+            .collect();
+        found.iter_mut().for_each(|part| part.sort_unstable());
+        // The first Gaussian of each part is another, so the order is the same every time.
+        found.sort_by_key(|part| (std::cmp::Reverse(part.len()), part.first().copied()));
+        found.into_iter().map(|part| describe(gaussians, part, options.trim)).collect()
+    }
+
+    /// Bytes in memory.
+    #[must_use]
+    pub fn size_bytes(&self) -> u64 {
+        let members: usize = self.members.iter().map(Vec::len).sum();
+        let each = size_of::<Vec<u32>>() + size_of::<u16>();
+        (self.entry.len() * each + members * 4 + self.touching.len() * 8) as u64
+    }
+}
+
+/// What was found to touch so far, by place in the list of chosen Gaussians.
+struct Bonds {
+    entry: Vec<u16>,
+    /// Gaussians of one entry that are joined.
+    sets: Sets,
+    /// Pairs of different entries that touch.
+    across: Vec<[u32; 2]>,
+}
+
+impl Bonds {
+    fn join(&mut self, a: usize, b: usize) {
+        if self.entry[a] == self.entry[b] {
+            self.sets.join(a, b);
+        } else if let (Ok(a), Ok(b)) = (u32::try_from(a), u32::try_from(b)) {
+            self.across.push([a, b]);
+        }
+    }
+}
+
+/// Where a Gaussian is, relative to the scene's origin.
 struct Site {
     mean: DVec3,
     /// Depth from the photo that made it; 0 where that is unknown.
@@ -119,7 +204,7 @@ fn sites(gaussians: &Gaussians, cameras: &[SceneCamera], chosen: &[u32]) -> Vec<
 
 /// Joins Gaussians of one photo whose pixels are at most two apart and whose depths are alike.
 fn join_pixels(
-    sets: &mut Sets,
+    bonds: &mut Bonds,
     gaussians: &Gaussians,
     chosen: &[u32],
     sites: &[Site],
@@ -143,7 +228,7 @@ fn join_pixels(
         let source = gaussians.source()[chosen[at] as usize];
         (source.view, i32::from(source.x), i32::from(source.y))
     };
-    let by_pixel: HashMap<(u16, i32, i32), usize> =
+    let by_pixel: FxHashMap<(u16, i32, i32), usize> =
         (0..chosen.len()).map(|at| (pixel(at), at)).collect();
     for at in 0..chosen.len() {
         let (view, x, y) = pixel(at);
@@ -151,16 +236,16 @@ fn join_pixels(
         for (dx, dy) in AHEAD {
             let Some(&other) = by_pixel.get(&(view, x + dx, y + dy)) else { continue };
             if depth > 0.0 && (sites[other].depth - depth).abs() <= same_depth * depth {
-                sets.join(at, other);
+                bonds.join(at, other);
             }
         }
     }
 }
 
 /// Joins Gaussians within `reach` spacings by a grid for each power of two of the spacing.
-fn join_cells(sets: &mut Sets, sites: &[Site], reach: f64) {
-    let mut cells: HashMap<(i32, [i64; 3]), usize> = HashMap::new();
-    let mut order: Vec<(i32, [i64; 3])> = Vec::new();
+fn join_cells(bonds: &mut Bonds, sites: &[Site], reach: f64) {
+    // Of each cell one Gaussian of each entry that has some there: all others are joined to it.
+    let mut cells: FxHashMap<(i32, [i64; 3]), Vec<usize>> = FxHashMap::default();
     for (at, site) in sites.iter().enumerate() {
         if site.spacing <= 0.0 || !site.spacing.is_finite() {
             continue;
@@ -172,22 +257,21 @@ fn join_cells(sets: &mut Sets, sites: &[Site], reach: f64) {
             let edge = reach * f64::from(level).exp2();
             #[expect(clippy::cast_possible_truncation, reason = "saturates far away")]
             let cell = (site.mean / edge).floor().to_array().map(|v| v as i64);
-            match cells.entry((level, cell)) {
-                std::collections::hash_map::Entry::Occupied(held) => sets.join(at, *held.get()),
-                std::collections::hash_map::Entry::Vacant(free) => {
-                    order.push((level, cell));
-                    free.insert(at);
-                }
+            let held = cells.entry((level, cell)).or_default();
+            match held.iter().find(|&&other| bonds.entry[other] == bonds.entry[at]) {
+                Some(&other) => bonds.join(at, other),
+                None => held.push(at),
             }
         }
     }
-    for (level, [x, y, z]) in order {
-        let at = cells[&(level, [x, y, z])];
-        // Half of the 26 cells around; the other half looks this way.
-        for step in 14..27 {
-            let next = [x + step % 3 - 1, y + step / 3 % 3 - 1, z + step / 9 - 1];
-            if let Some(&other) = cells.get(&(level, next)) {
-                sets.join(at, other);
+    for ((level, [x, y, z]), held) in &cells {
+        // The cell itself, and half of the 26 around; the other half looks this way.
+        for step in 13..27 {
+            let by = [step % 3 - 1, step / 3 % 3 - 1, step / 9 - 1];
+            let next = [x.saturating_add(by[0]), y.saturating_add(by[1]), z.saturating_add(by[2])];
+            let Some(others) = cells.get(&(*level, next)) else { continue };
+            for a in held {
+                others.iter().for_each(|b| bonds.join(*a, *b));
             }
         }
     }
@@ -222,10 +306,11 @@ type Bounds = [(DVec3, [f64; 2]); 3];
 fn bounds(means: &[DVec3], axes: [DVec3; 3], trim: f64) -> Bounds {
     axes.map(|axis| {
         let mut along: Vec<f64> = means.iter().map(|mean| mean.dot(axis)).collect();
-        along.sort_unstable_by(f64::total_cmp);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share")]
         let out = (trim.clamp(0.0, 0.49) * along.len() as f64) as usize;
-        (axis, [along[out], along[along.len() - 1 - out]])
+        let last = along.len() - 1 - out;
+        let least = *along.select_nth_unstable_by(out, f64::total_cmp).1;
+        (axis, [least, *along.select_nth_unstable_by(last, f64::total_cmp).1])
     })
 }
 
@@ -253,32 +338,6 @@ fn boxed(bounds: Bounds, origin: DVec3) -> Box3 {
         size: bounds.map(|(_, [a, b])| b - a),
         axes: bounds.map(|(axis, _)| axis.to_array()),
     }
-}
-
-/// Orthonormal eigenvectors of a symmetric matrix, by Jacobi's rotations.
-fn principal_axes(spread: DMat3) -> [DVec3; 3] {
-    let mut a = spread.to_cols_array_2d();
-    let mut v: [[f64; 3]; 3] = DMat3::IDENTITY.to_cols_array_2d();
-    for _ in 0..32 {
-        for (p, q) in [(0, 1), (0, 2), (1, 2)] {
-            if a[p][q].abs() <= f64::EPSILON * (a[p][p].abs() + a[q][q].abs()) {
-                continue;
-            }
-            let theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
-            let t = theta.signum() / (theta.abs() + (theta * theta + 1.0).sqrt());
-            let c = 1.0 / (t * t + 1.0).sqrt();
-            let s = t * c;
-            for numbers in a.iter_mut().chain(&mut v) {
-                let (kp, kq) = (numbers[p], numbers[q]);
-                (numbers[p], numbers[q]) = (c * kp - s * kq, s * kp + c * kq);
-            }
-            let (ap, aq) = (a[p], a[q]);
-            a[p] = std::array::from_fn(|k| c * ap[k] - s * aq[k]);
-            a[q] = std::array::from_fn(|k| s * ap[k] + c * aq[k]);
-        }
-    }
-    // The axes are the columns of v, whose rows were turned above.
-    [0, 1, 2].map(|k| DVec3::new(v[0][k], v[1][k], v[2][k]).normalize_or(DVec3::X))
 }
 
 /// Disjoint sets; the root of each is its smallest member.
@@ -334,7 +393,7 @@ mod tests {
             scales: vec![[0.01; 3]; n],
             opacities: vec![0.9; n],
             sh: vec![[0.0; 3]; n],
-            semantic_index: vec![0; n],
+            semantic_index: vec![1; n],
             source: at.iter().map(|(_, source)| *source).collect(),
             ..RawGaussians::default()
         };
@@ -355,15 +414,16 @@ mod tests {
         y.flat_map(|y| x.clone().map(move |x| one(x, y))).collect()
     }
 
-    fn all(of: &Gaussians) -> Vec<u32> {
-        (0..of.len() as u32).collect()
+    /// Parts of all Gaussians of entry 1.
+    fn parts(of: &Gaussians, cameras: &[SceneCamera], options: &PartOptions) -> Vec<Part> {
+        Pieces::new(of, cameras, options).parts(of, &[1], options)
     }
 
     #[test]
     fn things_apart_are_two_parts_and_the_largest_comes_first() {
         let sites = [patch(0, 0..10, 0..10, 4.0), patch(0, 40..60, 0..10, 4.0)].concat();
         let scene = gaussians(&sites);
-        let found = parts(&scene, &cameras(1), &all(&scene), &PartOptions::default());
+        let found = parts(&scene, &cameras(1), &PartOptions::default());
         let sizes: Vec<usize> = found.iter().map(|part| part.gaussians.len()).collect();
         assert_eq!(sizes, [200, 100]);
         assert_eq!(found[1].gaussians[..3], [0, 1, 2]);
@@ -374,7 +434,7 @@ mod tests {
         // View 1 stands one unit to the right: its patch continues that of view 0.
         let sites = [patch(0, 50..75, 40..60, 4.0), patch(1, 50..75, 40..60, 4.08)].concat();
         let scene = gaussians(&sites);
-        let found = parts(&scene, &cameras(2), &all(&scene), &PartOptions::default());
+        let found = parts(&scene, &cameras(2), &PartOptions::default());
         assert_eq!(found.len(), 1);
         assert_eq!(found[0].gaussians.len(), 1000);
     }
@@ -383,7 +443,7 @@ mod tests {
     fn near_and_far_things_are_joined_alike_and_a_step_in_depth_parts() {
         let sites = [patch(0, 0..20, 0..20, 0.5), patch(0, 20..40, 0..20, 50.0)].concat();
         let scene = gaussians(&sites);
-        let found = parts(&scene, &cameras(1), &all(&scene), &PartOptions::default());
+        let found = parts(&scene, &cameras(1), &PartOptions::default());
         assert_eq!(found.len(), 2, "neighbouring pixels, far apart in depth");
         assert!(found.iter().all(|part| part.gaussians.len() == 400));
     }
@@ -392,12 +452,41 @@ mod tests {
     fn specks_are_left_out() {
         let sites = [patch(0, 0..30, 0..30, 4.0), patch(0, 80..83, 80..83, 4.0)].concat();
         let scene = gaussians(&sites);
-        let found = parts(&scene, &cameras(1), &all(&scene), &PartOptions::default());
+        let found = parts(&scene, &cameras(1), &PartOptions::default());
         assert_eq!(found.len(), 1);
         let fine = PartOptions { count_min: 1, share_min: 0.0, ..PartOptions::default() };
-        assert_eq!(parts(&scene, &cameras(1), &all(&scene), &fine).len(), 2);
-        assert!(parts(&scene, &cameras(1), &[], &fine).is_empty());
-        assert!(parts(&scene, &cameras(1), &[5_000_000], &fine).is_empty(), "no such Gaussian");
+        assert_eq!(parts(&scene, &cameras(1), &fine).len(), 2);
+        let pieces = Pieces::new(&scene, &cameras(1), &fine);
+        assert!(pieces.parts(&scene, &[], &fine).is_empty());
+        assert!(pieces.parts(&scene, &[7], &fine).is_empty(), "no such entry");
+    }
+
+    #[test]
+    fn parts_of_some_entries_are_those_of_their_gaussians_alone() {
+        // Stripes of three entries across one plane, a hole between, and a far thing of entry 2.
+        let sites = [
+            patch(0, 0..60, 0..20, 4.0),
+            patch(1, 10..40, 30..60, 4.1),
+            patch(0, 70..90, 70..90, 9.0),
+        ]
+        .concat();
+        let stripe = |i: usize| 1 + (i % 60 / 7) as u16 % 3;
+        let entry = |i: usize| if i < 1200 { stripe(i) } else { 2 + (i / 1500) as u16 % 2 };
+        let index: Vec<u16> = (0..sites.len()).map(entry).collect();
+        let scene = gaussians(&sites).with_semantic_index(index.clone()).unwrap();
+        let options = PartOptions { count_min: 1, share_min: 0.0, ..PartOptions::default() };
+        let pieces = Pieces::new(&scene, &cameras(2), &options);
+        for entries in [&[1][..], &[2], &[3], &[1, 2], &[1, 3], &[2, 3], &[1, 2, 3]] {
+            let chosen = |i: &usize| entries.contains(&index[*i]);
+            let alone: Vec<usize> = (0..sites.len()).filter(chosen).collect();
+            let rest = gaussians(&alone.iter().map(|i| sites[*i]).collect::<Vec<_>>());
+            let sizes = |parts: &[Part]| -> Vec<(usize, Box3)> {
+                parts.iter().map(|part| (part.gaussians.len(), part.aligned)).collect()
+            };
+            let found = pieces.parts(&scene, entries, &options);
+            assert_eq!(sizes(&found), sizes(&parts(&rest, &cameras(2), &options)), "{entries:?}");
+            assert!(!found.is_empty(), "{entries:?}");
+        }
     }
 
     #[test]
@@ -421,7 +510,7 @@ mod tests {
         }
         let scene = gaussians(&sites);
         let options = PartOptions { trim: 0.0, ..PartOptions::default() };
-        let found = parts(&scene, &cameras(1), &all(&scene), &options);
+        let found = parts(&scene, &cameras(1), &options);
         assert_eq!(found.len(), 1);
         let Box3 { center, size, axes } = found[0].oriented;
         let near = |a: [f64; 3], b: [f64; 3]| a.iter().zip(b).all(|(x, y)| (x - y).abs() < 1e-3);
@@ -445,7 +534,7 @@ mod tests {
         let whole = PartOptions { trim: 0.0, ..PartOptions::default() };
         let trimmed = PartOptions { trim: 0.1, ..PartOptions::default() };
         let width = |options: &PartOptions| {
-            let found = parts(&scene, &cameras(1), &all(&scene), options);
+            let found = parts(&scene, &cameras(1), options);
             assert_eq!(found.len(), 1);
             found[0].aligned.size[0]
         };

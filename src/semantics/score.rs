@@ -139,6 +139,9 @@ pub struct TextScores {
     groups: Vec<Vec<[f64; 4]>>,
     /// `[M + 1]` relevancy of each row on its own.
     entries: Vec<f32>,
+    /// `[M + 1]` bit c is set where the row is nearer to phrase c than to the text. Pixels whose
+    /// rows share one are, too, whatever their weights; row 0 adds nothing, so it has all bits.
+    nearer: Vec<u64>,
 }
 
 impl TextScores {
@@ -155,6 +158,19 @@ impl TextScores {
     #[must_use]
     pub fn entries(&self) -> &[f32] {
         &self.entries
+    }
+
+    /// Whether no blend of the bank can be selected: all rows are nearer to one same phrase.
+    #[must_use]
+    pub fn selects_nothing(&self) -> bool {
+        self.nearer.iter().fold(u64::MAX, |all, row| all & row) != 0
+    }
+
+    /// Whether the rows of pixel `p` rule it out, without a blend.
+    fn ruled_out(&self, entries: PixelEntries<'_>, p: usize) -> bool {
+        let rows = entries.index[entries.range(p)].iter();
+        let nearer = |m: &u16| self.nearer.get(usize::from(*m)).copied().unwrap_or(u64::MAX);
+        rows.fold(u64::MAX, |all, m| all & nearer(m)) != 0
     }
 
     /// Whether the text selects bank index `m`.
@@ -265,9 +281,14 @@ impl Scorer {
             };
             std::iter::once([0.0; 4]).chain((0..own.len()).map(row)).collect()
         };
+        let nearer = |m: usize| {
+            let phrases = self.canon_scores.iter().take(u64::BITS as usize).enumerate();
+            phrases.fold(0_u64, |bits, (c, canon)| bits | u64::from(own[m] < canon[m]) << c)
+        };
         let mut text = TextScores {
             groups: self.canon_scores.chunks(GROUP).map(group).collect(),
             entries: vec![0.0],
+            nearer: std::iter::once(u64::MAX).chain((0..own.len()).map(nearer)).collect(),
         };
         let alone = (1..).zip(&self.norms).map(|(m, length)| {
             let [least, ..] = text.blend(&[m], &[1.0]);
@@ -336,8 +357,11 @@ impl Scorer {
                 entries.pixels()
             )));
         }
+        if text.selects_nothing() {
+            return Ok(vec![0.0; entries.pixels()]);
+        }
         let score = |(p, inverse): (usize, &f32)| {
-            if *inverse <= 0.0 {
+            if *inverse <= 0.0 || text.ruled_out(entries, p) {
                 return 0.0;
             }
             let [least, most, _] = text.blend_pixel(entries, p);
@@ -353,6 +377,9 @@ impl Scorer {
     pub fn mask(&self, text: &TextScores, entries: PixelEntries<'_>) -> Result<Vec<bool>> {
         entries.check()?;
         let inside = |p: usize| {
+            if text.ruled_out(entries, p) {
+                return false;
+            }
             let [least, most, coverage] = text.blend_pixel(entries, p);
             coverage >= self.scoring.coverage_floor && selected(least, most)
         };
@@ -486,6 +513,39 @@ mod tests {
         assert_eq!(map[..2], [0.0, 0.0]);
         assert!(map[2] > 0.99, "a row of zeros adds coverage alone");
         assert_eq!(scorer.mask(&text, view.entries()).unwrap(), [false, false, true]);
+    }
+
+    #[test]
+    fn rows_rule_a_pixel_out_only_where_no_blend_of_them_is_selected() {
+        let towards = |angle: f32| [angle.cos(), angle.sin()];
+        let around = |i: usize| towards(i as f32 * 0.7);
+        let rows: Vec<[f32; 2]> = (0..9).map(|i| towards(i as f32 * 0.2)).collect();
+        let bank = Bank { dim: 2, rows: rows.concat() };
+        let canon: Vec<[f32; 2]> = [3, 17, 31, 45, 59].map(around).to_vec();
+        let scorer = Scorer::new(&bank, scoring(ScoringProfile::Paper, &canon)).unwrap();
+        let pixels: Vec<Vec<(u16, f32)>> = (0..400_u16)
+            .map(|p| (0..1 + p % 4).map(|k| ((p * 7 + k * k) % 11, 0.1 + f32::from(k))).collect())
+            .collect();
+        let view = view(&pixels.iter().map(Vec::as_slice).collect::<Vec<_>>());
+        let entries = view.entries();
+        let norms = scorer.norms(entries).unwrap();
+        let [mut inside, mut ruled_out, mut nothing] = [0; 3];
+        for text in (0..50).map(|i| scorer.text(&around(i * 3 + 1)).unwrap()) {
+            let blended = |p| {
+                let [least, most, _] = text.blend_pixel(entries, p);
+                selected(least, most)
+            };
+            let want: Vec<bool> = (0..400).map(blended).collect();
+            assert_eq!(scorer.mask(&text, entries).unwrap(), want);
+            let map = scorer.relevancy(&text, entries, &norms).unwrap();
+            assert_eq!(map.iter().map(|v| *v >= 0.5).collect::<Vec<_>>(), want);
+            inside += want.iter().filter(|on| **on).count();
+            ruled_out += (0..400).filter(|p| text.ruled_out(entries, *p)).count();
+            nothing += usize::from(text.selects_nothing());
+            assert!(!text.selects_nothing() || want.iter().all(|on| !on));
+        }
+        let told = format!("{inside} selected, {ruled_out} ruled out, {nothing} texts");
+        assert!(inside > 500 && ruled_out > 5000 && (5..45).contains(&nothing), "{told}");
     }
 
     #[test]

@@ -1,16 +1,19 @@
 //! What texts are answered with: embeddings of texts, banks ready to be scored, and views whose
 //! semantic entries are still known. Each is kept for as long as it is asked.
 
-use std::sync::{Arc, OnceLock};
+use std::{
+    collections::HashMap,
+    sync::{Arc, OnceLock},
+};
 
 use super::{lru::Lru, types::TextWarning};
 use crate::{
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
     jobs::{Phrases, SemanticsMaker, TextEmbedding},
     limits::Limits,
     render::{Entries, Labels, RenderRequest, Renderer, compose},
     scene::{Scene, ScoringProfile, Semantics},
-    semantics::{PixelEntries, Scorer, Scoring, TextScores, ViewNorms},
+    semantics::{PartOptions, Pieces, PixelEntries, Scorer, Scoring, TextScores, ViewNorms},
 };
 
 /// What the paper compares texts with, and how sharply.
@@ -24,6 +27,8 @@ pub(super) struct Asker {
     texts: Lru<String, Arc<TextEmbedding>>,
     /// By scene, semantics and profile; by bytes.
     scorers: Lru<String, Arc<Scorer>>,
+    /// By scene and semantics; by bytes.
+    pieces: Lru<String, Arc<Pieces>>,
     /// By scene, semantics, renderer and camera; by bytes.
     views: Lru<String, Arc<SeenView>>,
 }
@@ -107,6 +112,7 @@ impl Asker {
             maker,
             texts: Lru::new(limits.texts_cached_max as u64),
             scorers: Lru::new(limits.scorers_cache_bytes_max),
+            pieces: Lru::new(limits.pieces_cache_bytes_max),
             views: Lru::new(limits.entries_cache_bytes_max),
         }
     }
@@ -116,27 +122,25 @@ impl Asker {
         self.maker.lacks()
     }
 
-    /// Embeddings of texts, those asked before from memory.
+    /// Embeddings of texts, those asked before from memory and the others in one run.
     fn embedded(&self, texts: &[String]) -> Result<Vec<Arc<TextEmbedding>>> {
-        let embed = |text: &String| {
-            if let Some(known) = self.texts.find(text) {
-                return Ok(known);
-            }
-            let made = self.maker.embed_texts(std::slice::from_ref(text));
-            let made = made.map_err(|error| match error.code() {
-                // The maker counts its own texts; a caller knows them by their words.
-                ErrorCode::InvalidRequest => Error::invalid(format!(
-                    "text {text:?} holds nothing that the text tower reads; write words"
-                )),
-                _ => error,
-            })?;
-            let made = made.into_iter().next();
-            let made = made.ok_or_else(|| Error::internal("a text has no embedding"))?;
-            let made = Arc::new(made);
-            self.texts.insert(text.clone(), Arc::clone(&made), 1);
-            Ok(made)
+        let known: Vec<_> = texts.iter().map(|text| self.texts.find(text)).collect();
+        let unknown = texts.iter().zip(&known).filter(|(_, known)| known.is_none());
+        let mut unknown: Vec<String> = unknown.map(|(text, _)| text.clone()).collect();
+        unknown.sort_unstable();
+        unknown.dedup();
+        let made =
+            if unknown.is_empty() { Vec::new() } else { self.maker.embed_texts(&unknown)? };
+        let made = unknown.into_iter().zip(made.into_iter().map(Arc::new));
+        let made: HashMap<String, Arc<TextEmbedding>> = made.collect();
+        for (text, embedding) in &made {
+            self.texts.insert(text.clone(), Arc::clone(embedding), 1);
+        }
+        let of = |(text, known): (&String, Option<_>)| {
+            let embedding = known.or_else(|| made.get(text).cloned());
+            embedding.ok_or_else(|| Error::internal("a text has no embedding"))
         };
-        texts.iter().map(embed).collect()
+        texts.iter().zip(known).map(of).collect()
     }
 
     /// A bank ready to be scored under a profile; `tag` tells scene and semantics.
@@ -168,6 +172,16 @@ impl Asker {
         let bytes = 4 * semantics.bank.rows.len() as u64 + 4 * rows * (rows + 1);
         self.scorers.insert(key, Arc::clone(&scorer), bytes);
         Ok(scorer)
+    }
+
+    /// The connected pieces of a scene's entries; `tag` tells scene and semantics.
+    pub(super) fn pieces(&self, tag: &str, scene: &Scene, options: &PartOptions) -> Arc<Pieces> {
+        if let Some(known) = self.pieces.find(&tag.to_owned()) {
+            return known;
+        }
+        let made = Arc::new(Pieces::new(&scene.gaussians, &scene.meta.cameras, options));
+        self.pieces.insert(tag.to_owned(), Arc::clone(&made), made.size_bytes());
+        made
     }
 
     /// Texts scored against a bank.

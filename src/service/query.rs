@@ -22,7 +22,7 @@ use crate::{
     limits::Limits,
     render::{Kinds, Renderer},
     scene::{Scene, SceneId, Semantics},
-    semantics::{PartOptions, Scorer, parts},
+    semantics::{PartOptions, Pieces, Scorer},
 };
 
 /// Relevancy from which a text selects.
@@ -97,21 +97,29 @@ impl Ground<'_> {
         let mut sets: Vec<Vec<u16>> = asked.iter().map(selected).collect();
         sets.sort_unstable();
         sets.dedup();
-        sets.into_par_iter()
-            .map(|set| {
-                let chosen = gaussians_of(self.scene, &set);
-                let parts = match boxes {
-                    Boxes::None => Vec::new(),
-                    _ => self.parts(&chosen, boxes),
-                };
-                (set, Selection { gaussians: chosen.len() as u64, parts })
-            })
-            .collect()
+        let mut held = vec![0_u64; usize::from(u16::MAX) + 1];
+        for m in self.scene.gaussians.semantic_index() {
+            held[usize::from(*m)] += 1;
+        }
+        let options = PartOptions::default();
+        let wanted = boxes != Boxes::None && sets.iter().any(|set| !set.is_empty());
+        let pieces = wanted.then(|| self.asker.pieces(self.tag, self.scene, &options));
+        let selection = |set: Vec<u16>| {
+            let gaussians = set.iter().map(|m| held[usize::from(*m)]).sum();
+            let parts = pieces.as_deref().map(|pieces| self.parts(pieces, &set, boxes, &options));
+            (set, Selection { gaussians, parts: parts.unwrap_or_default() })
+        };
+        sets.into_par_iter().map(selection).collect()
     }
 
-    fn parts(&self, chosen: &[u32], boxes: Boxes) -> Vec<Part3> {
-        let cameras = &self.scene.meta.cameras;
-        let found = parts(&self.scene.gaussians, cameras, chosen, &PartOptions::default());
+    fn parts(
+        &self,
+        pieces: &Pieces,
+        entries: &[u16],
+        boxes: Boxes,
+        options: &PartOptions,
+    ) -> Vec<Part3> {
+        let found = pieces.parts(&self.scene.gaussians, entries, options);
         let told = found.into_iter().take(self.limits.parts_max).map(|part| {
             let held = if boxes == Boxes::Aligned { part.aligned } else { part.oriented };
             Part3 {
@@ -154,17 +162,18 @@ fn look(seen: &SeenView, scorer: &Scorer, asked: &Asked, spec: &QuerySpec) -> Re
     let png = |layer| encode::layer(layer, width, height, Format::Png);
     let (mut view, mut corners) = (TextView::default(), None::<[u32; 4]>);
     let mut best = 0.0_f32;
-    let at = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
-    for ((x, y), score) in at.zip(&relevancy) {
-        if *score < SELECTED {
+    for (y, row) in (0..height).zip(relevancy.chunks_exact(width.max(1) as usize)) {
+        if row.iter().all(|score| *score < SELECTED) {
             continue;
         }
-        view.area += 1;
-        let [left, top, right, bottom] = corners.unwrap_or([x, y, x, y]);
-        corners = Some([left.min(x), top.min(y), right.max(x), bottom.max(y)]);
-        if *score > best {
-            best = *score;
-            view.peak = Some(Peak { x, y, relevancy: *score });
+        for (x, score) in (0..width).zip(row).filter(|(_, score)| **score >= SELECTED) {
+            view.area += 1;
+            let [left, top, right, bottom] = corners.unwrap_or([x, y, x, y]);
+            corners = Some([left.min(x), top.min(y), right.max(x), bottom.max(y)]);
+            if *score > best {
+                best = *score;
+                view.peak = Some(Peak { x, y, relevancy: *score });
+            }
         }
     }
     view.bbox =
