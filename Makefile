@@ -4,6 +4,7 @@
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
 # make eval-scenes   labelled scenes of held-out things, rendered to target/eval/scenes (g++, PYTHON)
 # make test-long   the random tests with many more cases, and the slow ones
+# make fuzz    every reader of bytes from outside, FUZZ_SECONDS=600 each
 
 SHELL := /bin/sh
 CARGO ?= cargo
@@ -16,7 +17,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/vulkan/env ]; then . $(abspath $(TARGET))/vulkan/env; fi;
 
-.PHONY: demo serve test test-long bench eval eval-scenes setup build fmt lint doc tests deny
+.PHONY: demo serve test test-long fuzz bench eval eval-scenes setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -46,6 +47,12 @@ deny:
 test-long: setup
 	$(ADAPTER) RUN_SLOW_TESTS=1 FUZZ_ITERS=20000 PROPTEST_CASES=2048 \
 		$(CARGO) test --locked --release --test it
+
+# Each target of tests/it/fuzz_input.rs for FUZZ_SECONDS of its own, one after the other.
+FUZZ_SECONDS ?= 600
+fuzz: setup
+	FUZZ_SECONDS=$(FUZZ_SECONDS) FUZZ_SEED=$$(date +%s) $(CARGO) test --locked --release --test it \
+		fuzz_input:: -- --nocapture --test-threads=1
 
 bench: setup
 	$(CARGO) bench --locked

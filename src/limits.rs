@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::error::{Error, Result};
+
 /// Bytes of an idempotency key: what a UUID and a prefix need many times over.
 pub const IDEMPOTENCY_KEY_BYTES_MAX: usize = 256;
 
@@ -30,6 +32,9 @@ pub struct Limits {
     pub uploads_bytes_max: usize,
     /// Bytes of one JSON part (`transforms`, `cameras`) or JSON body.
     pub json_bytes_max: usize,
+    /// Values in one JSON part or body, counted before it is read: eight megabytes of empty objects
+    /// would take hundreds of megabytes. 64 cameras have some 2,000.
+    pub json_values_max: usize,
     /// Pixels of one photo, read from the header before decoding.
     pub photo_pixels_max: u64,
     /// Longer side in pixels to which a photo is reduced after decoding: no stage looks closer, and
@@ -101,6 +106,36 @@ pub struct Limits {
 }
 
 impl Limits {
+    /// Holds a JSON text, called `what`, to its caps before anything is made of it.
+    ///
+    /// # Errors
+    /// `limit_exceeded` with the number of bytes or values.
+    pub fn check_json(&self, what: &str, json: &[u8]) -> Result<()> {
+        let (bytes, max) = (json.len(), self.json_bytes_max);
+        if bytes > max {
+            return Err(Error::limit(
+                what,
+                format!("{bytes} bytes of JSON"),
+                format!("{max} bytes"),
+            ));
+        }
+        let (mut values, mut in_text, mut escaped) = (1_usize, false, false);
+        for byte in json {
+            match byte {
+                _ if escaped => escaped = false,
+                b'\\' => escaped = in_text,
+                b'"' => in_text = !in_text,
+                b',' | b':' | b'[' | b'{' if !in_text => values += 1,
+                _ => {}
+            }
+        }
+        let max = self.json_values_max;
+        if values > max {
+            return Err(Error::limit(what, format!("{values} values of JSON"), max));
+        }
+        Ok(())
+    }
+
     /// Names of the caps that size something made at start: a changed one needs a restart.
     #[must_use]
     pub fn changed_for_next_start(&self, new: &Self) -> Vec<&'static str> {
@@ -132,6 +167,7 @@ impl Default for Limits {
             upload_bytes_max: 256 << 20,
             uploads_bytes_max: 1 << 30,
             json_bytes_max: 8 << 20,
+            json_values_max: 250_000,
             photo_pixels_max: 24_000_000,
             photo_side_kept_max: 2_048,
             archive_entries_max: 1_024,
@@ -165,6 +201,27 @@ impl Default for Limits {
             memory_bytes_max: 0,
             page_max: 100,
             gaussians_max: 16_777_216,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_of_a_json_text_are_counted_outside_of_its_strings() {
+        let limits = |json_values_max| Limits { json_values_max, ..Limits::default() };
+        for (json, count) in [
+            ("7", 1),
+            ("[1,2,3]", 4),
+            (r#"{"a":[{},{}],"b":"[,:{"}"#, 9),
+            (r#""\",[\\""#, 1),
+            (r#"["\\",2]"#, 3),
+        ] {
+            limits(count).check_json("x", json.as_bytes()).expect(json);
+            let error = limits(count - 1).check_json("x", json.as_bytes()).unwrap_err();
+            assert!(error.message().contains(&format!("{count} values")), "{json}: {error}");
         }
     }
 }

@@ -110,7 +110,8 @@ impl<'a> Budget<'a> {
         Ok((!folder && !left_by_macos).then_some(path))
     }
 
-    /// Reads one file whole; never more than what is left of the budget, whatever its header says.
+    /// Reads one file whole: as much as its header says, which must be left of the budget, and not
+    /// a byte more is unpacked.
     fn read(&mut self, path: &str, claimed: u64, from: impl Read) -> Result<Vec<u8>> {
         let max = self.limits.archive_unpacked_bytes_max;
         let left = max - self.bytes;
@@ -121,11 +122,13 @@ impl<'a> Budget<'a> {
             return Err(over((self.bytes.saturating_add(claimed)).to_string()));
         }
         let mut bytes = Vec::new();
-        from.take(left + 1).read_to_end(&mut bytes).map_err(|e| {
+        from.take(claimed.saturating_add(1)).read_to_end(&mut bytes).map_err(|e| {
             Error::photo(format!("archive: {path:?} is damaged or cut short")).caused_by(e)
         })?;
-        if bytes.len() as u64 > left {
-            return Err(over(format!("more than {max}")));
+        if bytes.len() as u64 > claimed {
+            return Err(Error::photo(format!(
+                "archive: {path:?} holds more than the {claimed} bytes that its header says"
+            )));
         }
         self.bytes += bytes.len() as u64;
         Ok(bytes)

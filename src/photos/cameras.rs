@@ -2,7 +2,7 @@
 
 use serde_json::{Map, Value};
 
-use super::{check_json_bytes, label, lens::Lens};
+use super::{label, lens::Lens};
 use crate::{
     error::{Error, Result},
     limits::Limits,
@@ -43,7 +43,7 @@ pub(super) fn parse(cameras: &UploadCameras, limits: &Limits) -> Result<Vec<Came
         UploadCameras::Transforms(bytes) => ("transforms", bytes, "frames"),
         UploadCameras::Cameras(bytes) => ("cameras", bytes, "cameras"),
     };
-    check_json_bytes(part, bytes.len(), limits)?;
+    limits.check_json(part, bytes)?;
     let top = object(bytes, part)?;
     let list = match top.get(list_key) {
         Some(Value::Array(list)) => list,

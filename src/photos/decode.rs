@@ -84,6 +84,23 @@ fn png_size(bytes: &[u8], format: ImageFormat) -> Option<(u32, u32)> {
     Some((word(16)?, word(20)?))
 }
 
+/// A PNG's signature and those of its chunks that make the picture. Others can be packed texts and
+/// profiles that a decoder would unpack to hundreds of megabytes.
+fn picture_of_png(bytes: &[u8]) -> Vec<u8> {
+    let (signature, mut rest) = bytes.split_at(bytes.len().min(8));
+    let mut kept = signature.to_vec();
+    while let Some((length, name)) = rest.split_first_chunk::<4>() {
+        // Length, name, data, checksum; a chunk that is cut short is the decoder's to judge.
+        let end = (u32::from_be_bytes(*length) as usize).saturating_add(12).min(rest.len());
+        let (chunk, after) = rest.split_at(end);
+        if [b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND"].iter().any(|n| name.starts_with(*n)) {
+            kept.extend_from_slice(chunk);
+        }
+        rest = after;
+    }
+    kept
+}
+
 /// Whether the JPEG's data reaches its end-of-image marker (the decoder would fill the rest with
 /// grey and say nothing).
 fn jpeg_ends(bytes: &[u8]) -> bool {
@@ -117,6 +134,8 @@ fn jpeg_ends(bytes: &[u8]) -> bool {
 /// The pixels as 8-bit RGB. Grey is repeated, 16 bits are rounded to 8, and pixels that are more
 /// transparent than not are no part of the photo (not valid).
 pub(super) fn pixels(bytes: &[u8], header: &Header, what: &str, limits: &Limits) -> Result<Photo> {
+    let bare = (header.format == ImageFormat::Png).then(|| picture_of_png(bytes));
+    let bytes = bare.as_deref().unwrap_or(bytes);
     let decoded = reader(bytes, header.format, limits).decode().map_err(|e| {
         let format = name(header.format);
         Error::photo(format!("{what}: the {format} data is damaged or cut short")).caused_by(e)
@@ -233,6 +252,19 @@ mod tests {
             let error = decoded(bytes).unwrap_err();
             assert!(error.message().contains(word), "{word}: {error}");
             assert!(error.message().starts_with("photo 3"), "{error}");
+        }
+    }
+
+    #[test]
+    fn of_a_png_only_the_picture_is_decoded() {
+        let png = encoded(&image::DynamicImage::from(gradient()), ImageFormat::Png);
+        assert_eq!(picture_of_png(&png), png, "there is nothing else in it");
+        let text = [&[0, 0, 0, 3][..], b"zTXt", b"abc", &[1, 2, 3, 4]].concat();
+        let with = [&png[..33], &text, &png[33..]].concat();
+        assert_eq!(picture_of_png(&with), png);
+        assert_eq!(decoded(&with).unwrap().rgb, gradient().into_raw());
+        for cut in 0..png.len() {
+            assert!(png.starts_with(&picture_of_png(&png[..cut])), "{cut}");
         }
     }
 

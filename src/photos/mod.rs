@@ -100,7 +100,10 @@ fn camera_file_of_dir(dir: &Path, limits: &Limits) -> Result<UploadCameras> {
     for name in CAMERA_FILES {
         let path = dir.join(name);
         let Ok(meta) = fs_err::metadata(&path) else { continue };
-        check_json_bytes(name, usize::try_from(meta.len()).unwrap_or(usize::MAX), limits)?;
+        let (size, max) = (meta.len(), limits.json_bytes_max);
+        if size > max as u64 {
+            return Err(Error::limit(format!("{name}: bytes"), size, max));
+        }
         let bytes = fs_err::read(&path)
             .map_err(|e| Error::invalid(format!("{name}: cannot be read")).caused_by(e))?;
         return Ok(cameras_named(name, bytes));
@@ -114,13 +117,6 @@ fn cameras_named(name: &str, bytes: Vec<u8>) -> UploadCameras {
     } else {
         UploadCameras::Cameras(bytes)
     }
-}
-
-fn check_json_bytes(what: &str, bytes: usize, limits: &Limits) -> Result<()> {
-    if bytes > limits.json_bytes_max {
-        return Err(Error::limit(format!("{what}: bytes"), bytes, limits.json_bytes_max));
-    }
-    Ok(())
 }
 
 fn check_count(photos: usize, limits: &Limits) -> Result<()> {

@@ -51,7 +51,7 @@ fn turned(columns: [f64; 3]) -> Upload {
 }
 
 /// The sample with photo 1 replaced.
-fn photo(bytes: Vec<u8>) -> Upload {
+pub(crate) fn photo(bytes: Vec<u8>) -> Upload {
     let mut upload = upload();
     upload.photos[1].bytes = bytes;
     upload
@@ -74,15 +74,23 @@ fn jpeg(bytes_kept: usize) -> Vec<u8> {
 }
 
 /// A PNG of 60 bytes whose header claims `side` x `side` pixels.
-fn huge_png(side: u32) -> Vec<u8> {
-    let mut header = b"IHDR".to_vec();
-    header.extend(side.to_be_bytes());
-    header.extend(side.to_be_bytes());
+pub(crate) fn huge_png(side: u32) -> Vec<u8> {
+    let mut header = [side.to_be_bytes(), side.to_be_bytes()].concat();
     header.extend([8, 2, 0, 0, 0]);
-    let mut png = b"\x89PNG\r\n\x1a\n\0\0\0\x0d".to_vec();
-    png.extend(&header);
-    png.extend(crc32(&header).to_be_bytes());
+    let mut png = png(&[(b"IHDR", &header)]);
     png.resize(60, 0);
+    png
+}
+
+/// A PNG of these chunks.
+pub(crate) fn png(chunks: &[(&[u8; 4], &[u8])]) -> Vec<u8> {
+    let mut png = b"\x89PNG\r\n\x1a\n".to_vec();
+    for (name, data) in chunks {
+        let body = [&name[..], data].concat();
+        png.extend(u32::try_from(data.len()).unwrap().to_be_bytes());
+        png.extend(&body);
+        png.extend(crc32(&body).to_be_bytes());
+    }
     png
 }
 
@@ -96,7 +104,7 @@ fn crc32(bytes: &[u8]) -> u32 {
 }
 
 /// A zip of these files, deflated, as an upload.
-fn zipped(files: Vec<(&str, Vec<u8>)>) -> Upload {
+pub(crate) fn zipped(files: Vec<(&str, Vec<u8>)>) -> Upload {
     let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
     let options = zip::write::SimpleFileOptions::default();
     for (name, bytes) in files {
@@ -144,7 +152,7 @@ fn strangers() -> Upload {
 }
 
 /// What is wrong, the upload, the code, and words that the message must have.
-fn uploads() -> Vec<(&'static str, Upload, &'static str, Vec<&'static str>)> {
+pub(crate) fn uploads() -> Vec<(&'static str, Upload, &'static str, Vec<&'static str>)> {
     let one = || Upload { photos: upload().photos[..1].to_vec(), ..upload() };
     let cameras_only = Upload { photos: Vec::new(), ..upload() };
     let photos_only = Upload { cameras: None, ..upload() };

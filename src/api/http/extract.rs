@@ -66,6 +66,7 @@ impl<T: DeserializeOwned> FromRequest<Api> for JsonBody<T> {
             }
             bytes.extend_from_slice(&piece);
         }
+        limits.check_json("body", &bytes)?;
         let value = serde_json::from_slice(&bytes)
             .map_err(|e| Error::invalid(format!("body: not the JSON expected: {e}")))?;
         Ok(Self(value))

@@ -1,8 +1,17 @@
 //! A multipart upload, read as it comes and refused at the first byte over a cap.
 
-use std::time::Duration;
+use std::{
+    future::poll_fn,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
+    task::{Poll, ready},
+    time::Duration,
+};
 
-use axum::extract::{FromRequest, Multipart, Request, multipart::Field};
+use axum::{
+    body::{Body, BodyDataStream},
+    extract::{FromRequest, Multipart, Request, multipart::Field},
+};
+use futures_util::{StreamExt, stream};
 
 use super::{error::ApiError, params::Params};
 use crate::{
@@ -20,6 +29,8 @@ const PAUSE_MAX: Duration = Duration::from_secs(30);
 const DRAIN_BYTES_MAX: usize = 512 << 20;
 /// How long that may take.
 const DRAIN_TIME_MAX: Duration = Duration::from_secs(20);
+/// Bytes that may come without the head of a part, or its next bytes, among them.
+const HEAD_BYTES_MAX: usize = 1 << 20;
 /// Longest text option.
 const OPTION_BYTES_MAX: usize = 256;
 /// Options that may come as text parts as well as in the query string.
@@ -37,6 +48,7 @@ pub(super) async fn receive(
         .get("content-length")
         .and_then(|value| value.to_str().ok())
         .and_then(|value| value.parse::<usize>().ok());
+    let (wire, request) = Wire::of(request);
     let mut form = Multipart::from_request(request, api).await.map_err(|_| {
         Error::invalid("body: not multipart/form-data with a boundary; send photos as parts")
     })?;
@@ -48,11 +60,12 @@ pub(super) async fn receive(
             format!("{length} bytes"),
             format!("{} bytes", limits.upload_bytes_max),
         )),
-        _ => parts(api, &mut form, params).await,
+        _ => parts(api, &mut form, params, &wire).await,
     };
+    let received = received.map_err(|error| wire.too_long().unwrap_or(error));
     if received.is_err() {
         // Closing a connection with unread bytes resets it, and the answer is lost with it.
-        tokio::spawn(tokio::time::timeout(DRAIN_TIME_MAX, drain(form)));
+        tokio::spawn(tokio::time::timeout(DRAIN_TIME_MAX, wire.drain()));
     }
     Ok(received?)
 }
@@ -61,29 +74,97 @@ async fn parts(
     api: &Api,
     form: &mut Multipart,
     params: &mut Params,
+    wire: &Wire,
 ) -> Result<(Upload, UploadGuard)> {
     let limits = api.service.limits();
     let mut upload = UploadBuilder::new(&limits, &api.uploads);
+    let mut options = OPTIONS.to_vec();
     loop {
         let next = tokio::time::timeout(PAUSE_MAX, form.next_field()).await.map_err(|_| pause())?;
         let Some(mut field) = next.map_err(broken)? else { break };
+        wire.progressed();
         let name = field.name().unwrap_or_default().to_owned();
         match name.as_str() {
             "transforms" => upload.begin_cameras(UploadCameras::Transforms(Vec::new()))?,
             "cameras" => upload.begin_cameras(UploadCameras::Cameras(Vec::new()))?,
             "archive" => upload.begin_archive(),
             option if OPTIONS.contains(&option) => {
-                let value = text(&mut field).await?;
-                params.push(option, value);
+                // Each once, or options alone could fill the memory.
+                let Some(at) = options.iter().position(|left| *left == option) else {
+                    return Err(Error::invalid(format!("upload: {option} is given twice")));
+                };
+                params.push(options.swap_remove(at), text(&mut field).await?);
+                wire.progressed();
                 continue;
             }
             _ => upload.begin_photo(&photo_name(&name, field.file_name())?)?,
         }
         while let Some(piece) = chunk(&mut field).await? {
+            wire.progressed();
             upload.extend(&piece)?;
         }
     }
     upload.finish()
+}
+
+/// A body on its way to the form's reader, which keeps what belongs to no part yet: a part's head
+/// without end would fill the memory outside of every budget, and be searched from its start at
+/// each piece.
+#[derive(Clone)]
+struct Wire(Arc<Mutex<(BodyDataStream, usize)>>);
+
+impl Wire {
+    /// The request with its body watched. The reader takes all that is there before it looks at
+    /// any of it: after each piece it is told that there is no more just now.
+    fn of(request: Request) -> (Self, Request) {
+        let (parts, body) = request.into_parts();
+        let wire = Self(Arc::new(Mutex::new((body.into_data_stream(), 0))));
+        let (of_body, mut taken) = (wire.clone(), false);
+        let paced = stream::poll_fn(move |context| {
+            if of_body.too_long().is_some() {
+                return Poll::Ready(Some(Err(axum::Error::new("too long"))));
+            }
+            if std::mem::take(&mut taken) {
+                context.waker().wake_by_ref();
+                return Poll::Pending;
+            }
+            let mut body = of_body.lock();
+            let piece = ready!(body.0.poll_next_unpin(context));
+            if let Some(Ok(piece)) = &piece {
+                taken = true;
+                body.1 += piece.len();
+            }
+            Poll::Ready(piece)
+        });
+        (wire, Request::from_parts(parts, Body::from_stream(paced)))
+    }
+
+    fn lock(&self) -> MutexGuard<'_, (BodyDataStream, usize)> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A part's head or a piece of its bytes was found.
+    fn progressed(&self) {
+        self.lock().1 = 0;
+    }
+
+    fn too_long(&self) -> Option<Error> {
+        let (bytes, max) = (self.lock().1, HEAD_BYTES_MAX);
+        let limit = || Error::limit("upload: the head of a part", format!("{bytes} bytes"), max);
+        (bytes > max).then(limit)
+    }
+
+    /// Reads on and forgets what it reads.
+    async fn drain(self) {
+        let mut read = 0;
+        while let Some(Ok(piece)) = poll_fn(|context| self.lock().0.poll_next_unpin(context)).await
+        {
+            read += piece.len();
+            if read > DRAIN_BYTES_MAX {
+                return;
+            }
+        }
+    }
 }
 
 /// A photo is named by its part where that has an extension, else by its file.
@@ -114,19 +195,6 @@ async fn text(field: &mut Field<'_>) -> Result<String> {
 async fn chunk(field: &mut Field<'_>) -> Result<Option<axum::body::Bytes>> {
     let piece = tokio::time::timeout(PAUSE_MAX, field.chunk()).await.map_err(|_| pause())?;
     piece.map_err(broken)
-}
-
-/// Reads on and forgets what it reads.
-async fn drain(mut form: Multipart) {
-    let mut read = 0;
-    while let Ok(Some(mut field)) = form.next_field().await {
-        while let Ok(Some(piece)) = field.chunk().await {
-            read += piece.len();
-            if read > DRAIN_BYTES_MAX {
-                return;
-            }
-        }
-    }
 }
 
 fn pause() -> Error {
