@@ -1,5 +1,6 @@
 //! How good the scenes are on posed photographs: `segsplat eval DIR`; what thinning costs them:
-//! [`density`]; what texts select in them: [`semantics`]; whether images find their names: [`words`].
+//! [`density`]; what texts select in them: [`semantics`]; whether images find their names:
+//! [`words`].
 //!
 //! Every triple (two inputs, a target between them) goes through the product's own road:
 //! undistortion, capture analysis, the shipped network, lifting, the CPU renderer. Beside PSNR and

@@ -20,7 +20,7 @@ pub struct ThinOptions {
     pub levels: u32,
     /// Largest difference of colour within a block, 0..1, any channel.
     pub colour: f32,
-    /// Factor on `colour` for each further level: a large block shows a ramp that a small one hides.
+    /// Factor on `colour` for each further level: a large block shows a ramp that a small hides.
     pub finer: f32,
     /// Largest difference of depth within a block, in widths of its own pixels.
     pub depth: f64,

@@ -10,6 +10,7 @@
 mod assign;
 mod bank;
 mod crops;
+mod entries;
 mod palette;
 mod parts;
 mod score;
@@ -19,9 +20,10 @@ pub use self::{
     assign::{NetworkPicture, from_source, relabel},
     bank::{Clusters, bank, rows_wanted},
     crops::Cutter,
+    entries::PixelEntries,
     palette::{colour, palette_table},
     parts::{Box3, Part, PartOptions, Pieces},
-    score::{PixelEntries, Scorer, Scoring, TextScores, ViewNorms, mask_from_blend},
+    score::{Scorer, Scoring, TextScores, ViewNorms, mask_from_blend},
     views::{Views, merge},
 };
 
