@@ -35,7 +35,8 @@ pub(super) fn read<T>(
         return Err(gpu.give_up(message).caused_by(error));
     }
     gpu.check()?;
-    match mapped.try_recv() {
+    // Whoever polls first is handed all answers that are due: another thread may be at ours still.
+    match mapped.recv_timeout(ANSWER_TIMEOUT) {
         Ok(Ok(())) => {}
         Ok(Err(error)) => {
             gpu.check()?;
