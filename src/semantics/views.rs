@@ -59,9 +59,7 @@ impl View {
         let (u, v) = photo.project(seen);
         Some([u / f64::from(photo.width), v / f64::from(photo.height)])
     }
-}
 
-impl View {
     /// Gives pixels without a Gaussian the depth of a neighbour: one that was thinned stands for a
     /// block of up to 4 x 4 pixels, with itself one pixel from its corner.
     fn fill(&mut self) {
