@@ -11,11 +11,11 @@ pub const IDEMPOTENCY_KEY_BYTES_MAX: usize = 256;
 /// bounds what the products of all pairs of rows take.
 pub const BANK_ROWS_MAX: usize = 4_096;
 
-/// Bytes of layers kept for views to come: three camera sets of a scene of sixteen photos.
-pub const LAYER_BYTES_MAX: u64 = 512 << 20;
+/// [`Limits::layers_cache_bytes_max`] unless something else is said.
+pub const LAYERS_CACHE_BYTES_MAX: u64 = 512 << 20;
 
-/// Bytes of magnified Gaussians kept for views to come: thirty views of a scene of two photos.
-pub const MAGNIFIED_BYTES_MAX: u64 = 256 << 20;
+/// [`Limits::magnified_cache_bytes_max`] unless something else is said.
+pub const MAGNIFIED_CACHE_BYTES_MAX: u64 = 256 << 20;
 
 /// Caps on what a caller may send or ask for.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -64,6 +64,10 @@ pub struct Limits {
     pub scorers_cache_bytes_max: u64,
     /// Bytes of views' semantic entries kept in memory, so that the next text draws nothing.
     pub entries_cache_bytes_max: u64,
+    /// Bytes of layers kept for views to come: three camera sets of a scene of sixteen photos.
+    pub layers_cache_bytes_max: u64,
+    /// Bytes of magnified Gaussians kept for views to come: thirty views of a scene of two photos.
+    pub magnified_cache_bytes_max: u64,
     /// Memory of the connected pieces of scenes that were asked for boxes, bytes.
     pub pieces_cache_bytes_max: u64,
     /// Parts of one text's selection that an answer lists, the largest first.
@@ -182,6 +186,8 @@ impl Default for Limits {
             texts_cached_max: 4_096,
             scorers_cache_bytes_max: 512 << 20,
             entries_cache_bytes_max: 512 << 20,
+            layers_cache_bytes_max: LAYERS_CACHE_BYTES_MAX,
+            magnified_cache_bytes_max: MAGNIFIED_CACHE_BYTES_MAX,
             pieces_cache_bytes_max: 128 << 20,
             parts_max: 64,
             queued_jobs_max: 64,

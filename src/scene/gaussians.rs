@@ -1,6 +1,9 @@
 //! Gaussians as a struct of arrays, world frame, f32 relative to an f64 origin.
 
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{
+    Arc, Weak,
+    atomic::{AtomicU64, Ordering},
+};
 
 use glam::DVec3;
 
@@ -87,6 +90,8 @@ pub struct Gaussians {
     identity: u64,
     /// Shared by Gaussians that differ in their bank indices only.
     shape: u64,
+    /// Shared by clones: see [`Self::life`].
+    life: Arc<()>,
 }
 
 /// Source of [`Gaussians::identity`] and [`Gaussians::shape_identity`]; 0 is the empty default.
@@ -106,7 +111,7 @@ impl Gaussians {
 
     fn new(raw: RawGaussians) -> Self {
         let identity = NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed);
-        Self { raw, identity, shape: identity }
+        Self { raw, identity, shape: identity, life: Arc::default() }
     }
 
     /// Drops what can never be drawn, clamps what is out of range, counts both.
@@ -237,6 +242,7 @@ impl Gaussians {
             raw: RawGaussians { semantic_index, ..self.raw.clone() },
             identity: NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed),
             shape: self.shape,
+            life: Arc::default(),
         })
     }
 
@@ -252,6 +258,11 @@ impl Gaussians {
     #[must_use]
     pub fn shape_identity(&self) -> u64 {
         self.shape
+    }
+
+    /// Lives as long as any Gaussians of this identity do.
+    pub(super) fn life(&self) -> Weak<()> {
+        Arc::downgrade(&self.life)
     }
 
     /// Number of Gaussians.

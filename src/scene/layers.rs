@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use crate::{
-    limits::LAYER_BYTES_MAX,
+    limits::LAYERS_CACHE_BYTES_MAX,
     scene::{Camera, Gaussians, Scene, copies::Copies},
 };
 
@@ -17,7 +17,7 @@ const FRONT_PHOTOS: usize = 4;
 const TURN_COST: f64 = 0.5;
 
 /// Front and behind, by the photos in front.
-static LAYERS: Copies<Arc<[Gaussians; 2]>> = Copies::new(LAYER_BYTES_MAX);
+pub(super) static LAYERS: Copies<Arc<[Gaussians; 2]>> = Copies::new(LAYERS_CACHE_BYTES_MAX);
 
 impl Scene {
     /// The Gaussians in front and behind for a camera, or `None` where few photos made the scene.
@@ -52,8 +52,8 @@ impl Scene {
             let view = usize::from(self.gaussians.source()[i].view);
             front.get(view).copied().unwrap_or(false)
         };
-        let key = (self.gaussians.identity(), front.iter().map(|&f| u64::from(f)).collect());
-        Some(LAYERS.get(key, || {
+        let in_front_bits = front.iter().map(|&f| u64::from(f)).collect();
+        Some(LAYERS.get(&self.gaussians, in_front_bits, || {
             let layers = [self.gaussians.only(in_front), self.gaussians.only(|i| !in_front(i))];
             let size = layers.iter().map(Gaussians::size_bytes).sum();
             (Arc::new(layers), size)

@@ -13,7 +13,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use crate::{
-    limits::MAGNIFIED_BYTES_MAX,
+    limits::MAGNIFIED_CACHE_BYTES_MAX,
     scene::{Camera, Gaussians, Scene, copies::Copies},
 };
 
@@ -25,7 +25,8 @@ const OWN_SIZE: f64 = 1.25;
 const SHARE_MIN: f64 = 1e-3;
 
 /// Answers by Gaussians, photos and camera.
-static MAGNIFIED: Copies<Option<Arc<Gaussians>>> = Copies::new(MAGNIFIED_BYTES_MAX);
+pub(super) static MAGNIFIED: Copies<Option<Arc<Gaussians>>> =
+    Copies::new(MAGNIFIED_CACHE_BYTES_MAX);
 
 /// Where a photo's Gaussians came from: camera centre and axis, and 1 / focal length in pixels of
 /// the network's picture; 0 where nothing is known.
@@ -73,7 +74,7 @@ impl Scene {
         };
         let photos = sources.iter().flat_map(|s| place(s.center, s.axis, s.pixel));
         let bits = place(eye.center, eye.axis, eye.focal).chain(photos).map(f64::to_bits);
-        MAGNIFIED.get((gaussians.identity(), bits.collect()), || {
+        MAGNIFIED.get(gaussians, bits.collect(), || {
             let copy = magnify(gaussians, &sources, eye).map(Arc::new);
             let size = copy.as_ref().map_or(0, |copy| copy.size_bytes());
             (copy, size)

@@ -37,3 +37,10 @@ pub use status::{
     SemanticsState, SemanticsStatus,
 };
 pub use upload::{Upload, UploadCameras, UploadFile};
+
+/// Bounds what all scenes of the process keep for views to come, bytes: layers, and Gaussians
+/// magnified for a view.
+pub fn keep_copies(layers_bytes_max: u64, magnified_bytes_max: u64) {
+    layers::LAYERS.set_bytes_max(layers_bytes_max);
+    magnify::MAGNIFIED.set_bytes_max(magnified_bytes_max);
+}

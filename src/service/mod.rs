@@ -52,7 +52,7 @@ use crate::{
     keys::Caller,
     limits::Limits,
     render::Renderer,
-    scene::SceneId,
+    scene::{self, SceneId},
     store::{Place, Record, Store, not_found},
 };
 
@@ -134,6 +134,7 @@ impl Service {
     pub fn open_at(place: &Place, config: Config, parts: Parts) -> Result<Self> {
         let (store, records) = Store::open_at(place, &config.limits)?;
         let store = Arc::new(store);
+        keep_copies(&config.limits);
         let jobs = Jobs::start(
             Arc::clone(&store),
             Arc::clone(&parts.maker),
@@ -203,6 +204,7 @@ impl Service {
     #[must_use]
     pub fn reload(&self, limits: Limits) -> Vec<&'static str> {
         let later = self.inner.config.limits.changed_for_next_start(&limits);
+        keep_copies(&limits);
         *self.inner.limits.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(limits);
         later
     }
@@ -318,6 +320,10 @@ impl Service {
     pub fn shut_down(&self) {
         self.inner.jobs.shut_down();
     }
+}
+
+fn keep_copies(limits: &Limits) {
+    scene::keep_copies(limits.layers_cache_bytes_max, limits.magnified_cache_bytes_max);
 }
 
 /// Where the next page starts: creation time and id of the last scene of this one.
