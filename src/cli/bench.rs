@@ -194,11 +194,11 @@ fn stages(args: &Args, config: &Config, out: &Output) -> Result<()> {
         SampleOptions { photos: args.photos, width: side, height: side, ..Default::default() };
     let upload = sample::upload(&options)?;
     let begun = Instant::now();
-    let engine = Arc::new(Engine::open(config)?);
+    let engine = Engine::open(config)?;
     let open_ms = ms(begun);
     let provider = engine.geometry().provider().name();
     let renderer = engine::renderer(config)?;
-    let maker = PipelineMaker::new(engine, config.limits.clone());
+    let maker = PipelineMaker::new(Arc::new(engine.into()), config.limits.clone());
     let mut times: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     let mut gaussians = 0;
     for i in 0..args.runs {

@@ -4,33 +4,36 @@ use std::sync::Arc;
 
 use crate::{
     config::Config,
-    error::{Error, Result},
+    error::Result,
     jobs::{NoSemantics, PipelineMaker, PipelineSemantics, SemanticsMaker},
     models::Bundle,
-    pipeline::Engine,
+    pipeline::{Engine, LateEngine},
     render::{Renderer, select::select},
     service::{ModelInfo, ModelsInfo, Parts},
 };
 
-/// Library, bundle, networks and renderer, as the server runs them.
+/// Library, bundle, networks and renderer, as the server runs them, all open.
 ///
 /// # Errors
 /// `model_unavailable`, `gpu_unavailable`, each with what is missing.
 pub fn parts(config: &Config) -> Result<Parts> {
-    // Side by side: one waits for a graphics driver where there is one, the other for a network.
-    let (engine, renderer) = std::thread::scope(|scope| {
-        let renderer = scope.spawn(|| renderer(config));
-        let engine = Engine::open(config);
-        let renderer = renderer.join().unwrap_or_else(|_| {
-            Err(Error::internal("the renderer's start was broken off: a fault of the program"))
-        });
-        (engine, renderer)
-    });
-    let (engine, renderer) = (Arc::new(engine?), renderer?);
-    let models = models_info(engine.bundle(), engine.geometry().provider().name());
+    let (parts, engine) = early_parts(config)?;
+    engine.get()?;
+    Ok(parts)
+}
+
+/// The same with networks that are still being opened, by a thread of the engine.
+///
+/// # Errors
+/// As [`parts`] where manifest or adapter are at fault; the engine tells of the rest.
+pub fn early_parts(config: &Config) -> Result<(Parts, Arc<LateEngine>)> {
+    let engine = Arc::new(LateEngine::open(config)?);
+    let renderer = renderer(config)?;
+    let models = models_info(engine.bundle(), "opening");
     let maker = Arc::new(PipelineMaker::new(Arc::clone(&engine), config.limits.clone()));
-    let semantics = Arc::new(PipelineSemantics::new(engine, config.limits.clone()));
-    Ok(Parts { maker, semantics, renderer, models })
+    let of_semantics = Arc::clone(&engine);
+    let semantics = Arc::new(PipelineSemantics::new(of_semantics, config.limits.clone()));
+    Ok((Parts { maker, semantics, renderer, models }, engine))
 }
 
 /// What answers texts; opens library and bundle only where it is `needed`.
@@ -41,7 +44,7 @@ pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticsMaker
     if !needed {
         return Ok(Arc::new(NoSemantics));
     }
-    let engine = Arc::new(Engine::open(config)?);
+    let engine = Arc::new(Engine::open(config)?.into());
     Ok(Arc::new(PipelineSemantics::new(engine, config.limits.clone())))
 }
 

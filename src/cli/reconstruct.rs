@@ -23,7 +23,7 @@ use crate::{
         content_sha256,
     },
     photos,
-    pipeline::Engine,
+    pipeline::{Engine, LateEngine},
     scene::{Density, Provenance, Scene, SceneId, SceneMeta, SceneOptions, SemanticsMode, Upload},
     store::{self, ply::PlyWriter, write_scene_file, write_semantics_file},
 };
@@ -50,7 +50,7 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let upload = upload_of(&args.photos, config)?;
-    let engine = Arc::new(Engine::open(config)?);
+    let engine = Arc::new(LateEngine::from(Engine::open(config)?));
     let options = SceneOptions {
         max_views: args.max_views,
         semantics: args.semantics,

@@ -1,6 +1,6 @@
 //! `segsplat serve`: both doors on one port until SIGTERM or Ctrl-C.
 
-use std::fmt::Write as _;
+use std::{fmt::Write as _, sync::Arc};
 
 use serde_json::json;
 use tokio::net::TcpListener;
@@ -10,6 +10,7 @@ use crate::{
     api::Doors,
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
+    pipeline::LateEngine,
     service::Service,
 };
 
@@ -35,7 +36,7 @@ pub(super) fn run(
         return out.answer(&text, &config);
     }
     config.check_doors()?;
-    let parts = engine::parts(&config)?;
+    let (parts, engine) = engine::early_parts(&config)?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
@@ -52,32 +53,42 @@ pub(super) fn run(
             .local_addr()
             .map_err(|e| Error::internal("the listener has no address").caused_by(e))?;
         let doors = Doors::new(service.clone())?;
-        let provider = &models.execution_provider;
         let (bundle, sha256) = (&models.bundle, models.bundle_sha256.get(..12).unwrap_or_default());
         tracing::info!(
             %address,
             renderer,
-            execution_provider = provider,
             bundle,
             bundle_sha256 = sha256,
             data_dir = %data_dir.display(),
             "serving HTTP and gRPC"
         );
         let mut text = format!("listening on {scheme}://{address}\n");
-        let _ = write!(text, "renderer {renderer}, network on {provider}, bundle {bundle}");
+        let _ = write!(text, "renderer {renderer}, bundle {bundle}");
         let answer = json!({
             "listening": format!("{scheme}://{address}"),
             "renderer": renderer,
-            "execution_provider": provider,
             "bundle": bundle,
         });
         out.answer(&text, &answer)?;
         reload_at_hangup(doors.clone(), read_again)?;
-        doors.serve(listener, stop_signal()?).await
+        tokio::select! {
+            served = doors.serve(listener, stop_signal()?) => served,
+            error = broken(engine) => Err(error),
+        }
     });
     tracing::info!("stopping: jobs at work are queued again for the next start");
     service.shut_down();
     served
+}
+
+/// Resolves where the networks do not open: a server that can make nothing ends, as one that finds
+/// nothing at its start does.
+async fn broken(engine: Arc<LateEngine>) -> Error {
+    let opened = tokio::task::spawn_blocking(move || engine.get().map(drop)).await;
+    match opened {
+        Ok(Err(error)) => error,
+        _ => std::future::pending().await,
+    }
 }
 
 /// Puts keys, limits and certificate in force again at each SIGHUP.

@@ -5,26 +5,28 @@ use std::sync::Arc;
 
 use crate::{
     error::Result,
-    jobs::{Made, Phrases, SceneMaker, SemanticsMaker, SemanticsWork, TextEmbedding, Work},
+    jobs::{
+        Made, Networks, Phrases, SceneMaker, SemanticsMaker, SemanticsWork, TextEmbedding, Work,
+    },
     limits::Limits,
     pipeline::{
-        self, Engine, Stage,
+        self, LateEngine, Stage,
         semantics::{SemanticsOptions, SemanticsStage, Watch, understand_upload},
     },
     scene::{Semantics, Upload},
 };
 
-/// Makes scenes with an [`Engine`].
+/// Makes scenes with an [`Engine`](pipeline::Engine).
 #[derive(Debug)]
 pub struct PipelineMaker {
-    engine: Arc<Engine>,
+    engine: Arc<LateEngine>,
     limits: Limits,
 }
 
 impl PipelineMaker {
     /// A maker that reads photos under these limits.
     #[must_use]
-    pub fn new(engine: Arc<Engine>, limits: Limits) -> Self {
+    pub fn new(engine: Arc<LateEngine>, limits: Limits) -> Self {
         Self { engine, limits }
     }
 }
@@ -32,6 +34,14 @@ impl PipelineMaker {
 impl SceneMaker for PipelineMaker {
     fn identity(&self) -> String {
         self.engine.bundle().sha256().to_owned()
+    }
+
+    fn networks(&self) -> Networks {
+        match self.engine.peek() {
+            None => Networks::Opening,
+            Some(Ok(engine)) => Networks::Open(engine.geometry().provider().name()),
+            Some(Err(_)) => Networks::Broken,
+        }
     }
 
     fn check(&self, upload: &Upload, limits: &Limits) -> Result<()> {
@@ -44,7 +54,7 @@ impl SceneMaker for PipelineMaker {
             (work.progress)(stage.name(), from + (to - from) * fraction);
         };
         let made = pipeline::make(
-            &self.engine,
+            self.engine.get()?,
             work.upload,
             &self.limits,
             work.options,
@@ -72,28 +82,29 @@ fn share_of(stage: Stage) -> [f32; 2] {
     }
 }
 
-/// Makes what scenes mean with an [`Engine`], whose networks are opened at the first use.
+/// Makes what scenes mean with an [`Engine`](pipeline::Engine), whose networks for that are opened
+/// at the first use.
 #[derive(Debug)]
 pub struct PipelineSemantics {
-    engine: Arc<Engine>,
+    engine: Arc<LateEngine>,
     limits: Limits,
 }
 
 impl PipelineSemantics {
     /// A maker that reads photos under these limits.
     #[must_use]
-    pub fn new(engine: Arc<Engine>, limits: Limits) -> Self {
+    pub fn new(engine: Arc<LateEngine>, limits: Limits) -> Self {
         Self { engine, limits }
     }
 }
 
 impl SemanticsMaker for PipelineSemantics {
     fn lacks(&self) -> Option<String> {
-        self.engine.lacks_semantics().map(str::to_owned)
+        self.engine.bundle().lacks_semantics().map(str::to_owned)
     }
 
     fn phrases(&self) -> Result<Phrases> {
-        let towers = self.engine.image_text()?;
+        let towers = self.engine.get()?.image_text()?;
         let manifest = towers.manifest();
         Ok(Phrases {
             canon: manifest.canon.clone(),
@@ -103,7 +114,7 @@ impl SemanticsMaker for PipelineSemantics {
     }
 
     fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
-        let embedded = self.engine.image_text()?.embed_texts(texts)?;
+        let embedded = self.engine.get()?.image_text()?.embed_texts(texts)?;
         let texts = embedded.into_iter().map(|text| TextEmbedding {
             row: text.row,
             tokens: text.tokens,
@@ -120,6 +131,7 @@ impl SemanticsMaker for PipelineSemantics {
         };
         let watch = Watch { progress: &progress, cancel: work.cancel };
         let options = SemanticsOptions::default();
-        understand_upload(&self.engine, work.upload, &self.limits, work.scene, &options, watch)
+        let engine = self.engine.get()?;
+        understand_upload(engine, work.upload, &self.limits, work.scene, &options, watch)
     }
 }

@@ -79,11 +79,27 @@ pub struct Made {
     pub bundle_sha256: String,
 }
 
+/// Where the networks of a maker stand.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Networks {
+    /// They are being opened; what is queued waits for that.
+    Opening,
+    /// They are open, on this execution provider; empty: there are none to open.
+    Open(&'static str),
+    /// They do not open: nothing is taken from the queue, so that nothing in it fails.
+    Broken,
+}
+
 /// Turns an upload into a scene: the pipeline, or a stand-in of a test.
 pub trait SceneMaker: Send + Sync {
     /// What else than upload and options decides the scene: the networks, by their hash.
     fn identity(&self) -> String {
         String::new()
+    }
+
+    /// Whether its networks are open.
+    fn networks(&self) -> Networks {
+        Networks::Open("")
     }
 
     /// Refuses an upload that cannot be made, before it is acknowledged. On the calling thread.
@@ -437,6 +453,12 @@ impl Jobs {
     #[must_use]
     pub fn counts(&self) -> (usize, usize) {
         (self.shared.queue.len(), self.shared.lock_running().len())
+    }
+
+    /// Where the networks stand.
+    #[must_use]
+    pub fn networks(&self) -> Networks {
+        self.shared.maker.networks()
     }
 
     /// Whether the queue takes jobs and every worker lives.

@@ -189,7 +189,9 @@ impl Shared {
 
     /// The life of the thread that makes semantics.
     pub(super) fn think(&self) {
-        while let Some(id) = self.asked.pop() {
+        let open = self.networks_open();
+        while open && let Some(id) = self.asked.pop() {
+            let _span = tracing::info_span!("semantics", scene = %id).entered();
             let stop = Arc::new(Stop::default());
             self.lock_thinking().insert(id.clone(), Arc::clone(&stop));
             if self.asked.is_closed() {

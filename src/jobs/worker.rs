@@ -12,7 +12,7 @@ use std::{
 
 use sha2::{Digest, Sha256};
 
-use super::{Made, Shared, Work};
+use super::{Made, Networks, Shared, Work};
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
@@ -21,11 +21,14 @@ use crate::{
         SemanticsMode, SemanticsReport, SemanticsState, SemanticsStatus,
     },
     store::{self, Record},
-    telemetry::meter,
+    telemetry::{self, meter},
 };
 
 /// Starts of one job before it is given up: a scene that kills the server must not do so forever.
 const ATTEMPTS_MAX: u32 = 3;
+
+/// Between two looks at whether the networks are open.
+const NETWORKS_LOOK: Duration = Duration::from_millis(5);
 
 /// Asks a job to stop, and remembers why: the first reason counts.
 #[derive(Debug, Default)]
@@ -137,14 +140,29 @@ impl Shared {
         self.running.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
+    /// Waits until the networks are open; whether they are. Not for long, so it looks again and
+    /// again: a server that is stopped meanwhile waits for nothing.
+    pub(super) fn networks_open(&self) -> bool {
+        loop {
+            match self.maker.networks() {
+                Networks::Open(_) => return true,
+                Networks::Broken => return false,
+                Networks::Opening if self.queue.is_closed() => return false,
+                Networks::Opening => std::thread::sleep(NETWORKS_LOOK),
+            }
+        }
+    }
+
     /// The life of a worker thread.
     pub(super) fn work(&self) {
-        while let Some(id) = self.queue.pop() {
+        let open = self.networks_open();
+        while open && let Some(id) = self.queue.pop() {
             let stop = Arc::new(Stop::default());
             self.lock_running().insert(id.clone(), Arc::clone(&stop));
             if self.queue.is_closed() {
                 stop.by_shutdown();
             }
+            let _span = self.span(&id).entered();
             // Whatever `make` panics with, its half-made values die with it.
             let outcome = catch_unwind(AssertUnwindSafe(|| self.run(&id, &stop)))
                 .unwrap_or_else(|panic| Err(panicked(&*panic)));
@@ -159,6 +177,17 @@ impl Shared {
             }
         }
         self.workers.fetch_sub(1, Ordering::Relaxed);
+    }
+
+    /// A span of the job, in the trace of the call that asked for the scene.
+    fn span(&self, id: &SceneId) -> tracing::Span {
+        let Some(record) = self.board.find(id) else { return tracing::Span::none() };
+        let request_id = record.request_id.as_deref();
+        let span = tracing::info_span!("scene", scene = %id, request_id);
+        if let Some(parent) = &record.traceparent {
+            telemetry::follow(&span, parent);
+        }
+        span
     }
 
     fn run(&self, id: &SceneId, stop: &Stop) -> Result<()> {

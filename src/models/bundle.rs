@@ -160,12 +160,22 @@ impl Bundle {
     /// # Errors
     /// `model_unavailable` as [`Self::open`]; none found names every place looked at.
     pub fn find(config: &Config) -> Result<Self> {
+        let bundle = Self::named(config)?;
+        bundle.verify()?;
+        Ok(bundle)
+    }
+
+    /// As [`Self::find`], with no file looked at but the manifest: [`Self::verify`] is still due.
+    ///
+    /// # Errors
+    /// `model_unavailable` when none is found or the manifest is malformed.
+    pub fn named(config: &Config) -> Result<Self> {
         if let Some(dir) = &config.bundle {
-            return Self::open(dir);
+            return Self::read(dir);
         }
         let places = search_places();
         match places.iter().find(|dir| dir.join(MANIFEST).is_file()) {
-            Some(dir) => Self::open(dir),
+            Some(dir) => Self::read(dir),
             None => Err(unavailable(format!(
                 "no model bundle: no {EMBEDDED}/{MANIFEST} beside the executable or in the \
                  working folder; name its folder with --bundle or SEGSPLAT_BUNDLE"
@@ -179,6 +189,12 @@ impl Bundle {
     /// `model_unavailable` when the manifest or a file is missing, the manifest is malformed, or a
     /// file's sha256 differs.
     pub fn open(dir: &Path) -> Result<Self> {
+        let bundle = Self::read(dir)?;
+        bundle.verify()?;
+        Ok(bundle)
+    }
+
+    fn read(dir: &Path) -> Result<Self> {
         let path = dir.join(MANIFEST);
         let size = fs_err::metadata(&path).map_err(|e| missing(MANIFEST, e))?.len();
         if size > MANIFEST_BYTES_MAX {
@@ -196,9 +212,7 @@ impl Bundle {
         if let Some(image_text) = &manifest.image_text {
             image_text.validate()?;
         }
-        let bundle = Self { dir: dir.to_owned(), sha256: hex_of(text.as_bytes()), manifest };
-        bundle.verify()?;
-        Ok(bundle)
+        Ok(Self { dir: dir.to_owned(), sha256: hex_of(text.as_bytes()), manifest })
     }
 
     /// Checks every file's sha256 again.
@@ -252,6 +266,17 @@ impl Bundle {
     #[must_use]
     pub fn image_text(&self) -> Option<&ImageTextManifest> {
         self.manifest.image_text.as_ref()
+    }
+
+    /// What it lacks for semantics; `None` where nothing.
+    #[must_use]
+    pub fn lacks_semantics(&self) -> Option<&'static str> {
+        match (self.masks(), self.image_text()) {
+            (Some(_), Some(_)) => None,
+            (None, Some(_)) => Some("no mask network"),
+            (Some(_), None) => Some("no image and text towers"),
+            (None, None) => Some("no semantic networks"),
+        }
     }
 
     /// Every file that the manifest names, itself left out.

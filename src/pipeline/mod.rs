@@ -5,8 +5,11 @@
 //! under the stage name [`Stage::Store`]. What the scene means comes when somebody asks, or at
 //! once: [`semantics`].
 
+mod late;
 pub mod masks;
 pub mod semantics;
+
+pub use self::late::LateEngine;
 
 use std::{
     fmt,
@@ -87,9 +90,15 @@ impl Engine {
     /// # Errors
     /// `model_unavailable` when library or bundle is missing or differs from its manifest.
     pub fn open(config: &Config) -> Result<Self> {
+        Self::open_bundle(&Bundle::named(config)?, config)
+    }
+
+    /// The same for a bundle whose manifest was read.
+    fn open_bundle(bundle: &Bundle, config: &Config) -> Result<Self> {
         // Both are read whole and hashed: side by side they take half as long.
-        let (bundle, runtime) = rayon::join(|| Bundle::find(config), || Runtime::load(config));
-        let (bundle, runtime) = (bundle?, runtime?);
+        let (verified, runtime) = rayon::join(|| bundle.verify(), || Runtime::load(config));
+        verified?;
+        let (bundle, runtime) = (bundle.clone(), runtime?);
         let geometry = Geometry::open(Arc::clone(&runtime), &bundle, config)?;
         let workers = rayon::ThreadPoolBuilder::new()
             .num_threads(config.threads)
@@ -260,6 +269,7 @@ struct Run<'a> {
 impl Run<'_> {
     fn stage<T>(&mut self, stage: Stage, work: impl FnOnce(&Self) -> Result<T>) -> Result<T> {
         self.check()?;
+        let _span = tracing::info_span!("stage", stage = stage.name()).entered();
         (self.progress)(stage, 0.0);
         let start = Instant::now();
         let done = work(self)?;

@@ -179,17 +179,6 @@ fn opened<T>(
 }
 
 impl Engine {
-    /// What the bundle lacks for semantics; `None` where nothing.
-    #[must_use]
-    pub fn lacks_semantics(&self) -> Option<&'static str> {
-        match (self.bundle.masks(), self.bundle.image_text()) {
-            (Some(_), Some(_)) => None,
-            (None, Some(_)) => Some("no mask network"),
-            (Some(_), None) => Some("no image and text towers"),
-            (None, None) => Some("no semantic networks"),
-        }
-    }
-
     /// The mask network, opened at the first call.
     ///
     /// # Errors

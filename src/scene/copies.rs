@@ -58,12 +58,7 @@ impl<T: Clone> Copies<T> {
 
     /// The copy made of these Gaussians and all that counts beside, or what `make` gives with its
     /// bytes. Nothing waits while it is made.
-    pub(super) fn get(
-        &self,
-        of: &Gaussians,
-        rest: Vec<u64>,
-        make: impl FnOnce() -> (T, u64),
-    ) -> T {
+    pub(super) fn get(&self, of: &Gaussians, rest: Vec<u64>, make: impl FnOnce() -> (T, u64)) -> T {
         let key = (of.identity(), rest);
         if let Some(copy) = self.lock().find(&key) {
             return copy;

@@ -16,6 +16,7 @@ use crate::{
         SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState, Upload,
     },
     store::{self, Record},
+    telemetry,
 };
 
 /// Locks that calls with one idempotency key share with few others.
@@ -58,7 +59,7 @@ impl Service {
     /// # Errors
     /// `invalid_request`, `photo_unreadable`, `limit_exceeded`, `overloaded`, `store_unavailable`.
     pub async fn create_scene(&self, request: CreateScene) -> Result<Created> {
-        let CreateScene { upload, mut options, idempotency_key, wait } = request;
+        let CreateScene { upload, mut options, idempotency_key, wait, request_id } = request;
         check_request(&options, idempotency_key.as_deref(), &self.limits())?;
         if options.semantics == SemanticsMode::Eager {
             self.inner.can_understand("semantics=eager")?;
@@ -74,7 +75,8 @@ impl Service {
             Some(key) => Some(self.inner.key_lock(key).lock().await),
             None => None,
         };
-        let (id, replayed) = self.submit(upload, options, idempotency_key).await?;
+        let record = |record| Record { options, idempotency_key, request_id, ..record };
+        let (id, replayed) = self.submit(upload, record).await?;
         drop(one_at_a_time);
         if let Some(wait) = wait {
             let unknown = (!keyed && !replayed).then(|| id.clone());
@@ -104,15 +106,14 @@ impl Service {
     async fn submit(
         &self,
         upload: Upload,
-        options: SceneOptions,
-        key: Option<String>,
+        record: impl FnOnce(Record) -> Record + Send + 'static,
     ) -> Result<(SceneId, bool)> {
         let (inner, caller) = (Arc::clone(&self.inner), self.caller.clone());
         let turn = Arc::clone(&inner.reading).acquire_owned().await;
         let turn = turn.map_err(|e| Error::internal("no upload is read now").caused_by(e))?;
         blocking(move || {
             let _turn = turn;
-            inner.submit_here(&upload, options, key, &caller)
+            inner.submit_here(&upload, record, &caller)
         })
         .await?
     }
@@ -122,23 +123,21 @@ impl Inner {
     fn submit_here(
         &self,
         upload: &Upload,
-        options: SceneOptions,
-        key: Option<String>,
+        record: impl FnOnce(Record) -> Record,
         caller: &Caller,
     ) -> Result<(SceneId, bool)> {
         self.maker.check(upload, &self.limits())?;
         let id = new_id();
-        let mut status = SceneStatus::new(id.clone(), SceneState::Queued, store::now_ms());
-        if options.semantics == SemanticsMode::Off {
-            status.semantics.state = SemanticsState::Off;
-        }
-        let record = Record {
-            request_sha256: request_sha256(upload, &options),
+        let status = SceneStatus::new(id.clone(), SceneState::Queued, store::now_ms());
+        let mut record = record(Record {
             owner: caller.owner().map(str::to_owned),
-            options,
-            idempotency_key: key,
+            traceparent: telemetry::traceparent(),
             ..Record::new(status)
-        };
+        });
+        record.request_sha256 = request_sha256(upload, &record.options);
+        if record.options.semantics == SemanticsMode::Off {
+            record.status.semantics.state = SemanticsState::Off;
+        }
         let made = self.jobs.submit(upload, record)?;
         let replayed = made != id;
         if !replayed {

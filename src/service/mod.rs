@@ -48,7 +48,7 @@ pub use crate::scene::{
 use crate::{
     config::Config,
     error::{Error, Result},
-    jobs::{Jobs, SceneMaker, SemanticsMaker},
+    jobs::{Jobs, Networks, SceneMaker, SemanticsMaker},
     keys::Caller,
     limits::Limits,
     render::Renderer,
@@ -295,7 +295,14 @@ impl Service {
     /// What makes and renders the scenes.
     #[must_use]
     pub fn models(&self) -> ModelsInfo {
-        self.inner.models.clone()
+        let mut models = self.inner.models.clone();
+        match self.inner.jobs.networks() {
+            Networks::Open("") => {}
+            Networks::Open(provider) => provider.clone_into(&mut models.execution_provider),
+            Networks::Opening => "opening".clone_into(&mut models.execution_provider),
+            Networks::Broken => "broken".clone_into(&mut models.execution_provider),
+        }
+        models
     }
 
     /// Whether new work is taken, and how much there is.
@@ -304,6 +311,11 @@ impl Service {
         let (jobs_queued, jobs_running) = self.inner.jobs.counts();
         Readiness {
             ready: self.inner.jobs.is_open(),
+            networks: match self.inner.jobs.networks() {
+                Networks::Opening => "opening",
+                Networks::Open(_) => "open",
+                Networks::Broken => "broken",
+            },
             jobs_queued,
             jobs_running,
             renders: self.inner.gate.inside(),

@@ -21,6 +21,8 @@ pub struct CreateScene {
     pub idempotency_key: Option<String>,
     /// How long to wait for the scene before answering, capped by `limits.wait_ms_max`.
     pub wait: Option<Duration>,
+    /// Id of the request, for the log and the trace of the scene's job.
+    pub request_id: Option<String>,
 }
 
 /// Answer of a create call.
@@ -542,6 +544,8 @@ pub struct ModelInfo {
 pub struct Readiness {
     /// Whether new work is taken.
     pub ready: bool,
+    /// The networks: `opening` (scenes are taken and wait for them), `open`, or `broken`.
+    pub networks: &'static str,
     /// Jobs that wait.
     pub jobs_queued: usize,
     /// Jobs at work.

@@ -36,6 +36,12 @@ pub struct Record {
     /// The replica that makes it, where replicas share the store.
     #[serde(default)]
     pub replica: Option<String>,
+    /// Id of the request that asked for it.
+    #[serde(default)]
+    pub request_id: Option<String>,
+    /// Its span in the caller's trace (W3C), where spans are exported.
+    #[serde(default)]
+    pub traceparent: Option<String>,
 }
 
 impl Record {
@@ -53,6 +59,8 @@ impl Record {
             semantics_sha256: None,
             content_sha256: None,
             replica: None,
+            request_id: None,
+            traceparent: None,
         }
     }
 }

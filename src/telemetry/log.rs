@@ -92,3 +92,13 @@ pub fn follow(span: &tracing::Span, traceparent: &str) {
     // The one error is that nobody exports spans.
     let _ = span.set_parent(TraceContextPropagator::new().extract(&carrier));
 }
+
+/// The `traceparent` (W3C) of the span that the calling thread is in; `None` where no spans are
+/// exported.
+#[must_use]
+pub fn traceparent() -> Option<String> {
+    let mut carrier = HashMap::new();
+    let context = tracing::Span::current().context();
+    TraceContextPropagator::new().inject_context(&context, &mut carrier);
+    carrier.remove("traceparent")
+}

@@ -6,4 +6,4 @@
 pub mod log;
 pub mod meter;
 
-pub use self::log::{follow, start};
+pub use self::log::{follow, start, traceparent};

@@ -186,10 +186,10 @@ fn hostile() -> Vec<(String, Sent, &'static str)> {
     cases
 }
 
-/// The code of the refusal.
-async fn send(base: &str, clients: &[reqwest::Client; 2], sent: &Sent) -> String {
+/// The request, ready to go: what it takes to put it together is no time of the server's.
+fn request(base: &str, clients: &[reqwest::Client; 2], sent: &Sent) -> reqwest::RequestBuilder {
     let [http, h2] = clients;
-    let request = match sent {
+    match sent {
         Sent::Form(upload) => http.post(format!("{base}{SCENES}")).multipart(form(upload)),
         Sent::Post(path, kind, body) => {
             http.post(format!("{base}{path}")).header("content-type", *kind).body(body.clone())
@@ -208,7 +208,11 @@ async fn send(base: &str, clients: &[reqwest::Client; 2], sent: &Sent) -> String
             .header("content-type", "application/grpc")
             .header("te", "trailers")
             .body(body.clone()),
-    };
+    }
+}
+
+/// The code of the refusal.
+async fn send(request: reqwest::RequestBuilder) -> String {
     let answer = request.send().await.expect("an answer");
     if let Some(code) = answer.headers().get("segsplat-code") {
         return code.to_str().unwrap().to_owned();
@@ -242,13 +246,14 @@ async fn what_wants_to_hurt_is_refused_at_once_and_in_little_memory() {
     assert!(cases.len() >= 40, "{}", cases.len());
     // The first connection of each kind is no part of what is measured.
     for warm in [Sent::Get("/healthz".into()), Sent::Rpc("ListScenes", framed(0, 0, &[]))] {
-        send(&server.url, &clients, &warm).await;
+        send(request(&server.url, &clients, &warm)).await;
     }
     let idle = server.peak();
     let (mut wrong, mut slowest) = (Vec::new(), Duration::ZERO);
     for (case, sent, want) in &cases {
+        let request = request(&server.url, &clients, sent);
         let begun = Instant::now();
-        let code = send(&server.url, &clients, sent).await;
+        let code = send(request).await;
         let (took, peak) = (begun.elapsed(), (server.peak() - idle) >> 20);
         println!("{case}: {code} after {took:.1?}, memory {peak} MiB over idle");
         if code != *want || took > slow {

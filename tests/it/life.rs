@@ -1,13 +1,30 @@
-//! The end of a server's life: not ready first, then nobody new, those inside finish.
+//! A server's life: ready before its networks are open; at the end not ready first, then nobody
+//! new, those inside finish.
 
 use std::{
-    sync::{Arc, atomic::Ordering},
+    path::{Path, PathBuf},
+    process::Command,
+    sync::{
+        Arc,
+        atomic::{AtomicU8, Ordering},
+    },
     time::{Duration, Instant},
 };
 
 use reqwest::Client;
+use segsplat::{
+    error::Result,
+    jobs::{Made, Networks, SceneMaker, Work},
+    limits::Limits,
+    scene::Upload,
+};
+use serde_json::Value;
 
-use crate::common::server::{TestServer, WallMaker, upload};
+use crate::common::{
+    process::{Start, can_serve, long},
+    root,
+    server::{TestServer, WallMaker, upload},
+};
 
 /// A server whose one scene is held back until the test lets go.
 async fn held(change: impl FnOnce(&mut segsplat::config::Config)) -> (Arc<WallMaker>, TestServer) {
@@ -91,4 +108,139 @@ async fn an_idle_server_ends_at_once() {
     let begun = Instant::now();
     server.stop().await;
     assert!(begun.elapsed() < Duration::from_secs(5), "{:?}", begun.elapsed());
+}
+
+/// A maker whose networks stand where the test wants them.
+#[derive(Debug, Default)]
+struct Late {
+    walls: WallMaker,
+    networks: AtomicU8,
+}
+
+impl SceneMaker for Late {
+    fn networks(&self) -> Networks {
+        let all = [Networks::Opening, Networks::Open("somewhere"), Networks::Broken];
+        all[usize::from(self.networks.load(Ordering::Acquire))]
+    }
+
+    fn check(&self, upload: &Upload, limits: &Limits) -> Result<()> {
+        self.walls.check(upload, limits)
+    }
+
+    fn make(&self, work: Work<'_>) -> Result<Made> {
+        assert_eq!(self.networks.load(Ordering::Acquire), 1, "too early");
+        self.walls.make(work)
+    }
+}
+
+async fn late() -> (Arc<Late>, TestServer) {
+    let maker = Arc::new(Late::default());
+    let of_server = Arc::clone(&maker);
+    (maker, TestServer::with(|_, parts| parts.maker = of_server).await)
+}
+
+/// What `path` says; whether it is a 200.
+async fn says(server: &TestServer, path: &str) -> (bool, Value) {
+    let answer = Client::new().get(server.url(path)).send().await.unwrap();
+    (answer.status() == 200, answer.json().await.unwrap())
+}
+
+#[tokio::test]
+async fn scenes_are_taken_while_the_networks_are_opened_and_wait_for_them() {
+    let (maker, server) = late().await;
+    let (ready, said) = says(&server, "/readyz").await;
+    assert!(ready && said["networks"] == "opening", "{said}");
+    let (_, models) = says(&server, "/v1/models").await;
+    assert_eq!(models["execution_provider"], "opening");
+    let create = server.url("/v1/scenes?wait_ms=60000");
+    let form = crate::common::doors::form(&upload());
+    let made = tokio::spawn(Client::new().post(create).multipart(form).send());
+    until("one scene waits", async || server.service.ready().jobs_queued == 1).await;
+    tokio::time::sleep(Duration::from_millis(50)).await;
+    assert_eq!(server.service.ready().jobs_running, 0, "nothing to make it with");
+    maker.networks.store(1, Ordering::Release);
+    assert_eq!(made.await.unwrap().unwrap().status(), 201);
+    let (ready, said) = says(&server, "/readyz").await;
+    assert!(ready && said["networks"] == "open", "{said}");
+    assert_eq!(says(&server, "/v1/models").await.1["execution_provider"], "somewhere");
+}
+
+#[tokio::test]
+async fn what_is_queued_stays_queued_where_the_networks_do_not_open() {
+    let (maker, server) = late().await;
+    let form = crate::common::doors::form(&upload());
+    let made = Client::new().post(server.url("/v1/scenes")).multipart(form).send().await.unwrap();
+    let id = made.json::<Value>().await.unwrap()["id"].as_str().unwrap().to_owned();
+    maker.networks.store(2, Ordering::Release);
+    until("not ready", async || !says(&server, "/readyz").await.0).await;
+    assert_eq!(says(&server, "/readyz").await.1["networks"], "broken");
+    let (_, scene) = says(&server, &format!("/v1/scenes/{id}")).await;
+    assert_eq!(scene["state"], "queued", "another start may make it");
+}
+
+/// `plane` with another byte in its network.
+fn spoilt(folder: &Path) -> PathBuf {
+    for entry in std::fs::read_dir(root().join("tests/fixtures/plane")).unwrap() {
+        let path = entry.unwrap().path();
+        let mut bytes = std::fs::read(&path).unwrap();
+        if path.extension().is_some_and(|end| end == "onnx") {
+            bytes[100] ^= 1;
+        }
+        std::fs::write(folder.join(path.file_name().unwrap()), bytes).unwrap();
+    }
+    folder.to_owned()
+}
+
+#[test]
+fn a_server_whose_networks_do_not_open_ends_and_says_why() {
+    if !can_serve() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let ended = Command::new(env!("CARGO_BIN_EXE_segsplat"))
+        .current_dir(root())
+        .args(["serve", "--listen", "127.0.0.1:0", "--renderer", "cpu", "--anonymous"])
+        .arg("--bundle")
+        .arg(spoilt(folder.path()))
+        .arg("--data-dir")
+        .arg(folder.path().join("data"))
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&ended.stderr);
+    assert_eq!(ended.status.code(), Some(6), "{said}");
+    assert!(said.contains("is not the file of bundle.toml: sha256"), "{said}");
+}
+
+/// The time to ready against that to open networks, which a server once waited for. A release build
+/// on a quiet machine (`RUN_SLOW_TESTS=1`) holds the bars: ready in a second, idle end in 0.3 s.
+#[tokio::test]
+async fn ready_comes_long_before_the_networks_are_open() {
+    if !can_serve() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let begun = Instant::now();
+    let server = Start::on(folder.path()).bundle("../../models/embedded").start();
+    let (client, ready) = (Client::new(), server.url("/readyz"));
+    let ask = async || client.get(&ready).send().await.unwrap().text().await.unwrap();
+    let first = ask().await;
+    let ready = begun.elapsed();
+    assert!(first.contains("\"ready\":true"), "{first}");
+    let mut now = first.clone();
+    while now.contains("opening") {
+        assert!(begun.elapsed() < Duration::from_secs(120), "{now}");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+        now = ask().await;
+    }
+    let open = begun.elapsed();
+    assert!(now.contains("\"networks\":\"open\""), "{now}");
+    let begun = Instant::now();
+    assert!(server.stop(), "it ends well");
+    let end = begun.elapsed();
+    println!("ready after {ready:?}, networks open after {open:?}, idle end in {end:?}");
+    assert!(first.contains("opening") && ready < open.mul_f64(0.7), "{ready:?} of {open:?}");
+    if long() {
+        assert!(ready < Duration::from_secs(1), "ready after {ready:?}");
+        assert!(end < Duration::from_millis(300), "idle end in {end:?}");
+    }
 }

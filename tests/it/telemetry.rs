@@ -4,6 +4,7 @@ use std::{
     collections::BTreeSet,
     io::{Read, Write},
     net::TcpListener,
+    sync::{Arc, Mutex},
     time::Duration,
 };
 
@@ -220,6 +221,51 @@ async fn spans_go_to_the_collector_as_a_part_of_the_callers_trace() {
     assert!(has(&0x0af7_6519_16cd_43dd_8448_eb21_1c80_319c_u128.to_be_bytes()));
     assert!(has(&0xb7ad_6b71_6920_3331_u64.to_be_bytes()));
     assert!(!has(b"very secret"), "a key went out");
+}
+
+/// The trace, span and parent of the span of this name, as protobuf has them one after the other.
+fn span_of<'a>(got: &'a [u8], name: &str) -> Option<[&'a [u8]; 3]> {
+    let named = [b"\x2a", &[name.len() as u8][..], name.as_bytes()].concat();
+    let at = got.windows(named.len()).position(|w| w == named)?;
+    let (parent, span, trace) = (at - 10, at - 20, at - 38);
+    let heads = [&got[trace..trace + 2], &got[span..span + 2], &got[parent..parent + 2]];
+    assert_eq!(heads, [b"\x0a\x10", b"\x12\x08", b"\x22\x08"], "{name}");
+    Some([&got[trace + 2..span], &got[span + 2..parent], &got[parent + 2..at]])
+}
+
+#[tokio::test]
+async fn a_scenes_job_has_a_span_in_the_trace_of_the_call_that_asked_for_it() {
+    if !can_serve() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let collector = format!("http://{}", listener.local_addr().unwrap());
+    let got = Arc::<Mutex<Vec<u8>>>::default();
+    let so_far = Arc::clone(&got);
+    // Until the test ends: nobody can say in how many pieces the spans come.
+    std::thread::spawn(move || {
+        loop {
+            let piece = collect(&listener);
+            so_far.lock().unwrap().extend(piece);
+        }
+    });
+    let server = Start::on(&folder.path().join("data")).arg("--otlp").arg(&collector).start();
+    let call = Client::new()
+        .post(server.url("/v1/scenes?wait_ms=60000"))
+        .header("traceparent", "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01")
+        .header("x-request-id", "asked-by-a-test")
+        .multipart(crate::common::doors::form(&upload()));
+    assert_eq!(call.send().await.unwrap().status(), 201);
+    assert!(tokio::task::spawn_blocking(|| server.stop()).await.unwrap(), "it ends well");
+    let got = got.lock().unwrap().clone();
+    let [[trace, call, _], [of_scene, scene, above], [of_stage, _, over]] =
+        ["http", "scene", "stage"].map(|name| span_of(&got, name).expect(name));
+    let callers = 0x0af7_6519_16cd_43dd_8448_eb21_1c80_319c_u128.to_be_bytes();
+    assert_eq!([trace, of_scene, of_stage], [&callers[..]; 3]);
+    assert_eq!((above, over), (call, scene), "a stage is in the scene, the scene in the call");
+    let ids = got.windows(15).filter(|w| w == b"asked-by-a-test").count();
+    assert!(ids >= 2, "call and job carry the request's id");
 }
 
 #[tokio::test]

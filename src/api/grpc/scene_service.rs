@@ -12,7 +12,7 @@ use super::{
 };
 use crate::{
     api::{
-        Api,
+        Api, request_id,
         semantics::check_bundle,
         upload::{UploadBuilder, UploadGuard},
     },
@@ -39,7 +39,9 @@ impl pb::scene_service_server::SceneService for Api {
         request: Request<Streaming<pb::CreateSceneRequest>>,
     ) -> Answer<pb::Scene> {
         let api = called(self, &request)?;
-        let scene = create(&api, request.into_inner()).await.map_err(|e| logged(&e))?;
+        let request_id = request.metadata().get(request_id::HEADER);
+        let request_id = request_id.and_then(|id| id.to_str().ok()).map(str::to_owned);
+        let scene = create(&api, request.into_inner(), request_id).await.map_err(|e| logged(&e))?;
         Ok(Response::new(scene))
     }
 
@@ -138,7 +140,11 @@ fn called<T>(api: &Api, request: &Request<T>) -> Result<Api, Status> {
     Ok(api.for_caller(caller))
 }
 
-async fn create(api: &Api, messages: Streaming<pb::CreateSceneRequest>) -> Result<pb::Scene> {
+async fn create(
+    api: &Api,
+    messages: Streaming<pb::CreateSceneRequest>,
+    request_id: Option<String>,
+) -> Result<pb::Scene> {
     let (upload, header, _guard) = receive(api, messages).await?;
     let wait = header.wait_ms.map(Duration::from_millis);
     let request = CreateScene {
@@ -150,6 +156,7 @@ async fn create(api: &Api, messages: Streaming<pb::CreateSceneRequest>) -> Resul
         },
         idempotency_key: Some(header.idempotency_key).filter(|key| !key.is_empty()),
         wait,
+        request_id,
     };
     let created = api.service.create_scene(request).await?;
     match (&created.status.error, wait) {

@@ -55,6 +55,9 @@ async fn rest_within(
     method: Method,
     path: String,
 ) -> Response {
+    if let Ok(value) = HeaderValue::from_str(&id) {
+        request.headers_mut().insert(request_id::HEADER, value);
+    }
     let started = Instant::now();
     let mut response = match deadline_of_query(request.uri().query()) {
         Err(error) => ApiError::from(error).into_response(),

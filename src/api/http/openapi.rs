@@ -509,6 +509,8 @@ pub(super) struct Model {
 pub(super) struct Readiness {
     /// Whether new work is taken.
     ready: bool,
+    /// `opening` (scenes are taken and wait), `open` or `broken`.
+    networks: String,
     /// Jobs that wait.
     jobs_queued: u64,
     /// Jobs at work.

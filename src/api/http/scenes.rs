@@ -22,7 +22,7 @@ use super::{
 };
 use crate::{
     api::{
-        Api,
+        Api, request_id,
         semantics::{check_bundle, mode},
     },
     error::{Error, Result},
@@ -48,9 +48,11 @@ pub(super) async fn create(
     request: Request,
 ) -> Result<Response, ApiError> {
     let idempotency_key = idempotency_key(request.headers())?;
+    let request_id = request.headers().get(request_id::HEADER);
+    let request_id = request_id.and_then(|id| id.to_str().ok()).map(str::to_owned);
     let (upload, _guard) = receive(&api, request, &mut params).await?;
     let (options, wait) = options(&api, params)?;
-    let request = CreateScene { upload, options, idempotency_key, wait };
+    let request = CreateScene { upload, options, idempotency_key, wait, request_id };
     let created = api.service.create_scene(request).await?;
     if let (Some(error), Some(_)) = (&created.status.error, wait) {
         return Err(ApiError::of_scene(error.to_error(), &created.status.id));
