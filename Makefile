@@ -3,6 +3,7 @@
 # make test    every check: format, lints, docs, all tests, in one (release) profile
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
 # make eval-scenes   labelled scenes of held-out things, rendered to target/eval/scenes (g++, PYTHON)
+# make plots  docs/plots from benches/runs (PYTHON with matplotlib)
 # make test-long   the random tests with many more cases, and the slow ones
 # make fuzz    every reader of bytes from outside, FUZZ_SECONDS=600 each
 
@@ -12,12 +13,12 @@ TARGET := $(or $(CARGO_TARGET_DIR),target)
 SEGSPLAT := $(TARGET)/release/segsplat
 DATA ?= $(or $(SEGSPLAT_SHARED_DATA),../shared/data)/scenes
 ARGS ?=
-# With numpy, pillow and trimesh; only for `make eval-scenes`.
+# With numpy, pillow and trimesh for `make eval-scenes`, matplotlib for `make plots`.
 PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/vulkan/env ]; then . $(abspath $(TARGET))/vulkan/env; fi;
 
-.PHONY: demo serve test test-long fuzz bench eval eval-scenes setup build fmt lint doc tests deny
+.PHONY: demo serve test test-long fuzz bench eval eval-scenes plots setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -45,7 +46,7 @@ deny:
 	else echo 'cargo-deny is not installed: licences and sources are not checked'; fi
 
 test-long: setup
-	$(ADAPTER) RUN_SLOW_TESTS=1 FUZZ_ITERS=20000 PROPTEST_CASES=2048 \
+	$(ADAPTER) RUN_SLOW_TESTS=1 FUZZ_ITERS=20000 FUZZ_SCENES=1000 FUZZ_GAUSSIANS=20001 PROPTEST_CASES=2048 \
 		$(CARGO) test --locked --release --test it
 
 # Each target of tests/it/fuzz_input.rs for FUZZ_SECONDS of its own, one after the other.
@@ -63,6 +64,9 @@ eval: build
 eval-scenes:
 	$(PYTHON) models/training/semantics/eval_scenes.py --data $(dir $(DATA)) \
 		--out $(TARGET)/eval/scenes
+
+plots:
+	$(PYTHON) benches/plots.py benches/runs docs/plots
 
 build: setup
 	$(CARGO) build --locked --release

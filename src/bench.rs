@@ -5,35 +5,39 @@
 //! cameras a fifth of the depth apart, drawn from between them. Its Gaussians carry bank indices in
 //! patches, as things are: `--labels` times labels beside colour.
 
+mod compared;
 mod generated;
 
-use std::{collections::BTreeMap, path::PathBuf, time::Instant};
+use std::{path::PathBuf, time::Instant};
 
 use glam::DVec3;
 use serde::Serialize;
 
-pub use self::generated::scene;
-use self::generated::{Random, dump};
+pub use self::{
+    compared::{Compared, DIFFERENCE_MAX, ORACLE_PIXELS},
+    generated::scene,
+};
+use self::{
+    compared::{compare, compare_oracle},
+    generated::{Random, dump},
+};
 use crate::{
     config::Config,
     error::{Error, Result},
     render::{
-        DeviceTimes, Frame, Kinds, Labels, Quality, RenderRequest, Renderer, StageTime,
+        DeviceTimes, Kinds, Labels, Quality, RenderRequest, Renderer, StageTime,
         cpu::CpuRenderer,
         gpu::GpuOptions,
-        oracle,
         select::{AdapterReport, select_with},
     },
     scene::{Camera, CameraToWorld, Gaussians},
 };
 
-/// Pixels apart by more than this are looked at by the oracle: one level of an 8-bit picture.
-pub const DIFFERENCE_MAX: f32 = 1.0 / 255.0;
 /// Most Gaussians that a bench makes.
 pub const GAUSSIANS_MAX: usize = 16 << 20;
 
 /// What to time.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct BenchArgs {
     /// Gaussians, 2 and more; rounded down to two square photos.
     pub gaussians: usize,
@@ -51,12 +55,23 @@ pub struct BenchArgs {
     pub dump: Option<PathBuf>,
     /// Frames after the first.
     pub frames: usize,
-    /// Whether to compare with the CPU renderer.
-    pub compare_cpu: bool,
+    /// How closely to keep to the model.
+    pub quality: Quality,
+    /// What to compare the picture with.
+    pub compare: Option<Reference>,
     /// Labels to time beside colour.
     pub labels: Option<BenchLabels>,
     /// Rows of the bank (M): indices that occur in the scene.
     pub bank: u16,
+}
+
+/// What a picture is compared with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Reference {
+    /// The exact pictures of the CPU renderer, every pixel.
+    Cpu,
+    /// The f64 oracle, at [`ORACLE_PIXELS`] places.
+    Oracle,
 }
 
 /// Labels that a bench times.
@@ -100,7 +115,7 @@ pub struct BenchReport {
     pub device: Option<DeviceTimes>,
     /// Views a second by callers, where they were asked for.
     pub callers: Option<CallerTimes>,
-    /// Difference to the CPU renderer, where it was asked for.
+    /// Difference to the reference, where one was asked for.
     pub compared: Option<Compared>,
     /// Times of labels, where they were asked for.
     pub labels: Option<LabelTimes>,
@@ -142,24 +157,6 @@ pub struct LabelTimes {
     pub compared: Option<Compared>,
 }
 
-/// How a picture differs from the CPU renderer's: colour, alpha, labels, and depth relative to
-/// depth.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
-pub struct Compared {
-    /// Pixels compared.
-    pub pixels: usize,
-    /// Largest difference of the pixels that are not `flips`.
-    pub max: f32,
-    /// Mean difference of all pixels.
-    pub mean: f64,
-    /// Pixels apart by more than 1/255 where the oracle stands at a cliff.
-    pub flips: usize,
-    /// Pixels apart by more than 1/255 elsewhere: faults.
-    pub faults: usize,
-    /// Median frame of the CPU renderer, for scale.
-    pub cpu_median_ms: f64,
-}
-
 /// Renders the scene of `args` with the renderer that `config` asks for.
 ///
 /// # Errors
@@ -178,12 +175,12 @@ pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
     let (gaussians, camera) = scene(args)?;
     let request = RenderRequest {
         camera,
-        kinds: Kinds { color: true, depth: args.compare_cpu, alpha: args.compare_cpu },
+        kinds: if args.compare.is_some() { Kinds::ALL } else { Kinds::COLOR },
         labels: Labels::None,
         background: [0.1, 0.2, 0.3],
         antialiased: false,
         near: 0.05,
-        quality: Quality::Exact,
+        quality: args.quality,
         crop: None,
     };
     let begun = Instant::now();
@@ -211,15 +208,18 @@ pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
         None => None,
     };
     // After the times: a GPU that waits meanwhile lowers its clocks.
-    let compared = if args.compare_cpu {
-        let cpu = CpuRenderer::new(config.threads)?;
-        let want = cpu.render(&gaussians, &request)?;
-        let mut compared = compare(&frame, &want, &gaussians, &request)?;
-        let times = self::times(&cpu, &gaussians, &request, args.frames.min(20))?;
-        compared.cpu_median_ms = times[times.len() / 2];
-        Some(compared)
-    } else {
-        None
+    let compared = match args.compare {
+        Some(Reference::Cpu) => {
+            let cpu = CpuRenderer::new(config.threads)?;
+            let exact = RenderRequest { quality: Quality::Exact, ..request.clone() };
+            let want = cpu.render(&gaussians, &exact)?;
+            let mut compared = compare(&frame, &want, &gaussians, &request)?;
+            let times = self::times(&cpu, &gaussians, &exact, args.frames.min(20))?;
+            compared.cpu_median_ms = times[times.len() / 2];
+            Some(compared)
+        }
+        Some(Reference::Oracle) => Some(compare_oracle(&frame, &gaussians, &request)?),
+        None => None,
     };
     Ok(BenchReport {
         renderer: renderer.name(),
@@ -363,12 +363,13 @@ fn label_times(
     let device = device_times(renderer, gaussians, &alone, args.frames)?;
     let device_all = device_times(renderer, gaussians, &all, args.frames)?;
     let frame = renderer.render(gaussians, &alone)?;
-    let compared = match args.compare_cpu {
-        true => {
-            let want = CpuRenderer::new(config.threads)?.render(gaussians, &alone)?;
+    let compared = match args.compare {
+        Some(Reference::Cpu) => {
+            let exact = RenderRequest { quality: Quality::Exact, ..alone.clone() };
+            let want = CpuRenderer::new(config.threads)?.render(gaussians, &exact)?;
             Some(compare(&frame, &want, gaussians, &alone)?)
         }
-        false => None,
+        _ => None,
     };
     Ok(LabelTimes {
         labels,
@@ -381,72 +382,6 @@ fn label_times(
         device_all,
         entries: frame.entries.map_or(0, |entries| entries.index.len()),
         compared,
-    })
-}
-
-/// Largest difference of each pixel over its channels; a NaN is infinitely far.
-fn differences(got: &Frame, want: &Frame) -> Vec<f32> {
-    fn pair<'a, T>(
-        got: Option<&'a Vec<T>>,
-        want: Option<&'a Vec<T>>,
-    ) -> Option<(&'a [T], &'a [T])> {
-        Some((got?.as_slice(), want?.as_slice()))
-    }
-    let colors = pair(got.color.as_ref(), want.color.as_ref());
-    let depths = pair(got.depth.as_ref(), want.depth.as_ref());
-    let alphas = pair(got.alpha.as_ref(), want.alpha.as_ref());
-    let blends = pair(got.blend.as_ref(), want.blend.as_ref());
-    let entries = got.entries.as_ref().zip(want.entries.as_ref());
-    let pixels = want.width as usize * want.height as usize;
-    (0..pixels)
-        .map(|i| {
-            let mut worst = 0.0_f32;
-            let mut add = |difference: f32| {
-                let d = if difference.is_nan() { f32::INFINITY } else { difference.abs() };
-                worst = worst.max(d);
-            };
-            if let Some((got, want)) = colors {
-                (0..3).for_each(|k| add(got[i][k] - want[i][k]));
-            }
-            if let Some((got, want)) = depths {
-                add((got[i] - want[i]) / want[i].abs().max(1.0));
-            }
-            if let Some((got, want)) = alphas {
-                add(got[i] - want[i]);
-            }
-            if let Some((got, want)) = blends {
-                (0..4).for_each(|k| add(got[i][k] - want[i][k]));
-            }
-            if let Some((got, want)) = entries {
-                let mut sums: BTreeMap<u16, f32> = got.pixel(i).collect();
-                want.pixel(i).for_each(|(m, weight)| *sums.entry(m).or_default() -= weight);
-                sums.into_values().for_each(&mut add);
-            }
-            worst
-        })
-        .collect()
-}
-
-fn compare(
-    got: &Frame,
-    want: &Frame,
-    gaussians: &Gaussians,
-    request: &RenderRequest,
-) -> Result<Compared> {
-    let apart = differences(got, want);
-    let far: Vec<usize> = (0..apart.len()).filter(|&i| apart[i] > DIFFERENCE_MAX).collect();
-    let pixels: Vec<[u32; 2]> =
-        far.iter().map(|&i| [i as u32 % want.width, i as u32 / want.width]).collect();
-    let truth = oracle::render_pixels(gaussians, request, oracle::DepthKey::F32, &pixels)?;
-    let flips = truth.iter().filter(|pixel| pixel.cliff.any()).count();
-    let near = apart.iter().copied().filter(|&d| d <= DIFFERENCE_MAX);
-    Ok(Compared {
-        pixels: apart.len(),
-        max: near.fold(0.0, f32::max),
-        mean: apart.iter().map(|&d| f64::from(d)).sum::<f64>() / apart.len().max(1) as f64,
-        flips,
-        faults: far.len() - flips,
-        cpu_median_ms: 0.0,
     })
 }
 
@@ -466,7 +401,8 @@ mod tests {
             dump: None,
             checked: false,
             frames: 1,
-            compare_cpu: true,
+            quality: Quality::Exact,
+            compare: Some(Reference::Cpu),
             labels: Some(BenchLabels::Entries),
             bank: 24,
         };
@@ -479,6 +415,12 @@ mod tests {
         let compared = labels.compared.expect("labels were compared");
         assert_eq!((compared.max, compared.flips, compared.faults), (0.0, 0, 0), "itself");
         assert!(labels.entries > 24, "{} entries", labels.entries);
+
+        let report = run(&BenchArgs { compare: Some(Reference::Oracle), ..args.clone() }, &config);
+        let compared = report.expect("a bench").compared.expect("a comparison");
+        assert_eq!((compared.pixels, compared.flips, compared.faults), (4096, 0, 0), "the oracle");
+        assert!(compared.worst > 0.0 && compared.worst < 2e-5, "{compared:?}");
+        assert!(compared.psnr_db.is_some_and(|db| db > 100.0), "{compared:?}");
 
         let (gaussians, camera) = scene(&args).expect("a scene");
         let request = RenderRequest {

@@ -115,6 +115,7 @@ with torch.inference_mode():
                 "mask_stages": report["labels"]["device"]["stages"],
             },
             "difference": {"max": apart.max().item(), "mean": apart.mean().item(),
+                           "psnr_db": -10 * apart.double().square().mean().log10().item(),
                            "over_1_255": (apart.amax(-1) > 1 / 255).sum().item()},
         }
         rows.append(row)

@@ -13,7 +13,7 @@ use serde_json::json;
 
 use super::{engine, output::Output};
 use crate::{
-    bench::{self, BenchArgs, BenchLabels, CallerTimes, LabelTimes},
+    bench::{self, BenchArgs, BenchLabels, CallerTimes, LabelTimes, Reference},
     config::{Config, ConfigArgs},
     error::{Error, Result},
     jobs::{PipelineMaker, SceneMaker, Work},
@@ -59,9 +59,12 @@ pub(super) struct Args {
     /// With --gaussians: frames after the first
     #[arg(long, default_value_t = 50)]
     frames: usize,
-    /// With --gaussians: compares the picture with that of the CPU renderer
+    /// With --gaussians: exact, or fast within a stated error
+    #[arg(long, value_parser = super::camera::quality, default_value = "exact")]
+    quality: Quality,
+    /// With --gaussians: compares the picture with another of it
     #[arg(long)]
-    compare: Option<Reference>,
+    compare: Option<ReferenceArg>,
     /// With --gaussians: times these labels beside colour
     #[arg(long)]
     labels: Option<LabelArg>,
@@ -74,8 +77,11 @@ pub(super) struct Args {
 
 /// What a picture is compared with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum Reference {
+enum ReferenceArg {
+    /// The CPU renderer's exact pictures
     Cpu,
+    /// The f64 oracle, at some thousand pixels
+    Oracle,
 }
 
 /// Labels to time.
@@ -97,10 +103,13 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
 /// The renderer alone.
 fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Result<()> {
     let (size, frames) = (args.size, args.frames);
-    let compare_cpu = args.compare.is_some();
     let labels = args.labels.map(|labels| match labels {
         LabelArg::Blend => BenchLabels::Blend,
         LabelArg::Entries => BenchLabels::Entries,
+    });
+    let compare = args.compare.map(|reference| match reference {
+        ReferenceArg::Cpu => Reference::Cpu,
+        ReferenceArg::Oracle => Reference::Oracle,
     });
     let width = args.width.unwrap_or(size);
     let wanted = BenchArgs {
@@ -112,7 +121,8 @@ fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Resul
         dump: args.dump.clone(),
         checked: args.checked,
         frames,
-        compare_cpu,
+        quality: args.quality,
+        compare,
         labels,
         bank: args.bank,
     };
@@ -149,9 +159,16 @@ fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Resul
     if let Some(found) = &report.compared {
         let _ = writeln!(
             text,
-            "against the CPU renderer ({:.2} ms): max {:.2e}, mean {:.2e}, {} of {} px flipped at \
-             a cliff, {} faults",
-            found.cpu_median_ms, found.max, found.mean, found.flips, found.pixels, found.faults
+            "against the reference (CPU {:.2} ms): max {:.2e}, mean {:.2e}, {} of {} px flipped at \
+             a cliff, {} faults; of all {:.2e}, {:.1} dB",
+            found.cpu_median_ms,
+            found.max,
+            found.mean,
+            found.flips,
+            found.pixels,
+            found.faults,
+            found.worst,
+            found.psnr_db.unwrap_or(f64::INFINITY)
         );
     }
     if let Some(times) = &report.labels {
