@@ -7,7 +7,8 @@
 //
 // The first digit of the depth sort leaves dropped Gaussians behind, and its pairs have no values
 // yet: they are the places in memory, so that equal depths stay in the order of the scene. Keys are
-// taken relative to the least one: digits that are then 0 for all are not sorted at all.
+// taken relative to the least one: digits that are then 0 for all are not sorted at all. Of a fast
+// view they are cut to two digits.
 
 @group(0) @binding(1) var<uniform> params: SortParams;
 @group(0) @binding(2) var<storage, read_write> plans: array<Plan>;
@@ -52,6 +53,13 @@ fn least_key() -> u32 {
     return select(0u, atomicLoad(&plans[which].key_min), is_first());
 }
 
+// Lowest bits of a depth that a fast view leaves out.
+fn blunt_bits() -> u32 {
+    let range = atomicLoad(&plans[which].key_max) - atomicLoad(&plans[which].key_min);
+    let bits = max(32u - countLeadingZeros(range), FAST_KEY_BITS);
+    return select(0u, bits - FAST_KEY_BITS, is_first() && views[which].fast != 0u);
+}
+
 fn blocks_of(count: u32) -> u32 {
     return (count + SORT_BLOCK - 1u) / SORT_BLOCK;
 }
@@ -81,6 +89,7 @@ fn histogram(
     let first = ((params.pass_at & 1u) * groups.z + which) * stride();
     let least = least_key();
     let drops = is_first();
+    let blunt = blunt_bits();
     atomicStore(&counts[local], 0u);
     workgroupBarrier();
     if block < blocks {
@@ -88,7 +97,7 @@ fn histogram(
         for (var i = block * SORT_BLOCK + local; i < end; i += WORKGROUP_SIZE) {
             let key = keys[first + i];
             if !(drops && key == DROPPED_KEY) {
-                atomicAdd(&counts[digit_of(key - least)], 1u);
+                atomicAdd(&counts[digit_of((key - least) >> blunt)], 1u);
             }
         }
     }
@@ -150,7 +159,7 @@ fn spine(
     if is_first() && digit == 0u && local == 0u {
         let low = atomicLoad(&plans[which].key_min);
         let high = atomicLoad(&plans[which].key_max);
-        let bits = select(0u, 32u - countLeadingZeros(high - low), low < high);
+        let bits = select(0u, 32u - countLeadingZeros(high - low), low < high) - blunt_bits();
         let passes = max(1u, (bits + 7u) / 8u);
         atomicMax(&plans[0].passes, passes);
         let x = min(blocks, GROUPS_X_MAX);
@@ -184,6 +193,7 @@ fn scatter(
     let to_start = ((1u - from_half) * groups.z + which) * stride();
     let least = least_key();
     let drops = is_first();
+    let blunt = blunt_bits();
 
     let totals = totals_start(groups.z);
     sums[local] = digit_counts[totals + local];
@@ -229,7 +239,7 @@ fn scatter(
     // Every invocation takes every round: barriers stand in uniform control flow.
     for (var round = 0u; round < SORT_BLOCK / SORT_SIZE; round++) {
         let i = first + round * SORT_SIZE;
-        let key = next_key - least;
+        let key = (next_key - least) >> blunt;
         let valid = i < end && !(drops && next_key == DROPPED_KEY);
         let digit = digit_of(key);
         let mask = (round % 3u) * MASK;

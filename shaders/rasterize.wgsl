@@ -9,8 +9,9 @@
 @group(0) @binding(1) var<storage, read> footprints: array<Footprint>;
 @group(0) @binding(2) var<storage, read> isect_ids: array<u32>;
 @group(0) @binding(3) var<storage, read> ranges: array<u32>;
-// The pictures of the band one after another, each row-major.
-@group(0) @binding(4) var<storage, read_write> pictures: array<f32>;
+// The pictures of the band one after another, each row-major: f32 as bits. Of a fast view colour
+// and alpha share a word of four levels.
+@group(0) @binding(4) var<storage, read_write> pictures: array<u32>;
 // [views][N, 3] as shade gives them; of a scene of degree 0 its harmonics, [N, 3].
 @group(0) @binding(5) var<storage, read> colors: array<f32>;
 
@@ -222,17 +223,21 @@ fn main(
         let alpha = min(alpha_sum, 1.0);
         if WITH_COLOR && views[which].color_start != NO_PICTURE {
             let out = color + (1.0 - alpha) * views[which].background.xyz;
-            let to = views[which].color_start + at_pixel * 3u;
-            pictures[to] = out.x;
-            pictures[to + 1u] = out.y;
-            pictures[to + 2u] = out.z;
+            if views[which].fast != 0u {
+                pictures[views[which].color_start + at_pixel] = pack4x8unorm(vec4(out, alpha));
+            } else {
+                let to = views[which].color_start + at_pixel * 3u;
+                pictures[to] = bitcast<u32>(out.x);
+                pictures[to + 1u] = bitcast<u32>(out.y);
+                pictures[to + 2u] = bitcast<u32>(out.z);
+            }
         }
         if WITH_DEPTH && views[which].depth_start != NO_PICTURE {
             pictures[views[which].depth_start + at_pixel] =
-                select(0.0, depth / alpha_sum, alpha_sum > 0.0);
+                bitcast<u32>(select(0.0, depth / alpha_sum, alpha_sum > 0.0));
         }
         if views[which].alpha_start != NO_PICTURE {
-            pictures[views[which].alpha_start + at_pixel] = alpha;
+            pictures[views[which].alpha_start + at_pixel] = bitcast<u32>(alpha);
         }
         store_labels(at_pixel);
     }

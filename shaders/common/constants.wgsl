@@ -32,6 +32,8 @@ const GROUPS_DEPTH: u32 = 0u;
 const GROUPS_DIGITS: u32 = 3u;
 const GROUPS_TILES: u32 = 6u;
 const GROUPS_RANGES: u32 = 7u;
+// Bits of a fast view's depth keys: two digits of the sort.
+const FAST_KEY_BITS: u32 = 16u;
 // Depth key of a dropped Gaussian: after every finite depth.
 const DROPPED_KEY: u32 = 0xffffffffu;
 // Value of a pair that was counted and not emitted: blends nothing.

@@ -25,8 +25,9 @@ fn add_label(label: u32, paint: vec4<f32>, painted: bool, share: f32, pixel: u32
 
 fn store_labels(pixel: u32) {
     let first = views[which].blend_start + pixel * 4u;
-    pictures[first] = blended.x;
-    pictures[first + 1u] = blended.y;
-    pictures[first + 2u] = blended.z;
-    pictures[first + 3u] = blended.w;
+    let bits = bitcast<vec4<u32>>(blended);
+    pictures[first] = bits.x;
+    pictures[first + 1u] = bits.y;
+    pictures[first + 2u] = bits.z;
+    pictures[first + 3u] = bits.w;
 }

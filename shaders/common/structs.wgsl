@@ -48,8 +48,9 @@ struct View {
     // First number in `ranges`, and first sorted tile pair.
     range_start: u32,
     pair_start: u32,
-    reserved_1: u32,
-    reserved_2: u32,
+    // Not 0: pictures of 8 bits and a blunt order by depth, see conventions.md.
+    fast: u32,
+    reserved: u32,
 }
 
 struct Gaussian {

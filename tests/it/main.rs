@@ -20,6 +20,7 @@ mod containers;
 mod crop;
 mod errors;
 mod evaluate;
+mod fast;
 mod faults;
 mod fuzz;
 mod fuzz_input;

@@ -123,8 +123,8 @@ fn structs_lie_in_memory_as_their_twins_do() {
                 slot_start,
                 range_start,
                 pair_start,
-                reserved_1,
-                reserved_2,
+                fast,
+                reserved,
             ]
         ),
         twin!(GaussianRow, "Gaussian", [mean, opacity, quat, scale, reserved]),

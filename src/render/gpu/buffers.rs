@@ -49,8 +49,8 @@ pub struct ViewRow {
     pub slot_start: u32,
     pub range_start: u32,
     pub pair_start: u32,
-    pub reserved_1: u32,
-    pub reserved_2: u32,
+    pub fast: u32,
+    pub reserved: u32,
 }
 
 /// `Gaussian` of the shaders.

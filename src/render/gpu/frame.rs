@@ -18,7 +18,7 @@ use super::{
 use crate::{
     error::{Error, Result},
     render::{
-        Entries, Frame, FrameStats, Kinds, Labels, RenderRequest, StageTime,
+        Entries, Frame, FrameStats, Kinds, Labels, Quality, RenderRequest, StageTime,
         constants::TILE_SIZE,
         labels::{BLEND_WIDTH, EntryRows},
         view::View,
@@ -58,7 +58,10 @@ struct Layout {
     depth: u32,
     alpha: u32,
     blend: u32,
-    floats: u64,
+    /// Words of all pictures.
+    words: u64,
+    /// Whether colour, and alpha beside it, are words of four levels.
+    fast: bool,
     /// Pixels of the band.
     pixels: u64,
     /// Entries a pixel has room for; 0 where none are wanted.
@@ -68,7 +71,7 @@ struct Layout {
 
 impl Layout {
     fn picture_bytes(&self) -> u64 {
-        self.floats * 4
+        self.words * 4
     }
 
     /// A count a pixel, then an index and a weight a slot.
@@ -128,6 +131,7 @@ pub(super) struct Drawing<'a> {
 impl<'a> Drawing<'a> {
     pub(super) fn new(view: &View, request: &'a RenderRequest, scene: &Scene) -> Self {
         let mut row = ViewRow::new(view, request.background, request.antialiased);
+        row.fast = u32::from(request.quality == Quality::Fast);
         (row.gaussian_count, row.sh_count) = (scene.count, scene.sh_count);
         let pixels = view.width as usize * view.height as usize;
         let kinds = request.kinds;
@@ -163,18 +167,19 @@ impl<'a> Drawing<'a> {
     fn layout(&self, rows: &Range<u32>, slots: u32) -> Layout {
         let pixel_rows = (rows.end * TILE_SIZE).min(self.row.height) - rows.start * TILE_SIZE;
         let pixels = u64::from(pixel_rows) * u64::from(self.row.width);
-        let mut floats = 0;
+        let fast = self.row.fast != 0;
+        let mut words = 0;
         let mut take = |wanted: bool, channels: u64| {
-            let start = if wanted { floats as u32 } else { NO_PICTURE };
-            floats += if wanted { channels * pixels } else { 0 };
+            let start = if wanted { words as u32 } else { NO_PICTURE };
+            words += if wanted { channels * pixels } else { 0 };
             start
         };
-        let color = take(self.kinds.color, 3);
+        let color = take(self.kinds.color, if fast { 1 } else { 3 });
         let depth = take(self.kinds.depth, 1);
-        let alpha = take(self.kinds.alpha, 1);
+        let alpha = take(self.kinds.alpha && !(fast && self.kinds.color), 1);
         let blend = take(matches!(self.wanted, Labels::Blend(_)), BLEND_WIDTH as u64);
         let tiles = self.row.tiles_x * (rows.end - rows.start);
-        Layout { color, depth, alpha, blend, floats, pixels, slots, tiles }
+        Layout { color, depth, alpha, blend, words, fast, pixels, slots, tiles }
     }
 
     /// Rows of the table that is blended; an empty one is a row of zeros.
@@ -216,22 +221,33 @@ impl<'a> Drawing<'a> {
     /// Takes the pictures and entries of a band out of what was read back.
     fn store(&mut self, layout: &Layout, pictures: &[u8], slots: &[u32]) {
         let pixels = layout.pixels as usize;
-        let part = |start: u32, channels: usize| {
+        let part = |start: u32, words: usize| {
             let start = start as usize * 4;
-            &pictures[start..start + pixels * channels * 4]
+            &pictures[start..start + pixels * words * 4]
         };
         let frame = &mut self.frame;
         if let Some(color) = &mut frame.color {
-            append(color, part(layout.color, 3));
+            if layout.fast {
+                let levels = part(layout.color, 1);
+                let level = |byte: u8| f32::from(byte) / 255.0;
+                append(color, levels, |[r, g, b, _]: [u8; 4]| [r, g, b].map(level));
+                if let Some(alpha) = &mut frame.alpha {
+                    append(alpha, levels, |word: [u8; 4]| level(word[3]));
+                }
+            } else {
+                append(color, part(layout.color, 3), |color| color);
+            }
         }
         if let Some(depth) = &mut frame.depth {
-            append(depth, part(layout.depth, 1));
+            append(depth, part(layout.depth, 1), |depth| depth);
         }
-        if let Some(alpha) = &mut frame.alpha {
-            append(alpha, part(layout.alpha, 1));
+        if let Some(alpha) = &mut frame.alpha
+            && layout.alpha != NO_PICTURE
+        {
+            append(alpha, part(layout.alpha, 1), |alpha| alpha);
         }
         if let Some(blend) = &mut frame.blend {
-            append(blend, part(layout.blend, BLEND_WIDTH));
+            append(blend, part(layout.blend, BLEND_WIDTH), |row| row);
         }
         if layout.slots > 0 {
             self.entries.push(entry_rows(slots, layout, self.row.width as usize));
@@ -349,12 +365,12 @@ impl Tools<'_> {
         let pair_half = sorted_half(bits) * views * capacity;
         let mut rows = Vec::with_capacity(drawings.len());
         let mut grid = [0; 2];
-        let (mut floats, mut slot_words, mut ranges) = (0_u64, 0_u64, 0_u32);
+        let (mut words, mut slot_words, mut ranges) = (0_u64, 0_u64, 0_u32);
         let mut table: Vec<[f32; BLEND_WIDTH]> = Vec::new();
         for (i, ((drawing, band), layout)) in drawings.iter().zip(bands).zip(layouts).enumerate() {
             let after = |start: u32| match start {
                 NO_PICTURE => NO_PICTURE,
-                start => start + floats as u32,
+                start => start + words as u32,
             };
             rows.push(ViewRow {
                 row_start: band.start,
@@ -373,13 +389,13 @@ impl Tools<'_> {
                 ..drawing.row
             });
             grid = [grid[0].max(drawing.row.tiles_x), grid[1].max(band.end - band.start)];
-            floats += layout.floats;
+            words += layout.words;
             slot_words += layout.slot_bytes() / 4;
             ranges += layout.tiles + 1;
             table.extend_from_slice(drawing.table());
         }
         let plan_bytes = PLAN_BYTES * u64::from(views);
-        let (picture_bytes, slot_bytes) = (floats * 4, slot_words * 4);
+        let (picture_bytes, slot_bytes) = (words * 4, slot_words * 4);
         let staging_bytes = plan_bytes + picture_bytes + slot_bytes;
         let (gpu, scene) = (self.gpu, self.scene);
         let colored = drawings.iter().any(|drawing| drawing.kinds.color);
@@ -462,13 +478,19 @@ impl Tools<'_> {
     }
 }
 
-/// Copies `bytes` to the end of `to`; many by all cores, for most of the time goes into new pages.
-fn append<T: Pod + Send + Sync>(to: &mut Vec<T>, bytes: &[u8]) {
-    let values: &[T] = bytemuck::cast_slice(bytes);
+/// Copies the values that `bytes` hold to the end of `to`; many by all cores, for most of the time
+/// goes into new pages.
+fn append<F: Pod + Send + Sync, T: Send>(
+    to: &mut Vec<T>,
+    bytes: &[u8],
+    read: impl Fn(F) -> T + Send + Sync,
+) {
+    let values: &[F] = bytemuck::cast_slice(bytes);
     if bytes.len() < PARALLEL_BYTES {
-        to.extend_from_slice(values);
+        to.extend(values.iter().map(|value| read(*value)));
     } else {
-        to.par_extend(values.par_iter().with_min_len(PARALLEL_BYTES / 16).copied());
+        let values = values.par_iter().with_min_len(PARALLEL_BYTES / 16);
+        to.par_extend(values.map(|value| read(*value)));
     }
 }
 

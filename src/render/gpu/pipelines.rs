@@ -25,6 +25,8 @@ pub const GROUPS_DIGITS: u32 = 3;
 pub const GROUPS_TILES: u32 = 6;
 /// Row of workgroup counts of the tile ranges.
 pub const GROUPS_RANGES: u32 = 7;
+/// Bits of a fast view's depth keys: two digits of the sort.
+pub const FAST_KEY_BITS: u32 = 16;
 /// Depth key of a dropped Gaussian.
 pub const DROPPED_KEY: u32 = u32::MAX;
 /// Value of a pair that was counted and not emitted.
@@ -34,7 +36,7 @@ pub const NO_PICTURE: u32 = u32::MAX;
 
 /// The kernels' numbers by the name they have in WGSL, beside
 /// [`crate::render::constants::SHARED`].
-pub const SHARED: [(&str, u32); 13] = [
+pub const SHARED: [(&str, u32); 14] = [
     ("WORKGROUP_SIZE", WORKGROUP_SIZE),
     ("VIEWS_MAX", VIEWS_MAX),
     ("SORT_SIZE", SORT_SIZE),
@@ -45,6 +47,7 @@ pub const SHARED: [(&str, u32); 13] = [
     ("GROUPS_DIGITS", GROUPS_DIGITS),
     ("GROUPS_TILES", GROUPS_TILES),
     ("GROUPS_RANGES", GROUPS_RANGES),
+    ("FAST_KEY_BITS", FAST_KEY_BITS),
     ("DROPPED_KEY", DROPPED_KEY),
     ("NO_GAUSSIAN", NO_GAUSSIAN),
     ("NO_PICTURE", NO_PICTURE),
