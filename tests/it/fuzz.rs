@@ -1,14 +1,17 @@
 //! Poisoned Gaussians, seeded: dropped or clamped with counts, never a NaN pixel, never a panic.
 //!
-//! `FUZZ_SEED` and `FUZZ_ITERS` choose others than the default.
+//! `FUZZ_SEED`, `FUZZ_SCENES` and `FUZZ_GAUSSIANS` choose others than the default.
 
 use segsplat::{
     error::ErrorCode,
-    render::{Frame, Labels, RenderRequest, Renderer, cpu::CpuRenderer},
+    render::{Frame, Labels, Quality, RenderRequest, Renderer, cpu::CpuRenderer},
     scene::{Gaussians, RawGaussians},
 };
 
-use crate::common::scenes::{Random, camera, checked, cloud, push, request};
+use crate::{
+    common::scenes::{Random, camera, checked, cloud, push, request},
+    twins::gpu,
+};
 
 /// Numbers that broke renderers before.
 const POISON: [f32; 24] = [
@@ -50,31 +53,37 @@ fn assert_clean(frame: &Frame, what: &str) {
     }
 }
 
-#[test]
-fn poisoned_gaussians_never_make_a_bad_pixel() {
+/// One number in five is poison.
+fn poisoned(random: &mut Random, count: u64, sh_degree: u8) -> RawGaussians {
+    let mut raw = RawGaussians { sh_degree, ..RawGaussians::default() };
+    for _ in 0..count {
+        let mut number = |low: f32, high: f32| match random.bits() % 5 {
+            0 => POISON[random.bits() as usize % POISON.len()],
+            _ => random.range(low, high),
+        };
+        let mean = [number(-2.0, 2.0), number(-2.0, 2.0), number(0.1, 6.0)];
+        let quat = [(); 4].map(|()| number(-1.0, 1.0));
+        let scale = [(); 3].map(|()| number(0.001, 0.5));
+        let opacity = number(0.0, 1.0);
+        let sh: Vec<[f32; 3]> = (0..(usize::from(sh_degree) + 1).pow(2))
+            .map(|_| [(); 3].map(|()| random.range(-1.0, 1.0)))
+            .collect();
+        push(&mut raw, mean, quat, scale, opacity, &sh);
+    }
+    raw
+}
+
+/// Draws `FUZZ_SCENES` scenes of fewer than `FUZZ_GAUSSIANS` Gaussians each, from odd cameras.
+fn fuzz(renderer: &dyn Renderer, iterations: u64) {
     let seed = environment("FUZZ_SEED", 20);
-    let cpu = CpuRenderer::new(2).expect("two threads");
-    for iteration in 0..environment("FUZZ_ITERS", 300) {
-        let what = format!("FUZZ_SEED={seed} iteration {iteration}");
+    let most = environment("FUZZ_GAUSSIANS", 40);
+    let (mut fuzzed, mut drawn) = (0, 0);
+    for iteration in 0..environment("FUZZ_SCENES", iterations) {
+        let what = format!("FUZZ_SEED={seed} FUZZ_GAUSSIANS={most} iteration {iteration}");
         let mut random = Random(seed.wrapping_mul(1_000_003) + iteration);
         let sh_degree = (random.bits() % 4) as u8;
-        let mut raw = RawGaussians { sh_degree, ..RawGaussians::default() };
-        let count = random.bits() % 40;
-        for _ in 0..count {
-            // One number in five is poison.
-            let mut number = |low: f32, high: f32| match random.bits() % 5 {
-                0 => POISON[random.bits() as usize % POISON.len()],
-                _ => random.range(low, high),
-            };
-            let mean = [number(-2.0, 2.0), number(-2.0, 2.0), number(0.1, 6.0)];
-            let quat = [(); 4].map(|()| number(-1.0, 1.0));
-            let scale = [(); 3].map(|()| number(0.001, 0.5));
-            let opacity = number(0.0, 1.0);
-            let sh: Vec<[f32; 3]> = (0..(usize::from(sh_degree) + 1).pow(2))
-                .map(|_| [(); 3].map(|()| random.range(-1.0, 1.0)))
-                .collect();
-            push(&mut raw, mean, quat, scale, opacity, &sh);
-        }
+        let count = random.bits() % most;
+        let raw = poisoned(&mut random, count, sh_degree);
         let (gaussians, report) = Gaussians::sanitize(raw).expect(&what);
         let dropped = report.not_finite
             + report.too_far
@@ -89,9 +98,26 @@ fn poisoned_gaussians_never_make_a_bad_pixel() {
         }
         let near = [1e-30, 0.01, 1.0, 1e30][random.bits() as usize % 4];
         let antialiased = random.bits().is_multiple_of(2);
-        let request = RenderRequest { near, antialiased, ..request(camera) };
-        assert_clean(&cpu.render(&gaussians, &request).expect(&what), &what);
+        let quality = Quality::ALL[random.bits() as usize % 2];
+        let request = RenderRequest { near, antialiased, quality, ..request(camera) };
+        let frame = renderer.render(&gaussians, &request).expect(&what);
+        assert_clean(&frame, &what);
+        fuzzed += count;
+        drawn += frame.stats.visible;
     }
+    println!("{fuzzed} Gaussians, {drawn} of them seen, by {}", renderer.name());
+    assert!(drawn > 0, "nothing was seen");
+}
+
+#[test]
+fn poisoned_gaussians_never_make_a_bad_pixel() {
+    fuzz(&CpuRenderer::new(2).expect("two threads"), 300);
+}
+
+#[test]
+fn poisoned_gaussians_never_make_a_bad_pixel_on_the_gpu() {
+    let Some(gpu) = gpu() else { return };
+    fuzz(gpu, 60);
 }
 
 #[test]
