@@ -1,8 +1,9 @@
-//! Whole frames on the CPU: time, and beside it the error against the f64 oracle.
+//! The CPU renderer: whole frames with their error against the f64 oracle beside the time, then
+//! each stage alone, and labels.
 //!
-//! Back of an envelope for 131,072 Gaussians at 256x256: each touches about 7 rows and 12 cells of
-//! 8 pixels, 1.6 million cell entries of about 40 vector instructions: 60 million, 8 ms on 2 cores.
-//! Rays end early, so less.
+//! Back of an envelope for 131,072 Gaussians at 256x256: each meets about 4 cells of 16 pixels,
+//! 480,000 blends of about 30 vector instructions: 15 million, 6 ms of one core with AVX-512, and
+//! as much again to project, sort and bin. `render/cpu/pair_131072` says what it is.
 
 #[path = "../tests/it/common/compare.rs"]
 mod compare;
@@ -13,9 +14,27 @@ use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use segsplat::{
-    render::{RenderRequest, Renderer, cpu::CpuRenderer, oracle},
+    render::{
+        Kinds, Labels, RenderRequest, Renderer,
+        cpu::{
+            CpuRenderer, emit_isects,
+            lanes::Width,
+            paint::Paint,
+            prefix_sum,
+            project::{Projected, Projection, project},
+            radix_sort,
+            rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
+            shade, tile_ranges,
+            tiles::Grid,
+        },
+        oracle,
+        view::View,
+    },
     scene::Gaussians,
 };
+
+const SIDE: u32 = 256;
+const TILE: u32 = 16;
 
 /// Prints the error of one frame, on sampled pixels.
 #[expect(clippy::print_stdout, reason = "no time without its error beside it")]
@@ -68,9 +87,138 @@ fn render(criterion: &mut Criterion) {
     }
 }
 
+/// A frame of 256 x 256 stage by stage, on one thread: what a stage costs, not how it scales.
+struct Stages {
+    gaussians: Gaussians,
+    request: RenderRequest,
+    view: View,
+    grid: Grid,
+    projected: Projected,
+    sorted: Vec<u64>,
+    spare: Vec<u64>,
+    offsets: Vec<u64>,
+    isects: Vec<u64>,
+    ranges: Vec<u32>,
+}
+
+impl Stages {
+    fn new() -> Self {
+        let (gaussians, camera) = scenes::two_views(SIDE, 1);
+        let request = scenes::request(camera);
+        let view = View::new(gaussians.origin(), &request).expect("a view");
+        let grid = Grid { width: SIDE, height: SIDE, tile_rows: 0..view.tiles_y() };
+        Self {
+            gaussians,
+            request,
+            view,
+            grid,
+            projected: Projected::default(),
+            sorted: Vec::new(),
+            spare: Vec::new(),
+            offsets: Vec::new(),
+            isects: Vec::new(),
+            ranges: Vec::new(),
+        }
+    }
+
+    fn project(&mut self, width: Width) {
+        let how = Projection { width, ..Projection::new(false) };
+        project(&self.gaussians, &self.view, how, &mut self.projected);
+    }
+
+    fn shade(&mut self) {
+        shade::shade(&self.gaussians, &self.view, &mut self.projected);
+    }
+
+    fn sort(&mut self) {
+        let Projected { footprints, tiles_per_gauss: tiles, .. } = &self.projected;
+        let visible = (0_u32..).zip(footprints.iter().zip(tiles)).filter(|(_, (_, t))| **t > 0);
+        self.sorted.clear();
+        self.sorted.extend(visible.map(|(i, (f, _))| radix_sort::pack(f.depth.to_bits(), i)));
+        radix_sort::radix_sort(&mut self.sorted, &mut self.spare, u32::BITS);
+    }
+
+    fn bin(&mut self) {
+        let tiles = &self.projected.tiles_per_gauss;
+        let counts = self.sorted.iter().map(|&pair| tiles[radix_sort::value(pair) as usize]);
+        prefix_sum::prefix_sum(counts, &mut self.offsets);
+        let (projected, isects) = (&self.projected, &mut self.isects);
+        emit_isects::emit_isects(projected, &self.sorted, &self.grid, &self.offsets, isects);
+        radix_sort::radix_sort(isects, &mut self.spare, 8);
+        tile_ranges::tile_ranges(isects, self.grid.tile_count(), &mut self.ranges);
+    }
+
+    /// All tiles into pictures that every request has.
+    fn rasterize(&self, request: &RenderRequest, width: Width, scratch: &mut TileScratch) {
+        let paint = Paint::new(request, self.gaussians.semantic_index()).with_width(width);
+        let stride = (SIDE * TILE) as usize;
+        let (mut color, mut depth) = (vec![[0.0; 3]; stride], vec![0.0; stride]);
+        let mut blend = vec![[0.0; 4]; stride];
+        for tile_y in 0..SIDE / TILE {
+            let mut out = RowOut {
+                color: request.kinds.color.then_some(&mut color),
+                depth: request.kinds.depth.then_some(&mut depth),
+                blend: matches!(request.labels, Labels::Blend(_)).then_some(&mut blend),
+                ..RowOut::default()
+            };
+            for tile_x in 0..SIDE / TILE {
+                let id = (tile_y * SIDE / TILE + tile_x) as usize;
+                let range = self.ranges[id] as usize..self.ranges[id + 1] as usize;
+                let tile = Tile { x: tile_x * TILE, y: tile_y * TILE, width: TILE, height: TILE };
+                let footprints = &self.projected.footprints;
+                let isects = &self.isects[range];
+                rasterize_tile(footprints, isects, tile, &paint, SIDE, scratch, &mut out);
+            }
+        }
+        black_box((color, depth, blend));
+    }
+}
+
+fn stages(criterion: &mut Criterion) {
+    let mut stages = Stages::new();
+    let one = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread");
+    let mut scratch = TileScratch::default();
+    let widths = Width::ALL.into_iter().filter(|width| width.available());
+    for width in widths.clone() {
+        criterion.bench_function(&format!("stage/project/{width:?}"), |b| {
+            b.iter(|| one.install(|| stages.project(width)));
+        });
+    }
+    criterion.bench_function("stage/shade", |b| b.iter(|| one.install(|| stages.shade())));
+    criterion.bench_function("stage/sort", |b| b.iter(|| stages.sort()));
+    criterion.bench_function("stage/bin", |b| b.iter(|| one.install(|| stages.bin())));
+    let table: Labels = Labels::Blend(vec![[0.5; 4]; 25].into());
+    let count = stages.gaussians.len() as u32;
+    let index = (0..count).map(|i| (i / 700 % 25) as u16).collect();
+    let gaussians = std::mem::replace(&mut stages.gaussians, scenes::cloud(1, 0, 1));
+    stages.gaussians = gaussians.with_semantic_index(index).expect("an index a Gaussian");
+    let (color, all) = (Kinds::COLOR, Kinds::ALL);
+    for (name, kinds, labels) in [
+        ("color", color, Labels::None),
+        ("color_depth", all, Labels::None),
+        ("mask", Kinds::NONE, table.clone()),
+        ("color_depth_mask", all, table),
+    ] {
+        let request = RenderRequest { kinds, labels, ..stages.request };
+        for width in widths.clone() {
+            criterion.bench_function(&format!("stage/rasterize/{name}/{width:?}"), |b| {
+                b.iter(|| stages.rasterize(&request, width, &mut scratch));
+            });
+        }
+    }
+    // Entries are joined from rows of tiles, which the renderer does: whole frames.
+    let cpu = CpuRenderer::new(1).expect("a thread");
+    for (name, kinds) in [("entries", Kinds::NONE), ("color_depth_entries", all)] {
+        let request = RenderRequest { kinds, labels: Labels::Entries, ..stages.request };
+        criterion.bench_function(&format!("labels/{name}/1_threads"), |b| {
+            b.iter(|| cpu.render(&stages.gaussians, &request).expect("entries"));
+        });
+    }
+}
+
 criterion_group! {
     name = benches;
     config = Criterion::default().sample_size(20);
-    targets = render
+    targets = render, stages
 }
 criterion_main!(benches);

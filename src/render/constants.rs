@@ -40,10 +40,8 @@ pub const FOOTPRINT_SLACK: f32 = 1e-4;
 pub const ISECTS_MAX: u64 = 1 << 25;
 /// Entries of one view (6 bytes each): 768 MiB, what 64 a pixel come to at 1080p.
 pub const ENTRIES_MAX: u64 = 1 << 27;
-/// Gaussians staged at once for a tile: their data and lists stay in the level-2 cache.
-pub const BATCH_SIZE: usize = 256;
-/// Pixels of a row that the rasteriser blends together: one 256-bit register of f32.
-pub const LANES: usize = 8;
+/// Gaussians staged at once for a tile: their data stay in the level-1 cache.
+pub const BATCH_SIZE: usize = 128;
 
 /// The numbers that the shaders must share, by the name they have in WGSL.
 pub const SHARED: [(&str, f32); 9] = [

@@ -53,3 +53,4 @@ mod tidy;
 mod tls;
 mod twins;
 mod understand;
+mod widths;

@@ -10,10 +10,12 @@ use segsplat::{
     render::{
         Frame, Kinds, RenderRequest, Renderer,
         cpu::{
-            CpuRenderer, emit_isects, prefix_sum, project,
+            CpuRenderer, emit_isects,
+            paint::Paint,
+            prefix_sum, project,
             project::{Footprint, Projected},
             radix_sort,
-            rasterize::{Paint, RowOut, Tile, TileScratch, rasterize_tile},
+            rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
             shade, tile_ranges,
             tiles::Grid,
         },
@@ -77,7 +79,8 @@ fn whole(view: &View) -> Grid {
 fn projected(gaussians: &Gaussians, request: &RenderRequest) -> Projected {
     let mut projected = Projected::default();
     let view = view_of(gaussians, request);
-    project::project(gaussians, &view, request.antialiased, &mut projected);
+    let how = project::Projection::new(request.antialiased);
+    project::project(gaussians, &view, how, &mut projected);
     projected
 }
 

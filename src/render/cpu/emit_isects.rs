@@ -6,11 +6,13 @@ use rayon::prelude::*;
 use super::{
     project::Projected,
     radix_sort::{pack, value},
-    tiles::Grid,
+    tiles::{Grid, TileSpans},
 };
 
 /// Gaussians a task.
 const CHUNK: usize = 1024;
+/// Gaussians whose spans are fetched at once.
+const FETCH: usize = 64;
 
 /// Writes the pairs of the Gaussian at place i of the depth order to
 /// `isects[isect_offsets[i]..isect_offsets[i + 1]]`.
@@ -38,16 +40,22 @@ pub fn emit_isects(
     }
     tasks.into_par_iter().for_each(|(sorted, slice)| {
         let mut slots = slice.iter_mut();
-        for &pair in sorted {
-            let id = value(pair);
-            let spans = projected.tile_spans[id as usize];
-            let footprint = &projected.footprints[id as usize];
-            spans.replay(footprint, grid, |tile_y, tiles| {
-                let row = (tile_y - grid.tile_rows.start) * grid.tiles_x();
-                for (tile_x, slot) in tiles.zip(&mut slots) {
-                    *slot = pack(row + tile_x, id);
-                }
-            });
+        let mut fetched = [TileSpans::default(); FETCH];
+        for sorted in sorted.chunks(FETCH) {
+            // In depth order spans lie anywhere: fetched alone, many are waited for at once.
+            for (spans, &pair) in fetched.iter_mut().zip(sorted) {
+                *spans = projected.tile_spans[value(pair) as usize];
+            }
+            for (spans, &pair) in fetched.iter().zip(sorted) {
+                let id = value(pair);
+                let footprint = &projected.footprints[id as usize];
+                spans.replay(footprint, grid, |tile_y, tiles| {
+                    let row = (tile_y - grid.tile_rows.start) * grid.tiles_x();
+                    for (tile_x, slot) in tiles.zip(&mut slots) {
+                        *slot = pack(row + tile_x, id);
+                    }
+                });
+            }
         }
         debug_assert!(slots.next().is_none(), "count and emission disagree; this is a bug");
     });

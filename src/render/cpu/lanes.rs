@@ -1,136 +1,364 @@
-//! Eight f32 at once, in plain Rust that compiles to vector instructions, and a fast exp.
+//! Vectors of f32 of the processor's own width, by `pulp`: AVX-512, AVX2 with FMA, or what every
+//! processor of the target has; and a fast power of two.
 //!
-//! Every function is inlined into its caller, so that it is compiled for the caller's processor.
+//! The kernel is compiled once for each width and picked when the renderer is made. Products and
+//! sums are fused where the processor fuses, so the two wide forms agree to the last bit and the
+//! portable one to rounding. Every function is inlined into its caller: it takes its processor.
 
-use std::ops::{Add, Mul, Sub};
+use std::ops::{Add, Div, Mul, Sub};
 
-/// Eight lanes.
-#[derive(Clone, Copy, Debug, PartialEq)]
-#[repr(align(32))]
-pub(super) struct F8(pub(super) [f32; 8]);
+use pulp::Simd;
+#[cfg(target_arch = "x86_64")]
+use pulp::x86::{V3, V4};
 
-impl F8 {
-    /// The same value in all lanes.
-    #[inline(always)]
+/// Widths of the kernel, the widest first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Width {
+    /// 16 lanes: AVX-512.
+    Sixteen,
+    /// 8 lanes: AVX2 and FMA.
+    Eight,
+    /// 4 lanes, of whatever the target has.
+    Four,
+}
+
+impl Width {
+    /// All, the widest first.
+    pub const ALL: [Self; 3] = [Self::Sixteen, Self::Eight, Self::Four];
+
+    /// The widest that this processor has.
     #[must_use]
-    pub(super) const fn splat(value: f32) -> Self {
-        Self([value; 8])
+    pub fn widest() -> Self {
+        Self::ALL.into_iter().find(|width| width.available()).unwrap_or(Self::Four)
     }
 
-    #[inline(always)]
-    fn map(self, f: impl Fn(f32) -> f32) -> Self {
-        let mut out = self.0;
-        for lane in &mut out {
-            *lane = f(*lane);
+    /// Whether this processor has it.
+    #[must_use]
+    pub fn available(self) -> bool {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Sixteen => V4::is_available(),
+            #[cfg(target_arch = "x86_64")]
+            Self::Eight => V3::is_available(),
+            #[cfg(not(target_arch = "x86_64"))]
+            Self::Sixteen | Self::Eight => false,
+            Self::Four => true,
         }
-        Self(out)
     }
 
-    #[inline(always)]
-    fn zip(self, other: Self, f: impl Fn(f32, f32) -> f32) -> Self {
-        let mut out = self.0;
-        for (lane, other) in out.iter_mut().zip(other.0) {
-            *lane = f(*lane, other);
+    /// Runs `kernel`, compiled for this width or for the next that the processor has.
+    #[inline]
+    pub(super) fn run<K: Kernel>(self, kernel: K) {
+        #[cfg(target_arch = "x86_64")]
+        {
+            if self == Self::Sixteen
+                && let Some(simd) = V4::try_new()
+            {
+                return simd.vectorize(Compiled { simd, kernel });
+            }
+            if self != Self::Four
+                && let Some(simd) = V3::try_new()
+            {
+                return simd.vectorize(Compiled { simd, kernel });
+            }
         }
-        Self(out)
-    }
-
-    /// The smaller of each lane and `bound`.
-    #[inline(always)]
-    #[must_use]
-    pub(super) fn min(self, bound: f32) -> Self {
-        self.map(|v| if v < bound { v } else { bound })
-    }
-
-    /// Lanes under `bound` become 0.
-    #[inline(always)]
-    #[must_use]
-    pub(super) fn zero_under(self, bound: f32) -> Self {
-        self.map(|v| if v >= bound { v } else { 0.0 })
-    }
-
-    /// Lanes where `test` is not over `bound` become 0.
-    #[inline(always)]
-    #[must_use]
-    pub(super) fn zero_where_not_over(self, test: Self, bound: f32) -> Self {
-        self.zip(test, |v, t| if t > bound { v } else { 0.0 })
-    }
-
-    /// Whether all lanes are 0.
-    #[inline(always)]
-    #[must_use]
-    pub(super) fn is_zero(self) -> bool {
-        self.0.iter().fold(0, |bits, lane| bits | lane.to_bits()) == 0
+        kernel.run(pulp::Scalar128b);
     }
 }
 
-impl Add for F8 {
+/// Work that is compiled for each width.
+pub(super) trait Kernel {
+    /// Does the work; must be inlined.
+    fn run<S: Lanes>(self, simd: S);
+}
+
+struct Compiled<S, K> {
+    simd: S,
+    kernel: K,
+}
+
+impl<S: Lanes, K: Kernel> pulp::NullaryFnOnce for Compiled<S, K> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        self.kernel.run(self.simd);
+    }
+}
+
+/// A width with what `pulp` leaves out: a mask as bits, and products added as fast as they can be.
+pub(super) trait Lanes: Simd {
+    /// One bit a lane, lane 0 the lowest.
+    fn bits(self, mask: Self::m32s) -> u32;
+
+    /// `a · b + c`, fused where the processor fuses.
+    #[inline(always)]
+    fn fused(self, a: Self::f32s, b: Self::f32s, c: Self::f32s) -> Self::f32s {
+        self.mul_add_f32s(a, b, c)
+    }
+
+    /// `a · b + c`, fused where the processor fuses.
+    #[inline(always)]
+    fn fused_f64(self, a: Self::f64s, b: Self::f64s, c: Self::f64s) -> Self::f64s {
+        self.mul_add_f64s(a, b, c)
+    }
+
+    /// Vector `i` of a row of numbers.
+    #[inline(always)]
+    fn load(self, row: &[f32; 16], i: usize) -> Self::f32s {
+        Self::as_simd_f32s(row).0[i]
+    }
+
+    /// Writes vector `i` of a row of numbers.
+    #[inline(always)]
+    fn store(self, row: &mut [f32; 16], i: usize, value: Self::f32s) {
+        Self::as_mut_simd_f32s(row).0[i] = value;
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+impl Lanes for V4 {
+    #[inline(always)]
+    fn bits(self, mask: Self::m32s) -> u32 {
+        u32::from(mask.0)
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+impl Lanes for V3 {
+    #[inline(always)]
+    fn bits(self, mask: Self::m32s) -> u32 {
+        self.avx._mm256_movemask_ps(pulp::cast(mask)).cast_unsigned()
+    }
+}
+
+/// Whether every processor of the target fuses; else a fused product is a call of a function.
+const FUSES: bool = cfg!(any(target_arch = "aarch64", target_feature = "fma"));
+
+impl Lanes for pulp::Scalar128b {
+    #[inline(always)]
+    fn fused(self, a: Self::f32s, b: Self::f32s, c: Self::f32s) -> Self::f32s {
+        match FUSES {
+            true => self.mul_add_f32s(a, b, c),
+            false => self.add_f32s(self.mul_f32s(a, b), c),
+        }
+    }
+
+    #[inline(always)]
+    fn fused_f64(self, a: Self::f64s, b: Self::f64s, c: Self::f64s) -> Self::f64s {
+        match FUSES {
+            true => self.mul_add_f64s(a, b, c),
+            false => self.add_f64s(self.mul_f64s(a, b), c),
+        }
+    }
+
+    #[inline(always)]
+    fn bits(self, mask: Self::m32s) -> u32 {
+        let pulp::m32x4(a, b, c, d) = mask;
+        [a, b, c, d].iter().rev().fold(0, |bits, lane| bits << 1 | u32::from(lane.is_set()))
+    }
+}
+
+/// A row of f64 that vectors are read from and written to.
+pub(super) type Row = [f64; 16];
+
+/// A vector of f64 with the usual signs.
+#[derive(Clone, Copy)]
+pub(super) struct Wide<S: Lanes>(S, S::f64s);
+
+impl<S: Lanes> Wide<S> {
+    /// The same number in all lanes.
+    #[inline(always)]
+    pub(super) fn of(simd: S, value: f64) -> Self {
+        Self(simd, simd.splat_f64s(value))
+    }
+
+    /// Vector `i` of a row.
+    #[inline(always)]
+    pub(super) fn at(simd: S, row: &Row, i: usize) -> Self {
+        Self(simd, S::as_simd_f64s(row).0[i])
+    }
+
+    /// Writes it as vector `i` of a row.
+    #[inline(always)]
+    pub(super) fn put(self, row: &mut Row, i: usize) {
+        S::as_mut_simd_f64s(row).0[i] = self.1;
+    }
+
+    /// `self · factor + term`, fused where the processor fuses.
+    #[inline(always)]
+    pub(super) fn times_plus(self, factor: Self, term: Self) -> Self {
+        Self(self.0, self.0.fused_f64(self.1, factor.1, term.1))
+    }
+
+    #[inline(always)]
+    pub(super) fn sqrt(self) -> Self {
+        Self(self.0, self.0.sqrt_f64s(self.1))
+    }
+
+    #[inline(always)]
+    pub(super) fn max(self, other: Self) -> Self {
+        Self(self.0, self.0.max_f64s(self.1, other.1))
+    }
+
+    #[inline(always)]
+    pub(super) fn min(self, other: Self) -> Self {
+        Self(self.0, self.0.min_f64s(self.1, other.1))
+    }
+
+    /// Lanes that are at least those of `other`; none that is NaN.
+    #[inline(always)]
+    pub(super) fn at_least(self, other: Self) -> S::m64s {
+        self.0.less_than_or_equal_f64s(other.1, self.1)
+    }
+
+    /// 0 in the lanes that are not of `mask`.
+    #[inline(always)]
+    pub(super) fn only(self, mask: S::m64s) -> Self {
+        Self(self.0, self.0.select_f64s(mask, self.1, self.0.splat_f64s(0.0)))
+    }
+
+    /// The whole number under it, or itself. For numbers under 2⁵⁰.
+    #[inline(always)]
+    pub(super) fn floor(self) -> Self {
+        let (one, shift) = (Self::of(self.0, 1.0), Self::of(self.0, 6_755_399_441_055_744.0));
+        let whole = (self + shift) - shift;
+        whole - one.only(self.0.less_than_f64s(self.1, whole.1))
+    }
+
+    /// The whole number over it, or itself. For numbers under 2⁵⁰.
+    #[inline(always)]
+    pub(super) fn ceil(self) -> Self {
+        let (one, shift) = (Self::of(self.0, 1.0), Self::of(self.0, 6_755_399_441_055_744.0));
+        let whole = (self + shift) - shift;
+        whole + one.only(self.0.less_than_f64s(whole.1, self.1))
+    }
+}
+
+impl<S: Lanes> Add for Wide<S> {
     type Output = Self;
     #[inline(always)]
     fn add(self, other: Self) -> Self {
-        self.zip(other, |a, b| a + b)
+        Self(self.0, self.0.add_f64s(self.1, other.1))
     }
 }
 
-impl Sub for F8 {
+impl<S: Lanes> Sub for Wide<S> {
     type Output = Self;
     #[inline(always)]
     fn sub(self, other: Self) -> Self {
-        self.zip(other, |a, b| a - b)
+        Self(self.0, self.0.sub_f64s(self.1, other.1))
     }
 }
 
-impl Mul for F8 {
+impl<S: Lanes> Mul for Wide<S> {
     type Output = Self;
     #[inline(always)]
     fn mul(self, other: Self) -> Self {
-        self.zip(other, |a, b| a * b)
+        Self(self.0, self.0.mul_f64s(self.1, other.1))
     }
 }
 
-/// Powers above this are as good as infinite: e^-80 is far under any alpha that counts.
-const POWER_MAX: f32 = 80.0;
+impl<S: Lanes> Div for Wide<S> {
+    type Output = Self;
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        Self(self.0, self.0.div_f64s(self.1, other.1))
+    }
+}
+
+/// Powers above this are as good as infinite: 2^-120 is far under any alpha that counts.
+const POWER_MAX: f32 = 120.0;
 /// Adding and taking away 1.5 · 2²³ rounds to a whole number, which stays in the low bits.
 const ROUND: f32 = 12_582_912.0;
-/// ln 2 in two parts; the first has few enough bits that its product with n is exact.
-const LN_2_HIGH: f32 = 355.0 / 512.0;
-const LN_2_LOW: f32 = -2.121_944_4e-4;
+/// 2^-g over |g| <= ½ to 9.2e-8 of its value (least largest relative error, by Lawson's weights).
+#[expect(clippy::approx_constant, reason = "the best first term is not ln 2, and near it")]
+const TERMS: [f32; 5] = [-0.693_147, 0.240_222_42, -0.055_507_336, 0.009_671_513, -0.001_326_472_7];
 
-/// e^-power for power >= 0, within 2e-7 of its value (Cephes expf: e^x = 2^n e^f, |f| <= ½ ln 2).
+/// 2^-power for power >= 0, within 2e-7 of its value.
 #[inline(always)]
-#[must_use]
-pub(super) fn exp_neg(power: F8) -> F8 {
-    power.map(|power| {
-        let x = -(if power < POWER_MAX { power } else { POWER_MAX });
-        let shifted = x * std::f32::consts::LOG2_E + ROUND;
-        let n = shifted - ROUND;
-        let f = (x - n * LN_2_HIGH) - n * LN_2_LOW;
-        let p = 1.987_569_1e-4 * f + 1.398_2e-3;
-        let p = p * f + 8.333_452e-3;
-        let p = p * f + 4.166_579_6e-2;
-        let p = p * f + 1.666_666_5e-1;
-        let p = p * f + 0.5;
-        let mantissa = p * f * f + f + 1.0;
-        let scale = f32::from_bits((shifted.to_bits() << 23).wrapping_add(1.0_f32.to_bits()));
-        mantissa * scale
-    })
+pub(super) fn exp2_neg<S: Lanes>(simd: S, power: S::f32s) -> S::f32s {
+    let x = simd.min_f32s(power, simd.splat_f32s(POWER_MAX));
+    let round = simd.splat_f32s(ROUND);
+    let shifted = simd.sub_f32s(round, x);
+    // g = power less the nearest whole number.
+    let g = simd.add_f32s(x, simd.sub_f32s(shifted, round));
+    let mut mantissa = simd.splat_f32s(TERMS[4]);
+    for coefficient in [TERMS[3], TERMS[2], TERMS[1], TERMS[0], 1.0] {
+        mantissa = simd.fused(mantissa, g, simd.splat_f32s(coefficient));
+    }
+    let whole = simd.transmute_u32s_f32s(shifted);
+    let exponent = simd.wrapping_dyn_shl_u32s(whole, simd.splat_u32s(23));
+    simd.transmute_f32s_u32s(simd.add_u32s(simd.transmute_u32s_f32s(mantissa), exponent))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    #[test]
-    fn exp_neg_is_within_2e_7_of_the_exact_value() {
-        let mut worst = 0.0_f64;
-        for i in 0..2_000_000_u32 {
-            let power = i as f32 * 4e-5;
-            let got = f64::from(exp_neg(F8::splat(power)).0[3]);
-            let want = (-f64::from(power)).exp();
-            worst = worst.max((got / want - 1.0).abs());
+    struct Powers<'a> {
+        from: &'a [[f32; 16]],
+        to: &'a mut [[f32; 16]],
+    }
+
+    impl Kernel for Powers<'_> {
+        #[inline(always)]
+        fn run<S: Lanes>(self, simd: S) {
+            for (from, to) in self.from.iter().zip(self.to) {
+                for i in 0..16 / S::F32_LANES {
+                    simd.store(to, i, exp2_neg(simd, simd.load(from, i)));
+                }
+            }
         }
-        assert!(worst < 2e-7, "relative error {worst:.2e}");
-        assert_eq!(exp_neg(F8::splat(0.0)).0[0], 1.0, "e^0");
-        assert!(exp_neg(F8::splat(f32::INFINITY)).0[0] < 1e-30, "e^-inf");
+    }
+
+    #[test]
+    fn powers_of_two_are_within_2e_7_at_every_width() {
+        let powers: Vec<[f32; 16]> = (0..80_000_u32)
+            .map(|i| std::array::from_fn(|k| (16 * i + k as u32) as f32 * 9e-5))
+            .collect();
+        let of = |width: Width| {
+            let mut got = vec![[0.0; 16]; powers.len()];
+            width.run(Powers { from: &powers, to: &mut got });
+            got
+        };
+        for width in Width::ALL.into_iter().filter(|width| width.available()) {
+            let mut worst = 0.0_f64;
+            let got = of(width);
+            for (got, power) in got.iter().flatten().zip(powers.iter().flatten()) {
+                let want = (-f64::from(*power)).exp2();
+                worst = worst.max((f64::from(*got) / want - 1.0).abs());
+            }
+            assert!(worst < 2e-7, "{width:?}: relative error {worst:.2e}");
+            assert_eq!(got[0][0], 1.0, "2^0");
+            let mut last = [[0.0; 16]];
+            width.run(Powers { from: &[[f32::INFINITY; 16]], to: &mut last });
+            assert!(last[0][0] < 1e-30, "{width:?}: 2^-inf is {}", last[0][0]);
+        }
+        if Width::Sixteen.available() {
+            assert!(of(Width::Sixteen) == of(Width::Eight), "the wide forms differ");
+        }
+    }
+
+    struct Masks<'a>(&'a mut u32);
+
+    impl Kernel for Masks<'_> {
+        #[inline(always)]
+        fn run<S: Lanes>(self, simd: S) {
+            let row: [f32; 16] = std::array::from_fn(|k| k as f32);
+            for i in 0..16 / S::F32_LANES {
+                let odd = simd.greater_than_f32s(simd.load(&row, i), simd.splat_f32s(6.5));
+                *self.0 |= simd.bits(odd) << (i * S::F32_LANES);
+            }
+        }
+    }
+
+    #[test]
+    fn bits_of_a_mask_are_in_the_order_of_the_lanes() {
+        for width in Width::ALL.into_iter().filter(|width| width.available()) {
+            let mut bits = 0;
+            width.run(Masks(&mut bits));
+            assert_eq!(bits, 0xff80, "{width:?}");
+        }
     }
 }

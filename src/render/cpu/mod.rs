@@ -5,7 +5,8 @@
 //! nothing is summed across tasks.
 
 pub mod emit_isects;
-mod lanes;
+pub mod lanes;
+pub mod paint;
 pub mod prefix_sum;
 pub mod project;
 pub mod radix_sort;
@@ -22,9 +23,11 @@ use std::{
 use rayon::prelude::*;
 
 use self::{
-    project::Projected,
+    lanes::Width,
+    paint::Paint,
+    project::{Projected, Projection},
     radix_sort::{key, pack, value},
-    rasterize::{Paint, RowOut, Tile, TileScratch},
+    rasterize::{RowOut, Tile, TileScratch},
     tiles::Grid,
 };
 use super::{
@@ -49,6 +52,7 @@ pub struct CpuRenderer {
     frames: Pool<FrameScratch>,
     tiles: Pool<TileScratch>,
     isects_max: u64,
+    width: Width,
 }
 
 impl CpuRenderer {
@@ -74,7 +78,15 @@ impl CpuRenderer {
             frames: Pool::default(),
             tiles: Pool::default(),
             isects_max: ISECTS_MAX,
+            width: Width::widest(),
         })
+    }
+
+    /// The same renderer with kernels of another width, where the processor has it.
+    #[must_use]
+    pub fn with_width(mut self, width: Width) -> Self {
+        self.width = width;
+        self
     }
 
     /// The same renderer with another budget of Gaussian-tile pairs, for tests of the bands.
@@ -89,7 +101,8 @@ impl CpuRenderer {
         let mut frame = blank(&view, request);
         let mut scratch = self.frames.take();
         let FrameScratch { projected, sorted, spare, .. } = &mut scratch;
-        project::project(gaussians, &view, request.antialiased, projected);
+        let how = Projection { antialiased: request.antialiased, width: self.width };
+        project::project(gaussians, &view, how, projected);
         let visible = (0_u32..).zip(&projected.tiles_per_gauss).filter(|&(_, &tiles)| tiles > 0);
         sorted.clear();
         // t.z is over 0, so its bits are in the order of its value.
@@ -102,8 +115,8 @@ impl CpuRenderer {
         }
         frame.stats.visible = sorted.len() as u64;
         let grid = Grid { width: view.width, height: view.height, tile_rows: 0..view.tiles_y() };
-        let mut band =
-            Band { paint: Paint::new(request, gaussians.semantic_index()), entries: Vec::new() };
+        let paint = Paint::new(request, gaussians.semantic_index()).with_width(self.width);
+        let mut band = Band { paint, entries: Vec::new() };
         self.draw_band(&grid, &mut band, &mut scratch, &mut frame)?;
         if request.labels == Labels::Entries {
             frame.entries = Some(Entries::join(band.entries)?);

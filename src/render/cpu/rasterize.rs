@@ -1,136 +1,132 @@
 //! Stage 8: front-to-back blend of colour, depth, alpha and labels. Partner:
 //! `shaders/rasterize.wgsl`
 //!
-//! A tile is cut into cells of [`LANES`] pixels of one row. Gaussians are staged a batch at a time
-//! and entered in the list of each cell that their footprint meets; then each cell blends its list
-//! with the state of its pixels in registers. A cell whose rays have all ended takes no more.
+//! A tile is cut into cells of 4 x 4 pixels. Gaussians are staged a batch at a time; each marks the
+//! cells that its ellipse may meet, and the marks are turned over so that a cell has them as a row
+//! of bits. Then each cell blends what marked it, with the state of its pixels in registers. A cell
+//! whose rays have all ended takes no more.
 //!
 //! What is blended beside alpha is a row of channels, packed: colour, depth and a label's row of
 //! the table, as far as they were asked for. Entries are summed in one bin for each index that
 //! occurs in the tile, so a Gaussian touches one bin a cell however large the bank is.
 
 use super::{
-    lanes::{F8, exp_neg},
+    lanes::{Kernel, Lanes, exp2_neg},
+    paint::{CHANNELS, Paint},
     project::Footprint,
     radix_sort,
 };
 use crate::render::{
-    Kinds, Labels, RenderRequest,
-    constants::{ALPHA_MAX, ALPHA_MIN, BATCH_SIZE, LANES, TILE_SIZE, TRANSMITTANCE_MIN},
+    Labels,
+    constants::{ALPHA_MAX, ALPHA_MIN, BATCH_SIZE, TILE_SIZE, TRANSMITTANCE_MIN},
     labels::{BLEND_WIDTH, EntryRows},
 };
 
 const SIDE: usize = TILE_SIZE as usize;
+/// Side of a cell, pixels.
+const CELL: usize = 4;
 /// Cells in a row of a tile.
-const ACROSS: usize = SIDE / LANES;
+const ACROSS: usize = SIDE / CELL;
 /// Cells of a tile.
-const CELLS: usize = SIDE * ACROSS;
-/// The lane's place in its cell.
-const LANE: F8 = F8([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
+const CELLS: usize = ACROSS * ACROSS;
+/// Pixels of a cell.
+const PIXELS: usize = CELL * CELL;
+/// Gaussians whose marks are turned over at once.
+const GROUP: usize = 64;
+/// Middles of the cells from the middle of the tile, pixels.
+const CELL_X: Numbers = along(ACROSS, false, CELL as f32);
+const CELL_Y: Numbers = along(ACROSS, true, CELL as f32);
+/// Centres of a cell's pixels from its middle.
+const PIXEL_X: Numbers = along(CELL, false, 1.0);
+const PIXEL_Y: Numbers = along(CELL, true, 1.0);
+/// Powers are counted in twos: half the squared distance times log2 e.
+const SQRT_LOG2_E: f64 = 1.201_122_408_786_449_8;
+/// Room for the rounding of the bound of a cell, on top of the footprint's own slack.
+const REACH_SLACK: f32 = 1e-4;
 
-/// Most channels: colour, depth, labels.
-const CHANNELS: usize = 3 + 1 + BLEND_WIDTH;
+/// One number for each of 16 pixels or cells, in one line of the cache.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[repr(C, align(64))]
+struct Numbers([f32; 16]);
+
+impl Numbers {
+    const ZERO: Self = Self([0.0; 16]);
+    const ONE: Self = Self([1.0; 16]);
+
+    /// Vector `i`.
+    #[inline(always)]
+    fn at<S: Lanes>(&self, simd: S, i: usize) -> S::f32s {
+        simd.load(&self.0, i)
+    }
+
+    /// Writes vector `i`.
+    #[inline(always)]
+    fn put<S: Lanes>(&mut self, simd: S, i: usize, value: S::f32s) {
+        simd.store(&mut self.0, i, value);
+    }
+}
+
+/// Columns (or rows) of a square of `side` x `side`, `step` apart, counted from its middle.
+const fn along(side: usize, rows: bool, step: f32) -> Numbers {
+    let mut out = [0.0; 16];
+    let mut i = 0;
+    while i < 16 {
+        let k = if rows { i / side } else { i % side };
+        out[i] = (k as f32 - (side - 1) as f32 / 2.0) * step;
+        i += 1;
+    }
+    Numbers(out)
+}
+
 /// Bin of a Gaussian that enters none.
 const NO_BIN: u32 = u32::MAX;
 
-/// What a Gaussian is blended with, chosen once a frame.
-#[derive(Clone, Copy, Debug)]
-pub struct Paint<'a> {
-    /// Pictures wanted.
-    kinds: Kinds,
-    /// Behind everything, in colour.
-    background: [f32; 3],
-    /// Labels wanted.
-    labels: &'a Labels,
-    /// `[N]` bank index of each Gaussian.
-    index: &'a [u16],
-}
-
-impl<'a> Paint<'a> {
-    /// What `request` asks for, of Gaussians with the bank indices `index`, `[N]`.
-    #[must_use]
-    pub fn new(request: &'a RenderRequest, index: &'a [u16]) -> Self {
-        let RenderRequest { kinds, background, labels, .. } = request;
-        Self { kinds: *kinds, background: *background, labels, index }
-    }
-
-    /// Labels wanted.
-    #[must_use]
-    pub fn labels(&self) -> &'a Labels {
-        self.labels
-    }
-
-    /// First channel of depth and of labels, and the number of all.
-    fn layout(&self) -> [usize; 3] {
-        let depth = if self.kinds.color { 3 } else { 0 };
-        let label = depth + usize::from(self.kinds.depth);
-        let blend = matches!(self.labels, Labels::Blend(_));
-        [depth, label, label + if blend { BLEND_WIDTH } else { 0 }]
-    }
-
-    /// The channels of Gaussian `id`.
-    #[inline(always)]
-    fn channels(&self, footprint: &Footprint, id: usize) -> [f32; CHANNELS] {
-        let [depth, label, _] = self.layout();
-        let mut channels = [0.0; CHANNELS];
-        if self.kinds.color {
-            channels[..3].copy_from_slice(&footprint.color);
-        }
-        if self.kinds.depth {
-            channels[depth] = footprint.depth;
-        }
-        if let Labels::Blend(table) = self.labels {
-            let row = Labels::row(table, self.index[id]);
-            channels[label..label + BLEND_WIDTH].copy_from_slice(&row);
-        }
-        channels
-    }
-}
-
-/// What a Gaussian needs to be blended, the same for all cells of a tile.
+/// A Gaussian about to be blended into a tile, the same for all of its cells.
+///
+/// At a place (x, y) from the middle of the tile, pixels, the power of two by which its alpha
+/// falls is u² + v² with `u = ux x + uy y + u0` and `v = vy y + v0`. Where it is seen at all, no
+/// term is large: the blur bounds `ux`, `uy` and `vy`, so f32 loses nothing that shows.
 #[derive(Clone, Copy, Debug, Default)]
+#[repr(C, align(64))]
 struct Staged {
-    inv_sx: f32,
+    ux: f32,
+    uy: f32,
+    u0: f32,
+    vy: f32,
+    v0: f32,
+    /// Power at which alpha is under 1/255, with slack.
+    reach: f32,
     opacity: f32,
     channels: [f32; CHANNELS],
     /// Bin of its index, where entries are wanted.
     bin: u32,
 }
 
-/// A Gaussian in the list of a cell: half the squared distance at lane i is
-/// `(along + inv_sx · i)² + across`.
-#[derive(Clone, Copy, Debug, Default)]
-struct Entry {
-    along: f32,
-    across: f32,
-    staged: u32,
-}
-
-/// The pixels of a cell.
+/// The pixels of a cell: a row of numbers each.
 #[derive(Clone, Copy, Debug)]
 struct Cell {
     /// Transmittance while the ray goes on, 0 after it has ended.
-    transmittance: F8,
+    transmittance: Numbers,
     /// Accumulated opacity.
-    alpha: F8,
+    alpha: Numbers,
     /// Accumulated channels.
-    channels: [F8; CHANNELS],
+    channels: [Numbers; CHANNELS],
 }
 
 impl Cell {
     const CLEAR: Self = Self {
-        transmittance: F8::splat(1.0),
-        alpha: F8::splat(0.0),
-        channels: [F8::splat(0.0); CHANNELS],
+        transmittance: Numbers::ONE,
+        alpha: Numbers::ZERO,
+        channels: [Numbers::ZERO; CHANNELS],
     };
 }
 
 /// Scratch of one worker; its contents mean nothing between tiles.
 #[derive(Debug)]
 pub struct TileScratch {
+    fetched: Vec<Footprint>,
     staged: Vec<Staged>,
-    entries: Vec<Entry>,
-    counts: [usize; CELLS],
+    marks: [[u64; CELLS]; BATCH_SIZE / GROUP],
     cells: [Cell; CELLS],
     bins: Bins,
 }
@@ -138,9 +134,9 @@ pub struct TileScratch {
 impl Default for TileScratch {
     fn default() -> Self {
         Self {
+            fetched: vec![Footprint::default(); BATCH_SIZE],
             staged: vec![Staged::default(); BATCH_SIZE],
-            entries: vec![Entry::default(); BATCH_SIZE * CELLS],
-            counts: [0; CELLS],
+            marks: [[0; CELLS]; BATCH_SIZE / GROUP],
             cells: [Cell::CLEAR; CELLS],
             bins: Bins::default(),
         }
@@ -155,7 +151,7 @@ struct Bins {
     /// `[65536]` bin of each index, [`NO_BIN`] where it does not occur; empty before the first.
     bin_of: Vec<u32>,
     /// `[CELLS, present.len()]` sums.
-    sums: Vec<F8>,
+    sums: Vec<Numbers>,
 }
 
 impl Bins {
@@ -178,12 +174,12 @@ impl Bins {
             self.bin_of[usize::from(*label)] = bin;
         }
         self.sums.clear();
-        self.sums.resize(CELLS * self.present.len(), F8::splat(0.0));
+        self.sums.resize(CELLS * self.present.len(), Numbers::ZERO);
     }
 
     /// The sums of a cell, one a bin.
     #[inline(always)]
-    fn of_cell(&mut self, cell: usize) -> &mut [F8] {
+    fn of_cell(&mut self, cell: usize) -> &mut [Numbers] {
         let count = self.present.len();
         &mut self.sums[cell * count..(cell + 1) * count]
     }
@@ -229,24 +225,19 @@ pub fn rasterize_tile(
     scratch: &mut TileScratch,
     out: &mut RowOut<'_>,
 ) {
-    let work = Work { footprints, isects, tile, paint };
+    if isects.is_empty() {
+        return store_empty(tile, paint, picture_width, out);
+    }
     if *paint.labels == Labels::Entries {
         scratch.bins.open(isects, paint.index);
     }
-    #[cfg(target_arch = "x86_64")]
-    if std::arch::is_x86_feature_detected!("avx2") {
-        #[expect(unsafe_code, reason = "a call into code compiled for AVX2")]
-        // SAFETY: the processor has AVX2, which was asked the line above.
-        unsafe {
-            blend_avx2(&work, scratch);
-        }
-        return store(tile, paint, picture_width, scratch, out);
-    }
-    blend(&work, scratch);
+    let work = Work { footprints, isects, tile, paint };
+    paint.width.run(Blend { work, scratch: &mut *scratch });
     store(tile, paint, picture_width, scratch, out);
 }
 
 /// A tile and what falls on it.
+#[derive(Clone, Copy)]
 struct Work<'a> {
     footprints: &'a [Footprint],
     isects: &'a [u64],
@@ -254,68 +245,80 @@ struct Work<'a> {
     paint: &'a Paint<'a>,
 }
 
-/// [`blend`], compiled for 256-bit registers. No operation is fused, so the bits are the same.
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn blend_avx2(work: &Work<'_>, scratch: &mut TileScratch) {
-    blend(work, scratch);
+struct Blend<'a> {
+    work: Work<'a>,
+    scratch: &'a mut TileScratch,
 }
 
-/// The loop with the channels that the frame asks for: what is not wanted is not computed.
-#[inline(always)]
-fn blend(work: &Work<'_>, scratch: &mut TileScratch) {
-    let [.., channels] = work.paint.layout();
-    match (channels, *work.paint.labels == Labels::Entries) {
-        (0, false) => blend_channels::<0, false>(work, scratch),
-        (1, false) => blend_channels::<1, false>(work, scratch),
-        (3, false) => blend_channels::<3, false>(work, scratch),
-        // Four alone compile to shuffles of four instead of lanes of eight, a quarter slower; with
-        // a fifth that stays 0 they do not.
-        (4 | 5, false) => blend_channels::<5, false>(work, scratch),
-        (7, false) => blend_channels::<7, false>(work, scratch),
-        (_, false) => blend_channels::<CHANNELS, false>(work, scratch),
-        (0, true) => blend_channels::<0, true>(work, scratch),
-        (1, true) => blend_channels::<1, true>(work, scratch),
-        (3, true) => blend_channels::<3, true>(work, scratch),
-        (_, true) => blend_channels::<4, true>(work, scratch),
-    }
-}
-
-#[inline(always)]
-fn blend_channels<const K: usize, const ENTRIES: bool>(work: &Work<'_>, scratch: &mut TileScratch) {
-    let Work { footprints, isects, tile, paint } = *work;
-    scratch.cells.fill(Cell::CLEAR);
-    // One bit a cell: set while some ray in it goes on.
-    let mut open = 0_u32;
-    for cell in 0..CELLS {
-        let inside =
-            cell / ACROSS < tile.height as usize && cell % ACROSS * LANES < tile.width as usize;
-        open |= u32::from(inside) << cell;
-    }
-    for batch in isects.chunks(BATCH_SIZE) {
-        scratch.counts.fill(0);
-        for (slot, &isect) in batch.iter().enumerate() {
-            let id = radix_sort::value(isect) as usize;
-            let footprint = &footprints[id];
-            scratch.staged[slot] = Staged {
-                inv_sx: footprint.inv_sx,
-                opacity: footprint.opacity,
-                channels: paint.channels(footprint, id),
-                bin: match ENTRIES {
-                    true => scratch.bins.bin_of[usize::from(paint.index[id])],
-                    false => NO_BIN,
-                },
-            };
-            enter(footprint, slot, tile, open, &mut scratch.entries, &mut scratch.counts);
+impl Kernel for Blend<'_> {
+    /// The loop with the channels that the frame asks for: what is not wanted is not computed.
+    #[inline(always)]
+    fn run<S: Lanes>(self, simd: S) {
+        let Self { work, scratch } = self;
+        let [.., channels] = work.paint.layout();
+        let entries = *work.paint.labels == Labels::Entries;
+        match (channels, entries) {
+            (0, false) => blend::<S, 0, false>(simd, work, scratch),
+            (1, false) => blend::<S, 1, false>(simd, work, scratch),
+            (3, false) => blend::<S, 3, false>(simd, work, scratch),
+            (4, false) => blend::<S, 4, false>(simd, work, scratch),
+            (5, false) => blend::<S, 5, false>(simd, work, scratch),
+            (7, false) => blend::<S, 7, false>(simd, work, scratch),
+            (_, false) => blend::<S, CHANNELS, false>(simd, work, scratch),
+            (0, true) => blend::<S, 0, true>(simd, work, scratch),
+            (1, true) => blend::<S, 1, true>(simd, work, scratch),
+            (3, true) => blend::<S, 3, true>(simd, work, scratch),
+            (_, true) => blend::<S, 4, true>(simd, work, scratch),
         }
-        for cell in 0..CELLS {
-            let entries = &scratch.entries[cell * BATCH_SIZE..][..scratch.counts[cell]];
-            if entries.is_empty() {
-                continue;
+    }
+}
+
+#[inline(always)]
+fn blend<S: Lanes, const K: usize, const ENTRIES: bool>(
+    simd: S,
+    work: Work<'_>,
+    scratch: &mut TileScratch,
+) {
+    let mut open = clear(&mut scratch.cells, work.tile);
+    for batch in work.isects.chunks(BATCH_SIZE) {
+        // Footprints lie far apart in memory: they are fetched in a loop so short that the
+        // processor waits for many at once.
+        let fetched = &mut scratch.fetched[..batch.len()];
+        for (fetched, &isect) in fetched.iter_mut().zip(batch) {
+            *fetched = work.footprints[radix_sort::value(isect) as usize];
+        }
+        let staged = &mut scratch.staged[..batch.len()];
+        for ((staged, footprint), &isect) in staged.iter_mut().zip(fetched).zip(batch) {
+            let id = radix_sort::value(isect) as usize;
+            let bin = match ENTRIES {
+                true => scratch.bins.bin_of[usize::from(work.paint.index[id])],
+                false => NO_BIN,
+            };
+            let channels = work.paint.channels(footprint, id);
+            *staged = stage(footprint, work.tile, channels, bin);
+        }
+        let groups = staged.chunks(GROUP).zip(&mut scratch.marks);
+        for (group, marks) in groups {
+            let mut met_by = [0_u16; GROUP];
+            for (bits, gaussian) in met_by.iter_mut().zip(group) {
+                *bits = met(simd, gaussian);
             }
-            let (at, sums) = (&mut scratch.cells[cell], scratch.bins.of_cell(cell));
-            if blend_cell::<K, ENTRIES>(at, entries, &scratch.staged, sums) {
-                open &= !(1 << cell);
+            *marks = turned_over(&met_by);
+        }
+        let groups = batch.len().div_ceil(GROUP);
+        let mut cells = open;
+        while cells != 0 {
+            let at = cells.trailing_zeros() as usize;
+            cells &= cells - 1;
+            let marks = &scratch.marks[..groups];
+            let (cell, sums) = (&mut scratch.cells[at], scratch.bins.of_cell(at));
+            let mut goes_on = false;
+            for i in 0..PIXELS / S::F32_LANES {
+                goes_on |=
+                    blend_cell::<S, K, ENTRIES>(simd, at, i, cell, &scratch.staged, marks, sums);
+            }
+            if !goes_on {
+                open &= !(1 << at);
             }
         }
         if open == 0 {
@@ -324,90 +327,186 @@ fn blend_channels<const K: usize, const ENTRIES: bool>(work: &Work<'_>, scratch:
     }
 }
 
-/// Enters a Gaussian in the list of every open cell that its footprint meets.
+/// One row of bits for each cell: bit i tells of Gaussian i, whose bit c tells of cell c.
 #[inline(always)]
-fn enter(
-    footprint: &Footprint,
-    slot: usize,
-    tile: Tile,
-    open: u32,
-    entries: &mut [Entry],
-    counts: &mut [usize; CELLS],
-) {
-    let x = footprint.mean[0] - f64::from(tile.x) - 0.5;
-    let y = footprint.mean[1] - f64::from(tile.y) - 0.5;
-    let tall = f64::from(footprint.reach.sqrt() / footprint.inv_sy) + 1e-3;
-    let last_row = f64::from(tile.height - 1);
-    if y + tall < 0.0 || y - tall > last_row {
-        return;
-    }
-    let first = (y - tall).max(0.0) as usize;
-    let last = (y + tall).min(last_row) as usize;
-    let side = f64::from(TILE_SIZE - 1);
-    let (px_per_sx, inv_sx) = (1.0 / footprint.inv_sx, f64::from(footprint.inv_sx));
-    for row in first..=last {
-        let dy = row as f64 - y;
-        let across = dy as f32 * footprint.inv_sy;
-        let across = across * across;
-        let left_over = footprint.reach - across;
-        if left_over < 0.0 {
-            continue;
-        }
-        let half = f64::from(left_over.sqrt() * px_per_sx) + 1e-3;
-        let center = x + footprint.slope * dy;
-        if center + half < 0.0 || center - half > side {
-            continue;
-        }
-        let first_cell = (center - half).max(0.0) as usize / LANES;
-        let last_cell = (center + half).min(side) as usize / LANES;
-        for column in first_cell..=last_cell {
-            let cell = row * ACROSS + column;
-            if open >> cell & 1 == 1 {
-                let along = ((column * LANES) as f64 - center) * inv_sx;
-                let entry = Entry { along: along as f32, across, staged: slot as u32 };
-                entries[cell * BATCH_SIZE + counts[cell]] = entry;
-                counts[cell] += 1;
+fn turned_over(met_by: &[u16; GROUP]) -> [u64; CELLS] {
+    let mut marks = [0; CELLS];
+    for (block, met_by) in met_by.chunks_exact(8).enumerate() {
+        for half in 0..2 {
+            // 8 x 8 bits in a word, transposed by three exchanges (Hacker's Delight, 7-3).
+            let mut word = 0_u64;
+            for (i, bits) in met_by.iter().enumerate() {
+                word |= u64::from(bits >> (8 * half) & 0xff) << (8 * i);
+            }
+            for (shift, mask) in
+                [(7, 0x00aa_00aa_00aa_00aa), (14, 0x0000_cccc_0000_cccc), (28, 0xf0f0_f0f0)]
+            {
+                let t = (word ^ word >> shift) & mask;
+                word ^= t ^ t << shift;
+            }
+            for k in 0..8 {
+                marks[8 * half + k] |= (word >> (8 * k) & 0xff) << (8 * block);
             }
         }
     }
+    marks
 }
 
-/// Blends a list into a cell: K channels, and the cell's bins; whether every ray of it has ended.
-#[inline(always)]
-fn blend_cell<const K: usize, const ENTRIES: bool>(
-    cell: &mut Cell,
-    entries: &[Entry],
-    staged: &[Staged],
-    sums: &mut [F8],
-) -> bool {
-    let (mut transmittance, mut alpha_sum) = (cell.transmittance, cell.alpha);
-    let mut channels: [F8; K] = std::array::from_fn(|channel| cell.channels[channel]);
-    let mut ended = false;
-    for entry in entries {
-        let gaussian = &staged[entry.staged as usize];
-        let along = LANE * F8::splat(gaussian.inv_sx) + F8::splat(entry.along);
-        let power = along * along + F8::splat(entry.across);
-        let alpha = (exp_neg(power) * F8::splat(gaussian.opacity)).min(ALPHA_MAX);
-        let alpha = alpha.zero_under(ALPHA_MIN);
-        let next = transmittance * (F8::splat(1.0) - alpha);
-        // The Gaussian that would end the ray is not added; an ended ray stays at 0.
-        let weight = (alpha * transmittance).zero_where_not_over(next, TRANSMITTANCE_MIN);
-        transmittance = next.zero_where_not_over(next, TRANSMITTANCE_MIN);
-        alpha_sum = alpha_sum + weight;
-        for (sum, &value) in channels.iter_mut().zip(&gaussian.channels) {
-            *sum = *sum + weight * F8::splat(value);
+/// Clears the cells; one bit for each that has pixels inside the picture. Pixels outside have
+/// ended.
+fn clear(cells: &mut [Cell; CELLS], tile: Tile) -> u32 {
+    cells.fill(Cell::CLEAR);
+    let mut open = (1 << CELLS) - 1;
+    if (tile.width, tile.height) == (TILE_SIZE, TILE_SIZE) {
+        return open;
+    }
+    for (i, cell) in cells.iter_mut().enumerate() {
+        for (pixel, transmittance) in cell.transmittance.0.iter_mut().enumerate() {
+            let (x, y) = place(i, pixel);
+            if x >= tile.width as usize || y >= tile.height as usize {
+                *transmittance = 0.0;
+            }
         }
-        if ENTRIES && let Some(sum) = sums.get_mut(gaussian.bin as usize) {
-            *sum = *sum + weight;
-        }
-        if transmittance.is_zero() {
-            ended = true;
-            break;
+        if cell.transmittance == Numbers::ZERO {
+            open &= !(1 << i);
         }
     }
-    (cell.transmittance, cell.alpha) = (transmittance, alpha_sum);
-    cell.channels[..K].copy_from_slice(&channels);
-    ended
+    open
+}
+
+/// Column and row in the tile of a pixel of a cell.
+#[inline(always)]
+const fn place(cell: usize, pixel: usize) -> (usize, usize) {
+    (cell % ACROSS * CELL + pixel % CELL, cell / ACROSS * CELL + pixel / CELL)
+}
+
+/// A footprint as a tile needs it. f64, narrowed where nothing is large any more.
+#[inline(always)]
+fn stage(footprint: &Footprint, tile: Tile, channels: [f32; CHANNELS], bin: u32) -> Staged {
+    let half = f64::from(TILE_SIZE) / 2.0;
+    let x = footprint.mean[0] - (f64::from(tile.x) + half);
+    let y = footprint.mean[1] - (f64::from(tile.y) + half);
+    let ux = f64::from(footprint.inv_sx) * SQRT_LOG2_E;
+    let vy = f64::from(footprint.inv_sy) * SQRT_LOG2_E;
+    Staged {
+        ux: ux as f32,
+        uy: (-ux * footprint.slope) as f32,
+        u0: (-ux * (x - footprint.slope * y)) as f32,
+        vy: vy as f32,
+        v0: (-vy * y) as f32,
+        reach: footprint.reach * std::f32::consts::LOG2_E + REACH_SLACK,
+        opacity: footprint.opacity,
+        channels,
+        bin,
+    }
+}
+
+/// One bit for each cell that the ellipse may meet.
+///
+/// Over a cell u and v stay within a box, whose distance from 0 is compared with the reach.
+#[inline(always)]
+fn met<S: Lanes>(simd: S, gaussian: &Staged) -> u16 {
+    let mut bits = 0;
+    let half = (CELL - 1) as f32 / 2.0;
+    let wide = simd.splat_f32s(half * (gaussian.ux.abs() + gaussian.uy.abs()));
+    let tall = simd.splat_f32s(half * gaussian.vy);
+    let zero = simd.splat_f32s(0.0);
+    for i in 0..CELLS / S::F32_LANES {
+        let (x, y) = (CELL_X.at(simd, i), CELL_Y.at(simd, i));
+        let (u, v) = along_axes(simd, gaussian, x, y);
+        let du = simd.max_f32s(simd.sub_f32s(simd.abs_f32s(u), wide), zero);
+        let dv = simd.max_f32s(simd.sub_f32s(simd.abs_f32s(v), tall), zero);
+        let nearest = simd.fused(du, du, simd.mul_f32s(dv, dv));
+        let near = simd.less_than_or_equal_f32s(nearest, simd.splat_f32s(gaussian.reach));
+        bits |= simd.bits(near) << (i * S::F32_LANES);
+    }
+    bits as u16
+}
+
+/// u and v at places from the middle of the tile.
+#[inline(always)]
+fn along_axes<S: Lanes>(simd: S, gaussian: &Staged, x: S::f32s, y: S::f32s) -> (S::f32s, S::f32s) {
+    let u = simd.fused(y, simd.splat_f32s(gaussian.uy), simd.splat_f32s(gaussian.u0));
+    let u = simd.fused(x, simd.splat_f32s(gaussian.ux), u);
+    let v = simd.fused(y, simd.splat_f32s(gaussian.vy), simd.splat_f32s(gaussian.v0));
+    (u, v)
+}
+
+/// Blends what marked cell `at` into vector `i` of it: K channels, and their bins; whether some
+/// ray goes on.
+#[inline(always)]
+fn blend_cell<S: Lanes, const K: usize, const ENTRIES: bool>(
+    simd: S,
+    at: usize,
+    i: usize,
+    cell: &mut Cell,
+    staged: &[Staged],
+    marks: &[[u64; CELLS]],
+    sums: &mut [Numbers],
+) -> bool {
+    let zero = simd.splat_f32s(0.0);
+    let end = simd.splat_f32s(TRANSMITTANCE_MIN);
+    let x = simd.add_f32s(PIXEL_X.at(simd, i), simd.splat_f32s(CELL_X.0[at]));
+    let y = simd.add_f32s(PIXEL_Y.at(simd, i), simd.splat_f32s(CELL_Y.0[at]));
+    let mut transmittance = cell.transmittance.at(simd, i);
+    let mut alpha_sum = cell.alpha.at(simd, i);
+    let mut channels = [zero; K];
+    for (channel, sum) in channels.iter_mut().zip(&cell.channels) {
+        *channel = sum.at(simd, i);
+    }
+    let mut goes_on = true;
+    'all: for (group, marks) in marks.iter().enumerate() {
+        let mut bits = marks[at];
+        while bits != 0 {
+            let gaussian = &staged[group * GROUP + bits.trailing_zeros() as usize];
+            bits &= bits - 1;
+            let (u, v) = along_axes(simd, gaussian, x, y);
+            let power = simd.fused(u, u, simd.mul_f32s(v, v));
+            let alpha = simd.mul_f32s(exp2_neg(simd, power), simd.splat_f32s(gaussian.opacity));
+            let alpha = simd.min_f32s(alpha, simd.splat_f32s(ALPHA_MAX));
+            let counts = simd.less_than_or_equal_f32s(simd.splat_f32s(ALPHA_MIN), alpha);
+            let alpha = simd.select_f32s(counts, alpha, zero);
+            let next = simd.mul_f32s(transmittance, simd.sub_f32s(simd.splat_f32s(1.0), alpha));
+            // The Gaussian that would end the ray is not added; an ended ray stays at 0.
+            let lives = simd.greater_than_f32s(next, end);
+            let weight = simd.select_f32s(lives, simd.mul_f32s(alpha, transmittance), zero);
+            transmittance = simd.select_f32s(lives, next, zero);
+            alpha_sum = simd.add_f32s(alpha_sum, weight);
+            for (sum, &value) in channels.iter_mut().zip(&gaussian.channels) {
+                *sum = simd.fused(weight, simd.splat_f32s(value), *sum);
+            }
+            if ENTRIES && let Some(sum) = sums.get_mut(gaussian.bin as usize) {
+                sum.put(simd, i, simd.add_f32s(sum.at(simd, i), weight));
+            }
+            if simd.bits(lives) == 0 {
+                goes_on = false;
+                break 'all;
+            }
+        }
+    }
+    cell.transmittance.put(simd, i, transmittance);
+    cell.alpha.put(simd, i, alpha_sum);
+    for (channel, sum) in channels.into_iter().zip(&mut cell.channels) {
+        sum.put(simd, i, channel);
+    }
+    goes_on
+}
+
+/// Writes a tile that nothing falls on.
+fn store_empty(tile: Tile, paint: &Paint<'_>, picture_width: u32, out: &mut RowOut<'_>) {
+    for row in 0..tile.height as usize {
+        let first = row * picture_width as usize + tile.x as usize;
+        let pixels = first..first + tile.width as usize;
+        if let Some(color) = &mut out.color {
+            color[pixels.clone()].fill(paint.background);
+        }
+        for plane in [&mut out.depth, &mut out.alpha].into_iter().flatten() {
+            plane[pixels.clone()].fill(0.0);
+        }
+        if let Some(blend) = &mut out.blend {
+            blend[pixels].fill([0.0; BLEND_WIDTH]);
+        }
+    }
 }
 
 /// Writes every pixel of the tile, colour blended over the background.
@@ -422,23 +521,23 @@ fn store(
     for row in 0..tile.height as usize {
         for column in 0..tile.width as usize {
             let at = row * picture_width as usize + tile.x as usize + column;
-            let cell = &scratch.cells[row * ACROSS + column / LANES];
-            let lane = column % LANES;
-            let alpha = cell.alpha.0[lane].min(1.0);
+            let cell = &scratch.cells[row / CELL * ACROSS + column / CELL];
+            let pixel = row % CELL * CELL + column % CELL;
+            let alpha = cell.alpha.0[pixel].min(1.0);
             if let Some(color) = &mut out.color {
                 color[at] = std::array::from_fn(|channel| {
-                    cell.channels[channel].0[lane] + (1.0 - alpha) * paint.background[channel]
+                    cell.channels[channel].0[pixel] + (1.0 - alpha) * paint.background[channel]
                 });
             }
             if let Some(depth) = &mut out.depth {
-                let sum = cell.channels[depth_at].0[lane];
-                depth[at] = if alpha > 0.0 { sum / cell.alpha.0[lane] } else { 0.0 };
+                let sum = cell.channels[depth_at].0[pixel];
+                depth[at] = if alpha > 0.0 { sum / cell.alpha.0[pixel] } else { 0.0 };
             }
             if let Some(out) = &mut out.alpha {
                 out[at] = alpha;
             }
             if let Some(blend) = &mut out.blend {
-                blend[at] = std::array::from_fn(|k| cell.channels[label_at + k].0[lane]);
+                blend[at] = std::array::from_fn(|k| cell.channels[label_at + k].0[pixel]);
             }
         }
     }
@@ -453,20 +552,36 @@ fn store_entries(tile: Tile, bins: &Bins, entries: &mut EntryRows) {
     if count == 0 {
         return;
     }
-    let mut touched = Vec::with_capacity(count);
-    for (cell, sums) in bins.sums.chunks_exact(count).enumerate() {
-        touched.clear();
-        touched.extend(bins.present.iter().zip(sums).filter(|(_, sum)| !sum.is_zero()));
-        let (row, first) = (cell / ACROSS, cell % ACROSS * LANES);
-        if row >= tile.height as usize {
-            break;
-        }
-        for column in first..(first + LANES).min(tile.width as usize) {
-            for (label, sum) in &touched {
-                let weight = sum.0[column - first];
-                if weight > 0.0 {
-                    entries.push(tile.x as usize + column, row, **label, weight);
+    for row in 0..tile.height as usize {
+        for column in 0..tile.width as usize {
+            let cell = row / CELL * ACROSS + column / CELL;
+            let pixel = row % CELL * CELL + column % CELL;
+            let sums = &bins.sums[cell * count..(cell + 1) * count];
+            for (label, sum) in bins.present.iter().zip(sums) {
+                if sum.0[pixel] > 0.0 {
+                    entries.push(tile.x as usize + column, row, *label, sum.0[pixel]);
                 }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn turned_over_marks_tell_the_same() {
+        let mut random = 9_u32;
+        let met_by: [u16; GROUP] = std::array::from_fn(|_| {
+            random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (random >> 13) as u16
+        });
+        let marks = turned_over(&met_by);
+        for (gaussian, bits) in met_by.iter().enumerate() {
+            for (cell, marks) in marks.iter().enumerate() {
+                let (want, got) = (bits >> cell & 1 == 1, marks >> gaussian & 1 == 1);
+                assert_eq!(got, want, "Gaussian {gaussian}, cell {cell}");
             }
         }
     }

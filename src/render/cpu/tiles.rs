@@ -3,8 +3,15 @@
 
 use std::ops::Range;
 
-use super::project::Footprint;
+use super::{
+    lanes::{Lanes, Row, Wide},
+    project::Footprint,
+};
 use crate::render::constants::TILE_SIZE;
+
+/// Places beyond this are all as far, pixels: pictures are smaller, and whole numbers of this size
+/// are exact.
+const FAR: f64 = 1_099_511_627_776.0;
 
 /// The part of the picture that is drawn: all columns, some rows of tiles.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -93,6 +100,100 @@ impl TileSpans {
     }
 }
 
+/// Ellipses asked at once.
+pub(super) const BLOCK: usize = 16;
+
+/// [`touched_tiles`] for many ellipses at once, as far as [`TileSpans`] keeps the answer.
+#[derive(Default)]
+pub(super) struct Ellipses {
+    mean: [Row; 2],
+    slope: Row,
+    inv_sx: Row,
+    inv_sy: Row,
+    reach: Row,
+    /// First row of tiles and one past the last; none where they are the same.
+    rows: [Row; 2],
+    /// For the first two rows of tiles: the first tile and one past the last.
+    spans: [[Row; 2]; 2],
+}
+
+impl Ellipses {
+    /// Ellipse `k` is that of `footprint`.
+    #[inline(always)]
+    pub(super) fn set(&mut self, k: usize, footprint: &Footprint) {
+        [self.mean[0][k], self.mean[1][k]] = footprint.mean;
+        self.slope[k] = footprint.slope;
+        self.inv_sx[k] = f64::from(footprint.inv_sx);
+        self.inv_sy[k] = f64::from(footprint.inv_sy);
+        self.reach[k] = f64::from(footprint.reach);
+    }
+
+    /// Answers for all, statement by statement as [`touched_tiles`].
+    #[inline(always)]
+    pub(super) fn touch<S: Lanes>(&mut self, simd: S, grid: &Grid) {
+        let number = |value: f64| Wide::of(simd, value);
+        let (zero, half, one) = (number(0.0), number(0.5), number(1.0));
+        let (tile, per_tile) = (number(f64::from(TILE_SIZE)), number(1.0 / f64::from(TILE_SIZE)));
+        let (far, last_row) = (number(FAR), number(f64::from(grid.height) - 1.0));
+        let last_column = number(f64::from(grid.width) - 1.0);
+        for i in 0..BLOCK / S::F64_LANES {
+            let at = |row: &Row| Wide::at(simd, row, i);
+            let (mean_x, mean_y, slope) = (at(&self.mean[0]), at(&self.mean[1]), at(&self.slope));
+            let (inv_sx, inv_sy) = (at(&self.inv_sx), at(&self.inv_sy));
+            let reach = at(&self.reach).sqrt();
+            let tall = reach / inv_sy;
+            let bounded = |value: Wide<S>| value.max(zero - far).min(far);
+            let top = bounded(mean_y - tall - half).ceil().max(zero);
+            let bottom = bounded(mean_y + tall - half).floor().min(last_row);
+            let across = reach / inv_sx;
+            let lean = slope * tall;
+            let peak = lean / (across * across + lean * lean).sqrt();
+            let per_tall = inv_sy / reach;
+            let first_row = (top * per_tile).floor();
+            let end_row = ((bottom * per_tile).floor() + one).only(bottom.at_least(top));
+            first_row.put(&mut self.rows[0], i);
+            end_row.put(&mut self.rows[1], i);
+            for (k, [first, end]) in self.spans.iter_mut().enumerate() {
+                let tile_y = first_row + number(k as f64);
+                let corner = tile_y * tile;
+                let low = (corner.max(top) + half - mean_y) * per_tall;
+                let high = ((corner + tile - one).min(bottom) + half - mean_y) * per_tall;
+                let at_right = peak.max(low).min(high);
+                let at_left = (zero - peak).max(low).min(high);
+                let half_width = |share: Wide<S>| (one - share * share).max(zero).sqrt() * across;
+                let right = lean * at_right + half_width(at_right);
+                let left = lean * at_left - half_width(at_left);
+                let left = bounded(mean_x + left - half).ceil().max(zero);
+                let right = bounded(mean_x + right - half).floor().min(last_column);
+                let meets = right.at_least(left);
+                (left * per_tile).floor().only(meets).put(first, i);
+                ((right * per_tile).floor() + one).only(meets).put(end, i);
+            }
+        }
+    }
+
+    /// The answer for ellipse `k`, that of `footprint`: spans and number of tiles.
+    #[inline(always)]
+    pub(super) fn spans(&self, k: usize, footprint: &Footprint, grid: &Grid) -> (TileSpans, u32) {
+        let (first, end) = (self.rows[0][k], self.rows[1][k]);
+        if end - first > 2.0 {
+            return TileSpans::of(footprint, grid);
+        }
+        let mut kept = TileSpans::default();
+        if end <= first {
+            return (kept, 0);
+        }
+        let mut count = 0;
+        kept.first_row = first as u16;
+        kept.rows = (end - first) as u16;
+        for (span, row) in kept.spans.iter_mut().zip(&self.spans).take(usize::from(kept.rows)) {
+            *span = [row[0][k] as u16, row[1][k] as u16];
+            count += u32::from(span[1] - span[0]);
+        }
+        (kept, count)
+    }
+}
+
 /// Calls `touch(tile_y, tiles)` for every row of tiles of `grid` with the span of tiles touched.
 ///
 /// A tile is touched where the ellipse "alpha may reach 1/255" meets the rectangle of the tile's
@@ -157,7 +258,10 @@ fn ceil(v: f64) -> i64 {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use super::{
+        super::lanes::{Kernel, Width},
+        *,
+    };
 
     #[test]
     fn floor_and_ceil_equal_the_standard_ones_and_saturate() {
@@ -166,6 +270,61 @@ mod tests {
         }
         for v in [f64::INFINITY, 1e300] {
             assert_eq!((floor(v), ceil(-v)), (i64::MAX, i64::MIN), "{v} saturates");
+        }
+    }
+
+    struct Asked<'a>(&'a [Footprint], &'a Grid, &'a mut Vec<(TileSpans, u32)>);
+
+    impl Kernel for Asked<'_> {
+        #[inline(always)]
+        fn run<S: Lanes>(self, simd: S) {
+            let Self(footprints, grid, answers) = self;
+            for block in footprints.chunks(BLOCK) {
+                let mut ellipses = Ellipses::default();
+                for (k, footprint) in block.iter().enumerate() {
+                    ellipses.set(k, footprint);
+                }
+                ellipses.touch(simd, grid);
+                let spans = block.iter().enumerate();
+                answers.extend(spans.map(|(k, footprint)| ellipses.spans(k, footprint, grid)));
+            }
+        }
+    }
+
+    #[test]
+    fn ellipses_in_lanes_touch_the_tiles_that_one_alone_touches() {
+        let grid = Grid { width: 203, height: 150, tile_rows: 0..10 };
+        let footprints: Vec<Footprint> = (0..4_000_u32)
+            .map(|i| {
+                let turn = |k: u32| f64::from((i.wrapping_mul(2_654_435_761) >> k) & 0xff) / 255.0;
+                // Some far away, some of no height, some that cover the picture.
+                let far = if i % 97 == 0 { 1e12 } else { 1.0 };
+                Footprint {
+                    mean: [(turn(3) * 300.0 - 50.0) * far, turn(9) * 250.0 - 50.0],
+                    slope: turn(12) * 8.0 - 4.0,
+                    inv_sx: (0.002 + turn(17)) as f32,
+                    inv_sy: (0.004 + turn(21) * turn(2)) as f32,
+                    reach: (turn(6) * 5.5) as f32,
+                    ..Footprint::default()
+                }
+            })
+            .collect();
+        let alone = footprints.iter().map(|f| TileSpans::of(f, &grid));
+        let want: Vec<_> = alone.collect();
+        assert!(want.iter().any(|(spans, _)| spans.rows > 2), "tall ones too");
+        for width in Width::ALL.into_iter().filter(|width| width.available()) {
+            let mut got = Vec::new();
+            width.run(Asked(&footprints, &grid, &mut got));
+            for (i, (got, want)) in got.iter().zip(&want).enumerate() {
+                // What a span tells counts, not how an empty one is written.
+                let tiles = |spans: &TileSpans| {
+                    let mut tiles = Vec::new();
+                    spans.replay(&footprints[i], &grid, |y, xs| tiles.push((y, xs)));
+                    tiles
+                };
+                assert_eq!(got.1, want.1, "{width:?}, count of {:?}", footprints[i]);
+                assert_eq!(tiles(&got.0), tiles(&want.0), "{width:?}, {:?}", footprints[i]);
+            }
         }
     }
 
