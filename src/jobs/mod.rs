@@ -347,6 +347,14 @@ impl Jobs {
         Ok(id)
     }
 
+    /// Refuses where another scene of this owner would not be queued now.
+    ///
+    /// # Errors
+    /// `overloaded` when the queue is full or the server stops.
+    pub fn has_room(&self, owner: Option<&str>) -> Result<()> {
+        self.shared.queue.reserve(owner).map(drop).map_err(|full| self.overloaded(full))
+    }
+
     fn overloaded(&self, full: Full) -> Error {
         let (message, seconds) = match full {
             Full::Closed => ("the server is stopping".to_owned(), 10),

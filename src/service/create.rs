@@ -69,8 +69,9 @@ impl Service {
             let can = self.inner.can_understand("semantics").is_ok();
             options.semantics = if can { SemanticsMode::Eager } else { SemanticsMode::Off };
         }
-        self.inner.memory.admit(upload.size_bytes())?;
         let keyed = idempotency_key.is_some();
+        self.has_room(keyed)?;
+        self.inner.memory.admit(upload.size_bytes())?;
         let one_at_a_time = match &idempotency_key {
             Some(key) => Some(self.inner.key_lock(key).lock().await),
             None => None,
@@ -86,6 +87,16 @@ impl Service {
             waited?;
         }
         Ok(Created { status: self.get(&id).await?, replayed })
+    }
+
+    /// Refuses a create that would find the queue full, before its photos are sent or decoded: work
+    /// for what is then refused would be taken from what is not. With an idempotency key it may be
+    /// one that was answered before, and is looked at whole.
+    ///
+    /// # Errors
+    /// `overloaded`.
+    pub fn has_room(&self, keyed: bool) -> Result<()> {
+        if keyed { Ok(()) } else { self.inner.jobs.has_room(self.caller.owner()) }
     }
 
     /// Waits until nothing more will happen to the scene, at most `limits.wait_ms_max`.

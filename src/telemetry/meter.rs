@@ -49,6 +49,9 @@ pub const STAGES: [&str; 14] = [
     "queue", "load", "render", "encode",
 ];
 
+/// Between two sortings of what was measured.
+const UPKEEP_EVERY: Duration = Duration::from_secs(5);
+
 /// Upper ends of the histograms' buckets, seconds: 1 ms to 10 minutes.
 const BUCKETS: [f64; 16] = [
     0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 15.0, 60.0, 180.0,
@@ -66,13 +69,31 @@ pub fn handle() -> Result<&'static PrometheusHandle> {
             .set_buckets_for_metric(Matcher::Suffix("_seconds".to_owned()), &BUCKETS)
             .and_then(PrometheusBuilder::install_recorder)
             .map_err(|e| e.to_string());
-        if built.is_ok() {
+        if let Ok(handle) = &built {
             describe();
             register();
+            keep_up(handle.clone());
         }
         built
     });
     handle.as_ref().map_err(|e| Error::internal(format!("metrics cannot be kept: {e}")))
+}
+
+/// Sorts every measured time into its histogram now and then: until it is sorted it takes memory of
+/// its own, and not everybody is asked for metrics. For as long as the process lives.
+fn keep_up(handle: PrometheusHandle) {
+    fn sort(handle: &PrometheusHandle) -> ! {
+        loop {
+            std::thread::sleep(UPKEEP_EVERY);
+            handle.run_upkeep();
+        }
+    }
+
+    if let Err(error) =
+        std::thread::Builder::new().name("metrics".to_owned()).spawn(move || sort(&handle))
+    {
+        tracing::warn!(%error, "metrics take memory until they are asked for");
+    }
 }
 
 fn describe() {

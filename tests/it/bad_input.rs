@@ -268,7 +268,7 @@ async fn bad_uploads_are_refused_by_name_and_the_server_lives() {
 }
 
 /// Sends `head` and `body` over a bare socket and reads what is answered while it stays open.
-async fn raw(stand: &Stand, head: &str, body: &[u8]) -> String {
+pub(super) async fn raw(stand: &Stand, head: &str, body: &[u8]) -> String {
     let mut socket = tokio::net::TcpStream::connect(stand.addr).await.unwrap();
     socket.write_all(head.as_bytes()).await.unwrap();
     socket.write_all(body).await.unwrap();

@@ -9,6 +9,7 @@ use segsplat::{
 };
 use serde_json::{Value, json};
 
+use super::bad_input::raw;
 use crate::common::{
     doors::{Door, Options, both, form, json as body},
     root,
@@ -61,6 +62,20 @@ async fn a_full_queue_is_overloaded_and_says_when_to_come_back() {
         let seconds = fault.retry_after.expect("retry-after");
         assert!(seconds.parse::<u32>().unwrap() > 0, "{seconds} of {}", door.name());
     }
+}
+
+#[tokio::test]
+async fn a_full_queue_refuses_before_the_photos_come() {
+    let stand = Stand::with(BoardMaker::default(), |config| {
+        config.limits.queued_jobs_max = 0;
+    })
+    .await;
+    let head = "POST /v1/scenes HTTP/1.1\r\nhost: x\r\ncontent-length: 9000000\r\n\
+                content-type: multipart/form-data; boundary=b\r\n\r\n";
+    let waited = std::time::Duration::from_secs(20);
+    let answer = tokio::time::timeout(waited, raw(&stand, head, b"--b")).await;
+    let answer = answer.expect("nothing more is waited for");
+    assert!(answer.starts_with("HTTP/1.1 429") && answer.contains("overloaded"), "{answer}");
 }
 
 async fn document(stand: &Stand) -> Value {

@@ -92,6 +92,14 @@ async fn a_full_queue_says_when_to_come_back() {
     assert_eq!(refused.code(), ErrorCode::Overloaded);
     assert!(refused.retry_after().is_some() && refused.message().contains("2 scenes wait"));
     assert_eq!(server.service.list(&PageRequest::default()).await.unwrap().scenes.len(), 3);
+    // No photo of what is refused is decoded; one with a key may be a call that was answered.
+    let mut broken = request();
+    broken.upload.photos[0].bytes.truncate(100);
+    let refused = server.service.create_scene(broken.clone()).await.unwrap_err();
+    assert_eq!(refused.code(), ErrorCode::Overloaded, "{refused}");
+    broken.idempotency_key = Some("k".to_owned());
+    let refused = server.service.create_scene(broken).await.unwrap_err();
+    assert_eq!(refused.code(), ErrorCode::PhotoUnreadable, "{refused}");
     maker.hold.store(false, Ordering::Release);
 }
 

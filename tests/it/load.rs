@@ -55,7 +55,7 @@ async fn memory_stays_as_it_is_over_many_scenes_of_many_shapes() {
             upload(i, photos, width, height)
         })
         .collect();
-    let (all, settled, most) = if long() { (1_000, 100, 1.05) } else { (60, 30, 1.25) };
+    let (all, settled, most) = if long() { (1_000, 100, 1.05) } else { (60, 30, 1.1) };
     let mut at = 0;
     for i in 0..all {
         let id = made(&client, &server, &uploads[i % uploads.len()]).await;
@@ -167,6 +167,7 @@ async fn ten_times_the_load_takes_little_of_what_is_answered() {
     let folder = tempfile::tempdir().unwrap();
     let limits = format!(
         "queued_renders_max = 16\nqueued_jobs_max = 4\ncache_bytes_max = 64000000\n\
+         layers_cache_bytes_max = 64000000\nmagnified_cache_bytes_max = 64000000\n\
          memory_bytes_max = {MEMORY_BYTES_MAX}"
     );
     let server = Arc::new(server(folder.path(), &limits));

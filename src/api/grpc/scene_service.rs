@@ -182,7 +182,10 @@ async fn receive(
         let Some(message) = next.map_err(|status| unreadable(&status))? else { break };
         let part = message.part.ok_or_else(|| Error::invalid("upload: an empty message"))?;
         match (part, &header) {
-            (Part::Header(first), None) => header = Some(begin(api, first, &mut upload)?),
+            (Part::Header(first), None) => {
+                api.service.has_room(!first.idempotency_key.is_empty())?;
+                header = Some(begin(api, first, &mut upload)?);
+            }
             (Part::Header(_), Some(_)) => {
                 return Err(Error::invalid("upload: a second header"));
             }

@@ -48,6 +48,7 @@ pub(super) async fn receive(
         .get("content-length")
         .and_then(|value| value.to_str().ok())
         .and_then(|value| value.parse::<usize>().ok());
+    let room_in_queue = api.service.has_room(request.headers().contains_key("idempotency-key"));
     let (wire, request) = Wire::of(request);
     let mut form = Multipart::from_request(request, api).await.map_err(|_| {
         Error::invalid("body: not multipart/form-data with a boundary; send photos as parts")
@@ -60,7 +61,10 @@ pub(super) async fn receive(
             format!("{length} bytes"),
             format!("{} bytes", limits.upload_bytes_max),
         )),
-        _ => parts(api, &mut form, params, &wire).await,
+        _ => match room_in_queue {
+            Ok(()) => parts(api, &mut form, params, &wire).await,
+            Err(full) => Err(full),
+        },
     };
     let received = received.map_err(|error| wire.too_long().unwrap_or(error));
     if received.is_err() {
