@@ -8,7 +8,7 @@ use axum::{
 use futures_util::StreamExt;
 use serde::de::DeserializeOwned;
 
-use super::error::ApiError;
+use super::{error::ApiError, receive::read_on};
 use crate::{
     api::{Api, upload::json_over},
     error::Error,
@@ -62,6 +62,7 @@ impl<T: DeserializeOwned> FromRequest<Api> for JsonBody<T> {
             let piece: Bytes =
                 piece.map_err(|e| Error::invalid("body: the upload broke off").caused_by(e))?;
             if bytes.len() + piece.len() > limits.json_bytes_max {
+                read_on(body);
                 return Err(json_over("body", bytes.len() + piece.len(), &limits).into());
             }
             bytes.extend_from_slice(&piece);

@@ -1,17 +1,16 @@
 //! A multipart upload, read as it comes and refused at the first byte over a cap.
 
 use std::{
-    future::poll_fn,
     sync::{Arc, Mutex, MutexGuard, PoisonError},
     task::{Poll, ready},
     time::Duration,
 };
 
 use axum::{
-    body::{Body, BodyDataStream},
+    body::{Body, BodyDataStream, Bytes},
     extract::{FromRequest, Multipart, Request, multipart::Field},
 };
-use futures_util::{StreamExt, stream};
+use futures_util::{Stream, StreamExt, stream};
 
 use super::{error::ApiError, params::Params};
 use crate::{
@@ -50,9 +49,7 @@ pub(super) async fn receive(
         .and_then(|value| value.parse::<usize>().ok());
     let room_in_queue = api.service.has_room(request.headers().contains_key("idempotency-key"));
     let (wire, request) = Wire::of(request);
-    let mut form = Multipart::from_request(request, api).await.map_err(|_| {
-        Error::invalid("body: not multipart/form-data with a boundary; send photos as parts")
-    })?;
+    let form = Multipart::from_request(request, api).await;
     // Parts' headers come on top of their bytes.
     let room = limits.upload_bytes_max + (1 << 20);
     let received = match length {
@@ -61,17 +58,36 @@ pub(super) async fn receive(
             format!("{length} bytes"),
             format!("{} bytes", limits.upload_bytes_max),
         )),
-        _ => match room_in_queue {
-            Ok(()) => parts(api, &mut form, params, &wire).await,
-            Err(full) => Err(full),
+        _ => match (room_in_queue, form) {
+            (Ok(()), Ok(mut form)) => parts(api, &mut form, params, &wire).await,
+            (Err(full), Ok(_)) => Err(full),
+            (_, Err(_)) => Err(Error::invalid(
+                "body: not multipart/form-data with a boundary; send photos as parts",
+            )),
         },
     };
     let received = received.map_err(|error| wire.too_long().unwrap_or(error));
     if received.is_err() {
-        // Closing a connection with unread bytes resets it, and the answer is lost with it.
-        tokio::spawn(tokio::time::timeout(DRAIN_TIME_MAX, wire.drain()));
+        read_on(stream::poll_fn(move |context| wire.lock().0.poll_next_unpin(context)));
     }
     Ok(received?)
+}
+
+/// Reads the rest of a refused body and forgets it, after the answer: closing a connection with
+/// unread bytes resets it, and the answer is lost with it.
+pub(super) fn read_on(
+    mut rest: impl Stream<Item = std::result::Result<Bytes, axum::Error>> + Send + Unpin + 'static,
+) {
+    let forgotten = async move {
+        let mut read = 0;
+        while let Some(Ok(piece)) = rest.next().await {
+            read += piece.len();
+            if read > DRAIN_BYTES_MAX {
+                return;
+            }
+        }
+    };
+    tokio::spawn(tokio::time::timeout(DRAIN_TIME_MAX, forgotten));
 }
 
 async fn parts(
@@ -156,18 +172,6 @@ impl Wire {
         let (bytes, max) = (self.lock().1, HEAD_BYTES_MAX);
         let limit = || Error::limit("upload: the head of a part", format!("{bytes} bytes"), max);
         (bytes > max).then(limit)
-    }
-
-    /// Reads on and forgets what it reads.
-    async fn drain(self) {
-        let mut read = 0;
-        while let Some(Ok(piece)) = poll_fn(|context| self.lock().0.poll_next_unpin(context)).await
-        {
-            read += piece.len();
-            if read > DRAIN_BYTES_MAX {
-                return;
-            }
-        }
     }
 }
 
