@@ -15,6 +15,7 @@ use crate::{
 pub const DIFFERENCE_MAX: f32 = 1.0 / 255.0;
 /// Pixels that the oracle is asked for.
 pub const ORACLE_PIXELS: usize = 4096;
+
 /// How a picture differs from a reference: colour, alpha, labels, and depth relative to depth.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Compared {

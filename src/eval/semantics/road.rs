@@ -9,21 +9,19 @@ use std::sync::{
 use super::{report::TargetReport, tally::TextMap};
 use crate::{
     error::{Error, Result},
+    eval::{scene_of, view_request},
     models::ImageText,
     pipeline::{
-        Engine, masks, reconstruct,
+        Engine, Reconstruction, masks, reconstruct,
         semantics::{SceneParts, SemanticsOptions, Watch, understand},
     },
-    render::{Entries, Kinds, Labels, Quality, RenderRequest, compose, cpu::CpuRenderer},
+    render::{Entries, Labels, RenderRequest, compose, cpu::CpuRenderer},
     scene::{
-        Bank, Camera, Crop, PhotoMasks, PosedPhoto, Provenance, Scene, SceneId, SceneMeta,
-        SceneOptions, ScoringProfile, SemanticsReport, StageTime,
+        Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, ScoringProfile, SemanticsReport,
+        StageTime,
     },
     semantics::{Cutter, PixelEntries, Scorer, Scoring},
 };
-
-/// Near plane as a share of the scene's median depth, as the service renders.
-const NEAR_SHARE: f64 = 0.01;
 
 /// What every target is seen with.
 pub(super) struct Road<'a> {
@@ -97,28 +95,11 @@ impl<'a> Road<'a> {
         let watch = Watch { progress: &|_, _| (), cancel: &cancel };
         let meaning = understand(self.engine, &parts, &self.understanding, watch)?;
         let gaussians = made.gaussians.with_semantic_index(meaning.index)?;
-        #[expect(clippy::cast_possible_truncation, reason = "a near plane needs no f64")]
-        let near = (made.report.median_depth * NEAR_SHARE).max(1e-6) as f32;
-        let request = RenderRequest {
-            camera: photos[target].camera,
-            kinds: Kinds::COLOR,
-            labels: Labels::Entries,
-            background: [0.0; 3],
-            antialiased: false,
-            near,
-            quality: Quality::Exact,
-            crop: None,
-        };
+        let plain = view_request(photos[target].camera, made.report.median_depth);
+        let request = RenderRequest { labels: Labels::Entries, ..plain };
         let warnings = made.report.warnings.len();
         let stages = made.report.stages.clone();
-        let meta = SceneMeta {
-            id: SceneId::from_bytes([0; 16]),
-            created_ms: 0,
-            cameras: made.cameras,
-            report: made.report,
-            provenance: Provenance::default(),
-        };
-        let scene = Scene::new(meta, gaussians, made.backdrop);
+        let scene = scene_of(Reconstruction { gaussians, ..made });
         let frame = compose::render_scene(self.renderer, &scene, &request, true)?;
         let entries =
             frame.entries.ok_or_else(|| Error::internal("eval: the view has no entries"))?;
