@@ -424,7 +424,7 @@ impl Tools<'_> {
         };
         let bindings = &mut self.scratch.bindings;
         let (kernels, marks) = (self.kernels, self.marks.as_deref_mut());
-        let submission = gpu.scoped("render", || {
+        gpu.scoped("render", || {
             room.begin(gpu, &rows);
             if !table.is_empty() {
                 gpu.queue.write_buffer(&room.table, 0, bytemuck::cast_slice(&table));
@@ -448,9 +448,9 @@ impl Tools<'_> {
             ])
         })??;
         if let Some(marks) = &self.marks {
-            self.times = marks.read(gpu, submission.clone())?;
+            self.times = marks.read(gpu)?;
         }
-        let ended = readback::read(gpu, submission, &room.staging, staging_bytes, |bytes| {
+        let ended = readback::read(gpu, &room.staging, staging_bytes, |bytes| {
             let (plans, rest) = bytes.split_at(plan_bytes as usize);
             let (mut pictures, slots) = rest.split_at(picture_bytes as usize);
             let mut slots: &[u32] = bytemuck::cast_slice(slots);

@@ -20,9 +20,9 @@ use crate::{
     render::{Frame, Kinds, RenderRequest},
 };
 
-/// Callers that draw at once. Two were slower on an H200: the second's submission waited for the
-/// first's pictures all the same, and both were half as large.
-pub(super) const TURNS: usize = 1;
+/// Callers that draw at once: the pictures of one submission are copied and the next is recorded
+/// while the device draws the other. Three were slower on an H200, their submissions too small.
+pub(super) const TURNS: usize = 2;
 /// How long a caller waits for others of the crowd to come again: well under what a submission of
 /// its own would cost them.
 const GATHER: Duration = Duration::from_micros(150);

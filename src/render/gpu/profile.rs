@@ -79,18 +79,14 @@ impl Marks {
         encoder.copy_buffer_to_buffer(&self.resolved, 0, &self.staging, 0, Some(bytes));
     }
 
-    /// Times of the dispatches of `submission`, which has been waited for or will be here.
+    /// Times of the dispatches of the last submission, which is waited for here.
     ///
     /// # Errors
     /// As [`readback::read`].
-    pub(super) fn read(
-        &self,
-        gpu: &Gpu,
-        submission: wgpu::SubmissionIndex,
-    ) -> Result<Vec<StageTime>> {
+    pub(super) fn read(&self, gpu: &Gpu) -> Result<Vec<StageTime>> {
         let bytes = (1 + self.names.len() as u64) * 8;
         let period = f64::from(gpu.queue.get_timestamp_period()) * 1e-6;
-        readback::read(gpu, submission, &self.staging, bytes, |bytes| {
+        readback::read(gpu, &self.staging, bytes, |bytes| {
             let ticks: Vec<u64> = bytemuck::pod_collect_to_vec(bytes);
             let spans = ticks.windows(2).map(|pair| pair[1].saturating_sub(pair[0]) as f64);
             self.names

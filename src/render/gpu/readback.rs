@@ -1,6 +1,10 @@
 //! From the device back to memory: one copy in the frame's own submission, one wait.
 
-use std::{sync::mpsc, time::Duration};
+use std::{
+    sync::mpsc::{self, TryRecvError},
+    thread,
+    time::{Duration, Instant},
+};
 
 use super::device::Gpu;
 use crate::error::{Error, Result};
@@ -8,14 +12,18 @@ use crate::error::{Error, Result};
 /// How long a submission may take before the device is given up. A software adapter needs seconds
 /// for a large picture; a hardware one that takes this long hangs.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(120);
+/// Least and greatest time between two looks at the device.
+const NAP_MIN: Duration = Duration::from_micros(20);
+const NAP_MAX: Duration = Duration::from_millis(1);
+/// A nap's share of the time waited so far.
+const NAP_SHARE: u32 = 8;
 
-/// Waits for `submission` and hands the first `size_bytes` of `staging` to `take`.
+/// Waits until the device is done with `staging` and hands its first `size_bytes` to `take`.
 ///
 /// # Errors
 /// `gpu_unavailable` when the device is lost or does not answer, `internal` for another fault.
 pub(super) fn read<T>(
     gpu: &Gpu,
-    submission: wgpu::SubmissionIndex,
     staging: &wgpu::Buffer,
     size_bytes: u64,
     take: impl FnOnce(&[u8]) -> T,
@@ -28,26 +36,33 @@ pub(super) fn read<T>(
             let _ = sender.send(result);
         });
     })?;
-    let wait =
-        wgpu::PollType::Wait { submission_index: Some(submission), timeout: Some(ANSWER_TIMEOUT) };
-    if let Err(error) = gpu.device.poll(wait) {
-        let message = "the GPU device did not answer in time".to_owned();
-        return Err(gpu.give_up(message).caused_by(error));
+    // Not `PollType::Wait`: while one thread waits in the driver, no other can submit (an H200 then
+    // stood idle between two callers), and a lone caller is woken later than by its own clock.
+    let begun = Instant::now();
+    loop {
+        if let Err(error) = gpu.device.poll(wgpu::PollType::Poll) {
+            let message = "the GPU device cannot be asked for its pictures".to_owned();
+            return Err(gpu.give_up(message).caused_by(error));
+        }
+        match mapped.try_recv() {
+            Ok(Ok(())) => break,
+            Ok(Err(error)) => {
+                gpu.check()?;
+                return Err(Error::internal("the GPU's pictures cannot be read").caused_by(error));
+            }
+            Err(TryRecvError::Disconnected) => {
+                let message = "the GPU device did not hand back its pictures".to_owned();
+                return Err(gpu.give_up(message));
+            }
+            Err(TryRecvError::Empty) if begun.elapsed() > ANSWER_TIMEOUT => {
+                return Err(gpu.give_up("the GPU device did not answer in time".to_owned()));
+            }
+            Err(TryRecvError::Empty) => {
+                thread::sleep((begun.elapsed() / NAP_SHARE).clamp(NAP_MIN, NAP_MAX));
+            }
+        }
     }
     gpu.check()?;
-    // Whoever polls first is handed all answers that are due: another thread may be at ours still.
-    match mapped.recv_timeout(ANSWER_TIMEOUT) {
-        Ok(Ok(())) => {}
-        Ok(Err(error)) => {
-            gpu.check()?;
-            return Err(Error::internal("the GPU's pictures cannot be read").caused_by(error));
-        }
-        Err(error) => {
-            return Err(gpu
-                .give_up("the GPU device did not hand back its pictures".to_owned())
-                .caused_by(error));
-        }
-    }
     let value = {
         let view = slice.get_mapped_range().map_err(|error| {
             Error::internal("the GPU's pictures cannot be read").caused_by(error)

@@ -117,7 +117,7 @@ impl<'a> Recorder<'a> {
     ///
     /// # Errors
     /// `internal` when a kernel of it was refused.
-    pub(super) fn submit(mut self, copies: &[Copy<'_>]) -> Result<wgpu::SubmissionIndex> {
+    pub(super) fn submit(mut self, copies: &[Copy<'_>]) -> Result<()> {
         if let Some(error) = self.failed.take() {
             return Err(error);
         }
@@ -131,7 +131,8 @@ impl<'a> Recorder<'a> {
         for &(from, from_offset, to, to_offset, size) in copies.iter().filter(|copy| copy.4 > 0) {
             self.encoder.copy_buffer_to_buffer(from, from_offset, to, to_offset, Some(size));
         }
-        Ok(self.gpu.queue.submit([self.encoder.finish()]))
+        self.gpu.queue.submit([self.encoder.finish()]);
+        Ok(())
     }
 
     /// Records one dispatch. Buffers are bound at their number, the digit's parameters at 1.

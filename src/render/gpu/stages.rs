@@ -349,7 +349,7 @@ fn run_from<const N: usize>(
         at += size as u64;
         (buffer, first as u64, &staging, to, size as u64)
     });
-    let submission = gpu.scoped("stage", || {
+    gpu.scoped("stage", || {
         room.begin(gpu, std::slice::from_ref(row));
         write(gpu);
         let bindings = &mut engine.scratch.bindings;
@@ -358,7 +358,7 @@ fn run_from<const N: usize>(
         record(&mut stages);
         stages.submit(&copies)
     })??;
-    readback::read(gpu, submission, &staging, total.max(4), |bytes| {
+    readback::read(gpu, &staging, total.max(4), |bytes| {
         let mut rest = bytes;
         parts.map(|(_, _, size)| {
             let (part, tail) = rest.split_at(size);

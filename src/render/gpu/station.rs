@@ -44,6 +44,18 @@ pub(super) struct Engine {
 }
 
 impl Engine {
+    /// What frames of `scene` are drawn with.
+    fn tools<'a>(
+        &'a mut self,
+        scene: &'a Scene,
+        labels: Option<&'a SceneLabels>,
+        isects_max: u32,
+        marks: Option<&'a mut Marks>,
+    ) -> Tools<'a> {
+        let (gpu, kernels, scratch) = (&self.on.gpu, &*self.on.kernels, &mut self.scratch);
+        Tools { gpu, kernels, scratch, scene, labels, isects_max, marks, times: Vec::new() }
+    }
+
     /// The scene of `gaussians`, and its bank indices where they are wanted.
     ///
     /// # Errors
@@ -266,16 +278,7 @@ impl Station {
             .zip(requests)
             .map(|(view, request)| Drawing::new(view, request, &scene))
             .collect();
-        let mut tools = Tools {
-            gpu: &engine.on.gpu,
-            kernels: &engine.on.kernels,
-            scratch: &mut engine.scratch,
-            scene: &scene,
-            labels: labels.as_ref(),
-            isects_max: self.options.isects_max,
-            marks: None,
-            times: Vec::new(),
-        };
+        let mut tools = engine.tools(&scene, labels.as_ref(), self.options.isects_max, None);
         let drawn = tools.together(&mut drawings)?;
         let frames = drawings
             .into_iter()
@@ -294,16 +297,7 @@ impl Station {
     ) -> Result<(Frame, Vec<StageTime>)> {
         let view = View::new(gaussians.origin(), request)?;
         let (scene, labels) = engine.scene(gaussians, request.labels != Labels::None)?;
-        let mut tools = Tools {
-            gpu: &engine.on.gpu,
-            kernels: &engine.on.kernels,
-            scratch: &mut engine.scratch,
-            scene: &scene,
-            labels: labels.as_ref(),
-            isects_max: self.options.isects_max,
-            marks,
-            times: Vec::new(),
-        };
+        let mut tools = engine.tools(&scene, labels.as_ref(), self.options.isects_max, marks);
         let mut drawing = Drawing::new(&view, request, &scene);
         let rows = drawing.whole();
         tools.rows(&mut drawing, rows)?;
