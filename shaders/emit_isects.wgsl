@@ -13,8 +13,6 @@
 
 // First place of each Gaussian of the block, and one past the last.
 var<workgroup> offsets: array<u32, 1025>;
-var<workgroup> sums: array<u32, 256>;
-var<workgroup> rows: array<u32, 16>;
 
 fn emit_one(id: u32, start: u32, count: u32) {
     let total = views[which].gaussian_count;
@@ -68,25 +66,9 @@ fn main(
     for (var k = 0u; k < 4u; k++) {
         sum += offsets[local * 4u + k];
     }
-    sums[local] = sum;
-    workgroupBarrier();
-    if local < 16u {
-        sum = 0u;
-        for (var k = 0u; k < 16u; k++) {
-            sum += sums[local * 16u + k];
-        }
-        rows[local] = sum;
-    }
-    workgroupBarrier();
-    var before = 0u;
+    var before = sum_before(local, sum);
     if block < blocks {
-        before = block_sums[which * blocks + block];
-    }
-    for (var k = 0u; k < local / 16u; k++) {
-        before += rows[k];
-    }
-    for (var k = local & 0xf0u; k < local; k++) {
-        before += sums[k];
+        before += block_sums[which * blocks + block];
     }
     for (var k = 0u; k < 4u; k++) {
         let touched = offsets[local * 4u + k];

@@ -12,9 +12,6 @@
 @group(0) @binding(4) var<storage, read_write> block_sums: array<u32>;
 @group(0) @binding(5) var<storage, read_write> groups_of: array<atomic<u32>>;
 
-var<workgroup> sums: array<u32, 256>;
-var<workgroup> rows: array<u32, 16>;
-
 fn blocks_of(count: u32) -> u32 {
     return (count + SCAN_BLOCK - 1u) / SCAN_BLOCK;
 }
@@ -38,20 +35,9 @@ fn sum_blocks(
             sum = add(sum, tiles[which * total + depth_ids[first + i]]);
         }
     }
-    sums[local] = sum;
-    workgroupBarrier();
-    if local < 16u {
-        for (var k = local + 16u; k < WORKGROUP_SIZE; k += 16u) {
-            sum = add(sum, sums[k]);
-        }
-        rows[local] = sum;
-    }
-    workgroupBarrier();
-    if local == 0u && block < blocks_of(total) {
-        for (var k = 1u; k < 16u; k++) {
-            sum = add(sum, rows[k]);
-        }
-        block_sums[which * blocks_of(total) + block] = sum;
+    let before = sum_before(local, sum);
+    if local == WORKGROUP_SIZE - 1u && block < blocks_of(total) {
+        block_sums[which * blocks_of(total) + block] = add(before, sum);
     }
 }
 
@@ -81,26 +67,9 @@ fn scan_sums(
     for (var block = first; block < end; block++) {
         sum = add(sum, block_sums[start + block]);
     }
-    sums[local] = sum;
-    workgroupBarrier();
-    let mine = sum;
-    if local < 16u {
-        sum = 0u;
-        for (var k = 0u; k < 16u; k++) {
-            sum = add(sum, sums[local * 16u + k]);
-        }
-        rows[local] = sum;
-    }
-    workgroupBarrier();
-    var before = 0u;
-    for (var k = 0u; k < local / 16u; k++) {
-        before = add(before, rows[k]);
-    }
-    for (var k = local & 0xf0u; k < local; k++) {
-        before = add(before, sums[k]);
-    }
+    var before = sum_before(local, sum);
     if local == WORKGROUP_SIZE - 1u {
-        let needed = add(before, mine);
+        let needed = add(before, sum);
         let isects = select(needed, 0u, needed > views[which].isect_capacity);
         plans[which].needed = needed;
         plans[which].isects = isects;

@@ -3,7 +3,8 @@
 //
 // histogram counts the digits of each block; spine turns the counts of a digit into places within
 // it, block by block; scatter moves the pairs. No subgroups: the rank of a pair among equals of its
-// round is a count of bits in a mask of 128.
+// round is a count of bits in a mask of 128. On a software adapter, where a barrier costs more than
+// moving a pair, spine_serial and scatter_serial take their places: an invocation moves a block.
 //
 // The first digit of the depth sort leaves dropped Gaussians behind, and its pairs have no values
 // yet: they are the places in memory, so that equal depths stay in the order of the scene. Keys are
@@ -29,7 +30,6 @@ var<workgroup> counts: array<atomic<u32>, 256>;
 var<workgroup> masks: array<atomic<u32>, 3072>;
 // First place of each digit in rounds of even and odd number.
 var<workgroup> places: array<u32, 512>;
-var<workgroup> sums: array<u32, 256>;
 
 fn stride() -> u32 {
     return select(views[which].gaussian_count, views[which].isect_capacity, params.by_tile != 0u);
@@ -121,59 +121,81 @@ fn spine(
     let row = counts_start() + digit * blocks;
     let first = min(local * each, blocks);
     let end = min(first + each, blocks);
-    var sum = 0u;
-    for (var block = first; block < end; block++) {
-        sum += digit_counts[row + block];
-    }
-    sums[local] = sum;
-    workgroupBarrier();
-    let mine = sum;
-    if local < 16u {
-        sum = 0u;
-        for (var k = 0u; k < 16u; k++) {
-            sum += sums[local * 16u + k];
-        }
-        places[local] = sum;
-    }
-    workgroupBarrier();
-    var before = 0u;
-    for (var k = 0u; k < local / 16u; k++) {
-        before += places[k];
-    }
-    for (var k = local & 0xf0u; k < local; k++) {
-        before += sums[k];
-    }
+    let sum = sum_of(row, first, end);
+    let before = sum_before(local, sum);
     if local == WORKGROUP_SIZE - 1u {
-        let total = before + mine;
+        let total = before + sum;
         digit_counts[totals_start(groups.z) + digit] = total;
         if is_first() && total > 0u {
             atomicAdd(&plans[which].sorted, total);
         }
     }
+    place_blocks(row, first, end, before);
+    if digit == 0u && local == 0u {
+        plan_digits(blocks, DIGITS, groups.z);
+    }
+}
+
+fn sum_of(row: u32, first: u32, end: u32) -> u32 {
+    var sum = 0u;
+    for (var block = first; block < end; block++) {
+        sum += digit_counts[row + block];
+    }
+    return sum;
+}
+
+// Makes first places of the counts of a digit's blocks.
+fn place_blocks(row: u32, first: u32, end: u32, start: u32) {
+    var before = start;
     for (var block = first; block < end; block++) {
         let count = digit_counts[row + block];
         digit_counts[row + block] = before;
         before += count;
     }
-    // The digits that are left: as many as the view with the widest range of depths needs.
-    if is_first() && digit == 0u && local == 0u {
-        let low = atomicLoad(&plans[which].key_min);
-        let high = atomicLoad(&plans[which].key_max);
-        let bits = select(0u, 32u - countLeadingZeros(high - low), low < high) - blunt_bits();
-        let passes = max(1u, (bits + 7u) / 8u);
-        atomicMax(&plans[0].passes, passes);
-        let x = min(blocks, GROUPS_X_MAX);
-        for (var at = 1u; at < 4u; at++) {
-            let by_block = (GROUPS_DEPTH + at - 1u) * 4u;
-            let by_digit = (GROUPS_DIGITS + at - 1u) * 4u;
-            atomicMax(&groups_of[by_block], x);
-            atomicMax(&groups_of[by_block + 1u], (blocks + x - 1u) / x);
-            atomicMax(&groups_of[by_digit], DIGITS);
-            atomicMax(&groups_of[by_digit + 1u], 1u);
-            if at < passes {
-                atomicMax(&groups_of[by_block + 2u], groups.z);
-                atomicMax(&groups_of[by_digit + 2u], groups.z);
-            }
+}
+
+// The digits that are left: as many as the view with the widest range of depths needs.
+fn plan_digits(blocks: u32, spines: u32, view_count: u32) {
+    if !is_first() {
+        return;
+    }
+    let low = atomicLoad(&plans[which].key_min);
+    let high = atomicLoad(&plans[which].key_max);
+    let bits = select(0u, 32u - countLeadingZeros(high - low), low < high) - blunt_bits();
+    let passes = max(1u, (bits + 7u) / 8u);
+    atomicMax(&plans[0].passes, passes);
+    let x = min(blocks, GROUPS_X_MAX);
+    for (var at = 1u; at < 4u; at++) {
+        let by_block = (GROUPS_DEPTH + at - 1u) * 4u;
+        let by_digit = (GROUPS_DIGITS + at - 1u) * 4u;
+        atomicMax(&groups_of[by_block], x);
+        atomicMax(&groups_of[by_block + 1u], (blocks + x - 1u) / x);
+        atomicMax(&groups_of[by_digit], spines);
+        atomicMax(&groups_of[by_digit + 1u], 1u);
+        if at < passes {
+            atomicMax(&groups_of[by_block + 2u], view_count);
+            atomicMax(&groups_of[by_digit + 2u], view_count);
+        }
+    }
+}
+
+// The same for a software adapter, in one workgroup: the places are those among all pairs.
+@compute @workgroup_size(256)
+fn spine_serial(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) digit: u32,
+) {
+    which = group.z;
+    let blocks = blocks_of(pair_count());
+    let row = counts_start() + digit * blocks;
+    let sum = sum_of(row, 0u, blocks);
+    let before = sum_before(digit, sum);
+    place_blocks(row, 0u, blocks, before);
+    if digit == DIGITS - 1u {
+        plan_digits(blocks, 1u, groups.z);
+        if is_first() {
+            atomicStore(&plans[which].sorted, before + sum);
         }
     }
 }
@@ -278,5 +300,45 @@ fn scatter(
         }
         clears = valid;
         cleared = mask + word + digit;
+    }
+}
+
+@compute @workgroup_size(8)
+fn scatter_serial(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    which = group.z;
+    let count = pair_count();
+    let blocks = blocks_of(count);
+    // As many workgroups come as there are blocks: the last ones find none left.
+    let block = (group.y * groups.x + group.x) * 8u + local;
+    if block >= blocks {
+        return;
+    }
+    let from_half = params.pass_at & 1u;
+    let from_start = (from_half * groups.z + which) * stride();
+    let to_start = ((1u - from_half) * groups.z + which) * stride();
+    let least = least_key();
+    let drops = is_first();
+    let blunt = blunt_bits();
+    let places = counts_start() + block;
+    let end = min(count, (block + 1u) * SORT_BLOCK);
+    for (var i = block * SORT_BLOCK; i < end; i++) {
+        let given = keys[from_start + i];
+        if drops && given == DROPPED_KEY {
+            continue;
+        }
+        let key = (given - least) >> blunt;
+        let at = places + digit_of(key) * blocks;
+        let place = digit_counts[at];
+        digit_counts[at] = place + 1u;
+        keys[to_start + place] = key;
+        if drops {
+            values[to_start + place] = i;
+        } else {
+            values[to_start + place] = values[from_start + i];
+        }
     }
 }

@@ -1,10 +1,13 @@
 // Stage 8: front-to-back blend of a tile's Gaussians: colour, alpha, expected depth, labels.
 // Twin: src/render/cpu/rasterize.rs
-// What label_of, add_label and store_labels do is one of common/labels_*.wgsl.
+// What label_of, label_row, add_label and store_labels do is one of common/labels_*.wgsl.
 //
 // A tile is 32 parts of 4 x 2 pixels. Gaussians are staged by the batch, each with a bit for every
-// part that the box around its footprint meets; a part's eight invocations then walk their own
-// bits, so that most of a batch costs them nothing. The box is never too small: no pixel changes.
+// part that the box around its footprint meets; a part's invocations then walk their own bits, so
+// that most of a batch costs them nothing. The box is never too small: no pixel changes.
+//
+// An invocation blends PIXELS pixels of a part: one on a GPU. On a software adapter, where reading
+// what was staged costs more than blending it, all eight.
 
 @group(0) @binding(1) var<storage, read> footprints: array<Footprint>;
 @group(0) @binding(2) var<storage, read> isect_ids: array<u32>;
@@ -30,6 +33,11 @@ var<workgroup> all_done: u32;
 
 const PARTS: u32 = 32u;
 const WORDS: u32 = 8u;
+// Pixels of a part.
+const PIXELS_MAX: u32 = 8u;
+
+override PIXELS: u32 = 1u;
+override LANES: u32 = WORKGROUP_SIZE / PIXELS;
 
 // A kernel is made for each set of pictures.
 override WITH_COLOR: bool = true;
@@ -80,6 +88,14 @@ struct Staged {
     paint: vec4<f32>,
 }
 
+// The row of a staged label: staged too where no colour or depth takes its place.
+fn row_of(label: u32, paint: vec4<f32>) -> vec4<f32> {
+    if WITH_COLOR || WITH_DEPTH {
+        return label_row(label);
+    }
+    return paint;
+}
+
 fn fetch(at: u32, end: u32) -> Staged {
     var staged: Staged;
     if at >= end {
@@ -103,7 +119,77 @@ fn fetch(at: u32, end: u32) -> Staged {
     return staged;
 }
 
-@compute @workgroup_size(256)
+// A pixel and what it has blended.
+struct Pixel {
+    // Its centre relative to the tile.
+    center: vec2<f32>,
+    // Its number in the pictures of the band; NO_PICTURE outside of them.
+    at: u32,
+    done: bool,
+    color: vec3<f32>,
+    depth: f32,
+    alpha: f32,
+    transmittance: f32,
+}
+
+// The pixels of this invocation.
+var<private> pixels: array<Pixel, PIXELS_MAX>;
+
+fn blend(q: u32, shape: vec4<f32>, weight: vec4<f32>, paint: vec4<f32>, row: vec4<f32>) {
+    let d = pixels[q].center - shape.xy;
+    let across = shape.w * (d.x - shape.z * d.y);
+    let along = weight.x * d.y;
+    let power = across * across + along * along;
+    let alpha = min(ALPHA_MAX, weight.y * exp(-power));
+    let transmittance = pixels[q].transmittance;
+    let left = transmittance * (1.0 - alpha);
+    // Hardly a branch: invocations that part ways take as long as both ways together. Over its
+    // reach alpha is under ALPHA_MIN for certain; a NaN is skipped too.
+    let hit = power <= weight.z && alpha >= ALPHA_MIN && !pixels[q].done;
+    let ends = hit && left <= TRANSMITTANCE_MIN;
+    let adds = hit && !ends;
+    pixels[q].done = pixels[q].done || ends;
+    // Colours, depths and rows are finite: nothing of them adds 0.
+    let share = select(0.0, alpha * transmittance, adds);
+    if WITH_COLOR {
+        pixels[q].color += share * paint.xyz;
+    }
+    if WITH_DEPTH {
+        pixels[q].depth += share * paint.w;
+    }
+    if adds {
+        add_label(u32(weight.w), row, share, q, pixels[q].at);
+    }
+    pixels[q].alpha += share;
+    pixels[q].transmittance = select(transmittance, left, adds);
+}
+
+fn store(q: u32) {
+    let at = pixels[q].at;
+    let alpha = min(pixels[q].alpha, 1.0);
+    if WITH_COLOR && views[which].color_start != NO_PICTURE {
+        let out = pixels[q].color + (1.0 - alpha) * views[which].background.xyz;
+        if views[which].fast != 0u {
+            pictures[views[which].color_start + at] = pack4x8unorm(vec4(out, alpha));
+        } else {
+            let to = views[which].color_start + at * 3u;
+            pictures[to] = bitcast<u32>(out.x);
+            pictures[to + 1u] = bitcast<u32>(out.y);
+            pictures[to + 2u] = bitcast<u32>(out.z);
+        }
+    }
+    if WITH_DEPTH && views[which].depth_start != NO_PICTURE {
+        let sum = pixels[q].alpha;
+        pictures[views[which].depth_start + at] =
+            bitcast<u32>(select(0.0, pixels[q].depth / sum, sum > 0.0));
+    }
+    if views[which].alpha_start != NO_PICTURE {
+        pictures[views[which].alpha_start + at] = bitcast<u32>(alpha);
+    }
+    store_labels(q, at);
+}
+
+@compute @workgroup_size(LANES)
 fn main(
     @builtin(workgroup_id) tile: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
@@ -113,16 +199,7 @@ fn main(
     let tiled = tile.x < views[which].tiles_x
         && tile.y + views[which].row_start < views[which].row_end;
     let corner = vec2<f32>(vec2(tile.x, tile.y + views[which].row_start) * TILE_SIZE);
-    let part = local / 8u;
-    let lane = local % 8u;
-    let at = vec2((part & 3u) * 4u + (lane & 3u), (part >> 2u) * 2u + (lane >> 2u));
-    let pixel = vec2<f32>(at) + 0.5;
-    let x = tile.x * TILE_SIZE + at.x;
-    let y = tile.y * TILE_SIZE + at.y;
-    let inside = tiled && x < views[which].width
-        && y + views[which].row_start * TILE_SIZE < views[which].height;
-    let at_pixel = y * views[which].width + x;
-    let painted = WITH_COLOR || WITH_DEPTH;
+    let part = local * PIXELS / 8u;
     var start = 0u;
     var end = 0u;
     if tiled {
@@ -135,46 +212,64 @@ fn main(
         atomicStore(&done_count, 0u);
     }
     workgroupBarrier();
-    var color = vec3(0.0);
-    var depth = 0.0;
-    var alpha_sum = 0.0;
-    var transmittance = 1.0;
-    var done = !inside;
-    var counted = done;
-    if done {
+    var open = 0u;
+    for (var q = 0u; q < PIXELS; q++) {
+        let lane = local * PIXELS % 8u + q;
+        let at = vec2((part & 3u) * 4u + (lane & 3u), (part >> 2u) * 2u + (lane >> 2u));
+        let x = tile.x * TILE_SIZE + at.x;
+        let y = tile.y * TILE_SIZE + at.y;
+        let inside = tiled && x < views[which].width
+            && y + views[which].row_start * TILE_SIZE < views[which].height;
+        let place = select(NO_PICTURE, y * views[which].width + x, inside);
+        pixels[q] = Pixel(vec2<f32>(at) + 0.5, place, !inside, vec3(0.0), 0.0, 0.0, 1.0);
+        open += u32(inside);
+    }
+    var counted = open == 0u;
+    if counted {
         atomicAdd(&done_count, 1u);
     }
     let batches = (end - start + WORKGROUP_SIZE - 1u) / WORKGROUP_SIZE;
-    var staged = fetch(start + local, end);
+    var staged: array<Staged, PIXELS_MAX>;
+    for (var q = 0u; q < PIXELS; q++) {
+        staged[q] = fetch(start + local + q * LANES, end);
+    }
     for (var batch = 0u; batch < batches; batch++) {
-        var parts = 0u;
-        if staged.some {
-            let one = staged.footprint;
-            let mean = one.mean - corner;
-            parts = parts_of(one, mean);
-            shapes[local] = vec4(mean, one.slope, one.inv_sx);
-            // A label has 16 bits: exact as f32.
-            weights[local] = vec4(one.inv_sy, one.opacity, one.reach, f32(staged.label));
-            paints[local] = staged.paint;
+        for (var q = 0u; q < PIXELS; q++) {
+            let to = local + q * LANES;
+            var parts = 0u;
+            if staged[q].some {
+                let one = staged[q].footprint;
+                let mean = one.mean - corner;
+                parts = parts_of(one, mean);
+                shapes[to] = vec4(mean, one.slope, one.inv_sx);
+                // A label has 16 bits: exact as f32.
+                weights[to] = vec4(one.inv_sy, one.opacity, one.reach, f32(staged[q].label));
+                paints[to] = staged[q].paint;
+            }
+            met[to] = parts;
         }
-        met[local] = parts;
         workgroupBarrier();
-        var word = 0u;
-        for (var k = 0u; k < 32u; k++) {
-            word |= ((met[(local & 0xe0u) + k] >> (local & 31u)) & 1u) << k;
+        for (var q = 0u; q < PIXELS; q++) {
+            let to = local + q * LANES;
+            var turned = 0u;
+            for (var k = 0u; k < 32u; k++) {
+                turned |= ((met[(to & 0xe0u) + k] >> (to & 31u)) & 1u) << k;
+            }
+            words[to] = turned;
         }
-        words[local] = word;
         if local == 0u {
             all_done = atomicLoad(&done_count);
         }
-        if workgroupUniformLoad(&all_done) == WORKGROUP_SIZE {
+        if workgroupUniformLoad(&all_done) == LANES {
             break;
         }
         // The next batch is on its way while this one is blended.
-        staged = fetch(start + (batch + 1u) * WORKGROUP_SIZE + local, end);
-        // Hardly a branch: invocations that part ways take as long as both ways together.
+        for (var q = 0u; q < PIXELS; q++) {
+            let at = start + (batch + 1u) * WORKGROUP_SIZE + local + q * LANES;
+            staged[q] = fetch(at, end);
+        }
         var w = 0u;
-        word = words[part];
+        var word = words[part];
         loop {
             while word == 0u && w < WORDS - 1u {
                 w++;
@@ -188,57 +283,28 @@ fn main(
             let shape = shapes[k];
             let weight = weights[k];
             let paint = paints[k];
-            let d = pixel - shape.xy;
-            let across = shape.w * (d.x - shape.z * d.y);
-            let along = weight.x * d.y;
-            let power = across * across + along * along;
-            let alpha = min(ALPHA_MAX, weight.y * exp(-power));
-            let left = transmittance * (1.0 - alpha);
-            // Over its reach alpha is under ALPHA_MIN for certain; a NaN is skipped too.
-            let hit = power <= weight.z && alpha >= ALPHA_MIN && !done;
-            let ends = hit && left <= TRANSMITTANCE_MIN;
-            let adds = hit && !ends;
-            done = done || ends;
-            // Colours, depths and rows are finite: nothing of them adds 0.
-            let share = select(0.0, alpha * transmittance, adds);
-            if WITH_COLOR {
-                color += share * paint.xyz;
+            let row = row_of(u32(weight.w), paint);
+            // No loop where there is one: GPUs' compilers make less of a loop within a loop.
+            blend(0u, shape, weight, paint, row);
+            if PIXELS > 1u {
+                for (var q = 1u; q < PIXELS; q++) {
+                    blend(q, shape, weight, paint, row);
+                }
             }
-            if WITH_DEPTH {
-                depth += share * paint.w;
-            }
-            if adds {
-                add_label(u32(weight.w), paint, painted, share, at_pixel);
-            }
-            alpha_sum += share;
-            transmittance = select(transmittance, left, adds);
         }
-        if done && !counted {
+        open = 0u;
+        for (var q = 0u; q < PIXELS; q++) {
+            open += u32(!pixels[q].done);
+        }
+        if open == 0u && !counted {
             counted = true;
             atomicAdd(&done_count, 1u);
         }
         workgroupBarrier();
     }
-    if inside {
-        let alpha = min(alpha_sum, 1.0);
-        if WITH_COLOR && views[which].color_start != NO_PICTURE {
-            let out = color + (1.0 - alpha) * views[which].background.xyz;
-            if views[which].fast != 0u {
-                pictures[views[which].color_start + at_pixel] = pack4x8unorm(vec4(out, alpha));
-            } else {
-                let to = views[which].color_start + at_pixel * 3u;
-                pictures[to] = bitcast<u32>(out.x);
-                pictures[to + 1u] = bitcast<u32>(out.y);
-                pictures[to + 2u] = bitcast<u32>(out.z);
-            }
+    for (var q = 0u; q < PIXELS; q++) {
+        if pixels[q].at != NO_PICTURE {
+            store(q);
         }
-        if WITH_DEPTH && views[which].depth_start != NO_PICTURE {
-            pictures[views[which].depth_start + at_pixel] =
-                bitcast<u32>(select(0.0, depth / alpha_sum, alpha_sum > 0.0));
-        }
-        if views[which].alpha_start != NO_PICTURE {
-            pictures[views[which].alpha_start + at_pixel] = bitcast<u32>(alpha);
-        }
-        store_labels(at_pixel);
     }
 }

@@ -2,7 +2,8 @@
 
 @group(0) @binding(7) var<storage, read> table: array<vec4<f32>>;
 
-var<private> blended: vec4<f32>;
+// Of each pixel of the invocation.
+var<private> blended: array<vec4<f32>, 8>;
 
 // An index beyond the table counts as 0.
 fn label_of(id: u32) -> u32 {
@@ -14,18 +15,13 @@ fn label_row(label: u32) -> vec4<f32> {
     return table[views[which].table_start + label];
 }
 
-// The row is staged where no colour takes its place.
-fn add_label(label: u32, paint: vec4<f32>, painted: bool, share: f32, pixel: u32) {
-    if painted {
-        blended += share * label_row(label);
-    } else {
-        blended += share * paint;
-    }
+fn add_label(label: u32, row: vec4<f32>, share: f32, q: u32, pixel: u32) {
+    blended[q] += share * row;
 }
 
-fn store_labels(pixel: u32) {
+fn store_labels(q: u32, pixel: u32) {
     let first = views[which].blend_start + pixel * 4u;
-    let bits = bitcast<vec4<u32>>(blended);
+    let bits = bitcast<vec4<u32>>(blended[q]);
     pictures[first] = bits.x;
     pictures[first + 1u] = bits.y;
     pictures[first + 2u] = bits.z;

@@ -8,6 +8,6 @@ fn label_row(label: u32) -> vec4<f32> {
     return vec4(0.0);
 }
 
-fn add_label(label: u32, paint: vec4<f32>, painted: bool, share: f32, pixel: u32) {}
+fn add_label(label: u32, row: vec4<f32>, share: f32, q: u32, pixel: u32) {}
 
-fn store_labels(pixel: u32) {}
+fn store_labels(q: u32, pixel: u32) {}

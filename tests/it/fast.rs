@@ -8,7 +8,7 @@ use segsplat::{
 
 use crate::{
     common::scenes::{Random, camera, checked, push, request, two_views},
-    twins::gpu,
+    twins::{both_kernels, gpu},
 };
 
 /// Half a level of 8 bits, and what f32 adds.
@@ -44,29 +44,31 @@ fn table() -> Vec<[f32; 4]> {
 
 #[test]
 fn where_no_order_is_in_doubt_fast_is_exact_to_half_a_level() {
-    let Some(gpu) = gpu() else { return };
-    let gaussians = layered();
-    let ask = RenderRequest { labels: Labels::Blend(table().into()), ..request(camera(70, 45)) };
-    let [exact, fast] = both(gpu, &gaussians, &ask);
-    assert_eq!(fast.depth, exact.depth, "depth is never rounded");
-    assert_eq!(fast.blend, exact.blend, "nor are labels");
-    assert_eq!(fast.stats, exact.stats);
-    let (mut brighter, mut rounded) = (0, 0);
-    for (i, want) in exact.color.iter().flatten().enumerate() {
-        let got = fast.color.as_ref().expect("colour")[i];
-        for (got, want) in got.into_iter().zip(*want) {
-            brighter += usize::from(want > 1.0);
-            rounded += usize::from(got != want);
-            let apart = (got - want.clamp(0.0, 1.0)).abs();
-            assert!(apart <= HALF_LEVEL, "pixel {i}: {got}, not {want}");
+    for gpu in both_kernels() {
+        let gaussians = layered();
+        let ask =
+            RenderRequest { labels: Labels::Blend(table().into()), ..request(camera(70, 45)) };
+        let [exact, fast] = both(gpu, &gaussians, &ask);
+        assert_eq!(fast.depth, exact.depth, "depth is never rounded");
+        assert_eq!(fast.blend, exact.blend, "nor are labels");
+        assert_eq!(fast.stats, exact.stats);
+        let (mut brighter, mut rounded) = (0, 0);
+        for (i, want) in exact.color.iter().flatten().enumerate() {
+            let got = fast.color.as_ref().expect("colour")[i];
+            for (got, want) in got.into_iter().zip(*want) {
+                brighter += usize::from(want > 1.0);
+                rounded += usize::from(got != want);
+                let apart = (got - want.clamp(0.0, 1.0)).abs();
+                assert!(apart <= HALF_LEVEL, "pixel {i}: {got}, not {want}");
+            }
         }
+        assert!(brighter > 0 && rounded > 0, "{brighter} values over white, {rounded} rounded");
+        let alphas = fast.alpha.iter().flatten().zip(exact.alpha.iter().flatten());
+        for (i, (got, want)) in alphas.enumerate() {
+            assert!((got - want).abs() <= HALF_LEVEL, "alpha of pixel {i}: {got}, not {want}");
+        }
+        assert_eq!(fast.alpha.as_ref().map(Vec::len), Some(70 * 45));
     }
-    assert!(brighter > 0 && rounded > 0, "{brighter} values over white, {rounded} rounded");
-    let alphas = fast.alpha.iter().flatten().zip(exact.alpha.iter().flatten());
-    for (i, (got, want)) in alphas.enumerate() {
-        assert!((got - want).abs() <= HALF_LEVEL, "alpha of pixel {i}: {got}, not {want}");
-    }
-    assert_eq!(fast.alpha.as_ref().map(Vec::len), Some(70 * 45));
 }
 
 #[test]

@@ -16,7 +16,7 @@ use crate::{
         scenes::{Random, camera, checked, cloud, push, request},
     },
     labels::{Drawn, alone, apart, draw_labels, labelled, literal_of, table},
-    twins::{gpu, open},
+    twins::{both_kernels, gpu, open},
 };
 
 fn cpu() -> CpuRenderer {
@@ -59,41 +59,48 @@ fn judge(gpu: &GpuRenderer, name: &str, gaussians: &Gaussians, request: &RenderR
 
 #[test]
 fn labels_of_the_gpu_equal_its_literal_road() {
-    let Some(gpu) = gpu() else { return };
-    for (m, width, height) in [(1, 33, 17), (2, 16, 16), (24, 64, 48), (512, 24, 20)] {
-        let gaussians = labelled(1_500, m, 200 + u64::from(m));
-        let request = request(camera(width, height));
-        let table = table(usize::from(m) + 1, 7);
-        let drawn = draw_labels(gpu, &gaussians, &request, &table);
-        let dense = literal_of(gpu, &gaussians, &request, m);
-        let (far, worst) = apart(&drawn, &dense, &table, 1e-5);
-        assert!(far.is_empty(), "M = {m}: {} pixels differ, first {:?}", far.len(), far.first());
-        println!("M = {m}: {} entries, max {worst:.2e}", drawn.entries.index.len());
+    for gpu in both_kernels() {
+        for (m, width, height) in [(1, 33, 17), (2, 16, 16), (24, 64, 48), (512, 24, 20)] {
+            let gaussians = labelled(1_500, m, 200 + u64::from(m));
+            let request = request(camera(width, height));
+            let table = table(usize::from(m) + 1, 7);
+            let drawn = draw_labels(gpu, &gaussians, &request, &table);
+            let dense = literal_of(gpu, &gaussians, &request, m);
+            let (far, worst) = apart(&drawn, &dense, &table, 1e-5);
+            assert!(
+                far.is_empty(),
+                "M = {m}: {} pixels differ, first {:?}",
+                far.len(),
+                far.first()
+            );
+            println!("M = {m}: {} entries, max {worst:.2e}", drawn.entries.index.len());
+        }
     }
 }
 
 #[test]
 fn labels_of_the_gpu_are_those_of_the_cpu() {
-    let Some(gpu) = gpu() else { return };
-    for (m, width, height) in
-        [(0, 40, 30), (1, 1, 1), (7, 97, 61), (24, 160, 120), (512, 160, 120), (4_096, 80, 60)]
-    {
-        let gaussians = labelled(3_001, m, 300 + u64::from(m));
-        judge(gpu, &format!("M = {m}"), &gaussians, &request(camera(width, height)));
-    }
-    let none = checked(RawGaussians::default());
-    let drawn = draw_labels(gpu, &none, &request(camera(20, 10)), &table(3, 1));
-    assert_eq!(drawn.entries, Entries::none(200), "no Gaussians");
-    assert_eq!(drawn.blend, [[0.0; 4]; 200], "no Gaussians");
+    for gpu in both_kernels() {
+        for (m, width, height) in
+            [(0, 40, 30), (1, 1, 1), (7, 97, 61), (24, 160, 120), (512, 160, 120), (4_096, 80, 60)]
+        {
+            let gaussians = labelled(3_001, m, 300 + u64::from(m));
+            judge(gpu, &format!("M = {m}"), &gaussians, &request(camera(width, height)));
+        }
+        let none = checked(RawGaussians::default());
+        let drawn = draw_labels(gpu, &none, &request(camera(20, 10)), &table(3, 1));
+        assert_eq!(drawn.entries, Entries::none(200), "no Gaussians");
+        assert_eq!(drawn.blend, [[0.0; 4]; 200], "no Gaussians");
 
-    // A table that is shorter than the bank, and none at all.
-    let (gaussians, request) = (labelled(900, 8, 51), request(camera(40, 25)));
-    for short in [table(4, 6), [[0.5, -1.0, 2.0, 3.0]; 2].into(), [].into()] {
-        let got = draw_labels(gpu, &gaussians, &request, &short).blend;
-        let want = draw_labels(&cpu(), &gaussians, &request, &short).blend;
-        let worst = got.iter().flatten().zip(want.iter().flatten());
-        let worst = worst.fold(0.0_f32, |worst, (a, b)| worst.max((a - b).abs()));
-        assert!(worst < 1e-3, "table of {} rows: {worst}", short.len());
+        // A table that is shorter than the bank, and none at all.
+        let (gaussians, request) = (labelled(900, 8, 51), request(camera(40, 25)));
+        for short in [table(4, 6), [[0.5, -1.0, 2.0, 3.0]; 2].into(), [].into()] {
+            let got = draw_labels(gpu, &gaussians, &request, &short).blend;
+            let want = draw_labels(&cpu(), &gaussians, &request, &short).blend;
+            let worst = got.iter().flatten().zip(want.iter().flatten());
+            let worst = worst.fold(0.0_f32, |worst, (a, b)| worst.max((a - b).abs()));
+            assert!(worst < 1e-3, "table of {} rows: {worst}", short.len());
+        }
     }
 }
 
@@ -111,25 +118,27 @@ fn stack(count: u16) -> Gaussians {
 
 #[test]
 fn pixels_with_more_entries_than_room_are_drawn_again() {
-    let Some(gpu) = open(|_| {}) else { return };
-    let many = stack(100);
-    let drawn = judge(&gpu, "100 entries a pixel", &many, &request(camera(48, 32)));
-    assert_eq!(drawn.entries.index.len(), 100 * 48 * 32, "every pixel sees every index");
-    // Room once made changes nothing for a view that needs less, and is found again.
-    let few = labelled(800, 5, 81);
-    judge(&gpu, "after it few", &few, &request(camera(48, 32)));
-    judge(&gpu, "and many again", &many, &request(camera(30, 20)));
-    // Slots for all of this picture are over the 128 MiB of a portable binding: bands.
-    let large = request(camera(512, 352));
-    let drawn = gpu.render(&many, &alone(&large, Labels::Entries)).expect("entries in bands");
-    let entries = drawn.entries.expect("entries");
-    let want = cpu().render(&many, &alone(&large, Labels::Entries)).expect("entries");
-    let want = want.entries.expect("entries");
-    assert_eq!(entries.offsets, want.offsets, "offsets in bands");
-    assert_eq!(entries.index, want.index, "indices in bands");
-    let worst = entries.weight.iter().zip(&want.weight);
-    let worst = worst.fold(0.0_f32, |worst, (a, b)| worst.max((a - b).abs()));
-    assert!(worst < 1e-4, "weights in bands: {worst}");
+    for serial in [false, true] {
+        let Some(gpu) = open(|options| options.serial = Some(serial)) else { return };
+        let many = stack(100);
+        let drawn = judge(&gpu, "100 entries a pixel", &many, &request(camera(48, 32)));
+        assert_eq!(drawn.entries.index.len(), 100 * 48 * 32, "every pixel sees every index");
+        // Room once made changes nothing for a view that needs less, and is found again.
+        let few = labelled(800, 5, 81);
+        judge(&gpu, "after it few", &few, &request(camera(48, 32)));
+        judge(&gpu, "and many again", &many, &request(camera(30, 20)));
+        // Slots for all of this picture are over the 128 MiB of a portable binding: bands.
+        let large = request(camera(512, 352));
+        let drawn = gpu.render(&many, &alone(&large, Labels::Entries)).expect("entries in bands");
+        let entries = drawn.entries.expect("entries");
+        let want = cpu().render(&many, &alone(&large, Labels::Entries)).expect("entries");
+        let want = want.entries.expect("entries");
+        assert_eq!(entries.offsets, want.offsets, "offsets in bands");
+        assert_eq!(entries.index, want.index, "indices in bands");
+        let worst = entries.weight.iter().zip(&want.weight);
+        let worst = worst.fold(0.0_f32, |worst, (a, b)| worst.max((a - b).abs()));
+        assert!(worst < 1e-4, "weights in bands: {worst}");
+    }
 }
 
 #[test]

@@ -48,27 +48,30 @@ fn at_once(gpu: &GpuRenderer, scene: &Gaussians, wanted: &[RenderRequest]) -> Ve
 
 #[test]
 fn views_drawn_together_are_those_drawn_alone() {
-    let Some(gpu) = open(|_| {}) else { return };
-    for labels in [Labels::None, Labels::Blend(table(9, 3)), Labels::Entries] {
-        let scene = labelled(2_000, 8, 61);
-        let wanted = requests(16, &labels);
-        let alone: Vec<_> =
-            wanted.iter().map(|one| gpu.render(&scene, one).expect("a view alone")).collect();
-        let before = gpu.submissions();
-        for (i, (got, want)) in at_once(&gpu, &scene, &wanted).iter().zip(&alone).enumerate() {
-            assert!(got == want, "view {i} among others, {labels:?}");
+    for serial in [false, true] {
+        let Some(gpu) = open(|options| options.serial = Some(serial)) else { return };
+        for labels in [Labels::None, Labels::Blend(table(9, 3)), Labels::Entries] {
+            let scene = labelled(2_000, 8, 61);
+            let wanted = requests(16, &labels);
+            let alone: Vec<_> =
+                wanted.iter().map(|one| gpu.render(&scene, one).expect("a view alone")).collect();
+            let before = gpu.submissions();
+            for (i, (got, want)) in at_once(&gpu, &scene, &wanted).iter().zip(&alone).enumerate() {
+                assert!(got == want, "view {i} among others, {labels:?}");
+            }
+            let (submissions, views) = gpu.submissions();
+            let (submissions, views) = (submissions - before.0, views - before.1);
+            println!("{views} views in {submissions} submissions");
+            assert_eq!(views, 16, "no two views are equal");
+            assert!(submissions < 16, "some views shared a submission");
         }
-        let (submissions, views) = gpu.submissions();
-        let (submissions, views) = (submissions - before.0, views - before.1);
-        println!("{views} views in {submissions} submissions");
-        assert_eq!(views, 16, "no two views are equal");
-        assert!(submissions < 16, "some views shared a submission");
+        // Degree 2: colours of each camera are its own.
+        let scene = cloud(1_500, 2, 62);
+        let wanted = requests(12, &Labels::None);
+        let alone: Vec<_> =
+            wanted.iter().map(|one| gpu.render(&scene, one).expect("alone")).collect();
+        assert!(at_once(&gpu, &scene, &wanted) == alone, "colours of higher degrees");
     }
-    // Degree 2: colours of each camera are its own.
-    let scene = cloud(1_500, 2, 62);
-    let wanted = requests(12, &Labels::None);
-    let alone: Vec<_> = wanted.iter().map(|one| gpu.render(&scene, one).expect("alone")).collect();
-    assert!(at_once(&gpu, &scene, &wanted) == alone, "colours of higher degrees");
 }
 
 #[test]

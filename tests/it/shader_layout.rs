@@ -38,25 +38,30 @@ fn every_shader_is_valid() {
 fn workgroups_stay_under_the_portable_floor() {
     for shader in &SHADERS {
         let module = parse(shader);
+        let info = naga::valid::Validator::new(
+            naga::valid::ValidationFlags::all(),
+            naga::valid::Capabilities::empty(),
+        )
+        .validate(&module)
+        .unwrap_or_else(|error| panic!("{}: {error}", shader.stem));
         let mut layouter = naga::proc::Layouter::default();
         layouter.update(module.to_ctx()).expect("types have sizes");
-        for entry in &module.entry_points {
+        for (at, entry) in module.entry_points.iter().enumerate() {
+            let what = format!("{}: {}", shader.stem, entry.name);
             let [x, y, z] = entry.workgroup_size;
-            assert!(x * y * z <= 256, "{}: {} has {} invocations", shader.stem, entry.name, x * y);
+            assert!(x * y * z <= 256, "{what} has {x} x {y} x {z} invocations");
+            let used = info.get_entry_point(at);
+            let globals = || module.global_variables.iter().filter(|(at, _)| !used[*at].is_empty());
+            let bytes: u32 = globals()
+                .filter(|(_, variable)| variable.space == naga::AddressSpace::WorkGroup)
+                .map(|(_, variable)| layouter[variable.ty].size)
+                .sum();
+            assert!(bytes <= 16 << 10, "{what}: {bytes} bytes of workgroup storage");
+            let storage = globals()
+                .filter(|(_, v)| matches!(v.space, naga::AddressSpace::Storage { .. }))
+                .count();
+            assert!(storage <= 8, "{what}: {storage} storage buffers");
         }
-        let bytes: u32 = module
-            .global_variables
-            .iter()
-            .filter(|(_, variable)| variable.space == naga::AddressSpace::WorkGroup)
-            .map(|(_, variable)| layouter[variable.ty].size)
-            .sum();
-        assert!(bytes <= 16 << 10, "{}: {bytes} bytes of workgroup storage", shader.stem);
-        let storage = module
-            .global_variables
-            .iter()
-            .filter(|(_, v)| matches!(v.space, naga::AddressSpace::Storage { .. }))
-            .count();
-        assert!(storage <= 8, "{}: {storage} storage buffers", shader.stem);
     }
 }
 

@@ -40,7 +40,8 @@ use crate::common::{
 pub(crate) fn open(change: impl Fn(&mut GpuOptions)) -> Option<GpuRenderer> {
     let mut told = String::new();
     for adapter in [None, Some("llvmpipe".to_owned())] {
-        let mut options = GpuOptions { adapter, portable: true, ..GpuOptions::default() };
+        let mut options =
+            GpuOptions { adapter, portable: true, serial: Some(false), ..GpuOptions::default() };
         change(&mut options);
         match GpuRenderer::open(&options).1 {
             Ok(gpu) => return Some(gpu),
@@ -61,6 +62,13 @@ pub(crate) fn gpu() -> Option<&'static GpuRenderer> {
         None => println!("skipped: no adapter"),
     }
     gpu
+}
+
+/// The same adapter with the kernels of a GPU, then with those of a software adapter.
+pub(crate) fn both_kernels() -> impl Iterator<Item = &'static GpuRenderer> {
+    static SERIAL: OnceLock<Option<GpuRenderer>> = OnceLock::new();
+    let serial = || SERIAL.get_or_init(|| open(|options| options.serial = Some(true))).as_ref();
+    gpu().into_iter().chain(serial())
 }
 
 fn cpu() -> CpuRenderer {
@@ -143,52 +151,54 @@ fn prefix_sum_twin() {
 
 #[test]
 fn radix_sort_twin() {
-    let Some(gpu) = gpu() else { return };
-    let mut random = Random(2);
-    for (count, key_bits) in
-        [(1, 32), (255, 32), (256, 8), (2_049, 32), (70_000, 32), (300_000, 9), (70_001, 1)]
-    {
-        let mask = u32::MAX >> (32 - key_bits);
-        let keys: Vec<u32> = (0..count).map(|_| random.bits() as u32 & mask).collect();
-        let values: Vec<u32> = (0..count).collect();
-        let mut want: Vec<u64> =
-            keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v)).collect();
-        radix_sort::radix_sort(&mut want, &mut Vec::new(), key_bits);
-        let (keys, values) = gpu.radix_sort(&keys, &values, key_bits).expect("a sort");
-        let got: Vec<u64> =
-            keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v)).collect();
-        assert!(got == want, "{count} pairs of {key_bits}-bit keys: order differs");
+    for gpu in both_kernels() {
+        let mut random = Random(2);
+        for (count, key_bits) in
+            [(1, 32), (255, 32), (256, 8), (2_049, 32), (70_000, 32), (300_000, 9), (70_001, 1)]
+        {
+            let mask = u32::MAX >> (32 - key_bits);
+            let keys: Vec<u32> = (0..count).map(|_| random.bits() as u32 & mask).collect();
+            let values: Vec<u32> = (0..count).collect();
+            let mut want: Vec<u64> =
+                keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v)).collect();
+            radix_sort::radix_sort(&mut want, &mut Vec::new(), key_bits);
+            let (keys, values) = gpu.radix_sort(&keys, &values, key_bits).expect("a sort");
+            let got: Vec<u64> =
+                keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v)).collect();
+            assert!(got == want, "{count} pairs of {key_bits}-bit keys: order differs");
+        }
     }
 }
 
 #[test]
 fn depth_sort_leaves_the_dropped_behind() {
-    let Some(gpu) = gpu() else { return };
-    let mut random = Random(22);
-    // Ranges of keys that take one to four digits; many equal; none at all.
-    for (count, low, range) in [
-        (1, 7, 1),
-        (5_000, 0x4000_0000, 200),
-        (70_000, 0x3f80_00ff, 3_000),
-        (131_072, 0x4012_3456, 1 << 23),
-        (40_000, 0x0080_0000, 0x7e00_0000_u64),
-        (300, 5, 0),
-    ] {
-        let keys: Vec<u32> = (0..count)
-            .map(|_| match (range, random.bits() % 5) {
-                (0, _) | (_, 0) => DROPPED_KEY,
-                _ => low + (random.bits() % range) as u32,
-            })
-            .collect();
-        let mut want: Vec<u64> = keys
-            .iter()
-            .enumerate()
-            .filter(|&(_, &key)| key != DROPPED_KEY)
-            .map(|(i, &key)| radix_sort::pack(key, i as u32))
-            .collect();
-        radix_sort::radix_sort(&mut want, &mut Vec::new(), 32);
-        let want: Vec<u32> = want.into_iter().map(radix_sort::value).collect();
-        assert!(gpu.depth_sort(&keys).expect("an order") == want, "{count} keys over {range}");
+    for gpu in both_kernels() {
+        let mut random = Random(22);
+        // Ranges of keys that take one to four digits; many equal; none at all.
+        for (count, low, range) in [
+            (1, 7, 1),
+            (5_000, 0x4000_0000, 200),
+            (70_000, 0x3f80_00ff, 3_000),
+            (131_072, 0x4012_3456, 1 << 23),
+            (40_000, 0x0080_0000, 0x7e00_0000_u64),
+            (300, 5, 0),
+        ] {
+            let keys: Vec<u32> = (0..count)
+                .map(|_| match (range, random.bits() % 5) {
+                    (0, _) | (_, 0) => DROPPED_KEY,
+                    _ => low + (random.bits() % range) as u32,
+                })
+                .collect();
+            let mut want: Vec<u64> = keys
+                .iter()
+                .enumerate()
+                .filter(|&(_, &key)| key != DROPPED_KEY)
+                .map(|(i, &key)| radix_sort::pack(key, i as u32))
+                .collect();
+            radix_sort::radix_sort(&mut want, &mut Vec::new(), 32);
+            let want: Vec<u32> = want.into_iter().map(radix_sort::value).collect();
+            assert!(gpu.depth_sort(&keys).expect("an order") == want, "{count} keys over {range}");
+        }
     }
 }
 
@@ -318,68 +328,71 @@ fn tile_ranges_twin() {
 
 #[test]
 fn rasterize_twin() {
-    let Some(gpu) = gpu() else { return };
-    let (gaussians, middle) = two_views(96, 7);
-    let request = request(middle);
-    let view = view_of(&gaussians, &request);
-    let mut projected = projected(&gaussians, &request);
-    let order = depth_order(&projected);
-    let (mut offsets, mut isects, mut ranges) = (vec![], vec![], vec![]);
-    shade::shade(&gaussians, &view, &mut projected);
-    let grid = whole(&view);
-    let counts = order.iter().map(|&p| projected.tiles_per_gauss[radix_sort::value(p) as usize]);
-    prefix_sum::prefix_sum(counts, &mut offsets);
-    emit_isects::emit_isects(&projected, &order, &grid, &offsets, &mut isects);
-    radix_sort::radix_sort(&mut isects, &mut Vec::new(), 16);
-    tile_ranges::tile_ranges(&isects, grid.tile_count(), &mut ranges);
+    for gpu in both_kernels() {
+        let (gaussians, middle) = two_views(96, 7);
+        let request = request(middle);
+        let view = view_of(&gaussians, &request);
+        let mut projected = projected(&gaussians, &request);
+        let order = depth_order(&projected);
+        let (mut offsets, mut isects, mut ranges) = (vec![], vec![], vec![]);
+        shade::shade(&gaussians, &view, &mut projected);
+        let grid = whole(&view);
+        let counts =
+            order.iter().map(|&p| projected.tiles_per_gauss[radix_sort::value(p) as usize]);
+        prefix_sum::prefix_sum(counts, &mut offsets);
+        emit_isects::emit_isects(&projected, &order, &grid, &offsets, &mut isects);
+        radix_sort::radix_sort(&mut isects, &mut Vec::new(), 16);
+        tile_ranges::tile_ranges(&isects, grid.tile_count(), &mut ranges);
 
-    let pixels = 96 * 96;
-    let (mut color, mut depth, mut alpha) =
-        (vec![[0.0; 3]; pixels], vec![0.0; pixels], vec![0.0; pixels]);
-    for tile_y in 0..view.tiles_y() {
-        let first = (tile_y * 16 * 96) as usize;
-        let mut out = RowOut {
-            color: Some(&mut color[first..]),
-            depth: Some(&mut depth[first..]),
-            alpha: Some(&mut alpha[first..]),
-            ..RowOut::default()
-        };
-        for tile_x in 0..view.tiles_x() {
-            let id = (tile_y * view.tiles_x() + tile_x) as usize;
-            let tile = Tile { x: tile_x * 16, y: tile_y * 16, width: 16, height: 16 };
-            rasterize_tile(
-                &projected.footprints,
-                &isects[ranges[id] as usize..ranges[id + 1] as usize],
-                tile,
-                &Paint::new(&request, gaussians.semantic_index()),
-                96,
-                &mut TileScratch::default(),
-                &mut out,
-            );
+        let pixels = 96 * 96;
+        let (mut color, mut depth, mut alpha) =
+            (vec![[0.0; 3]; pixels], vec![0.0; pixels], vec![0.0; pixels]);
+        for tile_y in 0..view.tiles_y() {
+            let first = (tile_y * 16 * 96) as usize;
+            let mut out = RowOut {
+                color: Some(&mut color[first..]),
+                depth: Some(&mut depth[first..]),
+                alpha: Some(&mut alpha[first..]),
+                ..RowOut::default()
+            };
+            for tile_x in 0..view.tiles_x() {
+                let id = (tile_y * view.tiles_x() + tile_x) as usize;
+                let tile = Tile { x: tile_x * 16, y: tile_y * 16, width: 16, height: 16 };
+                rasterize_tile(
+                    &projected.footprints,
+                    &isects[ranges[id] as usize..ranges[id + 1] as usize],
+                    tile,
+                    &Paint::new(&request, gaussians.semantic_index()),
+                    96,
+                    &mut TileScratch::default(),
+                    &mut out,
+                );
+            }
         }
+        let rows: Vec<_> = projected.footprints.iter().map(to_row).collect();
+        let colors: Vec<_> = projected.footprints.iter().map(|f| f.color).collect();
+        let ids: Vec<u32> = isects.iter().map(|&pair| radix_sort::value(pair)).collect();
+        let got = gpu
+            .rasterize(&view, request.background, &rows, &colors, &ids, &ranges)
+            .expect("pictures");
+        let want = Frame {
+            width: 96,
+            height: 96,
+            color: Some(color),
+            depth: Some(depth),
+            alpha: Some(alpha),
+            ..Frame::default()
+        };
+        let got = Frame {
+            color: Some(bytemuck::cast_slice(&got[..pixels * 3]).to_vec()),
+            depth: Some(got[pixels * 3..pixels * 4].to_vec()),
+            alpha: Some(got[pixels * 4..].to_vec()),
+            width: 96,
+            height: 96,
+            ..Frame::default()
+        };
+        same("rasterize alone", &got, &want, &gaussians, &request);
     }
-    let rows: Vec<_> = projected.footprints.iter().map(to_row).collect();
-    let colors: Vec<_> = projected.footprints.iter().map(|f| f.color).collect();
-    let ids: Vec<u32> = isects.iter().map(|&pair| radix_sort::value(pair)).collect();
-    let got =
-        gpu.rasterize(&view, request.background, &rows, &colors, &ids, &ranges).expect("pictures");
-    let want = Frame {
-        width: 96,
-        height: 96,
-        color: Some(color),
-        depth: Some(depth),
-        alpha: Some(alpha),
-        ..Frame::default()
-    };
-    let got = Frame {
-        color: Some(bytemuck::cast_slice(&got[..pixels * 3]).to_vec()),
-        depth: Some(got[pixels * 3..pixels * 4].to_vec()),
-        alpha: Some(got[pixels * 4..].to_vec()),
-        width: 96,
-        height: 96,
-        ..Frame::default()
-    };
-    same("rasterize alone", &got, &want, &gaussians, &request);
 }
 
 /// Pictures within 1/255; pixels further apart are few and stand at a cliff of the oracle.
@@ -418,81 +431,85 @@ fn judge(gpu: &GpuRenderer, name: &str, gaussians: &Gaussians, request: &RenderR
 
 #[test]
 fn pictures_of_131072_gaussians_are_the_same() {
-    let Some(gpu) = gpu() else { return };
-    let (gaussians, middle) = two_views(256, 1);
-    assert_eq!(gaussians.len(), 131_072, "a Gaussian a pixel of two photos");
-    let frame = judge(gpu, "two_views 256", &gaussians, &request(middle));
-    // The second time the scene and all room are there.
-    let again = gpu.render(&gaussians, &request(middle)).expect("a picture");
-    assert!(frame == again, "two renders of one view differ");
-    judge(
-        gpu,
-        "two_views 256 antialiased",
-        &gaussians,
-        &RenderRequest { antialiased: true, ..request(middle) },
-    );
+    for gpu in both_kernels() {
+        let (gaussians, middle) = two_views(256, 1);
+        assert_eq!(gaussians.len(), 131_072, "a Gaussian a pixel of two photos");
+        let frame = judge(gpu, "two_views 256", &gaussians, &request(middle));
+        // The second time the scene and all room are there.
+        let again = gpu.render(&gaussians, &request(middle)).expect("a picture");
+        assert!(frame == again, "two renders of one view differ");
+        judge(
+            gpu,
+            "two_views 256 antialiased",
+            &gaussians,
+            &RenderRequest { antialiased: true, ..request(middle) },
+        );
+    }
 }
 
 #[test]
 fn every_harmonic_degree_and_camera_is_the_same() {
-    let Some(gpu) = gpu() else { return };
-    for degree in 0..=3 {
-        let gaussians = cloud(3_000, degree, 10 + u64::from(degree));
-        judge(gpu, &format!("degree {degree}"), &gaussians, &request(camera(160, 120)));
-    }
-    let gaussians = cloud(4_000, 1, 21);
-    for (fx, fy, cx, cy) in
-        [(140.0, 90.0, 20.0, 100.0), (60.0, 200.0, 150.0, -10.0), (500.0, 480.0, 300.0, 60.0)]
-    {
-        let mut camera = camera(161, 119);
-        let lens = &mut camera.intrinsics;
-        (lens.fx, lens.fy, lens.cx, lens.cy) = (fx, fy, cx, cy);
-        judge(gpu, &format!("principal point {cx} {cy}"), &gaussians, &request(camera));
+    for gpu in both_kernels() {
+        for degree in 0..=3 {
+            let gaussians = cloud(3_000, degree, 10 + u64::from(degree));
+            judge(gpu, &format!("degree {degree}"), &gaussians, &request(camera(160, 120)));
+        }
+        let gaussians = cloud(4_000, 1, 21);
+        for (fx, fy, cx, cy) in
+            [(140.0, 90.0, 20.0, 100.0), (60.0, 200.0, 150.0, -10.0), (500.0, 480.0, 300.0, 60.0)]
+        {
+            let mut camera = camera(161, 119);
+            let lens = &mut camera.intrinsics;
+            (lens.fx, lens.fy, lens.cx, lens.cy) = (fx, fy, cx, cy);
+            judge(gpu, &format!("principal point {cx} {cy}"), &gaussians, &request(camera));
+        }
     }
 }
 
 #[test]
 fn few_gaussians_are_the_same() {
-    let Some(gpu) = gpu() else { return };
-    let none = checked(RawGaussians::default());
-    let frame = judge(gpu, "none", &none, &request(camera(50, 30)));
-    assert!(frame.color.expect("colour").iter().all(|c| *c == [0.1, 0.2, 0.3]), "background");
+    for gpu in both_kernels() {
+        let none = checked(RawGaussians::default());
+        let frame = judge(gpu, "none", &none, &request(camera(50, 30)));
+        assert!(frame.color.expect("colour").iter().all(|c| *c == [0.1, 0.2, 0.3]), "background");
 
-    let mut raw = RawGaussians::default();
-    let quat = Random(8).quat();
-    push(&mut raw, [0.1, 0.05, 2.0], quat, [0.2, 0.05, 0.01], 0.8, &[[1.0, -0.5, 0.3]]);
-    let one = checked(raw);
-    for side in [1, 15, 16, 17, 64] {
-        judge(gpu, &format!("one at {side} px"), &one, &request(camera(side, side)));
+        let mut raw = RawGaussians::default();
+        let quat = Random(8).quat();
+        push(&mut raw, [0.1, 0.05, 2.0], quat, [0.2, 0.05, 0.01], 0.8, &[[1.0, -0.5, 0.3]]);
+        let one = checked(raw);
+        for side in [1, 15, 16, 17, 64] {
+            judge(gpu, &format!("one at {side} px"), &one, &request(camera(side, side)));
+        }
+        let mut away = camera(40, 40);
+        away.camera_to_world = look(glam::DVec3::ZERO, glam::DVec3::NEG_Z);
+        let frame = judge(gpu, "looking away", &one, &request(away));
+        assert_eq!(frame.stats.visible, 0, "nothing is behind the camera");
     }
-    let mut away = camera(40, 40);
-    away.camera_to_world = look(glam::DVec3::ZERO, glam::DVec3::NEG_Z);
-    let frame = judge(gpu, "looking away", &one, &request(away));
-    assert_eq!(frame.stats.visible, 0, "nothing is behind the camera");
 }
 
 #[test]
 fn kinds_not_asked_for_are_not_given() {
-    let Some(gpu) = gpu() else { return };
-    let gaussians = cloud(500, 0, 9);
-    let all = gpu.render(&gaussians, &request(camera(70, 40))).expect("all kinds");
-    for (color, depth, alpha) in
-        [(true, false, false), (false, true, false), (false, false, true), (true, false, true)]
-    {
-        let kinds = Kinds { color, depth, alpha };
-        let frame = gpu
-            .render(&gaussians, &RenderRequest { kinds, ..request(camera(70, 40)) })
-            .expect("some kinds");
-        let colors = |frame: &Frame| frame.color.as_ref().map(|color| color.concat());
-        for (name, wanted, got, want) in [
-            ("colour", color, colors(&frame), colors(&all)),
-            ("depth", depth, frame.depth.clone(), all.depth.clone()),
-            ("alpha", alpha, frame.alpha.clone(), all.alpha.clone()),
-        ] {
-            assert_eq!(got.is_some(), wanted, "{kinds:?}: {name}");
-            // Each set of kinds is a kernel of its own, which may round otherwise.
-            for (got, want) in got.iter().flatten().zip(want.iter().flatten()) {
-                assert!((got - want).abs() <= 1e-5 * want.abs().max(1.0), "{kinds:?}: {name}");
+    for gpu in both_kernels() {
+        let gaussians = cloud(500, 0, 9);
+        let all = gpu.render(&gaussians, &request(camera(70, 40))).expect("all kinds");
+        for (color, depth, alpha) in
+            [(true, false, false), (false, true, false), (false, false, true), (true, false, true)]
+        {
+            let kinds = Kinds { color, depth, alpha };
+            let frame = gpu
+                .render(&gaussians, &RenderRequest { kinds, ..request(camera(70, 40)) })
+                .expect("some kinds");
+            let colors = |frame: &Frame| frame.color.as_ref().map(|color| color.concat());
+            for (name, wanted, got, want) in [
+                ("colour", color, colors(&frame), colors(&all)),
+                ("depth", depth, frame.depth.clone(), all.depth.clone()),
+                ("alpha", alpha, frame.alpha.clone(), all.alpha.clone()),
+            ] {
+                assert_eq!(got.is_some(), wanted, "{kinds:?}: {name}");
+                // Each set of kinds is a kernel of its own, which may round otherwise.
+                for (got, want) in got.iter().flatten().zip(want.iter().flatten()) {
+                    assert!((got - want).abs() <= 1e-5 * want.abs().max(1.0), "{kinds:?}: {name}");
+                }
             }
         }
     }

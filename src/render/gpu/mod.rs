@@ -51,6 +51,9 @@ pub struct GpuOptions {
     pub shaders: Option<PathBuf>,
     /// Has every index and loop of the shaders checked by code of its own.
     pub checked: bool,
+    /// Whether the kernels made for software adapters are used, where an invocation does what many
+    /// share on a GPU; `None`: on those alone.
+    pub serial: Option<bool>,
 }
 
 impl Default for GpuOptions {
@@ -64,6 +67,7 @@ impl Default for GpuOptions {
             scene_bytes_max: limits.device_scene_bytes_max,
             shaders: None,
             checked: false,
+            serial: None,
         }
     }
 }

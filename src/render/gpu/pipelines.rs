@@ -90,10 +90,10 @@ macro_rules! shader {
 /// Every shader, in the order of the stages.
 pub const SHADERS: [Shader; 9] = [
     shader!("project", "camera", "tiles"),
-    shader!("radix_sort"),
-    shader!("prefix_sum"),
+    shader!("radix_sort", "sum_before"),
+    shader!("prefix_sum", "sum_before"),
     shader!("shade", "sh"),
-    shader!("emit_isects", "tiles"),
+    shader!("emit_isects", "tiles", "sum_before"),
     shader!("tile_ranges"),
     shader!("rasterize", "labels_none"),
     shader!("rasterize", "labels_index", "labels_blend"),
@@ -131,7 +131,8 @@ pub(super) enum RasterLabels {
     Entries,
 }
 
-/// Name in measurements, place in [`SHADERS`] and entry point of every kernel but rasterize.
+/// Name in measurements, place in [`SHADERS`] and entry point of every kernel but rasterize; those
+/// of [`SERIAL`] have one more, for software adapters.
 const KERNELS: [(&str, usize, &str); 9] = [
     ("project", 0, "main"),
     ("histogram", 1, "histogram"),
@@ -143,6 +144,10 @@ const KERNELS: [(&str, usize, &str); 9] = [
     ("emit_isects", 4, "main"),
     ("tile_ranges", 5, "main"),
 ];
+/// Kernels with an entry point of their own for software adapters: `{name}_serial`.
+const SERIAL: [&str; 2] = ["spine", "scatter"];
+/// Pixels that an invocation of rasterize blends: on a GPU, and on a software adapter.
+const PIXELS: [f64; 2] = [1.0, 8.0];
 /// Place in [`SHADERS`] of rasterize without labels.
 const RASTERIZE: usize = 6;
 /// Sets of pictures, each a kernel of rasterize, by labels.
@@ -177,14 +182,22 @@ pub(super) struct Kernels {
     pipelines: Vec<wgpu::ComputePipeline>,
     /// Made when first wanted: a server that is asked for colour needs one of twelve.
     rasterize: [OnceLock<wgpu::ComputePipeline>; 3 * PICTURES],
+    /// Whether they are those for a software adapter.
+    pub(super) serial: bool,
 }
 
 impl Kernels {
-    /// Compiles every kernel, from the files in `folder` where one is named.
+    /// Compiles every kernel, from the files in `folder` where one is named; for a software
+    /// adapter if `serial`.
     ///
     /// # Errors
     /// `internal` when the driver refuses one, `invalid_request` when a file cannot be read.
-    pub(super) fn compile(gpu: &Gpu, folder: Option<&Path>, checked: bool) -> Result<Self> {
+    pub(super) fn compile(
+        gpu: &Gpu,
+        folder: Option<&Path>,
+        checked: bool,
+        serial: bool,
+    ) -> Result<Self> {
         let modules = SHADERS
             .iter()
             .map(|shader| {
@@ -210,9 +223,13 @@ impl Kernels {
             .collect::<Result<Vec<_>>>()?;
         let pipelines = KERNELS
             .iter()
-            .map(|&(name, module, entry)| pipeline(gpu, name, &modules[module], entry, &[]))
+            .map(|&(name, module, entry)| {
+                let own = if serial && SERIAL.contains(&name) { "_serial" } else { "" };
+                pipeline(gpu, name, &modules[module], &format!("{entry}{own}"), &[])
+            })
             .collect::<Result<_>>()?;
-        Ok(Self { modules, pipelines, rasterize: [const { OnceLock::new() }; 3 * PICTURES] })
+        let rasterize = [const { OnceLock::new() }; 3 * PICTURES];
+        Ok(Self { modules, pipelines, rasterize, serial })
     }
 
     /// The pipeline of a kernel.
@@ -229,6 +246,7 @@ impl Kernels {
             let constants = [
                 ("WITH_COLOR", f64::from(u8::from(raster.color))),
                 ("WITH_DEPTH", f64::from(u8::from(raster.depth))),
+                ("PIXELS", PIXELS[usize::from(self.serial)]),
             ];
             let module = &self.modules[RASTERIZE + labels];
             let made = pipeline(gpu, "rasterize", module, "main", &constants)?;

@@ -219,7 +219,7 @@ impl<'a> Recorder<'a> {
             let digit =
                 SortParams { shift: pass_at * DIGIT_BITS, pass_at, by_tile: 0, reserved: 0 };
             let groups = match pass_at {
-                0 => [Groups::Row(blocks), Groups::Row(DIGITS), Groups::Row(blocks)],
+                0 => [Groups::Row(blocks), Groups::Row(self.spines()), Groups::Row(blocks)],
                 _ => [
                     Groups::Planned(GROUPS_DEPTH + pass_at - 1),
                     Groups::Planned(GROUPS_DIGITS + pass_at - 1),
@@ -237,8 +237,13 @@ impl<'a> Recorder<'a> {
             let digit =
                 SortParams { shift: pass_at * DIGIT_BITS, pass_at, by_tile: 1, reserved: 0 };
             let planned = || Groups::Planned(GROUPS_TILES);
-            self.sort_digit(digit, &[planned(), Groups::Row(DIGITS), planned()]);
+            self.sort_digit(digit, &[planned(), Groups::Row(self.spines()), planned()]);
         }
+    }
+
+    /// Workgroups of spine: one a digit, or one for all.
+    fn spines(&self) -> u32 {
+        if self.kernels.serial { 1 } else { DIGITS }
     }
 
     fn sort_digit(&mut self, digit: SortParams, groups: &[Groups; 3]) {
