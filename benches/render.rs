@@ -106,7 +106,7 @@ impl Stages {
         let (gaussians, camera) = scenes::two_views(SIDE, 1);
         let request = scenes::request(camera);
         let view = View::new(gaussians.origin(), &request).expect("a view");
-        let grid = Grid { width: SIDE, height: SIDE, tile_rows: 0..view.tiles_y() };
+        let grid = Grid::whole(&view, None);
         Self {
             gaussians,
             request,

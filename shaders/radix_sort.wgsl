@@ -20,6 +20,10 @@
 @group(0) @binding(5) var<storage, read_write> digit_counts: array<u32>;
 @group(0) @binding(6) var<storage, read_write> groups_of: array<atomic<u32>>;
 
+// What is left out because no pixel needs it (src/render/skip.rs).
+override SKIP_UNSEEN: bool = true;
+override SKIP_EQUAL_DIGITS: bool = true;
+
 const DIGITS: u32 = 256u;
 // Words of a mask of SORT_SIZE bits.
 const MASK_WORDS: u32 = 4u;
@@ -88,7 +92,7 @@ fn histogram(
     let block = group.y * groups.x + group.x;
     let first = ((params.pass_at & 1u) * groups.z + which) * stride();
     let least = least_key();
-    let drops = is_first();
+    let drops = is_first() && SKIP_UNSEEN;
     let blunt = blunt_bits();
     atomicStore(&counts[local], 0u);
     workgroupBarrier();
@@ -162,7 +166,7 @@ fn plan_digits(blocks: u32, spines: u32, view_count: u32) {
     let low = atomicLoad(&plans[which].key_min);
     let high = atomicLoad(&plans[which].key_max);
     let bits = select(0u, 32u - countLeadingZeros(high - low), low < high) - blunt_bits();
-    let passes = max(1u, (bits + 7u) / 8u);
+    let passes = select(4u, max(1u, (bits + 7u) / 8u), SKIP_EQUAL_DIGITS);
     atomicMax(&plans[0].passes, passes);
     let x = min(blocks, GROUPS_X_MAX);
     for (var at = 1u; at < 4u; at++) {
@@ -214,7 +218,7 @@ fn scatter(
     let from_start = (from_half * groups.z + which) * stride();
     let to_start = ((1u - from_half) * groups.z + which) * stride();
     let least = least_key();
-    let drops = is_first();
+    let drops = is_first() && SKIP_UNSEEN;
     let blunt = blunt_bits();
 
     let totals = totals_start(groups.z);
@@ -268,7 +272,7 @@ fn scatter(
         var value = i;
         if valid {
             atomicOr(&masks[mask + word + digit], bit);
-            if !drops {
+            if !is_first() {
                 value = values[from_start + i];
             }
         }
@@ -321,7 +325,7 @@ fn scatter_serial(
     let from_start = (from_half * groups.z + which) * stride();
     let to_start = ((1u - from_half) * groups.z + which) * stride();
     let least = least_key();
-    let drops = is_first();
+    let drops = is_first() && SKIP_UNSEEN;
     let blunt = blunt_bits();
     let places = counts_start() + block;
     let end = min(count, (block + 1u) * SORT_BLOCK);
@@ -335,7 +339,7 @@ fn scatter_serial(
         let place = digit_counts[at];
         digit_counts[at] = place + 1u;
         keys[to_start + place] = key;
-        if drops {
+        if is_first() {
             values[to_start + place] = i;
         } else {
             values[to_start + place] = values[from_start + i];

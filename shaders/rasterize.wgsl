@@ -42,9 +42,16 @@ override LANES: u32 = WORKGROUP_SIZE / PIXELS;
 // A kernel is made for each set of pictures.
 override WITH_COLOR: bool = true;
 override WITH_DEPTH: bool = true;
+// What is left out because no pixel needs it (src/render/skip.rs).
+override SKIP_ELLIPSE_PARTS: bool = true;
+override SKIP_ENDED_RAYS: bool = true;
+override SKIP_FLAT_COLOR: bool = true;
 
 // Bits of the parts that meet the box around a footprint, whose mean is relative to the tile.
 fn parts_of(footprint: Footprint, mean: vec2<f32>) -> u32 {
+    if !SKIP_ELLIPSE_PARTS {
+        return 0xffffffffu;
+    }
     let root = sqrt(footprint.reach);
     let tall = root / footprint.inv_sy;
     let across = root / footprint.inv_sx;
@@ -71,7 +78,7 @@ fn parts_of(footprint: Footprint, mean: vec2<f32>) -> u32 {
 }
 
 fn color_of(id: u32) -> vec3<f32> {
-    if views[which].sh_count == 1u {
+    if SKIP_FLAT_COLOR && views[which].sh_count == 1u {
         let at = id * 3u;
         let c = vec3(colors[at], colors[at + 1u], colors[at + 2u]);
         return max(vec3(SH_OFFSET) + SH_C0 * c, vec3(0.0));
@@ -260,7 +267,7 @@ fn main(
         if local == 0u {
             all_done = atomicLoad(&done_count);
         }
-        if workgroupUniformLoad(&all_done) == LANES {
+        if workgroupUniformLoad(&all_done) == LANES && SKIP_ENDED_RAYS {
             break;
         }
         // The next batch is on its way while this one is blended.

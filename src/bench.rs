@@ -7,6 +7,7 @@
 
 mod compared;
 mod generated;
+mod skips;
 
 use std::{path::PathBuf, time::Instant};
 
@@ -16,6 +17,7 @@ use serde::Serialize;
 pub use self::{
     compared::{Compared, DIFFERENCE_MAX, ORACLE_PIXELS},
     generated::scene,
+    skips::SkipTimes,
 };
 use self::{
     compared::{compare, compare_oracle},
@@ -63,6 +65,8 @@ pub struct BenchArgs {
     pub labels: Option<BenchLabels>,
     /// Rows of the bank (M): indices that occur in the scene.
     pub bank: u16,
+    /// Whether to time frames without each of [`Skip::ALL`] as well.
+    pub skips: bool,
 }
 
 /// What a picture is compared with.
@@ -119,6 +123,8 @@ pub struct BenchReport {
     pub compared: Option<Compared>,
     /// Times of labels, where they were asked for.
     pub labels: Option<LabelTimes>,
+    /// What each skip saves, where it was asked for.
+    pub skips: Vec<SkipTimes>,
 }
 
 /// What many callers of one scene get.
@@ -173,15 +179,11 @@ pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
         )));
     }
     let (gaussians, camera) = scene(args)?;
+    let kinds = if args.compare.is_some() { Kinds::ALL } else { Kinds::COLOR };
     let request = RenderRequest {
-        camera,
-        kinds: if args.compare.is_some() { Kinds::ALL } else { Kinds::COLOR },
-        labels: Labels::None,
         background: [0.1, 0.2, 0.3],
-        antialiased: false,
-        near: 0.05,
         quality: args.quality,
-        crop: None,
+        ..RenderRequest::plain(camera, kinds, 0.05)
     };
     let begun = Instant::now();
     let options = GpuOptions {
@@ -238,6 +240,7 @@ pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
         callers,
         compared,
         labels,
+        skips: if args.skips { skips::run(&gaussians, &request, args, config)? } else { vec![] },
     })
 }
 
@@ -400,6 +403,7 @@ mod tests {
             shaders: None,
             dump: None,
             checked: false,
+            skips: false,
             frames: 1,
             quality: Quality::Exact,
             compare: Some(Reference::Cpu),
@@ -423,16 +427,7 @@ mod tests {
         assert!(compared.psnr_db.is_some_and(|db| db > 100.0), "{compared:?}");
 
         let (gaussians, camera) = scene(&args).expect("a scene");
-        let request = RenderRequest {
-            camera,
-            kinds: Kinds::ALL,
-            labels: Labels::None,
-            background: [0.0; 3],
-            antialiased: false,
-            near: 0.05,
-            quality: Quality::Exact,
-            crop: None,
-        };
+        let request = RenderRequest::plain(camera, Kinds::ALL, 0.05);
         let want = CpuRenderer::new(1)
             .and_then(|cpu| cpu.render(&gaussians, &request))
             .expect("a picture");

@@ -14,6 +14,9 @@ struct Extent {
     bottom: i32,
 }
 
+// Without it all tiles of the box around a footprint are touched.
+override SKIP_ELLIPSE_TILES: bool = true;
+
 // Pixels under this magnitude fit i32 and f32 alike.
 const PIXEL_BOUND: f32 = 16777216.0;
 
@@ -45,8 +48,12 @@ fn tile_span(footprint: Footprint, extent: Extent, tile_y: i32) -> vec2<u32> {
     let size = i32(TILE_SIZE);
     let row_low = f32(max(tile_y * size, extent.top)) + 0.5 - footprint.mean.y;
     let row_high = f32(min(tile_y * size + size - 1, extent.bottom)) + 0.5 - footprint.mean.y;
-    let low = clamp(row_low, -extent.tall, extent.tall);
-    let high = clamp(row_high, -extent.tall, extent.tall);
+    var low = -extent.tall;
+    var high = extent.tall;
+    if SKIP_ELLIPSE_TILES {
+        low = clamp(row_low, low, high);
+        high = clamp(row_high, -extent.tall, extent.tall);
+    }
     let peak = footprint.slope * extent.tall * (extent.tall / extent.wide);
     let at_right = clamp(peak, low, high);
     let at_left = clamp(-peak, low, high);

@@ -7,7 +7,10 @@ use serde::Serialize;
 use super::generated::Random;
 use crate::{
     error::Result,
-    render::{Frame, RenderRequest, oracle},
+    render::{
+        Frame, RenderRequest,
+        oracle::{self, OraclePixel},
+    },
     scene::Gaussians,
 };
 
@@ -33,12 +36,14 @@ pub struct Compared {
     pub flips: usize,
     /// Pixels apart by more than 1/255 elsewhere: faults.
     pub faults: usize,
+    /// The worst of them: column, row and difference.
+    pub fault: Option<(u32, u32, f32)>,
     /// Median frame of the CPU renderer, for scale.
     pub cpu_median_ms: f64,
 }
 
 /// Largest difference of each pixel over its channels; a NaN is infinitely far.
-fn differences(got: &Frame, want: &Frame) -> Vec<f32> {
+pub(super) fn differences(got: &Frame, want: &Frame) -> Vec<f32> {
     fn pair<'a, T>(
         got: Option<&'a Vec<T>>,
         want: Option<&'a Vec<T>>,
@@ -102,13 +107,9 @@ pub(super) fn compare(
     let pixels: Vec<[u32; 2]> =
         far.iter().map(|&i| [i as u32 % want.width, i as u32 / want.width]).collect();
     let truth = oracle::render_pixels(gaussians, request, oracle::DepthKey::F32, &pixels)?;
-    let flips = truth.iter().filter(|pixel| pixel.cliff.any()).count();
-    Ok(Compared {
-        flips,
-        faults: far.len() - flips,
-        psnr_db: psnr_db(got, want),
-        ..Compared::of(&apart)
-    })
+    let far = far.into_iter().zip(&pixels).zip(&truth);
+    let far = far.map(|((i, &place), truth)| (i, place, truth));
+    Ok(Compared::of(&apart, psnr_db(got, want), far))
 }
 
 /// The difference to the oracle, at places drawn by lot.
@@ -148,25 +149,37 @@ pub(super) fn compare_oracle(
     };
     let apart = differences(&part, &want);
     let far = (0..apart.len()).filter(|&i| apart[i] > DIFFERENCE_MAX);
-    let (flips, faults): (Vec<_>, Vec<_>) = far.partition(|&i| truth[i].cliff.any());
-    Ok(Compared {
-        flips: flips.len(),
-        faults: faults.len(),
-        psnr_db: psnr_db(&part, &want),
-        ..Compared::of(&apart)
-    })
+    let far = far.map(|i| (i, pixels[i], &truth[i]));
+    Ok(Compared::of(&apart, psnr_db(&part, &want), far))
 }
 
 impl Compared {
-    /// Of differences a pixel, which cliffs nobody has looked for in.
-    fn of(apart: &[f32]) -> Self {
+    /// Of differences a pixel; `far` are those over the bound, with their places and what the
+    /// oracle sees there.
+    fn of<'a>(
+        apart: &[f32],
+        psnr_db: Option<f64>,
+        far: impl Iterator<Item = (usize, [u32; 2], &'a OraclePixel)>,
+    ) -> Self {
         let near = apart.iter().copied().filter(|&d| d <= DIFFERENCE_MAX);
-        Self {
+        let mut compared = Self {
             pixels: apart.len(),
             max: near.fold(0.0, f32::max),
             mean: apart.iter().map(|&d| f64::from(d)).sum::<f64>() / apart.len().max(1) as f64,
             worst: apart.iter().copied().fold(0.0, f32::max),
+            psnr_db,
             ..Self::default()
+        };
+        for (i, [x, y], truth) in far {
+            if truth.cliff.any() {
+                compared.flips += 1;
+                continue;
+            }
+            compared.faults += 1;
+            if compared.fault.is_none_or(|(.., worst)| apart[i] > worst) {
+                compared.fault = Some((x, y, apart[i]));
+            }
         }
+        compared
     }
 }

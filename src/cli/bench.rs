@@ -13,12 +13,14 @@ use serde_json::json;
 
 use super::{engine, output::Output};
 use crate::{
-    bench::{self, BenchArgs, BenchLabels, CallerTimes, LabelTimes, Reference},
+    bench::{
+        self, BenchArgs, BenchLabels, CallerTimes, Compared, LabelTimes, Reference, SkipTimes,
+    },
     config::{Config, ConfigArgs},
     error::{Error, Result},
     jobs::{PipelineMaker, SceneMaker, Work},
     pipeline::Engine,
-    render::{DeviceTimes, Kinds, Labels, Quality, RenderRequest},
+    render::{DeviceTimes, Kinds, Quality, RenderRequest},
     sample::{self, SampleOptions},
     scene::SceneOptions,
     service::default_near,
@@ -71,6 +73,9 @@ pub(super) struct Args {
     /// With --labels: entries of the semantic bank that the scene has
     #[arg(long, default_value_t = 24)]
     bank: u16,
+    /// With --gaussians: what each thing that is left out saves, and that no pixel changes
+    #[arg(long)]
+    skips: bool,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
 }
@@ -125,6 +130,7 @@ fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Resul
         compare,
         labels,
         bank: args.bank,
+        skips: args.skips,
     };
     let report = bench::run(&wanted, config)?;
     let mut text = String::new();
@@ -170,6 +176,7 @@ fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Resul
             found.worst,
             found.psnr_db.unwrap_or(f64::INFINITY)
         );
+        fault(&mut text, found);
     }
     if let Some(times) = &report.labels {
         let LabelTimes { labels, bank, color_ms, labels_ms, both_ms, ratio, entries, .. } = times;
@@ -192,9 +199,26 @@ fn frames(args: &Args, gaussians: usize, config: &Config, out: &Output) -> Resul
                  cliff, {} faults",
                 found.max, found.mean, found.flips, found.pixels, found.faults
             );
+            fault(&mut text, found);
         }
     }
+    for times in &report.skips {
+        let SkipTimes { skip, scene, clock, with_ms, without_ms, apart, max } = times;
+        let _ = writeln!(
+            text,
+            "{:<13} {scene:<7} {with_ms:.3} ms, without it {without_ms:.3} ms ({:.2}x, {clock}); \
+             {apart} px apart, at most {max:.1e}",
+            skip.name(),
+            without_ms / with_ms
+        );
+    }
     out.answer(&text, &report)
+}
+
+fn fault(text: &mut String, found: &Compared) {
+    if let Some((x, y, apart)) = found.fault {
+        let _ = writeln!(text, "  the worst fault: column {x}, row {y}, {apart:.2e} off");
+    }
 }
 
 fn device(text: &mut String, name: &str, times: &DeviceTimes) {
@@ -231,16 +255,8 @@ fn stages(args: &Args, config: &Config, out: &Output) -> Result<()> {
         all.extend(made.report.stages.iter().map(|s| (format!("scene: {}", s.stage), s.ms)));
         let camera =
             made.cameras.first().ok_or_else(|| Error::internal("a scene has no camera"))?;
-        let request = RenderRequest {
-            camera: camera.camera,
-            kinds: Kinds::COLOR,
-            labels: Labels::None,
-            background: [0.0; 3],
-            antialiased: false,
-            near: default_near(made.report.median_depth),
-            quality: Quality::Exact,
-            crop: None,
-        };
+        let near = default_near(made.report.median_depth);
+        let request = RenderRequest::plain(camera.camera, Kinds::COLOR, near);
         let begun = Instant::now();
         renderer.render(&made.gaussians, &request)?;
         all.push(("view: first".to_owned(), ms(begun)));

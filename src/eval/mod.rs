@@ -32,7 +32,7 @@ use crate::{
     models::fit,
     photos,
     pipeline::{Engine, Reconstruction, reconstruct},
-    render::{Kinds, Labels, Quality, RenderRequest, Renderer, compose, cpu::CpuRenderer},
+    render::{Kinds, RenderRequest, Renderer, compose, cpu::CpuRenderer},
     scene::{Camera, Photo, PosedPhoto, Provenance, Scene, SceneId, SceneMeta, SceneOptions},
 };
 
@@ -209,16 +209,7 @@ fn judge(
 fn view_request(camera: Camera, median_depth: f64) -> RenderRequest {
     #[expect(clippy::cast_possible_truncation, reason = "a near plane needs no f64")]
     let near = (median_depth * NEAR_SHARE).max(1e-6) as f32;
-    RenderRequest {
-        camera,
-        kinds: Kinds { color: true, depth: false, alpha: false },
-        labels: Labels::None,
-        background: [0.0; 3],
-        antialiased: false,
-        near,
-        quality: Quality::Exact,
-        crop: None,
-    }
+    RenderRequest::plain(camera, Kinds::COLOR, near)
 }
 
 /// A scene of a reconstruction that nobody stores.

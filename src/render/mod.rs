@@ -10,6 +10,7 @@ pub mod gpu;
 pub mod labels;
 pub mod oracle;
 pub mod select;
+pub mod skip;
 pub mod view;
 
 pub use self::labels::{Entries, Labels};
@@ -86,6 +87,22 @@ pub struct RenderRequest {
 }
 
 impl RenderRequest {
+    /// A view as a caller gets it who asks for nothing in particular: the whole picture, exact,
+    /// over black, without labels.
+    #[must_use]
+    pub fn plain(camera: Camera, kinds: Kinds, near: f32) -> Self {
+        Self {
+            camera,
+            crop: None,
+            kinds,
+            labels: Labels::None,
+            background: [0.0; 3],
+            antialiased: false,
+            near,
+            quality: Quality::Exact,
+        }
+    }
+
     /// Intrinsics of the picture that comes out: those of the part, where one is asked for.
     #[must_use]
     pub fn lens(&self) -> Intrinsics {

@@ -45,7 +45,8 @@ pub fn select(config: &Config) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)
     select_with(config, GpuOptions::default())
 }
 
-/// As [`select`], with options for the GPU renderer; the adapter is the configured one.
+/// As [`select`], with options for the GPU renderer (`without` goes to the CPU's as well); the
+/// adapter is the configured one.
 ///
 /// # Errors
 /// As [`select`].
@@ -53,7 +54,7 @@ pub fn select_with(
     config: &Config,
     options: GpuOptions,
 ) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
-    let cpu = CpuRenderer::new(config.threads)?;
+    let cpu = CpuRenderer::new(config.threads)?.without(options.without);
     if config.renderer == RendererChoice::Cpu {
         tracing::info!(renderer = "cpu", "renderer chosen as configured");
         return Ok((Arc::new(cpu), Vec::new()));

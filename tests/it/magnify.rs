@@ -1,7 +1,7 @@
 //! Views larger than the network's own pictures: no dot grid, and no change at its own size.
 
 use segsplat::{
-    render::{Kinds, Labels, Quality, RenderRequest, Renderer, constants, cpu::CpuRenderer},
+    render::{Kinds, RenderRequest, Renderer, constants, cpu::CpuRenderer},
     scene::{
         Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, LEARNT_BLUR_PX2,
         Provenance, RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
@@ -60,16 +60,7 @@ fn wall() -> Scene {
 /// Smallest and largest alpha away from the picture's border.
 fn alpha_range(gaussians: &Gaussians, camera: Camera) -> [f32; 2] {
     let kinds = Kinds { color: false, depth: false, alpha: true };
-    let request = RenderRequest {
-        camera,
-        kinds,
-        labels: Labels::None,
-        background: [0.0; 3],
-        antialiased: false,
-        near: 0.01,
-        quality: Quality::Exact,
-        crop: None,
-    };
+    let request = RenderRequest::plain(camera, kinds, 0.01);
     let frame = CpuRenderer::new(1).and_then(|cpu| cpu.render(gaussians, &request));
     let frame = frame.expect("a wall renders");
     let (width, alpha) = (frame.width as usize, frame.alpha.expect("alpha was asked for"));

@@ -46,6 +46,7 @@ mod replicas;
 mod sample;
 mod segment;
 mod shader_layout;
+mod skips;
 mod store;
 mod telemetry;
 mod texts;

@@ -7,7 +7,7 @@ use segsplat::{
     error::ErrorCode,
     eval::psnr,
     pipeline::{self, Engine, Reconstruction},
-    render::{Kinds, Labels, Quality, RenderRequest, Renderer, cpu::CpuRenderer},
+    render::{Kinds, RenderRequest, Renderer, cpu::CpuRenderer},
     sample::{self, Room, SampleOptions},
     scene::{Density, SceneOptions},
 };
@@ -41,16 +41,8 @@ fn reconstruct(engine: &Engine, options: &SceneOptions) -> Reconstruction {
 
 /// The view half-way between the photos.
 fn request(made: &Reconstruction, kinds: Kinds) -> RenderRequest {
-    RenderRequest {
-        camera: sample::camera_at(&SAMPLE, 0.0).unwrap(),
-        kinds,
-        labels: Labels::None,
-        background: [0.0; 3],
-        antialiased: false,
-        near: 0.01 * made.report.median_depth as f32,
-        quality: Quality::Exact,
-        crop: None,
-    }
+    let near = 0.01 * made.report.median_depth as f32;
+    RenderRequest::plain(sample::camera_at(&SAMPLE, 0.0).unwrap(), kinds, near)
 }
 
 #[test]

@@ -80,7 +80,7 @@ fn view_of(gaussians: &Gaussians, request: &RenderRequest) -> View {
 }
 
 fn whole(view: &View) -> Grid {
-    Grid { width: view.width, height: view.height, tile_rows: 0..view.tiles_y() }
+    Grid::whole(view, None)
 }
 
 /// The CPU's footprints and tile counts.

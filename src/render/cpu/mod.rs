@@ -34,6 +34,7 @@ use super::{
     Entries, Frame, FrameStats, Labels, RenderRequest, Renderer,
     constants::{ISECTS_MAX, TILE_SIZE},
     labels::EntryRows,
+    skip::Skip,
     view::View,
 };
 use crate::{
@@ -53,6 +54,8 @@ pub struct CpuRenderer {
     tiles: Pool<TileScratch>,
     isects_max: u64,
     width: Width,
+    /// What is not left out.
+    without: Option<Skip>,
 }
 
 impl CpuRenderer {
@@ -79,6 +82,7 @@ impl CpuRenderer {
             tiles: Pool::default(),
             isects_max: ISECTS_MAX,
             width: Width::widest(),
+            without: None,
         })
     }
 
@@ -86,6 +90,13 @@ impl CpuRenderer {
     #[must_use]
     pub fn with_width(mut self, width: Width) -> Self {
         self.width = width;
+        self
+    }
+
+    /// The same renderer, one kind of needless work not left out, for tests and benchmarks.
+    #[must_use]
+    pub fn without(mut self, without: Option<Skip>) -> Self {
+        self.without = without;
         self
     }
 
@@ -101,21 +112,24 @@ impl CpuRenderer {
         let mut frame = blank(&view, request);
         let mut scratch = self.frames.take();
         let FrameScratch { projected, sorted, spare, .. } = &mut scratch;
-        let how = Projection { antialiased: request.antialiased, width: self.width };
+        let (width, without) = (self.width, self.without);
+        let how = Projection { antialiased: request.antialiased, width, without };
         project::project(gaussians, &view, how, projected);
-        let visible = (0_u32..).zip(&projected.tiles_per_gauss).filter(|&(_, &tiles)| tiles > 0);
+        let all = without == Some(Skip::Unseen);
+        let kept = |&(_, &tiles): &(u32, &u32)| tiles > 0 || all;
+        let kept = (0_u32..).zip(&projected.tiles_per_gauss).filter(kept);
         sorted.clear();
         // t.z is over 0, so its bits are in the order of its value.
-        sorted.extend(
-            visible.map(|(i, _)| pack(projected.footprints[i as usize].depth.to_bits(), i)),
-        );
+        sorted.extend(kept.map(|(i, _)| pack(projected.footprints[i as usize].depth.to_bits(), i)));
         radix_sort::radix_sort(sorted, spare, u32::BITS);
         if request.kinds.color {
             shade::shade(gaussians, &view, projected);
         }
-        frame.stats.visible = sorted.len() as u64;
-        let grid = Grid { width: view.width, height: view.height, tile_rows: 0..view.tiles_y() };
-        let paint = Paint::new(request, gaussians.semantic_index()).with_width(self.width);
+        let visible = projected.tiles_per_gauss.iter().filter(|&&tiles| tiles > 0);
+        frame.stats.visible = visible.count() as u64;
+        let grid = Grid::whole(&view, without);
+        let paint = Paint::new(request, gaussians.semantic_index());
+        let paint = paint.with_width(width).without(without);
         let mut band = Band { paint, entries: Vec::new() };
         self.draw_band(&grid, &mut band, &mut scratch, &mut frame)?;
         if request.labels == Labels::Entries {

@@ -1,7 +1,7 @@
-//! What a frame asks of the blend: the channels of a Gaussian, and the width of the kernels.
+//! What a frame asks of the blend: the channels of a Gaussian, and how the kernels work.
 
 use super::{lanes::Width, project::Footprint};
-use crate::render::{Kinds, Labels, RenderRequest, labels::BLEND_WIDTH};
+use crate::render::{Kinds, Labels, RenderRequest, labels::BLEND_WIDTH, skip::Skip};
 
 /// Most channels: colour, depth, labels.
 pub(super) const CHANNELS: usize = 3 + 1 + BLEND_WIDTH;
@@ -19,6 +19,8 @@ pub struct Paint<'a> {
     pub(super) index: &'a [u16],
     /// Lanes of the kernel.
     pub(super) width: Width,
+    /// What is not left out.
+    pub(super) without: Option<Skip>,
 }
 
 impl<'a> Paint<'a> {
@@ -26,13 +28,20 @@ impl<'a> Paint<'a> {
     #[must_use]
     pub fn new(request: &'a RenderRequest, index: &'a [u16]) -> Self {
         let RenderRequest { kinds, background, labels, .. } = request;
-        Self { kinds: *kinds, background: *background, labels, index, width: Width::widest() }
+        let (kinds, background, width) = (*kinds, *background, Width::widest());
+        Self { kinds, background, labels, index, width, without: None }
     }
 
     /// The same with kernels of another width.
     #[must_use]
     pub fn with_width(self, width: Width) -> Self {
         Self { width, ..self }
+    }
+
+    /// The same, one kind of needless work not left out.
+    #[must_use]
+    pub fn without(self, without: Option<Skip>) -> Self {
+        Self { without, ..self }
     }
 
     /// Labels wanted.

@@ -12,6 +12,7 @@ use super::{
 use crate::{
     render::{
         constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK},
+        skip::Skip,
         view::View,
     },
     scene::Gaussians,
@@ -76,13 +77,15 @@ pub struct Projection {
     pub antialiased: bool,
     /// Lanes of the kernel.
     pub width: Width,
+    /// What is not left out.
+    pub without: Option<Skip>,
 }
 
 impl Projection {
     /// All that saves time, as wide as the processor can.
     #[must_use]
     pub fn new(antialiased: bool) -> Self {
-        Self { antialiased, width: Width::widest() }
+        Self { antialiased, width: Width::widest(), without: None }
     }
 }
 
@@ -118,12 +121,16 @@ impl Kernel for Chunk<'_> {
     #[inline(always)]
     fn run<S: Lanes>(self, simd: S) {
         let Self { view, how, .. } = self;
-        let grid = Grid { width: view.width, height: view.height, tile_rows: 0..view.tiles_y() };
+        let grid = Grid::whole(view, how.without);
         let out = self.footprints.chunks_mut(BLOCK).zip(self.spans.chunks_mut(BLOCK));
         let out = out.zip(self.tiles.chunks_mut(BLOCK)).enumerate();
         let (mut block, mut ellipses) = (Block::default(), Ellipses::default());
         for (at, ((footprints, spans), tiles)) in out {
             tiles.fill(0);
+            if how.without == Some(Skip::Unseen) {
+                // Theirs are looked at too.
+                spans.fill(TileSpans::default());
+            }
             let first = self.first + at * BLOCK;
             block.load(self.gaussians, first, footprints.len());
             if !block.project(simd, view, how.antialiased) {

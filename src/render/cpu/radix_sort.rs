@@ -37,19 +37,16 @@ pub fn radix_sort(pairs: &mut Vec<u64>, spare: &mut Vec<u64>, key_bits: u32) {
         for &pair in pairs.iter() {
             next[digit(pair)] += 1;
         }
-        // A digit that all pairs share orders nothing.
-        if next.iter().all(|&count| count != pairs.len()) {
-            let mut start = 0;
-            for slot in &mut next {
-                start += std::mem::replace(slot, start);
-            }
-            for &pair in pairs.iter() {
-                let slot = &mut next[digit(pair)];
-                spare[*slot] = pair;
-                *slot += 1;
-            }
-            std::mem::swap(pairs, spare);
+        let mut start = 0;
+        for slot in &mut next {
+            start += std::mem::replace(slot, start);
         }
+        for &pair in pairs.iter() {
+            let slot = &mut next[digit(pair)];
+            spare[*slot] = pair;
+            *slot += 1;
+        }
+        std::mem::swap(pairs, spare);
         shift += DIGIT_BITS;
     }
 }

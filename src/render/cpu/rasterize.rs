@@ -20,6 +20,7 @@ use crate::render::{
     Labels,
     constants::{ALPHA_MAX, ALPHA_MIN, BATCH_SIZE, TILE_SIZE, TRANSMITTANCE_MIN},
     labels::{BLEND_WIDTH, EntryRows},
+    skip::Skip,
 };
 
 const SIDE: usize = TILE_SIZE as usize;
@@ -225,7 +226,7 @@ pub fn rasterize_tile(
     scratch: &mut TileScratch,
     out: &mut RowOut<'_>,
 ) {
-    if isects.is_empty() {
+    if isects.is_empty() && paint.without != Some(Skip::EmptyTiles) {
         return store_empty(tile, paint, picture_width, out);
     }
     if *paint.labels == Labels::Entries {
@@ -279,6 +280,8 @@ fn blend<S: Lanes, const K: usize, const ENTRIES: bool>(
     work: Work<'_>,
     scratch: &mut TileScratch,
 ) {
+    let by_parts = work.paint.without != Some(Skip::EllipseParts);
+    let ends = work.paint.without != Some(Skip::EndedRays);
     let mut open = clear(&mut scratch.cells, work.tile);
     for batch in work.isects.chunks(BATCH_SIZE) {
         // Footprints lie far apart in memory: they are fetched in a loop so short that the
@@ -301,7 +304,7 @@ fn blend<S: Lanes, const K: usize, const ENTRIES: bool>(
         for (group, marks) in groups {
             let mut met_by = [0_u16; GROUP];
             for (bits, gaussian) in met_by.iter_mut().zip(group) {
-                *bits = met(simd, gaussian);
+                *bits = if by_parts { met(simd, gaussian) } else { u16::MAX };
             }
             *marks = turned_over(&met_by);
         }
@@ -314,10 +317,11 @@ fn blend<S: Lanes, const K: usize, const ENTRIES: bool>(
             let (cell, sums) = (&mut scratch.cells[at], scratch.bins.of_cell(at));
             let mut goes_on = false;
             for i in 0..PIXELS / S::F32_LANES {
+                let staged = &scratch.staged;
                 goes_on |=
-                    blend_cell::<S, K, ENTRIES>(simd, at, i, cell, &scratch.staged, marks, sums);
+                    blend_cell::<S, K, ENTRIES>(simd, (at, i), ends, cell, staged, marks, sums);
             }
-            if !goes_on {
+            if ends && !goes_on {
                 open &= !(1 << at);
             }
         }
@@ -433,12 +437,12 @@ fn along_axes<S: Lanes>(simd: S, gaussian: &Staged, x: S::f32s, y: S::f32s) -> (
 }
 
 /// Blends what marked cell `at` into vector `i` of it: K channels, and their bins; whether some
-/// ray goes on.
+/// ray goes on. It stops where none does if `ends`.
 #[inline(always)]
 fn blend_cell<S: Lanes, const K: usize, const ENTRIES: bool>(
     simd: S,
-    at: usize,
-    i: usize,
+    (at, i): (usize, usize),
+    ends: bool,
     cell: &mut Cell,
     staged: &[Staged],
     marks: &[[u64; CELLS]],
@@ -478,7 +482,7 @@ fn blend_cell<S: Lanes, const K: usize, const ENTRIES: bool>(
             if ENTRIES && let Some(sum) = sums.get_mut(gaussian.bin as usize) {
                 sum.put(simd, i, simd.add_f32s(sum.at(simd, i), weight));
             }
-            if simd.bits(lives) == 0 {
+            if simd.bits(lives) == 0 && ends {
                 goes_on = false;
                 break 'all;
             }

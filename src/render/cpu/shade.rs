@@ -39,11 +39,7 @@ pub fn shade(gaussians: &Gaussians, view: &View, projected: &mut Projected) {
 /// Colour of harmonics `sh` (`[K, 3]`, 3DGS basis and order) seen along `toward` (any length).
 #[must_use]
 pub fn color(sh: &[[f32; 3]], toward: DVec3) -> [f32; 3] {
-    // Degree 0 is the same from everywhere.
-    let basis = match sh.len() {
-        1 => basis([0.0; 3]),
-        _ => basis(toward.normalize_or_zero().as_vec3().into()),
-    };
+    let basis = basis(toward.normalize_or_zero().as_vec3().into());
     let mut color = [SH_OFFSET; 3];
     for (coefficient, weight) in sh.iter().zip(basis) {
         for channel in 0..3 {

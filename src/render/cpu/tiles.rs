@@ -7,7 +7,7 @@ use super::{
     lanes::{Lanes, Row, Wide},
     project::Footprint,
 };
-use crate::render::constants::TILE_SIZE;
+use crate::render::{constants::TILE_SIZE, skip::Skip, view::View};
 
 /// Places beyond this are all as far, pixels: pictures are smaller, and whole numbers of this size
 /// are exact.
@@ -22,9 +22,23 @@ pub struct Grid {
     pub height: u32,
     /// Rows of tiles in question.
     pub tile_rows: Range<u32>,
+    /// Whether a footprint touches the tiles that its ellipse meets, or all that the box around it
+    /// does: [`Skip::EllipseTiles`].
+    pub by_ellipse: bool,
 }
 
 impl Grid {
+    /// All tiles of a picture.
+    #[must_use]
+    pub fn whole(view: &View, without: Option<Skip>) -> Self {
+        Self {
+            width: view.width,
+            height: view.height,
+            tile_rows: 0..view.tiles_y(),
+            by_ellipse: without != Some(Skip::EllipseTiles),
+        }
+    }
+
     /// Tiles in a row of tiles.
     #[must_use]
     pub fn tiles_x(&self) -> u32 {
@@ -158,6 +172,7 @@ impl Ellipses {
                 let corner = tile_y * tile;
                 let low = (corner.max(top) + half - mean_y) * per_tall;
                 let high = ((corner + tile - one).min(bottom) + half - mean_y) * per_tall;
+                let (low, high) = if grid.by_ellipse { (low, high) } else { (zero - one, one) };
                 let at_right = peak.max(low).min(high);
                 let at_left = (zero - peak).max(low).min(high);
                 let half_width = |share: Wide<S>| (one - share * share).max(zero).sqrt() * across;
@@ -223,6 +238,7 @@ pub fn touched_tiles(footprint: &Footprint, grid: &Grid, mut touch: impl FnMut(u
         // The band of pixel centres, over `tall`.
         let low = ((tile_y * tile).max(top) as f64 + 0.5 - mean_y) * per_tall;
         let high = ((tile_y * tile + tile - 1).min(bottom) as f64 + 0.5 - mean_y) * per_tall;
+        let (low, high) = if grid.by_ellipse { (low, high) } else { (-1.0, 1.0) };
         let at_right = peak.max(low).min(high);
         let at_left = (-peak).max(low).min(high);
         let right = mean_x + lean * at_right + half_width(at_right);
@@ -293,7 +309,7 @@ mod tests {
 
     #[test]
     fn ellipses_in_lanes_touch_the_tiles_that_one_alone_touches() {
-        let grid = Grid { width: 203, height: 150, tile_rows: 0..10 };
+        let grid = Grid { width: 203, height: 150, tile_rows: 0..10, by_ellipse: true };
         let footprints: Vec<Footprint> = (0..4_000_u32)
             .map(|i| {
                 let turn = |k: u32| f64::from((i.wrapping_mul(2_654_435_761) >> k) & 0xff) / 255.0;
@@ -332,7 +348,7 @@ mod tests {
     /// near the ellipse.
     #[test]
     fn touched_tiles_hold_every_pixel_of_the_ellipse() {
-        let grid = Grid { width: 203, height: 150, tile_rows: 0..10 };
+        let grid = Grid { width: 203, height: 150, tile_rows: 0..10, by_ellipse: true };
         let mut touched_total = 0;
         for i in 0..2_000_u32 {
             let turn = |k: u32| f64::from((i.wrapping_mul(2_654_435_761) >> k) & 0xff) / 255.0;

@@ -400,7 +400,7 @@ impl Tools<'_> {
         let (gpu, scene) = (self.gpu, self.scene);
         let colored = drawings.iter().any(|drawing| drawing.kinds.color);
         let deep = drawings.iter().any(|drawing| drawing.kinds.depth);
-        let shades = colored && scene.sh_count != 1;
+        let shades = colored && !self.kernels.flat(scene.sh_count);
         let room = self.scratch.room(
             gpu,
             &Need {

@@ -24,7 +24,7 @@ use std::path::PathBuf;
 use self::station::{Engine, Station};
 use super::{
     DeviceTimes, Frame, RenderRequest, Renderer, constants::ISECTS_MAX, select::AdapterReport,
-    view::View,
+    skip::Skip, view::View,
 };
 use crate::{
     error::{ErrorCode, Result},
@@ -54,6 +54,8 @@ pub struct GpuOptions {
     /// Whether the kernels made for software adapters are used, where an invocation does what many
     /// share on a GPU; `None`: on those alone.
     pub serial: Option<bool>,
+    /// Needless work that is not left out, for tests and benchmarks.
+    pub without: Option<Skip>,
 }
 
 impl Default for GpuOptions {
@@ -68,6 +70,7 @@ impl Default for GpuOptions {
             shaders: None,
             checked: false,
             serial: None,
+            without: None,
         }
     }
 }

@@ -2,8 +2,11 @@
 
 use std::{borrow::Cow, path::Path, sync::OnceLock};
 
-use super::device::Gpu;
-use crate::error::{Error, Result};
+use super::{GpuOptions, device::Gpu};
+use crate::{
+    error::{Error, Result},
+    render::skip::Skip,
+};
 
 /// Invocations of a workgroup: WebGPU's portable floor, and the values of a radix digit.
 pub const WORKGROUP_SIZE: u32 = 256;
@@ -184,30 +187,27 @@ pub(super) struct Kernels {
     rasterize: [OnceLock<wgpu::ComputePipeline>; 3 * PICTURES],
     /// Whether they are those for a software adapter.
     pub(super) serial: bool,
+    /// Needless work that is not left out.
+    without: Option<Skip>,
 }
 
 impl Kernels {
-    /// Compiles every kernel, from the files in `folder` where one is named; for a software
-    /// adapter if `serial`.
+    /// Compiles every kernel as `options` say, for an adapter that is `software` or not.
     ///
     /// # Errors
     /// `internal` when the driver refuses one, `invalid_request` when a file cannot be read.
-    pub(super) fn compile(
-        gpu: &Gpu,
-        folder: Option<&Path>,
-        checked: bool,
-        serial: bool,
-    ) -> Result<Self> {
+    pub(super) fn compile(gpu: &Gpu, options: &GpuOptions, software: bool) -> Result<Self> {
+        let serial = options.serial.unwrap_or(software);
         let modules = SHADERS
             .iter()
             .map(|shader| {
-                let source = source_of(shader, folder)?;
+                let source = source_of(shader, options.shaders.as_deref())?;
                 gpu.scoped(shader.stem, || {
                     let described = wgpu::ShaderModuleDescriptor {
                         label: Some(shader.stem),
                         source: wgpu::ShaderSource::Wgsl(source),
                     };
-                    if checked {
+                    if options.checked {
                         return gpu.device.create_shader_module(described);
                     }
                     let checks = wgpu::ShaderRuntimeChecks::unchecked();
@@ -225,11 +225,18 @@ impl Kernels {
             .iter()
             .map(|&(name, module, entry)| {
                 let own = if serial && SERIAL.contains(&name) { "_serial" } else { "" };
-                pipeline(gpu, name, &modules[module], &format!("{entry}{own}"), &[])
+                let constants: Vec<_> = left_in(&SHADERS[module], options.without).collect();
+                pipeline(gpu, name, &modules[module], &format!("{entry}{own}"), &constants)
             })
             .collect::<Result<_>>()?;
         let rasterize = [const { OnceLock::new() }; 3 * PICTURES];
-        Ok(Self { modules, pipelines, rasterize, serial })
+        Ok(Self { modules, pipelines, rasterize, serial, without: options.without })
+    }
+
+    /// Whether rasterize takes colours out of the harmonics of a scene with `sh_count`, not from
+    /// shade.
+    pub(super) fn flat(&self, sh_count: u32) -> bool {
+        sh_count == 1 && self.without != Some(Skip::FlatColor)
     }
 
     /// The pipeline of a kernel.
@@ -243,17 +250,24 @@ impl Kernels {
         let labels = raster.labels as usize;
         let at = labels * PICTURES + usize::from(raster.color) * 2 + usize::from(raster.depth);
         if self.rasterize[at].get().is_none() {
-            let constants = [
+            let mut constants = vec![
                 ("WITH_COLOR", f64::from(u8::from(raster.color))),
                 ("WITH_DEPTH", f64::from(u8::from(raster.depth))),
                 ("PIXELS", PIXELS[usize::from(self.serial)]),
             ];
+            constants.extend(left_in(&SHADERS[RASTERIZE + labels], self.without));
             let module = &self.modules[RASTERIZE + labels];
             let made = pipeline(gpu, "rasterize", module, "main", &constants)?;
             return Ok(self.rasterize[at].get_or_init(|| made));
         }
         self.rasterize[at].get().ok_or_else(|| Error::internal("a kernel was made and is gone"))
     }
+}
+
+/// The constant that has a shader do the work `without` names, if it knows that work.
+fn left_in(shader: &Shader, without: Option<Skip>) -> impl Iterator<Item = (&'static str, f64)> {
+    let known = |name: &&str| shader.source.contains(&format!("override {name}: bool"));
+    without.map(Skip::constant).filter(known).map(|name| (name, 0.0)).into_iter()
 }
 
 fn pipeline(

@@ -231,10 +231,14 @@ impl Queue {
             Arc::ptr_eq(other, job) || (!led && job.joins(other))
         };
         let mut waiting = lock(&self.waiting);
-        // Each turn's share of the crowd.
-        let expected = waiting.crowd.div_ceil(TURNS).min(views_max);
         let until = Instant::now() + GATHER;
-        while waiting.jobs.iter().filter(|other| fits(other)).count() < expected {
+        loop {
+            // Each turn's share of the crowd, but no more than are not being drawn.
+            let share = waiting.crowd.div_ceil(TURNS).min(views_max);
+            let expected = share.min(waiting.crowd - waiting.drawn.len().min(waiting.crowd));
+            if waiting.jobs.iter().filter(|other| fits(other)).count() >= expected {
+                break;
+            }
             let Some(left) = until.checked_duration_since(Instant::now()) else { break };
             let woken = self.arrived.wait_timeout(waiting, left);
             waiting = woken.unwrap_or_else(PoisonError::into_inner).0;
@@ -261,26 +265,14 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{
-        render::{Labels, Quality},
-        scene::{Camera, CameraToWorld, Intrinsics},
-    };
+    use crate::scene::{Camera, CameraToWorld, Intrinsics};
 
     fn request(near: f32) -> RenderRequest {
         let camera_to_world =
             CameraToWorld::look_at(glam::DVec3::ZERO, glam::DVec3::Z, glam::DVec3::NEG_Y, "test")
                 .unwrap();
         let intrinsics = Intrinsics { fx: 9.0, fy: 9.0, cx: 4.0, cy: 4.0, width: 8, height: 8 };
-        RenderRequest {
-            camera: Camera { intrinsics, camera_to_world },
-            kinds: Kinds::COLOR,
-            labels: Labels::None,
-            background: [0.0; 3],
-            antialiased: false,
-            near,
-            quality: Quality::Exact,
-            crop: None,
-        }
+        RenderRequest::plain(Camera { intrinsics, camera_to_world }, Kinds::COLOR, near)
     }
 
     fn frame(job: &Job) -> Frame {

@@ -328,7 +328,8 @@ impl<'a> Recorder<'a> {
         tiles: [u32; 2],
     ) {
         let room = self.room;
-        let colors = if scene.sh_count == 1 { scene.sh } else { &room.colors };
+        let flat = self.kernels.flat(scene.sh_count);
+        let colors = if flat { scene.sh } else { &room.colors };
         let mut buffers = vec![
             (0, &room.views),
             (1, &room.footprints),

@@ -123,9 +123,7 @@ impl Station {
 
     fn open_device(&self) -> Result<Opened> {
         let gpu = Gpu::open(&self.adapter, self.options.portable)?;
-        let options = &self.options;
-        let serial = options.serial.unwrap_or(self.report.software);
-        let kernels = Kernels::compile(&gpu, options.shaders.as_deref(), options.checked, serial)?;
+        let kernels = Kernels::compile(&gpu, &self.options, self.report.software)?;
         let scenes = SceneCache::new(self.options.scene_bytes_max);
         Ok(Opened { gpu, kernels: Arc::new(kernels), scenes: Arc::new(Mutex::new(scenes)) })
     }

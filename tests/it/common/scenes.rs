@@ -3,7 +3,7 @@
 
 use glam::{DVec3, Quat, Vec3};
 use segsplat::{
-    render::{Kinds, Labels, Quality, RenderRequest},
+    render::{Kinds, RenderRequest},
     scene::{Camera, CameraToWorld, Gaussians, Intrinsics, RawGaussians, SourcePixel},
 };
 
@@ -77,16 +77,7 @@ pub(crate) fn look(eye: DVec3, target: DVec3) -> CameraToWorld {
 
 /// A request for everything.
 pub(crate) fn request(camera: Camera) -> RenderRequest {
-    RenderRequest {
-        camera,
-        kinds: Kinds::ALL,
-        labels: Labels::None,
-        background: [0.1, 0.2, 0.3],
-        antialiased: false,
-        near: 0.05,
-        quality: Quality::Exact,
-        crop: None,
-    }
+    RenderRequest { background: [0.1, 0.2, 0.3], ..RenderRequest::plain(camera, Kinds::ALL, 0.05) }
 }
 
 /// What two photos of `side` x `side` pixels give: a Gaussian a pixel on a smooth surface with
