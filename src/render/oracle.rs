@@ -48,6 +48,9 @@ pub struct Cliff {
     pub transmittance: bool,
     /// Two neighbouring contributions have depths that f32 arithmetic may swap.
     pub depth: bool,
+    /// A contribution's alpha would pass 1/255 if its centre moved by what f32 leaves of a place
+    /// on the picture.
+    pub place: bool,
 }
 
 impl Cliff {
@@ -57,10 +60,10 @@ impl Cliff {
         self.alpha || self.transmittance
     }
 
-    /// Whether a renderer with depths of its own may differ here.
+    /// Whether a renderer with depths and places of its own, in f32, may differ here.
     #[must_use]
     pub fn any(self) -> bool {
-        self.alpha || self.transmittance || self.depth
+        self.alpha || self.transmittance || self.depth || self.place
     }
 }
 
@@ -201,6 +204,12 @@ impl Splat {
         let power = 0.5 * d.dot(self.conic * d);
         (self.opacity * (-power).exp()).min(f64::from(ALPHA_MAX))
     }
+
+    /// By which share alpha at a place changes where the centre moves by f32's rounding of it.
+    fn unsteadiness(&self, at: DVec2) -> f64 {
+        let rounding = f64::from(f32::EPSILON) * at.abs().max_element();
+        (self.conic * (at - self.mean)).length() * rounding
+    }
 }
 
 fn splat(
@@ -308,7 +317,9 @@ fn pixel(near: &[&Splat], center: DVec2, request: &RenderRequest) -> OraclePixel
     let mut last_depth = f64::NEG_INFINITY;
     for splat in near {
         let alpha = splat.alpha(center);
-        cliff.alpha |= (alpha / alpha_min - 1.0).abs() < CLIFF_ALPHA;
+        let from_cliff = (alpha / alpha_min - 1.0).abs();
+        cliff.alpha |= from_cliff < CLIFF_ALPHA;
+        cliff.place |= from_cliff < CLIFF_ALPHA + splat.unsteadiness(center);
         if alpha < alpha_min {
             continue;
         }

@@ -54,4 +54,5 @@ mod tidy;
 mod tls;
 mod twins;
 mod understand;
+mod views;
 mod widths;

@@ -1,7 +1,7 @@
 //! The CPU renderer against the f64 oracle: strict inside, flips counted at cliffs.
 
 use segsplat::{
-    render::{RenderRequest, Renderer, cpu::CpuRenderer, oracle},
+    render::{RenderRequest, Renderer, constants, cpu::CpuRenderer, oracle},
     scene::{Gaussians, RawGaussians},
 };
 
@@ -38,6 +38,33 @@ fn two_photos_of_256_agree_on_every_pixel() {
     let (gaussians, camera) = two_views(256, 1);
     assert_eq!(gaussians.len(), 131_072, "a Gaussian a pixel of two photos");
     judge("two_views 256", &gaussians, &request(camera));
+}
+
+/// Far from the picture's corner f32 knows a Gaussian's place less well than f64 does: whether its
+/// alpha passes 1/255 is then no renderer's fault that keeps places in f32.
+#[test]
+fn a_place_that_f32_rounds_is_a_cliff_for_those_who_keep_it_in_f32() {
+    for (column, steady) in [(3, true), (1_203, false)] {
+        let mut camera = camera(1_206, 8);
+        (camera.intrinsics.fx, camera.intrinsics.fy) = (1e3, 1e3);
+        (camera.intrinsics.cx, camera.intrinsics.cy) = (0.0, 0.0);
+        // A footprint of 0.55 px, 1.8 px from the pixel: 0.00392 more than 1/255 by 2e-4.
+        let x = f64::from(column) + 0.5 + 1.8;
+        let mean = [(x / 1e3 * 4.0) as f32, 0.002, 4.0];
+        let placed = 1e3 * f64::from(mean[0]) / 4.0;
+        let dy = 0.5 - 1e3 * f64::from(mean[1]) / 4.0;
+        let d = placed - (f64::from(column) + 0.5);
+        let power = (d * d + dy * dy) / (2.0 * f64::from(constants::BLUR_PX2));
+        let opacity = (power.exp() / 255.0 * (1.0 + 2e-4)) as f32;
+        let mut raw = RawGaussians::default();
+        push(&mut raw, mean, [1.0, 0.0, 0.0, 0.0], [1e-7; 3], opacity, &[[0.5; 3]]);
+        let at = [[column, 0]];
+        let key = oracle::DepthKey::F32;
+        let seen = oracle::render_pixels(&checked(raw), &request(camera), key, &at);
+        let cliff = seen.expect("the truth")[0].cliff;
+        assert!(!cliff.same_order(), "column {column}: {cliff:?}");
+        assert_eq!(cliff.any(), !steady, "column {column}: {cliff:?}");
+    }
 }
 
 #[test]

@@ -1,0 +1,172 @@
+//! The committed list of scenes and views (views.csv) drawn by every renderer, against the f64
+//! oracle: errors of each are printed and held to the bounds of docs/conventions.md.
+//!
+//! The scenes come of the generators of this suite by the row's numbers: `cloud` of a degree,
+//! `pair` (a Gaussian a pixel of two photos of side `count`), `giants` and `specks` (clouds of
+//! scales times 12 and 0.02); `stretch` lengthens one axis of each Gaussian, `shift` moves scene
+//! and camera away from the origin, metres.
+
+use std::sync::OnceLock;
+
+use glam::DVec3;
+use segsplat::{
+    render::{
+        Frame, Quality, RenderRequest, Renderer,
+        cpu::CpuRenderer,
+        oracle::{self, OraclePixel},
+    },
+    scene::Gaussians,
+};
+
+use crate::{
+    common::{
+        compare::{Tolerance, compare, oracle_samples, samples},
+        scenes::{Random, camera, checked, cloud, look, request, two_views},
+    },
+    twins::{both_kernels, gpu},
+};
+
+/// Most pixels of a view that the oracle is asked for.
+const PIXELS_MAX: usize = 4096;
+/// What `fast` keeps to: docs/conventions.md.
+const FAST_PSNR_DB: f64 = 50.0;
+const FAST_FAR_SHARE: f64 = 0.01;
+
+/// A row of the list with its truth.
+struct View {
+    name: String,
+    gaussians: Gaussians,
+    request: RenderRequest,
+    /// Places of `truth`, row-major.
+    places: Vec<usize>,
+    truth: Vec<OraclePixel>,
+}
+
+impl View {
+    fn of(row: &str) -> Self {
+        let mut cells = row.split(',');
+        let name = cells.next().expect("a name").to_owned();
+        let kind = cells.next().expect("a scene");
+        let numbers: Vec<f64> = cells
+            .map(|cell| cell.parse().unwrap_or_else(|e| panic!("{name}: {cell}: {e}")))
+            .collect();
+        let [count, degree, seed, stretch, shift, width, height, focal, view @ ..] = &numbers[..]
+        else {
+            panic!("{name}: {} numbers", numbers.len())
+        };
+        let &[eye_x, eye_y, eye_z, to_x, to_y, to_z, smooth] = view else {
+            panic!("{name}: a view of {} numbers", view.len())
+        };
+        let (count, seed) = (*count as usize, *seed as u64);
+        let scales = match kind {
+            "giants" => 12.0,
+            "specks" => 0.02,
+            _ => 1.0,
+        };
+        let gaussians = match kind {
+            "pair" => two_views(count as u32, seed).0,
+            _ => cloud(count, *degree as u8, seed),
+        };
+        let mut raw = gaussians.as_raw().clone();
+        let away = DVec3::new(*shift, -0.5 * shift, 0.25 * shift);
+        raw.origin += away;
+        for scale in &mut raw.scales {
+            *scale = scale.map(|s| s * scales);
+            scale[0] *= *stretch as f32;
+        }
+        let mut camera = camera(*width as u32, *height as u32);
+        camera.intrinsics.fx *= focal;
+        camera.intrinsics.fy *= focal;
+        let eye = away + DVec3::new(eye_x, eye_y, eye_z);
+        camera.camera_to_world = look(eye, away + DVec3::new(to_x, to_y, to_z));
+        let request = RenderRequest { antialiased: smooth != 0.0, ..request(camera) };
+        let gaussians = checked(raw);
+        let all = camera.intrinsics.width as usize * camera.intrinsics.height as usize;
+        let mut random = Random(seed);
+        let mut places: Vec<usize> = match all <= PIXELS_MAX {
+            true => (0..all).collect(),
+            false => (0..PIXELS_MAX).map(|_| random.bits() as usize % all).collect(),
+        };
+        places.sort_unstable();
+        places.dedup();
+        let wide = camera.intrinsics.width;
+        let pixels: Vec<_> =
+            places.iter().map(|&at| [at as u32 % wide, at as u32 / wide]).collect();
+        let key = oracle::DepthKey::F32;
+        let truth = oracle::render_pixels(&gaussians, &request, key, &pixels).expect("the truth");
+        Self { name, gaussians, request, places, truth }
+    }
+}
+
+/// The list; the truth of it is computed once.
+fn views() -> &'static [View] {
+    static VIEWS: OnceLock<Vec<View>> = OnceLock::new();
+    VIEWS.get_or_init(|| {
+        let rows: Vec<_> = include_str!("views.csv").lines().skip(1).collect();
+        assert_eq!(rows.len(), 50, "rows of the list");
+        rows.into_iter().map(View::of).collect()
+    })
+}
+
+/// Draws the list and holds each view to `tolerance` where no cliff is, as `cliff` tells.
+fn judge(renderer: &dyn Renderer, tolerance: Tolerance, cliff: fn(&OraclePixel) -> bool) {
+    let (mut worst, mut flips, mut pixels) = (0.0_f64, 0, 0);
+    for view in views() {
+        let frame = renderer.render(&view.gaussians, &view.request).expect("a picture");
+        let all = samples(&frame);
+        let got: Vec<_> = view.places.iter().map(|&at| all[at]).collect();
+        let cliffs: Vec<_> = view.truth.iter().map(cliff).collect();
+        let found = compare(&got, &oracle_samples(&view.truth), &cliffs, tolerance)
+            .unwrap_or_else(|told| panic!("{}: {}: {told}", renderer.name(), view.name));
+        println!(
+            "{}: {} px, max {:.1e}, mean {:.1e}, {} flips",
+            view.name, found.pixels, found.max, found.mean, found.flips
+        );
+        worst = worst.max(found.max);
+        flips += found.flips;
+        pixels += found.pixels;
+    }
+    println!("{}: 50 views, {pixels} px, max {worst:.2e}, {flips} flips", renderer.name());
+}
+
+#[test]
+fn the_cpu_keeps_to_the_oracle() {
+    let cpu = CpuRenderer::new(2).expect("two threads");
+    judge(&cpu, Tolerance::ORACLE, |pixel| pixel.cliff.same_order());
+}
+
+#[test]
+fn a_gpu_keeps_to_the_oracle() {
+    for gpu in both_kernels() {
+        judge(gpu, Tolerance::GPU, |pixel| pixel.cliff.any());
+    }
+}
+
+/// PSNR of colour to the oracle, dB, and the share of pixels over two levels off.
+fn apart(frame: &Frame, view: &View) -> (f64, f64) {
+    let colors = frame.color.as_ref().expect("colour");
+    let (mut squares, mut far) = (0.0, 0);
+    for (&at, truth) in view.places.iter().zip(&view.truth) {
+        let d = [0, 1, 2].map(|k| f64::from(colors[at][k]) - truth.color[k].clamp(0.0, 1.0));
+        squares += d.iter().map(|d| d * d).sum::<f64>();
+        far += usize::from(d.iter().any(|d| d.abs() > 2.0 / 255.0));
+    }
+    let count = view.places.len() as f64;
+    (-10.0 * (squares / (3.0 * count)).log10(), far as f64 / count)
+}
+
+#[test]
+fn fast_keeps_its_bound() {
+    let Some(gpu) = gpu() else { return };
+    let (mut least, mut most) = (f64::INFINITY, 0.0_f64);
+    for view in views() {
+        let request = RenderRequest { quality: Quality::Fast, ..view.request.clone() };
+        let frame = gpu.render(&view.gaussians, &request).expect("a picture");
+        let (psnr, far) = apart(&frame, view);
+        println!("{}: {psnr:.1} dB, {:.2} % over two levels", view.name, 100.0 * far);
+        assert!(psnr >= FAST_PSNR_DB, "{}: {psnr:.1} dB", view.name);
+        assert!(far <= FAST_FAR_SHARE, "{}: {:.2} % over two levels", view.name, 100.0 * far);
+        (least, most) = (least.min(psnr), most.max(far));
+    }
+    println!("fast: {least:.1} dB at least, {:.2} % over two levels at most", 100.0 * most);
+}
