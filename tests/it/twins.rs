@@ -170,6 +170,28 @@ fn radix_sort_twin() {
     }
 }
 
+/// More pairs than other sorts were found to lose, in more workgroups than a row of them: long
+/// form, on hardware (`RUN_SLOW_TESTS=1`).
+#[test]
+fn a_hundred_million_pairs_are_sorted() {
+    if std::env::var_os("RUN_SLOW_TESTS").is_none() {
+        return skipped("RUN_SLOW_TESTS is not set");
+    }
+    let Some(gpu) = open(|options| options.portable = false) else { return };
+    if gpu.adapter().software {
+        return skipped("no hardware adapter");
+    }
+    let mut random = Random(3);
+    let keys: Vec<u32> = (0..100_000_000).map(|_| random.bits() as u32).collect();
+    let values: Vec<u32> = (0..100_000_000).collect();
+    let mut want: Vec<u64> =
+        keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v)).collect();
+    radix_sort::radix_sort(&mut want, &mut Vec::new(), 32);
+    let (keys, values) = gpu.radix_sort(&keys, &values, 32).expect("a sort");
+    let pairs = keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v));
+    assert!(pairs.eq(want), "order differs");
+}
+
 #[test]
 fn depth_sort_leaves_the_dropped_behind() {
     for gpu in both_kernels() {

@@ -180,8 +180,8 @@ impl<'a> Recorder<'a> {
         pass.set_bind_group(0, &*group, &[]);
         match *groups {
             Groups::Row(count) => {
-                let x = count.clamp(1, GROUPS_X_MAX);
-                pass.dispatch_workgroups(x, count.div_ceil(x), self.views);
+                let [x, y] = split(count);
+                pass.dispatch_workgroups(x, y, self.views);
             }
             Groups::Grid(x, y) => pass.dispatch_workgroups(x, y, self.views),
             Groups::Planned(row) => {
@@ -354,6 +354,12 @@ impl<'a> Recorder<'a> {
     }
 }
 
+/// Workgroups along x and y that are at least `count`: one dimension has 65,535 at most.
+fn split(count: u32) -> [u32; 2] {
+    let x = count.clamp(1, GROUPS_X_MAX);
+    [x, count.div_ceil(x)]
+}
+
 /// Which half of the pairs holds them after a tile sort of `key_bits` bits.
 pub(super) fn sorted_half(key_bits: u32) -> u32 {
     key_bits.div_ceil(DIGIT_BITS) & 1
@@ -362,4 +368,21 @@ pub(super) fn sorted_half(key_bits: u32) -> u32 {
 /// Bits that the ids of `tiles` tiles take; one tile alone takes a digit all the same.
 pub(super) fn tile_bits(tiles: u32) -> u32 {
     (u32::BITS - tiles.saturating_sub(1).leading_zeros()).max(1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A dispatch over the limit of a dimension launches nothing, and says nothing.
+    #[test]
+    fn more_workgroups_than_a_dimension_holds_are_split() {
+        for count in [0, 1, 32_768, 32_769, 65_535, 65_536, 70_000, u32::MAX / WORKGROUP_SIZE] {
+            let [x, y] = split(count);
+            assert!(x >= 1 && x.max(y) <= 65_535, "{count}: {x} x {y}");
+            let rows = u64::from(x) * u64::from(y);
+            assert!(rows >= u64::from(count), "{count}: {x} x {y} are too few");
+            assert!(rows < u64::from(count.max(1)) + u64::from(x), "{count}: a row for nothing");
+        }
+    }
 }
