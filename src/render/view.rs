@@ -12,6 +12,8 @@ use crate::error::{Error, Result};
 const PIXELS_MAX: u64 = 1 << 27;
 /// Longest side: ids of tiles stay in 16 bits a side.
 const SIDE_MAX: u32 = 1 << 18;
+/// Room for what rounding moves a depth, as a share of it.
+const DEPTH_SLACK: f64 = 1e-5;
 
 /// Camera of one frame, relative to the scene's origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -91,6 +93,19 @@ impl View {
             width: drawn.width,
             height: drawn.height,
         })
+    }
+
+    /// Bits in which the depth keys (t.z as f32) of Gaussians with means in the box `low` to `high`
+    /// can differ from the least of them: a bound, with room for a renderer's rounding.
+    #[must_use]
+    pub fn depth_bits(&self, [low, high]: [DVec3; 2]) -> u32 {
+        let axis = self.rotation.row(2);
+        let middle = axis.dot(low.midpoint(high)) + self.translation.z;
+        let reach = axis.abs().dot(0.5 * (high - low));
+        let key = |depth: f64| (depth as f32).clamp(f32::MIN_POSITIVE, f32::MAX).to_bits();
+        let near = (middle - reach).max(self.near) * (1.0 - DEPTH_SLACK);
+        let far = (middle + reach) * (1.0 + DEPTH_SLACK);
+        u32::BITS - key(far).saturating_sub(key(near)).leading_zeros()
     }
 
     /// Tiles in a row of tiles.

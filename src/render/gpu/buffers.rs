@@ -2,6 +2,7 @@
 //! that grow, and the scenes kept on the device.
 
 use bytemuck::{Pod, Zeroable};
+use glam::DVec3;
 use wgpu::BufferUsages;
 
 use super::device::Gpu;
@@ -200,6 +201,8 @@ pub(super) struct Scene {
     pub(super) gaussians: wgpu::Buffer,
     /// `[N, K, 3]` f32.
     pub(super) sh: wgpu::Buffer,
+    /// Least and largest mean by axis, relative to the origin.
+    pub(super) bounds: [DVec3; 2],
     /// Uploaded when labels are first asked for.
     labels: Option<SceneLabels>,
 }
@@ -244,8 +247,13 @@ impl Scene {
                 reserved: 0.0,
             })
             .collect();
+        let means = || source.means().iter().map(|mean| glam::Vec3::from(*mean).as_dvec3());
         Ok(Self {
             shape: source.shape_identity(),
+            bounds: [
+                means().reduce(DVec3::min).unwrap_or_default(),
+                means().reduce(DVec3::max).unwrap_or_default(),
+            ],
             count: narrow("gaussians", source.len())?,
             sh_count: source.sh_count() as u32,
             gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows))?,

@@ -9,10 +9,12 @@ use rayon::prelude::*;
 use super::{
     buffers::{PlanRow, Scene, SceneLabels, ViewRow},
     device::Gpu,
-    pipelines::{Kernels, NO_PICTURE},
+    pipelines::{FAST_KEY_BITS, Kernels, NO_PICTURE},
     profile::Marks,
     readback,
-    recorder::{LabelBuffers, Recorder, SceneBuffers, sorted_half, tile_bits},
+    recorder::{
+        DIGIT_BITS, DIGITS_MAX, LabelBuffers, Recorder, SceneBuffers, sorted_half, tile_bits,
+    },
     scratch::{ENTRY_SLOTS_MIN, Need, Scratch},
 };
 use crate::{
@@ -119,6 +121,8 @@ pub(super) struct Tools<'a> {
 /// A frame being drawn, band by band from top to bottom.
 pub(super) struct Drawing<'a> {
     row: ViewRow,
+    /// Digits that the depth sort can take.
+    digits: u32,
     kinds: Kinds,
     wanted: &'a Labels,
     frame: Frame,
@@ -146,7 +150,12 @@ impl<'a> Drawing<'a> {
             stats: FrameStats::default(),
         };
         let wanted = &request.labels;
-        Self { row, kinds, wanted, frame, entries: Vec::new(), entries_max: 0 }
+        let mut bits = view.depth_bits(scene.bounds);
+        if request.quality == Quality::Fast {
+            bits = bits.min(FAST_KEY_BITS);
+        }
+        let digits = bits.div_ceil(DIGIT_BITS).max(1);
+        Self { row, digits, kinds, wanted, frame, entries: Vec::new(), entries_max: 0 }
     }
 
     /// The frame of all bands.
@@ -400,6 +409,11 @@ impl Tools<'_> {
         let (gpu, scene) = (self.gpu, self.scene);
         let colored = drawings.iter().any(|drawing| drawing.kinds.color);
         let deep = drawings.iter().any(|drawing| drawing.kinds.depth);
+        // The device may find fewer, each of which is a dispatch for nothing.
+        let digits = match self.kernels.sorts_all() {
+            true => DIGITS_MAX,
+            false => drawings.iter().map(|drawing| drawing.digits).max().unwrap_or(DIGITS_MAX),
+        };
         let shades = colored && !self.kernels.flat(scene.sh_count);
         let room = self.scratch.room(
             gpu,
@@ -435,7 +449,7 @@ impl Tools<'_> {
             if shades {
                 stages.shade(buffers);
             }
-            stages.depth_sort();
+            stages.depth_sort(digits);
             stages.prefix_sum();
             stages.emit_isects();
             stages.tile_sort(bits);

@@ -239,6 +239,11 @@ impl Kernels {
         sh_count == 1 && self.without != Some(Skip::FlatColor)
     }
 
+    /// Whether digits that are the same for all are sorted too.
+    pub(super) fn sorts_all(&self) -> bool {
+        self.without == Some(Skip::EqualDigits)
+    }
+
     /// The pipeline of a kernel.
     ///
     /// # Errors

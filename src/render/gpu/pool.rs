@@ -231,14 +231,11 @@ impl Queue {
             Arc::ptr_eq(other, job) || (!led && job.joins(other))
         };
         let mut waiting = lock(&self.waiting);
+        // Each turn's share of the crowd, waited for even while the others are being drawn: a
+        // submission costs as much as several views.
+        let expected = waiting.crowd.div_ceil(TURNS).min(views_max);
         let until = Instant::now() + GATHER;
-        loop {
-            // Each turn's share of the crowd, but no more than are not being drawn.
-            let share = waiting.crowd.div_ceil(TURNS).min(views_max);
-            let expected = share.min(waiting.crowd - waiting.drawn.len().min(waiting.crowd));
-            if waiting.jobs.iter().filter(|other| fits(other)).count() >= expected {
-                break;
-            }
+        while waiting.jobs.iter().filter(|other| fits(other)).count() < expected {
             let Some(left) = until.checked_duration_since(Instant::now()) else { break };
             let woken = self.arrived.wait_timeout(waiting, left);
             waiting = woken.unwrap_or_else(PoisonError::into_inner).0;

@@ -211,11 +211,11 @@ impl<'a> Recorder<'a> {
         );
     }
 
-    /// Stage 2: Gaussians in depth order, dropped ones left behind. How many digits that takes, and
-    /// so which half holds them, is known to the device.
-    pub(super) fn depth_sort(&mut self) {
+    /// Stage 2: Gaussians in depth order, dropped ones left behind, by at most `digits` digits. How
+    /// many it takes, and so which half holds them, is known to the device.
+    pub(super) fn depth_sort(&mut self, digits: u32) {
         let blocks = self.count.div_ceil(SORT_BLOCK);
-        for pass_at in 0..DIGITS_MAX {
+        for pass_at in 0..digits {
             let digit =
                 SortParams { shift: pass_at * DIGIT_BITS, pass_at, by_tile: 0, reserved: 0 };
             let groups = match pass_at {

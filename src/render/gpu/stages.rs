@@ -10,7 +10,7 @@ use super::{
         GROUPS_RANGES, GROUPS_TILES, GROUPS_X_MAX, NO_PICTURE, SORT_BLOCK, WORKGROUP_SIZE,
     },
     readback,
-    recorder::{Copy, LabelBuffers, Recorder, SceneBuffers, sorted_half},
+    recorder::{Copy, DIGITS_MAX, LabelBuffers, Recorder, SceneBuffers, sorted_half},
     scratch::{Need, Room},
 };
 use crate::{
@@ -89,8 +89,9 @@ impl GpuRenderer {
                 gpu.queue.write_buffer(&room.depth_keys, 0, bytemuck::cast_slice(keys));
                 gpu.queue.write_buffer(&room.plans, 0, bytemuck::bytes_of(&plan));
             };
-            let [ids, plans] =
-                run_from(engine, &room, &row, parts, write, |stages| stages.depth_sort())?;
+            let [ids, plans] = run_from(engine, &room, &row, parts, write, |stages| {
+                stages.depth_sort(DIGITS_MAX);
+            })?;
             let plan = cast::<PlanRow>(&plans)[0];
             let first = (plan.passes as usize & 1) * keys.len();
             Ok(cast::<u32>(&ids)[first..first + plan.sorted as usize].to_vec())
