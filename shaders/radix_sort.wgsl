@@ -25,6 +25,8 @@ override SKIP_UNSEEN: bool = true;
 override SKIP_EQUAL_DIGITS: bool = true;
 
 const DIGITS: u32 = 256u;
+// Invocations of a serial workgroup: lanes of a software adapter.
+const SERIAL_SIZE: u32 = 8u;
 // Words of a mask of SORT_SIZE bits.
 const MASK_WORDS: u32 = 4u;
 const MASK: u32 = 1024u;
@@ -307,7 +309,7 @@ fn scatter(
     }
 }
 
-@compute @workgroup_size(8)
+@compute @workgroup_size(SERIAL_SIZE)
 fn scatter_serial(
     @builtin(workgroup_id) group: vec3<u32>,
     @builtin(num_workgroups) groups: vec3<u32>,
@@ -317,7 +319,7 @@ fn scatter_serial(
     let count = pair_count();
     let blocks = blocks_of(count);
     // As many workgroups come as there are blocks: the last ones find none left.
-    let block = (group.y * groups.x + group.x) * 8u + local;
+    let block = (group.y * groups.x + group.x) * SERIAL_SIZE + local;
     if block >= blocks {
         return;
     }

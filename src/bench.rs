@@ -65,7 +65,7 @@ pub struct BenchArgs {
     pub labels: Option<BenchLabels>,
     /// Rows of the bank (M): indices that occur in the scene.
     pub bank: u16,
-    /// Whether to time frames without each of [`Skip::ALL`] as well.
+    /// Whether to time frames without each of [`crate::render::skip::Skip::ALL`] as well.
     pub skips: bool,
 }
 

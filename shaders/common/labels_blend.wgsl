@@ -3,7 +3,7 @@
 @group(0) @binding(7) var<storage, read> table: array<vec4<f32>>;
 
 // Of each pixel of the invocation.
-var<private> blended: array<vec4<f32>, 8>;
+var<private> blended: array<vec4<f32>, PIXELS_MAX>;
 
 // An index beyond the table counts as 0.
 fn label_of(id: u32) -> u32 {

@@ -7,9 +7,9 @@
 
 // The index of the last contributions and their sum: neighbours in depth are mostly of one thing.
 // Of each pixel of the invocation.
-var<private> run_index: array<u32, 8>;
-var<private> run_weight: array<f32, 8>;
-var<private> used: array<u32, 8>;
+var<private> run_index: array<u32, PIXELS_MAX>;
+var<private> run_weight: array<f32, PIXELS_MAX>;
+var<private> used: array<u32, PIXELS_MAX>;
 
 fn label_of(id: u32) -> u32 {
     return index_of(id);

@@ -102,6 +102,8 @@ struct Ended {
     drawn: bool,
     /// Entries a pixel to make room for, where there were more than room.
     more_slots: Option<u32>,
+    /// Digits of depth that the device found; of the first view, those of all.
+    passes: u32,
 }
 
 /// What frames are drawn with.
@@ -209,22 +211,22 @@ impl<'a> Drawing<'a> {
         pictures: &[u8],
         slots: &[u32],
     ) -> Ended {
-        let needed = plan.needed;
+        let PlanRow { needed, passes, .. } = plan;
         if needed > capacity {
-            return Ended { needed, drawn: false, more_slots: None };
+            return Ended { needed, drawn: false, more_slots: None, passes };
         }
         let counts = &slots[..slots.len().min(layout.pixels as usize)];
         let entries = counts.iter().copied().max().unwrap_or(0);
         if entries > layout.slots {
             let more_slots = Some(layout.slots.saturating_mul(ENTRY_SLOTS_GROWTH));
-            return Ended { needed, drawn: false, more_slots };
+            return Ended { needed, drawn: false, more_slots, passes };
         }
         self.store(layout, pictures, slots);
         self.entries_max = self.entries_max.max(entries);
         let stats = &mut self.frame.stats;
         stats.visible = stats.visible.max(u64::from(plan.visible));
         stats.intersections += u64::from(plan.isects);
-        Ended { needed, drawn: true, more_slots: None }
+        Ended { needed, drawn: true, more_slots: None, passes }
     }
 
     /// Takes the pictures and entries of a band out of what was read back.
@@ -484,6 +486,12 @@ impl Tools<'_> {
                 _ => parts.into_par_iter().map(take).collect::<Vec<_>>(),
             }
         })?;
+        let passes = ended.first().map_or(0, |ended| ended.passes);
+        if passes > digits {
+            return Err(Error::internal(format!(
+                "render: depths differ in {passes} digits where the scene's box has {digits}"
+            )));
+        }
         let most_isects = ended.iter().map(|ended| ended.needed).max().unwrap_or(0);
         let more_slots = ended.iter().filter_map(|ended| ended.more_slots).max();
         self.scratch.isects = most_isects;
