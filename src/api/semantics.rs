@@ -42,10 +42,7 @@ pub(super) fn kind(name: &str) -> Result<Kind> {
 /// How closely to render, from `exact` (also where nothing is said) or `fast`.
 pub(super) fn quality(text: Option<&str>) -> Result<Quality> {
     let Some(name) = text else { return Ok(Quality::default()) };
-    match Quality::ALL.into_iter().find(|quality| quality.name() == name) {
-        Some(quality) => Ok(quality),
-        None => wrong("quality", name, "exact or fast"),
-    }
+    Quality::named(name).map_or_else(|| wrong("quality", name, "exact or fast"), Ok)
 }
 
 /// How texts are scored, from `default` (also where nothing is said) or `paper`.

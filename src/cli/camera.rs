@@ -65,8 +65,7 @@ pub(super) struct CameraArgs {
 
 /// A quality by its name.
 pub(super) fn quality(name: &str) -> Result<Quality, String> {
-    let known = Quality::ALL.into_iter().find(|quality| quality.name() == name);
-    known.ok_or_else(|| Quality::ALL.map(Quality::name).join(", "))
+    Quality::named(name).ok_or_else(|| Quality::ALL.map(Quality::name).join(", "))
 }
 
 impl CameraArgs {

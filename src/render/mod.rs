@@ -54,6 +54,12 @@ impl Quality {
     /// All, the default first.
     pub const ALL: [Self; 2] = [Self::Exact, Self::Fast];
 
+    /// The one that callers call `name`.
+    #[must_use]
+    pub fn named(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|quality| quality.name() == name)
+    }
+
     /// The name that callers give.
     #[must_use]
     pub fn name(self) -> &'static str {
