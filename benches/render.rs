@@ -127,7 +127,7 @@ impl Stages {
     }
 
     fn shade(&mut self) {
-        shade::shade(&self.gaussians, &self.view, &mut self.projected);
+        shade::shade(&self.gaussians, &self.view, None, &mut self.projected);
     }
 
     fn sort(&mut self) {

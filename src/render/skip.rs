@@ -18,8 +18,8 @@ pub enum Skip {
     Unseen,
     /// Blending tiles that nothing falls on. On a GPU it is no step of its own.
     EmptyTiles,
-    /// The stage that shades, of a scene whose colours are the same from everywhere. On the CPU
-    /// it saved nothing and was dropped.
+    /// Directions to Gaussians, and on a GPU the stage that shades, of a scene whose colours are
+    /// the same from everywhere.
     FlatColor,
     /// Digits of the depth sort that are the same for all. On the CPU it saved nothing and was
     /// dropped.

@@ -284,7 +284,7 @@ fn shade_twin() {
         let gaussians = cloud(3_000, degree, 4);
         let request = request(camera(200, 150));
         let mut projected = projected(&gaussians, &request);
-        shade::shade(&gaussians, &view_of(&gaussians, &request), &mut projected);
+        shade::shade(&gaussians, &view_of(&gaussians, &request), None, &mut projected);
         let Projected { footprints, tiles_per_gauss: tiles, .. } = projected;
         let got = gpu.shade(&gaussians, &request, &tiles).expect("colours");
         let mut seen = 0;
@@ -359,7 +359,7 @@ fn rasterize_twin() {
         let mut projected = projected(&gaussians, &request);
         let order = depth_order(&projected);
         let (mut offsets, mut isects, mut ranges) = (vec![], vec![], vec![]);
-        shade::shade(&gaussians, &view, &mut projected);
+        shade::shade(&gaussians, &view, None, &mut projected);
         let grid = whole(&view);
         let counts =
             order.iter().map(|&p| projected.tiles_per_gauss[radix_sort::value(p) as usize]);

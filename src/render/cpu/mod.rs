@@ -123,7 +123,7 @@ impl CpuRenderer {
         sorted.extend(kept.map(|(i, _)| pack(projected.footprints[i as usize].depth.to_bits(), i)));
         radix_sort::radix_sort(sorted, spare, u32::BITS);
         if request.kinds.color {
-            shade::shade(gaussians, &view, projected);
+            shade::shade(gaussians, &view, without, projected);
         }
         let visible = projected.tiles_per_gauss.iter().filter(|&&tiles| tiles > 0);
         frame.stats.visible = visible.count() as u64;

@@ -9,6 +9,7 @@ use super::project::Projected;
 use crate::{
     render::{
         constants::{SH_C0, SH_C1, SH_C2, SH_C3, SH_OFFSET},
+        skip::Skip,
         view::View,
     },
     scene::Gaussians,
@@ -19,7 +20,11 @@ const CHUNK: usize = 1024;
 
 /// Fills in the colour of every visible footprint, in place: neighbours stay neighbours, which the
 /// rasteriser's cache needs more than depth order.
-pub fn shade(gaussians: &Gaussians, view: &View, projected: &mut Projected) {
+///
+/// A scene of degree 0 looks the same from everywhere: no direction is computed, unless `without`
+/// says so.
+pub fn shade(gaussians: &Gaussians, view: &View, without: Option<Skip>, projected: &mut Projected) {
+    let flat = gaussians.sh_count() == 1 && without != Some(Skip::FlatColor);
     let coefficients = gaussians.sh_count();
     let chunks = projected.footprints.par_chunks_mut(CHUNK);
     chunks.zip(projected.tiles_per_gauss.par_chunks(CHUNK)).enumerate().for_each(
@@ -28,8 +33,12 @@ pub fn shade(gaussians: &Gaussians, view: &View, projected: &mut Projected) {
                 if tiles > 0 {
                     let i = chunk * CHUNK + k;
                     let sh = &gaussians.sh()[i * coefficients..(i + 1) * coefficients];
-                    let mean = DVec3::from(gaussians.means()[i].map(f64::from));
-                    footprint.color = color(sh, mean - view.center);
+                    footprint.color = if flat {
+                        sh[0].map(|value| (SH_OFFSET + SH_C0 * value).max(0.0))
+                    } else {
+                        let mean = DVec3::from(gaussians.means()[i].map(f64::from));
+                        color(sh, mean - view.center)
+                    };
                 }
             }
         },
