@@ -191,7 +191,7 @@ pub fn run(args: &BenchArgs, config: &Config) -> Result<BenchReport> {
         checked: args.checked,
         ..GpuOptions::default()
     };
-    let (renderer, adapters) = select_with(config, options)?;
+    let (renderer, adapters) = select_with(&config.renderer(), options)?;
     let open_ms = ms(begun);
     let begun = Instant::now();
     let frame = renderer.render(&gaussians, &request)?;
@@ -391,7 +391,7 @@ fn label_times(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::RendererChoice;
+    use crate::render::RendererChoice;
 
     #[test]
     fn a_wrong_pixel_is_a_fault_and_nan_is_far() {

@@ -11,35 +11,9 @@ use serde::{Deserialize, Serialize};
 use crate::{
     error::{Error, Result},
     limits::Limits,
+    models::{NetworkOptions, ProviderChoice},
+    render::{RendererChoice, RendererOptions},
 };
-
-/// Which renderer serves views.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "snake_case")]
-pub enum RendererChoice {
-    /// A hardware adapter where there is one, else the CPU renderer. Never a software adapter.
-    #[default]
-    Auto,
-    /// The CPU renderer.
-    Cpu,
-    /// A wgpu adapter, software ones too when `adapter` names it; refuses to start without.
-    Gpu,
-}
-
-/// Execution provider of the networks.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, clap::ValueEnum)]
-#[serde(rename_all = "snake_case")]
-pub enum ProviderChoice {
-    /// CUDA where the library has it and it works, else CPU; the choice is logged.
-    #[default]
-    Auto,
-    /// CPU.
-    Cpu,
-    /// CUDA; refuses to start without.
-    Cuda,
-    /// WebGPU; refuses to start without.
-    Webgpu,
-}
 
 /// What was typed or set: every field optional, merged into [`Config`].
 #[derive(Args, Clone, Debug, Default, Deserialize)]
@@ -74,13 +48,13 @@ pub struct ConfigArgs {
     #[arg(long, env = "SEGSPLAT_ORT_LIBRARY")]
     pub ort_library: Option<PathBuf>,
     /// Which renderer serves views [default: auto]
-    #[arg(long, env = "SEGSPLAT_RENDERER", value_enum)]
+    #[arg(long, env = "SEGSPLAT_RENDERER", value_name = "auto|cpu|gpu", value_parser = named::<RendererChoice>)]
     pub renderer: Option<RendererChoice>,
     /// Part of the name of the wgpu adapter to use; several with commas between
     #[arg(long, env = "SEGSPLAT_ADAPTER")]
     pub adapter: Option<String>,
     /// Execution provider of the networks [default: auto]
-    #[arg(long, env = "SEGSPLAT_PROVIDER", value_enum)]
+    #[arg(long, env = "SEGSPLAT_PROVIDER", value_name = "auto|cpu|cuda|webgpu", value_parser = named::<ProviderChoice>)]
     pub provider: Option<ProviderChoice>,
     /// Threads for networks and rendering [default: the cores this process really has]
     #[arg(long, env = "SEGSPLAT_THREADS")]
@@ -301,6 +275,30 @@ impl Config {
         Ok(Some((bucket, prefix.trim_matches('/'))))
     }
 
+    /// What opening the networks needs.
+    #[must_use]
+    pub fn networks(&self) -> NetworkOptions {
+        NetworkOptions {
+            bundle: self.bundle.clone(),
+            ort_library: self.ort_library.clone(),
+            provider: self.provider,
+            threads: self.threads,
+            jobs: self.jobs,
+        }
+    }
+
+    /// What opening the renderer needs.
+    #[must_use]
+    pub fn renderer(&self) -> RendererOptions {
+        RendererOptions {
+            renderer: self.renderer,
+            adapter: self.adapter.clone(),
+            threads: self.threads,
+            waiting_max: self.limits.queued_renders_max,
+            scene_bytes_max: self.limits.device_scene_bytes_max,
+        }
+    }
+
     fn validate(&self) -> Result<()> {
         self.bucket()?;
         for (name, value, max) in [("threads", self.threads, 1024), ("jobs", self.jobs, 64)] {
@@ -331,4 +329,11 @@ impl Config {
 #[must_use]
 pub fn available_cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
+}
+
+/// A value of an enum by its name in the configuration file.
+fn named<T: serde::de::DeserializeOwned>(name: &str) -> std::result::Result<T, String> {
+    use serde::de::{IntoDeserializer, value::StrDeserializer};
+    let name: StrDeserializer<'_, serde::de::value::Error> = name.into_deserializer();
+    T::deserialize(name).map_err(|e| e.to_string())
 }

@@ -23,26 +23,18 @@
 
 pub mod api;
 pub mod bench;
-pub mod capture;
 pub mod cli;
 pub mod config;
-pub mod error;
 pub mod eval;
 pub mod jobs;
 pub mod keys;
-pub mod lift;
-pub mod limits;
-pub mod models;
-pub mod photos;
-pub mod pipeline;
-pub mod render;
-pub mod sample;
-pub mod scene;
-pub mod segment;
-pub mod semantics;
 pub mod service;
 pub mod store;
 pub mod telemetry;
+
+pub use segsplat_core::{error, limits, scene};
+pub use segsplat_render as render;
+pub use segsplat_vision::{capture, lift, models, photos, pipeline, sample, segment, semantics};
 
 /// The numeric example of `docs/conventions.md`, run by the doc tests.
 #[cfg(doctest)]

@@ -91,7 +91,11 @@ pub(super) fn run(
 ) -> Result<Vec<SkipTimes>> {
     let open = |without| -> Result<Arc<dyn Renderer>> {
         let shaders = args.shaders.clone();
-        Ok(select_with(config, GpuOptions { without, shaders, ..GpuOptions::default() })?.0)
+        Ok(select_with(
+            &config.renderer(),
+            GpuOptions { without, shaders, ..GpuOptions::default() },
+        )?
+        .0)
     };
     let product = open(None)?;
     let scenes = scenes(gaussians, request)?;

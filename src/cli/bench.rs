@@ -235,7 +235,7 @@ fn stages(args: &Args, config: &Config, out: &Output) -> Result<()> {
         SampleOptions { photos: args.photos, width: side, height: side, ..Default::default() };
     let upload = sample::upload(&options)?;
     let begun = Instant::now();
-    let engine = Engine::open(config)?;
+    let engine = Engine::open(&config.networks())?;
     let open_ms = ms(begun);
     let provider = engine.geometry().provider().name();
     let renderer = engine::renderer(config)?;

@@ -27,7 +27,7 @@ pub fn parts(config: &Config) -> Result<Parts> {
 /// # Errors
 /// As [`parts`] where manifest or adapter are at fault; the engine tells of the rest.
 pub fn early_parts(config: &Config) -> Result<(Parts, Arc<LateEngine>)> {
-    let engine = Arc::new(LateEngine::open(config)?);
+    let engine = Arc::new(LateEngine::open(&config.networks())?);
     let renderer = renderer(config)?;
     let models = models_info(engine.bundle(), "opening");
     let maker = Arc::new(PipelineMaker::new(Arc::clone(&engine), config.limits.clone()));
@@ -44,7 +44,7 @@ pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticsMaker
     if !needed {
         return Ok(Arc::new(NoSemantics));
     }
-    let engine = Arc::new(Engine::open(config)?.into());
+    let engine = Arc::new(Engine::open(&config.networks())?.into());
     Ok(Arc::new(PipelineSemantics::new(engine, config.limits.clone())))
 }
 
@@ -53,7 +53,7 @@ pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticsMaker
 /// # Errors
 /// `gpu_unavailable` when an adapter is asked for and none fits.
 pub fn renderer(config: &Config) -> Result<Arc<dyn Renderer>> {
-    let (renderer, _adapters) = select(config)?;
+    let (renderer, _adapters) = select(&config.renderer())?;
     Ok(renderer)
 }
 

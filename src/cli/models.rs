@@ -38,7 +38,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
 }
 
 fn list(config: &Config, out: &Output) -> Result<()> {
-    let bundle = Bundle::find(config)?;
+    let bundle = Bundle::find(&config.networks())?;
     let info = models_info(&bundle, "");
     out.answer(&words(&info), &json!({ "bundle": info.bundle, "models": info.models }))
 }
@@ -56,9 +56,9 @@ fn words(info: &ModelsInfo) -> String {
 }
 
 fn verify(config: &Config, out: &Output) -> Result<()> {
-    Bundle::find(config)?.verify()?;
-    let runtime = Runtime::load(config)?;
-    let engine = Engine::open(config)?;
+    Bundle::find(&config.networks())?.verify()?;
+    let runtime = Runtime::load(&config.networks())?;
+    let engine = Engine::open(&config.networks())?;
     let provider = engine.geometry().provider().name();
     let info = models_info(engine.bundle(), provider);
     let build = runtime.build().unwrap_or("a library that is not pinned");

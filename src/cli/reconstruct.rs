@@ -50,7 +50,7 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let upload = upload_of(&args.photos, config)?;
-    let engine = Arc::new(LateEngine::from(Engine::open(config)?));
+    let engine = Arc::new(LateEngine::from(Engine::open(&config.networks())?));
     let options = SceneOptions {
         max_views: args.max_views,
         semantics: args.semantics,

@@ -76,7 +76,7 @@ pub fn run(
     options: &DensityEval,
     done: &dyn Fn(&DensityReport),
 ) -> Result<Vec<DensityReport>> {
-    let engine = Engine::open(config)?;
+    let engine = Engine::open(&config.networks())?;
     let renderer = CpuRenderer::new(config.threads)?;
     let mut reports = Vec::new();
     for dir in scene_dirs(&options.dir, &options.scenes)? {

@@ -128,7 +128,7 @@ pub fn run(config: &Config, options: &MasksEval, done: &dyn Fn(&str)) -> Result<
     if options.photos == 0 {
         return Err(Error::invalid("eval masks: 0 photos; it must be at least 1"));
     }
-    let engine = Engine::open(config)?;
+    let engine = Engine::open(&config.networks())?;
     let network = engine.masks()?;
     let roads = roads(&stage::settings(network.manifest()), options.short);
     let mut reports: Vec<RoadReport> = roads

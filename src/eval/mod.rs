@@ -81,7 +81,7 @@ pub fn run(
     }
     let at_once = options.at_once.min(config.threads);
     let config = Config { jobs: at_once, ..config.clone() };
-    let engine = Engine::open(&config)?;
+    let engine = Engine::open(&config.networks())?;
     let renderer = CpuRenderer::new((config.threads / at_once).max(1))?;
     let mut scenes = Vec::new();
     for dir in scene_dirs(&options.dir, &options.scenes)? {

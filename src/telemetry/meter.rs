@@ -10,6 +10,8 @@ use metrics::{
 };
 use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle};
 
+pub use segsplat_core::meter::{STAGE_SECONDS, STAGES, stage};
+
 use crate::error::{Error, Result, TABLE};
 
 /// Calls answered, by `door` (http, grpc), `call` and `code` (ok or a code of the error table).
@@ -18,8 +20,6 @@ pub const REQUESTS: &str = "segsplat_requests_total";
 pub const REQUEST_SECONDS: &str = "segsplat_request_seconds";
 /// Calls let in whose answer is not sent yet.
 pub const INFLIGHT: &str = "segsplat_requests_inflight";
-/// Time of each stage, by `stage`.
-pub const STAGE_SECONDS: &str = "segsplat_stage_seconds";
 /// Jobs ended, by `kind` (scene, semantics) and `outcome` (done, failed, cancelled, requeued).
 pub const JOBS: &str = "segsplat_jobs_total";
 /// Jobs that wait.
@@ -42,12 +42,6 @@ pub const BUILD: &str = "segsplat_build_info";
 pub const RESIDENT: &str = "process_resident_memory_bytes";
 /// Open file descriptors of the process.
 pub const OPEN_FDS: &str = "process_open_fds";
-
-/// Stages of a scene, of its semantics, and of a view.
-pub const STAGES: [&str; 14] = [
-    "wait", "photos", "capture", "geometry", "lift", "store", "masks", "embed", "bank", "assign",
-    "queue", "load", "render", "encode",
-];
 
 /// Between two sortings of what was measured.
 const UPKEEP_EVERY: Duration = Duration::from_secs(5);
@@ -149,13 +143,6 @@ pub fn answered(door: &'static str, call: &'static str, code: &str, took: Durati
 /// Counts a call in (1) or out (-1).
 pub fn inflight(change: f64) {
     gauge!(INFLIGHT).increment(change);
-}
-
-/// Keeps the time of a stage; one that is not in [`STAGES`] is not kept.
-pub fn stage(name: &str, seconds: f64) {
-    if let Some(stage) = STAGES.into_iter().find(|stage| *stage == name) {
-        histogram!(STAGE_SECONDS, "stage" => stage).record(seconds);
-    }
 }
 
 /// Counts an ended job.

@@ -7,9 +7,8 @@ use std::{
 };
 
 use segsplat::{
-    config::Config,
     error::ErrorCode,
-    models::Runtime,
+    models::{NetworkOptions, Runtime},
     scene::{
         Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, Provenance,
         RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
@@ -204,7 +203,7 @@ fn a_sample_is_written_as_asked() {
 
 /// Whether the network can run here; says `skipped` where it cannot.
 fn with_network() -> bool {
-    match Runtime::load(&Config::default()) {
+    match Runtime::load(&NetworkOptions::default()) {
         Ok(_) => true,
         Err(error) => {
             skipped(&format!("no ONNX Runtime: {error}"));

@@ -85,7 +85,7 @@ fn parts(config: &Config) -> Option<Parts> {
 
 fn configured(config: &mut Config) {
     config.bundle = Some(Path::new("tests/fixtures/colours").to_owned());
-    config.renderer = segsplat::config::RendererChoice::Cpu;
+    config.renderer = segsplat::render::RendererChoice::Cpu;
     config.threads = 2;
     config.jobs = 1;
 }

@@ -20,14 +20,14 @@ const DEPTH: f64 = 4.0;
 fn network() -> Option<Geometry> {
     let bundle = Bundle::open(Path::new("tests/fixtures/plane")).unwrap();
     let config = Config::default();
-    let runtime = match Runtime::load(&config) {
+    let runtime = match Runtime::load(&config.networks()) {
         Err(e) if e.code() == ErrorCode::ModelUnavailable => {
             skipped(e.message());
             return None;
         }
         runtime => runtime.unwrap(),
     };
-    Some(Geometry::open(Arc::clone(&runtime), &bundle, &config).unwrap())
+    Some(Geometry::open(Arc::clone(&runtime), &bundle, &config.networks()).unwrap())
 }
 
 /// A photo whose red is the column and green the row.

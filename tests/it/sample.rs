@@ -3,9 +3,9 @@
 use std::sync::atomic::AtomicBool;
 
 use segsplat::{
-    config::Config,
     error::ErrorCode,
     eval::psnr,
+    models::NetworkOptions,
     pipeline::{self, Engine, Reconstruction},
     render::{Kinds, RenderRequest, Renderer, cpu::CpuRenderer},
     sample::{self, Room, SampleOptions},
@@ -24,7 +24,7 @@ const DEPTH_ERROR_MAX: f64 = 0.03;
 const SAMPLE: SampleOptions = SampleOptions { photos: 2, width: 256, height: 256, seed: 1 };
 
 fn engine() -> Option<Engine> {
-    match Engine::open(&Config::default()) {
+    match Engine::open(&NetworkOptions::default()) {
         Err(e) if e.code() == ErrorCode::ModelUnavailable => {
             skipped(e.message());
             None

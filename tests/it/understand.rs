@@ -259,7 +259,7 @@ fn engine(threads: usize) -> Option<Engine> {
     config.bundle = Some(Path::new("tests/fixtures/colours").to_owned());
     config.threads = threads;
     config.jobs = 1;
-    match Engine::open(&config) {
+    match Engine::open(&config.networks()) {
         Err(e) if e.code() == ErrorCode::ModelUnavailable => {
             skipped(e.message());
             None

@@ -79,7 +79,7 @@ pub fn run(
             options.photos
         )));
     }
-    let engine = Engine::open(config)?;
+    let engine = Engine::open(&config.networks())?;
     let renderer = CpuRenderer::new(config.threads)?;
     let road = Road::open(&engine, &renderer, options.understanding)?;
     let mut scenes = Vec::new();

@@ -143,11 +143,12 @@ pub fn run(
             options.template
         )));
     }
-    let bundle = Bundle::find(config)?;
-    let runtime = Runtime::load(config)?;
-    let towers = ImageText::open(Arc::clone(&runtime), &bundle, config)?.ok_or_else(|| {
-        Error::invalid(format!("eval words: bundle {:?} has no image-text pair", bundle.name()))
-    })?;
+    let bundle = Bundle::find(&config.networks())?;
+    let runtime = Runtime::load(&config.networks())?;
+    let towers =
+        ImageText::open(Arc::clone(&runtime), &bundle, &config.networks())?.ok_or_else(|| {
+            Error::invalid(format!("eval words: bundle {:?} has no image-text pair", bundle.name()))
+        })?;
     let mut names = Names::default();
     let mut sets = Vec::new();
     for path in &options.files {

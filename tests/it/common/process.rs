@@ -8,7 +8,10 @@ use std::{
     time::{Duration, Instant},
 };
 
-use segsplat::{config::Config, models::Runtime, scene::Upload};
+use segsplat::{
+    models::{NetworkOptions, Runtime},
+    scene::Upload,
+};
 use serde_json::Value;
 
 use super::{doors::form, root, skipped};
@@ -30,7 +33,7 @@ impl Drop for Process {
 
 /// Whether processes can make scenes here; says so where not.
 pub(crate) fn can_serve() -> bool {
-    let found = Runtime::load(&Config::default()).is_ok();
+    let found = Runtime::load(&NetworkOptions::default()).is_ok();
     if !found {
         skipped("no ONNX Runtime (scripts/setup gets it)");
     }

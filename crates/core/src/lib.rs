@@ -1,0 +1,8 @@
+//! The nouns of SegSplat: cameras, photos, Gaussians, statuses; errors, limits and stage times.
+//!
+//! Every other crate of the workspace uses this one; it uses none of them.
+
+pub mod error;
+pub mod limits;
+pub mod meter;
+pub mod scene;

@@ -1,0 +1,330 @@
+//! Stage 1: Gaussians to footprints, and which to drop. Partner: `shaders/project.wgsl`
+//!
+//! In: means, quats, scales, opacities `[N]`. Out: [`Footprint`] `[N]`; a dropped Gaussian has
+//! touched no tile (`tiles_per_gauss` 0). Everything is computed in f64 and narrowed at the end.
+
+use rayon::prelude::*;
+
+use super::{
+    lanes::{Kernel, Lanes, Row, Wide, Width},
+    tiles::{BLOCK, Ellipses, Grid, TileSpans},
+};
+use crate::{
+    constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK},
+    scene::Gaussians,
+    skip::Skip,
+    view::View,
+};
+
+/// Gaussians a task: large enough to hide the task's cost, small enough to balance two cores.
+const CHUNK: usize = 1024;
+
+/// A Gaussian on the picture.
+///
+/// With d = pixel - mean, half the squared Mahalanobis distance is
+/// `(inv_sx · (d.x - slope · d.y))² + (inv_sy · d.y)²`: x given y, then y (Cholesky). Unlike the
+/// conic `a d.x² + 2 b d.x d.y + c d.y²` it does not cancel for long thin Gaussians.
+///
+/// One line of the cache each: the blend fetches them in no order of memory.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[repr(align(64))]
+pub struct Footprint {
+    /// Centre, pixels. f64: a tile subtracts its corner before it narrows.
+    pub mean: [f64; 2],
+    /// Covariance xy over variance y.
+    pub slope: f64,
+    /// √(½ / variance of x given y), 1/px.
+    pub inv_sx: f32,
+    /// √(½ / variance of y), 1/px.
+    pub inv_sy: f32,
+    /// Half the squared distance at which alpha reaches 1/255, with slack.
+    pub reach: f32,
+    /// Opacity, compensated in antialiased mode.
+    pub opacity: f32,
+    /// t.z, world units; also the sort key.
+    pub depth: f32,
+    /// Colour; filled by `shade`.
+    pub color: [f32; 3],
+}
+
+/// What the stage gives, `[N]` each.
+#[derive(Debug, Default)]
+pub struct Projected {
+    /// Footprints; meaningless where dropped.
+    pub footprints: Vec<Footprint>,
+    /// Tiles touched, for the emission; meaningless where dropped.
+    pub tile_spans: Vec<TileSpans>,
+    /// Tiles touched; 0 where dropped.
+    pub tiles_per_gauss: Vec<u32>,
+}
+
+impl Projected {
+    /// Footprints from elsewhere, with the tiles that they touch.
+    #[must_use]
+    pub fn of(footprints: Vec<Footprint>, grid: &Grid) -> Self {
+        let touched = footprints.iter().map(|footprint| TileSpans::of(footprint, grid));
+        let (tile_spans, tiles_per_gauss) = touched.unzip();
+        Self { footprints, tile_spans, tiles_per_gauss }
+    }
+}
+
+/// How the stage works.
+#[derive(Clone, Copy, Debug)]
+pub struct Projection {
+    /// gsplat's antialiased mode.
+    pub antialiased: bool,
+    /// Lanes of the kernel.
+    pub width: Width,
+    /// What is not left out.
+    pub without: Option<Skip>,
+}
+
+impl Projection {
+    /// All that saves time, as wide as the processor can.
+    #[must_use]
+    pub fn new(antialiased: bool) -> Self {
+        Self { antialiased, width: Width::widest(), without: None }
+    }
+}
+
+/// Projects every Gaussian; `tiles_per_gauss[i]` is 0 for one that is dropped.
+pub fn project(gaussians: &Gaussians, view: &View, how: Projection, projected: &mut Projected) {
+    let count = gaussians.len();
+    let Projected { footprints, tile_spans, tiles_per_gauss } = projected;
+    footprints.resize(count, Footprint::default());
+    tile_spans.resize(count, TileSpans::default());
+    tiles_per_gauss.resize(count, 0);
+    let chunks = footprints
+        .par_chunks_mut(CHUNK)
+        .zip(tile_spans.par_chunks_mut(CHUNK))
+        .zip(tiles_per_gauss.par_chunks_mut(CHUNK));
+    chunks.enumerate().for_each(|(chunk, ((footprints, spans), tiles))| {
+        let first = chunk * CHUNK;
+        how.width.run(Chunk { gaussians, view, how, first, footprints, spans, tiles });
+    });
+}
+
+/// Gaussians of a task and where their footprints go.
+struct Chunk<'a> {
+    gaussians: &'a Gaussians,
+    view: &'a View,
+    how: Projection,
+    first: usize,
+    footprints: &'a mut [Footprint],
+    spans: &'a mut [TileSpans],
+    tiles: &'a mut [u32],
+}
+
+impl Kernel for Chunk<'_> {
+    #[inline(always)]
+    fn run<S: Lanes>(self, simd: S) {
+        let Self { view, how, .. } = self;
+        let grid = Grid::whole(view, how.without);
+        let out = self.footprints.chunks_mut(BLOCK).zip(self.spans.chunks_mut(BLOCK));
+        let out = out.zip(self.tiles.chunks_mut(BLOCK)).enumerate();
+        let (mut block, mut ellipses) = (Block::default(), Ellipses::default());
+        for (at, ((footprints, spans), tiles)) in out {
+            tiles.fill(0);
+            if how.without == Some(Skip::Unseen) {
+                // Theirs are looked at too.
+                spans.fill(TileSpans::default());
+            }
+            let first = self.first + at * BLOCK;
+            block.load(self.gaussians, first, footprints.len());
+            if !block.project(simd, view, how.antialiased) {
+                continue;
+            }
+            let mut seen = 0_u32;
+            for (k, footprint) in footprints.iter_mut().enumerate() {
+                if let Some(found) = block.footprint(k) {
+                    *footprint = found;
+                    ellipses.set(k, &found);
+                    seen |= 1 << k;
+                }
+            }
+            ellipses.touch(simd, &grid);
+            for (k, (spans, tiles)) in spans.iter_mut().zip(tiles).enumerate() {
+                if seen >> k & 1 == 1 {
+                    (*spans, *tiles) = ellipses.spans(k, &footprints[k], &grid);
+                }
+            }
+        }
+    }
+}
+
+/// Some Gaussians as rows of numbers, and their footprints.
+#[derive(Default)]
+struct Block {
+    mean: [Row; 3],
+    quat: [Row; 4],
+    scale: [Row; 3],
+    opacity: Row,
+    center: [Row; 2],
+    slope: Row,
+    inv_sx: Row,
+    inv_sy: Row,
+    depth: Row,
+    /// 1 for a Gaussian that can be seen so far.
+    kept: Row,
+}
+
+impl Block {
+    #[inline(always)]
+    fn load(&mut self, gaussians: &Gaussians, first: usize, count: usize) {
+        let places = first..first + count;
+        let rows = gaussians.means()[places.clone()].iter().zip(&gaussians.quats()[places.clone()]);
+        let rows = rows.zip(&gaussians.scales()[places.clone()]);
+        let rows = rows.zip(&gaussians.opacities()[places]);
+        for (k, (((mean, quat), scale), opacity)) in rows.enumerate() {
+            for (row, &value) in self.mean.iter_mut().zip(mean) {
+                row[k] = f64::from(value);
+            }
+            for (row, &value) in self.scale.iter_mut().zip(scale) {
+                row[k] = f64::from(value);
+            }
+            for (row, &value) in self.quat.iter_mut().zip(quat) {
+                row[k] = f64::from(value);
+            }
+            self.opacity[k] = f64::from(*opacity);
+        }
+    }
+
+    /// EWA projection of all; whether any may be seen.
+    #[inline(always)]
+    fn project<S: Lanes>(&mut self, simd: S, view: &View, antialiased: bool) -> bool {
+        let mut any = false;
+        self.kept = [0.0; BLOCK];
+        // No `map` of arrays from here on: what it calls is not compiled for the processor.
+        let number = |value: f64| Wide::of(simd, value);
+        let mut w = [[number(0.0); 3]; 3];
+        let mut moved = [number(0.0); 3];
+        for (row, (w, moved)) in w.iter_mut().zip(&mut moved).enumerate() {
+            for (column, w) in w.iter_mut().enumerate() {
+                *w = number(view.rotation.col(column)[row]);
+            }
+            *moved = number(view.translation[row]);
+        }
+        for i in 0..BLOCK / S::F64_LANES {
+            let at = |row: &Row| Wide::at(simd, row, i);
+            let mean = [at(&self.mean[0]), at(&self.mean[1]), at(&self.mean[2])];
+            let t = [
+                dot(w[0], mean) + moved[0],
+                dot(w[1], mean) + moved[1],
+                dot(w[2], mean) + moved[2],
+            ];
+            let kept = t[2].at_least(number(view.near));
+            if simd.first_true_m64s(kept) == S::F64_LANES {
+                continue;
+            }
+            any = true;
+            let per_z = number(1.0) / t[2];
+            let slope = [t[0] * per_z, t[1] * per_z];
+            let bounded = [
+                slope[0].max(number(view.slope_min[0])).min(number(view.slope_max[0])),
+                slope[1].max(number(view.slope_min[1])).min(number(view.slope_max[1])),
+            ];
+            // Rows of M = J W R diag(scales), so that the 2D covariance is M Mᵀ.
+            let quat = [at(&self.quat[0]), at(&self.quat[1]), at(&self.quat[2]), at(&self.quat[3])];
+            let columns = rotation(number(1.0), number(2.0), quat);
+            let mut local = w;
+            for (k, column) in columns.into_iter().enumerate() {
+                let scale = at(&self.scale[k]);
+                for row in 0..3 {
+                    local[row][k] = dot(w[row], column) * scale;
+                }
+            }
+            let [row_x, row_y, row_z] = local;
+            let m0 = image_row(row_x, row_z, bounded[0], number(view.focal[0]) * per_z);
+            let m1 = image_row(row_y, row_z, bounded[1], number(view.focal[1]) * per_z);
+            let blur = number(f64::from(BLUR_PX2));
+            let (xx, yy) = (dot(m0, m0), dot(m1, m1));
+            // det(M Mᵀ) as a sum of squares (Cauchy-Binet): it cannot cancel or go negative.
+            let cross = [
+                m0[1] * m1[2] - m0[2] * m1[1],
+                m0[2] * m1[0] - m0[0] * m1[2],
+                m0[0] * m1[1] - m0[1] * m1[0],
+            ];
+            let det_sharp = dot(cross, cross);
+            let det = det_sharp + blur * (xx + yy) + blur * blur;
+            let var_y = yy + blur;
+            let half = number(0.5);
+            if antialiased {
+                let share = (det_sharp / det).sqrt();
+                (at(&self.opacity) * share).put(&mut self.opacity, i);
+            }
+            for (k, (center, slope)) in self.center.iter_mut().zip(slope).enumerate() {
+                let place = number(view.focal[k]) * slope + number(view.principal[k]);
+                place.put(center, i);
+            }
+            (dot(m0, m1) / var_y).put(&mut self.slope, i);
+            (half * var_y / det).sqrt().put(&mut self.inv_sx, i);
+            (half / var_y).sqrt().put(&mut self.inv_sy, i);
+            t[2].put(&mut self.depth, i);
+            number(1.0).only(kept).put(&mut self.kept, i);
+        }
+        any
+    }
+
+    /// The footprint of Gaussian `k`; `None` when it cannot be seen.
+    #[inline(always)]
+    fn footprint(&self, k: usize) -> Option<Footprint> {
+        // A NaN is never at least the least alpha.
+        let seen = self.kept[k] > 0.0 && self.opacity[k] >= f64::from(ALPHA_MIN);
+        if !seen {
+            return None;
+        }
+        let opacity = self.opacity[k] as f32;
+        let footprint = Footprint {
+            mean: [self.center[0][k], self.center[1][k]],
+            slope: self.slope[k],
+            inv_sx: self.inv_sx[k] as f32,
+            inv_sy: self.inv_sy[k] as f32,
+            reach: (opacity / ALPHA_MIN).ln().max(0.0) + FOOTPRINT_SLACK,
+            opacity,
+            depth: self.depth[k] as f32,
+            color: [0.0; 3],
+        };
+        // Infinite variances and determinants end in a 0 or a NaN here.
+        let finite = footprint.mean[0].is_finite()
+            && footprint.mean[1].is_finite()
+            && footprint.slope.is_finite()
+            && footprint.depth.is_finite();
+        let wide = |inv: f32| inv > 0.0 && inv.is_finite();
+        (finite && wide(footprint.inv_sx) && wide(footprint.inv_sy)).then_some(footprint)
+    }
+}
+
+/// Columns of the rotation of a quaternion of any length, wxyz.
+#[inline(always)]
+fn rotation<S: Lanes>(one: Wide<S>, two: Wide<S>, quat: [Wide<S>; 4]) -> [[Wide<S>; 3]; 3] {
+    let [w, x, y, z] = quat;
+    let scale = two / (w * w + x * x + y * y + z * z);
+    let (xx, yy, zz) = (x * x * scale, y * y * scale, z * z * scale);
+    let (xy, xz, yz) = (x * y * scale, x * z * scale, y * z * scale);
+    let (wx, wy, wz) = (w * x * scale, w * y * scale, w * z * scale);
+    [
+        [one - (yy + zz), xy + wz, xz - wy],
+        [xy - wz, one - (xx + zz), yz + wx],
+        [xz + wy, yz - wx, one - (xx + yy)],
+    ]
+}
+
+/// A row of M: `(row - row_z · slope) · focal`.
+#[inline(always)]
+fn image_row<S: Lanes>(
+    row: [Wide<S>; 3],
+    row_z: [Wide<S>; 3],
+    slope: Wide<S>,
+    focal: Wide<S>,
+) -> [Wide<S>; 3] {
+    [
+        (row[0] - row_z[0] * slope) * focal,
+        (row[1] - row_z[1] * slope) * focal,
+        (row[2] - row_z[2] * slope) * focal,
+    ]
+}
+
+#[inline(always)]
+fn dot<S: Lanes>(a: [Wide<S>; 3], b: [Wide<S>; 3]) -> Wide<S> {
+    a[0].times_plus(b[0], a[1].times_plus(b[1], a[2] * b[2]))
+}

@@ -1,0 +1,592 @@
+//! Stage 8: front-to-back blend of colour, depth, alpha and labels. Partner:
+//! `shaders/rasterize.wgsl`
+//!
+//! A tile is cut into cells of 4 x 4 pixels. Gaussians are staged a batch at a time; each marks the
+//! cells that its ellipse may meet, and the marks are turned over so that a cell has them as a row
+//! of bits. Then each cell blends what marked it, with the state of its pixels in registers. A cell
+//! whose rays have all ended takes no more.
+//!
+//! What is blended beside alpha is a row of channels, packed: colour, depth and a label's row of
+//! the table, as far as they were asked for. Entries are summed in one bin for each index that
+//! occurs in the tile, so a Gaussian touches one bin a cell however large the bank is.
+
+use super::{
+    lanes::{Kernel, Lanes, exp2_neg},
+    paint::{CHANNELS, Paint},
+    project::Footprint,
+    radix_sort,
+};
+use crate::{
+    Labels,
+    constants::{ALPHA_MAX, ALPHA_MIN, BATCH_SIZE, TILE_SIZE, TRANSMITTANCE_MIN},
+    labels::{BLEND_WIDTH, EntryRows},
+    skip::Skip,
+};
+
+const SIDE: usize = TILE_SIZE as usize;
+/// Side of a cell, pixels.
+const CELL: usize = 4;
+/// Cells in a row of a tile.
+const ACROSS: usize = SIDE / CELL;
+/// Cells of a tile.
+const CELLS: usize = ACROSS * ACROSS;
+/// Pixels of a cell.
+const PIXELS: usize = CELL * CELL;
+/// Gaussians whose marks are turned over at once.
+const GROUP: usize = 64;
+/// Middles of the cells from the middle of the tile, pixels.
+const CELL_X: Numbers = along(ACROSS, false, CELL as f32);
+const CELL_Y: Numbers = along(ACROSS, true, CELL as f32);
+/// Centres of a cell's pixels from its middle.
+const PIXEL_X: Numbers = along(CELL, false, 1.0);
+const PIXEL_Y: Numbers = along(CELL, true, 1.0);
+/// Powers are counted in twos: half the squared distance times log2 e.
+const SQRT_LOG2_E: f64 = 1.201_122_408_786_449_8;
+/// Room for the rounding of the bound of a cell, on top of the footprint's own slack.
+const REACH_SLACK: f32 = 1e-4;
+
+/// One number for each of 16 pixels or cells, in one line of the cache.
+#[derive(Clone, Copy, Debug, PartialEq)]
+#[repr(C, align(64))]
+struct Numbers([f32; 16]);
+
+impl Numbers {
+    const ZERO: Self = Self([0.0; 16]);
+    const ONE: Self = Self([1.0; 16]);
+
+    /// Vector `i`.
+    #[inline(always)]
+    fn at<S: Lanes>(&self, simd: S, i: usize) -> S::f32s {
+        simd.load(&self.0, i)
+    }
+
+    /// Writes vector `i`.
+    #[inline(always)]
+    fn put<S: Lanes>(&mut self, simd: S, i: usize, value: S::f32s) {
+        simd.store(&mut self.0, i, value);
+    }
+}
+
+/// Columns (or rows) of a square of `side` x `side`, `step` apart, counted from its middle.
+const fn along(side: usize, rows: bool, step: f32) -> Numbers {
+    let mut out = [0.0; 16];
+    let mut i = 0;
+    while i < 16 {
+        let k = if rows { i / side } else { i % side };
+        out[i] = (k as f32 - (side - 1) as f32 / 2.0) * step;
+        i += 1;
+    }
+    Numbers(out)
+}
+
+/// Bin of a Gaussian that enters none.
+const NO_BIN: u32 = u32::MAX;
+
+/// A Gaussian about to be blended into a tile, the same for all of its cells.
+///
+/// At a place (x, y) from the middle of the tile, pixels, the power of two by which its alpha
+/// falls is u² + v² with `u = ux x + uy y + u0` and `v = vy y + v0`. Where it is seen at all, no
+/// term is large: the blur bounds `ux`, `uy` and `vy`, so f32 loses nothing that shows.
+#[derive(Clone, Copy, Debug, Default)]
+#[repr(C, align(64))]
+struct Staged {
+    ux: f32,
+    uy: f32,
+    u0: f32,
+    vy: f32,
+    v0: f32,
+    /// Power at which alpha is under 1/255, with slack.
+    reach: f32,
+    opacity: f32,
+    channels: [f32; CHANNELS],
+    /// Bin of its index, where entries are wanted.
+    bin: u32,
+}
+
+/// The pixels of a cell: a row of numbers each.
+#[derive(Clone, Copy, Debug)]
+struct Cell {
+    /// Transmittance while the ray goes on, 0 after it has ended.
+    transmittance: Numbers,
+    /// Accumulated opacity.
+    alpha: Numbers,
+    /// Accumulated channels.
+    channels: [Numbers; CHANNELS],
+}
+
+impl Cell {
+    const CLEAR: Self = Self {
+        transmittance: Numbers::ONE,
+        alpha: Numbers::ZERO,
+        channels: [Numbers::ZERO; CHANNELS],
+    };
+}
+
+/// Scratch of one worker; its contents mean nothing between tiles.
+#[derive(Debug)]
+pub struct TileScratch {
+    fetched: Vec<Footprint>,
+    staged: Vec<Staged>,
+    marks: [[u64; CELLS]; BATCH_SIZE / GROUP],
+    cells: [Cell; CELLS],
+    bins: Bins,
+}
+
+impl Default for TileScratch {
+    fn default() -> Self {
+        Self {
+            fetched: vec![Footprint::default(); BATCH_SIZE],
+            staged: vec![Staged::default(); BATCH_SIZE],
+            marks: [[0; CELLS]; BATCH_SIZE / GROUP],
+            cells: [Cell::CLEAR; CELLS],
+            bins: Bins::default(),
+        }
+    }
+}
+
+/// Weights of the indices that occur in a tile.
+#[derive(Debug, Default)]
+struct Bins {
+    /// Indices that occur, ascending; bin b is of `present[b]`.
+    present: Vec<u16>,
+    /// `[65536]` bin of each index, [`NO_BIN`] where it does not occur; empty before the first.
+    bin_of: Vec<u32>,
+    /// `[CELLS, present.len()]` sums.
+    sums: Vec<Numbers>,
+}
+
+impl Bins {
+    /// A bin for every index but 0 of the Gaussians `isects`, all sums 0.
+    fn open(&mut self, isects: &[u64], index: &[u16]) {
+        self.bin_of.resize(1 << u16::BITS, NO_BIN);
+        for left in self.present.drain(..) {
+            self.bin_of[usize::from(left)] = NO_BIN;
+        }
+        for &isect in isects {
+            let label = index[radix_sort::value(isect) as usize];
+            let bin = &mut self.bin_of[usize::from(label)];
+            if label != 0 && *bin == NO_BIN {
+                *bin = 0;
+                self.present.push(label);
+            }
+        }
+        self.present.sort_unstable();
+        for (bin, label) in (0_u32..).zip(&self.present) {
+            self.bin_of[usize::from(*label)] = bin;
+        }
+        self.sums.clear();
+        self.sums.resize(CELLS * self.present.len(), Numbers::ZERO);
+    }
+
+    /// The sums of a cell, one a bin.
+    #[inline(always)]
+    fn of_cell(&mut self, cell: usize) -> &mut [Numbers] {
+        let count = self.present.len();
+        &mut self.sums[cell * count..(cell + 1) * count]
+    }
+}
+
+/// A row of tiles of the pictures; `None` for kinds not asked for.
+#[derive(Debug, Default)]
+pub struct RowOut<'a> {
+    /// `[rows * width]` colours.
+    pub color: Option<&'a mut [[f32; 3]]>,
+    /// `[rows * width]` expected depths.
+    pub depth: Option<&'a mut [f32]>,
+    /// `[rows * width]` opacities.
+    pub alpha: Option<&'a mut [f32]>,
+    /// `[rows * width]` blended labels.
+    pub blend: Option<&'a mut [[f32; BLEND_WIDTH]]>,
+    /// Entries of the rows.
+    pub entries: Option<EntryRows>,
+}
+
+/// Place and size of a tile, pixels.
+#[derive(Clone, Copy, Debug)]
+pub struct Tile {
+    /// First column.
+    pub x: u32,
+    /// First row.
+    pub y: u32,
+    /// Columns inside the picture.
+    pub width: u32,
+    /// Rows inside the picture.
+    pub height: u32,
+}
+
+/// Blends the Gaussians `isects` (depth order) over the pixels of `tile`.
+///
+/// `picture_width` is the stride of `out`, which starts at the tile's first row.
+pub fn rasterize_tile(
+    footprints: &[Footprint],
+    isects: &[u64],
+    tile: Tile,
+    paint: &Paint<'_>,
+    picture_width: u32,
+    scratch: &mut TileScratch,
+    out: &mut RowOut<'_>,
+) {
+    if isects.is_empty() && paint.without != Some(Skip::EmptyTiles) {
+        return store_empty(tile, paint, picture_width, out);
+    }
+    if *paint.labels == Labels::Entries {
+        scratch.bins.open(isects, paint.index);
+    }
+    let work = Work { footprints, isects, tile, paint };
+    paint.width.run(Blend { work, scratch: &mut *scratch });
+    store(tile, paint, picture_width, scratch, out);
+}
+
+/// A tile and what falls on it.
+#[derive(Clone, Copy)]
+struct Work<'a> {
+    footprints: &'a [Footprint],
+    isects: &'a [u64],
+    tile: Tile,
+    paint: &'a Paint<'a>,
+}
+
+struct Blend<'a> {
+    work: Work<'a>,
+    scratch: &'a mut TileScratch,
+}
+
+impl Kernel for Blend<'_> {
+    /// The loop with the channels that the frame asks for: what is not wanted is not computed.
+    #[inline(always)]
+    fn run<S: Lanes>(self, simd: S) {
+        let Self { work, scratch } = self;
+        let [.., channels] = work.paint.layout();
+        let entries = *work.paint.labels == Labels::Entries;
+        match (channels, entries) {
+            (0, false) => blend::<S, 0, false>(simd, work, scratch),
+            (1, false) => blend::<S, 1, false>(simd, work, scratch),
+            (3, false) => blend::<S, 3, false>(simd, work, scratch),
+            (4, false) => blend::<S, 4, false>(simd, work, scratch),
+            (5, false) => blend::<S, 5, false>(simd, work, scratch),
+            (7, false) => blend::<S, 7, false>(simd, work, scratch),
+            (_, false) => blend::<S, CHANNELS, false>(simd, work, scratch),
+            (0, true) => blend::<S, 0, true>(simd, work, scratch),
+            (1, true) => blend::<S, 1, true>(simd, work, scratch),
+            (3, true) => blend::<S, 3, true>(simd, work, scratch),
+            (_, true) => blend::<S, 4, true>(simd, work, scratch),
+        }
+    }
+}
+
+#[inline(always)]
+fn blend<S: Lanes, const K: usize, const ENTRIES: bool>(
+    simd: S,
+    work: Work<'_>,
+    scratch: &mut TileScratch,
+) {
+    let by_parts = work.paint.without != Some(Skip::EllipseParts);
+    let ends = work.paint.without != Some(Skip::EndedRays);
+    let mut open = clear(&mut scratch.cells, work.tile);
+    for batch in work.isects.chunks(BATCH_SIZE) {
+        // Footprints lie far apart in memory: they are fetched in a loop so short that the
+        // processor waits for many at once.
+        let fetched = &mut scratch.fetched[..batch.len()];
+        for (fetched, &isect) in fetched.iter_mut().zip(batch) {
+            *fetched = work.footprints[radix_sort::value(isect) as usize];
+        }
+        let staged = &mut scratch.staged[..batch.len()];
+        for ((staged, footprint), &isect) in staged.iter_mut().zip(fetched).zip(batch) {
+            let id = radix_sort::value(isect) as usize;
+            let bin = match ENTRIES {
+                true => scratch.bins.bin_of[usize::from(work.paint.index[id])],
+                false => NO_BIN,
+            };
+            let channels = work.paint.channels(footprint, id);
+            *staged = stage(footprint, work.tile, channels, bin);
+        }
+        let groups = staged.chunks(GROUP).zip(&mut scratch.marks);
+        for (group, marks) in groups {
+            let mut met_by = [0_u16; GROUP];
+            for (bits, gaussian) in met_by.iter_mut().zip(group) {
+                *bits = if by_parts { met(simd, gaussian) } else { u16::MAX };
+            }
+            *marks = turned_over(&met_by);
+        }
+        let groups = batch.len().div_ceil(GROUP);
+        let mut cells = open;
+        while cells != 0 {
+            let at = cells.trailing_zeros() as usize;
+            cells &= cells - 1;
+            let marks = &scratch.marks[..groups];
+            let (cell, sums) = (&mut scratch.cells[at], scratch.bins.of_cell(at));
+            let mut goes_on = false;
+            for i in 0..PIXELS / S::F32_LANES {
+                let staged = &scratch.staged;
+                goes_on |=
+                    blend_cell::<S, K, ENTRIES>(simd, (at, i), ends, cell, staged, marks, sums);
+            }
+            if ends && !goes_on {
+                open &= !(1 << at);
+            }
+        }
+        if open == 0 {
+            break;
+        }
+    }
+}
+
+/// One row of bits for each cell: bit i tells of Gaussian i, whose bit c tells of cell c.
+#[inline(always)]
+fn turned_over(met_by: &[u16; GROUP]) -> [u64; CELLS] {
+    let mut marks = [0; CELLS];
+    for (block, met_by) in met_by.chunks_exact(8).enumerate() {
+        for half in 0..2 {
+            // 8 x 8 bits in a word, transposed by three exchanges (Hacker's Delight, 7-3).
+            let mut word = 0_u64;
+            for (i, bits) in met_by.iter().enumerate() {
+                word |= u64::from(bits >> (8 * half) & 0xff) << (8 * i);
+            }
+            for (shift, mask) in
+                [(7, 0x00aa_00aa_00aa_00aa), (14, 0x0000_cccc_0000_cccc), (28, 0xf0f0_f0f0)]
+            {
+                let t = (word ^ word >> shift) & mask;
+                word ^= t ^ t << shift;
+            }
+            for k in 0..8 {
+                marks[8 * half + k] |= (word >> (8 * k) & 0xff) << (8 * block);
+            }
+        }
+    }
+    marks
+}
+
+/// Clears the cells; one bit for each that has pixels inside the picture. Pixels outside have
+/// ended.
+fn clear(cells: &mut [Cell; CELLS], tile: Tile) -> u32 {
+    cells.fill(Cell::CLEAR);
+    let mut open = (1 << CELLS) - 1;
+    if (tile.width, tile.height) == (TILE_SIZE, TILE_SIZE) {
+        return open;
+    }
+    for (i, cell) in cells.iter_mut().enumerate() {
+        for (pixel, transmittance) in cell.transmittance.0.iter_mut().enumerate() {
+            let (x, y) = place(i, pixel);
+            if x >= tile.width as usize || y >= tile.height as usize {
+                *transmittance = 0.0;
+            }
+        }
+        if cell.transmittance == Numbers::ZERO {
+            open &= !(1 << i);
+        }
+    }
+    open
+}
+
+/// Column and row in the tile of a pixel of a cell.
+#[inline(always)]
+const fn place(cell: usize, pixel: usize) -> (usize, usize) {
+    (cell % ACROSS * CELL + pixel % CELL, cell / ACROSS * CELL + pixel / CELL)
+}
+
+/// A footprint as a tile needs it. f64, narrowed where nothing is large any more.
+#[inline(always)]
+fn stage(footprint: &Footprint, tile: Tile, channels: [f32; CHANNELS], bin: u32) -> Staged {
+    let half = f64::from(TILE_SIZE) / 2.0;
+    let x = footprint.mean[0] - (f64::from(tile.x) + half);
+    let y = footprint.mean[1] - (f64::from(tile.y) + half);
+    let ux = f64::from(footprint.inv_sx) * SQRT_LOG2_E;
+    let vy = f64::from(footprint.inv_sy) * SQRT_LOG2_E;
+    Staged {
+        ux: ux as f32,
+        uy: (-ux * footprint.slope) as f32,
+        u0: (-ux * (x - footprint.slope * y)) as f32,
+        vy: vy as f32,
+        v0: (-vy * y) as f32,
+        reach: footprint.reach * std::f32::consts::LOG2_E + REACH_SLACK,
+        opacity: footprint.opacity,
+        channels,
+        bin,
+    }
+}
+
+/// One bit for each cell that the ellipse may meet.
+///
+/// Over a cell u and v stay within a box, whose distance from 0 is compared with the reach.
+#[inline(always)]
+fn met<S: Lanes>(simd: S, gaussian: &Staged) -> u16 {
+    let mut bits = 0;
+    let half = (CELL - 1) as f32 / 2.0;
+    let wide = simd.splat_f32s(half * (gaussian.ux.abs() + gaussian.uy.abs()));
+    let tall = simd.splat_f32s(half * gaussian.vy);
+    let zero = simd.splat_f32s(0.0);
+    for i in 0..CELLS / S::F32_LANES {
+        let (x, y) = (CELL_X.at(simd, i), CELL_Y.at(simd, i));
+        let (u, v) = along_axes(simd, gaussian, x, y);
+        let du = simd.max_f32s(simd.sub_f32s(simd.abs_f32s(u), wide), zero);
+        let dv = simd.max_f32s(simd.sub_f32s(simd.abs_f32s(v), tall), zero);
+        let nearest = simd.fused(du, du, simd.mul_f32s(dv, dv));
+        let near = simd.less_than_or_equal_f32s(nearest, simd.splat_f32s(gaussian.reach));
+        bits |= simd.bits(near) << (i * S::F32_LANES);
+    }
+    bits as u16
+}
+
+/// u and v at places from the middle of the tile.
+#[inline(always)]
+fn along_axes<S: Lanes>(simd: S, gaussian: &Staged, x: S::f32s, y: S::f32s) -> (S::f32s, S::f32s) {
+    let u = simd.fused(y, simd.splat_f32s(gaussian.uy), simd.splat_f32s(gaussian.u0));
+    let u = simd.fused(x, simd.splat_f32s(gaussian.ux), u);
+    let v = simd.fused(y, simd.splat_f32s(gaussian.vy), simd.splat_f32s(gaussian.v0));
+    (u, v)
+}
+
+/// Blends what marked cell `at` into vector `i` of it: K channels, and their bins; whether some
+/// ray goes on. It stops where none does if `ends`.
+#[inline(always)]
+fn blend_cell<S: Lanes, const K: usize, const ENTRIES: bool>(
+    simd: S,
+    (at, i): (usize, usize),
+    ends: bool,
+    cell: &mut Cell,
+    staged: &[Staged],
+    marks: &[[u64; CELLS]],
+    sums: &mut [Numbers],
+) -> bool {
+    let zero = simd.splat_f32s(0.0);
+    let end = simd.splat_f32s(TRANSMITTANCE_MIN);
+    let x = simd.add_f32s(PIXEL_X.at(simd, i), simd.splat_f32s(CELL_X.0[at]));
+    let y = simd.add_f32s(PIXEL_Y.at(simd, i), simd.splat_f32s(CELL_Y.0[at]));
+    let mut transmittance = cell.transmittance.at(simd, i);
+    let mut alpha_sum = cell.alpha.at(simd, i);
+    let mut channels = [zero; K];
+    for (channel, sum) in channels.iter_mut().zip(&cell.channels) {
+        *channel = sum.at(simd, i);
+    }
+    let mut goes_on = true;
+    'all: for (group, marks) in marks.iter().enumerate() {
+        let mut bits = marks[at];
+        while bits != 0 {
+            let gaussian = &staged[group * GROUP + bits.trailing_zeros() as usize];
+            bits &= bits - 1;
+            let (u, v) = along_axes(simd, gaussian, x, y);
+            let power = simd.fused(u, u, simd.mul_f32s(v, v));
+            let alpha = simd.mul_f32s(exp2_neg(simd, power), simd.splat_f32s(gaussian.opacity));
+            let alpha = simd.min_f32s(alpha, simd.splat_f32s(ALPHA_MAX));
+            let counts = simd.less_than_or_equal_f32s(simd.splat_f32s(ALPHA_MIN), alpha);
+            let alpha = simd.select_f32s(counts, alpha, zero);
+            let next = simd.mul_f32s(transmittance, simd.sub_f32s(simd.splat_f32s(1.0), alpha));
+            // The Gaussian that would end the ray is not added; an ended ray stays at 0.
+            let lives = simd.greater_than_f32s(next, end);
+            let weight = simd.select_f32s(lives, simd.mul_f32s(alpha, transmittance), zero);
+            transmittance = simd.select_f32s(lives, next, zero);
+            alpha_sum = simd.add_f32s(alpha_sum, weight);
+            for (sum, &value) in channels.iter_mut().zip(&gaussian.channels) {
+                *sum = simd.fused(weight, simd.splat_f32s(value), *sum);
+            }
+            if ENTRIES && let Some(sum) = sums.get_mut(gaussian.bin as usize) {
+                sum.put(simd, i, simd.add_f32s(sum.at(simd, i), weight));
+            }
+            if simd.bits(lives) == 0 && ends {
+                goes_on = false;
+                break 'all;
+            }
+        }
+    }
+    cell.transmittance.put(simd, i, transmittance);
+    cell.alpha.put(simd, i, alpha_sum);
+    for (channel, sum) in channels.into_iter().zip(&mut cell.channels) {
+        sum.put(simd, i, channel);
+    }
+    goes_on
+}
+
+/// Writes a tile that nothing falls on.
+fn store_empty(tile: Tile, paint: &Paint<'_>, picture_width: u32, out: &mut RowOut<'_>) {
+    for row in 0..tile.height as usize {
+        let first = row * picture_width as usize + tile.x as usize;
+        let pixels = first..first + tile.width as usize;
+        if let Some(color) = &mut out.color {
+            color[pixels.clone()].fill(paint.background);
+        }
+        for plane in [&mut out.depth, &mut out.alpha].into_iter().flatten() {
+            plane[pixels.clone()].fill(0.0);
+        }
+        if let Some(blend) = &mut out.blend {
+            blend[pixels].fill([0.0; BLEND_WIDTH]);
+        }
+    }
+}
+
+/// Writes every pixel of the tile, colour blended over the background.
+fn store(
+    tile: Tile,
+    paint: &Paint<'_>,
+    picture_width: u32,
+    scratch: &TileScratch,
+    out: &mut RowOut<'_>,
+) {
+    let [depth_at, label_at, _] = paint.layout();
+    for row in 0..tile.height as usize {
+        for column in 0..tile.width as usize {
+            let at = row * picture_width as usize + tile.x as usize + column;
+            let cell = &scratch.cells[row / CELL * ACROSS + column / CELL];
+            let pixel = row % CELL * CELL + column % CELL;
+            let alpha = cell.alpha.0[pixel].min(1.0);
+            if let Some(color) = &mut out.color {
+                color[at] = std::array::from_fn(|channel| {
+                    cell.channels[channel].0[pixel] + (1.0 - alpha) * paint.background[channel]
+                });
+            }
+            if let Some(depth) = &mut out.depth {
+                let sum = cell.channels[depth_at].0[pixel];
+                depth[at] = if alpha > 0.0 { sum / cell.alpha.0[pixel] } else { 0.0 };
+            }
+            if let Some(out) = &mut out.alpha {
+                out[at] = alpha;
+            }
+            if let Some(blend) = &mut out.blend {
+                blend[at] = std::array::from_fn(|k| cell.channels[label_at + k].0[pixel]);
+            }
+        }
+    }
+    if let Some(entries) = &mut out.entries {
+        store_entries(tile, &scratch.bins, entries);
+    }
+}
+
+/// Writes the bins over 0 of every pixel.
+fn store_entries(tile: Tile, bins: &Bins, entries: &mut EntryRows) {
+    let count = bins.present.len();
+    if count == 0 {
+        return;
+    }
+    for row in 0..tile.height as usize {
+        for column in 0..tile.width as usize {
+            let cell = row / CELL * ACROSS + column / CELL;
+            let pixel = row % CELL * CELL + column % CELL;
+            let sums = &bins.sums[cell * count..(cell + 1) * count];
+            for (label, sum) in bins.present.iter().zip(sums) {
+                if sum.0[pixel] > 0.0 {
+                    entries.push(tile.x as usize + column, row, *label, sum.0[pixel]);
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn turned_over_marks_tell_the_same() {
+        let mut random = 9_u32;
+        let met_by: [u16; GROUP] = std::array::from_fn(|_| {
+            random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (random >> 13) as u16
+        });
+        let marks = turned_over(&met_by);
+        for (gaussian, bits) in met_by.iter().enumerate() {
+            for (cell, marks) in marks.iter().enumerate() {
+                let (want, got) = (bits >> cell & 1 == 1, marks >> gaussian & 1 == 1);
+                assert_eq!(got, want, "Gaussian {gaussian}, cell {cell}");
+            }
+        }
+    }
+}

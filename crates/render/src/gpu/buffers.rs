@@ -1,0 +1,343 @@
+//! What crosses the border to the shaders: `repr(C)` twins of shaders/common/structs.wgsl, buffers
+//! that grow, and the scenes kept on the device.
+
+use bytemuck::{Pod, Zeroable};
+use glam::DVec3;
+use wgpu::BufferUsages;
+
+use super::device::Gpu;
+use crate::{
+    error::{Error, ErrorCode, Result},
+    scene::Gaussians,
+    view::View,
+};
+
+/// `View` of the shaders: camera of one frame and the band of tile rows to draw.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
+pub struct ViewRow {
+    pub rotation_x: [f32; 4],
+    pub rotation_y: [f32; 4],
+    pub rotation_z: [f32; 4],
+    pub rotation_z_low: [f32; 4],
+    pub center: [f32; 4],
+    pub center_low: [f32; 4],
+    pub background: [f32; 4],
+    pub focal: [f32; 2],
+    pub principal: [f32; 2],
+    pub slope_min: [f32; 2],
+    pub slope_max: [f32; 2],
+    pub near: f32,
+    pub width: u32,
+    pub height: u32,
+    pub tiles_x: u32,
+    pub tiles_y: u32,
+    pub row_start: u32,
+    pub row_end: u32,
+    pub gaussian_count: u32,
+    pub sh_count: u32,
+    pub antialiased: u32,
+    pub isect_capacity: u32,
+    pub zero: u32,
+    pub color_start: u32,
+    pub depth_start: u32,
+    pub alpha_start: u32,
+    pub blend_start: u32,
+    pub label_rows: u32,
+    pub table_start: u32,
+    pub entry_slots: u32,
+    pub slot_start: u32,
+    pub range_start: u32,
+    pub pair_start: u32,
+    pub fast: u32,
+    pub reserved: u32,
+}
+
+/// `Gaussian` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
+pub struct GaussianRow {
+    pub mean: [f32; 3],
+    pub opacity: f32,
+    pub quat: [f32; 4],
+    pub scale: [f32; 3],
+    pub reserved: f32,
+}
+
+/// `Footprint` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
+pub struct FootprintRow {
+    pub mean: [f32; 2],
+    pub slope: f32,
+    pub inv_sx: f32,
+    pub inv_sy: f32,
+    pub reach: f32,
+    pub opacity: f32,
+    pub depth: f32,
+}
+
+/// `Plan` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
+#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
+pub struct PlanRow {
+    pub isects: u32,
+    pub needed: u32,
+    pub visible: u32,
+    pub sorted: u32,
+    pub key_min: u32,
+    pub key_max: u32,
+    pub passes: u32,
+    pub reserved: u32,
+}
+
+impl Default for PlanRow {
+    /// Before the first stage.
+    fn default() -> Self {
+        Self { key_min: u32::MAX, ..Self::zeroed() }
+    }
+}
+
+/// `SortParams` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
+pub struct SortParams {
+    pub shift: u32,
+    pub pass_at: u32,
+    pub by_tile: u32,
+    pub reserved: u32,
+}
+
+const _: () = assert!(size_of::<ViewRow>().is_multiple_of(16), "a uniform block");
+const _: () = assert!(size_of::<GaussianRow>() == 48, "three rows of four");
+const _: () = assert!(size_of::<FootprintRow>() == 32, "two rows of four");
+
+impl ViewRow {
+    /// The whole picture of `view`; the caller sets band, capacity and picture starts.
+    #[must_use]
+    pub fn new(view: &View, background: [f32; 3], antialiased: bool) -> Self {
+        let rotation = view.rotation;
+        let (rx, ry, rz) = (rotation.row(0), rotation.row(1), rotation.row(2));
+        let high = |v: glam::DVec3| v.as_vec3();
+        let low = |v: glam::DVec3| (v - v.as_vec3().as_dvec3()).as_vec3();
+        let row = |v: glam::Vec3| [v.x, v.y, v.z, 0.0];
+        let narrow = |v: [f64; 2]| v.map(|value| value as f32);
+        Self {
+            rotation_x: row(high(rx)),
+            rotation_y: row(high(ry)),
+            rotation_z: row(high(rz)),
+            rotation_z_low: row(low(rz)),
+            center: row(high(view.center)),
+            center_low: row(low(view.center)),
+            background: [background[0], background[1], background[2], 0.0],
+            focal: narrow(view.focal),
+            principal: narrow(view.principal),
+            slope_min: narrow(view.slope_min),
+            slope_max: narrow(view.slope_max),
+            near: view.near as f32,
+            width: view.width,
+            height: view.height,
+            tiles_x: view.tiles_x(),
+            tiles_y: view.tiles_y(),
+            row_start: 0,
+            row_end: view.tiles_y(),
+            antialiased: u32::from(antialiased),
+            ..Self::zeroed()
+        }
+    }
+}
+
+/// A buffer that is made again when it is too small. Its contents mean nothing between frames.
+#[derive(Debug)]
+pub(super) struct Slot {
+    label: &'static str,
+    usage: BufferUsages,
+    buffer: Option<wgpu::Buffer>,
+}
+
+impl Slot {
+    pub(super) const fn new(label: &'static str, usage: BufferUsages) -> Self {
+        Self { label, usage, buffer: None }
+    }
+
+    /// A storage buffer.
+    pub(super) const fn storage(label: &'static str) -> Self {
+        let copied = BufferUsages::COPY_SRC.union(BufferUsages::COPY_DST);
+        Self::new(label, BufferUsages::STORAGE.union(copied))
+    }
+
+    /// The buffer, at least `size_bytes` long.
+    ///
+    /// # Errors
+    /// `limit_exceeded` when the adapter cannot hold or bind as much.
+    pub(super) fn ensure(&mut self, gpu: &Gpu, size_bytes: u64) -> Result<wgpu::Buffer> {
+        if let Some(buffer) = &self.buffer
+            && buffer.size() >= size_bytes
+        {
+            return Ok(buffer.clone());
+        }
+        // Freed before its successor is asked for.
+        self.buffer = None;
+        let buffer = gpu.create_buffer(self.label, size_bytes, self.usage)?;
+        self.buffer = Some(buffer.clone());
+        Ok(buffer)
+    }
+}
+
+/// Gaussians on the device.
+#[derive(Clone, Debug)]
+pub(super) struct Scene {
+    shape: u64,
+    /// Number of Gaussians.
+    pub(super) count: u32,
+    /// Coefficients a Gaussian.
+    pub(super) sh_count: u32,
+    /// `[N]` of [`GaussianRow`].
+    pub(super) gaussians: wgpu::Buffer,
+    /// `[N, K, 3]` f32.
+    pub(super) sh: wgpu::Buffer,
+    /// Least and largest mean by axis, relative to the origin.
+    pub(super) bounds: [DVec3; 2],
+    /// Uploaded when labels are first asked for.
+    labels: Option<SceneLabels>,
+}
+
+/// Bank indices on the device.
+#[derive(Clone, Debug)]
+pub(super) struct SceneLabels {
+    identity: u64,
+    /// `[N]` u16, two a word.
+    pub(super) index: wgpu::Buffer,
+    /// Different indices but 0: no pixel sees more.
+    pub(super) distinct: u32,
+}
+
+impl SceneLabels {
+    fn upload(gpu: &Gpu, source: &Gaussians) -> Result<Self> {
+        let index = source.semantic_index();
+        let mut seen = vec![false; 1 << u16::BITS];
+        index.iter().for_each(|&m| seen[usize::from(m)] = true);
+        let distinct = seen[1..].iter().filter(|seen| **seen).count() as u32;
+        // Uploads are whole words.
+        let mut padded = index.to_vec();
+        padded.resize(index.len().next_multiple_of(2), 0);
+        let index = gpu.upload("bank indices", bytemuck::cast_slice(&padded))?;
+        Ok(Self { identity: source.identity(), index, distinct })
+    }
+}
+
+impl Scene {
+    fn size_bytes(&self) -> u64 {
+        let labels = self.labels.as_ref().map_or(0, |labels| labels.index.size());
+        self.gaussians.size() + self.sh.size() + labels
+    }
+
+    fn upload(gpu: &Gpu, source: &Gaussians) -> Result<Self> {
+        let rows: Vec<GaussianRow> = (0..source.len())
+            .map(|i| GaussianRow {
+                mean: source.means()[i],
+                opacity: source.opacities()[i],
+                quat: source.quats()[i],
+                scale: source.scales()[i],
+                reserved: 0.0,
+            })
+            .collect();
+        let means = || source.means().iter().map(|mean| glam::Vec3::from(*mean).as_dvec3());
+        Ok(Self {
+            shape: source.shape_identity(),
+            bounds: [
+                means().reduce(DVec3::min).unwrap_or_default(),
+                means().reduce(DVec3::max).unwrap_or_default(),
+            ],
+            count: narrow("gaussians", source.len())?,
+            sh_count: source.sh_count() as u32,
+            gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows))?,
+            sh: gpu.upload("sh", bytemuck::cast_slice(source.sh()))?,
+            labels: None,
+        })
+    }
+}
+
+/// Scenes kept on the device, most recently drawn last.
+#[derive(Debug)]
+pub(super) struct SceneCache {
+    scenes: Vec<Scene>,
+    bytes_max: u64,
+}
+
+impl SceneCache {
+    pub(super) fn new(bytes_max: u64) -> Self {
+        Self { scenes: Vec::new(), bytes_max }
+    }
+
+    /// The scene of `source`, uploaded once; others leave, least recently drawn first.
+    ///
+    /// # Errors
+    /// `limit_exceeded` when the scene does not fit the adapter's limits or memory.
+    pub(super) fn get(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<Scene> {
+        let shape = source.shape_identity();
+        if let Some(at) = self.scenes.iter().position(|scene| scene.shape == shape) {
+            let scene = self.scenes.remove(at);
+            self.scenes.push(scene.clone());
+            return Ok(scene);
+        }
+        let scene = match Scene::upload(gpu, source) {
+            // Memory may be held by the other scenes: once without them.
+            Err(error) if error.code() == ErrorCode::LimitExceeded && !self.scenes.is_empty() => {
+                self.scenes.clear();
+                gpu.forget();
+                Scene::upload(gpu, source)?
+            }
+            other => other?,
+        };
+        let held = |scenes: &[Scene]| scenes.iter().map(Scene::size_bytes).sum::<u64>();
+        while !self.scenes.is_empty() && held(&self.scenes) + scene.size_bytes() > self.bytes_max {
+            self.scenes.remove(0);
+            gpu.forget();
+        }
+        self.scenes.push(scene.clone());
+        Ok(scene)
+    }
+
+    /// The bank indices of `source`, uploaded once, and alone when they are all that changed.
+    ///
+    /// # Errors
+    /// As [`Self::get`].
+    pub(super) fn labels(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<SceneLabels> {
+        let shape = source.shape_identity();
+        let scene = self.scenes.iter_mut().find(|scene| scene.shape == shape);
+        let held = scene.as_ref().and_then(|scene| scene.labels.as_ref());
+        if let Some(labels) = held.filter(|labels| labels.identity == source.identity()) {
+            return Ok(labels.clone());
+        }
+        let labels = SceneLabels::upload(gpu, source)?;
+        if let Some(scene) = scene {
+            scene.labels = Some(labels.clone());
+        }
+        Ok(labels)
+    }
+
+    /// What tells the scenes held.
+    pub(super) fn shapes(&self) -> Vec<u64> {
+        self.scenes.iter().map(|scene| scene.shape).collect()
+    }
+
+    /// Gives up all scenes.
+    pub(super) fn clear(&mut self, gpu: &Gpu) {
+        self.scenes.clear();
+        gpu.forget();
+    }
+}
+
+/// Narrows a count that the limits keep under 2³².
+///
+/// # Errors
+/// `limit_exceeded` with `what` and the count.
+pub(super) fn narrow(what: &str, count: usize) -> Result<u32> {
+    u32::try_from(count).map_err(|_| Error::limit(what, count, u32::MAX))
+}

@@ -1,0 +1,350 @@
+//! Adapters: which there are, which is taken, and a device whose faults become errors.
+//!
+//! A software adapter (llvmpipe, lavapipe, `SwiftShader`) is taken only when asked for by name.
+
+use std::sync::{
+    Arc, Mutex, PoisonError,
+    atomic::{AtomicBool, AtomicU64, Ordering},
+};
+
+use wgpu::{BufferUsages, ErrorFilter};
+
+use super::profile;
+use crate::{
+    error::{Error, ErrorCode, Result},
+    select::AdapterReport,
+};
+
+/// Names under which software adapters go; their device type is not always honest.
+const SOFTWARE_NAMES: [&str; 5] =
+    ["llvmpipe", "lavapipe", "swiftshader", "softpipe", "basic render driver"];
+
+/// Bytes handed to the queue at once: its staging copy is as large.
+const UPLOAD_CHUNK: usize = 32 << 20;
+
+/// Storage buffers a stage that the kernels need.
+const STORAGE_BUFFERS: u32 = 7;
+/// Bytes of workgroup storage that the kernels need.
+const WORKGROUP_BYTES: u32 = 16 << 10;
+
+/// Describes every adapter that `backends` offer, in their order.
+fn list(backends: wgpu::Backends) -> Vec<(wgpu::Adapter, AdapterReport)> {
+    let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
+        backends,
+        // The kernels size their own dispatches within the limits: wgpu need not look at each.
+        flags: wgpu::InstanceFlags::from_build_config()
+            .difference(wgpu::InstanceFlags::VALIDATION_INDIRECT_CALL),
+        ..wgpu::InstanceDescriptor::new_without_display_handle()
+    });
+    pollster::block_on(instance.enumerate_adapters(backends))
+        .into_iter()
+        .map(|adapter| {
+            let report = describe(&adapter.get_info());
+            (adapter, report)
+        })
+        .collect()
+}
+
+fn describe(info: &wgpu::AdapterInfo) -> AdapterReport {
+    let text = format!("{} {} {}", info.name, info.driver, info.driver_info).to_lowercase();
+    let software = info.device_type == wgpu::DeviceType::Cpu
+        || SOFTWARE_NAMES.iter().any(|name| text.contains(name));
+    AdapterReport {
+        name: info.name.clone(),
+        kind: format!("{:?}", info.device_type),
+        backend: info.backend.to_string(),
+        driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+        software,
+        chosen: false,
+    }
+}
+
+/// How good an unnamed adapter is; `None` for one that is never taken unasked.
+fn rank(report: &AdapterReport, adapter: &wgpu::Adapter) -> Option<u32> {
+    if report.software {
+        return None;
+    }
+    match adapter.get_info().device_type {
+        wgpu::DeviceType::DiscreteGpu => Some(0),
+        wgpu::DeviceType::IntegratedGpu => Some(1),
+        wgpu::DeviceType::VirtualGpu => Some(2),
+        wgpu::DeviceType::Other | wgpu::DeviceType::Cpu => None,
+    }
+}
+
+/// Adapters found, and those taken, the best first: by parts of their names, else all hardware
+/// ones.
+///
+/// OpenGL is looked at only for a named adapter: it is never better than the others.
+pub(super) fn choose(
+    name: Option<&str>,
+) -> (Vec<AdapterReport>, Result<Vec<(wgpu::Adapter, AdapterReport)>>) {
+    let mut found = list(wgpu::Backends::VULKAN | wgpu::Backends::METAL | wgpu::Backends::DX12);
+    let mut taken = pick(&found, name);
+    if taken.is_empty() && name.is_some() {
+        found.extend(list(wgpu::Backends::GL));
+        taken = pick(&found, name);
+    }
+    taken.iter().for_each(|&at| found[at].1.chosen = true);
+    let reports: Vec<_> = found.iter().map(|(_, report)| report.clone()).collect();
+    if !taken.is_empty() {
+        let chosen = taken.into_iter().map(|at| found[at].clone()).collect();
+        return (reports, Ok(chosen));
+    }
+    let names: Vec<_> = reports.iter().map(|report| format!("{:?}", report.name)).collect();
+    let seen = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
+    let message = match name {
+        Some(name) => format!("no GPU adapter has {name:?} in its name; there are: {seen}"),
+        None => format!(
+            "no hardware GPU adapter; there are: {seen}. A software one must be named by `adapter`"
+        ),
+    };
+    (reports, Err(Error::new(ErrorCode::GpuUnavailable, message)))
+}
+
+/// Places of the adapters to use. `name` may hold several names, with commas between.
+fn pick(found: &[(wgpu::Adapter, AdapterReport)], name: Option<&str>) -> Vec<usize> {
+    let Some(names) = name else {
+        let ranked = |at: usize| rank(&found[at].1, &found[at].0).map(|rank| (rank, at));
+        let mut ranked: Vec<_> = (0..found.len()).filter_map(ranked).collect();
+        ranked.sort_unstable();
+        return ranked.into_iter().map(|(_, at)| at).collect();
+    };
+    let mut taken = Vec::new();
+    for name in names.split(',').map(|name| name.trim().to_lowercase()) {
+        let name = match name.as_str() {
+            "" => continue,
+            // Mesa's Vulkan driver of that name calls its adapter llvmpipe.
+            "lavapipe" => "llvmpipe",
+            name => name,
+        };
+        let called = |at: &usize| found[*at].1.name.to_lowercase().contains(name);
+        let new: Vec<_> =
+            (0..found.len()).filter(called).filter(|at| !taken.contains(at)).collect();
+        taken.extend(new);
+    }
+    taken
+}
+
+/// What went wrong outside of any error scope.
+#[derive(Debug, Default)]
+struct Faults {
+    lost: AtomicBool,
+    message: Mutex<Option<String>>,
+}
+
+impl Faults {
+    fn report(&self, message: String) {
+        self.message.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(message);
+    }
+}
+
+/// A device and its queue. Nothing that goes wrong on it ends the process. Clones are the same
+/// device.
+#[derive(Clone, Debug)]
+pub(super) struct Gpu {
+    pub(super) device: wgpu::Device,
+    pub(super) queue: wgpu::Queue,
+    /// Bytes one storage binding may span.
+    pub(super) binding_bytes_max: u64,
+    /// Whether it takes the times of its stages.
+    pub(super) has_times: bool,
+    /// Buffers made so far.
+    generation: Arc<AtomicU64>,
+    faults: Arc<Faults>,
+}
+
+impl Gpu {
+    /// Opens a device with all that the adapter allows, or with WebGPU's portable floor.
+    ///
+    /// # Errors
+    /// `gpu_unavailable` when the adapter refuses or is under what the kernels need.
+    pub(super) fn open(adapter: &wgpu::Adapter, portable: bool) -> Result<Self> {
+        let offered = adapter.limits();
+        for (what, has, needs) in [
+            (
+                "storage buffers a stage",
+                offered.max_storage_buffers_per_shader_stage,
+                STORAGE_BUFFERS,
+            ),
+            ("invocations a workgroup", offered.max_compute_invocations_per_workgroup, 256),
+            (
+                "bytes of workgroup storage",
+                offered.max_compute_workgroup_storage_size,
+                WORKGROUP_BYTES,
+            ),
+            ("workgroups a dimension", offered.max_compute_workgroups_per_dimension, 65_535),
+        ] {
+            if has < needs {
+                return Err(Error::new(
+                    ErrorCode::GpuUnavailable,
+                    format!("the GPU adapter has {has} {what}; {needs} are needed"),
+                ));
+            }
+        }
+        let limits = if portable { wgpu::Limits::default() } else { offered };
+        let binding_bytes_max =
+            limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) & !0xff;
+        let has_times = adapter.features().contains(profile::FEATURES);
+        let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+            label: Some("segsplat"),
+            required_features: (profile::FEATURES | wgpu::Features::SUBGROUP) & adapter.features(),
+            required_limits: limits,
+            ..Default::default()
+        }))
+        .map_err(|e| {
+            Error::new(ErrorCode::GpuUnavailable, "the GPU adapter refused a device").caused_by(e)
+        })?;
+        let faults = Arc::new(Faults::default());
+        let uncaptured = Arc::clone(&faults);
+        device.on_uncaptured_error(Arc::new(move |error| uncaptured.report(error.to_string())));
+        let lost = Arc::clone(&faults);
+        device.set_device_lost_callback(move |reason, message| {
+            if reason != wgpu::DeviceLostReason::Destroyed {
+                lost.lost.store(true, Ordering::Release);
+                lost.report(message);
+            }
+        });
+        let generation = Arc::default();
+        Ok(Self { device, queue, binding_bytes_max, has_times, generation, faults })
+    }
+
+    /// Tells when a buffer was made or given up: what was made of buffers is to be made anew.
+    pub(super) fn generation(&self) -> u64 {
+        self.generation.load(Ordering::Acquire)
+    }
+
+    /// Says that buffers are no longer wanted, see [`Self::generation`].
+    pub(super) fn forget(&self) {
+        self.generation.fetch_add(1, Ordering::AcqRel);
+    }
+
+    /// Whether the device is gone for good.
+    pub(super) fn is_lost(&self) -> bool {
+        self.faults.lost.load(Ordering::Acquire)
+    }
+
+    /// Has everyone who uses the device see it lost. It is not destroyed: someone may be reading
+    /// its memory.
+    pub(super) fn lose(&self) {
+        self.faults.lost.store(true, Ordering::Release);
+        self.faults.report("lost on purpose".to_owned());
+    }
+
+    /// Declares the device gone: it did not answer.
+    pub(super) fn give_up(&self, message: String) -> Error {
+        self.faults.lost.store(true, Ordering::Release);
+        Error::new(ErrorCode::GpuUnavailable, message)
+    }
+
+    /// What was reported outside of any scope since the last call.
+    ///
+    /// # Errors
+    /// `gpu_unavailable` when the device is lost, `internal` for any other fault.
+    pub(super) fn check(&self) -> Result<()> {
+        let message = self.faults.message.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if self.is_lost() {
+            return Err(Error::new(ErrorCode::GpuUnavailable, "the GPU device was lost")
+                .caused_by(message.unwrap_or_default()));
+        }
+        match message {
+            Some(message) => Err(Error::internal("the GPU reported an error").caused_by(message)),
+            None => Ok(()),
+        }
+    }
+
+    /// Runs `work` inside error scopes, so that its faults are its own.
+    ///
+    /// # Errors
+    /// `limit_exceeded` when memory ran out, `gpu_unavailable` when the device is lost, `internal`
+    /// otherwise; the message begins with `what`.
+    pub(super) fn scoped<T>(&self, what: &str, work: impl FnOnce() -> T) -> Result<T> {
+        let memory = self.device.push_error_scope(ErrorFilter::OutOfMemory);
+        let validation = self.device.push_error_scope(ErrorFilter::Validation);
+        let internal = self.device.push_error_scope(ErrorFilter::Internal);
+        let value = work();
+        let internal = pollster::block_on(internal.pop());
+        let validation = pollster::block_on(validation.pop());
+        let memory = pollster::block_on(memory.pop());
+        self.check()?;
+        if let Some(error) = memory {
+            return Err(Error::new(
+                ErrorCode::LimitExceeded,
+                format!("{what}: the GPU's memory is used up"),
+            )
+            .caused_by(error));
+        }
+        match internal.or(validation) {
+            Some(error) => {
+                Err(Error::internal(format!("{what}: the GPU reported an error")).caused_by(error))
+            }
+            None => Ok(value),
+        }
+    }
+
+    /// A buffer of `size_bytes`, rounded up to 256.
+    ///
+    /// # Errors
+    /// `limit_exceeded` when the adapter cannot bind as much or its memory is used up.
+    pub(super) fn create_buffer(
+        &self,
+        label: &'static str,
+        size_bytes: u64,
+        usage: BufferUsages,
+    ) -> Result<wgpu::Buffer> {
+        let size = size_bytes.max(1).next_multiple_of(256);
+        if size > self.binding_bytes_max {
+            return Err(Error::limit(
+                format_args!("bytes of {label} on this GPU adapter"),
+                size,
+                self.binding_bytes_max,
+            ));
+        }
+        self.forget();
+        self.scoped(label, || {
+            self.device.create_buffer(&wgpu::BufferDescriptor {
+                label: Some(label),
+                size,
+                usage,
+                mapped_at_creation: false,
+            })
+        })
+    }
+
+    /// A storage buffer that holds `bytes`.
+    ///
+    /// # Errors
+    /// As [`Self::create_buffer`].
+    pub(super) fn upload(&self, label: &'static str, bytes: &[u8]) -> Result<wgpu::Buffer> {
+        let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST | BufferUsages::COPY_SRC;
+        let buffer = self.create_buffer(label, bytes.len() as u64, usage)?;
+        self.scoped(label, || {
+            for (chunk, bytes) in bytes.chunks(UPLOAD_CHUNK).enumerate() {
+                self.queue.write_buffer(&buffer, (chunk * UPLOAD_CHUNK) as u64, bytes);
+                self.queue.submit([]);
+            }
+        })?;
+        Ok(buffer)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_unknown_name_is_refused_with_what_there_is() {
+        let (_, chosen) = choose(Some("no such adapter"));
+        let error = chosen.expect_err("nothing is called so");
+        assert_eq!(error.code(), ErrorCode::GpuUnavailable, "{error}");
+        assert!(error.message().contains("no such adapter"), "{error}");
+    }
+
+    #[test]
+    fn software_is_never_taken_unasked() {
+        let (_, chosen) = choose(None);
+        for (_, report) in chosen.into_iter().flatten() {
+            assert!(!report.software, "{report:?} was taken without being named");
+        }
+    }
+}

@@ -1,0 +1,536 @@
+//! One submission: the views of a batch, the room for their Gaussian-tile pairs, their pictures
+//! read back; and the bands of a view that does not fit at once.
+
+use std::ops::Range;
+
+use bytemuck::Pod;
+use rayon::prelude::*;
+
+use super::{
+    buffers::{PlanRow, Scene, SceneLabels, ViewRow},
+    device::Gpu,
+    pipelines::{FAST_KEY_BITS, Kernels, NO_PICTURE},
+    profile::Marks,
+    readback,
+    recorder::{
+        DIGIT_BITS, DIGITS_MAX, LabelBuffers, Recorder, SceneBuffers, sorted_half, tile_bits,
+    },
+    scratch::{ENTRY_SLOTS_MIN, Need, Scratch},
+};
+use crate::{
+    Entries, Frame, FrameStats, Kinds, Labels, Quality, RenderRequest, StageTime,
+    constants::TILE_SIZE,
+    error::{Error, Result},
+    labels::{BLEND_WIDTH, EntryRows},
+    view::View,
+};
+
+/// Fewest Gaussian-tile pairs that room is made for.
+const ISECT_CAPACITY_MIN: u32 = 1 << 16;
+/// Times a band is drawn: the first may lack room, the second knows what it needs.
+const ATTEMPTS_MAX: u32 = 3;
+/// How much more room for entries is made when it does not suffice.
+const ENTRY_SLOTS_GROWTH: u32 = 4;
+/// Bytes of a tile pair: key and Gaussian, each in two halves.
+const PAIR_BYTES_A_BUFFER: u64 = 8;
+const PLAN_BYTES: u64 = size_of::<PlanRow>() as u64;
+/// From so many bytes on a picture is copied by all cores.
+const PARALLEL_BYTES: usize = 4 << 20;
+
+/// A frame without Gaussians.
+pub(super) fn background(view: &View, request: &RenderRequest) -> Frame {
+    let pixels = view.width as usize * view.height as usize;
+    Frame {
+        width: view.width,
+        height: view.height,
+        color: request.kinds.color.then(|| vec![request.background; pixels]),
+        depth: request.kinds.depth.then(|| vec![0.0; pixels]),
+        alpha: request.kinds.alpha.then(|| vec![0.0; pixels]),
+        blend: matches!(request.labels, Labels::Blend(_)).then(|| vec![[0.0; 4]; pixels]),
+        entries: (request.labels == Labels::Entries).then(|| Entries::none(pixels)),
+        stats: FrameStats::default(),
+    }
+}
+
+/// What a band of a view takes in the buffers of its batch.
+struct Layout {
+    color: u32,
+    depth: u32,
+    alpha: u32,
+    blend: u32,
+    /// Words of all pictures.
+    words: u64,
+    /// Whether colour, and alpha beside it, are words of four levels.
+    fast: bool,
+    /// Pixels of the band.
+    pixels: u64,
+    /// Entries a pixel has room for; 0 where none are wanted.
+    slots: u32,
+    tiles: u32,
+}
+
+impl Layout {
+    fn picture_bytes(&self) -> u64 {
+        self.words * 4
+    }
+
+    /// A count a pixel, then an index and a weight a slot.
+    fn slot_bytes(&self) -> u64 {
+        if self.slots == 0 { 0 } else { self.pixels * 4 * (1 + 2 * u64::from(self.slots)) }
+    }
+}
+
+/// How an attempt at a band ended.
+enum Outcome {
+    /// In the frame.
+    Drawn,
+    /// So many tile pairs are too many for one band.
+    Pairs(u32),
+    /// A pixel has more entries than room; there is more room now.
+    Slots,
+}
+
+/// One view's band as it was read back: pictures and slots beside what they belong to.
+type Part<'a, 'b> = (&'a mut Drawing<'b>, &'a Layout, PlanRow, &'a [u8], &'a [u32]);
+
+/// How one view of a submission ended.
+struct Ended {
+    /// Tile pairs that there are.
+    needed: u32,
+    drawn: bool,
+    /// Entries a pixel to make room for, where there were more than room.
+    more_slots: Option<u32>,
+    /// Digits of depth that the device found; of the first view, those of all.
+    passes: u32,
+}
+
+/// What frames are drawn with.
+pub(super) struct Tools<'a> {
+    pub(super) gpu: &'a Gpu,
+    pub(super) kernels: &'a Kernels,
+    pub(super) scratch: &'a mut Scratch,
+    pub(super) scene: &'a Scene,
+    /// The scene's bank indices, where labels are wanted.
+    pub(super) labels: Option<&'a SceneLabels>,
+    pub(super) isects_max: u32,
+    pub(super) marks: Option<&'a mut Marks>,
+    /// Times of the last submission, where marks are set.
+    pub(super) times: Vec<StageTime>,
+}
+
+/// A frame being drawn, band by band from top to bottom.
+pub(super) struct Drawing<'a> {
+    row: ViewRow,
+    /// Digits that the depth sort can take.
+    digits: u32,
+    kinds: Kinds,
+    wanted: &'a Labels,
+    frame: Frame,
+    /// Entries of the bands drawn.
+    entries: Vec<EntryRows>,
+    /// Most entries of a pixel in them.
+    entries_max: u32,
+}
+
+impl<'a> Drawing<'a> {
+    pub(super) fn new(view: &View, request: &'a RenderRequest, scene: &Scene) -> Self {
+        let mut row = ViewRow::new(view, request.background, request.antialiased);
+        row.fast = u32::from(request.quality == Quality::Fast);
+        (row.gaussian_count, row.sh_count) = (scene.count, scene.sh_count);
+        let pixels = view.width as usize * view.height as usize;
+        let kinds = request.kinds;
+        let frame = Frame {
+            width: view.width,
+            height: view.height,
+            color: kinds.color.then(|| Vec::with_capacity(pixels)),
+            depth: kinds.depth.then(|| Vec::with_capacity(pixels)),
+            alpha: kinds.alpha.then(|| Vec::with_capacity(pixels)),
+            blend: matches!(request.labels, Labels::Blend(_)).then(|| Vec::with_capacity(pixels)),
+            entries: None,
+            stats: FrameStats::default(),
+        };
+        let wanted = &request.labels;
+        let mut bits = view.depth_bits(scene.bounds);
+        if request.quality == Quality::Fast {
+            bits = bits.min(FAST_KEY_BITS);
+        }
+        let digits = bits.div_ceil(DIGIT_BITS).max(1);
+        Self { row, digits, kinds, wanted, frame, entries: Vec::new(), entries_max: 0 }
+    }
+
+    /// The frame of all bands.
+    pub(super) fn finish(mut self, scratch: &mut Scratch) -> Result<Frame> {
+        if *self.wanted == Labels::Entries {
+            // The next view needs about as much; one odd view makes room for itself alone.
+            scratch.entry_slots = self.entries_max.next_power_of_two().max(ENTRY_SLOTS_MIN);
+            self.frame.entries = Some(Entries::join(self.entries)?);
+        }
+        Ok(self.frame)
+    }
+
+    /// All rows of tiles.
+    pub(super) fn whole(&self) -> Range<u32> {
+        0..self.row.tiles_y
+    }
+
+    fn layout(&self, rows: &Range<u32>, slots: u32) -> Layout {
+        let pixel_rows = (rows.end * TILE_SIZE).min(self.row.height) - rows.start * TILE_SIZE;
+        let pixels = u64::from(pixel_rows) * u64::from(self.row.width);
+        let fast = self.row.fast != 0;
+        let mut words = 0;
+        let mut take = |wanted: bool, channels: u64| {
+            let start = if wanted { words as u32 } else { NO_PICTURE };
+            words += if wanted { channels * pixels } else { 0 };
+            start
+        };
+        let color = take(self.kinds.color, if fast { 1 } else { 3 });
+        let depth = take(self.kinds.depth, 1);
+        let alpha = take(self.kinds.alpha && !(fast && self.kinds.color), 1);
+        let blend = take(matches!(self.wanted, Labels::Blend(_)), BLEND_WIDTH as u64);
+        let tiles = self.row.tiles_x * (rows.end - rows.start);
+        Layout { color, depth, alpha, blend, words, fast, pixels, slots, tiles }
+    }
+
+    /// Rows of the table that is blended; an empty one is a row of zeros.
+    fn table(&self) -> &[[f32; BLEND_WIDTH]] {
+        match self.wanted {
+            Labels::Blend(table) if table.is_empty() => &[[0.0; BLEND_WIDTH]],
+            Labels::Blend(table) => &table[..table.len().min(1 << u16::BITS)],
+            _ => &[],
+        }
+    }
+
+    /// Takes a band out of what was read back, if there was room for all of it.
+    fn take(
+        &mut self,
+        layout: &Layout,
+        plan: PlanRow,
+        capacity: u32,
+        pictures: &[u8],
+        slots: &[u32],
+    ) -> Ended {
+        let PlanRow { needed, passes, .. } = plan;
+        if needed > capacity {
+            return Ended { needed, drawn: false, more_slots: None, passes };
+        }
+        let counts = &slots[..slots.len().min(layout.pixels as usize)];
+        let entries = counts.iter().copied().max().unwrap_or(0);
+        if entries > layout.slots {
+            let more_slots = Some(layout.slots.saturating_mul(ENTRY_SLOTS_GROWTH));
+            return Ended { needed, drawn: false, more_slots, passes };
+        }
+        self.store(layout, pictures, slots);
+        self.entries_max = self.entries_max.max(entries);
+        let stats = &mut self.frame.stats;
+        stats.visible = stats.visible.max(u64::from(plan.visible));
+        stats.intersections += u64::from(plan.isects);
+        Ended { needed, drawn: true, more_slots: None, passes }
+    }
+
+    /// Takes the pictures and entries of a band out of what was read back.
+    fn store(&mut self, layout: &Layout, pictures: &[u8], slots: &[u32]) {
+        let pixels = layout.pixels as usize;
+        let part = |start: u32, words: usize| {
+            let start = start as usize * 4;
+            &pictures[start..start + pixels * words * 4]
+        };
+        let frame = &mut self.frame;
+        if let Some(color) = &mut frame.color {
+            if layout.fast {
+                let levels = part(layout.color, 1);
+                let level = |byte: u8| f32::from(byte) / 255.0;
+                append(color, levels, |[r, g, b, _]: [u8; 4]| [r, g, b].map(level));
+                if let Some(alpha) = &mut frame.alpha {
+                    append(alpha, levels, |word: [u8; 4]| level(word[3]));
+                }
+            } else {
+                append(color, part(layout.color, 3), |color| color);
+            }
+        }
+        if let Some(depth) = &mut frame.depth {
+            append(depth, part(layout.depth, 1), |depth| depth);
+        }
+        if let Some(alpha) = &mut frame.alpha
+            && layout.alpha != NO_PICTURE
+        {
+            append(alpha, part(layout.alpha, 1), |alpha| alpha);
+        }
+        if let Some(blend) = &mut frame.blend {
+            append(blend, part(layout.blend, BLEND_WIDTH), |row| row);
+        }
+        if layout.slots > 0 {
+            self.entries.push(entry_rows(slots, layout, self.row.width as usize));
+        }
+    }
+}
+
+impl Tools<'_> {
+    /// Draws the tile rows `rows`; halves them while they are over a limit of the adapter.
+    pub(super) fn rows(&mut self, drawing: &mut Drawing<'_>, rows: Range<u32>) -> Result<()> {
+        let layout = drawing.layout(&rows, self.entry_slots(drawing));
+        let single = rows.end - rows.start == 1;
+        let bytes = layout.picture_bytes() + layout.slot_bytes();
+        let bytes_max = self.gpu.binding_bytes_max - PLAN_BYTES;
+        if single || bytes.max((u64::from(layout.tiles) + 1) * 4) <= bytes_max {
+            match self.band(drawing, &rows, &layout)? {
+                Outcome::Drawn => return Ok(()),
+                // Whether the band still fits is asked again; slots grow to a bound.
+                Outcome::Slots => return self.rows(drawing, rows),
+                Outcome::Pairs(needed) if single => {
+                    return Err(Error::limit(
+                        "render: Gaussian-tile pairs in one row of tiles",
+                        needed,
+                        self.capacity_max(1),
+                    ));
+                }
+                Outcome::Pairs(_) => {}
+            }
+        }
+        let middle = rows.start.midpoint(rows.end);
+        self.rows(drawing, rows.start..middle)?;
+        self.rows(drawing, middle..rows.end)
+    }
+
+    /// Draws whole views in one submission, each as if it were alone; which of them are drawn. The
+    /// others need more room than was guessed, or do not fit beside each other.
+    pub(super) fn together(&mut self, drawings: &mut [Drawing<'_>]) -> Result<Vec<bool>> {
+        let layouts: Vec<_> = drawings
+            .iter()
+            .map(|drawing| drawing.layout(&drawing.whole(), self.entry_slots(drawing)))
+            .collect();
+        let sum = |bytes: fn(&Layout) -> u64| layouts.iter().map(bytes).sum::<u64>();
+        let bytes = sum(Layout::picture_bytes) + sum(Layout::slot_bytes);
+        let views = drawings.len() as u32;
+        let capacity = self.capacity(views);
+        if bytes + PLAN_BYTES * u64::from(views) > self.gpu.binding_bytes_max {
+            return Ok(vec![false; drawings.len()]);
+        }
+        let bands: Vec<_> = drawings.iter().map(Drawing::whole).collect();
+        let ended = self.attempt(drawings, &bands, &layouts, capacity)?;
+        Ok(ended.into_iter().map(|(_, drawn)| drawn).collect())
+    }
+
+    /// Entries to make room for: as many as the last views needed, never more than there can be.
+    fn entry_slots(&self, drawing: &Drawing<'_>) -> u32 {
+        match (drawing.wanted, self.labels) {
+            (Labels::Entries, Some(labels)) => self.scratch.entry_slots.min(labels.distinct.max(1)),
+            _ => 0,
+        }
+    }
+
+    fn capacity_max(&self, views: u32) -> u32 {
+        let bound = self.gpu.binding_bytes_max / (PAIR_BYTES_A_BUFFER * u64::from(views));
+        self.isects_max.min(u32::try_from(bound).unwrap_or(u32::MAX))
+    }
+
+    /// Tile pairs to make room for in each of `views` views.
+    fn capacity(&self, views: u32) -> u32 {
+        let guess = self.scene.count.saturating_mul(4).max(ISECT_CAPACITY_MIN);
+        // A quarter more: the next camera sees about as much.
+        let seen = self.scratch.isects.saturating_add(self.scratch.isects / 4);
+        guess.max(seen).min(self.capacity_max(views))
+    }
+
+    /// Draws one band into the frame.
+    fn band(
+        &mut self,
+        drawing: &mut Drawing<'_>,
+        rows: &Range<u32>,
+        layout: &Layout,
+    ) -> Result<Outcome> {
+        let capacity_max = self.capacity_max(1);
+        let mut capacity = self.capacity(1);
+        for _ in 0..ATTEMPTS_MAX {
+            let (alone, bands) = (std::slice::from_mut(drawing), std::slice::from_ref(rows));
+            let layouts = std::slice::from_ref(layout);
+            let ended = self.attempt(alone, bands, layouts, capacity)?;
+            let Some(&(needed, drawn)) = ended.first() else { break };
+            if drawn {
+                return Ok(Outcome::Drawn);
+            }
+            if needed <= capacity {
+                return Ok(Outcome::Slots);
+            }
+            if needed > capacity_max {
+                return Ok(Outcome::Pairs(needed));
+            }
+            capacity = self.capacity(1);
+        }
+        Err(Error::internal("render: the need of tile pairs grew from one attempt to the next"))
+    }
+
+    /// All stages over one band of each view, with room for `capacity` pairs a view; the pairs that
+    /// each needs, and whether it was drawn.
+    fn attempt(
+        &mut self,
+        drawings: &mut [Drawing<'_>],
+        bands: &[Range<u32>],
+        layouts: &[Layout],
+        capacity: u32,
+    ) -> Result<Vec<(u32, bool)>> {
+        let views = drawings.len() as u32;
+        let most_tiles = layouts.iter().map(|layout| layout.tiles).max().unwrap_or(1);
+        let bits = tile_bits(most_tiles);
+        let pair_half = sorted_half(bits) * views * capacity;
+        let mut rows = Vec::with_capacity(drawings.len());
+        let mut grid = [0; 2];
+        let (mut words, mut slot_words, mut ranges) = (0_u64, 0_u64, 0_u32);
+        let mut table: Vec<[f32; BLEND_WIDTH]> = Vec::new();
+        for (i, ((drawing, band), layout)) in drawings.iter().zip(bands).zip(layouts).enumerate() {
+            let after = |start: u32| match start {
+                NO_PICTURE => NO_PICTURE,
+                start => start + words as u32,
+            };
+            rows.push(ViewRow {
+                row_start: band.start,
+                row_end: band.end,
+                isect_capacity: capacity,
+                color_start: after(layout.color),
+                depth_start: after(layout.depth),
+                alpha_start: after(layout.alpha),
+                blend_start: after(layout.blend),
+                label_rows: drawing.table().len() as u32,
+                table_start: table.len() as u32,
+                entry_slots: layout.slots,
+                slot_start: slot_words as u32,
+                range_start: ranges,
+                pair_start: pair_half + i as u32 * capacity,
+                ..drawing.row
+            });
+            grid = [grid[0].max(drawing.row.tiles_x), grid[1].max(band.end - band.start)];
+            words += layout.words;
+            slot_words += layout.slot_bytes() / 4;
+            ranges += layout.tiles + 1;
+            table.extend_from_slice(drawing.table());
+        }
+        let plan_bytes = PLAN_BYTES * u64::from(views);
+        let (picture_bytes, slot_bytes) = (words * 4, slot_words * 4);
+        let staging_bytes = plan_bytes + picture_bytes + slot_bytes;
+        let (gpu, scene) = (self.gpu, self.scene);
+        let colored = drawings.iter().any(|drawing| drawing.kinds.color);
+        let deep = drawings.iter().any(|drawing| drawing.kinds.depth);
+        // The device may find fewer, each of which is a dispatch for nothing.
+        let digits = match self.kernels.sorts_all() {
+            true => DIGITS_MAX,
+            false => drawings.iter().map(|drawing| drawing.digits).max().unwrap_or(DIGITS_MAX),
+        };
+        let shades = colored && !self.kernels.flat(scene.sh_count);
+        let room = self.scratch.room(
+            gpu,
+            &Need {
+                views,
+                count: scene.count,
+                capacity,
+                ranges,
+                shades,
+                picture_bytes,
+                table_bytes: size_of_val(table.as_slice()) as u64,
+                slot_bytes,
+                staging_bytes,
+            },
+        )?;
+        let buffers =
+            SceneBuffers { gaussians: &scene.gaussians, sh: &scene.sh, sh_count: scene.sh_count };
+        let labels = match (drawings.first().map(|drawing| drawing.wanted), self.labels) {
+            (Some(Labels::Blend(_)), Some(labels)) => LabelBuffers::Blend { index: &labels.index },
+            (Some(Labels::Entries), Some(labels)) => LabelBuffers::Entries { index: &labels.index },
+            _ => LabelBuffers::None,
+        };
+        let bindings = &mut self.scratch.bindings;
+        let (kernels, marks) = (self.kernels, self.marks.as_deref_mut());
+        gpu.scoped("render", || {
+            room.begin(gpu, &rows);
+            if !table.is_empty() {
+                gpu.queue.write_buffer(&room.table, 0, bytemuck::cast_slice(&table));
+            }
+            let sizes = (views, scene.count);
+            let mut stages = Recorder::new(gpu, kernels, bindings, &room, sizes, marks);
+            stages.project(buffers);
+            if shades {
+                stages.shade(buffers);
+            }
+            stages.depth_sort(digits);
+            stages.prefix_sum();
+            stages.emit_isects();
+            stages.tile_sort(bits);
+            stages.tile_ranges();
+            stages.rasterize(buffers, &labels, (colored, deep), grid);
+            stages.submit(&[
+                (&room.plans, 0, &room.staging, 0, plan_bytes),
+                (&room.pictures, 0, &room.staging, plan_bytes, picture_bytes),
+                (&room.slots, 0, &room.staging, plan_bytes + picture_bytes, slot_bytes),
+            ])
+        })??;
+        if let Some(marks) = &self.marks {
+            self.times = marks.read(gpu)?;
+        }
+        let ended = readback::read(gpu, &room.staging, staging_bytes, |bytes| {
+            let (plans, rest) = bytes.split_at(plan_bytes as usize);
+            let (mut pictures, slots) = rest.split_at(picture_bytes as usize);
+            let mut slots: &[u32] = bytemuck::cast_slice(slots);
+            let plans: Vec<PlanRow> = bytemuck::pod_collect_to_vec(plans);
+            let mut parts = Vec::with_capacity(plans.len());
+            for ((drawing, layout), plan) in drawings.iter_mut().zip(layouts).zip(plans) {
+                let (mine, mine_slots);
+                (mine, pictures) = pictures.split_at(layout.picture_bytes() as usize);
+                (mine_slots, slots) = slots.split_at(layout.slot_bytes() as usize / 4);
+                parts.push((drawing, layout, plan, mine, mine_slots));
+            }
+            let take = |(drawing, layout, plan, mine, mine_slots): Part<'_, '_>| {
+                drawing.take(layout, plan, capacity, mine, mine_slots)
+            };
+            match parts.len() {
+                1 => parts.into_iter().map(take).collect(),
+                _ => parts.into_par_iter().map(take).collect::<Vec<_>>(),
+            }
+        })?;
+        let passes = ended.first().map_or(0, |ended| ended.passes);
+        if passes > digits {
+            return Err(Error::internal(format!(
+                "render: depths differ in {passes} digits where the scene's box has {digits}"
+            )));
+        }
+        let most_isects = ended.iter().map(|ended| ended.needed).max().unwrap_or(0);
+        let more_slots = ended.iter().filter_map(|ended| ended.more_slots).max();
+        self.scratch.isects = most_isects;
+        self.scratch.entry_slots = more_slots.unwrap_or(self.scratch.entry_slots);
+        Ok(ended.into_iter().map(|ended| (ended.needed, ended.drawn)).collect())
+    }
+}
+
+/// Copies the values that `bytes` hold to the end of `to`; many by all cores, for most of the time
+/// goes into new pages.
+fn append<F: Pod + Send + Sync, T: Send>(
+    to: &mut Vec<T>,
+    bytes: &[u8],
+    read: impl Fn(F) -> T + Send + Sync,
+) {
+    let values: &[F] = bytemuck::cast_slice(bytes);
+    if bytes.len() < PARALLEL_BYTES {
+        to.extend(values.iter().map(|value| read(*value)));
+    } else {
+        let values = values.par_iter().with_min_len(PARALLEL_BYTES / 16);
+        to.par_extend(values.map(|value| read(*value)));
+    }
+}
+
+/// The entries of a band's pixels, ascending, out of its slots.
+fn entry_rows(slots: &[u32], layout: &Layout, width: usize) -> EntryRows {
+    let pixels = layout.pixels as usize;
+    let mut rows = EntryRows::new(pixels / width, width);
+    let mut pixel = Vec::with_capacity(layout.slots as usize);
+    for (i, &count) in slots[..pixels].iter().enumerate() {
+        let plane = |slot: usize| pixels * (1 + slot) + i;
+        let held = (0..count as usize).map(|slot| {
+            let weight = f32::from_bits(slots[plane(2 * slot + 1)]);
+            (slots[plane(2 * slot)] as u16, weight)
+        });
+        pixel.clear();
+        pixel.extend(held);
+        pixel.sort_unstable_by_key(|entry| entry.0);
+        for &(index, weight) in &pixel {
+            rows.push(i % width, i / width, index, weight);
+        }
+    }
+    rows
+}

@@ -1,0 +1,158 @@
+//! Which renderer serves: looks at the adapters once, says what it took, and never takes a software
+//! adapter that was not named.
+
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+
+use super::{
+    DeviceTimes, Frame, RenderRequest, Renderer,
+    cpu::CpuRenderer,
+    gpu::{GpuOptions, GpuRenderer},
+};
+use crate::{
+    error::{ErrorCode, Result},
+    scene::Gaussians,
+};
+
+/// Which renderer serves views.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RendererChoice {
+    /// A hardware adapter where there is one, else the CPU renderer. Never a software adapter.
+    #[default]
+    Auto,
+    /// The CPU renderer.
+    Cpu,
+    /// A wgpu adapter, software ones too when `adapter` names it; refuses to start without.
+    Gpu,
+}
+
+/// Which renderer to open, and its bounds.
+#[derive(Clone, Debug)]
+pub struct RendererOptions {
+    /// Which renderer.
+    pub renderer: RendererChoice,
+    /// Part of the name of the wgpu adapter to use, or of several, with commas between.
+    pub adapter: Option<String>,
+    /// Threads of the CPU renderer.
+    pub threads: usize,
+    /// Renders at work or waiting on the GPU; one more is refused as `overloaded`.
+    pub waiting_max: usize,
+    /// Bytes of scenes kept on one GPU device.
+    pub scene_bytes_max: u64,
+}
+
+/// A GPU adapter as the driver describes it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct AdapterReport {
+    /// The adapter's own name.
+    pub name: String,
+    /// `DiscreteGpu`, `IntegratedGpu`, `VirtualGpu`, `Cpu` or `Other`.
+    pub kind: String,
+    /// `vulkan`, `metal`, `dx12` or `gl`.
+    pub backend: String,
+    /// Driver and its version.
+    pub driver: String,
+    /// Whether it computes on the processor.
+    pub software: bool,
+    /// Whether it was taken.
+    pub chosen: bool,
+}
+
+/// The renderer that `options` ask for, and the adapters found on the way.
+///
+/// `auto` takes a hardware adapter or the CPU renderer; `gpu` refuses to start without an adapter;
+/// an adapter that is named must be there.
+///
+/// # Errors
+/// `gpu_unavailable` when an adapter was asked for and none fits, `internal` when threads or
+/// kernels cannot be made.
+pub fn select(options: &RendererOptions) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
+    select_with(options, GpuOptions::default())
+}
+
+/// As [`select`], with more options for the GPU renderer (`without` goes to the CPU's as well);
+/// the adapter and the bounds are those of `wanted`.
+///
+/// # Errors
+/// As [`select`].
+pub fn select_with(
+    wanted: &RendererOptions,
+    options: GpuOptions,
+) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
+    let cpu = CpuRenderer::new(wanted.threads)?.without(options.without);
+    if wanted.renderer == RendererChoice::Cpu {
+        tracing::info!(renderer = "cpu", "renderer chosen as configured");
+        return Ok((Arc::new(cpu), Vec::new()));
+    }
+    let options = GpuOptions {
+        adapter: wanted.adapter.clone(),
+        waiting_max: wanted.waiting_max,
+        scene_bytes_max: wanted.scene_bytes_max,
+        ..options
+    };
+    let (reports, gpu) = GpuRenderer::open(&options);
+    for report in &reports {
+        tracing::info!(
+            adapter = report.name,
+            kind = report.kind,
+            backend = report.backend,
+            driver = report.driver,
+            software = report.software,
+            chosen = report.chosen,
+            "GPU adapter found"
+        );
+    }
+    let named = wanted.adapter.is_some() || wanted.renderer == RendererChoice::Gpu;
+    let renderer: Arc<dyn Renderer> = match gpu {
+        Ok(gpu) => {
+            tracing::info!(renderer = gpu.name(), "renderer chosen");
+            if wanted.renderer == RendererChoice::Gpu {
+                Arc::new(gpu)
+            } else {
+                Arc::new(WithCpu { gpu, cpu })
+            }
+        }
+        Err(error) if named => return Err(error),
+        Err(error) => {
+            tracing::info!(renderer = "cpu", reason = error.message(), "renderer chosen");
+            Arc::new(cpu)
+        }
+    };
+    Ok((renderer, reports))
+}
+
+/// A GPU renderer whose refusals the CPU renderer takes over, each said in the log.
+#[derive(Debug)]
+struct WithCpu {
+    gpu: GpuRenderer,
+    cpu: CpuRenderer,
+}
+
+impl Renderer for WithCpu {
+    fn name(&self) -> String {
+        self.gpu.name()
+    }
+
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        match self.gpu.render(gaussians, request) {
+            Err(error) if error.code() != ErrorCode::InvalidRequest => {
+                tracing::warn!(
+                    reason = error.message(),
+                    source = std::error::Error::source(&error).map(tracing::field::display),
+                    "the GPU renderer refused a frame; the CPU renderer draws it"
+                );
+                self.cpu.render(gaussians, request)
+            }
+            other => other,
+        }
+    }
+    fn device_times(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+    ) -> Result<Option<DeviceTimes>> {
+        self.gpu.device_times(gaussians, request)
+    }
+}

@@ -1,0 +1,496 @@
+//! A bundle: a folder with `bundle.toml` and the files it names, each checked by sha256.
+//!
+//! `models/README.md` documents the manifest. A bundle that differs from it is refused with what
+//! differs: the file, and both hashes.
+
+use std::{
+    io::Read,
+    path::{Path, PathBuf},
+};
+
+use serde::Deserialize;
+use sha2::{Digest, Sha256};
+
+use crate::{
+    error::{Error, ErrorCode, Result},
+    models::{
+        NetworkOptions, SETUP_COMMAND,
+        manifest::{ImageTextManifest, MasksManifest, check_file},
+    },
+};
+
+/// Name of the manifest in a bundle's folder.
+pub(super) const MANIFEST: &str = "bundle.toml";
+/// Where the bundle that ships with the server lies, under the working folder or the executable's.
+const EMBEDDED: &str = "models/embedded";
+/// Largest manifest read, bytes.
+const MANIFEST_BYTES_MAX: u64 = 1 << 20;
+/// Largest side of a bucket, pixels: `SourcePixel` counts in u16 and memory grows with the area.
+pub(super) const BUCKET_SIDE_MAX: u32 = 4_096;
+
+/// A bundle whose files are those of its manifest.
+#[derive(Clone, Debug)]
+pub struct Bundle {
+    dir: PathBuf,
+    sha256: String,
+    manifest: BundleManifest,
+}
+
+#[derive(Clone, Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct BundleManifest {
+    name: String,
+    version: String,
+    geometry: GeometryManifest,
+    masks: Option<MasksManifest>,
+    image_text: Option<ImageTextManifest>,
+}
+
+/// A file that the manifest names.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BundleFile<'a> {
+    /// What it is for: `geometry`, `masks.encoder`, `masks.decoder`, `image_text.image`,
+    /// `image_text.text`, `image_text.tokenizer`.
+    pub part: &'static str,
+    /// Name in the bundle's folder.
+    pub file: &'a str,
+    /// sha256 of the manifest, hex.
+    pub sha256: &'a str,
+    /// Licence of the weights.
+    pub licence: &'a str,
+}
+
+/// The rigid frame that a geometry network's outputs are in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OutputFrame {
+    /// Each view's own camera.
+    Camera,
+    /// The model frame: the first camera of the set.
+    Model,
+}
+
+/// How camera translations are scaled into the model frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Translation {
+    /// The largest distance between two cameras of the set is 1.
+    LargestBaseline,
+    /// World units.
+    World,
+}
+
+/// Input tensor names of a geometry network.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GeometryInputs {
+    /// `[V, 3, H, W]` f32.
+    pub images: String,
+    /// `[V, 3, 3]` f32, row 0 divided by W and row 1 by H.
+    pub intrinsics: String,
+    /// `[V, 4, 4]` f32, model frame.
+    pub camera_to_world: String,
+    /// `[V]` f32, model units.
+    pub near: String,
+    /// `[V]` f32, model units.
+    pub far: String,
+    /// `[V, K]` i64; absent for a network that chooses by itself.
+    pub neighbors: Option<String>,
+}
+
+/// Output tensor names of a geometry network.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GeometryOutputs {
+    /// `[V, H, W, 3]` f32, model units.
+    pub means: String,
+    /// `[V, H, W, 3]` f32, model units.
+    pub scales: String,
+    /// `[V, H, W, 4]` f32, wxyz.
+    pub quats: String,
+    /// `[V, H, W]` f32.
+    pub opacities: String,
+    /// `[V, H, W, K, 3]` f32.
+    pub sh: String,
+    /// `[V, H, W]` f32, 0..1; absent where the network has none (1 is taken).
+    pub confidence: Option<String>,
+}
+
+/// What `bundle.toml` says of the geometry network.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GeometryManifest {
+    /// File in the bundle's folder.
+    pub file: String,
+    /// Its sha256, hex.
+    pub sha256: String,
+    /// Licence of the weights.
+    pub licence: String,
+    /// Where the weights come from.
+    pub source: String,
+    /// Working sizes, `[height, width]`.
+    pub buckets: Vec<[u32; 2]>,
+    /// Fewest views at once.
+    pub views_min: usize,
+    /// Most views at once.
+    pub views_max: usize,
+    /// Most source views of a view.
+    pub neighbors_max: usize,
+    /// Degree of the spherical harmonics.
+    pub sh_degree: u8,
+    /// Frame of the outputs.
+    pub output_frame: OutputFrame,
+    /// Scale of the model frame.
+    pub translation: Translation,
+    /// Subtracted from the 0..1 channels.
+    pub mean: [f32; 3],
+    /// Divides them after that.
+    pub std: [f32; 3],
+    /// Input names.
+    pub inputs: GeometryInputs,
+    /// Output names.
+    pub outputs: GeometryOutputs,
+}
+
+impl Bundle {
+    /// The bundle of the configuration, or the one found beside the executable or in the working
+    /// folder.
+    ///
+    /// # Errors
+    /// `model_unavailable` as [`Self::open`]; none found names every place looked at.
+    pub fn find(options: &NetworkOptions) -> Result<Self> {
+        let bundle = Self::named(options)?;
+        bundle.verify()?;
+        Ok(bundle)
+    }
+
+    /// As [`Self::find`], with no file looked at but the manifest: [`Self::verify`] is still due.
+    ///
+    /// # Errors
+    /// `model_unavailable` when none is found or the manifest is malformed.
+    pub fn named(options: &NetworkOptions) -> Result<Self> {
+        if let Some(dir) = &options.bundle {
+            return Self::read(dir);
+        }
+        let places = search_places();
+        match places.iter().find(|dir| dir.join(MANIFEST).is_file()) {
+            Some(dir) => Self::read(dir),
+            None => Err(unavailable(format!(
+                "no model bundle: no {EMBEDDED}/{MANIFEST} beside the executable or in the \
+                 working folder; name its folder with --bundle or SEGSPLAT_BUNDLE"
+            ))),
+        }
+    }
+
+    /// Reads the manifest of `dir` and checks every file it names.
+    ///
+    /// # Errors
+    /// `model_unavailable` when the manifest or a file is missing, the manifest is malformed, or a
+    /// file's sha256 differs.
+    pub fn open(dir: &Path) -> Result<Self> {
+        let bundle = Self::read(dir)?;
+        bundle.verify()?;
+        Ok(bundle)
+    }
+
+    fn read(dir: &Path) -> Result<Self> {
+        let path = dir.join(MANIFEST);
+        let size = fs_err::metadata(&path).map_err(|e| missing(MANIFEST, e))?.len();
+        if size > MANIFEST_BYTES_MAX {
+            return Err(unavailable(format!(
+                "model bundle: {MANIFEST} has {size} bytes, over {MANIFEST_BYTES_MAX}"
+            )));
+        }
+        let text = fs_err::read_to_string(&path).map_err(|e| missing(MANIFEST, e))?;
+        let manifest: BundleManifest = toml::from_str(&text)
+            .map_err(|e| unavailable(format!("model bundle: {MANIFEST}: {e}")))?;
+        manifest.geometry.validate()?;
+        if let Some(masks) = &manifest.masks {
+            masks.validate()?;
+        }
+        if let Some(image_text) = &manifest.image_text {
+            image_text.validate()?;
+        }
+        Ok(Self { dir: dir.to_owned(), sha256: hex_of(text.as_bytes()), manifest })
+    }
+
+    /// Checks every file's sha256 again.
+    ///
+    /// # Errors
+    /// `model_unavailable`, naming the file and both hashes.
+    pub fn verify(&self) -> Result<()> {
+        for BundleFile { file, sha256, .. } in self.files() {
+            let found = sha256_of(&self.path(file)).map_err(|e| missing(file, e))?;
+            if found != sha256.to_lowercase() {
+                return Err(unavailable(format!(
+                    "model bundle: {file} is not the file of {MANIFEST}: sha256 {found}, not \
+                     {sha256}; restore it (`git checkout -- {EMBEDDED}`)"
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    /// Name of the bundle.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.manifest.name
+    }
+
+    /// Version of the bundle.
+    #[must_use]
+    pub fn version(&self) -> &str {
+        &self.manifest.version
+    }
+
+    /// sha256 of the manifest, hex: it names every file's hash, so it stands for the bundle.
+    #[must_use]
+    pub fn sha256(&self) -> &str {
+        &self.sha256
+    }
+
+    /// The geometry network's entry.
+    #[must_use]
+    pub fn geometry(&self) -> &GeometryManifest {
+        &self.manifest.geometry
+    }
+
+    /// The mask network's entry; `None`: the bundle has no semantics.
+    #[must_use]
+    pub fn masks(&self) -> Option<&MasksManifest> {
+        self.manifest.masks.as_ref()
+    }
+
+    /// The entry of image and text tower; `None`: the bundle has no semantics.
+    #[must_use]
+    pub fn image_text(&self) -> Option<&ImageTextManifest> {
+        self.manifest.image_text.as_ref()
+    }
+
+    /// What it lacks for semantics; `None` where nothing.
+    #[must_use]
+    pub fn lacks_semantics(&self) -> Option<&'static str> {
+        match (self.masks(), self.image_text()) {
+            (Some(_), Some(_)) => None,
+            (None, Some(_)) => Some("no mask network"),
+            (Some(_), None) => Some("no image and text towers"),
+            (None, None) => Some("no semantic networks"),
+        }
+    }
+
+    /// Every file that the manifest names, itself left out.
+    #[must_use]
+    pub fn files(&self) -> Vec<BundleFile<'_>> {
+        let BundleManifest { geometry, masks, image_text, .. } = &self.manifest;
+        let mut files = vec![BundleFile {
+            part: "geometry",
+            file: &geometry.file,
+            sha256: &geometry.sha256,
+            licence: &geometry.licence,
+        }];
+        if let Some(MasksManifest { encoder, decoder, licence, .. }) = masks {
+            let entry = |part, file, sha256| BundleFile { part, file, sha256, licence };
+            files.push(entry("masks.encoder", &encoder.file, &encoder.sha256));
+            files.push(entry("masks.decoder", &decoder.file, &decoder.sha256));
+        }
+        if let Some(ImageTextManifest { image, text, licence, .. }) = image_text {
+            let entry = |part, file, sha256| BundleFile { part, file, sha256, licence };
+            files.push(entry("image_text.image", &image.file, &image.sha256));
+            files.push(entry("image_text.text", &text.file, &text.sha256));
+            files.push(entry("image_text.tokenizer", &text.tokenizer, &text.tokenizer_sha256));
+        }
+        files
+    }
+
+    /// Where a file of [`Self::files`] lies.
+    #[must_use]
+    pub fn path(&self, file: &str) -> PathBuf {
+        self.dir.join(file)
+    }
+
+    /// Size in bytes of a file of [`Self::files`]; 0 when it has gone.
+    #[must_use]
+    pub fn size_bytes(&self, file: &str) -> u64 {
+        fs_err::metadata(self.path(file)).map_or(0, |meta| meta.len())
+    }
+}
+
+impl GeometryManifest {
+    fn validate(&self) -> Result<()> {
+        check_file("geometry", &self.file, &self.sha256)?;
+        let wrong =
+            |what: String| Err(unavailable(format!("model bundle: {MANIFEST}: geometry.{what}")));
+        let bad = |side: &u32| !(1..=BUCKET_SIDE_MAX).contains(side);
+        if self.buckets.is_empty() || self.buckets.iter().flatten().any(bad) {
+            return wrong(format!(
+                "buckets is {:?}; it must hold [height, width] pairs of 1 to {BUCKET_SIDE_MAX}",
+                self.buckets
+            ));
+        }
+        if self.views_min < 1 || self.views_max < self.views_min || self.views_max < 2 {
+            return wrong(format!(
+                "views_min {} and views_max {} must be in order, and views_max at least 2",
+                self.views_min, self.views_max
+            ));
+        }
+        if self.neighbors_max < 1 {
+            return wrong("neighbors_max is 0; it must be at least 1".to_owned());
+        }
+        if self.sh_degree > 3 {
+            return wrong(format!("sh_degree is {}; it must be 0 to 3", self.sh_degree));
+        }
+        if self.std.iter().any(|v| v.is_nan() || *v <= 0.0) || self.mean.iter().any(|v| v.is_nan())
+        {
+            return wrong("mean must be numbers and std numbers over 0".to_owned());
+        }
+        Ok(())
+    }
+}
+
+fn search_places() -> Vec<PathBuf> {
+    let beside = std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.join(EMBEDDED)));
+    beside.into_iter().chain([PathBuf::from(EMBEDDED)]).collect()
+}
+
+/// Streams a file through sha256; lower-case hex.
+pub(super) fn sha256_of(path: &Path) -> std::io::Result<String> {
+    let mut file = fs_err::File::open(path)?;
+    let mut hasher = Sha256::new();
+    let mut chunk = vec![0_u8; 1 << 16];
+    loop {
+        let read = file.read(&mut chunk)?;
+        if read == 0 {
+            break;
+        }
+        hasher.update(&chunk[..read]);
+    }
+    Ok(hex(&hasher.finalize()))
+}
+
+fn hex_of(bytes: &[u8]) -> String {
+    hex(&Sha256::digest(bytes))
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|b| format!("{b:02x}")).collect()
+}
+
+pub(super) fn unavailable(message: String) -> Error {
+    Error::new(ErrorCode::ModelUnavailable, message)
+}
+
+fn missing(file: &str, cause: std::io::Error) -> Error {
+    unavailable(format!(
+        "model bundle: {file} cannot be read ({}); the bundle is part of the repository: restore \
+         it (`git checkout -- {EMBEDDED}`), run `{SETUP_COMMAND}`, or name another with --bundle",
+        cause.kind()
+    ))
+    .caused_by(cause)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fixture(change: impl Fn(String) -> String) -> tempfile::TempDir {
+        let dir = tempfile::tempdir().unwrap();
+        let from = Path::new("tests/fixtures/plane");
+        let text = std::fs::read_to_string(from.join(MANIFEST)).unwrap();
+        std::fs::write(dir.path().join(MANIFEST), change(text)).unwrap();
+        std::fs::copy(from.join("plane.onnx"), dir.path().join("plane.onnx")).unwrap();
+        dir
+    }
+
+    #[test]
+    fn a_whole_bundle_opens() {
+        let dir = fixture(|text| text);
+        let bundle = Bundle::open(dir.path()).unwrap();
+        assert_eq!(bundle.geometry().file, "plane.onnx", "the manifest's file");
+        assert!(bundle.size_bytes("plane.onnx") > 100, "the file has a size");
+    }
+
+    #[test]
+    fn a_changed_file_is_refused_by_name_and_both_hashes() {
+        let dir = fixture(|text| text);
+        let path = dir.path().join("plane.onnx");
+        let mut bytes = std::fs::read(&path).unwrap();
+        bytes[20] ^= 1;
+        std::fs::write(&path, &bytes).unwrap();
+        let error = Bundle::open(dir.path()).unwrap_err();
+        assert_eq!(error.code(), ErrorCode::ModelUnavailable, "{error}");
+        let wanted = toml::from_str::<BundleManifest>(
+            &std::fs::read_to_string(dir.path().join(MANIFEST)).unwrap(),
+        )
+        .unwrap()
+        .geometry
+        .sha256;
+        let found = sha256_of(&path).unwrap();
+        for part in ["plane.onnx", &wanted, &found] {
+            assert!(error.message().contains(part), "{part} is not in: {error}");
+        }
+    }
+
+    #[test]
+    fn a_missing_file_and_a_missing_manifest_say_which() {
+        let dir = fixture(|text| text);
+        std::fs::remove_file(dir.path().join("plane.onnx")).unwrap();
+        let error = Bundle::open(dir.path()).unwrap_err();
+        assert!(error.message().contains("plane.onnx cannot be read"), "{error}");
+        std::fs::remove_file(dir.path().join(MANIFEST)).unwrap();
+        let error = Bundle::open(dir.path()).unwrap_err();
+        assert!(error.message().contains("bundle.toml cannot be read"), "{error}");
+    }
+
+    #[test]
+    fn every_file_of_semantics_is_checked_and_its_keys_too() {
+        let from = Path::new("tests/fixtures/colours");
+        let whole = Bundle::open(from).unwrap();
+        assert_eq!(whole.files().len(), 6, "{:?}", whole.files());
+        let dir = tempfile::tempdir().unwrap();
+        for entry in whole.files() {
+            std::fs::copy(from.join(entry.file), dir.path().join(entry.file)).unwrap();
+        }
+        let text = std::fs::read_to_string(from.join(MANIFEST)).unwrap();
+        for (from, to, named) in [
+            ("adapter = \"sam\"", "adapter = \"other\"", "unknown variant"),
+            ("size = 64", "size = 0", "masks.size is 0"),
+            ("levels = [0, 1, 2]", "levels = []", "masks.levels is []"),
+            ("points_per_side = 16", "points_per_side = 1000", "masks.points_per_side is 1000"),
+            ("pred_iou_thresh = 0.7", "pred_iou_thresh = 7.0", "masks.pred_iou_thresh is 7.0"),
+            ("min_area = 0.001", "min_area = 1.5", "masks.min_area is 1.5"),
+            ("tau = 10.0", "tau = 0.0", "image_text.tau is 0.0"),
+            ("canon = [\"object\", ", "canon = [\" \", ", "image_text.canon"),
+            ("dim = 8", "dim = 0", "image_text.dim is 0"),
+            ("batch = 16", "batch = 0", "image_text.image.batch is 0"),
+            ("context = 16", "context = 0", "image_text.text.context is 0"),
+            ("\"tokenizer.json\"", "\"../tokenizer.json\"", "plain file name"),
+            ("tokenizer_sha256 = \"5", "tokenizer_sha256 = \"6", "tokenizer.json is not the file"),
+            ("sha256 = \"cc519", "sha256 = \"dc519", "masks_decoder.onnx is not the file"),
+        ] {
+            assert!(text.contains(from), "the fixture has no {from:?}");
+            std::fs::write(dir.path().join(MANIFEST), text.replace(from, to)).unwrap();
+            let error = Bundle::open(dir.path()).unwrap_err();
+            assert_eq!(error.code(), ErrorCode::ModelUnavailable, "{error}");
+            assert!(error.message().contains(named), "{to}: {error}");
+        }
+    }
+
+    #[test]
+    fn a_malformed_manifest_names_the_field() {
+        for (from, to, named) in [
+            ("sh_degree = 0", "sh_degree = 4", "geometry.sh_degree is 4"),
+            ("file = \"plane.onnx\"", "file = \"../plane.onnx\"", "plain file name"),
+            ("views_max = 8", "views_max = 1", "views_max"),
+            ("std = [1.0, 1.0, 1.0]", "std = [1.0, 0.0, 1.0]", "std"),
+            ("[32, 32]", "[32, 0]", "buckets"),
+            ("sh_degree = 0", "colour = 1\nsh_degree = 0", "unknown field"),
+        ] {
+            let dir = fixture(|text| {
+                assert!(text.contains(from), "the fixture has no {from:?}");
+                text.replace(from, to)
+            });
+            let error = Bundle::open(dir.path()).unwrap_err();
+            assert!(error.message().contains(named), "{to}: {error}");
+        }
+    }
+}

@@ -1,0 +1,276 @@
+//! The image tower and the text tower: crops and texts to unit embeddings of one space.
+
+use std::{collections::BTreeMap, sync::Arc};
+
+use ort::{session::SessionInputValue, value::TensorRef};
+use tokenizers::Tokenizer;
+
+use crate::{
+    error::{Error, ErrorCode, Result},
+    models::{
+        Bundle, ImageTextManifest, NetworkOptions, Provider, Runtime,
+        pool::{Pool, input_shape},
+        resize::{planes, resize},
+    },
+    scene::Crop,
+};
+
+/// Image and text tower, ready to run from any thread.
+#[derive(Debug)]
+pub struct ImageText {
+    manifest: ImageTextManifest,
+    image: Pool,
+    text: Pool,
+    tokenizer: Tokenizer,
+    unknown: Option<u32>,
+    /// Crops a run of the image tower, where its file fixes them.
+    crops: Option<usize>,
+    /// Tokens a run of the text tower, where its file fixes them.
+    tokens: Option<usize>,
+    /// Texts a run of the text tower, where its file fixes them.
+    texts: Option<usize>,
+    provider: Provider,
+    _runtime: Arc<Runtime>,
+}
+
+/// Texts a run of the text tower where its file leaves that free.
+const TEXTS_A_RUN: usize = 64;
+
+/// A text in the tokenizer's ids.
+struct Tokens {
+    /// With markers of begin and end, cut to the network's context.
+    ids: Vec<i64>,
+    /// Tokens, markers left out.
+    count: usize,
+    /// How many of them the tokenizer does not know.
+    unknown: usize,
+    cut: bool,
+}
+
+/// What a text means.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TextEmbedding {
+    /// `[dim]`, unit length.
+    pub row: Vec<f32>,
+    /// Tokens that were read, markers of begin and end left out.
+    pub tokens: usize,
+    /// How many of them stand for something that the tokenizer does not know.
+    pub unknown: usize,
+    /// Whether the text was longer than the network's context and was cut.
+    pub cut: bool,
+}
+
+impl ImageText {
+    /// Opens both towers on the provider of the configuration; `None` where the bundle has none.
+    ///
+    /// # Errors
+    /// `model_unavailable` when the provider asked for is not there, or a file does not load.
+    pub fn open(
+        runtime: Arc<Runtime>,
+        bundle: &Bundle,
+        options: &NetworkOptions,
+    ) -> Result<Option<Self>> {
+        let Some(manifest) = bundle.image_text().cloned() else { return Ok(None) };
+        let open = |what, file: &str| Pool::open(&runtime, bundle, options, what, file);
+        let (image, provider) = open("image tower", &manifest.image.file)?;
+        let (text, _) = open("text tower", &manifest.text.file)?;
+        let named = &manifest.text.tokenizer;
+        let tokenizer = read_tokenizer(bundle, named)?;
+        let free = |n: &i64| usize::try_from(*n).ok().filter(|&n| n > 0);
+        let pictures = input_shape(&image.take(), &manifest.image.input).unwrap_or_default();
+        let ids = input_shape(&text.take(), &manifest.text.input_ids).unwrap_or_default();
+        Ok(Some(Self {
+            crops: pictures.first().and_then(free),
+            tokens: ids.get(1).and_then(free),
+            texts: ids.first().and_then(free),
+            unknown: tokenizer.token_to_id(&manifest.text.unknown),
+            manifest,
+            image,
+            text,
+            tokenizer,
+            provider,
+            _runtime: runtime,
+        }))
+    }
+
+    /// What the manifest says of the towers.
+    #[must_use]
+    pub fn manifest(&self) -> &ImageTextManifest {
+        &self.manifest
+    }
+
+    /// What computes them.
+    #[must_use]
+    pub fn provider(&self) -> Provider {
+        self.provider
+    }
+
+    /// `[crops * dim]`, rows of unit length; a row that has no length stays 0.
+    ///
+    /// # Errors
+    /// `internal` when the network fails or answers with another shape than its manifest says.
+    pub fn embed_images(&self, crops: &[Crop]) -> Result<Vec<f32>> {
+        let tower = &self.manifest.image;
+        let side = tower.size as usize;
+        let mut rows = Vec::with_capacity(crops.len() * self.manifest.dim);
+        for batch in crops.chunks(self.crops.unwrap_or(tower.batch)) {
+            // A file of fixed batch gets its last one filled up.
+            let fixed = self.crops.unwrap_or(batch.len());
+            let mut images = Vec::with_capacity(fixed * 3 * side * side);
+            for crop in batch {
+                let from = [crop.side as usize; 2];
+                let pixels = resize(&crop.rgb, from, [side; 2]);
+                images.extend(planes(&pixels, [side; 2], side, tower.mean, tower.std));
+            }
+            images.resize(fixed * 3 * side * side, 0.0);
+            let input = TensorRef::from_array_view(([fixed, 3, side, side], images.as_slice()))
+                .map_err(fault("image tower"))?;
+            let inputs = vec![(tower.input.as_str(), SessionInputValue::from(input))];
+            let mut session = self.image.take();
+            let outputs = session.run(inputs).map_err(fault("image tower"))?;
+            let found = self.rows(outputs.get(&tower.output), fixed, "image tower")?;
+            rows.extend(found.into_iter().take(batch.len() * self.manifest.dim));
+        }
+        Ok(rows)
+    }
+
+    /// The embedding of each text. Texts of one length run together; a row depends on the others
+    /// by rounding at most, and with the embedded bundle by no bit.
+    ///
+    /// # Errors
+    /// `invalid_request` when a text holds nothing that the tower reads; `internal` when the
+    /// network fails or answers with another shape than its manifest says.
+    pub fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
+        let read: Vec<Tokens> = texts.iter().map(|text| self.read(text)).collect::<Result<_>>()?;
+        let mut by_length: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+        for (i, tokens) in read.iter().enumerate() {
+            by_length.entry(self.tokens.unwrap_or(tokens.ids.len())).or_default().push(i);
+        }
+        let mut rows = vec![Vec::new(); texts.len()];
+        for (length, alike) in by_length {
+            for batch in alike.chunks(self.texts.unwrap_or(TEXTS_A_RUN)) {
+                let found = self.run_texts(batch.iter().map(|&i| &read[i]), length)?;
+                for (&i, row) in batch.iter().zip(found.chunks_exact(self.manifest.dim)) {
+                    rows[i] = row.to_vec();
+                }
+            }
+        }
+        let embedding = |(row, Tokens { count, unknown, cut, .. })| TextEmbedding {
+            row,
+            tokens: count,
+            unknown,
+            cut,
+        };
+        Ok(rows.into_iter().zip(read).map(embedding).collect())
+    }
+
+    /// A text as the text tower reads it.
+    fn read(&self, text: &str) -> Result<Tokens> {
+        let tower = &self.manifest.text;
+        let context = self.tokens.map_or(tower.context, |fixed| fixed.min(tower.context));
+        let encoding = self.tokenizer.encode_fast(text, true).map_err(|e| {
+            Error::invalid(format!("text {text:?} cannot be read by the tokenizer: {e}"))
+        })?;
+        let special = encoding.get_special_tokens_mask();
+        let words = || encoding.get_ids().iter().zip(special).filter(|(_, s)| **s == 0);
+        let count = words().count();
+        if count == 0 {
+            return Err(Error::invalid(format!(
+                "text {text:?} holds nothing that the text tower reads; write words"
+            )));
+        }
+        let unknown = words().filter(|(id, _)| self.unknown == Some(**id)).count();
+        let whole = encoding.get_ids();
+        let cut = whole.len() > context;
+        let mut ids: Vec<i64> = whole.iter().take(context).map(|&id| i64::from(id)).collect();
+        // The end marker stays at the end of a text that is cut: towers read the sentence there.
+        if let (true, Some(1), Some(last), Some(end)) =
+            (cut, special.last(), ids.last_mut(), whole.last())
+        {
+            *last = i64::from(*end);
+        }
+        Ok(Tokens { ids, count, unknown, cut })
+    }
+
+    /// Rows of texts of at most `length` ids, in one run; a file of fixed batch gets its last one
+    /// filled up, and the rows of that follow the others.
+    fn run_texts<'a>(
+        &self,
+        texts: impl Iterator<Item = &'a Tokens>,
+        length: usize,
+    ) -> Result<Vec<f32>> {
+        let tower = &self.manifest.text;
+        let (mut ids, mut there) = (Vec::new(), Vec::new());
+        let mut count = 0;
+        for text in texts {
+            count += 1;
+            ids.extend(&text.ids);
+            ids.resize(count * length, self.padding());
+            there.resize((count - 1) * length + text.ids.len(), 1_i64);
+            there.resize(count * length, 0);
+        }
+        if let Some(fixed) = self.texts {
+            count = fixed;
+            ids = ids.into_iter().cycle().take(count * length).collect();
+            there = there.into_iter().cycle().take(count * length).collect();
+        }
+        let view = |data| {
+            let input = TensorRef::from_array_view(([count, length], data));
+            Ok::<_, Error>(SessionInputValue::from(input.map_err(fault("text tower"))?))
+        };
+        let mut inputs = vec![(tower.input_ids.as_str(), view(ids.as_slice())?)];
+        if let Some(name) = &tower.attention_mask {
+            inputs.push((name, view(there.as_slice())?));
+        }
+        let mut session = self.text.take();
+        let outputs = session.run(inputs).map_err(fault("text tower"))?;
+        self.rows(outputs.get(&tower.output), count, "text tower")
+    }
+
+    /// Id that fills up a text.
+    fn padding(&self) -> i64 {
+        self.tokenizer.get_padding().map_or(0, |padding| i64::from(padding.pad_id))
+    }
+
+    /// Rows of an output, made unit length in f64.
+    fn rows(
+        &self,
+        value: Option<&ort::value::DynValue>,
+        count: usize,
+        what: &'static str,
+    ) -> Result<Vec<f32>> {
+        let dim = self.manifest.dim;
+        let value = value.ok_or_else(|| Error::internal(format!("{what}: no such output")))?;
+        let (shape, data) = value.try_extract_tensor::<f32>().map_err(fault(what))?;
+        let wanted = [count, dim].map(|n| i64::try_from(n).unwrap_or(-1));
+        if shape.iter().ne(&wanted) {
+            return Err(Error::internal(format!("{what}: output is {shape:?}, not {wanted:?}")));
+        }
+        let mut rows = data.to_vec();
+        for row in rows.chunks_exact_mut(dim) {
+            let length = row.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>().sqrt();
+            if !length.is_finite() {
+                return Err(Error::internal(format!("{what}: an embedding is not finite")));
+            }
+            if length > 0.0 {
+                #[expect(clippy::cast_possible_truncation, reason = "embeddings are f32")]
+                row.iter_mut().for_each(|v| *v = (f64::from(*v) / length) as f32);
+            }
+        }
+        Ok(rows)
+    }
+}
+
+/// The tokenizer's file, whose own truncation and padding are switched off: both are done here.
+fn read_tokenizer(bundle: &Bundle, named: &str) -> Result<Tokenizer> {
+    let unavailable =
+        |why: String| Error::new(ErrorCode::ModelUnavailable, format!("{named}: {why}"));
+    let bytes = fs_err::read(bundle.path(named)).map_err(|e| unavailable(e.kind().to_string()))?;
+    let mut tokenizer = Tokenizer::from_bytes(&bytes).map_err(|e| unavailable(e.to_string()))?;
+    tokenizer.with_truncation(None).map_err(|e| unavailable(e.to_string()))?;
+    Ok(tokenizer)
+}
+
+fn fault(what: &'static str) -> impl Fn(ort::Error) -> Error {
+    move |e| Error::internal(format!("{what} failed")).caused_by(e)
+}

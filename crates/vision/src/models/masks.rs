@@ -1,0 +1,311 @@
+//! The mask network: a photo is encoded once, then points in it are decoded to masks.
+//!
+//! Two signatures, told apart by the manifest's `adapter`. What a file takes (a batch of prompts or
+//! one, a former mask, the photo's size) is read from the file itself.
+
+use std::sync::Arc;
+
+use ort::{
+    session::{Session, SessionInputValue},
+    value::{TensorElementType, TensorRef, ValueType},
+};
+
+use crate::{
+    error::{Error, ErrorCode, Result},
+    models::{
+        Bundle, MaskAdapter, MasksManifest, NetworkOptions, Provider, Runtime,
+        pool::{Pool, input_shape},
+        resize::{planes, resize},
+    },
+    scene::Photo,
+};
+
+/// Side of the logits asked of an `efficient_sam` decoder: what it computes, before it enlarges.
+const EFFICIENT_SAM_LOGITS: u32 = 256;
+
+/// The network, ready to run from any thread.
+#[derive(Debug)]
+pub struct MaskNetwork {
+    manifest: MasksManifest,
+    encoder: Pool,
+    decoder: Pool,
+    takes: Takes,
+    provider: Provider,
+    _runtime: Arc<Runtime>,
+}
+
+/// A photo as the encoder saw it.
+#[derive(Clone, Debug)]
+pub struct PhotoEmbedding {
+    resized: [u32; 2],
+    /// Name for the decoder, shape and data.
+    tensors: Vec<(String, Vec<usize>, Vec<f32>)>,
+}
+
+/// Masks of a batch of prompts, as logits: over 0 is inside.
+#[derive(Clone, Debug)]
+pub struct MaskLogits {
+    /// Prompts (B).
+    pub prompts: usize,
+    /// Masks a prompt (K), from parts to the whole.
+    pub levels: usize,
+    /// `[width, height]` of the grid.
+    pub grid: [usize; 2],
+    /// `[B * K * height * width]`.
+    pub logits: Vec<f32>,
+    /// `[B * K]`.
+    pub predicted_iou: Vec<f32>,
+}
+
+/// What the decoder's file takes.
+#[derive(Clone, Debug)]
+struct Takes {
+    /// Prompts a run.
+    batch: usize,
+    /// Points a prompt: the one asked for, then padding.
+    points: usize,
+    /// Shape of the former mask, where there is such an input.
+    mask: Option<Vec<usize>>,
+    has_mask: bool,
+    size: Option<TensorElementType>,
+}
+
+impl PhotoEmbedding {
+    /// `[width, height]` of the part of the encoder's square that the photo fills, pixels.
+    #[must_use]
+    pub fn resized(&self) -> [u32; 2] {
+        self.resized
+    }
+}
+
+impl MaskNetwork {
+    /// Opens encoder and decoder on the provider of the configuration; `None` where the bundle has
+    /// no masks.
+    ///
+    /// # Errors
+    /// `model_unavailable` when the provider asked for is not there, a file does not load, or its
+    /// inputs are not those of the manifest.
+    pub fn open(
+        runtime: Arc<Runtime>,
+        bundle: &Bundle,
+        options: &NetworkOptions,
+    ) -> Result<Option<Self>> {
+        let Some(manifest) = bundle.masks().cloned() else { return Ok(None) };
+        let (encoder, provider) =
+            Pool::open(&runtime, bundle, options, "mask encoder", &manifest.encoder.file)?;
+        let (decoder, _) =
+            Pool::open(&runtime, bundle, options, "mask decoder", &manifest.decoder.file)?;
+        let takes = Takes::of(&decoder.take(), &manifest)?;
+        Ok(Some(Self { manifest, encoder, decoder, takes, provider, _runtime: runtime }))
+    }
+
+    /// What the manifest says of the network.
+    #[must_use]
+    pub fn manifest(&self) -> &MasksManifest {
+        &self.manifest
+    }
+
+    /// What computes it.
+    #[must_use]
+    pub fn provider(&self) -> Provider {
+        self.provider
+    }
+
+    /// Prompts in one run of the decoder.
+    #[must_use]
+    pub fn batch(&self) -> usize {
+        self.takes.batch
+    }
+
+    /// Runs the encoder.
+    ///
+    /// # Errors
+    /// `internal` when the network fails or has not the outputs of its manifest.
+    pub fn encode(&self, photo: &Photo) -> Result<PhotoEmbedding> {
+        let (m, side) = (&self.manifest, self.manifest.size);
+        let resized = match m.adapter {
+            MaskAdapter::Sam => longest(photo, side),
+            MaskAdapter::EfficientSam => [side, side],
+        };
+        let [width, height] = resized.map(|v| v as usize);
+        let pixels =
+            resize(&photo.rgb, [photo.width as usize, photo.height as usize], [width, height]);
+        let side = side as usize;
+        let image = planes(&pixels, [width, height], side, m.mean, m.std);
+        let input = TensorRef::from_array_view(([1, 3, side, side], image.as_slice()))
+            .map_err(fault("encoder input"))?;
+        let mut session = self.encoder.take();
+        let inputs = vec![(m.encoder.input.as_str(), SessionInputValue::from(input))];
+        let outputs = session.run(inputs).map_err(fault("encoder run"))?;
+        let main = (&m.encoder.output, &m.decoder.image_embeddings);
+        let names = [main].into_iter().chain(m.encoder.features.iter().map(|name| (name, name)));
+        let mut tensors = Vec::new();
+        for (from, to) in names {
+            let value = outputs
+                .get(from)
+                .ok_or_else(|| Error::internal(format!("mask encoder: no output {from:?}")))?;
+            let (shape, data) =
+                value.try_extract_tensor::<f32>().map_err(fault("encoder output"))?;
+            let shape = shape.iter().map(|&n| usize::try_from(n).unwrap_or(0)).collect();
+            tensors.push((to.clone(), shape, data.to_vec()));
+        }
+        Ok(PhotoEmbedding { resized, tensors })
+    }
+
+    /// Masks of each point; points are shares 0..1 of the photo's width and height.
+    ///
+    /// # Errors
+    /// `internal` when the network fails or answers with other shapes than its manifest says.
+    pub fn decode(&self, embedding: &PhotoEmbedding, points: &[[f32; 2]]) -> Result<MaskLogits> {
+        let mut all = MaskLogits {
+            prompts: points.len(),
+            levels: self.manifest.levels.len(),
+            grid: [0, 0],
+            logits: Vec::new(),
+            predicted_iou: Vec::new(),
+        };
+        for batch in points.chunks(self.takes.batch) {
+            self.decode_batch(embedding, batch, &mut all)?;
+        }
+        Ok(all)
+    }
+
+    fn decode_batch(
+        &self,
+        embedding: &PhotoEmbedding,
+        points: &[[f32; 2]],
+        all: &mut MaskLogits,
+    ) -> Result<()> {
+        let (names, takes) = (&self.manifest.decoder, &self.takes);
+        let (count, each) = (points.len(), takes.points);
+        let efficient = self.manifest.adapter == MaskAdapter::EfficientSam;
+        // EfficientSAM takes points in pixels of the size that its masks come back in.
+        let frame = if efficient { [EFFICIENT_SAM_LOGITS; 2] } else { embedding.resized };
+        let mut coords = vec![0.0_f32; count * each * 2];
+        let mut labels = vec![-1.0_f32; count * each];
+        for (i, point) in points.iter().enumerate() {
+            for axis in 0..2 {
+                coords[i * each * 2 + axis] = point[axis] * frame[axis] as f32;
+            }
+            labels[i * each] = 1.0;
+        }
+        let mut inputs: Vec<(&str, SessionInputValue<'_>)> = Vec::new();
+        for (name, shape, data) in &embedding.tensors {
+            inputs.push((name, tensor(shape, data)?));
+        }
+        let lead: &[usize] = if efficient { &[1] } else { &[] };
+        inputs.push((&names.point_coords, tensor(&[lead, &[count, each, 2]].concat(), &coords)?));
+        inputs.push((&names.point_labels, tensor(&[lead, &[count, each]].concat(), &labels)?));
+        let mask = vec![0.0; takes.mask.iter().flatten().product()];
+        if let Some(shape) = &takes.mask {
+            inputs.push((&names.mask_input, tensor(shape, &mask)?));
+        }
+        if takes.has_mask {
+            inputs.push((&names.has_mask_input, tensor(&[1], &[0.0])?));
+        }
+        // SAM's decoder enlarges to this size what nobody reads: the smallest will do.
+        let size = if efficient { frame } else { [1, 1] };
+        let (floats, ints) = (size.map(|v| v as f32), size.map(i64::from));
+        match takes.size {
+            Some(TensorElementType::Int64) => {
+                let view = TensorRef::from_array_view(([2], ints.as_slice()));
+                inputs.push((&names.orig_im_size, view.map_err(fault("decoder input"))?.into()));
+            }
+            Some(_) => inputs.push((&names.orig_im_size, tensor(&[2], &floats)?)),
+            None => {}
+        }
+        let mut session = self.decoder.take();
+        let outputs = session.run(inputs).map_err(fault("decoder run"))?;
+        let get = |name: &str, tail: usize| -> Result<(Vec<usize>, &[f32])> {
+            let value = outputs
+                .get(name)
+                .ok_or_else(|| Error::internal(format!("mask decoder: no output {name:?}")))?;
+            let (shape, data) =
+                value.try_extract_tensor::<f32>().map_err(fault("decoder output"))?;
+            let shape: Vec<usize> =
+                shape.iter().map(|&n| usize::try_from(n).unwrap_or(0)).collect();
+            let wanted = [lead, &[count]].concat();
+            if shape.len() != wanted.len() + tail || shape[..wanted.len()] != wanted {
+                return Err(Error::internal(format!(
+                    "mask decoder: output {name:?} is {shape:?} for {count} prompts"
+                )));
+            }
+            Ok((shape[wanted.len()..].to_vec(), data))
+        };
+        let (shape, logits) = get(&names.low_res_masks, 3)?;
+        let (found, iou) = get(&names.iou_predictions, 1)?;
+        let (kinds, grid) = (shape[0], [shape[2], shape[1]]);
+        let levels = &self.manifest.levels;
+        let fits = found[0] == kinds && levels.iter().all(|&level| level < kinds);
+        if !fits || (all.grid != grid && all.grid != [0, 0]) || grid.contains(&0) {
+            return Err(Error::internal(format!(
+                "mask decoder: masks are {shape:?} and IoUs {found:?}, with levels {levels:?}"
+            )));
+        }
+        all.grid = grid;
+        for prompt in 0..count {
+            for level in levels {
+                let at = prompt * kinds + level;
+                let cells = grid[0] * grid[1];
+                all.logits.extend_from_slice(&logits[at * cells..(at + 1) * cells]);
+                all.predicted_iou.push(iou[at]);
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Takes {
+    /// Reads the inputs of the decoder's file.
+    fn of(session: &Session, manifest: &MasksManifest) -> Result<Self> {
+        let names = &manifest.decoder;
+        let free = |n: i64| usize::try_from(n).ok().filter(|&n| n > 0);
+        let wanted = if manifest.adapter == MaskAdapter::EfficientSam { 4 } else { 3 };
+        let coords = input_shape(session, &names.point_coords).unwrap_or_default();
+        if coords.len() != wanted {
+            return Err(Error::new(
+                ErrorCode::ModelUnavailable,
+                format!(
+                    "mask decoder: input {:?} of {} has {} dimensions, not {wanted}",
+                    names.point_coords,
+                    names.file,
+                    coords.len()
+                ),
+            ));
+        }
+        // A padding point follows the one asked for, as SAM's own code adds one where no box is
+        // given; EfficientSAM pads by itself.
+        let points = free(coords[wanted - 2]).unwrap_or(if wanted == 4 { 1 } else { 2 });
+        let most = manifest.points_per_batch as usize;
+        Ok(Self {
+            batch: free(coords[wanted - 3]).map_or(most, |fixed| fixed.min(most)),
+            points,
+            mask: input_shape(session, &names.mask_input)
+                .map(|shape| shape.iter().map(|&n| free(n).unwrap_or(1)).collect()),
+            has_mask: input_shape(session, &names.has_mask_input).is_some(),
+            size: session.inputs().iter().find(|i| i.name() == names.orig_im_size).map(|input| {
+                match input.dtype() {
+                    ValueType::Tensor { ty, .. } => *ty,
+                    _ => TensorElementType::Float32,
+                }
+            }),
+        })
+    }
+}
+
+/// `[width, height]` with the longer side at `side`, rounded as Segment Anything does.
+fn longest(photo: &Photo, side: u32) -> [u32; 2] {
+    let (w, h) = (f64::from(photo.width), f64::from(photo.height));
+    let scale = f64::from(side) / w.max(h);
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "at most `side`")]
+    [w, h].map(|v| ((v * scale + 0.5) as u32).clamp(1, side))
+}
+
+fn tensor<'a>(shape: &[usize], data: &'a [f32]) -> Result<SessionInputValue<'a>> {
+    let view = TensorRef::from_array_view((shape.to_vec(), data));
+    Ok(view.map_err(fault("input"))?.into())
+}
+
+fn fault(what: &'static str) -> impl Fn(ort::Error) -> Error {
+    move |e| Error::internal(format!("mask network: {what} failed")).caused_by(e)
+}

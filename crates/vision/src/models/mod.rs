@@ -1,0 +1,33 @@
+//! The networks: a bundle with its manifest, ONNX Runtime, a pool of sessions, one adapter each.
+//!
+//! [`Geometry`]: photos with cameras, depth ranges and neighbours to [`ViewGaussians`].
+//! [`MaskNetwork`]: a photo and points in it to masks. [`ImageText`]: crops and texts to embeddings
+//! of one space. A network is known only by its `bundle.toml`: names, sizes, normalisation and
+//! frames all come from there. The only module that knows `ort`.
+//!
+//! [`ViewGaussians`]: crate::scene::ViewGaussians
+
+mod bundle;
+mod fit;
+mod frame;
+mod geometry;
+mod image_text;
+mod manifest;
+mod masks;
+mod options;
+mod pool;
+mod resize;
+mod runtime;
+
+pub use bundle::{Bundle, BundleFile, GeometryManifest, OutputFrame, Translation};
+pub use fit::{FittedPhoto, bucket_for, fit};
+pub use frame::ModelFrame;
+pub use geometry::{Geometry, GeometryInput};
+pub use image_text::{ImageText, TextEmbedding};
+pub use manifest::{
+    ImageTextManifest, ImageTowerManifest, MaskAdapter, MaskDecoderManifest, MaskEncoderManifest,
+    MasksManifest, TextTowerManifest,
+};
+pub use masks::{MaskLogits, MaskNetwork, PhotoEmbedding};
+pub use options::{NetworkOptions, ProviderChoice};
+pub use runtime::{Provider, Runtime, SETUP_COMMAND};

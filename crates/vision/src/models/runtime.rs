@@ -1,0 +1,267 @@
+//! ONNX Runtime: found, checked by sha256, loaded once in a process, never at build time.
+//!
+//! Search order: `--ort-library` / `SEGSPLAT_ORT_LIBRARY`, `ORT_DYLIB_PATH`, beside the
+//! executable, `target/ort/`, the system's folders. A library that the operator *named* is loaded
+//! whatever it is, with a warning when its hash is not pinned (a CUDA build, a newer release); one
+//! that was merely *found* must be one of the pinned builds, else the start is refused.
+
+use std::{
+    path::{Path, PathBuf},
+    sync::{Arc, Mutex, PoisonError},
+};
+
+use ort::{
+    ep::{self, ExecutionProvider},
+    session::{Session, builder::SessionBuilder},
+};
+use tracing::{info, warn};
+
+use crate::{
+    error::{Error, ErrorCode, Result},
+    models::{NetworkOptions, ProviderChoice, bundle::sha256_of},
+};
+
+/// The one command that gets the library.
+pub const SETUP_COMMAND: &str = "scripts/setup";
+/// File name of the library.
+const LIBRARY: &str = "libonnxruntime.so";
+/// sha256 and name of every accepted build, as `scripts/setup` reads it too.
+const PINS: &str = include_str!("../../../../third_party/onnxruntime.sha256");
+/// Folders of the system, in the loader's own order.
+const SYSTEM: [&str; 6] = [
+    "/usr/local/lib",
+    "/usr/lib/x86_64-linux-gnu",
+    "/usr/lib/aarch64-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib",
+    "/lib",
+];
+
+/// What computes the networks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Provider {
+    /// ONNX Runtime's own kernels.
+    Cpu,
+    /// CUDA.
+    Cuda,
+    /// WebGPU.
+    Webgpu,
+}
+
+impl Provider {
+    /// Name for reports and logs.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Cpu => "cpu",
+            Self::Cuda => "cuda",
+            Self::Webgpu => "webgpu",
+        }
+    }
+}
+
+/// The loaded library: one in a process.
+#[derive(Debug)]
+pub struct Runtime {
+    environment: ort::environment::Environment,
+    path: PathBuf,
+    sha256: String,
+    pinned: Option<&'static str>,
+}
+
+/// The process's library. `ort` can load one only, so a second one is an error, not a surprise.
+static LOADED: Mutex<Option<Arc<Runtime>>> = Mutex::new(None);
+
+impl Runtime {
+    /// Finds, checks and loads the library; the same [`Runtime`] again on later calls.
+    ///
+    /// # Errors
+    /// `model_unavailable`: no library (names the command that gets it), one that is not pinned
+    /// where it was only found, one too old, or another one is loaded already.
+    pub fn load(options: &NetworkOptions) -> Result<Arc<Self>> {
+        let (path, named) = locate(options)?;
+        let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(runtime) = &*loaded {
+            if runtime.path == path {
+                return Ok(Arc::clone(runtime));
+            }
+            return Err(unavailable(
+                "ONNX Runtime: another library is loaded in this process already",
+            ));
+        }
+        let sha256 = sha256_of(&path).map_err(|e| {
+            unavailable(format!("ONNX Runtime: the library cannot be read ({})", e.kind()))
+                .caused_by(e)
+        })?;
+        let pinned = pin_of(&sha256);
+        match (pinned, named) {
+            (Some(name), _) => info!(library = %path.display(), build = name, "ONNX Runtime"),
+            (None, true) => warn!(
+                library = %path.display(), sha256,
+                "ONNX Runtime is not a pinned build; loaded because it was named"
+            ),
+            (None, false) => {
+                return Err(unavailable(format!(
+                    "ONNX Runtime: the {LIBRARY} that was found has sha256 {sha256}, which is not \
+                     pinned; run `{SETUP_COMMAND}`, or name the library with \
+                     SEGSPLAT_ORT_LIBRARY to use it all the same"
+                )));
+            }
+        }
+        let environment = ort::init_from(&path)
+            .map_err(|e| {
+                unavailable(format!(
+                    "ONNX Runtime: the library does not load; run `{SETUP_COMMAND}`"
+                ))
+                .caused_by(e)
+            })?
+            .with_name("segsplat")
+            .with_telemetry(false)
+            .build()
+            .map_err(|e| unavailable("ONNX Runtime: the library does not start").caused_by(e))?;
+        let runtime = Arc::new(Self { environment, path, sha256, pinned });
+        *loaded = Some(Arc::clone(&runtime));
+        Ok(runtime)
+    }
+
+    /// sha256 of the library.
+    #[must_use]
+    pub fn sha256(&self) -> &str {
+        &self.sha256
+    }
+
+    /// Name of the pinned build, when it is one.
+    #[must_use]
+    pub fn build(&self) -> Option<&'static str> {
+        self.pinned
+    }
+
+    /// Opens `model` on `provider`, `threads` threads an operator, spinning off.
+    pub(super) fn session(
+        &self,
+        model: &Path,
+        provider: Provider,
+        threads: usize,
+    ) -> std::result::Result<Session, ort::Error> {
+        let builder = self.builder(provider, threads)?;
+        let mut builder = builder;
+        builder.commit_from_file(model)
+    }
+
+    fn builder(
+        &self,
+        provider: Provider,
+        threads: usize,
+    ) -> std::result::Result<SessionBuilder, ort::Error> {
+        let mut providers = Vec::new();
+        match provider {
+            Provider::Cpu => {}
+            Provider::Cuda => providers.push(ep::CUDA::default().build().error_on_failure()),
+            Provider::Webgpu => providers.push(ep::WebGPU::default().build().error_on_failure()),
+        }
+        Ok(Session::builder(&self.environment)?
+            .with_intra_threads(threads)?
+            .with_inter_threads(1)?
+            .with_intra_op_spinning(false)?
+            .with_inter_op_spinning(false)?
+            .with_execution_providers(providers)?)
+    }
+
+    /// Providers to try for a choice, best first.
+    pub(super) fn candidates(&self, choice: ProviderChoice) -> Result<Vec<Provider>> {
+        let has = |available: ort::Result<bool>| available.unwrap_or(false);
+        let refuse = |name: &str| {
+            Err(unavailable(format!(
+                "execution provider {name}: this ONNX Runtime library was built without it; name \
+                 one that has it with SEGSPLAT_ORT_LIBRARY, or use --provider auto"
+            )))
+        };
+        match choice {
+            ProviderChoice::Cpu => Ok(vec![Provider::Cpu]),
+            ProviderChoice::Auto if has(ep::CUDA::is_available()) => {
+                Ok(vec![Provider::Cuda, Provider::Cpu])
+            }
+            ProviderChoice::Auto => Ok(vec![Provider::Cpu]),
+            ProviderChoice::Cuda if has(ep::CUDA::is_available()) => Ok(vec![Provider::Cuda]),
+            ProviderChoice::Cuda => refuse("cuda"),
+            ProviderChoice::Webgpu if has(ep::WebGPU::is_available()) => Ok(vec![Provider::Webgpu]),
+            ProviderChoice::Webgpu => refuse("webgpu"),
+        }
+    }
+}
+
+/// Name of the pinned build with this hash.
+fn pin_of(sha256: &str) -> Option<&'static str> {
+    PINS.lines()
+        .filter_map(|line| line.split_once("  "))
+        .find(|(hash, _)| hash.eq_ignore_ascii_case(sha256))
+        .map(|(_, name)| name.trim())
+}
+
+/// The library's path, and whether the operator named it.
+fn locate(options: &NetworkOptions) -> Result<(PathBuf, bool)> {
+    let from_env = || std::env::var_os("ORT_DYLIB_PATH").map(PathBuf::from);
+    if let Some(path) = options.ort_library.clone().or_else(from_env) {
+        let path = if path.is_dir() { path.join(LIBRARY) } else { path };
+        return match path.canonicalize() {
+            Ok(path) => Ok((path, true)),
+            Err(e) => Err(unavailable(format!(
+                "ONNX Runtime: the library named by --ort-library, SEGSPLAT_ORT_LIBRARY or \
+                 ORT_DYLIB_PATH cannot be read ({}); run `{SETUP_COMMAND}` and unset it to use \
+                 the pinned one",
+                e.kind()
+            ))
+            .caused_by(e)),
+        };
+    }
+    let beside = std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.join(LIBRARY)));
+    let target = std::env::var_os("CARGO_TARGET_DIR").map(|dir| PathBuf::from(dir).join("ort"));
+    let folders = target
+        .into_iter()
+        .chain([PathBuf::from("target/ort")])
+        .chain(SYSTEM.iter().map(PathBuf::from))
+        .map(|dir| dir.join(LIBRARY));
+    beside
+        .into_iter()
+        .chain(folders)
+        .find_map(|path| path.canonicalize().ok())
+        .map(|path| (path, false))
+        .ok_or_else(|| {
+            unavailable(format!(
+                "ONNX Runtime is missing: no {LIBRARY} beside the executable, in target/ort or in \
+                 the system's folders; run `{SETUP_COMMAND}` (24 MB, checked by sha256)"
+            ))
+        })
+}
+
+fn unavailable(message: impl Into<String>) -> Error {
+    Error::new(ErrorCode::ModelUnavailable, message)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_pin_is_a_hash_and_a_name() {
+        let pins: Vec<_> = PINS.lines().filter(|line| !line.starts_with('#')).collect();
+        assert!(!pins.is_empty(), "no pins");
+        for line in pins {
+            let (hash, name) = line.split_once("  ").expect("hash, two spaces, name");
+            assert_eq!(hash.len(), 64, "{line}");
+            assert_eq!(pin_of(hash), Some(name.trim()), "{line}");
+        }
+        assert_eq!(pin_of(&"0".repeat(64)), None, "an unknown hash has no pin");
+    }
+
+    #[test]
+    fn a_named_library_that_is_missing_names_the_command() {
+        let options = NetworkOptions {
+            ort_library: Some("/nonexistent/lib.so".into()),
+            ..NetworkOptions::default()
+        };
+        let error = locate(&options).unwrap_err();
+        assert_eq!(error.code(), ErrorCode::ModelUnavailable, "{error}");
+        assert!(error.message().contains(SETUP_COMMAND), "{error}");
+    }
+}

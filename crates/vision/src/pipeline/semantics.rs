@@ -1,0 +1,445 @@
+//! The order of the stages that give a scene its meaning: masks ▸ embed ▸ bank ▸ assign.
+//!
+//! [`understand`] runs them with the engine's networks, which are opened at the first call;
+//! [`understand_with`] with whatever gives masks and embeddings. Every Gaussian takes the index of
+//! the pixel that made it; what other photos say of it is a switch of [`SemanticsOptions`].
+
+use std::{
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Instant,
+};
+
+use super::{Engine, masks};
+use crate::{
+    error::{Error, ErrorCode, Result},
+    limits::Limits,
+    meter,
+    models::{ImageText, MaskNetwork, NetworkOptions, Runtime},
+    photos,
+    scene::{
+        Bank, Crop, Gaussians, IndexMap, PhotoMasks, PosedPhoto, Scene, SceneCamera,
+        ScoringProfile, Semantics, SemanticsReport, StageTime, Upload,
+    },
+    semantics::{self, Clusters, Cutter, NetworkPicture, Scoring, Views},
+};
+
+/// Canonical phrases of the profile `paper`.
+const PAPER_CANON: [&str; 3] = ["object", "things", "stuff"];
+/// Sharpness of the profile `paper`.
+const PAPER_TAU: f64 = 10.0;
+
+/// How alike two rows must be to become one, where two photos show them on one surface.
+const MERGE_COSINE_MIN: f64 = 0.7;
+
+/// A stage of giving a scene its meaning, in order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum SemanticsStage {
+    /// The mask network, photo by photo.
+    Masks,
+    /// The image tower on a cut of each mask.
+    Embed,
+    /// K-Means over the embeddings.
+    Bank,
+    /// An index a Gaussian.
+    Assign,
+}
+
+impl SemanticsStage {
+    /// Name in events and reports.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Masks => "masks",
+            Self::Embed => "embed",
+            Self::Bank => "bank",
+            Self::Assign => "assign",
+        }
+    }
+
+    /// Where the stage begins and ends in the whole, 0..1; most of the time goes to the networks.
+    #[must_use]
+    pub fn share(self) -> [f32; 2] {
+        match self {
+            Self::Masks => [0.0, 0.6],
+            Self::Embed => [0.6, 0.95],
+            Self::Bank => [0.95, 0.98],
+            Self::Assign => [0.98, 1.0],
+        }
+    }
+}
+
+/// What may be done beyond the paper.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SemanticsOptions {
+    /// Ask a photo first where masks of earlier photos reappear.
+    pub seeds: bool,
+    /// Let all photos that show a Gaussian vote for its index.
+    pub votes: bool,
+    /// Join indices that are one thing seen from two sides, where their rows are at least this
+    /// alike (cosine); `None` joins none.
+    pub merge: Option<f64>,
+}
+
+impl Default for SemanticsOptions {
+    fn default() -> Self {
+        Self { seeds: true, votes: true, merge: Some(MERGE_COSINE_MIN) }
+    }
+}
+
+/// The masks of each photo; is told how to report its fraction, 0..1.
+pub type MasksOfPhotos<'a> = dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> + Sync + 'a;
+
+/// What gives masks and embeddings.
+pub struct SemanticsTools<'a> {
+    /// The masks of each photo; is told how to report its fraction, 0..1.
+    pub masks: &'a MasksOfPhotos<'a>,
+    /// `[crops * dim]` unit embeddings.
+    pub embed: &'a (dyn Fn(&[Crop]) -> Result<Vec<f32>> + Sync),
+    /// Numbers of an embedding.
+    pub dim: usize,
+    /// Added around a mask's box on each side, share of its longer side.
+    pub crop_margin: f64,
+    /// Crops that are embedded together, and so in memory together.
+    pub batch: usize,
+}
+
+impl std::fmt::Debug for SemanticsTools<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("SemanticsTools").field("dim", &self.dim).finish_non_exhaustive()
+    }
+}
+
+/// The scene that is to be understood: its photos, their cameras, and what they became.
+#[derive(Clone, Copy, Debug)]
+pub struct SceneParts<'a> {
+    /// Undistorted photos, in the scene's order.
+    pub photos: &'a [PosedPhoto],
+    /// The scene's cameras, in the same order.
+    pub cameras: &'a [SceneCamera],
+    /// Its Gaussians.
+    pub gaussians: &'a Gaussians,
+}
+
+/// How the work tells where it is, and is stopped.
+#[derive(Clone, Copy)]
+pub struct Watch<'a> {
+    /// Gets each stage with its own fraction, 0..1.
+    pub progress: &'a (dyn Fn(SemanticsStage, f32) + Sync),
+    /// Looked at between photos and batches.
+    pub cancel: &'a AtomicBool,
+}
+
+impl std::fmt::Debug for Watch<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Watch").finish_non_exhaustive()
+    }
+}
+
+impl Watch<'_> {
+    fn check(&self) -> Result<()> {
+        if self.cancel.load(Ordering::Relaxed) {
+            return Err(Error::new(ErrorCode::Cancelled, "the scene's semantics were cancelled"));
+        }
+        Ok(())
+    }
+}
+
+/// The networks that semantics need, opened at the first use and kept.
+#[derive(Debug)]
+pub(super) struct LazyNetworks {
+    options: NetworkOptions,
+    masks: Mutex<Option<Arc<MaskNetwork>>>,
+    image_text: Mutex<Option<Arc<ImageText>>>,
+}
+
+impl LazyNetworks {
+    pub(super) fn new(options: &NetworkOptions) -> Self {
+        Self { options: options.clone(), masks: Mutex::default(), image_text: Mutex::default() }
+    }
+}
+
+/// What is kept in `place`, opened now where it was not. A failure is not kept: it may be mended.
+fn opened<T>(
+    place: &Mutex<Option<Arc<T>>>,
+    what: &str,
+    open: impl FnOnce() -> Result<Option<T>>,
+) -> Result<Arc<T>> {
+    let mut held = place.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(network) = &*held {
+        return Ok(Arc::clone(network));
+    }
+    let network = open()?.ok_or_else(|| {
+        Error::new(ErrorCode::ModelUnavailable, format!("the bundle has no {what}"))
+    })?;
+    Ok(Arc::clone(held.insert(Arc::new(network))))
+}
+
+impl Engine {
+    /// The mask network, opened at the first call.
+    ///
+    /// # Errors
+    /// `model_unavailable` when the bundle has none or it does not open.
+    pub fn masks(&self) -> Result<Arc<MaskNetwork>> {
+        let open = || MaskNetwork::open(self.library(), &self.bundle, &self.lazy.options);
+        opened(&self.lazy.masks, "mask network", open)
+    }
+
+    /// The image and the text tower, opened at the first call.
+    ///
+    /// # Errors
+    /// `model_unavailable` when the bundle has none or one does not open.
+    pub fn image_text(&self) -> Result<Arc<ImageText>> {
+        let open = || ImageText::open(self.library(), &self.bundle, &self.lazy.options);
+        opened(&self.lazy.image_text, "image and text towers", open)
+    }
+
+    /// How texts are scored under a profile: the bundle's phrases and sharpness, or the paper's.
+    ///
+    /// # Errors
+    /// `model_unavailable` when the bundle has no text tower, `internal` when it fails.
+    pub fn scoring(&self, profile: ScoringProfile) -> Result<Scoring> {
+        let towers = self.image_text()?;
+        let manifest = towers.manifest();
+        let (canon, tau) = match profile {
+            ScoringProfile::Default => (manifest.canon.clone(), f64::from(manifest.tau)),
+            ScoringProfile::Paper => (PAPER_CANON.map(str::to_owned).to_vec(), PAPER_TAU),
+        };
+        let rows = towers.embed_texts(&canon)?.into_iter().map(|text| text.row).collect();
+        Scoring::new(profile, rows, tau, f64::from(manifest.coverage_floor))
+    }
+
+    fn library(&self) -> Arc<Runtime> {
+        Arc::clone(&self.runtime)
+    }
+}
+
+/// Gives a finished scene its meaning: reads its photos again, then as [`understand`].
+///
+/// # Errors
+/// As [`understand`]; `internal` when the upload is not the one the scene was made of.
+pub fn understand_upload(
+    engine: &Engine,
+    upload: &Upload,
+    limits: &Limits,
+    scene: &Scene,
+    options: &SemanticsOptions,
+    watch: Watch<'_>,
+) -> Result<Semantics> {
+    let photos = engine.workers.install(|| photos::read(upload, limits))?;
+    let cameras = &scene.meta.cameras;
+    let parts = SceneParts { photos: &photos, cameras, gaussians: &scene.gaussians };
+    understand(engine, &parts, options, watch)
+}
+
+/// Gives a scene its meaning with the engine's networks.
+///
+/// # Errors
+/// `model_unavailable`, `cancelled`, `internal`; `invalid_request` when the scene does not say
+/// which pixel made each Gaussian.
+pub fn understand(
+    engine: &Engine,
+    parts: &SceneParts<'_>,
+    options: &SemanticsOptions,
+    watch: Watch<'_>,
+) -> Result<Semantics> {
+    check_parts(parts)?;
+    let (network, towers) = (engine.masks()?, engine.image_text()?);
+    let settings = masks::settings(network.manifest());
+    let seeds = options.seeds.then_some(parts.gaussians);
+    let image = &towers.manifest().image;
+    let tools = SemanticsTools {
+        masks: &|progress| {
+            masks::photo_masks(&network, parts.photos, seeds, &settings, progress, watch.cancel)
+        },
+        embed: &|crops| towers.embed_images(crops),
+        dim: towers.manifest().dim,
+        crop_margin: f64::from(image.crop_margin),
+        batch: image.batch,
+    };
+    let mut made = engine.workers.install(|| understand_with(&tools, parts, options, watch))?;
+    made.report.bundle_sha256 = engine.bundle.sha256().to_owned();
+    made.report.execution_provider = towers.provider().name().to_owned();
+    Ok(made)
+}
+
+/// Gives a scene its meaning with any masks and embeddings.
+///
+/// # Errors
+/// Those of the tools, `cancelled`, `internal` when an answer has another length than asked for;
+/// `invalid_request` when the scene does not say which pixel made each Gaussian.
+pub fn understand_with(
+    tools: &SemanticsTools<'_>,
+    parts: &SceneParts<'_>,
+    options: &SemanticsOptions,
+    watch: Watch<'_>,
+) -> Result<Semantics> {
+    check_parts(parts)?;
+    let mut times = Vec::new();
+    let masks = timed(&mut times, SemanticsStage::Masks, watch, || {
+        (tools.masks)(&|fraction| (watch.progress)(SemanticsStage::Masks, fraction))
+    })?;
+    if masks.len() != parts.photos.len() {
+        return Err(Error::internal(format!(
+            "masks of {} photos, not of {}",
+            masks.len(),
+            parts.photos.len()
+        )));
+    }
+    let embedded = timed(&mut times, SemanticsStage::Embed, watch, || {
+        embed(tools, parts.photos, &masks, watch)
+    })?;
+    let mut labels = timed(&mut times, SemanticsStage::Bank, watch, || {
+        let clusters = semantics::bank(&embedded.rows, tools.dim, parts.photos.len())?;
+        Ok(label(&masks, &embedded.of, clusters))
+    })?;
+    let index = timed(&mut times, SemanticsStage::Assign, watch, || {
+        Ok(assign(&mut labels, parts, options))
+    })?;
+    let count = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
+    let report = SemanticsReport {
+        masks: masks.iter().map(|of| count(of.masks.len())).collect(),
+        bank_size: count(labels.bank.len()),
+        labelled: index.iter().filter(|m| **m > 0).count() as u64,
+        profile: ScoringProfile::Default,
+        stages: times,
+        ..SemanticsReport::default()
+    };
+    Ok(Semantics { bank: labels.bank, index, photos: labels.maps, report })
+}
+
+/// Refuses a scene whose Gaussians cannot be found in its photos.
+fn check_parts(parts: &SceneParts<'_>) -> Result<()> {
+    let (photos, cameras) = (parts.photos.len(), parts.cameras.len());
+    let named = parts.photos.iter().zip(parts.cameras).all(|(p, c)| p.file == c.file);
+    if photos != cameras || !named {
+        return Err(Error::internal(format!(
+            "semantics: {photos} photos are not those of the scene's {cameras} cameras"
+        )));
+    }
+    if !parts.gaussians.is_empty() && parts.cameras.iter().all(|c| c.network.is_none()) {
+        return Err(Error::invalid(
+            "semantics: the scene does not say which pixels made its Gaussians (an older program \
+             made it, or none did); make it again from its photos",
+        ));
+    }
+    Ok(())
+}
+
+fn timed<T>(
+    times: &mut Vec<StageTime>,
+    stage: SemanticsStage,
+    watch: Watch<'_>,
+    work: impl FnOnce() -> Result<T>,
+) -> Result<T> {
+    watch.check()?;
+    (watch.progress)(stage, 0.0);
+    let start = Instant::now();
+    let done = work()?;
+    let ms = start.elapsed().as_secs_f64() * 1e3;
+    meter::stage(stage.name(), ms / 1e3);
+    times.push(StageTime { stage: stage.name().to_owned(), ms });
+    (watch.progress)(stage, 1.0);
+    Ok(done)
+}
+
+/// Embeddings of all masks that have one.
+#[derive(Debug, Default)]
+struct Embedded {
+    /// `[count * dim]`.
+    rows: Vec<f32>,
+    /// Photo and mask of each, both counted from 0.
+    of: Vec<[usize; 2]>,
+}
+
+/// Cuts and embeds every mask, a batch at a time. A mask without pixels, or whose embedding has
+/// no length, has no meaning and stays background.
+fn embed(
+    tools: &SemanticsTools<'_>,
+    photos: &[PosedPhoto],
+    masks: &[PhotoMasks],
+    watch: Watch<'_>,
+) -> Result<Embedded> {
+    let mut found = Embedded::default();
+    let all: usize = masks.iter().map(|of| of.masks.len()).sum();
+    let mut done = 0;
+    for (photo, (posed, masks)) in photos.iter().zip(masks).enumerate() {
+        let cutter = Cutter::new(&posed.photo, masks);
+        let wanted: Vec<usize> = (0..masks.masks.len()).collect();
+        for batch in wanted.chunks(tools.batch.max(1)) {
+            watch.check()?;
+            (watch.progress)(SemanticsStage::Embed, done as f32 / all.max(1) as f32);
+            done += batch.len();
+            let cut = |&k: &usize| Some((k, cutter.cut(k, tools.crop_margin)?));
+            let (of, crops): (Vec<usize>, Vec<Crop>) = batch.iter().filter_map(cut).unzip();
+            if crops.is_empty() {
+                continue;
+            }
+            let rows = (tools.embed)(&crops)?;
+            if rows.len() != crops.len() * tools.dim {
+                return Err(Error::internal(format!(
+                    "semantics: {} numbers for {} crops of {}",
+                    rows.len(),
+                    crops.len(),
+                    tools.dim
+                )));
+            }
+            for (k, row) in of.into_iter().zip(rows.chunks_exact(tools.dim.max(1))) {
+                if row.iter().any(|v| *v != 0.0) {
+                    found.rows.extend_from_slice(row);
+                    found.of.push([photo, k]);
+                }
+            }
+        }
+    }
+    Ok(found)
+}
+
+/// The bank, what the photos say, and how many masks each row has.
+#[derive(Debug)]
+struct Labels {
+    bank: Bank,
+    counts: Vec<u32>,
+    maps: Vec<IndexMap>,
+}
+
+/// Puts the bank's indices in place of the masks'.
+fn label(masks: &[PhotoMasks], of: &[[usize; 2]], clusters: Clusters) -> Labels {
+    let mut becomes: Vec<Vec<u16>> = masks.iter().map(|m| vec![0; m.masks.len()]).collect();
+    let mut counts = vec![0_u32; clusters.bank.len()];
+    for ([photo, mask], index) in of.iter().zip(&clusters.index) {
+        becomes[*photo][*mask] = *index;
+        counts[usize::from(*index) - 1] += 1;
+    }
+    let maps = masks
+        .iter()
+        .zip(&becomes)
+        .map(|(m, becomes)| semantics::relabel(&m.map, becomes))
+        .collect();
+    Labels { bank: clusters.bank, counts, maps }
+}
+
+/// `[N]` index of each Gaussian; with `merge` the labels close up first.
+fn assign(labels: &mut Labels, parts: &SceneParts<'_>, options: &SemanticsOptions) -> Vec<u16> {
+    let picture = |input: &SceneCamera| {
+        let network = input.network?;
+        Some(NetworkPicture { network, photo: input.camera.intrinsics })
+    };
+    let pictures: Vec<Option<NetworkPicture>> = parts.cameras.iter().map(picture).collect();
+    let mut own = semantics::from_source(parts.gaussians.source(), &pictures, &labels.maps);
+    if !options.votes && options.merge.is_none() {
+        return own;
+    }
+    let views = Views::new(parts.gaussians, parts.cameras);
+    if let Some(cosine_min) = options.merge {
+        let group = views.same_things(&own, &labels.maps, &labels.bank, cosine_min);
+        let (bank, becomes) = semantics::merge(&labels.bank, &labels.counts, &group);
+        let renamed = |map: &IndexMap| semantics::relabel(map, &becomes[1..]);
+        labels.maps = labels.maps.iter().map(renamed).collect();
+        own.iter_mut().for_each(|m| *m = becomes[usize::from(*m)]);
+        labels.bank = bank;
+    }
+    if options.votes { views.vote(&own, &labels.maps) } else { own }
+}
