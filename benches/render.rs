@@ -5,11 +5,6 @@
 //! 480,000 blends of about 30 vector instructions: 15 million, 6 ms of one core with AVX-512, and
 //! as much again to project, sort and bin. `render/cpu/pair_131072` says what it is.
 
-#[path = "../tests/it/common/compare.rs"]
-mod compare;
-#[path = "../tests/it/common/scenes.rs"]
-mod scenes;
-
 use std::hint::black_box;
 
 use criterion::{Criterion, criterion_group, criterion_main};
@@ -32,6 +27,7 @@ use segsplat::{
     },
     scene::Gaussians,
 };
+use segsplat_testing::{compare, scenes};
 
 const SIDE: u32 = 256;
 const TILE: u32 = 16;

@@ -394,7 +394,7 @@ mod tests {
 
     fn fixture(change: impl Fn(String) -> String) -> tempfile::TempDir {
         let dir = tempfile::tempdir().unwrap();
-        let from = Path::new("tests/fixtures/plane");
+        let from = Path::new("../../tests/fixtures/plane");
         let text = std::fs::read_to_string(from.join(MANIFEST)).unwrap();
         std::fs::write(dir.path().join(MANIFEST), change(text)).unwrap();
         std::fs::copy(from.join("plane.onnx"), dir.path().join("plane.onnx")).unwrap();
@@ -443,7 +443,7 @@ mod tests {
 
     #[test]
     fn every_file_of_semantics_is_checked_and_its_keys_too() {
-        let from = Path::new("tests/fixtures/colours");
+        let from = Path::new("../../tests/fixtures/colours");
         let whole = Bundle::open(from).unwrap();
         assert_eq!(whole.files().len(), 6, "{:?}", whole.files());
         let dir = tempfile::tempdir().unwrap();

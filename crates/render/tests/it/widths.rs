@@ -1,21 +1,19 @@
 //! The CPU renderer at every width of its kernels: the wide forms agree to the last bit, the
 //! portable one, which fuses no products, to rounding.
 
-use segsplat::{
-    render::{
-        Entries, Frame, Labels, RenderRequest, Renderer,
-        cpu::{CpuRenderer, lanes::Width},
-        oracle,
-    },
-    scene::Gaussians,
+use segsplat_core::scene::Gaussians;
+use segsplat_render::{
+    Entries, Frame, Labels, RenderRequest, Renderer,
+    cpu::{CpuRenderer, lanes::Width},
+    oracle,
 };
 
-use crate::common::{
+use segsplat_testing::labels::{labelled, table};
+use segsplat_testing::{
     compare::{Tolerance, compare, samples},
     scenes::{camera, cloud, request, two_views},
     skipped,
 };
-use crate::labels::{labelled, table};
 
 /// How far apart colour, alpha, relative depth and labels may be, but at a cliff.
 const BOUND: f64 = 1e-5;

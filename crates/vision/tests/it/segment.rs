@@ -5,11 +5,11 @@ use std::sync::{
     atomic::{AtomicBool, Ordering},
 };
 
-use segsplat::{
+use segsplat_core::{
     error::{ErrorCode, Result},
     scene::{Photo, PhotoMasks},
-    segment::{Decoded, PromptDecoder, Seed, Settings, everything, proposals},
 };
+use segsplat_vision::segment::{Decoded, PromptDecoder, Seed, Settings, everything, proposals};
 
 /// Cells of the grid each way; the photo fills its upper three quarters.
 const GRID: usize = 64;

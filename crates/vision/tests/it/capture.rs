@@ -1,22 +1,23 @@
 //! What the photos themselves say of a capture: on a room of known depth, and on real scenes with
 //! right and with spoilt cameras.
 
-use segsplat::{
-    capture,
+use segsplat_core::{
     limits::Limits,
-    photos,
-    sample::{self, Room, SampleOptions},
     scene::{CameraToWorld, PosedPhoto, WarningCode},
 };
+use segsplat_vision::{
+    capture, photos,
+    sample::{self, Room, SampleOptions},
+};
 
-use crate::common;
+use segsplat_testing::shared_scene;
 
 fn options(photos: usize) -> SampleOptions {
     SampleOptions { photos, width: 200, height: 150, seed: 3 }
 }
 
 fn scene(name: &str) -> Option<Vec<PosedPhoto>> {
-    let folder = common::shared_scene(name)?;
+    let folder = shared_scene(name)?;
     Some(photos::read_dir(&folder, &Limits::default()).unwrap())
 }
 
@@ -254,7 +255,7 @@ fn intrinsics_scaled_at_the_door_are_reported() {
 
 #[test]
 fn ranges_of_a_real_room_hold_what_a_depth_camera_saw() {
-    let Some(folder) = common::shared_scene("red_kitchen") else { return };
+    let Some(folder) = shared_scene("red_kitchen") else { return };
     let posed = photos::read_dir(&folder, &Limits::default()).unwrap();
     let kinect = |i: usize| -> Vec<f64> {
         let path = folder.join(format!("depth/{i:04}.png"));

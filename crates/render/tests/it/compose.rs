@@ -3,18 +3,18 @@
 use std::sync::{Mutex, PoisonError};
 
 use glam::DVec3;
-use segsplat::{
+use segsplat_core::{
     error::Result,
-    render::{
-        Frame, Kinds, Labels, RenderRequest, Renderer, compose::render_scene, cpu::CpuRenderer,
-    },
     scene::{
         Backdrop, Camera, Gaussians, HealthReport, Provenance, RawGaussians, Scene, SceneCamera,
         SceneId, SceneMeta, SourcePixel,
     },
 };
+use segsplat_render::{
+    Frame, Kinds, Labels, RenderRequest, Renderer, compose::render_scene, cpu::CpuRenderer,
+};
 
-use crate::common::scenes::{Random, camera, checked, look, push, request};
+use segsplat_testing::scenes::{Random, camera, checked, look, push, request};
 
 /// The CPU renderer, which remembers what it was asked for.
 struct Watched {
@@ -176,7 +176,7 @@ fn layers_are_front_over_behind_in_every_picture_and_label() {
                 (&got.entries, &front.entries, &behind.entries)
             {
                 for m in 1..=4 {
-                    let of = |entries: &segsplat::render::Entries| {
+                    let of = |entries: &segsplat_render::Entries| {
                         entries.pixel(i).find(|entry| entry.0 == m).map_or(0.0, |entry| entry.1)
                     };
                     close(of(got), of(front) + room * of(behind), "entry", i);

@@ -9,21 +9,17 @@
 use std::sync::OnceLock;
 
 use glam::DVec3;
-use segsplat::{
-    render::{
-        Frame, Quality, RenderRequest, Renderer,
-        cpu::CpuRenderer,
-        oracle::{self, OraclePixel},
-    },
-    scene::Gaussians,
+use segsplat_core::scene::Gaussians;
+use segsplat_render::{
+    Frame, Quality, RenderRequest, Renderer,
+    cpu::CpuRenderer,
+    oracle::{self, OraclePixel},
 };
 
-use crate::{
-    common::{
-        compare::{Tolerance, compare, oracle_samples, samples},
-        scenes::{Random, camera, checked, cloud, look, request, two_views},
-    },
-    twins::{both_kernels, gpu},
+use crate::twins::{both_kernels, gpu};
+use segsplat_testing::{
+    compare::{Tolerance, compare, oracle_samples, samples},
+    scenes::{Random, camera, checked, cloud, look, request, two_views},
 };
 
 /// Most pixels of a view that the oracle is asked for.

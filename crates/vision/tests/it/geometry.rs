@@ -1,33 +1,35 @@
 //! A stand-in network whose answer is known (every pixel on the plane z = near of its camera):
 //! what comes out of it must lie where the photos' own cameras say, whatever their shape.
 
-use std::{collections::HashSet, path::Path, sync::Arc};
+use std::{collections::HashSet, sync::Arc};
 
 use glam::{DMat3, DMat4, DVec3};
-use segsplat::{
-    config::Config,
+use segsplat_core::{
     error::{ErrorCode, Result},
-    lift::{FuseOptions, Lifted, lift},
-    models::{Bundle, Geometry, GeometryInput, Runtime},
     scene::{Camera, CameraToWorld, Intrinsics, Photo, PosedPhoto, ViewGaussians},
 };
+use segsplat_vision::{
+    lift::{FuseOptions, Lifted, lift},
+    models::{Bundle, Geometry, GeometryInput, Runtime},
+};
 
-use crate::common::skipped;
+use segsplat_testing::{root, skipped};
+
+use crate::network_options;
 
 /// Depth of the plane, world units.
 const DEPTH: f64 = 4.0;
 
 fn network() -> Option<Geometry> {
-    let bundle = Bundle::open(Path::new("tests/fixtures/plane")).unwrap();
-    let config = Config::default();
-    let runtime = match Runtime::load(&config.networks()) {
+    let bundle = Bundle::open(&root().join("tests/fixtures/plane")).unwrap();
+    let runtime = match Runtime::load(&network_options()) {
         Err(e) if e.code() == ErrorCode::ModelUnavailable => {
             skipped(e.message());
             return None;
         }
         runtime => runtime.unwrap(),
     };
-    Some(Geometry::open(Arc::clone(&runtime), &bundle, &config.networks()).unwrap())
+    Some(Geometry::open(Arc::clone(&runtime), &bundle, &network_options()).unwrap())
 }
 
 /// A photo whose red is the column and green the row.

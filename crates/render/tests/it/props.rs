@@ -2,19 +2,17 @@
 
 use glam::{DAffine3, DQuat, DVec3, Vec3};
 use proptest::prelude::*;
-use segsplat::{
-    render::{
-        Frame, Kinds, RenderRequest, Renderer,
-        cpu::{
-            CpuRenderer,
-            project::{Projected, Projection, project},
-        },
-        view::View,
+use segsplat_core::scene::{CameraToWorld, Gaussians, RawGaussians};
+use segsplat_render::{
+    Frame, Kinds, RenderRequest, Renderer,
+    cpu::{
+        CpuRenderer,
+        project::{Projected, Projection, project},
     },
-    scene::{CameraToWorld, Gaussians, RawGaussians},
+    view::View,
 };
 
-use crate::common::{
+use segsplat_testing::{
     compare::{Tolerance, compare, samples},
     scenes::{Random, camera, checked, cloud, look, push, request, two_views},
 };
@@ -195,7 +193,7 @@ fn bands_of_a_small_budget_draw_the_same_picture() {
 
     let cpu = CpuRenderer::new(2).expect("two threads").with_isects_max(10);
     let error = cpu.render(&gaussians, &request).expect_err("a row of tiles over the budget");
-    assert_eq!(error.code(), segsplat::error::ErrorCode::LimitExceeded, "{error}");
+    assert_eq!(error.code(), segsplat_core::error::ErrorCode::LimitExceeded, "{error}");
 }
 
 #[test]

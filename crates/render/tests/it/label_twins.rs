@@ -3,20 +3,16 @@
 
 use std::sync::Arc;
 
-use segsplat::{
-    render::{
-        Entries, Kinds, Labels, RenderRequest, Renderer, cpu::CpuRenderer, gpu::GpuRenderer, oracle,
-    },
-    scene::{Gaussians, RawGaussians},
+use segsplat_core::scene::{Gaussians, RawGaussians};
+use segsplat_render::{
+    Entries, Kinds, Labels, RenderRequest, Renderer, cpu::CpuRenderer, gpu::GpuRenderer, oracle,
 };
 
-use crate::{
-    common::{
-        compare::Tolerance,
-        scenes::{Random, camera, checked, cloud, push, request},
-    },
-    labels::{Drawn, alone, apart, draw_labels, labelled, literal_of, table},
-    twins::{both_kernels, gpu, open},
+use crate::twins::{both_kernels, gpu, open};
+use segsplat_testing::labels::{Drawn, alone, apart, draw_labels, labelled, literal_of, table};
+use segsplat_testing::{
+    compare::Tolerance,
+    scenes::{Random, camera, checked, cloud, push, request},
 };
 
 fn cpu() -> CpuRenderer {

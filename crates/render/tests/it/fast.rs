@@ -1,15 +1,10 @@
 //! `quality=fast`: what it may differ from `exact`, by docs/conventions.md.
 
-use segsplat::{
-    bench::{self, BenchArgs},
-    render::{Frame, Labels, Quality, RenderRequest, Renderer, cpu::CpuRenderer},
-    scene::{Gaussians, RawGaussians},
-};
+use segsplat_core::scene::{Gaussians, RawGaussians};
+use segsplat_render::{Frame, Labels, Quality, RenderRequest, Renderer, cpu::CpuRenderer};
 
-use crate::{
-    common::scenes::{Random, camera, checked, push, request, two_views},
-    twins::{both_kernels, gpu},
-};
+use crate::twins::{both_kernels, gpu};
+use segsplat_testing::scenes::{Random, camera, checked, push, request, two_views};
 
 /// Half a level of 8 bits, and what f32 adds.
 const HALF_LEVEL: f32 = 0.5 / 255.0 + 1e-6;
@@ -84,11 +79,8 @@ fn alpha_alone_and_depth_alone_are_not_rounded() {
 #[test]
 fn of_dense_scenes_fast_keeps_its_bound() {
     let Some(gpu) = gpu() else { return };
-    let args = BenchArgs { gaussians: 20_000, size: 128, width: 128, ..BenchArgs::default() };
-    let (dense, between) = bench::scene(&args).expect("a scene");
-    for (name, (gaussians, camera)) in
-        [("two photos", two_views(48, 3)), ("a bench's", (dense, between))]
-    {
+    for side in [48, 100] {
+        let (name, (gaussians, camera)) = (format!("{side} x {side}"), two_views(side, 3));
         let [exact, fast] = both(gpu, &gaussians, &request(camera));
         let exact = exact.color.expect("colour");
         let fast = fast.color.expect("colour");

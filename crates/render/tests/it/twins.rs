@@ -5,32 +5,32 @@
 
 use std::sync::OnceLock;
 
-use segsplat::{
+use segsplat_core::{
     error::ErrorCode,
-    render::{
-        Frame, Kinds, RenderRequest, Renderer,
-        cpu::{
-            CpuRenderer, emit_isects,
-            paint::Paint,
-            prefix_sum, project,
-            project::{Footprint, Projected},
-            radix_sort,
-            rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
-            shade, tile_ranges,
-            tiles::Grid,
-        },
-        gpu::{
-            GpuOptions, GpuRenderer,
-            buffers::FootprintRow,
-            pipelines::{DROPPED_KEY, NO_GAUSSIAN},
-        },
-        oracle,
-        view::View,
-    },
     scene::{Gaussians, RawGaussians},
 };
+use segsplat_render::{
+    Frame, Kinds, RenderRequest, Renderer,
+    cpu::{
+        CpuRenderer, emit_isects,
+        paint::Paint,
+        prefix_sum, project,
+        project::{Footprint, Projected},
+        radix_sort,
+        rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
+        shade, tile_ranges,
+        tiles::Grid,
+    },
+    gpu::{
+        GpuOptions, GpuRenderer,
+        buffers::FootprintRow,
+        pipelines::{DROPPED_KEY, NO_GAUSSIAN},
+    },
+    oracle,
+    view::View,
+};
 
-use crate::common::{
+use segsplat_testing::{
     compare::{Tolerance, compare, samples},
     scenes::{Random, camera, checked, cloud, look, push, request, two_views},
     skipped,

@@ -3,17 +3,12 @@
 
 use std::{sync::Barrier, time::Duration, time::Instant};
 
-use segsplat::{
-    error::ErrorCode,
-    render::{Frame, Kinds, Labels, RenderRequest, Renderer, gpu::GpuRenderer},
-    scene::Gaussians,
-};
+use segsplat_core::{error::ErrorCode, scene::Gaussians};
+use segsplat_render::{Frame, Kinds, Labels, RenderRequest, Renderer, gpu::GpuRenderer};
 
-use crate::{
-    common::scenes::{camera, cloud, request},
-    labels::{labelled, table},
-    twins::open,
-};
+use crate::twins::open;
+use segsplat_testing::labels::{labelled, table};
+use segsplat_testing::scenes::{camera, cloud, request};
 
 /// Views of one scene that differ in camera, size and kinds.
 fn requests(count: u32, labels: &Labels) -> Vec<RenderRequest> {

@@ -1,19 +1,18 @@
 //! Seeded scenes for tests and benchmarks of the renderers.
-#![allow(dead_code, reason = "shared by tests and benchmarks, each of which uses a part")]
 
 use glam::{DVec3, Quat, Vec3};
-use segsplat::{
-    render::{Kinds, RenderRequest},
-    scene::{Camera, CameraToWorld, Gaussians, Intrinsics, RawGaussians, SourcePixel},
+use segsplat_core::scene::{
+    Camera, CameraToWorld, Gaussians, Intrinsics, RawGaussians, SourcePixel,
 };
+use segsplat_render::{Kinds, RenderRequest};
 
 /// A small seeded generator (`SplitMix64`), so that scenes never change with a library.
 #[derive(Clone, Debug)]
-pub(crate) struct Random(pub(crate) u64);
+pub struct Random(pub u64);
 
 impl Random {
     /// The next 64 bits.
-    pub(crate) fn bits(&mut self) -> u64 {
+    pub fn bits(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -22,12 +21,12 @@ impl Random {
     }
 
     /// Uniform in `low..high`.
-    pub(crate) fn range(&mut self, low: f32, high: f32) -> f32 {
+    pub fn range(&mut self, low: f32, high: f32) -> f32 {
         low + (high - low) * ((self.bits() >> 40) as f32 / (1_u64 << 24) as f32)
     }
 
     /// A unit quaternion, wxyz.
-    pub(crate) fn quat(&mut self) -> [f32; 4] {
+    pub fn quat(&mut self) -> [f32; 4] {
         let axis = Vec3::from_array([(); 3].map(|()| self.range(-1.0, 1.0))).normalize_or(Vec3::Z);
         let [x, y, z, w] = Quat::from_axis_angle(axis, self.range(-3.1, 3.1)).to_array();
         [w, x, y, z]
@@ -35,7 +34,7 @@ impl Random {
 }
 
 /// Adds a Gaussian of harmonics `sh` to `raw`.
-pub(crate) fn push(
+pub fn push(
     raw: &mut RawGaussians,
     mean: [f32; 3],
     quat: [f32; 4],
@@ -53,7 +52,7 @@ pub(crate) fn push(
 }
 
 /// `raw` checked; panics when a scene of this file loses a Gaussian.
-pub(crate) fn checked(raw: RawGaussians) -> Gaussians {
+pub fn checked(raw: RawGaussians) -> Gaussians {
     let count = raw.means.len();
     let (gaussians, _) = Gaussians::sanitize(raw).expect("arrays of equal length");
     assert_eq!(gaussians.len(), count, "a test scene lost Gaussians");
@@ -61,7 +60,7 @@ pub(crate) fn checked(raw: RawGaussians) -> Gaussians {
 }
 
 /// A camera of `width` x `height` with a 60 degree field of view, at the origin, looking along +z.
-pub(crate) fn camera(width: u32, height: u32) -> Camera {
+pub fn camera(width: u32, height: u32) -> Camera {
     let (w, h) = (f64::from(width), f64::from(height));
     let focal = 0.5 * w.max(h) / 30.0_f64.to_radians().tan();
     Camera {
@@ -71,18 +70,18 @@ pub(crate) fn camera(width: u32, height: u32) -> Camera {
 }
 
 /// A pose at `eye` looking at `target`, the picture's up being world -y.
-pub(crate) fn look(eye: DVec3, target: DVec3) -> CameraToWorld {
+pub fn look(eye: DVec3, target: DVec3) -> CameraToWorld {
     CameraToWorld::look_at(eye, target, DVec3::NEG_Y, "test camera").expect("a test camera")
 }
 
 /// A request for everything.
-pub(crate) fn request(camera: Camera) -> RenderRequest {
+pub fn request(camera: Camera) -> RenderRequest {
     RenderRequest { background: [0.1, 0.2, 0.3], ..RenderRequest::plain(camera, Kinds::ALL, 0.05) }
 }
 
 /// What two photos of `side` x `side` pixels give: a Gaussian a pixel on a smooth surface with
 /// steps, seen by two cameras a fifth of the depth apart. 256 gives 131,072 Gaussians.
-pub(crate) fn two_views(side: u32, seed: u64) -> (Gaussians, Camera) {
+pub fn two_views(side: u32, seed: u64) -> (Gaussians, Camera) {
     let mut random = Random(seed);
     let mut raw = RawGaussians::default();
     let lens = camera(side, side).intrinsics;
@@ -110,7 +109,7 @@ pub(crate) fn two_views(side: u32, seed: u64) -> (Gaussians, Camera) {
 }
 
 /// `count` Gaussians of all shapes in a box in front of [`camera`], harmonics of `sh_degree`.
-pub(crate) fn cloud(count: usize, sh_degree: u8, seed: u64) -> Gaussians {
+pub fn cloud(count: usize, sh_degree: u8, seed: u64) -> Gaussians {
     let mut random = Random(seed);
     let mut raw = RawGaussians {
         sh_degree,

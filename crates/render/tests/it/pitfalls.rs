@@ -8,15 +8,11 @@
 use std::f32::consts::TAU;
 
 use glam::DVec3;
-use segsplat::{
-    render::{Frame, RenderRequest, Renderer, constants::ALPHA_MAX, cpu::CpuRenderer},
-    scene::{Gaussians, RawGaussians},
-};
+use segsplat_core::scene::{Gaussians, RawGaussians};
+use segsplat_render::{Frame, RenderRequest, Renderer, constants::ALPHA_MAX, cpu::CpuRenderer};
 
-use crate::{
-    common::scenes::{camera, checked, cloud, look, push, request},
-    twins::{gpu, open},
-};
+use crate::twins::{gpu, open};
+use segsplat_testing::scenes::{camera, checked, cloud, look, push, request};
 
 /// No rotation.
 const UPRIGHT: [f32; 4] = [1.0, 0.0, 0.0, 0.0];

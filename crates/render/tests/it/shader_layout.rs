@@ -4,7 +4,7 @@
 use std::{collections::BTreeMap, mem::offset_of};
 
 use naga::{Expression, Literal, Module, TypeInner};
-use segsplat::render::{
+use segsplat_render::{
     constants,
     gpu::{
         buffers::{FootprintRow, GaussianRow, PlanRow, SortParams, ViewRow},
@@ -12,7 +12,7 @@ use segsplat::render::{
     },
 };
 
-use crate::common::root;
+use segsplat_testing::root;
 
 fn parse(shader: &Shader) -> Module {
     naga::front::wgsl::parse_str(shader.source)
@@ -209,7 +209,7 @@ fn every_stage_has_a_cpu_twin_and_every_file_is_used() {
     stems.dedup();
     assert_eq!(files, stems, "files in shaders/ against SHADERS");
     for stem in &stems {
-        let twin = root().join(format!("src/render/cpu/{stem}.rs"));
+        let twin = root().join(format!("crates/render/src/cpu/{stem}.rs"));
         assert!(twin.is_file(), "shaders/{stem}.wgsl has no twin {}", twin.display());
     }
 }

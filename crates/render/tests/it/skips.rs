@@ -1,16 +1,12 @@
 //! What renderers leave out changes no pixel: each skip switched off gives the same frame.
 //! What each saves is measured by `segsplat bench --skips`, not here.
 
-use segsplat::{
-    render::{Frame, Labels, RenderRequest, Renderer, cpu::CpuRenderer, skip::Skip},
-    scene::Gaussians,
-};
+use segsplat_core::scene::Gaussians;
+use segsplat_render::{Frame, Labels, RenderRequest, Renderer, cpu::CpuRenderer, skip::Skip};
 
-use crate::{
-    common::scenes::{camera, cloud, look, request, two_views},
-    labels::{labelled, table},
-    twins::open,
-};
+use crate::twins::open;
+use segsplat_testing::labels::{labelled, table};
+use segsplat_testing::scenes::{camera, cloud, look, request, two_views};
 
 /// Scenes and views in which every skip has something to leave out: Gaussians beside the picture
 /// and behind the camera, tiles without any, walls, harmonics, labels.
@@ -66,7 +62,7 @@ fn on_a_gpu_no_bit_changes() {
         let draw = |(_, gaussians, request): &(_, _, _)| gpu.render(gaussians, request);
         let wanted: Vec<_> = scenes.iter().map(|case| draw(case).expect("a frame")).collect();
         for skip in Skip::ALL {
-            let change = |options: &mut segsplat::render::gpu::GpuOptions| {
+            let change = |options: &mut segsplat_render::gpu::GpuOptions| {
                 (options.serial, options.without) = (Some(serial), Some(skip));
             };
             let Some(gpu) = open(change) else { return };

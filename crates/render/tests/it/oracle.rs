@@ -1,11 +1,9 @@
 //! The CPU renderer against the f64 oracle: strict inside, flips counted at cliffs.
 
-use segsplat::{
-    render::{RenderRequest, Renderer, constants, cpu::CpuRenderer, oracle},
-    scene::{Gaussians, RawGaussians},
-};
+use segsplat_core::scene::{Gaussians, RawGaussians};
+use segsplat_render::{RenderRequest, Renderer, constants, cpu::CpuRenderer, oracle};
 
-use crate::common::{
+use segsplat_testing::{
     compare::{Difference, Sample, Tolerance, compare, oracle_samples, samples},
     scenes::{Random, camera, checked, cloud, look, push, request, two_views},
 };
@@ -174,7 +172,7 @@ fn coordinates_far_from_zero_agree_with_the_scene_at_zero() {
         pose[4 * axis + 3] += far_off[axis];
     }
     there.camera.camera_to_world =
-        segsplat::scene::CameraToWorld::from_row_major(&pose, "far").expect("a pose");
+        segsplat_core::scene::CameraToWorld::from_row_major(&pose, "far").expect("a pose");
     judge("far", &far, &there);
     let a = cpu().render(&near, &here).expect("a picture");
     let b = cpu().render(&far, &there).expect("a picture");

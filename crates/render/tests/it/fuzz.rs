@@ -2,16 +2,14 @@
 //!
 //! `FUZZ_SEED`, `FUZZ_SCENES` and `FUZZ_GAUSSIANS` choose others than the default.
 
-use segsplat::{
+use segsplat_core::{
     error::ErrorCode,
-    render::{Frame, Labels, Quality, RenderRequest, Renderer, cpu::CpuRenderer},
     scene::{Gaussians, RawGaussians},
 };
+use segsplat_render::{Frame, Labels, Quality, RenderRequest, Renderer, cpu::CpuRenderer};
 
-use crate::{
-    common::scenes::{Random, camera, checked, cloud, push, request},
-    twins::gpu,
-};
+use crate::twins::gpu;
+use segsplat_testing::scenes::{Random, camera, checked, cloud, push, request};
 
 /// Numbers that broke renderers before.
 const POISON: [f32; 24] = [

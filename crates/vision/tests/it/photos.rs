@@ -2,16 +2,18 @@
 
 use std::io::Write;
 
-use segsplat::{
+use segsplat_core::{
     error::ErrorCode,
     limits::Limits,
+    scene::{PosedPhoto, Upload, UploadCameras, UploadFile},
+};
+use segsplat_vision::{
     photos,
     sample::{self, SampleOptions},
-    scene::{PosedPhoto, Upload, UploadCameras, UploadFile},
 };
 use serde_json::{Value, json};
 
-use crate::common;
+use segsplat_testing::shared_scene;
 
 fn options() -> SampleOptions {
     SampleOptions { photos: 3, width: 48, height: 36, seed: 5 }
@@ -268,8 +270,7 @@ fn bombs_meet_the_unpacked_bound() {
     let bomb = vec![0_u8; 3 << 20];
     let zip = zipped(&[("transforms.json", b"{}"), ("bomb.png", &bomb)]);
     assert!(zip.len() < 20_000, "the bomb must be small: {}", zip.len());
-    let mut limits = Limits::default();
-    limits.archive_unpacked_bytes_max = 1 << 20;
+    let limits = Limits { archive_unpacked_bytes_max: 1 << 20, ..Limits::default() };
     let error = photos::read(&archive(zip.clone()), &limits).unwrap_err();
     assert_eq!(error.code(), ErrorCode::LimitExceeded, "{error}");
     // The same bomb with headers that lie about its size.
@@ -314,7 +315,7 @@ fn damaged_photos_are_named() {
 #[test]
 fn real_scenes_are_read_with_their_distortion_undone() {
     for (scene, count, distorted) in [("fox", 50, true), ("computer_mouse", 24, false)] {
-        let Some(folder) = common::shared_scene(scene) else { return };
+        let Some(folder) = shared_scene(scene) else { return };
         let got = photos::read_dir(&folder, &Limits::default()).unwrap();
         assert_eq!(got.len(), count, "{scene}");
         for posed in &got {

@@ -1,34 +1,34 @@
 //! Stand-in mask, image and text networks whose answers are known: masks by colour, words by
 //! colour. What the adapters feed and read must make them right for any shape of photo.
 
-use std::{
-    path::Path,
-    sync::{
-        Arc,
-        atomic::{AtomicBool, Ordering},
-    },
+use std::sync::{
+    Arc,
+    atomic::{AtomicBool, Ordering},
 };
 
-use segsplat::{
-    config::Config,
+use segsplat_core::{
     error::ErrorCode,
-    models::{Bundle, ImageText, MaskLogits, MaskNetwork, NetworkOptions, Runtime},
-    pipeline::masks,
     scene::{
         Camera, CameraToWorld, Crop, Gaussians, Intrinsics, Photo, PosedPhoto, RawGaussians,
         SourcePixel,
     },
+};
+use segsplat_vision::{
+    models::{Bundle, ImageText, MaskLogits, MaskNetwork, Runtime},
+    pipeline::masks,
     segment::Seed,
 };
 
-use crate::common::skipped;
+use segsplat_testing::{root, skipped};
+
+use crate::network_options;
 
 const RED: [u8; 3] = [204, 26, 26];
 const GREEN: [u8; 3] = [26, 178, 26];
 const GREY: [u8; 3] = [128, 128, 128];
 
 fn runtime() -> Option<Arc<Runtime>> {
-    match Runtime::load(&NetworkOptions::default()) {
+    match Runtime::load(&network_options()) {
         Err(e) if e.code() == ErrorCode::ModelUnavailable => {
             skipped(e.message());
             None
@@ -38,7 +38,7 @@ fn runtime() -> Option<Arc<Runtime>> {
 }
 
 fn bundle() -> Bundle {
-    Bundle::open(Path::new("tests/fixtures/colours")).unwrap()
+    Bundle::open(&root().join("tests/fixtures/colours")).unwrap()
 }
 
 /// A grey photo with a red box in its left and a green one in its right half.
@@ -58,8 +58,7 @@ fn photo(width: u32, height: u32) -> Photo {
 #[test]
 fn a_mask_lies_where_the_point_was_whatever_the_photos_shape() {
     let Some(runtime) = runtime() else { return };
-    let network =
-        MaskNetwork::open(runtime, &bundle(), &NetworkOptions::default()).unwrap().unwrap();
+    let network = MaskNetwork::open(runtime, &bundle(), &network_options()).unwrap().unwrap();
     for (width, height) in [(64, 64), (128, 64), (96, 192), (250, 130)] {
         let embedding = network.encode(&photo(width, height)).unwrap();
         let filled = embedding.resized().map(|v| f64::from(v) / 64.0);
@@ -92,7 +91,7 @@ fn a_mask_lies_where_the_point_was_whatever_the_photos_shape() {
 
 /// The bundle with another decoder in the first one's place, and other lines in its manifest.
 fn with_decoder(file: &str, sha256: &str, changes: &[(&str, &str)]) -> (tempfile::TempDir, Bundle) {
-    let from = Path::new("tests/fixtures/colours");
+    let from = root().join("tests/fixtures/colours");
     let dir = tempfile::tempdir().unwrap();
     let whole = bundle();
     for entry in whole.files() {
@@ -114,7 +113,6 @@ fn with_decoder(file: &str, sha256: &str, changes: &[(&str, &str)]) -> (tempfile
 #[test]
 fn every_signature_of_a_decoder_gives_the_same_masks() {
     let Some(runtime) = runtime() else { return };
-    let config = Config::default();
     // Segment Anything's own export: one prompt a run, a former mask, four masks.
     let (_kept, export) = with_decoder(
         "masks_decoder_export.onnx",
@@ -134,7 +132,7 @@ fn every_signature_of_a_decoder_gives_the_same_masks() {
     let points = [[0.25_f32, 0.5], [0.76, 0.52], [0.5, 0.1]];
     let masks = |bundle: &Bundle, width, height| {
         let network =
-            MaskNetwork::open(Arc::clone(&runtime), bundle, &config.networks()).unwrap().unwrap();
+            MaskNetwork::open(Arc::clone(&runtime), bundle, &network_options()).unwrap().unwrap();
         let embedding = network.encode(&photo(width, height)).unwrap();
         (embedding.resized(), network.decode(&embedding, &points).unwrap())
     };
@@ -172,7 +170,7 @@ fn a_decoder_of_another_signature_is_refused_by_name() {
         "6000b740b2ed30d6008540076d9b404e10fe3095558d49b90483435f38245d92",
         &[],
     );
-    let error = MaskNetwork::open(runtime, &wrong, &NetworkOptions::default()).unwrap_err();
+    let error = MaskNetwork::open(runtime, &wrong, &network_options()).unwrap_err();
     assert_eq!(error.code(), ErrorCode::ModelUnavailable, "{error}");
     assert!(error.message().contains("point_coords"), "{error}");
 }
@@ -192,8 +190,7 @@ fn posed(photo: Photo, x: f64) -> PosedPhoto {
 #[test]
 fn photos_give_masks_and_seeds_say_where_they_reappear() {
     let Some(runtime) = runtime() else { return };
-    let network =
-        MaskNetwork::open(runtime, &bundle(), &NetworkOptions::default()).unwrap().unwrap();
+    let network = MaskNetwork::open(runtime, &bundle(), &network_options()).unwrap().unwrap();
     let settings = masks::settings(network.manifest());
     assert!((settings.pred_iou_thresh - 0.7).abs() < 1e-6, "the bundle's thresholds");
     let photos = [posed(photo(64, 64), 0.0), posed(photo(64, 64), 0.25)];
@@ -246,7 +243,7 @@ fn cosine(a: &[f32], b: &[f32]) -> f32 {
 #[test]
 fn words_find_their_colours() {
     let Some(runtime) = runtime() else { return };
-    let towers = ImageText::open(runtime, &bundle(), &NetworkOptions::default()).unwrap().unwrap();
+    let towers = ImageText::open(runtime, &bundle(), &network_options()).unwrap().unwrap();
     // More crops than a batch, of several sizes.
     let crops: Vec<Crop> =
         (0..40).map(|i| crop([RED, GREEN, GREY][i as usize % 3], 16 + i)).collect();
@@ -269,7 +266,7 @@ fn words_find_their_colours() {
 #[test]
 fn a_text_says_what_was_not_understood() {
     let Some(runtime) = runtime() else { return };
-    let towers = ImageText::open(runtime, &bundle(), &NetworkOptions::default()).unwrap().unwrap();
+    let towers = ImageText::open(runtime, &bundle(), &network_options()).unwrap().unwrap();
     let embed = |text: &str| towers.embed_texts(&[text.to_owned()]).map(|mut rows| rows.remove(0));
     let known = embed("the red apple").unwrap();
     assert_eq!((known.tokens, known.unknown, known.cut), (3, 0, false), "known words");
@@ -292,11 +289,10 @@ fn a_text_says_what_was_not_understood() {
 #[test]
 fn a_bundle_without_semantics_opens_without_them() {
     let Some(runtime) = runtime() else { return };
-    let plane = Bundle::open(Path::new("tests/fixtures/plane")).unwrap();
-    let config = Config::default();
+    let plane = Bundle::open(&root().join("tests/fixtures/plane")).unwrap();
     assert!(
-        MaskNetwork::open(Arc::clone(&runtime), &plane, &config.networks()).unwrap().is_none(),
+        MaskNetwork::open(Arc::clone(&runtime), &plane, &network_options()).unwrap().is_none(),
         "masks"
     );
-    assert!(ImageText::open(runtime, &plane, &config.networks()).unwrap().is_none(), "towers");
+    assert!(ImageText::open(runtime, &plane, &network_options()).unwrap().is_none(), "towers");
 }

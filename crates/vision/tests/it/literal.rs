@@ -6,16 +6,12 @@
 
 use std::sync::Arc;
 
-use segsplat::{
-    render::{Entries, Labels, RenderRequest, Renderer, cpu::CpuRenderer},
-    scene::{Bank, Gaussians, ScoringProfile},
-    semantics::{PixelEntries, Scorer, Scoring, mask_from_blend},
-};
+use segsplat_core::scene::{Bank, Gaussians, ScoringProfile};
+use segsplat_render::{Entries, Labels, RenderRequest, Renderer, cpu::CpuRenderer};
+use segsplat_vision::semantics::{PixelEntries, Scorer, Scoring, mask_from_blend};
 
-use crate::{
-    common::scenes::{Random, camera, request},
-    labels::{alone, labelled, literal_of},
-};
+use segsplat_testing::labels::{alone, labelled, literal_of};
+use segsplat_testing::scenes::{Random, camera, request};
 
 const DIM: usize = 48;
 const TAU: f64 = 10.0;

@@ -1,0 +1,25 @@
+//! The renderers against the oracle and against each other.
+#![allow(
+    clippy::panic,
+    clippy::print_stdout,
+    clippy::print_stderr,
+    clippy::unwrap_used,
+    reason = "helpers of tests are tests too"
+)]
+
+mod compare;
+mod compose;
+mod crop;
+mod fast;
+mod fuzz;
+mod label_twins;
+mod labels;
+mod oracle;
+mod pitfalls;
+mod pool;
+mod props;
+mod shader_layout;
+mod skips;
+mod twins;
+mod views;
+mod widths;

@@ -1,0 +1,153 @@
+//! Labels against plain colours: one-hot colours of M channels, three at a time, drawn by the same
+//! renderer.
+
+use std::sync::Arc;
+
+use segsplat_core::scene::{Gaussians, RawGaussians};
+use segsplat_render::{Entries, Kinds, Labels, RenderRequest, Renderer};
+
+use crate::scenes::{Random, checked, cloud};
+
+/// Degree-0 harmonic of 3DGS: colour = 0.5 + this times the coefficient.
+const SH_C0: f32 = 0.282_094_79;
+
+/// `count` Gaussians with indices 0..=m, at random.
+pub fn labelled(count: usize, m: u16, seed: u64) -> Gaussians {
+    let mut random = Random(seed);
+    let index = (0..count).map(|_| (random.bits() % (u64::from(m) + 1)) as u16).collect();
+    cloud(count, 0, seed).with_semantic_index(index).expect("an index a Gaussian")
+}
+
+/// A table of `rows` rows of small numbers, row 0 zeros.
+pub fn table(rows: usize, seed: u64) -> Arc<[[f32; 4]]> {
+    let mut random = Random(seed);
+    let row = |m| [(); 4].map(|()| if m == 0 { 0.0 } else { random.range(-1.0, 1.0) });
+    (0..rows).map(row).collect()
+}
+
+/// `request` for labels alone.
+pub fn alone(request: &RenderRequest, labels: Labels) -> RenderRequest {
+    RenderRequest { kinds: Kinds::NONE, labels, ..request.clone() }
+}
+
+/// The same Gaussians in one-hot colours: channel c shows index `first + c` and no other.
+fn one_hot(gaussians: &Gaussians, first: u16) -> Gaussians {
+    let index = gaussians.semantic_index();
+    let color = |m: u16| [0, 1, 2].map(|c| if m == first + c { 1.0 } else { 0.0 });
+    let sh = index.iter().map(|&m| color(m).map(|v: f32| (v - 0.5) / SH_C0)).collect();
+    checked(RawGaussians { sh, sh_degree: 0, ..gaussians.as_raw().clone() })
+}
+
+/// Dense E of indices 1..=m, `[H * W][m]`, by the road of colours.
+pub fn literal(
+    gaussians: &Gaussians,
+    request: &RenderRequest,
+    m: u16,
+    draw: impl Fn(&Gaussians, &RenderRequest) -> Vec<[f64; 3]>,
+) -> Vec<Vec<f64>> {
+    let pixels = request.camera.intrinsics.width * request.camera.intrinsics.height;
+    let mut dense = vec![vec![0.0; usize::from(m)]; pixels as usize];
+    let black = RenderRequest {
+        kinds: Kinds::COLOR,
+        labels: Labels::None,
+        background: [0.0; 3],
+        ..request.clone()
+    };
+    for first in (1..=m).step_by(3) {
+        for (pixel, color) in dense.iter_mut().zip(draw(&one_hot(gaussians, first), &black)) {
+            for (entry, value) in pixel[usize::from(first) - 1..].iter_mut().zip(color) {
+                *entry = value;
+            }
+        }
+    }
+    dense
+}
+
+/// Largest difference of sparse and dense E at pixel `i`; an index 0 or out of order is a fault.
+fn entries_apart(entries: &Entries, i: usize, dense: &[f64]) -> f64 {
+    let mut rest = dense.to_vec();
+    let mut last = 0;
+    for (index, weight) in entries.pixel(i) {
+        assert!(index > last, "pixel {i}: index {index} after {last}");
+        assert!(weight > 0.0, "pixel {i}: weight {weight} of index {index}");
+        last = index;
+        rest[usize::from(index) - 1] -= f64::from(weight);
+    }
+    rest.iter().fold(0.0, |worst, apart| worst.max(apart.abs()))
+}
+
+/// Largest difference of a blended pixel and E times the table.
+pub fn blend_apart(blend: [f32; 4], dense: &[f64], table: &[[f32; 4]]) -> f64 {
+    let mut want = [0.0; 4];
+    for (m, weight) in (1..).zip(dense) {
+        for (sum, value) in want.iter_mut().zip(Labels::row(table, m)) {
+            *sum += weight * f64::from(value);
+        }
+    }
+    want.iter().zip(blend).fold(0.0, |worst, (a, b)| worst.max((a - f64::from(b)).abs()))
+}
+
+/// Entries and blend of one view.
+#[derive(Debug)]
+pub struct Drawn {
+    /// From [`Labels::Entries`].
+    pub entries: Entries,
+    /// From [`Labels::Blend`].
+    pub blend: Vec<[f32; 4]>,
+}
+
+/// Draws one view with entries, and again with `table` blended.
+pub fn draw_labels(
+    renderer: &dyn Renderer,
+    gaussians: &Gaussians,
+    request: &RenderRequest,
+    table: &Arc<[[f32; 4]]>,
+) -> Drawn {
+    let draw = |labels| renderer.render(gaussians, &alone(request, labels)).expect("labels");
+    let blended = draw(Labels::Blend(Arc::clone(table)));
+    let listed = draw(Labels::Entries);
+    for frame in [&blended, &listed] {
+        assert!(frame.color.is_none() && frame.depth.is_none() && frame.alpha.is_none());
+    }
+    assert!(blended.entries.is_none() && listed.blend.is_none(), "labels not asked for");
+    Drawn {
+        entries: listed.entries.expect("entries were asked for"),
+        blend: blended.blend.expect("a blend was asked for"),
+    }
+}
+
+/// Pixels where `drawn` is further than `bound` from dense E, and the largest difference of the
+/// others.
+pub fn apart(
+    drawn: &Drawn,
+    dense: &[Vec<f64>],
+    table: &[[f32; 4]],
+    bound: f64,
+) -> (Vec<usize>, f64) {
+    assert_eq!((drawn.entries.pixels(), drawn.blend.len()), (dense.len(), dense.len()), "pixels");
+    let mut worst = 0.0_f64;
+    let mut far = Vec::new();
+    for (i, dense) in dense.iter().enumerate() {
+        let entries = entries_apart(&drawn.entries, i, dense);
+        let apart = entries.max(blend_apart(drawn.blend[i], dense, table));
+        if apart <= bound {
+            worst = worst.max(apart);
+        } else {
+            far.push(i);
+        }
+    }
+    (far, worst)
+}
+
+/// Dense E of the renderer itself, by the road of colours.
+pub fn literal_of(
+    renderer: &dyn Renderer,
+    gaussians: &Gaussians,
+    request: &RenderRequest,
+    m: u16,
+) -> Vec<Vec<f64>> {
+    literal(gaussians, request, m, |gaussians, request| {
+        let frame = renderer.render(gaussians, request).expect("one-hot colours");
+        frame.color.expect("colour").into_iter().map(|c| c.map(f64::from)).collect()
+    })
+}

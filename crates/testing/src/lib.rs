@@ -1,0 +1,53 @@
+//! What the tests of all crates share: generated scenes, comparison of pictures, where things are,
+//! and how a test says that it was skipped.
+#![allow(
+    clippy::expect_used,
+    clippy::missing_panics_doc,
+    clippy::panic,
+    clippy::print_stdout,
+    reason = "helpers of tests are tests too"
+)]
+
+pub mod compare;
+pub mod labels;
+pub mod scenes;
+
+use std::path::{Path, PathBuf};
+
+/// The repository's root.
+#[must_use]
+pub fn root() -> &'static Path {
+    Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."))
+}
+
+/// True where absence of data, library or adapter is a failure and not a skip.
+#[must_use]
+pub fn strict() -> bool {
+    std::env::var("CI").is_ok_and(|v| v == "true" || v == "1")
+}
+
+/// Prints `skipped: why` and goes on; fails where [`strict`].
+pub fn skipped(why: &str) {
+    assert!(!strict(), "skipped: {why}; with CI=true that is a failure");
+    println!("skipped: {why}");
+}
+
+/// The shared photo data: `SEGSPLAT_SHARED_DATA`, else `../shared/data` beside the repository.
+///
+/// `None` (said on standard output) where there is none; a failure where [`strict`].
+#[must_use]
+pub fn shared_data() -> Option<PathBuf> {
+    let named = std::env::var_os("SEGSPLAT_SHARED_DATA").map(PathBuf::from);
+    let folder = named.unwrap_or_else(|| root().join("../shared/data"));
+    if folder.join("scenes").is_dir() {
+        return Some(folder);
+    }
+    skipped("no shared photo data (set SEGSPLAT_SHARED_DATA)");
+    None
+}
+
+/// A folder of the shared photo scenes.
+#[must_use]
+pub fn shared_scene(name: &str) -> Option<PathBuf> {
+    shared_data().map(|data| data.join("scenes").join(name))
+}

@@ -1,0 +1,27 @@
+//! The stages from photos to a scene, one by one.
+#![allow(
+    clippy::panic,
+    clippy::print_stdout,
+    clippy::print_stderr,
+    clippy::unwrap_used,
+    reason = "helpers of tests are tests too"
+)]
+
+mod capture;
+mod colours;
+mod geometry;
+mod literal;
+mod photos;
+mod segment;
+
+use segsplat_vision::models::NetworkOptions;
+
+/// The defaults, with the library that `scripts/setup` put into the repository's target folder:
+/// these tests do not run in the root of the repository, where the search begins.
+fn network_options() -> NetworkOptions {
+    let library = segsplat_testing::root().join("target/ort");
+    let named =
+        ["ORT_DYLIB_PATH", "CARGO_TARGET_DIR"].iter().any(|v| std::env::var_os(v).is_some());
+    let ort_library = (!named && library.is_dir()).then_some(library);
+    NetworkOptions { ort_library, ..NetworkOptions::default() }
+}
