@@ -89,7 +89,7 @@ impl Local {
             semantics: self.semantics(scene, "query")?,
             tag: scene.meta.id.as_str(),
         };
-        ground.answer(&texts, spec, view.as_ref())
+        ground.answer(&texts, spec, view.as_ref(), || ())
     }
 
     /// As [`super::Service::pick`], without labels.

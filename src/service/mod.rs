@@ -8,13 +8,13 @@ mod camera;
 mod create;
 mod encode;
 mod export;
-mod gate;
 mod local;
 mod lru;
 mod memory;
 mod pick;
 mod query;
 mod rle;
+mod schedule;
 mod semantics;
 mod texts;
 mod types;
@@ -28,7 +28,7 @@ use std::{
 use futures_util::{Stream, stream};
 use tokio::sync::Semaphore;
 
-use self::{asker::Asker, gate::Gate, memory::Memory};
+use self::{asker::Asker, memory::Memory, schedule::Scheduler};
 pub use self::{
     local::Local,
     rle::Rle,
@@ -97,7 +97,7 @@ struct Inner {
     asker: Asker,
     renderer: Arc<dyn Renderer>,
     models: ModelsInfo,
-    gate: Gate,
+    scheduler: Arc<Scheduler>,
     /// Turns at decoding uploads.
     reading: Arc<Semaphore>,
     key_locks: [tokio::sync::Mutex<()>; create::KEY_LOCKS],
@@ -143,8 +143,6 @@ impl Service {
             &config.limits,
             (config.jobs, config.keep_photos),
         )?;
-        // A render uses all cores; a second one fills the gaps of the first.
-        let renders = (config.threads / 2).clamp(1, 8);
         let models = ModelsInfo {
             renderer: parts.renderer.name(),
             server_version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -155,9 +153,9 @@ impl Service {
             jobs,
             maker: parts.maker,
             asker: Asker::new(parts.semantics, &config.limits),
+            scheduler: Scheduler::new(parts.renderer.concurrency(), &config.limits),
             renderer: parts.renderer,
             models,
-            gate: Gate::new(renders, config.limits.queued_renders_max),
             reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
             key_locks: Default::default(),
             memory: Memory::new(config.limits.memory_bytes_max),
@@ -318,7 +316,7 @@ impl Service {
             },
             jobs_queued,
             jobs_running,
-            renders: self.inner.gate.inside(),
+            renders: self.inner.scheduler.len(),
         }
     }
 

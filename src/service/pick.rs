@@ -135,7 +135,7 @@ impl Service {
         let deadline = inner.deadline(&spec.options);
         let (work, id) = (Arc::clone(inner), id.clone());
         inner
-            .within(deadline, "the pick", move || {
+            .scheduled(deadline, 1, "the pick", move |_slot| {
                 let scene = match &understood {
                     Some(understood) => Arc::clone(&understood.scene),
                     None => work.load(&id)?,

@@ -47,12 +47,14 @@ struct Selection {
 }
 
 impl Ground<'_> {
-    /// Answers checked texts; `view` is the camera's, where one was given.
+    /// Answers checked texts; `view` is the camera's, where one was given. Calls `drawn` when it is
+    /// drawn.
     pub(super) fn answer(
         &self,
         texts: &[String],
         spec: &QuerySpec,
         view: Option<&Resolved>,
+        drawn: impl FnOnce(),
     ) -> Result<QueryAnswer> {
         let scorer = self.asker.scorer(self.tag, self.semantics, spec.profile)?;
         let asked = self.asker.ask(&scorer, texts)?;
@@ -61,10 +63,11 @@ impl Ground<'_> {
             let started = Instant::now();
             let request = view.labels_request(Kinds::NONE);
             let key = view.seen_key(self.tag, &self.renderer.name());
-            let (drawn, new) = self.asker.seen(self.renderer, self.scene, &request, key)?;
+            let (found, new) = self.asker.seen(self.renderer, self.scene, &request, key)?;
             render_ms = Some(if new { started.elapsed().as_secs_f64() * 1e3 } else { 0.0 });
-            seen = Some(drawn);
+            seen = Some(found);
         }
+        drawn();
         let selections = self.selections(&asked, spec.boxes);
         let result = |asked: &Asked| -> Result<TextResult> {
             let entries = selected(asked);
@@ -216,8 +219,9 @@ impl Service {
         let understood = inner.understood(id, "query", spec.wait).await?;
         let deadline = inner.deadline(&spec.options);
         let work = Arc::clone(inner);
+        let pixels = view.as_ref().map_or(0, Resolved::pixels);
         inner
-            .within(deadline, "the query", move || {
+            .scheduled(deadline, pixels, "the query", move |slot| {
                 let Understood { scene, semantics, .. } = &understood;
                 let ground = Ground {
                     asker: &work.asker,
@@ -227,7 +231,7 @@ impl Service {
                     semantics,
                     tag: &understood.tag(),
                 };
-                ground.answer(&texts, &spec, view.as_ref())
+                ground.answer(&texts, &spec, view.as_ref(), || slot.drawn())
             })
             .await
     }

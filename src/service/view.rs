@@ -1,16 +1,21 @@
 //! Views: request to camera to frame to file, one render a camera, bounded in time and number.
 
-use std::{sync::Arc, time::Instant};
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
-use futures_util::Stream;
+use futures_util::{Stream, StreamExt, stream};
 use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
+use tracing::Instrument;
 
 use super::{
     Inner, Service,
     asker::{Asked, Asker, SeenView},
     camera,
     encode::{self, Layer},
+    schedule::Slot,
     semantics::{Understood, meaning_tag},
     texts,
     types::{Ask, CameraSpec, Format, Kind, RenderedView, ViewOptions, ViewSpec, ViewsSpec},
@@ -91,6 +96,12 @@ impl Resolved {
         let whole = self.camera.intrinsics;
         let intrinsics = self.crop.map_or(whole, |crop| whole.part(crop));
         Camera { intrinsics, ..self.camera }
+    }
+
+    /// Pixels of the picture that comes out.
+    pub(super) fn pixels(&self) -> u64 {
+        let Intrinsics { width, height, .. } = self.seen().intrinsics;
+        u64::from(width) * u64::from(height)
     }
 
     /// Tells E of this view from that of any other; its pixels do not depend on the background.
@@ -174,7 +185,8 @@ impl Resolved {
         }
     }
 
-    /// The pictures of all kinds; `scene_tag` tells the scene in their tags.
+    /// The pictures of all kinds; `scene_tag` tells the scene in their tags. Calls `drawn` when
+    /// only the encoding is left to do.
     fn draw(
         &self,
         renderer: &dyn Renderer,
@@ -182,9 +194,11 @@ impl Resolved {
         scene_tag: &str,
         told: Option<&Told<'_>>,
         asked: &str,
+        drawn: impl FnOnce(),
     ) -> Result<Vec<RenderedView>> {
         let started = Instant::now();
         let (frame, source) = self.drawn(renderer, scene, told)?;
+        drawn();
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
         meter::stage("render", render_ms / 1e3);
         let name = renderer.name();
@@ -337,7 +351,7 @@ impl Resolved {
         scene: &Scene,
         told: Option<&Told<'_>>,
     ) -> Result<RenderedView> {
-        let mut views = self.draw(renderer, scene, scene.meta.id.as_str(), told, "")?;
+        let mut views = self.draw(renderer, scene, scene.meta.id.as_str(), told, "", || ())?;
         views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
     }
 }
@@ -409,39 +423,42 @@ impl Inner {
         deadline: Instant,
     ) -> Result<Vec<RenderedView>> {
         let inner = Arc::clone(self);
-        let work = move || {
+        let pixels = resolved.pixels();
+        let work = move |slot: &mut Slot| {
+            let drawn = || slot.drawn();
             let Some(about) = about else {
                 let scene = inner.load(&record.status.id)?;
-                return resolved.draw(&*inner.renderer, &scene, &scene_tag(&record), None, "");
+                let tag = scene_tag(&record);
+                return resolved.draw(&*inner.renderer, &scene, &tag, None, "", drawn);
             };
             let Understood { scene, semantics, .. } = &about.understood;
             let tag = about.understood.tag();
             let asked = asked_words(&tag, &about.ask);
             let told = Told::new(&inner.asker, semantics, tag, &about.ask)?;
             let tag = scene_tag(&record);
-            resolved.draw(&*inner.renderer, scene, &tag, Some(&told), &asked)
+            resolved.draw(&*inner.renderer, scene, &tag, Some(&told), &asked, drawn)
         };
-        self.within(deadline, "the view", work).await
+        self.scheduled(deadline, pixels, "the view", work).await
     }
 
-    /// Does heavy work on a blocking thread, in its turn and within the deadline.
-    pub(super) async fn within<T: Send + 'static>(
+    /// Does work on a blocking thread as soon as the scheduler starts it, within the deadline.
+    /// `pixels` are those of the view that it draws.
+    pub(super) async fn scheduled<T: Send + 'static>(
         &self,
         deadline: Instant,
+        pixels: u64,
         what: &str,
-        work: impl FnOnce() -> Result<T> + Send + 'static,
+        work: impl FnOnce(&mut Slot) -> Result<T> + Send + 'static,
     ) -> Result<T> {
         let started = Instant::now();
+        let limits = self.limits();
         let work = async {
-            let pass = self.gate.enter().await?;
+            let mut slot = self.scheduler.enter(pixels, &limits).await?;
             meter::stage("queue", started.elapsed().as_secs_f64());
             let span = tracing::Span::current();
-            tokio::task::spawn_blocking(move || {
-                let _pass = pass;
-                span.in_scope(work)
-            })
-            .await
-            .map_err(|e| Error::internal("the work was broken off").caused_by(e))?
+            tokio::task::spawn_blocking(move || span.in_scope(|| work(&mut slot)))
+                .await
+                .map_err(|e| Error::internal("the work was broken off").caused_by(e))?
         };
         let late = || {
             let ms = started.elapsed().as_millis();
@@ -454,7 +471,7 @@ impl Inner {
     }
 
     pub(super) fn deadline(&self, options: &ViewOptions) -> Instant {
-        let most = std::time::Duration::from_millis(self.limits().render_timeout_ms);
+        let most = Duration::from_millis(self.limits().render_timeout_ms);
         Instant::now() + options.deadline.map_or(most, |asked| asked.min(most))
     }
 }
@@ -517,7 +534,8 @@ impl Service {
     /// Renders many cameras, each once for all kinds; pictures come camera by camera.
     ///
     /// The request as a whole is checked before the first picture; a later fault ends the stream.
-    /// Each camera has `limits.render_timeout_ms`; a caller's deadline holds for all together.
+    /// Each camera has `limits.render_timeout_ms`; all together have `limits.views_timeout_ms`,
+    /// less where the caller's deadline is nearer, and `limits.views_pixels_max` pixels.
     ///
     /// # Errors
     /// As [`Self::render`].
@@ -549,7 +567,16 @@ impl Service {
             Inner::may_be_asked(&record, "views")?;
         }
         let all = resolve_for(&inner, &record, &spec.cameras, &kinds, &spec.options)?;
-        let last = spec.options.deadline.map(|asked| Instant::now() + asked);
+        let pixels: u64 = all.iter().map(Resolved::pixels).sum::<u64>() * kinds.len() as u64;
+        if pixels > limits.views_pixels_max {
+            let (cameras, kinds) = (all.len(), kinds.len());
+            let what = format!("views: {cameras} cameras, {kinds} kinds");
+            let max = limits.views_pixels_max;
+            return Err(Error::limit(what, format!("{pixels} px"), format!("{max} px")));
+        }
+        let most = Duration::from_millis(limits.views_timeout_ms);
+        let last = Instant::now() + spec.options.deadline.map_or(most, |asked| asked.min(most));
+        let at_once = self.inner.scheduler.views_at_once(pixels / (all.len() * kinds.len()) as u64);
         let (to, pictures) = mpsc::channel(READY_MAX);
         let id = id.clone();
         let task = async move {
@@ -561,23 +588,29 @@ impl Service {
                     return;
                 }
             };
-            for one in all {
-                let each = inner.deadline(&ViewOptions::default());
-                let deadline = last.map_or(each, |last| last.min(each));
-                let views =
-                    inner.render_one(Arc::clone(&record), one, about.clone(), deadline).await;
-                let (views, failed) = match views {
-                    Ok(views) => (views.into_iter().map(Ok).collect(), false),
-                    Err(error) => (vec![Err(error)], true),
+            // Each on a task of its own: a slot must not wait for a slow reader.
+            let render = |one: Resolved| {
+                let deadline = last.min(inner.deadline(&ViewOptions::default()));
+                let (inner, record) = (Arc::clone(&inner), Arc::clone(&record));
+                let about = about.clone();
+                let work = async move { inner.render_one(record, one, about, deadline).await };
+                tokio::spawn(work.in_current_span())
+            };
+            let mut rendered = stream::iter(all).map(render).buffered(at_once);
+            while let Some(views) = rendered.next().await {
+                let lost = |e| Err(Error::internal("a view was broken off").caused_by(e));
+                let views = match views.unwrap_or_else(lost) {
+                    Ok(views) => views,
+                    Err(error) => {
+                        let _ = to.send(Err(error)).await;
+                        return;
+                    }
                 };
                 for view in views {
                     // Whoever stopped listening wants no more.
-                    if to.send(view).await.is_err() {
+                    if to.send(Ok(view)).await.is_err() {
                         return;
                     }
-                }
-                if failed {
-                    return;
                 }
             }
         };

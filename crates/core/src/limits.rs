@@ -75,6 +75,16 @@ pub struct Limits {
     pub queued_jobs_max: usize,
     /// Renders at work or waiting; one more is refused as `overloaded`.
     pub queued_renders_max: usize,
+    /// Pixels of renders at work or waiting. One render may take a quarter of what is left, so that
+    /// large views leave room for small ones; else it is refused as `overloaded`.
+    pub queued_pixels_max: u64,
+    /// Pixels of renders at work: being drawn or encoded, some 20 to 30 bytes each. A larger view is
+    /// drawn alone.
+    pub active_pixels_max: u64,
+    /// Pixels of all pictures of one `views` request.
+    pub views_pixels_max: u64,
+    /// Milliseconds one `views` request may take.
+    pub views_timeout_ms: u64,
     /// Bytes of scenes kept in memory.
     pub cache_bytes_max: u64,
     /// Bytes of scenes kept on one GPU device: what a card of 8 GB has to spare beside its frames.
@@ -155,6 +165,7 @@ impl Limits {
             entries_cache_bytes_max,
             queued_jobs_max,
             queued_renders_max,
+            active_pixels_max,
             cache_bytes_max,
             scene_timeout_ms
         );
@@ -191,6 +202,10 @@ impl Default for Limits {
             parts_max: 64,
             queued_jobs_max: 64,
             queued_renders_max: 256,
+            queued_pixels_max: 256 << 20,
+            active_pixels_max: 64 << 20,
+            views_pixels_max: 512 << 20,
+            views_timeout_ms: 300_000,
             cache_bytes_max: 4 << 30,
             device_scene_bytes_max: 2 << 30,
             render_timeout_ms: 30_000,

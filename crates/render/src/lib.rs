@@ -174,6 +174,9 @@ pub trait Renderer: Send + Sync {
     /// Name for logs, `/v1/models` and benchmarks: `cpu`, or the adapter's own name.
     fn name(&self) -> String;
 
+    /// Views that it draws at the same time with profit; more callers only wait for one another.
+    fn concurrency(&self) -> usize;
+
     /// Renders one view.
     ///
     /// # Errors

@@ -123,7 +123,21 @@ pub fn select_with(
     Ok((renderer, reports))
 }
 
-/// A GPU renderer whose refusals the CPU renderer takes over, each said in the log.
+/// Whether the CPU renderer draws a view that the GPU renderer answered with this error: where the
+/// device failed or the view does not fit it. A wrong request stays wrong, a full queue says so to
+/// the caller, and a cancelled view is wanted no more.
+fn cpu_draws_after(code: ErrorCode) -> bool {
+    !matches!(
+        code,
+        ErrorCode::InvalidRequest
+            | ErrorCode::Overloaded
+            | ErrorCode::Cancelled
+            | ErrorCode::DeadlineExceeded
+            | ErrorCode::Stopping
+    )
+}
+
+/// A GPU renderer, and the CPU renderer for the views that it fails to draw, each logged.
 #[derive(Debug)]
 struct WithCpu {
     gpu: GpuRenderer,
@@ -135,24 +149,43 @@ impl Renderer for WithCpu {
         self.gpu.name()
     }
 
-    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
-        match self.gpu.render(gaussians, request) {
-            Err(error) if error.code() != ErrorCode::InvalidRequest => {
-                tracing::warn!(
-                    reason = error.message(),
-                    source = std::error::Error::source(&error).map(tracing::field::display),
-                    "the GPU renderer refused a frame; the CPU renderer draws it"
-                );
-                self.cpu.render(gaussians, request)
-            }
-            other => other,
-        }
+    fn concurrency(&self) -> usize {
+        self.gpu.concurrency()
     }
+
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        let error = match self.gpu.render(gaussians, request) {
+            Err(error) if cpu_draws_after(error.code()) => error,
+            answer => return answer,
+        };
+        tracing::warn!(
+            reason = error.message(),
+            source = std::error::Error::source(&error).map(tracing::field::display),
+            "the GPU renderer refused a view; the CPU renderer draws it"
+        );
+        self.cpu.render(gaussians, request)
+    }
+
     fn device_times(
         &self,
         gaussians: &Gaussians,
         request: &RenderRequest,
     ) -> Result<Option<DeviceTimes>> {
         self.gpu.device_times(gaussians, request)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_cpu_draws_what_the_device_fails_at_and_nothing_else() {
+        use ErrorCode::{
+            Cancelled, GpuUnavailable, Internal, InvalidRequest, LimitExceeded, Overloaded,
+        };
+        let drawn = |code: &ErrorCode| cpu_draws_after(*code);
+        assert!([GpuUnavailable, LimitExceeded, Internal].iter().all(drawn));
+        assert!(![InvalidRequest, Overloaded, Cancelled].iter().any(drawn));
     }
 }

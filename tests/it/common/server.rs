@@ -251,6 +251,10 @@ impl Renderer for CountingRenderer {
         PointRenderer.name()
     }
 
+    fn concurrency(&self) -> usize {
+        2
+    }
+
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         self.drawn.fetch_add(1, Ordering::AcqRel);
         match request.labels {
@@ -269,6 +273,10 @@ pub(crate) struct PointRenderer;
 impl Renderer for PointRenderer {
     fn name(&self) -> String {
         "points".to_owned()
+    }
+
+    fn concurrency(&self) -> usize {
+        2
     }
 
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {

@@ -232,6 +232,11 @@ impl Renderer for CpuRenderer {
         "cpu".to_owned()
     }
 
+    /// A view uses every thread; a second one fills the gaps of the first.
+    fn concurrency(&self) -> usize {
+        (self.threads.current_num_threads() / 2).clamp(1, 8)
+    }
+
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         self.threads.install(|| self.draw(gaussians, request))
     }

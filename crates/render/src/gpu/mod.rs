@@ -167,6 +167,11 @@ impl Renderer for GpuRenderer {
         self.adapter().name.clone()
     }
 
+    /// For every device the views of each submission under way, and those of the next one.
+    fn concurrency(&self) -> usize {
+        self.stations.len() * (pool::TURNS + 1) * pipelines::VIEWS_MAX as usize
+    }
+
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         let view = View::new(gaussians.origin(), request)?;
         if gaussians.is_empty() {

@@ -38,6 +38,10 @@ impl Renderer for Watched {
         "watched".to_owned()
     }
 
+    fn concurrency(&self) -> usize {
+        2
+    }
+
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
         seen.push((gaussians.identity(), request.clone()));
