@@ -30,6 +30,7 @@ mod load;
 mod magnify;
 mod replicas;
 mod sample;
+mod schedule;
 mod store;
 mod telemetry;
 mod texts;
