@@ -12,7 +12,7 @@ use crate::{
     config::Config,
     error::Result,
     pipeline::{Engine, reconstruct},
-    render::{Renderer, compose, cpu::CpuRenderer},
+    render::{Renderer, ViewPlanner, cpu::CpuRenderer},
     scene::{Camera, CameraToWorld, Density, PosedPhoto, Scene, SceneOptions},
 };
 
@@ -114,6 +114,7 @@ fn compare(
         ..a
     });
     let cameras: Vec<Camera> = [target.camera, a, b].into_iter().chain(between).collect();
+    let planner = ViewPlanner::default();
     let mut ms = [Vec::new(), Vec::new()];
     let mut views = [Vec::new(), Vec::new()];
     for camera in &cameras {
@@ -121,8 +122,7 @@ fn compare(
             for (i, scene) in scenes.iter().enumerate() {
                 let start = Instant::now();
                 let request = view_request(*camera, scene.meta.report.median_depth);
-                let frame =
-                    compose::render_scene(renderer as &dyn Renderer, scene, &request, true)?;
+                let frame = planner.render(renderer as &dyn Renderer, scene, &request, true)?;
                 ms[i].push(start.elapsed().as_secs_f64() * 1e3);
                 if run == 0 {
                     let mut color = frame.color.unwrap_or_default();

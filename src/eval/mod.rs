@@ -32,7 +32,7 @@ use crate::{
     models::fit,
     photos,
     pipeline::{Engine, Reconstruction, reconstruct},
-    render::{Kinds, RenderRequest, Renderer, compose, cpu::CpuRenderer},
+    render::{Kinds, RenderRequest, Renderer, ViewPlanner, cpu::CpuRenderer, plan::default_near},
     scene::{Camera, Photo, PosedPhoto, Provenance, Scene, SceneId, SceneMeta, SceneOptions},
 };
 
@@ -43,8 +43,6 @@ pub use warp::hindsight_warp;
 
 /// Side of the evaluated pictures, pixels.
 pub const SIDE: u32 = 256;
-/// Near plane as a share of the scene's median depth, as the service renders.
-const NEAR_SHARE: f64 = 0.01;
 
 /// What to evaluate.
 #[derive(Clone, Debug)]
@@ -170,7 +168,7 @@ fn judge(
         ..view_request(target.camera, made.report.median_depth)
     };
     let scene = scene_of(made);
-    let frame = compose::render_scene(renderer, &scene, &request, true)?;
+    let frame = ViewPlanner::default().render(renderer, &scene, &request, true)?;
     let report = scene.meta.report;
     let mut color = frame.color.unwrap_or_default();
     color.iter_mut().flatten().for_each(|v| *v = v.clamp(0.0, 1.0));
@@ -207,9 +205,7 @@ fn judge(
 
 /// A colour view as the service draws it; `median_depth` is the scene's.
 fn view_request(camera: Camera, median_depth: f64) -> RenderRequest {
-    #[expect(clippy::cast_possible_truncation, reason = "a near plane needs no f64")]
-    let near = (median_depth * NEAR_SHARE).max(1e-6) as f32;
-    RenderRequest::plain(camera, Kinds::COLOR, near)
+    RenderRequest::plain(camera, Kinds::COLOR, default_near(median_depth))
 }
 
 /// A scene of a reconstruction that nobody stores.

@@ -2,15 +2,15 @@
 
 use std::sync::Arc;
 
-use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
 
 use super::{
     Service,
     create::blocking,
-    local::select,
+    search::SceneTexts,
     texts,
     types::{Ask, Export, ExportFormat},
+    view::{asked_words, hash},
 };
 use crate::{
     error::Result,
@@ -46,13 +46,11 @@ impl Service {
         let text = texts::checked(text, "text", &self.limits())?;
         let understood = inner.understood(id, "text", ask.wait).await?;
         let tag = understood.tag();
-        let words = format!("{tag} {text:?} {:?}", ask.profile);
-        let etag: String =
-            Sha256::digest(words)[..16].iter().map(|byte| format!("{byte:02x}")).collect();
+        let etag = hash(&asked_words(&tag, &Ask { text: Some(text.clone()), ..ask.clone() })?);
         let profile = ask.profile;
         let chosen = blocking(move || {
-            let (scene, semantics) = (&understood.scene, &understood.semantics);
-            select(&inner.asker, scene, semantics, &tag, text, profile)
+            let subject = understood.subject(&tag);
+            Ok(SceneTexts::new(&inner.backend, subject, profile, &[text])?.gaussians())
         })
         .await??;
         let size_bytes = ply_size_bytes(&chosen);

@@ -3,31 +3,31 @@
 use std::sync::Arc;
 
 use super::{
-    asker::Asker,
-    pick,
-    query::{Ground, gaussians_of, selected},
+    pick, query,
+    search::{Backend, SceneTexts, Subject},
     texts,
     types::{Kind, PickSpec, Picked, QueryAnswer, QuerySpec, RenderedView, ViewSpec},
-    view::{Told, resolve_one},
+    view::resolve_one,
 };
 use crate::{
     error::{Error, ErrorCode, Result},
     jobs::SemanticsMaker,
     limits::Limits,
     render::Renderer,
-    scene::{Gaussians, Scene, ScoringProfile, Semantics},
+    scene::{Gaussians, Scene, ScoringProfile},
 };
 
 /// A renderer, networks and one scene at a time.
 pub struct Local {
-    asker: Asker,
-    renderer: Arc<dyn Renderer>,
+    backend: Backend,
     limits: Limits,
 }
 
 impl std::fmt::Debug for Local {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Local").field("renderer", &self.renderer.name()).finish_non_exhaustive()
+        f.debug_struct("Local")
+            .field("renderer", &self.backend.renderer.name())
+            .finish_non_exhaustive()
     }
 }
 
@@ -39,20 +39,21 @@ impl Local {
         renderer: Arc<dyn Renderer>,
         limits: Limits,
     ) -> Self {
-        Self { asker: Asker::new(semantics, &limits), renderer, limits }
+        Self { backend: Backend::new(renderer, semantics, &limits), limits }
     }
 
-    fn semantics<'a>(&self, scene: &'a Scene, what: &str) -> Result<&'a Semantics> {
-        if let Some(lack) = self.asker.lacks() {
+    fn subject<'a>(&self, scene: &'a Scene, what: &str) -> Result<Subject<'a>> {
+        if let Some(lack) = self.backend.search.lacks() {
             let message = format!("{what}: the bundle has {lack}");
             return Err(Error::new(ErrorCode::ModelUnavailable, message));
         }
-        scene.semantics.as_deref().ok_or_else(|| {
+        let semantics = scene.semantics.as_deref().ok_or_else(|| {
             let message = format!(
                 "{what}: the scene file has no semantics beside it; make it with --semantics eager"
             );
             Error::new(ErrorCode::SemanticsOff, message)
-        })
+        })?;
+        Ok(Subject { scene, semantics, tag: scene.meta.id.as_str() })
     }
 
     /// As [`super::Service::render`].
@@ -62,13 +63,15 @@ impl Local {
     pub fn render(&self, scene: &Scene, spec: &ViewSpec) -> Result<RenderedView> {
         let ask = texts::check_ask(&[spec.kind], &spec.ask, &self.limits)?;
         let view = resolve_one(scene, spec.camera, spec.kind, &spec.options, &self.limits)?;
-        let told = if spec.kind.needs_semantics() {
-            let semantics = self.semantics(scene, &format!("kind={}", spec.kind.name()))?;
-            Some(Told::new(&self.asker, semantics, scene.meta.id.to_string(), &ask)?)
-        } else {
-            None
+        let texts = match spec.kind.needs_semantics() {
+            true => {
+                let subject = self.subject(scene, &format!("kind={}", spec.kind.name()))?;
+                let text = ask.text.as_slice();
+                Some(SceneTexts::new(&self.backend, subject, ask.profile, text)?)
+            }
+            false => None,
         };
-        view.draw_one(&*self.renderer, scene, told.as_ref())
+        view.draw_one(&self.backend, scene, texts.as_ref())
     }
 
     /// As [`super::Service::query`].
@@ -81,15 +84,9 @@ impl Local {
             .camera
             .map(|camera| resolve_one(scene, camera, Kind::Mask, &spec.options, &self.limits));
         let view = view.transpose()?;
-        let ground = Ground {
-            asker: &self.asker,
-            renderer: &*self.renderer,
-            limits: &self.limits,
-            scene,
-            semantics: self.semantics(scene, "query")?,
-            tag: scene.meta.id.as_str(),
-        };
-        ground.answer(&texts, spec, view.as_ref(), || ())
+        let subject = self.subject(scene, "query")?;
+        let asked = SceneTexts::new(&self.backend, subject, spec.profile, &texts)?;
+        query::answer(&asked, &self.limits, spec, view.as_ref(), || ())
     }
 
     /// As [`super::Service::pick`], without labels.
@@ -98,7 +95,7 @@ impl Local {
     /// As there.
     pub fn pick(&self, scene: &Scene, spec: &PickSpec) -> Result<Picked> {
         let view = resolve_one(scene, spec.camera, Kind::Alpha, &spec.options, &self.limits)?;
-        pick::pick(scene, &view, spec.x, spec.y)
+        pick::pick(&self.backend.planner, scene, &view, [spec.x, spec.y])
     }
 
     /// The Gaussians that a text selects.
@@ -107,27 +104,7 @@ impl Local {
     /// As [`Self::query`].
     pub fn select(&self, scene: &Scene, text: &str, profile: ScoringProfile) -> Result<Gaussians> {
         let text = texts::checked(text, "text", &self.limits)?;
-        let semantics = self.semantics(scene, "text")?;
-        select(&self.asker, scene, semantics, scene.meta.id.as_str(), text, profile)
+        let subject = self.subject(scene, "text")?;
+        Ok(SceneTexts::new(&self.backend, subject, profile, &[text])?.gaussians())
     }
-}
-
-/// The Gaussians that a checked text selects.
-pub(super) fn select(
-    asker: &Asker,
-    scene: &Scene,
-    semantics: &Semantics,
-    tag: &str,
-    text: String,
-    profile: ScoringProfile,
-) -> Result<Gaussians> {
-    let scorer = asker.scorer(tag, semantics, profile)?;
-    let asked = asker.ask(&scorer, &[text])?;
-    let mut keep = vec![false; scene.gaussians.len()];
-    for one in &asked {
-        for i in gaussians_of(scene, &selected(one)) {
-            keep[i as usize] = true;
-        }
-    }
-    Ok(scene.gaussians.only(|i| keep[i]))
 }

@@ -2,19 +2,18 @@
 //!
 //! [`Service`] is a cheap clone; its calls are async and never do heavy work on the async threads.
 
-mod asker;
 mod base64;
 mod camera;
 mod create;
 mod encode;
 mod export;
 mod local;
-mod lru;
 mod memory;
 mod pick;
 mod query;
 mod rle;
 mod schedule;
+mod search;
 mod semantics;
 mod texts;
 mod types;
@@ -28,7 +27,6 @@ use std::{
 use futures_util::{Stream, stream};
 use tokio::sync::Semaphore;
 
-use self::{asker::Asker, memory::Memory, schedule::Scheduler};
 pub use self::{
     local::Local,
     rle::Rle,
@@ -38,9 +36,9 @@ pub use self::{
         Picked, PoseSpec, QueryAnswer, QuerySpec, Readiness, RenderedView, TextResult, TextView,
         TextWarning, ViewOptions, ViewSpec, ViewsSpec,
     },
-    view::default_near,
 };
-pub use crate::render::Quality;
+use self::{memory::Memory, schedule::Scheduler, search::Backend};
+pub use crate::render::{Quality, plan::default_near};
 pub use crate::scene::{
     Density, Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
     SemanticsState, SemanticsStatus, Upload, UploadCameras, UploadFile,
@@ -52,7 +50,7 @@ use crate::{
     keys::Caller,
     limits::Limits,
     render::Renderer,
-    scene::{self, SceneId},
+    scene::SceneId,
     store::{Place, Record, Store, not_found},
 };
 
@@ -94,8 +92,7 @@ struct Inner {
     store: Arc<Store>,
     jobs: Jobs,
     maker: Arc<dyn SceneMaker>,
-    asker: Asker,
-    renderer: Arc<dyn Renderer>,
+    backend: Backend,
     models: ModelsInfo,
     scheduler: Arc<Scheduler>,
     /// Turns at decoding uploads.
@@ -134,7 +131,6 @@ impl Service {
     pub fn open_at(place: &Place, config: Config, parts: Parts) -> Result<Self> {
         let (store, records) = Store::open_at(place, &config.limits)?;
         let store = Arc::new(store);
-        keep_copies(&config.limits);
         let jobs = Jobs::start(
             Arc::clone(&store),
             Arc::clone(&parts.maker),
@@ -152,9 +148,8 @@ impl Service {
             store,
             jobs,
             maker: parts.maker,
-            asker: Asker::new(parts.semantics, &config.limits),
             scheduler: Scheduler::new(parts.renderer.concurrency(), &config.limits),
-            renderer: parts.renderer,
+            backend: Backend::new(parts.renderer, parts.semantics, &config.limits),
             models,
             reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
             key_locks: Default::default(),
@@ -202,7 +197,7 @@ impl Service {
     #[must_use]
     pub fn reload(&self, limits: Limits) -> Vec<&'static str> {
         let later = self.inner.config.limits.changed_for_next_start(&limits);
-        keep_copies(&limits);
+        self.inner.backend.planner.set_limits(&limits);
         *self.inner.limits.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(limits);
         later
     }
@@ -330,10 +325,6 @@ impl Service {
     pub fn shut_down(&self) {
         self.inner.jobs.shut_down();
     }
-}
-
-fn keep_copies(limits: &Limits) {
-    scene::keep_copies(limits.layers_cache_bytes_max, limits.magnified_cache_bytes_max);
 }
 
 /// Where the next page starts: creation time and id of the last scene of this one.

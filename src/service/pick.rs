@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use super::{
     Inner, Service,
+    search::SceneTexts,
     semantics::Understood,
     texts,
     types::{Kind, Label, PickSpec, Picked},
@@ -11,50 +12,17 @@ use super::{
 };
 use crate::{
     error::{Error, Result},
-    render::{
-        Kinds, RenderRequest,
-        oracle::{Contribution, contributions},
-    },
-    scene::{Gaussians, Scene, SceneId},
+    render::{Kinds, ViewPlanner},
+    scene::{Scene, SceneId},
 };
 
-/// Share of the light that reaches what is behind, under which nothing is looked for there.
-const THROUGH_MIN: f64 = 0.01;
-
-/// The Gaussians that a pixel sees, by their number in the scene, front to back.
-fn seen_at(scene: &Scene, request: &RenderRequest, pixel: [u32; 2]) -> Result<Vec<Contribution>> {
-    let camera = &request.camera;
-    let along = |gaussians: &Gaussians| {
-        let magnified = scene.magnified(gaussians, camera);
-        contributions(magnified.as_deref().unwrap_or(gaussians), request, pixel)
-    };
-    let layers = scene.layers(camera);
-    let Some([front, behind]) = layers.as_deref() else { return along(&scene.gaussians) };
-    let numbered = |layer: &Gaussians, mut found: Vec<Contribution>| {
-        // A layer holds whole photos, in the scene's order.
-        let views: std::collections::HashSet<u16> =
-            layer.source().iter().map(|source| source.view).collect();
-        let all = scene.gaussians.source().iter().enumerate();
-        let numbers: Vec<usize> =
-            all.filter(|(_, source)| views.contains(&source.view)).map(|(i, _)| i).collect();
-        for one in &mut found {
-            one.gaussian = numbers.get(one.gaussian).copied().unwrap_or(one.gaussian);
-        }
-        found
-    };
-    let mut found = numbered(front, along(front)?);
-    let through = 1.0 - found.iter().map(|one| one.weight).sum::<f64>();
-    if through > THROUGH_MIN {
-        let under = numbered(behind, along(behind)?);
-        found.extend(
-            under.into_iter().map(|one| Contribution { weight: one.weight * through, ..one }),
-        );
-    }
-    Ok(found)
-}
-
 /// Depth, point and Gaussian of a pixel of a view.
-pub(super) fn pick(scene: &Scene, view: &Resolved, x: f64, y: f64) -> Result<Picked> {
+pub(super) fn pick(
+    planner: &ViewPlanner,
+    scene: &Scene,
+    view: &Resolved,
+    [x, y]: [f64; 2],
+) -> Result<Picked> {
     let request = view.labels_request(Kinds::NONE);
     let lens = request.camera.intrinsics;
     let pixel = [(x, lens.width, "x", "wide"), (y, lens.height, "y", "high")];
@@ -69,7 +37,7 @@ pub(super) fn pick(scene: &Scene, view: &Resolved, x: f64, y: f64) -> Result<Pic
         let at = value.floor() as u32;
         *whole = at;
     }
-    let found = seen_at(scene, &request, whole)?;
+    let found = planner.contributions(scene, &request, whole)?;
     let alpha: f64 = found.iter().map(|one| one.weight).sum();
     #[expect(clippy::cast_possible_truncation, reason = "0 to 1")]
     let mut picked = Picked { alpha: alpha as f32, ..Picked::default() };
@@ -100,8 +68,9 @@ impl Inner {
         entry: u16,
     ) -> Result<Vec<Label>> {
         let tag = understood.tag();
-        let scorer = self.asker.scorer(&tag, &understood.semantics, spec.profile)?;
-        let asked = self.asker.ask(&scorer, labels)?.into_iter();
+        let subject = understood.subject(&tag);
+        let asked =
+            SceneTexts::new(&self.backend, subject, spec.profile, labels)?.texts.into_iter();
         let score = |scores: &[f32]| scores.get(usize::from(entry)).copied().unwrap_or(0.0);
         let mut named: Vec<Label> = asked
             .map(|one| Label { relevancy: score(one.scores.entries()), text: one.text })
@@ -140,7 +109,7 @@ impl Service {
                     Some(understood) => Arc::clone(&understood.scene),
                     None => work.load(&id)?,
                 };
-                let mut picked = pick(&scene, &view, spec.x, spec.y)?;
+                let mut picked = pick(&work.backend.planner, &scene, &view, [spec.x, spec.y])?;
                 if let (Some(understood), Some(entry)) = (&understood, picked.entry) {
                     picked.labels = work.labels(understood, &spec, &labels, entry)?;
                 }

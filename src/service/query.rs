@@ -7,10 +7,9 @@ use rayon::prelude::*;
 
 use super::{
     Service,
-    asker::{Asked, Asker, SeenView},
     encode::{self, Layer},
     rle::Rle,
-    semantics::Understood,
+    search::{LabelledView, SceneTexts, ScoredText},
     texts,
     types::{
         Boxes, Format, Kind, MaskFormat, Part3, Peak, QueryAnswer, QuerySpec, TextResult, TextView,
@@ -20,25 +19,13 @@ use super::{
 use crate::{
     error::Result,
     limits::Limits,
-    render::{Kinds, Renderer},
-    scene::{Scene, SceneId, Semantics},
-    semantics::{PartOptions, Pieces, Scorer},
+    render::Kinds,
+    scene::SceneId,
+    semantics::{Part, PartOptions, Scorer},
 };
 
 /// Relevancy from which a text selects.
 const SELECTED: f32 = 0.5;
-
-/// What a query is answered from.
-#[derive(Clone, Copy)]
-pub(super) struct Ground<'a> {
-    pub(super) asker: &'a Asker,
-    pub(super) renderer: &'a dyn Renderer,
-    pub(super) limits: &'a Limits,
-    pub(super) scene: &'a Scene,
-    pub(super) semantics: &'a Semantics,
-    /// Tells scene and semantics.
-    pub(super) tag: &'a str,
-}
 
 /// A set of entries, what it selects, and in which parts.
 struct Selection {
@@ -46,122 +33,94 @@ struct Selection {
     parts: Vec<Part3>,
 }
 
-impl Ground<'_> {
-    /// Answers checked texts; `view` is the camera's, where one was given. Calls `drawn` when it is
-    /// drawn.
-    pub(super) fn answer(
-        &self,
-        texts: &[String],
-        spec: &QuerySpec,
-        view: Option<&Resolved>,
-        drawn: impl FnOnce(),
-    ) -> Result<QueryAnswer> {
-        let scorer = self.asker.scorer(self.tag, self.semantics, spec.profile)?;
-        let asked = self.asker.ask(&scorer, texts)?;
-        let (mut seen, mut render_ms) = (None, None);
-        if let Some(view) = view {
-            let started = Instant::now();
-            let request = view.labels_request(Kinds::NONE);
-            let key = view.seen_key(self.tag, &self.renderer.name());
-            let (found, new) = self.asker.seen(self.renderer, self.scene, &request, key)?;
-            render_ms = Some(if new { started.elapsed().as_secs_f64() * 1e3 } else { 0.0 });
-            seen = Some(found);
-        }
-        drawn();
-        let selections = self.selections(&asked, spec.boxes);
-        let result = |asked: &Asked| -> Result<TextResult> {
-            let entries = selected(asked);
-            let selection = selections.get(&entries);
-            let view = match &seen {
-                Some(seen) => Some(look(seen, &scorer, asked, spec)?),
-                None => None,
-            };
-            Ok(TextResult {
-                text: asked.text.clone(),
-                scores: asked.scores.entries().iter().skip(1).copied().collect(),
-                gaussians: selection.map_or(0, |selection| selection.gaussians),
-                parts: selection.map_or_else(Vec::new, |selection| selection.parts.clone()),
-                entries,
-                warnings: asked.warnings.clone(),
-                view,
-            })
-        };
-        Ok(QueryAnswer {
-            bank_size: u32::try_from(self.semantics.bank.len()).unwrap_or(u32::MAX),
-            profile: spec.profile,
-            camera: view.map(Resolved::camera),
-            render_ms,
-            results: asked.par_iter().map(result).collect::<Result<_>>()?,
+/// Answers the texts; `view` is that of the camera, where one was given. Calls `drawn` when it is
+/// drawn.
+pub(super) fn answer(
+    asked: &SceneTexts<'_>,
+    limits: &Limits,
+    spec: &QuerySpec,
+    view: Option<&Resolved>,
+    drawn: impl FnOnce(),
+) -> Result<QueryAnswer> {
+    let (mut labelled, mut render_ms) = (None, None);
+    if let Some(view) = view {
+        let started = Instant::now();
+        let key = view.labels_key(asked.of.tag, &asked.backend.renderer.name())?;
+        let (found, new) = asked.view(&view.labels_request(Kinds::NONE), key)?;
+        render_ms = Some(if new { started.elapsed().as_secs_f64() * 1e3 } else { 0.0 });
+        labelled = Some(found);
+    }
+    drawn();
+    let selections = selections(asked, limits, spec.boxes);
+    let result = |text: &ScoredText| -> Result<TextResult> {
+        let entries = text.selected();
+        let selection = selections.get(&entries);
+        let view = labelled.as_ref().map(|view| text_view(view, &asked.scorer, text, spec));
+        Ok(TextResult {
+            text: text.text.clone(),
+            scores: text.scores.entries().iter().skip(1).copied().collect(),
+            gaussians: selection.map_or(0, |selection| selection.gaussians),
+            parts: selection.map_or_else(Vec::new, |selection| selection.parts.clone()),
+            entries,
+            warnings: text.warnings.clone(),
+            view: view.transpose()?,
         })
-    }
+    };
+    Ok(QueryAnswer {
+        bank_size: u32::try_from(asked.of.semantics.bank.len()).unwrap_or(u32::MAX),
+        profile: spec.profile,
+        camera: view.map(Resolved::camera),
+        render_ms,
+        results: asked.texts.par_iter().map(result).collect::<Result<_>>()?,
+    })
+}
 
-    /// What each set of entries selects; texts that select the same share it.
-    fn selections(&self, asked: &[Asked], boxes: Boxes) -> HashMap<Vec<u16>, Selection> {
-        let mut sets: Vec<Vec<u16>> = asked.iter().map(selected).collect();
-        sets.sort_unstable();
-        sets.dedup();
-        let mut held = vec![0_u64; usize::from(u16::MAX) + 1];
-        for m in self.scene.gaussians.semantic_index() {
-            held[usize::from(*m)] += 1;
+/// What each set of entries selects; texts that select the same share it.
+fn selections(
+    asked: &SceneTexts<'_>,
+    limits: &Limits,
+    boxes: Boxes,
+) -> HashMap<Vec<u16>, Selection> {
+    let mut sets: Vec<Vec<u16>> = asked.texts.iter().map(ScoredText::selected).collect();
+    sets.sort_unstable();
+    sets.dedup();
+    let gaussians = &asked.of.scene.gaussians;
+    let mut counts = vec![0_u64; usize::from(u16::MAX) + 1];
+    for m in gaussians.semantic_index() {
+        counts[usize::from(*m)] += 1;
+    }
+    let options = PartOptions::default();
+    let wanted = boxes != Boxes::None && sets.iter().any(|set| !set.is_empty());
+    let pieces = wanted.then(|| asked.pieces(&options));
+    let part = |part: Part| {
+        let held = if boxes == Boxes::Aligned { part.aligned } else { part.oriented };
+        Part3 {
+            gaussians: part.gaussians.len() as u64,
+            center: held.center,
+            axes: held.axes,
+            size: held.size,
         }
-        let options = PartOptions::default();
-        let wanted = boxes != Boxes::None && sets.iter().any(|set| !set.is_empty());
-        let pieces = wanted.then(|| self.asker.pieces(self.tag, self.scene, &options));
-        let selection = |set: Vec<u16>| {
-            let gaussians = set.iter().map(|m| held[usize::from(*m)]).sum();
-            let parts = pieces.as_deref().map(|pieces| self.parts(pieces, &set, boxes, &options));
-            (set, Selection { gaussians, parts: parts.unwrap_or_default() })
-        };
-        sets.into_par_iter().map(selection).collect()
-    }
-
-    fn parts(
-        &self,
-        pieces: &Pieces,
-        entries: &[u16],
-        boxes: Boxes,
-        options: &PartOptions,
-    ) -> Vec<Part3> {
-        let found = pieces.parts(&self.scene.gaussians, entries, options);
-        let told = found.into_iter().take(self.limits.parts_max).map(|part| {
-            let held = if boxes == Boxes::Aligned { part.aligned } else { part.oriented };
-            Part3 {
-                gaussians: part.gaussians.len() as u64,
-                center: held.center,
-                axes: held.axes,
-                size: held.size,
-            }
-        });
-        told.collect()
-    }
-}
-
-/// Entries that a text selects, ascending.
-pub(super) fn selected(asked: &Asked) -> Vec<u16> {
-    let scores = asked.scores.entries();
-    let count = u16::try_from(scores.len()).unwrap_or(u16::MAX);
-    (1..count).filter(|&m| asked.scores.selects(m)).collect()
-}
-
-/// Gaussians of these entries, ascending.
-pub(super) fn gaussians_of(scene: &Scene, entries: &[u16]) -> Vec<u32> {
-    let most = entries.last().map_or(0, |last| usize::from(*last));
-    let mut chosen = vec![false; most + 1];
-    entries.iter().for_each(|m| chosen[usize::from(*m)] = true);
-    let index = scene.gaussians.semantic_index().iter();
-    index
-        .zip(0_u32..)
-        .filter(|(m, _)| chosen.get(usize::from(**m)).copied().unwrap_or(false))
-        .map(|(_, i)| i)
-        .collect()
+    };
+    let selection = |set: Vec<u16>| {
+        let parts = pieces.as_deref().map(|pieces| pieces.parts(gaussians, &set, &options));
+        let parts = parts.into_iter().flatten().take(limits.parts_max).map(part).collect();
+        let gaussians = set.iter().map(|m| counts[usize::from(*m)]).sum();
+        (set, Selection { gaussians, parts })
+    };
+    sets.into_par_iter().map(selection).collect()
 }
 
 /// What a text finds in a view.
-fn look(seen: &SeenView, scorer: &Scorer, asked: &Asked, spec: &QuerySpec) -> Result<TextView> {
-    let relevancy = seen.relevancy(scorer, &asked.scores)?;
+fn text_view(
+    labelled: &LabelledView,
+    scorer: &Scorer,
+    text: &ScoredText,
+    spec: &QuerySpec,
+) -> Result<TextView> {
+    let relevancy = labelled.relevancy(scorer, &text.scores)?;
     // A relevancy under 0.5 is 0, so this is the mask of the short form too.
     let mask: Vec<bool> = relevancy.iter().map(|score| *score >= SELECTED).collect();
-    let (width, height) = (seen.width, seen.height);
+    let (width, height) = (labelled.width, labelled.height);
     let png = |layer| encode::layer(layer, width, height, Format::Png);
     let (mut view, mut corners) = (TextView::default(), None::<[u32; 4]>);
     let mut best = 0.0_f32;
@@ -222,16 +181,10 @@ impl Service {
         let pixels = view.as_ref().map_or(0, Resolved::pixels);
         inner
             .scheduled(deadline, pixels, "the query", move |slot| {
-                let Understood { scene, semantics, .. } = &understood;
-                let ground = Ground {
-                    asker: &work.asker,
-                    renderer: &*work.renderer,
-                    limits: &work.limits(),
-                    scene,
-                    semantics,
-                    tag: &understood.tag(),
-                };
-                ground.answer(&texts, &spec, view.as_ref(), || slot.drawn())
+                let tag = understood.tag();
+                let subject = understood.subject(&tag);
+                let asked = SceneTexts::new(&work.backend, subject, spec.profile, &texts)?;
+                answer(&asked, &work.limits(), &spec, view.as_ref(), || slot.drawn())
             })
             .await
     }

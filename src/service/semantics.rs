@@ -4,7 +4,7 @@
 
 use std::{sync::Arc, time::Duration};
 
-use super::{Inner, Service, create::blocking, view::scene_tag};
+use super::{Inner, Service, create::blocking, search::Subject, view::scene_tag};
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{Scene, SceneId, SceneStatus, Semantics, SemanticsMode, SemanticsState},
@@ -23,6 +23,11 @@ pub(super) struct Understood {
 }
 
 impl Understood {
+    /// The scene as texts are asked of it; `tag` is [`Self::tag`].
+    pub(super) fn subject<'a>(&'a self, tag: &'a str) -> Subject<'a> {
+        Subject { scene: &self.scene, semantics: &self.semantics, tag }
+    }
+
     /// Tells scene and semantics from any others.
     pub(super) fn tag(&self) -> String {
         meaning_tag(&self.record)
@@ -38,7 +43,7 @@ pub(super) fn meaning_tag(record: &Record) -> String {
 impl Inner {
     /// Refuses what the loaded bundle cannot do; `what` was asked.
     pub(super) fn can_understand(&self, what: &str) -> Result<()> {
-        let Some(lack) = self.asker.lacks() else { return Ok(()) };
+        let Some(lack) = self.backend.search.lacks() else { return Ok(()) };
         Err(Error::new(
             ErrorCode::ModelUnavailable,
             format!(
@@ -149,7 +154,7 @@ impl Service {
 
     /// A status with what can be asked of the scene by text now.
     pub(super) fn shown(&self, mut status: SceneStatus) -> SceneStatus {
-        let lack = self.inner.asker.lacks();
+        let lack = self.inner.backend.search.lacks();
         let bundle = &self.inner.models.bundle;
         let reason = match (status.semantics.state, lack) {
             (SemanticsState::Off, _) => Some("the scene was made with semantics=off".to_owned()),

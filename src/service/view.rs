@@ -6,16 +6,16 @@ use std::{
 };
 
 use futures_util::{Stream, StreamExt, stream};
+use serde::Serialize;
 use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
 use tracing::Instrument;
 
 use super::{
-    Inner, Service,
-    asker::{Asked, Asker, SeenView},
-    camera,
+    Inner, Service, camera,
     encode::{self, Layer},
     schedule::Slot,
+    search::{Backend, LabelledView, SceneTexts},
     semantics::{Understood, meaning_tag},
     texts,
     types::{Ask, CameraSpec, Format, Kind, RenderedView, ViewOptions, ViewSpec, ViewsSpec},
@@ -23,17 +23,16 @@ use super::{
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    render::{Frame, Kinds, Labels, Quality, RenderRequest, Renderer, compose},
-    scene::{Camera, Intrinsics, Region, Scene, SceneCamera, SceneId, SceneState, Semantics},
-    semantics::{Scorer, mask_from_blend},
+    render::{
+        Frame, Kinds, Labels, Quality, RenderRequest,
+        plan::{NEAR_RANGE, default_near},
+    },
+    scene::{Camera, Intrinsics, Region, Scene, SceneCamera, SceneId, SceneState},
+    semantics::mask_from_blend,
     store::Record,
     telemetry::meter,
 };
 
-/// Near plane where none is asked for, as a share of the scene's median depth.
-const NEAR_SHARE: f64 = 0.01;
-/// Near planes accepted, world units.
-const NEAR_RANGE: [f32; 2] = [1e-9, 1e9];
 /// Pictures of a `views` request that wait for the caller to take them.
 const READY_MAX: usize = 2;
 
@@ -51,38 +50,11 @@ pub(super) struct Resolved {
     quality: Quality,
 }
 
-/// What the text kinds of a view are answered from.
-pub(super) struct Told<'a> {
-    asker: &'a Asker,
-    scorer: Arc<Scorer>,
-    /// What the kinds that take a text were asked.
-    text: Option<Asked>,
-    /// Tells scene and semantics.
-    tag: String,
-}
-
-impl<'a> Told<'a> {
-    pub(super) fn new(
-        asker: &'a Asker,
-        semantics: &Semantics,
-        tag: String,
-        ask: &Ask,
-    ) -> Result<Self> {
-        let scorer = asker.scorer(&tag, semantics, ask.profile)?;
-        let text = asker.ask(&scorer, ask.text.as_slice())?.pop();
-        Ok(Self { asker, scorer, text, tag })
-    }
-
-    fn text(&self) -> Result<&Asked> {
-        self.text.as_ref().ok_or_else(|| Error::internal("a text kind without a text"))
-    }
-}
-
-/// What a view's text kinds are read from.
-enum Source {
-    /// Entries, which answer every text.
-    Seen(Arc<SeenView>),
-    /// A blend that answers this one.
+/// What the text kinds of a view are read from.
+enum ViewLabels {
+    /// Weights over the bank, which answer every text.
+    Weights(Arc<LabelledView>),
+    /// A blend, which answers the one text that it was drawn for.
     Blend(Vec<[f32; 4]>),
 }
 
@@ -104,10 +76,11 @@ impl Resolved {
         u64::from(width) * u64::from(height)
     }
 
-    /// Tells E of this view from that of any other; its pixels do not depend on the background.
-    pub(super) fn seen_key(&self, tag: &str, renderer: &str) -> String {
+    /// Tells the labels of this view from those of all others. They do not depend on the
+    /// background.
+    pub(super) fn labels_key(&self, tag: &str, renderer: &str) -> Result<String> {
         let Self { camera, antialiased, near, crop, quality, .. } = self;
-        format!("{tag} {renderer} {camera:?} {antialiased} {near:?} {crop:?} {quality:?}")
+        words(&(tag, renderer, camera, antialiased, near, crop, quality))
     }
 
     /// A request of these pictures without labels.
@@ -130,83 +103,83 @@ impl Resolved {
     }
 
     /// Hash of scene, renderer and request for one kind; `asked` tells what was asked by text.
-    fn etag(&self, scene: &str, renderer: &str, kind: Kind, asked: &str) -> String {
+    fn etag(&self, scene: &str, renderer: &str, kind: Kind, asked: &str) -> Result<String> {
         let Self { camera, format, background, antialiased, near, crop, quality, .. } = self;
         let version = env!("CARGO_PKG_VERSION");
-        // Debug prints floats so that they read back the same.
-        let words = format!(
-            "{scene} {version} {renderer} {camera:?} {kind:?} {format:?} {background:?} \
-             {antialiased} {near:?} {crop:?} {quality:?} {asked}"
-        );
-        Sha256::digest(words)[..16].iter().map(|byte| format!("{byte:02x}")).collect()
+        let request = (camera, kind, format, background, antialiased, near, crop, quality);
+        Ok(hash(&words(&(scene, version, renderer, request, asked))?))
     }
 
-    /// One drawing for the pixel kinds and, where they are not known any more, for the labels.
+    /// One drawing for the pixel kinds and, where they are not known, for the labels.
     fn drawn(
         &self,
-        renderer: &dyn Renderer,
+        backend: &Backend,
         scene: &Scene,
-        told: Option<&Told<'_>>,
-    ) -> Result<(Frame, Option<Source>)> {
+        asked: Option<&SceneTexts<'_>>,
+    ) -> Result<(Frame, Option<ViewLabels>)> {
         let mut request = self.labels_request(self.kinds());
-        let mut known = None;
-        if let Some(told) = told {
-            let key = self.seen_key(&told.tag, &renderer.name());
-            known = told.asker.known_view(&key).map(Source::Seen);
-            if known.is_none() {
-                request.labels = self.labels(told);
+        let mut wanted = None;
+        if let Some(asked) = asked {
+            let key = self.labels_key(asked.of.tag, &backend.renderer.name())?;
+            if let Some(known) = asked.known_view(&key) {
+                let (width, height) = (known.width, known.height);
+                let frame = match request.kinds {
+                    Kinds::NONE => Frame { width, height, ..Frame::default() },
+                    _ => self.frame(backend, scene, &request)?,
+                };
+                return Ok((frame, Some(ViewLabels::Weights(known))));
             }
+            request.labels = self.labels(asked);
+            wanted = Some((asked, key));
         }
-        let nothing = request.kinds == Kinds::NONE && request.labels == Labels::None;
-        if let (true, Some(Source::Seen(seen))) = (nothing, &known) {
-            let frame = Frame { width: seen.width, height: seen.height, ..Frame::default() };
-            return Ok((frame, known));
-        }
-        let mut frame =
-            compose::render_scene(renderer, scene, &request, self.background.is_none())?;
-        if let (Some(told), Some(entries)) = (told, frame.entries.take()) {
-            let key = self.seen_key(&told.tag, &renderer.name());
-            known =
-                Some(Source::Seen(told.asker.keep_view(key, frame.width, frame.height, entries)));
-        } else if let Some(blend) = frame.blend.take() {
-            known = Some(Source::Blend(blend));
-        }
-        Ok((frame, known))
+        let mut frame = self.frame(backend, scene, &request)?;
+        let size = [frame.width, frame.height];
+        let labels = match (wanted, frame.entries.take(), frame.blend.take()) {
+            (Some((asked, key)), Some(entries), _) => {
+                Some(ViewLabels::Weights(asked.keep_view(key, size, entries)))
+            }
+            (_, _, blend) => blend.map(ViewLabels::Blend),
+        };
+        Ok((frame, labels))
     }
 
-    /// A mask alone is the blend of a few numbers; all else needs E.
-    fn labels(&self, told: &Told<'_>) -> Labels {
+    fn frame(&self, backend: &Backend, scene: &Scene, request: &RenderRequest) -> Result<Frame> {
+        backend.planner.render(&*backend.renderer, scene, request, self.background.is_none())
+    }
+
+    /// A mask alone is the blend of a few numbers; all else needs the weights.
+    fn labels(&self, asked: &SceneTexts<'_>) -> Labels {
         let mask_alone =
             self.kinds.iter().all(|kind| !kind.needs_semantics() || *kind == Kind::Mask);
-        let tables = told.text.as_ref().map(|text| text.scores.tables()).unwrap_or_default();
+        let tables = asked.texts.first().map(|text| text.scores.tables()).unwrap_or_default();
         match <[_; 1]>::try_from(tables) {
             Ok([table]) if mask_alone => Labels::Blend(table),
             _ => Labels::Entries,
         }
     }
 
-    /// The pictures of all kinds; `scene_tag` tells the scene in their tags. Calls `drawn` when
-    /// only the encoding is left to do.
+    /// The pictures of all kinds; `scene_tag` tells the scene in their tags, `asked_tag` what was
+    /// asked by text. Calls `drawn` when only the encoding is left to do.
     fn draw(
         &self,
-        renderer: &dyn Renderer,
+        backend: &Backend,
         scene: &Scene,
         scene_tag: &str,
-        told: Option<&Told<'_>>,
-        asked: &str,
+        texts: Option<(&SceneTexts<'_>, &str)>,
         drawn: impl FnOnce(),
     ) -> Result<Vec<RenderedView>> {
         let started = Instant::now();
-        let (frame, source) = self.drawn(renderer, scene, told)?;
+        let (frame, labels) = self.drawn(backend, scene, texts.map(|(asked, _)| asked))?;
         drawn();
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
         meter::stage("render", render_ms / 1e3);
-        let name = renderer.name();
+        let name = backend.renderer.name();
         let view = |&kind: &Kind| -> Result<RenderedView> {
             let encoding = Instant::now();
-            let (bytes, depth_scale) = match (kind.needs_semantics(), told, &source) {
-                (true, Some(told), Some(source)) => {
-                    (self.answer(kind, told, source, &frame)?, None)
+            let texts = texts.filter(|_| kind.needs_semantics());
+            let (bytes, depth_scale) = match (texts, &labels) {
+                (Some((asked, _)), Some(labels)) => {
+                    (self.text_picture(kind, asked, labels, &frame)?, None)
                 }
                 _ => {
                     let encoded = encode::encode(&frame, kind, self.format)?;
@@ -215,7 +188,6 @@ impl Resolved {
             };
             let encode_ms = encoding.elapsed().as_secs_f64() * 1e3;
             meter::stage("encode", encode_ms / 1e3);
-            let asked = if kind.needs_semantics() { asked } else { "" };
             Ok(RenderedView {
                 camera_index: self.camera_index,
                 kind,
@@ -225,7 +197,7 @@ impl Resolved {
                 bytes,
                 depth_scale,
                 camera: self.seen(),
-                etag: self.etag(scene_tag, &name, kind, asked),
+                etag: self.etag(scene_tag, &name, kind, texts.map_or("", |(_, tag)| tag))?,
                 stats: frame.stats,
                 render_ms,
                 encode_ms,
@@ -234,30 +206,43 @@ impl Resolved {
         self.kinds.iter().map(view).collect()
     }
 
-    fn answer(
+    fn text_picture(
         &self,
         kind: Kind,
-        told: &Told<'_>,
-        source: &Source,
+        asked: &SceneTexts<'_>,
+        labels: &ViewLabels,
         frame: &Frame,
     ) -> Result<Vec<u8>> {
         let file = |layer| encode::layer(layer, frame.width, frame.height, self.format);
-        match (kind, source) {
-            (Kind::Mask, Source::Blend(blend)) => {
-                file(Layer::Mask(&mask_from_blend(&[blend.as_slice()], told.scorer.scoring())))
+        let scorer = &asked.scorer;
+        let text = asked.texts.first();
+        match (kind, labels, text) {
+            (Kind::Mask, ViewLabels::Blend(blend), _) => {
+                file(Layer::Mask(&mask_from_blend(&[blend.as_slice()], scorer.scoring())))
             }
-            (Kind::Mask, Source::Seen(seen)) => {
-                file(Layer::Mask(&told.scorer.mask(&told.text()?.scores, seen.entries())?))
+            (Kind::Mask, ViewLabels::Weights(view), Some(text)) => {
+                file(Layer::Mask(&scorer.mask(&text.scores, view.entries())?))
             }
-            (Kind::Relevancy, Source::Seen(seen)) => {
-                file(Layer::Relevancy(&seen.relevancy(&told.scorer, &told.text()?.scores)?))
+            (Kind::Relevancy, ViewLabels::Weights(view), Some(text)) => {
+                file(Layer::Relevancy(&view.relevancy(scorer, &text.scores)?))
             }
-            (Kind::Semantics, Source::Seen(seen)) => {
-                file(Layer::Entries(&seen.strongest(&told.scorer)))
+            (Kind::Semantics, ViewLabels::Weights(view), _) => {
+                file(Layer::Entries(&view.strongest(scorer)))
             }
             _ => Err(Error::internal(format!("kind={} was not drawn", kind.name()))),
         }
     }
+}
+
+/// Values in a form that tells any two of them apart: numbers are written to their last bit.
+fn words(values: &impl Serialize) -> Result<String> {
+    serde_json::to_string(values)
+        .map_err(|e| Error::internal("a request cannot be written down").caused_by(e))
+}
+
+/// 32 hexadecimal digits that tell a text from all others.
+pub(super) fn hash(words: &str) -> String {
+    Sha256::digest(words)[..16].iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// Refuses a part of a picture where the whole view is what is asked about.
@@ -347,21 +332,14 @@ impl Resolved {
     /// The first picture, of a scene that is not in the service's store.
     pub(super) fn draw_one(
         &self,
-        renderer: &dyn Renderer,
+        backend: &Backend,
         scene: &Scene,
-        told: Option<&Told<'_>>,
+        texts: Option<&SceneTexts<'_>>,
     ) -> Result<RenderedView> {
-        let mut views = self.draw(renderer, scene, scene.meta.id.as_str(), told, "", || ())?;
+        let texts = texts.map(|texts| (texts, ""));
+        let mut views = self.draw(backend, scene, scene.meta.id.as_str(), texts, || ())?;
         views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
     }
-}
-
-/// The near plane of a scene whose median depth is `median_depth`, world units.
-#[must_use]
-pub fn default_near(median_depth: f64) -> f32 {
-    #[expect(clippy::cast_possible_truncation, reason = "clamped to the range accepted")]
-    let near = (median_depth * NEAR_SHARE) as f32;
-    if near.is_finite() && near > 0.0 { near.clamp(NEAR_RANGE[0], NEAR_RANGE[1]) } else { 0.01 }
 }
 
 impl Inner {
@@ -393,17 +371,15 @@ impl Inner {
         })
     }
 
-    /// What the text kinds of a request need, `None` where it has none of them.
-    async fn about(
+    /// The scene as the text kinds of a request need it, `None` where it has none of them.
+    async fn understood_for(
         self: &Arc<Self>,
         id: &SceneId,
         kinds: &[Kind],
-        ask: Ask,
-    ) -> Result<Option<Arc<About>>> {
+        ask: &Ask,
+    ) -> Result<Option<Understood>> {
         let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) else { return Ok(None) };
-        let what = format!("kind={}", kind.name());
-        let understood = self.understood(id, &what, ask.wait).await?;
-        Ok(Some(Arc::new(About { understood, ask })))
+        Ok(Some(self.understood(id, &format!("kind={}", kind.name()), ask.wait).await?))
     }
 
     /// Checks what a request asks by text, the bundle first: without networks no text is any good.
@@ -418,25 +394,24 @@ impl Inner {
     async fn render_one(
         self: &Arc<Self>,
         record: Arc<Record>,
-        resolved: Resolved,
-        about: Option<Arc<About>>,
+        view: Resolved,
+        texts: Option<(Understood, Ask)>,
         deadline: Instant,
     ) -> Result<Vec<RenderedView>> {
         let inner = Arc::clone(self);
-        let pixels = resolved.pixels();
+        let pixels = view.pixels();
         let work = move |slot: &mut Slot| {
+            let (backend, tag) = (&inner.backend, scene_tag(&record));
             let drawn = || slot.drawn();
-            let Some(about) = about else {
+            let Some((understood, ask)) = texts else {
                 let scene = inner.load(&record.status.id)?;
-                let tag = scene_tag(&record);
-                return resolved.draw(&*inner.renderer, &scene, &tag, None, "", drawn);
+                return view.draw(backend, &scene, &tag, None, drawn);
             };
-            let Understood { scene, semantics, .. } = &about.understood;
-            let tag = about.understood.tag();
-            let asked = asked_words(&tag, &about.ask);
-            let told = Told::new(&inner.asker, semantics, tag, &about.ask)?;
-            let tag = scene_tag(&record);
-            resolved.draw(&*inner.renderer, scene, &tag, Some(&told), &asked, drawn)
+            let meaning = understood.tag();
+            let subject = understood.subject(&meaning);
+            let asked = SceneTexts::new(backend, subject, ask.profile, ask.text.as_slice())?;
+            let asked_tag = asked_words(&meaning, &ask)?;
+            view.draw(backend, subject.scene, &tag, Some((&asked, &asked_tag)), drawn)
         };
         self.scheduled(deadline, pixels, "the view", work).await
     }
@@ -476,15 +451,9 @@ impl Inner {
     }
 }
 
-/// What text kinds of one request are answered from.
-struct About {
-    understood: Understood,
-    ask: Ask,
-}
-
 /// What was asked by text, in tags.
-fn asked_words(tag: &str, ask: &Ask) -> String {
-    format!("{tag} {:?} {:?}", ask.text, ask.profile)
+pub(super) fn asked_words(tag: &str, ask: &Ask) -> Result<String> {
+    words(&(tag, &ask.text, ask.profile))
 }
 
 impl Service {
@@ -501,11 +470,11 @@ impl Service {
         let resolved = resolve_for(inner, &record, &[spec.camera], &[spec.kind], &spec.options)?;
         let asked = match (spec.kind.needs_semantics(), &record.semantics_sha256) {
             (false, _) => String::new(),
-            (true, Some(_)) => asked_words(&meaning_tag(&record), &ask),
+            (true, Some(_)) => asked_words(&meaning_tag(&record), &ask)?,
             (true, None) => return Ok(None),
         };
-        let name = inner.renderer.name();
-        Ok(Some(resolved[0].etag(&scene_tag(&record), &name, spec.kind, &asked)))
+        let name = inner.backend.renderer.name();
+        Ok(Some(resolved[0].etag(&scene_tag(&record), &name, spec.kind, &asked)?))
     }
 
     /// Renders and encodes one view.
@@ -521,11 +490,11 @@ impl Service {
         let ask = inner.checked_ask(&kinds, &spec.ask)?;
         let record = Arc::new(inner.finished(id)?);
         let mut resolved = resolve_for(inner, &record, &[spec.camera], &kinds, &spec.options)?;
-        let about = inner.about(id, &kinds, ask).await?;
+        let understood = inner.understood_for(id, &kinds, &ask).await?;
         let deadline = inner.deadline(&spec.options);
         let one = resolved.remove(0);
         inner
-            .render_one(record, one, about, deadline)
+            .render_one(record, one, understood.map(|understood| (understood, ask)), deadline)
             .await?
             .pop()
             .ok_or_else(|| Error::internal("a render gave no picture"))
@@ -580,8 +549,8 @@ impl Service {
         let (to, pictures) = mpsc::channel(READY_MAX);
         let id = id.clone();
         let task = async move {
-            let about = match inner.about(&id, &kinds, ask).await {
-                Ok(about) => about,
+            let texts = match inner.understood_for(&id, &kinds, &ask).await {
+                Ok(understood) => understood.map(|understood| (understood, ask)),
                 Err(error) => {
                     // Whoever stopped listening needs no reason.
                     let _ = to.send(Err(error)).await;
@@ -592,8 +561,8 @@ impl Service {
             let render = |one: Resolved| {
                 let deadline = last.min(inner.deadline(&ViewOptions::default()));
                 let (inner, record) = (Arc::clone(&inner), Arc::clone(&record));
-                let about = about.clone();
-                let work = async move { inner.render_one(record, one, about, deadline).await };
+                let texts = texts.clone();
+                let work = async move { inner.render_one(record, one, texts, deadline).await };
                 tokio::spawn(work.in_current_span())
             };
             let mut rendered = stream::iter(all).map(render).buffered(at_once);

@@ -15,7 +15,6 @@
 //! while it has a status or a pending record; what has neither is rubbish that a sweep removes.
 //! A bad object is put aside, and the start goes on.
 
-mod cache;
 mod container;
 mod files;
 mod index;
@@ -39,10 +38,7 @@ use std::{
 use fs_err as fs;
 use object_store::path::Path as Name;
 
-use self::{
-    cache::Cache,
-    objects::{Objects, unavailable},
-};
+use self::objects::{Objects, unavailable};
 pub use self::{
     index::KeyUse,
     open::Place,
@@ -53,6 +49,7 @@ pub use self::{
     upload_file::hashes,
 };
 use crate::{
+    cache::Cache,
     error::{Error, ErrorCode, Result},
     scene::{Scene, SceneId, Semantics, Upload},
 };
@@ -69,7 +66,8 @@ pub struct Store {
     objects: Objects,
     /// Whether other processes use the same objects.
     shared: bool,
-    cache: Cache,
+    /// Finished scenes, by the bytes of their arrays.
+    cache: Cache<SceneId, Arc<Scene>>,
     /// One lock a scene being read, so that many callers read it once.
     reading: Mutex<HashMap<SceneId, Arc<Mutex<()>>>>,
     /// Scenes deleted here: what a job still writes of one is removed again.
@@ -101,7 +99,7 @@ impl Store {
     /// Bytes of scenes in memory.
     #[must_use]
     pub fn cached_bytes(&self) -> u64 {
-        self.cache.size_bytes()
+        self.cache.weight()
     }
 
     /// Keeps the first record of a scene, before anything else of it.
@@ -197,7 +195,7 @@ impl Store {
             }
         }
         self.unless_deleted(&id)?;
-        self.cache.insert(scene);
+        self.keep(scene);
         Ok(digest)
     }
 
@@ -218,7 +216,7 @@ impl Store {
         let kept = self.objects.put(of(id, SEMANTICS), file);
         kept.map_err(|e| unavailable("keep the scene's semantics", e))?;
         self.unless_deleted(id)?;
-        self.cache.insert(Arc::clone(&scene));
+        self.keep(Arc::clone(&scene));
         Ok((scene, digest))
     }
 
@@ -258,6 +256,11 @@ impl Store {
         Ok(file.and_then(|file| read_scene(&file).ok()).map(|(_, sha256)| sha256))
     }
 
+    fn keep(&self, scene: Arc<Scene>) {
+        let size = scene.size_bytes();
+        self.cache.insert(scene.meta.id.clone(), scene, size);
+    }
+
     /// Forgets the copy of a scene in memory: the next call reads what the store has.
     pub fn forget(&self, id: &SceneId) {
         self.cache.remove(id);
@@ -289,7 +292,7 @@ impl Store {
         match checked {
             Ok(scene) => {
                 let scene = Arc::new(self.with_its_semantics(scene)?);
-                self.cache.insert(Arc::clone(&scene));
+                self.keep(Arc::clone(&scene));
                 Ok(scene)
             }
             Err(error) => {

@@ -1,10 +1,10 @@
 //! Views larger than the network's own pictures: no dot grid, and no change at its own size.
 
 use segsplat::{
-    render::{Kinds, RenderRequest, Renderer, constants, cpu::CpuRenderer},
+    render::{Kinds, RenderRequest, Renderer, ViewPlanner, cpu::CpuRenderer},
     scene::{
-        Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, LEARNT_BLUR_PX2,
-        Provenance, RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
+        Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, Provenance,
+        RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
     },
 };
 
@@ -70,14 +70,9 @@ fn alpha_range(gaussians: &Gaussians, camera: Camera) -> [f32; 2] {
 }
 
 #[test]
-fn the_blur_given_back_is_the_renderers() {
-    assert_eq!(LEARNT_BLUR_PX2.to_bits(), constants::BLUR_PX2.to_bits());
-}
-
-#[test]
 fn the_networks_own_size_is_left_alone() {
     let scene = wall();
-    assert!(scene.magnified(&scene.gaussians, &camera(1)).is_none());
+    assert!(ViewPlanner::default().magnified(&scene, &scene.gaussians, &camera(1)).is_none());
 }
 
 #[test]
@@ -85,8 +80,9 @@ fn a_magnified_wall_has_no_dot_grid() {
     let scene = wall();
     let [own, _] = alpha_range(&scene.gaussians, camera(1));
     let [gap, _] = alpha_range(&scene.gaussians, camera(4));
-    let magnified =
-        scene.magnified(&scene.gaussians, &camera(4)).expect("four times larger is magnified");
+    let magnified = ViewPlanner::default()
+        .magnified(&scene, &scene.gaussians, &camera(4))
+        .expect("four times larger is magnified");
     let [filled, _] = alpha_range(&magnified, camera(4));
     assert!(gap < 0.5 * own, "without it the wall has gaps: {gap} against {own}");
     assert!(filled > 0.85 * own, "with it the wall is whole: {filled} against {own}");

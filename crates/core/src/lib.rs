@@ -2,6 +2,7 @@
 //!
 //! Every other crate of the workspace uses this one; it uses none of them.
 
+pub mod cache;
 pub mod error;
 pub mod limits;
 pub mod meter;

@@ -9,7 +9,7 @@ pub const ALPHA_MAX: f32 = 0.999;
 /// A ray ends when its transmittance would fall to this or under; that Gaussian is not added.
 pub const TRANSMITTANCE_MIN: f32 = 1e-4;
 /// Added to both diagonal entries of the 2D covariance, px²: a Gaussian covers at least a pixel.
-pub const BLUR_PX2: f32 = 0.3;
+pub const BLUR_PX2: f32 = crate::scene::BLUR_PX2;
 /// Share of the view's half-extent by which the frustum is widened before the Jacobian is taken:
 /// beyond it the affine approximation of the perspective map explodes.
 pub const FRUSTUM_MARGIN: f32 = 0.3;

@@ -3,18 +3,19 @@
 //! [`oracle`] is the judge (f64, per pixel, no tiles), [`cpu`] the tiled product renderer,
 //! [`gpu`] the same stages in WGSL. All three take [`RenderRequest`] and give [`Frame`].
 
-pub mod compose;
 pub mod constants;
 pub mod cpu;
 pub mod gpu;
 pub mod labels;
 pub mod oracle;
+pub mod plan;
 pub mod select;
 pub mod skip;
 pub mod view;
 
 pub use self::{
     labels::{Entries, Labels},
+    plan::ViewPlanner,
     select::{RendererChoice, RendererOptions},
 };
 use crate::{

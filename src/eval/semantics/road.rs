@@ -15,7 +15,7 @@ use crate::{
         Engine, Reconstruction, masks, reconstruct,
         semantics::{SceneParts, SemanticsOptions, Watch, understand},
     },
-    render::{Entries, Labels, RenderRequest, compose, cpu::CpuRenderer},
+    render::{Entries, Labels, RenderRequest, ViewPlanner, cpu::CpuRenderer},
     scene::{
         Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, ScoringProfile, SemanticsReport,
         StageTime,
@@ -100,7 +100,7 @@ impl<'a> Road<'a> {
         let warnings = made.report.warnings.len();
         let stages = made.report.stages.clone();
         let scene = scene_of(Reconstruction { gaussians, ..made });
-        let frame = compose::render_scene(self.renderer, &scene, &request, true)?;
+        let frame = ViewPlanner::default().render(self.renderer, &scene, &request, true)?;
         let entries =
             frame.entries.ok_or_else(|| Error::internal("eval: the view has no entries"))?;
         Ok(Seen {

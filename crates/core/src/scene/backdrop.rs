@@ -8,10 +8,7 @@ use std::f64::consts::{PI, TAU};
 
 use glam::DVec3;
 
-use crate::{
-    error::{Error, ErrorCode, Result},
-    scene::Camera,
-};
+use crate::error::{Error, ErrorCode, Result};
 
 /// Colours by direction, sRGB as the photos are.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -81,30 +78,11 @@ impl Backdrop {
             top * (1.0 - fv) + low * fv
         })
     }
-
-    /// Puts the backdrop behind a view rendered over black: `color += (1 - alpha) * backdrop`.
-    ///
-    /// `color` and `alpha` are `[height * width]` of the camera's picture.
-    pub fn fill(&self, camera: &Camera, color: &mut [[f32; 3]], alpha: &[f32]) {
-        let rotation = camera.camera_to_world.rotation();
-        let width = camera.intrinsics.width.max(1) as usize;
-        for (i, (pixel, &alpha)) in color.iter_mut().zip(alpha).enumerate() {
-            if alpha >= 1.0 {
-                continue;
-            }
-            let (x, y) = ((i % width) as f64 + 0.5, (i / width) as f64 + 0.5);
-            let behind = self.color(rotation * camera.intrinsics.unproject(x, y, 1.0));
-            for (value, behind) in pixel.iter_mut().zip(behind) {
-                *value += (1.0 - alpha) * behind;
-            }
-        }
-    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{CameraToWorld, Intrinsics};
 
     fn quarters() -> Backdrop {
         let cell = |i: usize| {
@@ -121,17 +99,5 @@ mod tests {
         assert!(quarters().color(DVec3::Y)[1] > 0.98, "+y is the last row");
         assert!(quarters().color(-DVec3::Y)[1] < 0.02, "-y is the first row");
         assert!(quarters().color(DVec3::X)[0] > quarters().color(-DVec3::X)[0], "+x is east");
-    }
-
-    #[test]
-    fn fill_shows_only_where_alpha_leaves_room() {
-        let camera = Camera {
-            intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 1.0, cy: 0.5, width: 2, height: 1 },
-            camera_to_world: CameraToWorld::look_at(DVec3::ZERO, DVec3::Z, -DVec3::Y, "c").unwrap(),
-        };
-        let white = Backdrop::from_cells(vec![[255; 3]; 128 * 64]).unwrap();
-        let mut color = vec![[0.25; 3]; 2];
-        white.fill(&camera, &mut color, &[1.0, 0.25]);
-        assert_eq!(color, vec![[0.25; 3], [1.0; 3]]);
     }
 }

@@ -9,6 +9,9 @@ use glam::DVec3;
 
 use crate::error::{Error, ErrorCode, Result};
 
+/// What every renderer adds to both diagonal entries of the 2D covariance, px²: a Gaussian covers
+/// at least a pixel. The network learns its Gaussians together with it.
+pub const BLUR_PX2: f32 = 0.3;
 /// Spherical harmonics of degree 0: 1 / (2 √π).
 pub const SH_C0: f32 = 0.282_094_79;
 
@@ -261,7 +264,8 @@ impl Gaussians {
     }
 
     /// Lives as long as any Gaussians of this identity do.
-    pub(super) fn life(&self) -> Weak<()> {
+    #[must_use]
+    pub fn life(&self) -> Weak<()> {
         Arc::downgrade(&self.life)
     }
 

@@ -92,6 +92,11 @@ pub enum ScoringProfile {
     Paper,
 }
 
+/// What [`ScoringProfile::Paper`] compares texts with.
+pub const PAPER_PHRASES: [&str; 3] = ["object", "things", "stuff"];
+/// How sharply [`ScoringProfile::Paper`] compares.
+pub const PAPER_TAU: f32 = 10.0;
+
 /// Counts and times of making the semantics.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct SemanticsReport {

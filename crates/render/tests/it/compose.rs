@@ -1,6 +1,6 @@
 //! A scene's view put together of layers and backdrop, and what is copied for it.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::{LazyLock, Mutex, PoisonError};
 
 use glam::DVec3;
 use segsplat_core::{
@@ -11,10 +11,16 @@ use segsplat_core::{
     },
 };
 use segsplat_render::{
-    Frame, Kinds, Labels, RenderRequest, Renderer, compose::render_scene, cpu::CpuRenderer,
+    Frame, Kinds, Labels, RenderRequest, Renderer, ViewPlanner, cpu::CpuRenderer,
 };
 
 use segsplat_testing::scenes::{Random, camera, checked, look, push, request};
+
+/// One planner for all tests of this file.
+fn planner() -> &'static ViewPlanner {
+    static PLANNER: LazyLock<ViewPlanner> = LazyLock::new(ViewPlanner::default);
+    &PLANNER
+}
 
 /// The CPU renderer, which remembers what it was asked for.
 struct Watched {
@@ -102,7 +108,10 @@ fn views(gaussians: &Gaussians) -> Vec<u16> {
 #[test]
 fn the_four_photos_closest_to_the_camera_are_in_front() {
     for few in 2..=4 {
-        assert!(scene(few, [0.2, 0.8]).layers(&at(0.0)).is_none(), "{few} photos make every view");
+        assert!(
+            planner().layers(&scene(few, [0.2, 0.8]), &at(0.0)).is_none(),
+            "{few} photos make every view"
+        );
     }
     let all = scene(7, [0.2, 0.8]);
     for (x, front, behind) in [
@@ -110,14 +119,14 @@ fn the_four_photos_closest_to_the_camera_are_in_front() {
         (3.0, [3, 4, 5, 6], [0, 1, 2]),
         (1.76, [2, 3, 4, 5], [0, 1, 6]),
     ] {
-        let layers = all.layers(&at(x)).expect("seven photos are layered");
+        let layers = planner().layers(&all, &at(x)).expect("seven photos are layered");
         assert_eq!(views(&layers[0]), front, "in front of x = {x}");
         assert_eq!(views(&layers[1]), behind, "behind at x = {x}");
         let total: usize = layers.iter().map(Gaussians::len).sum();
         assert_eq!(total, all.gaussians.len(), "every Gaussian is in one layer");
     }
     // Gaussians keep what belongs to them.
-    let layers = all.layers(&at(3.0)).expect("layers");
+    let layers = planner().layers(&all, &at(3.0)).expect("layers");
     let first = 3 * 150;
     assert_eq!(layers[0].means()[..9], all.gaussians.means()[first..first + 9], "means");
     let index = all.gaussians.semantic_index();
@@ -127,29 +136,29 @@ fn the_four_photos_closest_to_the_camera_are_in_front() {
     let mut turned = all.clone();
     let pose = look(DVec3::ZERO, DVec3::new(0.0, 0.0, -4.0));
     turned.meta.cameras[0].camera.camera_to_world = pose;
-    let layers = turned.layers(&at(0.0)).expect("layers");
+    let layers = planner().layers(&turned, &at(0.0)).expect("layers");
     assert_eq!(views(&layers[0]), [1, 2, 3, 4], "a turn costs");
     // A photo of which nothing is known is never in front.
     let mut unknown = all.clone();
     unknown.meta.report.network_focal_px[1] = 0.0;
-    let layers = unknown.layers(&at(0.0)).expect("layers");
+    let layers = planner().layers(&unknown, &at(0.0)).expect("layers");
     assert_eq!(views(&layers[0]), [0, 2, 3, 4], "an unused photo");
     let mut flat = all;
     flat.meta.report.median_depth = 0.0;
-    assert!(flat.layers(&at(0.0)).is_none(), "no depth, no measure");
+    assert!(planner().layers(&flat, &at(0.0)).is_none(), "no depth, no measure");
 }
 
 #[test]
 fn layers_are_front_over_behind_in_every_picture_and_label() {
     let scene = scene(6, [0.05, 0.4]);
     let cpu = CpuRenderer::new(2).expect("two threads");
-    let layers = scene.layers(&at(0.2)).expect("layers");
+    let layers = planner().layers(&scene, &at(0.2)).expect("layers");
     let table = [[0.0; 4], [1.0, 2.0, -1.0, 0.5], [0.25; 4], [-3.0, 0.0, 1.0, 2.0]];
     for labels in [Labels::None, Labels::Blend(table.into()), Labels::Entries] {
         let asked = RenderRequest { labels, ..request(at(0.2)) };
         let bare = RenderRequest { background: [0.0; 3], ..asked.clone() };
         let [front, behind] = [0, 1].map(|k| cpu.render(&layers[k], &bare).expect("a layer"));
-        let got = render_scene(&cpu, &scene, &asked, false).expect("a view");
+        let got = planner().render(&cpu, &scene, &asked, false).expect("a view");
         let (fa, ba) = (front.alpha.as_ref().unwrap(), behind.alpha.as_ref().unwrap());
         let close = |a: f32, b: f32, what: &str, i: usize| {
             assert!((a - b).abs() < 1e-5 * b.abs().max(1.0), "{what} of pixel {i}: {a}, not {b}");
@@ -202,7 +211,7 @@ fn the_backdrop_fills_colour_alone_and_a_mask_pays_for_no_picture() {
     let plain = RenderRequest { background: [0.0; 3], ..request(at(0.3)) };
     let bare = watched.cpu.render(&scene.gaussians, &plain).expect("a picture");
     let color_only = RenderRequest { kinds: Kinds::COLOR, ..plain.clone() };
-    let filled = render_scene(&watched, &scene, &color_only, true).expect("a view");
+    let filled = planner().render(&watched, &scene, &color_only, true).expect("a view");
     assert_eq!((filled.alpha, filled.depth), (None, None), "pictures not asked for");
     let (color, alpha) = (bare.color.expect("colour"), bare.alpha.expect("alpha"));
     let behind = [10.0, 200.0, 60.0].map(|v: f32| v / 255.0);
@@ -217,14 +226,14 @@ fn the_backdrop_fills_colour_alone_and_a_mask_pays_for_no_picture() {
     // Labels are the same with and without it, and cost one pass without alpha.
     for labels in [Labels::Entries, Labels::Blend([[1.0; 4]; 5].into())] {
         let mask = RenderRequest { kinds: Kinds::NONE, labels, ..plain.clone() };
-        let with = render_scene(&watched, &scene, &mask, true).expect("a mask");
+        let with = planner().render(&watched, &scene, &mask, true).expect("a mask");
         let seen = watched.take();
         assert_eq!(seen.len(), 1, "one pass");
         assert_eq!(seen[0].1.kinds, Kinds::NONE, "no picture");
-        let without = render_scene(&watched, &scene, &mask, false).expect("a mask");
+        let without = planner().render(&watched, &scene, &mask, false).expect("a mask");
         assert_eq!(with, without, "the backdrop adds nothing to labels");
         let all = RenderRequest { kinds: Kinds::ALL, ..mask };
-        let all = render_scene(&watched, &scene, &all, true).expect("everything");
+        let all = planner().render(&watched, &scene, &all, true).expect("everything");
         assert_eq!((all.blend, all.entries), (with.blend, with.entries), "beside pictures");
         watched.take();
     }
@@ -246,10 +255,10 @@ fn what_is_hidden_is_not_drawn() {
     }
     walled.gaussians = checked(raw);
     let watched = Watched::new();
-    render_scene(&watched, &walled, &request(at(0.2)), true).expect("a view");
+    planner().render(&watched, &walled, &request(at(0.2)), true).expect("a view");
     assert_eq!(watched.take().len(), 1, "a wall in front hides the layer behind");
     let open = scene(6, [0.05, 0.4]);
-    render_scene(&watched, &open, &request(at(0.2)), true).expect("a view");
+    planner().render(&watched, &open, &request(at(0.2)), true).expect("a view");
     assert_eq!(watched.take().len(), 2, "both layers");
 }
 
@@ -263,13 +272,14 @@ fn a_repeated_camera_set_copies_nothing() {
     let mut first = Vec::new();
     for round in 0..3 {
         for camera in cameras {
-            render_scene(&watched, &scene, &request(camera), true).expect("a view");
+            planner().render(&watched, &scene, &request(camera), true).expect("a view");
         }
         let mut identities: Vec<u64> = watched.take().iter().map(|seen| seen.0).collect();
         if round == 0 {
             first.clone_from(&identities);
-            let layered = scene.layers(&cameras[0]).expect("layers");
-            let magnified = scene.magnified(&layered[0], &cameras[0]).expect("magnified");
+            let layered = planner().layers(&scene, &cameras[0]).expect("layers");
+            let magnified =
+                planner().magnified(&scene, &layered[0], &cameras[0]).expect("magnified");
             assert_eq!(identities[0], magnified.identity(), "the front layer, magnified");
         }
         assert_eq!(identities, first, "round {round} draws other Gaussians");
@@ -279,12 +289,12 @@ fn a_repeated_camera_set_copies_nothing() {
     }
     // Another photo's focal length is another answer.
     scene.meta.report.network_focal_px[0] = 11.0;
-    render_scene(&watched, &scene, &request(cameras[0]), true).expect("a view");
+    planner().render(&watched, &scene, &request(cameras[0]), true).expect("a view");
     assert_ne!(watched.take()[0].0, first[0], "made for another network picture");
     // Other Gaussians are too.
     let index = vec![2; scene.gaussians.len()];
     scene.gaussians = scene.gaussians.with_semantic_index(index).expect("an index a Gaussian");
-    let frame = render_scene(
+    let frame = planner().render(
         &watched,
         &scene,
         &RenderRequest { labels: Labels::Entries, ..request(cameras[0]) },

@@ -11,7 +11,7 @@ use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::fuse::Fate;
-use crate::scene::{LEARNT_BLUR_PX2, SH_C0, ViewGaussians, principal_axes};
+use crate::scene::{BLUR_PX2, SH_C0, ViewGaussians, principal_axes};
 
 /// How alike neighbours must be, and how often blocks of blocks are tried.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -236,7 +236,7 @@ impl<'a> Blocks<'a> {
         // Across the axis: what is left of the covariance beside the camera's direction.
         let side = self.axis.any_orthonormal_vector();
         let up = self.axis.cross(side);
-        let blur = f64::from(LEARNT_BLUR_PX2);
+        let blur = f64::from(BLUR_PX2);
         let px2 = pixel * pixel;
         let (a, b) = (side.dot(*covariance * side) / px2, up.dot(*covariance * up) / px2);
         let c = side.dot(*covariance * up) / px2;
@@ -303,7 +303,7 @@ mod tests {
             let turn = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w));
             let variances = DVec3::from_array(view.scales[i].map(|s| f64::from(s).powi(2)));
             let s = turn * DMat3::from_diagonal(variances) * turn.transpose();
-            let blur = f64::from(LEARNT_BLUR_PX2);
+            let blur = f64::from(BLUR_PX2);
             let at = |a: usize, b: usize| s.col(a)[b] / (pixel * pixel);
             let area = ((at(0, 0) + blur) * (at(1, 1) + blur) - at(0, 1).powi(2)).sqrt();
             sum += f64::from(view.opacities[i]) * area;

@@ -20,16 +20,11 @@ use crate::{
     models::{ImageText, MaskNetwork, NetworkOptions, Runtime},
     photos,
     scene::{
-        Bank, Crop, Gaussians, IndexMap, PhotoMasks, PosedPhoto, Scene, SceneCamera,
-        ScoringProfile, Semantics, SemanticsReport, StageTime, Upload,
+        Bank, Crop, Gaussians, IndexMap, PAPER_PHRASES, PAPER_TAU, PhotoMasks, PosedPhoto, Scene,
+        SceneCamera, ScoringProfile, Semantics, SemanticsReport, StageTime, Upload,
     },
     semantics::{self, Clusters, Cutter, NetworkPicture, Scoring, Views},
 };
-
-/// Canonical phrases of the profile `paper`.
-const PAPER_CANON: [&str; 3] = ["object", "things", "stuff"];
-/// Sharpness of the profile `paper`.
-const PAPER_TAU: f64 = 10.0;
 
 /// How alike two rows must be to become one, where two photos show them on one surface.
 const MERGE_COSINE_MIN: f64 = 0.7;
@@ -205,7 +200,9 @@ impl Engine {
         let manifest = towers.manifest();
         let (canon, tau) = match profile {
             ScoringProfile::Default => (manifest.canon.clone(), f64::from(manifest.tau)),
-            ScoringProfile::Paper => (PAPER_CANON.map(str::to_owned).to_vec(), PAPER_TAU),
+            ScoringProfile::Paper => {
+                (PAPER_PHRASES.map(str::to_owned).to_vec(), f64::from(PAPER_TAU))
+            }
         };
         let rows = towers.embed_texts(&canon)?.into_iter().map(|text| text.row).collect();
         Scoring::new(profile, rows, tau, f64::from(manifest.coverage_floor))

@@ -1,0 +1,305 @@
+//! Texts asked of a scene: what views, queries, picks and exports are answered from.
+//!
+//! A [`TextSearch`] keeps what was made for the texts before: embeddings, banks ready to be scored,
+//! connected pieces, and the weights of views. A [`SceneTexts`] is one scene, the texts asked of
+//! it, and how the bank scores them.
+
+use std::{
+    collections::HashMap,
+    sync::{Arc, OnceLock},
+};
+
+use super::types::TextWarning;
+use crate::{
+    cache::Cache,
+    error::{Error, Result},
+    jobs::{Phrases, SemanticsMaker, TextEmbedding},
+    limits::Limits,
+    render::{Entries, Labels, RenderRequest, Renderer, ViewPlanner},
+    scene::{Gaussians, PAPER_PHRASES, PAPER_TAU, Scene, ScoringProfile, Semantics},
+    semantics::{PartOptions, Pieces, PixelEntries, Scorer, Scoring, TextScores, ViewNorms},
+};
+
+/// What answers are made with. Its calls block; they belong on a thread made for it.
+pub(super) struct Backend {
+    pub(super) renderer: Arc<dyn Renderer>,
+    pub(super) planner: ViewPlanner,
+    pub(super) search: TextSearch,
+}
+
+impl Backend {
+    pub(super) fn new(
+        renderer: Arc<dyn Renderer>,
+        semantics: Arc<dyn SemanticsMaker>,
+        limits: &Limits,
+    ) -> Self {
+        let (planner, search) = (ViewPlanner::new(limits), TextSearch::new(semantics, limits));
+        Self { renderer, planner, search }
+    }
+}
+
+/// The networks for texts, and what they and the scorers made before.
+pub(super) struct TextSearch {
+    maker: Arc<dyn SemanticsMaker>,
+    /// By text; each weighs 1.
+    embeddings: Cache<String, Arc<TextEmbedding>>,
+    /// By scene, semantics and profile; by bytes.
+    scorers: Cache<String, Arc<Scorer>>,
+    /// By scene and semantics; by bytes.
+    pieces: Cache<String, Arc<Pieces>>,
+    /// By scene, semantics, renderer and camera; by bytes.
+    views: Cache<String, Arc<LabelledView>>,
+}
+
+impl TextSearch {
+    fn new(maker: Arc<dyn SemanticsMaker>, limits: &Limits) -> Self {
+        Self {
+            maker,
+            embeddings: Cache::new(limits.texts_cached_max as u64),
+            scorers: Cache::new(limits.scorers_cache_bytes_max),
+            pieces: Cache::new(limits.pieces_cache_bytes_max),
+            views: Cache::new(limits.entries_cache_bytes_max),
+        }
+    }
+
+    /// What the bundle lacks, `None` where nothing.
+    pub(super) fn lacks(&self) -> Option<String> {
+        self.maker.lacks()
+    }
+
+    /// Embeddings of texts: known ones from memory, all others from one run of the network.
+    fn embedded(&self, texts: &[String]) -> Result<Vec<Arc<TextEmbedding>>> {
+        let known: Vec<_> = texts.iter().map(|text| self.embeddings.find(text)).collect();
+        let unknown = texts.iter().zip(&known).filter(|(_, known)| known.is_none());
+        let mut unknown: Vec<String> = unknown.map(|(text, _)| text.clone()).collect();
+        unknown.sort_unstable();
+        unknown.dedup();
+        let made =
+            if unknown.is_empty() { Vec::new() } else { self.maker.embed_texts(&unknown)? };
+        let made = unknown.into_iter().zip(made.into_iter().map(Arc::new));
+        let made: HashMap<String, Arc<TextEmbedding>> = made.collect();
+        for (text, embedding) in &made {
+            self.embeddings.insert(text.clone(), Arc::clone(embedding), 1);
+        }
+        let of = |(text, known): (&String, Option<_>)| {
+            let embedding = known.or_else(|| made.get(text).cloned());
+            embedding.ok_or_else(|| Error::internal("a text has no embedding"))
+        };
+        texts.iter().zip(known).map(of).collect()
+    }
+
+    /// A bank ready to be scored under a profile; `tag` tells scene and semantics.
+    fn scorer(
+        &self,
+        tag: &str,
+        semantics: &Semantics,
+        profile: ScoringProfile,
+    ) -> Result<Arc<Scorer>> {
+        let key = format!("{tag} {profile:?}");
+        if let Some(known) = self.scorers.find(&key) {
+            return Ok(known);
+        }
+        let phrases = match profile {
+            ScoringProfile::Default => self.maker.phrases()?,
+            ScoringProfile::Paper => Phrases {
+                canon: PAPER_PHRASES.map(str::to_owned).to_vec(),
+                tau: PAPER_TAU,
+                coverage_floor: 0.0,
+            },
+        };
+        let canon = self.embedded(&phrases.canon)?;
+        let canon = canon.iter().map(|embedding| embedding.row.clone()).collect();
+        let (tau, floor) = (f64::from(phrases.tau), f64::from(phrases.coverage_floor));
+        let scoring = Arc::new(Scoring::new(profile, canon, tau, floor)?);
+        let scorer = Arc::new(Scorer::new(&semantics.bank, scoring)?);
+        let rows = semantics.bank.len() as u64;
+        // Rows, and the products of each two of them.
+        let bytes = 4 * semantics.bank.rows.len() as u64 + 4 * rows * (rows + 1);
+        self.scorers.insert(key, Arc::clone(&scorer), bytes);
+        Ok(scorer)
+    }
+}
+
+/// A text, how the bank scores it, and what makes that doubtful.
+#[derive(Clone, Debug)]
+pub(super) struct ScoredText {
+    pub(super) text: String,
+    pub(super) scores: TextScores,
+    pub(super) warnings: Vec<TextWarning>,
+}
+
+impl ScoredText {
+    /// Entries that the text selects, ascending.
+    pub(super) fn selected(&self) -> Vec<u16> {
+        let count = u16::try_from(self.scores.entries().len()).unwrap_or(u16::MAX);
+        (1..count).filter(|&m| self.scores.selects(m)).collect()
+    }
+}
+
+/// The weights of a view's pixels over the bank: they answer every further text without a drawing.
+#[derive(Debug)]
+pub(super) struct LabelledView {
+    pub(super) width: u32,
+    pub(super) height: u32,
+    entries: Entries,
+    /// One for each scoring profile.
+    norms: [OnceLock<ViewNorms>; 2],
+}
+
+impl LabelledView {
+    pub(super) fn entries(&self) -> PixelEntries<'_> {
+        let Entries { offsets, index, weight } = &self.entries;
+        PixelEntries { offsets, index, weight }
+    }
+
+    /// `[H * W]` relevancy of a text.
+    pub(super) fn relevancy(&self, scorer: &Scorer, text: &TextScores) -> Result<Vec<f32>> {
+        let kept = match scorer.scoring().profile() {
+            ScoringProfile::Default => &self.norms[0],
+            ScoringProfile::Paper => &self.norms[1],
+        };
+        let norms = match kept.get() {
+            Some(norms) => norms,
+            None => {
+                let made = scorer.norms(self.entries())?;
+                kept.get_or_init(|| made)
+            }
+        };
+        scorer.relevancy(text, self.entries(), norms)
+    }
+
+    /// `[H * W]` entry of the largest weight, 0 where the weights are too small together.
+    pub(super) fn strongest(&self, scorer: &Scorer) -> Vec<u16> {
+        let floor = scorer.scoring().coverage_floor();
+        let strongest = |i: usize| {
+            let (mut best, mut most, mut coverage) = (0, 0.0_f32, 0.0_f64);
+            for (index, weight) in self.entries.pixel(i) {
+                coverage += f64::from(weight);
+                if weight > most {
+                    (best, most) = (index, weight);
+                }
+            }
+            if coverage < floor { 0 } else { best }
+        };
+        (0..self.entries.pixels()).map(strongest).collect()
+    }
+
+    fn size_bytes(&self) -> u64 {
+        // Norms of both profiles, whether they are made yet or not.
+        self.entries.size_bytes() + 2 * 4 * self.entries.pixels() as u64
+    }
+}
+
+/// A scene with its semantics, as texts are asked of it.
+#[derive(Clone, Copy)]
+pub(super) struct Subject<'a> {
+    pub(super) scene: &'a Scene,
+    pub(super) semantics: &'a Semantics,
+    /// Tells this scene with these semantics from all others.
+    pub(super) tag: &'a str,
+}
+
+/// A scene, and the texts asked of it, scored.
+pub(super) struct SceneTexts<'a> {
+    pub(super) backend: &'a Backend,
+    pub(super) of: Subject<'a>,
+    pub(super) scorer: Arc<Scorer>,
+    pub(super) texts: Vec<ScoredText>,
+}
+
+impl<'a> SceneTexts<'a> {
+    /// Scores checked texts under a profile.
+    pub(super) fn new(
+        backend: &'a Backend,
+        of: Subject<'a>,
+        profile: ScoringProfile,
+        texts: &[String],
+    ) -> Result<Self> {
+        let scorer = backend.search.scorer(of.tag, of.semantics, profile)?;
+        let scored = |(text, embedding): (&String, Arc<TextEmbedding>)| {
+            Ok(ScoredText {
+                text: text.clone(),
+                scores: scorer.text(&embedding.row)?,
+                warnings: warnings(text, &embedding),
+            })
+        };
+        let embeddings = backend.search.embedded(texts)?;
+        let texts = texts.iter().zip(embeddings).map(scored).collect::<Result<_>>()?;
+        Ok(Self { backend, of, scorer, texts })
+    }
+
+    /// The connected pieces of the scene's entries.
+    pub(super) fn pieces(&self, options: &PartOptions) -> Arc<Pieces> {
+        let (kept, tag) = (&self.backend.search.pieces, self.of.tag.to_owned());
+        if let Some(known) = kept.find(&tag) {
+            return known;
+        }
+        let scene = self.of.scene;
+        let made = Arc::new(Pieces::new(&scene.gaussians, &scene.meta.cameras, options));
+        kept.insert(tag, Arc::clone(&made), made.size_bytes());
+        made
+    }
+
+    /// The Gaussians that any of the texts selects.
+    pub(super) fn gaussians(&self) -> Gaussians {
+        let index = self.of.scene.gaussians.semantic_index();
+        let most = index.iter().copied().max().unwrap_or(0);
+        let mut chosen = vec![false; usize::from(most) + 1];
+        for m in self.texts.iter().flat_map(ScoredText::selected).filter(|&m| m <= most) {
+            chosen[usize::from(m)] = true;
+        }
+        self.of.scene.gaussians.only(|i| chosen[usize::from(index[i])])
+    }
+
+    /// A view's weights where they are still known; `key` tells the view from all others.
+    pub(super) fn known_view(&self, key: &str) -> Option<Arc<LabelledView>> {
+        self.backend.search.views.find(&key.to_owned())
+    }
+
+    /// Keeps the weights of a view that was drawn.
+    pub(super) fn keep_view(
+        &self,
+        key: String,
+        [width, height]: [u32; 2],
+        entries: Entries,
+    ) -> Arc<LabelledView> {
+        let view = Arc::new(LabelledView { width, height, entries, norms: Default::default() });
+        self.backend.search.views.insert(key, Arc::clone(&view), view.size_bytes());
+        view
+    }
+
+    /// A view's weights, drawn where they are not known; and whether they were drawn.
+    pub(super) fn view(
+        &self,
+        request: &RenderRequest,
+        key: String,
+    ) -> Result<(Arc<LabelledView>, bool)> {
+        if let Some(known) = self.known_view(&key) {
+            return Ok((known, false));
+        }
+        let request = RenderRequest { labels: Labels::Entries, ..request.clone() };
+        let Backend { renderer, planner, .. } = self.backend;
+        let frame = planner.render(&**renderer, self.of.scene, &request, false)?;
+        let entries =
+            frame.entries.ok_or_else(|| Error::internal("the renderer gave no entries"))?;
+        Ok((self.keep_view(key, [frame.width, frame.height], entries), true))
+    }
+}
+
+fn warnings(text: &str, embedding: &TextEmbedding) -> Vec<TextWarning> {
+    let warning = |code: &str, message: String| TextWarning { code: code.to_owned(), message };
+    let mut warnings = Vec::new();
+    let (tokens, unknown) = (embedding.tokens, embedding.unknown);
+    if unknown > 0 && unknown >= tokens {
+        let message = format!("the text tower knows no word of {text:?}; its scores mean nothing");
+        warnings.push(warning("unknown_words", message));
+    } else if unknown > 0 {
+        let message = format!("the text tower does not know {unknown} of {tokens} pieces of it");
+        warnings.push(warning("unknown_words", message));
+    }
+    if embedding.cut {
+        let message = format!("the text is longer than the text tower reads: {text:?} was cut");
+        warnings.push(warning("text_cut", message));
+    }
+    warnings
+}
