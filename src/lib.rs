@@ -10,7 +10,7 @@
 //!
 //! | layer | modules | may use |
 //! |---|---|---|
-//! | L0 nouns | [`scene`], [`error`], [`limits`], [`keys`], [`config`], [`telemetry`] | nothing above (`scene` uses `error`, `limits`) |
+//! | L0 nouns | [`scene`], [`error`], [`limits`], [`keys`], [`config`], [`crypto`], [`telemetry`] | nothing above (`scene` uses `error`, `limits`) |
 //! | L1 verbs | [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`render`], [`store`], [`sample`] | L0; never each other |
 //! | L2 | [`pipeline`] | L1: the only place that knows the order of the stages |
 //! | L3 | [`jobs`] | `pipeline`, `store` |
@@ -25,6 +25,7 @@ pub mod api;
 pub mod bench;
 pub mod cli;
 pub mod config;
+pub mod crypto;
 pub mod eval;
 pub mod jobs;
 pub mod keys;

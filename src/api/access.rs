@@ -4,14 +4,10 @@
 //! sent, or `unauthenticated`, `permission_denied`, `overloaded`. A key is never logged.
 
 use std::{
-    num::NonZeroU32,
-    sync::{Arc, PoisonError, RwLock},
+    sync::{Arc, Mutex, PoisonError, RwLock},
+    time::{Duration, Instant},
 };
 
-use governor::{
-    DefaultDirectRateLimiter, Quota, RateLimiter,
-    clock::{Clock, DefaultClock},
-};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use crate::{
@@ -79,9 +75,35 @@ struct Ring {
 /// What one key may use.
 #[derive(Debug)]
 struct Share {
-    rate: DefaultDirectRateLimiter,
+    rate: Rate,
     places: Arc<Semaphore>,
     places_max: usize,
+}
+
+/// Requests a second, a second's worth at once (GCRA: the time at which the next request is due).
+#[derive(Debug)]
+struct Rate {
+    interval: Duration,
+    due: Mutex<Instant>,
+}
+
+impl Rate {
+    fn per_second(requests: u32) -> Self {
+        let interval = Duration::from_secs(1) / requests.max(1);
+        Self { interval, due: Mutex::new(Instant::now()) }
+    }
+
+    /// Takes one request at the time `now`, or says how long to wait for it.
+    fn take(&self, now: Instant) -> Result<(), Duration> {
+        let mut due = self.due.lock().unwrap_or_else(PoisonError::into_inner);
+        let next = (*due).max(now) + self.interval;
+        let early = next.saturating_duration_since(now + Duration::from_secs(1));
+        if early.is_zero() {
+            *due = next;
+            return Ok(());
+        }
+        Err(early)
+    }
 }
 
 impl Ring {
@@ -91,9 +113,11 @@ impl Ring {
         let shares = keys.iter().map(|key| {
             let per_s = key.requests_per_s.unwrap_or(config.limits.key_requests_per_s);
             let places_max = key.inflight_max.unwrap_or(config.limits.key_inflight_max);
-            let per_s = NonZeroU32::new(per_s).unwrap_or(NonZeroU32::MIN);
-            let rate = RateLimiter::direct(Quota::per_second(per_s));
-            Share { rate, places: Arc::new(Semaphore::new(places_max)), places_max }
+            Share {
+                rate: Rate::per_second(per_s),
+                places: Arc::new(Semaphore::new(places_max)),
+                places_max,
+            }
         });
         let shares = shares.collect();
         Ok(Self { keys: Some((keys, shares)) })
@@ -148,8 +172,7 @@ impl Access {
                 ),
             ));
         }
-        if let Err(early) = share.rate.check() {
-            let wait = early.wait_time_from(DefaultClock::default().now());
+        if let Err(wait) = share.rate.take(Instant::now()) {
             let seconds = u32::try_from(wait.as_secs()).unwrap_or(u32::MAX).saturating_add(1);
             let message = format!("key {:?} has used up its requests a second", key.name);
             return Err(Error::new(ErrorCode::Overloaded, message).retry_after_s(seconds));

@@ -111,5 +111,6 @@ pub(super) fn dump(
         .map(|(name, dtype, shape, bytes)| Ok((name, TensorView::new(dtype, shape, bytes)?)))
         .collect::<std::result::Result<Vec<_>, safetensors::SafeTensorError>>()
         .map_err(fault)?;
-    safetensors::serialize_to_file(views, None, path).map_err(fault)
+    let bytes = safetensors::serialize(views, None).map_err(fault)?;
+    fs_err::write(path, bytes).map_err(|e| Error::internal(format!("{}: {e}", path.display())))
 }

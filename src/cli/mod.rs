@@ -89,6 +89,7 @@ impl Command {
 /// Runs the program with this process's arguments.
 #[must_use]
 pub fn main() -> ExitCode {
+    crate::crypto::install();
     run(std::env::args_os())
 }
 

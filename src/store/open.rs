@@ -51,6 +51,7 @@ impl Place {
         let Some((bucket, prefix)) = config.bucket()? else {
             return Ok(Self::Folder(config.data_dir.clone()));
         };
+        crate::crypto::install();
         let timeout = Duration::from_millis(config.limits.store_timeout_ms);
         let client = ClientOptions::new()
             .with_allow_http(config.s3_allow_http)

@@ -68,6 +68,7 @@ pub fn start(config: &Config) -> Result<Spans> {
 }
 
 fn provider(config: &Config) -> Result<SdkTracerProvider> {
+    crate::crypto::install();
     let mut exporter = SpanExporter::builder().with_http().with_protocol(Protocol::HttpBinary);
     if let Some(endpoint) = &config.otlp {
         exporter = exporter.with_endpoint(format!("{}/v1/traces", endpoint.trim_end_matches('/')));

@@ -3,12 +3,12 @@
 //! Labels take few values each, all named here or in the tables of calls and errors: nothing that
 //! a caller chooses becomes a label.
 
-use std::{sync::OnceLock, time::Duration};
+use std::{sync::LazyLock, time::Duration};
 
-use metrics::{
-    Unit, counter, describe_counter, describe_gauge, describe_histogram, gauge, histogram,
+use prometheus::{
+    Gauge, HistogramVec, IntCounter, IntCounterVec, TextEncoder, register_gauge,
+    register_gauge_vec, register_histogram_vec, register_int_counter, register_int_counter_vec,
 };
-use metrics_exporter_prometheus::{Matcher, PrometheusBuilder, PrometheusHandle};
 
 pub use segsplat_core::meter::{STAGE_SECONDS, STAGES, stage};
 
@@ -43,116 +43,98 @@ pub const RESIDENT: &str = "process_resident_memory_bytes";
 /// Open file descriptors of the process.
 pub const OPEN_FDS: &str = "process_open_fds";
 
-/// Between two sortings of what was measured.
-const UPKEEP_EVERY: Duration = Duration::from_secs(5);
+/// Every metric of the process.
+struct Metrics {
+    requests: IntCounterVec,
+    request_seconds: HistogramVec,
+    inflight: Gauge,
+    jobs: IntCounterVec,
+    jobs_queued: Gauge,
+    jobs_running: Gauge,
+    renders: Gauge,
+    cache_bytes: Gauge,
+    uploaded: IntCounter,
+    uploads_held: Gauge,
+    ready: Gauge,
+    resident: Gauge,
+    open_fds: Gauge,
+}
 
-/// Upper ends of the histograms' buckets, seconds: 1 ms to 10 minutes.
-const BUCKETS: [f64; 16] = [
-    0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 15.0, 60.0, 180.0,
-    600.0,
-];
-
-/// The recorder of this process; made and filled with every metric at the first call.
-///
-/// # Errors
-/// `internal` when another recorder was installed.
-pub fn handle() -> Result<&'static PrometheusHandle> {
-    static HANDLE: OnceLock<std::result::Result<PrometheusHandle, String>> = OnceLock::new();
-    let handle = HANDLE.get_or_init(|| {
-        let built = PrometheusBuilder::new()
-            .set_buckets_for_metric(Matcher::Suffix("_seconds".to_owned()), &BUCKETS)
-            .and_then(PrometheusBuilder::install_recorder)
-            .map_err(|e| e.to_string());
-        if let Ok(handle) = &built {
-            describe();
-            register();
-            keep_up(handle.clone());
+impl Metrics {
+    /// Registers every metric and gives each its first value, so that none appears only after its
+    /// first event.
+    fn register() -> prometheus::Result<Self> {
+        segsplat_core::meter::register();
+        let buckets = segsplat_core::meter::BUCKETS.to_vec();
+        register_gauge_vec!(BUILD, "1, with the version as a label", &["version"])?
+            .with_label_values(&[env!("CARGO_PKG_VERSION")])
+            .set(1.0);
+        let jobs = register_int_counter_vec!(
+            JOBS,
+            "Jobs ended, by kind and outcome",
+            &["kind", "outcome"]
+        )?;
+        for kind in ["scene", "semantics"] {
+            for outcome in ["done", "failed", "cancelled", "requeued"] {
+                jobs.with_label_values(&[kind, outcome]);
+            }
         }
-        built
-    });
-    handle.as_ref().map_err(|e| Error::internal(format!("metrics cannot be kept: {e}")))
-}
-
-/// Sorts every measured time into its histogram now and then: until it is sorted it takes memory of
-/// its own, and not everybody is asked for metrics. For as long as the process lives.
-fn keep_up(handle: PrometheusHandle) {
-    fn sort(handle: &PrometheusHandle) -> ! {
-        loop {
-            std::thread::sleep(UPKEEP_EVERY);
-            handle.run_upkeep();
-        }
-    }
-
-    if let Err(error) =
-        std::thread::Builder::new().name("metrics".to_owned()).spawn(move || sort(&handle))
-    {
-        tracing::warn!(%error, "metrics take memory until they are asked for");
-    }
-}
-
-fn describe() {
-    describe_counter!(REQUESTS, "Calls answered, by door, call and code");
-    describe_histogram!(REQUEST_SECONDS, Unit::Seconds, "Time to the first byte of the answer");
-    describe_gauge!(INFLIGHT, "Calls let in whose answer is not sent yet");
-    describe_histogram!(STAGE_SECONDS, Unit::Seconds, "Time of each stage of scenes and views");
-    describe_counter!(JOBS, "Jobs ended, by kind and outcome");
-    describe_gauge!(JOBS_QUEUED, "Jobs that wait");
-    describe_gauge!(JOBS_RUNNING, "Jobs at work");
-    describe_gauge!(RENDERS, "Renders at work or waiting");
-    describe_gauge!(CACHE_BYTES, Unit::Bytes, "Bytes of scenes in memory");
-    describe_counter!(UPLOADED, Unit::Bytes, "Bytes of uploads taken in");
-    describe_gauge!(UPLOADS_HELD, Unit::Bytes, "Bytes of uploads held in memory now");
-    describe_gauge!(READY, "1 where new work is taken");
-    describe_gauge!(BUILD, "1, with the version as a label");
-    describe_gauge!(RESIDENT, Unit::Bytes, "Resident memory of the process");
-    describe_gauge!(OPEN_FDS, "Open file descriptors of the process");
-}
-
-/// Makes each metric known with its first value, so that none appears only after its first event.
-fn register() {
-    for name in [INFLIGHT, JOBS_QUEUED, JOBS_RUNNING, RENDERS, CACHE_BYTES, UPLOADS_HELD, READY] {
-        gauge!(name).set(0.0);
-    }
-    gauge!(RESIDENT).set(0.0);
-    gauge!(OPEN_FDS).set(0.0);
-    gauge!(BUILD, "version" => env!("CARGO_PKG_VERSION")).set(1.0);
-    counter!(UPLOADED).absolute(0);
-    for kind in ["scene", "semantics"] {
-        for outcome in ["done", "failed", "cancelled", "requeued"] {
-            counter!(JOBS, "kind" => kind, "outcome" => outcome).absolute(0);
-        }
-    }
-    for stage in STAGES {
-        let _ = histogram!(STAGE_SECONDS, "stage" => stage);
+        Ok(Self {
+            requests: register_int_counter_vec!(
+                REQUESTS,
+                "Calls answered, by door, call and code",
+                &["door", "call", "code"]
+            )?,
+            request_seconds: register_histogram_vec!(
+                REQUEST_SECONDS,
+                "Time to the first byte of the answer",
+                &["door", "call"],
+                buckets
+            )?,
+            inflight: register_gauge!(INFLIGHT, "Calls let in whose answer is not sent yet")?,
+            jobs,
+            jobs_queued: register_gauge!(JOBS_QUEUED, "Jobs that wait")?,
+            jobs_running: register_gauge!(JOBS_RUNNING, "Jobs at work")?,
+            renders: register_gauge!(RENDERS, "Renders at work or waiting")?,
+            cache_bytes: register_gauge!(CACHE_BYTES, "Bytes of scenes in memory")?,
+            uploaded: register_int_counter!(UPLOADED, "Bytes of uploads taken in")?,
+            uploads_held: register_gauge!(UPLOADS_HELD, "Bytes of uploads held in memory now")?,
+            ready: register_gauge!(READY, "1 where new work is taken")?,
+            resident: register_gauge!(RESIDENT, "Resident memory of the process")?,
+            open_fds: register_gauge!(OPEN_FDS, "Open file descriptors of the process")?,
+        })
     }
 }
+
+static METRICS: LazyLock<Metrics> =
+    LazyLock::new(|| Metrics::register().expect("each name is registered once; this is a bug"));
 
 /// Makes a call known before its first, as every other metric is from the start.
 pub fn register_call(door: &'static str, call: &'static str) {
-    counter!(REQUESTS, "door" => door, "call" => call, "code" => "ok").absolute(0);
-    let _ = histogram!(REQUEST_SECONDS, "door" => door, "call" => call);
+    METRICS.requests.with_label_values(&[door, call, "ok"]);
+    METRICS.request_seconds.with_label_values(&[door, call]);
 }
 
 /// Counts an answered call; `code` is a name of the error table, or `ok`.
 pub fn answered(door: &'static str, call: &'static str, code: &str, took: Duration) {
     let code = TABLE.iter().find(|row| row.name == code).map_or("ok", |row| row.name);
-    counter!(REQUESTS, "door" => door, "call" => call, "code" => code).increment(1);
-    histogram!(REQUEST_SECONDS, "door" => door, "call" => call).record(took.as_secs_f64());
+    METRICS.requests.with_label_values(&[door, call, code]).inc();
+    METRICS.request_seconds.with_label_values(&[door, call]).observe(took.as_secs_f64());
 }
 
 /// Counts a call in (1) or out (-1).
 pub fn inflight(change: f64) {
-    gauge!(INFLIGHT).increment(change);
+    METRICS.inflight.add(change);
 }
 
 /// Counts an ended job.
 pub fn job(kind: &'static str, outcome: &'static str) {
-    counter!(JOBS, "kind" => kind, "outcome" => outcome).increment(1);
+    METRICS.jobs.with_label_values(&[kind, outcome]).inc();
 }
 
 /// Counts bytes of an upload.
 pub fn uploaded(bytes: usize) {
-    counter!(UPLOADED).increment(bytes as u64);
+    METRICS.uploaded.inc_by(bytes as u64);
 }
 
 /// What is looked up when somebody asks for the metrics.
@@ -175,29 +157,30 @@ pub struct Levels {
 /// All metrics as Prometheus reads them.
 ///
 /// # Errors
-/// `internal` when another recorder was installed.
+/// `internal` when they cannot be written as text.
 pub fn text(levels: Levels) -> Result<String> {
-    let handle = handle()?;
     let Levels { ready, jobs_queued, jobs_running, renders, cache_bytes, uploads_held_bytes } =
         levels;
-    gauge!(READY).set(f64::from(u8::from(ready)));
+    METRICS.ready.set(f64::from(u8::from(ready)));
     #[expect(clippy::cast_precision_loss, reason = "counts and bytes stay under 2^52")]
-    for (name, level) in [
-        (JOBS_QUEUED, jobs_queued as f64),
-        (JOBS_RUNNING, jobs_running as f64),
-        (RENDERS, renders as f64),
-        (CACHE_BYTES, cache_bytes as f64),
-        (UPLOADS_HELD, uploads_held_bytes as f64),
+    for (gauge, level) in [
+        (&METRICS.jobs_queued, jobs_queued as f64),
+        (&METRICS.jobs_running, jobs_running as f64),
+        (&METRICS.renders, renders as f64),
+        (&METRICS.cache_bytes, cache_bytes as f64),
+        (&METRICS.uploads_held, uploads_held_bytes as f64),
     ] {
-        gauge!(name).set(level);
+        gauge.set(level);
     }
     if let Some(bytes) = resident_bytes() {
-        gauge!(RESIDENT).set(bytes);
+        METRICS.resident.set(bytes);
     }
     if let Ok(open) = std::fs::read_dir("/proc/self/fd") {
-        gauge!(OPEN_FDS).set(open.fold(0.0, |count, _| count + 1.0));
+        METRICS.open_fds.set(open.fold(0.0, |count, _| count + 1.0));
     }
-    Ok(handle.render())
+    TextEncoder::new()
+        .encode_to_string(&prometheus::gather())
+        .map_err(|e| Error::internal("the metrics cannot be written").caused_by(e))
 }
 
 /// `VmRSS` of this process, where the system tells.

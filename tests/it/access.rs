@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use reqwest::{Client, StatusCode, header};
+use reqwest::{StatusCode, header};
 use segsplat::{
     api::grpc::{DESCRIPTORS, pb},
     api::http::routes,
@@ -173,7 +173,7 @@ async fn anothers_scene_is_as_one_that_does_not_exist() {
     }
     // Lists, and keys that make a call be made once, are each owner's own.
     let http = |name: &str| {
-        let request = Client::new().get(stand.url("/v1/scenes"));
+        let request = crate::common::client().get(stand.url("/v1/scenes"));
         request.bearer_auth(secret(name)).send()
     };
     for (name, count) in [("reader", 1), ("writer", 1), ("stranger", 0), ("boss", 1)] {
@@ -230,7 +230,7 @@ async fn a_key_gets_its_share_and_others_theirs() {
 #[tokio::test]
 async fn without_a_key_http_says_how_to_show_one_and_health_asks_none() {
     let (_folder, stand) = guarded("").await;
-    let client = Client::new();
+    let client = crate::common::client();
     let answer = client.get(stand.url("/v1/scenes")).send().await.unwrap();
     assert_eq!(answer.status(), StatusCode::UNAUTHORIZED);
     assert!(answer.headers()[header::WWW_AUTHENTICATE].to_str().unwrap().starts_with("Bearer"));
@@ -250,7 +250,7 @@ async fn only_named_origins_may_call_from_a_page() {
         config.cors_origins = vec!["https://ours.example".to_owned()];
     })
     .await;
-    let client = Client::new();
+    let client = crate::common::client();
     let ask =
         |origin: &'static str| client.get(stand.url("/v1/scenes")).header("origin", origin).send();
     let ours = ask("https://ours.example").await.unwrap();

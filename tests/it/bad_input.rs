@@ -405,7 +405,10 @@ async fn words_for_numbers_are_refused_by_name() {
         ("from=0&format=bmp", "bmp"),
         ("from=0&background=sky", "sky"),
     ] {
-        let answer = reqwest::get(stand.url(&format!("/v1/scenes/{id}/view?{query}"))).await;
+        let answer = crate::common::client()
+            .get(stand.url(&format!("/v1/scenes/{id}/view?{query}")))
+            .send()
+            .await;
         let fault = crate::common::doors::bytes(answer.unwrap()).await.expect_err(query);
         assert_eq!(fault.code, "invalid_request", "{query}: {}", fault.message);
         assert!(fault.message.contains(word), "{query}: {}", fault.message);

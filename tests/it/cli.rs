@@ -278,7 +278,9 @@ fn serve_says_where_it_listens_and_ends_at_sigterm() {
     assert!(url.starts_with("http://127.0.0.1:") && !url.ends_with(":0"), "{url}");
     assert_eq!(said["renderer"], "cpu");
     let runtime = tokio::runtime::Runtime::new().unwrap();
-    let ready = runtime.block_on(reqwest::get(format!("{url}/readyz"))).expect("it answers");
+    let ready = runtime
+        .block_on(crate::common::client().get(format!("{url}/readyz")).send())
+        .expect("it answers");
     assert!(ready.status().is_success(), "{}", ready.status());
     let pid = child.0.id().to_string();
     assert!(Command::new("kill").args(["-TERM", &pid]).status().unwrap().success());

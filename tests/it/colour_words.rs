@@ -114,7 +114,7 @@ async fn a_word_finds_its_thing_at_a_pose_between_the_photos() {
         *parts = made;
     })
     .await;
-    let client = reqwest::Client::new();
+    let client = crate::common::client();
     let post = client.post(server.url("/v1/scenes?wait_ms=120000")).multipart(form());
     let scene = body(post.send().await.unwrap()).await.unwrap();
     assert_eq!(scene["semantics"]["state"], "none", "{scene}");

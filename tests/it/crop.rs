@@ -46,7 +46,7 @@ async fn both_doors_give_a_part_and_take_a_quality() {
         ("from=0&quality=best", "exact or fast"),
     ] {
         let url = stand.url(&format!("/v1/scenes/{}/view?{query}", "0".repeat(32)));
-        let answer = reqwest::get(url).await.expect("an answer");
+        let answer = crate::common::client().get(url).send().await.expect("an answer");
         let fault = crate::common::doors::bytes(answer).await.expect_err(query);
         assert!(fault.message.contains(word), "{query}: {}", fault.message);
     }

@@ -79,7 +79,9 @@ async fn a_full_queue_refuses_before_the_photos_come() {
 }
 
 async fn document(stand: &Stand) -> Value {
-    body(reqwest::get(stand.url("/openapi.json")).await.unwrap()).await.unwrap()
+    body(crate::common::client().get(stand.url("/openapi.json")).send().await.unwrap())
+        .await
+        .unwrap()
 }
 
 /// `POST /v1/scenes` and so on, of the document.
@@ -105,7 +107,7 @@ async fn the_openapi_document_has_the_routes_and_nothing_else() {
     for route in routes() {
         let path = route.path.replace("{id}", &"0".repeat(32));
         let method = reqwest::Method::from_bytes(route.method.as_bytes()).unwrap();
-        let answer = reqwest::Client::new().request(method, stand.url(&path)).send().await;
+        let answer = crate::common::client().request(method, stand.url(&path)).send().await;
         let answer = answer.unwrap();
         assert_ne!(answer.status(), 405, "{} {path}", route.method);
         let text = answer.text().await.unwrap();
@@ -152,10 +154,10 @@ fn snake(camel: &str) -> String {
 async fn real_answers_have_the_fields_that_the_document_says() {
     let stand = Stand::start().await;
     let document = document(&stand).await;
-    let client = reqwest::Client::new();
+    let client = crate::common::client();
     let request = client.post(stand.url("/v1/scenes?wait_ms=120000")).multipart(form(&upload()));
     let scene = body(request.send().await.unwrap()).await.unwrap();
-    let get = async |path: &str| reqwest::get(stand.url(path)).await.unwrap();
+    let get = async |path: &str| crate::common::client().get(stand.url(path)).send().await.unwrap();
     let mut faults = Vec::new();
     check(&document, "Scene", &scene, &mut faults);
     for (name, path) in [

@@ -290,7 +290,7 @@ async fn work_is_dropped_when_its_only_caller_goes_away() {
     maker.hold.store(true, Ordering::Release);
     let given = Arc::clone(&maker);
     let server = TestServer::with(|_, parts| parts.maker = given).await;
-    let client = reqwest::Client::new();
+    let client = crate::common::client();
     let call = client
         .post(server.url("/v1/scenes?wait_ms=60000"))
         .multipart(crate::common::doors::form(&upload(1)))

@@ -376,7 +376,7 @@ fn refusal(status: u16, body: &[u8]) -> Option<(String, String)> {
 #[tokio::test]
 async fn multipart_bodies() {
     let server = server().await;
-    let (client, url) = (reqwest::Client::new(), server.url("/v1/scenes"));
+    let (client, url) = (crate::common::client(), server.url("/v1/scenes"));
     let mut body = Vec::new();
     let mut part = |head: &str, bytes: &[u8]| {
         body.extend(format!("--b\r\ncontent-disposition: form-data; {head}\r\n\r\n").as_bytes());
@@ -399,7 +399,10 @@ async fn multipart_bodies() {
         let refused = refusal(status, &answer.bytes().await.expect("a body"));
         cases.judge(refused.as_ref().map(|(code, message)| (&**code, &**message)));
     }
-    assert_eq!(reqwest::get(server.url("/healthz")).await.unwrap().status(), 200);
+    assert_eq!(
+        crate::common::client().get(server.url("/healthz")).send().await.unwrap().status(),
+        200
+    );
 }
 
 /// Sends a request line as it is and gives what is answered; nothing where it takes too long.
@@ -444,14 +447,17 @@ async fn ids_and_query_strings() {
             cases.judge(refused.as_ref().map(|(code, message)| (&**code, &**message)));
         }
     }
-    assert_eq!(reqwest::get(server.url("/healthz")).await.unwrap().status(), 200);
+    assert_eq!(
+        crate::common::client().get(server.url("/healthz")).send().await.unwrap().status(),
+        200
+    );
 }
 
 #[tokio::test]
 async fn grpc_messages() {
     let server = server().await;
     let scene_id = server.scene().await.id.to_string();
-    let client = reqwest::Client::builder().http2_prior_knowledge().build().unwrap();
+    let client = crate::common::client_builder().http2_prior_knowledge().build().unwrap();
     let ask = Ask::first();
     let (camera, options) = (Some(ask.camera()), Some(ask.options()));
     let view = pb::RenderViewRequest {
@@ -491,5 +497,8 @@ async fn grpc_messages() {
             cases.judge(text("segsplat-code").zip(text("grpc-message").or(Some(""))));
         }
     }
-    assert_eq!(reqwest::get(server.url("/healthz")).await.unwrap().status(), 200);
+    assert_eq!(
+        crate::common::client().get(server.url("/healthz")).send().await.unwrap().status(),
+        200
+    );
 }

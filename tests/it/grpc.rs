@@ -235,7 +235,7 @@ async fn the_callers_deadline_and_request_id_are_honoured() {
     // tonic's client ends such a call by itself; this one leaves it to the server.
     let path = stand.url("/segsplat.v1.SceneService/CreateScene");
     let never = tokio_stream::pending::<Result<Vec<u8>, std::io::Error>>();
-    let plain = reqwest::Client::builder().http2_prior_knowledge().build().unwrap();
+    let plain = crate::common::client_builder().http2_prior_knowledge().build().unwrap();
     let request = plain.post(path).header("content-type", "application/grpc");
     let request = request.header("grpc-timeout", "20m").header("te", "trailers");
     let answer = request.body(reqwest::Body::wrap_stream(never)).send().await.unwrap();

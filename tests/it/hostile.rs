@@ -238,8 +238,8 @@ async fn what_wants_to_hurt_is_refused_at_once_and_in_little_memory() {
     std::fs::write(&config, limits).unwrap();
     let start = Start::on(&folder.path().join("data"));
     let server = start.arg("--config").arg(config.to_str().unwrap()).start();
-    let plain = reqwest::Client::new();
-    let h2 = reqwest::Client::builder().http2_prior_knowledge().build().unwrap();
+    let plain = crate::common::client();
+    let h2 = crate::common::client_builder().http2_prior_knowledge().build().unwrap();
     let clients = [plain, h2];
     let (bar, slow) = (REFUSED_WITHIN[0], REFUSED_WITHIN[usize::from(!long())]);
     let cases = hostile();

@@ -3,7 +3,7 @@
 
 use std::io::{Cursor, Read};
 
-use reqwest::{Client, StatusCode, header};
+use reqwest::{StatusCode, header};
 use segsplat::scene::Upload;
 use serde_json::{Value, json};
 
@@ -14,7 +14,7 @@ use crate::common::{
 
 /// Makes the sample's scene and waits for it.
 async fn made(stand: &Stand) -> String {
-    let request = Client::new().post(stand.url("/v1/scenes?wait_ms=120000"));
+    let request = crate::common::client().post(stand.url("/v1/scenes?wait_ms=120000"));
     let answer = request.multipart(form(&upload())).send().await.unwrap();
     let scene = body(answer).await.unwrap();
     assert_eq!(scene["state"], "done", "{scene}");
@@ -22,7 +22,7 @@ async fn made(stand: &Stand) -> String {
 }
 
 async fn get(stand: &Stand, path: &str) -> reqwest::Response {
-    Client::new().get(stand.url(path)).send().await.unwrap()
+    crate::common::client().get(stand.url(path)).send().await.unwrap()
 }
 
 async fn fault(stand: &Stand, path: &str) -> Fault {
@@ -32,7 +32,7 @@ async fn fault(stand: &Stand, path: &str) -> Fault {
 #[tokio::test]
 async fn a_scene_is_made_listed_shown_and_deleted() {
     let stand = Stand::start().await;
-    let request = Client::new().post(stand.url("/v1/scenes?wait_ms=120000"));
+    let request = crate::common::client().post(stand.url("/v1/scenes?wait_ms=120000"));
     let answer = request.multipart(form(&upload())).send().await.unwrap();
     assert_eq!(answer.status(), StatusCode::CREATED);
     let location = answer.headers()[header::LOCATION].to_str().unwrap().to_owned();
@@ -55,7 +55,7 @@ async fn a_scene_is_made_listed_shown_and_deleted() {
     assert_eq!(page["scenes"][0]["id"], posted["id"]);
     assert_eq!(page["next"], Value::Null, "a third page of two scenes");
 
-    let gone = Client::new().delete(stand.url(&location)).send().await.unwrap();
+    let gone = crate::common::client().delete(stand.url(&location)).send().await.unwrap();
     assert_eq!(gone.status(), StatusCode::NO_CONTENT);
     assert_eq!(fault(&stand, &location).await.code, "scene_not_found");
 }
@@ -63,7 +63,7 @@ async fn a_scene_is_made_listed_shown_and_deleted() {
 #[tokio::test]
 async fn creating_without_waiting_is_accepted_and_events_lead_to_done() {
     let stand = Stand::start().await;
-    let request = Client::new().post(stand.url("/v1/scenes"));
+    let request = crate::common::client().post(stand.url("/v1/scenes"));
     let answer = request.multipart(form(&upload())).send().await.unwrap();
     assert_eq!(answer.status(), StatusCode::ACCEPTED);
     let location = answer.headers()[header::LOCATION].to_str().unwrap().to_owned();
@@ -142,7 +142,7 @@ async fn accept_chooses_the_encoding_and_a_known_tag_saves_the_picture() {
     let stand = Stand::start().await;
     let id = made(&stand).await;
     let url = stand.url(&format!("/v1/scenes/{id}/view?from=0&width=40&height=30"));
-    let client = Client::new();
+    let client = crate::common::client();
     let first = client.get(&url).header("accept", "image/webp").send().await.unwrap();
     assert_eq!(first.headers()[header::CONTENT_TYPE], "image/webp");
     let tag = first.headers()[header::ETAG].clone();
@@ -166,7 +166,7 @@ async fn many_views_come_as_parts_or_as_a_zip_and_equal_single_views() {
     let request = json!({
         "cameras": cameras, "kinds": ["color", "alpha"], "width": 40, "height": 30,
     });
-    let answer = Client::new().post(&url).json(&request).send().await.unwrap();
+    let answer = crate::common::client().post(&url).json(&request).send().await.unwrap();
     let media = answer.headers()[header::CONTENT_TYPE].to_str().unwrap().to_owned();
     let boundary = media.strip_prefix("multipart/mixed; boundary=").expect(&media).to_owned();
     let parts = split(&answer.bytes().await.unwrap(), &boundary);
@@ -174,7 +174,7 @@ async fn many_views_come_as_parts_or_as_a_zip_and_equal_single_views() {
 
     let mut zipped = request.clone();
     zipped["container"] = "zip".into();
-    let answer = Client::new().post(&url).json(&zipped).send().await.unwrap();
+    let answer = crate::common::client().post(&url).json(&zipped).send().await.unwrap();
     assert_eq!(answer.headers()[header::CONTENT_TYPE], "application/zip");
     let file = Cursor::new(answer.bytes().await.unwrap());
     let mut archive = zip::ZipArchive::new(file).unwrap();
@@ -222,7 +222,7 @@ async fn a_scene_exports_as_ply() {
 async fn one_idempotency_key_makes_one_scene() {
     let stand = Stand::start().await;
     let post = async |upload: &Upload| {
-        let request = Client::new().post(stand.url("/v1/scenes?wait_ms=120000"));
+        let request = crate::common::client().post(stand.url("/v1/scenes?wait_ms=120000"));
         let request = request.header("idempotency-key", "key-1").multipart(form(upload));
         request.send().await.unwrap()
     };
@@ -255,7 +255,8 @@ async fn an_archive_and_options_as_text_parts_are_taken() {
     let form = form(&Upload { archive: Some(archive), ..Upload::default() })
         .text("semantics", "off")
         .text("wait_ms", "120000");
-    let answer = Client::new().post(stand.url("/v1/scenes")).multipart(form).send().await.unwrap();
+    let answer =
+        crate::common::client().post(stand.url("/v1/scenes")).multipart(form).send().await.unwrap();
     assert_eq!(answer.status(), StatusCode::CREATED);
     assert_eq!(body(answer).await.unwrap()["cameras"].as_array().unwrap().len(), 3);
 }
@@ -266,7 +267,7 @@ async fn unknown_paths_methods_and_parameters_are_answered_in_our_shape() {
     let missing = fault(&stand, "/v1/nothing?x=1").await;
     assert_eq!((missing.code.as_str(), missing.number), ("not_found", 404));
     assert!(missing.message.contains("/v1/nothing"), "{}", missing.message);
-    let answer = Client::new().put(stand.url("/v1/scenes")).send().await.unwrap();
+    let answer = crate::common::client().put(stand.url("/v1/scenes")).send().await.unwrap();
     let allow = answer.headers()[header::ALLOW].to_str().unwrap().to_owned();
     assert!(allow.contains("GET") && allow.contains("POST"), "{allow}");
     let method = bytes(answer).await.unwrap_err();
@@ -274,7 +275,8 @@ async fn unknown_paths_methods_and_parameters_are_answered_in_our_shape() {
     let unknown = fault(&stand, "/v1/scenes?limti=3").await;
     assert_eq!(unknown.code, "invalid_request");
     assert!(unknown.message.contains("limti") && unknown.message.contains("limit"), "{unknown:?}");
-    let not_form = Client::new().post(stand.url("/v1/scenes")).json(&json!({})).send().await;
+    let not_form =
+        crate::common::client().post(stand.url("/v1/scenes")).json(&json!({})).send().await;
     let not_form = bytes(not_form.unwrap()).await.unwrap_err();
     assert!(not_form.message.contains("multipart"), "{}", not_form.message);
 }
@@ -282,13 +284,14 @@ async fn unknown_paths_methods_and_parameters_are_answered_in_our_shape() {
 #[tokio::test]
 async fn request_ids_are_kept_and_deadlines_end_a_call() {
     let stand = Stand::start().await;
-    let request = Client::new().get(stand.url("/healthz")).header("x-request-id", "mine-7");
+    let request =
+        crate::common::client().get(stand.url("/healthz")).header("x-request-id", "mine-7");
     let answer = request.send().await.unwrap();
     assert_eq!(answer.headers()["x-request-id"], "mine-7");
     assert_eq!(answer.headers()[header::X_CONTENT_TYPE_OPTIONS], "nosniff");
     let odd = fault(&stand, "/v1/scenes?deadline_ms=soon").await;
     assert!(odd.message.contains("soon"), "{}", odd.message);
-    let request = Client::new().post(stand.url("/v1/scenes?wait_ms=60000&deadline_ms=1"));
+    let request = crate::common::client().post(stand.url("/v1/scenes?wait_ms=60000&deadline_ms=1"));
     let late = request.multipart(form(&upload())).send().await.unwrap();
     let late = bytes(late).await.unwrap_err();
     assert_eq!((late.code.as_str(), late.number), ("deadline_exceeded", 504));
@@ -297,7 +300,10 @@ async fn request_ids_are_kept_and_deadlines_end_a_call() {
 #[tokio::test]
 async fn health_models_and_the_viewer_answer_over_http_2_as_well() {
     let stand = Stand::start().await;
-    for client in [Client::new(), Client::builder().http2_prior_knowledge().build().unwrap()] {
+    for client in [
+        crate::common::client(),
+        crate::common::client_builder().http2_prior_knowledge().build().unwrap(),
+    ] {
         let get = async |path: &str| client.get(stand.url(path)).send().await.unwrap();
         assert_eq!(body(get("/healthz").await).await.unwrap()["live"], true);
         assert_eq!(body(get("/readyz").await).await.unwrap()["ready"], true);

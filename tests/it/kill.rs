@@ -73,7 +73,7 @@ async fn export(
 /// scene it deletes some.
 async fn caller(server: Arc<Process>, ledger: Ledger, uploads: Arc<Vec<Upload>>, seed: u64) {
     let mut deletions = 0;
-    let (client, mut random) = (Client::new(), Random(seed));
+    let (client, mut random) = (crate::common::client(), Random(seed));
     loop {
         let ids: Vec<String> = {
             let ledger = ledger.lock().unwrap();
@@ -127,7 +127,7 @@ async fn caller(server: Arc<Process>, ledger: Ledger, uploads: Arc<Vec<Upload>>,
 
 /// Holds the server to what it had acknowledged.
 async fn check(server: &Process, ledger: &Ledger, room: Room) {
-    let client = Client::new();
+    let client = crate::common::client();
     let known: Vec<_> = ledger.lock().unwrap().clone().into_iter().collect();
     for (id, known) in known {
         let (status, said) =
@@ -261,7 +261,7 @@ async fn killed(folder: &Path, kills: u64, room: Room) {
     }
     let server = start.start();
     check(&server, &ledger, room).await;
-    let client = Client::new();
+    let client = crate::common::client();
     // Everything acknowledged is made, or has said why not.
     let known: Vec<String> = ledger
         .lock()
@@ -318,7 +318,7 @@ async fn killed(folder: &Path, kills: u64, room: Room) {
 
 /// As [`check`], where nothing is in the making any more: a scene given up is no loss.
 async fn check_after(server: &Process, ledger: &Ledger) {
-    let client = Client::new();
+    let client = crate::common::client();
     let known: Vec<_> = ledger.lock().unwrap().clone().into_iter().collect();
     for (id, known) in known.into_iter().filter(|(_, known)| known.export.is_some() && !known.gone)
     {

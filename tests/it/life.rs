@@ -11,7 +11,6 @@ use std::{
     time::{Duration, Instant},
 };
 
-use reqwest::Client;
 use segsplat::{
     error::Result,
     jobs::{Made, Networks, SceneMaker, Work},
@@ -54,7 +53,7 @@ async fn a_drain_is_unready_first_then_refuses_new_calls_and_finishes_those_insi
     })
     .await;
     let url = |path: &str| server.url(path);
-    let (client, form) = (Client::new(), crate::common::doors::form(&upload()));
+    let (client, form) = (crate::common::client(), crate::common::doors::form(&upload()));
     let making = client.post(url("/v1/scenes?wait_ms=60000")).multipart(form).send();
     let making = tokio::spawn(making);
     until("one scene at work", async || server.service.ready().jobs_running == 1).await;
@@ -89,7 +88,8 @@ async fn a_drain_is_unready_first_then_refuses_new_calls_and_finishes_those_insi
 async fn a_drain_ends_when_its_time_is_over() {
     let (_maker, server) = held(|config| config.drain_ms = 100).await;
     let form = crate::common::doors::form(&upload());
-    let making = Client::new().post(server.url("/v1/scenes?wait_ms=60000")).multipart(form).send();
+    let making =
+        crate::common::client().post(server.url("/v1/scenes?wait_ms=60000")).multipart(form).send();
     let making = tokio::spawn(making);
     until("one scene at work", async || server.service.ready().jobs_running == 1).await;
     let begun = Instant::now();
@@ -103,7 +103,7 @@ async fn a_drain_ends_when_its_time_is_over() {
 async fn an_idle_server_ends_at_once() {
     let server = TestServer::start().await;
     // An open connection without a call holds nobody up.
-    let client = Client::new();
+    let client = crate::common::client();
     assert_eq!(client.get(server.url("/readyz")).send().await.unwrap().status(), 200);
     let begun = Instant::now();
     server.stop().await;
@@ -141,7 +141,7 @@ async fn late() -> (Arc<Late>, TestServer) {
 
 /// What `path` says; whether it is a 200.
 async fn says(server: &TestServer, path: &str) -> (bool, Value) {
-    let answer = Client::new().get(server.url(path)).send().await.unwrap();
+    let answer = crate::common::client().get(server.url(path)).send().await.unwrap();
     (answer.status() == 200, answer.json().await.unwrap())
 }
 
@@ -154,7 +154,7 @@ async fn scenes_are_taken_while_the_networks_are_opened_and_wait_for_them() {
     assert_eq!(models["execution_provider"], "opening");
     let create = server.url("/v1/scenes?wait_ms=60000");
     let form = crate::common::doors::form(&upload());
-    let made = tokio::spawn(Client::new().post(create).multipart(form).send());
+    let made = tokio::spawn(crate::common::client().post(create).multipart(form).send());
     until("one scene waits", async || server.service.ready().jobs_queued == 1).await;
     tokio::time::sleep(Duration::from_millis(50)).await;
     assert_eq!(server.service.ready().jobs_running, 0, "nothing to make it with");
@@ -169,7 +169,12 @@ async fn scenes_are_taken_while_the_networks_are_opened_and_wait_for_them() {
 async fn what_is_queued_stays_queued_where_the_networks_do_not_open() {
     let (maker, server) = late().await;
     let form = crate::common::doors::form(&upload());
-    let made = Client::new().post(server.url("/v1/scenes")).multipart(form).send().await.unwrap();
+    let made = crate::common::client()
+        .post(server.url("/v1/scenes"))
+        .multipart(form)
+        .send()
+        .await
+        .unwrap();
     let id = made.json::<Value>().await.unwrap()["id"].as_str().unwrap().to_owned();
     maker.networks.store(2, Ordering::Release);
     until("not ready", async || !says(&server, "/readyz").await.0).await;
@@ -221,7 +226,7 @@ async fn ready_comes_long_before_the_networks_are_open() {
     let folder = tempfile::tempdir().unwrap();
     let begun = Instant::now();
     let server = Start::on(folder.path()).bundle("../../models/embedded").start();
-    let (client, ready) = (Client::new(), server.url("/readyz"));
+    let (client, ready) = (crate::common::client(), server.url("/readyz"));
     let ask = async || client.get(&ready).send().await.unwrap().text().await.unwrap();
     let first = ask().await;
     let ready = begun.elapsed();

@@ -47,7 +47,7 @@ async fn memory_stays_as_it_is_over_many_scenes_of_many_shapes() {
     let folder = tempfile::tempdir().unwrap();
     // Small, so that what the cache holds is no growth.
     let server = server(folder.path(), "cache_bytes_max = 4000000");
-    let client = Client::new();
+    let client = crate::common::client();
     let shapes = [(2, 64, 48), (3, 48, 96), (2, 320, 240), (5, 96, 64), (4, 160, 160)];
     let uploads: Vec<_> = (0..20)
         .map(|i| {
@@ -128,7 +128,7 @@ async fn press(server: &Arc<Process>, ids: &Arc<Vec<String>>, callers: u64, time
             let next = |n: u64| {
                 n.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407)
             };
-            let (client, mut met, mut n) = (Client::new(), Met::default(), next(seed));
+            let (client, mut met, mut n) = (crate::common::client(), Met::default(), next(seed));
             while Instant::now() < until {
                 let begun = Instant::now();
                 match call(&client, &server, &ids, &uploads, n).await {
@@ -171,7 +171,7 @@ async fn ten_times_the_load_takes_little_of_what_is_answered() {
          memory_bytes_max = {MEMORY_BYTES_MAX}"
     );
     let server = Arc::new(server(folder.path(), &limits));
-    let client = Client::new();
+    let client = crate::common::client();
     let mut ids = Vec::new();
     for seed in 0..4 {
         let id = made(&client, &server, &upload(seed, 2, 160, 120)).await;
@@ -191,7 +191,7 @@ async fn ten_times_the_load_takes_little_of_what_is_answered() {
     let alive = tokio::spawn({
         let (server, stop) = (Arc::clone(&server), Arc::clone(&stop));
         async move {
-            let (client, mut slowest, mut most) = (Client::new(), Duration::ZERO, 0);
+            let (client, mut slowest, mut most) = (crate::common::client(), Duration::ZERO, 0);
             while !stop.load(Ordering::Acquire) {
                 let begun = Instant::now();
                 let live = client.get(server.url("/healthz")).send().await.expect("alive");

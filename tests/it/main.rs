@@ -28,6 +28,7 @@ mod licences;
 mod life;
 mod load;
 mod magnify;
+mod proto;
 mod replicas;
 mod sample;
 mod schedule;

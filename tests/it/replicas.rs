@@ -59,7 +59,7 @@ async fn made(client: &Client, base: &str, seed: u64) -> String {
 #[tokio::test(flavor = "multi_thread")]
 async fn what_one_replica_makes_the_others_serve_list_and_delete() {
     let Some(cluster) = cluster() else { return };
-    let (client, [a, b, c]) = (Client::new(), [0, 1, 2].map(|i| &cluster.replicas[i]));
+    let (client, [a, b, c]) = (crate::common::client(), [0, 1, 2].map(|i| &cluster.replicas[i]));
     let id = made(&client, &a.url, 1).await;
     let path = |what: &str| format!("/v1/scenes/{id}{what}");
     let view = path("/view?from=0&to=1&t=0.5&width=64&height=48");
@@ -101,7 +101,7 @@ async fn a_replica_killed_under_load_fails_its_own_calls_once_and_its_scenes_are
     let Some(mut cluster) = cluster() else { return };
     let all: Vec<&Process> = cluster.replicas.iter().collect();
     let Some(balancer) = Balancer::start(&all).await else { return };
-    let client = Client::new();
+    let client = crate::common::client();
     let mut pictures = HashMap::new();
     for seed in 0..6 {
         let id = made(&client, &balancer.url, seed).await;
@@ -118,7 +118,7 @@ async fn a_replica_killed_under_load_fails_its_own_calls_once_and_its_scenes_are
             let (pictures, stop) = (Arc::clone(&pictures), Arc::clone(&stop));
             let (calls, failed) = (Arc::clone(&calls), Arc::clone(&failed));
             tokio::spawn(async move {
-                let client = Client::new();
+                let client = crate::common::client();
                 for (url, picture) in pictures.iter().cycle().skip(i) {
                     if stop.load(Ordering::Acquire) {
                         return;

@@ -8,7 +8,6 @@ use std::{
     time::Duration,
 };
 
-use reqwest::Client;
 use segsplat::{
     keys::hash,
     pipeline::{Stage, semantics::SemanticsStage},
@@ -24,7 +23,7 @@ use crate::common::{
 };
 
 async fn metrics(stand: &Stand) -> String {
-    let answer = reqwest::get(stand.url("/metrics")).await.unwrap();
+    let answer = crate::common::client().get(stand.url("/metrics")).send().await.unwrap();
     assert_eq!(answer.headers()["content-type"], "text/plain; version=0.0.4; charset=utf-8");
     answer.text().await.unwrap()
 }
@@ -84,7 +83,7 @@ async fn metrics_are_the_admins_unless_they_are_opened() {
         })
         .await;
         let ask = |key: Option<&str>| {
-            let request = Client::new().get(stand.url("/metrics"));
+            let request = crate::common::client().get(stand.url("/metrics"));
             key.map_or_else(
                 || request.try_clone().unwrap(),
                 |key| request.try_clone().unwrap().bearer_auth(key),
@@ -96,7 +95,7 @@ async fn metrics_are_the_admins_unless_they_are_opened() {
             assert_eq!(status, if open { 200 } else { closed }, "{key:?}, open: {open}");
         }
         // Names of keys are in no label, nor is anything else that a caller chooses.
-        let odd = Client::new().get(stand.url("/no/such/path-42")).send().await.unwrap();
+        let odd = crate::common::client().get(stand.url("/no/such/path-42")).send().await.unwrap();
         bytes(odd).await.unwrap_err();
         let id = "0123456789abcdef".repeat(2);
         for door in both_with(stand.addr, Some("boss")).await {
@@ -115,7 +114,7 @@ async fn answers_say_where_their_time_went_over_both_doors() {
     let doors = both(stand.addr).await;
     let (id, _) = doors[0].create(&upload(), &Options::wait()).await.unwrap();
     let url = stand.url(&format!("/v1/scenes/{id}/view?from=0&width=32&height=24"));
-    let answer = reqwest::get(url).await.unwrap();
+    let answer = crate::common::client().get(url).send().await.unwrap();
     let times: Vec<_> = answer
         .headers()
         .get_all("server-timing")
@@ -206,7 +205,7 @@ async fn spans_go_to_the_collector_as_a_part_of_the_callers_trace() {
     let collected = tokio::task::spawn_blocking(move || collect(&listener));
     let start = Start::on(&folder.path().join("data")).arg("--otlp").arg(&collector);
     let server = start.arg("--keys").arg(keys.to_str().unwrap()).start();
-    let call = Client::new()
+    let call = crate::common::client()
         .get(server.url("/v1/scenes"))
         .bearer_auth("very secret")
         .header("traceparent", "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01")
@@ -251,7 +250,7 @@ async fn a_scenes_job_has_a_span_in_the_trace_of_the_call_that_asked_for_it() {
         }
     });
     let server = Start::on(&folder.path().join("data")).arg("--otlp").arg(&collector).start();
-    let call = Client::new()
+    let call = crate::common::client()
         .post(server.url("/v1/scenes?wait_ms=60000"))
         .header("traceparent", "00-0af7651916cd43dd8448eb211c80319c-b7ad6b7169203331-01")
         .header("x-request-id", "asked-by-a-test")

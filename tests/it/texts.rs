@@ -346,7 +346,9 @@ async fn a_bundle_without_a_text_tower_says_so_to_every_text_call() {
         }
     }
     let export = format!("/v1/scenes/{id}/export?text=chair");
-    let fault = bytes(reqwest::get(server.url(&export)).await.unwrap()).await.unwrap_err();
+    let fault = bytes(crate::common::client().get(server.url(&export)).send().await.unwrap())
+        .await
+        .unwrap_err();
     assert_eq!(fault.code, ErrorCode::ModelUnavailable.name());
 }
 
@@ -355,7 +357,7 @@ async fn http_gives_pictures_of_texts_as_files_and_in_json() {
     let fixture = fixture().await;
     let id = fixture.scene(SemanticsMode::Eager).await;
     let server = &fixture.server;
-    let client = reqwest::Client::new();
+    let client = crate::common::client();
     let path = format!("/v1/scenes/{id}/view?from=0&width=32&height=24&kind=mask&text=photo+0");
     let first = client.get(server.url(&path)).send().await.unwrap();
     assert_eq!(first.headers()["content-type"], "image/png");

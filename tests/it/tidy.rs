@@ -23,7 +23,7 @@ const GOLDEN_BYTES_MAX: u64 = 64 << 10;
 const TREE_BYTES_MAX: u64 = 48 << 20;
 
 /// A crate's name and where it may be named.
-const CONFINED: [(&str, &[&str]); 13] = [
+const CONFINED: [(&str, &[&str]); 12] = [
     ("axum", &["src/api/http"]),
     ("tower_http", &["src/api/http"]),
     ("utoipa", &["src/api/http"]),
@@ -35,7 +35,6 @@ const CONFINED: [(&str, &[&str]); 13] = [
     ("wgpu", &["src/render/gpu"]),
     ("object_store", &["src/store"]),
     ("opentelemetry", &["src/telemetry"]),
-    ("governor", &["src/api"]),
     ("clap", &["src/cli", "src/config.rs", "src/main.rs"]),
 ];
 

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use reqwest::{Certificate, Client, Version};
+use reqwest::{Certificate, Version};
 use tokio::net::TcpStream;
 
 use crate::common::stand::{BoardMaker, Stand};
@@ -42,7 +42,7 @@ async fn one_port_speaks_http_1_http_2_and_grpc_over_tls() {
     let files = files();
     let stand = stand(&files).await;
     let url = |path: &str| format!("https://localhost:{}{path}", stand.addr.port());
-    let trusting = || Client::builder().tls_certs_only([files.root.clone()]);
+    let trusting = || crate::common::client_builder().tls_certs_only([files.root.clone()]);
     // Nobody speaks on these two; the others are served all the same.
     let silent = [TcpStream::connect(stand.addr).await, TcpStream::connect(stand.addr).await];
 
@@ -61,9 +61,9 @@ async fn one_port_speaks_http_1_http_2_and_grpc_over_tls() {
     assert!(answer.headers().get("grpc-status").is_none_or(|status| status == "0"));
     assert_eq!(answer.bytes().await.unwrap()[0], 0, "a message");
 
-    let plain = Client::new().get(format!("http://{}/readyz", stand.addr)).send().await;
+    let plain = crate::common::client().get(format!("http://{}/readyz", stand.addr)).send().await;
     assert!(plain.is_err(), "plain HTTP is answered on a TLS port");
-    let strange = Client::builder().tls_certs_only([]).build().unwrap();
+    let strange = crate::common::client_builder().tls_certs_only([]).build().unwrap();
     assert!(strange.get(url("/readyz")).send().await.is_err(), "the certificate is not checked");
     drop(silent);
     stand.stop().await;

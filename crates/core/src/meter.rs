@@ -1,8 +1,10 @@
 //! The one metric that stages below the server count: seconds of each stage.
 
-use metrics::histogram;
+use std::sync::LazyLock;
 
-/// Time of each stage, by `stage`.
+use prometheus::{HistogramVec, register_histogram_vec};
+
+/// Name of the metric: time of each stage, by `stage`.
 pub const STAGE_SECONDS: &str = "segsplat_stage_seconds";
 
 /// Stages of a scene, of its semantics, and of a view.
@@ -11,9 +13,30 @@ pub const STAGES: [&str; 14] = [
     "queue", "load", "render", "encode",
 ];
 
+/// Upper ends of the buckets of every histogram, seconds: 1 ms to 10 minutes.
+pub const BUCKETS: [f64; 16] = [
+    0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 15.0, 60.0, 180.0,
+    600.0,
+];
+
+static SECONDS: LazyLock<HistogramVec> = LazyLock::new(|| {
+    let help = "Time of each stage of scenes and views";
+    let seconds = register_histogram_vec!(STAGE_SECONDS, help, &["stage"], BUCKETS.to_vec())
+        .expect("the name is registered once; this is a bug");
+    for stage in STAGES {
+        seconds.with_label_values(&[stage]);
+    }
+    seconds
+});
+
+/// Makes every stage known, so that none appears only after its first run.
+pub fn register() {
+    LazyLock::force(&SECONDS);
+}
+
 /// Records the seconds of a stage; a name that is not in [`STAGES`] is not recorded.
 pub fn stage(name: &str, seconds: f64) {
-    if let Some(stage) = STAGES.into_iter().find(|stage| *stage == name) {
-        histogram!(STAGE_SECONDS, "stage" => stage).record(seconds);
+    if STAGES.contains(&name) {
+        SECONDS.with_label_values(&[name]).observe(seconds);
     }
 }

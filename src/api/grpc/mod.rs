@@ -17,7 +17,7 @@ use crate::error::{Error, Result};
 
 pub(super) use self::status::{complete, refusal, unimplemented};
 
-/// Messages and services made from `proto/segsplat/v1/scene.proto`.
+/// Messages and services generated from `proto/segsplat/v1/`; `tests/it/proto.rs` holds them to it.
 #[allow(
     missing_docs,
     unreachable_pub,
@@ -34,11 +34,11 @@ pub(super) use self::status::{complete, refusal, unimplemented};
     reason = "generated code"
 )]
 pub mod pb {
-    tonic::include_proto!("segsplat.v1");
+    include!(concat!(env!("CARGO_MANIFEST_DIR"), "/proto/generated/segsplat.v1.rs"));
 }
 
 /// Descriptors of `pb`, for reflection and for the test that holds the two doors together.
-pub const DESCRIPTORS: &[u8] = include_bytes!(concat!(env!("OUT_DIR"), "/segsplat_descriptor.bin"));
+pub const DESCRIPTORS: &[u8] = include_bytes!("../../../proto/generated/descriptors.bin");
 
 /// Largest picture sent as one message: 4096 x 4096 x 3 f32 and its headers.
 const MESSAGE_BYTES_MAX: usize = 256 << 20;

@@ -106,7 +106,6 @@ pub fn routes() -> Vec<Route> {
 fn app(api: &Api) -> Result<Router> {
     let rpc = grpc::routes(api.clone())?.prepare().into_axum_router().reset_fallback();
     // Before the first call, so that every metric is there.
-    meter::handle()?;
     access::rpc_calls().for_each(|call| meter::register_call("grpc", call));
     meter::register_call("http", access::OTHER);
     let guarded = |route: Route| {

@@ -14,11 +14,8 @@ use crate::{
     config::Config,
     error::{Error, Result},
     service::Service,
-    telemetry::meter,
 };
 
-/// How often measured times are added up.
-const UPKEEP: Duration = Duration::from_secs(5);
 /// How long connections without a call may take to close.
 const CLOSING: Duration = Duration::from_millis(200);
 
@@ -99,16 +96,6 @@ async fn run<L: Listener>(
 where
     L::Addr: std::fmt::Debug,
 {
-    // What was measured is added up now and then, or it would grow where nobody asks for it.
-    let upkeep = tokio::spawn(async {
-        let mut every = tokio::time::interval(UPKEEP);
-        loop {
-            every.tick().await;
-            if let Ok(handle) = meter::handle() {
-                handle.run_upkeep();
-            }
-        }
-    });
     let (emptied, mut empty) = watch::channel(false);
     let graceful = axum::serve(listener, app).with_graceful_shutdown(async move {
         stop.await;
@@ -128,7 +115,6 @@ where
         }
         () = late => Ok(()),
     };
-    upkeep.abort();
     served
 }
 

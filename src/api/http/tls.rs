@@ -15,7 +15,7 @@ use tokio_rustls::{
     TlsAcceptor,
     rustls::{
         ServerConfig,
-        crypto::aws_lc_rs,
+        crypto::ring,
         pki_types::{CertificateDer, PrivateKeyDer, pem::PemObject},
     },
     server::TlsStream,
@@ -102,7 +102,7 @@ fn load(config: &Config) -> Result<Option<Arc<ServerConfig>>> {
     }
     let key = PrivateKeyDer::from_pem_file(key)
         .map_err(|_| wrong("tls_key", "no private key in PEM can be read from it".to_owned()))?;
-    let mut server = ServerConfig::builder_with_provider(Arc::new(aws_lc_rs::default_provider()))
+    let mut server = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
         .with_safe_default_protocol_versions()
         .map_err(|e| Error::internal("TLS cannot be set up").caused_by(e))?
         .with_no_client_auth()

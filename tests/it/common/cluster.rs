@@ -158,7 +158,7 @@ impl Balancer {
             url: format!("http://127.0.0.1:{port}"),
             _folder: folder,
         };
-        let (client, ready) = (reqwest::Client::new(), format!("{}/readyz", balancer.url));
+        let (client, ready) = (crate::common::client(), format!("{}/readyz", balancer.url));
         eventually("the load balancer", async || {
             client.get(&ready).send().await.ok().filter(|answer| answer.status().is_success())
         })

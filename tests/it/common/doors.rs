@@ -56,7 +56,8 @@ pub(crate) async fn both_with(addr: SocketAddr, key: Option<&str>) -> [Door; 2] 
     if let Some(key) = key {
         headers.insert("authorization", format!("Bearer {key}").parse().expect("ASCII"));
     }
-    let client = reqwest::Client::builder().default_headers(headers).build().expect("a client");
+    let client =
+        crate::common::client_builder().default_headers(headers).build().expect("a client");
     let bearer = Bearer(key.map(str::to_owned));
     let keyed = SceneServiceClient::with_interceptor(channel(addr).await, bearer);
     [Door::Http { base: format!("http://{addr}"), client }, Door::Grpc { client: keyed }]
@@ -68,7 +69,7 @@ pub(crate) async fn both(addr: SocketAddr) -> [Door; 2] {
 }
 
 pub(crate) fn http(addr: SocketAddr) -> Door {
-    Door::Http { base: format!("http://{addr}"), client: reqwest::Client::new() }
+    Door::Http { base: format!("http://{addr}"), client: crate::common::client() }
 }
 
 pub(crate) async fn channel(addr: SocketAddr) -> Channel {

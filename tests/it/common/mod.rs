@@ -13,3 +13,14 @@ pub(crate) mod stand;
 pub(crate) use segsplat_testing::{
     compare, root, scenes, shared_data, shared_scene, skipped, strict,
 };
+
+/// A client whose TLS has its cryptography.
+pub(crate) fn client_builder() -> reqwest::ClientBuilder {
+    segsplat::crypto::install();
+    reqwest::Client::builder()
+}
+
+/// As [`client_builder`] with nothing else set.
+pub(crate) fn client() -> reqwest::Client {
+    client_builder().build().expect("a client")
+}

@@ -74,17 +74,11 @@ fn rank(report: &AdapterReport, adapter: &wgpu::Adapter) -> Option<u32> {
 
 /// Adapters found, and those taken, the best first: by parts of their names, else all hardware
 /// ones.
-///
-/// OpenGL is looked at only for a named adapter: it is never better than the others.
 pub(super) fn choose(
     name: Option<&str>,
 ) -> (Vec<AdapterReport>, Result<Vec<(wgpu::Adapter, AdapterReport)>>) {
     let mut found = list(wgpu::Backends::VULKAN | wgpu::Backends::METAL | wgpu::Backends::DX12);
-    let mut taken = pick(&found, name);
-    if taken.is_empty() && name.is_some() {
-        found.extend(list(wgpu::Backends::GL));
-        taken = pick(&found, name);
-    }
+    let taken = pick(&found, name);
     taken.iter().for_each(|&at| found[at].1.chosen = true);
     let reports: Vec<_> = found.iter().map(|(_, report)| report.clone()).collect();
     if !taken.is_empty() {

@@ -1,0 +1,32 @@
+//! The committed Rust of `proto/generated` is what `proto/segsplat` compiles to.
+
+use std::fs;
+
+use prost::Message;
+
+use crate::common::root;
+
+/// `UPDATE_DOCS=1 cargo test --test it proto` writes the files after a change of the proto.
+#[test]
+fn generated_code_is_that_of_the_proto_files() {
+    let made = tempfile::tempdir().unwrap();
+    let proto = root().join("proto");
+    let descriptors = protox::compile(["segsplat/v1/scene.proto"], [&proto]).unwrap();
+    fs::write(made.path().join("descriptors.bin"), descriptors.encode_to_vec()).unwrap();
+    tonic_prost_build::configure()
+        .bytes(".segsplat.v1")
+        .out_dir(made.path())
+        .compile_fds(descriptors)
+        .unwrap();
+    for name in ["descriptors.bin", "segsplat.v1.rs"] {
+        let (new, kept) = (made.path().join(name), proto.join("generated").join(name));
+        if std::env::var_os("UPDATE_DOCS").is_some() {
+            fs::copy(&new, &kept).unwrap();
+        }
+        let same = fs::read(&new).unwrap() == fs::read(&kept).unwrap_or_default();
+        assert!(
+            same,
+            "proto/generated/{name} differs from proto/segsplat: UPDATE_DOCS=1 writes it"
+        );
+    }
+}
