@@ -48,13 +48,13 @@ fn project_one(i: u32) -> Footprint {
         return footprint;
     }
     footprint.mean = views[which].focal * slope + views[which].principal;
-    footprint.slope = dot(m0, m1) / var_y;
-    footprint.inv_sx = sqrt(0.5 / given_x);
-    footprint.inv_sy = sqrt(0.5 / var_y);
-    footprint.reach = log(opacity / ALPHA_MIN) + FOOTPRINT_SLACK;
+    footprint.conic_shear = dot(m0, m1) / var_y;
+    footprint.conic_x = sqrt(0.5 / given_x);
+    footprint.conic_y = sqrt(0.5 / var_y);
+    footprint.power_max = log(opacity / ALPHA_MIN) + FOOTPRINT_SLACK;
     let finite = is_finite(footprint.mean.x) && is_finite(footprint.mean.y)
-        && is_finite(footprint.slope);
-    if finite && footprint.inv_sx > 0.0 && footprint.inv_sy > 0.0 {
+        && is_finite(footprint.conic_shear);
+    if finite && footprint.conic_x > 0.0 && footprint.conic_y > 0.0 {
         footprint.opacity = opacity;
     }
     return footprint;

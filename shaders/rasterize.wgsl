@@ -18,9 +18,9 @@
 // [views][N, 3] as shade gives them; of a scene of degree 0 its harmonics, [N, 3].
 @group(0) @binding(5) var<storage, read> colors: array<f32>;
 
-// mean - tile corner, slope, inv_sx
+// mean - tile corner, conic_shear, conic_x
 var<workgroup> shapes: array<vec4<f32>, 256>;
-// inv_sy, opacity, reach, label
+// conic_y, opacity, power_max, label
 var<workgroup> weights: array<vec4<f32>, 256>;
 // colour, depth; of labels alone a row of their table
 var<workgroup> paints: array<vec4<f32>, 256>;
@@ -52,10 +52,10 @@ fn parts_of(footprint: Footprint, mean: vec2<f32>) -> u32 {
     if !SKIP_ELLIPSE_PARTS {
         return 0xffffffffu;
     }
-    let root = sqrt(footprint.reach);
-    let tall = root / footprint.inv_sy;
-    let across = root / footprint.inv_sx;
-    let lean = abs(footprint.slope) * tall;
+    let root = sqrt(footprint.power_max);
+    let tall = root / footprint.conic_y;
+    let across = root / footprint.conic_x;
+    let lean = abs(footprint.conic_shear) * tall;
     // √(across² + lean²) without squares, which may overflow. The slack is far over f32's rounding.
     let large = max(across, lean);
     let ratio = min(across, lean) / large;
@@ -151,7 +151,7 @@ fn blend(q: u32, shape: vec4<f32>, weight: vec4<f32>, paint: vec4<f32>, row: vec
     let transmittance = pixels[q].transmittance;
     let left = transmittance * (1.0 - alpha);
     // Hardly a branch: invocations that part ways take as long as both ways together. Over its
-    // reach alpha is under ALPHA_MIN for certain; a NaN is skipped too.
+    // power_max alpha is under ALPHA_MIN for certain; a NaN is skipped too.
     let hit = power <= weight.z && alpha >= ALPHA_MIN && !pixels[q].done;
     let ends = hit && left <= TRANSMITTANCE_MIN;
     let adds = hit && !ends;
@@ -248,9 +248,9 @@ fn main(
                 let one = staged[q].footprint;
                 let mean = one.mean - corner;
                 parts = parts_of(one, mean);
-                shapes[to] = vec4(mean, one.slope, one.inv_sx);
+                shapes[to] = vec4(mean, one.conic_shear, one.conic_x);
                 // A label has 16 bits: exact as f32.
-                weights[to] = vec4(one.inv_sy, one.opacity, one.reach, f32(staged[q].label));
+                weights[to] = vec4(one.conic_y, one.opacity, one.power_max, f32(staged[q].label));
                 paints[to] = staged[q].paint;
             }
             met[to] = parts;

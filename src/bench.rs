@@ -27,7 +27,7 @@ use crate::{
     config::Config,
     error::{Error, Result},
     render::{
-        DeviceTimes, Kinds, Labels, Quality, RenderRequest, Renderer, StageTime,
+        DeviceTimes, DispatchTime, Kinds, Labels, Quality, RenderRequest, Renderer,
         cpu::CpuRenderer,
         gpu::GpuOptions,
         select::{AdapterReport, select_with},
@@ -285,7 +285,7 @@ fn device_times(
     };
     let stages = runs[0].stages.iter().enumerate().map(|(i, stage)| {
         let of_stage = runs.iter().filter_map(|run| run.stages.get(i)).map(|stage| stage.ms);
-        StageTime { stage: stage.stage, ms: middle(of_stage.collect()) }
+        DispatchTime { stage: stage.stage, ms: middle(of_stage.collect()) }
     });
     let total_ms = middle(runs.iter().map(|run| run.total_ms).collect());
     Ok(Some(DeviceTimes { total_ms, stages: stages.collect() }))
@@ -337,7 +337,7 @@ fn label_times(
 ) -> Result<LabelTimes> {
     let mut random = Random(2);
     let wanted = match labels {
-        BenchLabels::Entries => Labels::Entries,
+        BenchLabels::Entries => Labels::Weights,
         BenchLabels::Blend => Labels::Blend(
             (0..=args.bank)
                 .map(|m| [(); 4].map(|()| if m == 0 { 0.0 } else { random.range(-1.0, 1.0) }))
@@ -383,7 +383,7 @@ fn label_times(
         ratio: labels_ms / color_ms,
         device,
         device_all,
-        entries: frame.entries.map_or(0, |entries| entries.index.len()),
+        entries: frame.weights.map_or(0, |weights| weights.entries.len()),
         compared,
     })
 }
@@ -437,7 +437,7 @@ mod tests {
             let found = compare(&got, &want, &gaussians, &request).expect("a comparison");
             assert_eq!(found.flips + found.faults, 1, "{wrong}: {found:?}");
         }
-        for labels in [Labels::Entries, Labels::Blend([[1.0; 4]; 25].into())] {
+        for labels in [Labels::Weights, Labels::Blend([[1.0; 4]; 25].into())] {
             let request = RenderRequest { labels, kinds: Kinds::NONE, ..request.clone() };
             let want = CpuRenderer::new(1).and_then(|cpu| cpu.render(&gaussians, &request));
             let want = want.expect("labels");
@@ -445,8 +445,8 @@ mod tests {
             if let Some(blend) = &mut got.blend {
                 blend[7][3] += 0.5;
             }
-            if let Some(entries) = &mut got.entries {
-                entries.index[0] += 1;
+            if let Some(weights) = &mut got.weights {
+                weights.entries[0] += 1;
             }
             let found = compare(&got, &want, &gaussians, &request).expect("a comparison");
             assert_eq!(found.flips + found.faults, 1, "a wrong label: {found:?}");

@@ -43,7 +43,7 @@ struct View {
     label_rows: u32,
     table_start: u32,
     // Entries that a pixel has room for, and where they start in `slots`.
-    entry_slots: u32,
+    weight_slots: u32,
     slot_start: u32,
     // First number in `ranges`, and first sorted tile pair.
     range_start: u32,
@@ -63,14 +63,14 @@ struct Gaussian {
 }
 
 // A Gaussian on the picture. With d = pixel - mean, half the squared Mahalanobis distance is
-// (inv_sx (d.x - slope d.y))² + (inv_sy d.y)².
+// (conic_x (d.x - conic_shear d.y))² + (conic_y d.y)².
 struct Footprint {
     mean: vec2<f32>,
-    slope: f32,
-    inv_sx: f32,
-    inv_sy: f32,
-    // Half the squared distance at which alpha reaches ALPHA_MIN, with slack.
-    reach: f32,
+    conic_shear: f32,
+    conic_x: f32,
+    conic_y: f32,
+    // The largest half squared distance at which alpha is ALPHA_MIN, with slack.
+    power_max: f32,
     opacity: f32,
     depth: f32,
 }

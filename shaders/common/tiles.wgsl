@@ -3,7 +3,7 @@
 // test stays exact.
 
 struct Extent {
-    // √reach, and half-width and half-height of the box around the footprint, pixels.
+    // √power_max, and half-width and half-height of the box around the footprint, pixels.
     root: f32,
     wide: f32,
     tall: f32,
@@ -26,10 +26,10 @@ fn to_pixel(x: f32) -> i32 {
 
 // Extent of a footprint within the tile rows row_start..row_end.
 fn extent_of(footprint: Footprint, row_start: u32, row_end: u32) -> Extent {
-    let root = sqrt(footprint.reach);
-    let tall = root / footprint.inv_sy;
-    let across = root / footprint.inv_sx;
-    let lean = abs(footprint.slope) * tall;
+    let root = sqrt(footprint.power_max);
+    let tall = root / footprint.conic_y;
+    let across = root / footprint.conic_x;
+    let lean = abs(footprint.conic_shear) * tall;
     let large = max(across, lean);
     let wide = large * sqrt((across / large) * (across / large) + (lean / large) * (lean / large));
     let slack = vec2(0.01) + 4e-6 * (abs(footprint.mean) + vec2(wide, tall));
@@ -54,12 +54,12 @@ fn tile_span(footprint: Footprint, extent: Extent, tile_y: i32) -> vec2<u32> {
         low = clamp(row_low, low, high);
         high = clamp(row_high, -extent.tall, extent.tall);
     }
-    let peak = footprint.slope * extent.tall * (extent.tall / extent.wide);
+    let peak = footprint.conic_shear * extent.tall * (extent.tall / extent.wide);
     let at_right = clamp(peak, low, high);
     let at_left = clamp(-peak, low, high);
-    let right = footprint.mean.x + footprint.slope * at_right
+    let right = footprint.mean.x + footprint.conic_shear * at_right
         + half_width(footprint, extent, at_right) + extent.slack.x;
-    let left = footprint.mean.x + footprint.slope * at_left
+    let left = footprint.mean.x + footprint.conic_shear * at_left
         - half_width(footprint, extent, at_left) - extent.slack.x;
     let first = max(to_pixel(ceil(left - 0.5)), 0);
     let last = min(to_pixel(floor(right - 0.5)), i32(views[which].width) - 1);
@@ -71,7 +71,7 @@ fn tile_span(footprint: Footprint, extent: Extent, tile_y: i32) -> vec2<u32> {
 
 fn half_width(footprint: Footprint, extent: Extent, dy: f32) -> f32 {
     let across = dy / extent.tall;
-    return sqrt(max(0.0, 1.0 - across * across)) * (extent.root / footprint.inv_sx);
+    return sqrt(max(0.0, 1.0 - across * across)) * (extent.root / footprint.conic_x);
 }
 
 // Number of tiles touched in the tile rows row_start..row_end.

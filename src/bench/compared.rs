@@ -54,7 +54,7 @@ pub(super) fn differences(got: &Frame, want: &Frame) -> Vec<f32> {
     let depths = pair(got.depth.as_ref(), want.depth.as_ref());
     let alphas = pair(got.alpha.as_ref(), want.alpha.as_ref());
     let blends = pair(got.blend.as_ref(), want.blend.as_ref());
-    let entries = got.entries.as_ref().zip(want.entries.as_ref());
+    let weights = got.weights.as_ref().zip(want.weights.as_ref());
     let pixels = want.width as usize * want.height as usize;
     (0..pixels)
         .map(|i| {
@@ -75,7 +75,7 @@ pub(super) fn differences(got: &Frame, want: &Frame) -> Vec<f32> {
             if let Some((got, want)) = blends {
                 (0..4).for_each(|k| add(got[i][k] - want[i][k]));
             }
-            if let Some((got, want)) = entries {
+            if let Some((got, want)) = weights {
                 let mut sums: BTreeMap<u16, f32> = got.pixel(i).collect();
                 want.pixel(i).for_each(|(m, weight)| *sums.entry(m).or_default() -= weight);
                 sums.into_values().for_each(&mut add);

@@ -15,9 +15,9 @@ use crate::{
     error::{Error, Result},
     jobs::{Phrases, SemanticsMaker, TextEmbedding},
     limits::Limits,
-    render::{Entries, Labels, RenderRequest, Renderer, ViewPlanner},
+    render::{Labels, PixelWeights, RenderRequest, Renderer, ViewPlanner},
     scene::{Gaussians, PAPER_PHRASES, PAPER_TAU, Scene, ScoringProfile, Semantics},
-    semantics::{PartOptions, Pieces, PixelEntries, Scorer, Scoring, TextScores, ViewNorms},
+    semantics::{PartOptions, Pieces, Scorer, Scoring, TextScores, ViewNorms},
 };
 
 /// What answers are made with. Its calls block; they belong on a thread made for it.
@@ -141,17 +141,12 @@ impl ScoredText {
 pub(super) struct LabelledView {
     pub(super) width: u32,
     pub(super) height: u32,
-    entries: Entries,
+    pub(super) weights: PixelWeights,
     /// One for each scoring profile.
     norms: [OnceLock<ViewNorms>; 2],
 }
 
 impl LabelledView {
-    pub(super) fn entries(&self) -> PixelEntries<'_> {
-        let Entries { offsets, index, weight } = &self.entries;
-        PixelEntries { offsets, index, weight }
-    }
-
     /// `[H * W]` relevancy of a text.
     pub(super) fn relevancy(&self, scorer: &Scorer, text: &TextScores) -> Result<Vec<f32>> {
         let kept = match scorer.scoring().profile() {
@@ -161,11 +156,11 @@ impl LabelledView {
         let norms = match kept.get() {
             Some(norms) => norms,
             None => {
-                let made = scorer.norms(self.entries())?;
+                let made = scorer.norms(&self.weights)?;
                 kept.get_or_init(|| made)
             }
         };
-        scorer.relevancy(text, self.entries(), norms)
+        scorer.relevancy(text, &self.weights, norms)
     }
 
     /// `[H * W]` entry of the largest weight, 0 where the weights are too small together.
@@ -173,7 +168,7 @@ impl LabelledView {
         let floor = scorer.scoring().coverage_floor();
         let strongest = |i: usize| {
             let (mut best, mut most, mut coverage) = (0, 0.0_f32, 0.0_f64);
-            for (index, weight) in self.entries.pixel(i) {
+            for (index, weight) in self.weights.pixel(i) {
                 coverage += f64::from(weight);
                 if weight > most {
                     (best, most) = (index, weight);
@@ -181,12 +176,12 @@ impl LabelledView {
             }
             if coverage < floor { 0 } else { best }
         };
-        (0..self.entries.pixels()).map(strongest).collect()
+        (0..self.weights.pixels()).map(strongest).collect()
     }
 
     fn size_bytes(&self) -> u64 {
         // Norms of both profiles, whether they are made yet or not.
-        self.entries.size_bytes() + 2 * 4 * self.entries.pixels() as u64
+        self.weights.size_bytes() + 2 * 4 * self.weights.pixels() as u64
     }
 }
 
@@ -261,9 +256,9 @@ impl<'a> SceneTexts<'a> {
         &self,
         key: String,
         [width, height]: [u32; 2],
-        entries: Entries,
+        weights: PixelWeights,
     ) -> Arc<LabelledView> {
-        let view = Arc::new(LabelledView { width, height, entries, norms: Default::default() });
+        let view = Arc::new(LabelledView { width, height, weights, norms: Default::default() });
         self.backend.search.views.insert(key, Arc::clone(&view), view.size_bytes());
         view
     }
@@ -277,12 +272,12 @@ impl<'a> SceneTexts<'a> {
         if let Some(known) = self.known_view(&key) {
             return Ok((known, false));
         }
-        let request = RenderRequest { labels: Labels::Entries, ..request.clone() };
+        let request = RenderRequest { labels: Labels::Weights, ..request.clone() };
         let Backend { renderer, planner, .. } = self.backend;
         let frame = planner.render(&**renderer, self.of.scene, &request, false)?;
-        let entries =
-            frame.entries.ok_or_else(|| Error::internal("the renderer gave no entries"))?;
-        Ok((self.keep_view(key, [frame.width, frame.height], entries), true))
+        let weights =
+            frame.weights.ok_or_else(|| Error::internal("the renderer gave no weights"))?;
+        Ok((self.keep_view(key, [frame.width, frame.height], weights), true))
     }
 }
 

@@ -134,9 +134,9 @@ impl Resolved {
         }
         let mut frame = self.frame(backend, scene, &request)?;
         let size = [frame.width, frame.height];
-        let labels = match (wanted, frame.entries.take(), frame.blend.take()) {
-            (Some((asked, key)), Some(entries), _) => {
-                Some(ViewLabels::Weights(asked.keep_view(key, size, entries)))
+        let labels = match (wanted, frame.weights.take(), frame.blend.take()) {
+            (Some((asked, key)), Some(weights), _) => {
+                Some(ViewLabels::Weights(asked.keep_view(key, size, weights)))
             }
             (_, _, blend) => blend.map(ViewLabels::Blend),
         };
@@ -154,7 +154,7 @@ impl Resolved {
         let tables = asked.texts.first().map(|text| text.scores.tables()).unwrap_or_default();
         match <[_; 1]>::try_from(tables) {
             Ok([table]) if mask_alone => Labels::Blend(table),
-            _ => Labels::Entries,
+            _ => Labels::Weights,
         }
     }
 
@@ -221,7 +221,7 @@ impl Resolved {
                 file(Layer::Mask(&mask_from_blend(&[blend.as_slice()], scorer.scoring())))
             }
             (Kind::Mask, ViewLabels::Weights(view), Some(text)) => {
-                file(Layer::Mask(&scorer.mask(&text.scores, view.entries())?))
+                file(Layer::Mask(&scorer.mask(&text.scores, &view.weights)?))
             }
             (Kind::Relevancy, ViewLabels::Weights(view), Some(text)) => {
                 file(Layer::Relevancy(&view.relevancy(scorer, &text.scores)?))

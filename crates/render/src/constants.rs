@@ -39,7 +39,7 @@ pub const FOOTPRINT_SLACK: f32 = 1e-4;
 /// is drawn in bands of tile rows.
 pub const ISECTS_MAX: u64 = 1 << 25;
 /// Entries of one view (6 bytes each): 768 MiB, what 64 a pixel come to at 1080p.
-pub const ENTRIES_MAX: u64 = 1 << 27;
+pub const PIXEL_WEIGHTS_MAX: u64 = 1 << 27;
 /// Gaussians staged at once for a tile: their data stay in the level-1 cache.
 pub const BATCH_SIZE: usize = 128;
 

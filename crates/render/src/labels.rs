@@ -1,13 +1,17 @@
-//! What a view means, beside what it looks like: a few numbers a pixel blended from a table, or
-//! the weight of every index that a pixel sees.
+//! Labels of a view: four numbers a pixel, blended from a table, or the weights of all entries
+//! that a pixel shows.
 //!
-//! Each Gaussian has one index (0 = background), so a contribution of weight `alpha T` touches one
-//! row of the table, or one entry of the pixel, however many rows there are.
+//! Each Gaussian has one entry (0 = background). So a Gaussian that adds the weight `alpha T` to a
+//! pixel needs one row of the table, or adds to one weight of the pixel. The size of the bank does
+//! not matter.
 
 use std::sync::Arc;
 
-use super::constants::ENTRIES_MAX;
-use crate::error::{Error, Result};
+use super::constants::PIXEL_WEIGHTS_MAX;
+use crate::{
+    error::{Error, Result},
+    scene::PixelWeights,
+};
 
 /// Numbers in a row of a table that is blended.
 pub const BLEND_WIDTH: usize = 4;
@@ -19,15 +23,14 @@ pub enum Labels {
     #[default]
     None,
     /// `[H, W, 4]`: each Gaussian adds its weight times row `semantic_index` of this table of
-    /// M + 1 rows. An index beyond the table counts as 0; row 0 is zeros as a rule.
+    /// M + 1 rows. An entry beyond the table counts as entry 0; row 0 is zeros as a rule.
     Blend(Arc<[[f32; BLEND_WIDTH]]>),
-    /// The sparse weights of every index that a pixel sees: [`Entries`].
-    Entries,
+    /// The weights of all entries that a pixel shows: [`PixelWeights`].
+    Weights,
 }
 
 impl Labels {
-    /// Refuses a table with numbers that are not finite: one would spoil pixels that it never
-    /// touches.
+    /// Refuses a table with a number that is not finite.
     ///
     /// # Errors
     /// `invalid_request` with the row and the number.
@@ -41,71 +44,51 @@ impl Labels {
         }
     }
 
-    /// The row of the table for an index; zeros where there is no table.
+    /// The row of the table for an entry; zeros where the table is empty.
     #[inline]
     #[must_use]
-    pub fn row(table: &[[f32; BLEND_WIDTH]], index: u16) -> [f32; BLEND_WIDTH] {
-        table.get(usize::from(index)).or_else(|| table.first()).copied().unwrap_or_default()
+    pub fn row(table: &[[f32; BLEND_WIDTH]], entry: u16) -> [f32; BLEND_WIDTH] {
+        table.get(usize::from(entry)).or_else(|| table.first()).copied().unwrap_or_default()
     }
 }
 
-/// E, sparse: for each pixel the indices that it sees, ascending, with their weights over 0.
-///
-/// The weight of index m at a pixel is the sum of `alpha T` over the Gaussians of that index;
-/// index 0 is left out.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Entries {
-    /// `[H * W + 1]`: pixel i has the entries `offsets[i]..offsets[i + 1]`.
-    pub offsets: Vec<u32>,
-    /// `[offsets.last()]` indices.
-    pub index: Vec<u16>,
-    /// `[offsets.last()]` weights, 0..1.
-    pub weight: Vec<f32>,
+/// The weights of some rows of pixels. The rows are filled in any order.
+#[derive(Clone, Debug, Default)]
+pub struct WeightRows {
+    /// Number of weights of each pixel, row-major.
+    counts: Vec<u32>,
+    /// Of each row of pixels its (entry, weight) pairs, from left to right.
+    rows: Vec<Vec<(u16, f32)>>,
+    width: usize,
 }
 
-impl Entries {
-    /// No entries at all, over `pixels` pixels.
+impl WeightRows {
+    /// `rows` rows of `width` pixels without weights.
     #[must_use]
-    pub fn none(pixels: usize) -> Self {
-        Self { offsets: vec![0; pixels + 1], ..Self::default() }
+    pub fn new(rows: usize, width: usize) -> Self {
+        Self { counts: vec![0; rows * width], rows: vec![Vec::new(); rows], width }
     }
 
-    /// Number of pixels.
-    #[must_use]
-    pub fn pixels(&self) -> usize {
-        self.offsets.len().saturating_sub(1)
+    /// Adds a weight to pixel (`column`, `row`). Columns of a row come in ascending order, and so
+    /// do the entries of a pixel.
+    #[inline]
+    pub fn push(&mut self, column: usize, row: usize, entry: u16, weight: f32) {
+        self.counts[row * self.width + column] += 1;
+        self.rows[row].push((entry, weight));
     }
 
-    /// Indices and weights of pixel `i`, ascending.
-    pub fn pixel(&self, i: usize) -> impl Iterator<Item = (u16, f32)> + '_ {
-        let range = self.offsets[i] as usize..self.offsets[i + 1] as usize;
-        self.index[range.clone()].iter().copied().zip(self.weight[range].iter().copied())
-    }
-
-    /// Sum of the weights of pixel `i`.
-    #[must_use]
-    pub fn coverage(&self, i: usize) -> f32 {
-        self.pixel(i).map(|(_, weight)| weight).sum()
-    }
-
-    /// Bytes held.
-    #[must_use]
-    pub fn size_bytes(&self) -> u64 {
-        (self.offsets.len() * 4 + self.index.len() * 6) as u64
-    }
-
-    /// Puts rows of tiles together, in their order.
+    /// Joins bands of a view, from top to bottom.
     ///
     /// # Errors
-    /// `limit_exceeded` when there are more entries than [`ENTRIES_MAX`].
-    pub(super) fn join(parts: Vec<EntryRows>) -> Result<Self> {
+    /// `limit_exceeded` when there are more weights than [`PIXEL_WEIGHTS_MAX`].
+    pub(super) fn join(parts: Vec<Self>) -> Result<PixelWeights> {
         let total: usize = parts.iter().flat_map(|part| &part.rows).map(Vec::len).sum();
         check_total(total)?;
         let pixels = parts.iter().map(|part| part.counts.len()).sum::<usize>();
-        let mut all = Self {
+        let mut all = PixelWeights {
             offsets: Vec::with_capacity(pixels + 1),
-            index: Vec::with_capacity(total),
-            weight: Vec::with_capacity(total),
+            entries: Vec::with_capacity(total),
+            weights: Vec::with_capacity(total),
         };
         let mut end = 0;
         all.offsets.push(0);
@@ -115,73 +98,52 @@ impl Entries {
                 end
             }));
             for row in part.rows {
-                all.index.extend(row.iter().map(|entry| entry.0));
-                all.weight.extend(row.iter().map(|entry| entry.1));
+                all.entries.extend(row.iter().map(|pair| pair.0));
+                all.weights.extend(row.iter().map(|pair| pair.1));
             }
         }
         Ok(all)
     }
+}
 
-    /// These over `behind`, which is seen through a pixel's `room(i)`, 0..1.
-    ///
-    /// # Errors
-    /// `limit_exceeded` when there are more entries than [`ENTRIES_MAX`].
-    pub(super) fn over(&self, behind: &Self, room: impl Fn(usize) -> f32) -> Result<Self> {
-        let mut all = Self { offsets: vec![0], ..Self::default() };
-        for i in 0..self.pixels() {
-            let room = room(i);
-            let mut under = behind.pixel(i).map(|(m, w)| (m, w * room)).peekable();
-            let mut add = |(index, weight): (u16, f32)| {
-                if weight > 0.0 {
-                    all.index.push(index);
-                    all.weight.push(weight);
-                }
-            };
-            for (index, weight) in self.pixel(i) {
-                while let Some(before) = under.next_if(|entry| entry.0 < index) {
-                    add(before);
-                }
-                let same = under.next_if(|entry| entry.0 == index);
-                add((index, weight + same.map_or(0.0, |entry| entry.1)));
+/// `front` over `behind`, of which pixel i shows the share `room(i)`, 0..1.
+///
+/// # Errors
+/// `limit_exceeded` when there are more weights than [`PIXEL_WEIGHTS_MAX`].
+pub(super) fn over(
+    front: &PixelWeights,
+    behind: &PixelWeights,
+    room: impl Fn(usize) -> f32,
+) -> Result<PixelWeights> {
+    let mut all = PixelWeights { offsets: vec![0], ..PixelWeights::default() };
+    for i in 0..front.pixels() {
+        let room = room(i);
+        let mut under = behind.pixel(i).map(|(m, w)| (m, w * room)).peekable();
+        let mut add = |(entry, weight): (u16, f32)| {
+            if weight > 0.0 {
+                all.entries.push(entry);
+                all.weights.push(weight);
             }
-            under.for_each(add);
-            check_total(all.index.len())?;
-            all.offsets.push(all.index.len() as u32);
+        };
+        for (entry, weight) in front.pixel(i) {
+            while let Some(before) = under.next_if(|other| other.0 < entry) {
+                add(before);
+            }
+            let same = under.next_if(|other| other.0 == entry);
+            add((entry, weight + same.map_or(0.0, |other| other.1)));
         }
-        Ok(all)
+        under.for_each(add);
+        check_total(all.entries.len())?;
+        all.offsets.push(all.entries.len() as u32);
     }
+    Ok(all)
 }
 
 fn check_total(total: usize) -> Result<()> {
-    if total as u64 > ENTRIES_MAX {
-        return Err(Error::limit("render: entries of one view", total, ENTRIES_MAX));
+    if total as u64 > PIXEL_WEIGHTS_MAX {
+        return Err(Error::limit("render: weights of one view", total, PIXEL_WEIGHTS_MAX));
     }
     Ok(())
-}
-
-/// Entries of some rows of pixels, gathered in any order of the rows.
-#[derive(Clone, Debug, Default)]
-pub struct EntryRows {
-    /// Entries of each pixel, row-major.
-    counts: Vec<u32>,
-    /// Of each row of pixels its entries, from left to right.
-    rows: Vec<Vec<(u16, f32)>>,
-    width: usize,
-}
-
-impl EntryRows {
-    /// `rows` rows of `width` pixels without entries.
-    #[must_use]
-    pub fn new(rows: usize, width: usize) -> Self {
-        Self { counts: vec![0; rows * width], rows: vec![Vec::new(); rows], width }
-    }
-
-    /// Adds an entry to pixel (`column`, `row`): indices ascending, columns of a row too.
-    #[inline]
-    pub fn push(&mut self, column: usize, row: usize, index: u16, weight: f32) {
-        self.counts[row * self.width + column] += 1;
-        self.rows[row].push((index, weight));
-    }
 }
 
 #[cfg(test)]
@@ -189,44 +151,44 @@ mod tests {
     use super::*;
     use crate::error::ErrorCode;
 
-    fn entries(pixels: &[&[(u16, f32)]]) -> Entries {
-        let mut rows = EntryRows::new(1, pixels.len());
+    fn weights(pixels: &[&[(u16, f32)]]) -> PixelWeights {
+        let mut rows = WeightRows::new(1, pixels.len());
         for (column, pixel) in pixels.iter().enumerate() {
-            pixel.iter().for_each(|&(index, weight)| rows.push(column, 0, index, weight));
+            pixel.iter().for_each(|&(entry, weight)| rows.push(column, 0, entry, weight));
         }
-        Entries::join(vec![rows]).expect("few entries")
+        WeightRows::join(vec![rows]).expect("few weights")
     }
 
     #[test]
     fn rows_are_joined_in_their_order_whatever_order_they_were_filled_in() {
-        let mut top = EntryRows::new(2, 2);
+        let mut top = WeightRows::new(2, 2);
         top.push(1, 1, 7, 0.5);
         top.push(0, 0, 3, 0.25);
         top.push(0, 0, 4, 0.75);
-        let mut bottom = EntryRows::new(1, 2);
+        let mut bottom = WeightRows::new(1, 2);
         bottom.push(0, 0, 9, 1.0);
-        let all = Entries::join(vec![top, bottom]).expect("few entries");
+        let all = WeightRows::join(vec![top, bottom]).expect("few weights");
         assert_eq!(all.offsets, [0, 2, 2, 2, 3, 4, 4], "offsets");
-        assert_eq!(all.index, [3, 4, 7, 9], "indices");
-        assert_eq!(all.weight, [0.25, 0.75, 0.5, 1.0], "weights");
+        assert_eq!(all.entries, [3, 4, 7, 9], "entries");
+        assert_eq!(all.weights, [0.25, 0.75, 0.5, 1.0], "weights");
         assert_eq!(all.coverage(0), 1.0, "coverage of the first pixel");
-        assert_eq!((all.pixels(), all.coverage(1)), (6, 0.0), "a pixel without entries");
+        assert_eq!((all.pixels(), all.coverage(1)), (6, 0.0), "a pixel without weights");
     }
 
     #[test]
-    fn over_merges_by_index_and_drops_what_is_hidden() {
-        let front = entries(&[&[(2, 0.5), (5, 0.25)], &[(1, 1.0)], &[]]);
+    fn over_merges_by_entry_and_drops_what_is_hidden() {
+        let front = weights(&[&[(2, 0.5), (5, 0.25)], &[(1, 1.0)], &[]]);
         let behind =
-            entries(&[&[(1, 0.5), (2, 0.5), (9, 1.0)], &[(1, 0.5), (3, 0.5)], &[(4, 0.5)]]);
+            weights(&[&[(1, 0.5), (2, 0.5), (9, 1.0)], &[(1, 0.5), (3, 0.5)], &[(4, 0.5)]]);
         let rooms = [0.25, 0.0, 1.0];
-        let all = front.over(&behind, |i| rooms[i]).expect("few entries");
+        let all = over(&front, &behind, |i| rooms[i]).expect("few weights");
         let want =
-            entries(&[&[(1, 0.125), (2, 0.625), (5, 0.25), (9, 0.25)], &[(1, 1.0)], &[(4, 0.5)]]);
+            weights(&[&[(1, 0.125), (2, 0.625), (5, 0.25), (9, 0.25)], &[(1, 1.0)], &[(4, 0.5)]]);
         assert_eq!(all, want);
     }
 
     #[test]
-    fn a_table_must_be_finite_and_an_index_beyond_it_is_0() {
+    fn a_table_must_be_finite_and_an_entry_beyond_it_is_0() {
         let table = [[9.0; 4], [1.0; 4], [2.0; 4]];
         assert_eq!(Labels::row(&table, 2), [2.0; 4], "the last row");
         assert_eq!(Labels::row(&table, 3), [9.0; 4], "beyond the table");

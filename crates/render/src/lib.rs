@@ -13,8 +13,10 @@ pub mod select;
 pub mod skip;
 pub mod view;
 
+pub use segsplat_core::scene::PixelWeights;
+
 pub use self::{
-    labels::{Entries, Labels},
+    labels::Labels,
     plan::ViewPlanner,
     select::{RendererChoice, RendererOptions},
 };
@@ -146,15 +148,15 @@ pub struct Frame {
     pub alpha: Option<Vec<f32>>,
     /// `[H * W]` rows of [`Labels::Blend`], blended.
     pub blend: Option<Vec<[f32; 4]>>,
-    /// What [`Labels::Entries`] asks for.
-    pub entries: Option<Entries>,
+    /// What [`Labels::Weights`] asks for.
+    pub weights: Option<PixelWeights>,
     /// Counts.
     pub stats: FrameStats,
 }
 
 /// Time of one dispatch, by the device's own clock.
 #[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
-pub struct StageTime {
+pub struct DispatchTime {
     /// Kernel.
     pub stage: &'static str,
     /// Milliseconds.
@@ -167,7 +169,7 @@ pub struct DeviceTimes {
     /// From before the first stage to after the last, no stage marked between: milliseconds.
     pub total_ms: f64,
     /// Every dispatch of another frame, in order.
-    pub stages: Vec<StageTime>,
+    pub stages: Vec<DispatchTime>,
 }
 
 /// A renderer of the one model.

@@ -78,8 +78,8 @@ pub struct OraclePixel {
     pub alpha: f64,
     /// Blended rows of the request's table; zeros where none was given.
     pub blend: [f64; 4],
-    /// Weight of each index but 0, where entries were asked for.
-    pub entries: BTreeMap<u16, f64>,
+    /// Weight of each index but 0, where weights were asked for.
+    pub weights: BTreeMap<u16, f64>,
     /// Edges it stands on.
     pub cliff: Cliff,
 }
@@ -312,7 +312,7 @@ fn pixel(near: &[&Splat], center: DVec2, request: &RenderRequest) -> OraclePixel
     let mut transmittance = 1.0;
     let (mut color, mut depth, mut alpha_sum) = (DVec3::ZERO, 0.0, 0.0);
     let mut blend = [0.0; 4];
-    let mut entries = BTreeMap::new();
+    let mut weights = BTreeMap::new();
     let mut cliff = Cliff::default();
     let mut last_depth = f64::NEG_INFINITY;
     for splat in near {
@@ -342,8 +342,8 @@ fn pixel(near: &[&Splat], center: DVec2, request: &RenderRequest) -> OraclePixel
                     *sum += weight * f64::from(*value);
                 }
             }
-            Labels::Entries if splat.label == 0 => {}
-            Labels::Entries => *entries.entry(splat.label).or_insert(0.0) += weight,
+            Labels::Weights if splat.label == 0 => {}
+            Labels::Weights => *weights.entry(splat.label).or_insert(0.0) += weight,
         }
         transmittance = next;
     }
@@ -353,7 +353,7 @@ fn pixel(near: &[&Splat], center: DVec2, request: &RenderRequest) -> OraclePixel
         depth: if alpha_sum > 0.0 { depth / alpha_sum } else { 0.0 },
         alpha: alpha_sum,
         blend,
-        entries,
+        weights,
         cliff,
     }
 }

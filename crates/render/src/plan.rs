@@ -100,7 +100,7 @@ impl ViewPlanner {
     /// the request's background. Neither adds anything to labels.
     ///
     /// # Errors
-    /// Those of the renderer, and `limit_exceeded` when the layers have too many entries together.
+    /// Those of the renderer, and `limit_exceeded` when the layers have too many pixel weights together.
     pub fn render(
         &self,
         renderer: &dyn Renderer,
@@ -344,8 +344,8 @@ fn put_behind(front: &mut Frame, behind: &Frame) -> Result<()> {
     let (Some(alphas), Some(behind_alphas)) = (&mut front.alpha, &behind.alpha) else {
         return Ok(());
     };
-    if let (Some(entries), Some(under)) = (&mut front.entries, &behind.entries) {
-        *entries = entries.over(under, |i| 1.0 - alphas[i])?;
+    if let (Some(weights), Some(under)) = (&mut front.weights, &behind.weights) {
+        *weights = crate::labels::over(weights, under, |i| 1.0 - alphas[i])?;
     }
     for (i, (alpha, under)) in alphas.iter_mut().zip(behind_alphas).enumerate() {
         let room = (1.0 - *alpha) * under;

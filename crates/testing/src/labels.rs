@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use segsplat_core::scene::{Gaussians, RawGaussians};
-use segsplat_render::{Entries, Kinds, Labels, RenderRequest, Renderer};
+use segsplat_render::{Kinds, Labels, PixelWeights, RenderRequest, Renderer};
 
 use crate::scenes::{Random, checked, cloud};
 
@@ -64,10 +64,10 @@ pub fn literal(
 }
 
 /// Largest difference of sparse and dense E at pixel `i`; an index 0 or out of order is a fault.
-fn entries_apart(entries: &Entries, i: usize, dense: &[f64]) -> f64 {
+fn weights_apart(weights: &PixelWeights, i: usize, dense: &[f64]) -> f64 {
     let mut rest = dense.to_vec();
     let mut last = 0;
-    for (index, weight) in entries.pixel(i) {
+    for (index, weight) in weights.pixel(i) {
         assert!(index > last, "pixel {i}: index {index} after {last}");
         assert!(weight > 0.0, "pixel {i}: weight {weight} of index {index}");
         last = index;
@@ -87,16 +87,16 @@ pub fn blend_apart(blend: [f32; 4], dense: &[f64], table: &[[f32; 4]]) -> f64 {
     want.iter().zip(blend).fold(0.0, |worst, (a, b)| worst.max((a - f64::from(b)).abs()))
 }
 
-/// Entries and blend of one view.
+/// Pixel weights and blend of one view.
 #[derive(Debug)]
 pub struct Drawn {
-    /// From [`Labels::Entries`].
-    pub entries: Entries,
+    /// From [`Labels::Weights`].
+    pub weights: PixelWeights,
     /// From [`Labels::Blend`].
     pub blend: Vec<[f32; 4]>,
 }
 
-/// Draws one view with entries, and again with `table` blended.
+/// Draws one view with weights, and again with `table` blended.
 pub fn draw_labels(
     renderer: &dyn Renderer,
     gaussians: &Gaussians,
@@ -105,13 +105,13 @@ pub fn draw_labels(
 ) -> Drawn {
     let draw = |labels| renderer.render(gaussians, &alone(request, labels)).expect("labels");
     let blended = draw(Labels::Blend(Arc::clone(table)));
-    let listed = draw(Labels::Entries);
+    let listed = draw(Labels::Weights);
     for frame in [&blended, &listed] {
         assert!(frame.color.is_none() && frame.depth.is_none() && frame.alpha.is_none());
     }
-    assert!(blended.entries.is_none() && listed.blend.is_none(), "labels not asked for");
+    assert!(blended.weights.is_none() && listed.blend.is_none(), "labels not asked for");
     Drawn {
-        entries: listed.entries.expect("entries were asked for"),
+        weights: listed.weights.expect("weights were asked for"),
         blend: blended.blend.expect("a blend was asked for"),
     }
 }
@@ -124,12 +124,12 @@ pub fn apart(
     table: &[[f32; 4]],
     bound: f64,
 ) -> (Vec<usize>, f64) {
-    assert_eq!((drawn.entries.pixels(), drawn.blend.len()), (dense.len(), dense.len()), "pixels");
+    assert_eq!((drawn.weights.pixels(), drawn.blend.len()), (dense.len(), dense.len()), "pixels");
     let mut worst = 0.0_f64;
     let mut far = Vec::new();
     for (i, dense) in dense.iter().enumerate() {
-        let entries = entries_apart(&drawn.entries, i, dense);
-        let apart = entries.max(blend_apart(drawn.blend[i], dense, table));
+        let weights = weights_apart(&drawn.weights, i, dense);
+        let apart = weights.max(blend_apart(drawn.blend[i], dense, table));
         if apart <= bound {
             worst = worst.max(apart);
         } else {

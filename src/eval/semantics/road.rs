@@ -15,12 +15,12 @@ use crate::{
         Engine, Reconstruction, masks, reconstruct,
         semantics::{SceneParts, SemanticsOptions, Watch, understand},
     },
-    render::{Entries, Labels, RenderRequest, ViewPlanner, cpu::CpuRenderer},
+    render::{Labels, PixelWeights, RenderRequest, ViewPlanner, cpu::CpuRenderer},
     scene::{
         Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, ScoringProfile, SemanticsReport,
         StageTime,
     },
-    semantics::{Cutter, PixelEntries, Scorer, Scoring},
+    semantics::{Cutter, Scorer, Scoring},
 };
 
 /// What every target is seen with.
@@ -47,7 +47,7 @@ pub(super) struct Seen {
 /// A bank and the weights of each pixel of the target over it.
 struct Rows {
     bank: Bank,
-    entries: Entries,
+    weights: PixelWeights,
 }
 
 impl<'a> Road<'a> {
@@ -96,16 +96,16 @@ impl<'a> Road<'a> {
         let meaning = understand(self.engine, &parts, &self.understanding, watch)?;
         let gaussians = made.gaussians.with_semantic_index(meaning.index)?;
         let plain = view_request(photos[target].camera, made.report.median_depth);
-        let request = RenderRequest { labels: Labels::Entries, ..plain };
+        let request = RenderRequest { labels: Labels::Weights, ..plain };
         let warnings = made.report.warnings.len();
         let stages = made.report.stages.clone();
         let scene = scene_of(Reconstruction { gaussians, ..made });
         let frame = ViewPlanner::default().render(self.renderer, &scene, &request, true)?;
-        let entries =
-            frame.entries.ok_or_else(|| Error::internal("eval: the view has no entries"))?;
+        let weights =
+            frame.weights.ok_or_else(|| Error::internal("eval: the view has no weights"))?;
         Ok(Seen {
             color: frame.color.unwrap_or_default(),
-            scene: Rows { bank: meaning.bank, entries },
+            scene: Rows { bank: meaning.bank, weights },
             flat: self.flat(&given[0], &photos[target].camera, &cancel)?,
             semantics: meaning.report,
             stages,
@@ -142,19 +142,19 @@ impl<'a> Road<'a> {
             rows.extend(self.towers.embed_images(&crops)?);
         }
         let lens = target.intrinsics;
-        let mut entries = Entries { offsets: vec![0], ..Entries::default() };
+        let mut weights = PixelWeights { offsets: vec![0], ..PixelWeights::default() };
         for y in 0..lens.height {
             for x in 0..lens.width {
                 let share = |at: u32, of: u32| (f64::from(at) + 0.5) / f64::from(of);
                 let index = masks.map.at(share(x, lens.width), share(y, lens.height));
                 if index > 0 {
-                    entries.index.push(index);
-                    entries.weight.push(1.0);
+                    weights.entries.push(index);
+                    weights.weights.push(1.0);
                 }
-                entries.offsets.push(u32::try_from(entries.index.len()).unwrap_or(u32::MAX));
+                weights.offsets.push(u32::try_from(weights.entries.len()).unwrap_or(u32::MAX));
             }
         }
-        Ok(Rows { bank: Bank { dim: manifest.dim, rows }, entries })
+        Ok(Rows { bank: Bank { dim: manifest.dim, rows }, weights })
     }
 }
 
@@ -185,13 +185,13 @@ impl Seen {
         target: usize,
         inputs: &[usize],
     ) -> TargetReport {
-        let weight: f64 = self.scene.entries.weight.iter().map(|w| f64::from(*w)).sum();
+        let weight: f64 = self.scene.weights.weights.iter().map(|w| f64::from(*w)).sum();
         TargetReport {
             target: photos[target].file.clone(),
             inputs: inputs.iter().map(|&i| photos[i].file.clone()).collect(),
             semantics: self.semantics.clone(),
             stages: self.stages.clone(),
-            coverage: weight / self.scene.entries.pixels().max(1) as f64,
+            coverage: weight / self.scene.weights.pixels().max(1) as f64,
             warnings: self.warnings,
         }
     }
@@ -204,8 +204,7 @@ impl Rows {
     /// phrases orders them as their relevancies do.
     fn maps(&self, scoring: &Arc<Scoring>, texts: &[Vec<f32>]) -> Result<Vec<TextMap>> {
         let scorer = Scorer::new(&self.bank, Arc::clone(scoring))?;
-        let of = &self.entries;
-        let entries = PixelEntries { offsets: &of.offsets, index: &of.index, weight: &of.weight };
+        let of = &self.weights;
         let map = |text: &Vec<f32>| -> Result<TextMap> {
             let scores = scorer.text(text)?;
             let tables = scores.tables();
@@ -225,7 +224,7 @@ impl Rows {
             };
             Ok(TextMap {
                 score: (0..of.pixels()).map(score).collect(),
-                mask: scorer.mask(&scores, entries)?,
+                mask: scorer.mask(&scores, of)?,
             })
         };
         texts.iter().map(map).collect()

@@ -20,7 +20,7 @@ use segsplat::{
     jobs::{Made, NoSemantics, SceneMaker, Work},
     limits::Limits,
     photos,
-    render::{Entries, Frame, FrameStats, Labels, RenderRequest, Renderer},
+    render::{Frame, FrameStats, Labels, PixelWeights, RenderRequest, Renderer},
     sample::{self, SampleOptions},
     scene::{
         Backdrop, Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SceneId,
@@ -260,7 +260,7 @@ impl Renderer for CountingRenderer {
         match request.labels {
             Labels::None => {}
             Labels::Blend(_) => drop(self.blends.fetch_add(1, Ordering::AcqRel)),
-            Labels::Entries => drop(self.entries.fetch_add(1, Ordering::AcqRel)),
+            Labels::Weights => drop(self.entries.fetch_add(1, Ordering::AcqRel)),
         }
         PointRenderer.render(gaussians, request)
     }
@@ -311,14 +311,14 @@ impl Renderer for PointRenderer {
             }
             _ => None,
         };
-        let entries = (request.labels == Labels::Entries).then(|| {
-            let mut entries = Entries { offsets: vec![0], ..Entries::default() };
+        let weights = (request.labels == Labels::Weights).then(|| {
+            let mut weights = PixelWeights { offsets: vec![0], ..PixelWeights::default() };
             for &label in &labels {
-                entries.index.extend((label != 0).then_some(label));
-                entries.offsets.push(entries.index.len() as u32);
+                weights.entries.extend((label != 0).then_some(label));
+                weights.offsets.push(weights.entries.len() as u32);
             }
-            entries.weight = vec![1.0; entries.index.len()];
-            entries
+            weights.weights = vec![1.0; weights.entries.len()];
+            weights
         });
         Ok(Frame {
             width: lens.width,
@@ -327,7 +327,7 @@ impl Renderer for PointRenderer {
             depth: request.kinds.depth.then_some(depth),
             alpha: request.kinds.alpha.then_some(alpha),
             blend,
-            entries,
+            weights,
             stats,
         })
     }

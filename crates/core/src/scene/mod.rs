@@ -14,6 +14,7 @@ mod report;
 mod semantics;
 mod status;
 mod upload;
+mod weights;
 
 pub use axes::principal_axes;
 pub use backdrop::Backdrop;
@@ -34,3 +35,4 @@ pub use status::{
     SemanticsState, SemanticsStatus,
 };
 pub use upload::{Upload, UploadCameras, UploadFile};
+pub use weights::PixelWeights;

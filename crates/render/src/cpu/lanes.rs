@@ -48,7 +48,7 @@ impl Width {
 
     /// Runs `kernel`, compiled for this width or for the next that the processor has.
     #[inline]
-    pub(super) fn run<K: Kernel>(self, kernel: K) {
+    pub(super) fn run<K: LaneKernel>(self, kernel: K) {
         #[cfg(target_arch = "x86_64")]
         {
             if self == Self::Sixteen
@@ -67,7 +67,7 @@ impl Width {
 }
 
 /// Work that is compiled for each width.
-pub(super) trait Kernel {
+pub(super) trait LaneKernel {
     /// Does the work; must be inlined.
     fn run<S: Lanes>(self, simd: S);
 }
@@ -77,7 +77,7 @@ struct Compiled<S, K> {
     kernel: K,
 }
 
-impl<S: Lanes, K: Kernel> pulp::NullaryFnOnce for Compiled<S, K> {
+impl<S: Lanes, K: LaneKernel> pulp::NullaryFnOnce for Compiled<S, K> {
     type Output = ();
 
     #[inline(always)]
@@ -301,7 +301,7 @@ mod tests {
         to: &'a mut [[f32; 16]],
     }
 
-    impl Kernel for Powers<'_> {
+    impl LaneKernel for Powers<'_> {
         #[inline(always)]
         fn run<S: Lanes>(self, simd: S) {
             for (from, to) in self.from.iter().zip(self.to) {
@@ -342,7 +342,7 @@ mod tests {
 
     struct Masks<'a>(&'a mut u32);
 
-    impl Kernel for Masks<'_> {
+    impl LaneKernel for Masks<'_> {
         #[inline(always)]
         fn run<S: Lanes>(self, simd: S) {
             let row: [f32; 16] = std::array::from_fn(|k| k as f32);

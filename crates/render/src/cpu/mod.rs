@@ -5,6 +5,7 @@
 //! nothing is summed across tasks.
 
 pub mod emit_isects;
+pub mod footprint;
 pub mod lanes;
 pub mod paint;
 pub mod prefix_sum;
@@ -15,11 +16,9 @@ pub mod shade;
 pub mod tile_ranges;
 pub mod tiles;
 
-use std::{
-    ops::Range,
-    sync::{Mutex, PoisonError},
-};
+use std::ops::Range;
 
+use parking_lot::Mutex;
 use rayon::prelude::*;
 
 use self::{
@@ -31,9 +30,9 @@ use self::{
     tiles::Grid,
 };
 use super::{
-    Entries, Frame, FrameStats, Labels, RenderRequest, Renderer,
+    Frame, FrameStats, Labels, RenderRequest, Renderer,
     constants::{ISECTS_MAX, TILE_SIZE},
-    labels::EntryRows,
+    labels::WeightRows,
     skip::Skip,
     view::View,
 };
@@ -130,10 +129,10 @@ impl CpuRenderer {
         let grid = Grid::whole(&view, without);
         let paint = Paint::new(request, gaussians.semantic_index());
         let paint = paint.with_width(width).without(without);
-        let mut band = Band { paint, entries: Vec::new() };
+        let mut band = Band { paint, weights: Vec::new() };
         self.draw_band(&grid, &mut band, &mut scratch, &mut frame)?;
-        if request.labels == Labels::Entries {
-            frame.entries = Some(Entries::join(band.entries)?);
+        if request.labels == Labels::Weights {
+            frame.weights = Some(WeightRows::join(band.weights)?);
         }
         if gaussians.len() <= KEPT_GAUSSIANS_MAX {
             self.frames.give(scratch);
@@ -193,7 +192,7 @@ impl CpuRenderer {
     ) {
         let tiles_x = grid.tiles_x();
         let paint = band.paint;
-        let rows = band_rows(frame, grid, *paint.labels() == Labels::Entries);
+        let rows = band_rows(frame, grid, *paint.labels() == Labels::Weights);
         let drawn = rows.into_par_iter().with_max_len(1).enumerate().map(|(row, mut out)| {
             let mut tile_scratch = self.tiles.take();
             let y = (grid.tile_rows.start + row as u32) * TILE_SIZE;
@@ -220,10 +219,10 @@ impl CpuRenderer {
                 );
             }
             self.tiles.give(tile_scratch);
-            out.entries
+            out.weights
         });
-        let drawn: Vec<Option<EntryRows>> = drawn.collect();
-        band.entries.extend(drawn.into_iter().flatten());
+        let drawn: Vec<Option<WeightRows>> = drawn.collect();
+        band.weights.extend(drawn.into_iter().flatten());
     }
 }
 
@@ -242,10 +241,10 @@ impl Renderer for CpuRenderer {
     }
 }
 
-/// What the bands of a frame share, and their entries from top to bottom.
+/// What the bands of a frame share, and their weights from top to bottom.
 struct Band<'a> {
     paint: Paint<'a>,
-    entries: Vec<EntryRows>,
+    weights: Vec<WeightRows>,
 }
 
 /// Buffers of a frame, named as the stages name them.
@@ -265,11 +264,11 @@ struct Pool<T>(Mutex<Vec<T>>);
 
 impl<T: Default> Pool<T> {
     fn take(&self) -> T {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default()
+        self.0.lock().pop().unwrap_or_default()
     }
 
     fn give(&self, thing: T) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(thing);
+        self.0.lock().push(thing);
     }
 }
 
@@ -283,13 +282,13 @@ fn blank(view: &View, request: &RenderRequest) -> Frame {
         depth: request.kinds.depth.then(|| vec![0.0; pixels]),
         alpha: request.kinds.alpha.then(|| vec![0.0; pixels]),
         blend: matches!(request.labels, Labels::Blend(_)).then(|| vec![[0.0; 4]; pixels]),
-        entries: None,
+        weights: None,
         stats: FrameStats::default(),
     }
 }
 
 /// The pictures of a band, cut into rows of tiles.
-fn band_rows<'a>(frame: &'a mut Frame, grid: &Grid, entries: bool) -> Vec<RowOut<'a>> {
+fn band_rows<'a>(frame: &'a mut Frame, grid: &Grid, weights: bool) -> Vec<RowOut<'a>> {
     let stride = frame.width as usize * TILE_SIZE as usize;
     let first = grid.tile_rows.start as usize;
     let mut color = frame.color.as_mut().map(|all| all.chunks_mut(stride).skip(first));
@@ -304,9 +303,9 @@ fn band_rows<'a>(frame: &'a mut Frame, grid: &Grid, entries: bool) -> Vec<RowOut
             depth: depth.as_mut().and_then(Iterator::next),
             alpha: alpha.as_mut().and_then(Iterator::next),
             blend: blend.as_mut().and_then(Iterator::next),
-            entries: entries.then(|| {
+            weights: weights.then(|| {
                 let rows = TILE_SIZE.min(grid.height - tile_row * TILE_SIZE);
-                EntryRows::new(rows as usize, width)
+                WeightRows::new(rows as usize, width)
             }),
         })
         .collect()

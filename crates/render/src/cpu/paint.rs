@@ -1,6 +1,6 @@
 //! What a frame asks of the blend: the channels of a Gaussian, and how the kernels work.
 
-use super::{lanes::Width, project::Footprint};
+use super::{footprint::Footprint, lanes::Width};
 use crate::{Kinds, Labels, RenderRequest, labels::BLEND_WIDTH, skip::Skip};
 
 /// Most channels: colour, depth, labels.

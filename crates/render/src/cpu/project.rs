@@ -6,7 +6,8 @@
 use rayon::prelude::*;
 
 use super::{
-    lanes::{Kernel, Lanes, Row, Wide, Width},
+    footprint::Footprint,
+    lanes::{LaneKernel, Lanes, Row, Wide, Width},
     tiles::{BLOCK, Ellipses, Grid, TileSpans},
 };
 use crate::{
@@ -18,34 +19,6 @@ use crate::{
 
 /// Gaussians a task: large enough to hide the task's cost, small enough to balance two cores.
 const CHUNK: usize = 1024;
-
-/// A Gaussian on the picture.
-///
-/// With d = pixel - mean, half the squared Mahalanobis distance is
-/// `(inv_sx · (d.x - slope · d.y))² + (inv_sy · d.y)²`: x given y, then y (Cholesky). Unlike the
-/// conic `a d.x² + 2 b d.x d.y + c d.y²` it does not cancel for long thin Gaussians.
-///
-/// One line of the cache each: the blend fetches them in no order of memory.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-#[repr(align(64))]
-pub struct Footprint {
-    /// Centre, pixels. f64: a tile subtracts its corner before it narrows.
-    pub mean: [f64; 2],
-    /// Covariance xy over variance y.
-    pub slope: f64,
-    /// √(½ / variance of x given y), 1/px.
-    pub inv_sx: f32,
-    /// √(½ / variance of y), 1/px.
-    pub inv_sy: f32,
-    /// Half the squared distance at which alpha reaches 1/255, with slack.
-    pub reach: f32,
-    /// Opacity, compensated in antialiased mode.
-    pub opacity: f32,
-    /// t.z, world units; also the sort key.
-    pub depth: f32,
-    /// Colour; filled by `shade`.
-    pub color: [f32; 3],
-}
 
 /// What the stage gives, `[N]` each.
 #[derive(Debug, Default)]
@@ -115,7 +88,7 @@ struct Chunk<'a> {
     tiles: &'a mut [u32],
 }
 
-impl Kernel for Chunk<'_> {
+impl LaneKernel for Chunk<'_> {
     #[inline(always)]
     fn run<S: Lanes>(self, simd: S) {
         let Self { view, how, .. } = self;
@@ -160,9 +133,9 @@ struct Block {
     scale: [Row; 3],
     opacity: Row,
     center: [Row; 2],
-    slope: Row,
-    inv_sx: Row,
-    inv_sy: Row,
+    conic_shear: Row,
+    conic_x: Row,
+    conic_y: Row,
     depth: Row,
     /// 1 for a Gaussian that can be seen so far.
     kept: Row,
@@ -256,9 +229,9 @@ impl Block {
                 let place = number(view.focal[k]) * slope + number(view.principal[k]);
                 place.put(center, i);
             }
-            (dot(m0, m1) / var_y).put(&mut self.slope, i);
-            (half * var_y / det).sqrt().put(&mut self.inv_sx, i);
-            (half / var_y).sqrt().put(&mut self.inv_sy, i);
+            (dot(m0, m1) / var_y).put(&mut self.conic_shear, i);
+            (half * var_y / det).sqrt().put(&mut self.conic_x, i);
+            (half / var_y).sqrt().put(&mut self.conic_y, i);
             t[2].put(&mut self.depth, i);
             number(1.0).only(kept).put(&mut self.kept, i);
         }
@@ -276,10 +249,10 @@ impl Block {
         let opacity = self.opacity[k] as f32;
         let footprint = Footprint {
             mean: [self.center[0][k], self.center[1][k]],
-            slope: self.slope[k],
-            inv_sx: self.inv_sx[k] as f32,
-            inv_sy: self.inv_sy[k] as f32,
-            reach: (opacity / ALPHA_MIN).ln().max(0.0) + FOOTPRINT_SLACK,
+            conic_shear: self.conic_shear[k],
+            conic_x: self.conic_x[k] as f32,
+            conic_y: self.conic_y[k] as f32,
+            power_max: (opacity / ALPHA_MIN).ln().max(0.0) + FOOTPRINT_SLACK,
             opacity,
             depth: self.depth[k] as f32,
             color: [0.0; 3],
@@ -287,10 +260,10 @@ impl Block {
         // Infinite variances and determinants end in a 0 or a NaN here.
         let finite = footprint.mean[0].is_finite()
             && footprint.mean[1].is_finite()
-            && footprint.slope.is_finite()
+            && footprint.conic_shear.is_finite()
             && footprint.depth.is_finite();
         let wide = |inv: f32| inv > 0.0 && inv.is_finite();
-        (finite && wide(footprint.inv_sx) && wide(footprint.inv_sy)).then_some(footprint)
+        (finite && wide(footprint.conic_x) && wide(footprint.conic_y)).then_some(footprint)
     }
 }
 

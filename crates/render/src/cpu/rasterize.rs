@@ -7,19 +7,19 @@
 //! whose rays have all ended takes no more.
 //!
 //! What is blended beside alpha is a row of channels, packed: colour, depth and a label's row of
-//! the table, as far as they were asked for. Entries are summed in one bin for each index that
+//! the table, as far as they were asked for. Weights are summed in one bin for each index that
 //! occurs in the tile, so a Gaussian touches one bin a cell however large the bank is.
 
 use super::{
-    lanes::{Kernel, Lanes, exp2_neg},
+    footprint::Footprint,
+    lanes::{LaneKernel, Lanes, exp2_neg},
     paint::{CHANNELS, Paint},
-    project::Footprint,
     radix_sort,
 };
 use crate::{
     Labels,
     constants::{ALPHA_MAX, ALPHA_MIN, BATCH_SIZE, TILE_SIZE, TRANSMITTANCE_MIN},
-    labels::{BLEND_WIDTH, EntryRows},
+    labels::{BLEND_WIDTH, WeightRows},
     skip::Skip,
 };
 
@@ -43,7 +43,7 @@ const PIXEL_Y: Numbers = along(CELL, true, 1.0);
 /// Powers are counted in twos: half the squared distance times log2 e.
 const SQRT_LOG2_E: f64 = 1.201_122_408_786_449_8;
 /// Room for the rounding of the bound of a cell, on top of the footprint's own slack.
-const REACH_SLACK: f32 = 1e-4;
+const POWER_SLACK: f32 = 1e-4;
 
 /// One number for each of 16 pixels or cells, in one line of the cache.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -96,10 +96,10 @@ struct Staged {
     vy: f32,
     v0: f32,
     /// Power at which alpha is under 1/255, with slack.
-    reach: f32,
+    power_max: f32,
     opacity: f32,
     channels: [f32; CHANNELS],
-    /// Bin of its index, where entries are wanted.
+    /// Bin of its index, where weights are wanted.
     bin: u32,
 }
 
@@ -197,8 +197,8 @@ pub struct RowOut<'a> {
     pub alpha: Option<&'a mut [f32]>,
     /// `[rows * width]` blended labels.
     pub blend: Option<&'a mut [[f32; BLEND_WIDTH]]>,
-    /// Entries of the rows.
-    pub entries: Option<EntryRows>,
+    /// Weights of the rows.
+    pub weights: Option<WeightRows>,
 }
 
 /// Place and size of a tile, pixels.
@@ -229,17 +229,17 @@ pub fn rasterize_tile(
     if isects.is_empty() && paint.without != Some(Skip::EmptyTiles) {
         return store_empty(tile, paint, picture_width, out);
     }
-    if *paint.labels == Labels::Entries {
+    if *paint.labels == Labels::Weights {
         scratch.bins.open(isects, paint.index);
     }
-    let work = Work { footprints, isects, tile, paint };
+    let work = TileWork { footprints, isects, tile, paint };
     paint.width.run(Blend { work, scratch: &mut *scratch });
     store(tile, paint, picture_width, scratch, out);
 }
 
 /// A tile and what falls on it.
 #[derive(Clone, Copy)]
-struct Work<'a> {
+struct TileWork<'a> {
     footprints: &'a [Footprint],
     isects: &'a [u64],
     tile: Tile,
@@ -247,18 +247,18 @@ struct Work<'a> {
 }
 
 struct Blend<'a> {
-    work: Work<'a>,
+    work: TileWork<'a>,
     scratch: &'a mut TileScratch,
 }
 
-impl Kernel for Blend<'_> {
+impl LaneKernel for Blend<'_> {
     /// The loop with the channels that the frame asks for: what is not wanted is not computed.
     #[inline(always)]
     fn run<S: Lanes>(self, simd: S) {
         let Self { work, scratch } = self;
         let [.., channels] = work.paint.layout();
-        let entries = *work.paint.labels == Labels::Entries;
-        match (channels, entries) {
+        let weights = *work.paint.labels == Labels::Weights;
+        match (channels, weights) {
             (0, false) => blend::<S, 0, false>(simd, work, scratch),
             (1, false) => blend::<S, 1, false>(simd, work, scratch),
             (3, false) => blend::<S, 3, false>(simd, work, scratch),
@@ -275,9 +275,9 @@ impl Kernel for Blend<'_> {
 }
 
 #[inline(always)]
-fn blend<S: Lanes, const K: usize, const ENTRIES: bool>(
+fn blend<S: Lanes, const K: usize, const WEIGHTS: bool>(
     simd: S,
-    work: Work<'_>,
+    work: TileWork<'_>,
     scratch: &mut TileScratch,
 ) {
     let by_parts = work.paint.without != Some(Skip::EllipseParts);
@@ -293,7 +293,7 @@ fn blend<S: Lanes, const K: usize, const ENTRIES: bool>(
         let staged = &mut scratch.staged[..batch.len()];
         for ((staged, footprint), &isect) in staged.iter_mut().zip(fetched).zip(batch) {
             let id = radix_sort::value(isect) as usize;
-            let bin = match ENTRIES {
+            let bin = match WEIGHTS {
                 true => scratch.bins.bin_of[usize::from(work.paint.index[id])],
                 false => NO_BIN,
             };
@@ -319,7 +319,7 @@ fn blend<S: Lanes, const K: usize, const ENTRIES: bool>(
             for i in 0..PIXELS / S::F32_LANES {
                 let staged = &scratch.staged;
                 goes_on |=
-                    blend_cell::<S, K, ENTRIES>(simd, (at, i), ends, cell, staged, marks, sums);
+                    blend_cell::<S, K, WEIGHTS>(simd, (at, i), ends, cell, staged, marks, sums);
             }
             if ends && !goes_on {
                 open &= !(1 << at);
@@ -390,15 +390,15 @@ fn stage(footprint: &Footprint, tile: Tile, channels: [f32; CHANNELS], bin: u32)
     let half = f64::from(TILE_SIZE) / 2.0;
     let x = footprint.mean[0] - (f64::from(tile.x) + half);
     let y = footprint.mean[1] - (f64::from(tile.y) + half);
-    let ux = f64::from(footprint.inv_sx) * SQRT_LOG2_E;
-    let vy = f64::from(footprint.inv_sy) * SQRT_LOG2_E;
+    let ux = f64::from(footprint.conic_x) * SQRT_LOG2_E;
+    let vy = f64::from(footprint.conic_y) * SQRT_LOG2_E;
     Staged {
         ux: ux as f32,
-        uy: (-ux * footprint.slope) as f32,
-        u0: (-ux * (x - footprint.slope * y)) as f32,
+        uy: (-ux * footprint.conic_shear) as f32,
+        u0: (-ux * (x - footprint.conic_shear * y)) as f32,
         vy: vy as f32,
         v0: (-vy * y) as f32,
-        reach: footprint.reach * std::f32::consts::LOG2_E + REACH_SLACK,
+        power_max: footprint.power_max * std::f32::consts::LOG2_E + POWER_SLACK,
         opacity: footprint.opacity,
         channels,
         bin,
@@ -407,7 +407,7 @@ fn stage(footprint: &Footprint, tile: Tile, channels: [f32; CHANNELS], bin: u32)
 
 /// One bit for each cell that the ellipse may meet.
 ///
-/// Over a cell u and v stay within a box, whose distance from 0 is compared with the reach.
+/// Over a cell u and v stay within a box, whose distance from 0 is compared with `power_max`.
 #[inline(always)]
 fn met<S: Lanes>(simd: S, gaussian: &Staged) -> u16 {
     let mut bits = 0;
@@ -421,7 +421,7 @@ fn met<S: Lanes>(simd: S, gaussian: &Staged) -> u16 {
         let du = simd.max_f32s(simd.sub_f32s(simd.abs_f32s(u), wide), zero);
         let dv = simd.max_f32s(simd.sub_f32s(simd.abs_f32s(v), tall), zero);
         let nearest = simd.fused(du, du, simd.mul_f32s(dv, dv));
-        let near = simd.less_than_or_equal_f32s(nearest, simd.splat_f32s(gaussian.reach));
+        let near = simd.less_than_or_equal_f32s(nearest, simd.splat_f32s(gaussian.power_max));
         bits |= simd.bits(near) << (i * S::F32_LANES);
     }
     bits as u16
@@ -439,7 +439,7 @@ fn along_axes<S: Lanes>(simd: S, gaussian: &Staged, x: S::f32s, y: S::f32s) -> (
 /// Blends what marked cell `at` into vector `i` of it: K channels, and their bins; whether some
 /// ray goes on. It stops where none does if `ends`.
 #[inline(always)]
-fn blend_cell<S: Lanes, const K: usize, const ENTRIES: bool>(
+fn blend_cell<S: Lanes, const K: usize, const WEIGHTS: bool>(
     simd: S,
     (at, i): (usize, usize),
     ends: bool,
@@ -479,7 +479,7 @@ fn blend_cell<S: Lanes, const K: usize, const ENTRIES: bool>(
             for (sum, &value) in channels.iter_mut().zip(&gaussian.channels) {
                 *sum = simd.fused(weight, simd.splat_f32s(value), *sum);
             }
-            if ENTRIES && let Some(sum) = sums.get_mut(gaussian.bin as usize) {
+            if WEIGHTS && let Some(sum) = sums.get_mut(gaussian.bin as usize) {
                 sum.put(simd, i, simd.add_f32s(sum.at(simd, i), weight));
             }
             if simd.bits(lives) == 0 && ends {
@@ -545,13 +545,13 @@ fn store(
             }
         }
     }
-    if let Some(entries) = &mut out.entries {
-        store_entries(tile, &scratch.bins, entries);
+    if let Some(weights) = &mut out.weights {
+        store_weights(tile, &scratch.bins, weights);
     }
 }
 
 /// Writes the bins over 0 of every pixel.
-fn store_entries(tile: Tile, bins: &Bins, entries: &mut EntryRows) {
+fn store_weights(tile: Tile, bins: &Bins, weights: &mut WeightRows) {
     let count = bins.present.len();
     if count == 0 {
         return;
@@ -563,7 +563,7 @@ fn store_entries(tile: Tile, bins: &Bins, entries: &mut EntryRows) {
             let sums = &bins.sums[cell * count..(cell + 1) * count];
             for (label, sum) in bins.present.iter().zip(sums) {
                 if sum.0[pixel] > 0.0 {
-                    entries.push(tile.x as usize + column, row, *label, sum.0[pixel]);
+                    weights.push(tile.x as usize + column, row, *label, sum.0[pixel]);
                 }
             }
         }

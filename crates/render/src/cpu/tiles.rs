@@ -4,8 +4,8 @@
 use std::ops::Range;
 
 use super::{
+    footprint::Footprint,
     lanes::{Lanes, Row, Wide},
-    project::Footprint,
 };
 use crate::{constants::TILE_SIZE, skip::Skip, view::View};
 
@@ -121,10 +121,10 @@ pub(super) const BLOCK: usize = 16;
 #[derive(Default)]
 pub(super) struct Ellipses {
     mean: [Row; 2],
-    slope: Row,
-    inv_sx: Row,
-    inv_sy: Row,
-    reach: Row,
+    conic_shear: Row,
+    conic_x: Row,
+    conic_y: Row,
+    power_max: Row,
     /// First row of tiles and one past the last; none where they are the same.
     rows: [Row; 2],
     /// For the first two rows of tiles: the first tile and one past the last.
@@ -136,10 +136,10 @@ impl Ellipses {
     #[inline(always)]
     pub(super) fn set(&mut self, k: usize, footprint: &Footprint) {
         [self.mean[0][k], self.mean[1][k]] = footprint.mean;
-        self.slope[k] = footprint.slope;
-        self.inv_sx[k] = f64::from(footprint.inv_sx);
-        self.inv_sy[k] = f64::from(footprint.inv_sy);
-        self.reach[k] = f64::from(footprint.reach);
+        self.conic_shear[k] = footprint.conic_shear;
+        self.conic_x[k] = f64::from(footprint.conic_x);
+        self.conic_y[k] = f64::from(footprint.conic_y);
+        self.power_max[k] = f64::from(footprint.power_max);
     }
 
     /// Answers for all, statement by statement as [`touched_tiles`].
@@ -152,17 +152,18 @@ impl Ellipses {
         let last_column = number(f64::from(grid.width) - 1.0);
         for i in 0..BLOCK / S::F64_LANES {
             let at = |row: &Row| Wide::at(simd, row, i);
-            let (mean_x, mean_y, slope) = (at(&self.mean[0]), at(&self.mean[1]), at(&self.slope));
-            let (inv_sx, inv_sy) = (at(&self.inv_sx), at(&self.inv_sy));
-            let reach = at(&self.reach).sqrt();
-            let tall = reach / inv_sy;
+            let (mean_x, mean_y, shear) =
+                (at(&self.mean[0]), at(&self.mean[1]), at(&self.conic_shear));
+            let (conic_x, conic_y) = (at(&self.conic_x), at(&self.conic_y));
+            let radius = at(&self.power_max).sqrt();
+            let tall = radius / conic_y;
             let bounded = |value: Wide<S>| value.max(zero - far).min(far);
             let top = bounded(mean_y - tall - half).ceil().max(zero);
             let bottom = bounded(mean_y + tall - half).floor().min(last_row);
-            let across = reach / inv_sx;
-            let lean = slope * tall;
+            let across = radius / conic_x;
+            let lean = shear * tall;
             let peak = lean / (across * across + lean * lean).sqrt();
-            let per_tall = inv_sy / reach;
+            let per_tall = conic_y / radius;
             let first_row = (top * per_tile).floor();
             let end_row = ((bottom * per_tile).floor() + one).only(bottom.at_least(top));
             first_row.put(&mut self.rows[0], i);
@@ -217,8 +218,8 @@ impl Ellipses {
 #[inline]
 pub fn touched_tiles(footprint: &Footprint, grid: &Grid, mut touch: impl FnMut(u32, Range<u32>)) {
     let [mean_x, mean_y] = footprint.mean;
-    let reach = f64::from(footprint.reach).sqrt();
-    let tall = reach / f64::from(footprint.inv_sy);
+    let radius = f64::from(footprint.power_max).sqrt();
+    let tall = radius / f64::from(footprint.conic_y);
     let first_row = i64::from(grid.tile_rows.start * TILE_SIZE);
     let last_row = i64::from((grid.tile_rows.end * TILE_SIZE).min(grid.height)) - 1;
     let top = ceil(mean_y - tall - 0.5).max(first_row);
@@ -226,12 +227,12 @@ pub fn touched_tiles(footprint: &Footprint, grid: &Grid, mut touch: impl FnMut(u
     if top > bottom {
         return;
     }
-    let across = reach / f64::from(footprint.inv_sx);
-    let lean = footprint.slope * tall;
+    let across = radius / f64::from(footprint.conic_x);
+    let lean = footprint.conic_shear * tall;
     // Height, over `tall`, of the rightmost point of the ellipse; the leftmost is at -peak.
     let peak = lean / (across * across + lean * lean).sqrt();
     let half_width = |share: f64| (1.0 - share * share).max(0.0).sqrt() * across;
-    let per_tall = f64::from(footprint.inv_sy) / reach;
+    let per_tall = f64::from(footprint.conic_y) / radius;
     let last_column = i64::from(grid.width) - 1;
     let tile = i64::from(TILE_SIZE);
     for tile_y in top / tile..=bottom / tile {
@@ -275,7 +276,7 @@ fn ceil(v: f64) -> i64 {
 #[cfg(test)]
 mod tests {
     use super::{
-        super::lanes::{Kernel, Width},
+        super::lanes::{LaneKernel, Width},
         *,
     };
 
@@ -291,7 +292,7 @@ mod tests {
 
     struct Asked<'a>(&'a [Footprint], &'a Grid, &'a mut Vec<(TileSpans, u32)>);
 
-    impl Kernel for Asked<'_> {
+    impl LaneKernel for Asked<'_> {
         #[inline(always)]
         fn run<S: Lanes>(self, simd: S) {
             let Self(footprints, grid, answers) = self;
@@ -317,10 +318,10 @@ mod tests {
                 let far = if i % 97 == 0 { 1e12 } else { 1.0 };
                 Footprint {
                     mean: [(turn(3) * 300.0 - 50.0) * far, turn(9) * 250.0 - 50.0],
-                    slope: turn(12) * 8.0 - 4.0,
-                    inv_sx: (0.002 + turn(17)) as f32,
-                    inv_sy: (0.004 + turn(21) * turn(2)) as f32,
-                    reach: (turn(6) * 5.5) as f32,
+                    conic_shear: turn(12) * 8.0 - 4.0,
+                    conic_x: (0.002 + turn(17)) as f32,
+                    conic_y: (0.004 + turn(21) * turn(2)) as f32,
+                    power_max: (turn(6) * 5.5) as f32,
                     ..Footprint::default()
                 }
             })
@@ -354,10 +355,10 @@ mod tests {
             let turn = |k: u32| f64::from((i.wrapping_mul(2_654_435_761) >> k) & 0xff) / 255.0;
             let footprint = Footprint {
                 mean: [turn(3) * 300.0 - 50.0, turn(9) * 250.0 - 50.0],
-                slope: turn(12) * 8.0 - 4.0,
-                inv_sx: (0.01 + turn(17)) as f32,
-                inv_sy: (0.02 + turn(21) * turn(2)) as f32,
-                reach: (turn(6) * 5.5) as f32,
+                conic_shear: turn(12) * 8.0 - 4.0,
+                conic_x: (0.01 + turn(17)) as f32,
+                conic_y: (0.02 + turn(21) * turn(2)) as f32,
+                power_max: (turn(6) * 5.5) as f32,
                 ..Footprint::default()
             };
             let mut touched = vec![false; grid.tile_count() as usize];
@@ -382,13 +383,13 @@ mod tests {
             assert_eq!(spans.count(&footprint, &band) as usize, in_band, "band of {footprint:?}");
             let power = |x: f64, y: f64| {
                 let (dx, dy) = (x - footprint.mean[0], y - footprint.mean[1]);
-                (f64::from(footprint.inv_sx) * (dx - footprint.slope * dy)).powi(2)
-                    + (f64::from(footprint.inv_sy) * dy).powi(2)
+                (f64::from(footprint.conic_x) * (dx - footprint.conic_shear * dy)).powi(2)
+                    + (f64::from(footprint.conic_y) * dy).powi(2)
             };
             for y in 0..grid.height {
                 for x in 0..grid.width {
                     let inside =
-                        power(f64::from(x) + 0.5, f64::from(y) + 0.5) < footprint.reach.into();
+                        power(f64::from(x) + 0.5, f64::from(y) + 0.5) < footprint.power_max.into();
                     let tile = y / TILE_SIZE * grid.tiles_x() + x / TILE_SIZE;
                     assert!(
                         !inside || touched[tile as usize],
@@ -403,7 +404,7 @@ mod tests {
                     (0..=32).any(|k| {
                         let x = f64::from(tx * TILE_SIZE) + f64::from(k) * 0.5;
                         let y = f64::from(ty * TILE_SIZE) + f64::from(j) * 0.5;
-                        power(x, y) < f64::from(footprint.reach) * 1.05 + 1.5
+                        power(x, y) < f64::from(footprint.power_max) * 1.05 + 1.5
                     })
                 });
                 assert!(near, "tile {tx},{ty} is far from {footprint:?}");

@@ -46,7 +46,7 @@ pub struct ViewRow {
     pub blend_start: u32,
     pub label_rows: u32,
     pub table_start: u32,
-    pub entry_slots: u32,
+    pub weight_slots: u32,
     pub slot_start: u32,
     pub range_start: u32,
     pub pair_start: u32,
@@ -72,10 +72,10 @@ pub struct GaussianRow {
 #[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
 pub struct FootprintRow {
     pub mean: [f32; 2],
-    pub slope: f32,
-    pub inv_sx: f32,
-    pub inv_sy: f32,
-    pub reach: f32,
+    pub conic_shear: f32,
+    pub conic_x: f32,
+    pub conic_y: f32,
+    pub power_max: f32,
     pub opacity: f32,
     pub depth: f32,
 }
@@ -191,7 +191,7 @@ impl Slot {
 
 /// Gaussians on the device.
 #[derive(Clone, Debug)]
-pub(super) struct Scene {
+pub(super) struct DeviceScene {
     shape: u64,
     /// Number of Gaussians.
     pub(super) count: u32,
@@ -204,12 +204,12 @@ pub(super) struct Scene {
     /// Least and largest mean by axis, relative to the origin.
     pub(super) bounds: [DVec3; 2],
     /// Uploaded when labels are first asked for.
-    labels: Option<SceneLabels>,
+    labels: Option<DeviceLabels>,
 }
 
 /// Bank indices on the device.
 #[derive(Clone, Debug)]
-pub(super) struct SceneLabels {
+pub(super) struct DeviceLabels {
     identity: u64,
     /// `[N]` u16, two a word.
     pub(super) index: wgpu::Buffer,
@@ -217,7 +217,7 @@ pub(super) struct SceneLabels {
     pub(super) distinct: u32,
 }
 
-impl SceneLabels {
+impl DeviceLabels {
     fn upload(gpu: &Gpu, source: &Gaussians) -> Result<Self> {
         let index = source.semantic_index();
         let mut seen = vec![false; 1 << u16::BITS];
@@ -231,7 +231,7 @@ impl SceneLabels {
     }
 }
 
-impl Scene {
+impl DeviceScene {
     fn size_bytes(&self) -> u64 {
         let labels = self.labels.as_ref().map_or(0, |labels| labels.index.size());
         self.gaussians.size() + self.sh.size() + labels
@@ -266,7 +266,7 @@ impl Scene {
 /// Scenes kept on the device, most recently drawn last.
 #[derive(Debug)]
 pub(super) struct SceneCache {
-    scenes: Vec<Scene>,
+    scenes: Vec<DeviceScene>,
     bytes_max: u64,
 }
 
@@ -279,23 +279,23 @@ impl SceneCache {
     ///
     /// # Errors
     /// `limit_exceeded` when the scene does not fit the adapter's limits or memory.
-    pub(super) fn get(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<Scene> {
+    pub(super) fn get(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<DeviceScene> {
         let shape = source.shape_identity();
         if let Some(at) = self.scenes.iter().position(|scene| scene.shape == shape) {
             let scene = self.scenes.remove(at);
             self.scenes.push(scene.clone());
             return Ok(scene);
         }
-        let scene = match Scene::upload(gpu, source) {
+        let scene = match DeviceScene::upload(gpu, source) {
             // Memory may be held by the other scenes: once without them.
             Err(error) if error.code() == ErrorCode::LimitExceeded && !self.scenes.is_empty() => {
                 self.scenes.clear();
                 gpu.forget();
-                Scene::upload(gpu, source)?
+                DeviceScene::upload(gpu, source)?
             }
             other => other?,
         };
-        let held = |scenes: &[Scene]| scenes.iter().map(Scene::size_bytes).sum::<u64>();
+        let held = |scenes: &[DeviceScene]| scenes.iter().map(DeviceScene::size_bytes).sum::<u64>();
         while !self.scenes.is_empty() && held(&self.scenes) + scene.size_bytes() > self.bytes_max {
             self.scenes.remove(0);
             gpu.forget();
@@ -308,14 +308,14 @@ impl SceneCache {
     ///
     /// # Errors
     /// As [`Self::get`].
-    pub(super) fn labels(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<SceneLabels> {
+    pub(super) fn labels(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<DeviceLabels> {
         let shape = source.shape_identity();
         let scene = self.scenes.iter_mut().find(|scene| scene.shape == shape);
         let held = scene.as_ref().and_then(|scene| scene.labels.as_ref());
         if let Some(labels) = held.filter(|labels| labels.identity == source.identity()) {
             return Ok(labels.clone());
         }
-        let labels = SceneLabels::upload(gpu, source)?;
+        let labels = DeviceLabels::upload(gpu, source)?;
         if let Some(scene) = scene {
             scene.labels = Some(labels.clone());
         }

@@ -3,10 +3,11 @@
 //! A software adapter (llvmpipe, lavapipe, `SwiftShader`) is taken only when asked for by name.
 
 use std::sync::{
-    Arc, Mutex, PoisonError,
+    Arc,
     atomic::{AtomicBool, AtomicU64, Ordering},
 };
 
+use parking_lot::Mutex;
 use wgpu::{BufferUsages, ErrorFilter};
 
 use super::profile;
@@ -129,7 +130,7 @@ struct Faults {
 
 impl Faults {
     fn report(&self, message: String) {
-        self.message.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(message);
+        self.message.lock().get_or_insert(message);
     }
 }
 
@@ -236,7 +237,7 @@ impl Gpu {
     /// # Errors
     /// `gpu_unavailable` when the device is lost, `internal` for any other fault.
     pub(super) fn check(&self) -> Result<()> {
-        let message = self.faults.message.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let message = self.faults.message.lock().take();
         if self.is_lost() {
             return Err(Error::new(ErrorCode::GpuUnavailable, "the GPU device was lost")
                 .caused_by(message.unwrap_or_default()));

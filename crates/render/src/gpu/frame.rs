@@ -7,7 +7,7 @@ use bytemuck::Pod;
 use rayon::prelude::*;
 
 use super::{
-    buffers::{PlanRow, Scene, SceneLabels, ViewRow},
+    buffers::{DeviceLabels, DeviceScene, PlanRow, ViewRow},
     device::Gpu,
     pipelines::{FAST_KEY_BITS, Kernels, NO_PICTURE},
     profile::Marks,
@@ -18,10 +18,10 @@ use super::{
     scratch::{ENTRY_SLOTS_MIN, Need, Scratch},
 };
 use crate::{
-    Entries, Frame, FrameStats, Kinds, Labels, Quality, RenderRequest, StageTime,
+    DispatchTime, Frame, FrameStats, Kinds, Labels, PixelWeights, Quality, RenderRequest,
     constants::TILE_SIZE,
     error::{Error, Result},
-    labels::{BLEND_WIDTH, EntryRows},
+    labels::{BLEND_WIDTH, WeightRows},
     view::View,
 };
 
@@ -29,7 +29,7 @@ use crate::{
 const ISECT_CAPACITY_MIN: u32 = 1 << 16;
 /// Times a band is drawn: the first may lack room, the second knows what it needs.
 const ATTEMPTS_MAX: u32 = 3;
-/// How much more room for entries is made when it does not suffice.
+/// How much more room for weights is made when it does not suffice.
 const ENTRY_SLOTS_GROWTH: u32 = 4;
 /// Bytes of a tile pair: key and Gaussian, each in two halves.
 const PAIR_BYTES_A_BUFFER: u64 = 8;
@@ -47,7 +47,7 @@ pub(super) fn background(view: &View, request: &RenderRequest) -> Frame {
         depth: request.kinds.depth.then(|| vec![0.0; pixels]),
         alpha: request.kinds.alpha.then(|| vec![0.0; pixels]),
         blend: matches!(request.labels, Labels::Blend(_)).then(|| vec![[0.0; 4]; pixels]),
-        entries: (request.labels == Labels::Entries).then(|| Entries::none(pixels)),
+        weights: (request.labels == Labels::Weights).then(|| PixelWeights::none(pixels)),
         stats: FrameStats::default(),
     }
 }
@@ -64,7 +64,7 @@ struct Layout {
     fast: bool,
     /// Pixels of the band.
     pixels: u64,
-    /// Entries a pixel has room for; 0 where none are wanted.
+    /// Weights a pixel has room for; 0 where none are wanted.
     slots: u32,
     tiles: u32,
 }
@@ -86,7 +86,7 @@ enum Outcome {
     Drawn,
     /// So many tile pairs are too many for one band.
     Pairs(u32),
-    /// A pixel has more entries than room; there is more room now.
+    /// A pixel has more weights than room; there is more room now.
     Slots,
 }
 
@@ -98,7 +98,7 @@ struct Ended {
     /// Tile pairs that there are.
     needed: u32,
     drawn: bool,
-    /// Entries a pixel to make room for, where there were more than room.
+    /// Weights a pixel to make room for, where there were more than room.
     more_slots: Option<u32>,
     /// Digits of depth that the device found; of the first view, those of all.
     passes: u32,
@@ -109,13 +109,13 @@ pub(super) struct Tools<'a> {
     pub(super) gpu: &'a Gpu,
     pub(super) kernels: &'a Kernels,
     pub(super) scratch: &'a mut Scratch,
-    pub(super) scene: &'a Scene,
+    pub(super) scene: &'a DeviceScene,
     /// The scene's bank indices, where labels are wanted.
-    pub(super) labels: Option<&'a SceneLabels>,
+    pub(super) labels: Option<&'a DeviceLabels>,
     pub(super) isects_max: u32,
     pub(super) marks: Option<&'a mut Marks>,
     /// Times of the last submission, where marks are set.
-    pub(super) times: Vec<StageTime>,
+    pub(super) times: Vec<DispatchTime>,
 }
 
 /// A frame being drawn, band by band from top to bottom.
@@ -126,14 +126,14 @@ pub(super) struct Drawing<'a> {
     kinds: Kinds,
     wanted: &'a Labels,
     frame: Frame,
-    /// Entries of the bands drawn.
-    entries: Vec<EntryRows>,
-    /// Most entries of a pixel in them.
-    entries_max: u32,
+    /// Weights of the bands drawn.
+    weights: Vec<WeightRows>,
+    /// Most weights of a pixel in them.
+    weights_max: u32,
 }
 
 impl<'a> Drawing<'a> {
-    pub(super) fn new(view: &View, request: &'a RenderRequest, scene: &Scene) -> Self {
+    pub(super) fn new(view: &View, request: &'a RenderRequest, scene: &DeviceScene) -> Self {
         let mut row = ViewRow::new(view, request.background, request.antialiased);
         row.fast = u32::from(request.quality == Quality::Fast);
         (row.gaussian_count, row.sh_count) = (scene.count, scene.sh_count);
@@ -146,7 +146,7 @@ impl<'a> Drawing<'a> {
             depth: kinds.depth.then(|| Vec::with_capacity(pixels)),
             alpha: kinds.alpha.then(|| Vec::with_capacity(pixels)),
             blend: matches!(request.labels, Labels::Blend(_)).then(|| Vec::with_capacity(pixels)),
-            entries: None,
+            weights: None,
             stats: FrameStats::default(),
         };
         let wanted = &request.labels;
@@ -155,15 +155,15 @@ impl<'a> Drawing<'a> {
             bits = bits.min(FAST_KEY_BITS);
         }
         let digits = bits.div_ceil(DIGIT_BITS).max(1);
-        Self { row, digits, kinds, wanted, frame, entries: Vec::new(), entries_max: 0 }
+        Self { row, digits, kinds, wanted, frame, weights: Vec::new(), weights_max: 0 }
     }
 
     /// The frame of all bands.
     pub(super) fn finish(mut self, scratch: &mut Scratch) -> Result<Frame> {
-        if *self.wanted == Labels::Entries {
+        if *self.wanted == Labels::Weights {
             // The next view needs about as much; one odd view makes room for itself alone.
-            scratch.entry_slots = self.entries_max.next_power_of_two().max(ENTRY_SLOTS_MIN);
-            self.frame.entries = Some(Entries::join(self.entries)?);
+            scratch.weight_slots = self.weights_max.next_power_of_two().max(ENTRY_SLOTS_MIN);
+            self.frame.weights = Some(WeightRows::join(self.weights)?);
         }
         Ok(self.frame)
     }
@@ -214,20 +214,20 @@ impl<'a> Drawing<'a> {
             return Ended { needed, drawn: false, more_slots: None, passes };
         }
         let counts = &slots[..slots.len().min(layout.pixels as usize)];
-        let entries = counts.iter().copied().max().unwrap_or(0);
-        if entries > layout.slots {
+        let weights = counts.iter().copied().max().unwrap_or(0);
+        if weights > layout.slots {
             let more_slots = Some(layout.slots.saturating_mul(ENTRY_SLOTS_GROWTH));
             return Ended { needed, drawn: false, more_slots, passes };
         }
         self.store(layout, pictures, slots);
-        self.entries_max = self.entries_max.max(entries);
+        self.weights_max = self.weights_max.max(weights);
         let stats = &mut self.frame.stats;
         stats.visible = stats.visible.max(u64::from(plan.visible));
         stats.intersections += u64::from(plan.isects);
         Ended { needed, drawn: true, more_slots: None, passes }
     }
 
-    /// Takes the pictures and entries of a band out of what was read back.
+    /// Takes the pictures and weights of a band out of what was read back.
     fn store(&mut self, layout: &Layout, pictures: &[u8], slots: &[u32]) {
         let pixels = layout.pixels as usize;
         let part = |start: u32, words: usize| {
@@ -259,7 +259,7 @@ impl<'a> Drawing<'a> {
             append(blend, part(layout.blend, BLEND_WIDTH), |row| row);
         }
         if layout.slots > 0 {
-            self.entries.push(entry_rows(slots, layout, self.row.width as usize));
+            self.weights.push(weight_rows(slots, layout, self.row.width as usize));
         }
     }
 }
@@ -267,7 +267,7 @@ impl<'a> Drawing<'a> {
 impl Tools<'_> {
     /// Draws the tile rows `rows`; halves them while they are over a limit of the adapter.
     pub(super) fn rows(&mut self, drawing: &mut Drawing<'_>, rows: Range<u32>) -> Result<()> {
-        let layout = drawing.layout(&rows, self.entry_slots(drawing));
+        let layout = drawing.layout(&rows, self.weight_slots(drawing));
         let single = rows.end - rows.start == 1;
         let bytes = layout.picture_bytes() + layout.slot_bytes();
         let bytes_max = self.gpu.binding_bytes_max - PLAN_BYTES;
@@ -296,7 +296,7 @@ impl Tools<'_> {
     pub(super) fn together(&mut self, drawings: &mut [Drawing<'_>]) -> Result<Vec<bool>> {
         let layouts: Vec<_> = drawings
             .iter()
-            .map(|drawing| drawing.layout(&drawing.whole(), self.entry_slots(drawing)))
+            .map(|drawing| drawing.layout(&drawing.whole(), self.weight_slots(drawing)))
             .collect();
         let sum = |bytes: fn(&Layout) -> u64| layouts.iter().map(bytes).sum::<u64>();
         let bytes = sum(Layout::picture_bytes) + sum(Layout::slot_bytes);
@@ -310,10 +310,12 @@ impl Tools<'_> {
         Ok(ended.into_iter().map(|(_, drawn)| drawn).collect())
     }
 
-    /// Entries to make room for: as many as the last views needed, never more than there can be.
-    fn entry_slots(&self, drawing: &Drawing<'_>) -> u32 {
+    /// Weights to make room for: as many as the last views needed, never more than there can be.
+    fn weight_slots(&self, drawing: &Drawing<'_>) -> u32 {
         match (drawing.wanted, self.labels) {
-            (Labels::Entries, Some(labels)) => self.scratch.entry_slots.min(labels.distinct.max(1)),
+            (Labels::Weights, Some(labels)) => {
+                self.scratch.weight_slots.min(labels.distinct.max(1))
+            }
             _ => 0,
         }
     }
@@ -391,7 +393,7 @@ impl Tools<'_> {
                 blend_start: after(layout.blend),
                 label_rows: drawing.table().len() as u32,
                 table_start: table.len() as u32,
-                entry_slots: layout.slots,
+                weight_slots: layout.slots,
                 slot_start: slot_words as u32,
                 range_start: ranges,
                 pair_start: pair_half + i as u32 * capacity,
@@ -433,7 +435,7 @@ impl Tools<'_> {
             SceneBuffers { gaussians: &scene.gaussians, sh: &scene.sh, sh_count: scene.sh_count };
         let labels = match (drawings.first().map(|drawing| drawing.wanted), self.labels) {
             (Some(Labels::Blend(_)), Some(labels)) => LabelBuffers::Blend { index: &labels.index },
-            (Some(Labels::Entries), Some(labels)) => LabelBuffers::Entries { index: &labels.index },
+            (Some(Labels::Weights), Some(labels)) => LabelBuffers::Weights { index: &labels.index },
             _ => LabelBuffers::None,
         };
         let bindings = &mut self.scratch.bindings;
@@ -493,7 +495,7 @@ impl Tools<'_> {
         let most_isects = ended.iter().map(|ended| ended.needed).max().unwrap_or(0);
         let more_slots = ended.iter().filter_map(|ended| ended.more_slots).max();
         self.scratch.isects = most_isects;
-        self.scratch.entry_slots = more_slots.unwrap_or(self.scratch.entry_slots);
+        self.scratch.weight_slots = more_slots.unwrap_or(self.scratch.weight_slots);
         Ok(ended.into_iter().map(|ended| (ended.needed, ended.drawn)).collect())
     }
 }
@@ -514,10 +516,10 @@ fn append<F: Pod + Send + Sync, T: Send>(
     }
 }
 
-/// The entries of a band's pixels, ascending, out of its slots.
-fn entry_rows(slots: &[u32], layout: &Layout, width: usize) -> EntryRows {
+/// The weights of a band's pixels, ascending, out of its slots.
+fn weight_rows(slots: &[u32], layout: &Layout, width: usize) -> WeightRows {
     let pixels = layout.pixels as usize;
-    let mut rows = EntryRows::new(pixels / width, width);
+    let mut rows = WeightRows::new(pixels / width, width);
     let mut pixel = Vec::with_capacity(layout.slots as usize);
     for (i, &count) in slots[..pixels].iter().enumerate() {
         let plane = |slot: usize| pixels * (1 + slot) + i;

@@ -7,6 +7,7 @@
 //! submission. Nothing here ends the process: faults are errors, and what was being drawn when a
 //! device was lost is drawn on a new one.
 
+mod adapter;
 pub mod buffers;
 mod device;
 mod frame;
@@ -17,11 +18,10 @@ mod readback;
 mod recorder;
 mod scratch;
 pub mod stages;
-mod station;
 
 use std::path::PathBuf;
 
-use self::station::{Engine, Station};
+use self::adapter::{Adapter, Context};
 use super::{
     DeviceTimes, Frame, RenderRequest, Renderer, constants::ISECTS_MAX, select::AdapterReport,
     skip::Skip, view::View,
@@ -78,7 +78,7 @@ impl Default for GpuOptions {
 /// Renders with compute shaders on one or more devices, which callers share.
 #[derive(Debug)]
 pub struct GpuRenderer {
-    stations: Vec<Station>,
+    adapters: Vec<Adapter>,
 }
 
 impl GpuRenderer {
@@ -91,10 +91,10 @@ impl GpuRenderer {
     pub fn open(options: &GpuOptions) -> (Vec<AdapterReport>, Result<Self>) {
         let (mut reports, chosen) = device::choose(options.adapter.as_deref());
         let opened = chosen.and_then(|chosen| {
-            let (mut stations, mut refused) = (Vec::new(), None);
+            let (mut adapters, mut refused) = (Vec::new(), None);
             for (adapter, report) in chosen {
-                match Station::open(adapter, report.clone(), options) {
-                    Ok(station) => stations.push(station),
+                match Adapter::open(adapter, report.clone(), options) {
+                    Ok(adapter) => adapters.push(adapter),
                     Err(error) => {
                         tracing::warn!(
                             adapter = report.name,
@@ -108,8 +108,8 @@ impl GpuRenderer {
                 }
             }
             match refused {
-                Some(error) if stations.is_empty() => Err(error),
-                _ => Ok(Self { stations }),
+                Some(error) if adapters.is_empty() => Err(error),
+                _ => Ok(Self { adapters }),
             }
         });
         (reports, opened)
@@ -118,47 +118,47 @@ impl GpuRenderer {
     /// The first adapter in use.
     #[must_use]
     pub fn adapter(&self) -> &AdapterReport {
-        self.stations[0].adapter()
+        self.adapters[0].adapter()
     }
 
     /// Devices in use.
     #[must_use]
     pub fn devices(&self) -> usize {
-        self.stations.len()
+        self.adapters.len()
     }
 
     /// Scenes kept on all devices now.
     #[must_use]
     pub fn scenes_held(&self) -> usize {
-        self.stations.iter().map(Station::scenes_held).sum()
+        self.adapters.iter().map(Adapter::scenes_held).sum()
     }
 
     /// Submissions so far, and views drawn by them.
     #[must_use]
     pub fn submissions(&self) -> (u64, u64) {
-        let both = self.stations.iter().map(Station::submissions);
+        let both = self.adapters.iter().map(Adapter::submissions);
         both.fold((0, 0), |sum, one| (sum.0 + one.0, sum.1 + one.1))
     }
 
     /// Has every device seen as lost at once, whatever runs on it; the adapters stay. For tests of
     /// the recovery.
     pub fn lose_devices(&self) {
-        self.stations.iter().for_each(Station::lose_device);
+        self.adapters.iter().for_each(Adapter::lose_device);
     }
 
     /// The device to draw `gaussians` on: the one that holds them, unless it has a submission's
     /// worth of views more to draw than the one with the fewest.
-    fn station(&self, gaussians: &Gaussians) -> &Station {
-        let least = self.stations.iter().min_by_key(|station| station.waiting());
-        let least = least.unwrap_or(&self.stations[0]);
+    fn adapter_for(&self, gaussians: &Gaussians) -> &Adapter {
+        let least = self.adapters.iter().min_by_key(|adapter| adapter.waiting());
+        let least = least.unwrap_or(&self.adapters[0]);
         let shape = gaussians.shape_identity();
         let room = least.waiting() + pipelines::VIEWS_MAX as usize;
-        let holds = |station: &&Station| station.holds(shape) && station.waiting() <= room;
-        self.stations.iter().find(holds).unwrap_or(least)
+        let holds = |adapter: &&Adapter| adapter.holds(shape) && adapter.waiting() <= room;
+        self.adapters.iter().find(holds).unwrap_or(least)
     }
 
-    fn with_engine<T>(&self, work: impl FnOnce(&mut Engine) -> Result<T>) -> Result<T> {
-        self.stations[0].with_engine(work)
+    fn with_context<T>(&self, work: impl FnOnce(&mut Context) -> Result<T>) -> Result<T> {
+        self.adapters[0].with_context(work)
     }
 }
 
@@ -169,7 +169,7 @@ impl Renderer for GpuRenderer {
 
     /// For every device the views of each submission under way, and those of the next one.
     fn concurrency(&self) -> usize {
-        self.stations.len() * (pool::TURNS + 1) * pipelines::VIEWS_MAX as usize
+        self.adapters.len() * (pool::SUBMISSIONS_MAX + 1) * pipelines::VIEWS_MAX as usize
     }
 
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
@@ -177,12 +177,12 @@ impl Renderer for GpuRenderer {
         if gaussians.is_empty() {
             return Ok(frame::background(&view, request));
         }
-        let station = self.station(gaussians);
-        match station.render(gaussians, request) {
+        let adapter = self.adapter_for(gaussians);
+        match adapter.render(gaussians, request) {
             // Lost for good: the others serve.
             Err(error) if error.code() == ErrorCode::GpuUnavailable => {
-                let other = |other: &&Station| !std::ptr::eq(*other, station);
-                match self.stations.iter().find(other) {
+                let other = |other: &&Adapter| !std::ptr::eq(*other, adapter);
+                match self.adapters.iter().find(other) {
                     Some(other) => other.render(gaussians, request),
                     None => Err(error),
                 }
@@ -199,6 +199,6 @@ impl Renderer for GpuRenderer {
         if gaussians.is_empty() {
             return Ok(None);
         }
-        self.station(gaussians).device_times(gaussians, request)
+        self.adapter_for(gaussians).device_times(gaussians, request)
     }
 }

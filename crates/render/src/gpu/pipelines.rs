@@ -100,7 +100,7 @@ pub const SHADERS: [Shader; 9] = [
     shader!("tile_ranges"),
     shader!("rasterize", "labels_none"),
     shader!("rasterize", "labels_index", "labels_blend"),
-    shader!("rasterize", "labels_index", "labels_entries"),
+    shader!("rasterize", "labels_index", "labels_weights"),
 ];
 
 /// Kernels, in the order of [`KERNELS`].
@@ -131,7 +131,7 @@ pub(super) struct Raster {
 pub(super) enum RasterLabels {
     None,
     Blend,
-    Entries,
+    Weights,
 }
 
 /// Name in measurements, place in [`SHADERS`] and entry point of every kernel but rasterize; those

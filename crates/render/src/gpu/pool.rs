@@ -9,11 +9,13 @@
 use std::{
     collections::VecDeque,
     sync::{
-        Arc, Condvar, Mutex, MutexGuard, PoisonError,
+        Arc,
         atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     time::{Duration, Instant},
 };
+
+use parking_lot::{Condvar, Mutex};
 
 use crate::{
     Frame, Kinds, RenderRequest,
@@ -22,28 +24,28 @@ use crate::{
 
 /// Callers that draw at once: the pictures of one submission are copied and the next is recorded
 /// while the device draws the other. Three were slower on an H200, their submissions too small.
-pub(super) const TURNS: usize = 2;
+pub(super) const SUBMISSIONS_MAX: usize = 2;
 /// How long a caller waits for others of the crowd to come again: well under what a submission of
 /// its own would cost them.
 const GATHER: Duration = Duration::from_micros(150);
 
 /// One request in the queue.
 #[derive(Debug)]
-pub(super) struct Job {
+pub(super) struct QueuedView {
     /// [`crate::scene::Gaussians::identity`] of the scene.
     scene: u64,
     pub(super) request: RenderRequest,
     answer: Mutex<Option<Result<Frame>>>,
     /// Told when there is an answer, or the turn to draw.
     changed: Condvar,
-    /// Whether it is its caller's turn.
+    /// Whether it is its caller's batch.
     leads: AtomicBool,
     /// Callers that have not taken the answer yet; with none left it is gone.
     takers: AtomicUsize,
     answered: AtomicBool,
 }
 
-impl Job {
+impl QueuedView {
     /// Whether the other's answer would be this one's.
     fn equals(&self, scene: u64, request: &RenderRequest) -> bool {
         self.scene == scene && self.request == *request
@@ -60,7 +62,7 @@ impl Job {
     }
 
     pub(super) fn answer(&self, answer: Result<Frame>) {
-        *lock(&self.answer) = Some(answer);
+        *self.answer.lock() = Some(answer);
         self.answered.store(true, Ordering::Release);
         self.changed.notify_all();
     }
@@ -73,26 +75,26 @@ impl Job {
 
     fn lead(&self) {
         // Under the lock, so that nobody looks before it and waits after it.
-        let _answer = lock(&self.answer);
+        let _answer = self.answer.lock();
         self.leads.store(true, Ordering::Release);
         self.changed.notify_all();
     }
 
     /// Waits for the answer, or the turn of the caller that brought the request; which of them.
     fn wait(&self, mine: bool) -> bool {
-        let mut answer = lock(&self.answer);
+        let mut answer = self.answer.lock();
         while answer.is_none() {
             if mine && self.leads.load(Ordering::Acquire) {
                 return true;
             }
-            answer = self.changed.wait(answer).unwrap_or_else(PoisonError::into_inner);
+            self.changed.wait(&mut answer);
         }
         false
     }
 
     /// The answer, for one of those who share it; the last of them gets it itself.
     fn take(&self) -> Result<Frame> {
-        let mut answer = lock(&self.answer);
+        let mut answer = self.answer.lock();
         if self.takers.fetch_sub(1, Ordering::AcqRel) == 1 {
             return answer.take().unwrap_or_else(|| Err(Error::internal("no answer was given")));
         }
@@ -105,76 +107,77 @@ impl Job {
 }
 
 #[derive(Debug, Default)]
-struct Waiting {
+struct ViewsWaiting {
     /// In the order of arrival.
-    jobs: VecDeque<Arc<Job>>,
+    views: VecDeque<Arc<QueuedView>>,
     /// Being drawn.
-    drawn: Vec<Arc<Job>>,
-    /// Callers whose turn it is. There are [`TURNS`] while anyone waits for one.
-    turns: usize,
+    drawn: Vec<Arc<QueuedView>>,
+    /// Callers whose turn it is. There are [`SUBMISSIONS_MAX`] while anyone waits for one.
+    submissions: usize,
     /// Requests at once, lately.
     crowd: usize,
 }
 
-impl Waiting {
+impl ViewsWaiting {
     fn len(&self) -> usize {
-        self.jobs.len() + self.drawn.len()
+        self.views.len() + self.drawn.len()
     }
 
-    /// Gives free turns to those who have waited longest, but for those who will be drawn with one
+    /// Gives free submissions to those who have waited longest, but for those who will be drawn with one
     /// whose turn it is already.
-    fn hand_on(&mut self) {
-        while self.turns < TURNS {
-            let leads = |job: &&Arc<Job>| job.leads.load(Ordering::Acquire);
-            let joins = |job: &Arc<Job>| self.jobs.iter().filter(leads).any(|led| led.joins(job));
-            let next = self.jobs.iter().find(|job| !leads(job) && !joins(job));
-            let Some(job) = next else { break };
-            self.turns += 1;
-            job.lead();
+    fn start_next(&mut self) {
+        while self.submissions < SUBMISSIONS_MAX {
+            let leads = |view: &&Arc<QueuedView>| view.leads.load(Ordering::Acquire);
+            let joins =
+                |view: &Arc<QueuedView>| self.views.iter().filter(leads).any(|led| led.joins(view));
+            let next = self.views.iter().find(|view| !leads(view) && !joins(view));
+            let Some(view) = next else { break };
+            self.submissions += 1;
+            view.lead();
         }
     }
 }
 
 /// The requests of one device.
 #[derive(Debug)]
-pub(super) struct Queue {
-    waiting: Mutex<Waiting>,
+pub(super) struct ViewQueue {
+    waiting: Mutex<ViewsWaiting>,
     /// Told when a request has come.
     arrived: Condvar,
     waiting_max: usize,
 }
 
 /// One caller's drawing; its end, also by a panic, leaves nobody waiting for ever.
-struct Turn<'a> {
-    queue: &'a Queue,
-    batch: Vec<Arc<Job>>,
+struct ActiveBatch<'a> {
+    queue: &'a ViewQueue,
+    batch: Vec<Arc<QueuedView>>,
 }
 
-impl Drop for Turn<'_> {
+impl Drop for ActiveBatch<'_> {
     fn drop(&mut self) {
-        let open = |job: &&Arc<Job>| !job.answered.load(Ordering::Acquire);
-        for job in self.batch.iter().filter(open) {
-            job.answer(Err(Error::internal("a drawing was broken off")));
+        let open = |view: &&Arc<QueuedView>| !view.answered.load(Ordering::Acquire);
+        for view in self.batch.iter().filter(open) {
+            view.answer(Err(Error::internal("a drawing was broken off")));
         }
-        let mut waiting = lock(&self.queue.waiting);
-        let mine = |job: &Arc<Job>| self.batch.iter().any(|other| Arc::ptr_eq(job, other));
-        waiting.drawn.retain(|job| !mine(job));
-        waiting.turns -= 1;
-        waiting.hand_on();
+        let mut waiting = self.queue.waiting.lock();
+        let mine = |view: &Arc<QueuedView>| self.batch.iter().any(|other| Arc::ptr_eq(view, other));
+        waiting.drawn.retain(|view| !mine(view));
+        waiting.submissions -= 1;
+        waiting.start_next();
     }
 }
 
-impl Queue {
+impl ViewQueue {
     pub(super) fn new(waiting_max: usize) -> Self {
         Self { waiting: Mutex::default(), arrived: Condvar::new(), waiting_max }
     }
 
     /// Requests that wait or are being drawn.
     pub(super) fn len(&self) -> usize {
-        lock(&self.waiting).len()
+        self.waiting.lock().len()
     }
 
-    /// Draws `request` of `scene`, alone or with others: `draw` answers every job it is given, of
+    /// Draws `request` of `scene`, alone or with others: `draw` answers every view it is given, of
     /// which there are at most `views_max`.
     ///
     /// # Errors
@@ -184,31 +187,31 @@ impl Queue {
         scene: u64,
         request: &RenderRequest,
         views_max: usize,
-        draw: impl FnOnce(&[Arc<Job>]),
+        draw: impl FnOnce(&[Arc<QueuedView>]),
     ) -> Result<Frame> {
-        let (job, mine) = self.enter(scene, request)?;
-        if job.wait(mine) {
-            let turn = self.gather(&job, views_max);
-            draw(&turn.batch);
+        let (view, mine) = self.enter(scene, request)?;
+        if view.wait(mine) {
+            let batch = self.gather(&view, views_max);
+            draw(&batch.batch);
         }
-        job.take()
+        view.take()
     }
 
-    /// The job of `request`, and whether it is new.
-    fn enter(&self, scene: u64, request: &RenderRequest) -> Result<(Arc<Job>, bool)> {
-        let mut waiting = lock(&self.waiting);
-        let mut known = waiting.jobs.iter().chain(&waiting.drawn);
-        if let Some(job) = known.find(|job| job.equals(scene, request) && job.share()) {
-            return Ok((Arc::clone(job), false));
+    /// The view of `request`, and whether it is new.
+    fn enter(&self, scene: u64, request: &RenderRequest) -> Result<(Arc<QueuedView>, bool)> {
+        let mut waiting = self.waiting.lock();
+        let mut known = waiting.views.iter().chain(&waiting.drawn);
+        if let Some(view) = known.find(|view| view.equals(scene, request) && view.share()) {
+            return Ok((Arc::clone(view), false));
         }
-        if waiting.jobs.len() >= self.waiting_max {
+        if waiting.views.len() >= self.waiting_max {
             return Err(Error::new(
                 ErrorCode::Overloaded,
-                format!("{} views wait for the GPU already", waiting.jobs.len()),
+                format!("{} views wait for the GPU already", waiting.views.len()),
             )
             .retry_after_s(1));
         }
-        let job = Arc::new(Job {
+        let view = Arc::new(QueuedView {
             scene,
             request: request.clone(),
             answer: Mutex::default(),
@@ -217,46 +220,41 @@ impl Queue {
             takers: AtomicUsize::new(1),
             answered: AtomicBool::new(false),
         });
-        waiting.jobs.push_back(Arc::clone(&job));
+        waiting.views.push_back(Arc::clone(&view));
         waiting.crowd = waiting.crowd.max(waiting.len());
-        waiting.hand_on();
+        waiting.start_next();
         self.arrived.notify_all();
-        Ok((job, true))
+        Ok((view, true))
     }
 
-    /// The requests to draw with `job`, whose turn it is.
-    fn gather(&self, job: &Arc<Job>, views_max: usize) -> Turn<'_> {
-        let fits = |other: &Arc<Job>| {
+    /// The requests to draw with `view`, whose turn it is.
+    fn gather(&self, view: &Arc<QueuedView>, views_max: usize) -> ActiveBatch<'_> {
+        let fits = |other: &Arc<QueuedView>| {
             let led = other.leads.load(Ordering::Acquire);
-            Arc::ptr_eq(other, job) || (!led && job.joins(other))
+            Arc::ptr_eq(other, view) || (!led && view.joins(other))
         };
-        let mut waiting = lock(&self.waiting);
+        let mut waiting = self.waiting.lock();
         // Each turn's share of the crowd, waited for even while the others are being drawn: a
         // submission costs as much as several views.
-        let expected = waiting.crowd.div_ceil(TURNS).min(views_max);
+        let expected = waiting.crowd.div_ceil(SUBMISSIONS_MAX).min(views_max);
         let until = Instant::now() + GATHER;
-        while waiting.jobs.iter().filter(|other| fits(other)).count() < expected {
+        while waiting.views.iter().filter(|other| fits(other)).count() < expected {
             let Some(left) = until.checked_duration_since(Instant::now()) else { break };
-            let woken = self.arrived.wait_timeout(waiting, left);
-            waiting = woken.unwrap_or_else(PoisonError::into_inner).0;
+            self.arrived.wait_for(&mut waiting, left);
         }
-        let mut batch = vec![Arc::clone(job)];
-        waiting.jobs.retain(|other| {
-            let taken = batch.len() < views_max && fits(other) && !Arc::ptr_eq(other, job);
+        let mut batch = vec![Arc::clone(view)];
+        waiting.views.retain(|other| {
+            let taken = batch.len() < views_max && fits(other) && !Arc::ptr_eq(other, view);
             if taken {
                 batch.push(Arc::clone(other));
             }
-            !taken && !Arc::ptr_eq(other, job)
+            !taken && !Arc::ptr_eq(other, view)
         });
         waiting.crowd = waiting.len().max(waiting.crowd.saturating_sub(1)).max(1);
         waiting.drawn.extend_from_slice(&batch);
-        waiting.hand_on();
-        Turn { queue: self, batch }
+        waiting.start_next();
+        ActiveBatch { queue: self, batch }
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 #[cfg(test)]
@@ -272,24 +270,24 @@ mod tests {
         RenderRequest::plain(Camera { intrinsics, camera_to_world }, Kinds::COLOR, near)
     }
 
-    fn frame(job: &Job) -> Frame {
-        Frame { depth: Some(vec![job.request.near]), ..Frame::default() }
+    fn frame(view: &QueuedView) -> Frame {
+        Frame { depth: Some(vec![view.request.near]), ..Frame::default() }
     }
 
     #[test]
     fn waiting_requests_of_a_scene_are_drawn_together_and_equal_ones_once() {
-        let queue = Queue::new(64);
+        let queue = ViewQueue::new(64);
         let batches = Mutex::new(Vec::new());
-        let gate = std::sync::Barrier::new(1 + TURNS);
+        let gate = std::sync::Barrier::new(1 + SUBMISSIONS_MAX);
         std::thread::scope(|scope| {
-            // They hold all turns until everyone else waits.
-            for other in 0..TURNS as u64 {
+            // They hold all submissions until everyone else waits.
+            for other in 0..SUBMISSIONS_MAX as u64 {
                 let (queue, gate) = (&queue, &gate);
                 scope.spawn(move || {
-                    queue.render(90 + other, &request(1.0), 8, |jobs| {
+                    queue.render(90 + other, &request(1.0), 8, |views| {
                         gate.wait();
                         gate.wait();
-                        jobs.iter().for_each(|job| job.answer(Ok(frame(job))));
+                        views.iter().for_each(|view| view.answer(Ok(frame(view))));
                     })
                 });
             }
@@ -300,38 +298,39 @@ mod tests {
                 // The last two views are of another scene.
                 let scene = if i < 4 { 7 } else { 8 };
                 scope.spawn(move || {
-                    let got = queue.render(scene, &request(near), 8, |jobs| {
-                        lock(batches).push(jobs.len());
-                        jobs.iter().for_each(|job| job.answer(Ok(frame(job))));
+                    let got = queue.render(scene, &request(near), 8, |views| {
+                        batches.lock().push(views.len());
+                        views.iter().for_each(|view| view.answer(Ok(frame(view))));
                     });
                     assert_eq!(got.unwrap().depth, Some(vec![near]), "view {i}");
                 });
             }
-            while queue.len() < TURNS + 5 {
+            while queue.len() < SUBMISSIONS_MAX + 5 {
                 std::thread::yield_now();
             }
             // Whoever asks for a view that waits already has joined by now or will find it drawn.
             std::thread::sleep(Duration::from_millis(50));
             gate.wait();
         });
-        let mut batches = lock(&batches).clone();
+        let mut batches = batches.lock().clone();
         batches.sort_unstable();
         assert_eq!(batches, [2, 3], "two scenes, one view of the first wanted twice");
     }
 
     #[test]
     fn a_request_that_was_answered_and_taken_is_drawn_again() {
-        let queue = Queue::new(64);
-        let (gate, again) = (std::sync::Barrier::new(1 + TURNS), AtomicBool::new(false));
-        let draw = |jobs: &[Arc<Job>]| jobs.iter().for_each(|job| job.answer(Ok(frame(job))));
+        let queue = ViewQueue::new(64);
+        let (gate, again) = (std::sync::Barrier::new(1 + SUBMISSIONS_MAX), AtomicBool::new(false));
+        let draw =
+            |views: &[Arc<QueuedView>]| views.iter().for_each(|view| view.answer(Ok(frame(view))));
         std::thread::scope(|scope| {
-            for other in 0..TURNS as u64 {
+            for other in 0..SUBMISSIONS_MAX as u64 {
                 let (queue, gate) = (&queue, &gate);
                 scope.spawn(move || {
-                    queue.render(90 + other, &request(1.0), 8, |jobs| {
+                    queue.render(90 + other, &request(1.0), 8, |views| {
                         gate.wait();
                         gate.wait();
-                        draw(jobs);
+                        draw(views);
                     })
                 });
             }
@@ -342,10 +341,10 @@ mod tests {
                     let (queue, again) = (&queue, &again);
                     let asked = queue.len() + 1;
                     let caller = scope.spawn(move || {
-                        queue.render(7, &request(near), 8, |jobs| {
-                            draw(jobs);
+                        queue.render(7, &request(near), 8, |views| {
+                            draw(views);
                             let begun = Instant::now();
-                            while jobs.len() == 2
+                            while views.len() == 2
                                 && !again.load(Ordering::Acquire)
                                 && begun.elapsed() < Duration::from_secs(5)
                             {
@@ -372,10 +371,10 @@ mod tests {
 
     #[test]
     fn a_full_queue_and_a_broken_drawing_are_errors_for_all_who_wait() {
-        let queue = Queue::new(1);
-        let gate = std::sync::Barrier::new(1 + TURNS);
+        let queue = ViewQueue::new(1);
+        let gate = std::sync::Barrier::new(1 + SUBMISSIONS_MAX);
         std::thread::scope(|scope| {
-            let broken: Vec<_> = (0..TURNS as u64)
+            let broken: Vec<_> = (0..SUBMISSIONS_MAX as u64)
                 .map(|other| {
                     let (queue, gate) = (&queue, &gate);
                     scope.spawn(move || {
@@ -388,12 +387,12 @@ mod tests {
                 .collect();
             gate.wait();
             let second = scope.spawn(|| {
-                let answer = |jobs: &[Arc<Job>]| {
-                    jobs.iter().for_each(|job| job.answer(Ok(frame(job))));
+                let answer = |views: &[Arc<QueuedView>]| {
+                    views.iter().for_each(|view| view.answer(Ok(frame(view))));
                 };
                 queue.render(1, &request(2.0), 8, answer)
             });
-            while queue.len() < TURNS + 1 {
+            while queue.len() < SUBMISSIONS_MAX + 1 {
                 std::thread::yield_now();
             }
             let third = queue.render(1, &request(3.0), 8, |_| {}).unwrap_err();

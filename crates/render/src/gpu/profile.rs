@@ -3,7 +3,7 @@
 use wgpu::{BufferUsages, Features};
 
 use super::{device::Gpu, readback};
-use crate::{StageTime, error::Result};
+use crate::{DispatchTime, error::Result};
 
 /// Features without which the device gives no times.
 pub(super) const FEATURES: Features =
@@ -83,7 +83,7 @@ impl Marks {
     ///
     /// # Errors
     /// As [`readback::read`].
-    pub(super) fn read(&self, gpu: &Gpu) -> Result<Vec<StageTime>> {
+    pub(super) fn read(&self, gpu: &Gpu) -> Result<Vec<DispatchTime>> {
         let bytes = (1 + self.names.len() as u64) * 8;
         let period = f64::from(gpu.queue.get_timestamp_period()) * 1e-6;
         readback::read(gpu, &self.staging, bytes, |bytes| {
@@ -92,7 +92,7 @@ impl Marks {
             self.names
                 .iter()
                 .zip(spans)
-                .map(|(&stage, span)| StageTime { stage, ms: span * period })
+                .map(|(&stage, span)| DispatchTime { stage, ms: span * period })
                 .collect()
         })
     }

@@ -12,7 +12,7 @@ use super::{
         Raster, RasterLabels, SCAN_BLOCK, SORT_BLOCK, WORKGROUP_SIZE,
     },
     profile::Marks,
-    scratch::{Room, params_of},
+    scratch::{BatchBuffers, params_of},
 };
 use crate::error::{Error, Result};
 
@@ -47,7 +47,7 @@ pub(super) struct SceneBuffers<'a> {
 pub(super) enum LabelBuffers<'a> {
     None,
     Blend { index: &'a wgpu::Buffer },
-    Entries { index: &'a wgpu::Buffer },
+    Weights { index: &'a wgpu::Buffer },
 }
 
 /// Workgroups of a dispatch, over the views of the batch.
@@ -67,7 +67,7 @@ pub(super) struct Recorder<'a> {
     pub(super) gpu: &'a Gpu,
     kernels: &'a Kernels,
     bindings: &'a mut Bindings,
-    room: &'a Room,
+    room: &'a BatchBuffers,
     /// Views of the batch.
     views: u32,
     /// Gaussians of the scene.
@@ -85,7 +85,7 @@ impl<'a> Recorder<'a> {
         gpu: &'a Gpu,
         kernels: &'a Kernels,
         bindings: &'a mut Bindings,
-        room: &'a Room,
+        room: &'a BatchBuffers,
         (views, count): (u32, u32),
         mut marks: Option<&'a mut Marks>,
     ) -> Self {
@@ -344,9 +344,9 @@ impl<'a> Recorder<'a> {
                 buffers.extend([(6, index), (7, &room.table)]);
                 RasterLabels::Blend
             }
-            LabelBuffers::Entries { index } => {
+            LabelBuffers::Weights { index } => {
                 buffers.extend([(6, index), (7, &room.slots)]);
-                RasterLabels::Entries
+                RasterLabels::Weights
             }
         };
         let kernel = Kernel::Rasterize(Raster { color, depth, labels });

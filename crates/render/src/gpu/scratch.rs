@@ -37,7 +37,7 @@ pub(super) struct Need {
 
 /// The buffers of one batch, each at least as large as needed.
 #[derive(Clone, Debug)]
-pub(super) struct Room {
+pub(super) struct BatchBuffers {
     pub(super) views: wgpu::Buffer,
     pub(super) params: wgpu::Buffer,
     pub(super) plans: wgpu::Buffer,
@@ -87,7 +87,7 @@ pub(super) struct Scratch {
     /// Tile pairs of a view that the last views needed.
     pub(super) isects: u32,
     /// Entries a pixel that the last views needed.
-    pub(super) entry_slots: u32,
+    pub(super) weight_slots: u32,
 }
 
 impl Default for Scratch {
@@ -116,7 +116,7 @@ impl Default for Scratch {
             staging: Slot::new("staging", BufferUsages::MAP_READ | BufferUsages::COPY_DST),
             bindings: Bindings::default(),
             isects: 0,
-            entry_slots: ENTRY_SLOTS_MIN,
+            weight_slots: ENTRY_SLOTS_MIN,
         }
     }
 }
@@ -126,7 +126,7 @@ impl Scratch {
     ///
     /// # Errors
     /// `limit_exceeded` when the adapter cannot hold or bind as much.
-    pub(super) fn room(&mut self, gpu: &Gpu, need: &Need) -> Result<Room> {
+    pub(super) fn room(&mut self, gpu: &Gpu, need: &Need) -> Result<BatchBuffers> {
         let (views, count, capacity) =
             (u64::from(need.views), u64::from(need.count), u64::from(need.capacity));
         let sorted = count.max(capacity);
@@ -136,7 +136,7 @@ impl Scratch {
             Some(params) => params.clone(),
             None => self.params.insert(upload_params(gpu)?).clone(),
         };
-        Ok(Room {
+        Ok(BatchBuffers {
             views: self.views.ensure(gpu, VIEW_BYTES)?,
             params,
             plans: self.plans.ensure(gpu, views * size_of::<PlanRow>() as u64)?,
@@ -164,7 +164,7 @@ impl Scratch {
     }
 }
 
-impl Room {
+impl BatchBuffers {
     /// Sets what the stages start from: the cameras, empty plans, no groups asked for.
     pub(super) fn begin(&self, gpu: &Gpu, views: &[ViewRow]) {
         let plans = vec![PlanRow::default(); views.len()];

@@ -3,7 +3,7 @@
 use bytemuck::{Pod, Zeroable};
 
 use super::{
-    Engine, GpuRenderer,
+    Context, GpuRenderer,
     buffers::{FootprintRow, PlanRow, ViewRow, narrow},
     device::Gpu,
     pipelines::{
@@ -11,7 +11,7 @@ use super::{
     },
     readback,
     recorder::{Copy, DIGITS_MAX, LabelBuffers, Recorder, SceneBuffers, sorted_half},
-    scratch::{Need, Room},
+    scratch::{BatchBuffers, Need},
 };
 use crate::{RenderRequest, error::Result, scene::Gaussians, view::View};
 
@@ -38,9 +38,9 @@ impl GpuRenderer {
     /// As [`crate::Renderer::render`].
     pub fn project(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Projected> {
         let row = view_row(gaussians, request)?;
-        self.with_engine(|engine| {
-            let (scene, _) = engine.scene(gaussians, false)?;
-            let room = room(engine, &row, 0)?;
+        self.with_context(|context| {
+            let (scene, _) = context.scene(gaussians, false)?;
+            let room = room(context, &row, 0)?;
             let n = gaussians.len();
             let parts = [
                 (&room.footprints, 0, n * 32),
@@ -54,7 +54,7 @@ impl GpuRenderer {
                 sh_count: scene.sh_count,
             };
             let [footprints, tiles, depth_keys, plans] =
-                run(engine, &room, &row, parts, |stages| stages.project(buffers))?;
+                run(context, &room, &row, parts, |stages| stages.project(buffers))?;
             Ok(Projected {
                 footprints: cast(&footprints),
                 tiles: cast(&tiles),
@@ -69,10 +69,10 @@ impl GpuRenderer {
     /// # Errors
     /// As [`crate::Renderer::render`].
     pub fn depth_sort(&self, keys: &[u32]) -> Result<Vec<u32>> {
-        self.with_engine(|engine| {
+        self.with_context(|context| {
             let count = narrow("keys", keys.len())?;
             let row = ViewRow { gaussian_count: count, ..ViewRow::zeroed() };
-            let room = room(engine, &row, 0)?;
+            let room = room(context, &row, 0)?;
             let kept = || keys.iter().copied().filter(|&key| key != super::pipelines::DROPPED_KEY);
             let plan = PlanRow {
                 key_min: kept().min().unwrap_or(u32::MAX),
@@ -85,7 +85,7 @@ impl GpuRenderer {
                 gpu.queue.write_buffer(&room.depth_keys, 0, bytemuck::cast_slice(keys));
                 gpu.queue.write_buffer(&room.plans, 0, bytemuck::bytes_of(&plan));
             };
-            let [ids, plans] = run_from(engine, &room, &row, parts, write, |stages| {
+            let [ids, plans] = run_from(context, &room, &row, parts, write, |stages| {
                 stages.depth_sort(DIGITS_MAX);
             })?;
             let plan = cast::<PlanRow>(&plans)[0];
@@ -99,10 +99,10 @@ impl GpuRenderer {
     /// # Errors
     /// As [`crate::Renderer::render`].
     pub fn radix_sort(&self, keys: &[u32], values: &[u32], key_bits: u32) -> Result<KeysValues> {
-        self.with_engine(|engine| {
+        self.with_context(|context| {
             let count = narrow("pairs", keys.len())?;
             let row = ViewRow { gaussian_count: 1, isect_capacity: count, ..ViewRow::zeroed() };
-            let room = room(engine, &row, 0)?;
+            let room = room(context, &row, 0)?;
             let (half, start) = (keys.len() * 4, sorted_half(key_bits) as usize * keys.len() * 4);
             let parts = [(&room.tile_keys, start, half), (&room.isect_ids, start, half)];
             let write = |gpu: &Gpu| {
@@ -111,7 +111,7 @@ impl GpuRenderer {
                 plan_pairs(gpu, &room, count);
             };
             let [keys, values] =
-                run_from(engine, &room, &row, parts, write, |stages| stages.tile_sort(key_bits))?;
+                run_from(context, &room, &row, parts, write, |stages| stages.tile_sort(key_bits))?;
             Ok((cast(&keys), cast(&values)))
         })
     }
@@ -122,15 +122,15 @@ impl GpuRenderer {
     /// # Errors
     /// As [`crate::Renderer::render`].
     pub fn prefix_sum(&self, numbers: &[u32]) -> Result<(Vec<u32>, u32)> {
-        self.with_engine(|engine| {
+        self.with_context(|context| {
             let count = narrow("numbers", numbers.len())?;
             let row = ViewRow { gaussian_count: count, ..ViewRow::zeroed() };
-            let room = room(engine, &row, 0)?;
+            let room = room(context, &row, 0)?;
             let blocks = numbers.len().div_ceil(super::pipelines::SCAN_BLOCK as usize);
             let parts = [(&room.block_sums, 0, blocks * 4), (&room.plans, 0, size_of::<PlanRow>())];
             let write = |gpu: &Gpu| in_order(gpu, &room, numbers);
             let [sums, plans] =
-                run_from(engine, &room, &row, parts, write, |stages| stages.prefix_sum())?;
+                run_from(context, &room, &row, parts, write, |stages| stages.prefix_sum())?;
             Ok((cast(&sums), cast::<PlanRow>(&plans)[0].needed))
         })
     }
@@ -146,9 +146,9 @@ impl GpuRenderer {
         tiles: &[u32],
     ) -> Result<Vec<[f32; 3]>> {
         let row = view_row(gaussians, request)?;
-        self.with_engine(|engine| {
-            let (scene, _) = engine.scene(gaussians, false)?;
-            let room = room(engine, &row, 0)?;
+        self.with_context(|context| {
+            let (scene, _) = context.scene(gaussians, false)?;
+            let room = room(context, &row, 0)?;
             let parts = [(&room.colors, 0, gaussians.len() * 12)];
             let write = |gpu: &Gpu| {
                 gpu.queue.write_buffer(&room.tiles, 0, bytemuck::cast_slice(tiles));
@@ -159,7 +159,7 @@ impl GpuRenderer {
                 sh_count: scene.sh_count,
             };
             let [colors] =
-                run_from(engine, &room, &row, parts, write, |stages| stages.shade(buffers))?;
+                run_from(context, &room, &row, parts, write, |stages| stages.shade(buffers))?;
             Ok(cast(&colors))
         })
     }
@@ -174,21 +174,21 @@ impl GpuRenderer {
         footprints: &[FootprintRow],
         tiles: &[u32],
     ) -> Result<KeysValues> {
-        self.with_engine(|engine| {
+        self.with_context(|context| {
             let total: u32 = tiles.iter().sum();
             let row = ViewRow {
                 gaussian_count: narrow("footprints", footprints.len())?,
                 isect_capacity: total,
                 ..ViewRow::new(view, [0.0; 3], false)
             };
-            let room = room(engine, &row, 0)?;
+            let room = room(context, &row, 0)?;
             let size = total as usize * 4;
             let parts = [(&room.tile_keys, 0, size), (&room.isect_ids, 0, size)];
             let write = |gpu: &Gpu| {
                 in_order(gpu, &room, tiles);
                 gpu.queue.write_buffer(&room.footprints, 0, bytemuck::cast_slice(footprints));
             };
-            let [keys, ids] = run_from(engine, &room, &row, parts, write, |stages| {
+            let [keys, ids] = run_from(context, &room, &row, parts, write, |stages| {
                 stages.prefix_sum();
                 stages.emit_isects();
             })?;
@@ -201,14 +201,14 @@ impl GpuRenderer {
     /// # Errors
     /// As [`crate::Renderer::render`].
     pub fn tile_ranges(&self, view: &View, tile_keys: &[u32]) -> Result<Vec<u32>> {
-        self.with_engine(|engine| {
+        self.with_context(|context| {
             let count = narrow("tile pairs", tile_keys.len())?;
             let row = ViewRow {
                 gaussian_count: 1,
                 isect_capacity: count,
                 ..ViewRow::new(view, [0.0; 3], false)
             };
-            let room = room(engine, &row, 0)?;
+            let room = room(context, &row, 0)?;
             let size = (view.tiles_x() * view.tiles_y() + 1) as usize * 4;
             let parts = [(&room.ranges, 0, size)];
             let write = |gpu: &Gpu| {
@@ -216,7 +216,7 @@ impl GpuRenderer {
                 plan_pairs(gpu, &room, count);
             };
             let [ranges] =
-                run_from(engine, &room, &row, parts, write, |stages| stages.tile_ranges())?;
+                run_from(context, &room, &row, parts, write, |stages| stages.tile_ranges())?;
             Ok(cast(&ranges))
         })
     }
@@ -234,7 +234,7 @@ impl GpuRenderer {
         isect_ids: &[u32],
         ranges: &[u32],
     ) -> Result<Vec<f32>> {
-        self.with_engine(|engine| {
+        self.with_context(|context| {
             let pixels = view.width * view.height;
             let row = ViewRow {
                 gaussian_count: narrow("footprints", footprints.len())?,
@@ -245,7 +245,7 @@ impl GpuRenderer {
                 ..ViewRow::new(view, background, false)
             };
             let size = pixels as usize * 20;
-            let room = room(engine, &row, size)?;
+            let room = room(context, &row, size)?;
             let parts = [(&room.pictures, 0, size)];
             let write = |gpu: &Gpu| {
                 gpu.queue.write_buffer(&room.footprints, 0, bytemuck::cast_slice(footprints));
@@ -256,7 +256,7 @@ impl GpuRenderer {
             let (gaussians, sh) = (&room.footprints, &room.colors);
             let buffers = SceneBuffers { gaussians, sh, sh_count: 0 };
             let tiles = [view.tiles_x(), view.tiles_y()];
-            let [pictures] = run_from(engine, &room, &row, parts, write, |stages| {
+            let [pictures] = run_from(context, &room, &row, parts, write, |stages| {
                 stages.rasterize(buffers, &LabelBuffers::None, (true, true), tiles);
             })?;
             Ok(cast(&pictures))
@@ -277,7 +277,7 @@ fn view_row(gaussians: &Gaussians, request: &RenderRequest) -> Result<ViewRow> {
     })
 }
 
-fn room(engine: &mut Engine, row: &ViewRow, picture_bytes: usize) -> Result<Room> {
+fn room(context: &mut Context, row: &ViewRow, picture_bytes: usize) -> Result<BatchBuffers> {
     let need = Need {
         views: 1,
         count: row.gaussian_count,
@@ -287,11 +287,11 @@ fn room(engine: &mut Engine, row: &ViewRow, picture_bytes: usize) -> Result<Room
         picture_bytes: picture_bytes as u64,
         ..Need::default()
     };
-    engine.scratch.room(&engine.on.gpu, &need)
+    context.scratch.room(&context.on.gpu, &need)
 }
 
 /// `tiles` as the counts of Gaussians that lie in depth order.
-fn in_order(gpu: &Gpu, room: &Room, tiles: &[u32]) {
+fn in_order(gpu: &Gpu, room: &BatchBuffers, tiles: &[u32]) {
     let ids: Vec<u32> = (0..tiles.len() as u32).collect();
     let plan = PlanRow { sorted: tiles.len() as u32, ..PlanRow::default() };
     gpu.queue.write_buffer(&room.tiles, 0, bytemuck::cast_slice(tiles));
@@ -300,7 +300,7 @@ fn in_order(gpu: &Gpu, room: &Room, tiles: &[u32]) {
 }
 
 /// The plan of `count` pairs, as `scan_sums` makes it.
-fn plan_pairs(gpu: &Gpu, room: &Room, count: u32) {
+fn plan_pairs(gpu: &Gpu, room: &BatchBuffers, count: u32) {
     let plan = PlanRow { isects: count, needed: count, ..PlanRow::default() };
     gpu.queue.write_buffer(&room.plans, 0, bytemuck::bytes_of(&plan));
     let blocks = [
@@ -318,25 +318,25 @@ fn plan_pairs(gpu: &Gpu, room: &Room, count: u32) {
 type Part<'a> = (&'a wgpu::Buffer, usize, usize);
 
 fn run<const N: usize>(
-    engine: &mut Engine,
-    room: &Room,
+    context: &mut Context,
+    room: &BatchBuffers,
     row: &ViewRow,
     parts: [Part<'_>; N],
     record: impl FnOnce(&mut Recorder<'_>),
 ) -> Result<[Vec<u8>; N]> {
-    run_from(engine, room, row, parts, |_| {}, record)
+    run_from(context, room, row, parts, |_| {}, record)
 }
 
 /// Writes inputs, runs what is recorded, and reads parts of buffers.
 fn run_from<const N: usize>(
-    engine: &mut Engine,
-    room: &Room,
+    context: &mut Context,
+    room: &BatchBuffers,
     row: &ViewRow,
     parts: [Part<'_>; N],
     write: impl FnOnce(&Gpu),
     record: impl FnOnce(&mut Recorder<'_>),
 ) -> Result<[Vec<u8>; N]> {
-    let gpu = &engine.on.gpu;
+    let gpu = &context.on.gpu;
     let total = parts.iter().map(|part| part.2 as u64).sum::<u64>();
     let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
     let staging = gpu.create_buffer("staging", total, usage)?;
@@ -349,9 +349,9 @@ fn run_from<const N: usize>(
     gpu.scoped("stage", || {
         room.begin(gpu, std::slice::from_ref(row));
         write(gpu);
-        let bindings = &mut engine.scratch.bindings;
+        let bindings = &mut context.scratch.bindings;
         let sizes = (1, row.gaussian_count);
-        let mut stages = Recorder::new(gpu, &engine.on.kernels, bindings, room, sizes, None);
+        let mut stages = Recorder::new(gpu, &context.on.kernels, bindings, room, sizes, None);
         record(&mut stages);
         stages.submit(&copies)
     })??;

@@ -1,8 +1,9 @@
 //! A scene's view put together of layers and backdrop, and what is copied for it.
 
-use std::sync::{LazyLock, Mutex, PoisonError};
+use std::sync::LazyLock;
 
 use glam::DVec3;
+use parking_lot::Mutex;
 use segsplat_core::{
     error::Result,
     scene::{
@@ -11,7 +12,7 @@ use segsplat_core::{
     },
 };
 use segsplat_render::{
-    Frame, Kinds, Labels, RenderRequest, Renderer, ViewPlanner, cpu::CpuRenderer,
+    Frame, Kinds, Labels, PixelWeights, RenderRequest, Renderer, ViewPlanner, cpu::CpuRenderer,
 };
 
 use segsplat_testing::scenes::{Random, camera, checked, look, push, request};
@@ -35,7 +36,7 @@ impl Watched {
 
     /// Identities and requests since the last call.
     fn take(&self) -> Vec<(u64, RenderRequest)> {
-        std::mem::take(&mut *self.seen.lock().unwrap_or_else(PoisonError::into_inner))
+        std::mem::take(&mut *self.seen.lock())
     }
 }
 
@@ -49,7 +50,7 @@ impl Renderer for Watched {
     }
 
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
-        let mut seen = self.seen.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut seen = self.seen.lock();
         seen.push((gaussians.identity(), request.clone()));
         self.cpu.render(gaussians, request)
     }
@@ -154,7 +155,7 @@ fn layers_are_front_over_behind_in_every_picture_and_label() {
     let cpu = CpuRenderer::new(2).expect("two threads");
     let layers = planner().layers(&scene, &at(0.2)).expect("layers");
     let table = [[0.0; 4], [1.0, 2.0, -1.0, 0.5], [0.25; 4], [-3.0, 0.0, 1.0, 2.0]];
-    for labels in [Labels::None, Labels::Blend(table.into()), Labels::Entries] {
+    for labels in [Labels::None, Labels::Blend(table.into()), Labels::Weights] {
         let asked = RenderRequest { labels, ..request(at(0.2)) };
         let bare = RenderRequest { background: [0.0; 3], ..asked.clone() };
         let [front, behind] = [0, 1].map(|k| cpu.render(&layers[k], &bare).expect("a layer"));
@@ -186,11 +187,11 @@ fn layers_are_front_over_behind_in_every_picture_and_label() {
                 }
             }
             if let (Some(got), Some(front), Some(behind)) =
-                (&got.entries, &front.entries, &behind.entries)
+                (&got.weights, &front.weights, &behind.weights)
             {
                 for m in 1..=4 {
-                    let of = |entries: &segsplat_render::Entries| {
-                        entries.pixel(i).find(|entry| entry.0 == m).map_or(0.0, |entry| entry.1)
+                    let of = |weights: &PixelWeights| {
+                        weights.pixel(i).find(|entry| entry.0 == m).map_or(0.0, |entry| entry.1)
                     };
                     close(of(got), of(front) + room * of(behind), "entry", i);
                 }
@@ -198,7 +199,7 @@ fn layers_are_front_over_behind_in_every_picture_and_label() {
         }
         assert!(open > 100, "only {open} pixels show both layers");
         assert_eq!(got.blend.is_some(), matches!(asked.labels, Labels::Blend(_)), "blend");
-        assert_eq!(got.entries.is_some(), asked.labels == Labels::Entries, "entries");
+        assert_eq!(got.weights.is_some(), asked.labels == Labels::Weights, "weights");
         let stats = [front, behind].map(|frame| frame.stats.visible);
         assert_eq!(got.stats.visible, stats[0] + stats[1], "counts of both layers");
     }
@@ -224,7 +225,7 @@ fn the_backdrop_fills_colour_alone_and_a_mask_pays_for_no_picture() {
     watched.take();
 
     // Labels are the same with and without it, and cost one pass without alpha.
-    for labels in [Labels::Entries, Labels::Blend([[1.0; 4]; 5].into())] {
+    for labels in [Labels::Weights, Labels::Blend([[1.0; 4]; 5].into())] {
         let mask = RenderRequest { kinds: Kinds::NONE, labels, ..plain.clone() };
         let with = planner().render(&watched, &scene, &mask, true).expect("a mask");
         let seen = watched.take();
@@ -234,7 +235,7 @@ fn the_backdrop_fills_colour_alone_and_a_mask_pays_for_no_picture() {
         assert_eq!(with, without, "the backdrop adds nothing to labels");
         let all = RenderRequest { kinds: Kinds::ALL, ..mask };
         let all = planner().render(&watched, &scene, &all, true).expect("everything");
-        assert_eq!((all.blend, all.entries), (with.blend, with.entries), "beside pictures");
+        assert_eq!((all.blend, all.weights), (with.blend, with.weights), "beside pictures");
         watched.take();
     }
 }
@@ -297,9 +298,9 @@ fn a_repeated_camera_set_copies_nothing() {
     let frame = planner().render(
         &watched,
         &scene,
-        &RenderRequest { labels: Labels::Entries, ..request(cameras[0]) },
+        &RenderRequest { labels: Labels::Weights, ..request(cameras[0]) },
         true,
     );
-    let entries = frame.expect("a view").entries.expect("entries");
-    assert!(entries.index.iter().all(|&m| m == 2) && !entries.index.is_empty(), "old indices");
+    let weights = frame.expect("a view").weights.expect("weights");
+    assert!(weights.entries.iter().all(|&m| m == 2) && !weights.entries.is_empty(), "old indices");
 }

@@ -5,7 +5,8 @@ use std::sync::Arc;
 
 use segsplat_core::scene::{Gaussians, RawGaussians};
 use segsplat_render::{
-    Entries, Kinds, Labels, RenderRequest, Renderer, cpu::CpuRenderer, gpu::GpuRenderer, oracle,
+    Kinds, Labels, PixelWeights, RenderRequest, Renderer, cpu::CpuRenderer, gpu::GpuRenderer,
+    oracle,
 };
 
 use crate::twins::{both_kernels, gpu, open};
@@ -19,16 +20,16 @@ fn cpu() -> CpuRenderer {
     CpuRenderer::new(2).expect("two threads")
 }
 
-/// Dense rows of sparse entries, `[H * W][m]`.
-fn dense(entries: &Entries, m: usize) -> Vec<Vec<f64>> {
+/// Dense rows of sparse weights, `[H * W][m]`.
+fn dense(weights: &PixelWeights, m: usize) -> Vec<Vec<f64>> {
     let row = |i| {
         let mut row = vec![0.0; m];
-        for (index, weight) in entries.pixel(i) {
+        for (index, weight) in weights.pixel(i) {
             row[usize::from(index) - 1] = f64::from(weight);
         }
         row
     };
-    (0..entries.pixels()).map(row).collect()
+    (0..weights.pixels()).map(row).collect()
 }
 
 /// GPU against CPU: within 1/255, what differs more stands at a cliff of the oracle and is rare.
@@ -37,7 +38,7 @@ fn judge(gpu: &GpuRenderer, name: &str, gaussians: &Gaussians, request: &RenderR
     let table = table(usize::from(m) + 1, 11);
     let got = draw_labels(gpu, gaussians, request, &table);
     let want = draw_labels(&cpu(), gaussians, request, &table);
-    let dense = dense(&want.entries, usize::from(m));
+    let dense = dense(&want.weights, usize::from(m));
     // A blended number adds up errors of a whole row.
     let (far, worst) = apart(&got, &dense, &table, Tolerance::GPU.interior);
     let width = request.camera.intrinsics.width;
@@ -48,8 +49,8 @@ fn judge(gpu: &GpuRenderer, name: &str, gaussians: &Gaussians, request: &RenderR
     assert!(fault.is_none(), "{name}: pixel {fault:?} is far and at no cliff, of {}", far.len());
     let share = far.len() as f64 / dense.len() as f64;
     assert!(share <= Tolerance::GPU.flips, "{name}: {} pixels flipped", far.len());
-    let (px, seen) = (dense.len(), got.entries.index.len());
-    println!("{name}: {px} px, {seen} entries: max {worst:.2e}, {} flips", far.len());
+    let (px, seen) = (dense.len(), got.weights.entries.len());
+    println!("{name}: {px} px, {seen} weights: max {worst:.2e}, {} flips", far.len());
     got
 }
 
@@ -69,7 +70,7 @@ fn labels_of_the_gpu_equal_its_literal_road() {
                 far.len(),
                 far.first()
             );
-            println!("M = {m}: {} entries, max {worst:.2e}", drawn.entries.index.len());
+            println!("M = {m}: {} weights, max {worst:.2e}", drawn.weights.entries.len());
         }
     }
 }
@@ -85,7 +86,7 @@ fn labels_of_the_gpu_are_those_of_the_cpu() {
         }
         let none = checked(RawGaussians::default());
         let drawn = draw_labels(gpu, &none, &request(camera(20, 10)), &table(3, 1));
-        assert_eq!(drawn.entries, Entries::none(200), "no Gaussians");
+        assert_eq!(drawn.weights, PixelWeights::none(200), "no Gaussians");
         assert_eq!(drawn.blend, [[0.0; 4]; 200], "no Gaussians");
 
         // A table that is shorter than the bank, and none at all.
@@ -117,21 +118,21 @@ fn pixels_with_more_entries_than_room_are_drawn_again() {
     for serial in [false, true] {
         let Some(gpu) = open(|options| options.serial = Some(serial)) else { return };
         let many = stack(100);
-        let drawn = judge(&gpu, "100 entries a pixel", &many, &request(camera(48, 32)));
-        assert_eq!(drawn.entries.index.len(), 100 * 48 * 32, "every pixel sees every index");
+        let drawn = judge(&gpu, "100 weights a pixel", &many, &request(camera(48, 32)));
+        assert_eq!(drawn.weights.entries.len(), 100 * 48 * 32, "every pixel sees every index");
         // Room once made changes nothing for a view that needs less, and is found again.
         let few = labelled(800, 5, 81);
         judge(&gpu, "after it few", &few, &request(camera(48, 32)));
         judge(&gpu, "and many again", &many, &request(camera(30, 20)));
         // Slots for all of this picture are over the 128 MiB of a portable binding: bands.
         let large = request(camera(512, 352));
-        let drawn = gpu.render(&many, &alone(&large, Labels::Entries)).expect("entries in bands");
-        let entries = drawn.entries.expect("entries");
-        let want = cpu().render(&many, &alone(&large, Labels::Entries)).expect("entries");
-        let want = want.entries.expect("entries");
-        assert_eq!(entries.offsets, want.offsets, "offsets in bands");
-        assert_eq!(entries.index, want.index, "indices in bands");
-        let worst = entries.weight.iter().zip(&want.weight);
+        let drawn = gpu.render(&many, &alone(&large, Labels::Weights)).expect("weights in bands");
+        let weights = drawn.weights.expect("weights");
+        let want = cpu().render(&many, &alone(&large, Labels::Weights)).expect("weights");
+        let want = want.weights.expect("weights");
+        assert_eq!(weights.offsets, want.offsets, "offsets in bands");
+        assert_eq!(weights.entries, want.entries, "indices in bands");
+        let worst = weights.weights.iter().zip(&want.weights);
         let worst = worst.fold(0.0_f32, |worst, (a, b)| worst.max((a - b).abs()));
         assert!(worst < 1e-4, "weights in bands: {worst}");
     }
@@ -145,7 +146,7 @@ fn labels_change_no_picture_of_the_gpu_and_bands_no_label() {
     let table = table(10, 3);
     let want = gpu.render(&gaussians, &plain).expect("pictures");
     let drawn = draw_labels(gpu, &gaussians, &plain, &table);
-    for labels in [Labels::Blend(Arc::clone(&table)), Labels::Entries] {
+    for labels in [Labels::Blend(Arc::clone(&table)), Labels::Weights] {
         for (color, depth, alpha) in [(true, true, true), (true, false, false), (false, true, true)]
         {
             let kinds = Kinds { color, depth, alpha };
@@ -155,7 +156,7 @@ fn labels_change_no_picture_of_the_gpu_and_bands_no_label() {
             assert_eq!(got.depth, want.depth.clone().filter(|_| depth), "{kinds:?} depth");
             assert_eq!(got.alpha, want.alpha.clone().filter(|_| alpha), "{kinds:?} alpha");
             match labels {
-                Labels::Entries => assert_eq!(got.entries.as_ref(), Some(&drawn.entries)),
+                Labels::Weights => assert_eq!(got.weights.as_ref(), Some(&drawn.weights)),
                 _ => assert_eq!(got.blend.as_ref(), Some(&drawn.blend), "{kinds:?}"),
             }
         }
@@ -163,7 +164,7 @@ fn labels_change_no_picture_of_the_gpu_and_bands_no_label() {
     let total = want.stats.intersections as u32;
     let Some(small) = open(|options| options.isects_max = total / 2) else { return };
     let banded = draw_labels(&small, &gaussians, &plain, &table);
-    assert_eq!((banded.entries, banded.blend), (drawn.entries, drawn.blend), "in bands");
+    assert_eq!((banded.weights, banded.blend), (drawn.weights, drawn.blend), "in bands");
 }
 
 #[test]
@@ -179,5 +180,5 @@ fn another_index_of_the_same_gaussians_is_drawn_and_their_shape_is_kept() {
         judge(&gpu, &format!("index of {m}"), &labelled, &request);
         assert_eq!(gpu.scenes_held(), 1, "the shape is held once");
     }
-    assert_eq!(draw_labels(&gpu, &bare, &request, &table(4, 2)).entries, Entries::none(2_000));
+    assert_eq!(draw_labels(&gpu, &bare, &request, &table(4, 2)).weights, PixelWeights::none(2_000));
 }

@@ -1,11 +1,11 @@
 //! Labels against the literal road: one-hot vectors of M channels blended as colours are, three at
-//! a time, by the same renderer. Blend and Entries must say what it says, for any M.
+//! a time, by the same renderer. The blend and the pixel weights must equal it, for any M.
 
 use std::sync::Arc;
 
 use segsplat_core::scene::{Gaussians, RawGaussians};
 use segsplat_render::{
-    Entries, Frame, Kinds, Labels, RenderRequest, Renderer, cpu::CpuRenderer, oracle,
+    Frame, Kinds, Labels, PixelWeights, RenderRequest, Renderer, cpu::CpuRenderer, oracle,
 };
 
 use segsplat_testing::labels::{
@@ -31,8 +31,8 @@ fn labels_equal_the_literal_road_for_any_bank() {
         let dense = literal_of(&cpu(), &gaussians, &request, m);
         let (far, worst) = apart(&drawn, &dense, &table, 1e-5);
         assert!(far.is_empty(), "M = {m}: {} pixels differ, first {:?}", far.len(), far.first());
-        let seen = drawn.entries.index.len();
-        println!("M = {m}, {width}x{height}: {seen} entries, max {worst:.2e}");
+        let seen = drawn.weights.entries.len();
+        println!("M = {m}, {width}x{height}: {seen} weights, max {worst:.2e}");
         assert!(seen > 0, "M = {m}: nothing is seen");
     }
 }
@@ -44,12 +44,12 @@ fn the_oracle_and_the_cpu_agree_on_labels_outside_cliffs() {
         let request = request(camera(96, 64));
         let table = table(usize::from(m) + 1, 9);
         let drawn = draw_labels(&cpu(), &gaussians, &request, &table);
-        let listed = oracle::render(&gaussians, &alone(&request, Labels::Entries)).expect("truth");
+        let listed = oracle::render(&gaussians, &alone(&request, Labels::Weights)).expect("truth");
         let blend = Labels::Blend(Arc::clone(&table));
         let blended = oracle::render(&gaussians, &alone(&request, blend)).expect("truth");
         let dense: Vec<Vec<f64>> = listed
             .iter()
-            .map(|p| (1..=m).map(|k| p.entries.get(&k).copied().unwrap_or(0.0)).collect())
+            .map(|p| (1..=m).map(|k| p.weights.get(&k).copied().unwrap_or(0.0)).collect())
             .collect();
         let (far, worst) = apart(&drawn, &dense, &table, Tolerance::ORACLE.interior);
         assert!(far.iter().all(|&i| listed[i].cliff.same_order()), "M = {m}: off a cliff");
@@ -58,7 +58,7 @@ fn the_oracle_and_the_cpu_agree_on_labels_outside_cliffs() {
         println!("M = {m}: max {worst:.2e}, {} flips", far.len());
         // The oracle's own two roads.
         for (i, (pixel, dense)) in blended.iter().zip(&dense).enumerate() {
-            assert!(!listed[i].entries.contains_key(&0), "index 0 is no entry");
+            assert!(!listed[i].weights.contains_key(&0), "index 0 is no entry");
             let own = pixel.blend.map(|v| v as f32);
             assert!(blend_apart(own, dense, &table) < 1e-6, "M = {m}: pixel {i} of the oracle");
         }
@@ -72,10 +72,10 @@ fn the_oracles_entries_are_its_one_hot_colours() {
     let dense = literal(&gaussians, &request, 5, |gaussians, request| {
         oracle::render(gaussians, request).expect("truth").iter().map(|p| p.color).collect()
     });
-    let listed = oracle::render(&gaussians, &alone(&request, Labels::Entries)).expect("truth");
+    let listed = oracle::render(&gaussians, &alone(&request, Labels::Weights)).expect("truth");
     for (i, (pixel, dense)) in listed.iter().zip(&dense).enumerate() {
         for (k, want) in (1_u16..).zip(dense) {
-            let got = pixel.entries.get(&k).copied().unwrap_or(0.0);
+            let got = pixel.weights.get(&k).copied().unwrap_or(0.0);
             assert!((got - want).abs() < 1e-6, "pixel {i}, index {k}: {got}, not {want}");
         }
     }
@@ -88,20 +88,20 @@ fn labels_cost_no_other_picture_a_bit() {
     let table = table(10, 3);
     let want = cpu().render(&gaussians, &plain).expect("pictures");
     let drawn = draw_labels(&cpu(), &gaussians, &plain, &table);
-    for labels in [Labels::Blend(Arc::clone(&table)), Labels::Entries] {
+    for labels in [Labels::Blend(Arc::clone(&table)), Labels::Weights] {
         for (color, depth, alpha) in
             [(true, true, true), (true, false, false), (false, true, false), (false, false, true)]
         {
             let kinds = Kinds { color, depth, alpha };
             let request = RenderRequest { kinds, labels: labels.clone(), ..plain.clone() };
-            let Frame { color: c, depth: d, alpha: a, blend, entries, stats, .. } =
+            let Frame { color: c, depth: d, alpha: a, blend, weights, stats, .. } =
                 cpu().render(&gaussians, &request).expect("pictures and labels");
             assert_eq!(c, want.color.clone().filter(|_| color), "{kinds:?} colour");
             assert_eq!(d, want.depth.clone().filter(|_| depth), "{kinds:?} depth");
             assert_eq!(a, want.alpha.clone().filter(|_| alpha), "{kinds:?} alpha");
             assert_eq!(stats, want.stats, "{kinds:?} counts");
             match labels {
-                Labels::Entries => assert_eq!(entries.as_ref(), Some(&drawn.entries), "{kinds:?}"),
+                Labels::Weights => assert_eq!(weights.as_ref(), Some(&drawn.weights), "{kinds:?}"),
                 _ => assert_eq!(blend.as_ref(), Some(&drawn.blend), "{kinds:?}"),
             }
         }
@@ -117,13 +117,13 @@ fn threads_and_bands_change_no_label() {
     for threads in [1, 3, 8] {
         let other = CpuRenderer::new(threads).expect("threads");
         let got = draw_labels(&other, &gaussians, &request, &table);
-        assert_eq!(got.entries, want.entries, "{threads} threads");
+        assert_eq!(got.weights, want.weights, "{threads} threads");
         assert_eq!(got.blend, want.blend, "{threads} threads");
     }
     let total = cpu().render(&gaussians, &request).expect("a picture").stats.intersections;
     let banded = CpuRenderer::new(2).expect("threads").with_isects_max(total / 2);
     let got = draw_labels(&banded, &gaussians, &request, &table);
-    assert_eq!((got.entries, got.blend), (want.entries, want.blend), "in bands");
+    assert_eq!((got.weights, got.blend), (want.weights, want.blend), "in bands");
 }
 
 #[test]
@@ -146,10 +146,10 @@ fn an_index_beyond_the_table_counts_as_0_and_no_labels_is_a_legal_scene() {
     assert!(blend(&gaussians, &empty).iter().flatten().all(|&v| v == 0.0), "no table");
 
     let bare = cloud(600, 0, 51);
-    assert_eq!(draw_labels(&cpu(), &bare, &request, &short).entries, Entries::none(1_000));
+    assert_eq!(draw_labels(&cpu(), &bare, &request, &short).weights, PixelWeights::none(1_000));
     let none = checked(RawGaussians::default());
     let drawn = draw_labels(&cpu(), &none, &request, &short);
-    assert_eq!(drawn.entries, Entries::none(1_000), "no Gaussians");
+    assert_eq!(drawn.weights, PixelWeights::none(1_000), "no Gaussians");
     assert_eq!(drawn.blend, [[0.0; 4]; 1_000], "no Gaussians");
 
     let error = gaussians.with_semantic_index(vec![1; 599]).expect_err("one too few");
@@ -160,14 +160,14 @@ fn an_index_beyond_the_table_counts_as_0_and_no_labels_is_a_legal_scene() {
 fn weights_are_the_share_of_the_pixel_that_an_index_covers() {
     let gaussians = labelled(3_000, 12, 61);
     let plain = request(camera(80, 60));
-    let request = RenderRequest { labels: Labels::Entries, ..plain };
+    let request = RenderRequest { labels: Labels::Weights, ..plain };
     let frame = cpu().render(&gaussians, &request).expect("a picture");
-    let (entries, alpha) = (frame.entries.expect("entries"), frame.alpha.expect("alpha"));
+    let (weights, alpha) = (frame.weights.expect("weights"), frame.alpha.expect("alpha"));
     for (i, alpha) in alpha.iter().enumerate() {
-        let covered = entries.coverage(i);
+        let covered = weights.coverage(i);
         assert!(covered <= alpha + 1e-4, "pixel {i}: {covered} of {alpha}");
     }
-    let all: f32 = (0..entries.pixels()).map(|i| entries.coverage(i)).sum();
+    let all: f32 = (0..weights.pixels()).map(|i| weights.coverage(i)).sum();
     let most: f32 = alpha.iter().sum();
     // One Gaussian of thirteen has index 0.
     assert!(all > 0.8 * most && all < 0.99 * most, "{all} of {most} is labelled");

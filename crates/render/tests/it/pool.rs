@@ -45,7 +45,7 @@ fn at_once(gpu: &GpuRenderer, scene: &Gaussians, wanted: &[RenderRequest]) -> Ve
 fn views_drawn_together_are_those_drawn_alone() {
     for serial in [false, true] {
         let Some(gpu) = open(|options| options.serial = Some(serial)) else { return };
-        for labels in [Labels::None, Labels::Blend(table(9, 3)), Labels::Entries] {
+        for labels in [Labels::None, Labels::Blend(table(9, 3)), Labels::Weights] {
             let scene = labelled(2_000, 8, 61);
             let wanted = requests(16, &labels);
             let alone: Vec<_> =

@@ -124,7 +124,7 @@ fn structs_lie_in_memory_as_their_twins_do() {
                 blend_start,
                 label_rows,
                 table_start,
-                entry_slots,
+                weight_slots,
                 slot_start,
                 range_start,
                 pair_start,
@@ -133,7 +133,11 @@ fn structs_lie_in_memory_as_their_twins_do() {
             ]
         ),
         twin!(GaussianRow, "Gaussian", [mean, opacity, quat, scale, reserved]),
-        twin!(FootprintRow, "Footprint", [mean, slope, inv_sx, inv_sy, reach, opacity, depth]),
+        twin!(
+            FootprintRow,
+            "Footprint",
+            [mean, conic_shear, conic_x, conic_y, power_max, opacity, depth]
+        ),
         twin!(
             PlanRow,
             "Plan",

@@ -15,14 +15,14 @@ fn cases() -> Vec<(&'static str, Gaussians, RenderRequest)> {
     let mut aside = camera(150, 90);
     aside.camera_to_world = look(glam::DVec3::new(2.0, 0.5, 4.0), glam::DVec3::new(9.0, 0.0, 7.0));
     let small = request(camera(70, 50));
-    let entered = RenderRequest { labels: Labels::Entries, ..small };
+    let entered = RenderRequest { labels: Labels::Weights, ..small };
     let blended = RenderRequest { labels: Labels::Blend(table(9, 8)), ..small };
     vec![
         ("a Gaussian a pixel", pair, request(middle)),
         ("few, seen from aside", cloud(300, 0, 4), request(aside)),
         ("harmonics", cloud(2_000, 2, 5), request(camera(97, 61))),
         ("blended labels", labelled(2_000, 8, 7), blended),
-        ("entries", labelled(2_000, 8, 8), entered),
+        ("weights", labelled(2_000, 8, 8), entered),
     ]
 }
 

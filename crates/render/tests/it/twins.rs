@@ -13,9 +13,10 @@ use segsplat_render::{
     Frame, Kinds, RenderRequest, Renderer,
     cpu::{
         CpuRenderer, emit_isects,
+        footprint::Footprint,
         paint::Paint,
         prefix_sum, project,
-        project::{Footprint, Projected},
+        project::Projected,
         radix_sort,
         rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
         shade, tile_ranges,
@@ -95,10 +96,10 @@ fn projected(gaussians: &Gaussians, request: &RenderRequest) -> Projected {
 fn to_row(footprint: &Footprint) -> FootprintRow {
     FootprintRow {
         mean: footprint.mean.map(|v| v as f32),
-        slope: footprint.slope as f32,
-        inv_sx: footprint.inv_sx,
-        inv_sy: footprint.inv_sy,
-        reach: footprint.reach,
+        conic_shear: footprint.conic_shear as f32,
+        conic_x: footprint.conic_x,
+        conic_y: footprint.conic_y,
+        power_max: footprint.power_max,
         opacity: footprint.opacity,
         depth: footprint.depth,
     }
@@ -107,10 +108,10 @@ fn to_row(footprint: &Footprint) -> FootprintRow {
 fn to_footprint(row: &FootprintRow) -> Footprint {
     Footprint {
         mean: row.mean.map(f64::from),
-        slope: f64::from(row.slope),
-        inv_sx: row.inv_sx,
-        inv_sy: row.inv_sy,
-        reach: row.reach,
+        conic_shear: f64::from(row.conic_shear),
+        conic_x: row.conic_x,
+        conic_y: row.conic_y,
+        power_max: row.power_max,
         opacity: row.opacity,
         depth: row.depth,
         color: [0.0; 3],
@@ -260,10 +261,10 @@ fn project_twin() {
             for axis in 0..2 {
                 near("mean", row.mean[axis], want.mean[axis], 1e-3);
             }
-            near("slope", row.slope, want.slope, 1e-4);
-            near("inv_sx", row.inv_sx, want.inv_sx, 0.0);
-            near("inv_sy", row.inv_sy, want.inv_sy, 0.0);
-            near("reach", row.reach, want.reach, 2e-5);
+            near("conic_shear", row.conic_shear, want.conic_shear, 1e-4);
+            near("conic_x", row.conic_x, want.conic_x, 0.0);
+            near("conic_y", row.conic_y, want.conic_y, 0.0);
+            near("power_max", row.power_max, want.power_max, 2e-5);
             near("opacity", row.opacity, want.opacity, 0.0);
         }
         println!("{both} visible, {one_sided} on one side only, {keys_apart} keys apart");

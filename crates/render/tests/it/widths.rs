@@ -3,7 +3,7 @@
 
 use segsplat_core::scene::Gaussians;
 use segsplat_render::{
-    Entries, Frame, Labels, RenderRequest, Renderer,
+    Frame, Labels, PixelWeights, RenderRequest, Renderer,
     cpu::{CpuRenderer, lanes::Width},
     oracle,
 };
@@ -24,26 +24,26 @@ fn draw(width: Width, threads: usize, gaussians: &Gaussians, request: &RenderReq
 }
 
 /// Scenes and requests that reach every branch of the kernels: parts of tiles at the edges, long
-/// thin Gaussians, harmonics, the antialiased mode, blended labels and entries.
+/// thin Gaussians, harmonics, the antialiased mode, blended labels and weights.
 fn cases() -> Vec<(&'static str, Gaussians, RenderRequest)> {
     let (pair, middle) = two_views(96, 3);
     let rgb = request(camera(161, 119));
     let smooth = RenderRequest { antialiased: true, ..rgb.clone() };
     let blended = RenderRequest { labels: Labels::Blend(table(25, 8)), ..rgb };
-    let entered = RenderRequest { labels: Labels::Entries, ..rgb };
+    let entered = RenderRequest { labels: Labels::Weights, ..rgb };
     vec![
         ("a Gaussian a pixel", pair, request(middle)),
         ("harmonics", cloud(4_000, 3, 5), rgb),
         ("antialiased", cloud(4_000, 0, 6), smooth),
         ("blended labels", labelled(4_000, 24, 7), blended),
-        ("entries", labelled(4_000, 24, 8), entered),
+        ("weights", labelled(4_000, 24, 8), entered),
     ]
 }
 
 /// Largest difference of a pixel's weights; an entry that one side lacks counts as 0 there.
-fn entries_apart(a: &Entries, b: &Entries, pixel: usize) -> f32 {
-    let of = |entries: &Entries, index| {
-        entries.pixel(pixel).find(|entry| entry.0 == index).map_or(0.0, |entry| entry.1)
+fn weights_apart(a: &PixelWeights, b: &PixelWeights, pixel: usize) -> f32 {
+    let of = |weights: &PixelWeights, index| {
+        weights.pixel(pixel).find(|entry| entry.0 == index).map_or(0.0, |entry| entry.1)
     };
     let all = a.pixel(pixel).chain(b.pixel(pixel));
     all.map(|(index, _)| (of(a, index) - of(b, index)).abs()).fold(0.0, f32::max)
@@ -78,17 +78,17 @@ fn the_portable_form_agrees_with_the_widest_to_rounding() {
             .unwrap_or_else(|told| panic!("{name}: {told}"));
         println!("{name}: max {:.2e}, mean {:.2e}, {} flips", found.max, found.mean, found.flips);
         let calm = (0..cliff.len()).filter(|&pixel| !cliff[pixel]);
-        let (mut blends, mut entries) = (0.0_f32, 0.0_f32);
+        let (mut blends, mut weights) = (0.0_f32, 0.0_f32);
         for pixel in calm {
             if let (Some(got), Some(want)) = (&got.blend, &want.blend) {
                 let pairs = got[pixel].iter().zip(&want[pixel]);
                 blends = pairs.map(|(a, b)| (a - b).abs()).fold(blends, f32::max);
             }
-            if let (Some(got), Some(want)) = (&got.entries, &want.entries) {
-                entries = entries.max(entries_apart(got, want, pixel));
+            if let (Some(got), Some(want)) = (&got.weights, &want.weights) {
+                weights = weights.max(weights_apart(got, want, pixel));
             }
         }
         assert!(f64::from(blends) < BOUND, "{name}: blended labels apart by {blends:.2e}");
-        assert!(f64::from(entries) < BOUND, "{name}: entries apart by {entries:.2e}");
+        assert!(f64::from(weights) < BOUND, "{name}: weights apart by {weights:.2e}");
     }
 }

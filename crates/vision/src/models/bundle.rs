@@ -12,21 +12,17 @@ use serde::Deserialize;
 use sha2::{Digest, Sha256};
 
 use crate::{
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
     models::{
         NetworkOptions, SETUP_COMMAND,
-        manifest::{ImageTextManifest, MasksManifest, check_file},
+        manifest::{GeometryManifest, ImageTextManifest, MANIFEST, MasksManifest, unavailable},
     },
 };
 
-/// Name of the manifest in a bundle's folder.
-pub(super) const MANIFEST: &str = "bundle.toml";
 /// Where the bundle that ships with the server lies, under the working folder or the executable's.
 const EMBEDDED: &str = "models/embedded";
 /// Largest manifest read, bytes.
 const MANIFEST_BYTES_MAX: u64 = 1 << 20;
-/// Largest side of a bucket, pixels: `SourcePixel` counts in u16 and memory grows with the area.
-pub(super) const BUCKET_SIDE_MAX: u32 = 4_096;
 
 /// A bundle whose files are those of its manifest.
 #[derive(Clone, Debug)]
@@ -58,98 +54,6 @@ pub struct BundleFile<'a> {
     pub sha256: &'a str,
     /// Licence of the weights.
     pub licence: &'a str,
-}
-
-/// The rigid frame that a geometry network's outputs are in.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum OutputFrame {
-    /// Each view's own camera.
-    Camera,
-    /// The model frame: the first camera of the set.
-    Model,
-}
-
-/// How camera translations are scaled into the model frame.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Translation {
-    /// The largest distance between two cameras of the set is 1.
-    LargestBaseline,
-    /// World units.
-    World,
-}
-
-/// Input tensor names of a geometry network.
-#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct GeometryInputs {
-    /// `[V, 3, H, W]` f32.
-    pub images: String,
-    /// `[V, 3, 3]` f32, row 0 divided by W and row 1 by H.
-    pub intrinsics: String,
-    /// `[V, 4, 4]` f32, model frame.
-    pub camera_to_world: String,
-    /// `[V]` f32, model units.
-    pub near: String,
-    /// `[V]` f32, model units.
-    pub far: String,
-    /// `[V, K]` i64; absent for a network that chooses by itself.
-    pub neighbors: Option<String>,
-}
-
-/// Output tensor names of a geometry network.
-#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct GeometryOutputs {
-    /// `[V, H, W, 3]` f32, model units.
-    pub means: String,
-    /// `[V, H, W, 3]` f32, model units.
-    pub scales: String,
-    /// `[V, H, W, 4]` f32, wxyz.
-    pub quats: String,
-    /// `[V, H, W]` f32.
-    pub opacities: String,
-    /// `[V, H, W, K, 3]` f32.
-    pub sh: String,
-    /// `[V, H, W]` f32, 0..1; absent where the network has none (1 is taken).
-    pub confidence: Option<String>,
-}
-
-/// What `bundle.toml` says of the geometry network.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct GeometryManifest {
-    /// File in the bundle's folder.
-    pub file: String,
-    /// Its sha256, hex.
-    pub sha256: String,
-    /// Licence of the weights.
-    pub licence: String,
-    /// Where the weights come from.
-    pub source: String,
-    /// Working sizes, `[height, width]`.
-    pub buckets: Vec<[u32; 2]>,
-    /// Fewest views at once.
-    pub views_min: usize,
-    /// Most views at once.
-    pub views_max: usize,
-    /// Most source views of a view.
-    pub neighbors_max: usize,
-    /// Degree of the spherical harmonics.
-    pub sh_degree: u8,
-    /// Frame of the outputs.
-    pub output_frame: OutputFrame,
-    /// Scale of the model frame.
-    pub translation: Translation,
-    /// Subtracted from the 0..1 channels.
-    pub mean: [f32; 3],
-    /// Divides them after that.
-    pub std: [f32; 3],
-    /// Input names.
-    pub inputs: GeometryInputs,
-    /// Output names.
-    pub outputs: GeometryOutputs,
 }
 
 impl Bundle {
@@ -315,38 +219,6 @@ impl Bundle {
     }
 }
 
-impl GeometryManifest {
-    fn validate(&self) -> Result<()> {
-        check_file("geometry", &self.file, &self.sha256)?;
-        let wrong =
-            |what: String| Err(unavailable(format!("model bundle: {MANIFEST}: geometry.{what}")));
-        let bad = |side: &u32| !(1..=BUCKET_SIDE_MAX).contains(side);
-        if self.buckets.is_empty() || self.buckets.iter().flatten().any(bad) {
-            return wrong(format!(
-                "buckets is {:?}; it must hold [height, width] pairs of 1 to {BUCKET_SIDE_MAX}",
-                self.buckets
-            ));
-        }
-        if self.views_min < 1 || self.views_max < self.views_min || self.views_max < 2 {
-            return wrong(format!(
-                "views_min {} and views_max {} must be in order, and views_max at least 2",
-                self.views_min, self.views_max
-            ));
-        }
-        if self.neighbors_max < 1 {
-            return wrong("neighbors_max is 0; it must be at least 1".to_owned());
-        }
-        if self.sh_degree > 3 {
-            return wrong(format!("sh_degree is {}; it must be 0 to 3", self.sh_degree));
-        }
-        if self.std.iter().any(|v| v.is_nan() || *v <= 0.0) || self.mean.iter().any(|v| v.is_nan())
-        {
-            return wrong("mean must be numbers and std numbers over 0".to_owned());
-        }
-        Ok(())
-    }
-}
-
 fn search_places() -> Vec<PathBuf> {
     let beside = std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.join(EMBEDDED)));
     beside.into_iter().chain([PathBuf::from(EMBEDDED)]).collect()
@@ -375,10 +247,6 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
-pub(super) fn unavailable(message: String) -> Error {
-    Error::new(ErrorCode::ModelUnavailable, message)
-}
-
 fn missing(file: &str, cause: std::io::Error) -> Error {
     unavailable(format!(
         "model bundle: {file} cannot be read ({}); the bundle is part of the repository: restore \
@@ -391,6 +259,7 @@ fn missing(file: &str, cause: std::io::Error) -> Error {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::error::ErrorCode;
 
     fn fixture(change: impl Fn(String) -> String) -> tempfile::TempDir {
         let dir = tempfile::tempdir().unwrap();

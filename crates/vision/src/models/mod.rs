@@ -19,14 +19,14 @@ mod pool;
 mod resize;
 mod runtime;
 
-pub use bundle::{Bundle, BundleFile, GeometryManifest, OutputFrame, Translation};
+pub use bundle::{Bundle, BundleFile};
 pub use fit::{FittedPhoto, bucket_for, fit};
 pub use frame::ModelFrame;
 pub use geometry::{Geometry, GeometryInput};
 pub use image_text::{ImageText, TextEmbedding};
 pub use manifest::{
-    ImageTextManifest, ImageTowerManifest, MaskAdapter, MaskDecoderManifest, MaskEncoderManifest,
-    MasksManifest, TextTowerManifest,
+    GeometryManifest, ImageTextManifest, ImageTowerManifest, MaskAdapter, MaskDecoderManifest,
+    MaskEncoderManifest, MasksManifest, OutputFrame, TextTowerManifest, Translation,
 };
 pub use masks::{MaskLogits, MaskNetwork, PhotoEmbedding};
 pub use options::{NetworkOptions, ProviderChoice};

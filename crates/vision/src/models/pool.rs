@@ -1,11 +1,9 @@
 //! A pool of ONNX sessions: `Session::run` is not thread safe, so each caller borrows one.
 
-use std::{
-    ops::{Deref, DerefMut},
-    sync::{Condvar, Mutex, PoisonError},
-};
+use std::ops::{Deref, DerefMut};
 
 use ort::{session::Session, value::ValueType};
+use parking_lot::{Condvar, Mutex};
 use tracing::{info, warn};
 
 use crate::{
@@ -72,12 +70,12 @@ impl Pool {
 
     /// Waits for an idle session.
     pub(super) fn take(&self) -> Lent<'_> {
-        let mut idle = self.idle.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut idle = self.idle.lock();
         loop {
             if let Some(session) = idle.pop() {
                 return Lent { pool: self, session: Some(session) };
             }
-            idle = self.returned.wait(idle).unwrap_or_else(PoisonError::into_inner);
+            self.returned.wait(&mut idle);
         }
     }
 }
@@ -99,7 +97,7 @@ impl DerefMut for Lent<'_> {
 impl Drop for Lent<'_> {
     fn drop(&mut self) {
         if let Some(session) = self.session.take() {
-            self.pool.idle.lock().unwrap_or_else(PoisonError::into_inner).push(session);
+            self.pool.idle.lock().push(session);
             self.pool.returned.notify_one();
         }
     }

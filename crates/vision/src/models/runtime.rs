@@ -7,18 +7,19 @@
 
 use std::{
     path::{Path, PathBuf},
-    sync::{Arc, Mutex, PoisonError},
+    sync::Arc,
 };
 
 use ort::{
     ep::{self, ExecutionProvider},
     session::{Session, builder::SessionBuilder},
 };
+use parking_lot::Mutex;
 use tracing::{info, warn};
 
 use crate::{
-    error::{Error, ErrorCode, Result},
-    models::{NetworkOptions, ProviderChoice, bundle::sha256_of},
+    error::Result,
+    models::{NetworkOptions, ProviderChoice, bundle::sha256_of, manifest::unavailable},
 };
 
 /// The one command that gets the library.
@@ -80,7 +81,7 @@ impl Runtime {
     /// where it was only found, one too old, or another one is loaded already.
     pub fn load(options: &NetworkOptions) -> Result<Arc<Self>> {
         let (path, named) = locate(options)?;
-        let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut loaded = LOADED.lock();
         if let Some(runtime) = &*loaded {
             if runtime.path == path {
                 return Ok(Arc::clone(runtime));
@@ -234,13 +235,10 @@ fn locate(options: &NetworkOptions) -> Result<(PathBuf, bool)> {
         })
 }
 
-fn unavailable(message: impl Into<String>) -> Error {
-    Error::new(ErrorCode::ModelUnavailable, message)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::error::ErrorCode;
 
     #[test]
     fn every_pin_is_a_hash_and_a_name() {

@@ -10,7 +10,6 @@
 mod assign;
 mod bank;
 mod crops;
-mod entries;
 mod palette;
 mod parts;
 mod score;
@@ -20,7 +19,6 @@ pub use self::{
     assign::{NetworkPicture, from_source, relabel},
     bank::{Clusters, bank, rows_wanted},
     crops::Cutter,
-    entries::PixelEntries,
     palette::{colour, palette_table},
     parts::{Box3, Part, PartOptions, Pieces},
     score::{Scorer, Scoring, TextScores, ViewNorms, mask_from_blend},

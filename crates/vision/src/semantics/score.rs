@@ -9,10 +9,10 @@ use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 
-use super::{PixelEntries, dot, norm, unit_rows};
+use super::{dot, norm, unit_rows};
 use crate::{
     error::{Error, Result},
-    scene::{Bank, ScoringProfile},
+    scene::{Bank, PixelWeights, ScoringProfile},
 };
 
 /// Canonical phrases that one blend of four numbers carries beside the coverage.
@@ -124,8 +124,8 @@ impl TextScores {
     }
 
     /// Whether the rows of pixel `p` rule it out, without a blend.
-    fn ruled_out(&self, entries: PixelEntries<'_>, p: usize) -> bool {
-        let rows = entries.index[entries.range(p)].iter();
+    fn ruled_out(&self, weights: &PixelWeights, p: usize) -> bool {
+        let rows = weights.slices(p).0.iter();
         let nearer = |m: &u16| self.nearer.get(usize::from(*m)).copied().unwrap_or(u64::MAX);
         rows.fold(u64::MAX, |all, m| all & nearer(m)) != 0
     }
@@ -139,9 +139,9 @@ impl TextScores {
         known && selected(least, most)
     }
 
-    fn blend_pixel(&self, entries: PixelEntries<'_>, p: usize) -> [f64; 3] {
-        let range = entries.range(p);
-        self.blend(&entries.index[range.clone()], &entries.weight[range])
+    fn blend_pixel(&self, weights: &PixelWeights, p: usize) -> [f64; 3] {
+        let (entries, weights) = weights.slices(p);
+        self.blend(entries, weights)
     }
 
     /// Smallest and largest blended score of a pixel's entries, and their coverage.
@@ -266,17 +266,20 @@ impl Scorer {
     /// Lengths of a view's features, for [`Self::relevancy`].
     ///
     /// # Errors
-    /// `internal` when the arrays of `entries` do not belong together.
-    pub fn norms(&self, entries: PixelEntries<'_>) -> Result<ViewNorms> {
-        entries.check()?;
+    /// `internal` when the arrays of `weights` do not belong together.
+    pub fn norms(&self, weights: &PixelWeights) -> Result<ViewNorms> {
+        weights.check()?;
         let gram = self.gram.get_or_init(|| gram(&self.bank));
         let rows = self.rows();
-        let inverse = (0..entries.pixels())
+        let inverse = (0..weights.pixels())
             .into_par_iter()
             .with_min_len(PIXELS_EACH)
             .map(|p| {
                 let (mut square, mut coverage) = (0.0_f64, 0.0_f64);
-                let of = entries.of(p).filter(|(m, _)| (1..=rows).contains(m));
+                let of = weights
+                    .pixel(p)
+                    .map(|(m, weight)| (usize::from(m), f64::from(weight)))
+                    .filter(|(m, _)| (1..=rows).contains(m));
                 for (i, (m, weight)) in of.clone().enumerate() {
                     coverage += weight;
                     let mut across = 0.0;
@@ -299,29 +302,29 @@ impl Scorer {
     /// `[P]` relevancy of each pixel, 0.5 to 1, or 0 where the text does not apply.
     ///
     /// # Errors
-    /// `internal` when `entries` and `norms` are not of one view.
+    /// `internal` when `weights` and `norms` are not of one view.
     pub fn relevancy(
         &self,
         text: &TextScores,
-        entries: PixelEntries<'_>,
+        weights: &PixelWeights,
         norms: &ViewNorms,
     ) -> Result<Vec<f32>> {
-        entries.check()?;
-        if norms.inverse.len() != entries.pixels() {
+        weights.check()?;
+        if norms.inverse.len() != weights.pixels() {
             return Err(Error::internal(format!(
                 "scoring: {} norms for {} pixels",
                 norms.inverse.len(),
-                entries.pixels()
+                weights.pixels()
             )));
         }
         if text.selects_nothing() {
-            return Ok(vec![0.0; entries.pixels()]);
+            return Ok(vec![0.0; weights.pixels()]);
         }
         let score = |(p, inverse): (usize, &f32)| {
-            if *inverse <= 0.0 || text.ruled_out(entries, p) {
+            if *inverse <= 0.0 || text.ruled_out(weights, p) {
                 return 0.0;
             }
-            let [least, most, _] = text.blend_pixel(entries, p);
+            let [least, most, _] = text.blend_pixel(weights, p);
             if selected(least, most) { self.sharpen(least * f64::from(*inverse)) } else { 0.0 }
         };
         Ok(norms.inverse.par_iter().enumerate().with_min_len(PIXELS_EACH).map(score).collect())
@@ -330,17 +333,17 @@ impl Scorer {
     /// `[P]` where the text's relevancy is 0.5 or more: no norm, no exponential.
     ///
     /// # Errors
-    /// `internal` when the arrays of `entries` do not belong together.
-    pub fn mask(&self, text: &TextScores, entries: PixelEntries<'_>) -> Result<Vec<bool>> {
-        entries.check()?;
+    /// `internal` when the arrays of `weights` do not belong together.
+    pub fn mask(&self, text: &TextScores, weights: &PixelWeights) -> Result<Vec<bool>> {
+        weights.check()?;
         let inside = |p: usize| {
-            if text.ruled_out(entries, p) {
+            if text.ruled_out(weights, p) {
                 return false;
             }
-            let [least, most, coverage] = text.blend_pixel(entries, p);
+            let [least, most, coverage] = text.blend_pixel(weights, p);
             coverage >= self.scoring.coverage_floor && selected(least, most)
         };
-        Ok((0..entries.pixels()).into_par_iter().with_min_len(PIXELS_EACH).map(inside).collect())
+        Ok((0..weights.pixels()).into_par_iter().with_min_len(PIXELS_EACH).map(inside).collect())
     }
 }
 
@@ -395,23 +398,15 @@ mod tests {
         Scorer::new(&bank, scoring(profile, &[Y])).unwrap()
     }
 
-    /// Entries of pixels given as lists.
-    struct View(Vec<u32>, Vec<u16>, Vec<f32>);
-
-    fn view(pixels: &[&[(u16, f32)]]) -> View {
-        let mut view = View(vec![0], Vec::new(), Vec::new());
+    /// Weights of pixels given as lists.
+    fn view(pixels: &[&[(u16, f32)]]) -> PixelWeights {
+        let mut view = PixelWeights::none(0);
         for pixel in pixels {
-            view.1.extend(pixel.iter().map(|e| e.0));
-            view.2.extend(pixel.iter().map(|e| e.1));
-            view.0.push(view.1.len() as u32);
+            view.entries.extend(pixel.iter().map(|e| e.0));
+            view.weights.extend(pixel.iter().map(|e| e.1));
+            view.offsets.push(view.entries.len() as u32);
         }
         view
-    }
-
-    impl View {
-        fn entries(&self) -> PixelEntries<'_> {
-            PixelEntries { offsets: &self.0, index: &self.1, weight: &self.2 }
-        }
     }
 
     #[test]
@@ -433,12 +428,12 @@ mod tests {
         let text = scorer.text(&X).unwrap();
         let view =
             view(&[&[(1, 0.4), (2, 0.3)], &[(1, 0.3), (2, 0.4)], &[], &[(9, 1.0), (0, 1.0)]]);
-        let norms = scorer.norms(view.entries()).unwrap();
-        let map = scorer.relevancy(&text, view.entries(), &norms).unwrap();
+        let norms = scorer.norms(&view).unwrap();
+        let map = scorer.relevancy(&text, &view, &norms).unwrap();
         let want = 1.0 / (1.0 + (-10.0 * 0.1_f64 / 0.5).exp());
         assert!((f64::from(map[0]) - want).abs() < 1e-6, "{} {want}", map[0]);
         assert_eq!(&map[1..], [0.0, 0.0, 0.0], "under 0.5, nothing, no rows");
-        let mask = scorer.mask(&text, view.entries()).unwrap();
+        let mask = scorer.mask(&text, &view).unwrap();
         assert_eq!(mask, [true, false, false, false]);
     }
 
@@ -449,9 +444,9 @@ mod tests {
         let mask = |profile| {
             let scorer = scorer(&rows, profile);
             let text = scorer.text(&X).unwrap();
-            let (entries, norms) = (view.entries(), scorer.norms(view.entries()).unwrap());
-            let map = scorer.relevancy(&text, entries, &norms).unwrap();
-            let mask = scorer.mask(&text, entries).unwrap();
+            let norms = scorer.norms(&view).unwrap();
+            let map = scorer.relevancy(&text, &view, &norms).unwrap();
+            let mask = scorer.mask(&text, &view).unwrap();
             let from_map: Vec<bool> = map.iter().map(|v| *v >= 0.5).collect();
             assert_eq!(mask, from_map, "{profile:?}: two roads to one mask");
             mask
@@ -465,11 +460,11 @@ mod tests {
         let scorer = scorer(&[X, [-1.0, 0.0], [0.0, 0.0]], ScoringProfile::Default);
         let text = scorer.text(&X).unwrap();
         let view = view(&[&[(1, 0.5), (2, 0.5)], &[(3, 1.0)], &[(1, 0.5), (3, 0.5)]]);
-        let norms = scorer.norms(view.entries()).unwrap();
-        let map = scorer.relevancy(&text, view.entries(), &norms).unwrap();
+        let norms = scorer.norms(&view).unwrap();
+        let map = scorer.relevancy(&text, &view, &norms).unwrap();
         assert_eq!(map[..2], [0.0, 0.0]);
         assert!(map[2] > 0.99, "a row of zeros adds coverage alone");
-        assert_eq!(scorer.mask(&text, view.entries()).unwrap(), [false, false, true]);
+        assert_eq!(scorer.mask(&text, &view).unwrap(), [false, false, true]);
     }
 
     #[test]
@@ -484,20 +479,19 @@ mod tests {
             .map(|p| (0..1 + p % 4).map(|k| ((p * 7 + k * k) % 11, 0.1 + f32::from(k))).collect())
             .collect();
         let view = view(&pixels.iter().map(Vec::as_slice).collect::<Vec<_>>());
-        let entries = view.entries();
-        let norms = scorer.norms(entries).unwrap();
+        let norms = scorer.norms(&view).unwrap();
         let [mut inside, mut ruled_out, mut nothing] = [0; 3];
         for text in (0..50).map(|i| scorer.text(&around(i * 3 + 1)).unwrap()) {
             let blended = |p| {
-                let [least, most, _] = text.blend_pixel(entries, p);
+                let [least, most, _] = text.blend_pixel(&view, p);
                 selected(least, most)
             };
             let want: Vec<bool> = (0..400).map(blended).collect();
-            assert_eq!(scorer.mask(&text, entries).unwrap(), want);
-            let map = scorer.relevancy(&text, entries, &norms).unwrap();
+            assert_eq!(scorer.mask(&text, &view).unwrap(), want);
+            let map = scorer.relevancy(&text, &view, &norms).unwrap();
             assert_eq!(map.iter().map(|v| *v >= 0.5).collect::<Vec<_>>(), want);
             inside += want.iter().filter(|on| **on).count();
-            ruled_out += (0..400).filter(|p| text.ruled_out(entries, *p)).count();
+            ruled_out += (0..400).filter(|p| text.ruled_out(&view, *p)).count();
             nothing += usize::from(text.selects_nothing());
             assert!(!text.selects_nothing() || want.iter().all(|on| !on));
         }
@@ -542,7 +536,7 @@ mod tests {
             let pictures: Vec<Vec<[f32; 4]>> = tables.iter().map(blend).collect();
             let pictures: Vec<&[[f32; 4]]> = pictures.iter().map(Vec::as_slice).collect();
             let mask = mask_from_blend(&pictures, &scoring);
-            assert_eq!(mask, scorer.mask(&text, view.entries()).unwrap(), "{count} phrases");
+            assert_eq!(mask, scorer.mask(&text, &view).unwrap(), "{count} phrases");
             assert!(mask[0] && !mask[3], "{count} phrases: {mask:?}");
             // Far from the text, but farther from every phrase.
             assert!(mask[4], "{count} phrases: {mask:?}");
@@ -555,9 +549,9 @@ mod tests {
         let text = scorer.text(&X).unwrap();
         assert_eq!((text.entries().len(), text.tables()[0].len()), (1, 1));
         let view = view(&[&[], &[(1, 1.0)]]);
-        let norms = scorer.norms(view.entries()).unwrap();
-        assert_eq!(scorer.relevancy(&text, view.entries(), &norms).unwrap(), [0.0, 0.0]);
-        assert_eq!(scorer.mask(&text, view.entries()).unwrap(), [false, false]);
+        let norms = scorer.norms(&view).unwrap();
+        assert_eq!(scorer.relevancy(&text, &view, &norms).unwrap(), [0.0, 0.0]);
+        assert_eq!(scorer.mask(&text, &view).unwrap(), [false, false]);
     }
 
     #[test]
@@ -586,8 +580,8 @@ mod tests {
         assert!(Scorer::new(&wide, Arc::clone(&scorer.scoring)).is_err());
         let view = view(&[&[(1, 0.5)]]);
         let text = scorer.text(&X).unwrap();
-        assert!(scorer.relevancy(&text, view.entries(), &ViewNorms::default()).is_err());
-        let broken = PixelEntries { offsets: &[0, 2], index: &[1], weight: &[0.5] };
-        assert!(scorer.mask(&text, broken).is_err() && scorer.norms(broken).is_err());
+        assert!(scorer.relevancy(&text, &view, &ViewNorms::default()).is_err());
+        let broken = PixelWeights { offsets: vec![0, 2], entries: vec![1], weights: vec![0.5] };
+        assert!(scorer.mask(&text, &broken).is_err() && scorer.norms(&broken).is_err());
     }
 }

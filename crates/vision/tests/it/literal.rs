@@ -6,9 +6,9 @@
 
 use std::sync::Arc;
 
-use segsplat_core::scene::{Bank, Gaussians, ScoringProfile};
-use segsplat_render::{Entries, Labels, RenderRequest, Renderer, cpu::CpuRenderer};
-use segsplat_vision::semantics::{PixelEntries, Scorer, Scoring, mask_from_blend};
+use segsplat_core::scene::{Bank, Gaussians, PixelWeights, ScoringProfile};
+use segsplat_render::{Labels, RenderRequest, Renderer, cpu::CpuRenderer};
+use segsplat_vision::semantics::{Scorer, Scoring, mask_from_blend};
 
 use segsplat_testing::labels::{alone, labelled, literal_of};
 use segsplat_testing::scenes::{Random, camera, request};
@@ -127,15 +127,10 @@ struct View<'a> {
     gaussians: &'a Gaussians,
     request: &'a RenderRequest,
     dense: Vec<Vec<f64>>,
-    entries: Entries,
+    weights: PixelWeights,
 }
 
 impl View<'_> {
-    fn sparse(&self) -> PixelEntries<'_> {
-        let Entries { offsets, index, weight } = &self.entries;
-        PixelEntries { offsets, index, weight }
-    }
-
     /// One text by all roads.
     fn compare(
         &self,
@@ -158,9 +153,9 @@ impl View<'_> {
             .collect();
         let pictures: Vec<&[[f32; 4]]> = pictures.iter().map(Vec::as_slice).collect();
         let blended = mask_from_blend(&pictures, scorer.scoring());
-        let listed = scorer.mask(&scores, self.sparse()).expect("a mask");
-        let norms = scorer.norms(self.sparse()).expect("norms");
-        let map = scorer.relevancy(&scores, self.sparse(), &norms).expect("a relevancy");
+        let listed = scorer.mask(&scores, &self.weights).expect("a mask");
+        let norms = scorer.norms(&self.weights).expect("norms");
+        let map = scorer.relevancy(&scores, &self.weights, &norms).expect("a relevancy");
         assert_eq!(
             (blended.len(), listed.len(), map.len()),
             (self.dense.len(), self.dense.len(), self.dense.len())
@@ -236,13 +231,13 @@ fn fifty_scene_view_text_cases_equal_the_literal_road() {
         let bank = bank(m, kind, &mut random);
         let gaussians = labelled(700, m, 300 + seed);
         let request = request(camera(width, height));
-        let draw = renderer.render(&gaussians, &alone(&request, Labels::Entries)).expect("entries");
+        let draw = renderer.render(&gaussians, &alone(&request, Labels::Weights)).expect("entries");
         let view = View {
             renderer: &renderer,
             gaussians: &gaussians,
             request: &request,
             dense: literal_of(&renderer, &gaussians, &request, m),
-            entries: draw.entries.expect("entries were asked for"),
+            weights: draw.weights.expect("weights were asked for"),
         };
         let of = if kind == Grouped { &mut all } else { &mut special };
         for profile in [ScoringProfile::Default, ScoringProfile::Paper] {
@@ -278,9 +273,8 @@ fn a_scene_without_masks_is_legal_and_nothing_in_it_is_relevant() {
         let labels = Labels::Blend(Arc::clone(&scores.tables()[0]));
         let blend = renderer.render(&gaussians, &alone(&request, labels)).expect("a blend");
         let mask = mask_from_blend(&[&blend.blend.expect("asked for")], scorer.scoring());
-        let drawn = renderer.render(&gaussians, &alone(&request, Labels::Entries)).expect("E");
-        let Entries { offsets, index, weight } = drawn.entries.expect("asked for");
-        let sparse = PixelEntries { offsets: &offsets, index: &index, weight: &weight };
+        let drawn = renderer.render(&gaussians, &alone(&request, Labels::Weights)).expect("E");
+        let sparse = &drawn.weights.expect("asked for");
         let norms = scorer.norms(sparse).expect("norms");
         let map = scorer.relevancy(&scores, sparse, &norms).expect("a relevancy");
         assert_eq!((mask.len(), map.len()), (280, 280));

@@ -1,4 +1,4 @@
-// Labels::Entries: each pixel has `entry_slots` slots of (index, weight), filled as indices come
+// Labels::Weights: each pixel has `weight_slots` slots of (index, weight), filled as indices come
 // up. One that finds no room is counted all the same: the host sees the count, makes room and draws
 // again.
 
@@ -22,7 +22,7 @@ fn end_run(q: u32, pixel: u32) {
     let bottom = min(views[which].row_end * TILE_SIZE, views[which].height);
     let rows = bottom - views[which].row_start * TILE_SIZE;
     let pixels = rows * views[which].width;
-    let held = min(used[q], views[which].entry_slots);
+    let held = min(used[q], views[which].weight_slots);
     for (var slot = 0u; slot < held; slot++) {
         let at = views[which].slot_start + pixels * (1u + 2u * slot) + pixel;
         if slots[at] == run_index[q] {
@@ -31,7 +31,7 @@ fn end_run(q: u32, pixel: u32) {
             return;
         }
     }
-    if used[q] < views[which].entry_slots {
+    if used[q] < views[which].weight_slots {
         let at = views[which].slot_start + pixels * (1u + 2u * used[q]) + pixel;
         slots[at] = run_index[q];
         slots[at + pixels] = bitcast<u32>(run_weight[q]);

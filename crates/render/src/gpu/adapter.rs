@@ -1,22 +1,24 @@
 //! One adapter of the pool: its device, what is kept on it, and the callers that share it.
 
 use std::sync::{
-    Arc, Mutex, MutexGuard, PoisonError,
+    Arc,
     atomic::{AtomicU64, Ordering},
 };
 
+use parking_lot::Mutex;
+
 use super::{
     GpuOptions,
-    buffers::{Scene, SceneCache, SceneLabels},
+    buffers::{DeviceLabels, DeviceScene, SceneCache},
     device::Gpu,
     frame::{Drawing, Tools},
     pipelines::{Kernels, VIEWS_MAX},
-    pool::{Job, Queue, TURNS},
+    pool::{QueuedView, SUBMISSIONS_MAX, ViewQueue},
     profile::Marks,
     scratch::Scratch,
 };
 use crate::{
-    DeviceTimes, Frame, Labels, RenderRequest, StageTime,
+    DeviceTimes, DispatchTime, Frame, Labels, RenderRequest,
     error::{ErrorCode, Result},
     scene::Gaussians,
     select::AdapterReport,
@@ -30,7 +32,7 @@ const BATCH_GAUSSIANS: usize = 4 << 20;
 
 /// A device with what was compiled and kept on it; clones are the same one.
 #[derive(Clone, Debug)]
-pub(super) struct Opened {
+pub(super) struct OpenDevice {
     pub(super) gpu: Gpu,
     pub(super) kernels: Arc<Kernels>,
     scenes: Arc<Mutex<SceneCache>>,
@@ -38,17 +40,17 @@ pub(super) struct Opened {
 
 /// A device, for one who draws on it, and room of his own.
 #[derive(Debug)]
-pub(super) struct Engine {
-    pub(super) on: Opened,
+pub(super) struct Context {
+    pub(super) on: OpenDevice,
     pub(super) scratch: Scratch,
 }
 
-impl Engine {
+impl Context {
     /// What frames of `scene` are drawn with.
     fn tools<'a>(
         &'a mut self,
-        scene: &'a Scene,
-        labels: Option<&'a SceneLabels>,
+        scene: &'a DeviceScene,
+        labels: Option<&'a DeviceLabels>,
         isects_max: u32,
         marks: Option<&'a mut Marks>,
     ) -> Tools<'a> {
@@ -64,8 +66,8 @@ impl Engine {
         &self,
         gaussians: &Gaussians,
         labelled: bool,
-    ) -> Result<(Scene, Option<SceneLabels>)> {
-        let mut scenes = lock(&self.on.scenes);
+    ) -> Result<(DeviceScene, Option<DeviceLabels>)> {
+        let mut scenes = self.on.scenes.lock();
         let scene = scenes.get(&self.on.gpu, gaussians)?;
         let labels = match labelled {
             true => Some(scenes.labels(&self.on.gpu, gaussians)?),
@@ -75,29 +77,29 @@ impl Engine {
     }
 }
 
-/// The device of a station and the rooms that nobody uses.
+/// The device of an adapter, and the buffers that no submission uses now.
 #[derive(Debug, Default)]
-struct Held {
+struct DeviceState {
     /// `None` after the device was lost.
-    opened: Option<Opened>,
+    opened: Option<OpenDevice>,
     idle: Vec<Scratch>,
 }
 
 /// One adapter.
 #[derive(Debug)]
-pub(super) struct Station {
+pub(super) struct Adapter {
     options: GpuOptions,
     adapter: wgpu::Adapter,
     report: AdapterReport,
-    held: Mutex<Held>,
+    state: Mutex<DeviceState>,
     /// What tells the device's scenes, for those who do not wait for an upload.
     shapes: Mutex<Vec<u64>>,
-    queue: Queue,
+    queue: ViewQueue,
     submissions: AtomicU64,
     views: AtomicU64,
 }
 
-impl Station {
+impl Adapter {
     /// Opens a device and compiles the kernels.
     ///
     /// # Errors
@@ -107,25 +109,25 @@ impl Station {
         report: AdapterReport,
         options: &GpuOptions,
     ) -> Result<Self> {
-        let station = Self {
+        let opened = Self {
             options: options.clone(),
             adapter,
             report,
-            held: Mutex::default(),
+            state: Mutex::default(),
             shapes: Mutex::default(),
-            queue: Queue::new(options.waiting_max),
+            queue: ViewQueue::new(options.waiting_max),
             submissions: AtomicU64::new(0),
             views: AtomicU64::new(0),
         };
-        lock(&station.held).opened = Some(station.open_device()?);
-        Ok(station)
+        opened.state.lock().opened = Some(opened.open_device()?);
+        Ok(opened)
     }
 
-    fn open_device(&self) -> Result<Opened> {
+    fn open_device(&self) -> Result<OpenDevice> {
         let gpu = Gpu::open(&self.adapter, self.options.portable)?;
         let kernels = Kernels::compile(&gpu, &self.options, self.report.software)?;
         let scenes = SceneCache::new(self.options.scene_bytes_max);
-        Ok(Opened { gpu, kernels: Arc::new(kernels), scenes: Arc::new(Mutex::new(scenes)) })
+        Ok(OpenDevice { gpu, kernels: Arc::new(kernels), scenes: Arc::new(Mutex::new(scenes)) })
     }
 
     pub(super) fn adapter(&self) -> &AdapterReport {
@@ -133,12 +135,12 @@ impl Station {
     }
 
     pub(super) fn scenes_held(&self) -> usize {
-        lock(&self.shapes).len()
+        self.shapes.lock().len()
     }
 
     /// Whether the scene of that shape was here when the last view was drawn.
     pub(super) fn holds(&self, shape: u64) -> bool {
-        lock(&self.shapes).contains(&shape)
+        self.shapes.lock().contains(&shape)
     }
 
     /// Views that wait or are being drawn.
@@ -152,53 +154,56 @@ impl Station {
 
     /// Has everyone see the device lost, whatever runs on it.
     pub(super) fn lose_device(&self) {
-        if let Some(opened) = &lock(&self.held).opened {
+        if let Some(opened) = &self.state.lock().opened {
             opened.gpu.lose();
         }
     }
 
     /// Runs `work` on the device, opened again if it was lost.
-    pub(super) fn with_engine<T>(&self, work: impl FnOnce(&mut Engine) -> Result<T>) -> Result<T> {
-        let mut engine = self.engine()?;
-        let result = work(&mut engine);
-        *lock(&self.shapes) = lock(&engine.on.scenes).shapes();
-        let mut held = lock(&self.held);
-        if engine.on.gpu.is_lost() {
-            self.give_up(&mut held);
-        } else if held.idle.len() < TURNS {
-            held.idle.push(engine.scratch);
+    pub(super) fn with_context<T>(
+        &self,
+        work: impl FnOnce(&mut Context) -> Result<T>,
+    ) -> Result<T> {
+        let mut context = self.context()?;
+        let result = work(&mut context);
+        *self.shapes.lock() = context.on.scenes.lock().shapes();
+        let mut state = self.state.lock();
+        if context.on.gpu.is_lost() {
+            self.give_up(&mut state);
+        } else if state.idle.len() < SUBMISSIONS_MAX {
+            state.idle.push(context.scratch);
         }
         result
     }
 
-    fn engine(&self) -> Result<Engine> {
-        let mut held = lock(&self.held);
-        self.give_up(&mut held);
-        let on = match &held.opened {
+    fn context(&self) -> Result<Context> {
+        let mut state = self.state.lock();
+        self.give_up(&mut state);
+        let on = match &state.opened {
             Some(opened) => opened.clone(),
             None => {
                 let opened = self.open_device()?;
                 tracing::warn!(adapter = self.report.name, "the GPU device was opened again");
-                held.opened.insert(opened).clone()
+                state.opened.insert(opened).clone()
             }
         };
-        Ok(Engine { on, scratch: held.idle.pop().unwrap_or_default() })
+        Ok(Context { on, scratch: state.idle.pop().unwrap_or_default() })
     }
 
     /// Lets go of the device if it is lost.
-    fn give_up(&self, held: &mut Held) {
-        if held.opened.as_ref().is_some_and(|opened| opened.gpu.is_lost()) {
+    fn give_up(&self, state: &mut DeviceState) {
+        if state.opened.as_ref().is_some_and(|opened| opened.gpu.is_lost()) {
             tracing::error!(adapter = self.report.name, "the GPU device was lost");
-            *held = Held::default();
-            lock(&self.shapes).clear();
+            *state = DeviceState::default();
+            self.shapes.lock().clear();
         }
     }
 
-    /// Runs `work` as [`Self::with_engine`], once more on a new device each time one is lost.
-    fn persistently<T>(&self, mut work: impl FnMut(&mut Engine) -> Result<T>) -> Result<T> {
+    /// Runs `work` as [`Self::with_context`], once more on a new device each time one is lost.
+    fn persistently<T>(&self, mut work: impl FnMut(&mut Context) -> Result<T>) -> Result<T> {
         let mut opened = 1;
         loop {
-            match self.with_engine(&mut work) {
+            match self.with_context(&mut work) {
                 Err(error) if error.code() == ErrorCode::GpuUnavailable && opened < OPENED_MAX => {
                     opened += 1;
                 }
@@ -214,19 +219,19 @@ impl Station {
     pub(super) fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         let views_max = (BATCH_GAUSSIANS / gaussians.len().max(1)).clamp(1, VIEWS_MAX as usize);
         let scene = gaussians.identity();
-        self.queue.render(scene, request, views_max, |jobs| self.draw(gaussians, jobs))
+        self.queue.render(scene, request, views_max, |views| self.draw(gaussians, views))
     }
 
-    /// Draws and answers all of `jobs`.
-    fn draw(&self, gaussians: &Gaussians, jobs: &[Arc<Job>]) {
+    /// Draws and answers all of `views`.
+    fn draw(&self, gaussians: &Gaussians, views: &[Arc<QueuedView>]) {
         self.submissions.fetch_add(1, Ordering::Relaxed);
-        self.views.fetch_add(jobs.len() as u64, Ordering::Relaxed);
-        if jobs.len() > 1 {
-            let requests: Vec<_> = jobs.iter().map(|job| &job.request).collect();
-            match self.persistently(|engine| self.together(engine, gaussians, &requests)) {
+        self.views.fetch_add(views.len() as u64, Ordering::Relaxed);
+        if views.len() > 1 {
+            let requests: Vec<_> = views.iter().map(|view| &view.request).collect();
+            match self.persistently(|context| self.together(context, gaussians, &requests)) {
                 Ok(frames) => {
-                    for (job, frame) in jobs.iter().zip(frames) {
-                        job.answer(frame.map_or_else(|| self.alone(gaussians, job), Ok));
+                    for (view, frame) in views.iter().zip(frames) {
+                        view.answer(frame.map_or_else(|| self.alone(gaussians, view), Ok));
                     }
                     return;
                 }
@@ -234,26 +239,28 @@ impl Station {
                 Err(error) => tracing::warn!(
                     adapter = self.report.name,
                     reason = error.message(),
-                    views = jobs.len(),
+                    views = views.len(),
                     "views are drawn one by one"
                 ),
             }
         }
-        for job in jobs {
-            job.answer(self.alone(gaussians, job));
+        for view in views {
+            view.answer(self.alone(gaussians, view));
         }
     }
 
-    fn alone(&self, gaussians: &Gaussians, job: &Job) -> Result<Frame> {
-        let drawn = self.persistently(|engine| self.one(engine, gaussians, &job.request, None));
+    fn alone(&self, gaussians: &Gaussians, view: &QueuedView) -> Result<Frame> {
+        let drawn = self.persistently(|context| self.one(context, gaussians, &view.request, None));
         match drawn {
-            // Memory may be held by other scenes and by larger views: once without them.
-            Err(error) if error.code() == ErrorCode::LimitExceeded => self.persistently(|engine| {
-                lock(&self.held).idle.clear();
-                lock(&engine.on.scenes).clear(&engine.on.gpu);
-                engine.scratch = Scratch::default();
-                self.one(engine, gaussians, &job.request, None)
-            }),
+            // Memory may be state by other scenes and by larger views: once without them.
+            Err(error) if error.code() == ErrorCode::LimitExceeded => {
+                self.persistently(|context| {
+                    self.state.lock().idle.clear();
+                    context.on.scenes.lock().clear(&context.on.gpu);
+                    context.scratch = Scratch::default();
+                    self.one(context, gaussians, &view.request, None)
+                })
+            }
             other => other,
         }
         .map(|drawn| drawn.0)
@@ -262,7 +269,7 @@ impl Station {
     /// Views of one submission; `None` for one that needs more room than was guessed.
     fn together(
         &self,
-        engine: &mut Engine,
+        context: &mut Context,
         gaussians: &Gaussians,
         requests: &[&RenderRequest],
     ) -> Result<Vec<Option<Frame>>> {
@@ -271,37 +278,36 @@ impl Station {
             .map(|request| View::new(gaussians.origin(), request))
             .collect::<Result<_>>()?;
         let labelled = requests.first().is_some_and(|one| one.labels != Labels::None);
-        let (scene, labels) = engine.scene(gaussians, labelled)?;
+        let (scene, labels) = context.scene(gaussians, labelled)?;
         let mut drawings: Vec<_> = views
             .iter()
             .zip(requests)
             .map(|(view, request)| Drawing::new(view, request, &scene))
             .collect();
-        let mut tools = engine.tools(&scene, labels.as_ref(), self.options.isects_max, None);
+        let mut tools = context.tools(&scene, labels.as_ref(), self.options.isects_max, None);
         let drawn = tools.together(&mut drawings)?;
-        let frames = drawings
-            .into_iter()
-            .zip(drawn)
-            .map(|(drawing, drawn)| drawn.then(|| drawing.finish(&mut engine.scratch)).transpose());
+        let frames = drawings.into_iter().zip(drawn).map(|(drawing, drawn)| {
+            drawn.then(|| drawing.finish(&mut context.scratch)).transpose()
+        });
         frames.collect()
     }
 
     /// One frame, and the times of its last submission where marks are given.
     fn one(
         &self,
-        engine: &mut Engine,
+        context: &mut Context,
         gaussians: &Gaussians,
         request: &RenderRequest,
         marks: Option<&mut Marks>,
-    ) -> Result<(Frame, Vec<StageTime>)> {
+    ) -> Result<(Frame, Vec<DispatchTime>)> {
         let view = View::new(gaussians.origin(), request)?;
-        let (scene, labels) = engine.scene(gaussians, request.labels != Labels::None)?;
-        let mut tools = engine.tools(&scene, labels.as_ref(), self.options.isects_max, marks);
+        let (scene, labels) = context.scene(gaussians, request.labels != Labels::None)?;
+        let mut tools = context.tools(&scene, labels.as_ref(), self.options.isects_max, marks);
         let mut drawing = Drawing::new(&view, request, &scene);
         let rows = drawing.whole();
         tools.rows(&mut drawing, rows)?;
         let times = std::mem::take(&mut tools.times);
-        Ok((drawing.finish(&mut engine.scratch)?, times))
+        Ok((drawing.finish(&mut context.scratch)?, times))
     }
 
     /// Times of a view by the device's clock.
@@ -313,20 +319,16 @@ impl Station {
         gaussians: &Gaussians,
         request: &RenderRequest,
     ) -> Result<Option<DeviceTimes>> {
-        self.with_engine(|engine| {
-            if !engine.on.gpu.has_times {
+        self.with_context(|context| {
+            if !context.on.gpu.has_times {
                 return Ok(None);
             }
-            let mut times = |each| -> Result<Vec<StageTime>> {
-                let mut marks = Marks::new(&engine.on.gpu, each)?;
-                Ok(self.one(engine, gaussians, request, Some(&mut marks))?.1)
+            let mut times = |each| -> Result<Vec<DispatchTime>> {
+                let mut marks = Marks::new(&context.on.gpu, each)?;
+                Ok(self.one(context, gaussians, request, Some(&mut marks))?.1)
             };
             let total_ms = times(false)?.iter().map(|stage| stage.ms).sum();
             Ok(Some(DeviceTimes { total_ms, stages: times(true)? }))
         })
     }
-}
-
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
