@@ -16,7 +16,7 @@ ARGS ?=
 # With numpy, pillow and trimesh for `make eval-scenes`, matplotlib for `make plots`.
 PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
-ADAPTER := if [ -f $(TARGET)/vulkan/env ]; then . $(abspath $(TARGET))/vulkan/env; fi;
+ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
 .PHONY: demo serve test test-long fuzz bench eval eval-scenes plots setup build fmt lint doc tests deny
 

@@ -17,7 +17,7 @@ use segsplat::{
 };
 use serde_json::Value;
 
-use crate::common::skipped;
+use crate::common::{process::signal, skipped};
 
 fn segsplat(args: &[&str]) -> Output {
     let mut command = Command::new(env!("CARGO_BIN_EXE_segsplat"));
@@ -282,7 +282,6 @@ fn serve_says_where_it_listens_and_ends_at_sigterm() {
         .block_on(crate::common::client().get(format!("{url}/readyz")).send())
         .expect("it answers");
     assert!(ready.status().is_success(), "{}", ready.status());
-    let pid = child.0.id().to_string();
-    assert!(Command::new("kill").args(["-TERM", &pid]).status().unwrap().success());
+    assert!(signal(child.0.id(), "TERM"));
     assert!(child.0.wait().unwrap().success(), "a stop that was asked for is no failure");
 }

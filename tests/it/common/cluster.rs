@@ -78,7 +78,7 @@ fn free_port() -> u16 {
 }
 
 fn haproxy() -> Option<PathBuf> {
-    let unpacked = target().join("haproxy/usr/sbin/haproxy");
+    let unpacked = target().join("tools/haproxy");
     let places = [unpacked, "/usr/sbin/haproxy".into(), "/usr/local/sbin/haproxy".into()];
     places.into_iter().find(|path| path.is_file())
 }

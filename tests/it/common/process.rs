@@ -105,6 +105,13 @@ impl Start {
     }
 }
 
+/// Sends a signal to a process; whether it was there. By the shell's own `kill`: a bare Debian has no
+/// other.
+pub(crate) fn signal(pid: u32, name: &str) -> bool {
+    let sent = Command::new("sh").args(["-c", &format!("kill -{name} {pid}")]).status();
+    sent.is_ok_and(|status| status.success())
+}
+
 impl Process {
     /// `kill -9`, and waits until it is gone.
     pub(crate) fn kill(&mut self) {
@@ -115,16 +122,12 @@ impl Process {
 
     /// `kill -9` of a server that others still call.
     pub(crate) fn kill_now(&self) {
-        let pid = self.child.id().to_string();
-        let _ = Command::new("kill").args(["-9", &pid]).status();
+        signal(self.child.id(), "KILL");
     }
 
     /// SIGTERM, and waits for the end; whether it ended well.
     pub(crate) fn stop(mut self) -> bool {
-        let pid = self.child.id().to_string();
-        let told = Command::new("kill").args(["-TERM", &pid]).status();
-        told.is_ok_and(|status| status.success())
-            && self.child.wait().is_ok_and(|end| end.success())
+        signal(self.child.id(), "TERM") && self.child.wait().is_ok_and(|end| end.success())
     }
 
     pub(crate) fn url(&self, path: &str) -> String {
