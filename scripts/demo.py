@@ -1,9 +1,9 @@
 """Photos to views, end to end: starts the server on a free port of loopback, posts photos, asks
 for views at new poses and for a thing by text, writes views and mask as PNG, prints where, and
-stops the server.
+stops the server. With --server it asks a server that runs already, and stops nothing.
 
 Run by `make demo`. Uses generated photos, and real ones where the shared data is found. Needs
-nothing beside Python's own library.
+only Python's own library.
 """
 
 import argparse
@@ -161,20 +161,36 @@ def wait_ready(server: str, process: subprocess.Popen, log: Path) -> None:
 def main() -> None:
     """Starts, shows, stops."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--segsplat", type=Path, required=True, help="the program")
+    parser.add_argument("--segsplat", type=Path, help="the program")
+    parser.add_argument("--server", metavar="URL", help="a server that runs already")
+    parser.add_argument("--sample", type=Path, metavar="FOLDER",
+                        help="photos by `segsplat sample` (default: made with --segsplat)")
     parser.add_argument("--out", type=Path, required=True, help="folder of the pictures")
     options = parser.parse_args()
+    if not options.segsplat and not (options.server and options.sample):
+        parser.error("--segsplat is missing, or both --server and --sample")
     for number in [signal.SIGTERM, signal.SIGHUP]:
         signal.signal(number, lambda *_: sys.exit(1))
     out = options.out
     out.mkdir(parents=True, exist_ok=True)
-    sample = out / "sample"
-    subprocess.run([options.segsplat, "sample", "-o", sample, "--photos", "4", "--size",
-                    "320x240", "--seed", "1"], check=True, stdout=subprocess.DEVNULL)
+    sample = options.sample or out / "sample"
+    if not options.sample:
+        subprocess.run([options.segsplat, "sample", "-o", sample, "--photos", "4", "--size",
+                        "320x240", "--seed", "1"], check=True, stdout=subprocess.DEVNULL)
     sets = [("sample", sample, None)]
     shared = Path(os.environ.get("SEGSPLAT_SHARED_DATA") or "../shared/data") / "scenes"
-    real = [(name, shared / name, frames) for name, frames in REAL if (shared / name).is_dir()]
+    sets += [(name, shared / name, frames) for name, frames in REAL if (shared / name).is_dir()]
 
+    def show_all(server: str) -> None:
+        models = json.loads(call(f"{server}/v1/models"))
+        print(f"server at {server}: {json.dumps(models)[:400]}")
+        for name, folder, frames in sets:
+            show(server, name, folder, frames, out)
+
+    if options.server:
+        show_all(options.server)
+        print(f"views are in {out}")
+        return
     server = f"http://127.0.0.1:{free_port()}"
     log = out / "server.log"
     with log.open("w") as sink:
@@ -183,10 +199,7 @@ def main() -> None:
              "--data-dir", out / "data"], stdout=sink, stderr=sink)
         try:
             wait_ready(server, process, log)
-            models = json.loads(call(f"{server}/v1/models"))
-            print(f"server at {server}: {json.dumps(models)[:400]}")
-            for name, folder, frames in sets + real:
-                show(server, name, folder, frames, out)
+            show_all(server)
         finally:
             process.terminate()
             try:
