@@ -5,6 +5,8 @@
 use std::{
     collections::BTreeMap,
     io::{Cursor, Write},
+    ops::Range,
+    path::Path,
 };
 
 use segsplat::scene::{Upload, UploadCameras, UploadFile};
@@ -13,7 +15,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 use crate::common::{
     doors::{Ask, Door, Options, both},
-    shared_scene,
+    root, shared_scene,
     stand::{Stand, upload},
 };
 
@@ -504,18 +506,13 @@ async fn a_camera_in_a_wall_or_looking_away_sees_a_valid_picture() {
     }
 }
 
-/// Real photographs: six neighbouring frames of a shared scene and its transforms, changed.
-///
-/// The first frames of `fox` stand on a line across their viewing direction, where flipped axes
-/// make an equally good scene; these go round it.
-fn real(scene: &str, change: impl Fn(&mut Value)) -> Option<Upload> {
-    let folder = shared_scene(scene)?;
+/// Photographs of a folder and its transforms, changed.
+fn changed(folder: &Path, frames: Range<usize>, change: impl Fn(&mut Value)) -> Upload {
     let text = std::fs::read(folder.join("transforms.json")).unwrap();
     let mut transforms: Value = serde_json::from_slice(&text).unwrap();
-    let frames = transforms["frames"].as_array_mut().unwrap();
-    frames.drain(..10);
-    frames.truncate(6);
-    let photos = frames
+    let all = transforms["frames"].as_array_mut().unwrap();
+    *all = all[frames].to_vec();
+    let photos = all
         .iter()
         .map(|frame| {
             let name = frame["file_path"].as_str().unwrap().to_owned();
@@ -525,7 +522,7 @@ fn real(scene: &str, change: impl Fn(&mut Value)) -> Option<Upload> {
         .collect();
     change(&mut transforms);
     let cameras = Some(UploadCameras::Transforms(transforms.to_string().into_bytes()));
-    Some(Upload { cameras, photos, archive: None })
+    Upload { cameras, photos, archive: None }
 }
 
 fn matrices(transforms: &mut Value, change: impl Fn(&mut [[f64; 4]; 4])) {
@@ -538,23 +535,35 @@ fn matrices(transforms: &mut Value, change: impl Fn(&mut [[f64; 4]; 4])) {
 }
 
 #[tokio::test]
+async fn wrong_conventions_are_named() {
+    wrong_conventions(&root().join("tests/fixtures/room"), 0..6).await;
+}
+
+#[tokio::test]
 async fn wrong_conventions_on_real_photographs_are_named() {
-    let good = real("fox", |_| {});
-    let Some(good) = good else { return };
-    let axes = real("fox", |transforms| {
+    // The first frames of `fox` stand on a line across their viewing direction, where flipped axes
+    // make an equally good scene; these go round it.
+    let Some(folder) = shared_scene("fox") else { return };
+    wrong_conventions(&folder, 10..16).await;
+}
+
+/// The usual mistakes with these photographs are named at both doors.
+async fn wrong_conventions(folder: &Path, frames: Range<usize>) {
+    let good = changed(folder, frames.clone(), |_| {});
+    let axes = changed(folder, frames.clone(), |transforms| {
         matrices(transforms, |m| {
             for row in &mut m[..3] {
                 (row[1], row[2]) = (-row[1], -row[2]);
             }
         });
     });
-    let inverted = real("fox", |transforms| {
+    let inverted = changed(folder, frames.clone(), |transforms| {
         matrices(transforms, |m| {
             let pose = glam::DMat4::from_cols_array_2d(m).transpose();
             *m = pose.inverse().transpose().to_cols_array_2d();
         });
     });
-    let half = real("fox", |transforms| {
+    let half = changed(folder, frames, |transforms| {
         for key in ["fl_x", "fl_y", "cx", "cy"] {
             transforms[key] = json!(transforms[key].as_f64().unwrap() / 2.0);
         }
@@ -569,7 +578,6 @@ async fn wrong_conventions_on_real_photographs_are_named() {
             "{warnings:?} of a good one"
         );
         for (upload, code) in [(&axes, wrong[0]), (&inverted, wrong[1]), (&half, wrong[2])] {
-            let upload = upload.as_ref().expect("the data was there before");
             let named = match door.create(upload, &Options::wait()).await {
                 Ok((id, _)) => door.get(&id).await.unwrap().1,
                 Err(fault) => vec![format!("{}: {}", fault.code, fault.message)],

@@ -5,7 +5,10 @@ use std::{
     collections::{BTreeMap, HashSet},
     path::Path,
     process::Command,
-    sync::{Arc, Mutex},
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicU64, Ordering},
+    },
     time::{Duration, Instant},
 };
 
@@ -16,10 +19,7 @@ use segsplat::{
 };
 use sha2::{Digest, Sha256};
 
-use crate::common::{
-    process::{self, Process, Start, can_serve, eventually, long},
-    skipped,
-};
+use crate::common::process::{self, Process, Start, can_serve, eventually, long};
 
 /// Scenes beyond which callers rather delete than make.
 const SCENES_MAX: usize = 60;
@@ -36,6 +36,16 @@ struct Known {
 }
 
 type Ledger = Arc<Mutex<BTreeMap<String, Known>>>;
+
+/// What the callers of one round got so far. The kill waits for counts, so that it does not depend
+/// on the speed of the machine.
+#[derive(Debug, Default)]
+struct Progress {
+    /// Calls that were answered.
+    answers: AtomicU64,
+    /// Exports that arrived whole.
+    exports: AtomicU64,
+}
 
 /// Reproducible numbers.
 struct Random(u64);
@@ -71,7 +81,13 @@ async fn export(
 
 /// One caller: makes, looks, deletes, until the server is gone. Where there is no room for another
 /// scene it deletes some.
-async fn caller(server: Arc<Process>, ledger: Ledger, uploads: Arc<Vec<Upload>>, seed: u64) {
+async fn caller(
+    server: Arc<Process>,
+    ledger: Ledger,
+    progress: Arc<Progress>,
+    uploads: Arc<Vec<Upload>>,
+    seed: u64,
+) {
     let mut deletions = 0;
     let (client, mut random) = (crate::common::client(), Random(seed));
     loop {
@@ -102,10 +118,13 @@ async fn caller(server: Arc<Process>, ledger: Ledger, uploads: Arc<Vec<Upload>>,
                 )
             }
             (16..=37, Some(id)) => export(&client, &server, id).await.map(|file| match file {
-                Ok(digest) => note(&ledger, id, |known| {
-                    let first = known.export.get_or_insert_with(|| digest.clone());
-                    assert_eq!(*first, digest, "{id} changed");
-                }),
+                Ok(digest) => {
+                    note(&ledger, id, |known| {
+                        let first = known.export.get_or_insert_with(|| digest.clone());
+                        assert_eq!(*first, digest, "{id} changed");
+                    });
+                    progress.exports.fetch_add(1, Ordering::Relaxed);
+                }
                 // Not ready yet, or another caller's deletion came first.
                 Err(status) => assert!([404, 409, 429].contains(&status), "{id}: {status}"),
             }),
@@ -122,6 +141,7 @@ async fn caller(server: Arc<Process>, ledger: Ledger, uploads: Arc<Vec<Upload>>,
         if done.is_err() {
             return;
         }
+        progress.answers.fetch_add(1, Ordering::Relaxed);
     }
 }
 
@@ -163,19 +183,28 @@ enum Room {
 struct SmallDisk(tempfile::TempDir);
 
 impl SmallDisk {
-    /// `None` (said on standard output) where it cannot be mounted.
+    /// `None` (said on standard output) where this process may not mount.
     fn mount(size: &str) -> Option<Self> {
+        if !may_mount() {
+            println!("skipped: a small file system takes root, which no script can get");
+            return None;
+        }
         let folder = tempfile::tempdir().expect("a temporary folder");
         let mounted = Command::new("mount")
             .args(["-t", "tmpfs", "-o", &format!("size={size}"), "tmpfs"])
             .arg(folder.path())
             .status();
-        if mounted.is_ok_and(|status| status.success()) {
-            return Some(Self(folder));
-        }
-        skipped("no small file system can be mounted (it takes root)");
-        None
+        assert!(mounted.expect("mount starts").success(), "a small file system is mounted");
+        Some(Self(folder))
     }
+}
+
+/// Whether this process has the capability to mount (`CAP_SYS_ADMIN`).
+fn may_mount() -> bool {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let mask = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
+    mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok())
+        .is_some_and(|mask| mask >> 21 & 1 == 1)
 }
 
 impl Drop for SmallDisk {
@@ -247,13 +276,24 @@ async fn killed(folder: &Path, kills: u64, room: Room) {
         let server = Arc::new(start.start());
         starts.push(server.started_in);
         check(&server, &ledger, room).await;
+        let progress = Arc::new(Progress::default());
         let callers: Vec<_> = (0..4)
             .map(|i| {
                 let (server, ledger) = (Arc::clone(&server), Arc::clone(&ledger));
-                tokio::spawn(caller(server, ledger, Arc::clone(&uploads), 100 * round + i))
+                let (progress, uploads) = (Arc::clone(&progress), Arc::clone(&uploads));
+                tokio::spawn(caller(server, ledger, progress, uploads, 100 * round + i))
             })
             .collect();
-        tokio::time::sleep(Duration::from_millis(20 + random.below(1_500))).await;
+        // Every second kill may come before any scene is whole, the others only after some were.
+        let (answers, exports) = (random.below(150), (1 - round % 2) * (1 + random.below(15)));
+        eventually("answers before the kill", async || {
+            let reached = progress.answers.load(Ordering::Relaxed) >= answers
+                && progress.exports.load(Ordering::Relaxed) >= exports;
+            // A caller that panicked says so below.
+            (reached || callers.iter().any(|caller| caller.is_finished())).then_some(())
+        })
+        .await;
+        tokio::time::sleep(Duration::from_millis(random.below(100))).await;
         server.kill_now();
         for caller in callers {
             caller.await.expect("a caller saw what it must not");

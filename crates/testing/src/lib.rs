@@ -20,7 +20,7 @@ pub fn root() -> &'static Path {
     Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."))
 }
 
-/// True where absence of data, library or adapter is a failure and not a skip.
+/// True where the absence of a library or an adapter is a failure and not a skip.
 #[must_use]
 pub fn strict() -> bool {
     std::env::var("CI").is_ok_and(|v| v == "true" || v == "1")
@@ -34,15 +34,19 @@ pub fn skipped(why: &str) {
 
 /// The shared photo data: `SEGSPLAT_SHARED_DATA`, else `../shared/data` beside the repository.
 ///
-/// `None` (said on standard output) where there is none; a failure where [`strict`].
+/// It is no part of the repository, and every test with it has another on `tests/fixtures/room`.
+/// `None` (said on standard output) where there is none, also in CI; a failure where the variable
+/// names a folder without scenes.
 #[must_use]
 pub fn shared_data() -> Option<PathBuf> {
     let named = std::env::var_os("SEGSPLAT_SHARED_DATA").map(PathBuf::from);
+    let required = named.is_some();
     let folder = named.unwrap_or_else(|| root().join("../shared/data"));
     if folder.join("scenes").is_dir() {
         return Some(folder);
     }
-    skipped("no shared photo data (set SEGSPLAT_SHARED_DATA)");
+    assert!(!required, "SEGSPLAT_SHARED_DATA is {}, which has no scenes", folder.display());
+    println!("skipped: no shared photo data (set SEGSPLAT_SHARED_DATA)");
     None
 }
 

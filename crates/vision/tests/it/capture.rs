@@ -12,6 +12,8 @@ use segsplat_vision::{
 
 use segsplat_testing::shared_scene;
 
+use crate::room;
+
 fn options(photos: usize) -> SampleOptions {
     SampleOptions { photos, width: 200, height: 150, seed: 3 }
 }
@@ -19,6 +21,11 @@ fn options(photos: usize) -> SampleOptions {
 fn scene(name: &str) -> Option<Vec<PosedPhoto>> {
     let folder = shared_scene(name)?;
     Some(photos::read_dir(&folder, &Limits::default()).unwrap())
+}
+
+/// The generated photos of `tests/fixtures/room`.
+fn generated() -> Vec<PosedPhoto> {
+    photos::read_dir(&room::folder(), &Limits::default()).unwrap()
 }
 
 fn picked(photos: &[PosedPhoto], which: &[usize]) -> Vec<PosedPhoto> {
@@ -166,16 +173,26 @@ const NEIGHBORS: [(&str, [[usize; 2]; 2]); 8] = [
     ("terrace", [[8, 9], [12, 13]]),
 ];
 
+/// Two photos that see much of the same raise no warning.
+fn raises_no_false_alarm(name: &str, all: &[PosedPhoto], pair: [usize; 2]) {
+    let capture = capture::analyse(&picked(all, &pair)).unwrap();
+    assert_eq!(capture.warnings, [], "{name} {pair:?}");
+    let overlap = capture.overlap[0][1].max(capture.overlap[1][0]);
+    assert!(overlap > 0.4, "{name} {pair:?}: overlap {overlap}");
+}
+
+#[test]
+fn neighbours_raise_no_false_alarm() {
+    for first in 0..room::PHOTOS - 1 {
+        raises_no_false_alarm("room", &generated(), [first, first + 1]);
+    }
+}
+
 #[test]
 fn real_neighbours_raise_no_false_alarm() {
     for (name, pairs) in NEIGHBORS {
         let Some(all) = scene(name) else { return };
-        for pair in pairs {
-            let capture = capture::analyse(&picked(&all, &pair)).unwrap();
-            assert_eq!(capture.warnings, [], "{name} {pair:?}");
-            let overlap = capture.overlap[0][1].max(capture.overlap[1][0]);
-            assert!(overlap > 0.4, "{name} {pair:?}: overlap {overlap}");
-        }
+        pairs.into_iter().for_each(|pair| raises_no_false_alarm(name, &all, pair));
     }
 }
 
@@ -199,8 +216,8 @@ fn scale_k(p: &mut PosedPhoto, focal: f64, center: f64) {
     (k.cx, k.cy) = (k.cx * center, k.cy * center);
 }
 
-#[test]
-fn the_usual_mistakes_are_named_on_real_scenes() {
+/// Each usual mistake, made with two right photos, is named by a warning.
+fn mistakes_are_named(name: &str, right: &[PosedPhoto]) {
     type Spoil = fn(&mut PosedPhoto);
     let mistakes: [(&str, WarningCode, Spoil); 6] = [
         ("axes", WarningCode::AxesSwapped, |p| {
@@ -216,30 +233,65 @@ fn the_usual_mistakes_are_named_on_real_scenes() {
         ("K of half the size", WarningCode::IntrinsicsScale, |p| scale_k(p, 0.5, 0.5)),
         ("focal length of twice the size", WarningCode::IntrinsicsScale, |p| scale_k(p, 2.0, 1.0)),
     ];
-    let named = ["fox", "red_kitchen", "juice_box_table", "coke_can"];
-    for (name, pairs) in NEIGHBORS.iter().filter(|(name, _)| named.contains(name)) {
-        let Some(all) = scene(name) else { return };
-        let right = picked(&all, &pairs[0]);
-        for (what, code, spoil) in mistakes {
-            let capture = capture::analyse(&spoilt(&right, spoil)).unwrap();
-            let codes: Vec<WarningCode> = capture.warnings.iter().map(|w| w.code).collect();
-            assert!(codes.contains(&code), "{name}, {what}: {:?}", capture.warnings);
-            let message = &capture.warnings[0].message;
-            assert!(message.contains(" % "), "the figures are given: {message}");
-        }
+    for (what, code, spoil) in mistakes {
+        let capture = capture::analyse(&spoilt(right, spoil)).unwrap();
+        let codes: Vec<WarningCode> = capture.warnings.iter().map(|w| w.code).collect();
+        assert!(codes.contains(&code), "{name}, {what}: {:?}", capture.warnings);
+        let message = &capture.warnings[0].message;
+        assert!(message.contains(" % "), "the figures are given: {message}");
     }
 }
 
 #[test]
+fn the_usual_mistakes_are_named() {
+    // Nearer to each other two photos of this room do not tell a focal length.
+    for pair in [[0, 2], [1, 3]] {
+        mistakes_are_named("room", &picked(&generated(), &pair));
+    }
+}
+
+#[test]
+fn the_usual_mistakes_are_named_on_real_scenes() {
+    let named = ["fox", "red_kitchen", "juice_box_table", "coke_can"];
+    for (name, pairs) in NEIGHBORS.iter().filter(|(name, _)| named.contains(name)) {
+        let Some(all) = scene(name) else { return };
+        mistakes_are_named(name, &picked(&all, &pairs[0]));
+    }
+}
+
+/// A pair whose second photo is of another place is refused.
+fn stranger_is_refused(right: &[PosedPhoto], stranger: &PosedPhoto) {
+    let mut pair = right.to_vec();
+    pair[1].photo = stranger.photo.clone();
+    pair[1].camera.intrinsics = stranger.camera.intrinsics;
+    let error = capture::analyse(&pair).unwrap_err();
+    assert!(error.message().contains("share nothing"), "{error}");
+}
+
+#[test]
 fn strangers_are_refused() {
+    let elsewhere = sample::photos(&SampleOptions { seed: 5, ..options(2) }).unwrap();
+    stranger_is_refused(&picked(&generated(), &[0, 1]), &elsewhere[0]);
+}
+
+#[test]
+fn real_strangers_are_refused() {
     let (Some(fox), Some(kitchen)) = (scene("fox"), scene("red_kitchen")) else { return };
     for (i, j) in [(12, 13), (36, 35)] {
-        let mut pair = picked(&fox, &[i, j]);
-        let stranger = &kitchen[j % kitchen.len()];
-        pair[1].photo = stranger.photo.clone();
-        pair[1].camera.intrinsics = stranger.camera.intrinsics;
-        let error = capture::analyse(&pair).unwrap_err();
-        assert!(error.message().contains("share nothing"), "{error}");
+        stranger_is_refused(&picked(&fox, &[i, j]), &kitchen[j % kitchen.len()]);
+    }
+}
+
+#[test]
+fn ranges_hold_the_true_depths() {
+    let photos = generated();
+    for pair in [[0, 1], [2, 3], [4, 5]] {
+        let near_far = capture::near_far(&photos, &pair).unwrap();
+        for (i, range) in pair.into_iter().zip(near_far) {
+            let depth = room::room().view(&photos[i].camera).depth;
+            let share = inside(depth.into_iter().map(f64::from), range);
+            assert!(share > 0.93, "photo {i} of {pair:?}: {share} in {range:?}");
+        }
     }
 }
 

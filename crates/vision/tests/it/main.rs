@@ -12,6 +12,7 @@ mod colours;
 mod geometry;
 mod literal;
 mod photos;
+mod room;
 mod segment;
 
 use segsplat_vision::models::NetworkOptions;

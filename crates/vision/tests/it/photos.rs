@@ -15,6 +15,8 @@ use serde_json::{Value, json};
 
 use segsplat_testing::shared_scene;
 
+use crate::room;
+
 fn options() -> SampleOptions {
     SampleOptions { photos: 3, width: 48, height: 36, seed: 5 }
 }
@@ -270,7 +272,8 @@ fn bombs_meet_the_unpacked_bound() {
     let bomb = vec![0_u8; 3 << 20];
     let zip = zipped(&[("transforms.json", b"{}"), ("bomb.png", &bomb)]);
     assert!(zip.len() < 20_000, "the bomb must be small: {}", zip.len());
-    let limits = Limits { archive_unpacked_bytes_max: 1 << 20, ..Limits::default() };
+    let mut limits = Limits::default();
+    limits.archive_unpacked_bytes_max = 1 << 20;
     let error = photos::read(&archive(zip.clone()), &limits).unwrap_err();
     assert_eq!(error.code(), ErrorCode::LimitExceeded, "{error}");
     // The same bomb with headers that lie about its size.
@@ -310,6 +313,20 @@ fn damaged_photos_are_named() {
     huge.truncate(60);
     let words = ["photo 2", "100000x100000 px", "24000000"];
     refused(&spoilt(huge), ErrorCode::LimitExceeded, &words);
+}
+
+#[test]
+fn a_folder_is_read_with_the_distortion_of_its_lens_undone() {
+    let got = photos::read_dir(&room::folder(), &Limits::default()).unwrap();
+    assert_eq!(got.len(), room::PHOTOS);
+    for posed in &got {
+        let truth = room::room().view(&posed.camera).photo.rgb;
+        assert!(posed.photo.valid.is_none(), "this lens sees all that a pinhole camera would see");
+        assert_eq!(posed.photo.rgb.len(), truth.len());
+        let off = posed.photo.rgb.iter().zip(&truth).map(|(a, b)| f64::from(a.abs_diff(*b)));
+        let off = off.sum::<f64>() / truth.len() as f64;
+        assert!(off < 4.0, "{}: {off} levels off the truth", posed.file);
+    }
 }
 
 #[test]
