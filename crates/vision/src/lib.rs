@@ -2,8 +2,8 @@
 //!
 //! | layer | modules | may use |
 //! |---|---|---|
-//! | stages | [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`sample`] | `segsplat_core`; never each other |
-//! | order | [`pipeline`] | the stages: the only place that knows their order |
+//! | L1 stages | [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`sample`] | `segsplat_core`; never each other |
+//! | L2 order | [`pipeline`] | L1; the only place that knows their order |
 
 pub mod capture;
 pub mod lift;
