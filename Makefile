@@ -3,7 +3,8 @@
 # make test    every check: format, lints, docs, all tests, in one (release) profile
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
 # make eval-scenes   labelled scenes of held-out things, rendered to target/eval/scenes (g++, PYTHON)
-# make plots  docs/plots from benches/runs (PYTHON with matplotlib)
+# make report   the tables of docs/benchmarks.md from benches/runs
+# make plots   docs/plots from benches/runs (PYTHON with matplotlib)
 # make test-long   the random tests with many more cases, and the slow ones
 # make fuzz    every reader of bytes from outside, FUZZ_SECONDS=600 each
 
@@ -18,7 +19,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: demo serve test test-long fuzz bench eval eval-scenes plots setup build fmt lint doc tests deny
+.PHONY: demo serve test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -58,8 +59,14 @@ fuzz: setup
 bench: setup
 	$(CARGO) bench --locked
 
-eval: build
-	$(SEGSPLAT) eval $(DATA) $(ARGS)
+# The laboratory: measures, and writes the tables of docs/benchmarks.md.
+LAB := $(CARGO) run --locked --release -p segsplat-lab --
+
+eval: setup
+	$(LAB) photos $(DATA) $(ARGS)
+
+report:
+	$(LAB) report $(ARGS)
 
 eval-scenes:
 	$(PYTHON) models/training/semantics/eval_scenes.py --data $(dir $(DATA)) \

@@ -16,17 +16,15 @@
 //! | L3 | [`jobs`] | `pipeline`, `store` |
 //! | L4 | [`service`] | `jobs`, `store`, `render`, `semantics`, `models` |
 //! | L5 | [`api`] | `service`; the only place that knows HTTP and gRPC |
-//! | L6 | `main`, [`cli`], [`eval`], [`bench`](mod@bench) | everything |
+//! | L6 | `main`, [`cli`] | everything |
 //!
 //! `tests/it/tidy.rs` reads the `use crate::…` lines and holds the code to this table.
 //! Frames, units and orders: `docs/conventions.md`. Why things are as they are: `docs/adr/`.
 
 pub mod api;
-pub mod bench;
 pub mod cli;
 pub mod config;
 pub mod crypto;
-pub mod eval;
 pub mod jobs;
 pub mod keys;
 pub mod service;

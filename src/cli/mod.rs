@@ -9,13 +9,12 @@ pub mod engine;
 mod health;
 mod inspect;
 mod keys;
-mod masks;
-mod measure;
 mod models;
 mod output;
 mod query;
 mod reconstruct;
 mod render;
+mod sample;
 mod scene_file;
 mod serve;
 
@@ -62,12 +61,10 @@ enum Command {
     Inspect(inspect::Args),
     /// The model bundle and ONNX Runtime
     Models(models::Args),
-    /// Score scene folders against photos that were held out
-    Eval(Box<measure::EvalArgs>),
-    /// Time the stages on generated photos
-    Bench(bench::Args),
+    /// Time a view of a scene, and say how far it is from the exact picture
+    Bench(Box<bench::Args>),
     /// Write a small generated photo set with exact cameras
-    Sample(measure::SampleArgs),
+    Sample(sample::Args),
 }
 
 impl Command {
@@ -79,7 +76,6 @@ impl Command {
             Self::Render(args) => args.config.clone(),
             Self::Query(args) => args.config.clone(),
             Self::Models(args) => args.config.clone(),
-            Self::Eval(args) => args.config().clone(),
             Self::Bench(args) => args.config.clone(),
             Self::Inspect(_) | Self::Sample(_) | Self::Keys(_) => ConfigArgs::default(),
         }
@@ -134,8 +130,7 @@ fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
         Command::Query(args) => query::run(args, &config, out),
         Command::Inspect(args) => inspect::run(args, &config, out),
         Command::Models(args) => models::run(args, &config, out),
-        Command::Eval(args) => measure::eval(args, &config, out),
         Command::Bench(args) => bench::run(args, &config, out),
-        Command::Sample(args) => measure::sample(args, out),
+        Command::Sample(args) => sample::run(args, out),
     }
 }

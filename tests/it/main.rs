@@ -16,7 +16,6 @@ mod common;
 mod containers;
 mod crop;
 mod errors;
-mod evaluate;
 mod faults;
 mod fuzz_input;
 mod grpc;

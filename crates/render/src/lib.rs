@@ -3,6 +3,7 @@
 //! [`oracle`] is the judge (f64, per pixel, no tiles), [`cpu`] the tiled product renderer,
 //! [`gpu`] the same stages in WGSL. All three take [`RenderRequest`] and give [`Frame`].
 
+pub mod compare;
 pub mod constants;
 pub mod cpu;
 pub mod gpu;

@@ -1,7 +1,7 @@
 //! What a renderer leaves out because it cannot show, one by one.
 //!
-//! All are on in the product. Tests switch each off and find the same pictures; `segsplat bench
-//! --skips` times frames with and without each.
+//! All are on in the product. Tests switch each off and find the same pictures; `segsplat-lab
+//! skips` times frames with and without each.
 
 /// One kind of work that no pixel needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]

@@ -1,5 +1,5 @@
 //! What renderers leave out changes no pixel: each skip switched off gives the same frame.
-//! What each saves is measured by `segsplat bench --skips`, not here.
+//! What each saves is measured by `segsplat-lab skips`, not here.
 
 use segsplat_core::scene::Gaussians;
 use segsplat_render::{Frame, Labels, RenderRequest, Renderer, cpu::CpuRenderer, skip::Skip};

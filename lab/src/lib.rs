@@ -1,0 +1,109 @@
+//! The laboratory of SegSplat Server: it measures quality and time, and writes the tables of
+//! `docs/benchmarks.md`. It is not published and the server does not use it.
+//!
+//! Each command prints one JSON row for each thing that it measures, and appends the rows to the
+//! file that `--out` names. A row holds its command, its commit, its machine and its error
+//! ([`rows`]). `report` makes the tables of the page from the rows ([`report`]).
+//!
+//! | command | measures |
+//! |---|---|
+//! | `photos` | views of scenes against photos that were held out ([`photos`]) |
+//! | `density` | what thinning costs and saves ([`density`]) |
+//! | `semantics` | what texts select in views of labelled scenes ([`semantics`]) |
+//! | `masks` | what each shortcut of the mask stage changes ([`masks`]) |
+//! | `words` | whether images find their names ([`words`]) |
+//! | `frames` | frame times of a renderer on a generated scene, with their error ([`frames`]) |
+//! | `skips` | what each kind of skipped work saves ([`frames::skips`]) |
+//! | `stages` | time of each stage from photos to a view ([`stages`]) |
+
+pub mod density;
+pub mod folders;
+pub mod frames;
+mod grid;
+pub mod masks;
+pub mod metrics;
+mod npy;
+pub mod photos;
+pub mod report;
+pub mod rows;
+pub mod semantics;
+pub mod setup;
+pub mod stages;
+mod triples;
+mod warp;
+pub mod words;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+use segsplat_core::{error, limits, scene};
+use segsplat_render as render;
+use segsplat_vision::{models, photos as photo_files, pipeline, sample, segment};
+
+use self::rows::{Record, Rows};
+use crate::error::Result;
+
+/// Measures SegSplat Server.
+#[derive(Debug, Parser)]
+#[command(name = "segsplat-lab", version)]
+struct Cli {
+    #[command(flatten)]
+    record: Record,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Compare views of scenes with photos that were held out
+    Photos(photos::Args),
+    /// Compare thinned scenes with scenes of all Gaussians
+    Density(density::Args),
+    /// Compare what texts select with labels
+    Semantics(semantics::Args),
+    /// Compare the shortcuts of the mask stage
+    Masks(masks::Args),
+    /// Ask labelled images for their names
+    Words(words::Args),
+    /// Time frames of a generated scene
+    Frames(frames::Args),
+    /// Time frames without each kind of skipped work
+    Skips(frames::Args),
+    /// Time each stage from photos to a view
+    Stages(stages::Args),
+    /// Write the tables of docs/benchmarks.md from the rows
+    Report(report::Args),
+}
+
+/// Runs the program with this process's arguments.
+#[must_use]
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    match run(&cli) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            let mut source = std::error::Error::source(&error);
+            rows::progress(&format!("error: {error}"));
+            while let Some(cause) = source {
+                rows::progress(&format!("  because: {cause}"));
+                source = cause.source();
+            }
+            ExitCode::from(error.code().row().exit)
+        }
+    }
+}
+
+fn run(cli: &Cli) -> Result<()> {
+    let mut rows = Rows::open(&cli.record)?;
+    match &cli.command {
+        Command::Photos(args) => photos::run(args, &mut rows),
+        Command::Density(args) => density::run(args, &mut rows),
+        Command::Semantics(args) => semantics::run(args, &mut rows).map(drop),
+        Command::Masks(args) => masks::run(args, &mut rows),
+        Command::Words(args) => words::run(args, &mut rows),
+        Command::Frames(args) => frames::run(args, &mut rows),
+        Command::Skips(args) => frames::skips::run(args, &mut rows),
+        Command::Stages(args) => stages::run(args, &mut rows),
+        Command::Report(args) => report::run(args),
+    }
+}

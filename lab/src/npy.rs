@@ -1,0 +1,72 @@
+//! Just enough of `NumPy`'s `.npy` to read labelled photographs and LLFF cameras.
+
+/// An array in C order.
+#[derive(Debug)]
+pub(crate) struct Array {
+    kind: String,
+    /// Its sides, the slowest first.
+    pub(crate) shape: Vec<usize>,
+    data: Vec<u8>,
+}
+
+impl Array {
+    /// Reads a file; `None` where it is no such file or of Fortran order.
+    pub(crate) fn parse(mut bytes: Vec<u8>) -> Option<Self> {
+        if bytes.get(..6)? != b"\x93NUMPY" {
+            return None;
+        }
+        let (length, from) = match bytes.get(6)? {
+            1 => (u32::from(u16::from_le_bytes(bytes.get(8..10)?.try_into().ok()?)), 10),
+            _ => (u32::from_le_bytes(bytes.get(8..12)?.try_into().ok()?), 12),
+        };
+        let start = usize::try_from(length).ok()?.checked_add(from)?;
+        let header = std::str::from_utf8(bytes.get(from..start)?).ok()?;
+        if !header.contains("'fortran_order': False") {
+            return None;
+        }
+        let kind = header.split("'descr': '").nth(1)?.split('\'').next()?.to_owned();
+        let sides = header.split("'shape': (").nth(1)?.split(')').next()?.split(',');
+        let sides = sides.map(str::trim).filter(|side| !side.is_empty());
+        let shape = sides.map(|side| side.parse().ok()).collect::<Option<_>>()?;
+        Some(Self { kind, shape, data: bytes.split_off(start) })
+    }
+
+    /// The bytes of an array of bytes.
+    pub(crate) fn bytes(self) -> Option<Vec<u8>> {
+        (self.kind == "|u1").then_some(self.data)
+    }
+
+    /// Whole numbers that are not negative.
+    pub(crate) fn counts(&self) -> Option<Vec<usize>> {
+        let count = |value: i64| usize::try_from(value).ok();
+        match self.kind.as_str() {
+            "<i4" => self.each(|c| count(i32::from_le_bytes(c).into())),
+            "<i8" => self.each(|c| count(i64::from_le_bytes(c))),
+            _ => None,
+        }
+    }
+
+    /// Numbers of f64.
+    pub(crate) fn numbers(&self) -> Option<Vec<f64>> {
+        (self.kind == "<f8").then(|| self.each(|c| Some(f64::from_le_bytes(c)))).flatten()
+    }
+
+    /// Texts of fixed length in UTF-32, filled up with zeros.
+    pub(crate) fn texts(&self) -> Option<Vec<String>> {
+        let width = self.kind.strip_prefix("<U")?.parse::<usize>().ok().filter(|w| *w > 0)?;
+        let letters = self.each(|c| char::from_u32(u32::from_le_bytes(c)))?;
+        let text = |row: &[char]| row.iter().collect::<String>().trim_end_matches('\0').to_owned();
+        Some(letters.chunks_exact(width).map(text).collect())
+    }
+
+    fn each<const N: usize, T>(&self, of: impl Fn([u8; N]) -> Option<T>) -> Option<Vec<T>> {
+        self.data.chunks_exact(N).map(|c| of(c.try_into().ok()?)).collect()
+    }
+}
+
+#[cfg(test)]
+pub(crate) fn npy(kind: &str, shape: &str, data: &[u8]) -> Vec<u8> {
+    let header = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({shape}), }}\n");
+    let length = u16::try_from(header.len()).unwrap().to_le_bytes();
+    [b"\x93NUMPY\x01\x00", length.as_slice(), header.as_bytes(), data].concat()
+}

@@ -1,0 +1,372 @@
+//! Labelled scene folders, ours and those of 3D-OVS, as photos with a class for each pixel.
+//!
+//! Ours: `transforms.json` with `mask_file` in some frames and `masks/classes.json`; `scene.json`
+//! may name `surroundings`: classes that are counted but not asked for. 3D-OVS: `images/`,
+//! `segmentations/classes.txt`, `segmentations/FRAME/CLASS.png`, cameras in `transforms.json`,
+//! `cameras.json` or `poses_bounds.npy` (LLFF). Labels go through the photos' own reader, so a
+//! distorted photo and its labels are undone alike.
+
+use std::{
+    collections::BTreeMap,
+    io::Cursor,
+    path::{Component, Path, PathBuf},
+};
+
+use image::{DynamicImage, GrayImage, ImageFormat, RgbImage, imageops::FilterType};
+use serde_json::Value;
+
+use super::llff;
+use crate::{
+    error::{Error, Result},
+    limits::Limits,
+    photo_files as photos,
+    scene::{PosedPhoto, Upload, UploadFile},
+};
+
+/// A pixel that no photo shows: it is not judged.
+pub(super) const NOT_SEEN: u16 = u16::MAX;
+/// A channel at this value or above belongs to the class.
+const INSIDE: u8 = 128;
+
+/// A class of a scene.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Class {
+    pub(super) name: String,
+    /// Whether its name is asked; surroundings are only counted as wrong where selected.
+    pub(super) asked: bool,
+}
+
+/// A photo with labels.
+#[derive(Clone, Debug)]
+pub(super) struct LabelledFrame {
+    /// Index of the photo.
+    pub(super) photo: usize,
+    /// `[H * W]` class + 1 of each pixel, 0 = none of them, [`NOT_SEEN`].
+    pub(super) label: Vec<u16>,
+}
+
+/// A scene folder.
+#[derive(Clone, Debug)]
+pub(super) struct LabelledScene {
+    pub(super) photos: Vec<PosedPhoto>,
+    pub(super) classes: Vec<Class>,
+    pub(super) frames: Vec<LabelledFrame>,
+}
+
+/// Labels as stored: a class + 1 for each pixel of some photos, by the photo's place in the upload.
+struct Stored {
+    classes: Vec<Class>,
+    maps: Vec<(usize, GrayImage)>,
+}
+
+/// Whether the folder holds labels of either layout.
+pub(super) fn is_labelled(dir: &Path) -> bool {
+    dir.join("masks/classes.json").is_file() || dir.join("segmentations/classes.txt").is_file()
+}
+
+/// Reads photos and labels.
+///
+/// # Errors
+/// `invalid_request` when a file of the layout is missing, outside the folder, or no such file.
+pub(super) fn read(dir: &Path, limits: &Limits) -> Result<LabelledScene> {
+    let upload = if dir.join("poses_bounds.npy").is_file()
+        && !photos::CAMERA_FILES.iter().any(|name| dir.join(name).is_file())
+    {
+        llff::upload(dir, limits)?
+    } else {
+        photos::upload_of_dir(dir, limits)?
+    };
+    let stored = if dir.join("masks/classes.json").is_file() {
+        ours(dir, &upload)?
+    } else {
+        ovs(dir, &upload)?
+    };
+    let photos = photos::read(&upload, limits)?;
+    let frames = undo(&stored, &upload, &photos, limits)?;
+    Ok(LabelledScene { photos, classes: stored.classes, frames })
+}
+
+fn json(dir: &Path, name: &str) -> Result<Value> {
+    let wrong = || Error::invalid(format!("{name} cannot be read"));
+    let text = fs_err::read_to_string(dir.join(name)).map_err(|e| wrong().caused_by(e))?;
+    serde_json::from_str(&text).map_err(|e| wrong().caused_by(e))
+}
+
+/// A picture of the folder named by one of its files; only names that stay inside.
+fn picture(dir: &Path, name: &str) -> Result<GrayImage> {
+    let wrong = |what: &str| Error::invalid(format!("{name:?}: {what}"));
+    if Path::new(name).components().any(|part| !matches!(part, Component::Normal(_))) {
+        return Err(wrong("the path must be relative and stay inside the folder"));
+    }
+    let bytes = fs_err::read(dir.join(name)).map_err(|e| wrong("cannot be read").caused_by(e))?;
+    let picture = image::load_from_memory(&bytes).map_err(|e| wrong("no picture").caused_by(e))?;
+    Ok(picture.into_luma8())
+}
+
+/// Width and height of a photo, from its header.
+pub(super) fn dimensions(file: &UploadFile) -> Result<(u32, u32)> {
+    let wrong = || Error::photo(format!("{}: no photo", file.name));
+    image::ImageReader::new(Cursor::new(&file.bytes))
+        .with_guessed_format()
+        .map_err(|e| wrong().caused_by(e))?
+        .into_dimensions()
+        .map_err(|e| wrong().caused_by(e))
+}
+
+/// Place in the upload of the photo that a label belongs to: by path, or by stem.
+fn photo_called(upload: &Upload, name: &str) -> Option<usize> {
+    let stem = |path: &str| Path::new(path).file_stem().map(ToOwned::to_owned);
+    let whole = upload.photos.iter().position(|photo| photo.name == name);
+    whole.or_else(|| upload.photos.iter().position(|photo| stem(&photo.name) == stem(name)))
+}
+
+fn ours(dir: &Path, upload: &Upload) -> Result<Stored> {
+    let wrong = |what: &str| Error::invalid(format!("{what}"));
+    let named: BTreeMap<String, String> = serde_json::from_value(json(dir, "masks/classes.json")?)
+        .map_err(|e| wrong("masks/classes.json: no value to name table").caused_by(e))?;
+    let surroundings: Vec<String> = if dir.join("scene.json").is_file() {
+        serde_json::from_value(json(dir, "scene.json")?["surroundings"].clone()).unwrap_or_default()
+    } else {
+        Vec::new()
+    };
+    let (mut classes, mut class_of) = (Vec::new(), [0_u8; 256]);
+    for (value, name) in named {
+        let value: u8 = value.parse().ok().filter(|v| *v > 0).ok_or_else(|| {
+            wrong(&format!("masks/classes.json: value {value:?} must be 1 to 255"))
+        })?;
+        let asked = !surroundings.contains(&name);
+        classes.push(Class { name, asked });
+        class_of[usize::from(value)] =
+            u8::try_from(classes.len()).map_err(|_| wrong("over 255 classes"))?;
+    }
+    let mut maps = Vec::new();
+    let cameras = json(dir, "transforms.json")?;
+    for frame in cameras["frames"].as_array().into_iter().flatten() {
+        let (Some(file), Some(mask)) = (frame["file_path"].as_str(), frame["mask_file"].as_str())
+        else {
+            continue;
+        };
+        let photo = photo_called(upload, file)
+            .ok_or_else(|| wrong(&format!("{mask:?} belongs to no photo of the folder")))?;
+        let mut map = picture(dir, mask)?;
+        map.pixels_mut().for_each(|v| v.0[0] = class_of[usize::from(v.0[0])]);
+        maps.push((photo, map));
+    }
+    Ok(Stored { classes, maps })
+}
+
+fn ovs(dir: &Path, upload: &Upload) -> Result<Stored> {
+    let wrong = |what: &str| Error::invalid(format!("segmentations: {what}"));
+    let top = dir.join("segmentations");
+    let text = fs_err::read_to_string(top.join("classes.txt"))
+        .map_err(|e| wrong("classes.txt cannot be read").caused_by(e))?;
+    let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
+    let classes: Vec<Class> =
+        lines.map(|name| Class { name: name.to_owned(), asked: true }).collect();
+    if classes.is_empty() || classes.len() > 255 {
+        return Err(wrong(&format!("classes.txt names {} classes, not 1 to 255", classes.len())));
+    }
+    let mut folders: Vec<PathBuf> = Vec::new();
+    for entry in fs_err::read_dir(&top).map_err(|e| wrong("cannot be read").caused_by(e))? {
+        let path = entry.map_err(|e| wrong("cannot be read").caused_by(e))?.path();
+        if path.is_dir() {
+            folders.push(path);
+        }
+    }
+    folders.sort();
+    let mut maps = Vec::new();
+    for folder in folders {
+        let frame = folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
+        let photo = photo_called(upload, &frame)
+            .ok_or_else(|| wrong(&format!("frame {frame:?} is no photo of the folder")))?;
+        let mut map: Option<GrayImage> = None;
+        for (value, class) in (1_u8..).zip(&classes) {
+            let name = format!("segmentations/{frame}/{}.png", class.name);
+            if !dir.join(&name).is_file() {
+                continue;
+            }
+            let mask = picture(dir, &name)?;
+            let map = map.get_or_insert_with(|| GrayImage::new(mask.width(), mask.height()));
+            if map.dimensions() != mask.dimensions() {
+                return Err(wrong(&format!("{name}: another size than the frame's other masks")));
+            }
+            // Where masks overlap, the one named first keeps the pixel.
+            for (to, from) in map.pixels_mut().zip(mask.pixels()) {
+                if to.0[0] == 0 && from.0[0] >= INSIDE {
+                    to.0[0] = value;
+                }
+            }
+        }
+        maps.extend(map.map(|map| (photo, map)));
+    }
+    Ok(Stored { classes, maps })
+}
+
+/// Labels of the undistorted photos: three classes at a time travel as a photo's channels.
+fn undo(
+    stored: &Stored,
+    upload: &Upload,
+    photos: &[PosedPhoto],
+    limits: &Limits,
+) -> Result<Vec<LabelledFrame>> {
+    let blank = |&(photo, _): &(usize, GrayImage)| {
+        let valid = photos[photo].photo.valid.as_ref();
+        let pixels = photos[photo].photo.rgb.len() / 3;
+        let label = |p: usize| if valid.is_some_and(|valid| !valid[p]) { NOT_SEEN } else { 0 };
+        LabelledFrame { photo, label: (0..pixels).map(label).collect() }
+    };
+    let mut frames: Vec<LabelledFrame> = stored.maps.iter().map(blank).collect();
+    let values: Vec<u8> = (1..=u8::MAX).take(stored.classes.len()).collect();
+    for group in values.chunks(3) {
+        let mut labels = upload.clone();
+        for (photo, map) in &stored.maps {
+            let (width, height) = dimensions(&upload.photos[*photo])?;
+            let flags = RgbImage::from_fn(map.width(), map.height(), |x, y| {
+                let value = map.get_pixel(x, y).0[0];
+                let inside = |c: usize| group.get(c).is_some_and(|of| *of == value);
+                image::Rgb([0, 1, 2].map(|c| if inside(c) { u8::MAX } else { 0 }))
+            });
+            let flags =
+                DynamicImage::ImageRgb8(flags).resize_exact(width, height, FilterType::Nearest);
+            let mut bytes = Cursor::new(Vec::new());
+            flags
+                .write_to(&mut bytes, ImageFormat::Png)
+                .map_err(|e| Error::internal("labels cannot be encoded").caused_by(e))?;
+            labels.photos[*photo].bytes = bytes.into_inner();
+        }
+        let read = photos::read(&labels, limits)?;
+        for frame in &mut frames {
+            let flags = &read[frame.photo].photo.rgb;
+            for (label, flags) in frame.label.iter_mut().zip(flags.chunks_exact(3)) {
+                let class = group.iter().zip(flags).find(|(_, flag)| **flag >= INSIDE);
+                if let Some((value, _)) = class.filter(|_| *label == 0) {
+                    *label = u16::from(*value);
+                }
+            }
+        }
+    }
+    Ok(frames)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    fn png(dir: &Path, name: &str, picture: impl Into<DynamicImage>) {
+        let path = dir.join(name);
+        fs_err::create_dir_all(path.parent().unwrap()).unwrap();
+        picture.into().save(path).unwrap();
+    }
+
+    /// Two photos of 8 x 6, the second one pixel to the right of the first.
+    fn scene(k1: f64) -> tempfile::TempDir {
+        let dir = tempfile::tempdir().unwrap();
+        let mut frames = Vec::new();
+        for i in 0..2_u32 {
+            let name = format!("images/{i:02}.png");
+            png(dir.path(), &name, RgbImage::from_pixel(8, 6, image::Rgb([40, 80, 120])));
+            let pose = [[1, 0, 0, i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]];
+            frames.push(json!({ "file_path": name, "transform_matrix": pose }));
+        }
+        frames[1]["mask_file"] = json!("masks/01.png");
+        let cameras = json!({
+            "w": 8, "h": 6, "fl_x": 8.0, "fl_y": 8.0, "cx": 4.0, "cy": 3.0, "k1": k1,
+            "frames": frames,
+        });
+        fs_err::write(dir.path().join("transforms.json"), cameras.to_string()).unwrap();
+        dir
+    }
+
+    /// Left half one class, right half another, the last row none.
+    fn halves(x: u32, y: u32, [left, right]: [u8; 2]) -> image::Luma<u8> {
+        image::Luma([if y == 5 {
+            0
+        } else if x < 4 {
+            left
+        } else {
+            right
+        }])
+    }
+
+    const HALVES: [u16; 8] = [1, 1, 1, 1, 2, 2, 2, 2];
+
+    #[test]
+    fn our_layout_is_read_with_its_surroundings() {
+        let dir = scene(0.0);
+        let at = |name: &str| dir.path().join(name);
+        png(dir.path(), "masks/01.png", GrayImage::from_fn(8, 6, |x, y| halves(x, y, [7, 9])));
+        fs_err::write(at("masks/classes.json"), r#"{"7": "cup", "9": "wall"}"#).unwrap();
+        fs_err::write(at("scene.json"), r#"{"surroundings": ["wall"]}"#).unwrap();
+        assert!(is_labelled(dir.path()));
+        let scene = read(dir.path(), &Limits::default()).unwrap();
+        let class = |name: &str, asked| Class { name: name.to_owned(), asked };
+        assert_eq!(scene.classes, [class("cup", true), class("wall", false)]);
+        assert_eq!((scene.photos.len(), scene.frames.len()), (2, 1));
+        assert_eq!(scene.frames[0].photo, 1);
+        assert_eq!(scene.frames[0].label[..8], HALVES);
+        assert_eq!(scene.frames[0].label[40..], [0; 8]);
+    }
+
+    #[test]
+    fn the_layout_of_3d_ovs_is_read_and_the_first_class_keeps_a_pixel() {
+        let dir = scene(0.0);
+        let ours = |x: u32, y: u32, values| halves(x, y, values);
+        png(
+            dir.path(),
+            "segmentations/01/red cup.png",
+            GrayImage::from_fn(8, 6, |x, y| ours(x, y, [255, 0])),
+        );
+        // Twice the photo's size is resized; its overlap with the cup is the cup's.
+        png(
+            dir.path(),
+            "segmentations/00/wall.png",
+            GrayImage::from_pixel(16, 12, image::Luma([255])),
+        );
+        png(
+            dir.path(),
+            "segmentations/01/wall.png",
+            GrayImage::from_fn(8, 6, |x, y| ours(x, y, [255, 255])),
+        );
+        let classes = dir.path().join("segmentations/classes.txt");
+        fs_err::write(classes, "red cup\nwall\n").unwrap();
+        let scene = read(dir.path(), &Limits::default()).unwrap();
+        assert!(scene.classes.iter().all(|class| class.asked));
+        assert_eq!(scene.frames.len(), 2);
+        assert_eq!(scene.frames[0].label, [2; 48]);
+        assert_eq!(scene.frames[1].label[..8], HALVES);
+    }
+
+    #[test]
+    fn labels_bend_with_their_photo() {
+        // A strong pincushion: the corners look past the photo, and are not judged.
+        let dir = scene(0.9);
+        png(dir.path(), "masks/01.png", GrayImage::from_fn(8, 6, |x, y| halves(x, y, [1, 2])));
+        fs_err::write(dir.path().join("masks/classes.json"), r#"{"1": "a", "2": "b"}"#).unwrap();
+        let scene = read(dir.path(), &Limits::default()).unwrap();
+        let label = &scene.frames[0].label;
+        assert_eq!([label[0], label[7], label[40], label[47]], [NOT_SEEN; 4]);
+        assert_eq!(label[2 * 8 + 2..2 * 8 + 6], [1, 1, 2, 2]);
+        let valid = scene.photos[1].photo.valid.as_ref().unwrap();
+        assert!(label.iter().zip(valid).all(|(label, valid)| (*label == NOT_SEEN) != *valid));
+    }
+
+    #[test]
+    fn labels_outside_the_folder_or_of_no_photo_are_refused() {
+        for (mask, file) in [("../x.png", "images/01.png"), ("masks/01.png", "images/77.png")] {
+            let dir = scene(0.0);
+            png(dir.path(), "masks/01.png", GrayImage::new(8, 6));
+            fs_err::write(dir.path().join("masks/classes.json"), r#"{"1": "a"}"#).unwrap();
+            let path = dir.path().join("transforms.json");
+            let text = fs_err::read_to_string(&path).unwrap().replace("masks/01.png", mask);
+            let mut cameras: Value = serde_json::from_str(&text).unwrap();
+            let mut frame = cameras["frames"][1].clone();
+            frame["file_path"] = json!(file);
+            cameras["frames"].as_array_mut().unwrap().push(frame);
+            let upload = photos::upload_of_dir(dir.path(), &Limits::default()).unwrap();
+            fs_err::write(&path, cameras.to_string()).unwrap();
+            assert!(ours(dir.path(), &upload).is_err(), "{mask} of {file}");
+        }
+    }
+}

@@ -1,0 +1,106 @@
+//! The hindsight warp: what a network must beat to be of use.
+
+use rayon::prelude::*;
+
+use crate::{
+    metrics::{psnr, to_unit},
+    scene::PosedPhoto,
+};
+
+/// Depths tried, geometric from the first to the last, in baselines.
+const DEPTHS: i32 = 24;
+const NEAREST: f64 = 1.0;
+const FARTHEST: f64 = 30.0;
+
+/// Best PSNR over 24 constant depths (of the target's camera) and all inputs, dB.
+///
+/// Each target pixel takes the input's colour where a plane at that depth puts it: bilinear, the
+/// border repeated.
+pub(crate) fn hindsight_warp(target: &PosedPhoto, inputs: &[&PosedPhoto], baseline: f64) -> f64 {
+    let truth = to_unit(&target.photo);
+    let tries: Vec<(&PosedPhoto, i32)> =
+        inputs.iter().flat_map(|input| (0..DEPTHS).map(move |step| (*input, step))).collect();
+    let ratio: f64 = FARTHEST / NEAREST;
+    tries
+        .par_iter()
+        .map(|(input, step)| {
+            let share = f64::from(*step) / f64::from(DEPTHS - 1);
+            let warped = warp(target, input, NEAREST * ratio.powf(share) * baseline);
+            psnr(&warped, &truth, target.photo.valid.as_deref())
+        })
+        .max_by(f64::total_cmp)
+        .unwrap_or_default()
+}
+
+/// `input` seen from the target's camera, as if all of it lay at `depth` of the target's camera.
+fn warp(target: &PosedPhoto, input: &PosedPhoto, depth: f64) -> Vec<[f32; 3]> {
+    let lens = target.camera.intrinsics;
+    let to_input = input.camera.camera_to_world.viewmat() * target.camera.camera_to_world.matrix();
+    let mut out = Vec::with_capacity(lens.width as usize * lens.height as usize);
+    for y in 0..lens.height {
+        for x in 0..lens.width {
+            let point = lens.unproject(f64::from(x) + 0.5, f64::from(y) + 0.5, depth);
+            let seen = to_input.transform_point3(point);
+            let (u, v) = input.camera.intrinsics.project(seen);
+            out.push(bilinear(input, u - 0.5, v - 0.5));
+        }
+    }
+    out
+}
+
+/// Colour at (x, y), pixel centres at whole numbers, the border repeated.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped inside")]
+fn bilinear(input: &PosedPhoto, x: f64, y: f64) -> [f32; 3] {
+    let (w, h) = (input.photo.width as usize, input.photo.height as usize);
+    let inside = |v: f64, n: usize| if v.is_finite() { v.clamp(0.0, n as f64 - 1.0) } else { 0.0 };
+    let (x, y) = (inside(x, w), inside(y, h));
+    let (x0, y0) = (x as usize, y as usize);
+    let (x1, y1) = ((x0 + 1).min(w - 1), (y0 + 1).min(h - 1));
+    let (tx, ty) = ((x - x0 as f64) as f32, (y - y0 as f64) as f32);
+    let at = |x: usize, y: usize, c: usize| f32::from(input.photo.rgb[(y * w + x) * 3 + c]);
+    std::array::from_fn(|c| {
+        let top = at(x0, y0, c) * (1.0 - tx) + at(x1, y0, c) * tx;
+        let bottom = at(x0, y1, c) * (1.0 - tx) + at(x1, y1, c) * tx;
+        (top * (1.0 - ty) + bottom * ty) / 255.0
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Camera, CameraToWorld, Intrinsics, Photo};
+
+    /// A wall at z = `depth` with a pattern, seen from x = `eye`.
+    fn wall(eye: f64, depth: f64) -> PosedPhoto {
+        let lens = Intrinsics { fx: 64., fy: 64., cx: 32., cy: 32., width: 64, height: 64 };
+        let pose = [1., 0., 0., eye, 0., 1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1.];
+        let mut rgb = Vec::new();
+        for y in 0..64 {
+            for x in 0..64 {
+                let p = lens.unproject(f64::from(x) + 0.5, f64::from(y) + 0.5, depth);
+                let v = 127.5 + 60.0 * ((p.x + eye) * 5.0).sin() + 60.0 * (p.y * 6.0).cos();
+                rgb.extend([v as u8; 3]);
+            }
+        }
+        PosedPhoto {
+            file: String::new(),
+            photo: Photo { width: 64, height: 64, rgb, valid: None },
+            camera: Camera {
+                intrinsics: lens,
+                camera_to_world: CameraToWorld::from_row_major(&pose, "t").unwrap(),
+            },
+            intrinsics_made_for: None,
+        }
+    }
+
+    #[test]
+    fn a_wall_at_a_tried_depth_is_met() {
+        let baseline = 0.2;
+        let depth = baseline * FARTHEST.powf(12.0 / 23.0);
+        let target = wall(0.1, depth);
+        let best = hindsight_warp(&target, &[&wall(0.0, depth), &wall(0.2, depth)], baseline);
+        let off =
+            psnr(&warp(&target, &wall(0.0, depth), depth * 2.0), &to_unit(&target.photo), None);
+        assert!(best > off + 5.0, "{best} dB at the right depth, {off} at another");
+    }
+}

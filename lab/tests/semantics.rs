@@ -1,0 +1,109 @@
+//! `semantics` from a labelled folder to its figures, with the fixture's small networks.
+
+use std::path::Path;
+
+use segsplat_core::error::ErrorCode;
+use segsplat_lab::{
+    folders::Folders,
+    rows::Rows,
+    semantics::{self, Args},
+    setup::Setup,
+};
+use serde_json::json;
+
+const SIZE: [u32; 2] = [96, 64];
+const FOCAL: f64 = 90.0;
+const DEPTH: f64 = 4.0;
+
+/// Class of a point of the wall: 1 a red box, 2 a green one, 3 the wall itself.
+fn class(x: f64, y: f64) -> u8 {
+    match (x, y) {
+        _ if y.abs() > 0.6 => 3,
+        _ if (-1.4..-0.4).contains(&x) => 1,
+        _ if (0.4..1.4).contains(&x) => 2,
+        _ => 3,
+    }
+}
+
+/// Three photos of a wall at z = 4, side by side; every one is labelled.
+fn folder() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    for sub in ["images", "masks"] {
+        std::fs::create_dir(dir.path().join(sub)).unwrap();
+    }
+    let mut frames = Vec::new();
+    for v in 0..3_u32 {
+        let eye = (f64::from(v) - 1.0) * 0.3;
+        let at = |x: u32, y: u32| {
+            let across = |p: u32, n: u32| (f64::from(p) + 0.5 - f64::from(n) / 2.0) / FOCAL * DEPTH;
+            (across(x, SIZE[0]) + eye, across(y, SIZE[1]))
+        };
+        let photo = image::RgbImage::from_fn(SIZE[0], SIZE[1], |x, y| {
+            let (x, y) = at(x, y);
+            // Something to match by, too weak to be another colour.
+            let shade = 1.0 + 0.05 * ((x * 9.0).sin() * (y * 11.0 + x).cos());
+            let base = [[204.0, 26.0, 26.0], [26.0, 178.0, 26.0], [128.0; 3]];
+            let rgb: [f64; 3] = base[usize::from(class(x, y)) - 1];
+            image::Rgb(rgb.map(|v| (v * shade) as u8))
+        });
+        let labels = image::GrayImage::from_fn(SIZE[0], SIZE[1], |x, y| {
+            let (x, y) = at(x, y);
+            image::Luma([class(x, y)])
+        });
+        let [image, mask] = [format!("images/{v}.png"), format!("masks/{v}.png")];
+        photo.save(dir.path().join(&image)).unwrap();
+        labels.save(dir.path().join(&mask)).unwrap();
+        // OpenGL: looks along its own -z.
+        let pose = [[1., 0., 0., eye], [0., -1., 0., 0.], [0., 0., -1., 0.], [0., 0., 0., 1.]];
+        frames.push(json!({ "file_path": image, "mask_file": mask, "transform_matrix": pose }));
+    }
+    let cameras = json!({
+        "w": SIZE[0], "h": SIZE[1], "fl_x": FOCAL, "fl_y": FOCAL,
+        "cx": SIZE[0] / 2, "cy": SIZE[1] / 2, "frames": frames,
+    });
+    let write = |name: &str, text: String| std::fs::write(dir.path().join(name), text).unwrap();
+    write("transforms.json", cameras.to_string());
+    write("masks/classes.json", json!({ "1": "red", "2": "green", "3": "wall" }).to_string());
+    write("scene.json", json!({ "surroundings": ["wall"] }).to_string());
+    dir
+}
+
+#[test]
+fn words_find_their_boxes_in_a_view_and_a_word_for_nothing_does_not() {
+    let dir = folder();
+    let bundle = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/fixtures/colours");
+    let args = Args {
+        folders: Folders { dir: dir.path().to_owned(), scenes: Vec::new() },
+        photos: 2,
+        targets: 0,
+        absent: vec!["blue".to_owned(), "red".to_owned()],
+        seeds: None,
+        votes: None,
+        merge: None,
+        pictures: Some(dir.path().join("grids")),
+        setup: Setup { bundle: Some(bundle), threads: Some(2), ..Setup::default() },
+    };
+    let scenes = match semantics::run(&args, &mut Rows::default()) {
+        Err(e) if e.code() == ErrorCode::ModelUnavailable => {
+            assert!(std::env::var_os("CI").is_none(), "skipped: {e}");
+            return println!("skipped: {e}");
+        }
+        scenes => scenes.unwrap(),
+    };
+    let scene = &scenes[0];
+    assert_eq!(scene.targets.len(), 3);
+    // The middle photo is seen from the two beside it.
+    assert_eq!(scene.targets[1].inputs.len(), 2);
+    assert!(!scene.targets[1].inputs.contains(&scene.targets[1].target));
+    let judged = &scene.default;
+    for (scores, least) in [(&judged.scene, 0.8), (&judged.flat, 0.6)] {
+        assert!(scores.accuracy_closed > least, "{scores:?}");
+        assert!(scores.absent < 0.02, "{scores:?}");
+    }
+    // The boxes move by a tenth of the picture from photo to photo, and flat masks with them.
+    assert!(judged.scene.miou > judged.flat.miou + 0.05, "{judged:?}");
+    // "red" is in the scene, so it is no absent word.
+    let words = &judged.scene.absent_words;
+    assert_eq!(words.iter().map(|w| w.word.as_str()).collect::<Vec<_>>(), ["blue"]);
+    assert!(std::fs::read_dir(dir.path().join("grids")).unwrap().count() == 1);
+}
