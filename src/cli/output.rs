@@ -38,13 +38,6 @@ impl Output {
         Ok(())
     }
 
-    /// A line of an answer that grows while the work goes on; machines get it whole at the end.
-    pub(super) fn line(&self, text: &str) {
-        if !self.json {
-            write(&mut io::stdout().lock(), &format!("{text}\n"));
-        }
-    }
-
     /// Where the work is: one line that changes on a terminal, plain lines in a log.
     pub(super) fn progress(&self, what: &str, fraction: f32) {
         if self.json {
