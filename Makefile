@@ -1,6 +1,7 @@
 # make demo    photos to views, end to end, on generated photos (and ../shared/data if there)
 # make serve   the server on 127.0.0.1:8080; flags: make serve ARGS='--listen 0.0.0.0:8080'
-# make test    every check: format, lints, docs, all tests, in one (release) profile
+# make check   format, lints and the fast tests: the loop while you work
+# make test    everything that CI checks: format, lints, docs, all tests, licences
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
 # make eval-scenes   labelled scenes of held-out things, rendered to target/eval/scenes (g++, PYTHON)
 # make report   the tables of docs/benchmarks.md from benches/runs
@@ -19,7 +20,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: demo serve test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -27,20 +28,23 @@ demo: build
 serve: build
 	$(SEGSPLAT) serve $(ARGS)
 
+check: fmt lint setup
+	$(ADAPTER) $(CARGO) test --locked --workspace --lib --test it
+
 test: fmt lint doc tests deny
 
 fmt:
-	$(CARGO) fmt --check
+	$(CARGO) fmt --all --check
 
 lint:
-	$(CARGO) clippy --locked --release --all-targets -- -D warnings
+	$(CARGO) clippy --locked --workspace --all-targets -- -D warnings
 
 doc:
-	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --locked --release --lib --no-deps
+	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --locked --workspace --lib --no-deps
 
 tests: setup
-	$(ADAPTER) $(CARGO) test --locked --release --all-targets
-	$(CARGO) test --locked --release --doc
+	$(ADAPTER) $(CARGO) test --locked --workspace --lib --bins --tests
+	$(CARGO) test --locked --workspace --doc
 
 deny:
 	@if command -v cargo-deny > /dev/null; then $(CARGO) deny check licenses bans sources; \
@@ -48,12 +52,12 @@ deny:
 
 test-long: setup
 	$(ADAPTER) RUN_SLOW_TESTS=1 FUZZ_ITERS=20000 FUZZ_SCENES=1000 FUZZ_GAUSSIANS=20001 PROPTEST_CASES=2048 \
-		$(CARGO) test --locked --release --test it
+		$(CARGO) test --locked --release --workspace --tests
 
-# Each target of tests/it/fuzz_input.rs for FUZZ_SECONDS of its own, one after the other.
+# Each target of tests/slow/fuzz_input.rs for FUZZ_SECONDS of its own, one after the other.
 FUZZ_SECONDS ?= 600
 fuzz: setup
-	FUZZ_SECONDS=$(FUZZ_SECONDS) FUZZ_SEED=$$(date +%s) $(CARGO) test --locked --release --test it \
+	FUZZ_SECONDS=$(FUZZ_SECONDS) FUZZ_SEED=$$(date +%s) $(CARGO) test --locked --release --test slow \
 		fuzz_input:: -- --nocapture --test-threads=1
 
 bench: setup

@@ -1,4 +1,4 @@
-//! One integration binary: links ONNX Runtime, wgpu and tonic once.
+//! The tests of the server that take seconds; the slow ones are in `tests/slow`.
 #![allow(
     clippy::panic,
     clippy::print_stdout,
@@ -12,23 +12,20 @@ mod asking;
 mod bad_input;
 mod cli;
 mod colour_words;
+#[allow(dead_code, unused_imports, reason = "the slow tests use the rest")]
 mod common;
 mod containers;
 mod crop;
 mod errors;
 mod faults;
-mod fuzz_input;
 mod grpc;
 mod hostile;
 mod http;
 mod jobs;
-mod kill;
 mod licences;
 mod life;
-mod load;
 mod magnify;
 mod proto;
-mod replicas;
 mod sample;
 mod schedule;
 mod store;

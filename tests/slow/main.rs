@@ -1,0 +1,16 @@
+//! The tests of the server that take minutes: load, kills, replicas, fuzzed input.
+#![allow(
+    clippy::panic,
+    clippy::print_stdout,
+    clippy::print_stderr,
+    clippy::unwrap_used,
+    reason = "helpers of tests are tests too"
+)]
+
+#[path = "../it/common/mod.rs"]
+#[allow(dead_code, unused_imports, reason = "the quick tests use the rest")]
+mod common;
+mod fuzz_input;
+mod kill;
+mod load;
+mod replicas;
