@@ -10,15 +10,15 @@
 //!
 //! | layer | modules | may use |
 //! |---|---|---|
-//! | L0 nouns | [`scene`], [`error`], [`limits`], [`keys`], [`config`], [`crypto`], [`telemetry`] | nothing above (`scene` uses `error`, `limits`) |
-//! | L1 verbs | [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`render`], [`store`], [`sample`] | L0; never each other |
-//! | L2 | [`pipeline`] | L1: the only place that knows the order of the stages |
-//! | L3 | [`jobs`] | `pipeline`, `store` |
-//! | L4 | [`service`] | `jobs`, `store`, `render`, `semantics`, `models` |
-//! | L5 | [`api`] | `service`; the only place that knows HTTP and gRPC |
-//! | L6 | `main`, [`cli`] | everything |
+//! | L0 the crates below | [`cache`], [`error`], [`limits`], [`scene`], [`render`], [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`pipeline`], [`sample`] | their own tables |
+//! | L0 of the server | [`config`], [`crypto`], [`keys`], [`telemetry`] | L0 |
+//! | L1 | [`store`] | L0 |
+//! | L2 | [`jobs`] | L1 |
+//! | L3 | [`service`] | L1, L2 |
+//! | L4 | [`api`] | L3; the only place that knows HTTP and gRPC |
+//! | L5 | `main`, [`cli`] | everything |
 //!
-//! `tests/it/tidy.rs` reads the `use crate::…` lines and holds the code to this table.
+//! `tests/it/tidy.rs` reads the `use crate::…` lines and compares the code with this table.
 //! Frames, units and orders: `docs/conventions.md`. Why things are as they are: `docs/adr/`.
 
 pub mod api;

@@ -155,8 +155,8 @@ fn layers(page: &str) -> BTreeMap<String, BTreeSet<String>> {
         rows.push((level, quoted(cells[2]), cells[3].to_owned()));
     }
     assert!(rows.len() >= 2, "the table of layers is gone");
-    let of_level = |level: &str| {
-        rows.iter().find(|row| row.0 == level).map(|row| row.1.clone()).unwrap_or_default()
+    let of_level = |level: &str| -> BTreeSet<String> {
+        rows.iter().filter(|row| row.0 == level).flat_map(|row| row.1.clone()).collect()
     };
     let everything: BTreeSet<String> = rows.iter().flat_map(|row| row.1.clone()).collect();
     let mut allowed = BTreeMap::new();
