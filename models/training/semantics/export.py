@@ -110,31 +110,36 @@ def state(path, prefix=""):
 @torch.no_grad()
 def main():
     ap = argparse.ArgumentParser()
-    for name in ["masks", "words", "text", "tokenizer", "bundle"]:
-        ap.add_argument("--" + name, required=True)
+    for name in ["masks", "words", "text", "tokenizer"]:
+        ap.add_argument("--" + name, help="left out: the bundle's file stays")
+    ap.add_argument("--bundle", required=True)
     args = ap.parse_args()
     torch.manual_seed(0)
     at = lambda name: os.path.join(args.bundle, name)
-    net = MaskNet(MASK_SIDE)
-    net.load_state_dict(state(args.masks))
-    net = fold(net.eval())
-    picture = torch.randn(1, 3, MASK_SIDE, MASK_SIDE)
-    embedding = net.encoder(picture)
-    write(net.encoder, (picture,), at("mask_encoder.onnx"), ["images"], ["image_embeddings"], {})
-    points = torch.rand(4, 2, 2) * MASK_SIDE
-    labels = torch.tensor([[1.0, -1.0], [1.0, 1.0], [1.0, 0.0], [1.0, -1.0]])
-    write(net.decoder, (embedding, points, labels), at("mask_decoder.onnx"), ["image_embeddings", "point_coords", "point_labels"], ["low_res_masks", "iou_predictions"],
-          {"point_coords": {0: "prompts", 1: "points"}, "point_labels": {0: "prompts", 1: "points"}, "low_res_masks": {0: "prompts"}, "iou_predictions": {0: "prompts"}})
-    tower = ImageTower()
-    tower.load_state_dict(state(args.words, "tower."))
-    write(fold(tower.eval()), (torch.rand(2, 3, SIDE, SIDE) * 2 - 1,), at("image_tower.onnx"), ["images"], ["embeddings"], {"images": {0: "batch"}, "embeddings": {0: "batch"}})
-    text = TextTower()
-    text.load_state_dict(state(args.text))
-    ids = torch.randint(2, 8000, (3, CONTEXT))
-    ids[1, 4:] = 0
-    write(text.eval(), (ids,), at("text_tower.onnx"), ["input_ids"], ["embeddings"], {"input_ids": {0: "batch", 1: "tokens"}, "embeddings": {0: "batch"}})
-    shutil.copy(args.tokenizer, at("tokenizer.json"))
-    print("tokenizer.json sha256", hashlib.sha256(open(at("tokenizer.json"), "rb").read()).hexdigest())
+    if args.masks:
+        net = MaskNet(MASK_SIDE)
+        net.load_state_dict(state(args.masks))
+        net = fold(net.eval())
+        picture = torch.randn(1, 3, MASK_SIDE, MASK_SIDE)
+        embedding = net.encoder(picture)
+        write(net.encoder, (picture,), at("mask_encoder.onnx"), ["images"], ["image_embeddings"], {})
+        points = torch.rand(4, 2, 2) * MASK_SIDE
+        labels = torch.tensor([[1.0, -1.0], [1.0, 1.0], [1.0, 0.0], [1.0, -1.0]])
+        write(net.decoder, (embedding, points, labels), at("mask_decoder.onnx"), ["image_embeddings", "point_coords", "point_labels"], ["low_res_masks", "iou_predictions"],
+              {"point_coords": {0: "prompts", 1: "points"}, "point_labels": {0: "prompts", 1: "points"}, "low_res_masks": {0: "prompts"}, "iou_predictions": {0: "prompts"}})
+    if args.words:
+        tower = ImageTower()
+        tower.load_state_dict(state(args.words, "tower."))
+        write(fold(tower.eval()), (torch.rand(2, 3, SIDE, SIDE) * 2 - 1,), at("image_tower.onnx"), ["images"], ["embeddings"], {"images": {0: "batch"}, "embeddings": {0: "batch"}})
+    if args.text:
+        text = TextTower()
+        text.load_state_dict(state(args.text))
+        ids = torch.randint(2, 8000, (3, CONTEXT))
+        ids[1, 4:] = 0
+        write(text.eval(), (ids,), at("text_tower.onnx"), ["input_ids"], ["embeddings"], {"input_ids": {0: "batch", 1: "tokens"}, "embeddings": {0: "batch"}})
+    if args.tokenizer:
+        shutil.copy(args.tokenizer, at("tokenizer.json"))
+        print("tokenizer.json sha256", hashlib.sha256(open(at("tokenizer.json"), "rb").read()).hexdigest())
     print("all files", sum(os.path.getsize(at(f)) for f in os.listdir(args.bundle)) / 2**20, "MiB")
 
 
