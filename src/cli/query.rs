@@ -12,7 +12,7 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
     scene::ScoringProfile,
-    service::{Boxes, Local, MaskFormat, QueryAnswer, QuerySpec, TextResult},
+    service::{Boxes, MaskFormat, OfflineService, QueryAnswer, QuerySpec, TextResult},
     store::ply::PlyWriter,
 };
 
@@ -68,8 +68,8 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     };
     let opened = scene_file::open(&args.scene, &config.limits)?;
     let semantics = engine::semantics(config, true)?;
-    let local = Local::new(semantics, engine::renderer(config)?, config.limits.clone());
-    let answer = local.query(&opened.scene, &spec)?;
+    let service = OfflineService::new(semantics, engine::renderer(config)?, config.limits.clone());
+    let answer = service.query(&opened.scene, &spec)?;
     let mut text = String::new();
     for (i, found) in answer.results.iter().enumerate() {
         tell(&mut text, found);
@@ -77,7 +77,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         let path = numbered(output, i, answer.results.len());
         match ending {
             Some(Ending::Ply) => {
-                let chosen = local.select(&opened.scene, &found.text, profile)?;
+                let chosen = service.select(&opened.scene, &found.text, profile)?;
                 let file: Vec<u8> = PlyWriter::new(&chosen).flatten().collect();
                 write(&path, &file)?;
             }

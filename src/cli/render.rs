@@ -17,7 +17,7 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
     scene::{Region, ScoringProfile},
-    service::{Ask, Format, Kind, Local, ViewOptions, ViewSpec},
+    service::{Ask, Format, Kind, OfflineService, ViewOptions, ViewSpec},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -54,8 +54,8 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let opened = scene_file::open(&args.scene, &config.limits)?;
     let renderer = engine::renderer(config)?;
     let semantics = engine::semantics(config, spec.kind.needs_semantics())?;
-    let local = Local::new(semantics, Arc::clone(&renderer), config.limits.clone());
-    let view = local.render(&opened.scene, &spec)?;
+    let service = OfflineService::new(semantics, Arc::clone(&renderer), config.limits.clone());
+    let view = service.render(&opened.scene, &spec)?;
     fs_err::write(&args.output, &view.bytes).map_err(|e| {
         let what = format!("{}: cannot be written: {}", args.output.display(), e.kind());
         Error::new(ErrorCode::StoreUnavailable, what).caused_by(e)

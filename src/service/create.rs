@@ -104,7 +104,7 @@ impl Service {
     /// # Errors
     /// `scene_not_found`.
     pub async fn wait(&self, id: &SceneId, at_most: Duration) -> Result<SceneStatus> {
-        self.sees(id).await?;
+        self.scene(id).await?;
         let mut watcher = self.inner.jobs.watch(id)?;
         let at_most = at_most.min(Duration::from_millis(self.limits().wait_ms_max));
         let end = watcher.wait_for(|record| record.status.is_settled());

@@ -28,14 +28,13 @@ impl Service {
     /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; with a text also what
     /// [`Service::query`] says.
     pub async fn export(&self, id: &SceneId, format: ExportFormat, ask: &Ask) -> Result<Export> {
-        self.sees(id).await?;
+        let access = self.scene(id).await?;
         let ExportFormat::Ply = format;
         let inner = Arc::clone(&self.inner);
         let Some(text) = &ask.text else {
-            let record = inner.finished(id)?;
-            let asked = id.clone();
-            let scene = blocking(move || inner.load(&asked)).await??;
-            let digest = record.scene_sha256.unwrap_or_default();
+            let access = access.finished()?;
+            let digest = access.record().scene_sha256.clone().unwrap_or_default();
+            let scene = blocking(move || inner.load(&access)).await??;
             let etag = format!("{}-ply", digest.get(..32).unwrap_or(id.as_str()));
             let size_bytes = ply_size_bytes(&scene.gaussians);
             let (to, chunks) = mpsc::channel(PIECES_MAX);
@@ -44,7 +43,7 @@ impl Service {
         };
         inner.can_understand("text")?;
         let text = texts::checked(text, "text", &self.limits())?;
-        let understood = inner.understood(id, "text", ask.wait).await?;
+        let understood = inner.understood(&access.finished()?, "text", ask.wait).await?;
         let tag = understood.tag();
         let etag = hash(&asked_words(&tag, &Ask { text: Some(text.clone()), ..ask.clone() })?);
         let profile = ask.profile;

@@ -2,13 +2,14 @@
 //!
 //! [`Service`] is a cheap clone; its calls are async and never do heavy work on the async threads.
 
+mod access;
 mod base64;
 mod camera;
 mod create;
 mod encode;
 mod export;
-mod local;
 mod memory;
+mod offline;
 mod pick;
 mod query;
 mod rle;
@@ -27,8 +28,9 @@ use std::{
 use futures_util::{Stream, stream};
 use tokio::sync::Semaphore;
 
+use self::{memory::Memory, schedule::Scheduler, search::Backend};
 pub use self::{
-    local::Local,
+    offline::OfflineService,
     rle::Rle,
     types::{
         Ask, Boxes, CameraSpec, CreateScene, Created, Export, ExportFormat, Format, Kind, Label,
@@ -37,7 +39,6 @@ pub use self::{
         TextWarning, ViewOptions, ViewSpec, ViewsSpec,
     },
 };
-use self::{memory::Memory, schedule::Scheduler, search::Backend};
 pub use crate::render::{Quality, plan::default_near};
 pub use crate::scene::{
     Density, Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
@@ -51,7 +52,7 @@ use crate::{
     limits::Limits,
     render::Renderer,
     scene::SceneId,
-    store::{Place, Record, Store, not_found},
+    store::{Place, Record, Store},
 };
 
 /// Uploads decoded at the same time: each may hold `limits.photos_max` photos in memory.
@@ -166,21 +167,6 @@ impl Service {
         Self { inner: Arc::clone(&self.inner), caller }
     }
 
-    /// The record of a scene that this caller sees.
-    async fn record(&self, id: &SceneId) -> Result<Record> {
-        if self.inner.jobs.may_be_stale(id) {
-            let (inner, id) = (Arc::clone(&self.inner), id.clone());
-            create::blocking(move || inner.jobs.refresh(&id)).await??;
-        }
-        let record = self.inner.jobs.record(id)?;
-        if self.caller.sees(record.owner.as_deref()) { Ok(record) } else { Err(not_found(id)) }
-    }
-
-    /// Refuses a scene that is not there for this caller.
-    async fn sees(&self, id: &SceneId) -> Result<()> {
-        self.record(id).await.map(drop)
-    }
-
     /// The caps in force.
     #[must_use]
     pub fn limits(&self) -> Arc<Limits> {
@@ -207,7 +193,7 @@ impl Service {
     /// # Errors
     /// `scene_not_found`.
     pub async fn get(&self, id: &SceneId) -> Result<SceneStatus> {
-        Ok(self.shown(self.record(id).await?.status))
+        Ok(self.shown(self.scene(id).await?.record().status.clone()))
     }
 
     /// A page of scenes, newest first, without cameras.
@@ -239,8 +225,8 @@ impl Service {
     /// # Errors
     /// `scene_not_found`, `store_unavailable`.
     pub async fn delete(&self, id: &SceneId) -> Result<()> {
-        self.sees(id).await?;
-        let (inner, gone) = (Arc::clone(&self.inner), id.clone());
+        let scene = self.scene(id).await?;
+        let (inner, gone) = (Arc::clone(&self.inner), scene.id().clone());
         create::blocking(move || inner.jobs.delete(&gone)).await?
     }
 
@@ -249,8 +235,7 @@ impl Service {
     /// # Errors
     /// `scene_not_found`.
     pub async fn watch(&self, id: &SceneId) -> Result<impl Stream<Item = Event> + Send + use<>> {
-        self.sees(id).await?;
-        let watcher = self.inner.jobs.watch(id)?;
+        let watcher = self.inner.jobs.watch(self.scene(id).await?.id())?;
         let service = self.clone();
         let first = Some((service, watcher, true));
         Ok(stream::unfold(first, async |state| {

@@ -87,27 +87,28 @@ impl Service {
     /// # Errors
     /// As [`Service::query`] where labels are given, else as [`Service::render`].
     pub async fn pick(&self, id: &SceneId, spec: PickSpec) -> Result<Picked> {
-        self.sees(id).await?;
+        let scene = self.scene(id).await?;
         let inner = &self.inner;
         refuse_crop(&spec.options, "pick")?;
-        let record = inner.finished(id)?;
+        let scene = scene.finished()?;
         let cameras = [spec.camera];
-        let view = resolve_for(inner, &record, &cameras, &[Kind::Alpha], &spec.options)?.pop();
+        let view =
+            resolve_for(inner, scene.record(), &cameras, &[Kind::Alpha], &spec.options)?.pop();
         let view = view.ok_or_else(|| Error::internal("one camera gave no request"))?;
         let (labels, understood) = if spec.labels.is_empty() {
             (Vec::new(), None)
         } else {
             inner.can_understand("labels")?;
             let labels = texts::all_checked(&spec.labels, "labels", &self.limits())?;
-            (labels, Some(inner.understood(id, "labels", spec.wait).await?))
+            (labels, Some(inner.understood(&scene, "labels", spec.wait).await?))
         };
         let deadline = inner.deadline(&spec.options);
-        let (work, id) = (Arc::clone(inner), id.clone());
+        let work = Arc::clone(inner);
         inner
             .scheduled(deadline, 1, "the pick", move |_slot| {
                 let scene = match &understood {
                     Some(understood) => Arc::clone(&understood.scene),
-                    None => work.load(&id)?,
+                    None => work.load(&scene)?,
                 };
                 let mut picked = pick(&work.backend.planner, &scene, &view, [spec.x, spec.y])?;
                 if let (Some(understood), Some(entry)) = (&understood, picked.entry) {

@@ -162,20 +162,20 @@ impl Service {
     /// semantics are not ready in time, `semantics_off`, `model_unavailable`, `overloaded`,
     /// `deadline_exceeded`, and whatever the making of the semantics failed with.
     pub async fn query(&self, id: &SceneId, spec: QuerySpec) -> Result<QueryAnswer> {
-        self.sees(id).await?;
+        let scene = self.scene(id).await?;
         let inner = &self.inner;
         inner.can_understand("query")?;
         refuse_crop(&spec.options, "query")?;
         let texts = texts::all_checked(&spec.texts, "texts", &self.limits())?;
-        let record = inner.finished(id)?;
+        let scene = scene.finished()?;
         let view = match spec.camera {
             Some(camera) => {
                 let cameras = [camera];
-                resolve_for(inner, &record, &cameras, &[Kind::Mask], &spec.options)?.pop()
+                resolve_for(inner, scene.record(), &cameras, &[Kind::Mask], &spec.options)?.pop()
             }
             None => None,
         };
-        let understood = inner.understood(id, "query", spec.wait).await?;
+        let understood = inner.understood(&scene, "query", spec.wait).await?;
         let deadline = inner.deadline(&spec.options);
         let work = Arc::clone(inner);
         let pixels = view.as_ref().map_or(0, Resolved::pixels);

@@ -4,7 +4,9 @@
 
 use std::{sync::Arc, time::Duration};
 
-use super::{Inner, Service, create::blocking, search::Subject, view::scene_tag};
+use super::{
+    Inner, Service, access::SceneAccess, create::blocking, search::Subject, view::scene_tag,
+};
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{Scene, SceneId, SceneStatus, Semantics, SemanticsMode, SemanticsState},
@@ -17,7 +19,7 @@ const RETRY_AFTER_S: u32 = 2;
 /// A scene that can be asked by text.
 #[derive(Clone, Debug)]
 pub(super) struct Understood {
-    pub(super) record: Arc<Record>,
+    pub(super) access: SceneAccess,
     pub(super) scene: Arc<Scene>,
     pub(super) semantics: Arc<Semantics>,
 }
@@ -30,7 +32,7 @@ impl Understood {
 
     /// Tells scene and semantics from any others.
     pub(super) fn tag(&self) -> String {
-        meaning_tag(&self.record)
+        meaning_tag(self.access.record())
     }
 }
 
@@ -69,17 +71,20 @@ impl Inner {
 
     /// The scene with what it means; `None` where that must be made again: its file was put aside,
     /// or other networks made it, whose embeddings no text of these can be compared with.
-    fn loaded_semantics(&self, id: &SceneId) -> Result<Option<(Arc<Scene>, Arc<Semantics>)>> {
-        let scene = self.load(id)?;
+    fn loaded_semantics(
+        &self,
+        access: &SceneAccess,
+    ) -> Result<Option<(Arc<Scene>, Arc<Semantics>)>> {
+        let scene = self.load(access)?;
         let loaded = &self.models.bundle_sha256;
         if let Some(semantics) = scene.semantics.clone() {
             let made_by = &semantics.report.bundle_sha256;
             if made_by == loaded || made_by.is_empty() {
                 return Ok(Some((scene, semantics)));
             }
-            tracing::info!(scene = %id, made_by, "semantics of another bundle are made again");
+            tracing::info!(scene = %access.id(), made_by, "semantics of another bundle are made again");
         }
-        self.jobs.lose_semantics(id)?;
+        self.jobs.lose_semantics(access.id())?;
         Ok(None)
     }
 
@@ -88,13 +93,13 @@ impl Inner {
     /// `wait` bounds how long; who waits no longer is told where the making stands.
     pub(super) async fn understood(
         self: &Arc<Self>,
-        id: &SceneId,
+        scene: &SceneAccess,
         what: &str,
         wait: Option<Duration>,
     ) -> Result<Understood> {
-        let record = self.finished(id)?;
         self.can_understand(what)?;
-        Self::may_be_asked(&record, what)?;
+        Self::may_be_asked(scene.record(), what)?;
+        let id = scene.id();
         let limits = &self.limits();
         let wait = wait.unwrap_or(Duration::from_millis(limits.text_wait_ms));
         let until =
@@ -118,10 +123,11 @@ impl Inner {
                 (SemanticsState::Failed, Some(error)) => return Err(error.to_error()),
                 _ => return Err(not_yet(&record.status, what)),
             }
-            let (inner, asked) = (Arc::clone(self), id.clone());
+            let access = scene.renewed(record);
+            let (inner, asked) = (Arc::clone(self), access.clone());
             let found = blocking(move || inner.loaded_semantics(&asked)).await??;
             if let Some((scene, semantics)) = found {
-                return Ok(Understood { record: Arc::new(record), scene, semantics });
+                return Ok(Understood { access, scene, semantics });
             }
         }
     }
@@ -147,9 +153,9 @@ impl Service {
     /// `scene_not_found`, `scene_not_ready` also when they are still being made after that time,
     /// `semantics_off`, `model_unavailable`, `overloaded`, and whatever their making failed with.
     pub async fn understand(&self, id: &SceneId, wait: Option<Duration>) -> Result<SceneStatus> {
-        self.sees(id).await?;
-        let understood = self.inner.understood(id, "semantics", wait).await?;
-        Ok(self.shown(understood.record.status.clone()))
+        let scene = self.scene(id).await?.finished()?;
+        let understood = self.inner.understood(&scene, "semantics", wait).await?;
+        Ok(self.shown(understood.access.record().status.clone()))
     }
 
     /// A status with what can be asked of the scene by text now.

@@ -343,30 +343,14 @@ impl Resolved {
 }
 
 impl Inner {
-    /// The record of a scene that can be rendered.
-    pub(super) fn finished(&self, id: &SceneId) -> Result<Record> {
-        let record = self.jobs.record(id)?;
-        let not_ready = |why: String| Err(Error::new(ErrorCode::SceneNotReady, why));
-        match (record.status.state, &record.status.error) {
-            (SceneState::Done, _) => Ok(record),
-            (_, Some(error)) if error.to_error().code() == ErrorCode::SceneCorrupt => {
-                Err(error.to_error())
-            }
-            (SceneState::Failed, Some(error)) => {
-                not_ready(format!("scene {id} failed with {}: {}", error.code, error.message))
-            }
-            (state, _) => not_ready(format!("scene {id} is {}", state.name())),
-        }
-    }
-
     /// The scene itself; marks it when its file turns out to be bad. Blocks on the disk.
-    pub(super) fn load(&self, id: &SceneId) -> Result<Arc<Scene>> {
+    pub(super) fn load(&self, access: &SceneAccess) -> Result<Arc<Scene>> {
         let started = Instant::now();
-        let scene = self.store.scene(id);
+        let scene = self.store.scene(access.id());
         meter::stage("load", started.elapsed().as_secs_f64());
         scene.inspect_err(|error| {
             if error.code() == ErrorCode::SceneCorrupt {
-                self.jobs.spoil(id, error);
+                self.jobs.spoil(access.id(), error);
             }
         })
     }
@@ -374,12 +358,12 @@ impl Inner {
     /// The scene as the text kinds of a request need it, `None` where it has none of them.
     async fn understood_for(
         self: &Arc<Self>,
-        id: &SceneId,
+        scene: &SceneAccess,
         kinds: &[Kind],
         ask: &Ask,
     ) -> Result<Option<Understood>> {
         let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) else { return Ok(None) };
-        Ok(Some(self.understood(id, &format!("kind={}", kind.name()), ask.wait).await?))
+        Ok(Some(self.understood(scene, &format!("kind={}", kind.name()), ask.wait).await?))
     }
 
     /// Checks what a request asks by text, the bundle first: without networks no text is any good.
@@ -393,7 +377,7 @@ impl Inner {
     /// Renders on a blocking thread within the deadline; encodes each kind.
     async fn render_one(
         self: &Arc<Self>,
-        record: Arc<Record>,
+        scene: SceneAccess,
         view: Resolved,
         texts: Option<(Understood, Ask)>,
         deadline: Instant,
@@ -401,10 +385,10 @@ impl Inner {
         let inner = Arc::clone(self);
         let pixels = view.pixels();
         let work = move |slot: &mut Slot| {
-            let (backend, tag) = (&inner.backend, scene_tag(&record));
+            let (backend, tag) = (&inner.backend, scene_tag(scene.record()));
             let drawn = || slot.drawn();
             let Some((understood, ask)) = texts else {
-                let scene = inner.load(&record.status.id)?;
+                let scene = inner.load(&scene)?;
                 return view.draw(backend, &scene, &tag, None, drawn);
             };
             let meaning = understood.tag();
@@ -463,18 +447,19 @@ impl Service {
     /// # Errors
     /// As [`Self::render`], but for what only rendering meets.
     pub async fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<Option<String>> {
-        self.sees(id).await?;
+        let scene = self.scene(id).await?;
         let inner = &self.inner;
         let ask = inner.checked_ask(&[spec.kind], &spec.ask)?;
-        let record = inner.finished(id)?;
-        let resolved = resolve_for(inner, &record, &[spec.camera], &[spec.kind], &spec.options)?;
+        let scene = scene.finished()?;
+        let record = scene.record();
+        let resolved = resolve_for(inner, record, &[spec.camera], &[spec.kind], &spec.options)?;
         let asked = match (spec.kind.needs_semantics(), &record.semantics_sha256) {
             (false, _) => String::new(),
-            (true, Some(_)) => asked_words(&meaning_tag(&record), &ask)?,
+            (true, Some(_)) => asked_words(&meaning_tag(record), &ask)?,
             (true, None) => return Ok(None),
         };
         let name = inner.backend.renderer.name();
-        Ok(Some(resolved[0].etag(&scene_tag(&record), &name, spec.kind, &asked)?))
+        Ok(Some(resolved[0].etag(&scene_tag(record), &name, spec.kind, &asked)?))
     }
 
     /// Renders and encodes one view.
@@ -484,17 +469,18 @@ impl Service {
     /// `limit_exceeded`, `overloaded`, `deadline_exceeded`, `gpu_unavailable`; for kinds that need
     /// semantics also what [`Service::query`] says.
     pub async fn render(&self, id: &SceneId, spec: ViewSpec) -> Result<RenderedView> {
-        self.sees(id).await?;
+        let scene = self.scene(id).await?;
         let inner = &self.inner;
         let kinds = [spec.kind];
         let ask = inner.checked_ask(&kinds, &spec.ask)?;
-        let record = Arc::new(inner.finished(id)?);
-        let mut resolved = resolve_for(inner, &record, &[spec.camera], &kinds, &spec.options)?;
-        let understood = inner.understood_for(id, &kinds, &ask).await?;
+        let scene = scene.finished()?;
+        let mut resolved =
+            resolve_for(inner, scene.record(), &[spec.camera], &kinds, &spec.options)?;
+        let understood = inner.understood_for(&scene, &kinds, &ask).await?;
         let deadline = inner.deadline(&spec.options);
         let one = resolved.remove(0);
         inner
-            .render_one(record, one, understood.map(|understood| (understood, ask)), deadline)
+            .render_one(scene, one, understood.map(|understood| (understood, ask)), deadline)
             .await?
             .pop()
             .ok_or_else(|| Error::internal("a render gave no picture"))
@@ -513,7 +499,7 @@ impl Service {
         id: &SceneId,
         spec: &ViewsSpec,
     ) -> Result<impl Stream<Item = Result<RenderedView>> + Send + use<>> {
-        self.sees(id).await?;
+        let scene = self.scene(id).await?;
         let inner = Arc::clone(&self.inner);
         let limits = &inner.limits();
         for (what, count, max) in [
@@ -527,15 +513,15 @@ impl Service {
                 return Err(Error::limit(what, count, max));
             }
         }
-        let record = Arc::new(inner.finished(id)?);
+        let scene = scene.finished()?;
         let mut kinds = spec.kinds.clone();
         let mut seen = std::collections::HashSet::new();
         kinds.retain(|kind| seen.insert(*kind));
         let ask = inner.checked_ask(&kinds, &spec.ask)?;
         if kinds.iter().any(|kind| kind.needs_semantics()) {
-            Inner::may_be_asked(&record, "views")?;
+            Inner::may_be_asked(scene.record(), "views")?;
         }
-        let all = resolve_for(&inner, &record, &spec.cameras, &kinds, &spec.options)?;
+        let all = resolve_for(&inner, scene.record(), &spec.cameras, &kinds, &spec.options)?;
         let pixels: u64 = all.iter().map(Resolved::pixels).sum::<u64>() * kinds.len() as u64;
         if pixels > limits.views_pixels_max {
             let (cameras, kinds) = (all.len(), kinds.len());
@@ -547,9 +533,8 @@ impl Service {
         let last = Instant::now() + spec.options.deadline.map_or(most, |asked| asked.min(most));
         let at_once = self.inner.scheduler.views_at_once(pixels / (all.len() * kinds.len()) as u64);
         let (to, pictures) = mpsc::channel(READY_MAX);
-        let id = id.clone();
         let task = async move {
-            let texts = match inner.understood_for(&id, &kinds, &ask).await {
+            let texts = match inner.understood_for(&scene, &kinds, &ask).await {
                 Ok(understood) => understood.map(|understood| (understood, ask)),
                 Err(error) => {
                     // Whoever stopped listening needs no reason.
@@ -560,9 +545,9 @@ impl Service {
             // Each on a task of its own: a slot must not wait for a slow reader.
             let render = |one: Resolved| {
                 let deadline = last.min(inner.deadline(&ViewOptions::default()));
-                let (inner, record) = (Arc::clone(&inner), Arc::clone(&record));
+                let (inner, scene) = (Arc::clone(&inner), scene.clone());
                 let texts = texts.clone();
-                let work = async move { inner.render_one(record, one, texts, deadline).await };
+                let work = async move { inner.render_one(scene, one, texts, deadline).await };
                 tokio::spawn(work.in_current_span())
             };
             let mut rendered = stream::iter(all).map(render).buffered(at_once);

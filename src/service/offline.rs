@@ -17,22 +17,22 @@ use crate::{
     scene::{Gaussians, Scene, ScoringProfile},
 };
 
-/// A renderer, networks and one scene at a time.
-pub struct Local {
+/// The use cases of [`super::Service`] for scenes that lie in files: no store, jobs or owners.
+pub struct OfflineService {
     backend: Backend,
     limits: Limits,
 }
 
-impl std::fmt::Debug for Local {
+impl std::fmt::Debug for OfflineService {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Local")
+        f.debug_struct("OfflineService")
             .field("renderer", &self.backend.renderer.name())
             .finish_non_exhaustive()
     }
 }
 
-impl Local {
-    /// Answers with these.
+impl OfflineService {
+    /// A service with these networks, this renderer and these limits.
     #[must_use]
     pub fn new(
         semantics: Arc<dyn SemanticsMaker>,

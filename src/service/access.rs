@@ -1,0 +1,69 @@
+//! The check of a scene's owner, as a type that all work on a scene asks for.
+
+use std::sync::Arc;
+
+use super::{Service, create::blocking};
+use crate::{
+    error::{Error, ErrorCode, Result},
+    scene::{SceneId, SceneState},
+    store::{Record, not_found},
+};
+
+/// A scene that the caller may use. [`Service::scene`] alone makes one from an id, so nobody
+/// forgets to check the owner.
+#[derive(Clone, Debug)]
+pub(super) struct SceneAccess {
+    record: Arc<Record>,
+}
+
+impl SceneAccess {
+    pub(super) fn id(&self) -> &SceneId {
+        &self.record.status.id
+    }
+
+    /// The record at the time of the check.
+    pub(super) fn record(&self) -> &Record {
+        &self.record
+    }
+
+    /// The same scene with a newer record.
+    pub(super) fn renewed(&self, record: Record) -> Self {
+        debug_assert_eq!(*self.id(), record.status.id, "the record of another scene");
+        Self { record: Arc::new(record) }
+    }
+
+    /// The same scene, where it can be rendered.
+    pub(super) fn finished(self) -> Result<Self> {
+        let (status, id) = (&self.record.status, self.id());
+        let not_ready = |why: String| Err(Error::new(ErrorCode::SceneNotReady, why));
+        match (status.state, &status.error) {
+            (SceneState::Done, _) => Ok(self),
+            (_, Some(error)) if error.to_error().code() == ErrorCode::SceneCorrupt => {
+                Err(error.to_error())
+            }
+            (SceneState::Failed, Some(error)) => {
+                not_ready(format!("scene {id} failed with {}: {}", error.code, error.message))
+            }
+            (state, _) => not_ready(format!("scene {id} is {}", state.name())),
+        }
+    }
+}
+
+impl Service {
+    /// The scene, where this caller may use it.
+    ///
+    /// # Errors
+    /// `scene_not_found` where there is none, or it is another owner's.
+    pub(super) async fn scene(&self, id: &SceneId) -> Result<SceneAccess> {
+        if self.inner.jobs.may_be_stale(id) {
+            let (inner, id) = (Arc::clone(&self.inner), id.clone());
+            blocking(move || inner.jobs.refresh(&id)).await??;
+        }
+        let record = Arc::new(self.inner.jobs.record(id)?);
+        if self.caller.sees(record.owner.as_deref()) {
+            Ok(SceneAccess { record })
+        } else {
+            Err(not_found(id))
+        }
+    }
+}
