@@ -12,7 +12,9 @@ use tokio::sync::mpsc;
 use tracing::Instrument;
 
 use super::{
-    Inner, Service, camera,
+    Inner, Service,
+    access::SceneAccess,
+    camera,
     encode::{self, Layer},
     schedule::Slot,
     search::{Backend, LabelledView, SceneTexts},
@@ -27,7 +29,7 @@ use crate::{
         Frame, Kinds, Labels, Quality, RenderRequest,
         plan::{NEAR_RANGE, default_near},
     },
-    scene::{Camera, Intrinsics, Region, Scene, SceneCamera, SceneId, SceneState},
+    scene::{Camera, Intrinsics, Region, Scene, SceneCamera, SceneId},
     semantics::mask_from_blend,
     store::Record,
     telemetry::meter,
