@@ -9,7 +9,7 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
     render::{Kinds, RenderRequest, compare::compare_oracle, plan::default_near},
-    service::{Ask, CameraSpec, Kind, LensSpec, Local, PoseSpec, ViewSpec},
+    service::{Ask, CameraSpec, Kind, LensSpec, OfflineService, PoseSpec, ViewSpec},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -33,7 +33,7 @@ const FIRST: CameraSpec =
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
     let renderer = engine::renderer(config)?;
-    let local = Local::new(
+    let service = OfflineService::new(
         engine::semantics(config, false)?,
         std::sync::Arc::clone(&renderer),
         config.limits.clone(),
@@ -46,7 +46,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         options: options.clone(),
         ask: Ask::default(),
     };
-    let first = local.render(&scene, &spec)?;
+    let first = service.render(&scene, &spec)?;
     let near = options.near.unwrap_or_else(|| default_near(scene.meta.report.median_depth));
     let request = RenderRequest {
         antialiased: options.antialiased,
