@@ -55,6 +55,14 @@ bare_root() {
     fi
 }
 
+# cargo_registries FOLDER: writes there what this machine's cargo configuration says of registries.
+cargo_registries() {
+    local config=${CARGO_HOME:-$HOME/.cargo}/config.toml
+    mkdir -p "$1"
+    [ ! -f "$config" ] || awk '/^\[/ { keep = /^\[+(source|registr|http|net)/ } keep' "$config" \
+        > "$1/config.toml"
+}
+
 # in_root FOLDER COMMAND...: runs the command as root in the root, with mounts and processes that end
 # with it. The variables of this machine stay outside, except those that name registries.
 in_root() {
