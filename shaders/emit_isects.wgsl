@@ -1,5 +1,5 @@
-// Stage 5: one (tile, Gaussian) pair per touched tile, in depth order.
-// Twin: src/render/cpu/emit_isects.rs
+// Stage 5: one (tile, Gaussian) pair for each tile that a Gaussian touches, in depth order.
+// CPU: crates/render/src/cpu/emit_isects.rs
 
 @group(0) @binding(1) var<storage, read_write> plans: array<Plan>;
 @group(0) @binding(2) var<storage, read> footprints: array<Footprint>;

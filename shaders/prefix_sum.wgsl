@@ -1,8 +1,8 @@
-// Stage 3: where each Gaussian's tile pairs start, in depth order: sums of blocks here, the rest in
-// emit_isects. Twin: src/render/cpu/prefix_sum.rs (there in 64 bits)
+// Stage 3: where the tile pairs of each Gaussian start, in depth order: sums of blocks here, the
+// rest in emit_isects. CPU: crates/render/src/cpu/prefix_sum.rs (in 64 bits)
 //
-// sum_blocks adds up the tiles of each block; scan_sums makes first places of the sums, holds the
-// total against the room there is, and sizes the stages that follow.
+// sum_blocks adds up the tiles of each block. scan_sums turns the sums into start places, compares
+// the total with the room, and sizes the stages that follow.
 
 @group(0) @binding(1) var<storage, read_write> plans: array<Plan>;
 // Gaussians in depth order: [2][views][N].

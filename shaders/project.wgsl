@@ -1,5 +1,5 @@
-// Stage 1: Gaussians to footprints on the picture, and which to drop.
-// Twin: src/render/cpu/project.rs (there in f64; here depth alone is exact).
+// Stage 1: Gaussians to footprints; some are dropped.
+// CPU: crates/render/src/cpu/project.rs (in f64; here only depth is exact).
 
 @group(0) @binding(1) var<storage, read> gaussians: array<Gaussian>;
 @group(0) @binding(2) var<storage, read_write> footprints: array<Footprint>;

@@ -1,15 +1,15 @@
 // Stages 2 and 6: one digit (8 bits) of a stable radix sort of (key, value) pairs.
-// Twin: src/render/cpu/radix_sort.rs
+// CPU: crates/render/src/cpu/radix_sort.rs
 //
-// histogram counts the digits of each block; spine turns the counts of a digit into places within
-// it, block by block; scatter moves the pairs. No subgroups: the rank of a pair among equals of its
-// round is a count of bits in a mask of 128. On a software adapter, where a barrier costs more than
-// moving a pair, spine_serial and scatter_serial take their places: an invocation moves a block.
+// histogram counts the digits of each block. spine turns the counts of a digit into places, block
+// by block. scatter moves the pairs. There are no subgroups: the rank of a pair among equal digits
+// of its round is a count of bits in a mask of 128. On a software adapter a barrier costs more than
+// a move; there spine_serial and scatter_serial are used, in which one invocation moves a block.
 //
-// The first digit of the depth sort leaves dropped Gaussians behind, and its pairs have no values
-// yet: they are the places in memory, so that equal depths stay in the order of the scene. Keys are
-// taken relative to the least one: digits that are then 0 for all are not sorted at all. Of a fast
-// view they are cut to two digits.
+// The first digit of the depth sort drops Gaussians without tiles. Its pairs have no values yet:
+// the values are the places in memory, so equal depths keep the order of the scene. Keys are
+// relative to the smallest one, and digits that are then 0 for all keys are not sorted. Keys of a
+// fast view are cut to two digits.
 
 @group(0) @binding(1) var<uniform> params: SortParams;
 @group(0) @binding(2) var<storage, read_write> plans: array<Plan>;
@@ -20,7 +20,7 @@
 @group(0) @binding(5) var<storage, read_write> digit_counts: array<u32>;
 @group(0) @binding(6) var<storage, read_write> groups_of: array<atomic<u32>>;
 
-// What is left out because no pixel needs it (src/render/skip.rs).
+// Work that is left out because no pixel changes (crates/render/src/skip.rs).
 override SKIP_UNSEEN: bool = true;
 override SKIP_EQUAL_DIGITS: bool = true;
 

@@ -1,13 +1,13 @@
 // Stage 8: front-to-back blend of a tile's Gaussians: colour, alpha, expected depth, labels.
-// Twin: src/render/cpu/rasterize.rs
-// What label_of, label_row, add_label and store_labels do is one of common/labels_*.wgsl.
+// CPU: crates/render/src/cpu/rasterize.rs (which cuts tiles into cells of 4 x 4 pixels)
+// common/labels_*.wgsl define label_of, label_row, add_label and store_labels.
 //
-// A tile is 32 parts of 4 x 2 pixels. Gaussians are staged by the batch, each with a bit for every
-// part that the box around its footprint meets; a part's invocations then walk their own bits, so
-// that most of a batch costs them nothing. The box is never too small: no pixel changes.
+// A tile is 32 parts of 4 x 2 pixels. Gaussians are staged in batches, each with one bit for every
+// part that the box around its footprint touches. The invocations of a part walk only its own bits.
+// The box is never too small, so no pixel changes.
 //
-// An invocation blends PIXELS pixels of a part: one on a GPU. On a software adapter, where reading
-// what was staged costs more than blending it, all eight.
+// An invocation blends PIXELS pixels of a part: one on a GPU, all eight on a software adapter,
+// where reading a staged Gaussian costs more than blending it.
 
 @group(0) @binding(1) var<storage, read> footprints: array<Footprint>;
 @group(0) @binding(2) var<storage, read> isect_ids: array<u32>;
@@ -42,7 +42,7 @@ override LANES: u32 = WORKGROUP_SIZE / PIXELS;
 // A kernel is made for each set of pictures.
 override WITH_COLOR: bool = true;
 override WITH_DEPTH: bool = true;
-// What is left out because no pixel needs it (src/render/skip.rs).
+// Work that is left out because no pixel changes (crates/render/src/skip.rs).
 override SKIP_ELLIPSE_PARTS: bool = true;
 override SKIP_ENDED_RAYS: bool = true;
 override SKIP_FLAT_COLOR: bool = true;

@@ -1,7 +1,7 @@
-// Stage 4: colour of each Gaussian that touches the band, as seen from the camera.
-// Twin: src/render/cpu/shade.rs
+// Stage 4: colour of each Gaussian that touches the band, seen from the camera.
+// CPU: crates/render/src/cpu/shade.rs
 //
-// A scene of degree 0 has one colour for all cameras: rasterize takes it as it is.
+// A scene of degree 0 has one colour for all cameras. rasterize reads it directly.
 
 @group(0) @binding(1) var<storage, read> gaussians: array<Gaussian>;
 // [N, K, 3], flattened.

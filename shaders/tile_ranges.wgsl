@@ -1,5 +1,5 @@
-// Stage 7: where each tile's pairs start and end: ranges[tile]..ranges[tile + 1].
-// Twin: src/render/cpu/tile_ranges.rs
+// Stage 7: where the pairs of each tile start and end: ranges[tile]..ranges[tile + 1].
+// CPU: crates/render/src/cpu/tile_ranges.rs
 
 @group(0) @binding(1) var<storage, read_write> plans: array<Plan>;
 // Tile of each pair, sorted.

@@ -1,5 +1,5 @@
-// Camera space. Depth is the sort key and decides the picture, so it is computed in pairs of floats
-// (value and rounding error): the key is the f32 nearest to the true depth, as on the CPU.
+// Camera space. Depth is the sort key, so it is computed in pairs of floats (value and rounding
+// error): the key is the f32 nearest to the true depth, as on the CPU.
 
 // x, in a form that no compiler can fuse or reorder with its neighbours.
 fn opaque(x: f32) -> f32 {

@@ -1,4 +1,5 @@
-// Numbers of the one model: the same list as src/render/constants.rs (a test compares them).
+// Numbers of the rendering model: the list of crates/render/src/constants.rs (a test compares
+// them).
 const TILE_SIZE: u32 = 16u;
 const ALPHA_MIN: f32 = 0.003921569;
 const ALPHA_MAX: f32 = 0.999;
@@ -14,7 +15,7 @@ const SH_C3 = array<f32, 7>(
 );
 const SH_OFFSET: f32 = 0.5;
 
-// Numbers of the kernels: the same list as src/render/gpu/pipelines.rs.
+// Numbers of the kernels: the list of crates/render/src/gpu/pipelines.rs.
 // Invocations of a workgroup, the portable floor; also the values of a radix digit.
 const WORKGROUP_SIZE: u32 = 256u;
 // Views that one submission draws at most: the workgroup's z says which.

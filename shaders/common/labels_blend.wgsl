@@ -1,4 +1,4 @@
-// Labels::Blend: each contribution adds its share of one row of a table.
+// Labels::Blend: each Gaussian adds its weight times one row of a table.
 
 @group(0) @binding(7) var<storage, read> table: array<vec4<f32>>;
 

@@ -1,4 +1,4 @@
-// Bank index of each Gaussian.
+// Entry of the bank of each Gaussian.
 
 // [N] of 16 bits, two a word, the lower first.
 @group(0) @binding(6) var<storage, read> semantic_index: array<u32>;

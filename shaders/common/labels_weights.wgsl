@@ -1,6 +1,5 @@
-// Labels::Weights: each pixel has `weight_slots` slots of (index, weight), filled as indices come
-// up. One that finds no room is counted all the same: the host sees the count, makes room and draws
-// again.
+// Labels::Weights: each pixel has `weight_slots` slots of (entry, weight), filled as entries occur.
+// An entry that finds no slot is counted too: the host sees the count, makes room and draws again.
 
 // [pixels] counts, then for each slot [pixels] indices and [pixels] weights as bits.
 @group(0) @binding(7) var<storage, read_write> slots: array<u32>;

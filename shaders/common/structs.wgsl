@@ -1,5 +1,5 @@
-// Every struct that crosses the border to the host; twins in src/render/gpu/buffers.rs, compared by
-// a test.
+// Every struct that host and shaders share. crates/render/src/gpu/buffers.rs has the same structs,
+// and a test compares them.
 
 // Camera of one view relative to the scene's origin, and the band of tile rows to draw.
 struct View {

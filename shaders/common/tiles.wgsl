@@ -1,6 +1,6 @@
-// The one predicate "which tiles does this Gaussian touch", for the count and for the emission.
-// Twin: src/render/cpu/tiles.rs. f32 may widen a span by a tile, which changes no pixel: the pixel
-// test stays exact.
+// Which tiles a Gaussian touches: one function for the count and for the emission. CPU:
+// crates/render/src/cpu/tiles.rs. f32 may make a span one tile wider. No pixel changes, because the
+// test of each pixel is exact.
 
 struct Extent {
     // √power_max, and half-width and half-height of the box around the footprint, pixels.

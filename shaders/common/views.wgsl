@@ -1,4 +1,4 @@
-// Cameras of the batch, and which of them this workgroup works for.
+// Cameras of the batch, and the view that this workgroup works for.
 
 @group(0) @binding(0) var<uniform> views: array<View, VIEWS_MAX>;
 

@@ -348,6 +348,38 @@ fn paths_in_backticks_lead_somewhere() {
     fail_with(&faults, "paths in backticks that lead nowhere");
 }
 
+/// Names of the public types at the top level of a file, and where each stands.
+fn public_types() -> BTreeMap<String, Vec<String>> {
+    let mut found: BTreeMap<String, Vec<String>> = BTreeMap::new();
+    for (name, text) in ours(".rs") {
+        if !(name.starts_with("src/") || (name.starts_with("crates/") && name.contains("/src/"))) {
+            continue;
+        }
+        for line in code_of(&text).lines() {
+            let kinds = ["struct", "enum", "trait", "type", "union"];
+            let Some(rest) = line.strip_prefix("pub ") else { continue };
+            let Some((kind, rest)) = rest.split_once(' ') else { continue };
+            if kinds.contains(&kind) {
+                let ident = rest.split(|c: char| !c.is_alphanumeric() && c != '_').next();
+                found.entry(ident.unwrap_or_default().to_owned()).or_default().push(name.clone());
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn no_two_public_types_share_a_name() {
+    let types = public_types();
+    assert!(types.len() > 100, "only {} public types were found", types.len());
+    let faults: Vec<String> = types
+        .iter()
+        .filter(|(_, places)| places.len() > 1)
+        .map(|(name, places)| format!("{name}: {}", places.join(", ")))
+        .collect();
+    fail_with(&faults, "names of public types");
+}
+
 /// The page of error codes, from the table and the comments in `crates/core/src/error.rs`.
 fn errors_page() -> String {
     let mut page = String::from(

@@ -1,6 +1,6 @@
-//! One error enum, one table: what went wrong, its stable code, and what each door says.
+//! The errors: a stable code, a message for the client, and a cause for the log.
 //!
-//! A new code is one row of [`TABLE`]; HTTP, gRPC, the command line and `docs/errors.md` follow.
+//! A new code is one row of [`TABLE`]. HTTP, gRPC, the command line and `docs/errors.md` read it.
 
 use std::fmt;
 

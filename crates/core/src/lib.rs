@@ -1,6 +1,5 @@
-//! The nouns of SegSplat: cameras, photos, Gaussians, statuses; errors, limits and stage times.
-//!
-//! Every other crate of the workspace uses this one; it uses none of them.
+//! The types that every other crate uses: cameras, photos, Gaussians, statuses, errors, limits and
+//! stage times. This crate uses no other crate of the workspace.
 
 pub mod cache;
 pub mod error;

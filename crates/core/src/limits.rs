@@ -1,4 +1,5 @@
-//! Every cap in one place, with its unit and its reason. All can be set in the configuration file of the server.
+//! Every limit in one place, with its unit and its reason. The server's configuration file sets
+//! them.
 
 use serde::{Deserialize, Serialize};
 

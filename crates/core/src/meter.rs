@@ -1,4 +1,4 @@
-//! The one metric that stages below the server count: seconds of each stage.
+//! The one metric that the stages record themselves: seconds of each stage.
 
 use std::sync::LazyLock;
 

@@ -1,4 +1,5 @@
-//! How far a picture is from a reference: used by `segsplat bench`, the laboratory and the tests.
+//! How much a picture differs from a reference. `segsplat bench`, the laboratory and the tests use
+//! it.
 
 use std::collections::BTreeMap;
 

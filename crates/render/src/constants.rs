@@ -1,4 +1,5 @@
-//! Numbers of the one model, each with its reason; the shaders' list is compared with this one.
+//! Numbers of the rendering model, each with its reason. A test compares the shaders' list with
+//! this one.
 
 /// Side of a square tile, pixels: 256 pixels share one list of Gaussians, one workgroup a tile.
 pub const TILE_SIZE: u32 = 16;

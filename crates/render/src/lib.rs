@@ -1,7 +1,8 @@
-//! Gaussians and a camera in, pictures out: one model (docs/conventions.md), three renderers.
+//! Renders Gaussians: one model (docs/conventions.md), three renderers.
 //!
-//! [`oracle`] is the judge (f64, per pixel, no tiles), [`cpu`] the tiled product renderer,
-//! [`gpu`] the same stages in WGSL. All three take [`RenderRequest`] and give [`Frame`].
+//! [`oracle`] judges the others: f64, pixel by pixel, no tiles. [`cpu`] is the tiled renderer of
+//! the product. [`gpu`] has the same stages in WGSL. All three take a [`RenderRequest`]; [`cpu`]
+//! and [`gpu`] give a [`Frame`].
 
 pub mod compare;
 pub mod constants;

@@ -1,8 +1,9 @@
-//! The judge: f64, pixel by pixel, no tiles, one full sort. Slow on purpose and shares no
-//! arithmetic with the renderers it judges.
+//! The oracle: f64, pixel by pixel, no tiles, one full sort. It is slow on purpose and shares no
+//! arithmetic with the renderers that it judges.
 //!
-//! Thresholds make cliffs: where alpha is next to 1/255, a ray next to its end, or two depths next
-//! to each other, a renderer may fall on the other side and be right. Such pixels are marked.
+//! The model has thresholds. A pixel stands at a cliff when an alpha is close to 1/255, a ray close
+//! to its end, or two depths close to each other. Another renderer may decide differently there and
+//! still be right. The oracle marks such pixels.
 
 use std::collections::BTreeMap;
 

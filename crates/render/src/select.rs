@@ -1,5 +1,5 @@
-//! Which renderer serves: looks at the adapters once, says what it took, and never takes a software
-//! adapter that was not named.
+//! Which renderer serves. The adapters are looked at once, and the log says which one is used. A
+//! software adapter is used only when it is named.
 
 use std::sync::Arc;
 

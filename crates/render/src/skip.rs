@@ -1,7 +1,7 @@
-//! What a renderer leaves out because it cannot show, one by one.
+//! Work that a renderer leaves out because no pixel changes, one kind each.
 //!
-//! All are on in the product. Tests switch each off and find the same pictures; `segsplat-lab
-//! skips` times frames with and without each.
+//! The product leaves out all of it. Tests switch each kind off and expect the same pictures;
+//! `segsplat-lab skips` measures the time of each.
 
 /// One kind of work that no pixel needs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]

@@ -1,4 +1,5 @@
-//! A request's camera made relative to the Gaussians' origin in f64, before anything is narrowed.
+//! The camera of a request, relative to the Gaussians' origin. It is computed in f64, before any
+//! number becomes f32.
 
 use glam::{DMat3, DVec3};
 

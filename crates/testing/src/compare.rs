@@ -1,4 +1,5 @@
-//! One comparer for all renderers: strict inside, flips at a cliff counted, no flip without one.
+//! Compares the pictures of two renderers. Pixels may differ only at cliffs of the oracle, and
+//! those are counted and few.
 
 use segsplat_render::{Frame, oracle::OraclePixel};
 

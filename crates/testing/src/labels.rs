@@ -1,5 +1,5 @@
-//! Labels against plain colours: one-hot colours of M channels, three at a time, drawn by the same
-//! renderer.
+//! Labels by the plain definition: entries become one-hot colours, and the renderer blends them as
+//! colours, three entries at a time.
 
 use std::sync::Arc;
 

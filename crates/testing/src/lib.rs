@@ -1,5 +1,5 @@
-//! What the tests of all crates share: generated scenes, comparison of pictures, where things are,
-//! and how a test says that it was skipped.
+//! What the tests of all crates share: generated scenes, comparison of pictures, places of files,
+//! and how a test reports that it was skipped.
 #![allow(
     clippy::expect_used,
     clippy::missing_panics_doc,

@@ -18,7 +18,7 @@ use crate::{
     scene::{Camera, CameraToWorld, Intrinsics, PosedPhoto, Upload, UploadCameras, UploadFile},
 };
 
-pub use room::{Room, View};
+pub use room::{Room, TrueView};
 
 /// Point that every camera of [`cameras`] looks at, room units, +y down.
 pub const TARGET: DVec3 = DVec3::new(0.0, -0.62, 0.15);

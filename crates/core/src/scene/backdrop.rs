@@ -1,8 +1,8 @@
-//! What lies behind everything: the photos' colours by direction, for rays that meet no Gaussian.
+//! The backdrop: the photos' colours by direction, for rays that meet no Gaussian.
 //!
-//! A small map over longitude and latitude about the world's y axis. It has no parallax and no
-//! place; the alpha of a view says honestly where it shows. Where no photo looked, the nearest
-//! colours spread (see `lift::backdrop`).
+//! A small map over longitude and latitude about the world's y axis. It has no parallax. The alpha
+//! of a view says where it shows. Where no photo looked, the nearest colours spread (see
+//! `lift::backdrop`).
 
 use std::f64::consts::{PI, TAU};
 

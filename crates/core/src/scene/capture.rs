@@ -1,4 +1,4 @@
-//! What the photos themselves say of a capture: depth range, overlap, what looks wrong.
+//! What the photos show before any network runs: depth ranges, overlap, warnings.
 
 use crate::scene::Warning;
 

@@ -1,4 +1,4 @@
-//! What a geometry network says of one photo: a Gaussian for each pixel, in a rigid frame.
+//! The output of the geometry network for one photo: a Gaussian for each pixel, in a rigid frame.
 
 use crate::scene::{Camera, CameraToWorld};
 

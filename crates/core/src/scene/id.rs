@@ -1,4 +1,4 @@
-//! Scene ids: a fixed alphabet, never joined to a path before this check.
+//! Scene ids. The alphabet is checked here, before an id becomes part of a path.
 
 use std::{fmt, str::FromStr};
 

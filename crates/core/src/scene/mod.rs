@@ -1,5 +1,6 @@
-//! The nouns: cameras, photos, Gaussians, reports. No IO, no threads; constructors validate and
-//! the types are trusted below.
+//! The data types of scenes: cameras, photos, Gaussians, reports, ids, statuses.
+//!
+//! Constructors check their input, so code that gets a value need not check it again.
 
 mod axes;
 mod backdrop;

@@ -1,4 +1,4 @@
-//! Photos with known cameras, as read and undistorted; nothing after this knows of distortion.
+//! Photos with known cameras. Their lens distortion is already undone.
 
 use crate::scene::Camera;
 

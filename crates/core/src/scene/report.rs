@@ -1,4 +1,4 @@
-//! What a scene says of itself: counts, warnings with their figure, stage times.
+//! The report of a scene: counts, warnings with their figures, stage times.
 
 use serde::{Deserialize, Serialize};
 

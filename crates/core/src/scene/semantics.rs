@@ -1,6 +1,7 @@
-//! What a scene means: a small bank of embeddings, and the row of each Gaussian and photo pixel.
+//! The semantics of a scene: the bank of embeddings, and the entry of each Gaussian and of each
+//! cell of the photos.
 //!
-//! Index 0 is the background and has no row; index m is row m - 1 of the bank.
+//! Entry 0 is the background and has no row. Entry m is row m - 1 of the bank.
 
 use serde::{Deserialize, Serialize};
 

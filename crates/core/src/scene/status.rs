@@ -1,4 +1,4 @@
-//! Where a scene stands, as kept on disk, told to watchers and shown to callers.
+//! The status of a scene, as the store keeps it and as callers and watchers see it.
 
 use serde::{Deserialize, Serialize};
 

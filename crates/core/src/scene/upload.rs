@@ -1,4 +1,4 @@
-//! What a caller sends to make a scene, as bytes: camera JSON and photos, or one archive.
+//! An upload as bytes: camera JSON and photos, or one archive.
 
 use std::fmt;
 

@@ -1,4 +1,4 @@
-//! Which entries of the bank a pixel shows, and with what weights.
+//! The entries of the bank that each pixel of a view shows, with their weights.
 
 use crate::error::{Error, Result};
 

@@ -1,5 +1,5 @@
-//! Stage 5: one (tile, Gaussian) pair per touched tile, in depth order.
-//! Partner: `shaders/emit_isects.wgsl`
+//! Stage 5: one (tile, Gaussian) pair for each tile that a Gaussian touches, in depth order.
+//! Shader: `shaders/emit_isects.wgsl`
 
 use rayon::prelude::*;
 
@@ -9,9 +9,9 @@ use super::{
     tiles::{Grid, TileSpans},
 };
 
-/// Gaussians a task.
+/// Gaussians of a task.
 const CHUNK: usize = 1024;
-/// Gaussians whose spans are fetched at once.
+/// Gaussians whose spans are fetched together.
 const FETCH: usize = 64;
 
 /// Writes the pairs of the Gaussian at place i of the depth order to
@@ -28,7 +28,7 @@ pub fn emit_isects(
 ) {
     let total = isect_offsets.last().copied().unwrap_or(0) as usize;
     isects.resize(total, 0);
-    // Disjoint slices, one a task, cut where the offsets say.
+    // Disjoint slices, one for each task, cut at the offsets.
     let mut tasks = Vec::with_capacity(sorted.len().div_ceil(CHUNK));
     let mut rest = isects.as_mut_slice();
     for (chunk, sorted) in sorted.chunks(CHUNK).enumerate() {
@@ -42,7 +42,7 @@ pub fn emit_isects(
         let mut slots = slice.iter_mut();
         let mut fetched = [TileSpans::default(); FETCH];
         for sorted in sorted.chunks(FETCH) {
-            // In depth order spans lie anywhere: fetched alone, many are waited for at once.
+            // In depth order spans lie anywhere. A loop of its own fetches many at the same time.
             for (spans, &pair) in fetched.iter_mut().zip(sorted) {
                 *spans = projected.tile_spans[value(pair) as usize];
             }

@@ -1,4 +1,4 @@
-//! A Gaussian on the picture, as the stages hand it on.
+//! A Gaussian on the picture: what the stages of the CPU renderer pass on.
 
 /// A Gaussian on the picture.
 ///

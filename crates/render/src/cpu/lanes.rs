@@ -1,9 +1,10 @@
-//! Vectors of f32 of the processor's own width, by `pulp`: AVX-512, AVX2 with FMA, or what every
-//! processor of the target has; and a fast power of two.
+//! Vectors of f32 as wide as the processor has them, by `pulp` (AVX-512, AVX2 with FMA, or what
+//! every processor of the target has), and a fast power of two.
 //!
-//! The kernel is compiled once for each width and picked when the renderer is made. Products and
-//! sums are fused where the processor fuses, so the two wide forms agree to the last bit and the
-//! portable one to rounding. Every function is inlined into its caller: it takes its processor.
+//! A kernel is compiled once for each width. The renderer picks one when it is made. Products and
+//! sums are fused where the processor can, so the two wide forms agree to the last bit and the
+//! portable one differs by rounding. Every function is inlined, so that it is compiled for the
+//! width of its caller.
 
 use std::ops::{Add, Div, Mul, Sub};
 
@@ -26,13 +27,13 @@ impl Width {
     /// All, the widest first.
     pub const ALL: [Self; 3] = [Self::Sixteen, Self::Eight, Self::Four];
 
-    /// The widest that this processor has.
+    /// The widest one of this processor.
     #[must_use]
     pub fn widest() -> Self {
         Self::ALL.into_iter().find(|width| width.available()).unwrap_or(Self::Four)
     }
 
-    /// Whether this processor has it.
+    /// Whether this processor has this width.
     #[must_use]
     pub fn available(self) -> bool {
         match self {
@@ -46,7 +47,7 @@ impl Width {
         }
     }
 
-    /// Runs `kernel`, compiled for this width or for the next that the processor has.
+    /// Runs `kernel`, compiled for this width, or for the next one if the processor lacks it.
     #[inline]
     pub(super) fn run<K: LaneKernel>(self, kernel: K) {
         #[cfg(target_arch = "x86_64")]
@@ -86,9 +87,9 @@ impl<S: Lanes, K: LaneKernel> pulp::NullaryFnOnce for Compiled<S, K> {
     }
 }
 
-/// A width with what `pulp` leaves out: a mask as bits, and products added as fast as they can be.
+/// A width, with operations that `pulp` lacks: a mask as bits, and fast products with a sum.
 pub(super) trait Lanes: Simd {
-    /// One bit a lane, lane 0 the lowest.
+    /// One bit for each lane, lane 0 the lowest.
     fn bits(self, mask: Self::m32s) -> u32;
 
     /// `a · b + c`, fused where the processor fuses.
@@ -132,7 +133,7 @@ impl Lanes for V3 {
     }
 }
 
-/// Whether every processor of the target fuses; else a fused product is a call of a function.
+/// Whether every processor of the target fuses. Else a fused product is a function call.
 const FUSES: bool = cfg!(any(target_arch = "aarch64", target_feature = "fma"));
 
 impl Lanes for pulp::Scalar128b {
@@ -206,19 +207,19 @@ impl<S: Lanes> Wide<S> {
         Self(self.0, self.0.min_f64s(self.1, other.1))
     }
 
-    /// Lanes that are at least those of `other`; none that is NaN.
+    /// Mask of the lanes that are at least those of `other`; NaN never is.
     #[inline(always)]
     pub(super) fn at_least(self, other: Self) -> S::m64s {
         self.0.less_than_or_equal_f64s(other.1, self.1)
     }
 
-    /// 0 in the lanes that are not of `mask`.
+    /// These numbers in the lanes of `mask`, 0 in the others.
     #[inline(always)]
     pub(super) fn only(self, mask: S::m64s) -> Self {
         Self(self.0, self.0.select_f64s(mask, self.1, self.0.splat_f64s(0.0)))
     }
 
-    /// The whole number under it, or itself. For numbers under 2⁵⁰.
+    /// Rounds down. For numbers under 2⁵⁰.
     #[inline(always)]
     pub(super) fn floor(self) -> Self {
         let (one, shift) = (Self::of(self.0, 1.0), Self::of(self.0, 6_755_399_441_055_744.0));
@@ -226,7 +227,7 @@ impl<S: Lanes> Wide<S> {
         whole - one.only(self.0.less_than_f64s(self.1, whole.1))
     }
 
-    /// The whole number over it, or itself. For numbers under 2⁵⁰.
+    /// Rounds up. For numbers under 2⁵⁰.
     #[inline(always)]
     pub(super) fn ceil(self) -> Self {
         let (one, shift) = (Self::of(self.0, 1.0), Self::of(self.0, 6_755_399_441_055_744.0));
@@ -267,9 +268,9 @@ impl<S: Lanes> Div for Wide<S> {
     }
 }
 
-/// Powers above this are as good as infinite: 2^-120 is far under any alpha that counts.
+/// Powers above this count as infinite: 2^-120 is far under 1/255.
 const POWER_MAX: f32 = 120.0;
-/// Adding and taking away 1.5 · 2²³ rounds to a whole number, which stays in the low bits.
+/// Adding and subtracting 1.5 · 2²³ rounds to an integer, which stays in the low bits.
 const ROUND: f32 = 12_582_912.0;
 /// 2^-g over |g| <= ½ to 9.2e-8 of its value (least largest relative error, by Lawson's weights).
 #[expect(clippy::approx_constant, reason = "the best first term is not ln 2, and near it")]

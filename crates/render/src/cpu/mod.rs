@@ -1,8 +1,7 @@
-//! The tiled CPU renderer: the stages of the GPU renderer, one file each with the shader's stem.
+//! The tiled CPU renderer: the stages of the GPU renderer, one file each, named like the shader.
 //!
-//! It serves where there is no adapter, so it is a product and not a test toy. A frame is the same
-//! to the last bit whatever the number of threads: tasks write to places fixed in advance and
-//! nothing is summed across tasks.
+//! It serves where there is no adapter. A frame is the same to the last bit for any number of
+//! threads: each task writes to places that are fixed in advance, and no sum goes across tasks.
 
 pub mod emit_isects;
 pub mod footprint;
@@ -53,7 +52,7 @@ pub struct CpuRenderer {
     tiles: Pool<TileScratch>,
     isects_max: u64,
     width: Width,
-    /// What is not left out.
+    /// Work that is done although it could be skipped.
     without: Option<Skip>,
 }
 
@@ -85,14 +84,14 @@ impl CpuRenderer {
         })
     }
 
-    /// The same renderer with kernels of another width, where the processor has it.
+    /// The same renderer with kernels of another width, if the processor has it.
     #[must_use]
     pub fn with_width(mut self, width: Width) -> Self {
         self.width = width;
         self
     }
 
-    /// The same renderer, one kind of needless work not left out, for tests and benchmarks.
+    /// The same renderer without one of the skips, for tests and benchmarks.
     #[must_use]
     pub fn without(mut self, without: Option<Skip>) -> Self {
         self.without = without;
@@ -118,7 +117,7 @@ impl CpuRenderer {
         let kept = |&(_, &tiles): &(u32, &u32)| tiles > 0 || all;
         let kept = (0_u32..).zip(&projected.tiles_per_gauss).filter(kept);
         sorted.clear();
-        // t.z is over 0, so its bits are in the order of its value.
+        // t.z is over 0, so its bits sort like its value.
         sorted.extend(kept.map(|(i, _)| pack(projected.footprints[i as usize].depth.to_bits(), i)));
         radix_sort::radix_sort(sorted, spare, u32::BITS);
         if request.kinds.color {
@@ -241,7 +240,7 @@ impl Renderer for CpuRenderer {
     }
 }
 
-/// What the bands of a frame share, and their weights from top to bottom.
+/// Data that the bands of a frame share, and their weights from top to bottom.
 struct Band<'a> {
     paint: Paint<'a>,
     weights: Vec<WeightRows>,
@@ -258,7 +257,7 @@ struct FrameScratch {
     ranges: Vec<u32>,
 }
 
-/// Things kept for the next that needs one.
+/// Values that are used again.
 #[derive(Debug, Default)]
 struct Pool<T>(Mutex<Vec<T>>);
 

@@ -1,4 +1,4 @@
-//! What a frame asks of the blend: the channels of a Gaussian, and how the kernels work.
+//! What the blend of a frame computes: the channels of a Gaussian and the options of the kernels.
 
 use super::{footprint::Footprint, lanes::Width};
 use crate::{Kinds, Labels, RenderRequest, labels::BLEND_WIDTH, skip::Skip};
@@ -6,25 +6,25 @@ use crate::{Kinds, Labels, RenderRequest, labels::BLEND_WIDTH, skip::Skip};
 /// Most channels: colour, depth, labels.
 pub(super) const CHANNELS: usize = 3 + 1 + BLEND_WIDTH;
 
-/// What a Gaussian is blended with, chosen once a frame.
+/// What the blend computes, chosen once for each frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Paint<'a> {
-    /// Pictures wanted.
+    /// Pictures asked for.
     kinds: Kinds,
-    /// Behind everything, in colour.
+    /// Background colour.
     pub(super) background: [f32; 3],
-    /// Labels wanted.
+    /// Labels asked for.
     pub(super) labels: &'a Labels,
-    /// `[N]` bank index of each Gaussian.
+    /// `[N]` entry of each Gaussian.
     pub(super) index: &'a [u16],
     /// Lanes of the kernel.
     pub(super) width: Width,
-    /// What is not left out.
+    /// Work that is done although it could be skipped.
     pub(super) without: Option<Skip>,
 }
 
 impl<'a> Paint<'a> {
-    /// What `request` asks for, of Gaussians with the bank indices `index`, `[N]`.
+    /// The blend of `request`, of Gaussians with the entries `index`, `[N]`.
     #[must_use]
     pub fn new(request: &'a RenderRequest, index: &'a [u16]) -> Self {
         let RenderRequest { kinds, background, labels, .. } = request;
@@ -38,13 +38,13 @@ impl<'a> Paint<'a> {
         Self { width, ..self }
     }
 
-    /// The same, one kind of needless work not left out.
+    /// The same without one of the skips.
     #[must_use]
     pub fn without(self, without: Option<Skip>) -> Self {
         Self { without, ..self }
     }
 
-    /// Labels wanted.
+    /// Labels asked for.
     #[must_use]
     pub fn labels(&self) -> &'a Labels {
         self.labels

@@ -1,8 +1,8 @@
-//! Stage 3: where each visible Gaussian's tile pairs start. Partner: `shaders/prefix_sum.wgsl`
+//! Stage 3: where the tile pairs of each visible Gaussian start. Shader: `shaders/prefix_sum.wgsl`
 
-/// Exclusive prefix sum of `counts` into `offsets` (one longer); the total, in 64 bits.
+/// Writes the exclusive prefix sum of `counts` into `offsets` (one longer). Returns the total.
 ///
-/// Offsets are only meaningful while the total fits the caller's budget, which it checks first.
+/// The caller checks that the total fits its budget before it uses the offsets.
 pub fn prefix_sum(counts: impl Iterator<Item = u32>, offsets: &mut Vec<u64>) -> u64 {
     offsets.clear();
     let mut total = 0;

@@ -1,7 +1,7 @@
-//! Stage 1: Gaussians to footprints, and which to drop. Partner: `shaders/project.wgsl`
+//! Stage 1: Gaussians to footprints; some are dropped. Shader: `shaders/project.wgsl`
 //!
-//! In: means, quats, scales, opacities `[N]`. Out: [`Footprint`] `[N]`; a dropped Gaussian has
-//! touched no tile (`tiles_per_gauss` 0). Everything is computed in f64 and narrowed at the end.
+//! In: means, quats, scales, opacities `[N]`. Out: [`Footprint`] `[N]`. A dropped Gaussian touches
+//! no tile (`tiles_per_gauss` is 0). All arithmetic is f64; the results become f32 at the end.
 
 use rayon::prelude::*;
 
@@ -17,22 +17,22 @@ use crate::{
     view::View,
 };
 
-/// Gaussians a task: large enough to hide the task's cost, small enough to balance two cores.
+/// Gaussians of a task: enough to hide the cost of a task, few enough to balance two cores.
 const CHUNK: usize = 1024;
 
-/// What the stage gives, `[N]` each.
+/// Output of the stage, `[N]` each.
 #[derive(Debug, Default)]
 pub struct Projected {
-    /// Footprints; meaningless where dropped.
+    /// Footprints; undefined where dropped.
     pub footprints: Vec<Footprint>,
-    /// Tiles touched, for the emission; meaningless where dropped.
+    /// Tiles touched, for the emission; undefined where dropped.
     pub tile_spans: Vec<TileSpans>,
     /// Tiles touched; 0 where dropped.
     pub tiles_per_gauss: Vec<u32>,
 }
 
 impl Projected {
-    /// Footprints from elsewhere, with the tiles that they touch.
+    /// Given footprints, with the tiles that they touch.
     #[must_use]
     pub fn of(footprints: Vec<Footprint>, grid: &Grid) -> Self {
         let touched = footprints.iter().map(|footprint| TileSpans::of(footprint, grid));
@@ -41,26 +41,26 @@ impl Projected {
     }
 }
 
-/// How the stage works.
+/// Options of the stage.
 #[derive(Clone, Copy, Debug)]
 pub struct Projection {
     /// gsplat's antialiased mode.
     pub antialiased: bool,
     /// Lanes of the kernel.
     pub width: Width,
-    /// What is not left out.
+    /// Work that is done although it could be skipped.
     pub without: Option<Skip>,
 }
 
 impl Projection {
-    /// All that saves time, as wide as the processor can.
+    /// All skips, and the widest lanes of the processor.
     #[must_use]
     pub fn new(antialiased: bool) -> Self {
         Self { antialiased, width: Width::widest(), without: None }
     }
 }
 
-/// Projects every Gaussian; `tiles_per_gauss[i]` is 0 for one that is dropped.
+/// Projects every Gaussian. `tiles_per_gauss[i]` is 0 if Gaussian i is dropped.
 pub fn project(gaussians: &Gaussians, view: &View, how: Projection, projected: &mut Projected) {
     let count = gaussians.len();
     let Projected { footprints, tile_spans, tiles_per_gauss } = projected;
@@ -99,7 +99,7 @@ impl LaneKernel for Chunk<'_> {
         for (at, ((footprints, spans), tiles)) in out {
             tiles.fill(0);
             if how.without == Some(Skip::Unseen) {
-                // Theirs are looked at too.
+                // The spans of dropped Gaussians are read too.
                 spans.fill(TileSpans::default());
             }
             let first = self.first + at * BLOCK;
@@ -125,7 +125,7 @@ impl LaneKernel for Chunk<'_> {
     }
 }
 
-/// Some Gaussians as rows of numbers, and their footprints.
+/// A block of Gaussians and their footprints, one row for each number.
 #[derive(Default)]
 struct Block {
     mean: [Row; 3],
@@ -137,7 +137,7 @@ struct Block {
     conic_x: Row,
     conic_y: Row,
     depth: Row,
-    /// 1 for a Gaussian that can be seen so far.
+    /// 1 for a Gaussian that may be visible, else 0.
     kept: Row,
 }
 
@@ -162,7 +162,7 @@ impl Block {
         }
     }
 
-    /// EWA projection of all; whether any may be seen.
+    /// EWA projection of the block. Returns whether any Gaussian may be visible.
     #[inline(always)]
     fn project<S: Lanes>(&mut self, simd: S, view: &View, antialiased: bool) -> bool {
         let mut any = false;
@@ -238,10 +238,10 @@ impl Block {
         any
     }
 
-    /// The footprint of Gaussian `k`; `None` when it cannot be seen.
+    /// The footprint of Gaussian `k`; `None` if it is not visible.
     #[inline(always)]
     fn footprint(&self, k: usize) -> Option<Footprint> {
-        // A NaN is never at least the least alpha.
+        // The comparison is false for a NaN.
         let seen = self.kept[k] > 0.0 && self.opacity[k] >= f64::from(ALPHA_MIN);
         if !seen {
             return None;
@@ -257,7 +257,7 @@ impl Block {
             depth: self.depth[k] as f32,
             color: [0.0; 3],
         };
-        // Infinite variances and determinants end in a 0 or a NaN here.
+        // Infinite variances and determinants give a 0 or a NaN here.
         let finite = footprint.mean[0].is_finite()
             && footprint.mean[1].is_finite()
             && footprint.conic_shear.is_finite()

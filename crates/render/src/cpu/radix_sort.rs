@@ -1,4 +1,4 @@
-//! Stages 2 and 6: stable radix sort of (key, value) pairs. Partner: `shaders/radix_sort.wgsl`
+//! Stages 2 and 6: stable radix sort of (key, value) pairs. Shader: `shaders/radix_sort.wgsl`
 
 /// Bits of a digit: 2,048 counters stay in the level-1 cache.
 const DIGIT_BITS: u32 = 11;
@@ -27,7 +27,7 @@ pub fn key(pair: u64) -> u32 {
 
 /// Sorts `pairs` by key, stable, in time linear in their number; `spare` is scratch.
 ///
-/// Only the lowest `key_bits` bits of a key are looked at; keys must not have others set.
+/// Only the lowest `key_bits` bits of a key are compared. Other bits must be 0.
 pub fn radix_sort(pairs: &mut Vec<u64>, spare: &mut Vec<u64>, key_bits: u32) {
     spare.resize(pairs.len(), 0);
     let mut shift = 32;

@@ -1,14 +1,15 @@
-//! Stage 8: front-to-back blend of colour, depth, alpha and labels. Partner:
-//! `shaders/rasterize.wgsl`
+//! Stage 8: front-to-back blend of colour, depth, alpha and labels.
+//! Shader: `shaders/rasterize.wgsl`
 //!
-//! A tile is cut into cells of 4 x 4 pixels. Gaussians are staged a batch at a time; each marks the
-//! cells that its ellipse may meet, and the marks are turned over so that a cell has them as a row
-//! of bits. Then each cell blends what marked it, with the state of its pixels in registers. A cell
-//! whose rays have all ended takes no more.
+//! A tile is cut into cells of 4 x 4 pixels. Gaussians are staged in batches. Each one marks the
+//! cells that its ellipse may touch. The marks are transposed, so that each cell has one bit for
+//! each Gaussian of the batch. Then each cell blends the Gaussians with a set bit; the state of its
+//! pixels stays in registers. A cell whose rays have all ended blends no more. (The shader cuts a
+//! tile into parts of 4 x 2 pixels and tests boxes instead of ellipses. The pixels are the same.)
 //!
-//! What is blended beside alpha is a row of channels, packed: colour, depth and a label's row of
-//! the table, as far as they were asked for. Weights are summed in one bin for each index that
-//! occurs in the tile, so a Gaussian touches one bin a cell however large the bank is.
+//! Besides alpha, the blend sums packed channels: colour, depth, and the row of a table, as the
+//! request asks. Pixel weights are summed in one bin for each entry that occurs in the tile, so the
+//! size of the bank does not matter.
 
 use super::{
     footprint::Footprint,
@@ -32,17 +33,17 @@ const ACROSS: usize = SIDE / CELL;
 const CELLS: usize = ACROSS * ACROSS;
 /// Pixels of a cell.
 const PIXELS: usize = CELL * CELL;
-/// Gaussians whose marks are turned over at once.
+/// Gaussians of a batch: their marks are transposed together.
 const GROUP: usize = 64;
-/// Middles of the cells from the middle of the tile, pixels.
+/// Centres of the cells, relative to the centre of the tile, pixels.
 const CELL_X: Numbers = along(ACROSS, false, CELL as f32);
 const CELL_Y: Numbers = along(ACROSS, true, CELL as f32);
-/// Centres of a cell's pixels from its middle.
+/// Centres of a cell's pixels, relative to the centre of the cell.
 const PIXEL_X: Numbers = along(CELL, false, 1.0);
 const PIXEL_Y: Numbers = along(CELL, true, 1.0);
-/// Powers are counted in twos: half the squared distance times log2 e.
+/// Powers are exponents of 2: half the squared distance times log2 e.
 const SQRT_LOG2_E: f64 = 1.201_122_408_786_449_8;
-/// Room for the rounding of the bound of a cell, on top of the footprint's own slack.
+/// Slack for the rounding of a cell's bound, in addition to the footprint's slack.
 const POWER_SLACK: f32 = 1e-4;
 
 /// One number for each of 16 pixels or cells, in one line of the cache.
@@ -79,14 +80,14 @@ const fn along(side: usize, rows: bool, step: f32) -> Numbers {
     Numbers(out)
 }
 
-/// Bin of a Gaussian that enters none.
+/// Bin of a Gaussian without a bin.
 const NO_BIN: u32 = u32::MAX;
 
-/// A Gaussian about to be blended into a tile, the same for all of its cells.
+/// A Gaussian of a tile, ready for the blend of all cells.
 ///
-/// At a place (x, y) from the middle of the tile, pixels, the power of two by which its alpha
-/// falls is u² + v² with `u = ux x + uy y + u0` and `v = vy y + v0`. Where it is seen at all, no
-/// term is large: the blur bounds `ux`, `uy` and `vy`, so f32 loses nothing that shows.
+/// At (x, y), pixels from the centre of the tile, alpha is the opacity times 2^-(u² + v²) with
+/// `u = ux x + uy y + u0` and `v = vy y + v0`. Where the Gaussian is visible, all terms are small,
+/// because the blur bounds `ux`, `uy` and `vy`. So f32 is precise enough.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(64))]
 struct Staged {
@@ -99,11 +100,11 @@ struct Staged {
     power_max: f32,
     opacity: f32,
     channels: [f32; CHANNELS],
-    /// Bin of its index, where weights are wanted.
+    /// Bin of its entry, if weights are asked for.
     bin: u32,
 }
 
-/// The pixels of a cell: a row of numbers each.
+/// The pixels of a cell, one row for each number.
 #[derive(Clone, Copy, Debug)]
 struct Cell {
     /// Transmittance while the ray goes on, 0 after it has ended.
@@ -122,7 +123,7 @@ impl Cell {
     };
 }
 
-/// Scratch of one worker; its contents mean nothing between tiles.
+/// Scratch of one worker. Its contents are undefined between tiles.
 #[derive(Debug)]
 pub struct TileScratch {
     fetched: Vec<Footprint>,
@@ -144,19 +145,19 @@ impl Default for TileScratch {
     }
 }
 
-/// Weights of the indices that occur in a tile.
+/// Weights of the entries that occur in a tile.
 #[derive(Debug, Default)]
 struct Bins {
-    /// Indices that occur, ascending; bin b is of `present[b]`.
+    /// Entries that occur, ascending. Bin b belongs to `present[b]`.
     present: Vec<u16>,
-    /// `[65536]` bin of each index, [`NO_BIN`] where it does not occur; empty before the first.
+    /// `[65536]` bin of each entry, [`NO_BIN`] if it does not occur; empty before the first tile.
     bin_of: Vec<u32>,
     /// `[CELLS, present.len()]` sums.
     sums: Vec<Numbers>,
 }
 
 impl Bins {
-    /// A bin for every index but 0 of the Gaussians `isects`, all sums 0.
+    /// Makes a bin for each entry over 0 of the Gaussians `isects`. All sums are 0.
     fn open(&mut self, isects: &[u64], index: &[u16]) {
         self.bin_of.resize(1 << u16::BITS, NO_BIN);
         for left in self.present.drain(..) {
@@ -178,7 +179,7 @@ impl Bins {
         self.sums.resize(CELLS * self.present.len(), Numbers::ZERO);
     }
 
-    /// The sums of a cell, one a bin.
+    /// The sums of a cell, one for each bin.
     #[inline(always)]
     fn of_cell(&mut self, cell: usize) -> &mut [Numbers] {
         let count = self.present.len();
@@ -237,7 +238,7 @@ pub fn rasterize_tile(
     store(tile, paint, picture_width, scratch, out);
 }
 
-/// A tile and what falls on it.
+/// A tile and its Gaussians.
 #[derive(Clone, Copy)]
 struct TileWork<'a> {
     footprints: &'a [Footprint],
@@ -252,7 +253,7 @@ struct Blend<'a> {
 }
 
 impl LaneKernel for Blend<'_> {
-    /// The loop with the channels that the frame asks for: what is not wanted is not computed.
+    /// Runs the loop that is compiled for the channels of the frame.
     #[inline(always)]
     fn run<S: Lanes>(self, simd: S) {
         let Self { work, scratch } = self;
@@ -284,8 +285,8 @@ fn blend<S: Lanes, const K: usize, const WEIGHTS: bool>(
     let ends = work.paint.without != Some(Skip::EndedRays);
     let mut open = clear(&mut scratch.cells, work.tile);
     for batch in work.isects.chunks(BATCH_SIZE) {
-        // Footprints lie far apart in memory: they are fetched in a loop so short that the
-        // processor waits for many at once.
+        // Footprints lie far apart in memory. This loop is short, so that the processor fetches
+        // many of them at the same time.
         let fetched = &mut scratch.fetched[..batch.len()];
         for (fetched, &isect) in fetched.iter_mut().zip(batch) {
             *fetched = work.footprints[radix_sort::value(isect) as usize];
@@ -331,7 +332,7 @@ fn blend<S: Lanes, const K: usize, const WEIGHTS: bool>(
     }
 }
 
-/// One row of bits for each cell: bit i tells of Gaussian i, whose bit c tells of cell c.
+/// Transposes marks (bit c of Gaussian i) to rows (bit i of cell c).
 #[inline(always)]
 fn turned_over(met_by: &[u16; GROUP]) -> [u64; CELLS] {
     let mut marks = [0; CELLS];
@@ -356,8 +357,8 @@ fn turned_over(met_by: &[u16; GROUP]) -> [u64; CELLS] {
     marks
 }
 
-/// Clears the cells; one bit for each that has pixels inside the picture. Pixels outside have
-/// ended.
+/// Clears the cells. Returns one bit for each cell with pixels inside the picture. The rays of
+/// pixels outside have ended.
 fn clear(cells: &mut [Cell; CELLS], tile: Tile) -> u32 {
     cells.fill(Cell::CLEAR);
     let mut open = (1 << CELLS) - 1;
@@ -384,7 +385,7 @@ const fn place(cell: usize, pixel: usize) -> (usize, usize) {
     (cell % ACROSS * CELL + pixel % CELL, cell / ACROSS * CELL + pixel / CELL)
 }
 
-/// A footprint as a tile needs it. f64, narrowed where nothing is large any more.
+/// The footprint, relative to the tile. Computed in f64; the small results become f32.
 #[inline(always)]
 fn stage(footprint: &Footprint, tile: Tile, channels: [f32; CHANNELS], bin: u32) -> Staged {
     let half = f64::from(TILE_SIZE) / 2.0;
@@ -405,9 +406,9 @@ fn stage(footprint: &Footprint, tile: Tile, channels: [f32; CHANNELS], bin: u32)
     }
 }
 
-/// One bit for each cell that the ellipse may meet.
+/// One bit for each cell that the ellipse may touch.
 ///
-/// Over a cell u and v stay within a box, whose distance from 0 is compared with `power_max`.
+/// In a cell, u and v stay within a box. Its distance from 0 is compared with `power_max`.
 #[inline(always)]
 fn met<S: Lanes>(simd: S, gaussian: &Staged) -> u16 {
     let mut bits = 0;
@@ -436,8 +437,8 @@ fn along_axes<S: Lanes>(simd: S, gaussian: &Staged, x: S::f32s, y: S::f32s) -> (
     (u, v)
 }
 
-/// Blends what marked cell `at` into vector `i` of it: K channels, and their bins; whether some
-/// ray goes on. It stops where none does if `ends`.
+/// Blends the marked Gaussians into vector `i` of cell `at`: K channels and the bins. Returns
+/// whether any ray goes on. If `ends`, it stops when none does.
 #[inline(always)]
 fn blend_cell<S: Lanes, const K: usize, const WEIGHTS: bool>(
     simd: S,
@@ -496,7 +497,7 @@ fn blend_cell<S: Lanes, const K: usize, const WEIGHTS: bool>(
     goes_on
 }
 
-/// Writes a tile that nothing falls on.
+/// Writes a tile without Gaussians.
 fn store_empty(tile: Tile, paint: &Paint<'_>, picture_width: u32, out: &mut RowOut<'_>) {
     for row in 0..tile.height as usize {
         let first = row * picture_width as usize + tile.x as usize;

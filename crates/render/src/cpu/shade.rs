@@ -1,4 +1,4 @@
-//! Stage 4: colour of each visible Gaussian as seen from the camera. Partner: `shaders/shade.wgsl`
+//! Stage 4: colour of each visible Gaussian, seen from the camera. Shader: `shaders/shade.wgsl`
 //!
 //! In: spherical harmonics `[N, K, 3]`. Out: the colour of each footprint that touches a tile.
 
@@ -13,11 +13,11 @@ use crate::{
     view::View,
 };
 
-/// Gaussians a task.
+/// Gaussians of a task.
 const CHUNK: usize = 1024;
 
-/// Fills in the colour of every visible footprint, in place: neighbours stay neighbours, which the
-/// rasteriser's cache needs more than depth order.
+/// Writes the colour of every visible footprint, in place. The footprints keep the order of the
+/// scene, which suits the rasteriser's cache better than depth order.
 ///
 /// A scene of degree 0 looks the same from everywhere: no direction is computed, unless `without`
 /// says so.

@@ -1,4 +1,4 @@
-//! Stage 7: where each tile's pairs start and end. Partner: `shaders/tile_ranges.wgsl`
+//! Stage 7: where the pairs of each tile start and end. Shader: `shaders/tile_ranges.wgsl`
 
 use super::radix_sort::key;
 

@@ -1,5 +1,5 @@
-//! The one predicate "which tiles does this Gaussian touch", for the count and for the emission.
-//! Partner: `shaders/common/tiles.wgsl`
+//! Which tiles a Gaussian touches: one function for the count and for the emission.
+//! Shader: `shaders/common/tiles.wgsl`
 
 use std::ops::Range;
 
@@ -9,8 +9,8 @@ use super::{
 };
 use crate::{constants::TILE_SIZE, skip::Skip, view::View};
 
-/// Places beyond this are all as far, pixels: pictures are smaller, and whole numbers of this size
-/// are exact.
+/// Places are clamped to this, pixels. Pictures are smaller, and f64 holds integers of this size
+/// exactly.
 const FAR: f64 = 1_099_511_627_776.0;
 
 /// The part of the picture that is drawn: all columns, some rows of tiles.
@@ -20,10 +20,10 @@ pub struct Grid {
     pub width: u32,
     /// Picture height, pixels.
     pub height: u32,
-    /// Rows of tiles in question.
+    /// Rows of tiles to draw.
     pub tile_rows: Range<u32>,
-    /// Whether a footprint touches the tiles that its ellipse meets, or all that the box around it
-    /// does: [`Skip::EllipseTiles`].
+    /// Whether a footprint touches the tiles of its ellipse, or those of the box around it:
+    /// [`Skip::EllipseTiles`].
     pub by_ellipse: bool,
 }
 
@@ -52,9 +52,9 @@ impl Grid {
     }
 }
 
-/// The answer of [`touched_tiles`] for a footprint of at most two rows of tiles, as most are.
+/// The result of [`touched_tiles`] for a footprint of at most two rows of tiles. Most are.
 ///
-/// Emission replays it: in depth order these 12 bytes stay in the cache and footprints do not.
+/// The emission reads it: in depth order these 12 bytes stay in the cache, footprints do not.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct TileSpans {
     /// First row of tiles touched.
@@ -66,7 +66,7 @@ pub struct TileSpans {
 }
 
 impl TileSpans {
-    /// Asks [`touched_tiles`] once; the spans and the number of tiles.
+    /// Calls [`touched_tiles`] once. Returns the spans and the number of tiles.
     #[inline]
     #[must_use]
     pub fn of(footprint: &Footprint, grid: &Grid) -> (Self, u32) {
@@ -77,7 +77,7 @@ impl TileSpans {
             if kept.rows == 0 {
                 kept.first_row = tile_y as u16;
             }
-            // The ellipse may miss the pixels of a row between two that it meets.
+            // The ellipse may miss the pixels of a row between two that it touches.
             let row = usize::from(tile_y as u16 - kept.first_row);
             if let Some(span) = kept.spans.get_mut(row) {
                 *span = [tiles.start as u16, tiles.end as u16];
@@ -105,7 +105,7 @@ impl TileSpans {
         }
     }
 
-    /// Number of tiles touched in `grid`, which may be a band of the grid that was asked.
+    /// Number of tiles touched in `grid`, which may be a band of the first grid.
     #[must_use]
     pub fn count(&self, footprint: &Footprint, grid: &Grid) -> u32 {
         let mut count = 0;
@@ -114,10 +114,10 @@ impl TileSpans {
     }
 }
 
-/// Ellipses asked at once.
+/// Ellipses of a block.
 pub(super) const BLOCK: usize = 16;
 
-/// [`touched_tiles`] for many ellipses at once, as far as [`TileSpans`] keeps the answer.
+/// [`touched_tiles`] for a block of ellipses, as far as [`TileSpans`] stores the result.
 #[derive(Default)]
 pub(super) struct Ellipses {
     mean: [Row; 2],
@@ -125,14 +125,14 @@ pub(super) struct Ellipses {
     conic_x: Row,
     conic_y: Row,
     power_max: Row,
-    /// First row of tiles and one past the last; none where they are the same.
+    /// First row of tiles and one past the last; no row if they are equal.
     rows: [Row; 2],
     /// For the first two rows of tiles: the first tile and one past the last.
     spans: [[Row; 2]; 2],
 }
 
 impl Ellipses {
-    /// Ellipse `k` is that of `footprint`.
+    /// Sets ellipse `k` to that of `footprint`.
     #[inline(always)]
     pub(super) fn set(&mut self, k: usize, footprint: &Footprint) {
         [self.mean[0][k], self.mean[1][k]] = footprint.mean;
@@ -142,7 +142,7 @@ impl Ellipses {
         self.power_max[k] = f64::from(footprint.power_max);
     }
 
-    /// Answers for all, statement by statement as [`touched_tiles`].
+    /// Computes the spans of all, with the same statements as [`touched_tiles`].
     #[inline(always)]
     pub(super) fn touch<S: Lanes>(&mut self, simd: S, grid: &Grid) {
         let number = |value: f64| Wide::of(simd, value);
@@ -188,7 +188,7 @@ impl Ellipses {
         }
     }
 
-    /// The answer for ellipse `k`, that of `footprint`: spans and number of tiles.
+    /// Spans and number of tiles of ellipse `k`, which is that of `footprint`.
     #[inline(always)]
     pub(super) fn spans(&self, k: usize, footprint: &Footprint, grid: &Grid) -> (TileSpans, u32) {
         let (first, end) = (self.rows[0][k], self.rows[1][k]);
@@ -212,9 +212,9 @@ impl Ellipses {
 
 /// Calls `touch(tile_y, tiles)` for every row of tiles of `grid` with the span of tiles touched.
 ///
-/// A tile is touched where the ellipse "alpha may reach 1/255" meets the rectangle of the tile's
-/// pixel centres. The ellipse is convex, so a row of tiles sees one span: between the leftmost and
-/// the rightmost point of the ellipse inside the row's band.
+/// A tile is touched if the ellipse of alpha 1/255 meets the rectangle of the tile's pixel centres.
+/// The ellipse is convex, so it touches one span in a row of tiles: from its leftmost to its
+/// rightmost point inside the row.
 #[inline]
 pub fn touched_tiles(footprint: &Footprint, grid: &Grid, mut touch: impl FnMut(u32, Range<u32>)) {
     let [mean_x, mean_y] = footprint.mean;
@@ -259,7 +259,7 @@ pub fn count_tiles(footprint: &Footprint, grid: &Grid) -> u32 {
     TileSpans::of(footprint, grid).1
 }
 
-/// `v.floor()`, saturating: processors without SSE 4.1 would call a function for it.
+/// `v.floor()`, saturating. The standard one is a function call without SSE 4.1.
 #[inline]
 fn floor(v: f64) -> i64 {
     let whole = v as i64;

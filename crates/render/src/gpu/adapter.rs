@@ -1,4 +1,4 @@
-//! One adapter of the pool: its device, what is kept on it, and the callers that share it.
+//! One adapter of the pool: its device, the scenes on it, and the callers that share it.
 
 use std::sync::{
     Arc,
@@ -25,12 +25,12 @@ use crate::{
     view::View,
 };
 
-/// Devices opened for one submission before its views are given up.
+/// How often one submission is tried on a new device before its views fail.
 const OPENED_MAX: u32 = 3;
-/// Gaussians of all views of one submission: beyond it a view fills a device alone.
+/// Gaussians of all views of one submission. A view with more of them fills a device alone.
 const BATCH_GAUSSIANS: usize = 4 << 20;
 
-/// A device with what was compiled and kept on it; clones are the same one.
+/// A device, its kernels and its scenes. Clones share them.
 #[derive(Clone, Debug)]
 pub(super) struct OpenDevice {
     pub(super) gpu: Gpu,
@@ -38,7 +38,7 @@ pub(super) struct OpenDevice {
     scenes: Arc<Mutex<SceneCache>>,
 }
 
-/// A device, for one who draws on it, and room of his own.
+/// A device and scratch buffers for one submission.
 #[derive(Debug)]
 pub(super) struct Context {
     pub(super) on: OpenDevice,
@@ -46,7 +46,7 @@ pub(super) struct Context {
 }
 
 impl Context {
-    /// What frames of `scene` are drawn with.
+    /// The tools that draw frames of `scene`.
     fn tools<'a>(
         &'a mut self,
         scene: &'a DeviceScene,
@@ -58,7 +58,7 @@ impl Context {
         Tools { gpu, kernels, scratch, scene, labels, isects_max, marks, times: Vec::new() }
     }
 
-    /// The scene of `gaussians`, and its bank indices where they are wanted.
+    /// The scene of `gaussians`, and its entries if `labelled`.
     ///
     /// # Errors
     /// As [`SceneCache::get`].
@@ -92,7 +92,7 @@ pub(super) struct Adapter {
     adapter: wgpu::Adapter,
     report: AdapterReport,
     state: Mutex<DeviceState>,
-    /// What tells the device's scenes, for those who do not wait for an upload.
+    /// Shape identities of the device's scenes. Reading them does not wait for an upload.
     shapes: Mutex<Vec<u64>>,
     queue: ViewQueue,
     submissions: AtomicU64,
@@ -138,7 +138,7 @@ impl Adapter {
         self.shapes.lock().len()
     }
 
-    /// Whether the scene of that shape was here when the last view was drawn.
+    /// Whether the device held the scene of that shape when the last view was drawn.
     pub(super) fn holds(&self, shape: u64) -> bool {
         self.shapes.lock().contains(&shape)
     }
@@ -152,14 +152,14 @@ impl Adapter {
         (self.submissions.load(Ordering::Relaxed), self.views.load(Ordering::Relaxed))
     }
 
-    /// Has everyone see the device lost, whatever runs on it.
+    /// Marks the device as lost for everyone.
     pub(super) fn lose_device(&self) {
         if let Some(opened) = &self.state.lock().opened {
             opened.gpu.lose();
         }
     }
 
-    /// Runs `work` on the device, opened again if it was lost.
+    /// Runs `work` on the device. A lost device is opened again first.
     pub(super) fn with_context<T>(
         &self,
         work: impl FnOnce(&mut Context) -> Result<T>,
@@ -190,7 +190,7 @@ impl Adapter {
         Ok(Context { on, scratch: state.idle.pop().unwrap_or_default() })
     }
 
-    /// Lets go of the device if it is lost.
+    /// Drops the device if it is lost.
     fn give_up(&self, state: &mut DeviceState) {
         if state.opened.as_ref().is_some_and(|opened| opened.gpu.is_lost()) {
             tracing::error!(adapter = self.report.name, "the GPU device was lost");
@@ -199,7 +199,7 @@ impl Adapter {
         }
     }
 
-    /// Runs `work` as [`Self::with_context`], once more on a new device each time one is lost.
+    /// As [`Self::with_context`]; when the device is lost, `work` runs again on a new one.
     fn persistently<T>(&self, mut work: impl FnMut(&mut Context) -> Result<T>) -> Result<T> {
         let mut opened = 1;
         loop {
@@ -212,7 +212,7 @@ impl Adapter {
         }
     }
 
-    /// One view, drawn with the others of its scene that wait.
+    /// Draws one view, together with waiting views of the same scene.
     ///
     /// # Errors
     /// As [`crate::Renderer::render`], and `overloaded` when too many wait.
@@ -235,7 +235,7 @@ impl Adapter {
                     }
                     return;
                 }
-                // One of them may be at fault: the others must not suffer.
+                // One of them may be at fault, so each is drawn alone.
                 Err(error) => tracing::warn!(
                     adapter = self.report.name,
                     reason = error.message(),
@@ -252,7 +252,7 @@ impl Adapter {
     fn alone(&self, gaussians: &Gaussians, view: &QueuedView) -> Result<Frame> {
         let drawn = self.persistently(|context| self.one(context, gaussians, &view.request, None));
         match drawn {
-            // Memory may be state by other scenes and by larger views: once without them.
+            // Other scenes and larger views may hold the memory: free it and try once more.
             Err(error) if error.code() == ErrorCode::LimitExceeded => {
                 self.persistently(|context| {
                     self.state.lock().idle.clear();
@@ -266,7 +266,7 @@ impl Adapter {
         .map(|drawn| drawn.0)
     }
 
-    /// Views of one submission; `None` for one that needs more room than was guessed.
+    /// Views of one submission. `None` stands for a view that needs more room than expected.
     fn together(
         &self,
         context: &mut Context,
@@ -292,7 +292,7 @@ impl Adapter {
         frames.collect()
     }
 
-    /// One frame, and the times of its last submission where marks are given.
+    /// One frame, and the times of its last submission if `marks` is given.
     fn one(
         &self,
         context: &mut Context,
@@ -310,7 +310,7 @@ impl Adapter {
         Ok((drawing.finish(&mut context.scratch)?, times))
     }
 
-    /// Times of a view by the device's clock.
+    /// Times of a view by the clock of the device.
     ///
     /// # Errors
     /// As [`Self::render`].

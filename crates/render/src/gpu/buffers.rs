@@ -1,5 +1,5 @@
-//! What crosses the border to the shaders: `repr(C)` twins of shaders/common/structs.wgsl, buffers
-//! that grow, and the scenes kept on the device.
+//! Data that host and shaders share: `repr(C)` structs equal to those of
+//! shaders/common/structs.wgsl, buffers that grow, and the scenes on the device.
 
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
@@ -118,7 +118,7 @@ const _: () = assert!(size_of::<GaussianRow>() == 48, "three rows of four");
 const _: () = assert!(size_of::<FootprintRow>() == 32, "two rows of four");
 
 impl ViewRow {
-    /// The whole picture of `view`; the caller sets band, capacity and picture starts.
+    /// The row of the whole picture. The caller sets band, capacity and picture starts.
     #[must_use]
     pub fn new(view: &View, background: [f32; 3], antialiased: bool) -> Self {
         let rotation = view.rotation;
@@ -152,7 +152,7 @@ impl ViewRow {
     }
 }
 
-/// A buffer that is made again when it is too small. Its contents mean nothing between frames.
+/// A buffer that is replaced when it is too small. Its contents are undefined between frames.
 #[derive(Debug)]
 pub(super) struct Slot {
     label: &'static str,
@@ -174,14 +174,14 @@ impl Slot {
     /// The buffer, at least `size_bytes` long.
     ///
     /// # Errors
-    /// `limit_exceeded` when the adapter cannot hold or bind as much.
+    /// `limit_exceeded` when the adapter cannot hold or bind that many bytes.
     pub(super) fn ensure(&mut self, gpu: &Gpu, size_bytes: u64) -> Result<wgpu::Buffer> {
         if let Some(buffer) = &self.buffer
             && buffer.size() >= size_bytes
         {
             return Ok(buffer.clone());
         }
-        // Freed before its successor is asked for.
+        // Free the old buffer before the new one is allocated.
         self.buffer = None;
         let buffer = gpu.create_buffer(self.label, size_bytes, self.usage)?;
         self.buffer = Some(buffer.clone());
@@ -195,25 +195,25 @@ pub(super) struct DeviceScene {
     shape: u64,
     /// Number of Gaussians.
     pub(super) count: u32,
-    /// Coefficients a Gaussian.
+    /// Spherical harmonics of each Gaussian.
     pub(super) sh_count: u32,
     /// `[N]` of [`GaussianRow`].
     pub(super) gaussians: wgpu::Buffer,
     /// `[N, K, 3]` f32.
     pub(super) sh: wgpu::Buffer,
-    /// Least and largest mean by axis, relative to the origin.
+    /// Smallest and largest mean along each axis, relative to the origin.
     pub(super) bounds: [DVec3; 2],
-    /// Uploaded when labels are first asked for.
+    /// Uploaded when a request first asks for labels.
     labels: Option<DeviceLabels>,
 }
 
-/// Bank indices on the device.
+/// Entries of the Gaussians on the device.
 #[derive(Clone, Debug)]
 pub(super) struct DeviceLabels {
     identity: u64,
-    /// `[N]` u16, two a word.
+    /// `[N]` u16, two in a word.
     pub(super) index: wgpu::Buffer,
-    /// Different indices but 0: no pixel sees more.
+    /// Number of different entries over 0: no pixel shows more.
     pub(super) distinct: u32,
 }
 
@@ -263,7 +263,7 @@ impl DeviceScene {
     }
 }
 
-/// Scenes kept on the device, most recently drawn last.
+/// Scenes on the device, the most recently drawn last.
 #[derive(Debug)]
 pub(super) struct SceneCache {
     scenes: Vec<DeviceScene>,
@@ -275,7 +275,7 @@ impl SceneCache {
         Self { scenes: Vec::new(), bytes_max }
     }
 
-    /// The scene of `source`, uploaded once; others leave, least recently drawn first.
+    /// The scene of `source`, uploaded once. Other scenes leave, the least recently drawn first.
     ///
     /// # Errors
     /// `limit_exceeded` when the scene does not fit the adapter's limits or memory.
@@ -287,7 +287,7 @@ impl SceneCache {
             return Ok(scene);
         }
         let scene = match DeviceScene::upload(gpu, source) {
-            // Memory may be held by the other scenes: once without them.
+            // The other scenes may hold the memory: drop them and try once more.
             Err(error) if error.code() == ErrorCode::LimitExceeded && !self.scenes.is_empty() => {
                 self.scenes.clear();
                 gpu.forget();
@@ -304,7 +304,7 @@ impl SceneCache {
         Ok(scene)
     }
 
-    /// The bank indices of `source`, uploaded once, and alone when they are all that changed.
+    /// The entries of `source`, uploaded once. The Gaussians are not uploaded again with them.
     ///
     /// # Errors
     /// As [`Self::get`].
@@ -322,12 +322,12 @@ impl SceneCache {
         Ok(labels)
     }
 
-    /// What tells the scenes held.
+    /// Shape identities of the scenes.
     pub(super) fn shapes(&self) -> Vec<u64> {
         self.scenes.iter().map(|scene| scene.shape).collect()
     }
 
-    /// Gives up all scenes.
+    /// Drops all scenes.
     pub(super) fn clear(&mut self, gpu: &Gpu) {
         self.scenes.clear();
         gpu.forget();

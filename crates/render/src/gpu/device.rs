@@ -1,6 +1,6 @@
-//! Adapters: which there are, which is taken, and a device whose faults become errors.
+//! Adapters: a list, a choice, and a device whose faults become errors.
 //!
-//! A software adapter (llvmpipe, lavapipe, `SwiftShader`) is taken only when asked for by name.
+//! A software adapter (llvmpipe, lavapipe, `SwiftShader`) is used only when it is named.
 
 use std::sync::{
     Arc,
@@ -16,23 +16,23 @@ use crate::{
     select::AdapterReport,
 };
 
-/// Names under which software adapters go; their device type is not always honest.
+/// Names of software adapters. Their device type is not always right.
 const SOFTWARE_NAMES: [&str; 5] =
     ["llvmpipe", "lavapipe", "swiftshader", "softpipe", "basic render driver"];
 
-/// Bytes handed to the queue at once: its staging copy is as large.
+/// Bytes written to the queue at once: its staging copy has the same size.
 const UPLOAD_CHUNK: usize = 32 << 20;
 
-/// Storage buffers a stage that the kernels need.
+/// Storage buffers that a stage of the kernels needs.
 const STORAGE_BUFFERS: u32 = 7;
 /// Bytes of workgroup storage that the kernels need.
 const WORKGROUP_BYTES: u32 = 16 << 10;
 
-/// Describes every adapter that `backends` offer, in their order.
+/// Describes all adapters of `backends`, in their order.
 fn list(backends: wgpu::Backends) -> Vec<(wgpu::Adapter, AdapterReport)> {
     let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
         backends,
-        // The kernels size their own dispatches within the limits: wgpu need not look at each.
+        // The kernels size their own dispatches within the limits, so wgpu need not check each.
         flags: wgpu::InstanceFlags::from_build_config()
             .difference(wgpu::InstanceFlags::VALIDATION_INDIRECT_CALL),
         ..wgpu::InstanceDescriptor::new_without_display_handle()
@@ -60,7 +60,7 @@ fn describe(info: &wgpu::AdapterInfo) -> AdapterReport {
     }
 }
 
-/// How good an unnamed adapter is; `None` for one that is never taken unasked.
+/// Rank of an adapter that is not named; `None` for one that must be named.
 fn rank(report: &AdapterReport, adapter: &wgpu::Adapter) -> Option<u32> {
     if report.software {
         return None;
@@ -121,7 +121,7 @@ fn pick(found: &[(wgpu::Adapter, AdapterReport)], name: Option<&str>) -> Vec<usi
     taken
 }
 
-/// What went wrong outside of any error scope.
+/// Faults outside of any error scope.
 #[derive(Debug, Default)]
 struct Faults {
     lost: AtomicBool,
@@ -134,26 +134,25 @@ impl Faults {
     }
 }
 
-/// A device and its queue. Nothing that goes wrong on it ends the process. Clones are the same
-/// device.
+/// A device and its queue. No fault of it ends the process. Clones share the device.
 #[derive(Clone, Debug)]
 pub(super) struct Gpu {
     pub(super) device: wgpu::Device,
     pub(super) queue: wgpu::Queue,
-    /// Bytes one storage binding may span.
+    /// Largest storage binding, bytes.
     pub(super) binding_bytes_max: u64,
-    /// Whether it takes the times of its stages.
+    /// Whether it can measure times of stages.
     pub(super) has_times: bool,
-    /// Buffers made so far.
+    /// Number of buffers made so far.
     generation: Arc<AtomicU64>,
     faults: Arc<Faults>,
 }
 
 impl Gpu {
-    /// Opens a device with all that the adapter allows, or with WebGPU's portable floor.
+    /// Opens a device with the limits of the adapter, or with the smallest limits of WebGPU.
     ///
     /// # Errors
-    /// `gpu_unavailable` when the adapter refuses or is under what the kernels need.
+    /// `gpu_unavailable` when the adapter refuses or its limits are too small for the kernels.
     pub(super) fn open(adapter: &wgpu::Adapter, portable: bool) -> Result<Self> {
         let offered = adapter.limits();
         for (what, has, needs) in [
@@ -204,35 +203,35 @@ impl Gpu {
         Ok(Self { device, queue, binding_bytes_max, has_times, generation, faults })
     }
 
-    /// Tells when a buffer was made or given up: what was made of buffers is to be made anew.
+    /// Changes when a buffer is made or dropped. Bind groups of an older generation are invalid.
     pub(super) fn generation(&self) -> u64 {
         self.generation.load(Ordering::Acquire)
     }
 
-    /// Says that buffers are no longer wanted, see [`Self::generation`].
+    /// Starts a new [`Self::generation`] after buffers were dropped.
     pub(super) fn forget(&self) {
         self.generation.fetch_add(1, Ordering::AcqRel);
     }
 
-    /// Whether the device is gone for good.
+    /// Whether the device is lost.
     pub(super) fn is_lost(&self) -> bool {
         self.faults.lost.load(Ordering::Acquire)
     }
 
-    /// Has everyone who uses the device see it lost. It is not destroyed: someone may be reading
-    /// its memory.
+    /// Marks the device as lost for all its users. It is not destroyed, because someone may still
+    /// read its memory.
     pub(super) fn lose(&self) {
         self.faults.lost.store(true, Ordering::Release);
         self.faults.report("lost on purpose".to_owned());
     }
 
-    /// Declares the device gone: it did not answer.
+    /// Marks the device as lost because it did not answer.
     pub(super) fn give_up(&self, message: String) -> Error {
         self.faults.lost.store(true, Ordering::Release);
         Error::new(ErrorCode::GpuUnavailable, message)
     }
 
-    /// What was reported outside of any scope since the last call.
+    /// Checks for faults outside of any scope since the last call.
     ///
     /// # Errors
     /// `gpu_unavailable` when the device is lost, `internal` for any other fault.
@@ -248,7 +247,7 @@ impl Gpu {
         }
     }
 
-    /// Runs `work` inside error scopes, so that its faults are its own.
+    /// Runs `work` inside error scopes, so that its faults are told from others.
     ///
     /// # Errors
     /// `limit_exceeded` when memory ran out, `gpu_unavailable` when the device is lost, `internal`

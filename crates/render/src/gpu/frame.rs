@@ -1,5 +1,5 @@
-//! One submission: the views of a batch, the room for their Gaussian-tile pairs, their pictures
-//! read back; and the bands of a view that does not fit at once.
+//! One submission: it makes room for the Gaussian-tile pairs of a batch of views, draws them and
+//! reads their pictures back. A view that does not fit is drawn in bands.
 
 use std::ops::Range;
 
@@ -25,16 +25,16 @@ use crate::{
     view::View,
 };
 
-/// Fewest Gaussian-tile pairs that room is made for.
+/// Smallest room, in Gaussian-tile pairs.
 const ISECT_CAPACITY_MIN: u32 = 1 << 16;
-/// Times a band is drawn: the first may lack room, the second knows what it needs.
+/// How often a band is drawn: the first try may lack room, the second knows what it needs.
 const ATTEMPTS_MAX: u32 = 3;
-/// How much more room for weights is made when it does not suffice.
+/// Factor by which the room for weights grows when it is too small.
 const ENTRY_SLOTS_GROWTH: u32 = 4;
-/// Bytes of a tile pair: key and Gaussian, each in two halves.
+/// Bytes of a tile pair: key and Gaussian, each stored twice.
 const PAIR_BYTES_A_BUFFER: u64 = 8;
 const PLAN_BYTES: u64 = size_of::<PlanRow>() as u64;
-/// From so many bytes on a picture is copied by all cores.
+/// Pictures of more bytes than this are copied by all cores.
 const PARALLEL_BYTES: usize = 4 << 20;
 
 /// A frame without Gaussians.
@@ -52,7 +52,7 @@ pub(super) fn background(view: &View, request: &RenderRequest) -> Frame {
     }
 }
 
-/// What a band of a view takes in the buffers of its batch.
+/// Sizes of a band of a view in the buffers of its batch.
 struct Layout {
     color: u32,
     depth: u32,
@@ -60,11 +60,11 @@ struct Layout {
     blend: u32,
     /// Words of all pictures.
     words: u64,
-    /// Whether colour, and alpha beside it, are words of four levels.
+    /// Whether colour and alpha are packed as four 8-bit levels in a word.
     fast: bool,
     /// Pixels of the band.
     pixels: u64,
-    /// Weights a pixel has room for; 0 where none are wanted.
+    /// Room of a pixel, in weights; 0 if none are asked for.
     slots: u32,
     tiles: u32,
 }
@@ -74,51 +74,51 @@ impl Layout {
         self.words * 4
     }
 
-    /// A count a pixel, then an index and a weight a slot.
+    /// Words: one count for each pixel, then an entry and a weight for each slot.
     fn slot_bytes(&self) -> u64 {
         if self.slots == 0 { 0 } else { self.pixels * 4 * (1 + 2 * u64::from(self.slots)) }
     }
 }
 
-/// How an attempt at a band ended.
+/// Result of drawing a band.
 enum Outcome {
-    /// In the frame.
+    /// The band is in the frame.
     Drawn,
-    /// So many tile pairs are too many for one band.
+    /// One band cannot hold this many tile pairs.
     Pairs(u32),
-    /// A pixel has more weights than room; there is more room now.
+    /// A pixel had more weights than room. The room is larger now.
     Slots,
 }
 
-/// One view's band as it was read back: pictures and slots beside what they belong to.
+/// The band of one view after the read-back, with its pictures and slots.
 type Part<'a, 'b> = (&'a mut Drawing<'b>, &'a Layout, PlanRow, &'a [u8], &'a [u32]);
 
-/// How one view of a submission ended.
+/// Result of one view of a submission.
 struct Ended {
-    /// Tile pairs that there are.
+    /// Number of tile pairs of the view.
     needed: u32,
     drawn: bool,
-    /// Weights a pixel to make room for, where there were more than room.
+    /// New room of a pixel, in weights, if the old one was too small.
     more_slots: Option<u32>,
     /// Digits of depth that the device found; of the first view, those of all.
     passes: u32,
 }
 
-/// What frames are drawn with.
+/// Everything that drawing a frame needs.
 pub(super) struct Tools<'a> {
     pub(super) gpu: &'a Gpu,
     pub(super) kernels: &'a Kernels,
     pub(super) scratch: &'a mut Scratch,
     pub(super) scene: &'a DeviceScene,
-    /// The scene's bank indices, where labels are wanted.
+    /// Entries of the scene, if labels are asked for.
     pub(super) labels: Option<&'a DeviceLabels>,
     pub(super) isects_max: u32,
     pub(super) marks: Option<&'a mut Marks>,
-    /// Times of the last submission, where marks are set.
+    /// Times of the last submission, if marks are set.
     pub(super) times: Vec<DispatchTime>,
 }
 
-/// A frame being drawn, band by band from top to bottom.
+/// A frame in work. Its bands are drawn from top to bottom.
 pub(super) struct Drawing<'a> {
     row: ViewRow,
     /// Digits that the depth sort can take.
@@ -161,7 +161,7 @@ impl<'a> Drawing<'a> {
     /// The frame of all bands.
     pub(super) fn finish(mut self, scratch: &mut Scratch) -> Result<Frame> {
         if *self.wanted == Labels::Weights {
-            // The next view needs about as much; one odd view makes room for itself alone.
+            // The next view needs about the same room. One unusual view does not change that.
             scratch.weight_slots = self.weights_max.next_power_of_two().max(ENTRY_SLOTS_MIN);
             self.frame.weights = Some(WeightRows::join(self.weights)?);
         }
@@ -191,7 +191,7 @@ impl<'a> Drawing<'a> {
         Layout { color, depth, alpha, blend, words, fast, pixels, slots, tiles }
     }
 
-    /// Rows of the table that is blended; an empty one is a row of zeros.
+    /// Rows of the table to blend. An empty table is one row of zeros.
     fn table(&self) -> &[[f32; BLEND_WIDTH]] {
         match self.wanted {
             Labels::Blend(table) if table.is_empty() => &[[0.0; BLEND_WIDTH]],
@@ -200,7 +200,7 @@ impl<'a> Drawing<'a> {
         }
     }
 
-    /// Takes a band out of what was read back, if there was room for all of it.
+    /// Copies a band out of the read-back, if there was room for all of it.
     fn take(
         &mut self,
         layout: &Layout,
@@ -227,7 +227,7 @@ impl<'a> Drawing<'a> {
         Ended { needed, drawn: true, more_slots: None, passes }
     }
 
-    /// Takes the pictures and weights of a band out of what was read back.
+    /// Copies the pictures and weights of a band out of the read-back.
     fn store(&mut self, layout: &Layout, pictures: &[u8], slots: &[u32]) {
         let pixels = layout.pixels as usize;
         let part = |start: u32, words: usize| {
@@ -274,7 +274,7 @@ impl Tools<'_> {
         if single || bytes.max((u64::from(layout.tiles) + 1) * 4) <= bytes_max {
             match self.band(drawing, &rows, &layout)? {
                 Outcome::Drawn => return Ok(()),
-                // Whether the band still fits is asked again; slots grow to a bound.
+                // The next try checks again whether the band fits. Slots grow to a bound.
                 Outcome::Slots => return self.rows(drawing, rows),
                 Outcome::Pairs(needed) if single => {
                     return Err(Error::limit(
@@ -291,8 +291,8 @@ impl Tools<'_> {
         self.rows(drawing, middle..rows.end)
     }
 
-    /// Draws whole views in one submission, each as if it were alone; which of them are drawn. The
-    /// others need more room than was guessed, or do not fit beside each other.
+    /// Draws whole views in one submission, with the same pixels as alone. Returns which of them
+    /// were drawn. The others need more room, or do not fit together.
     pub(super) fn together(&mut self, drawings: &mut [Drawing<'_>]) -> Result<Vec<bool>> {
         let layouts: Vec<_> = drawings
             .iter()
@@ -310,7 +310,7 @@ impl Tools<'_> {
         Ok(ended.into_iter().map(|(_, drawn)| drawn).collect())
     }
 
-    /// Weights to make room for: as many as the last views needed, never more than there can be.
+    /// Room of a pixel, in weights: what the last views needed, at most one for each entry.
     fn weight_slots(&self, drawing: &Drawing<'_>) -> u32 {
         match (drawing.wanted, self.labels) {
             (Labels::Weights, Some(labels)) => {
@@ -325,10 +325,10 @@ impl Tools<'_> {
         self.isects_max.min(u32::try_from(bound).unwrap_or(u32::MAX))
     }
 
-    /// Tile pairs to make room for in each of `views` views.
+    /// Room of each of `views` views, in tile pairs.
     fn capacity(&self, views: u32) -> u32 {
         let guess = self.scene.count.saturating_mul(4).max(ISECT_CAPACITY_MIN);
-        // A quarter more: the next camera sees about as much.
+        // A quarter more than the last view needed.
         let seen = self.scratch.isects.saturating_add(self.scratch.isects / 4);
         guess.max(seen).min(self.capacity_max(views))
     }
@@ -361,8 +361,8 @@ impl Tools<'_> {
         Err(Error::internal("render: the need of tile pairs grew from one attempt to the next"))
     }
 
-    /// All stages over one band of each view, with room for `capacity` pairs a view; the pairs that
-    /// each needs, and whether it was drawn.
+    /// Runs all stages over one band of each view, with room for `capacity` pairs in each. Returns
+    /// how many pairs each view needs, and whether it was drawn.
     fn attempt(
         &mut self,
         drawings: &mut [Drawing<'_>],
@@ -411,7 +411,7 @@ impl Tools<'_> {
         let (gpu, scene) = (self.gpu, self.scene);
         let colored = drawings.iter().any(|drawing| drawing.kinds.color);
         let deep = drawings.iter().any(|drawing| drawing.kinds.depth);
-        // The device may find fewer, each of which is a dispatch for nothing.
+        // The device may need fewer digits. The others are dispatches without work.
         let digits = match self.kernels.sorts_all() {
             true => DIGITS_MAX,
             false => drawings.iter().map(|drawing| drawing.digits).max().unwrap_or(DIGITS_MAX),

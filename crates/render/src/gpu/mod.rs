@@ -1,11 +1,11 @@
 //! The GPU renderer: the stages of the CPU renderer in WGSL (shaders/*.wgsl), on wgpu.
 //!
-//! A frame is one submission and one read-back. The number of Gaussian-tile pairs is known to the
-//! device alone: it sizes the later stages itself, and a frame that turns out to need more room
-//! than there is draws nothing, says how much, and is drawn again. What the adapter cannot hold at
-//! once is drawn in bands of tile rows. Views of one scene that are wanted at once are one
-//! submission. Nothing here ends the process: faults are errors, and what was being drawn when a
-//! device was lost is drawn on a new one.
+//! A frame is one submission and one read-back. Only the device knows the number of Gaussian-tile
+//! pairs, so it sizes the later stages itself. A frame that needs more room than there is draws
+//! nothing and reports how much it needs; then it is drawn again. A frame that is too large for the
+//! adapter is drawn in bands of tile rows. Views of one scene that wait together are one
+//! submission. No fault ends the process: faults become errors, and after a lost device the views
+//! are drawn on a new one.
 
 mod adapter;
 pub mod buffers;

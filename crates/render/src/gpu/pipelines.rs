@@ -1,4 +1,4 @@
-//! The shaders, put together of shaders/*.wgsl, and their compiled kernels.
+//! The shaders, assembled from shaders/*.wgsl, and their compiled kernels.
 
 use std::{borrow::Cow, path::Path, sync::OnceLock};
 
@@ -59,7 +59,7 @@ pub const SHARED: [(&str, u32); 14] = [
 /// One stage's shader: its file's stem and its whole source, common parts first.
 #[derive(Clone, Copy, Debug)]
 pub struct Shader {
-    /// Stem of shaders/*.wgsl and of its twin src/render/cpu/*.rs; variants share it.
+    /// Stem of shaders/*.wgsl and of crates/render/src/cpu/*.rs; variants share it.
     pub stem: &'static str,
     /// Files under shaders/, in their order.
     pub files: &'static [&'static str],

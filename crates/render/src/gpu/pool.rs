@@ -1,10 +1,10 @@
-//! The queue of one device: who draws next, and with whom.
+//! The queue of views of one device: who draws next, and which views are drawn together.
 //!
 //! A caller puts its request into a bounded queue and waits. The caller whose request is first
-//! draws it, and with it every waiting request that fits one submission: of the same scene, drawn
-//! by the same kernels. A request equal to one that waits or is being drawn is not drawn again: its
-//! caller gets a copy. There is no thread besides the callers' own, so that nothing that they lend
-//! has to be owned.
+//! draws it. It draws with it all waiting requests that fit the same submission: those of the same
+//! scene and the same kernels. A request that is equal to one that waits or is being drawn is not
+//! drawn again; its caller gets a copy. The callers' own threads do the work, so the queue can
+//! borrow what they pass.
 
 use std::{
     collections::VecDeque,
@@ -22,11 +22,10 @@ use crate::{
     error::{Error, ErrorCode, Result},
 };
 
-/// Callers that draw at once: the pictures of one submission are copied and the next is recorded
-/// while the device draws the other. Three were slower on an H200, their submissions too small.
+/// Submissions at once: while the device draws one, the pictures of another are copied and the
+/// next is recorded. Three were slower on one NVIDIA H200, because each was too small.
 pub(super) const SUBMISSIONS_MAX: usize = 2;
-/// How long a caller waits for others of the crowd to come again: well under what a submission of
-/// its own would cost them.
+/// How long a submission waits for more views: much less than the cost of a submission.
 const GATHER: Duration = Duration::from_micros(150);
 
 /// One request in the queue.
@@ -36,23 +35,23 @@ pub(super) struct QueuedView {
     scene: u64,
     pub(super) request: RenderRequest,
     answer: Mutex<Option<Result<Frame>>>,
-    /// Told when there is an answer, or the turn to draw.
+    /// Notified when there is an answer, or when its caller may draw.
     changed: Condvar,
-    /// Whether it is its caller's batch.
+    /// Whether its caller may draw now.
     leads: AtomicBool,
-    /// Callers that have not taken the answer yet; with none left it is gone.
+    /// Callers that have not taken the answer yet.
     takers: AtomicUsize,
     answered: AtomicBool,
 }
 
 impl QueuedView {
-    /// Whether the other's answer would be this one's.
+    /// Whether both have the same answer.
     fn equals(&self, scene: u64, request: &RenderRequest) -> bool {
         self.scene == scene && self.request == *request
     }
 
-    /// Whether both may be drawn by one submission: by the same kernels, so that a view is the
-    /// same to the last bit whoever else asks.
+    /// Whether both can be in one submission. The kernels must be the same, so that a view has the
+    /// same bits alone and together with others.
     fn joins(&self, other: &Self) -> bool {
         let kernels = |request: &RenderRequest| {
             let Kinds { color, depth, .. } = request.kinds;
@@ -67,20 +66,20 @@ impl QueuedView {
         self.changed.notify_all();
     }
 
-    /// One more taker, unless the last has been there.
+    /// Adds a caller, unless the last one has taken the answer.
     fn share(&self) -> bool {
         let more = |takers| (takers > 0).then_some(takers + 1);
         self.takers.fetch_update(Ordering::AcqRel, Ordering::Acquire, more).is_ok()
     }
 
     fn lead(&self) {
-        // Under the lock, so that nobody looks before it and waits after it.
+        // Under the lock, so that no caller misses the notification.
         let _answer = self.answer.lock();
         self.leads.store(true, Ordering::Release);
         self.changed.notify_all();
     }
 
-    /// Waits for the answer, or the turn of the caller that brought the request; which of them.
+    /// Waits for the answer. Returns true if the caller must draw instead (only if `mine`).
     fn wait(&self, mine: bool) -> bool {
         let mut answer = self.answer.lock();
         while answer.is_none() {
@@ -92,7 +91,7 @@ impl QueuedView {
         false
     }
 
-    /// The answer, for one of those who share it; the last of them gets it itself.
+    /// The answer. The last caller gets it, the others a copy.
     fn take(&self) -> Result<Frame> {
         let mut answer = self.answer.lock();
         if self.takers.fetch_sub(1, Ordering::AcqRel) == 1 {
@@ -112,9 +111,9 @@ struct ViewsWaiting {
     views: VecDeque<Arc<QueuedView>>,
     /// Being drawn.
     drawn: Vec<Arc<QueuedView>>,
-    /// Callers whose turn it is. There are [`SUBMISSIONS_MAX`] while anyone waits for one.
+    /// Submissions at work, at most [`SUBMISSIONS_MAX`].
     submissions: usize,
-    /// Requests at once, lately.
+    /// Largest recent number of requests at once. It falls by one with each submission.
     crowd: usize,
 }
 
@@ -123,8 +122,8 @@ impl ViewsWaiting {
         self.views.len() + self.drawn.len()
     }
 
-    /// Gives free submissions to those who have waited longest, but for those who will be drawn with one
-    /// whose turn it is already.
+    /// Lets the callers that have waited longest draw, while submissions are free. Views that join
+    /// a submission that is about to start are left out.
     fn start_next(&mut self) {
         while self.submissions < SUBMISSIONS_MAX {
             let leads = |view: &&Arc<QueuedView>| view.leads.load(Ordering::Acquire);
@@ -138,16 +137,16 @@ impl ViewsWaiting {
     }
 }
 
-/// The requests of one device.
+/// The queue of one device.
 #[derive(Debug)]
 pub(super) struct ViewQueue {
     waiting: Mutex<ViewsWaiting>,
-    /// Told when a request has come.
+    /// Notified when a request arrives.
     arrived: Condvar,
     waiting_max: usize,
 }
 
-/// One caller's drawing; its end, also by a panic, leaves nobody waiting for ever.
+/// The views of one submission. When it is dropped, also by a panic, every view has an answer.
 struct ActiveBatch<'a> {
     queue: &'a ViewQueue,
     batch: Vec<Arc<QueuedView>>,
@@ -177,8 +176,8 @@ impl ViewQueue {
         self.waiting.lock().len()
     }
 
-    /// Draws `request` of `scene`, alone or with others: `draw` answers every view it is given, of
-    /// which there are at most `views_max`.
+    /// Draws `request` of `scene`, alone or with others. `draw` must answer all its views; it gets
+    /// at most `views_max`.
     ///
     /// # Errors
     /// `overloaded` when the queue is full, and what `draw` answers.
@@ -227,14 +226,14 @@ impl ViewQueue {
         Ok((view, true))
     }
 
-    /// The requests to draw with `view`, whose turn it is.
+    /// The views of the submission that `view` starts.
     fn gather(&self, view: &Arc<QueuedView>, views_max: usize) -> ActiveBatch<'_> {
         let fits = |other: &Arc<QueuedView>| {
             let led = other.leads.load(Ordering::Acquire);
             Arc::ptr_eq(other, view) || (!led && view.joins(other))
         };
         let mut waiting = self.waiting.lock();
-        // Each turn's share of the crowd, waited for even while the others are being drawn: a
+        // Wait for this submission's share of the recent views, also while others are drawn: a
         // submission costs as much as several views.
         let expected = waiting.crowd.div_ceil(SUBMISSIONS_MAX).min(views_max);
         let until = Instant::now() + GATHER;

@@ -1,4 +1,4 @@
-//! Times of the stages, taken by the device itself.
+//! Times of the stages by the device's own clock.
 
 use wgpu::{BufferUsages, Features};
 

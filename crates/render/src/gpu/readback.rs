@@ -1,4 +1,4 @@
-//! From the device back to memory: one copy in the frame's own submission, one wait.
+//! Reads buffers of the device: one copy in the frame's own submission, one wait.
 
 use std::{
     sync::mpsc::{self, TryRecvError},

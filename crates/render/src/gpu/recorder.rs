@@ -1,4 +1,4 @@
-//! The stages as recorded dispatches: which kernel, over which buffers, in how many workgroups.
+//! Records the stages as dispatches: which kernel, which buffers, how many workgroups.
 
 use std::collections::HashMap;
 
@@ -22,10 +22,10 @@ pub(super) const DIGITS: u32 = 256;
 pub(super) const DIGIT_BITS: u32 = 8;
 /// Digits of a key, at most.
 pub(super) const DIGITS_MAX: u32 = 4;
-/// Bind groups kept: a few frames' worth.
+/// Number of bind groups kept: those of a few frames.
 const BINDINGS_MAX: usize = 256;
 
-/// Bind groups of earlier frames: a steady scene makes none.
+/// Bind groups of earlier frames, for the next ones.
 #[derive(Debug, Default)]
 pub(super) struct Bindings {
     /// [`Gpu::generation`] that they were made in.
@@ -38,11 +38,11 @@ pub(super) struct Bindings {
 pub(super) struct SceneBuffers<'a> {
     pub(super) gaussians: &'a wgpu::Buffer,
     pub(super) sh: &'a wgpu::Buffer,
-    /// Coefficients a Gaussian.
+    /// Spherical harmonics of each Gaussian.
     pub(super) sh_count: u32,
 }
 
-/// What rasterize binds for the labels wanted: bank indices beside the table or the slots.
+/// Buffers of the labels for rasterize: entries, with the table or the slots.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum LabelBuffers<'a> {
     None,
@@ -52,10 +52,10 @@ pub(super) enum LabelBuffers<'a> {
 
 /// Workgroups of a dispatch, over the views of the batch.
 enum Groups {
-    /// This many in a row, folded into two dimensions where they are many.
+    /// This many, folded into two dimensions if they are too many for one.
     Row(u32),
     Grid(u32, u32),
-    /// What the device has put into this row of the room's `groups`.
+    /// The number that the device wrote into this row of `groups`.
     Planned(u32),
 }
 
@@ -75,7 +75,7 @@ pub(super) struct Recorder<'a> {
     encoder: wgpu::CommandEncoder,
     pass: Option<wgpu::ComputePass<'static>>,
     marks: Option<&'a mut Marks>,
-    /// The first kernel that was refused.
+    /// Error of the first kernel that was refused.
     failed: Option<Error>,
 }
 
@@ -211,8 +211,8 @@ impl<'a> Recorder<'a> {
         );
     }
 
-    /// Stage 2: Gaussians in depth order, dropped ones left behind, by at most `digits` digits. How
-    /// many it takes, and so which half holds them, is known to the device.
+    /// Stage 2: sorts the Gaussians by depth, without the dropped ones, by at most `digits` digits.
+    /// Only the device knows how many digits it took, and so which half holds the result.
     pub(super) fn depth_sort(&mut self, digits: u32) {
         let blocks = self.count.div_ceil(SORT_BLOCK);
         for pass_at in 0..digits {
@@ -230,8 +230,8 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// Stage 6: a stable sort of tile pairs by the lowest `key_bits` bits; the half that holds them
-    /// is [`sorted_half`].
+    /// Stage 6: a stable sort of tile pairs by the lowest `key_bits` bits. The result is in the half
+    /// [`sorted_half`].
     pub(super) fn tile_sort(&mut self, key_bits: u32) {
         for pass_at in 0..key_bits.div_ceil(DIGIT_BITS) {
             let digit =
@@ -255,7 +255,7 @@ impl<'a> Recorder<'a> {
         let (views, plans, counts) = (&room.views, &room.plans, &room.digit_counts);
         let by_block = [(0, views), (2, plans), (3, keys), (5, counts)];
         self.dispatch(Kernel::Histogram, Some(digit), &by_block, &groups[0]);
-        // The first digit of the depth sort alone writes the groups of the others.
+        // Only the first digit of the depth sort writes the groups of the others.
         let planner = digit.by_tile == 0 && digit.pass_at == 0;
         let asked = if planner { &room.groups } else { &room.groups_unasked };
         let by_digit = [(0, views), (2, plans), (5, counts), (6, asked)];
@@ -264,7 +264,7 @@ impl<'a> Recorder<'a> {
         self.dispatch(Kernel::Scatter, Some(digit), &moved, &groups[2]);
     }
 
-    /// Stage 3: first places of blocks of [`SCAN_BLOCK`] Gaussians, and what the rest is sized by.
+    /// Stage 3: start places of blocks of [`SCAN_BLOCK`] Gaussians, and the sizes of later stages.
     pub(super) fn prefix_sum(&mut self) {
         let room = self.room;
         let buffers = [
@@ -354,7 +354,7 @@ impl<'a> Recorder<'a> {
     }
 }
 
-/// Workgroups along x and y that are at least `count`: one dimension has 65,535 at most.
+/// Workgroups along x and y, together at least `count`. One dimension has at most 65,535.
 fn split(count: u32) -> [u32; 2] {
     let x = count.clamp(1, GROUPS_X_MAX);
     [x, count.div_ceil(x)]
@@ -365,7 +365,7 @@ pub(super) fn sorted_half(key_bits: u32) -> u32 {
     key_bits.div_ceil(DIGIT_BITS) & 1
 }
 
-/// Bits that the ids of `tiles` tiles take; one tile alone takes a digit all the same.
+/// Bits of the ids of `tiles` tiles; at least one digit.
 pub(super) fn tile_bits(tiles: u32) -> u32 {
     (u32::BITS - tiles.saturating_sub(1).leading_zeros()).max(1)
 }

@@ -1,4 +1,4 @@
-//! Buffers of a batch of views: they grow, stay, and are the same for the next batch.
+//! Buffers of a batch of views. They grow and serve the next batch too.
 
 use wgpu::BufferUsages;
 
@@ -10,20 +10,20 @@ use super::{
 };
 use crate::error::Result;
 
-/// Entries a pixel that room is made for at first: what a pixel at an edge sees of a room.
+/// First room of a pixel, in weights: a pixel at an edge of an object shows about as many entries.
 pub(super) const ENTRY_SLOTS_MIN: u32 = 8;
 /// Distance of two uniforms in the table of parameters: the portable alignment.
 const PARAMS_STRIDE: u64 = 256;
 const VIEW_BYTES: u64 = size_of::<ViewRow>() as u64 * VIEWS_MAX as u64;
 const GROUPS_BYTES: u64 = 16 * (GROUPS_RANGES as u64 + 1);
 
-/// What a batch needs room for.
+/// Sizes of a batch.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Need {
     pub(super) views: u32,
     /// Gaussians of the scene.
     pub(super) count: u32,
-    /// Tile pairs a view.
+    /// Tile pairs of each view.
     pub(super) capacity: u32,
     /// Numbers of tile ranges, of all views.
     pub(super) ranges: u32,

@@ -1,4 +1,4 @@
-//! One stage at a time from given inputs: what the tests compare with the CPU twin of each shader.
+//! Single stages on given inputs. The tests compare them with the CPU stages.
 
 use bytemuck::{Pod, Zeroable};
 
@@ -17,7 +17,7 @@ use crate::{RenderRequest, error::Result, scene::Gaussians, view::View};
 
 /// What `project` gives.
 #[derive(Clone, Debug)]
-pub struct Projected {
+pub struct ProjectedRows {
     /// `[N]`; means nothing for a dropped Gaussian.
     pub footprints: Vec<FootprintRow>,
     /// `[N]` tiles touched, 0 for a dropped Gaussian.
@@ -36,7 +36,7 @@ impl GpuRenderer {
     ///
     /// # Errors
     /// As [`crate::Renderer::render`].
-    pub fn project(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Projected> {
+    pub fn project(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<ProjectedRows> {
         let row = view_row(gaussians, request)?;
         self.with_context(|context| {
             let (scene, _) = context.scene(gaussians, false)?;
@@ -55,7 +55,7 @@ impl GpuRenderer {
             };
             let [footprints, tiles, depth_keys, plans] =
                 run(context, &room, &row, parts, |stages| stages.project(buffers))?;
-            Ok(Projected {
+            Ok(ProjectedRows {
                 footprints: cast(&footprints),
                 tiles: cast(&tiles),
                 depth_keys: cast(&depth_keys),

@@ -1,8 +1,8 @@
-//! Whether two photos show anything in common, whatever their cameras say.
+//! Whether two photos show the same things at all, for any cameras.
 //!
-//! Corners of one photo are searched over the whole of the other at a quarter of the matching
-//! size and back again; finds count when others nearby moved alike. Turns in the picture of more
-//! than some 20 degrees are not followed.
+//! Corners of one photo are searched in the whole other photo, at a quarter of the matching size,
+//! and back. A match counts when its neighbours moved the same way. Rotations in the picture of
+//! more than about 20 degrees are not found.
 
 use super::gray::GrayView;
 

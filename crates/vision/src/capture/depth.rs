@@ -1,4 +1,4 @@
-//! From matches to depth ranges and overlap.
+//! Depth ranges and overlap from matches.
 
 use glam::DVec3;
 

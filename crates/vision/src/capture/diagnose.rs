@@ -1,8 +1,8 @@
-//! What is wrong with a capture: the photos are compared again under the usual mistakes.
+//! Which mistake the cameras of a capture have: the photos are compared again under the usual ones.
 //!
-//! A mistake is named when the photos agree far better under its correction than as given. The
-//! bounds below were set on the real scenes of the test data, all of whose cameras are right, and
-//! on the same scenes with their cameras spoilt.
+//! A mistake is reported when the photos agree far better after its correction. The bounds below
+//! were chosen on the real scenes of the test data, whose cameras are right, and on the same scenes
+//! with wrong cameras.
 
 use rayon::prelude::*;
 

@@ -1,4 +1,4 @@
-//! The small grey picture that the photos are compared in, and the pixels worth comparing.
+//! The small grey picture of a photo that is compared, and the pixels of it that can be matched.
 
 use glam::DVec3;
 

@@ -1,4 +1,4 @@
-//! Which photos to compare, and the comparison of a pair in both directions.
+//! Which pairs of photos are compared, and the comparison of a pair in both directions.
 
 use rayon::prelude::*;
 

@@ -1,4 +1,4 @@
-//! Views that go through the network together, and who is whose source there.
+//! Which views go through the network together, and which are the sources of each.
 
 use crate::scene::{Capture, PosedPhoto, ViewSet};
 

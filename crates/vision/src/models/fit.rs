@@ -1,7 +1,7 @@
-//! Crop and resize to a network's working size, intrinsics following exactly.
+//! Crops and resizes a photo to the network's working size, and changes its intrinsics to match.
 //!
-//! The crop is central, of the bucket's aspect, and may begin between pixels; the filter is the
-//! triangle widened by the reduction, which does not alias and is what the training used.
+//! The crop is central and has the shape of the bucket. It may start between pixels. The filter is
+//! the triangle, widened by the reduction: it does not alias, and the training used it.
 
 use rayon::prelude::*;
 

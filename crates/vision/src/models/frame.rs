@@ -1,4 +1,4 @@
-//! The model frame: the first camera is the identity, lengths are scaled as the manifest says.
+//! The model frame: the first camera is the identity, and the manifest names the scale.
 
 use glam::{DMat3, DMat4};
 

@@ -1,4 +1,5 @@
-//! The geometry network: fits photos, builds the model frame, runs a session, undoes the scale.
+//! The geometry network: it fits the photos, makes the model frame, runs a session and returns to
+//! world units.
 
 use std::sync::Arc;
 

@@ -1,4 +1,4 @@
-//! The image tower and the text tower: crops and texts to unit embeddings of one space.
+//! The image tower and the text tower: crops and texts to embeddings of length 1 in one space.
 
 use std::{collections::BTreeMap, sync::Arc};
 

@@ -1,7 +1,7 @@
-//! The mask network: a photo is encoded once, then points in it are decoded to masks.
+//! The mask network: it encodes a photo once, then decodes points of it to masks.
 //!
-//! Two signatures, told apart by the manifest's `adapter`. What a file takes (a batch of prompts or
-//! one, a former mask, the photo's size) is read from the file itself.
+//! The manifest's `adapter` names one of two signatures. The inputs of a file (a batch of prompts
+//! or one, a former mask, the photo's size) are read from the file itself.
 
 use std::sync::Arc;
 

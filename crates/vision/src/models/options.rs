@@ -1,4 +1,4 @@
-//! What opening the networks needs to know.
+//! Options for opening the networks.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! A pool of ONNX sessions: `Session::run` is not thread safe, so each caller borrows one.
+//! A pool of ONNX sessions. `Session::run` needs a session for itself, so each caller borrows one.
 
 use std::ops::{Deref, DerefMut};
 

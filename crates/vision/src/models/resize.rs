@@ -1,7 +1,7 @@
-//! Resizing of 8-bit pictures: the triangle filter widened by the reduction, in whole numbers.
+//! Resizes 8-bit pictures by the triangle filter, widened by the reduction, in integers.
 //!
-//! Columns first, then rows, each pass rounded to 8 bits with 22-bit weights: what Pillow computes
-//! for `BILINEAR`, bit for bit, because Segment Anything and its kin are trained on that.
+//! First columns, then rows. Each pass has 22-bit weights and rounds to 8 bits. That is Pillow's
+//! `BILINEAR`, bit for bit: Segment Anything and similar networks were trained on it.
 
 use rayon::prelude::*;
 

@@ -1,9 +1,9 @@
-//! ONNX Runtime: found, checked by sha256, loaded once in a process, never at build time.
+//! ONNX Runtime: it is found, checked by sha256 and loaded once in a process, never at build time.
 //!
-//! Search order: `--ort-library` / `SEGSPLAT_ORT_LIBRARY`, `ORT_DYLIB_PATH`, beside the
-//! executable, `target/ort/`, the system's folders. A library that the operator *named* is loaded
-//! whatever it is, with a warning when its hash is not pinned (a CUDA build, a newer release); one
-//! that was merely *found* must be one of the pinned builds, else the start is refused.
+//! Search order: `--ort-library` / `SEGSPLAT_ORT_LIBRARY`, `ORT_DYLIB_PATH`, beside the executable,
+//! `target/ort/`, the system's folders. A library that the operator *named* is always loaded; a
+//! warning tells when its hash is not pinned (a CUDA build, a newer release). A library that was
+//! only *found* must be one of the pinned builds. Else the start is refused.
 
 use std::{
     path::{Path, PathBuf},

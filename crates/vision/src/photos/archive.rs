@@ -1,4 +1,5 @@
-//! Zip and tar, unpacked in memory: entries counted, names checked, sizes bounded as they are read.
+//! Zip and tar, unpacked in memory. Entries are counted, names are checked, and sizes are limited
+//! while bytes are read.
 
 use std::{
     collections::HashMap,

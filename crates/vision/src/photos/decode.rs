@@ -1,4 +1,4 @@
-//! Bytes to pixels: header first, limits before decoding, JPEG, PNG and WebP only.
+//! Decodes JPEG, PNG and WebP. The header and the limits are checked before the pixels.
 
 use std::io::Cursor;
 

@@ -1,4 +1,4 @@
-//! Which file belongs to which camera: by path, then by file name, then without extension.
+//! Which file belongs to which camera: by path, then by file name, then without the extension.
 
 use std::collections::HashMap;
 

@@ -1,7 +1,7 @@
-//! A room with boxes, balls and a pillar, and the ray caster that is its ground truth.
+//! A room with boxes, balls and a pillar, and the ray caster that gives its true pictures.
 //!
-//! Room frame: OpenCV, +y down, the floor at y = 0. Light falls from two area lamps with soft
-//! shadows on matt surfaces, so that a point looks the same from everywhere.
+//! Room frame: OpenCV, +y down, the floor at y = 0. Two area lamps give soft shadows on matt
+//! surfaces, so a point has the same colour from everywhere.
 
 use glam::{DVec2, DVec3};
 use rayon::prelude::*;
@@ -22,7 +22,7 @@ const BACK_WALL: f64 = 2.0;
 
 /// The true picture and depth at one camera.
 #[derive(Clone, Debug)]
-pub struct View {
+pub struct TrueView {
     /// 8-bit sRGB pixels.
     pub photo: Photo,
     /// `[H * W]` z-depth at the pixel centres, room units.
@@ -130,7 +130,7 @@ impl Room {
 
     /// The true picture and depth at `camera`.
     #[must_use]
-    pub fn view(&self, camera: &Camera) -> View {
+    pub fn view(&self, camera: &Camera) -> TrueView {
         let k = camera.intrinsics;
         let (rotation, eye) = (camera.camera_to_world.rotation(), camera.camera_to_world.center());
         let (width, height) = (k.width as usize, k.height as usize);
@@ -153,7 +153,7 @@ impl Room {
             .collect();
         let rgb = pixels.iter().flat_map(|(rgb, _)| *rgb).collect();
         let depth = pixels.iter().map(|(_, depth)| *depth).collect();
-        View { photo: Photo { width: k.width, height: k.height, rgb, valid: None }, depth }
+        TrueView { photo: Photo { width: k.width, height: k.height, rgb, valid: None }, depth }
     }
 
     /// Linear light along a ray of z-depth speed 1; `pixel` is a pixel's size at depth 1 and

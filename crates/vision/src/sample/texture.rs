@@ -1,7 +1,7 @@
-//! Solid textures that do not repeat: band-limited value noise and what is made of it.
+//! Solid textures that do not repeat: band-limited value noise.
 //!
-//! In: a point in the object's own frame and the size of a pixel there. Out: linear albedo.
-//! Octaves finer than the pixel fade out, so that pictures do not alias.
+//! In: a point in the object's own frame and the size of a pixel there. Out: linear albedo. Octaves
+//! finer than a pixel fade out, so pictures do not alias.
 
 use glam::{DVec2, DVec3};
 

@@ -1,8 +1,8 @@
-//! Whole objects, and one mask a pixel.
+//! Joins masks to whole objects and gives each pixel to one mask.
 
 use crate::{
     scene::{IndexMap, MaskInfo, Photo, PhotoMasks},
-    segment::{Bitset, Frame, Proposal, Proposals, Settings, judge::blank},
+    segment::{Bitset, PhotoGrid, Proposal, Proposals, Settings, judge::blank},
 };
 
 /// Most masks of a photo: an index is a u16, and 0 is none.
@@ -14,7 +14,7 @@ const MASKS_MAX: usize = u16::MAX as usize;
 /// ones. A mask of which too little is left to see goes.
 pub(super) fn one_a_pixel(
     found: &Proposals,
-    frame: Frame,
+    photo_grid: PhotoGrid,
     photo: &Photo,
     settings: &Settings,
 ) -> PhotoMasks {
@@ -23,14 +23,14 @@ pub(super) fn one_a_pixel(
     let scale = if settings.full_resolution { 1 } else { settings.map_scale.max(1) as usize };
     let [width, height] = [found.width * scale, found.height * scale];
     let cells = width * height;
-    let resample = (scale > 1).then(|| frame.to_map([width, height]));
+    let resample = (scale > 1).then(|| photo_grid.to_map([width, height]));
     let blank = blank(photo, [width, height]);
     let mut taken = blank.unwrap_or_else(|| Bitset::empty(cells));
     let mut kept: Vec<(usize, Bitset)> = Vec::new();
     for at in wholes {
         let proposal = &found.masks[at];
         let mut mask = match &resample {
-            Some(to) => Bitset::over(&to.apply(&proposal.logits.spread(frame.grid)), 0.0),
+            Some(to) => Bitset::over(&to.apply(&proposal.logits.spread(photo_grid.grid)), 0.0),
             None => proposal.mask.clone(),
         };
         mask.subtract(&taken);

@@ -1,4 +1,4 @@
-//! A mask as bits, and its box.
+//! A mask as a set of bits, and its box.
 
 /// A set of cells of a grid, row-major, one bit a cell.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

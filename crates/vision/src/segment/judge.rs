@@ -1,4 +1,4 @@
-//! Which of a decoder's masks are good: predicted IoU, stability, area.
+//! Which masks of a decoder are good: predicted IoU, stability, area.
 
 use half::f16;
 use rayon::prelude::*;
@@ -6,13 +6,13 @@ use rayon::prelude::*;
 use crate::{
     error::{Error, Result},
     scene::Photo,
-    segment::{Bitset, Box2, Decoded, Frame, Proposal, Settings, frame::Resample},
+    segment::{Bitset, Box2, Decoded, PhotoGrid, Proposal, Settings, photo_grid::Resample},
 };
 
 /// Judges the masks of one photo.
 #[derive(Debug)]
 pub(super) struct Judge {
-    frame: Frame,
+    photo_grid: PhotoGrid,
     levels: usize,
     /// To the photo's pixels; `None`: the decoder's cells that lie over the photo, as they are.
     resample: Option<Resample>,
@@ -37,22 +37,29 @@ impl Judge {
         photo: &Photo,
         settings: &Settings,
     ) -> Result<Self> {
-        let frame = Frame { grid: first.grid, side, resized };
+        let photo_grid = PhotoGrid { grid: first.grid, side, resized };
         let inside = resized.iter().all(|&v| v > 0 && v <= side);
         if first.grid.contains(&0) || first.levels == 0 || !inside {
             return Err(Error::internal(format!(
-                "masks: the decoder answers {} levels on {frame:?}",
+                "masks: the decoder answers {} levels on {photo_grid:?}",
                 first.levels
             )));
         }
-        let resample = settings.full_resolution.then(|| frame.to_photo(photo));
-        let map = resample.as_ref().map_or_else(|| frame.cells(), Resample::size);
+        let resample = settings.full_resolution.then(|| photo_grid.to_photo(photo));
+        let map = resample.as_ref().map_or_else(|| photo_grid.cells(), Resample::size);
         let blank = blank(photo, map);
-        Ok(Self { frame, levels: first.levels, resample, map, blank, settings: settings.clone() })
+        Ok(Self {
+            photo_grid,
+            levels: first.levels,
+            resample,
+            map,
+            blank,
+            settings: settings.clone(),
+        })
     }
 
-    pub(super) fn frame(&self) -> Frame {
-        self.frame
+    pub(super) fn photo_grid(&self) -> PhotoGrid {
+        self.photo_grid
     }
 
     /// `[width, height]` of the masks.
@@ -68,9 +75,9 @@ impl Judge {
         points: &[[f32; 2]],
         wholes: bool,
     ) -> Result<Vec<Proposal>> {
-        let cells = self.frame.grid[0] * self.frame.grid[1];
+        let cells = self.photo_grid.grid[0] * self.photo_grid.grid[1];
         let count = points.len() * self.levels;
-        if decoded.grid != self.frame.grid
+        if decoded.grid != self.photo_grid.grid
             || decoded.levels != self.levels
             || decoded.logits.len() != count * cells
             || decoded.predicted_iou.len() != count
@@ -114,7 +121,7 @@ impl Judge {
         }
         let values = match &self.resample {
             Some(resample) => resample.apply(logits),
-            None => cropped(logits, self.frame.grid[0], self.map),
+            None => cropped(logits, self.photo_grid.grid[0], self.map),
         };
         let over = |threshold: f32| values.iter().filter(|v| **v > threshold).count();
         let (strict, loose) = (over(s.stability_score_offset), over(-s.stability_score_offset));
@@ -134,7 +141,7 @@ impl Judge {
         let bounds = mask.bounds(self.map[0]);
         let fine = keep_logits && self.resample.is_none() && s.map_scale > 1;
         let logits =
-            if fine { Patch::new(logits, self.frame.grid, bounds) } else { Patch::default() };
+            if fine { Patch::new(logits, self.photo_grid.grid, bounds) } else { Patch::default() };
         Some(Proposal { mask, area, bounds, level, predicted_iou, stability, point, logits })
     }
 }

@@ -8,15 +8,15 @@
 
 mod assign;
 mod bitset;
-mod frame;
 mod judge;
 mod nms;
+mod photo_grid;
 mod prompts;
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
 pub use bitset::{Bitset, Box2};
-pub use frame::Frame;
+pub use photo_grid::PhotoGrid;
 
 use self::{judge::Judge, prompts::Prompts};
 use crate::{
@@ -188,10 +188,10 @@ pub fn everything(
     seeds: &[Seed],
     cancel: &AtomicBool,
 ) -> Result<PhotoMasks> {
-    let (mut found, frame) = passed(decoder, photo, settings, seeds, cancel, true)?;
+    let (mut found, photo_grid) = passed(decoder, photo, settings, seeds, cancel, true)?;
     found.suppress(settings);
-    let Some(frame) = frame else { return Ok(PhotoMasks::default()) };
-    Ok(assign::one_a_pixel(&found, frame, photo, settings))
+    let Some(photo_grid) = photo_grid else { return Ok(PhotoMasks::default()) };
+    Ok(assign::one_a_pixel(&found, photo_grid, photo, settings))
 }
 
 impl Proposals {
@@ -211,7 +211,7 @@ fn passed(
     seeds: &[Seed],
     cancel: &AtomicBool,
     wholes: bool,
-) -> Result<(Proposals, Option<Frame>)> {
+) -> Result<(Proposals, Option<PhotoGrid>)> {
     let seeds = if settings.use_seeds { seeds } else { &[] };
     let mut prompts = Prompts::new(settings, seeds);
     let mut found = Proposals::default();
@@ -219,7 +219,7 @@ fn passed(
     loop {
         let points = prompts.next(decoder.batch());
         if points.is_empty() {
-            return Ok((found, judge.map(|judge| judge.frame())));
+            return Ok((found, judge.map(|judge| judge.photo_grid())));
         }
         if cancel.load(Ordering::Relaxed) {
             return Err(Error::new(ErrorCode::Cancelled, "masks: the scene was cancelled"));

@@ -1,4 +1,4 @@
-//! Of masks that are nearly one, the surest stays.
+//! Of masks that are nearly equal only the best one stays.
 
 use crate::segment::Proposal;
 

@@ -1,4 +1,4 @@
-//! Which points are asked for, and in which order.
+//! Which points are prompts, and in which order.
 
 use crate::segment::{Bitset, Proposal, Seed, Settings};
 

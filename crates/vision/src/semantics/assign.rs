@@ -1,4 +1,4 @@
-//! From a photo's index map to its Gaussians: each takes the index of the pixel that made it.
+//! Gives each Gaussian of a photo the entry of its source pixel's cell.
 
 use rayon::prelude::*;
 

@@ -1,7 +1,7 @@
 //! The bank: K-Means over the embeddings of all masks of all photos.
 //!
-//! Deterministic to the last bit: seeds from a fixed number, ties by index, sums in f64 in the
-//! order of the features. Threads share only work whose results do not meet.
+//! The result is the same to the last bit every time: a fixed seed, ties by number, f64 sums in the
+//! order of the embeddings. Threads never add to the same sum.
 
 use std::collections::HashSet;
 

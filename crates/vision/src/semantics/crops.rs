@@ -1,4 +1,4 @@
-//! Cuts each mask out of its photo: the mask's box, a margin, a square, black outside the mask.
+//! Cuts a mask out of its photo: its box with a margin, as a square, black outside the mask.
 
 use crate::scene::{Crop, Photo, PhotoMasks};
 

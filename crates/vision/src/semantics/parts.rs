@@ -1,11 +1,12 @@
 //! What a text selects in space: connected parts of Gaussians, each with its boxes.
 //!
-//! A text selects whole entries of the bank. So the Gaussians of each entry are joined to pieces
-//! once a scene, with which pieces touch, and the parts of a text are joined from pieces.
+//! A text selects whole entries of the bank. So the Gaussians of each entry are joined to connected
+//! pieces once for each scene, and the pairs of pieces that touch are kept. The parts of a text are
+//! joined from these pieces.
 //!
-//! Two Gaussians touch when pixels next to each other made them at nearly one depth, or when they
-//! lie within a few of their own spacings of each other: a spacing is the width of a pixel of the
-//! network's picture at the Gaussian's depth, so that near and far things are joined alike.
+//! Two Gaussians touch when neighbouring pixels made them at nearly the same depth, or when they
+//! are at most a few spacings apart. A spacing is the width of a pixel of the network's picture at
+//! the Gaussian's depth, so near and far objects are joined alike.
 
 use glam::{DMat3, DVec3};
 use rayon::prelude::*;

@@ -1,9 +1,9 @@
-//! Scores of a text against the bank, in the short forms that make no feature of a pixel.
+//! Scores of a text against the bank, without the feature of any pixel.
 //!
-//! With a pixel's weights E over the bank's rows B, a text q and a canonical phrase c:
-//! `cos(F, q) - cos(F, c) = (E . B(q - c)) / sqrt(E^T B B^T E)`. So a text becomes one number a
-//! row and phrase, `d_c = B(q - c)`; a mask is the sign of a blend of these numbers, for any size
-//! of bank; and only a relevancy needs the norm, which no text changes.
+//! With the weights E of a pixel, the rows B of the bank, a text q and a phrase c:
+//! `cos(F, q) - cos(F, c) = (E . B(q - c)) / sqrt(E^T B B^T E)`. So a text becomes one number for
+//! each row and phrase, `d_c = B(q - c)`. A mask is the sign of a blend of these numbers, for any
+//! size of the bank. Only a relevancy needs the norm, and the norm does not depend on the text.
 
 use std::sync::{Arc, OnceLock};
 

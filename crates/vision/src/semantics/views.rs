@@ -1,8 +1,8 @@
-//! What the other photos say: each Gaussian looked up in every photo that sees it, by the depths
-//! that the Gaussians themselves give.
+//! Votes of the photos: each Gaussian is looked up in every photo that sees it. The Gaussians
+//! themselves give the depths.
 //!
-//! In: Gaussians with the pixels that made them, the cameras and the photos' bank index maps. Out:
-//! votes for an index of each Gaussian, and indices that are one thing seen from two sides.
+//! In: Gaussians with their source pixels, the cameras, and the photos' index maps. Out: votes for
+//! an entry of each Gaussian, and entries that are one object seen from two sides.
 
 use glam::DVec3;
 use rayon::prelude::*;

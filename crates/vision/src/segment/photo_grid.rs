@@ -1,10 +1,10 @@
-//! Where a decoder's grid of logits lies over a photo, and logits at other places of it.
+//! Where a decoder's grid of logits lies on a photo, and the logits at other places of the photo.
 
 use crate::scene::Photo;
 
 /// A decoder's grid and the photo in it: the photo fills the left top of a square of pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Frame {
+pub struct PhotoGrid {
     /// `[width, height]` of the grid of logits.
     pub grid: [usize; 2],
     /// Side of the square that the network sees, pixels.
@@ -26,7 +26,7 @@ pub(super) struct Resample {
     rows: Axis,
 }
 
-impl Frame {
+impl PhotoGrid {
     /// Cells of the grid that the photo fills, `[width, height]`.
     #[must_use]
     pub fn filled(&self) -> [f64; 2] {
@@ -149,10 +149,10 @@ mod tests {
     #[test]
     fn a_ramp_stays_where_the_photo_is() {
         // 40x24 of the 64-pixel square: 20x12 of the 32 cells.
-        let frame = Frame { grid: [32, 32], side: 64, resized: [40, 24] };
-        assert_eq!(frame.cells(), [20, 12], "cells over the photo");
+        let photo_grid = PhotoGrid { grid: [32, 32], side: 64, resized: [40, 24] };
+        assert_eq!(photo_grid.cells(), [20, 12], "cells over the photo");
         let photo = Photo { width: 100, height: 60, rgb: vec![0; 18_000], valid: None };
-        for resample in [frame.to_map([50, 30]), frame.to_photo(&photo)] {
+        for resample in [photo_grid.to_map([50, 30]), photo_grid.to_photo(&photo)] {
             let [w, h] = resample.size();
             let values = resample.apply(&ramp([32, 32]));
             for (x, y) in [(w / 2, h / 2), (w / 4, 2 * h / 3), (w - 6, h / 4)] {
@@ -167,10 +167,10 @@ mod tests {
     #[test]
     fn two_steps_are_what_torch_gives() {
         // F.interpolate(bilinear) of a 4x4 grid to 8x8, its first 8x6 to 5x3.
-        let frame = Frame { grid: [4, 4], side: 8, resized: [8, 6] };
+        let photo_grid = PhotoGrid { grid: [4, 4], side: 8, resized: [8, 6] };
         let photo = Photo { width: 5, height: 3, rgb: vec![0; 45], valid: None };
         let logits: Vec<f32> = (0..16).map(|i| ((i * 7) % 11) as f32 - 4.0).collect();
-        let found = frame.to_photo(&photo).apply(&logits);
+        let found = photo_grid.to_photo(&photo).apply(&logits);
         let torch = [
             -2.828_125, 0.6875, 1.0625, 1.4375, 4.953_125, 0.531_25, -0.25, 1.5, 2.8375, 1.196_875,
             -1.306_25, 1.35, 2.0, 0.175, -2.325,
