@@ -5,13 +5,13 @@ use crate::{
     segment::{Bitset, PhotoGrid, Proposal, Proposals, Settings, judge::blank},
 };
 
-/// Most masks of a photo: an index is a u16, and 0 is none.
+/// Most masks of a photo: a mask number is a u16, and 0 is none.
 const MASKS_MAX: usize = u16::MAX as usize;
 
-/// The index map of what was found, masks by area, the largest first.
+/// The index map of the masks, sorted by area, the largest first.
 ///
-/// A part goes where it lies in the mask of a whole; of what is left, small things lie on large
-/// ones. A mask of which too little is left to see goes.
+/// A mask that lies in the mask of a whole object is dropped. Of the others, small masks lie on
+/// large ones. A mask with too few visible pixels is dropped.
 pub(super) fn one_a_pixel(
     found: &Proposals,
     photo_grid: PhotoGrid,
@@ -59,7 +59,7 @@ pub(super) fn one_a_pixel(
     map
 }
 
-/// Positions of the masks that are not a part of a more whole one.
+/// Positions of the masks that do not lie in the mask of a whole object.
 fn wholes(masks: &[Proposal], part_thresh: f64) -> Vec<usize> {
     let is_part = |part: &Proposal| {
         masks.iter().any(|whole| {

@@ -7,7 +7,7 @@ pub struct Bitset {
     cells: usize,
 }
 
-/// Columns and rows of a mask, first and last included; as Segment Anything has boxes.
+/// Columns and rows of a mask, first and last included, as in Segment Anything.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Box2 {
     /// First column.
@@ -21,7 +21,7 @@ pub struct Box2 {
 }
 
 impl Bitset {
-    /// No cell of `cells`.
+    /// The empty set of a grid of `cells` cells.
     #[must_use]
     pub fn empty(cells: usize) -> Self {
         Self { words: vec![0; cells.div_ceil(64)], cells }
@@ -55,7 +55,7 @@ impl Bitset {
         self.words.get(cell / 64).is_some_and(|word| word >> (cell % 64) & 1 == 1)
     }
 
-    /// Takes a cell out.
+    /// Removes a cell.
     pub fn remove(&mut self, cell: usize) {
         if let Some(word) = self.words.get_mut(cell / 64) {
             *word &= !(1 << (cell % 64));
@@ -67,18 +67,18 @@ impl Bitset {
         self.words.iter_mut().zip(&other.words).for_each(|(a, b)| *a |= b);
     }
 
-    /// Takes out all cells of another set of the same grid.
+    /// Removes all cells of another set of the same grid.
     pub fn subtract(&mut self, other: &Self) {
         self.words.iter_mut().zip(&other.words).for_each(|(a, b)| *a &= !b);
     }
 
-    /// Cells in the set.
+    /// Number of cells in the set.
     #[must_use]
     pub fn count(&self) -> u32 {
         self.words.iter().map(|word| word.count_ones()).sum()
     }
 
-    /// Cells in both sets.
+    /// Number of cells in both sets.
     #[must_use]
     pub fn common(&self, other: &Self) -> u32 {
         self.words.iter().zip(&other.words).map(|(a, b)| (a & b).count_ones()).sum()
@@ -95,7 +95,7 @@ impl Bitset {
         })
     }
 
-    /// The smallest box around the set in a grid of this width; all 0 around nothing.
+    /// The smallest box around the set in a grid of this width; all 0 if the set is empty.
     #[must_use]
     pub fn bounds(&self, width: usize) -> Box2 {
         let mut bounds: Option<Box2> = None;

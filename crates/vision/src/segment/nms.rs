@@ -5,7 +5,7 @@ use crate::segment::Proposal;
 /// Positions of the masks that stay, surest first: greedy, as torchvision's `nms` over boxes and
 /// then the same over the masks themselves. A threshold of 1 or more keeps everything.
 ///
-/// Ties of the predicted IoU go to the earlier mask.
+/// In a tie of the predicted IoU the earlier mask stays.
 pub(super) fn suppress(masks: &[Proposal], box_threshold: f32, mask_threshold: f32) -> Vec<usize> {
     let mut order: Vec<usize> = (0..masks.len()).collect();
     order.sort_by(|&a, &b| masks[b].predicted_iou.total_cmp(&masks[a].predicted_iou));
@@ -18,7 +18,7 @@ pub(super) fn suppress(masks: &[Proposal], box_threshold: f32, mask_threshold: f
     })
 }
 
-/// Those of `order` that no earlier one that stays is too much alike.
+/// Removes from `order` each mask that is too similar to an earlier one that stays.
 fn greedy(order: &[usize], alike: impl Fn(usize, usize) -> bool) -> Vec<usize> {
     let mut kept: Vec<usize> = Vec::new();
     for &mask in order {

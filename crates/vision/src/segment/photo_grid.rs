@@ -13,12 +13,11 @@ pub struct PhotoGrid {
     pub resized: [u32; 2],
 }
 
-/// Weights that bring the grid to other cells, one axis: of each cell, its first source and four
-/// weights from there on.
+/// Weights of a resampling along one axis: for each output, its first source and four weights.
 #[derive(Clone, Debug)]
 struct Axis(Vec<(usize, [f32; 4])>);
 
-/// The grid's logits at the cells of a map that is laid over the whole photo.
+/// A resampling of the grid's logits to a map over the whole photo.
 #[derive(Clone, Debug)]
 pub(super) struct Resample {
     grid: [usize; 2],
@@ -42,17 +41,17 @@ impl PhotoGrid {
         [0, 1].map(|axis| (filled[axis].round() as usize).clamp(1, self.grid[axis].max(1)))
     }
 
-    /// To a map of `[width, height]` cells over the whole photo, in one step.
+    /// Resampling to a map of `[width, height]` cells over the whole photo, in one step.
     pub(super) fn to_map(self, map: [usize; 2]) -> Resample {
         let filled = self.filled();
         let axis = |axis: usize| Axis::direct(self.grid[axis], filled[axis], map[axis]);
         Resample { grid: self.grid, columns: axis(0), rows: axis(1) }
     }
 
-    /// To the photo's pixels as Segment Anything does: first to the square, then to the photo.
+    /// Resampling to the photo's pixels as in Segment Anything: to the square, then to the photo.
     pub(super) fn to_photo(self, photo: &Photo) -> Resample {
         let size = [photo.width as usize, photo.height as usize];
-        // A grid finer than the square has no second step to take.
+        // A grid finer than the square needs only one step.
         if self.grid.iter().any(|&cells| cells > self.side as usize) {
             return self.to_map(size);
         }
@@ -84,7 +83,7 @@ impl Axis {
         Self(taps.collect())
     }
 
-    /// This, and then `next` of its outputs; its outputs must lie closer than its sources do.
+    /// This resampling, then `next`. The outputs must be denser than the sources.
     fn then(&self, next: &Self) -> Self {
         let both = next.0.iter().map(|(first, weights)| {
             let start = self.0.get(*first).map_or(0, |tap| tap.0);
@@ -116,7 +115,7 @@ impl Resample {
         let mut line = vec![0.0_f32; self.grid[0] + 4];
         let mut before = None;
         for tap in &self.rows.0 {
-            // Rows of the same taps are the same row.
+            // Rows with the same weights are equal.
             if before == Some(tap) {
                 let from = out.len() - width;
                 out.extend_from_within(from..);

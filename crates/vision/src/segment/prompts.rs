@@ -2,20 +2,20 @@
 
 use crate::segment::{Bitset, Proposal, Seed, Settings};
 
-/// Every `STRIDES[i]`-th point of the grid is asked for in round `i`, those of earlier rounds left
-/// out; the last round has all that is left.
+/// Round `i` has every `STRIDES[i]`-th point of the grid that was not in an earlier round. The last
+/// round has all others.
 const STRIDES: [u32; 3] = [4, 2, 1];
-/// In a round before the last only a mask smaller than this share of the photo covers a point:
-/// small things lie on large ones.
+/// Before the last round a point counts as covered only by a mask smaller than this share of the
+/// photo, because small objects lie on large ones.
 const COVERING_SHARE_MAX: f64 = 0.1;
 
-/// The points still to ask for.
+/// The prompts that are left.
 #[derive(Debug)]
 pub(super) struct Prompts {
-    /// Point and round, the next last.
+    /// Point and round; the next one is the last.
     waiting: Vec<([f32; 2], usize)>,
     skip_covered: bool,
-    /// Cells under any mask of a whole object, and under a small one.
+    /// Cells covered by masks of whole objects: by any, and by small ones.
     covered: Bitset,
     covered_small: Bitset,
     map: [usize; 2],
@@ -57,7 +57,7 @@ impl Prompts {
         }
     }
 
-    /// The next points, at most `batch`; none when there is nothing left to ask for.
+    /// The next points, at most `batch`; empty at the end.
     pub(super) fn next(&mut self, batch: usize) -> Vec<[f32; 2]> {
         let mut points = Vec::new();
         while points.len() < batch.max(1) {
@@ -80,7 +80,7 @@ impl Prompts {
         if round + 1 == STRIDES.len() { self.covered.has(at) } else { self.covered_small.has(at) }
     }
 
-    /// Notes where masks of whole objects lie.
+    /// Marks the cells of masks of whole objects.
     pub(super) fn cover(&mut self, masks: &[Proposal], map: [usize; 2], levels: usize) {
         let cells = map[0] * map[1];
         if self.map != map {

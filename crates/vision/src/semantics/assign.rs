@@ -4,10 +4,10 @@ use rayon::prelude::*;
 
 use crate::scene::{IndexMap, Intrinsics, SourcePixel};
 
-/// How the network's picture of a photo lies on the photo: two lenses of one pose.
+/// Where the network's picture lies on its photo: two lenses of one pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NetworkPicture {
-    /// Lens of the network's picture, which `SourcePixel` counts pixels of.
+    /// Lens of the network's picture. `SourcePixel` counts its pixels.
     pub network: Intrinsics,
     /// Lens of the undistorted photo.
     pub photo: Intrinsics,
@@ -32,7 +32,7 @@ impl NetworkPicture {
     }
 }
 
-/// Replaces each index of a map: mask k of the map becomes `becomes[k - 1]`; 0 stays 0.
+/// Replaces mask numbers by entries: mask k becomes `becomes[k - 1]`; 0 stays 0.
 #[must_use]
 pub fn relabel(map: &IndexMap, becomes: &[u16]) -> IndexMap {
     let label = |index: &u16| {
@@ -41,8 +41,7 @@ pub fn relabel(map: &IndexMap, becomes: &[u16]) -> IndexMap {
     IndexMap { index: map.index.iter().map(label).collect(), ..*map }
 }
 
-/// `[N]` index of each Gaussian from the pixel that made it; 0 where its photo has no picture or
-/// no map.
+/// `[N]` entry of each Gaussian, from its source pixel; 0 if its photo has no picture or no map.
 #[must_use]
 pub fn from_source(
     source: &[SourcePixel],

@@ -15,30 +15,30 @@ use crate::{
 
 /// Seed of the first centre and of the draws after it.
 const SEED: u64 = 0x5e65_9141;
-/// Rounds of assigning and averaging; a bank of everyday size settles in ten.
+/// Most rounds of K-Means. A usual bank needs ten.
 const ROUNDS_MAX: usize = 100;
 
-/// A bank and the row of each feature.
+/// A bank and the entry of each embedding.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Clusters {
-    /// Plain centroids, `[M * dim]`; a scoring profile may bring them to unit length.
+    /// Plain centroids, `[M * dim]`. A scoring profile may scale them to length 1.
     pub bank: Bank,
-    /// `[N]` bank index of each feature, 1 to M.
+    /// `[N]` entry of each embedding, 1 to M.
     pub index: Vec<u16>,
 }
 
-/// Rows for so many features of so many photos before equal features are counted: 1.2 times the
-/// mean number of masks of a photo, rounded up.
+/// Number of rows for this many embeddings and photos: 1.2 times the mean number of masks of a
+/// photo, rounded up.
 #[must_use]
 pub fn rows_wanted(features: usize, views: usize) -> usize {
     (6 * features).div_ceil(5 * views.max(1)).min(BANK_ROWS_MAX)
 }
 
-/// Clusters `[N * dim]` features of `views` photos into as many rows as [`rows_wanted`], at most
-/// as many as there are distinct features. No features give an empty bank.
+/// Clusters `[N * dim]` embeddings of `views` photos into [`rows_wanted`] rows, at most one for
+/// each distinct embedding. Without embeddings the bank is empty.
 ///
 /// # Errors
-/// `internal` when the features are no whole number of rows or one is not finite.
+/// `internal` when the length is not a multiple of `dim` or a number is not finite.
 pub fn bank(features: &[f32], dim: usize, views: usize) -> Result<Clusters> {
     if features.is_empty() {
         return Ok(Clusters { bank: Bank { dim, rows: Vec::new() }, index: Vec::new() });
@@ -66,7 +66,7 @@ pub fn bank(features: &[f32], dim: usize, views: usize) -> Result<Clusters> {
             break;
         }
     }
-    // The last assignment may have left a row empty: then the one before it stands.
+    // The last assignment may leave a row empty. Then the one before it is used.
     fill_empty(&mut nearest, wanted);
     let centres = means(&rows, &nearest, wanted);
     #[expect(clippy::cast_possible_truncation, reason = "rows are f32")]
@@ -75,7 +75,7 @@ pub fn bank(features: &[f32], dim: usize, views: usize) -> Result<Clusters> {
     Ok(Clusters { bank: Bank { dim, rows }, index })
 }
 
-/// Number of features that differ from each other; -0 is 0.
+/// Number of distinct embeddings; -0 equals 0.
 fn distinct(rows: &[&[f32]]) -> usize {
     let bits = |row: &[f32]| row.iter().map(|v| (v + 0.0).to_bits()).collect::<Vec<u32>>();
     rows.iter().map(|row| bits(row)).collect::<HashSet<_>>().len()
@@ -95,7 +95,7 @@ fn distance(row: &[f32], centre: &[f64]) -> f64 {
     (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
 }
 
-/// The nearest centre of each feature, the first of equals, and its squared distance.
+/// The nearest centre of each embedding and its squared distance. The first one wins a tie.
 fn assign(rows: &[&[f32]], centres: &[Vec<f64>]) -> Vec<(usize, f64)> {
     rows.par_iter()
         .map(|row| {
@@ -111,7 +111,7 @@ fn assign(rows: &[&[f32]], centres: &[Vec<f64>]) -> Vec<(usize, f64)> {
         .collect()
 }
 
-/// Mean of each cluster's features, summed in their order.
+/// Mean of the embeddings of each cluster, summed in their order.
 fn means(rows: &[&[f32]], nearest: &[(usize, f64)], count: usize) -> Vec<Vec<f64>> {
     let dim = rows.first().map_or(0, |row| row.len());
     let mut sums = vec![vec![0.0_f64; dim]; count];
@@ -126,8 +126,8 @@ fn means(rows: &[&[f32]], nearest: &[(usize, f64)], count: usize) -> Vec<Vec<f64
     sums
 }
 
-/// Gives each empty cluster the feature that lies farthest from its own centre, the first of
-/// equals, out of clusters that keep another.
+/// Moves the embedding that is farthest from its centre to each empty cluster. Its old cluster must
+/// keep at least one; the first one wins a tie.
 fn fill_empty(nearest: &mut [(usize, f64)], count: usize) {
     let mut sizes = vec![0_usize; count];
     nearest.iter().for_each(|(m, _)| sizes[*m] += 1);
@@ -148,8 +148,8 @@ fn fill_empty(nearest: &mut [(usize, f64)], count: usize) {
     }
 }
 
-/// k-means++: each next centre is drawn by squared distance to those there are; of a few draws the
-/// one that leaves the least is taken, the first of equals.
+/// k-means++: draws the next centre with a probability by squared distance to the centres so far.
+/// Of a few draws it takes the one with the smallest sum of distances; the first one wins a tie.
 fn seeds(rows: &[&[f32]], count: usize) -> Vec<Vec<f64>> {
     let mut draw = Draw(SEED);
     let centre = |i: usize| rows[i].iter().map(|v| f64::from(*v)).collect::<Vec<f64>>();
@@ -185,8 +185,8 @@ fn seeds(rows: &[&[f32]], count: usize) -> Vec<Vec<f64>> {
     centres
 }
 
-/// The feature where the running sum of the distances passes `target`; never one at distance 0
-/// while another is farther.
+/// The embedding at which the running sum of the distances passes `target`. Its distance is 0 only
+/// if all are.
 fn pick(distances: &[f64], target: f64) -> usize {
     let mut sum = 0.0;
     let mut last = 0;
@@ -202,11 +202,11 @@ fn pick(distances: &[f64], target: f64) -> usize {
     last
 }
 
-/// `SplitMix64`: enough for a few draws, and the same on every machine.
+/// `SplitMix64`: the same numbers on every machine.
 struct Draw(u64);
 
 impl Draw {
-    /// 0 to under 1.
+    /// A number from 0 up to, but not including, 1.
     fn share(&mut self) -> f64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;

@@ -9,7 +9,7 @@ struct Bounds {
     y: [u32; 2],
 }
 
-/// A photo with its masks, ready to be cut; one cut at a time, so that few are in memory.
+/// A photo with its masks. It gives one crop at a time, so that few are in memory.
 pub struct Cutter<'a> {
     photo: &'a Photo,
     masks: &'a PhotoMasks,
@@ -29,7 +29,7 @@ impl std::fmt::Debug for Cutter<'_> {
 /// The cell of each pixel's centre along one axis.
 fn cells_of(pixels: u32, cells: u32) -> Vec<usize> {
     let (pixels_u64, cells) = (u64::from(pixels.max(1)), u64::from(cells));
-    // (i + 1/2) / pixels * cells, rounded down, in whole numbers.
+    // (i + 1/2) / pixels * cells, rounded down, in integers.
     let cell = |i: u64| ((2 * i + 1) * cells / (2 * pixels_u64)) as usize;
     (0..u64::from(pixels)).map(cell).collect()
 }
@@ -62,8 +62,8 @@ impl<'a> Cutter<'a> {
         Self { photo, masks, columns, rows, bounds }
     }
 
-    /// The cut of mask `k`, counted from 0, with `margin` of its box's longer side around it;
-    /// `None` where the mask has no pixel of the photo.
+    /// The crop of mask `k`, counted from 0, with a margin of `margin` times the longer side of its
+    /// box. `None` if the mask has no pixel of the photo.
     #[must_use]
     pub fn cut(&self, k: usize, margin: f64) -> Option<Crop> {
         let bounds = (*self.bounds.get(k)?)?;
@@ -75,7 +75,7 @@ impl<'a> Cutter<'a> {
         )]
         let border = (margin.max(0.0) * f64::from(longer)).round().min(f64::from(longer)) as u32;
         let side = longer + 2 * border;
-        // The box sits in the middle; the odd pixel goes right and down.
+        // The box is in the middle. An odd pixel goes to the right and to the bottom.
         let start =
             |[first, last]: [u32; 2]| i64::from(first) - i64::from(side - (last - first + 1)) / 2;
         let (left, top) = (start(bounds.x), start(bounds.y));

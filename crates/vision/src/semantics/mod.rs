@@ -32,7 +32,7 @@ fn norm(row: &[f32]) -> f64 {
     dot(row, row).sqrt()
 }
 
-/// Dot product in f64, four sums in a fixed order: the same bits on every thread and machine word.
+/// Dot product in f64 with four sums in a fixed order, so the bits are always the same.
 fn dot(a: &[f32], b: &[f32]) -> f64 {
     let mut sums = [0.0_f64; 4];
     let (quads_a, quads_b) = (a.chunks_exact(4), b.chunks_exact(4));
@@ -50,7 +50,7 @@ fn dot(a: &[f32], b: &[f32]) -> f64 {
     (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
 }
 
-/// The rows at unit length; a row of zeros stays one.
+/// The rows scaled to length 1. A row of zeros stays zero.
 fn unit_rows(bank: &Bank) -> Vec<f32> {
     let mut rows = bank.rows.clone();
     for row in rows.chunks_exact_mut(bank.dim.max(1)) {

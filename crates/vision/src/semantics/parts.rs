@@ -17,15 +17,15 @@ use crate::scene::{Gaussians, SceneCamera, principal_axes};
 /// How Gaussians are joined to parts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PartOptions {
-    /// Spacings within which Gaussians of any photos touch.
+    /// Gaussians touch if they are at most this many spacings apart.
     pub reach: f64,
-    /// Relative difference of depth under which neighbouring pixels of one photo touch.
+    /// Neighbouring pixels of one photo touch under this relative difference of depth.
     pub same_depth: f64,
     /// Fewest Gaussians of a part.
     pub count_min: usize,
     /// Smallest share of all selected Gaussians that a part may have.
     pub share_min: f64,
-    /// Share of a part's Gaussians that a box may leave out on each side of each axis.
+    /// Share of a part's Gaussians that a box leaves out on each side of each axis.
     pub trim: f64,
 }
 
@@ -35,14 +35,14 @@ impl Default for PartOptions {
     }
 }
 
-/// A box in the world, upright or turned.
+/// A box in the world, of any rotation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Box3 {
     /// Middle, world units.
     pub center: [f64; 3],
     /// Full lengths along the axes, world units.
     pub size: [f64; 3],
-    /// Unit axes, one a row, right-handed; for an aligned box those of the world.
+    /// Unit axes, one in each row, right-handed. An aligned box has those of the world.
     pub axes: [[f64; 3]; 3],
 }
 
@@ -59,21 +59,21 @@ pub struct Part {
     pub aligned: Box3,
 }
 
-/// The Gaussians of each bank entry in connected pieces, and which pieces touch.
+/// The connected pieces of the Gaussians of each entry, and the pairs of pieces that touch.
 #[derive(Clone, Debug, Default)]
 pub struct Pieces {
     /// Entry of each piece.
     entry: Vec<u16>,
     /// Gaussians of each piece, ascending.
     members: Vec<Vec<u32>>,
-    /// Pieces of different entries that touch, each pair once, the lower first.
+    /// Pairs of pieces of different entries that touch: each pair once, the smaller number first.
     touching: Vec<[u32; 2]>,
 }
 
 impl Pieces {
     /// The pieces of all Gaussians that have an entry.
     ///
-    /// `cameras` are the scene's; they say how far apart Gaussians of one surface lie.
+    /// `cameras` are those of the scene. They give the spacing of the Gaussians of a surface.
     #[must_use]
     pub fn new(gaussians: &Gaussians, cameras: &[SceneCamera], options: &PartOptions) -> Self {
         let index = gaussians.semantic_index();
@@ -109,8 +109,8 @@ impl Pieces {
         pieces
     }
 
-    /// Connected parts of the Gaussians of some `entries`, the largest first, small ones left out.
-    /// `gaussians` are those that the pieces were made of.
+    /// Connected parts of the Gaussians of `entries`, the largest first, without the small ones.
+    /// `gaussians` must be those that the pieces were made of.
     #[must_use]
     pub fn parts(
         &self,
@@ -141,7 +141,7 @@ impl Pieces {
             .filter(|part| part.len() as f64 >= least)
             .collect();
         found.iter_mut().for_each(|part| part.sort_unstable());
-        // The first Gaussian of each part is another, so the order is the same every time.
+        // Parts of one size are ordered by their first Gaussian, which is never shared.
         found.sort_by_key(|part| (std::cmp::Reverse(part.len()), part.first().copied()));
         found.into_iter().map(|part| describe(gaussians, part, options.trim)).collect()
     }
@@ -155,7 +155,7 @@ impl Pieces {
     }
 }
 
-/// What was found to touch so far, by place in the list of chosen Gaussians.
+/// The pairs found so far, by place in the list of chosen Gaussians.
 struct Bonds {
     entry: Vec<u16>,
     /// Gaussians of one entry that are joined.
@@ -174,10 +174,10 @@ impl Bonds {
     }
 }
 
-/// Where a Gaussian is, relative to the scene's origin.
+/// Place of a Gaussian, relative to the scene's origin.
 struct Site {
     mean: DVec3,
-    /// Depth from the photo that made it; 0 where that is unknown.
+    /// Depth in its source photo; 0 if unknown.
     depth: f64,
     /// Distance to its neighbours on the surface.
     spacing: f64,
@@ -203,7 +203,7 @@ fn sites(gaussians: &Gaussians, cameras: &[SceneCamera], chosen: &[u32]) -> Vec<
         .collect()
 }
 
-/// Joins Gaussians of one photo whose pixels are at most two apart and whose depths are alike.
+/// Joins Gaussians of one photo if their pixels are at most two apart and their depths similar.
 fn join_pixels(
     bonds: &mut Bonds,
     gaussians: &Gaussians,
@@ -243,9 +243,9 @@ fn join_pixels(
     }
 }
 
-/// Joins Gaussians within `reach` spacings by a grid for each power of two of the spacing.
+/// Joins Gaussians at most `reach` spacings apart. Each power of two of the spacing has a grid.
 fn join_cells(bonds: &mut Bonds, sites: &[Site], reach: f64) {
-    // Of each cell one Gaussian of each entry that has some there: all others are joined to it.
+    // One Gaussian of each entry in each cell. All others of the entry are joined to it.
     let mut cells: FxHashMap<(i32, [i64; 3]), Vec<usize>> = FxHashMap::default();
     for (at, site) in sites.iter().enumerate() {
         if site.spacing <= 0.0 || !site.spacing.is_finite() {
@@ -253,7 +253,7 @@ fn join_cells(bonds: &mut Bonds, sites: &[Site], reach: f64) {
         }
         #[expect(clippy::cast_possible_truncation, reason = "a power of two of an f64")]
         let level = site.spacing.log2().ceil() as i32;
-        // In its own grid, and in the next coarser one to meet those of wider spacing.
+        // In its own grid, and in the next coarser one for Gaussians of wider spacing.
         for level in [level, level + 1] {
             let edge = reach * f64::from(level).exp2();
             #[expect(clippy::cast_possible_truncation, reason = "saturates far away")]
@@ -266,7 +266,7 @@ fn join_cells(bonds: &mut Bonds, sites: &[Site], reach: f64) {
         }
     }
     for ((level, [x, y, z]), held) in &cells {
-        // The cell itself, and half of the 26 around; the other half looks this way.
+        // The cell itself and half of its 26 neighbours. The other half tests this cell.
         for step in 13..27 {
             let by = [step % 3 - 1, step / 3 % 3 - 1, step / 9 - 1];
             let next = [x.saturating_add(by[0]), y.saturating_add(by[1]), z.saturating_add(by[2])];
@@ -300,10 +300,10 @@ fn describe(gaussians: &Gaussians, part: Vec<u32>, trim: f64) -> Part {
     }
 }
 
-/// Axes with the least and the greatest place along each.
+/// Axes, with the smallest and the largest place along each.
 type Bounds = [(DVec3, [f64; 2]); 3];
 
-/// Bounds along three axes, without the share `trim` on each side.
+/// Bounds along three axes. The share `trim` is left out on each side.
 fn bounds(means: &[DVec3], axes: [DVec3; 3], trim: f64) -> Bounds {
     axes.map(|axis| {
         let mut along: Vec<f64> = means.iter().map(|mean| mean.dot(axis)).collect();
@@ -315,7 +315,7 @@ fn bounds(means: &[DVec3], axes: [DVec3; 3], trim: f64) -> Bounds {
     })
 }
 
-/// Axes by length, right-handed again; of each the sign that makes its largest number positive.
+/// Axes sorted by length, right-handed. The largest number of each axis is positive.
 fn longest_first(mut bounds: Bounds) -> Bounds {
     bounds.sort_by(|(_, a), (_, b)| (b[1] - b[0]).total_cmp(&(a[1] - a[0])));
     let turned = |(axis, [from, to]): (DVec3, [f64; 2])| (-axis, [-to, -from]);

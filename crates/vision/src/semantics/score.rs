@@ -15,12 +15,12 @@ use crate::{
     scene::{Bank, PixelWeights, ScoringProfile},
 };
 
-/// Canonical phrases that one blend of four numbers carries beside the coverage.
+/// Phrases in one blend of four numbers; the fourth number is the coverage.
 const GROUP: usize = 3;
-/// Pixels that a thread takes at once.
+/// Pixels of a task.
 const PIXELS_EACH: usize = 4096;
 
-/// What a text is compared to and how sharply: belongs to the model bundle and the profile.
+/// The phrases that a text is compared with, and tau. The bundle and the profile choose them.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scoring {
     profile: ScoringProfile,
@@ -30,11 +30,11 @@ pub struct Scoring {
 }
 
 impl Scoring {
-    /// Canonical phrases as unit embeddings, sharpness, and the coverage under which a pixel means
-    /// nothing (the profile `paper` has no such floor).
+    /// From phrases as embeddings of length 1, tau, and the coverage floor (the profile `paper`
+    /// ignores it).
     ///
     /// # Errors
-    /// `internal` when there is no phrase, they differ in length, or a number is out of range.
+    /// `internal` when there is no phrase, lengths differ, or a number is out of range.
     pub fn new(
         profile: ScoringProfile,
         canon: Vec<Vec<f32>>,
@@ -60,7 +60,7 @@ impl Scoring {
         Ok(Self { profile, canon, tau, coverage_floor })
     }
 
-    /// Coverage under which a pixel means nothing.
+    /// A pixel with less coverage has relevancy 0.
     #[must_use]
     pub fn coverage_floor(&self) -> f64 {
         self.coverage_floor
@@ -73,8 +73,8 @@ impl Scoring {
     }
 }
 
-/// 1 / the feature's length of each pixel of a view; 0 where a pixel means nothing. Kept with the
-/// view's entries, it serves every text.
+/// 1 / length of the feature of each pixel of a view; 0 where the coverage is too small. It serves
+/// every text.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ViewNorms {
     inverse: Vec<f32>,
@@ -88,21 +88,21 @@ impl ViewNorms {
     }
 }
 
-/// A text's scores against a bank: all that a query needs of it.
+/// The scores of a text against a bank.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TextScores {
-    /// For each three canonical phrases `[M + 1]` rows of 1, the coverage, and `B(q - c)`; row 0
-    /// is zeros. Short groups repeat their first phrase, which changes no minimum and no sign.
+    /// For each group of three phrases: `[M + 1]` rows of 1 (it sums to the coverage) and three
+    /// `B(q - c)`. Row 0 is zeros. A short group repeats its first phrase, which changes no result.
     groups: Vec<Vec<[f64; 4]>>,
-    /// `[M + 1]` relevancy of each row on its own.
+    /// `[M + 1]` relevancy of each entry alone.
     entries: Vec<f32>,
-    /// `[M + 1]` bit c is set where the row is nearer to phrase c than to the text. Pixels whose
-    /// rows share one are, too, whatever their weights; row 0 adds nothing, so it has all bits.
+    /// `[M + 1]` bit c is set if the row is nearer to phrase c than to the text. If all rows of a
+    /// pixel share a bit, no weights can select the pixel. Row 0 adds nothing, so it has all bits.
     nearer: Vec<u64>,
 }
 
 impl TextScores {
-    /// Tables to blend, one for each three canonical phrases: `[M + 1]` rows of the coverage and
+    /// Tables to blend, one for each group of three phrases: `[M + 1]` rows of the coverage and
     /// three scores. [`mask_from_blend`] reads the blended pictures.
     #[must_use]
     pub fn tables(&self) -> Vec<Arc<[[f32; 4]]>> {
@@ -111,29 +111,29 @@ impl TextScores {
         self.groups.iter().map(table).collect()
     }
 
-    /// `[M + 1]` relevancy of each bank index on its own, 0..1; that of the background is 0.
+    /// `[M + 1]` relevancy of each entry alone, 0..1; that of the background is 0.
     #[must_use]
     pub fn entries(&self) -> &[f32] {
         &self.entries
     }
 
-    /// Whether no blend of the bank can be selected: all rows are nearer to one same phrase.
+    /// Whether no pixel can be selected, because all rows are nearer to the same phrase.
     #[must_use]
     pub fn selects_nothing(&self) -> bool {
         self.nearer.iter().fold(u64::MAX, |all, row| all & row) != 0
     }
 
-    /// Whether the rows of pixel `p` rule it out, without a blend.
+    /// Whether the rows of pixel `p` exclude it, so that no blend is needed.
     fn ruled_out(&self, weights: &PixelWeights, p: usize) -> bool {
         let rows = weights.slices(p).0.iter();
         let nearer = |m: &u16| self.nearer.get(usize::from(*m)).copied().unwrap_or(u64::MAX);
         rows.fold(u64::MAX, |all, m| all & nearer(m)) != 0
     }
 
-    /// Whether the text selects bank index `m`.
+    /// Whether the text selects entry `m`.
     #[must_use]
     pub fn selects(&self, m: u16) -> bool {
-        // By the rule of the masks, so that a tie selects in space what it selects in a view.
+        // The rule of the masks, so that 3D and views agree on ties.
         let known = m > 0 && usize::from(m) < self.entries.len();
         let [least, most, _] = self.blend(&[m], &[1.0]);
         known && selected(least, most)
@@ -148,7 +148,7 @@ impl TextScores {
     fn blend(&self, index: &[u16], weight: &[f32]) -> [f64; 3] {
         let (mut least, mut most, mut coverage) = (f64::INFINITY, f64::NEG_INFINITY, 0.0);
         for rows in &self.groups {
-            // Index 0 and indices beyond the bank add a row of zeros.
+            // Entry 0 and entries beyond the bank add a row of zeros.
             let mut sums = [0.0_f64; 4];
             for (m, weight) in index.iter().zip(weight) {
                 let row = rows.get(usize::from(*m)).unwrap_or(&[0.0; 4]);
@@ -179,7 +179,7 @@ pub struct Scorer {
     norms: Vec<f64>,
     /// Canonical phrase by row.
     canon_scores: Vec<Vec<f64>>,
-    /// Lower triangle of B B^T, row by row; made when the first norm is asked for.
+    /// Lower triangle of B B^T, row by row. The first call of [`Self::norms`] computes it.
     gram: OnceLock<Vec<f64>>,
 }
 
@@ -206,7 +206,7 @@ impl Scorer {
         Ok(Self { bank, scoring, norms, canon_scores, gram: OnceLock::new() })
     }
 
-    /// How it scores.
+    /// The phrases, tau and profile.
     #[must_use]
     pub fn scoring(&self) -> &Scoring {
         &self.scoring
@@ -256,7 +256,7 @@ impl Scorer {
         Ok(text)
     }
 
-    /// The sigmoid of a difference of cosines, in the form that cannot overflow.
+    /// The sigmoid of a difference of cosines, in a form that cannot overflow.
     fn sharpen(&self, difference: f64) -> f32 {
         #[expect(clippy::cast_possible_truncation, reason = "a score 0..1")]
         let score = (1.0 / (1.0 + (-self.scoring.tau * difference).exp())) as f32;
@@ -330,7 +330,7 @@ impl Scorer {
         Ok(norms.inverse.par_iter().enumerate().with_min_len(PIXELS_EACH).map(score).collect())
     }
 
-    /// `[P]` where the text's relevancy is 0.5 or more: no norm, no exponential.
+    /// `[P]` whether the relevancy is 0.5 or more. It needs no norm and no exponential.
     ///
     /// # Errors
     /// `internal` when the arrays of `weights` do not belong together.
@@ -347,7 +347,7 @@ impl Scorer {
     }
 }
 
-/// `[P]` where a text applies, from the blended pictures of [`TextScores::tables`], in their order.
+/// `[P]` the mask of a text, from the blended pictures of [`TextScores::tables`], in their order.
 #[must_use]
 pub fn mask_from_blend(pictures: &[&[[f32; 4]]], scoring: &Scoring) -> Vec<bool> {
     let pixels = pictures.iter().map(|picture| picture.len()).min().unwrap_or(0);

@@ -10,23 +10,23 @@ use rayon::prelude::*;
 use super::assign::NetworkPicture;
 use crate::scene::{Bank, CameraToWorld, Gaussians, IndexMap, SceneCamera};
 
-/// Relative difference of depth under which a photo shows a Gaussian.
+/// A photo shows a Gaussian under this relative difference of depth.
 const SAME_SURFACE: f64 = 0.03;
-/// Gaussians whose votes are in memory together.
+/// Gaussians of a task.
 const PART: usize = 1 << 16;
 
-/// A photo as its Gaussians know it.
+/// A photo with the depths of its Gaussians.
 struct View {
     pose: CameraToWorld,
     picture: NetworkPicture,
-    /// `[H * W]` depth of the pixel's own Gaussian in the network's picture; 0 where it has none.
+    /// `[H * W]` depth of the Gaussian of each pixel of the network's picture; 0 without one.
     depth: Vec<f32>,
 }
 
 /// The surfaces that the photos of a scene show.
 pub struct Views<'a> {
     gaussians: &'a Gaussians,
-    /// One for each photo; `None` where it was not used.
+    /// One for each photo; `None` if it was not used.
     views: Vec<Option<View>>,
 }
 
@@ -37,7 +37,7 @@ impl std::fmt::Debug for Views<'_> {
 }
 
 impl View {
-    /// Where a world point falls on the photo, shares of its sides, if the photo shows it.
+    /// Place of a world point on the photo, shares of its sides; `None` if the photo lacks it.
     fn shows(&self, world: DVec3) -> Option<[f64; 2]> {
         let seen = self.pose.rotation().transpose() * (world - self.pose.center());
         if seen.z <= 0.0 {
@@ -60,8 +60,8 @@ impl View {
         Some([u / f64::from(photo.width), v / f64::from(photo.height)])
     }
 
-    /// Gives pixels without a Gaussian the depth of a neighbour: one that was thinned stands for a
-    /// block of up to 4 x 4 pixels, with itself one pixel from its corner.
+    /// Gives pixels without a Gaussian the depth of a neighbour. After thinning a Gaussian stands
+    /// for up to 4 x 4 pixels; its own pixel is one pixel from the corner of the block.
     fn fill(&mut self) {
         let (width, height) =
             (self.picture.network.width as usize, self.picture.network.height as usize);
@@ -81,7 +81,7 @@ impl View {
 }
 
 impl<'a> Views<'a> {
-    /// Puts every Gaussian back on the pixel that made it.
+    /// Writes the depth of every Gaussian to its source pixel.
     #[must_use]
     pub fn new(gaussians: &'a Gaussians, cameras: &[SceneCamera]) -> Self {
         let view = |input: &SceneCamera| {
@@ -106,8 +106,8 @@ impl<'a> Views<'a> {
         Self { gaussians, views }
     }
 
-    /// `[V]` what each photo says of Gaussian `i`: 0 where it does not show it, or shows it without
-    /// an index. The photo that made it says what `own` does.
+    /// `[V]` the vote of each photo for Gaussian `i`: an entry, or 0 if the photo does not show it
+    /// or has no entry there. The vote of its own photo is `own`.
     fn said(&self, i: usize, own: &[u16], maps: &[IndexMap]) -> Vec<u16> {
         let at = world(self.gaussians, i);
         let source = usize::from(self.gaussians.source()[i].view);
@@ -121,17 +121,17 @@ impl<'a> Views<'a> {
         self.views.iter().enumerate().map(look).collect()
     }
 
-    /// `[N]` the index that most photos give each Gaussian. Photos without an index for it do not
-    /// vote; its own photo wins a tie it is part of, the smallest index any other.
+    /// `[N]` the entry with the most votes for each Gaussian. A photo without an entry for it does
+    /// not vote. In a tie its own photo's entry wins if it is among them, else the smallest entry.
     #[must_use]
     pub fn vote(&self, own: &[u16], maps: &[IndexMap]) -> Vec<u16> {
         let vote = |(i, of): (usize, &u16)| winner(*of, self.said(i, own, maps));
         own.par_iter().enumerate().with_min_len(1024).map(vote).collect()
     }
 
-    /// Which bank indices are one thing seen from two sides, as the smallest index of each group:
-    /// `[M + 1]`. Two are joined where at least half of what each one covers, and the other's
-    /// photos show, has the other's index there, and their rows point the same way.
+    /// `[M + 1]` the smallest entry of each group of entries that are one object. Two entries are
+    /// joined if at least half of what each one covers, and the photos of the other show, has the
+    /// other entry there, and if their rows are similar.
     #[must_use]
     pub fn same_things(
         &self,
@@ -195,8 +195,8 @@ fn cosine(bank: &Bank, a: usize, b: usize) -> f64 {
     if lengths > 0.0 { super::dot(bank.row(a), bank.row(b)) / lengths } else { 0.0 }
 }
 
-/// A bank and its indices after groups of rows have become one row each: the mean over their
-/// features, of which row m had `counts[m]`. Indices keep their order.
+/// Joins groups of rows to one row each: the mean over their embeddings, of which row m had
+/// `counts[m]`. Entries keep their order.
 #[must_use]
 pub fn merge(bank: &Bank, counts: &[u32], group: &[u16]) -> (Bank, Vec<u16>) {
     let mut becomes = vec![0_u16; bank.len() + 1];
