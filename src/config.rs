@@ -48,13 +48,15 @@ pub struct ConfigArgs {
     #[arg(long, env = "SEGSPLAT_ORT_LIBRARY")]
     pub ort_library: Option<PathBuf>,
     /// Which renderer serves views [default: auto]
-    #[arg(long, env = "SEGSPLAT_RENDERER", value_name = "auto|cpu|gpu", value_parser = named::<RendererChoice>)]
+    #[arg(long, env = "SEGSPLAT_RENDERER", value_name = "auto|cpu|gpu")]
+    #[arg(value_parser = named::<RendererChoice>)]
     pub renderer: Option<RendererChoice>,
     /// Part of the name of the wgpu adapter to use; several with commas between
     #[arg(long, env = "SEGSPLAT_ADAPTER")]
     pub adapter: Option<String>,
     /// Execution provider of the networks [default: auto]
-    #[arg(long, env = "SEGSPLAT_PROVIDER", value_name = "auto|cpu|cuda|webgpu", value_parser = named::<ProviderChoice>)]
+    #[arg(long, env = "SEGSPLAT_PROVIDER", value_name = "auto|cpu|cuda|webgpu")]
+    #[arg(value_parser = named::<ProviderChoice>)]
     pub provider: Option<ProviderChoice>,
     /// Threads for networks and rendering [default: the cores this process really has]
     #[arg(long, env = "SEGSPLAT_THREADS")]

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use crate::{
     error::Result,
     jobs::{
-        Made, Networks, Phrases, SceneMaker, SemanticsMaker, SemanticsWork, TextEmbedding, Work,
+        EmbeddedText, Made, Networks, Phrases, SceneMaker, SemanticsMaker, SemanticsWork, Work,
     },
     limits::Limits,
     pipeline::{
@@ -113,9 +113,9 @@ impl SemanticsMaker for PipelineSemantics {
         })
     }
 
-    fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
+    fn embed_texts(&self, texts: &[String]) -> Result<Vec<EmbeddedText>> {
         let embedded = self.engine.get()?.image_text()?.embed_texts(texts)?;
-        let texts = embedded.into_iter().map(|text| TextEmbedding {
+        let texts = embedded.into_iter().map(|text| EmbeddedText {
             row: text.row,
             tokens: text.tokens,
             unknown: text.unknown,

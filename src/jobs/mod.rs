@@ -26,7 +26,7 @@ use tokio::sync::watch;
 
 pub use self::{
     maker::{PipelineMaker, PipelineSemantics},
-    semantics::{NoSemantics, Phrases, SemanticsMaker, SemanticsWork, TextEmbedding},
+    semantics::{EmbeddedText, NoSemantics, Phrases, SemanticsMaker, SemanticsWork},
     worker::content_sha256,
 };
 

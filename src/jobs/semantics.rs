@@ -44,7 +44,7 @@ impl fmt::Debug for SemanticsWork<'_> {
 
 /// A text as the bundle's text tower sees it.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct TextEmbedding {
+pub struct EmbeddedText {
     /// `[D]`, unit length.
     pub row: Vec<f32>,
     /// Tokens that were read.
@@ -81,7 +81,7 @@ pub trait SemanticsMaker: Send + Sync {
     ///
     /// # Errors
     /// `model_unavailable`, `internal`.
-    fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>>;
+    fn embed_texts(&self, texts: &[String]) -> Result<Vec<EmbeddedText>>;
 
     /// Does the whole work on the calling thread.
     ///
@@ -109,7 +109,7 @@ impl SemanticsMaker for NoSemantics {
         Err(Self::refusal())
     }
 
-    fn embed_texts(&self, _: &[String]) -> Result<Vec<TextEmbedding>> {
+    fn embed_texts(&self, _: &[String]) -> Result<Vec<EmbeddedText>> {
         Err(Self::refusal())
     }
 

@@ -30,7 +30,8 @@ fn every_dependency_has_a_licence_that_is_allowed_and_comes_from_the_registry() 
     for package in packages {
         let name = format!("{} {}", package["name"], package["version"]);
         if package["source"].is_null() {
-            assert_eq!(package["name"], "segsplat-server", "{name} comes from a path");
+            let ours = package["name"].as_str().unwrap().starts_with("segsplat-");
+            assert!(ours, "{name} comes from a path");
             continue;
         }
         let source = package["source"].as_str().unwrap();

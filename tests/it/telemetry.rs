@@ -51,12 +51,12 @@ async fn calls_stages_and_jobs_are_counted_over_both_doors() {
     };
     for door in ["http", "grpc"] {
         for call in ["create_scene", "render_view"] {
-            let labels = format!("{{door=\"{door}\",call=\"{call}\"");
-            grew(&format!("segsplat_requests_total{labels},code=\"ok\"}}"), 1.0);
-            grew(&format!("segsplat_request_seconds_count{labels}}}"), 1.0);
+            let (call, door) = (format!("{{call=\"{call}\","), format!("door=\"{door}\"}}"));
+            grew(&format!("segsplat_requests_total{call}code=\"ok\",{door}"), 1.0);
+            grew(&format!("segsplat_request_seconds_count{call}{door}"), 1.0);
         }
-        let missing = format!("segsplat_requests_total{{door=\"{door}\",call=\"get_scene\",");
-        assert!(value(&after, &format!("{missing}code=\"scene_not_found\"}}")) >= 1.0);
+        let missing = "segsplat_requests_total{call=\"get_scene\",code=\"scene_not_found\"";
+        assert!(value(&after, &format!("{missing},door=\"{door}\"}}")) >= 1.0);
     }
     for stage in ["wait", "queue", "load", "render", "encode"] {
         grew(&format!("segsplat_stage_seconds_count{{stage=\"{stage}\"}}"), 2.0);

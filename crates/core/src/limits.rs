@@ -79,8 +79,8 @@ pub struct Limits {
     /// Pixels of renders at work or waiting. One render may take a quarter of what is left, so that
     /// large views leave room for small ones; else it is refused as `overloaded`.
     pub queued_pixels_max: u64,
-    /// Pixels of renders at work: being drawn or encoded, some 20 to 30 bytes each. A larger view is
-    /// drawn alone.
+    /// Pixels of renders at work: being drawn or encoded, some 20 to 30 bytes each. A larger view
+    /// is drawn alone.
     pub active_pixels_max: u64,
     /// Pixels of all pictures of one `views` request.
     pub views_pixels_max: u64,

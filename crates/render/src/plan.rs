@@ -100,7 +100,8 @@ impl ViewPlanner {
     /// the request's background. Neither adds anything to labels.
     ///
     /// # Errors
-    /// Those of the renderer, and `limit_exceeded` when the layers have too many pixel weights together.
+    /// Those of the renderer, and `limit_exceeded` when the layers have too many pixel weights
+    /// together.
     pub fn render(
         &self,
         renderer: &dyn Renderer,

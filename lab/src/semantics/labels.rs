@@ -121,7 +121,7 @@ fn photo_called(upload: &Upload, name: &str) -> Option<usize> {
 }
 
 fn ours(dir: &Path, upload: &Upload) -> Result<Stored> {
-    let wrong = |what: &str| Error::invalid(format!("{what}"));
+    let wrong = |what: &str| Error::invalid(what);
     let named: BTreeMap<String, String> = serde_json::from_value(json(dir, "masks/classes.json")?)
         .map_err(|e| wrong("masks/classes.json: no value to name table").caused_by(e))?;
     let surroundings: Vec<String> = if dir.join("scene.json").is_file() {

@@ -145,8 +145,8 @@ pub fn run(args: &Args, rows: &mut Rows) -> Result<Vec<SceneReport>> {
         let [first, _, ..] = of[..] else { continue };
         let over = |judgement: fn(&SceneReport) -> &Judgement| Judgement {
             profile: judgement(first).profile,
-            scene: Scores::mean(of.iter().map(|s| &judgement(s).scene)),
-            flat: Scores::mean(of.iter().map(|s| &judgement(s).flat)),
+            scene: Scores::mean(&of.iter().map(|s| &judgement(s).scene).collect::<Vec<_>>()),
+            flat: Scores::mean(&of.iter().map(|s| &judgement(s).flat).collect::<Vec<_>>()),
         };
         let means = SceneReport {
             scene: name.to_owned(),

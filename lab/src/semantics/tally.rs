@@ -186,8 +186,8 @@ impl Tally {
 
 impl Scores {
     /// Means over scenes.
-    pub(super) fn mean<'a>(of: impl Iterator<Item = &'a Self> + Clone) -> Self {
-        let over = |figure: fn(&Self) -> f64| mean(of.clone().map(figure));
+    pub(super) fn mean(of: &[&Self]) -> Self {
+        let over = |figure: fn(&Self) -> f64| mean(of.iter().copied().map(figure));
         Self {
             miou: over(|s| s.miou),
             miou_closed: over(|s| s.miou_closed),
@@ -288,7 +288,7 @@ mod tests {
     #[test]
     fn means_are_over_scenes() {
         let [a, b] = [0.2, 0.6].map(|miou| Scores { miou, absent: 0.1, ..Scores::default() });
-        let mean = Scores::mean([&a, &b].into_iter());
+        let mean = Scores::mean(&[&a, &b]);
         assert!((mean.miou - 0.4).abs() < 1e-12 && (mean.absent - 0.1).abs() < 1e-12);
     }
 }

@@ -105,8 +105,8 @@ impl Start {
     }
 }
 
-/// Sends a signal to a process; whether it was there. By the shell's own `kill`: a bare Debian has no
-/// other.
+/// Sends a signal to a process; whether it was there. By the shell's own `kill`: a bare Debian has
+/// no other.
 pub(crate) fn signal(pid: u32, name: &str) -> bool {
     let sent = Command::new("sh").args(["-c", &format!("kill -{name} {pid}")]).status();
     sent.is_ok_and(|status| status.success())

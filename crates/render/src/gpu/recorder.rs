@@ -230,8 +230,8 @@ impl<'a> Recorder<'a> {
         }
     }
 
-    /// Stage 6: a stable sort of tile pairs by the lowest `key_bits` bits. The result is in the half
-    /// [`sorted_half`].
+    /// Stage 6: a stable sort of tile pairs by the lowest `key_bits` bits. The result is in the
+    /// half [`sorted_half`].
     pub(super) fn tile_sort(&mut self, key_bits: u32) {
         for pass_at in 0..key_bits.div_ceil(DIGIT_BITS) {
             let digit =
