@@ -10,7 +10,7 @@ use std::{
 
 use segsplat::{
     error::{Error, ErrorCode, Result},
-    jobs::{Phrases, SemanticsMaker, SemanticsWork, TextEmbedding},
+    jobs::{EmbeddedText, Phrases, SemanticsMaker, SemanticsWork},
     scene::{Bank, IndexMap, Semantics, SemanticsReport},
 };
 
@@ -50,7 +50,7 @@ impl SemanticsMaker for PhotoMeaning {
         Ok(Phrases { canon, tau: 10.0, coverage_floor: 0.05 })
     }
 
-    fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
+    fn embed_texts(&self, texts: &[String]) -> Result<Vec<EmbeddedText>> {
         self.embedded.fetch_add(texts.len(), Ordering::AcqRel);
         let embed = |text: &String| {
             let photo = text.strip_prefix("photo ").and_then(|n| n.parse::<usize>().ok());
@@ -59,7 +59,7 @@ impl SemanticsMaker for PhotoMeaning {
                 _ => axis(8 + text.bytes().map(usize::from).sum::<usize>() % 8),
             };
             let unknown = usize::from(text.starts_with('?'));
-            TextEmbedding { row, tokens: 1, unknown, cut: false }
+            EmbeddedText { row, tokens: 1, unknown, cut: false }
         };
         Ok(texts.iter().map(embed).collect())
     }
