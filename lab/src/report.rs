@@ -240,7 +240,12 @@ mod tests {
             key: Some("{scene}".to_owned()),
             pivot: Some("{photos}".to_owned()),
         };
-        let row = |scene, photos, db| json!({ "scene": scene, "photos": photos, "db": db, "commit": "c", "machine": "m" });
+        let row = |scene, photos, db| {
+            let (commit, machine) = ("c", "m");
+            json!({
+                "scene": scene, "photos": photos, "db": db, "commit": commit, "machine": machine
+            })
+        };
         let text = table.write(&[row("a", 2, 1.0), row("b", 2, 2.0), row("a", 4, 3.0)]);
         let wanted = "| scene | 2 | 4 |\n| --- | --- | --- |\n| a | 1.0 | 3.0 |\n\
                       | b | 2.0 |  |\n\nCommit c; m.\n";

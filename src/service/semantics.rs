@@ -82,7 +82,7 @@ impl Inner {
             if made_by == loaded || made_by.is_empty() {
                 return Ok(Some((scene, semantics)));
             }
-            tracing::info!(scene = %access.id(), made_by, "semantics of another bundle: made again");
+            tracing::info!(scene = %access.id(), made_by, "another bundle: semantics again");
         }
         self.jobs.lose_semantics(access.id())?;
         Ok(None)

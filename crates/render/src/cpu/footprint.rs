@@ -4,7 +4,8 @@
 ///
 /// With d = pixel - mean, half the squared Mahalanobis distance is
 /// `(conic_x · (d.x - conic_shear · d.y))² + (conic_y · d.y)²`: x given y, then y
-/// (Cholesky). Unlike the conic `a d.x² + 2 b d.x d.y + c d.y²` it does not cancel for long thin Gaussians.
+/// (Cholesky). Unlike the conic `a d.x² + 2 b d.x d.y + c d.y²` it does not cancel for long
+/// thin Gaussians.
 ///
 /// One line of the cache each: the blend fetches them in no order of memory.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
