@@ -12,7 +12,7 @@ mod asking;
 mod bad_input;
 mod cli;
 mod colour_words;
-#[allow(dead_code, unused_imports, reason = "the slow tests use the rest")]
+#[allow(unused_imports, reason = "the slow tests use the rest")]
 mod common;
 mod containers;
 mod crop;

@@ -8,7 +8,7 @@
 )]
 
 #[path = "../it/common/mod.rs"]
-#[allow(dead_code, unused_imports, reason = "the quick tests use the rest")]
+#[allow(unused_imports, reason = "the quick tests use the rest")]
 mod common;
 mod fuzz_input;
 mod kill;
