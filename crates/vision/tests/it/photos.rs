@@ -272,8 +272,7 @@ fn bombs_meet_the_unpacked_bound() {
     let bomb = vec![0_u8; 3 << 20];
     let zip = zipped(&[("transforms.json", b"{}"), ("bomb.png", &bomb)]);
     assert!(zip.len() < 20_000, "the bomb must be small: {}", zip.len());
-    let mut limits = Limits::default();
-    limits.archive_unpacked_bytes_max = 1 << 20;
+    let limits = Limits { archive_unpacked_bytes_max: 1 << 20, ..Limits::default() };
     let error = photos::read(&archive(zip.clone()), &limits).unwrap_err();
     assert_eq!(error.code(), ErrorCode::LimitExceeded, "{error}");
     // The same bomb with headers that lie about its size.
