@@ -1,6 +1,6 @@
 //! One configuration struct: defaults < file < environment < flags.
 //!
-//! Every field is a flag `--like-this`, a variable `SEGSPLAT_LIKE_THIS` and a key `like_this` of
+//! Every field is a flag `--like-this` of the commands that need it, a variable `SEGSPLAT_LIKE_THIS` and a key `like_this` of
 //! the TOML file named by `--config`. Limits live in the file's `[limits]` table.
 
 use std::{net::SocketAddr, path::PathBuf};
@@ -12,35 +12,13 @@ use crate::{
     error::{Error, Result},
     limits::Limits,
     models::{NetworkOptions, ProviderChoice},
+    names::named,
     render::{RendererChoice, RendererOptions},
 };
 
-/// What was typed or set: every field optional, merged into [`Config`].
-#[derive(Args, Clone, Debug, Default, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+/// Flags of every command that opens networks or a renderer; what is not given stays as it is.
+#[derive(Args, Clone, Debug, Default)]
 pub struct ConfigArgs {
-    /// Address and port to listen on [default: 127.0.0.1:8080]
-    #[arg(long, env = "SEGSPLAT_LISTEN")]
-    pub listen: Option<SocketAddr>,
-    /// Folder of the scenes [default: ./data]
-    #[arg(long, env = "SEGSPLAT_DATA_DIR")]
-    pub data_dir: Option<PathBuf>,
-    /// Bucket that replicas share, `s3://BUCKET/PREFIX`; its keys are `AWS_ACCESS_KEY_ID` and
-    /// `AWS_SECRET_ACCESS_KEY` of the environment [default: the data folder]
-    #[arg(long, env = "SEGSPLAT_STORE")]
-    pub store: Option<String>,
-    /// URL of an S3-compatible server [default: Amazon's]
-    #[arg(long, env = "SEGSPLAT_S3_ENDPOINT")]
-    pub s3_endpoint: Option<String>,
-    /// Region of the bucket [default: `AWS_REGION`, else us-east-1]
-    #[arg(long, env = "SEGSPLAT_S3_REGION")]
-    pub s3_region: Option<String>,
-    /// Whether the S3 endpoint may be plain http [default: false]
-    #[arg(long, env = "SEGSPLAT_S3_ALLOW_HTTP", num_args = 0..=1, default_missing_value = "true")]
-    pub s3_allow_http: Option<bool>,
-    /// Keep the photos of finished scenes; lazy semantics need them [default: true]
-    #[arg(long, env = "SEGSPLAT_KEEP_PHOTOS", num_args = 0..=1, default_missing_value = "true")]
-    pub keep_photos: Option<bool>,
     /// Folder of the model bundle [default: found beside the executable or in ./models/embedded]
     #[arg(long, env = "SEGSPLAT_BUNDLE")]
     pub bundle: Option<PathBuf>,
@@ -61,6 +39,50 @@ pub struct ConfigArgs {
     /// Threads for networks and rendering [default: the cores this process really has]
     #[arg(long, env = "SEGSPLAT_THREADS")]
     pub threads: Option<usize>,
+    /// Log filter in tracing's syntax [default: info,ort=warn]
+    #[arg(long, env = "SEGSPLAT_LOG")]
+    pub log: Option<String>,
+    /// Log lines as JSON [default: false]
+    #[arg(long, env = "SEGSPLAT_LOG_JSON", num_args = 0..=1, default_missing_value = "true")]
+    pub log_json: Option<bool>,
+}
+
+/// Flags that say where the server is reached: of `serve`, and of `health`, which asks it.
+#[derive(Args, Clone, Debug, Default)]
+pub struct DoorArgs {
+    /// Address and port to listen on [default: 127.0.0.1:8080]
+    #[arg(long, env = "SEGSPLAT_LISTEN")]
+    pub listen: Option<SocketAddr>,
+    /// Certificate chain (PEM): serve TLS, with --tls-key; read again at SIGHUP
+    #[arg(long, env = "SEGSPLAT_TLS_CERT", value_name = "FILE")]
+    pub tls_cert: Option<PathBuf>,
+    /// Private key of the certificate (PEM)
+    #[arg(long, env = "SEGSPLAT_TLS_KEY", value_name = "FILE")]
+    pub tls_key: Option<PathBuf>,
+}
+
+/// Flags of `serve` alone.
+#[derive(Args, Clone, Debug, Default)]
+pub struct ServerArgs {
+    /// Folder of the scenes [default: ./data]
+    #[arg(long, env = "SEGSPLAT_DATA_DIR")]
+    pub data_dir: Option<PathBuf>,
+    /// Bucket that replicas share, `s3://BUCKET/PREFIX`; its keys are `AWS_ACCESS_KEY_ID` and
+    /// `AWS_SECRET_ACCESS_KEY` of the environment [default: the data folder]
+    #[arg(long, env = "SEGSPLAT_STORE")]
+    pub store: Option<String>,
+    /// URL of an S3-compatible server [default: Amazon's]
+    #[arg(long, env = "SEGSPLAT_S3_ENDPOINT")]
+    pub s3_endpoint: Option<String>,
+    /// Region of the bucket [default: `AWS_REGION`, else us-east-1]
+    #[arg(long, env = "SEGSPLAT_S3_REGION")]
+    pub s3_region: Option<String>,
+    /// Whether the S3 endpoint may be plain http [default: false]
+    #[arg(long, env = "SEGSPLAT_S3_ALLOW_HTTP", num_args = 0..=1, default_missing_value = "true")]
+    pub s3_allow_http: Option<bool>,
+    /// Keep the photos of finished scenes; lazy semantics need them [default: true]
+    #[arg(long, env = "SEGSPLAT_KEEP_PHOTOS", num_args = 0..=1, default_missing_value = "true")]
+    pub keep_photos: Option<bool>,
     /// Scenes made at the same time [default: 1]
     #[arg(long, env = "SEGSPLAT_JOBS")]
     pub jobs: Option<usize>,
@@ -73,12 +95,6 @@ pub struct ConfigArgs {
     /// Show /metrics to callers without an admin's key [default: false]
     #[arg(long, env = "SEGSPLAT_OPEN_METRICS", num_args = 0..=1, default_missing_value = "true")]
     pub open_metrics: Option<bool>,
-    /// Certificate chain (PEM): serve TLS, with --tls-key; read again at SIGHUP
-    #[arg(long, env = "SEGSPLAT_TLS_CERT", value_name = "FILE")]
-    pub tls_cert: Option<PathBuf>,
-    /// Private key of the certificate (PEM)
-    #[arg(long, env = "SEGSPLAT_TLS_KEY", value_name = "FILE")]
-    pub tls_key: Option<PathBuf>,
     /// Origins whose pages may call, as `https://example.org`, or * for all [default: none]
     #[arg(long, env = "SEGSPLAT_CORS_ORIGINS", value_delimiter = ',', value_name = "ORIGINS")]
     pub cors_origins: Option<Vec<String>>,
@@ -91,19 +107,25 @@ pub struct ConfigArgs {
     /// Collector of traces, OTLP over HTTP, as `http://host:4318` [default: what OTEL_* name]
     #[arg(long, env = "SEGSPLAT_OTLP", value_name = "URL")]
     pub otlp: Option<String>,
-    /// Log filter in tracing's syntax [default: info,ort=warn]
-    #[arg(long, env = "SEGSPLAT_LOG")]
-    pub log: Option<String>,
-    /// Log lines as JSON [default: false]
-    #[arg(long, env = "SEGSPLAT_LOG_JSON", num_args = 0..=1, default_missing_value = "true")]
-    pub log_json: Option<bool>,
-    /// Caps on requests; only in the file
-    #[arg(skip)]
-    pub limits: Option<Limits>,
+}
+
+/// Everything that can be typed or set in the environment.
+#[derive(Args, Clone, Debug, Default)]
+pub struct AllArgs {
+    /// Where the server is reached.
+    #[command(flatten)]
+    pub door: DoorArgs,
+    /// What the server does.
+    #[command(flatten)]
+    pub server: ServerArgs,
+    /// Networks, renderer, log.
+    #[command(flatten)]
+    pub config: ConfigArgs,
 }
 
 /// The configuration in force.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 #[non_exhaustive]
 pub struct Config {
     /// Address and port to listen on.
@@ -198,50 +220,40 @@ impl Config {
     ///
     /// # Errors
     /// `invalid_request` when the file cannot be read or parsed, or a value is out of range.
-    pub fn resolve(file: Option<&std::path::Path>, typed: ConfigArgs) -> Result<Self> {
-        let from_file = match file {
-            None => ConfigArgs::default(),
+    pub fn resolve(file: Option<&std::path::Path>, typed: AllArgs) -> Result<Self> {
+        let mut config = match file {
+            None => Self::default(),
             Some(path) => {
                 let text = fs_err::read_to_string(path)
                     .map_err(|e| Error::invalid(format!("config file: {e}")))?;
                 toml::from_str(&text).map_err(|e| Error::invalid(format!("config file: {e}")))?
             }
         };
-        let d = Self::default();
-        let config = Self {
-            listen: typed.listen.or(from_file.listen).unwrap_or(d.listen),
-            data_dir: typed.data_dir.or(from_file.data_dir).unwrap_or(d.data_dir),
-            store: typed.store.or(from_file.store),
-            s3_endpoint: typed.s3_endpoint.or(from_file.s3_endpoint),
-            s3_region: typed.s3_region.or(from_file.s3_region),
-            s3_allow_http: typed
-                .s3_allow_http
-                .or(from_file.s3_allow_http)
-                .unwrap_or(d.s3_allow_http),
-            keep_photos: typed.keep_photos.or(from_file.keep_photos).unwrap_or(d.keep_photos),
-            bundle: typed.bundle.or(from_file.bundle),
-            ort_library: typed.ort_library.or(from_file.ort_library),
-            renderer: typed.renderer.or(from_file.renderer).unwrap_or(d.renderer),
-            adapter: typed.adapter.or(from_file.adapter),
-            provider: typed.provider.or(from_file.provider).unwrap_or(d.provider),
-            threads: typed.threads.or(from_file.threads).unwrap_or(d.threads),
-            jobs: typed.jobs.or(from_file.jobs).unwrap_or(d.jobs),
-            keys: typed.keys.or(from_file.keys),
-            anonymous: typed.anonymous.or(from_file.anonymous).unwrap_or(d.anonymous),
-            open_metrics: typed.open_metrics.or(from_file.open_metrics).unwrap_or(d.open_metrics),
-            tls_cert: typed.tls_cert.or(from_file.tls_cert),
-            tls_key: typed.tls_key.or(from_file.tls_key),
-            cors_origins: typed.cors_origins.or(from_file.cors_origins).unwrap_or(d.cors_origins),
-            drain_notice_ms: typed
-                .drain_notice_ms
-                .or(from_file.drain_notice_ms)
-                .unwrap_or(d.drain_notice_ms),
-            drain_ms: typed.drain_ms.or(from_file.drain_ms).unwrap_or(d.drain_ms),
-            otlp: typed.otlp.or(from_file.otlp),
-            log: typed.log.or(from_file.log).unwrap_or(d.log),
-            log_json: typed.log_json.or(from_file.log_json).unwrap_or(d.log_json),
-            limits: typed.limits.or(from_file.limits).unwrap_or(d.limits),
-        };
+        macro_rules! put_over {
+            ($args:expr, $($name:ident),+) => {
+                $(if let Some(value) = $args.$name { config.$name = value.into(); })+
+            };
+        }
+        let AllArgs { door, server, config: common } = typed;
+        put_over!(door, listen, tls_cert, tls_key);
+        put_over!(
+            server,
+            data_dir,
+            store,
+            s3_endpoint,
+            s3_region,
+            s3_allow_http,
+            keep_photos,
+            jobs,
+            keys,
+            anonymous,
+            open_metrics,
+            cors_origins,
+            drain_notice_ms,
+            drain_ms,
+            otlp
+        );
+        put_over!(common, bundle, ort_library, renderer, adapter, provider, threads, log, log_json);
         config.validate()?;
         Ok(config)
     }
@@ -331,11 +343,4 @@ impl Config {
 #[must_use]
 pub fn available_cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
-}
-
-/// A value of an enum by its name in the configuration file.
-fn named<T: serde::de::DeserializeOwned>(name: &str) -> std::result::Result<T, String> {
-    use serde::de::{IntoDeserializer, value::StrDeserializer};
-    let name: StrDeserializer<'_, serde::de::value::Error> = name.into_deserializer();
-    T::deserialize(name).map_err(|e| e.to_string())
 }

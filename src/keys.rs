@@ -5,11 +5,14 @@
 
 use std::{fmt, path::Path, sync::Arc};
 
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use subtle::{ConditionallySelectable, ConstantTimeEq};
 
-use crate::error::{Error, Result};
+use crate::{
+    error::{Error, Result},
+    names::display_names,
+};
 
 /// Starts every key, so that scanners for leaked secrets can find one.
 const PREFIX: &str = "segsplat_";
@@ -21,7 +24,7 @@ const NAME_BYTES_MAX: usize = 64;
 const KEYS_MAX: usize = 4_096;
 
 /// What a key may do. Each includes those before it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Scope {
     /// Look at scenes, ask them, export them.
@@ -32,17 +35,7 @@ pub enum Scope {
     Admin,
 }
 
-impl Scope {
-    /// The scope's name in the keys file.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Read => "read",
-            Self::Write => "write",
-            Self::Admin => "admin",
-        }
-    }
-}
+display_names!(Scope);
 
 /// Whose scenes a call may see.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]

@@ -31,7 +31,7 @@ pub mod service;
 pub mod store;
 pub mod telemetry;
 
-pub use segsplat_core::{cache, error, limits, scene};
+pub use segsplat_core::{cache, error, limits, names, scene};
 pub use segsplat_render as render;
 pub use segsplat_vision::{capture, lift, models, photos, pipeline, sample, segment, semantics};
 

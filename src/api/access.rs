@@ -164,12 +164,7 @@ impl Access {
         if key.scope < scope {
             return Err(Error::new(
                 ErrorCode::PermissionDenied,
-                format!(
-                    "key {:?} has scope {}; this call needs {}",
-                    key.name,
-                    key.scope.name(),
-                    scope.name()
-                ),
+                format!("key {:?} has scope {}; this call needs {scope}", key.name, key.scope),
             ));
         }
         if let Err(wait) = share.rate.take(Instant::now()) {

@@ -1,17 +1,14 @@
 //! Two doors, one house: HTTP and gRPC on one port, both thin over [`Service`].
 //!
-//! What the two share lives here: who is let in, request ids, what an upload may hold, which camera
-//! fields go together, what can be asked of semantics. `axum` stays in [`http`], `tonic` in
-//! [`grpc`].
+//! What the two share lives here: who is let in, request ids, what an upload may hold. `axum`
+//! stays in [`http`], `tonic` in [`grpc`].
 
 pub mod grpc;
 pub mod http;
 
 mod access;
-mod camera;
 mod life;
 mod request_id;
-mod semantics;
 mod upload;
 
 use std::sync::Arc;

@@ -12,6 +12,7 @@ use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
     scene::{Upload, UploadCameras, UploadFile},
+    service::ModelsInfo,
     telemetry::meter,
 };
 
@@ -207,6 +208,18 @@ impl<'a> UploadBuilder<'a> {
         }
         Ok(())
     }
+}
+
+/// Refuses a bundle that is not the loaded one; an empty name is the loaded one's.
+pub(super) fn check_bundle(asked: &str, models: &ModelsInfo) -> Result<()> {
+    if asked.is_empty() || asked == models.bundle {
+        return Ok(());
+    }
+    let shown: String = asked.chars().take(40).collect();
+    Err(Error::new(
+        ErrorCode::ModelUnavailable,
+        format!("bundle is {shown:?}; this server has {:?} loaded", models.bundle),
+    ))
 }
 
 /// The error of a JSON part of at least `len` bytes.

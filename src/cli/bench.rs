@@ -4,12 +4,15 @@ use std::{path::PathBuf, time::Instant};
 
 use serde_json::json;
 
-use super::{camera::CameraArgs, engine, output::Output, scene_file};
+use super::{camera, engine, output::Output, scene_file};
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
     render::{Kinds, RenderRequest, compare::compare_oracle, plan::default_near},
-    service::{Ask, CameraSpec, Kind, LensSpec, OfflineService, PoseSpec, ViewSpec},
+    service::{
+        CameraFields, CameraSpec, Kind, LensSpec, OfflineService, PictureOptions, PoseSpec,
+        TextOptions, ViewOptions, ViewSpec,
+    },
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -21,7 +24,9 @@ pub(super) struct Args {
     #[arg(long, default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
     frames: u32,
     #[command(flatten)]
-    camera: CameraArgs,
+    camera: CameraFields,
+    #[command(flatten)]
+    options: ViewOptions,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
 }
@@ -39,12 +44,13 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         config.limits.clone(),
     );
     // The first view checks the camera as the server does, and warms up.
-    let options = args.camera.options();
+    let options = &args.options;
     let spec = ViewSpec {
-        camera: args.camera.spec()?.unwrap_or(FIRST),
+        camera: camera::spec(&args.camera)?.unwrap_or(FIRST),
         kind: Kind::Color,
         options: options.clone(),
-        ask: Ask::default(),
+        picture: PictureOptions::default(),
+        text: TextOptions::default(),
     };
     let first = service.render(&scene, &spec)?;
     let near = options.near.unwrap_or_else(|| default_near(scene.meta.report.median_depth));

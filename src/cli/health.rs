@@ -10,7 +10,7 @@ use serde_json::json;
 
 use super::output::Output;
 use crate::{
-    config::{Config, ConfigArgs},
+    config::{Config, DoorArgs},
     error::{Error, ErrorCode, Result},
 };
 
@@ -20,7 +20,7 @@ const PATIENCE: Duration = Duration::from_secs(2);
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
     #[command(flatten)]
-    pub(super) config: ConfigArgs,
+    pub(super) door: DoorArgs,
     /// Ask whether it lives, not whether it is ready
     #[arg(long)]
     live: bool,

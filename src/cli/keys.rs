@@ -12,6 +12,7 @@ use super::output::Output;
 use crate::{
     error::{Error, ErrorCode, Result},
     keys::{self, Keys, Scope},
+    names::named,
 };
 
 /// Longest key read from standard input.
@@ -23,31 +24,22 @@ pub(super) struct Args {
     action: Action,
 }
 
-#[derive(Clone, Copy, Debug, clap::ValueEnum)]
-enum ScopeName {
-    /// Look at scenes, ask them, export them
-    Read,
-    /// Also make and delete scenes
-    Write,
-    /// Also see everybody's scenes and the metrics
-    Admin,
-}
-
 #[derive(Clone, Debug, Subcommand)]
 enum Action {
     /// Make a key: it is shown once; the keys file gets its hash
     New {
         /// Name of the key, for log and metrics
         name: String,
-        /// What it may do
-        #[arg(long, value_enum, default_value = "write")]
-        scope: ScopeName,
+        /// What it may do: `read` looks at scenes, asks them and exports them; `write` also makes
+        /// and deletes scenes; `admin` also sees everybody's scenes and the metrics
+        #[arg(long, default_value = "write", value_parser = named::<Scope>)]
+        scope: Scope,
         /// Whose scenes it makes and sees; keys of one owner share them [default: NAME]
         #[arg(long)]
         owner: Option<String>,
         /// Keys file to add it to; without one its entry is printed
-        #[arg(long, value_name = "FILE")]
-        file: Option<PathBuf>,
+        #[arg(long, value_name = "FILE", alias = "file")]
+        keys: Option<PathBuf>,
     },
     /// Read a key from standard input and print its hash
     Hash,
@@ -55,13 +47,8 @@ enum Action {
 
 pub(super) fn run(args: &Args, out: &Output) -> Result<()> {
     match &args.action {
-        Action::New { name, scope, owner, file } => {
-            let scope = match scope {
-                ScopeName::Read => Scope::Read,
-                ScopeName::Write => Scope::Write,
-                ScopeName::Admin => Scope::Admin,
-            };
-            new(name, scope, owner.as_deref(), file.as_deref(), out)
+        Action::New { name, scope, owner, keys } => {
+            new(name, *scope, owner.as_deref(), keys.as_deref(), out)
         }
         Action::Hash => {
             let mut key = String::new();
@@ -79,19 +66,19 @@ fn new(
     name: &str,
     scope: Scope,
     owner: Option<&str>,
-    file: Option<&Path>,
+    keys_file: Option<&Path>,
     out: &Output,
 ) -> Result<()> {
     keys::check_name("name", name)?;
     owner.map_or(Ok(()), |owner| keys::check_name("owner", owner))?;
     let key = keys::generate()?;
     let owner_line = owner.map(|owner| format!("owner = \"{owner}\"\n")).unwrap_or_default();
-    let (scope, sha256) = (scope.name(), keys::hash(&key));
+    let sha256 = keys::hash(&key);
     let entry = format!(
         "[[key]]\nname = \"{name}\"\n{owner_line}sha256 = \"{sha256}\"\nscopes = [\"{scope}\"]\n"
     );
     let value = json!({ "name": name, "key": key, "sha256": sha256, "scope": scope });
-    let Some(path) = file else {
+    let Some(path) = keys_file else {
         return out.answer(&format!("{key}\n\nfor the keys file:\n\n{entry}"), &value);
     };
     add(path, &entry)?;

@@ -20,12 +20,15 @@ mod serve;
 
 use std::{ffi::OsString, path::PathBuf, process::ExitCode};
 
-use clap::{Parser, Subcommand};
+use clap::{
+    Parser, Subcommand,
+    error::{ContextKind, ErrorKind},
+};
 
 use self::output::Output;
 use crate::{
-    config::{Config, ConfigArgs},
-    error::Result,
+    config::{AllArgs, Config, ConfigArgs},
+    error::{Error, Result},
     telemetry,
 };
 
@@ -68,16 +71,17 @@ enum Command {
 }
 
 impl Command {
-    fn config_args(&self) -> ConfigArgs {
+    fn config_args(&self) -> AllArgs {
+        let common = |config: &ConfigArgs| AllArgs { config: config.clone(), ..AllArgs::default() };
         match self {
             Self::Serve(args) => args.config.clone(),
-            Self::Health(args) => args.config.clone(),
-            Self::Reconstruct(args) => args.config.clone(),
-            Self::Render(args) => args.config.clone(),
-            Self::Query(args) => args.config.clone(),
-            Self::Models(args) => args.config.clone(),
-            Self::Bench(args) => args.config.clone(),
-            Self::Inspect(_) | Self::Sample(_) | Self::Keys(_) => ConfigArgs::default(),
+            Self::Health(args) => AllArgs { door: args.door.clone(), ..AllArgs::default() },
+            Self::Reconstruct(args) => common(&args.config),
+            Self::Render(args) => common(&args.config),
+            Self::Query(args) => common(&args.config),
+            Self::Models(args) => common(&args.config),
+            Self::Bench(args) => common(&args.config),
+            Self::Inspect(_) | Self::Sample(_) | Self::Keys(_) => AllArgs::default(),
         }
     }
 }
@@ -90,8 +94,17 @@ pub fn main() -> ExitCode {
 }
 
 fn run(args: impl IntoIterator<Item = OsString>) -> ExitCode {
-    let cli = match Cli::try_parse_from(args) {
+    // The flag's name before there was `--profile`.
+    let today = |arg: OsString| if arg == "--paper" { "--profile=paper".into() } else { arg };
+    let args: Vec<OsString> = args.into_iter().map(today).collect();
+    let cli = match Cli::try_parse_from(&args) {
         Ok(cli) => cli,
+        // A value that is none is an error as any other, also as JSON.
+        Err(wrong) if wrong.kind() == ErrorKind::ValueValidation => {
+            let error = Error::invalid(about(&wrong));
+            Output::new(args.iter().any(|arg| arg == "--json")).error(&error);
+            return ExitCode::from(error.code().row().exit);
+        }
         // Also `--help` and `--version`, which are no errors; clap knows the stream and the code.
         Err(told) => {
             let code = u8::try_from(told.exit_code()).unwrap_or(2);
@@ -108,9 +121,17 @@ fn run(args: impl IntoIterator<Item = OsString>) -> ExitCode {
     }
 }
 
+/// The flag, the value given and what it must be.
+fn about(wrong: &clap::Error) -> String {
+    let text = |kind| wrong.get(kind).map(ToString::to_string).unwrap_or_default();
+    let why = std::error::Error::source(wrong).map(ToString::to_string).unwrap_or_default();
+    let (flag, value) = (text(ContextKind::InvalidArg), text(ContextKind::InvalidValue));
+    format!("{flag}: {value:?}: {why}")
+}
+
 fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
     let typed = cli.command.config_args();
-    let quiet = typed.log.is_none() && !matches!(cli.command, Command::Serve(_));
+    let quiet = typed.config.log.is_none() && !matches!(cli.command, Command::Serve(_));
     let mut config = Config::resolve(cli.config.as_deref(), typed)?;
     if quiet {
         "warn".clone_into(&mut config.log);

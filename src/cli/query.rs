@@ -5,23 +5,18 @@ use std::{
     path::{Path, PathBuf},
 };
 
-use clap::ValueEnum;
-
-use super::{camera::CameraArgs, engine, output::Output, scene_file};
+use super::{camera, engine, output::Output, scene_file};
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
+    names::named,
     scene::ScoringProfile,
-    service::{Boxes, MaskFormat, OfflineService, QueryAnswer, QuerySpec, TextResult},
+    service::{
+        Boxes, CameraFields, MaskFormat, OfflineService, QueryAnswer, QuerySpec, TextResult,
+        ViewOptions,
+    },
     store::ply::PlyWriter,
 };
-
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum BoxesArg {
-    Oriented,
-    Aligned,
-    None,
-}
 
 #[derive(Clone, Debug, clap::Args)]
 #[command(allow_negative_numbers = true)]
@@ -34,34 +29,32 @@ pub(super) struct Args {
     /// Mask of the view (.png), or the Gaussians selected (.ply); of several texts one file each
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Boxes of the parts
-    #[arg(long, value_enum, default_value = "oriented")]
-    boxes: BoxesArg,
-    /// Score texts as the paper does
-    #[arg(long)]
-    paper: bool,
+    /// Boxes of the parts: oriented, aligned or none
+    #[arg(long, default_value = "oriented", value_parser = named::<Boxes>)]
+    boxes: Boxes,
+    /// How texts are scored: default, or paper
+    #[arg(long, default_value = "default", value_parser = named::<ScoringProfile>)]
+    profile: ScoringProfile,
     #[command(flatten)]
-    camera: CameraArgs,
+    camera: CameraFields,
+    #[command(flatten)]
+    options: ViewOptions,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
 }
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let ending = args.output.as_deref().map(ending_of).transpose()?;
-    let camera = args.camera.spec()?;
-    if ending == Some(Ending::Png) && camera.is_none() {
-        return Err(super::camera::no_camera());
+    let of_view = camera::spec(&args.camera)?;
+    if ending == Some(Ending::Png) && of_view.is_none() {
+        return Err(camera::no_camera());
     }
-    let profile = if args.paper { ScoringProfile::Paper } else { ScoringProfile::Default };
+    let profile = args.profile;
     let spec = QuerySpec {
         texts: args.texts.clone(),
-        camera,
-        options: args.camera.options(),
-        boxes: match args.boxes {
-            BoxesArg::Oriented => Boxes::Oriented,
-            BoxesArg::Aligned => Boxes::Aligned,
-            BoxesArg::None => Boxes::None,
-        },
+        camera: of_view,
+        options: args.options.clone(),
+        boxes: args.boxes,
         mask: if ending == Some(Ending::Png) { MaskFormat::Png } else { MaskFormat::Rle },
         profile,
         ..QuerySpec::default()

@@ -22,6 +22,7 @@ use crate::{
         PipelineMaker, PipelineSemantics, SceneMaker, SemanticsMaker, SemanticsWork, Work,
         content_sha256,
     },
+    names::named,
     photos,
     pipeline::{Engine, LateEngine},
     scene::{Density, Provenance, Scene, SceneId, SceneMeta, SceneOptions, SemanticsMode, Upload},
@@ -42,7 +43,7 @@ pub(super) struct Args {
     #[arg(long, value_parser = semantics, default_value = "off")]
     semantics: SemanticsMode,
     /// Gaussians kept: `thinned`, one for up to 16 neighbours where the photos are flat, or `full`
-    #[arg(long, value_parser = |name: &str| Density::named(name), default_value = "thinned")]
+    #[arg(long, value_parser = named::<Density>, default_value = "thinned")]
     density: Density,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
@@ -139,10 +140,9 @@ fn forget(path: &Path) -> Result<()> {
 }
 
 fn semantics(name: &str) -> Result<SemanticsMode, String> {
-    match name {
-        "eager" => Ok(SemanticsMode::Eager),
-        "off" => Ok(SemanticsMode::Off),
-        _ => Err("eager or off".to_owned()),
+    match named(name) {
+        Ok(SemanticsMode::Lazy) | Err(_) => Err("it must be eager or off".to_owned()),
+        mode => mode,
     }
 }
 

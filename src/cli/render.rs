@@ -8,7 +8,7 @@ use std::{
 use serde_json::json;
 
 use super::{
-    camera::{CameraArgs, no_camera, numbers},
+    camera::{self, no_camera},
     engine,
     output::Output,
     scene_file,
@@ -16,8 +16,11 @@ use super::{
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
-    scene::{Region, ScoringProfile},
-    service::{Ask, Format, Kind, OfflineService, ViewOptions, ViewSpec},
+    names::named,
+    service::{
+        CameraFields, Format, Kind, OfflineService, PictureOptions, TextOptions, ViewOptions,
+        ViewSpec,
+    },
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -29,22 +32,16 @@ pub(super) struct Args {
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     #[command(flatten)]
-    camera: CameraArgs,
+    camera: CameraFields,
+    #[command(flatten)]
+    options: ViewOptions,
+    #[command(flatten)]
+    picture: PictureOptions,
     /// What to draw: color, depth, alpha, semantics, relevancy or mask
-    #[arg(long, default_value = "color", value_parser = kind)]
+    #[arg(long, default_value = "color", value_parser = named::<Kind>)]
     kind: Kind,
-    /// What to look for, for relevancy and mask
-    #[arg(long)]
-    text: Option<String>,
-    /// Score the text as the paper does
-    #[arg(long)]
-    paper: bool,
-    /// Background colour, each 0 to 1 [default: the scene's backdrop]
-    #[arg(long, value_name = "R,G,B", value_delimiter = ',')]
-    background: Option<Vec<f32>>,
-    /// Draw only this part of the picture, pixels
-    #[arg(long, value_name = "X,Y,WIDTH,HEIGHT", value_delimiter = ',')]
-    crop: Option<Vec<u32>>,
+    #[command(flatten)]
+    text: TextOptions,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
 }
@@ -86,46 +83,21 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
 }
 
 fn spec(args: &Args) -> Result<ViewSpec> {
-    let background = match &args.background {
-        Some(background) => Some(numbers(background, "--background")?),
-        None => None,
-    };
-    let crop = match &args.crop {
-        Some(crop) => {
-            let [x, y, width, height] = numbers(crop, "--crop")?;
-            Some(Region { x, y, width, height })
-        }
-        None => None,
-    };
-    let profile = if args.paper { ScoringProfile::Paper } else { ScoringProfile::Default };
     Ok(ViewSpec {
-        camera: args.camera.spec()?.ok_or_else(no_camera)?,
+        camera: camera::spec(&args.camera)?.ok_or_else(no_camera)?,
         kind: args.kind,
-        options: ViewOptions {
-            format: format_of(&args.output)?,
-            background,
-            crop,
-            ..args.camera.options()
-        },
-        ask: Ask { text: args.text.clone(), profile, wait: None },
+        options: args.options.clone(),
+        picture: PictureOptions { format: format_of(&args.output)?, ..args.picture.clone() },
+        text: args.text.clone(),
     })
-}
-
-fn kind(name: &str) -> Result<Kind, String> {
-    let known = Kind::ALL.into_iter().find(|kind| kind.name() == name);
-    known.ok_or_else(|| Kind::ALL.map(Kind::name).join(", "))
 }
 
 fn format_of(path: &Path) -> Result<Format> {
     let end = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-    match end.as_str() {
-        "png" => Ok(Format::Png),
-        "jpg" | "jpeg" => Ok(Format::Jpeg),
-        "webp" => Ok(Format::Webp),
-        "npy" => Ok(Format::Npy),
-        _ => Err(Error::invalid(format!(
+    named(&end).map_err(|_| {
+        Error::invalid(format!(
             "{}: the ending says the format: png, jpg, webp or npy",
             path.display()
-        ))),
-    }
+        ))
+    })
 }

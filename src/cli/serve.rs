@@ -8,7 +8,7 @@ use tokio::net::TcpListener;
 use super::{engine, output::Output};
 use crate::{
     api::Doors,
-    config::{Config, ConfigArgs},
+    config::{AllArgs, Config},
     error::{Error, ErrorCode, Result},
     pipeline::LateEngine,
     service::Service,
@@ -17,7 +17,7 @@ use crate::{
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
     #[command(flatten)]
-    pub(super) config: ConfigArgs,
+    pub(super) config: AllArgs,
     /// Print the configuration in force as JSON and stop
     #[arg(long)]
     print_config: bool,

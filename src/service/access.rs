@@ -44,7 +44,7 @@ impl SceneAccess {
             (SceneState::Failed, Some(error)) => {
                 not_ready(format!("scene {id} failed with {}: {}", error.code, error.message))
             }
-            (state, _) => not_ready(format!("scene {id} is {}", state.name())),
+            (state, _) => not_ready(format!("scene {id} is {state}")),
         }
     }
 }

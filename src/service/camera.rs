@@ -2,10 +2,11 @@
 
 use glam::DVec3;
 
-use super::types::{CameraSpec, LensSpec, PoseSpec, ViewOptions};
+use super::request::{CameraSpec, LensSpec, PoseSpec, ViewOptions};
 use crate::{
     error::{Error, Result},
     limits::Limits,
+    names::shown,
     scene::{Camera, CameraToWorld, Intrinsics, SceneCamera},
 };
 
@@ -30,7 +31,10 @@ pub(super) fn resolve(
     let (from, to, t) = match spec.pose {
         PoseSpec::Between { from, to, t } => {
             if !(0.0..=1.0).contains(&t) {
-                return Err(Error::invalid(format!("{what}: t is {t}; it must be 0 to 1")));
+                return Err(Error::invalid(format!(
+                    "{what}: t is {}; it must be 0 to 1",
+                    shown(t)
+                )));
             }
             (input(inputs, from, "from", what)?, input(inputs, to, "to", what)?, t)
         }
@@ -65,6 +69,17 @@ fn input<'a>(
 }
 
 fn pose(spec: &CameraSpec, inputs: &[SceneCamera], what: &str) -> Result<CameraToWorld> {
+    if let PoseSpec::LookAt { eye, target, up } = spec.pose {
+        for (name, point) in [("eye", eye), ("target", target), ("up", up.unwrap_or_default())] {
+            let far = point.into_iter().find(|v| v.is_finite() && v.abs() > COORDINATE_MAX);
+            if let Some(far) = far {
+                return Err(Error::invalid(format!(
+                    "{what}: {name} has {}; coordinates reach at most {COORDINATE_MAX:e}",
+                    shown(far)
+                )));
+            }
+        }
+    }
     let pose = match spec.pose {
         PoseSpec::CameraToWorld(matrix) => CameraToWorld::from_row_major(&matrix, what)?,
         PoseSpec::LookAt { eye, target, up } => CameraToWorld::look_at(
@@ -167,8 +182,10 @@ fn lens(spec: &LensSpec, of_scene: Intrinsics, what: &str) -> Result<Intrinsics>
         LensSpec::Fov(degrees) => {
             if !(FOV_RANGE[0]..=FOV_RANGE[1]).contains(&degrees) {
                 return Err(Error::invalid(format!(
-                    "{what}: fov is {degrees} degrees; it must be {} to {}",
-                    FOV_RANGE[0], FOV_RANGE[1]
+                    "{what}: fov is {} degrees; it must be {} to {}",
+                    shown(degrees),
+                    FOV_RANGE[0],
+                    FOV_RANGE[1]
                 )));
             }
             vertical_fov(degrees, width, height)
@@ -187,7 +204,8 @@ fn lens(spec: &LensSpec, of_scene: Intrinsics, what: &str) -> Result<Intrinsics>
     ] {
         if !(least..=FOCAL_RANGE[1]).contains(&value) {
             return Err(Error::invalid(format!(
-                "{what}: {name} is {value} px; it must be {least} to {}",
+                "{what}: {name} is {} px; it must be {least} to {}",
+                shown(value),
                 FOCAL_RANGE[1]
             )));
         }

@@ -4,10 +4,7 @@ use std::{hash::BuildHasher, sync::Arc, time::Duration};
 
 use sha2::{Digest, Sha256};
 
-use super::{
-    Inner, Service,
-    types::{CreateScene, Created},
-};
+use super::{Inner, Service, request::CreateScene, types::Created};
 use crate::{
     error::{Error, Result},
     keys::Caller,

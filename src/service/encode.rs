@@ -5,7 +5,7 @@ use image::{
     codecs::{jpeg::JpegEncoder, png::PngEncoder, webp::WebPEncoder},
 };
 
-use super::types::{Format, Kind};
+use super::request::{Format, Kind};
 use crate::{
     error::{Error, Result},
     render::Frame,
@@ -68,7 +68,7 @@ pub(super) fn check(kind: Kind, format: Format) -> Result<()> {
         )),
         (Kind::Mask | Kind::Semantics, Format::Jpeg) => Err(Error::invalid(format!(
             "kind={} does not survive JPEG: ask for png, webp or npy",
-            kind.name()
+            kind
         ))),
         _ => Ok(()),
     }

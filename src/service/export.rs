@@ -7,9 +7,10 @@ use tokio::sync::mpsc;
 use super::{
     Service,
     create::blocking,
+    request::{ExportFormat, TextOptions},
     search::SceneTexts,
     texts,
-    types::{Ask, Export, ExportFormat},
+    types::Export,
     view::{asked_words, hash},
 };
 use crate::{
@@ -27,7 +28,12 @@ impl Service {
     /// # Errors
     /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; with a text also what
     /// [`Service::query`] says.
-    pub async fn export(&self, id: &SceneId, format: ExportFormat, ask: &Ask) -> Result<Export> {
+    pub async fn export(
+        &self,
+        id: &SceneId,
+        format: ExportFormat,
+        ask: &TextOptions,
+    ) -> Result<Export> {
         let access = self.scene(id).await?;
         let ExportFormat::Ply = format;
         let inner = Arc::clone(&self.inner);
@@ -45,7 +51,8 @@ impl Service {
         let text = texts::checked(text, "text", &self.limits())?;
         let understood = inner.understood(&access.finished()?, "text", ask.wait).await?;
         let tag = understood.tag();
-        let etag = hash(&asked_words(&tag, &Ask { text: Some(text.clone()), ..ask.clone() })?);
+        let etag =
+            hash(&asked_words(&tag, &TextOptions { text: Some(text.clone()), ..ask.clone() })?);
         let profile = ask.profile;
         let chosen = blocking(move || {
             let subject = understood.subject(&tag);

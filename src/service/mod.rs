@@ -12,6 +12,7 @@ mod memory;
 mod offline;
 mod pick;
 mod query;
+mod request;
 mod rle;
 mod schedule;
 mod search;
@@ -31,12 +32,15 @@ use tokio::sync::Semaphore;
 use self::{memory::Memory, schedule::Scheduler, search::Backend};
 pub use self::{
     offline::OfflineService,
+    request::{
+        Background, Boxes, CameraFields, CameraSpec, CreateScene, ExportFormat, Format, Kind,
+        LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions, PoseSpec, QuerySpec,
+        TextOptions, ViewOptions, ViewSpec, ViewsSpec,
+    },
     rle::Rle,
     types::{
-        Ask, Boxes, CameraSpec, CreateScene, Created, Export, ExportFormat, Format, Kind, Label,
-        LensSpec, MaskFormat, ModelInfo, ModelsInfo, Page, PageRequest, Part3, Peak, PickSpec,
-        Picked, PoseSpec, QueryAnswer, QuerySpec, Readiness, RenderedView, TextResult, TextView,
-        TextWarning, ViewOptions, ViewSpec, ViewsSpec,
+        Created, Export, Label, ModelInfo, ModelsInfo, Page, Part3, Peak, Picked, QueryAnswer,
+        Readiness, RenderedView, TextResult, TextView, TextWarning,
     },
 };
 pub use crate::render::{Quality, plan::default_near};
@@ -199,12 +203,14 @@ impl Service {
     /// A page of scenes, newest first, without cameras.
     ///
     /// # Errors
-    /// `invalid_request` when `after` is not a `next` of an earlier page.
+    /// `invalid_request` when `limit` is out of range or `after` not a `next` of an earlier page.
     pub async fn list(&self, page: &PageRequest) -> Result<Page> {
         let max = self.limits().page_max;
         let limit = match page.limit {
-            Some(0) => return Err(Error::invalid(format!("limit is 0; it must be 1 to {max}"))),
-            Some(limit) => limit.min(max),
+            Some(limit) if !(1..=max).contains(&limit) => {
+                return Err(Error::invalid(format!("limit is {limit}; it must be 1 to {max}")));
+            }
+            Some(limit) => limit,
             None => max,
         };
         let after = page.after.as_deref().map(parse_cursor).transpose()?;

@@ -4,9 +4,10 @@ use std::sync::Arc;
 
 use super::{
     pick, query,
+    request::{Kind, PickSpec, PictureOptions, QuerySpec, ViewSpec},
     search::{Backend, SceneTexts, Subject},
     texts,
-    types::{Kind, PickSpec, Picked, QueryAnswer, QuerySpec, RenderedView, ViewSpec},
+    types::{Picked, QueryAnswer, RenderedView},
     view::resolve_one,
 };
 use crate::{
@@ -61,11 +62,17 @@ impl OfflineService {
     /// # Errors
     /// As there; `semantics_off` where the scene has no semantics.
     pub fn render(&self, scene: &Scene, spec: &ViewSpec) -> Result<RenderedView> {
-        let ask = texts::check_ask(&[spec.kind], &spec.ask, &self.limits)?;
-        let view = resolve_one(scene, spec.camera, spec.kind, &spec.options, &self.limits)?;
+        let ask = texts::check_ask(&[spec.kind], &spec.text, &self.limits)?;
+        let view = resolve_one(
+            scene,
+            spec.camera,
+            spec.kind,
+            (&spec.options, &spec.picture),
+            &self.limits,
+        )?;
         let texts = match spec.kind.needs_semantics() {
             true => {
-                let subject = self.subject(scene, &format!("kind={}", spec.kind.name()))?;
+                let subject = self.subject(scene, &format!("kind={}", spec.kind))?;
                 let text = ask.text.as_slice();
                 Some(SceneTexts::new(&self.backend, subject, ask.profile, text)?)
             }
@@ -80,9 +87,15 @@ impl OfflineService {
     /// As there; `semantics_off` where the scene has no semantics.
     pub fn query(&self, scene: &Scene, spec: &QuerySpec) -> Result<QueryAnswer> {
         let texts = texts::all_checked(&spec.texts, "texts", &self.limits)?;
-        let view = spec
-            .camera
-            .map(|camera| resolve_one(scene, camera, Kind::Mask, &spec.options, &self.limits));
+        let view = spec.camera.map(|camera| {
+            resolve_one(
+                scene,
+                camera,
+                Kind::Mask,
+                (&spec.options, &PictureOptions::default()),
+                &self.limits,
+            )
+        });
         let view = view.transpose()?;
         let subject = self.subject(scene, "query")?;
         let asked = SceneTexts::new(&self.backend, subject, spec.profile, &texts)?;
@@ -94,7 +107,13 @@ impl OfflineService {
     /// # Errors
     /// As there.
     pub fn pick(&self, scene: &Scene, spec: &PickSpec) -> Result<Picked> {
-        let view = resolve_one(scene, spec.camera, Kind::Alpha, &spec.options, &self.limits)?;
+        let view = resolve_one(
+            scene,
+            spec.camera,
+            Kind::Alpha,
+            (&spec.options, &PictureOptions::default()),
+            &self.limits,
+        )?;
         pick::pick(&self.backend.planner, scene, &view, [spec.x, spec.y])
     }
 

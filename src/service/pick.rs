@@ -4,14 +4,16 @@ use std::sync::Arc;
 
 use super::{
     Inner, Service,
+    request::{Kind, PickSpec, PictureOptions},
     search::SceneTexts,
     semantics::Understood,
     texts,
-    types::{Kind, Label, PickSpec, Picked},
-    view::{Resolved, refuse_crop, resolve_for},
+    types::{Label, Picked},
+    view::{Resolved, resolve_for},
 };
 use crate::{
     error::{Error, Result},
+    names::shown,
     render::{Kinds, ViewPlanner},
     scene::{Scene, SceneId},
 };
@@ -30,7 +32,8 @@ pub(super) fn pick(
     for (whole, (value, size, name, side)) in whole.iter_mut().zip(pixel) {
         if !(0.0..f64::from(size)).contains(&value) {
             return Err(Error::invalid(format!(
-                "{name} is {value}; the picture is {size} px {side}"
+                "{name} is {}; the picture is {size} px {side}",
+                shown(value)
             )));
         }
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked")]
@@ -89,11 +92,11 @@ impl Service {
     pub async fn pick(&self, id: &SceneId, spec: PickSpec) -> Result<Picked> {
         let scene = self.scene(id).await?;
         let inner = &self.inner;
-        refuse_crop(&spec.options, "pick")?;
         let scene = scene.finished()?;
         let cameras = [spec.camera];
-        let view =
-            resolve_for(inner, scene.record(), &cameras, &[Kind::Alpha], &spec.options)?.pop();
+        let picture = PictureOptions::default();
+        let options = (&spec.options, &picture);
+        let view = resolve_for(inner, scene.record(), &cameras, &[Kind::Alpha], options)?.pop();
         let view = view.ok_or_else(|| Error::internal("one camera gave no request"))?;
         let (labels, understood) = if spec.labels.is_empty() {
             (Vec::new(), None)

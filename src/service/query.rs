@@ -8,13 +8,12 @@ use rayon::prelude::*;
 use super::{
     Service,
     encode::{self, Layer},
+    request::{Boxes, Format, Kind, MaskFormat, PictureOptions, QuerySpec},
     rle::Rle,
     search::{LabelledView, SceneTexts, ScoredText},
     texts,
-    types::{
-        Boxes, Format, Kind, MaskFormat, Part3, Peak, QueryAnswer, QuerySpec, TextResult, TextView,
-    },
-    view::{Resolved, refuse_crop, resolve_for},
+    types::{Part3, Peak, QueryAnswer, TextResult, TextView},
+    view::{Resolved, resolve_for},
 };
 use crate::{
     error::Result,
@@ -165,13 +164,14 @@ impl Service {
         let scene = self.scene(id).await?;
         let inner = &self.inner;
         inner.can_understand("query")?;
-        refuse_crop(&spec.options, "query")?;
         let texts = texts::all_checked(&spec.texts, "texts", &self.limits())?;
         let scene = scene.finished()?;
         let view = match spec.camera {
             Some(camera) => {
                 let cameras = [camera];
-                resolve_for(inner, scene.record(), &cameras, &[Kind::Mask], &spec.options)?.pop()
+                let picture = PictureOptions::default();
+                let options = (&spec.options, &picture);
+                resolve_for(inner, scene.record(), &cameras, &[Kind::Mask], options)?.pop()
             }
             None => None,
         };

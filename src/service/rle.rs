@@ -1,9 +1,10 @@
 //! Masks as COCO's compressed run lengths: column by column, as `pycocotools` reads and writes.
 
 use serde::Serialize;
+use utoipa::ToSchema;
 
 /// A mask as run lengths, off and on in turn, beginning with off.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, ToSchema)]
 pub struct Rle {
     /// Height and width, pixels.
     pub size: [u32; 2],

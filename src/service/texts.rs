@@ -1,6 +1,6 @@
 //! Texts at the door: how many, how long, of what.
 
-use super::types::{Ask, Kind};
+use super::request::{Kind, TextOptions};
 use crate::{
     error::{Error, Result},
     limits::Limits,
@@ -28,26 +28,23 @@ pub(super) fn checked(text: &str, what: &str, limits: &Limits) -> Result<String>
 
 /// Refuses a text without a kind that takes one, and such a kind without a text; gives the text
 /// checked.
-pub(super) fn check_ask(kinds: &[Kind], ask: &Ask, limits: &Limits) -> Result<Ask> {
+pub(super) fn check_ask(kinds: &[Kind], ask: &TextOptions, limits: &Limits) -> Result<TextOptions> {
     let takes = kinds.iter().find(|kind| kind.takes_text());
     let text = match (&ask.text, takes) {
         (None, None) => None,
         (Some(text), Some(_)) => Some(checked(text, "text", limits)?),
         (None, Some(kind)) => {
-            return Err(Error::invalid(format!(
-                "kind={} needs text: what to look for",
-                kind.name()
-            )));
+            return Err(Error::invalid(format!("kind={kind} needs text: what to look for")));
         }
         (Some(_), None) => {
-            let names: Vec<_> = kinds.iter().map(|kind| kind.name()).collect();
+            let names: Vec<_> = kinds.iter().map(ToString::to_string).collect();
             return Err(Error::invalid(format!(
                 "text goes with kind=relevancy and kind=mask, not with {}",
                 names.join(", ")
             )));
         }
     };
-    Ok(Ask { text, ..ask.clone() })
+    Ok(TextOptions { text, ..ask.clone() })
 }
 
 /// Each of `texts` checked; there must be 1 to `limits.texts_max`. `what` names the list.

@@ -1,29 +1,19 @@
-//! What goes into the use cases and what comes out: plain data, no transport's words.
+//! What the use cases answer: plain data. The requests are in `request.rs`.
 
-use std::{fmt, time::Duration};
+use std::fmt;
 
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
-use super::{base64, rle::Rle};
-use crate::{
-    render::{FrameStats, Quality},
-    scene::{Camera, Region, SceneOptions, SceneStatus, ScoringProfile, Upload},
+use super::{
+    base64,
+    request::{Format, Kind},
+    rle::Rle,
 };
-
-/// Everything needed to make a scene.
-#[derive(Clone, Debug, Default)]
-pub struct CreateScene {
-    /// Photos and cameras.
-    pub upload: Upload,
-    /// How to make it.
-    pub options: SceneOptions,
-    /// Two calls with one key and the same content make one scene; other content is refused.
-    pub idempotency_key: Option<String>,
-    /// How long to wait for the scene before answering, capped by `limits.wait_ms_max`.
-    pub wait: Option<Duration>,
-    /// Id of the request, for the log and the trace of the scene's job.
-    pub request_id: Option<String>,
-}
+use crate::{
+    render::FrameStats,
+    scene::{Camera, SceneStatus, ScoringProfile},
+};
 
 /// Answer of a create call.
 #[derive(Clone, Debug)]
@@ -34,17 +24,8 @@ pub struct Created {
     pub replayed: bool,
 }
 
-/// Which page of the list.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct PageRequest {
-    /// Scenes on the page; `None` or more than `limits.page_max`: that many.
-    pub limit: Option<usize>,
-    /// `next` of the page before.
-    pub after: Option<String>,
-}
-
 /// A page of scenes, newest first, without cameras.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]
 pub struct Page {
     /// The scenes.
     pub scenes: Vec<SceneStatus>,
@@ -52,252 +33,9 @@ pub struct Page {
     pub next: Option<String>,
 }
 
-/// Which picture.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Kind {
-    /// sRGB colour over the background.
-    #[default]
-    Color,
-    /// Expected depth, world units, 0 where nothing is.
-    Depth,
-    /// Accumulated opacity, 0..1.
-    Alpha,
-    /// A fixed colour for each entry of the semantic bank, black where there is none.
-    Semantics,
-    /// How well each pixel fits a text, 0..1.
-    Relevancy,
-    /// Where the relevancy is at least 0.5.
-    Mask,
-}
-
-impl Kind {
-    /// Every kind.
-    pub const ALL: [Self; 6] =
-        [Self::Color, Self::Depth, Self::Alpha, Self::Semantics, Self::Relevancy, Self::Mask];
-
-    /// The kind's snake_case name.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Color => "color",
-            Self::Depth => "depth",
-            Self::Alpha => "alpha",
-            Self::Semantics => "semantics",
-            Self::Relevancy => "relevancy",
-            Self::Mask => "mask",
-        }
-    }
-
-    /// Whether it answers a text.
-    #[must_use]
-    pub fn takes_text(self) -> bool {
-        matches!(self, Self::Relevancy | Self::Mask)
-    }
-
-    /// Whether it needs to know what the scene means.
-    #[must_use]
-    pub fn needs_semantics(self) -> bool {
-        self == Self::Semantics || self.takes_text()
-    }
-}
-
-/// What is asked by text, and how it is scored.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Ask {
-    /// The text; for kinds and exports that take one.
-    pub text: Option<String>,
-    /// How it is scored.
-    pub profile: ScoringProfile,
-    /// How long to wait for semantics that are being made; `None`: `limits.text_wait_ms`.
-    pub wait: Option<Duration>,
-}
-
-/// How a picture is encoded.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Format {
-    /// 8-bit RGB or grey; 16-bit grey for depth.
-    #[default]
-    Png,
-    /// 8-bit, quality 90; not for depth.
-    Jpeg,
-    /// 8-bit, lossless; not for depth.
-    Webp,
-    /// `NumPy` array of little-endian f32, `[H, W, 3]` or `[H, W]`, not clamped.
-    Npy,
-}
-
-/// Where a camera stands.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum PoseSpec {
-    /// 16 numbers, row-major, OpenCV camera-to-world.
-    CameraToWorld([f64; 16]),
-    /// A camera at `eye` that looks at `target`.
-    LookAt {
-        /// Camera centre.
-        eye: [f64; 3],
-        /// Point in the middle of the picture (where the principal point is central).
-        target: [f64; 3],
-        /// Up in the picture; `None`: that of the input cameras, else (0, -1, 0).
-        up: Option<[f64; 3]>,
-    },
-    /// Between two input cameras.
-    Between {
-        /// Index of one input camera.
-        from: usize,
-        /// Index of the other.
-        to: usize,
-        /// 0 at `from`, 1 at `to`; centre linear, rotation by slerp, lens linear.
-        t: f64,
-    },
-}
-
-/// Lens of a camera.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub enum LensSpec {
-    /// Pixels of the picture asked for. Without `cx`, `cy` the principal point is central.
-    Focal {
-        /// Focal length along x, pixels.
-        fx: f64,
-        /// Focal length along y, pixels; `None`: `fx`.
-        fy: Option<f64>,
-        /// Principal point x, pixels; `None`: half the width.
-        cx: Option<f64>,
-        /// Principal point y, pixels; `None`: half the height.
-        cy: Option<f64>,
-    },
-    /// Vertical field of view in degrees, square pixels, central principal point.
-    Fov(f64),
-    /// That of the input camera (of the first one, or of `from` and `to`), fitted to the size.
-    #[default]
-    OfScene,
-}
-
-/// A camera as asked for.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct CameraSpec {
-    /// Where it stands.
-    pub pose: PoseSpec,
-    /// What it sees with.
-    pub lens: LensSpec,
-}
-
-/// What all pictures of one request share.
-#[derive(Clone, Debug, PartialEq)]
-pub struct ViewOptions {
-    /// Width, pixels; `None`: from the height and the input camera's shape, longer side at
-    /// most 384 where both are missing.
-    pub width: Option<u32>,
-    /// Height, pixels; `None`: as for the width.
-    pub height: Option<u32>,
-    /// Encoding.
-    pub format: Format,
-    /// Background colour, 0..1; `None`: the scene's backdrop.
-    pub background: Option<[f32; 3]>,
-    /// gsplat's antialiased mode.
-    pub antialiased: bool,
-    /// Near plane, world units; `None`: 0.01 of the scene's median depth.
-    pub near: Option<f32>,
-    /// The part of the picture that is drawn and sent; `None`: all of it. For views alone.
-    pub crop: Option<Region>,
-    /// How closely to keep to the rendering model.
-    pub quality: Quality,
-    /// The caller's own deadline; never over `limits.render_timeout_ms`.
-    pub deadline: Option<Duration>,
-}
-
-impl Default for ViewOptions {
-    fn default() -> Self {
-        Self {
-            width: None,
-            height: None,
-            format: Format::Png,
-            background: None,
-            antialiased: false,
-            near: None,
-            crop: None,
-            quality: Quality::Exact,
-            deadline: None,
-        }
-    }
-}
-
-/// One view.
-#[derive(Clone, Debug, PartialEq)]
-pub struct ViewSpec {
-    /// Camera.
-    pub camera: CameraSpec,
-    /// Picture.
-    pub kind: Kind,
-    /// Size, encoding and the rest.
-    pub options: ViewOptions,
-    /// What is asked by text.
-    pub ask: Ask,
-}
-
-/// Many cameras and kinds; each camera is rendered once for all kinds.
-#[derive(Clone, Debug, PartialEq)]
-pub struct ViewsSpec {
-    /// Cameras.
-    pub cameras: Vec<CameraSpec>,
-    /// Pictures of each camera.
-    pub kinds: Vec<Kind>,
-    /// Size, encoding and the rest.
-    pub options: ViewOptions,
-    /// What is asked by text.
-    pub ask: Ask,
-}
-
-/// Which boxes hold the parts of a selection.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Boxes {
-    /// Turned along the part's own axes.
-    #[default]
-    Oriented,
-    /// Along the axes of the world.
-    Aligned,
-    /// No parts and no boxes.
-    None,
-}
-
-/// How a query's masks are given.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum MaskFormat {
-    /// COCO's compressed run lengths.
-    #[default]
-    Rle,
-    /// 8-bit grey PNG, 0 or 255.
-    Png,
-    /// Area, box and peak alone.
-    None,
-}
-
-/// Many texts asked of a scene, in 3D and, with a camera, in one view.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct QuerySpec {
-    /// The texts.
-    pub texts: Vec<String>,
-    /// View to answer in; none: 3D alone.
-    pub camera: Option<CameraSpec>,
-    /// Size and the rest of that view; the encoding does not count.
-    pub options: ViewOptions,
-    /// Boxes of the parts.
-    pub boxes: Boxes,
-    /// Masks of the view.
-    pub mask: MaskFormat,
-    /// Whether the view's relevancy is given too, as an 8-bit grey PNG.
-    pub relevancy: bool,
-    /// How texts are scored.
-    pub profile: ScoringProfile,
-    /// How long to wait for semantics that are being made; `None`: `limits.text_wait_ms`.
-    pub wait: Option<Duration>,
-}
-
 /// What a query found.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, ToSchema)]
+#[schema(as = QueryResult)]
 pub struct QueryAnswer {
     /// Entries of the scene's bank (M).
     pub bank_size: u32,
@@ -314,7 +52,7 @@ pub struct QueryAnswer {
 }
 
 /// What a text found.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, ToSchema)]
 pub struct TextResult {
     /// The text, without blanks around it.
     pub text: String,
@@ -334,7 +72,7 @@ pub struct TextResult {
 }
 
 /// Something that makes the answer to a text doubtful.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, ToSchema)]
 pub struct TextWarning {
     /// Stable snake_case code: `unknown_words`, `text_cut`.
     pub code: String,
@@ -343,7 +81,8 @@ pub struct TextWarning {
 }
 
 /// A connected part of a selection and its box, world frame of the upload.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, ToSchema)]
+#[schema(as = Part)]
 pub struct Part3 {
     /// Gaussians.
     pub gaussians: u64,
@@ -356,16 +95,18 @@ pub struct Part3 {
 }
 
 /// What a text found in a view.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, ToSchema)]
 pub struct TextView {
     /// Mask as run lengths.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mask_rle: Option<Rle>,
     /// Mask as a PNG; base64 in JSON.
     #[serde(skip_serializing_if = "Option::is_none", serialize_with = "base64::optional")]
+    #[schema(value_type = Option<String>)]
     pub mask_png: Option<Vec<u8>>,
     /// Relevancy as a PNG; base64 in JSON.
     #[serde(skip_serializing_if = "Option::is_none", serialize_with = "base64::optional")]
+    #[schema(value_type = Option<String>)]
     pub relevancy_png: Option<Vec<u8>>,
     /// Pixels of the mask.
     pub area: u64,
@@ -376,7 +117,7 @@ pub struct TextView {
 }
 
 /// The pixel of the highest relevancy.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, ToSchema)]
 pub struct Peak {
     /// Column.
     pub x: u32,
@@ -386,27 +127,9 @@ pub struct Peak {
     pub relevancy: f32,
 }
 
-/// What lies under a pixel of a view.
-#[derive(Clone, Debug, PartialEq)]
-pub struct PickSpec {
-    /// Camera.
-    pub camera: CameraSpec,
-    /// Across, pixels of the picture; the first pixel is 0 to 1.
-    pub x: f64,
-    /// Down, pixels.
-    pub y: f64,
-    /// Size and the rest of the view.
-    pub options: ViewOptions,
-    /// Texts to name the entry with; none: semantics are not made for it.
-    pub labels: Vec<String>,
-    /// How labels are scored.
-    pub profile: ScoringProfile,
-    /// How long to wait for semantics that are being made; `None`: `limits.text_wait_ms`.
-    pub wait: Option<Duration>,
-}
-
 /// What was found under a pixel.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, ToSchema)]
+#[schema(as = PickAnswer)]
 pub struct Picked {
     /// Accumulated opacity, 0..1.
     pub alpha: f32,
@@ -424,7 +147,7 @@ pub struct Picked {
 }
 
 /// A text and how well it names an entry.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, ToSchema)]
 pub struct Label {
     /// The text.
     pub text: String,
@@ -469,15 +192,6 @@ impl fmt::Debug for RenderedView {
     }
 }
 
-/// File format of an export.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ExportFormat {
-    /// Standard 3DGS PLY with `semantic_index` as an extra attribute.
-    #[default]
-    Ply,
-}
-
 /// A file being written; its size is known from the start.
 #[derive(Debug)]
 pub struct Export {
@@ -503,7 +217,8 @@ impl Export {
 }
 
 /// What makes the scenes: bundle, network, runtime.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
+#[schema(as = Models)]
 pub struct ModelsInfo {
     /// Name of the bundle.
     pub bundle: String,
@@ -520,7 +235,8 @@ pub struct ModelsInfo {
 }
 
 /// One network.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
+#[schema(as = Model)]
 pub struct ModelInfo {
     /// What it does: `geometry`, `masks.encoder`, `masks.decoder`, `image_text.image`,
     /// `image_text.text`, `image_text.tokenizer`.
@@ -540,7 +256,7 @@ pub struct ModelInfo {
 }
 
 /// What `/readyz` says.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]
 pub struct Readiness {
     /// Whether new work is taken.
     pub ready: bool,

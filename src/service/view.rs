@@ -16,20 +16,22 @@ use super::{
     access::SceneAccess,
     camera,
     encode::{self, Layer},
+    request::{CameraSpec, Kind, PictureOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec},
     schedule::Slot,
     search::{Backend, LabelledView, SceneTexts},
     semantics::{Understood, meaning_tag},
     texts,
-    types::{Ask, CameraSpec, Format, Kind, RenderedView, ViewOptions, ViewSpec, ViewsSpec},
+    types::RenderedView,
 };
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
+    names::shown,
     render::{
-        Frame, Kinds, Labels, Quality, RenderRequest,
+        Frame, Kinds, Labels, RenderRequest,
         plan::{NEAR_RANGE, default_near},
     },
-    scene::{Camera, Intrinsics, Region, Scene, SceneCamera, SceneId},
+    scene::{Camera, Intrinsics, Scene, SceneCamera, SceneId},
     semantics::mask_from_blend,
     store::Record,
     telemetry::meter,
@@ -44,12 +46,10 @@ pub(super) struct Resolved {
     camera_index: usize,
     camera: Camera,
     kinds: Vec<Kind>,
-    format: Format,
-    background: Option<[f32; 3]>,
-    antialiased: bool,
     near: f32,
-    crop: Option<Region>,
-    quality: Quality,
+    /// As asked for, with the size and the near plane that were found.
+    options: ViewOptions,
+    picture: PictureOptions,
 }
 
 /// What the text kinds of a view are read from.
@@ -68,7 +68,7 @@ impl Resolved {
     /// The camera of the picture that comes out.
     fn seen(&self) -> Camera {
         let whole = self.camera.intrinsics;
-        let intrinsics = self.crop.map_or(whole, |crop| whole.part(crop));
+        let intrinsics = self.picture.crop.map_or(whole, |crop| whole.part(crop));
         Camera { intrinsics, ..self.camera }
     }
 
@@ -81,21 +81,20 @@ impl Resolved {
     /// Tells the labels of this view from those of all others. They do not depend on the
     /// background.
     pub(super) fn labels_key(&self, tag: &str, renderer: &str) -> Result<String> {
-        let Self { camera, antialiased, near, crop, quality, .. } = self;
-        words(&(tag, renderer, camera, antialiased, near, crop, quality))
+        words(&(tag, renderer, self.camera, &self.options, self.picture.crop))
     }
 
     /// A request of these pictures without labels.
     pub(super) fn labels_request(&self, kinds: Kinds) -> RenderRequest {
         RenderRequest {
             camera: self.camera,
-            crop: self.crop,
+            crop: self.picture.crop,
             kinds,
             labels: Labels::None,
-            background: self.background.unwrap_or_default(),
-            antialiased: self.antialiased,
+            background: self.picture.background.color().unwrap_or_default(),
+            antialiased: self.options.antialiased,
             near: self.near,
-            quality: self.quality,
+            quality: self.options.quality,
         }
     }
 
@@ -106,9 +105,8 @@ impl Resolved {
 
     /// Hash of scene, renderer and request for one kind; `asked` tells what was asked by text.
     fn etag(&self, scene: &str, renderer: &str, kind: Kind, asked: &str) -> Result<String> {
-        let Self { camera, format, background, antialiased, near, crop, quality, .. } = self;
         let version = env!("CARGO_PKG_VERSION");
-        let request = (camera, kind, format, background, antialiased, near, crop, quality);
+        let request = (self.camera, kind, &self.options, &self.picture);
         Ok(hash(&words(&(scene, version, renderer, request, asked))?))
     }
 
@@ -146,7 +144,12 @@ impl Resolved {
     }
 
     fn frame(&self, backend: &Backend, scene: &Scene, request: &RenderRequest) -> Result<Frame> {
-        backend.planner.render(&*backend.renderer, scene, request, self.background.is_none())
+        backend.planner.render(
+            &*backend.renderer,
+            scene,
+            request,
+            self.picture.background.color().is_none(),
+        )
     }
 
     /// A mask alone is the blend of a few numbers; all else needs the weights.
@@ -184,7 +187,7 @@ impl Resolved {
                     (self.text_picture(kind, asked, labels, &frame)?, None)
                 }
                 _ => {
-                    let encoded = encode::encode(&frame, kind, self.format)?;
+                    let encoded = encode::encode(&frame, kind, self.picture.format)?;
                     (encoded.bytes, encoded.depth_scale)
                 }
             };
@@ -193,7 +196,7 @@ impl Resolved {
             Ok(RenderedView {
                 camera_index: self.camera_index,
                 kind,
-                format: self.format,
+                format: self.picture.format,
                 width: frame.width,
                 height: frame.height,
                 bytes,
@@ -215,7 +218,7 @@ impl Resolved {
         labels: &ViewLabels,
         frame: &Frame,
     ) -> Result<Vec<u8>> {
-        let file = |layer| encode::layer(layer, frame.width, frame.height, self.format);
+        let file = |layer| encode::layer(layer, frame.width, frame.height, self.picture.format);
         let scorer = &asked.scorer;
         let text = asked.texts.first();
         match (kind, labels, text) {
@@ -231,7 +234,7 @@ impl Resolved {
             (Kind::Semantics, ViewLabels::Weights(view), _) => {
                 file(Layer::Entries(&view.strongest(scorer)))
             }
-            _ => Err(Error::internal(format!("kind={} was not drawn", kind.name()))),
+            _ => Err(Error::internal(format!("kind={kind} was not drawn"))),
         }
     }
 }
@@ -247,14 +250,6 @@ pub(super) fn hash(words: &str) -> String {
     Sha256::digest(words)[..16].iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// Refuses a part of a picture where the whole view is what is asked about.
-pub(super) fn refuse_crop(options: &ViewOptions, call: &str) -> Result<()> {
-    match options.crop {
-        None => Ok(()),
-        Some(_) => Err(Error::invalid(format!("crop goes with views, not with {call}"))),
-    }
-}
-
 /// What tells one scene from any other, in tags.
 pub(super) fn scene_tag(record: &Record) -> String {
     format!("{} {}", record.scene_sha256.as_deref().unwrap_or_default(), record.status.id)
@@ -266,7 +261,7 @@ pub(super) fn resolve_for(
     record: &Record,
     cameras: &[CameraSpec],
     kinds: &[Kind],
-    options: &ViewOptions,
+    options: (&ViewOptions, &PictureOptions),
 ) -> Result<Vec<Resolved>> {
     let depth = record.status.report.as_ref().map_or(0.0, |report| report.median_depth);
     resolve(&inner.limits(), &record.status.cameras, depth, cameras, kinds, options)
@@ -278,18 +273,21 @@ fn resolve(
     median_depth: f64,
     cameras: &[CameraSpec],
     kinds: &[Kind],
-    options: &ViewOptions,
+    (options, picture): (&ViewOptions, &PictureOptions),
 ) -> Result<Vec<Resolved>> {
     for kind in kinds {
-        encode::check(*kind, options.format)?;
+        encode::check(*kind, picture.format)?;
     }
-    if let Some(bad) = options.background.iter().flatten().find(|v| !(0.0..=1.0).contains(*v)) {
+    let background = picture.background.color();
+    if let Some(bad) = background.iter().flatten().find(|v| !(0.0..=1.0).contains(*v)) {
+        let bad = shown(f64::from(*bad));
         return Err(Error::invalid(format!("background has {bad}; its values must be 0 to 1")));
     }
     let near = match options.near {
         Some(near) if (NEAR_RANGE[0]..=NEAR_RANGE[1]).contains(&near) => near,
         Some(near) => {
             let [least, most] = NEAR_RANGE;
+            let near = shown(f64::from(near));
             return Err(Error::invalid(format!("near is {near}; it must be {least} to {most}")));
         }
         None => default_near(median_depth),
@@ -305,12 +303,17 @@ fn resolve(
             camera_index,
             camera,
             kinds: kinds.to_vec(),
-            format: options.format,
-            background: options.background,
-            antialiased: options.antialiased,
             near,
-            crop: options.crop.map(|crop| crop.inside(width, height, &what)).transpose()?,
-            quality: options.quality,
+            options: ViewOptions {
+                width: Some(width),
+                height: Some(height),
+                near: Some(near),
+                ..options.clone()
+            },
+            picture: PictureOptions {
+                crop: picture.crop.map(|crop| crop.inside(width, height, &what)).transpose()?,
+                ..picture.clone()
+            },
         })
     };
     cameras.iter().enumerate().map(resolved).collect()
@@ -321,7 +324,7 @@ pub(super) fn resolve_one(
     scene: &Scene,
     camera: CameraSpec,
     kind: Kind,
-    options: &ViewOptions,
+    options: (&ViewOptions, &PictureOptions),
     limits: &Limits,
 ) -> Result<Resolved> {
     let meta = &scene.meta;
@@ -362,16 +365,16 @@ impl Inner {
         self: &Arc<Self>,
         scene: &SceneAccess,
         kinds: &[Kind],
-        ask: &Ask,
+        ask: &TextOptions,
     ) -> Result<Option<Understood>> {
         let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) else { return Ok(None) };
-        Ok(Some(self.understood(scene, &format!("kind={}", kind.name()), ask.wait).await?))
+        Ok(Some(self.understood(scene, &format!("kind={kind}"), ask.wait).await?))
     }
 
     /// Checks what a request asks by text, the bundle first: without networks no text is any good.
-    fn checked_ask(&self, kinds: &[Kind], ask: &Ask) -> Result<Ask> {
+    fn checked_ask(&self, kinds: &[Kind], ask: &TextOptions) -> Result<TextOptions> {
         if let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) {
-            self.can_understand(&format!("kind={}", kind.name()))?;
+            self.can_understand(&format!("kind={kind}"))?;
         }
         texts::check_ask(kinds, ask, &self.limits())
     }
@@ -381,7 +384,7 @@ impl Inner {
         self: &Arc<Self>,
         scene: SceneAccess,
         view: Resolved,
-        texts: Option<(Understood, Ask)>,
+        texts: Option<(Understood, TextOptions)>,
         deadline: Instant,
     ) -> Result<Vec<RenderedView>> {
         let inner = Arc::clone(self);
@@ -438,7 +441,7 @@ impl Inner {
 }
 
 /// What was asked by text, in tags.
-pub(super) fn asked_words(tag: &str, ask: &Ask) -> Result<String> {
+pub(super) fn asked_words(tag: &str, ask: &TextOptions) -> Result<String> {
     words(&(tag, &ask.text, ask.profile))
 }
 
@@ -451,10 +454,16 @@ impl Service {
     pub async fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<Option<String>> {
         let scene = self.scene(id).await?;
         let inner = &self.inner;
-        let ask = inner.checked_ask(&[spec.kind], &spec.ask)?;
+        let ask = inner.checked_ask(&[spec.kind], &spec.text)?;
         let scene = scene.finished()?;
         let record = scene.record();
-        let resolved = resolve_for(inner, record, &[spec.camera], &[spec.kind], &spec.options)?;
+        let resolved = resolve_for(
+            inner,
+            record,
+            &[spec.camera],
+            &[spec.kind],
+            (&spec.options, &spec.picture),
+        )?;
         let asked = match (spec.kind.needs_semantics(), &record.semantics_sha256) {
             (false, _) => String::new(),
             (true, Some(_)) => asked_words(&meaning_tag(record), &ask)?,
@@ -474,10 +483,15 @@ impl Service {
         let scene = self.scene(id).await?;
         let inner = &self.inner;
         let kinds = [spec.kind];
-        let ask = inner.checked_ask(&kinds, &spec.ask)?;
+        let ask = inner.checked_ask(&kinds, &spec.text)?;
         let scene = scene.finished()?;
-        let mut resolved =
-            resolve_for(inner, scene.record(), &[spec.camera], &kinds, &spec.options)?;
+        let mut resolved = resolve_for(
+            inner,
+            scene.record(),
+            &[spec.camera],
+            &kinds,
+            (&spec.options, &spec.picture),
+        )?;
         let understood = inner.understood_for(&scene, &kinds, &ask).await?;
         let deadline = inner.deadline(&spec.options);
         let one = resolved.remove(0);
@@ -519,11 +533,17 @@ impl Service {
         let mut kinds = spec.kinds.clone();
         let mut seen = std::collections::HashSet::new();
         kinds.retain(|kind| seen.insert(*kind));
-        let ask = inner.checked_ask(&kinds, &spec.ask)?;
+        let ask = inner.checked_ask(&kinds, &spec.text)?;
         if kinds.iter().any(|kind| kind.needs_semantics()) {
             Inner::may_be_asked(scene.record(), "views")?;
         }
-        let all = resolve_for(&inner, scene.record(), &spec.cameras, &kinds, &spec.options)?;
+        let all = resolve_for(
+            &inner,
+            scene.record(),
+            &spec.cameras,
+            &kinds,
+            (&spec.options, &spec.picture),
+        )?;
         let pixels: u64 = all.iter().map(Resolved::pixels).sum::<u64>() * kinds.len() as u64;
         if pixels > limits.views_pixels_max {
             let (cameras, kinds) = (all.len(), kinds.len());

@@ -343,6 +343,13 @@ async fn bad_views_are_refused_by_name_and_the_server_lives() {
         ("background 7", Ask::first().with("background", "7,0,0"), "invalid_request", "7"),
         ("eye in target", eye(size(), [0.0; 3]), "invalid_request", "same point"),
         (
+            "far eye",
+            eye(size(), [0.0; 3]).with_numbers("eye", &[1e308, 0.0, 0.0]),
+            "invalid_request",
+            "eye has 1e308; coordinates reach at most 1e9",
+        ),
+        ("wide fov", Ask::first().with("fov", 1e308), "invalid_request", "fov is 1e308 degrees"),
+        (
             "singular",
             size().with_numbers("camera_to_world", &singular),
             "invalid_request",

@@ -13,7 +13,7 @@ use segsplat::{
     error::ErrorCode,
     sample::{self, SampleOptions},
     scene::{SceneId, SceneState, ScoringProfile, Upload},
-    service::{Ask, CreateScene, ExportFormat, PageRequest, Service},
+    service::{CreateScene, ExportFormat, PageRequest, Service, TextOptions},
     store::Place,
 };
 
@@ -24,7 +24,7 @@ use crate::common::{
 };
 
 /// Nothing is asked by text.
-const ASK: Ask = Ask { text: None, profile: ScoringProfile::Default, wait: None };
+const ASK: TextOptions = TextOptions { text: None, profile: ScoringProfile::Default, wait: None };
 
 /// Reproducible numbers.
 struct Random(u64);

@@ -210,6 +210,7 @@ async fn a_scene_exports_as_ply() {
     let id = made(&stand).await;
     let answer = get(&stand, &format!("/v1/scenes/{id}/export?format=ply")).await;
     let length = answer.headers()[header::CONTENT_LENGTH].to_str().unwrap().to_owned();
+    assert_eq!(answer.headers()[header::ACCEPT_RANGES], "none");
     assert!(answer.headers()[header::CONTENT_DISPOSITION].to_str().unwrap().contains(".ply"));
     let file = answer.bytes().await.unwrap();
     assert_eq!(length, file.len().to_string());
@@ -271,7 +272,18 @@ async fn unknown_paths_methods_and_parameters_are_answered_in_our_shape() {
     let allow = answer.headers()[header::ALLOW].to_str().unwrap().to_owned();
     assert!(allow.contains("GET") && allow.contains("POST"), "{allow}");
     let method = bytes(answer).await.unwrap_err();
-    assert_eq!((method.code.as_str(), method.number), ("not_found", 405));
+    assert_eq!((method.code.as_str(), method.number), ("method_not_allowed", 405));
+    for limit in [0, 101] {
+        let page = fault(&stand, &format!("/v1/scenes?limit={limit}")).await;
+        assert_eq!(page.message, format!("limit is {limit}; it must be 1 to 100"));
+    }
+    // A part that is neither known nor a photo: a name that was mistyped.
+    let form = form(&upload()).text("semantcs", "off");
+    let odd =
+        crate::common::client().post(stand.url("/v1/scenes")).multipart(form).send().await.unwrap();
+    let odd = bytes(odd).await.unwrap_err();
+    assert_eq!(odd.code, "invalid_request");
+    assert!(odd.message.contains("semantcs") && odd.message.contains("density"), "{odd:?}");
     let unknown = fault(&stand, "/v1/scenes?limti=3").await;
     assert_eq!(unknown.code, "invalid_request");
     assert!(unknown.message.contains("limti") && unknown.message.contains("limit"), "{unknown:?}");

@@ -10,15 +10,15 @@ use segsplat::{
     error::ErrorCode,
     scene::{Event, SceneState, ScoringProfile},
     service::{
-        Ask, CameraSpec, CreateScene, ExportFormat, Kind, LensSpec, PageRequest, PoseSpec,
-        ViewOptions, ViewsSpec,
+        Background, CameraSpec, CreateScene, ExportFormat, Kind, LensSpec, PageRequest,
+        PictureOptions, PoseSpec, TextOptions, ViewOptions, ViewsSpec,
     },
 };
 
 use crate::common::server::{PATIENCE, TestServer, WallMaker, first_view, upload};
 
 /// Nothing is asked by text.
-const ASK: Ask = Ask { text: None, profile: ScoringProfile::Default, wait: None };
+const ASK: TextOptions = TextOptions { text: None, profile: ScoringProfile::Default, wait: None };
 
 fn request() -> CreateScene {
     CreateScene { upload: upload(), ..CreateScene::default() }
@@ -179,7 +179,8 @@ async fn views_come_camera_by_camera_and_tags_tell_pictures_apart() {
         cameras: vec![first_camera(); 3],
         kinds: vec![Kind::Depth, Kind::Color, Kind::Depth],
         options: ViewOptions::default(),
-        ask: Ask::default(),
+        picture: PictureOptions::default(),
+        text: TextOptions::default(),
     };
     let views: Vec<_> = server.service.render_many(&id, &spec).await.unwrap().collect().await;
     let order: Vec<_> =
@@ -191,7 +192,7 @@ async fn views_come_camera_by_camera_and_tags_tell_pictures_apart() {
     let tag = server.service.view_etag(&id, &one).await.unwrap();
     assert_eq!(server.service.render(&id, one.clone()).await.unwrap().etag, tag.clone().unwrap());
     let mut other = one.clone();
-    other.options.background = Some([0.0, 0.0, 0.5]);
+    other.picture.background = Background::Color([0.0, 0.0, 0.5]);
     assert_ne!(server.service.view_etag(&id, &other).await.unwrap(), tag);
     let mut late = one;
     late.options.deadline = Some(Duration::ZERO);

@@ -65,7 +65,8 @@ fn many(spec: &ViewSpec, cameras: usize, kinds: &[Kind]) -> ViewsSpec {
         cameras: vec![spec.camera; cameras],
         kinds: kinds.to_vec(),
         options: spec.options.clone(),
-        ask: spec.ask.clone(),
+        picture: spec.picture.clone(),
+        text: spec.text.clone(),
     }
 }
 

@@ -11,8 +11,8 @@ use segsplat::{
     error::ErrorCode,
     scene::{SceneId, SceneOptions, ScoringProfile, SemanticsMode, SemanticsState},
     service::{
-        Ask as AskText, Boxes, CreateScene, ExportFormat, Format, Kind, MaskFormat, PickSpec,
-        QuerySpec, Rle, ViewOptions, ViewSpec,
+        Boxes, CreateScene, ExportFormat, Format, Kind, MaskFormat, PickSpec, PictureOptions,
+        QuerySpec, Rle, TextOptions, ViewOptions, ViewSpec,
     },
 };
 
@@ -58,9 +58,9 @@ fn in_view(asked: &[&str]) -> QuerySpec {
 }
 
 fn view(kind: Kind, text: Option<&str>, format: Format) -> ViewSpec {
-    let ask = AskText { text: text.map(str::to_owned), ..AskText::default() };
-    let options = ViewOptions { format, ..ViewOptions::default() };
-    ViewSpec { kind, options, ask, ..first_view() }
+    let ask = TextOptions { text: text.map(str::to_owned), ..TextOptions::default() };
+    let picture = PictureOptions { format, ..PictureOptions::default() };
+    ViewSpec { kind, picture, text: ask, ..first_view() }
 }
 
 /// Whether each pixel of an 8-bit grey PNG is white; black is the only other value.
@@ -174,7 +174,7 @@ async fn a_mask_alone_is_a_blend_and_equals_the_mask_of_the_entries() {
     assert_eq!(fixture.renderer.counts(), [2, 1, 1]);
     assert_eq!(service.view_etag(&id, &mask()).await.unwrap().unwrap(), blended.etag);
     let mut other = mask();
-    other.ask.text = Some("photo 1".to_owned());
+    other.text.text = Some("photo 1".to_owned());
     assert_ne!(service.view_etag(&id, &other).await.unwrap().unwrap(), blended.etag);
 
     let numbers = service.render(&id, view(Kind::Semantics, None, Format::Npy)).await.unwrap();
@@ -227,7 +227,7 @@ async fn an_export_of_a_text_holds_what_it_selects() {
     let id = fixture.scene(SemanticsMode::Lazy).await;
     let service = &fixture.server.service;
     let export = async |text: Option<&str>| {
-        let ask = AskText { text: text.map(str::to_owned), ..AskText::default() };
+        let ask = TextOptions { text: text.map(str::to_owned), ..TextOptions::default() };
         let mut export = service.export(&id, ExportFormat::Ply, &ask).await.unwrap();
         let (size, etag) = (export.size_bytes, export.etag.clone());
         let mut file = Vec::new();

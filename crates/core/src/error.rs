@@ -19,8 +19,10 @@ pub enum ErrorCode {
     LimitExceeded,
     /// No scene of this id.
     SceneNotFound,
-    /// No such route, method or resource.
+    /// No such route or resource.
     NotFound,
+    /// The path is there, but not with this method.
+    MethodNotAllowed,
     /// The scene exists but is not done, or its semantics are still being made.
     SceneNotReady,
     /// A text was asked of a scene that was made with `semantics=off`.
@@ -78,12 +80,13 @@ const fn row(
 }
 
 /// The one table. gRPC numbers are those of `google.rpc.Code`.
-pub const TABLE: [ErrorRow; 18] = [
+pub const TABLE: [ErrorRow; 19] = [
     row(ErrorCode::InvalidRequest, "invalid_request", 400, 3, 2, false),
     row(ErrorCode::PhotoUnreadable, "photo_unreadable", 422, 3, 2, false),
     row(ErrorCode::LimitExceeded, "limit_exceeded", 413, 3, 2, false),
     row(ErrorCode::SceneNotFound, "scene_not_found", 404, 5, 3, false),
     row(ErrorCode::NotFound, "not_found", 404, 5, 3, false),
+    row(ErrorCode::MethodNotAllowed, "method_not_allowed", 405, 12, 3, false),
     row(ErrorCode::SceneNotReady, "scene_not_ready", 409, 9, 4, true),
     row(ErrorCode::SemanticsOff, "semantics_off", 409, 9, 4, false),
     row(ErrorCode::Unauthenticated, "unauthenticated", 401, 16, 8, false),

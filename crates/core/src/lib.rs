@@ -5,4 +5,5 @@ pub mod cache;
 pub mod error;
 pub mod limits;
 pub mod meter;
+pub mod names;
 pub mod scene;

@@ -49,7 +49,17 @@ impl Kinds {
 }
 
 /// How closely a renderer keeps to the model; `docs/conventions.md` bounds what `Fast` may differ.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, serde::Serialize)]
+#[derive(
+    Clone,
+    Copy,
+    Debug,
+    Default,
+    PartialEq,
+    Eq,
+    serde::Serialize,
+    serde::Deserialize,
+    utoipa::ToSchema,
+)]
 #[serde(rename_all = "snake_case")]
 pub enum Quality {
     /// f32 all through.
@@ -62,22 +72,9 @@ pub enum Quality {
 impl Quality {
     /// All, the default first.
     pub const ALL: [Self; 2] = [Self::Exact, Self::Fast];
-
-    /// The one that callers call `name`.
-    #[must_use]
-    pub fn named(name: &str) -> Option<Self> {
-        Self::ALL.into_iter().find(|quality| quality.name() == name)
-    }
-
-    /// The name that callers give.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Exact => "exact",
-            Self::Fast => "fast",
-        }
-    }
 }
+
+segsplat_core::names::display_names!(Quality);
 
 /// One view to render.
 #[derive(Clone, Debug, PartialEq)]

@@ -51,7 +51,7 @@ pub struct Args {
     #[arg(long, default_value_t = 50)]
     pub frames: usize,
     /// How closely to keep to the model: exact or fast
-    #[arg(long, default_value = "exact", value_parser = quality)]
+    #[arg(long, default_value = "exact", value_parser = segsplat_core::names::named::<Quality>)]
     pub quality: Quality,
     /// What the picture is compared with
     #[arg(long, default_value = "oracle")]
@@ -151,11 +151,6 @@ struct LabelTimes {
     entries: usize,
     #[serde(skip)]
     compared: Compared,
-}
-
-/// A quality by its name.
-fn quality(name: &str) -> Result<Quality, String> {
-    Quality::named(name).ok_or_else(|| Quality::ALL.map(Quality::name).join(", "))
 }
 
 impl Args {

@@ -1,15 +1,17 @@
 //! Messages to use cases and back. What a message lacks or an enum does not know is named.
 
+use std::time::Duration;
+
 use super::pb;
 use crate::{
     error::{Error, Result},
-    scene::{
-        CameraToWorld, HealthReport, Intrinsics, Region, ScoringProfile, SemanticsReport, StageTime,
-    },
+    scene::{CameraToWorld, HealthReport, Intrinsics, ScoringProfile, SemanticsReport, StageTime},
     service::{
-        CameraSpec, Density, Event, ExportFormat, Format, Kind, LensSpec, PoseSpec, Quality,
-        RenderedView, SceneError, SceneState, SceneStatus, SemanticsMode, SemanticsState,
-        SemanticsStatus, ViewOptions,
+        Background, Boxes, CameraSpec, Density, Event, ExportFormat, Format, Kind, Label, LensSpec,
+        MaskFormat, Part3, Peak, PickSpec, Picked, PictureOptions, PoseSpec, Quality, QueryAnswer,
+        QuerySpec, RenderedView, SceneError, SceneState, SceneStatus, SemanticsMode,
+        SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView, TextWarning,
+        ViewOptions,
     },
 };
 
@@ -22,7 +24,7 @@ pub(super) fn scene(status: SceneStatus) -> pb::Scene {
     };
     pb::Scene {
         id: status.id.to_string(),
-        state: state(status.state).into(),
+        state: pb::SceneState::from(status.state).into(),
         stage: status.stage.unwrap_or_default(),
         fraction: status.fraction,
         created_ms: status.created_ms,
@@ -35,26 +37,19 @@ pub(super) fn scene(status: SceneStatus) -> pb::Scene {
 }
 
 fn semantics_status(status: SemanticsStatus) -> pb::SemanticsStatus {
-    let state = match status.state {
-        SemanticsState::Off => pb::SemanticsState::Off,
-        SemanticsState::None => pb::SemanticsState::None,
-        SemanticsState::Running => pb::SemanticsState::Running,
-        SemanticsState::Ready => pb::SemanticsState::Ready,
-        SemanticsState::Failed => pb::SemanticsState::Failed,
-    };
     let report = |report: SemanticsReport| pb::SemanticsReport {
         masks: report.masks,
         bank_size: report.bank_size,
         labelled: report.labelled,
         bundle_sha256: report.bundle_sha256,
-        profile: profile(report.profile).into(),
+        profile: pb::ScoringProfile::from(report.profile).into(),
         stages: report.stages.into_iter().map(stage_time).collect(),
         execution_provider: report.execution_provider,
     };
     pb::SemanticsStatus {
         available: status.available,
         reason: status.reason.unwrap_or_default(),
-        state: state.into(),
+        state: pb::SemanticsState::from(status.state).into(),
         stage: status.stage.unwrap_or_default(),
         fraction: status.fraction,
         bank_size: status.bank_size,
@@ -63,25 +58,8 @@ fn semantics_status(status: SemanticsStatus) -> pb::SemanticsStatus {
     }
 }
 
-pub(super) fn profile(profile: ScoringProfile) -> pb::ScoringProfile {
-    match profile {
-        ScoringProfile::Default => pb::ScoringProfile::Default,
-        ScoringProfile::Paper => pb::ScoringProfile::Paper,
-    }
-}
-
 fn stage_time(time: StageTime) -> pb::StageTime {
     pb::StageTime { stage: time.stage, ms: time.ms }
-}
-
-fn state(state: SceneState) -> pb::SceneState {
-    match state {
-        SceneState::Queued => pb::SceneState::Queued,
-        SceneState::Running => pb::SceneState::Running,
-        SceneState::Done => pb::SceneState::Done,
-        SceneState::Failed => pb::SceneState::Failed,
-        SceneState::Cancelled => pb::SceneState::Cancelled,
-    }
 }
 
 fn scene_error(error: SceneError) -> pb::SceneError {
@@ -91,10 +69,7 @@ fn scene_error(error: SceneError) -> pb::SceneError {
 fn report(report: HealthReport) -> pb::HealthReport {
     let [depth_near, depth_far] = report.depth_range;
     let warning = |warning: crate::scene::Warning| pb::Warning {
-        code: serde_json::to_value(warning.code)
-            .ok()
-            .and_then(|code| code.as_str().map(str::to_owned))
-            .unwrap_or_default(),
+        code: warning.code.to_string(),
         message: warning.message,
         value: warning.value,
     };
@@ -116,11 +91,11 @@ fn report(report: HealthReport) -> pb::HealthReport {
     }
 }
 
-pub(super) fn intrinsics(k: Intrinsics) -> pb::Intrinsics {
+fn intrinsics(k: Intrinsics) -> pb::Intrinsics {
     pb::Intrinsics { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, width: k.width, height: k.height }
 }
 
-pub(super) fn matrix(pose: &CameraToWorld) -> Vec<f64> {
+fn matrix(pose: &CameraToWorld) -> Vec<f64> {
     pose.to_row_major().to_vec()
 }
 
@@ -139,22 +114,6 @@ pub(super) fn event(event: Event) -> pb::SceneEvent {
             pb::SceneEvent { error: Some(scene_error(error)), ..of(pb::SceneState::Failed) }
         }
         Event::Cancelled => of(pb::SceneState::Cancelled),
-    }
-}
-
-/// When the semantic bank is made.
-pub(super) fn semantics(number: i32) -> Result<SemanticsMode> {
-    match known::<pb::Semantics>("semantics", number)? {
-        pb::Semantics::Unspecified | pb::Semantics::Lazy => Ok(SemanticsMode::Lazy),
-        pb::Semantics::Eager => Ok(SemanticsMode::Eager),
-        pb::Semantics::Off => Ok(SemanticsMode::Off),
-    }
-}
-
-pub(super) fn density(number: i32) -> Result<Density> {
-    match known::<pb::Density>("density", number)? {
-        pb::Density::Unspecified | pb::Density::Thinned => Ok(Density::Thinned),
-        pb::Density::Full => Ok(Density::Full),
     }
 }
 
@@ -203,74 +162,49 @@ fn lens(lens: Option<pb::camera_spec::Lens>) -> LensSpec {
     }
 }
 
-pub(super) fn vec3(v: &pb::Vec3) -> [f64; 3] {
+fn vec3(v: &pb::Vec3) -> [f64; 3] {
     [v.x, v.y, v.z]
 }
 
-/// Which picture.
-pub(super) fn kind(number: i32) -> Result<Kind> {
-    match known::<pb::Kind>("kind", number)? {
-        pb::Kind::Unspecified | pb::Kind::Color => Ok(Kind::Color),
-        pb::Kind::Depth => Ok(Kind::Depth),
-        pb::Kind::Alpha => Ok(Kind::Alpha),
-        pb::Kind::Semantics => Ok(Kind::Semantics),
-        pb::Kind::Relevancy => Ok(Kind::Relevancy),
-        pb::Kind::Mask => Ok(Kind::Mask),
-    }
-}
-
-/// Size, encoding and the rest.
-pub(super) fn options(options: Option<pb::ViewOptions>) -> Result<ViewOptions> {
-    let options = options.unwrap_or_default();
-    let format = match known::<pb::Format>("format", options.format)? {
-        pb::Format::Unspecified | pb::Format::Png => Format::Png,
-        pb::Format::Jpeg => Format::Jpeg,
-        pb::Format::Webp => Format::Webp,
-        pb::Format::Npy => Format::Npy,
-    };
-    #[expect(clippy::cast_possible_truncation, reason = "a colour fits f32")]
-    let background = options.background.map(|v| [v.x as f32, v.y as f32, v.z as f32]);
+/// How a view is rendered.
+pub(super) fn options(options: &pb::ViewOptions) -> Result<ViewOptions> {
     Ok(ViewOptions {
         width: options.width,
         height: options.height,
-        format,
-        background,
         antialiased: options.antialiased,
         near: options.near,
-        crop: options.crop.map(|crop| Region {
-            x: crop.x,
-            y: crop.y,
-            width: crop.width,
-            height: crop.height,
-        }),
-        quality: match known::<pb::Quality>("quality", options.quality)? {
-            pb::Quality::Unspecified | pb::Quality::Exact => Quality::Exact,
-            pb::Quality::Fast => Quality::Fast,
-        },
+        quality: value("quality", options.quality)?,
         deadline: None,
+    })
+}
+
+/// The same where no picture comes out: the encoding does not count, and there is no part of it.
+fn options_alone(given: Option<pb::ViewOptions>, call: &str) -> Result<ViewOptions> {
+    let given = given.unwrap_or_default();
+    match given.crop {
+        None => options(&given),
+        Some(_) => Err(Error::invalid(format!("crop goes with views, not with {call}"))),
+    }
+}
+
+/// How a view is encoded.
+pub(super) fn picture(options: &pb::ViewOptions) -> Result<PictureOptions> {
+    #[expect(clippy::cast_possible_truncation, reason = "a colour fits f32")]
+    let color = |v: pb::Vec3| Background::Color([v.x as f32, v.y as f32, v.z as f32]);
+    let crop = |crop: pb::Region| [crop.x, crop.y, crop.width, crop.height].into();
+    Ok(PictureOptions {
+        format: value("format", options.format)?,
+        background: options.background.map(color).unwrap_or_default(),
+        crop: options.crop.map(crop),
     })
 }
 
 /// One encoded picture.
 pub(super) fn view(view: RenderedView) -> pb::View {
-    let kind = match view.kind {
-        Kind::Color => pb::Kind::Color,
-        Kind::Depth => pb::Kind::Depth,
-        Kind::Alpha => pb::Kind::Alpha,
-        Kind::Semantics => pb::Kind::Semantics,
-        Kind::Relevancy => pb::Kind::Relevancy,
-        Kind::Mask => pb::Kind::Mask,
-    };
-    let format = match view.format {
-        Format::Png => pb::Format::Png,
-        Format::Jpeg => pb::Format::Jpeg,
-        Format::Webp => pb::Format::Webp,
-        Format::Npy => pb::Format::Npy,
-    };
     pb::View {
         camera_index: u32::try_from(view.camera_index).unwrap_or(u32::MAX),
-        kind: kind.into(),
-        format: format.into(),
+        kind: pb::Kind::from(view.kind).into(),
+        format: pb::Format::from(view.format).into(),
         width: view.width,
         height: view.height,
         data: view.bytes.into(),
@@ -283,17 +217,163 @@ pub(super) fn view(view: RenderedView) -> pb::View {
     }
 }
 
-/// File format of an export.
-pub(super) fn export_format(number: i32) -> Result<ExportFormat> {
-    match known::<pb::ExportFormat>("format", number)? {
-        pb::ExportFormat::Unspecified | pb::ExportFormat::Ply => Ok(ExportFormat::Ply),
+/// What a view or an export asks by text; an empty text is none.
+pub(super) fn text(text: String, profile: i32, wait_ms: Option<u64>) -> Result<TextOptions> {
+    Ok(TextOptions {
+        text: Some(text).filter(|text| !text.is_empty()),
+        profile: value("profile", profile)?,
+        wait: wait_ms.map(Duration::from_millis),
+    })
+}
+
+/// A query.
+pub(super) fn query(request: pb::QueryRequest) -> Result<QuerySpec> {
+    let view = request.camera.map(|given| camera(Some(given), "camera")).transpose()?;
+    Ok(QuerySpec {
+        texts: request.texts,
+        camera: view,
+        options: options_alone(request.options, "query")?,
+        boxes: value("boxes", request.boxes)?,
+        mask: value("mask", request.mask)?,
+        relevancy: request.relevancy,
+        profile: value("profile", request.profile)?,
+        wait: request.semantics_wait_ms.map(Duration::from_millis),
+    })
+}
+
+/// What a query found.
+pub(super) fn answer(answer: QueryAnswer) -> pb::QueryResponse {
+    let camera = answer.camera;
+    pb::QueryResponse {
+        bank_size: answer.bank_size,
+        profile: pb::ScoringProfile::from(answer.profile).into(),
+        intrinsics: camera.map(|camera| intrinsics(camera.intrinsics)),
+        camera_to_world: camera.map_or_else(Vec::new, |camera| matrix(&camera.camera_to_world)),
+        render_ms: answer.render_ms,
+        results: answer.results.into_iter().map(result).collect(),
     }
 }
 
-/// The enum's value of this number; proto3 lets any number through.
-pub(super) fn known<E: TryFrom<i32>>(name: &str, number: i32) -> Result<E> {
-    E::try_from(number)
-        .map_err(|_| Error::invalid(format!("{name} is {number}, which is none of its values")))
+fn result(found: TextResult) -> pb::TextResult {
+    let warning =
+        |warning: TextWarning| pb::TextWarning { code: warning.code, message: warning.message };
+    pb::TextResult {
+        text: found.text,
+        scores: found.scores,
+        entries: found.entries.into_iter().map(u32::from).collect(),
+        gaussians: found.gaussians,
+        parts: found.parts.iter().map(part).collect(),
+        warnings: found.warnings.into_iter().map(warning).collect(),
+        view: found.view.map(text_view),
+    }
+}
+
+fn point([x, y, z]: [f64; 3]) -> pb::Vec3 {
+    pb::Vec3 { x, y, z }
+}
+
+fn part(part: &Part3) -> pb::Part {
+    pb::Part {
+        gaussians: part.gaussians,
+        center: Some(point(part.center)),
+        axes: part.axes.iter().copied().map(point).collect(),
+        size: Some(point(part.size)),
+    }
+}
+
+fn text_view(view: TextView) -> pb::TextView {
+    let peak = |peak: Peak| pb::Peak { x: peak.x, y: peak.y, relevancy: peak.relevancy };
+    pb::TextView {
+        mask_rle: view.mask_rle.map(|rle| rle.counts).unwrap_or_default(),
+        mask_png: view.mask_png.unwrap_or_default().into(),
+        relevancy_png: view.relevancy_png.unwrap_or_default().into(),
+        area: view.area,
+        bbox: view.bbox.map_or_else(Vec::new, |bbox| bbox.to_vec()),
+        peak: view.peak.map(peak),
+    }
+}
+
+/// A pixel of a view.
+pub(super) fn pick(request: pb::PickRequest) -> Result<PickSpec> {
+    Ok(PickSpec {
+        camera: camera(request.camera, "pick")?,
+        x: request.x,
+        y: request.y,
+        options: options_alone(request.options, "pick")?,
+        labels: request.labels,
+        profile: value("profile", request.profile)?,
+        wait: request.semantics_wait_ms.map(Duration::from_millis),
+    })
+}
+
+/// What lies under it.
+pub(super) fn picked(picked: Picked) -> pb::PickResponse {
+    let label = |label: Label| pb::Label { text: label.text, relevancy: label.relevancy };
+    pb::PickResponse {
+        alpha: picked.alpha,
+        depth: picked.depth,
+        point: picked.point.map(point),
+        gaussian: picked.gaussian,
+        entry: picked.entry.map(u32::from),
+        labels: picked.labels.into_iter().map(label).collect(),
+    }
+}
+
+/// An enum that a message carries as a number.
+pub(super) trait OfNumber: Sized {
+    /// The value of this number; proto3 lets any number through.
+    fn of_number(number: i32) -> Option<Self>;
+}
+
+/// The value of a message's enum; `name` names it in messages.
+pub(super) fn value<T: OfNumber>(name: &str, number: i32) -> Result<T> {
+    T::of_number(number)
+        .ok_or_else(|| Error::invalid(format!("{name} is {number}, which is none of its values")))
+}
+
+/// Enums that callers send; one that is not set is the default.
+macro_rules! sent {
+    ($($ours:ident = $theirs:ident { $($value:ident),+ })+) => {$(
+        impl OfNumber for $ours {
+            fn of_number(number: i32) -> Option<Self> {
+                Some(match pb::$theirs::try_from(number).ok()? {
+                    pb::$theirs::Unspecified => Self::default(),
+                    $(pb::$theirs::$value => Self::$value,)+
+                })
+            }
+        }
+    )+};
+}
+
+/// Enums that callers get.
+macro_rules! answered {
+    ($($ours:ident = $theirs:ident { $($value:ident),+ })+) => {$(
+        impl From<$ours> for pb::$theirs {
+            fn from(value: $ours) -> Self {
+                match value { $($ours::$value => Self::$value,)+ }
+            }
+        }
+    )+};
+}
+
+sent! {
+    SemanticsMode = Semantics { Lazy, Eager, Off }
+    Density = Density { Thinned, Full }
+    Kind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }
+    Format = Format { Png, Jpeg, Webp, Npy }
+    Quality = Quality { Exact, Fast }
+    ScoringProfile = ScoringProfile { Default, Paper }
+    Boxes = Boxes { Oriented, Aligned, None }
+    MaskFormat = MaskFormat { Rle, Png, None }
+    ExportFormat = ExportFormat { Ply }
+}
+
+answered! {
+    SceneState = SceneState { Queued, Running, Done, Failed, Cancelled }
+    SemanticsState = SemanticsState { Off, None, Running, Ready, Failed }
+    Kind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }
+    Format = Format { Png, Jpeg, Webp, Npy }
+    ScoringProfile = ScoringProfile { Default, Paper }
 }
 
 #[cfg(test)]
@@ -311,9 +391,9 @@ mod tests {
             lens: None,
         };
         assert!(message(camera(Some(short), "view").unwrap_err()).contains("12 numbers"));
-        assert!(message(kind(99).unwrap_err()).contains("kind is 99"));
-        assert_eq!(kind(6).unwrap(), Kind::Mask);
+        assert!(message(value::<Kind>("kind", 99).unwrap_err()).contains("kind is 99"));
+        assert_eq!(value::<Kind>("kind", 6).unwrap(), Kind::Mask);
         let odd = pb::ViewOptions { format: -1, ..Default::default() };
-        assert!(message(options(Some(odd)).unwrap_err()).contains("format is -1"));
+        assert!(message(picture(&odd).unwrap_err()).contains("format is -1"));
     }
 }

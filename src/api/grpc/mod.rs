@@ -3,7 +3,6 @@
 //! Errors carry the code of the one table in metadata `segsplat-code`: several codes share one
 //! gRPC status, so the string is the truth.
 
-mod ask;
 mod convert;
 mod scene_service;
 mod status;

@@ -6,20 +6,19 @@ use futures_util::{Stream, StreamExt, stream};
 use tonic::{Request, Response, Status, Streaming};
 
 use super::{
-    ask, convert,
+    convert,
     pb::{self, create_scene_header::Cameras, create_scene_request::Part},
     status::{logged, unreadable},
 };
 use crate::{
     api::{
         Api, request_id,
-        semantics::check_bundle,
-        upload::{UploadBuilder, UploadGuard},
+        upload::{UploadBuilder, UploadGuard, check_bundle},
     },
     error::{Error, ErrorCode, Result},
     keys::Caller,
     scene::{Upload, UploadCameras},
-    service::{CreateScene, PageRequest, SceneOptions, ViewSpec, ViewsSpec},
+    service::{CreateScene, Kind, PageRequest, SceneOptions, SemanticsMode, ViewSpec, ViewsSpec},
 };
 
 /// Longest pause between two messages of an upload.
@@ -108,10 +107,10 @@ impl pb::scene_service_server::SceneService for Api {
         let found = async {
             let request = request.into_inner();
             let id = request.scene_id.parse()?;
-            api.service.query(&id, ask::query(request)?).await
+            api.service.query(&id, convert::query(request)?).await
         };
         let found = found.await.map_err(|e: Error| logged(&e))?;
-        Ok(Response::new(ask::answer(found)))
+        Ok(Response::new(convert::answer(found)))
     }
 
     async fn pick(&self, request: Request<pb::PickRequest>) -> Answer<pb::PickResponse> {
@@ -119,10 +118,10 @@ impl pb::scene_service_server::SceneService for Api {
         let found = async {
             let request = request.into_inner();
             let id = request.scene_id.parse()?;
-            api.service.pick(&id, ask::pick(request)?).await
+            api.service.pick(&id, convert::pick(request)?).await
         };
         let found = found.await.map_err(|e: Error| logged(&e))?;
-        Ok(Response::new(ask::picked(found)))
+        Ok(Response::new(convert::picked(found)))
     }
 
     async fn export(&self, request: Request<pb::ExportRequest>) -> Answer<Self::ExportStream> {
@@ -151,8 +150,8 @@ async fn create(
         upload,
         options: SceneOptions {
             max_views: header.max_views.map(|views| views as usize),
-            semantics: convert::semantics(header.semantics)?,
-            density: convert::density(header.density)?,
+            semantics: convert::value("semantics", header.semantics)?,
+            density: convert::value("density", header.density)?,
         },
         idempotency_key: Some(header.idempotency_key).filter(|key| !key.is_empty()),
         wait,
@@ -215,7 +214,7 @@ fn begin(
     mut header: pb::CreateSceneHeader,
     upload: &mut UploadBuilder<'_>,
 ) -> Result<pb::CreateSceneHeader> {
-    convert::semantics(header.semantics)?;
+    convert::value::<SemanticsMode>("semantics", header.semantics)?;
     check_bundle(&header.bundle, &api.service.models())?;
     match header.cameras.take() {
         None => {}
@@ -231,34 +230,41 @@ fn begin(
 
 async fn render(api: &Api, request: pb::RenderViewRequest) -> Result<pb::View> {
     let id = request.scene_id.parse()?;
-    let kind = convert::kind(request.kind)?;
-    let ask = ask::ask(request.text, request.profile, request.semantics_wait_ms)?;
-    let camera = convert::camera(request.camera, "view")?;
-    let options = convert::options(request.options)?;
-    let view = api.service.render(&id, ViewSpec { camera, kind, options, ask }).await?;
+    let given = request.options.unwrap_or_default();
+    let spec = ViewSpec {
+        kind: convert::value("kind", request.kind)?,
+        text: convert::text(request.text, request.profile, request.semantics_wait_ms)?,
+        camera: convert::camera(request.camera, "view")?,
+        options: convert::options(&given)?,
+        picture: convert::picture(&given)?,
+    };
+    let view = api.service.render(&id, spec).await?;
     Ok(convert::view(view))
 }
 
 async fn render_many(api: &Api, request: pb::RenderViewsRequest) -> Result<Many<pb::View>> {
     let id = request.scene_id.parse()?;
-    let ask = ask::ask(request.text, request.profile, request.semantics_wait_ms)?;
+    let text = convert::text(request.text, request.profile, request.semantics_wait_ms)?;
     let kinds = match request.kinds.as_slice() {
-        [] => vec![crate::service::Kind::Color],
-        kinds => kinds.iter().map(|kind| convert::kind(*kind)).collect::<Result<_>>()?,
+        [] => vec![Kind::Color],
+        kinds => kinds.iter().map(|kind| convert::value("kind", *kind)).collect::<Result<_>>()?,
     };
     let cameras = request.cameras.into_iter().enumerate();
     let cameras = cameras
         .map(|(i, camera)| convert::camera(Some(camera), &format!("camera {i}")))
         .collect::<Result<_>>()?;
-    let options = convert::options(request.options)?;
-    let views = api.service.render_many(&id, &ViewsSpec { cameras, kinds, options, ask }).await?;
+    let given = request.options.unwrap_or_default();
+    let (options, picture) = (convert::options(&given)?, convert::picture(&given)?);
+    let spec = ViewsSpec { cameras, kinds, options, picture, text };
+    let views = api.service.render_many(&id, &spec).await?;
     Ok(views.map(|view| view.map(convert::view).map_err(|e| logged(&e))).boxed())
 }
 
 async fn export(api: &Api, request: pb::ExportRequest) -> Result<Many<pb::ExportChunk>> {
     let id = request.scene_id.parse()?;
-    let ask = ask::ask(request.text, request.profile, request.semantics_wait_ms)?;
-    let export = api.service.export(&id, convert::export_format(request.format)?, &ask).await?;
+    let text = convert::text(request.text, request.profile, request.semantics_wait_ms)?;
+    let format = convert::value("format", request.format)?;
+    let export = api.service.export(&id, format, &text).await?;
     let first = pb::ExportChunk {
         size_bytes: Some(export.size_bytes),
         file_name: export.file_name.clone(),

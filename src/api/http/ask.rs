@@ -2,113 +2,97 @@
 
 use std::time::Duration;
 
-use axum::{Extension, Json};
+use axum::Json;
 use serde::Deserialize;
+use utoipa::IntoParams;
 
 use super::{
     edge::Deadline,
     error::ApiError,
     extract::{Called, Id, JsonBody},
-    openapi::IdParam,
-    params::Params,
-    render::camera_fields,
-    schemas::{PickAnswer, PickParams, QueryBody as QueryRequest, QueryResult},
+    fields::Fields,
+    render::camera,
 };
 use crate::{
-    api::{camera::CameraFields, semantics},
-    error::Error,
-    service::{Boxes, MaskFormat, PickSpec, Picked, QueryAnswer, QuerySpec, ViewOptions},
+    scene::ScoringProfile,
+    service::{CameraFields, PickSpec, Picked, QueryAnswer, QuerySpec, ViewOptions},
 };
 
-/// Body of `POST /v1/scenes/{id}/query`.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(super) struct QueryBody {
-    #[serde(default)]
-    texts: Vec<String>,
-    camera: Option<CameraFields>,
-    width: Option<u32>,
-    height: Option<u32>,
-    #[serde(default)]
-    antialiased: bool,
-    near: Option<f32>,
-    boxes: Option<String>,
-    mask: Option<String>,
-    #[serde(default)]
-    relevancy: bool,
-    profile: Option<String>,
-    wait_ms: Option<u64>,
-}
-
-/// `POST /v1/scenes/{id}/query`
+/// Ask a scene texts: where is each, in 3D and in a view
 #[utoipa::path(
     post, path = "/v1/scenes/{id}/query", operation_id = "query", tag = "texts",
-    params(IdParam), request_body = QueryRequest,
-    responses((status = 200, description = "What each text found", body = QueryResult))
+    params(Id), request_body = QuerySpec,
+    responses((status = 200, description = "What each text found", body = QueryAnswer))
 )]
 pub(super) async fn query(
     Called(api): Called,
     Id(id): Id,
-    deadline: Option<Extension<Deadline>>,
-    params: Params,
-    JsonBody(body): JsonBody<QueryBody>,
+    deadline: Deadline,
+    params: Fields,
+    JsonBody(mut body): JsonBody,
 ) -> Result<Json<QueryAnswer>, ApiError> {
     params.finish()?;
+    let f = &mut body;
+    let of_view: Option<CameraFields> = f.value("camera")?;
     let spec = QuerySpec {
-        texts: body.texts,
-        camera: body.camera.map(|fields| fields.spec("camera")).transpose()?,
-        options: ViewOptions {
-            width: body.width,
-            height: body.height,
-            antialiased: body.antialiased,
-            near: body.near,
-            deadline: deadline.map(|Extension(Deadline(deadline))| deadline),
-            ..ViewOptions::default()
-        },
-        boxes: body.boxes.map_or(Ok(Boxes::default()), |name| semantics::boxes(&name))?,
-        mask: body.mask.map_or(Ok(MaskFormat::default()), |name| semantics::mask(&name))?,
-        relevancy: body.relevancy,
-        profile: semantics::profile(body.profile.as_deref())?,
-        wait: body.wait_ms.map(Duration::from_millis),
+        texts: f.value("texts")?.unwrap_or_default(),
+        camera: of_view.map(|fields| camera(fields, "camera")).transpose()?,
+        options: ViewOptions { deadline: deadline.0, ..f.take()? },
+        boxes: f.value("boxes")?.unwrap_or_default(),
+        mask: f.value("mask")?.unwrap_or_default(),
+        relevancy: f.value("relevancy")?.unwrap_or_default(),
+        profile: f.value("profile")?.unwrap_or_default(),
+        wait: f.millis("wait_ms")?,
     };
+    body.finish()?;
     Ok(Json(api.service.query(&id, spec).await?))
 }
 
-/// `GET /v1/scenes/{id}/pick`
+/// A pixel, and the texts to name what lies under it with.
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+pub(super) struct PickParams {
+    /// Across, pixels of the picture.
+    x: f64,
+    /// Down, pixels of the picture.
+    y: f64,
+    /// A text to name the entry with; may be given many times.
+    #[serde(default)]
+    label: Vec<String>,
+    /// How labels are scored: `default`, or `paper`.
+    #[serde(default)]
+    #[param(inline)]
+    profile: ScoringProfile,
+    /// Milliseconds to wait for semantics that are being made.
+    wait_ms: Option<u64>,
+}
+
+/// What lies under a pixel of a view
 #[utoipa::path(
     get, path = "/v1/scenes/{id}/pick", operation_id = "pick", tag = "texts",
-    params(IdParam, PickParams),
-    responses((status = 200, description = "What lies under the pixel", body = PickAnswer))
+    params(Id, PickParams, CameraFields, ViewOptions),
+    responses((status = 200, description = "What lies under the pixel", body = Picked))
 )]
 pub(super) async fn pick(
     Called(api): Called,
     Id(id): Id,
-    deadline: Option<Extension<Deadline>>,
-    mut params: Params,
+    deadline: Deadline,
+    mut fields: Fields,
 ) -> Result<Json<Picked>, ApiError> {
-    let p = &mut params;
-    // First, while they stand in the order they were given in.
-    let labels = p.texts("label");
-    let camera = camera_fields(p)?.spec("camera")?;
-    let what = "a number of pixels";
-    let missing = |name| Error::invalid(format!("{name} is missing; give x and y"));
-    let (x, y) = (p.number("x", what)?, p.number("y", what)?);
+    let f = &mut fields;
+    let camera = camera(f.take()?, "camera")?;
+    let labels = f.all("label")?;
+    let params = PickParams { label: labels, ..f.take()? };
+    let PickParams { x, y, label, profile, wait_ms } = params;
     let spec = PickSpec {
         camera,
-        x: x.ok_or_else(|| missing("x"))?,
-        y: y.ok_or_else(|| missing("y"))?,
-        options: ViewOptions {
-            width: p.whole("width")?,
-            height: p.whole("height")?,
-            antialiased: p.flag("antialiased")?.unwrap_or(false),
-            near: p.number("near", "a number")?,
-            deadline: deadline.map(|Extension(Deadline(deadline))| deadline),
-            ..ViewOptions::default()
-        },
-        labels,
-        profile: semantics::profile(p.text("profile")?.as_deref())?,
-        wait: p.whole::<u64>("wait_ms")?.map(Duration::from_millis),
+        x,
+        y,
+        options: ViewOptions { deadline: deadline.0, ..f.take()? },
+        labels: label,
+        profile,
+        wait: wait_ms.map(Duration::from_millis),
     };
-    params.finish()?;
+    fields.finish()?;
     Ok(Json(api.service.pick(&id, spec).await?))
 }

@@ -2,13 +2,14 @@
 
 use std::{
     any::Any,
+    convert::Infallible,
     time::{Duration, Instant},
 };
 
 use axum::{
     body::Body,
-    extract::{Request, State},
-    http::{HeaderMap, HeaderValue, Method, StatusCode, header},
+    extract::{FromRequestParts, Request, State},
+    http::{HeaderMap, HeaderValue, Method, StatusCode, header, request::Parts},
     middleware::Next,
     response::{IntoResponse, Response},
 };
@@ -32,8 +33,16 @@ use crate::{
 };
 
 /// The caller's own deadline, for handlers that hand it on.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Deadline(pub(super) Duration);
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Deadline(pub(super) Option<Duration>);
+
+impl<S: Sync> FromRequestParts<S> for Deadline {
+    type Rejection = Infallible;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Infallible> {
+        Ok(parts.extensions.get().copied().unwrap_or_default())
+    }
+}
 
 /// Name of the call that gave an answer, for metrics.
 #[derive(Clone, Copy, Debug)]
@@ -63,7 +72,7 @@ async fn rest_within(
         Err(error) => ApiError::from(error).into_response(),
         Ok(None) => next.run(request).await,
         Ok(Some(deadline)) => {
-            request.extensions_mut().insert(Deadline(deadline));
+            request.extensions_mut().insert(Deadline(Some(deadline)));
             match tokio::time::timeout(deadline, next.run(request)).await {
                 Ok(response) => response,
                 Err(_) => ApiError::from(deadline_passed(deadline)).into_response(),

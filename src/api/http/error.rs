@@ -8,7 +8,8 @@ use axum::{
     http::{HeaderValue, Method, StatusCode, Uri, header},
     response::{IntoResponse, Response},
 };
-use serde_json::json;
+use serde::Serialize;
+use utoipa::ToSchema;
 
 use super::edge;
 use crate::{
@@ -16,11 +17,36 @@ use crate::{
     scene::SceneId,
 };
 
+/// The body of every error.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct ErrorBody {
+    /// Stable `snake_case` code.
+    code: &'static str,
+    /// Names input, value and bound.
+    message: String,
+    /// Finds the call in the log; also in the header `x-request-id`.
+    request_id: String,
+    /// More about it.
+    details: ErrorDetails,
+}
+
+/// More about an error.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct ErrorDetails {
+    /// Whether the same call may succeed later.
+    retry: bool,
+    /// When, seconds from now.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    retry_after_s: Option<u32>,
+    /// The scene it is about.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    scene: Option<String>,
+}
+
 /// An error on its way out of a handler; the edge writes the body, which holds the request's id.
 #[derive(Debug)]
 pub(super) struct ApiError {
     error: Error,
-    status: Option<StatusCode>,
     scene: Option<SceneId>,
 }
 
@@ -37,16 +63,14 @@ impl ApiError {
 
 impl From<Error> for ApiError {
     fn from(error: Error) -> Self {
-        Self { error, status: None, scene: None }
+        Self { error, scene: None }
     }
 }
 
 impl IntoResponse for ApiError {
     fn into_response(self) -> Response {
-        let status = self.status.unwrap_or_else(|| {
-            StatusCode::from_u16(self.error.code().row().http)
-                .unwrap_or(StatusCode::INTERNAL_SERVER_ERROR)
-        });
+        let status = StatusCode::from_u16(self.error.code().row().http)
+            .unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
         let mut response = status.into_response();
         response.extensions_mut().insert(Fault(Arc::new(self)));
         response
@@ -62,19 +86,16 @@ impl Fault {
     /// Writes body and headers into `response`.
     pub(super) fn write(&self, response: Response, request_id: &str) -> Response {
         let error = self.error();
-        let mut details = json!({ "retry": error.code().row().retry });
-        if let Some(seconds) = retry_after_s(error) {
-            details["retry_after_s"] = json!(seconds);
-        }
-        if let Some(scene) = &self.0.scene {
-            details["scene"] = json!(scene.as_str());
-        }
-        let body = json!({
-            "code": error.code().name(),
-            "message": error.message(),
-            "request_id": request_id,
-            "details": details,
-        });
+        let body = ErrorBody {
+            code: error.code().name(),
+            message: error.message().to_owned(),
+            request_id: request_id.to_owned(),
+            details: ErrorDetails {
+                retry: error.code().row().retry,
+                retry_after_s: retry_after_s(error),
+                scene: self.0.scene.as_ref().map(ToString::to_string),
+            },
+        };
         let (parts, _) = response.into_parts();
         let mut answer = (parts.status, Json(body)).into_response();
         for (name, value) in &parts.headers {
@@ -111,9 +132,8 @@ pub(super) async fn no_such_route(request: Request) -> Response {
 /// Answer of a path that has other methods; axum adds `Allow`.
 pub(super) async fn method_not_allowed(method: Method, uri: Uri) -> Response {
     let shown: String = uri.path().chars().take(80).collect();
-    let error = Error::new(ErrorCode::NotFound, format!("{shown} has no method {method}"));
-    let status = Some(StatusCode::METHOD_NOT_ALLOWED);
-    ApiError { status, ..ApiError::from(error) }.into_response()
+    let message = format!("{shown} has no method {method}");
+    ApiError::from(Error::new(ErrorCode::MethodNotAllowed, message)).into_response()
 }
 
 /// Answer of a handler that panicked; the panic's text is for the log alone.

@@ -6,9 +6,9 @@ use axum::{
     http::request::Parts,
 };
 use futures_util::StreamExt;
-use serde::de::DeserializeOwned;
+use utoipa::IntoParams;
 
-use super::{error::ApiError, receive::read_on};
+use super::{error::ApiError, fields::Fields, receive::read_on};
 use crate::{
     api::{Api, upload::json_over},
     error::Error,
@@ -17,8 +17,13 @@ use crate::{
 };
 
 /// The `{id}` of the path, checked before anything else sees it.
-#[derive(Clone, Debug)]
-pub(super) struct Id(pub(super) SceneId);
+#[derive(Clone, Debug, IntoParams)]
+#[into_params(names("id"), parameter_in = Path)]
+pub(super) struct Id(
+    /// 32 lower-case hex digits.
+    #[param(value_type = String)]
+    pub(super) SceneId,
+);
 
 impl FromRequestParts<Api> for Id {
     type Rejection = ApiError;
@@ -47,11 +52,11 @@ impl FromRequestParts<Api> for Called {
     }
 }
 
-/// A JSON body of at most `limits.json_bytes_max`, whatever its content type says.
+/// The fields of a JSON body of at most `limits.json_bytes_max`, whatever its content type says.
 #[derive(Clone, Debug)]
-pub(super) struct JsonBody<T>(pub(super) T);
+pub(super) struct JsonBody(pub(super) Fields);
 
-impl<T: DeserializeOwned> FromRequest<Api> for JsonBody<T> {
+impl FromRequest<Api> for JsonBody {
     type Rejection = ApiError;
 
     async fn from_request(request: Request, api: &Api) -> Result<Self, ApiError> {
@@ -68,8 +73,6 @@ impl<T: DeserializeOwned> FromRequest<Api> for JsonBody<T> {
             bytes.extend_from_slice(&piece);
         }
         limits.check_json("body", &bytes)?;
-        let value = serde_json::from_slice(&bytes)
-            .map_err(|e| Error::invalid(format!("body: not the JSON expected: {e}")))?;
-        Ok(Self(value))
+        Ok(Self(Fields::of_json(&bytes)?))
     }
 }

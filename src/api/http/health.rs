@@ -6,29 +6,38 @@ use axum::{
     http::{StatusCode, header},
     response::{IntoResponse, Response},
 };
+use serde::Serialize;
+use utoipa::ToSchema;
 
-use super::{error::ApiError, extract::Called, openapi, params::Params};
+use super::{error::ApiError, extract::Called, fields::Fields};
 use crate::{
     api::Api,
-    service::ModelsInfo,
+    service::{ModelsInfo, Readiness},
     telemetry::meter::{self, Levels},
 };
 
-/// `GET /healthz`: the process answers.
-#[utoipa::path(
-    get, path = "/healthz", operation_id = "live", tag = "server",
-    responses((status = 200, description = "It answers", body = openapi::Liveness))
-)]
-pub(super) async fn live() -> Json<serde_json::Value> {
-    Json(serde_json::json!({ "live": true }))
+/// Whether the process answers.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct Liveness {
+    /// True.
+    live: bool,
 }
 
-/// `GET /readyz`: 200 where new work is taken, else 503 with the same body.
+/// Whether the process answers
+#[utoipa::path(
+    get, path = "/healthz", operation_id = "live", tag = "server",
+    responses((status = 200, description = "It answers", body = Liveness))
+)]
+pub(super) async fn live() -> Json<Liveness> {
+    Json(Liveness { live: true })
+}
+
+/// Whether new work is taken: 200, else 503 with the same body
 #[utoipa::path(
     get, path = "/readyz", operation_id = "ready", tag = "server",
     responses(
-        (status = 200, description = "New work is taken", body = openapi::Readiness),
-        (status = 503, description = "Not now", body = openapi::Readiness),
+        (status = 200, description = "New work is taken", body = Readiness),
+        (status = 503, description = "Not now", body = Readiness),
     )
 )]
 pub(super) async fn ready(State(api): State<Api>) -> Response {
@@ -38,7 +47,7 @@ pub(super) async fn ready(State(api): State<Api>) -> Response {
     (status, Json(readiness)).into_response()
 }
 
-/// `GET /metrics`
+/// Metrics of the process
 #[utoipa::path(
     get, path = "/metrics", operation_id = "metrics", tag = "server",
     responses((
@@ -59,15 +68,15 @@ pub(super) async fn metrics(State(api): State<Api>) -> Result<Response, ApiError
     Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], text).into_response())
 }
 
-/// `GET /v1/models`
+/// The model bundle and the renderer
 #[utoipa::path(
     get, path = "/v1/models", operation_id = "models", tag = "server",
-    responses((status = 200, description = "Bundle and renderer", body = openapi::Models))
+    responses((status = 200, description = "Bundle and renderer", body = ModelsInfo))
 )]
 pub(super) async fn models(
     Called(api): Called,
-    params: Params,
+    fields: Fields,
 ) -> Result<Json<ModelsInfo>, ApiError> {
-    params.finish()?;
+    fields.finish()?;
     Ok(Json(api.service.models()))
 }

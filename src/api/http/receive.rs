@@ -11,8 +11,9 @@ use axum::{
     extract::{FromRequest, Multipart, Request, multipart::Field},
 };
 use futures_util::{Stream, StreamExt, stream};
+use utoipa::ToSchema;
 
-use super::{error::ApiError, params::Params};
+use super::{error::ApiError, fields::Fields};
 use crate::{
     api::{
         Api,
@@ -35,11 +36,30 @@ const OPTION_BYTES_MAX: usize = 256;
 /// Options that may come as text parts as well as in the query string.
 const OPTIONS: [&str; 5] = ["semantics", "bundle", "max_views", "density", "wait_ms"];
 
-/// Reads the parts of `request`; text parts that are options go to `params`.
+/// Parts of the upload, for `/openapi.json`: no value has this type, parts are read as they come.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "read by the derive alone")]
+pub(super) struct UploadForm {
+    /// A nerfstudio or instant-ngp `transforms.json` (OpenGL axes).
+    #[schema(content_media_type = "application/json")]
+    transforms: Option<String>,
+    /// Our own JSON (OpenCV axes):
+    /// `{"cameras":[{"file","intrinsics","camera_to_world"}]}`.
+    #[schema(content_media_type = "application/json")]
+    cameras: Option<String>,
+    /// A zip or tar of a folder of photos and its camera JSON, instead of all other parts.
+    #[schema(content_media_type = "application/octet-stream")]
+    archive: Option<String>,
+    /// Any other part is a photo, named by its part or file.
+    #[schema(content_media_type = "image/*")]
+    photo: Option<Vec<String>>,
+}
+
+/// Reads the parts of `request`; text parts that are options go to `fields`.
 pub(super) async fn receive(
     api: &Api,
     request: Request,
-    params: &mut Params,
+    fields: &mut Fields,
 ) -> Result<(Upload, UploadGuard), ApiError> {
     let limits = api.service.limits();
     let length = request
@@ -59,7 +79,7 @@ pub(super) async fn receive(
             format!("{} bytes", limits.upload_bytes_max),
         )),
         _ => match (room_in_queue, form) {
-            (Ok(()), Ok(mut form)) => parts(api, &mut form, params, &wire).await,
+            (Ok(()), Ok(mut form)) => parts(api, &mut form, fields, &wire).await,
             (Err(full), Ok(_)) => Err(full),
             (_, Err(_)) => Err(Error::invalid(
                 "body: not multipart/form-data with a boundary; send photos as parts",
@@ -93,7 +113,7 @@ pub(super) fn read_on(
 async fn parts(
     api: &Api,
     form: &mut Multipart,
-    params: &mut Params,
+    fields: &mut Fields,
     wire: &Wire,
 ) -> Result<(Upload, UploadGuard)> {
     let limits = api.service.limits();
@@ -113,7 +133,7 @@ async fn parts(
                 let Some(at) = options.iter().position(|left| *left == option) else {
                     return Err(Error::invalid(format!("upload: {option} is given twice")));
                 };
-                params.push(options.swap_remove(at), text(&mut field).await?);
+                fields.push(options.swap_remove(at), text(&mut field).await?);
                 wire.progressed();
                 continue;
             }
@@ -175,16 +195,26 @@ impl Wire {
     }
 }
 
-/// A photo is named by its part where that has an extension, else by its file.
+/// A photo is named by its part where that has an extension, else by its file. A part with neither
+/// is no photo.
 fn photo_name(part: &str, file: Option<&str>) -> Result<String> {
-    let chosen = match file {
-        Some(file) if !part.contains('.') && !file.is_empty() => file,
-        _ => part,
-    };
-    if chosen.is_empty() {
-        return Err(Error::invalid("upload: a part has no name; name each photo by its file"));
+    match file.filter(|file| !file.is_empty()) {
+        _ if part.contains('.') => Ok(part.to_owned()),
+        Some(file) => Ok(file.to_owned()),
+        None if part.is_empty() => {
+            Err(Error::invalid("upload: a part has no name; name each photo by its file"))
+        }
+        // Its length is refused with the bound.
+        None if part.len() > OPTION_BYTES_MAX => Ok(part.to_owned()),
+        None => {
+            let shown: String = part.chars().take(40).collect();
+            Err(Error::invalid(format!(
+                "upload: unknown part {shown:?}; there are transforms, cameras, archive, {}, and \
+                 photos, each with the name of its file",
+                OPTIONS.join(", ")
+            )))
+        }
     }
-    Ok(chosen.to_owned())
 }
 
 async fn text(field: &mut Field<'_>) -> Result<String> {
@@ -227,10 +257,10 @@ mod tests {
             ("images/a.png", Some("local.png"), "images/a.png"),
             ("photo", Some("a.png"), "a.png"),
             ("a.png", None, "a.png"),
-            ("photo", None, "photo"),
         ] {
             assert_eq!(photo_name(part, file).unwrap(), name, "{part} {file:?}");
         }
         assert!(photo_name("", None).is_err());
+        assert!(photo_name("semantcs", None).unwrap_err().message().contains("density"));
     }
 }

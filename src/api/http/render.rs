@@ -1,36 +1,55 @@
 //! One rendered view, and the scene as a file.
 
-use std::{convert::Infallible, time::Duration};
+use std::convert::Infallible;
 
 use axum::{
-    Extension,
     body::Body,
     http::{HeaderMap, HeaderValue, StatusCode, header},
     response::{IntoResponse, Response},
 };
 use futures_util::StreamExt;
+use serde::Deserialize;
+use utoipa::IntoParams;
 
 use super::{
     edge::Deadline,
     error::ApiError,
     extract::{Called, Id},
-    openapi::{ExportParams, IdParam, ViewParams},
-    params::Params,
+    fields::Fields,
 };
 use crate::{
-    api::{
-        camera::CameraFields,
-        semantics::{kind, profile, quality},
-    },
     error::{Error, Result},
-    scene::Region,
-    service::{Ask, ExportFormat, Format, Kind, RenderedView, ViewOptions, ViewSpec},
+    service::{
+        CameraFields, CameraSpec, ExportFormat, Format, Kind, PictureOptions, RenderedView,
+        TextOptions, ViewOptions, ViewSpec,
+    },
 };
 
-/// `GET /v1/scenes/{id}/view`
+/// What a view shows.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct ViewParams {
+    /// `color` (default), `depth`, `alpha`, `semantics` (a fixed colour for each entry of the
+    /// bank), `relevancy` or `mask` (of a text).
+    #[param(inline)]
+    kind: Kind,
+}
+
+/// What an export is.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct ExportParams {
+    /// `ply` (default).
+    #[param(inline)]
+    format: ExportFormat,
+}
+
+/// One view of a scene
 #[utoipa::path(
     get, path = "/v1/scenes/{id}/view", operation_id = "render_view", tag = "views",
-    params(IdParam, ViewParams),
+    params(Id, CameraFields, ViewParams, ViewOptions, PictureOptions, TextOptions),
     responses(
         (
             status = 200, content_type = "image/png", body = Vec<u8>,
@@ -42,12 +61,12 @@ use crate::{
 pub(super) async fn view(
     Called(api): Called,
     Id(id): Id,
-    deadline: Option<Extension<Deadline>>,
+    deadline: Deadline,
     headers: HeaderMap,
-    params: Params,
+    fields: Fields,
 ) -> Result<Response, ApiError> {
-    let mut spec = spec_of(params, accept(&headers))?;
-    spec.options.deadline = deadline.map(|Extension(Deadline(deadline))| deadline);
+    let mut spec = spec_of(fields, accept(&headers))?;
+    spec.options.deadline = deadline.0;
     if let Some(known) = headers.get(header::IF_NONE_MATCH).and_then(|v| v.to_str().ok()) {
         let etag = api.service.view_etag(&id, &spec).await?.map(|etag| quoted(&etag));
         if let Some(etag) = etag.filter(|etag| matches_etag(known, etag)) {
@@ -61,10 +80,10 @@ pub(super) async fn view(
     Ok(answer)
 }
 
-/// `GET /v1/scenes/{id}/export`
+/// The scene, or what a text selects of it, as a file
 #[utoipa::path(
     get, path = "/v1/scenes/{id}/export", operation_id = "export", tag = "views",
-    params(IdParam, ExportParams),
+    params(Id, ExportParams, TextOptions),
     responses((
         status = 200, content_type = "application/octet-stream", body = Vec<u8>,
         description = "Standard 3DGS PLY"
@@ -74,17 +93,11 @@ pub(super) async fn export(
     Called(api): Called,
     Id(id): Id,
     headers: HeaderMap,
-    mut params: Params,
+    mut fields: Fields,
 ) -> Result<Response, ApiError> {
-    let format = match params.text("format")?.as_deref() {
-        None | Some("ply") => ExportFormat::Ply,
-        Some(other) => {
-            let shown: String = other.chars().take(40).collect();
-            return Err(Error::invalid(format!("format is {shown:?}; it must be ply")).into());
-        }
-    };
-    let ask = ask(&mut params)?;
-    params.finish()?;
+    let ExportParams { format } = fields.take()?;
+    let ask: TextOptions = fields.take()?;
+    fields.finish()?;
     let export = api.service.export(&id, format, &ask).await?;
     let etag = quoted(&export.etag);
     let known = headers.get(header::IF_NONE_MATCH).and_then(|v| v.to_str().ok());
@@ -95,6 +108,8 @@ pub(super) async fn export(
     let headers = [
         (header::CONTENT_TYPE, "application/octet-stream".to_owned()),
         (header::CONTENT_LENGTH, export.size_bytes.to_string()),
+        // It is written while it is sent, always from its start.
+        (header::ACCEPT_RANGES, "none".to_owned()),
         (header::CONTENT_DISPOSITION, disposition),
         (header::ETAG, etag),
         (header::CACHE_CONTROL, "private, no-cache".to_owned()),
@@ -139,105 +154,23 @@ pub(super) fn content_type(format: Format) -> &'static str {
     }
 }
 
-/// The camera's fields, as separate parameters.
-pub(super) fn camera_fields(p: &mut Params) -> Result<CameraFields> {
-    Ok(CameraFields {
-        camera_to_world: p.numbers("camera_to_world")?,
-        eye: p.numbers("eye")?,
-        target: p.numbers("target")?,
-        up: p.numbers("up")?,
-        from: p.whole("from")?,
-        to: p.whole("to")?,
-        t: p.number("t", "a number")?,
-        fx: p.number("fx", "a number")?,
-        fy: p.number("fy", "a number")?,
-        cx: p.number("cx", "a number")?,
-        cy: p.number("cy", "a number")?,
-        fov: p.number("fov", "a number of degrees")?,
-    })
+/// The camera of these fields; `what` names it in messages.
+pub(super) fn camera(fields: CameraFields, what: &str) -> Result<CameraSpec> {
+    let wrong = |error: Error| Error::invalid(format!("{what}: {}", error.message()));
+    CameraSpec::try_from(fields).map_err(wrong)
 }
 
-/// What is asked by text.
-fn ask(p: &mut Params) -> Result<Ask> {
-    Ok(Ask {
-        text: p.text("text")?,
-        profile: profile(p.text("profile")?.as_deref())?,
-        wait: p.whole::<u64>("wait_ms")?.map(Duration::from_millis),
-    })
-}
-
-fn spec_of(mut params: Params, accept: Option<&str>) -> Result<ViewSpec> {
-    let p = &mut params;
-    let fields = camera_fields(p)?;
-    let kind = kind(p.text("kind")?.as_deref().unwrap_or("color"))?;
-    let format = match p.text("format")? {
-        Some(name) => format(&name)?,
-        None => negotiate(accept, kind)?,
-    };
-    let options = ViewOptions {
-        width: p.whole("width")?,
-        height: p.whole("height")?,
-        format,
-        background: p.text("background")?.map_or(Ok(None), |text| background(&text))?,
-        antialiased: p.flag("antialiased")?.unwrap_or(false),
-        near: p.number("near", "a number")?,
-        crop: p.wholes("crop")?.map(crop),
-        quality: quality(p.text("quality")?.as_deref())?,
-        deadline: None,
-    };
-    let ask = ask(p)?;
-    params.finish()?;
-    Ok(ViewSpec { camera: fields.spec("view")?, kind, options, ask })
-}
-
-/// A part of a picture from its first column, first row, width and height.
-pub(super) fn crop([x, y, width, height]: [u32; 4]) -> Region {
-    Region { x, y, width, height }
-}
-
-/// The encoding named `name`.
-pub(super) fn format(name: &str) -> Result<Format> {
-    match name {
-        "png" => Ok(Format::Png),
-        "jpeg" | "jpg" => Ok(Format::Jpeg),
-        "webp" => Ok(Format::Webp),
-        "npy" => Ok(Format::Npy),
-        other => {
-            let shown: String = other.chars().take(40).collect();
-            Err(Error::invalid(format!("format is {shown:?}; it must be png, jpeg, webp or npy")))
-        }
+fn spec_of(mut fields: Fields, accept: Option<&str>) -> Result<ViewSpec> {
+    let f = &mut fields;
+    let format_given = f.has("format");
+    let camera = camera(f.take()?, "camera")?;
+    let ViewParams { kind } = f.take()?;
+    let (options, mut picture, text) = (f.take()?, f.take::<PictureOptions>()?, f.take()?);
+    fields.finish()?;
+    if !format_given {
+        picture.format = negotiate(accept, kind)?;
     }
-}
-
-/// `backdrop` (none), or a colour: `black`, `white`, `#rrggbb` or three numbers of 0..1.
-pub(super) fn background(text: &str) -> Result<Option<[f32; 3]>> {
-    let shown: String = text.chars().take(40).collect();
-    let wrong = || {
-        Error::invalid(format!(
-            "background is {shown:?}; it must be backdrop, black, white, #rrggbb or three numbers \
-             of 0..1"
-        ))
-    };
-    match text {
-        "backdrop" => return Ok(None),
-        "black" => return Ok(Some([0.0; 3])),
-        "white" => return Ok(Some([1.0; 3])),
-        _ => {}
-    }
-    let mut color = [0.0; 3];
-    if let Some(hex) = text.strip_prefix('#') {
-        let digits = hex.len() == 6 && hex.bytes().all(|b| b.is_ascii_hexdigit());
-        let value = u32::from_str_radix(hex, 16).ok().filter(|_| digits);
-        let [_, bytes @ ..] = value.ok_or_else(wrong)?.to_be_bytes();
-        return Ok(Some(bytes.map(|byte| f32::from(byte) / 255.0)));
-    }
-    if text.split(',').count() != 3 {
-        return Err(wrong());
-    }
-    for (channel, part) in color.iter_mut().zip(text.split(',')) {
-        *channel = part.trim().parse().map_err(|_| wrong())?;
-    }
-    Ok(Some(color))
+    Ok(ViewSpec { camera, kind, options, picture, text })
 }
 
 fn accept(headers: &HeaderMap) -> Option<&str> {
@@ -269,7 +202,7 @@ fn negotiate(accept: Option<&str>, kind: Kind) -> Result<Format> {
         let shown: String = accept.chars().take(80).collect();
         Error::invalid(format!(
             "Accept is {shown:?}; a kind={} picture can be image/png{}{}, application/x-npy",
-            kind.name(),
+            kind,
             if lossy { ", image/jpeg" } else { "" },
             if kind == Kind::Depth { "" } else { ", image/webp" },
         ))
@@ -301,16 +234,6 @@ mod tests {
         assert_eq!(pick("text/html", Kind::Color), None);
         assert_eq!(pick("image/png;q=0", Kind::Color), None);
         assert_eq!(negotiate(None, Kind::Color).unwrap(), Format::Png);
-    }
-
-    #[test]
-    fn backgrounds_are_names_hex_or_numbers() {
-        assert_eq!(background("white").unwrap(), Some([1.0; 3]));
-        assert_eq!(background("#ff0000").unwrap(), Some([1.0, 0.0, 0.0]));
-        assert_eq!(background("0, 0.5,1").unwrap(), Some([0.0, 0.5, 1.0]));
-        for odd in ["", "#ff00", "#ggffff", "1,2", "a,b,c", "#+fffff"] {
-            assert!(background(odd).is_err(), "{odd} was taken");
-        }
     }
 
     #[test]

@@ -12,46 +12,53 @@ use axum::{
     },
 };
 use futures_util::{Stream, StreamExt};
+use serde::Deserialize;
+use utoipa::IntoParams;
 
 use super::{
     error::ApiError,
     extract::{Called, Id},
-    openapi::{self, CreateParams, IdParam, ListParams, Scene, UploadForm},
-    params::Params,
-    receive::receive,
+    fields::Fields,
+    receive::{UploadForm, receive},
 };
 use crate::{
-    api::{
-        Api, request_id,
-        semantics::{check_bundle, mode},
-    },
+    api::{Api, request_id, upload::check_bundle},
     error::{Error, Result},
     scene::StageTime,
-    service::{
-        CreateScene, Density, Event, Page, PageRequest, SceneOptions, SceneState, SceneStatus,
-    },
+    service::{CreateScene, Event, Page, PageRequest, SceneOptions, SceneState, SceneStatus},
 };
 
-/// `POST /v1/scenes`
+/// What `create_scene` takes besides the upload and the scene's options.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct CreateParams {
+    /// Name of the model bundle; the loaded one by default.
+    bundle: Option<String>,
+    /// Milliseconds to wait for the scene before answering.
+    wait_ms: Option<u64>,
+}
+
+/// Make a scene of photos and their cameras
 #[utoipa::path(
     post, path = "/v1/scenes", operation_id = "create_scene", tag = "scenes",
-    params(CreateParams, ("Idempotency-Key" = Option<String>, Header)),
+    params(SceneOptions, CreateParams, ("Idempotency-Key" = Option<String>, Header)),
     request_body(content = UploadForm, content_type = "multipart/form-data"),
     responses(
-        (status = 201, description = "Made", body = Scene),
-        (status = 202, description = "Taken; see Location", body = Scene),
+        (status = 201, description = "Made", body = SceneStatus),
+        (status = 202, description = "Taken; see Location", body = SceneStatus),
     )
 )]
 pub(super) async fn create(
     Called(api): Called,
-    mut params: Params,
+    mut fields: Fields,
     request: Request,
 ) -> Result<Response, ApiError> {
     let idempotency_key = idempotency_key(request.headers())?;
     let request_id = request.headers().get(request_id::HEADER);
     let request_id = request_id.and_then(|id| id.to_str().ok()).map(str::to_owned);
-    let (upload, _guard) = receive(&api, request, &mut params).await?;
-    let (options, wait) = options(&api, params)?;
+    let (upload, _guard) = receive(&api, request, &mut fields).await?;
+    let (options, wait) = options(&api, fields)?;
     let request = CreateScene { upload, options, idempotency_key, wait, request_id };
     let created = api.service.create_scene(request).await?;
     if let (Some(error), Some(_)) = (&created.status.error, wait) {
@@ -80,50 +87,50 @@ fn server_timing(stages: &[StageTime]) -> String {
     times.collect::<Vec<_>>().join(", ")
 }
 
-/// `GET /v1/scenes`
+/// A page of the scenes
 #[utoipa::path(
-    get, path = "/v1/scenes", operation_id = "list_scenes", tag = "scenes", params(ListParams),
-    responses((status = 200, description = "A page, newest first", body = openapi::Page))
+    get, path = "/v1/scenes", operation_id = "list_scenes", tag = "scenes", params(PageRequest),
+    responses((status = 200, description = "A page, newest first", body = Page))
 )]
-pub(super) async fn list(Called(api): Called, mut params: Params) -> Result<Json<Page>, ApiError> {
-    let page = PageRequest { limit: params.whole("limit")?, after: params.text("after")? };
-    params.finish()?;
+pub(super) async fn list(Called(api): Called, mut fields: Fields) -> Result<Json<Page>, ApiError> {
+    let page: PageRequest = fields.take()?;
+    fields.finish()?;
     Ok(Json(api.service.list(&page).await?))
 }
 
-/// `GET /v1/scenes/{id}`
+/// One scene
 #[utoipa::path(
-    get, path = "/v1/scenes/{id}", operation_id = "get_scene", tag = "scenes", params(IdParam),
-    responses((status = 200, description = "The scene", body = Scene))
+    get, path = "/v1/scenes/{id}", operation_id = "get_scene", tag = "scenes", params(Id),
+    responses((status = 200, description = "The scene", body = SceneStatus))
 )]
 pub(super) async fn get(
     Called(api): Called,
     Id(id): Id,
-    params: Params,
+    fields: Fields,
 ) -> Result<Json<SceneStatus>, ApiError> {
-    params.finish()?;
+    fields.finish()?;
     Ok(Json(api.service.get(&id).await?))
 }
 
-/// `DELETE /v1/scenes/{id}`
+/// Delete a scene
 #[utoipa::path(
     delete, path = "/v1/scenes/{id}", operation_id = "delete_scene", tag = "scenes",
-    params(IdParam), responses((status = 204, description = "Gone"))
+    params(Id), responses((status = 204, description = "Gone"))
 )]
 pub(super) async fn delete(
     Called(api): Called,
     Id(id): Id,
-    params: Params,
+    fields: Fields,
 ) -> Result<StatusCode, ApiError> {
-    params.finish()?;
+    fields.finish()?;
     api.service.delete(&id).await?;
     Ok(StatusCode::NO_CONTENT)
 }
 
-/// `GET /v1/scenes/{id}/events`
+/// What happens to a scene, as it happens
 #[utoipa::path(
     get, path = "/v1/scenes/{id}/events", operation_id = "watch_scene", tag = "scenes",
-    params(IdParam),
+    params(Id),
     responses((
         status = 200, content_type = "text/event-stream", body = String,
         description = "Events queued, running, done, failed, cancelled, each with JSON data"
@@ -132,34 +139,26 @@ pub(super) async fn delete(
 pub(super) async fn events(
     Called(api): Called,
     Id(id): Id,
-    params: Params,
+    fields: Fields,
 ) -> Result<Sse<impl Stream<Item = Result<sse::Event, Infallible>>>, ApiError> {
-    params.finish()?;
+    fields.finish()?;
     let events = api.service.watch(&id).await?.map(|event| Ok(sse_event(&event)));
     Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(Duration::from_secs(15))))
 }
 
 /// The event's name as SSE's `event`, the whole of it as JSON in `data`.
 fn sse_event(event: &Event) -> sse::Event {
-    let named = sse::Event::default().event(event.name());
-    let data = serde_json::to_string(event).unwrap_or_else(|_| "{}".to_owned());
-    named.data(data)
+    let data = serde_json::to_value(event).unwrap_or_default();
+    let name = data["event"].as_str().unwrap_or_default();
+    sse::Event::default().event(name).data(data.to_string())
 }
 
-fn options(api: &Api, mut params: Params) -> Result<(SceneOptions, Option<Duration>)> {
-    let semantics = params.text("semantics")?.map(|text| mode(&text)).transpose()?;
-    if let Some(bundle) = params.text("bundle")? {
-        check_bundle(&bundle, &api.service.models())?;
-    }
-    let density = params.text("density")?.map(|text| Density::named(&text)).transpose()?;
-    let options = SceneOptions {
-        max_views: params.whole("max_views")?,
-        density: density.unwrap_or_default(),
-        semantics: semantics.unwrap_or_default(),
-    };
-    let wait = params.whole::<u64>("wait_ms")?.map(Duration::from_millis);
-    params.finish()?;
-    Ok((options, wait))
+fn options(api: &Api, mut fields: Fields) -> Result<(SceneOptions, Option<Duration>)> {
+    let options: SceneOptions = fields.take()?;
+    let CreateParams { bundle, wait_ms } = fields.take()?;
+    fields.finish()?;
+    check_bundle(&bundle.unwrap_or_default(), &api.service.models())?;
+    Ok((options, wait_ms.map(Duration::from_millis)))
 }
 
 /// 1 to 255 printable ASCII characters.

@@ -12,7 +12,7 @@ const POLICY: &str = "default-src 'none'; script-src 'unsafe-inline'; style-src 
                       img-src 'self' blob: data:; connect-src 'self'; form-action 'self'; \
                       base-uri 'none'; frame-ancestors 'none'";
 
-/// `GET /`
+/// The viewer page
 #[utoipa::path(
     get, path = "/", operation_id = "viewer", tag = "server",
     responses((

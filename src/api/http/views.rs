@@ -3,78 +3,76 @@
 use std::{
     io::{self, Write},
     sync::{Arc, Mutex, PoisonError},
-    time::Duration,
 };
 
 use axum::{
-    Extension,
     body::{Body, Bytes},
     http::{HeaderMap, header},
     response::{IntoResponse, Response},
 };
 use futures_util::{Stream, StreamExt, stream};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 use zip::{CompressionMethod, ZipWriter, write::SimpleFileOptions};
 
 use super::{
     edge::Deadline,
     error::ApiError,
     extract::{Called, Id, JsonBody},
-    openapi::{IdParam, ViewsRequest},
-    params::Params,
-    render::{background, content_type, crop, format, view_headers},
+    fields::Fields,
+    render::{camera, content_type, view_headers},
 };
 use crate::{
-    api::{
-        camera::CameraFields,
-        semantics::{kind, profile, quality},
-    },
-    error::{Error, Result},
-    service::{Ask, Format, Kind, RenderedView, ViewOptions, ViewsSpec},
+    error::Result,
+    service::{CameraFields, Format, Kind, RenderedView, ViewOptions, ViewsSpec},
 };
 
 /// Between the parts of a multipart answer; the pictures' own bytes cannot hold it by accident.
 const BOUNDARY: &str = "segsplat-7d1f0b9c52e84a36";
 
-/// Body of `POST /v1/scenes/{id}/views`.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
+/// Body of `render_views`: views, and what they come in.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ViewsRequest)]
 pub(super) struct ViewsBody {
-    cameras: Vec<CameraFields>,
-    kinds: Option<Vec<String>>,
-    width: Option<u32>,
-    height: Option<u32>,
-    format: Option<String>,
-    background: Option<BackgroundBody>,
-    #[serde(default)]
-    antialiased: bool,
-    near: Option<f32>,
-    crop: Option<[u32; 4]>,
-    quality: Option<String>,
-    text: Option<String>,
-    profile: Option<String>,
-    wait_ms: Option<u64>,
-    container: Option<String>,
+    #[serde(flatten)]
+    spec: ViewsSpec,
+    /// `multipart` or `zip`; else `Accept` decides, else multipart.
+    container: Option<Container>,
 }
 
-/// A background as text (as in the query string) or as three numbers.
-#[derive(Clone, Debug, Deserialize)]
-#[serde(untagged)]
-enum BackgroundBody {
-    Text(String),
-    Numbers([f32; 3]),
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Container {
+/// What many pictures come in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum Container {
+    /// `multipart/mixed`.
     Multipart,
+    /// `application/zip`, stored.
     Zip,
 }
 
-/// `POST /v1/scenes/{id}/views`
+impl ViewsBody {
+    fn of(mut body: Fields) -> Result<Self> {
+        let f = &mut body;
+        let cameras: Vec<CameraFields> = f.value("cameras")?.unwrap_or_default();
+        let cameras = cameras.into_iter().enumerate();
+        let cameras = cameras.map(|(i, fields)| camera(fields, &format!("cameras[{i}]")));
+        let spec = ViewsSpec {
+            cameras: cameras.collect::<Result<_>>()?,
+            kinds: f.value("kinds")?.unwrap_or_else(|| vec![Kind::Color]),
+            options: f.take()?,
+            picture: f.take()?,
+            text: f.take()?,
+        };
+        let container = f.value("container")?;
+        body.finish()?;
+        Ok(Self { spec, container })
+    }
+}
+
+/// Many views of a scene: each camera in each kind
 #[utoipa::path(
     post, path = "/v1/scenes/{id}/views", operation_id = "render_views", tag = "views",
-    params(IdParam), request_body = ViewsRequest,
+    params(Id), request_body = ViewsBody,
     responses((
         status = 200, content_type = "multipart/mixed", body = Vec<u8>,
         description = "The pictures camera by camera; or application/zip"
@@ -83,15 +81,16 @@ enum Container {
 pub(super) async fn views(
     Called(api): Called,
     Id(id): Id,
-    deadline: Option<Extension<Deadline>>,
+    deadline: Deadline,
     headers: HeaderMap,
-    params: Params,
-    JsonBody(body): JsonBody<ViewsBody>,
+    params: Fields,
+    JsonBody(body): JsonBody,
 ) -> Result<Response, ApiError> {
     params.finish()?;
-    let container = container(body.container.as_deref(), &headers)?;
-    let mut spec = spec_of(body)?;
-    spec.options.deadline = deadline.map(|Extension(Deadline(deadline))| deadline);
+    let ViewsBody { spec, container } = ViewsBody::of(body)?;
+    let container = container.unwrap_or_else(|| accepted(&headers));
+    let options = ViewOptions { deadline: deadline.0, ..spec.options };
+    let spec = ViewsSpec { options, ..spec };
     let pictures = api.service.render_many(&id, &spec).await?.boxed();
     Ok(match container {
         Container::Multipart => {
@@ -105,63 +104,21 @@ pub(super) async fn views(
     })
 }
 
-fn container(asked: Option<&str>, headers: &HeaderMap) -> Result<Container> {
-    match asked {
-        Some("multipart") => Ok(Container::Multipart),
-        Some("zip") => Ok(Container::Zip),
-        Some(other) => {
-            let shown: String = other.chars().take(40).collect();
-            Err(Error::invalid(format!("container is {shown:?}; it must be multipart or zip")))
-        }
-        None => {
-            let accept = headers.get(header::ACCEPT).and_then(|value| value.to_str().ok());
-            let zip = accept.is_some_and(|accept| accept.contains("application/zip"));
-            Ok(if zip { Container::Zip } else { Container::Multipart })
-        }
+fn accepted(headers: &HeaderMap) -> Container {
+    let accept = headers.get(header::ACCEPT).and_then(|value| value.to_str().ok());
+    match accept {
+        Some(accept) if accept.contains("application/zip") => Container::Zip,
+        _ => Container::Multipart,
     }
-}
-
-fn spec_of(body: ViewsBody) -> Result<ViewsSpec> {
-    let cameras = body.cameras.iter().enumerate();
-    let cameras =
-        cameras.map(|(i, fields)| fields.spec(&format!("camera {i}"))).collect::<Result<_>>()?;
-    let kinds = match body.kinds {
-        None => vec![Kind::Color],
-        Some(names) => names.iter().map(|name| kind(name)).collect::<Result<_>>()?,
-    };
-    let background = match body.background {
-        None => None,
-        Some(BackgroundBody::Numbers(numbers)) => Some(numbers),
-        Some(BackgroundBody::Text(text)) => background(&text)?,
-    };
-    let options = ViewOptions {
-        width: body.width,
-        height: body.height,
-        format: body.format.map_or(Ok(Format::Png), |name| format(&name))?,
-        background,
-        antialiased: body.antialiased,
-        near: body.near,
-        crop: body.crop.map(crop),
-        quality: quality(body.quality.as_deref())?,
-        deadline: None,
-    };
-    let ask = Ask {
-        text: body.text,
-        profile: profile(body.profile.as_deref())?,
-        wait: body.wait_ms.map(Duration::from_millis),
-    };
-    Ok(ViewsSpec { cameras, kinds, options, ask })
 }
 
 /// `view-003-depth.png`
 fn file_name(view: &RenderedView) -> String {
-    let extension = match view.format {
-        Format::Png => "png",
-        Format::Jpeg => "jpg",
-        Format::Webp => "webp",
-        Format::Npy => "npy",
-    };
-    format!("view-{:03}-{}.{extension}", view.camera_index, view.kind.name())
+    let RenderedView { camera_index, kind, format, .. } = view;
+    match format {
+        Format::Jpeg => format!("view-{camera_index:03}-{kind}.jpg"),
+        _ => format!("view-{camera_index:03}-{kind}.{format}"),
+    }
 }
 
 /// Parts with the headers of a single view; a fault ends it with a part that holds the error.
@@ -235,7 +192,7 @@ fn index_entry(name: &str, view: &RenderedView) -> serde_json::Value {
     serde_json::json!({
         "file": name,
         "camera_index": view.camera_index,
-        "kind": view.kind.name(),
+        "kind": view.kind,
         "content_type": content_type(view.format),
         "camera": view.camera,
         "depth_scale": view.depth_scale,

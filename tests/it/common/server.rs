@@ -27,8 +27,8 @@ use segsplat::{
         SceneStatus, SourcePixel, Upload,
     },
     service::{
-        Ask, CameraSpec, CreateScene, Kind, LensSpec, ModelsInfo, Parts, PoseSpec, Service,
-        ViewOptions, ViewSpec,
+        CameraSpec, CreateScene, Kind, LensSpec, ModelsInfo, Parts, PictureOptions, PoseSpec,
+        Service, TextOptions, ViewOptions, ViewSpec,
     },
     store::Place,
 };
@@ -149,7 +149,13 @@ pub(crate) fn upload() -> Upload {
 pub(crate) fn first_view() -> ViewSpec {
     let pose = PoseSpec::Between { from: 0, to: 1, t: 0.0 };
     let camera = CameraSpec { pose, lens: LensSpec::OfScene };
-    ViewSpec { camera, kind: Kind::Color, options: ViewOptions::default(), ask: Ask::default() }
+    ViewSpec {
+        camera,
+        kind: Kind::Color,
+        options: ViewOptions::default(),
+        picture: PictureOptions::default(),
+        text: TextOptions::default(),
+    }
 }
 
 /// Stands in for the network. Held back while `hold` is true, so that tests see work in progress;

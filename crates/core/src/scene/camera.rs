@@ -2,8 +2,12 @@
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
-use crate::error::{Error, Result};
+use crate::{
+    error::{Error, Result},
+    names::shown,
+};
 
 /// How far a rotation may be from orthonormal (largest entry of |R Rᵀ - I|).
 pub const ORTHONORMAL_TOLERANCE: f64 = 1e-3;
@@ -11,7 +15,7 @@ pub const ORTHONORMAL_TOLERANCE: f64 = 1e-3;
 /// Pinhole intrinsics in pixels of the image they belong to.
 ///
 /// The centre of pixel (0, 0) is (0.5, 0.5); the principal point need not be central.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Intrinsics {
     /// Focal length along x, pixels.
     pub fx: f64,
@@ -42,6 +46,7 @@ impl Intrinsics {
         }
         for (name, value) in [("fx", self.fx), ("fy", self.fy)] {
             if value <= 0.0 {
+                let value = shown(value);
                 return Err(Error::invalid(format!(
                     "{what}: {name} is {value}; it must be over 0"
                 )));
@@ -98,8 +103,9 @@ impl Intrinsics {
     }
 }
 
-/// A part of a picture, pixels of the whole one.
+/// A part of a picture, pixels of the whole one; in serde four numbers: x, y, width, height.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(from = "[u32; 4]", into = "[u32; 4]")]
 pub struct Region {
     /// First column.
     pub x: u32,
@@ -109,6 +115,18 @@ pub struct Region {
     pub width: u32,
     /// Rows.
     pub height: u32,
+}
+
+impl From<[u32; 4]> for Region {
+    fn from([x, y, width, height]: [u32; 4]) -> Self {
+        Self { x, y, width, height }
+    }
+}
+
+impl From<Region> for [u32; 4] {
+    fn from(region: Region) -> Self {
+        [region.x, region.y, region.width, region.height]
+    }
 }
 
 impl Region {
@@ -153,9 +171,8 @@ impl CameraToWorld {
         let last = [m[12], m[13], m[14], m[15] - 1.0];
         if last.iter().any(|v| v.abs() > ORTHONORMAL_TOLERANCE) {
             return Err(Error::invalid(format!(
-                "{what}: the last row of camera_to_world is [{}, {}, {}, {}]; \
-                 it must be [0, 0, 0, 1]",
-                m[12], m[13], m[14], m[15]
+                "{what}: the last row of camera_to_world is [{}]; it must be [0, 0, 0, 1]",
+                [m[12], m[13], m[14], m[15]].map(shown).join(", ")
             )));
         }
         let mat = DMat4::from_cols_array(m).transpose();
@@ -296,10 +313,11 @@ impl<'de> Deserialize<'de> for CameraToWorld {
 }
 
 /// A pinhole camera with a pose.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Camera {
     /// Lens, in pixels of the picture to be made or that was taken.
     pub intrinsics: Intrinsics,
-    /// Pose, OpenCV camera-to-world.
+    /// Pose: 16 numbers, row-major, OpenCV camera-to-world.
+    #[schema(value_type = [f64; 16])]
     pub camera_to_world: CameraToWorld,
 }

@@ -1,9 +1,10 @@
 //! The report of a scene: counts, warnings with their figures, stage times.
 
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 /// What looks wrong with a capture; the scene was made all the same.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
 pub enum WarningCode {
@@ -27,8 +28,10 @@ pub enum WarningCode {
     PhotosUnused,
 }
 
+crate::names::display_names!(WarningCode);
+
 /// One warning: what, a sentence, and the figure behind it.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Warning {
     /// What looks wrong.
     pub code: WarningCode,
@@ -39,7 +42,7 @@ pub struct Warning {
 }
 
 /// How many Gaussians were dropped or clamped for one reason.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct DropCount {
     /// Why, `snake_case`: `opacity_below_1_255`, `not_finite`, `duplicate`, `out_of_reach`, …
     pub reason: String,
@@ -48,7 +51,7 @@ pub struct DropCount {
 }
 
 /// Time of one stage.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct StageTime {
     /// Stage name, as in progress events.
     pub stage: String,
@@ -57,7 +60,7 @@ pub struct StageTime {
 }
 
 /// The health report of a scene.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct HealthReport {
     /// Photos given.
     pub photos: u32,
@@ -75,6 +78,7 @@ pub struct HealthReport {
     pub overlap: f64,
     /// Focal length of each photo in the network's picture of it, pixels; 0 where it was not used.
     #[serde(default)]
+    #[schema(required = true)]
     pub network_focal_px: Vec<f64>,
     /// Time of each stage.
     pub stages: Vec<StageTime>,

@@ -4,6 +4,7 @@
 //! Entry 0 is the background and has no row. Entry m is row m - 1 of the bank.
 
 use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 use crate::scene::StageTime;
 
@@ -83,7 +84,7 @@ impl Bank {
 }
 
 /// How what the paper leaves open is decided.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ScoringProfile {
     /// Unit centroids, a coverage floor, the bundle's canon and tau.
@@ -99,7 +100,7 @@ pub const PAPER_PHRASES: [&str; 3] = ["object", "things", "stuff"];
 pub const PAPER_TAU: f32 = 10.0;
 
 /// Counts and times of making the semantics.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct SemanticsReport {
     /// Masks of each photo.
     pub masks: Vec<u32>,

@@ -1,14 +1,16 @@
 //! The status of a scene, as the store keeps it and as callers and watchers see it.
 
 use serde::{Deserialize, Serialize};
+use utoipa::{IntoParams, ToSchema};
 
 use crate::{
-    error::{Error, ErrorCode, Result, TABLE},
+    error::{Error, ErrorCode, TABLE},
+    names::display_names,
     scene::{Camera, HealthReport, Intrinsics, SceneId, SemanticsReport},
 };
 
 /// When the semantics of a scene are made.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum SemanticsMode {
     /// At the first call that needs them.
@@ -21,7 +23,7 @@ pub enum SemanticsMode {
 }
 
 /// How many of a network's Gaussians a scene keeps.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Density {
     /// One for up to 16 neighbours where the pictures are flat: same views within a stated error.
@@ -31,34 +33,25 @@ pub enum Density {
     Full,
 }
 
-impl Density {
-    /// The density of a snake_case name.
-    ///
-    /// # Errors
-    /// `invalid_request` for any other.
-    pub fn named(name: &str) -> Result<Self> {
-        match name {
-            "thinned" => Ok(Self::Thinned),
-            "full" => Ok(Self::Full),
-            _ => Err(Error::invalid(format!("density is {name:?}; it must be thinned or full"))),
-        }
-    }
-}
-
 /// Options of a scene, kept with it.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, IntoParams)]
 #[serde(default, deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
 pub struct SceneOptions {
-    /// Views the network takes at once; `None`: what the bundle says.
+    /// Views the network takes at once; what the bundle says by default.
     pub max_views: Option<usize>,
-    /// When its semantics are made.
+    /// When a scene's semantics are made: `lazy` (default) with the first text, `eager` as soon as
+    /// it can be viewed, `off` never.
+    #[param(inline)]
     pub semantics: SemanticsMode,
-    /// How many of its Gaussians are kept.
+    /// Gaussians kept: `thinned` (default), one for up to 16 neighbours where the photos are flat,
+    /// or `full`, one a pixel.
+    #[param(inline)]
     pub density: Density,
 }
 
 /// Where a scene stands.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum SceneState {
     /// Waits for a worker.
@@ -79,22 +72,12 @@ impl SceneState {
     pub fn is_final(self) -> bool {
         matches!(self, Self::Done | Self::Failed | Self::Cancelled)
     }
-
-    /// The state's snake_case name.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Queued => "queued",
-            Self::Running => "running",
-            Self::Done => "done",
-            Self::Failed => "failed",
-            Self::Cancelled => "cancelled",
-        }
-    }
 }
 
+display_names!(SemanticsMode, Density, SceneState, SemanticsState);
+
 /// Why a scene failed: a code of the error table and its message.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct SceneError {
     /// Name of a row of the error table.
     pub code: String,
@@ -118,7 +101,7 @@ impl SceneError {
 }
 
 /// An input camera of a scene and the photo it belongs to.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct SceneCamera {
     /// File name of the photo.
     pub file: String,
@@ -132,7 +115,7 @@ pub struct SceneCamera {
 }
 
 /// Where the semantics of a scene stand.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum SemanticsState {
     /// Never made: the scene was asked to have none.
@@ -148,35 +131,24 @@ pub enum SemanticsState {
     Failed,
 }
 
-impl SemanticsState {
-    /// The state's snake_case name.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Off => "off",
-            Self::None => "none",
-            Self::Running => "running",
-            Self::Ready => "ready",
-            Self::Failed => "failed",
-        }
-    }
-}
-
 /// What can be asked of a scene by text, and how far that is.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(default)]
 pub struct SemanticsStatus {
     /// Whether a text can be asked: at once where `ready`, else after they are made.
+    #[schema(required = true)]
     pub available: bool,
     /// Why not.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub reason: Option<String>,
     /// Where they stand.
+    #[schema(required = true)]
     pub state: SemanticsState,
     /// Stage at work while running: `masks`, `embed`, `bank`, `assign`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub stage: Option<String>,
     /// Share of their making that is done, 0..1.
+    #[schema(required = true)]
     pub fraction: f32,
     /// Entries of the bank (M), once ready.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -209,9 +181,11 @@ impl SemanticsStatus {
 }
 
 /// A scene as `GET /v1/scenes/{id}` shows it.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+#[schema(as = Scene)]
 pub struct SceneStatus {
-    /// Id.
+    /// Id: 32 lower-case hex digits.
+    #[schema(value_type = String)]
     pub id: SceneId,
     /// State.
     pub state: SceneState,
@@ -235,6 +209,7 @@ pub struct SceneStatus {
     pub cameras: Vec<SceneCamera>,
     /// What can be asked of it by text.
     #[serde(default)]
+    #[schema(required = true)]
     pub semantics: SemanticsStatus,
 }
 
@@ -292,17 +267,5 @@ impl Event {
     #[must_use]
     pub fn is_last(&self) -> bool {
         matches!(self, Self::Done | Self::Failed(_) | Self::Cancelled)
-    }
-
-    /// The event's snake_case name.
-    #[must_use]
-    pub fn name(&self) -> &'static str {
-        match self {
-            Self::Queued { .. } => "queued",
-            Self::Running { .. } => "running",
-            Self::Done => "done",
-            Self::Failed(_) => "failed",
-            Self::Cancelled => "cancelled",
-        }
     }
 }
