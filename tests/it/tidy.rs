@@ -42,7 +42,10 @@ const TREE_BYTES_MAX: u64 = 48 << 20;
 const CONFINED: [(&str, &[&str]); 12] = [
     ("axum", &["src/api/http"]),
     ("tower_http", &["src/api/http"]),
-    ("utoipa", &["src/api/http", "src/service", "crates/core/src/scene"]),
+    (
+        "utoipa",
+        &["src/api/http", "src/service", "crates/core/src/scene", "crates/render/src/lib.rs"],
+    ),
     ("tonic", &["src/api/grpc"]),
     ("tonic_health", &["src/api/grpc"]),
     ("tonic_reflection", &["src/api/grpc"]),
