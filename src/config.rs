@@ -80,6 +80,10 @@ pub struct ConfigArgs {
     /// Origins whose pages may call, as `https://example.org`, or * for all [default: none]
     #[arg(long, env = "SEGSPLAT_CORS_ORIGINS", value_delimiter = ',', value_name = "ORIGINS")]
     pub cors_origins: Option<Vec<String>>,
+    /// Hosts that calls may name beside loopback and the listened address, or * for all [default: all
+    /// with --keys, else none]
+    #[arg(long, env = "SEGSPLAT_ALLOWED_HOSTS", value_delimiter = ',', value_name = "HOSTS")]
+    pub allowed_hosts: Option<Vec<String>>,
     /// Milliseconds to serve on, not ready, after SIGTERM, so that balancers look away [default: 0]
     #[arg(long, env = "SEGSPLAT_DRAIN_NOTICE_MS")]
     pub drain_notice_ms: Option<u64>,
@@ -144,6 +148,8 @@ pub struct Config {
     pub tls_key: Option<PathBuf>,
     /// Origins whose pages may call.
     pub cors_origins: Vec<String>,
+    /// Hosts that calls may name beside loopback and the listened address; `*` allows all.
+    pub allowed_hosts: Vec<String>,
     /// Milliseconds to serve on, not ready, after the stop signal.
     pub drain_notice_ms: u64,
     /// Milliseconds that open calls get to end after that.
@@ -181,6 +187,7 @@ impl Default for Config {
             tls_cert: None,
             tls_key: None,
             cors_origins: Vec::new(),
+            allowed_hosts: Vec::new(),
             drain_notice_ms: 0,
             drain_ms: 10_000,
             otlp: None,
@@ -230,6 +237,10 @@ impl Config {
             tls_cert: typed.tls_cert.or(from_file.tls_cert),
             tls_key: typed.tls_key.or(from_file.tls_key),
             cors_origins: typed.cors_origins.or(from_file.cors_origins).unwrap_or(d.cors_origins),
+            allowed_hosts: typed
+                .allowed_hosts
+                .or(from_file.allowed_hosts)
+                .unwrap_or(d.allowed_hosts),
             drain_notice_ms: typed
                 .drain_notice_ms
                 .or(from_file.drain_notice_ms)
@@ -317,6 +328,17 @@ impl Config {
             return Err(Error::invalid(
                 "config: limits.key_requests_per_s and key_inflight_max must be over 0",
             ));
+        }
+        let is_host = |name: &String| {
+            name == "*"
+                || name.parse::<std::net::IpAddr>().is_ok()
+                || (!name.is_empty()
+                    && name.bytes().all(|c| c.is_ascii_alphanumeric() || b"-._".contains(&c)))
+        };
+        if let Some(name) = self.allowed_hosts.iter().find(|name| !is_host(name)) {
+            return Err(Error::invalid(format!(
+                "config: allowed_hosts has {name:?}; give names or addresses without a port"
+            )));
         }
         if self.tls_cert.is_some() != self.tls_key.is_some() {
             return Err(Error::invalid("config: tls_cert and tls_key go together"));

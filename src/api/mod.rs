@@ -9,6 +9,7 @@ pub mod http;
 
 mod access;
 mod camera;
+mod hosts;
 mod life;
 mod request_id;
 mod semantics;

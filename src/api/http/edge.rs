@@ -2,13 +2,14 @@
 
 use std::{
     any::Any,
+    sync::Arc,
     time::{Duration, Instant},
 };
 
 use axum::{
     body::Body,
     extract::{Request, State},
-    http::{HeaderMap, HeaderValue, Method, StatusCode, header},
+    http::{HeaderMap, HeaderValue, Method, StatusCode, header, uri::Authority},
     middleware::Next,
     response::{IntoResponse, Response},
 };
@@ -21,7 +22,7 @@ use super::{
 use crate::{
     api::{
         Api,
-        access::{self, Pass},
+        access::{self, Access, Pass},
         grpc,
         life::Inside,
         request_id,
@@ -40,15 +41,20 @@ pub(super) struct Deadline(pub(super) Duration);
 struct Call(&'static str);
 
 /// Around every HTTP call.
-pub(super) async fn rest(request: Request, next: Next) -> Response {
+pub(super) async fn rest(
+    State(access): State<Arc<Access>>,
+    request: Request,
+    next: Next,
+) -> Response {
     let id = id_of(request.headers());
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
     let span = tracing::info_span!("http", %method, path, request_id = id, key = Empty);
     follow(&span, request.headers());
-    rest_within(request, next, id, method, path).instrument(span).await
+    rest_within(&access, request, next, id, method, path).instrument(span).await
 }
 
 async fn rest_within(
+    access: &Access,
     mut request: Request,
     next: Next,
     id: String,
@@ -59,7 +65,9 @@ async fn rest_within(
         request.headers_mut().insert(request_id::HEADER, value);
     }
     let started = Instant::now();
-    let mut response = match deadline_of_query(request.uri().query()) {
+    let allowed = access.check_hosts(hosts_of(&request));
+    let deadline = allowed.and_then(|()| deadline_of_query(request.uri().query()));
+    let mut response = match deadline {
         Err(error) => ApiError::from(error).into_response(),
         Ok(None) => next.run(request).await,
         Ok(Some(deadline)) => {
@@ -125,8 +133,16 @@ pub(super) async fn guard(
     response
 }
 
+/// Every host that a call names: that of its target, which is `:authority` in HTTP/2, and those of its
+/// `host` headers.
+fn hosts_of(request: &Request) -> impl Iterator<Item = &str> {
+    let named = request.headers().get_all(header::HOST).iter();
+    let named = named.map(|host| host.to_str().unwrap_or("not text"));
+    request.uri().authority().map(Authority::as_str).into_iter().chain(named)
+}
+
 /// Refuses pages of other origins where no key is asked for: a browser on this machine would let
-/// any page of the web in.
+/// any page of the web in. The host that the origin is held against is an allowed one.
 fn check_origin(api: &Api, request: &Request) -> Result<(), Error> {
     let Some(origin) = request.headers().get(header::ORIGIN) else { return Ok(()) };
     if api.access.asks() {
@@ -181,7 +197,9 @@ async fn rpc_within(
     }
     let started = Instant::now();
     let (call, scope) = access::of_rpc(&path);
-    let held = scope.map(|scope| let_in(&api, scope, &mut request)).transpose();
+    let allowed = api.access.check_hosts(hosts_of(&request));
+    let held =
+        allowed.and_then(|()| scope.map(|scope| let_in(&api, scope, &mut request)).transpose());
     let mut response = match (held, deadline_of_grpc(request.headers())) {
         (Err(error), _) => {
             log_fault(&error, &path, 0.0);

@@ -20,6 +20,8 @@ mod tls;
 mod viewer;
 mod views;
 
+use std::sync::Arc;
+
 use axum::{
     Router,
     extract::DefaultBodyLimit,
@@ -29,7 +31,11 @@ use axum::{
 };
 use tower_http::catch_panic::CatchPanicLayer;
 
-use super::{Api, access, grpc};
+use super::{
+    Api,
+    access::{self, Access},
+    grpc,
+};
 use crate::{error::Result, keys::Scope, telemetry::meter};
 
 pub use self::serve::{Doors, serve};
@@ -122,7 +128,7 @@ fn app(api: &Api) -> Result<Router> {
         .fold(Router::new(), |router, (path, handler)| router.route(path, handler))
         .method_not_allowed_fallback(error::method_not_allowed)
         .with_state(api.clone());
-    let rest = rest_edge(rest.fallback(error::no_such_route));
+    let rest = rest_edge(rest.fallback(error::no_such_route), Arc::clone(&api.access));
     let both = rest.merge(rpc_edge(rpc, api.clone()));
     Ok(match cors::layer(&api.service.config().cors_origins)? {
         Some(cors) => both.layer(cors),
@@ -131,11 +137,11 @@ fn app(api: &Api) -> Result<Router> {
 }
 
 /// What surrounds every HTTP call: request id, deadline, one error shape, a net for panics.
-fn rest_edge(router: Router) -> Router {
+fn rest_edge(router: Router, access: Arc<Access>) -> Router {
     router
         .layer(DefaultBodyLimit::disable())
         .layer(CatchPanicLayer::custom(error::panicked))
-        .layer(middleware::from_fn(edge::rest))
+        .layer(middleware::from_fn_with_state(access, edge::rest))
 }
 
 /// The same for every gRPC call.
@@ -174,6 +180,7 @@ mod tests {
             Router::new()
                 .route("/boom", routing::get(boom))
                 .route("/ok", routing::get(|| async {})),
+            Arc::new(Access::new(&crate::config::Config::default()).unwrap()),
         );
         let (status, headers, body) = call(router.clone(), "/boom").await;
         assert_eq!(status, StatusCode::INTERNAL_SERVER_ERROR);
