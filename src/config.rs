@@ -41,10 +41,12 @@ pub struct ConfigArgs {
     /// Keep the photos of finished scenes; lazy semantics need them [default: true]
     #[arg(long, env = "SEGSPLAT_KEEP_PHOTOS", num_args = 0..=1, default_missing_value = "true")]
     pub keep_photos: Option<bool>,
-    /// Folder of the model bundle [default: found beside the executable or in ./models/embedded]
+    /// Folder of the model bundle [default: `models/embedded` beside the executable, in
+    /// ../share/segsplat, in the checkout that it was built in or in the working folder]
     #[arg(long, env = "SEGSPLAT_BUNDLE")]
     pub bundle: Option<PathBuf>,
-    /// ONNX Runtime library [default: `ORT_DYLIB_PATH`, beside the executable, target/ort, system]
+    /// ONNX Runtime library [default: `ORT_DYLIB_PATH`, beside the executable,
+    /// ../share/segsplat, target/ort, the system's folders]
     #[arg(long, env = "SEGSPLAT_ORT_LIBRARY")]
     pub ort_library: Option<PathBuf>,
     /// Which renderer serves views [default: auto]
