@@ -16,6 +16,7 @@ use axum::{
 use tracing::{Instrument, Span, field::Empty};
 
 use super::{
+    connection::{Pace, TooSlow},
     error::{ApiError, Fault, panic_error},
     held::hold,
 };
@@ -42,7 +43,7 @@ struct Call(&'static str);
 
 /// Around every HTTP call.
 pub(super) async fn rest(
-    State(access): State<Arc<Access>>,
+    State((access, pace)): State<(Arc<Access>, Pace)>,
     request: Request,
     next: Next,
 ) -> Response {
@@ -50,17 +51,19 @@ pub(super) async fn rest(
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
     let span = tracing::info_span!("http", %method, path, request_id = id, key = Empty);
     follow(&span, request.headers());
-    rest_within(&access, request, next, id, method, path).instrument(span).await
+    rest_within(&access, pace, request, next, id, method, path).instrument(span).await
 }
 
 async fn rest_within(
     access: &Access,
-    mut request: Request,
+    pace: Pace,
+    request: Request,
     next: Next,
     id: String,
     method: Method,
     path: String,
 ) -> Response {
+    let (mut request, too_slow) = watch_body(request, pace);
     if let Ok(value) = HeaderValue::from_str(&id) {
         request.headers_mut().insert(request_id::HEADER, value);
     }
@@ -78,6 +81,9 @@ async fn rest_within(
             }
         }
     };
+    if too_slow.get() && response.extensions().get::<Fault>().is_some() {
+        response = ApiError::from(pace.error()).into_response();
+    }
     if response.extensions().get::<Fault>().is_none() && is_bare_refusal(&response) {
         // A refusal of the framework's own, before any handler of ours.
         response = dress(&response);
@@ -133,6 +139,13 @@ pub(super) async fn guard(
     response
 }
 
+/// The request with its body watched.
+fn watch_body(request: Request, pace: Pace) -> (Request, TooSlow) {
+    let (parts, body) = request.into_parts();
+    let (body, too_slow) = pace.watch(body);
+    (Request::from_parts(parts, body), too_slow)
+}
+
 /// Every host that a call names: that of its target, which is `:authority` in HTTP/2, and those of its
 /// `host` headers.
 fn hosts_of(request: &Request) -> impl Iterator<Item = &str> {
@@ -177,21 +190,27 @@ fn let_in(api: &Api, scope: Scope, request: &mut Request) -> Result<(Inside, Pas
 }
 
 /// Around every gRPC call.
-pub(super) async fn rpc(State(api): State<Api>, request: Request, next: Next) -> Response {
+pub(super) async fn rpc(
+    State((api, pace)): State<(Api, Pace)>,
+    request: Request,
+    next: Next,
+) -> Response {
     let id = id_of(request.headers());
     let path = request.uri().path().to_owned();
     let span = tracing::info_span!("grpc", path, request_id = id, key = Empty);
     follow(&span, request.headers());
-    rpc_within(api, request, next, id, path).instrument(span).await
+    rpc_within(api, pace, request, next, id, path).instrument(span).await
 }
 
 async fn rpc_within(
     api: Api,
-    mut request: Request,
+    pace: Pace,
+    request: Request,
     next: Next,
     id: String,
     path: String,
 ) -> Response {
+    let (mut request, too_slow) = watch_body(request, pace);
     if let Ok(value) = HeaderValue::from_str(&id) {
         request.headers_mut().insert(request_id::HEADER, value);
     }
@@ -213,6 +232,9 @@ async fn rpc_within(
             }
         }
     };
+    if too_slow.get() {
+        response = grpc::refusal(&pace.error()).map(Body::new);
+    }
     let took = started.elapsed();
     let ms = took.as_secs_f64() * 1e3;
     grpc::complete(response.headers_mut());
