@@ -243,6 +243,22 @@ fn photos_become_a_scene_that_can_be_looked_at() {
     assert_eq!(verified["verified"], true);
 }
 
+#[test]
+fn models_say_their_licences_and_views_only_where_they_take_some() {
+    let listed = ok(&["models", "list"]);
+    assert!(
+        listed.contains("geometry: geometry.onnx") && listed.contains("up to 8 views"),
+        "{listed}"
+    );
+    assert!(!listed.contains("up to 0 views"), "{listed}");
+    for model in ok_json(&["models", "list"])["models"].as_array().unwrap() {
+        let licence = model["licence"].as_str().unwrap();
+        for said in ["research", "CamVid CC BY-NC", "COCO", "models/cards/"] {
+            assert!(licence.contains(said), "{}: {licence:?} lacks {said:?}", model["name"]);
+        }
+    }
+}
+
 /// The program as a package installs it, and as cargo builds it in a checkout: called from a folder
 /// that holds neither bundle nor library.
 #[cfg(unix)]
