@@ -81,7 +81,7 @@ async fn rest_within(
             }
         }
     };
-    if too_slow.get() && response.extensions().get::<Fault>().is_some() {
+    if too_slow.get() && !response.status().is_success() {
         response = ApiError::from(pace.error()).into_response();
     }
     if response.extensions().get::<Fault>().is_none() && is_bare_refusal(&response) {
