@@ -4,10 +4,9 @@ use std::sync::atomic::AtomicBool;
 
 use segsplat::{
     error::ErrorCode,
-    eval::psnr,
     models::NetworkOptions,
     pipeline::{self, Engine, Reconstruction},
-    render::{Kinds, RenderRequest, Renderer, cpu::CpuRenderer},
+    render::{Kinds, RenderRequest, Renderer, compare::psnr, cpu::CpuRenderer},
     sample::{self, Room, SampleOptions},
     scene::{Density, SceneOptions},
 };
