@@ -1,7 +1,8 @@
 //! One configuration struct: defaults < file < environment < flags.
 //!
-//! Every field is a flag `--like-this` of the commands that need it, a variable `SEGSPLAT_LIKE_THIS` and a key `like_this` of
-//! the TOML file named by `--config`. Limits live in the file's `[limits]` table.
+//! Every field is a flag `--like-this` of the commands that need it, a variable
+//! `SEGSPLAT_LIKE_THIS` and a key `like_this` of the TOML file named by `--config`. Limits live in
+//! the file's `[limits]` table.
 
 use std::{net::SocketAddr, path::PathBuf};
 
@@ -19,10 +20,12 @@ use crate::{
 /// Flags of every command that opens networks or a renderer; what is not given stays as it is.
 #[derive(Args, Clone, Debug, Default)]
 pub struct ConfigArgs {
-    /// Folder of the model bundle [default: found beside the executable or in ./models/embedded]
+    /// Folder of the model bundle [default: `models/embedded` beside the executable, in
+    /// ../share/segsplat, in the checkout that it was built in or in the working folder]
     #[arg(long, env = "SEGSPLAT_BUNDLE")]
     pub bundle: Option<PathBuf>,
-    /// ONNX Runtime library [default: `ORT_DYLIB_PATH`, beside the executable, target/ort, system]
+    /// ONNX Runtime library [default: `ORT_DYLIB_PATH`, beside the executable,
+    /// ../share/segsplat, target/ort, the system's folders]
     #[arg(long, env = "SEGSPLAT_ORT_LIBRARY")]
     pub ort_library: Option<PathBuf>,
     /// Which renderer serves views [default: auto]
@@ -98,6 +101,10 @@ pub struct ServerArgs {
     /// Origins whose pages may call, as `https://example.org`, or * for all [default: none]
     #[arg(long, env = "SEGSPLAT_CORS_ORIGINS", value_delimiter = ',', value_name = "ORIGINS")]
     pub cors_origins: Option<Vec<String>>,
+    /// Hosts that calls may name beside loopback and the listened address, or * for all [default: all
+    /// with --keys, else none]
+    #[arg(long, env = "SEGSPLAT_ALLOWED_HOSTS", value_delimiter = ',', value_name = "HOSTS")]
+    pub allowed_hosts: Option<Vec<String>>,
     /// Milliseconds to serve on, not ready, after SIGTERM, so that balancers look away [default: 0]
     #[arg(long, env = "SEGSPLAT_DRAIN_NOTICE_MS")]
     pub drain_notice_ms: Option<u64>,
@@ -168,6 +175,8 @@ pub struct Config {
     pub tls_key: Option<PathBuf>,
     /// Origins whose pages may call.
     pub cors_origins: Vec<String>,
+    /// Hosts that calls may name beside loopback and the listened address; `*` allows all.
+    pub allowed_hosts: Vec<String>,
     /// Milliseconds to serve on, not ready, after the stop signal.
     pub drain_notice_ms: u64,
     /// Milliseconds that open calls get to end after that.
@@ -205,6 +214,7 @@ impl Default for Config {
             tls_cert: None,
             tls_key: None,
             cors_origins: Vec::new(),
+            allowed_hosts: Vec::new(),
             drain_notice_ms: 0,
             drain_ms: 10_000,
             otlp: None,
@@ -249,6 +259,7 @@ impl Config {
             anonymous,
             open_metrics,
             cors_origins,
+            allowed_hosts,
             drain_notice_ms,
             drain_ms,
             otlp
@@ -331,6 +342,17 @@ impl Config {
             return Err(Error::invalid(
                 "config: limits.key_requests_per_s and key_inflight_max must be over 0",
             ));
+        }
+        let is_host = |name: &String| {
+            name == "*"
+                || name.parse::<std::net::IpAddr>().is_ok()
+                || (!name.is_empty()
+                    && name.bytes().all(|c| c.is_ascii_alphanumeric() || b"-._".contains(&c)))
+        };
+        if let Some(name) = self.allowed_hosts.iter().find(|name| !is_host(name)) {
+            return Err(Error::invalid(format!(
+                "config: allowed_hosts has {name:?}; give names or addresses without a port"
+            )));
         }
         if self.tls_cert.is_some() != self.tls_key.is_some() {
             return Err(Error::invalid("config: tls_cert and tls_key go together"));

@@ -10,6 +10,7 @@ use std::{
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
+use super::hosts::AllowedHosts;
 use crate::{
     config::Config,
     error::{Error, ErrorCode, Result},
@@ -66,8 +67,9 @@ pub(super) struct Access {
     ring: RwLock<Arc<Ring>>,
 }
 
-#[derive(Debug, Default)]
+#[derive(Debug)]
 struct Ring {
+    hosts: AllowedHosts,
     /// `None`: nobody is asked for a key.
     keys: Option<(Keys, Vec<Share>)>,
 }
@@ -108,7 +110,8 @@ impl Rate {
 
 impl Ring {
     fn load(config: &Config) -> Result<Self> {
-        let Some(path) = &config.keys else { return Ok(Self::default()) };
+        let hosts = AllowedHosts::new(config);
+        let Some(path) = &config.keys else { return Ok(Self { hosts, keys: None }) };
         let keys = Keys::load(path)?;
         let shares = keys.iter().map(|key| {
             let per_s = key.requests_per_s.unwrap_or(config.limits.key_requests_per_s);
@@ -120,7 +123,7 @@ impl Ring {
             }
         });
         let shares = shares.collect();
-        Ok(Self { keys: Some((keys, shares)) })
+        Ok(Self { hosts, keys: Some((keys, shares)) })
     }
 }
 
@@ -141,6 +144,11 @@ impl Access {
     /// Whether callers must show a key.
     pub(super) fn asks(&self) -> bool {
         self.ring().keys.is_some()
+    }
+
+    /// Checks each host that a call names.
+    pub(super) fn check_hosts<'a>(&self, hosts: impl Iterator<Item = &'a str>) -> Result<()> {
+        self.ring().hosts.check(hosts)
     }
 
     /// Lets a call in that needs `scope`; `shown` is the value of `authorization`.

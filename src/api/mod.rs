@@ -7,6 +7,7 @@ pub mod grpc;
 pub mod http;
 
 mod access;
+mod hosts;
 mod life;
 mod request_id;
 mod upload;

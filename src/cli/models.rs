@@ -46,11 +46,12 @@ fn list(config: &Config, out: &Output) -> Result<()> {
 fn words(info: &ModelsInfo) -> String {
     let mut text = format!("bundle {} ({})\n", info.bundle, info.bundle_sha256);
     for model in &info.models {
-        let _ = writeln!(
-            text,
-            "  {}: {}, {} bytes, up to {} views, {}\n    sha256 {}",
-            model.name, model.file, model.size_bytes, model.views_max, model.licence, model.sha256
-        );
+        let _ = write!(text, "  {}: {}, {} bytes", model.name, model.file, model.size_bytes);
+        // A text tower and a tokenizer take no views.
+        if model.views_max > 0 {
+            let _ = write!(text, ", up to {} views", model.views_max);
+        }
+        let _ = writeln!(text, ", {}\n    sha256 {}", model.licence, model.sha256);
     }
     text
 }

@@ -11,7 +11,7 @@ use segsplat::{
 };
 
 use crate::common::{
-    doors::{Ask, Door, Fault, Options, both, both_with, bytes, fault_of},
+    doors::{Ask, Door, Fault, Options, both, both_named, both_with, bytes, fault_of},
     server::{TestServer, upload},
 };
 
@@ -273,5 +273,40 @@ async fn only_named_origins_may_call_from_a_page() {
     assert_eq!(own.status(), 200, "the server's own page");
     for door in both(stand.addr).await {
         assert_eq!(code(&call(&door, "ListScenes", "").await), "ok");
+    }
+}
+
+#[tokio::test]
+async fn a_page_that_rebinds_its_name_to_this_machine_calls_nothing() {
+    let stand = TestServer::start().await;
+    let (id, _) = both(stand.addr).await[0].create(&upload(), &Options::wait()).await.unwrap();
+    for door in both_named(stand.addr, &format!("evil.example:{}", stand.addr.port())).await {
+        for (name, _) in CALLS {
+            let what = format!("{name} over {}", door.name());
+            let fault = call(&door, name, &id).await.expect_err(&what);
+            assert_eq!(fault.code, "permission_denied", "{what}: {fault:?}");
+            assert!(fault.message.contains("evil.example"), "{what}: {fault:?}");
+        }
+    }
+    for door in both_named(stand.addr, &format!("localhost:{}", stand.addr.port())).await {
+        assert_eq!(code(&call(&door, "GetScene", &id).await), "ok", "{}", door.name());
+    }
+}
+
+#[tokio::test]
+async fn hosts_that_are_named_may_be_called_and_with_keys_any() {
+    let named = TestServer::with(|config, _| {
+        config.allowed_hosts = vec!["gpu.example".to_owned()];
+    })
+    .await;
+    for (host, want) in [("gpu.example", "ok"), ("evil.example", "permission_denied")] {
+        for door in both_named(named.addr, host).await {
+            assert_eq!(code(&call(&door, "ListScenes", "").await), want, "{host} {}", door.name());
+        }
+    }
+    let (_folder, guarded) = guarded("").await;
+    for door in both_named(guarded.addr, "any.example").await {
+        let answer = call(&door, "ListScenes", "").await;
+        assert_eq!(code(&answer), "unauthenticated", "{}: a key is asked for", door.name());
     }
 }

@@ -282,7 +282,7 @@ pub(super) async fn raw(stand: &Stand, head: &str, body: &[u8]) -> String {
 #[tokio::test]
 async fn what_is_too_big_is_refused_before_the_rest_arrives() {
     let stand = Stand::start().await;
-    let post = "POST /v1/scenes HTTP/1.1\r\nhost: x\r\n\
+    let post = "POST /v1/scenes HTTP/1.1\r\nhost: localhost\r\n\
                 content-type: multipart/form-data; boundary=b\r\n";
     // The head alone tells that it is too long; nothing of the body is sent.
     let head = format!("{post}content-length: 400000000\r\n\r\n");

@@ -245,6 +245,61 @@ fn photos_become_a_scene_that_can_be_looked_at() {
     assert_eq!(verified["verified"], true);
 }
 
+#[test]
+fn models_say_their_licences_and_views_only_where_they_take_some() {
+    let listed = ok(&["models", "list"]);
+    assert!(
+        listed.contains("geometry: geometry.onnx") && listed.contains("up to 8 views"),
+        "{listed}"
+    );
+    assert!(!listed.contains("up to 0 views"), "{listed}");
+    for model in ok_json(&["models", "list"])["models"].as_array().unwrap() {
+        let licence = model["licence"].as_str().unwrap();
+        for said in ["research", "CamVid CC BY-NC", "COCO", "models/cards/"] {
+            assert!(licence.contains(said), "{}: {licence:?} lacks {said:?}", model["name"]);
+        }
+    }
+}
+
+/// The program as a package installs it, and as cargo builds it in a checkout: called from a folder
+/// that holds neither bundle nor library.
+#[cfg(unix)]
+#[test]
+fn bundle_and_library_are_found_from_any_folder() {
+    use std::os::unix::fs::symlink;
+    let Ok(runtime) = Runtime::load(&NetworkOptions::default()) else {
+        return skipped("no ONNX Runtime (scripts/setup gets it)");
+    };
+    let elsewhere = tempfile::tempdir().unwrap();
+    for (program, bundle, library) in [
+        ("bin/segsplat", "share/segsplat/models/embedded", "share/segsplat/libonnxruntime.so"),
+        ("target/release/segsplat", "models/embedded", "target/ort/libonnxruntime.so"),
+    ] {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |path: &str| {
+            let path = folder.path().join(path);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            path
+        };
+        if program.starts_with("target") {
+            std::fs::write(at("Cargo.toml"), "").unwrap();
+        }
+        std::fs::copy(env!("CARGO_BIN_EXE_segsplat"), at(program)).unwrap();
+        symlink(crate::common::root().join("models/embedded"), at(bundle)).unwrap();
+        symlink(runtime.path(), at(library)).unwrap();
+        let verified = Command::new(folder.path().join(program))
+            .current_dir(elsewhere.path())
+            .env_clear()
+            .args(["models", "verify", "--json"])
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&verified.stderr);
+        assert!(verified.status.success(), "{program}: {said}");
+        let said: Value = serde_json::from_slice(&verified.stdout).unwrap();
+        assert_eq!(said["verified"], true, "{program}");
+    }
+}
+
 /// A child that does not outlive its test.
 struct Served(Child);
 

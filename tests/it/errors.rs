@@ -70,7 +70,7 @@ async fn a_full_queue_refuses_before_the_photos_come() {
         config.limits.queued_jobs_max = 0;
     })
     .await;
-    let head = "POST /v1/scenes HTTP/1.1\r\nhost: x\r\ncontent-length: 9000000\r\n\
+    let head = "POST /v1/scenes HTTP/1.1\r\nhost: localhost\r\ncontent-length: 9000000\r\n\
                 content-type: multipart/form-data; boundary=b\r\n\r\n";
     let waited = std::time::Duration::from_secs(20);
     let answer = tokio::time::timeout(waited, raw(&stand, head, b"--b")).await;

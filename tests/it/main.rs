@@ -28,6 +28,7 @@ mod magnify;
 mod proto;
 mod sample;
 mod schedule;
+mod slow_callers;
 mod store;
 mod telemetry;
 mod texts;

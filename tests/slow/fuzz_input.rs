@@ -412,7 +412,7 @@ async fn line(address: SocketAddr, case: &[u8]) -> Option<Vec<u8>> {
     let mut bytes = b"GET ".to_vec();
     // A line ends where the caller says it does.
     bytes.extend(case.iter().filter(|byte| !b"\r\n".contains(byte)));
-    bytes.extend(b" HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n");
+    bytes.extend(b" HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n");
     let mut answer = Vec::new();
     let talk = async {
         socket.write_all(&bytes).await?;

@@ -90,6 +90,13 @@ pub struct Limits {
     pub cache_bytes_max: u64,
     /// Bytes of scenes kept on one GPU device: what a card of 8 GB has to spare beside its frames.
     pub device_scene_bytes_max: u64,
+    /// Milliseconds until the head of a request must be whole, from the connection's start or the end of
+    /// the call before it. A connection that sends none for so long is closed.
+    pub head_timeout_ms: u64,
+    /// Bytes that a request's body must bring in each `body_window_ms` that it is waited for.
+    pub body_bytes_min: usize,
+    /// Milliseconds in which `body_bytes_min` must come: half a kilobyte a second, unless set.
+    pub body_window_ms: u64,
     /// Milliseconds one render may take.
     pub render_timeout_ms: u64,
     /// Milliseconds one scene may take.
@@ -167,6 +174,9 @@ impl Limits {
             queued_jobs_max,
             queued_renders_max,
             active_pixels_max,
+            head_timeout_ms,
+            body_bytes_min,
+            body_window_ms,
             cache_bytes_max,
             scene_timeout_ms
         );
@@ -209,6 +219,9 @@ impl Default for Limits {
             views_timeout_ms: 300_000,
             cache_bytes_max: 4 << 30,
             device_scene_bytes_max: 2 << 30,
+            head_timeout_ms: 10_000,
+            body_bytes_min: 8 << 10,
+            body_window_ms: 16_000,
             render_timeout_ms: 30_000,
             scene_timeout_ms: 600_000,
             wait_ms_max: 600_000,

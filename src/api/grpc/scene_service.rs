@@ -15,14 +15,11 @@ use crate::{
         Api, request_id,
         upload::{UploadBuilder, UploadGuard, check_bundle},
     },
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
     keys::Caller,
     scene::{Upload, UploadCameras},
     service::{CreateScene, Kind, PageRequest, SceneOptions, SemanticsMode, ViewSpec, ViewsSpec},
 };
-
-/// Longest pause between two messages of an upload.
-const PAUSE_MAX: Duration = Duration::from_secs(30);
 
 type Answer<T> = Result<Response<T>, Status>;
 type Many<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send + 'static>>;
@@ -172,13 +169,8 @@ async fn receive(
     let mut upload = UploadBuilder::new(&limits, &api.uploads);
     let mut header = None;
     loop {
-        let next = tokio::time::timeout(PAUSE_MAX, messages.message()).await.map_err(|_| {
-            Error::new(
-                ErrorCode::DeadlineExceeded,
-                format!("upload: nothing came for {} s", PAUSE_MAX.as_secs()),
-            )
-        })?;
-        let Some(message) = next.map_err(|status| unreadable(&status))? else { break };
+        let next = messages.message().await.map_err(|status| unreadable(&status))?;
+        let Some(message) = next else { break };
         let part = message.part.ok_or_else(|| Error::invalid("upload: an empty message"))?;
         match (part, &header) {
             (Part::Header(first), None) => {

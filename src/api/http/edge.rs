@@ -3,26 +3,28 @@
 use std::{
     any::Any,
     convert::Infallible,
+    sync::Arc,
     time::{Duration, Instant},
 };
 
 use axum::{
     body::Body,
     extract::{FromRequestParts, Request, State},
-    http::{HeaderMap, HeaderValue, Method, StatusCode, header, request::Parts},
+    http::{HeaderMap, HeaderValue, Method, StatusCode, header, request::Parts, uri::Authority},
     middleware::Next,
     response::{IntoResponse, Response},
 };
 use tracing::{Instrument, Span, field::Empty};
 
 use super::{
+    connection::{Pace, TooSlow},
     error::{ApiError, Fault, panic_error},
     held::hold,
 };
 use crate::{
     api::{
         Api,
-        access::{self, Pass},
+        access::{self, Access, Pass},
         grpc,
         life::Inside,
         request_id,
@@ -49,26 +51,35 @@ impl<S: Sync> FromRequestParts<S> for Deadline {
 struct Call(&'static str);
 
 /// Around every HTTP call.
-pub(super) async fn rest(request: Request, next: Next) -> Response {
+pub(super) async fn rest(
+    State((access, pace)): State<(Arc<Access>, Pace)>,
+    request: Request,
+    next: Next,
+) -> Response {
     let id = id_of(request.headers());
     let (method, path) = (request.method().clone(), request.uri().path().to_owned());
     let span = tracing::info_span!("http", %method, path, request_id = id, key = Empty);
     follow(&span, request.headers());
-    rest_within(request, next, id, method, path).instrument(span).await
+    rest_within(&access, pace, request, next, id, method, path).instrument(span).await
 }
 
 async fn rest_within(
-    mut request: Request,
+    access: &Access,
+    pace: Pace,
+    request: Request,
     next: Next,
     id: String,
     method: Method,
     path: String,
 ) -> Response {
+    let (mut request, too_slow) = watch_body(request, pace);
     if let Ok(value) = HeaderValue::from_str(&id) {
         request.headers_mut().insert(request_id::HEADER, value);
     }
     let started = Instant::now();
-    let mut response = match deadline_of_query(request.uri().query()) {
+    let allowed = access.check_hosts(hosts_of(&request));
+    let deadline = allowed.and_then(|()| deadline_of_query(request.uri().query()));
+    let mut response = match deadline {
         Err(error) => ApiError::from(error).into_response(),
         Ok(None) => next.run(request).await,
         Ok(Some(deadline)) => {
@@ -79,6 +90,9 @@ async fn rest_within(
             }
         }
     };
+    if too_slow.get() && !response.status().is_success() {
+        response = ApiError::from(pace.error()).into_response();
+    }
     if response.extensions().get::<Fault>().is_none() && is_bare_refusal(&response) {
         // A refusal of the framework's own, before any handler of ours.
         response = dress(&response);
@@ -134,8 +148,23 @@ pub(super) async fn guard(
     response
 }
 
+/// The request with its body watched.
+fn watch_body(request: Request, pace: Pace) -> (Request, TooSlow) {
+    let (parts, body) = request.into_parts();
+    let (body, too_slow) = pace.watch(body);
+    (Request::from_parts(parts, body), too_slow)
+}
+
+/// Every host that a call names: that of its target, which is `:authority` in HTTP/2, and those of its
+/// `host` headers.
+fn hosts_of(request: &Request) -> impl Iterator<Item = &str> {
+    let named = request.headers().get_all(header::HOST).iter();
+    let named = named.map(|host| host.to_str().unwrap_or("not text"));
+    request.uri().authority().map(Authority::as_str).into_iter().chain(named)
+}
+
 /// Refuses pages of other origins where no key is asked for: a browser on this machine would let
-/// any page of the web in.
+/// any page of the web in. The host that the origin is held against is an allowed one.
 fn check_origin(api: &Api, request: &Request) -> Result<(), Error> {
     let Some(origin) = request.headers().get(header::ORIGIN) else { return Ok(()) };
     if api.access.asks() {
@@ -170,27 +199,35 @@ fn let_in(api: &Api, scope: Scope, request: &mut Request) -> Result<(Inside, Pas
 }
 
 /// Around every gRPC call.
-pub(super) async fn rpc(State(api): State<Api>, request: Request, next: Next) -> Response {
+pub(super) async fn rpc(
+    State((api, pace)): State<(Api, Pace)>,
+    request: Request,
+    next: Next,
+) -> Response {
     let id = id_of(request.headers());
     let path = request.uri().path().to_owned();
     let span = tracing::info_span!("grpc", path, request_id = id, key = Empty);
     follow(&span, request.headers());
-    rpc_within(api, request, next, id, path).instrument(span).await
+    rpc_within(api, pace, request, next, id, path).instrument(span).await
 }
 
 async fn rpc_within(
     api: Api,
-    mut request: Request,
+    pace: Pace,
+    request: Request,
     next: Next,
     id: String,
     path: String,
 ) -> Response {
+    let (mut request, too_slow) = watch_body(request, pace);
     if let Ok(value) = HeaderValue::from_str(&id) {
         request.headers_mut().insert(request_id::HEADER, value);
     }
     let started = Instant::now();
     let (call, scope) = access::of_rpc(&path);
-    let held = scope.map(|scope| let_in(&api, scope, &mut request)).transpose();
+    let allowed = api.access.check_hosts(hosts_of(&request));
+    let held =
+        allowed.and_then(|()| scope.map(|scope| let_in(&api, scope, &mut request)).transpose());
     let mut response = match (held, deadline_of_grpc(request.headers())) {
         (Err(error), _) => {
             log_fault(&error, &path, 0.0);
@@ -204,6 +241,9 @@ async fn rpc_within(
             }
         }
     };
+    if too_slow.get() {
+        response = grpc::refusal(&pace.error()).map(Body::new);
+    }
     let took = started.elapsed();
     let ms = took.as_secs_f64() * 1e3;
     grpc::complete(response.headers_mut());

@@ -3,6 +3,7 @@
 //! [`routes`] is the list of calls; `/openapi.json` is held to it by `tests/it/errors.rs`.
 
 mod ask;
+mod connection;
 mod cors;
 mod edge;
 mod error;
@@ -19,6 +20,8 @@ mod tls;
 mod viewer;
 mod views;
 
+use std::sync::Arc;
+
 use axum::{
     Router,
     extract::DefaultBodyLimit,
@@ -28,8 +31,14 @@ use axum::{
 };
 use tower_http::catch_panic::CatchPanicLayer;
 
-use super::{Api, access, grpc};
+use super::{
+    Api,
+    access::{self, Access},
+    grpc,
+};
 use crate::{error::Result, keys::Scope, telemetry::meter};
+
+use self::connection::Pace;
 
 pub use self::serve::{Doors, serve};
 
@@ -104,6 +113,7 @@ pub fn routes() -> Vec<Route> {
 /// Both doors as one router.
 fn app(api: &Api) -> Result<Router> {
     let rpc = grpc::routes(api.clone())?.prepare().into_axum_router().reset_fallback();
+    let pace = Pace::new(&api.service.limits());
     // Before the first call, so that every metric is there.
     access::rpc_calls().for_each(|call| meter::register_call("grpc", call));
     meter::register_call("http", access::OTHER);
@@ -121,8 +131,8 @@ fn app(api: &Api) -> Result<Router> {
         .fold(Router::new(), |router, (path, handler)| router.route(path, handler))
         .method_not_allowed_fallback(error::method_not_allowed)
         .with_state(api.clone());
-    let rest = rest_edge(rest.fallback(error::no_such_route));
-    let both = rest.merge(rpc_edge(rpc, api.clone()));
+    let rest = rest_edge(rest.fallback(error::no_such_route), (Arc::clone(&api.access), pace));
+    let both = rest.merge(rpc_edge(rpc, (api.clone(), pace)));
     Ok(match cors::layer(&api.service.config().cors_origins)? {
         Some(cors) => both.layer(cors),
         None => both,
@@ -130,18 +140,18 @@ fn app(api: &Api) -> Result<Router> {
 }
 
 /// What surrounds every HTTP call: request id, deadline, one error shape, a net for panics.
-fn rest_edge(router: Router) -> Router {
+fn rest_edge(router: Router, state: (Arc<Access>, Pace)) -> Router {
     router
         .layer(DefaultBodyLimit::disable())
         .layer(CatchPanicLayer::custom(error::panicked))
-        .layer(middleware::from_fn(edge::rest))
+        .layer(middleware::from_fn_with_state(state, edge::rest))
 }
 
 /// The same for every gRPC call.
-fn rpc_edge(router: Router, api: Api) -> Router {
+fn rpc_edge(router: Router, state: (Api, Pace)) -> Router {
     router
         .layer(CatchPanicLayer::custom(edge::rpc_panicked))
-        .layer(middleware::from_fn_with_state(api, edge::rpc))
+        .layer(middleware::from_fn_with_state(state, edge::rpc))
 }
 
 #[cfg(test)]
@@ -173,6 +183,10 @@ mod tests {
             Router::new()
                 .route("/boom", routing::get(boom))
                 .route("/ok", routing::get(|| async {})),
+            (
+                Arc::new(Access::new(&crate::config::Config::default()).unwrap()),
+                Pace::new(&crate::limits::Limits::default()),
+            ),
         );
         let (status, headers, body) = call(router.clone(), "/boom").await;
         assert_eq!(status, StatusCode::INTERNAL_SERVER_ERROR);

@@ -19,12 +19,10 @@ use crate::{
         Api,
         upload::{UploadBuilder, UploadGuard},
     },
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
     scene::{Upload, UploadCameras},
 };
 
-/// Longest pause between two pieces of an upload.
-const PAUSE_MAX: Duration = Duration::from_secs(30);
 /// What is still read of an upload already refused, so that the caller sees the answer.
 const DRAIN_BYTES_MAX: usize = 512 << 20;
 /// How long that may take.
@@ -120,8 +118,7 @@ async fn parts(
     let mut upload = UploadBuilder::new(&limits, &api.uploads);
     let mut options = OPTIONS.to_vec();
     loop {
-        let next = tokio::time::timeout(PAUSE_MAX, form.next_field()).await.map_err(|_| pause())?;
-        let Some(mut field) = next.map_err(broken)? else { break };
+        let Some(mut field) = form.next_field().await.map_err(broken)? else { break };
         wire.progressed();
         let name = field.name().unwrap_or_default().to_owned();
         match name.as_str() {
@@ -139,7 +136,7 @@ async fn parts(
             }
             _ => upload.begin_photo(&photo_name(&name, field.file_name())?)?,
         }
-        while let Some(piece) = chunk(&mut field).await? {
+        while let Some(piece) = field.chunk().await.map_err(broken)? {
             wire.progressed();
             upload.extend(&piece)?;
         }
@@ -219,7 +216,7 @@ fn photo_name(part: &str, file: Option<&str>) -> Result<String> {
 
 async fn text(field: &mut Field<'_>) -> Result<String> {
     let mut bytes = Vec::new();
-    while let Some(piece) = chunk(field).await? {
+    while let Some(piece) = field.chunk().await.map_err(broken)? {
         bytes.extend_from_slice(&piece);
         if bytes.len() > OPTION_BYTES_MAX {
             let name = field.name().unwrap_or_default();
@@ -228,18 +225,6 @@ async fn text(field: &mut Field<'_>) -> Result<String> {
         }
     }
     String::from_utf8(bytes).map_err(|_| Error::invalid("upload: an option is not UTF-8 text"))
-}
-
-async fn chunk(field: &mut Field<'_>) -> Result<Option<axum::body::Bytes>> {
-    let piece = tokio::time::timeout(PAUSE_MAX, field.chunk()).await.map_err(|_| pause())?;
-    piece.map_err(broken)
-}
-
-fn pause() -> Error {
-    Error::new(
-        ErrorCode::DeadlineExceeded,
-        format!("upload: nothing came for {} s", PAUSE_MAX.as_secs()),
-    )
 }
 
 fn broken(error: axum::extract::multipart::MultipartError) -> Error {

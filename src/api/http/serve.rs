@@ -1,6 +1,6 @@
 //! One port for both doors: plain or TLS, and an orderly end.
 
-use std::{future::Future, time::Duration};
+use std::{future::Future, pin::pin, time::Duration};
 
 use axum::{
     Router,
@@ -8,13 +8,8 @@ use axum::{
 };
 use tokio::{net::TcpListener, sync::watch};
 
-use super::{app, tls::Tls};
-use crate::{
-    api::Api,
-    config::Config,
-    error::{Error, Result},
-    service::Service,
-};
+use super::{app, connection, tls::Tls};
+use crate::{api::Api, config::Config, error::Result, service::Service};
 
 /// How long connections without a call may take to close.
 const CLOSING: Duration = Duration::from_millis(200);
@@ -88,34 +83,30 @@ pub async fn serve(
 }
 
 async fn run<L: Listener>(
-    listener: L,
+    mut listener: L,
     app: Router,
     api: Api,
     stop: impl Future<Output = ()> + Send + 'static,
-) -> Result<()>
-where
-    L::Addr: std::fmt::Debug,
-{
-    let (emptied, mut empty) = watch::channel(false);
-    let graceful = axum::serve(listener, app).with_graceful_shutdown(async move {
+) -> Result<()> {
+    let head_max = Duration::from_millis(api.service.limits().head_timeout_ms);
+    let drained = async {
         stop.await;
         drain(&api).await;
-        emptied.send_replace(true);
-    });
-    let late = async move {
-        // An error means that the sender is gone: the server has ended by itself.
-        if empty.wait_for(|&empty| empty).await.is_err() {
-            std::future::pending::<()>().await;
-        }
-        tokio::time::sleep(CLOSING).await;
     };
-    let served = tokio::select! {
-        ended = graceful.into_future() => {
-            ended.map_err(|e| Error::internal("the listener failed").caused_by(e))
-        }
-        () = late => Ok(()),
-    };
-    served
+    let mut drained = pin!(drained);
+    let (stopping, stopped) = watch::channel(false);
+    loop {
+        let (stream, _) = tokio::select! {
+            accepted = listener.accept() => accepted,
+            () = &mut drained => break,
+        };
+        tokio::spawn(connection::serve(stream, app.clone(), head_max, stopped.clone()));
+    }
+    drop((listener, stopped));
+    stopping.send_replace(true);
+    // Calls that are still open were told of their end before.
+    let _ = tokio::time::timeout(CLOSING, stopping.closed()).await;
+    Ok(())
 }
 
 /// First not ready, then nobody new, then those inside leave.

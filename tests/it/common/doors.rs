@@ -68,6 +68,19 @@ pub(crate) async fn both(addr: SocketAddr) -> [Door; 2] {
     [http(addr), grpc(addr).await]
 }
 
+/// Both doors of the server at `addr`, called by the name `host` as a rebound page does.
+pub(crate) async fn both_named(addr: SocketAddr, host: &str) -> [Door; 2] {
+    let mut headers = reqwest::header::HeaderMap::new();
+    headers.insert("host", host.parse().expect("ASCII"));
+    headers.insert("origin", format!("http://{host}").parse().expect("ASCII"));
+    let client = reqwest::Client::builder().default_headers(headers).build().expect("a client");
+    let endpoint = Channel::from_shared(format!("http://{addr}")).expect("an address is a URI");
+    let endpoint = endpoint.origin(format!("http://{host}").parse().expect("a URI"));
+    let channel = endpoint.connect().await.expect("the server listens");
+    let grpc = SceneServiceClient::with_interceptor(channel, Bearer(None));
+    [Door::Http { base: format!("http://{addr}"), client }, Door::Grpc { client: grpc }]
+}
+
 pub(crate) fn http(addr: SocketAddr) -> Door {
     Door::Http { base: format!("http://{addr}"), client: crate::common::client() }
 }

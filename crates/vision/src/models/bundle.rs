@@ -16,10 +16,11 @@ use crate::{
     models::{
         NetworkOptions, SETUP_COMMAND,
         manifest::{GeometryManifest, ImageTextManifest, MANIFEST, MasksManifest, unavailable},
+        places,
     },
 };
 
-/// Where the bundle that ships with the server lies, under the working folder or the executable's.
+/// Where the bundle that ships with the server lies in one of [`places::folders`].
 const EMBEDDED: &str = "models/embedded";
 /// Largest manifest read, bytes.
 const MANIFEST_BYTES_MAX: u64 = 1 << 20;
@@ -76,12 +77,13 @@ impl Bundle {
         if let Some(dir) = &options.bundle {
             return Self::read(dir);
         }
-        let places = search_places();
-        match places.iter().find(|dir| dir.join(MANIFEST).is_file()) {
-            Some(dir) => Self::read(dir),
+        let mut found = places::folders().into_iter().map(|folder| folder.join(EMBEDDED));
+        match found.find(|dir| dir.join(MANIFEST).is_file()) {
+            Some(dir) => Self::read(&dir),
             None => Err(unavailable(format!(
-                "no model bundle: no {EMBEDDED}/{MANIFEST} beside the executable or in the \
-                 working folder; name its folder with --bundle or SEGSPLAT_BUNDLE"
+                "no model bundle: no {EMBEDDED}/{MANIFEST} beside the executable, in \
+                 ../share/segsplat, in the checkout that it was built in or in the working folder; \
+                 name its folder with --bundle or SEGSPLAT_BUNDLE"
             ))),
         }
     }
@@ -217,11 +219,6 @@ impl Bundle {
     pub fn size_bytes(&self, file: &str) -> u64 {
         fs_err::metadata(self.path(file)).map_or(0, |meta| meta.len())
     }
-}
-
-fn search_places() -> Vec<PathBuf> {
-    let beside = std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.join(EMBEDDED)));
-    beside.into_iter().chain([PathBuf::from(EMBEDDED)]).collect()
 }
 
 /// Streams a file through sha256; lower-case hex.

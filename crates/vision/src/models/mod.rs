@@ -15,6 +15,7 @@ mod image_text;
 mod manifest;
 mod masks;
 mod options;
+mod places;
 mod pool;
 mod resize;
 mod runtime;

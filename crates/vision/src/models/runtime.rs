@@ -1,7 +1,7 @@
 //! ONNX Runtime: it is found, checked by sha256 and loaded once in a process, never at build time.
 //!
 //! Search order: `--ort-library` / `SEGSPLAT_ORT_LIBRARY`, `ORT_DYLIB_PATH`, beside the executable,
-//! `target/ort/`, the system's folders. A library that the operator *named* is always loaded; a
+//! `../share/segsplat`, `target/ort` of the checkout or of the working folder, the system's folders. A library that the operator *named* is always loaded; a
 //! warning tells when its hash is not pinned (a CUDA build, a newer release). A library that was
 //! only *found* must be one of the pinned builds. Else the start is refused.
 
@@ -19,7 +19,7 @@ use tracing::{info, warn};
 
 use crate::{
     error::Result,
-    models::{NetworkOptions, ProviderChoice, bundle::sha256_of, manifest::unavailable},
+    models::{NetworkOptions, ProviderChoice, bundle::sha256_of, manifest::unavailable, places},
 };
 
 /// The one command that gets the library.
@@ -125,6 +125,12 @@ impl Runtime {
         Ok(runtime)
     }
 
+    /// The library's file.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
     /// sha256 of the library.
     #[must_use]
     pub fn sha256(&self) -> &str {
@@ -215,22 +221,20 @@ fn locate(options: &NetworkOptions) -> Result<(PathBuf, bool)> {
             .caused_by(e)),
         };
     }
-    let beside = std::env::current_exe().ok().and_then(|exe| Some(exe.parent()?.join(LIBRARY)));
     let target = std::env::var_os("CARGO_TARGET_DIR").map(|dir| PathBuf::from(dir).join("ort"));
-    let folders = target
-        .into_iter()
-        .chain([PathBuf::from("target/ort")])
+    let own = places::folders();
+    own.iter()
+        .cloned()
+        .chain(target)
+        .chain(own.iter().map(|folder| folder.join("target/ort")))
         .chain(SYSTEM.iter().map(PathBuf::from))
-        .map(|dir| dir.join(LIBRARY));
-    beside
-        .into_iter()
-        .chain(folders)
-        .find_map(|path| path.canonicalize().ok())
+        .find_map(|folder| folder.join(LIBRARY).canonicalize().ok())
         .map(|path| (path, false))
         .ok_or_else(|| {
             unavailable(format!(
-                "ONNX Runtime is missing: no {LIBRARY} beside the executable, in target/ort or in \
-                 the system's folders; run `{SETUP_COMMAND}` (24 MB, checked by sha256)"
+                "ONNX Runtime is missing: no {LIBRARY} beside the executable, in \
+                 ../share/segsplat, in target/ort or in the system's folders; run \
+                 `{SETUP_COMMAND}` (24 MB, checked by sha256)"
             ))
         })
 }

@@ -6,12 +6,24 @@ use std::{
     io::{Cursor, Read},
 };
 
+use zip::{ZipReadOptions, unstable::read::ZipIterable};
+
 use super::{CAMERA_FILES, cameras_named, names};
 use crate::{
     error::{Error, Result},
     limits::Limits,
     scene::{Upload, UploadFile},
 };
+
+/// What packers that are not read begin with, and their names.
+const PACKED: [(&[u8], &str); 6] = [
+    (b"\x1F\x8B", "gzip"),
+    (b"BZh", "bzip2"),
+    (b"\xFD7zXZ\0", "xz"),
+    (b"\x28\xB5\x2F\xFD", "zstd"),
+    (b"7z\xBC\xAF\x27\x1C", "7-Zip"),
+    (b"Rar!", "RAR"),
+];
 
 /// The cameras and files of an archive of one folder.
 ///
@@ -21,31 +33,33 @@ use crate::{
 pub(super) fn unpack(bytes: &[u8], limits: &Limits) -> Result<Upload> {
     let files = match bytes {
         [b'P', b'K', ..] => unzip(bytes, limits)?,
-        [0x1F, 0x8B, ..] => {
-            return Err(Error::photo("archive: compressed by gzip; send a zip or a plain tar"));
-        }
         _ if bytes.get(257..262) == Some(b"ustar") => untar(bytes, limits)?,
-        _ => return Err(Error::photo("archive: neither a zip nor a tar file")),
+        _ => {
+            let known = PACKED.iter().find(|(start, _)| bytes.starts_with(start));
+            return Err(Error::photo(match known {
+                Some((_, by)) => format!("archive: packed by {by}; send a zip or a plain tar"),
+                None => "archive: neither a zip nor a tar file".to_owned(),
+            }));
+        }
     };
     folder(files)
 }
 
-/// Picks the camera file nearest the root; its folder is what the photos' paths are relative to.
+/// Takes the camera file out; its folder is what the photos' paths are relative to.
 fn folder(mut files: HashMap<String, Vec<u8>>) -> Result<Upload> {
-    let depth = |path: &str| path.matches('/').count();
     let mut found: Vec<&String> = files
         .keys()
         .filter(|path| CAMERA_FILES.contains(&path.rsplit('/').next().unwrap_or(path)))
         .collect();
-    found.sort_by(|a, b| depth(a).cmp(&depth(b)).then(a.cmp(b)));
+    found.sort();
     let chosen = match found[..] {
         [] => return Err(Error::invalid("archive: no transforms.json and no cameras.json in it")),
-        [first, second, ..] if depth(first) == depth(second) => {
+        [one] => one.clone(),
+        [first, second, ..] => {
             return Err(Error::invalid(format!(
                 "archive: two camera files, {first:?} and {second:?}; a scene has one"
             )));
         }
-        [first, ..] => first.clone(),
     };
     let (root, name) = match chosen.rsplit_once('/') {
         Some((root, name)) => (format!("{root}/"), name.to_owned()),
@@ -144,27 +158,22 @@ fn insert(files: &mut HashMap<String, Vec<u8>>, path: String, bytes: Vec<u8>) ->
     Ok(())
 }
 
-/// Number of entries that the end record of a zip claims, so that a huge directory is never read.
-fn zip_entries_claimed(bytes: &[u8]) -> Option<usize> {
-    let tail = &bytes[bytes.len().saturating_sub(22 + 65_535)..];
-    let claims = tail.windows(22).filter(|w| w.starts_with(b"PK\x05\x06"));
-    claims.map(|w| usize::from(u16::from_le_bytes([w[10], w[11]]))).max()
-}
-
 fn unzip(bytes: &[u8], limits: &Limits) -> Result<HashMap<String, Vec<u8>>> {
-    let damaged = || Error::photo("archive: the zip is damaged or cut short");
-    let claimed = zip_entries_claimed(bytes).ok_or_else(damaged)?;
-    if claimed > limits.archive_entries_max {
-        return Err(Error::limit("archive: entries", claimed, limits.archive_entries_max));
+    let damaged = |e| Error::photo("archive: the zip is damaged or cut short").caused_by(e);
+    // Unlike `ZipArchive` it reads no entry before it is asked to, so that their number, in ZIP64 too,
+    // is checked first; and it keeps entries that share a name.
+    let config = zip::read::Config::default();
+    let mut zip = ZipIterable::try_new(Cursor::new(bytes), config).map_err(damaged)?;
+    if zip.len() > limits.archive_entries_max {
+        return Err(Error::limit("archive: entries", zip.len(), limits.archive_entries_max));
     }
-    let mut zip = zip::ZipArchive::new(Cursor::new(bytes)).map_err(|e| damaged().caused_by(e))?;
     let mut budget = Budget::new(limits);
     let mut wanted = Vec::new();
     // All names and claims are checked before anything is unpacked.
     let mut claimed_bytes = 0_u64;
-    for i in 0..zip.len() {
-        let entry = zip.by_index_raw(i).map_err(|e| damaged().caused_by(e))?;
-        let name = entry.name().map_err(|e| damaged().caused_by(e))?;
+    for entry in zip.files().map_err(damaged)? {
+        let entry = entry.map_err(damaged)?;
+        let name = entry.name().map_err(damaged)?;
         let path = budget.entry(name.as_bytes(), entry.is_symlink(), entry.is_dir())?;
         claimed_bytes = claimed_bytes.saturating_add(entry.size());
         if claimed_bytes > limits.archive_unpacked_bytes_max {
@@ -175,16 +184,18 @@ fn unzip(bytes: &[u8], limits: &Limits) -> Result<HashMap<String, Vec<u8>>> {
             if entry.encrypted() {
                 return Err(Error::photo(format!("archive: {path:?} is encrypted")));
             }
-            wanted.push((i, path));
+            wanted.push((entry, path));
         }
     }
     let mut files = HashMap::new();
-    for (i, path) in wanted {
-        let entry = zip.by_index(i).map_err(|e| {
+    let mut body = Cursor::new(bytes);
+    for (entry, path) in wanted {
+        let size = entry.size();
+        let entry = entry.with_reader(&mut body, ZipReadOptions::new()).map_err(|e| {
             Error::photo(format!("archive: {path:?} is damaged or packed in an unknown way"))
                 .caused_by(e)
         })?;
-        let read = budget.read(&path, entry.size(), entry)?;
+        let read = budget.read(&path, size, entry)?;
         insert(&mut files, path, read)?;
     }
     Ok(files)

@@ -230,10 +230,12 @@ mod tests {
         let photo = decoded(&encoded(&grey16, ImageFormat::Png)).unwrap();
         assert_eq!(photo.rgb[3..6], [0x40; 3]);
         let alpha = image::DynamicImage::from(image::ImageBuffer::from_fn(4, 4, |x, _| {
-            image::Rgba([9_u8, 9, 9, if x == 2 { 0 } else { 255 }])
+            image::Rgba([9_u8, 9, 9, [127, 128, 0, 255][x as usize]])
         }));
         let photo = decoded(&encoded(&alpha, ImageFormat::Png)).unwrap();
-        assert_eq!(photo.valid.unwrap()[..4], [true, true, false, true]);
+        // Half a pixel's alpha is enough, and its colour is the stored one.
+        assert_eq!(photo.valid.unwrap()[..4], [false, true, false, true]);
+        assert_eq!(photo.rgb[3..6], [9; 3]);
     }
 
     #[test]

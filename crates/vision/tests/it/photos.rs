@@ -262,9 +262,68 @@ fn hostile_archives_are_refused() {
     refused(&archive(zipped(&two)), invalid, &["two camera files"]);
     let unreadable = ErrorCode::PhotoUnreadable;
     refused(&archive(b"hello".to_vec()), unreadable, &["neither a zip nor a tar"]);
-    refused(&archive(vec![0x1F, 0x8B, 8, 0]), unreadable, &["gzip"]);
+    for (bytes, name) in
+        [(&[0x1F, 0x8B, 8, 0][..], "gzip"), (b"BZh91AY&SY", "bzip2"), (b"\xFD7zXZ\0", "xz")]
+    {
+        refused(&archive(bytes.to_vec()), unreadable, &[name, "send a zip or a plain tar"]);
+    }
     let cut = zipped(&[("a.png", &[7; 4000])]);
     refused(&archive(cut[..cut.len() / 2].to_vec()), unreadable, &["damaged"]);
+}
+
+#[test]
+fn zip_and_tar_refuse_names_and_camera_files_that_come_twice() {
+    let json: &[u8] = b"{}";
+    for (entries, words) in [
+        ([("a/x.png", json), ("a/y.png", json), ("t", json)], ["two entries", "a/x.png"]),
+        (
+            [("transforms.json", json), ("b/transforms.json", json), ("t", json)],
+            ["two camera files", "b/transforms.json"],
+        ),
+        ([("cameras.json", json), ("b/transforms.json", json), ("t", json)], ["two camera", "b/"]),
+    ] {
+        let twice =
+            entries.map(|(name, bytes)| (if name == "a/y.png" { "a/x.png" } else { name }, bytes));
+        // The zip writer refuses to write a name twice.
+        let mut zip = zipped(&entries);
+        for at in 0..zip.len() - 7 {
+            if &zip[at..at + 7] == b"a/y.png" {
+                zip[at + 2] = b'x';
+            }
+        }
+        for bytes in [zip, tarred(&twice, tar::EntryType::Regular)] {
+            refused(&archive(bytes), ErrorCode::InvalidRequest, &words);
+        }
+    }
+}
+
+/// A ZIP64 file whose records are all zero, and whose old end record tells of one entry.
+fn zip64_claiming(entries: u64) -> Vec<u8> {
+    let mut zip = b"PK\x03\x04".to_vec();
+    let directory = zip.len() as u64;
+    zip.resize(zip.len() + 46 * entries as usize, 0);
+    let end = zip.len() as u64;
+    zip.extend(b"PK\x06\x06");
+    zip.extend(44_u64.to_le_bytes());
+    zip.extend([45, 0, 45, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
+    for value in [entries, entries, end - directory, directory] {
+        zip.extend(value.to_le_bytes());
+    }
+    zip.extend(b"PK\x06\x07\0\0\0\0");
+    zip.extend(end.to_le_bytes());
+    zip.extend([1, 0, 0, 0]);
+    zip.extend(b"PK\x05\x06\0\0\0\0\x01\0\x01\0");
+    zip.extend([0xFF; 8]);
+    zip.extend([0, 0]);
+    zip
+}
+
+#[test]
+fn the_entries_of_a_zip64_are_counted_before_a_record_is_read() {
+    let words = ["archive: entries: 100000 is over 1024"];
+    refused(&archive(zip64_claiming(100_000)), ErrorCode::LimitExceeded, &words);
+    // Few enough to be read, which these records are not.
+    refused(&archive(zip64_claiming(1_000)), ErrorCode::PhotoUnreadable, &["damaged"]);
 }
 
 #[test]
