@@ -18,10 +18,7 @@ use super::{
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
-    jobs::{
-        PipelineMaker, PipelineSemantics, SceneMaker, SemanticsMaker, SemanticsWork, Work,
-        content_sha256,
-    },
+    jobs::{PipelineMaker, PipelineSemantics, SceneMaker, SemanticsMaker, SemanticsWork, Work},
     photos,
     pipeline::{Engine, LateEngine},
     scene::{Density, Provenance, Scene, SceneId, SceneMeta, SceneOptions, SemanticsMode, Upload},
@@ -87,7 +84,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         cameras: made.cameras,
         report: made.report,
         provenance: Provenance {
-            content_sha256: content_sha256(&files, &options, &made.bundle_sha256),
+            content_sha256: store::content_sha256(&files, &options, &made.bundle_sha256),
             files,
             bundle_sha256: made.bundle_sha256,
             options,

@@ -27,7 +27,6 @@ use tokio::sync::watch;
 pub use self::{
     maker::{PipelineMaker, PipelineSemantics},
     semantics::{NoSemantics, Phrases, SemanticsMaker, SemanticsWork, TextEmbedding},
-    worker::content_sha256,
 };
 
 use self::{
@@ -39,10 +38,10 @@ use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
     scene::{
-        Backdrop, Gaussians, HealthReport, SceneCamera, SceneId, SceneOptions, SceneState,
-        SemanticsMode, SemanticsState, SemanticsStatus, Upload,
+        Backdrop, Gaussians, HealthReport, PhotoHash, SceneCamera, SceneId, SceneOptions,
+        SceneState, SemanticsMode, SemanticsState, SemanticsStatus, Upload,
     },
-    store::{KeyUse, Record, Store, not_found},
+    store::{self, KeyUse, Record, Store, not_found},
 };
 
 /// What a job asks for, and how it tells where it is.
@@ -260,9 +259,14 @@ impl Jobs {
     /// # Errors
     /// `invalid_request` when the key was used for another upload, `overloaded` when the queue is
     /// full or the server stops, `store_unavailable`.
-    pub fn submit(&self, upload: &Upload, mut record: Record) -> Result<SceneId> {
+    pub fn submit(
+        &self,
+        upload: &Upload,
+        files: &[PhotoHash],
+        mut record: Record,
+    ) -> Result<SceneId> {
         // First, so that a full queue still answers for what it holds.
-        if let Some(earlier) = self.earlier(&record)? {
+        if let Some(earlier) = self.earlier(files, &record)? {
             return Ok(earlier);
         }
         let shared = &self.shared;
@@ -274,7 +278,7 @@ impl Jobs {
         let id = record.status.id.clone();
         shared.hold(&id);
         let kept = || -> Result<Option<SceneId>> {
-            if let Some(other) = self.use_key(&record)? {
+            if let Some(other) = self.use_key(files, &record)? {
                 return Ok(Some(other));
             }
             shared.store.put_upload(upload, &record).inspect_err(|_| {
@@ -295,7 +299,7 @@ impl Jobs {
     }
 
     /// The scene that an earlier call with this record's idempotency key made.
-    fn earlier(&self, record: &Record) -> Result<Option<SceneId>> {
+    fn earlier(&self, files: &[PhotoHash], record: &Record) -> Result<Option<SceneId>> {
         let Some(key) = &record.idempotency_key else { return Ok(None) };
         let owner = record.owner.as_deref();
         let Some(used) = self.shared.store.key_use(owner, key)? else { return Ok(None) };
@@ -305,11 +309,11 @@ impl Jobs {
             self.shared.store.forget_key(owner, key)?;
             return Ok(None);
         }
-        self.replayed(record, used).map(Some)
+        self.replayed(files, record, used).map(Some)
     }
 
     /// Notes the use of the record's key; gives the scene of a call that was faster.
-    fn use_key(&self, record: &Record) -> Result<Option<SceneId>> {
+    fn use_key(&self, files: &[PhotoHash], record: &Record) -> Result<Option<SceneId>> {
         let Some(key) = &record.idempotency_key else { return Ok(None) };
         let store = &self.shared.store;
         let id = record.status.id.clone();
@@ -320,7 +324,7 @@ impl Jobs {
             Ok(None) => Ok(None),
             Ok(Some(used)) => {
                 store.drop_pending(&id)?;
-                self.replayed(record, used).map(Some)
+                self.replayed(files, record, used).map(Some)
             }
             Err(error) => {
                 let _ = store.drop_pending(&id);
@@ -330,9 +334,9 @@ impl Jobs {
     }
 
     /// The scene of an earlier use of a key, if it was for the same request.
-    fn replayed(&self, record: &Record, used: KeyUse) -> Result<SceneId> {
+    fn replayed(&self, files: &[PhotoHash], record: &Record, used: KeyUse) -> Result<SceneId> {
         let id = used.id;
-        if used.request_sha256 != record.request_sha256 {
+        if !store::is_of_request(&used.request_sha256, files, &record.options) {
             return Err(Error::invalid(format!(
                 "the idempotency key was used for another upload (scene {id})"
             )));
@@ -427,7 +431,12 @@ impl Jobs {
                 at_work = true;
             }
         }
-        if let Err(error) = shared.store.remove(&record) {
+        // A job that was about to end may have removed its own objects first: gone is gone.
+        let removed = match shared.store.remove(&record) {
+            Err(error) if error.code() == ErrorCode::SceneNotFound => Ok(()),
+            removed => removed,
+        };
+        if let Err(error) = removed {
             // It is there still, but nobody makes it any more.
             shared.board.update(id, |record| {
                 if !record.status.state.is_final() {

@@ -10,15 +10,13 @@ use std::{
     time::{Duration, Instant},
 };
 
-use sha2::{Digest, Sha256};
-
 use super::{Made, Networks, Shared, Work};
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
     scene::{
-        PhotoHash, Provenance, Scene, SceneError, SceneId, SceneMeta, SceneOptions, SceneState,
-        SemanticsMode, SemanticsReport, SemanticsState, SemanticsStatus,
+        PhotoHash, Provenance, Scene, SceneError, SceneId, SceneMeta, SceneState, SemanticsMode,
+        SemanticsReport, SemanticsState, SemanticsStatus,
     },
     store::{self, Record},
     telemetry::{self, meter},
@@ -118,21 +116,6 @@ impl Drop for Turn<'_> {
     }
 }
 
-/// Everything that decides what a scene is, as one hash, hex: photos and cameras in their order,
-/// options, the maker's identity (the bundle's hash) and the program's version.
-#[must_use]
-pub fn content_sha256(files: &[PhotoHash], options: &SceneOptions, maker: &str) -> String {
-    let mut hash = Sha256::new();
-    // Lengths keep names and hashes apart.
-    for file in files {
-        hash.update((file.file.len() as u64).to_le_bytes());
-        hash.update(&file.file);
-        hash.update(&file.sha256);
-    }
-    hash.update(format!("{options:?} {maker} {}", env!("CARGO_PKG_VERSION")));
-    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
 impl Shared {
     pub(super) fn lock_running(
         &self,
@@ -214,7 +197,7 @@ impl Shared {
         }
         let upload = self.store.upload(id)?;
         let files = store::hashes(&upload);
-        let content = content_sha256(&files, &record.options, &self.maker.identity());
+        let content = store::content_sha256(&files, &record.options, &self.maker.identity());
         let _turn = self.turn(&content, stop);
         if let Some(known) = self.made_of(&content, &record)? {
             tracing::info!(scene = %id, of = %known.meta.id, "made before of the same content");

@@ -145,11 +145,12 @@ impl Inner {
             traceparent: telemetry::traceparent(),
             ..Record::new(status)
         });
-        record.request_sha256 = request_sha256(upload, &record.options);
+        let files = store::hashes(upload);
+        record.request_sha256 = store::request_sha256(&files, &record.options);
         if record.options.semantics == SemanticsMode::Off {
             record.status.semantics.state = SemanticsState::Off;
         }
-        let made = self.jobs.submit(upload, record)?;
+        let made = self.jobs.submit(upload, &files, record)?;
         let replayed = made != id;
         if !replayed {
             tracing::info!(scene = %id, photos = upload.photos.len(), "queued");
@@ -172,18 +173,6 @@ pub(super) async fn blocking<T: Send + 'static>(
     tokio::task::spawn_blocking(move || span.in_scope(work))
         .await
         .map_err(|e| Error::internal("the work was broken off").caused_by(e))
-}
-
-fn request_sha256(upload: &Upload, options: &SceneOptions) -> String {
-    let mut hash = Sha256::new();
-    for file in store::hashes(upload) {
-        // Lengths first, so that no two lists of files read the same.
-        hash.update((file.file.len() as u64).to_le_bytes());
-        hash.update(file.file);
-        hash.update(file.sha256);
-    }
-    hash.update(format!("{options:?}"));
-    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 fn check_request(

@@ -17,6 +17,7 @@
 
 mod container;
 mod files;
+mod hashes;
 mod index;
 mod objects;
 mod open;
@@ -38,8 +39,10 @@ use std::{
 use fs_err as fs;
 use object_store::path::Path as Name;
 
+pub(crate) use self::hashes::is_of_request;
 use self::objects::{Objects, unavailable};
 pub use self::{
+    hashes::{content_sha256, request_sha256},
     index::KeyUse,
     open::Place,
     record::Record,
@@ -347,15 +350,12 @@ impl Store {
         let was_there = unmake().inspect_err(|_| {
             self.lock_gone().remove(id);
         })?;
-        if !was_there {
-            return Err(not_found(id));
-        }
         self.cache.remove(id);
         // The next sweep takes what cannot be removed now: the scene is gone all the same.
         if let Err(error) = self.purge(id).and_then(|()| self.unlink(record)) {
             tracing::warn!(scene = %id, %error, "left-overs of a deleted scene stay for a sweep");
         }
-        Ok(())
+        if was_there { Ok(()) } else { Err(not_found(id)) }
     }
 
     /// Takes back what was just written where the scene has been deleted meanwhile.
