@@ -124,7 +124,7 @@ impl Service {
         let turn = turn.map_err(|e| Error::internal("no upload is read now").caused_by(e))?;
         blocking(move || {
             let _turn = turn;
-            inner.submit_here(&upload, record, &caller)
+            inner.submit_here(upload, record, &caller)
         })
         .await?
     }
@@ -133,11 +133,10 @@ impl Service {
 impl Inner {
     fn submit_here(
         &self,
-        upload: &Upload,
+        upload: Upload,
         record: impl FnOnce(Record) -> Record,
         caller: &Caller,
     ) -> Result<(SceneId, bool)> {
-        self.maker.check(upload, &self.limits())?;
         let id = new_id();
         let status = SceneStatus::new(id.clone(), SceneState::Queued, store::now_ms());
         let mut record = record(Record {
@@ -145,15 +144,14 @@ impl Inner {
             traceparent: telemetry::traceparent(),
             ..Record::new(status)
         });
-        let files = store::hashes(upload);
-        record.request_sha256 = store::request_sha256(&files, &record.options);
         if record.options.semantics == SemanticsMode::Off {
             record.status.semantics.state = SemanticsState::Off;
         }
-        let made = self.jobs.submit(upload, &files, record)?;
+        let photos = upload.photos.len();
+        let made = self.jobs.submit(upload, record, &self.limits())?;
         let replayed = made != id;
         if !replayed {
-            tracing::info!(scene = %id, photos = upload.photos.len(), "queued");
+            tracing::info!(scene = %id, photos, "queued");
         }
         Ok((made, replayed))
     }

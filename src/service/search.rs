@@ -13,10 +13,10 @@ use super::types::TextWarning;
 use crate::{
     cache::Cache,
     error::{Error, Result},
-    jobs::{Phrases, SemanticsMaker, TextEmbedding},
+    jobs::{Phrases, SemanticsMaker},
     limits::Limits,
     render::{Labels, PixelWeights, RenderRequest, Renderer, ViewPlanner},
-    scene::{Gaussians, PAPER_PHRASES, PAPER_TAU, Scene, ScoringProfile, Semantics},
+    scene::{Gaussians, PAPER_PHRASES, PAPER_TAU, Scene, ScoringProfile, Semantics, TextEmbedding},
     semantics::{PartOptions, Pieces, Scorer, Scoring, TextScores, ViewNorms},
 };
 

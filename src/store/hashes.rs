@@ -8,7 +8,7 @@ use serde_json::Value;
 use sha2::{Digest, Sha256};
 
 use super::files::hex;
-use crate::scene::{Density, PhotoHash, SceneOptions, SemanticsMode};
+use crate::scene::{Density, PhotoHash, Provenance, SceneOptions, SemanticsMode};
 
 /// sha256 over files and options, hex: what an idempotency key stands for.
 #[must_use]
@@ -16,12 +16,19 @@ pub fn request_sha256(files: &[PhotoHash], options: &SceneOptions) -> String {
     hash(files, &canonical(options))
 }
 
-/// sha256 over all that decides what a scene is, hex: photos and cameras in their order, options,
-/// the hash of the networks, and the version of the program.
+/// What a scene is made of: photos and cameras in their order, options, and the networks by the
+/// sha256 of their bundle (hex; empty where none is used), with the hash over all of it.
 #[must_use]
-pub fn content_sha256(files: &[PhotoHash], options: &SceneOptions, networks: &str) -> String {
-    let options = canonical(options);
-    hash(files, &format!("{options} {networks} {}", env!("CARGO_PKG_VERSION")))
+pub fn provenance(files: Vec<PhotoHash>, options: &SceneOptions, networks: &str) -> Provenance {
+    let program_version = env!("CARGO_PKG_VERSION").to_owned();
+    let rest = format!("{} {networks} {program_version}", canonical(options));
+    Provenance {
+        content_sha256: hash(&files, &rest),
+        files,
+        bundle_sha256: networks.to_owned(),
+        options: options.clone(),
+        program_version,
+    }
 }
 
 /// Whether a kept hash is that of this request, also where an earlier program wrote it.
@@ -87,7 +94,8 @@ mod tests {
         // Kept in stores: these must not change.
         let kept = [&SceneOptions::default(), &set].map(|o| request_sha256(&files(), o));
         assert_eq!(kept, KEPT, "requests hash as they always did");
-        assert_ne!(content_sha256(&files(), &set, "n"), content_sha256(&files(), &set, "m"));
+        let content = |networks| provenance(files(), &set, networks).content_sha256;
+        assert_ne!(content("n"), content("m"));
     }
 
     const KEPT: [&str; 2] = [

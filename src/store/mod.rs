@@ -42,7 +42,7 @@ use object_store::path::Path as Name;
 pub(crate) use self::hashes::is_of_request;
 use self::objects::{Objects, unavailable};
 pub use self::{
-    hashes::{content_sha256, request_sha256},
+    hashes::{provenance, request_sha256},
     index::KeyUse,
     open::Place,
     record::Record,
@@ -117,11 +117,10 @@ impl Store {
     ///
     /// # Errors
     /// `store_unavailable`.
-    pub fn put_upload(&self, upload: &Upload, record: &Record) -> Result<()> {
+    pub fn put_upload(&self, upload: Upload, record: &Record) -> Result<()> {
         let id = &record.status.id;
         let keep = || -> Result<()> {
-            let mut file = Vec::with_capacity(upload.size_bytes() + (64 << 10));
-            upload_file::write(&mut file, upload, record)
+            let file = upload_file::pack(upload, record)
                 .map_err(|e| Error::internal("the upload cannot be packed").caused_by(e))?;
             // The record first: an upload without one is rubbish, however the call ends.
             self.announce(record)?;
@@ -174,13 +173,13 @@ impl Store {
         self.objects.put(path, sealed).map_err(|e| unavailable("keep the scene's status", e))
     }
 
-    /// Keeps a finished scene, also in memory; gives the sha256 of its file, hex.
+    /// Keeps a finished scene, also in memory; gives it and the sha256 of its file, hex.
     ///
     /// Where another replica was faster, its file stays and is the scene.
     ///
     /// # Errors
     /// `store_unavailable`; `scene_not_found` when the scene was deleted.
-    pub fn put_scene(&self, scene: Scene) -> Result<String> {
+    pub fn put_scene(&self, scene: Scene) -> Result<(Arc<Scene>, String)> {
         let id = scene.meta.id.clone();
         let mut file = Vec::with_capacity(scene.gaussians.size_bytes() as usize + (64 << 10));
         let mut digest = write_scene(&mut file, &scene)
@@ -198,8 +197,8 @@ impl Store {
             }
         }
         self.unless_deleted(&id)?;
-        self.keep(scene);
-        Ok(digest)
+        self.keep(Arc::clone(&scene));
+        Ok((scene, digest))
     }
 
     /// Keeps what a scene means; gives the scene that carries it and the file's sha256, hex.

@@ -126,7 +126,7 @@ pub fn compare_oracle(
     let all = u64::from(got.width) * u64::from(got.height);
     // Steps of the golden ratio: every part of the picture, no pattern.
     let place = |i: u64| {
-        let share = (i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32) * all >> 32;
+        let share = ((i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 32) * all) >> 32;
         [(share % u64::from(got.width)) as u32, (share / u64::from(got.width)) as u32]
     };
     let pixels: Vec<[u32; 2]> = (0..ORACLE_PIXELS as u64).map(place).collect();

@@ -25,6 +25,8 @@ pub enum WarningCode {
     PoorPoseAgreement,
     /// Photos of the upload that were not used.
     PhotosUnused,
+    /// Several photos are one picture, under different poses.
+    SamePicture,
 }
 
 /// One warning: what, a sentence, and the figure behind it.
