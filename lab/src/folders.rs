@@ -11,7 +11,7 @@ use crate::{
     models::fit,
     photo_files,
     render::{Kinds, RenderRequest, plan::default_near},
-    scene::{Camera, Photo, PosedPhoto, Provenance, Scene, SceneId, SceneMeta},
+    scene::{Camera, Photo, PosedPhoto, Provenance, Scene, SceneId},
 };
 
 /// Side of the square photos that are compared, pixels.
@@ -110,14 +110,7 @@ pub fn view_request(camera: Camera, kinds: Kinds, median_depth: f64) -> RenderRe
 /// A scene that nobody stores.
 #[must_use]
 pub fn scene_of(made: crate::pipeline::Reconstruction) -> Scene {
-    let meta = SceneMeta {
-        id: SceneId::from_bytes([0; 16]),
-        created_ms: 0,
-        cameras: made.cameras,
-        report: made.report,
-        provenance: Provenance::default(),
-    };
-    Scene::new(meta, made.gaussians, made.backdrop)
+    made.into_scene(SceneId::from_bytes([0; 16]), 0, Provenance::default())
 }
 
 #[cfg(test)]

@@ -25,8 +25,8 @@ use crate::{
     photo_files,
     pipeline::{Engine, masks as stage, masks::SeenPhoto, reconstruct},
     rows::{Rows, progress},
-    scene::{Camera, Gaussians, Photo, PhotoMasks, PosedPhoto, SceneOptions},
-    segment::{self, Bitset, Decoded, PromptDecoder, Proposals, Seed, Settings},
+    scene::{Camera, Gaussians, MaskLogits, Photo, PhotoMasks, PosedPhoto, SceneOptions},
+    segment::{self, Bitset, PromptDecoder, Proposals, Seed, Settings},
     setup::Setup,
 };
 
@@ -106,7 +106,7 @@ impl PromptDecoder for Counted<'_> {
         self.seen.placed()
     }
 
-    fn decode(&self, points: &[[f32; 2]]) -> Result<Decoded> {
+    fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits> {
         let before = self.asked.fetch_add(points.len(), Ordering::Relaxed);
         if self.once || before == 0 {
             return self.seen.decode(points);

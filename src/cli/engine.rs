@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::{
     config::Config,
     error::Result,
-    jobs::{NoSemantics, PipelineMaker, PipelineSemantics, SemanticsMaker},
+    jobs::{NoSemantics, PipelineMaker, SemanticsMaker},
     models::Bundle,
     pipeline::{Engine, LateEngine},
     render::{Renderer, select::select},
@@ -30,9 +30,8 @@ pub fn early_parts(config: &Config) -> Result<(Parts, Arc<LateEngine>)> {
     let engine = Arc::new(LateEngine::open(&config.networks())?);
     let renderer = renderer(config)?;
     let models = models_info(engine.bundle(), "opening");
-    let maker = Arc::new(PipelineMaker::new(Arc::clone(&engine), config.limits.clone()));
-    let of_semantics = Arc::clone(&engine);
-    let semantics = Arc::new(PipelineSemantics::new(of_semantics, config.limits.clone()));
+    let maker = Arc::new(PipelineMaker(Arc::clone(&engine)));
+    let semantics = Arc::clone(&maker) as Arc<dyn SemanticsMaker>;
     Ok((Parts { maker, semantics, renderer, models }, engine))
 }
 
@@ -44,8 +43,8 @@ pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticsMaker
     if !needed {
         return Ok(Arc::new(NoSemantics));
     }
-    let engine = Arc::new(Engine::open(&config.networks())?.into());
-    Ok(Arc::new(PipelineSemantics::new(engine, config.limits.clone())))
+    let engine = Engine::open(&config.networks())?;
+    Ok(Arc::new(PipelineMaker(Arc::new(engine.into()))))
 }
 
 /// The renderer that the configuration asks for.

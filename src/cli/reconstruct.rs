@@ -18,14 +18,13 @@ use super::{
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
-    jobs::{
-        PipelineMaker, PipelineSemantics, SceneMaker, SemanticsMaker, SemanticsWork, Work,
-        content_sha256,
-    },
     names::named,
     photos,
-    pipeline::{Engine, LateEngine},
-    scene::{Density, Provenance, Scene, SceneId, SceneMeta, SceneOptions, SemanticsMode, Upload},
+    pipeline::{
+        self, Engine,
+        semantics::{SceneParts, SemanticsOptions, understand},
+    },
+    scene::{Density, Scene, SceneId, SceneOptions, SemanticsMode, Stage, Upload, Watch},
     store::{self, ply::PlyWriter, write_scene_file, write_semantics_file},
 };
 
@@ -51,7 +50,7 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let upload = upload_of(&args.photos, config)?;
-    let engine = Arc::new(LateEngine::from(Engine::open(&config.networks())?));
+    let engine = Engine::open(&config.networks())?;
     let options = SceneOptions {
         max_views: args.max_views,
         semantics: args.semantics,
@@ -63,45 +62,32 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
             "--semantics eager: a PLY has no place for them; write a scene",
         ));
     }
-    let begun = Instant::now();
-    let thinker = PipelineSemantics::new(Arc::clone(&engine), config.limits.clone());
-    if let (true, Some(lack)) = (eager, thinker.lacks()) {
+    if let (true, Some(lack)) = (eager, engine.bundle().lacks_semantics()) {
         let message = format!("--semantics eager: the bundle has {lack}");
         return Err(Error::new(ErrorCode::ModelUnavailable, message));
     }
-    let progress = |stage: &str, fraction: f32| out.progress(stage, fraction);
-    let cancel = AtomicBool::new(false);
-    let made = PipelineMaker::new(engine, config.limits.clone()).make(Work {
-        upload: &upload,
-        options: &options,
-        progress: &progress,
-        cancel: &cancel,
-    })?;
-    let files = store::hashes(&upload);
+    let begun = Instant::now();
+    let progress =
+        |stage: Stage, fraction: f32| out.progress(stage.name(), stage.overall(fraction));
+    let watch = Watch { progress: &progress, cancel: &AtomicBool::new(false) };
+    progress(Stage::Photos, 0.0);
+    let photos = pipeline::read(&upload, &config.limits, watch.cancel)?;
+    let made = pipeline::make(&engine, &photos, &options, watch)?;
+    let provenance = store::provenance(store::hashes(&upload), &options, engine.bundle().sha256());
     let mut hash = Sha256::new();
-    files.iter().for_each(|file| hash.update(format!("{} {}\n", file.sha256, file.file)));
+    for file in &provenance.files {
+        hash.update(format!("{} {}\n", file.sha256, file.file));
+    }
     let mut id = [0; 16];
     id.copy_from_slice(&hash.finalize()[..16]);
-    let meta = SceneMeta {
-        id: SceneId::from_bytes(id),
-        created_ms: store::now_ms(),
-        cameras: made.cameras,
-        report: made.report,
-        provenance: Provenance {
-            content_sha256: content_sha256(&files, &options, &made.bundle_sha256),
-            files,
-            bundle_sha256: made.bundle_sha256,
-            options,
-            program_version: env!("CARGO_PKG_VERSION").to_owned(),
-        },
-    };
-    let mut scene = Scene::new(meta, made.gaussians, made.backdrop);
+    let mut scene = made.into_scene(SceneId::from_bytes(id), store::now_ms(), provenance);
     let path = path_of(&args.output);
     write(&path, &scene)?;
     if eager {
-        let (upload, progress) = (&upload, &progress);
-        let work = SemanticsWork { upload, scene: &scene, progress, cancel: &cancel };
-        let semantics = Arc::new(thinker.make(work)?);
+        let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
+        let parts = SceneParts { photos: &photos.photos, cameras, gaussians };
+        let made = understand(&engine, &parts, &SemanticsOptions::default(), watch)?;
+        let semantics = Arc::new(made);
         write_semantics_file(&semantics_path(&path), &scene.meta.id, &semantics)?;
         scene = scene.with_semantics(semantics)?;
     } else if !is_ply(&path) {

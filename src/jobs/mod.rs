@@ -1,168 +1,94 @@
-//! Scenes in the making: a bounded queue, workers, progress that late watchers pick up, cancel.
+//! Jobs: a bounded queue, workers, progress for watchers, and a way to stop each job.
 //!
-//! In: an upload, made safe on disk before [`Jobs::submit`] returns. Out: a scene in the store.
-//! Invariant: what was acknowledged is made, failed with a code, or cancelled, over any restart.
+//! A job makes a scene of an upload, or the semantics of a scene. In: an upload, safe in the store
+//! before [`Jobs::submit`] returns. Out: a scene in the store. Invariant: an acknowledged scene is
+//! made, fails with a code, or is cancelled, over any restart.
 
-mod board;
-mod keeper;
-mod maker;
-mod peers;
+mod job;
+mod makers;
+mod photos;
 mod queue;
+mod records;
+mod replicas;
+mod scene;
 mod semantics;
 mod worker;
 
 use std::{
-    collections::{HashMap, HashSet},
+    collections::HashSet,
     fmt,
     sync::{
         Arc, Condvar, Mutex, PoisonError,
         atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering},
     },
     thread::JoinHandle,
-    time::Instant,
 };
 
 use tokio::sync::watch;
 
-pub use self::{
-    maker::{PipelineMaker, PipelineSemantics},
-    semantics::{EmbeddedText, NoSemantics, Phrases, SemanticsMaker, SemanticsWork},
-    worker::content_sha256,
-};
+pub use self::makers::{Networks, NoSemantics, Phrases, PipelineMaker, SceneMaker, SemanticsMaker};
 
 use self::{
-    board::Board,
+    job::{Kind, Reason, Running},
+    photos::{ReadUpload, ReadUploads},
     queue::{Full, Queue},
-    worker::Stop,
+    records::Records,
+    replicas::Replicas,
+    worker::Shutdown,
 };
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
+    pipeline,
     scene::{
-        Backdrop, Gaussians, HealthReport, SceneCamera, SceneId, SceneOptions, SceneState,
-        SemanticsMode, SemanticsState, SemanticsStatus, Upload,
+        PhotoHash, SceneId, SceneState, SemanticsMode, SemanticsState, SemanticsStatus, Upload,
     },
-    store::{KeyUse, Record, Store, not_found},
+    store::{self, KeyUse, Record, Store, not_found},
 };
 
-/// What a job asks for, and how it tells where it is.
-#[derive(Clone, Copy)]
-pub struct Work<'a> {
-    /// Photos and cameras.
-    pub upload: &'a Upload,
-    /// Options of the call.
-    pub options: &'a SceneOptions,
-    /// Tells the stage at work and the share of the whole that is done, 0..1.
-    pub progress: &'a (dyn Fn(&str, f32) + Sync),
-    /// Turns true when the work is to stop; the answer is then `cancelled`.
-    pub cancel: &'a AtomicBool,
+/// What jobs work with.
+pub struct JobParts {
+    /// Where scenes are kept.
+    pub store: Arc<Store>,
+    /// Makes scenes.
+    pub maker: Arc<dyn SceneMaker>,
+    /// Makes semantics.
+    pub semantics: Arc<dyn SemanticsMaker>,
+    /// Caps; those of jobs stay as they are at the start.
+    pub limits: Limits,
+    /// Scenes made at the same time.
+    pub workers: usize,
+    /// Whether the photos of finished scenes are kept.
+    pub keep_photos: bool,
 }
 
-impl fmt::Debug for Work<'_> {
+impl fmt::Debug for JobParts {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Work").field("options", self.options).finish_non_exhaustive()
+        f.debug_struct("JobParts").field("workers", &self.workers).finish_non_exhaustive()
     }
-}
-
-/// What a job gives.
-#[derive(Clone, Debug)]
-pub struct Made {
-    /// The Gaussians.
-    pub gaussians: Gaussians,
-    /// The photos' colours by direction.
-    pub backdrop: Backdrop,
-    /// Health report.
-    pub report: HealthReport,
-    /// Cameras of the photos.
-    pub cameras: Vec<SceneCamera>,
-    /// sha256 of the bundle's manifest, hex; empty where no network was used.
-    pub bundle_sha256: String,
-}
-
-/// Where the networks of a maker stand.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Networks {
-    /// They are being opened; what is queued waits for that.
-    Opening,
-    /// They are open, on this execution provider; empty: there are none to open.
-    Open(&'static str),
-    /// They do not open: nothing is taken from the queue, so that nothing in it fails.
-    Broken,
-}
-
-/// Turns an upload into a scene: the pipeline, or a stand-in of a test.
-pub trait SceneMaker: Send + Sync {
-    /// What else than upload and options decides the scene: the networks, by their hash.
-    fn identity(&self) -> String {
-        String::new()
-    }
-
-    /// Whether its networks are open.
-    fn networks(&self) -> Networks {
-        Networks::Open("")
-    }
-
-    /// Refuses an upload that cannot be made, before it is acknowledged. On the calling thread.
-    ///
-    /// # Errors
-    /// `invalid_request`, `photo_unreadable`, `limit_exceeded`; each names photo, value and bound.
-    fn check(&self, upload: &Upload, limits: &Limits) -> Result<()>;
-
-    /// Does the whole work on the calling thread.
-    ///
-    /// # Errors
-    /// Any code; it becomes the scene's `error`.
-    fn make(&self, work: Work<'_>) -> Result<Made>;
 }
 
 /// The queue, its workers and the state of every scene.
 pub struct Jobs {
     shared: Arc<Shared>,
-    workers: Mutex<Vec<JoinHandle<()>>>,
+    threads: Mutex<Vec<JoinHandle<()>>>,
 }
 
 struct Shared {
-    store: Arc<Store>,
-    maker: Arc<dyn SceneMaker>,
-    limits: Limits,
-    board: Board,
+    parts: JobParts,
+    records: Records,
     queue: Queue,
-    running: Mutex<HashMap<SceneId, Arc<Stop>>>,
-    semantics: Arc<dyn SemanticsMaker>,
-    /// Scenes whose semantics were asked for.
-    asked: Queue,
-    thinking: Mutex<HashMap<SceneId, Arc<Stop>>>,
+    running: Running,
+    uploads: ReadUploads,
+    replicas: Box<dyn Replicas>,
+    /// Workers that make scenes and live.
     workers: AtomicUsize,
-    /// Whether the photos of finished scenes are kept.
-    keep_photos: bool,
-    /// Name of this process among those that share the store.
-    replica: String,
-    /// Scenes that this process works on, or is to.
-    mine: Mutex<HashSet<SceneId>>,
-    /// When scenes made elsewhere were last read.
-    fresh: Mutex<HashMap<SceneId, Instant>>,
-    listed: Mutex<Listed>,
-    /// Content hashes being made, and their end.
-    making: Mutex<HashSet<String>>,
-    made: Condvar,
+    /// Content hashes that workers make scenes of, and a signal when one ends.
+    contents: Mutex<HashSet<String>>,
+    content_made: Condvar,
     /// Milliseconds that the last scenes took, smoothed; 0: none was made yet.
     scene_ms: AtomicU64,
-    stopping: Mutex<bool>,
-    stopped: Condvar,
-}
-
-/// What the store listed last, and when.
-#[derive(Debug, Default)]
-struct Listed {
-    stamps: HashMap<SceneId, String>,
-    at: Option<Instant>,
-}
-
-/// An unfinished record as it stands before anybody makes it.
-fn requeued(record: &mut Record) {
-    record.status.state = SceneState::Queued;
-    record.status.stage = None;
-    record.status.fraction = 0.0;
+    shutdown: Shutdown,
 }
 
 impl fmt::Debug for Jobs {
@@ -172,146 +98,113 @@ impl fmt::Debug for Jobs {
 }
 
 impl Jobs {
-    /// Starts `workers` threads and queues again what was queued or running when the program
-    /// last stopped. `keep_photos`: whether the photos of finished scenes are kept.
+    /// Starts the threads, and queues again what was queued or running when the program last
+    /// stopped.
     ///
     /// # Errors
     /// `internal` when a thread cannot be started.
-    pub fn start(
-        store: Arc<Store>,
-        maker: Arc<dyn SceneMaker>,
-        semantics: Arc<dyn SemanticsMaker>,
-        mut records: Vec<Record>,
-        limits: &Limits,
-        (workers, keep_photos): (usize, bool),
-    ) -> Result<Self> {
+    pub fn start(parts: JobParts, mut records: Vec<Record>) -> Result<Self> {
         let shared = Arc::new(Shared {
-            store,
-            maker,
-            limits: limits.clone(),
-            board: Board::default(),
-            queue: Queue::new(limits.queued_jobs_max),
-            running: Mutex::default(),
-            semantics,
-            asked: Queue::new(limits.queued_jobs_max),
-            thinking: Mutex::default(),
-            workers: AtomicUsize::new(workers),
-            keep_photos,
-            replica: replica_name(),
-            mine: Mutex::default(),
-            fresh: Mutex::default(),
-            listed: Mutex::default(),
-            making: Mutex::default(),
-            made: Condvar::new(),
+            records: Records::default(),
+            queue: Queue::new(parts.limits.queued_jobs_max),
+            running: Running::default(),
+            uploads: ReadUploads::new(parts.limits.read_uploads_bytes_max),
+            replicas: replicas::of(&parts),
+            workers: AtomicUsize::new(parts.workers),
+            contents: Mutex::default(),
+            content_made: Condvar::new(),
             scene_ms: AtomicU64::new(0),
-            stopping: Mutex::default(),
-            stopped: Condvar::new(),
+            shutdown: Shutdown::default(),
+            parts,
         });
         records.sort_by_key(|record| record.status.created_ms);
-        for mut record in records {
-            let id = record.status.id.clone();
-            let unfinished = !record.status.state.is_final();
-            if unfinished {
-                tracing::info!(scene = %id, attempts = record.attempts, "queued again");
-                requeued(&mut record);
-            }
-            semantics::at_start(&mut record);
-            let eager = !unfinished
-                && record.options.semantics == SemanticsMode::Eager
-                && record.status.state == SceneState::Done
-                && record.status.semantics.state == SemanticsState::None
-                && shared.semantics.lacks().is_none();
-            if eager {
-                record.status.semantics.state = SemanticsState::Running;
-            }
-            let owner = record.owner.clone();
-            shared.board.insert(record);
-            if eager || unfinished {
-                shared.hold(&id);
-            }
-            if eager {
-                shared.asked.push(id, owner.as_deref());
-            } else if unfinished {
-                shared.queue.push(id, owner.as_deref());
-            }
+        for record in records {
+            shared.take_up(record);
         }
-        let start = |name: String, life: fn(&Shared)| {
+        let start = |name: String, life: Box<dyn FnOnce(&Shared) + Send>| {
             let shared = Arc::clone(&shared);
             std::thread::Builder::new()
                 .name(name)
                 .spawn(move || life(&shared))
                 .map_err(|e| Error::internal("no thread can be started").caused_by(e))
         };
-        let mut threads = (0..workers)
-            .map(|i| start(format!("scene-{i}"), Shared::work))
-            .collect::<Result<Vec<_>>>()?;
-        // One is enough: a scene's semantics use every core already.
-        threads.push(start("semantics".to_owned(), Shared::think)?);
-        threads.push(start("housekeeper".to_owned(), Shared::keep_house)?);
-        if shared.store.is_shared() {
-            threads.push(start("peers".to_owned(), Shared::live_with_peers)?);
+        let mut threads = Vec::new();
+        for i in 0..shared.parts.workers {
+            let life = Box::new(|shared: &Shared| shared.work(Kind::Scene));
+            threads.push(start(format!("scene-{i}"), life)?);
         }
-        Ok(Self { shared, workers: Mutex::new(threads) })
+        // One is enough: the semantics of a scene use every core already.
+        let life = Box::new(|shared: &Shared| shared.work(Kind::Semantics));
+        threads.push(start("semantics".to_owned(), life)?);
+        threads.push(start("sweeper".to_owned(), Box::new(Shared::sweep))?);
+        if shared.replicas.name().is_some() {
+            let life = Box::new(|shared: &Shared| shared.replicas.watch(shared));
+            threads.push(start("replicas".to_owned(), life)?);
+        }
+        Ok(Self { shared, threads: Mutex::new(threads) })
     }
 
-    /// Makes an upload safe on disk and queues it; gives its id, or that of the scene which an
-    /// earlier call with the same idempotency key made. Blocks on the store.
+    /// Reads an upload, makes it safe in the store and queues it. Gives its id, or that of the
+    /// scene which an earlier call with the same idempotency key made. Blocks.
     ///
     /// # Errors
+    /// `invalid_request`, `photo_unreadable`, `limit_exceeded` where the upload cannot be a scene;
     /// `invalid_request` when the key was used for another upload, `overloaded` when the queue is
     /// full or the server stops, `store_unavailable`.
-    pub fn submit(&self, upload: &Upload, mut record: Record) -> Result<SceneId> {
+    pub fn submit(&self, upload: Upload, mut record: Record, limits: &Limits) -> Result<SceneId> {
+        let shared = &self.shared;
+        let photos = pipeline::read(&upload, limits, &AtomicBool::new(false))?;
+        let files = store::hashes(&upload);
+        record.request_sha256 = store::request_sha256(&files, &record.options);
         // First, so that a full queue still answers for what it holds.
-        if let Some(earlier) = self.earlier(&record)? {
+        if let Some(earlier) = self.earlier(&files, &record)? {
             return Ok(earlier);
         }
-        let shared = &self.shared;
-        let place =
-            shared.queue.reserve(record.owner.as_deref()).map_err(|full| self.overloaded(full))?;
-        if shared.store.is_shared() {
-            record.replica = Some(shared.replica.clone());
-        }
+        let reserved = shared.queue.reserve(Kind::Scene, record.owner.as_deref());
+        let place = reserved.map_err(|full| self.overloaded(full))?;
+        record.replica = shared.replicas.name().map(str::to_owned);
         let id = record.status.id.clone();
-        shared.hold(&id);
+        shared.replicas.hold(&id);
         let kept = || -> Result<Option<SceneId>> {
-            if let Some(other) = self.use_key(&record)? {
+            if let Some(other) = self.use_key(&files, &record)? {
                 return Ok(Some(other));
             }
-            shared.store.put_upload(upload, &record).inspect_err(|_| {
+            shared.parts.store.put_upload(upload, &record).inspect_err(|_| {
                 if let Some(key) = &record.idempotency_key {
-                    // One that stays leads to no scene, and is looked through.
-                    let _ = shared.store.forget_key(record.owner.as_deref(), key);
+                    // A key that stays leads to no scene and counts as unused.
+                    let _ = shared.parts.store.forget_key(record.owner.as_deref(), key);
                 }
             })?;
             Ok(None)
         };
-        if let Some(other) = kept().inspect_err(|_| shared.done_with(&id))? {
-            shared.done_with(&id);
+        if let Some(other) = kept().inspect_err(|_| shared.release(&id))? {
+            shared.release(&id);
             return Ok(other);
         }
-        shared.board.insert(record);
+        shared.uploads.keep(&id, Arc::new(ReadUpload { files, photos }));
+        shared.records.insert(record);
         place.fill(id.clone());
         Ok(id)
     }
 
     /// The scene that an earlier call with this record's idempotency key made.
-    fn earlier(&self, record: &Record) -> Result<Option<SceneId>> {
+    fn earlier(&self, files: &[PhotoHash], record: &Record) -> Result<Option<SceneId>> {
         let Some(key) = &record.idempotency_key else { return Ok(None) };
         let owner = record.owner.as_deref();
-        let Some(used) = self.shared.store.key_use(owner, key)? else { return Ok(None) };
+        let Some(used) = self.shared.parts.store.key_use(owner, key)? else { return Ok(None) };
         self.refresh(&used.id)?;
-        if self.shared.board.find(&used.id).is_none() {
+        if self.shared.records.find(&used.id).is_none() {
             // Deleted, or never acknowledged.
-            self.shared.store.forget_key(owner, key)?;
+            self.shared.parts.store.forget_key(owner, key)?;
             return Ok(None);
         }
-        self.replayed(record, used).map(Some)
+        self.replayed(files, record, used).map(Some)
     }
 
     /// Notes the use of the record's key; gives the scene of a call that was faster.
-    fn use_key(&self, record: &Record) -> Result<Option<SceneId>> {
+    fn use_key(&self, files: &[PhotoHash], record: &Record) -> Result<Option<SceneId>> {
         let Some(key) = &record.idempotency_key else { return Ok(None) };
-        let store = &self.shared.store;
+        let store = &self.shared.parts.store;
         let id = record.status.id.clone();
         let new = KeyUse { id: id.clone(), request_sha256: record.request_sha256.clone() };
         // The scene is announced before the key leads to it.
@@ -320,7 +213,7 @@ impl Jobs {
             Ok(None) => Ok(None),
             Ok(Some(used)) => {
                 store.drop_pending(&id)?;
-                self.replayed(record, used).map(Some)
+                self.replayed(files, record, used).map(Some)
             }
             Err(error) => {
                 let _ = store.drop_pending(&id);
@@ -330,17 +223,17 @@ impl Jobs {
     }
 
     /// The scene of an earlier use of a key, if it was for the same request.
-    fn replayed(&self, record: &Record, used: KeyUse) -> Result<SceneId> {
-        let id = used.id;
-        if used.request_sha256 != record.request_sha256 {
+    fn replayed(&self, files: &[PhotoHash], record: &Record, used: KeyUse) -> Result<SceneId> {
+        let (shared, id) = (&self.shared, used.id);
+        if !store::is_of_request(&used.request_sha256, files, &record.options) {
             return Err(Error::invalid(format!(
                 "the idempotency key was used for another upload (scene {id})"
             )));
         }
-        let known = self.shared.board.find(&id);
+        let known = shared.records.find(&id);
         let over = known.is_some_and(|known| known.status.state.is_final());
-        if !over && self.shared.store.is_shared() && !self.shared.store.was_acknowledged(&id)? {
-            // Another replica is writing it, and may fail yet: nothing is acknowledged for it.
+        if !over && !shared.replicas.is_acknowledged(&shared.parts.store, &id)? {
+            // Another replica still writes it and may fail: nothing is acknowledged for it.
             let message = format!("the first call with this idempotency key (scene {id}) is open");
             return Err(Error::new(ErrorCode::Overloaded, message).retry_after_s(1));
         }
@@ -352,7 +245,8 @@ impl Jobs {
     /// # Errors
     /// `overloaded` when the queue is full or the server stops.
     pub fn has_room(&self, owner: Option<&str>) -> Result<()> {
-        self.shared.queue.reserve(owner).map(drop).map_err(|full| self.overloaded(full))
+        let reserved = self.shared.queue.reserve(Kind::Scene, owner);
+        reserved.map(drop).map_err(|full| self.overloaded(full))
     }
 
     fn overloaded(&self, full: Full) -> Error {
@@ -382,7 +276,7 @@ impl Jobs {
     /// # Errors
     /// `scene_not_found`.
     pub fn record(&self, id: &SceneId) -> Result<Record> {
-        self.shared.board.find(id).ok_or_else(|| not_found(id))
+        self.shared.records.find(id).ok_or_else(|| not_found(id))
     }
 
     /// A channel that holds the newest record; it closes when the scene is deleted.
@@ -390,7 +284,7 @@ impl Jobs {
     /// # Errors
     /// `scene_not_found`.
     pub fn watch(&self, id: &SceneId) -> Result<watch::Receiver<Record>> {
-        self.shared.board.watch(id).ok_or_else(|| not_found(id))
+        self.shared.records.watch(id).ok_or_else(|| not_found(id))
     }
 
     /// Up to `limit` records of those to `show`, newest first, after the scene of that creation
@@ -402,16 +296,39 @@ impl Jobs {
         limit: usize,
         show: impl Fn(&Record) -> bool,
     ) -> (Vec<Record>, bool) {
-        self.shared.board.page(after, limit, show)
+        self.shared.records.page(after, limit, show)
     }
 
-    /// Jobs that go before a waiting one, 0 for any other.
+    /// Jobs that go before a waiting scene, 0 for any other.
     #[must_use]
     pub fn ahead(&self, id: &SceneId) -> usize {
         self.shared.queue.ahead(id).unwrap_or(0)
     }
 
-    /// Stops the scene's job if it has one and removes all that is kept. Blocks on the disk.
+    /// Whether the store may know more of this scene than this process.
+    #[must_use]
+    pub fn may_be_stale(&self, id: &SceneId) -> bool {
+        self.shared.replicas.may_be_stale(id)
+    }
+
+    /// Reads what the store has of a scene that another replica makes. Blocks on the store.
+    ///
+    /// # Errors
+    /// `store_unavailable`.
+    pub fn refresh(&self, id: &SceneId) -> Result<()> {
+        let replicas = &self.shared.replicas;
+        if replicas.may_be_stale(id) { replicas.refresh(&self.shared, id) } else { Ok(()) }
+    }
+
+    /// Reads what the store has of all scenes. Blocks on the store.
+    ///
+    /// # Errors
+    /// `store_unavailable`.
+    pub fn refresh_all(&self) -> Result<()> {
+        self.shared.replicas.refresh_all(&self.shared)
+    }
+
+    /// Stops the scene's jobs and removes everything that is kept of it. Blocks on the store.
     ///
     /// # Errors
     /// `scene_not_found`, `store_unavailable`.
@@ -419,17 +336,15 @@ impl Jobs {
         let shared = &self.shared;
         let record = self.record(id)?;
         shared.queue.remove(id);
-        shared.asked.remove(id);
-        let mut at_work = false;
-        for working in [shared.lock_running(), shared.lock_thinking()] {
-            if let Some(stop) = working.get(id) {
-                stop.by_caller();
-                at_work = true;
-            }
-        }
-        if let Err(error) = shared.store.remove(&record) {
+        let at_work = shared.running.stop(Some(id), Reason::Cancelled);
+        // A job that was about to end may have removed its own objects first: gone is gone.
+        let removed = match shared.parts.store.remove(&record) {
+            Err(error) if error.code() == ErrorCode::SceneNotFound => Ok(()),
+            removed => removed,
+        };
+        if let Err(error) = removed {
             // It is there still, but nobody makes it any more.
-            shared.board.update(id, |record| {
+            shared.records.update(id, |record| {
                 if !record.status.state.is_final() {
                     record.status.state = SceneState::Cancelled;
                     record.status.stage = None;
@@ -441,35 +356,36 @@ impl Jobs {
             return Err(error);
         }
         if !at_work {
-            shared.done_with(id);
+            shared.release(id);
         }
-        if shared.board.remove(id) { Ok(()) } else { Err(not_found(id)) }
+        if shared.records.remove(id) { Ok(()) } else { Err(not_found(id)) }
     }
 
     /// Watchers of a scene, callers who wait for it among them.
     #[must_use]
     pub fn watchers(&self, id: &SceneId) -> usize {
-        self.shared.board.watchers(id)
+        self.shared.records.watchers(id)
     }
 
     /// Marks a finished scene as failed: its file turned out to be bad.
     pub fn spoil(&self, id: &SceneId, error: &Error) {
-        self.shared.fail(id, error);
+        self.shared.fail(Kind::Scene, id, error);
     }
 
-    /// Jobs that wait and jobs at work.
+    /// Scenes that wait for a worker, and scenes that a worker is at.
     #[must_use]
     pub fn counts(&self) -> (usize, usize) {
-        (self.shared.queue.len(), self.shared.lock_running().len())
+        let shared = &self.shared;
+        (shared.queue.len(Kind::Scene), shared.running.scenes(Kind::Scene).len())
     }
 
     /// Where the networks stand.
     #[must_use]
     pub fn networks(&self) -> Networks {
-        self.shared.maker.networks()
+        self.shared.parts.maker.networks()
     }
 
-    /// Whether the queue takes jobs and every worker lives.
+    /// Whether the queue takes jobs and a worker lives.
     #[must_use]
     pub fn is_open(&self) -> bool {
         !self.shared.queue.is_closed() && self.shared.workers.load(Ordering::Relaxed) > 0
@@ -479,43 +395,51 @@ impl Jobs {
     /// the next start.
     pub fn shut_down(&self) {
         self.shared.queue.close();
-        self.shared.asked.close();
-        self.shared.end_rest();
-        for at_work in [self.shared.lock_running(), self.shared.lock_thinking()] {
-            for stop in at_work.values() {
-                stop.by_shutdown();
-            }
-        }
-        let mut workers = self.workers.lock().unwrap_or_else(PoisonError::into_inner);
-        for worker in workers.drain(..) {
-            if worker.join().is_err() {
+        self.shared.shutdown.begin();
+        self.shared.running.stop(None, Reason::Shutdown);
+        let mut threads = self.threads.lock().unwrap_or_else(PoisonError::into_inner);
+        for thread in threads.drain(..) {
+            if thread.join().is_err() {
                 tracing::error!("a worker had panicked");
             }
         }
     }
 }
 
-impl Shared {
-    /// From now on this process works on the scene, and its board is the truth about it.
-    fn hold(&self, id: &SceneId) {
-        self.mine.lock().unwrap_or_else(PoisonError::into_inner).insert(id.clone());
-    }
-
-    /// This process writes nothing of the scene any more.
-    fn done_with(&self, id: &SceneId) {
-        self.mine.lock().unwrap_or_else(PoisonError::into_inner).remove(id);
-    }
-}
-
-/// Tells this process from every other that uses the store.
-fn replica_name() -> String {
-    use std::hash::BuildHasher;
-    let random = || std::hash::RandomState::new().hash_one(std::process::id());
-    format!("{:016x}{:016x}", random(), random())
-}
-
 impl Drop for Jobs {
     fn drop(&mut self) {
         self.shut_down();
+    }
+}
+
+impl Shared {
+    /// Takes up a scene that an earlier run of the program left.
+    fn take_up(&self, mut record: Record) {
+        let (id, owner) = (record.status.id.clone(), record.owner.clone());
+        let unfinished = !record.status.state.is_final();
+        if unfinished {
+            tracing::info!(scene = %id, attempts = record.attempts, "queued again");
+            scene::requeue(&mut record);
+        }
+        semantics::reset(&mut record);
+        let eager = record.options.semantics == SemanticsMode::Eager
+            && record.status.state == SceneState::Done
+            && record.status.semantics.state == SemanticsState::None
+            && self.parts.semantics.lacks().is_none();
+        if eager {
+            record.status.semantics.state = SemanticsState::Running;
+        }
+        self.records.insert(record);
+        if eager || unfinished {
+            let kind = if eager { Kind::Semantics } else { Kind::Scene };
+            self.replicas.hold(&id);
+            self.queue.push(kind, id, owner.as_deref());
+        }
+    }
+
+    /// This process writes nothing of the scene any more.
+    fn release(&self, id: &SceneId) {
+        self.uploads.forget(id);
+        self.replicas.release(id);
     }
 }

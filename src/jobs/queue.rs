@@ -1,21 +1,34 @@
-//! A bounded queue of scene ids, fair between owners. A place is reserved first: nothing
-//! acknowledged is refused.
+//! A bounded queue of jobs, fair between owners. A place is reserved first: nothing acknowledged
+//! is refused.
 //!
-//! Each owner has a lane; lanes take turns, one job a turn. An owner may fill half the places, so
-//! that others always find one.
+//! Each kind of job and each owner has a lane; lanes of a kind take turns, one job a turn. An owner
+//! may fill half the places of a kind, so that others always find one.
 
 use std::{
     collections::{HashMap, VecDeque},
     sync::{Condvar, Mutex, MutexGuard, PoisonError},
 };
 
+use super::job::Kind;
 use crate::scene::SceneId;
 
-type Owner = Option<String>;
+/// Whose jobs a lane holds.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+struct Lane {
+    kind: Kind,
+    owner: Option<String>,
+}
+
+impl Lane {
+    fn of(kind: Kind, owner: Option<&str>) -> Self {
+        Self { kind, owner: owner.map(str::to_owned) }
+    }
+}
 
 /// Waiting jobs: of one owner first in, first out; between owners in turns.
 #[derive(Debug)]
 pub(super) struct Queue {
+    /// Jobs of one kind that may wait.
     waiting_max: usize,
     inner: Mutex<Inner>,
     changed: Condvar,
@@ -23,10 +36,10 @@ pub(super) struct Queue {
 
 #[derive(Debug, Default)]
 struct Inner {
-    /// Lanes that have jobs, the one whose turn it is in front.
-    lanes: VecDeque<(Owner, VecDeque<SceneId>)>,
+    /// Lanes that have jobs; of each kind the one whose turn it is in front.
+    lanes: VecDeque<(Lane, VecDeque<SceneId>)>,
     /// Places promised to uploads that are being written.
-    reserved: HashMap<Owner, usize>,
+    reserved: HashMap<Lane, usize>,
     closed: bool,
 }
 
@@ -45,18 +58,18 @@ pub(super) enum Full {
 #[derive(Debug)]
 pub(super) struct Place<'a> {
     queue: &'a Queue,
-    owner: Owner,
+    lane: Lane,
 }
 
 impl Drop for Place<'_> {
     fn drop(&mut self) {
         let mut inner = self.queue.lock();
-        let left = inner.reserved.get_mut(&self.owner).map(|count| {
+        let left = inner.reserved.get_mut(&self.lane).map(|count| {
             *count -= 1;
             *count
         });
         if left == Some(0) {
-            inner.reserved.remove(&self.owner);
+            inner.reserved.remove(&self.lane);
         }
     }
 }
@@ -64,18 +77,26 @@ impl Drop for Place<'_> {
 impl Place<'_> {
     /// Puts a job into the place.
     pub(super) fn fill(self, id: SceneId) {
-        self.queue.push(id, self.owner.as_deref());
+        self.queue.push(self.lane.kind, id, self.lane.owner.as_deref());
     }
 }
 
 impl Inner {
-    fn waiting(&self) -> usize {
-        self.lanes.iter().map(|(_, lane)| lane.len()).sum()
+    /// Jobs that wait and places that are promised, of the lanes that `is` names.
+    fn taken(&self, is: impl Fn(&Lane) -> bool) -> usize {
+        let waiting = self.lanes.iter().filter(|(lane, _)| is(lane)).map(|(_, jobs)| jobs.len());
+        let reserved = self.reserved.iter().filter(|(lane, _)| is(lane)).map(|(_, count)| count);
+        waiting.sum::<usize>() + reserved.sum::<usize>()
     }
 
-    fn of(&self, owner: &Owner) -> usize {
-        let lane = self.lanes.iter().find(|(of, _)| of == owner).map_or(0, |(_, lane)| lane.len());
-        lane + self.reserved.get(owner).copied().unwrap_or(0)
+    fn next(&mut self, kind: Kind) -> Option<SceneId> {
+        let turn = self.lanes.iter().position(|(lane, _)| lane.kind == kind)?;
+        let (lane, mut jobs) = self.lanes.remove(turn)?;
+        let id = jobs.pop_front();
+        if !jobs.is_empty() {
+            self.lanes.push_back((lane, jobs));
+        }
+        id
     }
 }
 
@@ -85,84 +106,79 @@ impl Queue {
     }
 
     /// A place for a job of `owner`.
-    pub(super) fn reserve(&self, owner: Option<&str>) -> Result<Place<'_>, Full> {
-        let owner = owner.map(str::to_owned);
+    pub(super) fn reserve(&self, kind: Kind, owner: Option<&str>) -> Result<Place<'_>, Full> {
+        let lane = Lane::of(kind, owner);
         let mut inner = self.lock();
         let share = self.waiting_max.div_ceil(2);
         if inner.closed {
             return Err(Full::Closed);
         }
-        if inner.waiting() + inner.reserved.values().sum::<usize>() >= self.waiting_max {
+        if inner.taken(|other| other.kind == kind) >= self.waiting_max {
             return Err(Full::All(self.waiting_max));
         }
         // Who has no owner has nobody to share with.
-        if owner.is_some() && inner.of(&owner) >= share {
+        if owner.is_some() && inner.taken(|other| *other == lane) >= share {
             return Err(Full::Share(share));
         }
-        *inner.reserved.entry(owner.clone()).or_default() += 1;
-        Ok(Place { queue: self, owner })
+        *inner.reserved.entry(lane.clone()).or_default() += 1;
+        Ok(Place { queue: self, lane })
     }
 
     /// Adds a job beyond any bound: one that was acknowledged before a restart.
-    pub(super) fn push(&self, id: SceneId, owner: Option<&str>) {
-        let mut inner = self.lock();
-        match inner.lanes.iter_mut().find(|(of, _)| of.as_deref() == owner) {
-            Some((_, lane)) => lane.push_back(id),
-            None => inner.lanes.push_back((owner.map(str::to_owned), VecDeque::from([id]))),
+    pub(super) fn push(&self, kind: Kind, id: SceneId, owner: Option<&str>) {
+        let (mut inner, lane) = (self.lock(), Lane::of(kind, owner));
+        match inner.lanes.iter_mut().find(|(other, _)| *other == lane) {
+            Some((_, jobs)) => jobs.push_back(id),
+            None => inner.lanes.push_back((lane, VecDeque::from([id]))),
         }
-        self.changed.notify_one();
+        // Workers of the other kind may wait too.
+        self.changed.notify_all();
     }
 
-    /// The next job; waits for one. `None` once the queue is closed.
-    pub(super) fn pop(&self) -> Option<SceneId> {
+    /// The next job of a kind; waits for one. `None` once the queue is closed.
+    pub(super) fn pop(&self, kind: Kind) -> Option<SceneId> {
         let mut inner = self.lock();
         loop {
             if inner.closed {
                 return None;
             }
-            if let Some((owner, mut lane)) = inner.lanes.pop_front() {
-                let id = lane.pop_front();
-                if !lane.is_empty() {
-                    inner.lanes.push_back((owner, lane));
-                }
-                if id.is_some() {
-                    return id;
-                }
-                continue;
+            if let Some(id) = inner.next(kind) {
+                return Some(id);
             }
             inner = self.changed.wait(inner).unwrap_or_else(PoisonError::into_inner);
         }
     }
 
-    /// Takes a waiting job out; whether it was there.
+    /// Takes the waiting jobs of a scene out; whether there were any.
     pub(super) fn remove(&self, id: &SceneId) -> bool {
         let mut inner = self.lock();
-        let found = inner.lanes.iter_mut().any(|(_, lane)| {
-            let place = lane.iter().position(|waiting| waiting == id);
-            place.is_some_and(|place| lane.remove(place).is_some())
-        });
-        inner.lanes.retain(|(_, lane)| !lane.is_empty());
-        found
+        let waiting = |inner: &Inner| inner.lanes.iter().map(|(_, jobs)| jobs.len()).sum::<usize>();
+        let before = waiting(&inner);
+        inner.lanes.iter_mut().for_each(|(_, jobs)| jobs.retain(|other| other != id));
+        inner.lanes.retain(|(_, jobs)| !jobs.is_empty());
+        waiting(&inner) < before
     }
 
-    /// Jobs that go before `id` as things stand; `None` when it does not wait.
+    /// Jobs that go before the scene `id` as things stand; `None` when it does not wait.
     pub(super) fn ahead(&self, id: &SceneId) -> Option<usize> {
         let inner = self.lock();
-        let place = |lane: &VecDeque<SceneId>| lane.iter().position(|waiting| waiting == id);
-        let (turn, place) = inner
-            .lanes
-            .iter()
-            .enumerate()
-            .find_map(|(turn, (_, lane))| Some((turn, place(lane)?)))?;
-        let before = inner.lanes.iter().enumerate().map(|(other, (_, lane))| {
-            // A lane whose turn comes earlier gives one job more.
-            lane.len().min(place + usize::from(other < turn))
-        });
-        Some(before.sum())
+        let lanes = inner.lanes.iter().filter(|(lane, _)| lane.kind == Kind::Scene);
+        let lanes: Vec<&VecDeque<SceneId>> = lanes.map(|(_, jobs)| jobs).collect();
+        let place = |jobs: &VecDeque<SceneId>| jobs.iter().position(|waiting| waiting == id);
+        let (turn, place) =
+            lanes.iter().enumerate().find_map(|(turn, jobs)| Some((turn, place(jobs)?)))?;
+        // A lane whose turn comes earlier gives one job more.
+        let before = |(other, jobs): (usize, &&VecDeque<SceneId>)| {
+            jobs.len().min(place + usize::from(other < turn))
+        };
+        Some(lanes.iter().enumerate().map(before).sum())
     }
 
-    pub(super) fn len(&self) -> usize {
-        self.lock().waiting()
+    /// Jobs of a kind that wait.
+    pub(super) fn len(&self, kind: Kind) -> usize {
+        let inner = self.lock();
+        let lanes = inner.lanes.iter().filter(|(lane, _)| lane.kind == kind);
+        lanes.map(|(_, jobs)| jobs.len()).sum()
     }
 
     /// Lets no worker take another job.
@@ -191,46 +207,50 @@ mod tests {
     #[test]
     fn a_reserved_place_counts_and_comes_back() {
         let queue = Queue::new(2);
-        let first = queue.reserve(None).unwrap();
-        let second = queue.reserve(None).unwrap();
-        assert_eq!(queue.reserve(None).unwrap_err(), Full::All(2), "both places are promised");
+        let first = queue.reserve(Kind::Scene, None).unwrap();
+        let second = queue.reserve(Kind::Scene, None).unwrap();
+        assert_eq!(
+            queue.reserve(Kind::Scene, None).unwrap_err(),
+            Full::All(2),
+            "both places are promised"
+        );
         drop(second);
-        queue.reserve(None).unwrap().fill(id(2));
+        queue.reserve(Kind::Scene, None).unwrap().fill(id(2));
         first.fill(id(1));
-        assert!(queue.reserve(None).is_err(), "both places are filled");
+        assert!(queue.reserve(Kind::Scene, None).is_err(), "both places are filled");
         assert_eq!((queue.ahead(&id(2)), queue.ahead(&id(1))), (Some(0), Some(1)));
-        assert_eq!(queue.pop(), Some(id(2)));
-        assert!(queue.reserve(None).is_ok());
+        assert_eq!(queue.pop(Kind::Scene), Some(id(2)));
+        assert!(queue.reserve(Kind::Scene, None).is_ok());
     }
 
     #[test]
     fn a_removed_job_is_not_given_out() {
         let queue = Queue::new(8);
-        (1..=3).for_each(|byte| queue.push(id(byte), None));
+        (1..=3).for_each(|byte| queue.push(Kind::Scene, id(byte), None));
         assert!(queue.remove(&id(2)));
         assert!(!queue.remove(&id(2)), "it is gone");
-        assert_eq!((queue.pop(), queue.pop()), (Some(id(1)), Some(id(3))));
+        assert_eq!((queue.pop(Kind::Scene), queue.pop(Kind::Scene)), (Some(id(1)), Some(id(3))));
     }
 
     #[test]
     fn closing_wakes_a_waiting_worker_and_refuses_new_jobs() {
         let queue = Queue::new(8);
         std::thread::scope(|scope| {
-            let worker = scope.spawn(|| queue.pop());
+            let worker = scope.spawn(|| queue.pop(Kind::Scene));
             queue.close();
             assert_eq!(worker.join().unwrap(), None);
         });
-        assert_eq!(queue.reserve(None).unwrap_err(), Full::Closed);
+        assert_eq!(queue.reserve(Kind::Scene, None).unwrap_err(), Full::Closed);
     }
 
     #[test]
     fn owners_take_turns_and_the_places_ahead_are_those_that_go_before() {
         let queue = Queue::new(20);
         for (byte, owner) in [(1, "a"), (2, "a"), (3, "a"), (4, "b"), (5, "c"), (6, "b")] {
-            queue.push(id(byte), Some(owner));
+            queue.push(Kind::Scene, id(byte), Some(owner));
         }
         let ahead: Vec<_> = (1..=6).map(|byte| queue.ahead(&id(byte)).unwrap()).collect();
-        let order: Vec<_> = (0..6).map(|_| queue.pop().unwrap()).collect();
+        let order: Vec<_> = (0..6).map(|_| queue.pop(Kind::Scene).unwrap()).collect();
         assert_eq!(order, [1, 4, 5, 2, 6, 3].map(id), "one each in turn, then the rest");
         let went: Vec<_> = (1..=6)
             .map(|byte| order.iter().position(|other| *other == id(byte)).unwrap())
@@ -239,13 +259,24 @@ mod tests {
     }
 
     #[test]
+    fn each_kind_has_its_own_places_and_turns() {
+        let queue = Queue::new(1);
+        let scene = queue.reserve(Kind::Scene, None).unwrap();
+        queue.reserve(Kind::Semantics, None).unwrap().fill(id(2));
+        scene.fill(id(1));
+        assert_eq!((queue.len(Kind::Scene), queue.ahead(&id(2))), (1, None));
+        assert_eq!(queue.pop(Kind::Semantics), Some(id(2)));
+        assert_eq!(queue.pop(Kind::Scene), Some(id(1)));
+    }
+
+    #[test]
     fn one_owner_leaves_places_for_others() {
         let queue = Queue::new(4);
-        let _being_written = queue.reserve(Some("a")).unwrap();
-        queue.reserve(Some("a")).unwrap().fill(id(1));
-        assert_eq!(queue.reserve(Some("a")).unwrap_err(), Full::Share(2));
-        queue.reserve(Some("b")).unwrap().fill(id(2));
-        queue.reserve(None).unwrap().fill(id(3));
-        assert_eq!(queue.reserve(Some("c")).unwrap_err(), Full::All(4));
+        let _being_written = queue.reserve(Kind::Scene, Some("a")).unwrap();
+        queue.reserve(Kind::Scene, Some("a")).unwrap().fill(id(1));
+        assert_eq!(queue.reserve(Kind::Scene, Some("a")).unwrap_err(), Full::Share(2));
+        queue.reserve(Kind::Scene, Some("b")).unwrap().fill(id(2));
+        queue.reserve(Kind::Scene, None).unwrap().fill(id(3));
+        assert_eq!(queue.reserve(Kind::Scene, Some("c")).unwrap_err(), Full::All(4));
     }
 }

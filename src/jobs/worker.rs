@@ -1,150 +1,93 @@
-//! One worker: takes a job, runs it with a time limit, keeps what it gives; outlives its panics.
+//! The one loop of all workers: takes a job, runs it with a time limit, and outlives its panics.
 
 use std::{
+    any::Any,
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{
-        Arc, MutexGuard, PoisonError,
-        atomic::{AtomicBool, AtomicU8, Ordering},
+        Arc, Condvar, Mutex, PoisonError,
+        atomic::Ordering,
         mpsc::{self, RecvTimeoutError},
     },
-    time::{Duration, Instant},
+    time::Duration,
 };
 
-use sha2::{Digest, Sha256};
-
-use super::{Made, Networks, Shared, Work};
+use super::{
+    Networks, Shared,
+    job::{Job, Kind, Reason},
+    photos::ReadUpload,
+    scene::requeue,
+};
 use crate::{
-    error::{Error, ErrorCode, Result},
-    limits::Limits,
-    scene::{
-        PhotoHash, Provenance, Scene, SceneError, SceneId, SceneMeta, SceneOptions, SceneState,
-        SemanticsMode, SemanticsReport, SemanticsState, SemanticsStatus,
-    },
+    error::{Error, Result},
+    pipeline,
+    scene::{SceneError, SceneId, SceneState, SemanticsState, SemanticsStatus, Stage, Watch},
     store::{self, Record},
     telemetry::{self, meter},
 };
 
-/// Starts of one job before it is given up: a scene that kills the server must not do so forever.
-const ATTEMPTS_MAX: u32 = 3;
-
 /// Between two looks at whether the networks are open.
 const NETWORKS_LOOK: Duration = Duration::from_millis(5);
 
-/// Asks a job to stop, and remembers why: the first reason counts.
+/// Whether the program stops, for threads that pause.
 #[derive(Debug, Default)]
-pub(super) struct Stop {
-    flag: AtomicBool,
-    reason: AtomicU8,
+pub(super) struct Shutdown {
+    begun: Mutex<bool>,
+    signal: Condvar,
 }
 
-const BY_CALLER: u8 = 1;
-const BY_TIMEOUT: u8 = 2;
-const BY_SHUTDOWN: u8 = 3;
-
-impl Stop {
-    fn ask(&self, reason: u8) {
-        // Whoever asked first is the reason.
-        let _ = self.reason.compare_exchange(0, reason, Ordering::AcqRel, Ordering::Acquire);
-        self.flag.store(true, Ordering::Release);
+impl Shutdown {
+    pub(super) fn begin(&self) {
+        *self.begun.lock().unwrap_or_else(PoisonError::into_inner) = true;
+        self.signal.notify_all();
     }
 
-    pub(super) fn by_caller(&self) {
-        self.ask(BY_CALLER);
+    /// Pauses for `time`, less when the program stops; whether it does.
+    pub(super) fn pause(&self, time: Duration) -> bool {
+        let begun = self.begun.lock().unwrap_or_else(PoisonError::into_inner);
+        let waited = self.signal.wait_timeout_while(begun, time, |begun| !*begun);
+        *waited.unwrap_or_else(PoisonError::into_inner).0
     }
-
-    pub(super) fn is_by_caller(&self) -> bool {
-        self.reason() == BY_CALLER
-    }
-
-    pub(super) fn by_shutdown(&self) {
-        self.ask(BY_SHUTDOWN);
-    }
-
-    pub(super) fn flag(&self) -> &AtomicBool {
-        &self.flag
-    }
-
-    /// The error of work that was stopped, `None` where nobody asked it to; `what` begins it.
-    pub(super) fn told(&self, limits: &Limits, what: &str) -> Option<Error> {
-        match self.reason() {
-            BY_CALLER => Some(Error::new(ErrorCode::Cancelled, format!("{what}: cancelled"))),
-            BY_TIMEOUT => {
-                let seconds = Duration::from_millis(limits.scene_timeout_ms).as_secs_f64();
-                let message = format!("{what} took longer than {seconds} s");
-                Some(Error::new(ErrorCode::DeadlineExceeded, message))
-            }
-            BY_SHUTDOWN => {
-                let message = format!("{what}: the server is stopping");
-                Some(Error::new(ErrorCode::Overloaded, message).retry_after_s(10))
-            }
-            _ => None,
-        }
-    }
-
-    /// How the work ended, for metrics.
-    pub(super) fn outcome(&self, done: bool) -> &'static str {
-        match (done, self.reason()) {
-            (true, _) => "done",
-            (false, BY_CALLER) => "cancelled",
-            (false, BY_SHUTDOWN) => "requeued",
-            (false, _) => "failed",
-        }
-    }
-
-    fn reason(&self) -> u8 {
-        self.reason.load(Ordering::Acquire)
-    }
-}
-
-/// A scene that is kept, and what its record is to say.
-struct Finished {
-    meta: SceneMeta,
-    digest: String,
-    semantics: Option<(String, SemanticsReport)>,
-}
-
-/// Leave to make some content; ends when dropped.
-struct Turn<'a> {
-    shared: &'a Shared,
-    content: String,
-}
-
-impl Drop for Turn<'_> {
-    fn drop(&mut self) {
-        let mut making = self.shared.making.lock().unwrap_or_else(PoisonError::into_inner);
-        making.remove(&self.content);
-        drop(making);
-        self.shared.made.notify_all();
-    }
-}
-
-/// Everything that decides what a scene is, as one hash, hex: photos and cameras in their order,
-/// options, the maker's identity (the bundle's hash) and the program's version.
-#[must_use]
-pub fn content_sha256(files: &[PhotoHash], options: &SceneOptions, maker: &str) -> String {
-    let mut hash = Sha256::new();
-    // Lengths keep names and hashes apart.
-    for file in files {
-        hash.update((file.file.len() as u64).to_le_bytes());
-        hash.update(&file.file);
-        hash.update(&file.sha256);
-    }
-    hash.update(format!("{options:?} {maker} {}", env!("CARGO_PKG_VERSION")));
-    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 impl Shared {
-    pub(super) fn lock_running(
-        &self,
-    ) -> MutexGuard<'_, std::collections::HashMap<SceneId, Arc<Stop>>> {
-        self.running.lock().unwrap_or_else(PoisonError::into_inner)
+    /// The life of a worker thread.
+    pub(super) fn work(&self, kind: Kind) {
+        let open = self.networks_open();
+        while open && let Some(id) = self.queue.pop(kind) {
+            let job = self.running.begin(kind, id);
+            if self.queue.is_closed() {
+                job.stop(Reason::Shutdown);
+            }
+            let _span = self.span(&job).entered();
+            // Whatever panics, its half-made values die with it.
+            let run = AssertUnwindSafe(|| match kind {
+                Kind::Scene => self.make_scene(&job),
+                Kind::Semantics => self.make_semantics(&job),
+            });
+            let outcome = catch_unwind(run).unwrap_or_else(|panic| Err(panicked(&*panic)));
+            meter::job(kind.name(), job.outcome(outcome.is_ok()));
+            if let Err(error) = outcome {
+                self.settle(&job, &error);
+            }
+            self.running.end(&job);
+            let record = self.records.find(&job.scene);
+            let follows = record.is_some_and(|record| {
+                kind == Kind::Scene && record.status.semantics.state == SemanticsState::Running
+            });
+            if !follows {
+                self.release(&job.scene);
+            }
+        }
+        if kind == Kind::Scene {
+            self.workers.fetch_sub(1, Ordering::Relaxed);
+        }
     }
 
-    /// Waits until the networks are open; whether they are. Not for long, so it looks again and
-    /// again: a server that is stopped meanwhile waits for nothing.
-    pub(super) fn networks_open(&self) -> bool {
+    /// Waits until the networks are open; whether they are. It looks again and again, so that a
+    /// server that is stopped meanwhile need not wait.
+    fn networks_open(&self) -> bool {
         loop {
-            match self.maker.networks() {
+            match self.parts.maker.networks() {
                 Networks::Open(_) => return true,
                 Networks::Broken => return false,
                 Networks::Opening if self.queue.is_closed() => return false,
@@ -153,35 +96,14 @@ impl Shared {
         }
     }
 
-    /// The life of a worker thread.
-    pub(super) fn work(&self) {
-        let open = self.networks_open();
-        while open && let Some(id) = self.queue.pop() {
-            let stop = Arc::new(Stop::default());
-            self.lock_running().insert(id.clone(), Arc::clone(&stop));
-            if self.queue.is_closed() {
-                stop.by_shutdown();
-            }
-            let _span = self.span(&id).entered();
-            // Whatever `make` panics with, its half-made values die with it.
-            let outcome = catch_unwind(AssertUnwindSafe(|| self.run(&id, &stop)))
-                .unwrap_or_else(|panic| Err(panicked(&*panic)));
-            meter::job("scene", stop.outcome(outcome.is_ok()));
-            if let Err(error) = outcome {
-                self.settle(&id, &stop, &error);
-            }
-            self.lock_running().remove(&id);
-            let semantics = self.board.find(&id).map(|record| record.status.semantics.state);
-            if semantics != Some(SemanticsState::Running) {
-                self.done_with(&id);
-            }
-        }
-        self.workers.fetch_sub(1, Ordering::Relaxed);
-    }
-
-    /// A span of the job, in the trace of the call that asked for the scene.
-    fn span(&self, id: &SceneId) -> tracing::Span {
-        let Some(record) = self.board.find(id) else { return tracing::Span::none() };
+    /// A span of the job, a scene's in the trace of the call that asked for it.
+    fn span(&self, job: &Job) -> tracing::Span {
+        let id = &job.scene;
+        let record = match job.kind {
+            Kind::Scene => self.records.find(id),
+            Kind::Semantics => return tracing::info_span!("semantics", scene = %id),
+        };
+        let Some(record) = record else { return tracing::Span::none() };
         let request_id = record.request_id.as_deref();
         let span = tracing::info_span!("scene", scene = %id, request_id);
         if let Some(parent) = &record.traceparent {
@@ -190,250 +112,124 @@ impl Shared {
         span
     }
 
-    fn run(&self, id: &SceneId, stop: &Stop) -> Result<()> {
-        let begun = Instant::now();
-        let Some(record) = self.board.update(id, |record| {
-            record.attempts += 1;
-            record.status.state = SceneState::Running;
-            record.status.updated_ms = store::now_ms();
-        }) else {
-            return Ok(());
-        };
-        let waited_ms = record.status.updated_ms.saturating_sub(record.status.created_ms);
-        meter::stage("wait", Duration::from_millis(waited_ms).as_secs_f64());
-        if record.attempts > ATTEMPTS_MAX {
-            return Err(Error::internal(format!(
-                "given up: the server stopped {ATTEMPTS_MAX} times while making this scene"
-            )));
-        }
-        self.store.put_record(&record)?;
-        if record.attempts > 1
-            && let Some(made) = self.made_before(id)?
-        {
-            return self.finish(&record, made);
-        }
-        let upload = self.store.upload(id)?;
-        let files = store::hashes(&upload);
-        let content = content_sha256(&files, &record.options, &self.maker.identity());
-        let _turn = self.turn(&content, stop);
-        if let Some(known) = self.made_of(&content, &record)? {
-            tracing::info!(scene = %id, of = %known.meta.id, "made before of the same content");
-            return self.copy(&record, &known);
-        }
-        let progress = |stage: &str, fraction: f32| {
-            self.board.update(id, |record| {
-                record.status.stage = Some(stage.to_owned());
-                record.status.fraction = fraction.clamp(0.0, 1.0);
-            });
-        };
-        let made = self.within_time(stop, || {
-            self.maker.make(Work {
-                upload: &upload,
-                options: &record.options,
-                progress: &progress,
-                cancel: &stop.flag,
-            })
-        })?;
-        drop(upload);
-        progress("store", 0.99);
-        let took = u64::try_from(begun.elapsed().as_millis()).unwrap_or(u64::MAX);
-        let before = self.scene_ms.load(Ordering::Relaxed);
-        let smoothed = if before == 0 { took } else { (3 * before + took) / 4 };
-        self.scene_ms.store(smoothed.max(1), Ordering::Relaxed);
-        self.keep(&record, files, content, made)
-    }
-
-    /// Runs `make`, and asks it to stop when the time of a scene is over.
+    /// Runs `work`, which shows its progress in the record and is stopped when its time is over.
     pub(super) fn within_time<T>(
         &self,
-        stop: &Stop,
-        make: impl FnOnce() -> Result<T>,
+        job: &Job,
+        work: impl FnOnce(Watch<'_>) -> Result<T>,
     ) -> Result<T> {
-        let limit = Duration::from_millis(self.limits.scene_timeout_ms);
+        let limit = Duration::from_millis(self.parts.limits.scene_timeout_ms);
+        let progress = |stage: Stage, fraction: f32| self.show(job, stage, fraction);
+        let watch = Watch { progress: &progress, cancel: &job.cancel };
         let (finished, watchdog) = mpsc::channel::<()>();
         std::thread::scope(|scope| {
             scope.spawn(move || {
                 if watchdog.recv_timeout(limit) == Err(RecvTimeoutError::Timeout) {
-                    stop.ask(BY_TIMEOUT);
+                    job.stop(Reason::Timeout);
                 }
             });
-            let made = catch_unwind(AssertUnwindSafe(make));
+            let done = catch_unwind(AssertUnwindSafe(|| work(watch)));
             drop(finished);
-            made.unwrap_or_else(|panic| Err(panicked(&*panic)))
+            done.unwrap_or_else(|panic| Err(panicked(&*panic)))
         })
     }
 
-    fn keep(
-        &self,
-        record: &Record,
-        files: Vec<PhotoHash>,
-        content_sha256: String,
-        made: Made,
-    ) -> Result<()> {
-        let meta = SceneMeta {
-            id: record.status.id.clone(),
-            created_ms: record.status.created_ms,
-            cameras: made.cameras,
-            report: made.report,
-            provenance: Provenance {
-                files,
-                bundle_sha256: made.bundle_sha256,
-                options: record.options.clone(),
-                content_sha256,
-                program_version: env!("CARGO_PKG_VERSION").to_owned(),
-            },
-        };
-        let scene = Scene::new(meta.clone(), made.gaussians, made.backdrop);
-        let digest = self.store.put_scene(scene)?;
-        self.finish(record, Finished { meta, digest, semantics: None })
+    pub(super) fn show(&self, job: &Job, stage: Stage, fraction: f32) {
+        self.records.update(&job.scene, |record| job.kind.show(record, stage, fraction));
     }
 
-    /// Keeps under this record what was made of the same content before.
-    fn copy(&self, record: &Record, known: &Scene) -> Result<()> {
-        let id = &record.status.id;
-        let meta = SceneMeta {
-            id: id.clone(),
-            created_ms: record.status.created_ms,
-            ..known.meta.clone()
-        };
-        let semantics = known.semantics.clone();
-        let mut scene = known.clone();
-        scene.meta = meta.clone();
-        let digest = self.store.put_scene(scene)?;
-        let semantics = match semantics {
-            Some(semantics) => {
-                let report = semantics.report.clone();
-                Some((self.store.put_semantics(id, (*semantics).clone())?.1, report))
+    /// The photos of a job: as the create call read them, else read from the store.
+    pub(super) fn photos(&self, id: &SceneId, watch: Watch<'_>) -> Result<Arc<ReadUpload>> {
+        if let Some(kept) = self.uploads.find(id) {
+            return Ok(kept);
+        }
+        let upload = self.parts.store.upload(id)?;
+        let photos = pipeline::read(&upload, &self.parts.limits, watch.cancel)?;
+        Ok(Arc::new(ReadUpload { files: store::hashes(&upload), photos }))
+    }
+
+    /// What becomes of a job that failed or was stopped.
+    fn settle(&self, job: &Job, error: &Error) {
+        let id = &job.scene;
+        match (job.stopped(), job.kind) {
+            // Watchers are told that the scene is deleted.
+            (Some(Reason::Cancelled), _) => {
+                tracing::info!(scene = %id, "{} cancelled", job.kind.what());
             }
-            None => None,
-        };
-        self.finish(record, Finished { meta, digest, semantics })
-    }
-
-    /// What an earlier attempt had made and kept, before it was cut off.
-    fn made_before(&self, id: &SceneId) -> Result<Option<Finished>> {
-        match self.store.scene(id) {
-            Ok(scene) => {
-                let digest = self.store.scene_digest(id)?;
-                Ok(digest.map(|digest| Finished {
-                    meta: scene.meta.clone(),
-                    digest,
-                    semantics: None,
-                }))
-            }
-            Err(e) if matches!(e.code(), ErrorCode::SceneNotFound | ErrorCode::SceneCorrupt) => {
-                Ok(None)
-            }
-            Err(error) => Err(error),
-        }
-    }
-
-    /// The finished scene of this content and owner, where there is one and it is sound.
-    fn made_of(&self, content: &str, record: &Record) -> Result<Option<Arc<Scene>>> {
-        let owner = record.owner.as_deref();
-        let Some(id) = self.store.scene_of_content(owner, content)? else { return Ok(None) };
-        if id == record.status.id {
-            return Ok(None);
-        }
-        // Whatever is wrong with it, this one can be made.
-        let scene = self.store.scene(&id).ok();
-        Ok(scene.filter(|scene| scene.meta.provenance.content_sha256 == content))
-    }
-
-    /// Waits until no other worker here makes the same content.
-    fn turn(&self, content: &str, stop: &Stop) -> Turn<'_> {
-        let mut making = self.making.lock().unwrap_or_else(PoisonError::into_inner);
-        while making.contains(content) && !stop.flag.load(Ordering::Acquire) {
-            let waited = self.made.wait_timeout(making, Duration::from_millis(50));
-            making = waited.unwrap_or_else(PoisonError::into_inner).0;
-        }
-        making.insert(content.to_owned());
-        Turn { shared: self, content: content.to_owned() }
-    }
-
-    /// The scene is kept: its record is, then its watchers are told.
-    fn finish(&self, record: &Record, finished: Finished) -> Result<()> {
-        let id = &record.status.id;
-        let Finished { meta, digest, semantics } = finished;
-        // On disk first, so that a watcher who sees `done` may pull the plug.
-        let Some(mut done) = self.board.find(id) else { return Ok(()) };
-        done.scene_sha256 = Some(digest);
-        let content = meta.provenance.content_sha256;
-        done.content_sha256 = Some(content.clone()).filter(|hash| !hash.is_empty());
-        done.replica = None;
-        done.status.state = SceneState::Done;
-        done.status.stage = None;
-        done.status.fraction = 1.0;
-        done.status.updated_ms = store::now_ms();
-        done.status.report = Some(meta.report);
-        done.status.cameras = meta.cameras;
-        if let Some((digest, report)) = semantics {
-            done.semantics_sha256 = Some(digest);
-            done.status.semantics = SemanticsStatus::ready(report);
-        }
-        self.store.put_record(&done)?;
-        if !content.is_empty() {
-            self.store.put_content(done.owner.as_deref(), &content, id)?;
-        }
-        // In one change, so that no watcher takes `done` for the end.
-        let ready = done.status.semantics.state == SemanticsState::Ready;
-        let eager = done.options.semantics == SemanticsMode::Eager && !ready;
-        if eager {
-            done.status.semantics = SemanticsStatus::new(SemanticsState::Running);
-        }
-        let owner = done.owner.clone();
-        self.board.update(id, |record| *record = done);
-        tracing::info!(scene = %id, "done");
-        if eager {
-            self.asked.push(id.clone(), owner.as_deref());
-        } else if !self.keep_photos {
-            self.store.drop_upload(id)?;
-        }
-        Ok(())
-    }
-
-    /// What becomes of a job that gave no scene.
-    fn settle(&self, id: &SceneId, stop: &Stop, error: &Error) {
-        match stop.reason() {
-            BY_SHUTDOWN => {
-                let queued = self.board.update(id, |record| {
+            (Some(Reason::Shutdown), Kind::Scene) => {
+                let queued = self.records.update(id, |record| {
                     record.attempts = record.attempts.saturating_sub(1);
-                    record.status.state = SceneState::Queued;
-                    record.status.stage = None;
-                    record.status.fraction = 0.0;
+                    requeue(record);
                 });
-                if let Some(Err(error)) = queued.map(|record| self.store.put_record(&record)) {
-                    tracing::error!(scene = %id, %error, "its status is not kept");
+                if let Some(record) = queued {
+                    self.keep_failed(&record);
                 }
             }
-            BY_CALLER => tracing::info!(scene = %id, "cancelled"),
-            _ => self.fail(id, stop.told(&self.limits, "the scene").as_ref().unwrap_or(error)),
+            _ => {
+                let stopped = job.stop_error(&self.parts.limits);
+                self.fail(job.kind, id, stopped.as_ref().unwrap_or(error));
+            }
         }
     }
 
-    pub(super) fn fail(&self, id: &SceneId, error: &Error) {
+    /// Makes a failure known to watchers; that of a scene also to the store.
+    pub(super) fn fail(&self, kind: Kind, id: &SceneId, error: &Error) {
         if matches!(error.code().row().http, 500..) {
             let cause = std::error::Error::source(error).map(ToString::to_string);
-            tracing::error!(scene = %id, code = error.code().name(), %error, cause, "failed");
+            let code = error.code().name();
+            tracing::error!(scene = %id, code, %error, cause, "{} failed", kind.what());
         } else {
-            tracing::info!(scene = %id, code = error.code().name(), %error, "failed");
+            let code = error.code().name();
+            tracing::info!(scene = %id, code, %error, "{} failed", kind.what());
         }
-        let failed = self.board.find(id).map(|mut record| {
-            record.status.state = SceneState::Failed;
-            record.status.stage = None;
-            record.status.updated_ms = store::now_ms();
-            record.status.error = Some(SceneError::from(error));
-            record
-        });
-        let Some(failed) = failed else { return };
-        if let Err(error) = self.store.put_record(&failed) {
-            tracing::error!(scene = %id, %error, "its status is not kept");
+        let now = store::now_ms();
+        let change = |record: &mut Record| match kind {
+            Kind::Scene => {
+                record.status.state = SceneState::Failed;
+                record.status.stage = None;
+                record.status.updated_ms = now;
+                record.status.error = Some(SceneError::from(error));
+            }
+            Kind::Semantics => {
+                record.status.semantics = SemanticsStatus {
+                    error: Some(SceneError::from(error)),
+                    ..SemanticsStatus::new(SemanticsState::Failed)
+                };
+            }
+        };
+        if let (Kind::Scene, Some(mut failed)) = (kind, self.records.find(id)) {
+            change(&mut failed);
+            self.keep_failed(&failed);
         }
-        self.board.update(id, |record| *record = failed);
+        self.records.update(id, change);
+    }
+
+    fn keep_failed(&self, record: &Record) {
+        if let Err(error) = self.parts.store.put_record(record) {
+            tracing::error!(scene = %record.status.id, %error, "its status is not kept");
+        }
+    }
+
+    /// The life of the thread that removes what crashes and deletions left in the store.
+    pub(super) fn sweep(&self) {
+        let limits = &self.parts.limits;
+        // By then no job of a deleted scene can still be at work, on any replica.
+        let buried = Duration::from_millis(limits.scene_timeout_ms.saturating_mul(2))
+            + Duration::from_millis(limits.replica_lease_ms);
+        loop {
+            match self.parts.store.sweep(buried) {
+                Ok(0) => {}
+                Ok(removed) => tracing::info!(removed, "left-overs removed from the store"),
+                Err(error) => tracing::warn!(%error, "the store cannot be swept"),
+            }
+            if self.shutdown.pause(Duration::from_millis(limits.sweep_every_ms.max(1_000))) {
+                return;
+            }
+        }
     }
 }
 
-pub(super) fn panicked(panic: &(dyn std::any::Any + Send)) -> Error {
+fn panicked(panic: &(dyn Any + Send)) -> Error {
     let text = panic
         .downcast_ref::<&str>()
         .copied()

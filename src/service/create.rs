@@ -121,7 +121,7 @@ impl Service {
         let turn = turn.map_err(|e| Error::internal("no upload is read now").caused_by(e))?;
         blocking(move || {
             let _turn = turn;
-            inner.submit_here(&upload, record, &caller)
+            inner.submit_here(upload, record, &caller)
         })
         .await?
     }
@@ -130,11 +130,10 @@ impl Service {
 impl Inner {
     fn submit_here(
         &self,
-        upload: &Upload,
+        upload: Upload,
         record: impl FnOnce(Record) -> Record,
         caller: &Caller,
     ) -> Result<(SceneId, bool)> {
-        self.maker.check(upload, &self.limits())?;
         let id = new_id();
         let status = SceneStatus::new(id.clone(), SceneState::Queued, store::now_ms());
         let mut record = record(Record {
@@ -142,14 +141,14 @@ impl Inner {
             traceparent: telemetry::traceparent(),
             ..Record::new(status)
         });
-        record.request_sha256 = request_sha256(upload, &record.options);
         if record.options.semantics == SemanticsMode::Off {
             record.status.semantics.state = SemanticsState::Off;
         }
-        let made = self.jobs.submit(upload, record)?;
+        let photos = upload.photos.len();
+        let made = self.jobs.submit(upload, record, &self.limits())?;
         let replayed = made != id;
         if !replayed {
-            tracing::info!(scene = %id, photos = upload.photos.len(), "queued");
+            tracing::info!(scene = %id, photos, "queued");
         }
         Ok((made, replayed))
     }
@@ -169,18 +168,6 @@ pub(super) async fn blocking<T: Send + 'static>(
     tokio::task::spawn_blocking(move || span.in_scope(work))
         .await
         .map_err(|e| Error::internal("the work was broken off").caused_by(e))
-}
-
-fn request_sha256(upload: &Upload, options: &SceneOptions) -> String {
-    let mut hash = Sha256::new();
-    for file in store::hashes(upload) {
-        // Lengths first, so that no two lists of files read the same.
-        hash.update((file.file.len() as u64).to_le_bytes());
-        hash.update(file.file);
-        hash.update(file.sha256);
-    }
-    hash.update(format!("{options:?}"));
-    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 fn check_request(

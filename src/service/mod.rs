@@ -51,11 +51,11 @@ pub use crate::scene::{
 use crate::{
     config::Config,
     error::{Error, Result},
-    jobs::{Jobs, Networks, SceneMaker, SemanticsMaker},
+    jobs::{JobParts, Jobs, Networks, SceneMaker, SemanticsMaker},
     keys::Caller,
     limits::Limits,
     render::Renderer,
-    scene::SceneId,
+    scene::{SceneId, Stage},
     store::{Place, Record, Store},
 };
 
@@ -96,7 +96,6 @@ struct Inner {
     limits: RwLock<Arc<Limits>>,
     store: Arc<Store>,
     jobs: Jobs,
-    maker: Arc<dyn SceneMaker>,
     backend: Backend,
     models: ModelsInfo,
     scheduler: Arc<Scheduler>,
@@ -136,14 +135,15 @@ impl Service {
     pub fn open_at(place: &Place, config: Config, parts: Parts) -> Result<Self> {
         let (store, records) = Store::open_at(place, &config.limits)?;
         let store = Arc::new(store);
-        let jobs = Jobs::start(
-            Arc::clone(&store),
-            Arc::clone(&parts.maker),
-            Arc::clone(&parts.semantics),
-            records,
-            &config.limits,
-            (config.jobs, config.keep_photos),
-        )?;
+        let job_parts = JobParts {
+            store: Arc::clone(&store),
+            maker: parts.maker,
+            semantics: Arc::clone(&parts.semantics),
+            limits: config.limits.clone(),
+            workers: config.jobs,
+            keep_photos: config.keep_photos,
+        };
+        let jobs = Jobs::start(job_parts, records)?;
         let models = ModelsInfo {
             renderer: parts.renderer.name(),
             server_version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -152,7 +152,6 @@ impl Service {
         let inner = Inner {
             store,
             jobs,
-            maker: parts.maker,
             scheduler: Scheduler::new(parts.renderer.concurrency(), &config.limits),
             backend: Backend::new(parts.renderer, parts.semantics, &config.limits),
             models,
@@ -259,12 +258,15 @@ impl Service {
         let semantics = &status.semantics;
         match status.state {
             SceneState::Done if semantics.state == SemanticsState::Running => Event::Running {
-                stage: semantics.stage.clone().unwrap_or_else(|| "masks".to_owned()),
+                stage: semantics
+                    .stage
+                    .clone()
+                    .unwrap_or_else(|| Stage::SEMANTICS[0].name().to_owned()),
                 fraction: semantics.fraction,
             },
             SceneState::Queued => Event::Queued { ahead: self.inner.jobs.ahead(&status.id) },
             SceneState::Running => Event::Running {
-                stage: status.stage.clone().unwrap_or_else(|| "photos".to_owned()),
+                stage: status.stage.clone().unwrap_or_else(|| Stage::SCENE[0].name().to_owned()),
                 fraction: status.fraction,
             },
             SceneState::Done => Event::Done,

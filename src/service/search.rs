@@ -13,10 +13,10 @@ use super::types::TextWarning;
 use crate::{
     cache::Cache,
     error::{Error, Result},
-    jobs::{EmbeddedText, Phrases, SemanticsMaker},
+    jobs::{Phrases, SemanticsMaker},
     limits::Limits,
     render::{Labels, PixelWeights, RenderRequest, Renderer, ViewPlanner},
-    scene::{Gaussians, PAPER_PHRASES, PAPER_TAU, Scene, ScoringProfile, Semantics},
+    scene::{Gaussians, PAPER_PHRASES, PAPER_TAU, Scene, ScoringProfile, Semantics, TextEmbedding},
     semantics::{PartOptions, Pieces, Scorer, Scoring, TextScores, ViewNorms},
 };
 
@@ -42,7 +42,7 @@ impl Backend {
 pub(super) struct TextSearch {
     maker: Arc<dyn SemanticsMaker>,
     /// By text; each weighs 1.
-    embeddings: Cache<String, Arc<EmbeddedText>>,
+    embeddings: Cache<String, Arc<TextEmbedding>>,
     /// By scene, semantics and profile; by bytes.
     scorers: Cache<String, Arc<Scorer>>,
     /// By scene and semantics; by bytes.
@@ -68,7 +68,7 @@ impl TextSearch {
     }
 
     /// Embeddings of texts: known ones from memory, all others from one run of the network.
-    fn embedded(&self, texts: &[String]) -> Result<Vec<Arc<EmbeddedText>>> {
+    fn embedded(&self, texts: &[String]) -> Result<Vec<Arc<TextEmbedding>>> {
         let known: Vec<_> = texts.iter().map(|text| self.embeddings.find(text)).collect();
         let unknown = texts.iter().zip(&known).filter(|(_, known)| known.is_none());
         let mut unknown: Vec<String> = unknown.map(|(text, _)| text.clone()).collect();
@@ -77,7 +77,7 @@ impl TextSearch {
         let made =
             if unknown.is_empty() { Vec::new() } else { self.maker.embed_texts(&unknown)? };
         let made = unknown.into_iter().zip(made.into_iter().map(Arc::new));
-        let made: HashMap<String, Arc<EmbeddedText>> = made.collect();
+        let made: HashMap<String, Arc<TextEmbedding>> = made.collect();
         for (text, embedding) in &made {
             self.embeddings.insert(text.clone(), Arc::clone(embedding), 1);
         }
@@ -211,7 +211,7 @@ impl<'a> SceneTexts<'a> {
         texts: &[String],
     ) -> Result<Self> {
         let scorer = backend.search.scorer(of.tag, of.semantics, profile)?;
-        let scored = |(text, embedding): (&String, Arc<EmbeddedText>)| {
+        let scored = |(text, embedding): (&String, Arc<TextEmbedding>)| {
             Ok(ScoredText {
                 text: text.clone(),
                 scores: scorer.text(&embedding.row)?,
@@ -281,7 +281,7 @@ impl<'a> SceneTexts<'a> {
     }
 }
 
-fn warnings(text: &str, embedding: &EmbeddedText) -> Vec<TextWarning> {
+fn warnings(text: &str, embedding: &TextEmbedding) -> Vec<TextWarning> {
     let warning = |code: &str, message: String| TextWarning { code: code.to_owned(), message };
     let mut warnings = Vec::new();
     let (tokens, unknown) = (embedding.tokens, embedding.unknown);

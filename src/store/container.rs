@@ -35,6 +35,19 @@ pub(super) fn write(
     meta_json: &str,
     arrays: &[Array<'_>],
 ) -> io::Result<String> {
+    let (head, digest) = frame(label, meta_json, arrays)?;
+    for part in [&head[..]].into_iter().chain(arrays.iter().map(|a| a.bytes)).chain([&digest[..]]) {
+        to.write_all(part)?;
+    }
+    Ok(super::files::hex(&digest))
+}
+
+/// What goes before the arrays of a container, and the digest that goes after them.
+pub(super) fn frame(
+    label: &Label,
+    meta_json: &str,
+    arrays: &[Array<'_>],
+) -> io::Result<(Vec<u8>, [u8; DIGEST_BYTES])> {
     let mut header = serde_json::Map::new();
     header.insert(
         "__metadata__".to_owned(),
@@ -60,15 +73,13 @@ pub(super) fn write(
     let mut header = serde_json::to_vec(&header)?;
     header.resize(header.len().next_multiple_of(8), b' ');
 
+    let head = [&(header.len() as u64).to_le_bytes()[..], &header].concat();
     let mut hash = Sha256::new();
-    let length = (header.len() as u64).to_le_bytes();
-    for part in [&length[..], &header].into_iter().chain(arrays.iter().map(|a| a.bytes)) {
-        hash.update(part);
-        to.write_all(part)?;
-    }
-    let digest = hash.finalize();
-    to.write_all(&digest)?;
-    Ok(super::files::hex(&digest))
+    [&head[..]]
+        .into_iter()
+        .chain(arrays.iter().map(|a| a.bytes))
+        .for_each(|part| hash.update(part));
+    Ok((head, hash.finalize().into()))
 }
 
 /// A container whose digest, kind and version are right.

@@ -17,6 +17,7 @@
 
 mod container;
 mod files;
+mod hashes;
 mod index;
 mod objects;
 mod open;
@@ -38,8 +39,10 @@ use std::{
 use fs_err as fs;
 use object_store::path::Path as Name;
 
+pub(crate) use self::hashes::is_of_request;
 use self::objects::{Objects, unavailable};
 pub use self::{
+    hashes::{provenance, request_sha256},
     index::KeyUse,
     open::Place,
     record::Record,
@@ -114,11 +117,10 @@ impl Store {
     ///
     /// # Errors
     /// `store_unavailable`.
-    pub fn put_upload(&self, upload: &Upload, record: &Record) -> Result<()> {
+    pub fn put_upload(&self, upload: Upload, record: &Record) -> Result<()> {
         let id = &record.status.id;
         let keep = || -> Result<()> {
-            let mut file = Vec::with_capacity(upload.size_bytes() + (64 << 10));
-            upload_file::write(&mut file, upload, record)
+            let file = upload_file::pack(upload, record)
                 .map_err(|e| Error::internal("the upload cannot be packed").caused_by(e))?;
             // The record first: an upload without one is rubbish, however the call ends.
             self.announce(record)?;
@@ -171,13 +173,13 @@ impl Store {
         self.objects.put(path, sealed).map_err(|e| unavailable("keep the scene's status", e))
     }
 
-    /// Keeps a finished scene, also in memory; gives the sha256 of its file, hex.
+    /// Keeps a finished scene, also in memory; gives it and the sha256 of its file, hex.
     ///
     /// Where another replica was faster, its file stays and is the scene.
     ///
     /// # Errors
     /// `store_unavailable`; `scene_not_found` when the scene was deleted.
-    pub fn put_scene(&self, scene: Scene) -> Result<String> {
+    pub fn put_scene(&self, scene: Scene) -> Result<(Arc<Scene>, String)> {
         let id = scene.meta.id.clone();
         let mut file = Vec::with_capacity(scene.gaussians.size_bytes() as usize + (64 << 10));
         let mut digest = write_scene(&mut file, &scene)
@@ -195,8 +197,8 @@ impl Store {
             }
         }
         self.unless_deleted(&id)?;
-        self.keep(scene);
-        Ok(digest)
+        self.keep(Arc::clone(&scene));
+        Ok((scene, digest))
     }
 
     /// Keeps what a scene means; gives the scene that carries it and the file's sha256, hex.
@@ -347,15 +349,12 @@ impl Store {
         let was_there = unmake().inspect_err(|_| {
             self.lock_gone().remove(id);
         })?;
-        if !was_there {
-            return Err(not_found(id));
-        }
         self.cache.remove(id);
         // The next sweep takes what cannot be removed now: the scene is gone all the same.
         if let Err(error) = self.purge(id).and_then(|()| self.unlink(record)) {
             tracing::warn!(scene = %id, %error, "left-overs of a deleted scene stay for a sweep");
         }
-        Ok(())
+        if was_there { Ok(()) } else { Err(not_found(id)) }
     }
 
     /// Takes back what was just written where the scene has been deleted meanwhile.

@@ -92,24 +92,24 @@ impl Objects {
     }
 
     /// Keeps an object, whatever was there.
-    pub(super) fn put(&self, path: Path, bytes: Vec<u8>) -> Result<(), Fault> {
-        self.put_as(path, bytes, PutMode::Overwrite)
+    pub(super) fn put(&self, path: Path, bytes: impl Into<PutPayload>) -> Result<(), Fault> {
+        self.put_as(path, bytes.into(), PutMode::Overwrite)
     }
 
     /// Keeps an object unless there is one; whether it was kept.
     pub(super) fn create(&self, path: Path, bytes: Vec<u8>) -> Result<bool, Fault> {
-        match self.put_as(path, bytes, PutMode::Create) {
+        match self.put_as(path, bytes.into(), PutMode::Create) {
             Ok(()) => Ok(true),
             Err(Fault::AlreadyExists { .. } | Fault::Precondition { .. }) => Ok(false),
             Err(fault) => Err(fault),
         }
     }
 
-    fn put_as(&self, path: Path, bytes: Vec<u8>, mode: PutMode) -> Result<(), Fault> {
+    fn put_as(&self, path: Path, bytes: PutPayload, mode: PutMode) -> Result<(), Fault> {
         let store = Arc::clone(&self.store);
         self.run(async move {
             let options = PutOptions { mode, ..PutOptions::default() };
-            store.put_opts(&path, PutPayload::from(bytes), options).await.map(drop)
+            store.put_opts(&path, bytes, options).await.map(drop)
         })
     }
 

@@ -1,7 +1,8 @@
 //! An upload as one container: what was acknowledged can be made after any restart.
 
-use std::io::{self, Write};
+use std::io;
 
+use object_store::PutPayload;
 use safetensors::Dtype;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -55,8 +56,9 @@ pub fn hashes(upload: &Upload) -> Vec<PhotoHash> {
         .collect()
 }
 
-pub(super) fn write(to: &mut dyn Write, upload: &Upload, record: &super::Record) -> io::Result<()> {
-    let parts = parts(upload);
+/// The file of an upload: its bytes go in as they are, none is copied.
+pub(super) fn pack(upload: Upload, record: &super::Record) -> io::Result<PutPayload> {
+    let parts = parts(&upload);
     let header = serde_json::to_string(&Header {
         record: record.clone(),
         parts: parts.iter().map(|(part, name, _)| (*part, (*name).to_owned())).collect(),
@@ -71,7 +73,15 @@ pub(super) fn write(to: &mut dyn Write, upload: &Upload, record: &super::Record)
             bytes,
         })
         .collect();
-    container::write(to, &LABEL, &header, &arrays).map(|_digest| ())
+    let (head, digest) = container::frame(&LABEL, &header, &arrays)?;
+    let cameras = upload.cameras.map(|cameras| match cameras {
+        UploadCameras::Transforms(json) | UploadCameras::Cameras(json) => json,
+    });
+    let photos = upload.photos.into_iter().map(|photo| photo.bytes);
+    let bytes = cameras.into_iter().chain(upload.archive).chain(photos);
+    let pieces = std::iter::once(head).chain(bytes).chain([digest.to_vec()]);
+    // A payload takes each piece over as it is.
+    Ok(pieces.flat_map(PutPayload::from).collect())
 }
 
 /// The upload and the record it was acknowledged with.

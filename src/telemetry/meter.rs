@@ -10,7 +10,7 @@ use prometheus::{
     register_gauge_vec, register_histogram_vec, register_int_counter, register_int_counter_vec,
 };
 
-pub use segsplat_core::meter::{STAGE_SECONDS, STAGES, stage};
+pub use segsplat_core::meter::{STAGE_SECONDS, stage, stages};
 
 use crate::error::{Error, Result, TABLE};
 

@@ -218,6 +218,37 @@ async fn a_full_store_refuses_uploads_serves_what_it_has_and_recovers_by_deletin
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_deletion_counts_where_the_job_removed_its_own_record_first() {
+    let folder = tempfile::tempdir().unwrap();
+    let local = LocalFileSystem::new_with_prefix(folder.path()).unwrap();
+    let local: Arc<dyn ObjectStore> = Arc::new(local.with_automatic_cleanup(true));
+    let faults = Arc::new(FaultStore::new(local, Duration::ZERO));
+    let place = Place::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
+    let maker = Arc::new(WallMaker::default());
+    maker.hold.store(true, Ordering::Release);
+    let given = Arc::clone(&maker);
+    let server = TestServer::at(&place, |_, parts| parts.maker = given).await;
+    let held = CreateScene { wait: None, ..request(1) };
+    let id = server.service.create_scene(held).await.unwrap().status.id;
+    // A job that ends now sees that its scene is deleted, and removes what it wrote. It does so
+    // between the two objects that the deletion removes.
+    let pending = folder.path().join("pending").join(id.as_str());
+    assert!(pending.exists(), "the scene is being made");
+    faults.plan(move |what, _| {
+        if what == "delete" {
+            let _ = std::fs::remove_file(&pending);
+        }
+        None
+    });
+    server.service.delete(&id).await.expect("it is deleted");
+    let after = server.service.get(&id).await.map(|status| status.state);
+    assert_eq!(after.map_err(|error| error.code()), Err(ErrorCode::SceneNotFound));
+    assert_eq!(listed(&server.service).await, HashSet::new(), "no ghost is listed");
+    let again = server.service.delete(&id).await.unwrap_err();
+    assert_eq!(again.code(), ErrorCode::SceneNotFound);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_flipped_bit_is_reported_or_repaired_and_harms_no_neighbour() {
     let mut server = TestServer::with(|_, _| {}).await;
     let scenes = if long() { 60 } else { 8 };

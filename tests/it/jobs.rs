@@ -8,7 +8,7 @@ use std::{
 use futures_util::StreamExt;
 use segsplat::{
     error::ErrorCode,
-    scene::{Event, SceneState, ScoringProfile},
+    scene::{Event, SceneState, ScoringProfile, Stage},
     service::{
         Background, CameraSpec, CreateScene, ExportFormat, Kind, LensSpec, PageRequest,
         PictureOptions, PoseSpec, TextOptions, ViewOptions, ViewsSpec,
@@ -50,7 +50,7 @@ async fn a_scene_goes_through_its_states_and_a_late_watcher_sees_where_it_is() {
     }
     let mut late = std::pin::pin!(server.service.watch(&id).await.unwrap());
     let Some(Event::Running { stage, fraction }) = late.next().await else { panic!("not running") };
-    assert_eq!((stage.as_str(), fraction), ("geometry", 0.5));
+    assert_eq!((stage.as_str(), fraction), ("geometry", Stage::Geometry.overall(0.5)));
     maker.hold.store(false, Ordering::Release);
     let rest: Vec<Event> = late.collect().await;
     assert_eq!(rest.last(), Some(&Event::Done));

@@ -13,9 +13,9 @@ use std::{
 
 use segsplat::{
     error::Result,
-    jobs::{Made, Networks, SceneMaker, Work},
-    limits::Limits,
-    scene::Upload,
+    jobs::{Networks, SceneMaker},
+    pipeline::{PhotoSet, Reconstruction},
+    scene::{SceneOptions, Watch},
 };
 use serde_json::Value;
 
@@ -123,13 +123,14 @@ impl SceneMaker for Late {
         all[usize::from(self.networks.load(Ordering::Acquire))]
     }
 
-    fn check(&self, upload: &Upload, limits: &Limits) -> Result<()> {
-        self.walls.check(upload, limits)
-    }
-
-    fn make(&self, work: Work<'_>) -> Result<Made> {
+    fn make(
+        &self,
+        photos: &PhotoSet,
+        options: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<Reconstruction> {
         assert_eq!(self.networks.load(Ordering::Acquire), 1, "too early");
-        self.walls.make(work)
+        self.walls.make(photos, options, watch)
     }
 }
 

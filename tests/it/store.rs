@@ -154,7 +154,7 @@ fn a_bad_scene_is_put_aside_and_the_start_goes_on() {
     let folder = tempfile::tempdir().unwrap();
     let (store, _) = open(folder.path());
     for id in [1, 2] {
-        store.put_upload(&upload(), &record(id)).unwrap();
+        store.put_upload(upload(), &record(id)).unwrap();
         store.put_scene(scene(id, 30, 0)).unwrap();
     }
     drop(store);
@@ -188,7 +188,7 @@ fn a_bad_status_is_rebuilt_from_the_scene_or_from_the_upload() {
     let folder = tempfile::tempdir().unwrap();
     let (store, _) = open(folder.path());
     for byte in [1, 2, 3, 4] {
-        store.put_upload(&upload(), &record(byte)).unwrap();
+        store.put_upload(upload(), &record(byte)).unwrap();
     }
     store.put_scene(scene(1, 5, 0)).unwrap();
     for byte in [1, 3] {
@@ -225,7 +225,7 @@ fn what_a_crash_leaves_is_nothing_or_all() {
     let folder = tempfile::tempdir().unwrap();
     let (store, _) = open(folder.path());
     for byte in [1, 2, 3] {
-        store.put_upload(&upload(), &record(byte)).unwrap();
+        store.put_upload(upload(), &record(byte)).unwrap();
     }
     store.put_scene(scene(1, 20, 0)).unwrap();
     store.put_record(&done(1)).unwrap();
@@ -263,7 +263,7 @@ fn what_a_crash_leaves_is_nothing_or_all() {
 fn uploads_come_back_as_sent_and_names_are_no_paths() {
     let folder = tempfile::tempdir().unwrap();
     let (store, _) = open(folder.path());
-    store.put_upload(&upload(), &record(1)).unwrap();
+    store.put_upload(upload(), &record(1)).unwrap();
     drop(store);
     let (store, records) = open(folder.path());
     assert_eq!(records, [record(1)]);

@@ -14,16 +14,13 @@ use segsplat::{
     error::{ErrorCode, Result},
     pipeline::{
         Engine, reconstruct,
-        semantics::{
-            SceneParts, SemanticsOptions, SemanticsStage, SemanticsTools, Watch, understand,
-            understand_with,
-        },
+        semantics::{SceneParts, SemanticsOptions, SemanticsTools, understand, understand_with},
     },
     sample::{self, SampleOptions},
     scene::{
         Camera, CameraToWorld, Crop, Gaussians, IndexMap, Intrinsics, MaskInfo, Photo, PhotoMasks,
         PosedPhoto, RawGaussians, SceneCamera, SceneOptions, ScoringProfile, Semantics,
-        SourcePixel,
+        SourcePixel, Stage, Watch,
     },
     semantics::Scorer,
 };
@@ -132,7 +129,7 @@ fn each_gaussian_takes_the_bank_row_of_its_pixel() {
         Ok((0..2).map(two_masks).collect())
     };
     let watch = Watch {
-        progress: &|stage: SemanticsStage, fraction| {
+        progress: &|stage: Stage, fraction| {
             told.lock().unwrap().push((stage.name(), fraction));
         },
         cancel: &NO_CANCEL,

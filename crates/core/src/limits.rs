@@ -72,6 +72,9 @@ pub struct Limits {
     pub pieces_cache_bytes_max: u64,
     /// Parts of one text's selection that an answer lists, the largest first.
     pub parts_max: usize,
+    /// Bytes of photos that the create call read, kept in memory for the jobs of their scenes. A
+    /// job whose photos do not fit reads them again.
+    pub read_uploads_bytes_max: u64,
     /// Jobs that wait; one more is refused as `overloaded`.
     pub queued_jobs_max: usize,
     /// Renders at work or waiting; one more is refused as `overloaded`.
@@ -171,6 +174,7 @@ impl Limits {
             texts_cached_max,
             scorers_cache_bytes_max,
             entries_cache_bytes_max,
+            read_uploads_bytes_max,
             queued_jobs_max,
             queued_renders_max,
             active_pixels_max,
@@ -211,6 +215,7 @@ impl Default for Limits {
             magnified_cache_bytes_max: MAGNIFIED_CACHE_BYTES_MAX,
             pieces_cache_bytes_max: 128 << 20,
             parts_max: 64,
+            read_uploads_bytes_max: 512 << 20,
             queued_jobs_max: 64,
             queued_renders_max: 256,
             queued_pixels_max: 256 << 20,

@@ -4,14 +4,19 @@ use std::sync::LazyLock;
 
 use prometheus::{HistogramVec, register_histogram_vec};
 
+use crate::scene::Stage;
+
 /// Name of the metric: time of each stage, by `stage`.
 pub const STAGE_SECONDS: &str = "segsplat_stage_seconds";
 
+/// Stages of a view, and the wait of a job for its worker.
+const OTHERS: [&str; 5] = ["wait", "queue", "load", "render", "encode"];
+
 /// Stages of a scene, of its semantics, and of a view.
-pub const STAGES: [&str; 14] = [
-    "wait", "photos", "capture", "geometry", "lift", "store", "masks", "embed", "bank", "assign",
-    "queue", "load", "render", "encode",
-];
+pub fn stages() -> impl Iterator<Item = &'static str> {
+    let jobs = Stage::SCENE.into_iter().chain(Stage::SEMANTICS).map(Stage::name);
+    jobs.chain(OTHERS)
+}
 
 /// Upper ends of the buckets of every histogram, seconds: 1 ms to 10 minutes.
 pub const BUCKETS: [f64; 16] = [
@@ -23,7 +28,7 @@ static SECONDS: LazyLock<HistogramVec> = LazyLock::new(|| {
     let help = "Time of each stage of scenes and views";
     let seconds = register_histogram_vec!(STAGE_SECONDS, help, &["stage"], BUCKETS.to_vec())
         .expect("the name is registered once; this is a bug");
-    for stage in STAGES {
+    for stage in stages() {
         seconds.with_label_values(&[stage]);
     }
     seconds
@@ -34,9 +39,9 @@ pub fn register() {
     LazyLock::force(&SECONDS);
 }
 
-/// Records the seconds of a stage; a name that is not in [`STAGES`] is not recorded.
+/// Records the seconds of a stage; a name that is not in [`stages`] is not recorded.
 pub fn stage(name: &str, seconds: f64) {
-    if STAGES.contains(&name) {
+    if stages().any(|stage| stage == name) {
         SECONDS.with_label_values(&[name]).observe(seconds);
     }
 }

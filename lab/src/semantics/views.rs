@@ -13,12 +13,12 @@ use crate::{
     models::ImageText,
     pipeline::{
         Engine, Reconstruction, masks, reconstruct,
-        semantics::{SceneParts, SemanticsOptions, Watch, understand},
+        semantics::{SceneParts, SemanticsOptions, understand},
     },
     render::{Kinds, Labels, PixelWeights, RenderRequest, ViewPlanner, cpu::CpuRenderer},
     scene::{
         Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, ScoringProfile, SemanticsReport,
-        StageTime,
+        StageTime, Watch,
     },
 };
 

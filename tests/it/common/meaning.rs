@@ -10,8 +10,10 @@ use std::{
 
 use segsplat::{
     error::{Error, ErrorCode, Result},
-    jobs::{EmbeddedText, Phrases, SemanticsMaker, SemanticsWork},
-    scene::{Bank, IndexMap, Semantics, SemanticsReport},
+    jobs::{Phrases, SemanticsMaker},
+    scene::{
+        Bank, IndexMap, PosedPhoto, Scene, Semantics, SemanticsReport, Stage, TextEmbedding, Watch,
+    },
 };
 
 use super::server::PATIENCE;
@@ -50,7 +52,7 @@ impl SemanticsMaker for PhotoMeaning {
         Ok(Phrases { canon, tau: 10.0, coverage_floor: 0.05 })
     }
 
-    fn embed_texts(&self, texts: &[String]) -> Result<Vec<EmbeddedText>> {
+    fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
         self.embedded.fetch_add(texts.len(), Ordering::AcqRel);
         let embed = |text: &String| {
             let photo = text.strip_prefix("photo ").and_then(|n| n.parse::<usize>().ok());
@@ -59,18 +61,18 @@ impl SemanticsMaker for PhotoMeaning {
                 _ => axis(8 + text.bytes().map(usize::from).sum::<usize>() % 8),
             };
             let unknown = usize::from(text.starts_with('?'));
-            EmbeddedText { row, tokens: 1, unknown, cut: false }
+            TextEmbedding { row, tokens: 1, unknown, cut: false }
         };
         Ok(texts.iter().map(embed).collect())
     }
 
-    fn make(&self, work: SemanticsWork<'_>) -> Result<Semantics> {
+    fn make(&self, given: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics> {
         self.made.fetch_add(1, Ordering::AcqRel);
-        (work.progress)("masks", 0.25);
+        (watch.progress)(Stage::Masks, 0.25);
         let begun = Instant::now();
         while self.hold.load(Ordering::Acquire) {
             assert!(begun.elapsed() < PATIENCE, "nobody let go of the stand-in");
-            if work.cancel.load(Ordering::Acquire) {
+            if watch.cancel.load(Ordering::Acquire) {
                 return Err(Error::new(ErrorCode::Cancelled, "stopped"));
             }
             std::thread::sleep(Duration::from_millis(2));
@@ -78,11 +80,11 @@ impl SemanticsMaker for PhotoMeaning {
         if let Some(code) = *self.fails.lock().expect("no panic holds it") {
             return Err(Error::new(code, "made to fail"));
         }
-        (work.progress)("assign", 0.75);
-        let photos = work.scene.meta.cameras.len();
-        assert!(!work.upload.photos.is_empty(), "the photos are kept with the scene");
+        (watch.progress)(Stage::Assign, 0.75);
+        let photos = scene.meta.cameras.len();
+        assert_eq!(given.len(), photos, "the photos are kept with the scene");
         let index: Vec<u16> =
-            work.scene.gaussians.source().iter().map(|source| source.view + 1).collect();
+            scene.gaussians.source().iter().map(|source| source.view + 1).collect();
         let report = SemanticsReport {
             masks: vec![1; photos],
             bank_size: photos as u32,

@@ -17,14 +17,13 @@ use segsplat::{
     api,
     config::Config,
     error::{Error, ErrorCode, Result},
-    jobs::{Made, NoSemantics, SceneMaker, Work},
-    limits::Limits,
-    photos,
+    jobs::{NoSemantics, SceneMaker},
+    pipeline::{PhotoSet, Reconstruction},
     render::{Frame, FrameStats, Labels, PixelWeights, RenderRequest, Renderer},
     sample::{self, SampleOptions},
     scene::{
         Backdrop, Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SceneId,
-        SceneStatus, SourcePixel, Upload,
+        SceneOptions, SceneStatus, SourcePixel, Stage, Upload, Watch,
     },
     service::{
         CameraSpec, CreateScene, Kind, LensSpec, ModelsInfo, Parts, PictureOptions, PoseSpec,
@@ -168,25 +167,29 @@ pub(crate) struct WallMaker {
 }
 
 impl SceneMaker for WallMaker {
-    fn check(&self, upload: &Upload, limits: &Limits) -> Result<()> {
-        photos::read(upload, limits).map(|_| ())
+    fn identity(&self) -> String {
+        "stand-in".to_owned()
     }
 
-    fn make(&self, work: Work<'_>) -> Result<Made> {
+    fn make(
+        &self,
+        photos: &PhotoSet,
+        _: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<Reconstruction> {
         self.made.fetch_add(1, Ordering::AcqRel);
-        let photos = photos::read(work.upload, &Limits::default())?;
-        (work.progress)("photos", 0.1);
-        (work.progress)("geometry", 0.5);
+        let photos = &photos.photos;
+        (watch.progress)(Stage::Geometry, 0.5);
         let begun = Instant::now();
         while self.hold.load(Ordering::Acquire) {
             assert!(begun.elapsed() < PATIENCE, "nobody let go of the stand-in");
-            if work.cancel.load(Ordering::Acquire) {
+            if watch.cancel.load(Ordering::Acquire) {
                 return Err(Error::new(ErrorCode::Cancelled, "stopped"));
             }
             std::thread::sleep(Duration::from_millis(2));
         }
         assert!(!photos.iter().any(|p| p.file.contains("panic")), "on purpose");
-        let (gaussians, _) = Gaussians::sanitize(wall(&photos))?;
+        let (gaussians, _) = Gaussians::sanitize(wall(photos))?;
         let report = HealthReport {
             photos: photos.len() as u32,
             views_used: photos.len() as u32,
@@ -199,13 +202,7 @@ impl SceneMaker for WallMaker {
             .iter()
             .map(|p| SceneCamera { file: p.file.clone(), camera: p.camera, network: None })
             .collect();
-        Ok(Made {
-            gaussians,
-            backdrop: Backdrop::default(),
-            report,
-            cameras,
-            bundle_sha256: "stand-in".to_owned(),
-        })
+        Ok(Reconstruction { gaussians, backdrop: Backdrop::default(), report, cameras })
     }
 }
 

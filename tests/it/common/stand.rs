@@ -2,21 +2,20 @@
 //! judged by the product's own code, then the first photo stands as a board of Gaussians at the
 //! capture's median depth.
 
-use std::sync::{Arc, LazyLock, atomic::Ordering};
+use std::sync::{Arc, LazyLock};
 
 use glam::DVec3;
 use segsplat::{
     capture,
     config::Config,
     error::{Error, ErrorCode, Result},
-    jobs::{Made, SceneMaker, Work},
-    limits::Limits,
-    photos,
+    jobs::SceneMaker,
+    pipeline::{PhotoSet, Reconstruction},
     render::cpu::CpuRenderer,
     sample::{self, SampleOptions},
     scene::{
-        Backdrop, Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SourcePixel,
-        Upload,
+        Backdrop, Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SceneOptions,
+        SourcePixel, Stage, Upload, Watch,
     },
     service::ModelsInfo,
 };
@@ -36,22 +35,19 @@ pub(crate) struct BoardMaker {
 }
 
 impl SceneMaker for BoardMaker {
-    fn check(&self, upload: &Upload, limits: &Limits) -> Result<()> {
-        photos::read(upload, limits).map(drop)
-    }
-
-    fn make(&self, work: Work<'_>) -> Result<Made> {
-        (work.progress)("photos", 0.1);
+    fn make(
+        &self,
+        photos: &PhotoSet,
+        _: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<Reconstruction> {
         if let Some(code) = self.fails {
             return Err(Error::new(code, format!("made to fail with {}", code.name())));
         }
-        let photos = photos::read(work.upload, &Limits::default())?;
-        (work.progress)("capture", 0.4);
-        let capture = capture::analyse(&photos)?;
-        if work.cancel.load(Ordering::Relaxed) {
-            return Err(Error::new(ErrorCode::Cancelled, "stopped"));
-        }
-        (work.progress)("lift", 0.8);
+        let photos = &photos.photos;
+        (watch.progress)(Stage::Capture, 0.5);
+        let capture = capture::analyse_until(photos, watch.cancel)?;
+        (watch.progress)(Stage::Lift, 0.5);
         let (gaussians, _) = Gaussians::sanitize(board(&photos[0], capture.median_depth))?;
         let report = HealthReport {
             photos: u32::try_from(photos.len()).expect("few photos"),
@@ -67,13 +63,7 @@ impl SceneMaker for BoardMaker {
             network: None,
         };
         let cameras = photos.iter().map(camera).collect();
-        Ok(Made {
-            gaussians,
-            backdrop: Backdrop::default(),
-            report,
-            cameras,
-            bundle_sha256: String::new(),
-        })
+        Ok(Reconstruction { gaussians, backdrop: Backdrop::default(), report, cameras })
     }
 }
 

@@ -13,6 +13,7 @@ mod made;
 mod photo;
 mod report;
 mod semantics;
+mod stage;
 mod status;
 mod upload;
 mod weights;
@@ -28,9 +29,10 @@ pub use made::{PhotoHash, Provenance, Scene, SceneMeta};
 pub use photo::{Crop, Photo, PosedPhoto};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{
-    Bank, IndexMap, MaskInfo, PAPER_PHRASES, PAPER_TAU, PhotoMasks, ScoringProfile, Semantics,
-    SemanticsReport,
+    Bank, IndexMap, MaskInfo, MaskLogits, PAPER_PHRASES, PAPER_TAU, PhotoMasks, ScoringProfile,
+    Semantics, SemanticsReport, TextEmbedding,
 };
+pub use stage::{Stage, Watch, unless_cancelled};
 pub use status::{
     Density, Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
     SemanticsState, SemanticsStatus,

@@ -26,6 +26,8 @@ pub enum WarningCode {
     PoorPoseAgreement,
     /// Photos of the upload that were not used.
     PhotosUnused,
+    /// Several photos are one picture, under different poses.
+    SamePicture,
 }
 
 crate::names::display_names!(WarningCode);

@@ -54,6 +54,32 @@ pub struct PhotoMasks {
     pub masks: Vec<MaskInfo>,
 }
 
+/// Masks of a batch of points of a photo, as logits: over 0 is inside.
+#[derive(Clone, Debug, Default)]
+pub struct MaskLogits {
+    /// Masks a point (K), from parts to the whole.
+    pub levels: usize,
+    /// `[width, height]` of the grid.
+    pub grid: [usize; 2],
+    /// `[B * K * height * width]`.
+    pub logits: Vec<f32>,
+    /// `[B * K]`.
+    pub predicted_iou: Vec<f32>,
+}
+
+/// A text as the text tower sees it.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct TextEmbedding {
+    /// `[D]`, unit length.
+    pub row: Vec<f32>,
+    /// Tokens that were read, markers of begin and end left out.
+    pub tokens: usize,
+    /// How many of them stand for something that the tokenizer does not know.
+    pub unknown: usize,
+    /// Whether the text was longer than the network reads, and was cut.
+    pub cut: bool,
+}
+
 /// Rows of the bank.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Bank {

@@ -4,6 +4,8 @@
 //! were chosen on the real scenes of the test data, whose cameras are right, and on the same scenes
 //! with wrong cameras.
 
+use std::sync::atomic::AtomicBool;
+
 use rayon::prelude::*;
 
 use super::{
@@ -136,9 +138,10 @@ pub(super) fn warnings(
     ranges: &Ranges,
     overlap: &mut [Vec<f64>],
     warnings: &mut Vec<Warning>,
+    cancel: &AtomicBool,
 ) -> Result<()> {
     let implied = implied_scale(photos);
-    let answer = asked(views, implied)?;
+    let answer = asked(views, implied, cancel)?;
     if let Some((mistake, corrected)) = answer.mistake {
         warnings.push(mistake.warning(photos, answer.given, corrected));
         if !matches!(mistake, Mistake::Resolution(_)) {
@@ -204,11 +207,11 @@ struct Asked {
 }
 
 /// Looks for a mistake that explains the photos far better than the given cameras.
-fn asked(views: &[GrayView], implied: Option<f64>) -> Result<Asked> {
+fn asked(views: &[GrayView], implied: Option<f64>, cancel: &AtomicBool) -> Result<Asked> {
     let views: Vec<GrayView> = views.par_iter().map(|v| v.reduced(AREA)).collect();
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
     let asked = witnesses(&cameras)?;
-    let given = mean_agreement(&pairs::compare(&views, &asked));
+    let given = mean_agreement(&pairs::compare(&views, &asked, cancel)?);
     let under = |mistake: Mistake| -> Result<(Mistake, f64)> {
         let corrected: Vec<Camera> =
             cameras.iter().map(|c| mistake.corrected(c)).collect::<Result<_>>()?;
@@ -217,7 +220,7 @@ fn asked(views: &[GrayView], implied: Option<f64>) -> Result<Asked> {
             Mistake::Inverted | Mistake::InvertedAndAxes => witnesses(&corrected)?,
             _ => asked.clone(),
         };
-        Ok((mistake, mean_agreement(&pairs::compare_as(&views, &corrected, &asked))))
+        Ok((mistake, mean_agreement(&pairs::compare_as(&views, &corrected, &asked, cancel)?)))
     };
     if let Some(scale) = implied {
         let (mistake, share) = under(Mistake::Resolution(scale))?;

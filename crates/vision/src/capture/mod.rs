@@ -18,11 +18,13 @@ mod pairs;
 mod sets;
 mod sweep;
 
+use std::sync::atomic::AtomicBool;
+
 use rayon::prelude::*;
 
 use crate::{
     error::{Error, Result},
-    scene::{Capture, PosedPhoto, Warning, WarningCode},
+    scene::{Capture, PosedPhoto, Warning, WarningCode, unless_cancelled},
 };
 use gray::GrayView;
 
@@ -30,6 +32,8 @@ pub use sets::view_sets;
 
 /// Neighbours that each photo is compared with.
 const NEIGHBORS: usize = 3;
+/// Photos that one warning names.
+const NAMED_MAX: usize = 4;
 /// Of this many photos and more, one neighbour fewer.
 const MANY_PHOTOS: usize = 32;
 
@@ -39,13 +43,22 @@ const MANY_PHOTOS: usize = 32;
 /// `invalid_request` for fewer than two photos, cameras all at one place, or photos that share
 /// nothing; the message names the photos and the figure.
 pub fn analyse(photos: &[PosedPhoto]) -> Result<Capture> {
-    let views = gray_views(photos)?;
-    let found = pairs::searched(&views, neighbour_count(views.len()))?;
+    analyse_until(photos, &AtomicBool::new(false))
+}
+
+/// As [`analyse`]; stops before the next comparison of two photos once `cancel` is true.
+///
+/// # Errors
+/// As [`analyse`]; `cancelled`.
+pub fn analyse_until(photos: &[PosedPhoto], cancel: &AtomicBool) -> Result<Capture> {
+    let views = gray_views(photos, cancel)?;
+    let found = pairs::searched(&views, neighbour_count(views.len()), cancel)?;
     let points = depth::pooled(&views, &found);
     let ranges = depth::ranges(&views, &points)?;
     let mut overlap = depth::overlap(&views, &points, &found);
     let mut warnings = made_for_warnings(photos);
-    diagnose::warnings(photos, &views, &found, &ranges, &mut overlap, &mut warnings)?;
+    warnings.extend(same_picture(photos, &views)?);
+    diagnose::warnings(photos, &views, &found, &ranges, &mut overlap, &mut warnings, cancel)?;
     Ok(Capture { near_far: ranges.near_far, overlap, median_depth: ranges.median_depth, warnings })
 }
 
@@ -60,8 +73,9 @@ pub fn analyse(photos: &[PosedPhoto]) -> Result<Capture> {
 /// When an index of `set` is not one of `photos`.
 pub fn near_far(photos: &[PosedPhoto], set: &[usize]) -> Result<Vec<[f64; 2]>> {
     let chosen: Vec<&PosedPhoto> = set.iter().map(|&i| &photos[i]).collect();
-    let views = gray_views(&chosen)?;
-    let found = pairs::searched(&views, neighbour_count(views.len()))?;
+    let never = AtomicBool::new(false);
+    let views = gray_views(&chosen, &never)?;
+    let found = pairs::searched(&views, neighbour_count(views.len()), &never)?;
     Ok(depth::ranges(&views, &depth::pooled(&views, &found))?.near_far)
 }
 
@@ -69,20 +83,64 @@ fn neighbour_count(photos: usize) -> usize {
     if photos < MANY_PHOTOS { NEIGHBORS } else { NEIGHBORS - 1 }
 }
 
-fn gray_views<P: std::borrow::Borrow<PosedPhoto> + Sync>(photos: &[P]) -> Result<Vec<GrayView>> {
+fn gray_views<P: std::borrow::Borrow<PosedPhoto> + Sync>(
+    photos: &[P],
+    cancel: &AtomicBool,
+) -> Result<Vec<GrayView>> {
     if photos.len() < 2 {
         return Err(Error::invalid(format!(
             "{} photo; a capture needs at least 2 to see depth",
             photos.len()
         )));
     }
-    Ok(photos.par_iter().map(|p| GrayView::new(p.borrow())).collect())
+    let view = |photo: &P| {
+        unless_cancelled(cancel)?;
+        Ok(GrayView::new(photo.borrow()))
+    };
+    photos.par_iter().map(view).collect()
 }
 
 /// A photo as messages call it.
 fn name(photos: &[PosedPhoto], i: usize) -> String {
     let shown: String = photos[i].file.chars().take(80).collect();
     format!("photo {i} ({shown:?})")
+}
+
+/// Names photos that are one picture under different poses: at most one of the poses is right.
+///
+/// # Errors
+/// `invalid_request` where all photos are one picture, which has no depth.
+fn same_picture(photos: &[PosedPhoto], views: &[GrayView]) -> Result<Option<Warning>> {
+    let same = |i: usize, j: usize| {
+        let (a, b) = (&photos[i], &photos[j]);
+        views[i].gray == views[j].gray
+            && a.photo.rgb == b.photo.rgb
+            && a.camera.camera_to_world != b.camera.camera_to_world
+    };
+    // A blank photo is the same as any other, and its matchable pixels tell.
+    let all: Vec<usize> = (0..photos.len()).filter(|&i| !views[i].candidates.is_empty()).collect();
+    let copies = |i: usize| all.iter().copied().filter(|&j| j == i || same(i, j)).collect();
+    let groups = all.iter().map(|&i| copies(i));
+    let Some(group) =
+        groups.max_by_key(|group: &Vec<usize>| (group.len(), photos.len() - group[0]))
+    else {
+        return Ok(None);
+    };
+    if group.len() < 2 {
+        return Ok(None);
+    }
+    let names: Vec<String> = group.iter().take(NAMED_MAX).map(|&i| name(photos, i)).collect();
+    let more = group.len().saturating_sub(NAMED_MAX);
+    let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+    let message = format!(
+        "{}{more} are the same picture under different poses; at most one of these poses is right",
+        names.join(", ")
+    );
+    if group.len() == photos.len() {
+        return Err(Error::invalid(message));
+    }
+    let value = group.len() as f64;
+    Ok(Some(Warning { code: WarningCode::SamePicture, message, value }))
 }
 
 /// Says which intrinsics were scaled when the photos were read.

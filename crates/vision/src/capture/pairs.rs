@@ -1,5 +1,7 @@
 //! Which pairs of photos are compared, and the comparison of a pair in both directions.
 
+use std::sync::atomic::AtomicBool;
+
 use rayon::prelude::*;
 
 use super::{
@@ -8,7 +10,7 @@ use super::{
 };
 use crate::{
     error::{Error, Result},
-    scene::Camera,
+    scene::{Camera, unless_cancelled},
 };
 
 /// Baselines under this share of the largest give no depth.
@@ -96,11 +98,15 @@ pub(super) fn ranked(cameras: &[Camera]) -> Result<Vec<Vec<usize>>> {
 
 /// Compares each view with its `count` most promising partners, each pair once; the few views that
 /// agree with none of these are given a second choice.
-pub(super) fn searched(views: &[GrayView], count: usize) -> Result<Vec<PairFound>> {
+pub(super) fn searched(
+    views: &[GrayView],
+    count: usize,
+    cancel: &AtomicBool,
+) -> Result<Vec<PairFound>> {
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
     let ranked = ranked(&cameras)?;
     let first = unique((0..views.len()).flat_map(|i| tied(i, ranked[i].iter().take(count))));
-    let mut found = compare(views, &first);
+    let mut found = compare(views, &first, cancel)?;
     let best = |i: usize, found: &[PairFound]| {
         found.iter().filter(|p| p.side(i).is_some()).map(PairFound::best).fold(0.0, f64::max)
     };
@@ -109,7 +115,7 @@ pub(super) fn searched(views: &[GrayView], count: usize) -> Result<Vec<PairFound
         let more = weak.iter().flat_map(|&i| tied(i, ranked[i].iter().skip(count).take(2 * count)));
         let mut second = unique(more);
         second.retain(|pair| first.binary_search(pair).is_err());
-        found.extend(compare(views, &second));
+        found.extend(compare(views, &second, cancel)?);
     }
     Ok(found)
 }
@@ -129,13 +135,20 @@ fn unique(pairs: impl Iterator<Item = [usize; 2]>) -> Vec<[usize; 2]> {
 }
 
 /// Compares each pair in both directions.
-pub(super) fn compare(views: &[GrayView], pairs: &[[usize; 2]]) -> Vec<PairFound> {
+pub(super) fn compare(
+    views: &[GrayView],
+    pairs: &[[usize; 2]],
+    cancel: &AtomicBool,
+) -> Result<Vec<PairFound>> {
     let sweeps: Vec<Sweep> = pairs
         .par_iter()
         .flat_map(|&[i, j]| [(i, j), (j, i)])
-        .map(|(i, j)| sweep(&views[i], &views[j], &Relative::new(&views[i], &views[j])))
-        .collect();
-    pairs
+        .map(|(i, j)| {
+            unless_cancelled(cancel)?;
+            Ok(sweep(&views[i], &views[j], &Relative::new(&views[i], &views[j])))
+        })
+        .collect::<Result<_>>()?;
+    let found = pairs
         .iter()
         .zip(sweeps.chunks_exact(2))
         .map(|(&[i, j], sweeps)| {
@@ -154,7 +167,8 @@ pub(super) fn compare(views: &[GrayView], pairs: &[[usize; 2]]) -> Vec<PairFound
                 angle: angle(&a.camera, &b.camera),
             }
         })
-        .collect()
+        .collect();
+    Ok(found)
 }
 
 /// Compares each pair with other cameras in place of the views' own.
@@ -162,7 +176,8 @@ pub(super) fn compare_as(
     views: &[GrayView],
     cameras: &[Camera],
     pairs: &[[usize; 2]],
-) -> Vec<PairFound> {
+    cancel: &AtomicBool,
+) -> Result<Vec<PairFound>> {
     let mut used: Vec<usize> = pairs.iter().flatten().copied().collect();
     used.sort_unstable();
     used.dedup();
@@ -176,7 +191,7 @@ pub(super) fn compare_as(
         .collect();
     let at = |i: usize| used.binary_search(&i).unwrap_or(0);
     let local: Vec<[usize; 2]> = pairs.iter().map(|&[i, j]| [at(i), at(j)]).collect();
-    compare(&changed, &local)
+    compare(&changed, &local, cancel)
 }
 
 /// Keeps the matches that at least two others nearby agree with: surfaces are in one piece,

@@ -5,9 +5,14 @@
 //! no coarser than its own. So every dropped Gaussian leaves that many layers behind it and no
 //! hole, and a surface seen by sixty photos is said no more often than one seen by a few.
 
+use std::sync::atomic::AtomicBool;
+
 use rayon::prelude::*;
 
-use crate::scene::ViewGaussians;
+use crate::{
+    error::Result,
+    scene::{ViewGaussians, unless_cancelled},
+};
 
 /// What counts as one surface, and how often it may be said.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -55,17 +60,19 @@ pub(super) fn fuse(
     views: &[ViewGaussians],
     candidate: &[Vec<bool>],
     options: &FuseOptions,
-) -> Vec<Vec<Fate>> {
+    cancel: &AtomicBool,
+) -> Result<Vec<Vec<Fate>>> {
     let mut fates: Vec<Vec<Fate>> = candidate
         .iter()
         .map(|row| row.iter().map(|&c| if c { Fate::Keep } else { Fate::Absent }).collect())
         .collect();
     if views.len() <= options.layers {
-        return fates;
+        return Ok(fates);
     }
     let mut surfaces: Vec<Surface<'_>> =
         views.iter().zip(candidate).map(|(view, keep)| Surface::new(view, keep)).collect();
     for v in surest_first(views) {
+        unless_cancelled(cancel)?;
         let judged: Vec<Fate> = (0..views[v].len())
             .into_par_iter()
             .map(|i| match fates[v][i] {
@@ -77,7 +84,7 @@ pub(super) fn fuse(
         surfaces[v].kept = Some(kept);
         fates[v] = judged;
     }
-    fates
+    Ok(fates)
 }
 
 /// Views by mean confidence, the surest first; ties by index.

@@ -11,6 +11,8 @@ mod thin;
 
 pub use backdrop::backdrop;
 
+use std::sync::atomic::AtomicBool;
+
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 
@@ -20,7 +22,10 @@ use crate::{
         fuse::{Fate, fuse},
         sh::ShRotation,
     },
-    scene::{Camera, DropCount, Gaussians, Intrinsics, RawGaussians, SourcePixel, ViewGaussians},
+    scene::{
+        Camera, DropCount, Gaussians, Intrinsics, RawGaussians, SourcePixel, ViewGaussians,
+        unless_cancelled,
+    },
 };
 
 pub use fuse::FuseOptions;
@@ -48,12 +53,14 @@ pub struct Lifted {
 /// Lifts, fuses and thins. `cameras` are all cameras of the scene; their mean centre is the origin.
 ///
 /// # Errors
-/// `internal` when arrays disagree in length or views in SH degree.
+/// `internal` when arrays disagree in length or views in SH degree; `cancelled` once `cancel` is
+/// true, which is asked before each view.
 pub fn lift(
     views: Vec<ViewGaussians>,
     cameras: &[Camera],
     fusing: &FuseOptions,
     thinning: Option<&ThinOptions>,
+    cancel: &AtomicBool,
 ) -> Result<Lifted> {
     let degree = views.first().map_or(0, |view| view.sh_degree);
     for view in &views {
@@ -61,14 +68,18 @@ pub fn lift(
     }
     let mut counts = Counts::default();
     let mut views = best_of_each_photo(views, &mut counts);
-    let candidate: Vec<Vec<bool>> =
-        views.iter().map(|view| candidates(view, &mut counts)).collect();
-    let mut fates = fuse(&views, &candidate, fusing);
+    let mut candidate = Vec::with_capacity(views.len());
+    for view in &views {
+        unless_cancelled(cancel)?;
+        candidate.push(candidates(view, &mut counts));
+    }
+    let mut fates = fuse(&views, &candidate, fusing, cancel)?;
     if let Some(thinning) = thinning {
-        views
-            .par_iter_mut()
-            .zip(&mut fates)
-            .for_each(|(view, fates)| thin::thin(view, fates, thinning));
+        views.par_iter_mut().zip(&mut fates).try_for_each(|(view, fates)| {
+            unless_cancelled(cancel)?;
+            thin::thin(view, fates, thinning);
+            Ok::<_, Error>(())
+        })?;
     }
     for fate in fates.iter().flatten() {
         match fate {
@@ -87,6 +98,7 @@ pub fn lift(
     let mut raw = RawGaussians { origin, sh_degree: degree, ..RawGaussians::default() };
     let mut depths = Vec::new();
     for (view, fate) in views.iter().zip(&fates) {
+        unless_cancelled(cancel)?;
         append(&mut raw, view, fate, origin, &mut depths);
     }
     let (gaussians, report) = Gaussians::sanitize(raw)?;

@@ -12,7 +12,7 @@ use crate::{
         pool::{Pool, input_shape},
         resize::{planes, resize},
     },
-    scene::Crop,
+    scene::{Crop, TextEmbedding},
 };
 
 /// Image and text tower, ready to run from any thread.
@@ -45,19 +45,6 @@ struct Tokens {
     /// How many of them the tokenizer does not know.
     unknown: usize,
     cut: bool,
-}
-
-/// What a text means.
-#[derive(Clone, Debug, PartialEq)]
-pub struct TextEmbedding {
-    /// `[dim]`, unit length.
-    pub row: Vec<f32>,
-    /// Tokens that were read, markers of begin and end left out.
-    pub tokens: usize,
-    /// How many of them stand for something that the tokenizer does not know.
-    pub unknown: usize,
-    /// Whether the text was longer than the network's context and was cut.
-    pub cut: bool,
 }
 
 impl ImageText {

@@ -17,7 +17,7 @@ use crate::{
         pool::{Pool, input_shape},
         resize::{planes, resize},
     },
-    scene::Photo,
+    scene::{MaskLogits, Photo},
 };
 
 /// Side of the logits asked of an `efficient_sam` decoder: what it computes, before it enlarges.
@@ -40,21 +40,6 @@ pub struct PhotoEmbedding {
     resized: [u32; 2],
     /// Name for the decoder, shape and data.
     tensors: Vec<(String, Vec<usize>, Vec<f32>)>,
-}
-
-/// Masks of a batch of prompts, as logits: over 0 is inside.
-#[derive(Clone, Debug)]
-pub struct MaskLogits {
-    /// Prompts (B).
-    pub prompts: usize,
-    /// Masks a prompt (K), from parts to the whole.
-    pub levels: usize,
-    /// `[width, height]` of the grid.
-    pub grid: [usize; 2],
-    /// `[B * K * height * width]`.
-    pub logits: Vec<f32>,
-    /// `[B * K]`.
-    pub predicted_iou: Vec<f32>,
 }
 
 /// What the decoder's file takes.
@@ -158,7 +143,6 @@ impl MaskNetwork {
     /// `internal` when the network fails or answers with other shapes than its manifest says.
     pub fn decode(&self, embedding: &PhotoEmbedding, points: &[[f32; 2]]) -> Result<MaskLogits> {
         let mut all = MaskLogits {
-            prompts: points.len(),
             levels: self.manifest.levels.len(),
             grid: [0, 0],
             logits: Vec::new(),

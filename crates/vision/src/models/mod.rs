@@ -24,11 +24,11 @@ pub use bundle::{Bundle, BundleFile};
 pub use fit::{FittedPhoto, bucket_for, fit};
 pub use frame::ModelFrame;
 pub use geometry::{Geometry, GeometryInput};
-pub use image_text::{ImageText, TextEmbedding};
+pub use image_text::ImageText;
 pub use manifest::{
     GeometryManifest, ImageTextManifest, ImageTowerManifest, MaskAdapter, MaskDecoderManifest,
     MaskEncoderManifest, MasksManifest, OutputFrame, TextTowerManifest, Translation,
 };
-pub use masks::{MaskLogits, MaskNetwork, PhotoEmbedding};
+pub use masks::{MaskNetwork, PhotoEmbedding};
 pub use options::{NetworkOptions, ProviderChoice};
 pub use runtime::{Provider, Runtime, SETUP_COMMAND};

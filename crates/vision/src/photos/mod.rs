@@ -15,7 +15,7 @@ mod decode;
 mod lens;
 mod names;
 
-use std::{collections::HashSet, path::Path};
+use std::{collections::HashSet, path::Path, sync::atomic::AtomicBool};
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -24,7 +24,7 @@ pub use crate::scene::{Upload, UploadCameras, UploadFile};
 use crate::{
     error::{Error, Result},
     limits::Limits,
-    scene::{Camera, CameraToWorld, PosedPhoto},
+    scene::{Camera, CameraToWorld, PosedPhoto, unless_cancelled},
 };
 use cameras::{CameraEntry, PoseAxes};
 
@@ -45,6 +45,18 @@ fn label(index: usize, file: &str) -> String {
 /// `invalid_request` for missing, surplus or impossible cameras, `photo_unreadable` for files that
 /// are not what they claim, `limit_exceeded`; each names photo, value and bound.
 pub fn read(upload: &Upload, limits: &Limits) -> Result<Vec<PosedPhoto>> {
+    read_until(upload, limits, &AtomicBool::new(false))
+}
+
+/// As [`read`]; stops before the next photo once `cancel` is true.
+///
+/// # Errors
+/// As [`read`]; `cancelled`.
+pub fn read_until(
+    upload: &Upload,
+    limits: &Limits,
+    cancel: &AtomicBool,
+) -> Result<Vec<PosedPhoto>> {
     let total = upload.size_bytes();
     if total > limits.upload_bytes_max {
         return Err(Error::limit("upload bytes", total, limits.upload_bytes_max));
@@ -57,9 +69,9 @@ pub fn read(upload: &Upload, limits: &Limits) -> Result<Vec<PosedPhoto>> {
                 ));
             }
             let unpacked = archive::unpack(archive, limits)?;
-            read_parts(&unpacked, limits, Every::Camera)
+            read_parts(&unpacked, limits, Every::Camera, cancel)
         }
-        None => read_parts(upload, limits, Every::Photo),
+        None => read_parts(upload, limits, Every::Photo, cancel),
     }
 }
 
@@ -68,7 +80,8 @@ pub fn read(upload: &Upload, limits: &Limits) -> Result<Vec<PosedPhoto>> {
 /// # Errors
 /// As [`read`]; also `invalid_request` where the folder has no camera file.
 pub fn read_dir(dir: &Path, limits: &Limits) -> Result<Vec<PosedPhoto>> {
-    read_parts(&upload_of_dir(dir, limits)?, limits, Every::Camera)
+    let never = AtomicBool::new(false);
+    read_parts(&upload_of_dir(dir, limits)?, limits, Every::Camera, &never)
 }
 
 /// The camera file of a folder and the photos it names, as an upload.
@@ -152,7 +165,12 @@ struct Paired<'a> {
     label: String,
 }
 
-fn read_parts(upload: &Upload, limits: &Limits, every: Every) -> Result<Vec<PosedPhoto>> {
+fn read_parts(
+    upload: &Upload,
+    limits: &Limits,
+    every: Every,
+    cancel: &AtomicBool,
+) -> Result<Vec<PosedPhoto>> {
     if every == Every::Photo {
         check_count(upload.photos.len(), limits)?;
     }
@@ -181,6 +199,7 @@ fn read_parts(upload: &Upload, limits: &Limits, every: Every) -> Result<Vec<Pose
         .zip(headers)
         .zip(poses)
         .map(|((p, (header, lens)), camera_to_world)| {
+            unless_cancelled(cancel)?;
             let raw = decode::pixels(&p.file.bytes, &header, &p.label, limits)?;
             let photo = lens::undistort(raw, &lens);
             let (photo, intrinsics) =

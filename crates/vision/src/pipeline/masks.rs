@@ -8,8 +8,8 @@ use std::sync::atomic::AtomicBool;
 use crate::{
     error::Result,
     models::{MaskNetwork, MasksManifest, PhotoEmbedding},
-    scene::{Gaussians, Photo, PhotoMasks, PosedPhoto},
-    segment::{self, Decoded, PromptDecoder, Seed, Settings},
+    scene::{Gaussians, MaskLogits, Photo, PhotoMasks, PosedPhoto},
+    segment::{self, PromptDecoder, Seed, Settings},
 };
 
 /// Cells along one side of the photo, each of which gets one seed: two views of a thing seed once.
@@ -41,14 +41,8 @@ impl PromptDecoder for SeenPhoto<'_> {
         (self.network.manifest().size, self.embedding.resized())
     }
 
-    fn decode(&self, points: &[[f32; 2]]) -> Result<Decoded> {
-        let found = self.network.decode(&self.embedding, points)?;
-        Ok(Decoded {
-            levels: found.levels,
-            grid: found.grid,
-            logits: found.logits,
-            predicted_iou: found.predicted_iou,
-        })
+    fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits> {
+        self.network.decode(&self.embedding, points)
     }
 }
 

@@ -1,9 +1,8 @@
-//! The order of the stages: photos ▸ capture ▸ geometry ▸ lift ▸ store.
+//! Runs the stages of [`Stage`]: photos ▸ capture ▸ geometry ▸ lift ▸ store.
 //!
-//! [`Engine`] holds what is opened once (library, bundle, sessions); [`reconstruct`] is the list of
-//! stages from photos to Gaussians, [`make`] the same from an upload. The caller stores the scene,
-//! under the stage name [`Stage::Store`]. What the scene means comes when somebody asks, or at
-//! once: [`semantics`].
+//! [`Engine`] holds what is opened once (library, bundle, sessions). [`read`] makes photos of an
+//! upload, [`reconstruct`] makes Gaussians of photos, and the caller stores the scene, which is the
+//! stage [`Stage::Store`]. [`semantics`] makes the semantics of a scene.
 
 mod late;
 pub mod masks;
@@ -12,66 +11,24 @@ pub mod semantics;
 pub use self::late::LateEngine;
 
 use std::{
-    fmt,
-    sync::{
-        Arc,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::{Arc, atomic::AtomicBool},
     time::Instant,
 };
 
 use crate::{
     capture,
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
     lift,
     limits::Limits,
     meter,
     models::{Bundle, Geometry, GeometryInput, NetworkOptions, Runtime},
     photos,
     scene::{
-        Backdrop, Camera, Capture, Density, Gaussians, HealthReport, Intrinsics, PosedPhoto,
-        SceneCamera, SceneOptions, StageTime, Upload, ViewSet,
+        Backdrop, Camera, Capture, Density, Gaussians, HealthReport, Intrinsics, Photo, PosedPhoto,
+        Provenance, Scene, SceneCamera, SceneId, SceneMeta, SceneOptions, Stage, StageTime, Upload,
+        ViewSet, Watch, unless_cancelled,
     },
 };
-
-/// A stage of making a scene, in order.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Stage {
-    /// The upload becomes undistorted photos with cameras.
-    Photos,
-    /// Depth ranges, overlap and diagnosis from the photos themselves.
-    Capture,
-    /// The geometry network.
-    Geometry,
-    /// One scene of what the network said of each photo.
-    Lift,
-    /// The scene goes to the store.
-    Store,
-}
-
-impl Stage {
-    /// All stages, in order.
-    pub const ALL: [Self; 5] =
-        [Self::Photos, Self::Capture, Self::Geometry, Self::Lift, Self::Store];
-
-    /// Name in events and reports.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Photos => "photos",
-            Self::Capture => "capture",
-            Self::Geometry => "geometry",
-            Self::Lift => "lift",
-            Self::Store => "store",
-        }
-    }
-}
-
-impl fmt::Display for Stage {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.name())
-    }
-}
 
 /// What every scene is made with; opened once, shared by all jobs.
 #[derive(Debug)]
@@ -133,7 +90,7 @@ impl Engine {
     }
 }
 
-/// A scene, made.
+/// What the stages make of photos. With an id and what it was made of it is a [`Scene`].
 #[derive(Clone, Debug)]
 pub struct Reconstruction {
     /// The Gaussians, world frame.
@@ -146,34 +103,64 @@ pub struct Reconstruction {
     pub cameras: Vec<SceneCamera>,
 }
 
-/// Refuses an upload whose photos or cameras cannot be read, without making anything.
-///
-/// # Errors
-/// `invalid_request`, `photo_unreadable`, `limit_exceeded`; each names photo, value and bound.
-pub fn check(upload: &Upload, limits: &Limits) -> Result<()> {
-    photos::read(upload, limits).map(drop)
+impl Reconstruction {
+    /// The scene of this id, created at `created_ms` (milliseconds since 1970).
+    #[must_use]
+    pub fn into_scene(self, id: SceneId, created_ms: u64, provenance: Provenance) -> Scene {
+        let Self { gaussians, backdrop, report, cameras } = self;
+        Scene::new(SceneMeta { id, created_ms, cameras, report, provenance }, gaussians, backdrop)
+    }
 }
 
-/// An upload to Gaussians: reads the photos, then as [`reconstruct`].
+/// The photos of an upload, read and undistorted.
+#[derive(Clone, Debug)]
+pub struct PhotoSet {
+    /// The photos, in the order of the cameras.
+    pub photos: Vec<PosedPhoto>,
+    /// How long that took, milliseconds.
+    pub read_ms: f64,
+}
+
+impl PhotoSet {
+    /// Bytes of the pixels.
+    #[must_use]
+    pub fn size_bytes(&self) -> u64 {
+        let bytes = |photo: &Photo| photo.rgb.len() + photo.valid.as_ref().map_or(0, Vec::len);
+        self.photos.iter().map(|posed| bytes(&posed.photo) as u64).sum()
+    }
+}
+
+/// Reads an upload: the stage [`Stage::Photos`].
 ///
 /// # Errors
-/// As [`check`] and [`reconstruct`].
+/// `invalid_request`, `photo_unreadable`, `limit_exceeded`, each names photo, value and bound;
+/// `cancelled`.
+pub fn read(upload: &Upload, limits: &Limits, cancel: &AtomicBool) -> Result<PhotoSet> {
+    let begun = Instant::now();
+    let photos = photos::read_until(upload, limits, cancel)?;
+    let read_ms = begun.elapsed().as_secs_f64() * 1e3;
+    meter::stage(Stage::Photos.name(), read_ms / 1e3);
+    Ok(PhotoSet { photos, read_ms })
+}
+
+/// The stages from read photos to Gaussians, the time of reading them in the report.
+///
+/// # Errors
+/// As [`reconstruct`].
 pub fn make(
     engine: &Engine,
-    upload: &Upload,
-    limits: &Limits,
+    photos: &PhotoSet,
     options: &SceneOptions,
-    progress: &(dyn Fn(Stage, f32) + Sync),
-    cancel: &AtomicBool,
+    watch: Watch<'_>,
 ) -> Result<Reconstruction> {
-    let mut run = Run { progress, cancel, times: Vec::new() };
-    let photos =
-        run.stage(Stage::Photos, |_| engine.workers.install(|| photos::read(upload, limits)))?;
-    finish(engine, &photos, options, run)
+    let mut made = reconstruct(engine, &photos.photos, options, watch.progress, watch.cancel)?;
+    let stage = Stage::Photos.name().to_owned();
+    made.report.stages.insert(0, StageTime { stage, ms: photos.read_ms });
+    Ok(made)
 }
 
-/// Photos to Gaussians. `progress` gets each stage with its fraction, 0 to 1; `cancel` is looked at
-/// between stages and between runs of the network.
+/// Photos to Gaussians. `progress` gets each stage with its fraction, 0 to 1; the loops of each
+/// stage look at `cancel`.
 ///
 /// # Errors
 /// `invalid_request` when the capture cannot be reconstructed, `cancelled`, or `internal`.
@@ -184,32 +171,23 @@ pub fn reconstruct(
     progress: &(dyn Fn(Stage, f32) + Sync),
     cancel: &AtomicBool,
 ) -> Result<Reconstruction> {
-    finish(engine, photos, options, Run { progress, cancel, times: Vec::new() })
-}
-
-/// The stages after the photos.
-fn finish(
-    engine: &Engine,
-    photos: &[PosedPhoto],
-    options: &SceneOptions,
-    mut run: Run<'_>,
-) -> Result<Reconstruction> {
+    let mut stages = Stages::new(Watch { progress, cancel });
     let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
     let manifest = engine.geometry.manifest();
     let views_max = views_max(options, manifest.views_min, manifest.views_max)?;
 
-    let (capture, sets) = run.stage(Stage::Capture, |_| {
+    let (capture, sets) = stages.run(Stage::Capture, || {
         engine.workers.install(|| {
-            let capture = capture::analyse(photos)?;
+            let capture = capture::analyse_until(photos, cancel)?;
             let sets = capture::view_sets(&capture, photos, views_max, manifest.neighbors_max);
             Ok((capture, sets))
         })
     })?;
-    let views = run.stage(Stage::Geometry, |run| {
+    let views = stages.run(Stage::Geometry, || {
         let mut views = Vec::new();
         for (done, set) in sets.iter().enumerate() {
-            run.check()?;
-            (run.progress)(Stage::Geometry, fraction(done, sets.len()));
+            unless_cancelled(cancel)?;
+            progress(Stage::Geometry, fraction(done, sets.len()));
             let input = GeometryInput {
                 photos,
                 views: &set.views,
@@ -220,14 +198,14 @@ fn finish(
         }
         Ok(views)
     })?;
-    let (lifted, backdrop) = run.stage(Stage::Lift, |_| {
+    let (lifted, backdrop) = stages.run(Stage::Lift, || {
         engine.workers.install(|| {
             let thinning = match options.density {
                 Density::Thinned => Some(lift::ThinOptions::default()),
                 Density::Full => None,
             };
             let fusing = lift::FuseOptions::default();
-            let lifted = lift::lift(views, &cameras, &fusing, thinning.as_ref())?;
+            let lifted = lift::lift(views, &cameras, &fusing, thinning.as_ref(), cancel)?;
             Ok((lifted, lift::backdrop(photos)))
         })
     })?;
@@ -251,39 +229,35 @@ fn finish(
         median_depth: lifted.median_depth,
         overlap: mean_best_overlap(&capture),
         network_focal_px: lifted.lenses.iter().map(focal).collect(),
-        stages: run.times,
+        stages: stages.times,
         execution_provider: engine.geometry.provider().name().to_owned(),
         warnings: capture.warnings,
     };
     Ok(Reconstruction { gaussians: lifted.gaussians, backdrop, report, cameras })
 }
 
-/// One scene on its way: reports, times and stops it.
-struct Run<'a> {
-    progress: &'a (dyn Fn(Stage, f32) + Sync),
-    cancel: &'a AtomicBool,
+/// The stages of one job: each is told, timed, and not begun once the job is cancelled.
+struct Stages<'a> {
+    watch: Watch<'a>,
     times: Vec<StageTime>,
 }
 
-impl Run<'_> {
-    fn stage<T>(&mut self, stage: Stage, work: impl FnOnce(&Self) -> Result<T>) -> Result<T> {
-        self.check()?;
+impl<'a> Stages<'a> {
+    fn new(watch: Watch<'a>) -> Self {
+        Self { watch, times: Vec::new() }
+    }
+
+    fn run<T>(&mut self, stage: Stage, work: impl FnOnce() -> Result<T>) -> Result<T> {
+        unless_cancelled(self.watch.cancel)?;
         let _span = tracing::info_span!("stage", stage = stage.name()).entered();
-        (self.progress)(stage, 0.0);
+        (self.watch.progress)(stage, 0.0);
         let start = Instant::now();
-        let done = work(self)?;
+        let done = work()?;
         let ms = start.elapsed().as_secs_f64() * 1e3;
         meter::stage(stage.name(), ms / 1e3);
         self.times.push(StageTime { stage: stage.name().to_owned(), ms });
-        (self.progress)(stage, 1.0);
+        (self.watch.progress)(stage, 1.0);
         Ok(done)
-    }
-
-    fn check(&self) -> Result<()> {
-        if self.cancel.load(Ordering::Relaxed) {
-            return Err(Error::new(ErrorCode::Cancelled, "the scene was cancelled"));
-        }
-        Ok(())
     }
 }
 

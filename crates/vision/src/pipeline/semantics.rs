@@ -4,67 +4,21 @@
 //! [`understand_with`] with whatever gives masks and embeddings. Every Gaussian takes the index of
 //! the pixel that made it; what other photos say of it is a switch of [`SemanticsOptions`].
 
-use std::{
-    sync::{
-        Arc, Mutex, PoisonError,
-        atomic::{AtomicBool, Ordering},
-    },
-    time::Instant,
-};
+use std::sync::{Arc, Mutex, PoisonError};
 
-use super::{Engine, masks};
+use super::{Engine, Stages, masks};
 use crate::{
     error::{Error, ErrorCode, Result},
-    limits::Limits,
-    meter,
     models::{ImageText, MaskNetwork, NetworkOptions, Runtime},
-    photos,
     scene::{
-        Bank, Crop, Gaussians, IndexMap, PAPER_PHRASES, PAPER_TAU, PhotoMasks, PosedPhoto, Scene,
-        SceneCamera, ScoringProfile, Semantics, SemanticsReport, StageTime, Upload,
+        Bank, Crop, Gaussians, IndexMap, PAPER_PHRASES, PAPER_TAU, PhotoMasks, PosedPhoto,
+        SceneCamera, ScoringProfile, Semantics, SemanticsReport, Stage, Watch, unless_cancelled,
     },
     semantics::{self, Clusters, Cutter, NetworkPicture, Scoring, Views},
 };
 
 /// How alike two rows must be to become one, where two photos show them on one surface.
 const MERGE_COSINE_MIN: f64 = 0.7;
-
-/// A stage of giving a scene its meaning, in order.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum SemanticsStage {
-    /// The mask network, photo by photo.
-    Masks,
-    /// The image tower on a cut of each mask.
-    Embed,
-    /// K-Means over the embeddings.
-    Bank,
-    /// An index a Gaussian.
-    Assign,
-}
-
-impl SemanticsStage {
-    /// Name in events and reports.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Masks => "masks",
-            Self::Embed => "embed",
-            Self::Bank => "bank",
-            Self::Assign => "assign",
-        }
-    }
-
-    /// Where the stage begins and ends in the whole, 0..1; most of the time goes to the networks.
-    #[must_use]
-    pub fn share(self) -> [f32; 2] {
-        match self {
-            Self::Masks => [0.0, 0.6],
-            Self::Embed => [0.6, 0.95],
-            Self::Bank => [0.95, 0.98],
-            Self::Assign => [0.98, 1.0],
-        }
-    }
-}
 
 /// What may be done beyond the paper.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -116,30 +70,6 @@ pub struct SceneParts<'a> {
     pub cameras: &'a [SceneCamera],
     /// Its Gaussians.
     pub gaussians: &'a Gaussians,
-}
-
-/// How the work tells where it is, and is stopped.
-#[derive(Clone, Copy)]
-pub struct Watch<'a> {
-    /// Gets each stage with its own fraction, 0..1.
-    pub progress: &'a (dyn Fn(SemanticsStage, f32) + Sync),
-    /// Looked at between photos and batches.
-    pub cancel: &'a AtomicBool,
-}
-
-impl std::fmt::Debug for Watch<'_> {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Watch").finish_non_exhaustive()
-    }
-}
-
-impl Watch<'_> {
-    fn check(&self) -> Result<()> {
-        if self.cancel.load(Ordering::Relaxed) {
-            return Err(Error::new(ErrorCode::Cancelled, "the scene's semantics were cancelled"));
-        }
-        Ok(())
-    }
 }
 
 /// The networks that semantics need, opened at the first use and kept.
@@ -213,24 +143,6 @@ impl Engine {
     }
 }
 
-/// Gives a finished scene its meaning: reads its photos again, then as [`understand`].
-///
-/// # Errors
-/// As [`understand`]; `internal` when the upload is not the one the scene was made of.
-pub fn understand_upload(
-    engine: &Engine,
-    upload: &Upload,
-    limits: &Limits,
-    scene: &Scene,
-    options: &SemanticsOptions,
-    watch: Watch<'_>,
-) -> Result<Semantics> {
-    let photos = engine.workers.install(|| photos::read(upload, limits))?;
-    let cameras = &scene.meta.cameras;
-    let parts = SceneParts { photos: &photos, cameras, gaussians: &scene.gaussians };
-    understand(engine, &parts, options, watch)
-}
-
 /// Gives a scene its meaning with the engine's networks.
 ///
 /// # Errors
@@ -274,9 +186,9 @@ pub fn understand_with(
     watch: Watch<'_>,
 ) -> Result<Semantics> {
     check_parts(parts)?;
-    let mut times = Vec::new();
-    let masks = timed(&mut times, SemanticsStage::Masks, watch, || {
-        (tools.masks)(&|fraction| (watch.progress)(SemanticsStage::Masks, fraction))
+    let mut stages = Stages::new(watch);
+    let masks = stages.run(Stage::Masks, || {
+        (tools.masks)(&|fraction| (watch.progress)(Stage::Masks, fraction))
     })?;
     if masks.len() != parts.photos.len() {
         return Err(Error::internal(format!(
@@ -285,23 +197,19 @@ pub fn understand_with(
             parts.photos.len()
         )));
     }
-    let embedded = timed(&mut times, SemanticsStage::Embed, watch, || {
-        embed(tools, parts.photos, &masks, watch)
-    })?;
-    let mut labels = timed(&mut times, SemanticsStage::Bank, watch, || {
+    let embedded = stages.run(Stage::Embed, || embed(tools, parts.photos, &masks, watch))?;
+    let mut labels = stages.run(Stage::Bank, || {
         let clusters = semantics::bank(&embedded.rows, tools.dim, parts.photos.len())?;
         Ok(label(&masks, &embedded.of, clusters))
     })?;
-    let index = timed(&mut times, SemanticsStage::Assign, watch, || {
-        Ok(assign(&mut labels, parts, options))
-    })?;
+    let index = stages.run(Stage::Assign, || Ok(assign(&mut labels, parts, options)))?;
     let count = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
     let report = SemanticsReport {
         masks: masks.iter().map(|of| count(of.masks.len())).collect(),
         bank_size: count(labels.bank.len()),
         labelled: index.iter().filter(|m| **m > 0).count() as u64,
         profile: ScoringProfile::Default,
-        stages: times,
+        stages: stages.times,
         ..SemanticsReport::default()
     };
     Ok(Semantics { bank: labels.bank, index, photos: labels.maps, report })
@@ -323,23 +231,6 @@ fn check_parts(parts: &SceneParts<'_>) -> Result<()> {
         ));
     }
     Ok(())
-}
-
-fn timed<T>(
-    times: &mut Vec<StageTime>,
-    stage: SemanticsStage,
-    watch: Watch<'_>,
-    work: impl FnOnce() -> Result<T>,
-) -> Result<T> {
-    watch.check()?;
-    (watch.progress)(stage, 0.0);
-    let start = Instant::now();
-    let done = work()?;
-    let ms = start.elapsed().as_secs_f64() * 1e3;
-    meter::stage(stage.name(), ms / 1e3);
-    times.push(StageTime { stage: stage.name().to_owned(), ms });
-    (watch.progress)(stage, 1.0);
-    Ok(done)
 }
 
 /// Embeddings of all masks that have one.
@@ -366,8 +257,8 @@ fn embed(
         let cutter = Cutter::new(&posed.photo, masks);
         let wanted: Vec<usize> = (0..masks.masks.len()).collect();
         for batch in wanted.chunks(tools.batch.max(1)) {
-            watch.check()?;
-            (watch.progress)(SemanticsStage::Embed, done as f32 / all.max(1) as f32);
+            unless_cancelled(watch.cancel)?;
+            (watch.progress)(Stage::Embed, done as f32 / all.max(1) as f32);
             done += batch.len();
             let cut = |&k: &usize| Some((k, cutter.cut(k, tools.crop_margin)?));
             let (of, crops): (Vec<usize>, Vec<Crop>) = batch.iter().filter_map(cut).unzip();

@@ -5,8 +5,8 @@ use rayon::prelude::*;
 
 use crate::{
     error::{Error, Result},
-    scene::Photo,
-    segment::{Bitset, Box2, Decoded, PhotoGrid, Proposal, Settings, photo_grid::Resample},
+    scene::{MaskLogits, Photo},
+    segment::{Bitset, Box2, PhotoGrid, Proposal, Settings, photo_grid::Resample},
 };
 
 /// Judges the masks of one photo.
@@ -33,7 +33,7 @@ impl Judge {
     /// Knows the grid from the first answer.
     pub(super) fn new(
         (side, resized): (u32, [u32; 2]),
-        first: &Decoded,
+        first: &MaskLogits,
         photo: &Photo,
         settings: &Settings,
     ) -> Result<Self> {
@@ -71,7 +71,7 @@ impl Judge {
     /// one where `wholes` is set.
     pub(super) fn pass(
         &self,
-        decoded: &Decoded,
+        decoded: &MaskLogits,
         points: &[[f32; 2]],
         wholes: bool,
     ) -> Result<Vec<Proposal>> {

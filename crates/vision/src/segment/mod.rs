@@ -21,21 +21,8 @@ pub use photo_grid::PhotoGrid;
 use self::{judge::Judge, prompts::Prompts};
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Photo, PhotoMasks},
+    scene::{MaskLogits, Photo, PhotoMasks},
 };
-
-/// Masks of a batch of points, as logits: over 0 is inside.
-#[derive(Clone, Debug, Default)]
-pub struct Decoded {
-    /// Masks a point (K), from parts to the whole.
-    pub levels: usize,
-    /// `[width, height]` of the grid.
-    pub grid: [usize; 2],
-    /// `[B * K * height * width]`.
-    pub logits: Vec<f32>,
-    /// `[B * K]`.
-    pub predicted_iou: Vec<f32>,
-}
 
 /// A photo that points can be asked of.
 pub trait PromptDecoder: Sync {
@@ -49,7 +36,7 @@ pub trait PromptDecoder: Sync {
     ///
     /// # Errors
     /// What the network says.
-    fn decode(&self, points: &[[f32; 2]]) -> Result<Decoded>;
+    fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits>;
 }
 
 /// A point worth asking for, known from elsewhere: where a mask of another photo reappears.

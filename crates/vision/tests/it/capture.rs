@@ -1,7 +1,13 @@
 //! What the photos themselves say of a capture: on a room of known depth, and on real scenes with
 //! right and with spoilt cameras.
 
+use std::{
+    sync::atomic::{AtomicBool, Ordering},
+    time::Duration,
+};
+
 use segsplat_core::{
+    error::ErrorCode,
     limits::Limits,
     scene::{CameraToWorld, PosedPhoto, WarningCode},
 };
@@ -118,6 +124,44 @@ fn overlap_falls_with_distance_and_sets_follow_it() {
     assert_eq!(one.len(), 1);
     assert_eq!(one[0].views.len(), 9);
     assert_eq!(one, capture::view_sets(&capture, &posed, 16, 3), "deterministic");
+}
+
+#[test]
+fn one_picture_under_several_poses_is_named() {
+    let posed = sample::photos(&options(4)).unwrap();
+    let copied = |copies: usize| -> Vec<PosedPhoto> {
+        let mut photos = posed.clone();
+        for copy in &mut photos[1..copies] {
+            copy.photo = posed[0].photo.clone();
+        }
+        photos
+    };
+    let refused = capture::analyse(&copied(4)).unwrap_err();
+    assert_eq!(refused.code(), ErrorCode::InvalidRequest);
+    for (i, photo) in posed.iter().enumerate() {
+        let named = format!("photo {i} ({:?})", photo.file);
+        assert!(refused.message().contains(&named), "{refused}");
+    }
+    let warnings = capture::analyse(&copied(2)).unwrap().warnings;
+    let same = warnings.iter().find(|w| w.code == WarningCode::SamePicture).expect("a warning");
+    assert!(same.message.starts_with("photo 0 (") && same.message.contains("photo 1 ("));
+    assert!(!same.message.contains("photo 2 ("), "{}", same.message);
+    let right = capture::analyse(&posed).unwrap().warnings;
+    assert!(right.iter().all(|w| w.code != WarningCode::SamePicture), "{right:?}");
+}
+
+#[test]
+fn a_cancelled_capture_ends_between_two_comparisons() {
+    let posed = sample::photos(&options(24)).unwrap();
+    let cancel = AtomicBool::new(false);
+    let ended = std::thread::scope(|scope| {
+        let analysis = scope.spawn(|| capture::analyse_until(&posed, &cancel));
+        // The comparisons take seconds; the grey pictures of so few pixels take none.
+        std::thread::sleep(Duration::from_millis(100));
+        cancel.store(true, Ordering::Relaxed);
+        analysis.join().unwrap()
+    });
+    assert_eq!(ended.unwrap_err().code(), ErrorCode::Cancelled);
 }
 
 #[test]

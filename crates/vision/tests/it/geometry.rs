@@ -1,7 +1,10 @@
 //! A stand-in network whose answer is known (every pixel on the plane z = near of its camera):
 //! what comes out of it must lie where the photos' own cameras say, whatever their shape.
 
-use std::{collections::HashSet, sync::Arc};
+use std::{
+    collections::HashSet,
+    sync::{Arc, atomic::AtomicBool},
+};
 
 use glam::{DMat3, DMat4, DVec3};
 use segsplat_core::{
@@ -19,6 +22,8 @@ use crate::network_options;
 
 /// Depth of the plane, world units.
 const DEPTH: f64 = 4.0;
+
+static GO_ON: AtomicBool = AtomicBool::new(false);
 
 fn network() -> Option<Geometry> {
     let bundle = Bundle::open(&root().join("tests/fixtures/plane")).unwrap();
@@ -74,7 +79,7 @@ fn run(network: &Geometry, photos: &[PosedPhoto]) -> Result<Vec<ViewGaussians>> 
 
 fn lifted(network: &Geometry, photos: &[PosedPhoto]) -> Lifted {
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera).collect();
-    lift(run(network, photos).unwrap(), &cameras, &FuseOptions::default(), None).unwrap()
+    lift(run(network, photos).unwrap(), &cameras, &FuseOptions::default(), None, &GO_ON).unwrap()
 }
 
 #[test]

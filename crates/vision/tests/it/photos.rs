@@ -1,6 +1,6 @@
 //! Uploads as callers send them: what is read, and what is refused by which words.
 
-use std::io::Write;
+use std::{io::Write, sync::atomic::AtomicBool};
 
 use segsplat_core::{
     error::ErrorCode,
@@ -59,6 +59,14 @@ fn same_as_sent(got: &[PosedPhoto], want: &[PosedPhoto]) {
         let off = (a.matrix() - b.matrix()).to_cols_array();
         assert!(off.iter().all(|v| v.abs() < 1e-9), "{off:?}");
     }
+}
+
+#[test]
+fn a_cancelled_reading_ends_before_the_next_photo() {
+    let opengl = UploadCameras::Transforms(sample::transforms_json(&sent().0));
+    let upload = upload(opengl, sent().1);
+    let read = photos::read_until(&upload, &Limits::default(), &AtomicBool::new(true));
+    assert_eq!(read.unwrap_err().code(), ErrorCode::Cancelled);
 }
 
 #[test]

@@ -7,9 +7,9 @@ use std::sync::{
 
 use segsplat_core::{
     error::{ErrorCode, Result},
-    scene::{Photo, PhotoMasks},
+    scene::{MaskLogits, Photo, PhotoMasks},
 };
-use segsplat_vision::segment::{Decoded, PromptDecoder, Seed, Settings, everything, proposals};
+use segsplat_vision::segment::{PromptDecoder, Seed, Settings, everything, proposals};
 
 /// Cells of the grid each way; the photo fills its upper three quarters.
 const GRID: usize = 64;
@@ -43,9 +43,9 @@ impl PromptDecoder for Shapes {
 
     /// Levels: the shape near the point, nearer the whole, the whole. Nothing under the point: a
     /// mask that is not sure of itself.
-    fn decode(&self, points: &[[f32; 2]]) -> Result<Decoded> {
+    fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits> {
         self.asked.lock().unwrap().extend(points);
-        let mut decoded = Decoded { levels: 3, grid: [GRID; 2], ..Decoded::default() };
+        let mut decoded = MaskLogits { levels: 3, grid: [GRID; 2], ..MaskLogits::default() };
         for point in points {
             let [px, py] = point.map(f64::from);
             let shape = self.top(px, py);
@@ -178,7 +178,7 @@ fn a_cancelled_scene_stops_and_a_senseless_decoder_is_named() {
     assert_eq!(error.code(), ErrorCode::Cancelled, "{error}");
     cancel.store(false, Ordering::Relaxed);
 
-    struct Broken(Decoded, [u32; 2]);
+    struct Broken(MaskLogits, [u32; 2]);
     impl PromptDecoder for Broken {
         fn batch(&self) -> usize {
             8
@@ -186,15 +186,19 @@ fn a_cancelled_scene_stops_and_a_senseless_decoder_is_named() {
         fn placed(&self) -> (u32, [u32; 2]) {
             (64, self.1)
         }
-        fn decode(&self, _: &[[f32; 2]]) -> Result<Decoded> {
+        fn decode(&self, _: &[[f32; 2]]) -> Result<MaskLogits> {
             Ok(self.0.clone())
         }
     }
-    let whole =
-        Decoded { levels: 1, grid: [4, 4], logits: vec![1.0; 8 * 16], predicted_iou: vec![1.0; 8] };
-    let short = Decoded { logits: vec![1.0; 7], ..whole.clone() };
-    let flat = Decoded { grid: [0, 4], ..whole.clone() };
-    let none = Decoded { levels: 0, ..whole.clone() };
+    let whole = MaskLogits {
+        levels: 1,
+        grid: [4, 4],
+        logits: vec![1.0; 8 * 16],
+        predicted_iou: vec![1.0; 8],
+    };
+    let short = MaskLogits { logits: vec![1.0; 7], ..whole.clone() };
+    let flat = MaskLogits { grid: [0, 4], ..whole.clone() };
+    let none = MaskLogits { levels: 0, ..whole.clone() };
     for (decoded, placed) in
         [(short, [64, 64]), (flat, [64, 64]), (none, [64, 64]), (whole, [65, 0])]
     {
@@ -203,7 +207,7 @@ fn a_cancelled_scene_stops_and_a_senseless_decoder_is_named() {
         assert_eq!(error.code(), ErrorCode::Internal, "{error}");
         assert!(error.message().starts_with("masks:"), "{error}");
     }
-    let poison = Decoded {
+    let poison = MaskLogits {
         levels: 1,
         grid: [4, 4],
         logits: vec![f32::NAN; 8 * 16],

@@ -17,7 +17,7 @@ type Order = (std::cmp::Reverse<u64>, SceneId);
 
 /// Records of all scenes, each with a channel that keeps the newest.
 #[derive(Debug, Default)]
-pub(super) struct Board {
+pub(super) struct Records {
     inner: RwLock<Inner>,
 }
 
@@ -34,7 +34,7 @@ impl Inner {
     }
 }
 
-impl Board {
+impl Records {
     pub(super) fn insert(&self, record: Record) {
         let mut inner = self.inner.write().unwrap_or_else(PoisonError::into_inner);
         let (id, created) = (record.status.id.clone(), record.status.created_ms);
@@ -157,39 +157,39 @@ mod tests {
 
     #[test]
     fn pages_go_from_the_newest_and_miss_none_when_scenes_come_and_go() {
-        let board = Board::default();
+        let records = Records::default();
         for (byte, created) in [(1, 10), (2, 30), (3, 20), (4, 20)] {
-            board.insert(record(byte, created));
+            records.insert(record(byte, created));
         }
         let ids = |records: &[Record]| -> Vec<u8> {
             let digits = |r: &Record| r.status.id.as_str()[..2].to_owned();
             records.iter().map(|r| u8::from_str_radix(&digits(r), 16).unwrap()).collect()
         };
-        let (first, more) = board.page(None, 2, |_| true);
+        let (first, more) = records.page(None, 2, |_| true);
         assert_eq!((ids(&first), more), (vec![2, 3], true));
         let last = &first[1].status;
-        board.insert(record(9, 99));
-        board.remove(&last.id);
-        let (second, more) = board.page(Some((last.created_ms, last.id.clone())), 2, |_| true);
+        records.insert(record(9, 99));
+        records.remove(&last.id);
+        let (second, more) = records.page(Some((last.created_ms, last.id.clone())), 2, |_| true);
         assert_eq!((ids(&second), more), (vec![4, 1], false));
-        let (own, more) = board.page(None, 1, |record| record.owner.is_some());
+        let (own, more) = records.page(None, 1, |record| record.owner.is_some());
         assert_eq!((ids(&own), more), (vec![2], true), "more of one's own");
         let after = Some((own[0].status.created_ms, own[0].status.id.clone()));
-        let (own, more) = board.page(after, 1, |record| record.owner.is_some());
+        let (own, more) = records.page(after, 1, |record| record.owner.is_some());
         assert_eq!((ids(&own), more), (vec![4], false), "others' scenes are no more");
     }
 
     #[test]
     fn a_late_watcher_sees_the_present_state_and_a_deleted_scene_ends_as_cancelled() {
-        let board = Board::default();
-        board.insert(record(1, 0));
+        let records = Records::default();
+        records.insert(record(1, 0));
         let id = SceneId::from_bytes([1; 16]);
-        board.update(&id, |record| record.status.fraction = 0.5).unwrap();
-        let watcher = board.watch(&id).unwrap();
+        records.update(&id, |record| record.status.fraction = 0.5).unwrap();
+        let watcher = records.watch(&id).unwrap();
         assert!((watcher.borrow().status.fraction - 0.5).abs() < 1e-6);
-        assert!(board.remove(&id));
+        assert!(records.remove(&id));
         assert_eq!(watcher.borrow().status.state, SceneState::Cancelled);
         assert!(watcher.has_changed().is_err(), "no sender is left");
-        assert!(board.find(&id).is_none() && !board.remove(&id));
+        assert!(records.find(&id).is_none() && !records.remove(&id));
     }
 }

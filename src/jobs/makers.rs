@@ -1,0 +1,164 @@
+//! What turns photos into scenes and scenes into semantics: the pipeline, or a stand-in of a test.
+
+use std::sync::Arc;
+
+use crate::{
+    error::{Error, ErrorCode, Result},
+    pipeline::{
+        self, LateEngine, PhotoSet, Reconstruction,
+        semantics::{SceneParts, SemanticsOptions, understand},
+    },
+    scene::{PosedPhoto, Scene, SceneOptions, Semantics, TextEmbedding, Watch},
+};
+
+/// Where the networks of a maker stand.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Networks {
+    /// They are being opened; queued jobs wait for them.
+    Opening,
+    /// They are open, on this execution provider; empty: there are none to open.
+    Open(&'static str),
+    /// They do not open. No job is taken from the queue, so that none fails.
+    Broken,
+}
+
+/// Turns photos into scenes.
+pub trait SceneMaker: Send + Sync {
+    /// What else than photos and options decides the scene: sha256 of the bundle's manifest, hex;
+    /// empty where no network is used.
+    fn identity(&self) -> String {
+        String::new()
+    }
+
+    /// Whether its networks are open.
+    fn networks(&self) -> Networks {
+        Networks::Open("")
+    }
+
+    /// Does the whole work on the calling thread.
+    ///
+    /// # Errors
+    /// Any code; it becomes the scene's `error`.
+    fn make(
+        &self,
+        photos: &PhotoSet,
+        options: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<Reconstruction>;
+}
+
+/// What the bundle compares texts with, and how.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Phrases {
+    /// Canonical phrases: what a thing is called when nothing is known of it.
+    pub canon: Vec<String>,
+    /// Steepness of the comparison.
+    pub tau: f32,
+    /// Coverage under which a pixel has no semantics, 0..1.
+    pub coverage_floor: f32,
+}
+
+/// Makes the semantics of scenes, and embeds texts.
+pub trait SemanticsMaker: Send + Sync {
+    /// What the loaded bundle lacks for it, as in "no mask network"; `None` where nothing.
+    fn lacks(&self) -> Option<String>;
+
+    /// What the bundle compares texts with.
+    ///
+    /// # Errors
+    /// `model_unavailable`.
+    fn phrases(&self) -> Result<Phrases>;
+
+    /// Embeds texts, one after the other in their order. On the calling thread.
+    ///
+    /// # Errors
+    /// `model_unavailable`, `internal`.
+    fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>>;
+
+    /// Does the whole work on the calling thread. `photos` are those that the scene was made of.
+    ///
+    /// # Errors
+    /// Any code; it becomes the `error` of the scene's semantics.
+    fn make(&self, photos: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics>;
+}
+
+/// Makes no semantics: the bundle has no networks for them.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct NoSemantics;
+
+impl NoSemantics {
+    fn refusal() -> Error {
+        Error::new(ErrorCode::ModelUnavailable, "the bundle has no semantic networks")
+    }
+}
+
+impl SemanticsMaker for NoSemantics {
+    fn lacks(&self) -> Option<String> {
+        Some("no semantic networks".to_owned())
+    }
+
+    fn phrases(&self) -> Result<Phrases> {
+        Err(Self::refusal())
+    }
+
+    fn embed_texts(&self, _: &[String]) -> Result<Vec<TextEmbedding>> {
+        Err(Self::refusal())
+    }
+
+    fn make(&self, _: &[PosedPhoto], _: &Scene, _: Watch<'_>) -> Result<Semantics> {
+        Err(Self::refusal())
+    }
+}
+
+/// Makes scenes and semantics with the networks of an engine.
+#[derive(Clone, Debug)]
+pub struct PipelineMaker(pub Arc<LateEngine>);
+
+impl SceneMaker for PipelineMaker {
+    fn identity(&self) -> String {
+        self.0.bundle().sha256().to_owned()
+    }
+
+    fn networks(&self) -> Networks {
+        match self.0.peek() {
+            None => Networks::Opening,
+            Some(Ok(engine)) => Networks::Open(engine.geometry().provider().name()),
+            Some(Err(_)) => Networks::Broken,
+        }
+    }
+
+    fn make(
+        &self,
+        photos: &PhotoSet,
+        options: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<Reconstruction> {
+        pipeline::make(self.0.get()?, photos, options, watch)
+    }
+}
+
+impl SemanticsMaker for PipelineMaker {
+    fn lacks(&self) -> Option<String> {
+        self.0.bundle().lacks_semantics().map(str::to_owned)
+    }
+
+    fn phrases(&self) -> Result<Phrases> {
+        let towers = self.0.get()?.image_text()?;
+        let manifest = towers.manifest();
+        Ok(Phrases {
+            canon: manifest.canon.clone(),
+            tau: manifest.tau,
+            coverage_floor: manifest.coverage_floor,
+        })
+    }
+
+    fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
+        self.0.get()?.image_text()?.embed_texts(texts)
+    }
+
+    fn make(&self, photos: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics> {
+        let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
+        let parts = SceneParts { photos, cameras, gaussians };
+        understand(self.0.get()?, &parts, &SemanticsOptions::default(), watch)
+    }
+}

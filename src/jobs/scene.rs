@@ -1,0 +1,192 @@
+//! The job that makes a scene of photos, and keeps it.
+
+use std::{
+    sync::{Arc, PoisonError, atomic::Ordering},
+    time::{Duration, Instant},
+};
+
+use super::{
+    Shared,
+    job::{Job, Kind},
+};
+use crate::{
+    error::{Error, ErrorCode, Result},
+    scene::{
+        Scene, SceneId, SceneMeta, SceneState, SemanticsMode, SemanticsState, SemanticsStatus,
+        Stage,
+    },
+    store::{self, Record},
+    telemetry::meter,
+};
+
+/// Starts of one job before it is given up: a scene that kills the server must not do so forever.
+const ATTEMPTS_MAX: u32 = 3;
+
+/// An unfinished record as it stands before anybody makes it.
+pub(super) fn requeue(record: &mut Record) {
+    record.status.state = SceneState::Queued;
+    record.status.stage = None;
+    record.status.fraction = 0.0;
+}
+
+/// Leave to make a scene of some content; ends when dropped.
+struct ContentLock<'a> {
+    shared: &'a Shared,
+    content: String,
+}
+
+impl Drop for ContentLock<'_> {
+    fn drop(&mut self) {
+        let mut contents = self.shared.contents.lock().unwrap_or_else(PoisonError::into_inner);
+        contents.remove(&self.content);
+        drop(contents);
+        self.shared.content_made.notify_all();
+    }
+}
+
+impl Shared {
+    pub(super) fn make_scene(&self, job: &Job) -> Result<()> {
+        let (begun, id, store) = (Instant::now(), &job.scene, &self.parts.store);
+        let Some(record) = self.records.update(id, |record| {
+            record.attempts += 1;
+            record.status.state = SceneState::Running;
+            record.status.updated_ms = store::now_ms();
+        }) else {
+            return Ok(());
+        };
+        let waited_ms = record.status.updated_ms.saturating_sub(record.status.created_ms);
+        meter::stage("wait", Duration::from_millis(waited_ms).as_secs_f64());
+        if record.attempts > ATTEMPTS_MAX {
+            return Err(Error::internal(format!(
+                "given up: the server stopped {ATTEMPTS_MAX} times while making this scene"
+            )));
+        }
+        store.put_record(&record)?;
+        if record.attempts > 1
+            && let Some((scene, digest)) = self.made_before(id)?
+        {
+            return self.finish(&scene, digest, None);
+        }
+        let networks = self.parts.maker.identity();
+        let files = match self.uploads.find(id) {
+            Some(upload) => upload.files.clone(),
+            None => store::hashes(&store.upload(id)?),
+        };
+        let provenance = store::provenance(files, &record.options, &networks);
+        let _lock = self.lock_content(&provenance.content_sha256, job);
+        if let Some(known) = self.made_of(&provenance.content_sha256, &record)? {
+            tracing::info!(scene = %id, of = %known.meta.id, "made before of the same content");
+            return self.copy(&record, &known);
+        }
+        let made = self.within_time(job, |watch| {
+            (watch.progress)(Stage::Photos, 0.0);
+            let upload = self.photos(id, watch)?;
+            if record.options.semantics == SemanticsMode::Eager {
+                self.uploads.keep(id, Arc::clone(&upload));
+            } else {
+                self.uploads.forget(id);
+            }
+            self.parts.maker.make(&upload.photos, &record.options, watch)
+        })?;
+        self.show(job, Stage::Store, 0.0);
+        let took = u64::try_from(begun.elapsed().as_millis()).unwrap_or(u64::MAX);
+        let before = self.scene_ms.load(Ordering::Relaxed);
+        let smoothed = if before == 0 { took } else { (3 * before + took) / 4 };
+        self.scene_ms.store(smoothed.max(1), Ordering::Relaxed);
+        let scene = made.into_scene(id.clone(), record.status.created_ms, provenance);
+        let (scene, digest) = store.put_scene(scene)?;
+        self.finish(&scene, digest, None)
+    }
+
+    /// Keeps under this record what was made of the same content before.
+    fn copy(&self, record: &Record, known: &Scene) -> Result<()> {
+        let id = &record.status.id;
+        let created_ms = record.status.created_ms;
+        let meta = SceneMeta { id: id.clone(), created_ms, ..known.meta.clone() };
+        let (mut scene, digest) = self.parts.store.put_scene(Scene { meta, ..known.clone() })?;
+        let mut semantics_digest = None;
+        if let Some(semantics) = &known.semantics {
+            let kept = self.parts.store.put_semantics(id, (**semantics).clone())?;
+            (scene, semantics_digest) = (kept.0, Some(kept.1));
+        }
+        self.finish(&scene, digest, semantics_digest)
+    }
+
+    /// What an earlier attempt had made and kept, before it was cut off, and its digest.
+    fn made_before(&self, id: &SceneId) -> Result<Option<(Arc<Scene>, String)>> {
+        match self.parts.store.scene(id) {
+            Ok(scene) => {
+                let digest = self.parts.store.scene_digest(id)?;
+                Ok(digest.map(|digest| (scene, digest)))
+            }
+            Err(e) if matches!(e.code(), ErrorCode::SceneNotFound | ErrorCode::SceneCorrupt) => {
+                Ok(None)
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    /// The finished scene of this content and owner, where there is one and it is sound.
+    fn made_of(&self, content: &str, record: &Record) -> Result<Option<Arc<Scene>>> {
+        let (store, owner) = (&self.parts.store, record.owner.as_deref());
+        let Some(id) = store.scene_of_content(owner, content)? else { return Ok(None) };
+        if id == record.status.id {
+            return Ok(None);
+        }
+        // Whatever is wrong with it, this one can be made.
+        let scene = store.scene(&id).ok();
+        Ok(scene.filter(|scene| scene.meta.provenance.content_sha256 == content))
+    }
+
+    /// Waits until no other worker here makes a scene of the same content.
+    fn lock_content(&self, content: &str, job: &Job) -> ContentLock<'_> {
+        let mut contents = self.contents.lock().unwrap_or_else(PoisonError::into_inner);
+        while contents.contains(content) && job.stopped().is_none() {
+            let waited = self.content_made.wait_timeout(contents, Duration::from_millis(50));
+            contents = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        contents.insert(content.to_owned());
+        ContentLock { shared: self, content: content.to_owned() }
+    }
+
+    /// The scene is kept under its digest, and its semantics under theirs: its record is kept,
+    /// then its watchers are told.
+    fn finish(&self, scene: &Scene, digest: String, semantics: Option<String>) -> Result<()> {
+        let (store, meta, id) = (&self.parts.store, &scene.meta, &scene.meta.id);
+        // In the store first, so that a watcher who sees `done` may pull the plug.
+        let Some(mut done) = self.records.find(id) else { return Ok(()) };
+        let content = &meta.provenance.content_sha256;
+        done.scene_sha256 = Some(digest);
+        done.content_sha256 = Some(content.clone()).filter(|hash| !hash.is_empty());
+        done.replica = None;
+        done.status.state = SceneState::Done;
+        done.status.stage = None;
+        done.status.fraction = 1.0;
+        done.status.updated_ms = store::now_ms();
+        done.status.report = Some(meta.report.clone());
+        done.status.cameras.clone_from(&meta.cameras);
+        if let (Some(digest), Some(semantics)) = (semantics, &scene.semantics) {
+            done.semantics_sha256 = Some(digest);
+            done.status.semantics = SemanticsStatus::ready(semantics.report.clone());
+        }
+        store.put_record(&done)?;
+        if !content.is_empty() {
+            store.put_content(done.owner.as_deref(), content, id)?;
+        }
+        // In one change, so that no watcher takes `done` for the end.
+        let ready = done.status.semantics.state == SemanticsState::Ready;
+        let eager = done.options.semantics == SemanticsMode::Eager && !ready;
+        if eager {
+            done.status.semantics = SemanticsStatus::new(SemanticsState::Running);
+        }
+        let owner = done.owner.clone();
+        self.records.update(id, |record| *record = done);
+        tracing::info!(scene = %id, "done");
+        if eager {
+            self.queue.push(Kind::Semantics, id.clone(), owner.as_deref());
+        } else if !self.parts.keep_photos {
+            store.drop_upload(id)?;
+        }
+        Ok(())
+    }
+}

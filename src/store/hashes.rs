@@ -1,0 +1,120 @@
+//! What two uploads, or two requests, have in common: hashes over canonical bytes.
+//!
+//! Nothing here reads the `Debug` text of a type: renaming a field must not change a kept hash.
+
+use std::collections::BTreeMap;
+
+use serde_json::Value;
+use sha2::{Digest, Sha256};
+
+use super::files::hex;
+use crate::scene::{Density, PhotoHash, Provenance, SceneOptions, SemanticsMode};
+
+/// sha256 over files and options, hex: what an idempotency key stands for.
+#[must_use]
+pub fn request_sha256(files: &[PhotoHash], options: &SceneOptions) -> String {
+    hash(files, &canonical(options))
+}
+
+/// What a scene is made of: photos and cameras in their order, options, and the networks by the
+/// sha256 of their bundle (hex; empty where none is used), with the hash over all of it.
+#[must_use]
+pub fn provenance(files: Vec<PhotoHash>, options: &SceneOptions, networks: &str) -> Provenance {
+    let program_version = env!("CARGO_PKG_VERSION").to_owned();
+    let rest = format!("{} {networks} {program_version}", canonical(options));
+    Provenance {
+        content_sha256: hash(&files, &rest),
+        files,
+        bundle_sha256: networks.to_owned(),
+        options: options.clone(),
+        program_version,
+    }
+}
+
+/// Whether a kept hash is that of this request, also where an earlier program wrote it.
+pub(crate) fn is_of_request(kept: &str, files: &[PhotoHash], options: &SceneOptions) -> bool {
+    kept == request_sha256(files, options) || kept == hash(files, &before_canonical(options))
+}
+
+fn hash(files: &[PhotoHash], rest: &str) -> String {
+    let mut hash = Sha256::new();
+    for file in files {
+        // The length of the name first, so that no two lists of files read the same.
+        hash.update((file.file.len() as u64).to_le_bytes());
+        hash.update(&file.file);
+        hash.update(&file.sha256);
+    }
+    hash.update(rest);
+    hex(&hash.finalize())
+}
+
+/// The options that differ from the defaults, as JSON sorted by name: an option that a later
+/// program adds changes no hash of a request that does not use it.
+fn canonical(options: &SceneOptions) -> String {
+    let fields = |options: &SceneOptions| match serde_json::to_value(options) {
+        Ok(Value::Object(fields)) => fields.into_iter().collect(),
+        _ => BTreeMap::new(),
+    };
+    let default = fields(&SceneOptions::default());
+    let mut set = fields(options);
+    set.retain(|name, value| default.get(name) != Some(value));
+    Value::Object(set.into_iter().collect()).to_string()
+}
+
+/// The text that was hashed for the options before [`canonical`] was. An option that no such
+/// program had is left out.
+fn before_canonical(options: &SceneOptions) -> String {
+    let SceneOptions { max_views, semantics, density } = options;
+    let semantics = match semantics {
+        SemanticsMode::Lazy => "Lazy",
+        SemanticsMode::Eager => "Eager",
+        SemanticsMode::Off => "Off",
+    };
+    let density = match density {
+        Density::Thinned => "Thinned",
+        Density::Full => "Full",
+    };
+    let max_views = max_views.map_or("None".to_owned(), |views| format!("Some({views})"));
+    format!("SceneOptions {{ max_views: {max_views}, semantics: {semantics}, density: {density} }}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn files() -> Vec<PhotoHash> {
+        vec![PhotoHash { file: "a.png".to_owned(), sha256: "ab".repeat(32) }]
+    }
+
+    #[test]
+    fn hashes_are_of_canonical_bytes_and_stay_as_they_are() {
+        let set = SceneOptions { max_views: Some(4), ..SceneOptions::default() };
+        assert_eq!(canonical(&SceneOptions::default()), "{}");
+        assert_eq!(canonical(&set), r#"{"max_views":4}"#);
+        // Kept in stores: these must not change.
+        let kept = [&SceneOptions::default(), &set].map(|o| request_sha256(&files(), o));
+        assert_eq!(kept, KEPT, "requests hash as they always did");
+        let content = |networks| provenance(files(), &set, networks).content_sha256;
+        assert_ne!(content("n"), content("m"));
+    }
+
+    const KEPT: [&str; 2] = [
+        "b7bd00d38ce6aaa41c0f929fbb8971a3c739290c1f29d43e4d7466783ed1f611",
+        "8249305ff777f2e2298755ba26fb029c872ef1f89eb1cb9e8addc6ecb6ce556d",
+    ];
+
+    #[test]
+    fn a_hash_of_an_earlier_program_is_recognised() {
+        let options = SceneOptions {
+            max_views: Some(4),
+            semantics: SemanticsMode::Off,
+            density: Density::Full,
+        };
+        // What the program before the canonical hash wrote for these files and options.
+        let kept = "6f9d5ef2fc62ff0b280c3e5cf5abb1e2f47730a52713ab25b33b5dea8e4c8c22";
+        assert!(is_of_request(kept, &files(), &options));
+        assert!(is_of_request(&request_sha256(&files(), &options), &files(), &options));
+        assert!(!is_of_request(kept, &files(), &SceneOptions::default()));
+        assert!(!is_of_request(kept, &[], &options), "other files");
+    }
+}
