@@ -5,7 +5,7 @@
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
 # make eval-scenes   labelled scenes of held-out things, rendered to target/eval/scenes (g++, PYTHON)
 # make report   the tables of docs/benchmarks.md from benches/runs
-# make plots   docs/plots from benches/runs (PYTHON with matplotlib)
+# make plots   docs/plots from docs/measurements/runs (PYTHON with matplotlib)
 # make test-long   the random tests with many more cases, and the slow ones
 # make fuzz    every reader of bytes from outside, FUZZ_SECONDS=600 each
 
@@ -77,7 +77,7 @@ eval-scenes:
 		--out $(TARGET)/eval/scenes
 
 plots:
-	$(PYTHON) benches/plots.py benches/runs docs/plots
+	$(PYTHON) benches/plots.py docs/measurements/runs docs/plots
 
 build: setup
 	$(CARGO) build --locked --release

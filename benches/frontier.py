@@ -1,8 +1,8 @@
-"""Time against error: runs `segsplat bench` over counts, sizes, qualities and banks.
+"""Time against error: runs `segsplat-lab frames` over counts, sizes, qualities and banks.
 
-    python frontier.py SEGSPLAT OUT.jsonl --renderer gpu|cpu [--adapter NAME --threads N --quick]
+    python frontier.py LAB OUT.jsonl --renderer gpu|cpu [--adapter NAME --threads N --quick]
 
-Each line of OUT is one report of the bench with the error against the f64 oracle at 4,096 pixels
+Each line of OUT is one row of it with the error against the f64 oracle at 4,096 pixels
 (for labels: against the CPU renderer), and what was asked. `make plots` draws them."""
 
 import argparse
@@ -10,7 +10,7 @@ import json
 import subprocess
 
 parser = argparse.ArgumentParser()
-parser.add_argument("segsplat")
+parser.add_argument("lab")
 parser.add_argument("out")
 parser.add_argument("--renderer", required=True, choices=["gpu", "cpu"])
 parser.add_argument("--adapter")
@@ -35,7 +35,7 @@ with open(args.out, "w") as out:
             continue  # the same as exact
         frames = 5 if args.renderer == "cpu" and gaussians > 200_000 else 30
         command = [
-            args.segsplat, "bench", "--json", "--renderer", args.renderer,
+            args.lab, "--table", "frontier", "frames", "--renderer", args.renderer,
             "--gaussians", str(gaussians), "--width", str(width), "--size", str(height),
             "--frames", str(frames), "--quality", quality,
             "--compare", "cpu" if labels else "oracle",
@@ -50,10 +50,9 @@ with open(args.out, "w") as out:
         if done.returncode:
             raise SystemExit(f"{' '.join(command)}: {done.stderr}")
         report = json.loads(done.stdout)
-        row = {"renderer": args.renderer, "quality": quality, "labels": labels, "report": report}
-        out.write(json.dumps(row) + "\n")
+        out.write(done.stdout)
         out.flush()
-        found = report["labels"]["compared"] if labels else report["compared"]
+        found = report["error"]["labels" if labels else "picture"]
         device = report["device"]
         print(gaussians, width, height, quality, labels, f"{report['median_ms']:.3f} ms",
               f"device {device['total_ms']:.3f} ms" if device else "", found, flush=True)

@@ -1,4 +1,4 @@
-"""Draws docs/plots/*.svg from benches/runs/*.jsonl (needs matplotlib): `make plots`.
+"""Draws docs/plots/*.svg from the rows of a folder (needs matplotlib): `make plots`.
 
 Every time stands beside its error: the oracle's for our renderers, ours for the peers."""
 
@@ -23,7 +23,15 @@ STYLE = {("gpu", "exact"): "C0o-", ("gpu", "fast"): "C2s--", ("cpu", "exact"): "
 def rows(pattern):
     for path in sorted(runs.glob(pattern)):
         for line in path.read_text().splitlines():
-            yield json.loads(line)
+            row = json.loads(line)
+            if "error" in row and "report" not in row:  # a row of segsplat-lab frames
+                error, labels = row["error"], row["labels"]
+                found = {**error["picture"], "worst": error["picture"]["max"]}
+                row = {"renderer": "cpu" if row["renderer"] == "cpu" else "gpu",
+                       "quality": row["quality"],
+                       "labels": labels and [labels["labels"], labels["bank"]],
+                       "report": {**row, "size": row["height"], "compared": found}}
+            yield row
 
 
 def time_ms(row):

@@ -1,4 +1,4 @@
-"""Compiles gsplat's CUDA extension for forward passes of 3 and 32 channels only (a fifth of the
+"""Compiles gsplat's CUDA extension for forward passes of 3, 4 and 32 channels only (a fifth of the
 compile time; 24 channels are padded to 32 by gsplat itself) and copies it to a folder.
 
     python build_gsplat.py SITE OUT
@@ -17,7 +17,7 @@ for path in [*csrc.glob("csrc/*.cu"), *csrc.glob("csrc/*.cpp")]:
     text = path.read_text()
     kept = re.sub(
         r"^(\s*)(__INS__|__LAUNCH_KERNEL__)\((\d+)\)\s*$",
-        lambda m: m[0] if m[3] in ("3", "32") else "",
+        lambda m: m[0] if m[3] in ("3", "4", "32") else "",
         text,
         flags=re.M,
     )

@@ -1,10 +1,13 @@
-"""gsplat and `segsplat bench` on one GPU and one scene, in turn.
+"""gsplat and `segsplat-lab frames` on one GPU and one scene, in turn.
 
-    python gsplat_peer.py SITE OUT SEGSPLAT [--gaussians N --width W --height H --rounds R ...]
+    python gsplat_peer.py SITE OUT LAB [--gaussians N --width W --height H --rounds R ...]
 
-SITE holds gsplat (see build_gsplat.py), OUT takes the raw figures (peers.jsonl). gsplat is timed by
-CUDA events around what it is asked for, our renderer by its own timestamps around the same: neither
-reads anything back."""
+SITE holds gsplat (see build_gsplat.py), LAB is the program segsplat-lab, OUT takes one row.
+Two comparisons, each of like with like. Call: the wall time from the call until the picture lies
+in the host's memory, for both. Kernels: the sum of the kernels' own times by PyTorch's profiler
+against the sum of our dispatches' times by the device's clock. gsplat blends a text's mask in two
+ways: its usual one (24 channels, decoded, compared with the texts), and ours (four scalars a
+Gaussian)."""
 
 import argparse
 import json
@@ -12,11 +15,12 @@ import pathlib
 import statistics
 import subprocess
 import sys
+import time
 
 parser = argparse.ArgumentParser()
 parser.add_argument("site")
 parser.add_argument("out", type=pathlib.Path)
-parser.add_argument("segsplat")
+parser.add_argument("lab", nargs="+", help="segsplat-lab, or a program that answers as it does")
 parser.add_argument("--gaussians", type=int, default=5_896_178)
 parser.add_argument("--width", type=int, default=1920)
 parser.add_argument("--height", type=int, default=1080)
@@ -31,13 +35,13 @@ sys.path.insert(0, args.site)
 import torch  # noqa: E402
 from gsplat import rasterization  # noqa: E402
 from safetensors.torch import load_file  # noqa: E402
+from torch.profiler import ProfilerActivity, profile  # noqa: E402
 
-args.out.mkdir(parents=True, exist_ok=True)
-scene_file = args.out / "scene.safetensors"
+scene_file = args.out.with_suffix(".safetensors")
 command = [
-    args.segsplat, "bench", "--renderer", "gpu", "--gaussians", str(args.gaussians),
+    *args.lab, "frames", "--renderer", "gpu", "--gaussians", str(args.gaussians),
     "--size", str(args.height), "--width", str(args.width), "--frames", str(args.frames),
-    "--labels", "blend", "--bank", str(args.bank), "--json",
+    "--labels", "blend", "--bank", str(args.bank),
 ]
 
 
@@ -60,6 +64,7 @@ shared = dict(
 )
 one_hot = torch.nn.functional.one_hot(scene["index"].long(), args.bank + 1)[:, 1:].float()
 torch.manual_seed(1)
+scalars = torch.rand(len(one_hot), 4).cuda()
 bank = torch.nn.functional.normalize(torch.randn(args.bank, args.features), dim=1).cuda()
 texts = torch.nn.functional.normalize(torch.randn(args.texts, args.features), dim=1).cuda()
 
@@ -70,59 +75,77 @@ def colour(packed):
 
 
 def mask(packed):
-    """The usual road: 24 blended channels, decoded, brought to unit length, compared."""
+    """gsplat's usual way: 24 blended channels, decoded, brought to unit length, compared."""
     weights = rasterization(colors=one_hot, packed=packed, **shared)[0][0]
     seen = torch.nn.functional.normalize(weights.reshape(-1, args.bank) @ bank, dim=1)
     cosines = seen @ texts.T
     scores = torch.sigmoid(10 * (cosines[:, :1] - cosines[:, 1:])).amin(1)
-    return scores >= 0.5
+    return (scores >= 0.5,)
 
 
-def timed(work):
+def mask_of_scalars(packed):
+    """Our way: four scalars a Gaussian, blended."""
+    return rasterization(colors=scalars, packed=packed, **shared)[:1]
+
+
+def call_ms(work):
     times = []
     for i in range(args.frames + 3):
-        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-        start.record()
-        work()
-        end.record()
-        end.synchronize()
-        if i >= 3:
-            times.append(start.elapsed_time(end))
-    return statistics.median(times)
+        begun = time.perf_counter()
+        [picture.cpu() for picture in work()]
+        times.append(1e3 * (time.perf_counter() - begun))
+    return statistics.median(times[3:])
+
+
+def kernel_ms(work):
+    work()
+    torch.cuda.synchronize()
+    with profile(activities=[ProfilerActivity.CUDA, ProfilerActivity.CPU]) as seen:
+        for _ in range(args.frames):
+            work()
+        torch.cuda.synchronize()
+    total = sum(event.self_device_time_total for event in seen.key_averages()
+                if event.device_type == torch.autograd.DeviceType.CUDA)
+    return 1e-3 * total / args.frames
+
+
+def kernels_of(times):
+    return sum(stage["ms"] for stage in times["stages"])
 
 
 with torch.inference_mode():
     seen, alpha = (picture[0] for picture in colour(False))
     apart = (seen + (1 - alpha) * camera[23:26].cuda() - scene["color"]).abs()
-    rows = []
+    found = {}
     for turn in range(args.rounds):
         # The faster of gsplat's two layouts is taken for each.
-        theirs = {
-            "colour_ms": min(timed(lambda: colour(p)) for p in (False, True)),
-            "mask_ms": min(timed(lambda: mask(p)) for p in (False, True)),
-        }
+        for name, work in (("colour", colour), ("mask_24", mask), ("mask_4", mask_of_scalars)):
+            for what, measure in (("call_ms", call_ms), ("kernels_ms", kernel_ms)):
+                best = min(measure(lambda: work(packed)) for packed in (False, True))
+                found.setdefault(f"gsplat {name} {what}", []).append(best)
         report = ours()
-        row = {
-            "round": turn,
-            "gaussians": report["gaussians"],
-            "width": report["width"],
-            "height": report["size"],
-            "gsplat": theirs,
-            "segsplat": {
-                "colour_ms": report["device"]["total_ms"],
-                "mask_ms": report["labels"]["device"]["total_ms"],
-                "stages": report["device"]["stages"],
-                "mask_stages": report["labels"]["device"]["stages"],
-            },
-            "difference": {"max": apart.max().item(), "mean": apart.mean().item(),
-                           "psnr_db": -10 * apart.double().square().mean().log10().item(),
-                           "over_1_255": (apart.amax(-1) > 1 / 255).sum().item()},
-        }
-        rows.append(row)
-        print(json.dumps({k: v for k, v in row.items()}), flush=True)
-with open(args.out / "peers.jsonl", "a") as file:
-    file.writelines(json.dumps(row) + "\n" for row in rows)
-middle = lambda who, what: statistics.median(row[who][what] for row in rows)  # noqa: E731
-for what in ("colour_ms", "mask_ms"):
-    mine, theirs = middle("segsplat", what), middle("gsplat", what)
-    print(f"{what}: segsplat {mine:.3f}, gsplat {theirs:.3f}, {theirs / mine:.2f} times")
+        labels = report["labels"]
+        for name, value in (
+            ("colour call_ms", labels["color_ms"]), ("mask call_ms", labels["labels_ms"]),
+            ("colour kernels_ms", kernels_of(report["device"])),
+            ("mask kernels_ms", kernels_of(labels["device"])),
+            ("colour device_ms", report["device"]["total_ms"]),
+            ("mask device_ms", labels["device"]["total_ms"]),
+        ):
+            found.setdefault(f"segsplat {name}", []).append(value)
+row = {
+    **{key: first[key] for key in ("commit", "machine", "gaussians", "width", "height")},
+    "table": "gsplat",
+    "command": f"gsplat_peer.py SITE OUT LAB --gaussians {args.gaussians} --width {args.width} "
+               f"--height {args.height} --frames {args.frames} --rounds {args.rounds}",
+    "gsplat_version": "1.5.3", "torch": torch.__version__, "rounds": args.rounds,
+    "error": {"max": apart.max().item(), "mean": apart.mean().item(),
+              "psnr_db": -10 * apart.double().square().mean().log10().item(),
+              "over_1_255": (apart.amax(-1) > 1 / 255).sum().item()},
+    **{who: {key.split(" ", 1)[1].replace(" ", "_"): statistics.median(values)
+             for key, values in found.items() if key.startswith(who)}
+       for who in ("segsplat", "gsplat")},
+}
+with open(args.out, "a") as file:
+    file.write(json.dumps(row) + "\n")
+print(json.dumps(row))

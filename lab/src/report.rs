@@ -39,6 +39,8 @@ struct Tables {
 #[serde(deny_unknown_fields)]
 struct Table {
     name: String,
+    /// Table that the rows belong to, where it is another.
+    rows: Option<String>,
     /// Heading and template of each column.
     columns: Vec<[String; 2]>,
     /// Template of what the rows of one line share.
@@ -81,7 +83,10 @@ pub fn page(root: &Path, old: &str) -> Result<String> {
     let mut page = old.to_owned();
     for table in &tables.table {
         let begin = format!("<!-- table: {} -->\n", table.name);
-        let of_table = rows.get(&table.name).map(Vec::as_slice).unwrap_or_default();
+        let of_table = rows
+            .get(table.rows.as_ref().unwrap_or(&table.name))
+            .map(Vec::as_slice)
+            .unwrap_or_default();
         let place = page
             .split_once(&begin)
             .and_then(|(before, rest)| Some((before, rest.split_once("<!-- end -->")?.1)));
@@ -232,6 +237,7 @@ mod tests {
     fn rows_of_one_key_are_one_line() {
         let table = Table {
             name: "t".to_owned(),
+            rows: None,
             columns: vec![
                 ["scene".to_owned(), "{key}".to_owned()],
                 ["2".to_owned(), "{2.db:.1}".to_owned()],

@@ -2,4 +2,5 @@
 #![allow(clippy::panic, clippy::print_stdout, clippy::unwrap_used, reason = "tests")]
 
 mod frames;
+mod report;
 mod semantics;

@@ -1,6 +1,6 @@
 """Compares our masks with those of Segment Anything's own everything-mode on the same networks.
 
-    segsplat eval masks SCENES --dump OUT [--bundle DIR]
+    segsplat-lab masks SCENES --dump OUT [--bundle DIR]
     python3 official_masks.py OUT BUNDLE_DIR [--report FILE]
 
 OUT holds each photo as our networks saw it (PNG) and our masks before level choice and before the

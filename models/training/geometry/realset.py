@@ -1,5 +1,5 @@
 """Packs the evaluation triples of the shared real scenes for `train.py --real`: looked at, never
-trained on. The figure that counts is `segsplat eval`, through the shipped ONNX and the product's
+trained on. The figure that counts is `segsplat-lab photos`, through the shipped ONNX and the product's
 renderer; this is the same protocol in PyTorch, with depth ranges from a plain plane sweep.
 
     python realset.py --scenes ../../../../shared/data/scenes --out /tmp/realset.pt

@@ -1,4 +1,6 @@
-"""Twenty labelled scenes for evaluation, rendered from meshes that training never sees.
+"""Twenty labelled scenes for evaluation, of meshes that the training of masks and words never sees.
+
+The training of geometry saw 69 of these 74 meshes.
 
     python eval_scenes.py --data ../../../../shared/data --out ../../../target/eval/scenes
 

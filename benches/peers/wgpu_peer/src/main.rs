@@ -1,4 +1,4 @@
-//! wgpu-3dgs-viewer and `segsplat bench` on one adapter and one scene, in turn.
+//! wgpu-3dgs-viewer and `segsplat-lab frames` on one adapter and one scene, in turn.
 //!
 //!     wgpu_peer OUT SEGSPLAT ADAPTER [GAUSSIANS WIDTH HEIGHT FRAMES ROUNDS]
 //!
@@ -26,7 +26,7 @@ type Result<T> = std::result::Result<T, Box<dyn Error>>;
 const TARGET: wgpu::TextureFormat = wgpu::TextureFormat::Rgba16Float;
 const PIXEL_BYTES: u32 = 8;
 
-/// The scene, camera and picture that `segsplat bench --dump` writes.
+/// The scene, camera and picture that `segsplat-lab frames --dump` writes.
 struct Dump {
     gaussians: Vec<Gaussian>,
     camera: Vec<f32>,
@@ -254,7 +254,7 @@ fn main() -> Result<()> {
     let ours = |more: &[&str]| -> Result<Value> {
         let numbers = [gaussians, height, width, frames].map(|number| number.to_string());
         let done = Command::new(segsplat)
-            .args(["bench", "--renderer", "gpu", "--adapter", adapter, "--json"])
+            .args(["frames", "--renderer", "gpu", "--adapter", adapter])
             .args(["--gaussians", &numbers[0], "--size", &numbers[1], "--width", &numbers[2]])
             .args(["--frames", &numbers[3]])
             .args(more)
