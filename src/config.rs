@@ -101,8 +101,8 @@ pub struct ServerArgs {
     /// Origins whose pages may call, as `https://example.org`, or * for all [default: none]
     #[arg(long, env = "SEGSPLAT_CORS_ORIGINS", value_delimiter = ',', value_name = "ORIGINS")]
     pub cors_origins: Option<Vec<String>>,
-    /// Hosts that calls may name beside loopback and the listened address, or * for all [default: all
-    /// with --keys, else none]
+    /// Hosts that calls may name beside loopback and the listened address, or * for all
+    /// [default: all with --keys, else none]
     #[arg(long, env = "SEGSPLAT_ALLOWED_HOSTS", value_delimiter = ',', value_name = "HOSTS")]
     pub allowed_hosts: Option<Vec<String>>,
     /// Milliseconds to serve on, not ready, after SIGTERM, so that balancers look away [default: 0]

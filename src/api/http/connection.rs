@@ -32,14 +32,14 @@ use crate::{
     limits::Limits,
 };
 
-/// Bytes by which HTTP/1.1 and HTTP/2 can be told apart, and the reader's own time limit takes over.
+/// After this many bytes HTTP/1.1 and HTTP/2 differ, and the reader's own time limit begins.
 const PREFACE_BYTES: usize = 24;
 
 /// Serves `app` on one connection until either side ends it, or `stopping` becomes true: then it
 /// finishes its open calls.
 ///
-/// A head that is not whole after `head_max` ends the connection, and so does a peer that answers no
-/// HTTP/2 ping in that time.
+/// The connection ends if a head is not whole after `head_max`, or if the peer answers no HTTP/2
+/// ping in that time.
 pub(super) async fn serve<S>(
     stream: S,
     app: Router,
@@ -72,8 +72,8 @@ pub(super) async fn serve<S>(
     }
 }
 
-/// A stream whose first bytes must come in time. The server's own limit on heads begins only when it
-/// knows the protocol, which a silent caller never tells.
+/// A stream whose first bytes must come in time. The server's own limit on heads begins when it
+/// knows the protocol. A silent caller never tells it.
 struct FirstBytes<S> {
     stream: S,
     /// Runs until the protocol is known or something is answered.

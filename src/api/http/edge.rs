@@ -155,7 +155,7 @@ fn watch_body(request: Request, pace: Pace) -> (Request, TooSlow) {
     (Request::from_parts(parts, body), too_slow)
 }
 
-/// Every host that a call names: that of its target, which is `:authority` in HTTP/2, and those of its
+/// Every host that a call names: the host of its target (`:authority` in HTTP/2) and those of its
 /// `host` headers.
 fn hosts_of(request: &Request) -> impl Iterator<Item = &str> {
     let named = request.headers().get_all(header::HOST).iter();

@@ -160,8 +160,8 @@ fn insert(files: &mut HashMap<String, Vec<u8>>, path: String, bytes: Vec<u8>) ->
 
 fn unzip(bytes: &[u8], limits: &Limits) -> Result<HashMap<String, Vec<u8>>> {
     let damaged = |e| Error::photo("archive: the zip is damaged or cut short").caused_by(e);
-    // Unlike `ZipArchive` it reads no entry before it is asked to, so that their number, in ZIP64 too,
-    // is checked first; and it keeps entries that share a name.
+    // `ZipArchive` reads all entries when it opens. This reads none before it is asked to, so their
+    // number is checked first, in ZIP64 too. It also keeps entries that share a name.
     let config = zip::read::Config::default();
     let mut zip = ZipIterable::try_new(Cursor::new(bytes), config).map_err(damaged)?;
     if zip.len() > limits.archive_entries_max {
