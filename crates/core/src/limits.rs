@@ -93,8 +93,8 @@ pub struct Limits {
     pub cache_bytes_max: u64,
     /// Bytes of scenes kept on one GPU device: what a card of 8 GB has to spare beside its frames.
     pub device_scene_bytes_max: u64,
-    /// Milliseconds in which the head of a request must come, from the connection's start or the end
-    /// of the call before it. A connection that sends none in this time is closed.
+    /// Milliseconds in which the head of a request must come, from the connection's start or the
+    /// end of the call before it. A connection that sends none in this time is closed.
     pub head_timeout_ms: u64,
     /// Bytes that a request's body must bring in each `body_window_ms` that it is waited for.
     pub body_bytes_min: usize,

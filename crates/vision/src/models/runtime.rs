@@ -1,10 +1,10 @@
 //! ONNX Runtime: it is found, checked by sha256 and loaded once in a process, never at build time.
 //!
-//! Search order: `--ort-library` / `SEGSPLAT_ORT_LIBRARY`, `ORT_DYLIB_PATH`, beside the executable,
-//! `../share/segsplat`, `target/ort` of the checkout or of the working folder, the system's folders.
-//! A library that the operator *named* is always loaded. A warning tells when its hash is not pinned
-//! (a CUDA build, a newer release). A library that was only *found* must be one of the pinned
-//! builds. Else the start is refused.
+//! Search order: `--ort-library` / `SEGSPLAT_ORT_LIBRARY`, `ORT_DYLIB_PATH`, beside the
+//! executable, `../share/segsplat`, `target/ort` of the checkout or of the working folder, the
+//! system's folders. A library that the operator *named* is always loaded. A warning tells when its
+//! hash is not pinned (a CUDA build, a newer release). A library that was only *found* must be one
+//! of the pinned builds. Else the start is refused.
 
 use std::{
     path::{Path, PathBuf},
