@@ -2,8 +2,8 @@
 //!
 //! A page of the web can give its own name the address of this machine. Its calls then look like
 //! calls of the server's own page, but they still carry the page's name. So without keys a call
-//! must name loopback, an address that the server listens on, or a host of `allowed_hosts`. With keys,
-//! every name is allowed unless `allowed_hosts` is set: a browser never adds a key by itself.
+//! must name loopback, an address that the server listens on, or a host of `allowed_hosts`. With
+//! keys, every name is allowed unless `allowed_hosts` is set: a browser never adds a key by itself.
 
 use std::net::IpAddr;
 
