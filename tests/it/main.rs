@@ -26,7 +26,6 @@ mod licences;
 mod life;
 mod magnify;
 mod proto;
-mod sample;
 mod schedule;
 mod slow_callers;
 mod store;

@@ -1,4 +1,4 @@
-//! The tests of the server that take minutes: load, kills, replicas, fuzzed input.
+//! The tests of the server that take long: load, kills, replicas, fuzzed input, the sample.
 #![allow(
     clippy::panic,
     clippy::print_stdout,
@@ -14,3 +14,4 @@ mod fuzz_input;
 mod kill;
 mod load;
 mod replicas;
+mod sample;
