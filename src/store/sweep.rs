@@ -33,8 +33,16 @@ impl Store {
             let paths = objects.iter().map(|object| object.path.clone()).collect();
             let files = self.objects.get_all(paths).map_err(|e| unavailable("be swept", e))?;
             for (object, file) in objects.into_iter().zip(files) {
-                let id = file.as_deref().and_then(Self::pointed);
-                orphans.extend(id.map(|id| (id, object)));
+                // One without a file is gone already.
+                let Some(file) = file else { continue };
+                match Self::pointed(&file) {
+                    Some(id) => orphans.push((id, object)),
+                    // A write that was cut short: it leads to no scene.
+                    None => {
+                        self.delete(object)?;
+                        removed += 1;
+                    }
+                }
             }
         }
         let mut nobodys: HashSet<SceneId> = HashSet::new();

@@ -9,7 +9,9 @@ use std::{
 use futures_util::{StreamExt, future::join_all};
 use segsplat::{
     error::ErrorCode,
-    scene::{Event, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState},
+    scene::{
+        Event, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState, Stage,
+    },
     service::CreateScene,
 };
 
@@ -72,9 +74,14 @@ async fn the_scene_stays_done_while_its_semantics_run_and_watchers_see_their_sta
     assert_eq!((late.code(), late.retry_after()), (ErrorCode::SceneNotReady, Some(2)));
     assert!(late.message().contains("are being made"), "{late}");
     let mut events = std::pin::pin!(server.service.watch(&id).await.unwrap());
-    while !matches!(events.next().await, Some(Event::Running { stage, fraction })
-        if stage == "masks" && fraction > 0.2)
-    {}
+    let masks = Event::Running {
+        stage: "masks".to_owned(),
+        fraction: Stage::Masks.overall(PhotoMeaning::HELD_AT),
+    };
+    let seen = tokio::time::timeout(PATIENCE, async {
+        while events.next().await.expect("it is held") != masks {}
+    });
+    seen.await.expect("a watcher sees the share of the job, not of the stage");
     let status = server.service.get(&id).await.unwrap();
     assert_eq!((status.state, status.semantics.state), (SceneState::Done, SemanticsState::Running));
     assert_eq!(status.semantics.stage.as_deref(), Some("masks"));

@@ -36,6 +36,11 @@ pub(crate) struct PhotoMeaning {
     pub(crate) embedded: AtomicUsize,
 }
 
+impl PhotoMeaning {
+    /// Share of the stage `masks` that is done while it is held back.
+    pub(crate) const HELD_AT: f32 = 0.25;
+}
+
 fn axis(at: usize) -> Vec<f32> {
     let mut row = vec![0.0; DIM];
     row[at % DIM] = 1.0;
@@ -68,7 +73,7 @@ impl SemanticsMaker for PhotoMeaning {
 
     fn make(&self, given: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics> {
         self.made.fetch_add(1, Ordering::AcqRel);
-        (watch.progress)(Stage::Masks, 0.25);
+        (watch.progress)(Stage::Masks, Self::HELD_AT);
         let begun = Instant::now();
         while self.hold.load(Ordering::Acquire) {
             assert!(begun.elapsed() < PATIENCE, "nobody let go of the stand-in");
