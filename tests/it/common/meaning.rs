@@ -10,7 +10,7 @@ use std::{
 
 use segsplat::{
     error::{Error, ErrorCode, Result},
-    jobs::{Phrases, SemanticsMaker},
+    jobs::{Phrases, SemanticNetworks},
     scene::{
         Bank, IndexMap, PosedPhoto, Scene, Semantics, SemanticsReport, Stage, TextEmbedding, Watch,
     },
@@ -30,8 +30,8 @@ pub(crate) struct PhotoMeaning {
     pub(crate) fails: std::sync::Mutex<Option<ErrorCode>>,
     /// What the bundle is said to lack.
     pub(crate) lack: Option<&'static str>,
-    /// Scenes made.
-    pub(crate) made: AtomicUsize,
+    /// Calls of `make`.
+    pub(crate) calls: AtomicUsize,
     /// Texts embedded.
     pub(crate) embedded: AtomicUsize,
 }
@@ -47,7 +47,7 @@ fn axis(at: usize) -> Vec<f32> {
     row
 }
 
-impl SemanticsMaker for PhotoMeaning {
+impl SemanticNetworks for PhotoMeaning {
     fn lacks(&self) -> Option<String> {
         self.lack.map(str::to_owned)
     }
@@ -72,7 +72,7 @@ impl SemanticsMaker for PhotoMeaning {
     }
 
     fn make(&self, given: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics> {
-        self.made.fetch_add(1, Ordering::AcqRel);
+        self.calls.fetch_add(1, Ordering::AcqRel);
         (watch.progress)(Stage::Masks, Self::HELD_AT);
         let begun = Instant::now();
         while self.hold.load(Ordering::Acquire) {
