@@ -225,8 +225,8 @@ impl OtherReplicas {
         self.fresh.lock().remove(id);
     }
 
-    /// One beat: writes the heartbeat and the progress of its scenes, drops scenes that were deleted
-    /// or taken over elsewhere, and takes over those of dead replicas.
+    /// One beat: writes the heartbeat and the progress of its scenes, drops scenes that were
+    /// deleted or taken over elsewhere, and takes over those of dead replicas.
     fn beat(&self, jobs: &Jobs, seen: &mut Seen) -> Result<()> {
         let store = &jobs.parts.store;
         seen.count += 1;

@@ -73,7 +73,7 @@ impl Jobs {
         let provenance = store::provenance(files, &record.options, &networks);
         let _lock = self.lock_content(&provenance.content_sha256, job)?;
         if let Some(known) = self.scene_of_content(&provenance.content_sha256, &record)? {
-            tracing::info!(scene = %id, of = %known.meta.id, "a copy of a scene of the same content");
+            tracing::info!(scene = %id, of = %known.meta.id, "copied: the same content");
             return self.copy(&record, &known);
         }
         let reconstruction = self.within_time(job, |watch| {

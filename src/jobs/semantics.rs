@@ -33,7 +33,8 @@ fn wanted(record: &Record) -> bool {
 
 impl Jobs {
     /// Queues the semantics of a finished scene, unless they are ready or on their way.
-    /// Fails with `scene_not_found`; `overloaded` when too many scenes wait for theirs, or the server stops.
+    /// Fails with `scene_not_found`; `overloaded` when too many scenes wait for theirs, or the
+    /// server stops.
     pub(crate) fn understand(&self, id: &SceneId) -> Result<()> {
         let record = self.record(id)?;
         if !wanted(&record) {

@@ -19,8 +19,8 @@ use crate::{
 /// Locks that calls with one idempotency key share with few others.
 pub(super) const KEY_LOCKS: usize = 16;
 
-/// A create call that waits. When its caller goes away before it has the id, and nobody else watches
-/// the scene, the scene is deleted.
+/// A create call that waits. When its caller goes away before it has the id, and nobody else
+/// watches the scene, the scene is deleted.
 struct Waiting {
     service: Service,
     id: Option<SceneId>,
@@ -47,7 +47,8 @@ impl Drop for Waiting {
 }
 
 impl Service {
-    /// Takes an upload, makes it safe in the store, queues it, and waits as long as the caller wants.
+    /// Takes an upload, makes it safe in the store, queues it, and waits as long as the caller
+    /// wants.
     ///
     /// What is wrong with photos and cameras themselves is answered here; what only the pipeline
     /// finds becomes the scene's error. When a caller without an idempotency key goes away while it

@@ -121,8 +121,8 @@ impl Drop for Inner {
 }
 
 impl Service {
-    /// Opens the store at `place`, queues unfinished jobs again and starts the workers. Blocks on the
-    /// store.
+    /// Opens the store at `place`, queues unfinished jobs again and starts the workers. Blocks on
+    /// the store.
     ///
     /// # Errors
     /// `store_unavailable` when the store cannot be used.

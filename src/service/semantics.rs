@@ -63,8 +63,8 @@ impl Inner {
         Err(Error::new(ErrorCode::SemanticsOff, format!("{what}: scene {id} {why}")))
     }
 
-    /// The scene with its semantics; `None` where they must be made again: their file was put aside,
-    /// or other networks made them, whose embeddings cannot be compared with texts of these.
+    /// The scene with its semantics; `None` where they must be made again: their file was put
+    /// aside, or other networks made them, whose embeddings cannot be compared with texts of these.
     fn loaded_semantics(
         &self,
         access: &SceneAccess,
@@ -146,7 +146,8 @@ impl Service {
     ///
     /// # Errors
     /// `scene_not_found`, `scene_not_ready` also when they are still being made after that time,
-    /// `semantics_off`, `model_unavailable`, `overloaded`, and the error of the job that makes them.
+    /// `semantics_off`, `model_unavailable`, `overloaded`, and the error of the job that makes
+    /// them.
     pub async fn understand(&self, id: &SceneId, wait: Option<Duration>) -> Result<SceneStatus> {
         let scene = self.scene(id).await?.finished()?;
         let understood = self.inner.understood(&scene, "semantics", wait).await?;

@@ -1,7 +1,7 @@
 //! What replicas tell each other through the store that they share.
 //!
-//! - `replicas/R`: the heartbeat of replica R. A replica whose heartbeat does not change for a lease
-//!   counts as dead; no clocks are compared.
+//! - `replicas/R`: the heartbeat of replica R. A replica whose heartbeat does not change for a
+//!   lease counts as dead; no clocks are compared.
 //! - `claims/ID.R`: who makes scene ID in place of R. Created once, so there is one heir; where the
 //!   heir dies too, its own name begins the next claim.
 //! - `deleted/ID`: a tombstone. A job that still makes ID removes what it wrote.
@@ -37,8 +37,8 @@ impl Store {
         self.listed("replicas", |name| Some(name.to_owned()))
     }
 
-    /// Lets `heir` make scene `id` in place of `of`, unless another has claimed it; gives the replica
-    /// that makes it.
+    /// Lets `heir` make scene `id` in place of `of`, unless another has claimed it; gives the
+    /// replica that makes it.
     pub(crate) fn claim(&self, id: &SceneId, of: &str, heir: &str) -> Result<String> {
         let path = Name::from(format!("claims/{id}.{of}"));
         let what = "take over a scene";

@@ -1,8 +1,8 @@
 //! Removing objects that belong to no scene: a kill between two writes leaves them.
 //!
 //! Safe beside callers and other replicas. A scene's record is there before anything else of it
-//! and goes first, and its status is there before its pending record goes. So an id that has neither,
-//! looked for in that order, is no scene.
+//! and goes first, and its status is there before its pending record goes. So an id that has
+//! neither, looked for in that order, is no scene.
 
 use std::{collections::HashSet, time::Duration};
 

@@ -1,5 +1,5 @@
-//! A store that fails, tears writes, stalls, fills up and flips bits: an acknowledged scene stays as
-//! it was, or is reported as bad.
+//! A store that fails, tears writes, stalls, fills up and flips bits: an acknowledged scene stays
+//! as it was, or is reported as bad.
 
 use std::{
     collections::{BTreeMap, HashSet},

@@ -1,4 +1,5 @@
-//! Jobs: no acknowledged scene is lost, a panic ends its own job alone, late watchers see the state.
+//! Jobs: no acknowledged scene is lost, a panic ends its own job alone, late watchers see the
+//! state.
 
 use std::{
     sync::{Arc, atomic::Ordering},
@@ -226,7 +227,7 @@ async fn a_scene_that_is_deleted_while_its_photos_are_read_reaches_no_network() 
         config.limits.read_uploads_bytes_max = 0;
     })
     .await;
-    let options = SampleOptions { photos: 12, width: 640, height: 480, seed: 5 };
+    let options = SampleOptions { photos: 12, width: 320, height: 240, seed: 5 };
     let upload = sample::upload(&options).unwrap();
     let create = CreateScene { upload, ..CreateScene::default() };
     let id = server.service.create_scene(create).await.unwrap().status.id;

@@ -1,5 +1,5 @@
-//! Start and end of a server: it takes scenes before its networks are open; when it stops, it says so
-//! first, takes no new calls, and finishes the open ones.
+//! Start and end of a server: it takes scenes before its networks are open; when it stops, it says
+//! so first, takes no new calls, and finishes the open ones.
 
 use std::{
     path::{Path, PathBuf},

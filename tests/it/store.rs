@@ -1,5 +1,5 @@
-//! The store: files come back bit for bit, are whole or absent, and are put aside when they are bad;
-//! PLY out and in.
+//! The store: files come back bit for bit, are whole or absent, and are put aside when they are
+//! bad; PLY out and in.
 
 use std::{fs, io::Cursor, path::Path, time::Duration};
 

@@ -1,5 +1,5 @@
-//! The stages that make the semantics of a scene, with stand-ins for the networks and with the small
-//! networks of the fixture.
+//! The stages that make the semantics of a scene, with stand-ins for the networks and with the
+//! small networks of the fixture.
 
 use std::{
     path::Path,
