@@ -45,7 +45,7 @@ use crate::{
     store::{self, KeyUse, Record, Store, not_found},
 };
 
-/// What jobs work with.
+/// The parts that jobs need.
 pub(crate) struct JobParts {
     pub(crate) store: Arc<Store>,
     pub(crate) scenes: Arc<dyn SceneNetworks>,
@@ -139,7 +139,7 @@ impl Jobs {
         let photos = pipeline::read(&upload, limits, &AtomicBool::new(false))?;
         let files = store::hashes(&upload);
         record.request_sha256 = store::request_sha256(&files, &record.options);
-        // First, so that a full queue still answers for what it holds.
+        // First, so that a full queue still answers for scenes that it holds.
         if let Some(earlier) = self.earlier(&files, &record)? {
             return Ok(earlier);
         }

@@ -35,7 +35,7 @@ impl NetworkState {
 
 /// Makes scenes of photos.
 pub trait SceneNetworks: Send + Sync {
-    /// What else than photos and options decides the scene: sha256 of the bundle's manifest, hex;
+    /// What decides the scene beside photos and options: sha256 of the bundle's manifest, hex;
     /// empty where no network is used.
     fn identity(&self) -> String {
         String::new()

@@ -50,7 +50,7 @@ impl Service {
     /// Takes an upload, makes it safe in the store, queues it, and waits as long as the caller
     /// wants.
     ///
-    /// What is wrong with photos and cameras themselves is answered here; what only the pipeline
+    /// Faults of photos and cameras themselves are answered here; a fault that only the pipeline
     /// finds becomes the scene's error. When a caller without an idempotency key goes away while it
     /// waits, the scene is deleted: nobody knows its id.
     ///

@@ -119,7 +119,7 @@ fn levels(values: &[f32]) -> Vec<u8> {
     values.iter().map(level).collect()
 }
 
-/// Depths as native-endian 16-bit steps of the scale; whatever has a depth is at least 1.
+/// Depths as native-endian 16-bit steps of the scale; a depth over 0 is at least 1.
 fn depth_steps(depth: &[f32]) -> (Vec<u8>, f64) {
     let farthest = depth.iter().copied().filter(|d| d.is_finite()).fold(0.0_f32, f32::max);
     let scale = if farthest > 0.0 { f64::from(farthest) / f64::from(DEPTH_STEPS) } else { 1.0 };

@@ -170,7 +170,7 @@ impl Service {
     /// # Errors
     /// `invalid_request`, `limit_exceeded`, `scene_not_found`, `scene_not_ready` also when the
     /// semantics are not ready in time, `semantics_off`, `model_unavailable`, `overloaded`,
-    /// `deadline_exceeded`, and whatever the making of the semantics failed with.
+    /// `deadline_exceeded`, and the error of the job that makes the semantics.
     pub async fn query(&self, id: &SceneId, spec: QuerySpec) -> Result<QueryAnswer> {
         let scene = self.scene(id).await?;
         let inner = &self.inner;

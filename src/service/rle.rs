@@ -16,7 +16,7 @@ impl Rle {
     /// Encodes a mask, `[height * width]` row-major.
     pub fn encode(mask: &[bool], width: u32, height: u32) -> Self {
         let (w, h) = (width as usize, height as usize);
-        // Most columns of most masks are empty; what is row-major is quickly seen row by row.
+        // Most columns of most masks are empty; row-major memory is fast to read row by row.
         let mut some = vec![false; w];
         for row in mask.chunks_exact(w.max(1)) {
             some.iter_mut().zip(row).for_each(|(some, on)| *some |= on);

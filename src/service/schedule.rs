@@ -95,7 +95,7 @@ impl Drop for Slot {
 struct Place<'a> {
     scheduler: &'a Scheduler,
     key: (u64, u64),
-    /// Closed after the view has left the queue, so that no slot is sent to nobody.
+    /// Closed after the view has left the queue, so that no slot is lost.
     started: oneshot::Receiver<Slot>,
 }
 

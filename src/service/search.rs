@@ -1,4 +1,4 @@
-//! Texts and scenes: what views, queries, picks and exports are answered from.
+//! Texts and scenes: the data that views, queries, picks and exports need.
 //!
 //! A [`Backend`] keeps what earlier texts needed: embeddings, banks ready to be scored, connected
 //! pieces, and the weights of views. A [`SceneTexts`] is one scene, the texts for it, and how the

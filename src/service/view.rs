@@ -53,7 +53,7 @@ pub(super) struct Resolved {
     picture: PictureOptions,
 }
 
-/// What the text kinds of a view are read from.
+/// The drawn labels of a view, from which the pictures of texts are computed.
 enum ViewLabels {
     /// Weights over the bank, which answer every text.
     Weights(Arc<LabelledView>),
@@ -432,7 +432,7 @@ impl Service {
     /// semantics that do not exist yet.
     ///
     /// # Errors
-    /// As [`Self::render`], but for what only rendering meets.
+    /// As [`Self::render`], without those of the rendering itself.
     pub async fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<Option<String>> {
         let (scene, ask, view) = self.checked_view(id, spec).await?;
         let record = scene.record();
