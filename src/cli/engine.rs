@@ -5,7 +5,7 @@ use std::sync::Arc;
 use crate::{
     config::Config,
     error::Result,
-    jobs::{NoSemantics, PipelineMaker, SemanticsMaker},
+    jobs::{NoSemantics, PipelineNetworks, SemanticNetworks},
     models::Bundle,
     pipeline::{Engine, LateEngine},
     render::{Renderer, select::select},
@@ -30,21 +30,21 @@ pub fn early_parts(config: &Config) -> Result<(Parts, Arc<LateEngine>)> {
     let engine = Arc::new(LateEngine::open(&config.networks())?);
     let renderer = renderer(config)?;
     let models = models_info(engine.bundle(), "opening");
-    let maker = Arc::new(PipelineMaker(Arc::clone(&engine)));
-    let semantics = Arc::clone(&maker) as Arc<dyn SemanticsMaker>;
-    Ok((Parts { maker, semantics, renderer, models }, engine))
+    let networks = Arc::new(PipelineNetworks(Arc::clone(&engine)));
+    let semantics = Arc::clone(&networks) as Arc<dyn SemanticNetworks>;
+    Ok((Parts { scenes: networks, semantics, renderer, models }, engine))
 }
 
 /// What answers texts; opens library and bundle only where it is `needed`.
 ///
 /// # Errors
 /// `model_unavailable`.
-pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticsMaker>> {
+pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticNetworks>> {
     if !needed {
         return Ok(Arc::new(NoSemantics));
     }
     let engine = Engine::open(&config.networks())?;
-    Ok(Arc::new(PipelineMaker(Arc::new(engine.into()))))
+    Ok(Arc::new(PipelineNetworks(Arc::new(engine.into()))))
 }
 
 /// The renderer that the configuration asks for.

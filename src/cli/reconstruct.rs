@@ -134,7 +134,7 @@ fn semantics(name: &str) -> Result<SemanticsMode, String> {
 
 fn write(path: &Path, scene: &Scene) -> Result<()> {
     if !is_ply(path) {
-        return write_scene_file(path, scene).map(drop);
+        return write_scene_file(path, scene);
     }
     let write = || -> std::io::Result<()> {
         let mut file = fs_err::File::create(path)?;

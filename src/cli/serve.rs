@@ -12,6 +12,7 @@ use crate::{
     error::{Error, ErrorCode, Result},
     pipeline::LateEngine,
     service::Service,
+    store::Place,
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -44,7 +45,7 @@ pub(super) fn run(
     let (models, data_dir) = (parts.models.clone(), config.data_dir.clone());
     let scheme = if config.tls_cert.is_some() { "https" } else { "http" };
     let (renderer, listen) = (parts.renderer.name(), config.listen);
-    let service = Service::open(config, parts)?;
+    let service = Service::open(&Place::of(&config)?, config, parts)?;
     let served = runtime.block_on(async {
         let listener = TcpListener::bind(listen).await.map_err(|e| {
             Error::invalid(format!("listen: {listen} cannot be used: {e}")).caused_by(e)

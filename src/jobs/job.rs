@@ -1,16 +1,13 @@
 //! One job: what it makes, of which scene, and how it is stopped.
 
-use std::{
-    sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
-        atomic::{AtomicBool, AtomicU8, Ordering},
-    },
-    time::Duration,
+use std::sync::{
+    Arc, OnceLock,
+    atomic::{AtomicBool, Ordering},
 };
 
+use parking_lot::Mutex;
+
 use crate::{
-    error::{Error, ErrorCode},
-    limits::Limits,
     scene::{SceneId, Stage},
     store::Record,
 };
@@ -25,19 +22,11 @@ pub(super) enum Kind {
 }
 
 impl Kind {
-    /// Name in metrics and spans.
-    pub(super) fn name(self) -> &'static str {
+    /// Name in metrics, and name in messages.
+    pub(super) fn names(self) -> (&'static str, &'static str) {
         match self {
-            Self::Scene => "scene",
-            Self::Semantics => "semantics",
-        }
-    }
-
-    /// Name in messages.
-    pub(super) fn what(self) -> &'static str {
-        match self {
-            Self::Scene => "the scene",
-            Self::Semantics => "the scene's semantics",
+            Self::Scene => ("scene", "the scene"),
+            Self::Semantics => ("semantics", "the scene's semantics"),
         }
     }
 
@@ -55,10 +44,9 @@ impl Kind {
 
 /// Why a job was stopped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[repr(u8)]
 pub(super) enum Reason {
     /// The scene is deleted, or another replica makes it.
-    Cancelled = 1,
+    Cancelled,
     /// It took too long.
     Timeout,
     /// The server stops.
@@ -71,43 +59,19 @@ pub(super) struct Job {
     pub(super) kind: Kind,
     pub(super) scene: SceneId,
     pub(super) cancel: AtomicBool,
-    /// 0, or a [`Reason`].
-    reason: AtomicU8,
+    reason: OnceLock<Reason>,
 }
 
 impl Job {
-    pub(super) fn new(kind: Kind, scene: SceneId) -> Self {
-        Self { kind, scene, cancel: AtomicBool::new(false), reason: AtomicU8::new(0) }
-    }
-
     /// Asks the job to stop; the first reason counts.
     pub(super) fn stop(&self, reason: Reason) {
-        let _ = self.reason.compare_exchange(0, reason as u8, Ordering::AcqRel, Ordering::Acquire);
+        let _ = self.reason.set(reason);
         self.cancel.store(true, Ordering::Release);
     }
 
     /// Why it was asked to stop, `None` where it was not.
     pub(super) fn stopped(&self) -> Option<Reason> {
-        let reason = self.reason.load(Ordering::Acquire);
-        let all = [Reason::Cancelled, Reason::Timeout, Reason::Shutdown];
-        all.into_iter().find(|known| *known as u8 == reason)
-    }
-
-    /// The error of a job that was asked to stop; `None` where it was not.
-    pub(super) fn stop_error(&self, limits: &Limits) -> Option<Error> {
-        let what = self.kind.what();
-        Some(match self.stopped()? {
-            Reason::Cancelled => Error::new(ErrorCode::Cancelled, format!("{what}: cancelled")),
-            Reason::Timeout => {
-                let seconds = Duration::from_millis(limits.scene_timeout_ms).as_secs_f64();
-                let message = format!("{what} took longer than {seconds} s");
-                Error::new(ErrorCode::DeadlineExceeded, message)
-            }
-            Reason::Shutdown => {
-                let message = format!("{what}: the server is stopping");
-                Error::new(ErrorCode::Overloaded, message).retry_after_s(10)
-            }
-        })
+        self.reason.get().copied()
     }
 
     /// How it ended, for metrics.
@@ -121,40 +85,32 @@ impl Job {
     }
 }
 
-/// The jobs that workers are at.
+/// The jobs that workers run.
 #[derive(Debug, Default)]
 pub(super) struct Running(Mutex<Vec<Arc<Job>>>);
 
 impl Running {
     pub(super) fn begin(&self, kind: Kind, scene: SceneId) -> Arc<Job> {
-        let job = Arc::new(Job::new(kind, scene));
-        self.lock().push(Arc::clone(&job));
+        let cancel = AtomicBool::new(false);
+        let job = Arc::new(Job { kind, scene, cancel, reason: OnceLock::new() });
+        self.0.lock().push(Arc::clone(&job));
         job
     }
 
-    pub(super) fn end(&self, job: &Job) {
-        self.lock().retain(|other| !std::ptr::eq(&**other, job));
+    pub(super) fn end(&self, job: &Arc<Job>) {
+        self.0.lock().retain(|other| !Arc::ptr_eq(other, job));
     }
 
     /// Stops the jobs of a scene, or all; whether there were any.
     pub(super) fn stop(&self, scene: Option<&SceneId>, reason: Reason) -> bool {
-        let running = self.lock();
-        let its = running.iter().filter(|job| scene.is_none_or(|scene| job.scene == *scene));
-        let mut any = false;
-        for job in its {
-            job.stop(reason);
-            any = true;
-        }
-        any
+        let running = self.0.lock();
+        let jobs = running.iter().filter(|job| scene.is_none_or(|scene| job.scene == *scene));
+        jobs.map(|job| job.stop(reason)).count() > 0
     }
 
-    /// Scenes that jobs of this kind are at.
+    /// Scenes of the running jobs of a kind.
     pub(super) fn scenes(&self, kind: Kind) -> Vec<SceneId> {
-        let running = self.lock();
+        let running = self.0.lock();
         running.iter().filter(|job| job.kind == kind).map(|job| job.scene.clone()).collect()
-    }
-
-    fn lock(&self) -> MutexGuard<'_, Vec<Arc<Job>>> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }

@@ -1,13 +1,15 @@
-//! A bounded queue of jobs, fair between owners. A place is reserved first: nothing acknowledged
-//! is refused.
+//! A bounded queue of jobs, fair between owners. A place is reserved first, so that no acknowledged
+//! job is refused.
 //!
 //! Each kind of job and each owner has a lane; lanes of a kind take turns, one job a turn. An owner
 //! may fill half the places of a kind, so that others always find one.
 
 use std::{
     collections::{HashMap, VecDeque},
-    sync::{Condvar, Mutex, MutexGuard, PoisonError},
+    time::Duration,
 };
+
+use parking_lot::{Condvar, Mutex};
 
 use super::job::Kind;
 use crate::scene::SceneId;
@@ -27,7 +29,7 @@ impl Lane {
 
 /// Waiting jobs: of one owner first in, first out; between owners in turns.
 #[derive(Debug)]
-pub(super) struct Queue {
+pub(crate) struct Queue {
     /// Jobs of one kind that may wait.
     waiting_max: usize,
     inner: Mutex<Inner>,
@@ -63,14 +65,11 @@ pub(super) struct Place<'a> {
 
 impl Drop for Place<'_> {
     fn drop(&mut self) {
-        let mut inner = self.queue.lock();
-        let left = inner.reserved.get_mut(&self.lane).map(|count| {
+        let reserved = &mut self.queue.inner.lock().reserved;
+        if let Some(count) = reserved.get_mut(&self.lane) {
             *count -= 1;
-            *count
-        });
-        if left == Some(0) {
-            inner.reserved.remove(&self.lane);
         }
+        reserved.retain(|_, count| *count > 0);
     }
 }
 
@@ -108,7 +107,7 @@ impl Queue {
     /// A place for a job of `owner`.
     pub(super) fn reserve(&self, kind: Kind, owner: Option<&str>) -> Result<Place<'_>, Full> {
         let lane = Lane::of(kind, owner);
-        let mut inner = self.lock();
+        let mut inner = self.inner.lock();
         let share = self.waiting_max.div_ceil(2);
         if inner.closed {
             return Err(Full::Closed);
@@ -116,7 +115,7 @@ impl Queue {
         if inner.taken(|other| other.kind == kind) >= self.waiting_max {
             return Err(Full::All(self.waiting_max));
         }
-        // Who has no owner has nobody to share with.
+        // Without owners there is nobody to share with.
         if owner.is_some() && inner.taken(|other| *other == lane) >= share {
             return Err(Full::Share(share));
         }
@@ -126,7 +125,7 @@ impl Queue {
 
     /// Adds a job beyond any bound: one that was acknowledged before a restart.
     pub(super) fn push(&self, kind: Kind, id: SceneId, owner: Option<&str>) {
-        let (mut inner, lane) = (self.lock(), Lane::of(kind, owner));
+        let (mut inner, lane) = (self.inner.lock(), Lane::of(kind, owner));
         match inner.lanes.iter_mut().find(|(other, _)| *other == lane) {
             Some((_, jobs)) => jobs.push_back(id),
             None => inner.lanes.push_back((lane, VecDeque::from([id]))),
@@ -137,7 +136,7 @@ impl Queue {
 
     /// The next job of a kind; waits for one. `None` once the queue is closed.
     pub(super) fn pop(&self, kind: Kind) -> Option<SceneId> {
-        let mut inner = self.lock();
+        let mut inner = self.inner.lock();
         loop {
             if inner.closed {
                 return None;
@@ -145,23 +144,21 @@ impl Queue {
             if let Some(id) = inner.next(kind) {
                 return Some(id);
             }
-            inner = self.changed.wait(inner).unwrap_or_else(PoisonError::into_inner);
+            self.changed.wait(&mut inner);
         }
     }
 
-    /// Takes the waiting jobs of a scene out; whether there were any.
-    pub(super) fn remove(&self, id: &SceneId) -> bool {
-        let mut inner = self.lock();
-        let waiting = |inner: &Inner| inner.lanes.iter().map(|(_, jobs)| jobs.len()).sum::<usize>();
-        let before = waiting(&inner);
-        inner.lanes.iter_mut().for_each(|(_, jobs)| jobs.retain(|other| other != id));
-        inner.lanes.retain(|(_, jobs)| !jobs.is_empty());
-        waiting(&inner) < before
+    /// Takes the waiting jobs of a scene out.
+    pub(super) fn remove(&self, id: &SceneId) {
+        self.inner.lock().lanes.retain_mut(|(_, jobs)| {
+            jobs.retain(|other| other != id);
+            !jobs.is_empty()
+        });
     }
 
-    /// Jobs that go before the scene `id` as things stand; `None` when it does not wait.
-    pub(super) fn ahead(&self, id: &SceneId) -> Option<usize> {
-        let inner = self.lock();
+    /// Jobs that go before the scene `id` now; `None` when it does not wait.
+    pub(crate) fn ahead(&self, id: &SceneId) -> Option<usize> {
+        let inner = self.inner.lock();
         let lanes = inner.lanes.iter().filter(|(lane, _)| lane.kind == Kind::Scene);
         let lanes: Vec<&VecDeque<SceneId>> = lanes.map(|(_, jobs)| jobs).collect();
         let place = |jobs: &VecDeque<SceneId>| jobs.iter().position(|waiting| waiting == id);
@@ -176,23 +173,26 @@ impl Queue {
 
     /// Jobs of a kind that wait.
     pub(super) fn len(&self, kind: Kind) -> usize {
-        let inner = self.lock();
+        let inner = self.inner.lock();
         let lanes = inner.lanes.iter().filter(|(lane, _)| lane.kind == kind);
         lanes.map(|(_, jobs)| jobs.len()).sum()
     }
 
     /// Lets no worker take another job.
     pub(super) fn close(&self) {
-        self.lock().closed = true;
+        self.inner.lock().closed = true;
         self.changed.notify_all();
     }
 
-    pub(super) fn is_closed(&self) -> bool {
-        self.lock().closed
+    /// Pauses the calling thread for `time`, less when the queue is closed; whether it is.
+    pub(super) fn pause(&self, time: Duration) -> bool {
+        let mut inner = self.inner.lock();
+        self.changed.wait_while_for(&mut inner, |inner| !inner.closed, time);
+        inner.closed
     }
 
-    fn lock(&self) -> MutexGuard<'_, Inner> {
-        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    pub(super) fn is_closed(&self) -> bool {
+        self.inner.lock().closed
     }
 }
 
@@ -207,28 +207,23 @@ mod tests {
     #[test]
     fn a_reserved_place_counts_and_comes_back() {
         let queue = Queue::new(2);
-        let first = queue.reserve(Kind::Scene, None).unwrap();
-        let second = queue.reserve(Kind::Scene, None).unwrap();
-        assert_eq!(
-            queue.reserve(Kind::Scene, None).unwrap_err(),
-            Full::All(2),
-            "both places are promised"
-        );
+        let reserve = || queue.reserve(Kind::Scene, None);
+        let (first, second) = (reserve().unwrap(), reserve().unwrap());
+        assert_eq!(reserve().unwrap_err(), Full::All(2), "both places are promised");
         drop(second);
-        queue.reserve(Kind::Scene, None).unwrap().fill(id(2));
+        reserve().unwrap().fill(id(2));
         first.fill(id(1));
-        assert!(queue.reserve(Kind::Scene, None).is_err(), "both places are filled");
+        assert!(reserve().is_err(), "both places are filled");
         assert_eq!((queue.ahead(&id(2)), queue.ahead(&id(1))), (Some(0), Some(1)));
         assert_eq!(queue.pop(Kind::Scene), Some(id(2)));
-        assert!(queue.reserve(Kind::Scene, None).is_ok());
+        assert!(reserve().is_ok());
     }
 
     #[test]
     fn a_removed_job_is_not_given_out() {
         let queue = Queue::new(8);
         (1..=3).for_each(|byte| queue.push(Kind::Scene, id(byte), None));
-        assert!(queue.remove(&id(2)));
-        assert!(!queue.remove(&id(2)), "it is gone");
+        queue.remove(&id(2));
         assert_eq!((queue.pop(Kind::Scene), queue.pop(Kind::Scene)), (Some(id(1)), Some(id(3))));
     }
 
@@ -252,10 +247,8 @@ mod tests {
         let ahead: Vec<_> = (1..=6).map(|byte| queue.ahead(&id(byte)).unwrap()).collect();
         let order: Vec<_> = (0..6).map(|_| queue.pop(Kind::Scene).unwrap()).collect();
         assert_eq!(order, [1, 4, 5, 2, 6, 3].map(id), "one each in turn, then the rest");
-        let went: Vec<_> = (1..=6)
-            .map(|byte| order.iter().position(|other| *other == id(byte)).unwrap())
-            .collect();
-        assert_eq!(ahead, went);
+        let place = |byte| order.iter().position(|other| *other == id(byte)).unwrap();
+        assert_eq!(ahead, (1..=6).map(place).collect::<Vec<_>>());
     }
 
     #[test]
@@ -272,11 +265,12 @@ mod tests {
     #[test]
     fn one_owner_leaves_places_for_others() {
         let queue = Queue::new(4);
-        let _being_written = queue.reserve(Kind::Scene, Some("a")).unwrap();
-        queue.reserve(Kind::Scene, Some("a")).unwrap().fill(id(1));
-        assert_eq!(queue.reserve(Kind::Scene, Some("a")).unwrap_err(), Full::Share(2));
-        queue.reserve(Kind::Scene, Some("b")).unwrap().fill(id(2));
-        queue.reserve(Kind::Scene, None).unwrap().fill(id(3));
-        assert_eq!(queue.reserve(Kind::Scene, Some("c")).unwrap_err(), Full::All(4));
+        let reserve = |owner| queue.reserve(Kind::Scene, owner);
+        let _being_written = reserve(Some("a")).unwrap();
+        reserve(Some("a")).unwrap().fill(id(1));
+        assert_eq!(reserve(Some("a")).unwrap_err(), Full::Share(2));
+        reserve(Some("b")).unwrap().fill(id(2));
+        reserve(None).unwrap().fill(id(3));
+        assert_eq!(reserve(Some("c")).unwrap_err(), Full::All(4));
     }
 }

@@ -1,19 +1,19 @@
 //! The job that makes a scene of photos, and keeps it.
 
 use std::{
-    sync::{Arc, PoisonError, atomic::Ordering},
+    sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
 };
 
 use super::{
-    Shared,
+    Jobs,
     job::{Job, Kind},
 };
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{
         Scene, SceneId, SceneMeta, SceneState, SemanticsMode, SemanticsState, SemanticsStatus,
-        Stage,
+        Stage, unless_cancelled,
     },
     store::{self, Record},
     telemetry::meter,
@@ -22,29 +22,27 @@ use crate::{
 /// Starts of one job before it is given up: a scene that kills the server must not do so forever.
 const ATTEMPTS_MAX: u32 = 3;
 
-/// An unfinished record as it stands before anybody makes it.
+/// Makes an unfinished record that of a queued scene.
 pub(super) fn requeue(record: &mut Record) {
     record.status.state = SceneState::Queued;
     record.status.stage = None;
     record.status.fraction = 0.0;
 }
 
-/// Leave to make a scene of some content; ends when dropped.
+/// Keeps other workers from making a scene of the same content, until it is dropped.
 struct ContentLock<'a> {
-    shared: &'a Shared,
+    jobs: &'a Jobs,
     content: String,
 }
 
 impl Drop for ContentLock<'_> {
     fn drop(&mut self) {
-        let mut contents = self.shared.contents.lock().unwrap_or_else(PoisonError::into_inner);
-        contents.remove(&self.content);
-        drop(contents);
-        self.shared.content_made.notify_all();
+        self.jobs.contents.lock().remove(&self.content);
+        self.jobs.content_free.notify_all();
     }
 }
 
-impl Shared {
+impl Jobs {
     pub(super) fn make_scene(&self, job: &Job) -> Result<()> {
         let (begun, id, store) = (Instant::now(), &job.scene, &self.parts.store);
         let Some(record) = self.records.update(id, |record| {
@@ -63,22 +61,22 @@ impl Shared {
         }
         store.put_record(&record)?;
         if record.attempts > 1
-            && let Some((scene, digest)) = self.made_before(id)?
+            && let Some((scene, digest)) = self.kept_scene(id)?
         {
             return self.finish(&scene, digest, None);
         }
-        let networks = self.parts.maker.identity();
+        let networks = self.parts.scenes.identity();
         let files = match self.uploads.find(id) {
             Some(upload) => upload.files.clone(),
             None => store::hashes(&store.upload(id)?),
         };
         let provenance = store::provenance(files, &record.options, &networks);
-        let _lock = self.lock_content(&provenance.content_sha256, job);
-        if let Some(known) = self.made_of(&provenance.content_sha256, &record)? {
-            tracing::info!(scene = %id, of = %known.meta.id, "made before of the same content");
+        let _lock = self.lock_content(&provenance.content_sha256, job)?;
+        if let Some(known) = self.scene_of_content(&provenance.content_sha256, &record)? {
+            tracing::info!(scene = %id, of = %known.meta.id, "copied: the same content");
             return self.copy(&record, &known);
         }
-        let made = self.within_time(job, |watch| {
+        let reconstruction = self.within_time(job, |watch| {
             (watch.progress)(Stage::Photos, 0.0);
             let upload = self.photos(id, watch)?;
             if record.options.semantics == SemanticsMode::Eager {
@@ -86,19 +84,19 @@ impl Shared {
             } else {
                 self.uploads.forget(id);
             }
-            self.parts.maker.make(&upload.photos, &record.options, watch)
+            self.parts.scenes.make(&upload.photos, &record.options, watch)
         })?;
         self.show(job, Stage::Store, 0.0);
         let took = u64::try_from(begun.elapsed().as_millis()).unwrap_or(u64::MAX);
         let before = self.scene_ms.load(Ordering::Relaxed);
         let smoothed = if before == 0 { took } else { (3 * before + took) / 4 };
         self.scene_ms.store(smoothed.max(1), Ordering::Relaxed);
-        let scene = made.into_scene(id.clone(), record.status.created_ms, provenance);
+        let scene = reconstruction.into_scene(id.clone(), record.status.created_ms, provenance);
         let (scene, digest) = store.put_scene(scene)?;
         self.finish(&scene, digest, None)
     }
 
-    /// Keeps under this record what was made of the same content before.
+    /// Keeps an earlier scene of the same content under this record.
     fn copy(&self, record: &Record, known: &Scene) -> Result<()> {
         let id = &record.status.id;
         let created_ms = record.status.created_ms;
@@ -112,8 +110,8 @@ impl Shared {
         self.finish(&scene, digest, semantics_digest)
     }
 
-    /// What an earlier attempt had made and kept, before it was cut off, and its digest.
-    fn made_before(&self, id: &SceneId) -> Result<Option<(Arc<Scene>, String)>> {
+    /// The scene that an earlier attempt kept before it was cut off, and its digest.
+    fn kept_scene(&self, id: &SceneId) -> Result<Option<(Arc<Scene>, String)>> {
         match self.parts.store.scene(id) {
             Ok(scene) => {
                 let digest = self.parts.store.scene_digest(id)?;
@@ -127,34 +125,36 @@ impl Shared {
     }
 
     /// The finished scene of this content and owner, where there is one and it is sound.
-    fn made_of(&self, content: &str, record: &Record) -> Result<Option<Arc<Scene>>> {
+    fn scene_of_content(&self, content: &str, record: &Record) -> Result<Option<Arc<Scene>>> {
         let (store, owner) = (&self.parts.store, record.owner.as_deref());
         let Some(id) = store.scene_of_content(owner, content)? else { return Ok(None) };
         if id == record.status.id {
             return Ok(None);
         }
-        // Whatever is wrong with it, this one can be made.
+        // Where that one is bad, this one is made.
         let scene = store.scene(&id).ok();
         Ok(scene.filter(|scene| scene.meta.provenance.content_sha256 == content))
     }
 
     /// Waits until no other worker here makes a scene of the same content.
-    fn lock_content(&self, content: &str, job: &Job) -> ContentLock<'_> {
-        let mut contents = self.contents.lock().unwrap_or_else(PoisonError::into_inner);
-        while contents.contains(content) && job.stopped().is_none() {
-            let waited = self.content_made.wait_timeout(contents, Duration::from_millis(50));
-            contents = waited.unwrap_or_else(PoisonError::into_inner).0;
+    fn lock_content(&self, content: &str, job: &Job) -> Result<ContentLock<'_>> {
+        let mut contents = self.contents.lock();
+        while contents.contains(content) {
+            unless_cancelled(&job.cancel)?;
+            self.content_free.wait_for(&mut contents, Duration::from_millis(50));
         }
         contents.insert(content.to_owned());
-        ContentLock { shared: self, content: content.to_owned() }
+        Ok(ContentLock { jobs: self, content: content.to_owned() })
     }
 
     /// The scene is kept under its digest, and its semantics under theirs: its record is kept,
     /// then its watchers are told.
     fn finish(&self, scene: &Scene, digest: String, semantics: Option<String>) -> Result<()> {
         let (store, meta, id) = (&self.parts.store, &scene.meta, &scene.meta.id);
-        // In the store first, so that a watcher who sees `done` may pull the plug.
-        let Some(mut done) = self.records.find(id) else { return Ok(()) };
+        // In the store first: a watcher who sees `done` may stop the machine.
+        let Some(mut done) = self.records.find(id).map(Arc::unwrap_or_clone) else {
+            return Ok(());
+        };
         let content = &meta.provenance.content_sha256;
         done.scene_sha256 = Some(digest);
         done.content_sha256 = Some(content.clone()).filter(|hash| !hash.is_empty());

@@ -4,7 +4,7 @@ use std::{
     any::Any,
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{
-        Arc, Condvar, Mutex, PoisonError,
+        Arc,
         atomic::Ordering,
         mpsc::{self, RecvTimeoutError},
     },
@@ -12,44 +12,23 @@ use std::{
 };
 
 use super::{
-    Networks, Shared,
+    Jobs, NetworkState,
     job::{Job, Kind, Reason},
     photos::ReadUpload,
     scene::requeue,
 };
 use crate::{
-    error::{Error, Result},
+    error::{Error, ErrorCode, Result},
     pipeline,
     scene::{SceneError, SceneId, SceneState, SemanticsState, SemanticsStatus, Stage, Watch},
     store::{self, Record},
     telemetry::{self, meter},
 };
 
-/// Between two looks at whether the networks are open.
+/// Time between two checks whether the networks are open.
 const NETWORKS_LOOK: Duration = Duration::from_millis(5);
 
-/// Whether the program stops, for threads that pause.
-#[derive(Debug, Default)]
-pub(super) struct Shutdown {
-    begun: Mutex<bool>,
-    signal: Condvar,
-}
-
-impl Shutdown {
-    pub(super) fn begin(&self) {
-        *self.begun.lock().unwrap_or_else(PoisonError::into_inner) = true;
-        self.signal.notify_all();
-    }
-
-    /// Pauses for `time`, less when the program stops; whether it does.
-    pub(super) fn pause(&self, time: Duration) -> bool {
-        let begun = self.begun.lock().unwrap_or_else(PoisonError::into_inner);
-        let waited = self.signal.wait_timeout_while(begun, time, |begun| !*begun);
-        *waited.unwrap_or_else(PoisonError::into_inner).0
-    }
-}
-
-impl Shared {
+impl Jobs {
     /// The life of a worker thread.
     pub(super) fn work(&self, kind: Kind) {
         let open = self.networks_open();
@@ -59,22 +38,22 @@ impl Shared {
                 job.stop(Reason::Shutdown);
             }
             let _span = self.span(&job).entered();
-            // Whatever panics, its half-made values die with it.
+            // After a panic nothing uses the values that it left.
             let run = AssertUnwindSafe(|| match kind {
                 Kind::Scene => self.make_scene(&job),
                 Kind::Semantics => self.make_semantics(&job),
             });
-            let outcome = catch_unwind(run).unwrap_or_else(|panic| Err(panicked(&*panic)));
-            meter::job(kind.name(), job.outcome(outcome.is_ok()));
+            let outcome = catch_unwind(run).unwrap_or_else(|panic| Err(panicked(kind, &*panic)));
+            meter::job(kind.names().0, job.outcome(outcome.is_ok()));
             if let Err(error) = outcome {
-                self.settle(&job, &error);
+                self.end_failed(&job, &error);
             }
             self.running.end(&job);
             let record = self.records.find(&job.scene);
-            let follows = record.is_some_and(|record| {
-                kind == Kind::Scene && record.status.semantics.state == SemanticsState::Running
-            });
-            if !follows {
+            // Its semantics are queued already, by this job or by a caller.
+            let follows =
+                |record: Arc<Record>| record.status.semantics.state == SemanticsState::Running;
+            if !record.is_some_and(follows) {
                 self.release(&job.scene);
             }
         }
@@ -83,27 +62,28 @@ impl Shared {
         }
     }
 
-    /// Waits until the networks are open; whether they are. It looks again and again, so that a
-    /// server that is stopped meanwhile need not wait.
+    /// Waits until the networks are open; whether they are. It ends when the server stops.
     fn networks_open(&self) -> bool {
         loop {
-            match self.parts.maker.networks() {
-                Networks::Open(_) => return true,
-                Networks::Broken => return false,
-                Networks::Opening if self.queue.is_closed() => return false,
-                Networks::Opening => std::thread::sleep(NETWORKS_LOOK),
+            match self.networks() {
+                NetworkState::Open(_) => return true,
+                NetworkState::Broken => return false,
+                NetworkState::Opening => {
+                    if self.queue.pause(NETWORKS_LOOK) {
+                        return false;
+                    }
+                }
             }
         }
     }
 
-    /// A span of the job, a scene's in the trace of the call that asked for it.
+    /// A span of the job. That of a scene belongs to the trace of the call that created it.
     fn span(&self, job: &Job) -> tracing::Span {
         let id = &job.scene;
-        let record = match job.kind {
-            Kind::Scene => self.records.find(id),
-            Kind::Semantics => return tracing::info_span!("semantics", scene = %id),
-        };
-        let Some(record) = record else { return tracing::Span::none() };
+        if job.kind == Kind::Semantics {
+            return tracing::info_span!("semantics", scene = %id);
+        }
+        let Some(record) = self.records.find(id) else { return tracing::Span::none() };
         let request_id = record.request_id.as_deref();
         let span = tracing::info_span!("scene", scene = %id, request_id);
         if let Some(parent) = &record.traceparent {
@@ -121,16 +101,15 @@ impl Shared {
         let limit = Duration::from_millis(self.parts.limits.scene_timeout_ms);
         let progress = |stage: Stage, fraction: f32| self.show(job, stage, fraction);
         let watch = Watch { progress: &progress, cancel: &job.cancel };
-        let (finished, watchdog) = mpsc::channel::<()>();
         std::thread::scope(|scope| {
+            // Dropped at the end of the work, also by a panic.
+            let (_finished, watchdog) = mpsc::channel::<()>();
             scope.spawn(move || {
                 if watchdog.recv_timeout(limit) == Err(RecvTimeoutError::Timeout) {
                     job.stop(Reason::Timeout);
                 }
             });
-            let done = catch_unwind(AssertUnwindSafe(|| work(watch)));
-            drop(finished);
-            done.unwrap_or_else(|panic| Err(panicked(&*panic)))
+            work(watch)
         })
     }
 
@@ -149,12 +128,23 @@ impl Shared {
     }
 
     /// What becomes of a job that failed or was stopped.
-    fn settle(&self, job: &Job, error: &Error) {
-        let id = &job.scene;
-        match (job.stopped(), job.kind) {
-            // Watchers are told that the scene is deleted.
+    fn end_failed(&self, job: &Job, error: &Error) {
+        let (id, (_, what)) = (&job.scene, job.kind.names());
+        let stopped = match (job.stopped(), job.kind) {
+            (None, _) => None,
             (Some(Reason::Cancelled), _) => {
-                tracing::info!(scene = %id, "{} cancelled", job.kind.what());
+                // Watchers are told that the scene is deleted.
+                tracing::info!(scene = %id, "{what} cancelled");
+                return;
+            }
+            (Some(Reason::Timeout), _) => {
+                let limit = Duration::from_millis(self.parts.limits.scene_timeout_ms);
+                let message = format!("{what} took longer than {} s", limit.as_secs_f64());
+                Some(Error::new(ErrorCode::DeadlineExceeded, message))
+            }
+            (Some(Reason::Shutdown), Kind::Semantics) => {
+                let message = format!("{what}: the server is stopping");
+                Some(Error::new(ErrorCode::Overloaded, message).retry_after_s(10))
             }
             (Some(Reason::Shutdown), Kind::Scene) => {
                 let queued = self.records.update(id, |record| {
@@ -162,25 +152,22 @@ impl Shared {
                     requeue(record);
                 });
                 if let Some(record) = queued {
-                    self.keep_failed(&record);
+                    self.keep_record(&record);
                 }
+                return;
             }
-            _ => {
-                let stopped = job.stop_error(&self.parts.limits);
-                self.fail(job.kind, id, stopped.as_ref().unwrap_or(error));
-            }
-        }
+        };
+        self.fail(job.kind, id, stopped.as_ref().unwrap_or(error));
     }
 
     /// Makes a failure known to watchers; that of a scene also to the store.
     pub(super) fn fail(&self, kind: Kind, id: &SceneId, error: &Error) {
-        if matches!(error.code().row().http, 500..) {
+        let (code, (_, what)) = (error.code().name(), kind.names());
+        if error.code().row().http >= 500 {
             let cause = std::error::Error::source(error).map(ToString::to_string);
-            let code = error.code().name();
-            tracing::error!(scene = %id, code, %error, cause, "{} failed", kind.what());
+            tracing::error!(scene = %id, code, %error, cause, "{what} failed");
         } else {
-            let code = error.code().name();
-            tracing::info!(scene = %id, code, %error, "{} failed", kind.what());
+            tracing::info!(scene = %id, code, %error, "{what} failed");
         }
         let now = store::now_ms();
         let change = |record: &mut Record| match kind {
@@ -198,13 +185,13 @@ impl Shared {
             }
         };
         if let (Kind::Scene, Some(mut failed)) = (kind, self.records.find(id)) {
-            change(&mut failed);
-            self.keep_failed(&failed);
+            change(Arc::make_mut(&mut failed));
+            self.keep_record(&failed);
         }
         self.records.update(id, change);
     }
 
-    fn keep_failed(&self, record: &Record) {
+    fn keep_record(&self, record: &Record) {
         if let Err(error) = self.parts.store.put_record(record) {
             tracing::error!(scene = %record.status.id, %error, "its status is not kept");
         }
@@ -213,7 +200,7 @@ impl Shared {
     /// The life of the thread that removes what crashes and deletions left in the store.
     pub(super) fn sweep(&self) {
         let limits = &self.parts.limits;
-        // By then no job of a deleted scene can still be at work, on any replica.
+        // By then no job of a deleted scene can still run, on any replica.
         let buried = Duration::from_millis(limits.scene_timeout_ms.saturating_mul(2))
             + Duration::from_millis(limits.replica_lease_ms);
         loop {
@@ -222,18 +209,19 @@ impl Shared {
                 Ok(removed) => tracing::info!(removed, "left-overs removed from the store"),
                 Err(error) => tracing::warn!(%error, "the store cannot be swept"),
             }
-            if self.shutdown.pause(Duration::from_millis(limits.sweep_every_ms.max(1_000))) {
+            if self.queue.pause(Duration::from_millis(limits.sweep_every_ms.max(1_000))) {
                 return;
             }
         }
     }
 }
 
-fn panicked(panic: &(dyn Any + Send)) -> Error {
+fn panicked(kind: Kind, panic: &(dyn Any + Send)) -> Error {
     let text = panic
         .downcast_ref::<&str>()
         .copied()
         .or_else(|| panic.downcast_ref::<String>().map(String::as_str));
     tracing::error!(panic = text, "a job panicked");
-    Error::internal("the scene could not be made: a fault of the server, not of the request")
+    let what = kind.names().1;
+    Error::internal(format!("{what} could not be made: a fault of the server, not of the request"))
 }

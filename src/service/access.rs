@@ -1,4 +1,4 @@
-//! The check of a scene's owner, as a type that all work on a scene asks for.
+//! The check of a scene's owner, as a type that all code which uses a scene requires.
 
 use std::sync::Arc;
 
@@ -27,9 +27,9 @@ impl SceneAccess {
     }
 
     /// The same scene with a newer record.
-    pub(super) fn renewed(&self, record: Record) -> Self {
+    pub(super) fn renewed(&self, record: Arc<Record>) -> Self {
         debug_assert_eq!(*self.id(), record.status.id, "the record of another scene");
-        Self { record: Arc::new(record) }
+        Self { record }
     }
 
     /// The same scene, where it can be rendered.
@@ -51,15 +51,13 @@ impl SceneAccess {
 
 impl Service {
     /// The scene, where this caller may use it.
-    ///
-    /// # Errors
-    /// `scene_not_found` where there is none, or it is another owner's.
+    /// Fails with `scene_not_found` where there is none, or it is another owner's.
     pub(super) async fn scene(&self, id: &SceneId) -> Result<SceneAccess> {
         if self.inner.jobs.may_be_stale(id) {
             let (inner, id) = (Arc::clone(&self.inner), id.clone());
             blocking(move || inner.jobs.refresh(&id)).await??;
         }
-        let record = Arc::new(self.inner.jobs.record(id)?);
+        let record = self.inner.jobs.record(id)?;
         if self.caller.sees(record.owner.as_deref()) {
             Ok(SceneAccess { record })
         } else {

@@ -1,6 +1,6 @@
-//! Creating a scene: check, make safe on disk, queue, wait as long as asked.
+//! Creating a scene: check, make safe in the store, queue, wait as long as the caller wants.
 
-use std::{hash::BuildHasher, sync::Arc, time::Duration};
+use std::{sync::Arc, time::Duration};
 
 use sha2::{Digest, Sha256};
 
@@ -19,8 +19,8 @@ use crate::{
 /// Locks that calls with one idempotency key share with few others.
 pub(super) const KEY_LOCKS: usize = 16;
 
-/// What a create call waits with: where its caller goes away before the id was told, and nobody
-/// else watches the scene, nobody wants it.
+/// A create call that waits. When its caller goes away before it has the id, and nobody else
+/// watches the scene, the scene is deleted.
 struct Waiting {
     service: Service,
     id: Option<SceneId>,
@@ -36,7 +36,7 @@ impl Drop for Waiting {
         runtime.spawn(async move {
             let jobs = &service.inner.jobs;
             let open = jobs.record(&id).is_ok_and(|record| !record.status.state.is_final());
-            if open && jobs.watchers(&id) == 0 {
+            if open && jobs.records.watchers(&id) == 0 {
                 tracing::info!(scene = %id, "its caller went away before it had an id");
                 if let Err(error) = service.delete(&id).await {
                     tracing::warn!(scene = %id, %error, "it cannot be dropped");
@@ -47,11 +47,12 @@ impl Drop for Waiting {
 }
 
 impl Service {
-    /// Takes an upload, makes it safe on disk, queues it, and waits as long as asked.
+    /// Takes an upload, makes it safe in the store, queues it, and waits as long as the caller
+    /// wants.
     ///
-    /// What is wrong with photos and cameras themselves is answered here; what only the pipeline
-    /// finds becomes the scene's error. A caller who goes away while waiting, without an
-    /// idempotency key, has the scene dropped: its id was told to nobody.
+    /// Faults of photos and cameras themselves are answered here; a fault that only the pipeline
+    /// finds becomes the scene's error. When a caller without an idempotency key goes away while it
+    /// waits, the scene is deleted: nobody knows its id.
     ///
     /// # Errors
     /// `invalid_request`, `photo_unreadable`, `limit_exceeded`, `overloaded`, `store_unavailable`.
@@ -86,9 +87,8 @@ impl Service {
         Ok(Created { status: self.get(&id).await?, replayed })
     }
 
-    /// Refuses a create that would find the queue full, before its photos are sent or decoded: work
-    /// for what is then refused would be taken from what is not. With an idempotency key it may be
-    /// one that was answered before, and is looked at whole.
+    /// Refuses a create that would find the queue full, before its photos are sent or decoded. A
+    /// call with an idempotency key is read first: it may be one that was answered before.
     ///
     /// # Errors
     /// `overloaded`.
@@ -117,10 +117,10 @@ impl Service {
         record: impl FnOnce(Record) -> Record + Send + 'static,
     ) -> Result<(SceneId, bool)> {
         let (inner, caller) = (Arc::clone(&self.inner), self.caller.clone());
-        let turn = Arc::clone(&inner.reading).acquire_owned().await;
-        let turn = turn.map_err(|e| Error::internal("no upload is read now").caused_by(e))?;
+        let permit = Arc::clone(&inner.reading).acquire_owned().await;
+        let permit = permit.map_err(|e| Error::internal("no upload is read now").caused_by(e))?;
         blocking(move || {
-            let _turn = turn;
+            let _permit = permit;
             inner.submit_here(upload, record, &caller)
         })
         .await?
@@ -134,7 +134,7 @@ impl Inner {
         record: impl FnOnce(Record) -> Record,
         caller: &Caller,
     ) -> Result<(SceneId, bool)> {
-        let id = new_id();
+        let id = store::new_id()?;
         let status = SceneStatus::new(id.clone(), SceneState::Queued, store::now_ms());
         let mut record = record(Record {
             owner: caller.owner().map(str::to_owned),
@@ -145,12 +145,12 @@ impl Inner {
             record.status.semantics.state = SemanticsState::Off;
         }
         let photos = upload.photos.len();
-        let made = self.jobs.submit(upload, record, &self.limits())?;
-        let replayed = made != id;
+        let queued = self.jobs.submit(upload, record, &self.limits())?;
+        let replayed = queued != id;
         if !replayed {
             tracing::info!(scene = %id, photos, "queued");
         }
-        Ok((made, replayed))
+        Ok((queued, replayed))
     }
 
     /// Held by a call with this key, so that two of them cannot both be the first.
@@ -160,7 +160,7 @@ impl Inner {
     }
 }
 
-/// Runs what takes long on a thread made for it.
+/// Runs long work on a blocking thread.
 pub(super) async fn blocking<T: Send + 'static>(
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Result<T> {
@@ -190,16 +190,4 @@ fn check_request(
         }
         _ => Ok(()),
     }
-}
-
-/// 128 bits nobody can guess: std's hash keys are the system's random numbers.
-fn new_id() -> SceneId {
-    let random = || std::hash::RandomState::new().hash_one(std::time::Instant::now());
-    let mut hash = Sha256::new();
-    for word in [random(), random(), random(), random(), store::now_ms()] {
-        hash.update(word.to_le_bytes());
-    }
-    let mut bytes = [0; 16];
-    bytes.copy_from_slice(&hash.finalize()[..16]);
-    SceneId::from_bytes(bytes)
 }

@@ -1,4 +1,4 @@
-//! A scene as a file for other programs, made piece by piece while it is sent.
+//! A scene as a file for other programs, written part by part while it is sent.
 
 use std::sync::Arc;
 
@@ -11,7 +11,7 @@ use super::{
     search::SceneTexts,
     texts,
     types::Export,
-    view::{asked_words, hash},
+    view::{hash, text_words},
 };
 use crate::{
     error::Result,
@@ -19,8 +19,8 @@ use crate::{
     store::ply::{PlyWriter, ply_size_bytes},
 };
 
-/// Pieces that wait for the caller to take them.
-const PIECES_MAX: usize = 4;
+/// Parts that wait for the caller to take them.
+const PARTS_MAX: usize = 4;
 
 impl Service {
     /// The scene, or what a text selects of it, as a file for other programs.
@@ -41,36 +41,40 @@ impl Service {
             let access = access.finished()?;
             let digest = access.record().scene_sha256.clone().unwrap_or_default();
             let scene = blocking(move || inner.load(&access)).await??;
-            let etag = format!("{}-ply", digest.get(..32).unwrap_or(id.as_str()));
+            let etag = digest.get(..32).unwrap_or(id.as_str());
             let size_bytes = ply_size_bytes(&scene.gaussians);
-            let (to, chunks) = mpsc::channel(PIECES_MAX);
-            tokio::task::spawn_blocking(move || send(&scene.gaussians, &to));
-            return Ok(Export { file_name: format!("{id}.ply"), size_bytes, etag, chunks });
+            let chunks = chunks(move |to| send(&scene.gaussians, to));
+            let (file_name, etag) = (format!("{id}.ply"), format!("{etag}-ply"));
+            return Ok(Export { file_name, size_bytes, etag, chunks });
         };
         inner.can_understand("text")?;
         let text = texts::checked(text, "text", &self.limits())?;
         let understood = inner.understood(&access.finished()?, "text", ask.wait).await?;
-        let tag = understood.tag();
-        let etag =
-            hash(&asked_words(&tag, &TextOptions { text: Some(text.clone()), ..ask.clone() })?);
+        let etag = hash(&text_words(understood.subject().tag, Some(&text), ask.profile)?);
         let profile = ask.profile;
         let chosen = blocking(move || {
-            let subject = understood.subject(&tag);
-            Ok(SceneTexts::new(&inner.backend, subject, profile, &[text])?.gaussians())
+            let texts = SceneTexts::new(&inner.backend, understood.subject(), profile, &[text]);
+            texts.map(|texts| texts.gaussians())
         })
         .await??;
         let size_bytes = ply_size_bytes(&chosen);
-        let (to, chunks) = mpsc::channel(PIECES_MAX);
-        tokio::task::spawn_blocking(move || send(&chosen, &to));
-        let etag = format!("{etag}-ply");
-        Ok(Export { file_name: format!("{id}-part.ply"), size_bytes, etag, chunks })
+        let chunks = chunks(move |to| send(&chosen, to));
+        let (file_name, etag) = (format!("{id}-part.ply"), format!("{etag}-ply"));
+        Ok(Export { file_name, size_bytes, etag, chunks })
     }
 }
 
+/// The parts of a file that `send` writes on a blocking thread.
+fn chunks(send: impl FnOnce(&mpsc::Sender<Vec<u8>>) + Send + 'static) -> mpsc::Receiver<Vec<u8>> {
+    let (to, chunks) = mpsc::channel(PARTS_MAX);
+    tokio::task::spawn_blocking(move || send(&to));
+    chunks
+}
+
 fn send(gaussians: &Gaussians, to: &mpsc::Sender<Vec<u8>>) {
-    for piece in PlyWriter::new(gaussians) {
-        // Whoever stopped listening wants no more.
-        if to.blocking_send(piece).is_err() {
+    for part in PlyWriter::new(gaussians) {
+        // The caller stopped listening and wants no more.
+        if to.blocking_send(part).is_err() {
             return;
         }
     }

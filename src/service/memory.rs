@@ -1,4 +1,4 @@
-//! Memory in use against its budget: what an upload would take beyond it is refused, not tried.
+//! Memory in use and its budget: an upload that does not fit is refused before it is read.
 
 use fs_err as fs;
 

@@ -3,7 +3,6 @@
 //! [`Service`] is a cheap clone; its calls are async and never do heavy work on the async threads.
 
 mod access;
-mod base64;
 mod camera;
 mod create;
 mod encode;
@@ -21,12 +20,10 @@ mod texts;
 mod types;
 mod view;
 
-use std::{
-    fmt,
-    sync::{Arc, PoisonError, RwLock},
-};
+use std::{fmt, sync::Arc};
 
 use futures_util::{Stream, stream};
+use parking_lot::RwLock;
 use tokio::sync::Semaphore;
 
 use self::{memory::Memory, schedule::Scheduler, search::Backend};
@@ -51,7 +48,7 @@ pub use crate::scene::{
 use crate::{
     config::Config,
     error::{Error, Result},
-    jobs::{JobParts, Jobs, Networks, SceneMaker, SemanticsMaker},
+    jobs::{JobParts, Jobs, NetworkState, SceneNetworks, SemanticNetworks},
     keys::Caller,
     limits::Limits,
     render::Renderer,
@@ -74,11 +71,11 @@ pub struct Service {
 /// What the service works with.
 #[derive(Clone)]
 pub struct Parts {
-    /// Turns uploads into scenes.
-    pub maker: Arc<dyn SceneMaker>,
-    /// Turns scenes into what they mean, and texts into embeddings.
-    pub semantics: Arc<dyn SemanticsMaker>,
-    /// Turns scenes into views.
+    /// Make scenes of photos.
+    pub scenes: Arc<dyn SceneNetworks>,
+    /// Make semantics of scenes, and embeddings of texts.
+    pub semantics: Arc<dyn SemanticNetworks>,
+    /// Draws views of scenes.
     pub renderer: Arc<dyn Renderer>,
     /// What `/v1/models` says; the renderer and the version are filled in.
     pub models: ModelsInfo,
@@ -95,11 +92,11 @@ struct Inner {
     /// Caps in force: those of the configuration, or newer ones.
     limits: RwLock<Arc<Limits>>,
     store: Arc<Store>,
-    jobs: Jobs,
+    jobs: Arc<Jobs>,
     backend: Backend,
     models: ModelsInfo,
     scheduler: Arc<Scheduler>,
-    /// Turns at decoding uploads.
+    /// Permits to decode uploads.
     reading: Arc<Semaphore>,
     key_locks: [tokio::sync::Mutex<()>; create::KEY_LOCKS],
     memory: Memory,
@@ -113,31 +110,28 @@ impl fmt::Debug for Inner {
 
 impl Inner {
     fn limits(&self) -> Arc<Limits> {
-        Arc::clone(&self.limits.read().unwrap_or_else(PoisonError::into_inner))
+        Arc::clone(&self.limits.read())
+    }
+}
+
+impl Drop for Inner {
+    fn drop(&mut self) {
+        self.jobs.shut_down();
     }
 }
 
 impl Service {
-    /// Opens the store that the configuration names, takes up unfinished work and starts the
-    /// workers. Blocks on the store.
+    /// Opens the store at `place`, queues unfinished jobs again and starts the workers. Blocks on
+    /// the store.
     ///
     /// # Errors
     /// `store_unavailable` when the store cannot be used.
-    pub fn open(config: Config, parts: Parts) -> Result<Self> {
-        let place = Place::of(&config)?;
-        Self::open_at(&place, config, parts)
-    }
-
-    /// As [`Self::open`], with the scenes of this place.
-    ///
-    /// # Errors
-    /// As [`Self::open`].
-    pub fn open_at(place: &Place, config: Config, parts: Parts) -> Result<Self> {
-        let (store, records) = Store::open_at(place, &config.limits)?;
+    pub fn open(place: &Place, config: Config, parts: Parts) -> Result<Self> {
+        let (store, records) = Store::open(place, &config.limits)?;
         let store = Arc::new(store);
         let job_parts = JobParts {
             store: Arc::clone(&store),
-            maker: parts.maker,
+            scenes: parts.scenes,
             semantics: Arc::clone(&parts.semantics),
             limits: config.limits.clone(),
             workers: config.jobs,
@@ -165,33 +159,29 @@ impl Service {
     }
 
     /// The same service for another caller.
-    #[must_use]
     pub fn for_caller(&self, caller: Caller) -> Self {
         Self { inner: Arc::clone(&self.inner), caller }
     }
 
     /// The caps in force.
-    #[must_use]
     pub fn limits(&self) -> Arc<Limits> {
         self.inner.limits()
     }
 
     /// The configuration of the start.
-    #[must_use]
     pub fn config(&self) -> &Config {
         &self.inner.config
     }
 
     /// Puts other caps in force; names those that only the next start can follow.
-    #[must_use]
     pub fn reload(&self, limits: Limits) -> Vec<&'static str> {
         let later = self.inner.config.limits.changed_for_next_start(&limits);
         self.inner.backend.planner.set_limits(&limits);
-        *self.inner.limits.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(limits);
+        *self.inner.limits.write() = Arc::new(limits);
         later
     }
 
-    /// Where a scene stands, with its report and cameras once done.
+    /// The status of a scene, with its report and cameras once done.
     ///
     /// # Errors
     /// `scene_not_found`.
@@ -217,12 +207,16 @@ impl Service {
         if inner.store.is_shared() {
             create::blocking(move || inner.jobs.refresh_all()).await??;
         }
-        let (records, more) =
-            self.inner.jobs.page(after, limit, |record| self.caller.sees(record.owner.as_deref()));
-        let next = records.last().filter(|_| more).map(cursor);
-        let without_cameras =
-            |record: Record| self.shown(SceneStatus { cameras: Vec::new(), ..record.status });
-        Ok(Page { scenes: records.into_iter().map(without_cameras).collect(), next })
+        let (records, more) = self
+            .inner
+            .jobs
+            .records
+            .page(after, limit, |record| self.caller.sees(record.owner.as_deref()));
+        let next = records.last().filter(|_| more).map(|last| cursor(last));
+        let without_cameras = |record: &Arc<Record>| {
+            self.shown(SceneStatus { cameras: Vec::new(), ..record.status.clone() })
+        };
+        Ok(Page { scenes: records.iter().map(without_cameras).collect(), next })
     }
 
     /// Stops the scene's job if it has one and removes everything kept of it.
@@ -264,7 +258,9 @@ impl Service {
                     .unwrap_or_else(|| Stage::SEMANTICS[0].name().to_owned()),
                 fraction: semantics.fraction,
             },
-            SceneState::Queued => Event::Queued { ahead: self.inner.jobs.ahead(&status.id) },
+            SceneState::Queued => {
+                Event::Queued { ahead: self.inner.jobs.queue.ahead(&status.id).unwrap_or(0) }
+            }
             SceneState::Running => Event::Running {
                 stage: status.stage.clone().unwrap_or_else(|| Stage::SCENE[0].name().to_owned()),
                 fraction: status.fraction,
@@ -279,29 +275,22 @@ impl Service {
     }
 
     /// What makes and renders the scenes.
-    #[must_use]
     pub fn models(&self) -> ModelsInfo {
         let mut models = self.inner.models.clone();
         match self.inner.jobs.networks() {
-            Networks::Open("") => {}
-            Networks::Open(provider) => provider.clone_into(&mut models.execution_provider),
-            Networks::Opening => "opening".clone_into(&mut models.execution_provider),
-            Networks::Broken => "broken".clone_into(&mut models.execution_provider),
+            NetworkState::Open("") => {}
+            NetworkState::Open(provider) => provider.clone_into(&mut models.execution_provider),
+            state => state.name().clone_into(&mut models.execution_provider),
         }
         models
     }
 
-    /// Whether new work is taken, and how much there is.
-    #[must_use]
+    /// Whether new jobs are taken, and how many there are.
     pub fn ready(&self) -> Readiness {
         let (jobs_queued, jobs_running) = self.inner.jobs.counts();
         Readiness {
             ready: self.inner.jobs.is_open(),
-            networks: match self.inner.jobs.networks() {
-                Networks::Opening => "opening",
-                Networks::Open(_) => "open",
-                Networks::Broken => "broken",
-            },
+            networks: self.inner.jobs.networks().name(),
             jobs_queued,
             jobs_running,
             renders: self.inner.scheduler.len(),
@@ -309,12 +298,11 @@ impl Service {
     }
 
     /// Bytes of scenes in memory.
-    #[must_use]
     pub fn cached_bytes(&self) -> u64 {
         self.inner.store.cached_bytes()
     }
 
-    /// Takes no more jobs, stops those at work (the next start takes them up again). Blocks.
+    /// Takes no more jobs and stops the running ones; the next start continues them. Blocks.
     pub fn shut_down(&self) {
         self.inner.jobs.shut_down();
     }

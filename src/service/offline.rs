@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use super::{
     pick, query,
-    request::{Kind, PickSpec, PictureOptions, QuerySpec, ViewSpec},
+    request::{PickSpec, QuerySpec, ViewSpec},
     search::{Backend, SceneTexts, Subject},
     texts,
     types::{Picked, QueryAnswer, RenderedView},
@@ -12,7 +12,7 @@ use super::{
 };
 use crate::{
     error::{Error, ErrorCode, Result},
-    jobs::SemanticsMaker,
+    jobs::SemanticNetworks,
     limits::Limits,
     render::Renderer,
     scene::{Gaussians, Scene, ScoringProfile},
@@ -26,17 +26,14 @@ pub struct OfflineService {
 
 impl std::fmt::Debug for OfflineService {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("OfflineService")
-            .field("renderer", &self.backend.renderer.name())
-            .finish_non_exhaustive()
+        write!(f, "OfflineService({})", self.backend.renderer.name())
     }
 }
 
 impl OfflineService {
     /// A service with these networks, this renderer and these limits.
-    #[must_use]
     pub fn new(
-        semantics: Arc<dyn SemanticsMaker>,
+        semantics: Arc<dyn SemanticNetworks>,
         renderer: Arc<dyn Renderer>,
         limits: Limits,
     ) -> Self {
@@ -44,7 +41,7 @@ impl OfflineService {
     }
 
     fn subject<'a>(&self, scene: &'a Scene, what: &str) -> Result<Subject<'a>> {
-        if let Some(lack) = self.backend.search.lacks() {
+        if let Some(lack) = self.backend.lacks() {
             let message = format!("{what}: the bundle has {lack}");
             return Err(Error::new(ErrorCode::ModelUnavailable, message));
         }
@@ -63,22 +60,18 @@ impl OfflineService {
     /// As there; `semantics_off` where the scene has no semantics.
     pub fn render(&self, scene: &Scene, spec: &ViewSpec) -> Result<RenderedView> {
         let ask = texts::check_ask(&[spec.kind], &spec.text, &self.limits)?;
-        let view = resolve_one(
-            scene,
-            spec.camera,
-            spec.kind,
-            (&spec.options, &spec.picture),
-            &self.limits,
-        )?;
-        let texts = match spec.kind.needs_semantics() {
-            true => {
-                let subject = self.subject(scene, &format!("kind={}", spec.kind))?;
-                let text = ask.text.as_slice();
-                Some(SceneTexts::new(&self.backend, subject, ask.profile, text)?)
-            }
-            false => None,
+        let options = (&spec.options, &spec.picture);
+        let view = resolve_one(&self.limits, scene, spec.camera, spec.kind, options)?;
+        let texts = if spec.kind.needs_semantics() {
+            let subject = self.subject(scene, &format!("kind={}", spec.kind))?;
+            let text = ask.text.as_slice();
+            Some(SceneTexts::new(&self.backend, subject, ask.profile, text)?)
+        } else {
+            None
         };
-        view.draw_one(&self.backend, scene, texts.as_ref())
+        let tag = scene.meta.id.as_str();
+        let mut views = view.draw(&self.backend, scene, tag, texts.as_ref(), || ())?;
+        views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
     }
 
     /// As [`super::Service::query`].
@@ -87,19 +80,10 @@ impl OfflineService {
     /// As there; `semantics_off` where the scene has no semantics.
     pub fn query(&self, scene: &Scene, spec: &QuerySpec) -> Result<QueryAnswer> {
         let texts = texts::all_checked(&spec.texts, "texts", &self.limits)?;
-        let view = spec.camera.map(|camera| {
-            resolve_one(
-                scene,
-                camera,
-                Kind::Mask,
-                (&spec.options, &PictureOptions::default()),
-                &self.limits,
-            )
-        });
-        let view = view.transpose()?;
+        let view = query::query_view(&self.limits, scene, spec)?;
         let subject = self.subject(scene, "query")?;
-        let asked = SceneTexts::new(&self.backend, subject, spec.profile, &texts)?;
-        query::answer(&asked, &self.limits, spec, view.as_ref(), || ())
+        let texts = SceneTexts::new(&self.backend, subject, spec.profile, &texts)?;
+        query::answer(&texts, &self.limits, spec, view.as_ref(), || ())
     }
 
     /// As [`super::Service::pick`], without labels.
@@ -107,13 +91,7 @@ impl OfflineService {
     /// # Errors
     /// As there.
     pub fn pick(&self, scene: &Scene, spec: &PickSpec) -> Result<Picked> {
-        let view = resolve_one(
-            scene,
-            spec.camera,
-            Kind::Alpha,
-            (&spec.options, &PictureOptions::default()),
-            &self.limits,
-        )?;
+        let view = pick::pick_view(&self.limits, scene, spec)?;
         pick::pick(&self.backend.planner, scene, &view, [spec.x, spec.y])
     }
 

@@ -9,14 +9,25 @@ use super::{
     semantics::Understood,
     texts,
     types::{Label, Picked},
-    view::{Resolved, resolve_for},
+    view::{Inputs, Resolved, resolve_one},
 };
 use crate::{
     error::{Error, Result},
+    limits::Limits,
     names::shown,
     render::{Kinds, ViewPlanner},
     scene::{Scene, SceneId},
 };
+
+/// The view of a pick.
+pub(super) fn pick_view<'a>(
+    limits: &Limits,
+    inputs: impl Into<Inputs<'a>>,
+    spec: &PickSpec,
+) -> Result<Resolved> {
+    let options = (&spec.options, &PictureOptions::default());
+    resolve_one(limits, inputs, spec.camera, Kind::Alpha, options)
+}
 
 /// Depth, point and Gaussian of a pixel of a view.
 pub(super) fn pick(
@@ -36,13 +47,10 @@ pub(super) fn pick(
                 shown(value)
             )));
         }
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked")]
-        let at = value.floor() as u32;
-        *whole = at;
+        *whole = value.floor() as u32;
     }
     let found = planner.contributions(scene, &request, whole)?;
     let alpha: f64 = found.iter().map(|one| one.weight).sum();
-    #[expect(clippy::cast_possible_truncation, reason = "0 to 1")]
     let mut picked = Picked { alpha: alpha as f32, ..Picked::default() };
     if alpha <= 0.0 {
         return Ok(picked);
@@ -70,14 +78,13 @@ impl Inner {
         labels: &[String],
         entry: u16,
     ) -> Result<Vec<Label>> {
-        let tag = understood.tag();
-        let subject = understood.subject(&tag);
-        let asked =
-            SceneTexts::new(&self.backend, subject, spec.profile, labels)?.texts.into_iter();
+        let subject = understood.subject();
+        let texts = SceneTexts::new(&self.backend, subject, spec.profile, labels)?.texts;
         let score = |scores: &[f32]| scores.get(usize::from(entry)).copied().unwrap_or(0.0);
-        let mut named: Vec<Label> = asked
-            .map(|one| Label { relevancy: score(one.scores.entries()), text: one.text })
-            .collect();
+        let named = texts
+            .into_iter()
+            .map(|one| Label { relevancy: score(one.scores.entries()), text: one.text });
+        let mut named: Vec<Label> = named.collect();
         named.sort_by(|a, b| b.relevancy.total_cmp(&a.relevancy));
         Ok(named)
     }
@@ -85,7 +92,7 @@ impl Inner {
 
 impl Service {
     /// What lies under a pixel of a view: depth, point, Gaussian, entry of the bank, and how well
-    /// the labels given name it. Without labels no semantics are made for it.
+    /// the given labels name it. Without labels it needs no semantics.
     ///
     /// # Errors
     /// As [`Service::query`] where labels are given, else as [`Service::render`].
@@ -93,11 +100,7 @@ impl Service {
         let scene = self.scene(id).await?;
         let inner = &self.inner;
         let scene = scene.finished()?;
-        let cameras = [spec.camera];
-        let picture = PictureOptions::default();
-        let options = (&spec.options, &picture);
-        let view = resolve_for(inner, scene.record(), &cameras, &[Kind::Alpha], options)?.pop();
-        let view = view.ok_or_else(|| Error::internal("one camera gave no request"))?;
+        let view = pick_view(&self.limits(), scene.record(), &spec)?;
         let (labels, understood) = if spec.labels.is_empty() {
             (Vec::new(), None)
         } else {
@@ -106,16 +109,16 @@ impl Service {
             (labels, Some(inner.understood(&scene, "labels", spec.wait).await?))
         };
         let deadline = inner.deadline(&spec.options);
-        let work = Arc::clone(inner);
+        let shared = Arc::clone(inner);
         inner
             .scheduled(deadline, 1, "the pick", move |_slot| {
                 let scene = match &understood {
                     Some(understood) => Arc::clone(&understood.scene),
-                    None => work.load(&scene)?,
+                    None => shared.load(&scene)?,
                 };
-                let mut picked = pick(&work.backend.planner, &scene, &view, [spec.x, spec.y])?;
+                let mut picked = pick(&shared.backend.planner, &scene, &view, [spec.x, spec.y])?;
                 if let (Some(understood), Some(entry)) = (&understood, picked.entry) {
-                    picked.labels = work.labels(understood, &spec, &labels, entry)?;
+                    picked.labels = shared.labels(understood, &spec, &labels, entry)?;
                 }
                 Ok(picked)
             })

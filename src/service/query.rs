@@ -1,5 +1,5 @@
-//! Many texts asked of one scene: scores of the bank, parts in 3D, and with a camera one drawing
-//! of the view for all of them.
+//! Many texts for one scene: scores of the bank, parts in 3D, and with a camera one drawing of the
+//! view for all of them.
 
 use std::{collections::HashMap, sync::Arc, time::Instant};
 
@@ -13,7 +13,7 @@ use super::{
     search::{LabelledView, SceneTexts, ScoredText},
     texts,
     types::{Part3, Peak, QueryAnswer, TextResult, TextView},
-    view::{Resolved, resolve_for},
+    view::{Inputs, Resolved, resolve_one},
 };
 use crate::{
     error::Result,
@@ -35,7 +35,7 @@ struct Selection {
 /// Answers the texts; `view` is that of the camera, where one was given. Calls `drawn` when it is
 /// drawn.
 pub(super) fn answer(
-    asked: &SceneTexts<'_>,
+    texts: &SceneTexts<'_>,
     limits: &Limits,
     spec: &QuerySpec,
     view: Option<&Resolved>,
@@ -44,17 +44,17 @@ pub(super) fn answer(
     let (mut labelled, mut render_ms) = (None, None);
     if let Some(view) = view {
         let started = Instant::now();
-        let key = view.labels_key(asked.of.tag, &asked.backend.renderer.name())?;
-        let (found, new) = asked.view(&view.labels_request(Kinds::NONE), key)?;
+        let key = view.labels_key(texts.of.tag, &texts.backend.renderer.name())?;
+        let (found, new) = texts.view(&view.labels_request(Kinds::NONE), key)?;
         render_ms = Some(if new { started.elapsed().as_secs_f64() * 1e3 } else { 0.0 });
         labelled = Some(found);
     }
     drawn();
-    let selections = selections(asked, limits, spec.boxes);
+    let selections = selections(texts, limits, spec.boxes);
     let result = |text: &ScoredText| -> Result<TextResult> {
         let entries = text.selected();
         let selection = selections.get(&entries);
-        let view = labelled.as_ref().map(|view| text_view(view, &asked.scorer, text, spec));
+        let view = labelled.as_ref().map(|view| text_view(view, &texts.scorer, text, spec));
         Ok(TextResult {
             text: text.text.clone(),
             scores: text.scores.entries().iter().skip(1).copied().collect(),
@@ -66,31 +66,42 @@ pub(super) fn answer(
         })
     };
     Ok(QueryAnswer {
-        bank_size: u32::try_from(asked.of.semantics.bank.len()).unwrap_or(u32::MAX),
+        bank_size: u32::try_from(texts.of.semantics.bank.len()).unwrap_or(u32::MAX),
         profile: spec.profile,
         camera: view.map(Resolved::camera),
         render_ms,
-        results: asked.texts.par_iter().map(result).collect::<Result<_>>()?,
+        results: texts.texts.par_iter().map(result).collect::<Result<_>>()?,
     })
+}
+
+/// The view that a query asks for, where it has a camera.
+pub(super) fn query_view<'a>(
+    limits: &Limits,
+    inputs: impl Into<Inputs<'a>>,
+    spec: &QuerySpec,
+) -> Result<Option<Resolved>> {
+    let Some(camera) = spec.camera else { return Ok(None) };
+    let options = (&spec.options, &PictureOptions::default());
+    resolve_one(limits, inputs, camera, Kind::Mask, options).map(Some)
 }
 
 /// What each set of entries selects; texts that select the same share it.
 fn selections(
-    asked: &SceneTexts<'_>,
+    texts: &SceneTexts<'_>,
     limits: &Limits,
     boxes: Boxes,
 ) -> HashMap<Vec<u16>, Selection> {
-    let mut sets: Vec<Vec<u16>> = asked.texts.iter().map(ScoredText::selected).collect();
+    let mut sets: Vec<Vec<u16>> = texts.texts.iter().map(ScoredText::selected).collect();
     sets.sort_unstable();
     sets.dedup();
-    let gaussians = &asked.of.scene.gaussians;
+    let gaussians = &texts.of.scene.gaussians;
     let mut counts = vec![0_u64; usize::from(u16::MAX) + 1];
     for m in gaussians.semantic_index() {
         counts[usize::from(*m)] += 1;
     }
     let options = PartOptions::default();
     let wanted = boxes != Boxes::None && sets.iter().any(|set| !set.is_empty());
-    let pieces = wanted.then(|| asked.pieces(&options));
+    let pieces = wanted.then(|| texts.pieces(&options));
     let part = |part: Part| {
         let held = if boxes == Boxes::Aligned { part.aligned } else { part.oriented };
         Part3 {
@@ -120,7 +131,7 @@ fn text_view(
     // A relevancy under 0.5 is 0, so this is the mask of the short form too.
     let mask: Vec<bool> = relevancy.iter().map(|score| *score >= SELECTED).collect();
     let (width, height) = (labelled.width, labelled.height);
-    let png = |layer| encode::layer(layer, width, height, Format::Png);
+    let png = |layer| Ok(encode::encode(layer, width, height, Format::Png)?.bytes);
     let (mut view, mut corners) = (TextView::default(), None::<[u32; 4]>);
     let mut best = 0.0_f32;
     for (y, row) in (0..height).zip(relevancy.chunks_exact(width.max(1) as usize)) {
@@ -145,46 +156,37 @@ fn text_view(
         MaskFormat::None => {}
     }
     if spec.relevancy {
-        view.relevancy_png = Some(png(Layer::Relevancy(&relevancy))?);
+        view.relevancy_png = Some(png(Layer::Share(&relevancy))?);
     }
     Ok(view)
 }
 
 impl Service {
-    /// Asks a scene many texts: which entries of its bank and which Gaussians they select, in
-    /// which connected parts; with a camera also where in that view.
+    /// Answers many texts for a scene: which entries of its bank and which Gaussians they select,
+    /// in which connected parts; with a camera also where in that view.
     ///
-    /// The first text of a scene has its semantics made, and waits for them.
+    /// The first text of a scene starts the job that makes its semantics, and waits for it.
     ///
     /// # Errors
     /// `invalid_request`, `limit_exceeded`, `scene_not_found`, `scene_not_ready` also when the
     /// semantics are not ready in time, `semantics_off`, `model_unavailable`, `overloaded`,
-    /// `deadline_exceeded`, and whatever the making of the semantics failed with.
+    /// `deadline_exceeded`, and the error of the job that makes the semantics.
     pub async fn query(&self, id: &SceneId, spec: QuerySpec) -> Result<QueryAnswer> {
         let scene = self.scene(id).await?;
         let inner = &self.inner;
         inner.can_understand("query")?;
         let texts = texts::all_checked(&spec.texts, "texts", &self.limits())?;
         let scene = scene.finished()?;
-        let view = match spec.camera {
-            Some(camera) => {
-                let cameras = [camera];
-                let picture = PictureOptions::default();
-                let options = (&spec.options, &picture);
-                resolve_for(inner, scene.record(), &cameras, &[Kind::Mask], options)?.pop()
-            }
-            None => None,
-        };
+        let view = query_view(&self.limits(), scene.record(), &spec)?;
         let understood = inner.understood(&scene, "query", spec.wait).await?;
         let deadline = inner.deadline(&spec.options);
-        let work = Arc::clone(inner);
+        let shared = Arc::clone(inner);
         let pixels = view.as_ref().map_or(0, Resolved::pixels);
         inner
             .scheduled(deadline, pixels, "the query", move |slot| {
-                let tag = understood.tag();
-                let subject = understood.subject(&tag);
-                let asked = SceneTexts::new(&work.backend, subject, spec.profile, &texts)?;
-                answer(&asked, &work.limits(), &spec, view.as_ref(), || slot.drawn())
+                let subject = understood.subject();
+                let texts = SceneTexts::new(&shared.backend, subject, spec.profile, &texts)?;
+                answer(&texts, &shared.limits(), &spec, view.as_ref(), || slot.drawn())
             })
             .await
     }

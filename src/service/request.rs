@@ -1,4 +1,4 @@
-//! What callers ask: one set of types for the query string, JSON bodies, the command line and
+//! Requests: one set of types for the query string, JSON bodies, the command line and
 //! `/openapi.json`. Their field names are the names of parameters and flags. gRPC has its own
 //! messages, which `api/grpc/convert.rs` turns into these.
 
@@ -61,13 +61,11 @@ pub enum Kind {
 
 impl Kind {
     /// Whether it answers a text.
-    #[must_use]
     pub fn takes_text(self) -> bool {
         matches!(self, Self::Relevancy | Self::Mask)
     }
 
     /// Whether it needs the scene's semantics.
-    #[must_use]
     pub fn needs_semantics(self) -> bool {
         self == Self::Semantics || self.takes_text()
     }
@@ -180,8 +178,8 @@ pub struct CameraFields {
     pub fov: Option<f64>,
 }
 
-/// Where a camera stands.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// Pose of a camera.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub enum PoseSpec {
     /// 16 numbers, row-major, OpenCV camera-to-world.
     CameraToWorld([f64; 16]),
@@ -206,9 +204,9 @@ pub enum PoseSpec {
 }
 
 /// Lens of a camera.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub enum LensSpec {
-    /// Pixels of the picture asked for. Without `cx`, `cy` the principal point is central.
+    /// Pixels of the requested picture. Without `cx`, `cy` the principal point is central.
     Focal {
         /// Focal length along x, pixels.
         fx: f64,
@@ -226,13 +224,12 @@ pub enum LensSpec {
     OfScene,
 }
 
-/// A camera as asked for: [`CameraFields`] whose fields go together.
+/// A camera of a request: [`CameraFields`] whose fields go together.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-#[serde(into = "CameraFields")]
 pub struct CameraSpec {
-    /// Where it stands.
+    /// Pose.
     pub pose: PoseSpec,
-    /// What it sees with.
+    /// Lens.
     pub lens: LensSpec,
 }
 
@@ -244,33 +241,8 @@ impl TryFrom<CameraFields> for CameraSpec {
     }
 }
 
-impl From<CameraSpec> for CameraFields {
-    fn from(camera: CameraSpec) -> Self {
-        let mut fields = match camera.pose {
-            PoseSpec::CameraToWorld(matrix) => {
-                Self { camera_to_world: Some(matrix), ..Self::default() }
-            }
-            PoseSpec::LookAt { eye, target, up } => {
-                Self { eye: Some(eye), target: Some(target), up, ..Self::default() }
-            }
-            PoseSpec::Between { from, to, t } => {
-                Self { from: Some(from), to: Some(to), t: Some(t), ..Self::default() }
-            }
-        };
-        match camera.lens {
-            LensSpec::Focal { fx, fy, cx, cy } => {
-                (fields.fx, fields.fy, fields.cx, fields.cy) = (Some(fx), fy, cx, cy);
-            }
-            LensSpec::Fov(fov) => fields.fov = Some(fov),
-            LensSpec::OfScene => {}
-        }
-        fields
-    }
-}
-
 impl CameraFields {
     /// Whether any field of a pose is given.
-    #[must_use]
     pub fn has_pose(&self) -> bool {
         self.camera_to_world.is_some() || self.has_look() || self.has_between()
     }
@@ -403,7 +375,7 @@ pub struct ViewSpec {
     pub options: ViewOptions,
     /// How it is encoded.
     pub picture: PictureOptions,
-    /// What is asked by text.
+    /// Its text.
     pub text: TextOptions,
 }
 
@@ -422,12 +394,12 @@ pub struct ViewsSpec {
     /// How they are encoded.
     #[serde(flatten)]
     pub picture: PictureOptions,
-    /// What is asked by text.
+    /// Its text.
     #[serde(flatten)]
     pub text: TextOptions,
 }
 
-/// Many texts asked of a scene, in 3D and, with a camera, in one view.
+/// Many texts for a scene, in 3D and, with a camera, in one view.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, ToSchema)]
 #[serde(default)]
 #[schema(as = QueryBody)]
@@ -466,7 +438,7 @@ pub struct PickSpec {
     pub y: f64,
     /// Size and the rest of the view.
     pub options: ViewOptions,
-    /// Texts to name the entry with; none: semantics are not made for it.
+    /// Texts to name the entry with; without them it needs no semantics.
     pub labels: Vec<String>,
     /// How labels are scored.
     pub profile: ScoringProfile,
@@ -486,7 +458,6 @@ pub enum Background {
 
 impl Background {
     /// The one colour, where it is one.
-    #[must_use]
     pub fn color(self) -> Option<[f32; 3]> {
         match self {
             Self::Backdrop => None,
@@ -584,44 +555,5 @@ mod millis {
         from: D,
     ) -> Result<Option<Duration>, D::Error> {
         Ok(Option::<u64>::deserialize(from)?.map(Duration::from_millis))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn fields_that_do_not_go_together_are_refused_by_name() {
-        let eye = Some([0.0, 0.0, -1.0]);
-        let of = CameraFields::default;
-        let cases = [
-            (of(), "no pose given"),
-            (CameraFields { eye, ..of() }, "eye and target go together"),
-            (CameraFields { t: Some(0.5), ..of() }, "need from"),
-            (CameraFields { eye, from: Some(0), ..of() }, "not several"),
-            (CameraFields { from: Some(0), cx: Some(1.0), ..of() }, "need fx"),
-            (CameraFields { from: Some(0), fx: Some(1.0), fov: Some(50.0), ..of() }, "not both"),
-        ];
-        for (fields, part) in cases {
-            let error = CameraSpec::try_from(fields).expect_err("refused");
-            assert!(error.message().contains(part), "{} lacks {part}", error.message());
-        }
-        let spec = CameraSpec::try_from(CameraFields { from: Some(2), ..of() }).unwrap();
-        assert_eq!(spec.pose, PoseSpec::Between { from: 2, to: 2, t: 0.0 });
-        assert_eq!(spec.lens, LensSpec::OfScene);
-        assert_eq!(CameraSpec::try_from(CameraFields::from(spec)).unwrap(), spec);
-    }
-
-    #[test]
-    fn backgrounds_are_names_hex_or_numbers() {
-        let color = |text: &str| text.parse::<Background>().map(Background::color);
-        assert_eq!(color("backdrop").unwrap(), None);
-        assert_eq!(color("white").unwrap(), Some([1.0; 3]));
-        assert_eq!(color("#ff0000").unwrap(), Some([1.0, 0.0, 0.0]));
-        assert_eq!(color("0, 0.5,1").unwrap(), Some([0.0, 0.5, 1.0]));
-        for odd in ["", "#ff00", "#ggffff", "1,2", "a,b,c", "#+fffff"] {
-            assert!(color(odd).unwrap_err().contains("#rrggbb"), "{odd} was taken");
-        }
     }
 }

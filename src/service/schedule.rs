@@ -10,11 +10,9 @@
 //!
 //! [`Renderer::concurrency`]: crate::render::Renderer::concurrency
 
-use std::{
-    collections::BTreeMap,
-    sync::{Arc, Mutex, MutexGuard, PoisonError},
-};
+use std::{collections::BTreeMap, sync::Arc};
 
+use parking_lot::Mutex;
 use tokio::sync::oneshot;
 
 use crate::{
@@ -63,7 +61,7 @@ struct Waiting {
     start: oneshot::Sender<Slot>,
 }
 
-/// Leave to draw a view. Dropped at the end of its work.
+/// A permit to draw a view. Dropped when its picture is encoded.
 #[derive(Debug)]
 pub(super) struct Slot {
     scheduler: Arc<Scheduler>,
@@ -75,7 +73,7 @@ impl Slot {
     /// Says that the view is drawn: the next one is drawn while this one is encoded.
     pub(super) fn drawn(&mut self) {
         if std::mem::take(&mut self.drawing) {
-            let mut state = self.scheduler.lock();
+            let mut state = self.scheduler.state.lock();
             state.drawing -= 1;
             state.drawing_small -= usize::from(self.pixels <= SMALL_PIXELS);
             self.scheduler.start_next(&mut state);
@@ -86,7 +84,7 @@ impl Slot {
 impl Drop for Slot {
     fn drop(&mut self) {
         self.drawn();
-        let mut state = self.scheduler.lock();
+        let mut state = self.scheduler.state.lock();
         state.active -= 1;
         state.active_pixels -= self.pixels;
         self.scheduler.start_next(&mut state);
@@ -97,13 +95,13 @@ impl Drop for Slot {
 struct Place<'a> {
     scheduler: &'a Scheduler,
     key: (u64, u64),
-    /// Closed after the view has left the queue, so that no slot is sent to nobody.
+    /// Closed after the view has left the queue, so that no slot is lost.
     started: oneshot::Receiver<Slot>,
 }
 
 impl Drop for Place<'_> {
     fn drop(&mut self) {
-        let mut state = self.scheduler.lock();
+        let mut state = self.scheduler.state.lock();
         if let Some(gone) = state.waiting.remove(&self.key) {
             state.waiting_pixels -= gone.pixels;
         }
@@ -123,21 +121,19 @@ impl Scheduler {
         few.clamp(1, CALLER_VIEWS).min(self.concurrency + 1)
     }
 
-    /// Views that wait or are at work.
+    /// Views that wait, are drawn or are encoded.
     pub(super) fn len(&self) -> usize {
-        let state = self.lock();
+        let state = self.state.lock();
         state.waiting.len() + state.active
     }
 
     /// Waits until a view of so many pixels may be drawn. A caller who goes away gives its place
     /// back.
-    ///
-    /// # Errors
-    /// `overloaded` when too many views, or too many pixels, wait already.
+    /// Fails with `overloaded` when too many views, or too many pixels, wait already.
     pub(super) async fn enter(self: &Arc<Self>, pixels: u64, limits: &Limits) -> Result<Slot> {
         let (start, started) = oneshot::channel();
         let mut place = {
-            let mut state = self.lock();
+            let mut state = self.state.lock();
             let views = state.waiting.len() + state.active;
             let queued = state.waiting_pixels + state.active_pixels;
             let room = limits.queued_pixels_max.saturating_sub(queued);
@@ -189,38 +185,39 @@ impl Scheduler {
         let (&key, _) = state.waiting.iter().find(small)?;
         (state.drawing_small == 0).then_some(key)
     }
-
-    fn lock(&self) -> MutexGuard<'_, State> {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
 }
 
 #[cfg(test)]
 mod tests {
-    use futures_util::FutureExt;
+    use futures_util::{FutureExt, future::BoxFuture};
 
     use super::*;
 
     const HUGE: u64 = 4096 * 4096;
 
-    fn limits() -> Limits {
-        Limits::default()
+    /// A view that has to wait.
+    fn waits<'a>(
+        scheduler: &'a Arc<Scheduler>,
+        pixels: u64,
+        limits: &'a Limits,
+    ) -> BoxFuture<'a, Result<Slot>> {
+        let mut waiting = scheduler.enter(pixels, limits).boxed();
+        assert!(waiting.as_mut().now_or_never().is_none(), "a view of {pixels} pixels waits");
+        waiting
     }
 
     #[tokio::test]
     async fn one_too_many_is_refused_and_places_return() {
-        let limits = Limits { queued_renders_max: 2, ..limits() };
+        let limits = Limits { queued_renders_max: 2, ..Limits::default() };
         let scheduler = Scheduler::new(1, &limits);
         let first = scheduler.enter(HUGE, &limits).await.unwrap();
-        let mut second = Box::pin(scheduler.enter(HUGE, &limits));
-        assert!(second.as_mut().now_or_never().is_none(), "one at a time");
+        let second = waits(&scheduler, HUGE, &limits);
         let third = scheduler.enter(1, &limits).await.unwrap_err();
         assert_eq!((third.code(), third.retry_after()), (ErrorCode::Overloaded, Some(1)));
         assert_eq!(scheduler.len(), 2, "the refused one is not counted");
         drop(second);
         assert_eq!(scheduler.len(), 1, "a caller that goes away gives its place back");
-        let mut second = Box::pin(scheduler.enter(HUGE, &limits));
-        assert!(second.as_mut().now_or_never().is_none(), "it waits");
+        let second = waits(&scheduler, HUGE, &limits);
         drop(first);
         assert_eq!(scheduler.len(), 1, "the second one has a slot that it has not taken");
         drop(second);
@@ -230,28 +227,27 @@ mod tests {
 
     #[tokio::test]
     async fn a_view_that_is_drawn_holds_no_slot_while_it_is_encoded() {
-        let limits = limits();
+        let limits = Limits::default();
         let scheduler = Scheduler::new(1, &limits);
         let mut first = scheduler.enter(HUGE, &limits).await.unwrap();
-        let mut second = Box::pin(scheduler.enter(HUGE, &limits));
-        assert!(second.as_mut().now_or_never().is_none(), "one at a time");
+        let second = waits(&scheduler, HUGE, &limits);
         first.drawn();
         let second = second.await.unwrap();
         assert_eq!(scheduler.len(), 2, "one is encoded, one is drawn");
         drop((first, second));
-        let state = scheduler.lock();
+        let state = scheduler.state.lock();
         assert_eq!((state.active, state.active_pixels, state.drawing), (0, 0, 0), "all given back");
     }
 
     #[tokio::test]
     async fn pictures_in_memory_stay_within_their_pixels() {
-        let limits = Limits { active_pixels_max: 2 * HUGE, ..limits() };
+        let limits = Limits { active_pixels_max: 2 * HUGE, ..Limits::default() };
         let scheduler = Scheduler::new(8, &limits);
         let mut first = scheduler.enter(HUGE, &limits).await.unwrap();
         let _second = scheduler.enter(HUGE, &limits).await.unwrap();
         first.drawn();
-        let mut third = Box::pin(scheduler.enter(HUGE, &limits));
-        assert!(third.as_mut().now_or_never().is_none(), "the first is still being encoded");
+        // The first is still being encoded.
+        let third = waits(&scheduler, HUGE, &limits);
         drop(first);
         assert!(third.await.is_ok());
         let alone = Scheduler::new(8, &limits);
@@ -260,25 +256,22 @@ mod tests {
 
     #[tokio::test]
     async fn large_views_neither_fill_the_queue_nor_keep_small_ones_waiting() {
-        let limits = limits();
+        let limits = Limits::default();
         let scheduler = Scheduler::new(1, &limits);
         let drawn = scheduler.enter(HUGE, &limits).await.unwrap();
         let mut huge = Vec::new();
         for _ in 0..31 {
-            let mut one = Box::pin(scheduler.enter(HUGE, &limits));
+            let mut one = scheduler.enter(HUGE, &limits).boxed();
             match one.as_mut().now_or_never() {
                 None => huge.push(one),
-                Some(refused) => {
-                    assert_eq!(refused.unwrap_err().code(), ErrorCode::Overloaded);
-                }
+                Some(refused) => assert_eq!(refused.unwrap_err().code(), ErrorCode::Overloaded),
             }
         }
         assert!(!huge.is_empty() && huge.len() < 31, "{} huge views wait", huge.len());
         let small = scheduler.enter(64 * 64, &limits).await.expect("drawn beside the huge one");
-        let mut other = Box::pin(scheduler.enter(64 * 64, &limits));
-        assert!(other.as_mut().now_or_never().is_none(), "one small view at a time beside it");
-        let mut middle = Box::pin(scheduler.enter(1024 * 1024, &limits));
-        assert!(middle.as_mut().now_or_never().is_none(), "not small");
+        // One small view at a time is drawn beside it.
+        let other = waits(&scheduler, 64 * 64, &limits);
+        let middle = waits(&scheduler, 1024 * 1024, &limits);
         drop(small);
         drop(other.await.unwrap());
         drop(drawn);
@@ -290,15 +283,13 @@ mod tests {
 
     #[tokio::test]
     async fn a_large_view_waits_for_no_more_pixels_than_its_own() {
-        let limits = limits();
+        let limits = Limits::default();
         let scheduler = Scheduler::new(1, &limits);
         let mut slot = scheduler.enter(HUGE, &limits).await.unwrap();
-        let mut huge = Box::pin(scheduler.enter(HUGE, &limits));
-        assert!(huge.as_mut().now_or_never().is_none(), "it waits");
+        let mut huge = waits(&scheduler, HUGE, &limits);
         let mut before = 0;
         loop {
-            let mut next = Box::pin(scheduler.enter(HUGE / 8, &limits));
-            assert!(next.as_mut().now_or_never().is_none(), "one is drawn");
+            let mut next = waits(&scheduler, HUGE / 8, &limits);
             drop(slot);
             match next.as_mut().now_or_never() {
                 Some(started) => slot = started.unwrap(),
@@ -307,6 +298,6 @@ mod tests {
             before += 1;
             assert!(before < 20, "it starves");
         }
-        assert!(huge.now_or_never().is_some() && before >= 4, "after {before} smaller views");
+        assert!(huge.as_mut().now_or_never().is_some() && before >= 4, "after {before} small ones");
     }
 }

@@ -1,46 +1,31 @@
-//! Texts asked of a scene: what views, queries, picks and exports are answered from.
+//! Texts and scenes: the data that views, queries, picks and exports need.
 //!
-//! A [`TextSearch`] keeps what was made for the texts before: embeddings, banks ready to be scored,
-//! connected pieces, and the weights of views. A [`SceneTexts`] is one scene, the texts asked of
-//! it, and how the bank scores them.
+//! A [`Backend`] keeps what earlier texts needed: embeddings, banks ready to be scored, connected
+//! pieces, and the weights of views. A [`SceneTexts`] is one scene, the texts for it, and how the
+//! bank scores them.
 
 use std::{
-    collections::HashMap,
+    collections::{BTreeSet, HashMap},
     sync::{Arc, OnceLock},
 };
 
-use super::types::TextWarning;
+use super::{types::TextWarning, view::text_words};
 use crate::{
     cache::Cache,
     error::{Error, Result},
-    jobs::{Phrases, SemanticsMaker},
+    jobs::{Phrases, SemanticNetworks},
     limits::Limits,
     render::{Labels, PixelWeights, RenderRequest, Renderer, ViewPlanner},
     scene::{Gaussians, PAPER_PHRASES, PAPER_TAU, Scene, ScoringProfile, Semantics, TextEmbedding},
     semantics::{PartOptions, Pieces, Scorer, Scoring, TextScores, ViewNorms},
 };
 
-/// What answers are made with. Its calls block; they belong on a thread made for it.
+/// What answers are computed with, and what was kept from earlier texts. Its calls block; they
+/// belong on a blocking thread.
 pub(super) struct Backend {
     pub(super) renderer: Arc<dyn Renderer>,
     pub(super) planner: ViewPlanner,
-    pub(super) search: TextSearch,
-}
-
-impl Backend {
-    pub(super) fn new(
-        renderer: Arc<dyn Renderer>,
-        semantics: Arc<dyn SemanticsMaker>,
-        limits: &Limits,
-    ) -> Self {
-        let (planner, search) = (ViewPlanner::new(limits), TextSearch::new(semantics, limits));
-        Self { renderer, planner, search }
-    }
-}
-
-/// The networks for texts, and what they and the scorers made before.
-pub(super) struct TextSearch {
-    maker: Arc<dyn SemanticsMaker>,
+    networks: Arc<dyn SemanticNetworks>,
     /// By text; each weighs 1.
     embeddings: Cache<String, Arc<TextEmbedding>>,
     /// By scene, semantics and profile; by bytes.
@@ -51,10 +36,16 @@ pub(super) struct TextSearch {
     views: Cache<String, Arc<LabelledView>>,
 }
 
-impl TextSearch {
-    fn new(maker: Arc<dyn SemanticsMaker>, limits: &Limits) -> Self {
+impl Backend {
+    pub(super) fn new(
+        renderer: Arc<dyn Renderer>,
+        networks: Arc<dyn SemanticNetworks>,
+        limits: &Limits,
+    ) -> Self {
         Self {
-            maker,
+            renderer,
+            planner: ViewPlanner::new(limits),
+            networks,
             embeddings: Cache::new(limits.texts_cached_max as u64),
             scorers: Cache::new(limits.scorers_cache_bytes_max),
             pieces: Cache::new(limits.pieces_cache_bytes_max),
@@ -64,28 +55,27 @@ impl TextSearch {
 
     /// What the bundle lacks, `None` where nothing.
     pub(super) fn lacks(&self) -> Option<String> {
-        self.maker.lacks()
+        self.networks.lacks()
     }
 
     /// Embeddings of texts: known ones from memory, all others from one run of the network.
     fn embedded(&self, texts: &[String]) -> Result<Vec<Arc<TextEmbedding>>> {
-        let known: Vec<_> = texts.iter().map(|text| self.embeddings.find(text)).collect();
-        let unknown = texts.iter().zip(&known).filter(|(_, known)| known.is_none());
-        let mut unknown: Vec<String> = unknown.map(|(text, _)| text.clone()).collect();
-        unknown.sort_unstable();
-        unknown.dedup();
-        let made =
-            if unknown.is_empty() { Vec::new() } else { self.maker.embed_texts(&unknown)? };
-        let made = unknown.into_iter().zip(made.into_iter().map(Arc::new));
-        let made: HashMap<String, Arc<TextEmbedding>> = made.collect();
-        for (text, embedding) in &made {
-            self.embeddings.insert(text.clone(), Arc::clone(embedding), 1);
+        let known =
+            texts.iter().filter_map(|text| Some((text.clone(), self.embeddings.find(text)?)));
+        let mut found: HashMap<String, Arc<TextEmbedding>> = known.collect();
+        let unknown: BTreeSet<&String> =
+            texts.iter().filter(|text| !found.contains_key(*text)).collect();
+        let unknown: Vec<String> = unknown.into_iter().cloned().collect();
+        if !unknown.is_empty() {
+            let new = self.networks.embed_texts(&unknown)?;
+            for (text, embedding) in unknown.into_iter().zip(new) {
+                let embedding = Arc::new(embedding);
+                self.embeddings.insert(text.clone(), Arc::clone(&embedding), 1);
+                found.insert(text, embedding);
+            }
         }
-        let of = |(text, known): (&String, Option<_>)| {
-            let embedding = known.or_else(|| made.get(text).cloned());
-            embedding.ok_or_else(|| Error::internal("a text has no embedding"))
-        };
-        texts.iter().zip(known).map(of).collect()
+        let lost = || Error::internal("a text has no embedding");
+        texts.iter().map(|text| found.get(text).cloned().ok_or_else(lost)).collect()
     }
 
     /// A bank ready to be scored under a profile; `tag` tells scene and semantics.
@@ -100,7 +90,7 @@ impl TextSearch {
             return Ok(known);
         }
         let phrases = match profile {
-            ScoringProfile::Default => self.maker.phrases()?,
+            ScoringProfile::Default => self.networks.phrases()?,
             ScoringProfile::Paper => Phrases {
                 canon: PAPER_PHRASES.map(str::to_owned).to_vec(),
                 tau: PAPER_TAU,
@@ -156,8 +146,8 @@ impl LabelledView {
         let norms = match kept.get() {
             Some(norms) => norms,
             None => {
-                let made = scorer.norms(&self.weights)?;
-                kept.get_or_init(|| made)
+                let norms = scorer.norms(&self.weights)?;
+                kept.get_or_init(|| norms)
             }
         };
         scorer.relevancy(text, &self.weights, norms)
@@ -180,12 +170,12 @@ impl LabelledView {
     }
 
     fn size_bytes(&self) -> u64 {
-        // Norms of both profiles, whether they are made yet or not.
+        // Norms of both profiles, also where they are not computed yet.
         self.weights.size_bytes() + 2 * 4 * self.weights.pixels() as u64
     }
 }
 
-/// A scene with its semantics, as texts are asked of it.
+/// A scene with its semantics, for texts.
 #[derive(Clone, Copy)]
 pub(super) struct Subject<'a> {
     pub(super) scene: &'a Scene,
@@ -194,7 +184,7 @@ pub(super) struct Subject<'a> {
     pub(super) tag: &'a str,
 }
 
-/// A scene, and the texts asked of it, scored.
+/// A scene and its scored texts.
 pub(super) struct SceneTexts<'a> {
     pub(super) backend: &'a Backend,
     pub(super) of: Subject<'a>,
@@ -210,7 +200,7 @@ impl<'a> SceneTexts<'a> {
         profile: ScoringProfile,
         texts: &[String],
     ) -> Result<Self> {
-        let scorer = backend.search.scorer(of.tag, of.semantics, profile)?;
+        let scorer = backend.scorer(of.tag, of.semantics, profile)?;
         let scored = |(text, embedding): (&String, Arc<TextEmbedding>)| {
             Ok(ScoredText {
                 text: text.clone(),
@@ -218,21 +208,27 @@ impl<'a> SceneTexts<'a> {
                 warnings: warnings(text, &embedding),
             })
         };
-        let embeddings = backend.search.embedded(texts)?;
+        let embeddings = backend.embedded(texts)?;
         let texts = texts.iter().zip(embeddings).map(scored).collect::<Result<_>>()?;
         Ok(Self { backend, of, scorer, texts })
     }
 
+    /// What tells the first text, how it is scored and the scene from all others, in tags.
+    pub(super) fn words(&self) -> Result<String> {
+        let text = self.texts.first().map(|text| text.text.as_str());
+        text_words(self.of.tag, text, self.scorer.scoring().profile())
+    }
+
     /// The connected pieces of the scene's entries.
     pub(super) fn pieces(&self, options: &PartOptions) -> Arc<Pieces> {
-        let (kept, tag) = (&self.backend.search.pieces, self.of.tag.to_owned());
+        let (kept, tag) = (&self.backend.pieces, self.of.tag.to_owned());
         if let Some(known) = kept.find(&tag) {
             return known;
         }
         let scene = self.of.scene;
-        let made = Arc::new(Pieces::new(&scene.gaussians, &scene.meta.cameras, options));
-        kept.insert(tag, Arc::clone(&made), made.size_bytes());
-        made
+        let pieces = Arc::new(Pieces::new(&scene.gaussians, &scene.meta.cameras, options));
+        kept.insert(tag, Arc::clone(&pieces), pieces.size_bytes());
+        pieces
     }
 
     /// The Gaussians that any of the texts selects.
@@ -248,7 +244,7 @@ impl<'a> SceneTexts<'a> {
 
     /// A view's weights where they are still known; `key` tells the view from all others.
     pub(super) fn known_view(&self, key: &str) -> Option<Arc<LabelledView>> {
-        self.backend.search.views.find(&key.to_owned())
+        self.backend.views.find(&key.to_owned())
     }
 
     /// Keeps the weights of a view that was drawn.
@@ -259,7 +255,7 @@ impl<'a> SceneTexts<'a> {
         weights: PixelWeights,
     ) -> Arc<LabelledView> {
         let view = Arc::new(LabelledView { width, height, weights, norms: Default::default() });
-        self.backend.search.views.insert(key, Arc::clone(&view), view.size_bytes());
+        self.backend.views.insert(key, Arc::clone(&view), view.size_bytes());
         view
     }
 

@@ -1,6 +1,8 @@
-//! Before a text is answered: does the bundle know texts, may the scene be asked, is it understood?
+//! What a text needs before it is answered: networks for texts, a scene that allows texts, and the
+//! semantics of the scene.
 //!
-//! The first text has the semantics made; however many ask meanwhile, they are made once.
+//! The first text starts the job that makes the semantics. They are made once, however many callers
+//! wait for them.
 
 use std::{sync::Arc, time::Duration};
 
@@ -16,23 +18,19 @@ use crate::{
 /// When to ask again for semantics that are being made, seconds.
 const RETRY_AFTER_S: u32 = 2;
 
-/// A scene that can be asked by text.
+/// A scene that is ready for texts.
 #[derive(Clone, Debug)]
 pub(super) struct Understood {
     pub(super) access: SceneAccess,
     pub(super) scene: Arc<Scene>,
-    pub(super) semantics: Arc<Semantics>,
+    semantics: Arc<Semantics>,
+    /// Tells scene and semantics from any others.
+    tag: String,
 }
 
 impl Understood {
-    /// The scene as texts are asked of it; `tag` is [`Self::tag`].
-    pub(super) fn subject<'a>(&'a self, tag: &'a str) -> Subject<'a> {
-        Subject { scene: &self.scene, semantics: &self.semantics, tag }
-    }
-
-    /// Tells scene and semantics from any others.
-    pub(super) fn tag(&self) -> String {
-        meaning_tag(self.access.record())
+    pub(super) fn subject(&self) -> Subject<'_> {
+        Subject { scene: &self.scene, semantics: &self.semantics, tag: &self.tag }
     }
 }
 
@@ -43,34 +41,30 @@ pub(super) fn meaning_tag(record: &Record) -> String {
 }
 
 impl Inner {
-    /// Refuses what the loaded bundle cannot do; `what` was asked.
+    /// Refuses `what` where the loaded bundle cannot do it.
     pub(super) fn can_understand(&self, what: &str) -> Result<()> {
-        let Some(lack) = self.backend.search.lacks() else { return Ok(()) };
-        Err(Error::new(
-            ErrorCode::ModelUnavailable,
-            format!(
-                "{what}: bundle {:?} has {lack}; colour, depth and alpha are available",
-                self.models.bundle
-            ),
-        ))
+        let Some(lack) = self.backend.lacks() else { return Ok(()) };
+        let why = self.lacking(&lack);
+        Err(Error::new(ErrorCode::ModelUnavailable, format!("{what}: {why}")))
     }
 
-    /// Refuses a scene that was made to be asked nothing.
+    fn lacking(&self, lack: &str) -> String {
+        let bundle = &self.models.bundle;
+        format!("bundle {bundle:?} has {lack}; colour, depth and alpha are available")
+    }
+
+    /// Refuses a scene that was made without semantics.
     pub(super) fn may_be_asked(record: &Record, what: &str) -> Result<()> {
         if record.options.semantics != SemanticsMode::Off {
             return Ok(());
         }
-        Err(Error::new(
-            ErrorCode::SemanticsOff,
-            format!(
-                "{what}: scene {} was made with semantics=off; make it again with lazy or eager",
-                record.status.id
-            ),
-        ))
+        let id = &record.status.id;
+        let why = "was made with semantics=off; make it again with lazy or eager";
+        Err(Error::new(ErrorCode::SemanticsOff, format!("{what}: scene {id} {why}")))
     }
 
-    /// The scene with what it means; `None` where that must be made again: its file was put aside,
-    /// or other networks made it, whose embeddings no text of these can be compared with.
+    /// The scene with its semantics; `None` where they must be made again: their file was put
+    /// aside, or other networks made them, whose embeddings cannot be compared with texts of these.
     fn loaded_semantics(
         &self,
         access: &SceneAccess,
@@ -88,9 +82,9 @@ impl Inner {
         Ok(None)
     }
 
-    /// The scene with what it means, which is made now where it was not before.
+    /// The scene with its semantics, which are made now where they were not before.
     ///
-    /// `wait` bounds how long; who waits no longer is told where the making stands.
+    /// `wait` bounds how long; after that the error says how far the job is.
     pub(super) async fn understood(
         self: &Arc<Self>,
         scene: &SceneAccess,
@@ -107,13 +101,13 @@ impl Inner {
         let mut watcher = self.jobs.watch(id)?;
         loop {
             self.jobs.understand(id)?;
-            let settled = tokio::time::timeout_at(
+            let ended = tokio::time::timeout_at(
                 until,
                 watcher.wait_for(|r| r.status.semantics.state != SemanticsState::Running),
             )
             .await
-            .map(|settled| settled.map(|record| record.clone()));
-            let record = match settled {
+            .map(|ended| ended.map(|record| Arc::clone(&record)));
+            let record = match ended {
                 Ok(Ok(record)) => record,
                 Ok(Err(_closed)) => return Err(not_found(id)),
                 Err(_late) => return Err(not_yet(&watcher.borrow().status, what)),
@@ -127,13 +121,14 @@ impl Inner {
             let (inner, asked) = (Arc::clone(self), access.clone());
             let found = blocking(move || inner.loaded_semantics(&asked)).await??;
             if let Some((scene, semantics)) = found {
-                return Ok(Understood { access, scene, semantics });
+                let tag = meaning_tag(access.record());
+                return Ok(Understood { access, scene, semantics, tag });
             }
         }
     }
 }
 
-/// The semantics are on their way; says how far.
+/// The semantics are being made; says how far the job is.
 fn not_yet(status: &SceneStatus, what: &str) -> Error {
     let semantics = &status.semantics;
     let message = format!(
@@ -146,28 +141,24 @@ fn not_yet(status: &SceneStatus, what: &str) -> Error {
 }
 
 impl Service {
-    /// Has a scene's semantics made, unless they are there, and waits for them: at most `wait`,
+    /// Makes the semantics of a scene, unless they are ready, and waits for them: at most `wait`,
     /// or as long as a text would.
     ///
     /// # Errors
     /// `scene_not_found`, `scene_not_ready` also when they are still being made after that time,
-    /// `semantics_off`, `model_unavailable`, `overloaded`, and whatever their making failed with.
+    /// `semantics_off`, `model_unavailable`, `overloaded`, and the error of the job that makes
+    /// them.
     pub async fn understand(&self, id: &SceneId, wait: Option<Duration>) -> Result<SceneStatus> {
         let scene = self.scene(id).await?.finished()?;
         let understood = self.inner.understood(&scene, "semantics", wait).await?;
         Ok(self.shown(understood.access.record().status.clone()))
     }
 
-    /// A status with what can be asked of the scene by text now.
+    /// A status that says whether texts can be answered for the scene now.
     pub(super) fn shown(&self, mut status: SceneStatus) -> SceneStatus {
-        let lack = self.inner.backend.search.lacks();
-        let bundle = &self.inner.models.bundle;
-        let reason = match (status.semantics.state, lack) {
-            (SemanticsState::Off, _) => Some("the scene was made with semantics=off".to_owned()),
-            (_, Some(lack)) => {
-                Some(format!("bundle {bundle:?} has {lack}; colour, depth and alpha are available"))
-            }
-            (_, None) => None,
+        let reason = match status.semantics.state {
+            SemanticsState::Off => Some("the scene was made with semantics=off".to_owned()),
+            _ => self.inner.backend.lacks().map(|lack| self.inner.lacking(&lack)),
         };
         status.semantics.available = reason.is_none();
         status.semantics.reason = reason;

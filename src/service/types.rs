@@ -2,11 +2,11 @@
 
 use std::fmt;
 
-use serde::{Deserialize, Serialize};
+use base64::{Engine as _, prelude::BASE64_STANDARD};
+use serde::{Deserialize, Serialize, Serializer};
 use utoipa::ToSchema;
 
 use super::{
-    base64,
     request::{Format, Kind},
     rle::Rle,
 };
@@ -101,11 +101,11 @@ pub struct TextView {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub mask_rle: Option<Rle>,
     /// Mask as a PNG; base64 in JSON.
-    #[serde(skip_serializing_if = "Option::is_none", serialize_with = "base64::optional")]
+    #[serde(skip_serializing_if = "Option::is_none", serialize_with = "as_base64")]
     #[schema(value_type = Option<String>)]
     pub mask_png: Option<Vec<u8>>,
     /// Relevancy as a PNG; base64 in JSON.
-    #[serde(skip_serializing_if = "Option::is_none", serialize_with = "base64::optional")]
+    #[serde(skip_serializing_if = "Option::is_none", serialize_with = "as_base64")]
     #[schema(value_type = Option<String>)]
     pub relevancy_png: Option<Vec<u8>>,
     /// Pixels of the mask.
@@ -114,6 +114,11 @@ pub struct TextView {
     pub bbox: Option<[u32; 4]>,
     /// Where the relevancy is highest; none where it is 0 everywhere.
     pub peak: Option<Peak>,
+}
+
+#[expect(clippy::ref_option, reason = "serde calls it so")]
+fn as_base64<S: Serializer>(file: &Option<Vec<u8>>, to: S) -> Result<S::Ok, S::Error> {
+    file.as_ref().map(|bytes| BASE64_STANDARD.encode(bytes)).serialize(to)
 }
 
 /// The pixel of the highest relevancy.
@@ -139,10 +144,10 @@ pub struct Picked {
     pub point: Option<[f64; 3]>,
     /// The Gaussian that adds most, counted from 0 in the scene's order.
     pub gaussian: Option<u64>,
-    /// Its entry of the bank, counted from 1; none where the scene is not understood yet, or the
+    /// Its entry of the bank, counted from 1; none where the scene has no semantics yet, or the
     /// Gaussian is background.
     pub entry: Option<u16>,
-    /// The labels asked for, the best first.
+    /// The labels of the request, the best first.
     pub labels: Vec<Label>,
 }
 
@@ -205,12 +210,7 @@ pub struct Export {
 }
 
 impl Export {
-    /// Next piece; `None` at the end.
-    pub async fn next_chunk(&mut self) -> Option<Vec<u8>> {
-        self.chunks.recv().await
-    }
-
-    /// The pieces as a stream.
+    /// The parts as a stream.
     pub fn into_stream(self) -> impl futures_util::Stream<Item = Vec<u8>> + Send + 'static {
         tokio_stream::wrappers::ReceiverStream::new(self.chunks)
     }
@@ -258,14 +258,14 @@ pub struct ModelInfo {
 /// What `/readyz` says.
 #[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]
 pub struct Readiness {
-    /// Whether new work is taken.
+    /// Whether new jobs are taken.
     pub ready: bool,
     /// The networks: `opening` (scenes are taken and wait for them), `open`, or `broken`.
     pub networks: &'static str,
     /// Jobs that wait.
     pub jobs_queued: usize,
-    /// Jobs at work.
+    /// Jobs that workers run.
     pub jobs_running: usize,
-    /// Renders at work or waiting.
+    /// Views that are drawn, encoded or wait.
     pub renders: usize,
 }

@@ -15,7 +15,8 @@ use super::{
     Inner, Service,
     access::SceneAccess,
     camera,
-    encode::{self, Layer},
+    create::blocking,
+    encode::{self, Encoded, Layer},
     request::{CameraSpec, Kind, PictureOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec},
     schedule::Slot,
     search::{Backend, LabelledView, SceneTexts},
@@ -31,9 +32,9 @@ use crate::{
         Frame, Kinds, Labels, RenderRequest,
         plan::{NEAR_RANGE, default_near},
     },
-    scene::{Camera, Intrinsics, Scene, SceneCamera, SceneId},
+    scene::{Camera, Intrinsics, Scene, SceneCamera, SceneId, ScoringProfile},
     semantics::mask_from_blend,
-    store::Record,
+    store::{Record, hex},
     telemetry::meter,
 };
 
@@ -47,12 +48,12 @@ pub(super) struct Resolved {
     camera: Camera,
     kinds: Vec<Kind>,
     near: f32,
-    /// As asked for, with the size and the near plane that were found.
+    /// As in the request, with the size and the near plane that were found.
     options: ViewOptions,
     picture: PictureOptions,
 }
 
-/// What the text kinds of a view are read from.
+/// The drawn labels of a view, from which the pictures of texts are computed.
 enum ViewLabels {
     /// Weights over the bank, which answer every text.
     Weights(Arc<LabelledView>),
@@ -103,11 +104,11 @@ impl Resolved {
         Kinds { color: has(Kind::Color), depth: has(Kind::Depth), alpha: has(Kind::Alpha) }
     }
 
-    /// Hash of scene, renderer and request for one kind; `asked` tells what was asked by text.
-    fn etag(&self, scene: &str, renderer: &str, kind: Kind, asked: &str) -> Result<String> {
+    /// Hash of scene, renderer and request for one kind; `texts` are the words of [`text_words`].
+    fn etag(&self, scene: &str, renderer: &str, kind: Kind, texts: &str) -> Result<String> {
         let version = env!("CARGO_PKG_VERSION");
         let request = (self.camera, kind, &self.options, &self.picture);
-        Ok(hash(&words(&(scene, version, renderer, request, asked))?))
+        Ok(hash(&words(&(scene, version, renderer, request, texts))?))
     }
 
     /// One drawing for the pixel kinds and, where they are not known, for the labels.
@@ -115,66 +116,57 @@ impl Resolved {
         &self,
         backend: &Backend,
         scene: &Scene,
-        asked: Option<&SceneTexts<'_>>,
+        texts: Option<&SceneTexts<'_>>,
     ) -> Result<(Frame, Option<ViewLabels>)> {
         let mut request = self.labels_request(self.kinds());
-        let mut wanted = None;
-        if let Some(asked) = asked {
-            let key = self.labels_key(asked.of.tag, &backend.renderer.name())?;
-            if let Some(known) = asked.known_view(&key) {
-                let (width, height) = (known.width, known.height);
-                let frame = match request.kinds {
-                    Kinds::NONE => Frame { width, height, ..Frame::default() },
-                    _ => self.frame(backend, scene, &request)?,
-                };
-                return Ok((frame, Some(ViewLabels::Weights(known))));
-            }
-            request.labels = self.labels(asked);
-            wanted = Some((asked, key));
+        let Some(texts) = texts else { return Ok((self.frame(backend, scene, &request)?, None)) };
+        let key = self.labels_key(texts.of.tag, &backend.renderer.name())?;
+        if let Some(known) = texts.known_view(&key) {
+            let (width, height) = (known.width, known.height);
+            let frame = match request.kinds {
+                Kinds::NONE => Frame { width, height, ..Frame::default() },
+                _ => self.frame(backend, scene, &request)?,
+            };
+            return Ok((frame, Some(ViewLabels::Weights(known))));
         }
+        request.labels = self.labels(texts);
         let mut frame = self.frame(backend, scene, &request)?;
         let size = [frame.width, frame.height];
-        let labels = match (wanted, frame.weights.take(), frame.blend.take()) {
-            (Some((asked, key)), Some(weights), _) => {
-                Some(ViewLabels::Weights(asked.keep_view(key, size, weights)))
-            }
-            (_, _, blend) => blend.map(ViewLabels::Blend),
+        let labels = match (frame.weights.take(), frame.blend.take()) {
+            (Some(weights), _) => Some(ViewLabels::Weights(texts.keep_view(key, size, weights))),
+            (None, blend) => blend.map(ViewLabels::Blend),
         };
         Ok((frame, labels))
     }
 
     fn frame(&self, backend: &Backend, scene: &Scene, request: &RenderRequest) -> Result<Frame> {
-        backend.planner.render(
-            &*backend.renderer,
-            scene,
-            request,
-            self.picture.background.color().is_none(),
-        )
+        let backdrop = self.picture.background.color().is_none();
+        backend.planner.render(&*backend.renderer, scene, request, backdrop)
     }
 
     /// A mask alone is the blend of a few numbers; all else needs the weights.
-    fn labels(&self, asked: &SceneTexts<'_>) -> Labels {
+    fn labels(&self, texts: &SceneTexts<'_>) -> Labels {
         let mask_alone =
             self.kinds.iter().all(|kind| !kind.needs_semantics() || *kind == Kind::Mask);
-        let tables = asked.texts.first().map(|text| text.scores.tables()).unwrap_or_default();
+        let tables = texts.texts.first().map(|text| text.scores.tables()).unwrap_or_default();
         match <[_; 1]>::try_from(tables) {
             Ok([table]) if mask_alone => Labels::Blend(table),
             _ => Labels::Weights,
         }
     }
 
-    /// The pictures of all kinds; `scene_tag` tells the scene in their tags, `asked_tag` what was
-    /// asked by text. Calls `drawn` when only the encoding is left to do.
-    fn draw(
+    /// The pictures of all kinds; `scene_tag` tells the scene in their tags. Calls `drawn` when
+    /// only the encoding is left to do.
+    pub(super) fn draw(
         &self,
         backend: &Backend,
         scene: &Scene,
         scene_tag: &str,
-        texts: Option<(&SceneTexts<'_>, &str)>,
+        texts: Option<&SceneTexts<'_>>,
         drawn: impl FnOnce(),
     ) -> Result<Vec<RenderedView>> {
         let started = Instant::now();
-        let (frame, labels) = self.drawn(backend, scene, texts.map(|(asked, _)| asked))?;
+        let (frame, labels) = self.drawn(backend, scene, texts)?;
         drawn();
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
         meter::stage("render", render_ms / 1e3);
@@ -182,27 +174,23 @@ impl Resolved {
         let view = |&kind: &Kind| -> Result<RenderedView> {
             let encoding = Instant::now();
             let texts = texts.filter(|_| kind.needs_semantics());
-            let (bytes, depth_scale) = match (texts, &labels) {
-                (Some((asked, _)), Some(labels)) => {
-                    (self.text_picture(kind, asked, labels, &frame)?, None)
-                }
-                _ => {
-                    let encoded = encode::encode(&frame, kind, self.picture.format)?;
-                    (encoded.bytes, encoded.depth_scale)
-                }
+            let encoded = match (texts, &labels) {
+                (Some(texts), Some(labels)) => self.text_picture(kind, texts, labels, &frame)?,
+                _ => self.encode(encode::layer(&frame, kind)?, &frame)?,
             };
             let encode_ms = encoding.elapsed().as_secs_f64() * 1e3;
             meter::stage("encode", encode_ms / 1e3);
+            let texts = texts.map(SceneTexts::words).transpose()?.unwrap_or_default();
             Ok(RenderedView {
                 camera_index: self.camera_index,
                 kind,
                 format: self.picture.format,
                 width: frame.width,
                 height: frame.height,
-                bytes,
-                depth_scale,
+                bytes: encoded.bytes,
+                depth_scale: encoded.depth_scale,
                 camera: self.seen(),
-                etag: self.etag(scene_tag, &name, kind, texts.map_or("", |(_, tag)| tag))?,
+                etag: self.etag(scene_tag, &name, kind, &texts)?,
                 stats: frame.stats,
                 render_ms,
                 encode_ms,
@@ -211,66 +199,88 @@ impl Resolved {
         self.kinds.iter().map(view).collect()
     }
 
+    fn encode(&self, layer: Layer<'_>, frame: &Frame) -> Result<Encoded> {
+        encode::encode(layer, frame.width, frame.height, self.picture.format)
+    }
+
     fn text_picture(
         &self,
         kind: Kind,
-        asked: &SceneTexts<'_>,
+        texts: &SceneTexts<'_>,
         labels: &ViewLabels,
         frame: &Frame,
-    ) -> Result<Vec<u8>> {
-        let file = |layer| encode::layer(layer, frame.width, frame.height, self.picture.format);
-        let scorer = &asked.scorer;
-        let text = asked.texts.first();
+    ) -> Result<Encoded> {
+        let (scorer, text) = (&texts.scorer, texts.texts.first());
         match (kind, labels, text) {
             (Kind::Mask, ViewLabels::Blend(blend), _) => {
-                file(Layer::Mask(&mask_from_blend(&[blend.as_slice()], scorer.scoring())))
+                let mask = mask_from_blend(&[blend.as_slice()], scorer.scoring());
+                self.encode(Layer::Mask(&mask), frame)
             }
             (Kind::Mask, ViewLabels::Weights(view), Some(text)) => {
-                file(Layer::Mask(&scorer.mask(&text.scores, &view.weights)?))
+                self.encode(Layer::Mask(&scorer.mask(&text.scores, &view.weights)?), frame)
             }
             (Kind::Relevancy, ViewLabels::Weights(view), Some(text)) => {
-                file(Layer::Relevancy(&view.relevancy(scorer, &text.scores)?))
+                self.encode(Layer::Share(&view.relevancy(scorer, &text.scores)?), frame)
             }
             (Kind::Semantics, ViewLabels::Weights(view), _) => {
-                file(Layer::Entries(&view.strongest(scorer)))
+                self.encode(Layer::Entries(&view.strongest(scorer)), frame)
             }
             _ => Err(Error::internal(format!("kind={kind} was not drawn"))),
         }
     }
 }
 
-/// Values in a form that tells any two of them apart: numbers are written to their last bit.
+/// Values as text: equal text means equal values. Numbers are written to their last bit.
 fn words(values: &impl Serialize) -> Result<String> {
     serde_json::to_string(values)
         .map_err(|e| Error::internal("a request cannot be written down").caused_by(e))
 }
 
-/// 32 hexadecimal digits that tell a text from all others.
+/// 32 hexadecimal digits of the sha256 of a text.
 pub(super) fn hash(words: &str) -> String {
-    Sha256::digest(words)[..16].iter().map(|byte| format!("{byte:02x}")).collect()
+    hex(&Sha256::digest(words)[..16])
 }
 
-/// What tells one scene from any other, in tags.
+/// Tells a scene from all others, in tags.
 pub(super) fn scene_tag(record: &Record) -> String {
     format!("{} {}", record.scene_sha256.as_deref().unwrap_or_default(), record.status.id)
 }
 
-/// Cameras and median depth of a record, as [`resolve`] takes them.
-pub(super) fn resolve_for(
-    inner: &Inner,
-    record: &Record,
-    cameras: &[CameraSpec],
-    kinds: &[Kind],
+/// What views of a scene are resolved against.
+#[derive(Clone, Copy)]
+pub(super) struct Inputs<'a> {
+    cameras: &'a [SceneCamera],
+    median_depth: f64,
+}
+
+impl<'a> From<&'a Record> for Inputs<'a> {
+    fn from(record: &'a Record) -> Self {
+        let median_depth = record.status.report.as_ref().map_or(0.0, |report| report.median_depth);
+        Self { cameras: &record.status.cameras, median_depth }
+    }
+}
+
+impl<'a> From<&'a Scene> for Inputs<'a> {
+    fn from(scene: &'a Scene) -> Self {
+        Self { cameras: &scene.meta.cameras, median_depth: scene.meta.report.median_depth }
+    }
+}
+
+/// The request of one camera and one kind.
+pub(super) fn resolve_one<'a>(
+    limits: &Limits,
+    inputs: impl Into<Inputs<'a>>,
+    camera: CameraSpec,
+    kind: Kind,
     options: (&ViewOptions, &PictureOptions),
-) -> Result<Vec<Resolved>> {
-    let depth = record.status.report.as_ref().map_or(0.0, |report| report.median_depth);
-    resolve(&inner.limits(), &record.status.cameras, depth, cameras, kinds, options)
+) -> Result<Resolved> {
+    let mut all = resolve(limits, inputs.into(), &[camera], &[kind], options)?;
+    all.pop().ok_or_else(|| Error::internal("one camera gave no request"))
 }
 
 fn resolve(
     limits: &Limits,
-    inputs: &[SceneCamera],
-    median_depth: f64,
+    inputs: Inputs<'_>,
     cameras: &[CameraSpec],
     kinds: &[Kind],
     (options, picture): (&ViewOptions, &PictureOptions),
@@ -290,14 +300,14 @@ fn resolve(
             let near = shown(f64::from(near));
             return Err(Error::invalid(format!("near is {near}; it must be {least} to {most}")));
         }
-        None => default_near(median_depth),
+        None => default_near(inputs.median_depth),
     };
     let resolved = |(camera_index, spec)| {
         let what = match cameras.len() {
             1 => "camera".to_owned(),
             _ => format!("camera {camera_index}"),
         };
-        let camera = camera::resolve(spec, options, inputs, limits, &what)?;
+        let camera = camera::resolve(spec, options, inputs.cameras, limits, &what)?;
         let Intrinsics { width, height, .. } = camera.intrinsics;
         Ok(Resolved {
             camera_index,
@@ -319,36 +329,8 @@ fn resolve(
     cameras.iter().enumerate().map(resolved).collect()
 }
 
-/// One camera of a scene that is not in the service's store.
-pub(super) fn resolve_one(
-    scene: &Scene,
-    camera: CameraSpec,
-    kind: Kind,
-    options: (&ViewOptions, &PictureOptions),
-    limits: &Limits,
-) -> Result<Resolved> {
-    let meta = &scene.meta;
-    let depth = meta.report.median_depth;
-    let mut all = resolve(limits, &meta.cameras, depth, &[camera], &[kind], options)?;
-    all.pop().ok_or_else(|| Error::internal("one camera gave no request"))
-}
-
-impl Resolved {
-    /// The first picture, of a scene that is not in the service's store.
-    pub(super) fn draw_one(
-        &self,
-        backend: &Backend,
-        scene: &Scene,
-        texts: Option<&SceneTexts<'_>>,
-    ) -> Result<RenderedView> {
-        let texts = texts.map(|texts| (texts, ""));
-        let mut views = self.draw(backend, scene, scene.meta.id.as_str(), texts, || ())?;
-        views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
-    }
-}
-
 impl Inner {
-    /// The scene itself; marks it when its file turns out to be bad. Blocks on the disk.
+    /// The scene itself. It is marked as failed when its file is bad. Blocks on the store.
     pub(super) fn load(&self, access: &SceneAccess) -> Result<Arc<Scene>> {
         let started = Instant::now();
         let scene = self.store.scene(access.id());
@@ -371,7 +353,7 @@ impl Inner {
         Ok(Some(self.understood(scene, &format!("kind={kind}"), ask.wait).await?))
     }
 
-    /// Checks what a request asks by text, the bundle first: without networks no text is any good.
+    /// Checks the text of a request; the bundle first, because no text works without networks.
     fn checked_ask(&self, kinds: &[Kind], ask: &TextOptions) -> Result<TextOptions> {
         if let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) {
             self.can_understand(&format!("kind={kind}"))?;
@@ -396,16 +378,14 @@ impl Inner {
                 let scene = inner.load(&scene)?;
                 return view.draw(backend, &scene, &tag, None, drawn);
             };
-            let meaning = understood.tag();
-            let subject = understood.subject(&meaning);
-            let asked = SceneTexts::new(backend, subject, ask.profile, ask.text.as_slice())?;
-            let asked_tag = asked_words(&meaning, &ask)?;
-            view.draw(backend, subject.scene, &tag, Some((&asked, &asked_tag)), drawn)
+            let subject = understood.subject();
+            let texts = SceneTexts::new(backend, subject, ask.profile, ask.text.as_slice())?;
+            view.draw(backend, subject.scene, &tag, Some(&texts), drawn)
         };
         self.scheduled(deadline, pixels, "the view", work).await
     }
 
-    /// Does work on a blocking thread as soon as the scheduler starts it, within the deadline.
+    /// Runs `work` on a blocking thread as soon as the scheduler starts it, within the deadline.
     /// `pixels` are those of the view that it draws.
     pub(super) async fn scheduled<T: Send + 'static>(
         &self,
@@ -419,10 +399,7 @@ impl Inner {
         let work = async {
             let mut slot = self.scheduler.enter(pixels, &limits).await?;
             meter::stage("queue", started.elapsed().as_secs_f64());
-            let span = tracing::Span::current();
-            tokio::task::spawn_blocking(move || span.in_scope(|| work(&mut slot)))
-                .await
-                .map_err(|e| Error::internal("the work was broken off").caused_by(e))?
+            blocking(move || work(&mut slot)).await?
         };
         let late = || {
             let ms = started.elapsed().as_millis();
@@ -435,42 +412,37 @@ impl Inner {
     }
 
     pub(super) fn deadline(&self, options: &ViewOptions) -> Instant {
-        let most = Duration::from_millis(self.limits().render_timeout_ms);
-        Instant::now() + options.deadline.map_or(most, |asked| asked.min(most))
+        until(options.deadline, self.limits().render_timeout_ms)
     }
 }
 
-/// What was asked by text, in tags.
-pub(super) fn asked_words(tag: &str, ask: &TextOptions) -> Result<String> {
-    words(&(tag, &ask.text, ask.profile))
+/// The caller's deadline, at most `most_ms` from now.
+fn until(deadline: Option<Duration>, most_ms: u64) -> Instant {
+    let most = Duration::from_millis(most_ms);
+    Instant::now() + deadline.map_or(most, |deadline| deadline.min(most))
+}
+
+/// A text of a scene and how it is scored, in tags; `tag` tells scene and semantics.
+pub(super) fn text_words(tag: &str, text: Option<&str>, profile: ScoringProfile) -> Result<String> {
+    words(&(tag, text, profile))
 }
 
 impl Service {
     /// The tag that [`Self::render`] would answer with, without rendering; `None` where it needs
-    /// semantics that are not made yet.
+    /// semantics that do not exist yet.
     ///
     /// # Errors
-    /// As [`Self::render`], but for what only rendering meets.
+    /// As [`Self::render`], without those of the rendering itself.
     pub async fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<Option<String>> {
-        let scene = self.scene(id).await?;
-        let inner = &self.inner;
-        let ask = inner.checked_ask(&[spec.kind], &spec.text)?;
-        let scene = scene.finished()?;
+        let (scene, ask, view) = self.checked_view(id, spec).await?;
         let record = scene.record();
-        let resolved = resolve_for(
-            inner,
-            record,
-            &[spec.camera],
-            &[spec.kind],
-            (&spec.options, &spec.picture),
-        )?;
-        let asked = match (spec.kind.needs_semantics(), &record.semantics_sha256) {
+        let texts = match (spec.kind.needs_semantics(), &record.semantics_sha256) {
             (false, _) => String::new(),
-            (true, Some(_)) => asked_words(&meaning_tag(record), &ask)?,
+            (true, Some(_)) => text_words(&meaning_tag(record), ask.text.as_deref(), ask.profile)?,
             (true, None) => return Ok(None),
         };
-        let name = inner.backend.renderer.name();
-        Ok(Some(resolved[0].etag(&scene_tag(record), &name, spec.kind, &asked)?))
+        let name = self.inner.backend.renderer.name();
+        view.etag(&scene_tag(record), &name, spec.kind, &texts).map(Some)
     }
 
     /// Renders and encodes one view.
@@ -480,26 +452,27 @@ impl Service {
     /// `limit_exceeded`, `overloaded`, `deadline_exceeded`, `gpu_unavailable`; for kinds that need
     /// semantics also what [`Service::query`] says.
     pub async fn render(&self, id: &SceneId, spec: ViewSpec) -> Result<RenderedView> {
-        let scene = self.scene(id).await?;
+        let (scene, ask, view) = self.checked_view(id, &spec).await?;
         let inner = &self.inner;
-        let kinds = [spec.kind];
-        let ask = inner.checked_ask(&kinds, &spec.text)?;
-        let scene = scene.finished()?;
-        let mut resolved = resolve_for(
-            inner,
-            scene.record(),
-            &[spec.camera],
-            &kinds,
-            (&spec.options, &spec.picture),
-        )?;
-        let understood = inner.understood_for(&scene, &kinds, &ask).await?;
+        let understood = inner.understood_for(&scene, &[spec.kind], &ask).await?;
         let deadline = inner.deadline(&spec.options);
-        let one = resolved.remove(0);
-        inner
-            .render_one(scene, one, understood.map(|understood| (understood, ask)), deadline)
-            .await?
-            .pop()
-            .ok_or_else(|| Error::internal("a render gave no picture"))
+        let texts = understood.map(|understood| (understood, ask));
+        let mut views = inner.render_one(scene, view, texts, deadline).await?;
+        views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
+    }
+
+    /// The scene of a view, its text and its request, all checked.
+    async fn checked_view(
+        &self,
+        id: &SceneId,
+        spec: &ViewSpec,
+    ) -> Result<(SceneAccess, TextOptions, Resolved)> {
+        let scene = self.scene(id).await?;
+        let ask = self.inner.checked_ask(&[spec.kind], &spec.text)?;
+        let scene = scene.finished()?;
+        let options = (&spec.options, &spec.picture);
+        let view = resolve_one(&self.limits(), scene.record(), spec.camera, spec.kind, options)?;
+        Ok((scene, ask, view))
     }
 
     /// Renders many cameras, each once for all kinds; pictures come camera by camera.
@@ -518,17 +491,8 @@ impl Service {
         let scene = self.scene(id).await?;
         let inner = Arc::clone(&self.inner);
         let limits = &inner.limits();
-        for (what, count, max) in [
-            ("cameras", spec.cameras.len(), limits.cameras_max),
-            ("kinds", spec.kinds.len(), limits.kinds_max),
-        ] {
-            if count == 0 {
-                return Err(Error::invalid(format!("no {what}; give 1 to {max}")));
-            }
-            if count > max {
-                return Err(Error::limit(what, count, max));
-            }
-        }
+        texts::check_count("cameras", spec.cameras.len(), limits.cameras_max)?;
+        texts::check_count("kinds", spec.kinds.len(), limits.kinds_max)?;
         let scene = scene.finished()?;
         let mut kinds = spec.kinds.clone();
         let mut seen = std::collections::HashSet::new();
@@ -537,13 +501,8 @@ impl Service {
         if kinds.iter().any(|kind| kind.needs_semantics()) {
             Inner::may_be_asked(scene.record(), "views")?;
         }
-        let all = resolve_for(
-            &inner,
-            scene.record(),
-            &spec.cameras,
-            &kinds,
-            (&spec.options, &spec.picture),
-        )?;
+        let options = (&spec.options, &spec.picture);
+        let all = resolve(limits, scene.record().into(), &spec.cameras, &kinds, options)?;
         let pixels: u64 = all.iter().map(Resolved::pixels).sum::<u64>() * kinds.len() as u64;
         if pixels > limits.views_pixels_max {
             let (cameras, kinds) = (all.len(), kinds.len());
@@ -551,43 +510,34 @@ impl Service {
             let max = limits.views_pixels_max;
             return Err(Error::limit(what, format!("{pixels} px"), format!("{max} px")));
         }
-        let most = Duration::from_millis(limits.views_timeout_ms);
-        let last = Instant::now() + spec.options.deadline.map_or(most, |asked| asked.min(most));
+        let last = until(spec.options.deadline, limits.views_timeout_ms);
         let at_once = self.inner.scheduler.views_at_once(pixels / (all.len() * kinds.len()) as u64);
         let (to, pictures) = mpsc::channel(READY_MAX);
         let task = async move {
-            let texts = match inner.understood_for(&scene, &kinds, &ask).await {
-                Ok(understood) => understood.map(|understood| (understood, ask)),
-                Err(error) => {
-                    // Whoever stopped listening needs no reason.
-                    let _ = to.send(Err(error)).await;
-                    return;
-                }
-            };
-            // Each on a task of its own: a slot must not wait for a slow reader.
-            let render = |one: Resolved| {
-                let deadline = last.min(inner.deadline(&ViewOptions::default()));
-                let (inner, scene) = (Arc::clone(&inner), scene.clone());
-                let texts = texts.clone();
-                let work = async move { inner.render_one(scene, one, texts, deadline).await };
-                tokio::spawn(work.in_current_span())
-            };
-            let mut rendered = stream::iter(all).map(render).buffered(at_once);
-            while let Some(views) = rendered.next().await {
-                let lost = |e| Err(Error::internal("a view was broken off").caused_by(e));
-                let views = match views.unwrap_or_else(lost) {
-                    Ok(views) => views,
-                    Err(error) => {
-                        let _ = to.send(Err(error)).await;
-                        return;
-                    }
+            let views = async {
+                let understood = inner.understood_for(&scene, &kinds, &ask).await?;
+                let texts = understood.map(|understood| (understood, ask));
+                // Each on a task of its own: a slot must not wait for a slow reader.
+                let render = |one: Resolved| {
+                    let deadline = last.min(inner.deadline(&ViewOptions::default()));
+                    let (inner, scene, texts) = (Arc::clone(&inner), scene.clone(), texts.clone());
+                    let views = async move { inner.render_one(scene, one, texts, deadline).await };
+                    tokio::spawn(views.in_current_span())
                 };
-                for view in views {
-                    // Whoever stopped listening wants no more.
-                    if to.send(Ok(view)).await.is_err() {
-                        return;
+                let mut rendered = stream::iter(all).map(render).buffered(at_once);
+                while let Some(views) = rendered.next().await {
+                    let lost = |e| Error::internal("a view was broken off").caused_by(e);
+                    for view in views.map_err(lost)?? {
+                        // The caller stopped listening and wants no more.
+                        if to.send(Ok(view)).await.is_err() {
+                            return Ok(());
+                        }
                     }
                 }
+                Ok::<(), Error>(())
+            };
+            if let Err(error) = views.await {
+                let _ = to.send(Err(error)).await;
             }
         };
         tokio::spawn(task);

@@ -5,7 +5,9 @@
 
 use std::io::{self, Write};
 
+use bytemuck::Pod;
 use safetensors::{Dtype, SafeTensors, tensor::Metadata};
+use serde::de::DeserializeOwned;
 use serde_json::json;
 use sha2::{Digest, Sha256};
 
@@ -16,10 +18,22 @@ const DIGEST_NAME: &str = "sha256";
 
 /// One array to write: little-endian bytes, row-major.
 pub(super) struct Array<'a> {
-    pub(super) name: String,
-    pub(super) dtype: Dtype,
-    pub(super) shape: Vec<usize>,
-    pub(super) bytes: &'a [u8],
+    name: String,
+    dtype: Dtype,
+    shape: Vec<usize>,
+    bytes: &'a [u8],
+}
+
+impl<'a> Array<'a> {
+    pub(super) fn new(
+        name: impl Into<String>,
+        dtype: Dtype,
+        shape: &[usize],
+        values: &'a [impl Pod],
+    ) -> Self {
+        let (name, shape) = (name.into(), shape.to_vec());
+        Self { name, dtype, shape, bytes: bytemuck::cast_slice(values) }
+    }
 }
 
 /// What a container is, before its arrays.
@@ -84,14 +98,15 @@ pub(super) fn frame(
 
 /// A container whose digest, kind and version are right.
 pub(super) struct Container<'a> {
-    pub(super) meta_json: String,
     pub(super) sha256: String,
+    meta_json: String,
     tensors: SafeTensors<'a>,
+    what: &'a str,
 }
 
 impl<'a> Container<'a> {
     /// Checks the whole file. `what` names it in messages.
-    pub(super) fn read(file: &'a [u8], label: &Label, what: &str) -> Result<Self> {
+    pub(super) fn read(file: &'a [u8], label: &Label, what: &'a str) -> Result<Self> {
         let corrupt =
             |why: String| Error::new(ErrorCode::SceneCorrupt, format!("{what} is corrupt: {why}"));
         let split = file
@@ -121,16 +136,27 @@ impl<'a> Container<'a> {
         }
         let meta_json = word("json")?.clone();
         let tensors = SafeTensors::deserialize(file).map_err(|e| corrupt(e.to_string()))?;
-        Ok(Self { meta_json, sha256: super::files::hex(digest), tensors })
+        Ok(Self { sha256: super::files::hex(digest), meta_json, tensors, what })
     }
 
-    /// Bytes and shape of an array of the type expected.
-    pub(super) fn array(&self, name: &str, dtype: Dtype) -> Result<(Vec<usize>, &'a [u8])> {
+    /// What the file says beside its arrays.
+    pub(super) fn header<T: DeserializeOwned>(&self) -> Result<T> {
+        serde_json::from_str(&self.meta_json).map_err(|e| {
+            Error::new(ErrorCode::SceneCorrupt, format!("{}'s metadata: {e}", self.what))
+        })
+    }
+
+    /// An array of the type expected as rows of `T`, copied so that alignment does not matter.
+    pub(super) fn rows<T: Pod>(&self, name: &str, dtype: Dtype) -> Result<Vec<T>> {
         let bad = |why: String| Error::new(ErrorCode::SceneCorrupt, format!("array {name}: {why}"));
         let view = self.tensors.tensor(name).map_err(|e| bad(e.to_string()))?;
         if view.dtype() != dtype {
             return Err(bad(format!("type {:?}, not {dtype:?}", view.dtype())));
         }
-        Ok((view.shape().to_vec(), view.data()))
+        let bytes = view.data();
+        if bytes.len() % size_of::<T>() != 0 {
+            return Err(bad(format!("{} bytes are no whole number of rows", bytes.len())));
+        }
+        Ok(bytemuck::pod_collect_to_vec(bytes))
     }
 }

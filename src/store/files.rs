@@ -9,7 +9,7 @@ use fs_err::{self as fs, File};
 
 use crate::error::{Error, ErrorCode};
 
-/// Ending of files being written; whatever carries it after a crash is rubbish.
+/// Ending of files that are being written; after a crash such a file is useless.
 pub(super) const TEMPORARY: &str = "tmp";
 
 /// Writes `path` through `write`; readers see the old file or the whole new one.
@@ -20,7 +20,7 @@ pub(super) fn write_atomic(
     let temporary = path.with_extension(TEMPORARY);
     let written = write_synced(&temporary, write).and_then(|()| fs::rename(&temporary, path));
     if let Err(error) = written {
-        // The first error is the one to tell; a file left behind is cleared at the next start.
+        // The first error is returned; a file left behind is removed at the next start.
         let _ = fs::remove_file(&temporary);
         return Err(error);
     }
@@ -54,6 +54,6 @@ pub(super) fn unavailable(what: &str, cause: io::Error) -> Error {
 }
 
 /// Lower-case hex.
-pub(super) fn hex(bytes: &[u8]) -> String {
+pub(crate) fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }

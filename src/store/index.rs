@@ -1,12 +1,12 @@
 //! Small objects that point at scenes: the use of an idempotency key, the scene of a content hash.
 //!
-//! A pointer whose scene is gone is rubbish: it is looked through, and a sweep removes it.
+//! A pointer whose scene is gone counts as absent, and a sweep removes it.
 
 use object_store::path::Path as Name;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use sha2::{Digest, Sha256};
 
-use super::{Record, Store, files::hex, objects::unavailable};
+use super::{Record, Store, files::hex};
 use crate::{
     error::{Error, Result},
     scene::SceneId,
@@ -15,7 +15,7 @@ use crate::{
 /// What an idempotency key was used for.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct KeyUse {
-    /// The scene it made.
+    /// The scene of that call.
     pub id: SceneId,
     /// sha256 over the upload and the options of the call, hex.
     pub request_sha256: String,
@@ -26,12 +26,11 @@ struct Content {
     id: SceneId,
 }
 
-/// Owner and key as one name: neither can be read from it, nor one owner's key meet another's.
+/// Owner and key as one name: neither can be read from it, and no two owners share a name.
 fn key_name(owner: Option<&str>, key: &str) -> Name {
     Name::from(format!("keys/{}", named_hash(owner, key)))
 }
 
-/// One owner's scenes never answer for another's: the name holds the owner.
 fn content_name(owner: Option<&str>, content_sha256: &str) -> Name {
     Name::from(format!("contents/{}", named_hash(owner, content_sha256)))
 }
@@ -52,16 +51,16 @@ impl Store {
     /// `store_unavailable`.
     pub fn use_key(&self, owner: Option<&str>, key: &str, new: &KeyUse) -> Result<Option<KeyUse>> {
         let name = key_name(owner, key);
-        let failed = |e| unavailable("keep the idempotency key", e);
+        let what = "keep the idempotency key";
         // A use that cannot be read is no use: it is replaced, once.
         for _ in 0..2 {
-            if self.objects.create(name.clone(), json(new)?).map_err(failed)? {
+            if self.objects.create(what, name.clone(), json(new)?)? {
                 return Ok(None);
             }
             if let Some(used) = self.pointer(&name)? {
                 return Ok(Some(used));
             }
-            self.objects.delete(name.clone()).map_err(failed)?;
+            self.objects.delete(what, name.clone())?;
         }
         Err(Error::internal("the idempotency key cannot be kept"))
     }
@@ -79,8 +78,7 @@ impl Store {
     /// # Errors
     /// `store_unavailable`.
     pub fn forget_key(&self, owner: Option<&str>, key: &str) -> Result<()> {
-        let deleted = self.objects.delete(key_name(owner, key));
-        deleted.map(drop).map_err(|e| unavailable("forget the idempotency key", e))
+        self.objects.delete("forget the idempotency key", key_name(owner, key)).map(drop)
     }
 
     /// The scene that was made of this content for this owner, if one was.
@@ -97,29 +95,21 @@ impl Store {
     /// # Errors
     /// `store_unavailable`.
     pub fn put_content(&self, owner: Option<&str>, sha256: &str, id: &SceneId) -> Result<()> {
-        let kept =
-            self.objects.put(content_name(owner, sha256), json(&Content { id: id.clone() })?);
-        kept.map_err(|e| unavailable("keep the content hash", e))
+        let content = json(&Content { id: id.clone() })?;
+        self.objects.put("keep the content hash", content_name(owner, sha256), content)
     }
 
     /// Removes the pointers that lead to this scene.
     pub(super) fn unlink(&self, record: &Record) -> Result<()> {
-        let (id, owner) = (&record.status.id, record.owner.as_deref());
-        let mut names = Vec::new();
-        if let Some(key) = &record.idempotency_key {
-            let name = key_name(owner, key);
-            if self.pointer::<KeyUse>(&name)?.is_some_and(|used| used.id == *id) {
-                names.push(name);
+        let owner = record.owner.as_deref();
+        let key = record.idempotency_key.iter().map(|key| key_name(owner, key));
+        let content = record.content_sha256.iter().map(|content| content_name(owner, content));
+        for name in key.chain(content) {
+            // A use of a key has the field of a content pointer too.
+            let content = self.pointer::<Content>(&name)?;
+            if content.is_some_and(|content| content.id == record.status.id) {
+                self.objects.delete("remove a deleted scene", name)?;
             }
-        }
-        if let Some(content) = &record.content_sha256 {
-            let name = content_name(owner, content);
-            if self.pointer::<Content>(&name)?.is_some_and(|content| content.id == *id) {
-                names.push(name);
-            }
-        }
-        for name in names {
-            self.objects.delete(name).map_err(|e| unavailable("remove a deleted scene", e))?;
         }
         Ok(())
     }
@@ -130,7 +120,7 @@ impl Store {
     }
 
     fn pointer<T: DeserializeOwned>(&self, name: &Name) -> Result<Option<T>> {
-        let file = self.objects.get(name.clone()).map_err(|e| unavailable("read an index", e))?;
+        let file = self.objects.get("read an index", name.clone())?;
         Ok(file.and_then(|file| serde_json::from_slice(&file).ok()))
     }
 }

@@ -1,7 +1,8 @@
 //! The object store under everything kept: blocking calls for any thread, each with a time limit.
 //!
 //! A put is there whole or not at all: a local folder writes a staging file, syncs and renames it;
-//! an S3-compatible store takes one PUT.
+//! an S3-compatible store takes one PUT. The first argument of each call is what a failure says
+//! the store cannot do; the error is `store_unavailable`.
 
 use std::{
     future::Future,
@@ -72,112 +73,92 @@ impl Objects {
     }
 
     /// Does `call` on the store's own threads, so that any thread may wait for it.
-    fn run<T: Send + 'static>(
+    fn run<T: Send + 'static, F>(
         &self,
-        call: impl Future<Output = Result<T, Fault>> + Send + 'static,
-    ) -> Result<T, Fault> {
-        let gone = |why: &str| Fault::Generic { store: "scenes", source: why.into() };
-        let Some(runtime) = &self.runtime else { return Err(gone("the store is closed")) };
-        let (answer, answered) = mpsc::sync_channel(1);
-        let timeout = self.timeout;
-        runtime.spawn(async move {
-            let done = tokio::time::timeout(timeout, call).await.unwrap_or_else(|_late| {
-                let source = std::io::Error::from(std::io::ErrorKind::TimedOut);
-                Err(Fault::Generic { store: "scenes", source: source.into() })
-            });
-            // Whoever asked is waiting, unless the program ends.
-            let _ = answer.send(done);
-        });
-        answered.recv().unwrap_or_else(|_| Err(gone("the call was broken off")))
+        what: &str,
+        call: impl FnOnce(Arc<dyn ObjectStore>) -> F,
+    ) -> Result<T>
+    where
+        F: Future<Output = Result<T, Fault>> + Send + 'static,
+    {
+        let answer = match &self.runtime {
+            None => Err(fault("the store is closed")),
+            Some(runtime) => {
+                let (to, answer) = mpsc::sync_channel(1);
+                let (call, timeout) = (call(Arc::clone(&self.store)), self.timeout);
+                runtime.spawn(async move {
+                    let late = |_| Err(fault(std::io::Error::from(std::io::ErrorKind::TimedOut)));
+                    let done = tokio::time::timeout(timeout, call).await.unwrap_or_else(late);
+                    // The caller waits for it, unless the program ends.
+                    let _ = to.send(done);
+                });
+                answer.recv().unwrap_or_else(|_| Err(fault("the call was broken off")))
+            }
+        };
+        answer.map_err(|fault| unavailable(what, fault))
     }
 
     /// Keeps an object, whatever was there.
-    pub(super) fn put(&self, path: Path, bytes: impl Into<PutPayload>) -> Result<(), Fault> {
-        self.put_as(path, bytes.into(), PutMode::Overwrite)
+    pub(super) fn put(&self, what: &str, path: Path, bytes: impl Into<PutPayload>) -> Result<()> {
+        let bytes = bytes.into();
+        self.run(what, |store| async move { store.put(&path, bytes).await.map(drop) })
     }
 
     /// Keeps an object unless there is one; whether it was kept.
-    pub(super) fn create(&self, path: Path, bytes: Vec<u8>) -> Result<bool, Fault> {
-        match self.put_as(path, bytes.into(), PutMode::Create) {
-            Ok(()) => Ok(true),
-            Err(Fault::AlreadyExists { .. } | Fault::Precondition { .. }) => Ok(false),
-            Err(fault) => Err(fault),
-        }
-    }
-
-    fn put_as(&self, path: Path, bytes: PutPayload, mode: PutMode) -> Result<(), Fault> {
-        let store = Arc::clone(&self.store);
-        self.run(async move {
-            let options = PutOptions { mode, ..PutOptions::default() };
-            store.put_opts(&path, bytes, options).await.map(drop)
-        })
-    }
-
-    /// An object's bytes; `None` where there is none.
-    pub(super) fn get(&self, path: Path) -> Result<Option<Vec<u8>>, Fault> {
-        let store = Arc::clone(&self.store);
-        self.run(async move { whole(&*store, &path).await })
-    }
-
-    /// The bytes of many objects, in their order.
-    pub(super) fn get_all(&self, paths: Vec<Path>) -> Result<Vec<Option<Vec<u8>>>, Fault> {
-        let store = Arc::clone(&self.store);
-        self.run(async move {
-            let get = |path: Path| {
-                let store = Arc::clone(&store);
-                async move { whole(&*store, &path).await }
-            };
-            stream::iter(paths).map(get).buffered(AT_ONCE).try_collect().await
-        })
-    }
-
-    pub(super) fn exists(&self, path: Path) -> Result<bool, Fault> {
-        let store = Arc::clone(&self.store);
-        self.run(async move {
-            match store.head(&path).await {
+    pub(super) fn create(&self, what: &str, path: Path, bytes: Vec<u8>) -> Result<bool> {
+        let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
+        self.run(what, |store| async move {
+            match store.put_opts(&path, bytes.into(), options).await {
                 Ok(_) => Ok(true),
-                Err(Fault::NotFound { .. }) => Ok(false),
+                Err(Fault::AlreadyExists { .. } | Fault::Precondition { .. }) => Ok(false),
                 Err(fault) => Err(fault),
             }
         })
     }
 
+    /// An object's bytes; `None` where there is none.
+    pub(super) fn get(&self, what: &str, path: Path) -> Result<Option<Vec<u8>>> {
+        self.run(what, |store| whole(store, path))
+    }
+
+    /// The bytes of many objects, in their order.
+    pub(super) fn get_all(&self, what: &str, paths: Vec<Path>) -> Result<Vec<Option<Vec<u8>>>> {
+        self.run(what, |store| {
+            let get = move |path| whole(Arc::clone(&store), path);
+            stream::iter(paths).map(get).buffered(AT_ONCE).try_collect()
+        })
+    }
+
+    pub(super) fn exists(&self, what: &str, path: Path) -> Result<bool> {
+        self.run(what, |store| async move { Ok(found(store.head(&path).await)?.is_some()) })
+    }
+
     /// Removes an object, for good on return; whether it was there, as far as the store says (S3
     /// does not).
-    pub(super) fn delete(&self, path: Path) -> Result<bool, Fault> {
-        let (store, folder) = (Arc::clone(&self.store), self.folder.clone());
-        self.run(async move {
-            match store.delete(&path).await {
-                Ok(()) => {}
-                Err(Fault::NotFound { .. }) => return Ok(false),
-                Err(fault) => return Err(fault),
+    pub(super) fn delete(&self, what: &str, path: Path) -> Result<bool> {
+        let folder = self.folder.clone();
+        self.run(what, |store| async move {
+            if found(store.delete(&path).await)?.is_none() {
+                return Ok(false);
             }
             if let Some(folder) = folder {
                 let file = folder.join(path.as_ref());
                 let synced = tokio::task::spawn_blocking(move || sync_above(&folder, &file)).await;
-                let failed = |source| Fault::Generic { store: "scenes", source };
-                synced.map_err(|e| failed(e.into()))?.map_err(|e| failed(e.into()))?;
+                synced.map_err(fault)?.map_err(fault)?;
             }
             Ok(true)
         })
     }
 
-    /// Puts an object under another name; `false` where there was none.
-    pub(super) fn rename(&self, from: Path, to: Path) -> Result<bool, Fault> {
-        let store = Arc::clone(&self.store);
-        self.run(async move {
-            match store.rename(&from, &to).await {
-                Ok(()) => Ok(true),
-                Err(Fault::NotFound { .. }) => Ok(false),
-                Err(fault) => Err(fault),
-            }
-        })
+    /// Puts an object under another name, where there is one.
+    pub(super) fn rename(&self, what: &str, from: Path, to: Path) -> Result<()> {
+        self.run(what, |store| async move { found(store.rename(&from, &to).await).map(drop) })
     }
 
     /// All objects under a prefix.
-    pub(super) fn list(&self, prefix: &str) -> Result<Vec<Listed>, Fault> {
-        let (store, prefix) = (Arc::clone(&self.store), Path::from(prefix));
-        self.run(async move {
+    pub(super) fn list(&self, what: &str, prefix: &str) -> Result<Vec<Listed>> {
+        let prefix = Path::from(prefix);
+        self.run(what, |store| async move {
             let now = std::time::SystemTime::now();
             let listed = |meta: ObjectMeta| Listed {
                 stamp: format!("{:?} {}", meta.e_tag, meta.last_modified.timestamp_millis()),
@@ -189,12 +170,22 @@ impl Objects {
     }
 }
 
-async fn whole(store: &dyn ObjectStore, path: &Path) -> Result<Option<Vec<u8>>, Fault> {
-    match store.get(path).await {
-        Ok(found) => Ok(Some(Vec::from(found.bytes().await?))),
+fn fault(source: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> Fault {
+    Fault::Generic { store: "scenes", source: source.into() }
+}
+
+/// `None` where a call found no object.
+fn found<T>(result: Result<T, Fault>) -> Result<Option<T>, Fault> {
+    match result {
+        Ok(found) => Ok(Some(found)),
         Err(Fault::NotFound { .. }) => Ok(None),
         Err(fault) => Err(fault),
     }
+}
+
+async fn whole(store: Arc<dyn ObjectStore>, path: Path) -> Result<Option<Vec<u8>>, Fault> {
+    let Some(found) = found(store.get(&path).await)? else { return Ok(None) };
+    Ok(Some(Vec::from(found.bytes().await?)))
 }
 
 /// Makes it last that `file` is gone: its folder may be gone with it.

@@ -1,7 +1,6 @@
-//! Opening a folder or a bucket, and finding every scene in it, whatever a crash left.
+//! Opening a folder or a bucket, and finding every scene in it, also after a crash.
 
 use std::{
-    collections::HashSet,
     path::{Path, PathBuf},
     sync::Arc,
     time::Duration,
@@ -12,10 +11,11 @@ use object_store::{
     ClientOptions, ObjectStore, RetryConfig, aws::AmazonS3Builder, local::LocalFileSystem,
     prefix::PrefixStore,
 };
+use parking_lot::Mutex;
 
 use super::{
     Cache, Objects, Record, SCENE, STATUS, Store, UPLOAD, aside, files, of, pending, record,
-    scene_file, unavailable, upload_file,
+    scene_file, upload_file,
 };
 use crate::{
     config::Config,
@@ -84,29 +84,20 @@ impl Place {
 }
 
 impl Store {
-    /// Opens a folder, made where missing, and gives the record of every scene in it.
-    ///
-    /// # Errors
-    /// As [`Self::open_at`].
-    pub fn open(root: &Path, cache_bytes_max: u64) -> Result<(Self, Vec<Record>)> {
-        let limits = Limits { cache_bytes_max, ..Limits::default() };
-        Self::open_at(&Place::Folder(root.to_owned()), &limits)
-    }
-
     /// Opens a place, and gives the record of every scene in it; none where replicas share it,
-    /// which look scenes up as they are asked for.
+    /// which read scenes when they need them.
     ///
     /// A scene whose record is bad gets it back from its scene file or its upload; one that has
     /// neither is reported as failed with `scene_corrupt`.
     ///
     /// # Errors
     /// `store_unavailable` when the place cannot be used, or another process uses the folder.
-    pub fn open_at(place: &Place, limits: &Limits) -> Result<(Self, Vec<Record>)> {
+    pub fn open(place: &Place, limits: &Limits) -> Result<(Self, Vec<Record>)> {
         let timeout = Duration::from_millis(limits.store_timeout_ms);
         let (objects, shared, lock) = match place {
             Place::Folder(root) => {
                 let lock = lock(root)?;
-                // Of a folder that holds other things too, only what is ours.
+                // The folder may hold other things: only ours are touched.
                 PREFIXES.iter().for_each(|ours| clear_cut_off(&root.join(ours)));
                 let (folder, local) = local(root)?;
                 (Objects::new(Arc::new(local), Some(folder), timeout)?, false, Some(lock))
@@ -118,8 +109,8 @@ impl Store {
             objects,
             shared,
             cache: Cache::new(limits.cache_bytes_max),
-            reading: std::sync::Mutex::default(),
-            gone: std::sync::Mutex::default(),
+            reading: Mutex::default(),
+            gone: Mutex::default(),
             _lock: lock,
         };
         let records = if shared {
@@ -134,20 +125,19 @@ impl Store {
 
     /// The record of every scene; what was never acknowledged is removed.
     fn recover(&self) -> Result<Vec<Record>> {
-        let unfinished: HashSet<SceneId> =
-            self.unfinished()?.into_iter().map(|(id, _)| id).collect();
-        let mut ids: Vec<SceneId> = self.stamps()?.into_iter().map(|(id, _)| id).collect();
+        let unfinished = self.unfinished()?;
+        let mut ids: Vec<SceneId> = self.stamps()?.into_keys().collect();
         ids.sort();
-        let failed = |e| unavailable("read the scenes", e);
-        let statuses =
-            self.objects.get_all(ids.iter().map(|id| of(id, STATUS)).collect()).map_err(failed)?;
+        let what = "read the scenes";
+        let statuses = ids.iter().map(|id| of(id, STATUS)).collect();
+        let statuses = self.objects.get_all(what, statuses)?;
         let mut records = Vec::with_capacity(ids.len());
         for (id, status) in ids.iter().zip(statuses) {
             match status.as_deref().and_then(|file| sound(id, file)) {
                 Some(record) => {
                     // Where a crash came between the status and the end of the pending record.
-                    if unfinished.contains(id) {
-                        self.objects.delete(pending(id)).map_err(failed)?;
+                    if unfinished.contains_key(id) {
+                        self.objects.delete(what, pending(id))?;
                     }
                     records.push(record);
                 }
@@ -176,7 +166,7 @@ fn local(root: &Path) -> Result<(PathBuf, LocalFileSystem)> {
     let folder = fs::canonicalize(root)
         .map_err(|cause| files::unavailable("open the data folder", cause))?;
     let local = LocalFileSystem::new_with_prefix(&folder)
-        .map_err(|fault| unavailable("open the data folder", fault))?;
+        .map_err(|fault| super::objects::unavailable("open the data folder", fault))?;
     Ok((folder, local.with_fsync(true).with_automatic_cleanup(true)))
 }
 
@@ -187,13 +177,13 @@ fn clear_cut_off(folder: &Path) {
         let number = name.to_str().and_then(|name| name.rsplit_once('#'));
         number.is_some_and(|(_, number)| number.bytes().all(|byte| byte.is_ascii_digit()))
     };
-    for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
-        // What stays is in nobody's way; a folder with anything in it stays.
-        if entry.file_type().is_ok_and(|kind| kind.is_dir()) {
-            clear_cut_off(&entry.path());
-            let _ = fs::remove_dir(entry.path());
-        } else if is_staged(&entry.file_name()) {
-            let _ = fs::remove_file(entry.path());
+    for file in fs::read_dir(folder).into_iter().flatten().flatten() {
+        // A folder with anything in it stays, and does no harm.
+        if file.file_type().is_ok_and(|kind| kind.is_dir()) {
+            clear_cut_off(&file.path());
+            let _ = fs::remove_dir(file.path());
+        } else if is_staged(&file.file_name()) {
+            let _ = fs::remove_file(file.path());
         }
     }
 }
@@ -205,11 +195,11 @@ pub(super) fn sound(id: &SceneId, file: &[u8]) -> Option<Record> {
 
 /// The newest record of a scene: its status, else what is pending, else what can be rebuilt.
 pub(super) fn find_record(store: &Store, id: &SceneId) -> Result<Option<Record>> {
-    let failed = |e| unavailable("read a status", e);
-    let mut found = store.objects.get(of(id, STATUS)).map_err(failed)?;
+    let what = "read a status";
+    let mut found = store.objects.get(what, of(id, STATUS))?;
     let is_status = found.is_some();
     if !is_status {
-        found = store.objects.get(pending(id)).map_err(failed)?;
+        found = store.objects.get(what, pending(id))?;
     }
     let Some(file) = found else { return Ok(None) };
     let error = match record::unseal(&file) {
@@ -219,36 +209,30 @@ pub(super) fn find_record(store: &Store, id: &SceneId) -> Result<Option<Record>>
     };
     tracing::error!(scene = %id, error = %error, "a scene's status is bad; rebuilding it");
     let rebuilt = match from_scene(store, id)? {
-        Some(record) => record,
-        None => match from_upload(store, id)? {
-            Some(record) => record,
-            None => lost(id, &error),
-        },
+        None => from_upload(store, id)?,
+        found => found,
     };
+    let rebuilt = rebuilt.unwrap_or_else(|| {
+        Record::new(SceneStatus {
+            error: Some(SceneError::from(&error)),
+            ..SceneStatus::new(id.clone(), SceneState::Failed, super::now_ms())
+        })
+    });
     let put_aside = if is_status {
-        store.objects.rename(of(id, STATUS), of(id, &aside(STATUS)))
+        let what = "put a bad status aside";
+        store.objects.rename(what, of(id, STATUS), of(id, &aside(STATUS)))
     } else {
-        Ok(true)
+        Ok(())
     };
-    let kept = put_aside
-        .map_err(|e| unavailable("put a bad status aside", e))
-        .and_then(|_| store.put_record(&rebuilt));
+    let kept = put_aside.and_then(|()| store.put_record(&rebuilt));
     if let Err(error) = kept {
         tracing::error!(scene = %id, %error, "the rebuilt status cannot be written");
     }
     Ok(Some(rebuilt))
 }
 
-fn lost(id: &SceneId, error: &Error) -> Record {
-    let status = SceneStatus {
-        error: Some(SceneError::from(error)),
-        ..SceneStatus::new(id.clone(), SceneState::Failed, super::now_ms())
-    };
-    Record::new(status)
-}
-
 fn from_scene(store: &Store, id: &SceneId) -> Result<Option<Record>> {
-    let Some(file) = store.get(id, SCENE, "read the scene")? else { return Ok(None) };
+    let Some(file) = store.objects.get("read the scene", of(id, SCENE))? else { return Ok(None) };
     let Ok((scene, sha256)) = scene_file::read_scene(&file) else { return Ok(None) };
     let meta = scene.meta;
     if meta.id != *id {
@@ -260,7 +244,7 @@ fn from_scene(store: &Store, id: &SceneId) -> Result<Option<Record>> {
         cameras: meta.cameras,
         ..SceneStatus::new(id.clone(), SceneState::Done, meta.created_ms)
     };
-    // Without the upload nobody but an admin sees it: better than the wrong owner.
+    // Without the upload only an admin sees it: better than the wrong owner.
     let owner = first_record(store, id)?.and_then(|record| record.owner);
     Ok(Some(Record {
         owner,
@@ -273,16 +257,13 @@ fn from_scene(store: &Store, id: &SceneId) -> Result<Option<Record>> {
 }
 
 fn from_upload(store: &Store, id: &SceneId) -> Result<Option<Record>> {
-    let bad = store.objects.exists(of(id, &aside(SCENE)));
-    if bad.map_err(|e| unavailable("look for a bad scene", e))? {
-        return Ok(None);
-    }
-    first_record(store, id)
+    let bad = store.objects.exists("look for a bad scene", of(id, &aside(SCENE)))?;
+    if bad { Ok(None) } else { first_record(store, id) }
 }
 
 /// The record that the upload was kept with.
 fn first_record(store: &Store, id: &SceneId) -> Result<Option<Record>> {
-    let Some(file) = store.get(id, UPLOAD, "read the upload")? else { return Ok(None) };
+    let Some(file) = store.objects.get("read the upload", of(id, UPLOAD))? else { return Ok(None) };
     let record = upload_file::read(&file).ok().map(|(_, record)| record);
     Ok(record.filter(|record| record.status.id == *id))
 }

@@ -14,7 +14,7 @@ use sha2::{Digest, Sha256};
 pub struct Record {
     /// What callers see.
     pub status: SceneStatus,
-    /// Whose it is: the owner named by the key of the call; `None` where no key was asked for.
+    /// The owner that the key of the call names; `None` where the server needs no keys.
     #[serde(default)]
     pub owner: Option<String>,
     /// Options of the call.
@@ -36,7 +36,7 @@ pub struct Record {
     /// The replica that makes it, where replicas share the store.
     #[serde(default)]
     pub replica: Option<String>,
-    /// Id of the request that asked for it.
+    /// Id of the request that created it.
     #[serde(default)]
     pub request_id: Option<String>,
     /// Its span in the caller's trace (W3C), where spans are exported.
@@ -46,7 +46,6 @@ pub struct Record {
 
 impl Record {
     /// A record of which nothing but the status is known.
-    #[must_use]
     pub fn new(status: SceneStatus) -> Self {
         Self {
             status,

@@ -2,14 +2,13 @@
 
 use std::io::{self, Write};
 
-use bytemuck::Pod;
 use glam::DVec3;
 use safetensors::Dtype;
 use serde::{Deserialize, Serialize};
 
 use super::container::{self, Array, Container, Label};
 use crate::{
-    error::{Error, ErrorCode, Result},
+    error::Result,
     scene::{Backdrop, Gaussians, RawGaussians, Scene, SceneMeta, SourcePixel},
 };
 
@@ -36,26 +35,16 @@ pub fn write_scene(to: &mut dyn Write, scene: &Scene) -> io::Result<String> {
         meta: scene.meta.clone(),
     })?;
     let source: Vec<[u16; 3]> = raw.source.iter().map(|s| [s.view, s.x, s.y]).collect();
-    let array = |name: &str, dtype, shape: &[usize], bytes| Array {
-        name: name.to_owned(),
-        dtype,
-        shape: shape.to_vec(),
-        bytes,
-    };
+    let backdrop_shape = [Backdrop::HEIGHT, Backdrop::WIDTH, 3];
     let arrays = [
-        array("means", Dtype::F32, &[n, 3], bytemuck::cast_slice(&raw.means)),
-        array("quats", Dtype::F32, &[n, 4], bytemuck::cast_slice(&raw.quats)),
-        array("scales", Dtype::F32, &[n, 3], bytemuck::cast_slice(&raw.scales)),
-        array("opacities", Dtype::F32, &[n], bytemuck::cast_slice(&raw.opacities)),
-        array("sh", Dtype::F32, &[n, k, 3], bytemuck::cast_slice(&raw.sh)),
-        array("semantic_index", Dtype::U16, &[n], bytemuck::cast_slice(&raw.semantic_index)),
-        array("source", Dtype::U16, &[n, 3], bytemuck::cast_slice(&source)),
-        array(
-            "backdrop",
-            Dtype::U8,
-            &[Backdrop::HEIGHT, Backdrop::WIDTH, 3],
-            bytemuck::cast_slice(scene.backdrop.cells()),
-        ),
+        Array::new("means", Dtype::F32, &[n, 3], &raw.means),
+        Array::new("quats", Dtype::F32, &[n, 4], &raw.quats),
+        Array::new("scales", Dtype::F32, &[n, 3], &raw.scales),
+        Array::new("opacities", Dtype::F32, &[n], &raw.opacities),
+        Array::new("sh", Dtype::F32, &[n, k, 3], &raw.sh),
+        Array::new("semantic_index", Dtype::U16, &[n], &raw.semantic_index),
+        Array::new("source", Dtype::U16, &[n, 3], &source),
+        Array::new("backdrop", Dtype::U8, &backdrop_shape, scene.backdrop.cells()),
     ];
     container::write(to, &LABEL, &header, &arrays)
 }
@@ -66,36 +55,23 @@ pub fn write_scene(to: &mut dyn Write, scene: &Scene) -> io::Result<String> {
 /// `scene_corrupt` when any byte differs from what was written, or the version is unknown.
 pub fn read_scene(file: &[u8]) -> Result<(Scene, String)> {
     let container = Container::read(file, &LABEL, "the scene file")?;
-    let header: Header = serde_json::from_str(&container.meta_json).map_err(|e| {
-        Error::new(ErrorCode::SceneCorrupt, format!("the scene file's metadata: {e}"))
-    })?;
+    let header: Header = container.header()?;
     let raw = RawGaussians {
         origin: DVec3::from_array(header.origin),
-        means: rows(&container, "means", Dtype::F32)?,
-        quats: rows(&container, "quats", Dtype::F32)?,
-        scales: rows(&container, "scales", Dtype::F32)?,
-        opacities: rows(&container, "opacities", Dtype::F32)?,
+        means: container.rows("means", Dtype::F32)?,
+        quats: container.rows("quats", Dtype::F32)?,
+        scales: container.rows("scales", Dtype::F32)?,
+        opacities: container.rows("opacities", Dtype::F32)?,
         sh_degree: header.sh_degree,
-        sh: rows(&container, "sh", Dtype::F32)?,
-        semantic_index: rows(&container, "semantic_index", Dtype::U16)?,
-        source: rows::<[u16; 3]>(&container, "source", Dtype::U16)?
+        sh: container.rows("sh", Dtype::F32)?,
+        semantic_index: container.rows("semantic_index", Dtype::U16)?,
+        source: container
+            .rows::<[u16; 3]>("source", Dtype::U16)?
             .into_iter()
             .map(|[view, x, y]| SourcePixel { view, x, y })
             .collect(),
     };
-    let backdrop = Backdrop::from_cells(rows(&container, "backdrop", Dtype::U8)?)?;
+    let backdrop = Backdrop::from_cells(container.rows("backdrop", Dtype::U8)?)?;
     let scene = Scene::new(header.meta, Gaussians::restore(raw)?, backdrop);
     Ok((scene, container.sha256))
-}
-
-/// An array as rows of `T`, copied so that alignment does not matter.
-pub(super) fn rows<T: Pod>(container: &Container<'_>, name: &str, dtype: Dtype) -> Result<Vec<T>> {
-    let (_, bytes) = container.array(name, dtype)?;
-    if bytes.len() % size_of::<T>() != 0 {
-        return Err(Error::new(
-            ErrorCode::SceneCorrupt,
-            format!("array {name}: {} bytes are no whole number of rows", bytes.len()),
-        ));
-    }
-    Ok(bytemuck::pod_collect_to_vec(bytes))
 }

@@ -1,14 +1,11 @@
-//! What a scene means as one container, beside the scene's own file.
+//! The semantics of a scene as one container, beside the scene's own file.
 
 use std::io::{self, Write};
 
 use safetensors::Dtype;
 use serde::{Deserialize, Serialize};
 
-use super::{
-    container::{self, Array, Container, Label},
-    scene_file::rows,
-};
+use super::container::{self, Array, Container, Label};
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{Bank, IndexMap, SceneId, Semantics, SemanticsReport},
@@ -44,21 +41,10 @@ pub fn write_semantics(
         report: semantics.report.clone(),
     })?;
     let cells: Vec<u16> = semantics.photos.iter().flat_map(|map| map.index.clone()).collect();
-    let array = |name: &str, dtype, shape: &[usize], bytes| Array {
-        name: name.to_owned(),
-        dtype,
-        shape: shape.to_vec(),
-        bytes,
-    };
     let arrays = [
-        array("bank", Dtype::F32, &[bank.len(), bank.dim], bytemuck::cast_slice(&bank.rows)),
-        array(
-            "index",
-            Dtype::U16,
-            &[semantics.index.len()],
-            bytemuck::cast_slice(&semantics.index),
-        ),
-        array("photos", Dtype::U16, &[cells.len()], bytemuck::cast_slice(&cells)),
+        Array::new("bank", Dtype::F32, &[bank.len(), bank.dim], &bank.rows),
+        Array::new("index", Dtype::U16, &[semantics.index.len()], &semantics.index),
+        Array::new("photos", Dtype::U16, &[cells.len()], &cells),
     ];
     container::write(to, &LABEL, &header, &arrays)
 }
@@ -72,16 +58,15 @@ pub fn read_semantics(file: &[u8], id: &SceneId) -> Result<(Semantics, String)> 
     let corrupt =
         |why: String| Error::new(ErrorCode::SceneCorrupt, format!("the semantics file: {why}"));
     let container = Container::read(file, &LABEL, "the semantics file")?;
-    let header: Header =
-        serde_json::from_str(&container.meta_json).map_err(|e| corrupt(e.to_string()))?;
+    let header: Header = container.header()?;
     if header.scene != *id {
         return Err(corrupt(format!("it is of scene {}, not of {id}", header.scene)));
     }
-    let bank = Bank { dim: header.dim, rows: rows(&container, "bank", Dtype::F32)? };
+    let bank = Bank { dim: header.dim, rows: container.rows("bank", Dtype::F32)? };
     if bank.rows.len() != bank.len() * bank.dim || bank.rows.iter().any(|v| !v.is_finite()) {
         return Err(corrupt("the bank has no whole number of finite rows".to_owned()));
     }
-    let mut cells = &rows::<u16>(&container, "photos", Dtype::U16)?[..];
+    let mut cells = &container.rows::<u16>("photos", Dtype::U16)?[..];
     let mut photos = Vec::new();
     for [width, height] in header.maps {
         let size = width as usize * height as usize;
@@ -91,6 +76,6 @@ pub fn read_semantics(file: &[u8], id: &SceneId) -> Result<(Semantics, String)> 
         photos.push(IndexMap { width, height, index: own.to_vec() });
         cells = rest;
     }
-    let index = rows(&container, "index", Dtype::U16)?;
+    let index = container.rows("index", Dtype::U16)?;
     Ok((Semantics { bank, index, photos, report: header.report }, container.sha256))
 }

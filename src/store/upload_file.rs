@@ -1,4 +1,4 @@
-//! An upload as one container: what was acknowledged can be made after any restart.
+//! An upload as one container, so that an acknowledged scene can be made after any restart.
 
 use std::io;
 
@@ -12,7 +12,7 @@ use super::{
     files::hex,
 };
 use crate::{
-    error::{Error, ErrorCode, Result},
+    error::Result,
     scene::{PhotoHash, Upload, UploadCameras, UploadFile},
 };
 
@@ -45,7 +45,6 @@ fn parts(upload: &Upload) -> Vec<(Part, &str, &[u8])> {
 }
 
 /// Name and sha256 of every file of an upload.
-#[must_use]
 pub fn hashes(upload: &Upload) -> Vec<PhotoHash> {
     parts(upload)
         .into_iter()
@@ -66,12 +65,7 @@ pub(super) fn pack(upload: Upload, record: &super::Record) -> io::Result<PutPayl
     let arrays: Vec<_> = parts
         .iter()
         .enumerate()
-        .map(|(i, (_, _, bytes))| Array {
-            name: format!("part_{i}"),
-            dtype: Dtype::U8,
-            shape: vec![bytes.len()],
-            bytes,
-        })
+        .map(|(i, (_, _, bytes))| Array::new(format!("part_{i}"), Dtype::U8, &[bytes.len()], bytes))
         .collect();
     let (head, digest) = container::frame(&LABEL, &header, &arrays)?;
     let cameras = upload.cameras.map(|cameras| match cameras {
@@ -79,20 +73,18 @@ pub(super) fn pack(upload: Upload, record: &super::Record) -> io::Result<PutPayl
     });
     let photos = upload.photos.into_iter().map(|photo| photo.bytes);
     let bytes = cameras.into_iter().chain(upload.archive).chain(photos);
-    let pieces = std::iter::once(head).chain(bytes).chain([digest.to_vec()]);
-    // A payload takes each piece over as it is.
-    Ok(pieces.flat_map(PutPayload::from).collect())
+    let parts = std::iter::once(head).chain(bytes).chain([digest.to_vec()]);
+    // A payload takes each part over as it is.
+    Ok(parts.flat_map(PutPayload::from).collect())
 }
 
 /// The upload and the record it was acknowledged with.
 pub(super) fn read(file: &[u8]) -> Result<(Upload, super::Record)> {
     let container = Container::read(file, &LABEL, "the stored upload")?;
-    let header: Header = serde_json::from_str(&container.meta_json).map_err(|e| {
-        Error::new(ErrorCode::SceneCorrupt, format!("the stored upload's metadata: {e}"))
-    })?;
+    let header: Header = container.header()?;
     let mut upload = Upload::default();
     for (i, (part, name)) in header.parts.into_iter().enumerate() {
-        let bytes = container.array(&format!("part_{i}"), Dtype::U8)?.1.to_vec();
+        let bytes = container.rows(&format!("part_{i}"), Dtype::U8)?;
         match part {
             Part::Transforms => upload.cameras = Some(UploadCameras::Transforms(bytes)),
             Part::Cameras => upload.cameras = Some(UploadCameras::Cameras(bytes)),

@@ -1,5 +1,5 @@
-//! Asking a scene by text: when its semantics are made, how often, what is told meanwhile, and
-//! what is refused.
+//! Texts for a scene: when its semantics are made, how often, what watchers see meanwhile, and what
+//! is refused.
 
 use std::{
     sync::{Arc, atomic::Ordering},
@@ -9,7 +9,9 @@ use std::{
 use futures_util::{StreamExt, future::join_all};
 use segsplat::{
     error::ErrorCode,
-    scene::{Event, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState},
+    scene::{
+        Event, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState, Stage,
+    },
     service::CreateScene,
 };
 
@@ -33,7 +35,7 @@ async fn scene(server: &TestServer, semantics: SemanticsMode) -> SceneStatus {
     server.service.create_scene(request).await.expect("a good upload").status
 }
 
-async fn stand(server: &TestServer, id: &SceneId) -> SemanticsState {
+async fn semantics_state(server: &TestServer, id: &SceneId) -> SemanticsState {
     server.service.get(id).await.unwrap().semantics.state
 }
 
@@ -43,13 +45,13 @@ async fn lazy_semantics_are_made_by_the_first_who_asks_and_once_however_many_ask
     let status = scene(&server, SemanticsMode::Lazy).await;
     assert_eq!((status.state, status.semantics.state), (SceneState::Done, SemanticsState::None));
     assert!(status.semantics.available);
-    assert_eq!(meaning.made.load(Ordering::Acquire), 0, "nobody has asked");
+    assert_eq!(meaning.calls.load(Ordering::Acquire), 0, "nobody has asked");
     meaning.hold.store(true, Ordering::Release);
     let id = &status.id;
     let ask = || server.service.understand(id, Some(PATIENCE));
     let all = join_all((0..20).map(|_| ask()));
     let let_go = async {
-        while stand(&server, id).await != SemanticsState::Running {
+        while semantics_state(&server, id).await != SemanticsState::Running {
             tokio::time::sleep(Duration::from_millis(2)).await;
         }
         meaning.hold.store(false, Ordering::Release);
@@ -60,7 +62,7 @@ async fn lazy_semantics_are_made_by_the_first_who_asks_and_once_however_many_ask
         assert_eq!((semantics.state, semantics.bank_size), (SemanticsState::Ready, Some(3)));
     }
     ask().await.unwrap();
-    assert_eq!(meaning.made.load(Ordering::Acquire), 1, "20 callers at once, and one later");
+    assert_eq!(meaning.calls.load(Ordering::Acquire), 1, "20 callers at once, and one later");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -72,9 +74,14 @@ async fn the_scene_stays_done_while_its_semantics_run_and_watchers_see_their_sta
     assert_eq!((late.code(), late.retry_after()), (ErrorCode::SceneNotReady, Some(2)));
     assert!(late.message().contains("are being made"), "{late}");
     let mut events = std::pin::pin!(server.service.watch(&id).await.unwrap());
-    while !matches!(events.next().await, Some(Event::Running { stage, fraction })
-        if stage == "masks" && fraction > 0.2)
-    {}
+    let masks = Event::Running {
+        stage: "masks".to_owned(),
+        fraction: Stage::Masks.overall(PhotoMeaning::HELD_AT),
+    };
+    let seen = tokio::time::timeout(PATIENCE, async {
+        while events.next().await.expect("it is held") != masks {}
+    });
+    seen.await.expect("a watcher sees the share of the job, not of the stage");
     let status = server.service.get(&id).await.unwrap();
     assert_eq!((status.state, status.semantics.state), (SceneState::Done, SemanticsState::Running));
     assert_eq!(status.semantics.stage.as_deref(), Some("masks"));
@@ -119,7 +126,7 @@ async fn off_and_a_bundle_without_networks_are_refused_each_with_its_code() {
     let error = server.service.understand(&off.id, None).await.unwrap_err();
     assert_eq!(error.code(), ErrorCode::SemanticsOff);
     assert!(error.message().contains("semantics=off"), "{error}");
-    assert_eq!(meaning.made.load(Ordering::Acquire), 0);
+    assert_eq!(meaning.calls.load(Ordering::Acquire), 0);
 
     let lacking = PhotoMeaning { lack: Some("no text tower"), ..PhotoMeaning::default() };
     let server = TestServer::with(|_, parts| parts.semantics = Arc::new(lacking)).await;
@@ -147,7 +154,7 @@ async fn semantics_that_fail_say_why_and_the_next_text_tries_again() {
     *meaning.fails.lock().unwrap() = None;
     let status = server.service.understand(&id, None).await.unwrap();
     assert_eq!(status.semantics.state, SemanticsState::Ready);
-    assert_eq!(meaning.made.load(Ordering::Acquire), 2);
+    assert_eq!(meaning.calls.load(Ordering::Acquire), 2);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -156,9 +163,9 @@ async fn semantics_are_kept_over_a_restart_and_made_again_when_their_file_is_bad
     let id = scene(&server, SemanticsMode::Lazy).await.id;
     server.service.understand(&id, None).await.unwrap();
     let server = server.restart().await;
-    assert_eq!(stand(&server, &id).await, SemanticsState::Ready);
+    assert_eq!(semantics_state(&server, &id).await, SemanticsState::Ready);
     server.service.understand(&id, None).await.unwrap();
-    assert_eq!(meaning.made.load(Ordering::Acquire), 1, "read from their file");
+    assert_eq!(meaning.calls.load(Ordering::Acquire), 1, "read from their file");
     let server = server.restart().await;
     let folder = server.data_dir().join("scenes").join(id.as_str());
     let mut file = std::fs::read(folder.join("semantics.segsplat")).unwrap();
@@ -167,7 +174,7 @@ async fn semantics_are_kept_over_a_restart_and_made_again_when_their_file_is_bad
     std::fs::write(folder.join("semantics.segsplat"), file).unwrap();
     let status = server.service.understand(&id, None).await.unwrap();
     assert_eq!(status.semantics.state, SemanticsState::Ready);
-    assert_eq!(meaning.made.load(Ordering::Acquire), 2, "made again");
+    assert_eq!(meaning.calls.load(Ordering::Acquire), 2, "made again");
     assert!(folder.join("semantics.quarantined").exists(), "the bad file is put aside");
     assert!(folder.join("semantics.segsplat").exists(), "the new one is kept");
     // What a bad status said is found again in the files.
@@ -175,7 +182,7 @@ async fn semantics_are_kept_over_a_restart_and_made_again_when_their_file_is_bad
     std::fs::write(folder.join("status.json"), b"rubbish").unwrap();
     let server = server.restart().await;
     server.service.understand(&id, None).await.unwrap();
-    assert_eq!(meaning.made.load(Ordering::Acquire), 2);
+    assert_eq!(meaning.calls.load(Ordering::Acquire), 2);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -185,7 +192,7 @@ async fn deleting_a_scene_stops_its_semantics_and_tells_who_waits() {
     meaning.hold.store(true, Ordering::Release);
     let waits = server.service.understand(&id, Some(PATIENCE));
     let deletes = async {
-        while stand(&server, &id).await != SemanticsState::Running {
+        while semantics_state(&server, &id).await != SemanticsState::Running {
             tokio::time::sleep(Duration::from_millis(2)).await;
         }
         server.service.delete(&id).await.unwrap();

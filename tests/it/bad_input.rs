@@ -14,9 +14,9 @@ use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 use crate::common::{
+    cpu_server::{CpuServer, upload},
     doors::{Ask, Door, Options, both},
     root, shared_scene,
-    stand::{Stand, upload},
 };
 
 /// The transforms of the sample, to be spoilt.
@@ -248,7 +248,7 @@ async fn lives(door: &Door, after: &str) {
 
 #[tokio::test]
 async fn bad_uploads_are_refused_by_name_and_the_server_lives() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let cases = uploads();
     for door in both(stand.addr).await {
         let mut messages = BTreeMap::new();
@@ -270,7 +270,7 @@ async fn bad_uploads_are_refused_by_name_and_the_server_lives() {
 }
 
 /// Sends `head` and `body` over a bare socket and reads what is answered while it stays open.
-pub(super) async fn raw(stand: &Stand, head: &str, body: &[u8]) -> String {
+pub(super) async fn raw(stand: &CpuServer, head: &str, body: &[u8]) -> String {
     let mut socket = tokio::net::TcpStream::connect(stand.addr).await.unwrap();
     socket.write_all(head.as_bytes()).await.unwrap();
     socket.write_all(body).await.unwrap();
@@ -281,7 +281,7 @@ pub(super) async fn raw(stand: &Stand, head: &str, body: &[u8]) -> String {
 
 #[tokio::test]
 async fn what_is_too_big_is_refused_before_the_rest_arrives() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let post = "POST /v1/scenes HTTP/1.1\r\nhost: localhost\r\n\
                 content-type: multipart/form-data; boundary=b\r\n";
     // The head alone tells that it is too long; nothing of the body is sent.
@@ -302,7 +302,7 @@ async fn what_is_too_big_is_refused_before_the_rest_arrives() {
 
 #[tokio::test]
 async fn what_is_no_http_does_not_end_the_server() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     for (head, body) in [
         ("\u{1}\u{2}\u{3} what\r\n\r\n", &b""[..]),
         ("GET /v1/scenes HTTP/9.9\r\n\r\n", b""),
@@ -320,7 +320,7 @@ async fn what_is_no_http_does_not_end_the_server() {
 
 #[tokio::test]
 async fn bad_views_are_refused_by_name_and_the_server_lives() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let doors = both(stand.addr).await;
     let (id, _) = doors[0].create(&upload(), &Options::wait()).await.unwrap();
     let eye = |ask: Ask, target: [f64; 3]| {
@@ -400,7 +400,7 @@ async fn bad_views_are_refused_by_name_and_the_server_lives() {
 
 #[tokio::test]
 async fn words_for_numbers_are_refused_by_name() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let id = "0".repeat(32);
     for (query, word) in [
         ("from=0&width=wide", "wide"),
@@ -426,7 +426,7 @@ async fn words_for_numbers_are_refused_by_name() {
 
 #[tokio::test]
 async fn unknown_ids_and_ids_that_climb_are_not_found() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     for door in both(stand.addr).await {
         let unknown = "f".repeat(32);
         for id in [unknown.as_str(), "..%2f..%2fetc%2fpasswd", "%2e%2e%2f", "A", "é"] {
@@ -449,7 +449,7 @@ async fn unknown_ids_and_ids_that_climb_are_not_found() {
 
 #[tokio::test]
 async fn what_the_bundle_cannot_do_is_refused_by_name() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     for door in both(stand.addr).await {
         let options = Options { semantics: Some("eager"), ..Options::wait() };
         let fault = door.create(&upload(), &options).await.unwrap_err();
@@ -460,7 +460,7 @@ async fn what_the_bundle_cannot_do_is_refused_by_name() {
         assert!(fault.message.contains("\"other\""), "{}", fault.message);
         for semantics in ["lazy", "off"] {
             let options =
-                Options { semantics: Some(semantics), bundle: Some("board"), ..Options::wait() };
+                Options { semantics: Some(semantics), bundle: Some("plane"), ..Options::wait() };
             let (_, state) = door.create(&upload(), &options).await.unwrap();
             assert_eq!(state, "done", "semantics={semantics} by {}", door.name());
         }
@@ -477,7 +477,7 @@ fn npy(file: &[u8]) -> Vec<f32> {
 
 #[tokio::test]
 async fn a_camera_in_a_wall_or_looking_away_sees_a_valid_picture() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     for door in both(stand.addr).await {
         let (id, _) = door.create(&upload(), &Options::wait()).await.unwrap();
         let photos = segsplat::photos::read(&upload(), &segsplat::limits::Limits::default());
@@ -575,7 +575,7 @@ async fn wrong_conventions(folder: &Path, frames: Range<usize>) {
             transforms[key] = json!(transforms[key].as_f64().unwrap() / 2.0);
         }
     });
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     for door in both(stand.addr).await {
         let (id, _) = door.create(&good, &Options::wait()).await.unwrap();
         let (_, warnings) = door.get(&id).await.unwrap();

@@ -1,4 +1,4 @@
-//! The whole road with networks: photos over HTTP, the fixture's mask network and towers, a word,
+//! The whole path with networks: photos over HTTP, the fixture's mask network and towers, a word,
 //! and its mask at a pose between the photos; then the same without a server.
 
 use std::{io::Cursor, path::Path, process::Command};

@@ -1,8 +1,8 @@
 //! A view's crop and quality at both doors.
 
 use crate::common::{
+    cpu_server::{CpuServer, upload},
     doors::{Ask, Options, both},
-    stand::{Stand, upload},
 };
 
 /// The f32 values of an NPY file.
@@ -14,7 +14,7 @@ fn npy(file: &[u8]) -> Vec<f32> {
 
 #[tokio::test]
 async fn both_doors_give_a_part_and_take_a_quality() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     for door in both(stand.addr).await {
         let (id, _) = door.create(&upload(), &Options::wait()).await.expect("a scene");
         let name = door.name();

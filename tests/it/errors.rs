@@ -11,16 +11,16 @@ use serde_json::{Value, json};
 
 use super::bad_input::raw;
 use crate::common::{
+    cpu_server::{CpuServer, PlaneNetworks, upload},
     doors::{Door, Options, both, form, json as body},
     root,
-    stand::{BoardMaker, Stand, upload},
 };
 
 #[tokio::test]
 async fn every_code_comes_through_both_doors_as_its_row_says() {
     for row in &TABLE {
-        let maker = BoardMaker { fails: Some(row.code) };
-        let stand = Stand::with(maker, |_| {}).await;
+        let maker = PlaneNetworks { fails: Some(row.code) };
+        let stand = CpuServer::with(maker, |_| {}).await;
         for door in both(stand.addr).await {
             let fault = door.create(&upload(), &Options::wait()).await.expect_err(row.name);
             assert_eq!(fault.code, row.name, "{}", door.name());
@@ -33,8 +33,8 @@ async fn every_code_comes_through_both_doors_as_its_row_says() {
 
 #[tokio::test]
 async fn a_failed_scene_keeps_its_code_and_its_views_are_refused_with_it() {
-    let maker = BoardMaker { fails: Some(segsplat::error::ErrorCode::PhotoUnreadable) };
-    let stand = Stand::with(maker, |_| {}).await;
+    let maker = PlaneNetworks { fails: Some(segsplat::error::ErrorCode::PhotoUnreadable) };
+    let stand = CpuServer::with(maker, |_| {}).await;
     for door in both(stand.addr).await {
         let (id, _) = door.create(&upload(), &Options::default()).await.unwrap();
         loop {
@@ -52,7 +52,7 @@ async fn a_failed_scene_keeps_its_code_and_its_views_are_refused_with_it() {
 
 #[tokio::test]
 async fn a_full_queue_is_overloaded_and_says_when_to_come_back() {
-    let stand = Stand::with(BoardMaker::default(), |config| {
+    let stand = CpuServer::with(PlaneNetworks::default(), |config| {
         config.limits.queued_jobs_max = 0;
     })
     .await;
@@ -66,7 +66,7 @@ async fn a_full_queue_is_overloaded_and_says_when_to_come_back() {
 
 #[tokio::test]
 async fn a_full_queue_refuses_before_the_photos_come() {
-    let stand = Stand::with(BoardMaker::default(), |config| {
+    let stand = CpuServer::with(PlaneNetworks::default(), |config| {
         config.limits.queued_jobs_max = 0;
     })
     .await;
@@ -78,7 +78,7 @@ async fn a_full_queue_refuses_before_the_photos_come() {
     assert!(answer.starts_with("HTTP/1.1 429") && answer.contains("overloaded"), "{answer}");
 }
 
-async fn document(stand: &Stand) -> Value {
+async fn document(stand: &CpuServer) -> Value {
     body(crate::common::client().get(stand.url("/openapi.json")).send().await.unwrap())
         .await
         .unwrap()
@@ -99,7 +99,7 @@ fn documented(document: &Value) -> BTreeSet<String> {
 
 #[tokio::test]
 async fn the_openapi_document_has_the_routes_and_nothing_else() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let served: BTreeSet<_> =
         routes().iter().map(|route| format!("{} {}", route.method, route.path)).collect();
     let document = document(&stand).await;
@@ -125,7 +125,7 @@ async fn the_openapi_document_has_the_routes_and_nothing_else() {
 
 #[tokio::test]
 async fn the_two_doors_have_the_same_calls() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let document = document(&stand).await;
     let operations: BTreeSet<_> = document["paths"]
         .as_object()
@@ -160,7 +160,7 @@ fn snake(camel: &str) -> String {
 
 #[tokio::test]
 async fn real_answers_have_the_fields_that_the_document_says() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let document = document(&stand).await;
     let client = crate::common::client();
     let request = client.post(stand.url("/v1/scenes?wait_ms=120000")).multipart(form(&upload()));
@@ -238,7 +238,7 @@ fn check(document: &Value, name: &str, value: &Value, faults: &mut Vec<String>) 
 
 #[tokio::test]
 async fn a_request_of_ours_is_never_answered_with_another_shape() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let [http, _] = both(stand.addr).await;
     let Door::Http { base, client } = http else { panic!("the first door is HTTP") };
     for (method, path) in [

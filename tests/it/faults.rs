@@ -1,5 +1,5 @@
-//! A store that fails, tears, stalls, fills up and rots: what was acknowledged stays as it was, or
-//! says that it is bad.
+//! A store that fails, tears writes, stalls, fills up and flips bits: an acknowledged scene stays
+//! as it was, or is reported as bad.
 
 use std::{
     collections::{BTreeMap, HashSet},
@@ -8,6 +8,7 @@ use std::{
     time::Duration,
 };
 
+use futures_util::StreamExt;
 use object_store::{ObjectStore, local::LocalFileSystem};
 use segsplat::{
     error::ErrorCode,
@@ -20,10 +21,10 @@ use segsplat::{
 use crate::common::{
     faults::{FaultStore, Wrong},
     process::long,
-    server::{PATIENCE, TestServer, WallMaker},
+    server::{PATIENCE, TestServer, WallNetworks},
 };
 
-/// Nothing is asked by text.
+/// No text.
 const ASK: TextOptions = TextOptions { text: None, profile: ScoringProfile::Default, wait: None };
 
 /// Reproducible numbers.
@@ -48,12 +49,8 @@ fn request(seed: u64) -> CreateScene {
 
 async fn export(service: &Service, id: &SceneId) -> Result<Vec<u8>, ErrorCode> {
     let export = service.export(id, ExportFormat::Ply, &ASK).await;
-    let mut export = export.map_err(|error| error.code())?;
-    let mut file = Vec::new();
-    while let Some(piece) = export.next_chunk().await {
-        file.extend(piece);
-    }
-    Ok(file)
+    let export = export.map_err(|error| error.code())?;
+    Ok(export.into_stream().concat().await)
 }
 
 /// Ids of all scenes that the server lists.
@@ -69,18 +66,21 @@ async fn listed(service: &Service) -> HashSet<SceneId> {
     }
 }
 
-/// Scene ids in the names and pointers under a folder.
-fn kept(data: &Path) -> HashSet<SceneId> {
+/// Ids of the scenes to which names and pointers under a folder belong. A pointer that cannot be
+/// read belongs to none and is listed under its own name.
+fn kept(data: &Path) -> HashSet<String> {
+    let files = |prefix: &str| std::fs::read_dir(data.join(prefix)).into_iter().flatten();
+    let name = |file: std::fs::DirEntry| file.file_name().to_string_lossy().into_owned();
     let mut ids = HashSet::new();
-    for prefix in ["scenes", "pending"] {
-        for entry in std::fs::read_dir(data.join(prefix)).into_iter().flatten() {
-            ids.extend(entry.unwrap().file_name().to_str().and_then(|name| name.parse().ok()));
-        }
+    for file in ["scenes", "pending"].into_iter().flat_map(files) {
+        ids.extend(name(file.unwrap()).parse().map(|id: SceneId| id.to_string()));
     }
-    for entry in std::fs::read_dir(data.join("contents")).into_iter().flatten() {
-        let json: serde_json::Value =
-            serde_json::from_slice(&std::fs::read(entry.unwrap().path()).unwrap()).unwrap();
-        ids.extend(json["id"].as_str().and_then(|id| id.parse().ok()));
+    for file in files("contents") {
+        let file = file.unwrap();
+        // The sweep may remove it meanwhile.
+        let Ok(bytes) = std::fs::read(file.path()) else { continue };
+        let json: serde_json::Value = serde_json::from_slice(&bytes).unwrap_or_default();
+        ids.insert(json["id"].as_str().map_or_else(|| name(file), str::to_owned));
     }
     ids
 }
@@ -163,14 +163,15 @@ async fn a_store_that_fails_tears_and_stalls_loses_nothing_it_acknowledged() {
         assert_eq!(export(&server.service, id).await, Err(ErrorCode::SceneNotFound), "{id}");
     }
     let there = listed(&server.service).await;
+    let there: HashSet<String> = there.iter().map(SceneId::to_string).collect();
     for _ in 0..100 {
         if kept(folder.path()).is_subset(&there) {
             break;
         }
         tokio::time::sleep(Duration::from_millis(20)).await;
     }
-    let left: Vec<_> = kept(folder.path()).difference(&there).cloned().collect();
-    assert_eq!(left, [], "left over after a sweep");
+    let left: Vec<String> = kept(folder.path()).difference(&there).cloned().collect();
+    assert_eq!(left, [""; 0], "left over after a sweep");
     println!(
         "{steps} calls, {} faults: {refused} creates refused, {} scenes whole, {} gone, {} whose \
          deletion failed",
@@ -224,10 +225,10 @@ async fn a_deletion_counts_where_the_job_removed_its_own_record_first() {
     let local: Arc<dyn ObjectStore> = Arc::new(local.with_automatic_cleanup(true));
     let faults = Arc::new(FaultStore::new(local, Duration::ZERO));
     let place = Place::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
-    let maker = Arc::new(WallMaker::default());
-    maker.hold.store(true, Ordering::Release);
-    let given = Arc::clone(&maker);
-    let server = TestServer::at(&place, |_, parts| parts.maker = given).await;
+    let networks = Arc::new(WallNetworks::default());
+    networks.hold.store(true, Ordering::Release);
+    let given = Arc::clone(&networks);
+    let server = TestServer::at(&place, |_, parts| parts.scenes = given).await;
     let held = CreateScene { wait: None, ..request(1) };
     let id = server.service.create_scene(held).await.unwrap().status.id;
     // A job that ends now sees that its scene is deleted, and removes what it wrote. It does so
@@ -290,16 +291,16 @@ async fn a_flipped_bit_is_reported_or_repaired_and_harms_no_neighbour() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_same_content_is_computed_once_for_an_owner() {
-    let maker = Arc::new(WallMaker::default());
-    let given = Arc::clone(&maker);
+    let networks = Arc::new(WallNetworks::default());
+    let given = Arc::clone(&networks);
     let server = TestServer::with(|config, parts| {
-        parts.maker = given;
+        parts.scenes = given;
         config.jobs = 3;
     })
     .await;
     let both = [request(1), request(1), request(2)].map(|r| server.service.create_scene(r));
     let made = futures_util::future::try_join_all(both).await.unwrap();
-    assert_eq!(maker.made.load(Ordering::Acquire), 2, "two contents, three scenes");
+    assert_eq!(networks.calls.load(Ordering::Acquire), 2, "two contents, three scenes");
     let files = futures_util::future::join_all(
         made.iter().map(|created| export(&server.service, &created.status.id)),
     )
@@ -310,17 +311,17 @@ async fn the_same_content_is_computed_once_for_an_owner() {
 
     let ann = server.service.for_caller(segsplat::keys::Caller::Owner("ann".into()));
     ann.create_scene(request(2)).await.unwrap();
-    assert_eq!(maker.made.load(Ordering::Acquire), 3, "nobody else's scene answers for it");
+    assert_eq!(networks.calls.load(Ordering::Acquire), 3, "nobody else's scene answers for it");
     ann.create_scene(request(2)).await.unwrap();
-    assert_eq!(maker.made.load(Ordering::Acquire), 3);
+    assert_eq!(networks.calls.load(Ordering::Acquire), 3);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn work_is_dropped_when_its_only_caller_goes_away() {
-    let maker = Arc::new(WallMaker::default());
-    maker.hold.store(true, Ordering::Release);
-    let given = Arc::clone(&maker);
-    let server = TestServer::with(|_, parts| parts.maker = given).await;
+    let networks = Arc::new(WallNetworks::default());
+    networks.hold.store(true, Ordering::Release);
+    let given = Arc::clone(&networks);
+    let server = TestServer::with(|_, parts| parts.scenes = given).await;
     let client = crate::common::client();
     let call = client
         .post(server.url("/v1/scenes?wait_ms=60000"))
@@ -338,6 +339,6 @@ async fn work_is_dropped_when_its_only_caller_goes_away() {
     let id = server.service.create_scene(known).await.unwrap().status.id;
     let waiting = server.service.wait(&id, Duration::from_millis(50)).await.unwrap();
     assert!(!waiting.state.is_final(), "who has the id may come back");
-    maker.hold.store(false, Ordering::Release);
+    networks.hold.store(false, Ordering::Release);
     assert_eq!(server.finished(&id).await.state, SceneState::Done);
 }

@@ -14,11 +14,11 @@ use tonic_health::pb::{HealthCheckRequest, health_client::HealthClient};
 use tonic_reflection::pb::{v1, v1alpha};
 
 use crate::common::{
+    cpu_server::{CpuServer, upload},
     doors::{Options, channel, fault_of, messages},
-    stand::{Stand, upload},
 };
 
-async fn client(stand: &Stand) -> SceneServiceClient<Channel> {
+async fn client(stand: &CpuServer) -> SceneServiceClient<Channel> {
     SceneServiceClient::new(channel(stand.addr).await)
 }
 
@@ -31,7 +31,7 @@ async fn made(client: &mut SceneServiceClient<Channel>) -> pb::Scene {
 
 #[tokio::test]
 async fn a_scene_is_made_listed_shown_and_deleted() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let mut client = client(&stand).await;
     let scene = made(&mut client).await;
     assert_eq!(scene.cameras.len(), 3, "cameras of three photos");
@@ -56,7 +56,7 @@ async fn a_scene_is_made_listed_shown_and_deleted() {
 
 #[tokio::test]
 async fn watching_ends_with_done() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let mut client = client(&stand).await;
     let sent = tokio_stream::iter(messages(&upload(), &Options::default()));
     let scene = client.create_scene(sent).await.unwrap().into_inner();
@@ -74,7 +74,7 @@ async fn watching_ends_with_done() {
 
 #[tokio::test]
 async fn many_views_stream_in_order_and_equal_single_ones() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let mut client = client(&stand).await;
     let id = made(&mut client).await.id;
     let between = |to: u32, t: f64| pb::CameraSpec {
@@ -112,7 +112,7 @@ async fn many_views_stream_in_order_and_equal_single_ones() {
 
 #[tokio::test]
 async fn an_export_comes_in_pieces_that_start_with_its_size() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let mut client = client(&stand).await;
     let scene_id = made(&mut client).await.id;
     let format = pb::ExportFormat::Ply.into();
@@ -130,7 +130,7 @@ async fn an_export_comes_in_pieces_that_start_with_its_size() {
 
 #[tokio::test]
 async fn a_picture_over_four_mebibytes_fits_one_message() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let mut client = client(&stand).await.max_decoding_message_size(64 << 20);
     let scene_id = made(&mut client).await.id;
     let pose = pb::camera_spec::Pose::Between(pb::Between::default());
@@ -151,7 +151,7 @@ async fn a_picture_over_four_mebibytes_fits_one_message() {
 
 #[tokio::test]
 async fn health_and_reflection_of_both_versions_answer() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let channel = channel(stand.addr).await;
     let mut health = HealthClient::new(channel.clone());
     for service in ["", "segsplat.v1.SceneService"] {
@@ -193,7 +193,7 @@ async fn health_and_reflection_of_both_versions_answer() {
 
 #[tokio::test]
 async fn unknown_services_and_methods_are_unimplemented() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let channel = channel(stand.addr).await;
     for path in ["/segsplat.v9.Nothing/Call", "/segsplat.v1.SceneService/Nothing"] {
         let mut grpc = tonic::client::Grpc::new(channel.clone());
@@ -214,7 +214,7 @@ async fn a_message_that_is_no_protobuf_is_an_invalid_request() {
         #[prost(uint64, tag = "1")]
         scene_id: u64,
     }
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let mut grpc = tonic::client::Grpc::new(channel(stand.addr).await);
     grpc.ready().await.unwrap();
     let codec = tonic_prost::ProstCodec::<Odd, pb::Scene>::default();
@@ -226,7 +226,7 @@ async fn a_message_that_is_no_protobuf_is_an_invalid_request() {
 
 #[tokio::test]
 async fn the_callers_deadline_and_request_id_are_honoured() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let mut client = client(&stand).await;
     let mut request = Request::new(pb::GetSceneRequest { scene_id: "0".repeat(32) });
     request.metadata_mut().insert("x-request-id", "mine-8".parse().unwrap());

@@ -11,9 +11,9 @@ use tokio_stream::StreamExt;
 
 use super::bad_input::{huge_png, photo, png, uploads, zipped};
 use crate::common::{
+    cpu_server::upload,
     doors::form,
     process::{Start, can_serve, long},
-    stand::upload,
 };
 
 /// A refusal may take so long: the bar, and what a slow machine with a debug build never misses.

@@ -8,12 +8,12 @@ use segsplat::scene::Upload;
 use serde_json::{Value, json};
 
 use crate::common::{
+    cpu_server::{CpuServer, upload},
     doors::{Fault, bytes, form, json as body},
-    stand::{Stand, upload},
 };
 
 /// Makes the sample's scene and waits for it.
-async fn made(stand: &Stand) -> String {
+async fn made(stand: &CpuServer) -> String {
     let request = crate::common::client().post(stand.url("/v1/scenes?wait_ms=120000"));
     let answer = request.multipart(form(&upload())).send().await.unwrap();
     let scene = body(answer).await.unwrap();
@@ -21,17 +21,17 @@ async fn made(stand: &Stand) -> String {
     scene["id"].as_str().unwrap().to_owned()
 }
 
-async fn get(stand: &Stand, path: &str) -> reqwest::Response {
+async fn get(stand: &CpuServer, path: &str) -> reqwest::Response {
     crate::common::client().get(stand.url(path)).send().await.unwrap()
 }
 
-async fn fault(stand: &Stand, path: &str) -> Fault {
+async fn fault(stand: &CpuServer, path: &str) -> Fault {
     bytes(get(stand, path).await).await.expect_err(path)
 }
 
 #[tokio::test]
 async fn a_scene_is_made_listed_shown_and_deleted() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let request = crate::common::client().post(stand.url("/v1/scenes?wait_ms=120000"));
     let answer = request.multipart(form(&upload())).send().await.unwrap();
     assert_eq!(answer.status(), StatusCode::CREATED);
@@ -45,7 +45,7 @@ async fn a_scene_is_made_listed_shown_and_deleted() {
     assert_eq!(shown["cameras"][1]["file"], "images/0001.png");
     assert!(shown["report"]["gaussians"].as_u64().unwrap() > 100, "{}", shown["report"]);
     assert_eq!(shown["semantics"]["available"], false);
-    assert!(shown["semantics"]["reason"].as_str().unwrap().contains("board"));
+    assert!(shown["semantics"]["reason"].as_str().unwrap().contains("plane"));
 
     let second = made(&stand).await;
     let page = body(get(&stand, "/v1/scenes?limit=1").await).await.unwrap();
@@ -62,7 +62,7 @@ async fn a_scene_is_made_listed_shown_and_deleted() {
 
 #[tokio::test]
 async fn creating_without_waiting_is_accepted_and_events_lead_to_done() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let request = crate::common::client().post(stand.url("/v1/scenes"));
     let answer = request.multipart(form(&upload())).send().await.unwrap();
     assert_eq!(answer.status(), StatusCode::ACCEPTED);
@@ -82,7 +82,7 @@ async fn creating_without_waiting_is_accepted_and_events_lead_to_done() {
 
 #[tokio::test]
 async fn every_kind_comes_in_every_encoding_it_can() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let id = made(&stand).await;
     for (kind, format, media) in [
         ("color", "png", "image/png"),
@@ -121,7 +121,7 @@ async fn every_kind_comes_in_every_encoding_it_can() {
 
 #[tokio::test]
 async fn the_picture_from_an_input_camera_looks_like_its_photo() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let id = made(&stand).await;
     let answer = get(&stand, &format!("/v1/scenes/{id}/view?from=0&width=160&height=120")).await;
     let view = image::load_from_memory(&answer.bytes().await.unwrap()).unwrap().to_rgb8();
@@ -139,7 +139,7 @@ async fn the_picture_from_an_input_camera_looks_like_its_photo() {
 
 #[tokio::test]
 async fn accept_chooses_the_encoding_and_a_known_tag_saves_the_picture() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let id = made(&stand).await;
     let url = stand.url(&format!("/v1/scenes/{id}/view?from=0&width=40&height=30"));
     let client = crate::common::client();
@@ -159,7 +159,7 @@ async fn accept_chooses_the_encoding_and_a_known_tag_saves_the_picture() {
 
 #[tokio::test]
 async fn many_views_come_as_parts_or_as_a_zip_and_equal_single_views() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let id = made(&stand).await;
     let url = stand.url(&format!("/v1/scenes/{id}/views"));
     let cameras = json!([{ "from": 0 }, { "from": 0, "to": 2, "t": 0.5 }]);
@@ -206,7 +206,7 @@ fn split(body: &[u8], boundary: &str) -> Vec<Vec<u8>> {
 
 #[tokio::test]
 async fn a_scene_exports_as_ply() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let id = made(&stand).await;
     let answer = get(&stand, &format!("/v1/scenes/{id}/export?format=ply")).await;
     let length = answer.headers()[header::CONTENT_LENGTH].to_str().unwrap().to_owned();
@@ -221,7 +221,7 @@ async fn a_scene_exports_as_ply() {
 
 #[tokio::test]
 async fn one_idempotency_key_makes_one_scene() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let post = async |upload: &Upload| {
         let request = crate::common::client().post(stand.url("/v1/scenes?wait_ms=120000"));
         let request = request.header("idempotency-key", "key-1").multipart(form(upload));
@@ -240,7 +240,7 @@ async fn one_idempotency_key_makes_one_scene() {
 
 #[tokio::test]
 async fn an_archive_and_options_as_text_parts_are_taken() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
     let options = zip::write::SimpleFileOptions::default();
     let whole = upload();
@@ -264,7 +264,7 @@ async fn an_archive_and_options_as_text_parts_are_taken() {
 
 #[tokio::test]
 async fn unknown_paths_methods_and_parameters_are_answered_in_our_shape() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let missing = fault(&stand, "/v1/nothing?x=1").await;
     assert_eq!((missing.code.as_str(), missing.number), ("not_found", 404));
     assert!(missing.message.contains("/v1/nothing"), "{}", missing.message);
@@ -295,7 +295,7 @@ async fn unknown_paths_methods_and_parameters_are_answered_in_our_shape() {
 
 #[tokio::test]
 async fn request_ids_are_kept_and_deadlines_end_a_call() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let request =
         crate::common::client().get(stand.url("/healthz")).header("x-request-id", "mine-7");
     let answer = request.send().await.unwrap();
@@ -311,7 +311,7 @@ async fn request_ids_are_kept_and_deadlines_end_a_call() {
 
 #[tokio::test]
 async fn health_models_and_the_viewer_answer_over_http_2_as_well() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     for client in [
         crate::common::client(),
         crate::common::client_builder().http2_prior_knowledge().build().unwrap(),
@@ -320,7 +320,7 @@ async fn health_models_and_the_viewer_answer_over_http_2_as_well() {
         assert_eq!(body(get("/healthz").await).await.unwrap()["live"], true);
         assert_eq!(body(get("/readyz").await).await.unwrap()["ready"], true);
         let models = body(get("/v1/models").await).await.unwrap();
-        assert_eq!((&models["bundle"], &models["renderer"]), (&"board".into(), &"cpu".into()));
+        assert_eq!((&models["bundle"], &models["renderer"]), (&"plane".into(), &"cpu".into()));
         let page = get("/").await;
         assert!(page.headers().contains_key(header::CONTENT_SECURITY_POLICY));
         let page = page.text().await.unwrap();
@@ -330,7 +330,7 @@ async fn health_models_and_the_viewer_answer_over_http_2_as_well() {
 
 #[tokio::test]
 async fn the_stop_signal_ends_the_server_even_with_a_watcher() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let id = made(&stand).await;
     let idle = get(&stand, &format!("/v1/scenes/{id}")).await;
     assert_eq!(idle.status(), StatusCode::OK);

@@ -1,4 +1,5 @@
-//! Scenes in the making: nothing acknowledged is lost, panics stay in their job, watchers catch up.
+//! Jobs: no acknowledged scene is lost, a panic ends its own job alone, late watchers see the
+//! state.
 
 use std::{
     sync::{Arc, atomic::Ordering},
@@ -8,33 +9,42 @@ use std::{
 use futures_util::StreamExt;
 use segsplat::{
     error::ErrorCode,
-    scene::{Event, SceneState, ScoringProfile, Stage},
+    keys::Caller,
+    limits::Limits,
+    sample::{self, SampleOptions},
+    scene::{
+        Density, Event, SceneId, SceneOptions, SceneState, SceneStatus, ScoringProfile,
+        SemanticsMode, Stage,
+    },
     service::{
         Background, CameraSpec, CreateScene, ExportFormat, Kind, LensSpec, PageRequest,
-        PictureOptions, PoseSpec, TextOptions, ViewOptions, ViewsSpec,
+        PictureOptions, PoseSpec, Service, TextOptions, ViewOptions, ViewsSpec,
     },
+    store::{self, Place, Record, Store},
 };
+use serde_json::json;
+use sha2::{Digest, Sha256};
 
-use crate::common::server::{PATIENCE, TestServer, WallMaker, first_view, upload};
+use crate::common::server::{PATIENCE, TestServer, WallNetworks, first_view, upload};
 
-/// Nothing is asked by text.
+/// No text.
 const ASK: TextOptions = TextOptions { text: None, profile: ScoringProfile::Default, wait: None };
 
 fn request() -> CreateScene {
     CreateScene { upload: upload(), ..CreateScene::default() }
 }
 
-/// A server whose maker is held, and its hold.
-async fn held() -> (TestServer, Arc<WallMaker>) {
-    let maker = Arc::new(WallMaker::default());
-    maker.hold.store(true, Ordering::Release);
-    let given = Arc::clone(&maker);
+/// A server whose networks wait, and the networks.
+async fn on_hold() -> (TestServer, Arc<WallNetworks>) {
+    let networks = Arc::new(WallNetworks::default());
+    networks.hold.store(true, Ordering::Release);
+    let given = Arc::clone(&networks);
     let server = TestServer::with(|config, parts| {
-        parts.maker = given;
+        parts.scenes = given;
         config.limits.queued_jobs_max = 2;
     })
     .await;
-    (server, maker)
+    (server, networks)
 }
 
 fn first_camera() -> CameraSpec {
@@ -43,7 +53,7 @@ fn first_camera() -> CameraSpec {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_scene_goes_through_its_states_and_a_late_watcher_sees_where_it_is() {
-    let (server, maker) = held().await;
+    let (server, networks) = on_hold().await;
     let id = server.service.create_scene(request()).await.unwrap().status.id;
     let mut early = std::pin::pin!(server.service.watch(&id).await.unwrap());
     while !matches!(early.next().await, Some(Event::Running { stage, .. }) if stage == "geometry") {
@@ -51,7 +61,7 @@ async fn a_scene_goes_through_its_states_and_a_late_watcher_sees_where_it_is() {
     let mut late = std::pin::pin!(server.service.watch(&id).await.unwrap());
     let Some(Event::Running { stage, fraction }) = late.next().await else { panic!("not running") };
     assert_eq!((stage.as_str(), fraction), ("geometry", Stage::Geometry.overall(0.5)));
-    maker.hold.store(false, Ordering::Release);
+    networks.hold.store(false, Ordering::Release);
     let rest: Vec<Event> = late.collect().await;
     assert_eq!(rest.last(), Some(&Event::Done));
     let status = server.service.get(&id).await.unwrap();
@@ -81,7 +91,7 @@ async fn a_panicking_job_fails_alone() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_full_queue_says_when_to_come_back() {
-    let (server, maker) = held().await;
+    let (server, networks) = on_hold().await;
     let running = server.service.create_scene(request()).await.unwrap().status.id;
     let mut events = std::pin::pin!(server.service.watch(&running).await.unwrap());
     while !matches!(events.next().await, Some(Event::Running { .. })) {}
@@ -100,12 +110,12 @@ async fn a_full_queue_says_when_to_come_back() {
     broken.idempotency_key = Some("k".to_owned());
     let refused = server.service.create_scene(broken).await.unwrap_err();
     assert_eq!(refused.code(), ErrorCode::PhotoUnreadable, "{refused}");
-    maker.hold.store(false, Ordering::Release);
+    networks.hold.store(false, Ordering::Release);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_was_acknowledged_is_made_after_a_restart() {
-    let (server, maker) = held().await;
+    let (server, networks) = on_hold().await;
     let running = server.service.create_scene(request()).await.unwrap().status.id;
     let queued = server.service.create_scene(request()).await.unwrap().status.id;
     let server = server.restart().await;
@@ -113,7 +123,7 @@ async fn what_was_acknowledged_is_made_after_a_restart() {
         let state = server.service.get(id).await.unwrap().state;
         assert!(!state.is_final(), "{id} is {state:?}");
     }
-    maker.hold.store(false, Ordering::Release);
+    networks.hold.store(false, Ordering::Release);
     for id in [&running, &queued] {
         assert_eq!(server.finished(id).await.state, SceneState::Done);
     }
@@ -126,7 +136,7 @@ async fn what_was_acknowledged_is_made_after_a_restart() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn deleting_stops_the_job_and_tells_its_watchers() {
-    let (server, maker) = held().await;
+    let (server, networks) = on_hold().await;
     let id = server.service.create_scene(request()).await.unwrap().status.id;
     let mut events = std::pin::pin!(server.service.watch(&id).await.unwrap());
     while !matches!(events.next().await, Some(Event::Running { .. })) {}
@@ -137,16 +147,16 @@ async fn deleting_stops_the_job_and_tells_its_watchers() {
     assert_eq!(server.service.delete(&id).await.unwrap_err().code(), ErrorCode::SceneNotFound);
     let scenes = server.data_dir().join("scenes");
     assert_eq!(std::fs::read_dir(scenes).map_or(0, Iterator::count), 0, "nothing is kept of it");
-    maker.hold.store(false, Ordering::Release);
+    networks.hold.store(false, Ordering::Release);
     assert_eq!(server.scene().await.state, SceneState::Done);
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_scene_that_takes_too_long_fails_with_its_code() {
-    let maker = Arc::new(WallMaker::default());
-    maker.hold.store(true, Ordering::Release);
+    let networks = Arc::new(WallNetworks::default());
+    networks.hold.store(true, Ordering::Release);
     let server = TestServer::with(|config, parts| {
-        parts.maker = maker;
+        parts.scenes = networks;
         config.limits.scene_timeout_ms = 50;
     })
     .await;
@@ -169,6 +179,169 @@ async fn one_key_makes_one_scene_also_after_a_restart() {
     assert_eq!(refused.code(), ErrorCode::InvalidRequest, "{refused}");
     server.service.delete(&first.status.id).await.unwrap();
     assert!(!server.service.create_scene(keyed()).await.unwrap().replayed);
+}
+
+/// The upload of another scene.
+fn other_request(seed: u64) -> CreateScene {
+    let options = SampleOptions { photos: 2, width: 48, height: 32, seed };
+    CreateScene { upload: sample::upload(&options).unwrap(), ..CreateScene::default() }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn photos_of_a_waiting_job_are_read_once_where_they_fit() {
+    let networks = Arc::new(WallNetworks::default());
+    networks.hold.store(true, Ordering::Release);
+    let given = Arc::clone(&networks);
+    // One upload fits: two photos of 48 x 32 pixels, three bytes each.
+    let server = TestServer::with(|config, parts| {
+        parts.scenes = given;
+        config.jobs = 1;
+        config.limits.read_uploads_bytes_max = 2 * 48 * 32 * 3;
+    })
+    .await;
+    let running = server.service.create_scene(other_request(1)).await.unwrap().status.id;
+    let mut events = std::pin::pin!(server.service.watch(&running).await.unwrap());
+    while !matches!(events.next().await, Some(Event::Running { stage, .. }) if stage == "geometry")
+    {
+    }
+    let fits = server.service.create_scene(other_request(2)).await.unwrap().status.id;
+    let too_large = server.service.create_scene(other_request(3)).await.unwrap().status.id;
+    for id in [&fits, &too_large] {
+        let folder = server.data_dir().join("scenes").join(id.as_str());
+        std::fs::remove_file(folder.join("upload.segsplat")).unwrap();
+    }
+    networks.hold.store(false, Ordering::Release);
+    assert_eq!(server.finished(&running).await.state, SceneState::Done);
+    assert_eq!(server.finished(&fits).await.state, SceneState::Done, "its photos are in memory");
+    let error = server.finished(&too_large).await.error.expect("its photos are in the store alone");
+    assert_eq!(error.code, "scene_not_found");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_scene_that_is_deleted_while_its_photos_are_read_reaches_no_network() {
+    let networks = Arc::new(WallNetworks::default());
+    let given = Arc::clone(&networks);
+    let server = TestServer::with(|config, parts| {
+        parts.scenes = given;
+        // The job reads them again.
+        config.limits.read_uploads_bytes_max = 0;
+    })
+    .await;
+    let options = SampleOptions { photos: 12, width: 320, height: 240, seed: 5 };
+    let upload = sample::upload(&options).unwrap();
+    let create = CreateScene { upload, ..CreateScene::default() };
+    let id = server.service.create_scene(create).await.unwrap().status.id;
+    let mut events = std::pin::pin!(server.service.watch(&id).await.unwrap());
+    while !matches!(events.next().await, Some(Event::Running { stage, .. }) if stage == "photos") {}
+    server.service.delete(&id).await.unwrap();
+    while server.service.ready().jobs_running > 0 {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    assert_eq!(networks.calls.load(Ordering::Acquire), 0, "its photos were not read to the end");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_job_that_stops_waiting_for_the_same_content_lets_no_other_make_it() {
+    let networks = Arc::new(WallNetworks::default());
+    networks.hold.store(true, Ordering::Release);
+    let given = Arc::clone(&networks);
+    let server = TestServer::with(|config, parts| {
+        parts.scenes = given;
+        config.jobs = 3;
+    })
+    .await;
+    let running = async || {
+        let id = server.service.create_scene(request()).await.unwrap().status.id;
+        let mut events = std::pin::pin!(server.service.watch(&id).await.unwrap());
+        while !matches!(events.next().await, Some(Event::Running { .. })) {}
+        id
+    };
+    let first = running().await;
+    let waits = running().await;
+    server.service.delete(&waits).await.unwrap();
+    while server.service.ready().jobs_running > 1 {
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+    let next = running().await;
+    tokio::time::sleep(Duration::from_millis(100)).await;
+    assert_eq!(networks.calls.load(Ordering::Acquire), 1, "the first makes it");
+    networks.hold.store(false, Ordering::Release);
+    for id in [first, next] {
+        assert_eq!(server.finished(&id).await.state, SceneState::Done);
+    }
+    assert_eq!(networks.calls.load(Ordering::Acquire), 1, "the other is a copy");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_key_that_an_earlier_program_kept_still_answers_for_its_scene() {
+    let server = TestServer::start().await;
+    let set =
+        SceneOptions { max_views: Some(2), semantics: SemanticsMode::Off, density: Density::Full };
+    // That program hashed the Rust text of the options.
+    let cases = [
+        (SceneOptions::default(), "max_views: None, semantics: Lazy, density: Thinned"),
+        (set, "max_views: Some(2), semantics: Off, density: Full"),
+    ];
+    for (i, (options, text)) in cases.into_iter().enumerate() {
+        let keyed = || CreateScene {
+            idempotency_key: Some(format!("k{i}")),
+            options: options.clone(),
+            ..request()
+        };
+        let first = server.service.create_scene(keyed()).await.unwrap().status;
+        let mut hash = Sha256::new();
+        for file in store::hashes(&upload()) {
+            hash.update((file.file.len() as u64).to_le_bytes());
+            hash.update(&file.file);
+            hash.update(&file.sha256);
+        }
+        hash.update(format!("SceneOptions {{ {text} }}"));
+        let old: String = hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
+        let keys = std::fs::read_dir(server.data_dir().join("keys")).unwrap();
+        let mut keys = keys.map(|key| key.unwrap().path());
+        let id = first.id.as_str();
+        let key = keys.find(|key| std::fs::read_to_string(key).unwrap().contains(id)).unwrap();
+        let of = |sha256: &str| json!({ "id": id, "request_sha256": sha256 }).to_string();
+        std::fs::write(&key, of(&old)).unwrap();
+        let again = server.service.create_scene(keyed()).await.unwrap();
+        assert_eq!((again.replayed, &again.status.id), (true, &first.id), "{text}");
+        std::fs::write(&key, of(&"ab".repeat(32))).unwrap();
+        let refused = server.service.create_scene(keyed()).await.unwrap_err();
+        assert_eq!(refused.code(), ErrorCode::InvalidRequest, "{text}: {refused}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn pages_go_from_the_newest_and_miss_none_when_scenes_come_and_go() {
+    let folder = tempfile::tempdir().unwrap();
+    let place = Place::Folder(folder.path().to_owned());
+    let keep = |byte: u8, created_ms: u64| {
+        let id = SceneId::from_bytes([byte; 16]);
+        let owner = byte.is_multiple_of(2).then(|| "even".to_owned());
+        let status = SceneStatus::new(id, SceneState::Done, created_ms);
+        let (store, _) = Store::open(&place, &Limits::default()).unwrap();
+        store.put_record(&Record { owner, ..Record::new(status) }).unwrap();
+    };
+    for (byte, created_ms) in [(1, 10), (2, 30), (3, 20), (4, 20)] {
+        keep(byte, created_ms);
+    }
+    let page = async |service: &Service, limit: usize, after: Option<String>| {
+        let found = service.list(&PageRequest { limit: Some(limit), after }).await.unwrap();
+        let byte = |scene: &SceneStatus| u8::from_str_radix(&scene.id.as_str()[..2], 16).unwrap();
+        (found.scenes.iter().map(byte).collect::<Vec<_>>(), found.next)
+    };
+    let server = TestServer::at(&place, |_, _| {}).await;
+    let (first, next) = page(&server.service, 2, None).await;
+    assert_eq!((first, next.is_some()), (vec![2, 3], true));
+    server.service.delete(&SceneId::from_bytes([3; 16])).await.unwrap();
+    server.stop().await;
+    keep(9, 99);
+    let server = TestServer::at(&place, |_, _| {}).await;
+    assert_eq!(page(&server.service, 2, next).await, (vec![4, 1], None));
+    let even = server.service.for_caller(Caller::Owner("even".into()));
+    let (own, next) = page(&even, 1, None).await;
+    assert_eq!((own, next.is_some()), (vec![2], true), "more of one's own");
+    assert_eq!(page(&even, 1, next).await, (vec![4], None), "others' scenes are no more");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -231,10 +404,7 @@ async fn a_scene_spoiled_on_disk_says_so_and_the_server_lives() {
 async fn an_export_has_the_size_it_says() {
     let server = TestServer::start().await;
     let id = server.scene().await.id;
-    let mut export = server.service.export(&id, ExportFormat::Ply, &ASK).await.unwrap();
-    let (size, mut got) = (export.size_bytes, 0);
-    while let Some(chunk) = export.next_chunk().await {
-        got += chunk.len() as u64;
-    }
-    assert_eq!(got, size);
+    let export = server.service.export(&id, ExportFormat::Ply, &ASK).await.unwrap();
+    let size = export.size_bytes;
+    assert_eq!(export.into_stream().concat().await.len() as u64, size);
 }

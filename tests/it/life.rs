@@ -1,5 +1,5 @@
-//! A server's life: ready before its networks are open; at the end not ready first, then nobody
-//! new, those inside finish.
+//! Start and end of a server: it takes scenes before its networks are open; when it stops, it says
+//! so first, takes no new calls, and finishes the open ones.
 
 use std::{
     path::{Path, PathBuf},
@@ -13,7 +13,7 @@ use std::{
 
 use segsplat::{
     error::Result,
-    jobs::{Networks, SceneMaker},
+    jobs::{NetworkState, SceneNetworks},
     pipeline::{PhotoSet, Reconstruction},
     scene::{SceneOptions, Watch},
 };
@@ -22,19 +22,21 @@ use serde_json::Value;
 use crate::common::{
     process::{Start, can_serve, long},
     root,
-    server::{TestServer, WallMaker, upload},
+    server::{TestServer, WallNetworks, upload},
 };
 
 /// A server whose one scene is held back until the test lets go.
-async fn held(change: impl FnOnce(&mut segsplat::config::Config)) -> (Arc<WallMaker>, TestServer) {
-    let maker = Arc::new(WallMaker::default());
-    maker.hold.store(true, Ordering::Release);
-    let of_server = Arc::clone(&maker);
+async fn on_hold(
+    change: impl FnOnce(&mut segsplat::config::Config),
+) -> (Arc<WallNetworks>, TestServer) {
+    let networks = Arc::new(WallNetworks::default());
+    networks.hold.store(true, Ordering::Release);
+    let of_server = Arc::clone(&networks);
     let server = TestServer::with(|config, parts| {
-        parts.maker = of_server;
+        parts.scenes = of_server;
         change(config);
     });
-    (maker, server.await)
+    (networks, server.await)
 }
 
 async fn until(what: &str, mut check: impl AsyncFnMut() -> bool) {
@@ -47,7 +49,7 @@ async fn until(what: &str, mut check: impl AsyncFnMut() -> bool) {
 
 #[tokio::test]
 async fn a_drain_is_unready_first_then_refuses_new_calls_and_finishes_those_inside() {
-    let (maker, server) = held(|config| {
+    let (networks, server) = on_hold(|config| {
         config.drain_notice_ms = 1_500;
         config.drain_ms = 60_000;
     })
@@ -77,7 +79,7 @@ async fn a_drain_is_unready_first_then_refuses_new_calls_and_finishes_those_insi
     };
     until("nobody new is let in", refused).await;
     assert!(!stopping.is_finished(), "one is inside");
-    maker.hold.store(false, Ordering::Release);
+    networks.hold.store(false, Ordering::Release);
     let made = making.await.unwrap().unwrap();
     assert_eq!(made.status(), 201, "what was inside is finished");
     made.bytes().await.unwrap();
@@ -86,7 +88,7 @@ async fn a_drain_is_unready_first_then_refuses_new_calls_and_finishes_those_insi
 
 #[tokio::test]
 async fn a_drain_ends_when_its_time_is_over() {
-    let (_maker, server) = held(|config| config.drain_ms = 100).await;
+    let (_networks, server) = on_hold(|config| config.drain_ms = 100).await;
     let form = crate::common::doors::form(&upload());
     let making =
         crate::common::client().post(server.url("/v1/scenes?wait_ms=60000")).multipart(form).send();
@@ -102,7 +104,7 @@ async fn a_drain_ends_when_its_time_is_over() {
 #[tokio::test]
 async fn an_idle_server_ends_at_once() {
     let server = TestServer::start().await;
-    // An open connection without a call holds nobody up.
+    // An open connection without a call does not delay the end.
     let client = crate::common::client();
     assert_eq!(client.get(server.url("/readyz")).send().await.unwrap().status(), 200);
     let begun = Instant::now();
@@ -110,17 +112,17 @@ async fn an_idle_server_ends_at_once() {
     assert!(begun.elapsed() < Duration::from_secs(5), "{:?}", begun.elapsed());
 }
 
-/// A maker whose networks stand where the test wants them.
+/// Networks in the state that the test sets.
 #[derive(Debug, Default)]
 struct Late {
-    walls: WallMaker,
-    networks: AtomicU8,
+    walls: WallNetworks,
+    state: AtomicU8,
 }
 
-impl SceneMaker for Late {
-    fn networks(&self) -> Networks {
-        let all = [Networks::Opening, Networks::Open("somewhere"), Networks::Broken];
-        all[usize::from(self.networks.load(Ordering::Acquire))]
+impl SceneNetworks for Late {
+    fn state(&self) -> NetworkState {
+        let all = [NetworkState::Opening, NetworkState::Open("somewhere"), NetworkState::Broken];
+        all[usize::from(self.state.load(Ordering::Acquire))]
     }
 
     fn make(
@@ -129,15 +131,15 @@ impl SceneMaker for Late {
         options: &SceneOptions,
         watch: Watch<'_>,
     ) -> Result<Reconstruction> {
-        assert_eq!(self.networks.load(Ordering::Acquire), 1, "too early");
+        assert_eq!(self.state.load(Ordering::Acquire), 1, "too early");
         self.walls.make(photos, options, watch)
     }
 }
 
 async fn late() -> (Arc<Late>, TestServer) {
-    let maker = Arc::new(Late::default());
-    let of_server = Arc::clone(&maker);
-    (maker, TestServer::with(|_, parts| parts.maker = of_server).await)
+    let networks = Arc::new(Late::default());
+    let of_server = Arc::clone(&networks);
+    (networks, TestServer::with(|_, parts| parts.scenes = of_server).await)
 }
 
 /// What `path` says; whether it is a 200.
@@ -148,7 +150,7 @@ async fn says(server: &TestServer, path: &str) -> (bool, Value) {
 
 #[tokio::test]
 async fn scenes_are_taken_while_the_networks_are_opened_and_wait_for_them() {
-    let (maker, server) = late().await;
+    let (networks, server) = late().await;
     let (ready, said) = says(&server, "/readyz").await;
     assert!(ready && said["networks"] == "opening", "{said}");
     let (_, models) = says(&server, "/v1/models").await;
@@ -159,7 +161,7 @@ async fn scenes_are_taken_while_the_networks_are_opened_and_wait_for_them() {
     until("one scene waits", async || server.service.ready().jobs_queued == 1).await;
     tokio::time::sleep(Duration::from_millis(50)).await;
     assert_eq!(server.service.ready().jobs_running, 0, "nothing to make it with");
-    maker.networks.store(1, Ordering::Release);
+    networks.state.store(1, Ordering::Release);
     assert_eq!(made.await.unwrap().unwrap().status(), 201);
     let (ready, said) = says(&server, "/readyz").await;
     assert!(ready && said["networks"] == "open", "{said}");
@@ -168,7 +170,7 @@ async fn scenes_are_taken_while_the_networks_are_opened_and_wait_for_them() {
 
 #[tokio::test]
 async fn what_is_queued_stays_queued_where_the_networks_do_not_open() {
-    let (maker, server) = late().await;
+    let (networks, server) = late().await;
     let form = crate::common::doors::form(&upload());
     let made = crate::common::client()
         .post(server.url("/v1/scenes"))
@@ -177,7 +179,7 @@ async fn what_is_queued_stays_queued_where_the_networks_do_not_open() {
         .await
         .unwrap();
     let id = made.json::<Value>().await.unwrap()["id"].as_str().unwrap().to_owned();
-    maker.networks.store(2, Ordering::Release);
+    networks.state.store(2, Ordering::Release);
     until("not ready", async || !says(&server, "/readyz").await.0).await;
     assert_eq!(says(&server, "/readyz").await.1["networks"], "broken");
     let (_, scene) = says(&server, &format!("/v1/scenes/{id}")).await;

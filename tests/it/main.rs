@@ -25,6 +25,7 @@ mod jobs;
 mod licences;
 mod life;
 mod magnify;
+mod offline;
 mod proto;
 mod schedule;
 mod slow_callers;

@@ -1,4 +1,4 @@
-//! Views that are asked for at the same time: who is drawn, in which order, and what is refused.
+//! Views at the same time: which are drawn, in which order, and which are refused.
 
 use std::{
     sync::{

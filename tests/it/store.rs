@@ -1,19 +1,21 @@
-//! The store: bit for bit, whole or not at all, bad files put aside, PLY out and in.
+//! The store: files come back bit for bit, are whole or absent, and are put aside when they are
+//! bad; PLY out and in.
 
 use std::{fs, io::Cursor, path::Path, time::Duration};
 
 use glam::DVec3;
 use segsplat::{
     error::{ErrorCode, Result},
+    limits::Limits,
     scene::{
-        Backdrop, Gaussians, HealthReport, Provenance, RawGaussians, SanitizeReport, Scene,
-        SceneId, SceneMeta, SceneOptions, SceneState, SceneStatus, SourcePixel, Upload,
+        Backdrop, Gaussians, HealthReport, PhotoHash, Provenance, RawGaussians, SanitizeReport,
+        Scene, SceneId, SceneMeta, SceneOptions, SceneState, SceneStatus, SourcePixel, Upload,
         UploadCameras, UploadFile,
     },
     store::{
-        KeyUse, Record, Store,
+        KeyUse, Place, Record, Store,
         ply::{PlyWriter, ply_size_bytes, read_ply},
-        read_scene, write_scene,
+        provenance, read_scene, request_sha256, write_scene,
     },
 };
 
@@ -106,7 +108,7 @@ fn file_of(scene: &Scene) -> Vec<u8> {
 }
 
 fn open(root: &Path) -> (Store, Vec<Record>) {
-    Store::open(root, 1 << 20).unwrap()
+    Store::open(&Place::Folder(root.to_owned()), &Limits::default()).unwrap()
 }
 
 #[test]
@@ -308,7 +310,8 @@ fn a_key_and_a_content_lead_to_their_owners_scene_only() {
 fn one_process_holds_a_folder() {
     let folder = tempfile::tempdir().unwrap();
     let (store, _) = open(folder.path());
-    let second = Store::open(folder.path(), 0).unwrap_err();
+    let second =
+        Store::open(&Place::Folder(folder.path().to_owned()), &Limits::default()).unwrap_err();
     assert_eq!(second.code(), ErrorCode::StoreUnavailable);
     drop(store);
     open(folder.path());
@@ -480,4 +483,19 @@ fn hostile_ply_is_refused_with_a_typed_error() {
     for length in 0..good.len() {
         assert!(read(&good[..length]).is_err(), "cut to {length} bytes");
     }
+}
+
+#[test]
+fn requests_hash_as_they_always_did_and_networks_tell_contents_apart() {
+    let files = vec![PhotoHash { file: "a.png".to_owned(), sha256: "ab".repeat(32) }];
+    let set = SceneOptions { max_views: Some(4), ..SceneOptions::default() };
+    // Kept in stores: these must not change.
+    let kept = [&SceneOptions::default(), &set].map(|options| request_sha256(&files, options));
+    let want = [
+        "b7bd00d38ce6aaa41c0f929fbb8971a3c739290c1f29d43e4d7466783ed1f611",
+        "8249305ff777f2e2298755ba26fb029c872ef1f89eb1cb9e8addc6ecb6ce556d",
+    ];
+    assert_eq!(kept, want);
+    let content = |networks| provenance(files.clone(), &set, networks).content_sha256;
+    assert_ne!(content("n"), content("m"));
 }

@@ -12,13 +12,13 @@ use segsplat::{keys::hash, scene::Stage, telemetry::meter::stages};
 use serde_json::Value;
 
 use crate::common::{
+    cpu_server::{CpuServer, PlaneNetworks, upload},
     doors::{Ask, Options, both, both_with, bytes},
     process::{Start, can_serve},
     root,
-    stand::{BoardMaker, Stand, upload},
 };
 
-async fn metrics(stand: &Stand) -> String {
+async fn metrics(stand: &CpuServer) -> String {
     let answer = crate::common::client().get(stand.url("/metrics")).send().await.unwrap();
     assert_eq!(answer.headers()["content-type"], "text/plain; version=0.0.4; charset=utf-8");
     answer.text().await.unwrap()
@@ -32,7 +32,7 @@ fn value(text: &str, line: &str) -> f64 {
 
 #[tokio::test]
 async fn calls_stages_and_jobs_are_counted_over_both_doors() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let before = metrics(&stand).await;
     for door in both(stand.addr).await {
         let (id, _) = door.create(&upload(), &Options::wait()).await.unwrap();
@@ -73,7 +73,7 @@ async fn metrics_are_the_admins_unless_they_are_opened() {
     };
     std::fs::write(&path, entry("boss", "admin") + &entry("other", "write")).unwrap();
     for open in [false, true] {
-        let stand = Stand::with(BoardMaker::default(), |config| {
+        let stand = CpuServer::with(PlaneNetworks::default(), |config| {
             config.keys = Some(path.clone());
             config.open_metrics = open;
         })
@@ -106,7 +106,7 @@ async fn metrics_are_the_admins_unless_they_are_opened() {
 
 #[tokio::test]
 async fn answers_say_where_their_time_went_over_both_doors() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let doors = both(stand.addr).await;
     let (id, _) = doors[0].create(&upload(), &Options::wait()).await.unwrap();
     let url = stand.url(&format!("/v1/scenes/{id}/view?from=0&width=32&height=24"));
@@ -146,7 +146,7 @@ fn types(text: &str) -> impl Iterator<Item = (&str, &str)> {
 
 #[tokio::test]
 async fn every_metric_is_in_the_manual_and_the_manual_knows_no_other() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let text = metrics(&stand).await;
     let served: BTreeSet<(&str, &str)> = types(&text).collect();
     let manual = std::fs::read_to_string(root().join("docs/operations.md")).unwrap();
@@ -263,7 +263,7 @@ async fn a_scenes_job_has_a_span_in_the_trace_of_the_call_that_asked_for_it() {
 
 #[tokio::test]
 async fn every_metric_of_the_board_is_served() {
-    let stand = Stand::start().await;
+    let stand = CpuServer::start().await;
     let text = metrics(&stand).await;
     let served: BTreeSet<String> = types(&text)
         .flat_map(|(name, kind)| {

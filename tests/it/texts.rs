@@ -1,5 +1,5 @@
-//! What texts find: in space, in a view, under a pixel, in an export; how often a view is drawn
-//! for them; and what each bad text is told by both doors.
+//! What texts find: in space, in a view, under a pixel and in an export; how often a view is drawn
+//! for them; and the error of each bad text at both doors.
 
 use std::{
     collections::BTreeMap,
@@ -7,6 +7,7 @@ use std::{
     time::Duration,
 };
 
+use futures_util::StreamExt;
 use segsplat::{
     error::ErrorCode,
     scene::{SceneId, SceneOptions, ScoringProfile, SemanticsMode, SemanticsState},
@@ -124,7 +125,7 @@ async fn a_text_finds_its_gaussians_in_space_and_in_a_view() {
     let rle = answer.results[2].view.as_ref().unwrap().mask_rle.clone();
     assert_eq!(rle.unwrap(), Rle::encode(&mask, camera.width, camera.height));
     assert!(answer.results[0].parts.is_empty(), "no boxes were asked for");
-    assert_eq!(meaning.made.load(Ordering::Acquire), 1);
+    assert_eq!(meaning.calls.load(Ordering::Acquire), 1);
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -228,12 +229,9 @@ async fn an_export_of_a_text_holds_what_it_selects() {
     let service = &fixture.server.service;
     let export = async |text: Option<&str>| {
         let ask = TextOptions { text: text.map(str::to_owned), ..TextOptions::default() };
-        let mut export = service.export(&id, ExportFormat::Ply, &ask).await.unwrap();
+        let export = service.export(&id, ExportFormat::Ply, &ask).await.unwrap();
         let (size, etag) = (export.size_bytes, export.etag.clone());
-        let mut file = Vec::new();
-        while let Some(piece) = export.next_chunk().await {
-            file.extend(piece);
-        }
+        let file: Vec<u8> = export.into_stream().concat().await;
         assert_eq!(size, file.len() as u64);
         let count = String::from_utf8_lossy(&file[..400])
             .lines()
@@ -325,7 +323,7 @@ async fn a_query_while_semantics_run_waits_or_is_told_how_far_they_are() {
         let_go
     );
     assert_eq!(a.unwrap(), b.unwrap(), "both doors say the same");
-    assert_eq!(fixture.meaning.made.load(Ordering::Acquire), 1);
+    assert_eq!(fixture.meaning.calls.load(Ordering::Acquire), 1);
 }
 
 #[tokio::test(flavor = "multi_thread")]

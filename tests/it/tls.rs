@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use reqwest::{Certificate, Version};
 use tokio::net::TcpStream;
 
-use crate::common::stand::{BoardMaker, Stand};
+use crate::common::cpu_server::{CpuServer, PlaneNetworks};
 
 struct Files {
     folder: tempfile::TempDir,
@@ -28,9 +28,9 @@ fn files() -> Files {
     Files { folder, root }
 }
 
-async fn stand(files: &Files) -> Stand {
+async fn stand(files: &Files) -> CpuServer {
     let (cert, key) = (files.path("cert.pem"), files.path("key.pem"));
-    Stand::with(BoardMaker::default(), |config| {
+    CpuServer::with(PlaneNetworks::default(), |config| {
         config.tls_cert = Some(cert);
         config.tls_key = Some(key);
     })
@@ -83,12 +83,13 @@ async fn a_certificate_that_cannot_be_used_is_named_and_its_key_is_not_shown() {
         config.tls_cert = Some(files.path("cert.pem"));
         config.tls_key = Some(files.path("key.pem"));
         let parts = segsplat::service::Parts {
-            maker: std::sync::Arc::new(BoardMaker::default()),
+            scenes: std::sync::Arc::new(PlaneNetworks::default()),
             semantics: std::sync::Arc::new(segsplat::jobs::NoSemantics),
             renderer: std::sync::Arc::new(crate::common::server::PointRenderer),
             models: segsplat::service::ModelsInfo::default(),
         };
-        let service = segsplat::service::Service::open(config, parts).unwrap();
+        let place = segsplat::store::Place::of(&config).unwrap();
+        let service = segsplat::service::Service::open(&place, config, parts).unwrap();
         let error = segsplat::api::Doors::new(service).expect_err("refused");
         assert!(error.message().contains(want), "{error}");
         assert!(!error.message().contains("SECRET"), "{error}");

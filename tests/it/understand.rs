@@ -1,5 +1,5 @@
-//! The stages that give a scene its meaning, with stand-ins for the networks and with the
-//! fixture's small ones.
+//! The stages that make the semantics of a scene, with stand-ins for the networks and with the
+//! small networks of the fixture.
 
 use std::{
     path::Path,

@@ -1,5 +1,5 @@
-//! Bytes from outside, seeded and spoilt: every reader answers or refuses with a code; none panics,
-//! hangs or calls it a fault of its own.
+//! Damaged bytes from outside, with fixed seeds: every reader answers or refuses with a code; none
+//! panics, hangs or reports a fault of the server.
 //!
 //! `FUZZ_SEED` and `FUZZ_ITERS` choose others than the default; with `FUZZ_SECONDS` each target
 //! goes on for so long (`make fuzz`). What fails is written to `target/fuzz`. With `FUZZ_KEEP=1` a

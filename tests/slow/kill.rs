@@ -1,5 +1,5 @@
-//! `kill -9` at random points of create, look, delete and evict: nothing acknowledged is lost or
-//! changed, and nothing is left over. The program itself, on a folder of its own.
+//! `kill -9` at random points of create, view, delete and evict: no acknowledged scene is lost or
+//! changed, and no object is left over. It runs the program itself, on a folder of its own.
 
 use std::{
     collections::{BTreeMap, HashSet},
@@ -367,7 +367,7 @@ async fn check_after(server: &Process, ledger: &Ledger) {
     }
 }
 
-/// Scenes that the server has and nobody was told of: the kill came before the answer.
+/// Scenes of the server whose id no caller got: the kill came before the answer.
 async fn unacknowledged(client: &Client, server: &Process, ledger: &Ledger) -> HashSet<String> {
     let (mut ids, mut after) = (HashSet::new(), String::new());
     loop {

@@ -1,5 +1,5 @@
-//! The program under more load than it can carry, and for long: it answers what it can, refuses the
-//! rest by its code, stays alive, and does not grow.
+//! The program under too much load for a long time: it answers what it can, refuses the rest with a
+//! code, stays alive, and does not grow.
 
 use std::{
     sync::{
@@ -86,7 +86,7 @@ struct Met {
     times: Vec<Duration>,
 }
 
-/// The call that a random number stands for; its status. Of twenty calls one makes a scene, one
+/// Makes the call of a random number; gives its status. Of twenty calls one makes a scene, one
 /// lists, four ask by text and fourteen look.
 async fn call(client: &Client, server: &Process, ids: &[String], made: &[Upload], n: u64) -> u16 {
     let id = &ids[(n >> 33) as usize % ids.len()];

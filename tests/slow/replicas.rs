@@ -1,5 +1,5 @@
-//! Replicas that share an S3-compatible store, as plain processes behind HAProxy: what one makes
-//! all serve, and one that dies takes nothing with it.
+//! Replicas that share an S3-compatible store, as plain processes behind HAProxy: all serve the
+//! scenes of each, and no scene is lost with a replica that dies.
 
 use std::{
     collections::HashMap,

@@ -46,7 +46,7 @@ fn cut_short(cause: io::Error, read: usize, count: usize) -> Error {
     if cause.kind() == io::ErrorKind::UnexpectedEof {
         bad(format!("the file ends after {read} of {count} Gaussians"))
     } else {
-        super::super::files::unavailable("read the PLY", cause)
+        crate::store::files::unavailable("read the PLY", cause)
     }
 }
 
@@ -54,14 +54,11 @@ fn bad(why: impl std::fmt::Display) -> Error {
     Error::invalid(format!("PLY: {why}"))
 }
 
+/// A type of numbers; integers with their size in bytes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Scalar {
-    I8,
-    U8,
-    I16,
-    U16,
-    I32,
-    U32,
+    Signed(usize),
+    Unsigned(usize),
     F32,
     F64,
 }
@@ -69,12 +66,12 @@ enum Scalar {
 impl Scalar {
     fn parse(name: &str) -> Option<Self> {
         Some(match name {
-            "char" | "int8" => Self::I8,
-            "uchar" | "uint8" => Self::U8,
-            "short" | "int16" => Self::I16,
-            "ushort" | "uint16" => Self::U16,
-            "int" | "int32" => Self::I32,
-            "uint" | "uint32" => Self::U32,
+            "char" | "int8" => Self::Signed(1),
+            "uchar" | "uint8" => Self::Unsigned(1),
+            "short" | "int16" => Self::Signed(2),
+            "ushort" | "uint16" => Self::Unsigned(2),
+            "int" | "int32" => Self::Signed(4),
+            "uint" | "uint32" => Self::Unsigned(4),
             "float" | "float32" => Self::F32,
             "double" | "float64" => Self::F64,
             _ => return None,
@@ -83,31 +80,28 @@ impl Scalar {
 
     fn size(self) -> usize {
         match self {
-            Self::I8 | Self::U8 => 1,
-            Self::I16 | Self::U16 => 2,
-            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::Signed(size) | Self::Unsigned(size) => size,
+            Self::F32 => 4,
             Self::F64 => 8,
         }
     }
 
     /// The value at the start of `bytes`, which hold at least [`Self::size`].
     fn value(self, bytes: &[u8], big_endian: bool) -> f64 {
-        let mut word = [0; 8];
-        let size = self.size();
+        let (mut word, size) = ([0; 8], self.size());
         word[..size].copy_from_slice(&bytes[..size]);
         if big_endian {
             word[..size].reverse();
         }
-        let [b0, b1, b2, b3, ..] = word;
+        let bits = u64::from_le_bytes(word);
         match self {
-            Self::I8 => f64::from(i8::from_le_bytes([b0])),
-            Self::U8 => f64::from(b0),
-            Self::I16 => f64::from(i16::from_le_bytes([b0, b1])),
-            Self::U16 => f64::from(u16::from_le_bytes([b0, b1])),
-            Self::I32 => f64::from(i32::from_le_bytes([b0, b1, b2, b3])),
-            Self::U32 => f64::from(u32::from_le_bytes([b0, b1, b2, b3])),
-            Self::F32 => f64::from(f32::from_le_bytes([b0, b1, b2, b3])),
-            Self::F64 => f64::from_le_bytes(word),
+            Self::Unsigned(_) => bits as f64,
+            Self::Signed(size) => {
+                let unused = 64 - 8 * size;
+                ((bits as i64) << unused >> unused) as f64
+            }
+            Self::F32 => f64::from(f32::from_bits(bits as u32)),
+            Self::F64 => f64::from_bits(bits),
         }
     }
 }
@@ -130,7 +124,7 @@ impl Header {
         let mut line = |what: &str| -> Result<String> {
             let mut line = Vec::new();
             from.read_until(b'\n', &mut line)
-                .map_err(|cause| super::super::files::unavailable("read the PLY", cause))?;
+                .map_err(|cause| crate::store::files::unavailable("read the PLY", cause))?;
             if line.last() != Some(&b'\n') {
                 return Err(bad(format!(
                     "{what} is missing in the first {HEADER_BYTES_MAX} bytes"
@@ -200,11 +194,6 @@ impl Header {
         let Attribute { scalar, offset, .. } = self.attributes[attribute];
         scalar.value(&vertex[offset..], self.big_endian)
     }
-
-    #[expect(clippy::cast_possible_truncation, reason = "f64 files are narrowed")]
-    fn value_f32(&self, vertex: &[u8], attribute: usize) -> f32 {
-        self.value(vertex, attribute) as f32
-    }
 }
 
 fn push_attribute(attributes: &mut Vec<Attribute>, scalar: &str, name: &str) -> Result<()> {
@@ -232,7 +221,7 @@ struct Layout {
     position: [usize; 3],
     dc: [usize; 3],
     rest: Vec<usize>,
-    opacity: [usize; 1],
+    opacity: usize,
     scale: [usize; 3],
     rotation: [usize; 4],
     semantic_index: Option<usize>,
@@ -255,7 +244,7 @@ impl Layout {
             position: header.require(["x", "y", "z"])?,
             dc: header.require(["f_dc_0", "f_dc_1", "f_dc_2"])?,
             rest,
-            opacity: header.require(["opacity"])?,
+            opacity: header.require(["opacity"])?[0],
             scale: header.require(["scale_0", "scale_1", "scale_2"])?,
             rotation: header.require(["rot_0", "rot_1", "rot_2", "rot_3"])?,
             semantic_index: header.find("semantic_index"),
@@ -265,7 +254,7 @@ impl Layout {
 
     fn push(&self, header: &Header, vertex: &[u8], raw: &mut RawGaussians) {
         let value = |attribute| header.value(vertex, attribute);
-        let narrow = |attribute| header.value_f32(vertex, attribute);
+        let narrow = |attribute| value(attribute) as f32;
         let position = DVec3::from_array(self.position.map(value));
         let wide = self.position.iter().any(|&i| header.attributes[i].scalar == Scalar::F64);
         if raw.means.is_empty() && wide && position.is_finite() {
@@ -274,20 +263,14 @@ impl Layout {
         }
         raw.means.push((position - raw.origin).as_vec3().to_array());
         raw.quats.push(self.rotation.map(narrow));
-        #[expect(clippy::cast_possible_truncation, reason = "the scene holds f32")]
         raw.scales.push(self.scale.map(|i| value(i).exp() as f32));
-        #[expect(clippy::cast_possible_truncation, reason = "the scene holds f32")]
-        raw.opacities.push((1.0 / (1.0 + (-value(self.opacity[0])).exp())) as f32);
+        raw.opacities.push((1.0 / (1.0 + (-value(self.opacity)).exp())) as f32);
         raw.sh.push(self.dc.map(narrow));
         let each = self.rest.len() / 3;
         for coefficient in 0..each {
             raw.sh.push([0, 1, 2].map(|channel| narrow(self.rest[channel * each + coefficient])));
         }
-        #[expect(
-            clippy::cast_possible_truncation,
-            clippy::cast_sign_loss,
-            reason = "the cast saturates; an index that is none becomes the background"
-        )]
+        // The cast saturates; an index that is none becomes the background.
         let index = self.semantic_index.map_or(0, |i| value(i) as u16);
         raw.semantic_index.push(index);
         raw.source.push(SourcePixel::default());

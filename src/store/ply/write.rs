@@ -1,13 +1,13 @@
-//! Gaussians as a PLY, piece by piece, so that no whole file stands in memory.
+//! Gaussians as a PLY, part by part, so that no whole file is in memory.
 
 use crate::scene::Gaussians;
 
-/// Gaussians a piece.
-const PIECE: usize = 16_384;
+/// Gaussians of a part.
+const PART: usize = 16_384;
 /// Opacity 1 has no finite logit; this one reads back as 1 within f32's step.
 const OPACITY_MAX: f64 = 1.0 - 5e-8;
 
-/// Iterates over the pieces of the file: the header, then vertices.
+/// Iterates over the parts of the file: the header, then vertices.
 #[derive(Debug)]
 pub struct PlyWriter<'a> {
     gaussians: &'a Gaussians,
@@ -17,7 +17,6 @@ pub struct PlyWriter<'a> {
 
 impl<'a> PlyWriter<'a> {
     /// A writer at the start of the file.
-    #[must_use]
     pub fn new(gaussians: &'a Gaussians) -> Self {
         Self { gaussians, next: None }
     }
@@ -31,21 +30,20 @@ impl Iterator for PlyWriter<'_> {
             self.next = Some(0);
             return Some(header(self.gaussians).into_bytes());
         };
-        let to = (from + PIECE).min(self.gaussians.len());
+        let to = (from + PART).min(self.gaussians.len());
         if from == to {
             return None;
         }
         self.next = Some(to);
-        let mut piece = Vec::with_capacity((to - from) * vertex_bytes(self.gaussians));
+        let mut part = Vec::with_capacity((to - from) * vertex_bytes(self.gaussians));
         for i in from..to {
-            vertex(self.gaussians, i, &mut piece);
+            vertex(self.gaussians, i, &mut part);
         }
-        Some(piece)
+        Some(part)
     }
 }
 
 /// Size of the whole file.
-#[must_use]
 pub fn ply_size_bytes(gaussians: &Gaussians) -> u64 {
     (header(gaussians).len() + gaussians.len() * vertex_bytes(gaussians)) as u64
 }
@@ -73,7 +71,6 @@ fn vertex(gaussians: &Gaussians, i: usize, to: &mut Vec<u8>) {
     let raw = gaussians.as_raw();
     let k = gaussians.sh_count();
     let sh = &raw.sh[i * k..(i + 1) * k];
-    #[expect(clippy::cast_possible_truncation, reason = "the format holds f32")]
     let mut put = |value: f64| to.extend_from_slice(&(value as f32).to_le_bytes());
     for (mean, origin) in raw.means[i].iter().zip(raw.origin.to_array()) {
         put(f64::from(*mean) + origin);

@@ -10,7 +10,7 @@ use std::{
 
 use segsplat::{
     error::{Error, ErrorCode, Result},
-    jobs::{Phrases, SemanticsMaker},
+    jobs::{Phrases, SemanticNetworks},
     scene::{
         Bank, IndexMap, PosedPhoto, Scene, Semantics, SemanticsReport, Stage, TextEmbedding, Watch,
     },
@@ -30,10 +30,15 @@ pub(crate) struct PhotoMeaning {
     pub(crate) fails: std::sync::Mutex<Option<ErrorCode>>,
     /// What the bundle is said to lack.
     pub(crate) lack: Option<&'static str>,
-    /// Scenes made.
-    pub(crate) made: AtomicUsize,
+    /// Calls of `make`.
+    pub(crate) calls: AtomicUsize,
     /// Texts embedded.
     pub(crate) embedded: AtomicUsize,
+}
+
+impl PhotoMeaning {
+    /// Share of the stage `masks` that is done while it is held back.
+    pub(crate) const HELD_AT: f32 = 0.25;
 }
 
 fn axis(at: usize) -> Vec<f32> {
@@ -42,7 +47,7 @@ fn axis(at: usize) -> Vec<f32> {
     row
 }
 
-impl SemanticsMaker for PhotoMeaning {
+impl SemanticNetworks for PhotoMeaning {
     fn lacks(&self) -> Option<String> {
         self.lack.map(str::to_owned)
     }
@@ -67,8 +72,8 @@ impl SemanticsMaker for PhotoMeaning {
     }
 
     fn make(&self, given: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics> {
-        self.made.fetch_add(1, Ordering::AcqRel);
-        (watch.progress)(Stage::Masks, 0.25);
+        self.calls.fetch_add(1, Ordering::AcqRel);
+        (watch.progress)(Stage::Masks, Self::HELD_AT);
         let begun = Instant::now();
         while self.hold.load(Ordering::Acquire) {
             assert!(begun.elapsed() < PATIENCE, "nobody let go of the stand-in");

@@ -2,12 +2,12 @@
 #![allow(dead_code, reason = "not every build of the tests uses every helper")]
 
 pub(crate) mod cluster;
+pub(crate) mod cpu_server;
 pub(crate) mod doors;
 pub(crate) mod faults;
 pub(crate) mod meaning;
 pub(crate) mod process;
 pub(crate) mod server;
-pub(crate) mod stand;
 
 #[allow(unused_imports, reason = "as above")]
 pub(crate) use segsplat_testing::{

@@ -17,7 +17,7 @@ use segsplat::{
     api,
     config::Config,
     error::{Error, ErrorCode, Result},
-    jobs::{NoSemantics, SceneMaker},
+    jobs::{NoSemantics, SceneNetworks},
     pipeline::{PhotoSet, Reconstruction},
     render::{Frame, FrameStats, Labels, PixelWeights, RenderRequest, Renderer},
     sample::{self, SampleOptions},
@@ -52,7 +52,7 @@ pub(crate) struct TestServer {
 }
 
 impl TestServer {
-    /// A server with the stand-in maker and the default limits.
+    /// A server with the stand-in networks and the default limits.
     pub(crate) async fn start() -> Self {
         Self::with(|_, _| {}).await
     }
@@ -72,7 +72,7 @@ impl TestServer {
         let mut config = Config::default();
         config.data_dir = folder.path().join("data");
         let mut parts = Parts {
-            maker: Arc::new(WallMaker::default()),
+            scenes: Arc::new(WallNetworks::default()),
             semantics: Arc::new(NoSemantics),
             renderer: Arc::new(PointRenderer),
             models: ModelsInfo::default(),
@@ -83,7 +83,7 @@ impl TestServer {
     }
 
     async fn serve(place: Place, config: Config, parts: Parts, folder: TempDir) -> Self {
-        let service = Service::open_at(&place, config.clone(), parts.clone());
+        let service = Service::open(&place, config.clone(), parts.clone());
         let service = service.expect("the place is usable");
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
         let addr = listener.local_addr().expect("a bound listener has an address");
@@ -160,13 +160,13 @@ pub(crate) fn first_view() -> ViewSpec {
 /// Stands in for the network. Held back while `hold` is true, so that tests see work in progress;
 /// a photo named `panic` makes it panic.
 #[derive(Debug, Default)]
-pub(crate) struct WallMaker {
+pub(crate) struct WallNetworks {
     pub(crate) hold: AtomicBool,
-    /// Scenes made.
-    pub(crate) made: AtomicUsize,
+    /// Calls of `make`.
+    pub(crate) calls: AtomicUsize,
 }
 
-impl SceneMaker for WallMaker {
+impl SceneNetworks for WallNetworks {
     fn identity(&self) -> String {
         "stand-in".to_owned()
     }
@@ -177,7 +177,7 @@ impl SceneMaker for WallMaker {
         _: &SceneOptions,
         watch: Watch<'_>,
     ) -> Result<Reconstruction> {
-        self.made.fetch_add(1, Ordering::AcqRel);
+        self.calls.fetch_add(1, Ordering::AcqRel);
         let photos = &photos.photos;
         (watch.progress)(Stage::Geometry, 0.5);
         let begun = Instant::now();
@@ -238,14 +238,14 @@ pub(crate) struct CountingRenderer {
     pub(crate) drawn: AtomicUsize,
     /// Those with blended labels.
     pub(crate) blends: AtomicUsize,
-    /// Those with entries.
-    pub(crate) entries: AtomicUsize,
+    /// Those with pixel weights.
+    pub(crate) weights: AtomicUsize,
 }
 
 impl CountingRenderer {
-    /// Views drawn, those with blended labels, those with entries.
+    /// Views drawn, those with blended labels, those with pixel weights.
     pub(crate) fn counts(&self) -> [usize; 3] {
-        [&self.drawn, &self.blends, &self.entries].map(|count| count.load(Ordering::Acquire))
+        [&self.drawn, &self.blends, &self.weights].map(|count| count.load(Ordering::Acquire))
     }
 }
 
@@ -263,7 +263,7 @@ impl Renderer for CountingRenderer {
         match request.labels {
             Labels::None => {}
             Labels::Blend(_) => drop(self.blends.fetch_add(1, Ordering::AcqRel)),
-            Labels::Weights => drop(self.entries.fetch_add(1, Ordering::AcqRel)),
+            Labels::Weights => drop(self.weights.fetch_add(1, Ordering::AcqRel)),
         }
         PointRenderer.render(gaussians, request)
     }

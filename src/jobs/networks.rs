@@ -1,4 +1,4 @@
-//! What turns photos into scenes and scenes into semantics: the pipeline, or a stand-in of a test.
+//! The networks of jobs: those of the bundle, or the stand-ins of a test.
 
 use std::sync::Arc;
 
@@ -11,9 +11,9 @@ use crate::{
     scene::{PosedPhoto, Scene, SceneOptions, Semantics, TextEmbedding, Watch},
 };
 
-/// Where the networks of a maker stand.
+/// Whether the networks are open.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Networks {
+pub enum NetworkState {
     /// They are being opened; queued jobs wait for them.
     Opening,
     /// They are open, on this execution provider; empty: there are none to open.
@@ -22,17 +22,28 @@ pub enum Networks {
     Broken,
 }
 
-/// Turns photos into scenes.
-pub trait SceneMaker: Send + Sync {
-    /// What else than photos and options decides the scene: sha256 of the bundle's manifest, hex;
+impl NetworkState {
+    /// Name in answers.
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Opening => "opening",
+            Self::Open(_) => "open",
+            Self::Broken => "broken",
+        }
+    }
+}
+
+/// Makes scenes of photos.
+pub trait SceneNetworks: Send + Sync {
+    /// What decides the scene beside photos and options: sha256 of the bundle's manifest, hex;
     /// empty where no network is used.
     fn identity(&self) -> String {
         String::new()
     }
 
-    /// Whether its networks are open.
-    fn networks(&self) -> Networks {
-        Networks::Open("")
+    /// Whether they are open.
+    fn state(&self) -> NetworkState {
+        NetworkState::Open("")
     }
 
     /// Does the whole work on the calling thread.
@@ -59,7 +70,7 @@ pub struct Phrases {
 }
 
 /// Makes the semantics of scenes, and embeds texts.
-pub trait SemanticsMaker: Send + Sync {
+pub trait SemanticNetworks: Send + Sync {
     /// What the loaded bundle lacks for it, as in "no mask network"; `None` where nothing.
     fn lacks(&self) -> Option<String>;
 
@@ -92,7 +103,7 @@ impl NoSemantics {
     }
 }
 
-impl SemanticsMaker for NoSemantics {
+impl SemanticNetworks for NoSemantics {
     fn lacks(&self) -> Option<String> {
         Some("no semantic networks".to_owned())
     }
@@ -112,18 +123,18 @@ impl SemanticsMaker for NoSemantics {
 
 /// Makes scenes and semantics with the networks of an engine.
 #[derive(Clone, Debug)]
-pub struct PipelineMaker(pub Arc<LateEngine>);
+pub struct PipelineNetworks(pub Arc<LateEngine>);
 
-impl SceneMaker for PipelineMaker {
+impl SceneNetworks for PipelineNetworks {
     fn identity(&self) -> String {
         self.0.bundle().sha256().to_owned()
     }
 
-    fn networks(&self) -> Networks {
+    fn state(&self) -> NetworkState {
         match self.0.peek() {
-            None => Networks::Opening,
-            Some(Ok(engine)) => Networks::Open(engine.geometry().provider().name()),
-            Some(Err(_)) => Networks::Broken,
+            None => NetworkState::Opening,
+            Some(Ok(engine)) => NetworkState::Open(engine.geometry().provider().name()),
+            Some(Err(_)) => NetworkState::Broken,
         }
     }
 
@@ -137,7 +148,7 @@ impl SceneMaker for PipelineMaker {
     }
 }
 
-impl SemanticsMaker for PipelineMaker {
+impl SemanticNetworks for PipelineNetworks {
     fn lacks(&self) -> Option<String> {
         self.0.bundle().lacks_semantics().map(str::to_owned)
     }

@@ -1,6 +1,5 @@
-//! A whole server whose scenes are made without a network: photos are read and the capture is
-//! judged by the product's own code, then the first photo stands as a board of Gaussians at the
-//! capture's median depth.
+//! A whole server whose scenes need no network: the product's own code reads photos and judges the
+//! capture. Then the first photo becomes a plane of Gaussians at the median depth of the capture.
 
 use std::sync::{Arc, LazyLock};
 
@@ -9,7 +8,7 @@ use segsplat::{
     capture,
     config::Config,
     error::{Error, ErrorCode, Result},
-    jobs::SceneMaker,
+    jobs::SceneNetworks,
     pipeline::{PhotoSet, Reconstruction},
     render::cpu::CpuRenderer,
     sample::{self, SampleOptions},
@@ -24,17 +23,17 @@ use super::server::TestServer;
 
 /// Degree 0 of the 3DGS basis.
 const SH_C0: f32 = 0.282_094_79;
-/// Gaussians along the longer side of the board.
-const BOARD: u32 = 80;
+/// Gaussians along the longer side of the plane.
+const PLANE: u32 = 80;
 
-/// Makes a board of the first photo.
+/// Makes a plane of the first photo.
 #[derive(Debug, Default)]
-pub(crate) struct BoardMaker {
+pub(crate) struct PlaneNetworks {
     /// Fails every scene with this code instead.
     pub(crate) fails: Option<ErrorCode>,
 }
 
-impl SceneMaker for BoardMaker {
+impl SceneNetworks for PlaneNetworks {
     fn make(
         &self,
         photos: &PhotoSet,
@@ -48,7 +47,7 @@ impl SceneMaker for BoardMaker {
         (watch.progress)(Stage::Capture, 0.5);
         let capture = capture::analyse_until(photos, watch.cancel)?;
         (watch.progress)(Stage::Lift, 0.5);
-        let (gaussians, _) = Gaussians::sanitize(board(&photos[0], capture.median_depth))?;
+        let (gaussians, _) = Gaussians::sanitize(plane(&photos[0], capture.median_depth))?;
         let report = HealthReport {
             photos: u32::try_from(photos.len()).expect("few photos"),
             views_used: u32::try_from(photos.len()).expect("few photos"),
@@ -68,9 +67,9 @@ impl SceneMaker for BoardMaker {
 }
 
 /// The photo's pixels as round Gaussians at depth `z` of its camera.
-fn board(posed: &PosedPhoto, z: f64) -> RawGaussians {
+fn plane(posed: &PosedPhoto, z: f64) -> RawGaussians {
     let (photo, camera) = (&posed.photo, posed.camera);
-    let step = photo.width.max(photo.height).div_ceil(BOARD).max(1);
+    let step = photo.width.max(photo.height).div_ceil(PLANE).max(1);
     let origin = camera.camera_to_world.center();
     let mut raw = RawGaussians { origin, ..RawGaussians::default() };
     for y in (0..photo.height).step_by(step as usize) {
@@ -93,9 +92,9 @@ fn board(posed: &PosedPhoto, z: f64) -> RawGaussians {
 }
 
 /// A [`TestServer`] that judges captures and renders with the product's CPU renderer.
-pub(crate) struct Stand(TestServer);
+pub(crate) struct CpuServer(TestServer);
 
-impl std::ops::Deref for Stand {
+impl std::ops::Deref for CpuServer {
     type Target = TestServer;
 
     fn deref(&self) -> &TestServer {
@@ -103,18 +102,18 @@ impl std::ops::Deref for Stand {
     }
 }
 
-impl Stand {
+impl CpuServer {
     /// A server with default limits.
     pub(crate) async fn start() -> Self {
-        Self::with(BoardMaker::default(), |_| {}).await
+        Self::with(PlaneNetworks::default(), |_| {}).await
     }
 
-    /// A server with this maker and a changed configuration.
-    pub(crate) async fn with(maker: BoardMaker, change: impl FnOnce(&mut Config)) -> Self {
+    /// A server with these networks and a changed configuration.
+    pub(crate) async fn with(networks: PlaneNetworks, change: impl FnOnce(&mut Config)) -> Self {
         let server = TestServer::with(|config, parts| {
-            parts.maker = Arc::new(maker);
+            parts.scenes = Arc::new(networks);
             parts.renderer = Arc::new(CpuRenderer::new(config.threads).expect("a CPU renderer"));
-            parts.models = ModelsInfo { bundle: "board".to_owned(), ..ModelsInfo::default() };
+            parts.models = ModelsInfo { bundle: "plane".to_owned(), ..ModelsInfo::default() };
             change(config);
         });
         Self(server.await)
