@@ -4,22 +4,19 @@
 use std::sync::{Arc, atomic::AtomicBool};
 
 use segsplat_vision::semantics::{Cutter, Scorer, Scoring};
-use serde::Serialize;
+use serde_json::{Value, json};
 
 use super::{PROFILES, tally::TextMap};
 use crate::{
     error::{Error, Result},
-    folders::{scene_of, view_request},
     models::ImageText,
     pipeline::{
-        Engine, Reconstruction, masks, reconstruct,
+        Engine, Reconstruction, masks,
         semantics::{SceneParts, SemanticsOptions, understand},
     },
     render::{Kinds, Labels, PixelWeights, RenderRequest, ViewPlanner, cpu::CpuRenderer},
-    scene::{
-        Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, ScoringProfile, SemanticsReport,
-        StageTime, Watch,
-    },
+    scene::{Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, ScoringProfile, Watch},
+    scenes::{make, scene_of, view_request},
 };
 
 /// What every target is seen with.
@@ -36,30 +33,15 @@ pub(super) struct Tools<'a> {
 pub(super) struct Seen {
     /// The view's colours, for pictures.
     pub(super) color: Vec<[f32; 3]>,
-    pub(super) report: TargetReport,
-    scene: Rows,
-    flat: Rows,
-}
-
-/// How one target went.
-#[derive(Clone, Debug, Serialize)]
-pub struct TargetReport {
-    /// File of the target.
-    pub target: String,
-    /// Files of the inputs, the nearest first.
-    pub inputs: Vec<String>,
-    /// How semantics went: masks, bank size, times.
-    pub semantics: SemanticsReport,
-    /// Times of the stages before.
-    pub stages: Vec<StageTime>,
-    /// Mean sum of the weights that a pixel of the target has over the bank, 0..1.
-    pub coverage: f64,
-    /// What looked wrong with the inputs.
-    pub warnings: usize,
+    /// Files of the target and its inputs, the nearest first; how semantics and the stages before
+    /// went; the mean sum of the weights of a pixel of the target over the bank, 0 to 1.
+    pub(super) report: Value,
+    scene: BankView,
+    flat: BankView,
 }
 
 /// A bank and the weights of each pixel of the target over it.
-struct Rows {
+struct BankView {
     bank: Bank,
     weights: PixelWeights,
 }
@@ -76,12 +58,6 @@ impl<'a> Tools<'a> {
         Ok(Self { engine, renderer, towers, understanding, scorings })
     }
 
-    /// Name and version of the bundle.
-    pub(super) fn bundle(&self) -> String {
-        let bundle = self.engine.bundle();
-        format!("{} {}", bundle.name(), bundle.version())
-    }
-
     /// Unit embeddings of texts.
     pub(super) fn texts(&self, texts: &[String]) -> Result<Vec<Vec<f32>>> {
         Ok(self.towers.embed_texts(texts)?.into_iter().map(|text| text.row).collect())
@@ -96,30 +72,33 @@ impl<'a> Tools<'a> {
     ) -> Result<Seen> {
         let given: Vec<PosedPhoto> = inputs.iter().map(|&i| photos[i].clone()).collect();
         let cancel = AtomicBool::new(false);
-        let made = reconstruct(self.engine, &given, &SceneOptions::default(), &|_, _| (), &cancel)?;
-        let parts =
-            SceneParts { photos: &given, cameras: &made.cameras, gaussians: &made.gaussians };
+        let reconstruction = make(self.engine, &given, &SceneOptions::default())?;
+        let parts = SceneParts {
+            photos: &given,
+            cameras: &reconstruction.cameras,
+            gaussians: &reconstruction.gaussians,
+        };
         let watch = Watch { progress: &|_, _| (), cancel: &cancel };
         let meaning = understand(self.engine, &parts, &self.understanding, watch)?;
-        let gaussians = made.gaussians.with_semantic_index(meaning.index)?;
-        let plain = view_request(photos[target].camera, Kinds::COLOR, made.report.median_depth);
+        let gaussians = reconstruction.gaussians.with_semantic_index(meaning.index)?;
+        let plain =
+            view_request(photos[target].camera, Kinds::COLOR, reconstruction.report.median_depth);
         let request = RenderRequest { labels: Labels::Weights, ..plain };
-        let (warnings, stages) = (made.report.warnings.len(), made.report.stages.clone());
-        let scene = scene_of(Reconstruction { gaussians, ..made });
+        let scene = scene_of(Reconstruction { gaussians, ..reconstruction });
         let frame = ViewPlanner::default().render(self.renderer, &scene, &request, true)?;
         let weights = frame.weights.ok_or_else(|| Error::internal("the view has no weights"))?;
         let weight: f64 = weights.weights.iter().map(|w| f64::from(*w)).sum();
-        let report = TargetReport {
-            target: photos[target].file.clone(),
-            inputs: given.iter().map(|photo| photo.file.clone()).collect(),
-            semantics: meaning.report,
-            stages,
-            coverage: weight / weights.pixels().max(1) as f64,
-            warnings,
-        };
+        let report = json!({
+            "target": photos[target].file,
+            "inputs": given.iter().map(|photo| &photo.file).collect::<Vec<_>>(),
+            "semantics": meaning.report,
+            "stages": scene.meta.report.stages,
+            "coverage": weight / weights.pixels().max(1) as f64,
+            "warnings": scene.meta.report.warnings.len(),
+        });
         Ok(Seen {
             color: frame.color.unwrap_or_default(),
-            scene: Rows { bank: meaning.bank, weights },
+            scene: BankView { bank: meaning.bank, weights },
             flat: self.flat(&given[0], &photos[target].camera, &cancel)?,
             report,
         })
@@ -127,7 +106,7 @@ impl<'a> Tools<'a> {
 
     /// The masks of one photo, each with a row of its own, laid over a picture of the size of the
     /// target.
-    fn flat(&self, photo: &PosedPhoto, target: &Camera, cancel: &AtomicBool) -> Result<Rows> {
+    fn flat(&self, photo: &PosedPhoto, target: &Camera, cancel: &AtomicBool) -> Result<BankView> {
         let network = self.engine.masks()?;
         let settings = masks::settings(network.manifest());
         let found = masks::photo_masks(
@@ -163,7 +142,7 @@ impl<'a> Tools<'a> {
                 weights.offsets.push(u32::try_from(weights.entries.len()).unwrap_or(u32::MAX));
             }
         }
-        Ok(Rows { bank: Bank { dim: manifest.dim, rows }, weights })
+        Ok(BankView { bank: Bank { dim: manifest.dim, rows }, weights })
     }
 }
 
@@ -182,7 +161,7 @@ impl Seen {
     }
 }
 
-impl Rows {
+impl BankView {
     /// The product's masks, and scores by which texts can be compared at a pixel.
     ///
     /// At one pixel all texts share the feature's length, so the smallest `E . B(q - c)` over the
