@@ -1,6 +1,6 @@
 """Views of one scene over HTTP: FastAPI, PyTorch on the CPU, PNG by Pillow.
 
-All tiles of a view are blended at once, 64 Gaussians of each tile at a time. As many views are
+All tiles of a view are blended at once, 16 Gaussians of each tile at a time. As many views are
 drawn at once as there are threads, each by one thread."""
 
 import argparse
@@ -15,7 +15,7 @@ from PIL import Image
 
 SH_C0 = 0.28209479177387814
 TILE = 16
-CHUNK = 64
+CHUNK = 16
 
 
 def read_ply(path):
@@ -110,14 +110,15 @@ def render(scene, camera_to_world, fx, fy, cx, cy, width, height, near=0.01):
         dx = xs[open_tiles, :, None] - u[ids][:, None]
         dy = ys[open_tiles, :, None] - v[ids][:, None]
         k = conic[ids][:, None]
-        power = -0.5 * (k[..., 0] * dx * dx + k[..., 2] * dy * dy) - k[..., 1] * dx * dy
+        power = (dx * k[..., 0] * -0.5).sub_(dy * k[..., 1]).mul_(dx)
+        power.add_(dy.mul_(dy).mul_(k[..., 2] * -0.5))
         strength = torch.where(nth < bounds[1:][open_tiles, None], opacity[ids], 0.0)
-        alpha = (strength[:, None] * power.exp()).clamp(max=0.999)
-        alpha = torch.where(alpha < 1 / 255, 0.0, alpha)
+        alpha = power.exp_().mul_(strength[:, None]).clamp_(max=0.999)
+        alpha.masked_fill_(alpha < 1 / 255, 0.0)
         before = light[open_tiles, :, None]
-        after = before * (1 - alpha).cumprod(2)
-        before = torch.cat([before, after[..., :-1]], 2)
-        weight = torch.where(after > 1e-4, alpha * before, 0.0)
+        after = (1 - alpha).cumprod_(2).mul_(before)
+        weight = torch.cat([before, after[..., :-1]], 2).mul_(alpha)
+        weight.masked_fill_(after <= 1e-4, 0.0)
         image[open_tiles] += weight @ colour[ids]
         light[open_tiles] = after[..., -1]
         first += CHUNK

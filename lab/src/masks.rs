@@ -1,10 +1,10 @@
 //! What each shortcut of the mask stage changes.
 //!
 //! The same photos go through the mask stage in several variants: no shortcut first, then each
-//! shortcut alone, then all. A row has the time of a variant, the points asked, and how far its
-//! masks are those of the first variant. `--dump` writes the masks before level choice and the
-//! rule of one mask a pixel, for `tests/tools/official_masks.py` to compare with Segment
-//! Anything's own code.
+//! shortcut alone, then all. A row has the time of a variant, the points asked, and how many of its
+//! masks are masks of the first variant. `--dump` writes the masks before a level is chosen and
+//! before each pixel gets one mask. `tests/tools/official_masks.py` compares them with those of
+//! Segment Anything's own code.
 
 use std::{
     collections::BTreeMap,
@@ -87,9 +87,9 @@ impl PromptDecoder for Counted<'_> {
     }
 }
 
-/// Makes a row for each variant; its error is how little its masks are those of the first. A row
-/// has means over photos: seconds (also those of the encoder), points asked, masks, the share of
-/// the photo in some mask, and what [`compare`] says.
+/// Makes a row for each variant; its error is the share of the first variant's masks that it lacks.
+/// A row has means over photos: seconds (also those of the encoder), points asked, masks, the share
+/// of the photo in some mask, and what [`compare`] says.
 ///
 /// # Errors
 /// `invalid_request` when there is no scene or an option is out of range, `model_unavailable` when

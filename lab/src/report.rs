@@ -52,8 +52,8 @@ struct Table {
 /// Writes the page, or checks it.
 ///
 /// # Errors
-/// `invalid_request` where a file is missing or no such file, where a row has no command, commit,
-/// machine or error, and with `check` where the page differs.
+/// `invalid_request` where a file cannot be read, where a row has no command, commit, machine or
+/// error, and with `check` where the page differs.
 pub(crate) fn run(args: &Args) -> Result<()> {
     let path = args.root.join("docs/benchmarks.md");
     let old = read(&path)?;

@@ -47,9 +47,6 @@ pub(crate) fn is_posed(dir: &Path) -> bool {
 
 /// The photos of a scene folder, undistorted, cropped in the middle to their short side, [`SIDE`]
 /// pixels square.
-///
-/// # Errors
-/// Those of the reader of photos.
 pub(crate) fn squares(dir: &Path) -> Result<Vec<PosedPhoto>> {
     let photos = photo_files::read_dir(dir, &Limits::default())?;
     let square = |posed: &PosedPhoto| {
@@ -78,9 +75,6 @@ pub fn nearest(photos: &[PosedPhoto], target: usize, count: usize) -> Vec<usize>
 }
 
 /// The Gaussians of the photos.
-///
-/// # Errors
-/// Those of the stages.
 pub(crate) fn make(
     engine: &Engine,
     photos: &[PosedPhoto],

@@ -35,9 +35,6 @@ pub(crate) struct Args {
 }
 
 /// Makes a row of the medians; its error is the PSNR of the first photo's view to that photo.
-///
-/// # Errors
-/// Those of the stages.
 pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let side = args.side;
     let options =

@@ -1,4 +1,4 @@
-//! The hindsight warp: what a network must beat to be of use.
+//! The hindsight warp: a network is of use only where it is better than this.
 
 use rayon::prelude::*;
 

@@ -62,9 +62,6 @@ fn scenes(
 /// Makes a row for each skip and scene; its error is the difference between the frames. Times are
 /// medians, of the device where it has a clock, else of a call; `ratio` is that without the skip
 /// over that with it.
-///
-/// # Errors
-/// Those of [`super::run`].
 pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     args.check()?;
     let (gaussians, request) = args.scene()?;

@@ -3,8 +3,8 @@
 //! Ours: `transforms.json` with `mask_file` in some frames and `masks/classes.json`; `scene.json`
 //! may name `surroundings`: classes that are counted but not asked for. 3D-OVS: `images/`,
 //! `segmentations/classes.txt`, `segmentations/FRAME/CLASS.png`, cameras in `transforms.json`,
-//! `cameras.json` or `poses_bounds.npy` (LLFF). Labels go through the photos' own reader, so a
-//! distorted photo and its labels are undone alike.
+//! `cameras.json` or `poses_bounds.npy` (LLFF). Labels go through the reader of photos, which
+//! removes the lens distortion of both in the same way.
 
 use std::{
     collections::BTreeMap,
@@ -72,7 +72,7 @@ pub fn is_labelled(dir: &Path) -> bool {
 /// Reads photos and labels.
 ///
 /// # Errors
-/// `invalid_request` when a file of the layout is missing, outside the folder, or no such file.
+/// `invalid_request` when a file is missing, lies outside the folder or cannot be read.
 pub fn read(dir: &Path, limits: &Limits) -> Result<LabelledScene> {
     let upload = if dir.join("poses_bounds.npy").is_file()
         && !photos::CAMERA_FILES.iter().any(|name| dir.join(name).is_file())
@@ -97,7 +97,7 @@ fn json(dir: &Path, name: &str) -> Result<Value> {
     serde_json::from_str(&text).map_err(|e| wrong().caused_by(e))
 }
 
-/// A picture of the folder named by one of its files; only names that stay inside.
+/// A picture that a file of the folder names; the name must stay inside the folder.
 fn picture(dir: &Path, name: &str) -> Result<GrayImage> {
     let wrong = |what: &str| Error::invalid(format!("{name:?}: {what}"));
     if Path::new(name).components().any(|part| !matches!(part, Component::Normal(_))) {
@@ -171,13 +171,9 @@ fn ovs(dir: &Path, upload: &Upload) -> Result<Stored> {
     if classes.is_empty() || classes.len() > 255 {
         return Err(wrong(&format!("classes.txt names {} classes, not 1 to 255", classes.len())));
     }
-    let mut folders: Vec<PathBuf> = Vec::new();
-    for entry in fs_err::read_dir(&top).map_err(|e| wrong("cannot be read").caused_by(e))? {
-        let path = entry.map_err(|e| wrong("cannot be read").caused_by(e))?.path();
-        if path.is_dir() {
-            folders.push(path);
-        }
-    }
+    let listed = fs_err::read_dir(&top).map_err(|e| wrong("cannot be read").caused_by(e))?;
+    let mut folders: Vec<PathBuf> = listed.flatten().map(|entry| entry.path()).collect();
+    folders.retain(|path| path.is_dir());
     folders.sort();
     let mut maps = Vec::new();
     for folder in folders {
@@ -207,7 +203,8 @@ fn ovs(dir: &Path, upload: &Upload) -> Result<Stored> {
     Ok(Stored { classes, maps })
 }
 
-/// Labels of the undistorted photos: three classes at a time travel as a photo's channels.
+/// Labels of the undistorted photos. The reader takes three classes at a time, as the channels of a
+/// photo.
 fn undo(
     stored: &Stored,
     upload: &Upload,

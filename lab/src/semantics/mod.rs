@@ -2,8 +2,8 @@
 //!
 //! The paper's protocol: a labelled photo is the target, the photos nearest to it are the input,
 //! and the class names are asked in a view from the target's camera. Both scoring profiles are
-//! judged from one scene. Beside them stands the *flat* baseline without any 3D: the masks of the
-//! nearest photo, each scored by the same text on its own, laid over the target as they are.
+//! judged from one scene. The *flat* baseline has no 3D: each mask of the nearest photo is scored
+//! by the same text, and the masks are laid over the target as they are.
 
 pub mod labels;
 mod llff;
@@ -31,7 +31,7 @@ use crate::{
     setup::Inputs,
 };
 
-/// Words for what is in no scene, unless others are given. A scene that has one does not ask it.
+/// Words for what is in no scene. A scene that has a class of this name does not ask the word.
 const ABSENT: &str = "airplane,elephant,church,waterfall,bicycle,violin,helmet,bridge";
 /// Profiles in the order they are judged: `paper`, `default`.
 const PROFILES: [ScoringProfile; 2] = [ScoringProfile::Paper, ScoringProfile::Default];
@@ -93,7 +93,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         row["bundle"] = json!(bundle);
         row["photos"] = json!(args.inputs.photos);
         let miou = row["default"]["scene"]["miou"].as_f64().unwrap_or(f64::NAN);
-        progress(&format!("{}: mIoU {miou:.3}", row["scene"]));
+        let scene = row["scene"].as_str().unwrap_or_default();
+        progress(&format!("{scene}: mIoU {miou:.3}"));
         rows.push(json!({ "one_less_miou": 1.0 - miou }), row)
     };
     let mut scenes = Vec::new();
@@ -131,12 +132,12 @@ fn judge(tools: &Tools<'_>, name: &str, scene: &LabelledScene, args: &Args) -> R
         }
         let seen = tools.see(&scene.photos, frame.photo, &inputs).map_err(fault)?;
         let mut all_maps = Vec::new();
-        for (tallies, profile) in tallies.iter_mut().zip(PROFILES) {
-            let maps = seen.maps(tools, profile, &texts)?;
-            for (tally, maps) in tallies.iter_mut().zip(&maps) {
-                tally.add(&frame.label, maps);
+        for (tallies, scoring) in tallies.iter_mut().zip(&tools.scorings) {
+            for (tally, way) in tallies.iter_mut().zip(&seen.ways) {
+                let maps = way.maps(scoring, &texts)?;
+                tally.add(&frame.label, &maps);
+                all_maps.push(maps);
             }
-            all_maps.extend(maps);
         }
         if args.pictures.is_some() {
             pictures.push(shown(scene, frame, &seen, &all_maps));

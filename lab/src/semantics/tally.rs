@@ -1,4 +1,4 @@
-//! From what a text selects and what the labels say to IoU and accuracy.
+//! Compares what texts select with labels: IoU and accuracy.
 //!
 //! Three readings of one set of scores. *Threshold*: each text's own mask, over all pixels: what
 //! the product answers. *Closed*: every labelled pixel takes its best text, whatever its score, as
@@ -19,7 +19,7 @@ pub struct TextMap {
     pub mask: Vec<bool>,
 }
 
-/// Pixels in both, selected, and true.
+/// Counts of pixels: selected and labelled, selected, labelled.
 #[derive(Clone, Copy, Debug, Default)]
 struct Overlap {
     both: u64,

@@ -1,5 +1,5 @@
-//! From photos and texts to what each text says of each pixel of the target: by the product's
-//! stages, and by the flat baseline without 3D.
+//! What each text says of each pixel of the target: by the stages of the product, and by the flat
+//! baseline without 3D.
 
 use std::sync::{Arc, atomic::AtomicBool};
 
@@ -15,18 +15,18 @@ use crate::{
         semantics::{SceneParts, SemanticsOptions, understand},
     },
     render::{Kinds, Labels, PixelWeights, RenderRequest, ViewPlanner, cpu::CpuRenderer},
-    scene::{Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, ScoringProfile, Watch},
+    scene::{Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, Watch},
     scenes::{make, scene_of, view_request},
 };
 
-/// What every target is seen with.
+/// What all targets share.
 pub(super) struct Tools<'a> {
     engine: &'a Engine,
     renderer: &'a CpuRenderer,
     towers: Arc<ImageText>,
     understanding: SemanticsOptions,
     /// How each profile scores, as [`PROFILES`].
-    scorings: Vec<Arc<Scoring>>,
+    pub(super) scorings: Vec<Arc<Scoring>>,
 }
 
 /// One target, seen from its inputs.
@@ -36,12 +36,12 @@ pub(super) struct Seen {
     /// Files of the target and its inputs, the nearest first; how semantics and the stages before
     /// went; the mean sum of the weights of a pixel of the target over the bank, 0 to 1.
     pub(super) report: Value,
-    scene: BankView,
-    flat: BankView,
+    /// The view of the scene, and the nearest photo taken for the target.
+    pub(super) ways: [BankView; 2],
 }
 
 /// A bank and the weights of each pixel of the target over it.
-struct BankView {
+pub(super) struct BankView {
     bank: Bank,
     weights: PixelWeights,
 }
@@ -98,8 +98,10 @@ impl<'a> Tools<'a> {
         });
         Ok(Seen {
             color: frame.color.unwrap_or_default(),
-            scene: BankView { bank: meaning.bank, weights },
-            flat: self.flat(&given[0], &photos[target].camera, &cancel)?,
+            ways: [
+                BankView { bank: meaning.bank, weights },
+                self.flat(&given[0], &photos[target].camera, &cancel)?,
+            ],
             report,
         })
     }
@@ -109,26 +111,16 @@ impl<'a> Tools<'a> {
     fn flat(&self, photo: &PosedPhoto, target: &Camera, cancel: &AtomicBool) -> Result<BankView> {
         let network = self.engine.masks()?;
         let settings = masks::settings(network.manifest());
-        let found = masks::photo_masks(
-            &network,
-            std::slice::from_ref(photo),
-            None,
-            &settings,
-            &|_| (),
-            cancel,
-        )?;
+        let photos = std::slice::from_ref(photo);
+        let found = masks::photo_masks(&network, photos, None, &settings, &|_| (), cancel)?;
         let none = PhotoMasks::default();
         let masks = found.first().unwrap_or(&none);
         let cutter = Cutter::new(&photo.photo, masks);
         let manifest = self.towers.manifest();
         let margin = f64::from(manifest.image.crop_margin);
         let cut = |k: usize| cutter.cut(k, margin).unwrap_or(Crop { side: 1, rgb: vec![0; 3] });
-        let mut rows = Vec::new();
-        let all: Vec<usize> = (0..masks.masks.len()).collect();
-        for batch in all.chunks(manifest.image.batch.max(1)) {
-            let crops: Vec<Crop> = batch.iter().map(|k| cut(*k)).collect();
-            rows.extend(self.towers.embed_images(&crops)?);
-        }
+        let crops: Vec<Crop> = (0..masks.masks.len()).map(cut).collect();
+        let rows = self.towers.embed_images(&crops)?;
         let lens = target.intrinsics;
         let mut weights = PixelWeights { offsets: vec![0], ..PixelWeights::default() };
         for y in 0..lens.height {
@@ -146,27 +138,12 @@ impl<'a> Tools<'a> {
     }
 }
 
-impl Seen {
-    /// What each text says of each pixel of the view of the scene, and of the nearest photo taken
-    /// for the target.
-    pub(super) fn maps(
-        &self,
-        tools: &Tools<'_>,
-        profile: ScoringProfile,
-        texts: &[Vec<f32>],
-    ) -> Result<[Vec<TextMap>; 2]> {
-        let at = PROFILES.iter().position(|of| *of == profile).unwrap_or_default();
-        let scoring = &tools.scorings[at];
-        Ok([self.scene.maps(scoring, texts)?, self.flat.maps(scoring, texts)?])
-    }
-}
-
 impl BankView {
     /// The product's masks, and scores by which texts can be compared at a pixel.
     ///
     /// At one pixel all texts share the feature's length, so the smallest `E . B(q - c)` over the
     /// phrases orders them as their relevancies do.
-    fn maps(&self, scoring: &Arc<Scoring>, texts: &[Vec<f32>]) -> Result<Vec<TextMap>> {
+    pub(super) fn maps(&self, scoring: &Arc<Scoring>, texts: &[Vec<f32>]) -> Result<Vec<TextMap>> {
         let scorer = Scorer::new(&self.bank, Arc::clone(scoring))?;
         let of = &self.weights;
         let map = |text: &Vec<f32>| -> Result<TextMap> {

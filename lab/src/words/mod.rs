@@ -29,8 +29,6 @@ use crate::{
 
 /// One image of this many is held out, the last of each run.
 const HELD_OUT_OF: usize = 10;
-/// Crops that are decoded before the tower sees them.
-const BATCH: usize = 64;
 /// Classes of clutter, which are no word.
 const NO_CLASS: &str = "background";
 
@@ -150,48 +148,35 @@ fn stride(count: usize, max: usize) -> usize {
 fn embed(path: &Path, towers: &ImageText, names: &mut Names, images_max: usize) -> Result<Set> {
     let bytes_max = Limits::default().archive_unpacked_bytes_max;
     let margin = f64::from(towers.manifest().image.crop_margin);
-    let (mut rows, mut truth) = (Vec::new(), Vec::new());
-    let mut waiting: Vec<Crop> = Vec::new();
-    let mut add = |crop: Option<Crop>, name: Option<usize>| -> Result<()> {
-        waiting.extend(crop);
-        truth.extend(name);
-        if waiting.len() == BATCH || (name.is_none() && !waiting.is_empty()) {
-            rows.extend(towers.embed_images(&waiting)?);
-            waiting.clear();
-        }
-        Ok(())
-    };
-    let ending = path.extension().unwrap_or_default().to_ascii_lowercase();
-    let (name, own): (_, Vec<usize>) = if ending == "npz" {
+    // Crops with the index of their name.
+    let mut things: Vec<(Crop, usize)> = Vec::new();
+    let npz = path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("npz"));
+    let (name, mut own): (_, Vec<usize>) = if npz {
         let set = npz::Labelled::open(path, bytes_max)?;
         let own: Vec<Option<usize>> = set.names.iter().map(|n| names.add(n)).collect();
-        let is_class = |i: &usize| own[set.labels[*i]].is_some();
-        let held: Vec<usize> = held_out(set.labels.len()).filter(is_class).collect();
-        for &i in held.iter().step_by(stride(held.len(), images_max)) {
-            let Some(class) = own[set.labels[i]] else { continue };
+        let class = |i: usize| Some((i, own[set.labels[i]]?));
+        let held: Vec<(usize, usize)> = held_out(set.labels.len()).filter_map(class).collect();
+        for &(i, class) in held.iter().step_by(stride(held.len(), images_max)) {
             let photo = decode(set.image(i), &format!("{} image {i}", set.set))?;
-            add(Some(square(&photo)), Some(class))?;
+            things.push((square(&photo), class));
         }
         (set.set, own.into_iter().flatten().collect())
     } else {
         let set = segments::Segmented::open(path, bytes_max)?;
         let own = set.class_names().into_iter().filter_map(|class| names.add(class)).collect();
-        let mut things = Vec::new();
+        let mut cut = Vec::new();
         for i in held_out(set.images.len()) {
-            things.extend(set.images[i].cut(margin)?);
+            cut.extend(set.images[i].cut(margin)?);
         }
-        let every = stride(things.len(), images_max);
-        for (crop, class) in things.into_iter().step_by(every) {
-            let Some(class) = names.add(&class) else { continue };
-            add(Some(crop), Some(class))?;
-        }
+        let every = stride(cut.len(), images_max);
+        let named = |(crop, class): (Crop, String)| Some((crop, names.add(&class)?));
+        things.extend(cut.into_iter().step_by(every).filter_map(named));
         (set.set, own)
     };
-    add(None, None)?;
-    let mut own = own;
     own.sort_unstable();
     own.dedup();
-    Ok(Set { name, masked: ending != "npz", own, rows, truth })
+    let (crops, truth): (Vec<Crop>, Vec<usize>) = things.into_iter().unzip();
+    Ok(Set { name, masked: !npz, own, rows: towers.embed_images(&crops)?, truth })
 }
 
 /// Indices that training leaves out, of `count` in a file's order.
