@@ -133,7 +133,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         progress(&format!("{name}: {} photos", chosen.len()));
     }
     for (variant, of_photos) in variants.iter().zip(&measured) {
-        let mut row = means(&of_photos.iter().collect::<Vec<_>>());
+        let mut row = means(of_photos);
         row["variant"] = json!(variant.name);
         row["photos"] = json!(of_photos.len());
         let lost = 1.0 - row["found"].as_f64().unwrap_or(f64::NAN);

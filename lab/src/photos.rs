@@ -63,7 +63,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                 Error::new(e.code(), format!("{name}, target {target}: {e}")).caused_by(e)
             })
         })?;
-        let mut row = means(&judged.iter().map(|(row, _)| row).collect::<Vec<_>>());
+        let mut row = means(judged.iter().map(|(row, _)| row));
         row["scene"] = json!(name);
         row["use"] = json!(use_of(&name));
         row["photos"] = json!(photos);
@@ -82,7 +82,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         let of_use = || scenes.iter().filter(|scene| scene["use"] == of_scenes["use"]);
         let triples: Vec<&Value> =
             of_use().filter_map(|scene| scene["each"].as_array()).flatten().collect();
-        let mut of_triples = means(&triples);
+        let mut of_triples = means(triples.iter().copied());
         of_triples["scene"] = json!("**mean of triples**");
         of_triples["use"] = of_scenes["use"].clone();
         for mut row in [of_scenes, of_triples] {

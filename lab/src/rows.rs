@@ -96,12 +96,13 @@ impl Rows {
 /// Objects of one shape as one object: the mean of each number, also of numbers in objects. What is
 /// no number in each of them is left out.
 #[must_use]
-pub fn means(rows: &[&Value]) -> Value {
+pub fn means<'a>(rows: impl IntoIterator<Item = &'a Value>) -> Value {
+    let rows: Vec<&Value> = rows.into_iter().collect();
     let mut means = Map::new();
     for (key, value) in rows.first().and_then(|first| first.as_object()).into_iter().flatten() {
         let of_key: Vec<&Value> = rows.iter().map(|row| &row[key]).collect();
         if value.is_object() {
-            means.insert(key.clone(), self::means(&of_key));
+            means.insert(key.clone(), self::means(of_key));
         } else if let Some(numbers) = of_key.iter().map(|v| v.as_f64()).collect::<Option<Vec<_>>>()
         {
             means.insert(key.clone(), json!(mean(numbers)));

@@ -32,7 +32,7 @@ pub(crate) fn use_of(scene: &str) -> &'static str {
 pub(crate) fn means_by_use(rows: &[Value]) -> Vec<Value> {
     let of_use = |of: &&str| {
         let rows: Vec<&Value> = rows.iter().filter(|row| row["use"] == **of).collect();
-        let mut row = means(&rows);
+        let mut row = means(rows.iter().copied());
         row["scene"] = json!("**mean of scenes**");
         row["use"] = json!(of);
         (rows.len() > 1).then_some(row)

@@ -41,10 +41,10 @@ fn ssim_of_known_pictures() {
 #[test]
 fn means_are_those_of_numbers_at_any_depth() {
     let [a, b] = [1.0, 3.0].map(|n| json!({ "n": n, "in": { "x": 2.0 * n }, "name": "t" }));
-    assert_eq!(means(&[&a, &b]), json!({ "n": 2.0, "in": { "x": 4.0 } }));
+    assert_eq!(means([&a, &b]), json!({ "n": 2.0, "in": { "x": 4.0 } }));
     let missing = json!({ "n": null });
-    assert_eq!(means(&[&a, &missing]), json!({ "in": {} }), "no number, no mean");
-    assert_eq!(means(&[]), json!({}));
+    assert_eq!(means([&a, &missing]), json!({ "in": {} }), "no number, no mean");
+    assert_eq!(means([]), json!({}));
 }
 
 /// A wall at z = `depth` with a pattern, seen from x = `eye`.

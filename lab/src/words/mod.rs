@@ -127,7 +127,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         })
     };
     let mut measured: Vec<Value> = sets.iter().map(measure).collect();
-    let mut mean = means(&measured.iter().collect::<Vec<_>>());
+    let mut mean = means(&measured);
     mean["set"] = json!("**mean of sets**");
     mean["images"] = json!(sets.iter().map(|set| set.truth.len()).sum::<usize>());
     measured.push(mean);
