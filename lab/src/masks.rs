@@ -221,8 +221,8 @@ fn drive(
     Ok(found.into_iter().zip(rows).collect())
 }
 
-/// The share of `a`'s masks with a partner in `b` of IoU [`ALIKE`] and more, the share of `b`'s with
-/// one in `a`, and the mean IoU of `a`'s masks with their best partner.
+/// The share of `a`'s masks with a partner in `b` of IoU [`ALIKE`] and more, the share of `b`'s
+/// with one in `a`, and the mean IoU of `a`'s masks with their best partner.
 fn compare(a: &PhotoMasks, b: &PhotoMasks) -> [f64; 3] {
     let mut common: BTreeMap<(u16, u16), u32> = BTreeMap::new();
     let (mut of_a, mut of_b) = (BTreeMap::new(), BTreeMap::new());

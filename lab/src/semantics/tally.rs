@@ -126,8 +126,10 @@ impl Tally {
             }))
         };
         let classes: Vec<Value> = (0..self.asked.len()).filter_map(class).collect();
-        let word = |(word, counted): &(String, [u64; 2])| json!({ "word": word, "selected": share(*counted) });
-        let absent_words: Vec<Value> = self.absent.iter().map(word).collect();
+        let absent = self.absent.iter();
+        let absent_words: Vec<Value> = absent
+            .map(|(word, counted)| json!({ "word": word, "selected": share(*counted) }))
+            .collect();
         let over = |all: &[Value], key: &str| mean(all.iter().filter_map(|one| one[key].as_f64()));
         json!({
             "miou": over(&classes, "iou"),

@@ -2,12 +2,12 @@
 //!
 //!     wgpu_peer OUT LAB ADAPTER [GAUSSIANS WIDTH HEIGHT FRAMES ROUNDS]
 //!
-//! LAB is the program segsplat-lab. OUT takes one row a round (wgpu_peer.jsonl). Both are timed by the device's clock from before
-//! the first stage to after the last, and by the wall from the call to the picture in memory. The
-//! viewer draws quads back to front: without the 0.3 px² blur, out to four standard deviations,
-//! colours and opacities of 8 bits; at another extent than √8 its Gaussians are not Gaussians.
-//! Its picture is compared with ours over the same background, drawn into 16-bit floats so that
-//! the target adds little of its own.
+//! LAB is the program segsplat-lab. OUT takes one row a round (wgpu_peer.jsonl). Both are timed by
+//! the device's clock from before the first stage to after the last, and by the wall from the call
+//! to the picture in memory. The viewer draws quads back to front: without the 0.3 px² blur, out to
+//! four standard deviations, colours and opacities of 8 bits; at another extent than √8 its
+//! Gaussians are not Gaussians. Its picture is compared with ours over the same background, drawn
+//! into 16-bit floats so that the target adds little of its own.
 
 use std::{error::Error, fs, io::Write as _, path::Path, process::Command, time::Instant};
 
