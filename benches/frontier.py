@@ -27,7 +27,7 @@ if args.quick:
 runs = [(n, *WIDE, quality, None) for n in counts for quality in ("exact", "fast")]
 runs += [(131_072, *SMALL, quality, None) for quality in ("exact", "fast")]
 runs += [(999_698, *size, quality, None) for size in sizes for quality in ("exact", "fast")]
-runs += [(131_072, *SMALL, "exact", (labels, m)) for labels in ("blend", "entries") for m in banks]
+runs += [(131_072, *SMALL, "exact", (labels, m)) for labels in ("blend", "weights") for m in banks]
 
 with open(args.out, "w") as out:
     for gaussians, width, height, quality, labels in runs:

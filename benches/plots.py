@@ -98,12 +98,13 @@ save(figure, "error-and-time")
 
 figure, axes = plt.subplots(figsize=(5.5, 3.5))
 for renderer in ("gpu", "cpu"):
-    for labels, marker in (("blend", "o-"), ("entries", "s--")):
+    # Older rows call the weights of all entries "entries".
+    for names, marker in ((("blend",), "o-"), (("weights", "entries"), "s--")):
         found = sorted((r["labels"][1], r["report"]["labels"]["labels_ms"],
                         r["report"]["labels"]["color_ms"]) for r in frontier
-                       if r["labels"] and r["labels"][0] == labels and r["renderer"] == renderer)
+                       if r["labels"] and r["labels"][0] in names and r["renderer"] == renderer)
         if found:
-            what = "a text's mask" if labels == "blend" else "all of E"
+            what = "a text's mask" if names == ("blend",) else "all of E"
             where = "one NVIDIA H200" if renderer == "gpu" else "2 CPU threads"
             axes.loglog([m for m, _, _ in found], [ms / color for _, ms, color in found],
                         ("C0" if renderer == "gpu" else "C1") + marker, ms=4,

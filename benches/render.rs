@@ -202,12 +202,12 @@ fn stages(criterion: &mut Criterion) {
             });
         }
     }
-    // Entries are joined from rows of tiles, which the renderer does: whole frames.
+    // Weights are joined from rows of tiles, which the renderer does: whole frames.
     let cpu = CpuRenderer::new(1).expect("a thread");
-    for (name, kinds) in [("entries", Kinds::NONE), ("color_depth_entries", all)] {
+    for (name, kinds) in [("weights", Kinds::NONE), ("color_depth_weights", all)] {
         let request = RenderRequest { kinds, labels: Labels::Weights, ..stages.request };
         criterion.bench_function(&format!("labels/{name}/1_threads"), |b| {
-            b.iter(|| cpu.render(&stages.gaussians, &request).expect("entries"));
+            b.iter(|| cpu.render(&stages.gaussians, &request).expect("weights"));
         });
     }
 }

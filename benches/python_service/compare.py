@@ -1,4 +1,5 @@
-"""Views a second over HTTP: segsplat and the plain Python service, one run, one machine."""
+"""Views a second over HTTP: segsplat and the plain Python service, in turn on one machine, with as
+many threads each. Appends one row for docs/benchmarks.md to the file that --out names."""
 
 import argparse
 import io
@@ -87,6 +88,8 @@ def main():
     parser.add_argument("--seconds", type=float, default=20)
     parser.add_argument("--callers", type=int, default=8)
     parser.add_argument("--size", type=int, default=256)
+    parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--machine", required=True, help="in words")
     parser.add_argument("--out", type=pathlib.Path)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -95,6 +98,7 @@ def main():
         subprocess.run(sample, check=True, stdout=subprocess.DEVNULL)
         ours = subprocess.Popen(
             [args.segsplat, "serve", "--json", "--renderer", "cpu", "--listen", "127.0.0.1:0",
+             "--threads", str(args.threads),
              "--data-dir", folder / "data"], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
         theirs = None
         try:
@@ -120,14 +124,20 @@ def main():
             urls = [f"{base}/v1/scenes/{scene['id']}/view?{q}&background=black" for q in query]
             port = free_port()
             theirs = subprocess.Popen(
-                [sys.executable, HERE / "service.py", ply, "--port", str(port)])
+                [sys.executable, HERE / "service.py", ply, "--port", str(port), "--threads",
+                 str(args.threads)])
             gaussians = json.loads(until_up(f"http://127.0.0.1:{port}/healthz"))["gaussians"]
             plain = [f"http://127.0.0.1:{port}/view?{q}" for q in query]
-            difference = max(
-                np.abs(picture(urls[i]) - picture(plain[i])).mean() for i in (0, 31, 63))
-            result = {"gaussians": gaussians, "size": args.size, "callers": args.callers,
-                      "seconds": args.seconds, "cores": len(os.sched_getaffinity(0)),
-                      "mean_difference_levels": round(float(difference), 3)}
+            apart = [np.abs(picture(urls[i]) - picture(plain[i])) for i in (0, 31, 63)]
+            git = ["git", "rev-parse", "--short", "HEAD"]
+            commit = subprocess.run(git, cwd=ROOT, check=True, capture_output=True, text=True)
+            result = {"table": "python", "command": f"compare.py --callers {args.callers} "
+                      f"--seconds {args.seconds:g} --size {args.size} --threads {args.threads}",
+                      "commit": commit.stdout.strip(), "machine": args.machine,
+                      "error": {"levels_max": float(max(a.max() for a in apart)),
+                                "levels_mean": float(max(a.mean() for a in apart))},
+                      "gaussians": gaussians, "size": args.size, "callers": args.callers,
+                      "threads": args.threads, "seconds": args.seconds}
             for name, all_urls in (("segsplat", urls), ("python", plain)):
                 load(all_urls, args.callers, 2)
                 rate, times = load(all_urls, args.callers, args.seconds)
@@ -136,10 +146,10 @@ def main():
                                 "p99_ms": round(times[int(len(times) * 0.99)], 1)}
             result["ratio"] = round(
                 result["segsplat"]["views_per_s"] / result["python"]["views_per_s"], 1)
-            text = json.dumps(result, indent=2)
-            print(text)
+            print(json.dumps(result, indent=2))
             if args.out:
-                args.out.write_text(text + "\n")
+                with args.out.open("a") as file:
+                    file.write(json.dumps(result) + "\n")
         finally:
             for server in (ours, theirs):
                 if server:

@@ -1,7 +1,11 @@
-"""Views of one scene over HTTP: FastAPI, PyTorch on the CPU, PNG by Pillow."""
+"""Views of one scene over HTTP: FastAPI, PyTorch on the CPU, PNG by Pillow.
+
+All tiles of a view are blended at once, 16 Gaussians of each tile at a time. As many views are
+drawn at once as there are threads, each by one thread."""
 
 import argparse
 import io
+import threading
 
 import numpy as np
 import torch
@@ -11,6 +15,7 @@ from PIL import Image
 
 SH_C0 = 0.28209479177387814
 TILE = 16
+CHUNK = 16
 
 
 def read_ply(path):
@@ -87,32 +92,48 @@ def render(scene, camera_to_world, fx, fy, cx, cy, width, height, near=0.01):
     tile = (top[who] + nth // wide[who]) * across + left[who] + nth % wide[who]
     tile, place = torch.sort(tile, stable=True)
     who = who[place]
-    bounds = torch.searchsorted(tile, torch.arange(across * down + 1)).tolist()
-    image = torch.zeros(down * TILE, across * TILE, 3)
+    bounds = torch.searchsorted(tile, torch.arange(across * down + 1))
     ys, xs = torch.meshgrid(torch.arange(TILE) + 0.5, torch.arange(TILE) + 0.5, indexing="ij")
-    for t in range(across * down):
-        ids = who[bounds[t]:bounds[t + 1]]
-        if not len(ids):
-            continue
-        x0, y0 = t % across * TILE, t // across * TILE
-        dx = (xs + x0).reshape(-1, 1) - u[ids]
-        dy = (ys + y0).reshape(-1, 1) - v[ids]
-        k = conic[ids]
-        power = -0.5 * (k[:, 0] * dx * dx + k[:, 2] * dy * dy) - k[:, 1] * dx * dy
-        alpha = (opacity[ids] * power.exp()).clamp(max=0.999)
-        alpha = torch.where(alpha < 1 / 255, 0.0, alpha)
-        after = (1 - alpha).cumprod(1)
-        before = torch.cat([torch.ones(len(after), 1), after[:, :-1]], 1)
-        weight = torch.where(after > 1e-4, alpha * before, 0.0)
-        image[y0:y0 + TILE, x0:x0 + TILE] = (weight @ colour[ids]).view(TILE, TILE, 3)
-    return image[:height, :width]
+    at = torch.arange(across * down)
+    xs = xs.reshape(1, -1) + (at % across * TILE)[:, None]
+    ys = ys.reshape(1, -1) + (at // across * TILE)[:, None]
+    image = torch.zeros(across * down, TILE * TILE, 3)
+    light = torch.ones(across * down, TILE * TILE)
+    first = 0
+    while True:
+        begin = bounds[:-1] + first
+        open_tiles = ((begin < bounds[1:]) & (light > 1e-4).any(1)).nonzero()[:, 0]
+        if not len(open_tiles):
+            break
+        nth = begin[open_tiles, None] + torch.arange(CHUNK)
+        ids = who[nth.clamp(max=len(who) - 1)]
+        dx = xs[open_tiles, :, None] - u[ids][:, None]
+        dy = ys[open_tiles, :, None] - v[ids][:, None]
+        k = conic[ids][:, None]
+        power = (dx * k[..., 0] * -0.5).sub_(dy * k[..., 1]).mul_(dx)
+        power.add_(dy.mul_(dy).mul_(k[..., 2] * -0.5))
+        strength = torch.where(nth < bounds[1:][open_tiles, None], opacity[ids], 0.0)
+        alpha = power.exp_().mul_(strength[:, None]).clamp_(max=0.999)
+        alpha.masked_fill_(alpha < 1 / 255, 0.0)
+        before = light[open_tiles, :, None]
+        after = (1 - alpha).cumprod_(2).mul_(before)
+        weight = torch.cat([before, after[..., :-1]], 2).mul_(alpha)
+        weight.masked_fill_(after <= 1e-4, 0.0)
+        image[open_tiles] += weight @ colour[ids]
+        light[open_tiles] = after[..., -1]
+        first += CHUNK
+    image = image.view(down, across, TILE, TILE, 3).transpose(1, 2)
+    return image.reshape(down * TILE, across * TILE, 3)[:height, :width]
 
 
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("ply")
     parser.add_argument("--port", type=int, default=8090)
+    parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
+    torch.set_num_threads(1)
+    free = threading.BoundedSemaphore(args.threads)
     scene = read_ply(args.ply)
     app = FastAPI()
 
@@ -120,10 +141,11 @@ def main():
     def view(camera_to_world: str, fx: float, fy: float, cx: float, cy: float,
              width: int, height: int):
         pose = torch.tensor([float(n) for n in camera_to_world.split(",")], dtype=torch.float64)
-        image = render(scene, pose.view(4, 4), fx, fy, cx, cy, width, height)
-        pixels = (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
         file = io.BytesIO()
-        Image.fromarray(pixels).save(file, "PNG")
+        with free:
+            image = render(scene, pose.view(4, 4), fx, fy, cx, cy, width, height)
+            pixels = (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+            Image.fromarray(pixels).save(file, "PNG")
         return Response(file.getvalue(), media_type="image/png")
 
     @app.get("/healthz")

@@ -3,92 +3,61 @@
 //! The middle triple of each scene is made into a scene twice, with all Gaussians and thinned, and
 //! both are drawn from the inputs, from between them and from the photo that was held out.
 
-use std::{sync::atomic::AtomicBool, time::Instant};
+use std::time::Instant;
 
-use serde::Serialize;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::{
     error::Result,
-    folders::{Folders, REPORTED, is_posed, scene_of, squares, view_request},
-    metrics::{psnr, to_unit},
-    photos::clamped,
-    pipeline::{Engine, reconstruct},
+    metrics::{clamped, psnr, to_unit},
+    pipeline::Engine,
     render::{Kinds, ViewPlanner, cpu::CpuRenderer},
     rows::{Rows, median, ms},
     scene::{Camera, CameraToWorld, Density, PosedPhoto, Scene, SceneOptions},
-    setup::Setup,
+    scenes::{is_posed, make, scene_of, squares, use_of, view_request},
+    setup::Inputs,
     triples::{Triple, triples},
 };
 
 /// Times that each view is drawn.
 const RUNS: usize = 5;
 
-/// What to compare.
-#[derive(Clone, Debug, clap::Args)]
-pub struct Args {
-    #[command(flatten)]
-    folders: Folders,
-    /// Photos in: the pair, and the next nearest to the target
-    #[arg(long, default_value_t = 2)]
-    photos: usize,
-    #[command(flatten)]
-    setup: Setup,
-}
-
-/// One scene: `full` with all Gaussians, `thinned` with those left.
-#[derive(Clone, Debug, Serialize)]
-struct Compared {
-    scene: String,
-    reported: bool,
-    full: u64,
-    thinned: u64,
-    fewer: f64,
-    /// Median time of a colour view, ms.
-    full_ms: f64,
-    thinned_ms: f64,
-    /// PSNR to the photo that was held out, dB.
-    full_psnr: f64,
-    thinned_psnr: f64,
-    /// Smallest PSNR of a view of the thinned scene to the same view of the full one, dB.
-    psnr_min: f64,
-    /// Largest difference of any channel of any pixel of those views, of 255.
-    difference_max: f32,
-}
-
-/// Makes a row for each scene.
+/// Makes a row for each scene; its error is the least PSNR between both scenes.
 ///
 /// # Errors
 /// `invalid_request` when there is no scene, else whatever a stage of the pipeline says.
-pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
-    let engine = Engine::open(&args.setup.networks(1))?;
-    let renderer = CpuRenderer::new(args.setup.threads())?;
-    for (name, dir) in args.folders.find(is_posed)? {
+pub(crate) fn run(inputs: &Inputs, rows: &mut Rows) -> Result<()> {
+    let engine = Engine::open(&inputs.setup.networks(1))?;
+    let renderer = CpuRenderer::new(inputs.setup.threads())?;
+    for (name, dir) in inputs.find(is_posed)? {
         let squares = squares(&dir)?;
-        let cameras: Vec<Camera> = squares.iter().map(|p| p.camera).collect();
-        let all = triples(&cameras);
+        let all = triples(&squares);
         let Some(triple) = all.get(all.len() / 2) else { continue };
-        let found = compare(name, &engine, &renderer, &squares, triple, args.photos)?;
-        rows.push(json!({ "psnr_db": found.psnr_min }), &found)?;
+        let mut row = compare(&engine, &renderer, &squares, triple, inputs.photos)?;
+        row["use"] = json!(use_of(&name));
+        row["scene"] = json!(name);
+        rows.push(json!({ "psnr_db": row["psnr_min"] }), row)?;
     }
     Ok(())
 }
 
+/// One triple: `full` with all Gaussians, `thinned` with those left; times are those of a colour
+/// view, PSNR is to the photo that was held out. `psnr_min` is the least of a view of the thinned
+/// scene to the same view of the full one, `difference_max` the largest of any channel, of 255.
 fn compare(
-    scene: String,
     engine: &Engine,
     renderer: &CpuRenderer,
     squares: &[PosedPhoto],
     triple: &Triple,
     photos: usize,
-) -> Result<Compared> {
+) -> Result<Value> {
     let inputs = triple.inputs(squares, photos);
     let given: Vec<PosedPhoto> = inputs.iter().map(|&i| squares[i].clone()).collect();
-    let make = |density| -> Result<Scene> {
+    let scene = |density| -> Result<Scene> {
         let options = SceneOptions { density, ..SceneOptions::default() };
-        reconstruct(engine, &given, &options, &|_, _| (), &AtomicBool::new(false)).map(scene_of)
+        Ok(scene_of(make(engine, &given, &options)?))
     };
-    let scenes = [make(Density::Full)?, make(Density::Thinned)?];
+    let scenes = [scene(Density::Full)?, scene(Density::Thinned)?];
     let target = &squares[triple.target];
     let [a, b] = triple.pair.map(|i| squares[i].camera);
     let between = [0.25, 0.5, 0.75].map(|t| Camera {
@@ -114,20 +83,18 @@ fn compare(
     let (truth, valid) = (to_unit(&target.photo), target.photo.valid.as_deref());
     let pairs = || views[0].iter().zip(&views[1]);
     let differences = pairs().flat_map(|(a, b)| a.iter().flatten().zip(b.iter().flatten()));
-    let [full, thinned] = [0, 1].map(|i| scenes[i].gaussians.len() as u64);
+    let [full, thinned] = [0, 1].map(|i| scenes[i].gaussians.len());
     let [full_ms, thinned_ms] = times.map(median);
     let [full_psnr, thinned_psnr] = [0, 1].map(|i| psnr(&views[i][0], &truth, valid));
-    Ok(Compared {
-        reported: REPORTED.contains(&scene.as_str()),
-        scene,
-        full,
-        thinned,
-        fewer: full as f64 / thinned.max(1) as f64,
-        full_ms,
-        thinned_ms,
-        full_psnr,
-        thinned_psnr,
-        psnr_min: pairs().map(|(a, b)| psnr(b, a, None)).fold(f64::INFINITY, f64::min),
-        difference_max: differences.map(|(a, b)| (a - b).abs() * 255.0).fold(0.0, f32::max),
-    })
+    Ok(json!({
+        "full": full,
+        "thinned": thinned,
+        "fewer": full as f64 / thinned.max(1) as f64,
+        "full_ms": full_ms,
+        "thinned_ms": thinned_ms,
+        "full_psnr": full_psnr,
+        "thinned_psnr": thinned_psnr,
+        "psnr_min": pairs().map(|(a, b)| psnr(b, a, None)).fold(f64::INFINITY, f64::min),
+        "difference_max": differences.map(|(a, b)| (a - b).abs() * 255.0).fold(0.0, f32::max),
+    }))
 }

@@ -4,33 +4,22 @@
 //! Each command prints one JSON row for each thing that it measures, and appends the rows to the
 //! file that `--out` names. A row holds its command, its commit, its machine and its error
 //! ([`rows`]). `report` makes the tables of the page from the rows ([`report`]).
-//!
-//! | command | measures |
-//! |---|---|
-//! | `photos` | views of scenes against photos that were held out ([`photos`]) |
-//! | `density` | what thinning costs and saves ([`density`]) |
-//! | `semantics` | what texts select in views of labelled scenes ([`semantics`]) |
-//! | `masks` | what each shortcut of the mask stage changes ([`masks`]) |
-//! | `words` | whether images find their names ([`words`]) |
-//! | `frames` | frame times of a renderer on a generated scene, with their error ([`frames`]) |
-//! | `skips` | what each kind of skipped work saves ([`frames::skips`]) |
-//! | `stages` | time of each stage from photos to a view ([`stages`]) |
 
-pub mod density;
-pub mod folders;
-pub mod frames;
+mod density;
+mod frames;
 mod grid;
-pub mod masks;
+mod masks;
 pub mod metrics;
 mod npy;
-pub mod photos;
+mod photos;
 pub mod report;
 pub mod rows;
+pub mod scenes;
 pub mod semantics;
-pub mod setup;
-pub mod stages;
-mod triples;
-mod warp;
+mod setup;
+mod stages;
+pub mod triples;
+pub mod warp;
 pub mod words;
 
 use std::process::ExitCode;
@@ -46,7 +35,7 @@ use crate::error::Result;
 /// Measures SegSplat Server.
 #[derive(Debug, Parser)]
 #[command(name = "segsplat-lab", version)]
-struct Cli {
+pub struct Cli {
     #[command(flatten)]
     record: Record,
     #[command(subcommand)]
@@ -58,7 +47,7 @@ enum Command {
     /// Compare views of scenes with photos that were held out
     Photos(photos::Args),
     /// Compare thinned scenes with scenes of all Gaussians
-    Density(density::Args),
+    Density(setup::Inputs),
     /// Compare what texts select with labels
     Semantics(semantics::Args),
     /// Compare the shortcuts of the mask stage
@@ -80,7 +69,7 @@ enum Command {
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
     match run(&cli) {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(_rows) => ExitCode::SUCCESS,
         Err(error) => {
             let mut source = std::error::Error::source(&error);
             rows::progress(&format!("error: {error}"));
@@ -93,17 +82,22 @@ pub fn main() -> ExitCode {
     }
 }
 
-fn run(cli: &Cli) -> Result<()> {
+/// Runs a command; its rows, which it also prints.
+///
+/// # Errors
+/// Those of the command.
+pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
     let mut rows = Rows::open(&cli.record)?;
     match &cli.command {
-        Command::Photos(args) => photos::run(args, &mut rows),
-        Command::Density(args) => density::run(args, &mut rows),
-        Command::Semantics(args) => semantics::run(args, &mut rows).map(drop),
-        Command::Masks(args) => masks::run(args, &mut rows),
-        Command::Words(args) => words::run(args, &mut rows),
-        Command::Frames(args) => frames::run(args, &mut rows),
-        Command::Skips(args) => frames::skips::run(args, &mut rows),
-        Command::Stages(args) => stages::run(args, &mut rows),
-        Command::Report(args) => report::run(args),
+        Command::Photos(args) => photos::run(args, &mut rows)?,
+        Command::Density(args) => density::run(args, &mut rows)?,
+        Command::Semantics(args) => semantics::run(args, &mut rows)?,
+        Command::Masks(args) => masks::run(args, &mut rows)?,
+        Command::Words(args) => words::run(args, &mut rows)?,
+        Command::Frames(args) => frames::run(args, &mut rows)?,
+        Command::Skips(args) => frames::skips::run(args, &mut rows)?,
+        Command::Stages(args) => stages::run(args, &mut rows)?,
+        Command::Report(args) => report::run(args)?,
     }
+    Ok(rows.into_all())
 }

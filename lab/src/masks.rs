@@ -1,10 +1,10 @@
 //! What each shortcut of the mask stage changes.
 //!
 //! The same photos go through the mask stage in several variants: no shortcut first, then each
-//! shortcut alone, then all. A row has the time of a variant, the points asked, and how far its
-//! masks are those of the first variant. `--dump` writes the masks before level choice and the
-//! rule of one mask a pixel, for `tests/tools/official_masks.py` to compare with Segment
-//! Anything's own code.
+//! shortcut alone, then all. A row has the time of a variant, the points asked, and how many of its
+//! masks are masks of the first variant. `--dump` writes the masks before a level is chosen and
+//! before each pixel gets one mask. `tests/tools/official_masks.py` compares them with those of
+//! Segment Anything's own code.
 
 use std::{
     collections::BTreeMap,
@@ -13,21 +13,20 @@ use std::{
     time::Instant,
 };
 
-use serde::Serialize;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    folders::{Folders, is_posed, nearest},
     grid,
     limits::Limits,
     models::MaskNetwork,
     photo_files,
-    pipeline::{Engine, masks as stage, masks::SeenPhoto, reconstruct},
-    rows::{Rows, progress},
-    scene::{Camera, Gaussians, MaskLogits, Photo, PhotoMasks, PosedPhoto, SceneOptions},
+    pipeline::{Engine, masks as stage, masks::SeenPhoto},
+    rows::{Rows, means, progress},
+    scene::{Gaussians, MaskLogits, Photo, PhotoMasks, PosedPhoto, SceneOptions},
+    scenes::{is_posed, make, nearest},
     segment::{self, Bitset, PromptDecoder, Proposals, Seed, Settings},
-    setup::Setup,
+    setup::Inputs,
 };
 
 /// Masks of this much IoU are the same mask.
@@ -35,22 +34,18 @@ const ALIKE: f64 = 0.95;
 /// Places along each side of a photo at which two index maps are compared.
 const PLACES: u32 = 256;
 
-/// What to run.
+/// What to run: neighbouring photos of each scene; seeds need at least 2.
 #[derive(Clone, Debug, clap::Args)]
-pub struct Args {
+#[command(mut_arg("photos", |photos| photos.default_value("3")))]
+pub(crate) struct Args {
     #[command(flatten)]
-    folders: Folders,
-    /// Neighbouring photos of each scene; seeds need at least 2
-    #[arg(long, default_value_t = 3)]
-    photos: usize,
+    inputs: Inputs,
     /// Only the variant without shortcuts and the product's
     #[arg(long)]
     short: bool,
     /// Folder for the photos and their masks before one mask a pixel is left
     #[arg(long, value_name = "DIR")]
     dump: Option<PathBuf>,
-    #[command(flatten)]
-    setup: Setup,
 }
 
 /// A way through the mask stage.
@@ -62,29 +57,6 @@ struct Variant {
     once: bool,
     /// Points in one run of the decoder; `None`: as the bundle says.
     batch: Option<usize>,
-}
-
-/// One variant: sums over photos, then means.
-#[derive(Clone, Debug, Default, Serialize)]
-struct Measured {
-    variant: &'static str,
-    photos: usize,
-    /// Seconds a photo, encoding too.
-    seconds: f64,
-    /// Seconds a photo in the encoder.
-    encode_seconds: f64,
-    /// Points asked of a photo.
-    asked: f64,
-    /// Masks of a photo, one a pixel.
-    masks: f64,
-    /// Share of the first variant's masks with a partner of IoU 0.95 and more here.
-    found: f64,
-    /// Share of the masks here with such a partner in the first variant.
-    found_back: f64,
-    /// IoU of the first variant's masks with their best partner here.
-    iou: f64,
-    /// Share of the photo in some mask.
-    covered: f64,
 }
 
 /// A decoder as a variant wants it, which counts points.
@@ -115,50 +87,57 @@ impl PromptDecoder for Counted<'_> {
     }
 }
 
-/// Makes a row for each variant; its error is how little its masks are those of the first.
+/// Makes a row for each variant; its error is the share of the first variant's masks that it lacks.
+/// A row has means over photos: seconds (also those of the encoder), points asked, masks, the share
+/// of the photo in some mask, and what [`compare`] says.
 ///
 /// # Errors
 /// `invalid_request` when there is no scene or an option is out of range, `model_unavailable` when
 /// the bundle has no mask network, else whatever a stage says.
-pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
-    if args.photos == 0 {
+pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
+    if args.inputs.photos == 0 {
         return Err(Error::invalid("0 photos; it must be at least 1"));
     }
-    let engine = Engine::open(&args.setup.networks(1))?;
+    let engine = Engine::open(&args.inputs.setup.networks(1))?;
     let network = engine.masks()?;
     let variants = variants(&stage::settings(network.manifest()), args.short);
-    let named = |v: &Variant| Measured { variant: v.name, ..Measured::default() };
-    let mut all: Vec<Measured> = variants.iter().map(named).collect();
-    for (name, dir) in args.folders.find(is_posed)? {
+    let mut measured: Vec<Vec<Value>> = vec![Vec::new(); variants.len()];
+    for (name, dir) in args.inputs.find(is_posed)? {
         let photos = photo_files::read_dir(&dir, &Limits::default())?;
-        let cameras: Vec<Camera> = photos.iter().map(|p| p.camera).collect();
         let middle = photos.len() / 2;
-        let beside = nearest(&cameras, middle, args.photos - 1);
+        let beside = nearest(&photos, middle, args.inputs.photos - 1);
         let chosen: Vec<PosedPhoto> =
             [middle].into_iter().chain(beside).map(|i| photos[i].clone()).collect();
         let gaussians = gaussians(&engine, &chosen)?;
         let mut first: Vec<PhotoMasks> = Vec::new();
-        for (variant, measured) in variants.iter().zip(&mut all) {
+        for (variant, of_variant) in variants.iter().zip(&mut measured) {
             let found = engine
                 .workers()
-                .install(|| drive(&network, &chosen, gaussians.as_ref(), variant, measured))?;
+                .install(|| drive(&network, &chosen, gaussians.as_ref(), variant))?;
             if first.is_empty() {
-                first = found.clone();
+                first = found.iter().map(|(masks, _)| masks.clone()).collect();
             }
-            first.iter().zip(&found).for_each(|(a, b)| compare(a, b, measured));
+            for (first, (masks, mut row)) in first.iter().zip(found) {
+                let [found, found_back, iou] = compare(first, &masks);
+                row["found"] = json!(found);
+                row["found_back"] = json!(found_back);
+                row["iou"] = json!(iou);
+                of_variant.push(row);
+            }
         }
         if let Some(out) = &args.dump {
             for (i, posed) in chosen.iter().enumerate() {
                 dump(&network, posed, &variants, &out.join(format!("{name}_{i}")))?;
             }
         }
-        all.iter_mut().for_each(|measured| measured.photos += chosen.len());
         progress(&format!("{name}: {} photos", chosen.len()));
     }
-    for mut measured in all {
-        measured.finish();
-        let error = json!({ "masks_lost": 1.0 - measured.found, "iou": measured.iou });
-        rows.push(error, &measured)?;
+    for (variant, of_photos) in variants.iter().zip(&measured) {
+        let mut row = means(of_photos);
+        row["variant"] = json!(variant.name);
+        row["photos"] = json!(of_photos.len());
+        let lost = 1.0 - row["found"].as_f64().unwrap_or(f64::NAN);
+        rows.push(json!({ "masks_lost": lost, "iou": row["iou"] }), row)?;
     }
     Ok(())
 }
@@ -195,24 +174,22 @@ fn gaussians(engine: &Engine, photos: &[PosedPhoto]) -> Result<Option<Gaussians>
     if photos.len() < 2 {
         return Ok(None);
     }
-    let never = AtomicBool::new(false);
-    match reconstruct(engine, photos, &SceneOptions::default(), &|_, _| (), &never) {
-        Ok(made) => Ok(Some(made.gaussians)),
+    match make(engine, photos, &SceneOptions::default()) {
+        Ok(scene) => Ok(Some(scene.gaussians)),
         Err(e) if e.code() == ErrorCode::InvalidRequest => Ok(None),
         Err(e) => Err(e),
     }
 }
 
-/// All photos of one scene in one variant; adds its times and counts.
+/// All photos of one scene in one variant: the masks of each, with times and counts.
 fn drive(
     network: &MaskNetwork,
     photos: &[PosedPhoto],
     gaussians: Option<&Gaussians>,
     variant: &Variant,
-    measured: &mut Measured,
-) -> Result<Vec<PhotoMasks>> {
+) -> Result<Vec<(PhotoMasks, Value)>> {
     let never = AtomicBool::new(false);
-    let mut found: Vec<PhotoMasks> = Vec::new();
+    let (mut found, mut rows) = (Vec::new(), Vec::new());
     for (at, posed) in photos.iter().enumerate() {
         let start = Instant::now();
         let seeds: Vec<Seed> = match gaussians {
@@ -230,19 +207,23 @@ fn drive(
             batch: variant.batch,
             asked: 0.into(),
         };
-        measured.encode_seconds += (start.elapsed() - begun).as_secs_f64();
+        let encode_seconds = (start.elapsed() - begun).as_secs_f64();
         let masks = segment::everything(&counted, &posed.photo, &variant.settings, &seeds, &never)?;
-        measured.seconds += start.elapsed().as_secs_f64();
-        measured.asked += counted.asked.into_inner() as f64;
-        measured.masks += masks.masks.len() as f64;
-        measured.covered += masks.masks.iter().map(|mask| mask.area).sum::<f64>();
+        rows.push(json!({
+            "seconds": start.elapsed().as_secs_f64(),
+            "encode_seconds": encode_seconds,
+            "asked": counted.asked.into_inner(),
+            "masks": masks.masks.len(),
+            "covered": masks.masks.iter().map(|mask| mask.area).sum::<f64>(),
+        }));
         found.push(masks);
     }
-    Ok(found)
+    Ok(found.into_iter().zip(rows).collect())
 }
 
-/// How many of `a`'s masks are masks of `b`, and the other way round: means of this photo.
-fn compare(a: &PhotoMasks, b: &PhotoMasks, measured: &mut Measured) {
+/// The share of `a`'s masks with a partner in `b` of IoU [`ALIKE`] and more, the share of `b`'s
+/// with one in `a`, and the mean IoU of `a`'s masks with their best partner.
+fn compare(a: &PhotoMasks, b: &PhotoMasks) -> [f64; 3] {
     let mut common: BTreeMap<(u16, u16), u32> = BTreeMap::new();
     let (mut of_a, mut of_b) = (BTreeMap::new(), BTreeMap::new());
     for at in 0..PLACES * PLACES {
@@ -267,29 +248,9 @@ fn compare(a: &PhotoMasks, b: &PhotoMasks, measured: &mut Measured) {
         0 => 1.0,
         n => best.values().filter(|iou| **iou >= ALIKE).count() as f64 / n as f64,
     };
-    measured.found += alike(&best_a, a.masks.len());
-    measured.found_back += alike(&best_b, b.masks.len());
     let total: f64 = best_a.values().sum();
-    measured.iou += if a.masks.is_empty() { 1.0 } else { total / a.masks.len() as f64 };
-}
-
-/// The masks of one setting, as the comparison reads them.
-#[derive(Serialize)]
-struct Dumped {
-    width: usize,
-    height: usize,
-    asked: usize,
-    masks: Vec<DumpedMask>,
-}
-
-#[derive(Serialize)]
-struct DumpedMask {
-    predicted_iou: f32,
-    stability: f32,
-    point: [f32; 2],
-    level: usize,
-    /// Column-major runs, the first of them outside.
-    counts: Vec<u32>,
+    let iou = if a.masks.is_empty() { 1.0 } else { total / a.masks.len() as f64 };
+    [alike(&best_a, a.masks.len()), alike(&best_b, b.masks.len()), iou]
 }
 
 /// Writes the photo and its proposals: all that is computed, coarsely judged, and coarsely judged
@@ -301,33 +262,37 @@ fn dump(network: &MaskNetwork, posed: &PosedPhoto, variants: &[Variant], to: &Pa
     // The other code is not told which pixels undistortion left without a source.
     let photo = &Photo { valid: None, ..posed.photo.clone() };
     let never = AtomicBool::new(false);
-    let mut found = BTreeMap::new();
+    let mut found = serde_json::Map::new();
     for (name, settings) in [("exact", exact), ("coarse", coarse), ("covered", covered)] {
         let seen = SeenPhoto::new(network, photo)?;
         let proposals = segment::proposals(&seen, photo, &settings, &[], &never)?;
-        found.insert(name, dumped(&proposals));
+        found.insert(name.to_owned(), dumped(&proposals));
     }
     let written = |e: std::io::Error| Error::invalid(format!("the dump: {e}"));
     if let Some(folder) = to.parent() {
         fs_err::create_dir_all(folder).map_err(written)?;
     }
-    let text = serde_json::to_string(&found).map_err(|e| Error::internal("dump").caused_by(e))?;
+    let text = Value::Object(found).to_string();
     fs_err::write(to.with_extension("json"), text).map_err(written)?;
     grid::photo(photo)
         .save(to.with_extension("png"))
         .map_err(|e| Error::invalid(format!("the dump: {e}")))
 }
 
-fn dumped(proposals: &Proposals) -> Dumped {
+/// The masks of one setting; `counts` are column-major runs, the first of them outside.
+fn dumped(proposals: &Proposals) -> Value {
     let (width, height) = (proposals.width, proposals.height);
-    let masks = proposals.masks.iter().map(|mask| DumpedMask {
-        predicted_iou: mask.predicted_iou,
-        stability: mask.stability,
-        point: mask.point,
-        level: mask.level,
-        counts: runs(&mask.mask, width, height),
+    let masks = proposals.masks.iter().map(|mask| {
+        json!({
+            "predicted_iou": mask.predicted_iou,
+            "stability": mask.stability,
+            "point": mask.point,
+            "level": mask.level,
+            "counts": runs(&mask.mask, width, height),
+        })
     });
-    Dumped { width, height, asked: proposals.asked, masks: masks.collect() }
+    let masks: Vec<Value> = masks.collect();
+    json!({ "width": width, "height": height, "asked": proposals.asked, "masks": masks })
 }
 
 /// Column-major runs of a mask, outside first.
@@ -341,25 +306,6 @@ fn runs(mask: &Bitset, width: usize, height: usize) -> Vec<u32> {
         counts.last_mut().into_iter().for_each(|run| *run += 1);
     }
     counts
-}
-
-impl Measured {
-    /// Turns sums over photos into means.
-    fn finish(&mut self) {
-        let photos = self.photos.max(1) as f64;
-        for sum in [
-            &mut self.seconds,
-            &mut self.encode_seconds,
-            &mut self.asked,
-            &mut self.masks,
-            &mut self.found,
-            &mut self.found_back,
-            &mut self.iou,
-            &mut self.covered,
-        ] {
-            *sum /= photos;
-        }
-    }
 }
 
 #[cfg(test)]
@@ -378,11 +324,11 @@ mod tests {
     fn masks_find_their_partners_whatever_their_numbers() {
         let a = masks([1, 1, 2, 2, 1, 1, 2, 2, 0, 0, 0, 0, 3, 0, 0, 0], 3);
         let b = masks([2, 2, 1, 1, 2, 2, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0], 2);
-        let mut measured = Measured::default();
-        compare(&a, &b, &mut measured);
-        assert!((measured.found - 1.0 / 3.0).abs() < 1e-9, "one of three: {measured:?}");
-        assert!((measured.found_back - 0.5).abs() < 1e-9, "one of two: {measured:?}");
-        assert!((measured.iou - (1.0 + 0.75 + 0.0) / 3.0).abs() < 1e-9, "mean: {measured:?}");
+        let found = compare(&a, &b);
+        // One of three, one of two, and the mean of 1, 0.75 and 0.
+        for (found, want) in found.into_iter().zip([1.0 / 3.0, 0.5, 1.75 / 3.0]) {
+            assert!((found - want).abs() < 1e-9, "{found} is not {want}");
+        }
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! SSIM on RGB in 0..1.
+//! PSNR and SSIM on RGB in 0..1.
 
 pub use crate::render::compare::psnr;
 use crate::scene::Photo;
@@ -12,8 +12,16 @@ const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
 
 /// Pixels of a photo as RGB in 0..1.
-pub(crate) fn to_unit(photo: &Photo) -> Vec<[f32; 3]> {
+#[must_use]
+pub fn to_unit(photo: &Photo) -> Vec<[f32; 3]> {
     photo.rgb.chunks_exact(3).map(|c| [c[0], c[1], c[2]].map(|v| f32::from(v) / 255.0)).collect()
+}
+
+/// Colours as a picture of 8 bits holds them: within 0 and 1.
+pub(crate) fn clamped(color: Option<Vec<[f32; 3]>>) -> Vec<[f32; 3]> {
+    let mut color = color.unwrap_or_default();
+    color.iter_mut().flatten().for_each(|v| *v = v.clamp(0.0, 1.0));
+    color
 }
 
 /// Structural similarity: 11x11 Gaussian window of sigma 1.5 inside the picture, mean over windows
@@ -77,37 +85,4 @@ fn blurred(values: &[f64], width: usize, window: &[f64; WINDOW]) -> Vec<f64> {
         }
     }
     out
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::render::compare::PSNR_MAX;
-
-    fn picture(f: impl Fn(usize, usize) -> f32) -> Vec<[f32; 3]> {
-        (0..32).flat_map(|y| (0..32).map(move |x| (x, y))).map(|(x, y)| [f(x, y); 3]).collect()
-    }
-
-    #[test]
-    fn psnr_of_a_known_error() {
-        let (a, b) = (picture(|_, _| 0.5), picture(|_, _| 0.6));
-        assert!((psnr(&a, &b, None) - 20.0).abs() < 1e-4, "0.1 off is 20 dB");
-        assert_eq!(psnr(&a, &a, None), PSNR_MAX, "equal");
-        let mut one = a.clone();
-        one[7] = [1.0; 3];
-        let valid: Vec<bool> = (0..one.len()).map(|i| i != 7).collect();
-        assert_eq!(psnr(&one, &a, Some(&valid)), PSNR_MAX, "masked");
-    }
-
-    #[test]
-    fn ssim_of_known_pictures() {
-        let texture = picture(|x, y| ((x * 7 + y * 13) % 10) as f32 / 10.0);
-        assert!((ssim(&texture, &texture, 32, None) - 1.0).abs() < 1e-9, "equal");
-        // Flat pictures: only the luminance term is left.
-        let (a, b) = (picture(|_, _| 0.5), picture(|_, _| 0.7));
-        let wanted = (2.0 * 0.35 + C1) / (0.25 + 0.49 + C1);
-        assert!((ssim(&a, &b, 32, None) - wanted).abs() < 1e-6, "luminance");
-        let inverse: Vec<[f32; 3]> = texture.iter().map(|c| c.map(|v| 0.9 - v)).collect();
-        assert!(ssim(&inverse, &texture, 32, None) < 0.0, "opposite structure");
-    }
 }

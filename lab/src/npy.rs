@@ -38,17 +38,17 @@ impl Array {
 
     /// Whole numbers that are not negative.
     pub(crate) fn counts(&self) -> Option<Vec<usize>> {
-        let count = |value: i64| usize::try_from(value).ok();
         match self.kind.as_str() {
-            "<i4" => self.each(|c| count(i32::from_le_bytes(c).into())),
-            "<i8" => self.each(|c| count(i64::from_le_bytes(c))),
+            "<i4" => self.each(|c| i32::from_le_bytes(c).try_into().ok()),
+            "<i8" => self.each(|c| i64::from_le_bytes(c).try_into().ok()),
             _ => None,
         }
     }
 
     /// Numbers of f64.
     pub(crate) fn numbers(&self) -> Option<Vec<f64>> {
-        (self.kind == "<f8").then(|| self.each(|c| Some(f64::from_le_bytes(c)))).flatten()
+        let wanted = self.kind == "<f8";
+        self.each(|c| wanted.then_some(f64::from_le_bytes(c)))
     }
 
     /// Texts of fixed length in UTF-32, filled up with zeros.
@@ -62,11 +62,4 @@ impl Array {
     fn each<const N: usize, T>(&self, of: impl Fn([u8; N]) -> Option<T>) -> Option<Vec<T>> {
         self.data.chunks_exact(N).map(|c| of(c.try_into().ok()?)).collect()
     }
-}
-
-#[cfg(test)]
-pub(crate) fn npy(kind: &str, shape: &str, data: &[u8]) -> Vec<u8> {
-    let header = format!("{{'descr': '{kind}', 'fortran_order': False, 'shape': ({shape}), }}\n");
-    let length = u16::try_from(header.len()).unwrap().to_le_bytes();
-    [b"\x93NUMPY\x01\x00", length.as_slice(), header.as_bytes(), data].concat()
 }

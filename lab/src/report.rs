@@ -19,7 +19,7 @@ use crate::error::{Error, Result};
 
 /// What to write.
 #[derive(Clone, Debug, clap::Args)]
-pub struct Args {
+pub(crate) struct Args {
     /// The repository's folder
     #[arg(long, default_value = ".")]
     root: PathBuf,
@@ -52,9 +52,9 @@ struct Table {
 /// Writes the page, or checks it.
 ///
 /// # Errors
-/// `invalid_request` where a file is missing or no such file, where a row has no command, commit,
-/// machine or error, and with `check` where the page differs.
-pub fn run(args: &Args) -> Result<()> {
+/// `invalid_request` where a file cannot be read, where a row has no command, commit, machine or
+/// error, and with `check` where the page differs.
+pub(crate) fn run(args: &Args) -> Result<()> {
     let path = args.root.join("docs/benchmarks.md");
     let old = read(&path)?;
     let new = page(&args.root, &old)?;
@@ -217,44 +217,4 @@ fn cell(value: &Value, format: &str) -> Option<String> {
         "%" => format!("{:.1} %", 100.0 * number),
         digits => format!("{number:.*}", digits.trim_start_matches('.').parse().ok()?),
     })
-}
-
-#[cfg(test)]
-mod tests {
-    use serde_json::json;
-
-    use super::*;
-
-    #[test]
-    fn templates_take_values_as_they_say() {
-        let row = json!({ "n": 1_234_567, "a": { "b": [0.5, 2.0e-4] }, "s": "x", "none": null });
-        let filled = fill("{s}: {n:,}, {n}, {a.b.0:%}, {a.b.1:e}, {a.b.0:.2} ms", &row);
-        assert_eq!(filled, "x: 1,234,567, 1234567, 50.0 %, 2.0e-4, 0.50 ms");
-        assert_eq!(fill("{none} ms", &row) + &fill("{a.c:.1} ms", &row), "", "no value, no cell");
-    }
-
-    #[test]
-    fn rows_of_one_key_are_one_line() {
-        let table = Table {
-            name: "t".to_owned(),
-            rows: None,
-            columns: vec![
-                ["scene".to_owned(), "{key}".to_owned()],
-                ["2".to_owned(), "{2.db:.1}".to_owned()],
-                ["4".to_owned(), "{4.db:.1}".to_owned()],
-            ],
-            key: Some("{scene}".to_owned()),
-            pivot: Some("{photos}".to_owned()),
-        };
-        let row = |scene, photos, db| {
-            let (commit, machine) = ("c", "m");
-            json!({
-                "scene": scene, "photos": photos, "db": db, "commit": commit, "machine": machine
-            })
-        };
-        let text = table.write(&[row("a", 2, 1.0), row("b", 2, 2.0), row("a", 4, 3.0)]);
-        let wanted = "| scene | 2 | 4 |\n| --- | --- | --- |\n| a | 1.0 | 3.0 |\n\
-                      | b | 2.0 |  |\n\nCommit c; m.\n";
-        assert_eq!(text, wanted);
-    }
 }

@@ -8,14 +8,13 @@ use std::{
     time::{Instant, SystemTime, UNIX_EPOCH},
 };
 
-use serde::Serialize;
-use serde_json::Value;
+use serde_json::{Map, Value, json};
 
 use crate::error::{Error, Result};
 
 /// What is written into every row beside the measurement.
-#[derive(Clone, Debug, Default, clap::Args)]
-pub struct Record {
+#[derive(Clone, Debug, clap::Args)]
+pub(crate) struct Record {
     /// File to append the rows to (JSON lines)
     #[arg(long, global = true, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -33,27 +32,13 @@ pub struct Record {
 /// Options of [`Record`], which are no part of the command that a row names.
 const OWN_OPTIONS: [&str; 4] = ["--out", "--table", "--commit", "--machine"];
 
-/// Writes rows.
-#[derive(Debug, Default)]
-pub struct Rows {
-    table: String,
-    command: String,
-    commit: String,
-    machine: String,
+/// Writes rows, and keeps them.
+#[derive(Debug)]
+pub(crate) struct Rows {
+    /// Table, command, commit and machine.
+    source: Map<String, Value>,
     file: Option<fs_err::File>,
-}
-
-/// One line of a file of rows.
-#[derive(Serialize)]
-struct Row<'a, T> {
-    table: &'a str,
-    command: &'a str,
-    commit: &'a str,
-    machine: &'a str,
-    unix_s: u64,
-    error: Value,
-    #[serde(flatten)]
-    values: &'a T,
+    rows: Vec<Value>,
 }
 
 impl Rows {
@@ -61,48 +46,69 @@ impl Rows {
     ///
     /// # Errors
     /// `invalid_request` where the file cannot be opened.
-    pub fn open(record: &Record) -> Result<Self> {
-        let file = match &record.out {
-            Some(path) => {
-                let opened = fs_err::OpenOptions::new().create(true).append(true).open(path);
-                Some(opened.map_err(|e| Error::invalid("--out: cannot be opened").caused_by(e))?)
-            }
-            None => None,
-        };
+    pub(crate) fn open(record: &Record) -> Result<Self> {
+        let open = |path| fs_err::OpenOptions::new().create(true).append(true).open(path);
+        let file = record.out.as_ref().map(open).transpose();
+        let text = |text: String| Value::String(text);
+        let source = [
+            ("table", text(record.table.clone())),
+            ("command", text(command(std::env::args().skip(1)))),
+            ("commit", text(record.commit.clone().unwrap_or_else(commit))),
+            ("machine", text(record.machine.clone().unwrap_or_else(machine))),
+        ];
         Ok(Self {
-            table: record.table.clone(),
-            command: command(std::env::args().skip(1)),
-            commit: record.commit.clone().unwrap_or_else(commit),
-            machine: record.machine.clone().unwrap_or_else(machine),
-            file,
+            source: source.into_iter().map(|(key, value)| (key.to_owned(), value)).collect(),
+            file: file.map_err(|e| Error::invalid("--out: cannot be opened").caused_by(e))?,
+            rows: Vec::new(),
         })
     }
 
-    /// Writes a row of `values` whose error is `error`: a number of dB, a difference, a share.
+    /// Writes a row of the object `values` whose error is `error`: a number of dB, a difference, a
+    /// share.
     ///
     /// # Errors
-    /// `internal` where the values are no JSON object or the file cannot be written.
+    /// `internal` where the file cannot be written.
     #[expect(clippy::print_stdout, reason = "the rows are the answer of the program")]
-    pub fn push(&mut self, error: impl Serialize, values: &impl Serialize) -> Result<()> {
-        let fault = |e: serde_json::Error| Error::internal("a row is no JSON").caused_by(e);
-        let since = SystemTime::now().duration_since(UNIX_EPOCH);
-        let row = Row {
-            table: &self.table,
-            command: &self.command,
-            commit: &self.commit,
-            machine: &self.machine,
-            unix_s: since.map_or(0, |since| since.as_secs()),
-            error: serde_json::to_value(error).map_err(fault)?,
-            values,
-        };
-        let line = serde_json::to_string(&row).map_err(fault)?;
-        println!("{line}");
+    pub(crate) fn push(&mut self, error: Value, values: Value) -> Result<()> {
+        let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let mut row = self.source.clone();
+        row.insert("unix_s".to_owned(), since.as_secs().into());
+        row.insert("error".to_owned(), error);
+        if let Value::Object(values) = values {
+            row.extend(values);
+        }
+        let row = Value::Object(row);
+        println!("{row}");
         if let Some(file) = &mut self.file {
-            writeln!(file, "{line}")
+            writeln!(file, "{row}")
                 .map_err(|e| Error::internal("--out: cannot be written").caused_by(e))?;
         }
+        self.rows.push(row);
         Ok(())
     }
+
+    /// All rows.
+    pub(crate) fn into_all(self) -> Vec<Value> {
+        self.rows
+    }
+}
+
+/// Objects of one shape as one object: the mean of each number, also of numbers in objects. What is
+/// no number in each of them is left out.
+#[must_use]
+pub fn means<'a>(rows: impl IntoIterator<Item = &'a Value>) -> Value {
+    let rows: Vec<&Value> = rows.into_iter().collect();
+    let mut means = Map::new();
+    for (key, value) in rows.first().and_then(|first| first.as_object()).into_iter().flatten() {
+        let of_key: Vec<&Value> = rows.iter().map(|row| &row[key]).collect();
+        if value.is_object() {
+            means.insert(key.clone(), self::means(of_key));
+        } else if let Some(numbers) = of_key.iter().map(|v| v.as_f64()).collect::<Option<Vec<_>>>()
+        {
+            means.insert(key.clone(), json!(mean(numbers)));
+        }
+    }
+    Value::Object(means)
 }
 
 /// Says where the work is.
@@ -128,6 +134,31 @@ pub(crate) fn mean(values: impl IntoIterator<Item = f64>) -> f64 {
     sum / count
 }
 
+/// `work` of 0 to `count`, `at_once` at a time, in order.
+///
+/// Threads of its own: a rayon worker that waits for another pool takes the next item, and then the
+/// time of one item would hold that of another.
+pub(crate) fn each<T: Send>(
+    count: usize,
+    at_once: usize,
+    work: impl Fn(usize) -> Result<T> + Sync,
+) -> Result<Vec<T>> {
+    let share = |first: usize| -> Result<Vec<(usize, T)>> {
+        (first..count).step_by(at_once).map(|i| Ok((i, work(i)?))).collect()
+    };
+    let mut found = std::thread::scope(|scope| -> Result<Vec<(usize, T)>> {
+        let share = &share;
+        let threads: Vec<_> = (0..at_once).map(|first| scope.spawn(move || share(first))).collect();
+        let mut found = Vec::new();
+        for thread in threads {
+            found.extend(thread.join().map_err(|_| Error::internal("a thread panicked"))??);
+        }
+        Ok(found)
+    })?;
+    found.sort_by_key(|(i, _)| *i);
+    Ok(found.into_iter().map(|(_, one)| one).collect())
+}
+
 /// The command line without [`OWN_OPTIONS`].
 fn command(arguments: impl Iterator<Item = String>) -> String {
     let (mut words, mut skip) = (vec!["segsplat-lab".to_owned()], false);
@@ -144,10 +175,8 @@ fn command(arguments: impl Iterator<Item = String>) -> String {
 fn commit() -> String {
     let git = |arguments: &[&str]| -> String {
         let done = Command::new("git").args(arguments).output();
-        done.map_or_else(
-            |_| String::new(),
-            |done| String::from_utf8_lossy(&done.stdout).trim().into(),
-        )
+        let text = done.map(|done| String::from_utf8_lossy(&done.stdout).trim().to_owned());
+        text.unwrap_or_default()
     };
     let changed = git(&["status", "--porcelain", "--untracked-files=no"]);
     let mark = if changed.is_empty() { "" } else { " with changes" };

@@ -1,11 +1,14 @@
-//! Networks and renderers, opened from the command line.
+//! What the command line says of scenes, networks and renderers.
 
-use std::{path::PathBuf, sync::Arc};
+use std::{
+    path::{Path, PathBuf},
+    sync::Arc,
+};
 
-use serde::Deserialize;
+use segsplat_core::names::named;
 
 use crate::{
-    error::Result,
+    error::{Error, Result},
     limits::Limits,
     models::NetworkOptions,
     render::{
@@ -15,49 +18,78 @@ use crate::{
     },
 };
 
+/// Scene folders, how many photos of them are put in, and what runs the networks.
+#[derive(Clone, Debug, clap::Args)]
+pub(crate) struct Inputs {
+    /// A scene folder, or a folder of scene folders
+    dir: PathBuf,
+    /// Only these scenes, by name, separated by commas [default: all]
+    #[arg(long, value_delimiter = ',')]
+    scenes: Vec<String>,
+    /// Photos put in: those nearest to the target
+    #[arg(long, default_value_t = 2)]
+    pub(crate) photos: usize,
+    #[command(flatten)]
+    pub(crate) setup: Setup,
+}
+
 /// What runs the measured code.
 #[derive(Clone, Debug, clap::Args)]
-pub struct Setup {
+pub(crate) struct Setup {
     /// Folder of the model bundle [default: as the server finds it]
     #[arg(long, env = "SEGSPLAT_BUNDLE")]
-    pub bundle: Option<PathBuf>,
+    bundle: Option<PathBuf>,
     /// ONNX Runtime library [default: as the server finds it]
     #[arg(long, env = "SEGSPLAT_ORT_LIBRARY")]
-    pub ort_library: Option<PathBuf>,
+    ort_library: Option<PathBuf>,
     /// Threads of the networks and of the CPU renderer [default: all cores]
     #[arg(long)]
-    pub threads: Option<usize>,
+    threads: Option<usize>,
     /// Renderer: auto, cpu or gpu
     #[arg(long, default_value = "cpu", value_parser = named::<RendererChoice>)]
-    pub renderer: RendererChoice,
+    renderer: RendererChoice,
     /// Part of the name of the GPU adapter
     #[arg(long)]
-    pub adapter: Option<String>,
+    adapter: Option<String>,
 }
 
-/// A value by the name that serde knows it by.
-pub(crate) fn named<T: for<'a> Deserialize<'a>>(name: &str) -> Result<T, String> {
-    T::deserialize(serde::de::value::StrDeserializer::<serde::de::value::Error>::new(name))
-        .map_err(|e| e.to_string())
-}
-
-impl Default for Setup {
-    fn default() -> Self {
-        let renderer = RendererChoice::Cpu;
-        Self { bundle: None, ort_library: None, threads: None, renderer, adapter: None }
+impl Inputs {
+    /// The folders for which `is_scene`, sorted by name: `dir` itself, or those in it. Each with
+    /// its name.
+    ///
+    /// # Errors
+    /// `invalid_request` where there is none, or none of a name that was asked for.
+    pub(crate) fn find(&self, is_scene: impl Fn(&Path) -> bool) -> Result<Vec<(String, PathBuf)>> {
+        let mut paths = vec![self.dir.clone()];
+        if !is_scene(&self.dir) {
+            let fault = |e: std::io::Error| Error::invalid(format!("the folder: {}", e.kind()));
+            let listed = fs_err::read_dir(&self.dir).map_err(fault)?;
+            paths = listed.flatten().map(|entry| entry.path()).filter(|p| is_scene(p)).collect();
+        }
+        let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into();
+        let mut found: Vec<(String, PathBuf)> =
+            paths.into_iter().map(|path| (name(&path), path)).collect();
+        let unknown = |wanted: &&String| !found.iter().any(|(name, _)| name == *wanted);
+        if let Some(wanted) = self.scenes.iter().find(unknown) {
+            return Err(Error::invalid(format!("no scene folder is called {wanted:?}")));
+        }
+        found.retain(|(name, _)| self.scenes.is_empty() || self.scenes.contains(name));
+        found.sort();
+        if found.is_empty() {
+            return Err(Error::invalid("there is no scene folder"));
+        }
+        Ok(found)
     }
 }
 
 impl Setup {
     /// Threads in use.
-    #[must_use]
-    pub fn threads(&self) -> usize {
+    pub(crate) fn threads(&self) -> usize {
         self.threads.unwrap_or_else(|| NetworkOptions::default().threads)
     }
 
     /// What opening the networks needs, for `jobs` scenes at a time.
-    #[must_use]
-    pub fn networks(&self, jobs: usize) -> NetworkOptions {
+    pub(crate) fn networks(&self, jobs: usize) -> NetworkOptions {
         NetworkOptions {
             bundle: self.bundle.clone(),
             ort_library: self.ort_library.clone(),
@@ -68,10 +100,10 @@ impl Setup {
     }
 
     /// The renderer, and the adapters that there are.
-    ///
-    /// # Errors
-    /// Those of [`select_with`].
-    pub fn renderer(&self, options: GpuOptions) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
+    pub(crate) fn renderer(
+        &self,
+        options: GpuOptions,
+    ) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
         let limits = Limits::default();
         let wanted = RendererOptions {
             renderer: self.renderer,

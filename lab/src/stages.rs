@@ -1,27 +1,26 @@
 //! Time of each stage from photos to a view, on generated photos.
 
-use std::{collections::BTreeMap, sync::atomic::AtomicBool, time::Instant};
+use std::{collections::BTreeMap, time::Instant};
 
 use serde_json::json;
 
 use crate::{
     error::{Error, Result},
-    folders::view_request,
     limits::Limits,
-    metrics::{psnr, to_unit},
+    metrics::{clamped, psnr, to_unit},
     photo_files,
-    photos::clamped,
-    pipeline::{Engine, reconstruct},
+    pipeline::Engine,
     render::{Kinds, gpu::GpuOptions},
     rows::{Rows, median, ms},
     sample::{self, SampleOptions},
     scene::SceneOptions,
+    scenes::{make, view_request},
     setup::Setup,
 };
 
 /// What to time.
 #[derive(Clone, Debug, clap::Args)]
-pub struct Args {
+pub(crate) struct Args {
     /// Photos, 2 to 64
     #[arg(long, default_value_t = 2)]
     photos: usize,
@@ -36,10 +35,7 @@ pub struct Args {
 }
 
 /// Makes a row of the medians; its error is the PSNR of the first photo's view to that photo.
-///
-/// # Errors
-/// Those of the stages.
-pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
+pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let side = args.side;
     let options =
         SampleOptions { photos: args.photos, width: side, height: side, ..Default::default() };
@@ -54,25 +50,24 @@ pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         let begun = Instant::now();
         let photos = photo_files::read(&upload, &Limits::default())?;
         let read_ms = ms(begun);
-        let never = AtomicBool::new(false);
-        let made = reconstruct(&engine, &photos, &SceneOptions::default(), &|_, _| (), &never)?;
+        let scene = make(&engine, &photos, &SceneOptions::default())?;
         let mut all = vec![("scene".to_owned(), ms(begun)), ("read".to_owned(), read_ms)];
-        all.extend(made.report.stages.iter().map(|s| (s.stage.clone(), s.ms)));
+        all.extend(scene.report.stages.iter().map(|s| (s.stage.clone(), s.ms)));
         let first = photos.first().ok_or_else(|| Error::internal("there is no photo"))?;
-        let request = view_request(first.camera, Kinds::COLOR, made.report.median_depth);
+        let request = view_request(first.camera, Kinds::COLOR, scene.report.median_depth);
         for name in ["first view", "view"] {
             let begun = Instant::now();
-            let frame = renderer.render(&made.gaussians, &request)?;
+            let frame = renderer.render(&scene.gaussians, &request)?;
             all.push((name.to_owned(), ms(begun)));
             error = psnr(&clamped(frame.color), &to_unit(&first.photo), None);
         }
         all.into_iter().for_each(|(name, ms)| times.entry(name).or_default().push(ms));
-        gaussians = made.gaussians.len();
+        gaussians = scene.gaussians.len();
     }
     let of_first: BTreeMap<_, _> = times.iter().map(|(name, runs)| (name, runs[0])).collect();
     let medians: BTreeMap<_, _> =
         times.iter().map(|(name, runs)| (name, median(runs[1..].to_vec()))).collect();
-    let values = json!({
+    let row = json!({
         "photos": args.photos,
         "side": side,
         "gaussians": gaussians,
@@ -83,5 +78,5 @@ pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         "first_ms": of_first,
         "median_ms": medians,
     });
-    rows.push(json!({ "psnr_db": error }), &values)
+    rows.push(json!({ "psnr_db": error }), row)
 }

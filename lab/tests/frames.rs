@@ -1,31 +1,40 @@
 //! Comparisons find what is wrong, and a run of `frames` makes a row.
 
 use segsplat_core::scene::Gaussians;
-use segsplat_lab::{
-    frames::{self, Args, LabelKind, Reference, scene},
-    rows::Rows,
-};
 use segsplat_render::{
     Kinds, Labels, RenderRequest, Renderer,
     compare::{compare, compare_oracle},
     cpu::CpuRenderer,
 };
+use segsplat_testing::scenes::{camera, request, two_views};
+
+use crate::lab;
 
 #[test]
 fn frames_are_timed_with_labels_and_callers() {
-    for compare in [Reference::Cpu, Reference::Oracle] {
-        let args =
-            Args { compare, labels: Some(LabelKind::Entries), callers: 2, ..Args::small(800, 24) };
-        frames::run(&args, &mut Rows::default()).unwrap();
+    for (reference, labels, pixels) in [("cpu", "weights", 576), ("oracle", "blend", 4096)] {
+        let line = format!(
+            "frames --gaussians 800 --size 24 --frames 1 --compare {reference} --labels {labels} \
+             --callers 2"
+        );
+        let rows = lab(&line.split(' ').collect::<Vec<_>>()).unwrap();
+        let error = &rows[0]["error"];
+        assert_eq!(error["picture"]["pixels"], pixels);
+        assert_eq!(error["picture"]["faults"], 0, "{error}");
+        assert_eq!(error["labels"]["faults"], 0, "{error}");
+        assert_eq!(rows[0]["labels"]["labels"], labels);
+        assert!(rows[0]["callers"]["all_per_s"].as_f64() > Some(0.0), "{}", rows[0]);
     }
-    assert!(frames::run(&Args::small(1, 24), &mut Rows::default()).is_err(), "one Gaussian");
-    assert!(frames::run(&Args::small(800, 0), &mut Rows::default()).is_err(), "no pixel");
+    assert!(lab(&["frames", "--gaussians", "1", "--size", "24"]).is_err(), "one Gaussian");
+    assert!(lab(&["frames", "--gaussians", "800", "--size", "0"]).is_err(), "no pixel");
 }
 
 #[test]
 fn a_wrong_pixel_is_a_fault_and_nan_is_far() {
-    let (gaussians, camera) = scene(&Args::small(800, 24)).unwrap();
-    let request = RenderRequest::plain(camera, Kinds::ALL, 0.05);
+    let (gaussians, _) = two_views(20, 1);
+    let entries = (0..gaussians.len()).map(|i| 1 + (i % 24) as u16).collect();
+    let gaussians = gaussians.with_semantic_index(entries).unwrap();
+    let request = request(camera(24, 24));
     let draw = |gaussians: &Gaussians, request: &RenderRequest| {
         CpuRenderer::new(1).and_then(|cpu| cpu.render(gaussians, request)).unwrap()
     };

@@ -1,19 +1,73 @@
 //! The page of measurements says what the runs say.
 
-use std::path::Path;
+use std::{fs, path::Path};
 
 use segsplat_lab::report::page;
-
-fn root() -> &'static Path {
-    Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/.."))
-}
+use segsplat_testing::root;
+use serde_json::{Value, json};
 
 #[test]
 fn the_page_is_what_the_rows_say() {
-    let old = std::fs::read_to_string(root().join("docs/benchmarks.md")).unwrap();
+    let old = fs::read_to_string(root().join("docs/benchmarks.md")).unwrap();
     let new = page(root(), &old).unwrap();
     let first = old.lines().zip(new.lines()).find(|(old, new)| old != new);
     assert!(old == new, "docs/benchmarks.md differs; `make report` writes it: {first:?}");
     let changed = old.replacen(" dB", " db", 1).replacen("| 0.", "| 9.", 1);
     assert_ne!(page(root(), &changed).unwrap(), changed, "a changed cell is found");
+}
+
+/// A repository of one table.
+fn repository(columns: &str, rows: &[Value]) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    fs::create_dir_all(dir.path().join("benches/runs")).unwrap();
+    let table = format!("[[table]]\nname = \"t\"\n{columns}\n");
+    fs::write(dir.path().join("benches/tables.toml"), table).unwrap();
+    let rows: Vec<String> = rows.iter().map(Value::to_string).collect();
+    fs::write(dir.path().join("benches/runs/1.jsonl"), rows.join("\n")).unwrap();
+    dir
+}
+
+fn row(values: &Value) -> Value {
+    let mut row =
+        json!({ "table": "t", "command": "run", "commit": "c", "machine": "m", "error": 0 });
+    row.as_object_mut().unwrap().extend(values.as_object().unwrap().clone());
+    row
+}
+
+/// The table on the page of this repository.
+fn table(root: &Path) -> Result<String, String> {
+    let (before, after) = ("# Page\n<!-- table: t -->\n", "<!-- end -->\n");
+    let page = page(root, &format!("{before}old{after}")).map_err(|e| e.to_string())?;
+    Ok(page.strip_prefix(before).unwrap().strip_suffix(after).unwrap().to_owned())
+}
+
+#[test]
+fn templates_take_values_as_they_say() {
+    let columns = "columns = [['all', '{s}: {n:,}, {n}, {a.b.0:%}, {a.b.1:e}, {a.b.0:.2} ms'], \
+                   ['none', '{none} ms'], ['no path', '{a.c:.1} ms']]";
+    let values = json!({ "n": 1_234_567, "a": { "b": [0.5, 2.0e-4] }, "s": "x", "none": null });
+    let dir = repository(columns, &[row(&values)]);
+    let wanted = "| all | none | no path |\n| --- | --- | --- |\n\
+                  | x: 1,234,567, 1234567, 50.0 %, 2.0e-4, 0.50 ms |  |  |\n\nCommit c; m.\n";
+    assert_eq!(table(dir.path()).unwrap(), wanted, "where a value is missing the cell is empty");
+}
+
+#[test]
+fn rows_of_one_key_are_one_line() {
+    let columns = "key = '{scene}'\npivot = '{photos}'\n\
+                   columns = [['scene', '{key}'], ['2', '{2.db:.1}'], ['4', '{4.db:.1}']]";
+    let of = |scene, photos, db| row(&json!({ "scene": scene, "photos": photos, "db": db }));
+    let dir = repository(columns, &[of("a", 2, 1.0), of("b", 2, 2.0), of("a", 4, 3.0)]);
+    let wanted = "| scene | 2 | 4 |\n| --- | --- | --- |\n| a | 1.0 | 3.0 |\n\
+                  | b | 2.0 |  |\n\nCommit c; m.\n";
+    assert_eq!(table(dir.path()).unwrap(), wanted);
+}
+
+#[test]
+fn a_row_without_its_source_or_error_is_refused() {
+    let columns = "columns = [['n', '{n}']]";
+    for (key, value) in [("command", json!("")), ("commit", json!(null)), ("error", json!(null))] {
+        let dir = repository(columns, &[row(&json!({ "n": 1, key: value }))]);
+        assert_eq!(table(dir.path()).unwrap_err(), format!("1.jsonl, row 1: no {key}"));
+    }
 }

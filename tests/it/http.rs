@@ -4,7 +4,7 @@
 use std::io::{Cursor, Read};
 
 use reqwest::{StatusCode, header};
-use segsplat::scene::Upload;
+use segsplat::{render::compare::psnr, scene::Upload};
 use serde_json::{Value, json};
 
 use crate::common::{
@@ -126,14 +126,10 @@ async fn the_picture_from_an_input_camera_looks_like_its_photo() {
     let answer = get(&stand, &format!("/v1/scenes/{id}/view?from=0&width=160&height=120")).await;
     let view = image::load_from_memory(&answer.bytes().await.unwrap()).unwrap().to_rgb8();
     let photo = image::load_from_memory(&upload().photos[0].bytes).unwrap().to_rgb8();
-    let error: f64 = view
-        .as_raw()
-        .iter()
-        .zip(photo.as_raw())
-        .map(|(a, b)| (f64::from(*a) - f64::from(*b)).powi(2))
-        .sum::<f64>()
-        / view.as_raw().len() as f64;
-    let psnr = 10.0 * (255.0_f64.powi(2) / error).log10();
+    let [view, photo] = [view, photo].map(|picture| -> Vec<[f32; 3]> {
+        picture.pixels().map(|pixel| pixel.0.map(|v| f32::from(v) / 255.0)).collect()
+    });
+    let psnr = psnr(&view, &photo, None);
     assert!(psnr > 18.0, "the board is {psnr:.1} dB from its photo");
 }
 

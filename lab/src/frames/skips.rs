@@ -4,10 +4,9 @@
 use std::sync::Arc;
 
 use glam::DVec3;
-use serde::Serialize;
 use serde_json::json;
 
-use super::{Args, device_times, times};
+use super::{Args, Drawing};
 use crate::{
     error::Result,
     render::{RenderRequest, Renderer, compare::differences, gpu::GpuOptions, skip::Skip},
@@ -19,19 +18,6 @@ use crate::{
 const ROUNDS: usize = 5;
 /// Walls of the scene of layers.
 const LAYERS: usize = 8;
-
-/// One skip of one scene; `without_ms` is the median frame that does the needless work.
-#[derive(Clone, Copy, Debug, Serialize)]
-struct SkipTimes {
-    skip: Skip,
-    scene: &'static str,
-    /// Whose time: `device` where it has a clock, else `call`.
-    clock: &'static str,
-    with_ms: f64,
-    without_ms: f64,
-    /// `without_ms / with_ms`.
-    ratio: f64,
-}
 
 /// The generated scene; the same of long thin Gaussians; as walls behind each other; seen by a
 /// camera that looks past most of it; and from far away, an island in an empty picture.
@@ -73,11 +59,10 @@ fn scenes(
     ])
 }
 
-/// Makes a row for each skip and scene; its error is the difference between the frames.
-///
-/// # Errors
-/// Those of [`super::run`].
-pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
+/// Makes a row for each skip and scene; its error is the difference between the frames. Times are
+/// medians, of the device where it has a clock, else of a call; `ratio` is that without the skip
+/// over that with it.
+pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     args.check()?;
     let (gaussians, request) = args.scene()?;
     let open = |without| -> Result<Arc<dyn Renderer>> {
@@ -94,33 +79,31 @@ pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             let mut clock = "";
             for _ in 0..ROUNDS {
                 for (renderer, times) in [&product, &plain].into_iter().zip(&mut rounds) {
+                    let drawing = Drawing { renderer: &**renderer, gaussians, request };
                     let frames = args.frames.div_ceil(ROUNDS);
-                    let (of, ms) = frame_ms(&**renderer, gaussians, request, frames)?;
-                    clock = of;
-                    times.push(ms);
+                    let device = drawing.device_times(frames)?;
+                    clock = if device.is_some() { "device" } else { "call" };
+                    times.push(match device {
+                        Some(device) => device.total_ms,
+                        None => median(drawing.times(frames)?),
+                    });
                 }
             }
             let [with_ms, without_ms] = rounds.map(median);
-            let ratio = without_ms / with_ms;
+            let row = json!({
+                "skip": skip,
+                "scene": scene,
+                "clock": clock,
+                "with_ms": with_ms,
+                "without_ms": without_ms,
+                "ratio": without_ms / with_ms,
+            });
             let error = json!({
                 "pixels": apart.iter().filter(|&&d| d > 0.0).count(),
                 "max": apart.into_iter().fold(0.0, f32::max),
             });
-            rows.push(error, &SkipTimes { skip, scene, clock, with_ms, without_ms, ratio })?;
+            rows.push(error, row)?;
         }
     }
     Ok(())
-}
-
-/// Whose clock, and the median of `frames` frames by it.
-fn frame_ms(
-    renderer: &dyn Renderer,
-    gaussians: &Gaussians,
-    request: &RenderRequest,
-    frames: usize,
-) -> Result<(&'static str, f64)> {
-    match device_times(renderer, gaussians, request, frames)? {
-        Some(times) => Ok(("device", times.total_ms)),
-        None => Ok(("call", median(times(renderer, gaussians, request, frames)?))),
-    }
 }

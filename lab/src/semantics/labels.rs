@@ -3,8 +3,8 @@
 //! Ours: `transforms.json` with `mask_file` in some frames and `masks/classes.json`; `scene.json`
 //! may name `surroundings`: classes that are counted but not asked for. 3D-OVS: `images/`,
 //! `segmentations/classes.txt`, `segmentations/FRAME/CLASS.png`, cameras in `transforms.json`,
-//! `cameras.json` or `poses_bounds.npy` (LLFF). Labels go through the photos' own reader, so a
-//! distorted photo and its labels are undone alike.
+//! `cameras.json` or `poses_bounds.npy` (LLFF). Labels go through the reader of photos, which
+//! removes the lens distortion of both in the same way.
 
 use std::{
     collections::BTreeMap,
@@ -24,33 +24,37 @@ use crate::{
 };
 
 /// A pixel that no photo shows: it is not judged.
-pub(super) const NOT_SEEN: u16 = u16::MAX;
+pub const NOT_SEEN: u16 = u16::MAX;
 /// A channel at this value or above belongs to the class.
 const INSIDE: u8 = 128;
 
 /// A class of a scene.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Class {
-    pub(super) name: String,
+pub struct Class {
+    /// The word that is asked.
+    pub name: String,
     /// Whether its name is asked; surroundings are only counted as wrong where selected.
-    pub(super) asked: bool,
+    pub asked: bool,
 }
 
 /// A photo with labels.
 #[derive(Clone, Debug)]
-pub(super) struct LabelledFrame {
+pub struct LabelledFrame {
     /// Index of the photo.
-    pub(super) photo: usize,
+    pub photo: usize,
     /// `[H * W]` class + 1 of each pixel, 0 = none of them, [`NOT_SEEN`].
-    pub(super) label: Vec<u16>,
+    pub label: Vec<u16>,
 }
 
 /// A scene folder.
 #[derive(Clone, Debug)]
-pub(super) struct LabelledScene {
-    pub(super) photos: Vec<PosedPhoto>,
-    pub(super) classes: Vec<Class>,
-    pub(super) frames: Vec<LabelledFrame>,
+pub struct LabelledScene {
+    /// All photos, undistorted.
+    pub photos: Vec<PosedPhoto>,
+    /// All classes.
+    pub classes: Vec<Class>,
+    /// The photos that have labels.
+    pub frames: Vec<LabelledFrame>,
 }
 
 /// Labels as stored: a class + 1 for each pixel of some photos, by the photo's place in the upload.
@@ -60,15 +64,16 @@ struct Stored {
 }
 
 /// Whether the folder holds labels of either layout.
-pub(super) fn is_labelled(dir: &Path) -> bool {
+#[must_use]
+pub fn is_labelled(dir: &Path) -> bool {
     dir.join("masks/classes.json").is_file() || dir.join("segmentations/classes.txt").is_file()
 }
 
 /// Reads photos and labels.
 ///
 /// # Errors
-/// `invalid_request` when a file of the layout is missing, outside the folder, or no such file.
-pub(super) fn read(dir: &Path, limits: &Limits) -> Result<LabelledScene> {
+/// `invalid_request` when a file is missing, lies outside the folder or cannot be read.
+pub fn read(dir: &Path, limits: &Limits) -> Result<LabelledScene> {
     let upload = if dir.join("poses_bounds.npy").is_file()
         && !photos::CAMERA_FILES.iter().any(|name| dir.join(name).is_file())
     {
@@ -92,7 +97,7 @@ fn json(dir: &Path, name: &str) -> Result<Value> {
     serde_json::from_str(&text).map_err(|e| wrong().caused_by(e))
 }
 
-/// A picture of the folder named by one of its files; only names that stay inside.
+/// A picture that a file of the folder names; the name must stay inside the folder.
 fn picture(dir: &Path, name: &str) -> Result<GrayImage> {
     let wrong = |what: &str| Error::invalid(format!("{name:?}: {what}"));
     if Path::new(name).components().any(|part| !matches!(part, Component::Normal(_))) {
@@ -166,13 +171,9 @@ fn ovs(dir: &Path, upload: &Upload) -> Result<Stored> {
     if classes.is_empty() || classes.len() > 255 {
         return Err(wrong(&format!("classes.txt names {} classes, not 1 to 255", classes.len())));
     }
-    let mut folders: Vec<PathBuf> = Vec::new();
-    for entry in fs_err::read_dir(&top).map_err(|e| wrong("cannot be read").caused_by(e))? {
-        let path = entry.map_err(|e| wrong("cannot be read").caused_by(e))?.path();
-        if path.is_dir() {
-            folders.push(path);
-        }
-    }
+    let listed = fs_err::read_dir(&top).map_err(|e| wrong("cannot be read").caused_by(e))?;
+    let mut folders: Vec<PathBuf> = listed.flatten().map(|entry| entry.path()).collect();
+    folders.retain(|path| path.is_dir());
     folders.sort();
     let mut maps = Vec::new();
     for folder in folders {
@@ -202,7 +203,8 @@ fn ovs(dir: &Path, upload: &Upload) -> Result<Stored> {
     Ok(Stored { classes, maps })
 }
 
-/// Labels of the undistorted photos: three classes at a time travel as a photo's channels.
+/// Labels of the undistorted photos. The reader takes three classes at a time, as the channels of a
+/// photo.
 fn undo(
     stored: &Stored,
     upload: &Upload,
@@ -246,127 +248,4 @@ fn undo(
         }
     }
     Ok(frames)
-}
-
-#[cfg(test)]
-mod tests {
-    use serde_json::json;
-
-    use super::*;
-
-    fn png(dir: &Path, name: &str, picture: impl Into<DynamicImage>) {
-        let path = dir.join(name);
-        fs_err::create_dir_all(path.parent().unwrap()).unwrap();
-        picture.into().save(path).unwrap();
-    }
-
-    /// Two photos of 8 x 6, the second one pixel to the right of the first.
-    fn scene(k1: f64) -> tempfile::TempDir {
-        let dir = tempfile::tempdir().unwrap();
-        let mut frames = Vec::new();
-        for i in 0..2_u32 {
-            let name = format!("images/{i:02}.png");
-            png(dir.path(), &name, RgbImage::from_pixel(8, 6, image::Rgb([40, 80, 120])));
-            let pose = [[1, 0, 0, i], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]];
-            frames.push(json!({ "file_path": name, "transform_matrix": pose }));
-        }
-        frames[1]["mask_file"] = json!("masks/01.png");
-        let cameras = json!({
-            "w": 8, "h": 6, "fl_x": 8.0, "fl_y": 8.0, "cx": 4.0, "cy": 3.0, "k1": k1,
-            "frames": frames,
-        });
-        fs_err::write(dir.path().join("transforms.json"), cameras.to_string()).unwrap();
-        dir
-    }
-
-    /// Left half one class, right half another, the last row none.
-    fn halves(x: u32, y: u32, [left, right]: [u8; 2]) -> image::Luma<u8> {
-        image::Luma([if y == 5 {
-            0
-        } else if x < 4 {
-            left
-        } else {
-            right
-        }])
-    }
-
-    const HALVES: [u16; 8] = [1, 1, 1, 1, 2, 2, 2, 2];
-
-    #[test]
-    fn our_layout_is_read_with_its_surroundings() {
-        let dir = scene(0.0);
-        let at = |name: &str| dir.path().join(name);
-        png(dir.path(), "masks/01.png", GrayImage::from_fn(8, 6, |x, y| halves(x, y, [7, 9])));
-        fs_err::write(at("masks/classes.json"), r#"{"7": "cup", "9": "wall"}"#).unwrap();
-        fs_err::write(at("scene.json"), r#"{"surroundings": ["wall"]}"#).unwrap();
-        assert!(is_labelled(dir.path()));
-        let scene = read(dir.path(), &Limits::default()).unwrap();
-        let class = |name: &str, asked| Class { name: name.to_owned(), asked };
-        assert_eq!(scene.classes, [class("cup", true), class("wall", false)]);
-        assert_eq!((scene.photos.len(), scene.frames.len()), (2, 1));
-        assert_eq!(scene.frames[0].photo, 1);
-        assert_eq!(scene.frames[0].label[..8], HALVES);
-        assert_eq!(scene.frames[0].label[40..], [0; 8]);
-    }
-
-    #[test]
-    fn the_layout_of_3d_ovs_is_read_and_the_first_class_keeps_a_pixel() {
-        let dir = scene(0.0);
-        let ours = |x: u32, y: u32, values| halves(x, y, values);
-        png(
-            dir.path(),
-            "segmentations/01/red cup.png",
-            GrayImage::from_fn(8, 6, |x, y| ours(x, y, [255, 0])),
-        );
-        // Twice the photo's size is resized; its overlap with the cup is the cup's.
-        png(
-            dir.path(),
-            "segmentations/00/wall.png",
-            GrayImage::from_pixel(16, 12, image::Luma([255])),
-        );
-        png(
-            dir.path(),
-            "segmentations/01/wall.png",
-            GrayImage::from_fn(8, 6, |x, y| ours(x, y, [255, 255])),
-        );
-        let classes = dir.path().join("segmentations/classes.txt");
-        fs_err::write(classes, "red cup\nwall\n").unwrap();
-        let scene = read(dir.path(), &Limits::default()).unwrap();
-        assert!(scene.classes.iter().all(|class| class.asked));
-        assert_eq!(scene.frames.len(), 2);
-        assert_eq!(scene.frames[0].label, [2; 48]);
-        assert_eq!(scene.frames[1].label[..8], HALVES);
-    }
-
-    #[test]
-    fn labels_bend_with_their_photo() {
-        // A strong pincushion: the corners look past the photo, and are not judged.
-        let dir = scene(0.9);
-        png(dir.path(), "masks/01.png", GrayImage::from_fn(8, 6, |x, y| halves(x, y, [1, 2])));
-        fs_err::write(dir.path().join("masks/classes.json"), r#"{"1": "a", "2": "b"}"#).unwrap();
-        let scene = read(dir.path(), &Limits::default()).unwrap();
-        let label = &scene.frames[0].label;
-        assert_eq!([label[0], label[7], label[40], label[47]], [NOT_SEEN; 4]);
-        assert_eq!(label[2 * 8 + 2..2 * 8 + 6], [1, 1, 2, 2]);
-        let valid = scene.photos[1].photo.valid.as_ref().unwrap();
-        assert!(label.iter().zip(valid).all(|(label, valid)| (*label == NOT_SEEN) != *valid));
-    }
-
-    #[test]
-    fn labels_outside_the_folder_or_of_no_photo_are_refused() {
-        for (mask, file) in [("../x.png", "images/01.png"), ("masks/01.png", "images/77.png")] {
-            let dir = scene(0.0);
-            png(dir.path(), "masks/01.png", GrayImage::new(8, 6));
-            fs_err::write(dir.path().join("masks/classes.json"), r#"{"1": "a"}"#).unwrap();
-            let path = dir.path().join("transforms.json");
-            let text = fs_err::read_to_string(&path).unwrap().replace("masks/01.png", mask);
-            let mut cameras: Value = serde_json::from_str(&text).unwrap();
-            let mut frame = cameras["frames"][1].clone();
-            frame["file_path"] = json!(file);
-            cameras["frames"].as_array_mut().unwrap().push(frame);
-            let upload = photos::upload_of_dir(dir.path(), &Limits::default()).unwrap();
-            fs_err::write(&path, cameras.to_string()).unwrap();
-            assert!(ours(dir.path(), &upload).is_err(), "{mask} of {file}");
-        }
-    }
 }

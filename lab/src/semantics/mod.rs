@@ -2,18 +2,17 @@
 //!
 //! The paper's protocol: a labelled photo is the target, the photos nearest to it are the input,
 //! and the class names are asked in a view from the target's camera. Both scoring profiles are
-//! judged from one scene. Beside them stands the *flat* baseline without any 3D: the masks of the
-//! nearest photo, each scored by the same text on its own, laid over the target as they are.
+//! judged from one scene. The *flat* baseline has no 3D: each mask of the nearest photo is scored
+//! by the same text, and the masks are laid over the target as they are.
 
-mod labels;
+pub mod labels;
 mod llff;
-mod tally;
+pub mod tally;
 mod views;
 
 use std::path::PathBuf;
 
-use serde::Serialize;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use self::{
     labels::{LabelledFrame, LabelledScene, NOT_SEEN},
@@ -22,89 +21,47 @@ use self::{
 };
 use crate::{
     error::{Error, Result},
-    folders::{Folders, REPORTED, nearest},
     grid,
     limits::Limits,
     pipeline::{Engine, semantics::SemanticsOptions},
     render::cpu::CpuRenderer,
     rows::{Rows, progress},
-    scene::{Camera, ScoringProfile},
-    setup::Setup,
+    scene::ScoringProfile,
+    scenes::{means_by_use, nearest, use_of},
+    setup::Inputs,
 };
 
-pub use self::{
-    tally::{AbsentScore, ClassScore, Scores},
-    views::TargetReport,
-};
-
-/// Words for what is in no scene, unless others are given. A scene that has one does not ask it.
-pub const ABSENT: &str = "airplane,elephant,church,waterfall,bicycle,violin,helmet,bridge";
-/// Profiles in the order they are judged.
+/// Words for what is in no scene. A scene that has a class of this name does not ask the word.
+const ABSENT: &str = "airplane,elephant,church,waterfall,bicycle,violin,helmet,bridge";
+/// Profiles in the order they are judged: `paper`, `default`.
 const PROFILES: [ScoringProfile; 2] = [ScoringProfile::Paper, ScoringProfile::Default];
 /// Width of the pictures of a grid.
 const PICTURE_WIDTH: u32 = 320;
 
-/// What to evaluate.
+/// What to evaluate: labelled scene folders (masks/classes.json or segmentations/).
 #[derive(Clone, Debug, clap::Args)]
-pub struct Args {
-    /// Labelled scene folders (masks/classes.json or segmentations/)
+pub(crate) struct Args {
     #[command(flatten)]
-    pub folders: Folders,
-    /// Photos in: those nearest to the labelled photo
-    #[arg(long, default_value_t = 2)]
-    pub photos: usize,
+    inputs: Inputs,
     /// Labelled photos of a scene to score, evenly spread; 0: all of them
     #[arg(long, default_value_t = 0)]
-    pub targets: usize,
+    targets: usize,
     /// Words for what is in no scene, separated by commas
     #[arg(long, value_delimiter = ',', default_value = ABSENT)]
-    pub absent: Vec<String>,
+    absent: Vec<String>,
     /// Ask a photo first where masks of earlier photos reappear [default: as the service]
     #[arg(long)]
-    pub seeds: Option<bool>,
+    seeds: Option<bool>,
     /// Let all photos that show a Gaussian vote for its entry [default: as the service]
     #[arg(long)]
-    pub votes: Option<bool>,
+    votes: Option<bool>,
     /// Join bank entries that are one thing, at least this alike (cosine); 0: none [default: as
     /// the service]
     #[arg(long, value_name = "COSINE")]
-    pub merge: Option<f64>,
+    merge: Option<f64>,
     /// Folder for picture grids, one a scene
     #[arg(long, value_name = "DIR")]
-    pub pictures: Option<PathBuf>,
-    /// What runs the networks
-    #[command(flatten)]
-    pub setup: Setup,
-}
-
-/// One profile: the product's views beside the flat baseline.
-#[derive(Clone, Debug, Serialize)]
-pub struct Judgement {
-    /// Scoring profile.
-    pub profile: ScoringProfile,
-    /// Texts asked of the scene, at the target's camera.
-    pub scene: Scores,
-    /// Texts asked of the nearest photo's masks, laid over the target.
-    pub flat: Scores,
-}
-
-/// One scene, or the means over scenes (then without targets).
-#[derive(Clone, Debug, Serialize)]
-pub struct SceneReport {
-    /// Folder name.
-    pub scene: String,
-    /// Whether it is one of the scenes whose figures are reported.
-    pub reported: bool,
-    /// Name and version of the bundle.
-    pub bundle: String,
-    /// Photos put in.
-    pub photos: usize,
-    /// Profile `paper`.
-    pub paper: Judgement,
-    /// Profile `default`.
-    pub default: Judgement,
-    /// The targets.
-    pub targets: Vec<TargetReport>,
+    pictures: Option<PathBuf>,
 }
 
 impl Args {
@@ -124,86 +81,63 @@ impl Args {
 /// # Errors
 /// `invalid_request` when there is no labelled scene or an option is out of range, else whatever a
 /// stage says, with scene and target named.
-pub fn run(args: &Args, rows: &mut Rows) -> Result<Vec<SceneReport>> {
-    if args.photos < 2 {
+pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
+    if args.inputs.photos < 2 {
         return Err(Error::invalid("photos must be at least 2"));
     }
-    let engine = Engine::open(&args.setup.networks(1))?;
-    let renderer = CpuRenderer::new(args.setup.threads())?;
+    let engine = Engine::open(&args.inputs.setup.networks(1))?;
+    let renderer = CpuRenderer::new(args.inputs.setup.threads())?;
     let tools = Tools::open(&engine, &renderer, args.understanding())?;
+    let bundle = format!("{} {}", engine.bundle().name(), engine.bundle().version());
+    let mut push = |mut row: Value| {
+        row["bundle"] = json!(bundle);
+        row["photos"] = json!(args.inputs.photos);
+        let miou = row["default"]["scene"]["miou"].as_f64().unwrap_or(f64::NAN);
+        let scene = row["scene"].as_str().unwrap_or_default();
+        progress(&format!("{scene}: mIoU {miou:.3}"));
+        rows.push(json!({ "one_less_miou": 1.0 - miou }), row)
+    };
     let mut scenes = Vec::new();
-    for (name, dir) in args.folders.find(labels::is_labelled)? {
+    for (name, dir) in args.inputs.find(labels::is_labelled)? {
         let scene = labels::read(&dir, &Limits::default())?;
-        let report = judge(&tools, name, &scene, args)?;
-        report.push(rows)?;
-        progress(&format!("{}: mIoU {:.3}", report.scene, report.default.scene.miou));
-        scenes.push(report);
+        let row = judge(&tools, &name, &scene, args)?;
+        push(row.clone())?;
+        scenes.push(row);
     }
-    let groups = [("mean of reported", true), ("mean of choosing", false)];
-    for (name, reported) in groups {
-        let of: Vec<&SceneReport> = scenes.iter().filter(|s| s.reported == reported).collect();
-        let [first, _, ..] = of[..] else { continue };
-        let over = |judgement: fn(&SceneReport) -> &Judgement| Judgement {
-            profile: judgement(first).profile,
-            scene: Scores::mean(&of.iter().map(|s| &judgement(s).scene).collect::<Vec<_>>()),
-            flat: Scores::mean(&of.iter().map(|s| &judgement(s).flat).collect::<Vec<_>>()),
-        };
-        let means = SceneReport {
-            scene: name.to_owned(),
-            reported,
-            bundle: first.bundle.clone(),
-            photos: args.photos,
-            paper: over(|s| &s.paper),
-            default: over(|s| &s.default),
-            targets: Vec::new(),
-        };
-        means.push(rows)?;
-    }
-    Ok(scenes)
+    means_by_use(&scenes).into_iter().try_for_each(push)
 }
 
-impl SceneReport {
-    fn push(&self, rows: &mut Rows) -> Result<()> {
-        rows.push(json!({ "one_less_miou": 1.0 - self.default.scene.miou }), self)
-    }
-}
-
-/// All targets of one scene.
-fn judge(
-    tools: &Tools<'_>,
-    name: String,
-    scene: &LabelledScene,
-    args: &Args,
-) -> Result<SceneReport> {
+/// All targets of one scene: for each profile the figures of the scene (texts asked of it, at the
+/// target's camera) and of the flat baseline.
+fn judge(tools: &Tools<'_>, name: &str, scene: &LabelledScene, args: &Args) -> Result<Value> {
     let is_class =
         |word: &&String| scene.classes.iter().any(|class| class.name.eq_ignore_ascii_case(word));
     let absent: Vec<String> = args.absent.iter().filter(|w| !is_class(w)).cloned().collect();
     let blank = Tally::new(&scene.classes, &absent);
     let texts = tools.texts(&blank.texts())?;
     let mut tallies = [[blank.clone(), blank.clone()], [blank.clone(), blank]];
-    let cameras: Vec<Camera> = scene.photos.iter().map(|p| p.camera).collect();
     let every = match args.targets {
         0 => 1,
         most => scene.frames.len().div_ceil(most).max(1),
     };
     let (mut targets, mut pictures) = (Vec::new(), Vec::new());
     for frame in scene.frames.iter().step_by(every) {
-        let inputs = nearest(&cameras, frame.photo, args.photos);
+        let inputs = nearest(&scene.photos, frame.photo, args.inputs.photos);
         let fault = |e: Error| {
             let file = &scene.photos[frame.photo].file;
             Error::new(e.code(), format!("{name}, target {file}: {e}")).caused_by(e)
         };
-        if inputs.len() < args.photos {
+        if inputs.len() < args.inputs.photos {
             return Err(fault(Error::invalid(format!("{} photos beside it", inputs.len()))));
         }
         let seen = tools.see(&scene.photos, frame.photo, &inputs).map_err(fault)?;
         let mut all_maps = Vec::new();
-        for (tallies, profile) in tallies.iter_mut().zip(PROFILES) {
-            let maps = seen.maps(tools, profile, &texts)?;
-            for (tally, maps) in tallies.iter_mut().zip(&maps) {
-                tally.add(&frame.label, maps);
+        for (tallies, scoring) in tallies.iter_mut().zip(&tools.scorings) {
+            for (tally, way) in tallies.iter_mut().zip(&seen.ways) {
+                let maps = way.maps(scoring, &texts)?;
+                tally.add(&frame.label, &maps);
+                all_maps.push(maps);
             }
-            all_maps.extend(maps);
         }
         if args.pictures.is_some() {
             pictures.push(shown(scene, frame, &seen, &all_maps));
@@ -211,16 +145,13 @@ fn judge(
         targets.push(seen.report);
     }
     if let Some(out) = &args.pictures {
-        grid::write(out, &name, &pictures.iter().collect::<Vec<_>>())?;
+        grid::write(out, name, &pictures.iter().collect::<Vec<_>>())?;
     }
-    let [paper, default] = [0, 1].map(|i| Judgement {
-        profile: PROFILES[i],
-        scene: tallies[i][0].scores(),
-        flat: tallies[i][1].scores(),
-    });
-    let reported = REPORTED.contains(&name.as_str());
-    let bundle = tools.bundle();
-    Ok(SceneReport { scene: name, reported, bundle, photos: args.photos, paper, default, targets })
+    let mut row = json!({ "scene": name, "use": use_of(name), "targets": targets });
+    for (profile, [scene, flat]) in ["paper", "default"].into_iter().zip(&tallies) {
+        row[profile] = json!({ "scene": scene.scores(), "flat": flat.scores() });
+    }
+    Ok(row)
 }
 
 /// One target's pictures: photo, view, labels, then for each profile the best selecting text of

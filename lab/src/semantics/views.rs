@@ -1,65 +1,47 @@
-//! From photos and texts to what each text says of each pixel of the target: by the product's
-//! stages, and by the flat baseline without 3D.
+//! What each text says of each pixel of the target: by the stages of the product, and by the flat
+//! baseline without 3D.
 
 use std::sync::{Arc, atomic::AtomicBool};
 
 use segsplat_vision::semantics::{Cutter, Scorer, Scoring};
-use serde::Serialize;
+use serde_json::{Value, json};
 
 use super::{PROFILES, tally::TextMap};
 use crate::{
     error::{Error, Result},
-    folders::{scene_of, view_request},
     models::ImageText,
     pipeline::{
-        Engine, Reconstruction, masks, reconstruct,
+        Engine, Reconstruction, masks,
         semantics::{SceneParts, SemanticsOptions, understand},
     },
     render::{Kinds, Labels, PixelWeights, RenderRequest, ViewPlanner, cpu::CpuRenderer},
-    scene::{
-        Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, ScoringProfile, SemanticsReport,
-        StageTime, Watch,
-    },
+    scene::{Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, Watch},
+    scenes::{make, scene_of, view_request},
 };
 
-/// What every target is seen with.
+/// What all targets share.
 pub(super) struct Tools<'a> {
     engine: &'a Engine,
     renderer: &'a CpuRenderer,
     towers: Arc<ImageText>,
     understanding: SemanticsOptions,
     /// How each profile scores, as [`PROFILES`].
-    scorings: Vec<Arc<Scoring>>,
+    pub(super) scorings: Vec<Arc<Scoring>>,
 }
 
 /// One target, seen from its inputs.
 pub(super) struct Seen {
     /// The view's colours, for pictures.
     pub(super) color: Vec<[f32; 3]>,
-    pub(super) report: TargetReport,
-    scene: Rows,
-    flat: Rows,
-}
-
-/// How one target went.
-#[derive(Clone, Debug, Serialize)]
-pub struct TargetReport {
-    /// File of the target.
-    pub target: String,
-    /// Files of the inputs, the nearest first.
-    pub inputs: Vec<String>,
-    /// How semantics went: masks, bank size, times.
-    pub semantics: SemanticsReport,
-    /// Times of the stages before.
-    pub stages: Vec<StageTime>,
-    /// Mean sum of the weights that a pixel of the target has over the bank, 0..1.
-    pub coverage: f64,
-    /// What looked wrong with the inputs.
-    pub warnings: usize,
+    /// Files of the target and its inputs, the nearest first; how semantics and the stages before
+    /// went; the mean sum of the weights of a pixel of the target over the bank, 0 to 1.
+    pub(super) report: Value,
+    /// The view of the scene, and the nearest photo taken for the target.
+    pub(super) ways: [BankView; 2],
 }
 
 /// A bank and the weights of each pixel of the target over it.
-struct Rows {
+pub(super) struct BankView {
     bank: Bank,
     weights: PixelWeights,
 }
@@ -76,12 +58,6 @@ impl<'a> Tools<'a> {
         Ok(Self { engine, renderer, towers, understanding, scorings })
     }
 
-    /// Name and version of the bundle.
-    pub(super) fn bundle(&self) -> String {
-        let bundle = self.engine.bundle();
-        format!("{} {}", bundle.name(), bundle.version())
-    }
-
     /// Unit embeddings of texts.
     pub(super) fn texts(&self, texts: &[String]) -> Result<Vec<Vec<f32>>> {
         Ok(self.towers.embed_texts(texts)?.into_iter().map(|text| text.row).collect())
@@ -96,60 +72,55 @@ impl<'a> Tools<'a> {
     ) -> Result<Seen> {
         let given: Vec<PosedPhoto> = inputs.iter().map(|&i| photos[i].clone()).collect();
         let cancel = AtomicBool::new(false);
-        let made = reconstruct(self.engine, &given, &SceneOptions::default(), &|_, _| (), &cancel)?;
-        let parts =
-            SceneParts { photos: &given, cameras: &made.cameras, gaussians: &made.gaussians };
+        let reconstruction = make(self.engine, &given, &SceneOptions::default())?;
+        let parts = SceneParts {
+            photos: &given,
+            cameras: &reconstruction.cameras,
+            gaussians: &reconstruction.gaussians,
+        };
         let watch = Watch { progress: &|_, _| (), cancel: &cancel };
         let meaning = understand(self.engine, &parts, &self.understanding, watch)?;
-        let gaussians = made.gaussians.with_semantic_index(meaning.index)?;
-        let plain = view_request(photos[target].camera, Kinds::COLOR, made.report.median_depth);
+        let gaussians = reconstruction.gaussians.with_semantic_index(meaning.index)?;
+        let plain =
+            view_request(photos[target].camera, Kinds::COLOR, reconstruction.report.median_depth);
         let request = RenderRequest { labels: Labels::Weights, ..plain };
-        let (warnings, stages) = (made.report.warnings.len(), made.report.stages.clone());
-        let scene = scene_of(Reconstruction { gaussians, ..made });
+        let scene = scene_of(Reconstruction { gaussians, ..reconstruction });
         let frame = ViewPlanner::default().render(self.renderer, &scene, &request, true)?;
         let weights = frame.weights.ok_or_else(|| Error::internal("the view has no weights"))?;
         let weight: f64 = weights.weights.iter().map(|w| f64::from(*w)).sum();
-        let report = TargetReport {
-            target: photos[target].file.clone(),
-            inputs: given.iter().map(|photo| photo.file.clone()).collect(),
-            semantics: meaning.report,
-            stages,
-            coverage: weight / weights.pixels().max(1) as f64,
-            warnings,
-        };
+        let report = json!({
+            "target": photos[target].file,
+            "inputs": given.iter().map(|photo| &photo.file).collect::<Vec<_>>(),
+            "semantics": meaning.report,
+            "stages": scene.meta.report.stages,
+            "coverage": weight / weights.pixels().max(1) as f64,
+            "warnings": scene.meta.report.warnings.len(),
+        });
         Ok(Seen {
             color: frame.color.unwrap_or_default(),
-            scene: Rows { bank: meaning.bank, weights },
-            flat: self.flat(&given[0], &photos[target].camera, &cancel)?,
+            ways: [
+                BankView { bank: meaning.bank, weights },
+                self.flat(&given[0], &photos[target].camera, &cancel)?,
+            ],
             report,
         })
     }
 
     /// The masks of one photo, each with a row of its own, laid over a picture of the size of the
     /// target.
-    fn flat(&self, photo: &PosedPhoto, target: &Camera, cancel: &AtomicBool) -> Result<Rows> {
+    fn flat(&self, photo: &PosedPhoto, target: &Camera, cancel: &AtomicBool) -> Result<BankView> {
         let network = self.engine.masks()?;
         let settings = masks::settings(network.manifest());
-        let found = masks::photo_masks(
-            &network,
-            std::slice::from_ref(photo),
-            None,
-            &settings,
-            &|_| (),
-            cancel,
-        )?;
+        let photos = std::slice::from_ref(photo);
+        let found = masks::photo_masks(&network, photos, None, &settings, &|_| (), cancel)?;
         let none = PhotoMasks::default();
         let masks = found.first().unwrap_or(&none);
         let cutter = Cutter::new(&photo.photo, masks);
         let manifest = self.towers.manifest();
         let margin = f64::from(manifest.image.crop_margin);
         let cut = |k: usize| cutter.cut(k, margin).unwrap_or(Crop { side: 1, rgb: vec![0; 3] });
-        let mut rows = Vec::new();
-        let all: Vec<usize> = (0..masks.masks.len()).collect();
-        for batch in all.chunks(manifest.image.batch.max(1)) {
-            let crops: Vec<Crop> = batch.iter().map(|k| cut(*k)).collect();
-            rows.extend(self.towers.embed_images(&crops)?);
-        }
+        let crops: Vec<Crop> = (0..masks.masks.len()).map(cut).collect();
+        let rows = self.towers.embed_images(&crops)?;
         let lens = target.intrinsics;
         let mut weights = PixelWeights { offsets: vec![0], ..PixelWeights::default() };
         for y in 0..lens.height {
@@ -163,31 +134,16 @@ impl<'a> Tools<'a> {
                 weights.offsets.push(u32::try_from(weights.entries.len()).unwrap_or(u32::MAX));
             }
         }
-        Ok(Rows { bank: Bank { dim: manifest.dim, rows }, weights })
+        Ok(BankView { bank: Bank { dim: manifest.dim, rows }, weights })
     }
 }
 
-impl Seen {
-    /// What each text says of each pixel of the view of the scene, and of the nearest photo taken
-    /// for the target.
-    pub(super) fn maps(
-        &self,
-        tools: &Tools<'_>,
-        profile: ScoringProfile,
-        texts: &[Vec<f32>],
-    ) -> Result<[Vec<TextMap>; 2]> {
-        let at = PROFILES.iter().position(|of| *of == profile).unwrap_or_default();
-        let scoring = &tools.scorings[at];
-        Ok([self.scene.maps(scoring, texts)?, self.flat.maps(scoring, texts)?])
-    }
-}
-
-impl Rows {
+impl BankView {
     /// The product's masks, and scores by which texts can be compared at a pixel.
     ///
     /// At one pixel all texts share the feature's length, so the smallest `E . B(q - c)` over the
     /// phrases orders them as their relevancies do.
-    fn maps(&self, scoring: &Arc<Scoring>, texts: &[Vec<f32>]) -> Result<Vec<TextMap>> {
+    pub(super) fn maps(&self, scoring: &Arc<Scoring>, texts: &[Vec<f32>]) -> Result<Vec<TextMap>> {
         let scorer = Scorer::new(&self.bank, Arc::clone(scoring))?;
         let of = &self.weights;
         let map = |text: &Vec<f32>| -> Result<TextMap> {

@@ -5,8 +5,8 @@
 //! `.npz` sets hold whole photographs; a `.tar` with `segments.json` holds photographs with a mask
 //! for each thing, which are cut out as the product cuts them.
 
-mod npz;
-mod segments;
+pub mod npz;
+pub mod segments;
 
 use std::{
     collections::HashMap,
@@ -16,28 +16,25 @@ use std::{
 };
 
 use image::ImageReader;
-use serde::Serialize;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use crate::{
     error::{Error, Result},
     limits::Limits,
     models::{Bundle, ImageText, Runtime},
-    rows::{Rows, mean, progress},
+    rows::{Rows, means, progress},
     scene::Crop,
     setup::Setup,
 };
 
 /// One image of this many is held out, the last of each run.
 const HELD_OUT_OF: usize = 10;
-/// Crops that are decoded before the tower sees them.
-const BATCH: usize = 64;
 /// Classes of clutter, which are no word.
 const NO_CLASS: &str = "background";
 
 /// What to evaluate.
 #[derive(Clone, Debug, clap::Args)]
-pub struct Args {
+pub(crate) struct Args {
     /// Labelled sets: .npz of photographs, .tar of photographs with segments.json
     #[arg(required = true)]
     files: Vec<PathBuf>,
@@ -51,34 +48,10 @@ pub struct Args {
     setup: Setup,
 }
 
-/// How often the right name came first, or among the first five.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-struct Hits {
-    /// Names to choose from.
-    names: usize,
-    /// Share of images whose name came first.
-    top1: f64,
-    /// Share of images whose name came among the first five.
-    top5: f64,
-}
-
-/// One set.
-#[derive(Clone, Debug, Serialize)]
-struct Measured {
-    set: String,
-    bundle: String,
-    /// Whether the images are things cut out by their mask.
-    masked: bool,
-    images: usize,
-    /// Among the set's own names.
-    own: Hits,
-    /// Among the names of all sets.
-    all: Hits,
-}
-
-/// A set as crops to be embedded, with the index of each one's name in a list of all names.
+/// A set as embeddings, with the index of each one's name in a list of all names.
 struct Set {
     name: String,
+    /// Whether the images are things cut out by their mask.
     masked: bool,
     /// Indices into the list of all names, of the set's own classes.
     own: Vec<usize>,
@@ -120,12 +93,12 @@ fn plain(stored: &str) -> String {
 }
 
 /// Makes a row for each set, and one of means; the error is the share of images that miss their
-/// name.
+/// name. `own` are hits among the set's own names, `all` among the names of all sets.
 ///
 /// # Errors
 /// `invalid_request` for files that are no labelled sets, `model_unavailable` where the bundle has
 /// no image-text pair.
-pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
+pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     if !args.template.contains("{}") {
         return Err(Error::invalid(format!("template {:?} has no {{}}", args.template)));
     }
@@ -144,28 +117,24 @@ pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let found = towers.embed_texts(&texts)?;
     let dim = towers.manifest().dim;
     let all: Vec<usize> = (0..texts.len()).collect();
-    let measure = |set: &Set| Measured {
-        set: set.name.clone(),
-        bundle: format!("{} {}", bundle.name(), bundle.version()),
-        masked: set.masked,
-        images: set.truth.len(),
-        own: hits(set, dim, &set.own, |n| &found[n].row),
-        all: hits(set, dim, &all, |n| &found[n].row),
+    let measure = |set: &Set| {
+        json!({
+            "set": set.name,
+            "masked": set.masked,
+            "images": set.truth.len(),
+            "own": hits(set, dim, &set.own, |n| &found[n].row),
+            "all": hits(set, dim, &all, |n| &found[n].row),
+        })
     };
-    let mut measured: Vec<Measured> = sets.iter().map(measure).collect();
-    let over = |of: fn(&Measured) -> Hits| Hits {
-        names: all.len(),
-        top1: mean(measured.iter().map(|m| of(m).top1)),
-        top5: mean(measured.iter().map(|m| of(m).top5)),
-    };
-    let images = measured.iter().map(|m| m.images).sum();
-    let (own, among_all) = (over(|m| m.own), over(|m| m.all));
-    if let Some(first) = measured.first().cloned() {
-        let set = "mean of sets".to_owned();
-        measured.push(Measured { set, masked: false, images, own, all: among_all, ..first });
-    }
-    for measured in &measured {
-        rows.push(json!({ "missed": 1.0 - measured.all.top1 }), measured)?;
+    let mut measured: Vec<Value> = sets.iter().map(measure).collect();
+    let mut mean = means(&measured);
+    mean["set"] = json!("**mean of sets**");
+    mean["images"] = json!(sets.iter().map(|set| set.truth.len()).sum::<usize>());
+    measured.push(mean);
+    for mut row in measured {
+        row["bundle"] = json!(format!("{} {}", bundle.name(), bundle.version()));
+        let missed = 1.0 - row["all"]["top1"].as_f64().unwrap_or(f64::NAN);
+        rows.push(json!({ "missed": missed }), row)?;
     }
     Ok(())
 }
@@ -179,56 +148,35 @@ fn stride(count: usize, max: usize) -> usize {
 fn embed(path: &Path, towers: &ImageText, names: &mut Names, images_max: usize) -> Result<Set> {
     let bytes_max = Limits::default().archive_unpacked_bytes_max;
     let margin = f64::from(towers.manifest().image.crop_margin);
-    let (mut rows, mut truth) = (Vec::new(), Vec::new());
-    let mut waiting: Vec<Crop> = Vec::new();
-    let mut flush = |waiting: &mut Vec<Crop>| -> Result<()> {
-        rows.extend(towers.embed_images(waiting)?);
-        waiting.clear();
-        Ok(())
-    };
-    let ending = path.extension().unwrap_or_default().to_ascii_lowercase();
-    let (name, own) = if ending == "npz" {
+    // Crops with the index of their name.
+    let mut things: Vec<(Crop, usize)> = Vec::new();
+    let npz = path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("npz"));
+    let (name, mut own): (_, Vec<usize>) = if npz {
         let set = npz::Labelled::open(path, bytes_max)?;
         let own: Vec<Option<usize>> = set.names.iter().map(|n| names.add(n)).collect();
-        let is_class = |i: &usize| own[set.labels[*i]].is_some();
-        let held: Vec<usize> = held_out(set.labels.len()).filter(is_class).collect();
-        for &i in held.iter().step_by(stride(held.len(), images_max)) {
-            let Some(class) = own[set.labels[i]] else { continue };
+        let class = |i: usize| Some((i, own[set.labels[i]]?));
+        let held: Vec<(usize, usize)> = held_out(set.labels.len()).filter_map(class).collect();
+        for &(i, class) in held.iter().step_by(stride(held.len(), images_max)) {
             let photo = decode(set.image(i), &format!("{} image {i}", set.set))?;
-            waiting.push(square(&photo));
-            truth.push(class);
-            if waiting.len() == BATCH {
-                flush(&mut waiting)?;
-            }
+            things.push((square(&photo), class));
         }
         (set.set, own.into_iter().flatten().collect())
     } else {
-        let mut own = Vec::new();
         let set = segments::Segmented::open(path, bytes_max)?;
-        for class in set.class_names() {
-            own.extend(names.add(class));
+        let own = set.class_names().into_iter().filter_map(|class| names.add(class)).collect();
+        let mut cut = Vec::new();
+        for i in held_out(set.images.len()) {
+            cut.extend(set.images[i].cut(margin)?);
         }
-        let held: Vec<usize> = held_out(set.images.len()).collect();
-        let mut things = Vec::new();
-        for i in held {
-            things.extend(set.images[i].cut(margin)?);
-        }
-        let every = stride(things.len(), images_max);
-        for (crop, class) in things.into_iter().step_by(every) {
-            let Some(class) = names.add(&class) else { continue };
-            waiting.push(crop);
-            truth.push(class);
-            if waiting.len() == BATCH {
-                flush(&mut waiting)?;
-            }
-        }
+        let every = stride(cut.len(), images_max);
+        let named = |(crop, class): (Crop, String)| Some((crop, names.add(&class)?));
+        things.extend(cut.into_iter().step_by(every).filter_map(named));
         (set.set, own)
     };
-    flush(&mut waiting)?;
-    let mut own: Vec<usize> = own;
     own.sort_unstable();
     own.dedup();
-    Ok(Set { name, masked: ending != "npz", own, rows, truth })
+    let (crops, truth): (Vec<Crop>, Vec<usize>) = things.into_iter().unzip();
+    Ok(Set { name, masked: !npz, own, rows: towers.embed_images(&crops)?, truth })
 }
 
 /// Indices that training leaves out, of `count` in a file's order.
@@ -253,14 +201,14 @@ fn square(photo: &image::RgbImage) -> Crop {
     Crop { side, rgb: whole.into_raw() }
 }
 
-/// Shares of images whose name is the nearest, or among the five nearest, of `names`; of equally
-/// near names the right one comes last.
+/// How many `names` there are, and the shares of images whose name is the nearest of them (`top1`)
+/// or among the five nearest (`top5`); of equally near names the right one comes last.
 fn hits<'a>(
     set: &Set,
     dim: usize,
     names: &[usize],
     row_of: impl Fn(usize) -> &'a Vec<f32>,
-) -> Hits {
+) -> Value {
     let (mut first, mut five) = (0_u32, 0_u32);
     for (image, truth) in set.rows.chunks_exact(dim.max(1)).zip(&set.truth) {
         let score = |n: usize| -> f32 { image.iter().zip(row_of(n)).map(|(a, b)| a * b).sum() };
@@ -270,7 +218,7 @@ fn hits<'a>(
         five += u32::from(before < 5);
     }
     let share = |n: u32| f64::from(n) / set.truth.len().max(1) as f64;
-    Hits { names: names.len(), top1: share(first), top5: share(five) }
+    json!({ "names": names.len(), "top1": share(first), "top5": share(five) })
 }
 
 #[cfg(test)]
@@ -307,7 +255,7 @@ mod tests {
         let all: Vec<usize> = (0..8).collect();
         let found = hits(&set, 2, &all, |n| &rows[n]);
         // The best name first; the fifth best among five; all alike: nothing.
-        assert_eq!(found, Hits { names: 8, top1: 1.0 / 3.0, top5: 2.0 / 3.0 });
+        assert_eq!(found, json!({ "names": 8, "top1": 1.0 / 3.0, "top5": 2.0 / 3.0 }));
     }
 
     #[test]

@@ -1,13 +1,13 @@
 //! wgpu-3dgs-viewer and `segsplat-lab frames` on one adapter and one scene, in turn.
 //!
-//!     wgpu_peer OUT SEGSPLAT ADAPTER [GAUSSIANS WIDTH HEIGHT FRAMES ROUNDS]
+//!     wgpu_peer OUT LAB ADAPTER [GAUSSIANS WIDTH HEIGHT FRAMES ROUNDS]
 //!
-//! OUT takes the raw figures (wgpu_peer.jsonl). Both are timed by the device's clock from before
-//! the first stage to after the last, and by the wall from the call to the picture in memory. The
-//! viewer draws quads back to front: without the 0.3 px² blur, out to four standard deviations,
-//! colours and opacities of 8 bits; at another extent than √8 its Gaussians are not Gaussians.
-//! Its picture is compared with ours over the same background, drawn into 16-bit floats so that
-//! the target adds little of its own.
+//! LAB is the program segsplat-lab. OUT takes one row a round (wgpu_peer.jsonl). Both are timed by
+//! the device's clock from before the first stage to after the last, and by the wall from the call
+//! to the picture in memory. The viewer draws quads back to front: without the 0.3 px² blur, out to
+//! four standard deviations, colours and opacities of 8 bits; at another extent than √8 its
+//! Gaussians are not Gaussians. Its picture is compared with ours over the same background, drawn
+//! into 16-bit floats so that the target adds little of its own.
 
 use std::{error::Error, fs, io::Write as _, path::Path, process::Command, time::Instant};
 
@@ -242,8 +242,8 @@ fn difference(picture: &[u16], dump: &Dump) -> Value {
 
 fn main() -> Result<()> {
     let args: Vec<String> = std::env::args().skip(1).collect();
-    let [out, segsplat, adapter, numbers @ ..] = args.as_slice() else {
-        return Err("wgpu_peer OUT SEGSPLAT ADAPTER [GAUSSIANS WIDTH HEIGHT FRAMES ROUNDS]".into());
+    let [out, lab, adapter, numbers @ ..] = args.as_slice() else {
+        return Err("wgpu_peer OUT LAB ADAPTER [GAUSSIANS WIDTH HEIGHT FRAMES ROUNDS]".into());
     };
     let number = |i: usize, default: u32| numbers.get(i).map_or(Ok(default), |text| text.parse());
     let (gaussians, width, height) = (number(0, 131_072)?, number(1, 256)?, number(2, 256)?);
@@ -253,7 +253,7 @@ fn main() -> Result<()> {
     let scene = out.join("scene.safetensors");
     let ours = |more: &[&str]| -> Result<Value> {
         let numbers = [gaussians, height, width, frames].map(|number| number.to_string());
-        let done = Command::new(segsplat)
+        let done = Command::new(lab)
             .args(["frames", "--renderer", "gpu", "--adapter", adapter])
             .args(["--gaussians", &numbers[0], "--size", &numbers[1], "--width", &numbers[2]])
             .args(["--frames", &numbers[3]])
@@ -281,6 +281,12 @@ fn main() -> Result<()> {
         }
         let report = ours(&[])?;
         let row = json!({
+            "table": "wgpu",
+            "command": format!(
+                "wgpu_peer OUT LAB {adapter} {gaussians} {width} {height} {frames} {rounds}"
+            ),
+            "commit": report["commit"],
+            "machine": report["machine"],
             "round": round,
             "gaussians": report["gaussians"],
             "width": width,
@@ -289,7 +295,7 @@ fn main() -> Result<()> {
             "segsplat": {
                 "device_ms": report["device"]["total_ms"], "call_ms": report["median_ms"],
             },
-            "difference": difference(&picture, &dump),
+            "error": difference(&picture, &dump),
         });
         println!("{row}");
         writeln!(rows, "{row}")?;

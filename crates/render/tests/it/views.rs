@@ -141,14 +141,10 @@ fn a_gpu_keeps_to_the_oracle() {
 /// PSNR of colour to the oracle, dB, and the share of pixels over two levels off.
 fn apart(frame: &Frame, view: &View) -> (f64, f64) {
     let colors = frame.color.as_ref().expect("colour");
-    let (mut squares, mut far) = (0.0, 0);
-    for (&at, truth) in view.places.iter().zip(&view.truth) {
-        let d = [0, 1, 2].map(|k| f64::from(colors[at][k]) - truth.color[k].clamp(0.0, 1.0));
-        squares += d.iter().map(|d| d * d).sum::<f64>();
-        far += usize::from(d.iter().any(|d| d.abs() > 2.0 / 255.0));
-    }
-    let count = view.places.len() as f64;
-    (-10.0 * (squares / (3.0 * count)).log10(), far as f64 / count)
+    let got: Vec<[f32; 3]> = view.places.iter().map(|&at| colors[at]).collect();
+    let truth: Vec<[f32; 3]> =
+        view.truth.iter().map(|pixel| pixel.color.map(|v| v as f32)).collect();
+    crate::fast::apart(&got, &truth)
 }
 
 #[test]
