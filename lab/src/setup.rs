@@ -6,12 +6,10 @@ use serde::Deserialize;
 
 use crate::{
     error::Result,
-    limits::Limits,
     models::NetworkOptions,
     render::{
-        Renderer, RendererChoice, RendererOptions,
-        gpu::GpuOptions,
-        select::{AdapterReport, select_with},
+        Renderer, RendererChoice, RendererOptions, Switches,
+        select::{AdapterReport, select},
     },
 };
 
@@ -70,16 +68,14 @@ impl Setup {
     /// The renderer, and the adapters that there are.
     ///
     /// # Errors
-    /// Those of [`select_with`].
-    pub fn renderer(&self, options: GpuOptions) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
-        let limits = Limits::default();
-        let wanted = RendererOptions {
+    /// Those of [`select`].
+    pub fn renderer(&self, switches: Switches) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
+        select(&RendererOptions {
             renderer: self.renderer,
             adapter: self.adapter.clone(),
             threads: self.threads(),
-            waiting_max: limits.queued_renders_max,
-            scene_bytes_max: limits.device_scene_bytes_max,
-        };
-        select_with(&wanted, options)
+            switches,
+            ..RendererOptions::default()
+        })
     }
 }

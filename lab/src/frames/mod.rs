@@ -19,10 +19,9 @@ use self::generated::{Random, dump};
 use crate::{
     error::{Error, Result},
     render::{
-        DeviceTimes, DispatchTime, Kinds, Labels, Quality, RenderRequest, Renderer,
+        DeviceTimes, DispatchTime, Kinds, Labels, Quality, RenderRequest, Renderer, Switches,
         compare::{Compared, compare, compare_oracle},
         cpu::CpuRenderer,
-        gpu::GpuOptions,
         select::AdapterReport,
     },
     rows::{Rows, median, ms},
@@ -187,8 +186,8 @@ impl Args {
         Err(Error::invalid(format!("2 to {most} Gaussians, and at least 1 pixel and 1 frame")))
     }
 
-    fn gpu_options(&self) -> GpuOptions {
-        GpuOptions { shaders: self.shaders.clone(), checked: self.checked, ..GpuOptions::default() }
+    fn switches(&self) -> Switches {
+        Switches { shaders: self.shaders.clone(), checked: self.checked, ..Switches::default() }
     }
 
     /// The generated scene, and the view of it with every picture.
@@ -211,7 +210,7 @@ pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     args.check()?;
     let (gaussians, request) = args.scene()?;
     let begun = Instant::now();
-    let (renderer, adapters) = args.setup.renderer(args.gpu_options())?;
+    let (renderer, adapters) = args.setup.renderer(args.switches())?;
     let renderer = &*renderer;
     let open_ms = ms(begun);
     let begun = Instant::now();

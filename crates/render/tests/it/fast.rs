@@ -3,7 +3,7 @@
 use segsplat_core::scene::{Gaussians, RawGaussians};
 use segsplat_render::{Frame, Labels, Quality, RenderRequest, Renderer, cpu::CpuRenderer};
 
-use crate::twins::{both_kernels, gpu};
+use crate::common::{both_kernels, gpu};
 use segsplat_testing::scenes::{Random, camera, checked, push, request, two_views};
 
 /// Half a level of 8 bits, and what f32 adds.
