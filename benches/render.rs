@@ -13,10 +13,10 @@ use segsplat::{
         Kinds, Labels, RenderRequest, Renderer,
         cpu::{
             CpuRenderer, emit_isects,
-            lanes::Width,
+            lanes::{KernelOptions, Width},
             paint::Paint,
             prefix_sum,
-            project::{Projected, Projection, project},
+            project::{Projected, project},
             radix_sort,
             rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
             shade, tile_ranges,
@@ -43,8 +43,7 @@ fn print_error(name: &str, gaussians: &Gaussians, request: &RenderRequest) {
     let pixels: Vec<[u32; 2]> = (0..4_096)
         .map(|_| [random.bits() as u32 % lens.width, random.bits() as u32 % lens.height])
         .collect();
-    let truth = oracle::render_pixels(gaussians, request, oracle::DepthKey::F32, &pixels)
-        .expect("the truth");
+    let truth = oracle::render_pixels(gaussians, request, &pixels).expect("the truth");
     let got: Vec<_> = pixels.iter().map(|&[x, y]| all[(y * lens.width + x) as usize]).collect();
     let cliff: Vec<bool> = truth.iter().map(|p| p.cliff.same_order()).collect();
     let want = compare::oracle_samples(&truth);
@@ -102,7 +101,7 @@ impl Stages {
         let (gaussians, camera) = scenes::two_views(SIDE, 1);
         let request = scenes::request(camera);
         let view = View::new(gaussians.origin(), &request).expect("a view");
-        let grid = Grid::whole(&view, None);
+        let grid = Grid::whole(&view, KernelOptions::default());
         Self {
             gaussians,
             request,
@@ -118,12 +117,13 @@ impl Stages {
     }
 
     fn project(&mut self, width: Width) {
-        let how = Projection { width, ..Projection::new(false) };
-        project(&self.gaussians, &self.view, how, &mut self.projected);
+        let options = KernelOptions { width, ..KernelOptions::default() };
+        project(&self.gaussians, &self.view, false, options, &mut self.projected);
     }
 
     fn shade(&mut self) {
-        shade::shade(&self.gaussians, &self.view, None, &mut self.projected);
+        let options = KernelOptions::default();
+        shade::shade(&self.gaussians, &self.view, options, &mut self.projected);
     }
 
     fn sort(&mut self) {
@@ -146,7 +146,8 @@ impl Stages {
 
     /// All tiles into pictures that every request has.
     fn rasterize(&self, request: &RenderRequest, width: Width, scratch: &mut TileScratch) {
-        let paint = Paint::new(request, self.gaussians.semantic_index()).with_width(width);
+        let options = KernelOptions { width, ..KernelOptions::default() };
+        let paint = Paint::new(request, self.gaussians.semantic_index(), options);
         let stride = (SIDE * TILE) as usize;
         let (mut color, mut depth) = (vec![[0.0; 3]; stride], vec![0.0; stride]);
         let mut blend = vec![[0.0; 4]; stride];

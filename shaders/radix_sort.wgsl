@@ -20,7 +20,7 @@
 @group(0) @binding(5) var<storage, read_write> digit_counts: array<u32>;
 @group(0) @binding(6) var<storage, read_write> groups_of: array<atomic<u32>>;
 
-// Work that is left out because no pixel changes (crates/render/src/skip.rs).
+// Work that is left out because no pixel changes (crates/render/src/switches.rs).
 override SKIP_UNSEEN: bool = true;
 override SKIP_EQUAL_DIGITS: bool = true;
 

@@ -39,10 +39,10 @@ const PIXELS_MAX: u32 = 8u;
 override PIXELS: u32 = 1u;
 override LANES: u32 = WORKGROUP_SIZE / PIXELS;
 
-// A kernel is made for each set of pictures.
+// A kernel is compiled for each set of pictures.
 override WITH_COLOR: bool = true;
 override WITH_DEPTH: bool = true;
-// Work that is left out because no pixel changes (crates/render/src/skip.rs).
+// Work that is left out because no pixel changes (crates/render/src/switches.rs).
 override SKIP_ELLIPSE_PARTS: bool = true;
 override SKIP_ENDED_RAYS: bool = true;
 override SKIP_FLAT_COLOR: bool = true;

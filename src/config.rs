@@ -319,8 +319,8 @@ impl Config {
             renderer: self.renderer,
             adapter: self.adapter.clone(),
             threads: self.threads,
-            waiting_max: self.limits.queued_renders_max,
             scene_bytes_max: self.limits.device_scene_bytes_max,
+            ..RendererOptions::default()
         }
     }
 

@@ -12,9 +12,8 @@ use crate::{
     limits::Limits,
     models::NetworkOptions,
     render::{
-        Renderer, RendererChoice, RendererOptions,
-        gpu::GpuOptions,
-        select::{AdapterReport, select_with},
+        Renderer, RendererChoice, RendererOptions, Switches,
+        select::{AdapterReport, select},
     },
 };
 
@@ -102,16 +101,14 @@ impl Setup {
     /// The renderer, and the adapters that there are.
     pub(crate) fn renderer(
         &self,
-        options: GpuOptions,
+        switches: Switches,
     ) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
-        let limits = Limits::default();
-        let wanted = RendererOptions {
+        select(&RendererOptions {
             renderer: self.renderer,
             adapter: self.adapter.clone(),
             threads: self.threads(),
-            waiting_max: limits.queued_renders_max,
-            scene_bytes_max: limits.device_scene_bytes_max,
-        };
-        select_with(&wanted, options)
+            switches,
+            ..RendererOptions::default()
+        })
     }
 }

@@ -10,7 +10,7 @@ use crate::{
     metrics::{clamped, psnr, to_unit},
     photo_files,
     pipeline::Engine,
-    render::{Kinds, gpu::GpuOptions},
+    render::{Kinds, Switches},
     rows::{Rows, median, ms},
     sample::{self, SampleOptions},
     scene::SceneOptions,
@@ -43,7 +43,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let begun = Instant::now();
     let engine = Engine::open(&args.setup.networks(1))?;
     let open_ms = ms(begun);
-    let (renderer, _adapters) = args.setup.renderer(GpuOptions::default())?;
+    let (renderer, _adapters) = args.setup.renderer(Switches::default())?;
     let mut times: BTreeMap<String, Vec<f64>> = BTreeMap::new();
     let (mut gaussians, mut error) = (0, 0.0);
     for _ in 0..args.runs {

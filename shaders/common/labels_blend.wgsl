@@ -5,10 +5,10 @@
 // Of each pixel of the invocation.
 var<private> blended: array<vec4<f32>, PIXELS_MAX>;
 
-// An index beyond the table counts as 0.
+// An entry beyond the table counts as entry 0.
 fn label_of(id: u32) -> u32 {
-    let index = index_of(id);
-    return select(0u, index, index < views[which].label_rows);
+    let entry = entry_of(id);
+    return select(0u, entry, entry < views[which].label_rows);
 }
 
 fn label_row(label: u32) -> vec4<f32> {

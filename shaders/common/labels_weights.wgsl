@@ -1,21 +1,21 @@
 // Labels::Weights: each pixel has `weight_slots` slots of (entry, weight), filled as entries occur.
-// An entry that finds no slot is counted too: the host sees the count, makes room and draws again.
+// An entry without a slot is counted too: the host sees the count, makes room and draws again.
 
-// [pixels] counts, then for each slot [pixels] indices and [pixels] weights as bits.
+// [pixels] counts, then for each slot [pixels] entries and [pixels] weights as bits.
 @group(0) @binding(7) var<storage, read_write> slots: array<u32>;
 
-// The index of the last contributions and their sum: neighbours in depth are mostly of one thing.
+// The entry of the last contributions and their sum: neighbours in depth are mostly of one thing.
 // Of each pixel of the invocation.
-var<private> run_index: array<u32, PIXELS_MAX>;
+var<private> run_entry: array<u32, PIXELS_MAX>;
 var<private> run_weight: array<f32, PIXELS_MAX>;
 var<private> used: array<u32, PIXELS_MAX>;
 
 fn label_of(id: u32) -> u32 {
-    return index_of(id);
+    return entry_of(id);
 }
 
 fn end_run(q: u32, pixel: u32) {
-    if run_index[q] == 0u {
+    if run_entry[q] == 0u {
         return;
     }
     let bottom = min(views[which].row_end * TILE_SIZE, views[which].height);
@@ -24,7 +24,7 @@ fn end_run(q: u32, pixel: u32) {
     let held = min(used[q], views[which].weight_slots);
     for (var slot = 0u; slot < held; slot++) {
         let at = views[which].slot_start + pixels * (1u + 2u * slot) + pixel;
-        if slots[at] == run_index[q] {
+        if slots[at] == run_entry[q] {
             let sum = bitcast<f32>(slots[at + pixels]) + run_weight[q];
             slots[at + pixels] = bitcast<u32>(sum);
             return;
@@ -32,7 +32,7 @@ fn end_run(q: u32, pixel: u32) {
     }
     if used[q] < views[which].weight_slots {
         let at = views[which].slot_start + pixels * (1u + 2u * used[q]) + pixel;
-        slots[at] = run_index[q];
+        slots[at] = run_entry[q];
         slots[at + pixels] = bitcast<u32>(run_weight[q]);
     }
     used[q]++;
@@ -46,9 +46,9 @@ fn add_label(label: u32, row: vec4<f32>, share: f32, q: u32, pixel: u32) {
     if label == 0u {
         return;
     }
-    if label != run_index[q] {
+    if label != run_entry[q] {
         end_run(q, pixel);
-        run_index[q] = label;
+        run_entry[q] = label;
         run_weight[q] = 0.0;
     }
     run_weight[q] += share;

@@ -405,8 +405,8 @@ fn errors_page() -> String {
     );
     let source = read("crates/core/src/error.rs");
     for row in &TABLE {
-        let variant = format!("    {:?},", row.code);
-        let at = source.find(&variant).expect("each code stands in the enum");
+        let variant = format!("    {:?}: ", row.code);
+        let at = source.find(&variant).expect("each code stands in the table");
         let mut said: Vec<&str> = Vec::new();
         for line in source[..at].lines().rev().skip_while(|line| line.trim().is_empty()) {
             let Some(comment) = line.trim().strip_prefix("/// ") else { break };

@@ -7,50 +7,6 @@ use std::fmt;
 /// Result of everything fallible in this crate.
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
-/// Stable, machine-readable kind of an error.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-#[non_exhaustive]
-pub enum ErrorCode {
-    /// The request itself is wrong: a missing part, a bad number, an impossible pose.
-    InvalidRequest,
-    /// A photo or archive cannot be read as what it claims to be.
-    PhotoUnreadable,
-    /// A stated limit is exceeded; the message names limit, value and maximum.
-    LimitExceeded,
-    /// No scene of this id.
-    SceneNotFound,
-    /// No such route or resource.
-    NotFound,
-    /// The path is there, but not with this method.
-    MethodNotAllowed,
-    /// The scene exists but is not done, or its semantics are still being made.
-    SceneNotReady,
-    /// A text was asked of a scene that was made with `semantics=off`.
-    SemanticsOff,
-    /// No key was shown, or one that nobody knows.
-    Unauthenticated,
-    /// The key may not do this: its scope is too narrow.
-    PermissionDenied,
-    /// Too much work is queued; try again after the time given.
-    Overloaded,
-    /// The server is stopping; another one, or the next, takes the call.
-    Stopping,
-    /// The deadline of the call passed.
-    DeadlineExceeded,
-    /// The caller went away or asked to stop.
-    Cancelled,
-    /// The model bundle or ONNX Runtime is missing or does not match its manifest.
-    ModelUnavailable,
-    /// The store cannot be read or written now.
-    StoreUnavailable,
-    /// No usable GPU adapter where one was required.
-    GpuUnavailable,
-    /// A stored scene fails its checksum or has an unknown version.
-    SceneCorrupt,
-    /// A fault of ours.
-    Internal,
-}
-
 /// One row of the error table.
 #[derive(Clone, Copy, Debug)]
 pub struct ErrorRow {
@@ -68,62 +24,87 @@ pub struct ErrorRow {
     pub retry: bool,
 }
 
-const fn row(
-    code: ErrorCode,
-    name: &'static str,
-    http: u16,
-    grpc: i32,
-    exit: u8,
-    retry: bool,
-) -> ErrorRow {
-    ErrorRow { code, name, http, grpc, exit, retry }
+macro_rules! table {
+    ($($(#[$doc:meta])+ $code:ident: $name:literal, $http:literal, $grpc:literal, $exit:literal,
+        $retry:literal;)+) => {
+        /// Stable, machine-readable kind of an error.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+        #[non_exhaustive]
+        pub enum ErrorCode {
+            $($(#[$doc])+ $code,)+
+        }
+
+        /// The one table, in the order of the codes. gRPC numbers are those of `google.rpc.Code`.
+        pub static TABLE: [ErrorRow; [$(ErrorCode::$code),+].len()] = [
+            $(ErrorRow {
+                code: ErrorCode::$code,
+                name: $name,
+                http: $http,
+                grpc: $grpc,
+                exit: $exit,
+                retry: $retry,
+            },)+
+        ];
+    };
 }
 
-/// The one table. gRPC numbers are those of `google.rpc.Code`.
-pub const TABLE: [ErrorRow; 19] = [
-    row(ErrorCode::InvalidRequest, "invalid_request", 400, 3, 2, false),
-    row(ErrorCode::PhotoUnreadable, "photo_unreadable", 422, 3, 2, false),
-    row(ErrorCode::LimitExceeded, "limit_exceeded", 413, 3, 2, false),
-    row(ErrorCode::SceneNotFound, "scene_not_found", 404, 5, 3, false),
-    row(ErrorCode::NotFound, "not_found", 404, 5, 3, false),
-    row(ErrorCode::MethodNotAllowed, "method_not_allowed", 405, 12, 3, false),
-    row(ErrorCode::SceneNotReady, "scene_not_ready", 409, 9, 4, true),
-    row(ErrorCode::SemanticsOff, "semantics_off", 409, 9, 4, false),
-    row(ErrorCode::Unauthenticated, "unauthenticated", 401, 16, 8, false),
-    row(ErrorCode::PermissionDenied, "permission_denied", 403, 7, 8, false),
-    row(ErrorCode::Overloaded, "overloaded", 429, 8, 5, true),
-    row(ErrorCode::Stopping, "stopping", 503, 14, 6, true),
-    row(ErrorCode::DeadlineExceeded, "deadline_exceeded", 504, 4, 5, true),
-    row(ErrorCode::Cancelled, "cancelled", 499, 1, 5, false),
-    row(ErrorCode::ModelUnavailable, "model_unavailable", 503, 14, 6, true),
-    row(ErrorCode::StoreUnavailable, "store_unavailable", 503, 14, 6, true),
-    row(ErrorCode::GpuUnavailable, "gpu_unavailable", 503, 14, 6, true),
-    row(ErrorCode::SceneCorrupt, "scene_corrupt", 500, 15, 7, false),
-    row(ErrorCode::Internal, "internal", 500, 13, 1, false),
-];
+// Code: name, HTTP status, gRPC status, exit code, whether the same call may succeed later.
+table! {
+    /// The request itself is wrong: a missing part, a bad number, an impossible pose.
+    InvalidRequest: "invalid_request", 400, 3, 2, false;
+    /// A photo or archive cannot be read as what it claims to be.
+    PhotoUnreadable: "photo_unreadable", 422, 3, 2, false;
+    /// A stated limit is exceeded; the message names limit, value and maximum.
+    LimitExceeded: "limit_exceeded", 413, 3, 2, false;
+    /// No scene of this id.
+    SceneNotFound: "scene_not_found", 404, 5, 3, false;
+    /// No such route or resource.
+    NotFound: "not_found", 404, 5, 3, false;
+    /// The path is there, but not with this method.
+    MethodNotAllowed: "method_not_allowed", 405, 12, 3, false;
+    /// The scene exists but is not done, or its semantics are still being made.
+    SceneNotReady: "scene_not_ready", 409, 9, 4, true;
+    /// A text was asked of a scene that was made with `semantics=off`.
+    SemanticsOff: "semantics_off", 409, 9, 4, false;
+    /// No key was shown, or one that nobody knows.
+    Unauthenticated: "unauthenticated", 401, 16, 8, false;
+    /// The key may not do this: its scope is too narrow.
+    PermissionDenied: "permission_denied", 403, 7, 8, false;
+    /// Too much work is queued; try again after the time given.
+    Overloaded: "overloaded", 429, 8, 5, true;
+    /// The server is stopping; another one, or the next, takes the call.
+    Stopping: "stopping", 503, 14, 6, true;
+    /// The deadline of the call passed.
+    DeadlineExceeded: "deadline_exceeded", 504, 4, 5, true;
+    /// The caller went away or asked to stop.
+    Cancelled: "cancelled", 499, 1, 5, false;
+    /// The model bundle or ONNX Runtime is missing or does not match its manifest.
+    ModelUnavailable: "model_unavailable", 503, 14, 6, true;
+    /// The store cannot be read or written now.
+    StoreUnavailable: "store_unavailable", 503, 14, 6, true;
+    /// No usable GPU adapter where one was required.
+    GpuUnavailable: "gpu_unavailable", 503, 14, 6, true;
+    /// A stored scene fails its checksum or has an unknown version.
+    SceneCorrupt: "scene_corrupt", 500, 15, 7, false;
+    /// A fault of ours.
+    Internal: "internal", 500, 13, 1, false;
+}
 
 impl ErrorCode {
     /// The row of this code.
-    #[must_use]
-    #[expect(clippy::missing_panics_doc, reason = "a test finds a row for every code")]
     pub fn row(self) -> &'static ErrorRow {
-        TABLE
-            .iter()
-            .find(|row| row.code == self)
-            .expect("every code has a row (tested); this is a bug")
+        &TABLE[self as usize]
     }
 
     /// Stable `snake_case` name.
-    #[must_use]
     pub fn name(self) -> &'static str {
         self.row().name
     }
 }
 
-/// An error with its code and a message that names the input, the value and the bound.
-///
-/// The message is shown to clients: it holds no path of this machine and no source chain.
-/// The source, where there is one, is for the log.
+/// An error with its code and a message that names the input, the value and the bound. The message
+/// is shown to clients: it holds no path of this machine and no source chain. The source, where
+/// there is one, is for the log.
 #[derive(Debug, thiserror::Error)]
 #[error("{message}")]
 pub struct Error {
@@ -183,35 +164,17 @@ impl Error {
     }
 
     /// The code.
-    #[must_use]
     pub fn code(&self) -> ErrorCode {
         self.code
     }
 
     /// The message for the client.
-    #[must_use]
     pub fn message(&self) -> &str {
         &self.message
     }
 
     /// Seconds after which a retry may succeed.
-    #[must_use]
     pub fn retry_after(&self) -> Option<u32> {
         self.retry_after_s
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use std::collections::HashSet;
-
-    #[test]
-    fn names_are_unique_and_every_row_finds_itself() {
-        let names: HashSet<_> = TABLE.iter().map(|row| row.name).collect();
-        assert_eq!(names.len(), TABLE.len(), "two codes share a name");
-        for row in &TABLE {
-            assert_eq!(row.code.row().name, row.name, "row of another code");
-        }
     }
 }

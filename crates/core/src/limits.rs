@@ -12,121 +12,145 @@ pub const IDEMPOTENCY_KEY_BYTES_MAX: usize = 256;
 /// bounds what the products of all pairs of rows take.
 pub const BANK_ROWS_MAX: usize = 4_096;
 
-/// [`Limits::layers_cache_bytes_max`] unless something else is said.
-pub const LAYERS_CACHE_BYTES_MAX: u64 = 512 << 20;
+/// Declares the limits: name, type and default; `restart` where a new number counts only after a
+/// restart, because it sizes something at start.
+macro_rules! limits {
+    ($($(#[$doc:meta])+ $name:ident: $type:ty = $default:expr $(, $restart:ident)?;)+) => {
+        /// Caps on what a caller may send or ask for.
+        #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+        #[serde(default, deny_unknown_fields)]
+        pub struct Limits {
+            $($(#[$doc])+ pub $name: $type,)+
+        }
 
-/// [`Limits::magnified_cache_bytes_max`] unless something else is said.
-pub const MAGNIFIED_CACHE_BYTES_MAX: u64 = 256 << 20;
+        impl Default for Limits {
+            fn default() -> Self {
+                Self { $($name: $default,)+ }
+            }
+        }
 
-/// Caps on what a caller may send or ask for.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Limits {
+        impl Limits {
+            /// Names of the limits that differ in `new` and count only after a restart.
+            pub fn changed_for_next_start(&self, new: &Self) -> Vec<&'static str> {
+                let mut names = Vec::new();
+                $($(
+                    let $restart = stringify!($name);
+                    if self.$name != new.$name {
+                        names.push($restart);
+                    }
+                )?)+
+                names
+            }
+        }
+    };
+}
+
+limits! {
     /// Photos in one scene: the pipeline's time grows with their number.
-    pub photos_max: usize,
+    photos_max: usize = 64;
     /// Fewest photos that give parallax.
-    pub photos_min: usize,
+    photos_min: usize = 2;
     /// Bytes of one upload, all parts together.
-    pub upload_bytes_max: usize,
+    upload_bytes_max: usize = 256 << 20;
     /// Bytes of all uploads being received; one more byte is refused as `overloaded`.
-    pub uploads_bytes_max: usize,
+    uploads_bytes_max: usize = 1 << 30, restart;
     /// Bytes of one JSON part (`transforms`, `cameras`) or JSON body.
-    pub json_bytes_max: usize,
+    json_bytes_max: usize = 8 << 20;
     /// Values in one JSON part or body, counted before it is read: eight megabytes of empty objects
     /// would take hundreds of megabytes. 64 cameras have some 2,000.
-    pub json_values_max: usize,
+    json_values_max: usize = 250_000;
     /// Pixels of one photo, read from the header before decoding.
-    pub photo_pixels_max: u64,
+    photo_pixels_max: u64 = 24_000_000;
     /// Longer side in pixels to which a photo is reduced after decoding: no stage looks closer, and
     /// it bounds the memory of a full upload.
-    pub photo_side_kept_max: u32,
-    /// Entries in an archive, files and folders alike.
-    pub archive_entries_max: usize,
+    photo_side_kept_max: u32 = 2_048;
+    /// Files and folders in an archive.
+    archive_entries_max: usize = 1_024;
     /// Bytes of one archive unpacked: what a zip bomb meets.
-    pub archive_unpacked_bytes_max: u64,
+    archive_unpacked_bytes_max: u64 = 512 << 20;
     /// Length of a photo's file name in bytes.
-    pub file_name_bytes_max: usize,
+    file_name_bytes_max: usize = 256;
     /// Width or height of a rendered view in pixels.
-    pub view_side_max: u32,
+    view_side_max: u32 = 4_096;
     /// Cameras in one `views` request.
-    pub cameras_max: usize,
+    cameras_max: usize = 64;
     /// Kinds of picture in one `views` request.
-    pub kinds_max: usize,
+    kinds_max: usize = 8;
     /// Texts in one `query` request, and labels in one `pick`.
-    pub texts_max: usize,
+    texts_max: usize = 128;
     /// Characters of one text: more than any noun phrase needs.
-    pub text_chars_max: usize,
+    text_chars_max: usize = 256;
     /// Milliseconds a text waits for semantics that are being made, unless it says how long.
-    pub text_wait_ms: u64,
+    text_wait_ms: u64 = 120_000;
     /// Embeddings of texts kept in memory, those asked last: a few kilobytes each.
-    pub texts_cached_max: usize,
+    texts_cached_max: usize = 4_096, restart;
     /// Bytes of banks kept in memory ready to be scored.
-    pub scorers_cache_bytes_max: u64,
+    scorers_cache_bytes_max: u64 = 512 << 20, restart;
     /// Bytes of views' semantic entries kept in memory, so that the next text draws nothing.
-    pub entries_cache_bytes_max: u64,
+    entries_cache_bytes_max: u64 = 512 << 20, restart;
     /// Bytes of layers kept for views to come: three camera sets of a scene of sixteen photos.
-    pub layers_cache_bytes_max: u64,
+    layers_cache_bytes_max: u64 = 512 << 20;
     /// Bytes of magnified Gaussians kept for views to come: thirty views of a scene of two photos.
-    pub magnified_cache_bytes_max: u64,
-    /// Memory of the connected pieces of scenes that were asked for boxes, bytes.
-    pub pieces_cache_bytes_max: u64,
+    magnified_cache_bytes_max: u64 = 256 << 20;
+    /// Bytes kept of the parts of scenes that were looked for to give boxes.
+    pieces_cache_bytes_max: u64 = 128 << 20;
     /// Parts of one text's selection that an answer lists, the largest first.
-    pub parts_max: usize,
+    parts_max: usize = 64;
     /// Bytes of photos that the create call read, kept in memory for the jobs of their scenes. A
     /// job whose photos do not fit reads them again.
-    pub read_uploads_bytes_max: u64,
+    read_uploads_bytes_max: u64 = 512 << 20, restart;
     /// Jobs that wait; one more is refused as `overloaded`.
-    pub queued_jobs_max: usize,
+    queued_jobs_max: usize = 64, restart;
     /// Renders at work or waiting; one more is refused as `overloaded`.
-    pub queued_renders_max: usize,
+    queued_renders_max: usize = 256;
     /// Pixels of renders at work or waiting. One render may take a quarter of what is left, so that
     /// large views leave room for small ones; else it is refused as `overloaded`.
-    pub queued_pixels_max: u64,
+    queued_pixels_max: u64 = 256 << 20;
     /// Pixels of renders at work: being drawn or encoded, some 20 to 30 bytes each. A larger view
     /// is drawn alone.
-    pub active_pixels_max: u64,
+    active_pixels_max: u64 = 64 << 20, restart;
     /// Pixels of all pictures of one `views` request.
-    pub views_pixels_max: u64,
+    views_pixels_max: u64 = 512 << 20;
     /// Milliseconds one `views` request may take.
-    pub views_timeout_ms: u64,
+    views_timeout_ms: u64 = 300_000;
     /// Bytes of scenes kept in memory.
-    pub cache_bytes_max: u64,
+    cache_bytes_max: u64 = 4 << 30, restart;
     /// Bytes of scenes kept on one GPU device: what a card of 8 GB has to spare beside its frames.
-    pub device_scene_bytes_max: u64,
+    device_scene_bytes_max: u64 = 2 << 30;
     /// Milliseconds in which the head of a request must come, from the connection's start or the
     /// end of the call before it. A connection that sends none in this time is closed.
-    pub head_timeout_ms: u64,
+    head_timeout_ms: u64 = 10_000, restart;
     /// Bytes that a request's body must bring in each `body_window_ms` that it is waited for.
-    pub body_bytes_min: usize,
+    body_bytes_min: usize = 8 << 10, restart;
     /// Milliseconds in which `body_bytes_min` must come: half a kilobyte a second, unless set.
-    pub body_window_ms: u64,
+    body_window_ms: u64 = 16_000, restart;
     /// Milliseconds one render may take.
-    pub render_timeout_ms: u64,
+    render_timeout_ms: u64 = 30_000;
     /// Milliseconds one scene may take.
-    pub scene_timeout_ms: u64,
+    scene_timeout_ms: u64 = 600_000, restart;
     /// Milliseconds a caller may hold a request open with `wait_ms`.
-    pub wait_ms_max: u64,
+    wait_ms_max: u64 = 600_000;
     /// Requests a second of one API key that says no number of its own; a second's worth at once.
-    pub key_requests_per_s: u32,
+    key_requests_per_s: u32 = 500;
     /// Calls of one API key that may be open at the same time, where it says no number of its own.
-    pub key_inflight_max: usize,
+    key_inflight_max: usize = 128;
     /// Milliseconds one call to the store may take.
-    pub store_timeout_ms: u64,
+    store_timeout_ms: u64 = 60_000;
     /// Milliseconds between two looks for what a crash left in the store.
-    pub sweep_every_ms: u64,
+    sweep_every_ms: u64 = 600_000;
     /// Milliseconds for which a replica believes what it read of a scene made elsewhere.
-    pub record_fresh_ms: u64,
+    record_fresh_ms: u64 = 1_000;
     /// Milliseconds between two heartbeats of a replica.
-    pub replica_beat_ms: u64,
+    replica_beat_ms: u64 = 2_000;
     /// Milliseconds without a heartbeat after which others make a replica's scenes.
-    pub replica_lease_ms: u64,
+    replica_lease_ms: u64 = 10_000;
     /// Resident bytes of the process beyond which uploads are refused as `overloaded`; 0: four
     /// fifths of what the machine or the container has.
-    pub memory_bytes_max: u64,
+    memory_bytes_max: u64 = 0;
     /// Scenes on one page of a list.
-    pub page_max: usize,
+    page_max: usize = 100;
     /// Gaussians in one scene, made or imported.
-    pub gaussians_max: usize,
+    gaussians_max: usize = 16_777_216;
 }
 
 impl Limits {
@@ -137,11 +161,8 @@ impl Limits {
     pub fn check_json(&self, what: &str, json: &[u8]) -> Result<()> {
         let (bytes, max) = (json.len(), self.json_bytes_max);
         if bytes > max {
-            return Err(Error::limit(
-                what,
-                format!("{bytes} bytes of JSON"),
-                format!("{max} bytes"),
-            ));
+            let bytes = format!("{bytes} bytes of JSON");
+            return Err(Error::limit(what, bytes, format!("{max} bytes")));
         }
         let (mut values, mut in_text, mut escaped) = (1_usize, false, false);
         for byte in json {
@@ -158,109 +179,5 @@ impl Limits {
             return Err(Error::limit(what, format!("{values} values of JSON"), max));
         }
         Ok(())
-    }
-
-    /// Names of the caps that size something made at start: a changed one needs a restart.
-    #[must_use]
-    pub fn changed_for_next_start(&self, new: &Self) -> Vec<&'static str> {
-        let mut names = Vec::new();
-        macro_rules! compare {
-            ($($field:ident),*) => {
-                $(if self.$field != new.$field { names.push(stringify!($field)); })*
-            };
-        }
-        compare!(
-            uploads_bytes_max,
-            texts_cached_max,
-            scorers_cache_bytes_max,
-            entries_cache_bytes_max,
-            read_uploads_bytes_max,
-            queued_jobs_max,
-            queued_renders_max,
-            active_pixels_max,
-            head_timeout_ms,
-            body_bytes_min,
-            body_window_ms,
-            cache_bytes_max,
-            scene_timeout_ms
-        );
-        names
-    }
-}
-
-impl Default for Limits {
-    fn default() -> Self {
-        Self {
-            photos_max: 64,
-            photos_min: 2,
-            upload_bytes_max: 256 << 20,
-            uploads_bytes_max: 1 << 30,
-            json_bytes_max: 8 << 20,
-            json_values_max: 250_000,
-            photo_pixels_max: 24_000_000,
-            photo_side_kept_max: 2_048,
-            archive_entries_max: 1_024,
-            archive_unpacked_bytes_max: 512 << 20,
-            file_name_bytes_max: 256,
-            view_side_max: 4_096,
-            cameras_max: 64,
-            kinds_max: 8,
-            texts_max: 128,
-            text_chars_max: 256,
-            text_wait_ms: 120_000,
-            texts_cached_max: 4_096,
-            scorers_cache_bytes_max: 512 << 20,
-            entries_cache_bytes_max: 512 << 20,
-            layers_cache_bytes_max: LAYERS_CACHE_BYTES_MAX,
-            magnified_cache_bytes_max: MAGNIFIED_CACHE_BYTES_MAX,
-            pieces_cache_bytes_max: 128 << 20,
-            parts_max: 64,
-            read_uploads_bytes_max: 512 << 20,
-            queued_jobs_max: 64,
-            queued_renders_max: 256,
-            queued_pixels_max: 256 << 20,
-            active_pixels_max: 64 << 20,
-            views_pixels_max: 512 << 20,
-            views_timeout_ms: 300_000,
-            cache_bytes_max: 4 << 30,
-            device_scene_bytes_max: 2 << 30,
-            head_timeout_ms: 10_000,
-            body_bytes_min: 8 << 10,
-            body_window_ms: 16_000,
-            render_timeout_ms: 30_000,
-            scene_timeout_ms: 600_000,
-            wait_ms_max: 600_000,
-            key_requests_per_s: 500,
-            key_inflight_max: 128,
-            store_timeout_ms: 60_000,
-            sweep_every_ms: 600_000,
-            record_fresh_ms: 1_000,
-            replica_beat_ms: 2_000,
-            replica_lease_ms: 10_000,
-            memory_bytes_max: 0,
-            page_max: 100,
-            gaussians_max: 16_777_216,
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn values_of_a_json_text_are_counted_outside_of_its_strings() {
-        let limits = |json_values_max| Limits { json_values_max, ..Limits::default() };
-        for (json, count) in [
-            ("7", 1),
-            ("[1,2,3]", 4),
-            (r#"{"a":[{},{}],"b":"[,:{"}"#, 9),
-            (r#""\",[\\""#, 1),
-            (r#"["\\",2]"#, 3),
-        ] {
-            limits(count).check_json("x", json.as_bytes()).expect(json);
-            let error = limits(count - 1).check_json("x", json.as_bytes()).unwrap_err();
-            assert!(error.message().contains(&format!("{count} values")), "{json}: {error}");
-        }
     }
 }

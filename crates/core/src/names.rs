@@ -15,7 +15,6 @@ pub fn named<T: for<'de> Deserialize<'de>>(name: &str) -> Result<T, String> {
 }
 
 /// A number for a message: 1e308, not 309 digits.
-#[must_use]
 pub fn shown(number: f64) -> String {
     let plain = number == 0.0 || !number.is_finite() || (1e-6..1e16).contains(&number.abs());
     if plain { number.to_string() } else { format!("{number:e}") }
@@ -34,15 +33,3 @@ macro_rules! display_names {
 }
 
 pub use display_names;
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn numbers_are_short() {
-        let numbers = [0.0, -5.0, 1.5, 0.000_002, 1e15, 1e308, -1e-300, f64::NAN];
-        let want = ["0", "-5", "1.5", "0.000002", "1000000000000000", "1e308", "-1e-300", "NaN"];
-        assert_eq!(numbers.map(shown), want);
-    }
-}

@@ -44,7 +44,6 @@ pub struct Compared {
 
 /// Peak signal-to-noise ratio in dB of colours in 0..1, over the pixels that are valid; at most
 /// [`PSNR_MAX`].
-#[must_use]
 pub fn psnr(picture: &[[f32; 3]], truth: &[[f32; 3]], valid: Option<&[bool]>) -> f64 {
     let (mut sum, mut count) = (0.0, 0_u64);
     for (i, (a, b)) in picture.iter().zip(truth).enumerate() {
@@ -60,7 +59,6 @@ pub fn psnr(picture: &[[f32; 3]], truth: &[[f32; 3]], valid: Option<&[bool]>) ->
 }
 
 /// Largest difference of each pixel over its channels; a NaN is infinitely far.
-#[must_use]
 pub fn differences(got: &Frame, want: &Frame) -> Vec<f32> {
     let colors = got.color.as_ref().zip(want.color.as_ref());
     let depths = got.depth.as_ref().zip(want.depth.as_ref());
@@ -109,7 +107,7 @@ pub fn compare(
     let far: Vec<usize> = (0..apart.len()).filter(|&i| apart[i] > DIFFERENCE_MAX).collect();
     let pixels: Vec<[u32; 2]> =
         far.iter().map(|&i| [i as u32 % want.width, i as u32 / want.width]).collect();
-    let truth = oracle::render_pixels(gaussians, request, oracle::DepthKey::F32, &pixels)?;
+    let truth = oracle::render_pixels(gaussians, request, &pixels)?;
     let far = far.into_iter().zip(pixels).zip(&truth).map(|((i, at), truth)| (i, at, truth));
     Ok(Compared::of(&apart, got, want, far))
 }
@@ -130,7 +128,7 @@ pub fn compare_oracle(
         [(share % u64::from(got.width)) as u32, (share / u64::from(got.width)) as u32]
     };
     let pixels: Vec<[u32; 2]> = (0..ORACLE_PIXELS as u64).map(place).collect();
-    let truth = oracle::render_pixels(gaussians, request, oracle::DepthKey::F32, &pixels)?;
+    let truth = oracle::render_pixels(gaussians, request, &pixels)?;
     let width = ORACLE_PIXELS as u32;
     let blank = || Frame { width, height: 1, ..Frame::default() };
     let want = Frame {

@@ -46,7 +46,6 @@ impl Labels {
 
     /// The row of the table for an entry; zeros where the table is empty.
     #[inline]
-    #[must_use]
     pub fn row(table: &[[f32; BLEND_WIDTH]], entry: u16) -> [f32; BLEND_WIDTH] {
         table.get(usize::from(entry)).or_else(|| table.first()).copied().unwrap_or_default()
     }
@@ -64,7 +63,6 @@ pub struct WeightRows {
 
 impl WeightRows {
     /// `rows` rows of `width` pixels without weights.
-    #[must_use]
     pub fn new(rows: usize, width: usize) -> Self {
         Self { counts: vec![0; rows * width], rows: vec![Vec::new(); rows], width }
     }
@@ -78,9 +76,7 @@ impl WeightRows {
     }
 
     /// Joins bands of a view, from top to bottom.
-    ///
-    /// # Errors
-    /// `limit_exceeded` when there are more weights than [`PIXEL_WEIGHTS_MAX`].
+    /// Errors: `limit_exceeded` when there are more weights than [`PIXEL_WEIGHTS_MAX`].
     pub(super) fn join(parts: Vec<Self>) -> Result<PixelWeights> {
         let total: usize = parts.iter().flat_map(|part| &part.rows).map(Vec::len).sum();
         check_total(total)?;
@@ -107,9 +103,7 @@ impl WeightRows {
 }
 
 /// `front` over `behind`, of which pixel i shows the share `room(i)`, 0..1.
-///
-/// # Errors
-/// `limit_exceeded` when there are more weights than [`PIXEL_WEIGHTS_MAX`].
+/// Errors: `limit_exceeded` when there are more weights than [`PIXEL_WEIGHTS_MAX`].
 pub(super) fn over(
     front: &PixelWeights,
     behind: &PixelWeights,
@@ -149,7 +143,6 @@ fn check_total(total: usize) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::error::ErrorCode;
 
     fn weights(pixels: &[&[(u16, f32)]]) -> PixelWeights {
         let mut rows = WeightRows::new(1, pixels.len());
@@ -185,19 +178,5 @@ mod tests {
         let want =
             weights(&[&[(1, 0.125), (2, 0.625), (5, 0.25), (9, 0.25)], &[(1, 1.0)], &[(4, 0.5)]]);
         assert_eq!(all, want);
-    }
-
-    #[test]
-    fn a_table_must_be_finite_and_an_entry_beyond_it_is_0() {
-        let table = [[9.0; 4], [1.0; 4], [2.0; 4]];
-        assert_eq!(Labels::row(&table, 2), [2.0; 4], "the last row");
-        assert_eq!(Labels::row(&table, 3), [9.0; 4], "beyond the table");
-        assert_eq!(Labels::row(&[], 3), [0.0; 4], "no table");
-        Labels::Blend(table.into()).check().expect("finite numbers");
-        let mut bad = table;
-        bad[1][2] = f32::NAN;
-        let error = Labels::Blend(bad.into()).check().expect_err("a NaN");
-        assert_eq!(error.code(), ErrorCode::InvalidRequest, "{error}");
-        assert!(error.message().starts_with("labels: row 1"), "{error}");
     }
 }

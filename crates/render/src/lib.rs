@@ -12,19 +12,23 @@ pub mod labels;
 pub mod oracle;
 pub mod plan;
 pub mod select;
-pub mod skip;
+pub mod switches;
 pub mod view;
 
 pub use segsplat_core::scene::PixelWeights;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
 
 pub use self::{
     labels::Labels,
     plan::ViewPlanner,
     select::{RendererChoice, RendererOptions},
+    switches::{Skip, Switches},
 };
 use crate::{
     error::Result,
     scene::{Camera, Gaussians, Intrinsics, Region},
+    view::View,
 };
 use segsplat_core::{error, limits, scene};
 
@@ -49,17 +53,7 @@ impl Kinds {
 }
 
 /// How closely a renderer keeps to the model; `docs/conventions.md` bounds what `Fast` may differ.
-#[derive(
-    Clone,
-    Copy,
-    Debug,
-    Default,
-    PartialEq,
-    Eq,
-    serde::Serialize,
-    serde::Deserialize,
-    utoipa::ToSchema,
-)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Quality {
     /// f32 all through.
@@ -101,7 +95,6 @@ pub struct RenderRequest {
 impl RenderRequest {
     /// A view as a caller gets it who asks for nothing in particular: the whole picture, exact,
     /// over black, without labels.
-    #[must_use]
     pub fn plain(camera: Camera, kinds: Kinds, near: f32) -> Self {
         Self {
             camera,
@@ -116,7 +109,6 @@ impl RenderRequest {
     }
 
     /// Intrinsics of the picture that comes out: those of the part, where one is asked for.
-    #[must_use]
     pub fn lens(&self) -> Intrinsics {
         let whole = self.camera.intrinsics;
         self.crop.map_or(whole, |crop| whole.part(crop))
@@ -153,8 +145,34 @@ pub struct Frame {
     pub stats: FrameStats,
 }
 
+impl Frame {
+    /// Pictures of zeros, `filled` pixels of each kind that is asked for. Without weights.
+    fn blank([width, height]: [u32; 2], request: &RenderRequest, filled: usize) -> Self {
+        let RenderRequest { kinds, labels, .. } = request;
+        Self {
+            width,
+            height,
+            color: kinds.color.then(|| vec![[0.0; 3]; filled]),
+            depth: kinds.depth.then(|| vec![0.0; filled]),
+            alpha: kinds.alpha.then(|| vec![0.0; filled]),
+            blend: matches!(labels, Labels::Blend(_)).then(|| vec![[0.0; 4]; filled]),
+            weights: None,
+            stats: FrameStats::default(),
+        }
+    }
+
+    /// A frame without Gaussians.
+    fn background(view: &View, request: &RenderRequest) -> Self {
+        let pixels = view.width as usize * view.height as usize;
+        let mut frame = Self::blank([view.width, view.height], request, pixels);
+        frame.color.iter_mut().for_each(|color| color.fill(request.background));
+        frame.weights = (request.labels == Labels::Weights).then(|| PixelWeights::none(pixels));
+        frame
+    }
+}
+
 /// Time of one dispatch, by the device's own clock.
-#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct DispatchTime {
     /// Kernel.
     pub stage: &'static str,
@@ -163,7 +181,7 @@ pub struct DispatchTime {
 }
 
 /// Times of one frame on a device, by its own clock.
-#[derive(Clone, Debug, Default, PartialEq, serde::Serialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct DeviceTimes {
     /// From before the first stage to after the last, no stage marked between: milliseconds.
     pub total_ms: f64,
@@ -182,8 +200,9 @@ pub trait Renderer: Send + Sync {
     /// Renders one view.
     ///
     /// # Errors
-    /// `limit_exceeded` when the work does not fit the device's limits, `gpu_unavailable` when the
-    /// device is lost, `internal` for a fault of ours. An empty scene is a clean background.
+    /// `limit_exceeded` when the work does not fit the device's limits, `gpu_unavailable`
+    /// when the device is lost, `internal` for a fault of ours. An empty scene is a clean
+    /// background.
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame>;
 
     /// Renders one view for the times of it on the device; `None` where none keeps them.

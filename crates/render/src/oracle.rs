@@ -30,16 +30,6 @@ pub const CLIFF_TRANSMITTANCE: f64 = 1e-3;
 /// Relative difference of two depths under which f32 arithmetic may swap them.
 pub const CLIFF_DEPTH: f64 = 1e-6;
 
-/// By which key the oracle sorts.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum DepthKey {
-    /// t.z narrowed to f32, ties by index: the model.
-    #[default]
-    F32,
-    /// t.z in f64, to report what the narrower key changes.
-    F64,
-}
-
 /// Why a pixel may rightly differ.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Cliff {
@@ -56,13 +46,11 @@ pub struct Cliff {
 
 impl Cliff {
     /// Whether a renderer that sorts by the very key of the oracle may differ here.
-    #[must_use]
     pub fn same_order(self) -> bool {
         self.alpha || self.transmittance
     }
 
     /// Whether a renderer with depths and places of its own, in f32, may differ here.
-    #[must_use]
     pub fn any(self) -> bool {
         self.alpha || self.transmittance || self.depth || self.place
     }
@@ -79,7 +67,7 @@ pub struct OraclePixel {
     pub alpha: f64,
     /// Blended rows of the request's table; zeros where none was given.
     pub blend: [f64; 4],
-    /// Weight of each index but 0, where weights were asked for.
+    /// Weight of each entry but 0, where weights were asked for.
     pub weights: BTreeMap<u16, f64>,
     /// Edges it stands on.
     pub cliff: Cliff,
@@ -92,7 +80,7 @@ pub struct OraclePixel {
 pub fn render(gaussians: &Gaussians, request: &RenderRequest) -> Result<Vec<OraclePixel>> {
     let Intrinsics { width, height, .. } = request.lens();
     let pixels: Vec<[u32; 2]> = (0..height).flat_map(|y| (0..width).map(move |x| [x, y])).collect();
-    render_pixels(gaussians, request, DepthKey::F32, &pixels)
+    render_pixels(gaussians, request, &pixels)
 }
 
 /// Renders the pixels (column, row of the part drawn) given, in their order: for pictures too
@@ -105,18 +93,14 @@ pub fn render(gaussians: &Gaussians, request: &RenderRequest) -> Result<Vec<Orac
 pub fn render_pixels(
     gaussians: &Gaussians,
     request: &RenderRequest,
-    key: DepthKey,
     pixels: &[[u32; 2]],
 ) -> Result<Vec<OraclePixel>> {
     let lens = request.camera.intrinsics.validated("camera")?;
     let corner = request.crop.map_or([0, 0], |crop| [crop.x, crop.y]);
     let mut splats: Vec<Splat> =
         (0..gaussians.len()).filter_map(|i| splat(gaussians, i, request, &lens)).collect();
-    // Stable, so ties stay in the order of the index.
-    match key {
-        DepthKey::F32 => splats.sort_by(|a, b| (a.depth as f32).total_cmp(&(b.depth as f32))),
-        DepthKey::F64 => splats.sort_by(|a, b| a.depth.total_cmp(&b.depth)),
-    }
+    // t.z narrowed to f32 is the key of the model. Stable, so ties stay in the order of the scene.
+    splats.sort_by(|a, b| (a.depth as f32).total_cmp(&(b.depth as f32)));
     // Pixels of one row share the list of Gaussians that can reach the row.
     let mut by_row: Vec<usize> = (0..pixels.len()).collect();
     by_row.sort_by_key(|&i| pixels[i][1]);
@@ -195,7 +179,7 @@ struct Splat {
     opacity: f64,
     depth: f64,
     color: DVec3,
-    label: u16,
+    entry: u16,
 }
 
 impl Splat {
@@ -273,7 +257,7 @@ fn splat(
         opacity,
         depth: t.z,
         color: color(&gaussians.sh()[i * k..(i + 1) * k], from_eye.normalize_or_zero()),
-        label: gaussians.semantic_index()[i],
+        entry: gaussians.semantic_index()[i],
     })
 }
 
@@ -338,13 +322,13 @@ fn pixel(near: &[&Splat], center: DVec2, request: &RenderRequest) -> OraclePixel
         match &request.labels {
             Labels::None => {}
             Labels::Blend(table) => {
-                let row = table.get(usize::from(splat.label)).or_else(|| table.first());
+                let row = table.get(usize::from(splat.entry)).or_else(|| table.first());
                 for (sum, value) in blend.iter_mut().zip(row.into_iter().flatten()) {
                     *sum += weight * f64::from(*value);
                 }
             }
-            Labels::Weights if splat.label == 0 => {}
-            Labels::Weights => *weights.entry(splat.label).or_insert(0.0) += weight,
+            Labels::Weights if splat.entry == 0 => {}
+            Labels::Weights => *weights.entry(splat.entry).or_insert(0.0) += weight,
         }
         transmittance = next;
     }

@@ -55,14 +55,12 @@ const THROUGH_MIN: f64 = 0.01;
 const ANSWER_BYTES: u64 = 256 << 10;
 
 /// The near plane of a scene whose median depth is `median_depth`, world units.
-#[must_use]
 pub fn default_near(median_depth: f64) -> f32 {
-    #[expect(clippy::cast_possible_truncation, reason = "clamped to the range accepted")]
     let near = (median_depth * NEAR_SHARE) as f32;
     if near.is_finite() && near > 0.0 { near.clamp(NEAR_RANGE[0], NEAR_RANGE[1]) } else { 0.01 }
 }
 
-/// Copies made of some Gaussians: by their identity, and the bits of all else that counts.
+/// Copies of Gaussians, by their identity and the bits of all else that counts.
 type Copies<T> = Cache<(u64, Vec<u64>), (T, Weak<()>)>;
 
 /// Chooses the Gaussians of views, and keeps the copies that it makes for them.
@@ -82,7 +80,6 @@ impl Default for ViewPlanner {
 
 impl ViewPlanner {
     /// Keeps copies of at most `layers_cache_bytes_max` and `magnified_cache_bytes_max` bytes.
-    #[must_use]
     pub fn new(limits: &Limits) -> Self {
         Self {
             layers: Cache::new(limits.layers_cache_bytes_max),
@@ -136,9 +133,7 @@ impl ViewPlanner {
                 fill(&scene.backdrop, &seen, color, alpha);
             } else {
                 for (pixel, alpha) in color.iter_mut().zip(alpha) {
-                    for (value, behind) in pixel.iter_mut().zip(request.background) {
-                        *value += (1.0 - alpha) * behind;
-                    }
+                    add(pixel, request.background, 1.0 - alpha);
                 }
             }
         }
@@ -188,7 +183,6 @@ impl ViewPlanner {
 
     /// The Gaussians in front and behind for a camera, or `None` where few photos made the scene.
     /// Cameras with the same photos in front get the same copies, while those are kept.
-    #[must_use]
     pub fn layers(&self, scene: &Scene, camera: &Camera) -> Option<Arc<[Gaussians; 2]>> {
         let focals = &scene.meta.report.network_focal_px;
         let depth = scene.meta.report.median_depth;
@@ -223,7 +217,6 @@ impl ViewPlanner {
 
     /// Gaussians of a scene for a view that magnifies them, or `None` where they are right as they
     /// are. The same camera gets the same copy, while it is kept.
-    #[must_use]
     pub fn magnified(
         &self,
         scene: &Scene,
@@ -260,7 +253,7 @@ impl ViewPlanner {
     }
 }
 
-/// The copy made of `gaussians`, or what `make` gives with its bytes. Nothing waits while it makes.
+/// The copy of `gaussians`, or what `make` gives with its bytes. `make` runs outside of the lock.
 fn kept<T: Clone>(
     copies: &Copies<T>,
     gaussians: &Gaussians,
@@ -272,7 +265,7 @@ fn kept<T: Clone>(
         return copy;
     }
     let (copy, size) = make();
-    // Another caller may have made it in the meantime: all go on with the first one.
+    // Another caller may have been faster: all go on with the first copy.
     if let Some((first, _)) = copies.find(&key) {
         return first;
     }
@@ -308,7 +301,6 @@ fn magnify(gaussians: &Gaussians, photos: &[Source], view: &Source) -> Option<Ga
             if depth <= 0.0 || p <= 1.0 || !p.is_finite() {
                 return 0.0;
             }
-            #[expect(clippy::cast_possible_truncation, reason = "scales are f32")]
             let variance = (width * width * (1.0 - 1.0 / (p * p))) as f32;
             BLUR_PX2 * variance
         })
@@ -322,9 +314,8 @@ fn magnify(gaussians: &Gaussians, photos: &[Source], view: &Source) -> Option<Ga
     Some(gaussians.with_scales(scales))
 }
 
-/// Puts the backdrop behind a view rendered over black: `color += (1 - alpha) * backdrop`.
-///
-/// `color` and `alpha` are `[height * width]` of the camera's picture.
+/// Puts the backdrop behind a view rendered over black: `color += (1 - alpha) * backdrop`. `color`
+/// and `alpha` are `[height * width]` of the camera's picture.
 fn fill(backdrop: &Backdrop, camera: &Camera, color: &mut [[f32; 3]], alpha: &[f32]) {
     let rotation = camera.camera_to_world.rotation();
     let width = camera.intrinsics.width.max(1) as usize;
@@ -334,9 +325,14 @@ fn fill(backdrop: &Backdrop, camera: &Camera, color: &mut [[f32; 3]], alpha: &[f
         }
         let (x, y) = ((i % width) as f64 + 0.5, (i / width) as f64 + 0.5);
         let behind = backdrop.color(rotation * camera.intrinsics.unproject(x, y, 1.0));
-        for (value, behind) in pixel.iter_mut().zip(behind) {
-            *value += (1.0 - alpha) * behind;
-        }
+        add(pixel, behind, 1.0 - alpha);
+    }
+}
+
+/// Adds a share of a pixel to another.
+fn add<const N: usize>(to: &mut [f32; N], pixel: [f32; N], share: f32) {
+    for (value, more) in to.iter_mut().zip(pixel) {
+        *value += share * more;
     }
 }
 
@@ -351,14 +347,10 @@ fn put_behind(front: &mut Frame, behind: &Frame) -> Result<()> {
     for (i, (alpha, under)) in alphas.iter_mut().zip(behind_alphas).enumerate() {
         let room = (1.0 - *alpha) * under;
         if let (Some(color), Some(under)) = (&mut front.color, &behind.color) {
-            for (value, under) in color[i].iter_mut().zip(under[i]) {
-                *value += (1.0 - *alpha) * under;
-            }
+            add(&mut color[i], under[i], 1.0 - *alpha);
         }
         if let (Some(blend), Some(under)) = (&mut front.blend, &behind.blend) {
-            for (value, under) in blend[i].iter_mut().zip(under[i]) {
-                *value += (1.0 - *alpha) * under;
-            }
+            add(&mut blend[i], under[i], 1.0 - *alpha);
         }
         if let (Some(depth), Some(under)) = (&mut front.depth, &behind.depth) {
             let total = *alpha + room;
@@ -376,7 +368,7 @@ fn put_behind(front: &mut Frame, behind: &Frame) -> Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::scene::{CameraToWorld, Intrinsics, RawGaussians};
+    use crate::scene::RawGaussians;
 
     fn some(count: usize) -> Vec<Gaussians> {
         let one = || Gaussians::sanitize(RawGaussians::default()).expect("none is fine").0;
@@ -401,17 +393,5 @@ mod tests {
             "the second has left, the clone holds the first"
         );
         assert_eq!(get(&held, 6), 1);
-    }
-
-    #[test]
-    fn fill_shows_only_where_alpha_leaves_room() {
-        let camera = Camera {
-            intrinsics: Intrinsics { fx: 1.0, fy: 1.0, cx: 1.0, cy: 0.5, width: 2, height: 1 },
-            camera_to_world: CameraToWorld::look_at(DVec3::ZERO, DVec3::Z, -DVec3::Y, "c").unwrap(),
-        };
-        let white = Backdrop::from_cells(vec![[255; 3]; 128 * 64]).unwrap();
-        let mut color = vec![[0.25; 3]; 2];
-        fill(&white, &camera, &mut color, &[1.0, 0.25]);
-        assert_eq!(color, vec![[0.25; 3], [1.0; 3]]);
     }
 }

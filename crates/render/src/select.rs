@@ -6,12 +6,12 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    DeviceTimes, Frame, RenderRequest, Renderer,
-    cpu::CpuRenderer,
-    gpu::{GpuOptions, GpuRenderer},
+    DeviceTimes, Frame, RenderRequest, Renderer, cpu::CpuRenderer, gpu::GpuRenderer,
+    switches::Switches,
 };
 use crate::{
     error::{ErrorCode, Result},
+    limits::Limits,
     scene::Gaussians,
 };
 
@@ -35,12 +35,24 @@ pub struct RendererOptions {
     pub renderer: RendererChoice,
     /// Part of the name of the wgpu adapter to use, or of several, with commas between.
     pub adapter: Option<String>,
-    /// Threads of the CPU renderer.
+    /// Threads of the CPU renderer; 0: one for each core that the process may use.
     pub threads: usize,
-    /// Renders at work or waiting on the GPU; one more is refused as `overloaded`.
-    pub waiting_max: usize,
     /// Bytes of scenes kept on one GPU device.
     pub scene_bytes_max: u64,
+    /// For tests and the laboratory.
+    pub switches: Switches,
+}
+
+impl Default for RendererOptions {
+    fn default() -> Self {
+        Self {
+            renderer: RendererChoice::default(),
+            adapter: None,
+            threads: 0,
+            scene_bytes_max: Limits::default().device_scene_bytes_max,
+            switches: Switches::default(),
+        }
+    }
 }
 
 /// A GPU adapter as the driver describes it.
@@ -67,32 +79,14 @@ pub struct AdapterReport {
 ///
 /// # Errors
 /// `gpu_unavailable` when an adapter was asked for and none fits, `internal` when threads or
-/// kernels cannot be made.
+/// kernels cannot be started.
 pub fn select(options: &RendererOptions) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
-    select_with(options, GpuOptions::default())
-}
-
-/// As [`select`], with more options for the GPU renderer (`without` goes to the CPU's as well);
-/// the adapter and the bounds are those of `wanted`.
-///
-/// # Errors
-/// As [`select`].
-pub fn select_with(
-    wanted: &RendererOptions,
-    options: GpuOptions,
-) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
-    let cpu = CpuRenderer::new(wanted.threads)?.without(options.without);
-    if wanted.renderer == RendererChoice::Cpu {
+    let cpu = CpuRenderer::with_switches(options.threads, &options.switches)?;
+    if options.renderer == RendererChoice::Cpu {
         tracing::info!(renderer = "cpu", "renderer chosen as configured");
         return Ok((Arc::new(cpu), Vec::new()));
     }
-    let options = GpuOptions {
-        adapter: wanted.adapter.clone(),
-        waiting_max: wanted.waiting_max,
-        scene_bytes_max: wanted.scene_bytes_max,
-        ..options
-    };
-    let (reports, gpu) = GpuRenderer::open(&options);
+    let (reports, gpu) = GpuRenderer::open(options);
     for report in &reports {
         tracing::info!(
             adapter = report.name,
@@ -104,11 +98,11 @@ pub fn select_with(
             "GPU adapter found"
         );
     }
-    let named = wanted.adapter.is_some() || wanted.renderer == RendererChoice::Gpu;
+    let named = options.adapter.is_some() || options.renderer == RendererChoice::Gpu;
     let renderer: Arc<dyn Renderer> = match gpu {
         Ok(gpu) => {
             tracing::info!(renderer = gpu.name(), "renderer chosen");
-            if wanted.renderer == RendererChoice::Gpu {
+            if options.renderer == RendererChoice::Gpu {
                 Arc::new(gpu)
             } else {
                 Arc::new(WithCpu { gpu, cpu })

@@ -55,22 +55,20 @@ impl View {
             Some(crop) => lens.part(crop.inside(lens.width, lens.height, "camera")?),
         };
         if !(request.near.is_finite() && request.near > 0.0) {
+            let near = request.near;
             return Err(Error::invalid(format!(
-                "near is {}; it must be a finite number over 0",
-                request.near
+                "near is {near}; it must be a finite number over 0"
             )));
         }
         if let Some(value) = request.background.iter().find(|value| !value.is_finite()) {
             return Err(Error::invalid(format!("background holds {value}, not a finite number")));
         }
         request.labels.check()?;
-        let (pixels, pixels_max) = (u64::from(drawn.width) * u64::from(drawn.height), PIXELS_MAX);
-        if pixels > pixels_max || drawn.width.max(drawn.height) > SIDE_MAX {
-            return Err(Error::limit(
-                "camera: pixels of the picture",
-                format!("{}x{}", drawn.width, drawn.height),
-                format!("{pixels_max} in all or {SIDE_MAX} a side"),
-            ));
+        let pixels = u64::from(drawn.width) * u64::from(drawn.height);
+        if pixels > PIXELS_MAX || drawn.width.max(drawn.height) > SIDE_MAX {
+            let size = format!("{}x{}", drawn.width, drawn.height);
+            let bound = format!("{PIXELS_MAX} in all or {SIDE_MAX} a side");
+            return Err(Error::limit("camera: pixels of the picture", size, bound));
         }
         let pose = request.camera.camera_to_world;
         let rotation = pose.rotation().transpose();
@@ -98,7 +96,6 @@ impl View {
 
     /// Bits in which the depth keys (t.z as f32) of Gaussians with means in the box `low` to `high`
     /// can differ from the least of them: a bound, with room for a renderer's rounding.
-    #[must_use]
     pub fn depth_bits(&self, [low, high]: [DVec3; 2]) -> u32 {
         let axis = self.rotation.row(2);
         let middle = axis.dot(low.midpoint(high)) + self.translation.z;
@@ -110,13 +107,11 @@ impl View {
     }
 
     /// Tiles in a row of tiles.
-    #[must_use]
     pub fn tiles_x(&self) -> u32 {
         self.width.div_ceil(TILE_SIZE)
     }
 
     /// Rows of tiles.
-    #[must_use]
     pub fn tiles_y(&self) -> u32 {
         self.height.div_ceil(TILE_SIZE)
     }

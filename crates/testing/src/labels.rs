@@ -38,7 +38,7 @@ fn one_hot(gaussians: &Gaussians, first: u16) -> Gaussians {
     checked(RawGaussians { sh, sh_degree: 0, ..gaussians.as_raw().clone() })
 }
 
-/// Dense E of indices 1..=m, `[H * W][m]`, by the road of colours.
+/// Dense E of indices 1..=m, `[H * W][m]`, by blending them as colours.
 pub fn literal(
     gaussians: &Gaussians,
     request: &RenderRequest,
@@ -139,7 +139,7 @@ pub fn apart(
     (far, worst)
 }
 
-/// Dense E of the renderer itself, by the road of colours.
+/// Dense E of the renderer itself, by blending them as colours.
 pub fn literal_of(
     renderer: &dyn Renderer,
     gaussians: &Gaussians,

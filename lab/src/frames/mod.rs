@@ -19,9 +19,9 @@ use crate::{
     error::{Error, Result},
     render::{
         DeviceTimes, DispatchTime, Frame, Kinds, Labels, Quality, RenderRequest, Renderer,
+        Switches,
         compare::{Compared, compare, compare_oracle},
         cpu::CpuRenderer,
-        gpu::GpuOptions,
     },
     rows::{Rows, each, median, ms},
     scene::{Camera, CameraToWorld, Gaussians},
@@ -109,8 +109,8 @@ impl Args {
         Err(Error::invalid(format!("2 to {most} Gaussians, and at least 1 pixel and 1 frame")))
     }
 
-    fn gpu_options(&self) -> GpuOptions {
-        GpuOptions { shaders: self.shaders.clone(), checked: self.checked, ..GpuOptions::default() }
+    fn switches(&self) -> Switches {
+        Switches { shaders: self.shaders.clone(), checked: self.checked, ..Switches::default() }
     }
 
     /// The generated scene, and the view of it with every picture.
@@ -139,7 +139,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     args.check()?;
     let (gaussians, request) = args.scene()?;
     let begun = Instant::now();
-    let (renderer, adapters) = args.setup.renderer(args.gpu_options())?;
+    let (renderer, adapters) = args.setup.renderer(args.switches())?;
     let open_ms = ms(begun);
     let drawing = Drawing { renderer: &*renderer, gaussians: &gaussians, request: &request };
     let begun = Instant::now();

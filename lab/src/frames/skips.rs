@@ -9,7 +9,7 @@ use serde_json::json;
 use super::{Args, Drawing};
 use crate::{
     error::Result,
-    render::{RenderRequest, Renderer, compare::differences, gpu::GpuOptions, skip::Skip},
+    render::{RenderRequest, Renderer, Skip, Switches, compare::differences},
     rows::{Rows, median},
     scene::{Camera, CameraToWorld, Gaussians, RawGaussians},
 };
@@ -66,7 +66,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     args.check()?;
     let (gaussians, request) = args.scene()?;
     let open = |without| -> Result<Arc<dyn Renderer>> {
-        Ok(args.setup.renderer(GpuOptions { without, ..args.gpu_options() })?.0)
+        Ok(args.setup.renderer(Switches { without, ..args.switches() })?.0)
     };
     let product = open(None)?;
     let scenes = scenes(gaussians, &request)?;

@@ -4,7 +4,6 @@ use glam::{DMat3, DVec3};
 
 /// Orthonormal eigenvectors of a symmetric matrix, by Jacobi's rotations; their order and signs are
 /// arbitrary.
-#[must_use]
 pub fn principal_axes(spread: DMat3) -> [DVec3; 3] {
     let mut a = spread.to_cols_array_2d();
     let mut v: [[f64; 3]; 3] = DMat3::IDENTITY.to_cols_array_2d();

@@ -46,13 +46,11 @@ impl Backdrop {
     }
 
     /// The cells, `[HEIGHT * WIDTH]`.
-    #[must_use]
     pub fn cells(&self) -> &[[u8; 3]] {
         &self.rgb
     }
 
     /// Position of a direction in the map: cells along longitude and latitude, centres at +0.5.
-    #[must_use]
     pub fn position(direction: DVec3) -> (f64, f64) {
         let longitude = direction.x.atan2(direction.z);
         let flat = direction.x.hypot(direction.z);
@@ -61,14 +59,11 @@ impl Backdrop {
     }
 
     /// Bilinear colour in a world direction (any length but 0), 0..1.
-    #[must_use]
     pub fn color(&self, direction: DVec3) -> [f32; 3] {
         let (u, v) = Self::position(direction);
         let (u, v) = (u - 0.5, (v - 0.5).clamp(0.0, (Self::HEIGHT - 1) as f64));
         let (u0, v0) = (u.floor(), v.floor());
-        #[expect(clippy::cast_possible_truncation, reason = "weights of 0..1")]
         let (fu, fv) = ((u - u0) as f32, (v - v0) as f32);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "in range")]
         let (x0, y0) = ((u0 as i64).rem_euclid(Self::WIDTH as i64) as usize, v0 as usize);
         let (x1, y1) = ((x0 + 1) % Self::WIDTH, (y0 + 1).min(Self::HEIGHT - 1));
         let at = |x: usize, y: usize, c: usize| f32::from(self.rgb[y * Self::WIDTH + x][c]) / 255.0;
@@ -77,27 +72,5 @@ impl Backdrop {
             let low = at(x0, y1, c) * (1.0 - fu) + at(x1, y1, c) * fu;
             top * (1.0 - fv) + low * fv
         })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn quarters() -> Backdrop {
-        let cell = |i: usize| {
-            let (x, y) = (i % Backdrop::WIDTH, i / Backdrop::WIDTH);
-            [(x * 2) as u8, (y * 4) as u8, 0]
-        };
-        Backdrop::from_cells((0..Backdrop::WIDTH * Backdrop::HEIGHT).map(cell).collect()).unwrap()
-    }
-
-    #[test]
-    fn forward_is_the_middle_and_down_is_the_last_row() {
-        let (u, v) = Backdrop::position(DVec3::Z);
-        assert_eq!((u, v), (64.0, 32.0));
-        assert!(quarters().color(DVec3::Y)[1] > 0.98, "+y is the last row");
-        assert!(quarters().color(-DVec3::Y)[1] < 0.02, "-y is the first row");
-        assert!(quarters().color(DVec3::X)[0] > quarters().color(-DVec3::X)[0], "+x is east");
     }
 }

@@ -9,12 +9,11 @@ use crate::{
     names::shown,
 };
 
-/// How far a rotation may be from orthonormal (largest entry of |R Rᵀ - I|).
+/// How far a rotation may be from orthonormal (largest number of |R Rᵀ - I|).
 pub const ORTHONORMAL_TOLERANCE: f64 = 1e-3;
 
-/// Pinhole intrinsics in pixels of the image they belong to.
-///
-/// The centre of pixel (0, 0) is (0.5, 0.5); the principal point need not be central.
+/// Pinhole intrinsics in pixels of the image they belong to. The centre of pixel (0, 0) is (0.5,
+/// 0.5); the principal point need not be central.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Intrinsics {
     /// Focal length along x, pixels.
@@ -37,26 +36,20 @@ impl Intrinsics {
     /// # Errors
     /// `invalid_request`, with a message that starts with `what` and names the value.
     pub fn validated(self, what: &str) -> Result<Self> {
+        let refuse = |why: String| Err(Error::invalid(format!("{what}: {why}")));
         for (name, value) in [("fx", self.fx), ("fy", self.fy), ("cx", self.cx), ("cy", self.cy)] {
             if !value.is_finite() {
-                return Err(Error::invalid(format!(
-                    "{what}: {name} is {value}, not a finite number"
-                )));
+                return refuse(format!("{name} is {value}, not a finite number"));
             }
         }
         for (name, value) in [("fx", self.fx), ("fy", self.fy)] {
             if value <= 0.0 {
-                let value = shown(value);
-                return Err(Error::invalid(format!(
-                    "{what}: {name} is {value}; it must be over 0"
-                )));
+                return refuse(format!("{name} is {}; it must be over 0", shown(value)));
             }
         }
         if self.width == 0 || self.height == 0 {
-            return Err(Error::invalid(format!(
-                "{what}: {}x{} px; both sides must be at least 1",
-                self.width, self.height
-            )));
+            let (width, height) = (self.width, self.height);
+            return refuse(format!("{width}x{height} px; both sides must be at least 1"));
         }
         Ok(self)
     }
@@ -73,9 +66,8 @@ impl Intrinsics {
         self.cropped(f64::from(crop.x), f64::from(crop.y), crop.width, crop.height)
     }
 
-    /// Intrinsics of the image resized to `width` x `height`.
-    ///
-    /// Exact with pixel centres at +0.5: coordinates scale about the image corner.
+    /// Intrinsics of the image resized to `width` x `height`. Exact with pixel centres at +0.5:
+    /// coordinates scale about the image corner.
     #[must_use]
     pub fn resized(self, width: u32, height: u32) -> Self {
         let sx = f64::from(width) / f64::from(self.width);
@@ -91,13 +83,11 @@ impl Intrinsics {
     }
 
     /// Pixel of a point in camera coordinates (z > 0).
-    #[must_use]
     pub fn project(&self, point: DVec3) -> (f64, f64) {
         (self.fx * point.x / point.z + self.cx, self.fy * point.y / point.z + self.cy)
     }
 
     /// Point in camera coordinates seen at pixel (u, v) at depth z.
-    #[must_use]
     pub fn unproject(&self, u: f64, v: f64, z: f64) -> DVec3 {
         DVec3::new((u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z, z)
     }
@@ -160,44 +150,38 @@ impl CameraToWorld {
     /// `invalid_request` when not finite, the last row is not (0,0,0,1), the rotation is singular,
     /// not orthonormal within [`ORTHONORMAL_TOLERANCE`], or a reflection.
     pub fn from_row_major(m: &[f64; 16], what: &str) -> Result<Self> {
+        let refuse = |why: String| Err(Error::invalid(format!("{what}: {why}")));
         if let Some(i) = m.iter().position(|v| !v.is_finite()) {
-            return Err(Error::invalid(format!(
-                "{what}: camera_to_world[{}][{}] is {}, not a finite number",
-                i / 4,
-                i % 4,
-                m[i]
-            )));
+            let (row, column, value) = (i / 4, i % 4, m[i]);
+            return refuse(format!(
+                "camera_to_world[{row}][{column}] is {value}, not a finite number"
+            ));
         }
         let last = [m[12], m[13], m[14], m[15] - 1.0];
         if last.iter().any(|v| v.abs() > ORTHONORMAL_TOLERANCE) {
-            return Err(Error::invalid(format!(
-                "{what}: the last row of camera_to_world is [{}]; it must be [0, 0, 0, 1]",
-                [m[12], m[13], m[14], m[15]].map(shown).join(", ")
-            )));
+            let last = [m[12], m[13], m[14], m[15]].map(shown).join(", ");
+            return refuse(format!(
+                "the last row of camera_to_world is [{last}]; it must be [0, 0, 0, 1]"
+            ));
         }
         let mat = DMat4::from_cols_array(m).transpose();
         let r = DMat3::from_mat4(mat);
         let det = r.determinant();
         if det.abs() < 1e-6 {
-            return Err(Error::invalid(format!(
-                "{what}: the rotation of camera_to_world is singular (determinant {det:.3e})"
-            )));
+            return refuse(format!(
+                "the rotation of camera_to_world is singular (determinant {det:.3e})"
+            ));
         }
-        let gram = r * r.transpose();
-        let off = (gram - DMat3::IDENTITY)
-            .to_cols_array()
-            .iter()
-            .fold(0.0_f64, |worst, v| worst.max(v.abs()));
+        let gram = r * r.transpose() - DMat3::IDENTITY;
+        let off = gram.to_cols_array().iter().fold(0.0_f64, |worst, v| worst.max(v.abs()));
         if off > ORTHONORMAL_TOLERANCE {
-            return Err(Error::invalid(format!(
-                "{what}: the rotation of camera_to_world is not orthonormal \
+            return refuse(format!(
+                "the rotation of camera_to_world is not orthonormal \
                  (off by {off:.3e}, at most {ORTHONORMAL_TOLERANCE:.0e})"
-            )));
+            ));
         }
         if det < 0.0 {
-            return Err(Error::invalid(format!(
-                "{what}: camera_to_world is mirrored (determinant {det:.3})"
-            )));
+            return refuse(format!("camera_to_world is mirrored (determinant {det:.3})"));
         }
         Ok(Self::orthonormalised(mat))
     }
@@ -221,9 +205,8 @@ impl CameraToWorld {
     /// `invalid_request` when eye and target coincide or `up` is parallel to the view axis.
     pub fn look_at(eye: DVec3, target: DVec3, up: DVec3, what: &str) -> Result<Self> {
         if !(eye.is_finite() && target.is_finite() && up.is_finite()) {
-            return Err(Error::invalid(format!(
-                "{what}: eye, target and up must be finite numbers"
-            )));
+            let why = format!("{what}: eye, target and up must be finite numbers");
+            return Err(Error::invalid(why));
         }
         let forward = (target - eye)
             .try_normalize()
@@ -231,17 +214,10 @@ impl CameraToWorld {
         let right = forward.cross(up).try_normalize().ok_or_else(|| {
             Error::invalid(format!("{what}: up is zero or parallel to the view axis"))
         })?;
-        let down = forward.cross(right);
-        Ok(Self(DMat4::from_cols(
-            right.extend(0.0),
-            down.extend(0.0),
-            forward.extend(0.0),
-            eye.extend(1.0),
-        )))
+        Ok(Self::from_axes(right, forward, eye))
     }
 
     /// The pose at share `t` of the way, 0..1: centres on a line, rotations by the shortest turn.
-    #[must_use]
     pub fn between(from: &Self, to: &Self, t: f64) -> Self {
         let [a, b] = [from, to].map(|pose| DQuat::from_mat3(&pose.rotation()));
         let turn = a.slerp(b, t).normalize();
@@ -253,47 +229,42 @@ impl CameraToWorld {
         let forward = mat.z_axis.truncate().normalize();
         let x = mat.x_axis.truncate();
         let right = (x - forward * forward.dot(x)).normalize();
+        Self::from_axes(right, forward, mat.w_axis.truncate())
+    }
+
+    /// From two unit axes at right angles, and the centre.
+    fn from_axes(right: DVec3, forward: DVec3, center: DVec3) -> Self {
         let down = forward.cross(right);
-        Self(DMat4::from_cols(
-            right.extend(0.0),
-            down.extend(0.0),
-            forward.extend(0.0),
-            mat.w_axis.truncate().extend(1.0),
-        ))
+        let [right, down, forward] = [right, down, forward].map(|axis| axis.extend(0.0));
+        Self(DMat4::from_cols(right, down, forward, center.extend(1.0)))
     }
 
     /// The matrix, camera to world.
-    #[must_use]
     pub fn matrix(&self) -> DMat4 {
         self.0
     }
 
     /// World to camera.
-    #[must_use]
     pub fn viewmat(&self) -> DMat4 {
         self.0.inverse()
     }
 
     /// Rotation, camera to world.
-    #[must_use]
     pub fn rotation(&self) -> DMat3 {
         DMat3::from_mat4(self.0)
     }
 
     /// Camera centre in the world.
-    #[must_use]
     pub fn center(&self) -> DVec3 {
         self.0.w_axis.truncate()
     }
 
     /// Unit viewing axis (+z of the camera) in the world.
-    #[must_use]
     pub fn axis(&self) -> DVec3 {
         self.0.z_axis.truncate()
     }
 
     /// 16 numbers, row-major.
-    #[must_use]
     pub fn to_row_major(&self) -> [f64; 16] {
         self.0.transpose().to_cols_array()
     }

@@ -9,13 +9,13 @@ use glam::DVec3;
 
 use crate::error::{Error, ErrorCode, Result};
 
-/// What every renderer adds to both diagonal entries of the 2D covariance, px²: a Gaussian covers
-/// at least a pixel. The network learns its Gaussians together with it.
+/// What every renderer adds to both numbers on the diagonal of the 2D covariance, px²: a Gaussian
+/// covers at least a pixel. The network learns its Gaussians together with it.
 pub const BLUR_PX2: f32 = 0.3;
 /// Spherical harmonics of degree 0: 1 / (2 √π).
 pub const SH_C0: f32 = 0.282_094_79;
 
-/// The view and pixel (of the network's input picture) that made a Gaussian.
+/// The view and pixel (of the network's input picture) that a Gaussian comes from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct SourcePixel {
     /// Index of the photo in the scene.
@@ -43,11 +43,52 @@ pub struct RawGaussians {
     pub sh_degree: u8,
     /// `[N, K, 3]` with K = (degree + 1)², 3DGS basis and order, world frame.
     pub sh: Vec<[f32; 3]>,
-    /// `[N]` index into the semantic bank, 0 = background.
+    /// `[N]` entry of the bank, 0 = background.
     pub semantic_index: Vec<u16>,
     /// `[N]` where each came from.
     pub source: Vec<SourcePixel>,
 }
+
+impl RawGaussians {
+    /// Coefficients a Gaussian: (degree + 1)².
+    fn sh_count(&self) -> usize {
+        (usize::from(self.sh_degree) + 1).pow(2)
+    }
+
+    /// The name, length and right length of an array that does not fit the others.
+    fn unequal(&self) -> Option<(&'static str, usize, usize)> {
+        let n = self.means.len();
+        let lengths = [
+            ("quats", self.quats.len(), n),
+            ("scales", self.scales.len(), n),
+            ("opacities", self.opacities.len(), n),
+            ("sh", self.sh.len(), n * self.sh_count()),
+            ("semantic_index", self.semantic_index.len(), n),
+            ("source", self.source.len(), n),
+        ];
+        lengths.into_iter().find(|(_, got, want)| got != want)
+    }
+
+    /// No Gaussians, of the same origin and degree.
+    fn emptied(&self) -> Self {
+        Self { origin: self.origin, sh_degree: self.sh_degree, ..Self::default() }
+    }
+
+    /// Adds Gaussian `i` of `from`, with other numbers in three arrays.
+    fn push(&mut self, from: &Self, i: usize, (quat, scale, opacity): Checked) {
+        let k = from.sh_count();
+        self.means.push(from.means[i]);
+        self.quats.push(quat);
+        self.scales.push(scale);
+        self.opacities.push(opacity);
+        self.sh.extend_from_slice(&from.sh[i * k..(i + 1) * k]);
+        self.semantic_index.push(from.semantic_index[i]);
+        self.source.push(from.source[i]);
+    }
+}
+
+/// Quaternion, scales and opacity of a Gaussian.
+type Checked = ([f32; 4], [f32; 3], f32);
 
 /// How many Gaussians were dropped or changed on the way in, by reason.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -70,7 +111,6 @@ pub struct SanitizeReport {
 
 impl SanitizeReport {
     /// Reasons and counts, for the health report.
-    #[must_use]
     pub fn counts(&self) -> [(&'static str, u64); 7] {
         [
             ("not_finite", self.not_finite),
@@ -84,14 +124,13 @@ impl SanitizeReport {
     }
 }
 
-/// Checked Gaussians: finite, unit quaternions, positive scales, opacity in [1/255, 1].
-///
-/// Nothing below checks again.
+/// Checked Gaussians: finite, unit quaternions, positive scales, opacity in [1/255, 1]. Nothing
+/// below checks again.
 #[derive(Clone, Debug, Default)]
 pub struct Gaussians {
     raw: RawGaussians,
     identity: u64,
-    /// Shared by Gaussians that differ in their bank indices only.
+    /// Shared by Gaussians that differ in their entries only.
     shape: u64,
     /// Shared by clones: see [`Self::life`].
     life: Arc<()>,
@@ -126,41 +165,17 @@ impl Gaussians {
         reason = "the unchecked arrays are given up, so that nothing uses them any more"
     )]
     pub fn sanitize(raw: RawGaussians) -> Result<(Self, SanitizeReport)> {
-        let n = raw.means.len();
-        let k = (usize::from(raw.sh_degree) + 1).pow(2);
-        let lengths = [
-            ("quats", raw.quats.len(), n),
-            ("scales", raw.scales.len(), n),
-            ("opacities", raw.opacities.len(), n),
-            ("sh", raw.sh.len(), n * k),
-            ("semantic_index", raw.semantic_index.len(), n),
-            ("source", raw.source.len(), n),
-        ];
-        for (name, got, want) in lengths {
-            if got != want {
-                return Err(Error::internal(format!(
-                    "gaussians: {name} has {got} rows, not {want}"
-                )));
-            }
+        if let Some((name, got, want)) = raw.unequal() {
+            return Err(Error::internal(format!("gaussians: {name} has {got} rows, not {want}")));
         }
         if raw.sh_degree > 3 {
-            return Err(Error::internal(format!(
-                "gaussians: SH degree {} is over 3",
-                raw.sh_degree
-            )));
+            let degree = raw.sh_degree;
+            return Err(Error::internal(format!("gaussians: SH degree {degree} is over 3")));
         }
-        let mut report = SanitizeReport::default();
-        let mut kept =
-            RawGaussians { origin: raw.origin, sh_degree: raw.sh_degree, ..Default::default() };
-        for i in 0..n {
-            if let Some((quat, scales, opacity)) = check_one(&raw, i, k, &mut report) {
-                kept.means.push(raw.means[i]);
-                kept.quats.push(quat);
-                kept.scales.push(scales);
-                kept.opacities.push(opacity);
-                kept.sh.extend_from_slice(&raw.sh[i * k..(i + 1) * k]);
-                kept.semantic_index.push(raw.semantic_index[i]);
-                kept.source.push(raw.source[i]);
+        let (mut report, mut kept) = (SanitizeReport::default(), raw.emptied());
+        for i in 0..raw.means.len() {
+            if let Some(checked) = check_one(&raw, i, &mut report) {
+                kept.push(&raw, i, checked);
             }
         }
         Ok((Self::new(kept), report))
@@ -172,20 +187,12 @@ impl Gaussians {
     /// `scene_corrupt` when a Gaussian breaks what [`Self::sanitize`] promises, or lengths differ.
     pub fn restore(raw: RawGaussians) -> Result<Self> {
         let bad = |what: String| Error::new(ErrorCode::SceneCorrupt, format!("gaussians: {what}"));
-        let k = (usize::from(raw.sh_degree) + 1).pow(2);
-        let lengths = [raw.quats.len(), raw.scales.len(), raw.opacities.len()];
-        let n = raw.means.len();
-        let equal = lengths.iter().all(|&len| len == n)
-            && raw.sh_degree <= 3
-            && raw.sh.len() == n * k
-            && raw.semantic_index.len() == n
-            && raw.source.len() == n;
-        if !equal || !raw.origin.is_finite() {
+        if raw.unequal().is_some() || raw.sh_degree > 3 || !raw.origin.is_finite() {
             return Err(bad(format!("arrays of unequal length, or origin {}", raw.origin)));
         }
         let mut report = SanitizeReport::default();
-        for i in 0..n {
-            let kept = check_one(&raw, i, k, &mut report);
+        for i in 0..raw.means.len() {
+            let kept = check_one(&raw, i, &mut report);
             let same = kept.is_some_and(|(quat, scale, opacity)| {
                 let turned = quat.iter().zip(&raw.quats[i]).any(|(a, b)| (a - b).abs() > 1e-5);
                 !turned && scale == raw.scales[i] && opacity.total_cmp(&raw.opacities[i]).is_eq()
@@ -197,29 +204,19 @@ impl Gaussians {
         Ok(Self::new(raw))
     }
 
-    /// The Gaussians whose index `keep` takes, in their order.
-    #[must_use]
+    /// The Gaussians whose number `keep` takes, in their order.
     pub fn only(&self, keep: impl Fn(usize) -> bool) -> Self {
-        let (k, all) = (self.sh_count(), &self.raw);
-        let mut raw =
-            RawGaussians { origin: all.origin, sh_degree: all.sh_degree, ..Default::default() };
+        let (all, mut some) = (&self.raw, self.raw.emptied());
         for i in (0..self.len()).filter(|&i| keep(i)) {
-            raw.means.push(all.means[i]);
-            raw.quats.push(all.quats[i]);
-            raw.scales.push(all.scales[i]);
-            raw.opacities.push(all.opacities[i]);
-            raw.sh.extend_from_slice(&all.sh[i * k..(i + 1) * k]);
-            raw.semantic_index.push(all.semantic_index[i]);
-            raw.source.push(all.source[i]);
+            some.push(all, i, (all.quats[i], all.scales[i], all.opacities[i]));
         }
-        Self::new(raw)
+        Self::new(some)
     }
 
     /// The same Gaussians with other scales, `[N, 3]`, clamped into range.
     ///
     /// # Panics
     /// When the number of scales is another: a bug of the caller.
-    #[must_use]
     #[expect(clippy::manual_clamp, reason = "`clamp` would keep a NaN; this makes it the smallest")]
     pub fn with_scales(&self, mut scales: Vec<[f32; 3]>) -> Self {
         assert_eq!(scales.len(), self.len(), "one scale a Gaussian; this is a bug");
@@ -229,10 +226,10 @@ impl Gaussians {
         Self::new(RawGaussians { scales, ..self.raw.clone() })
     }
 
-    /// The same Gaussians with other bank indices, `[N]`.
+    /// The same Gaussians with other entries of the bank, `[N]`.
     ///
     /// # Errors
-    /// `internal` when the number of indices is another.
+    /// `internal` when the number of entries is another.
     pub fn with_semantic_index(&self, semantic_index: Vec<u16>) -> Result<Self> {
         if semantic_index.len() != self.len() {
             return Err(Error::internal(format!(
@@ -241,158 +238,118 @@ impl Gaussians {
                 self.len()
             )));
         }
-        Ok(Self {
-            raw: RawGaussians { semantic_index, ..self.raw.clone() },
-            identity: NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed),
-            shape: self.shape,
-            life: Arc::default(),
-        })
+        let raw = RawGaussians { semantic_index, ..self.raw.clone() };
+        Ok(Self { shape: self.shape, ..Self::new(raw) })
     }
 
-    /// Number that no other content of this process has; clones share it, for they cannot change.
-    ///
-    /// A renderer keeps what it uploaded under this number.
-    #[must_use]
+    /// Number that no other content of this process has; clones share it, for they cannot change. A
+    /// renderer keeps what it uploaded under this number.
     pub fn identity(&self) -> u64 {
         self.identity
     }
 
     /// As [`Self::identity`], but shared by Gaussians that differ in `semantic_index` only.
-    #[must_use]
     pub fn shape_identity(&self) -> u64 {
         self.shape
     }
 
     /// Lives as long as any Gaussians of this identity do.
-    #[must_use]
     pub fn life(&self) -> Weak<()> {
         Arc::downgrade(&self.life)
     }
 
     /// Number of Gaussians.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.raw.means.len()
     }
 
     /// Whether there are none.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.raw.means.is_empty()
     }
 
     /// World position that `means` are relative to.
-    #[must_use]
     pub fn origin(&self) -> DVec3 {
         self.raw.origin
     }
 
-    /// `[N, 3]` centres relative to the origin.
-    #[must_use]
-    pub fn means(&self) -> &[[f32; 3]] {
-        &self.raw.means
-    }
-
-    /// `[N, 4]` unit quaternions, wxyz.
-    #[must_use]
-    pub fn quats(&self) -> &[[f32; 4]] {
-        &self.raw.quats
-    }
-
-    /// `[N, 3]` standard deviations.
-    #[must_use]
-    pub fn scales(&self) -> &[[f32; 3]] {
-        &self.raw.scales
-    }
-
-    /// `[N]` opacities.
-    #[must_use]
-    pub fn opacities(&self) -> &[f32] {
-        &self.raw.opacities
-    }
-
     /// Degree of the spherical harmonics.
-    #[must_use]
     pub fn sh_degree(&self) -> u8 {
         self.raw.sh_degree
     }
 
     /// Coefficients a Gaussian: (degree + 1)².
-    #[must_use]
     pub fn sh_count(&self) -> usize {
-        (usize::from(self.raw.sh_degree) + 1).pow(2)
-    }
-
-    /// `[N, K, 3]` coefficients, flattened over N and K.
-    #[must_use]
-    pub fn sh(&self) -> &[[f32; 3]] {
-        &self.raw.sh
-    }
-
-    /// `[N]` bank indices.
-    #[must_use]
-    pub fn semantic_index(&self) -> &[u16] {
-        &self.raw.semantic_index
-    }
-
-    /// `[N]` sources.
-    #[must_use]
-    pub fn source(&self) -> &[SourcePixel] {
-        &self.raw.source
+        self.raw.sh_count()
     }
 
     /// The arrays, for a stage that makes new Gaussians of them.
-    #[must_use]
     pub fn into_raw(self) -> RawGaussians {
         self.raw
     }
 
     /// The arrays.
-    #[must_use]
     pub fn as_raw(&self) -> &RawGaussians {
         &self.raw
     }
 
     /// Bytes held.
-    #[must_use]
     pub fn size_bytes(&self) -> u64 {
         let each = 12 + 16 + 12 + 4 + 2 + 6 + 12 * self.sh_count();
         (self.len() * each) as u64
     }
 }
 
+/// Methods that give an array.
+macro_rules! arrays {
+    ($($(#[$doc:meta])+ $name:ident: $of:ty;)+) => {
+        impl Gaussians {
+            $(
+                $(#[$doc])+
+                pub fn $name(&self) -> &[$of] {
+                    &self.raw.$name
+                }
+            )+
+        }
+    };
+}
+
+arrays! {
+    /// `[N, 3]` centres relative to the origin.
+    means: [f32; 3];
+    /// `[N, 4]` unit quaternions, wxyz.
+    quats: [f32; 4];
+    /// `[N, 3]` standard deviations.
+    scales: [f32; 3];
+    /// `[N]` opacities.
+    opacities: f32;
+    /// `[N, K, 3]` coefficients, flattened over N and K.
+    sh: [f32; 3];
+    /// `[N]` entries of the bank.
+    semantic_index: u16;
+    /// `[N]` sources.
+    source: SourcePixel;
+}
+
 /// Checks Gaussian `i`; what to keep of it, or `None` after counting why not.
-fn check_one(
-    raw: &RawGaussians,
-    i: usize,
-    k: usize,
-    report: &mut SanitizeReport,
-) -> Option<([f32; 4], [f32; 3], f32)> {
+fn check_one(raw: &RawGaussians, i: usize, report: &mut SanitizeReport) -> Option<Checked> {
     let (mean, quat, scale, opacity) =
         (raw.means[i], raw.quats[i], raw.scales[i], raw.opacities[i]);
+    let k = raw.sh_count();
     let sh = &raw.sh[i * k..(i + 1) * k];
     let finite = mean.iter().chain(&quat).chain(&scale).all(|v| v.is_finite())
         && opacity.is_finite()
         && sh.iter().flatten().all(|v| v.is_finite() && v.abs() <= Gaussians::SH_MAX);
-    if !finite {
-        report.not_finite += 1;
-        return None;
-    }
-    if mean.iter().any(|v| v.abs() > Gaussians::COORDINATE_MAX) {
-        report.too_far += 1;
-        return None;
-    }
-    if opacity < Gaussians::OPACITY_MIN {
-        report.transparent += 1;
-        return None;
-    }
     let norm = quat.iter().map(|&v| f64::from(v) * f64::from(v)).sum::<f64>().sqrt();
-    if norm < 1e-12 {
-        report.zero_quat += 1;
-        return None;
-    }
-    if scale.iter().any(|&v| v <= 0.0) {
-        report.zero_scale += 1;
+    let faults = [
+        (!finite, &mut report.not_finite),
+        (mean.iter().any(|v| v.abs() > Gaussians::COORDINATE_MAX), &mut report.too_far),
+        (opacity < Gaussians::OPACITY_MIN, &mut report.transparent),
+        (norm < 1e-12, &mut report.zero_quat),
+        (scale.iter().any(|&v| v <= 0.0), &mut report.zero_scale),
+    ];
+    if let Some((_, count)) = faults.into_iter().find(|(fault, _)| *fault) {
+        *count += 1;
         return None;
     }
     let clamped = scale.map(|v| v.clamp(Gaussians::SCALE_MIN, Gaussians::SCALE_MAX));
@@ -402,7 +359,6 @@ fn check_one(
     if opacity > 1.0 {
         report.opacity_clamped += 1;
     }
-    #[expect(clippy::cast_possible_truncation, reason = "a unit quaternion fits f32")]
     let unit = quat.map(|v| (f64::from(v) / norm) as f32);
     Some((unit, clamped, opacity.min(1.0)))
 }

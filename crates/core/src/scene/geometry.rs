@@ -2,10 +2,9 @@
 
 use crate::scene::{Camera, CameraToWorld};
 
-/// Gaussians of one photo, one for each pixel of the network's picture, row-major.
-///
-/// Lengths and positions are in world units already; only the rigid motion `frame_to_world` lies
-/// between them and the world. Nothing here is checked: a network may say anything.
+/// Gaussians of one photo, one for each pixel of the network's picture, row-major. Lengths and
+/// positions are in world units already; only the rigid motion `frame_to_world` lies between them
+/// and the world. Nothing here is checked: a network may say anything.
 #[derive(Clone, Debug)]
 pub struct ViewGaussians {
     /// Index of the photo in the scene.
@@ -36,13 +35,11 @@ pub struct ViewGaussians {
 
 impl ViewGaussians {
     /// Pixels, and so Gaussians.
-    #[must_use]
     pub fn len(&self) -> usize {
         self.means.len()
     }
 
     /// Whether there are none.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()
     }

@@ -11,18 +11,16 @@ pub const SCENE_ID_CHARS: usize = 32;
 
 /// Id of a scene: 32 lower-case hex digits.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(try_from = "String", into = "String")]
+#[serde(try_from = "String")]
 pub struct SceneId(String);
 
 impl SceneId {
     /// From 16 bytes (random, or a content hash).
-    #[must_use]
     pub fn from_bytes(bytes: [u8; 16]) -> Self {
         Self(bytes.iter().map(|b| format!("{b:02x}")).collect())
     }
 
     /// The hex digits.
-    #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
     }
@@ -50,12 +48,6 @@ impl TryFrom<String> for SceneId {
 
     fn try_from(text: String) -> Result<Self, Error> {
         text.parse()
-    }
-}
-
-impl From<SceneId> for String {
-    fn from(id: SceneId) -> Self {
-        id.0
     }
 }
 

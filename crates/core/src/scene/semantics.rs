@@ -8,7 +8,7 @@ use utoipa::ToSchema;
 
 use crate::scene::StageTime;
 
-/// An index for each cell of a grid that is laid over a whole photo; cells need not be square.
+/// The entry of each cell of a grid over a whole photo; cells need not be square.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct IndexMap {
     /// Columns.
@@ -20,8 +20,7 @@ pub struct IndexMap {
 }
 
 impl IndexMap {
-    /// The index at a place of the photo, `x` and `y` as shares 0..1 of its width and height.
-    #[must_use]
+    /// The entry at a place of the photo, `x` and `y` as shares 0..1 of its width and height.
     pub fn at(&self, x: f64, y: f64) -> u16 {
         let cell = |share: f64, cells: u32| {
             let last = f64::from(cells.max(1) - 1);
@@ -48,7 +47,7 @@ pub struct MaskInfo {
 /// The masks of one photo: at most one a pixel.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PhotoMasks {
-    /// Mask k of `masks` is index k + 1.
+    /// Cells of mask k of `masks` have the number k + 1.
     pub map: IndexMap,
     /// What the network said of each.
     pub masks: Vec<MaskInfo>,
@@ -91,19 +90,16 @@ pub struct Bank {
 
 impl Bank {
     /// Number of rows (M).
-    #[must_use]
     pub fn len(&self) -> usize {
         self.rows.len().checked_div(self.dim).unwrap_or(0)
     }
 
     /// Whether there are none.
-    #[must_use]
     pub fn is_empty(&self) -> bool {
         self.rows.is_empty()
     }
 
     /// Row `m`, counted from 0.
-    #[must_use]
     pub fn row(&self, m: usize) -> &[f32] {
         &self.rows[m * self.dim..(m + 1) * self.dim]
     }
@@ -113,10 +109,10 @@ impl Bank {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ScoringProfile {
-    /// Unit centroids, a coverage floor, the bundle's canon and tau.
+    /// Rows of length 1, a coverage floor, phrases and tau of the bundle.
     #[default]
     Default,
-    /// Plain centroids, no coverage floor, the paper's three phrases and tau.
+    /// Rows as they are, no coverage floor, three phrases and tau of the paper.
     Paper,
 }
 
@@ -144,14 +140,14 @@ pub struct SemanticsReport {
     pub execution_provider: String,
 }
 
-/// What a scene means.
+/// The semantics of a scene.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Semantics {
     /// The bank.
     pub bank: Bank,
-    /// `[N]` bank index of each Gaussian, in the order of the scene's Gaussians.
+    /// `[N]` entry of each Gaussian, in the order of the scene's Gaussians.
     pub index: Vec<u16>,
-    /// Bank index maps of the photos, in the photos' order.
+    /// Index maps of the photos, in their order.
     pub photos: Vec<IndexMap>,
     /// How it went.
     pub report: SemanticsReport,

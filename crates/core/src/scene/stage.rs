@@ -39,13 +39,11 @@ impl Stage {
     pub const SEMANTICS: [Self; 4] = [Self::Masks, Self::Embed, Self::Bank, Self::Assign];
 
     /// Name in events, reports and metrics.
-    #[must_use]
     pub const fn name(self) -> &'static str {
         self.row().0
     }
 
     /// Share of the whole job that is done when `fraction` of this stage is, both 0..1.
-    #[must_use]
     pub fn overall(self, fraction: f32) -> f32 {
         let (_, [from, to]) = self.row();
         from + (to - from) * fraction.clamp(0.0, 1.0)

@@ -68,7 +68,6 @@ pub enum SceneState {
 
 impl SceneState {
     /// Whether nothing more will happen.
-    #[must_use]
     pub fn is_final(self) -> bool {
         matches!(self, Self::Done | Self::Failed | Self::Cancelled)
     }
@@ -93,7 +92,6 @@ impl From<&Error> for SceneError {
 
 impl SceneError {
     /// The error this was; a name of no row is `internal`.
-    #[must_use]
     pub fn to_error(&self) -> Error {
         let row = TABLE.iter().find(|row| row.name == self.code);
         Error::new(row.map_or(ErrorCode::Internal, |row| row.code), self.message.clone())
@@ -163,13 +161,11 @@ pub struct SemanticsStatus {
 
 impl SemanticsStatus {
     /// Nothing but a state.
-    #[must_use]
     pub fn new(state: SemanticsState) -> Self {
         Self { state, ..Self::default() }
     }
 
     /// Made, with this report.
-    #[must_use]
     pub fn ready(report: SemanticsReport) -> Self {
         Self {
             fraction: 1.0,
@@ -215,7 +211,6 @@ pub struct SceneStatus {
 
 impl SceneStatus {
     /// A scene in `state`, nothing more known.
-    #[must_use]
     pub fn new(id: SceneId, state: SceneState, created_ms: u64) -> Self {
         Self {
             id,
@@ -232,7 +227,6 @@ impl SceneStatus {
     }
 
     /// Whether nothing happens to it now: neither it nor its semantics are being made.
-    #[must_use]
     pub fn is_settled(&self) -> bool {
         self.state.is_final() && self.semantics.state != SemanticsState::Running
     }
@@ -264,7 +258,6 @@ pub enum Event {
 
 impl Event {
     /// Whether no event follows.
-    #[must_use]
     pub fn is_last(&self) -> bool {
         matches!(self, Self::Done | Self::Failed(_) | Self::Cancelled)
     }

@@ -39,7 +39,6 @@ pub struct Upload {
 
 impl Upload {
     /// Bytes of all parts together.
-    #[must_use]
     pub fn size_bytes(&self) -> usize {
         let cameras = match &self.cameras {
             Some(UploadCameras::Transforms(json) | UploadCameras::Cameras(json)) => json.len(),

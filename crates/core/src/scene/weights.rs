@@ -3,10 +3,8 @@
 use crate::error::{Error, Result};
 
 /// The weights E of a view, sparse: of each pixel the entries that it shows, ascending, each with
-/// its weight over 0.
-///
-/// The weight of entry m at a pixel is the sum of `alpha T` over the Gaussians of that entry.
-/// Entry 0 (the background) is left out.
+/// its weight over 0. The weight of entry m at a pixel is the sum of `alpha T` over the Gaussians
+/// of that entry. Entry 0 (the background) is left out.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PixelWeights {
     /// `[H * W + 1]`: the weights of pixel i are `offsets[i]..offsets[i + 1]`.
@@ -19,19 +17,16 @@ pub struct PixelWeights {
 
 impl PixelWeights {
     /// `pixels` pixels that show no entry.
-    #[must_use]
     pub fn none(pixels: usize) -> Self {
         Self { offsets: vec![0; pixels + 1], ..Self::default() }
     }
 
     /// Number of pixels.
-    #[must_use]
     pub fn pixels(&self) -> usize {
         self.offsets.len().saturating_sub(1)
     }
 
     /// The entries of pixel `i`, ascending, and their weights.
-    #[must_use]
     pub fn slices(&self, i: usize) -> (&[u16], &[f32]) {
         let range = self.offsets[i] as usize..self.offsets[i + 1] as usize;
         (&self.entries[range.clone()], &self.weights[range])
@@ -44,13 +39,11 @@ impl PixelWeights {
     }
 
     /// Sum of the weights of pixel `i`.
-    #[must_use]
     pub fn coverage(&self, i: usize) -> f32 {
         self.slices(i).1.iter().sum()
     }
 
     /// Bytes held.
-    #[must_use]
     pub fn size_bytes(&self) -> u64 {
         (self.offsets.len() * 4 + self.entries.len() * 6) as u64
     }

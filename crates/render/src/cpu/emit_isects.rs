@@ -15,10 +15,9 @@ const CHUNK: usize = 1024;
 const FETCH: usize = 64;
 
 /// Writes the pairs of the Gaussian at place i of the depth order to
-/// `isects[isect_offsets[i]..isect_offsets[i + 1]]`.
-///
-/// Keys are tile ids counted from the first tile of the band; values are indices of Gaussians. The
-/// caller has checked that the total fits [`crate::constants::ISECTS_MAX`].
+/// `isects[isect_offsets[i]..isect_offsets[i + 1]]`. Keys are tile ids counted from the first tile
+/// of the band; values are indices of Gaussians. The caller has checked that the total fits
+/// [`crate::constants::ISECTS_MAX`].
 pub fn emit_isects(
     projected: &Projected,
     sorted: &[u64],

@@ -1,7 +1,7 @@
 //! Vectors of f32 as wide as the processor has them, by `pulp` (AVX-512, AVX2 with FMA, or what
 //! every processor of the target has), and a fast power of two.
 //!
-//! A kernel is compiled once for each width. The renderer picks one when it is made. Products and
+//! A kernel is compiled once for each width. The renderer picks one when it is opened. Products and
 //! sums are fused where the processor can, so the two wide forms agree to the last bit and the
 //! portable one differs by rounding. Every function is inlined, so that it is compiled for the
 //! width of its caller.
@@ -11,6 +11,8 @@ use std::ops::{Add, Div, Mul, Sub};
 use pulp::Simd;
 #[cfg(target_arch = "x86_64")]
 use pulp::x86::{V3, V4};
+
+use crate::switches::{Skip, Switches};
 
 /// Widths of the kernel, the widest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -28,13 +30,11 @@ impl Width {
     pub const ALL: [Self; 3] = [Self::Sixteen, Self::Eight, Self::Four];
 
     /// The widest one of this processor.
-    #[must_use]
     pub fn widest() -> Self {
         Self::ALL.into_iter().find(|width| width.available()).unwrap_or(Self::Four)
     }
 
     /// Whether this processor has this width.
-    #[must_use]
     pub fn available(self) -> bool {
         match self {
             #[cfg(target_arch = "x86_64")]
@@ -64,6 +64,34 @@ impl Width {
             }
         }
         kernel.run(pulp::Scalar128b);
+    }
+}
+
+/// How the kernels of a frame run. The default: the widest lanes, and no needless work.
+#[derive(Clone, Copy, Debug)]
+pub struct KernelOptions {
+    /// Lanes.
+    pub width: Width,
+    /// Needless work that is done all the same.
+    pub without: Option<Skip>,
+}
+
+impl KernelOptions {
+    pub(super) fn new(switches: &Switches) -> Self {
+        let Switches { width, without, .. } = *switches;
+        Self { width: width.unwrap_or_else(Width::widest), without }
+    }
+
+    /// Whether work of this kind is left out.
+    #[inline]
+    pub(super) fn skips(self, skip: Skip) -> bool {
+        self.without != Some(skip)
+    }
+}
+
+impl Default for KernelOptions {
+    fn default() -> Self {
+        Self::new(&Switches::default())
     }
 }
 
@@ -236,36 +264,23 @@ impl<S: Lanes> Wide<S> {
     }
 }
 
-impl<S: Lanes> Add for Wide<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn add(self, other: Self) -> Self {
-        Self(self.0, self.0.add_f64s(self.1, other.1))
-    }
+macro_rules! operators {
+    ($($operator:ident $name:ident $lanes:ident;)+) => {
+        $(impl<S: Lanes> $operator for Wide<S> {
+            type Output = Self;
+            #[inline(always)]
+            fn $name(self, other: Self) -> Self {
+                Self(self.0, self.0.$lanes(self.1, other.1))
+            }
+        })+
+    };
 }
 
-impl<S: Lanes> Sub for Wide<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn sub(self, other: Self) -> Self {
-        Self(self.0, self.0.sub_f64s(self.1, other.1))
-    }
-}
-
-impl<S: Lanes> Mul for Wide<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn mul(self, other: Self) -> Self {
-        Self(self.0, self.0.mul_f64s(self.1, other.1))
-    }
-}
-
-impl<S: Lanes> Div for Wide<S> {
-    type Output = Self;
-    #[inline(always)]
-    fn div(self, other: Self) -> Self {
-        Self(self.0, self.0.div_f64s(self.1, other.1))
-    }
+operators! {
+    Add add add_f64s;
+    Sub sub sub_f64s;
+    Mul mul mul_f64s;
+    Div div div_f64s;
 }
 
 /// Powers above this count as infinite: 2^-120 is far under 1/255.

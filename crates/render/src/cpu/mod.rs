@@ -21,18 +21,18 @@ use parking_lot::Mutex;
 use rayon::prelude::*;
 
 use self::{
-    lanes::Width,
+    lanes::KernelOptions,
     paint::Paint,
-    project::{Projected, Projection},
+    project::Projected,
     radix_sort::{key, pack, value},
     rasterize::{RowOut, Tile, TileScratch},
     tiles::Grid,
 };
 use super::{
-    Frame, FrameStats, Labels, RenderRequest, Renderer,
+    Frame, Labels, RenderRequest, Renderer,
     constants::{ISECTS_MAX, TILE_SIZE},
     labels::WeightRows,
-    skip::Skip,
+    switches::{Skip, Switches},
     view::View,
 };
 use crate::{
@@ -51,9 +51,7 @@ pub struct CpuRenderer {
     frames: Pool<FrameScratch>,
     tiles: Pool<TileScratch>,
     isects_max: u64,
-    width: Width,
-    /// Work that is done although it could be skipped.
-    without: Option<Skip>,
+    options: KernelOptions,
 }
 
 impl CpuRenderer {
@@ -62,6 +60,14 @@ impl CpuRenderer {
     /// # Errors
     /// `internal` when the threads cannot be started.
     pub fn new(threads: usize) -> Result<Self> {
+        Self::with_switches(threads, &Switches::default())
+    }
+
+    /// The same with switches, for tests and the laboratory.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn with_switches(threads: usize, switches: &Switches) -> Result<Self> {
         let threads = match threads {
             0 => std::thread::available_parallelism().map_or(1, usize::from),
             n => n,
@@ -71,49 +77,27 @@ impl CpuRenderer {
             .thread_name(|i| format!("render-{i}"))
             .build()
             .map_err(|error| {
-                Error::internal(format!("render: {threads} threads cannot be started"))
-                    .caused_by(error)
+                let why = format!("render: {threads} threads cannot be started");
+                Error::internal(why).caused_by(error)
             })?;
         Ok(Self {
             threads: pool,
             frames: Pool::default(),
             tiles: Pool::default(),
-            isects_max: ISECTS_MAX,
-            width: Width::widest(),
-            without: None,
+            isects_max: switches.isects_max.unwrap_or(ISECTS_MAX).into(),
+            options: KernelOptions::new(switches),
         })
-    }
-
-    /// The same renderer with kernels of another width, if the processor has it.
-    #[must_use]
-    pub fn with_width(mut self, width: Width) -> Self {
-        self.width = width;
-        self
-    }
-
-    /// The same renderer without one of the skips, for tests and benchmarks.
-    #[must_use]
-    pub fn without(mut self, without: Option<Skip>) -> Self {
-        self.without = without;
-        self
-    }
-
-    /// The same renderer with another budget of Gaussian-tile pairs, for tests of the bands.
-    #[must_use]
-    pub fn with_isects_max(mut self, isects_max: u64) -> Self {
-        self.isects_max = isects_max;
-        self
     }
 
     fn draw(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         let view = View::new(gaussians.origin(), request)?;
-        let mut frame = blank(&view, request);
+        let pixels = view.width as usize * view.height as usize;
+        let mut frame = Frame::blank([view.width, view.height], request, pixels);
         let mut scratch = self.frames.take();
         let FrameScratch { projected, sorted, spare, .. } = &mut scratch;
-        let (width, without) = (self.width, self.without);
-        let how = Projection { antialiased: request.antialiased, width, without };
-        project::project(gaussians, &view, how, projected);
-        let all = without == Some(Skip::Unseen);
+        let options = self.options;
+        project::project(gaussians, &view, request.antialiased, options, projected);
+        let all = !options.skips(Skip::Unseen);
         let kept = |&(_, &tiles): &(u32, &u32)| tiles > 0 || all;
         let kept = (0_u32..).zip(&projected.tiles_per_gauss).filter(kept);
         sorted.clear();
@@ -121,13 +105,12 @@ impl CpuRenderer {
         sorted.extend(kept.map(|(i, _)| pack(projected.footprints[i as usize].depth.to_bits(), i)));
         radix_sort::radix_sort(sorted, spare, u32::BITS);
         if request.kinds.color {
-            shade::shade(gaussians, &view, without, projected);
+            shade::shade(gaussians, &view, options, projected);
         }
         let visible = projected.tiles_per_gauss.iter().filter(|&&tiles| tiles > 0);
         frame.stats.visible = visible.count() as u64;
-        let grid = Grid::whole(&view, without);
-        let paint = Paint::new(request, gaussians.semantic_index());
-        let paint = paint.with_width(width).without(without);
+        let grid = Grid::whole(&view, options);
+        let paint = Paint::new(request, gaussians.semantic_index(), options);
         let mut band = Band { paint, weights: Vec::new() };
         self.draw_band(&grid, &mut band, &mut scratch, &mut frame)?;
         if request.labels == Labels::Weights {
@@ -160,11 +143,8 @@ impl CpuRenderer {
         let Range { start, end } = grid.tile_rows;
         if total > self.isects_max {
             if end - start == 1 {
-                return Err(Error::limit(
-                    "render: Gaussian-tile pairs in one row of tiles",
-                    total,
-                    self.isects_max,
-                ));
+                let what = "render: Gaussian-tile pairs in one row of tiles";
+                return Err(Error::limit(what, total, self.isects_max));
             }
             let middle = start.midpoint(end);
             for tile_rows in [start..middle, middle..end] {
@@ -191,18 +171,15 @@ impl CpuRenderer {
     ) {
         let tiles_x = grid.tiles_x();
         let paint = band.paint;
-        let rows = band_rows(frame, grid, *paint.labels() == Labels::Weights);
+        let rows = band_rows(frame, grid, *paint.labels == Labels::Weights);
         let drawn = rows.into_par_iter().with_max_len(1).enumerate().map(|(row, mut out)| {
             let mut tile_scratch = self.tiles.take();
             let y = (grid.tile_rows.start + row as u32) * TILE_SIZE;
             for tile_x in 0..tiles_x {
                 let x = tile_x * TILE_SIZE;
-                let tile = Tile {
-                    x,
-                    y,
-                    width: TILE_SIZE.min(grid.width - x),
-                    height: TILE_SIZE.min(grid.height - y),
-                };
+                let [width, height] =
+                    [grid.width - x, grid.height - y].map(|side| TILE_SIZE.min(side));
+                let tile = Tile { x, y, width, height };
                 let id = row * tiles_x as usize + tile_x as usize;
                 let range = scratch.ranges[id] as usize..scratch.ranges[id + 1] as usize;
                 let isects = &scratch.isects[range];
@@ -268,21 +245,6 @@ impl<T: Default> Pool<T> {
 
     fn give(&self, thing: T) {
         self.0.lock().push(thing);
-    }
-}
-
-/// A frame of the right size; every pixel is written by a tile.
-fn blank(view: &View, request: &RenderRequest) -> Frame {
-    let pixels = view.width as usize * view.height as usize;
-    Frame {
-        width: view.width,
-        height: view.height,
-        color: request.kinds.color.then(|| vec![[0.0; 3]; pixels]),
-        depth: request.kinds.depth.then(|| vec![0.0; pixels]),
-        alpha: request.kinds.alpha.then(|| vec![0.0; pixels]),
-        blend: matches!(request.labels, Labels::Blend(_)).then(|| vec![[0.0; 4]; pixels]),
-        weights: None,
-        stats: FrameStats::default(),
     }
 }
 

@@ -1,7 +1,7 @@
 //! What the blend of a frame computes: the channels of a Gaussian and the options of the kernels.
 
-use super::{footprint::Footprint, lanes::Width};
-use crate::{Kinds, Labels, RenderRequest, labels::BLEND_WIDTH, skip::Skip};
+use super::{footprint::Footprint, lanes::KernelOptions};
+use crate::{Kinds, Labels, RenderRequest, labels::BLEND_WIDTH};
 
 /// Most channels: colour, depth, labels.
 pub(super) const CHANNELS: usize = 3 + 1 + BLEND_WIDTH;
@@ -16,38 +16,15 @@ pub struct Paint<'a> {
     /// Labels asked for.
     pub(super) labels: &'a Labels,
     /// `[N]` entry of each Gaussian.
-    pub(super) index: &'a [u16],
-    /// Lanes of the kernel.
-    pub(super) width: Width,
-    /// Work that is done although it could be skipped.
-    pub(super) without: Option<Skip>,
+    pub(super) entries: &'a [u16],
+    pub(super) options: KernelOptions,
 }
 
 impl<'a> Paint<'a> {
-    /// The blend of `request`, of Gaussians with the entries `index`, `[N]`.
-    #[must_use]
-    pub fn new(request: &'a RenderRequest, index: &'a [u16]) -> Self {
+    /// The blend of `request`, of Gaussians with these entries, `[N]`.
+    pub fn new(request: &'a RenderRequest, entries: &'a [u16], options: KernelOptions) -> Self {
         let RenderRequest { kinds, background, labels, .. } = request;
-        let (kinds, background, width) = (*kinds, *background, Width::widest());
-        Self { kinds, background, labels, index, width, without: None }
-    }
-
-    /// The same with kernels of another width.
-    #[must_use]
-    pub fn with_width(self, width: Width) -> Self {
-        Self { width, ..self }
-    }
-
-    /// The same without one of the skips.
-    #[must_use]
-    pub fn without(self, without: Option<Skip>) -> Self {
-        Self { without, ..self }
-    }
-
-    /// Labels asked for.
-    #[must_use]
-    pub fn labels(&self) -> &'a Labels {
-        self.labels
+        Self { kinds: *kinds, background: *background, labels, entries, options }
     }
 
     /// First channel of depth and of labels, and the number of all.
@@ -70,7 +47,7 @@ impl<'a> Paint<'a> {
             channels[depth] = footprint.depth;
         }
         if let Labels::Blend(table) = self.labels {
-            let row = Labels::row(table, self.index[id]);
+            let row = Labels::row(table, self.entries[id]);
             channels[label..label + BLEND_WIDTH].copy_from_slice(&row);
         }
         channels

@@ -7,13 +7,13 @@ use rayon::prelude::*;
 
 use super::{
     footprint::Footprint,
-    lanes::{LaneKernel, Lanes, Row, Wide, Width},
+    lanes::{KernelOptions, LaneKernel, Lanes, Row, Wide},
     tiles::{BLOCK, Ellipses, Grid, TileSpans},
 };
 use crate::{
     constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK},
     scene::Gaussians,
-    skip::Skip,
+    switches::Skip,
     view::View,
 };
 
@@ -31,37 +31,15 @@ pub struct Projected {
     pub tiles_per_gauss: Vec<u32>,
 }
 
-impl Projected {
-    /// Given footprints, with the tiles that they touch.
-    #[must_use]
-    pub fn of(footprints: Vec<Footprint>, grid: &Grid) -> Self {
-        let touched = footprints.iter().map(|footprint| TileSpans::of(footprint, grid));
-        let (tile_spans, tiles_per_gauss) = touched.unzip();
-        Self { footprints, tile_spans, tiles_per_gauss }
-    }
-}
-
-/// Options of the stage.
-#[derive(Clone, Copy, Debug)]
-pub struct Projection {
-    /// gsplat's antialiased mode.
-    pub antialiased: bool,
-    /// Lanes of the kernel.
-    pub width: Width,
-    /// Work that is done although it could be skipped.
-    pub without: Option<Skip>,
-}
-
-impl Projection {
-    /// All skips, and the widest lanes of the processor.
-    #[must_use]
-    pub fn new(antialiased: bool) -> Self {
-        Self { antialiased, width: Width::widest(), without: None }
-    }
-}
-
-/// Projects every Gaussian. `tiles_per_gauss[i]` is 0 if Gaussian i is dropped.
-pub fn project(gaussians: &Gaussians, view: &View, how: Projection, projected: &mut Projected) {
+/// Projects every Gaussian; `antialiased` is gsplat's mode. `tiles_per_gauss[i]` is 0 if Gaussian i
+/// is dropped.
+pub fn project(
+    gaussians: &Gaussians,
+    view: &View,
+    antialiased: bool,
+    options: KernelOptions,
+    projected: &mut Projected,
+) {
     let count = gaussians.len();
     let Projected { footprints, tile_spans, tiles_per_gauss } = projected;
     footprints.resize(count, Footprint::default());
@@ -73,7 +51,8 @@ pub fn project(gaussians: &Gaussians, view: &View, how: Projection, projected: &
         .zip(tiles_per_gauss.par_chunks_mut(CHUNK));
     chunks.enumerate().for_each(|(chunk, ((footprints, spans), tiles))| {
         let first = chunk * CHUNK;
-        how.width.run(Chunk { gaussians, view, how, first, footprints, spans, tiles });
+        let out = (footprints, spans, tiles);
+        options.width.run(Chunk { gaussians, view, antialiased, options, first, out });
     });
 }
 
@@ -81,30 +60,29 @@ pub fn project(gaussians: &Gaussians, view: &View, how: Projection, projected: &
 struct Chunk<'a> {
     gaussians: &'a Gaussians,
     view: &'a View,
-    how: Projection,
+    antialiased: bool,
+    options: KernelOptions,
     first: usize,
-    footprints: &'a mut [Footprint],
-    spans: &'a mut [TileSpans],
-    tiles: &'a mut [u32],
+    out: (&'a mut [Footprint], &'a mut [TileSpans], &'a mut [u32]),
 }
 
 impl LaneKernel for Chunk<'_> {
     #[inline(always)]
     fn run<S: Lanes>(self, simd: S) {
-        let Self { view, how, .. } = self;
-        let grid = Grid::whole(view, how.without);
-        let out = self.footprints.chunks_mut(BLOCK).zip(self.spans.chunks_mut(BLOCK));
-        let out = out.zip(self.tiles.chunks_mut(BLOCK)).enumerate();
+        let Self { view, antialiased, options, out: (footprints, spans, tiles), .. } = self;
+        let grid = Grid::whole(view, options);
+        let out = footprints.chunks_mut(BLOCK).zip(spans.chunks_mut(BLOCK));
+        let out = out.zip(tiles.chunks_mut(BLOCK)).enumerate();
         let (mut block, mut ellipses) = (Block::default(), Ellipses::default());
         for (at, ((footprints, spans), tiles)) in out {
             tiles.fill(0);
-            if how.without == Some(Skip::Unseen) {
+            if !options.skips(Skip::Unseen) {
                 // The spans of dropped Gaussians are read too.
                 spans.fill(TileSpans::default());
             }
             let first = self.first + at * BLOCK;
             block.load(self.gaussians, first, footprints.len());
-            if !block.project(simd, view, how.antialiased) {
+            if !block.project(simd, view, antialiased) {
                 continue;
             }
             let mut seen = 0_u32;

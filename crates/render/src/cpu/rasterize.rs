@@ -21,7 +21,7 @@ use crate::{
     Labels,
     constants::{ALPHA_MAX, ALPHA_MIN, BATCH_SIZE, TILE_SIZE, TRANSMITTANCE_MIN},
     labels::{BLEND_WIDTH, WeightRows},
-    skip::Skip,
+    switches::Skip,
 };
 
 const SIDE: usize = TILE_SIZE as usize;
@@ -83,11 +83,10 @@ const fn along(side: usize, rows: bool, step: f32) -> Numbers {
 /// Bin of a Gaussian without a bin.
 const NO_BIN: u32 = u32::MAX;
 
-/// A Gaussian of a tile, ready for the blend of all cells.
-///
-/// At (x, y), pixels from the centre of the tile, alpha is the opacity times 2^-(u² + v²) with
-/// `u = ux x + uy y + u0` and `v = vy y + v0`. Where the Gaussian is visible, all terms are small,
-/// because the blur bounds `ux`, `uy` and `vy`. So f32 is precise enough.
+/// A Gaussian of a tile, ready for the blend of all cells. At (x, y), pixels from the centre of the
+/// tile, alpha is the opacity times 2^-(u² + v²) with `u = ux x + uy y + u0` and `v = vy y + v0`.
+/// Where the Gaussian is visible, all terms are small, because the blur bounds `ux`, `uy` and `vy`.
+/// So f32 is precise enough.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(64))]
 struct Staged {
@@ -158,22 +157,22 @@ struct Bins {
 
 impl Bins {
     /// Makes a bin for each entry over 0 of the Gaussians `isects`. All sums are 0.
-    fn open(&mut self, isects: &[u64], index: &[u16]) {
+    fn open(&mut self, isects: &[u64], entries: &[u16]) {
         self.bin_of.resize(1 << u16::BITS, NO_BIN);
         for left in self.present.drain(..) {
             self.bin_of[usize::from(left)] = NO_BIN;
         }
         for &isect in isects {
-            let label = index[radix_sort::value(isect) as usize];
-            let bin = &mut self.bin_of[usize::from(label)];
-            if label != 0 && *bin == NO_BIN {
+            let entry = entries[radix_sort::value(isect) as usize];
+            let bin = &mut self.bin_of[usize::from(entry)];
+            if entry != 0 && *bin == NO_BIN {
                 *bin = 0;
-                self.present.push(label);
+                self.present.push(entry);
             }
         }
         self.present.sort_unstable();
-        for (bin, label) in (0_u32..).zip(&self.present) {
-            self.bin_of[usize::from(*label)] = bin;
+        for (bin, entry) in (0_u32..).zip(&self.present) {
+            self.bin_of[usize::from(*entry)] = bin;
         }
         self.sums.clear();
         self.sums.resize(CELLS * self.present.len(), Numbers::ZERO);
@@ -215,9 +214,8 @@ pub struct Tile {
     pub height: u32,
 }
 
-/// Blends the Gaussians `isects` (depth order) over the pixels of `tile`.
-///
-/// `picture_width` is the stride of `out`, which starts at the tile's first row.
+/// Blends the Gaussians `isects` (depth order) over the pixels of `tile`. `picture_width` is the
+/// stride of `out`, which starts at the tile's first row.
 pub fn rasterize_tile(
     footprints: &[Footprint],
     isects: &[u64],
@@ -227,28 +225,22 @@ pub fn rasterize_tile(
     scratch: &mut TileScratch,
     out: &mut RowOut<'_>,
 ) {
-    if isects.is_empty() && paint.without != Some(Skip::EmptyTiles) {
+    if isects.is_empty() && paint.options.skips(Skip::EmptyTiles) {
         return store_empty(tile, paint, picture_width, out);
     }
     if *paint.labels == Labels::Weights {
-        scratch.bins.open(isects, paint.index);
+        scratch.bins.open(isects, paint.entries);
     }
-    let work = TileWork { footprints, isects, tile, paint };
-    paint.width.run(Blend { work, scratch: &mut *scratch });
+    paint.options.width.run(Blend { footprints, isects, tile, paint, scratch: &mut *scratch });
     store(tile, paint, picture_width, scratch, out);
 }
 
-/// A tile and its Gaussians.
-#[derive(Clone, Copy)]
-struct TileWork<'a> {
+/// A tile, its Gaussians and the scratch to blend them in.
+struct Blend<'a> {
     footprints: &'a [Footprint],
     isects: &'a [u64],
     tile: Tile,
     paint: &'a Paint<'a>,
-}
-
-struct Blend<'a> {
-    work: TileWork<'a>,
     scratch: &'a mut TileScratch,
 }
 
@@ -256,85 +248,83 @@ impl LaneKernel for Blend<'_> {
     /// Runs the loop that is compiled for the channels of the frame.
     #[inline(always)]
     fn run<S: Lanes>(self, simd: S) {
-        let Self { work, scratch } = self;
-        let [.., channels] = work.paint.layout();
-        let weights = *work.paint.labels == Labels::Weights;
+        let [.., channels] = self.paint.layout();
+        let weights = *self.paint.labels == Labels::Weights;
         match (channels, weights) {
-            (0, false) => blend::<S, 0, false>(simd, work, scratch),
-            (1, false) => blend::<S, 1, false>(simd, work, scratch),
-            (3, false) => blend::<S, 3, false>(simd, work, scratch),
-            (4, false) => blend::<S, 4, false>(simd, work, scratch),
-            (5, false) => blend::<S, 5, false>(simd, work, scratch),
-            (7, false) => blend::<S, 7, false>(simd, work, scratch),
-            (_, false) => blend::<S, CHANNELS, false>(simd, work, scratch),
-            (0, true) => blend::<S, 0, true>(simd, work, scratch),
-            (1, true) => blend::<S, 1, true>(simd, work, scratch),
-            (3, true) => blend::<S, 3, true>(simd, work, scratch),
-            (_, true) => blend::<S, 4, true>(simd, work, scratch),
+            (0, false) => self.blend::<S, 0, false>(simd),
+            (1, false) => self.blend::<S, 1, false>(simd),
+            (3, false) => self.blend::<S, 3, false>(simd),
+            (4, false) => self.blend::<S, 4, false>(simd),
+            (5, false) => self.blend::<S, 5, false>(simd),
+            (7, false) => self.blend::<S, 7, false>(simd),
+            (_, false) => self.blend::<S, CHANNELS, false>(simd),
+            (0, true) => self.blend::<S, 0, true>(simd),
+            (1, true) => self.blend::<S, 1, true>(simd),
+            (3, true) => self.blend::<S, 3, true>(simd),
+            (_, true) => self.blend::<S, 4, true>(simd),
         }
     }
 }
 
-#[inline(always)]
-fn blend<S: Lanes, const K: usize, const WEIGHTS: bool>(
-    simd: S,
-    work: TileWork<'_>,
-    scratch: &mut TileScratch,
-) {
-    let by_parts = work.paint.without != Some(Skip::EllipseParts);
-    let ends = work.paint.without != Some(Skip::EndedRays);
-    let mut open = clear(&mut scratch.cells, work.tile);
-    for batch in work.isects.chunks(BATCH_SIZE) {
-        // Footprints lie far apart in memory. This loop is short, so that the processor fetches
-        // many of them at the same time.
-        let fetched = &mut scratch.fetched[..batch.len()];
-        for (fetched, &isect) in fetched.iter_mut().zip(batch) {
-            *fetched = work.footprints[radix_sort::value(isect) as usize];
-        }
-        let staged = &mut scratch.staged[..batch.len()];
-        for ((staged, footprint), &isect) in staged.iter_mut().zip(fetched).zip(batch) {
-            let id = radix_sort::value(isect) as usize;
-            let bin = match WEIGHTS {
-                true => scratch.bins.bin_of[usize::from(work.paint.index[id])],
-                false => NO_BIN,
-            };
-            let channels = work.paint.channels(footprint, id);
-            *staged = stage(footprint, work.tile, channels, bin);
-        }
-        let groups = staged.chunks(GROUP).zip(&mut scratch.marks);
-        for (group, marks) in groups {
-            let mut met_by = [0_u16; GROUP];
-            for (bits, gaussian) in met_by.iter_mut().zip(group) {
-                *bits = if by_parts { met(simd, gaussian) } else { u16::MAX };
+impl Blend<'_> {
+    #[inline(always)]
+    fn blend<S: Lanes, const K: usize, const WEIGHTS: bool>(self, simd: S) {
+        let Self { footprints, isects, tile, paint, scratch } = self;
+        let by_parts = paint.options.skips(Skip::EllipseParts);
+        let ends = paint.options.skips(Skip::EndedRays);
+        let mut open = clear(&mut scratch.cells, tile);
+        for batch in isects.chunks(BATCH_SIZE) {
+            // Footprints lie far apart in memory. This loop is short, so that the processor fetches
+            // many of them at the same time.
+            let fetched = &mut scratch.fetched[..batch.len()];
+            for (fetched, &isect) in fetched.iter_mut().zip(batch) {
+                *fetched = footprints[radix_sort::value(isect) as usize];
             }
-            *marks = turned_over(&met_by);
-        }
-        let groups = batch.len().div_ceil(GROUP);
-        let mut cells = open;
-        while cells != 0 {
-            let at = cells.trailing_zeros() as usize;
-            cells &= cells - 1;
-            let marks = &scratch.marks[..groups];
-            let (cell, sums) = (&mut scratch.cells[at], scratch.bins.of_cell(at));
-            let mut goes_on = false;
-            for i in 0..PIXELS / S::F32_LANES {
-                let staged = &scratch.staged;
-                goes_on |=
-                    blend_cell::<S, K, WEIGHTS>(simd, (at, i), ends, cell, staged, marks, sums);
+            let staged = &mut scratch.staged[..batch.len()];
+            for ((staged, footprint), &isect) in staged.iter_mut().zip(fetched).zip(batch) {
+                let id = radix_sort::value(isect) as usize;
+                let bin = match WEIGHTS {
+                    true => scratch.bins.bin_of[usize::from(paint.entries[id])],
+                    false => NO_BIN,
+                };
+                let channels = paint.channels(footprint, id);
+                *staged = stage(footprint, tile, channels, bin);
             }
-            if ends && !goes_on {
-                open &= !(1 << at);
+            let groups = staged.chunks(GROUP).zip(&mut scratch.marks);
+            for (group, marks) in groups {
+                let mut met_by = [0_u16; GROUP];
+                for (bits, gaussian) in met_by.iter_mut().zip(group) {
+                    *bits = if by_parts { met(simd, gaussian) } else { u16::MAX };
+                }
+                *marks = transposed(&met_by);
             }
-        }
-        if open == 0 {
-            break;
+            let groups = batch.len().div_ceil(GROUP);
+            let mut cells = open;
+            while cells != 0 {
+                let at = cells.trailing_zeros() as usize;
+                cells &= cells - 1;
+                let marks = &scratch.marks[..groups];
+                let (cell, sums) = (&mut scratch.cells[at], scratch.bins.of_cell(at));
+                let mut goes_on = false;
+                for i in 0..PIXELS / S::F32_LANES {
+                    let staged = &scratch.staged;
+                    goes_on |=
+                        blend_cell::<S, K, WEIGHTS>(simd, (at, i), ends, cell, staged, marks, sums);
+                }
+                if ends && !goes_on {
+                    open &= !(1 << at);
+                }
+            }
+            if open == 0 {
+                break;
+            }
         }
     }
 }
 
 /// Transposes marks (bit c of Gaussian i) to rows (bit i of cell c).
 #[inline(always)]
-fn turned_over(met_by: &[u16; GROUP]) -> [u64; CELLS] {
+fn transposed(met_by: &[u16; GROUP]) -> [u64; CELLS] {
     let mut marks = [0; CELLS];
     for (block, met_by) in met_by.chunks_exact(8).enumerate() {
         for half in 0..2 {
@@ -406,9 +396,8 @@ fn stage(footprint: &Footprint, tile: Tile, channels: [f32; CHANNELS], bin: u32)
     }
 }
 
-/// One bit for each cell that the ellipse may touch.
-///
-/// In a cell, u and v stay within a box. Its distance from 0 is compared with `power_max`.
+/// One bit for each cell that the ellipse may touch. In a cell, u and v stay within a box. Its
+/// distance from 0 is compared with `power_max`.
 #[inline(always)]
 fn met<S: Lanes>(simd: S, gaussian: &Staged) -> u16 {
     let mut bits = 0;
@@ -526,7 +515,8 @@ fn store(
     for row in 0..tile.height as usize {
         for column in 0..tile.width as usize {
             let at = row * picture_width as usize + tile.x as usize + column;
-            let cell = &scratch.cells[row / CELL * ACROSS + column / CELL];
+            let cell_at = row / CELL * ACROSS + column / CELL;
+            let cell = &scratch.cells[cell_at];
             let pixel = row % CELL * CELL + column % CELL;
             let alpha = cell.alpha.0[pixel].min(1.0);
             if let Some(color) = &mut out.color {
@@ -544,27 +534,11 @@ fn store(
             if let Some(blend) = &mut out.blend {
                 blend[at] = std::array::from_fn(|k| cell.channels[label_at + k].0[pixel]);
             }
-        }
-    }
-    if let Some(weights) = &mut out.weights {
-        store_weights(tile, &scratch.bins, weights);
-    }
-}
-
-/// Writes the bins over 0 of every pixel.
-fn store_weights(tile: Tile, bins: &Bins, weights: &mut WeightRows) {
-    let count = bins.present.len();
-    if count == 0 {
-        return;
-    }
-    for row in 0..tile.height as usize {
-        for column in 0..tile.width as usize {
-            let cell = row / CELL * ACROSS + column / CELL;
-            let pixel = row % CELL * CELL + column % CELL;
-            let sums = &bins.sums[cell * count..(cell + 1) * count];
-            for (label, sum) in bins.present.iter().zip(sums) {
-                if sum.0[pixel] > 0.0 {
-                    weights.push(tile.x as usize + column, row, *label, sum.0[pixel]);
+            if let Some(weights) = &mut out.weights {
+                let Bins { present, sums, .. } = &scratch.bins;
+                let sums = &sums[cell_at * present.len()..];
+                for (entry, sum) in present.iter().zip(sums).filter(|(_, sum)| sum.0[pixel] > 0.0) {
+                    weights.push(tile.x as usize + column, row, *entry, sum.0[pixel]);
                 }
             }
         }
@@ -576,13 +550,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn turned_over_marks_tell_the_same() {
+    fn transposed_marks_are_the_same_marks() {
         let mut random = 9_u32;
         let met_by: [u16; GROUP] = std::array::from_fn(|_| {
             random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             (random >> 13) as u16
         });
-        let marks = turned_over(&met_by);
+        let marks = transposed(&met_by);
         for (gaussian, bits) in met_by.iter().enumerate() {
             for (cell, marks) in marks.iter().enumerate() {
                 let (want, got) = (bits >> cell & 1 == 1, marks >> gaussian & 1 == 1);

@@ -5,11 +5,11 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::project::Projected;
+use super::{lanes::KernelOptions, project::Projected};
 use crate::{
     constants::{SH_C0, SH_C1, SH_C2, SH_C3, SH_OFFSET},
     scene::Gaussians,
-    skip::Skip,
+    switches::Skip,
     view::View,
 };
 
@@ -17,12 +17,15 @@ use crate::{
 const CHUNK: usize = 1024;
 
 /// Writes the colour of every visible footprint, in place. The footprints keep the order of the
-/// scene, which suits the rasteriser's cache better than depth order.
-///
-/// A scene of degree 0 looks the same from everywhere: no direction is computed, unless `without`
-/// says so.
-pub fn shade(gaussians: &Gaussians, view: &View, without: Option<Skip>, projected: &mut Projected) {
-    let flat = gaussians.sh_count() == 1 && without != Some(Skip::FlatColor);
+/// scene, which suits the rasteriser's cache better than depth order. A scene of degree 0 looks the
+/// same from everywhere, so no direction is computed.
+pub fn shade(
+    gaussians: &Gaussians,
+    view: &View,
+    options: KernelOptions,
+    projected: &mut Projected,
+) {
+    let flat = gaussians.sh_count() == 1 && options.skips(Skip::FlatColor);
     let coefficients = gaussians.sh_count();
     let chunks = projected.footprints.par_chunks_mut(CHUNK);
     chunks.zip(projected.tiles_per_gauss.par_chunks(CHUNK)).enumerate().for_each(
@@ -44,7 +47,6 @@ pub fn shade(gaussians: &Gaussians, view: &View, without: Option<Skip>, projecte
 }
 
 /// Colour of harmonics `sh` (`[K, 3]`, 3DGS basis and order) seen along `toward` (any length).
-#[must_use]
 pub fn color(sh: &[[f32; 3]], toward: DVec3) -> [f32; 3] {
     let basis = basis(toward.normalize_or_zero().as_vec3().into());
     let mut color = [SH_OFFSET; 3];

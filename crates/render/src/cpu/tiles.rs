@@ -5,9 +5,9 @@ use std::ops::Range;
 
 use super::{
     footprint::Footprint,
-    lanes::{Lanes, Row, Wide},
+    lanes::{KernelOptions, Lanes, Row, Wide},
 };
-use crate::{constants::TILE_SIZE, skip::Skip, view::View};
+use crate::{constants::TILE_SIZE, switches::Skip, view::View};
 
 /// Places are clamped to this, pixels. Pictures are smaller, and f64 holds integers of this size
 /// exactly.
@@ -29,32 +29,28 @@ pub struct Grid {
 
 impl Grid {
     /// All tiles of a picture.
-    #[must_use]
-    pub fn whole(view: &View, without: Option<Skip>) -> Self {
+    pub fn whole(view: &View, options: KernelOptions) -> Self {
         Self {
             width: view.width,
             height: view.height,
             tile_rows: 0..view.tiles_y(),
-            by_ellipse: without != Some(Skip::EllipseTiles),
+            by_ellipse: options.skips(Skip::EllipseTiles),
         }
     }
 
     /// Tiles in a row of tiles.
-    #[must_use]
     pub fn tiles_x(&self) -> u32 {
         self.width.div_ceil(TILE_SIZE)
     }
 
     /// Tiles of the whole band.
-    #[must_use]
     pub fn tile_count(&self) -> u32 {
         self.tiles_x() * (self.tile_rows.end - self.tile_rows.start)
     }
 }
 
-/// The result of [`touched_tiles`] for a footprint of at most two rows of tiles. Most are.
-///
-/// The emission reads it: in depth order these 12 bytes stay in the cache, footprints do not.
+/// The result of [`touched_tiles`] for a footprint of at most two rows of tiles. Most are. The
+/// emission reads it: in depth order these 12 bytes stay in the cache, footprints do not.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct TileSpans {
     /// First row of tiles touched.
@@ -68,7 +64,6 @@ pub struct TileSpans {
 impl TileSpans {
     /// Calls [`touched_tiles`] once. Returns the spans and the number of tiles.
     #[inline]
-    #[must_use]
     pub fn of(footprint: &Footprint, grid: &Grid) -> (Self, u32) {
         let mut kept = Self::default();
         let mut count = 0;
@@ -106,7 +101,6 @@ impl TileSpans {
     }
 
     /// Number of tiles touched in `grid`, which may be a band of the first grid.
-    #[must_use]
     pub fn count(&self, footprint: &Footprint, grid: &Grid) -> u32 {
         let mut count = 0;
         self.replay(footprint, grid, |_, tiles| count += tiles.end - tiles.start);
@@ -210,9 +204,8 @@ impl Ellipses {
     }
 }
 
-/// Calls `touch(tile_y, tiles)` for every row of tiles of `grid` with the span of tiles touched.
-///
-/// A tile is touched if the ellipse of alpha 1/255 meets the rectangle of the tile's pixel centres.
+/// Calls `touch(tile_y, tiles)` for every row of tiles of `grid` with the span of tiles touched. A
+/// tile is touched if the ellipse of alpha 1/255 meets the rectangle of the tile's pixel centres.
 /// The ellipse is convex, so it touches one span in a row of tiles: from its leftmost to its
 /// rightmost point inside the row.
 #[inline]
@@ -252,13 +245,6 @@ pub fn touched_tiles(footprint: &Footprint, grid: &Grid, mut touch: impl FnMut(u
     }
 }
 
-/// Number of tiles touched in `grid`.
-#[inline]
-#[must_use]
-pub fn count_tiles(footprint: &Footprint, grid: &Grid) -> u32 {
-    TileSpans::of(footprint, grid).1
-}
-
 /// `v.floor()`, saturating. The standard one is a function call without SSE 4.1.
 #[inline]
 fn floor(v: f64) -> i64 {
@@ -275,10 +261,7 @@ fn ceil(v: f64) -> i64 {
 
 #[cfg(test)]
 mod tests {
-    use super::{
-        super::lanes::{LaneKernel, Width},
-        *,
-    };
+    use super::*;
 
     #[test]
     fn floor_and_ceil_equal_the_standard_ones_and_saturate() {
@@ -288,128 +271,5 @@ mod tests {
         for v in [f64::INFINITY, 1e300] {
             assert_eq!((floor(v), ceil(-v)), (i64::MAX, i64::MIN), "{v} saturates");
         }
-    }
-
-    struct Asked<'a>(&'a [Footprint], &'a Grid, &'a mut Vec<(TileSpans, u32)>);
-
-    impl LaneKernel for Asked<'_> {
-        #[inline(always)]
-        fn run<S: Lanes>(self, simd: S) {
-            let Self(footprints, grid, answers) = self;
-            for block in footprints.chunks(BLOCK) {
-                let mut ellipses = Ellipses::default();
-                for (k, footprint) in block.iter().enumerate() {
-                    ellipses.set(k, footprint);
-                }
-                ellipses.touch(simd, grid);
-                let spans = block.iter().enumerate();
-                answers.extend(spans.map(|(k, footprint)| ellipses.spans(k, footprint, grid)));
-            }
-        }
-    }
-
-    #[test]
-    fn ellipses_in_lanes_touch_the_tiles_that_one_alone_touches() {
-        let grid = Grid { width: 203, height: 150, tile_rows: 0..10, by_ellipse: true };
-        let footprints: Vec<Footprint> = (0..4_000_u32)
-            .map(|i| {
-                let turn = |k: u32| f64::from((i.wrapping_mul(2_654_435_761) >> k) & 0xff) / 255.0;
-                // Some far away, some of no height, some that cover the picture.
-                let far = if i % 97 == 0 { 1e12 } else { 1.0 };
-                Footprint {
-                    mean: [(turn(3) * 300.0 - 50.0) * far, turn(9) * 250.0 - 50.0],
-                    conic_shear: turn(12) * 8.0 - 4.0,
-                    conic_x: (0.002 + turn(17)) as f32,
-                    conic_y: (0.004 + turn(21) * turn(2)) as f32,
-                    power_max: (turn(6) * 5.5) as f32,
-                    ..Footprint::default()
-                }
-            })
-            .collect();
-        let alone = footprints.iter().map(|f| TileSpans::of(f, &grid));
-        let want: Vec<_> = alone.collect();
-        assert!(want.iter().any(|(spans, _)| spans.rows > 2), "tall ones too");
-        for width in Width::ALL.into_iter().filter(|width| width.available()) {
-            let mut got = Vec::new();
-            width.run(Asked(&footprints, &grid, &mut got));
-            for (i, (got, want)) in got.iter().zip(&want).enumerate() {
-                // What a span tells counts, not how an empty one is written.
-                let tiles = |spans: &TileSpans| {
-                    let mut tiles = Vec::new();
-                    spans.replay(&footprints[i], &grid, |y, xs| tiles.push((y, xs)));
-                    tiles
-                };
-                assert_eq!(got.1, want.1, "{width:?}, count of {:?}", footprints[i]);
-                assert_eq!(tiles(&got.0), tiles(&want.0), "{width:?}, {:?}", footprints[i]);
-            }
-        }
-    }
-
-    /// Every pixel centre inside the ellipse lies in a touched tile, and every tile touched comes
-    /// near the ellipse.
-    #[test]
-    fn touched_tiles_hold_every_pixel_of_the_ellipse() {
-        let grid = Grid { width: 203, height: 150, tile_rows: 0..10, by_ellipse: true };
-        let mut touched_total = 0;
-        for i in 0..2_000_u32 {
-            let turn = |k: u32| f64::from((i.wrapping_mul(2_654_435_761) >> k) & 0xff) / 255.0;
-            let footprint = Footprint {
-                mean: [turn(3) * 300.0 - 50.0, turn(9) * 250.0 - 50.0],
-                conic_shear: turn(12) * 8.0 - 4.0,
-                conic_x: (0.01 + turn(17)) as f32,
-                conic_y: (0.02 + turn(21) * turn(2)) as f32,
-                power_max: (turn(6) * 5.5) as f32,
-                ..Footprint::default()
-            };
-            let mut touched = vec![false; grid.tile_count() as usize];
-            touched_tiles(&footprint, &grid, |tile_y, tiles| {
-                for tile_x in tiles {
-                    touched[(tile_y * grid.tiles_x() + tile_x) as usize] = true;
-                    touched_total += 1;
-                }
-            });
-            let (spans, count) = TileSpans::of(&footprint, &grid);
-            let mut replayed = vec![false; touched.len()];
-            spans.replay(&footprint, &grid, |tile_y, tiles| {
-                for tile_x in tiles {
-                    replayed[(tile_y * grid.tiles_x() + tile_x) as usize] = true;
-                }
-            });
-            assert_eq!(replayed, touched, "count and emission of {footprint:?}");
-            let told = touched.iter().filter(|&&t| t).count();
-            assert_eq!(count as usize, told, "count of {footprint:?}");
-            let band = Grid { tile_rows: 3..5, ..grid.clone() };
-            let in_band = touched[3 * 13..5 * 13].iter().filter(|&&t| t).count();
-            assert_eq!(spans.count(&footprint, &band) as usize, in_band, "band of {footprint:?}");
-            let power = |x: f64, y: f64| {
-                let (dx, dy) = (x - footprint.mean[0], y - footprint.mean[1]);
-                (f64::from(footprint.conic_x) * (dx - footprint.conic_shear * dy)).powi(2)
-                    + (f64::from(footprint.conic_y) * dy).powi(2)
-            };
-            for y in 0..grid.height {
-                for x in 0..grid.width {
-                    let inside =
-                        power(f64::from(x) + 0.5, f64::from(y) + 0.5) < footprint.power_max.into();
-                    let tile = y / TILE_SIZE * grid.tiles_x() + x / TILE_SIZE;
-                    assert!(
-                        !inside || touched[tile as usize],
-                        "pixel {x},{y} of {footprint:?} is left out"
-                    );
-                }
-            }
-            // No tile more than half a pixel away from the ellipse: a fine search over the tile.
-            for (tile, _) in touched.iter().enumerate().filter(|(_, t)| **t) {
-                let (tx, ty) = (tile as u32 % grid.tiles_x(), tile as u32 / grid.tiles_x());
-                let near = (0..=32).any(|j| {
-                    (0..=32).any(|k| {
-                        let x = f64::from(tx * TILE_SIZE) + f64::from(k) * 0.5;
-                        let y = f64::from(ty * TILE_SIZE) + f64::from(j) * 0.5;
-                        power(x, y) < f64::from(footprint.power_max) * 1.05 + 1.5
-                    })
-                });
-                assert!(near, "tile {tx},{ty} is far from {footprint:?}");
-            }
-        }
-        assert!(touched_total > 1_000, "the test saw {touched_total} tiles only");
     }
 }

@@ -8,8 +8,7 @@ use std::sync::{
 use parking_lot::Mutex;
 
 use super::{
-    GpuOptions,
-    buffers::{DeviceLabels, DeviceScene, SceneCache},
+    buffers::{DeviceScene, SceneCache},
     device::Gpu,
     frame::{Drawing, Tools},
     pipelines::{Kernels, VIEWS_MAX},
@@ -18,11 +17,11 @@ use super::{
     scratch::Scratch,
 };
 use crate::{
-    DeviceTimes, DispatchTime, Frame, Labels, RenderRequest,
+    DeviceTimes, DispatchTime, Frame, Labels, RenderRequest, RendererOptions,
+    constants::ISECTS_MAX,
     error::{ErrorCode, Result},
     scene::Gaussians,
     select::AdapterReport,
-    view::View,
 };
 
 /// How often one submission is tried on a new device before its views fail.
@@ -50,30 +49,16 @@ impl Context {
     fn tools<'a>(
         &'a mut self,
         scene: &'a DeviceScene,
-        labels: Option<&'a DeviceLabels>,
         isects_max: u32,
         marks: Option<&'a mut Marks>,
     ) -> Tools<'a> {
         let (gpu, kernels, scratch) = (&self.on.gpu, &*self.on.kernels, &mut self.scratch);
-        Tools { gpu, kernels, scratch, scene, labels, isects_max, marks, times: Vec::new() }
+        Tools { gpu, kernels, scratch, scene, isects_max, marks }
     }
 
-    /// The scene of `gaussians`, and its entries if `labelled`.
-    ///
-    /// # Errors
-    /// As [`SceneCache::get`].
-    pub(super) fn scene(
-        &self,
-        gaussians: &Gaussians,
-        labelled: bool,
-    ) -> Result<(DeviceScene, Option<DeviceLabels>)> {
-        let mut scenes = self.on.scenes.lock();
-        let scene = scenes.get(&self.on.gpu, gaussians)?;
-        let labels = match labelled {
-            true => Some(scenes.labels(&self.on.gpu, gaussians)?),
-            false => None,
-        };
-        Ok((scene, labels))
+    /// The scene of `gaussians`; if `labelled`, with its entries.
+    pub(super) fn scene(&self, gaussians: &Gaussians, labelled: bool) -> Result<DeviceScene> {
+        self.on.scenes.lock().get(&self.on.gpu, gaussians, labelled)
     }
 }
 
@@ -88,7 +73,7 @@ struct DeviceState {
 /// One adapter.
 #[derive(Debug)]
 pub(super) struct Adapter {
-    options: GpuOptions,
+    options: RendererOptions,
     adapter: wgpu::Adapter,
     report: AdapterReport,
     state: Mutex<DeviceState>,
@@ -101,13 +86,12 @@ pub(super) struct Adapter {
 
 impl Adapter {
     /// Opens a device and compiles the kernels.
-    ///
-    /// # Errors
-    /// `gpu_unavailable` when the adapter refuses, `internal` when a kernel does not compile.
+    /// Errors: `gpu_unavailable` when the adapter refuses, `internal` when a kernel does not
+    /// compile.
     pub(super) fn open(
         adapter: wgpu::Adapter,
         report: AdapterReport,
-        options: &GpuOptions,
+        options: &RendererOptions,
     ) -> Result<Self> {
         let opened = Self {
             options: options.clone(),
@@ -115,7 +99,7 @@ impl Adapter {
             report,
             state: Mutex::default(),
             shapes: Mutex::default(),
-            queue: ViewQueue::new(options.waiting_max),
+            queue: ViewQueue::default(),
             submissions: AtomicU64::new(0),
             views: AtomicU64::new(0),
         };
@@ -124,14 +108,18 @@ impl Adapter {
     }
 
     fn open_device(&self) -> Result<OpenDevice> {
-        let gpu = Gpu::open(&self.adapter, self.options.portable)?;
-        let kernels = Kernels::compile(&gpu, &self.options, self.report.software)?;
+        let gpu = Gpu::open(&self.adapter, self.options.switches.portable)?;
+        let kernels = Kernels::compile(&gpu, &self.options.switches, self.report.software)?;
         let scenes = SceneCache::new(self.options.scene_bytes_max);
         Ok(OpenDevice { gpu, kernels: Arc::new(kernels), scenes: Arc::new(Mutex::new(scenes)) })
     }
 
-    pub(super) fn adapter(&self) -> &AdapterReport {
+    pub(super) fn report(&self) -> &AdapterReport {
         &self.report
+    }
+
+    fn isects_max(&self) -> u32 {
+        self.options.switches.isects_max.unwrap_or(ISECTS_MAX)
     }
 
     pub(super) fn scenes_held(&self) -> usize {
@@ -155,7 +143,7 @@ impl Adapter {
     /// Marks the device as lost for everyone.
     pub(super) fn lose_device(&self) {
         if let Some(opened) = &self.state.lock().opened {
-            opened.gpu.lose();
+            opened.gpu.give_up("lost on purpose".to_owned());
         }
     }
 
@@ -213,9 +201,6 @@ impl Adapter {
     }
 
     /// Draws one view, together with waiting views of the same scene.
-    ///
-    /// # Errors
-    /// As [`crate::Renderer::render`], and `overloaded` when too many wait.
     pub(super) fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         let views_max = (BATCH_GAUSSIANS / gaussians.len().max(1)).clamp(1, VIEWS_MAX as usize);
         let scene = gaussians.identity();
@@ -263,28 +248,20 @@ impl Adapter {
             }
             other => other,
         }
-        .map(|drawn| drawn.0)
     }
 
     /// Views of one submission. `None` stands for a view that needs more room than expected.
-    fn together(
+    fn together<'a>(
         &self,
         context: &mut Context,
         gaussians: &Gaussians,
-        requests: &[&RenderRequest],
+        requests: &[&'a RenderRequest],
     ) -> Result<Vec<Option<Frame>>> {
-        let views: Vec<_> = requests
-            .iter()
-            .map(|request| View::new(gaussians.origin(), request))
-            .collect::<Result<_>>()?;
         let labelled = requests.first().is_some_and(|one| one.labels != Labels::None);
-        let (scene, labels) = context.scene(gaussians, labelled)?;
-        let mut drawings: Vec<_> = views
-            .iter()
-            .zip(requests)
-            .map(|(view, request)| Drawing::new(view, request, &scene))
-            .collect();
-        let mut tools = context.tools(&scene, labels.as_ref(), self.options.isects_max, None);
+        let scene = context.scene(gaussians, labelled)?;
+        let start = |request: &&'a RenderRequest| Drawing::new(gaussians.origin(), request, &scene);
+        let mut drawings = requests.iter().map(start).collect::<Result<Vec<_>>>()?;
+        let mut tools = context.tools(&scene, self.isects_max(), None);
         let drawn = tools.together(&mut drawings)?;
         let frames = drawings.into_iter().zip(drawn).map(|(drawing, drawn)| {
             drawn.then(|| drawing.finish(&mut context.scratch)).transpose()
@@ -292,28 +269,23 @@ impl Adapter {
         frames.collect()
     }
 
-    /// One frame, and the times of its last submission if `marks` is given.
+    /// One frame; `marks` has the times of its last submission.
     fn one(
         &self,
         context: &mut Context,
         gaussians: &Gaussians,
         request: &RenderRequest,
         marks: Option<&mut Marks>,
-    ) -> Result<(Frame, Vec<DispatchTime>)> {
-        let view = View::new(gaussians.origin(), request)?;
-        let (scene, labels) = context.scene(gaussians, request.labels != Labels::None)?;
-        let mut tools = context.tools(&scene, labels.as_ref(), self.options.isects_max, marks);
-        let mut drawing = Drawing::new(&view, request, &scene);
+    ) -> Result<Frame> {
+        let scene = context.scene(gaussians, request.labels != Labels::None)?;
+        let mut tools = context.tools(&scene, self.isects_max(), marks);
+        let mut drawing = Drawing::new(gaussians.origin(), request, &scene)?;
         let rows = drawing.whole();
         tools.rows(&mut drawing, rows)?;
-        let times = std::mem::take(&mut tools.times);
-        Ok((drawing.finish(&mut context.scratch)?, times))
+        drawing.finish(&mut context.scratch)
     }
 
     /// Times of a view by the clock of the device.
-    ///
-    /// # Errors
-    /// As [`Self::render`].
     pub(super) fn device_times(
         &self,
         gaussians: &Gaussians,
@@ -325,7 +297,8 @@ impl Adapter {
             }
             let mut times = |each| -> Result<Vec<DispatchTime>> {
                 let mut marks = Marks::new(&context.on.gpu, each)?;
-                Ok(self.one(context, gaussians, request, Some(&mut marks))?.1)
+                self.one(context, gaussians, request, Some(&mut marks))?;
+                marks.read(&context.on.gpu)
             };
             let total_ms = times(false)?.iter().map(|stage| stage.ms).sum();
             Ok(Some(DeviceTimes { total_ms, stages: times(true)? }))

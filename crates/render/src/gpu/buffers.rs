@@ -1,11 +1,11 @@
 //! Data that host and shaders share: `repr(C)` structs equal to those of
-//! shaders/common/structs.wgsl, buffers that grow, and the scenes on the device.
+//! shaders/common/structs.wgsl, and the scenes on the device.
+#![expect(missing_docs, reason = "shaders/common/structs.wgsl describes the fields")]
 
 use bytemuck::{Pod, Zeroable};
 use glam::DVec3;
-use wgpu::BufferUsages;
 
-use super::device::Gpu;
+use super::{device::Gpu, recorder::SceneBuffers};
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::Gaussians,
@@ -15,7 +15,6 @@ use crate::{
 /// `View` of the shaders: camera of one frame and the band of tile rows to draw.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
-#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
 pub struct ViewRow {
     pub rotation_x: [f32; 4],
     pub rotation_y: [f32; 4],
@@ -57,7 +56,6 @@ pub struct ViewRow {
 /// `Gaussian` of the shaders.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
-#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
 pub struct GaussianRow {
     pub mean: [f32; 3],
     pub opacity: f32,
@@ -69,7 +67,6 @@ pub struct GaussianRow {
 /// `Footprint` of the shaders.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Default, PartialEq, Pod, Zeroable)]
-#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
 pub struct FootprintRow {
     pub mean: [f32; 2],
     pub conic_shear: f32,
@@ -83,7 +80,6 @@ pub struct FootprintRow {
 /// `Plan` of the shaders.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
-#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
 pub struct PlanRow {
     pub isects: u32,
     pub needed: u32,
@@ -105,7 +101,6 @@ impl Default for PlanRow {
 /// `SortParams` of the shaders.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
-#[expect(missing_docs, reason = "the fields are described in shaders/common/structs.wgsl")]
 pub struct SortParams {
     pub shift: u32,
     pub pass_at: u32,
@@ -119,7 +114,6 @@ const _: () = assert!(size_of::<FootprintRow>() == 32, "two rows of four");
 
 impl ViewRow {
     /// The row of the whole picture. The caller sets band, capacity and picture starts.
-    #[must_use]
     pub fn new(view: &View, background: [f32; 3], antialiased: bool) -> Self {
         let rotation = view.rotation;
         let (rx, ry, rz) = (rotation.row(0), rotation.row(1), rotation.row(2));
@@ -152,43 +146,6 @@ impl ViewRow {
     }
 }
 
-/// A buffer that is replaced when it is too small. Its contents are undefined between frames.
-#[derive(Debug)]
-pub(super) struct Slot {
-    label: &'static str,
-    usage: BufferUsages,
-    buffer: Option<wgpu::Buffer>,
-}
-
-impl Slot {
-    pub(super) const fn new(label: &'static str, usage: BufferUsages) -> Self {
-        Self { label, usage, buffer: None }
-    }
-
-    /// A storage buffer.
-    pub(super) const fn storage(label: &'static str) -> Self {
-        let copied = BufferUsages::COPY_SRC.union(BufferUsages::COPY_DST);
-        Self::new(label, BufferUsages::STORAGE.union(copied))
-    }
-
-    /// The buffer, at least `size_bytes` long.
-    ///
-    /// # Errors
-    /// `limit_exceeded` when the adapter cannot hold or bind that many bytes.
-    pub(super) fn ensure(&mut self, gpu: &Gpu, size_bytes: u64) -> Result<wgpu::Buffer> {
-        if let Some(buffer) = &self.buffer
-            && buffer.size() >= size_bytes
-        {
-            return Ok(buffer.clone());
-        }
-        // Free the old buffer before the new one is allocated.
-        self.buffer = None;
-        let buffer = gpu.create_buffer(self.label, size_bytes, self.usage)?;
-        self.buffer = Some(buffer.clone());
-        Ok(buffer)
-    }
-}
-
 /// Gaussians on the device.
 #[derive(Clone, Debug)]
 pub(super) struct DeviceScene {
@@ -204,7 +161,7 @@ pub(super) struct DeviceScene {
     /// Smallest and largest mean along each axis, relative to the origin.
     pub(super) bounds: [DVec3; 2],
     /// Uploaded when a request first asks for labels.
-    labels: Option<DeviceLabels>,
+    pub(super) labels: Option<DeviceLabels>,
 }
 
 /// Entries of the Gaussians on the device.
@@ -212,28 +169,34 @@ pub(super) struct DeviceScene {
 pub(super) struct DeviceLabels {
     identity: u64,
     /// `[N]` u16, two in a word.
-    pub(super) index: wgpu::Buffer,
+    pub(super) entries: wgpu::Buffer,
     /// Number of different entries over 0: no pixel shows more.
     pub(super) distinct: u32,
 }
 
 impl DeviceLabels {
     fn upload(gpu: &Gpu, source: &Gaussians) -> Result<Self> {
-        let index = source.semantic_index();
+        let entries = source.semantic_index();
         let mut seen = vec![false; 1 << u16::BITS];
-        index.iter().for_each(|&m| seen[usize::from(m)] = true);
+        entries.iter().for_each(|&entry| seen[usize::from(entry)] = true);
         let distinct = seen[1..].iter().filter(|seen| **seen).count() as u32;
         // Uploads are whole words.
-        let mut padded = index.to_vec();
-        padded.resize(index.len().next_multiple_of(2), 0);
-        let index = gpu.upload("bank indices", bytemuck::cast_slice(&padded))?;
-        Ok(Self { identity: source.identity(), index, distinct })
+        let mut padded = entries.to_vec();
+        padded.resize(entries.len().next_multiple_of(2), 0);
+        let entries = gpu.upload("bank entries", bytemuck::cast_slice(&padded))?;
+        Ok(Self { identity: source.identity(), entries, distinct })
     }
 }
 
 impl DeviceScene {
+    /// What the stages read.
+    pub(super) fn buffers(&self) -> SceneBuffers<'_> {
+        let Self { gaussians, sh, sh_count, .. } = self;
+        SceneBuffers { gaussians, sh, sh_count: *sh_count }
+    }
+
     fn size_bytes(&self) -> u64 {
-        let labels = self.labels.as_ref().map_or(0, |labels| labels.index.size());
+        let labels = self.labels.as_ref().map_or(0, |labels| labels.entries.size());
         self.gaussians.size() + self.sh.size() + labels
     }
 
@@ -275,51 +238,46 @@ impl SceneCache {
         Self { scenes: Vec::new(), bytes_max }
     }
 
-    /// The scene of `source`, uploaded once. Other scenes leave, the least recently drawn first.
-    ///
-    /// # Errors
-    /// `limit_exceeded` when the scene does not fit the adapter's limits or memory.
-    pub(super) fn get(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<DeviceScene> {
+    /// The scene of `source`, uploaded once; if `labelled`, with the entries of `source`.
+    /// Errors: `limit_exceeded` when it does not fit the adapter's limits or memory.
+    pub(super) fn get(
+        &mut self,
+        gpu: &Gpu,
+        source: &Gaussians,
+        labelled: bool,
+    ) -> Result<DeviceScene> {
         let shape = source.shape_identity();
-        if let Some(at) = self.scenes.iter().position(|scene| scene.shape == shape) {
-            let scene = self.scenes.remove(at);
-            self.scenes.push(scene.clone());
-            return Ok(scene);
+        let scene = match self.scenes.iter().position(|scene| scene.shape == shape) {
+            Some(at) => self.scenes.remove(at),
+            None => self.upload(gpu, source)?,
+        };
+        let last = self.scenes.len();
+        self.scenes.push(scene);
+        let scene = &mut self.scenes[last];
+        let labels_of = scene.labels.as_ref().map(|labels| labels.identity);
+        if labelled && labels_of != Some(source.identity()) {
+            scene.labels = Some(DeviceLabels::upload(gpu, source)?);
         }
+        Ok(scene.clone())
+    }
+
+    /// Uploads a scene. Others leave to make room, the least recently drawn first.
+    fn upload(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<DeviceScene> {
         let scene = match DeviceScene::upload(gpu, source) {
             // The other scenes may hold the memory: drop them and try once more.
             Err(error) if error.code() == ErrorCode::LimitExceeded && !self.scenes.is_empty() => {
-                self.scenes.clear();
-                gpu.forget();
+                self.clear(gpu);
                 DeviceScene::upload(gpu, source)?
             }
             other => other?,
         };
-        let held = |scenes: &[DeviceScene]| scenes.iter().map(DeviceScene::size_bytes).sum::<u64>();
-        while !self.scenes.is_empty() && held(&self.scenes) + scene.size_bytes() > self.bytes_max {
+        let size_bytes = |scenes: &[_]| scenes.iter().map(DeviceScene::size_bytes).sum::<u64>();
+        let bytes_max = self.bytes_max.saturating_sub(scene.size_bytes());
+        while size_bytes(&self.scenes) > bytes_max {
             self.scenes.remove(0);
             gpu.forget();
         }
-        self.scenes.push(scene.clone());
         Ok(scene)
-    }
-
-    /// The entries of `source`, uploaded once. The Gaussians are not uploaded again with them.
-    ///
-    /// # Errors
-    /// As [`Self::get`].
-    pub(super) fn labels(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<DeviceLabels> {
-        let shape = source.shape_identity();
-        let scene = self.scenes.iter_mut().find(|scene| scene.shape == shape);
-        let held = scene.as_ref().and_then(|scene| scene.labels.as_ref());
-        if let Some(labels) = held.filter(|labels| labels.identity == source.identity()) {
-            return Ok(labels.clone());
-        }
-        let labels = DeviceLabels::upload(gpu, source)?;
-        if let Some(scene) = scene {
-            scene.labels = Some(labels.clone());
-        }
-        Ok(labels)
     }
 
     /// Shape identities of the scenes.
@@ -335,9 +293,7 @@ impl SceneCache {
 }
 
 /// Narrows a count that the limits keep under 2³².
-///
-/// # Errors
-/// `limit_exceeded` with `what` and the count.
+/// Errors: `limit_exceeded` with `what` and the count.
 pub(super) fn narrow(what: &str, count: usize) -> Result<u32> {
     u32::try_from(count).map_err(|_| Error::limit(what, count, u32::MAX))
 }

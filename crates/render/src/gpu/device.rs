@@ -20,6 +20,9 @@ use crate::{
 const SOFTWARE_NAMES: [&str; 5] =
     ["llvmpipe", "lavapipe", "swiftshader", "softpipe", "basic render driver"];
 
+/// How storage buffers are used.
+pub(super) const STORAGE: BufferUsages =
+    BufferUsages::STORAGE.union(BufferUsages::COPY_SRC).union(BufferUsages::COPY_DST);
 /// Bytes written to the queue at once: its staging copy has the same size.
 const UPLOAD_CHUNK: usize = 32 << 20;
 
@@ -60,19 +63,6 @@ fn describe(info: &wgpu::AdapterInfo) -> AdapterReport {
     }
 }
 
-/// Rank of an adapter that is not named; `None` for one that must be named.
-fn rank(report: &AdapterReport, adapter: &wgpu::Adapter) -> Option<u32> {
-    if report.software {
-        return None;
-    }
-    match adapter.get_info().device_type {
-        wgpu::DeviceType::DiscreteGpu => Some(0),
-        wgpu::DeviceType::IntegratedGpu => Some(1),
-        wgpu::DeviceType::VirtualGpu => Some(2),
-        wgpu::DeviceType::Other | wgpu::DeviceType::Cpu => None,
-    }
-}
-
 /// Adapters found, and those taken, the best first: by parts of their names, else all hardware
 /// ones.
 pub(super) fn choose(
@@ -100,22 +90,21 @@ pub(super) fn choose(
 /// Places of the adapters to use. `name` may hold several names, with commas between.
 fn pick(found: &[(wgpu::Adapter, AdapterReport)], name: Option<&str>) -> Vec<usize> {
     let Some(names) = name else {
-        let ranked = |at: usize| rank(&found[at].1, &found[at].0).map(|rank| (rank, at));
-        let mut ranked: Vec<_> = (0..found.len()).filter_map(ranked).collect();
-        ranked.sort_unstable();
-        return ranked.into_iter().map(|(_, at)| at).collect();
+        use wgpu::DeviceType::{DiscreteGpu, IntegratedGpu, VirtualGpu};
+        let of_type = |wanted| {
+            let all = found.iter().enumerate().filter(|(_, (_, report))| !report.software);
+            all.filter(move |(_, (adapter, _))| adapter.get_info().device_type == wanted)
+        };
+        let best_first = [DiscreteGpu, IntegratedGpu, VirtualGpu].into_iter().flat_map(of_type);
+        return best_first.map(|(at, _)| at).collect();
     };
     let mut taken = Vec::new();
     for name in names.split(',').map(|name| name.trim().to_lowercase()) {
-        let name = match name.as_str() {
-            "" => continue,
-            // Mesa's Vulkan driver of that name calls its adapter llvmpipe.
-            "lavapipe" => "llvmpipe",
-            name => name,
-        };
+        // Mesa's Vulkan driver of that name calls its adapter llvmpipe.
+        let name = if name == "lavapipe" { "llvmpipe" } else { name.as_str() };
         let called = |at: &usize| found[*at].1.name.to_lowercase().contains(name);
-        let new: Vec<_> =
-            (0..found.len()).filter(called).filter(|at| !taken.contains(at)).collect();
+        let new = (0..found.len()).filter(|at| !name.is_empty() && called(at));
+        let new: Vec<_> = new.filter(|at| !taken.contains(at)).collect();
         taken.extend(new);
     }
     taken
@@ -150,30 +139,26 @@ pub(super) struct Gpu {
 
 impl Gpu {
     /// Opens a device with the limits of the adapter, or with the smallest limits of WebGPU.
-    ///
-    /// # Errors
-    /// `gpu_unavailable` when the adapter refuses or its limits are too small for the kernels.
+    /// Errors: `gpu_unavailable` when the adapter refuses or its limits are too small for the
+    /// kernels.
     pub(super) fn open(adapter: &wgpu::Adapter, portable: bool) -> Result<Self> {
         let offered = adapter.limits();
+        let wgpu::Limits {
+            max_storage_buffers_per_shader_stage: buffers,
+            max_compute_invocations_per_workgroup: invocations,
+            max_compute_workgroup_storage_size: bytes,
+            max_compute_workgroups_per_dimension: groups,
+            ..
+        } = offered;
         for (what, has, needs) in [
-            (
-                "storage buffers a stage",
-                offered.max_storage_buffers_per_shader_stage,
-                STORAGE_BUFFERS,
-            ),
-            ("invocations a workgroup", offered.max_compute_invocations_per_workgroup, 256),
-            (
-                "bytes of workgroup storage",
-                offered.max_compute_workgroup_storage_size,
-                WORKGROUP_BYTES,
-            ),
-            ("workgroups a dimension", offered.max_compute_workgroups_per_dimension, 65_535),
+            ("storage buffers a stage", buffers, STORAGE_BUFFERS),
+            ("invocations a workgroup", invocations, 256),
+            ("bytes of workgroup storage", bytes, WORKGROUP_BYTES),
+            ("workgroups a dimension", groups, 65_535),
         ] {
             if has < needs {
-                return Err(Error::new(
-                    ErrorCode::GpuUnavailable,
-                    format!("the GPU adapter has {has} {what}; {needs} are needed"),
-                ));
+                let why = format!("the GPU adapter has {has} {what}; {needs} are needed");
+                return Err(Error::new(ErrorCode::GpuUnavailable, why));
             }
         }
         let limits = if portable { wgpu::Limits::default() } else { offered };
@@ -220,21 +205,13 @@ impl Gpu {
 
     /// Marks the device as lost for all its users. It is not destroyed, because someone may still
     /// read its memory.
-    pub(super) fn lose(&self) {
-        self.faults.lost.store(true, Ordering::Release);
-        self.faults.report("lost on purpose".to_owned());
-    }
-
-    /// Marks the device as lost because it did not answer.
     pub(super) fn give_up(&self, message: String) -> Error {
         self.faults.lost.store(true, Ordering::Release);
         Error::new(ErrorCode::GpuUnavailable, message)
     }
 
     /// Checks for faults outside of any scope since the last call.
-    ///
-    /// # Errors
-    /// `gpu_unavailable` when the device is lost, `internal` for any other fault.
+    /// Errors: `gpu_unavailable` when the device is lost, `internal` for any other fault.
     pub(super) fn check(&self) -> Result<()> {
         let message = self.faults.message.lock().take();
         if self.is_lost() {
@@ -248,10 +225,8 @@ impl Gpu {
     }
 
     /// Runs `work` inside error scopes, so that its faults are told from others.
-    ///
-    /// # Errors
-    /// `limit_exceeded` when memory ran out, `gpu_unavailable` when the device is lost, `internal`
-    /// otherwise; the message begins with `what`.
+    /// Errors: `limit_exceeded` when memory ran out, `gpu_unavailable` when the device is lost,
+    /// `internal` otherwise; the message begins with `what`.
     pub(super) fn scoped<T>(&self, what: &str, work: impl FnOnce() -> T) -> Result<T> {
         let memory = self.device.push_error_scope(ErrorFilter::OutOfMemory);
         let validation = self.device.push_error_scope(ErrorFilter::Validation);
@@ -262,11 +237,8 @@ impl Gpu {
         let memory = pollster::block_on(memory.pop());
         self.check()?;
         if let Some(error) = memory {
-            return Err(Error::new(
-                ErrorCode::LimitExceeded,
-                format!("{what}: the GPU's memory is used up"),
-            )
-            .caused_by(error));
+            let why = format!("{what}: the GPU's memory is used up");
+            return Err(Error::new(ErrorCode::LimitExceeded, why).caused_by(error));
         }
         match internal.or(validation) {
             Some(error) => {
@@ -277,9 +249,7 @@ impl Gpu {
     }
 
     /// A buffer of `size_bytes`, rounded up to 256.
-    ///
-    /// # Errors
-    /// `limit_exceeded` when the adapter cannot bind as much or its memory is used up.
+    /// Errors: `limit_exceeded` when the adapter cannot bind as much or its memory is used up.
     pub(super) fn create_buffer(
         &self,
         label: &'static str,
@@ -288,11 +258,8 @@ impl Gpu {
     ) -> Result<wgpu::Buffer> {
         let size = size_bytes.max(1).next_multiple_of(256);
         if size > self.binding_bytes_max {
-            return Err(Error::limit(
-                format_args!("bytes of {label} on this GPU adapter"),
-                size,
-                self.binding_bytes_max,
-            ));
+            let what = format_args!("bytes of {label} on this GPU adapter");
+            return Err(Error::limit(what, size, self.binding_bytes_max));
         }
         self.forget();
         self.scoped(label, || {
@@ -306,12 +273,8 @@ impl Gpu {
     }
 
     /// A storage buffer that holds `bytes`.
-    ///
-    /// # Errors
-    /// As [`Self::create_buffer`].
     pub(super) fn upload(&self, label: &'static str, bytes: &[u8]) -> Result<wgpu::Buffer> {
-        let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST | BufferUsages::COPY_SRC;
-        let buffer = self.create_buffer(label, bytes.len() as u64, usage)?;
+        let buffer = self.create_buffer(label, bytes.len() as u64, STORAGE)?;
         self.scoped(label, || {
             for (chunk, bytes) in bytes.chunks(UPLOAD_CHUNK).enumerate() {
                 self.queue.write_buffer(&buffer, (chunk * UPLOAD_CHUNK) as u64, bytes);
@@ -319,26 +282,5 @@ impl Gpu {
             }
         })?;
         Ok(buffer)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn an_unknown_name_is_refused_with_what_there_is() {
-        let (_, chosen) = choose(Some("no such adapter"));
-        let error = chosen.expect_err("nothing is called so");
-        assert_eq!(error.code(), ErrorCode::GpuUnavailable, "{error}");
-        assert!(error.message().contains("no such adapter"), "{error}");
-    }
-
-    #[test]
-    fn software_is_never_taken_unasked() {
-        let (_, chosen) = choose(None);
-        for (_, report) in chosen.into_iter().flatten() {
-            assert!(!report.software, "{report:?} was taken without being named");
-        }
     }
 }

@@ -4,21 +4,20 @@
 use std::ops::Range;
 
 use bytemuck::Pod;
+use glam::DVec3;
 use rayon::prelude::*;
 
 use super::{
-    buffers::{DeviceLabels, DeviceScene, PlanRow, ViewRow},
+    buffers::{DeviceScene, PlanRow, ViewRow},
     device::Gpu,
-    pipelines::{FAST_KEY_BITS, Kernels, NO_PICTURE},
+    pipelines::{FAST_KEY_BITS, Kernels, NO_PICTURE, RasterLabels},
     profile::Marks,
     readback,
-    recorder::{
-        DIGIT_BITS, DIGITS_MAX, LabelBuffers, Recorder, SceneBuffers, sorted_half, tile_bits,
-    },
-    scratch::{ENTRY_SLOTS_MIN, Need, Scratch},
+    recorder::{DIGIT_BITS, DIGITS_MAX, LabelInputs, Recorder, sorted_half, tile_bits},
+    scratch::{Need, Scratch, WEIGHT_SLOTS_MIN},
 };
 use crate::{
-    DispatchTime, Frame, FrameStats, Kinds, Labels, PixelWeights, Quality, RenderRequest,
+    Frame, Labels, Quality, RenderRequest,
     constants::TILE_SIZE,
     error::{Error, Result},
     labels::{BLEND_WIDTH, WeightRows},
@@ -30,27 +29,12 @@ const ISECT_CAPACITY_MIN: u32 = 1 << 16;
 /// How often a band is drawn: the first try may lack room, the second knows what it needs.
 const ATTEMPTS_MAX: u32 = 3;
 /// Factor by which the room for weights grows when it is too small.
-const ENTRY_SLOTS_GROWTH: u32 = 4;
+const WEIGHT_SLOTS_GROWTH: u32 = 4;
 /// Bytes of a tile pair: key and Gaussian, each stored twice.
 const PAIR_BYTES_A_BUFFER: u64 = 8;
 const PLAN_BYTES: u64 = size_of::<PlanRow>() as u64;
 /// Pictures of more bytes than this are copied by all cores.
 const PARALLEL_BYTES: usize = 4 << 20;
-
-/// A frame without Gaussians.
-pub(super) fn background(view: &View, request: &RenderRequest) -> Frame {
-    let pixels = view.width as usize * view.height as usize;
-    Frame {
-        width: view.width,
-        height: view.height,
-        color: request.kinds.color.then(|| vec![request.background; pixels]),
-        depth: request.kinds.depth.then(|| vec![0.0; pixels]),
-        alpha: request.kinds.alpha.then(|| vec![0.0; pixels]),
-        blend: matches!(request.labels, Labels::Blend(_)).then(|| vec![[0.0; 4]; pixels]),
-        weights: (request.labels == Labels::Weights).then(|| PixelWeights::none(pixels)),
-        stats: FrameStats::default(),
-    }
-}
 
 /// Sizes of a band of a view in the buffers of its batch.
 struct Layout {
@@ -80,28 +64,16 @@ impl Layout {
     }
 }
 
-/// Result of drawing a band.
-enum Outcome {
-    /// The band is in the frame.
-    Drawn,
-    /// One band cannot hold this many tile pairs.
-    Pairs(u32),
-    /// A pixel had more weights than room. The room is larger now.
-    Slots,
-}
-
 /// The band of one view after the read-back, with its pictures and slots.
 type Part<'a, 'b> = (&'a mut Drawing<'b>, &'a Layout, PlanRow, &'a [u8], &'a [u32]);
 
 /// Result of one view of a submission.
 struct Ended {
-    /// Number of tile pairs of the view.
-    needed: u32,
+    /// Counts of the device. The digits of the first view are those of all.
+    plan: PlanRow,
     drawn: bool,
     /// New room of a pixel, in weights, if the old one was too small.
     more_slots: Option<u32>,
-    /// Digits of depth that the device found; of the first view, those of all.
-    passes: u32,
 }
 
 /// Everything that drawing a frame needs.
@@ -110,12 +82,8 @@ pub(super) struct Tools<'a> {
     pub(super) kernels: &'a Kernels,
     pub(super) scratch: &'a mut Scratch,
     pub(super) scene: &'a DeviceScene,
-    /// Entries of the scene, if labels are asked for.
-    pub(super) labels: Option<&'a DeviceLabels>,
     pub(super) isects_max: u32,
     pub(super) marks: Option<&'a mut Marks>,
-    /// Times of the last submission, if marks are set.
-    pub(super) times: Vec<DispatchTime>,
 }
 
 /// A frame in work. Its bands are drawn from top to bottom.
@@ -123,8 +91,7 @@ pub(super) struct Drawing<'a> {
     row: ViewRow,
     /// Digits that the depth sort can take.
     digits: u32,
-    kinds: Kinds,
-    wanted: &'a Labels,
+    request: &'a RenderRequest,
     frame: Frame,
     /// Weights of the bands drawn.
     weights: Vec<WeightRows>,
@@ -133,36 +100,31 @@ pub(super) struct Drawing<'a> {
 }
 
 impl<'a> Drawing<'a> {
-    pub(super) fn new(view: &View, request: &'a RenderRequest, scene: &DeviceScene) -> Self {
-        let mut row = ViewRow::new(view, request.background, request.antialiased);
+    /// Errors: those of [`View::new`].
+    pub(super) fn new(
+        origin: DVec3,
+        request: &'a RenderRequest,
+        scene: &DeviceScene,
+    ) -> Result<Self> {
+        let view = View::new(origin, request)?;
+        let mut row = ViewRow::new(&view, request.background, request.antialiased);
         row.fast = u32::from(request.quality == Quality::Fast);
         (row.gaussian_count, row.sh_count) = (scene.count, scene.sh_count);
-        let pixels = view.width as usize * view.height as usize;
-        let kinds = request.kinds;
-        let frame = Frame {
-            width: view.width,
-            height: view.height,
-            color: kinds.color.then(|| Vec::with_capacity(pixels)),
-            depth: kinds.depth.then(|| Vec::with_capacity(pixels)),
-            alpha: kinds.alpha.then(|| Vec::with_capacity(pixels)),
-            blend: matches!(request.labels, Labels::Blend(_)).then(|| Vec::with_capacity(pixels)),
-            weights: None,
-            stats: FrameStats::default(),
-        };
-        let wanted = &request.labels;
+        // The bands are appended.
+        let frame = Frame::blank([view.width, view.height], request, 0);
         let mut bits = view.depth_bits(scene.bounds);
         if request.quality == Quality::Fast {
             bits = bits.min(FAST_KEY_BITS);
         }
         let digits = bits.div_ceil(DIGIT_BITS).max(1);
-        Self { row, digits, kinds, wanted, frame, weights: Vec::new(), weights_max: 0 }
+        Ok(Self { row, digits, request, frame, weights: Vec::new(), weights_max: 0 })
     }
 
     /// The frame of all bands.
     pub(super) fn finish(mut self, scratch: &mut Scratch) -> Result<Frame> {
-        if *self.wanted == Labels::Weights {
+        if self.request.labels == Labels::Weights {
             // The next view needs about the same room. One unusual view does not change that.
-            scratch.weight_slots = self.weights_max.next_power_of_two().max(ENTRY_SLOTS_MIN);
+            scratch.weight_slots = self.weights_max.next_power_of_two().max(WEIGHT_SLOTS_MIN);
             self.frame.weights = Some(WeightRows::join(self.weights)?);
         }
         Ok(self.frame)
@@ -176,24 +138,24 @@ impl<'a> Drawing<'a> {
     fn layout(&self, rows: &Range<u32>, slots: u32) -> Layout {
         let pixel_rows = (rows.end * TILE_SIZE).min(self.row.height) - rows.start * TILE_SIZE;
         let pixels = u64::from(pixel_rows) * u64::from(self.row.width);
-        let fast = self.row.fast != 0;
+        let (kinds, fast) = (self.request.kinds, self.row.fast != 0);
         let mut words = 0;
         let mut take = |wanted: bool, channels: u64| {
             let start = if wanted { words as u32 } else { NO_PICTURE };
             words += if wanted { channels * pixels } else { 0 };
             start
         };
-        let color = take(self.kinds.color, if fast { 1 } else { 3 });
-        let depth = take(self.kinds.depth, 1);
-        let alpha = take(self.kinds.alpha && !(fast && self.kinds.color), 1);
-        let blend = take(matches!(self.wanted, Labels::Blend(_)), BLEND_WIDTH as u64);
+        let color = take(kinds.color, if fast { 1 } else { 3 });
+        let depth = take(kinds.depth, 1);
+        let alpha = take(kinds.alpha && !(fast && kinds.color), 1);
+        let blend = take(matches!(self.request.labels, Labels::Blend(_)), BLEND_WIDTH as u64);
         let tiles = self.row.tiles_x * (rows.end - rows.start);
         Layout { color, depth, alpha, blend, words, fast, pixels, slots, tiles }
     }
 
     /// Rows of the table to blend. An empty table is one row of zeros.
     fn table(&self) -> &[[f32; BLEND_WIDTH]] {
-        match self.wanted {
+        match &self.request.labels {
             Labels::Blend(table) if table.is_empty() => &[[0.0; BLEND_WIDTH]],
             Labels::Blend(table) => &table[..table.len().min(1 << u16::BITS)],
             _ => &[],
@@ -209,27 +171,28 @@ impl<'a> Drawing<'a> {
         pictures: &[u8],
         slots: &[u32],
     ) -> Ended {
-        let PlanRow { needed, passes, .. } = plan;
-        if needed > capacity {
-            return Ended { needed, drawn: false, more_slots: None, passes };
+        let mut ended = Ended { plan, drawn: false, more_slots: None };
+        if plan.needed > capacity {
+            return ended;
         }
         let counts = &slots[..slots.len().min(layout.pixels as usize)];
         let weights = counts.iter().copied().max().unwrap_or(0);
         if weights > layout.slots {
-            let more_slots = Some(layout.slots.saturating_mul(ENTRY_SLOTS_GROWTH));
-            return Ended { needed, drawn: false, more_slots, passes };
+            ended.more_slots = Some(layout.slots.saturating_mul(WEIGHT_SLOTS_GROWTH));
+            return ended;
         }
         self.store(layout, pictures, slots);
         self.weights_max = self.weights_max.max(weights);
         let stats = &mut self.frame.stats;
         stats.visible = stats.visible.max(u64::from(plan.visible));
         stats.intersections += u64::from(plan.isects);
-        Ended { needed, drawn: true, more_slots: None, passes }
+        Ended { drawn: true, ..ended }
     }
 
     /// Copies the pictures and weights of a band out of the read-back.
     fn store(&mut self, layout: &Layout, pictures: &[u8], slots: &[u32]) {
         let pixels = layout.pixels as usize;
+        let all = self.row.width as usize * self.row.height as usize;
         let part = |start: u32, words: usize| {
             let start = start as usize * 4;
             &pictures[start..start + pixels * words * 4]
@@ -239,24 +202,24 @@ impl<'a> Drawing<'a> {
             if layout.fast {
                 let levels = part(layout.color, 1);
                 let level = |byte: u8| f32::from(byte) / 255.0;
-                append(color, levels, |[r, g, b, _]: [u8; 4]| [r, g, b].map(level));
+                append(color, all, levels, |[r, g, b, _]: [u8; 4]| [r, g, b].map(level));
                 if let Some(alpha) = &mut frame.alpha {
-                    append(alpha, levels, |word: [u8; 4]| level(word[3]));
+                    append(alpha, all, levels, |word: [u8; 4]| level(word[3]));
                 }
             } else {
-                append(color, part(layout.color, 3), |color| color);
+                append(color, all, part(layout.color, 3), |color| color);
             }
         }
         if let Some(depth) = &mut frame.depth {
-            append(depth, part(layout.depth, 1), |depth| depth);
+            append(depth, all, part(layout.depth, 1), |depth| depth);
         }
         if let Some(alpha) = &mut frame.alpha
             && layout.alpha != NO_PICTURE
         {
-            append(alpha, part(layout.alpha, 1), |alpha| alpha);
+            append(alpha, all, part(layout.alpha, 1), |alpha| alpha);
         }
         if let Some(blend) = &mut frame.blend {
-            append(blend, part(layout.blend, BLEND_WIDTH), |row| row);
+            append(blend, all, part(layout.blend, BLEND_WIDTH), |row| row);
         }
         if layout.slots > 0 {
             self.weights.push(weight_rows(slots, layout, self.row.width as usize));
@@ -272,18 +235,24 @@ impl Tools<'_> {
         let bytes = layout.picture_bytes() + layout.slot_bytes();
         let bytes_max = self.gpu.binding_bytes_max - PLAN_BYTES;
         if single || bytes.max((u64::from(layout.tiles) + 1) * 4) <= bytes_max {
-            match self.band(drawing, &rows, &layout)? {
-                Outcome::Drawn => return Ok(()),
-                // The next try checks again whether the band fits. Slots grow to a bound.
-                Outcome::Slots => return self.rows(drawing, rows),
-                Outcome::Pairs(needed) if single => {
-                    return Err(Error::limit(
-                        "render: Gaussian-tile pairs in one row of tiles",
-                        needed,
-                        self.capacity_max(1),
-                    ));
+            let (mut needed, mut attempts, capacity_max) = (0, 0, self.capacity_max(1));
+            while attempts < ATTEMPTS_MAX && needed <= capacity_max {
+                let capacity = self.capacity(1);
+                let (alone, band) = (std::slice::from_mut(drawing), std::slice::from_ref(&rows));
+                let ended = self.attempt(alone, band, std::slice::from_ref(&layout), capacity)?;
+                if ended[0].drawn {
+                    return Ok(());
                 }
-                Outcome::Pairs(_) => {}
+                needed = ended[0].plan.needed;
+                if needed <= capacity {
+                    // Slots grew. The next try checks again whether the band fits.
+                    return self.rows(drawing, rows);
+                }
+                attempts += 1;
+            }
+            if single {
+                let what = "render: Gaussian-tile pairs in one row of tiles";
+                return Err(Error::limit(what, needed, capacity_max));
             }
         }
         let middle = rows.start.midpoint(rows.end);
@@ -307,12 +276,12 @@ impl Tools<'_> {
         }
         let bands: Vec<_> = drawings.iter().map(Drawing::whole).collect();
         let ended = self.attempt(drawings, &bands, &layouts, capacity)?;
-        Ok(ended.into_iter().map(|(_, drawn)| drawn).collect())
+        Ok(ended.into_iter().map(|ended| ended.drawn).collect())
     }
 
     /// Room of a pixel, in weights: what the last views needed, at most one for each entry.
     fn weight_slots(&self, drawing: &Drawing<'_>) -> u32 {
-        match (drawing.wanted, self.labels) {
+        match (&drawing.request.labels, &self.scene.labels) {
             (Labels::Weights, Some(labels)) => {
                 self.scratch.weight_slots.min(labels.distinct.max(1))
             }
@@ -333,43 +302,14 @@ impl Tools<'_> {
         guess.max(seen).min(self.capacity_max(views))
     }
 
-    /// Draws one band into the frame.
-    fn band(
-        &mut self,
-        drawing: &mut Drawing<'_>,
-        rows: &Range<u32>,
-        layout: &Layout,
-    ) -> Result<Outcome> {
-        let capacity_max = self.capacity_max(1);
-        let mut capacity = self.capacity(1);
-        for _ in 0..ATTEMPTS_MAX {
-            let (alone, bands) = (std::slice::from_mut(drawing), std::slice::from_ref(rows));
-            let layouts = std::slice::from_ref(layout);
-            let ended = self.attempt(alone, bands, layouts, capacity)?;
-            let Some(&(needed, drawn)) = ended.first() else { break };
-            if drawn {
-                return Ok(Outcome::Drawn);
-            }
-            if needed <= capacity {
-                return Ok(Outcome::Slots);
-            }
-            if needed > capacity_max {
-                return Ok(Outcome::Pairs(needed));
-            }
-            capacity = self.capacity(1);
-        }
-        Err(Error::internal("render: the need of tile pairs grew from one attempt to the next"))
-    }
-
-    /// Runs all stages over one band of each view, with room for `capacity` pairs in each. Returns
-    /// how many pairs each view needs, and whether it was drawn.
+    /// Runs all stages over one band of each view, with room for `capacity` pairs in each.
     fn attempt(
         &mut self,
         drawings: &mut [Drawing<'_>],
         bands: &[Range<u32>],
         layouts: &[Layout],
         capacity: u32,
-    ) -> Result<Vec<(u32, bool)>> {
+    ) -> Result<Vec<Ended>> {
         let views = drawings.len() as u32;
         let most_tiles = layouts.iter().map(|layout| layout.tiles).max().unwrap_or(1);
         let bits = tile_bits(most_tiles);
@@ -409,8 +349,8 @@ impl Tools<'_> {
         let (picture_bytes, slot_bytes) = (words * 4, slot_words * 4);
         let staging_bytes = plan_bytes + picture_bytes + slot_bytes;
         let (gpu, scene) = (self.gpu, self.scene);
-        let colored = drawings.iter().any(|drawing| drawing.kinds.color);
-        let deep = drawings.iter().any(|drawing| drawing.kinds.depth);
+        let colored = drawings.iter().any(|drawing| drawing.request.kinds.color);
+        let deep = drawings.iter().any(|drawing| drawing.request.kinds.depth);
         // The device may need fewer digits. The others are dispatches without work.
         let digits = match self.kernels.sorts_all() {
             true => DIGITS_MAX,
@@ -431,12 +371,12 @@ impl Tools<'_> {
                 staging_bytes,
             },
         )?;
-        let buffers =
-            SceneBuffers { gaussians: &scene.gaussians, sh: &scene.sh, sh_count: scene.sh_count };
-        let labels = match (drawings.first().map(|drawing| drawing.wanted), self.labels) {
-            (Some(Labels::Blend(_)), Some(labels)) => LabelBuffers::Blend { index: &labels.index },
-            (Some(Labels::Weights), Some(labels)) => LabelBuffers::Weights { index: &labels.index },
-            _ => LabelBuffers::None,
+        let buffers = scene.buffers();
+        let entries = self.scene.labels.as_ref().map(|labels| &labels.entries);
+        let labels: LabelInputs<'_> = match drawings.first().map(|one| &one.request.labels) {
+            Some(Labels::Blend(_)) => (RasterLabels::Blend, entries),
+            Some(Labels::Weights) => (RasterLabels::Weights, entries),
+            _ => (RasterLabels::None, None),
         };
         let bindings = &mut self.scratch.bindings;
         let (kernels, marks) = (self.kernels, self.marks.as_deref_mut());
@@ -456,16 +396,13 @@ impl Tools<'_> {
             stages.emit_isects();
             stages.tile_sort(bits);
             stages.tile_ranges();
-            stages.rasterize(buffers, &labels, (colored, deep), grid);
+            stages.rasterize(buffers, labels, (colored, deep), grid);
             stages.submit(&[
                 (&room.plans, 0, &room.staging, 0, plan_bytes),
                 (&room.pictures, 0, &room.staging, plan_bytes, picture_bytes),
                 (&room.slots, 0, &room.staging, plan_bytes + picture_bytes, slot_bytes),
             ])
         })??;
-        if let Some(marks) = &self.marks {
-            self.times = marks.read(gpu)?;
-        }
         let ended = readback::read(gpu, &room.staging, staging_bytes, |bytes| {
             let (plans, rest) = bytes.split_at(plan_bytes as usize);
             let (mut pictures, slots) = rest.split_at(picture_bytes as usize);
@@ -486,28 +423,29 @@ impl Tools<'_> {
                 _ => parts.into_par_iter().map(take).collect::<Vec<_>>(),
             }
         })?;
-        let passes = ended.first().map_or(0, |ended| ended.passes);
+        let passes = ended.first().map_or(0, |ended| ended.plan.passes);
         if passes > digits {
             return Err(Error::internal(format!(
                 "render: depths differ in {passes} digits where the scene's box has {digits}"
             )));
         }
-        let most_isects = ended.iter().map(|ended| ended.needed).max().unwrap_or(0);
+        self.scratch.isects = ended.iter().map(|ended| ended.plan.needed).max().unwrap_or(0);
         let more_slots = ended.iter().filter_map(|ended| ended.more_slots).max();
-        self.scratch.isects = most_isects;
         self.scratch.weight_slots = more_slots.unwrap_or(self.scratch.weight_slots);
-        Ok(ended.into_iter().map(|ended| (ended.needed, ended.drawn)).collect())
+        Ok(ended)
     }
 }
 
-/// Copies the values that `bytes` hold to the end of `to`; many by all cores, for most of the time
-/// goes into new pages.
+/// Copies the values that `bytes` hold to the end of `to`, which gets `all` values in the end; many
+/// by all cores, for most of the time goes into new pages.
 fn append<F: Pod + Send + Sync, T: Send>(
     to: &mut Vec<T>,
+    all: usize,
     bytes: &[u8],
     read: impl Fn(F) -> T + Send + Sync,
 ) {
     let values: &[F] = bytemuck::cast_slice(bytes);
+    to.reserve_exact(all - to.len());
     if bytes.len() < PARALLEL_BYTES {
         to.extend(values.iter().map(|value| read(*value)));
     } else {
@@ -523,15 +461,14 @@ fn weight_rows(slots: &[u32], layout: &Layout, width: usize) -> WeightRows {
     let mut pixel = Vec::with_capacity(layout.slots as usize);
     for (i, &count) in slots[..pixels].iter().enumerate() {
         let plane = |slot: usize| pixels * (1 + slot) + i;
-        let held = (0..count as usize).map(|slot| {
+        pixel.clear();
+        pixel.extend((0..count as usize).map(|slot| {
             let weight = f32::from_bits(slots[plane(2 * slot + 1)]);
             (slots[plane(2 * slot)] as u16, weight)
-        });
-        pixel.clear();
-        pixel.extend(held);
-        pixel.sort_unstable_by_key(|entry| entry.0);
-        for &(index, weight) in &pixel {
-            rows.push(i % width, i / width, index, weight);
+        }));
+        pixel.sort_unstable_by_key(|pair| pair.0);
+        for &(entry, weight) in &pixel {
+            rows.push(i % width, i / width, entry, weight);
         }
     }
     rows

@@ -8,72 +8,25 @@
 //! are drawn on a new one.
 
 mod adapter;
-pub mod buffers;
+mod buffers;
 mod device;
 mod frame;
-pub mod pipelines;
+pub mod internals;
+mod pipelines;
 mod pool;
 mod profile;
 mod readback;
 mod recorder;
 mod scratch;
-pub mod stages;
 
-use std::path::PathBuf;
-
-use self::adapter::{Adapter, Context};
+use self::adapter::Adapter;
 use super::{
-    DeviceTimes, Frame, RenderRequest, Renderer, constants::ISECTS_MAX, select::AdapterReport,
-    skip::Skip, view::View,
+    DeviceTimes, Frame, RenderRequest, Renderer, RendererOptions, select::AdapterReport, view::View,
 };
 use crate::{
     error::{ErrorCode, Result},
-    limits::Limits,
     scene::Gaussians,
 };
-
-/// How a GPU renderer is opened.
-#[derive(Clone, Debug)]
-pub struct GpuOptions {
-    /// Parts of adapters' names, with commas between; `None` takes every hardware adapter, never a
-    /// software one.
-    pub adapter: Option<String>,
-    /// Asks for WebGPU's portable floor instead of all that the adapter has: 128 MiB a binding,
-    /// 8 storage buffers a stage, 16 KiB of workgroup storage.
-    pub portable: bool,
-    /// Gaussian-tile pairs held at once; more are drawn in bands.
-    pub isects_max: u32,
-    /// Views that wait for one device.
-    pub waiting_max: usize,
-    /// Bytes of scenes kept on one device.
-    pub scene_bytes_max: u64,
-    /// Folder whose files stand in for the built-in shaders: to try changes without a build.
-    pub shaders: Option<PathBuf>,
-    /// Has every index and loop of the shaders checked by code of its own.
-    pub checked: bool,
-    /// Whether the kernels made for software adapters are used, where an invocation does what many
-    /// share on a GPU; `None`: on those alone.
-    pub serial: Option<bool>,
-    /// Needless work that is not left out, for tests and benchmarks.
-    pub without: Option<Skip>,
-}
-
-impl Default for GpuOptions {
-    fn default() -> Self {
-        let limits = Limits::default();
-        Self {
-            adapter: None,
-            portable: false,
-            isects_max: ISECTS_MAX as u32,
-            waiting_max: limits.queued_renders_max,
-            scene_bytes_max: limits.device_scene_bytes_max,
-            shaders: None,
-            checked: false,
-            serial: None,
-            without: None,
-        }
-    }
-}
 
 /// Renders with compute shaders on one or more devices, which callers share.
 #[derive(Debug)]
@@ -88,7 +41,7 @@ impl GpuRenderer {
     /// # Errors
     /// `gpu_unavailable` when no adapter fits or all refuse, `internal` when a kernel does not
     /// compile.
-    pub fn open(options: &GpuOptions) -> (Vec<AdapterReport>, Result<Self>) {
+    pub fn open(options: &RendererOptions) -> (Vec<AdapterReport>, Result<Self>) {
         let (mut reports, chosen) = device::choose(options.adapter.as_deref());
         let opened = chosen.and_then(|chosen| {
             let (mut adapters, mut refused) = (Vec::new(), None);
@@ -116,34 +69,8 @@ impl GpuRenderer {
     }
 
     /// The first adapter in use.
-    #[must_use]
     pub fn adapter(&self) -> &AdapterReport {
-        self.adapters[0].adapter()
-    }
-
-    /// Devices in use.
-    #[must_use]
-    pub fn devices(&self) -> usize {
-        self.adapters.len()
-    }
-
-    /// Scenes kept on all devices now.
-    #[must_use]
-    pub fn scenes_held(&self) -> usize {
-        self.adapters.iter().map(Adapter::scenes_held).sum()
-    }
-
-    /// Submissions so far, and views drawn by them.
-    #[must_use]
-    pub fn submissions(&self) -> (u64, u64) {
-        let both = self.adapters.iter().map(Adapter::submissions);
-        both.fold((0, 0), |sum, one| (sum.0 + one.0, sum.1 + one.1))
-    }
-
-    /// Has every device seen as lost at once, whatever runs on it; the adapters stay. For tests of
-    /// the recovery.
-    pub fn lose_devices(&self) {
-        self.adapters.iter().for_each(Adapter::lose_device);
+        self.adapters[0].report()
     }
 
     /// The device to draw `gaussians` on: the one that holds them, unless it has a submission's
@@ -155,10 +82,6 @@ impl GpuRenderer {
         let room = least.waiting() + pipelines::VIEWS_MAX as usize;
         let holds = |adapter: &&Adapter| adapter.holds(shape) && adapter.waiting() <= room;
         self.adapters.iter().find(holds).unwrap_or(least)
-    }
-
-    fn with_context<T>(&self, work: impl FnOnce(&mut Context) -> Result<T>) -> Result<T> {
-        self.adapters[0].with_context(work)
     }
 }
 
@@ -175,7 +98,7 @@ impl Renderer for GpuRenderer {
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         let view = View::new(gaussians.origin(), request)?;
         if gaussians.is_empty() {
-            return Ok(frame::background(&view, request));
+            return Ok(Frame::background(&view, request));
         }
         let adapter = self.adapter_for(gaussians);
         match adapter.render(gaussians, request) {

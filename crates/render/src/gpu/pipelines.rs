@@ -1,64 +1,52 @@
 //! The shaders, assembled from shaders/*.wgsl, and their compiled kernels.
 
-use std::{borrow::Cow, path::Path, sync::OnceLock};
+use std::{borrow::Cow, collections::HashMap, path::Path};
 
-use super::{GpuOptions, device::Gpu};
+use parking_lot::Mutex;
+
+use super::device::Gpu;
 use crate::{
+    constants::shared,
     error::{Error, Result},
-    skip::Skip,
+    switches::{Skip, Switches},
 };
 
-/// Invocations of a workgroup: WebGPU's portable floor, and the values of a radix digit.
-pub const WORKGROUP_SIZE: u32 = 256;
-/// Views that one submission draws at most.
-pub const VIEWS_MAX: u32 = 8;
-/// Invocations of a workgroup that moves pairs.
-pub const SORT_SIZE: u32 = 128;
-/// Pairs that one workgroup sorts.
-pub const SORT_BLOCK: u32 = 2048;
-/// Gaussians whose tile pairs one workgroup emits.
-pub const SCAN_BLOCK: u32 = 1024;
-/// Workgroups along x at most; more go to y. Under the portable 65,535.
-pub const GROUPS_X_MAX: u32 = 32_768;
-/// First row of workgroup counts of digits 1 to 3 of the depth sort, by blocks.
-pub const GROUPS_DEPTH: u32 = 0;
-/// The same, by values of the digit.
-pub const GROUPS_DIGITS: u32 = 3;
-/// Row of workgroup counts of the tile sort.
-pub const GROUPS_TILES: u32 = 6;
-/// Row of workgroup counts of the tile ranges.
-pub const GROUPS_RANGES: u32 = 7;
-/// Bits of a fast view's depth keys: two digits of the sort.
-pub const FAST_KEY_BITS: u32 = 16;
-/// Depth key of a dropped Gaussian.
-pub const DROPPED_KEY: u32 = u32::MAX;
-/// Value of a pair that was counted and not emitted.
-pub const NO_GAUSSIAN: u32 = u32::MAX;
-/// Start of a picture that was not asked for.
-pub const NO_PICTURE: u32 = u32::MAX;
+shared! { pub(super) u32;
+    /// Invocations of a workgroup: WebGPU's portable floor, and the values of a radix digit.
+    WORKGROUP_SIZE = 256;
+    /// Views that one submission draws at most.
+    VIEWS_MAX = 8;
+    /// Invocations of a workgroup that moves pairs.
+    SORT_SIZE = 128;
+    /// Pairs that one workgroup sorts.
+    SORT_BLOCK = 2048;
+    /// Gaussians whose tile pairs one workgroup emits.
+    SCAN_BLOCK = 1024;
+    /// Workgroups along x at most; more go to y. Under the portable 65,535.
+    GROUPS_X_MAX = 32_768;
+    /// First row of workgroup counts of digits 1 to 3 of the depth sort, by blocks.
+    GROUPS_DEPTH = 0;
+    /// The same, by values of the digit.
+    GROUPS_DIGITS = 3;
+    /// Row of workgroup counts of the tile sort.
+    GROUPS_TILES = 6;
+    /// Row of workgroup counts of the tile ranges.
+    GROUPS_RANGES = 7;
+    /// Bits of a fast view's depth keys: two digits of the sort.
+    FAST_KEY_BITS = 16;
+    /// Depth key of a dropped Gaussian.
+    DROPPED_KEY = u32::MAX;
+    /// Value of a pair that was counted and not emitted.
+    NO_GAUSSIAN = u32::MAX;
+    /// Start of a picture that was not asked for.
+    NO_PICTURE = u32::MAX;
+}
 
-/// The kernels' numbers by the name they have in WGSL, beside
-/// [`crate::constants::SHARED`].
-pub const SHARED: [(&str, u32); 14] = [
-    ("WORKGROUP_SIZE", WORKGROUP_SIZE),
-    ("VIEWS_MAX", VIEWS_MAX),
-    ("SORT_SIZE", SORT_SIZE),
-    ("SORT_BLOCK", SORT_BLOCK),
-    ("SCAN_BLOCK", SCAN_BLOCK),
-    ("GROUPS_X_MAX", GROUPS_X_MAX),
-    ("GROUPS_DEPTH", GROUPS_DEPTH),
-    ("GROUPS_DIGITS", GROUPS_DIGITS),
-    ("GROUPS_TILES", GROUPS_TILES),
-    ("GROUPS_RANGES", GROUPS_RANGES),
-    ("FAST_KEY_BITS", FAST_KEY_BITS),
-    ("DROPPED_KEY", DROPPED_KEY),
-    ("NO_GAUSSIAN", NO_GAUSSIAN),
-    ("NO_PICTURE", NO_PICTURE),
-];
-
-/// One stage's shader: its file's stem and its whole source, common parts first.
+/// The source of one stage, common parts first.
 #[derive(Clone, Copy, Debug)]
 pub struct Shader {
+    /// Name of its own.
+    pub name: &'static str,
     /// Stem of shaders/*.wgsl and of crates/render/src/cpu/*.rs; variants share it.
     pub stem: &'static str,
     /// Files under shaders/, in their order.
@@ -69,8 +57,9 @@ pub struct Shader {
 
 /// The source of a stage: constants, structs, views, then the named parts, then the stage itself.
 macro_rules! shader {
-    ($stem:literal $(, $part:literal)*) => {
+    ($name:literal, $stem:literal $(, $part:literal)*) => {
         Shader {
+            name: $name,
             stem: $stem,
             files: &[
                 "common/constants.wgsl",
@@ -92,18 +81,18 @@ macro_rules! shader {
 
 /// Every shader, in the order of the stages.
 pub const SHADERS: [Shader; 9] = [
-    shader!("project", "camera", "tiles"),
-    shader!("radix_sort", "sum_before"),
-    shader!("prefix_sum", "sum_before"),
-    shader!("shade", "sh"),
-    shader!("emit_isects", "tiles", "sum_before"),
-    shader!("tile_ranges"),
-    shader!("rasterize", "labels_none"),
-    shader!("rasterize", "labels_index", "labels_blend"),
-    shader!("rasterize", "labels_index", "labels_weights"),
+    shader!("project", "project", "camera", "tiles"),
+    shader!("radix_sort", "radix_sort", "sum_before"),
+    shader!("prefix_sum", "prefix_sum", "sum_before"),
+    shader!("shade", "shade", "sh"),
+    shader!("emit_isects", "emit_isects", "tiles", "sum_before"),
+    shader!("tile_ranges", "tile_ranges"),
+    shader!("rasterize", "rasterize", "labels_none"),
+    shader!("rasterize_blend", "rasterize", "labels_entries", "labels_blend"),
+    shader!("rasterize_weights", "rasterize", "labels_entries", "labels_weights"),
 ];
 
-/// Kernels, in the order of [`KERNELS`].
+/// Kernels, in the order of the stages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(super) enum Kernel {
     Project,
@@ -115,18 +104,10 @@ pub(super) enum Kernel {
     Shade,
     EmitIsects,
     TileRanges,
-    Rasterize(Raster),
+    Rasterize { color: bool, depth: bool, labels: RasterLabels },
 }
 
-/// What a kernel of rasterize is made for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub(super) struct Raster {
-    pub(super) color: bool,
-    pub(super) depth: bool,
-    pub(super) labels: RasterLabels,
-}
-
-/// Labels that a kernel of rasterize blends, in the order of [`SHADERS`].
+/// Labels that a kernel of rasterize blends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(super) enum RasterLabels {
     None,
@@ -134,86 +115,85 @@ pub(super) enum RasterLabels {
     Weights,
 }
 
-/// Name in measurements, place in [`SHADERS`] and entry point of every kernel but rasterize; those
-/// of [`SERIAL`] have one more, for software adapters.
-const KERNELS: [(&str, usize, &str); 9] = [
-    ("project", 0, "main"),
-    ("histogram", 1, "histogram"),
-    ("spine", 1, "spine"),
-    ("scatter", 1, "scatter"),
-    ("sum_blocks", 2, "sum_blocks"),
-    ("scan_sums", 2, "scan_sums"),
-    ("shade", 3, "main"),
-    ("emit_isects", 4, "main"),
-    ("tile_ranges", 5, "main"),
-];
-/// Kernels with an entry point of their own for software adapters: `{name}_serial`.
-const SERIAL: [&str; 2] = ["spine", "scatter"];
-/// Pixels that an invocation of rasterize blends: on a GPU, and on a software adapter.
-const PIXELS: [f64; 2] = [1.0, 8.0];
-/// Place in [`SHADERS`] of rasterize without labels.
-const RASTERIZE: usize = 6;
-/// Sets of pictures, each a kernel of rasterize, by labels.
-const PICTURES: usize = 4;
-
 impl Kernel {
-    fn place(self) -> Option<usize> {
-        Some(match self {
-            Self::Project => 0,
-            Self::Histogram => 1,
-            Self::Spine => 2,
-            Self::Scatter => 3,
-            Self::SumBlocks => 4,
-            Self::ScanSums => 5,
-            Self::Shade => 6,
-            Self::EmitIsects => 7,
-            Self::TileRanges => 8,
-            Self::Rasterize(_) => return None,
-        })
+    /// Those that every view needs.
+    const ALWAYS: [Self; 9] = [
+        Self::Project,
+        Self::Histogram,
+        Self::Spine,
+        Self::Scatter,
+        Self::SumBlocks,
+        Self::ScanSums,
+        Self::Shade,
+        Self::EmitIsects,
+        Self::TileRanges,
+    ];
+
+    /// Name in measurements, name of the shader, and entry point on a GPU and on a software
+    /// adapter.
+    fn row(self) -> (&'static str, &'static str, [&'static str; 2]) {
+        match self {
+            Self::Project => ("project", "project", ["main"; 2]),
+            Self::Histogram => ("histogram", "radix_sort", ["histogram"; 2]),
+            Self::Spine => ("spine", "radix_sort", ["spine", "spine_serial"]),
+            Self::Scatter => ("scatter", "radix_sort", ["scatter", "scatter_serial"]),
+            Self::SumBlocks => ("sum_blocks", "prefix_sum", ["sum_blocks"; 2]),
+            Self::ScanSums => ("scan_sums", "prefix_sum", ["scan_sums"; 2]),
+            Self::Shade => ("shade", "shade", ["main"; 2]),
+            Self::EmitIsects => ("emit_isects", "emit_isects", ["main"; 2]),
+            Self::TileRanges => ("tile_ranges", "tile_ranges", ["main"; 2]),
+            Self::Rasterize { labels, .. } => {
+                let shader = match labels {
+                    RasterLabels::None => "rasterize",
+                    RasterLabels::Blend => "rasterize_blend",
+                    RasterLabels::Weights => "rasterize_weights",
+                };
+                ("rasterize", shader, ["main"; 2])
+            }
+        }
     }
 
     /// Name in measurements.
     pub(super) fn name(self) -> &'static str {
-        self.place().map_or("rasterize", |place| KERNELS[place].0)
+        self.row().0
     }
 }
 
 /// The compiled kernels.
 #[derive(Debug)]
 pub(super) struct Kernels {
+    /// In the order of [`SHADERS`].
     modules: Vec<wgpu::ShaderModule>,
-    pipelines: Vec<wgpu::ComputePipeline>,
-    /// Made when first wanted: a server that is asked for colour needs one of twelve.
-    rasterize: [OnceLock<wgpu::ComputePipeline>; 3 * PICTURES],
+    /// Those of rasterize are compiled for the first view that needs them: a server that is asked
+    /// for colour needs one of twelve.
+    pipelines: Mutex<HashMap<Kernel, wgpu::ComputePipeline>>,
     /// Whether they are those for a software adapter.
     pub(super) serial: bool,
-    /// Needless work that is not left out.
+    /// Needless work that is done all the same.
     without: Option<Skip>,
 }
 
 impl Kernels {
-    /// Compiles every kernel as `options` say, for an adapter that is `software` or not.
-    ///
-    /// # Errors
-    /// `internal` when the driver refuses one, `invalid_request` when a file cannot be read.
-    pub(super) fn compile(gpu: &Gpu, options: &GpuOptions, software: bool) -> Result<Self> {
-        let serial = options.serial.unwrap_or(software);
+    /// Compiles the kernels for an adapter that is `software` or not.
+    /// Errors: `internal` when the driver refuses one, `invalid_request` when a file cannot be
+    /// read.
+    pub(super) fn compile(gpu: &Gpu, switches: &Switches, software: bool) -> Result<Self> {
         let modules = SHADERS
             .iter()
             .map(|shader| {
-                let source = source_of(shader, options.shaders.as_deref())?;
+                let source = source_of(shader, switches.shaders.as_deref())?;
                 gpu.scoped(shader.stem, || {
                     let described = wgpu::ShaderModuleDescriptor {
-                        label: Some(shader.stem),
+                        label: Some(shader.name),
                         source: wgpu::ShaderSource::Wgsl(source),
                     };
-                    if options.checked {
+                    if switches.checked {
                         return gpu.device.create_shader_module(described);
                     }
                     let checks = wgpu::ShaderRuntimeChecks::unchecked();
-                    // SAFETY: the shaders are our own. Every index is held against a count that
-                    // the host has made room for, and every loop ends; the twin tests run them
-                    // with the checks too.
+                    // SAFETY: the shaders are our own. Every index is compared with a count that
+                    // the host has made room for, and every loop ends. Tests run them with the
+                    // checks too.
                     #[expect(unsafe_code, reason = "the checks cost a fifth of a frame")]
                     unsafe {
                         gpu.device.create_shader_module_trusted(described, checks)
@@ -221,16 +201,13 @@ impl Kernels {
                 })
             })
             .collect::<Result<Vec<_>>>()?;
-        let pipelines = KERNELS
-            .iter()
-            .map(|&(name, module, entry)| {
-                let own = if serial && SERIAL.contains(&name) { "_serial" } else { "" };
-                let constants: Vec<_> = left_in(&SHADERS[module], options.without).collect();
-                pipeline(gpu, name, &modules[module], &format!("{entry}{own}"), &constants)
-            })
-            .collect::<Result<_>>()?;
-        let rasterize = [const { OnceLock::new() }; 3 * PICTURES];
-        Ok(Self { modules, pipelines, rasterize, serial, without: options.without })
+        let serial = switches.serial.unwrap_or(software);
+        let pipelines = Mutex::default();
+        let kernels = Self { modules, pipelines, serial, without: switches.without };
+        for kernel in Kernel::ALWAYS {
+            kernels.get(gpu, kernel)?;
+        }
+        Ok(kernels)
     }
 
     /// Whether rasterize takes colours out of the harmonics of a scene with `sh_count`, not from
@@ -245,57 +222,48 @@ impl Kernels {
     }
 
     /// The pipeline of a kernel.
-    ///
-    /// # Errors
-    /// `internal` when the driver refuses one that is wanted for the first time.
-    pub(super) fn get(&self, gpu: &Gpu, kernel: Kernel) -> Result<&wgpu::ComputePipeline> {
-        let Kernel::Rasterize(raster) = kernel else {
-            return Ok(&self.pipelines[kernel.place().unwrap_or_default()]);
-        };
-        let labels = raster.labels as usize;
-        let at = labels * PICTURES + usize::from(raster.color) * 2 + usize::from(raster.depth);
-        if self.rasterize[at].get().is_none() {
-            let mut constants = vec![
-                ("WITH_COLOR", f64::from(u8::from(raster.color))),
-                ("WITH_DEPTH", f64::from(u8::from(raster.depth))),
-                ("PIXELS", PIXELS[usize::from(self.serial)]),
-            ];
-            constants.extend(left_in(&SHADERS[RASTERIZE + labels], self.without));
-            let module = &self.modules[RASTERIZE + labels];
-            let made = pipeline(gpu, "rasterize", module, "main", &constants)?;
-            return Ok(self.rasterize[at].get_or_init(|| made));
+    /// Errors: `internal` when the driver refuses one that is needed for the first time.
+    pub(super) fn get(&self, gpu: &Gpu, kernel: Kernel) -> Result<wgpu::ComputePipeline> {
+        if let Some(pipeline) = self.pipelines.lock().get(&kernel) {
+            return Ok(pipeline.clone());
         }
-        self.rasterize[at].get().ok_or_else(|| Error::internal("a kernel was made and is gone"))
+        // Not under the lock: other submissions go on while a kernel is compiled.
+        let pipeline = self.pipeline(gpu, kernel)?;
+        Ok(self.pipelines.lock().entry(kernel).or_insert(pipeline).clone())
     }
-}
 
-/// The constant that has a shader do the work `without` names, if it knows that work.
-fn left_in(shader: &Shader, without: Option<Skip>) -> impl Iterator<Item = (&'static str, f64)> {
-    let known = |name: &&str| shader.source.contains(&format!("override {name}: bool"));
-    without.map(Skip::constant).filter(known).map(|name| (name, 0.0)).into_iter()
-}
-
-fn pipeline(
-    gpu: &Gpu,
-    name: &'static str,
-    module: &wgpu::ShaderModule,
-    entry: &str,
-    constants: &[(&str, f64)],
-) -> Result<wgpu::ComputePipeline> {
-    gpu.scoped(name, || {
-        gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-            label: Some(name),
-            layout: None,
-            module,
-            entry_point: Some(entry),
-            compilation_options: wgpu::PipelineCompilationOptions {
-                constants,
-                // Every shader writes its workgroup memory before it reads it.
-                zero_initialize_workgroup_memory: false,
-            },
-            cache: None,
+    fn pipeline(&self, gpu: &Gpu, kernel: Kernel) -> Result<wgpu::ComputePipeline> {
+        let (name, shader, entry_points) = kernel.row();
+        let found = SHADERS.iter().zip(&self.modules).find(|(one, _)| one.name == shader);
+        let Some((shader, module)) = found else {
+            return Err(Error::internal(format!("{name}: there is no shader {shader}")));
+        };
+        let mut constants = Vec::new();
+        if let Kernel::Rasterize { color, depth, .. } = kernel {
+            constants.push(("WITH_COLOR", f64::from(u8::from(color))));
+            constants.push(("WITH_DEPTH", f64::from(u8::from(depth))));
+            // Pixels that an invocation blends.
+            constants.push(("PIXELS", if self.serial { 8.0 } else { 1.0 }));
+        }
+        // The shader does the work that its constant names, if it knows that work.
+        let known = |name: &String| shader.source.contains(&format!("override {name}: bool"));
+        let without = self.without.map(Skip::constant).filter(known);
+        constants.extend(without.iter().map(|name| (name.as_str(), 0.0)));
+        gpu.scoped(name, || {
+            gpu.device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                label: Some(name),
+                layout: None,
+                module,
+                entry_point: Some(entry_points[usize::from(self.serial)]),
+                compilation_options: wgpu::PipelineCompilationOptions {
+                    constants: &constants,
+                    // Every shader writes its workgroup memory before it reads it.
+                    zero_initialize_workgroup_memory: false,
+                },
+                cache: None,
+            })
         })
-    })
+    }
 }
 
 fn source_of(shader: &Shader, folder: Option<&Path>) -> Result<Cow<'static, str>> {

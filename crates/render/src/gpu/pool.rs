@@ -1,10 +1,10 @@
 //! The queue of views of one device: who draws next, and which views are drawn together.
 //!
-//! A caller puts its request into a bounded queue and waits. The caller whose request is first
-//! draws it. It draws with it all waiting requests that fit the same submission: those of the same
-//! scene and the same kernels. A request that is equal to one that waits or is being drawn is not
-//! drawn again; its caller gets a copy. The callers' own threads do the work, so the queue can
-//! borrow what they pass.
+//! A caller puts its request into the queue and waits. The scheduler of the service bounds the
+//! number of callers. The caller whose request is first draws it. It draws with it all waiting
+//! requests that fit the same submission: those of the same scene and the same kernels. A request
+//! that is equal to one that waits or is being drawn is not drawn again; its caller gets a copy.
+//! The threads of the callers do the work, so the queue can borrow what they pass.
 
 use std::{
     collections::VecDeque,
@@ -19,7 +19,7 @@ use parking_lot::{Condvar, Mutex};
 
 use crate::{
     Frame, Kinds, RenderRequest,
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
 };
 
 /// Submissions at once: while the device draws one, the pictures of another are copied and the
@@ -138,12 +138,11 @@ impl ViewsWaiting {
 }
 
 /// The queue of one device.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct ViewQueue {
     waiting: Mutex<ViewsWaiting>,
     /// Notified when a request arrives.
     arrived: Condvar,
-    waiting_max: usize,
 }
 
 /// The views of one submission. When it is dropped, also by a panic, every view has an answer.
@@ -167,10 +166,6 @@ impl Drop for ActiveBatch<'_> {
 }
 
 impl ViewQueue {
-    pub(super) fn new(waiting_max: usize) -> Self {
-        Self { waiting: Mutex::default(), arrived: Condvar::new(), waiting_max }
-    }
-
     /// Requests that wait or are being drawn.
     pub(super) fn len(&self) -> usize {
         self.waiting.lock().len()
@@ -178,9 +173,7 @@ impl ViewQueue {
 
     /// Draws `request` of `scene`, alone or with others. `draw` must answer all its views; it gets
     /// at most `views_max`.
-    ///
-    /// # Errors
-    /// `overloaded` when the queue is full, and what `draw` answers.
+    /// Errors: what `draw` answers.
     pub(super) fn render(
         &self,
         scene: u64,
@@ -188,7 +181,7 @@ impl ViewQueue {
         views_max: usize,
         draw: impl FnOnce(&[Arc<QueuedView>]),
     ) -> Result<Frame> {
-        let (view, mine) = self.enter(scene, request)?;
+        let (view, mine) = self.enter(scene, request);
         if view.wait(mine) {
             let batch = self.gather(&view, views_max);
             draw(&batch.batch);
@@ -197,18 +190,11 @@ impl ViewQueue {
     }
 
     /// The view of `request`, and whether it is new.
-    fn enter(&self, scene: u64, request: &RenderRequest) -> Result<(Arc<QueuedView>, bool)> {
+    fn enter(&self, scene: u64, request: &RenderRequest) -> (Arc<QueuedView>, bool) {
         let mut waiting = self.waiting.lock();
         let mut known = waiting.views.iter().chain(&waiting.drawn);
         if let Some(view) = known.find(|view| view.equals(scene, request) && view.share()) {
-            return Ok((Arc::clone(view), false));
-        }
-        if waiting.views.len() >= self.waiting_max {
-            return Err(Error::new(
-                ErrorCode::Overloaded,
-                format!("{} views wait for the GPU already", waiting.views.len()),
-            )
-            .retry_after_s(1));
+            return (Arc::clone(view), false);
         }
         let view = Arc::new(QueuedView {
             scene,
@@ -223,7 +209,7 @@ impl ViewQueue {
         waiting.crowd = waiting.crowd.max(waiting.len());
         waiting.start_next();
         self.arrived.notify_all();
-        Ok((view, true))
+        (view, true)
     }
 
     /// The views of the submission that `view` starts.
@@ -258,8 +244,16 @@ impl ViewQueue {
 
 #[cfg(test)]
 mod tests {
+    use std::{
+        sync::Barrier,
+        thread::{Scope, ScopedJoinHandle},
+    };
+
     use super::*;
-    use crate::scene::{Camera, CameraToWorld, Intrinsics};
+    use crate::{
+        error::ErrorCode,
+        scene::{Camera, CameraToWorld, Intrinsics},
+    };
 
     fn request(near: f32) -> RenderRequest {
         let camera_to_world =
@@ -269,28 +263,46 @@ mod tests {
         RenderRequest::plain(Camera { intrinsics, camera_to_world }, Kinds::COLOR, near)
     }
 
-    fn frame(view: &QueuedView) -> Frame {
-        Frame { depth: Some(vec![view.request.near]), ..Frame::default() }
+    /// Answers each view with its near plane.
+    fn draw(views: &[Arc<QueuedView>]) {
+        for view in views {
+            let depth = Some(vec![view.request.near]);
+            view.answer(Ok(Frame { depth, ..Frame::default() }));
+        }
+    }
+
+    fn wait_for(queue: &ViewQueue, requests: usize) {
+        while queue.len() < requests {
+            std::thread::yield_now();
+        }
+    }
+
+    /// Callers that take all submissions and hold them until `gate` is passed once more.
+    fn hold<'scope>(
+        scope: &'scope Scope<'scope, '_>,
+        (queue, gate): (&'scope ViewQueue, &'scope Barrier),
+        answer: fn(&[Arc<QueuedView>]),
+    ) -> Vec<ScopedJoinHandle<'scope, Result<Frame>>> {
+        let caller = |other| {
+            scope.spawn(move || {
+                queue.render(90 + other, &request(1.0), 8, |views| {
+                    gate.wait();
+                    gate.wait();
+                    answer(views);
+                })
+            })
+        };
+        let callers = (0..SUBMISSIONS_MAX as u64).map(caller).collect();
+        gate.wait();
+        callers
     }
 
     #[test]
     fn waiting_requests_of_a_scene_are_drawn_together_and_equal_ones_once() {
-        let queue = ViewQueue::new(64);
+        let (queue, gate) = (ViewQueue::default(), Barrier::new(1 + SUBMISSIONS_MAX));
         let batches = Mutex::new(Vec::new());
-        let gate = std::sync::Barrier::new(1 + SUBMISSIONS_MAX);
         std::thread::scope(|scope| {
-            // They hold all submissions until everyone else waits.
-            for other in 0..SUBMISSIONS_MAX as u64 {
-                let (queue, gate) = (&queue, &gate);
-                scope.spawn(move || {
-                    queue.render(90 + other, &request(1.0), 8, |views| {
-                        gate.wait();
-                        gate.wait();
-                        views.iter().for_each(|view| view.answer(Ok(frame(view))));
-                    })
-                });
-            }
-            gate.wait();
+            hold(scope, (&queue, &gate), draw);
             let near = [2.0, 3.0, 2.0, 4.0, 5.0, 3.0];
             for (i, near) in near.into_iter().enumerate() {
                 let (queue, batches) = (&queue, &batches);
@@ -299,15 +311,13 @@ mod tests {
                 scope.spawn(move || {
                     let got = queue.render(scene, &request(near), 8, |views| {
                         batches.lock().push(views.len());
-                        views.iter().for_each(|view| view.answer(Ok(frame(view))));
+                        draw(views);
                     });
                     assert_eq!(got.unwrap().depth, Some(vec![near]), "view {i}");
                 });
             }
-            while queue.len() < SUBMISSIONS_MAX + 5 {
-                std::thread::yield_now();
-            }
-            // Whoever asks for a view that waits already has joined by now or will find it drawn.
+            wait_for(&queue, SUBMISSIONS_MAX + 5);
+            // The sixth caller joins a view that waits, or finds it drawn.
             std::thread::sleep(Duration::from_millis(50));
             gate.wait();
         });
@@ -318,48 +328,30 @@ mod tests {
 
     #[test]
     fn a_request_that_was_answered_and_taken_is_drawn_again() {
-        let queue = ViewQueue::new(64);
-        let (gate, again) = (std::sync::Barrier::new(1 + SUBMISSIONS_MAX), AtomicBool::new(false));
-        let draw =
-            |views: &[Arc<QueuedView>]| views.iter().for_each(|view| view.answer(Ok(frame(view))));
+        let (queue, gate) = (ViewQueue::default(), Barrier::new(1 + SUBMISSIONS_MAX));
+        let again = AtomicBool::new(false);
         std::thread::scope(|scope| {
-            for other in 0..SUBMISSIONS_MAX as u64 {
-                let (queue, gate) = (&queue, &gate);
-                scope.spawn(move || {
-                    queue.render(90 + other, &request(1.0), 8, |views| {
-                        gate.wait();
-                        gate.wait();
+            hold(scope, (&queue, &gate), draw);
+            // Two views that are drawn together, by a caller who goes on after the answers.
+            let [first, second] = [2.0, 3.0].map(|near| {
+                let (queue, again) = (&queue, &again);
+                let requests = queue.len() + 1;
+                let caller = scope.spawn(move || {
+                    queue.render(7, &request(near), 8, |views| {
                         draw(views);
+                        let begun = Instant::now();
+                        while views.len() == 2
+                            && !again.load(Ordering::Acquire)
+                            && begun.elapsed() < Duration::from_secs(5)
+                        {
+                            std::thread::yield_now();
+                        }
                     })
                 });
-            }
+                wait_for(queue, requests);
+                caller
+            });
             gate.wait();
-            // Two views that are drawn together, by a caller who goes on after the answers.
-            let callers: Vec<_> = [2.0, 3.0]
-                .map(|near| {
-                    let (queue, again) = (&queue, &again);
-                    let asked = queue.len() + 1;
-                    let caller = scope.spawn(move || {
-                        queue.render(7, &request(near), 8, |views| {
-                            draw(views);
-                            let begun = Instant::now();
-                            while views.len() == 2
-                                && !again.load(Ordering::Acquire)
-                                && begun.elapsed() < Duration::from_secs(5)
-                            {
-                                std::thread::yield_now();
-                            }
-                        })
-                    });
-                    while queue.len() < asked {
-                        std::thread::yield_now();
-                    }
-                    caller
-                })
-                .into();
-            gate.wait();
-            let mut callers = callers.into_iter();
-            let (first, second) = (callers.next().unwrap(), callers.next().unwrap());
             assert!(second.join().unwrap().is_ok(), "answered while the first still draws");
             let got = queue.render(7, &request(3.0), 8, draw);
             again.store(true, Ordering::Release);
@@ -369,39 +361,18 @@ mod tests {
     }
 
     #[test]
-    fn a_full_queue_and_a_broken_drawing_are_errors_for_all_who_wait() {
-        let queue = ViewQueue::new(1);
-        let gate = std::sync::Barrier::new(1 + SUBMISSIONS_MAX);
+    fn a_broken_drawing_is_an_error_for_all_who_wait_and_the_next_is_drawn() {
+        let (queue, gate) = (ViewQueue::default(), Barrier::new(1 + SUBMISSIONS_MAX));
         std::thread::scope(|scope| {
-            let broken: Vec<_> = (0..SUBMISSIONS_MAX as u64)
-                .map(|other| {
-                    let (queue, gate) = (&queue, &gate);
-                    scope.spawn(move || {
-                        queue.render(other, &request(1.0), 8, |_| {
-                            gate.wait();
-                            gate.wait();
-                        })
-                    })
-                })
-                .collect();
-            gate.wait();
-            let second = scope.spawn(|| {
-                let answer = |views: &[Arc<QueuedView>]| {
-                    views.iter().for_each(|view| view.answer(Ok(frame(view))));
-                };
-                queue.render(1, &request(2.0), 8, answer)
-            });
-            while queue.len() < SUBMISSIONS_MAX + 1 {
-                std::thread::yield_now();
-            }
-            let third = queue.render(1, &request(3.0), 8, |_| {}).unwrap_err();
-            assert_eq!((third.code(), third.retry_after()), (ErrorCode::Overloaded, Some(1)));
+            let broken = hold(scope, (&queue, &gate), |_| {});
+            let next = scope.spawn(|| queue.render(1, &request(2.0), 8, draw));
+            wait_for(&queue, SUBMISSIONS_MAX + 1);
             gate.wait();
             for broken in broken {
                 let error = broken.join().unwrap().unwrap_err();
                 assert_eq!(error.code(), ErrorCode::Internal, "nobody answered it");
             }
-            assert!(second.join().unwrap().is_ok(), "the next one is drawn");
+            assert!(next.join().unwrap().is_ok(), "the next one is drawn");
         });
     }
 }

@@ -18,16 +18,12 @@ pub(super) struct Marks {
     resolved: wgpu::Buffer,
     staging: wgpu::Buffer,
     names: Vec<&'static str>,
-    /// Whether every dispatch is marked, or the start and the last alone.
+    /// Whether every dispatch is marked, or the start and the end alone.
     each: bool,
-    last: Option<&'static str>,
 }
 
 impl Marks {
     /// Marks for one submission.
-    ///
-    /// # Errors
-    /// As [`Gpu::create_buffer`].
     pub(super) fn new(gpu: &Gpu, each: bool) -> Result<Self> {
         let bytes = u64::from(MARKS_MAX) * 8;
         let resolve = BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC;
@@ -44,30 +40,31 @@ impl Marks {
             staging: gpu.create_buffer("timestamps", bytes, staging)?,
             names: Vec::new(),
             each,
-            last: None,
         })
     }
 
     pub(super) fn start(&mut self, pass: &mut wgpu::ComputePass<'_>) {
         self.names.clear();
-        self.last = None;
         pass.write_timestamp(&self.queries, 0);
     }
 
     pub(super) fn mark(&mut self, pass: &mut wgpu::ComputePass<'_>, name: &'static str) {
-        let at = 1 + self.names.len() as u32;
-        if self.each && at < MARKS_MAX {
-            pass.write_timestamp(&self.queries, at);
-            self.names.push(name);
-        } else {
-            self.last = Some(name);
+        if self.each {
+            self.write(pass, name);
         }
     }
 
     /// After the last dispatch, inside its pass.
     pub(super) fn end(&mut self, pass: &mut wgpu::ComputePass<'_>) {
-        if let Some(name) = self.last.take().filter(|_| !self.each) {
-            pass.write_timestamp(&self.queries, 1);
+        if !self.each {
+            self.write(pass, "frame");
+        }
+    }
+
+    fn write(&mut self, pass: &mut wgpu::ComputePass<'_>, name: &'static str) {
+        let at = 1 + self.names.len() as u32;
+        if at < MARKS_MAX {
+            pass.write_timestamp(&self.queries, at);
             self.names.push(name);
         }
     }
@@ -80,9 +77,6 @@ impl Marks {
     }
 
     /// Times of the dispatches of the last submission, which is waited for here.
-    ///
-    /// # Errors
-    /// As [`readback::read`].
     pub(super) fn read(&self, gpu: &Gpu) -> Result<Vec<DispatchTime>> {
         let bytes = (1 + self.names.len() as u64) * 8;
         let period = f64::from(gpu.queue.get_timestamp_period()) * 1e-6;

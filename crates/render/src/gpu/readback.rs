@@ -19,9 +19,8 @@ const NAP_MAX: Duration = Duration::from_millis(1);
 const NAP_SHARE: u32 = 8;
 
 /// Waits until the device is done with `staging` and hands its first `size_bytes` to `take`.
-///
-/// # Errors
-/// `gpu_unavailable` when the device is lost or does not answer, `internal` for another fault.
+/// Errors: `gpu_unavailable` when the device is lost or does not answer, `internal` for another
+/// fault.
 pub(super) fn read<T>(
     gpu: &Gpu,
     staging: &wgpu::Buffer,

@@ -9,10 +9,10 @@ use super::{
     device::Gpu,
     pipelines::{
         GROUPS_DEPTH, GROUPS_DIGITS, GROUPS_RANGES, GROUPS_TILES, GROUPS_X_MAX, Kernel, Kernels,
-        Raster, RasterLabels, SCAN_BLOCK, SORT_BLOCK, WORKGROUP_SIZE,
+        RasterLabels, SCAN_BLOCK, SORT_BLOCK, WORKGROUP_SIZE,
     },
     profile::Marks,
-    scratch::{BatchBuffers, params_of},
+    scratch::{BatchBuffers, digit, params_of},
 };
 use crate::error::{Error, Result};
 
@@ -42,13 +42,8 @@ pub(super) struct SceneBuffers<'a> {
     pub(super) sh_count: u32,
 }
 
-/// Buffers of the labels for rasterize: entries, with the table or the slots.
-#[derive(Clone, Copy, Debug)]
-pub(super) enum LabelBuffers<'a> {
-    None,
-    Blend { index: &'a wgpu::Buffer },
-    Weights { index: &'a wgpu::Buffer },
-}
+/// The kind of labels that rasterize blends, and the entries of the Gaussians where it does.
+pub(super) type LabelInputs<'a> = (RasterLabels, Option<&'a wgpu::Buffer>);
 
 /// Workgroups of a dispatch, over the views of the batch.
 enum Groups {
@@ -114,9 +109,7 @@ impl<'a> Recorder<'a> {
     }
 
     /// Ends the stages and submits everything.
-    ///
-    /// # Errors
-    /// `internal` when a kernel of it was refused.
+    /// Errors: `internal` when a kernel of it was refused.
     pub(super) fn submit(mut self, copies: &[Copy<'_>]) -> Result<()> {
         if let Some(error) = self.failed.take() {
             return Err(error);
@@ -176,7 +169,7 @@ impl<'a> Recorder<'a> {
             })
         });
         let Some(pass) = &mut self.pass else { return };
-        pass.set_pipeline(pipeline);
+        pass.set_pipeline(&pipeline);
         pass.set_bind_group(0, &*group, &[]);
         match *groups {
             Groups::Row(count) => {
@@ -196,19 +189,16 @@ impl<'a> Recorder<'a> {
     /// Stage 1.
     pub(super) fn project(&mut self, scene: SceneBuffers<'_>) {
         let room = self.room;
-        self.dispatch(
-            Kernel::Project,
-            None,
-            &[
-                (0, &room.views),
-                (1, scene.gaussians),
-                (2, &room.footprints),
-                (3, &room.depth_keys),
-                (4, &room.tiles),
-                (5, &room.plans),
-            ],
-            &Groups::Row(self.count.div_ceil(WORKGROUP_SIZE)),
-        );
+        let buffers = [
+            (0, &room.views),
+            (1, scene.gaussians),
+            (2, &room.footprints),
+            (3, &room.depth_keys),
+            (4, &room.tiles),
+            (5, &room.plans),
+        ];
+        let groups = Groups::Row(self.count.div_ceil(WORKGROUP_SIZE));
+        self.dispatch(Kernel::Project, None, &buffers, &groups);
     }
 
     /// Stage 2: sorts the Gaussians by depth, without the dropped ones, by at most `digits` digits.
@@ -216,8 +206,6 @@ impl<'a> Recorder<'a> {
     pub(super) fn depth_sort(&mut self, digits: u32) {
         let blocks = self.count.div_ceil(SORT_BLOCK);
         for pass_at in 0..digits {
-            let digit =
-                SortParams { shift: pass_at * DIGIT_BITS, pass_at, by_tile: 0, reserved: 0 };
             let groups = match pass_at {
                 0 => [Groups::Row(blocks), Groups::Row(self.spines()), Groups::Row(blocks)],
                 _ => [
@@ -226,7 +214,7 @@ impl<'a> Recorder<'a> {
                     Groups::Planned(GROUPS_DEPTH + pass_at - 1),
                 ],
             };
-            self.sort_digit(digit, &groups);
+            self.sort_digit(digit(0, pass_at), &groups);
         }
     }
 
@@ -234,10 +222,8 @@ impl<'a> Recorder<'a> {
     /// half [`sorted_half`].
     pub(super) fn tile_sort(&mut self, key_bits: u32) {
         for pass_at in 0..key_bits.div_ceil(DIGIT_BITS) {
-            let digit =
-                SortParams { shift: pass_at * DIGIT_BITS, pass_at, by_tile: 1, reserved: 0 };
             let planned = || Groups::Planned(GROUPS_TILES);
-            self.sort_digit(digit, &[planned(), Groups::Row(self.spines()), planned()]);
+            self.sort_digit(digit(1, pass_at), &[planned(), Groups::Row(self.spines()), planned()]);
         }
     }
 
@@ -323,7 +309,7 @@ impl<'a> Recorder<'a> {
     pub(super) fn rasterize(
         &mut self,
         scene: SceneBuffers<'_>,
-        labels: &LabelBuffers<'_>,
+        (labels, entries): LabelInputs<'_>,
         (color, depth): (bool, bool),
         tiles: [u32; 2],
     ) {
@@ -338,18 +324,11 @@ impl<'a> Recorder<'a> {
             (4, &room.pictures),
             (5, colors),
         ];
-        let labels = match *labels {
-            LabelBuffers::None => RasterLabels::None,
-            LabelBuffers::Blend { index } => {
-                buffers.extend([(6, index), (7, &room.table)]);
-                RasterLabels::Blend
-            }
-            LabelBuffers::Weights { index } => {
-                buffers.extend([(6, index), (7, &room.slots)]);
-                RasterLabels::Weights
-            }
-        };
-        let kernel = Kernel::Rasterize(Raster { color, depth, labels });
+        if let Some(entries) = entries {
+            let weights = labels == RasterLabels::Weights;
+            buffers.extend([(6, entries), (7, if weights { &room.slots } else { &room.table })]);
+        }
+        let kernel = Kernel::Rasterize { color, depth, labels };
         self.dispatch(kernel, None, &buffers, &Groups::Grid(tiles[0], tiles[1]));
     }
 }

@@ -1,21 +1,24 @@
 //! Buffers of a batch of views. They grow and serve the next batch too.
 
+use std::collections::HashMap;
+
 use wgpu::BufferUsages;
 
 use super::{
-    buffers::{FootprintRow, PlanRow, Slot, SortParams, ViewRow},
-    device::Gpu,
+    buffers::{FootprintRow, PlanRow, SortParams, ViewRow},
+    device::{Gpu, STORAGE},
     pipelines::{GROUPS_RANGES, SCAN_BLOCK, SORT_BLOCK, VIEWS_MAX},
     recorder::{Bindings, DIGIT_BITS, DIGITS, DIGITS_MAX},
 };
 use crate::error::Result;
 
 /// First room of a pixel, in weights: a pixel at an edge of an object shows about as many entries.
-pub(super) const ENTRY_SLOTS_MIN: u32 = 8;
+pub(super) const WEIGHT_SLOTS_MIN: u32 = 8;
 /// Distance of two uniforms in the table of parameters: the portable alignment.
 const PARAMS_STRIDE: u64 = 256;
 const VIEW_BYTES: u64 = size_of::<ViewRow>() as u64 * VIEWS_MAX as u64;
 const GROUPS_BYTES: u64 = 16 * (GROUPS_RANGES as u64 + 1);
+const UNIFORM: BufferUsages = BufferUsages::UNIFORM.union(BufferUsages::COPY_DST);
 
 /// Sizes of a batch.
 #[derive(Clone, Copy, Debug, Default)]
@@ -61,106 +64,91 @@ pub(super) struct BatchBuffers {
     pub(super) staging: wgpu::Buffer,
 }
 
-/// Slots of a room, and what the last views needed.
+/// Buffers of earlier batches, and what the last views needed.
 #[derive(Debug)]
 pub(super) struct Scratch {
-    views: Slot,
+    /// By their labels. Their contents are undefined between frames.
+    buffers: HashMap<&'static str, wgpu::Buffer>,
     params: Option<wgpu::Buffer>,
-    plans: Slot,
-    groups: Slot,
-    groups_unasked: Slot,
-    footprints: Slot,
-    tiles: Slot,
-    depth_keys: Slot,
-    depth_ids: Slot,
-    tile_keys: Slot,
-    isect_ids: Slot,
-    digit_counts: Slot,
-    block_sums: Slot,
-    colors: Slot,
-    ranges: Slot,
-    pictures: Slot,
-    table: Slot,
-    slots: Slot,
-    staging: Slot,
     pub(super) bindings: Bindings,
     /// Tile pairs of a view that the last views needed.
     pub(super) isects: u32,
-    /// Entries a pixel that the last views needed.
+    /// Weights a pixel that the last views needed.
     pub(super) weight_slots: u32,
 }
 
 impl Default for Scratch {
     fn default() -> Self {
-        let uniform = BufferUsages::UNIFORM | BufferUsages::COPY_DST;
-        let copied = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST;
         Self {
-            views: Slot::new("views", uniform),
+            buffers: HashMap::new(),
             params: None,
-            plans: Slot::storage("plans"),
-            groups: Slot::new("groups", copied | BufferUsages::INDIRECT),
-            groups_unasked: Slot::storage("groups unasked"),
-            footprints: Slot::storage("footprints"),
-            tiles: Slot::storage("tiles of Gaussians"),
-            depth_keys: Slot::storage("depth keys"),
-            depth_ids: Slot::storage("depth order"),
-            tile_keys: Slot::storage("tile keys"),
-            isect_ids: Slot::storage("tile pairs"),
-            digit_counts: Slot::storage("digit counts"),
-            block_sums: Slot::storage("block sums"),
-            colors: Slot::storage("colours"),
-            ranges: Slot::storage("tile ranges"),
-            pictures: Slot::storage("pictures"),
-            table: Slot::storage("label table"),
-            slots: Slot::storage("entry slots"),
-            staging: Slot::new("staging", BufferUsages::MAP_READ | BufferUsages::COPY_DST),
             bindings: Bindings::default(),
             isects: 0,
-            weight_slots: ENTRY_SLOTS_MIN,
+            weight_slots: WEIGHT_SLOTS_MIN,
         }
     }
 }
 
 impl Scratch {
     /// Buffers for `need`.
-    ///
-    /// # Errors
-    /// `limit_exceeded` when the adapter cannot hold or bind as much.
+    /// Errors: `limit_exceeded` when the adapter cannot hold or bind as much.
     pub(super) fn room(&mut self, gpu: &Gpu, need: &Need) -> Result<BatchBuffers> {
         let (views, count, capacity) =
             (u64::from(need.views), u64::from(need.count), u64::from(need.capacity));
-        let sorted = count.max(capacity);
-        let digits = u64::from(DIGITS) * (sorted.div_ceil(u64::from(SORT_BLOCK)) + 1);
+        let footprint_bytes = size_of::<FootprintRow>() as u64;
+        let digits = u64::from(DIGITS) * (count.max(capacity).div_ceil(SORT_BLOCK.into()) + 1);
+        let blocks = count.div_ceil(SCAN_BLOCK.into());
         let color_bytes = if need.shades { views * count * 12 } else { 0 };
         let params = match &self.params {
             Some(params) => params.clone(),
             None => self.params.insert(upload_params(gpu)?).clone(),
         };
+        let mut sized = |label, usage, size_bytes| self.sized(gpu, label, usage, size_bytes);
+        let staging = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
+        let views_buffer = sized("views", UNIFORM, VIEW_BYTES)?;
+        let groups = sized("groups", STORAGE | BufferUsages::INDIRECT, GROUPS_BYTES)?;
+        let staging = sized("staging", staging, need.staging_bytes)?;
+        let mut storage = |label, size_bytes| sized(label, STORAGE, size_bytes);
         Ok(BatchBuffers {
-            views: self.views.ensure(gpu, VIEW_BYTES)?,
+            views: views_buffer,
             params,
-            plans: self.plans.ensure(gpu, views * size_of::<PlanRow>() as u64)?,
-            groups: self.groups.ensure(gpu, GROUPS_BYTES)?,
-            groups_unasked: self.groups_unasked.ensure(gpu, GROUPS_BYTES)?,
-            footprints: self
-                .footprints
-                .ensure(gpu, views * count * size_of::<FootprintRow>() as u64)?,
-            tiles: self.tiles.ensure(gpu, views * count * 4)?,
-            depth_keys: self.depth_keys.ensure(gpu, views * count * 8)?,
-            depth_ids: self.depth_ids.ensure(gpu, views * count * 8)?,
-            tile_keys: self.tile_keys.ensure(gpu, views * capacity * 8)?,
-            isect_ids: self.isect_ids.ensure(gpu, views * capacity * 8)?,
-            digit_counts: self.digit_counts.ensure(gpu, views * digits * 4)?,
-            block_sums: self
-                .block_sums
-                .ensure(gpu, views * count.div_ceil(u64::from(SCAN_BLOCK)) * 4)?,
-            colors: self.colors.ensure(gpu, color_bytes)?,
-            ranges: self.ranges.ensure(gpu, u64::from(need.ranges) * 4)?,
-            pictures: self.pictures.ensure(gpu, need.picture_bytes)?,
-            table: self.table.ensure(gpu, need.table_bytes)?,
-            slots: self.slots.ensure(gpu, need.slot_bytes)?,
-            staging: self.staging.ensure(gpu, need.staging_bytes)?,
+            plans: storage("plans", views * size_of::<PlanRow>() as u64)?,
+            groups,
+            groups_unasked: storage("groups unasked", GROUPS_BYTES)?,
+            footprints: storage("footprints", views * count * footprint_bytes)?,
+            tiles: storage("tiles of Gaussians", views * count * 4)?,
+            depth_keys: storage("depth keys", views * count * 8)?,
+            depth_ids: storage("depth order", views * count * 8)?,
+            tile_keys: storage("tile keys", views * capacity * 8)?,
+            isect_ids: storage("tile pairs", views * capacity * 8)?,
+            digit_counts: storage("digit counts", views * digits * 4)?,
+            block_sums: storage("block sums", views * blocks * 4)?,
+            colors: storage("colours", color_bytes)?,
+            ranges: storage("tile ranges", u64::from(need.ranges) * 4)?,
+            pictures: storage("pictures", need.picture_bytes)?,
+            table: storage("label table", need.table_bytes)?,
+            slots: storage("weight slots", need.slot_bytes)?,
+            staging,
         })
+    }
+
+    /// The buffer of a label, replaced if it is shorter than `size_bytes`.
+    /// Errors: `limit_exceeded` when the adapter cannot hold or bind that many bytes.
+    fn sized(
+        &mut self,
+        gpu: &Gpu,
+        label: &'static str,
+        usage: BufferUsages,
+        size_bytes: u64,
+    ) -> Result<wgpu::Buffer> {
+        if let Some(buffer) = self.buffers.get(label).filter(|one| one.size() >= size_bytes) {
+            return Ok(buffer.clone());
+        }
+        // Free the old buffer before the new one is allocated.
+        self.buffers.remove(label);
+        let buffer = gpu.create_buffer(label, size_bytes, usage)?;
+        self.buffers.insert(label, buffer.clone());
+        Ok(buffer)
     }
 }
 
@@ -174,22 +162,21 @@ impl BatchBuffers {
     }
 }
 
+/// The parameters of digit `pass_at` of a sort.
+pub(super) fn digit(by_tile: u32, pass_at: u32) -> SortParams {
+    SortParams { shift: pass_at * DIGIT_BITS, pass_at, by_tile, reserved: 0 }
+}
+
 /// Place of a digit's parameters in the table of all.
 pub(super) fn params_of(digit: SortParams) -> u64 {
     u64::from(digit.by_tile * DIGITS_MAX + digit.pass_at) * PARAMS_STRIDE
 }
 
 fn upload_params(gpu: &Gpu) -> Result<wgpu::Buffer> {
-    let mut bytes = vec![0; (PARAMS_STRIDE * u64::from(2 * DIGITS_MAX)) as usize];
-    for by_tile in 0..2 {
-        for pass_at in 0..DIGITS_MAX {
-            let digit = SortParams { shift: pass_at * DIGIT_BITS, pass_at, by_tile, reserved: 0 };
-            let at = params_of(digit) as usize;
-            bytes[at..at + size_of::<SortParams>()].copy_from_slice(bytemuck::bytes_of(&digit));
-        }
+    let size_bytes = PARAMS_STRIDE * u64::from(2 * DIGITS_MAX);
+    let buffer = gpu.create_buffer("sort parameters", size_bytes, UNIFORM)?;
+    for one in (0..2 * DIGITS_MAX).map(|at| digit(at / DIGITS_MAX, at % DIGITS_MAX)) {
+        gpu.queue.write_buffer(&buffer, params_of(one), bytemuck::bytes_of(&one));
     }
-    let usage = BufferUsages::UNIFORM | BufferUsages::COPY_DST;
-    let buffer = gpu.create_buffer("sort parameters", bytes.len() as u64, usage)?;
-    gpu.queue.write_buffer(&buffer, 0, &bytes);
     Ok(buffer)
 }

@@ -304,3 +304,40 @@ fn a_repeated_camera_set_copies_nothing() {
     let weights = frame.expect("a view").weights.expect("weights");
     assert!(weights.entries.iter().all(|&m| m == 2) && !weights.entries.is_empty(), "old indices");
 }
+
+/// A renderer whose pixels are a quarter of white, of alternating opacity.
+struct Checkered;
+
+impl Renderer for Checkered {
+    fn name(&self) -> String {
+        "checkered".to_owned()
+    }
+
+    fn concurrency(&self) -> usize {
+        1
+    }
+
+    fn render(&self, _: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        let lens = request.lens();
+        let pixels = (lens.width * lens.height) as usize;
+        Ok(Frame {
+            width: lens.width,
+            height: lens.height,
+            color: Some(vec![[0.25; 3]; pixels]),
+            alpha: Some((0..pixels).map(|i| if i % 2 == 0 { 1.0 } else { 0.25 }).collect()),
+            ..Frame::default()
+        })
+    }
+}
+
+#[test]
+fn the_backdrop_shows_only_where_alpha_leaves_room() {
+    let mut scene = scene(3, [0.2, 0.8]);
+    let cells = Backdrop::WIDTH * Backdrop::HEIGHT;
+    scene.backdrop = Backdrop::from_cells(vec![[255; 3]; cells]).expect("all cells");
+    let asked = RenderRequest { kinds: Kinds::COLOR, ..request(at(0.3)) };
+    let frame = planner().render(&Checkered, &scene, &asked, true).expect("a view");
+    for (i, color) in frame.color.expect("colour").into_iter().enumerate() {
+        assert_eq!(color, if i % 2 == 0 { [0.25; 3] } else { [1.0; 3] }, "pixel {i}");
+    }
+}

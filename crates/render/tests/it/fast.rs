@@ -5,7 +5,7 @@ use segsplat_render::{
     Frame, Labels, Quality, RenderRequest, Renderer, compare::psnr, cpu::CpuRenderer,
 };
 
-use crate::twins::{both_kernels, gpu};
+use crate::common::{both_kernels, gpu};
 use segsplat_testing::scenes::{Random, camera, checked, push, request, two_views};
 
 /// Half a level of 8 bits, and what f32 adds.

@@ -8,7 +8,7 @@ use segsplat_core::{
 };
 use segsplat_render::{Frame, Labels, Quality, RenderRequest, Renderer, cpu::CpuRenderer};
 
-use crate::twins::gpu;
+use crate::common::gpu;
 use segsplat_testing::scenes::{Random, camera, checked, cloud, push, request};
 
 /// Numbers that broke renderers before.

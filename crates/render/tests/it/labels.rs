@@ -1,11 +1,14 @@
-//! Labels against the literal road: one-hot vectors of M channels blended as colours are, three at
-//! a time, by the same renderer. The blend and the pixel weights must equal it, for any M.
+//! Labels against the plain definition: one-hot vectors of M channels, blended as colours are,
+//! three at a time, by the same renderer. The blend and the pixel weights must equal it, for any M.
 
 use std::sync::Arc;
 
-use segsplat_core::scene::{Gaussians, RawGaussians};
+use segsplat_core::{
+    error::ErrorCode,
+    scene::{Gaussians, RawGaussians},
+};
 use segsplat_render::{
-    Frame, Kinds, Labels, PixelWeights, RenderRequest, Renderer, cpu::CpuRenderer, oracle,
+    Frame, Kinds, Labels, PixelWeights, RenderRequest, Renderer, Switches, cpu::CpuRenderer, oracle,
 };
 
 use segsplat_testing::labels::{
@@ -21,7 +24,7 @@ fn cpu() -> CpuRenderer {
 }
 
 #[test]
-fn labels_equal_the_literal_road_for_any_bank() {
+fn labels_equal_the_plain_definition_for_any_bank() {
     let sizes = [(1, 33, 17), (2, 16, 16), (3, 1, 1), (7, 50, 31), (24, 64, 48), (64, 40, 40)];
     for (m, width, height) in sizes.into_iter().chain([(512, 32, 24), (4_096, 16, 12)]) {
         let gaussians = labelled(1_500, m, 100 + u64::from(m));
@@ -56,7 +59,7 @@ fn the_oracle_and_the_cpu_agree_on_labels_outside_cliffs() {
         let share = far.len() as f64 / dense.len() as f64;
         assert!(share <= Tolerance::ORACLE.flips, "M = {m}: {} pixels flipped", far.len());
         println!("M = {m}: max {worst:.2e}, {} flips", far.len());
-        // The oracle's own two roads.
+        // The two ways of the oracle.
         for (i, (pixel, dense)) in blended.iter().zip(&dense).enumerate() {
             assert!(!listed[i].weights.contains_key(&0), "index 0 is no entry");
             let own = pixel.blend.map(|v| v as f32);
@@ -121,7 +124,8 @@ fn threads_and_bands_change_no_label() {
         assert_eq!(got.blend, want.blend, "{threads} threads");
     }
     let total = cpu().render(&gaussians, &request).expect("a picture").stats.intersections;
-    let banded = CpuRenderer::new(2).expect("threads").with_isects_max(total / 2);
+    let switches = Switches { isects_max: Some(total as u32 / 2), ..Switches::default() };
+    let banded = CpuRenderer::with_switches(2, &switches).expect("threads");
     let got = draw_labels(&banded, &gaussians, &request, &table);
     assert_eq!((got.weights, got.blend), (want.weights, want.blend), "in bands");
 }
@@ -171,4 +175,18 @@ fn weights_are_the_share_of_the_pixel_that_an_index_covers() {
     let most: f32 = alpha.iter().sum();
     // One Gaussian of thirteen has index 0.
     assert!(all > 0.8 * most && all < 0.99 * most, "{all} of {most} is labelled");
+}
+
+#[test]
+fn a_table_must_be_finite_and_an_entry_beyond_it_is_0() {
+    let table = [[9.0; 4], [1.0; 4], [2.0; 4]];
+    assert_eq!(Labels::row(&table, 2), [2.0; 4], "the last row");
+    assert_eq!(Labels::row(&table, 3), [9.0; 4], "beyond the table");
+    assert_eq!(Labels::row(&[], 3), [0.0; 4], "no table");
+    Labels::Blend(table.into()).check().expect("finite numbers");
+    let mut bad = table;
+    bad[1][2] = f32::NAN;
+    let error = Labels::Blend(bad.into()).check().expect_err("a NaN");
+    assert_eq!(error.code(), ErrorCode::InvalidRequest, "{error}");
+    assert!(error.message().starts_with("labels: row 1"), "{error}");
 }

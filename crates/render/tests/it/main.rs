@@ -7,6 +7,8 @@
     reason = "helpers of tests are tests too"
 )]
 
+#[path = "../common/mod.rs"]
+mod common;
 mod compare;
 mod compose;
 mod crop;
@@ -20,6 +22,6 @@ mod pool;
 mod props;
 mod shader_layout;
 mod skips;
+mod stages;
 mod twins;
-mod views;
 mod widths;

@@ -57,8 +57,7 @@ fn a_place_that_f32_rounds_is_a_cliff_for_those_who_keep_it_in_f32() {
         let mut raw = RawGaussians::default();
         push(&mut raw, mean, [1.0, 0.0, 0.0, 0.0], [1e-7; 3], opacity, &[[0.5; 3]]);
         let at = [[column, 0]];
-        let key = oracle::DepthKey::F32;
-        let seen = oracle::render_pixels(&checked(raw), &request(camera), key, &at);
+        let seen = oracle::render_pixels(&checked(raw), &request(camera), &at);
         let cliff = seen.expect("the truth")[0].cliff;
         assert!(!cliff.same_order(), "column {column}: {cliff:?}");
         assert_eq!(cliff.any(), !steady, "column {column}: {cliff:?}");
@@ -148,8 +147,7 @@ fn a_large_picture_agrees_on_sampled_pixels() {
     let mut random = Random(62);
     let pixels: Vec<[u32; 2]> =
         (0..8_192).map(|_| [random.bits() as u32 % 2_048, random.bits() as u32 % 1_536]).collect();
-    let truth = oracle::render_pixels(&gaussians, &request, oracle::DepthKey::F32, &pixels)
-        .expect("the truth");
+    let truth = oracle::render_pixels(&gaussians, &request, &pixels).expect("the truth");
     let frame = samples(&cpu().render(&gaussians, &request).expect("a picture"));
     let got: Vec<Sample> = pixels.iter().map(|&[x, y]| frame[(y * 2_048 + x) as usize]).collect();
     let cliff: Vec<bool> = truth.iter().map(|p| p.cliff.same_order()).collect();

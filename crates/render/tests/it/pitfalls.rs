@@ -11,7 +11,7 @@ use glam::DVec3;
 use segsplat_core::scene::{Gaussians, RawGaussians};
 use segsplat_render::{Frame, RenderRequest, Renderer, constants::ALPHA_MAX, cpu::CpuRenderer};
 
-use crate::twins::{gpu, open};
+use crate::common::{gpu, open};
 use segsplat_testing::scenes::{camera, checked, cloud, look, push, request};
 
 /// No rotation.

@@ -1,12 +1,13 @@
 //! The devices that callers share: views drawn together, devices lost, memory and limits met.
-//! Adapter and skipping are those of `twins`.
 
 use std::{sync::Barrier, time::Duration, time::Instant};
 
 use segsplat_core::{error::ErrorCode, scene::Gaussians};
-use segsplat_render::{Frame, Kinds, Labels, RenderRequest, Renderer, gpu::GpuRenderer};
+use segsplat_render::{
+    Frame, Kinds, Labels, RenderRequest, Renderer, RendererOptions, gpu::GpuRenderer,
+};
 
-use crate::twins::open;
+use crate::common::open;
 use segsplat_testing::labels::{labelled, table};
 use segsplat_testing::scenes::{camera, cloud, request};
 
@@ -44,21 +45,22 @@ fn at_once(gpu: &GpuRenderer, scene: &Gaussians, wanted: &[RenderRequest]) -> Ve
 #[test]
 fn views_drawn_together_are_those_drawn_alone() {
     for serial in [false, true] {
-        let Some(gpu) = open(|options| options.serial = Some(serial)) else { return };
+        let Some(gpu) = open(|options| options.switches.serial = Some(serial)) else { return };
         for labels in [Labels::None, Labels::Blend(table(9, 3)), Labels::Weights] {
             let scene = labelled(2_000, 8, 61);
             let wanted = requests(16, &labels);
             let alone: Vec<_> =
                 wanted.iter().map(|one| gpu.render(&scene, one).expect("a view alone")).collect();
-            let before = gpu.submissions();
+            let before = gpu.internals().submissions();
             for (i, (got, want)) in at_once(&gpu, &scene, &wanted).iter().zip(&alone).enumerate() {
                 assert!(got == want, "view {i} among others, {labels:?}");
             }
-            let (submissions, views) = gpu.submissions();
+            let (submissions, views) = gpu.internals().submissions();
             let (submissions, views) = (submissions - before.0, views - before.1);
             println!("{views} views in {submissions} submissions");
             assert_eq!(views, 16, "no two views are equal");
-            assert!(submissions < 16, "some views shared a submission");
+            // Views of three sets of kernels. Two start at once; the others wait and share.
+            assert!(submissions <= 8, "16 views in {submissions} submissions");
         }
         // Degree 2: colours of each camera are its own.
         let scene = cloud(1_500, 2, 62);
@@ -75,12 +77,13 @@ fn equal_requests_are_drawn_once() {
     let scene = cloud(20_000, 0, 63);
     let one = request(camera(320, 240));
     let want = gpu.render(&scene, &one).expect("a view");
-    let before = gpu.submissions().1;
+    let before = gpu.internals().submissions().1;
     let wanted = vec![one; 16];
     assert!(at_once(&gpu, &scene, &wanted).iter().all(|got| *got == want), "all got it");
-    let drawn = gpu.submissions().1 - before;
+    let drawn = gpu.internals().submissions().1 - before;
     println!("{drawn} of 16 drawn");
-    assert!(drawn < 16, "equal views were drawn {drawn} times");
+    // The first one is drawn while the others arrive.
+    assert!(drawn <= 4, "equal views were drawn {drawn} times");
 }
 
 #[test]
@@ -104,14 +107,14 @@ fn a_device_lost_under_sixteen_requests_loses_none_of_them() {
                 .collect();
             begin.wait();
             std::thread::sleep(Duration::from_millis(wait_ms));
-            gpu.lose_devices();
+            gpu.internals().lose_devices();
             for (i, (thread, want)) in threads.into_iter().zip(&alone).enumerate() {
                 let got = thread.join().expect("a caller").expect("an answer");
                 assert!(got == *want, "view {i} after the loss");
             }
         });
     }
-    gpu.lose_devices();
+    gpu.internals().lose_devices();
     let begun = Instant::now();
     assert!(gpu.render(scene, &wanted[0]).expect("a view") == alone[0], "the next view");
     println!("served again after {:?}", begun.elapsed());
@@ -125,13 +128,13 @@ fn scenes_leave_by_bytes_and_come_again() {
     let one = request(camera(48, 32));
     let want = gpu.render(&a, &one).expect("a view");
     gpu.render(&b, &one).expect("a view of the other");
-    assert_eq!(gpu.scenes_held(), 1, "the first has left");
+    assert_eq!(gpu.internals().scenes_held(), 1, "the first has left");
     assert!(gpu.render(&a, &one).expect("a view again") == want, "it came again");
 }
 
 #[test]
 fn what_no_buffer_holds_is_refused_with_the_figures() {
-    let Some(gpu) = open(|options| options.portable = true) else { return };
+    let Some(gpu) = open(|options| options.switches.portable = true) else { return };
     // 2.8 million Gaussians of 48 bytes are over the portable 128 MiB of a binding.
     let scene = cloud(2_800_000, 0, 67);
     let error = gpu.render(&scene, &request(camera(16, 16))).expect_err("too many");
@@ -139,4 +142,21 @@ fn what_no_buffer_holds_is_refused_with_the_figures() {
     assert!(error.message().contains("134400000 is over 134217728"), "{error}");
     let small = cloud(100, 0, 68);
     gpu.render(&small, &request(camera(16, 16))).expect("others are drawn");
+}
+
+#[test]
+fn an_unknown_adapter_is_refused_with_what_there_is() {
+    let adapter = Some("no such adapter".to_owned());
+    let (_, opened) = GpuRenderer::open(&RendererOptions { adapter, ..Default::default() });
+    let error = opened.expect_err("nothing is called so");
+    assert_eq!(error.code(), ErrorCode::GpuUnavailable, "{error}");
+    assert!(error.message().contains("no such adapter"), "{error}");
+}
+
+#[test]
+fn software_is_never_taken_unasked() {
+    let (reports, _) = GpuRenderer::open(&RendererOptions::default());
+    for report in reports {
+        assert!(!(report.software && report.chosen), "{report:?} was taken without being named");
+    }
 }

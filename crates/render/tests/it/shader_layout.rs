@@ -1,14 +1,13 @@
 //! The shaders as the host believes them to be: valid, of the same layout, with the same numbers,
-//! each with its CPU twin.
+//! each with a CPU stage of the same name.
 
 use std::{collections::BTreeMap, mem::offset_of};
 
 use naga::{Expression, Literal, Module, TypeInner};
 use segsplat_render::{
     constants,
-    gpu::{
-        buffers::{FootprintRow, GaussianRow, PlanRow, SortParams, ViewRow},
-        pipelines::{self, SHADERS, Shader},
+    gpu::internals::{
+        self, FootprintRow, GaussianRow, PlanRow, SHADERS, Shader, SortParams, ViewRow,
     },
 };
 
@@ -78,7 +77,7 @@ fn layout_of(module: &Module, name: &str) -> Option<(BTreeMap<String, u32>, u32)
     })
 }
 
-macro_rules! twin {
+macro_rules! layout {
     ($rust:ty, $wgsl:literal, [$($field:ident),* $(,)?]) => {{
         let offsets: BTreeMap<String, u32> = [
             $((stringify!($field).to_owned(), offset_of!($rust, $field) as u32)),*
@@ -89,9 +88,9 @@ macro_rules! twin {
 }
 
 #[test]
-fn structs_lie_in_memory_as_their_twins_do() {
-    let twins = [
-        twin!(
+fn structs_lie_in_memory_as_the_shaders_say() {
+    let layouts = [
+        layout!(
             ViewRow,
             "View",
             [
@@ -132,20 +131,20 @@ fn structs_lie_in_memory_as_their_twins_do() {
                 reserved,
             ]
         ),
-        twin!(GaussianRow, "Gaussian", [mean, opacity, quat, scale, reserved]),
-        twin!(
+        layout!(GaussianRow, "Gaussian", [mean, opacity, quat, scale, reserved]),
+        layout!(
             FootprintRow,
             "Footprint",
             [mean, conic_shear, conic_x, conic_y, power_max, opacity, depth]
         ),
-        twin!(
+        layout!(
             PlanRow,
             "Plan",
             [isects, needed, visible, sorted, key_min, key_max, passes, reserved]
         ),
-        twin!(SortParams, "SortParams", [shift, pass_at, by_tile, reserved]),
+        layout!(SortParams, "SortParams", [shift, pass_at, by_tile, reserved]),
     ];
-    for (name, offsets, size) in twins {
+    for (name, offsets, size) in layouts {
         let mut seen = 0;
         for shader in &SHADERS {
             // Every shader holds every struct, whether it uses it or not.
@@ -186,7 +185,7 @@ fn constants_are_those_of_the_host() {
         ("SH_C3", narrow(&constants::SH_C3)),
     ];
     wanted.extend(constants::SHARED.iter().map(|&(name, value)| (name, narrow(&[value]))));
-    wanted.extend(pipelines::SHARED.iter().map(|&(name, value)| (name, vec![f64::from(value)])));
+    wanted.extend(internals::SHARED.iter().map(|&(name, value)| (name, vec![f64::from(value)])));
     for shader in &SHADERS {
         let module = parse(shader);
         for (name, value) in &wanted {
@@ -198,7 +197,7 @@ fn constants_are_those_of_the_host() {
 }
 
 #[test]
-fn every_stage_has_a_cpu_twin_and_every_file_is_used() {
+fn every_stage_has_a_cpu_stage_and_every_file_is_used() {
     let mut files: Vec<String> = fs_err::read_dir(root().join("shaders"))
         .expect("the folder of shaders")
         .filter_map(|entry| {
@@ -213,7 +212,7 @@ fn every_stage_has_a_cpu_twin_and_every_file_is_used() {
     stems.dedup();
     assert_eq!(files, stems, "files in shaders/ against SHADERS");
     for stem in &stems {
-        let twin = root().join(format!("crates/render/src/cpu/{stem}.rs"));
-        assert!(twin.is_file(), "shaders/{stem}.wgsl has no twin {}", twin.display());
+        let stage = root().join(format!("crates/render/src/cpu/{stem}.rs"));
+        assert!(stage.is_file(), "shaders/{stem}.wgsl has no {}", stage.display());
     }
 }

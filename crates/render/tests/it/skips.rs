@@ -1,12 +1,44 @@
-//! What renderers leave out changes no pixel: each skip switched off gives the same frame.
-//! What each saves is measured by `segsplat-lab skips`, not here.
+//! Work that renderers leave out changes no pixel: each skip switched off gives the same frame.
+//! Other tests show that each switch does something. `segsplat-lab skips` measures what each saves.
 
-use segsplat_core::scene::Gaussians;
-use segsplat_render::{Frame, Labels, RenderRequest, Renderer, cpu::CpuRenderer, skip::Skip};
+use segsplat_core::scene::{Gaussians, RawGaussians};
+use segsplat_render::{
+    Frame, Kinds, Labels, RenderRequest, Renderer, Skip, Switches,
+    cpu::{
+        CpuRenderer,
+        footprint::Footprint,
+        lanes::KernelOptions,
+        paint::Paint,
+        project::{Projected, project},
+        rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
+        tiles::TileSpans,
+    },
+    gpu::internals::SHADERS,
+    view::View,
+};
 
-use crate::twins::open;
+use crate::common::open;
 use segsplat_testing::labels::{labelled, table};
-use segsplat_testing::scenes::{camera, cloud, look, request, two_views};
+use segsplat_testing::scenes::{camera, checked, cloud, look, push, request, two_views};
+
+/// Skips of the CPU renderer. Its sort has no digits to leave out.
+const OF_CPU: [Skip; 6] = [
+    Skip::EllipseTiles,
+    Skip::EllipseParts,
+    Skip::EndedRays,
+    Skip::Unseen,
+    Skip::FlatColor,
+    Skip::EmptyTiles,
+];
+/// Skips of the shaders, by their constants. An empty tile is no step of its own there.
+const OF_SHADERS: [Skip; 6] = [
+    Skip::EllipseTiles,
+    Skip::EllipseParts,
+    Skip::EndedRays,
+    Skip::Unseen,
+    Skip::FlatColor,
+    Skip::EqualDigits,
+];
 
 /// Scenes and views in which every skip has something to leave out: Gaussians beside the picture
 /// and behind the camera, tiles without any, walls, harmonics, labels.
@@ -26,29 +58,28 @@ fn cases() -> Vec<(&'static str, Gaussians, RenderRequest)> {
     ]
 }
 
-/// The same frame; boxes have more tiles than ellipses, and Gaussians in them that no pixel sees.
-fn same(skip: Skip, name: &str, mut got: Frame, want: &Frame) {
+/// The same frame. Boxes have more tiles than ellipses; returns how many pairs more.
+fn same(skip: Skip, name: &str, mut got: Frame, want: &Frame) -> u64 {
+    let more = got.stats.intersections - want.stats.intersections;
+    assert!(more == 0 || skip == Skip::EllipseTiles, "{skip:?}: {name} has {more} pairs more");
     if skip == Skip::EllipseTiles {
-        let (boxes, ellipses) = (got.stats, want.stats);
-        assert!(boxes.intersections >= ellipses.intersections, "{name}: {boxes:?}, {ellipses:?}");
-        got.stats = ellipses;
+        got.stats = want.stats;
     }
-    assert!(got == *want, "without {}: {name} differs", skip.name());
+    assert!(got == *want, "without {skip:?}: {name} differs");
+    more
 }
 
 #[test]
 fn on_the_cpu_no_bit_changes() {
     let draw = |without, gaussians: &Gaussians, request: &RenderRequest| {
-        let cpu = CpuRenderer::new(2).expect("two threads").without(without);
-        cpu.render(gaussians, request).expect("a frame")
+        let cpu = CpuRenderer::with_switches(2, &Switches { without, ..Switches::default() });
+        cpu.expect("two threads").render(gaussians, request).expect("a frame")
     };
     let mut boxed = 0;
     for (name, gaussians, request) in cases() {
         let want = draw(None, &gaussians, &request);
-        for skip in Skip::ALL {
-            let got = draw(Some(skip), &gaussians, &request);
-            boxed += got.stats.intersections - want.stats.intersections;
-            same(skip, name, got, &want);
+        for skip in OF_CPU {
+            boxed += same(skip, name, draw(Some(skip), &gaussians, &request), &want);
         }
     }
     assert!(boxed > 1_000, "the switch of tiles does switch: {boxed} pairs more");
@@ -58,17 +89,120 @@ fn on_the_cpu_no_bit_changes() {
 fn on_a_gpu_no_bit_changes() {
     let scenes = cases();
     for serial in [false, true] {
-        let Some(gpu) = open(|options| options.serial = Some(serial)) else { return };
+        let Some(gpu) = open(|options| options.switches.serial = Some(serial)) else { return };
         let draw = |(_, gaussians, request): &(_, _, _)| gpu.render(gaussians, request);
         let wanted: Vec<_> = scenes.iter().map(|case| draw(case).expect("a frame")).collect();
-        for skip in Skip::ALL {
-            let change = |options: &mut segsplat_render::gpu::GpuOptions| {
-                (options.serial, options.without) = (Some(serial), Some(skip));
+        let mut boxed = 0;
+        for skip in OF_SHADERS {
+            let Some(gpu) = open(|options| {
+                options.switches.serial = Some(serial);
+                options.switches.without = Some(skip);
+            }) else {
+                return;
             };
-            let Some(gpu) = open(change) else { return };
             for ((name, gaussians, request), want) in scenes.iter().zip(&wanted) {
-                same(skip, name, gpu.render(gaussians, request).expect("a frame"), want);
+                boxed += same(skip, name, gpu.render(gaussians, request).expect("a frame"), want);
             }
         }
+        assert!(boxed > 1_000, "the switch of tiles does switch: {boxed} pairs more");
+    }
+}
+
+#[test]
+fn the_shaders_know_their_switches() {
+    for skip in Skip::ALL {
+        let name = skip.constant();
+        // Declared, and asked for at least once.
+        let used = SHADERS.iter().any(|shader| shader.source.matches(&name).count() > 1);
+        assert_eq!(used, OF_SHADERS.contains(&skip), "{name}");
+    }
+}
+
+/// A Gaussian of degree 0.
+fn one() -> Gaussians {
+    let mut raw = RawGaussians::default();
+    push(&mut raw, [0.0, 0.0, 3.0], [1.0, 0.0, 0.0, 0.0], [0.1; 3], 0.9, &[[0.5; 3]]);
+    checked(raw)
+}
+
+/// The kernels that a device runs for one Gaussian.
+fn dispatches(without: Option<Skip>) -> Option<Vec<&'static str>> {
+    let gpu = open(|options| options.switches.without = without)?;
+    let times = gpu.device_times(&one(), &request(camera(64, 48))).expect("times");
+    Some(times?.stages.iter().map(|time| time.stage).collect())
+}
+
+#[test]
+fn a_gpu_runs_more_kernels_without_the_skips_of_the_host() {
+    let Some(want) = dispatches(None) else { return };
+    let count = |all: &[&str], name| all.iter().filter(|&&one| one == name).count();
+    assert_eq!(count(&want, "shade"), 0, "{want:?}");
+    let shaded = dispatches(Some(Skip::FlatColor)).expect("the same adapter");
+    assert_eq!(count(&shaded, "shade"), 1, "{shaded:?}");
+    let sorted = dispatches(Some(Skip::EqualDigits)).expect("the same adapter");
+    assert!(count(&sorted, "scatter") > count(&want, "scatter"), "{sorted:?}");
+}
+
+/// Pixels of a tile, blended from footprints that no stage gives, so that a skip shows.
+fn tile(footprints: &[Footprint], without: Option<Skip>) -> Vec<[f32; 3]> {
+    let request =
+        RenderRequest { kinds: Kinds::COLOR, background: [-0.0; 3], ..request(camera(16, 16)) };
+    let entries = vec![0; footprints.len()];
+    let options = KernelOptions { without, ..KernelOptions::default() };
+    let paint = Paint::new(&request, &entries, options);
+    let isects: Vec<u64> = (0..footprints.len() as u64).collect();
+    let mut color = vec![[9.0; 3]; 256];
+    let mut out = RowOut { color: Some(&mut color), ..RowOut::default() };
+    let place = Tile { x: 0, y: 0, width: 16, height: 16 };
+    let mut scratch = TileScratch::default();
+    rasterize_tile(footprints, &isects, place, &paint, 16, &mut scratch, &mut out);
+    color
+}
+
+/// Of the other switches of the CPU, pairs show that of the tiles, and nothing but the time shows
+/// that of flat colours.
+#[test]
+fn every_switch_of_the_blend_on_the_cpu_does_switch() {
+    let wall = Footprint {
+        mean: [8.0; 2],
+        conic_x: 1e-3,
+        conic_y: 1e-3,
+        power_max: 6.0,
+        opacity: 0.999,
+        depth: 1.0,
+        color: [0.5; 3],
+        ..Footprint::default()
+    };
+    // It says that it ends beside its centre, where no pixel is.
+    let short = Footprint { power_max: -1.0, ..wall };
+    assert_eq!(tile(&[short], None), [[-0.0; 3]; 256], "no part is touched");
+    assert_ne!(tile(&[short], Some(Skip::EllipseParts)), [[-0.0; 3]; 256], "all parts are");
+    // Four walls end every ray. What is behind them has weight 0, and 0 times NaN is NaN.
+    let bad = Footprint { color: [f32::NAN; 3], ..wall };
+    let behind = [wall, wall, wall, wall, bad];
+    let has_nan = |pixels: &[[f32; 3]]| pixels.iter().flatten().any(|value| value.is_nan());
+    assert!(!has_nan(&tile(&behind, None)), "ended rays see nothing");
+    assert!(has_nan(&tile(&behind, Some(Skip::EndedRays))), "ended rays are blended on");
+    // Zero and the background -0 are 0; the background alone is -0.
+    let negative = |pixels: &[[f32; 3]]| pixels.iter().flatten().all(|v| v.is_sign_negative());
+    assert!(negative(&tile(&[], None)), "an empty tile is filled");
+    assert!(!negative(&tile(&[], Some(Skip::EmptyTiles))), "an empty tile is blended");
+}
+
+#[test]
+fn the_switch_of_unseen_gaussians_on_the_cpu_does_switch() {
+    let (one, seen) = (one(), request(camera(40, 40)));
+    let mut away = seen.clone();
+    away.camera.camera_to_world = look(glam::DVec3::ZERO, glam::DVec3::NEG_Z);
+    for (without, kept) in [(None, true), (Some(Skip::Unseen), false)] {
+        let mut projected = Projected::default();
+        for request in [&seen, &away] {
+            let view = View::new(one.origin(), request).expect("a view");
+            let options = KernelOptions { without, ..KernelOptions::default() };
+            project(&one, &view, false, options, &mut projected);
+        }
+        assert_eq!(projected.tiles_per_gauss, [0], "it is behind the camera");
+        // Spans of a Gaussian that is not sorted are never read, so nobody clears them.
+        assert_eq!(projected.tile_spans[0] != TileSpans::default(), kept, "{without:?}");
     }
 }

@@ -1,9 +1,4 @@
 //! Every stage of the GPU renderer against its CPU twin, from the same input; then whole pictures.
-//!
-//! Needs an adapter: a hardware one, else lavapipe. Without any the tests say `skipped`;
-//! `REQUIRE_GPU=1` (or CI=true) makes that a failure. The device has WebGPU's portable limits.
-
-use std::sync::OnceLock;
 
 use segsplat_core::{
     error::ErrorCode,
@@ -12,84 +7,38 @@ use segsplat_core::{
 use segsplat_render::{
     Frame, Kinds, RenderRequest, Renderer,
     cpu::{
-        CpuRenderer, emit_isects,
+        emit_isects,
         footprint::Footprint,
+        lanes::KernelOptions,
         paint::Paint,
         prefix_sum, project,
         project::Projected,
         radix_sort,
         rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
         shade, tile_ranges,
-        tiles::Grid,
+        tiles::{Grid, TileSpans},
     },
-    gpu::{
-        GpuOptions, GpuRenderer,
-        buffers::FootprintRow,
-        pipelines::{DROPPED_KEY, NO_GAUSSIAN},
-    },
-    oracle,
+    gpu::internals::{DROPPED_KEY, FootprintRow, NO_GAUSSIAN},
     view::View,
 };
 
-use segsplat_testing::{
-    compare::{Tolerance, compare, samples},
-    scenes::{Random, camera, checked, cloud, look, push, request, two_views},
-    skipped,
-};
-
-/// Opens an adapter with `change` made to the portable options; hardware first.
-pub(crate) fn open(change: impl Fn(&mut GpuOptions)) -> Option<GpuRenderer> {
-    let mut told = String::new();
-    for adapter in [None, Some("llvmpipe".to_owned())] {
-        let mut options =
-            GpuOptions { adapter, portable: true, serial: Some(false), ..GpuOptions::default() };
-        change(&mut options);
-        match GpuRenderer::open(&options).1 {
-            Ok(gpu) => return Some(gpu),
-            Err(error) => told = error.to_string(),
-        }
-    }
-    assert!(std::env::var_os("REQUIRE_GPU").is_none(), "REQUIRE_GPU is set: {told}");
-    skipped("no adapter");
-    None
-}
-
-/// The adapter that the tests share.
-pub(crate) fn gpu() -> Option<&'static GpuRenderer> {
-    static GPU: OnceLock<Option<GpuRenderer>> = OnceLock::new();
-    let gpu = GPU.get_or_init(|| open(|_| {})).as_ref();
-    match gpu {
-        Some(gpu) => println!("adapter: {:?}", gpu.adapter()),
-        None => println!("skipped: no adapter"),
-    }
-    gpu
-}
-
-/// The same adapter with the kernels of a GPU, then with those of a software adapter.
-pub(crate) fn both_kernels() -> impl Iterator<Item = &'static GpuRenderer> {
-    static SERIAL: OnceLock<Option<GpuRenderer>> = OnceLock::new();
-    let serial = || SERIAL.get_or_init(|| open(|options| options.serial = Some(true))).as_ref();
-    gpu().into_iter().chain(serial())
-}
-
-fn cpu() -> CpuRenderer {
-    CpuRenderer::new(2).expect("two threads")
-}
+use crate::common::{both_kernels, gpu, judge, open, same};
+use segsplat_testing::scenes::{Random, camera, checked, cloud, look, push, request, two_views};
 
 fn view_of(gaussians: &Gaussians, request: &RenderRequest) -> View {
     View::new(gaussians.origin(), request).expect("a test view")
 }
 
 fn whole(view: &View) -> Grid {
-    Grid::whole(view, None)
+    Grid::whole(view, KernelOptions::default())
 }
 
 /// The CPU's footprints and tile counts.
 fn projected(gaussians: &Gaussians, request: &RenderRequest) -> Projected {
     let mut projected = Projected::default();
     let view = view_of(gaussians, request);
-    let how = project::Projection::new(request.antialiased);
-    project::project(gaussians, &view, how, &mut projected);
+    let options = KernelOptions::default();
+    project::project(gaussians, &view, request.antialiased, options, &mut projected);
     projected
 }
 
@@ -138,13 +87,13 @@ fn prefix_sum_twin() {
         let mut want = Vec::new();
         prefix_sum::prefix_sum(numbers.iter().copied(), &mut want);
         let starts: Vec<u32> = want[..count].iter().step_by(1_024).map(|&sum| sum as u32).collect();
-        let (got, total) = gpu.prefix_sum(&numbers).expect("sums");
+        let (got, total) = gpu.internals().prefix_sum(&numbers).expect("sums");
         assert!(got == starts, "{count} numbers: sums differ");
         assert_eq!(u64::from(total), want[count], "{count} numbers: the whole sum");
     }
     let mut huge = vec![0; 3 * 1_024];
     (huge[5], huge[1_500], huge[1_501], huge[3_000]) = (u32::MAX - 5, 3, 3, 9);
-    let (starts, total) = gpu.prefix_sum(&huge).expect("sums");
+    let (starts, total) = gpu.internals().prefix_sum(&huge).expect("sums");
     let near = u32::MAX - 5;
     assert_eq!(starts, [0, near, u32::MAX], "sums stay at the largest number");
     assert_eq!(total, u32::MAX, "the whole sum too");
@@ -163,36 +112,13 @@ fn radix_sort_twin() {
             let mut want: Vec<u64> =
                 keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v)).collect();
             radix_sort::radix_sort(&mut want, &mut Vec::new(), key_bits);
-            let (keys, values) = gpu.radix_sort(&keys, &values, key_bits).expect("a sort");
+            let (keys, values) =
+                gpu.internals().radix_sort(&keys, &values, key_bits).expect("a sort");
             let got: Vec<u64> =
                 keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v)).collect();
             assert!(got == want, "{count} pairs of {key_bits}-bit keys: order differs");
         }
     }
-}
-
-/// More pairs than other sorts were found to lose, in more workgroups than a row of them: long
-/// form, on hardware (`RUN_SLOW_TESTS=1`).
-#[test]
-fn a_hundred_million_pairs_are_sorted() {
-    if std::env::var_os("RUN_SLOW_TESTS").is_none() {
-        println!("skipped: RUN_SLOW_TESTS is not set");
-        return;
-    }
-    let Some(gpu) = open(|options| options.portable = false) else { return };
-    if gpu.adapter().software {
-        println!("skipped: no hardware adapter");
-        return;
-    }
-    let mut random = Random(3);
-    let keys: Vec<u32> = (0..100_000_000).map(|_| random.bits() as u32).collect();
-    let values: Vec<u32> = (0..100_000_000).collect();
-    let mut want: Vec<u64> =
-        keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v)).collect();
-    radix_sort::radix_sort(&mut want, &mut Vec::new(), 32);
-    let (keys, values) = gpu.radix_sort(&keys, &values, 32).expect("a sort");
-    let pairs = keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v));
-    assert!(pairs.eq(want), "order differs");
 }
 
 #[test]
@@ -222,7 +148,10 @@ fn depth_sort_leaves_the_dropped_behind() {
                 .collect();
             radix_sort::radix_sort(&mut want, &mut Vec::new(), 32);
             let want: Vec<u32> = want.into_iter().map(radix_sort::value).collect();
-            assert!(gpu.depth_sort(&keys).expect("an order") == want, "{count} keys over {range}");
+            assert!(
+                gpu.internals().depth_sort(&keys).expect("an order") == want,
+                "{count} keys over {range}"
+            );
         }
     }
 }
@@ -237,7 +166,7 @@ fn project_twin() {
         let gaussians = cloud(20_000, 0, 3);
         let request = RenderRequest { antialiased, ..request(turned) };
         let Projected { footprints, tiles_per_gauss: tiles, .. } = projected(&gaussians, &request);
-        let got = gpu.project(&gaussians, &request).expect("footprints");
+        let got = gpu.internals().project(&gaussians, &request).expect("footprints");
         let (mut one_sided, mut keys_apart, mut both) = (0, 0, 0_u32);
         let (mut cpu_tiles, mut gpu_tiles) = (0_u64, 0_u64);
         for i in 0..gaussians.len() {
@@ -285,9 +214,10 @@ fn shade_twin() {
         let gaussians = cloud(3_000, degree, 4);
         let request = request(camera(200, 150));
         let mut projected = projected(&gaussians, &request);
-        shade::shade(&gaussians, &view_of(&gaussians, &request), None, &mut projected);
+        let view = view_of(&gaussians, &request);
+        shade::shade(&gaussians, &view, KernelOptions::default(), &mut projected);
         let Projected { footprints, tiles_per_gauss: tiles, .. } = projected;
-        let got = gpu.shade(&gaussians, &request, &tiles).expect("colours");
+        let got = gpu.internals().shade(&gaussians, &request, &tiles).expect("colours");
         let mut seen = 0;
         for i in (0..gaussians.len()).filter(|&i| tiles[i] > 0) {
             seen += 1;
@@ -305,15 +235,18 @@ fn emit_isects_twin() {
     let gaussians = cloud(8_000, 0, 5);
     let request = request(camera(333, 222));
     let view = view_of(&gaussians, &request);
-    let all = gpu.project(&gaussians, &request).expect("footprints");
+    let all = gpu.internals().project(&gaussians, &request).expect("footprints");
     let seen: Vec<usize> = (0..gaussians.len()).filter(|&i| all.tiles[i] > 0).collect();
     let rows: Vec<_> = seen.iter().map(|&i| all.footprints[i]).collect();
     let tiles: Vec<_> = seen.iter().map(|&i| all.tiles[i]).collect();
-    let (tile_keys, ids) = gpu.emit_isects(&view, &rows, &tiles).expect("pairs");
+    let (tile_keys, ids) = gpu.internals().emit_isects(&view, &rows, &tiles).expect("pairs");
     let unwritten = ids.iter().filter(|&&id| id == NO_GAUSSIAN).count();
 
     let grid = whole(&view);
-    let footprints = Projected::of(rows.iter().map(to_footprint).collect(), &grid);
+    let footprints: Vec<_> = rows.iter().map(to_footprint).collect();
+    let touched = footprints.iter().map(|footprint| TileSpans::of(footprint, &grid));
+    let (tile_spans, tiles_per_gauss) = touched.unzip();
+    let footprints = Projected { footprints, tile_spans, tiles_per_gauss };
     let in_order: Vec<u64> = (0..rows.len() as u32).map(|i| radix_sort::pack(0, i)).collect();
     let mut want_offsets = Vec::new();
     prefix_sum::prefix_sum(footprints.tiles_per_gauss.iter().copied(), &mut want_offsets);
@@ -347,7 +280,11 @@ fn tile_ranges_twin() {
         let mut want = Vec::new();
         let pairs: Vec<u64> = keys.iter().map(|&tile| radix_sort::pack(tile, 0)).collect();
         tile_ranges::tile_ranges(&pairs, tiles, &mut want);
-        assert_eq!(gpu.tile_ranges(&view, &keys).expect("ranges"), want, "{count} pairs");
+        assert_eq!(
+            gpu.internals().tile_ranges(&view, &keys).expect("ranges"),
+            want,
+            "{count} pairs"
+        );
     }
 }
 
@@ -360,7 +297,7 @@ fn rasterize_twin() {
         let mut projected = projected(&gaussians, &request);
         let order = depth_order(&projected);
         let (mut offsets, mut isects, mut ranges) = (vec![], vec![], vec![]);
-        shade::shade(&gaussians, &view, None, &mut projected);
+        shade::shade(&gaussians, &view, KernelOptions::default(), &mut projected);
         let grid = whole(&view);
         let counts =
             order.iter().map(|&p| projected.tiles_per_gauss[radix_sort::value(p) as usize]);
@@ -387,7 +324,7 @@ fn rasterize_twin() {
                     &projected.footprints,
                     &isects[ranges[id] as usize..ranges[id + 1] as usize],
                     tile,
-                    &Paint::new(&request, gaussians.semantic_index()),
+                    &Paint::new(&request, gaussians.semantic_index(), KernelOptions::default()),
                     96,
                     &mut TileScratch::default(),
                     &mut out,
@@ -398,6 +335,7 @@ fn rasterize_twin() {
         let colors: Vec<_> = projected.footprints.iter().map(|f| f.color).collect();
         let ids: Vec<u32> = isects.iter().map(|&pair| radix_sort::value(pair)).collect();
         let got = gpu
+            .internals()
             .rasterize(&view, request.background, &rows, &colors, &ids, &ranges)
             .expect("pictures");
         let want = Frame {
@@ -417,58 +355,6 @@ fn rasterize_twin() {
             ..Frame::default()
         };
         same("rasterize alone", &got, &want, &gaussians, &request);
-    }
-}
-
-/// Pictures within 1/255; pixels further apart are few and stand at a cliff of the oracle.
-fn same(name: &str, got: &Frame, want: &Frame, gaussians: &Gaussians, request: &RenderRequest) {
-    let (got, want) = (samples(got), samples(want));
-    let apart = |i: usize| compare(&got[i..=i], &want[i..=i], &[false], Tolerance::GPU).is_err();
-    let far: Vec<usize> = (0..want.len()).filter(|&i| apart(i)).collect();
-    let width = request.camera.intrinsics.width;
-    let pixels: Vec<[u32; 2]> = far.iter().map(|&i| [i as u32 % width, i as u32 / width]).collect();
-    let truth = oracle::render_pixels(gaussians, request, oracle::DepthKey::F32, &pixels)
-        .expect("the truth");
-    let mut cliff = vec![false; want.len()];
-    for (&i, truth) in far.iter().zip(&truth) {
-        cliff[i] = truth.cliff.any();
-    }
-    let found = compare(&got, &want, &cliff, Tolerance::GPU)
-        .unwrap_or_else(|told| panic!("{name}: {told}"));
-    println!(
-        "{name}: {} Gaussians, {} px: max {:.2e}, mean {:.2e}, {} flips",
-        gaussians.len(),
-        found.pixels,
-        found.max,
-        found.mean,
-        found.flips
-    );
-}
-
-fn judge(gpu: &GpuRenderer, name: &str, gaussians: &Gaussians, request: &RenderRequest) -> Frame {
-    let got = gpu.render(gaussians, request).expect("a picture of the GPU");
-    let want = cpu().render(gaussians, request).expect("a picture of the CPU");
-    same(name, &got, &want, gaussians, request);
-    let (a, b) = (got.stats.visible, want.stats.visible);
-    assert!(a.abs_diff(b) * 1_000 <= b.max(1), "{name}: {a} visible, not {b}");
-    got
-}
-
-#[test]
-fn pictures_of_131072_gaussians_are_the_same() {
-    for gpu in both_kernels() {
-        let (gaussians, middle) = two_views(256, 1);
-        assert_eq!(gaussians.len(), 131_072, "a Gaussian a pixel of two photos");
-        let frame = judge(gpu, "two_views 256", &gaussians, &request(middle));
-        // The second time the scene and all room are there.
-        let again = gpu.render(&gaussians, &request(middle)).expect("a picture");
-        assert!(frame == again, "two renders of one view differ");
-        judge(
-            gpu,
-            "two_views 256 antialiased",
-            &gaussians,
-            &RenderRequest { antialiased: true, ..request(middle) },
-        );
     }
 }
 
@@ -548,13 +434,13 @@ fn bands_and_growth_change_nothing() {
     let want = gpu.render(&gaussians, &request).expect("a picture");
     let total = want.stats.intersections as u32;
     // One row of tiles of four fits, two do not.
-    let Some(small) = open(|options| options.isects_max = total / 3) else { return };
+    let Some(small) = open(|options| options.switches.isects_max = Some(total / 3)) else { return };
     let got = small.render(&gaussians, &request).expect("a picture in bands");
     assert_eq!(got.color, want.color, "colour in bands");
     assert_eq!(got.depth, want.depth, "depth in bands");
     assert_eq!(got.stats, want.stats, "counts in bands");
 
-    let Some(tiny) = open(|options| options.isects_max = 16) else { return };
+    let Some(tiny) = open(|options| options.switches.isects_max = Some(16)) else { return };
     let error = tiny.render(&gaussians, &request).expect_err("a row has more than 16 pairs");
     assert_eq!(error.code(), ErrorCode::LimitExceeded, "{error}");
     assert!(error.message().ends_with("is over 16"), "{error}");
@@ -579,5 +465,5 @@ fn scenes_are_uploaded_once() {
     for scene in [&a, &b, &a.clone(), &b] {
         gpu.render(scene, &request(camera(32, 32))).expect("a picture");
     }
-    assert_eq!(gpu.scenes_held(), 2, "clones share their upload");
+    assert_eq!(gpu.internals().scenes_held(), 2, "clones share their upload");
 }

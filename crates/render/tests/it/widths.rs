@@ -3,7 +3,7 @@
 
 use segsplat_core::scene::Gaussians;
 use segsplat_render::{
-    Frame, Labels, PixelWeights, RenderRequest, Renderer,
+    Frame, Labels, PixelWeights, RenderRequest, Renderer, Switches,
     cpu::{CpuRenderer, lanes::Width},
     oracle,
 };
@@ -19,7 +19,8 @@ use segsplat_testing::{
 const BOUND: f64 = 1e-5;
 
 fn draw(width: Width, threads: usize, gaussians: &Gaussians, request: &RenderRequest) -> Frame {
-    let cpu = CpuRenderer::new(threads).expect("threads").with_width(width);
+    let switches = Switches { width: Some(width), ..Switches::default() };
+    let cpu = CpuRenderer::with_switches(threads, &switches).expect("threads");
     cpu.render(gaussians, request).expect("a picture")
 }
 

@@ -1,4 +1,4 @@
-//! A finished scene: its Gaussians, and what it is made of and how it went.
+//! A finished scene: its Gaussians, its sources and its report.
 
 use std::sync::Arc;
 
@@ -18,7 +18,7 @@ pub struct PhotoHash {
     pub sha256: String,
 }
 
-/// What a scene was made of, so that it can be made again.
+/// The sources of a scene: all that is needed to make it again.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Provenance {
     /// Files of the upload: photos, or the archive, and the camera description.
@@ -45,7 +45,7 @@ pub struct SceneMeta {
     pub cameras: Vec<SceneCamera>,
     /// Health report.
     pub report: HealthReport,
-    /// What it was made of.
+    /// Sources.
     pub provenance: Provenance,
 }
 
@@ -58,28 +58,26 @@ pub struct Scene {
     pub gaussians: Gaussians,
     /// The photos' colours by direction, behind everything.
     pub backdrop: Backdrop,
-    /// What it means, once somebody has asked; the Gaussians then carry its indices.
+    /// Its semantics, once they are ready; the Gaussians then have its entries.
     pub semantics: Option<Arc<Semantics>>,
 }
 
 impl Scene {
-    /// A scene that nobody has asked by text.
-    #[must_use]
+    /// A scene without semantics.
     pub fn new(meta: SceneMeta, gaussians: Gaussians, backdrop: Backdrop) -> Self {
         Self { meta, gaussians, backdrop, semantics: None }
     }
 
     /// Bytes held by its arrays.
-    #[must_use]
     pub fn size_bytes(&self) -> u64 {
-        let meaning = self.semantics.as_ref().map_or(0, |semantics| {
+        let semantics = self.semantics.as_ref().map_or(0, |semantics| {
             let photos: usize = semantics.photos.iter().map(|map| map.index.len()).sum();
             4 * semantics.bank.rows.len() + 2 * (semantics.index.len() + photos)
         });
-        self.gaussians.size_bytes() + meaning as u64
+        self.gaussians.size_bytes() + semantics as u64
     }
 
-    /// The same scene, its Gaussians carrying the indices of `semantics`.
+    /// The same scene; its Gaussians have the entries of `semantics`.
     ///
     /// # Errors
     /// `scene_corrupt` when the semantics are those of a scene with other Gaussians, or name

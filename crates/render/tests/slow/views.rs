@@ -1,7 +1,7 @@
 //! The committed list of scenes and views (views.csv) drawn by every renderer, against the f64
 //! oracle: errors of each are printed and held to the bounds of docs/conventions.md.
 //!
-//! The scenes come of the generators of this suite by the row's numbers: `cloud` of a degree,
+//! The scenes are generated from the numbers of the row: `cloud` of a degree,
 //! `pair` (a Gaussian a pixel of two photos of side `count`), `giants` and `specks` (clouds of
 //! scales times 12 and 0.02); `stretch` lengthens one axis of each Gaussian, `shift` moves scene
 //! and camera away from the origin, metres.
@@ -16,7 +16,7 @@ use segsplat_render::{
     oracle::{self, OraclePixel},
 };
 
-use crate::twins::{both_kernels, gpu};
+use crate::common::{both_kernels, gpu};
 use segsplat_testing::{
     compare::{Tolerance, compare, oracle_samples, samples},
     scenes::{Random, camera, checked, cloud, look, request, two_views},
@@ -88,8 +88,7 @@ impl View {
         let wide = camera.intrinsics.width;
         let pixels: Vec<_> =
             places.iter().map(|&at| [at as u32 % wide, at as u32 / wide]).collect();
-        let key = oracle::DepthKey::F32;
-        let truth = oracle::render_pixels(&gaussians, &request, key, &pixels).expect("the truth");
+        let truth = oracle::render_pixels(&gaussians, &request, &pixels).expect("the truth");
         Self { name, gaussians, request, places, truth }
     }
 }

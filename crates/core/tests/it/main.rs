@@ -1,0 +1,98 @@
+//! The types that all crates share.
+#![allow(clippy::unwrap_used, reason = "tests")]
+
+use std::collections::HashSet;
+
+use glam::DVec3;
+use segsplat_core::{cache::Cache, error::TABLE, limits::Limits, names::shown, scene::Backdrop};
+
+#[test]
+fn the_least_recently_used_leaves_first_and_weights_are_given_back() {
+    let cache = Cache::new(10);
+    cache.insert("a", 1, 4);
+    cache.insert("b", 2, 4);
+    assert_eq!(cache.find(&"a"), Some(1), "a is now used last");
+    cache.insert("c", 3, 4);
+    let found = ["a", "b", "c"].map(|key| cache.find(&key));
+    assert_eq!(found, [Some(1), None, Some(3)], "b was used first");
+    cache.insert("a", 7, 6);
+    assert_eq!((cache.find(&"a"), cache.find(&"c")), (Some(7), Some(3)), "6 + 4 fit");
+    cache.insert("d", 4, 11);
+    assert_eq!(cache.find(&"d"), None, "heavier than all");
+    assert_eq!(cache.weight(), 10, "of a and c");
+    for _ in 0..5 {
+        cache.insert("c", 3, 4);
+    }
+    assert_eq!(cache.weight(), 10, "the same key again takes no more room");
+    cache.remove(&"c");
+    cache.retain(|value| *value != 7);
+    assert_eq!((cache.weight(), cache.find(&"a")), (0, None), "all given back");
+    assert_eq!(["a", "b", "c", "d"].map(|key| cache.find(&key)), [None; 4], "nothing is left");
+}
+
+#[test]
+fn a_smaller_bound_drops_what_no_longer_fits() {
+    let cache = Cache::new(10);
+    (0..10).for_each(|key| cache.insert(key, (), 1));
+    cache.set_weight_max(3);
+    let left: Vec<i32> = (0..10).filter(|key| cache.find(key).is_some()).collect();
+    assert_eq!(left, [7, 8, 9], "the last three");
+}
+
+#[test]
+fn names_are_unique_and_every_row_finds_itself() {
+    let names: HashSet<_> = TABLE.iter().map(|row| row.name).collect();
+    assert_eq!(names.len(), TABLE.len(), "two codes share a name");
+    for row in &TABLE {
+        assert_eq!(row.code.row().name, row.name, "row of another code");
+    }
+}
+
+#[test]
+fn values_of_a_json_text_are_counted_outside_of_its_strings() {
+    let limits = |json_values_max| Limits { json_values_max, ..Limits::default() };
+    for (json, count) in [
+        ("7", 1),
+        ("[1,2,3]", 4),
+        (r#"{"a":[{},{}],"b":"[,:{"}"#, 9),
+        (r#""\",[\\""#, 1),
+        (r#"["\\",2]"#, 3),
+    ] {
+        limits(count).check_json("x", json.as_bytes()).expect(json);
+        let error = limits(count - 1).check_json("x", json.as_bytes()).unwrap_err();
+        assert!(error.message().contains(&format!("{count} values")), "{json}: {error}");
+    }
+}
+
+#[test]
+fn limits_that_size_something_at_start_need_a_restart() {
+    let (old, mut new) = (Limits::default(), Limits::default());
+    new.photos_max += 1;
+    assert!(old.changed_for_next_start(&new).is_empty(), "read for each call");
+    (new.cache_bytes_max, new.uploads_bytes_max) = (1, 1);
+    assert_eq!(old.changed_for_next_start(&new), ["uploads_bytes_max", "cache_bytes_max"]);
+}
+
+#[test]
+fn numbers_are_short() {
+    let numbers = [0.0, -5.0, 1.5, 0.000_002, 1e15, 1e308, -1e-300, f64::NAN];
+    let want = ["0", "-5", "1.5", "0.000002", "1000000000000000", "1e308", "-1e-300", "NaN"];
+    assert_eq!(numbers.map(shown), want);
+}
+
+fn quarters() -> Backdrop {
+    let cell = |i: usize| {
+        let (x, y) = (i % Backdrop::WIDTH, i / Backdrop::WIDTH);
+        [(x * 2) as u8, (y * 4) as u8, 0]
+    };
+    Backdrop::from_cells((0..Backdrop::WIDTH * Backdrop::HEIGHT).map(cell).collect()).unwrap()
+}
+
+#[test]
+fn forward_is_the_middle_and_down_is_the_last_row() {
+    let (u, v) = Backdrop::position(DVec3::Z);
+    assert_eq!((u, v), (64.0, 32.0));
+    assert!(quarters().color(DVec3::Y)[1] > 0.98, "+y is the last row");
+    assert!(quarters().color(-DVec3::Y)[1] < 0.02, "-y is the first row");
+    assert!(quarters().color(DVec3::X)[0] > quarters().color(-DVec3::X)[0], "+x is east");
+}

@@ -1,0 +1,70 @@
+//! Switches that tests and the laboratory set. The product leaves all of them at their defaults.
+
+use std::path::PathBuf;
+
+use crate::cpu::lanes::Width;
+
+/// What tests and the laboratory change in a renderer, all at once.
+#[derive(Clone, Debug, Default)]
+pub struct Switches {
+    /// Needless work that is done all the same. All renderers.
+    pub without: Option<Skip>,
+    /// Gaussian-tile pairs held at once; more are drawn in bands. `None`: as many as
+    /// [`crate::constants::ISECTS_MAX`]. All renderers.
+    pub isects_max: Option<u32>,
+    /// Lanes of the CPU kernels. `None`: the widest of the processor.
+    pub width: Option<Width>,
+    /// Takes the smallest limits of WebGPU instead of those of the adapter: 128 MiB a binding,
+    /// 8 storage buffers a stage, 16 KiB of workgroup storage.
+    pub portable: bool,
+    /// Folder whose files replace the built-in shaders: to try changes without a build.
+    pub shaders: Option<PathBuf>,
+    /// Lets the shaders check every index and loop.
+    pub checked: bool,
+    /// Whether the kernels for software adapters are used, where one invocation does what many
+    /// share on a GPU. `None`: on software adapters alone.
+    pub serial: Option<bool>,
+}
+
+/// One kind of work that a renderer leaves out because no pixel changes. Tests switch each kind off
+/// and expect the same pictures; `segsplat-lab skips` measures the time of each.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Skip {
+    /// Tiles of the box around a footprint that its ellipse misses, in the count and in the
+    /// emission alike.
+    EllipseTiles,
+    /// Parts of a tile that the ellipse (on a GPU: the box around it) misses.
+    EllipseParts,
+    /// Gaussians behind the rest where all rays of a tile (on the CPU: of a part) have ended.
+    EndedRays,
+    /// Sorting Gaussians that no tile of the picture sees.
+    Unseen,
+    /// Directions to Gaussians, and on a GPU the stage that shades, of a scene whose colours are
+    /// the same from everywhere.
+    FlatColor,
+    /// Blending tiles that nothing falls on. CPU only: on a GPU it is no step of its own.
+    EmptyTiles,
+    /// Digits of the depth sort that are the same for all. GPU only: on the CPU it saved nothing.
+    EqualDigits,
+}
+
+impl Skip {
+    /// All of them.
+    pub const ALL: [Self; 7] = [
+        Self::EllipseTiles,
+        Self::EllipseParts,
+        Self::EndedRays,
+        Self::Unseen,
+        Self::FlatColor,
+        Self::EmptyTiles,
+        Self::EqualDigits,
+    ];
+
+    /// The constant of the shaders that is true while it is on, in those that know it.
+    pub fn constant(self) -> String {
+        format!("SKIP_{self}").to_uppercase()
+    }
+}
+
+segsplat_core::names::display_names!(Skip);

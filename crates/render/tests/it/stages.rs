@@ -1,0 +1,159 @@
+//! Single stages of the CPU renderer.
+
+use segsplat_core::scene::{Gaussians, RawGaussians};
+use segsplat_render::{
+    constants::TILE_SIZE,
+    cpu::{
+        footprint::Footprint,
+        lanes::{KernelOptions, Width},
+        prefix_sum::prefix_sum,
+        project::{Projected, project},
+        radix_sort::{key, pack, radix_sort},
+        tiles::{Grid, TileSpans, touched_tiles},
+    },
+    view::View,
+};
+use segsplat_testing::scenes::{Random, camera, checked, push, request};
+
+#[test]
+fn sums_do_not_wrap_at_32_bits() {
+    let mut offsets = vec![9];
+    let total = prefix_sum([u32::MAX, 0, u32::MAX].into_iter(), &mut offsets);
+    let max = u64::from(u32::MAX);
+    assert_eq!(offsets, [0, max, max, 2 * max], "exclusive sums");
+    assert_eq!(total, 2 * max, "total");
+}
+
+#[test]
+fn the_radix_sort_equals_the_standard_stable_sort() {
+    let mut state = 7_u32;
+    let mut next = || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        state
+    };
+    for (len, key_bits) in [(0, 32), (1, 32), (5_000, 32), (70_000, 8), (70_000, 17)] {
+        let mask = u32::MAX >> (32 - key_bits);
+        let mut pairs: Vec<u64> = (0..len).map(|i| pack(next() & mask, i)).collect();
+        let mut want = pairs.clone();
+        want.sort_by_key(|&pair| key(pair));
+        radix_sort(&mut pairs, &mut Vec::new(), key_bits);
+        assert_eq!(pairs, want, "{len} pairs of {key_bits}-bit keys");
+    }
+}
+
+/// Every pixel centre inside the ellipse lies in a touched tile, and every tile touched comes
+/// near the ellipse.
+#[test]
+fn touched_tiles_hold_every_pixel_of_the_ellipse() {
+    let grid = Grid { width: 203, height: 150, tile_rows: 0..10, by_ellipse: true };
+    let mut touched_total = 0;
+    for i in 0..2_000_u32 {
+        let random = |k: u32| f64::from((i.wrapping_mul(2_654_435_761) >> k) & 0xff) / 255.0;
+        let footprint = Footprint {
+            mean: [random(3) * 300.0 - 50.0, random(9) * 250.0 - 50.0],
+            conic_shear: random(12) * 8.0 - 4.0,
+            conic_x: (0.01 + random(17)) as f32,
+            conic_y: (0.02 + random(21) * random(2)) as f32,
+            power_max: (random(6) * 5.5) as f32,
+            ..Footprint::default()
+        };
+        let mut touched = vec![false; grid.tile_count() as usize];
+        touched_tiles(&footprint, &grid, |tile_y, tiles| {
+            for tile_x in tiles {
+                touched[(tile_y * grid.tiles_x() + tile_x) as usize] = true;
+                touched_total += 1;
+            }
+        });
+        let (spans, count) = TileSpans::of(&footprint, &grid);
+        let mut replayed = vec![false; touched.len()];
+        spans.replay(&footprint, &grid, |tile_y, tiles| {
+            for tile_x in tiles {
+                replayed[(tile_y * grid.tiles_x() + tile_x) as usize] = true;
+            }
+        });
+        assert_eq!(replayed, touched, "count and emission of {footprint:?}");
+        let told = touched.iter().filter(|&&t| t).count();
+        assert_eq!(count as usize, told, "count of {footprint:?}");
+        let band = Grid { tile_rows: 3..5, ..grid.clone() };
+        let in_band = touched[3 * 13..5 * 13].iter().filter(|&&t| t).count();
+        assert_eq!(spans.count(&footprint, &band) as usize, in_band, "band of {footprint:?}");
+        let power = |x: f64, y: f64| {
+            let (dx, dy) = (x - footprint.mean[0], y - footprint.mean[1]);
+            (f64::from(footprint.conic_x) * (dx - footprint.conic_shear * dy)).powi(2)
+                + (f64::from(footprint.conic_y) * dy).powi(2)
+        };
+        for y in 0..grid.height {
+            for x in 0..grid.width {
+                let inside =
+                    power(f64::from(x) + 0.5, f64::from(y) + 0.5) < footprint.power_max.into();
+                let tile = y / TILE_SIZE * grid.tiles_x() + x / TILE_SIZE;
+                assert!(
+                    !inside || touched[tile as usize],
+                    "pixel {x},{y} of {footprint:?} is left out"
+                );
+            }
+        }
+        // No tile more than half a pixel away from the ellipse: a fine search over the tile.
+        for (tile, _) in touched.iter().enumerate().filter(|(_, t)| **t) {
+            let (tx, ty) = (tile as u32 % grid.tiles_x(), tile as u32 / grid.tiles_x());
+            let near = (0..=32).any(|j| {
+                (0..=32).any(|k| {
+                    let x = f64::from(tx * TILE_SIZE) + f64::from(k) * 0.5;
+                    let y = f64::from(ty * TILE_SIZE) + f64::from(j) * 0.5;
+                    power(x, y) < f64::from(footprint.power_max) * 1.05 + 1.5
+                })
+            });
+            assert!(near, "tile {tx},{ty} is far from {footprint:?}");
+        }
+    }
+    assert!(touched_total > 1_000, "the test saw {touched_total} tiles only");
+}
+
+/// Gaussians of all shapes: needles, walls, specks, some at the edges and far beside the picture.
+fn shapes() -> Gaussians {
+    let (mut raw, mut random) = (RawGaussians::default(), Random(52));
+    for i in 0..4_000 {
+        let z = random.range(1.0, 6.0);
+        let beside = if i % 97 == 0 { 1e6 } else { 1.0 };
+        let mean = [random.range(-0.8, 0.8) * z * beside, random.range(-0.7, 0.7) * z, z];
+        let scale = match i % 4 {
+            0 => [random.range(0.1, 9.0), 1e-3, 1e-4],
+            1 => [random.range(0.5, 3.0); 3],
+            2 => [1e-6; 3],
+            _ => [random.range(0.001, 0.1), random.range(0.001, 0.1), 0.01],
+        };
+        push(&mut raw, mean, random.quat(), scale, random.range(0.005, 1.0), &[[0.5; 3]]);
+    }
+    checked(raw)
+}
+
+#[test]
+fn ellipses_in_lanes_touch_the_tiles_that_one_alone_touches() {
+    let (gaussians, request) = (shapes(), request(camera(203, 150)));
+    let view = View::new(gaussians.origin(), &request).expect("a view");
+    for width in Width::ALL.into_iter().filter(|width| width.available()) {
+        let options = KernelOptions { width, ..KernelOptions::default() };
+        let grid = Grid::whole(&view, options);
+        let mut projected = Projected::default();
+        project(&gaussians, &view, false, options, &mut projected);
+        let (mut seen, mut tall) = (0, 0);
+        for (i, footprint) in projected.footprints.iter().enumerate() {
+            if footprint.opacity == 0.0 {
+                continue;
+            }
+            // What a span says counts, not how an empty one is written.
+            let tiles = |spans: &TileSpans| {
+                let mut tiles = Vec::new();
+                spans.replay(footprint, &grid, |y, xs| tiles.push((y, xs)));
+                tiles
+            };
+            let (want, count) = TileSpans::of(footprint, &grid);
+            assert_eq!(projected.tiles_per_gauss[i], count, "{width:?}, count of {footprint:?}");
+            let got = tiles(&projected.tile_spans[i]);
+            assert_eq!(got, tiles(&want), "{width:?}, {footprint:?}");
+            seen += usize::from(count > 0);
+            tall += usize::from(got.len() > 2);
+        }
+        assert!(seen > 2_000 && tall > 500, "{width:?}: {seen} seen, {tall} of them tall");
+    }
+}
