@@ -13,7 +13,7 @@ use crate::{
     folders::{Folders, REPORTED, is_posed, scene_of, squares, view_request},
     metrics::{psnr, to_unit},
     photos::clamped,
-    pipeline::{Engine, reconstruct},
+    pipeline::{Pipeline, reconstruct},
     render::{Kinds, ViewPlanner, cpu::CpuRenderer},
     rows::{Rows, median, ms},
     scene::{Camera, CameraToWorld, Density, PosedPhoto, Scene, SceneOptions},
@@ -61,7 +61,7 @@ struct Compared {
 /// # Errors
 /// `invalid_request` when there is no scene, else whatever a stage of the pipeline says.
 pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
-    let engine = Engine::open(&args.setup.networks(1))?;
+    let engine = Pipeline::open(&args.setup.networks(1))?;
     let renderer = CpuRenderer::new(args.setup.threads())?;
     for (name, dir) in args.folders.find(is_posed)? {
         let squares = squares(&dir)?;
@@ -76,7 +76,7 @@ pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
 
 fn compare(
     scene: String,
-    engine: &Engine,
+    engine: &Pipeline,
     renderer: &CpuRenderer,
     squares: &[PosedPhoto],
     triple: &Triple,

@@ -23,7 +23,7 @@ use crate::{
     limits::Limits,
     models::MaskNetwork,
     photo_files,
-    pipeline::{Engine, masks as stage, masks::SeenPhoto, reconstruct},
+    pipeline::{Pipeline, masks as stage, masks::SeenPhoto, reconstruct},
     rows::{Rows, progress},
     scene::{Camera, Gaussians, MaskLogits, Photo, PhotoMasks, PosedPhoto, SceneOptions},
     segment::{self, Bitset, PromptDecoder, Proposals, Seed, Settings},
@@ -124,7 +124,7 @@ pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     if args.photos == 0 {
         return Err(Error::invalid("0 photos; it must be at least 1"));
     }
-    let engine = Engine::open(&args.setup.networks(1))?;
+    let engine = Pipeline::open(&args.setup.networks(1))?;
     let network = engine.masks()?;
     let variants = variants(&stage::settings(network.manifest()), args.short);
     let named = |v: &Variant| Measured { variant: v.name, ..Measured::default() };
@@ -191,7 +191,7 @@ fn variants(product: &Settings, short: bool) -> Vec<Variant> {
 }
 
 /// The Gaussians of these photos, for the seeds; `None` where they make no scene.
-fn gaussians(engine: &Engine, photos: &[PosedPhoto]) -> Result<Option<Gaussians>> {
+fn gaussians(engine: &Pipeline, photos: &[PosedPhoto]) -> Result<Option<Gaussians>> {
     if photos.len() < 2 {
         return Ok(None);
     }

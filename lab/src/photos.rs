@@ -19,7 +19,7 @@ use crate::{
     folders::{Folders, REPORTED, SIDE, is_posed, scene_of, squares, view_request},
     grid,
     metrics::{psnr, ssim, to_unit},
-    pipeline::{Engine, reconstruct},
+    pipeline::{Pipeline, reconstruct},
     render::{Kinds, ViewPlanner, cpu::CpuRenderer},
     rows::{Rows, mean, ms, progress},
     scene::{Camera, PosedPhoto, SceneOptions},
@@ -91,7 +91,7 @@ pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     }
     let threads = args.setup.threads();
     let at_once = args.at_once.min(threads);
-    let engine = Engine::open(&args.setup.networks(at_once))?;
+    let engine = Pipeline::open(&args.setup.networks(at_once))?;
     let renderer = CpuRenderer::new((threads / at_once).max(1))?;
     let mut scenes = Vec::new();
     for (name, dir) in args.folders.find(is_posed)? {
@@ -195,7 +195,7 @@ fn each<T: Sync, U: Send>(
 }
 
 fn judge(
-    engine: &Engine,
+    engine: &Pipeline,
     renderer: &CpuRenderer,
     squares: &[PosedPhoto],
     triple: &Triple,

@@ -11,7 +11,7 @@ use crate::{
     metrics::{psnr, to_unit},
     photo_files,
     photos::clamped,
-    pipeline::{Engine, reconstruct},
+    pipeline::{Pipeline, reconstruct},
     render::{Kinds, gpu::GpuOptions},
     rows::{Rows, median, ms},
     sample::{self, SampleOptions},
@@ -45,7 +45,7 @@ pub fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         SampleOptions { photos: args.photos, width: side, height: side, ..Default::default() };
     let upload = sample::upload(&options)?;
     let begun = Instant::now();
-    let engine = Engine::open(&args.setup.networks(1))?;
+    let engine = Pipeline::open(&args.setup.networks(1))?;
     let open_ms = ms(begun);
     let (renderer, _adapters) = args.setup.renderer(GpuOptions::default())?;
     let mut times: BTreeMap<String, Vec<f64>> = BTreeMap::new();

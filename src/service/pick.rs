@@ -76,7 +76,7 @@ impl Inner {
             SceneTexts::new(&self.backend, subject, spec.profile, labels)?.texts.into_iter();
         let score = |scores: &[f32]| scores.get(usize::from(entry)).copied().unwrap_or(0.0);
         let mut named: Vec<Label> = asked
-            .map(|one| Label { relevancy: score(one.scores.entries()), text: one.text })
+            .map(|one| Label { relevancy: score(one.scores.relevancies()), text: one.text })
             .collect();
         named.sort_by(|a, b| b.relevancy.total_cmp(&a.relevancy));
         Ok(named)

@@ -1,7 +1,7 @@
 //! Texts asked of a scene: what views, queries, picks and exports are answered from.
 //!
 //! A [`TextSearch`] keeps what was made for the texts before: embeddings, banks ready to be scored,
-//! connected pieces, and the weights of views. A [`SceneTexts`] is one scene, the texts asked of
+//! connected components, and the weights of views. A [`SceneTexts`] is one scene, the texts asked of
 //! it, and how the bank scores them.
 
 use std::{
@@ -17,7 +17,7 @@ use crate::{
     limits::Limits,
     render::{Labels, PixelWeights, RenderRequest, Renderer, ViewPlanner},
     scene::{Gaussians, PAPER_PHRASES, PAPER_TAU, Scene, ScoringProfile, Semantics, TextEmbedding},
-    semantics::{PartOptions, Pieces, Scorer, Scoring, TextScores, ViewNorms},
+    semantics::{Components, InstanceOptions, Scorer, Scoring, TextScores, ViewNorms},
 };
 
 /// What answers are made with. Its calls block; they belong on a thread made for it.
@@ -46,7 +46,7 @@ pub(super) struct TextSearch {
     /// By scene, semantics and profile; by bytes.
     scorers: Cache<String, Arc<Scorer>>,
     /// By scene and semantics; by bytes.
-    pieces: Cache<String, Arc<Pieces>>,
+    components: Cache<String, Arc<Components>>,
     /// By scene, semantics, renderer and camera; by bytes.
     views: Cache<String, Arc<LabelledView>>,
 }
@@ -57,7 +57,7 @@ impl TextSearch {
             maker,
             embeddings: Cache::new(limits.texts_cached_max as u64),
             scorers: Cache::new(limits.scorers_cache_bytes_max),
-            pieces: Cache::new(limits.pieces_cache_bytes_max),
+            components: Cache::new(limits.pieces_cache_bytes_max),
             views: Cache::new(limits.entries_cache_bytes_max),
         }
     }
@@ -131,7 +131,7 @@ pub(super) struct ScoredText {
 impl ScoredText {
     /// Entries that the text selects, ascending.
     pub(super) fn selected(&self) -> Vec<u16> {
-        let count = u16::try_from(self.scores.entries().len()).unwrap_or(u16::MAX);
+        let count = u16::try_from(self.scores.relevancies().len()).unwrap_or(u16::MAX);
         (1..count).filter(|&m| self.scores.selects(m)).collect()
     }
 }
@@ -223,14 +223,14 @@ impl<'a> SceneTexts<'a> {
         Ok(Self { backend, of, scorer, texts })
     }
 
-    /// The connected pieces of the scene's entries.
-    pub(super) fn pieces(&self, options: &PartOptions) -> Arc<Pieces> {
-        let (kept, tag) = (&self.backend.search.pieces, self.of.tag.to_owned());
+    /// The connected components of the scene's entries.
+    pub(super) fn components(&self, options: &InstanceOptions) -> Arc<Components> {
+        let (kept, tag) = (&self.backend.search.components, self.of.tag.to_owned());
         if let Some(known) = kept.find(&tag) {
             return known;
         }
         let scene = self.of.scene;
-        let made = Arc::new(Pieces::new(&scene.gaussians, &scene.meta.cameras, options));
+        let made = Arc::new(Components::new(&scene.gaussians, &scene.meta.cameras, options));
         kept.insert(tag, Arc::clone(&made), made.size_bytes());
         made
     }

@@ -25,7 +25,7 @@ use crate::{
     folders::{Folders, REPORTED, nearest},
     grid,
     limits::Limits,
-    pipeline::{Engine, semantics::SemanticsOptions},
+    pipeline::{Pipeline, semantics::SemanticsOptions},
     render::cpu::CpuRenderer,
     rows::{Rows, progress},
     scene::{Camera, ScoringProfile},
@@ -128,7 +128,7 @@ pub fn run(args: &Args, rows: &mut Rows) -> Result<Vec<SceneReport>> {
     if args.photos < 2 {
         return Err(Error::invalid("photos must be at least 2"));
     }
-    let engine = Engine::open(&args.setup.networks(1))?;
+    let engine = Pipeline::open(&args.setup.networks(1))?;
     let renderer = CpuRenderer::new(args.setup.threads())?;
     let tools = Tools::open(&engine, &renderer, args.understanding())?;
     let mut scenes = Vec::new();

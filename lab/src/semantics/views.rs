@@ -12,8 +12,8 @@ use crate::{
     folders::{scene_of, view_request},
     models::ImageText,
     pipeline::{
-        Engine, Reconstruction, masks, reconstruct,
-        semantics::{SceneParts, SemanticsOptions, understand},
+        Pipeline, Reconstruction, masks, reconstruct,
+        semantics::{SemanticsInput, SemanticsOptions, understand},
     },
     render::{Kinds, Labels, PixelWeights, RenderRequest, ViewPlanner, cpu::CpuRenderer},
     scene::{
@@ -24,7 +24,7 @@ use crate::{
 
 /// What every target is seen with.
 pub(super) struct Tools<'a> {
-    engine: &'a Engine,
+    engine: &'a Pipeline,
     renderer: &'a CpuRenderer,
     towers: Arc<ImageText>,
     understanding: SemanticsOptions,
@@ -66,7 +66,7 @@ struct Rows {
 
 impl<'a> Tools<'a> {
     pub(super) fn open(
-        engine: &'a Engine,
+        engine: &'a Pipeline,
         renderer: &'a CpuRenderer,
         understanding: SemanticsOptions,
     ) -> Result<Self> {
@@ -98,7 +98,7 @@ impl<'a> Tools<'a> {
         let cancel = AtomicBool::new(false);
         let made = reconstruct(self.engine, &given, &SceneOptions::default(), &|_, _| (), &cancel)?;
         let parts =
-            SceneParts { photos: &given, cameras: &made.cameras, gaussians: &made.gaussians };
+            SemanticsInput { photos: &given, cameras: &made.cameras, gaussians: &made.gaussians };
         let watch = Watch { progress: &|_, _| (), cancel: &cancel };
         let meaning = understand(self.engine, &parts, &self.understanding, watch)?;
         let gaussians = made.gaussians.with_semantic_index(meaning.index)?;

@@ -46,7 +46,7 @@ impl SceneMaker for BoardMaker {
         }
         let photos = &photos.photos;
         (watch.progress)(Stage::Capture, 0.5);
-        let capture = capture::analyse_until(photos, watch.cancel)?;
+        let capture = capture::analyse(photos, watch.cancel)?;
         (watch.progress)(Stage::Lift, 0.5);
         let (gaussians, _) = Gaussians::sanitize(board(&photos[0], capture.median_depth))?;
         let report = HealthReport {

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 /// `target/TRIPLE/release/deps`.
 const ABOVE_MAX: usize = 5;
 
-/// Folders in which `models/` or the library may lie: the executable's, `../share/segsplat` beside it,
-/// the checkout that the executable was built in, the working folder.
+/// Folders in which `models/` or the library may lie: the executable's, `../share/segsplat` beside
+/// it, the checkout that the executable was built in, the working folder.
 pub(super) fn folders() -> Vec<PathBuf> {
     let executable = std::env::current_exe().ok();
     let beside = executable.as_deref().map(of_executable).unwrap_or_default();
