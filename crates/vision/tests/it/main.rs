@@ -22,6 +22,7 @@ mod instances;
 mod literal;
 mod palette;
 mod photos;
+mod quality;
 mod room;
 mod sample;
 mod score;
