@@ -10,7 +10,7 @@ use serde_json::{Value, json};
 use crate::{
     error::Result,
     metrics::{clamped, psnr, to_unit},
-    pipeline::Engine,
+    pipeline::Pipeline,
     render::{Kinds, ViewPlanner, cpu::CpuRenderer},
     rows::{Rows, median, ms},
     scene::{Camera, CameraToWorld, Density, PosedPhoto, Scene, SceneOptions},
@@ -27,7 +27,7 @@ const RUNS: usize = 5;
 /// # Errors
 /// `invalid_request` when there is no scene, else whatever a stage of the pipeline says.
 pub(crate) fn run(inputs: &Inputs, rows: &mut Rows) -> Result<()> {
-    let engine = Engine::open(&inputs.setup.networks(1))?;
+    let engine = Pipeline::open(&inputs.setup.networks(1))?;
     let renderer = CpuRenderer::new(inputs.setup.threads())?;
     for (name, dir) in inputs.find(is_posed)? {
         let squares = squares(&dir)?;
@@ -45,7 +45,7 @@ pub(crate) fn run(inputs: &Inputs, rows: &mut Rows) -> Result<()> {
 /// view, PSNR is to the photo that was held out. `psnr_min` is the least of a view of the thinned
 /// scene to the same view of the full one, `difference_max` the largest of any channel, of 255.
 fn compare(
-    engine: &Engine,
+    engine: &Pipeline,
     renderer: &CpuRenderer,
     squares: &[PosedPhoto],
     triple: &Triple,

@@ -21,7 +21,7 @@ use crate::{
     limits::Limits,
     models::MaskNetwork,
     photo_files,
-    pipeline::{Engine, masks as stage, masks::SeenPhoto},
+    pipeline::{Pipeline, masks as stage, masks::SeenPhoto},
     rows::{Rows, means, progress},
     scene::{Gaussians, MaskLogits, Photo, PhotoMasks, PosedPhoto, SceneOptions},
     scenes::{is_posed, make, nearest},
@@ -98,7 +98,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     if args.inputs.photos == 0 {
         return Err(Error::invalid("0 photos; it must be at least 1"));
     }
-    let engine = Engine::open(&args.inputs.setup.networks(1))?;
+    let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
     let network = engine.masks()?;
     let variants = variants(&stage::settings(network.manifest()), args.short);
     let mut measured: Vec<Vec<Value>> = vec![Vec::new(); variants.len()];
@@ -170,7 +170,7 @@ fn variants(product: &Settings, short: bool) -> Vec<Variant> {
 }
 
 /// The Gaussians of these photos, for the seeds; `None` where they make no scene.
-fn gaussians(engine: &Engine, photos: &[PosedPhoto]) -> Result<Option<Gaussians>> {
+fn gaussians(engine: &Pipeline, photos: &[PosedPhoto]) -> Result<Option<Gaussians>> {
     if photos.len() < 2 {
         return Ok(None);
     }

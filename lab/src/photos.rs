@@ -13,7 +13,7 @@ use crate::{
     error::{Error, Result},
     grid,
     metrics::{clamped, psnr, ssim, to_unit},
-    pipeline::Engine,
+    pipeline::Pipeline,
     render::{Kinds, ViewPlanner, cpu::CpuRenderer},
     rows::{Rows, each, means, ms, progress},
     scene::{PosedPhoto, SceneOptions},
@@ -51,7 +51,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     }
     let threads = args.inputs.setup.threads();
     let at_once = args.at_once.min(threads);
-    let engine = Engine::open(&args.inputs.setup.networks(at_once))?;
+    let engine = Pipeline::open(&args.inputs.setup.networks(at_once))?;
     let renderer = CpuRenderer::new((threads / at_once).max(1))?;
     let mut scenes = Vec::new();
     for (name, dir) in args.inputs.find(is_posed)? {
@@ -100,7 +100,7 @@ fn push(rows: &mut Rows, row: Value) -> Result<()> {
 
 /// The figures of one triple, and its pictures: inputs, target, view and depth.
 fn judge(
-    engine: &Engine,
+    engine: &Pipeline,
     renderer: &CpuRenderer,
     squares: &[PosedPhoto],
     triple: &Triple,

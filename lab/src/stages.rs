@@ -9,7 +9,7 @@ use crate::{
     limits::Limits,
     metrics::{clamped, psnr, to_unit},
     photo_files,
-    pipeline::Engine,
+    pipeline::Pipeline,
     render::{Kinds, Switches},
     rows::{Rows, median, ms},
     sample::{self, SampleOptions},
@@ -41,7 +41,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         SampleOptions { photos: args.photos, width: side, height: side, ..Default::default() };
     let upload = sample::upload(&options)?;
     let begun = Instant::now();
-    let engine = Engine::open(&args.setup.networks(1))?;
+    let engine = Pipeline::open(&args.setup.networks(1))?;
     let open_ms = ms(begun);
     let (renderer, _adapters) = args.setup.renderer(Switches::default())?;
     let mut times: BTreeMap<String, Vec<f64>> = BTreeMap::new();

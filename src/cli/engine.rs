@@ -7,7 +7,7 @@ use crate::{
     error::Result,
     jobs::{NoSemantics, PipelineNetworks, SemanticNetworks},
     models::Bundle,
-    pipeline::{Engine, LateEngine},
+    pipeline::{Pipeline, PipelineLoader},
     render::{Renderer, select::select},
     service::{ModelInfo, ModelsInfo, Parts},
 };
@@ -26,8 +26,8 @@ pub fn parts(config: &Config) -> Result<Parts> {
 ///
 /// # Errors
 /// As [`parts`] where manifest or adapter are at fault; the engine tells of the rest.
-pub fn early_parts(config: &Config) -> Result<(Parts, Arc<LateEngine>)> {
-    let engine = Arc::new(LateEngine::open(&config.networks())?);
+pub fn early_parts(config: &Config) -> Result<(Parts, Arc<PipelineLoader>)> {
+    let engine = Arc::new(PipelineLoader::open(&config.networks())?);
     let renderer = renderer(config)?;
     let models = models_info(engine.bundle(), "opening");
     let networks = Arc::new(PipelineNetworks(Arc::clone(&engine)));
@@ -43,7 +43,7 @@ pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticNetwor
     if !needed {
         return Ok(Arc::new(NoSemantics));
     }
-    let engine = Engine::open(&config.networks())?;
+    let engine = Pipeline::open(&config.networks())?;
     Ok(Arc::new(PipelineNetworks(Arc::new(engine.into()))))
 }
 

@@ -10,7 +10,7 @@ use crate::{
     config::{Config, ConfigArgs},
     error::Result,
     models::{Bundle, Runtime},
-    pipeline::Engine,
+    pipeline::Pipeline,
     service::ModelsInfo,
 };
 
@@ -59,7 +59,7 @@ fn words(info: &ModelsInfo) -> String {
 fn verify(config: &Config, out: &Output) -> Result<()> {
     Bundle::find(&config.networks())?.verify()?;
     let runtime = Runtime::load(&config.networks())?;
-    let engine = Engine::open(&config.networks())?;
+    let engine = Pipeline::open(&config.networks())?;
     let provider = engine.geometry().provider().name();
     let info = models_info(engine.bundle(), provider);
     let build = runtime.build().unwrap_or("a library that is not pinned");

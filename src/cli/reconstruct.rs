@@ -21,8 +21,8 @@ use crate::{
     names::named,
     photos,
     pipeline::{
-        self, Engine,
-        semantics::{SceneParts, SemanticsOptions, understand},
+        self, Pipeline,
+        semantics::{SemanticsInput, SemanticsOptions, understand},
     },
     scene::{Density, Scene, SceneId, SceneOptions, SemanticsMode, Stage, Upload, Watch},
     store::{self, ply::PlyWriter, write_scene_file, write_semantics_file},
@@ -50,7 +50,7 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let upload = upload_of(&args.photos, config)?;
-    let engine = Engine::open(&config.networks())?;
+    let engine = Pipeline::open(&config.networks())?;
     let options = SceneOptions {
         max_views: args.max_views,
         semantics: args.semantics,
@@ -85,7 +85,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     write(&path, &scene)?;
     if eager {
         let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
-        let parts = SceneParts { photos: &photos.photos, cameras, gaussians };
+        let parts = SemanticsInput { photos: &photos.photos, cameras, gaussians };
         let made = understand(&engine, &parts, &SemanticsOptions::default(), watch)?;
         let semantics = Arc::new(made);
         write_semantics_file(&semantics_path(&path), &scene.meta.id, &semantics)?;

@@ -10,7 +10,7 @@ use crate::{
     api::Doors,
     config::{AllArgs, Config},
     error::{Error, ErrorCode, Result},
-    pipeline::LateEngine,
+    pipeline::PipelineLoader,
     service::Service,
     store::Place,
 };
@@ -84,7 +84,7 @@ pub(super) fn run(
 
 /// Resolves where the networks do not open: a server that can make nothing ends, as one that finds
 /// nothing at its start does.
-async fn broken(engine: Arc<LateEngine>) -> Error {
+async fn broken(engine: Arc<PipelineLoader>) -> Error {
     let opened = tokio::task::spawn_blocking(move || engine.get().map(drop)).await;
     match opened {
         Ok(Err(error)) => error,

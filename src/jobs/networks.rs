@@ -5,8 +5,8 @@ use std::sync::Arc;
 use crate::{
     error::{Error, ErrorCode, Result},
     pipeline::{
-        self, LateEngine, PhotoSet, Reconstruction,
-        semantics::{SceneParts, SemanticsOptions, understand},
+        self, PhotoSet, PipelineLoader, Reconstruction,
+        semantics::{SemanticsInput, SemanticsOptions, understand},
     },
     scene::{PosedPhoto, Scene, SceneOptions, Semantics, TextEmbedding, Watch},
 };
@@ -123,7 +123,7 @@ impl SemanticNetworks for NoSemantics {
 
 /// Makes scenes and semantics with the networks of an engine.
 #[derive(Clone, Debug)]
-pub struct PipelineNetworks(pub Arc<LateEngine>);
+pub struct PipelineNetworks(pub Arc<PipelineLoader>);
 
 impl SceneNetworks for PipelineNetworks {
     fn identity(&self) -> String {
@@ -169,7 +169,7 @@ impl SemanticNetworks for PipelineNetworks {
 
     fn make(&self, photos: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics> {
         let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
-        let parts = SceneParts { photos, cameras, gaussians };
+        let parts = SemanticsInput { photos, cameras, gaussians };
         understand(self.0.get()?, &parts, &SemanticsOptions::default(), watch)
     }
 }

@@ -36,8 +36,8 @@ pub use self::{
     },
     rle::Rle,
     types::{
-        Created, Export, Label, ModelInfo, ModelsInfo, Page, Part3, Peak, Picked, QueryAnswer,
-        Readiness, RenderedView, TextResult, TextView, TextWarning,
+        Created, Export, InstanceBox, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
+        QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning,
     },
 };
 pub use crate::render::{Quality, plan::default_near};

@@ -83,7 +83,7 @@ impl Inner {
         let score = |scores: &[f32]| scores.get(usize::from(entry)).copied().unwrap_or(0.0);
         let named = texts
             .into_iter()
-            .map(|one| Label { relevancy: score(one.scores.entries()), text: one.text });
+            .map(|one| Label { relevancy: score(one.scores.relevancies()), text: one.text });
         let mut named: Vec<Label> = named.collect();
         named.sort_by(|a, b| b.relevancy.total_cmp(&a.relevancy));
         Ok(named)

@@ -12,7 +12,7 @@ use super::{
     rle::Rle,
     search::{LabelledView, SceneTexts, ScoredText},
     texts,
-    types::{Part3, Peak, QueryAnswer, TextResult, TextView},
+    types::{InstanceBox, Peak, QueryAnswer, TextResult, TextView},
     view::{Inputs, Resolved, resolve_one},
 };
 use crate::{
@@ -20,7 +20,7 @@ use crate::{
     limits::Limits,
     render::Kinds,
     scene::SceneId,
-    semantics::{Part, PartOptions, Scorer},
+    semantics::{Instance, InstanceOptions, Scorer},
 };
 
 /// Relevancy from which a text selects.
@@ -29,7 +29,7 @@ const SELECTED: f32 = 0.5;
 /// A set of entries, what it selects, and in which parts.
 struct Selection {
     gaussians: u64,
-    parts: Vec<Part3>,
+    parts: Vec<InstanceBox>,
 }
 
 /// Answers the texts; `view` is that of the camera, where one was given. Calls `drawn` when it is
@@ -57,7 +57,7 @@ pub(super) fn answer(
         let view = labelled.as_ref().map(|view| text_view(view, &texts.scorer, text, spec));
         Ok(TextResult {
             text: text.text.clone(),
-            scores: text.scores.entries().iter().skip(1).copied().collect(),
+            scores: text.scores.relevancies().iter().skip(1).copied().collect(),
             gaussians: selection.map_or(0, |selection| selection.gaussians),
             parts: selection.map_or_else(Vec::new, |selection| selection.parts.clone()),
             entries,
@@ -99,21 +99,21 @@ fn selections(
     for m in gaussians.semantic_index() {
         counts[usize::from(*m)] += 1;
     }
-    let options = PartOptions::default();
+    let options = InstanceOptions::default();
     let wanted = boxes != Boxes::None && sets.iter().any(|set| !set.is_empty());
-    let pieces = wanted.then(|| texts.pieces(&options));
-    let part = |part: Part| {
-        let held = if boxes == Boxes::Aligned { part.aligned } else { part.oriented };
-        Part3 {
-            gaussians: part.gaussians.len() as u64,
+    let components = wanted.then(|| texts.components(&options));
+    let boxed = |instance: Instance| {
+        let held = if boxes == Boxes::Aligned { instance.aligned } else { instance.oriented };
+        InstanceBox {
+            gaussians: instance.gaussians.len() as u64,
             center: held.center,
             axes: held.axes,
             size: held.size,
         }
     };
     let selection = |set: Vec<u16>| {
-        let parts = pieces.as_deref().map(|pieces| pieces.parts(gaussians, &set, &options));
-        let parts = parts.into_iter().flatten().take(limits.parts_max).map(part).collect();
+        let parts = components.as_deref().map(|of| of.instances(gaussians, &set, &options));
+        let parts = parts.into_iter().flatten().take(limits.parts_max).map(boxed).collect();
         let gaussians = set.iter().map(|m| counts[usize::from(*m)]).sum();
         (set, Selection { gaussians, parts })
     };

@@ -1,7 +1,7 @@
 //! Texts and scenes: the data that views, queries, picks and exports need.
 //!
 //! A [`Backend`] keeps what earlier texts needed: embeddings, banks ready to be scored, connected
-//! pieces, and the weights of views. A [`SceneTexts`] is one scene, the texts for it, and how the
+//! components, and the weights of views. A [`SceneTexts`] is one scene, the texts for it, and how the
 //! bank scores them.
 
 use std::{
@@ -17,7 +17,7 @@ use crate::{
     limits::Limits,
     render::{Labels, PixelWeights, RenderRequest, Renderer, ViewPlanner},
     scene::{Gaussians, PAPER_PHRASES, PAPER_TAU, Scene, ScoringProfile, Semantics, TextEmbedding},
-    semantics::{PartOptions, Pieces, Scorer, Scoring, TextScores, ViewNorms},
+    semantics::{Components, InstanceOptions, Scorer, Scoring, TextScores, ViewNorms},
 };
 
 /// What answers are computed with, and what was kept from earlier texts. Its calls block; they
@@ -31,7 +31,7 @@ pub(super) struct Backend {
     /// By scene, semantics and profile; by bytes.
     scorers: Cache<String, Arc<Scorer>>,
     /// By scene and semantics; by bytes.
-    pieces: Cache<String, Arc<Pieces>>,
+    components: Cache<String, Arc<Components>>,
     /// By scene, semantics, renderer and camera; by bytes.
     views: Cache<String, Arc<LabelledView>>,
 }
@@ -48,7 +48,7 @@ impl Backend {
             networks,
             embeddings: Cache::new(limits.texts_cached_max as u64),
             scorers: Cache::new(limits.scorers_cache_bytes_max),
-            pieces: Cache::new(limits.pieces_cache_bytes_max),
+            components: Cache::new(limits.pieces_cache_bytes_max),
             views: Cache::new(limits.entries_cache_bytes_max),
         }
     }
@@ -121,7 +121,7 @@ pub(super) struct ScoredText {
 impl ScoredText {
     /// Entries that the text selects, ascending.
     pub(super) fn selected(&self) -> Vec<u16> {
-        let count = u16::try_from(self.scores.entries().len()).unwrap_or(u16::MAX);
+        let count = u16::try_from(self.scores.relevancies().len()).unwrap_or(u16::MAX);
         (1..count).filter(|&m| self.scores.selects(m)).collect()
     }
 }

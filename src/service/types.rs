@@ -63,7 +63,7 @@ pub struct TextResult {
     /// Gaussians selected.
     pub gaussians: u64,
     /// Connected parts of the selection, the largest first.
-    pub parts: Vec<Part3>,
+    pub parts: Vec<InstanceBox>,
     /// What makes the answer doubtful.
     pub warnings: Vec<TextWarning>,
     /// What it found in the view.
@@ -83,7 +83,7 @@ pub struct TextWarning {
 /// A connected part of a selection and its box, world frame of the upload.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, ToSchema)]
 #[schema(as = Part)]
-pub struct Part3 {
+pub struct InstanceBox {
     /// Gaussians.
     pub gaussians: u64,
     /// Centre of the box.

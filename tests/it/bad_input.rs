@@ -485,6 +485,7 @@ async fn a_camera_in_a_wall_or_looking_away_sees_a_valid_picture() {
         let (eye, axis) = (pose.center(), pose.axis());
         let board = segsplat::capture::analyse(
             &segsplat::photos::read(&upload(), &segsplat::limits::Limits::default()).unwrap(),
+            &std::sync::atomic::AtomicBool::new(false),
         )
         .unwrap()
         .median_depth;

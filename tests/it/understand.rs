@@ -13,8 +13,10 @@ use segsplat::{
     config::Config,
     error::{ErrorCode, Result},
     pipeline::{
-        Engine, reconstruct,
-        semantics::{SceneParts, SemanticsOptions, SemanticsTools, understand, understand_with},
+        Pipeline, reconstruct,
+        semantics::{
+            SemanticsInput, SemanticsOptions, SemanticsTools, understand, understand_with,
+        },
     },
     sample::{self, SampleOptions},
     scene::{
@@ -80,8 +82,8 @@ fn wall() -> Wall {
 }
 
 impl Wall {
-    fn parts(&self) -> SceneParts<'_> {
-        SceneParts { photos: &self.photos, cameras: &self.cameras, gaussians: &self.gaussians }
+    fn parts(&self) -> SemanticsInput<'_> {
+        SemanticsInput { photos: &self.photos, cameras: &self.cameras, gaussians: &self.gaussians }
     }
 }
 
@@ -251,12 +253,12 @@ fn wrong_answers_and_wrong_scenes_are_refused_by_name() {
     assert_eq!(error.unwrap_err().code(), ErrorCode::Cancelled);
 }
 
-fn engine(threads: usize) -> Option<Engine> {
+fn engine(threads: usize) -> Option<Pipeline> {
     let mut config = Config::default();
     config.bundle = Some(Path::new("tests/fixtures/colours").to_owned());
     config.threads = threads;
     config.jobs = 1;
-    match Engine::open(&config.networks()) {
+    match Pipeline::open(&config.networks()) {
         Err(e) if e.code() == ErrorCode::ModelUnavailable => {
             skipped(e.message());
             None
@@ -265,7 +267,7 @@ fn engine(threads: usize) -> Option<Engine> {
     }
 }
 
-fn understood(engine: &Engine, wall: &Wall) -> Semantics {
+fn understood(engine: &Pipeline, wall: &Wall) -> Semantics {
     let watch = Watch { progress: &|_, _| (), cancel: &NO_CANCEL };
     understand(engine, &wall.parts(), &SemanticsOptions::default(), watch).unwrap()
 }
@@ -310,7 +312,8 @@ fn a_scene_of_the_pipeline_says_which_pixels_made_it() {
     let network = made.cameras[0].network.unwrap();
     assert_eq!((network.width, network.height), (48, 32), "the bundle's bucket of this shape");
     assert!((network.fx - made.report.network_focal_px[0]).abs() < 1e-9, "square pixels");
-    let parts = SceneParts { photos: &photos, cameras: &made.cameras, gaussians: &made.gaussians };
+    let parts =
+        SemanticsInput { photos: &photos, cameras: &made.cameras, gaussians: &made.gaussians };
     let watch = Watch { progress: &|_, _| (), cancel: &NO_CANCEL };
     let alone = SemanticsOptions { votes: false, ..SemanticsOptions::default() };
     let meant = understand(&engine, &parts, &alone, watch).unwrap();

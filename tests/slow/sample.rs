@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 use segsplat::{
     error::ErrorCode,
     models::NetworkOptions,
-    pipeline::{self, Engine, Reconstruction},
+    pipeline::{self, Pipeline, Reconstruction},
     render::{Kinds, RenderRequest, Renderer, compare::psnr, cpu::CpuRenderer},
     sample::{self, Room, SampleOptions},
     scene::{Density, SceneOptions},
@@ -22,8 +22,8 @@ const DEPTH_ERROR_MAX: f64 = 0.03;
 
 const SAMPLE: SampleOptions = SampleOptions { photos: 2, width: 256, height: 256, seed: 1 };
 
-fn engine() -> Option<Engine> {
-    match Engine::open(&NetworkOptions::default()) {
+fn engine() -> Option<Pipeline> {
+    match Pipeline::open(&NetworkOptions::default()) {
         Err(e) if e.code() == ErrorCode::ModelUnavailable => {
             skipped(e.message());
             None
@@ -32,7 +32,7 @@ fn engine() -> Option<Engine> {
     }
 }
 
-fn reconstruct(engine: &Engine, options: &SceneOptions) -> Reconstruction {
+fn reconstruct(engine: &Pipeline, options: &SceneOptions) -> Reconstruction {
     let photos = sample::photos(&SAMPLE).unwrap();
     let go_on = AtomicBool::new(false);
     pipeline::reconstruct(engine, &photos, options, &|_, _| {}, &go_on).unwrap()

@@ -11,7 +11,7 @@ use crate::scenes::{Random, checked, cloud};
 /// Degree-0 harmonic of 3DGS: colour = 0.5 + this times the coefficient.
 const SH_C0: f32 = 0.282_094_79;
 
-/// `count` Gaussians with indices 0..=m, at random.
+/// `count` Gaussians with entries 0..=m, at random.
 pub fn labelled(count: usize, m: u16, seed: u64) -> Gaussians {
     let mut random = Random(seed);
     let index = (0..count).map(|_| (random.bits() % (u64::from(m) + 1)) as u16).collect();
@@ -30,7 +30,7 @@ pub fn alone(request: &RenderRequest, labels: Labels) -> RenderRequest {
     RenderRequest { kinds: Kinds::NONE, labels, ..request.clone() }
 }
 
-/// The same Gaussians in one-hot colours: channel c shows index `first + c` and no other.
+/// The same Gaussians in one-hot colours: channel c shows entry `first + c` and no other.
 fn one_hot(gaussians: &Gaussians, first: u16) -> Gaussians {
     let index = gaussians.semantic_index();
     let color = |m: u16| [0, 1, 2].map(|c| if m == first + c { 1.0 } else { 0.0 });
@@ -38,7 +38,7 @@ fn one_hot(gaussians: &Gaussians, first: u16) -> Gaussians {
     checked(RawGaussians { sh, sh_degree: 0, ..gaussians.as_raw().clone() })
 }
 
-/// Dense E of indices 1..=m, `[H * W][m]`, by blending them as colours.
+/// Dense E of entries 1..=m, `[H * W][m]`, from one-hot colours.
 pub fn literal(
     gaussians: &Gaussians,
     request: &RenderRequest,
@@ -63,15 +63,15 @@ pub fn literal(
     dense
 }
 
-/// Largest difference of sparse and dense E at pixel `i`; an index 0 or out of order is a fault.
+/// Largest difference of sparse and dense E at pixel `i`. Entries must be over 0 and in order.
 fn weights_apart(weights: &PixelWeights, i: usize, dense: &[f64]) -> f64 {
     let mut rest = dense.to_vec();
     let mut last = 0;
-    for (index, weight) in weights.pixel(i) {
-        assert!(index > last, "pixel {i}: index {index} after {last}");
-        assert!(weight > 0.0, "pixel {i}: weight {weight} of index {index}");
-        last = index;
-        rest[usize::from(index) - 1] -= f64::from(weight);
+    for (entry, weight) in weights.pixel(i) {
+        assert!(entry > last, "pixel {i}: entry {entry} after {last}");
+        assert!(weight > 0.0, "pixel {i}: weight {weight} of entry {entry}");
+        last = entry;
+        rest[usize::from(entry) - 1] -= f64::from(weight);
     }
     rest.iter().fold(0.0, |worst, apart| worst.max(apart.abs()))
 }
@@ -139,7 +139,7 @@ pub fn apart(
     (far, worst)
 }
 
-/// Dense E of the renderer itself, by blending them as colours.
+/// Dense E of the renderer itself, from one-hot colours.
 pub fn literal_of(
     renderer: &dyn Renderer,
     gaussians: &Gaussians,

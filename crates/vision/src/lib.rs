@@ -14,4 +14,31 @@ pub mod sample;
 pub mod segment;
 pub mod semantics;
 
+use glam::DVec3;
 use segsplat_core::{error, limits, meter, scene};
+
+/// How a photo is called in messages: `photo 3 ("images/0003.jpg")`.
+fn photo_label(index: usize, file: &str) -> String {
+    let shown: String = file.chars().take(80).collect();
+    format!("photo {index} ({shown:?})")
+}
+
+/// World point at the centre of Gaussian `i`.
+fn center_of(gaussians: &scene::Gaussians, i: usize) -> DVec3 {
+    point(gaussians.means()[i]) + gaussians.origin()
+}
+
+fn point(mean: [f32; 3]) -> DVec3 {
+    DVec3::from_array(mean.map(f64::from))
+}
+
+/// A world point in the frame of a camera, and the place (u, v) in pixels at which its picture
+/// shows the point. `None` behind the camera or outside of the picture.
+fn seen_at(camera: &scene::Camera, world: DVec3) -> Option<(DVec3, f64, f64)> {
+    let pose = &camera.camera_to_world;
+    let seen = pose.rotation().transpose() * (world - pose.center());
+    let (u, v) = camera.intrinsics.project(seen);
+    let (width, height) = (camera.intrinsics.width.into(), camera.intrinsics.height.into());
+    (seen.z > 0.0 && (0.0..width).contains(&u) && (0.0..height).contains(&v))
+        .then_some((seen, u, v))
+}

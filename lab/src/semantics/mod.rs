@@ -23,7 +23,7 @@ use crate::{
     error::{Error, Result},
     grid,
     limits::Limits,
-    pipeline::{Engine, semantics::SemanticsOptions},
+    pipeline::{Pipeline, semantics::SemanticsOptions},
     render::cpu::CpuRenderer,
     rows::{Rows, progress},
     scene::ScoringProfile,
@@ -85,7 +85,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     if args.inputs.photos < 2 {
         return Err(Error::invalid("photos must be at least 2"));
     }
-    let engine = Engine::open(&args.inputs.setup.networks(1))?;
+    let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
     let renderer = CpuRenderer::new(args.inputs.setup.threads())?;
     let tools = Tools::open(&engine, &renderer, args.understanding())?;
     let bundle = format!("{} {}", engine.bundle().name(), engine.bundle().version());

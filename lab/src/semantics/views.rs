@@ -11,8 +11,8 @@ use crate::{
     error::{Error, Result},
     models::ImageText,
     pipeline::{
-        Engine, Reconstruction, masks,
-        semantics::{SceneParts, SemanticsOptions, understand},
+        Pipeline, Reconstruction, masks,
+        semantics::{SemanticsInput, SemanticsOptions, understand},
     },
     render::{Kinds, Labels, PixelWeights, RenderRequest, ViewPlanner, cpu::CpuRenderer},
     scene::{Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, Watch},
@@ -21,7 +21,7 @@ use crate::{
 
 /// What all targets share.
 pub(super) struct Tools<'a> {
-    engine: &'a Engine,
+    engine: &'a Pipeline,
     renderer: &'a CpuRenderer,
     towers: Arc<ImageText>,
     understanding: SemanticsOptions,
@@ -48,7 +48,7 @@ pub(super) struct BankView {
 
 impl<'a> Tools<'a> {
     pub(super) fn open(
-        engine: &'a Engine,
+        engine: &'a Pipeline,
         renderer: &'a CpuRenderer,
         understanding: SemanticsOptions,
     ) -> Result<Self> {
@@ -73,7 +73,7 @@ impl<'a> Tools<'a> {
         let given: Vec<PosedPhoto> = inputs.iter().map(|&i| photos[i].clone()).collect();
         let cancel = AtomicBool::new(false);
         let reconstruction = make(self.engine, &given, &SceneOptions::default())?;
-        let parts = SceneParts {
+        let parts = SemanticsInput {
             photos: &given,
             cameras: &reconstruction.cameras,
             gaussians: &reconstruction.gaussians,

@@ -7,9 +7,9 @@ use crate::{
     error::{Error, Result},
     scene::{CameraToWorld, HealthReport, Intrinsics, ScoringProfile, SemanticsReport, StageTime},
     service::{
-        Background, Boxes, CameraSpec, Density, Event, ExportFormat, Format, Kind, Label, LensSpec,
-        MaskFormat, Part3, Peak, PickSpec, Picked, PictureOptions, PoseSpec, Quality, QueryAnswer,
-        QuerySpec, RenderedView, SceneError, SceneState, SceneStatus, SemanticsMode,
+        Background, Boxes, CameraSpec, Density, Event, ExportFormat, Format, InstanceBox, Kind,
+        Label, LensSpec, MaskFormat, Peak, PickSpec, Picked, PictureOptions, PoseSpec, Quality,
+        QueryAnswer, QuerySpec, RenderedView, SceneError, SceneState, SceneStatus, SemanticsMode,
         SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView, TextWarning,
         ViewOptions,
     },
@@ -272,7 +272,7 @@ fn point([x, y, z]: [f64; 3]) -> pb::Vec3 {
     pb::Vec3 { x, y, z }
 }
 
-fn part(part: &Part3) -> pb::Part {
+fn part(part: &InstanceBox) -> pb::Part {
     pb::Part {
         gaussians: part.gaussians,
         center: Some(point(part.center)),

@@ -45,7 +45,7 @@ impl SceneNetworks for PlaneNetworks {
         }
         let photos = &photos.photos;
         (watch.progress)(Stage::Capture, 0.5);
-        let capture = capture::analyse_until(photos, watch.cancel)?;
+        let capture = capture::analyse(photos, watch.cancel)?;
         (watch.progress)(Stage::Lift, 0.5);
         let (gaussians, _) = Gaussians::sanitize(plane(&photos[0], capture.median_depth))?;
         let report = HealthReport {

@@ -3,7 +3,7 @@
 use glam::DVec3;
 
 use super::{
-    gray::{GrayView, STRIDE},
+    gray::{GrayView, Grid},
     pairs::{PairFound, baseline},
     sweep::Relative,
 };
@@ -179,43 +179,21 @@ pub(super) fn overlap(
     (0..views.len()).map(|i| (0..views.len()).map(|j| share(i, j)).collect()).collect()
 }
 
-/// The matched inverse depths of a view on its grid.
+/// The matched inverse depths of a view.
 struct Surface {
-    cols: usize,
-    rows: usize,
-    w: Vec<f64>,
+    grid: Grid,
     slack: f64,
 }
 
 impl Surface {
     fn new(view: &GrayView, points: &[Point]) -> Self {
-        let (cols, rows) = (view.width.div_ceil(STRIDE), view.height.div_ceil(STRIDE));
-        let mut w = vec![f64::NAN; cols * rows];
-        let mut slack = 0.0_f64;
-        for p in points {
-            w[usize::from(p.y) / STRIDE * cols + usize::from(p.x) / STRIDE] = p.w;
-            slack = slack.max(p.w_per_px);
-        }
-        Self { cols, rows, w, slack }
+        let grid = Grid::new(view, points.iter().map(|p| (p.x, p.y, p.w)));
+        Self { grid, slack: points.iter().map(|p| p.w_per_px).fold(0.0, f64::max) }
     }
 
     /// Whether all that is known around the pixel lies clearly before inverse depth `w`.
     fn hides(&self, (x, y): (usize, usize), w: f64) -> bool {
-        const REACH: usize = 2;
-        let (x, y) = (x / STRIDE, y / STRIDE);
-        let mut known = false;
-        for row in y.saturating_sub(REACH)..(y + REACH + 1).min(self.rows) {
-            let cells = x.saturating_sub(REACH)..(x + REACH + 1).min(self.cols);
-            for &at in &self.w[row * self.cols + cells.start..row * self.cols + cells.end] {
-                if at.is_nan() {
-                    continue;
-                }
-                if at <= w * (1.0 + HIDDEN) + self.slack {
-                    return false;
-                }
-                known = true;
-            }
-        }
-        known
+        let mut around = self.grid.around(x, y).peekable();
+        around.peek().is_some() && around.all(|at| at > w * (1.0 + HIDDEN) + self.slack)
     }
 }

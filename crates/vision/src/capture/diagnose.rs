@@ -14,6 +14,7 @@ use super::{
     gray::GrayView,
     name,
     pairs::{self, PairFound},
+    warning,
 };
 use crate::{
     error::{Error, Result},
@@ -126,40 +127,40 @@ impl Mistake {
                 (WarningCode::IntrinsicsScale, what, s)
             }
         };
-        Warning { code, message: format!("{what}; {figures}"), value }
+        warning(code, value, format!("{what}; {figures}"))
     }
 }
 
-/// Adds what looks wrong to `warnings`; refuses photos that share nothing.
+/// What looks wrong. Photos that share nothing are refused.
 pub(super) fn warnings(
     photos: &[PosedPhoto],
     views: &[GrayView],
     found: &[PairFound],
     ranges: &Ranges,
     overlap: &mut [Vec<f64>],
-    warnings: &mut Vec<Warning>,
     cancel: &AtomicBool,
-) -> Result<()> {
-    let implied = implied_scale(photos);
-    let answer = asked(views, implied, cancel)?;
+) -> Result<Vec<Warning>> {
+    let answer = agreement(views, implied_scale(photos), cancel)?;
     if let Some((mistake, corrected)) = answer.mistake {
-        warnings.push(mistake.warning(photos, answer.given, corrected));
-        if !matches!(mistake, Mistake::Resolution(_)) {
-            principal_point(photos, warnings);
-        }
-        return Ok(());
+        let scaled = matches!(mistake, Mistake::Resolution(_));
+        let point = if scaled { None } else { principal_point(photos) };
+        let warning = mistake.warning(photos, answer.given, corrected);
+        return Ok([warning].into_iter().chain(point).collect());
     }
-    principal_point(photos, warnings);
     let distinct = answer.given >= DISTINCT_MIN && answer.given >= DISTINCT_RATIO * answer.rival;
-    if !distinct && found.iter().all(|p| p.best() < CHANCE) {
-        return nothing_agrees(photos, views, found, warnings);
-    }
-    poor_agreement(photos, found, warnings);
-    strays(photos, found, overlap, warnings);
-    low_overlap(photos, overlap, warnings);
-    baselines(found, ranges, warnings);
-    range_hit(photos, found, warnings);
-    Ok(())
+    let found_wrong = if !distinct && found.iter().all(|p| p.best() < CHANCE) {
+        vec![principal_point(photos), Some(nothing_agrees(photos, views, found)?)]
+    } else {
+        vec![
+            principal_point(photos),
+            poor_agreement(photos, found),
+            strays(photos, found, overlap),
+            low_overlap(photos, overlap),
+            baselines(found, ranges),
+            range_hit(photos, found),
+        ]
+    };
+    Ok(found_wrong.into_iter().flatten().collect())
 }
 
 /// Scale of K that would bring the principal point to the centre, where x and y imply the same.
@@ -181,13 +182,8 @@ fn implied_scale(photos: &[PosedPhoto]) -> Option<f64> {
 /// Pairs spread over the photos, each photo with its best partner.
 fn witnesses(cameras: &[Camera]) -> Result<Vec<[usize; 2]>> {
     let ranked = pairs::ranked(cameras)?;
-    let mut all: Vec<[usize; 2]> = ranked
-        .iter()
-        .enumerate()
-        .filter_map(|(i, row)| row.first().map(|&j| [i.min(j), i.max(j)]))
-        .collect();
-    all.sort_unstable();
-    all.dedup();
+    let best = |(i, row): (usize, &Vec<usize>)| row.first().map(|&j| [i.min(j), i.max(j)]);
+    let all = pairs::unique(ranked.iter().enumerate().filter_map(best));
     let count = all.len().min(WITNESSES);
     Ok((0..count).map(|i| all[i * all.len() / count]).collect())
 }
@@ -196,8 +192,8 @@ fn mean_agreement(found: &[PairFound]) -> f64 {
     found.iter().map(PairFound::best).sum::<f64>() / found.len().max(1) as f64
 }
 
-/// What the photos answered under the given cameras and under the usual mistakes.
-struct Asked {
+/// How well the photos agree under the given cameras and under the usual mistakes.
+struct Agreement {
     /// Agreement under the given cameras.
     given: f64,
     /// Best agreement under a correction that is not called for: what chance gives here.
@@ -207,7 +203,7 @@ struct Asked {
 }
 
 /// Looks for a mistake that explains the photos far better than the given cameras.
-fn asked(views: &[GrayView], implied: Option<f64>, cancel: &AtomicBool) -> Result<Asked> {
+fn agreement(views: &[GrayView], implied: Option<f64>, cancel: &AtomicBool) -> Result<Agreement> {
     let views: Vec<GrayView> = views.par_iter().map(|v| v.reduced(AREA)).collect();
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
     let asked = witnesses(&cameras)?;
@@ -225,7 +221,7 @@ fn asked(views: &[GrayView], implied: Option<f64>, cancel: &AtomicBool) -> Resul
     if let Some(scale) = implied {
         let (mistake, share) = under(Mistake::Resolution(scale))?;
         if share >= ALTERNATIVE_MIN && share >= IMPLIED_RATIO * given {
-            return Ok(Asked { given, rival: share, mistake: Some((mistake, share)) });
+            return Ok(Agreement { given, rival: share, mistake: Some((mistake, share)) });
         }
     }
     let wins = |&(mistake, share): &(Mistake, f64)| {
@@ -238,7 +234,7 @@ fn asked(views: &[GrayView], implied: Option<f64>, cancel: &AtomicBool) -> Resul
     let shares: Vec<(Mistake, f64)> = tried.into_par_iter().map(under).collect::<Result<_>>()?;
     let rival = shares.iter().map(|s| s.1).fold(0.0, f64::max);
     let mistake = shares.into_iter().filter(wins).max_by(|a, b| a.1.total_cmp(&b.1));
-    Ok(Asked { given, rival, mistake })
+    Ok(Agreement { given, rival, mistake })
 }
 
 /// No pair agrees: strangers are refused, photos that do share something are warned of.
@@ -246,8 +242,7 @@ fn nothing_agrees(
     photos: &[PosedPhoto],
     views: &[GrayView],
     found: &[PairFound],
-    warnings: &mut Vec<Warning>,
-) -> Result<()> {
+) -> Result<Warning> {
     let best = found
         .iter()
         .max_by(|a, b| a.best().total_cmp(&b.best()))
@@ -272,9 +267,10 @@ fn nothing_agrees(
             100.0 * CONTENT_MIN
         )));
     }
-    warnings.push(Warning {
-        code: WarningCode::PoorPoseAgreement,
-        message: format!(
+    Ok(warning(
+        WarningCode::PoorPoseAgreement,
+        share,
+        format!(
             "the photos show the same things but do not agree under the given cameras: at best \
              {:.1} % of the matchable pixels, {} and {}; the poses or intrinsics are wrong in a \
              way that no usual mistake explains",
@@ -282,25 +278,22 @@ fn nothing_agrees(
             name(photos, i),
             name(photos, j)
         ),
-        value: share,
-    });
-    Ok(())
+    ))
 }
 
-fn poor_agreement(photos: &[PosedPhoto], found: &[PairFound], warnings: &mut Vec<Warning>) {
+fn poor_agreement(photos: &[PosedPhoto], found: &[PairFound]) -> Option<Warning> {
     let poor = |p: &&PairFound| p.angle <= POOR_ANGLE_MAX && p.best() < CHANCE;
     let close = found.iter().filter(|p| p.angle <= POOR_ANGLE_MAX).count();
     let bad: Vec<&PairFound> = found.iter().filter(poor).collect();
-    let Some(worst) = bad.iter().min_by(|a, b| a.best().total_cmp(&b.best())) else {
-        return;
-    };
+    let worst = bad.iter().min_by(|a, b| a.best().total_cmp(&b.best()))?;
     if 2 * bad.len() < close {
-        return;
+        return None;
     }
     let share = worst.best();
-    warnings.push(Warning {
-        code: WarningCode::PoorPoseAgreement,
-        message: format!(
+    Some(warning(
+        WarningCode::PoorPoseAgreement,
+        share,
+        format!(
             "{} of {close} pairs of photos that look the same way agree on less than {:.0} % of \
              their matchable pixels; worst are {} and {} with {:.1} %",
             bad.len(),
@@ -309,31 +302,24 @@ fn poor_agreement(photos: &[PosedPhoto], found: &[PairFound], warnings: &mut Vec
             name(photos, worst.views[1]),
             100.0 * share
         ),
-        value: share,
-    });
+    ))
 }
 
 /// Photos that agree with no other: their overlap is nothing, so that no view set takes them.
-fn strays(
-    photos: &[PosedPhoto],
-    found: &[PairFound],
-    overlap: &mut [Vec<f64>],
-    warnings: &mut Vec<Warning>,
-) {
-    let best = |i: usize| {
-        found.iter().filter(|p| p.side(i).is_some()).map(PairFound::best).fold(0.0_f64, f64::max)
-    };
+fn strays(photos: &[PosedPhoto], found: &[PairFound], overlap: &mut [Vec<f64>]) -> Option<Warning> {
+    let best = |i: usize| pairs::best_of(i, found);
     let strays: Vec<usize> = (0..photos.len()).filter(|&i| best(i) < STRAY).collect();
-    let Some(&first) = strays.first() else { return };
+    let &first = strays.first()?;
     for &i in &strays {
         for j in (0..photos.len()).filter(|&j| j != i) {
             overlap[i][j] = 0.0;
             overlap[j][i] = 0.0;
         }
     }
-    warnings.push(Warning {
-        code: WarningCode::PhotosUnused,
-        message: format!(
+    Some(warning(
+        WarningCode::PhotosUnused,
+        strays.len() as f64,
+        format!(
             "{} of {} photos agree with no other on {:.0} % of their matchable pixels or more and \
              are not used; the first is {} with {:.1} %",
             strays.len(),
@@ -342,11 +328,10 @@ fn strays(
             name(photos, first),
             100.0 * best(first)
         ),
-        value: strays.len() as f64,
-    });
+    ))
 }
 
-fn principal_point(photos: &[PosedPhoto], warnings: &mut Vec<Warning>) {
+fn principal_point(photos: &[PosedPhoto]) -> Option<Warning> {
     let off = |photo: &PosedPhoto| {
         let k = photo.camera.intrinsics;
         let x = (k.cx / f64::from(k.width) - 0.5).abs();
@@ -354,11 +339,12 @@ fn principal_point(photos: &[PosedPhoto], warnings: &mut Vec<Warning>) {
         x.max(y)
     };
     let bad: Vec<usize> = (0..photos.len()).filter(|&i| off(&photos[i]) > PRINCIPAL_OFF).collect();
-    let Some(&i) = bad.first() else { return };
+    let &i = bad.first()?;
     let k = photos[i].camera.intrinsics;
-    warnings.push(Warning {
-        code: WarningCode::PrincipalPointOff,
-        message: format!(
+    Some(warning(
+        WarningCode::PrincipalPointOff,
+        off(&photos[i]),
+        format!(
             "{}: the principal point ({:.1}, {:.1}) is {:.2} of a side from the centre of \
              {}x{} px, over {PRINCIPAL_OFF} ({} of {} photos)",
             name(photos, i),
@@ -370,20 +356,20 @@ fn principal_point(photos: &[PosedPhoto], warnings: &mut Vec<Warning>) {
             bad.len(),
             photos.len()
         ),
-        value: off(&photos[i]),
-    });
+    ))
 }
 
-fn low_overlap(photos: &[PosedPhoto], overlap: &[Vec<f64>], warnings: &mut Vec<Warning>) {
+fn low_overlap(photos: &[PosedPhoto], overlap: &[Vec<f64>]) -> Option<Warning> {
     let best = |i: usize| {
         (0..photos.len()).filter(|&j| j != i).map(|j| overlap[i][j]).fold(0.0_f64, f64::max)
     };
     let low: Vec<usize> =
         (0..photos.len()).filter(|&i| best(i) > 0.0 && best(i) < OVERLAP_MIN).collect();
-    let Some(&worst) = low.iter().min_by(|&&a, &&b| best(a).total_cmp(&best(b))) else { return };
-    warnings.push(Warning {
-        code: WarningCode::LowOverlap,
-        message: format!(
+    let &worst = low.iter().min_by(|&&a, &&b| best(a).total_cmp(&best(b)))?;
+    Some(warning(
+        WarningCode::LowOverlap,
+        best(worst),
+        format!(
             "{} of {} photos share less than {:.0} % of their matched pixels with any other; least \
              has {} with {:.0} %",
             low.len(),
@@ -392,47 +378,34 @@ fn low_overlap(photos: &[PosedPhoto], overlap: &[Vec<f64>], warnings: &mut Vec<W
             name(photos, worst),
             100.0 * best(worst)
         ),
-        value: best(worst),
-    });
+    ))
 }
 
-fn baselines(found: &[PairFound], ranges: &Ranges, warnings: &mut Vec<Warning>) {
+fn baselines(found: &[PairFound], ranges: &Ranges) -> Option<Warning> {
     let longest =
         found.iter().filter(|p| p.best() >= STRAY).map(|p| p.baseline).fold(0.0, f64::max);
     let ratio = longest * ranges.near_tenth_w;
-    if longest > 0.0 && ratio < BASELINE_MIN {
-        warnings.push(Warning {
-            code: WarningCode::SmallBaseline,
-            message: format!(
-                "the longest baseline of neighbouring photos, {longest:.4}, is {:.2} % of \
-                 the depth nine tenths of the matches lie beyond; under {:.0} % it is a guess",
-                100.0 * ratio,
-                100.0 * BASELINE_MIN
-            ),
-            value: ratio,
-        });
-    }
+    let message = format!(
+        "the longest baseline of neighbouring photos, {longest:.4}, is {:.2} % of the depth nine \
+         tenths of the matches lie beyond; under {:.0} % it is a guess",
+        100.0 * ratio,
+        100.0 * BASELINE_MIN
+    );
+    (longest > 0.0 && ratio < BASELINE_MIN)
+        .then(|| warning(WarningCode::SmallBaseline, ratio, message))
 }
 
-fn range_hit(photos: &[PosedPhoto], found: &[PairFound], warnings: &mut Vec<Warning>) {
-    let worst = found
-        .iter()
-        .flat_map(|p| [(p, 0), (p, 1)])
-        .max_by(|a, b| a.0.at_nearest[a.1].total_cmp(&b.0.at_nearest[b.1]));
-    let Some((pair, side)) = worst else { return };
+fn range_hit(photos: &[PosedPhoto], found: &[PairFound]) -> Option<Warning> {
+    let sides = found.iter().flat_map(|p| [(p, 0), (p, 1)]);
+    let (pair, side) = sides.max_by(|a, b| a.0.at_nearest[a.1].total_cmp(&b.0.at_nearest[b.1]))?;
     let share = pair.at_nearest[side];
-    if share > RANGE_HIT_MAX {
-        warnings.push(Warning {
-            code: WarningCode::DepthRangeHit,
-            message: format!(
-                "{}: {:.1} % of its matchable pixels match {} best at the nearest depth searched, \
-                 over {:.0} %: something stands too close for this baseline",
-                name(photos, pair.views[side]),
-                100.0 * share,
-                name(photos, pair.views[1 - side]),
-                100.0 * RANGE_HIT_MAX
-            ),
-            value: share,
-        });
-    }
+    let message = format!(
+        "{}: {:.1} % of its matchable pixels match {} best at the nearest depth searched, over \
+         {:.0} %: something stands too close for this baseline",
+        name(photos, pair.views[side]),
+        100.0 * share,
+        name(photos, pair.views[1 - side]),
+        100.0 * RANGE_HIT_MAX
+    );
+    (share > RANGE_HIT_MAX).then(|| warning(WarningCode::DepthRangeHit, share, message))
 }

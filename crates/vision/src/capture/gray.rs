@@ -23,8 +23,8 @@ pub(super) struct GrayView {
     pub(super) gray: Vec<f32>,
     /// `[height * width]`: whether the whole window around the pixel has a source.
     pub(super) valid: Option<Vec<bool>>,
-    /// `[height * width]`: whether the pixel lacks a source; empty where none does.
-    holes: Vec<bool>,
+    /// `[height * width]`: whether the pixel lacks a source.
+    pub(super) holes: Vec<bool>,
     /// Camera of the small picture.
     pub(super) camera: Camera,
     /// Matchable pixels on the grid, row by row.
@@ -50,75 +50,60 @@ impl GrayView {
     /// Reduces a photo by area averages and finds its matchable pixels.
     pub(super) fn new(posed: &PosedPhoto) -> Self {
         let photo = &posed.photo;
-        let (w0, h0) = (photo.width as usize, photo.height as usize);
-        let scale = (AREA / (w0 * h0) as f64).sqrt().min(1.0);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positive")]
-        let side = |n: usize| ((n as f64 * scale).round() as usize).max(1);
-        let (width, height) = (side(w0), side(h0));
-        let xs = spans(w0, width);
-        let ys = spans(h0, height);
-        let mut gray = vec![0.0_f32; width * height];
-        let mut holes = vec![false; width * height];
-        let mut line = vec![0.0_f32; width];
-        for (y, rows) in ys.iter().enumerate() {
-            let out = &mut gray[y * width..(y + 1) * width];
-            for &(row, row_weight) in rows {
-                let rgb = &photo.rgb[row * w0 * 3..(row + 1) * w0 * 3];
-                for (x, cols) in xs.iter().enumerate() {
-                    line[x] =
-                        cols.iter().map(|&(c, weight)| weight * luma(&rgb[c * 3..c * 3 + 3])).sum();
-                    if let Some(valid) = &photo.valid {
-                        let row = &valid[row * w0..(row + 1) * w0];
-                        holes[y * width + x] |= cols.iter().any(|&(c, _)| !row[c]);
-                    }
-                }
-                for (out, value) in out.iter_mut().zip(&line) {
-                    *out += row_weight * value;
-                }
-            }
-        }
-        let mean = gray.iter().sum::<f32>() / gray.len() as f32;
-        gray.iter_mut().for_each(|v| *v -= mean);
-        let valid = photo.valid.as_ref().map(|_| whole_windows(&holes, width, height));
-        let intrinsics = posed.camera.intrinsics.resized(width as u32, height as u32);
-        let camera = Camera { intrinsics, ..posed.camera };
-        let (candidates, row_start) = (vec![], vec![]);
-        let mut view = Self { width, height, gray, valid, holes, camera, candidates, row_start };
+        let size = [photo.width as usize, photo.height as usize];
+        let value = |x: usize, y: usize| luma(&photo.rgb[(y * size[0] + x) * 3..][..3]);
+        let valid = photo.valid.as_ref();
+        let hole = valid.map(|valid| |x: usize, y: usize| !valid[y * size[0] + x]);
+        let mut view = Self::averaged(size, AREA, posed.camera, value, hole);
+        let mean = view.gray.iter().sum::<f32>() / view.gray.len() as f32;
+        view.gray.iter_mut().for_each(|v| *v -= mean);
         view.find_candidates();
         view
     }
 
     /// The same view with about `area` pixels, if it has more.
     pub(super) fn reduced(&self, area: f64) -> Self {
-        let scale = (area / (self.width * self.height) as f64).sqrt().min(1.0);
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positive")]
-        let side = |n: usize| ((n as f64 * scale).round() as usize).max(1);
-        let (width, height) = (side(self.width), side(self.height));
-        let (xs, ys) = (spans(self.width, width), spans(self.height, height));
-        let mut gray = vec![0.0_f32; width * height];
-        let mut holes = vec![false; width * height];
-        for (y, rows) in ys.iter().enumerate() {
-            for (x, cols) in xs.iter().enumerate() {
-                for &(row, row_weight) in rows {
-                    for &(col, weight) in cols {
-                        gray[y * width + x] +=
-                            row_weight * weight * self.gray[row * self.width + col];
-                        holes[y * width + x] |= !self.has_source(col, row);
-                    }
-                }
-            }
-        }
-        let valid = self.valid.as_ref().map(|_| whole_windows(&holes, width, height));
-        let intrinsics = self.camera.intrinsics.resized(width as u32, height as u32);
-        let camera = Camera { intrinsics, ..self.camera };
-        let (candidates, row_start) = (vec![], vec![]);
-        let mut view = Self { width, height, gray, valid, holes, camera, candidates, row_start };
+        let value = |x: usize, y: usize| self.gray[y * self.width + x];
+        let valid = self.valid.as_ref();
+        let hole = valid.map(|_| |x: usize, y: usize| self.holes[y * self.width + x]);
+        let size = [self.width, self.height];
+        let mut view = Self::averaged(size, area, self.camera, value, hole);
         view.find_candidates();
         view
     }
 
-    fn has_source(&self, x: usize, y: usize) -> bool {
-        self.holes.is_empty() || !self.holes[y * self.width + x]
+    /// Averages over areas of a picture of `w0` x `h0`, about `area` pixels, without candidates.
+    fn averaged(
+        [w0, h0]: [usize; 2],
+        area: f64,
+        camera: Camera,
+        value: impl Fn(usize, usize) -> f32,
+        hole: Option<impl Fn(usize, usize) -> bool>,
+    ) -> Self {
+        let scale = (area / (w0 * h0) as f64).sqrt().min(1.0);
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positive")]
+        let side = |n: usize| ((n as f64 * scale).round() as usize).max(1);
+        let (width, height) = (side(w0), side(h0));
+        let (columns, rows) = (spans(w0, width), spans(h0, height));
+        let mut gray = vec![0.0_f32; width * height];
+        let mut holes = vec![false; width * height];
+        for (y, rows) in rows.iter().enumerate() {
+            for &(row, row_weight) in rows {
+                for (x, columns) in columns.iter().enumerate() {
+                    let at = y * width + x;
+                    let mean: f32 = columns.iter().map(|&(c, weight)| weight * value(c, row)).sum();
+                    gray[at] += row_weight * mean;
+                    if let Some(hole) = &hole {
+                        holes[at] |= columns.iter().any(|&(c, _)| hole(c, row));
+                    }
+                }
+            }
+        }
+        let valid = hole.map(|_| whole_windows(&holes, width, height));
+        let intrinsics = camera.intrinsics.resized(width as u32, height as u32);
+        let camera = Camera { intrinsics, ..camera };
+        let (candidates, row_start) = (vec![], vec![]);
+        Self { width, height, gray, valid, holes, camera, candidates, row_start }
     }
 
     fn find_candidates(&mut self) {
@@ -160,6 +145,46 @@ impl GrayView {
     /// Direction of a pixel's ray in camera coordinates, z = 1.
     pub(super) fn ray(&self, x: f64, y: f64) -> DVec3 {
         self.camera.intrinsics.unproject(x + 0.5, y + 0.5, 1.0)
+    }
+}
+
+/// Inverse depths on the grid of the candidates of a view; NaN where none is known.
+#[derive(Clone, Debug)]
+pub(super) struct Grid {
+    columns: usize,
+    rows: usize,
+    w: Vec<f64>,
+}
+
+impl Grid {
+    /// The grid of `view` with `(x, y, w)` at the cells of the pixels (x, y).
+    pub(super) fn new(view: &GrayView, points: impl Iterator<Item = (u16, u16, f64)>) -> Self {
+        let (columns, rows) = (view.width.div_ceil(STRIDE), view.height.div_ceil(STRIDE));
+        let mut w = vec![f64::NAN; columns * rows];
+        for (x, y, value) in points {
+            w[usize::from(y) / STRIDE * columns + usize::from(x) / STRIDE] = value;
+        }
+        Self { columns, rows, w }
+    }
+
+    /// The value of the cell at a place, in pixels; `None` outside or where nothing is known.
+    pub(super) fn at(&self, u: f64, v: f64) -> Option<f64> {
+        let cell = |c: f64, n: usize| {
+            let cell = ((c - 0.5) / STRIDE as f64).round();
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked")]
+            (cell >= 0.0 && cell < n as f64).then_some(cell as usize)
+        };
+        let (x, y) = (cell(u, self.columns)?, cell(v, self.rows)?);
+        Some(self.w[y * self.columns + x]).filter(|w| !w.is_nan())
+    }
+
+    /// What is known at most two cells away from the cell of the pixel (x, y).
+    pub(super) fn around(&self, x: usize, y: usize) -> impl Iterator<Item = f64> + '_ {
+        let near = |at: usize, n: usize| at.saturating_sub(2)..(at + 3).min(n);
+        let (columns, rows) = (near(x / STRIDE, self.columns), near(y / STRIDE, self.rows));
+        rows.flat_map(move |row| &self.w[row * self.columns..][columns.clone()])
+            .copied()
+            .filter(|w| !w.is_nan())
     }
 }
 

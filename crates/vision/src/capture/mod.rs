@@ -1,4 +1,4 @@
-//! What the photos say of themselves before any network: depth ranges, overlap, wrong cameras.
+//! Measures a capture before any network runs: depth ranges, overlap, wrong cameras.
 //!
 //! Neighbouring photos, reduced to some 20,000 pixels, are compared under the given cameras by a
 //! plane sweep (`sweep`). Its confident matches give each photo its depth range and each pair its
@@ -24,6 +24,7 @@ use rayon::prelude::*;
 
 use crate::{
     error::{Error, Result},
+    photo_label,
     scene::{Capture, PosedPhoto, Warning, WarningCode, unless_cancelled},
 };
 use gray::GrayView;
@@ -37,73 +38,41 @@ const NAMED_MAX: usize = 4;
 /// Of this many photos and more, one neighbour fewer.
 const MANY_PHOTOS: usize = 32;
 
-/// Measures a capture; photos that cannot be one scene are refused.
+/// Measures a capture. It stops before the next comparison of two photos once `cancel` is true.
 ///
 /// # Errors
 /// `invalid_request` for fewer than two photos, cameras all at one place, or photos that share
-/// nothing; the message names the photos and the figure.
-pub fn analyse(photos: &[PosedPhoto]) -> Result<Capture> {
-    analyse_until(photos, &AtomicBool::new(false))
-}
-
-/// As [`analyse`]; stops before the next comparison of two photos once `cancel` is true.
-///
-/// # Errors
-/// As [`analyse`]; `cancelled`.
-pub fn analyse_until(photos: &[PosedPhoto], cancel: &AtomicBool) -> Result<Capture> {
-    let views = gray_views(photos, cancel)?;
-    let found = pairs::searched(&views, neighbour_count(views.len()), cancel)?;
-    let points = depth::pooled(&views, &found);
-    let ranges = depth::ranges(&views, &points)?;
-    let mut overlap = depth::overlap(&views, &points, &found);
-    let mut warnings = made_for_warnings(photos);
-    warnings.extend(same_picture(photos, &views)?);
-    diagnose::warnings(photos, &views, &found, &ranges, &mut overlap, &mut warnings, cancel)?;
-    Ok(Capture { near_far: ranges.near_far, overlap, median_depth: ranges.median_depth, warnings })
-}
-
-/// Depth range of each photo of `set` (indices into `photos`), measured among these alone.
-///
-/// The same as [`analyse`] gives for these photos, without the diagnosis.
-///
-/// # Errors
-/// As [`analyse`], less the refusal of photos that share nothing: these get a wide guess.
-///
-/// # Panics
-/// When an index of `set` is not one of `photos`.
-pub fn near_far(photos: &[PosedPhoto], set: &[usize]) -> Result<Vec<[f64; 2]>> {
-    let chosen: Vec<&PosedPhoto> = set.iter().map(|&i| &photos[i]).collect();
-    let never = AtomicBool::new(false);
-    let views = gray_views(&chosen, &never)?;
-    let found = pairs::searched(&views, neighbour_count(views.len()), &never)?;
-    Ok(depth::ranges(&views, &depth::pooled(&views, &found))?.near_far)
-}
-
-fn neighbour_count(photos: usize) -> usize {
-    if photos < MANY_PHOTOS { NEIGHBORS } else { NEIGHBORS - 1 }
-}
-
-fn gray_views<P: std::borrow::Borrow<PosedPhoto> + Sync>(
-    photos: &[P],
-    cancel: &AtomicBool,
-) -> Result<Vec<GrayView>> {
+/// nothing; the message names the photos and the figure. `cancelled`.
+pub fn analyse(photos: &[PosedPhoto], cancel: &AtomicBool) -> Result<Capture> {
     if photos.len() < 2 {
         return Err(Error::invalid(format!(
             "{} photo; a capture needs at least 2 to see depth",
             photos.len()
         )));
     }
-    let view = |photo: &P| {
+    let view = |photo: &PosedPhoto| {
         unless_cancelled(cancel)?;
-        Ok(GrayView::new(photo.borrow()))
+        Ok(GrayView::new(photo))
     };
-    photos.par_iter().map(view).collect()
+    let views: Vec<GrayView> = photos.par_iter().map(view).collect::<Result<_>>()?;
+    let neighbours = if views.len() < MANY_PHOTOS { NEIGHBORS } else { NEIGHBORS - 1 };
+    let found = pairs::searched(&views, neighbours, cancel)?;
+    let points = depth::pooled(&views, &found);
+    let ranges = depth::ranges(&views, &points)?;
+    let mut overlap = depth::overlap(&views, &points, &found);
+    let mut warnings: Vec<Warning> = made_for_warning(photos).into_iter().collect();
+    warnings.extend(same_picture(photos, &views)?);
+    warnings.extend(diagnose::warnings(photos, &views, &found, &ranges, &mut overlap, cancel)?);
+    Ok(Capture { near_far: ranges.near_far, overlap, median_depth: ranges.median_depth, warnings })
 }
 
 /// A photo as messages call it.
 fn name(photos: &[PosedPhoto], i: usize) -> String {
-    let shown: String = photos[i].file.chars().take(80).collect();
-    format!("photo {i} ({shown:?})")
+    photo_label(i, &photos[i].file)
+}
+
+fn warning(code: WarningCode, value: f64, message: String) -> Warning {
+    Warning { code, message, value }
 }
 
 /// Names photos that are one picture under different poses: at most one of the poses is right.
@@ -121,14 +90,8 @@ fn same_picture(photos: &[PosedPhoto], views: &[GrayView]) -> Result<Option<Warn
     let all: Vec<usize> = (0..photos.len()).filter(|&i| !views[i].candidates.is_empty()).collect();
     let copies = |i: usize| all.iter().copied().filter(|&j| j == i || same(i, j)).collect();
     let groups = all.iter().map(|&i| copies(i));
-    let Some(group) =
-        groups.max_by_key(|group: &Vec<usize>| (group.len(), photos.len() - group[0]))
-    else {
-        return Ok(None);
-    };
-    if group.len() < 2 {
-        return Ok(None);
-    }
+    let largest = groups.max_by_key(|g: &Vec<usize>| (g.len(), photos.len() - g[0]));
+    let Some(group) = largest.filter(|group| group.len() > 1) else { return Ok(None) };
     let names: Vec<String> = group.iter().take(NAMED_MAX).map(|&i| name(photos, i)).collect();
     let more = group.len().saturating_sub(NAMED_MAX);
     let more = if more > 0 { format!(" and {more} more") } else { String::new() };
@@ -139,15 +102,14 @@ fn same_picture(photos: &[PosedPhoto], views: &[GrayView]) -> Result<Option<Warn
     if group.len() == photos.len() {
         return Err(Error::invalid(message));
     }
-    let value = group.len() as f64;
-    Ok(Some(Warning { code: WarningCode::SamePicture, message, value }))
+    Ok(Some(warning(WarningCode::SamePicture, group.len() as f64, message)))
 }
 
-/// Says which intrinsics were scaled when the photos were read.
-fn made_for_warnings(photos: &[PosedPhoto]) -> Vec<Warning> {
+/// Names the intrinsics that were scaled when the photos were read.
+fn made_for_warning(photos: &[PosedPhoto]) -> Option<Warning> {
     let scaled = |i: usize| photos[i].intrinsics_made_for.map(|size| (i, size));
     let all: Vec<(usize, [u32; 2])> = (0..photos.len()).filter_map(scaled).collect();
-    let Some(&(i, [w, h])) = all.first() else { return vec![] };
+    let &(i, [w, h]) = all.first()?;
     let k = photos[i].camera.intrinsics;
     let value = f64::from(k.width) / f64::from(w);
     let message = format!(
@@ -159,5 +121,5 @@ fn made_for_warnings(photos: &[PosedPhoto]) -> Vec<Warning> {
         all.len(),
         photos.len()
     );
-    vec![Warning { code: WarningCode::IntrinsicsScale, message, value }]
+    Some(warning(WarningCode::IntrinsicsScale, value, message))
 }

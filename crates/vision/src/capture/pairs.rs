@@ -5,7 +5,7 @@ use std::sync::atomic::AtomicBool;
 use rayon::prelude::*;
 
 use super::{
-    gray::{GrayView, STRIDE},
+    gray::{GrayView, Grid},
     sweep::{Match, Relative, Sweep, consistent, sweep},
 };
 use crate::{
@@ -107,10 +107,7 @@ pub(super) fn searched(
     let ranked = ranked(&cameras)?;
     let first = unique((0..views.len()).flat_map(|i| tied(i, ranked[i].iter().take(count))));
     let mut found = compare(views, &first, cancel)?;
-    let best = |i: usize, found: &[PairFound]| {
-        found.iter().filter(|p| p.side(i).is_some()).map(PairFound::best).fold(0.0, f64::max)
-    };
-    let weak: Vec<usize> = (0..views.len()).filter(|&i| best(i, &found) < WEAK).collect();
+    let weak: Vec<usize> = (0..views.len()).filter(|&i| best_of(i, &found) < WEAK).collect();
     if !weak.is_empty() && 3 * weak.len() <= views.len() {
         let more = weak.iter().flat_map(|&i| tied(i, ranked[i].iter().skip(count).take(2 * count)));
         let mut second = unique(more);
@@ -127,7 +124,13 @@ fn tied<'a>(
     partners.map(move |&j| [i.min(j), i.max(j)])
 }
 
-fn unique(pairs: impl Iterator<Item = [usize; 2]>) -> Vec<[usize; 2]> {
+/// Best agreement of a view with any other.
+pub(super) fn best_of(view: usize, found: &[PairFound]) -> f64 {
+    found.iter().filter(|p| p.side(view).is_some()).map(PairFound::best).fold(0.0, f64::max)
+}
+
+/// The pairs sorted, each once.
+pub(super) fn unique(pairs: impl Iterator<Item = [usize; 2]>) -> Vec<[usize; 2]> {
     let mut pairs: Vec<[usize; 2]> = pairs.collect();
     pairs.sort_unstable();
     pairs.dedup();
@@ -178,47 +181,21 @@ pub(super) fn compare_as(
     pairs: &[[usize; 2]],
     cancel: &AtomicBool,
 ) -> Result<Vec<PairFound>> {
-    let mut used: Vec<usize> = pairs.iter().flatten().copied().collect();
-    used.sort_unstable();
-    used.dedup();
-    let changed: Vec<GrayView> = used
-        .iter()
-        .map(|&i| {
-            let mut view = views[i].clone();
-            view.camera = cameras[i];
-            view
-        })
-        .collect();
-    let at = |i: usize| used.binary_search(&i).unwrap_or(0);
-    let local: Vec<[usize; 2]> = pairs.iter().map(|&[i, j]| [at(i), at(j)]).collect();
-    compare(&changed, &local, cancel)
+    let view = |i: usize| GrayView { camera: cameras[i], ..views[i].clone() };
+    let changed: Vec<GrayView> = (0..views.len()).map(view).collect();
+    compare(&changed, pairs, cancel)
 }
 
 /// Keeps the matches that at least two others nearby agree with: surfaces are in one piece,
 /// chance is not.
 fn supported(view: &GrayView, matches: &[Match]) -> Vec<Match> {
-    const REACH: usize = 2;
     const NEEDED: usize = 2;
     const PIXELS: f64 = 2.0;
-    let (cols, rows) = (view.width.div_ceil(STRIDE), view.height.div_ceil(STRIDE));
-    let mut grid = vec![f64::NAN; cols * rows];
-    let cell = |m: &Match| {
-        let at = view.candidates[m.candidate];
-        (usize::from(at.x) / STRIDE, usize::from(at.y) / STRIDE)
-    };
-    for m in matches {
-        let (x, y) = cell(m);
-        grid[y * cols + x] = m.w;
-    }
+    let at = |m: &Match| view.candidates[m.candidate];
+    let grid = Grid::new(view, matches.iter().map(|m| (at(m).x, at(m).y, m.w)));
     let enough = |m: &&Match| {
-        let (x, y) = cell(m);
-        let near = PIXELS * m.w_per_px;
-        let agreeing = (y.saturating_sub(REACH)..(y + REACH + 1).min(rows))
-            .flat_map(|row| {
-                &grid[row * cols + x.saturating_sub(REACH)..row * cols + (x + REACH + 1).min(cols)]
-            })
-            .filter(|&&w| (w - m.w).abs() <= near)
-            .count();
+        let around = grid.around(at(m).x.into(), at(m).y.into());
+        let agreeing = around.filter(|w| (w - m.w).abs() <= PIXELS * m.w_per_px).count();
         // The match itself agrees with itself.
         agreeing > NEEDED
     };

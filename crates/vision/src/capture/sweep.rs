@@ -6,7 +6,7 @@
 
 use glam::{DMat3, DVec3};
 
-use super::gray::{GrayView, RADIUS, STRIDE};
+use super::gray::{GrayView, Grid, RADIUS, STRIDE};
 
 /// Nearest plane, in baselines.
 const NEAREST_BASELINES: f64 = 0.45;
@@ -212,29 +212,18 @@ pub(super) fn consistent(
     forward: &Sweep,
     backward: &Sweep,
 ) -> Vec<Match> {
-    let (cols, rows) = (source.width.div_ceil(STRIDE), source.height.div_ceil(STRIDE));
-    let mut w_of_cell = vec![f64::NAN; cols * rows];
-    for m in &backward.matches {
+    let found = backward.matches.iter().map(|m| {
         let at = source.candidates[m.candidate];
-        w_of_cell[usize::from(at.y) / STRIDE * cols + usize::from(at.x) / STRIDE] = m.w;
-    }
+        (at.x, at.y, m.w)
+    });
+    let grid = Grid::new(source, found);
     let leads_back = |m: &&Match| {
         let at = reference.candidates[m.candidate];
         let (x, y) = (f64::from(at.x), f64::from(at.y));
         let Some((u, v)) = there.pixel(reference.ray(x, y), m.w) else { return false };
-        let cell = |c: f64, n: usize| {
-            let cell = ((c - 0.5) / STRIDE as f64).round();
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked")]
-            (cell >= 0.0 && cell < n as f64).then_some(cell as usize)
-        };
-        let (Some(cx), Some(cy)) = (cell(u, cols), cell(v, rows)) else { return false };
-        let w = w_of_cell[cy * cols + cx];
-        if w.is_nan() {
-            return false;
-        }
         // The depth found at that cell, seen along the exact ray of the match.
-        back.pixel(source.ray(u - 0.5, v - 0.5), w)
-            .is_some_and(|(bu, bv)| (bu - x - 0.5).hypot(bv - y - 0.5) <= LEFT_RIGHT_PX)
+        let returned = grid.at(u, v).and_then(|w| back.pixel(source.ray(u - 0.5, v - 0.5), w));
+        returned.is_some_and(|(bu, bv)| (bu - x - 0.5).hypot(bv - y - 0.5) <= LEFT_RIGHT_PX)
     };
     forward.matches.iter().filter(leads_back).copied().collect()
 }

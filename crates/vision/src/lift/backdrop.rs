@@ -109,19 +109,9 @@ impl Level {
         let mut half = Self::empty(self.width / 2, self.height / 2);
         for y in 0..half.height {
             for x in 0..half.width {
-                let mut sum = [0.0_f32; 4];
-                for (dx, dy) in [(0, 0), (1, 0), (0, 1), (1, 1)] {
-                    let cell = self.cells[(2 * y + dy) * self.width + 2 * x + dx];
-                    for c in 0..3 {
-                        sum[c] += cell[c] * cell[3];
-                    }
-                    sum[3] += cell[3];
-                }
-                if sum[3] > 0.0 {
-                    let w = sum[3];
-                    half.cells[y * half.width + x] =
-                        [sum[0] / w, sum[1] / w, sum[2] / w, w.min(1.0)];
-                }
+                let child = |(dx, dy)| (self.cells[(2 * y + dy) * self.width + 2 * x + dx], 1.0);
+                let mean = mean([(0, 0), (1, 0), (0, 1), (1, 1)].map(child));
+                half.cells[y * half.width + x] = [mean[0], mean[1], mean[2], mean[3].min(1.0)];
             }
         }
         half
@@ -131,8 +121,7 @@ impl Level {
     fn between(&self, x: usize, y: usize) -> [f32; 4] {
         let (u, v) = ((x as f32 - 0.5) / 2.0, (y as f32 - 0.5) / 2.0);
         let (u0, v0) = (u.floor(), v.floor());
-        let mut sum = [0.0_f32; 4];
-        for (dx, dy) in [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)] {
+        mean([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)].map(|(dx, dy)| {
             let wx = if dx == 0.0 { 1.0 - (u - u0) } else { u - u0 };
             let wy = if dy == 0.0 { 1.0 - (v - v0) } else { v - v0 };
             #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "in range")]
@@ -140,60 +129,19 @@ impl Level {
                 ((u0 + dx) as i64).rem_euclid(self.width as i64) as usize,
                 ((v0 + dy).max(0.0) as usize).min(self.height - 1),
             );
-            let cell = self.cells[cy * self.width + cx];
-            let weight = wx * wy * cell[3];
-            for c in 0..3 {
-                sum[c] += cell[c] * weight;
-            }
-            sum[3] += weight;
-        }
-        if sum[3] > 0.0 {
-            let w = sum[3];
-            sum = [sum[0] / w, sum[1] / w, sum[2] / w, w];
-        }
-        sum
+            (self.cells[cy * self.width + cx], wx * wy)
+        }))
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use glam::DVec3;
-
-    use super::*;
-    use crate::scene::{Camera, CameraToWorld, Intrinsics, Photo};
-
-    fn photo(target: DVec3, rgb: [u8; 3]) -> PosedPhoto {
-        let pose = CameraToWorld::look_at(DVec3::ZERO, target, -DVec3::Y, "photo").unwrap();
-        PosedPhoto {
-            file: "a.png".to_owned(),
-            photo: Photo { width: 64, height: 64, rgb: rgb.repeat(64 * 64), valid: None },
-            camera: Camera {
-                intrinsics: Intrinsics {
-                    fx: 64.0,
-                    fy: 64.0,
-                    cx: 32.0,
-                    cy: 32.0,
-                    width: 64,
-                    height: 64,
-                },
-                camera_to_world: pose,
-            },
-            intrinsics_made_for: None,
-        }
+/// Mean colour of cells by their weights, each times its share, and the sum of these.
+fn mean(cells: [([f32; 4], f32); 4]) -> [f32; 4] {
+    let mut sum = [0.0_f32; 4];
+    for (cell, share) in cells {
+        let weight = share * cell[3];
+        (0..3).for_each(|c| sum[c] += cell[c] * weight);
+        sum[3] += weight;
     }
-
-    #[test]
-    fn each_side_keeps_its_colour_and_every_hole_is_filled() {
-        let made = backdrop(&[photo(DVec3::X, [200, 0, 0]), photo(-DVec3::X, [0, 0, 200])]);
-        assert_eq!(made.color(DVec3::X), [200.0 / 255.0, 0.0, 0.0]);
-        assert_eq!(made.color(-DVec3::X), [0.0, 0.0, 200.0 / 255.0]);
-        let near = made.color(DVec3::new(1.0, 0.0, 0.7));
-        assert!(near[0] > near[2], "just outside the red photo it is red: {near:?}");
-        assert!(made.cells().iter().all(|c| c[0] > 0 || c[2] > 0), "no cell is left black");
-    }
-
-    #[test]
-    fn no_photos_are_black() {
-        assert_eq!(backdrop(&[]), Backdrop::default());
-    }
+    let w = sum[3];
+    if w > 0.0 { [sum[0] / w, sum[1] / w, sum[2] / w, w] } else { sum }
 }

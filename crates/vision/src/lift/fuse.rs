@@ -1,9 +1,9 @@
-//! Fusion: what several photos say of one surface, said once or twice, not many times.
+//! Fusion: a surface that many photos show is kept from a few of them.
 //!
 //! Photos are taken one after another, the surest first. A Gaussian is dropped where at least
 //! [`FuseOptions::layers`] photos before it *kept* a Gaussian of the same surface at that place,
-//! no coarser than its own. So every dropped Gaussian leaves that many layers behind it and no
-//! hole, and a surface seen by sixty photos is said no more often than one seen by a few.
+//! no coarser than its own. So no hole opens, and a surface that sixty photos show has as many
+//! layers as a surface that a few photos show.
 
 use std::sync::atomic::AtomicBool;
 
@@ -11,10 +11,12 @@ use rayon::prelude::*;
 
 use crate::{
     error::Result,
+    point,
     scene::{ViewGaussians, unless_cancelled},
+    seen_at,
 };
 
-/// What counts as one surface, and how often it may be said.
+/// What counts as one surface, and how many layers it may have.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FuseOptions {
     /// Photos that may keep Gaussians of one surface. Networks are trained on the union of their
@@ -42,16 +44,16 @@ pub(super) enum Fate {
     Absent,
     /// The surface has enough layers already.
     Duplicate,
-    /// A neighbour says it too since thinning.
+    /// Thinning merged it with its neighbours.
     Merged,
 }
 
-/// A view with what fusion asks of it at every pixel.
+/// A view and what fusion needs of each of its pixels.
 struct Surface<'a> {
     view: &'a ViewGaussians,
     /// `[H * W]` z in this view's camera of the pixel's own Gaussian; NaN where it is absent.
     depth: Vec<f32>,
-    /// `[H * W]` which of them were kept; `None` until this view was judged.
+    /// `[H * W]` which of them were kept; `None` until this view was decided.
     kept: Option<Vec<bool>>,
 }
 
@@ -73,33 +75,34 @@ pub(super) fn fuse(
         views.iter().zip(candidate).map(|(view, keep)| Surface::new(view, keep)).collect();
     for v in surest_first(views) {
         unless_cancelled(cancel)?;
-        let judged: Vec<Fate> = (0..views[v].len())
+        let decided: Vec<Fate> = (0..views[v].len())
             .into_par_iter()
             .map(|i| match fates[v][i] {
-                Fate::Keep => judge(&surfaces, options, v, i),
+                Fate::Keep => fate_of(&surfaces, options, v, i),
                 other => other,
             })
             .collect();
-        let kept = judged.iter().map(|fate| *fate == Fate::Keep).collect();
+        let kept = decided.iter().map(|fate| *fate == Fate::Keep).collect();
         surfaces[v].kept = Some(kept);
-        fates[v] = judged;
+        fates[v] = decided;
     }
     Ok(fates)
 }
 
+/// Sum of the confidence of all pixels that have one.
+pub(super) fn sum_of_confidence(view: &ViewGaussians) -> f64 {
+    view.confidence.iter().filter(|c| c.is_finite()).map(|&c| f64::from(c)).sum()
+}
+
 /// Views by mean confidence, the surest first; ties by index.
 fn surest_first(views: &[ViewGaussians]) -> Vec<usize> {
-    let sure = |v: usize| -> f64 {
-        let row = &views[v].confidence;
-        let sum: f64 = row.iter().filter(|c| c.is_finite()).map(|&c| f64::from(c)).sum();
-        sum / row.len().max(1) as f64
-    };
+    let sure = |v: usize| -> f64 { sum_of_confidence(&views[v]) / views[v].len().max(1) as f64 };
     let mut order: Vec<(usize, f64)> = (0..views.len()).map(|v| (v, sure(v))).collect();
     order.sort_by(|a, b| b.1.total_cmp(&a.1));
     order.into_iter().map(|(v, _)| v).collect()
 }
 
-fn judge(surfaces: &[Surface<'_>], options: &FuseOptions, v: usize, i: usize) -> Fate {
+fn fate_of(surfaces: &[Surface<'_>], options: &FuseOptions, v: usize, i: usize) -> Fate {
     let own = &surfaces[v];
     let world = own.view.frame_to_world.matrix().transform_point3(point(own.view.means[i]));
     let own_footprint = f64::from(own.depth[i]) / own.view.camera.intrinsics.fx;
@@ -132,22 +135,11 @@ impl<'a> Surface<'a> {
         Self { view, depth, kept: None }
     }
 
-    /// Pixel that sees a world point and the point's depth there; `None` outside the picture.
+    /// Pixel that shows a world point, and the depth of the point there.
     fn look(&self, world: glam::DVec3) -> Option<(usize, f64)> {
-        let rotation = self.view.camera.camera_to_world.rotation();
-        let seen = rotation.transpose() * (world - self.view.camera.camera_to_world.center());
-        if seen.z <= 0.0 {
-            return None;
-        }
-        let lens = &self.view.camera.intrinsics;
-        let (x, y) = lens.project(seen);
-        let inside =
-            x >= 0.0 && y >= 0.0 && x < f64::from(lens.width) && y < f64::from(lens.height);
+        let (seen, x, y) = seen_at(&self.view.camera, world)?;
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "inside")]
-        inside.then(|| ((y as usize) * lens.width as usize + x as usize, seen.z))
+        let (x, y) = (x as usize, y as usize);
+        Some((y * self.view.camera.intrinsics.width as usize + x, seen.z))
     }
-}
-
-fn point(mean: [f32; 3]) -> glam::DVec3 {
-    glam::Vec3::from_array(mean).as_dvec3()
 }

@@ -1,4 +1,4 @@
-//! From each photo's Gaussians to one scene: dropped what cannot count, fused, moved to the world.
+//! From each photo's Gaussians to one scene in the world. Useless and repeated ones are dropped.
 //!
 //! In: [`ViewGaussians`] (a rigid motion away from the world), one for each photo and set. Out:
 //! checked [`Gaussians`] relative to the mean of the camera centres, and how many were dropped for
@@ -22,6 +22,7 @@ use crate::{
         fuse::{Fate, fuse},
         sh::ShRotation,
     },
+    point,
     scene::{
         Camera, DropCount, Gaussians, Intrinsics, RawGaussians, SourcePixel, ViewGaussians,
         unless_cancelled,
@@ -54,7 +55,7 @@ pub struct Lifted {
 ///
 /// # Errors
 /// `internal` when arrays disagree in length or views in SH degree; `cancelled` once `cancel` is
-/// true, which is asked before each view.
+/// true, which is read before each view.
 pub fn lift(
     views: Vec<ViewGaussians>,
     cameras: &[Camera],
@@ -150,12 +151,9 @@ fn check_lengths(view: &ViewGaussians, degree: u8) -> Result<()> {
 
 /// A photo that went through the network in several sets is kept from the set that was surest.
 fn best_of_each_photo(mut views: Vec<ViewGaussians>, counts: &mut Counts) -> Vec<ViewGaussians> {
-    let sure = |view: &ViewGaussians| -> f64 {
-        view.confidence.iter().filter(|c| c.is_finite()).map(|&c| f64::from(c)).sum()
-    };
     let mut kept: Vec<(f64, ViewGaussians)> = Vec::with_capacity(views.len());
     for view in views.drain(..) {
-        let score = sure(&view);
+        let score = fuse::sum_of_confidence(&view);
         match kept.iter_mut().find(|(_, other)| other.photo == view.photo) {
             None => kept.push((score, view)),
             Some(entry) => {
@@ -187,7 +185,7 @@ fn candidates(view: &ViewGaussians, counts: &mut Counts) -> Vec<bool> {
                 transparent += 1;
                 return false;
             }
-            let mean = glam::Vec3::from_array(view.means[i]).as_dvec3();
+            let mean = point(view.means[i]);
             if !mean.is_finite() {
                 return true; // counted as not finite by the last check
             }
@@ -227,7 +225,7 @@ fn append(
     let moved: Vec<([f32; 3], [f32; 4], f64)> = kept
         .par_iter()
         .map(|&i| {
-            let mean = rotation * glam::Vec3::from_array(view.means[i]).as_dvec3() + shift;
+            let mean = rotation * point(view.means[i]) + shift;
             let [w, x, y, z] = view.quats[i].map(f64::from);
             let quat = turn * DQuat::from_xyzw(x, y, z, w);
             let quat = [quat.w as f32, quat.x as f32, quat.y as f32, quat.z as f32];

@@ -1,8 +1,8 @@
-//! Thinning: where a picture is flat, one Gaussian says what four neighbours said.
+//! Thinning: where a picture is flat, one Gaussian replaces four neighbours.
 //!
-//! A network makes a Gaussian a pixel, on a wall as on a leaf. Aligned blocks of 2 x 2 pixels (and
-//! 2 x 2 of those) whose colours and depths are alike, with their surroundings, become one
-//! Gaussian: the mixture's mean and covariance, and the opacity that keeps its mass in the
+//! A network makes one Gaussian for each pixel, on a wall as on a leaf. Aligned blocks of 2 x 2
+//! pixels (and 2 x 2 of those) whose colours and depths are alike, with their surroundings, become
+//! one Gaussian: the mixture's mean and covariance, and the opacity that keeps its mass in the
 //! picture, `sum a_i A_i`, where `A = sqrt(det)` of the footprint with the renderer's blur. Where
 //! that would be an opacity over [`ThinOptions::opacity_max`], part of the rest widens it instead.
 //! The merged one takes the place of one of the four, so it keeps a source pixel.
@@ -11,7 +11,10 @@ use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::fuse::Fate;
-use crate::scene::{BLUR_PX2, SH_C0, ViewGaussians, principal_axes};
+use crate::{
+    point,
+    scene::{BLUR_PX2, SH_C0, ViewGaussians, principal_axes},
+};
 
 /// How alike neighbours must be, and how often blocks of blocks are tried.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -47,7 +50,7 @@ impl Default for ThinOptions {
     }
 }
 
-/// Pixels of one cell of a level that say it all; `None` where the cell is no single Gaussian.
+/// The cells of a level that one Gaussian stands for.
 struct Level {
     columns: usize,
     rows: usize,
@@ -79,12 +82,12 @@ pub(super) fn thin(view: &mut ViewGaussians, fates: &mut [Fate], options: &ThinO
     for step in 0..options.levels {
         let (columns, rows) = (level.columns / 2, level.rows / 2);
         let blocks = Blocks::new(view, &level, options, step);
-        let made: Vec<Merged> =
+        let blocks: Vec<Merged> =
             (0..columns * rows).into_par_iter().filter_map(|cell| blocks.merge(cell)).collect();
         let mut next = Level { columns, rows, at: vec![None; columns * rows] };
         // The place nearest to the block's middle.
         let heir = if step == 0 { 3 } else { 0 };
-        for merged in made {
+        for merged in blocks {
             let at = merged.of[heir];
             next.at[merged.cell] = u32::try_from(at).ok();
             merged.of.iter().for_each(|&i| fates[i] = Fate::Merged);
@@ -241,134 +244,5 @@ impl<'a> Blocks<'a> {
         let (a, b) = (side.dot(*covariance * side) / px2, up.dot(*covariance * up) / px2);
         let c = side.dot(*covariance * up) / px2;
         ((a + blur) * (b + blur) - c * c).max(0.0).sqrt()
-    }
-}
-
-fn point(mean: [f32; 3]) -> DVec3 {
-    glam::Vec3::from_array(mean).as_dvec3()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::scene::{Camera, CameraToWorld, Intrinsics};
-
-    const SIDE: usize = 16;
-
-    /// A wall across the axis at depth 4 seen by `SIDE` x `SIDE` pixels, a Gaussian a pixel;
-    /// `colour` and `depth` say otherwise of a pixel.
-    fn wall(
-        colour: impl Fn(usize, usize) -> f32,
-        depth: impl Fn(usize, usize) -> f32,
-    ) -> (ViewGaussians, Vec<Fate>) {
-        let side = SIDE as u32;
-        let (focal, middle) = (20.0, f64::from(side) / 2.0);
-        let intrinsics =
-            Intrinsics { fx: focal, fy: focal, cx: middle, cy: middle, width: side, height: side };
-        let identity = glam::DMat4::IDENTITY.to_cols_array();
-        let camera_to_world = CameraToWorld::from_row_major(&identity, "test").unwrap();
-        let pixels = || (0..SIDE * SIDE).map(|i| (i % SIDE, i / SIDE));
-        let mean = |(x, y): (usize, usize)| {
-            let z = depth(x, y);
-            let away = |k: usize| (k as f32 + 0.5 - middle as f32) / focal as f32 * z;
-            [away(x), away(y), z]
-        };
-        let view = ViewGaussians {
-            photo: 0,
-            camera: Camera { intrinsics, camera_to_world },
-            frame_to_world: camera_to_world,
-            near_far: [1.0, 10.0],
-            means: pixels().map(mean).collect(),
-            scales: vec![[0.08, 0.1, 0.05]; SIDE * SIDE],
-            quats: vec![[1.0, 0.0, 0.0, 0.0]; SIDE * SIDE],
-            opacities: vec![0.4; SIDE * SIDE],
-            sh_degree: 0,
-            sh: pixels().map(|(x, y)| [colour(x, y) / SH_C0; 3]).collect(),
-            confidence: vec![1.0; SIDE * SIDE],
-            valid: None,
-        };
-        (view, vec![Fate::Keep; SIDE * SIDE])
-    }
-
-    fn kept(fates: &[Fate]) -> Vec<usize> {
-        (0..fates.len()).filter(|&i| fates[i] == Fate::Keep).collect()
-    }
-
-    /// Mass in the picture, `sum a A` in px², and where its middle is.
-    fn mass(view: &ViewGaussians, of: &[usize]) -> (f64, DVec3) {
-        let (mut sum, mut middle) = (0.0, DVec3::ZERO);
-        for &i in of {
-            let pixel = f64::from(view.means[i][2]) / view.camera.intrinsics.fx;
-            let [w, x, y, z] = view.quats[i].map(f64::from);
-            let turn = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w));
-            let variances = DVec3::from_array(view.scales[i].map(|s| f64::from(s).powi(2)));
-            let s = turn * DMat3::from_diagonal(variances) * turn.transpose();
-            let blur = f64::from(BLUR_PX2);
-            let at = |a: usize, b: usize| s.col(a)[b] / (pixel * pixel);
-            let area = ((at(0, 0) + blur) * (at(1, 1) + blur) - at(0, 1).powi(2)).sqrt();
-            sum += f64::from(view.opacities[i]) * area;
-            middle += f64::from(view.opacities[i]) * area * point(view.means[i]);
-        }
-        (sum, middle / sum)
-    }
-
-    #[test]
-    fn a_flat_wall_keeps_one_of_sixteen_with_the_mass_and_the_middle_of_all() {
-        let (mut view, mut fates) = wall(|_, _| 0.2, |_, _| 4.0);
-        let (before, middle) = mass(&view, &kept(&fates));
-        thin(&mut view, &mut fates, &ThinOptions::default());
-        let left = kept(&fates);
-        assert_eq!(left.len(), SIDE * SIDE / 16);
-        let (after, still) = mass(&view, &left);
-        // Opacity would pass its bound, so some of the mass is given up: never more than is said.
-        let options = ThinOptions::default();
-        assert!(left.iter().all(|&i| f64::from(view.opacities[i]) <= options.opacity_max + 1e-6));
-        assert!(middle.distance(still) < 1e-5, "{middle} {still}");
-        assert!(after <= before * (1.0 + 1e-5) && after > before / 4.0, "{before} {after}");
-        let blocks: Vec<_> = left.iter().map(|i| (i % SIDE / 4, i / SIDE / 4)).collect();
-        assert!((0..16).all(|b| blocks.contains(&(b % 4, b / 4))), "one a block: {blocks:?}");
-    }
-
-    #[test]
-    fn faint_gaussians_keep_all_their_mass() {
-        let (mut view, mut fates) = wall(|_, _| 0.2, |_, _| 4.0);
-        view.opacities.fill(0.05);
-        let (before, _) = mass(&view, &kept(&fates));
-        thin(&mut view, &mut fates, &ThinOptions { levels: 1, ..ThinOptions::default() });
-        assert_eq!(kept(&fates).len(), SIDE * SIDE / 4);
-        let (after, _) = mass(&view, &kept(&fates));
-        assert!((after / before - 1.0).abs() < 1e-5, "{before} {after}");
-    }
-
-    #[test]
-    fn texture_edges_of_depth_and_what_is_beside_them_stay() {
-        let same = |_: usize, _: usize| 4.0;
-        let (mut view, mut fates) = wall(|x, y| 0.1 * ((x + y) % 2) as f32, same);
-        thin(&mut view, &mut fates, &ThinOptions::default());
-        assert_eq!(kept(&fates).len(), SIDE * SIDE, "a texture");
-
-        // An edge between columns 7 and 8, and so between blocks: the ring sees it.
-        for (colour, depth) in [(0.3, 4.0), (0.0, 6.0)] {
-            let (mut view, mut fates) = wall(
-                |x, _| if x < 8 { 0.0 } else { colour },
-                |x, _| if x < 8 { 4.0 } else { depth },
-            );
-            thin(&mut view, &mut fates, &ThinOptions::default());
-            let left = kept(&fates);
-            let beside = |i: &&usize| (6..10).contains(&(**i % SIDE));
-            assert_eq!(left.iter().filter(beside).count(), 4 * SIDE, "{colour} {depth}");
-            assert!(left.len() < SIDE * SIDE * 3 / 4, "{} left", left.len());
-        }
-    }
-
-    #[test]
-    fn what_is_no_gaussian_any_more_merges_with_nothing() {
-        let (mut view, mut fates) = wall(|_, _| 0.2, |_, _| 4.0);
-        fates[0] = Fate::Duplicate;
-        view.scales[5] = [f32::NAN; 3];
-        thin(&mut view, &mut fates, &ThinOptions::default());
-        assert_eq!(fates[0], Fate::Duplicate);
-        assert!([1, SIDE, SIDE + 1, 4, 5].iter().all(|&i| fates[i] == Fate::Keep), "{fates:?}");
-        assert!(view.means.iter().flatten().all(|v| v.is_finite()));
     }
 }

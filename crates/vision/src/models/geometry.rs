@@ -1,18 +1,21 @@
 //! The geometry network: it fits the photos, makes the model frame, runs a session and returns to
 //! world units.
 
-use std::sync::Arc;
-
-use ort::{session::SessionInputValue, value::TensorRef};
+use ort::session::SessionInputValue;
 
 use crate::{
     error::{Error, Result},
     models::{
         Bundle, GeometryManifest, ModelFrame, NetworkOptions, OutputFrame, Provider, Runtime,
-        bucket_for, fit, fit::FittedPhoto, pool::Pool,
+        bucket_for, fit,
+        fit::FittedPhoto,
+        pool::{Pool, fault, output, tensor},
     },
     scene::{CameraToWorld, Intrinsics, PosedPhoto, ViewGaussians},
 };
+
+/// Name of the network in messages.
+const WHAT: &str = "geometry network";
 
 /// One set of photos for the network.
 #[derive(Clone, Copy, Debug)]
@@ -33,7 +36,6 @@ pub struct Geometry {
     manifest: GeometryManifest,
     pool: Pool,
     provider: Provider,
-    _runtime: Arc<Runtime>,
 }
 
 impl Geometry {
@@ -41,14 +43,13 @@ impl Geometry {
     ///
     /// # Errors
     /// `model_unavailable` when the provider asked for is not there, or the model does not load.
-    pub fn open(runtime: Arc<Runtime>, bundle: &Bundle, options: &NetworkOptions) -> Result<Self> {
+    pub fn open(runtime: &Runtime, bundle: &Bundle, options: &NetworkOptions) -> Result<Self> {
         let manifest = bundle.geometry().clone();
-        let (pool, provider) =
-            Pool::open(&runtime, bundle, options, "geometry network", &manifest.file)?;
-        Ok(Self { manifest, pool, provider, _runtime: runtime })
+        let (pool, provider) = Pool::open(runtime, bundle, options, WHAT, &manifest.file)?;
+        Ok(Self { manifest, pool, provider })
     }
 
-    /// What the manifest says of the network.
+    /// The network's section of the manifest.
     #[must_use]
     pub fn manifest(&self) -> &GeometryManifest {
         &self.manifest
@@ -70,73 +71,44 @@ impl Geometry {
         let [height, width] = prepared.bucket;
         let count = input.views.len();
         let (h, w) = (height as usize, width as usize);
-        let neighbors_each = input.neighbors[0].len();
         let names = &self.manifest.inputs;
         let mut inputs: Vec<(&str, SessionInputValue<'_>)> = vec![
-            (&names.images, tensor(([count, 3, h, w], &prepared.images))?),
-            (&names.intrinsics, tensor(([count, 3, 3], &prepared.intrinsics))?),
-            (&names.camera_to_world, tensor(([count, 4, 4], &prepared.poses))?),
-            (&names.near, tensor(([count], &prepared.near))?),
-            (&names.far, tensor(([count], &prepared.far))?),
+            (&names.images, tensor(WHAT, &[count, 3, h, w], &prepared.images)?),
+            (&names.intrinsics, tensor(WHAT, &[count, 3, 3], &prepared.intrinsics)?),
+            (&names.camera_to_world, tensor(WHAT, &[count, 4, 4], &prepared.poses)?),
+            (&names.near, tensor(WHAT, &[count], &prepared.near)?),
+            (&names.far, tensor(WHAT, &[count], &prepared.far)?),
         ];
         if let Some(name) = &names.neighbors {
-            let view = TensorRef::from_array_view((
-                [count, neighbors_each],
-                prepared.neighbors.as_slice(),
-            ))
-            .map_err(fault("input"))?;
-            inputs.push((name, view.into()));
+            let shape = [count, input.neighbors[0].len()];
+            inputs.push((name, tensor(WHAT, &shape, &prepared.neighbors)?));
         }
         let mut session = self.pool.take();
-        let outputs = session.run(inputs).map_err(fault("run"))?;
+        let outputs = session.run(inputs).map_err(fault(WHAT, "run"))?;
         let names = &self.manifest.outputs;
-        let get = |name: &str, shape: &[usize]| -> Result<&[f32]> {
-            let value = outputs
-                .get(name)
-                .ok_or_else(|| Error::internal(format!("geometry network: no output {name:?}")))?;
-            let (found, data) = value.try_extract_tensor::<f32>().map_err(fault("output"))?;
-            let matches = found.len() == shape.len()
-                && found.iter().zip(shape).all(|(&a, &b)| usize::try_from(a) == Ok(b));
-            if !matches {
+        let get = |name: &str, tail: &[usize]| -> Result<&[f32]> {
+            let wanted = [&[count, h, w], tail].concat();
+            let (found, data) = output(WHAT, &outputs, name)?;
+            if found != wanted {
                 return Err(Error::internal(format!(
-                    "geometry network: output {name:?} is {found:?}, not {shape:?}"
+                    "{WHAT}: output {name:?} is {found:?}, not {wanted:?}"
                 )));
             }
             Ok(data)
         };
         let sh_count = (usize::from(self.manifest.sh_degree) + 1).pow(2);
-        let arrays = Arrays {
-            means: get(&names.means, &[count, h, w, 3])?,
-            scales: get(&names.scales, &[count, h, w, 3])?,
-            quats: get(&names.quats, &[count, h, w, 4])?,
-            opacities: get(&names.opacities, &[count, h, w])?,
-            sh: get(&names.sh, &[count, h, w, sh_count, 3])?,
-            confidence: match &names.confidence {
-                Some(name) => Some(get(name, &[count, h, w])?),
-                None => None,
-            },
-        };
-        Ok(self.to_views(input, prepared, &arrays))
-    }
+        let (means, scales) = (get(&names.means, &[3])?, get(&names.scales, &[3])?);
+        let (quats, opacities) = (get(&names.quats, &[4])?, get(&names.opacities, &[])?);
+        let sh = get(&names.sh, &[sh_count, 3])?;
+        let confidence = names.confidence.as_ref().map(|name| get(name, &[])).transpose()?;
 
-    fn to_views(
-        &self,
-        input: &GeometryInput<'_>,
-        prepared: Prepared,
-        arrays: &Arrays<'_>,
-    ) -> Vec<ViewGaussians> {
-        let pixels = (prepared.bucket[0] * prepared.bucket[1]) as usize;
-        #[expect(clippy::cast_possible_truncation, reason = "network outputs are f32")]
-        let unit = prepared.frame.unit() as f32;
-        let sh_count = arrays.sh.len() / (arrays.opacities.len() * 3).max(1);
-        let scaled = |data: &[f32], v: usize| -> Vec<[f32; 3]> {
-            chunks::<3>(&data[v * pixels * 3..(v + 1) * pixels * 3])
-                .map(|row| row.map(|x| x * unit))
-                .collect()
-        };
+        let pixels = h * w;
+        let unit = narrow(prepared.frame.unit());
         let views = input.views.iter().zip(prepared.fitted).enumerate();
-        views
-            .map(|(v, (&photo, fitted))| ViewGaussians {
+        let view = |(v, (&photo, fitted)): (usize, (&usize, FittedPhoto))| {
+            let part = |data, each| part_of(data, v, pixels * each);
+            let scaled = |data| chunks(part(data, 3)).map(|row| row.map(|x| x * unit)).collect();
+            ViewGaussians {
                 photo: u16::try_from(photo).unwrap_or(u16::MAX),
                 camera: fitted.camera,
                 frame_to_world: match self.manifest.output_frame {
@@ -144,27 +116,25 @@ impl Geometry {
                     OutputFrame::Model => prepared.frame.pose(),
                 },
                 near_far: input.near_far[photo],
-                means: scaled(arrays.means, v),
-                scales: scaled(arrays.scales, v),
-                quats: chunks(&arrays.quats[v * pixels * 4..(v + 1) * pixels * 4]).collect(),
-                opacities: arrays.opacities[v * pixels..(v + 1) * pixels].to_vec(),
+                means: scaled(means),
+                scales: scaled(scales),
+                quats: chunks(part(quats, 4)).collect(),
+                opacities: part(opacities, 1).to_vec(),
                 sh_degree: self.manifest.sh_degree,
-                sh: chunks(&arrays.sh[v * pixels * sh_count * 3..(v + 1) * pixels * sh_count * 3])
-                    .collect(),
-                confidence: match arrays.confidence {
-                    Some(all) => all[v * pixels..(v + 1) * pixels].to_vec(),
-                    None => vec![1.0; pixels],
-                },
+                sh: chunks(part(sh, sh_count * 3)).collect(),
+                confidence: confidence
+                    .map_or_else(|| vec![1.0; pixels], |all| part(all, 1).to_vec()),
                 valid: fitted.valid,
-            })
-            .collect()
+            }
+        };
+        Ok(views.map(view).collect())
     }
 
     fn prepare(&self, input: &GeometryInput<'_>) -> Result<Prepared> {
         let (count, manifest) = (input.views.len(), &self.manifest);
         if count < manifest.views_min || count > manifest.views_max {
             return Err(Error::internal(format!(
-                "geometry network: {count} views, outside {} to {}",
+                "{WHAT}: {count} views, outside {} to {}",
                 manifest.views_min, manifest.views_max
             )));
         }
@@ -176,13 +146,13 @@ impl Geometry {
             || !input.neighbors.iter().all(fits)
         {
             return Err(Error::internal(format!(
-                "geometry network: neighbours {:?} do not fit {count} views",
+                "{WHAT}: neighbours {:?} do not fit {count} views",
                 input.neighbors
             )));
         }
         if input.views.iter().any(|&v| v >= input.photos.len() || v >= input.near_far.len()) {
             return Err(Error::internal(format!(
-                "geometry network: views {:?} of {} photos",
+                "{WHAT}: views {:?} of {} photos",
                 input.views,
                 input.photos.len()
             )));
@@ -190,7 +160,7 @@ impl Geometry {
         let lenses: Vec<Intrinsics> =
             input.views.iter().map(|&v| input.photos[v].camera.intrinsics).collect();
         let bucket = bucket_for(&lenses, &manifest.buckets)
-            .ok_or_else(|| Error::internal("geometry network: no buckets"))?;
+            .ok_or_else(|| Error::internal(format!("{WHAT}: no buckets")))?;
         let fitted: Vec<FittedPhoto> = input
             .views
             .iter()
@@ -237,15 +207,6 @@ struct Prepared {
     neighbors: Vec<i64>,
 }
 
-struct Arrays<'a> {
-    means: &'a [f32],
-    scales: &'a [f32],
-    quats: &'a [f32],
-    opacities: &'a [f32],
-    sh: &'a [f32],
-    confidence: Option<&'a [f32]>,
-}
-
 /// `[V, 3, H, W]`, normalised as the manifest says.
 fn images(fitted: &[FittedPhoto], manifest: &GeometryManifest) -> Vec<f32> {
     let mut images = Vec::with_capacity(fitted.iter().map(|view| view.rgb.len()).sum());
@@ -270,20 +231,11 @@ fn narrow(value: f64) -> f32 {
     value as f32
 }
 
+/// The numbers of view `v`, of which each has `count`.
+fn part_of(data: &[f32], v: usize, count: usize) -> &[f32] {
+    &data[v * count..(v + 1) * count]
+}
+
 fn chunks<const N: usize>(data: &[f32]) -> impl Iterator<Item = [f32; N]> + '_ {
-    data.chunks_exact(N).map(|row| {
-        let mut out = [0.0; N];
-        out.copy_from_slice(row);
-        out
-    })
-}
-
-fn tensor<'a, const N: usize>(
-    (shape, data): ([usize; N], &'a [f32]),
-) -> Result<SessionInputValue<'a>> {
-    Ok(TensorRef::from_array_view((shape, data)).map_err(fault("input"))?.into())
-}
-
-fn fault(what: &'static str) -> impl Fn(ort::Error) -> Error {
-    move |e| Error::internal(format!("geometry network: {what} failed")).caused_by(e)
+    data.as_chunks::<N>().0.iter().copied()
 }

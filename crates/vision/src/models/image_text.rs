@@ -1,19 +1,24 @@
 //! The image tower and the text tower: crops and texts to embeddings of length 1 in one space.
 
-use std::{collections::BTreeMap, sync::Arc};
+use std::collections::BTreeMap;
 
-use ort::{session::SessionInputValue, value::TensorRef};
+use ort::session::SessionOutputs;
 use tokenizers::Tokenizer;
 
 use crate::{
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
     models::{
         Bundle, ImageTextManifest, NetworkOptions, Provider, Runtime,
-        pool::{Pool, input_shape},
+        manifest::unavailable,
+        pool::{Pool, fault, fixed, input_shape, output, tensor},
         resize::{planes, resize},
     },
     scene::{Crop, TextEmbedding},
 };
+
+/// Names of the two files in messages.
+const IMAGE: &str = "image tower";
+const TEXT: &str = "text tower";
 
 /// Image and text tower, ready to run from any thread.
 #[derive(Debug)]
@@ -30,7 +35,6 @@ pub struct ImageText {
     /// Texts a run of the text tower, where its file fixes them.
     texts: Option<usize>,
     provider: Provider,
-    _runtime: Arc<Runtime>,
 }
 
 /// Texts a run of the text tower where its file leaves that free.
@@ -53,34 +57,32 @@ impl ImageText {
     /// # Errors
     /// `model_unavailable` when the provider asked for is not there, or a file does not load.
     pub fn open(
-        runtime: Arc<Runtime>,
+        runtime: &Runtime,
         bundle: &Bundle,
         options: &NetworkOptions,
     ) -> Result<Option<Self>> {
         let Some(manifest) = bundle.image_text().cloned() else { return Ok(None) };
-        let open = |what, file: &str| Pool::open(&runtime, bundle, options, what, file);
-        let (image, provider) = open("image tower", &manifest.image.file)?;
-        let (text, _) = open("text tower", &manifest.text.file)?;
-        let named = &manifest.text.tokenizer;
-        let tokenizer = read_tokenizer(bundle, named)?;
-        let free = |n: &i64| usize::try_from(*n).ok().filter(|&n| n > 0);
+        let open = |what, file: &str| Pool::open(runtime, bundle, options, what, file);
+        let (image, provider) = open(IMAGE, &manifest.image.file)?;
+        let (text, _) = open(TEXT, &manifest.text.file)?;
+        let tokenizer = read_tokenizer(bundle, &manifest.text.tokenizer)?;
+        let size = |shape: &[i64], axis: usize| shape.get(axis).copied().and_then(fixed);
         let pictures = input_shape(&image.take(), &manifest.image.input).unwrap_or_default();
         let ids = input_shape(&text.take(), &manifest.text.input_ids).unwrap_or_default();
         Ok(Some(Self {
-            crops: pictures.first().and_then(free),
-            tokens: ids.get(1).and_then(free),
-            texts: ids.first().and_then(free),
+            crops: size(&pictures, 0),
+            tokens: size(&ids, 1),
+            texts: size(&ids, 0),
             unknown: tokenizer.token_to_id(&manifest.text.unknown),
             manifest,
             image,
             text,
             tokenizer,
             provider,
-            _runtime: runtime,
         }))
     }
 
-    /// What the manifest says of the towers.
+    /// The section of the manifest.
     #[must_use]
     pub fn manifest(&self) -> &ImageTextManifest {
         &self.manifest
@@ -102,20 +104,19 @@ impl ImageText {
         let mut rows = Vec::with_capacity(crops.len() * self.manifest.dim);
         for batch in crops.chunks(self.crops.unwrap_or(tower.batch)) {
             // A file of fixed batch gets its last one filled up.
-            let fixed = self.crops.unwrap_or(batch.len());
-            let mut images = Vec::with_capacity(fixed * 3 * side * side);
+            let count = self.crops.unwrap_or(batch.len());
+            let mut images = Vec::with_capacity(count * 3 * side * side);
             for crop in batch {
                 let from = [crop.side as usize; 2];
                 let pixels = resize(&crop.rgb, from, [side; 2]);
                 images.extend(planes(&pixels, [side; 2], side, tower.mean, tower.std));
             }
-            images.resize(fixed * 3 * side * side, 0.0);
-            let input = TensorRef::from_array_view(([fixed, 3, side, side], images.as_slice()))
-                .map_err(fault("image tower"))?;
-            let inputs = vec![(tower.input.as_str(), SessionInputValue::from(input))];
+            images.resize(count * 3 * side * side, 0.0);
+            let input = tensor(IMAGE, &[count, 3, side, side], &images)?;
             let mut session = self.image.take();
-            let outputs = session.run(inputs).map_err(fault("image tower"))?;
-            let found = self.rows(outputs.get(&tower.output), fixed, "image tower")?;
+            let outputs = session.run(vec![(tower.input.as_str(), input)]);
+            let outputs = outputs.map_err(fault(IMAGE, "run"))?;
+            let found = self.rows(&outputs, &tower.output, count, IMAGE)?;
             rows.extend(found.into_iter().take(batch.len() * self.manifest.dim));
         }
         Ok(rows)
@@ -201,17 +202,13 @@ impl ImageText {
             ids = ids.into_iter().cycle().take(count * length).collect();
             there = there.into_iter().cycle().take(count * length).collect();
         }
-        let view = |data| {
-            let input = TensorRef::from_array_view(([count, length], data));
-            Ok::<_, Error>(SessionInputValue::from(input.map_err(fault("text tower"))?))
-        };
-        let mut inputs = vec![(tower.input_ids.as_str(), view(ids.as_slice())?)];
+        let mut inputs = vec![(tower.input_ids.as_str(), tensor(TEXT, &[count, length], &ids)?)];
         if let Some(name) = &tower.attention_mask {
-            inputs.push((name, view(there.as_slice())?));
+            inputs.push((name, tensor(TEXT, &[count, length], &there)?));
         }
         let mut session = self.text.take();
-        let outputs = session.run(inputs).map_err(fault("text tower"))?;
-        self.rows(outputs.get(&tower.output), count, "text tower")
+        let outputs = session.run(inputs).map_err(fault(TEXT, "run"))?;
+        self.rows(&outputs, &tower.output, count, TEXT)
     }
 
     /// Id that fills up a text.
@@ -222,15 +219,15 @@ impl ImageText {
     /// Rows of an output, made unit length in f64.
     fn rows(
         &self,
-        value: Option<&ort::value::DynValue>,
+        outputs: &SessionOutputs<'_>,
+        name: &str,
         count: usize,
-        what: &'static str,
+        what: &str,
     ) -> Result<Vec<f32>> {
         let dim = self.manifest.dim;
-        let value = value.ok_or_else(|| Error::internal(format!("{what}: no such output")))?;
-        let (shape, data) = value.try_extract_tensor::<f32>().map_err(fault(what))?;
-        let wanted = [count, dim].map(|n| i64::try_from(n).unwrap_or(-1));
-        if shape.iter().ne(&wanted) {
+        let (shape, data) = output(what, outputs, name)?;
+        let wanted = [count, dim];
+        if shape != wanted {
             return Err(Error::internal(format!("{what}: output is {shape:?}, not {wanted:?}")));
         }
         let mut rows = data.to_vec();
@@ -250,14 +247,9 @@ impl ImageText {
 
 /// The tokenizer's file, whose own truncation and padding are switched off: both are done here.
 fn read_tokenizer(bundle: &Bundle, named: &str) -> Result<Tokenizer> {
-    let unavailable =
-        |why: String| Error::new(ErrorCode::ModelUnavailable, format!("{named}: {why}"));
-    let bytes = fs_err::read(bundle.path(named)).map_err(|e| unavailable(e.kind().to_string()))?;
-    let mut tokenizer = Tokenizer::from_bytes(&bytes).map_err(|e| unavailable(e.to_string()))?;
-    tokenizer.with_truncation(None).map_err(|e| unavailable(e.to_string()))?;
+    let refused = |why: String| unavailable(format!("{named}: {why}"));
+    let bytes = fs_err::read(bundle.path(named)).map_err(|e| refused(e.kind().to_string()))?;
+    let mut tokenizer = Tokenizer::from_bytes(&bytes).map_err(|e| refused(e.to_string()))?;
+    tokenizer.with_truncation(None).map_err(|e| refused(e.to_string()))?;
     Ok(tokenizer)
-}
-
-fn fault(what: &'static str) -> impl Fn(ort::Error) -> Error {
-    move |e| Error::internal(format!("{what} failed")).caused_by(e)
 }

@@ -1,7 +1,11 @@
 //! The sections of `bundle.toml`: the geometry network, the mask network, the image and text
 //! towers. `models/README.md` lists every key. A bundle without the last two has no semantics.
 
-use std::path::Path;
+use std::{
+    fmt::{Debug, Display},
+    ops::RangeInclusive,
+    path::Path,
+};
 
 use serde::Deserialize;
 
@@ -79,7 +83,7 @@ pub struct GeometryOutputs {
     pub confidence: Option<String>,
 }
 
-/// What `bundle.toml` says of the geometry network.
+/// The geometry network in `bundle.toml`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct GeometryManifest {
@@ -118,32 +122,23 @@ pub struct GeometryManifest {
 impl GeometryManifest {
     pub(super) fn validate(&self) -> Result<()> {
         check_file("geometry", &self.file, &self.sha256)?;
-        let wrong =
-            |what: String| Err(unavailable(format!("model bundle: {MANIFEST}: geometry.{what}")));
         let bad = |side: &u32| !(1..=BUCKET_SIDE_MAX).contains(side);
         if self.buckets.is_empty() || self.buckets.iter().flatten().any(bad) {
-            return wrong(format!(
-                "buckets is {:?}; it must hold [height, width] pairs of 1 to {BUCKET_SIDE_MAX}",
-                self.buckets
-            ));
+            let must = format!("hold [height, width] pairs of 1 to {BUCKET_SIDE_MAX}");
+            return wrong("geometry.buckets", &self.buckets, &must);
         }
         if self.views_min < 1 || self.views_max < self.views_min || self.views_max < 2 {
-            return wrong(format!(
-                "views_min {} and views_max {} must be in order, and views_max at least 2",
+            return Err(unavailable(format!(
+                "model bundle: {MANIFEST}: geometry.views_min {} and views_max {} must be in \
+                 order, and views_max at least 2",
                 self.views_min, self.views_max
-            ));
+            )));
         }
         if self.neighbors_max < 1 {
-            return wrong("neighbors_max is 0; it must be at least 1".to_owned());
+            return wrong("geometry.neighbors_max", &self.neighbors_max, "be at least 1");
         }
-        if self.sh_degree > 3 {
-            return wrong(format!("sh_degree is {}; it must be 0 to 3", self.sh_degree));
-        }
-        if self.std.iter().any(|v| v.is_nan() || *v <= 0.0) || self.mean.iter().any(|v| v.is_nan())
-        {
-            return wrong("mean must be numbers and std numbers over 0".to_owned());
-        }
-        Ok(())
+        check_range("geometry.sh_degree", self.sh_degree, 0..=3)?;
+        check_channels("geometry", self.mean, self.std)
     }
 }
 
@@ -158,7 +153,7 @@ pub enum MaskAdapter {
     EfficientSam,
 }
 
-/// What `bundle.toml` says of the mask network.
+/// The mask network in `bundle.toml`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MasksManifest {
@@ -258,7 +253,7 @@ pub struct MaskDecoderManifest {
     pub iou_predictions: String,
 }
 
-/// What `bundle.toml` says of the pair of an image and a text tower.
+/// The pair of an image and a text tower in `bundle.toml`.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ImageTextManifest {
@@ -332,61 +327,34 @@ pub struct TextTowerManifest {
     pub output: String,
 }
 
+/// Declares a function for each default value, as serde wants them.
+macro_rules! defaults {
+    ($($name:ident: $kind:ty = $value:expr;)*) => {
+        $(pub(super) fn $name() -> $kind { $value.into() })*
+    };
+}
+
 /// SAM's names, and the numbers that most bundles use.
 mod defaults {
-    pub(super) fn points_per_side() -> u32 {
-        32
-    }
-    pub(super) fn points_per_batch() -> u32 {
-        64
-    }
-    pub(super) fn pred_iou_thresh() -> f32 {
-        0.8
-    }
-    pub(super) fn stability_score_thresh() -> f32 {
-        0.9
-    }
-    pub(super) fn stability_score_offset() -> f32 {
-        1.0
-    }
-    pub(super) fn nms_thresh() -> f32 {
-        0.7
-    }
-    pub(super) fn min_area() -> f64 {
-        0.0005
-    }
-    pub(super) fn coverage_floor() -> f32 {
-        0.05
-    }
-    pub(super) fn batch() -> usize {
-        16
-    }
-    pub(super) fn image_embeddings() -> String {
-        "image_embeddings".to_owned()
-    }
-    pub(super) fn point_coords() -> String {
-        "point_coords".to_owned()
-    }
-    pub(super) fn point_labels() -> String {
-        "point_labels".to_owned()
-    }
-    pub(super) fn mask_input() -> String {
-        "mask_input".to_owned()
-    }
-    pub(super) fn has_mask_input() -> String {
-        "has_mask_input".to_owned()
-    }
-    pub(super) fn orig_im_size() -> String {
-        "orig_im_size".to_owned()
-    }
-    pub(super) fn low_res_masks() -> String {
-        "low_res_masks".to_owned()
-    }
-    pub(super) fn iou_predictions() -> String {
-        "iou_predictions".to_owned()
-    }
-    pub(super) fn unknown() -> String {
-        "[UNK]".to_owned()
+    defaults! {
+        points_per_side: u32 = 32_u32;
+        points_per_batch: u32 = 64_u32;
+        pred_iou_thresh: f32 = 0.8_f32;
+        stability_score_thresh: f32 = 0.9_f32;
+        stability_score_offset: f32 = 1.0_f32;
+        nms_thresh: f32 = 0.7_f32;
+        min_area: f64 = 0.0005;
+        coverage_floor: f32 = 0.05_f32;
+        batch: usize = 16_usize;
+        image_embeddings: String = "image_embeddings";
+        point_coords: String = "point_coords";
+        point_labels: String = "point_labels";
+        mask_input: String = "mask_input";
+        has_mask_input: String = "has_mask_input";
+        orig_im_size: String = "orig_im_size";
+        low_res_masks: String = "low_res_masks";
+        iou_predictions: String = "iou_predictions";
+        unknown: String = "[UNK]";
     }
 }
 
@@ -396,7 +364,7 @@ pub(super) fn unavailable(message: impl Into<String>) -> Error {
 }
 
 /// Fails with the manifest's name, the key and what it must be.
-fn wrong<T>(key: &str, value: &dyn std::fmt::Debug, must: &str) -> Result<T> {
+fn wrong<T>(key: &str, value: &dyn Debug, must: &str) -> Result<T> {
     Err(unavailable(format!("model bundle: {MANIFEST}: {key} is {value:?}; it must {must}")))
 }
 
@@ -411,11 +379,20 @@ fn check_file(section: &str, file: &str, sha256: &str) -> Result<()> {
     Ok(())
 }
 
-/// A side in pixels and the normalisation of its channels.
-fn check_picture(section: &str, size: u32, mean: [f32; 3], std: [f32; 3]) -> Result<()> {
-    if !(1..=BUCKET_SIDE_MAX).contains(&size) {
-        return wrong(&format!("{section}.size"), &size, &format!("be 1 to {BUCKET_SIDE_MAX}"));
+/// A number between two bounds, both included.
+fn check_range<T: Copy + PartialOrd + Debug + Display>(
+    key: &str,
+    value: T,
+    range: RangeInclusive<T>,
+) -> Result<()> {
+    if range.contains(&value) {
+        return Ok(());
     }
+    wrong(key, &value, &format!("be {} to {}", range.start(), range.end()))
+}
+
+/// The normalisation of channels.
+fn check_channels(section: &str, mean: [f32; 3], std: [f32; 3]) -> Result<()> {
     if mean.iter().any(|v| !v.is_finite()) {
         return wrong(&format!("{section}.mean"), &mean, "hold numbers");
     }
@@ -429,34 +406,17 @@ impl MasksManifest {
     pub(super) fn validate(&self) -> Result<()> {
         check_file("masks.encoder", &self.encoder.file, &self.encoder.sha256)?;
         check_file("masks.decoder", &self.decoder.file, &self.decoder.sha256)?;
-        check_picture("masks", self.size, self.mean, self.std)?;
+        check_range("masks.size", self.size, 1..=BUCKET_SIDE_MAX)?;
+        check_channels("masks", self.mean, self.std)?;
         if self.levels.is_empty() || self.levels.iter().any(|&level| level > 15) {
             return wrong("masks.levels", &self.levels, "hold 1 or more of 0 to 15");
         }
-        if !(1..=POINTS_PER_SIDE_MAX).contains(&self.points_per_side) {
-            return wrong(
-                "masks.points_per_side",
-                &self.points_per_side,
-                &format!("be 1 to {POINTS_PER_SIDE_MAX}"),
-            );
-        }
-        if !(1..=POINTS_PER_BATCH_MAX).contains(&self.points_per_batch) {
-            return wrong(
-                "masks.points_per_batch",
-                &self.points_per_batch,
-                &format!("be 1 to {POINTS_PER_BATCH_MAX}"),
-            );
-        }
-        for (key, value) in [
-            ("masks.pred_iou_thresh", self.pred_iou_thresh),
-            ("masks.stability_score_thresh", self.stability_score_thresh),
-            ("masks.box_nms_thresh", self.box_nms_thresh),
-            ("masks.mask_nms_thresh", self.mask_nms_thresh),
-        ] {
-            if !(0.0..=1.0).contains(&value) {
-                return wrong(key, &value, "be 0 to 1");
-            }
-        }
+        check_range("masks.points_per_side", self.points_per_side, 1..=POINTS_PER_SIDE_MAX)?;
+        check_range("masks.points_per_batch", self.points_per_batch, 1..=POINTS_PER_BATCH_MAX)?;
+        check_range("masks.pred_iou_thresh", self.pred_iou_thresh, 0.0..=1.0)?;
+        check_range("masks.stability_score_thresh", self.stability_score_thresh, 0.0..=1.0)?;
+        check_range("masks.box_nms_thresh", self.box_nms_thresh, 0.0..=1.0)?;
+        check_range("masks.mask_nms_thresh", self.mask_nms_thresh, 0.0..=1.0)?;
         if !self.stability_score_offset.is_finite() || self.stability_score_offset < 0.0 {
             return wrong("masks.stability_score_offset", &self.stability_score_offset, "be >= 0");
         }
@@ -469,39 +429,22 @@ impl MasksManifest {
 
 impl ImageTextManifest {
     pub(super) fn validate(&self) -> Result<()> {
-        check_file("image_text.image", &self.image.file, &self.image.sha256)?;
-        check_file("image_text.text", &self.text.file, &self.text.sha256)?;
-        check_file("image_text.text.tokenizer", &self.text.tokenizer, &self.text.tokenizer_sha256)?;
-        check_picture("image_text.image", self.image.size, self.image.mean, self.image.std)?;
-        if !(1..=DIM_MAX).contains(&self.dim) {
-            return wrong("image_text.dim", &self.dim, &format!("be 1 to {DIM_MAX}"));
-        }
+        let (image, text) = (&self.image, &self.text);
+        check_file("image_text.image", &image.file, &image.sha256)?;
+        check_file("image_text.text", &text.file, &text.sha256)?;
+        check_file("image_text.text.tokenizer", &text.tokenizer, &text.tokenizer_sha256)?;
+        check_range("image_text.image.size", image.size, 1..=BUCKET_SIDE_MAX)?;
+        check_channels("image_text.image", image.mean, image.std)?;
+        check_range("image_text.dim", self.dim, 1..=DIM_MAX)?;
         if !self.tau.is_finite() || self.tau <= 0.0 {
             return wrong("image_text.tau", &self.tau, "be a number over 0");
         }
         if self.canon.is_empty() || self.canon.iter().any(|phrase| phrase.trim().is_empty()) {
             return wrong("image_text.canon", &self.canon, "hold 1 or more phrases");
         }
-        if !(0.0..=1.0).contains(&self.coverage_floor) {
-            return wrong("image_text.coverage_floor", &self.coverage_floor, "be 0 to 1");
-        }
-        if !(0.0..=4.0).contains(&self.image.crop_margin) {
-            return wrong("image_text.image.crop_margin", &self.image.crop_margin, "be 0 to 4");
-        }
-        if !(1..=BATCH_MAX).contains(&self.image.batch) {
-            return wrong(
-                "image_text.image.batch",
-                &self.image.batch,
-                &format!("be 1 to {BATCH_MAX}"),
-            );
-        }
-        if !(1..=CONTEXT_MAX).contains(&self.text.context) {
-            return wrong(
-                "image_text.text.context",
-                &self.text.context,
-                &format!("be 1 to {CONTEXT_MAX}"),
-            );
-        }
-        Ok(())
+        check_range("image_text.coverage_floor", self.coverage_floor, 0.0..=1.0)?;
+        check_range("image_text.image.crop_margin", image.crop_margin, 0.0..=4.0)?;
+        check_range("image_text.image.batch", image.batch, 1..=BATCH_MAX)?;
+        check_range("image_text.text.context", text.context, 1..=CONTEXT_MAX)
     }
 }

@@ -3,24 +3,26 @@
 //! The manifest's `adapter` names one of two signatures. The inputs of a file (a batch of prompts
 //! or one, a former mask, the photo's size) are read from the file itself.
 
-use std::sync::Arc;
-
 use ort::{
     session::{Session, SessionInputValue},
-    value::{TensorElementType, TensorRef, ValueType},
+    value::{TensorElementType, ValueType},
 };
 
 use crate::{
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
     models::{
-        Bundle, MaskAdapter, MasksManifest, NetworkOptions, Provider, Runtime,
-        pool::{Pool, input_shape},
+        Bundle, MaskAdapter, MasksManifest, NetworkOptions, Runtime,
+        manifest::unavailable,
+        pool::{Pool, fault, fixed, input_shape, output, tensor},
         resize::{planes, resize},
     },
     scene::{MaskLogits, Photo},
 };
 
-/// Side of the logits asked of an `efficient_sam` decoder: what it computes, before it enlarges.
+/// Names of the two files in messages.
+const ENCODER: &str = "mask encoder";
+const DECODER: &str = "mask decoder";
+/// Side of the logits of an `efficient_sam` decoder, before it enlarges them.
 const EFFICIENT_SAM_LOGITS: u32 = 256;
 
 /// The network, ready to run from any thread.
@@ -30,8 +32,6 @@ pub struct MaskNetwork {
     encoder: Pool,
     decoder: Pool,
     takes: Takes,
-    provider: Provider,
-    _runtime: Arc<Runtime>,
 }
 
 /// A photo as the encoder saw it.
@@ -47,7 +47,7 @@ pub struct PhotoEmbedding {
 struct Takes {
     /// Prompts a run.
     batch: usize,
-    /// Points a prompt: the one asked for, then padding.
+    /// Points of a prompt: the prompt itself, then padding.
     points: usize,
     /// Shape of the former mask, where there is such an input.
     mask: Option<Vec<usize>>,
@@ -71,35 +71,24 @@ impl MaskNetwork {
     /// `model_unavailable` when the provider asked for is not there, a file does not load, or its
     /// inputs are not those of the manifest.
     pub fn open(
-        runtime: Arc<Runtime>,
+        runtime: &Runtime,
         bundle: &Bundle,
         options: &NetworkOptions,
     ) -> Result<Option<Self>> {
         let Some(manifest) = bundle.masks().cloned() else { return Ok(None) };
-        let (encoder, provider) =
-            Pool::open(&runtime, bundle, options, "mask encoder", &manifest.encoder.file)?;
-        let (decoder, _) =
-            Pool::open(&runtime, bundle, options, "mask decoder", &manifest.decoder.file)?;
+        let open = |what, file: &str| -> Result<Pool> {
+            Ok(Pool::open(runtime, bundle, options, what, file)?.0)
+        };
+        let encoder = open(ENCODER, &manifest.encoder.file)?;
+        let decoder = open(DECODER, &manifest.decoder.file)?;
         let takes = Takes::of(&decoder.take(), &manifest)?;
-        Ok(Some(Self { manifest, encoder, decoder, takes, provider, _runtime: runtime }))
+        Ok(Some(Self { manifest, encoder, decoder, takes }))
     }
 
-    /// What the manifest says of the network.
+    /// The network's section of the manifest.
     #[must_use]
     pub fn manifest(&self) -> &MasksManifest {
         &self.manifest
-    }
-
-    /// What computes it.
-    #[must_use]
-    pub fn provider(&self) -> Provider {
-        self.provider
-    }
-
-    /// Prompts in one run of the decoder.
-    #[must_use]
-    pub fn batch(&self) -> usize {
-        self.takes.batch
     }
 
     /// Runs the encoder.
@@ -117,21 +106,15 @@ impl MaskNetwork {
             resize(&photo.rgb, [photo.width as usize, photo.height as usize], [width, height]);
         let side = side as usize;
         let image = planes(&pixels, [width, height], side, m.mean, m.std);
-        let input = TensorRef::from_array_view(([1, 3, side, side], image.as_slice()))
-            .map_err(fault("encoder input"))?;
+        let input = tensor(ENCODER, &[1, 3, side, side], &image)?;
         let mut session = self.encoder.take();
-        let inputs = vec![(m.encoder.input.as_str(), SessionInputValue::from(input))];
-        let outputs = session.run(inputs).map_err(fault("encoder run"))?;
+        let inputs = vec![(m.encoder.input.as_str(), input)];
+        let outputs = session.run(inputs).map_err(fault(ENCODER, "run"))?;
         let main = (&m.encoder.output, &m.decoder.image_embeddings);
         let names = [main].into_iter().chain(m.encoder.features.iter().map(|name| (name, name)));
         let mut tensors = Vec::new();
         for (from, to) in names {
-            let value = outputs
-                .get(from)
-                .ok_or_else(|| Error::internal(format!("mask encoder: no output {from:?}")))?;
-            let (shape, data) =
-                value.try_extract_tensor::<f32>().map_err(fault("encoder output"))?;
-            let shape = shape.iter().map(|&n| usize::try_from(n).unwrap_or(0)).collect();
+            let (shape, data) = output(ENCODER, &outputs, from)?;
             tensors.push((to.clone(), shape, data.to_vec()));
         }
         Ok(PhotoEmbedding { resized, tensors })
@@ -175,43 +158,42 @@ impl MaskNetwork {
         }
         let mut inputs: Vec<(&str, SessionInputValue<'_>)> = Vec::new();
         for (name, shape, data) in &embedding.tensors {
-            inputs.push((name, tensor(shape, data)?));
+            inputs.push((name, tensor(DECODER, shape, data)?));
         }
         let lead: &[usize] = if efficient { &[1] } else { &[] };
-        inputs.push((&names.point_coords, tensor(&[lead, &[count, each, 2]].concat(), &coords)?));
-        inputs.push((&names.point_labels, tensor(&[lead, &[count, each]].concat(), &labels)?));
-        let mask = vec![0.0; takes.mask.iter().flatten().product()];
+        inputs.push((
+            &names.point_coords,
+            tensor(DECODER, &[lead, &[count, each, 2]].concat(), &coords)?,
+        ));
+        inputs.push((
+            &names.point_labels,
+            tensor(DECODER, &[lead, &[count, each]].concat(), &labels)?,
+        ));
+        let mask = vec![0.0_f32; takes.mask.iter().flatten().product()];
         if let Some(shape) = &takes.mask {
-            inputs.push((&names.mask_input, tensor(shape, &mask)?));
+            inputs.push((&names.mask_input, tensor(DECODER, shape, &mask)?));
         }
         if takes.has_mask {
-            inputs.push((&names.has_mask_input, tensor(&[1], &[0.0])?));
+            inputs.push((&names.has_mask_input, tensor(DECODER, &[1], &[0.0_f32])?));
         }
-        // SAM's decoder enlarges to this size what nobody reads: the smallest will do.
+        // SAM's decoder enlarges its masks to this size. Nobody reads these, so it is the smallest.
         let size = if efficient { frame } else { [1, 1] };
         let (floats, ints) = (size.map(|v| v as f32), size.map(i64::from));
         match takes.size {
             Some(TensorElementType::Int64) => {
-                let view = TensorRef::from_array_view(([2], ints.as_slice()));
-                inputs.push((&names.orig_im_size, view.map_err(fault("decoder input"))?.into()));
+                inputs.push((&names.orig_im_size, tensor(DECODER, &[2], &ints)?));
             }
-            Some(_) => inputs.push((&names.orig_im_size, tensor(&[2], &floats)?)),
+            Some(_) => inputs.push((&names.orig_im_size, tensor(DECODER, &[2], &floats)?)),
             None => {}
         }
         let mut session = self.decoder.take();
-        let outputs = session.run(inputs).map_err(fault("decoder run"))?;
+        let outputs = session.run(inputs).map_err(fault(DECODER, "run"))?;
         let get = |name: &str, tail: usize| -> Result<(Vec<usize>, &[f32])> {
-            let value = outputs
-                .get(name)
-                .ok_or_else(|| Error::internal(format!("mask decoder: no output {name:?}")))?;
-            let (shape, data) =
-                value.try_extract_tensor::<f32>().map_err(fault("decoder output"))?;
-            let shape: Vec<usize> =
-                shape.iter().map(|&n| usize::try_from(n).unwrap_or(0)).collect();
+            let (shape, data) = output(DECODER, &outputs, name)?;
             let wanted = [lead, &[count]].concat();
             if shape.len() != wanted.len() + tail || shape[..wanted.len()] != wanted {
                 return Err(Error::internal(format!(
-                    "mask decoder: output {name:?} is {shape:?} for {count} prompts"
+                    "{DECODER}: output {name:?} is {shape:?} for {count} prompts"
                 )));
             }
             Ok((shape[wanted.len()..].to_vec(), data))
@@ -223,7 +205,7 @@ impl MaskNetwork {
         let fits = found[0] == kinds && levels.iter().all(|&level| level < kinds);
         if !fits || (all.grid != grid && all.grid != [0, 0]) || grid.contains(&0) {
             return Err(Error::internal(format!(
-                "mask decoder: masks are {shape:?} and IoUs {found:?}, with levels {levels:?}"
+                "{DECODER}: masks are {shape:?} and IoUs {found:?}, with levels {levels:?}"
             )));
         }
         all.grid = grid;
@@ -243,29 +225,25 @@ impl Takes {
     /// Reads the inputs of the decoder's file.
     fn of(session: &Session, manifest: &MasksManifest) -> Result<Self> {
         let names = &manifest.decoder;
-        let free = |n: i64| usize::try_from(n).ok().filter(|&n| n > 0);
         let wanted = if manifest.adapter == MaskAdapter::EfficientSam { 4 } else { 3 };
         let coords = input_shape(session, &names.point_coords).unwrap_or_default();
         if coords.len() != wanted {
-            return Err(Error::new(
-                ErrorCode::ModelUnavailable,
-                format!(
-                    "mask decoder: input {:?} of {} has {} dimensions, not {wanted}",
-                    names.point_coords,
-                    names.file,
-                    coords.len()
-                ),
-            ));
+            return Err(unavailable(format!(
+                "{DECODER}: input {:?} of {} has {} dimensions, not {wanted}",
+                names.point_coords,
+                names.file,
+                coords.len()
+            )));
         }
-        // A padding point follows the one asked for, as SAM's own code adds one where no box is
-        // given; EfficientSAM pads by itself.
-        let points = free(coords[wanted - 2]).unwrap_or(if wanted == 4 { 1 } else { 2 });
+        // A padding point follows the prompt, as SAM's own code adds one where there is no box.
+        // EfficientSAM pads by itself.
+        let points = fixed(coords[wanted - 2]).unwrap_or(if wanted == 4 { 1 } else { 2 });
         let most = manifest.points_per_batch as usize;
         Ok(Self {
-            batch: free(coords[wanted - 3]).map_or(most, |fixed| fixed.min(most)),
+            batch: fixed(coords[wanted - 3]).map_or(most, |batch| batch.min(most)),
             points,
             mask: input_shape(session, &names.mask_input)
-                .map(|shape| shape.iter().map(|&n| free(n).unwrap_or(1)).collect()),
+                .map(|shape| shape.iter().map(|&n| fixed(n).unwrap_or(1)).collect()),
             has_mask: input_shape(session, &names.has_mask_input).is_some(),
             size: session.inputs().iter().find(|i| i.name() == names.orig_im_size).map(|input| {
                 match input.dtype() {
@@ -283,13 +261,4 @@ fn longest(photo: &Photo, side: u32) -> [u32; 2] {
     let scale = f64::from(side) / w.max(h);
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "at most `side`")]
     [w, h].map(|v| ((v * scale + 0.5) as u32).clamp(1, side))
-}
-
-fn tensor<'a>(shape: &[usize], data: &'a [f32]) -> Result<SessionInputValue<'a>> {
-    let view = TensorRef::from_array_view((shape.to_vec(), data));
-    Ok(view.map_err(fault("input"))?.into())
-}
-
-fn fault(what: &'static str) -> impl Fn(ort::Error) -> Error {
-    move |e| Error::internal(format!("mask network: {what} failed")).caused_by(e)
 }

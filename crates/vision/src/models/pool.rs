@@ -2,13 +2,16 @@
 
 use std::ops::{Deref, DerefMut};
 
-use ort::{session::Session, value::ValueType};
+use ort::{
+    session::{Session, SessionInputValue, SessionOutputs},
+    value::{PrimitiveTensorElementType, TensorRef, ValueType},
+};
 use parking_lot::{Condvar, Mutex};
 use tracing::{info, warn};
 
 use crate::{
-    error::{Error, ErrorCode, Result},
-    models::{Bundle, NetworkOptions, Provider, Runtime},
+    error::{Error, Result},
+    models::{Bundle, NetworkOptions, Provider, Runtime, manifest::unavailable},
 };
 
 /// Sessions of one network, lent one at a time.
@@ -42,10 +45,11 @@ impl Pool {
             let opened: std::result::Result<Vec<_>, _> =
                 (0..count).map(|_| runtime.session(&path, provider, threads)).collect();
             match opened {
-                Ok(sessions) => {
+                Ok(idle) => {
                     let name = provider.name();
                     info!(network = what, provider = name, sessions = count, threads, "open");
-                    return Ok((Self::new(sessions), provider));
+                    let pool = Self { idle: Mutex::new(idle), returned: Condvar::new() };
+                    return Ok((pool, provider));
                 }
                 Err(e) => {
                     warn!(network = what, provider = provider.name(), error = %e, "refused");
@@ -54,18 +58,8 @@ impl Pool {
             }
         }
         let named = refused.as_ref().map_or("none", |(provider, _)| provider.name());
-        let message = format!("{what}: {named} does not open {file}");
-        let error = Error::new(ErrorCode::ModelUnavailable, message);
-        Err(match refused {
-            Some((_, cause)) => error.caused_by(cause),
-            None => error,
-        })
-    }
-
-    /// A pool of these sessions; at least one, or [`Self::take`] waits for ever.
-    pub(super) fn new(sessions: Vec<Session>) -> Self {
-        debug_assert!(!sessions.is_empty(), "an empty pool");
-        Self { idle: Mutex::new(sessions), returned: Condvar::new() }
+        let error = unavailable(format!("{what}: {named} does not open {file}"));
+        Err(refused.into_iter().fold(error, |error, (_, cause)| error.caused_by(cause)))
     }
 
     /// Waits for an idle session.
@@ -103,6 +97,39 @@ impl Drop for Lent<'_> {
     }
 }
 
+/// `data` as an input of the network `what`.
+pub(super) fn tensor<'a, T: PrimitiveTensorElementType + std::fmt::Debug + Clone + 'static>(
+    what: &str,
+    shape: &[usize],
+    data: &'a [T],
+) -> Result<SessionInputValue<'a>> {
+    let view = TensorRef::from_array_view((shape.to_vec(), data));
+    Ok(view.map_err(fault(what, "input"))?.into())
+}
+
+/// Shape and numbers of an output of the network `what`.
+pub(super) fn output<'a>(
+    what: &str,
+    outputs: &'a SessionOutputs<'_>,
+    name: &str,
+) -> Result<(Vec<usize>, &'a [f32])> {
+    let value =
+        outputs.get(name).ok_or_else(|| Error::internal(format!("{what}: no output {name:?}")))?;
+    let (shape, data) = value.try_extract_tensor::<f32>().map_err(fault(what, "output"))?;
+    Ok((shape.iter().map(|&n| usize::try_from(n).unwrap_or(0)).collect(), data))
+}
+
+/// The error of a step of the network `what`.
+pub(super) fn fault(what: &str, step: &str) -> impl Fn(ort::Error) -> Error {
+    let message = format!("{what}: {step} failed");
+    move |e| Error::internal(&message).caused_by(e)
+}
+
+/// A dimension of a file; `None` where the file leaves it free.
+pub(super) fn fixed(dimension: i64) -> Option<usize> {
+    usize::try_from(dimension).ok().filter(|&n| n > 0)
+}
+
 /// Shape of a session's input, -1 where it is free; `None` where it has no such input.
 pub(super) fn input_shape(session: &Session, name: &str) -> Option<Vec<i64>> {
     let input = session.inputs().iter().find(|input| input.name() == name)?;
@@ -112,10 +139,9 @@ pub(super) fn input_shape(session: &Session, name: &str) -> Option<Vec<i64>> {
     }
 }
 
-/// How `threads` are shared: sessions, and threads an operator in each.
-///
-/// One session a concurrent job, never more sessions than threads, never more threads than given.
-pub(super) fn shares(threads: usize, jobs: usize) -> (usize, usize) {
+/// Sessions, and threads of an operator in each: a session for each job, together at most
+/// `threads`.
+fn shares(threads: usize, jobs: usize) -> (usize, usize) {
     let sessions = jobs.clamp(1, threads.max(1));
     (sessions, (threads / sessions).max(1))
 }

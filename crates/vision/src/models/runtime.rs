@@ -1,10 +1,10 @@
 //! ONNX Runtime: it is found, checked by sha256 and loaded once in a process, never at build time.
 //!
-//! Search order: `--ort-library` / `SEGSPLAT_ORT_LIBRARY`, `ORT_DYLIB_PATH`, beside the
-//! executable, `../share/segsplat`, `target/ort` of the checkout or of the working folder, the
-//! system's folders. A library that the operator *named* is always loaded. A warning tells when its
-//! hash is not pinned (a CUDA build, a newer release). A library that was only *found* must be one
-//! of the pinned builds. Else the start is refused.
+//! Search order: `--ort-library` / `SEGSPLAT_ORT_LIBRARY`, `ORT_DYLIB_PATH`, beside the executable,
+//! `../share/segsplat`, `target/ort` of the checkout or of the working folder, the system's
+//! folders. A library that the operator *named* is always loaded. A warning tells when its hash is
+//! not pinned (a CUDA build, a newer release). A library that was only *found* must be one of the
+//! pinned builds, or the server does not start.
 
 use std::{
     path::{Path, PathBuf},
@@ -13,7 +13,7 @@ use std::{
 
 use ort::{
     ep::{self, ExecutionProvider},
-    session::{Session, builder::SessionBuilder},
+    session::Session,
 };
 use parking_lot::Mutex;
 use tracing::{info, warn};
@@ -151,49 +151,38 @@ impl Runtime {
         provider: Provider,
         threads: usize,
     ) -> std::result::Result<Session, ort::Error> {
-        let builder = self.builder(provider, threads)?;
-        let mut builder = builder;
-        builder.commit_from_file(model)
-    }
-
-    fn builder(
-        &self,
-        provider: Provider,
-        threads: usize,
-    ) -> std::result::Result<SessionBuilder, ort::Error> {
-        let mut providers = Vec::new();
-        match provider {
-            Provider::Cpu => {}
-            Provider::Cuda => providers.push(ep::CUDA::default().build().error_on_failure()),
-            Provider::Webgpu => providers.push(ep::WebGPU::default().build().error_on_failure()),
-        }
-        Ok(Session::builder(&self.environment)?
+        let providers = match provider {
+            Provider::Cpu => vec![],
+            Provider::Cuda => vec![ep::CUDA::default().build().error_on_failure()],
+            Provider::Webgpu => vec![ep::WebGPU::default().build().error_on_failure()],
+        };
+        Session::builder(&self.environment)?
             .with_intra_threads(threads)?
             .with_inter_threads(1)?
             .with_intra_op_spinning(false)?
             .with_inter_op_spinning(false)?
-            .with_execution_providers(providers)?)
+            .with_execution_providers(providers)?
+            .commit_from_file(model)
     }
 
     /// Providers to try for a choice, best first.
     pub(super) fn candidates(&self, choice: ProviderChoice) -> Result<Vec<Provider>> {
-        let has = |available: ort::Result<bool>| available.unwrap_or(false);
-        let refuse = |name: &str| {
-            Err(unavailable(format!(
-                "execution provider {name}: this ONNX Runtime library was built without it; name \
-                 one that has it with SEGSPLAT_ORT_LIBRARY, or use --provider auto"
-            )))
-        };
-        match choice {
-            ProviderChoice::Cpu => Ok(vec![Provider::Cpu]),
-            ProviderChoice::Auto if has(ep::CUDA::is_available()) => {
-                Ok(vec![Provider::Cuda, Provider::Cpu])
+        let (provider, available) = match choice {
+            ProviderChoice::Cpu => return Ok(vec![Provider::Cpu]),
+            ProviderChoice::Auto | ProviderChoice::Cuda => {
+                (Provider::Cuda, ep::CUDA::is_available())
             }
-            ProviderChoice::Auto => Ok(vec![Provider::Cpu]),
-            ProviderChoice::Cuda if has(ep::CUDA::is_available()) => Ok(vec![Provider::Cuda]),
-            ProviderChoice::Cuda => refuse("cuda"),
-            ProviderChoice::Webgpu if has(ep::WebGPU::is_available()) => Ok(vec![Provider::Webgpu]),
-            ProviderChoice::Webgpu => refuse("webgpu"),
+            ProviderChoice::Webgpu => (Provider::Webgpu, ep::WebGPU::is_available()),
+        };
+        match (choice, available.unwrap_or(false)) {
+            (ProviderChoice::Auto, false) => Ok(vec![Provider::Cpu]),
+            (ProviderChoice::Auto, true) => Ok(vec![provider, Provider::Cpu]),
+            (_, true) => Ok(vec![provider]),
+            (_, false) => Err(unavailable(format!(
+                "execution provider {}: this ONNX Runtime library was built without it; name one \
+                 that has it with SEGSPLAT_ORT_LIBRARY, or use --provider auto",
+                provider.name()
+            ))),
         }
     }
 }

@@ -125,8 +125,8 @@ impl<'a> Budget<'a> {
         Ok((!folder && !left_by_macos).then_some(path))
     }
 
-    /// Reads one file whole: as much as its header says, which must be left of the budget, and not
-    /// a byte more is unpacked.
+    /// Reads one file whole. The size in its header must be left in the budget. Not one byte more
+    /// is unpacked.
     fn read(&mut self, path: &str, claimed: u64, from: impl Read) -> Result<Vec<u8>> {
         let max = self.limits.archive_unpacked_bytes_max;
         let left = max - self.bytes;
@@ -160,8 +160,8 @@ fn insert(files: &mut HashMap<String, Vec<u8>>, path: String, bytes: Vec<u8>) ->
 
 fn unzip(bytes: &[u8], limits: &Limits) -> Result<HashMap<String, Vec<u8>>> {
     let damaged = |e| Error::photo("archive: the zip is damaged or cut short").caused_by(e);
-    // `ZipArchive` reads all entries when it opens. This reads none before it is asked to, so their
-    // number is checked first, in ZIP64 too. It also keeps entries that share a name.
+    // Unlike `ZipArchive` it reads no entry in `try_new`, so the number of entries, in ZIP64 too,
+    // is checked first. It also keeps entries that share a name.
     let config = zip::read::Config::default();
     let mut zip = ZipIterable::try_new(Cursor::new(bytes), config).map_err(damaged)?;
     if zip.len() > limits.archive_entries_max {

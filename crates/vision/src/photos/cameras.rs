@@ -2,10 +2,11 @@
 
 use serde_json::{Map, Value};
 
-use super::{label, lens::Lens};
+use super::lens::Lens;
 use crate::{
     error::{Error, Result},
     limits::Limits,
+    photo_label as label,
     scene::UploadCameras,
 };
 
@@ -157,7 +158,8 @@ fn matrix(value: Option<&Value>, key: &str, what: &str) -> std::result::Result<[
             return Err(shape());
         }
     }
-    let mut m = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+    let mut m = [0.0; 16];
+    m[15] = 1.0;
     if flat.len() != 16 && flat.len() != 12 {
         return Err(format!("{} (it has {})", shape(), flat.len()));
     }
@@ -184,26 +186,27 @@ fn transforms_frame(
     let mut lens = Lens::default();
     for scope in [frame, top] {
         let get = |key| number(scope, key, &what);
-        let first = |slot: &mut Option<f64>, value: Option<f64>| *slot = slot.or(value);
         // Within one scope a focal length wins over an angle, and the frame over the top level.
-        if lens.fx.is_none() && lens.angle_x.is_none() {
-            lens.fx = get("fl_x")?;
-            lens.angle_x = match get("camera_angle_x")? {
-                Some(radians) => Some(radians),
-                None => get("x_fov")?.or(get("fov_x")?).map(f64::to_radians),
-            };
+        for (focal, angle, [in_pixels, radians, degrees, also_degrees]) in [
+            (&mut lens.fx, &mut lens.angle_x, ["fl_x", "camera_angle_x", "x_fov", "fov_x"]),
+            (&mut lens.fy, &mut lens.angle_y, ["fl_y", "camera_angle_y", "y_fov", "fov_y"]),
+        ] {
+            if focal.is_none() && angle.is_none() {
+                *focal = get(in_pixels)?;
+                *angle = match get(radians)? {
+                    Some(radians) => Some(radians),
+                    None => get(degrees)?.or(get(also_degrees)?).map(f64::to_radians),
+                };
+            }
         }
-        if lens.fy.is_none() && lens.angle_y.is_none() {
-            lens.fy = get("fl_y")?;
-            lens.angle_y = match get("camera_angle_y")? {
-                Some(radians) => Some(radians),
-                None => get("y_fov")?.or(get("fov_y")?).map(f64::to_radians),
-            };
+        for (slot, key) in [
+            (&mut lens.cx, "cx"),
+            (&mut lens.cy, "cy"),
+            (&mut lens.width, "w"),
+            (&mut lens.height, "h"),
+        ] {
+            *slot = slot.or(get(key)?);
         }
-        first(&mut lens.cx, get("cx")?);
-        first(&mut lens.cy, get("cy")?);
-        first(&mut lens.width, get("w")?);
-        first(&mut lens.height, get("h")?);
         read_distortion(&mut lens, scope, &what)?;
     }
     let pose = matrix(frame.get("transform_matrix"), "transform_matrix", &what);
@@ -254,29 +257,4 @@ fn read_distortion(lens: &mut Lens, scope: &Map<String, Value>, what: &str) -> R
         lens.is_fisheye = lens.is_fisheye.or(Some(*fisheye));
     }
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn bare_nan_is_read_outside_strings_only() {
-        assert_eq!(without_bare_nan(r#"{"a":[NaN,-Infinity]}"#).unwrap(), r#"{"a":[null,null]}"#);
-        assert_eq!(without_bare_nan(r#"{"NaN \" Infinity":1}"#), None);
-    }
-
-    #[test]
-    fn a_frame_wins_over_the_top_level() {
-        let json = br#"{"fl_x":100,"cx":5,"w":10,"h":8,"k1":0.1,"camera_model":"OPENCV",
-            "frames":[{"file_path":"a","fl_x":200,"k1":0,"transform_matrix":[]},
-                      {"file_path":"b","camera_angle_x":1.5}]}"#;
-        let cameras = UploadCameras::Transforms(json.to_vec());
-        let got = parse(&cameras, &Limits::default()).unwrap();
-        assert_eq!((got[0].lens.fx, got[0].lens.k[0]), (Some(200.0), Some(0.0)));
-        assert_eq!((got[1].lens.fx, got[1].lens.angle_x), (None, Some(1.5)));
-        assert_eq!((got[1].lens.k[0], got[1].lens.width), (Some(0.1), Some(10.0)));
-        assert!(got[0].pose().unwrap_err().message().contains("4 rows of 4"));
-        assert!(got[1].pose().unwrap_err().message().contains("missing"));
-    }
 }

@@ -1,9 +1,9 @@
-//! Photos in: camera JSON, photo files or an archive become upright facts, [`PosedPhoto`]s.
+//! Photos in: camera JSON, photo files or an archive become [`PosedPhoto`]s.
 //!
-//! Conventions are converted here and nowhere else: OpenGL poses to OpenCV, lens distortion
-//! undone, intrinsics brought to the size of the photo. Everything that can be refused from names,
-//! numbers and headers is refused before a pixel is decoded. Pixels are taken as stored: EXIF
-//! orientation is ignored, as COLMAP ignores it.
+//! Only this module converts conventions: OpenGL poses to OpenCV, photos of a lens to photos of a
+//! pinhole camera, intrinsics to the size of the photo. Faults in names, numbers and headers are
+//! refused before a pixel is decoded. Pixels are taken as stored: EXIF orientation is ignored, as
+//! COLMAP ignores it.
 //!
 //! Photos sent one by one each need a camera, but the JSON may describe more cameras than photos
 //! were sent. In a folder or an archive every camera needs its photo, and files that no camera
@@ -24,18 +24,13 @@ pub use crate::scene::{Upload, UploadCameras, UploadFile};
 use crate::{
     error::{Error, Result},
     limits::Limits,
+    photo_label as label,
     scene::{Camera, CameraToWorld, PosedPhoto, unless_cancelled},
 };
 use cameras::{CameraEntry, PoseAxes};
 
 /// Names under which a folder or archive may hold its cameras.
 pub const CAMERA_FILES: [&str; 2] = ["transforms.json", "cameras.json"];
-
-/// How a camera is called in messages: `photo 3 ("images/0003.jpg")`.
-fn label(index: usize, file: &str) -> String {
-    let shown: String = file.chars().take(80).collect();
-    format!("photo {index} ({shown:?})")
-}
 
 /// Reads an upload into photos with cameras, in the order of the cameras.
 ///

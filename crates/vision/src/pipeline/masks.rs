@@ -1,14 +1,16 @@
 //! The mask network as a decoder of points, and the masks of all photos of a scene.
 //!
-//! A later photo is asked first where the masks of earlier photos reappear: their Gaussians know
-//! where in the world they are.
+//! The first prompts of a photo lie where the masks of earlier photos reappear. The Gaussians of
+//! these masks give the places in the world.
 
 use std::sync::atomic::AtomicBool;
 
 use crate::{
+    center_of,
     error::Result,
     models::{MaskNetwork, MasksManifest, PhotoEmbedding},
     scene::{Gaussians, MaskLogits, Photo, PhotoMasks, PosedPhoto},
+    seen_at,
     segment::{self, PromptDecoder, Seed, Settings},
 };
 
@@ -46,7 +48,7 @@ impl PromptDecoder for SeenPhoto<'_> {
     }
 }
 
-/// Thresholds as the bundle says, every skip on.
+/// The thresholds of the bundle, with every saving on.
 #[must_use]
 pub fn settings(manifest: &MasksManifest) -> Settings {
     Settings {
@@ -101,7 +103,7 @@ pub fn seeds(
     let mut taken = vec![false; SEED_CELLS * SEED_CELLS];
     let mut seeds = Vec::new();
     for world in middles.into_iter().flatten().flatten() {
-        let Some(point) = seen_at(&photos[to], world) else { continue };
+        let Some(point) = share_at(&photos[to], world) else { continue };
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a cell")]
         let cell = point.map(|share| (share * SEED_CELLS as f64) as usize);
         let at = cell[1] * SEED_CELLS + cell[0];
@@ -119,12 +121,10 @@ fn middles(
     photos: &[PosedPhoto],
     earlier: &[PhotoMasks],
 ) -> Vec<Vec<Option<glam::DVec3>>> {
-    let world =
-        |i: usize| glam::Vec3::from_array(gaussians.means()[i]).as_dvec3() + gaussians.origin();
     // The mask that each Gaussian is of, in the photo that made it, and where in that photo.
     let of = |i: usize| {
         let view = usize::from(gaussians.source().get(i)?.view);
-        let point = seen_at(photos.get(view)?, world(i))?;
+        let point = share_at(photos.get(view)?, center_of(gaussians, i))?;
         let mask = usize::from(earlier.get(view)?.map.at(point[0], point[1])).checked_sub(1)?;
         Some((view, mask, point))
     };
@@ -145,20 +145,15 @@ fn middles(
         let off = [0, 1].map(|axis| point[axis] - sum[axis] / count.max(1.0));
         let away = off[0] * off[0] + off[1] * off[1];
         if away < best[view][mask].0 {
-            best[view][mask] = (away, Some(world(i)));
+            best[view][mask] = (away, Some(center_of(gaussians, i)));
         }
     }
     best.into_iter().map(|view| view.into_iter().map(|(_, middle)| middle).collect()).collect()
 }
 
-/// Where a photo sees a world point, shares of width and height; `None` outside of it.
-fn seen_at(posed: &PosedPhoto, world: glam::DVec3) -> Option<[f64; 2]> {
-    let seen = posed.camera.camera_to_world.viewmat().transform_point3(world);
-    if seen.z <= 0.0 {
-        return None;
-    }
+/// Where a photo shows a world point, shares of width and height; `None` outside of it.
+fn share_at(posed: &PosedPhoto, world: glam::DVec3) -> Option<[f64; 2]> {
+    let (_, u, v) = seen_at(&posed.camera, world)?;
     let lens = posed.camera.intrinsics;
-    let (u, v) = lens.project(seen);
-    let point = [u / f64::from(lens.width), v / f64::from(lens.height)];
-    point.iter().all(|share| (0.0..1.0).contains(share)).then_some(point)
+    Some([u / f64::from(lens.width), v / f64::from(lens.height)])
 }

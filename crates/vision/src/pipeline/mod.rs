@@ -1,14 +1,14 @@
 //! Runs the stages of [`Stage`]: photos ▸ capture ▸ geometry ▸ lift ▸ store.
 //!
-//! [`Engine`] holds what is opened once (library, bundle, sessions). [`read`] makes photos of an
+//! [`Pipeline`] holds what is opened once (library, bundle, sessions). [`read`] makes photos of an
 //! upload, [`reconstruct`] makes Gaussians of photos, and the caller stores the scene, which is the
 //! stage [`Stage::Store`]. [`semantics`] makes the semantics of a scene.
 
-mod late;
+mod loader;
 pub mod masks;
 pub mod semantics;
 
-pub use self::late::LateEngine;
+pub use self::loader::PipelineLoader;
 
 use std::{
     sync::{Arc, atomic::AtomicBool},
@@ -30,17 +30,17 @@ use crate::{
     },
 };
 
-/// What every scene is made with; opened once, shared by all jobs.
+/// Library, bundle, networks and threads that make scenes. All jobs share one.
 #[derive(Debug)]
-pub struct Engine {
+pub struct Pipeline {
     runtime: Arc<Runtime>,
     bundle: Bundle,
     geometry: Geometry,
     workers: rayon::ThreadPool,
-    lazy: semantics::LazyNetworks,
+    lazy: semantics::SemanticNetworks,
 }
 
-impl Engine {
+impl Pipeline {
     /// Finds, checks and opens library, bundle and network.
     ///
     /// # Errors
@@ -55,20 +55,14 @@ impl Engine {
         let (verified, runtime) = rayon::join(|| bundle.verify(), || Runtime::load(options));
         verified?;
         let (bundle, runtime) = (bundle.clone(), runtime?);
-        let geometry = Geometry::open(Arc::clone(&runtime), &bundle, options)?;
+        let geometry = Geometry::open(&runtime, &bundle, options)?;
         let workers = rayon::ThreadPoolBuilder::new()
             .num_threads(options.threads)
             .thread_name(|i| format!("pipeline-{i}"))
             .build()
             .map_err(|e| Error::internal("pipeline: no worker threads").caused_by(e))?;
-        let lazy = semantics::LazyNetworks::new(options);
+        let lazy = semantics::SemanticNetworks::new(options);
         Ok(Self { runtime, bundle, geometry, workers, lazy })
-    }
-
-    /// The library.
-    #[must_use]
-    pub fn runtime(&self) -> &Runtime {
-        &self.runtime
     }
 
     /// The bundle.
@@ -90,14 +84,14 @@ impl Engine {
     }
 }
 
-/// What the stages make of photos. With an id and what it was made of it is a [`Scene`].
+/// What the stages make of photos. With an id and a provenance it is a [`Scene`].
 #[derive(Clone, Debug)]
 pub struct Reconstruction {
     /// The Gaussians, world frame.
     pub gaussians: Gaussians,
     /// The photos' colours by direction, behind everything.
     pub backdrop: Backdrop,
-    /// What the scene says of itself.
+    /// Counts, times and warnings.
     pub report: HealthReport,
     /// The photos' files and cameras, undistorted pixels, in the photos' order.
     pub cameras: Vec<SceneCamera>,
@@ -148,15 +142,16 @@ pub fn read(upload: &Upload, limits: &Limits, cancel: &AtomicBool) -> Result<Pho
 /// # Errors
 /// As [`reconstruct`].
 pub fn make(
-    engine: &Engine,
+    pipeline: &Pipeline,
     photos: &PhotoSet,
     options: &SceneOptions,
     watch: Watch<'_>,
 ) -> Result<Reconstruction> {
-    let mut made = reconstruct(engine, &photos.photos, options, watch.progress, watch.cancel)?;
+    let mut reconstruction =
+        reconstruct(pipeline, &photos.photos, options, watch.progress, watch.cancel)?;
     let stage = Stage::Photos.name().to_owned();
-    made.report.stages.insert(0, StageTime { stage, ms: photos.read_ms });
-    Ok(made)
+    reconstruction.report.stages.insert(0, StageTime { stage, ms: photos.read_ms });
+    Ok(reconstruction)
 }
 
 /// Photos to Gaussians. `progress` gets each stage with its fraction, 0 to 1; the loops of each
@@ -165,7 +160,7 @@ pub fn make(
 /// # Errors
 /// `invalid_request` when the capture cannot be reconstructed, `cancelled`, or `internal`.
 pub fn reconstruct(
-    engine: &Engine,
+    pipeline: &Pipeline,
     photos: &[PosedPhoto],
     options: &SceneOptions,
     progress: &(dyn Fn(Stage, f32) + Sync),
@@ -173,12 +168,12 @@ pub fn reconstruct(
 ) -> Result<Reconstruction> {
     let mut stages = Stages::new(Watch { progress, cancel });
     let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
-    let manifest = engine.geometry.manifest();
+    let manifest = pipeline.geometry.manifest();
     let views_max = views_max(options, manifest.views_min, manifest.views_max)?;
 
     let (capture, sets) = stages.run(Stage::Capture, || {
-        engine.workers.install(|| {
-            let capture = capture::analyse_until(photos, cancel)?;
+        pipeline.workers.install(|| {
+            let capture = capture::analyse(photos, cancel)?;
             let sets = capture::view_sets(&capture, photos, views_max, manifest.neighbors_max);
             Ok((capture, sets))
         })
@@ -194,12 +189,12 @@ pub fn reconstruct(
                 near_far: &capture.near_far,
                 neighbors: &set.neighbors,
             };
-            views.extend(engine.geometry.run(&input)?);
+            views.extend(pipeline.geometry.run(&input)?);
         }
         Ok(views)
     })?;
     let (lifted, backdrop) = stages.run(Stage::Lift, || {
-        engine.workers.install(|| {
+        pipeline.workers.install(|| {
             let thinning = match options.density {
                 Density::Thinned => Some(lift::ThinOptions::default()),
                 Density::Full => None,
@@ -230,13 +225,13 @@ pub fn reconstruct(
         overlap: mean_best_overlap(&capture),
         network_focal_px: lifted.lenses.iter().map(focal).collect(),
         stages: stages.times,
-        execution_provider: engine.geometry.provider().name().to_owned(),
+        execution_provider: pipeline.geometry.provider().name().to_owned(),
         warnings: capture.warnings,
     };
     Ok(Reconstruction { gaussians: lifted.gaussians, backdrop, report, cameras })
 }
 
-/// The stages of one job: each is told, timed, and not begun once the job is cancelled.
+/// The stages of one job. Each is reported and timed. None begins after the job is cancelled.
 struct Stages<'a> {
     watch: Watch<'a>,
     times: Vec<StageTime>,

@@ -1,20 +1,22 @@
 //! The order of the stages that give a scene its meaning: masks ▸ embed ▸ bank ▸ assign.
 //!
-//! [`understand`] runs them with the engine's networks, which are opened at the first call;
-//! [`understand_with`] with whatever gives masks and embeddings. Every Gaussian takes the index of
-//! the pixel that made it; what other photos say of it is a switch of [`SemanticsOptions`].
+//! [`understand`] runs them with the pipeline's networks, which are opened at the first call;
+//! [`understand_with`] with whatever gives masks and embeddings. Every Gaussian takes the entry of
+//! the pixel that made it. [`SemanticsOptions`] says whether other photos vote.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
-use super::{Engine, Stages, masks};
+use parking_lot::Mutex;
+
+use super::{Pipeline, Stages, count, fraction, masks};
 use crate::{
     error::{Error, ErrorCode, Result},
-    models::{ImageText, MaskNetwork, NetworkOptions, Runtime},
+    models::{ImageText, MaskNetwork, NetworkOptions},
     scene::{
         Bank, Crop, Gaussians, IndexMap, PAPER_PHRASES, PAPER_TAU, PhotoMasks, PosedPhoto,
         SceneCamera, ScoringProfile, Semantics, SemanticsReport, Stage, Watch, unless_cancelled,
     },
-    semantics::{self, Clusters, Cutter, NetworkPicture, Scoring, Views},
+    semantics::{self, Clusters, Cutter, Scoring, Views},
 };
 
 /// How alike two rows must be to become one, where two photos show them on one surface.
@@ -25,9 +27,9 @@ const MERGE_COSINE_MIN: f64 = 0.7;
 pub struct SemanticsOptions {
     /// Ask a photo first where masks of earlier photos reappear.
     pub seeds: bool,
-    /// Let all photos that show a Gaussian vote for its index.
+    /// Let all photos that show a Gaussian vote for its entry.
     pub votes: bool,
-    /// Join indices that are one thing seen from two sides, where their rows are at least this
+    /// Join entries that are one object seen from two sides, where their rows are at least this
     /// alike (cosine); `None` joins none.
     pub merge: Option<f64>,
 }
@@ -38,12 +40,12 @@ impl Default for SemanticsOptions {
     }
 }
 
-/// The masks of each photo; is told how to report its fraction, 0..1.
+/// Gives the masks of each photo. Its argument takes the fraction that is done, 0..1.
 pub type MasksOfPhotos<'a> = dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> + Sync + 'a;
 
 /// What gives masks and embeddings.
 pub struct SemanticsTools<'a> {
-    /// The masks of each photo; is told how to report its fraction, 0..1.
+    /// The masks of each photo.
     pub masks: &'a MasksOfPhotos<'a>,
     /// `[crops * dim]` unit embeddings.
     pub embed: &'a (dyn Fn(&[Crop]) -> Result<Vec<f32>> + Sync),
@@ -61,9 +63,9 @@ impl std::fmt::Debug for SemanticsTools<'_> {
     }
 }
 
-/// The scene that is to be understood: its photos, their cameras, and what they became.
+/// A scene whose semantics are to be made.
 #[derive(Clone, Copy, Debug)]
-pub struct SceneParts<'a> {
+pub struct SemanticsInput<'a> {
     /// Undistorted photos, in the scene's order.
     pub photos: &'a [PosedPhoto],
     /// The scene's cameras, in the same order.
@@ -74,41 +76,41 @@ pub struct SceneParts<'a> {
 
 /// The networks that semantics need, opened at the first use and kept.
 #[derive(Debug)]
-pub(super) struct LazyNetworks {
+pub(super) struct SemanticNetworks {
     options: NetworkOptions,
     masks: Mutex<Option<Arc<MaskNetwork>>>,
     image_text: Mutex<Option<Arc<ImageText>>>,
 }
 
-impl LazyNetworks {
+impl SemanticNetworks {
     pub(super) fn new(options: &NetworkOptions) -> Self {
         Self { options: options.clone(), masks: Mutex::default(), image_text: Mutex::default() }
     }
 }
 
-/// What is kept in `place`, opened now where it was not. A failure is not kept: it may be mended.
+/// The network in `place`; it is opened if it is not there yet. A failure is not kept.
 fn opened<T>(
     place: &Mutex<Option<Arc<T>>>,
     what: &str,
     open: impl FnOnce() -> Result<Option<T>>,
 ) -> Result<Arc<T>> {
-    let mut held = place.lock().unwrap_or_else(PoisonError::into_inner);
-    if let Some(network) = &*held {
+    let mut kept = place.lock();
+    if let Some(network) = &*kept {
         return Ok(Arc::clone(network));
     }
     let network = open()?.ok_or_else(|| {
         Error::new(ErrorCode::ModelUnavailable, format!("the bundle has no {what}"))
     })?;
-    Ok(Arc::clone(held.insert(Arc::new(network))))
+    Ok(Arc::clone(kept.insert(Arc::new(network))))
 }
 
-impl Engine {
+impl Pipeline {
     /// The mask network, opened at the first call.
     ///
     /// # Errors
     /// `model_unavailable` when the bundle has none or it does not open.
     pub fn masks(&self) -> Result<Arc<MaskNetwork>> {
-        let open = || MaskNetwork::open(self.library(), &self.bundle, &self.lazy.options);
+        let open = || MaskNetwork::open(&self.runtime, &self.bundle, &self.lazy.options);
         opened(&self.lazy.masks, "mask network", open)
     }
 
@@ -117,7 +119,7 @@ impl Engine {
     /// # Errors
     /// `model_unavailable` when the bundle has none or one does not open.
     pub fn image_text(&self) -> Result<Arc<ImageText>> {
-        let open = || ImageText::open(self.library(), &self.bundle, &self.lazy.options);
+        let open = || ImageText::open(&self.runtime, &self.bundle, &self.lazy.options);
         opened(&self.lazy.image_text, "image and text towers", open)
     }
 
@@ -137,41 +139,38 @@ impl Engine {
         let rows = towers.embed_texts(&canon)?.into_iter().map(|text| text.row).collect();
         Scoring::new(profile, rows, tau, f64::from(manifest.coverage_floor))
     }
-
-    fn library(&self) -> Arc<Runtime> {
-        Arc::clone(&self.runtime)
-    }
 }
 
-/// Gives a scene its meaning with the engine's networks.
+/// Gives a scene its meaning with the pipeline's networks.
 ///
 /// # Errors
 /// `model_unavailable`, `cancelled`, `internal`; `invalid_request` when the scene does not say
 /// which pixel made each Gaussian.
 pub fn understand(
-    engine: &Engine,
-    parts: &SceneParts<'_>,
+    pipeline: &Pipeline,
+    input: &SemanticsInput<'_>,
     options: &SemanticsOptions,
     watch: Watch<'_>,
 ) -> Result<Semantics> {
-    check_parts(parts)?;
-    let (network, towers) = (engine.masks()?, engine.image_text()?);
+    check_input(input)?;
+    let (network, towers) = (pipeline.masks()?, pipeline.image_text()?);
     let settings = masks::settings(network.manifest());
-    let seeds = options.seeds.then_some(parts.gaussians);
+    let seeds = options.seeds.then_some(input.gaussians);
     let image = &towers.manifest().image;
     let tools = SemanticsTools {
         masks: &|progress| {
-            masks::photo_masks(&network, parts.photos, seeds, &settings, progress, watch.cancel)
+            masks::photo_masks(&network, input.photos, seeds, &settings, progress, watch.cancel)
         },
         embed: &|crops| towers.embed_images(crops),
         dim: towers.manifest().dim,
         crop_margin: f64::from(image.crop_margin),
         batch: image.batch,
     };
-    let mut made = engine.workers.install(|| understand_with(&tools, parts, options, watch))?;
-    made.report.bundle_sha256 = engine.bundle.sha256().to_owned();
-    made.report.execution_provider = towers.provider().name().to_owned();
-    Ok(made)
+    let mut semantics =
+        pipeline.workers.install(|| understand_with(&tools, input, options, watch))?;
+    semantics.report.bundle_sha256 = pipeline.bundle.sha256().to_owned();
+    semantics.report.execution_provider = towers.provider().name().to_owned();
+    Ok(semantics)
 }
 
 /// Gives a scene its meaning with any masks and embeddings.
@@ -181,29 +180,28 @@ pub fn understand(
 /// `invalid_request` when the scene does not say which pixel made each Gaussian.
 pub fn understand_with(
     tools: &SemanticsTools<'_>,
-    parts: &SceneParts<'_>,
+    input: &SemanticsInput<'_>,
     options: &SemanticsOptions,
     watch: Watch<'_>,
 ) -> Result<Semantics> {
-    check_parts(parts)?;
+    check_input(input)?;
     let mut stages = Stages::new(watch);
     let masks = stages.run(Stage::Masks, || {
         (tools.masks)(&|fraction| (watch.progress)(Stage::Masks, fraction))
     })?;
-    if masks.len() != parts.photos.len() {
+    if masks.len() != input.photos.len() {
         return Err(Error::internal(format!(
             "masks of {} photos, not of {}",
             masks.len(),
-            parts.photos.len()
+            input.photos.len()
         )));
     }
-    let embedded = stages.run(Stage::Embed, || embed(tools, parts.photos, &masks, watch))?;
+    let embedded = stages.run(Stage::Embed, || embed(tools, input.photos, &masks, watch))?;
     let mut labels = stages.run(Stage::Bank, || {
-        let clusters = semantics::bank(&embedded.rows, tools.dim, parts.photos.len())?;
+        let clusters = semantics::bank(&embedded.rows, tools.dim, input.photos.len())?;
         Ok(label(&masks, &embedded.of, clusters))
     })?;
-    let index = stages.run(Stage::Assign, || Ok(assign(&mut labels, parts, options)))?;
-    let count = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
+    let index = stages.run(Stage::Assign, || Ok(assign(&mut labels, input, options)))?;
     let report = SemanticsReport {
         masks: masks.iter().map(|of| count(of.masks.len())).collect(),
         bank_size: count(labels.bank.len()),
@@ -216,15 +214,15 @@ pub fn understand_with(
 }
 
 /// Refuses a scene whose Gaussians cannot be found in its photos.
-fn check_parts(parts: &SceneParts<'_>) -> Result<()> {
-    let (photos, cameras) = (parts.photos.len(), parts.cameras.len());
-    let named = parts.photos.iter().zip(parts.cameras).all(|(p, c)| p.file == c.file);
+fn check_input(input: &SemanticsInput<'_>) -> Result<()> {
+    let (photos, cameras) = (input.photos.len(), input.cameras.len());
+    let named = input.photos.iter().zip(input.cameras).all(|(p, c)| p.file == c.file);
     if photos != cameras || !named {
         return Err(Error::internal(format!(
             "semantics: {photos} photos are not those of the scene's {cameras} cameras"
         )));
     }
-    if !parts.gaussians.is_empty() && parts.cameras.iter().all(|c| c.network.is_none()) {
+    if !input.gaussians.is_empty() && input.cameras.iter().all(|c| c.network.is_none()) {
         return Err(Error::invalid(
             "semantics: the scene does not say which pixels made its Gaussians (an older program \
              made it, or none did); make it again from its photos",
@@ -258,7 +256,7 @@ fn embed(
         let wanted: Vec<usize> = (0..masks.masks.len()).collect();
         for batch in wanted.chunks(tools.batch.max(1)) {
             unless_cancelled(watch.cancel)?;
-            (watch.progress)(Stage::Embed, done as f32 / all.max(1) as f32);
+            (watch.progress)(Stage::Embed, fraction(done, all));
             done += batch.len();
             let cut = |&k: &usize| Some((k, cutter.cut(k, tools.crop_margin)?));
             let (of, crops): (Vec<usize>, Vec<Crop>) = batch.iter().filter_map(cut).unzip();
@@ -293,13 +291,13 @@ struct Labels {
     maps: Vec<IndexMap>,
 }
 
-/// Puts the bank's indices in place of the masks'.
+/// Replaces the numbers of the masks by entries.
 fn label(masks: &[PhotoMasks], of: &[[usize; 2]], clusters: Clusters) -> Labels {
     let mut becomes: Vec<Vec<u16>> = masks.iter().map(|m| vec![0; m.masks.len()]).collect();
     let mut counts = vec![0_u32; clusters.bank.len()];
-    for ([photo, mask], index) in of.iter().zip(&clusters.index) {
-        becomes[*photo][*mask] = *index;
-        counts[usize::from(*index) - 1] += 1;
+    for ([photo, mask], entry) in of.iter().zip(&clusters.entries) {
+        becomes[*photo][*mask] = *entry;
+        counts[usize::from(*entry) - 1] += 1;
     }
     let maps = masks
         .iter()
@@ -309,18 +307,13 @@ fn label(masks: &[PhotoMasks], of: &[[usize; 2]], clusters: Clusters) -> Labels 
     Labels { bank: clusters.bank, counts, maps }
 }
 
-/// `[N]` index of each Gaussian; with `merge` the labels close up first.
-fn assign(labels: &mut Labels, parts: &SceneParts<'_>, options: &SemanticsOptions) -> Vec<u16> {
-    let picture = |input: &SceneCamera| {
-        let network = input.network?;
-        Some(NetworkPicture { network, photo: input.camera.intrinsics })
-    };
-    let pictures: Vec<Option<NetworkPicture>> = parts.cameras.iter().map(picture).collect();
-    let mut own = semantics::from_source(parts.gaussians.source(), &pictures, &labels.maps);
+/// `[N]` entry of each Gaussian. With `merge` entries of one object are joined first.
+fn assign(labels: &mut Labels, input: &SemanticsInput<'_>, options: &SemanticsOptions) -> Vec<u16> {
+    let mut own = semantics::from_source(input.gaussians.source(), input.cameras, &labels.maps);
     if !options.votes && options.merge.is_none() {
         return own;
     }
-    let views = Views::new(parts.gaussians, parts.cameras);
+    let views = Views::new(input.gaussians, input.cameras);
     if let Some(cosine_min) = options.merge {
         let group = views.same_things(&own, &labels.maps, &labels.bank, cosine_min);
         let (bank, becomes) = semantics::merge(&labels.bank, &labels.counts, &group);

@@ -27,6 +27,8 @@ pub struct TrueView {
     pub photo: Photo,
     /// `[H * W]` z-depth at the pixel centres, room units.
     pub depth: Vec<f32>,
+    /// `[H * W]` number of the thing at the pixel centres; 0 is the room itself.
+    pub things: Vec<u8>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -134,7 +136,7 @@ impl Room {
         let k = camera.intrinsics;
         let (rotation, eye) = (camera.camera_to_world.rotation(), camera.camera_to_world.center());
         let (width, height) = (k.width as usize, k.height as usize);
-        let pixels: Vec<([u8; 3], f32)> = (0..width * height)
+        let pixels: Vec<([u8; 3], f32, u8)> = (0..width * height)
             .into_par_iter()
             .map(|i| {
                 let (x, y) = ((i % width) as f64, (i / width) as f64);
@@ -147,19 +149,22 @@ impl Room {
                     light += self.radiance(eye, ray(shift.x, shift.y), 1.0 / k.fx.min(k.fy), shift);
                 }
                 let mean = light * EXPOSURE / f64::from(SUPERSAMPLE * SUPERSAMPLE);
-                let depth = self.nearest(eye, ray(0.5, 0.5)).map_or(0.0, |(_, hit)| hit.t);
-                (mean.to_array().map(srgb), depth as f32)
+                let middle = self.nearest(eye, ray(0.5, 0.5));
+                let (depth, thing) = middle.map_or((0.0, 0), |(i, hit)| (hit.t, i as u8));
+                (mean.to_array().map(srgb), depth as f32, thing)
             })
             .collect();
-        let rgb = pixels.iter().flat_map(|(rgb, _)| *rgb).collect();
-        let depth = pixels.iter().map(|(_, depth)| *depth).collect();
-        TrueView { photo: Photo { width: k.width, height: k.height, rgb, valid: None }, depth }
+        let rgb = pixels.iter().flat_map(|(rgb, ..)| *rgb).collect();
+        let photo = Photo { width: k.width, height: k.height, rgb, valid: None };
+        let (depth, things) = pixels.into_iter().map(|(_, depth, thing)| (depth, thing)).unzip();
+        TrueView { photo, depth, things }
     }
 
     /// Linear light along a ray of z-depth speed 1; `pixel` is a pixel's size at depth 1 and
     /// `shift` (0..1, two axes) moves the shadow rays within their strata.
     fn radiance(&self, eye: DVec3, ray: DVec3, pixel: f64, shift: DVec2) -> DVec3 {
-        let Some((thing, hit)) = self.nearest(eye, ray) else { return DVec3::ZERO };
+        let Some((i, hit)) = self.nearest(eye, ray) else { return DVec3::ZERO };
+        let thing = &self.things[i];
         let world = eye + ray * hit.t;
         let local = thing.to_local(world - thing.at);
         let normal = thing.to_world(hit.normal);
@@ -214,8 +219,9 @@ impl Room {
         sum
     }
 
-    fn nearest(&self, from: DVec3, ray: DVec3) -> Option<(&Thing, Hit)> {
-        let hits = self.things.iter().filter_map(|thing| Some((thing, thing.hit(from, ray)?)));
+    fn nearest(&self, from: DVec3, ray: DVec3) -> Option<(usize, Hit)> {
+        let things = self.things.iter().enumerate();
+        let hits = things.filter_map(|(i, thing)| Some((i, thing.hit(from, ray)?)));
         hits.min_by(|a, b| a.1.t.total_cmp(&b.1.t))
     }
 

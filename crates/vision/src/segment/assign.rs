@@ -2,7 +2,7 @@
 
 use crate::{
     scene::{IndexMap, MaskInfo, Photo, PhotoMasks},
-    segment::{Bitset, PhotoGrid, Proposal, Proposals, Settings, judge::blank},
+    segment::{Bitset, PhotoGrid, Proposal, Proposals, Settings, filter::blank},
 };
 
 /// Most masks of a photo: a mask number is a u16, and 0 is none.

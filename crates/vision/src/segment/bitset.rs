@@ -4,7 +4,6 @@
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Bitset {
     words: Vec<u64>,
-    cells: usize,
 }
 
 /// Columns and rows of a mask, first and last included, as in Segment Anything.
@@ -24,7 +23,7 @@ impl Bitset {
     /// The empty set of a grid of `cells` cells.
     #[must_use]
     pub fn empty(cells: usize) -> Self {
-        Self { words: vec![0; cells.div_ceil(64)], cells }
+        Self { words: vec![0; cells.div_ceil(64)] }
     }
 
     /// The cells whose value is over `threshold`.
@@ -34,32 +33,13 @@ impl Bitset {
             let bit = |(i, v): (usize, &f32)| u64::from(*v > threshold) << i;
             chunk.iter().enumerate().map(bit).fold(0, |word, bit| word | bit)
         };
-        Self { words: values.chunks(64).map(word).collect(), cells: values.len() }
-    }
-
-    /// Number of cells of the grid.
-    #[must_use]
-    pub fn len(&self) -> usize {
-        self.cells
-    }
-
-    /// Whether the grid has no cell.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.cells == 0
+        Self { words: values.chunks(64).map(word).collect() }
     }
 
     /// Whether a cell is in the set.
     #[must_use]
     pub fn has(&self, cell: usize) -> bool {
         self.words.get(cell / 64).is_some_and(|word| word >> (cell % 64) & 1 == 1)
-    }
-
-    /// Removes a cell.
-    pub fn remove(&mut self, cell: usize) {
-        if let Some(word) = self.words.get_mut(cell / 64) {
-            *word &= !(1 << (cell % 64));
-        }
     }
 
     /// Adds all cells of another set of the same grid.
@@ -130,42 +110,4 @@ impl Box2 {
 
 fn narrow(n: usize) -> u32 {
     u32::try_from(n).unwrap_or(u32::MAX)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn set(cells: usize, of: &[usize]) -> Bitset {
-        let values: Vec<f32> =
-            (0..cells).map(|i| if of.contains(&i) { 1.0 } else { -1.0 }).collect();
-        Bitset::over(&values, 0.0)
-    }
-
-    #[test]
-    fn sets_count_meet_and_part() {
-        let (a, b) = (set(130, &[0, 63, 64, 129]), set(130, &[63, 100, 129]));
-        assert_eq!((a.count(), b.count(), a.common(&b)), (4, 3, 2), "counts");
-        assert_eq!(a.cells().collect::<Vec<_>>(), [0, 63, 64, 129], "cells");
-        let mut both = a.clone();
-        both.add(&b);
-        assert_eq!(both.count(), 5, "union");
-        both.subtract(&a);
-        assert_eq!(both.cells().collect::<Vec<_>>(), [100], "difference");
-        both.remove(100);
-        assert_eq!(both, Bitset::empty(130), "nothing is left");
-        assert!(a.has(64) && !a.has(65) && !a.has(4_000), "membership");
-    }
-
-    #[test]
-    fn boxes_are_those_of_segment_anything() {
-        let mask = set(48, &[9, 10, 18, 29]);
-        let found = mask.bounds(8);
-        assert_eq!(found, Box2 { x0: 1, y0: 1, x1: 5, y1: 3 }, "inclusive corners");
-        assert_eq!(Bitset::empty(48).bounds(8), Box2::default(), "around nothing");
-        // torchvision.ops.box_iou([[1,1,5,3]], [[3,1,5,4]]) = 4 / (8 + 6 - 4)
-        let other = Box2 { x0: 3, y0: 1, x1: 5, y1: 4 };
-        assert!((found.iou(other) - 0.4).abs() < 1e-6, "{}", found.iou(other));
-        assert_eq!(Box2::default().iou(Box2::default()), 0.0, "two empty boxes");
-    }
 }

@@ -1,32 +1,31 @@
 //! Everything in a photo as masks: a grid of points is decoded, good masks stay, one a pixel.
 //!
-//! [`proposals`] is Segment Anything's everything-mode up to the end of its filters and NMS;
-//! [`everything`] goes on to whole objects and one mask a pixel. What need not be computed is a
-//! switch of [`Settings`] each: masks are judged on the decoder's own coarse grid, points are not
-//! asked for where a mask lies already, and points known from other photos are asked for first.
-//! The decoder itself is behind [`PromptDecoder`]: this module knows no network.
+//! [`proposals`] is Segment Anything's everything-mode up to the end of its filters and NMS.
+//! [`everything`] goes on to whole objects and one mask for each pixel. [`Settings`] has a switch
+//! for each saving: masks are filtered on the decoder's own coarse grid, points are skipped where a
+//! mask lies already, and points known from other photos come first. The decoder is behind
+//! [`PromptDecoder`]: this module knows no network.
 
 mod assign;
 mod bitset;
-mod judge;
+mod filter;
 mod nms;
 mod photo_grid;
 mod prompts;
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 pub use bitset::{Bitset, Box2};
-pub use photo_grid::PhotoGrid;
 
-use self::{judge::Judge, prompts::Prompts};
+use self::{filter::MaskFilter, photo_grid::PhotoGrid, prompts::Prompts};
 use crate::{
-    error::{Error, ErrorCode, Result},
-    scene::{MaskLogits, Photo, PhotoMasks},
+    error::Result,
+    scene::{MaskLogits, Photo, PhotoMasks, unless_cancelled},
 };
 
-/// A photo that points can be asked of.
+/// A photo and the network that gives masks for its points.
 pub trait PromptDecoder: Sync {
-    /// Points that are best asked together.
+    /// Points that are best decoded together.
     fn batch(&self) -> usize;
 
     /// Side in pixels of the square that the network saw, and `[width, height]` of the photo in it.
@@ -39,7 +38,7 @@ pub trait PromptDecoder: Sync {
     fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits>;
 }
 
-/// A point worth asking for, known from elsewhere: where a mask of another photo reappears.
+/// A prompt that is known from elsewhere: where a mask of another photo reappears.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Seed {
     /// Shares 0..1 of width and height.
@@ -63,17 +62,18 @@ pub struct Settings {
     pub mask_nms_thresh: f32,
     /// Smallest mask, share of the photo.
     pub min_area: f64,
-    /// Largest mask, share of the photo: a mask of everything says nothing.
+    /// Largest mask, share of the photo.
     pub max_area: f64,
     /// A part goes where at least this share of it lies in the mask of a whole.
     pub part_thresh: f64,
     /// Cells of the index map along each side of a cell of logits, 1 and up.
     pub map_scale: u32,
-    /// Judge masks at the photo's own pixels, as Segment Anything does, and not on the coarse grid.
+    /// Filter masks at the photo's own pixels, as Segment Anything does, and not on the coarse
+    /// grid.
     pub full_resolution: bool,
-    /// Do not ask where a mask lies already.
+    /// Skip points where a mask lies already.
     pub skip_covered: bool,
-    /// Ask at the seeds first.
+    /// Decode the seeds first.
     pub use_seeds: bool,
 }
 
@@ -129,10 +129,10 @@ pub struct Proposal {
     pub predicted_iou: f32,
     /// Stability.
     pub stability: f32,
-    /// Where it was asked for, shares 0..1.
+    /// Its prompt, shares 0..1.
     pub point: [f32; 2],
     /// Logits of its box and one cell around it, where a finer map is wanted.
-    logits: judge::Patch,
+    logits: filter::Patch,
 }
 
 /// The masks of a photo that passed.
@@ -144,7 +144,7 @@ pub struct Proposals {
     pub height: usize,
     /// The masks, surest first.
     pub masks: Vec<Proposal>,
-    /// Points that were asked for.
+    /// Points that were decoded.
     pub asked: usize,
 }
 
@@ -159,9 +159,7 @@ pub fn proposals(
     seeds: &[Seed],
     cancel: &AtomicBool,
 ) -> Result<Proposals> {
-    let mut found = passed(decoder, photo, settings, seeds, cancel, false)?.0;
-    found.suppress(settings);
-    Ok(found)
+    Ok(passed(decoder, photo, settings, seeds, cancel, false)?.0)
 }
 
 /// What is in a photo: whole objects, at most one a pixel.
@@ -175,22 +173,12 @@ pub fn everything(
     seeds: &[Seed],
     cancel: &AtomicBool,
 ) -> Result<PhotoMasks> {
-    let (mut found, photo_grid) = passed(decoder, photo, settings, seeds, cancel, true)?;
-    found.suppress(settings);
-    let Some(photo_grid) = photo_grid else { return Ok(PhotoMasks::default()) };
-    Ok(assign::one_a_pixel(&found, photo_grid, photo, settings))
+    let (found, photo_grid) = passed(decoder, photo, settings, seeds, cancel, true)?;
+    let masks = photo_grid.map(|grid| assign::one_a_pixel(&found, grid, photo, settings));
+    Ok(masks.unwrap_or_default())
 }
 
-impl Proposals {
-    /// NMS over boxes, then over masks.
-    fn suppress(&mut self, settings: &Settings) {
-        let kept = nms::suppress(&self.masks, settings.box_nms_thresh, settings.mask_nms_thresh);
-        self.masks = kept.into_iter().map(|at| std::mem::take(&mut self.masks[at])).collect();
-    }
-}
-
-/// The masks that pass the filters, in the order asked; of each point only the most whole one
-/// where `wholes` is set.
+/// The masks that pass the filters and NMS. With `wholes` only the most whole mask of each point.
 fn passed(
     decoder: &dyn PromptDecoder,
     photo: &Photo,
@@ -202,24 +190,25 @@ fn passed(
     let seeds = if settings.use_seeds { seeds } else { &[] };
     let mut prompts = Prompts::new(settings, seeds);
     let mut found = Proposals::default();
-    let mut judge: Option<Judge> = None;
+    let mut filter: Option<MaskFilter> = None;
     loop {
         let points = prompts.next(decoder.batch());
         if points.is_empty() {
-            return Ok((found, judge.map(|judge| judge.photo_grid())));
+            break;
         }
-        if cancel.load(Ordering::Relaxed) {
-            return Err(Error::new(ErrorCode::Cancelled, "masks: the scene was cancelled"));
-        }
+        unless_cancelled(cancel)?;
         let decoded = decoder.decode(&points)?;
-        let judge = match &mut judge {
-            Some(judge) => judge,
-            none => none.insert(Judge::new(decoder.placed(), &decoded, photo, settings)?),
+        let filter = match &mut filter {
+            Some(filter) => filter,
+            none => none.insert(MaskFilter::new(decoder.placed(), &decoded, photo, settings)?),
         };
-        let masks = judge.pass(&decoded, &points, wholes)?;
+        let masks = filter.pass(&decoded, &points, wholes)?;
         found.asked += points.len();
-        [found.width, found.height] = judge.map();
-        prompts.cover(&masks, judge.map(), decoded.levels);
+        [found.width, found.height] = filter.map();
+        prompts.cover(&masks, filter.map(), decoded.levels);
         found.masks.extend(masks);
     }
+    let kept = nms::suppress(&found.masks, settings.box_nms_thresh, settings.mask_nms_thresh);
+    found.masks = kept.into_iter().map(|at| std::mem::take(&mut found.masks[at])).collect();
+    Ok((found, filter.map(|filter| filter.photo_grid())))
 }

@@ -4,13 +4,13 @@ use crate::scene::Photo;
 
 /// A decoder's grid and the photo in it: the photo fills the left top of a square of pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct PhotoGrid {
+pub(super) struct PhotoGrid {
     /// `[width, height]` of the grid of logits.
-    pub grid: [usize; 2],
+    pub(super) grid: [usize; 2],
     /// Side of the square that the network sees, pixels.
-    pub side: u32,
+    pub(super) side: u32,
     /// `[width, height]` of the photo in it, pixels.
-    pub resized: [u32; 2],
+    pub(super) resized: [u32; 2],
 }
 
 /// Weights of a resampling along one axis: for each output, its first source and four weights.
@@ -27,15 +27,13 @@ pub(super) struct Resample {
 
 impl PhotoGrid {
     /// Cells of the grid that the photo fills, `[width, height]`.
-    #[must_use]
-    pub fn filled(&self) -> [f64; 2] {
+    pub(super) fn filled(&self) -> [f64; 2] {
         let share = |axis: usize| f64::from(self.resized[axis]) / f64::from(self.side.max(1));
         [share(0) * self.grid[0] as f64, share(1) * self.grid[1] as f64]
     }
 
     /// Whole cells of the grid that lie over the photo, `[width, height]`; at least one each way.
-    #[must_use]
-    pub fn cells(&self) -> [usize; 2] {
+    pub(super) fn cells(&self) -> [usize; 2] {
         let filled = self.filled();
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a grid")]
         [0, 1].map(|axis| (filled[axis].round() as usize).clamp(1, self.grid[axis].max(1)))

@@ -107,29 +107,6 @@ mod tests {
     }
 
     #[test]
-    fn without_skips_it_is_segment_anythings_grid() {
-        let settings = Settings { points_per_side: 3, skip_covered: false, ..Settings::default() };
-        let points = all(&mut Prompts::new(&settings, &[]), 4);
-        assert_eq!(points.len(), 9, "{points:?}");
-        let close = |a: [f32; 2], b: [f32; 2]| (0..2).all(|i| (a[i] - b[i]).abs() < 1e-6);
-        assert!(close(points[0], [1.0 / 6.0, 1.0 / 6.0]), "{points:?}");
-        assert!(close(points[1], [0.5, 1.0 / 6.0]), "rows first: {points:?}");
-        assert!(close(points[8], [5.0 / 6.0, 5.0 / 6.0]), "{points:?}");
-    }
-
-    #[test]
-    fn every_point_is_asked_once_coarse_ones_first() {
-        let settings = Settings { points_per_side: 16, ..Settings::default() };
-        let mut points = all(&mut Prompts::new(&settings, &[]), 64);
-        assert_eq!(points.len(), 256, "all");
-        let gap = (points[0][0] - points[1][0]).abs();
-        assert!((gap - 0.25).abs() < 1e-6, "the first round is coarse: {gap}");
-        points.sort_by(|a, b| a.partial_cmp(b).unwrap());
-        points.dedup();
-        assert_eq!(points.len(), 256, "none twice");
-    }
-
-    #[test]
     fn what_is_covered_is_not_asked_again_and_small_things_on_large_ones_are() {
         let settings = Settings { points_per_side: 16, ..Settings::default() };
         let cover = |share: f32, level: usize| {
@@ -149,14 +126,5 @@ mod tests {
         // The upper half, large: its points of the second round are asked all the same.
         assert_eq!(cover(0.5, 2), 64 + (240 - 64) / 2, "a large one only those of the last round");
         assert_eq!(cover(0.5, 1), 240, "a part covers nothing");
-    }
-
-    #[test]
-    fn seeds_come_first_and_outside_ones_not_at_all() {
-        let settings = Settings { points_per_side: 4, ..Settings::default() };
-        let seeds = [[0.3, 0.4], [1.2, 0.5], [0.9, 0.1]].map(|point| Seed { point });
-        let points = all(&mut Prompts::new(&settings, &seeds), 5);
-        assert_eq!(points[..2], [[0.3, 0.4], [0.9, 0.1]], "{points:?}");
-        assert_eq!(points.len(), 2 + 16, "then the grid");
     }
 }

@@ -7,6 +7,7 @@ use std::collections::HashSet;
 
 use rayon::prelude::*;
 
+use super::sum_of;
 use crate::{
     error::{Error, Result},
     limits::BANK_ROWS_MAX,
@@ -24,7 +25,7 @@ pub struct Clusters {
     /// Plain centroids, `[M * dim]`. A scoring profile may scale them to length 1.
     pub bank: Bank,
     /// `[N]` entry of each embedding, 1 to M.
-    pub index: Vec<u16>,
+    pub entries: Vec<u16>,
 }
 
 /// Number of rows for this many embeddings and photos: 1.2 times the mean number of masks of a
@@ -41,7 +42,7 @@ pub fn rows_wanted(features: usize, views: usize) -> usize {
 /// `internal` when the length is not a multiple of `dim` or a number is not finite.
 pub fn bank(features: &[f32], dim: usize, views: usize) -> Result<Clusters> {
     if features.is_empty() {
-        return Ok(Clusters { bank: Bank { dim, rows: Vec::new() }, index: Vec::new() });
+        return Ok(Clusters { bank: Bank { dim, rows: Vec::new() }, entries: Vec::new() });
     }
     if dim == 0 || !features.len().is_multiple_of(dim) {
         return Err(Error::internal(format!(
@@ -71,8 +72,8 @@ pub fn bank(features: &[f32], dim: usize, views: usize) -> Result<Clusters> {
     let centres = means(&rows, &nearest, wanted);
     #[expect(clippy::cast_possible_truncation, reason = "rows are f32")]
     let rows = centres.iter().flatten().map(|v| *v as f32).collect();
-    let index = nearest.iter().map(|(m, _)| u16::try_from(m + 1).unwrap_or(u16::MAX)).collect();
-    Ok(Clusters { bank: Bank { dim, rows }, index })
+    let entries = nearest.iter().map(|(m, _)| u16::try_from(m + 1).unwrap_or(u16::MAX)).collect();
+    Ok(Clusters { bank: Bank { dim, rows }, entries })
 }
 
 /// Number of distinct embeddings; -0 equals 0.
@@ -81,18 +82,9 @@ fn distinct(rows: &[&[f32]]) -> usize {
     rows.iter().map(|row| bits(row)).collect::<HashSet<_>>().len()
 }
 
-/// Squared distance, four sums in a fixed order.
+/// Squared distance.
 fn distance(row: &[f32], centre: &[f64]) -> f64 {
-    let mut sums = [0.0_f64; 4];
-    let (quads, of) = (row.chunks_exact(4), centre.chunks_exact(4));
-    let square = |a: f32, b: f64| (f64::from(a) - b) * (f64::from(a) - b);
-    let rest: f64 = quads.remainder().iter().zip(of.remainder()).map(|(a, b)| square(*a, *b)).sum();
-    for (x, y) in quads.zip(of) {
-        for (lane, sum) in sums.iter_mut().enumerate() {
-            *sum += square(x[lane], y[lane]);
-        }
-    }
-    (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
+    sum_of(row, centre, |a, b| (a - b) * (a - b))
 }
 
 /// The nearest centre of each embedding and its squared distance. The first one wins a tie.
@@ -218,95 +210,7 @@ impl Draw {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-
-    /// `count` unit features of `dim` numbers around `groups` directions.
-    fn features(count: usize, dim: usize, groups: usize, spread: f64, seed: u64) -> Vec<f32> {
-        let mut draw = Draw(seed);
-        let mut normal = || (0..6).map(|_| draw.share() - 0.5).sum::<f64>();
-        let ways: Vec<Vec<f64>> =
-            (0..groups).map(|_| (0..dim).map(|_| normal()).collect()).collect();
-        (0..count)
-            .flat_map(|i| {
-                let row: Vec<f64> =
-                    ways[i % groups].iter().map(|v| v + spread * normal()).collect();
-                let length = row.iter().map(|v| v * v).sum::<f64>().sqrt();
-                row.into_iter().map(move |v| (v / length) as f32)
-            })
-            .collect()
-    }
-
-    fn threads(count: usize) -> rayon::ThreadPool {
-        rayon::ThreadPoolBuilder::new().num_threads(count).build().unwrap()
-    }
-
-    #[test]
-    fn rows_are_1_2_times_the_masks_of_a_photo_rounded_up() {
-        let cases = [(0, 2, 0), (1, 2, 1), (10, 2, 6), (40, 2, 24), (41, 2, 25), (5, 1, 6)];
-        for (features, views, rows) in cases {
-            assert_eq!(rows_wanted(features, views), rows, "{features} of {views}");
-        }
-        assert_eq!(rows_wanted(1_000_000, 1), BANK_ROWS_MAX);
-    }
-
-    #[test]
-    fn no_features_one_feature_and_equal_features_are_legal() {
-        assert_eq!(bank(&[], 8, 2).unwrap().bank.len(), 0);
-        let one = bank(&[0.6, 0.8], 2, 2).unwrap();
-        assert_eq!((one.bank.rows, one.index), (vec![0.6, 0.8], vec![1]));
-        let equal = bank(&[0.6, 0.8, 0.6, 0.8, 0.6, 0.8], 2, 1).unwrap();
-        assert_eq!((equal.bank.len(), equal.index), (1, vec![1, 1, 1]));
-        let two = bank(&[0.0, 1.0, -0.0, 1.0, 1.0, 0.0], 2, 1).unwrap();
-        assert_eq!(two.bank.len(), 2, "-0 is 0");
-    }
-
-    #[test]
-    fn what_is_no_feature_is_refused() {
-        assert!(bank(&[0.5; 7], 3, 2).is_err() && bank(&[0.5], 0, 2).is_err());
-        let error = bank(&[0.0, 1.0, f32::NAN, 1.0], 2, 2).unwrap_err();
-        assert!(error.message().contains("feature 1"), "{error}");
-    }
-
-    #[test]
-    fn the_bank_is_the_same_bit_for_bit_on_any_number_of_threads() {
-        let data = features(240, 37, 50, 0.8, 3);
-        let alone = threads(1).install(|| bank(&data, 37, 3)).unwrap();
-        assert_eq!(alone.bank.len(), 96);
-        for count in [2, 3, 8] {
-            let many = threads(count).install(|| bank(&data, 37, 3)).unwrap();
-            let same = many.bank.rows.iter().zip(&alone.bank.rows);
-            assert!(same.into_iter().all(|(a, b)| a.to_bits() == b.to_bits()), "{count}");
-            assert_eq!(many.index, alone.index, "{count} threads");
-        }
-    }
-
-    #[test]
-    fn groups_that_lie_apart_are_found() {
-        let data = features(60, 32, 12, 0.05, 11);
-        let found = bank(&data, 32, 6).unwrap();
-        assert_eq!(found.bank.len(), 12);
-        for (i, index) in found.index.iter().enumerate() {
-            assert_eq!(*index, found.index[i % 12], "feature {i}");
-        }
-        let used: HashSet<u16> = found.index.iter().copied().collect();
-        assert_eq!(used.len(), 12, "no two groups share a row");
-    }
-
-    #[test]
-    fn each_row_is_the_mean_of_its_features_and_none_is_empty() {
-        let data = features(90, 16, 7, 1.0, 5);
-        let found = bank(&data, 16, 2).unwrap();
-        assert_eq!(found.bank.len(), 54);
-        for m in 1..=54_u16 {
-            let own: Vec<usize> = (0..90).filter(|&i| found.index[i] == m).collect();
-            assert!(!own.is_empty(), "row {m}");
-            for d in 0..16 {
-                let sum: f64 = own.iter().map(|i| f64::from(data[i * 16 + d])).sum();
-                let row = f64::from(found.bank.row(usize::from(m) - 1)[d]);
-                assert!((sum / own.len() as f64 - row).abs() < 1e-6, "row {m}, number {d}");
-            }
-        }
-    }
+    use super::fill_empty;
 
     #[test]
     fn an_empty_cluster_gets_the_farthest_feature_of_a_larger_one() {

@@ -1,26 +1,27 @@
-//! From masks and embeddings to meaning: crops, the bank, an index a Gaussian, scores of a text.
+//! From masks and embeddings to meaning: crops, the bank, an entry for each Gaussian, scores of a
+//! text.
 //!
-//! In: photos, their masks and one embedding a mask, all from elsewhere. Out: a [`Bank`] of few
-//! rows, the row of each Gaussian, and for a text embedding the tables, maps and parts in 3D that
-//! answer "where is it?". Nothing here knows a network, a renderer or a word.
+//! In: photos, their masks and one embedding for each mask. Out: a [`Bank`] of few rows, the entry
+//! of each Gaussian, and for a text embedding the tables, maps and instances in 3D that answer
+//! "where is it?". This module knows no network, no renderer and no word.
 //!
-//! The formulas are those of `docs/conventions.md` in their short forms: no feature of the
-//! embedding's length is ever made for a pixel.
+//! The formulas are the short forms of `docs/conventions.md`: no pixel gets a feature of the
+//! embedding's length.
 
 mod assign;
 mod bank;
 mod crops;
+mod instances;
 mod palette;
-mod parts;
 mod score;
 mod views;
 
 pub use self::{
-    assign::{NetworkPicture, from_source, relabel},
+    assign::{from_source, relabel},
     bank::{Clusters, bank, rows_wanted},
     crops::Cutter,
+    instances::{Box3, Components, Instance, InstanceOptions},
     palette::{colour, palette_table},
-    parts::{Box3, Part, PartOptions, Pieces},
     score::{Scorer, Scoring, TextScores, ViewNorms, mask_from_blend},
     views::{Views, merge},
 };
@@ -32,21 +33,22 @@ fn norm(row: &[f32]) -> f64 {
     dot(row, row).sqrt()
 }
 
-/// Dot product in f64 with four sums in a fixed order, so the bits are always the same.
+/// Dot product in f64.
 fn dot(a: &[f32], b: &[f32]) -> f64 {
+    sum_of(a, b, |x, y| x * y)
+}
+
+/// Sum of a term of each pair in f64: four sums in a fixed order, so the bits are always the same.
+fn sum_of<B: Copy + Into<f64>>(a: &[f32], b: &[B], term: impl Fn(f64, f64) -> f64) -> f64 {
+    let term = |(x, y): (&f32, &B)| term(f64::from(*x), (*y).into());
     let mut sums = [0.0_f64; 4];
-    let (quads_a, quads_b) = (a.chunks_exact(4), b.chunks_exact(4));
-    let rest: f64 = quads_a
-        .remainder()
-        .iter()
-        .zip(quads_b.remainder())
-        .map(|(x, y)| f64::from(*x) * f64::from(*y))
-        .sum();
-    for (x, y) in quads_a.zip(quads_b) {
-        for (lane, sum) in sums.iter_mut().enumerate() {
-            *sum += f64::from(x[lane]) * f64::from(y[lane]);
+    let ((quads_a, rest_a), (quads_b, rest_b)) = (a.as_chunks::<4>(), b.as_chunks::<4>());
+    for pair in quads_a.iter().zip(quads_b) {
+        for (sum, pair) in sums.iter_mut().zip(pair.0.iter().zip(pair.1)) {
+            *sum += term(pair);
         }
     }
+    let rest: f64 = rest_a.iter().zip(rest_b).map(term).sum();
     (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
 }
 

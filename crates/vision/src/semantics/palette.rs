@@ -9,8 +9,8 @@ const TONES: [[f64; 2]; 5] = [[0.95, 0.75], [0.65, 0.85], [1.0, 0.4], [0.8, 1.0]
 
 /// sRGB colour 0..1 of an entry; the background is black.
 #[must_use]
-pub fn colour(index: u16) -> [f32; 3] {
-    let Some(m) = index.checked_sub(1) else { return [0.0; 3] };
+pub fn colour(entry: u16) -> [f32; 3] {
+    let Some(m) = entry.checked_sub(1) else { return [0.0; 3] };
     let hue = (f64::from(m) * HUE_STEP).fract() * 6.0;
     let [value, saturation] = TONES[usize::from(m) % TONES.len()];
     // Each channel is at its maximum for a third of the circle, and rises and falls for a sixth.
@@ -32,48 +32,4 @@ pub fn palette_table(rows: usize) -> Arc<[[f32; 4]]> {
         if m == 0 { [0.0; 4] } else { [1.0, r, g, b] }
     };
     (0..=rows).map(row).collect()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use std::collections::HashSet;
-
-    #[test]
-    fn the_background_is_black_and_no_entry_is() {
-        assert_eq!(colour(0), [0.0; 3]);
-        for m in 1..=4096 {
-            let shade = colour(m);
-            assert!(shade.iter().all(|v| (0.0..=1.0).contains(v)), "{m}: {shade:?}");
-            assert!(shade.iter().any(|v| *v >= 0.49), "{m}: {shade:?} is nearly black");
-        }
-    }
-
-    #[test]
-    fn entries_differ_as_eight_bit_colours() {
-        let byte = |v: f32| (v * 255.0).round() as u8;
-        let seen: HashSet<[u8; 3]> = (1..=512).map(|m| colour(m).map(byte)).collect();
-        assert!(seen.len() >= 510, "{} colours of 512", seen.len());
-        let far = |a: [f32; 3], b: [f32; 3]| {
-            a.iter().zip(b).map(|(x, y)| (x - y).abs()).fold(0.0_f32, f32::max)
-        };
-        for a in 1..24 {
-            for b in 1..a {
-                assert!(far(colour(a), colour(b)) > 0.08, "{a} and {b} look alike");
-            }
-        }
-    }
-
-    #[test]
-    fn the_hue_goes_round_the_circle() {
-        assert_eq!(colour(1), [0.95, 0.95 * 0.25, 0.95 * 0.25].map(|v: f64| v as f32), "red");
-    }
-
-    #[test]
-    fn the_table_has_a_row_for_each_index() {
-        let table = palette_table(3);
-        assert_eq!((table.len(), table[0]), (4, [0.0; 4]));
-        assert_eq!(table[2][1..], colour(2));
-        assert_eq!(table[2][0].to_bits(), 1.0_f32.to_bits());
-    }
 }

@@ -95,7 +95,7 @@ pub struct TextScores {
     /// `B(q - c)`. Row 0 is zeros. A short group repeats its first phrase, which changes no result.
     groups: Vec<Vec<[f64; 4]>>,
     /// `[M + 1]` relevancy of each entry alone.
-    entries: Vec<f32>,
+    relevancies: Vec<f32>,
     /// `[M + 1]` bit c is set if the row is nearer to phrase c than to the text. If all rows of a
     /// pixel share a bit, no weights can select the pixel. Row 0 adds nothing, so it has all bits.
     nearer: Vec<u64>,
@@ -113,8 +113,8 @@ impl TextScores {
 
     /// `[M + 1]` relevancy of each entry alone, 0..1; that of the background is 0.
     #[must_use]
-    pub fn entries(&self) -> &[f32] {
-        &self.entries
+    pub fn relevancies(&self) -> &[f32] {
+        &self.relevancies
     }
 
     /// Whether no pixel can be selected, because all rows are nearer to the same phrase.
@@ -134,7 +134,7 @@ impl TextScores {
     #[must_use]
     pub fn selects(&self, m: u16) -> bool {
         // The rule of the masks, so that 3D and views agree on ties.
-        let known = m > 0 && usize::from(m) < self.entries.len();
+        let known = m > 0 && usize::from(m) < self.relevancies.len();
         let [least, most, _] = self.blend(&[m], &[1.0]);
         known && selected(least, most)
     }
@@ -145,12 +145,12 @@ impl TextScores {
     }
 
     /// Smallest and largest blended score of a pixel's entries, and their coverage.
-    fn blend(&self, index: &[u16], weight: &[f32]) -> [f64; 3] {
+    fn blend(&self, entries: &[u16], weights: &[f32]) -> [f64; 3] {
         let (mut least, mut most, mut coverage) = (f64::INFINITY, f64::NEG_INFINITY, 0.0);
         for rows in &self.groups {
             // Entry 0 and entries beyond the bank add a row of zeros.
             let mut sums = [0.0_f64; 4];
-            for (m, weight) in index.iter().zip(weight) {
+            for (m, weight) in entries.iter().zip(weights) {
                 let row = rows.get(usize::from(*m)).unwrap_or(&[0.0; 4]);
                 let weight = f64::from(*weight);
                 for (sum, v) in sums.iter_mut().zip(row) {
@@ -244,7 +244,7 @@ impl Scorer {
         };
         let mut text = TextScores {
             groups: self.canon_scores.chunks(GROUP).map(group).collect(),
-            entries: vec![0.0],
+            relevancies: vec![0.0],
             nearer: std::iter::once(u64::MAX).chain((0..own.len()).map(nearer)).collect(),
         };
         let alone = (1..).zip(&self.norms).map(|(m, length)| {
@@ -252,7 +252,7 @@ impl Scorer {
             if *length > 0.0 { self.sharpen(least / length) } else { 0.0 }
         });
         let alone: Vec<f32> = alone.collect();
-        text.entries.extend(alone);
+        text.relevancies.extend(alone);
         Ok(text)
     }
 
@@ -385,88 +385,6 @@ fn gram(bank: &Bank) -> Vec<f64> {
 mod tests {
     use super::*;
 
-    fn scoring(profile: ScoringProfile, canon: &[[f32; 2]]) -> Arc<Scoring> {
-        let canon = canon.iter().map(|c| c.to_vec()).collect();
-        Arc::new(Scoring::new(profile, canon, 10.0, 0.05).unwrap())
-    }
-
-    const X: [f32; 2] = [1.0, 0.0];
-    const Y: [f32; 2] = [0.0, 1.0];
-
-    fn scorer(rows: &[[f32; 2]], profile: ScoringProfile) -> Scorer {
-        let bank = Bank { dim: 2, rows: rows.concat() };
-        Scorer::new(&bank, scoring(profile, &[Y])).unwrap()
-    }
-
-    /// Weights of pixels given as lists.
-    fn view(pixels: &[&[(u16, f32)]]) -> PixelWeights {
-        let mut view = PixelWeights::none(0);
-        for pixel in pixels {
-            view.entries.extend(pixel.iter().map(|e| e.0));
-            view.weights.extend(pixel.iter().map(|e| e.1));
-            view.offsets.push(view.entries.len() as u32);
-        }
-        view
-    }
-
-    #[test]
-    fn a_row_that_is_the_text_scores_as_the_formula_says() {
-        let scorer = scorer(&[X, Y, [3.0, 4.0]], ScoringProfile::Paper);
-        let text = scorer.text(&X).unwrap();
-        let close = |a: f32, b: f64| (f64::from(a) - b).abs() < 1e-6;
-        let sigmoid = |v: f64| 1.0 / (1.0 + (-10.0 * v).exp());
-        let entries = text.entries();
-        assert!(close(entries[1], sigmoid(1.0)) && close(entries[2], sigmoid(-1.0)));
-        assert!(close(entries[3], sigmoid(-0.2)), "a row's own length does not matter alone");
-        assert!(entries[0].to_bits() == 0 && text.selects(1) && !text.selects(2));
-        assert!(!text.selects(0) && !text.selects(4), "the background and what is no row");
-    }
-
-    #[test]
-    fn pixels_blend_their_rows_and_forget_the_rest() {
-        let scorer = scorer(&[X, Y], ScoringProfile::Paper);
-        let text = scorer.text(&X).unwrap();
-        let view =
-            view(&[&[(1, 0.4), (2, 0.3)], &[(1, 0.3), (2, 0.4)], &[], &[(9, 1.0), (0, 1.0)]]);
-        let norms = scorer.norms(&view).unwrap();
-        let map = scorer.relevancy(&text, &view, &norms).unwrap();
-        let want = 1.0 / (1.0 + (-10.0 * 0.1_f64 / 0.5).exp());
-        assert!((f64::from(map[0]) - want).abs() < 1e-6, "{} {want}", map[0]);
-        assert_eq!(&map[1..], [0.0, 0.0, 0.0], "under 0.5, nothing, no rows");
-        let mask = scorer.mask(&text, &view).unwrap();
-        assert_eq!(mask, [true, false, false, false]);
-    }
-
-    #[test]
-    fn the_default_profile_has_unit_rows_and_a_coverage_floor_the_paper_has_neither() {
-        let rows = [[0.1, 0.0], Y];
-        let view = view(&[&[(1, 0.5), (2, 0.3)], &[(1, 0.04)], &[(1, 0.05)]]);
-        let mask = |profile| {
-            let scorer = scorer(&rows, profile);
-            let text = scorer.text(&X).unwrap();
-            let norms = scorer.norms(&view).unwrap();
-            let map = scorer.relevancy(&text, &view, &norms).unwrap();
-            let mask = scorer.mask(&text, &view).unwrap();
-            let from_map: Vec<bool> = map.iter().map(|v| *v >= 0.5).collect();
-            assert_eq!(mask, from_map, "{profile:?}: two roads to one mask");
-            mask
-        };
-        assert_eq!(mask(ScoringProfile::Default), [true, false, true]);
-        assert_eq!(mask(ScoringProfile::Paper), [false, true, true]);
-    }
-
-    #[test]
-    fn opposite_rows_cancel_to_no_relevancy_and_never_nan() {
-        let scorer = scorer(&[X, [-1.0, 0.0], [0.0, 0.0]], ScoringProfile::Default);
-        let text = scorer.text(&X).unwrap();
-        let view = view(&[&[(1, 0.5), (2, 0.5)], &[(3, 1.0)], &[(1, 0.5), (3, 0.5)]]);
-        let norms = scorer.norms(&view).unwrap();
-        let map = scorer.relevancy(&text, &view, &norms).unwrap();
-        assert_eq!(map[..2], [0.0, 0.0]);
-        assert!(map[2] > 0.99, "a row of zeros adds coverage alone");
-        assert_eq!(scorer.mask(&text, &view).unwrap(), [false, false, true]);
-    }
-
     #[test]
     fn rows_rule_a_pixel_out_only_where_no_blend_of_them_is_selected() {
         let towards = |angle: f32| [angle.cos(), angle.sin()];
@@ -474,11 +392,15 @@ mod tests {
         let rows: Vec<[f32; 2]> = (0..9).map(|i| towards(i as f32 * 0.2)).collect();
         let bank = Bank { dim: 2, rows: rows.concat() };
         let canon: Vec<[f32; 2]> = [3, 17, 31, 45, 59].map(around).to_vec();
-        let scorer = Scorer::new(&bank, scoring(ScoringProfile::Paper, &canon)).unwrap();
-        let pixels: Vec<Vec<(u16, f32)>> = (0..400_u16)
-            .map(|p| (0..1 + p % 4).map(|k| ((p * 7 + k * k) % 11, 0.1 + f32::from(k))).collect())
-            .collect();
-        let view = view(&pixels.iter().map(Vec::as_slice).collect::<Vec<_>>());
+        let canon = canon.iter().map(|c| c.to_vec()).collect();
+        let scoring = Scoring::new(ScoringProfile::Paper, canon, 10.0, 0.05).unwrap();
+        let scorer = Scorer::new(&bank, Arc::new(scoring)).unwrap();
+        let mut view = PixelWeights::none(0);
+        for p in 0..400_u16 {
+            view.entries.extend((0..1 + p % 4).map(|k| (p * 7 + k * k) % 11));
+            view.weights.extend((0..1 + p % 4).map(|k| 0.1 + f32::from(k)));
+            view.offsets.push(view.entries.len() as u32);
+        }
         let norms = scorer.norms(&view).unwrap();
         let [mut inside, mut ruled_out, mut nothing] = [0; 3];
         for text in (0..50).map(|i| scorer.text(&around(i * 3 + 1)).unwrap()) {
@@ -497,91 +419,5 @@ mod tests {
         }
         let told = format!("{inside} selected, {ruled_out} ruled out, {nothing} texts");
         assert!(inside > 500 && ruled_out > 5000 && (5..45).contains(&nothing), "{told}");
-    }
-
-    #[test]
-    fn the_worst_phrase_decides_and_blended_tables_say_the_same() {
-        let bank = Bank { dim: 2, rows: [X, [0.6, 0.8], [-0.6, -0.8]].concat() };
-        for count in 1..=5_usize {
-            // Phrases turn towards X; the last is the nearest to it.
-            let canon: Vec<[f32; 2]> = (1..=count)
-                .map(|i| {
-                    let turn = 1.5 - 0.25 * i as f32;
-                    [turn.cos(), turn.sin()]
-                })
-                .collect();
-            let scoring = scoring(ScoringProfile::Default, &canon);
-            let scorer = Scorer::new(&bank, Arc::clone(&scoring)).unwrap();
-            let text = scorer.text(&X).unwrap();
-            let want = 1.0 / (1.0 + (-10.0 * (1.0 - f64::from(canon[count - 1][0]))).exp());
-            assert!((f64::from(text.entries()[1]) - want).abs() < 1e-5, "{count} phrases");
-            let tables = text.tables();
-            assert_eq!(tables.len(), count.div_ceil(3));
-            let pixels: [&[(u16, f32)]; 5] =
-                [&[(1, 0.5)], &[(2, 0.9)], &[(1, 0.2), (2, 0.3)], &[(1, 0.01)], &[(3, 0.7)]];
-            let view = view(&pixels);
-            let blend = |table: &Arc<[[f32; 4]]>| -> Vec<[f32; 4]> {
-                let sum = |pixel: &&[(u16, f32)]| {
-                    let mut sum = [0.0; 4];
-                    for (m, weight) in *pixel {
-                        let row = table[usize::from(*m)];
-                        sum.iter_mut()
-                            .zip(row)
-                            .for_each(|(s, v): (&mut f32, f32)| *s += weight * v);
-                    }
-                    sum
-                };
-                pixels.iter().map(sum).collect()
-            };
-            let pictures: Vec<Vec<[f32; 4]>> = tables.iter().map(blend).collect();
-            let pictures: Vec<&[[f32; 4]]> = pictures.iter().map(Vec::as_slice).collect();
-            let mask = mask_from_blend(&pictures, &scoring);
-            assert_eq!(mask, scorer.mask(&text, &view).unwrap(), "{count} phrases");
-            assert!(mask[0] && !mask[3], "{count} phrases: {mask:?}");
-            // Far from the text, but farther from every phrase.
-            assert!(mask[4], "{count} phrases: {mask:?}");
-        }
-    }
-
-    #[test]
-    fn an_empty_bank_has_no_relevancy_anywhere() {
-        let scorer = scorer(&[], ScoringProfile::Default);
-        let text = scorer.text(&X).unwrap();
-        assert_eq!((text.entries().len(), text.tables()[0].len()), (1, 1));
-        let view = view(&[&[], &[(1, 1.0)]]);
-        let norms = scorer.norms(&view).unwrap();
-        assert_eq!(scorer.relevancy(&text, &view, &norms).unwrap(), [0.0, 0.0]);
-        assert_eq!(scorer.mask(&text, &view).unwrap(), [false, false]);
-    }
-
-    #[test]
-    fn a_great_tau_saturates_without_overflow() {
-        let canon = vec![Y.to_vec()];
-        let scoring = Scoring::new(ScoringProfile::Paper, canon, 1e6, 0.05).unwrap();
-        let bank = Bank { dim: 2, rows: [X, Y].concat() };
-        let text = Scorer::new(&bank, Arc::new(scoring)).unwrap().text(&X).unwrap();
-        assert_eq!(text.entries(), [0.0, 1.0, 0.0]);
-    }
-
-    #[test]
-    fn what_does_not_belong_together_is_refused() {
-        let new = |canon: Vec<Vec<f32>>, tau, floor| {
-            Scoring::new(ScoringProfile::Default, canon, tau, floor)
-        };
-        assert!(new(vec![], 10.0, 0.0).is_err() && new(vec![vec![]], 10.0, 0.0).is_err());
-        assert!(new(vec![X.to_vec(), vec![1.0]], 10.0, 0.0).is_err());
-        assert!(new(vec![vec![f32::NAN]], 10.0, 0.0).is_err());
-        assert!(new(vec![X.to_vec()], 0.0, 0.0).is_err());
-        assert!(new(vec![X.to_vec()], f64::NAN, 0.0).is_err());
-        assert!(new(vec![X.to_vec()], 10.0, 1.5).is_err());
-        let scorer = scorer(&[X], ScoringProfile::Default);
-        assert!(scorer.text(&[1.0]).is_err() && scorer.text(&[1.0, f32::INFINITY]).is_err());
-        let wide = Bank { dim: 3, rows: vec![1.0; 3] };
-        assert!(Scorer::new(&wide, Arc::clone(&scorer.scoring)).is_err());
-        let view = view(&[&[(1, 0.5)]]);
-        let text = scorer.text(&X).unwrap();
-        assert!(scorer.relevancy(&text, &view, &ViewNorms::default()).is_err());
-        let broken = PixelWeights { offsets: vec![0, 2], entries: vec![1], weights: vec![0.5] };
-        assert!(scorer.mask(&text, &broken).is_err() && scorer.norms(&broken).is_err());
     }
 }

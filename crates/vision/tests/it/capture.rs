@@ -7,9 +7,9 @@ use std::{
 };
 
 use segsplat_core::{
-    error::ErrorCode,
+    error::{ErrorCode, Result},
     limits::Limits,
-    scene::{CameraToWorld, PosedPhoto, WarningCode},
+    scene::{CameraToWorld, Capture, PosedPhoto, WarningCode},
 };
 use segsplat_vision::{
     capture, photos,
@@ -38,6 +38,15 @@ fn picked(photos: &[PosedPhoto], which: &[usize]) -> Vec<PosedPhoto> {
     which.iter().map(|&i| photos[i].clone()).collect()
 }
 
+fn analyse(photos: &[PosedPhoto]) -> Result<Capture> {
+    capture::analyse(photos, &AtomicBool::new(false))
+}
+
+/// Depth ranges of some of the photos, measured among these alone.
+fn ranges_of(photos: &[PosedPhoto], which: &[usize]) -> Vec<[f64; 2]> {
+    analyse(&picked(photos, which)).unwrap().near_far
+}
+
 /// Share of the depths inside the range.
 fn inside(depths: impl Iterator<Item = f64>, [near, far]: [f64; 2]) -> f64 {
     let (mut count, mut total) = (0, 0);
@@ -53,10 +62,8 @@ fn the_depth_range_holds_the_true_depths_and_little_else() {
     let room = Room::new(3);
     for count in [2, 5] {
         let posed = sample::photos(&options(count)).unwrap();
-        let capture = capture::analyse(&posed).unwrap();
+        let capture = analyse(&posed).unwrap();
         assert_eq!(capture.warnings, [], "a right capture");
-        let set: Vec<usize> = (0..count).collect();
-        assert_eq!(capture::near_far(&posed, &set).unwrap(), capture.near_far);
         for (posed, &[near, far]) in posed.iter().zip(&capture.near_far) {
             let depth = room.view(&posed.camera).depth;
             let mut depths: Vec<f64> = depth.into_iter().map(f64::from).collect();
@@ -76,7 +83,7 @@ fn the_depth_range_holds_the_true_depths_and_little_else() {
 #[test]
 fn depth_follows_the_unit_of_the_cameras() {
     let posed = sample::photos(&options(2)).unwrap();
-    let near_far = capture::near_far(&posed, &[0, 1]).unwrap();
+    let near_far = ranges_of(&posed, &[0, 1]);
     let scaled: Vec<PosedPhoto> = posed
         .iter()
         .map(|p| {
@@ -89,7 +96,7 @@ fn depth_follows_the_unit_of_the_cameras() {
             p
         })
         .collect();
-    let far_away = capture::near_far(&scaled, &[0, 1]).unwrap();
+    let far_away = ranges_of(&scaled, &[0, 1]);
     for (a, b) in near_far.iter().flatten().zip(far_away.iter().flatten()) {
         assert!((b / a / 1000.0 - 1.0).abs() < 0.02, "{a} became {b}");
     }
@@ -98,7 +105,7 @@ fn depth_follows_the_unit_of_the_cameras() {
 #[test]
 fn overlap_falls_with_distance_and_sets_follow_it() {
     let posed = sample::photos(&options(9)).unwrap();
-    let capture = capture::analyse(&posed).unwrap();
+    let capture = analyse(&posed).unwrap();
     assert!(capture.overlap[0][1] > 0.8, "{}", capture.overlap[0][1]);
     assert!(capture.overlap[0][8] < capture.overlap[0][1]);
     let sets = capture::view_sets(&capture, &posed, 4, 3);
@@ -136,17 +143,17 @@ fn one_picture_under_several_poses_is_named() {
         }
         photos
     };
-    let refused = capture::analyse(&copied(4)).unwrap_err();
+    let refused = analyse(&copied(4)).unwrap_err();
     assert_eq!(refused.code(), ErrorCode::InvalidRequest);
     for (i, photo) in posed.iter().enumerate() {
         let named = format!("photo {i} ({:?})", photo.file);
         assert!(refused.message().contains(&named), "{refused}");
     }
-    let warnings = capture::analyse(&copied(2)).unwrap().warnings;
+    let warnings = analyse(&copied(2)).unwrap().warnings;
     let same = warnings.iter().find(|w| w.code == WarningCode::SamePicture).expect("a warning");
     assert!(same.message.starts_with("photo 0 (") && same.message.contains("photo 1 ("));
     assert!(!same.message.contains("photo 2 ("), "{}", same.message);
-    let right = capture::analyse(&posed).unwrap().warnings;
+    let right = analyse(&posed).unwrap().warnings;
     assert!(right.iter().all(|w| w.code != WarningCode::SamePicture), "{right:?}");
 }
 
@@ -155,7 +162,7 @@ fn a_cancelled_capture_ends_between_two_comparisons() {
     let posed = sample::photos(&options(24)).unwrap();
     let cancel = AtomicBool::new(false);
     let ended = std::thread::scope(|scope| {
-        let analysis = scope.spawn(|| capture::analyse_until(&posed, &cancel));
+        let analysis = scope.spawn(|| capture::analyse(&posed, &cancel));
         // The comparisons take seconds; the grey pictures of so few pixels take none.
         std::thread::sleep(Duration::from_millis(100));
         cancel.store(true, Ordering::Relaxed);
@@ -167,14 +174,14 @@ fn a_cancelled_capture_ends_between_two_comparisons() {
 #[test]
 fn captures_without_depth_are_refused() {
     let posed = sample::photos(&options(2)).unwrap();
-    let one = capture::analyse(&posed[..1]).unwrap_err();
+    let one = analyse(&posed[..1]).unwrap_err();
     assert!(one.message().contains("at least 2"), "{one}");
     let same = [posed[0].clone(), posed[0].clone()];
-    let error = capture::analyse(&same).unwrap_err();
+    let error = analyse(&same).unwrap_err();
     assert!(error.message().contains("one place"), "{error}");
     let mut blank = posed;
     blank[1].photo.rgb.fill(128);
-    let error = capture::analyse(&blank).unwrap_err();
+    let error = analyse(&blank).unwrap_err();
     assert!(error.message().contains("share nothing"), "{error}");
     assert!(error.message().contains("photo 0"), "names the photos: {error}");
 }
@@ -182,7 +189,7 @@ fn captures_without_depth_are_refused() {
 #[test]
 fn invalid_pixels_are_never_matched() {
     let mut posed = sample::photos(&options(2)).unwrap();
-    let want = capture::near_far(&posed, &[0, 1]).unwrap();
+    let want = ranges_of(&posed, &[0, 1]);
     // A frame of rubbish that moves with the photo would read as a surface at infinity.
     for p in &mut posed {
         let (w, h) = (p.photo.width as usize, p.photo.height as usize);
@@ -199,7 +206,7 @@ fn invalid_pixels_are_never_matched() {
         }
         p.photo.valid = Some(valid);
     }
-    let got = capture::near_far(&posed, &[0, 1]).unwrap();
+    let got = ranges_of(&posed, &[0, 1]);
     for ([_, far], [_, want]) in got.iter().zip(&want) {
         assert!(far < &(1.5 * want), "far {far}, without the frame {want}");
     }
@@ -219,7 +226,7 @@ const NEIGHBORS: [(&str, [[usize; 2]; 2]); 8] = [
 
 /// Two photos that see much of the same raise no warning.
 fn raises_no_false_alarm(name: &str, all: &[PosedPhoto], pair: [usize; 2]) {
-    let capture = capture::analyse(&picked(all, &pair)).unwrap();
+    let capture = analyse(&picked(all, &pair)).unwrap();
     assert_eq!(capture.warnings, [], "{name} {pair:?}");
     let overlap = capture.overlap[0][1].max(capture.overlap[1][0]);
     assert!(overlap > 0.4, "{name} {pair:?}: overlap {overlap}");
@@ -278,7 +285,7 @@ fn mistakes_are_named(name: &str, right: &[PosedPhoto]) {
         ("focal length of twice the size", WarningCode::IntrinsicsScale, |p| scale_k(p, 2.0, 1.0)),
     ];
     for (what, code, spoil) in mistakes {
-        let capture = capture::analyse(&spoilt(right, spoil)).unwrap();
+        let capture = analyse(&spoilt(right, spoil)).unwrap();
         let codes: Vec<WarningCode> = capture.warnings.iter().map(|w| w.code).collect();
         assert!(codes.contains(&code), "{name}, {what}: {:?}", capture.warnings);
         let message = &capture.warnings[0].message;
@@ -308,7 +315,7 @@ fn stranger_is_refused(right: &[PosedPhoto], stranger: &PosedPhoto) {
     let mut pair = right.to_vec();
     pair[1].photo = stranger.photo.clone();
     pair[1].camera.intrinsics = stranger.camera.intrinsics;
-    let error = capture::analyse(&pair).unwrap_err();
+    let error = analyse(&pair).unwrap_err();
     assert!(error.message().contains("share nothing"), "{error}");
 }
 
@@ -330,7 +337,7 @@ fn real_strangers_are_refused() {
 fn ranges_hold_the_true_depths() {
     let photos = generated();
     for pair in [[0, 1], [2, 3], [4, 5]] {
-        let near_far = capture::near_far(&photos, &pair).unwrap();
+        let near_far = ranges_of(&photos, &pair);
         for (i, range) in pair.into_iter().zip(near_far) {
             let depth = room::room().view(&photos[i].camera).depth;
             let share = inside(depth.into_iter().map(f64::from), range);
@@ -343,7 +350,7 @@ fn ranges_hold_the_true_depths() {
 fn intrinsics_scaled_at_the_door_are_reported() {
     let mut posed = sample::photos(&options(2)).unwrap();
     posed[1].intrinsics_made_for = Some([400, 300]);
-    let capture = capture::analyse(&posed).unwrap();
+    let capture = analyse(&posed).unwrap();
     assert_eq!(capture.warnings[0].code, WarningCode::IntrinsicsScale);
     assert!((capture.warnings[0].value - 0.5).abs() < 1e-9);
     assert!(capture.warnings[0].message.contains("400x300"), "{}", capture.warnings[0].message);
@@ -364,7 +371,7 @@ fn ranges_of_a_real_room_hold_what_a_depth_camera_saw() {
             .collect()
     };
     for pair in [[0, 2], [8, 9], [16, 17], [20, 21]] {
-        let near_far = capture::near_far(&posed, &pair).unwrap();
+        let near_far = ranges_of(&posed, &pair);
         for (i, range) in pair.into_iter().zip(near_far) {
             let share = inside(kinect(i).into_iter(), range);
             println!("red_kitchen {pair:?}, photo {i}: {share:.4} of the pixels in {range:.2?} m");

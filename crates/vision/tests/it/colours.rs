@@ -58,7 +58,7 @@ fn photo(width: u32, height: u32) -> Photo {
 #[test]
 fn a_mask_lies_where_the_point_was_whatever_the_photos_shape() {
     let Some(runtime) = runtime() else { return };
-    let network = MaskNetwork::open(runtime, &bundle(), &network_options()).unwrap().unwrap();
+    let network = MaskNetwork::open(&runtime, &bundle(), &network_options()).unwrap().unwrap();
     for (width, height) in [(64, 64), (128, 64), (96, 192), (250, 130)] {
         let embedding = network.encode(&photo(width, height)).unwrap();
         let filled = embedding.resized().map(|v| f64::from(v) / 64.0);
@@ -132,8 +132,7 @@ fn every_signature_of_a_decoder_gives_the_same_masks() {
     );
     let points = [[0.25_f32, 0.5], [0.76, 0.52], [0.5, 0.1]];
     let masks = |bundle: &Bundle, width, height| {
-        let network =
-            MaskNetwork::open(Arc::clone(&runtime), bundle, &network_options()).unwrap().unwrap();
+        let network = MaskNetwork::open(&runtime, bundle, &network_options()).unwrap().unwrap();
         let embedding = network.encode(&photo(width, height)).unwrap();
         (embedding.resized(), network.decode(&embedding, &points).unwrap())
     };
@@ -171,7 +170,7 @@ fn a_decoder_of_another_signature_is_refused_by_name() {
         "6000b740b2ed30d6008540076d9b404e10fe3095558d49b90483435f38245d92",
         &[],
     );
-    let error = MaskNetwork::open(runtime, &wrong, &network_options()).unwrap_err();
+    let error = MaskNetwork::open(&runtime, &wrong, &network_options()).unwrap_err();
     assert_eq!(error.code(), ErrorCode::ModelUnavailable, "{error}");
     assert!(error.message().contains("point_coords"), "{error}");
 }
@@ -191,7 +190,7 @@ fn posed(photo: Photo, x: f64) -> PosedPhoto {
 #[test]
 fn photos_give_masks_and_seeds_say_where_they_reappear() {
     let Some(runtime) = runtime() else { return };
-    let network = MaskNetwork::open(runtime, &bundle(), &network_options()).unwrap().unwrap();
+    let network = MaskNetwork::open(&runtime, &bundle(), &network_options()).unwrap().unwrap();
     let settings = masks::settings(network.manifest());
     assert!((settings.pred_iou_thresh - 0.7).abs() < 1e-6, "the bundle's thresholds");
     let photos = [posed(photo(64, 64), 0.0), posed(photo(64, 64), 0.25)];
@@ -244,7 +243,7 @@ fn cosine(a: &[f32], b: &[f32]) -> f32 {
 #[test]
 fn words_find_their_colours() {
     let Some(runtime) = runtime() else { return };
-    let towers = ImageText::open(runtime, &bundle(), &network_options()).unwrap().unwrap();
+    let towers = ImageText::open(&runtime, &bundle(), &network_options()).unwrap().unwrap();
     // More crops than a batch, of several sizes.
     let crops: Vec<Crop> =
         (0..40).map(|i| crop([RED, GREEN, GREY][i as usize % 3], 16 + i)).collect();
@@ -267,7 +266,7 @@ fn words_find_their_colours() {
 #[test]
 fn a_text_says_what_was_not_understood() {
     let Some(runtime) = runtime() else { return };
-    let towers = ImageText::open(runtime, &bundle(), &network_options()).unwrap().unwrap();
+    let towers = ImageText::open(&runtime, &bundle(), &network_options()).unwrap().unwrap();
     let embed = |text: &str| towers.embed_texts(&[text.to_owned()]).map(|mut rows| rows.remove(0));
     let known = embed("the red apple").unwrap();
     assert_eq!((known.tokens, known.unknown, known.cut), (3, 0, false), "known words");
@@ -291,9 +290,6 @@ fn a_text_says_what_was_not_understood() {
 fn a_bundle_without_semantics_opens_without_them() {
     let Some(runtime) = runtime() else { return };
     let plane = Bundle::open(&root().join("tests/fixtures/plane")).unwrap();
-    assert!(
-        MaskNetwork::open(Arc::clone(&runtime), &plane, &network_options()).unwrap().is_none(),
-        "masks"
-    );
-    assert!(ImageText::open(runtime, &plane, &network_options()).unwrap().is_none(), "towers");
+    assert!(MaskNetwork::open(&runtime, &plane, &network_options()).unwrap().is_none(), "masks");
+    assert!(ImageText::open(&runtime, &plane, &network_options()).unwrap().is_none(), "towers");
 }

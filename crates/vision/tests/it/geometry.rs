@@ -1,10 +1,7 @@
 //! A stand-in network whose answer is known (every pixel on the plane z = near of its camera):
 //! what comes out of it must lie where the photos' own cameras say, whatever their shape.
 
-use std::{
-    collections::HashSet,
-    sync::{Arc, atomic::AtomicBool},
-};
+use std::{collections::HashSet, sync::atomic::AtomicBool};
 
 use glam::{DMat3, DMat4, DVec3};
 use segsplat_core::{
@@ -34,7 +31,7 @@ fn network() -> Option<Geometry> {
         }
         runtime => runtime.unwrap(),
     };
-    Some(Geometry::open(Arc::clone(&runtime), &bundle, &network_options()).unwrap())
+    Some(Geometry::open(&runtime, &bundle, &network_options()).unwrap())
 }
 
 /// A photo whose red is the column and green the row.
@@ -91,10 +88,10 @@ fn a_plane_of_known_depth_lies_where_the_photos_own_cameras_say() {
             photo(width, height, far_away, 0.1),
             photo(width, height, far_away + DVec3::new(0.7, 0.1, -0.2), -0.15),
         ];
-        let made = lifted(&network, &photos);
-        let gaussians = &made.gaussians;
+        let result = lifted(&network, &photos);
+        let gaussians = &result.gaussians;
         assert!(gaussians.len() > 1_500, "{} of {width}x{height}", gaussians.len());
-        assert!((made.median_depth - DEPTH).abs() < 1e-3, "median depth {}", made.median_depth);
+        assert!((result.median_depth - DEPTH).abs() < 1e-3, "median depth {}", result.median_depth);
         for i in 0..gaussians.len() {
             let camera = &photos[usize::from(gaussians.source()[i].view)].camera;
             let mean = glam::Vec3::from_array(gaussians.means()[i]).as_dvec3();
@@ -123,22 +120,22 @@ fn six_photos_of_one_plane_keep_four_layers_and_no_hole() {
     // Parallel cameras in one line: their planes are the same plane.
     let photos: Vec<PosedPhoto> =
         (0..6).map(|i| photo(64, 64, DVec3::new(0.05 * f64::from(i), 0.0, 0.0), 0.0)).collect();
-    let made = lifted(&network, &photos);
-    let total: u64 = made.dropped.iter().map(|d| d.count).sum();
-    assert_eq!(made.gaussians.len() as u64 + total, 6 * 32 * 32, "all are accounted for");
-    assert!(made.dropped.iter().any(|d| d.reason == "duplicate"), "{:?}", made.dropped);
+    let result = lifted(&network, &photos);
+    let total: u64 = result.dropped.iter().map(|d| d.count).sum();
+    assert_eq!(result.gaussians.len() as u64 + total, 6 * 32 * 32, "all are accounted for");
+    assert!(result.dropped.iter().any(|d| d.reason == "duplicate"), "{:?}", result.dropped);
 
     // Around every place that all six see, at least four photos and at most five have a Gaussian.
     let pixel = DEPTH / (0.9 * 32.0);
     for (x, y) in [(0.0, 0.0), (0.6, -0.4), (-0.5, 0.7)] {
         let place = DVec3::new(x, y, DEPTH);
-        let near: HashSet<u16> = (0..made.gaussians.len())
+        let near: HashSet<u16> = (0..result.gaussians.len())
             .filter(|&i| {
-                let mean = glam::Vec3::from_array(made.gaussians.means()[i]).as_dvec3();
-                let off = mean + made.gaussians.origin() - place;
+                let mean = glam::Vec3::from_array(result.gaussians.means()[i]).as_dvec3();
+                let off = mean + result.gaussians.origin() - place;
                 off.x.abs() <= 0.6 * pixel && off.y.abs() <= 0.6 * pixel
             })
-            .map(|i| made.gaussians.source()[i].view)
+            .map(|i| result.gaussians.source()[i].view)
             .collect();
         assert!((4..=5).contains(&near.len()), "({x}, {y}): layers of photos {near:?}");
     }

@@ -1,4 +1,4 @@
-//! The short forms of semantics against the literal road: dense E blended as one-hot colours,
+//! The short forms of semantics against the plain definition: dense E blended as one-hot colours,
 //! decoded to D numbers a pixel, brought to unit length, compared with the text in f64.
 //!
 //! Masks must be equal on every pixel that is no tie, relevancy within 1e-5 where the feature is
@@ -63,7 +63,7 @@ fn bank(m: u16, kind: Rows, random: &mut Random) -> Bank {
     Bank { dim: DIM, rows: rows.concat() }
 }
 
-/// What the literal road says of a pixel.
+/// What the plain definition gives for a pixel.
 struct Truth {
     coverage: f64,
     norm: f64,
@@ -121,7 +121,7 @@ struct Tally {
     worst: f64,
 }
 
-/// A view with its E by both roads.
+/// A view with its E in both forms.
 struct View<'a> {
     renderer: &'a CpuRenderer,
     gaussians: &'a Gaussians,
@@ -131,7 +131,7 @@ struct View<'a> {
 }
 
 impl View<'_> {
-    /// One text by all roads.
+    /// One text in all forms.
     fn compare(
         &self,
         scorer: &Scorer,
@@ -209,7 +209,7 @@ fn texts(bank: &Bank, canon: &[Vec<f32>], random: &mut Random) -> Vec<Vec<f32>> 
 }
 
 #[test]
-fn fifty_scene_view_text_cases_equal_the_literal_road() {
+fn fifty_scene_view_text_cases_equal_the_plain_definition() {
     use Rows::{Equal, Grouped, Opposite};
     let renderer = CpuRenderer::new(2).expect("two threads");
     let views = [

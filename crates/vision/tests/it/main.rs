@@ -7,13 +7,28 @@
     reason = "helpers of tests are tests too"
 )]
 
+mod assign;
+mod backdrop;
+mod bank;
+mod bitset;
+mod bundle;
 mod capture;
 mod colours;
+mod crops;
+mod fit;
+mod frame;
 mod geometry;
+mod instances;
 mod literal;
+mod palette;
 mod photos;
+mod quality;
 mod room;
+mod sample;
+mod score;
 mod segment;
+mod thin;
+mod votes;
 
 use segsplat_vision::models::NetworkOptions;
 

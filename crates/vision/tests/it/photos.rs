@@ -1,6 +1,11 @@
 //! Uploads as callers send them: what is read, and what is refused by which words.
 
-use std::{io::Write, sync::atomic::AtomicBool};
+use std::{
+    io::{Cursor, Write},
+    sync::atomic::AtomicBool,
+};
+
+use image::{DynamicImage, ImageBuffer, ImageFormat, Rgb, RgbImage};
 
 use segsplat_core::{
     error::ErrorCode,
@@ -29,6 +34,21 @@ fn sent() -> (Vec<PosedPhoto>, Vec<UploadFile>) {
 
 fn upload(cameras: UploadCameras, files: Vec<UploadFile>) -> Upload {
     Upload { cameras: Some(cameras), photos: files, archive: None }
+}
+
+/// `cameras` JSON of the photos: this project's own form, OpenCV camera-to-world.
+fn cameras_json(photos: &[PosedPhoto]) -> Vec<u8> {
+    let cameras: Vec<_> = photos
+        .iter()
+        .map(|posed| {
+            json!({
+                "file": posed.file,
+                "intrinsics": posed.camera.intrinsics,
+                "camera_to_world": posed.camera.camera_to_world,
+            })
+        })
+        .collect();
+    format!("{:#}\n", json!({ "cameras": cameras })).into_bytes()
 }
 
 fn transforms() -> Value {
@@ -76,7 +96,7 @@ fn both_camera_files_give_the_same_photos_in_their_order() {
     let limits = Limits::default();
     let opengl = UploadCameras::Transforms(sample::transforms_json(&posed));
     same_as_sent(&photos::read(&upload(opengl, files.clone()), &limits).unwrap(), &posed);
-    let opencv = UploadCameras::Cameras(sample::cameras_json(&posed));
+    let opencv = UploadCameras::Cameras(cameras_json(&posed));
     for file in &mut files {
         let name = file.name.rsplit('/').next().unwrap_or_default();
         file.name = format!("elsewhere/{name}");
@@ -102,7 +122,7 @@ fn the_number_of_photos_is_bounded_on_both_sides() {
 #[test]
 fn impossible_cameras_are_refused_by_photo_and_value() {
     type Spoil = fn(&mut Value);
-    let cases: [(Spoil, &[&str]); 15] = [
+    let cases: [(Spoil, &[&str]); 22] = [
         (|f| f["transform_matrix"] = Value::Null, &["transform_matrix", "4 rows of 4"]),
         (|f| drop(f.as_object_mut().unwrap().remove("transform_matrix")), &["missing"]),
         (|f| f["transform_matrix"][0] = json!([1, 2, 3]), &["4 rows of 4"]),
@@ -118,6 +138,13 @@ fn impossible_cameras_are_refused_by_photo_and_value() {
         (|f| f["w"] = json!(-48), &["width", "-48"]),
         (|f| f["camera_model"] = json!("EQUIRECTANGULAR"), &["EQUIRECTANGULAR", "OPENCV_FISHEYE"]),
         (|f| f["k1"] = Value::Null, &["k1 is NaN"]),
+        (|f| f["fl_x"] = Value::Null, &["fx is NaN"]),
+        (|f| f["cx"] = Value::Null, &["cx is NaN"]),
+        (|f| f["w"] = json!(0), &["width"]),
+        (|f| without(f, &["h"]), &["only one"]),
+        (|f| without(f, &["fl_x", "fl_y"]), &["no focal length"]),
+        (|f| (without(f, &["fl_x", "fl_y"]), f["camera_angle_x"] = json!(4.0)).1, &["angle"]),
+        (|f| f["fl_y"] = json!(0), &["fy is 0"]),
     ];
     for (spoil, words) in cases {
         let mut json = transforms();
@@ -126,6 +153,11 @@ fn impossible_cameras_are_refused_by_photo_and_value() {
         words.push("photo 1 (");
         refused(&with_transforms(&json, sent().1), ErrorCode::InvalidRequest, &words);
     }
+}
+
+fn without(frame: &mut Value, keys: &[&str]) {
+    let fields = frame.as_object_mut().unwrap();
+    keys.iter().for_each(|key| drop(fields.remove(*key)));
 }
 
 fn mirrored(frame: &Value) -> Value {
@@ -197,8 +229,78 @@ fn intrinsics_of_another_size_are_scaled_and_remembered() {
     assert_eq!(got[0].camera.intrinsics, sent().0[0].camera.intrinsics);
 }
 
+#[test]
+fn a_frame_wins_over_the_top_level_and_angles_give_the_focal_length() {
+    let mut json = transforms();
+    let frames = json["frames"].as_array_mut().unwrap();
+    for frame in frames.iter_mut() {
+        without(frame, &["fl_x", "fl_y", "cx", "cy", "w", "h"]);
+    }
+    frames[0]["fl_x"] = json!(200);
+    frames[1]["camera_angle_x"] = json!(2.0 * 0.5_f64.atan());
+    (json["fl_x"], json["cx"], json["w"], json["h"]) = (json!(100), json!(5), json!(48), json!(36));
+    let got = photos::read(&with_transforms(&json, sent().1), &Limits::default()).unwrap();
+    let k: Vec<_> = got.iter().map(|posed| posed.camera.intrinsics).collect();
+    assert_eq!((k[0].fx, k[0].fy, k[0].cx, k[0].cy), (200.0, 200.0, 5.0, 18.0));
+    assert!((k[1].fx - 48.0).abs() < 1e-9 && (k[1].fy - 48.0).abs() < 1e-9, "{:?}", k[1]);
+    assert_eq!((k[2].fx, k[2].cx), (100.0, 5.0));
+}
+
+#[test]
+fn bare_nan_is_read_outside_of_strings_only() {
+    let mut json = transforms();
+    let (_, mut files) = sent();
+    for (i, file) in files.iter_mut().enumerate() {
+        file.name = format!("NaN \" Infinity{i}.png");
+        json["frames"][i]["file_path"] = json!(file.name);
+    }
+    json["frames"][0]["sharpness"] = json!("HERE");
+    let text = json.to_string().replace("\"HERE\"", "-Infinity");
+    let upload = upload(UploadCameras::Transforms(text.into_bytes()), files);
+    same_as_sent(&photos::read(&upload, &Limits::default()).unwrap(), &sent().0);
+}
+
+#[test]
+fn files_find_their_cameras_by_path_then_by_name_then_without_extension() {
+    // Paths of the cameras, names of the files, and the camera of each file in the result.
+    type Case<'a> = ([&'a str; 3], &'a [&'a str], Result<&'a [usize], &'a str>);
+    let cases: [Case<'_>; 7] = [
+        (["a/1.jpg", "b/1.jpg", "c.png"], &["b/1.jpg", "c.png"], Ok(&[1, 2])),
+        (["./images/a", "images/b.jpg", "c"], &["b.jpg", "a.png"], Ok(&[0, 1])),
+        (["./train/r_0", "c.png", "d.png"], &["train/r_0.png", "c.png"], Ok(&[0, 1])),
+        (["images//a.png", "images\\c.png", "d"], &["images/a.png", "images/c.png"], Ok(&[0, 1])),
+        (["x/a.jpg", "y/a.jpg", "b"], &["a.jpg", "b.png"], Err("two cameras")),
+        (["a.jpg", "./a.jpg", "b"], &["a.jpg", "b.png"], Err("two cameras")),
+        (["a.jpg", "b.png", "c"], &["x/a.jpg", "y/a.jpg", "b.png"], Err("two photos")),
+    ];
+    for (paths, names, want) in cases {
+        let mut json = transforms();
+        for (i, path) in paths.iter().enumerate() {
+            json["frames"][i]["file_path"] = json!(path);
+        }
+        let (posed, sent) = sent();
+        let files = names.iter().map(|n| UploadFile { name: (*n).to_owned(), ..sent[0].clone() });
+        let got = photos::read(&with_transforms(&json, files.collect()), &Limits::default());
+        match (got, want) {
+            (Ok(got), Ok(want)) => {
+                let places = got.iter().map(|p| p.camera.camera_to_world.center());
+                let want = want.iter().map(|&i| posed[i].camera.camera_to_world.center());
+                assert!(places.zip(want).all(|(a, b)| a.distance(b) < 1e-9), "{paths:?}");
+                assert_eq!(got.len(), names.len(), "{paths:?}");
+            }
+            (Err(error), Err(words)) => assert!(error.message().contains(words), "{error}"),
+            (got, want) => panic!("{paths:?}: {got:?}, not {want:?}"),
+        }
+    }
+    for bad in ["", "..", "a/../b", "/etc/passwd", "C:\\x.jpg", "\\\\host\\x", "a\0b"] {
+        let (_, mut files) = sent();
+        files[1].name = bad.to_owned();
+        refused(&with_transforms(&transforms(), files), ErrorCode::InvalidRequest, &["relative"]);
+    }
+}
+
 fn zipped(entries: &[(&str, &[u8])]) -> Vec<u8> {
-    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
     for (name, bytes) in entries {
         zip.start_file(*name, zip::write::SimpleFileOptions::default()).unwrap();
         zip.write_all(bytes).unwrap();
@@ -262,7 +364,7 @@ fn hostile_archives_are_refused() {
     for kind in [tar::EntryType::Symlink, tar::EntryType::Link, tar::EntryType::Char] {
         refused(&archive(tarred(&[("a", b"")], kind)), invalid, &["link"]);
     }
-    let mut zip = zip::ZipWriter::new(std::io::Cursor::new(Vec::new()));
+    let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
     zip.add_symlink("a.png", "/etc/passwd", zip::write::SimpleFileOptions::default()).unwrap();
     refused(&archive(zip.finish().unwrap().into_inner()), invalid, &["link"]);
     refused(&archive(zipped(&[("a.png", b"x")])), invalid, &["no transforms.json"]);
@@ -377,8 +479,142 @@ fn damaged_photos_are_named() {
     huge[16..20].copy_from_slice(&100_000_u32.to_be_bytes());
     huge[20..24].copy_from_slice(&100_000_u32.to_be_bytes());
     huge.truncate(60);
-    let words = ["photo 2", "100000x100000 px", "24000000"];
+    let words = ["photo 2", "100000x100000 px is over 24000000 px"];
     refused(&spoilt(huge), ErrorCode::LimitExceeded, &words);
+    let jpeg = encoded(&gradient().into(), ImageFormat::Jpeg);
+    refused(&spoilt(jpeg[..jpeg.len() - 40].to_vec()), unreadable, &["photo 2", "cut short"]);
+    refused(&spoilt(jpeg[..60].to_vec()), unreadable, &["photo 2", "damaged"]);
+}
+
+fn gradient() -> RgbImage {
+    RgbImage::from_fn(40, 30, |x, y| Rgb([(x * 6) as u8, (y * 8) as u8, 90]))
+}
+
+fn encoded(image: &DynamicImage, format: ImageFormat) -> Vec<u8> {
+    let mut out = Cursor::new(Vec::new());
+    image.write_to(&mut out, format).unwrap();
+    out.into_inner()
+}
+
+/// The last photo of an upload, with these changes of its frame.
+fn read_last(bytes: Vec<u8>, change: &Value, limits: &Limits) -> PosedPhoto {
+    let mut json = transforms();
+    without(&mut json["frames"][2], &["cx", "cy", "w", "h"]);
+    for (key, value) in change.as_object().unwrap() {
+        json["frames"][2][key] = value.clone();
+    }
+    let (_, mut files) = sent();
+    files[2].bytes = bytes;
+    photos::read(&with_transforms(&json, files), limits).unwrap().remove(2)
+}
+
+#[test]
+fn the_three_formats_and_all_depths_are_read() {
+    let decoded = |image: &DynamicImage, format| {
+        read_last(encoded(image, format), &json!({}), &Limits::default()).photo
+    };
+    let rgb = DynamicImage::from(gradient());
+    for format in [ImageFormat::Png, ImageFormat::WebP] {
+        assert_eq!(decoded(&rgb, format).rgb, gradient().into_raw(), "{format:?}");
+    }
+    let photo = decoded(&rgb, ImageFormat::Jpeg);
+    assert_eq!((photo.width, photo.height), (40, 30));
+    let grey16 = ImageBuffer::from_fn(4, 4, |x, _| image::Luma([(x * 0x4040) as u16]));
+    assert_eq!(decoded(&grey16.into(), ImageFormat::Png).rgb[3..6], [0x40; 3]);
+    let alpha = |x: u32| [127, 128, 0, 255][x as usize];
+    let alpha = ImageBuffer::from_fn(4, 4, |x, _| image::Rgba([9_u8, 9, 9, alpha(x)]));
+    let photo = decoded(&alpha.into(), ImageFormat::Png);
+    // Half a pixel's alpha is enough, and its colour is the stored one.
+    assert_eq!(photo.valid.unwrap()[..4], [false, true, false, true]);
+    assert_eq!(photo.rgb[3..6], [9; 3]);
+}
+
+#[test]
+fn large_photos_are_kept_smaller_with_their_camera() {
+    let limits = Limits { photo_side_kept_max: 20, ..Limits::default() };
+    let lens = json!({"fl_x": 50, "fl_y": 52, "cx": 21, "cy": 14});
+    let png = encoded(&gradient().into(), ImageFormat::Png);
+    let PosedPhoto { photo, camera, .. } = read_last(png, &lens, &limits);
+    let k = camera.intrinsics;
+    assert_eq!((photo.width, photo.height, photo.rgb.len()), (20, 15, 900));
+    assert_eq!((k.fx, k.fy, k.cx, k.cy), (25.0, 26.0, 10.5, 7.0));
+    // The mean of pixels 2 and 3 of a ramp of 6 a pixel.
+    assert!(photo.rgb[3].abs_diff(15) <= 1, "{}", photo.rgb[3]);
+}
+
+/// Where a lens draws the ray (x, y, 1): OpenCV's two models. `k`: `k1 k2 k3 k4`, `p`: `p1 p2`.
+fn distorted([x, y]: [f64; 2], fisheye: bool, k: [f64; 4], p: [f64; 2]) -> [f64; 2] {
+    let r = x.hypot(y);
+    let angle = if fisheye { r.atan() } else { r };
+    let powers = (1..).map(|n| angle.powi(2 * n));
+    let radial = 1.0 + k.iter().zip(powers).map(|(k, power)| k * power).sum::<f64>();
+    if fisheye {
+        return [x, y].map(|v| if r > 0.0 { v * angle * radial / r } else { v });
+    }
+    let (xy, r2) = (2.0 * x * y, r * r);
+    [
+        x * radial + p[0] * xy + p[1] * (r2 + 2.0 * x * x),
+        y * radial + p[1] * xy + p[0] * (r2 + 2.0 * y * y),
+    ]
+}
+
+/// Draws a smooth pattern through a lens and reads the photo. The result must be what a pinhole
+/// camera sees. Largest difference, and how many pixels have a source.
+fn through_lens(model: &str, k: [f64; 4], p: [f64; 2]) -> (f64, usize) {
+    let fisheye = model == "OPENCV_FISHEYE";
+    let pattern = |[x, y]: [f64; 2]| 128.0 + 100.0 * (6.0 * x).sin() * (5.0 * y).cos();
+    let ray =
+        |x: u32, y: u32| [(x, 60.0), (y, 45.0)].map(|(v, c)| (f64::from(v) + 0.5 - c) / 100.0);
+    let image = RgbImage::from_fn(120, 90, |x, y| {
+        // The ray that the lens draws at this pixel, by fixed-point steps.
+        let want = ray(x, y);
+        let mut at = want;
+        for _ in 0..50 {
+            let found = distorted(at, fisheye, k, p);
+            at = [0, 1].map(|axis| at[axis] + want[axis] - found[axis]);
+        }
+        Rgb([pattern(at).round().clamp(0.0, 255.0) as u8; 3])
+    });
+    let lens = json!({
+        "camera_model": model, "fl_x": 100, "fl_y": 100, "w": 120, "h": 90,
+        "k1": k[0], "k2": k[1], "k3": k[2], "k4": k[3], "p1": p[0], "p2": p[1],
+    });
+    let png = encoded(&image.into(), ImageFormat::Png);
+    let photo = read_last(png, &lens, &Limits::default()).photo;
+    let (mut worst, mut count) = (0.0_f64, 0);
+    for (i, value) in photo.rgb.iter().step_by(3).enumerate() {
+        if photo.valid.as_ref().is_none_or(|valid| valid[i]) {
+            let want = pattern(ray(i as u32 % 120, i as u32 / 120));
+            worst = worst.max((f64::from(*value) - want).abs());
+            count += 1;
+        }
+    }
+    (worst, count)
+}
+
+#[test]
+fn distortion_is_undone_and_pixels_without_source_are_invalid() {
+    let (worst, count) = through_lens("OPENCV", [-0.12, 0.02, 0.004, -0.001], [0.004, -0.003]);
+    assert!(worst < 3.0, "off by {worst} of 255");
+    assert!(count > 120 * 90 * 9 / 10, "{count} valid");
+    let (worst, count) = through_lens("OPENCV", [0.15, 0.0, 0.0, 0.0], [0.0; 2]);
+    assert!(worst < 3.0, "off by {worst} of 255");
+    assert!(count < 120 * 90, "corners must have no source");
+    let (worst, _) = through_lens("OPENCV_FISHEYE", [0.03, -0.01, 0.0, 0.0], [0.0; 2]);
+    assert!(worst < 3.0, "off by {worst} of 255");
+}
+
+#[test]
+fn the_fold_of_a_strong_lens_makes_no_pixels() {
+    let lens = json!({"fl_x": 100, "fl_y": 100, "w": 120, "h": 90, "k1": -0.9});
+    let png = encoded(&RgbImage::new(120, 90).into(), ImageFormat::Png);
+    let valid = read_last(png, &lens, &Limits::default()).photo.valid.unwrap();
+    // r (1 - 0.9 r²) turns at r = 1 / sqrt(2.7).
+    for (i, valid) in valid.into_iter().enumerate() {
+        let (x, y) = ((i % 120) as f64 - 59.5, (i / 120) as f64 - 44.5);
+        let off = x.hypot(y) / 100.0 - 1.0 / 2.7_f64.sqrt();
+        assert!(off.abs() < 2e-3 || valid == (off < 0.0), "pixel {i}, {off} from the fold");
+    }
 }
 
 #[test]

@@ -139,6 +139,44 @@ fn each_skip_leaves_the_masks_as_they_are_and_asks_less() {
     assert_eq!(off.asked.lock().unwrap().len(), asked, "seeds that are switched off");
 }
 
+/// The points that are asked in a picture of nothing, in order.
+fn asked(settings: &Settings, seeds: &[Seed]) -> Vec<[f32; 2]> {
+    let nothing = Shapes::new(&[]);
+    run(&nothing, settings, seeds);
+    nothing.asked.into_inner().unwrap()
+}
+
+#[test]
+fn without_skips_it_is_segment_anythings_grid() {
+    let settings = Settings { points_per_side: 3, skip_covered: false, ..Settings::default() };
+    let points = asked(&settings, &[]);
+    assert_eq!(points.len(), 9, "{points:?}");
+    let close = |a: [f32; 2], b: [f32; 2]| (0..2).all(|i| (a[i] - b[i]).abs() < 1e-6);
+    assert!(close(points[0], [1.0 / 6.0, 1.0 / 6.0]), "{points:?}");
+    assert!(close(points[1], [0.5, 1.0 / 6.0]), "rows first: {points:?}");
+    assert!(close(points[8], [5.0 / 6.0, 5.0 / 6.0]), "{points:?}");
+}
+
+#[test]
+fn every_point_is_asked_once_coarse_ones_first() {
+    let mut points = asked(&Settings { points_per_side: 16, ..Settings::default() }, &[]);
+    assert_eq!(points.len(), 256, "all");
+    let gap = (points[0][0] - points[1][0]).abs();
+    assert!((gap - 0.25).abs() < 1e-6, "the first round is coarse: {gap}");
+    points.sort_by(|a, b| a.partial_cmp(b).unwrap());
+    points.dedup();
+    assert_eq!(points.len(), 256, "none twice");
+}
+
+#[test]
+fn seeds_come_first_and_outside_ones_not_at_all() {
+    let settings = Settings { points_per_side: 4, ..Settings::default() };
+    let seeds = [[0.3, 0.4], [1.2, 0.5], [0.9, 0.1]].map(|point| Seed { point });
+    let points = asked(&settings, &seeds);
+    assert_eq!(points[..2], [[0.3, 0.4], [0.9, 0.1]], "{points:?}");
+    assert_eq!(points.len(), 2 + 16, "then the grid");
+}
+
 #[test]
 fn proposals_are_parts_and_wholes_above_the_thresholds() {
     let settings = Settings::default().exact();

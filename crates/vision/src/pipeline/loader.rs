@@ -1,5 +1,6 @@
-//! An engine that opens in the background: the bundle's manifest is read at once, so that scenes
-//! can be queued and stored ones be seen; hashes, library and network follow on a thread.
+//! A pipeline that opens in the background. The bundle's manifest is read at once, so that scenes
+//! can be queued and stored scenes can be shown. A thread checks the hashes and opens library and
+//! network.
 
 use std::{
     sync::{Arc, OnceLock},
@@ -7,22 +8,22 @@ use std::{
     time::Instant,
 };
 
-use super::Engine;
+use super::Pipeline;
 use crate::{
     error::{Error, Result},
     models::{Bundle, NetworkOptions},
 };
 
-/// An [`Engine`], open or about to be.
+/// A [`Pipeline`] that is open or is being opened.
 #[derive(Debug)]
-pub struct LateEngine {
+pub struct PipelineLoader {
     bundle: Bundle,
-    opened: Arc<OnceLock<Result<Engine>>>,
+    opened: Arc<OnceLock<Result<Pipeline>>>,
     opening: Option<JoinHandle<()>>,
 }
 
-impl LateEngine {
-    /// Reads the manifest of the configuration's bundle and has the rest opened by a thread.
+impl PipelineLoader {
+    /// Reads the manifest of the configuration's bundle. A thread opens the rest.
     ///
     /// # Errors
     /// `model_unavailable` when there is no bundle or its manifest is malformed.
@@ -32,13 +33,13 @@ impl LateEngine {
         let (of_thread, options, named) = (Arc::clone(&opened), options.clone(), bundle.clone());
         let open = move || {
             let begun = Instant::now();
-            let engine = Engine::open_bundle(&named, &options);
-            if engine.is_ok() {
+            let pipeline = Pipeline::open_bundle(&named, &options);
+            if pipeline.is_ok() {
                 let ms = begun.elapsed().as_secs_f64() * 1e3;
                 tracing::info!(ms, "the networks are open");
             }
             // This thread alone sets it.
-            let _ = of_thread.set(engine);
+            let _ = of_thread.set(pipeline);
         };
         let thread = std::thread::Builder::new().name("networks".to_owned()).spawn(open);
         let opening =
@@ -52,40 +53,40 @@ impl LateEngine {
         &self.bundle
     }
 
-    /// The engine, once it is open: waits for that.
+    /// Waits until the pipeline is open.
     ///
     /// # Errors
     /// `model_unavailable` when it does not open.
-    pub fn get(&self) -> Result<&Engine> {
-        told(self.opened.wait())
+    pub fn get(&self) -> Result<&Pipeline> {
+        shared(self.opened.wait())
     }
 
-    /// The engine; `None` while it is being opened.
+    /// The pipeline; `None` while it is being opened.
     #[must_use]
-    pub fn peek(&self) -> Option<Result<&Engine>> {
-        self.opened.get().map(told)
+    pub fn peek(&self) -> Option<Result<&Pipeline>> {
+        self.opened.get().map(shared)
     }
 }
 
-impl From<Engine> for LateEngine {
-    fn from(engine: Engine) -> Self {
-        let bundle = engine.bundle().clone();
-        Self { bundle, opened: Arc::new(OnceLock::from(Ok(engine))), opening: None }
+impl From<Pipeline> for PipelineLoader {
+    fn from(pipeline: Pipeline) -> Self {
+        let bundle = pipeline.bundle().clone();
+        Self { bundle, opened: Arc::new(OnceLock::from(Ok(pipeline))), opening: None }
     }
 }
 
-impl Drop for LateEngine {
-    /// Waits for the thread: the library does not bear the process's end while it opens a network.
+impl Drop for PipelineLoader {
+    /// Waits for the thread: the library crashes if the process ends while it opens a network.
     fn drop(&mut self) {
         if let Some(opening) = self.opening.take() {
-            // A panic was told by its own message.
+            // A panic has printed its own message.
             let _ = opening.join();
         }
     }
 }
 
-/// An error is kept for everybody who asks, so each gets one of the same words.
-fn told(opened: &Result<Engine>) -> Result<&Engine> {
+/// Each caller gets an error of its own with the same words.
+fn shared(opened: &Result<Pipeline>) -> Result<&Pipeline> {
     opened.as_ref().map_err(|error| {
         let again = Error::new(error.code(), error.message());
         match std::error::Error::source(error) {

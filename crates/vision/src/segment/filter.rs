@@ -9,9 +9,9 @@ use crate::{
     segment::{Bitset, Box2, PhotoGrid, Proposal, Settings, photo_grid::Resample},
 };
 
-/// Judges the masks of one photo.
+/// Keeps the good masks of one photo.
 #[derive(Debug)]
-pub(super) struct Judge {
+pub(super) struct MaskFilter {
     photo_grid: PhotoGrid,
     levels: usize,
     /// To the photo's pixels; `None`: the decoder's cells that lie over the photo, as they are.
@@ -29,7 +29,7 @@ pub(super) struct Patch {
     values: Vec<f16>,
 }
 
-impl Judge {
+impl MaskFilter {
     /// Knows the grid from the first answer.
     pub(super) fn new(
         (side, resized): (u32, [u32; 2]),
@@ -95,7 +95,7 @@ impl Judge {
             let mask = |level: usize| {
                 let at = i * self.levels + level;
                 let logits = &decoded.logits[at * cells..(at + 1) * cells];
-                self.judge(logits, decoded.predicted_iou[at], level, *point, wholes)
+                self.passed(logits, decoded.predicted_iou[at], level, *point, wholes)
             };
             if wholes {
                 (0..self.levels).rev().find_map(mask).into_iter().collect()
@@ -107,7 +107,7 @@ impl Judge {
         Ok(each.into_iter().flatten().collect())
     }
 
-    fn judge(
+    fn passed(
         &self,
         logits: &[f32],
         predicted_iou: f32,

@@ -1,0 +1,356 @@
+//! What a text selects in space: instances, each a connected set of Gaussians with its boxes.
+//!
+//! A text selects whole entries of the bank. So the connected components of the Gaussians of each
+//! entry are found once for each scene, with the pairs of components that touch. An instance of a
+//! text is made of components of the selected entries that touch each other.
+//!
+//! Two Gaussians touch when neighbouring pixels made them at nearly the same depth, or when they
+//! are at most a few spacings apart. A spacing is the width of a pixel of the network's picture at
+//! the Gaussian's depth, so near and far objects are joined alike.
+
+use glam::{DMat3, DVec3};
+use rayon::prelude::*;
+use rustc_hash::FxHashMap;
+
+use crate::{
+    point,
+    scene::{Gaussians, SceneCamera, principal_axes},
+};
+
+/// How Gaussians are joined to instances.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct InstanceOptions {
+    /// Gaussians touch if they are at most this many spacings apart.
+    pub reach: f64,
+    /// Neighbouring pixels of one photo touch under this relative difference of depth.
+    pub same_depth: f64,
+    /// Fewest Gaussians of an instance.
+    pub count_min: usize,
+    /// Smallest share of all selected Gaussians that an instance may have.
+    pub share_min: f64,
+    /// Share of an instance's Gaussians that a box leaves out on each side of each axis.
+    pub trim: f64,
+}
+
+impl Default for InstanceOptions {
+    fn default() -> Self {
+        Self { reach: 4.0, same_depth: 0.02, count_min: 12, share_min: 0.02, trim: 0.005 }
+    }
+}
+
+/// A box in the world, of any rotation.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Box3 {
+    /// Middle, world units.
+    pub center: [f64; 3],
+    /// Full lengths along the axes, world units.
+    pub size: [f64; 3],
+    /// Unit axes, one in each row, right-handed. An aligned box has those of the world.
+    pub axes: [[f64; 3]; 3],
+}
+
+/// Connected Gaussians of the entries that a text selects.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Instance {
+    /// Its Gaussians, ascending.
+    pub gaussians: Vec<u32>,
+    /// Mean centre of its Gaussians, world units.
+    pub centroid: [f64; 3],
+    /// Box along its own principal axes, the longest first.
+    pub oriented: Box3,
+    /// Box along the world's axes.
+    pub aligned: Box3,
+}
+
+/// The connected components of the Gaussians of each entry, and the pairs that touch.
+#[derive(Clone, Debug, Default)]
+pub struct Components {
+    /// Entry of each component.
+    entry: Vec<u16>,
+    /// Gaussians of each component, ascending.
+    members: Vec<Vec<u32>>,
+    /// Pairs of different entries that touch: each pair once, the smaller number first.
+    touching: Vec<[u32; 2]>,
+}
+
+impl Components {
+    /// The components of all Gaussians that have an entry.
+    ///
+    /// `cameras` are those of the scene. They give the spacing of the Gaussians of a surface.
+    #[must_use]
+    pub fn new(gaussians: &Gaussians, cameras: &[SceneCamera], options: &InstanceOptions) -> Self {
+        let index = gaussians.semantic_index();
+        let chosen: Vec<u32> =
+            index.iter().zip(0_u32..).filter(|(m, _)| **m > 0).map(|(_, i)| i).collect();
+        let sites = sites(gaussians, cameras, &chosen);
+        let mut bonds = Bonds {
+            entry: chosen.iter().map(|&i| index[i as usize]).collect(),
+            sets: Sets::new(chosen.len()),
+            across: Vec::new(),
+        };
+        join_pixels(&mut bonds, gaussians, &chosen, &sites, options.same_depth);
+        join_cells(&mut bonds, &sites, options.reach);
+
+        let mut components = Self::default();
+        let mut component_of = vec![0_u32; chosen.len()];
+        for (at, i) in chosen.iter().enumerate() {
+            // The root is the smallest member, so it comes first.
+            let root = bonds.sets.root(at) as usize;
+            if root == at {
+                component_of[at] = u32::try_from(components.entry.len()).unwrap_or(u32::MAX);
+                components.entry.push(bonds.entry[at]);
+                components.members.push(Vec::new());
+            }
+            component_of[at] = component_of[root];
+            components.members[component_of[at] as usize].push(*i);
+        }
+        let component = |at: u32| component_of[at as usize];
+        let across = bonds.across.into_iter().map(|[a, b]| [component(a), component(b)]);
+        components.touching = across.map(|[a, b]| [a.min(b), a.max(b)]).collect();
+        components.touching.sort_unstable();
+        components.touching.dedup();
+        components
+    }
+
+    /// Connected instances of the Gaussians of `entries`, the largest first, without the small
+    /// ones. `gaussians` must be those that the components were made of.
+    #[must_use]
+    pub fn instances(
+        &self,
+        gaussians: &Gaussians,
+        entries: &[u16],
+        options: &InstanceOptions,
+    ) -> Vec<Instance> {
+        let chosen = |component: usize| entries.contains(&self.entry[component]);
+        let mut sets = Sets::new(self.entry.len());
+        for [a, b] in self.touching.iter().map(|pair| pair.map(|component| component as usize)) {
+            if chosen(a) && chosen(b) {
+                sets.join(a, b);
+            }
+        }
+        let mut joined: FxHashMap<u32, Vec<usize>> = FxHashMap::default();
+        let mut total = 0;
+        for component in (0..self.entry.len()).filter(|component| chosen(*component)) {
+            joined.entry(sets.root(component)).or_default().push(component);
+            total += self.members[component].len();
+        }
+        let least = (options.share_min * total as f64).max(options.count_min as f64);
+        let mut found: Vec<Vec<u32>> = joined
+            .into_values()
+            .map(|components| -> Vec<u32> {
+                let members = components.into_iter().flat_map(|component| &self.members[component]);
+                members.copied().collect()
+            })
+            .filter(|instance| instance.len() as f64 >= least)
+            .collect();
+        found.iter_mut().for_each(|instance| instance.sort_unstable());
+        // Parts of one size are ordered by their first Gaussian, which is never shared.
+        found
+            .sort_by_key(|instance| (std::cmp::Reverse(instance.len()), instance.first().copied()));
+        found.into_iter().map(|instance| describe(gaussians, instance, options.trim)).collect()
+    }
+
+    /// Bytes in memory.
+    #[must_use]
+    pub fn size_bytes(&self) -> u64 {
+        let members: usize = self.members.iter().map(Vec::len).sum();
+        let each = size_of::<Vec<u32>>() + size_of::<u16>();
+        (self.entry.len() * each + members * 4 + self.touching.len() * 8) as u64
+    }
+}
+
+/// The pairs found so far, by place in the list of chosen Gaussians.
+struct Bonds {
+    entry: Vec<u16>,
+    /// Gaussians of one entry that are joined.
+    sets: Sets,
+    /// Pairs of different entries that touch.
+    across: Vec<[u32; 2]>,
+}
+
+impl Bonds {
+    fn join(&mut self, a: usize, b: usize) {
+        if self.entry[a] == self.entry[b] {
+            self.sets.join(a, b);
+        } else if let (Ok(a), Ok(b)) = (u32::try_from(a), u32::try_from(b)) {
+            self.across.push([a, b]);
+        }
+    }
+}
+
+/// Place of a Gaussian, relative to the scene's origin.
+struct Site {
+    mean: DVec3,
+    /// Depth in its source photo; 0 if unknown.
+    depth: f64,
+    /// Distance to its neighbours on the surface.
+    spacing: f64,
+}
+
+fn sites(gaussians: &Gaussians, cameras: &[SceneCamera], chosen: &[u32]) -> Vec<Site> {
+    chosen
+        .par_iter()
+        .map(|&i| {
+            let i = i as usize;
+            let mean = point(gaussians.means()[i]);
+            let input = cameras.get(usize::from(gaussians.source()[i].view));
+            let seen = input.and_then(|input| {
+                let pose = &input.camera.camera_to_world;
+                let depth = (mean + gaussians.origin() - pose.center()).dot(pose.axis());
+                let lens = input.network?;
+                (depth > 0.0).then_some((depth, depth / lens.fx.min(lens.fy)))
+            });
+            let widest = gaussians.scales()[i].into_iter().fold(0.0_f32, f32::max);
+            let (depth, spacing) = seen.unwrap_or((0.0, f64::from(widest)));
+            Site { mean, depth, spacing }
+        })
+        .collect()
+}
+
+/// Joins Gaussians of one photo if their pixels are at most two apart and their depths similar.
+fn join_pixels(
+    bonds: &mut Bonds,
+    gaussians: &Gaussians,
+    chosen: &[u32],
+    sites: &[Site],
+    same_depth: f64,
+) {
+    let pixel = |at: usize| {
+        let source = gaussians.source()[chosen[at] as usize];
+        (source.view, i32::from(source.x), i32::from(source.y))
+    };
+    let by_pixel: FxHashMap<(u16, i32, i32), usize> =
+        (0..chosen.len()).map(|at| (pixel(at), at)).collect();
+    for at in 0..chosen.len() {
+        let (view, x, y) = pixel(at);
+        let depth = sites[at].depth;
+        // The pixels to the right and below. The others test this pixel.
+        let ahead = (0..=2).flat_map(|dy| (-2..=2).map(move |dx| (dx, dy)));
+        for (dx, dy) in ahead.filter(|&(dx, dy)| (dy, dx) > (0, 0)) {
+            let Some(&other) = by_pixel.get(&(view, x + dx, y + dy)) else { continue };
+            if depth > 0.0 && (sites[other].depth - depth).abs() <= same_depth * depth {
+                bonds.join(at, other);
+            }
+        }
+    }
+}
+
+/// Joins Gaussians at most `reach` spacings apart. Each power of two of the spacing has a grid.
+fn join_cells(bonds: &mut Bonds, sites: &[Site], reach: f64) {
+    // One Gaussian of each entry in each cell. All others of the entry are joined to it.
+    let mut cells: FxHashMap<(i32, [i64; 3]), Vec<usize>> = FxHashMap::default();
+    for (at, site) in sites.iter().enumerate() {
+        if site.spacing <= 0.0 || !site.spacing.is_finite() {
+            continue;
+        }
+        #[expect(clippy::cast_possible_truncation, reason = "a power of two of an f64")]
+        let level = site.spacing.log2().ceil() as i32;
+        // In its own grid, and in the next coarser one for Gaussians of wider spacing.
+        for level in [level, level + 1] {
+            let edge = reach * f64::from(level).exp2();
+            #[expect(clippy::cast_possible_truncation, reason = "saturates far away")]
+            let cell = (site.mean / edge).floor().to_array().map(|v| v as i64);
+            let held = cells.entry((level, cell)).or_default();
+            match held.iter().find(|&&other| bonds.entry[other] == bonds.entry[at]) {
+                Some(&other) => bonds.join(at, other),
+                None => held.push(at),
+            }
+        }
+    }
+    for ((level, [x, y, z]), held) in &cells {
+        // The cell itself and half of its 26 neighbours. The other half tests this cell.
+        for step in 13..27 {
+            let by = [step % 3 - 1, step / 3 % 3 - 1, step / 9 - 1];
+            let next = [x.saturating_add(by[0]), y.saturating_add(by[1]), z.saturating_add(by[2])];
+            let Some(others) = cells.get(&(*level, next)) else { continue };
+            for a in held {
+                others.iter().for_each(|b| bonds.join(*a, *b));
+            }
+        }
+    }
+}
+
+fn describe(gaussians: &Gaussians, instance: Vec<u32>, trim: f64) -> Instance {
+    let means: Vec<DVec3> =
+        instance.iter().map(|&i| point(gaussians.means()[i as usize])).collect();
+    let count = means.len().max(1) as f64;
+    let middle = means.iter().sum::<DVec3>() / count;
+    let mut spread = DMat3::ZERO;
+    for mean in &means {
+        let d = *mean - middle;
+        spread += DMat3::from_cols(d * d.x, d * d.y, d * d.z);
+    }
+    let origin = gaussians.origin();
+    let own = bounds(&means, principal_axes(spread * (1.0 / count)), trim);
+    Instance {
+        centroid: (middle + origin).to_array(),
+        oriented: boxed(longest_first(own), origin),
+        aligned: boxed(bounds(&means, [DVec3::X, DVec3::Y, DVec3::Z], trim), origin),
+        gaussians: instance,
+    }
+}
+
+/// Axes, with the smallest and the largest place along each.
+type Bounds = [(DVec3, [f64; 2]); 3];
+
+/// Bounds along three axes. The share `trim` is left out on each side.
+fn bounds(means: &[DVec3], axes: [DVec3; 3], trim: f64) -> Bounds {
+    axes.map(|axis| {
+        let mut along: Vec<f64> = means.iter().map(|mean| mean.dot(axis)).collect();
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share")]
+        let out = (trim.clamp(0.0, 0.49) * along.len() as f64) as usize;
+        let last = along.len() - 1 - out;
+        let least = *along.select_nth_unstable_by(out, f64::total_cmp).1;
+        (axis, [least, *along.select_nth_unstable_by(last, f64::total_cmp).1])
+    })
+}
+
+/// Axes sorted by length, right-handed. The largest number of each axis is positive.
+fn longest_first(mut bounds: Bounds) -> Bounds {
+    bounds.sort_by(|(_, a), (_, b)| (b[1] - b[0]).total_cmp(&(a[1] - a[0])));
+    let turned = |(axis, [from, to]): (DVec3, [f64; 2])| (-axis, [-to, -from]);
+    for bound in &mut bounds[..2] {
+        let numbers = bound.0.to_array();
+        let largest = numbers.into_iter().max_by(|a, b| a.abs().total_cmp(&b.abs()));
+        if largest.is_some_and(|v| v < 0.0) {
+            *bound = turned(*bound);
+        }
+    }
+    if bounds[0].0.cross(bounds[1].0).dot(bounds[2].0) < 0.0 {
+        bounds[2] = turned(bounds[2]);
+    }
+    bounds
+}
+
+fn boxed(bounds: Bounds, origin: DVec3) -> Box3 {
+    let center: DVec3 = bounds.iter().map(|(axis, [a, b])| *axis * (0.5 * (a + b))).sum();
+    Box3 {
+        center: (center + origin).to_array(),
+        size: bounds.map(|(_, [a, b])| b - a),
+        axes: bounds.map(|(axis, _)| axis.to_array()),
+    }
+}
+
+/// Disjoint sets; the root of each is its smallest member.
+struct Sets(Vec<u32>);
+
+impl Sets {
+    fn new(count: usize) -> Self {
+        Self((0..u32::try_from(count).unwrap_or(u32::MAX)).collect())
+    }
+
+    fn root(&mut self, of: usize) -> u32 {
+        let mut at = of;
+        while self.0[at] as usize != at {
+            let above = self.0[self.0[at] as usize];
+            self.0[at] = above;
+            at = above as usize;
+        }
+        self.0[at]
+    }
+
+    fn join(&mut self, a: usize, b: usize) {
+        let (a, b) = (self.root(a), self.root(b));
+        self.0[a.max(b) as usize] = a.min(b);
+    }
+}
