@@ -10,7 +10,7 @@ use crate::{
     limits::Limits,
     models::fit,
     photo_files,
-    pipeline::{Engine, Reconstruction, reconstruct},
+    pipeline::{Pipeline, Reconstruction, reconstruct},
     render::{Kinds, RenderRequest, plan::default_near},
     rows::means,
     scene::{Camera, Photo, PosedPhoto, Provenance, Scene, SceneId, SceneOptions},
@@ -76,7 +76,7 @@ pub fn nearest(photos: &[PosedPhoto], target: usize, count: usize) -> Vec<usize>
 
 /// The Gaussians of the photos.
 pub(crate) fn make(
-    engine: &Engine,
+    engine: &Pipeline,
     photos: &[PosedPhoto],
     options: &SceneOptions,
 ) -> Result<Reconstruction> {

@@ -9,7 +9,6 @@ use segsplat_core::names::named;
 
 use crate::{
     error::{Error, Result},
-    limits::Limits,
     models::NetworkOptions,
     render::{
         Renderer, RendererChoice, RendererOptions, Switches,

@@ -219,16 +219,16 @@ impl<'a> SceneTexts<'a> {
         text_words(self.of.tag, text, self.scorer.scoring().profile())
     }
 
-    /// The connected pieces of the scene's entries.
-    pub(super) fn pieces(&self, options: &PartOptions) -> Arc<Pieces> {
-        let (kept, tag) = (&self.backend.pieces, self.of.tag.to_owned());
+    /// The connected components of the scene's entries.
+    pub(super) fn components(&self, options: &InstanceOptions) -> Arc<Components> {
+        let (kept, tag) = (&self.backend.components, self.of.tag.to_owned());
         if let Some(known) = kept.find(&tag) {
             return known;
         }
         let scene = self.of.scene;
-        let pieces = Arc::new(Pieces::new(&scene.gaussians, &scene.meta.cameras, options));
-        kept.insert(tag, Arc::clone(&pieces), pieces.size_bytes());
-        pieces
+        let made = Arc::new(Components::new(&scene.gaussians, &scene.meta.cameras, options));
+        kept.insert(tag, Arc::clone(&made), made.size_bytes());
+        made
     }
 
     /// The Gaussians that any of the texts selects.
