@@ -17,16 +17,16 @@ use crate::{
 /// # Errors
 /// `model_unavailable`, `gpu_unavailable`, each with what is missing.
 pub fn parts(config: &Config) -> Result<Parts> {
-    let (parts, engine) = early_parts(config)?;
+    let (parts, engine) = parts_that_open(config)?;
     engine.get()?;
     Ok(parts)
 }
 
-/// The same with networks that are still being opened, by a thread of the engine.
+/// The same, but a thread of the engine still opens the networks.
 ///
 /// # Errors
-/// As [`parts`] where manifest or adapter are at fault; the engine tells of the rest.
-pub fn early_parts(config: &Config) -> Result<(Parts, Arc<LateEngine>)> {
+/// As [`parts`] where manifest or adapter are wrong; `LateEngine::get` has the other errors.
+pub fn parts_that_open(config: &Config) -> Result<(Parts, Arc<LateEngine>)> {
     let engine = Arc::new(LateEngine::open(&config.networks())?);
     let renderer = renderer(config)?;
     let models = models_info(engine.bundle(), "opening");
@@ -35,7 +35,7 @@ pub fn early_parts(config: &Config) -> Result<(Parts, Arc<LateEngine>)> {
     Ok((Parts { maker, semantics, renderer, models }, engine))
 }
 
-/// What answers texts; opens library and bundle only where it is `needed`.
+/// What makes semantics; opens library and bundle only where `needed`.
 ///
 /// # Errors
 /// `model_unavailable`.

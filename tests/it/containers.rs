@@ -15,8 +15,7 @@ fn read(name: &str) -> String {
 /// Variables that the program knows: those of the configuration and `SEGSPLAT_CONFIG`.
 fn known() -> BTreeSet<String> {
     let code = read("src/config.rs") + &read("src/cli/mod.rs");
-    let names = code.split("env = \"").skip(1).filter_map(|rest| rest.split('"').next());
-    names.map(str::to_owned).collect()
+    variables(&code)
 }
 
 /// Every `SEGSPLAT_…` word of a text.

@@ -8,11 +8,10 @@ use axum::{
 use futures_util::StreamExt;
 use utoipa::IntoParams;
 
-use super::{error::ApiError, fields::Fields, receive::read_on};
+use super::{error::ApiError, fields::Fields, multipart::read_on};
 use crate::{
     api::{Api, upload::json_over},
     error::Error,
-    keys::Caller,
     scene::SceneId,
 };
 
@@ -37,18 +36,15 @@ impl FromRequestParts<Api> for Id {
     }
 }
 
-/// The doors' state for the caller of this request, whom the edge has let in.
+/// The API for the caller of this request, whom the middleware has let in.
 #[derive(Clone, Debug)]
-pub(super) struct Called(pub(super) Api);
+pub(super) struct CallerApi(pub(super) Api);
 
-impl FromRequestParts<Api> for Called {
+impl FromRequestParts<Api> for CallerApi {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, api: &Api) -> Result<Self, ApiError> {
-        // Without the edge nobody was asked for a key, so nobody is let in.
-        let caller = parts.extensions.get::<Caller>();
-        let caller = caller.ok_or_else(|| Error::internal("the call was not let in"))?;
-        Ok(Self(api.for_caller(caller)))
+        Ok(Self(api.for_caller(parts.extensions.get())?))
     }
 }
 
