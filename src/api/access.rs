@@ -193,16 +193,6 @@ mod tests {
     use crate::keys::hash;
 
     #[test]
-    fn a_method_without_a_row_needs_an_admin() {
-        let of = |method: &str| of_rpc(&format!("/segsplat.v1.SceneService/{method}"));
-        assert_eq!(of("Pick"), ("pick", Some(Scope::Read)));
-        assert_eq!(of("DeleteScene"), ("delete_scene", Some(Scope::Write)));
-        assert_eq!(of("Nothing"), (OTHER, Some(Scope::Admin)));
-        assert_eq!(of_rpc("/grpc.health.v1.Health/Check"), (OTHER, None));
-        assert_eq!(rpc_calls().count(), RPCS.len() + 1);
-    }
-
-    #[test]
     fn each_key_has_a_rate_and_permits_and_permits_return() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("keys.toml");

@@ -22,7 +22,7 @@ use crate::{
     service::Service,
 };
 
-pub use self::http::{Server, serve};
+pub use self::http::Server;
 
 /// What every handler of both transports has. Cloning shares everything.
 #[derive(Clone, Debug)]
@@ -44,10 +44,10 @@ impl Api {
         Ok(Self { service, uploads, access, drain: Drain::default() })
     }
 
-    /// The same for one caller. The middleware puts the caller beside each request that it lets in;
-    /// without one nobody has checked the key.
+    /// The same for one caller. The middleware adds the caller to each request whose key it has
+    /// checked.
     fn for_caller(&self, caller: Option<&Caller>) -> Result<Self> {
-        let caller = caller.ok_or_else(|| Error::internal("nobody checked the caller's key"))?;
+        let caller = caller.ok_or_else(|| Error::internal("the caller's key was not checked"))?;
         Ok(Self { service: self.service.for_caller(caller.clone()), ..self.clone() })
     }
 

@@ -12,21 +12,12 @@ use crate::{
     service::{ModelInfo, ModelsInfo, Parts},
 };
 
-/// Library, bundle, networks and renderer, as the server runs them, all open.
+/// Bundle, networks and renderer as the server runs them. A thread of the engine still opens the
+/// networks; `LateEngine::get` waits for it.
 ///
 /// # Errors
 /// `model_unavailable`, `gpu_unavailable`, each with what is missing.
-pub fn parts(config: &Config) -> Result<Parts> {
-    let (parts, engine) = parts_that_open(config)?;
-    engine.get()?;
-    Ok(parts)
-}
-
-/// The same, but a thread of the engine still opens the networks.
-///
-/// # Errors
-/// As [`parts`] where manifest or adapter are wrong; `LateEngine::get` has the other errors.
-pub fn parts_that_open(config: &Config) -> Result<(Parts, Arc<LateEngine>)> {
+pub fn parts(config: &Config) -> Result<(Parts, Arc<LateEngine>)> {
     let engine = Arc::new(LateEngine::open(&config.networks())?);
     let renderer = renderer(config)?;
     let models = models_info(engine.bundle(), "opening");
@@ -50,13 +41,13 @@ pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticsMaker
 /// The renderer that the configuration asks for.
 ///
 /// # Errors
-/// `gpu_unavailable` when an adapter is asked for and none fits.
+/// `gpu_unavailable` when an adapter is named and none fits.
 pub fn renderer(config: &Config) -> Result<Arc<dyn Renderer>> {
     let (renderer, _adapters) = select(&config.renderer())?;
     Ok(renderer)
 }
 
-/// What a bundle says of itself.
+/// The description of a bundle for callers.
 #[must_use]
 pub fn models_info(bundle: &Bundle, execution_provider: &str) -> ModelsInfo {
     let geometry = bundle.geometry();

@@ -80,6 +80,6 @@ impl Output {
 }
 
 fn write(to: &mut dyn Write, words: &str) {
-    // There is nobody to tell when the terminal is gone.
+    // When the terminal is gone, the error cannot be shown.
     let _ = to.write_all(words.as_bytes()).and_then(|()| to.flush());
 }

@@ -38,7 +38,7 @@ pub(super) fn run(
         return out.answer(&text, &config);
     }
     config.check_open_to_others()?;
-    let (parts, engine) = engine::parts_that_open(&config)?;
+    let (parts, engine) = engine::parts(&config)?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()

@@ -14,9 +14,6 @@ pub use segsplat_core::meter::{stage, stages};
 
 use crate::error::{Error, Result, TABLE};
 
-/// Jobs that wait: what replicas are scaled by.
-pub const JOBS_QUEUED: &str = "segsplat_jobs_queued";
-
 struct Metrics {
     requests: IntCounterVec,
     request_seconds: HistogramVec,
@@ -65,7 +62,7 @@ impl Metrics {
             )?,
             inflight: gauge("segsplat_requests_inflight", "Calls whose answer is not sent yet")?,
             jobs,
-            jobs_queued: gauge(JOBS_QUEUED, "Jobs that wait")?,
+            jobs_queued: gauge("segsplat_jobs_queued", "Jobs that wait")?,
             jobs_running: gauge("segsplat_jobs_running", "Jobs at work")?,
             renders: gauge("segsplat_renders_inside", "Renders at work or waiting")?,
             cache_bytes: gauge("segsplat_scene_cache_bytes", "Bytes of scenes in memory")?,

@@ -191,6 +191,21 @@ async fn anothers_scene_is_as_one_that_does_not_exist() {
     assert_ne!(first, other, "a key of another owner gave away a scene");
 }
 
+#[tokio::test]
+async fn a_method_without_a_row_needs_an_admin_and_health_no_key() {
+    let (_folder, stand) = guarded("").await;
+    let client = crate::common::client_builder().http2_prior_knowledge().build().unwrap();
+    for (name, path, want) in [
+        ("writer", "/segsplat.v1.SceneService/Nothing", "permission_denied"),
+        ("boss", "/segsplat.v1.SceneService/Nothing", "not_found"),
+        ("writer", "/grpc.health.v1.Health/Nothing", "not_found"),
+    ] {
+        let request = client.post(stand.url(path)).bearer_auth(secret(name));
+        let answer = request.header("content-type", "application/grpc").send().await.unwrap();
+        assert_eq!(answer.headers()["segsplat-code"], want, "{name} calls {path}");
+    }
+}
+
 #[test]
 fn every_call_of_both_doors_has_its_scope_in_the_table() {
     let text: String = DESCRIPTORS.iter().map(|&b| char::from(b)).collect();

@@ -222,6 +222,14 @@ async fn a_message_that_is_no_protobuf_is_an_invalid_request() {
     let request = Request::new(Odd { scene_id: 7 });
     let fault = fault_of(grpc.unary(request, path, codec).await.unwrap_err());
     assert_eq!((fault.code.as_str(), fault.number), ("invalid_request", 3), "{}", fault.message);
+    // tonic refuses a message of 4 GiB by its length alone.
+    let client = crate::common::client_builder().http2_prior_knowledge().build().unwrap();
+    let request = client.post(stand.url("/segsplat.v1.SceneService/GetScene"));
+    let request = request.header("content-type", "application/grpc").header("te", "trailers");
+    let answer = request.body([&[0, 255, 255, 255, 255][..], &[0; 64]].concat()).send().await;
+    let answer = answer.unwrap();
+    assert_eq!(answer.headers()["segsplat-code"], "limit_exceeded");
+    assert_eq!(answer.headers()["grpc-status"], "3");
 }
 
 #[tokio::test]

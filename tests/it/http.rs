@@ -326,6 +326,16 @@ async fn request_ids_are_kept_and_deadlines_end_a_call() {
         crate::common::client().get(stand.url("/healthz")).header("x-request-id", "mine-7");
     let answer = request.send().await.unwrap();
     assert_eq!(answer.headers()["x-request-id"], "mine-7");
+    let long = "a".repeat(65);
+    let mut fresh = std::collections::BTreeSet::new();
+    for odd in [&b""[..], b"a b", b"a\"b", "ä".as_bytes(), long.as_bytes()] {
+        let odd = HeaderValue::from_bytes(odd).unwrap();
+        let request = crate::common::client().get(stand.url("/healthz"));
+        let answer = request.header("x-request-id", odd).send().await.unwrap();
+        let id = answer.headers()["x-request-id"].to_str().unwrap().to_owned();
+        assert_eq!(id.len(), 16, "{id}");
+        assert!(fresh.insert(id), "new ids repeat");
+    }
     assert_eq!(answer.headers()[header::X_CONTENT_TYPE_OPTIONS], "nosniff");
     let odd = fault(&stand, "/v1/scenes?deadline_ms=soon").await;
     assert!(odd.message.contains("soon"), "{}", odd.message);

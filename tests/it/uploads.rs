@@ -49,6 +49,7 @@ async fn limits_stop_an_upload_at_the_first_byte_over_and_name_the_bound() {
 async fn an_upload_that_cannot_be_a_scene_says_what_is_missing() {
     let server = TestServer::start().await;
     let photo = |form: Form, part: &'static str, name: &str| form.part(part, file(name, 1));
+    let plain = || Form::new().percent_encode_noop();
     let cameras = || Form::new().text("cameras", "{}");
     for (form, word) in [
         (Form::new().text("density", "full"), "no photos"),
@@ -60,7 +61,7 @@ async fn an_upload_that_cannot_be_a_scene_says_what_is_missing() {
         (photo(Form::new().part("archive", file("a.zip", 1)), "p", "a.png"), "its own photos"),
         // A photo is named by its part where that has an extension, else by its file.
         (
-            photo(photo(Form::new(), "images/a.png", "b.png"), "images/a.png", "c.png"),
+            photo(photo(plain(), "images/a.png", "b.png"), "images/a.png", "c.png"),
             "\"images/a.png\" was sent twice",
         ),
         (Form::new().text("a.png", "x").text("a.png", "x"), "\"a.png\" was sent twice"),

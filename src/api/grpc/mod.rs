@@ -16,7 +16,7 @@ use crate::error::{Error, Result};
 
 pub(super) use self::status::{complete, refusal, retry_after_s, unimplemented};
 
-/// Messages and services generated from `proto/segsplat/v1/`; `tests/it/proto.rs` holds them to it.
+/// Messages and services generated from `proto/segsplat/v1/`; `tests/it/proto.rs` compares them.
 #[allow(
     missing_docs,
     unreachable_pub,

@@ -91,31 +91,3 @@ pub(in crate::api) fn complete(headers: &mut HeaderMap) {
     }
     headers.insert(CODE, HeaderValue::from_static(code.name()));
 }
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn tonics_own_refusals_get_a_code_and_ours_are_left_alone() {
-        let completed = |status: &str, code: Option<&'static str>| {
-            let mut headers = HeaderMap::new();
-            headers.insert("grpc-status", status.parse().unwrap());
-            if let Some(code) = code {
-                headers.insert(CODE, HeaderValue::from_static(code));
-            }
-            complete(&mut headers);
-            let text = |key| headers.get(key).map(|v: &HeaderValue| v.to_str().unwrap().to_owned());
-            (text("grpc-status").unwrap(), text(CODE))
-        };
-        assert_eq!(completed("0", None), ("0".to_owned(), None));
-        let limit = ("3".to_owned(), Some("limit_exceeded".to_owned()));
-        assert_eq!(completed("11", None), limit);
-        let invalid = ("3".to_owned(), Some("invalid_request".to_owned()));
-        assert_eq!(completed("13", None), invalid);
-        let internal = ("13".to_owned(), Some("internal".to_owned()));
-        assert_eq!(completed("13", Some("internal")), internal);
-        let missing = ("12".to_owned(), Some("not_found".to_owned()));
-        assert_eq!(completed("12", None), missing);
-    }
-}

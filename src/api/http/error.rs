@@ -127,12 +127,8 @@ pub(super) async fn method_not_allowed(method: Method, uri: Uri) -> Response {
 
 /// The error of a panic, with its text as the source.
 pub(super) fn panic_error(panic: Box<dyn Any + Send + 'static>) -> Error {
-    let text = match panic.downcast::<String>() {
-        Ok(text) => *text,
-        Err(panic) => match panic.downcast::<&'static str>() {
-            Ok(text) => (*text).to_owned(),
-            Err(_) => "a panic without text".to_owned(),
-        },
-    };
+    let text = panic.downcast::<String>().map(|text| *text);
+    let text = text.or_else(|panic| panic.downcast::<&'static str>().map(|text| text.to_string()));
+    let text = text.unwrap_or_else(|_| "a panic without text".to_owned());
     Error::internal("a fault of the server; the request id finds it in the log").caused_by(text)
 }

@@ -1,4 +1,4 @@
-//! Own extractors, so that a bad id or body is answered in our shape and names what is wrong.
+//! Our own extractors: the answer to a bad id or body has our shape and names what is wrong.
 
 use axum::{
     body::Bytes,
@@ -15,7 +15,7 @@ use crate::{
     scene::SceneId,
 };
 
-/// The `{id}` of the path, checked before anything else sees it.
+/// The `{id}` of the path, checked.
 #[derive(Clone, Debug, IntoParams)]
 #[into_params(names("id"), parameter_in = Path)]
 pub(super) struct Id(
@@ -36,7 +36,7 @@ impl FromRequestParts<Api> for Id {
     }
 }
 
-/// The API for the caller of this request, whom the middleware has let in.
+/// The API for the caller of this request, after the middleware has checked the key.
 #[derive(Clone, Debug)]
 pub(super) struct CallerApi(pub(super) Api);
 

@@ -9,7 +9,6 @@ use std::{
     fmt::{self, Display},
     iter,
     str::FromStr,
-    time::Duration,
 };
 
 use axum::{
@@ -186,23 +185,20 @@ impl Fields {
     pub(super) fn value<T: DeserializeOwned>(&mut self, name: &'static str) -> Result<Option<T>> {
         self.known.push(name);
         let Some(given) = self.one(name).map_err(refused)? else { return Ok(None) };
-        Option::deserialize(Value { path: name, given }).map_err(refused)
-    }
-
-    /// Takes the value of `name` as a time in milliseconds.
-    pub(super) fn millis(&mut self, name: &'static str) -> Result<Option<Duration>> {
-        Ok(self.value(name)?.map(Duration::from_millis))
+        Option::deserialize(Value { path: name.to_owned(), given }).map_err(refused)
     }
 
     /// Takes every value of `name`, in their order.
     pub(super) fn all<T: DeserializeOwned>(&mut self, name: &'static str) -> Result<Vec<T>> {
         self.known.push(name);
         let mine = self.given.extract_if(.., |(given, _)| given == name);
-        mine.map(|(_, given)| T::deserialize(Value { path: name, given }).map_err(refused))
-            .collect()
+        mine.map(|(_, given)| {
+            T::deserialize(Value { path: name.to_owned(), given }).map_err(refused)
+        })
+        .collect()
     }
 
-    /// Refuses what nobody took.
+    /// Refuses names that are left.
     pub(super) fn finish(self) -> Result<()> {
         let Some((name, _)) = self.given.first() else { return Ok(()) };
         let known = match self.known.as_slice() {
@@ -239,7 +235,7 @@ impl<'de> Deserializer<'de> for &mut Fields {
         for name in fields {
             // `null` and nothing are the same.
             if let Some(given) = self.one(name)?.filter(|given| !given.is_null()) {
-                taken.push((*name, Value { path: name, given }));
+                taken.push((*name, Value { path: (*name).to_owned(), given }));
             }
         }
         visitor.visit_map(de::value::MapDeserializer::new(taken.into_iter()))
@@ -256,12 +252,12 @@ impl<'de> Deserializer<'de> for &mut Fields {
 }
 
 /// A value and where it stands: `width`, `cameras[3]`.
-struct Value<P> {
-    path: P,
+struct Value {
+    path: String,
     given: Given,
 }
 
-impl<P: Display> Value<P> {
+impl Value {
     fn must_be(&self, what: impl Display) -> FieldError {
         FieldError(format!("{} is {}; it must be {what}", self.path, self.given))
     }
@@ -276,7 +272,7 @@ impl<P: Display> Value<P> {
     }
 }
 
-impl<'de, P: Display> IntoDeserializer<'de, FieldError> for Value<P> {
+impl IntoDeserializer<'_, FieldError> for Value {
     type Deserializer = Self;
 
     fn into_deserializer(self) -> Self {
@@ -292,7 +288,7 @@ macro_rules! deserialize_numbers {
     )+)+};
 }
 
-impl<'de, P: Display> Deserializer<'de> for Value<P> {
+impl<'de> Deserializer<'de> for Value {
     type Error = FieldError;
 
     fn deserialize_any<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, FieldError> {
@@ -354,16 +350,14 @@ impl<'de, P: Display> Deserializer<'de> for Value<P> {
             let must = format!("it must have {len}{separated}");
             return Err(FieldError(format!("{path} has {count} numbers; {must}")));
         }
-        let parts = parts.into_iter().map(|given| Value { path: &path, given });
+        let parts = parts.into_iter().map(|given| Self { path: path.clone(), given });
         visitor.visit_seq(de::value::SeqDeserializer::new(parts))
     }
 
     fn deserialize_seq<V: Visitor<'de>>(self, visitor: V) -> Result<V::Value, FieldError> {
         let Given::List(values) = self.given else { return Err(self.must_be("a list")) };
-        let path = self.path;
         let values = values.into_iter().enumerate();
-        // The path as text: a list in a list would be a type without end.
-        let values = values.map(|(i, given)| Value { path: format!("{path}[{i}]"), given });
+        let values = values.map(|(i, given)| Self { path: format!("{}[{i}]", self.path), given });
         let mut list = de::value::SeqDeserializer::new(values);
         let read = visitor.visit_seq(&mut list)?;
         list.end()?;

@@ -1,4 +1,4 @@
-//! Is it alive, is it ready, what is it made of.
+//! Liveness, readiness, metrics and models.
 
 use axum::{
     Json,

@@ -39,7 +39,7 @@ use self::{
     middleware::{Around, Transport, around, grpc_guard, http_guard},
 };
 
-pub use self::serve::{Server, serve};
+pub use self::serve::Server;
 
 /// Name of the one call that the configuration can open.
 const METRICS: &str = "metrics";

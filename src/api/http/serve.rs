@@ -70,18 +70,6 @@ impl Server {
     }
 }
 
-/// Serves `service` on `listener` until `stop` resolves.
-///
-/// # Errors
-/// As [`Server::new`] and [`Server::serve`].
-pub async fn serve(
-    listener: TcpListener,
-    service: Service,
-    stop: impl Future<Output = ()> + Send + 'static,
-) -> Result<()> {
-    Server::new(service)?.serve(listener, stop).await
-}
-
 async fn run<L: Listener>(
     mut listener: L,
     app: Router,
@@ -104,7 +92,7 @@ async fn run<L: Listener>(
     }
     drop((listener, stopped));
     stopping.send_replace(true);
-    // Calls that are still open were told of their end before.
+    // The open calls had `drain_ms` to end.
     let _ = tokio::time::timeout(CLOSING, stopping.closed()).await;
     Ok(())
 }

@@ -42,7 +42,7 @@ pub(super) async fn query(
         mask: f.value("mask")?.unwrap_or_default(),
         relevancy: f.value("relevancy")?.unwrap_or_default(),
         profile: f.value("profile")?.unwrap_or_default(),
-        wait: f.millis("wait_ms")?,
+        wait: f.value("wait_ms")?.map(Duration::from_millis),
     };
     body.finish()?;
     Ok(Json(api.service.query(&id, spec).await?))
