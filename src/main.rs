@@ -7,9 +7,9 @@ fn main() -> ExitCode {
     segsplat::cli::main()
 }
 
-/// Heaps that the system's allocator may make. Left alone it makes up to eight a core, one for each
-/// of the threads that make, draw and send scenes in turn, and each keeps what it once held: the
-/// memory of a server crept on for hundreds of scenes. All large arrays are outside of heaps.
+/// Limits the heaps of the system's allocator. By default it makes up to eight for each core, and
+/// each keeps the memory that it once had: the memory of a server grew over hundreds of scenes.
+/// Large arrays are outside of these heaps.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 fn bound_arenas() {
     const ARENAS: i32 = 2;

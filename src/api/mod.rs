@@ -1,47 +1,54 @@
-//! Two doors, one house: HTTP and gRPC on one port, both thin over [`Service`].
+//! HTTP and gRPC on one port, both thin over [`Service`].
 //!
-//! What the two share lives here: who is let in, request ids, what an upload may hold. `axum`
-//! stays in [`http`], `tonic` in [`grpc`].
+//! What both share is here: keys and hosts, request ids, the limits of an upload. `axum` stays in
+//! [`http`], `tonic` in [`grpc`].
 
 pub mod grpc;
 pub mod http;
 
 mod access;
+mod drain;
 mod hosts;
-mod life;
 mod request_id;
 mod upload;
 
-use std::sync::Arc;
+use std::{error::Error as _, sync::Arc};
 
-use self::{access::Access, life::Life, upload::UploadBudget};
-use crate::{config::Config, error::Result, keys::Caller, service::Service};
+use self::{access::Access, drain::Drain, upload::UploadBudget};
+use crate::{
+    config::Config,
+    error::{Error, Result},
+    keys::Caller,
+    service::Service,
+};
 
-pub use self::http::{Doors, serve};
+pub use self::http::Server;
 
-/// What every handler of both doors holds. Cloning shares everything.
+/// What every handler of both transports has. Cloning shares everything.
 #[derive(Clone, Debug)]
 pub struct Api {
     service: Service,
     uploads: UploadBudget,
     access: Arc<Access>,
-    life: Life,
+    drain: Drain,
 }
 
 impl Api {
-    /// The doors of `service`, with the keys that its configuration names.
+    /// The API of `service`, with the keys that its configuration names.
     ///
     /// # Errors
     /// `invalid_request` when the keys file cannot be used.
     pub fn new(service: Service) -> Result<Self> {
         let uploads = UploadBudget::new(service.limits().uploads_bytes_max);
         let access = Arc::new(Access::new(service.config())?);
-        Ok(Self { service, uploads, access, life: Life::default() })
+        Ok(Self { service, uploads, access, drain: Drain::default() })
     }
 
-    /// The same for one caller.
-    fn for_caller(&self, caller: &Caller) -> Self {
-        Self { service: self.service.for_caller(caller.clone()), ..self.clone() }
+    /// The same for one caller. The middleware adds the caller to each request whose key it has
+    /// checked.
+    fn for_caller(&self, caller: Option<&Caller>) -> Result<Self> {
+        let caller = caller.ok_or_else(|| Error::internal("the caller's key was not checked"))?;
+        Ok(Self { service: self.service.for_caller(caller.clone()), ..self.clone() })
     }
 
     /// Puts the keys and limits of `config` in force. On an error nothing changes.
@@ -53,8 +60,31 @@ impl Api {
         let later = self.service.reload(config.limits.clone());
         tracing::info!(keys, "keys and limits are read again");
         if !later.is_empty() {
-            tracing::warn!(limits = ?later, "these change only with the next start");
+            tracing::warn!(limits = ?later, "these limits change only with the next start");
         }
         Ok(())
     }
+}
+
+/// Logs an error with its causes: callers' faults at `info`, ours at `error`. `ms`: time of the
+/// call.
+fn log_error(error: &Error, ms: Option<f64>) {
+    let code = error.code().name();
+    let mut message = error.message().to_owned();
+    let mut source = error.source();
+    while let Some(cause) = source {
+        message.push_str(": ");
+        message.push_str(&cause.to_string());
+        source = cause.source();
+    }
+    if error.code().row().http >= 500 {
+        tracing::error!(code, ms, "{message}");
+    } else {
+        tracing::info!(code, ms, "{message}");
+    }
+}
+
+/// The first characters of a text from a caller, for messages.
+fn short(text: &str) -> String {
+    text.chars().take(80).collect()
 }

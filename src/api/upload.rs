@@ -1,13 +1,14 @@
-//! Collects an upload piece by piece and stops at the first byte over a cap.
+//! Collects an upload piece by piece and stops at the first byte over a limit.
 //!
-//! Both doors feed it as the bytes arrive, so a 200 MB camera JSON is refused after 8 MiB and the
-//! 65th photo before its first pixel. All uploads together are held to a budget of memory.
+//! HTTP and gRPC feed it as the bytes arrive, so a camera JSON of 200 MB is refused after 8 MiB and
+//! the 65th photo before its first pixel. All uploads together have a budget of memory.
 
 use std::sync::{
     Arc,
     atomic::{AtomicUsize, Ordering},
 };
 
+use super::short;
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
@@ -16,7 +17,7 @@ use crate::{
     telemetry::meter,
 };
 
-/// Bytes that all uploads in flight may hold together.
+/// Bytes that all open uploads may hold together.
 #[derive(Clone, Debug)]
 pub(super) struct UploadBudget {
     held: Arc<AtomicUsize>,
@@ -24,7 +25,6 @@ pub(super) struct UploadBudget {
 }
 
 impl UploadBudget {
-    /// A budget of `max` bytes.
     pub(super) fn new(max: usize) -> Self {
         Self { held: Arc::default(), max }
     }
@@ -35,7 +35,7 @@ impl UploadBudget {
     }
 }
 
-/// What the bytes that follow belong to.
+/// What the next bytes belong to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Current {
     Nothing,
@@ -44,7 +44,7 @@ enum Current {
     Archive,
 }
 
-/// An upload on its way in.
+/// An upload that is being read.
 #[derive(Debug)]
 pub(super) struct UploadBuilder<'a> {
     limits: &'a Limits,
@@ -64,7 +64,7 @@ impl<'a> UploadBuilder<'a> {
         }
     }
 
-    /// The camera description follows.
+    /// Begins the camera description, with the bytes that are in it.
     pub(super) fn begin_cameras(&mut self, cameras: UploadCameras) -> Result<()> {
         if self.upload.cameras.is_some() {
             return Err(Error::invalid(
@@ -79,20 +79,20 @@ impl<'a> UploadBuilder<'a> {
         self.check_json()
     }
 
-    /// The photo `name` follows.
+    /// Begins the photo `name`.
     pub(super) fn begin_photo(&mut self, name: &str) -> Result<()> {
-        let max = self.limits.file_name_bytes_max;
+        let (count, max) = (self.upload.photos.len(), self.limits.file_name_bytes_max);
         if name.len() > max {
             return Err(Error::limit(
-                format!("photo {}: file name", self.upload.photos.len()),
+                format!("photo {count}: file name"),
                 format!("{} bytes", name.len()),
                 format!("{max} bytes"),
             ));
         }
-        if self.upload.photos.len() >= self.limits.photos_max {
+        if count >= self.limits.photos_max {
             return Err(Error::limit(
                 "upload",
-                format!("photo {name:?} is number {}", self.upload.photos.len() + 1),
+                format!("photo {name:?} is number {}", count + 1),
                 format!("{} photos a scene", self.limits.photos_max),
             ));
         }
@@ -104,7 +104,7 @@ impl<'a> UploadBuilder<'a> {
         Ok(())
     }
 
-    /// The archive follows, or goes on.
+    /// Begins the archive, or goes on with it.
     pub(super) fn begin_archive(&mut self) {
         self.upload.archive.get_or_insert_default();
         self.current = Current::Archive;
@@ -113,66 +113,47 @@ impl<'a> UploadBuilder<'a> {
     /// Adds bytes to what was begun last.
     pub(super) fn extend(&mut self, bytes: &[u8]) -> Result<()> {
         self.account(bytes.len())?;
-        match self.current {
-            Current::Nothing => return Err(Error::invalid("upload: bytes before any file's name")),
-            Current::Cameras => {
-                if let Some(UploadCameras::Transforms(json) | UploadCameras::Cameras(json)) =
-                    &mut self.upload.cameras
-                {
-                    json.extend_from_slice(bytes);
-                }
-                self.check_json()?;
-            }
-            Current::Photo => {
-                if let Some(photo) = self.upload.photos.last_mut() {
-                    photo.bytes.extend_from_slice(bytes);
-                }
-            }
-            Current::Archive => {
-                self.upload.archive.get_or_insert_default().extend_from_slice(bytes);
-            }
-        }
-        Ok(())
+        let upload = &mut self.upload;
+        let file = match self.current {
+            Current::Nothing => None,
+            Current::Cameras => upload
+                .cameras
+                .as_mut()
+                .map(|(UploadCameras::Transforms(json) | UploadCameras::Cameras(json))| json),
+            Current::Photo => upload.photos.last_mut().map(|photo| &mut photo.bytes),
+            Current::Archive => upload.archive.as_mut(),
+        };
+        let file = file.ok_or_else(|| Error::invalid("upload: bytes before any file's name"))?;
+        file.extend_from_slice(bytes);
+        if self.current == Current::Cameras { self.check_json() } else { Ok(()) }
     }
 
     /// The whole upload; its bytes count against the budget until the guard is dropped.
     pub(super) fn finish(self) -> Result<(Upload, UploadGuard)> {
         let upload = self.upload;
-        let min = self.limits.photos_min;
-        let photos = upload.photos.len();
-        match (&upload.archive, &upload.cameras) {
+        let (min, max, photos) =
+            (self.limits.photos_min, self.limits.photos_max, upload.photos.len());
+        let wrong = match (&upload.archive, &upload.cameras) {
             (Some(_), Some(_)) => {
-                return Err(Error::invalid(
-                    "upload: an archive holds its own camera description; send one or the other",
-                ));
+                "an archive holds its own camera description; send one or the other".to_owned()
             }
             (Some(_), None) if photos > 0 => {
-                return Err(Error::invalid(
-                    "upload: an archive holds its own photos; send one or the other",
-                ));
+                "an archive holds its own photos; send one or the other".to_owned()
             }
-            (Some(_), None) => {}
-            (None, None) if photos == 0 => {
-                return Err(Error::invalid(format!(
-                    "upload: no photos and no cameras; send transforms or cameras and {min} to {} \
-                     photos, or an archive",
-                    self.limits.photos_max
-                )));
-            }
+            (None, None) if photos == 0 => format!(
+                "no photos and no cameras; send transforms or cameras and {min} to {max} photos, \
+                 or an archive"
+            ),
             (None, None) => {
-                return Err(Error::invalid(
-                    "upload: no camera description; send a part named transforms or cameras",
-                ));
+                "no camera description; send a part named transforms or cameras".to_owned()
             }
             (None, Some(_)) if photos < min => {
-                return Err(Error::invalid(format!(
-                    "upload: {photos} photo{}; a scene needs at least {min}",
-                    if photos == 1 { "" } else { "s" }
-                )));
+                let s = if photos == 1 { "" } else { "s" };
+                format!("{photos} photo{s}; a scene needs at least {min}")
             }
-            (None, Some(_)) => {}
-        }
-        Ok((upload, self.guard))
+            _ => return Ok((upload, self.guard)),
+        };
+        Err(Error::invalid(format!("upload: {wrong}")))
     }
 
     fn account(&mut self, bytes: usize) -> Result<()> {
@@ -188,38 +169,34 @@ impl<'a> UploadBuilder<'a> {
             ));
         }
         if all > guard.budget.max {
-            let message = format!(
-                "uploads at work hold {all} bytes, over {} bytes; try again",
-                guard.budget.max
-            );
+            let max = guard.budget.max;
+            let message = format!("all uploads hold {all} bytes, over {max} bytes; try again");
             return Err(Error::new(ErrorCode::Overloaded, message).retry_after_s(2));
         }
         Ok(())
     }
 
     fn check_json(&self) -> Result<()> {
-        let (name, len) = match &self.upload.cameras {
-            Some(UploadCameras::Transforms(json)) => ("transforms", json.len()),
-            Some(UploadCameras::Cameras(json)) => ("cameras", json.len()),
+        let (name, json) = match &self.upload.cameras {
+            Some(UploadCameras::Transforms(json)) => ("transforms", json),
+            Some(UploadCameras::Cameras(json)) => ("cameras", json),
             None => return Ok(()),
         };
-        if len > self.limits.json_bytes_max {
-            return Err(json_over(name, len, self.limits));
+        if json.len() > self.limits.json_bytes_max {
+            return Err(json_over(name, json.len(), self.limits));
         }
         Ok(())
     }
 }
 
-/// Refuses a bundle that is not the loaded one; an empty name is the loaded one's.
+/// Refuses a bundle that is not the loaded one; an empty name stands for the loaded one.
 pub(super) fn check_bundle(asked: &str, models: &ModelsInfo) -> Result<()> {
     if asked.is_empty() || asked == models.bundle {
         return Ok(());
     }
-    let shown: String = asked.chars().take(40).collect();
-    Err(Error::new(
-        ErrorCode::ModelUnavailable,
-        format!("bundle is {shown:?}; this server has {:?} loaded", models.bundle),
-    ))
+    let message =
+        format!("bundle is {:?}; this server has {:?} loaded", short(asked), models.bundle);
+    Err(Error::new(ErrorCode::ModelUnavailable, message))
 }
 
 /// The error of a JSON part of at least `len` bytes.
@@ -248,66 +225,22 @@ impl Drop for UploadGuard {
 mod tests {
     use super::*;
 
-    fn limits() -> Limits {
-        Limits { photos_max: 3, json_bytes_max: 10, upload_bytes_max: 100, ..Limits::default() }
-    }
-
-    fn message<T>(result: Result<T>) -> (ErrorCode, String) {
-        let error = result.err().expect("refused");
-        (error.code(), error.message().to_owned())
-    }
-
-    #[test]
-    fn caps_stop_at_the_first_byte_over_and_name_the_bound() {
-        let (limits, budget) = (limits(), UploadBudget::new(1_000));
-        let mut upload = UploadBuilder::new(&limits, &budget);
-        upload.begin_cameras(UploadCameras::Transforms(Vec::new())).unwrap();
-        upload.extend(&[b' '; 10]).unwrap();
-        let (code, text) = message(upload.extend(b" "));
-        assert_eq!(code, ErrorCode::LimitExceeded);
-        assert!(text.contains("11 bytes") && text.contains("10 bytes"), "{text}");
-        drop(upload);
-
-        let mut upload = UploadBuilder::new(&limits, &budget);
-        for name in ["a.png", "b.png", "c.png"] {
-            upload.begin_photo(name).unwrap();
-        }
-        assert_eq!(message(upload.begin_photo("d.png")).0, ErrorCode::LimitExceeded);
-        assert_eq!(message(upload.extend(&[0; 101])).0, ErrorCode::LimitExceeded);
-        assert!(message(upload.begin_photo(&"x".repeat(257))).1.contains("257 bytes"));
-        drop(upload);
-        assert_eq!(budget.held.load(Ordering::Relaxed), 0, "bytes stay counted after a refusal");
-    }
-
+    // The messages are tested over HTTP, in `tests/it/uploads.rs`.
     #[test]
     fn all_uploads_together_keep_to_the_budget_until_their_guards_drop() {
-        let (limits, budget) = (limits(), UploadBudget::new(150));
-        let mut first = UploadBuilder::new(&limits, &budget);
-        first.begin_archive();
-        first.extend(&[0; 90]).unwrap();
-        let (_, guard) = first.finish().unwrap();
-        let mut second = UploadBuilder::new(&limits, &budget);
-        second.begin_archive();
-        assert_eq!(message(second.extend(&[0; 90])).0, ErrorCode::Overloaded);
-        drop((second, guard));
-        let mut third = UploadBuilder::new(&limits, &budget);
-        third.begin_archive();
-        third.extend(&[0; 90]).unwrap();
-    }
-
-    #[test]
-    fn an_upload_that_cannot_be_a_scene_says_what_is_missing() {
-        let (limits, budget) = (limits(), UploadBudget::new(1_000));
-        let new = || UploadBuilder::new(&limits, &budget);
-        assert!(message(new().finish()).1.contains("no photos"));
-        let mut one = new();
-        one.begin_photo("a.png").unwrap();
-        assert!(message(one.begin_photo("a.png")).1.contains("twice"));
-        assert!(message(one.finish()).1.contains("no camera description"));
-        let mut one = new();
-        one.begin_cameras(UploadCameras::Cameras(b"{}".to_vec())).unwrap();
-        one.begin_photo("a.png").unwrap();
-        assert!(message(one.finish()).1.contains("1 photo; a scene needs at least 2"));
-        assert!(message(new().extend(b"x")).1.contains("before any file's name"));
+        let limits = Limits { upload_bytes_max: 100, ..Limits::default() };
+        let budget = UploadBudget::new(150);
+        let archive = || {
+            let mut upload = UploadBuilder::new(&limits, &budget);
+            upload.begin_archive();
+            upload.extend(&[0; 90]).map(|()| upload)
+        };
+        let (_, guard) = archive().unwrap().finish().unwrap();
+        assert_eq!(archive().unwrap_err().code(), ErrorCode::Overloaded);
+        drop(guard);
+        drop(archive().unwrap());
+        assert_eq!(budget.held_bytes(), 0);
+        let nameless = UploadBuilder::new(&limits, &budget).extend(b"x").unwrap_err();
+        assert!(nameless.message().contains("before any file's name"), "{nameless}");
     }
 }

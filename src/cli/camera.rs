@@ -5,8 +5,8 @@ use crate::{
     service::{CameraFields, CameraSpec},
 };
 
-/// The camera of these flags, `None` where no pose is given. Between two cameras the middle is
-/// meant where `--t` is not given.
+/// The camera of these flags, `None` where no pose is given. With `--from` and `--to`, `--t` is 0.5
+/// by default.
 pub(super) fn spec(fields: &CameraFields) -> Result<Option<CameraSpec>> {
     if !fields.has_pose() {
         return Ok(None);
@@ -15,7 +15,7 @@ pub(super) fn spec(fields: &CameraFields) -> Result<Option<CameraSpec>> {
     CameraFields { t, ..fields.clone() }.try_into().map(Some)
 }
 
-/// Nothing says where to stand.
+/// The error of a command line without a pose.
 pub(super) fn no_camera() -> Error {
     Error::invalid(
         "no camera: give --from, --from and --to, --eye and --target, or --camera-to-world",

@@ -12,21 +12,12 @@ use crate::{
     service::{ModelInfo, ModelsInfo, Parts},
 };
 
-/// Library, bundle, networks and renderer, as the server runs them, all open.
+/// Bundle, networks and renderer as the server runs them. A thread of the engine still opens the
+/// networks; `LateEngine::get` waits for it.
 ///
 /// # Errors
 /// `model_unavailable`, `gpu_unavailable`, each with what is missing.
-pub fn parts(config: &Config) -> Result<Parts> {
-    let (parts, engine) = early_parts(config)?;
-    engine.get()?;
-    Ok(parts)
-}
-
-/// The same with networks that are still being opened, by a thread of the engine.
-///
-/// # Errors
-/// As [`parts`] where manifest or adapter are at fault; the engine tells of the rest.
-pub fn early_parts(config: &Config) -> Result<(Parts, Arc<PipelineLoader>)> {
+pub fn parts(config: &Config) -> Result<(Parts, Arc<PipelineLoader>)> {
     let engine = Arc::new(PipelineLoader::open(&config.networks())?);
     let renderer = renderer(config)?;
     let models = models_info(engine.bundle(), "opening");
@@ -35,7 +26,7 @@ pub fn early_parts(config: &Config) -> Result<(Parts, Arc<PipelineLoader>)> {
     Ok((Parts { scenes: networks, semantics, renderer, models }, engine))
 }
 
-/// What answers texts; opens library and bundle only where it is `needed`.
+/// What makes semantics; opens library and bundle only where `needed`.
 ///
 /// # Errors
 /// `model_unavailable`.
@@ -50,13 +41,13 @@ pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticNetwor
 /// The renderer that the configuration asks for.
 ///
 /// # Errors
-/// `gpu_unavailable` when an adapter is asked for and none fits.
+/// `gpu_unavailable` when an adapter is named and none fits.
 pub fn renderer(config: &Config) -> Result<Arc<dyn Renderer>> {
     let (renderer, _adapters) = select(&config.renderer())?;
     Ok(renderer)
 }
 
-/// What a bundle says of itself.
+/// The description of a bundle for callers.
 #[must_use]
 pub fn models_info(bundle: &Bundle, execution_provider: &str) -> ModelsInfo {
     let geometry = bundle.geometry();

@@ -1,4 +1,4 @@
-//! `segsplat health`: asks a running server whether it is ready; for containers without a shell.
+//! `segsplat health`: asks a running server whether it is ready, for containers without a shell.
 
 use std::{
     io::{Read as _, Write as _},
@@ -10,7 +10,7 @@ use serde_json::json;
 
 use super::output::Output;
 use crate::{
-    config::{Config, DoorArgs},
+    config::{Config, ListenArgs},
     error::{Error, ErrorCode, Result},
 };
 
@@ -20,13 +20,13 @@ const PATIENCE: Duration = Duration::from_secs(2);
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
     #[command(flatten)]
-    pub(super) door: DoorArgs,
-    /// Ask whether it lives, not whether it is ready
+    pub(super) listen: ListenArgs,
+    /// Ask whether the process answers, not whether it is ready
     #[arg(long)]
     live: bool,
 }
 
-/// With TLS the port is asked no more than to be open: the certificate names hosts, not loopback.
+/// With TLS this only checks that the port is open: the certificate names hosts, not loopback.
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let address = beside(config.listen);
     let path = if args.live { "/healthz" } else { "/readyz" };
@@ -53,7 +53,7 @@ fn beside(listen: SocketAddr) -> SocketAddr {
 
 fn connect(address: SocketAddr) -> Result<TcpStream> {
     TcpStream::connect_timeout(&address, PATIENCE).map_err(|e| {
-        Error::new(ErrorCode::Stopping, format!("nobody answers on {address}")).caused_by(e)
+        Error::new(ErrorCode::Stopping, format!("no server answers on {address}")).caused_by(e)
     })
 }
 

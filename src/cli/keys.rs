@@ -26,18 +26,18 @@ pub(super) struct Args {
 
 #[derive(Clone, Debug, Subcommand)]
 enum Action {
-    /// Make a key: it is shown once; the keys file gets its hash
+    /// Make a key. It is shown once; the keys file gets its hash
     New {
         /// Name of the key, for log and metrics
         name: String,
-        /// What it may do: `read` looks at scenes, asks them and exports them; `write` also makes
-        /// and deletes scenes; `admin` also sees everybody's scenes and the metrics
+        /// What it allows: `read` shows, searches and exports scenes; `write` also makes and
+        /// deletes scenes; `admin` also shows the scenes of all owners and the metrics
         #[arg(long, default_value = "write", value_parser = named::<Scope>)]
         scope: Scope,
-        /// Whose scenes it makes and sees; keys of one owner share them [default: NAME]
+        /// Owner of the scenes that it makes and sees; keys of one owner share them [default: NAME]
         #[arg(long)]
         owner: Option<String>,
-        /// Keys file to add it to; without one its entry is printed
+        /// Keys file to add it to; without one the lines for the file are printed
         #[arg(long, value_name = "FILE", alias = "file")]
         keys: Option<PathBuf>,
     },
@@ -70,30 +70,31 @@ fn new(
     out: &Output,
 ) -> Result<()> {
     keys::check_name("name", name)?;
-    owner.map_or(Ok(()), |owner| keys::check_name("owner", owner))?;
+    keys::check_name("owner", owner.unwrap_or(name))?;
     let key = keys::generate()?;
     let owner_line = owner.map(|owner| format!("owner = \"{owner}\"\n")).unwrap_or_default();
     let sha256 = keys::hash(&key);
-    let entry = format!(
+    let lines = format!(
         "[[key]]\nname = \"{name}\"\n{owner_line}sha256 = \"{sha256}\"\nscopes = [\"{scope}\"]\n"
     );
     let value = json!({ "name": name, "key": key, "sha256": sha256, "scope": scope });
     let Some(path) = keys_file else {
-        return out.answer(&format!("{key}\n\nfor the keys file:\n\n{entry}"), &value);
+        return out.answer(&format!("{key}\n\nfor the keys file:\n\n{lines}"), &value);
     };
-    add(path, &entry)?;
+    add(path, &lines)?;
     out.answer(&key, &value)
 }
 
-/// Adds an entry to a keys file, which stays readable by its owner alone, or is not changed.
-fn add(path: &Path, entry: &str) -> Result<()> {
+/// Adds the lines of a key to a keys file that only its owner may read. On an error the file is not
+/// changed.
+fn add(path: &Path, lines: &str) -> Result<()> {
     let before = match fs_err::read_to_string(path) {
         Ok(text) => text,
         Err(cause) if cause.kind() == std::io::ErrorKind::NotFound => String::new(),
         Err(cause) => return Err(Error::invalid(format!("keys file: {cause}")).caused_by(cause)),
     };
     let gap = if before.is_empty() || before.ends_with("\n\n") { "" } else { "\n" };
-    let text = format!("{before}{gap}{entry}");
+    let text = format!("{before}{gap}{lines}");
     Keys::parse(&text)?;
     let mut options = fs_err::OpenOptions::new();
     options.create(true).append(true);
@@ -104,6 +105,6 @@ fn add(path: &Path, entry: &str) -> Result<()> {
     }
     options
         .open(path)
-        .and_then(|mut file| file.write_all(format!("{gap}{entry}").as_bytes()))
+        .and_then(|mut file| file.write_all(format!("{gap}{lines}").as_bytes()))
         .map_err(|e| Error::new(ErrorCode::StoreUnavailable, format!("keys file: {e}")))
 }

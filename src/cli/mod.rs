@@ -1,7 +1,8 @@
-//! The command line: arguments to calls of the library, answers to the terminal, errors to exits.
+//! The command line: arguments to calls of the library, answers to the terminal, errors to exit
+//! codes.
 //!
-//! Answers go to standard output, one JSON value where `--json` is given; progress, the log and
-//! errors go to standard error. The exit code of an error is its row of the error table.
+//! Answers go to standard output, as one JSON value with `--json`. Progress, the log and errors go
+//! to standard error. The error table has the exit code of each error.
 
 mod bench;
 mod camera;
@@ -58,13 +59,13 @@ enum Command {
     Reconstruct(reconstruct::Args),
     /// Render a view of a scene
     Render(Box<render::Args>),
-    /// Ask a scene by text: where is it, in space and in a view
+    /// Search a scene by text, in 3D and in a view
     Query(Box<query::Args>),
-    /// Say what is in a scene file
+    /// Show what is in a scene file
     Inspect(inspect::Args),
     /// The model bundle and ONNX Runtime
     Models(models::Args),
-    /// Time a view of a scene, and say how far it is from the exact picture
+    /// Measure the time of a view of a scene and its difference from the exact picture
     Bench(Box<bench::Args>),
     /// Write a small generated photo set with exact cameras
     Sample(sample::Args),
@@ -75,7 +76,7 @@ impl Command {
         let common = |config: &ConfigArgs| AllArgs { config: config.clone(), ..AllArgs::default() };
         match self {
             Self::Serve(args) => args.config.clone(),
-            Self::Health(args) => AllArgs { door: args.door.clone(), ..AllArgs::default() },
+            Self::Health(args) => AllArgs { listen: args.listen.clone(), ..AllArgs::default() },
             Self::Reconstruct(args) => common(&args.config),
             Self::Render(args) => common(&args.config),
             Self::Query(args) => common(&args.config),
@@ -94,21 +95,21 @@ pub fn main() -> ExitCode {
 }
 
 fn run(args: impl IntoIterator<Item = OsString>) -> ExitCode {
-    // The flag's name before there was `--profile`.
+    // `--paper` is the old name of `--profile=paper`.
     let today = |arg: OsString| if arg == "--paper" { "--profile=paper".into() } else { arg };
     let args: Vec<OsString> = args.into_iter().map(today).collect();
     let cli = match Cli::try_parse_from(&args) {
         Ok(cli) => cli,
-        // A value that is none is an error as any other, also as JSON.
+        // A wrong value is an error like any other, also as JSON.
         Err(wrong) if wrong.kind() == ErrorKind::ValueValidation => {
             let error = Error::invalid(about(&wrong));
             Output::new(args.iter().any(|arg| arg == "--json")).error(&error);
             return ExitCode::from(error.code().row().exit);
         }
         // Also `--help` and `--version`, which are no errors; clap knows the stream and the code.
-        Err(told) => {
-            let code = u8::try_from(told.exit_code()).unwrap_or(2);
-            return if told.print().is_ok() { ExitCode::from(code) } else { ExitCode::FAILURE };
+        Err(other) => {
+            let code = u8::try_from(other.exit_code()).unwrap_or(2);
+            return if other.print().is_ok() { ExitCode::from(code) } else { ExitCode::FAILURE };
         }
     };
     let out = Output::new(cli.json);
@@ -136,7 +137,7 @@ fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
     if quiet {
         "warn".clone_into(&mut config.log);
     }
-    // Answers stand alone on standard output; the spans that are left go out at the end.
+    // Dropped at the end, which sends the last spans.
     let _spans = telemetry::start(&config)?;
     match &cli.command {
         Command::Serve(args) => {

@@ -1,4 +1,4 @@
-//! `segsplat models`: what the bundle holds, and whether bundle and library are what they claim.
+//! `segsplat models`: what the bundle holds, and a check of bundle and library.
 
 use std::fmt::Write as _;
 
@@ -24,7 +24,7 @@ pub(super) struct Args {
 
 #[derive(Clone, Copy, Debug, Subcommand)]
 enum Action {
-    /// Say what the bundle holds
+    /// List the networks of the bundle
     List,
     /// Check every file against its sha256, and open the networks
     Verify,
@@ -40,10 +40,10 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
 fn list(config: &Config, out: &Output) -> Result<()> {
     let bundle = Bundle::find(&config.networks())?;
     let info = models_info(&bundle, "");
-    out.answer(&words(&info), &json!({ "bundle": info.bundle, "models": info.models }))
+    out.answer(&summary(&info), &json!({ "bundle": info.bundle, "models": info.models }))
 }
 
-fn words(info: &ModelsInfo) -> String {
+fn summary(info: &ModelsInfo) -> String {
     let mut text = format!("bundle {} ({})\n", info.bundle, info.bundle_sha256);
     for model in &info.models {
         let _ = write!(text, "  {}: {}, {} bytes", model.name, model.file, model.size_bytes);
@@ -63,7 +63,7 @@ fn verify(config: &Config, out: &Output) -> Result<()> {
     let provider = engine.geometry().provider().name();
     let info = models_info(engine.bundle(), provider);
     let build = runtime.build().unwrap_or("a library that is not pinned");
-    let mut text = words(&info);
+    let mut text = summary(&info);
     let _ = writeln!(text, "  every file matches its sha256");
     let _ = writeln!(text, "ONNX Runtime: {build}, sha256 {}", runtime.sha256());
     let _ = writeln!(text, "  the networks open on {provider}");

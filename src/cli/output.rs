@@ -1,4 +1,4 @@
-//! The one way from the program to the terminal.
+//! Everything that the program writes to the terminal.
 
 use std::{
     error::Error as _,
@@ -25,8 +25,7 @@ impl Output {
         Self { json, terminal: io::stderr().is_terminal(), last: Mutex::default() }
     }
 
-    /// An answer: `text` for people, `value` for machines. A closed pipe ends the program's words,
-    /// not the program.
+    /// An answer: `text` for people, `value` for machines. A closed pipe is no error.
     pub(super) fn answer(&self, text: &str, value: &impl Serialize) -> Result<()> {
         let words = if self.json {
             serde_json::to_string(value)
@@ -38,7 +37,7 @@ impl Output {
         Ok(())
     }
 
-    /// Where the work is: one line that changes on a terminal, plain lines in a log.
+    /// Progress: one line that changes on a terminal, plain lines in a log.
     pub(super) fn progress(&self, what: &str, fraction: f32) {
         if self.json {
             return;
@@ -81,6 +80,6 @@ impl Output {
 }
 
 fn write(to: &mut dyn Write, words: &str) {
-    // There is nobody to tell when the terminal is gone.
+    // When the terminal is gone, the error cannot be shown.
     let _ = to.write_all(words.as_bytes()).and_then(|()| to.flush());
 }

@@ -1,4 +1,4 @@
-//! `segsplat query`: texts asked of a scene file that was made with its semantics.
+//! `segsplat query`: search by text in a scene file that has semantics.
 
 use std::{
     fmt::Write as _,
@@ -8,12 +8,11 @@ use std::{
 use super::{camera, engine, output::Output, scene_file};
 use crate::{
     config::{Config, ConfigArgs},
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
     names::named,
     scene::ScoringProfile,
     service::{
-        Boxes, CameraFields, MaskFormat, OfflineService, QueryAnswer, QuerySpec, TextResult,
-        ViewOptions,
+        Boxes, CameraFields, MaskFormat, OfflineService, QuerySpec, TextResult, ViewOptions,
     },
     store::ply::PlyWriter,
 };
@@ -23,10 +22,11 @@ use crate::{
 pub(super) struct Args {
     /// Scene file, or a folder with one
     scene: PathBuf,
-    /// What to look for; several texts are asked at once
+    /// What to look for; several texts may be given
     #[arg(required = true)]
     texts: Vec<String>,
-    /// Mask of the view (.png), or the Gaussians selected (.ply); of several texts one file each
+    /// File of the mask in the view (.png) or of the selected Gaussians (.ply); with several texts,
+    /// one file each
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Boxes of the parts: oriented, aligned or none
@@ -62,26 +62,30 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let opened = scene_file::open(&args.scene, &config.limits)?;
     let semantics = engine::semantics(config, true)?;
     let service = OfflineService::new(semantics, engine::renderer(config)?, config.limits.clone());
-    let answer = service.query(&opened.scene, &spec)?;
+    let mut answer = service.query(&opened.scene, &spec)?;
     let mut text = String::new();
     for (i, found) in answer.results.iter().enumerate() {
-        tell(&mut text, found);
+        describe(&mut text, found);
         let Some(output) = &args.output else { continue };
         let path = numbered(output, i, answer.results.len());
         match ending {
             Some(Ending::Ply) => {
                 let chosen = service.select(&opened.scene, &found.text, profile)?;
                 let file: Vec<u8> = PlyWriter::new(&chosen).flatten().collect();
-                write(&path, &file)?;
+                scene_file::write(&path, &file)?;
             }
             _ => {
                 let mask = found.view.as_ref().and_then(|view| view.mask_png.as_deref());
-                write(&path, mask.unwrap_or_default())?;
+                scene_file::write(&path, mask.unwrap_or_default())?;
             }
         }
         let _ = writeln!(text, "  written to {}", path.display());
     }
-    out.answer(&text, &without_pictures(answer))
+    // The masks are in the files that were written.
+    for view in answer.results.iter_mut().filter_map(|found| found.view.as_mut()) {
+        view.mask_png = None;
+    }
+    out.answer(&text, &answer)
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -91,12 +95,11 @@ enum Ending {
 }
 
 fn ending_of(path: &Path) -> Result<Ending> {
-    let end = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-    match end.as_str() {
+    match scene_file::ending(path).as_str() {
         "png" => Ok(Ending::Png),
         "ply" => Ok(Ending::Ply),
         _ => Err(Error::invalid(format!(
-            "{}: the ending says what is written: png (the mask) or ply (the Gaussians)",
+            "{}: the ending must be png (for the mask) or ply (for the Gaussians)",
             path.display()
         ))),
     }
@@ -112,14 +115,7 @@ fn numbered(path: &Path, i: usize, count: usize) -> PathBuf {
     path.with_file_name(format!("{stem}-{i}.{end}"))
 }
 
-fn write(path: &Path, file: &[u8]) -> Result<()> {
-    fs_err::write(path, file).map_err(|e| {
-        let what = format!("{}: cannot be written: {}", path.display(), e.kind());
-        Error::new(ErrorCode::StoreUnavailable, what).caused_by(e)
-    })
-}
-
-fn tell(text: &mut String, found: &TextResult) {
+fn describe(text: &mut String, found: &TextResult) {
     // Writing to a string does not fail.
     let best = found.scores.iter().copied().fold(0.0, f32::max);
     let _ = writeln!(
@@ -153,12 +149,4 @@ fn tell(text: &mut String, found: &TextResult) {
     for warning in &found.warnings {
         let _ = writeln!(text, "  warning {}: {}", warning.code, warning.message);
     }
-}
-
-/// What was written to files needs no second copy in the answer.
-fn without_pictures(mut answer: QueryAnswer) -> QueryAnswer {
-    for view in answer.results.iter_mut().filter_map(|found| found.view.as_mut()) {
-        view.mask_png = None;
-    }
-    answer
 }

@@ -13,7 +13,7 @@ use sha2::{Digest, Sha256};
 
 use super::{
     output::Output,
-    scene_file::{is_ply, path_of, semantics_path},
+    scene_file::{is_ply, path_of, semantics_path, unreadable, unwritable},
 };
 use crate::{
     config::{Config, ConfigArgs},
@@ -35,10 +35,10 @@ pub(super) struct Args {
     /// Scene file to write; with the ending .ply a 3DGS PLY
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Views the network takes at once [default: what the bundle says]
+    /// Views that the network takes at once [default: what the bundle says]
     #[arg(long)]
     max_views: Option<usize>,
-    /// Make what texts are asked of too, in a file beside the scene's: `eager`; `off` makes none
+    /// `eager` also makes the semantics, in a file beside the scene's; `off` makes none
     #[arg(long, value_parser = semantics, default_value = "off")]
     semantics: SemanticsMode,
     /// Gaussians kept: `thinned`, one for up to 16 neighbours where the photos are flat, or `full`
@@ -59,7 +59,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let eager = args.semantics == SemanticsMode::Eager;
     if eager && is_ply(&args.output) {
         return Err(Error::invalid(
-            "--semantics eager: a PLY has no place for them; write a scene",
+            "--semantics eager: a PLY cannot hold semantics; write a scene file",
         ));
     }
     if let (true, Some(lack)) = (eager, engine.bundle().lacks_semantics()) {
@@ -91,36 +91,30 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         write_semantics_file(&semantics_path(&path), &scene.meta.id, &semantics)?;
         scene = scene.with_semantics(semantics)?;
     } else if !is_ply(&path) {
-        forget(&semantics_path(&path))?;
+        remove(&semantics_path(&path))?;
     }
     let total_ms = begun.elapsed().as_secs_f64() * 1e3;
     out.progress("done", 1.0);
-    tell(&path, &scene, total_ms, out)
+    describe(&path, &scene, total_ms, out)
 }
 
 fn upload_of(path: &Path, config: &Config) -> Result<Upload> {
     if path.is_dir() {
         return photos::upload_of_dir(path, &config.limits);
     }
-    let unreadable = |e: std::io::Error| {
-        Error::invalid(format!("{}: cannot be read: {}", path.display(), e.kind())).caused_by(e)
-    };
-    let size = fs_err::metadata(path).map_err(unreadable)?.len();
+    let size = fs_err::metadata(path).map_err(|e| unreadable(path, e))?.len();
     let max = config.limits.upload_bytes_max;
     if size > max as u64 {
         return Err(Error::limit("upload bytes", size, max));
     }
-    let archive = fs_err::read(path).map_err(unreadable)?;
+    let archive = fs_err::read(path).map_err(|e| unreadable(path, e))?;
     Ok(Upload { archive: Some(archive), ..Upload::default() })
 }
 
-/// Removes the semantics of a scene that was written over.
-fn forget(path: &Path) -> Result<()> {
+/// Removes the semantics of a scene that was replaced.
+fn remove(path: &Path) -> Result<()> {
     match fs_err::remove_file(path) {
-        Err(e) if e.kind() != std::io::ErrorKind::NotFound => {
-            let what = format!("{}: cannot be removed: {}", path.display(), e.kind());
-            Err(Error::new(ErrorCode::StoreUnavailable, what).caused_by(e))
-        }
+        Err(e) if e.kind() != std::io::ErrorKind::NotFound => Err(unwritable(path, e)),
         _ => Ok(()),
     }
 }
@@ -143,13 +137,10 @@ fn write(path: &Path, scene: &Scene) -> Result<()> {
         }
         file.sync_all()
     };
-    write().map_err(|e| {
-        let what = format!("{}: cannot be written: {}", path.display(), e.kind());
-        Error::new(ErrorCode::StoreUnavailable, what).caused_by(e)
-    })
+    write().map_err(|e| unwritable(path, e))
 }
 
-fn tell(path: &Path, scene: &Scene, total_ms: f64, out: &Output) -> Result<()> {
+fn describe(path: &Path, scene: &Scene, total_ms: f64, out: &Output) -> Result<()> {
     let report = &scene.meta.report;
     let mut text = format!(
         "{}: {} Gaussians of {} photos in {total_ms:.0} ms\n",
@@ -157,14 +148,12 @@ fn tell(path: &Path, scene: &Scene, total_ms: f64, out: &Output) -> Result<()> {
         report.gaussians,
         report.views_used
     );
-    for stage in &report.stages {
+    let semantics = scene.semantics.as_ref().map(|semantics| &semantics.report);
+    let of_semantics = semantics.iter().flat_map(|semantics| &semantics.stages);
+    for stage in report.stages.iter().chain(of_semantics) {
         let _ = writeln!(text, "  {:<10}{:>9.1} ms", stage.stage, stage.ms);
     }
-    let semantics = scene.semantics.as_ref().map(|semantics| &semantics.report);
     if let Some(semantics) = semantics {
-        for stage in &semantics.stages {
-            let _ = writeln!(text, "  {:<10}{:>9.1} ms", stage.stage, stage.ms);
-        }
         let _ = writeln!(
             text,
             "  semantics: {} entries, {} Gaussians have one",

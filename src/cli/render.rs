@@ -15,7 +15,7 @@ use super::{
 };
 use crate::{
     config::{Config, ConfigArgs},
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
     names::named,
     service::{
         CameraFields, Format, Kind, OfflineService, PictureOptions, TextOptions, ViewOptions,
@@ -47,25 +47,28 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
-    let spec = spec(args)?;
+    let spec = ViewSpec {
+        camera: camera::spec(&args.camera)?.ok_or_else(no_camera)?,
+        kind: args.kind,
+        options: args.options.clone(),
+        picture: PictureOptions { format: format_of(&args.output)?, ..args.picture.clone() },
+        text: args.text.clone(),
+    };
     let opened = scene_file::open(&args.scene, &config.limits)?;
     let renderer = engine::renderer(config)?;
     let semantics = engine::semantics(config, spec.kind.needs_semantics())?;
     let service = OfflineService::new(semantics, Arc::clone(&renderer), config.limits.clone());
     let view = service.render(&opened.scene, &spec)?;
-    fs_err::write(&args.output, &view.bytes).map_err(|e| {
-        let what = format!("{}: cannot be written: {}", args.output.display(), e.kind());
-        Error::new(ErrorCode::StoreUnavailable, what).caused_by(e)
-    })?;
-    let scale =
-        view.depth_scale.map_or_else(String::new, |scale| format!(", depth = value * {scale:e}"));
+    scene_file::write(&args.output, &view.bytes)?;
+    let scale = view.depth_scale.map(|scale| format!(", depth = value * {scale:e}"));
     let text = format!(
-        "{}: {}x{} px in {:.1} ms on {}{scale}",
+        "{}: {}x{} px in {:.1} ms on {}{}",
         args.output.display(),
         view.width,
         view.height,
         view.render_ms,
-        renderer.name()
+        renderer.name(),
+        scale.unwrap_or_default()
     );
     let value = json!({
         "output": args.output.display().to_string(),
@@ -82,21 +85,10 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     out.answer(&text, &value)
 }
 
-fn spec(args: &Args) -> Result<ViewSpec> {
-    Ok(ViewSpec {
-        camera: camera::spec(&args.camera)?.ok_or_else(no_camera)?,
-        kind: args.kind,
-        options: args.options.clone(),
-        picture: PictureOptions { format: format_of(&args.output)?, ..args.picture.clone() },
-        text: args.text.clone(),
-    })
-}
-
 fn format_of(path: &Path) -> Result<Format> {
-    let end = path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-    named(&end).map_err(|_| {
+    named(&scene_file::ending(path)).map_err(|_| {
         Error::invalid(format!(
-            "{}: the ending says the format: png, jpg, webp or npy",
+            "{}: the ending must be that of a format: png, jpg, webp or npy",
             path.display()
         ))
     })

@@ -1,13 +1,13 @@
-//! A scene named on the command line: a scene file, a folder that holds one, or a PLY.
+//! Files of the command line: a scene file, a folder with one, or a PLY.
 
 use std::{
-    io::BufReader,
+    io::{self, BufReader},
     path::{Path, PathBuf},
     sync::Arc,
 };
 
 use crate::{
-    error::{Error, Result},
+    error::{Error, ErrorCode, Result},
     limits::Limits,
     scene::{Backdrop, DropCount, HealthReport, Provenance, Scene, SceneId, SceneMeta},
     store::{ply::read_ply, read_scene, read_semantics},
@@ -26,7 +26,7 @@ pub(super) struct Opened {
     pub(super) sha256: Option<String>,
 }
 
-/// Where the semantics of a scene file lie: beside it, as the server keeps them.
+/// The file of a scene's semantics: beside the scene file, as the server keeps them.
 pub(super) fn semantics_path(scene: &Path) -> PathBuf {
     if scene.file_name().is_some_and(|name| name == IN_FOLDER) {
         return scene.with_file_name("semantics.segsplat");
@@ -40,16 +40,35 @@ pub(super) fn path_of(path: &Path) -> PathBuf {
 }
 
 pub(super) fn is_ply(path: &Path) -> bool {
-    path.extension().is_some_and(|end| end.eq_ignore_ascii_case("ply"))
+    ending(path) == "ply"
 }
 
+/// The error of a file that cannot be read.
+pub(super) fn unreadable(path: &Path, cause: io::Error) -> Error {
+    Error::invalid(format!("{}: cannot be read: {}", path.display(), cause.kind())).caused_by(cause)
+}
+
+/// Writes a file.
+pub(super) fn write(path: &Path, file: &[u8]) -> Result<()> {
+    fs_err::write(path, file).map_err(|cause| unwritable(path, cause))
+}
+
+/// The error of a file that cannot be written.
+pub(super) fn unwritable(path: &Path, cause: io::Error) -> Error {
+    let what = format!("{}: cannot be written: {}", path.display(), cause.kind());
+    Error::new(ErrorCode::StoreUnavailable, what).caused_by(cause)
+}
+
+/// The ending of a file's name, in lower case.
+pub(super) fn ending(path: &Path) -> String {
+    path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase()
+}
+
+/// Opens a scene with its semantics, where there are some.
 pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
     let path = path_of(path);
-    let unreadable = |e: std::io::Error| {
-        Error::invalid(format!("{}: cannot be read: {}", path.display(), e.kind())).caused_by(e)
-    };
     if is_ply(&path) {
-        let file = fs_err::File::open(&path).map_err(unreadable)?;
+        let file = fs_err::File::open(&path).map_err(|e| unreadable(&path, e))?;
         let (gaussians, counts) = read_ply(BufReader::new(file), limits.gaussians_max)?;
         let dropped = counts
             .counts()
@@ -71,7 +90,7 @@ pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
         let scene = Scene::new(meta, gaussians, Backdrop::default());
         return Ok(Opened { scene, format: "ply", sha256: None });
     }
-    let file = fs_err::read(&path).map_err(unreadable)?;
+    let file = fs_err::read(&path).map_err(|e| unreadable(&path, e))?;
     let (mut scene, sha256) = read_scene(&file)?;
     let beside = semantics_path(&path);
     match fs_err::read(&beside) {
@@ -79,11 +98,8 @@ pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
             let (semantics, _) = read_semantics(&file, &scene.meta.id)?;
             scene = scene.with_semantics(Arc::new(semantics))?;
         }
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => {}
-        Err(e) => {
-            let what = format!("{}: cannot be read: {}", beside.display(), e.kind());
-            return Err(Error::invalid(what).caused_by(e));
-        }
+        Err(e) if e.kind() == io::ErrorKind::NotFound => {}
+        Err(e) => return Err(unreadable(&beside, e)),
     }
     Ok(Opened { scene, format: "segsplat", sha256: Some(sha256) })
 }

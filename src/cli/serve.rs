@@ -1,15 +1,17 @@
-//! `segsplat serve`: both doors on one port until SIGTERM or Ctrl-C.
+//! `segsplat serve`: HTTP and gRPC on one port until SIGTERM or Ctrl-C.
 
-use std::{fmt::Write as _, sync::Arc};
+use std::sync::Arc;
 
 use serde_json::json;
 use tokio::net::TcpListener;
+#[cfg(unix)]
+use tokio::signal::unix::{Signal, SignalKind, signal};
 
 use super::{engine, output::Output};
 use crate::{
-    api::Doors,
+    api::Server,
     config::{AllArgs, Config},
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
     pipeline::PipelineLoader,
     service::Service,
     store::Place,
@@ -24,7 +26,7 @@ pub(super) struct Args {
     print_config: bool,
 }
 
-/// `read_again` gives the configuration as the files say now.
+/// `read_again` gives the configuration that the files hold now.
 pub(super) fn run(
     args: &Args,
     config: Config,
@@ -36,8 +38,8 @@ pub(super) fn run(
             .map_err(|e| Error::internal("the configuration is no JSON").caused_by(e))?;
         return out.answer(&text, &config);
     }
-    config.check_doors()?;
-    let (parts, engine) = engine::early_parts(&config)?;
+    config.check_open_to_others()?;
+    let (parts, engine) = engine::parts(&config)?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
@@ -53,7 +55,7 @@ pub(super) fn run(
         let address = listener
             .local_addr()
             .map_err(|e| Error::internal("the listener has no address").caused_by(e))?;
-        let doors = Doors::new(service.clone())?;
+        let server = Server::new(service.clone())?;
         let (bundle, sha256) = (&models.bundle, models.bundle_sha256.get(..12).unwrap_or_default());
         tracing::info!(
             %address,
@@ -63,17 +65,13 @@ pub(super) fn run(
             data_dir = %data_dir.display(),
             "serving HTTP and gRPC"
         );
-        let mut text = format!("listening on {scheme}://{address}\n");
-        let _ = write!(text, "renderer {renderer}, bundle {bundle}");
-        let answer = json!({
-            "listening": format!("{scheme}://{address}"),
-            "renderer": renderer,
-            "bundle": bundle,
-        });
+        let url = format!("{scheme}://{address}");
+        let text = format!("listening on {url}\nrenderer {renderer}, bundle {bundle}");
+        let answer = json!({ "listening": url, "renderer": renderer, "bundle": bundle });
         out.answer(&text, &answer)?;
-        reload_at_hangup(doors.clone(), read_again)?;
+        reload_at_hangup(server.clone(), read_again)?;
         tokio::select! {
-            served = doors.serve(listener, stop_signal()?) => served,
+            served = server.serve(listener, stop_signal()?) => served,
             error = broken(engine) => Err(error),
         }
     });
@@ -82,8 +80,8 @@ pub(super) fn run(
     served
 }
 
-/// Resolves where the networks do not open: a server that can make nothing ends, as one that finds
-/// nothing at its start does.
+/// Resolves where the networks do not open: then the server ends, as it does where it finds no
+/// bundle at its start.
 async fn broken(engine: Arc<PipelineLoader>) -> Error {
     let opened = tokio::task::spawn_blocking(move || engine.get().map(drop)).await;
     match opened {
@@ -95,34 +93,29 @@ async fn broken(engine: Arc<PipelineLoader>) -> Error {
 /// Puts keys, limits and certificate in force again at each SIGHUP.
 #[cfg_attr(not(unix), expect(clippy::unnecessary_wraps, reason = "signals are unix"))]
 fn reload_at_hangup(
-    doors: Doors,
+    server: Server,
     read_again: impl Fn() -> Result<Config> + Send + 'static,
 ) -> Result<()> {
     #[cfg(unix)]
     {
-        use tokio::signal::unix::{SignalKind, signal};
-        let mut hangup = signal(SignalKind::hangup()).map_err(|e| {
-            Error::new(ErrorCode::Internal, "signals cannot be watched").caused_by(e)
-        })?;
+        let mut hangup = watch(SignalKind::hangup())?;
         tokio::spawn(async move {
             while hangup.recv().await.is_some() {
-                if let Err(error) = read_again().and_then(|config| doors.reload(&config)) {
-                    tracing::error!(%error, "nothing is read again: the old values stay in force");
+                if let Err(error) = read_again().and_then(|config| server.reload(&config)) {
+                    tracing::error!(%error, "keys, limits and certificate are not changed");
                 }
             }
         });
     }
     #[cfg(not(unix))]
-    drop((doors, read_again));
+    drop((server, read_again));
     Ok(())
 }
 
 /// Resolves at the first SIGTERM or Ctrl-C.
 fn stop_signal() -> Result<impl Future<Output = ()> + Send + 'static> {
-    let watch = |e| Error::new(ErrorCode::Internal, "signals cannot be watched").caused_by(e);
     #[cfg(unix)]
-    let mut terminate =
-        tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()).map_err(watch)?;
+    let mut terminate = watch(SignalKind::terminate())?;
     #[cfg(unix)]
     let terminated = async move {
         terminate.recv().await;
@@ -135,4 +128,9 @@ fn stop_signal() -> Result<impl Future<Output = ()> + Send + 'static> {
             () = terminated => {}
         }
     })
+}
+
+#[cfg(unix)]
+fn watch(kind: SignalKind) -> Result<Signal> {
+    signal(kind).map_err(|e| Error::internal("signals cannot be watched").caused_by(e))
 }

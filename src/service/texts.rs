@@ -1,4 +1,4 @@
-//! Texts at the door: how many, how long, of what.
+//! Checks of the texts of a request: how many, how long, of what.
 
 use super::request::{Kind, TextOptions};
 use crate::{

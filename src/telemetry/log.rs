@@ -1,7 +1,7 @@
-//! The log to standard error, and the spans of calls to a collector, where one is named.
+//! The log on standard error, and the spans of calls for a collector, where one is named.
 //!
-//! OTLP goes over HTTP in protobuf. The standard `OTEL_*` variables are followed: endpoint,
-//! headers, service name, resource attributes, sampling.
+//! OTLP goes over HTTP in protobuf. The standard `OTEL_*` variables set endpoint, headers, service
+//! name, resource attributes and sampling.
 
 use std::{collections::HashMap, time::Duration};
 
@@ -19,7 +19,7 @@ use crate::{
 /// Variables that name a collector when the configuration does not.
 const ENDPOINTS: [&str; 2] = ["OTEL_EXPORTER_OTLP_TRACES_ENDPOINT", "OTEL_EXPORTER_OTLP_ENDPOINT"];
 
-/// How long the collector may hold up the end of the program.
+/// How long the program waits for the collector at its end.
 const LAST_SPANS: Duration = Duration::from_secs(1);
 
 /// Sends what is left when the program ends.
@@ -62,7 +62,7 @@ pub fn start(config: &Config) -> Result<Spans> {
         )
     });
     let started = tracing_subscriber::registry().with(lines).with(spans).try_init();
-    // Already started: a test runs commands in one process.
+    // An error says that it has started already: a test runs commands in one process.
     drop(started);
     Ok(Spans(provider))
 }
@@ -86,11 +86,11 @@ fn provider(config: &Config) -> Result<SdkTracerProvider> {
         .build())
 }
 
-/// Makes `span` a child of the caller's own, whose `traceparent` (W3C) this is. Does nothing where
+/// Makes `span` a child of the caller's span, whose `traceparent` (W3C) this is. Does nothing where
 /// no spans are exported.
 pub fn follow(span: &tracing::Span, traceparent: &str) {
     let carrier = HashMap::from([("traceparent".to_owned(), traceparent.to_owned())]);
-    // The one error is that nobody exports spans.
+    // The only error is that no spans are exported.
     let _ = span.set_parent(TraceContextPropagator::new().extract(&carrier));
 }
 

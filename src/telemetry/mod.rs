@@ -1,4 +1,4 @@
-//! What the server says of itself: metrics for Prometheus, traces for OTLP, the log.
+//! Metrics for Prometheus, traces for OTLP, the log.
 //!
 //! [`meter`] knows every metric there is; [`log`] starts the log and, where a collector is named,
 //! sends the spans of each call to it.

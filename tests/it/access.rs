@@ -4,8 +4,11 @@ use std::path::Path;
 
 use reqwest::{StatusCode, header};
 use segsplat::{
-    api::grpc::{DESCRIPTORS, pb},
-    api::http::routes,
+    api::{
+        Server,
+        grpc::{DESCRIPTORS, pb},
+        http::routes,
+    },
     error::TABLE,
     keys::{Scope, hash},
 };
@@ -188,6 +191,21 @@ async fn anothers_scene_is_as_one_that_does_not_exist() {
     assert_ne!(first, other, "a key of another owner gave away a scene");
 }
 
+#[tokio::test]
+async fn a_method_without_a_row_needs_an_admin_and_health_no_key() {
+    let (_folder, stand) = guarded("").await;
+    let client = crate::common::client_builder().http2_prior_knowledge().build().unwrap();
+    for (name, path, want) in [
+        ("writer", "/segsplat.v1.SceneService/Nothing", "permission_denied"),
+        ("boss", "/segsplat.v1.SceneService/Nothing", "not_found"),
+        ("writer", "/grpc.health.v1.Health/Nothing", "not_found"),
+    ] {
+        let request = client.post(stand.url(path)).bearer_auth(secret(name));
+        let answer = request.header("content-type", "application/grpc").send().await.unwrap();
+        assert_eq!(answer.headers()["segsplat-code"], want, "{name} calls {path}");
+    }
+}
+
 #[test]
 fn every_call_of_both_doors_has_its_scope_in_the_table() {
     let text: String = DESCRIPTORS.iter().map(|&b| char::from(b)).collect();
@@ -225,6 +243,133 @@ async fn a_key_gets_its_share_and_others_theirs() {
     assert!(refused > 0, "eight calls at once at two a second");
     let boss = both_with(stand.addr, Some(&secret("boss"))).await;
     assert_eq!(code(&call(&boss[0], "ListScenes", "").await), "ok", "another key's share");
+}
+
+#[tokio::test]
+async fn a_bearer_key_of_wide_enough_scope_is_allowed() {
+    let (_folder, stand) = guarded("inflight_max = 1").await;
+    let ok = StatusCode::OK;
+    let (unknown, denied) = (StatusCode::UNAUTHORIZED, StatusCode::FORBIDDEN);
+    let reader = secret("reader");
+    for (shown, path, want) in [
+        ("", "/v1/scenes", unknown),
+        (&*reader, "/v1/scenes", unknown),
+        ("Basic reader-reader", "/v1/scenes", unknown),
+        ("Bearer reader-reade", "/v1/scenes", unknown),
+        ("Bearer ", "/v1/scenes", unknown),
+        ("Bearer reader-reader", "/v1/scenes", ok),
+        ("bearer writer-writer", "/v1/scenes", ok),
+        // Its only permit has returned with the first answer.
+        ("Bearer reader-reader", "/v1/scenes", ok),
+        ("Bearer reader-reader", "/metrics", denied),
+    ] {
+        let request = crate::common::client().get(stand.url(path)).header("authorization", shown);
+        let answer = request.send().await.unwrap();
+        assert_eq!(answer.status(), want, "{shown:?} for {path}");
+        assert!(answer.content_length().is_some(), "{shown:?}: the length is known");
+        let body = answer.text().await.unwrap();
+        assert!(!body.contains("reader-reader"), "{body}");
+    }
+}
+
+#[tokio::test]
+async fn keys_read_again_count_at_once_and_a_bad_file_changes_nothing() {
+    let (folder, stand) = guarded("").await;
+    let path = folder.path().join("keys.toml");
+    let server = Server::new(stand.service.clone()).unwrap();
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("http://{}/v1/scenes", listener.local_addr().unwrap());
+    tokio::spawn(server.clone().serve(listener, std::future::pending()));
+    let status = async || {
+        let request = crate::common::client().get(&url).bearer_auth(secret("reader"));
+        request.send().await.unwrap().status()
+    };
+    let mut config = stand.service.config().clone();
+    assert_eq!(status().await, StatusCode::OK);
+    std::fs::write(&path, "rubbish").unwrap();
+    assert!(server.reload(&config).is_err());
+    assert_eq!(status().await, StatusCode::OK, "the old keys stay");
+    let other = hash("other");
+    let text = format!("[[key]]\nname = \"b\"\nsha256 = \"{other}\"\nscopes = [\"read\"]");
+    std::fs::write(&path, text).unwrap();
+    server.reload(&config).unwrap();
+    assert_eq!(status().await, StatusCode::UNAUTHORIZED);
+    config.keys = None;
+    server.reload(&config).unwrap();
+    assert_eq!(status().await, StatusCode::OK, "callers need no key any more");
+}
+
+#[tokio::test]
+async fn without_keys_a_call_names_loopback_the_address_or_an_allowed_host() {
+    let keys = tempfile::tempdir().unwrap();
+    let path = keys.path().join("keys.toml");
+    write_keys(&path, "");
+    for (listen, named, keys, allowed, refused) in [
+        (
+            "127.0.0.1",
+            &["gpu.example"][..],
+            None,
+            &[
+                "localhost:1",
+                "LocalHost.",
+                "127.0.0.1:8080",
+                "127.8.9.1",
+                "[::1]:80",
+                "GPU.example:443",
+            ][..],
+            &[
+                "evil.example:8080",
+                "localhost.evil.example",
+                "10.0.0.7",
+                "0.0.0.0:8080",
+                "a b",
+                "evil.example@",
+                "127.0.0.1.evil.example",
+                "[::2]",
+                "x@[::2]",
+            ][..],
+        ),
+        ("10.0.0.7", &[], None, &["10.0.0.7:8080"], &["10.0.0.8:8080"]),
+        // Who listens on every address has that of the caller; a rebound name is never an address.
+        ("0.0.0.0", &[], None, &["10.0.0.8:8080"], &["evil.example"]),
+        ("0.0.0.0", &[], Some(&path), &["any.example"], &[]),
+        ("127.0.0.1", &["*"], None, &["any.example"], &[]),
+        ("0.0.0.0", &["gpu.example"], Some(&path), &["gpu.example"], &["any.example"]),
+    ] {
+        let server = TestServer::with(|config, _| {
+            config.listen = format!("{listen}:8080").parse().unwrap();
+            config.allowed_hosts = named.iter().map(|&name| name.to_owned()).collect();
+            config.keys = keys.cloned();
+        })
+        .await;
+        let hosts = allowed.iter().map(|host| (host, 200)).chain(refused.iter().map(|h| (h, 403)));
+        for (host, want) in hosts {
+            let request = crate::common::client().get(server.url("/healthz")).header("host", *host);
+            let answer = request.send().await.unwrap();
+            assert_eq!(answer.status(), want, "{host} at {listen}, allowed {named:?}");
+            if want == 403 {
+                let fault = bytes(answer).await.unwrap_err();
+                assert!(fault.message.contains(host), "{fault:?} lacks {host}");
+            }
+        }
+    }
+}
+
+#[test]
+fn origins_are_a_scheme_and_a_host_and_nothing_more() {
+    let runtime = tokio::runtime::Runtime::new().unwrap();
+    let usable = |origin: &str| {
+        let origins = vec![origin.to_owned()];
+        let server = runtime.block_on(TestServer::with(|config, _| config.cors_origins = origins));
+        let _inside = runtime.enter();
+        Server::new(server.service).is_ok()
+    };
+    for good in ["https://a.example", "http://localhost:3000", "http://[::1]:80"] {
+        assert!(usable(good), "{good}");
+    }
+    for odd in ["", "a.example", "https://", "https://a/", "https://a/b", "https://*.a"] {
+        assert!(!usable(odd), "{odd}");
+    }
 }
 
 #[tokio::test]

@@ -74,7 +74,8 @@ fn form() -> reqwest::multipart::Form {
 
 /// The product's own parts with the fixture's bundle; `None` (said aloud) without ONNX Runtime.
 fn parts(config: &Config) -> Option<Parts> {
-    match engine::parts(config) {
+    let parts = engine::parts(config).and_then(|(parts, engine)| engine.get().map(|_| parts));
+    match parts {
         Err(e) if e.code() == ErrorCode::ModelUnavailable => {
             skipped(e.message());
             None

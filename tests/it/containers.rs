@@ -15,8 +15,7 @@ fn read(name: &str) -> String {
 /// Variables that the program knows: those of the configuration and `SEGSPLAT_CONFIG`.
 fn known() -> BTreeSet<String> {
     let code = read("src/config.rs") + &read("src/cli/mod.rs");
-    let names = code.split("env = \"").skip(1).filter_map(|rest| rest.split('"').next());
-    names.map(str::to_owned).collect()
+    variables(&code)
 }
 
 /// Every `SEGSPLAT_…` word of a text.
@@ -148,7 +147,7 @@ fn the_manifests_probe_what_is_served_and_nothing_runs_as_root() {
         "a replica that is not ready would be killed"
     );
     let metric = &documents[3]["spec"]["metrics"][0]["pods"]["metric"]["name"];
-    assert_eq!(metric, segsplat::telemetry::meter::JOBS_QUEUED);
+    assert_eq!(metric, "segsplat_jobs_queued");
     let drain = |name: &str| -> u64 {
         let env = container["env"].as_array().unwrap();
         let found = env.iter().find(|e| e["name"] == name).expect("set");

@@ -1,11 +1,13 @@
 //! One table, two doors, two descriptions: every code through both transports, the OpenAPI
 //! document against the routes and real answers, the proto against the OpenAPI document.
 
-use std::collections::BTreeSet;
+use std::{collections::BTreeSet, sync::Arc};
 
 use segsplat::{
     api::{grpc::DESCRIPTORS, http::routes},
-    error::TABLE,
+    error::{Result, TABLE},
+    jobs::{NoSemantics, Phrases, SemanticNetworks},
+    scene::{PosedPhoto, Scene, Semantics, TextEmbedding, Watch},
 };
 use serde_json::{Value, json};
 
@@ -14,6 +16,7 @@ use crate::common::{
     cpu_server::{CpuServer, PlaneNetworks, upload},
     doors::{Door, Options, both, form, json as body},
     root,
+    server::TestServer,
 };
 
 #[tokio::test]
@@ -28,6 +31,42 @@ async fn every_code_comes_through_both_doors_as_its_row_says() {
             assert!(fault.message.contains("made to fail"), "{}", fault.message);
             assert!(!fault.request_id.is_empty(), "no request id from {}", door.name());
         }
+    }
+}
+
+/// Panics when it is asked what the bundle lacks.
+struct Panics;
+
+impl SemanticNetworks for Panics {
+    fn lacks(&self) -> Option<String> {
+        panic!("on purpose")
+    }
+
+    fn phrases(&self) -> Result<Phrases> {
+        NoSemantics.phrases()
+    }
+
+    fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
+        NoSemantics.embed_texts(texts)
+    }
+
+    fn make(&self, photos: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics> {
+        NoSemantics.make(photos, scene, watch)
+    }
+}
+
+#[tokio::test]
+async fn a_panic_in_a_call_is_an_internal_error_and_the_server_lives() {
+    let server = TestServer::with(|_, parts| parts.semantics = Arc::new(Panics)).await;
+    for door in both(server.addr).await {
+        let options = Options { semantics: Some("eager"), ..Options::wait() };
+        let fault = door.create(&upload(), &options).await.unwrap_err();
+        let row = TABLE.iter().find(|row| row.name == "internal").unwrap();
+        assert_eq!((&*fault.code, fault.number), ("internal", door.number_of(row)), "{fault:?}");
+        assert!(!fault.request_id.is_empty(), "{fault:?}");
+        assert!(!fault.message.contains("on purpose"), "the panic's text reached the client");
+        let unknown = door.get(&"0".repeat(32)).await.unwrap_err();
+        assert_eq!(unknown.code, "scene_not_found", "{} is dead", door.name());
     }
 }
 

@@ -3,7 +3,7 @@
 use prost::Message;
 use segsplat::api::grpc::{
     DESCRIPTORS,
-    pb::{self, scene_service_client::SceneServiceClient},
+    pb::{self, camera_spec::Pose, scene_service_client::SceneServiceClient},
 };
 use tonic::{
     Code, Request,
@@ -222,6 +222,14 @@ async fn a_message_that_is_no_protobuf_is_an_invalid_request() {
     let request = Request::new(Odd { scene_id: 7 });
     let fault = fault_of(grpc.unary(request, path, codec).await.unwrap_err());
     assert_eq!((fault.code.as_str(), fault.number), ("invalid_request", 3), "{}", fault.message);
+    // tonic refuses a message of 4 GiB by its length alone.
+    let client = crate::common::client_builder().http2_prior_knowledge().build().unwrap();
+    let request = client.post(stand.url("/segsplat.v1.SceneService/GetScene"));
+    let request = request.header("content-type", "application/grpc").header("te", "trailers");
+    let answer = request.body([&[0, 255, 255, 255, 255][..], &[0; 64]].concat()).send().await;
+    let answer = answer.unwrap();
+    assert_eq!(answer.headers()["segsplat-code"], "limit_exceeded");
+    assert_eq!(answer.headers()["grpc-status"], "3");
 }
 
 #[tokio::test]
@@ -254,4 +262,29 @@ fn the_descriptors_are_those_of_the_proto_file() {
 /// The descriptors' texts; enough to look for names.
 fn texts(bytes: &[u8]) -> String {
     bytes.iter().map(|&b| if b.is_ascii_graphic() { b as char } else { ' ' }).collect()
+}
+
+#[tokio::test]
+async fn what_a_message_lacks_is_named() {
+    let stand = CpuServer::start().await;
+    let mut client = client(&stand).await;
+    let id = made(&mut client).await.id;
+    let camera = |pose| Some(pb::CameraSpec { pose, lens: None });
+    let short = pb::Matrix { values: vec![1.0; 12] };
+    let from = Pose::Between(pb::Between { from: 0, to: 0, t: 0.0 });
+    let format = Some(pb::ViewOptions { format: -1, ..Default::default() });
+    for (camera, kind, options, word) in [
+        (None, 0, None, "no camera"),
+        (camera(None), 0, None, "no pose"),
+        (camera(Some(Pose::CameraToWorld(short))), 0, None, "12 numbers"),
+        (camera(Some(from.clone())), 99, None, "kind is 99"),
+        (camera(Some(from.clone())), 0, format, "format is -1"),
+        (camera(Some(from)), pb::Kind::Mask.into(), None, "mask"),
+    ] {
+        let scene_id = id.clone();
+        let request =
+            pb::RenderViewRequest { scene_id, camera, kind, options, ..Default::default() };
+        let fault = client.render_view(request).await.expect_err(word);
+        assert!(fault.message().contains(word), "{fault:?} lacks {word}");
+    }
 }

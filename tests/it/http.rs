@@ -3,7 +3,10 @@
 
 use std::io::{Cursor, Read};
 
-use reqwest::{StatusCode, header};
+use reqwest::{
+    StatusCode,
+    header::{self, HeaderValue},
+};
 use segsplat::{render::compare::psnr, scene::Upload};
 use serde_json::{Value, json};
 
@@ -142,15 +145,38 @@ async fn accept_chooses_the_encoding_and_a_known_tag_saves_the_picture() {
     let first = client.get(&url).header("accept", "image/webp").send().await.unwrap();
     assert_eq!(first.headers()[header::CONTENT_TYPE], "image/webp");
     let tag = first.headers()[header::ETAG].clone();
-    let ask = |tag| client.get(&url).header("accept", "image/webp").header("if-none-match", tag);
+    let ask = |tag: HeaderValue| {
+        client.get(&url).header("accept", "image/webp").header("if-none-match", tag)
+    };
     let again = ask(tag.clone()).send().await.unwrap();
     assert_eq!(again.status(), StatusCode::NOT_MODIFIED);
     assert_eq!(again.headers()[header::ETAG], tag);
     assert!(again.bytes().await.unwrap().is_empty(), "304 with a body");
-    let other = client.get(&url).header("if-none-match", tag).send().await.unwrap();
+    let other = client.get(&url).header("if-none-match", tag.clone()).send().await.unwrap();
     assert_eq!(other.status(), StatusCode::OK, "PNG under the tag of a WebP");
-    let none = client.get(&url).header("accept", "text/html").send().await.unwrap();
-    assert_eq!(bytes(none).await.unwrap_err().code, "invalid_request");
+    let known = tag.to_str().unwrap();
+    for (named, status) in [
+        (format!("\"a\", W/{known}"), StatusCode::NOT_MODIFIED),
+        ("*".to_owned(), StatusCode::NOT_MODIFIED),
+        (format!("\"b{known}"), StatusCode::OK),
+    ] {
+        assert_eq!(ask(named.parse().unwrap()).send().await.unwrap().status(), status, "{named}");
+    }
+    for (accept, kind, want) in [
+        ("image/jpeg", "color", Some("image/jpeg")),
+        ("image/png;q=0.5, image/webp", "color", Some("image/webp")),
+        ("image/avif,image/webp,*/*;q=0.8", "depth", Some("image/png")),
+        ("application/x-npy", "depth", Some("application/x-npy")),
+        ("text/html", "color", None),
+        ("image/png;q=0", "color", None),
+    ] {
+        let request = client.get(format!("{url}&kind={kind}")).header("accept", accept);
+        let answer = request.send().await.unwrap();
+        match want {
+            Some(want) => assert_eq!(answer.headers()[header::CONTENT_TYPE], want, "{accept}"),
+            None => assert_eq!(bytes(answer).await.unwrap_err().code, "invalid_request"),
+        }
+    }
 }
 
 #[tokio::test]
@@ -296,6 +322,16 @@ async fn request_ids_are_kept_and_deadlines_end_a_call() {
         crate::common::client().get(stand.url("/healthz")).header("x-request-id", "mine-7");
     let answer = request.send().await.unwrap();
     assert_eq!(answer.headers()["x-request-id"], "mine-7");
+    let long = "a".repeat(65);
+    let mut fresh = std::collections::BTreeSet::new();
+    for odd in [&b""[..], b"a b", b"a\"b", "ä".as_bytes(), long.as_bytes()] {
+        let odd = HeaderValue::from_bytes(odd).unwrap();
+        let request = crate::common::client().get(stand.url("/healthz"));
+        let answer = request.header("x-request-id", odd).send().await.unwrap();
+        let id = answer.headers()["x-request-id"].to_str().unwrap().to_owned();
+        assert_eq!(id.len(), 16, "{id}");
+        assert!(fresh.insert(id), "new ids repeat");
+    }
     assert_eq!(answer.headers()[header::X_CONTENT_TYPE_OPTIONS], "nosniff");
     let odd = fault(&stand, "/v1/scenes?deadline_ms=soon").await;
     assert!(odd.message.contains("soon"), "{}", odd.message);

@@ -154,6 +154,8 @@ async fn every_metric_is_in_the_manual_and_the_manual_knows_no_other() {
     let rows = rows.filter(|(name, _)| name.starts_with("segsplat_") || name.starts_with("proc"));
     let told = rows.map(|(name, rest)| (name, rest.split(' ').next().unwrap()));
     assert_eq!(told.collect::<BTreeSet<_>>(), served);
+    let done = "segsplat_jobs_total{kind=\"scene\",outcome=\"done\"}";
+    assert!(text.contains(done), "{text}");
 }
 
 #[test]

@@ -90,7 +90,7 @@ async fn a_certificate_that_cannot_be_used_is_named_and_its_key_is_not_shown() {
         };
         let place = segsplat::store::Place::of(&config).unwrap();
         let service = segsplat::service::Service::open(&place, config, parts).unwrap();
-        let error = segsplat::api::Doors::new(service).expect_err("refused");
+        let error = segsplat::api::Server::new(service).expect_err("refused");
         assert!(error.message().contains(want), "{error}");
         assert!(!error.message().contains("SECRET"), "{error}");
         std::fs::write(files.path(name), good).unwrap();

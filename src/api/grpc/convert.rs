@@ -1,98 +1,96 @@
-//! Messages to use cases and back. What a message lacks or an enum does not know is named.
+//! Messages to requests, and answers to messages. Errors name what a message lacks.
 
 use std::time::Duration;
 
 use super::pb;
 use crate::{
     error::{Error, Result},
-    scene::{CameraToWorld, HealthReport, Intrinsics, ScoringProfile, SemanticsReport, StageTime},
+    scene::{
+        CameraToWorld, DropCount, HealthReport, Intrinsics, ScoringProfile, SemanticsReport,
+        StageTime, Warning,
+    },
     service::{
         Background, Boxes, CameraSpec, Density, Event, ExportFormat, Format, InstanceBox, Kind,
         Label, LensSpec, MaskFormat, Peak, PickSpec, Picked, PictureOptions, PoseSpec, Quality,
-        QueryAnswer, QuerySpec, RenderedView, SceneError, SceneState, SceneStatus, SemanticsMode,
-        SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView, TextWarning,
-        ViewOptions,
+        QueryAnswer, QuerySpec, RenderedView, SceneCamera, SceneError, SceneState, SceneStatus,
+        SemanticsMode, SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView,
+        TextWarning, ViewOptions,
     },
 };
 
-/// A scene with what can be asked of it by text.
-pub(super) fn scene(status: SceneStatus) -> pb::Scene {
-    let camera = |camera: crate::service::SceneCamera| pb::SceneCamera {
-        file: camera.file,
-        intrinsics: Some(intrinsics(camera.camera.intrinsics)),
-        camera_to_world: matrix(&camera.camera.camera_to_world),
+/// A message with some fields of the same names and types, and others.
+macro_rules! message {
+    ($message:ident from $from:ident { $($same:ident),+ } $($other:tt)*) => {
+        pb::$message { $($same: $from.$same,)+ $($other)* }
     };
-    pb::Scene {
+}
+
+/// A scene and its semantics.
+pub(super) fn scene(status: SceneStatus) -> pb::Scene {
+    let camera = |SceneCamera { file, camera, .. }: SceneCamera| pb::SceneCamera {
+        file,
+        intrinsics: Some(intrinsics(camera.intrinsics)),
+        camera_to_world: matrix(&camera.camera_to_world),
+    };
+    message!(Scene from status { fraction, created_ms, updated_ms }
         id: status.id.to_string(),
         state: pb::SceneState::from(status.state).into(),
         stage: status.stage.unwrap_or_default(),
-        fraction: status.fraction,
-        created_ms: status.created_ms,
-        updated_ms: status.updated_ms,
         error: status.error.map(scene_error),
         report: status.report.map(report),
         cameras: status.cameras.into_iter().map(camera).collect(),
         semantics: Some(semantics_status(status.semantics)),
-    }
+    )
 }
 
 fn semantics_status(status: SemanticsStatus) -> pb::SemanticsStatus {
-    let report = |report: SemanticsReport| pb::SemanticsReport {
-        masks: report.masks,
-        bank_size: report.bank_size,
-        labelled: report.labelled,
-        bundle_sha256: report.bundle_sha256,
-        profile: pb::ScoringProfile::from(report.profile).into(),
-        stages: report.stages.into_iter().map(stage_time).collect(),
-        execution_provider: report.execution_provider,
+    let report = |report: SemanticsReport| {
+        message!(SemanticsReport from report
+            { masks, bank_size, labelled, bundle_sha256, execution_provider }
+            profile: pb::ScoringProfile::from(report.profile).into(),
+            stages: report.stages.into_iter().map(stage_time).collect(),
+        )
     };
-    pb::SemanticsStatus {
-        available: status.available,
+    message!(SemanticsStatus from status { available, fraction, bank_size }
         reason: status.reason.unwrap_or_default(),
         state: pb::SemanticsState::from(status.state).into(),
         stage: status.stage.unwrap_or_default(),
-        fraction: status.fraction,
-        bank_size: status.bank_size,
         error: status.error.map(scene_error),
         report: status.report.map(report),
-    }
+    )
 }
 
-fn stage_time(time: StageTime) -> pb::StageTime {
-    pb::StageTime { stage: time.stage, ms: time.ms }
+fn stage_time(StageTime { stage, ms }: StageTime) -> pb::StageTime {
+    pb::StageTime { stage, ms }
 }
 
-fn scene_error(error: SceneError) -> pb::SceneError {
-    pb::SceneError { code: error.code, message: error.message }
+fn scene_error(SceneError { code, message }: SceneError) -> pb::SceneError {
+    pb::SceneError { code, message }
 }
 
 fn report(report: HealthReport) -> pb::HealthReport {
     let [depth_near, depth_far] = report.depth_range;
-    let warning = |warning: crate::scene::Warning| pb::Warning {
-        code: warning.code.to_string(),
-        message: warning.message,
-        value: warning.value,
+    let warning = |Warning { code, message, value }: Warning| pb::Warning {
+        code: code.to_string(),
+        message,
+        value,
     };
-    let drop_count =
-        |drop: crate::scene::DropCount| pb::DropCount { reason: drop.reason, count: drop.count };
-    pb::HealthReport {
-        photos: report.photos,
-        views_used: report.views_used,
-        gaussians: report.gaussians,
+    let drop_count = |DropCount { reason, count }: DropCount| pb::DropCount { reason, count };
+    message!(HealthReport from report
+        {
+            photos, views_used, gaussians, median_depth, overlap, network_focal_px,
+            execution_provider
+        }
         dropped: report.dropped.into_iter().map(drop_count).collect(),
         depth_near,
         depth_far,
-        median_depth: report.median_depth,
-        overlap: report.overlap,
-        network_focal_px: report.network_focal_px,
         stages: report.stages.into_iter().map(stage_time).collect(),
-        execution_provider: report.execution_provider,
         warnings: report.warnings.into_iter().map(warning).collect(),
-    }
+    )
 }
 
-fn intrinsics(k: Intrinsics) -> pb::Intrinsics {
-    pb::Intrinsics { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, width: k.width, height: k.height }
+fn intrinsics(Intrinsics { fx, fy, cx, cy, width, height }: Intrinsics) -> pb::Intrinsics {
+    pb::Intrinsics { fx, fy, cx, cy, width, height }
 }
 
 fn matrix(pose: &CameraToWorld) -> Vec<f64> {
@@ -168,22 +166,17 @@ fn vec3(v: &pb::Vec3) -> [f64; 3] {
 
 /// How a view is rendered.
 pub(super) fn options(options: &pb::ViewOptions) -> Result<ViewOptions> {
-    Ok(ViewOptions {
-        width: options.width,
-        height: options.height,
-        antialiased: options.antialiased,
-        near: options.near,
-        quality: value("quality", options.quality)?,
-        deadline: None,
-    })
+    let &pb::ViewOptions { width, height, antialiased, near, .. } = options;
+    let quality = value("quality", options.quality)?;
+    Ok(ViewOptions { width, height, antialiased, near, quality, deadline: None })
 }
 
-/// The same where no picture comes out: the encoding does not count, and there is no part of it.
+/// The same for a call that returns no picture.
 fn options_alone(given: Option<pb::ViewOptions>, call: &str) -> Result<ViewOptions> {
     let given = given.unwrap_or_default();
     match given.crop {
         None => options(&given),
-        Some(_) => Err(Error::invalid(format!("crop goes with views, not with {call}"))),
+        Some(_) => Err(Error::invalid(format!("crop is for views, not for {call}"))),
     }
 }
 
@@ -201,26 +194,26 @@ pub(super) fn picture(options: &pb::ViewOptions) -> Result<PictureOptions> {
 
 /// One encoded picture.
 pub(super) fn view(view: RenderedView) -> pb::View {
-    pb::View {
+    message!(View from view { width, height, depth_scale, etag, render_ms }
         camera_index: u32::try_from(view.camera_index).unwrap_or(u32::MAX),
         kind: pb::Kind::from(view.kind).into(),
         format: pb::Format::from(view.format).into(),
-        width: view.width,
-        height: view.height,
         data: view.bytes.into(),
-        depth_scale: view.depth_scale,
-        etag: view.etag,
         intrinsics: Some(intrinsics(view.camera.intrinsics)),
         camera_to_world: matrix(&view.camera.camera_to_world),
-        render_ms: view.render_ms,
         visible: view.stats.visible,
-    }
+    )
 }
 
-/// What a view or an export asks by text; an empty text is none.
+/// proto3 cannot tell an empty text from none.
+pub(super) fn not_empty(text: String) -> Option<String> {
+    Some(text).filter(|text| !text.is_empty())
+}
+
+/// The text of a view or an export, and how it is scored.
 pub(super) fn text(text: String, profile: i32, wait_ms: Option<u64>) -> Result<TextOptions> {
     Ok(TextOptions {
-        text: Some(text).filter(|text| !text.is_empty()),
+        text: not_empty(text),
         profile: value("profile", profile)?,
         wait: wait_ms.map(Duration::from_millis),
     })
@@ -244,28 +237,22 @@ pub(super) fn query(request: pb::QueryRequest) -> Result<QuerySpec> {
 /// What a query found.
 pub(super) fn answer(answer: QueryAnswer) -> pb::QueryResponse {
     let camera = answer.camera;
-    pb::QueryResponse {
-        bank_size: answer.bank_size,
+    message!(QueryResponse from answer { bank_size, render_ms }
         profile: pb::ScoringProfile::from(answer.profile).into(),
         intrinsics: camera.map(|camera| intrinsics(camera.intrinsics)),
         camera_to_world: camera.map_or_else(Vec::new, |camera| matrix(&camera.camera_to_world)),
-        render_ms: answer.render_ms,
         results: answer.results.into_iter().map(result).collect(),
-    }
+    )
 }
 
 fn result(found: TextResult) -> pb::TextResult {
-    let warning =
-        |warning: TextWarning| pb::TextWarning { code: warning.code, message: warning.message };
-    pb::TextResult {
-        text: found.text,
-        scores: found.scores,
+    let warning = |TextWarning { code, message }: TextWarning| pb::TextWarning { code, message };
+    message!(TextResult from found { text, scores, gaussians }
         entries: found.entries.into_iter().map(u32::from).collect(),
-        gaussians: found.gaussians,
         parts: found.parts.iter().map(part).collect(),
         warnings: found.warnings.into_iter().map(warning).collect(),
         view: found.view.map(text_view),
-    }
+    )
 }
 
 fn point([x, y, z]: [f64; 3]) -> pb::Vec3 {
@@ -282,7 +269,7 @@ fn part(part: &InstanceBox) -> pb::Part {
 }
 
 fn text_view(view: TextView) -> pb::TextView {
-    let peak = |peak: Peak| pb::Peak { x: peak.x, y: peak.y, relevancy: peak.relevancy };
+    let peak = |Peak { x, y, relevancy }: Peak| pb::Peak { x, y, relevancy };
     pb::TextView {
         mask_rle: view.mask_rle.map(|rle| rle.counts).unwrap_or_default(),
         mask_png: view.mask_png.unwrap_or_default().into(),
@@ -308,45 +295,27 @@ pub(super) fn pick(request: pb::PickRequest) -> Result<PickSpec> {
 
 /// What lies under it.
 pub(super) fn picked(picked: Picked) -> pb::PickResponse {
-    let label = |label: Label| pb::Label { text: label.text, relevancy: label.relevancy };
-    pb::PickResponse {
-        alpha: picked.alpha,
-        depth: picked.depth,
+    let label = |Label { text, relevancy }: Label| pb::Label { text, relevancy };
+    message!(PickResponse from picked { alpha, depth, gaussian }
         point: picked.point.map(point),
-        gaussian: picked.gaussian,
         entry: picked.entry.map(u32::from),
         labels: picked.labels.into_iter().map(label).collect(),
-    }
-}
-
-/// An enum that a message carries as a number.
-pub(super) trait OfNumber: Sized {
-    /// The value of this number; proto3 lets any number through.
-    fn of_number(number: i32) -> Option<Self>;
+    )
 }
 
 /// The value of a message's enum; `name` names it in messages.
-pub(super) fn value<T: OfNumber>(name: &str, number: i32) -> Result<T> {
-    T::of_number(number)
-        .ok_or_else(|| Error::invalid(format!("{name} is {number}, which is none of its values")))
+pub(super) fn value<T: FromNumber>(name: &str, number: i32) -> Result<T> {
+    T::from_number(number)
+        .ok_or_else(|| Error::invalid(format!("{name} is {number}; there is no such value")))
 }
 
-/// Enums that callers send; one that is not set is the default.
-macro_rules! sent {
-    ($($ours:ident = $theirs:ident { $($value:ident),+ })+) => {$(
-        impl OfNumber for $ours {
-            fn of_number(number: i32) -> Option<Self> {
-                Some(match pb::$theirs::try_from(number).ok()? {
-                    pb::$theirs::Unspecified => Self::default(),
-                    $(pb::$theirs::$value => Self::$value,)+
-                })
-            }
-        }
-    )+};
+/// An enum that a message has as a number. Any number may come; 0 is the default.
+pub(super) trait FromNumber: Sized {
+    fn from_number(number: i32) -> Option<Self>;
 }
 
-/// Enums that callers get.
-macro_rules! answered {
+/// Enums of ours that become numbers of a message, with the values that both have.
+macro_rules! to_number {
     ($($ours:ident = $theirs:ident { $($value:ident),+ })+) => {$(
         impl From<$ours> for pb::$theirs {
             fn from(value: $ours) -> Self {
@@ -356,7 +325,28 @@ macro_rules! answered {
     )+};
 }
 
-sent! {
+/// The same in both directions.
+macro_rules! both_ways {
+    ($($ours:ident = $theirs:ident { $($value:ident),+ })+) => {$(
+        to_number! { $ours = $theirs { $($value),+ } }
+
+        impl FromNumber for $ours {
+            fn from_number(number: i32) -> Option<Self> {
+                Some(match pb::$theirs::try_from(number).ok()? {
+                    pb::$theirs::Unspecified => Self::default(),
+                    $(pb::$theirs::$value => Self::$value,)+
+                })
+            }
+        }
+    )+};
+}
+
+to_number! {
+    SceneState = SceneState { Queued, Running, Done, Failed, Cancelled }
+    SemanticsState = SemanticsState { Off, None, Running, Ready, Failed }
+}
+
+both_ways! {
     SemanticsMode = Semantics { Lazy, Eager, Off }
     Density = Density { Thinned, Full }
     Kind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }
@@ -366,34 +356,4 @@ sent! {
     Boxes = Boxes { Oriented, Aligned, None }
     MaskFormat = MaskFormat { Rle, Png, None }
     ExportFormat = ExportFormat { Ply }
-}
-
-answered! {
-    SceneState = SceneState { Queued, Running, Done, Failed, Cancelled }
-    SemanticsState = SemanticsState { Off, None, Running, Ready, Failed }
-    Kind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }
-    Format = Format { Png, Jpeg, Webp, Npy }
-    ScoringProfile = ScoringProfile { Default, Paper }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn what_a_message_lacks_is_named() {
-        let message = |error: Error| error.message().to_owned();
-        assert!(message(camera(None, "view").unwrap_err()).contains("no camera"));
-        let empty = Some(pb::CameraSpec::default());
-        assert!(message(camera(empty, "view").unwrap_err()).contains("no pose"));
-        let short = pb::CameraSpec {
-            pose: Some(pb::camera_spec::Pose::CameraToWorld(pb::Matrix { values: vec![1.0; 12] })),
-            lens: None,
-        };
-        assert!(message(camera(Some(short), "view").unwrap_err()).contains("12 numbers"));
-        assert!(message(value::<Kind>("kind", 99).unwrap_err()).contains("kind is 99"));
-        assert_eq!(value::<Kind>("kind", 6).unwrap(), Kind::Mask);
-        let odd = pb::ViewOptions { format: -1, ..Default::default() };
-        assert!(message(picture(&odd).unwrap_err()).contains("format is -1"));
-    }
 }

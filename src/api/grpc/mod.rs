@@ -1,7 +1,7 @@
-//! The gRPC door: `segsplat.v1.SceneService`, health and reflection.
+//! gRPC: `segsplat.v1.SceneService`, health and reflection.
 //!
-//! Errors carry the code of the one table in metadata `segsplat-code`: several codes share one
-//! gRPC status, so the string is the truth.
+//! Errors have the code of the table in metadata `segsplat-code`, because several codes share one
+//! gRPC status.
 
 mod convert;
 mod scene_service;
@@ -11,12 +11,12 @@ use futures_util::FutureExt;
 use tonic::service::Routes;
 use tonic_health::{ServingStatus, server::HealthReporter};
 
-use super::{Api, life::Life};
+use super::{Api, drain::Drain};
 use crate::error::{Error, Result};
 
-pub(super) use self::status::{complete, refusal, unimplemented};
+pub(super) use self::status::{complete, refusal, retry_after_s, unimplemented};
 
-/// Messages and services generated from `proto/segsplat/v1/`; `tests/it/proto.rs` holds them to it.
+/// Messages and services generated from `proto/segsplat/v1/`; `tests/it/proto.rs` compares them.
 #[allow(
     missing_docs,
     unreachable_pub,
@@ -36,13 +36,13 @@ pub mod pb {
     include!(concat!(env!("CARGO_MANIFEST_DIR"), "/proto/generated/segsplat.v1.rs"));
 }
 
-/// Descriptors of `pb`, for reflection and for the test that holds the two doors together.
+/// Descriptors of `pb`, for reflection and for the test that compares HTTP and gRPC.
 pub const DESCRIPTORS: &[u8] = include_bytes!("../../../proto/generated/descriptors.bin");
 
 /// Largest picture sent as one message: 4096 x 4096 x 3 f32 and its headers.
 const MESSAGE_BYTES_MAX: usize = 256 << 20;
 
-/// The door as routes, to be merged with HTTP's.
+/// The routes of gRPC, to be merged with those of HTTP.
 ///
 /// # Errors
 /// `internal` when the descriptors are damaged.
@@ -52,7 +52,7 @@ const MESSAGE_BYTES_MAX: usize = 256 << 20;
 pub fn routes(api: Api) -> Result<Routes> {
     // The camera JSON goes in one message with the header; all else comes in smaller pieces.
     let decoding_max = api.service.limits().json_bytes_max + (1 << 20);
-    let life = api.life.clone();
+    let drain = api.drain.clone();
     let scenes = pb::scene_service_server::SceneServiceServer::new(api)
         .max_decoding_message_size(decoding_max)
         .max_encoding_message_size(MESSAGE_BYTES_MAX);
@@ -63,22 +63,22 @@ pub fn routes(api: Api) -> Result<Routes> {
             .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
     };
     Ok(Routes::new(scenes)
-        .add_service(health(life))
+        .add_service(health(drain))
         .add_service(reflection().build_v1().map_err(damaged)?)
         .add_service(reflection().build_v1alpha().map_err(damaged)?))
 }
 
-/// Serving until the server is told to stop, for the server and for the one service.
+/// Says that server and service serve, until the server begins to stop.
 fn health(
-    life: Life,
+    drain: Drain,
 ) -> tonic_health::pb::health_server::HealthServer<tonic_health::server::HealthService> {
     let reporter = HealthReporter::new();
     let service = tonic_health::server::HealthService::from_health_reporter(reporter.clone());
     let name = pb::scene_service_server::SERVICE_NAME;
-    // Nobody else holds the lock yet, so this is ready at once.
+    // Nobody else has the lock yet, so this is ready at once.
     reporter.set_service_status(name, ServingStatus::Serving).now_or_never();
     tokio::spawn(async move {
-        life.ending().await;
+        drain.stopping().await;
         for name in ["", name] {
             reporter.set_service_status(name, ServingStatus::NotServing).await;
         }

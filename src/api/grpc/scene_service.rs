@@ -1,4 +1,4 @@
-//! `segsplat.v1.SceneService`: take apart, call the service, put together.
+//! `segsplat.v1.SceneService`: messages to requests, calls of the service, answers to messages.
 
 use std::{pin::Pin, time::Duration};
 
@@ -6,7 +6,7 @@ use futures_util::{Stream, StreamExt, stream};
 use tonic::{Request, Response, Status, Streaming};
 
 use super::{
-    convert,
+    convert::{self, not_empty},
     pb::{self, create_scene_header::Cameras, create_scene_request::Part},
     status::{logged, unreadable},
 };
@@ -16,13 +16,23 @@ use crate::{
         upload::{UploadBuilder, UploadGuard, check_bundle},
     },
     error::{Error, Result},
-    keys::Caller,
     scene::{Upload, UploadCameras},
     service::{CreateScene, Kind, PageRequest, SceneOptions, SemanticsMode, ViewSpec, ViewsSpec},
 };
 
 type Answer<T> = Result<Response<T>, Status>;
 type Many<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send + 'static>>;
+
+/// Does `work` for the caller of `request`. An error goes to the log and becomes a status.
+async fn answer<Q, A, F: Future<Output = Result<A>>>(
+    api: &Api,
+    request: Request<Q>,
+    work: impl FnOnce(Api, Q) -> F,
+) -> Answer<A> {
+    let api = api.for_caller(request.extensions().get()).map_err(|e| logged(&e))?;
+    let answer = work(api, request.into_inner()).await.map_err(|e| logged(&e))?;
+    Ok(Response::new(answer))
+}
 
 #[tonic::async_trait]
 impl pb::scene_service_server::SceneService for Api {
@@ -34,114 +44,94 @@ impl pb::scene_service_server::SceneService for Api {
         &self,
         request: Request<Streaming<pb::CreateSceneRequest>>,
     ) -> Answer<pb::Scene> {
-        let api = called(self, &request)?;
         let request_id = request.metadata().get(request_id::HEADER);
         let request_id = request_id.and_then(|id| id.to_str().ok()).map(str::to_owned);
-        let scene = create(&api, request.into_inner(), request_id).await.map_err(|e| logged(&e))?;
-        Ok(Response::new(scene))
+        answer(self, request, |api, messages| create(api, messages, request_id)).await
     }
 
     async fn watch_scene(
         &self,
         request: Request<pb::WatchSceneRequest>,
     ) -> Answer<Self::WatchSceneStream> {
-        let api = called(self, &request)?;
-        let events = async { api.service.watch(&request.get_ref().scene_id.parse()?).await }.await;
-        let events = events.map_err(|e| logged(&e))?;
-        Ok(Response::new(events.map(|event| Ok(convert::event(event))).boxed()))
+        answer(self, request, |api, request| async move {
+            let events = api.service.watch(&request.scene_id.parse()?).await?;
+            Ok(events.map(|event| Ok(convert::event(event))).boxed())
+        })
+        .await
     }
 
     async fn get_scene(&self, request: Request<pb::GetSceneRequest>) -> Answer<pb::Scene> {
-        let api = called(self, &request)?;
-        let status = async { api.service.get(&request.get_ref().scene_id.parse()?).await }.await;
-        let status = status.map_err(|e| logged(&e))?;
-        Ok(Response::new(convert::scene(status)))
+        answer(self, request, |api, request| async move {
+            Ok(convert::scene(api.service.get(&request.scene_id.parse()?).await?))
+        })
+        .await
     }
 
     async fn list_scenes(
         &self,
         request: Request<pb::ListScenesRequest>,
     ) -> Answer<pb::ListScenesResponse> {
-        let api = called(self, &request)?;
-        let request = request.into_inner();
-        let page = PageRequest {
-            limit: request.limit.map(|limit| limit as usize),
-            after: Some(request.after).filter(|after| !after.is_empty()),
-        };
-        let page = api.service.list(&page).await.map_err(|e| logged(&e))?;
-        let scenes = page.scenes.into_iter().map(convert::scene).collect();
-        let next = page.next.unwrap_or_default();
-        Ok(Response::new(pb::ListScenesResponse { scenes, next }))
+        answer(self, request, |api, request| async move {
+            let page = PageRequest {
+                limit: request.limit.map(|limit| limit as usize),
+                after: not_empty(request.after),
+            };
+            let page = api.service.list(&page).await?;
+            let scenes = page.scenes.into_iter().map(convert::scene).collect();
+            Ok(pb::ListScenesResponse { scenes, next: page.next.unwrap_or_default() })
+        })
+        .await
     }
 
     async fn delete_scene(
         &self,
         request: Request<pb::DeleteSceneRequest>,
     ) -> Answer<pb::DeleteSceneResponse> {
-        let api = called(self, &request)?;
-        let gone = async { api.service.delete(&request.get_ref().scene_id.parse()?).await }.await;
-        gone.map_err(|e| logged(&e))?;
-        Ok(Response::new(pb::DeleteSceneResponse {}))
+        answer(self, request, |api, request| async move {
+            api.service.delete(&request.scene_id.parse()?).await?;
+            Ok(pb::DeleteSceneResponse {})
+        })
+        .await
     }
 
     async fn render_view(&self, request: Request<pb::RenderViewRequest>) -> Answer<pb::View> {
-        let api = called(self, &request)?;
-        let view = render(&api, request.into_inner()).await.map_err(|e| logged(&e))?;
-        Ok(Response::new(view))
+        answer(self, request, render).await
     }
 
     async fn render_views(
         &self,
         request: Request<pb::RenderViewsRequest>,
     ) -> Answer<Self::RenderViewsStream> {
-        let api = called(self, &request)?;
-        let views = render_many(&api, request.into_inner()).await.map_err(|e| logged(&e))?;
-        Ok(Response::new(views))
+        answer(self, request, render_many).await
     }
 
     async fn query(&self, request: Request<pb::QueryRequest>) -> Answer<pb::QueryResponse> {
-        let api = called(self, &request)?;
-        let found = async {
-            let request = request.into_inner();
+        answer(self, request, |api, request| async move {
             let id = request.scene_id.parse()?;
-            api.service.query(&id, convert::query(request)?).await
-        };
-        let found = found.await.map_err(|e: Error| logged(&e))?;
-        Ok(Response::new(convert::answer(found)))
+            Ok(convert::answer(api.service.query(&id, convert::query(request)?).await?))
+        })
+        .await
     }
 
     async fn pick(&self, request: Request<pb::PickRequest>) -> Answer<pb::PickResponse> {
-        let api = called(self, &request)?;
-        let found = async {
-            let request = request.into_inner();
+        answer(self, request, |api, request| async move {
             let id = request.scene_id.parse()?;
-            api.service.pick(&id, convert::pick(request)?).await
-        };
-        let found = found.await.map_err(|e: Error| logged(&e))?;
-        Ok(Response::new(convert::picked(found)))
+            Ok(convert::picked(api.service.pick(&id, convert::pick(request)?).await?))
+        })
+        .await
     }
 
     async fn export(&self, request: Request<pb::ExportRequest>) -> Answer<Self::ExportStream> {
-        let api = called(self, &request)?;
-        let chunks = export(&api, request.into_inner()).await.map_err(|e| logged(&e))?;
-        Ok(Response::new(chunks))
+        answer(self, request, export).await
     }
 }
 
-/// The doors' state for the caller of this request, whom the edge has let in.
-fn called<T>(api: &Api, request: &Request<T>) -> Result<Api, Status> {
-    // Without the edge nobody was asked for a key, so nobody is let in.
-    let caller = request.extensions().get::<Caller>();
-    let caller = caller.ok_or_else(|| logged(&Error::internal("the call was not let in")))?;
-    Ok(api.for_caller(caller))
-}
-
 async fn create(
-    api: &Api,
+    api: Api,
     messages: Streaming<pb::CreateSceneRequest>,
     request_id: Option<String>,
 ) -> Result<pb::Scene> {
-    let (upload, header, _guard) = receive(api, messages).await?;
+    let (upload, header, _guard) = read_upload(&api, messages).await?;
     let wait = header.wait_ms.map(Duration::from_millis);
     let request = CreateScene {
         upload,
@@ -150,7 +140,7 @@ async fn create(
             semantics: convert::value("semantics", header.semantics)?,
             density: convert::value("density", header.density)?,
         },
-        idempotency_key: Some(header.idempotency_key).filter(|key| !key.is_empty()),
+        idempotency_key: not_empty(header.idempotency_key),
         wait,
         request_id,
     };
@@ -161,7 +151,7 @@ async fn create(
     }
 }
 
-async fn receive(
+async fn read_upload(
     api: &Api,
     mut messages: Streaming<pb::CreateSceneRequest>,
 ) -> Result<(Upload, pb::CreateSceneHeader, UploadGuard)> {
@@ -208,19 +198,15 @@ fn begin(
 ) -> Result<pb::CreateSceneHeader> {
     convert::value::<SemanticsMode>("semantics", header.semantics)?;
     check_bundle(&header.bundle, &api.service.models())?;
-    match header.cameras.take() {
-        None => {}
-        Some(Cameras::TransformsJson(json)) => {
-            upload.begin_cameras(UploadCameras::Transforms(json.into()))?;
-        }
-        Some(Cameras::CamerasJson(json)) => {
-            upload.begin_cameras(UploadCameras::Cameras(json.into()))?;
-        }
-    }
+    let cameras = header.cameras.take().map(|cameras| match cameras {
+        Cameras::TransformsJson(json) => UploadCameras::Transforms(json.into()),
+        Cameras::CamerasJson(json) => UploadCameras::Cameras(json.into()),
+    });
+    cameras.map_or(Ok(()), |cameras| upload.begin_cameras(cameras))?;
     Ok(header)
 }
 
-async fn render(api: &Api, request: pb::RenderViewRequest) -> Result<pb::View> {
+async fn render(api: Api, request: pb::RenderViewRequest) -> Result<pb::View> {
     let id = request.scene_id.parse()?;
     let given = request.options.unwrap_or_default();
     let spec = ViewSpec {
@@ -234,7 +220,7 @@ async fn render(api: &Api, request: pb::RenderViewRequest) -> Result<pb::View> {
     Ok(convert::view(view))
 }
 
-async fn render_many(api: &Api, request: pb::RenderViewsRequest) -> Result<Many<pb::View>> {
+async fn render_many(api: Api, request: pb::RenderViewsRequest) -> Result<Many<pb::View>> {
     let id = request.scene_id.parse()?;
     let text = convert::text(request.text, request.profile, request.semantics_wait_ms)?;
     let kinds = match request.kinds.as_slice() {
@@ -252,7 +238,7 @@ async fn render_many(api: &Api, request: pb::RenderViewsRequest) -> Result<Many<
     Ok(views.map(|view| view.map(convert::view).map_err(|e| logged(&e))).boxed())
 }
 
-async fn export(api: &Api, request: pb::ExportRequest) -> Result<Many<pb::ExportChunk>> {
+async fn export(api: Api, request: pb::ExportRequest) -> Result<Many<pb::ExportChunk>> {
     let id = request.scene_id.parse()?;
     let text = convert::text(request.text, request.profile, request.semantics_wait_ms)?;
     let format = convert::value("format", request.format)?;

@@ -4,6 +4,7 @@ use std::{any::Any, sync::Arc};
 
 use axum::{
     Json,
+    body::Body,
     extract::Request,
     http::{HeaderValue, Method, StatusCode, Uri, header},
     response::{IntoResponse, Response},
@@ -11,8 +12,12 @@ use axum::{
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::edge;
+use super::middleware;
 use crate::{
+    api::{
+        grpc::{self, retry_after_s},
+        short,
+    },
     error::{Error, ErrorCode},
     scene::SceneId,
 };
@@ -43,27 +48,17 @@ pub(super) struct ErrorDetails {
     scene: Option<String>,
 }
 
-/// An error on its way out of a handler; the edge writes the body, which holds the request's id.
-#[derive(Debug)]
-pub(super) struct ApiError {
-    error: Error,
-    scene: Option<SceneId>,
-}
-
-/// What the edge needs to write the body.
+/// An error of a handler. It travels beside the answer to the middleware, which logs it and writes
+/// the body, which holds the request's id.
 #[derive(Clone, Debug)]
-pub(super) struct Fault(Arc<ApiError>);
-
-impl ApiError {
-    /// The error with the scene it is about, for `details`.
-    pub(super) fn of_scene(error: Error, id: &SceneId) -> Self {
-        Self { scene: Some(id.clone()), ..Self::from(error) }
-    }
+pub(super) struct ApiError {
+    error: Arc<Error>,
+    scene: Option<SceneId>,
 }
 
 impl From<Error> for ApiError {
     fn from(error: Error) -> Self {
-        Self { error, scene: None }
+        Self { error: Arc::new(error), scene: None }
     }
 }
 
@@ -72,15 +67,19 @@ impl IntoResponse for ApiError {
         let status = StatusCode::from_u16(self.error.code().row().http)
             .unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
         let mut response = status.into_response();
-        response.extensions_mut().insert(Fault(Arc::new(self)));
+        response.extensions_mut().insert(self);
         response
     }
 }
 
-impl Fault {
-    /// The error, for the log.
+impl ApiError {
+    /// The error with the scene it is about, for `details`.
+    pub(super) fn of_scene(error: Error, id: &SceneId) -> Self {
+        Self { scene: Some(id.clone()), ..Self::from(error) }
+    }
+
     pub(super) fn error(&self) -> &Error {
-        &self.0.error
+        &self.error
     }
 
     /// Writes body and headers into `response`.
@@ -93,19 +92,16 @@ impl Fault {
             details: ErrorDetails {
                 retry: error.code().row().retry,
                 retry_after_s: retry_after_s(error),
-                scene: self.0.scene.as_ref().map(ToString::to_string),
+                scene: self.scene.as_ref().map(ToString::to_string),
             },
         };
-        let (parts, _) = response.into_parts();
-        let mut answer = (parts.status, Json(body)).into_response();
-        for (name, value) in &parts.headers {
-            if name != header::CONTENT_LENGTH && name != header::CONTENT_TYPE {
-                answer.headers_mut().insert(name, value.clone());
-            }
-        }
+        let (mut parts, _) = response.into_parts();
+        parts.headers.remove(header::CONTENT_LENGTH);
+        parts.headers.remove(header::CONTENT_TYPE);
+        let mut answer = (parts.status, parts.headers, Json(body)).into_response();
         if error.code() == ErrorCode::Unauthenticated {
-            let asks = HeaderValue::from_static("Bearer realm=\"segsplat\"");
-            answer.headers_mut().insert(header::WWW_AUTHENTICATE, asks);
+            let bearer = HeaderValue::from_static("Bearer realm=\"segsplat\"");
+            answer.headers_mut().insert(header::WWW_AUTHENTICATE, bearer);
         }
         if let Some(seconds) = retry_after_s(error) {
             answer.headers_mut().insert(header::RETRY_AFTER, HeaderValue::from(seconds));
@@ -114,41 +110,25 @@ impl Fault {
     }
 }
 
-/// Seconds to wait before the same call may succeed, where that is known.
-pub(super) fn retry_after_s(error: &Error) -> Option<u32> {
-    error.retry_after().or_else(|| (error.code() == ErrorCode::Overloaded).then_some(1))
-}
-
 /// Answer of a path that no route has; gRPC callers get gRPC's own `UNIMPLEMENTED`.
 pub(super) async fn no_such_route(request: Request) -> Response {
-    if edge::is_grpc(request.headers()) {
-        return edge::rpc_unimplemented(request.uri().path());
+    if middleware::is_grpc(request.headers()) {
+        return grpc::unimplemented(request.uri().path()).map(Body::new);
     }
-    let shown: String = request.uri().path().chars().take(80).collect();
-    let message = format!("no such route: {} {shown}", request.method());
+    let message = format!("no such route: {} {}", request.method(), short(request.uri().path()));
     ApiError::from(Error::new(ErrorCode::NotFound, message)).into_response()
 }
 
 /// Answer of a path that has other methods; axum adds `Allow`.
 pub(super) async fn method_not_allowed(method: Method, uri: Uri) -> Response {
-    let shown: String = uri.path().chars().take(80).collect();
-    let message = format!("{shown} has no method {method}");
+    let message = format!("{} has no method {method}", short(uri.path()));
     ApiError::from(Error::new(ErrorCode::MethodNotAllowed, message)).into_response()
-}
-
-/// Answer of a handler that panicked; the panic's text is for the log alone.
-pub(super) fn panicked(panic: Box<dyn Any + Send + 'static>) -> Response {
-    ApiError::from(panic_error(panic)).into_response()
 }
 
 /// The error of a panic, with its text as the source.
 pub(super) fn panic_error(panic: Box<dyn Any + Send + 'static>) -> Error {
-    let text = match panic.downcast::<String>() {
-        Ok(text) => *text,
-        Err(panic) => match panic.downcast::<&'static str>() {
-            Ok(text) => (*text).to_owned(),
-            Err(_) => "a panic without text".to_owned(),
-        },
-    };
+    let text = panic.downcast::<String>().map(|text| *text);
+    let text = text.or_else(|panic| panic.downcast::<&'static str>().map(|text| text.to_string()));
+    let text = text.unwrap_or_else(|_| "a panic without text".to_owned());
     Error::internal("a fault of the server; the request id finds it in the log").caused_by(text)
 }

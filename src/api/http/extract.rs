@@ -1,4 +1,4 @@
-//! Own extractors, so that a bad id or body is answered in our shape and names what is wrong.
+//! Our own extractors: the answer to a bad id or body has our shape and names what is wrong.
 
 use axum::{
     body::Bytes,
@@ -8,15 +8,14 @@ use axum::{
 use futures_util::StreamExt;
 use utoipa::IntoParams;
 
-use super::{error::ApiError, fields::Fields, receive::read_on};
+use super::{error::ApiError, fields::Fields, multipart::read_on};
 use crate::{
     api::{Api, upload::json_over},
     error::Error,
-    keys::Caller,
     scene::SceneId,
 };
 
-/// The `{id}` of the path, checked before anything else sees it.
+/// The `{id}` of the path, checked.
 #[derive(Clone, Debug, IntoParams)]
 #[into_params(names("id"), parameter_in = Path)]
 pub(super) struct Id(
@@ -37,18 +36,15 @@ impl FromRequestParts<Api> for Id {
     }
 }
 
-/// The doors' state for the caller of this request, whom the edge has let in.
+/// The API for the caller of this request, after the middleware has checked the key.
 #[derive(Clone, Debug)]
-pub(super) struct Called(pub(super) Api);
+pub(super) struct CallerApi(pub(super) Api);
 
-impl FromRequestParts<Api> for Called {
+impl FromRequestParts<Api> for CallerApi {
     type Rejection = ApiError;
 
     async fn from_request_parts(parts: &mut Parts, api: &Api) -> Result<Self, ApiError> {
-        // Without the edge nobody was asked for a key, so nobody is let in.
-        let caller = parts.extensions.get::<Caller>();
-        let caller = caller.ok_or_else(|| Error::internal("the call was not let in"))?;
-        Ok(Self(api.for_caller(caller)))
+        Ok(Self(api.for_caller(parts.extensions.get())?))
     }
 }
 

@@ -1,4 +1,4 @@
-//! Is it alive, is it ready, what is it made of.
+//! Liveness, readiness, metrics and models.
 
 use axum::{
     Json,
@@ -9,7 +9,7 @@ use axum::{
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::{error::ApiError, extract::Called, fields::Fields};
+use super::{error::ApiError, extract::CallerApi, fields::Fields};
 use crate::{
     api::Api,
     service::{ModelsInfo, Readiness},
@@ -42,7 +42,7 @@ pub(super) async fn live() -> Json<Liveness> {
 )]
 pub(super) async fn ready(State(api): State<Api>) -> Response {
     let mut readiness = api.service.ready();
-    readiness.ready &= !api.life.is_ending();
+    readiness.ready &= !api.drain.is_stopping();
     let status = if readiness.ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
     (status, Json(readiness)).into_response()
 }
@@ -58,7 +58,7 @@ pub(super) async fn ready(State(api): State<Api>) -> Response {
 pub(super) async fn metrics(State(api): State<Api>) -> Result<Response, ApiError> {
     let readiness = api.service.ready();
     let text = meter::text(Levels {
-        ready: readiness.ready && !api.life.is_ending(),
+        ready: readiness.ready && !api.drain.is_stopping(),
         jobs_queued: readiness.jobs_queued,
         jobs_running: readiness.jobs_running,
         renders: readiness.renders,
@@ -74,7 +74,7 @@ pub(super) async fn metrics(State(api): State<Api>) -> Result<Response, ApiError
     responses((status = 200, description = "Bundle and renderer", body = ModelsInfo))
 )]
 pub(super) async fn models(
-    Called(api): Called,
+    CallerApi(api): CallerApi,
     fields: Fields,
 ) -> Result<Json<ModelsInfo>, ApiError> {
     fields.finish()?;

@@ -1,21 +1,21 @@
-//! The HTTP door, and the port that both doors share: HTTP/1.1, HTTP/2 and gRPC over h2c.
+//! HTTP/1.1 and HTTP/2, and gRPC on the same port.
 //!
-//! [`routes`] is the list of calls; `/openapi.json` is held to it by `tests/it/errors.rs`.
+//! [`routes`] is the list of calls; `tests/it/errors.rs` compares `/openapi.json` with it.
 
-mod ask;
+mod body;
 mod connection;
 mod cors;
-mod edge;
 mod error;
 mod extract;
 mod fields;
 mod health;
-mod held;
+mod middleware;
+mod multipart;
 mod openapi;
-mod receive;
 mod render;
 mod scenes;
 mod serve;
+mod texts;
 mod tls;
 mod viewer;
 mod views;
@@ -25,27 +25,26 @@ use std::sync::Arc;
 use axum::{
     Router,
     extract::DefaultBodyLimit,
-    handler::Handler,
-    middleware,
-    routing::{self, MethodRouter},
+    middleware::from_fn_with_state,
+    routing::{MethodRouter, delete, get, post},
 };
 use tower_http::catch_panic::CatchPanicLayer;
 
-use super::{
-    Api,
-    access::{self, Access},
-    grpc,
-};
+use super::{Api, access, grpc};
 use crate::{error::Result, keys::Scope, telemetry::meter};
 
-use self::connection::Pace;
+use self::{
+    body::Pace,
+    error::panic_error,
+    middleware::{Around, Transport, around, grpc_guard, http_guard},
+};
 
-pub use self::serve::{Doors, serve};
+pub use self::serve::Server;
 
 /// Name of the one call that the configuration can open.
 const METRICS: &str = "metrics";
 
-/// One call of the HTTP door.
+/// One call over HTTP.
 #[derive(Clone, Debug)]
 pub struct Route {
     /// Method, upper case.
@@ -54,66 +53,42 @@ pub struct Route {
     pub path: &'static str,
     /// Name in metrics: that of the gRPC method where there is one.
     pub call: &'static str,
-    /// What a key must be good for; `None`: nobody is asked.
+    /// The scope that a key must have; `None`: callers need no key.
     pub scope: Option<Scope>,
     handler: MethodRouter<Api>,
 }
 
-fn get<H: Handler<T, Api>, T: 'static>(
-    path: &'static str,
-    call: &'static str,
-    scope: impl Into<Option<Scope>>,
-    handler: H,
-) -> Route {
-    Route { method: "GET", path, call, scope: scope.into(), handler: routing::get(handler) }
-}
-
-fn post<H: Handler<T, Api>, T: 'static>(
-    path: &'static str,
-    call: &'static str,
-    scope: Scope,
-    handler: H,
-) -> Route {
-    Route { method: "POST", path, call, scope: Some(scope), handler: routing::post(handler) }
-}
-
-fn delete<H: Handler<T, Api>, T: 'static>(
-    path: &'static str,
-    call: &'static str,
-    scope: Scope,
-    handler: H,
-) -> Route {
-    Route { method: "DELETE", path, call, scope: Some(scope), handler: routing::delete(handler) }
-}
-
-/// Every call of the HTTP door.
+/// Every call over HTTP.
 #[must_use]
 pub fn routes() -> Vec<Route> {
-    use Scope::{Admin, Read, Write};
-    vec![
-        post("/v1/scenes", "create_scene", Write, scenes::create),
-        get("/v1/scenes", "list_scenes", Read, scenes::list),
-        get("/v1/scenes/{id}", "get_scene", Read, scenes::get),
-        delete("/v1/scenes/{id}", "delete_scene", Write, scenes::delete),
-        get("/v1/scenes/{id}/events", "watch_scene", Read, scenes::events),
-        get("/v1/scenes/{id}/view", "render_view", Read, render::view),
-        post("/v1/scenes/{id}/views", "render_views", Read, views::views),
-        post("/v1/scenes/{id}/query", "query", Read, ask::query),
-        get("/v1/scenes/{id}/pick", "pick", Read, ask::pick),
-        get("/v1/scenes/{id}/export", "export", Read, render::export),
-        get("/v1/models", "models", Read, health::models),
-        get("/metrics", METRICS, Admin, health::metrics),
-        get("/healthz", "live", None, health::live),
-        get("/readyz", "ready", None, health::ready),
-        get("/openapi.json", "openapi", None, openapi::document),
-        get("/", "viewer", None, viewer::index),
+    let (none, read, write) = (None, Some(Scope::Read), Some(Scope::Write));
+    let admin = Some(Scope::Admin);
+    [
+        ("POST", "/v1/scenes", "create_scene", write, post(scenes::create)),
+        ("GET", "/v1/scenes", "list_scenes", read, get(scenes::list)),
+        ("GET", "/v1/scenes/{id}", "get_scene", read, get(scenes::get)),
+        ("DELETE", "/v1/scenes/{id}", "delete_scene", write, delete(scenes::delete)),
+        ("GET", "/v1/scenes/{id}/events", "watch_scene", read, get(scenes::events)),
+        ("GET", "/v1/scenes/{id}/view", "render_view", read, get(render::view)),
+        ("POST", "/v1/scenes/{id}/views", "render_views", read, post(views::views)),
+        ("POST", "/v1/scenes/{id}/query", "query", read, post(texts::query)),
+        ("GET", "/v1/scenes/{id}/pick", "pick", read, get(texts::pick)),
+        ("GET", "/v1/scenes/{id}/export", "export", read, get(render::export)),
+        ("GET", "/v1/models", "models", read, get(health::models)),
+        ("GET", "/metrics", METRICS, admin, get(health::metrics)),
+        ("GET", "/healthz", "live", none, get(health::live)),
+        ("GET", "/readyz", "ready", none, get(health::ready)),
+        ("GET", "/openapi.json", "openapi", none, get(openapi::document)),
+        ("GET", "/", "viewer", none, get(viewer::index)),
     ]
+    .map(|(method, path, call, scope, handler)| Route { method, path, call, scope, handler })
+    .into()
 }
 
-/// Both doors as one router.
+/// HTTP and gRPC as one router.
 fn app(api: &Api) -> Result<Router> {
-    let rpc = grpc::routes(api.clone())?.prepare().into_axum_router().reset_fallback();
-    let pace = Pace::new(&api.service.limits());
+    let grpc = grpc::routes(api.clone())?.prepare().into_axum_router().reset_fallback();
+    let grpc = grpc.layer(from_fn_with_state(api.clone(), grpc_guard));
     // Before the first call, so that every metric is there.
     access::rpc_calls().for_each(|call| meter::register_call("grpc", call));
     meter::register_call("http", access::OTHER);
@@ -121,90 +96,31 @@ fn app(api: &Api) -> Result<Router> {
         meter::register_call("http", route.call);
         let open = route.call == METRICS && api.service.config().open_metrics;
         let scope = route.scope.filter(|_| !open);
-        let state = (api.clone(), route.call, scope);
-        let guard = middleware::from_fn_with_state(state, edge::guard);
+        let guard = from_fn_with_state((api.clone(), route.call, scope), http_guard);
         (route.path, route.handler.route_layer(guard))
     };
-    let rest = routes()
+    let http = routes()
         .into_iter()
         .map(guarded)
         .fold(Router::new(), |router, (path, handler)| router.route(path, handler))
         .method_not_allowed_fallback(error::method_not_allowed)
-        .with_state(api.clone());
-    let rest = rest_edge(rest.fallback(error::no_such_route), (Arc::clone(&api.access), pace));
-    let both = rest.merge(rpc_edge(rpc, (api.clone(), pace)));
+        .with_state(api.clone())
+        .fallback(error::no_such_route)
+        .layer(DefaultBodyLimit::disable());
+    let pace = Pace::new(&api.service.limits());
+    let state = |transport| (transport, Arc::clone(&api.access), pace);
+    let both = surrounded(http, state(Transport::Http));
+    let both = both.merge(surrounded(grpc, state(Transport::Grpc)));
     Ok(match cors::layer(&api.service.config().cors_origins)? {
         Some(cors) => both.layer(cors),
         None => both,
     })
 }
 
-/// What surrounds every HTTP call: request id, deadline, one error shape, a net for panics.
-fn rest_edge(router: Router, state: (Arc<Access>, Pace)) -> Router {
+/// What surrounds every call: request id, deadline, one shape of errors, answers to panics.
+fn surrounded(router: Router, state: Around) -> Router {
+    let transport = state.0;
     router
-        .layer(DefaultBodyLimit::disable())
-        .layer(CatchPanicLayer::custom(error::panicked))
-        .layer(middleware::from_fn_with_state(state, edge::rest))
-}
-
-/// The same for every gRPC call.
-fn rpc_edge(router: Router, state: (Api, Pace)) -> Router {
-    router
-        .layer(CatchPanicLayer::custom(edge::rpc_panicked))
-        .layer(middleware::from_fn_with_state(state, edge::rpc))
-}
-
-#[cfg(test)]
-mod tests {
-    use axum::body::Body;
-    use axum::http::{Request, StatusCode};
-    use tower::ServiceExt;
-
-    use super::*;
-
-    async fn boom() -> &'static str {
-        panic!("on purpose")
-    }
-
-    async fn call(router: Router, path: &str) -> (StatusCode, axum::http::HeaderMap, String) {
-        let request = Request::get(path)
-            .header("content-type", "application/grpc")
-            .body(Body::empty())
-            .unwrap();
-        let response = router.oneshot(request).await.unwrap();
-        let (parts, body) = response.into_parts();
-        let bytes = axum::body::to_bytes(body, 1 << 20).await.unwrap();
-        (parts.status, parts.headers, String::from_utf8(bytes.to_vec()).unwrap())
-    }
-
-    #[tokio::test]
-    async fn a_panic_in_a_handler_is_an_internal_error_and_the_router_lives() {
-        let router = rest_edge(
-            Router::new()
-                .route("/boom", routing::get(boom))
-                .route("/ok", routing::get(|| async {})),
-            (
-                Arc::new(Access::new(&crate::config::Config::default()).unwrap()),
-                Pace::new(&crate::limits::Limits::default()),
-            ),
-        );
-        let (status, headers, body) = call(router.clone(), "/boom").await;
-        assert_eq!(status, StatusCode::INTERNAL_SERVER_ERROR);
-        let body: serde_json::Value = serde_json::from_str(&body).unwrap();
-        assert_eq!(body["code"], "internal");
-        assert_eq!(body["request_id"], headers["x-request-id"].to_str().unwrap());
-        assert!(!body.to_string().contains("on purpose"), "the panic's text reached the client");
-        assert_eq!(call(router, "/ok").await.0, StatusCode::OK);
-    }
-
-    #[tokio::test]
-    async fn a_panic_in_a_grpc_call_is_an_internal_status() {
-        let router = Router::new()
-            .route("/boom", routing::get(boom))
-            .layer(CatchPanicLayer::custom(edge::rpc_panicked));
-        let (status, headers, _) = call(router, "/boom").await;
-        assert_eq!(status, StatusCode::OK);
-        assert_eq!(headers["grpc-status"], "13");
-        assert_eq!(headers["segsplat-code"], "internal");
-    }
+        .layer(CatchPanicLayer::custom(move |panic| transport.refusal(panic_error(panic))))
+        .layer(from_fn_with_state(state, around))
 }

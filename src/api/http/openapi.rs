@@ -1,4 +1,4 @@
-//! `/openapi.json`: the calls of this door. The schemas say what the bodies hold;
+//! `/openapi.json`: the calls over HTTP. The schemas say what the bodies hold;
 //! `tests/it/errors.rs` compares them with real answers and the paths with the routes.
 
 use axum::Json;
@@ -12,7 +12,7 @@ use utoipa::{
     },
 };
 
-use super::{ask, error::ErrorBody, health, render, scenes, viewer, views};
+use super::{error::ErrorBody, health, render, scenes, texts, viewer, views};
 
 /// This document
 #[utoipa::path(
@@ -31,14 +31,14 @@ pub(super) async fn document() -> Json<openapi::OpenApi> {
     ),
     paths(
         scenes::create, scenes::list, scenes::get, scenes::delete, scenes::events, render::view,
-        views::views, ask::query, ask::pick, render::export, health::models, health::live,
+        views::views, texts::query, texts::pick, render::export, health::models, health::live,
         health::ready, health::metrics, document, viewer::index,
     ),
     components(schemas(ErrorBody)),
     tags(
         (name = "scenes", description = "Make, list, show, watch and delete scenes"),
         (name = "views", description = "Pictures and files of a scene"),
-        (name = "texts", description = "Where is it? A scene asked by text"),
+        (name = "texts", description = "Where is it? Texts to a scene"),
         (name = "server", description = "Health, models, this document"),
     ),
     modifiers(&EveryCall),

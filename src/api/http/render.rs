@@ -3,6 +3,7 @@
 use std::convert::Infallible;
 
 use axum::{
+    Extension,
     body::Body,
     http::{HeaderMap, HeaderValue, StatusCode, header},
     response::{IntoResponse, Response},
@@ -12,12 +13,13 @@ use serde::Deserialize;
 use utoipa::IntoParams;
 
 use super::{
-    edge::Deadline,
     error::ApiError,
-    extract::{Called, Id},
+    extract::{CallerApi, Id},
     fields::Fields,
+    middleware::{Deadline, text_of},
 };
 use crate::{
+    api::short,
     error::{Error, Result},
     service::{
         CameraFields, CameraSpec, ExportFormat, Format, Kind, PictureOptions, RenderedView,
@@ -59,25 +61,22 @@ pub(super) struct ExportParams {
     )
 )]
 pub(super) async fn view(
-    Called(api): Called,
+    CallerApi(api): CallerApi,
     Id(id): Id,
-    deadline: Deadline,
+    Extension(Deadline(deadline)): Extension<Deadline>,
     headers: HeaderMap,
     fields: Fields,
 ) -> Result<Response, ApiError> {
-    let mut spec = spec_of(fields, accept(&headers))?;
-    spec.options.deadline = deadline.0;
-    if let Some(known) = headers.get(header::IF_NONE_MATCH).and_then(|v| v.to_str().ok()) {
-        let etag = api.service.view_etag(&id, &spec).await?.map(|etag| quoted(&etag));
-        if let Some(etag) = etag.filter(|etag| matches_etag(known, etag)) {
-            return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
-        }
+    let mut spec = spec_of(fields, text_of(&headers, "accept"))?;
+    spec.options.deadline = deadline;
+    if headers.contains_key(header::IF_NONE_MATCH)
+        && let Some(etag) = api.service.view_etag(&id, &spec).await?
+        && let Some(answer) = not_modified(&headers, &etag)
+    {
+        return Ok(answer);
     }
     let view = api.service.render(&id, spec).await?;
-    let mut answer = Response::new(Body::empty());
-    *answer.headers_mut() = view_headers(&view);
-    *answer.body_mut() = Body::from(view.bytes);
-    Ok(answer)
+    Ok((view_headers(&view), view.bytes).into_response())
 }
 
 /// The scene, or what a text selects of it, as a file
@@ -90,7 +89,7 @@ pub(super) async fn view(
     ))
 )]
 pub(super) async fn export(
-    Called(api): Called,
+    CallerApi(api): CallerApi,
     Id(id): Id,
     headers: HeaderMap,
     mut fields: Fields,
@@ -99,10 +98,8 @@ pub(super) async fn export(
     let ask: TextOptions = fields.take()?;
     fields.finish()?;
     let export = api.service.export(&id, format, &ask).await?;
-    let etag = quoted(&export.etag);
-    let known = headers.get(header::IF_NONE_MATCH).and_then(|v| v.to_str().ok());
-    if known.is_some_and(|known| matches_etag(known, &etag)) {
-        return Ok((StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response());
+    if let Some(answer) = not_modified(&headers, &export.etag) {
+        return Ok(answer);
     }
     let disposition = format!("attachment; filename=\"{}\"", export.file_name);
     let headers = [
@@ -111,7 +108,7 @@ pub(super) async fn export(
         // It is written while it is sent, always from its start.
         (header::ACCEPT_RANGES, "none".to_owned()),
         (header::CONTENT_DISPOSITION, disposition),
-        (header::ETAG, etag),
+        (header::ETAG, quoted(&export.etag)),
         (header::CACHE_CONTROL, "private, no-cache".to_owned()),
     ];
     let pieces = export.into_stream().map(Ok::<_, Infallible>);
@@ -123,17 +120,14 @@ pub(super) fn view_headers(view: &RenderedView) -> HeaderMap {
     let mut headers = HeaderMap::new();
     let pose = view.camera.camera_to_world.to_row_major().map(|v| v.to_string()).join(",");
     let k = view.camera.intrinsics;
-    let lens = format!("{},{},{},{}", k.fx, k.fy, k.cx, k.cy);
+    let times = format!("render;dur={:.2}, encode;dur={:.2}", view.render_ms, view.encode_ms);
     let texts = [
         ("content-type", content_type(view.format).to_owned()),
         ("etag", quoted(&view.etag)),
         ("cache-control", "private, no-cache".to_owned()),
-        (
-            "server-timing",
-            format!("render;dur={:.2}, encode;dur={:.2}", view.render_ms, view.encode_ms),
-        ),
+        ("server-timing", times),
         ("x-camera-to-world", pose),
-        ("x-intrinsics", lens),
+        ("x-intrinsics", format!("{},{},{},{}", k.fx, k.fy, k.cx, k.cy)),
     ];
     let scale = view.depth_scale.map(|scale| ("x-depth-scale", scale.to_string()));
     for (name, text) in texts.into_iter().chain(scale) {
@@ -173,10 +167,6 @@ fn spec_of(mut fields: Fields, accept: Option<&str>) -> Result<ViewSpec> {
     Ok(ViewSpec { camera, kind, options, picture, text })
 }
 
-fn accept(headers: &HeaderMap) -> Option<&str> {
-    headers.get(header::ACCEPT).and_then(|value| value.to_str().ok())
-}
-
 /// The encoding of `Accept` with the highest weight that fits the kind; PNG where any will do.
 fn negotiate(accept: Option<&str>, kind: Kind) -> Result<Format> {
     let Some(accept) = accept else { return Ok(Format::Png) };
@@ -199,10 +189,9 @@ fn negotiate(accept: Option<&str>, kind: Kind) -> Result<Format> {
         }
     }
     best.map(|(_, format)| format).ok_or_else(|| {
-        let shown: String = accept.chars().take(80).collect();
         Error::invalid(format!(
-            "Accept is {shown:?}; a kind={} picture can be image/png{}{}, application/x-npy",
-            kind,
+            "Accept is {:?}; a kind={kind} picture can be image/png{}{}, application/x-npy",
+            short(accept),
             if lossy { ", image/jpeg" } else { "" },
             if kind == Kind::Depth { "" } else { ", image/webp" },
         ))
@@ -213,33 +202,16 @@ fn quoted(etag: &str) -> String {
     format!("\"{etag}\"")
 }
 
+/// The answer to a caller that has the file of this tag.
+fn not_modified(headers: &HeaderMap, etag: &str) -> Option<Response> {
+    let etag = quoted(etag);
+    let has = matches_etag(text_of(headers, "if-none-match")?, &etag);
+    has.then(|| (StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response())
+}
+
 fn matches_etag(known: &str, etag: &str) -> bool {
     known
         .split(',')
         .map(|tag| tag.trim().trim_start_matches("W/"))
         .any(|tag| tag == "*" || tag == etag)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn accept_chooses_by_weight_and_depth_is_never_lossy() {
-        let pick = |accept, kind| negotiate(Some(accept), kind).ok();
-        assert_eq!(pick("image/jpeg", Kind::Color), Some(Format::Jpeg));
-        assert_eq!(pick("image/png;q=0.5, image/webp", Kind::Color), Some(Format::Webp));
-        assert_eq!(pick("image/avif,image/webp,*/*;q=0.8", Kind::Depth), Some(Format::Png));
-        assert_eq!(pick("application/x-npy", Kind::Depth), Some(Format::Npy));
-        assert_eq!(pick("text/html", Kind::Color), None);
-        assert_eq!(pick("image/png;q=0", Kind::Color), None);
-        assert_eq!(negotiate(None, Kind::Color).unwrap(), Format::Png);
-    }
-
-    #[test]
-    fn etags_match_lists_weak_tags_and_the_star() {
-        assert!(matches_etag("\"a\", W/\"b\"", "\"b\""));
-        assert!(matches_etag("*", "\"b\""));
-        assert!(!matches_etag("\"bb\"", "\"b\""));
-    }
 }

@@ -17,9 +17,9 @@ use utoipa::IntoParams;
 
 use super::{
     error::ApiError,
-    extract::{Called, Id},
+    extract::{CallerApi, Id},
     fields::Fields,
-    receive::{UploadForm, receive},
+    multipart::{UploadForm, read_upload},
 };
 use crate::{
     api::{Api, request_id, upload::check_bundle},
@@ -50,14 +50,14 @@ pub(super) struct CreateParams {
     )
 )]
 pub(super) async fn create(
-    Called(api): Called,
+    CallerApi(api): CallerApi,
     mut fields: Fields,
     request: Request,
 ) -> Result<Response, ApiError> {
     let idempotency_key = idempotency_key(request.headers())?;
     let request_id = request.headers().get(request_id::HEADER);
     let request_id = request_id.and_then(|id| id.to_str().ok()).map(str::to_owned);
-    let (upload, _guard) = receive(&api, request, &mut fields).await?;
+    let (upload, _guard) = read_upload(&api, request, &mut fields).await?;
     let (options, wait) = options(&api, fields)?;
     let request = CreateScene { upload, options, idempotency_key, wait, request_id };
     let created = api.service.create_scene(request).await?;
@@ -92,7 +92,10 @@ fn server_timing(stages: &[StageTime]) -> String {
     get, path = "/v1/scenes", operation_id = "list_scenes", tag = "scenes", params(PageRequest),
     responses((status = 200, description = "A page, newest first", body = Page))
 )]
-pub(super) async fn list(Called(api): Called, mut fields: Fields) -> Result<Json<Page>, ApiError> {
+pub(super) async fn list(
+    CallerApi(api): CallerApi,
+    mut fields: Fields,
+) -> Result<Json<Page>, ApiError> {
     let page: PageRequest = fields.take()?;
     fields.finish()?;
     Ok(Json(api.service.list(&page).await?))
@@ -104,7 +107,7 @@ pub(super) async fn list(Called(api): Called, mut fields: Fields) -> Result<Json
     responses((status = 200, description = "The scene", body = SceneStatus))
 )]
 pub(super) async fn get(
-    Called(api): Called,
+    CallerApi(api): CallerApi,
     Id(id): Id,
     fields: Fields,
 ) -> Result<Json<SceneStatus>, ApiError> {
@@ -118,7 +121,7 @@ pub(super) async fn get(
     params(Id), responses((status = 204, description = "Gone"))
 )]
 pub(super) async fn delete(
-    Called(api): Called,
+    CallerApi(api): CallerApi,
     Id(id): Id,
     fields: Fields,
 ) -> Result<StatusCode, ApiError> {
@@ -137,7 +140,7 @@ pub(super) async fn delete(
     ))
 )]
 pub(super) async fn events(
-    Called(api): Called,
+    CallerApi(api): CallerApi,
     Id(id): Id,
     fields: Fields,
 ) -> Result<Sse<impl Stream<Item = Result<sse::Event, Infallible>>>, ApiError> {

@@ -1,4 +1,4 @@
-//! One port for both doors: plain or TLS, and an orderly end.
+//! One port for HTTP and gRPC, plain or TLS, and an orderly end.
 
 use std::{future::Future, pin::pin, time::Duration};
 
@@ -14,16 +14,16 @@ use crate::{api::Api, config::Config, error::Result, service::Service};
 /// How long connections without a call may take to close.
 const CLOSING: Duration = Duration::from_millis(200);
 
-/// Both doors, ready to be served. Cloning shares everything.
+/// HTTP and gRPC, ready to be served. Cloning shares everything.
 #[derive(Clone, Debug)]
-pub struct Doors {
+pub struct Server {
     api: Api,
     app: Router,
     tls: Option<Tls>,
 }
 
-impl Doors {
-    /// The doors of `service`: keys, certificate and limits of its configuration.
+impl Server {
+    /// Serves `service` with the keys, the certificate and the limits of its configuration.
     ///
     /// # Errors
     /// `invalid_request` when keys, certificate or origins cannot be used.
@@ -36,7 +36,7 @@ impl Doors {
         Ok(Self { app: app(&api)?, api, tls })
     }
 
-    /// Puts keys, limits and certificate of `config` in force. What is wrong changes nothing.
+    /// Puts keys, limits and certificate of `config` in force. On an error the old ones stay.
     ///
     /// # Errors
     /// `invalid_request` when keys or certificate cannot be used.
@@ -70,18 +70,6 @@ impl Doors {
     }
 }
 
-/// Serves both doors of `service` on `listener` until `stop` resolves.
-///
-/// # Errors
-/// As [`Doors::new`] and [`Doors::serve`].
-pub async fn serve(
-    listener: TcpListener,
-    service: Service,
-    stop: impl Future<Output = ()> + Send + 'static,
-) -> Result<()> {
-    Doors::new(service)?.serve(listener, stop).await
-}
-
 async fn run<L: Listener>(
     mut listener: L,
     app: Router,
@@ -104,25 +92,25 @@ async fn run<L: Listener>(
     }
     drop((listener, stopped));
     stopping.send_replace(true);
-    // Calls that are still open were told of their end before.
+    // The open calls had `drain_ms` to end.
     let _ = tokio::time::timeout(CLOSING, stopping.closed()).await;
     Ok(())
 }
 
-/// First not ready, then nobody new, then those inside leave.
+/// First the server is not ready, then it refuses new calls, then it waits for the open ones.
 async fn drain(api: &Api) {
     let config = api.service.config();
-    api.life.stop_being_ready();
+    api.drain.begin();
     if config.drain_notice_ms > 0 {
-        tracing::info!(ms = config.drain_notice_ms, "not ready any more; serving on");
+        tracing::info!(ms = config.drain_notice_ms, "not ready any more; still serving");
         tokio::time::sleep(Duration::from_millis(config.drain_notice_ms)).await;
     }
-    api.life.drain();
-    let inside = api.life.inside();
-    if inside > 0 {
-        tracing::info!(inside, ms = config.drain_ms, "draining");
+    api.drain.refuse_calls();
+    let open_calls = api.drain.open_calls();
+    if open_calls > 0 {
+        tracing::info!(open_calls, ms = config.drain_ms, "draining");
     }
-    if !api.life.empty(Duration::from_millis(config.drain_ms)).await {
-        tracing::warn!(inside = api.life.inside(), "calls are cut off: their time is over");
+    if !api.drain.wait_for_calls(Duration::from_millis(config.drain_ms)).await {
+        tracing::warn!(open_calls = api.drain.open_calls(), "calls are cut off: drain_ms is over");
     }
 }

@@ -1,6 +1,6 @@
-//! TLS in front of both doors: one port, HTTP/1.1, HTTP/2 and gRPC by ALPN.
+//! TLS on the one port: HTTP/1.1, HTTP/2 and gRPC by ALPN.
 //!
-//! Handshakes run beside each other and have a time limit, so that one slow caller holds nobody up.
+//! Handshakes run beside each other and have a time limit, so that a slow caller delays nobody.
 
 use std::{
     fmt, io,
@@ -28,7 +28,7 @@ use crate::{
 
 /// Longest handshake.
 const HANDSHAKE_MAX: Duration = Duration::from_secs(10);
-/// Handshakes at the same time, and connections that wait to be taken after theirs.
+/// Handshakes at the same time, and connections that wait for `accept` after theirs.
 const HANDSHAKES_MAX: usize = 256;
 
 /// The certificate in force. Cloning shares it.
@@ -69,7 +69,7 @@ impl Tls {
         let tls = self.clone();
         tokio::spawn(async move {
             loop {
-                // A place first: who does not get one stays in the system's queue.
+                // A place in the channel first: without one, callers stay in the system's queue.
                 let Ok(place) = to.clone().reserve_owned().await else { return };
                 let (stream, from) = tokio::select! {
                     accepted = listener.accept() => accepted,
@@ -92,16 +92,17 @@ impl Tls {
 
 fn load(config: &Config) -> Result<Option<Arc<ServerConfig>>> {
     let (Some(cert), Some(key)) = (&config.tls_cert, &config.tls_key) else { return Ok(None) };
-    // The messages name the files' roles: what is in the key's file never reaches a log.
+    // The messages name the option: the text of the key's file never reaches a log.
     let wrong = |what: &str, why: String| Error::invalid(format!("{what}: {why}"));
     let chain = CertificateDer::pem_file_iter(cert)
         .and_then(Iterator::collect::<std::result::Result<Vec<_>, _>>)
         .map_err(|e| wrong("tls_cert", e.to_string()))?;
     if chain.is_empty() {
-        return Err(wrong("tls_cert", "no certificate in it".to_owned()));
+        return Err(wrong("tls_cert", "the file holds no certificate".to_owned()));
     }
-    let key = PrivateKeyDer::from_pem_file(key)
-        .map_err(|_| wrong("tls_key", "no private key in PEM can be read from it".to_owned()))?;
+    let key = PrivateKeyDer::from_pem_file(key).map_err(|_| {
+        wrong("tls_key", "the file holds no readable private key in PEM".to_owned())
+    })?;
     let mut server = ServerConfig::builder_with_provider(Arc::new(ring::default_provider()))
         .with_safe_default_protocol_versions()
         .map_err(|e| Error::internal("TLS cannot be set up").caused_by(e))?
@@ -126,7 +127,7 @@ impl Listener for TlsListener {
     async fn accept(&mut self) -> (Self::Io, Self::Addr) {
         match self.ready.recv().await {
             Some(ready) => ready,
-            // The task that fills it ends with this receiver alone.
+            // The task that sends ends only after this receiver.
             None => std::future::pending().await,
         }
     }

@@ -6,6 +6,7 @@ use std::{
 };
 
 use axum::{
+    Extension,
     body::{Body, Bytes},
     http::{HeaderMap, header},
     response::{IntoResponse, Response},
@@ -16,10 +17,10 @@ use utoipa::ToSchema;
 use zip::{CompressionMethod, ZipWriter, write::SimpleFileOptions};
 
 use super::{
-    edge::Deadline,
     error::ApiError,
-    extract::{Called, Id, JsonBody},
+    extract::{CallerApi, Id, JsonBody},
     fields::Fields,
+    middleware::{Deadline, text_of},
     render::{camera, content_type, view_headers},
 };
 use crate::{
@@ -79,37 +80,28 @@ impl ViewsBody {
     ))
 )]
 pub(super) async fn views(
-    Called(api): Called,
+    CallerApi(api): CallerApi,
     Id(id): Id,
-    deadline: Deadline,
+    Extension(Deadline(deadline)): Extension<Deadline>,
     headers: HeaderMap,
     params: Fields,
     JsonBody(body): JsonBody,
 ) -> Result<Response, ApiError> {
     params.finish()?;
     let ViewsBody { spec, container } = ViewsBody::of(body)?;
-    let container = container.unwrap_or_else(|| accepted(&headers));
-    let options = ViewOptions { deadline: deadline.0, ..spec.options };
+    let wants_zip = text_of(&headers, "accept").is_some_and(|a| a.contains("application/zip"));
+    let accepted = if wants_zip { Container::Zip } else { Container::Multipart };
+    let options = ViewOptions { deadline, ..spec.options };
     let spec = ViewsSpec { options, ..spec };
     let pictures = api.service.render_many(&id, &spec).await?.boxed();
-    Ok(match container {
-        Container::Multipart => {
-            let kind = format!("multipart/mixed; boundary={BOUNDARY}");
-            ([(header::CONTENT_TYPE, kind)], Body::from_stream(multipart(pictures))).into_response()
-        }
-        Container::Zip => {
-            let kind = "application/zip".to_owned();
-            ([(header::CONTENT_TYPE, kind)], Body::from_stream(zip(pictures))).into_response()
-        }
-    })
-}
-
-fn accepted(headers: &HeaderMap) -> Container {
-    let accept = headers.get(header::ACCEPT).and_then(|value| value.to_str().ok());
-    match accept {
-        Some(accept) if accept.contains("application/zip") => Container::Zip,
-        _ => Container::Multipart,
-    }
+    let (kind, body) = match container.unwrap_or(accepted) {
+        Container::Multipart => (
+            format!("multipart/mixed; boundary={BOUNDARY}"),
+            Body::from_stream(multipart(pictures)),
+        ),
+        Container::Zip => ("application/zip".to_owned(), Body::from_stream(zip(pictures))),
+    };
+    Ok(([(header::CONTENT_TYPE, kind)], body).into_response())
 }
 
 /// `view-003-depth.png`
@@ -131,15 +123,13 @@ fn multipart(
             Ok(view) => {
                 let headers = view_headers(&view);
                 for (name, value) in &headers {
-                    part.extend_from_slice(name.as_str().as_bytes());
-                    part.extend_from_slice(b": ");
-                    part.extend_from_slice(value.as_bytes());
-                    part.extend_from_slice(b"\r\n");
+                    let line = [name.as_str().as_bytes(), b": ", value.as_bytes(), b"\r\n"];
+                    part.extend(line.concat());
                 }
-                let disposition = format!("attachment; filename=\"{}\"", file_name(&view));
-                let length = view.bytes.len();
+                let (name, length) = (file_name(&view), view.bytes.len());
                 let rest = format!(
-                    "content-disposition: {disposition}\r\ncontent-length: {length}\r\n\r\n"
+                    "content-disposition: attachment; filename=\"{name}\"\r\n\
+                     content-length: {length}\r\n\r\n"
                 );
                 part.extend_from_slice(rest.as_bytes());
                 part.extend_from_slice(&view.bytes);
@@ -175,7 +165,7 @@ fn zip(
                 let name = file_name(&view);
                 writer.start_file(&name, stored)?;
                 writer.write_all(&view.bytes)?;
-                index.push(index_entry(&name, &view));
+                index.push(index_row(&name, &view));
                 Ok(Some((outbox.take(), (Some((pictures, writer, index)), outbox))))
             }
             None => {
@@ -188,7 +178,7 @@ fn zip(
     })
 }
 
-fn index_entry(name: &str, view: &RenderedView) -> serde_json::Value {
+fn index_row(name: &str, view: &RenderedView) -> serde_json::Value {
     serde_json::json!({
         "file": name,
         "camera_index": view.camera_index,

@@ -88,9 +88,11 @@ impl TestServer {
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
         let addr = listener.local_addr().expect("a bound listener has an address");
         let (stop, stopped) = oneshot::channel();
-        let served = tokio::spawn(api::serve(listener, service.clone(), async {
-            let _ = stopped.await;
-        }));
+        let of_server = service.clone();
+        let served = tokio::spawn(async move {
+            let stopped = async { drop(stopped.await) };
+            api::Server::new(of_server)?.serve(listener, stopped).await
+        });
         Self { addr, service, place, config, parts, folder, stop, served }
     }
 

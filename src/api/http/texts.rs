@@ -1,16 +1,16 @@
-//! Texts asked of a scene: in 3D, in a view, and of the thing under a pixel.
+//! Texts to a scene: search in 3D and in a view, and names for what is under a pixel.
 
 use std::time::Duration;
 
-use axum::Json;
+use axum::{Extension, Json};
 use serde::Deserialize;
 use utoipa::IntoParams;
 
 use super::{
-    edge::Deadline,
     error::ApiError,
-    extract::{Called, Id, JsonBody},
+    extract::{CallerApi, Id, JsonBody},
     fields::Fields,
+    middleware::Deadline,
     render::camera,
 };
 use crate::{
@@ -18,16 +18,16 @@ use crate::{
     service::{CameraFields, PickSpec, Picked, QueryAnswer, QuerySpec, ViewOptions},
 };
 
-/// Ask a scene texts: where is each, in 3D and in a view
+/// Search a scene by texts, in 3D and in a view
 #[utoipa::path(
     post, path = "/v1/scenes/{id}/query", operation_id = "query", tag = "texts",
     params(Id), request_body = QuerySpec,
     responses((status = 200, description = "What each text found", body = QueryAnswer))
 )]
 pub(super) async fn query(
-    Called(api): Called,
+    CallerApi(api): CallerApi,
     Id(id): Id,
-    deadline: Deadline,
+    Extension(Deadline(deadline)): Extension<Deadline>,
     params: Fields,
     JsonBody(mut body): JsonBody,
 ) -> Result<Json<QueryAnswer>, ApiError> {
@@ -37,18 +37,18 @@ pub(super) async fn query(
     let spec = QuerySpec {
         texts: f.value("texts")?.unwrap_or_default(),
         camera: of_view.map(|fields| camera(fields, "camera")).transpose()?,
-        options: ViewOptions { deadline: deadline.0, ..f.take()? },
+        options: ViewOptions { deadline, ..f.take()? },
         boxes: f.value("boxes")?.unwrap_or_default(),
         mask: f.value("mask")?.unwrap_or_default(),
         relevancy: f.value("relevancy")?.unwrap_or_default(),
         profile: f.value("profile")?.unwrap_or_default(),
-        wait: f.millis("wait_ms")?,
+        wait: f.value("wait_ms")?.map(Duration::from_millis),
     };
     body.finish()?;
     Ok(Json(api.service.query(&id, spec).await?))
 }
 
-/// A pixel, and the texts to name what lies under it with.
+/// A pixel, and texts that may name what is under it.
 #[derive(Debug, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 pub(super) struct PickParams {
@@ -56,7 +56,7 @@ pub(super) struct PickParams {
     x: f64,
     /// Down, pixels of the picture.
     y: f64,
-    /// A text to name the entry with; may be given many times.
+    /// A text that may name the entry; may be given many times.
     #[serde(default)]
     label: Vec<String>,
     /// How labels are scored: `default`, or `paper`.
@@ -67,16 +67,16 @@ pub(super) struct PickParams {
     wait_ms: Option<u64>,
 }
 
-/// What lies under a pixel of a view
+/// What is under a pixel of a view
 #[utoipa::path(
     get, path = "/v1/scenes/{id}/pick", operation_id = "pick", tag = "texts",
     params(Id, PickParams, CameraFields, ViewOptions),
-    responses((status = 200, description = "What lies under the pixel", body = Picked))
+    responses((status = 200, description = "What is under the pixel", body = Picked))
 )]
 pub(super) async fn pick(
-    Called(api): Called,
+    CallerApi(api): CallerApi,
     Id(id): Id,
-    deadline: Deadline,
+    Extension(Deadline(deadline)): Extension<Deadline>,
     mut fields: Fields,
 ) -> Result<Json<Picked>, ApiError> {
     let f = &mut fields;
@@ -88,7 +88,7 @@ pub(super) async fn pick(
         camera,
         x,
         y,
-        options: ViewOptions { deadline: deadline.0, ..f.take()? },
+        options: ViewOptions { deadline, ..f.take()? },
         labels: label,
         profile,
         wait: wait_ms.map(Duration::from_millis),

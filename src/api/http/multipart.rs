@@ -13,23 +13,23 @@ use axum::{
 use futures_util::{Stream, StreamExt, stream};
 use utoipa::ToSchema;
 
-use super::{error::ApiError, fields::Fields};
+use super::{error::ApiError, fields::Fields, middleware::text_of};
 use crate::{
     api::{
-        Api,
+        Api, short,
         upload::{UploadBuilder, UploadGuard},
     },
     error::{Error, Result},
     scene::{Upload, UploadCameras},
 };
 
-/// What is still read of an upload already refused, so that the caller sees the answer.
+/// Bytes still read of an upload that was refused, so that the caller gets the answer.
 const DRAIN_BYTES_MAX: usize = 512 << 20;
 /// How long that may take.
 const DRAIN_TIME_MAX: Duration = Duration::from_secs(20);
-/// Bytes that may come without the head of a part, or its next bytes, among them.
+/// Bytes that may come before the next head of a part or the next bytes of a part.
 const HEAD_BYTES_MAX: usize = 1 << 20;
-/// Longest text option.
+/// Longest option as a text part.
 const OPTION_BYTES_MAX: usize = 256;
 /// Options that may come as text parts as well as in the query string.
 const OPTIONS: [&str; 5] = ["semantics", "bundle", "max_views", "density", "wait_ms"];
@@ -54,49 +54,44 @@ pub(super) struct UploadForm {
 }
 
 /// Reads the parts of `request`; text parts that are options go to `fields`.
-pub(super) async fn receive(
+pub(super) async fn read_upload(
     api: &Api,
     request: Request,
     fields: &mut Fields,
 ) -> Result<(Upload, UploadGuard), ApiError> {
     let limits = api.service.limits();
-    let length = request
-        .headers()
-        .get("content-length")
-        .and_then(|value| value.to_str().ok())
-        .and_then(|value| value.parse::<usize>().ok());
-    let room_in_queue = api.service.has_room(request.headers().contains_key("idempotency-key"));
-    let (wire, request) = Wire::of(request);
+    let length = text_of(request.headers(), "content-length");
+    let length = length.and_then(|value| value.parse::<usize>().ok());
+    let has_room = api.service.has_room(request.headers().contains_key("idempotency-key"));
+    let (body, request) = WatchedBody::of(request);
     let form = Multipart::from_request(request, api).await;
     // Parts' headers come on top of their bytes.
-    let room = limits.upload_bytes_max + (1 << 20);
-    let received = match length {
-        Some(length) if length > room => Err(Error::limit(
+    let max = limits.upload_bytes_max + (1 << 20);
+    let read = match (length, has_room, form) {
+        (Some(length), ..) if length > max => Err(Error::limit(
             "upload",
             format!("{length} bytes"),
             format!("{} bytes", limits.upload_bytes_max),
         )),
-        _ => match (room_in_queue, form) {
-            (Ok(()), Ok(mut form)) => parts(api, &mut form, fields, &wire).await,
-            (Err(full), Ok(_)) => Err(full),
-            (_, Err(_)) => Err(Error::invalid(
-                "body: not multipart/form-data with a boundary; send photos as parts",
-            )),
-        },
+        (_, _, Err(_)) => Err(Error::invalid(
+            "body: not multipart/form-data with a boundary; send photos as parts",
+        )),
+        (_, Err(full), _) => Err(full),
+        (_, Ok(()), Ok(mut form)) => parts(api, &mut form, fields, &body).await,
     };
-    let received = received.map_err(|error| wire.too_long().unwrap_or(error));
-    if received.is_err() {
-        read_on(stream::poll_fn(move |context| wire.lock().0.poll_next_unpin(context)));
+    let read = read.map_err(|error| body.too_long().unwrap_or(error));
+    if read.is_err() {
+        read_on(stream::poll_fn(move |context| body.lock().0.poll_next_unpin(context)));
     }
-    Ok(received?)
+    Ok(read?)
 }
 
-/// Reads the rest of a refused body and forgets it, after the answer: closing a connection with
-/// unread bytes resets it, and the answer is lost with it.
+/// Reads the rest of a refused body after the answer and drops it: a connection that is closed with
+/// unread bytes is reset, and the caller does not get the answer.
 pub(super) fn read_on(
     mut rest: impl Stream<Item = std::result::Result<Bytes, axum::Error>> + Send + Unpin + 'static,
 ) {
-    let forgotten = async move {
+    let dropped = async move {
         let mut read = 0;
         while let Some(Ok(piece)) = rest.next().await {
             read += piece.len();
@@ -105,21 +100,21 @@ pub(super) fn read_on(
             }
         }
     };
-    tokio::spawn(tokio::time::timeout(DRAIN_TIME_MAX, forgotten));
+    tokio::spawn(tokio::time::timeout(DRAIN_TIME_MAX, dropped));
 }
 
 async fn parts(
     api: &Api,
     form: &mut Multipart,
     fields: &mut Fields,
-    wire: &Wire,
+    body: &WatchedBody,
 ) -> Result<(Upload, UploadGuard)> {
     let limits = api.service.limits();
     let mut upload = UploadBuilder::new(&limits, &api.uploads);
     let mut options = OPTIONS.to_vec();
     loop {
         let Some(mut field) = form.next_field().await.map_err(broken)? else { break };
-        wire.progressed();
+        body.progressed();
         let name = field.name().unwrap_or_default().to_owned();
         match name.as_str() {
             "transforms" => upload.begin_cameras(UploadCameras::Transforms(Vec::new()))?,
@@ -131,33 +126,33 @@ async fn parts(
                     return Err(Error::invalid(format!("upload: {option} is given twice")));
                 };
                 fields.push(options.swap_remove(at), text(&mut field).await?);
-                wire.progressed();
+                body.progressed();
                 continue;
             }
             _ => upload.begin_photo(&photo_name(&name, field.file_name())?)?,
         }
         while let Some(piece) = field.chunk().await.map_err(broken)? {
-            wire.progressed();
+            body.progressed();
             upload.extend(&piece)?;
         }
     }
     upload.finish()
 }
 
-/// A body on its way to the form's reader, which keeps what belongs to no part yet: a part's head
-/// without end would fill the memory outside of every budget, and be searched from its start at
-/// each piece.
+/// A body, and the bytes since the last part began or went on. The reader of the form keeps bytes
+/// that belong to no part yet: a part's head without end would fill the memory outside of every
+/// budget, and each piece would search it from its start.
 #[derive(Clone)]
-struct Wire(Arc<Mutex<(BodyDataStream, usize)>>);
+struct WatchedBody(Arc<Mutex<(BodyDataStream, usize)>>);
 
-impl Wire {
-    /// The request with its body watched. The reader takes all that is there before it looks at
-    /// any of it: after each piece it is told that there is no more just now.
+impl WatchedBody {
+    /// The request with its body watched. The reader takes all bytes that are there before it looks
+    /// at them: after each piece this body says that there are no more just now.
     fn of(request: Request) -> (Self, Request) {
         let (parts, body) = request.into_parts();
-        let wire = Self(Arc::new(Mutex::new((body.into_data_stream(), 0))));
-        let (of_body, mut taken) = (wire.clone(), false);
-        let paced = stream::poll_fn(move |context| {
+        let watched = Self(Arc::new(Mutex::new((body.into_data_stream(), 0))));
+        let (of_body, mut taken) = (watched.clone(), false);
+        let pieces = stream::poll_fn(move |context| {
             if of_body.too_long().is_some() {
                 return Poll::Ready(Some(Err(axum::Error::new("too long"))));
             }
@@ -173,7 +168,7 @@ impl Wire {
             }
             Poll::Ready(piece)
         });
-        (wire, Request::from_parts(parts, Body::from_stream(paced)))
+        (watched, Request::from_parts(parts, Body::from_stream(pieces)))
     }
 
     fn lock(&self) -> MutexGuard<'_, (BodyDataStream, usize)> {
@@ -192,8 +187,8 @@ impl Wire {
     }
 }
 
-/// A photo is named by its part where that has an extension, else by its file. A part with neither
-/// is no photo.
+/// The name of a photo is that of its part where it has an extension, else that of its file. A part
+/// with neither is no photo.
 fn photo_name(part: &str, file: Option<&str>) -> Result<String> {
     match file.filter(|file| !file.is_empty()) {
         _ if part.contains('.') => Ok(part.to_owned()),
@@ -203,14 +198,12 @@ fn photo_name(part: &str, file: Option<&str>) -> Result<String> {
         }
         // Its length is refused with the bound.
         None if part.len() > OPTION_BYTES_MAX => Ok(part.to_owned()),
-        None => {
-            let shown: String = part.chars().take(40).collect();
-            Err(Error::invalid(format!(
-                "upload: unknown part {shown:?}; there are transforms, cameras, archive, {}, and \
-                 photos, each with the name of its file",
-                OPTIONS.join(", ")
-            )))
-        }
+        None => Err(Error::invalid(format!(
+            "upload: unknown part {:?}; there are transforms, cameras, archive, {}, and photos, \
+             each with the name of its file",
+            short(part),
+            OPTIONS.join(", ")
+        ))),
     }
 }
 
@@ -230,22 +223,4 @@ async fn text(field: &mut Field<'_>) -> Result<String> {
 fn broken(error: axum::extract::multipart::MultipartError) -> Error {
     Error::invalid(format!("upload: the multipart body is damaged: {}", error.body_text()))
         .caused_by(error)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn photos_are_named_by_their_part_or_file() {
-        for (part, file, name) in [
-            ("images/a.png", Some("local.png"), "images/a.png"),
-            ("photo", Some("a.png"), "a.png"),
-            ("a.png", None, "a.png"),
-        ] {
-            assert_eq!(photo_name(part, file).unwrap(), name, "{part} {file:?}");
-        }
-        assert!(photo_name("", None).is_err());
-        assert!(photo_name("semantcs", None).unwrap_err().message().contains("density"));
-    }
 }

@@ -1,0 +1,334 @@
+//! What every call passes on its way in and out: request id, deadline, key, error body, log line.
+
+use std::{
+    sync::{Arc, atomic::Ordering},
+    time::{Duration, Instant},
+};
+
+use axum::{
+    body::Body,
+    extract::{Request, State},
+    http::{HeaderMap, HeaderValue, StatusCode, header, uri::Authority},
+    middleware::Next,
+    response::{IntoResponse, Response},
+};
+use tracing::{Instrument, Span, field::Empty};
+
+use super::{
+    body::{Pace, hold},
+    error::ApiError,
+};
+use crate::{
+    api::{Api, access, access::Access, grpc, log_error, request_id, short},
+    error::{Error, ErrorCode, Result},
+    keys::Scope,
+    telemetry::{self, meter},
+};
+
+/// The caller's own deadline, for handlers that hand it on.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Deadline(pub(super) Option<Duration>);
+
+/// How a call came in, which decides how errors go out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Transport {
+    Http,
+    Grpc,
+}
+
+impl Transport {
+    /// Name in metrics.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Http => "http",
+            Self::Grpc => "grpc",
+        }
+    }
+
+    /// The answer of an error. [`around`] logs it and writes HTTP's body.
+    pub(super) fn refusal(self, error: Error) -> Response {
+        let error = ApiError::from(error);
+        match self {
+            Self::Http => error.into_response(),
+            Self::Grpc => {
+                let mut response = grpc::refusal(error.error()).map(Body::new);
+                response.extensions_mut().insert(error);
+                response
+            }
+        }
+    }
+
+    fn deadline(self, request: &Request) -> Result<Option<Duration>> {
+        match self {
+            Self::Http => deadline_of_query(request.uri().query()),
+            Self::Grpc => Ok(deadline_of_grpc(request.headers())),
+        }
+    }
+}
+
+/// What [`around`] works with.
+pub(super) type Around = (Transport, Arc<Access>, Pace);
+
+/// Name of the call that gave an answer, for metrics.
+#[derive(Clone, Copy, Debug)]
+struct Call(&'static str);
+
+/// Around every call.
+pub(super) async fn around(
+    State(state): State<Around>,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    let id = text_of(request.headers(), request_id::HEADER);
+    let id = request_id::accept(id);
+    let (method, path) = (request.method(), request.uri().path());
+    let span = match state.0 {
+        Transport::Http => {
+            tracing::info_span!("http", %method, path, request_id = id, key = Empty)
+        }
+        Transport::Grpc => tracing::info_span!("grpc", path, request_id = id, key = Empty),
+    };
+    // The call becomes a part of the caller's own trace.
+    if let Some(parent) = text_of(request.headers(), "traceparent") {
+        telemetry::follow(&span, parent);
+    }
+    set(request.headers_mut(), request_id::HEADER, &id);
+    let mut response = within(state, request, next, &id).instrument(span).await;
+    set(response.headers_mut(), request_id::HEADER, &id);
+    set(response.headers_mut(), header::X_CONTENT_TYPE_OPTIONS.as_str(), "nosniff");
+    response
+}
+
+async fn within(
+    (transport, access, pace): Around,
+    request: Request,
+    next: Next,
+    id: &str,
+) -> Response {
+    let started = Instant::now();
+    let path = request.uri().path().to_owned();
+    let (mut request, too_slow) = pace.watch(request);
+    let allowed = access.check_hosts(hosts_of(&request));
+    let mut response = match allowed.and_then(|()| transport.deadline(&request)) {
+        Err(error) => transport.refusal(error),
+        Ok(deadline) => {
+            request.extensions_mut().insert(Deadline(deadline));
+            let max = deadline.unwrap_or(Duration::MAX);
+            let answered = tokio::time::timeout(max, next.run(request)).await;
+            answered.unwrap_or_else(|_| transport.refusal(deadline_passed(max)))
+        }
+    };
+    if too_slow.load(Ordering::Acquire)
+        && (transport == Transport::Grpc || !response.status().is_success())
+    {
+        response = transport.refusal(pace.error());
+    }
+    let call = match transport {
+        Transport::Grpc => {
+            grpc::complete(response.headers_mut());
+            access::of_rpc(&path).0
+        }
+        Transport::Http => {
+            if response.extensions().get::<ApiError>().is_none() && is_bare_refusal(&response) {
+                response = with_our_body(&response);
+            }
+            response.extensions().get::<Call>().map_or(access::OTHER, |Call(name)| name)
+        }
+    };
+    let took = started.elapsed();
+    let ms = took.as_secs_f64() * 1e3;
+    let error = response.extensions_mut().remove::<ApiError>();
+    let code = error.as_ref().map(|error| error.error().code().name());
+    let code = code.or_else(|| text_of(response.headers(), "segsplat-code")).unwrap_or("ok");
+    meter::answered(transport.name(), call, code, took);
+    if let Some(error) = error {
+        log_error(error.error(), Some(ms));
+        if transport == Transport::Http {
+            response = error.write(response, id);
+        }
+    } else {
+        tracing::debug!(status = response.status().as_u16(), ms, code, "served");
+    }
+    // The whole time goes beside those of the stages.
+    if let Ok(value) = HeaderValue::from_str(&format!("total;dur={ms:.2}")) {
+        response.headers_mut().append("server-timing", value);
+    }
+    response
+}
+
+/// Around each HTTP route: checks origin and key, and says which call it is.
+pub(super) async fn http_guard(
+    State((api, call, scope)): State<(Api, &'static str, Option<Scope>)>,
+    request: Request,
+    next: Next,
+) -> Response {
+    let checked = scope.map_or(Ok(()), |_| check_origin(&api, &request));
+    let mut response = match checked {
+        Ok(()) => admit(&api, Transport::Http, scope, request, next).await,
+        Err(error) => Transport::Http.refusal(error),
+    };
+    response.extensions_mut().insert(Call(call));
+    response
+}
+
+/// Around each gRPC call: checks the key.
+pub(super) async fn grpc_guard(State(api): State<Api>, request: Request, next: Next) -> Response {
+    let (_, scope) = access::of_rpc(request.uri().path());
+    admit(&api, Transport::Grpc, scope, request, next).await
+}
+
+/// Checks the key and counts the call as open, until the answer is sent.
+async fn admit(
+    api: &Api,
+    transport: Transport,
+    scope: Option<Scope>,
+    mut request: Request,
+    next: Next,
+) -> Response {
+    let Some(scope) = scope else { return next.run(request).await };
+    let admitted = api.drain.open_call().and_then(|call| {
+        let shown = request.headers_mut().remove(header::AUTHORIZATION);
+        let shown = shown.as_ref().map(|value| value.to_str().unwrap_or_default());
+        let admission = api.access.admit(shown, scope)?;
+        if let Some(key) = &admission.key {
+            Span::current().record("key", &**key);
+        }
+        request.extensions_mut().insert(admission.caller.clone());
+        Ok((call, admission))
+    });
+    match admitted {
+        Ok(held) => hold(next.run(request).await, held),
+        Err(error) => transport.refusal(error),
+    }
+}
+
+/// Every host that a call names: that of its target, which is `:authority` in HTTP/2, and those of
+/// its `host` headers.
+fn hosts_of(request: &Request) -> impl Iterator<Item = &str> {
+    let named = request.headers().get_all(header::HOST).iter();
+    let named = named.map(|host| host.to_str().unwrap_or("not text"));
+    request.uri().authority().map(Authority::as_str).into_iter().chain(named)
+}
+
+/// Refuses pages of other origins where callers need no key: else a browser on this machine would
+/// let any page of the web call. The origin is compared with an allowed host.
+fn check_origin(api: &Api, request: &Request) -> Result<()> {
+    let Some(origin) = request.headers().get(header::ORIGIN) else { return Ok(()) };
+    if api.access.needs_keys() {
+        return Ok(());
+    }
+    let origin = origin.to_str().unwrap_or_default();
+    let host = text_of(request.headers(), header::HOST.as_str());
+    let host = host.or_else(|| request.uri().authority().map(Authority::as_str));
+    let own = origin.split_once("://").map(|(_, host)| host);
+    let named = &api.service.config().cors_origins;
+    if (own.is_some() && own == host) || named.iter().any(|name| name == "*" || name == origin) {
+        return Ok(());
+    }
+    let message =
+        format!("a page of {:?} calls; to allow it, name it in cors_origins", short(origin));
+    Err(Error::new(ErrorCode::PermissionDenied, message))
+}
+
+/// Whether the caller speaks gRPC.
+pub(super) fn is_grpc(headers: &HeaderMap) -> bool {
+    text_of(headers, "content-type").is_some_and(|value| value.starts_with("application/grpc"))
+}
+
+/// The value of a header, where it is text.
+pub(super) fn text_of<'a>(headers: &'a HeaderMap, name: &str) -> Option<&'a str> {
+    headers.get(name)?.to_str().ok()
+}
+
+fn set(headers: &mut HeaderMap, name: &'static str, text: &str) {
+    if let Ok(value) = HeaderValue::from_str(text) {
+        headers.insert(name, value);
+    }
+}
+
+/// An error status without a body of ours: ours is JSON, the framework's is text.
+fn is_bare_refusal(response: &Response) -> bool {
+    let kind = text_of(response.headers(), "content-type").unwrap_or_default();
+    let status = response.status();
+    (status.is_client_error() || status.is_server_error())
+        && !kind.starts_with("application/json")
+        && !is_grpc(response.headers())
+}
+
+/// Puts a refusal of the framework's own into our shape and keeps its headers.
+fn with_our_body(response: &Response) -> Response {
+    let error = match response.status() {
+        StatusCode::NOT_FOUND | StatusCode::METHOD_NOT_ALLOWED => {
+            Error::new(ErrorCode::NotFound, "no such route or method")
+        }
+        StatusCode::PAYLOAD_TOO_LARGE => {
+            Error::new(ErrorCode::LimitExceeded, "the body is over the limit")
+        }
+        status if status.is_client_error() => {
+            Error::invalid(format!("the request cannot be read ({status})"))
+        }
+        status => Error::internal(format!("the server answered {status}")),
+    };
+    let mut ours = Transport::Http.refusal(error);
+    *ours.status_mut() = response.status();
+    ours.headers_mut().extend(response.headers().clone());
+    ours
+}
+
+fn deadline_passed(deadline: Duration) -> Error {
+    Error::new(
+        ErrorCode::DeadlineExceeded,
+        format!("the call's deadline of {} ms passed", deadline.as_millis()),
+    )
+}
+
+/// `deadline_ms=` of a query string.
+fn deadline_of_query(query: Option<&str>) -> Result<Option<Duration>> {
+    let value =
+        query.unwrap_or_default().split('&').find_map(|pair| pair.strip_prefix("deadline_ms="));
+    let Some(value) = value else { return Ok(None) };
+    match value.parse::<u64>() {
+        Ok(ms) if ms > 0 => Ok(Some(Duration::from_millis(ms))),
+        _ => {
+            let must = "it must be a whole number over 0";
+            Err(Error::invalid(format!("deadline_ms is {:?}; {must}", short(value))))
+        }
+    }
+}
+
+/// `grpc-timeout`: up to eight digits and a unit of H, M, S, m, u or n; others are ignored.
+fn deadline_of_grpc(headers: &HeaderMap) -> Option<Duration> {
+    let text = text_of(headers, "grpc-timeout")?;
+    let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
+    let value: u64 = digits.parse().ok().filter(|_| digits.len() <= 8)?;
+    match unit {
+        "H" => Some(Duration::from_secs(value * 3_600)),
+        "M" => Some(Duration::from_secs(value * 60)),
+        "S" => Some(Duration::from_secs(value)),
+        "m" => Some(Duration::from_millis(value)),
+        "u" => Some(Duration::from_micros(value)),
+        "n" => Some(Duration::from_nanos(value)),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn grpc_timeouts_are_read_in_every_unit_and_nonsense_is_ignored() {
+        let read = |text: &str| {
+            let mut headers = HeaderMap::new();
+            headers.insert("grpc-timeout", HeaderValue::from_str(text).unwrap());
+            deadline_of_grpc(&headers)
+        };
+        assert_eq!(read("2H"), Some(Duration::from_secs(7_200)));
+        assert_eq!(read("3S"), Some(Duration::from_secs(3)));
+        assert_eq!(read("250m"), Some(Duration::from_millis(250)));
+        assert_eq!(read("5u"), Some(Duration::from_micros(5)));
+        for odd in ["", "S", "5", "5x", "-5S", "123456789S"] {
+            assert_eq!(read(odd), None, "{odd}");
+        }
+    }
+}

@@ -1,0 +1,75 @@
+//! Uploads over HTTP that are refused while they are read; messages name the bound.
+
+use reqwest::multipart::{Form, Part};
+
+use crate::common::{
+    doors::{Fault, bytes},
+    server::TestServer,
+};
+
+async fn refused(server: &TestServer, form: Form) -> Fault {
+    let request = crate::common::client().post(server.url("/v1/scenes")).multipart(form);
+    bytes(request.send().await.unwrap()).await.expect_err("refused")
+}
+
+fn file(name: &str, size: usize) -> Part {
+    Part::bytes(vec![b' '; size]).file_name(name.to_owned())
+}
+
+#[tokio::test]
+async fn limits_stop_an_upload_at_the_first_byte_over_and_name_the_bound() {
+    let server = TestServer::with(|config, _| {
+        config.limits.photos_max = 3;
+        config.limits.json_bytes_max = 10;
+        config.limits.upload_bytes_max = 100;
+        config.limits.uploads_bytes_max = 150;
+    })
+    .await;
+    let photos = |count: usize| {
+        (0..count).fold(Form::new(), |form, i| form.part("photo", file(&format!("{i}.png"), 1)))
+    };
+    // The budget holds one of these uploads: their bytes are not counted after the refusal.
+    for _ in 0..3 {
+        for (form, words) in [
+            (Form::new().part("transforms", file("t.json", 11)), ["11 bytes", "10 bytes"]),
+            (photos(4), ["\"3.png\" is number 4", "3 photos"]),
+            (Form::new().part("photo", file("a.png", 101)), ["101 bytes", "100 bytes"]),
+            (Form::new().part("photo", file(&"x".repeat(257), 1)), ["257 bytes", "256 bytes"]),
+        ] {
+            let fault = refused(&server, form).await;
+            assert_eq!(fault.code, "limit_exceeded", "{fault:?}");
+            for word in words {
+                assert!(fault.message.contains(word), "{fault:?} lacks {word}");
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn an_upload_that_cannot_be_a_scene_says_what_is_missing() {
+    let server = TestServer::start().await;
+    let photo = |form: Form, part: &'static str, name: &str| form.part(part, file(name, 1));
+    let plain = || Form::new().percent_encode_noop();
+    let cameras = || Form::new().text("cameras", "{}");
+    for (form, word) in [
+        (Form::new().text("density", "full"), "no photos"),
+        (photo(photo(Form::new(), "photo", "a.png"), "photo", "a.png"), "\"a.png\" was sent twice"),
+        (photo(Form::new(), "photo", "a.png"), "no camera description"),
+        (photo(cameras(), "photo", "a.png"), "1 photo; a scene needs at least 2"),
+        (cameras().text("transforms", "{}"), "camera description given twice"),
+        (cameras().part("archive", file("a.zip", 1)), "its own camera description"),
+        (photo(Form::new().part("archive", file("a.zip", 1)), "p", "a.png"), "its own photos"),
+        // A photo is named by its part where that has an extension, else by its file.
+        (
+            photo(photo(plain(), "images/a.png", "b.png"), "images/a.png", "c.png"),
+            "\"images/a.png\" was sent twice",
+        ),
+        (Form::new().text("a.png", "x").text("a.png", "x"), "\"a.png\" was sent twice"),
+        (Form::new().text("", "x"), "a part has no name"),
+        (Form::new().text("density", "full").text("density", "full"), "density is given twice"),
+    ] {
+        let fault = refused(&server, form).await;
+        assert_eq!(fault.code, "invalid_request", "{fault:?}");
+        assert!(fault.message.contains(word), "{fault:?} lacks {word}");
+    }
+}
