@@ -7,34 +7,42 @@ use tower_http::cors::{Any, CorsLayer};
 
 use crate::error::{Error, Result};
 
-/// How long a browser may keep an answer to its preflight question.
+/// How long a browser may keep the answer to its preflight request.
 const MAX_AGE: Duration = Duration::from_secs(600);
+
+/// Headers that a page may send.
+const ALLOWED: [HeaderName; 6] = [
+    HeaderName::from_static("idempotency-key"),
+    HeaderName::from_static("x-request-id"),
+    HeaderName::from_static("traceparent"),
+    header::AUTHORIZATION,
+    header::CONTENT_TYPE,
+    header::IF_NONE_MATCH,
+];
+/// Headers that a page may read.
+const EXPOSED: [HeaderName; 9] = [
+    HeaderName::from_static("x-request-id"),
+    HeaderName::from_static("x-depth-scale"),
+    HeaderName::from_static("x-camera-to-world"),
+    HeaderName::from_static("x-intrinsics"),
+    HeaderName::from_static("server-timing"),
+    HeaderName::from_static("idempotency-replayed"),
+    header::ETAG,
+    header::LOCATION,
+    header::RETRY_AFTER,
+];
 
 /// The rules for these origins, `*` for all; `None` where none is named.
 ///
-/// Keys travel in a header that pages set themselves, never in a cookie, so credentials stay off.
+/// Pages send keys in a header, never in a cookie, so credentials stay off.
 pub(super) fn layer(origins: &[String]) -> Result<Option<CorsLayer>> {
     if origins.is_empty() {
         return Ok(None);
     }
-    let own = |names: &[&'static str]| -> Vec<HeaderName> {
-        names.iter().copied().map(HeaderName::from_static).collect()
-    };
-    let mut allowed = own(&["idempotency-key", "x-request-id", "traceparent"]);
-    allowed.extend([header::AUTHORIZATION, header::CONTENT_TYPE, header::IF_NONE_MATCH]);
-    let mut exposed = own(&[
-        "x-request-id",
-        "x-depth-scale",
-        "x-camera-to-world",
-        "x-intrinsics",
-        "server-timing",
-        "idempotency-replayed",
-    ]);
-    exposed.extend([header::ETAG, header::LOCATION, header::RETRY_AFTER]);
     let rules = CorsLayer::new()
         .allow_methods([Method::GET, Method::POST, Method::DELETE])
-        .allow_headers(allowed)
-        .expose_headers(exposed)
+        .allow_headers(ALLOWED)
+        .expose_headers(EXPOSED)
         .max_age(MAX_AGE);
     if origins.iter().any(|origin| origin == "*") {
         return Ok(Some(rules.allow_origin(Any)));
@@ -51,7 +59,7 @@ fn named(origin: &str) -> Result<HeaderValue> {
     });
     HeaderValue::from_str(origin).ok().filter(|_| plain).ok_or_else(|| {
         Error::invalid(format!(
-            "cors_origins: {origin:?} is no origin; give https://host or https://host:port"
+            "cors_origins: {origin:?} is not an origin; give https://host or https://host:port"
         ))
     })
 }

@@ -48,7 +48,8 @@ impl FromRequestParts<Api> for CallerApi {
     }
 }
 
-/// The fields of a JSON body of at most `limits.json_bytes_max`, whatever its content type says.
+/// The fields of a JSON body of at most `limits.json_bytes_max`, of any content type. Such a call
+/// takes no query parameters.
 #[derive(Clone, Debug)]
 pub(super) struct JsonBody(pub(super) Fields);
 
@@ -57,7 +58,8 @@ impl FromRequest<Api> for JsonBody {
 
     async fn from_request(request: Request, api: &Api) -> Result<Self, ApiError> {
         let limits = api.service.limits();
-        let mut body = request.into_body().into_data_stream();
+        let (mut parts, body) = request.into_parts();
+        let mut body = body.into_data_stream();
         let mut bytes = Vec::new();
         while let Some(piece) = body.next().await {
             let piece: Bytes =
@@ -68,6 +70,8 @@ impl FromRequest<Api> for JsonBody {
             }
             bytes.extend_from_slice(&piece);
         }
+        let Ok(query) = Fields::from_request_parts(&mut parts, api).await;
+        query.finish()?;
         limits.check_json("body", &bytes)?;
         Ok(Self(Fields::of_json(&bytes)?))
     }

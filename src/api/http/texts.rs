@@ -28,10 +28,8 @@ pub(super) async fn query(
     CallerApi(api): CallerApi,
     Id(id): Id,
     Extension(Deadline(deadline)): Extension<Deadline>,
-    params: Fields,
     JsonBody(mut body): JsonBody,
 ) -> Result<Json<QueryAnswer>, ApiError> {
-    params.finish()?;
     let f = &mut body;
     let of_view: Option<CameraFields> = f.value("camera")?;
     let spec = QuerySpec {

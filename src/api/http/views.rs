@@ -84,10 +84,8 @@ pub(super) async fn views(
     Id(id): Id,
     Extension(Deadline(deadline)): Extension<Deadline>,
     headers: HeaderMap,
-    params: Fields,
     JsonBody(body): JsonBody,
 ) -> Result<Response, ApiError> {
-    params.finish()?;
     let ViewsBody { spec, container } = ViewsBody::of(body)?;
     let wants_zip = text_of(&headers, "accept").is_some_and(|a| a.contains("application/zip"));
     let accepted = if wants_zip { Container::Zip } else { Container::Multipart };
