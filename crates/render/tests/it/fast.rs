@@ -1,23 +1,13 @@
 //! `quality=fast`: what it may differ from `exact`, by docs/conventions.md.
 
 use segsplat_core::scene::{Gaussians, RawGaussians};
-use segsplat_render::{
-    Frame, Labels, Quality, RenderRequest, Renderer, compare::psnr, cpu::CpuRenderer,
-};
+use segsplat_render::{Frame, Labels, Quality, RenderRequest, Renderer, cpu::CpuRenderer};
 
-use crate::common::{both_kernels, gpu};
+use crate::common::{both_kernels, colours_apart, gpu};
 use segsplat_testing::scenes::{Random, camera, checked, push, request, two_views};
 
 /// Half a level of 8 bits, and what f32 adds.
 const HALF_LEVEL: f32 = 0.5 / 255.0 + 1e-6;
-
-/// PSNR to colours that are clamped to 0..1, and the share of pixels over two levels of 255.
-pub(crate) fn apart(got: &[[f32; 3]], want: &[[f32; 3]]) -> (f64, f64) {
-    let want: Vec<[f32; 3]> = want.iter().map(|c| c.map(|v| v.clamp(0.0, 1.0))).collect();
-    let far = |(a, b): &(&[f32; 3], &[f32; 3])| (0..3).any(|k| (a[k] - b[k]).abs() > 2.0 / 255.0);
-    let count = got.iter().zip(&want).filter(far).count();
-    (psnr(got, &want, None), count as f64 / want.len() as f64)
-}
 
 /// Both qualities of one view.
 fn both(renderer: &dyn Renderer, gaussians: &Gaussians, ask: &RenderRequest) -> [Frame; 2] {
@@ -93,7 +83,7 @@ fn of_dense_scenes_fast_keeps_its_bound() {
         let (name, (gaussians, camera)) = (format!("{side} x {side}"), two_views(side, 3));
         let [exact, fast] = both(gpu, &gaussians, &request(camera));
         let exact = exact.color.expect("colour");
-        let (psnr, share) = apart(&fast.color.expect("colour"), &exact);
+        let (psnr, share) = colours_apart(&fast.color.expect("colour"), &exact);
         println!("{name}: {psnr:.1} dB, {:.3} % over two levels", 100.0 * share);
         assert!(psnr >= 50.0, "{name}: {psnr:.1} dB");
         assert!(share <= 0.01, "{name}: {share} of the pixels over two levels");

@@ -16,7 +16,7 @@ use segsplat_render::{
     oracle::{self, OraclePixel},
 };
 
-use crate::common::{both_kernels, gpu};
+use crate::common::{both_kernels, colours_apart, gpu};
 use segsplat_testing::{
     compare::{Tolerance, compare, oracle_samples, samples},
     scenes::{Random, camera, checked, cloud, look, request, two_views},
@@ -143,7 +143,7 @@ fn apart(frame: &Frame, view: &View) -> (f64, f64) {
     let got: Vec<[f32; 3]> = view.places.iter().map(|&at| colors[at]).collect();
     let truth: Vec<[f32; 3]> =
         view.truth.iter().map(|pixel| pixel.color.map(|v| v as f32)).collect();
-    crate::fast::apart(&got, &truth)
+    colours_apart(&got, &truth)
 }
 
 #[test]
