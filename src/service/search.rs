@@ -1,8 +1,8 @@
 //! Texts asked of a scene: what views, queries, picks and exports are answered from.
 //!
 //! A [`TextSearch`] keeps what was made for the texts before: embeddings, banks ready to be scored,
-//! connected components, and the weights of views. A [`SceneTexts`] is one scene, the texts asked of
-//! it, and how the bank scores them.
+//! components, and the weights of views. A [`SceneTexts`] is one scene, the texts asked of it, and
+//! how the bank scores them.
 
 use std::{
     collections::HashMap,
