@@ -1,8 +1,8 @@
 //! Texts and scenes: the data that views, queries, picks and exports need.
 //!
 //! A [`Backend`] keeps what earlier texts needed: embeddings, banks ready to be scored, connected
-//! components, and the weights of views. A [`SceneTexts`] is one scene, the texts for it, and how the
-//! bank scores them.
+//! components, and the weights of views. A [`SceneTexts`] is one scene, the texts for it, and how
+//! the bank scores them.
 
 use std::{
     collections::{BTreeSet, HashMap},
