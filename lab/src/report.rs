@@ -75,7 +75,7 @@ fn read(path: &Path) -> Result<String> {
 /// The page with its tables made anew from the files under `root`.
 ///
 /// # Errors
-/// As [`run`].
+/// As `run`.
 pub fn page(root: &Path, old: &str) -> Result<String> {
     let tables: Tables = toml::from_str(&read(&root.join("benches/tables.toml"))?)
         .map_err(|e| Error::invalid("benches/tables.toml").caused_by(e))?;

@@ -1,7 +1,7 @@
 //! Jobs: a bounded queue, workers, progress for watchers, and a way to stop each job.
 //!
 //! A job makes a scene of an upload, or the semantics of a scene. In: an upload, safe in the store
-//! before [`Jobs::submit`] returns. Out: a scene in the store. Invariant: an acknowledged scene is
+//! before `Jobs::submit` returns. Out: a scene in the store. Invariant: an acknowledged scene is
 //! made, fails with a code, or is cancelled, over any restart.
 
 mod job;
