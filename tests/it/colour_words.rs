@@ -4,13 +4,13 @@
 use std::{io::Cursor, path::Path, process::Command};
 
 use image::{Rgb, RgbImage};
-use segsplat::{cli::engine, config::Config, error::ErrorCode, service::Parts};
+use segsplat::{cli::engine, config::Config, service::Parts};
 use serde_json::{Value, json};
 
 use crate::common::{
     doors::{bytes, json as body},
+    opened,
     server::TestServer,
-    skipped,
 };
 
 /// Sides of a photo, focal length in pixels.
@@ -74,14 +74,7 @@ fn form() -> reqwest::multipart::Form {
 
 /// The product's own parts with the fixture's bundle; `None` (said aloud) without ONNX Runtime.
 fn parts(config: &Config) -> Option<Parts> {
-    let parts = engine::parts(config).and_then(|(parts, engine)| engine.get().map(|_| parts));
-    match parts {
-        Err(e) if e.code() == ErrorCode::ModelUnavailable => {
-            skipped(e.message());
-            None
-        }
-        parts => Some(parts.unwrap()),
-    }
+    opened(engine::parts(config).and_then(|(parts, engine)| engine.get().map(|_| parts)))
 }
 
 fn configured(config: &mut Config) {

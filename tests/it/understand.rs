@@ -27,7 +27,7 @@ use segsplat::{
     semantics::Scorer,
 };
 
-use crate::common::skipped;
+use crate::common::opened;
 
 static NO_CANCEL: AtomicBool = AtomicBool::new(false);
 const SIDE: u32 = 16;
@@ -258,13 +258,7 @@ fn engine(threads: usize) -> Option<Pipeline> {
     config.bundle = Some(Path::new("tests/fixtures/colours").to_owned());
     config.threads = threads;
     config.jobs = 1;
-    match Pipeline::open(&config.networks()) {
-        Err(e) if e.code() == ErrorCode::ModelUnavailable => {
-            skipped(e.message());
-            None
-        }
-        engine => Some(engine.unwrap()),
-    }
+    opened(Pipeline::open(&config.networks()))
 }
 
 fn understood(engine: &Pipeline, wall: &Wall) -> Semantics {

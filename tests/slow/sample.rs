@@ -3,7 +3,6 @@
 use std::sync::atomic::AtomicBool;
 
 use segsplat::{
-    error::ErrorCode,
     models::NetworkOptions,
     pipeline::{self, Pipeline, Reconstruction},
     render::{Kinds, RenderRequest, Renderer, compare::psnr, cpu::CpuRenderer},
@@ -11,7 +10,7 @@ use segsplat::{
     scene::{Density, SceneOptions},
 };
 
-use crate::common::skipped;
+use crate::common::opened;
 
 /// Measured 35.6 dB with the embedded network: the room is of a kind that it was trained on.
 const PSNR_MIN: f64 = 30.0;
@@ -23,13 +22,7 @@ const DEPTH_ERROR_MAX: f64 = 0.03;
 const SAMPLE: SampleOptions = SampleOptions { photos: 2, width: 256, height: 256, seed: 1 };
 
 fn engine() -> Option<Pipeline> {
-    match Pipeline::open(&NetworkOptions::default()) {
-        Err(e) if e.code() == ErrorCode::ModelUnavailable => {
-            skipped(e.message());
-            None
-        }
-        engine => Some(engine.unwrap()),
-    }
+    opened(Pipeline::open(&NetworkOptions::default()))
 }
 
 fn reconstruct(engine: &Pipeline, options: &SceneOptions) -> Reconstruction {

@@ -11,7 +11,7 @@ pub(crate) mod server;
 
 #[allow(unused_imports, reason = "as above")]
 pub(crate) use segsplat_testing::{
-    compare, root, scenes, shared_data, shared_scene, skipped, strict,
+    compare, opened, root, scenes, shared_data, shared_scene, skipped, strict,
 };
 
 /// A client whose TLS has its cryptography.

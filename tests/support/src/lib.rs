@@ -14,6 +14,8 @@ pub mod scenes;
 
 use std::path::{Path, PathBuf};
 
+use segsplat_core::error::{ErrorCode, Result};
+
 /// The repository's root.
 #[must_use]
 pub fn root() -> &'static Path {
@@ -30,6 +32,17 @@ pub fn strict() -> bool {
 pub fn skipped(why: &str) {
     assert!(!strict(), "skipped: {why}; with CI=true that is a failure");
     println!("skipped: {why}");
+}
+
+/// What was opened; `None` where ONNX Runtime or a network is missing, which is then [`skipped`].
+pub fn opened<T>(result: Result<T>) -> Option<T> {
+    match result {
+        Err(e) if e.code() == ErrorCode::ModelUnavailable => {
+            skipped(e.message());
+            None
+        }
+        opened => Some(opened.expect("networks that open")),
+    }
 }
 
 /// The shared photo data: `SEGSPLAT_SHARED_DATA`, else `../shared/data` beside the repository.

@@ -19,7 +19,7 @@ use segsplat_vision::{
     segment::Seed,
 };
 
-use segsplat_testing::{root, skipped};
+use segsplat_testing::{opened, root};
 
 use crate::network_options;
 
@@ -28,13 +28,7 @@ const GREEN: [u8; 3] = [26, 178, 26];
 const GREY: [u8; 3] = [128, 128, 128];
 
 fn runtime() -> Option<Arc<Runtime>> {
-    match Runtime::load(&network_options()) {
-        Err(e) if e.code() == ErrorCode::ModelUnavailable => {
-            skipped(e.message());
-            None
-        }
-        runtime => Some(runtime.unwrap()),
-    }
+    opened(Runtime::load(&network_options()))
 }
 
 fn bundle() -> Bundle {

@@ -13,7 +13,7 @@ use segsplat_vision::{
     models::{Bundle, Geometry, GeometryInput, Runtime},
 };
 
-use segsplat_testing::{root, skipped};
+use segsplat_testing::{opened, root};
 
 use crate::network_options;
 
@@ -24,13 +24,7 @@ static GO_ON: AtomicBool = AtomicBool::new(false);
 
 fn network() -> Option<Geometry> {
     let bundle = Bundle::open(&root().join("tests/fixtures/plane")).unwrap();
-    let runtime = match Runtime::load(&network_options()) {
-        Err(e) if e.code() == ErrorCode::ModelUnavailable => {
-            skipped(e.message());
-            return None;
-        }
-        runtime => runtime.unwrap(),
-    };
+    let runtime = opened(Runtime::load(&network_options()))?;
     Some(Geometry::open(&runtime, &bundle, &network_options()).unwrap())
 }
 

@@ -3,11 +3,8 @@
 
 use std::sync::Arc;
 
-use segsplat_core::{
-    error::ErrorCode,
-    scene::{Crop, PosedPhoto},
-};
-use segsplat_testing::{root, skipped};
+use segsplat_core::scene::{Crop, PosedPhoto};
+use segsplat_testing::{opened, root};
 use segsplat_vision::{
     models::{Bundle, Geometry, GeometryInput, ImageText, MaskNetwork, Runtime},
     sample::{self, Room, SampleOptions, TrueView},
@@ -24,13 +21,7 @@ const MASK_IOU_MIN: f64 = 0.5;
 const NAMED_MIN: usize = 6;
 
 fn runtime() -> Option<Arc<Runtime>> {
-    match Runtime::load(&network_options()) {
-        Err(e) if e.code() == ErrorCode::ModelUnavailable => {
-            skipped(e.message());
-            None
-        }
-        runtime => Some(runtime.unwrap()),
-    }
+    opened(Runtime::load(&network_options()))
 }
 
 fn bundle() -> Bundle {
