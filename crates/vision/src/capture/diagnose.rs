@@ -135,12 +135,10 @@ impl Mistake {
 pub(super) fn warnings(
     photos: &[PosedPhoto],
     views: &[GrayView],
-    found: &[PairFound],
+    (found, answer): (&[PairFound], &Agreement),
     ranges: &Ranges,
     overlap: &mut [Vec<f64>],
-    cancel: &AtomicBool,
 ) -> Result<Vec<Warning>> {
-    let answer = agreement(views, implied_scale(photos), cancel)?;
     if let Some((mistake, corrected)) = answer.mistake {
         let scaled = matches!(mistake, Mistake::Resolution(_));
         let point = if scaled { None } else { principal_point(photos) };
@@ -193,7 +191,7 @@ fn mean_agreement(found: &[PairFound]) -> f64 {
 }
 
 /// How well the photos agree under the given cameras and under the usual mistakes.
-struct Agreement {
+pub(super) struct Agreement {
     /// Agreement under the given cameras.
     given: f64,
     /// Best agreement under a correction that is not called for: what chance gives here.
@@ -203,7 +201,11 @@ struct Agreement {
 }
 
 /// Looks for a mistake that explains the photos far better than the given cameras.
-fn agreement(views: &[GrayView], implied: Option<f64>, cancel: &AtomicBool) -> Result<Agreement> {
+pub(super) fn agreement(
+    photos: &[PosedPhoto],
+    views: &[GrayView],
+    cancel: &AtomicBool,
+) -> Result<Agreement> {
     let views: Vec<GrayView> = views.par_iter().map(|v| v.reduced(AREA)).collect();
     let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
     let asked = witnesses(&cameras)?;
@@ -218,7 +220,7 @@ fn agreement(views: &[GrayView], implied: Option<f64>, cancel: &AtomicBool) -> R
         };
         Ok((mistake, mean_agreement(&pairs::compare_as(&views, &corrected, &asked, cancel)?)))
     };
-    if let Some(scale) = implied {
+    if let Some(scale) = implied_scale(photos) {
         let (mistake, share) = under(Mistake::Resolution(scale))?;
         if share >= ALTERNATIVE_MIN && share >= IMPLIED_RATIO * given {
             return Ok(Agreement { given, rival: share, mistake: Some((mistake, share)) });

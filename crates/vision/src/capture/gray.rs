@@ -1,6 +1,7 @@
 //! The small grey picture of a photo that is compared, and the pixels of it that can be matched.
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 use crate::scene::{Camera, PosedPhoto};
 
@@ -13,6 +14,8 @@ pub(super) const RADIUS: usize = 3;
 /// Least standard deviation of a window worth matching, of full scale 1: 4/255 is over the noise
 /// of a compressed photo at this size.
 const TEXTURE_MIN: f32 = 4.0 / 255.0;
+/// Rows of a small picture that one thread averages at a time.
+const ROWS_A_TASK: usize = 8;
 
 /// A photo reduced to grey at matching size, with its camera and its matchable pixels.
 #[derive(Clone, Debug)]
@@ -51,10 +54,11 @@ impl GrayView {
     pub(super) fn new(posed: &PosedPhoto) -> Self {
         let photo = &posed.photo;
         let size = [photo.width as usize, photo.height as usize];
-        let value = |x: usize, y: usize| luma(&photo.rgb[(y * size[0] + x) * 3..][..3]);
-        let valid = photo.valid.as_ref();
-        let hole = valid.map(|valid| |x: usize, y: usize| !valid[y * size[0] + x]);
-        let mut view = Self::averaged(size, AREA, posed.camera, value, hole);
+        let line = |y: usize, into: &mut [f32]| {
+            let pixels = photo.rgb[y * size[0] * 3..].chunks_exact(3);
+            into.iter_mut().zip(pixels).for_each(|(v, rgb)| *v = luma(rgb));
+        };
+        let mut view = Self::averaged(size, AREA, posed.camera, line, photo.valid.as_deref());
         let mean = view.gray.iter().sum::<f32>() / view.gray.len() as f32;
         view.gray.iter_mut().for_each(|v| *v -= mean);
         view.find_candidates();
@@ -63,22 +67,25 @@ impl GrayView {
 
     /// The same view with about `area` pixels, if it has more.
     pub(super) fn reduced(&self, area: f64) -> Self {
-        let value = |x: usize, y: usize| self.gray[y * self.width + x];
-        let valid = self.valid.as_ref();
-        let hole = valid.map(|_| |x: usize, y: usize| self.holes[y * self.width + x]);
+        let line = |y: usize, into: &mut [f32]| {
+            into.copy_from_slice(&self.gray[y * self.width..][..self.width]);
+        };
+        let sourced: Option<Vec<bool>> =
+            self.valid.as_ref().map(|_| self.holes.iter().map(|hole| !hole).collect());
         let size = [self.width, self.height];
-        let mut view = Self::averaged(size, area, self.camera, value, hole);
+        let mut view = Self::averaged(size, area, self.camera, line, sourced.as_deref());
         view.find_candidates();
         view
     }
 
     /// Averages over areas of a picture of `w0` x `h0`, about `area` pixels, without candidates.
+    /// `line` writes a row of the picture; `sourced` says which of its pixels have a source.
     fn averaged(
         [w0, h0]: [usize; 2],
         area: f64,
         camera: Camera,
-        value: impl Fn(usize, usize) -> f32,
-        hole: Option<impl Fn(usize, usize) -> bool>,
+        line: impl Fn(usize, &mut [f32]) + Sync,
+        sourced: Option<&[bool]>,
     ) -> Self {
         let scale = (area / (w0 * h0) as f64).sqrt().min(1.0);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "positive")]
@@ -87,19 +94,27 @@ impl GrayView {
         let (columns, rows) = (spans(w0, width), spans(h0, height));
         let mut gray = vec![0.0_f32; width * height];
         let mut holes = vec![false; width * height];
-        for (y, rows) in rows.iter().enumerate() {
-            for &(row, row_weight) in rows {
-                for (x, columns) in columns.iter().enumerate() {
-                    let at = y * width + x;
-                    let mean: f32 = columns.iter().map(|&(c, weight)| weight * value(c, row)).sum();
-                    gray[at] += row_weight * mean;
-                    if let Some(hole) = &hole {
-                        holes[at] |= columns.iter().any(|&(c, _)| hole(c, row));
+        let out = gray.par_chunks_mut(width).zip(holes.par_chunks_mut(width));
+        out.zip(&rows).with_min_len(ROWS_A_TASK).for_each_init(
+            || vec![0.0_f32; w0],
+            |values, ((gray, holes), rows)| {
+                for &(row, row_weight) in rows {
+                    line(row, values);
+                    for (out, columns) in gray.iter_mut().zip(&columns) {
+                        let mean: f32 = columns.iter().map(|&(c, weight)| weight * values[c]).sum();
+                        *out += row_weight * mean;
+                    }
+                    let Some(sourced) = sourced else { continue };
+                    let sourced = &sourced[row * w0..][..w0];
+                    if sourced.contains(&false) {
+                        for (hole, columns) in holes.iter_mut().zip(&columns) {
+                            *hole |= columns.iter().any(|&(c, _)| !sourced[c]);
+                        }
                     }
                 }
-            }
-        }
-        let valid = hole.map(|_| whole_windows(&holes, width, height));
+            },
+        );
+        let valid = sourced.map(|_| whole_windows(&holes, width, height));
         let intrinsics = camera.intrinsics.resized(width as u32, height as u32);
         let camera = Camera { intrinsics, ..camera };
         let (candidates, row_start) = (vec![], vec![]);

@@ -7,8 +7,8 @@
 //! matchable pixels, under wrong cameras or between strangers on less than 10 %. `diagnose` asks
 //! the same question under the usual mistakes.
 //!
-//! Processor time, measured: 0.06 s for the ranges of two photos, 0.2 s with the diagnosis, 3.3 s
-//! for 24 photos; all of it runs on every core that rayon has.
+//! Processor time, measured with AVX-512: 0.06 s for two photos, 0.9 s for 8, 1.6 s for 24; all of
+//! it runs on every core that rayon has.
 
 mod content;
 mod depth;
@@ -17,6 +17,7 @@ mod gray;
 mod pairs;
 mod sets;
 mod sweep;
+mod warp;
 
 use std::sync::atomic::AtomicBool;
 
@@ -56,13 +57,23 @@ pub fn analyse(photos: &[PosedPhoto], cancel: &AtomicBool) -> Result<Capture> {
     };
     let views: Vec<GrayView> = photos.par_iter().map(view).collect::<Result<_>>()?;
     let neighbours = if views.len() < MANY_PHOTOS { NEIGHBORS } else { NEIGHBORS - 1 };
-    let found = pairs::searched(&views, neighbours, cancel)?;
+    let (found, agreement) = rayon::join(
+        || pairs::searched(&views, neighbours, cancel),
+        || diagnose::agreement(photos, &views, cancel),
+    );
+    let found = found?;
     let points = depth::pooled(&views, &found);
     let ranges = depth::ranges(&views, &points)?;
     let mut overlap = depth::overlap(&views, &points, &found);
     let mut warnings: Vec<Warning> = made_for_warning(photos).into_iter().collect();
     warnings.extend(same_picture(photos, &views)?);
-    warnings.extend(diagnose::warnings(photos, &views, &found, &ranges, &mut overlap, cancel)?);
+    warnings.extend(diagnose::warnings(
+        photos,
+        &views,
+        (&found, &agreement?),
+        &ranges,
+        &mut overlap,
+    )?);
     Ok(Capture { near_far: ranges.near_far, overlap, median_depth: ranges.median_depth, warnings })
 }
 

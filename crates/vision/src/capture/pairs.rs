@@ -143,35 +143,40 @@ pub(super) fn compare(
     pairs: &[[usize; 2]],
     cancel: &AtomicBool,
 ) -> Result<Vec<PairFound>> {
-    let sweeps: Vec<Sweep> = pairs
-        .par_iter()
-        .flat_map(|&[i, j]| [(i, j), (j, i)])
-        .map(|(i, j)| {
-            unless_cancelled(cancel)?;
-            Ok(sweep(&views[i], &views[j], &Relative::new(&views[i], &views[j])))
-        })
-        .collect::<Result<_>>()?;
-    let found = pairs
-        .iter()
-        .zip(sweeps.chunks_exact(2))
-        .map(|(&[i, j], sweeps)| {
-            let (a, b) = (&views[i], &views[j]);
-            let (there, back) = (Relative::new(a, b), Relative::new(b, a));
-            let first = consistent((a, b), (&there, &back), &sweeps[0], &sweeps[1]);
-            let second = consistent((b, a), (&back, &there), &sweeps[1], &sweeps[0]);
-            let matches = [supported(a, &first), supported(b, &second)];
-            let share = |count: usize, of: usize| count as f64 / of.max(1) as f64;
-            PairFound {
-                views: [i, j],
-                agreement: [0, 1].map(|s| share(matches[s].len(), sweeps[s].inside)),
-                at_nearest: [0, 1].map(|s| share(sweeps[s].at_nearest, sweeps[s].inside)),
-                matches,
-                baseline: baseline(&a.camera, &b.camera),
-                angle: angle(&a.camera, &b.camera),
-            }
-        })
-        .collect();
-    Ok(found)
+    // Few sweeps are split over the threads: a thread that waits for parts may begin another sweep,
+    // and each sweep takes megabytes.
+    let split = pairs.len() < rayon::current_num_threads();
+    let one_way = |i: usize, j: usize| {
+        unless_cancelled(cancel)?;
+        let there = Relative::new(&views[i], &views[j]);
+        Ok::<_, Error>((sweep(&views[i], &views[j], &there, split), there))
+    };
+    let both_ways = |&[i, j]: &[usize; 2]| {
+        let (forward, backward) = rayon::join(|| one_way(i, j), || one_way(j, i));
+        Ok(joined([i, j], [&views[i], &views[j]], &[forward?, backward?]))
+    };
+    pairs.par_iter().map(both_ways).collect()
+}
+
+/// What the sweeps of a pair, there and back, say together.
+fn joined(
+    indices: [usize; 2],
+    [a, b]: [&GrayView; 2],
+    [(forward, there), (backward, back)]: &[(Sweep, Relative); 2],
+) -> PairFound {
+    let first = consistent((a, b), (there, back), forward, backward);
+    let second = consistent((b, a), (back, there), backward, forward);
+    let matches = [supported(a, &first), supported(b, &second)];
+    let sweeps = [forward, backward];
+    let share = |count: usize, of: usize| count as f64 / of.max(1) as f64;
+    PairFound {
+        views: indices,
+        agreement: [0, 1].map(|s| share(matches[s].len(), sweeps[s].inside)),
+        at_nearest: [0, 1].map(|s| share(sweeps[s].at_nearest, sweeps[s].inside)),
+        matches,
+        baseline: baseline(&a.camera, &b.camera),
+        angle: angle(&a.camera, &b.camera),
+    }
 }
 
 /// Compares each pair with other cameras in place of the views' own.

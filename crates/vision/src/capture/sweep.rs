@@ -5,8 +5,12 @@
 //! A plane at inverse depth w maps ray r of the first camera to K' (R r + w t) of the second.
 
 use glam::{DMat3, DVec3};
+use rayon::prelude::*;
 
-use super::gray::{GrayView, Grid, RADIUS, STRIDE};
+use super::{
+    gray::{GrayView, Grid},
+    warp::{Lines, Warp, find_best, find_rivals},
+};
 
 /// Nearest plane, in baselines.
 const NEAREST_BASELINES: f64 = 0.45;
@@ -25,14 +29,16 @@ const RIVAL_RATIO_MAX: f32 = 0.75;
 const RIVAL_PLANES: usize = 3;
 /// Largest distance between a pixel and where its match leads back to, pixels.
 const LEFT_RIGHT_PX: f64 = 1.5;
+/// Planes that one thread takes at a time.
+const PLANES_A_TASK: usize = 8;
 
 /// A second camera seen from a first, in pixels of the small pictures.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Relative {
     /// K' R
-    kr: DMat3,
+    pub(super) kr: DMat3,
     /// K' t
-    kt: DVec3,
+    pub(super) kt: DVec3,
     baseline: f64,
 }
 
@@ -67,7 +73,7 @@ impl Relative {
     }
 
     /// Inverse depths from beyond infinity to close by, at most a pixel apart.
-    fn planes(&self, reference: &GrayView, source: &GrayView) -> Vec<f64> {
+    pub(super) fn planes(&self, reference: &GrayView, source: &GrayView) -> Vec<f64> {
         const GRID: usize = 5;
         let mut rays = Vec::with_capacity(GRID * GRID);
         for gy in 0..GRID {
@@ -131,33 +137,18 @@ pub(super) struct Sweep {
     pub(super) at_nearest: usize,
 }
 
-/// Compares `reference` with `source` over all planes.
-pub(super) fn sweep(reference: &GrayView, source: &GrayView, relative: &Relative) -> Sweep {
+/// Compares `reference` with `source` over all planes, on one thread unless `split`.
+pub(super) fn sweep(
+    reference: &GrayView,
+    source: &GrayView,
+    relative: &Relative,
+    split: bool,
+) -> Sweep {
     let planes = relative.planes(reference, source);
     let count = reference.candidates.len();
-    let mut volume = vec![-1.0_f32; planes.len() * count];
-    let mut warp = Warp::new(reference.width);
-    for (&w, scores) in planes.iter().zip(volume.chunks_exact_mut(count.max(1))) {
-        warp.plane(reference, source, relative, w, scores);
-    }
-    let mut best = vec![-1.0_f32; count];
-    let mut best_plane = vec![0_u32; count];
-    for (plane, scores) in volume.chunks_exact(count.max(1)).enumerate() {
-        for ((best, at), &score) in best.iter_mut().zip(&mut best_plane).zip(scores) {
-            if score > *best {
-                *best = score;
-                *at = plane as u32;
-            }
-        }
-    }
-    let mut rival = vec![-1.0_f32; count];
-    for (plane, scores) in volume.chunks_exact(count.max(1)).enumerate() {
-        for ((rival, &at), &score) in rival.iter_mut().zip(&best_plane).zip(scores) {
-            if (at as usize).abs_diff(plane) > RIVAL_PLANES && score > *rival {
-                *rival = score;
-            }
-        }
-    }
+    let volume = scores(reference, source, relative, &planes, split);
+    let (best, best_plane) = find_best(&volume, count);
+    let rival = find_rivals(&volume, &best_plane, RIVAL_PLANES as u32);
     let mut matches = Vec::new();
     let mut at_nearest = 0;
     let inside = best.iter().filter(|&&score| score > -1.0).count();
@@ -205,6 +196,34 @@ pub(super) fn sweep(reference: &GrayView, source: &GrayView, relative: &Relative
     Sweep { matches, inside, at_nearest }
 }
 
+/// `[planes, candidates]` ZNCC; -1 where the window of a candidate leaves `source`.
+fn scores(
+    reference: &GrayView,
+    source: &GrayView,
+    relative: &Relative,
+    planes: &[f64],
+    split: bool,
+) -> Vec<f32> {
+    let count = reference.candidates.len();
+    let mut volume = vec![-1.0_f32; planes.len() * count];
+    let Some(warp) = Warp::new(reference, source, relative).filter(|_| count > 0) else {
+        return volume;
+    };
+    let lines = || Lines::new(reference.width);
+    let run = |lines: &mut Lines, (scores, planes): (&mut [f32], &[f64])| {
+        for (scores, &w) in scores.chunks_exact_mut(count).zip(planes) {
+            warp.plane(w, lines, scores);
+        }
+    };
+    if split {
+        let tasks = volume.par_chunks_mut(count * PLANES_A_TASK);
+        tasks.zip(planes.par_chunks(PLANES_A_TASK)).for_each_init(lines, run);
+    } else {
+        run(&mut lines(), (&mut volume, planes));
+    }
+    volume
+}
+
 /// Keeps the matches that lead back to where they came from.
 pub(super) fn consistent(
     (reference, source): (&GrayView, &GrayView),
@@ -226,164 +245,4 @@ pub(super) fn consistent(
         returned.is_some_and(|(bu, bv)| (bu - x - 0.5).hypot(bv - y - 0.5) <= LEFT_RIGHT_PX)
     };
     forward.matches.iter().filter(leads_back).copied().collect()
-}
-
-/// Buffers of one sweep: the warped rows and the running column sums.
-struct Warp {
-    width: usize,
-    rows: Vec<f32>,
-    ranges: [(usize, usize); 2 * RADIUS + 1],
-    sum: Vec<f32>,
-    squares: Vec<f32>,
-    products: Vec<f32>,
-}
-
-impl Warp {
-    fn new(width: usize) -> Self {
-        Self {
-            width,
-            rows: vec![0.0; width * (2 * RADIUS + 1)],
-            ranges: [(0, 0); 2 * RADIUS + 1],
-            sum: vec![0.0; width],
-            squares: vec![0.0; width],
-            products: vec![0.0; width],
-        }
-    }
-
-    /// ZNCC of every candidate of `reference` under one plane; -1 where its window leaves `source`.
-    fn plane(
-        &mut self,
-        reference: &GrayView,
-        source: &GrayView,
-        relative: &Relative,
-        w: f64,
-        scores: &mut [f32],
-    ) {
-        const SIDE: usize = 2 * RADIUS + 1;
-        let width = self.width;
-        self.sum.fill(0.0);
-        self.squares.fill(0.0);
-        self.products.fill(0.0);
-        self.rows.fill(0.0);
-        self.ranges = [(0, 0); SIDE];
-        for y in 0..reference.height {
-            let slot = y % SIDE;
-            let row = &mut self.rows[slot * width..(slot + 1) * width];
-            if y >= SIDE && self.ranges[slot].0 < self.ranges[slot].1 {
-                let old = &reference.gray[(y - SIDE) * width..(y - SIDE + 1) * width];
-                for x in 0..width {
-                    self.sum[x] -= row[x];
-                    self.squares[x] -= row[x] * row[x];
-                    self.products[x] -= row[x] * old[x];
-                }
-            }
-            let range = warp_row(reference, source, relative, w, y, row);
-            self.ranges[slot] = range;
-            if range.0 < range.1 {
-                let new = &reference.gray[y * width..(y + 1) * width];
-                for x in 0..width {
-                    self.sum[x] += row[x];
-                    self.squares[x] += row[x] * row[x];
-                    self.products[x] += row[x] * new[x];
-                }
-            }
-            if y < 2 * RADIUS || !(y - RADIUS).is_multiple_of(STRIDE) {
-                continue;
-            }
-            let from = self.ranges.iter().map(|r| r.0).max().unwrap_or(0) + RADIUS;
-            let to = self.ranges.iter().map(|r| r.1).min().unwrap_or(0);
-            if from + RADIUS >= to {
-                continue;
-            }
-            self.score_row(reference, (y - RADIUS) / STRIDE, from..to - RADIUS, scores);
-        }
-    }
-
-    fn score_row(
-        &self,
-        reference: &GrayView,
-        grid_row: usize,
-        columns: std::ops::Range<usize>,
-        scores: &mut [f32],
-    ) {
-        let n = ((2 * RADIUS + 1) * (2 * RADIUS + 1)) as f32;
-        let row = reference.row_start[grid_row]..reference.row_start[grid_row + 1];
-        for (c, score) in reference.candidates[row.clone()].iter().zip(&mut scores[row]) {
-            let x = usize::from(c.x);
-            if !columns.contains(&x) {
-                continue;
-            }
-            let window = x - RADIUS..=x + RADIUS;
-            let sum: f32 = self.sum[window.clone()].iter().sum();
-            let squares: f32 = self.squares[window.clone()].iter().sum();
-            let products: f32 = self.products[window].iter().sum();
-            let energy = squares - sum * sum / n;
-            // Under the texture floor of the candidates the score would be noise.
-            let covariance = products - c.mean * sum;
-            let norm = (c.energy * energy.max(0.25 * c.energy.min(0.01))).sqrt();
-            *score = (covariance / norm).clamp(-0.999, 1.0);
-        }
-    }
-}
-
-/// Warps one row of `source` under the plane; returns the columns with a source, others are 0.
-fn warp_row(
-    reference: &GrayView,
-    source: &GrayView,
-    relative: &Relative,
-    w: f64,
-    y: usize,
-    row: &mut [f32],
-) -> (usize, usize) {
-    let start = relative.kr * reference.ray(0.0, y as f64) + relative.kt * w;
-    let step = relative.kr * (reference.ray(1.0, y as f64) - reference.ray(0.0, y as f64));
-    // In front, and between the centres of the outermost pixels: five half-planes along the row.
-    let (u_max, v_max) = (source.width as f64 - 0.5, source.height as f64 - 0.5);
-    let mut span = (0.0_f64, row.len() as f64 - 1.0);
-    for (constant, slope) in [
-        (start.z - 1e-6, step.z),
-        (start.x - 0.5 * start.z, step.x - 0.5 * step.z),
-        (start.y - 0.5 * start.z, step.y - 0.5 * step.z),
-        (u_max * start.z - start.x, u_max * step.z - step.x),
-        (v_max * start.z - start.y, v_max * step.z - step.y),
-    ] {
-        if slope.abs() < 1e-12 {
-            if constant < 0.0 {
-                span.1 = -1.0;
-            }
-        } else if slope > 0.0 {
-            span.0 = span.0.max(-constant / slope);
-        } else {
-            span.1 = span.1.min(-constant / slope);
-        }
-    }
-    row.fill(0.0);
-    if span.0 > span.1 {
-        return (0, 0);
-    }
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..=width")]
-    let (from, to) = (span.0.ceil() as usize, span.1.floor() as usize + 1);
-    let (x_top, y_top) = ((source.width - 2) as f32, (source.height - 2) as f32);
-    let stride = source.width;
-    let start = [start.x as f32, start.y as f32, start.z as f32];
-    let step = [step.x as f32, step.y as f32, step.z as f32];
-    for (x, out) in row[from..to].iter_mut().enumerate() {
-        let t = (from + x) as f32;
-        let inverse = 1.0 / (start[2] + step[2] * t);
-        let u = (start[0] + step[0] * t) * inverse - 0.5;
-        let v = (start[1] + step[1] * t) * inverse - 0.5;
-        let (u0, v0) = (u.max(0.0).min(x_top).floor(), v.max(0.0).min(y_top).floor());
-        let (a, b) = ((u - u0).clamp(0.0, 1.0), (v - v0).clamp(0.0, 1.0));
-        let i = v0 as usize * stride + u0 as usize;
-        let quad = [
-            source.gray[i],
-            source.gray[i + 1],
-            source.gray[i + stride],
-            source.gray[i + stride + 1],
-        ];
-        let upper = quad[0] + a * (quad[1] - quad[0]);
-        let lower = quad[2] + a * (quad[3] - quad[2]);
-        *out = upper + b * (lower - upper);
-    }
-    (from, to)
 }

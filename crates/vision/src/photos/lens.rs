@@ -10,7 +10,11 @@ use rayon::prelude::*;
 use crate::{
     error::{Error, Result},
     scene::{Intrinsics, Photo},
+    vectorised,
 };
+
+/// Lines of a photo that one thread undistorts at a time.
+const LINES_A_TASK: usize = 16;
 
 /// Models whose radial terms act on the tangent of the angle.
 const PERSPECTIVE: [&str; 6] =
@@ -193,6 +197,7 @@ impl Distortion {
     }
 
     /// Distorted over undistorted radius at undistorted radius² `r2`.
+    #[inline(always)]
     fn radial(&self, r2: f64) -> f64 {
         let [k1, k2, k3, k4] = self.k;
         if self.fisheye {
@@ -209,6 +214,7 @@ impl Distortion {
     }
 
     /// Where the ray (x, y, 1) fell on the image plane; `None` past the fold.
+    #[inline(always)]
     fn apply(&self, x: f64, y: f64) -> Option<(f64, f64)> {
         let r2 = x * x + y * y;
         if r2.sqrt() > self.radius_max {
@@ -236,25 +242,31 @@ pub(super) fn undistort(photo: Photo, lens: &LensAtSize) -> Photo {
     let (width, height) = (photo.width as usize, photo.height as usize);
     let mut rgb = vec![0_u8; width * height * 3];
     let mut valid = vec![false; width * height];
-    rgb.par_chunks_mut(width * 3).zip(valid.par_chunks_mut(width)).enumerate().for_each(
-        |(row, (rgb, valid))| {
-            let y = (row as f64 + 0.5 - k.cy) / k.fy;
-            for col in 0..width {
-                let x = (col as f64 + 0.5 - k.cx) / k.fx;
-                let Some((dx, dy)) = distortion.apply(x, y) else { continue };
-                let at = (k.fx * dx + k.cx, k.fy * dy + k.cy);
-                if let Some(value) = bilinear(&photo, at) {
-                    rgb[col * 3..col * 3 + 3].copy_from_slice(&value);
-                    valid[col] = true;
-                }
+    let columns: Vec<f64> = (0..width).map(|col| (col as f64 + 0.5 - k.cx) / k.fx).collect();
+    let line = |(row, (rgb, valid)): (usize, (&mut [u8], &mut [bool]))| {
+        let y = (row as f64 + 0.5 - k.cy) / k.fy;
+        for ((&x, rgb), valid) in columns.iter().zip(rgb.as_chunks_mut::<3>().0).zip(valid) {
+            let Some((dx, dy)) = distortion.apply(x, y) else { continue };
+            let at = (k.fx * dx + k.cx, k.fy * dy + k.cy);
+            if let Some(value) = bilinear(&photo, at) {
+                *rgb = value;
+                *valid = true;
             }
-        },
-    );
+        }
+    };
+    let lines = rgb.par_chunks_mut(width * 3).zip(valid.par_chunks_mut(width)).enumerate();
+    lines.with_min_len(LINES_A_TASK).for_each(|of| {
+        vectorised(
+            #[inline(always)]
+            || line(of),
+        );
+    });
     let valid = valid.contains(&false).then_some(valid);
     Photo { width: photo.width, height: photo.height, rgb, valid }
 }
 
 /// The colour at (u, v), pixel centres at +0.5; `None` outside the picture or on invalid pixels.
+#[inline(always)]
 fn bilinear(photo: &Photo, (u, v): (f64, f64)) -> Option<[u8; 3]> {
     let (width, height) = (photo.width as usize, photo.height as usize);
     if !(u >= 0.0 && v >= 0.0 && u <= width as f64 && v <= height as f64) {
