@@ -6,6 +6,7 @@ use std::sync::{
 };
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 use crate::error::{Error, ErrorCode, Result};
 
@@ -74,21 +75,36 @@ impl RawGaussians {
         Self { origin: self.origin, sh_degree: self.sh_degree, ..Self::default() }
     }
 
-    /// Adds Gaussian `i` of `from`, with other numbers in three arrays.
-    fn push(&mut self, from: &Self, i: usize, (quat, scale, opacity): Checked) {
+    /// Adds Gaussian `i` of `from`.
+    fn push(&mut self, from: &Self, i: usize) {
         let k = from.sh_count();
         self.means.push(from.means[i]);
-        self.quats.push(quat);
-        self.scales.push(scale);
-        self.opacities.push(opacity);
+        self.quats.push(from.quats[i]);
+        self.scales.push(from.scales[i]);
+        self.opacities.push(from.opacities[i]);
         self.sh.extend_from_slice(&from.sh[i * k..(i + 1) * k]);
         self.semantic_index.push(from.semantic_index[i]);
         self.source.push(from.source[i]);
     }
+
+    /// The Gaussians whose number `keep` takes, in their order.
+    fn only(&self, keep: impl Fn(usize) -> bool) -> Self {
+        let mut some = self.emptied();
+        (0..self.means.len()).filter(|&i| keep(i)).for_each(|i| some.push(self, i));
+        some
+    }
 }
+
+/// Gaussians that one thread checks at a time.
+const PART: usize = 1 << 12;
 
 /// Quaternion, scales and opacity of a Gaussian.
 type Checked = ([f32; 4], [f32; 3], f32);
+/// Mean, quaternion, scales, opacity and coefficients of a Gaussian.
+type Unchecked<'a> = (&'a [f32; 3], &'a [f32; 4], &'a [f32; 3], f32, &'a [[f32; 3]]);
+/// Parts of the arrays that checking changes, and of those that it reads only.
+type Changed<'a> = ((&'a mut [[f32; 4]], &'a mut [[f32; 3]]), &'a mut [f32]);
+type Given<'a> = (&'a [[f32; 3]], &'a [[f32; 3]]);
 
 /// How many Gaussians were dropped or changed on the way in, by reason.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -110,6 +126,16 @@ pub struct SanitizeReport {
 }
 
 impl SanitizeReport {
+    fn add(&mut self, other: &Self) {
+        self.not_finite += other.not_finite;
+        self.too_far += other.too_far;
+        self.transparent += other.transparent;
+        self.zero_quat += other.zero_quat;
+        self.zero_scale += other.zero_scale;
+        self.opacity_clamped += other.opacity_clamped;
+        self.scale_clamped += other.scale_clamped;
+    }
+
     /// Reasons and counts, for the health report.
     pub fn counts(&self) -> [(&'static str, u64); 7] {
         [
@@ -160,11 +186,7 @@ impl Gaussians {
     ///
     /// # Errors
     /// `internal` when the arrays' lengths disagree or the SH degree is over 3.
-    #[expect(
-        clippy::needless_pass_by_value,
-        reason = "the unchecked arrays are given up, so that nothing uses them any more"
-    )]
-    pub fn sanitize(raw: RawGaussians) -> Result<(Self, SanitizeReport)> {
+    pub fn sanitize(mut raw: RawGaussians) -> Result<(Self, SanitizeReport)> {
         if let Some((name, got, want)) = raw.unequal() {
             return Err(Error::internal(format!("gaussians: {name} has {got} rows, not {want}")));
         }
@@ -172,13 +194,31 @@ impl Gaussians {
             let degree = raw.sh_degree;
             return Err(Error::internal(format!("gaussians: SH degree {degree} is over 3")));
         }
-        let (mut report, mut kept) = (SanitizeReport::default(), raw.emptied());
-        for i in 0..raw.means.len() {
-            if let Some(checked) = check_one(&raw, i, &mut report) {
-                kept.push(&raw, i, checked);
+        let k = raw.sh_count();
+        let given = raw.means.par_chunks(PART).zip(raw.sh.par_chunks(PART * k));
+        let changed = raw.quats.par_chunks_mut(PART).zip(raw.scales.par_chunks_mut(PART));
+        let changed = changed.zip(raw.opacities.par_chunks_mut(PART));
+        let of_part = |(((quats, scales), opacities), (means, sh)): (Changed<'_>, Given<'_>)| {
+            let (mut report, mut dropped) = (SanitizeReport::default(), Vec::new());
+            let numbers = quats.iter_mut().zip(scales).zip(opacities);
+            let rows = means.iter().zip(sh.chunks_exact(k)).zip(numbers);
+            for (i, ((mean, sh), ((quat, scale), opacity))) in rows.enumerate() {
+                match check_one((mean, quat, scale, *opacity, sh), &mut report) {
+                    Some(checked) => (*quat, *scale, *opacity) = checked,
+                    None => dropped.push(i),
+                }
             }
+            (report, dropped)
+        };
+        let parts: Vec<_> = changed.zip(given).map(of_part).collect();
+        let mut report = SanitizeReport::default();
+        let mut keep = vec![true; raw.means.len()];
+        for (part, (of_part, dropped)) in parts.iter().enumerate() {
+            report.add(of_part);
+            dropped.iter().for_each(|i| keep[part * PART + i] = false);
         }
-        Ok((Self::new(kept), report))
+        let whole = parts.iter().all(|(_, dropped)| dropped.is_empty());
+        Ok((Self::new(if whole { raw } else { raw.only(|i| keep[i]) }), report))
     }
 
     /// Takes back what [`Self::into_raw`] gave, bit for bit.
@@ -190,27 +230,25 @@ impl Gaussians {
         if raw.unequal().is_some() || raw.sh_degree > 3 || !raw.origin.is_finite() {
             return Err(bad(format!("arrays of unequal length, or origin {}", raw.origin)));
         }
-        let mut report = SanitizeReport::default();
-        for i in 0..raw.means.len() {
-            let kept = check_one(&raw, i, &mut report);
-            let same = kept.is_some_and(|(quat, scale, opacity)| {
-                let turned = quat.iter().zip(&raw.quats[i]).any(|(a, b)| (a - b).abs() > 1e-5);
-                !turned && scale == raw.scales[i] && opacity.total_cmp(&raw.opacities[i]).is_eq()
-            });
-            if !same {
-                return Err(bad(format!("number {i} is out of range")));
-            }
+        let k = raw.sh_count();
+        let is_bad = |&i: &usize| {
+            let (quat, scale, opacity) = (&raw.quats[i], &raw.scales[i], raw.opacities[i]);
+            let row = (&raw.means[i], quat, scale, opacity, &raw.sh[i * k..(i + 1) * k]);
+            !check_one(row, &mut SanitizeReport::default()).is_some_and(|kept| {
+                let turned = kept.0.iter().zip(quat).any(|(a, b)| (a - b).abs() > 1e-5);
+                !turned && kept.1 == *scale && kept.2.total_cmp(&opacity).is_eq()
+            })
+        };
+        let all = (0..raw.means.len()).into_par_iter().with_min_len(PART);
+        match all.find_first(is_bad) {
+            Some(i) => Err(bad(format!("number {i} is out of range"))),
+            None => Ok(Self::new(raw)),
         }
-        Ok(Self::new(raw))
     }
 
     /// The Gaussians whose number `keep` takes, in their order.
     pub fn only(&self, keep: impl Fn(usize) -> bool) -> Self {
-        let (all, mut some) = (&self.raw, self.raw.emptied());
-        for i in (0..self.len()).filter(|&i| keep(i)) {
-            some.push(all, i, (all.quats[i], all.scales[i], all.opacities[i]));
-        }
-        Self::new(some)
+        Self::new(self.raw.only(keep))
     }
 
     /// The same Gaussians with other scales, `[N, 3]`, clamped into range.
@@ -331,13 +369,12 @@ arrays! {
     source: SourcePixel;
 }
 
-/// Checks Gaussian `i`; what to keep of it, or `None` after counting why not.
-fn check_one(raw: &RawGaussians, i: usize, report: &mut SanitizeReport) -> Option<Checked> {
-    let (mean, quat, scale, opacity) =
-        (raw.means[i], raw.quats[i], raw.scales[i], raw.opacities[i]);
-    let k = raw.sh_count();
-    let sh = &raw.sh[i * k..(i + 1) * k];
-    let finite = mean.iter().chain(&quat).chain(&scale).all(|v| v.is_finite())
+/// Checks a Gaussian; what to keep of it, or `None` after counting why not.
+fn check_one(
+    (mean, quat, scale, opacity, sh): Unchecked<'_>,
+    report: &mut SanitizeReport,
+) -> Option<Checked> {
+    let finite = mean.iter().chain(quat).chain(scale).all(|v| v.is_finite())
         && opacity.is_finite()
         && sh.iter().flatten().all(|v| v.is_finite() && v.abs() <= Gaussians::SH_MAX);
     let norm = quat.iter().map(|&v| f64::from(v) * f64::from(v)).sum::<f64>().sqrt();
@@ -353,7 +390,7 @@ fn check_one(raw: &RawGaussians, i: usize, report: &mut SanitizeReport) -> Optio
         return None;
     }
     let clamped = scale.map(|v| v.clamp(Gaussians::SCALE_MIN, Gaussians::SCALE_MAX));
-    if clamped != scale {
+    if clamped != *scale {
         report.scale_clamped += 1;
     }
     if opacity > 1.0 {

@@ -38,22 +38,27 @@ fn observe(posed: &PosedPhoto) -> Level {
     let (width, height) = (posed.photo.width as usize, posed.photo.height as usize);
     let step = (width.max(height) / SAMPLES).max(1);
     let rotation = posed.camera.camera_to_world.rotation();
-    for y in (step / 2..height).step_by(step) {
-        for x in (step / 2..width).step_by(step) {
-            let at = y * width + x;
-            if posed.photo.valid.as_ref().is_some_and(|valid| !valid[at]) {
-                continue;
-            }
+    let of_row = |y: usize| -> Vec<(usize, usize)> {
+        let pixels = (step / 2..width).step_by(step).map(|x| (x, y * width + x));
+        let seen = pixels.filter(|(_, at)| posed.photo.valid.as_ref().is_none_or(|v| v[*at]));
+        seen.map(|(x, at)| {
             let ray = posed.camera.intrinsics.unproject(x as f64 + 0.5, y as f64 + 0.5, 1.0);
             let (u, v) = Backdrop::position(rotation * ray);
             #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "in range")]
-            let cell = (v as usize).min(level.height - 1) * level.width
-                + (u as usize).min(level.width - 1);
-            for c in 0..3 {
-                level.cells[cell][c] += f32::from(posed.photo.rgb[at * 3 + c]);
-            }
-            level.cells[cell][3] += 1.0;
+            let cell = (v as usize).min(Backdrop::HEIGHT - 1) * Backdrop::WIDTH
+                + (u as usize).min(Backdrop::WIDTH - 1);
+            (cell, at)
+        })
+        .collect()
+    };
+    let rows = (step / 2..height).into_par_iter().step_by(step);
+    let cells: Vec<Vec<(usize, usize)>> = rows.map(of_row).collect();
+    // Whole numbers under 2^24: their sums are exact in any order.
+    for (cell, at) in cells.into_iter().flatten() {
+        for c in 0..3 {
+            level.cells[cell][c] += f32::from(posed.photo.rgb[at * 3 + c]);
         }
+        level.cells[cell][3] += 1.0;
     }
     level
 }

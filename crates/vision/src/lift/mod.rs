@@ -37,6 +37,8 @@ pub use thin::ThinOptions;
 const DEPTH_SLACK: f64 = 2.0;
 /// How far beyond its own picture a Gaussian may lie, as a share of the picture's side.
 const FRAME_SLACK: f64 = 0.1;
+/// Pixels that one thread takes at a time.
+const PIXELS_A_TASK: usize = 1 << 11;
 
 /// A lifted scene.
 #[derive(Clone, Debug)]
@@ -69,10 +71,16 @@ pub fn lift(
     }
     let mut counts = Counts::default();
     let mut views = best_of_each_photo(views, &mut counts);
-    let mut candidate = Vec::with_capacity(views.len());
-    for view in &views {
+    let judged = |view: &ViewGaussians| {
         unless_cancelled(cancel)?;
-        candidate.push(candidates(view, &mut counts));
+        Ok(candidates(view))
+    };
+    let judged: Vec<(Vec<bool>, [u64; 3])> = views.par_iter().map(judged).collect::<Result<_>>()?;
+    let mut candidate = Vec::with_capacity(views.len());
+    for (kept, dropped) in judged {
+        let reasons = ["no_source_pixel", "opacity_below_1_255", "out_of_reach"];
+        reasons.into_iter().zip(dropped).for_each(|(reason, count)| counts.add(reason, count));
+        candidate.push(kept);
     }
     let mut fates = fuse(&views, &candidate, fusing, cancel)?;
     if let Some(thinning) = thinning {
@@ -82,12 +90,9 @@ pub fn lift(
             Ok::<_, Error>(())
         })?;
     }
-    for fate in fates.iter().flatten() {
-        match fate {
-            Fate::Duplicate => counts.add("duplicate", 1),
-            Fate::Merged => counts.add("merged", 1),
-            Fate::Keep | Fate::Absent => {}
-        }
+    for (reason, dropped) in [("duplicate", Fate::Duplicate), ("merged", Fate::Merged)] {
+        let of_view = |fates: &Vec<Fate>| fates.iter().filter(|fate| **fate == dropped).count();
+        counts.add(reason, fates.par_iter().map(of_view).sum::<usize>() as u64);
     }
     let mut lenses = vec![None; cameras.len()];
     for view in &views {
@@ -96,12 +101,9 @@ pub fn lift(
         }
     }
     let origin = center_of(cameras);
-    let mut raw = RawGaussians { origin, sh_degree: degree, ..RawGaussians::default() };
-    let mut depths = Vec::new();
-    for (view, fate) in views.iter().zip(&fates) {
-        unless_cancelled(cancel)?;
-        append(&mut raw, view, fate, origin, &mut depths);
-    }
+    unless_cancelled(cancel)?;
+    let (raw, depths) = moved(&views, &fates, origin, degree);
+    drop((views, fates));
     let (gaussians, report) = Gaussians::sanitize(raw)?;
     for (reason, count) in report.counts() {
         counts.add(reason, count);
@@ -141,6 +143,7 @@ fn check_lengths(view: &ViewGaussians, degree: u8) -> Result<()> {
         Some((name, got, want)) => {
             Err(Error::internal(format!("lift: {name} has {got} rows, not {want}")))
         }
+        None if degree > 3 => Err(Error::internal(format!("lift: SH degree {degree} is over 3"))),
         None if view.sh_degree != degree => Err(Error::internal(format!(
             "lift: SH degrees {} and {degree} in one scene",
             view.sh_degree
@@ -168,88 +171,127 @@ fn best_of_each_photo(mut views: Vec<ViewGaussians>, counts: &mut Counts) -> Vec
     kept.into_iter().map(|(_, view)| view).collect()
 }
 
-/// Which Gaussians of a view can count at all.
-fn candidates(view: &ViewGaussians, counts: &mut Counts) -> Vec<bool> {
+/// Which Gaussians of a view can count at all. The others by reason: no source pixel, transparent,
+/// out of reach.
+fn candidates(view: &ViewGaussians) -> (Vec<bool>, [u64; 3]) {
     let lens = &view.camera.intrinsics;
     let (w, h) = (f64::from(lens.width), f64::from(lens.height));
     let to_camera = view.camera.camera_to_world.viewmat() * view.frame_to_world.matrix();
     let [near, far] = view.near_far;
-    let (mut no_source, mut transparent, mut out_of_reach) = (0, 0, 0);
-    let kept = (0..view.len())
-        .map(|i| {
-            if view.valid.as_ref().is_some_and(|valid| !valid[i]) {
-                no_source += 1;
-                return false;
-            }
-            if view.opacities[i] < Gaussians::OPACITY_MIN {
-                transparent += 1;
-                return false;
-            }
-            let mean = point(view.means[i]);
-            if !mean.is_finite() {
-                return true; // counted as not finite by the last check
-            }
-            let seen = to_camera.transform_point3(mean);
-            let (x, y) = lens.project(seen);
-            let reached = seen.z >= near / DEPTH_SLACK
-                && seen.z <= far * DEPTH_SLACK
-                && (-FRAME_SLACK * w..=(1.0 + FRAME_SLACK) * w).contains(&x)
-                && (-FRAME_SLACK * h..=(1.0 + FRAME_SLACK) * h).contains(&y);
-            out_of_reach += u64::from(!reached);
-            reached
-        })
-        .collect();
-    counts.add("no_source_pixel", no_source);
-    counts.add("opacity_below_1_255", transparent);
-    counts.add("out_of_reach", out_of_reach);
-    kept
+    let fault = |i: usize| {
+        if view.valid.as_ref().is_some_and(|valid| !valid[i]) {
+            return Some(0);
+        }
+        if view.opacities[i] < Gaussians::OPACITY_MIN {
+            return Some(1);
+        }
+        let mean = point(view.means[i]);
+        if !mean.is_finite() {
+            return None; // counted as not finite by the last check
+        }
+        let seen = to_camera.transform_point3(mean);
+        let (x, y) = lens.project(seen);
+        let reached = seen.z >= near / DEPTH_SLACK
+            && seen.z <= far * DEPTH_SLACK
+            && (-FRAME_SLACK * w..=(1.0 + FRAME_SLACK) * w).contains(&x)
+            && (-FRAME_SLACK * h..=(1.0 + FRAME_SLACK) * h).contains(&y);
+        (!reached).then_some(2)
+    };
+    let all = (0..view.len()).into_par_iter().with_min_len(PIXELS_A_TASK);
+    let faults: Vec<Option<u8>> = all.map(fault).collect();
+    let mut dropped = [0; 3];
+    faults.iter().flatten().for_each(|&reason| dropped[usize::from(reason)] += 1);
+    (faults.iter().map(Option::is_none).collect(), dropped)
 }
 
-/// Moves the kept Gaussians of a view to the world and appends them.
-#[expect(clippy::cast_possible_truncation, reason = "scenes are f32 relative to an f64 origin")]
-fn append(
-    raw: &mut RawGaussians,
-    view: &ViewGaussians,
-    fate: &[Fate],
+/// How the Gaussians of a view move to the world.
+struct Move<'a> {
+    view: &'a ViewGaussians,
+    rotation: DMat3,
+    turn: DQuat,
+    shift: DVec3,
+    sh_rotation: ShRotation,
+    camera: DVec3,
+    axis: DVec3,
     origin: DVec3,
-    depths: &mut Vec<f64>,
-) {
-    let rotation: DMat3 = view.frame_to_world.rotation();
-    let turn = DQuat::from_mat3(&rotation);
-    let shift = view.frame_to_world.center() - origin;
-    let sh_rotation = ShRotation::new(rotation, view.sh_degree);
-    let sh_count = (usize::from(view.sh_degree) + 1).pow(2);
-    let (camera, axis) = (view.camera.camera_to_world.center(), view.camera.camera_to_world.axis());
-    let kept: Vec<usize> = (0..view.len()).filter(|&i| fate[i] == Fate::Keep).collect();
-    let width = view.camera.intrinsics.width as usize;
-    let moved: Vec<([f32; 3], [f32; 4], f64)> = kept
-        .par_iter()
-        .map(|&i| {
-            let mean = rotation * point(view.means[i]) + shift;
-            let [w, x, y, z] = view.quats[i].map(f64::from);
-            let quat = turn * DQuat::from_xyzw(x, y, z, w);
-            let quat = [quat.w as f32, quat.x as f32, quat.y as f32, quat.z as f32];
-            ((mean.as_vec3()).to_array(), quat, (mean + origin - camera).dot(axis))
-        })
-        .collect();
-    for (&i, (mean, quat, depth)) in kept.iter().zip(moved) {
-        raw.means.push(mean);
-        raw.quats.push(quat);
-        raw.scales.push(view.scales[i]);
-        raw.opacities.push(view.opacities[i]);
-        let mut coefficients = view.sh[i * sh_count..(i + 1) * sh_count].to_vec();
-        sh_rotation.apply(&mut coefficients);
-        raw.sh.extend(coefficients);
-        raw.semantic_index.push(0);
-        raw.source.push(SourcePixel {
-            view: view.photo,
-            x: (i % width) as u16,
-            y: (i / width) as u16,
-        });
-        if depth.is_finite() {
-            depths.push(depth);
+    width: usize,
+}
+
+impl<'a> Move<'a> {
+    fn new(view: &'a ViewGaussians, origin: DVec3) -> Self {
+        let rotation = view.frame_to_world.rotation();
+        let pose = &view.camera.camera_to_world;
+        Self {
+            view,
+            rotation,
+            turn: DQuat::from_mat3(&rotation),
+            shift: view.frame_to_world.center() - origin,
+            sh_rotation: ShRotation::new(rotation, view.sh_degree),
+            camera: pose.center(),
+            axis: pose.axis(),
+            origin,
+            width: view.camera.intrinsics.width as usize,
         }
     }
+
+    /// Centre relative to the origin, and depth in the camera.
+    fn mean(&self, i: usize) -> ([f32; 3], f64) {
+        let mean = self.rotation * point(self.view.means[i]) + self.shift;
+        (mean.as_vec3().to_array(), (mean + self.origin - self.camera).dot(self.axis))
+    }
+
+    #[expect(clippy::cast_possible_truncation, reason = "scenes are f32")]
+    fn quat(&self, i: usize) -> [f32; 4] {
+        let [w, x, y, z] = self.view.quats[i].map(f64::from);
+        let quat = self.turn * DQuat::from_xyzw(x, y, z, w);
+        [quat.w, quat.x, quat.y, quat.z].map(|v| v as f32)
+    }
+
+    fn sh(&self, i: usize, into: &mut [[f32; 3]]) {
+        let count = into.len();
+        into.copy_from_slice(&self.view.sh[i * count..(i + 1) * count]);
+        self.sh_rotation.apply(into);
+    }
+
+    fn source(&self, i: usize) -> SourcePixel {
+        let (x, y) = ((i % self.width) as u16, (i / self.width) as u16);
+        SourcePixel { view: self.view.photo, x, y }
+    }
+}
+
+/// The kept Gaussians of all views in the world, view by view, and their finite depths.
+fn moved(
+    views: &[ViewGaussians],
+    fates: &[Vec<Fate>],
+    origin: DVec3,
+    degree: u8,
+) -> (RawGaussians, Vec<f64>) {
+    let moves: Vec<Move<'_>> = views.par_iter().map(|view| Move::new(view, origin)).collect();
+    let of_view = |(v, fates): (usize, &Vec<Fate>)| -> Vec<(usize, usize)> {
+        let kept = fates.iter().enumerate().filter(|(_, fate)| **fate == Fate::Keep);
+        kept.map(|(i, _)| (v, i)).collect()
+    };
+    let kept: Vec<Vec<(usize, usize)>> = fates.par_iter().enumerate().map(of_view).collect();
+    let kept = kept.concat();
+    let rows = || kept.par_iter().with_min_len(PIXELS_A_TASK);
+    let (mut means, mut depths) = (Vec::new(), Vec::new());
+    rows().map(|&(v, i)| moves[v].mean(i)).unzip_into_vecs(&mut means, &mut depths);
+    depths.retain(|depth| depth.is_finite());
+    let sh_count = (usize::from(degree) + 1).pow(2);
+    let mut sh = vec![[0.0; 3]; kept.len() * sh_count];
+    sh.par_chunks_mut(sh_count).zip(rows()).for_each(|(sh, &(v, i))| moves[v].sh(i, sh));
+    let raw = RawGaussians {
+        origin,
+        means,
+        quats: rows().map(|&(v, i)| moves[v].quat(i)).collect(),
+        scales: rows().map(|&(v, i)| views[v].scales[i]).collect(),
+        opacities: rows().map(|&(v, i)| views[v].opacities[i]).collect(),
+        sh_degree: degree,
+        sh,
+        semantic_index: vec![0; kept.len()],
+        source: rows().map(|&(v, i)| moves[v].source(i)).collect(),
+    };
+    (raw, depths)
 }
 
 fn center_of(cameras: &[Camera]) -> DVec3 {

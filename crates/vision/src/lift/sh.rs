@@ -7,7 +7,7 @@
 use glam::{DMat3, DVec3};
 
 /// Coefficients of degree 3.
-const COUNT_MAX: usize = 16;
+pub(super) const COUNT_MAX: usize = 16;
 /// Gauss-Legendre nodes and weights, order 4: exact to degree 7.
 const NODES: [(f64, f64); 4] = [
     (-0.861_136_311_594_052_6, 0.347_854_845_137_453_86),

@@ -10,7 +10,7 @@
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 
-use super::fuse::Fate;
+use super::{fuse::Fate, sh::COUNT_MAX as SH_COUNT_MAX};
 use crate::{
     point,
     scene::{BLUR_PX2, SH_C0, ViewGaussians, principal_axes},
@@ -68,8 +68,8 @@ struct Merged {
     axes: [DVec3; 3],
     deviations: [f64; 3],
     opacity: f64,
-    /// Share of each of the four.
-    weights: [f64; 4],
+    /// Coefficients, the view's count of them.
+    sh: [[f32; 3]; SH_COUNT_MAX],
 }
 
 /// Merges in place: the merged Gaussian has the place of one of its four, the others are
@@ -108,14 +108,7 @@ fn put(view: &mut ViewGaussians, at: usize, merged: &Merged) {
     view.scales[at] = merged.deviations.map(|deviation| deviation as f32);
     view.opacities[at] = merged.opacity as f32;
     let k = (usize::from(view.sh_degree) + 1).pow(2);
-    for row in 0..k {
-        let mut sum = [0.0_f64; 3];
-        for (i, weight) in merged.of.iter().zip(merged.weights) {
-            let own = view.sh[i * k + row];
-            sum.iter_mut().zip(own).for_each(|(sum, own)| *sum += weight * f64::from(own));
-        }
-        view.sh[at * k + row] = sum.map(|v| v as f32);
-    }
+    view.sh[at * k..(at + 1) * k].copy_from_slice(&merged.sh[..k]);
 }
 
 /// The blocks of a level.
@@ -228,10 +221,26 @@ impl<'a> Blocks<'a> {
         let [a, b, c] = axes;
         let axes = if a.cross(b).dot(c) < 0.0 { [a, b, -c] } else { axes };
         let deviations = axes.map(|axis| axis.dot(covariance * axis).max(0.0).sqrt());
-        let merged =
-            Merged { cell, of, mean, axes, deviations, opacity: wanted.min(opacity_max), weights };
+        let (opacity, sh) = (wanted.min(opacity_max), self.sh(of, weights));
+        let merged = Merged { cell, of, mean, axes, deviations, opacity, sh };
         let finite = mean.is_finite() && deviations.iter().all(|d| d.is_finite() && *d > 0.0);
         (finite && merged.opacity.is_finite()).then_some(merged)
+    }
+
+    /// The coefficients of four Gaussians, each with its share.
+    #[expect(clippy::cast_possible_truncation, reason = "scenes are f32")]
+    fn sh(&self, of: [usize; 4], weights: [f64; 4]) -> [[f32; 3]; SH_COUNT_MAX] {
+        let count = (usize::from(self.view.sh_degree) + 1).pow(2);
+        let mut mixed = [[0.0; 3]; SH_COUNT_MAX];
+        for (row, mixed) in mixed.iter_mut().take(count).enumerate() {
+            let mut sum = [0.0_f64; 3];
+            for (i, weight) in of.iter().zip(weights) {
+                let own = self.view.sh[i * count + row];
+                sum.iter_mut().zip(own).for_each(|(sum, own)| *sum += weight * f64::from(own));
+            }
+            *mixed = sum.map(|v| v as f32);
+        }
+        mixed
     }
 
     /// Area of a Gaussian in the picture with the blur, px² over 2 pi.

@@ -200,8 +200,11 @@ pub fn reconstruct(
                 Density::Full => None,
             };
             let fusing = lift::FuseOptions::default();
-            let lifted = lift::lift(views, &cameras, &fusing, thinning.as_ref(), cancel)?;
-            Ok((lifted, lift::backdrop(photos)))
+            let (lifted, backdrop) = rayon::join(
+                || lift::lift(views, &cameras, &fusing, thinning.as_ref(), cancel),
+                || lift::backdrop(photos),
+            );
+            Ok((lifted?, backdrop))
         })
     })?;
 
