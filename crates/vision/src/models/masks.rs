@@ -125,6 +125,20 @@ impl MaskNetwork {
     /// # Errors
     /// `internal` when the network fails or answers with other shapes than its manifest says.
     pub fn decode(&self, embedding: &PhotoEmbedding, points: &[[f32; 2]]) -> Result<MaskLogits> {
+        self.decode_over(embedding, points, f32::NEG_INFINITY)
+    }
+
+    /// As [`Self::decode`], with logits of 0 where a mask's predicted IoU is not over `iou_over`:
+    /// most masks are not copied.
+    ///
+    /// # Errors
+    /// As [`Self::decode`].
+    pub fn decode_over(
+        &self,
+        embedding: &PhotoEmbedding,
+        points: &[[f32; 2]],
+        iou_over: f32,
+    ) -> Result<MaskLogits> {
         let mut all = MaskLogits {
             levels: self.manifest.levels.len(),
             grid: [0, 0],
@@ -132,7 +146,7 @@ impl MaskNetwork {
             predicted_iou: Vec::new(),
         };
         for batch in points.chunks(self.takes.batch) {
-            self.decode_batch(embedding, batch, &mut all)?;
+            self.decode_batch(embedding, batch, (points.len(), iou_over), &mut all)?;
         }
         Ok(all)
     }
@@ -141,6 +155,7 @@ impl MaskNetwork {
         &self,
         embedding: &PhotoEmbedding,
         points: &[[f32; 2]],
+        (points_in_all, iou_over): (usize, f32),
         all: &mut MaskLogits,
     ) -> Result<()> {
         let (names, takes) = (&self.manifest.decoder, &self.takes);
@@ -209,11 +224,18 @@ impl MaskNetwork {
             )));
         }
         all.grid = grid;
+        let cells = grid[0] * grid[1];
+        if all.logits.is_empty() {
+            // Zeroed memory that is never written takes no time.
+            all.logits = vec![0.0; points_in_all * levels.len() * cells];
+        }
         for prompt in 0..count {
             for level in levels {
-                let at = prompt * kinds + level;
-                let cells = grid[0] * grid[1];
-                all.logits.extend_from_slice(&logits[at * cells..(at + 1) * cells]);
+                let (at, to) = (prompt * kinds + level, all.predicted_iou.len());
+                if iou[at] > iou_over {
+                    let own = &logits[at * cells..(at + 1) * cells];
+                    all.logits[to * cells..(to + 1) * cells].copy_from_slice(own);
+                }
                 all.predicted_iou.push(iou[at]);
             }
         }

@@ -5,17 +5,22 @@
 
 use std::sync::atomic::AtomicBool;
 
+use glam::DVec3;
+use rayon::prelude::*;
+
 use crate::{
     center_of,
     error::Result,
     models::{MaskNetwork, MasksManifest, PhotoEmbedding},
-    scene::{Gaussians, MaskLogits, Photo, PhotoMasks, PosedPhoto},
+    scene::{Gaussians, MaskLogits, Photo, PhotoMasks, PosedPhoto, SourcePixel},
     seen_at,
     segment::{self, PromptDecoder, Seed, Settings},
 };
 
 /// Cells along one side of the photo, each of which gets one seed: two views of a thing seed once.
 const SEED_CELLS: usize = 32;
+/// Gaussians that one thread looks up at a time.
+const GAUSSIANS_A_TASK: usize = 1 << 12;
 
 /// A photo that the mask network has seen.
 #[derive(Debug)]
@@ -44,7 +49,9 @@ impl PromptDecoder for SeenPhoto<'_> {
     }
 
     fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits> {
-        self.network.decode(&self.embedding, points)
+        // Masks under the threshold are dropped by the filter, which does not look at them.
+        let iou_over = self.network.manifest().pred_iou_thresh;
+        self.network.decode_over(&self.embedding, points, iou_over)
     }
 }
 
@@ -76,15 +83,27 @@ pub fn photo_masks(
     progress: &(dyn Fn(f32) + Sync),
     cancel: &AtomicBool,
 ) -> Result<Vec<PhotoMasks>> {
+    let encoded = |posed: &PosedPhoto| SeenPhoto::new(network, &posed.photo);
     let mut masks: Vec<PhotoMasks> = Vec::new();
+    let mut places: Vec<DVec3> = Vec::new();
+    let mut next = photos.first().map(encoded);
     for (at, posed) in photos.iter().enumerate() {
         progress(at as f32 / photos.len() as f32);
-        let seeds = match gaussians {
-            Some(gaussians) if settings.use_seeds => seeds(gaussians, photos, &masks, at),
-            _ => Vec::new(),
-        };
-        let seen = SeenPhoto::new(network, &posed.photo)?;
-        masks.push(segment::everything(&seen, &posed.photo, settings, &seeds, cancel)?);
+        let gaussians = gaussians.filter(|_| settings.use_seeds);
+        let seeds = seeds_at(posed, &places);
+        let seen = next.take().unwrap_or_else(|| encoded(posed))?;
+        // The next photo is encoded meanwhile.
+        let of_photo = std::thread::scope(|scope| {
+            let ahead = photos.get(at + 1).map(|posed| scope.spawn(move || encoded(posed)));
+            let found = segment::everything(&seen, &posed.photo, settings, &seeds, cancel);
+            // One that panicked is encoded again, and panics where it can be seen.
+            next = ahead.and_then(|ahead| ahead.join().ok());
+            found
+        })?;
+        if let Some(gaussians) = gaussians {
+            places.extend(middles(gaussians, photos, at, &of_photo));
+        }
+        masks.push(of_photo);
     }
     progress(1.0);
     Ok(masks)
@@ -99,11 +118,17 @@ pub fn seeds(
     earlier: &[PhotoMasks],
     to: usize,
 ) -> Vec<Seed> {
-    let middles = middles(gaussians, photos, earlier);
+    let of_view = |(view, masks): (usize, &PhotoMasks)| middles(gaussians, photos, view, masks);
+    let places: Vec<DVec3> = earlier.iter().enumerate().flat_map(of_view).collect();
+    seeds_at(&photos[to], &places)
+}
+
+/// At most one seed a cell, where the photo shows world points.
+fn seeds_at(photo: &PosedPhoto, places: &[DVec3]) -> Vec<Seed> {
     let mut taken = vec![false; SEED_CELLS * SEED_CELLS];
     let mut seeds = Vec::new();
-    for world in middles.into_iter().flatten().flatten() {
-        let Some(point) = share_at(&photos[to], world) else { continue };
+    for &world in places {
+        let Some(point) = share_at(photo, world) else { continue };
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a cell")]
         let cell = point.map(|share| (share * SEED_CELLS as f64) as usize);
         let at = cell[1] * SEED_CELLS + cell[0];
@@ -115,44 +140,42 @@ pub fn seeds(
     seeds
 }
 
-/// Of each mask of each earlier photo the world point of the Gaussian nearest to its middle.
+/// The Gaussian nearest to the middle of each mask of a photo, where it has one: its world point.
 fn middles(
     gaussians: &Gaussians,
     photos: &[PosedPhoto],
-    earlier: &[PhotoMasks],
-) -> Vec<Vec<Option<glam::DVec3>>> {
-    // The mask that each Gaussian is of, in the photo that made it, and where in that photo.
-    let of = |i: usize| {
-        let view = usize::from(gaussians.source().get(i)?.view);
-        let point = share_at(photos.get(view)?, center_of(gaussians, i))?;
-        let mask = usize::from(earlier.get(view)?.map.at(point[0], point[1])).checked_sub(1)?;
-        Some((view, mask, point))
+    view: usize,
+    masks: &PhotoMasks,
+) -> Vec<DVec3> {
+    // The photo's Gaussians, the mask that each is of, and where in the photo.
+    let of = |(i, source): (usize, &SourcePixel)| {
+        let posed = photos.get(view).filter(|_| usize::from(source.view) == view)?;
+        let point = share_at(posed, center_of(gaussians, i))?;
+        let mask = usize::from(masks.map.at(point[0], point[1])).checked_sub(1)?;
+        (mask < masks.masks.len()).then_some((i, mask, point))
     };
-    let found: Vec<_> = (0..gaussians.len()).map(of).collect();
-    let each = |masks: &PhotoMasks| masks.masks.len();
-    let mut sums: Vec<Vec<([f64; 2], f64)>> =
-        earlier.iter().map(|masks| vec![([0.0; 2], 0.0); each(masks)]).collect();
-    for (view, mask, point) in found.iter().flatten() {
-        if let Some((sum, count)) = sums[*view].get_mut(*mask) {
-            *sum = [sum[0] + point[0], sum[1] + point[1]];
-            *count += 1.0;
-        }
+    let all = gaussians.source().par_iter().enumerate().with_min_len(GAUSSIANS_A_TASK);
+    let found: Vec<(usize, usize, [f64; 2])> = all.filter_map(of).collect();
+    let mut sums = vec![([0.0; 2], 0.0); masks.masks.len()];
+    for (_, mask, point) in &found {
+        let (sum, count) = &mut sums[*mask];
+        *sum = [sum[0] + point[0], sum[1] + point[1]];
+        *count += 1.0;
     }
-    let mut best: Vec<Vec<(f64, Option<glam::DVec3>)>> =
-        earlier.iter().map(|masks| vec![(f64::INFINITY, None); each(masks)]).collect();
-    for (i, (view, mask, point)) in found.iter().enumerate().filter_map(|(i, f)| Some((i, (*f)?))) {
-        let Some((sum, count)) = sums[view].get(mask) else { continue };
-        let off = [0, 1].map(|axis| point[axis] - sum[axis] / count.max(1.0));
+    let mut best = vec![(f64::INFINITY, None); masks.masks.len()];
+    for (i, mask, point) in found {
+        let (sum, count) = sums[mask];
+        let off = [0, 1].map(|axis| point[axis] - sum[axis] / count);
         let away = off[0] * off[0] + off[1] * off[1];
-        if away < best[view][mask].0 {
-            best[view][mask] = (away, Some(center_of(gaussians, i)));
+        if away < best[mask].0 {
+            best[mask] = (away, Some(center_of(gaussians, i)));
         }
     }
-    best.into_iter().map(|view| view.into_iter().map(|(_, middle)| middle).collect()).collect()
+    best.into_iter().filter_map(|(_, middle)| middle).collect()
 }
 
 /// Where a photo shows a world point, shares of width and height; `None` outside of it.
-fn share_at(posed: &PosedPhoto, world: glam::DVec3) -> Option<[f64; 2]> {
+fn share_at(posed: &PosedPhoto, world: DVec3) -> Option<[f64; 2]> {
     let (_, u, v) = seen_at(&posed.camera, world)?;
     let lens = posed.camera.intrinsics;
     Some([u / f64::from(lens.width), v / f64::from(lens.height)])

@@ -7,6 +7,7 @@
 use std::sync::Arc;
 
 use parking_lot::Mutex;
+use rayon::prelude::*;
 
 use super::{Pipeline, Stages, count, fraction, masks};
 use crate::{
@@ -259,7 +260,7 @@ fn embed(
             (watch.progress)(Stage::Embed, fraction(done, all));
             done += batch.len();
             let cut = |&k: &usize| Some((k, cutter.cut(k, tools.crop_margin)?));
-            let (of, crops): (Vec<usize>, Vec<Crop>) = batch.iter().filter_map(cut).unzip();
+            let (of, crops): (Vec<usize>, Vec<Crop>) = batch.par_iter().filter_map(cut).unzip();
             if crops.is_empty() {
                 continue;
             }

@@ -1,5 +1,7 @@
 //! Which masks of a decoder are good: predicted IoU, stability, area.
 
+use std::borrow::Cow;
+
 use half::f16;
 use rayon::prelude::*;
 
@@ -120,7 +122,7 @@ impl MaskFilter {
             return None;
         }
         let values = match &self.resample {
-            Some(resample) => resample.apply(logits),
+            Some(resample) => Cow::Owned(resample.apply(logits)),
             None => cropped(logits, self.photo_grid.grid[0], self.map),
         };
         let over = |threshold: f32| values.iter().filter(|v| **v > threshold).count();
@@ -176,9 +178,14 @@ impl Patch {
 }
 
 /// The left top of a grid.
-fn cropped(logits: &[f32], grid_width: usize, [width, height]: [usize; 2]) -> Vec<f32> {
+fn cropped(logits: &[f32], grid_width: usize, [width, height]: [usize; 2]) -> Cow<'_, [f32]> {
+    if width == grid_width {
+        return Cow::Borrowed(&logits[..width * height]);
+    }
+    let mut values = Vec::with_capacity(width * height);
     let rows = logits.chunks_exact(grid_width).take(height);
-    rows.flat_map(|row| &row[..width]).copied().collect()
+    rows.for_each(|row| values.extend_from_slice(&row[..width]));
+    Cow::Owned(values)
 }
 
 /// Cells of a map whose middle has no source in the photo.

@@ -18,6 +18,9 @@ use crate::{
 const SEED: u64 = 0x5e65_9141;
 /// Most rounds of K-Means. A usual bank needs ten.
 const ROUNDS_MAX: usize = 100;
+/// Embeddings that one thread compares at a time, with all centres and with one.
+const ROWS_A_TASK: usize = 4;
+const ROWS_A_SEED: usize = 128;
 
 /// A bank and the entry of each embedding.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -90,6 +93,7 @@ fn distance(row: &[f32], centre: &[f64]) -> f64 {
 /// The nearest centre of each embedding and its squared distance. The first one wins a tie.
 fn assign(rows: &[&[f32]], centres: &[Vec<f64>]) -> Vec<(usize, f64)> {
     rows.par_iter()
+        .with_min_len(ROWS_A_TASK)
         .map(|row| {
             let mut best = (0, f64::INFINITY);
             for (m, centre) in centres.iter().enumerate() {
@@ -163,6 +167,7 @@ fn seeds(rows: &[&[f32]], count: usize) -> Vec<Vec<f64>> {
             let closer: Vec<f64> = rows
                 .par_iter()
                 .zip(&distances)
+                .with_min_len(ROWS_A_SEED)
                 .map(|(row, old)| distance(row, &candidate).min(*old))
                 .collect();
             let left: f64 = closer.iter().sum();

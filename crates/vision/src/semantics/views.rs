@@ -6,17 +6,18 @@
 
 use glam::DVec3;
 use rayon::prelude::*;
+use rustc_hash::FxHashMap;
 
 use crate::{
     center_of,
-    scene::{Bank, Camera, Gaussians, IndexMap, Intrinsics, SceneCamera},
+    scene::{Bank, Camera, Gaussians, IndexMap, Intrinsics, SceneCamera, SourcePixel},
     seen_at,
 };
 
 /// A photo shows a Gaussian under this relative difference of depth.
 const SAME_SURFACE: f64 = 0.03;
-/// Gaussians of a task.
-const PART: usize = 1 << 16;
+/// Gaussians that one thread takes at a time.
+const PART: usize = 1 << 12;
 
 /// A photo with the depths of its Gaussians.
 #[derive(Debug)]
@@ -81,42 +82,56 @@ impl<'a> Views<'a> {
             Some(View { camera, photo: input.camera.intrinsics, depth })
         };
         let mut views: Vec<Option<View>> = cameras.iter().map(view).collect();
-        for (i, source) in gaussians.source().iter().enumerate() {
+        let depth = |(i, source): (usize, &SourcePixel)| {
+            let pose = &views.get(usize::from(source.view))?.as_ref()?.camera.camera_to_world;
+            #[expect(clippy::cast_possible_truncation, reason = "compared to per cents")]
+            let depth = (center_of(gaussians, i) - pose.center()).dot(pose.axis()) as f32;
+            Some(depth)
+        };
+        let all = gaussians.source().par_iter().enumerate().with_min_len(PART);
+        let depths: Vec<Option<f32>> = all.map(depth).collect();
+        for (source, depth) in gaussians.source().iter().zip(depths) {
             let Some(Some(view)) = views.get_mut(usize::from(source.view)) else { continue };
-            let (lens, pose) = (&view.camera.intrinsics, &view.camera.camera_to_world);
+            let lens = &view.camera.intrinsics;
             if u32::from(source.x) < lens.width && u32::from(source.y) < lens.height {
                 let at = usize::from(source.y) * lens.width as usize + usize::from(source.x);
-                let to = center_of(gaussians, i) - pose.center();
-                #[expect(clippy::cast_possible_truncation, reason = "compared to per cents")]
-                let depth = to.dot(pose.axis()) as f32;
-                view.depth[at] = depth;
+                view.depth[at] = depth.unwrap_or_default();
             }
         }
-        views.iter_mut().flatten().for_each(View::fill);
+        views.par_iter_mut().flatten().for_each(View::fill);
         Self { gaussians, views }
     }
 
     /// `[V]` the vote of each photo for Gaussian `i`: an entry, or 0 if the photo does not show it
     /// or has no entry there. The vote of its own photo is `own`.
-    fn said(&self, i: usize, own: &[u16], maps: &[IndexMap]) -> Vec<u16> {
+    fn said<'b>(
+        &'b self,
+        i: usize,
+        own: &'b [u16],
+        maps: &'b [IndexMap],
+    ) -> impl Iterator<Item = u16> + 'b {
         let at = center_of(self.gaussians, i);
         let source = usize::from(self.gaussians.source()[i].view);
-        let look = |(v, view): (usize, &Option<View>)| {
+        let look = move |(v, view): (usize, &Option<View>)| {
             if v == source {
                 return own[i];
             }
             let place = view.as_ref().and_then(|view| view.shows(at));
             place.zip(maps.get(v)).map_or(0, |([x, y], map)| map.at(x, y))
         };
-        self.views.iter().enumerate().map(look).collect()
+        self.views.iter().enumerate().map(look)
     }
 
     /// `[N]` the entry with the most votes for each Gaussian. A photo without an entry for it does
     /// not vote. In a tie its own photo's entry wins if it is among them, else the smallest entry.
     #[must_use]
     pub fn vote(&self, own: &[u16], maps: &[IndexMap]) -> Vec<u16> {
-        let vote = |(i, of): (usize, &u16)| winner(*of, self.said(i, own, maps));
-        own.par_iter().enumerate().with_min_len(1024).map(vote).collect()
+        let vote = |votes: &mut Vec<u16>, (i, of): (usize, &u16)| {
+            votes.clear();
+            votes.extend(self.said(i, own, maps).filter(|vote| *vote > 0));
+            winner(*of, votes)
+        };
+        own.par_iter().enumerate().with_min_len(PART).map_init(Vec::new, vote).collect()
     }
 
     /// `[M + 1]` the smallest entry of each group of entries that are one object. Two entries are
@@ -131,20 +146,24 @@ impl<'a> Views<'a> {
         cosine_min: f64,
     ) -> Vec<u16> {
         let rows = bank.len() + 1;
-        let mut pairs = vec![0_u32; rows * rows];
-        for start in (0..own.len()).step_by(PART) {
-            let part = start..own.len().min(start + PART);
-            let said: Vec<Vec<u16>> =
-                part.clone().into_par_iter().map(|i| self.said(i, own, maps)).collect();
-            for (i, votes) in part.zip(said) {
+        let met = |part: usize| {
+            let mut met: FxHashMap<[usize; 2], u32> = FxHashMap::default();
+            for (i, of) in (part * PART..).zip(own[part * PART..].iter().take(PART)) {
                 let source = usize::from(self.gaussians.source()[i].view);
-                for (v, other) in votes.into_iter().enumerate() {
-                    let (a, b) = (usize::from(own[i]), usize::from(other));
-                    if v != source && a > 0 && b > 0 && a < rows && b < rows {
-                        pairs[a * rows + b] += 1;
+                let others = self.said(i, own, maps).enumerate().filter(|(v, _)| *v != source);
+                for pair in others.map(|(_, other)| [usize::from(*of), usize::from(other)]) {
+                    if pair.iter().all(|entry| (1..rows).contains(entry)) {
+                        *met.entry(pair).or_default() += 1;
                     }
                 }
             }
+            met
+        };
+        let parts = (0..own.len().div_ceil(PART)).into_par_iter();
+        let parts: Vec<FxHashMap<[usize; 2], u32>> = parts.map(met).collect();
+        let mut pairs = vec![0_u32; rows * rows];
+        for ([a, b], count) in parts.into_iter().flatten() {
+            pairs[a * rows + b] += count;
         }
         let met: Vec<u32> = pairs.chunks_exact(rows).map(|row| row.iter().sum()).collect();
         let mut group: Vec<usize> = (0..rows).collect();
@@ -164,8 +183,8 @@ impl<'a> Views<'a> {
     }
 }
 
-fn winner(own: u16, mut votes: Vec<u16>) -> u16 {
-    votes.retain(|vote| *vote > 0);
+/// `votes` without 0; they are sorted.
+fn winner(own: u16, votes: &mut [u16]) -> u16 {
     votes.sort_unstable();
     let (mut best, mut most) = (own, votes.iter().filter(|vote| **vote == own).count());
     for run in votes.chunk_by(|a, b| a == b) {
@@ -215,9 +234,9 @@ mod tests {
 
     #[test]
     fn of_two_photos_that_disagree_its_own_is_believed() {
-        assert_eq!(winner(6, vec![6, 5]), 6);
-        assert_eq!(winner(6, vec![5, 6, 5]), 5);
-        assert_eq!(winner(0, vec![0, 9, 0, 4]), 4, "the smallest of others' tie");
-        assert_eq!(winner(0, vec![0, 0]), 0);
+        assert_eq!(winner(6, &mut [6, 5]), 6);
+        assert_eq!(winner(6, &mut [5, 6, 5]), 5);
+        assert_eq!(winner(0, &mut [9, 4]), 4, "the smallest of others' tie");
+        assert_eq!(winner(0, &mut []), 0);
     }
 }
