@@ -17,6 +17,10 @@ use crate::{
     render::{RendererChoice, RendererOptions},
 };
 
+/// Threads for each scene that is made at the same time as others, and most such scenes.
+const THREADS_A_JOB: usize = 4;
+const JOBS_MAX: usize = 8;
+
 /// The type of an option in [`Config`]: without a default it may be absent.
 macro_rules! option_type {
     ($type:ty) => { Option<$type> };
@@ -121,8 +125,9 @@ options! {
         /// Keep the photos of finished scenes; lazy semantics need them [default: true]
         #[arg(num_args = 0..=1, default_missing_value = "true")]
         "SEGSPLAT_KEEP_PHOTOS" keep_photos: bool = true,
-        /// Scenes made at the same time [default: 1]
-        "SEGSPLAT_JOBS" jobs: usize = 1,
+        /// Scenes made at the same time, each on its share of the threads; 0: one for each four
+        /// threads, and one at a time in a network [default: 0]
+        "SEGSPLAT_JOBS" jobs: usize = 0,
         /// File of API keys (TOML, made by `segsplat keys new`); read again at SIGHUP
         #[arg(value_name = "FILE")]
         "SEGSPLAT_KEYS" keys: PathBuf,
@@ -233,7 +238,16 @@ impl Config {
             ort_library: self.ort_library.clone(),
             provider: self.provider,
             threads: self.threads,
-            jobs: self.jobs,
+            jobs: self.jobs.max(1),
+        }
+    }
+
+    /// Scenes made at the same time.
+    #[must_use]
+    pub fn workers(&self) -> usize {
+        match self.jobs {
+            0 => (self.threads / THREADS_A_JOB).clamp(1, JOBS_MAX),
+            jobs => jobs,
         }
     }
 
@@ -261,8 +275,8 @@ impl Config {
         let odd_host = self.allowed_hosts.iter().find(|name| !is_host(name));
         let wrong = if !(1..=1024).contains(&self.threads) {
             format!("threads is {}; it must be 1 to 1024", self.threads)
-        } else if !(1..=64).contains(&self.jobs) {
-            format!("jobs is {}; it must be 1 to 64", self.jobs)
+        } else if self.jobs > 64 {
+            format!("jobs is {}; it must be 0 to 64", self.jobs)
         } else if limits.photos_min < 2 || limits.photos_max < limits.photos_min {
             "limits.photos_min must be at least 2 and at most photos_max".to_owned()
         } else if limits.key_requests_per_s == 0 || limits.key_inflight_max == 0 {

@@ -10,6 +10,7 @@ mod photos;
 mod queue;
 mod records;
 mod replicas;
+mod room;
 mod scene;
 mod semantics;
 mod worker;
@@ -36,6 +37,7 @@ use self::{
     queue::{Full, Queue},
     records::Records,
     replicas::Replicas,
+    room::Room,
 };
 use crate::{
     error::{Error, ErrorCode, Result},
@@ -52,7 +54,7 @@ pub(crate) struct JobParts {
     pub(crate) semantics: Arc<dyn SemanticNetworks>,
     /// Caps; those of jobs stay as they are at the start.
     pub(crate) limits: Limits,
-    /// Scenes made at the same time.
+    /// Scenes made at the same time, and semantics made at the same time.
     pub(crate) workers: usize,
     /// Whether the photos of finished scenes are kept.
     pub(crate) keep_photos: bool,
@@ -66,6 +68,7 @@ pub(crate) struct Jobs {
     pub(crate) queue: Queue,
     running: Running,
     uploads: ReadUploads,
+    room: Room,
     replicas: Box<dyn Replicas>,
     /// Workers that make scenes and live.
     workers: AtomicUsize,
@@ -87,6 +90,7 @@ impl Jobs {
             queue: Queue::new(parts.limits.queued_jobs_max),
             running: Running::default(),
             uploads: ReadUploads::new(parts.limits.read_uploads_bytes_max),
+            room: Room::new(parts.limits.photos_max),
             replicas: replicas::of(&parts)?,
             workers: AtomicUsize::new(parts.workers),
             contents: Mutex::default(),
@@ -110,9 +114,8 @@ impl Jobs {
         let start_all = || {
             for i in 0..jobs.parts.workers {
                 start(format!("scene-{i}"), |jobs| jobs.work(Kind::Scene))?;
+                start(format!("semantics-{i}"), |jobs| jobs.work(Kind::Semantics))?;
             }
-            // One is enough: the semantics of a scene use every core already.
-            start("semantics".to_owned(), |jobs| jobs.work(Kind::Semantics))?;
             start("sweeper".to_owned(), Self::sweep)?;
             if jobs.replicas.name().is_some() {
                 start("replicas".to_owned(), |jobs| jobs.replicas.watch(jobs))?;
@@ -136,8 +139,11 @@ impl Jobs {
         mut record: Record,
         limits: &Limits,
     ) -> Result<SceneId> {
-        let photos = pipeline::read(&upload, limits, &AtomicBool::new(false))?;
-        let files = store::hashes(&upload);
+        let (photos, files) = rayon::join(
+            || pipeline::read(&upload, limits, &AtomicBool::new(false)),
+            || store::hashes(&upload),
+        );
+        let photos = photos?;
         record.request_sha256 = store::request_sha256(&files, &record.options);
         // First, so that a full queue still answers for scenes that it holds.
         if let Some(earlier) = self.earlier(&files, &record)? {

@@ -11,9 +11,10 @@ use super::{
 };
 use crate::{
     error::{Error, ErrorCode, Result},
+    pipeline::Reconstruction,
     scene::{
-        Scene, SceneId, SceneMeta, SceneState, SemanticsMode, SemanticsState, SemanticsStatus,
-        Stage, unless_cancelled,
+        Provenance, Scene, SceneId, SceneMeta, SceneState, SemanticsMode, SemanticsState,
+        SemanticsStatus, Stage, unless_cancelled,
     },
     store::{self, Record},
     telemetry::meter,
@@ -27,6 +28,15 @@ pub(super) fn requeue(record: &mut Record) {
     record.status.state = SceneState::Queued;
     record.status.stage = None;
     record.status.fraction = 0.0;
+}
+
+/// What a job found or made.
+enum Made {
+    /// The scene that an earlier attempt kept, and its digest.
+    Kept(Arc<Scene>, String),
+    /// A scene of the same content.
+    Known(Arc<Scene>),
+    New(Box<Reconstruction>, Box<Provenance>),
 }
 
 /// Keeps other workers from making a scene of the same content, until it is dropped.
@@ -59,11 +69,40 @@ impl Jobs {
                 "given up: the server stopped {ATTEMPTS_MAX} times while making this scene"
             )));
         }
-        store.put_record(&record)?;
+        // Its start is kept while the work begins, and before anything that ends it.
+        let started = || self.parts.store.put_record(&record);
+        let (started, made) = store::side_by_side(started, || self.find_or_make(job, &record));
+        started?;
+        let (made, _lock) = made?;
+        let (reconstruction, provenance) = match made {
+            Made::Kept(scene, digest) => return self.finish(&scene, digest, None),
+            Made::Known(known) => {
+                tracing::info!(scene = %id, of = %known.meta.id, "copied: the same content");
+                return self.copy(&record, &known);
+            }
+            Made::New(reconstruction, provenance) => (reconstruction, provenance),
+        };
+        self.show(job, Stage::Store, 0.0);
+        let took = u64::try_from(begun.elapsed().as_millis()).unwrap_or(u64::MAX);
+        let before = self.scene_ms.load(Ordering::Relaxed);
+        let smoothed = if before == 0 { took } else { (3 * before + took) / 4 };
+        self.scene_ms.store(smoothed.max(1), Ordering::Relaxed);
+        let scene = reconstruction.into_scene(id.clone(), record.status.created_ms, *provenance);
+        let stored = Instant::now();
+        let (scene, digest) = store.put_scene(scene)?;
+        let finished = self.finish(&scene, digest, None);
+        meter::stage(Stage::Store.name(), stored.elapsed().as_secs_f64());
+        finished
+    }
+
+    /// The scene of this record: kept already, that of the same content, or made now. With it the
+    /// lock of the content, where there is one.
+    fn find_or_make(&self, job: &Job, record: &Record) -> Result<(Made, Option<ContentLock<'_>>)> {
+        let (id, store) = (&job.scene, &self.parts.store);
         if record.attempts > 1
             && let Some((scene, digest)) = self.kept_scene(id)?
         {
-            return self.finish(&scene, digest, None);
+            return Ok((Made::Kept(scene, digest), None));
         }
         let networks = self.parts.scenes.identity();
         let files = match self.uploads.find(id) {
@@ -71,10 +110,9 @@ impl Jobs {
             None => store::hashes(&store.upload(id)?),
         };
         let provenance = store::provenance(files, &record.options, &networks);
-        let _lock = self.lock_content(&provenance.content_sha256, job)?;
-        if let Some(known) = self.scene_of_content(&provenance.content_sha256, &record)? {
-            tracing::info!(scene = %id, of = %known.meta.id, "copied: the same content");
-            return self.copy(&record, &known);
+        let lock = Some(self.lock_content(&provenance.content_sha256, job)?);
+        if let Some(known) = self.scene_of_content(&provenance.content_sha256, record)? {
+            return Ok((Made::Known(known), lock));
         }
         let reconstruction = self.within_time(job, |watch| {
             (watch.progress)(Stage::Photos, 0.0);
@@ -84,16 +122,10 @@ impl Jobs {
             } else {
                 self.uploads.forget(id);
             }
+            let _room = self.room.take(upload.photos.photos.len(), watch.cancel)?;
             self.parts.scenes.make(&upload.photos, &record.options, watch)
         })?;
-        self.show(job, Stage::Store, 0.0);
-        let took = u64::try_from(begun.elapsed().as_millis()).unwrap_or(u64::MAX);
-        let before = self.scene_ms.load(Ordering::Relaxed);
-        let smoothed = if before == 0 { took } else { (3 * before + took) / 4 };
-        self.scene_ms.store(smoothed.max(1), Ordering::Relaxed);
-        let scene = reconstruction.into_scene(id.clone(), record.status.created_ms, provenance);
-        let (scene, digest) = store.put_scene(scene)?;
-        self.finish(&scene, digest, None)
+        Ok((Made::New(Box::new(reconstruction), Box::new(provenance)), lock))
     }
 
     /// Keeps an earlier scene of the same content under this record.
@@ -104,7 +136,7 @@ impl Jobs {
         let (mut scene, digest) = self.parts.store.put_scene(Scene { meta, ..known.clone() })?;
         let mut semantics_digest = None;
         if let Some(semantics) = &known.semantics {
-            let kept = self.parts.store.put_semantics(id, (**semantics).clone())?;
+            let kept = self.parts.store.put_semantics(id, (**semantics).clone(), |_| Ok(()))?;
             (scene, semantics_digest) = (kept.0, Some(kept.1));
         }
         self.finish(&scene, digest, semantics_digest)
@@ -147,8 +179,8 @@ impl Jobs {
         Ok(ContentLock { jobs: self, content: content.to_owned() })
     }
 
-    /// The scene is kept under its digest, and its semantics under theirs: its record is kept,
-    /// then its watchers are told.
+    /// The scene is kept under its digest, and its semantics under theirs: its record is kept, then
+    /// its watchers are told, then what a start would tidy up too is tidied up.
     fn finish(&self, scene: &Scene, digest: String, semantics: Option<String>) -> Result<()> {
         let (store, meta, id) = (&self.parts.store, &scene.meta, &scene.meta.id);
         // In the store first: a watcher who sees `done` may stop the machine.
@@ -169,10 +201,7 @@ impl Jobs {
             done.semantics_sha256 = Some(digest);
             done.status.semantics = SemanticsStatus::ready(semantics.report.clone());
         }
-        store.put_record(&done)?;
-        if !content.is_empty() {
-            store.put_content(done.owner.as_deref(), content, id)?;
-        }
+        store.put_status(&done)?;
         // In one change, so that no watcher takes `done` for the end.
         let ready = done.status.semantics.state == SemanticsState::Ready;
         let eager = done.options.semantics == SemanticsMode::Eager && !ready;
@@ -184,7 +213,17 @@ impl Jobs {
         tracing::info!(scene = %id, "done");
         if eager {
             self.queue.push(Kind::Semantics, id.clone(), owner.as_deref());
-        } else if !self.parts.keep_photos {
+        }
+        // The scene is there, whatever comes of these. The content first: the next job with this
+        // content begins when this one ends.
+        let noted = match content.is_empty() {
+            true => Ok(()),
+            false => store.put_content(owner.as_deref(), content, id),
+        };
+        if let Err(error) = noted.and_then(|()| store.settle(id)) {
+            tracing::warn!(scene = %id, %error, "left for the next start");
+        }
+        if !eager && !self.parts.keep_photos {
             store.drop_upload(id)?;
         }
         Ok(())

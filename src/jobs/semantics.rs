@@ -11,7 +11,7 @@ use super::{
 };
 use crate::{
     error::{Error, Result},
-    scene::{SceneId, SceneState, SemanticsMode, SemanticsState, SemanticsStatus},
+    scene::{SceneId, SceneState, SemanticsMode, SemanticsReport, SemanticsState, SemanticsStatus},
     store::Record,
 };
 
@@ -79,29 +79,31 @@ impl Jobs {
             let message = format!("{}: {}", job.kind.names().1, e.message());
             Error::new(e.code(), message).caused_by(e)
         };
+        // In the store first: a watcher who sees `ready` may stop the machine. A record without the
+        // file counts as no semantics, so both are kept at the same time.
+        let keep = |report: SemanticsReport, digest: Option<&str>| -> Result<Option<Record>> {
+            let found = self.records.find(id).map(Arc::unwrap_or_clone);
+            let Some(mut ready) = found else { return Ok(None) };
+            ready.status.semantics = SemanticsStatus::ready(report);
+            ready.semantics_sha256 = digest.map(str::to_owned).or(ready.semantics_sha256);
+            store.put_record(&ready)?;
+            Ok(Some(ready))
+        };
         let make = || {
-            let mut scene = store.scene(id)?;
-            let mut digest = None;
+            let scene = store.scene(id)?;
             // A start that lost the status but not the file has nothing to make.
-            if scene.semantics.is_none() {
-                let semantics = self.within_time(job, |watch| {
-                    let upload = self.photos(id, watch)?;
-                    self.parts.semantics.make(&upload.photos.photos, &scene, watch)
-                })?;
-                let kept = store.put_semantics(id, semantics)?;
-                (scene, digest) = (kept.0, Some(kept.1));
+            if let Some(semantics) = &scene.semantics {
+                return keep(semantics.report.clone(), None);
             }
-            Ok((scene, digest))
+            let semantics = self.within_time(job, |watch| {
+                let upload = self.photos(id, watch)?;
+                let _room = self.room.take(upload.photos.photos.len(), watch.cancel)?;
+                self.parts.semantics.make(&upload.photos.photos, &scene, watch)
+            })?;
+            let report = semantics.report.clone();
+            Ok(store.put_semantics(id, semantics, |digest| keep(report, Some(digest)))?.2)
         };
-        let (scene, digest) = make().map_err(named)?;
-        let report = scene.semantics.as_ref().map(|of| of.report.clone()).unwrap_or_default();
-        // In the store first: a watcher who sees `ready` may stop the machine.
-        let Some(mut ready) = self.records.find(id).map(Arc::unwrap_or_clone) else {
-            return Ok(());
-        };
-        ready.status.semantics = SemanticsStatus::ready(report);
-        ready.semantics_sha256 = digest.or(ready.semantics_sha256);
-        store.put_record(&ready).map_err(named)?;
+        let Some(ready) = make().map_err(named)? else { return Ok(()) };
         let bank_size = ready.status.semantics.bank_size;
         let eager = ready.options.semantics == SemanticsMode::Eager;
         self.records.update(id, |record| *record = ready);

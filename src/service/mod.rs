@@ -134,7 +134,7 @@ impl Service {
             scenes: parts.scenes,
             semantics: Arc::clone(&parts.semantics),
             limits: config.limits.clone(),
-            workers: config.jobs,
+            workers: config.workers(),
             keep_photos: config.keep_photos,
         };
         let jobs = Jobs::start(job_parts, records)?;

@@ -6,7 +6,7 @@
 //! scenes/ID/semantics.segsplat  its semantics, once a text needed them
 //! scenes/ID/status.json         the record of what is over: done or failed
 //! scenes/ID/*.quarantined       an object that failed its checksum
-//! pending/ID                    the record of what is not over; gone once there is a status
+//! pending/ID                    the record of what is not over; gone soon after there is a status
 //! keys/HASH  contents/HASH      scene of an idempotency key, and of a content hash
 //! replicas/R claims/ID.R deleted/ID   only where replicas share the store: see `shared`
 //! ```
@@ -29,7 +29,12 @@ mod shared;
 mod sweep;
 mod upload_file;
 
-use std::{collections::HashMap, path::Path, sync::Arc, time::Instant};
+use std::{
+    collections::{HashMap, HashSet},
+    path::Path,
+    sync::Arc,
+    time::Instant,
+};
 
 use fs_err as fs;
 use object_store::path::Path as Name;
@@ -68,6 +73,8 @@ pub struct Store {
     cache: Cache<SceneId, Arc<Scene>>,
     /// One lock a scene being read, so that many callers read it once.
     reading: Mutex<HashMap<SceneId, Arc<Mutex<()>>>>,
+    /// Scenes whose upload and first record are being written: a sweep leaves them alone.
+    arriving: Mutex<HashSet<SceneId>>,
     /// Scenes deleted here: what a job still writes of one is removed again.
     gone: Mutex<HashMap<SceneId, Instant>>,
     /// Dropped with the store: another process may then use the folder.
@@ -112,9 +119,16 @@ impl Store {
         let keep = || -> Result<()> {
             let file = upload_file::pack(upload, record)
                 .map_err(|e| Error::internal("the upload cannot be packed").caused_by(e))?;
-            // The record first: a sweep removes an upload without one, however the call ends.
-            self.announce(record)?;
-            self.objects.put("keep the upload", of(id, UPLOAD), file)
+            let put = || self.objects.put("keep the upload", of(id, UPLOAD), file);
+            if self.shared {
+                // The record first: the sweep of a replica removes an upload without one.
+                self.announce(record)?;
+                return put();
+            }
+            self.arriving.lock().insert(id.clone());
+            let (announced, kept) = side_by_side(|| self.announce(record), put);
+            self.arriving.lock().remove(id);
+            announced.and(kept)
         };
         keep().inspect_err(|_| {
             // What cannot be removed now is removed at the next start.
@@ -148,9 +162,19 @@ impl Store {
             self.put_sealed(pending(id), record)?;
             return self.unless_deleted(id);
         }
+        self.put_status(record)?;
+        self.settle(id)
+    }
+
+    /// Keeps the record of a scene that is over. Its pending record stays until it is settled.
+    pub(crate) fn put_status(&self, record: &Record) -> Result<()> {
+        let id = &record.status.id;
         self.put_sealed(of(id, STATUS), record)?;
-        self.unless_deleted(id)?;
-        // The scene is over: there is a status.
+        self.unless_deleted(id)
+    }
+
+    /// Removes the pending record of a scene that has a status. A start does it too.
+    pub(crate) fn settle(&self, id: &SceneId) -> Result<()> {
         self.objects.delete("keep the scene's status", pending(id))?;
         if self.shared { self.drop_claims(id) } else { Ok(()) }
     }
@@ -189,23 +213,28 @@ impl Store {
         Ok((scene, digest))
     }
 
-    /// Keeps the semantics of a scene; gives the scene that carries them and the file's sha256,
-    /// hex.
-    /// Fails as [`Self::scene`]; `scene_corrupt` also when they are of other Gaussians.
-    pub(crate) fn put_semantics(
+    /// Keeps the semantics of a scene, and does `beside` with their file's sha256, hex, at the same
+    /// time; gives the scene that carries them, the sha256, and what `beside` gave.
+    /// Fails as [`Self::scene`] and as `beside`; `scene_corrupt` also when they are of other
+    /// Gaussians.
+    pub(crate) fn put_semantics<T>(
         &self,
         id: &SceneId,
         semantics: Semantics,
-    ) -> Result<(Arc<Scene>, String)> {
+        beside: impl FnOnce(&str) -> Result<T>,
+    ) -> Result<(Arc<Scene>, String, T)> {
         let semantics = Arc::new(semantics);
         let scene = Arc::new(self.scene(id)?.with_semantics(Arc::clone(&semantics))?);
         let mut file = Vec::new();
         let digest = write_semantics(&mut file, id, &semantics)
             .map_err(|e| Error::internal("the semantics cannot be packed").caused_by(e))?;
-        self.objects.put("keep the scene's semantics", of(id, SEMANTICS), file)?;
+        let put = || self.objects.put("keep the scene's semantics", of(id, SEMANTICS), file);
+        let (kept, beside) = side_by_side(put, || beside(&digest));
+        kept?;
+        let beside = beside?;
         self.unless_deleted(id)?;
         self.keep(Arc::clone(&scene));
-        Ok((scene, digest))
+        Ok((scene, digest, beside))
     }
 
     /// A finished scene, from memory or the store, with its semantics where they were made; every
@@ -341,6 +370,19 @@ impl Store {
             tracing::error!(scene = %id, %error, "a bad object cannot be put aside");
         }
     }
+}
+
+/// Does two things that wait for the disk at the same time.
+pub(crate) fn side_by_side<A: Send, B>(
+    one: impl FnOnce() -> A + Send,
+    other: impl FnOnce() -> B,
+) -> (A, B) {
+    std::thread::scope(|scope| {
+        let one = scope.spawn(one);
+        let other = other();
+        let one = one.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        (one, other)
+    })
 }
 
 /// Writes a scene container to any path, whole or not at all; for the command line.

@@ -23,6 +23,8 @@ use crate::error::{Error, ErrorCode, Result};
 
 /// Calls to the store at the same time where many objects are read at once.
 const AT_ONCE: usize = 16;
+/// How often a put to a local store is tried again because its folder was removed meanwhile.
+const FOLDER_GONE_MAX: usize = 4;
 
 /// An object and what tells its versions apart.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -100,8 +102,16 @@ impl Objects {
 
     /// Keeps an object, whatever was there.
     pub(super) fn put(&self, what: &str, path: Path, bytes: impl Into<PutPayload>) -> Result<()> {
-        let bytes = bytes.into();
-        self.run(what, |store| async move { store.put(&path, bytes).await.map(drop) })
+        let bytes: PutPayload = bytes.into();
+        self.run(what, |store| async move {
+            for _ in 0..FOLDER_GONE_MAX {
+                match store.put(&path, bytes.clone()).await {
+                    Err(fault) if folder_is_gone(&fault) => {}
+                    done => return done.map(drop),
+                }
+            }
+            store.put(&path, bytes).await.map(drop)
+        })
     }
 
     /// Keeps an object unless there is one; whether it was kept.
@@ -138,7 +148,12 @@ impl Objects {
     pub(super) fn delete(&self, what: &str, path: Path) -> Result<bool> {
         let folder = self.folder.clone();
         self.run(what, |store| async move {
-            if found(store.delete(&path).await)?.is_none() {
+            let was_there = match store.delete(&path).await {
+                // The object went, and its folder, which another deletion emptied.
+                Err(fault) if folder_is_gone(&fault) => true,
+                deleted => found(deleted)?.is_some(),
+            };
+            if !was_there {
                 return Ok(false);
             }
             if let Some(folder) = folder {
@@ -172,6 +187,19 @@ impl Objects {
 
 fn fault(source: impl Into<Box<dyn std::error::Error + Send + Sync>>) -> Fault {
     Fault::Generic { store: "scenes", source: source.into() }
+}
+
+/// Whether a local store missed a folder: deletions remove folders that they empty, also beside a
+/// call that needs one.
+fn folder_is_gone(fault: &Fault) -> bool {
+    let mut cause: Option<&(dyn std::error::Error + 'static)> = Some(fault);
+    let mut gone = false;
+    while let Some(error) = cause {
+        let io = error.downcast_ref::<std::io::Error>();
+        gone |= io.is_some_and(|io| io.kind() == std::io::ErrorKind::NotFound);
+        cause = error.source();
+    }
+    gone && !matches!(fault, Fault::NotFound { .. })
 }
 
 /// `None` where a call found no object.

@@ -110,6 +110,7 @@ impl Store {
             shared,
             cache: Cache::new(limits.cache_bytes_max),
             reading: Mutex::default(),
+            arriving: Mutex::default(),
             gone: Mutex::default(),
             _lock: lock,
         };

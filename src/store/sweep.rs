@@ -1,8 +1,8 @@
 //! Removing objects that belong to no scene: a kill between two writes leaves them.
 //!
-//! Safe beside callers and other replicas. A scene's record is there before anything else of it
-//! and goes first, and its status is there before its pending record goes. So an id that has
-//! neither, looked for in that order, is no scene.
+//! Safe beside callers and other replicas. A scene's record is there before anything else of it,
+//! or the scene is known to arrive here. Its record goes first, and its status is there before its
+//! pending record goes. So an id that has neither, looked for in that order, is no scene.
 
 use std::{collections::HashSet, time::Duration};
 
@@ -80,6 +80,9 @@ impl Store {
 
     /// Whether there is such a scene, acknowledged or on its way to be.
     fn exists(&self, id: &SceneId) -> Result<bool> {
+        if self.arriving.lock().contains(id) {
+            return Ok(true);
+        }
         let exists = |path| self.objects.exists(SWEEP, path);
         Ok(exists(pending(id))? || exists(of(id, STATUS))?)
     }

@@ -1,9 +1,10 @@
 //! The store: files come back bit for bit, are whole or absent, and are put aside when they are
 //! bad; PLY out and in.
 
-use std::{fs, io::Cursor, path::Path, time::Duration};
+use std::{fs, io::Cursor, path::Path, sync::Arc, time::Duration};
 
 use glam::DVec3;
+use object_store::{memory::InMemory, path::Path as Name};
 use segsplat::{
     error::{ErrorCode, Result},
     limits::Limits,
@@ -18,6 +19,8 @@ use segsplat::{
         provenance, read_scene, request_sha256, write_scene,
     },
 };
+
+use crate::common::faults::{FaultStore, Wrong};
 
 /// Reproducible numbers in 0..1.
 struct Numbers(u64);
@@ -183,6 +186,41 @@ fn done(byte: u8) -> Record {
     let mut record = record(byte);
     record.status.state = SceneState::Done;
     record
+}
+
+#[test]
+fn uploads_arrive_beside_deletions() {
+    let folder = tempfile::tempdir().unwrap();
+    let (store, _) = open(folder.path());
+    let work = |byte: u8| {
+        for _ in 0..16 {
+            // A deletion removes the folders that it empties, which others need meanwhile.
+            store.put_upload(upload(), &record(byte)).unwrap();
+            store.upload(&id(byte)).unwrap();
+            store.remove(&record(byte)).unwrap();
+        }
+    };
+    std::thread::scope(|scope| {
+        (1..=8).for_each(|byte| drop(scope.spawn(move || work(byte))));
+    });
+}
+
+#[test]
+fn a_sweep_leaves_an_upload_whose_record_is_on_its_way() {
+    let stall = Duration::from_millis(300);
+    let faults = Arc::new(FaultStore::new(Arc::new(InMemory::new()), stall));
+    let is_record = |what: &str, path: &Name| what == "put" && path.as_ref().starts_with("pending");
+    faults.plan(move |what, path| is_record(what, path).then_some(Wrong::Stalls));
+    let place = Place::Own(faults);
+    let (store, _) = Store::open(&place, &Limits::default()).unwrap();
+    std::thread::scope(|scope| {
+        let put = scope.spawn(|| store.put_upload(upload(), &record(1)));
+        while store.upload(&id(1)).is_err() && !put.is_finished() {}
+        assert!(!put.is_finished(), "the record is on its way");
+        assert_eq!(store.sweep(Duration::ZERO).unwrap(), 0, "nothing is removed");
+        put.join().unwrap().unwrap();
+    });
+    store.upload(&id(1)).unwrap();
 }
 
 #[test]
