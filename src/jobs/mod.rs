@@ -288,7 +288,9 @@ impl Jobs {
         let record = self.record(id)?;
         self.queue.remove(id);
         let running = self.running.stop(Some(id), Reason::Cancelled);
-        match self.parts.store.remove(&record) {
+        let removed = self.parts.store.remove(&record);
+        let removed_here = removed.is_ok();
+        match removed {
             // A job that was about to end may have removed its own objects first.
             Err(error) if error.code() != ErrorCode::SceneNotFound => {
                 // It still exists, but no job makes it any more.
@@ -305,7 +307,8 @@ impl Jobs {
         if !running {
             self.release(id);
         }
-        if self.records.remove(id) { Ok(()) } else { Err(not_found(id)) }
+        // What watches the other replicas may have seen first that it is gone.
+        if self.records.remove(id) || removed_here { Ok(()) } else { Err(not_found(id)) }
     }
 
     /// Marks a finished scene as failed: its file turned out to be bad.
