@@ -1,15 +1,17 @@
 """Trains the image tower on cuts, so that names without outlines are kept, and measures just that.
 
-    python train_open.py --pack PACK --salient FOLDER --net net.npz --image ../../embedded/image_tower.onnx --out OUT --seconds S \
-        [--withhold] [--rank R --world N --meet FOLDER]
+    python train_open.py --pack PACK --net net.npz --image ../../embedded/image_tower.onnx --out OUT --seconds S \
+        --prepared FOLDER [--withhold]
+    python train_open.py --prepare ...           # makes the files of --prepared and ends
 
-With --withhold the names of `withheld.txt` (and all that is a kind of one) are kept out of every bank of pictures;
-shares, canon and recipe are chosen on those *open names*, and the twin run without --withhold ships. Two recipes
-train on the same batches. What differs from train_real.py:
+What never changes (outlines, teachers' answers) is computed once, with --prepare, and read afterwards: GPU time is
+for training. With --withhold the names of `withheld.txt` (and all that is a kind of one) are kept out of every
+bank of pictures; shares, canon and recipe are chosen on those *open names*, and the twin run without --withhold
+ships. Two recipes train on the same batches. What differs from train_real.py:
 
 - Teachers look at each thing once, at its best: the tower that training begins with at the exact cut and at plain
-  boxes (their mean names better than either), EfficientNet-Lite2 at the boxes. The tower learns to say the same of ragged, merged, hidden and
-  small cuts, named or not (windows of photographs without labels, too).
+  boxes (their mean names better than either), EfficientNet-Lite2 at the boxes. The tower learns to say the same of
+  ragged, merged, hidden and small cuts, named or not (windows of photographs without labels, too).
 - Half of the drawn things are cut by the mask network's own masks (net_masks.py): that is what the product cuts.
 - A word that no picture of the sets shows is never taught as false with full weight: that is how unknown names sink.
 - The frequencies of names are taken out of the choice of a name (logit adjustment).
@@ -25,16 +27,16 @@ import numpy as np
 import torch
 import torch.nn as nn
 import torch.nn.functional as F
-from PIL import Image
 
 from colours import dominant_colour
 from export import fold
 from salient import Salient
-from train_real import CONTEXT, DIM, DRAWN, KIND, PHOTO, POOL, THING, UNKNOWN, Pictures, decode, exact, folded, letterbox, lite2_of, normalised, outlines, unfold, window
+from train_real import CONTEXT, DIM, DRAWN, KIND, PHOTO, POOL, THING, UNKNOWN, Pictures, decode, exact, folded, letterbox, lite2_of, normalised, outlines, unfold
 from words_model import SIDE, ImageTower
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 SOURCES = [1.0, 1.6, 7.0, 5.0]  # how often a photograph of each labelled set is seen
+TOP = 16  # likeliest names of EfficientNet-Lite2 that are kept
 ABSENT = 0.015  # "found" is also measured at the canon where this share of false words is found
 # What the tower that training begins with is shown: brightness outside the outline, margin, weight.
 VIEWS = [(0.0, 0.0, 1.0), (1.0, 0.08, 0.6), (1.0, 0.3, 0.4)]
@@ -46,27 +48,23 @@ def withheld_words():
     return {w for row in open(os.path.join(HERE, "withheld.txt")) if not row.startswith("#") for w in row.strip().split(", ") if w}
 
 
-class Meet:
-    """Rows computed once by several processes: each computes its part and reads the others'."""
+class Prepared:
+    """Arrays that are computed once and read afterwards: FOLDER/NAME.npz. Without a folder they are always computed."""
 
-    def __init__(self, folder, rank, world):
-        self.folder, self.rank, self.world = folder, rank, world
-        os.makedirs(folder, exist_ok=True)
+    def __init__(self, folder, write):
+        self.folder, self.write = folder, write
 
-    def rows(self, name, n, compute):
-        mine = compute(torch.arange(self.rank, n, self.world))
-        path = lambda r: os.path.join(self.folder, f"{name}.{r}.pt")
-        if self.world == 1:
-            return mine
-        torch.save([t.cpu() for t in mine], path(self.rank) + ".tmp")
-        os.rename(path(self.rank) + ".tmp", path(self.rank))
-        out = [torch.empty((n, *t.shape[1:]), dtype=t.dtype) for t in mine]
-        for r in range(self.world):
-            while not os.path.exists(path(r)):
-                time.sleep(0.2)
-            for whole, part in zip(out, torch.load(path(r))):
-                whole[r :: self.world] = part
-        return out
+    def arrays(self, name, compute):
+        path = self.folder and os.path.join(self.folder, name + ".npz")
+        if path and os.path.exists(path):
+            z = np.load(path)
+            return [z[k] for k in sorted(z.files)]
+        got = compute()
+        if path and self.write:
+            os.makedirs(self.folder, exist_ok=True)
+            np.savez_compressed(path, **{f"a{i}": v for i, v in enumerate(got)})
+            print(path, os.path.getsize(path) >> 10, "KiB", flush=True)
+        return got
 
 
 class Bank:
@@ -77,13 +75,13 @@ class Bank:
 
     def only(self, keep):
         out = Bank(self.name, self.pics[keep], self.cls[keep], self.weight[keep], self.outlined[keep])
-        out.net, out.net_fits = self.net[keep], self.net_fits[keep]
+        out.net, out.net_fits = self.net[keep.to(self.net.device)], self.net_fits[keep.to(self.net.device)]
         return out
 
     def under_net(self):
         """Windows under the best mask of the mask network, and classes, of the things that it finds."""
         keep = self.net_fits[:, 0]
-        return torch.cat([self.pics[keep][..., :3], self.net[keep][:, 0, :, :, None]], -1), self.cls[keep]
+        return torch.cat([self.pics[keep][..., :3], self.net[keep][:, 0, :, :, None]], -1), self.cls[keep.cpu()]
 
 
 def few(n, limit):
@@ -94,58 +92,64 @@ def stacked(make, rows):
     return torch.from_numpy(np.stack(list(POOL.map(make, rows))))
 
 
-def mask_window(mask, box, size):
-    """A mask [h,w] as a window of `box`, u8 [size,size]."""
-    x0, y0, x1, y1 = box
-    side = max(x1 - x0, y1 - y0) * (1 + 2 * CONTEXT)
-    cx, cy = (x0 + x1) / 2, (y0 + y1) / 2
-    at = (cx - side / 2, cy - side / 2, cx + side / 2, cy + side / 2)
-    return np.asarray(Image.fromarray(mask).transform((size, size), Image.EXTENT, at, Image.BILINEAR))
+def windows(photo, boxes, size, context):
+    """What lies around each of `boxes` [K,4] (x0, y0, x1, y1) of a photo [C,h,w] or of one a box [K,C,h,w], 0..255, as
+    squares u8 [K,size,size,C]; 0 beyond the photo."""
+    h, w = photo.shape[-2:]
+    x = photo.float().expand(len(boxes), *photo.shape[-3:])
+    x0, y0, x1, y1 = torch.as_tensor(np.array(boxes, np.float32), device=x.device).T
+    side = torch.maximum(x1 - x0, y1 - y0) * (1 + 2 * context)
+    zero = torch.zeros_like(side)
+    theta = torch.stack([torch.stack([side / w, zero, (x0 + x1) / w - 1], -1), torch.stack([zero, side / h, (y0 + y1) / h - 1], -1)], 1)
+    grid = F.affine_grid(theta, (len(boxes), 1, size, size), align_corners=False)
+    return F.grid_sample(x, grid, align_corners=False).round().byte().permute(0, 2, 3, 1)
 
 
-def net_windows(bits, shape, box):
-    """The mask network's masks [2,128,16] of a photograph of `shape` as windows, u8 [2,DRAWN,DRAWN]."""
-    k = 128 / max(shape[:2])
-    h, w = min(128, math.ceil(shape[0] * k)), min(128, math.ceil(shape[1] * k))
-    out = []
-    for m in np.unpackbits(bits, axis=-1):
-        soft = Image.fromarray(m[:h, :w] * 255).resize(shape[1::-1], Image.BILINEAR)
-        out.append(mask_window(np.asarray(soft), box, DRAWN))
-    return np.stack(out)
-
-
-def drawn_bank(path, net, limit):
+def drawn_bank(path, net, device, limit):
     """Bank of the drawn things, the photographs, and each thing's photograph; `net`: file of net_masks.py."""
     z, made = np.load(path), np.load(net)
     bits, fits = (made[k + os.path.basename(path)[:-4]] for k in ("bits_", "iou_"))
     photos, masks, thing = decode(z), decode(z, "mask", "mask_at", "L"), z["thing"]
-    keep, rows = [], []
-    for k in few(len(thing), limit):
-        p, n, c, s = thing[k]
-        ys, xs = np.nonzero(masks[p] == n)
-        if len(ys) >= 40:
-            keep.append(k)
-            rows.append((p, n, (xs.min(), ys.min(), xs.max() + 1, ys.max() + 1)))
-    pics = stacked(lambda r: window(photos[r[0]], masks[r[0]] == r[1], r[2], DRAWN, CONTEXT), rows)
+    wanted, keep, pics, nets = set(few(len(thing), limit).tolist()), [], [], []
+    for p in range(len(photos)):
+        label = torch.tensor(masks[p], device=device)
+        rows, boxes = [], []
+        for k in np.nonzero(thing[:, 0] == p)[0]:
+            ys, xs = np.nonzero(masks[p] == thing[k, 1])
+            if k in wanted and len(ys) >= 40:
+                rows.append(k)
+                boxes.append((xs.min(), ys.min(), xs.max() + 1, ys.max() + 1))
+        if not rows:
+            continue
+        h, w = photos[p].shape[:2]
+        small = [min(128, math.ceil(v * 128 / max(h, w))) for v in (h, w)]
+        theirs = torch.from_numpy(np.unpackbits(bits[rows], axis=-1)[:, :, : small[0], : small[1]]).to(device).float() * 255
+        both = torch.cat([(label == torch.from_numpy(thing[rows, 1]).to(device).view(-1, 1, 1))[:, None] * 255.0,
+                          F.interpolate(theirs, (h, w), mode="bilinear")], 1)
+        m = windows(both, boxes, DRAWN, CONTEXT)
+        rgb = windows(torch.tensor(photos[p], device=device).permute(2, 0, 1), boxes, DRAWN, CONTEXT)
+        keep += rows
+        pics.append(torch.cat([rgb, m[..., :1]], -1))
+        nets.append(m[..., 1:].permute(0, 3, 1, 2))
     cls = torch.from_numpy(thing[keep, 2].astype(np.int64))
-    bank = Bank("drawn", pics, cls, torch.ones(len(cls)), torch.ones(len(cls), dtype=torch.bool))
-    bank.net = stacked(lambda i: net_windows(bits[keep[i]], photos[rows[i][0]].shape, rows[i][2]), range(len(rows)))
-    bank.net_fits = torch.from_numpy(fits[keep] >= 0.4) & ((bank.net > 127).flatten(2).sum(-1) > 40)
-    return bank, photos, torch.tensor([r[0] for r in rows])
+    bank = Bank("drawn", torch.cat(pics), cls, torch.ones(len(cls)), torch.ones(len(cls), dtype=torch.bool))
+    bank.net = torch.cat(nets)
+    bank.net_fits = torch.from_numpy(fits[keep] >= 0.4).to(device) & ((bank.net > 127).flatten(2).sum(-1) > 40)
+    return bank, photos, torch.from_numpy(thing[keep, 0])
 
 
 class Cuts(Pictures):
     """Batches of cuts of four banks, with what the teachers said of each."""
 
-    def __init__(self, pack, net, net_masks, meet, device, seed, limit):
+    def __init__(self, pack, salient, net_masks, prepared, device, seed, limit):
         self.device, self.gen = device, torch.Generator(device=device).manual_seed(seed)
         at = lambda n: os.path.join(pack, n)
         words = np.load(at("words.npz"))
-        drawn, rooms, self.room = drawn_bank(at("drawn.npz"), net_masks, limit)
+        drawn, rooms, self.room = drawn_bank(at("drawn.npz"), net_masks, device, limit)
         z = np.load(at("photos.npz"))
         pick, whole = few(len(z["label"]), limit), decode(z)
         pics = stacked(lambda i: letterbox(whole[i], PHOTO), pick)
-        photos = self.outlined("photos", net, meet, pics, z["label"][pick], torch.tensor(SOURCES)[torch.from_numpy(z["source"][pick].astype(np.int64))])
+        photos = self.outlined("photos", salient, prepared, pics, z["label"][pick], torch.tensor(SOURCES)[torch.from_numpy(z["source"][pick].astype(np.int64))])
         z = np.load(at("things.npz"))
         of = {str(n): int(c) for n, c in zip(words["thing_names"], words["things"])}
         pics = stacked(lambda a: letterbox(a, THING), decode(z, mode="RGBA")[:limit])
@@ -161,24 +165,36 @@ class Cuts(Pictures):
                 x, y = rng.uniform(0, a.shape[1] - side), rng.uniform(0, a.shape[0] - side)
                 boxes.append((a, UNKNOWN, (x, y, x + side, y + side), k - len(wild)))
         boxes = [boxes[i] for i in few(len(boxes), limit)]
-        pics = stacked(lambda b: window(b[0], np.ones(b[0].shape[:2], bool), b[2], 208, 0.12)[..., :3], boxes)
-        wild = self.outlined("wild", net, meet, pics, np.array([b[1] for b in boxes]), torch.ones(len(boxes)))
+        pics, at_photo = [], 0
+        while at_photo < len(boxes):  # runs of one photograph together
+            a, end = boxes[at_photo][0], at_photo
+            while end < len(boxes) and boxes[end][0] is a:
+                end += 1
+            pics.append(windows(torch.tensor(a, device=device).permute(2, 0, 1), [b[2] for b in boxes[at_photo:end]], 208, 0.12))
+            at_photo = end
+        wild = self.outlined("wild", salient, prepared, torch.cat(pics), np.array([b[1] for b in boxes]), torch.ones(len(boxes)))
         self.banks, self.window_of = [drawn, photos, shapes, wild], torch.tensor([b[3] for b in boxes])
 
-    def outlined(self, name, net, meet, pics, cls, weight):
+    def outlined(self, name, salient, prepared, pics, cls, weight):
         """A bank of pictures under the outlines of the salient-object network, or whole where it found none."""
-        mask, fine = (t.to("cpu") for t in meet.rows(name, len(pics), lambda rows: outlines(net, pics[rows])))
-        inside = (pics.amax(-1) > 0).byte() * 255
-        mask = torch.where(fine[:, None, None], mask, inside)
+
+        def find():
+            mask, fine = outlines(salient(), pics)
+            return [np.packbits(mask.cpu().numpy() > 127, axis=-1), fine.cpu().numpy()]
+
+        bits, fine = prepared.arrays("outlines_" + name, find)
+        mask, fine = (torch.from_numpy(v).to(self.device) for v in (np.unpackbits(bits, axis=-1) * 255, fine))
+        pics = pics.to(self.device)
+        mask = torch.where(fine[:, None, None], mask, (pics.amax(-1) > 0).byte() * 255)
         return Bank(name, torch.cat([pics, mask[..., None]], -1), torch.from_numpy(cls.astype(np.int64)), weight.float(), fine)
 
     @torch.no_grad()
-    def ask(self, meet, first, lite2):
+    def ask(self, prepared, first, lite2):
         """Each bank's `first` [N,384], the mean of several views, and `opinion` [N,1000]: what the teachers say."""
 
-        def say(bank, rows):
-            first_out, opinion = [], []
-            for part in rows.split(256):
+        def say(bank):
+            out = []
+            for part in torch.arange(len(bank.cls)).split(256):
                 w, said, logits = bank.pics[part].to(self.device), 0, 0
                 with torch.autocast(KIND, dtype=torch.bfloat16):
                     for dim, margin, weight in VIEWS:
@@ -186,12 +202,16 @@ class Cuts(Pictures):
                         for view in (x, x.flip(-1)):
                             said = said + weight * first(view)
                             logits = logits + (lite2._fc(lite2.head(view)).float() / 4 if dim else 0)
-                first_out.append(F.normalize(said, dim=-1).half())
-                opinion.append(logits.half())
-            return torch.cat(first_out), torch.cat(opinion)
+                # In 8 bits, and of the thousand the likeliest: the rest share what is left.
+                top, which = logits.softmax(-1).topk(TOP, -1)
+                out.append([v.cpu().numpy() for v in ((F.normalize(said, dim=-1) * 400).round().clamp(-127, 127).to(torch.int8), top.half(), which.short())])
+            return [np.concatenate(v) for v in zip(*out)]
 
         for b in self.banks:
-            b.first, b.opinion = (t.to(self.device) for t in meet.rows("said_" + b.name, len(b.cls), lambda rows: say(b, rows)))
+            first_said, top, which = (torch.from_numpy(v).to(self.device) for v in prepared.arrays("said_" + b.name, lambda: say(b)))
+            b.first, top = F.normalize(first_said.float(), dim=-1).half(), top.float()
+            rest = ((1 - top.sum(1, keepdim=True)) / (1000 - TOP)).clamp(min=1e-7)
+            b.opinion = rest.expand(-1, 1000).scatter(1, which.long(), top).clamp(min=1e-7).log().half()
 
     def ready(self, withheld):
         """Pictures go to the device; those of withheld classes, and windows of photographs of such, are never drawn."""
@@ -199,8 +219,6 @@ class Cuts(Pictures):
         rooms = self.room[((drawn >= 0) & withheld.cpu()[drawn.clamp(min=0)])]
         self.banks[3].weight[torch.isin(self.window_of, rooms)] = 0
         for b in self.banks:
-            if b.name == "drawn":
-                b.net, b.net_fits = b.net.to(self.device), b.net_fits.to(self.device)
             b.pics, b.cls, b.outlined = b.pics.to(self.device), b.cls.to(self.device), b.outlined.to(self.device)
             weight = b.weight.to(self.device)
             named = b.cls >= 0
@@ -293,16 +311,15 @@ class Student:
 
 def main():
     ap = argparse.ArgumentParser()
-    for name in ["pack", "salient", "net", "image", "out"]:
+    for name in ["pack", "net", "image", "out"]:
         ap.add_argument("--" + name, required=True)
-    ap.add_argument("--seconds", type=float, required=True)
-    ap.add_argument("--by", type=float, help="time (seconds since 1970) at which training ends at the latest")
+    ap.add_argument("--salient", help="folder of the salient-object network; only to prepare")
+    ap.add_argument("--seconds", type=float, default=400)
     ap.add_argument("--withhold", action="store_true")
     ap.add_argument("--batch", type=int, nargs=4, default=[120, 112, 24, 72], help="drawn, photographs, shapes, without labels")
     ap.add_argument("--seed", type=int, default=80)
-    ap.add_argument("--rank", type=int, default=0)
-    ap.add_argument("--world", type=int, default=1)
-    ap.add_argument("--meet", default="/tmp/meet")
+    ap.add_argument("--prepared", help="folder of what --prepare made")
+    ap.add_argument("--prepare", action="store_true", help="make the files of --prepared, and end")
     ap.add_argument("--limit", type=int, help="so many rows of each bank, to try the program")
     ap.add_argument("--name", default="")
     args = ap.parse_args()
@@ -332,28 +349,30 @@ def main():
     open_class = (truth_of[: len(own)][:, listed] == 1).any(1) | torch.isin(own, listed)
 
     # Pictures, and what the teachers say of them.
-    meet = Meet(args.meet, args.rank, args.world)
-    net = Salient(args.salient, device, torch.float16 if KIND == "cuda" else torch.float32)
-    cuts = Cuts(args.pack, net, args.net, meet, device, args.seed + 1, args.limit)
+    prepared = Prepared(args.prepared, args.prepare)
+    salient = lambda: Salient(args.salient, device, torch.float16 if KIND == "cuda" else torch.float32)
+    cuts = Cuts(args.pack, salient, args.net, prepared, device, args.seed + 1, args.limit)
     tell("outlines:", {b.name: (len(b.cls), int(b.outlined.sum())) for b in cuts.banks})
     lite2 = lite2_of(at("lite2.npz")).to(device).eval().requires_grad_(False).to(memory_format=torch.channels_last)
     fc, shipped = lite2._fc, folded(args.image)
     flat = lambda: fold(ImageTower()).to(device).eval().requires_grad_(False).to(memory_format=torch.channels_last)
     first = flat()
     first.load_state_dict(shipped)
-    cuts.ask(meet, first, lite2)
+    cuts.ask(prepared, first, lite2)
     tell("asked the teachers")
+    if args.prepare:
+        return
 
     # Sets to measure on: held-out things, things and photographs of withheld classes, held-out whole photographs.
     g = torch.Generator().manual_seed(5)
-    held, _, _ = drawn_bank(at("drawn_held.npz"), args.net, args.limit)
+    held, _, _ = drawn_bank(at("drawn_held.npz"), args.net, device, args.limit)
     held = held.only(held.cls >= 0)
     opened = open_class.cpu()
-    is_open = lambda b: (b.cls >= 0) & opened[b.cls.clamp(min=0)]
+    is_open = lambda b: (b.cls >= 0) & opened[b.cls.clamp(min=0)]  # still on the CPU, as all classes are
     opens = [b.only(is_open(b)) for b in (cuts.banks[0], held)]
     joined = lambda two: [torch.cat(v) for v in zip(*two)]
     photos = cuts.banks[1]
-    rows = torch.nonzero(is_open(photos) & photos.outlined)[:, 0]
+    rows = torch.nonzero(is_open(photos) & photos.outlined.cpu())[:, 0]
     rows = rows[torch.randperm(len(rows), generator=g)]
     seen_of, some = {}, []
     for r in rows.tolist():
@@ -487,9 +506,7 @@ def main():
         loss = ce + bce + s.hold * hold + s.kd * kd + 0.2 * made
         return loss, [loss, ce, bce, hold, kd, made]
 
-    if args.by:
-        args.seconds = min(args.seconds, args.by - time.time())
-    tell("ready, seconds", args.seconds)
+    tell("ready")
     begin, step, marks = time.time(), 0, [0.15, 0.3, 0.45, 0.6, 0.75, 0.9]
     torch.backends.cudnn.benchmark = True
     while True:
