@@ -34,7 +34,7 @@ KIND = "cuda" if torch.cuda.is_available() else "cpu"
 DRAWN, PHOTO, THING, CONTEXT = 352, 176, 144, 0.35
 DIM = 0.35  # brightness that is left outside an outline, where it is not black
 UNKNOWN = -1
-POOL = ThreadPoolExecutor(16)
+POOL = ThreadPoolExecutor(min(32, os.cpu_count() * 2))
 
 
 def decode(z, blob="blob", at="offsets", mode="RGB"):
