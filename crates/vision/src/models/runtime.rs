@@ -2,8 +2,9 @@
 //!
 //! Search order: `--ort-library` / `SEGSPLAT_ORT_LIBRARY`, `ORT_DYLIB_PATH`, beside the executable,
 //! `../share/segsplat`, `target/ort` of the checkout or of the working folder, the system's
-//! folders. A library that the operator *named* is always loaded. A warning tells when its hash is
-//! not pinned (a CUDA build, a newer release). A library that was only *found* must be one of the
+//! folders. In each of them a folder `cuda` or `webgpu` comes first for that provider, and `cuda`
+//! for `auto`. A library that the operator *named* is always loaded. A warning tells when its hash
+//! is not pinned (a newer release). A library that was only *found* must be one of the
 //! pinned builds, or the server does not start.
 
 use std::{
@@ -12,15 +13,17 @@ use std::{
 };
 
 use ort::{
-    ep::{self, ExecutionProvider},
-    session::Session,
+    ep::{self, ExecutionProvider, cuda::ConvAlgorithmSearch},
+    session::{Session, builder::PrepackedWeights},
 };
 use parking_lot::Mutex;
 use tracing::{info, warn};
 
 use crate::{
     error::Result,
-    models::{NetworkOptions, ProviderChoice, bundle::sha256_of, manifest::unavailable, places},
+    models::{
+        NetworkOptions, ProviderChoice, bundle::sha256_of, correlate, manifest::unavailable, places,
+    },
 };
 
 /// The one command that gets the library.
@@ -110,6 +113,9 @@ impl Runtime {
                 )));
             }
         }
+        if matches!(options.provider, ProviderChoice::Auto | ProviderChoice::Cuda) {
+            preload_cuda(&path);
+        }
         let environment = ort::init_from(&path)
             .map_err(|e| {
                 unavailable(format!(
@@ -144,25 +150,47 @@ impl Runtime {
         self.pinned
     }
 
-    /// Opens `model` on `provider`, `threads` threads an operator, spinning off.
+    /// Opens `model` on `provider`, `threads` threads an operator, spinning off. Sessions that get
+    /// the same `weights` share what the CPU's kernels make of them. `eight_bits` says that the file
+    /// computes in 8 bits.
+    ///
+    /// CUDA computes in f32: TF32 is off. Its convolutions are chosen by a heuristic: the search is
+    /// seconds long for each shape.
     pub(super) fn session(
         &self,
         model: &Path,
         provider: Provider,
         threads: usize,
-    ) -> std::result::Result<Session, ort::Error> {
+        weights: Option<&PrepackedWeights>,
+        eight_bits: bool,
+    ) -> ort::Result<Session> {
         let providers = match provider {
             Provider::Cpu => vec![],
-            Provider::Cuda => vec![ep::CUDA::default().build().error_on_failure()],
+            Provider::Cuda => vec![
+                ep::CUDA::default()
+                    .with_tf32(false)
+                    .with_conv_algorithm_search(ConvAlgorithmSearch::Heuristic)
+                    .build()
+                    .error_on_failure(),
+            ],
             Provider::Webgpu => vec![ep::WebGPU::default().build().error_on_failure()],
         };
-        Session::builder(&self.environment)?
+        let mut builder = Session::builder(&self.environment)?
             .with_intra_threads(threads)?
             .with_inter_threads(1)?
             .with_intra_op_spinning(false)?
             .with_inter_op_spinning(false)?
-            .with_execution_providers(providers)?
-            .commit_from_file(model)
+            .with_operators(correlate::domain()?)?
+            .with_execution_providers(providers)?;
+        if let Some(weights) = weights {
+            builder = builder.with_prepacked_weights(weights)?;
+        }
+        if eight_bits {
+            // Without it, processors that lack 8-bit dot products let sums of products overflow.
+            // It breaks files of f32 arithmetic that store a weight in 8 bits.
+            builder = builder.with_precise_qmm()?;
+        }
+        builder.commit_from_file(model)
     }
 
     /// Providers to try for a choice, best first.
@@ -213,11 +241,14 @@ fn locate(options: &NetworkOptions) -> Result<(PathBuf, bool)> {
     }
     let target = std::env::var_os("CARGO_TARGET_DIR").map(|dir| PathBuf::from(dir).join("ort"));
     let own = places::folders();
-    own.iter()
+    let folders = own
+        .iter()
         .cloned()
         .chain(target)
         .chain(own.iter().map(|folder| folder.join("target/ort")))
-        .chain(SYSTEM.iter().map(PathBuf::from))
+        .chain(SYSTEM.iter().map(PathBuf::from));
+    folders
+        .flat_map(|folder| builds(options.provider).iter().map(move |build| folder.join(build)))
         .find_map(|folder| folder.join(LIBRARY).canonicalize().ok())
         .map(|path| (path, false))
         .ok_or_else(|| {
@@ -227,6 +258,28 @@ fn locate(options: &NetworkOptions) -> Result<(PathBuf, bool)> {
                  `{SETUP_COMMAND}` (24 MB, checked by sha256)"
             ))
         })
+}
+
+/// Folders of the builds for a choice, beside or in the folder that is searched, best first.
+fn builds(choice: ProviderChoice) -> &'static [&'static str] {
+    match choice {
+        ProviderChoice::Cpu => &[""],
+        ProviderChoice::Auto | ProviderChoice::Cuda => &["cuda", ""],
+        ProviderChoice::Webgpu => &["webgpu", ""],
+    }
+}
+
+/// Loads CUDA's libraries that lie beside the library, so that the loader needs no path.
+fn preload_cuda(library: &Path) {
+    let names = ep::cuda::CUDA_DYLIBS.iter().chain(ep::cuda::CUDNN_DYLIBS);
+    for name in names.copied() {
+        let path = library.with_file_name(name);
+        if path.is_file()
+            && let Err(e) = ort::util::preload_dylib(&path)
+        {
+            warn!(library = name, error = %e, "a library of CUDA does not load");
+        }
+    }
 }
 
 #[cfg(test)]
