@@ -45,8 +45,8 @@ pub struct Geometry {
 }
 
 impl Geometry {
-    /// Opens it on the provider of the configuration. On a device every shape in use has run when
-    /// this returns, and its answer was held to the CPU's.
+    /// Opens it on the provider of the configuration. On a device its answer was held to the CPU's
+    /// when this returns.
     ///
     /// # Errors
     /// `model_unavailable` when the provider asked for is not there or differs from the CPU, or the
@@ -65,16 +65,18 @@ impl Geometry {
             probe: &|_| Ok(probe.inputs(&manifest)),
         };
         let network = Network::open(runtime, bundle, options, &spec)?;
-        let geometry = Self { network, manifest: manifest.clone() };
-        if geometry.provider() != Provider::Cpu {
-            geometry.warm()?;
-        }
-        Ok(geometry)
+        Ok(Self { network, manifest: manifest.clone() })
     }
 
-    /// Runs every size with the usual numbers of views: the first run of a shape is slow on a
-    /// device.
-    fn warm(&self) -> Result<()> {
+    /// Runs every size with the usual numbers of views, where a device computes it: the first run
+    /// of a shape takes a second there.
+    ///
+    /// # Errors
+    /// As [`Self::run`].
+    pub fn warm(&self) -> Result<()> {
+        if self.provider() == Provider::Cpu {
+            return Ok(());
+        }
         let manifest = &self.manifest;
         let counts = WARM_VIEWS.into_iter().filter(|views| *views <= manifest.views_max);
         for views in counts {

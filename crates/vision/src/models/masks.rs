@@ -44,7 +44,7 @@ pub struct PhotoEmbedding {
 /// What the decoder's file takes.
 #[derive(Clone, Debug)]
 struct Takes {
-    /// The signature of EfficientSAM.
+    /// The signature `efficient_sam`.
     efficient: bool,
     /// Prompts a run.
     batch: usize,

@@ -132,7 +132,7 @@ impl Runner for Session {
             .map(|input| Ok((input.name, input.value()?)))
             .collect::<ort::Result<_>>()
             .map_err(failed)?;
-        let outputs = Session::run(self, values).map_err(failed)?;
+        let outputs = Self::run(self, values).map_err(failed)?;
         read(&outputs).map_err(Failure::Read)
     }
 }

@@ -154,8 +154,9 @@ impl Runtime {
     /// the same `weights` share what the CPU's kernels make of them. `eight_bits` says that the file
     /// computes in 8 bits.
     ///
-    /// CUDA computes in f32: TF32 is off. Its convolutions are chosen by a heuristic: the search is
-    /// seconds long for each shape.
+    /// Devices get weights that are stored in 8 bits as f32, so that no kernel for them is needed.
+    /// CUDA computes in f32: TF32 is off. Its convolutions are chosen by a search, which takes
+    /// about a second at the first run of a shape; the heuristic's are several times slower.
     pub(super) fn session(
         &self,
         model: &Path,
@@ -169,7 +170,7 @@ impl Runtime {
             Provider::Cuda => vec![
                 ep::CUDA::default()
                     .with_tf32(false)
-                    .with_conv_algorithm_search(ConvAlgorithmSearch::Heuristic)
+                    .with_conv_algorithm_search(ConvAlgorithmSearch::Exhaustive)
                     .build()
                     .error_on_failure(),
             ],
@@ -184,6 +185,9 @@ impl Runtime {
             .with_execution_providers(providers)?;
         if let Some(weights) = weights {
             builder = builder.with_prepacked_weights(weights)?;
+        }
+        if provider != Provider::Cpu {
+            builder = builder.with_quant_qdq(false)?;
         }
         if eight_bits {
             // Without it, processors that lack 8-bit dot products let sums of products overflow.
@@ -207,8 +211,8 @@ impl Runtime {
             (ProviderChoice::Auto, true) => Ok(vec![provider, Provider::Cpu]),
             (_, true) => Ok(vec![provider]),
             (_, false) => Err(unavailable(format!(
-                "execution provider {}: this ONNX Runtime library was built without it; name one \
-                 that has it with SEGSPLAT_ORT_LIBRARY, or use --provider auto",
+                "execution provider {0}: this ONNX Runtime library was built without it; run \
+                 `{SETUP_COMMAND} --provider {0}`, or use --provider auto",
                 provider.name()
             ))),
         }
