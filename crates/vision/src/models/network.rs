@@ -23,7 +23,10 @@ use tracing::{info, warn};
 use crate::{
     error::{Error, Result},
     meter,
-    models::{Bundle, NetworkOptions, Provider, ProviderChoice, Runtime, manifest::unavailable},
+    models::{
+        Bundle, NetworkOptions, Provider, ProviderChoice, Runtime, manifest::unavailable,
+        runtime::Arithmetic,
+    },
 };
 
 /// Failed runs in a row after which a provider is not asked again.
@@ -252,19 +255,25 @@ impl Opener {
         };
         let own = self.cpu_file.as_ref().filter(|_| provider == Provider::Cpu);
         let file = own.unwrap_or(&self.file);
+        let arithmetic = match (provider, own) {
+            (Provider::Cpu, Some(_)) => Arithmetic::EightBits,
+            (Provider::Cpu, None) => Arithmetic::Fast,
+            (Provider::Cuda | Provider::Webgpu, _) => Arithmetic::F32,
+        };
         let weights = PrepackedWeights::new();
         let sessions: Vec<Session> = (0..count)
-            .map(|_| self.runtime.session(file, provider, threads, Some(&weights), own.is_some()))
+            .map(|_| self.runtime.session(file, provider, threads, Some(&weights), arithmetic))
             .collect::<ort::Result<_>>()?;
         let takes = sessions.first().map(Takes::of).unwrap_or_default();
         let runners = sessions.into_iter().map(|session| Box::new(session) as Box<dyn Runner>);
         Ok((Pool::new(runners.collect()), takes))
     }
 
-    /// The CPU's own answer from the file that devices run.
+    /// The CPU's own answer in f32 from the file that devices run.
     fn reference(&self) -> ort::Result<Pool> {
         let threads = self.options.threads;
-        let session = self.runtime.session(&self.file, Provider::Cpu, threads, None, false)?;
+        let session =
+            self.runtime.session(&self.file, Provider::Cpu, threads, None, Arithmetic::F32)?;
         Ok(Pool::new(vec![Box::new(session)]))
     }
 }

@@ -65,6 +65,18 @@ impl Provider {
     }
 }
 
+/// How a session computes with weights that are stored in 8 bits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Arithmetic {
+    /// In 8 bits where ONNX Runtime finds that faster: some of the CPU's products of matrices.
+    Fast,
+    /// In f32: devices, and the CPU where it judges them. No kernel for 8 bits is needed.
+    F32,
+    /// In 8 bits all through, as the file says. Processors that lack 8-bit dot products get a form
+    /// in which sums of products do not overflow; it breaks files that only store a weight so.
+    EightBits,
+}
+
 /// The loaded library: one in a process.
 #[derive(Debug)]
 pub struct Runtime {
@@ -151,10 +163,8 @@ impl Runtime {
     }
 
     /// Opens `model` on `provider`, `threads` threads an operator, spinning off. Sessions that get
-    /// the same `weights` share what the CPU's kernels make of them. `eight_bits` says that the file
-    /// computes in 8 bits.
+    /// the same `weights` share what the CPU's kernels make of them.
     ///
-    /// Devices get weights that are stored in 8 bits as f32, so that no kernel for them is needed.
     /// CUDA computes in f32: TF32 is off. Its convolutions are chosen by a search, which takes
     /// about a second at the first run of a shape; the heuristic's are several times slower.
     pub(super) fn session(
@@ -163,7 +173,7 @@ impl Runtime {
         provider: Provider,
         threads: usize,
         weights: Option<&PrepackedWeights>,
-        eight_bits: bool,
+        arithmetic: Arithmetic,
     ) -> ort::Result<Session> {
         let providers = match provider {
             Provider::Cpu => vec![],
@@ -186,15 +196,12 @@ impl Runtime {
         if let Some(weights) = weights {
             builder = builder.with_prepacked_weights(weights)?;
         }
-        if provider != Provider::Cpu {
-            builder = builder.with_quant_qdq(false)?;
+        match arithmetic {
+            Arithmetic::Fast => builder,
+            Arithmetic::F32 => builder.with_quant_qdq(false)?,
+            Arithmetic::EightBits => builder.with_precise_qmm()?,
         }
-        if eight_bits {
-            // Without it, processors that lack 8-bit dot products let sums of products overflow.
-            // It breaks files of f32 arithmetic that store a weight in 8 bits.
-            builder = builder.with_precise_qmm()?;
-        }
-        builder.commit_from_file(model)
+        .commit_from_file(model)
     }
 
     /// Providers to try for a choice, best first.
