@@ -10,6 +10,7 @@ mod frames;
 mod grid;
 mod masks;
 pub mod metrics;
+mod networks;
 mod npy;
 mod photos;
 pub mod report;
@@ -54,6 +55,8 @@ enum Command {
     Masks(masks::Args),
     /// Ask labelled images for their names
     Words(words::Args),
+    /// Time the networks on a provider and hold them to the CPU
+    Networks(networks::Args),
     /// Time frames of a generated scene
     Frames(frames::Args),
     /// Time frames without each kind of skipped work
@@ -94,6 +97,7 @@ pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
         Command::Semantics(args) => semantics::run(args, &mut rows)?,
         Command::Masks(args) => masks::run(args, &mut rows)?,
         Command::Words(args) => words::run(args, &mut rows)?,
+        Command::Networks(args) => networks::run(args, &mut rows)?,
         Command::Frames(args) => frames::run(args, &mut rows)?,
         Command::Skips(args) => frames::skips::run(args, &mut rows)?,
         Command::Stages(args) => stages::run(args, &mut rows)?,

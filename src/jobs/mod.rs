@@ -326,6 +326,11 @@ impl Jobs {
         self.parts.scenes.state()
     }
 
+    /// Why a network is not computed where it was to be; `None` where all are.
+    pub(crate) fn remark(&self) -> Option<String> {
+        self.parts.scenes.remark()
+    }
+
     /// Whether the queue takes jobs and a worker lives.
     pub(crate) fn is_open(&self) -> bool {
         !self.queue.is_closed() && self.workers.load(Ordering::Relaxed) > 0

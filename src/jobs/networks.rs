@@ -46,6 +46,11 @@ pub trait SceneNetworks: Send + Sync {
         NetworkState::Open("")
     }
 
+    /// Why a network is not computed where it was to be; `None` where all are.
+    fn remark(&self) -> Option<String> {
+        None
+    }
+
     /// Does the whole work on the calling thread.
     ///
     /// # Errors
@@ -136,6 +141,10 @@ impl SceneNetworks for PipelineNetworks {
             Some(Ok(engine)) => NetworkState::Open(engine.geometry().provider().name()),
             Some(Err(_)) => NetworkState::Broken,
         }
+    }
+
+    fn remark(&self) -> Option<String> {
+        self.0.peek()?.ok()?.remark()
     }
 
     fn make(

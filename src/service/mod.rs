@@ -282,6 +282,10 @@ impl Service {
             NetworkState::Open(provider) => provider.clone_into(&mut models.execution_provider),
             state => state.name().clone_into(&mut models.execution_provider),
         }
+        if let Some(remark) = self.inner.jobs.remark() {
+            let provider = &mut models.execution_provider;
+            *provider = format!("{provider} ({remark})");
+        }
         models
     }
 

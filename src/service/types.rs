@@ -226,7 +226,7 @@ pub struct ModelsInfo {
     pub bundle_sha256: String,
     /// Networks of the bundle.
     pub models: Vec<ModelInfo>,
-    /// Execution provider in use.
+    /// Execution provider in use; in brackets why it is not the one that was to be used.
     pub execution_provider: String,
     /// Renderer in use: `cpu`, or the adapter's name.
     pub renderer: String,
@@ -238,8 +238,8 @@ pub struct ModelsInfo {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 #[schema(as = Model)]
 pub struct ModelInfo {
-    /// What it does: `geometry`, `masks.encoder`, `masks.decoder`, `image_text.image`,
-    /// `image_text.text`, `image_text.tokenizer`.
+    /// What it does: `geometry`, `geometry.cpu`, `masks.encoder`, `masks.decoder`,
+    /// `image_text.image`, `image_text.text`, `image_text.tokenizer`.
     pub name: String,
     /// File in the bundle.
     pub file: String,

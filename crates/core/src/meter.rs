@@ -1,8 +1,8 @@
-//! The one metric that the stages record themselves: seconds of each stage.
+//! The metrics that the stages record themselves: seconds of each stage, and failed providers.
 
 use std::sync::LazyLock;
 
-use prometheus::{HistogramVec, register_histogram_vec};
+use prometheus::{HistogramVec, IntCounterVec, register_histogram_vec, register_int_counter_vec};
 
 use crate::scene::Stage;
 
@@ -37,6 +37,32 @@ static SECONDS: LazyLock<HistogramVec> = LazyLock::new(|| {
 /// Makes every stage known, so that none appears only after its first run.
 pub fn register() {
     LazyLock::force(&SECONDS);
+    LazyLock::force(&FALLBACKS);
+}
+
+/// Name of the metric: runs that the CPU answered because the provider failed, by `network`.
+pub const NETWORK_FALLBACKS: &str = "segsplat_network_fallbacks_total";
+
+/// Names of the networks.
+const NETWORKS: [&str; 5] =
+    ["geometry network", "mask encoder", "mask decoder", "image tower", "text tower"];
+
+static FALLBACKS: LazyLock<IntCounterVec> = LazyLock::new(|| {
+    let help = "Runs of a network that the CPU answered because the provider failed";
+    let fallbacks = register_int_counter_vec!(NETWORK_FALLBACKS, help, &["network"])
+        .expect("the name is registered once; this is a bug");
+    for network in NETWORKS {
+        fallbacks.with_label_values(&[network]);
+    }
+    fallbacks
+});
+
+/// Counts a run of `network` that the CPU answered because its provider failed; another name is not
+/// counted.
+pub fn fallback(network: &str) {
+    if NETWORKS.contains(&network) {
+        FALLBACKS.with_label_values(&[network]).inc();
+    }
 }
 
 /// Records the seconds of a stage; a name that is not in [`stages`] is not recorded.

@@ -103,7 +103,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     }
     let options = args.setup.networks(1);
     let bundle = Bundle::find(&options)?;
-    let towers = ImageText::open(&*Runtime::load(&options)?, &bundle, &options)?
+    let towers = ImageText::open(&Runtime::load(&options)?, &bundle, &options)?
         .ok_or_else(|| Error::invalid("the bundle has no image-text pair"))?;
     let mut names = Names::default();
     let mut sets = Vec::new();

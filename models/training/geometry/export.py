@@ -41,6 +41,35 @@ def halve(path, least=256):
     onnx.save(m, path)
 
 
+def pad_channels(path):
+    """Convolutions of 17 and 21 channels get channels of weight 0 up to a multiple of 4: ONNX Runtime's
+    WebGPU provider 1.27 computes them wrong (docs/measurements/webgpu). The result is the same."""
+    m = onnx.load(path)
+    made = {o: n for n in m.graph.node for o in n.output}
+    stored = {t.name: t for t in m.graph.initializer}
+    nodes = []
+    for n in m.graph.node:
+        cast = made.get(n.input[1]) if n.op_type == "Conv" else None
+        weight = stored.get(cast.input[0]) if cast is not None and cast.op_type == "Cast" else None
+        grouped = any(a.name == "group" and a.i > 1 for a in n.attribute)
+        if weight is not None and not grouped and weight.dims[1] % 4:
+            w, joined = numpy_helper.to_array(weight), made[n.input[0]]
+            more = -w.shape[1] % 4
+            if joined.op_type != "Concat" or more != 3:
+                raise SystemExit(f"{n.name}: {w.shape[1]} channels, which this cannot fill up")
+            # One of the joined inputs has three channels: it is joined once more.
+            three = joined.input[-1] if "r_in" in n.name else joined.input[0]
+            wide = np.concatenate([w, np.zeros((w.shape[0], more, *w.shape[2:]), w.dtype)], 1)
+            weight.CopyFrom(numpy_helper.from_array(wide, weight.name))
+            nodes.append(helper.make_node("Concat", [*joined.input, three], [joined.output[0] + "_padded"], joined.name + "_padded", axis=1))
+            n.input[0] = nodes[-1].output[0]
+        nodes.append(n)
+    del m.graph.node[:]
+    m.graph.node.extend(nodes)
+    onnx.checker.check_model(m)
+    onnx.save(m, path)
+
+
 def example(v, n, h, w, seed):
     """Textured input with a plausible rig."""
     g = torch.Generator().manual_seed(seed)
@@ -66,6 +95,7 @@ def main():
     torch.onnx.export(wrapped, example(2, 1, 256, 256, 0), args.out, input_names=list(AXES), output_names=Exported.NAMES,
                       dynamic_axes=AXES, opset_version=17, dynamo=False)
     halve(args.out)
+    pad_channels(args.out)
 
     import onnxruntime as ort
 

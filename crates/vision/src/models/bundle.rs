@@ -46,8 +46,8 @@ struct BundleManifest {
 /// A file that the manifest names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BundleFile<'a> {
-    /// What it is for: `geometry`, `masks.encoder`, `masks.decoder`, `image_text.image`,
-    /// `image_text.text`, `image_text.tokenizer`.
+    /// What it is for: `geometry`, `geometry.cpu`, `masks.encoder`, `masks.decoder`,
+    /// `image_text.image`, `image_text.text`, `image_text.tokenizer`.
     pub part: &'static str,
     /// Name in the bundle's folder.
     pub file: &'a str,
@@ -195,6 +195,14 @@ impl Bundle {
             sha256: &geometry.sha256,
             licence: &geometry.licence,
         }];
+        if let Some(cpu) = &geometry.cpu {
+            files.push(BundleFile {
+                part: "geometry.cpu",
+                file: &cpu.file,
+                sha256: &cpu.sha256,
+                licence: &geometry.licence,
+            });
+        }
         if let Some(MasksManifest { encoder, decoder, licence, .. }) = masks {
             let entry = |part, file, sha256| BundleFile { part, file, sha256, licence };
             files.push(entry("masks.encoder", &encoder.file, &encoder.sha256));

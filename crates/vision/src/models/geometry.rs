@@ -1,7 +1,7 @@
 //! The geometry network: it fits the photos, makes the model frame, runs a session and returns to
 //! world units.
 
-use ort::session::SessionInputValue;
+use std::sync::Arc;
 
 use crate::{
     error::{Error, Result},
@@ -9,13 +9,20 @@ use crate::{
         Bundle, GeometryManifest, ModelFrame, NetworkOptions, OutputFrame, Provider, Runtime,
         bucket_for, fit,
         fit::FittedPhoto,
-        pool::{Pool, fault, output, tensor},
+        network::{Input, Network, Outputs, Spec},
     },
     scene::{CameraToWorld, Intrinsics, PosedPhoto, ViewGaussians},
 };
 
 /// Name of the network in messages.
 const WHAT: &str = "geometry network";
+/// Largest difference of a provider to the CPU: rounding moves the depth of a few pixels that have
+/// two equally good matches. A provider that computes one convolution wrong is off by 0.1 and more.
+const TOLERANCE: f64 = 1e-2;
+/// Focal length of the fixed input, widths of the picture.
+const FOCAL: f64 = 1.1;
+/// Numbers of views that a device is made ready for.
+const WARM_VIEWS: [usize; 3] = [2, 4, 8];
 
 /// One set of photos for the network.
 #[derive(Clone, Copy, Debug)]
@@ -34,19 +41,51 @@ pub struct GeometryInput<'a> {
 #[derive(Debug)]
 pub struct Geometry {
     manifest: GeometryManifest,
-    pool: Pool,
-    provider: Provider,
+    network: Network,
 }
 
 impl Geometry {
-    /// Opens one session a concurrent job on the provider of the configuration.
+    /// Opens it on the provider of the configuration. On a device its answer was held to the CPU's
+    /// when this returns.
     ///
     /// # Errors
-    /// `model_unavailable` when the provider asked for is not there, or the model does not load.
-    pub fn open(runtime: &Runtime, bundle: &Bundle, options: &NetworkOptions) -> Result<Self> {
+    /// `model_unavailable` when the provider asked for is not there or differs from the CPU, or the
+    /// model does not load.
+    pub fn open(runtime: &Arc<Runtime>, bundle: &Bundle, options: &NetworkOptions) -> Result<Self> {
         let manifest = bundle.geometry().clone();
-        let (pool, provider) = Pool::open(runtime, bundle, options, WHAT, &manifest.file)?;
-        Ok(Self { manifest, pool, provider })
+        let probe = Tensors::probe(&manifest, manifest.buckets[0], 2);
+        let names = &manifest.outputs;
+        let all = [&names.means, &names.scales, &names.quats, &names.opacities, &names.sh];
+        let spec = Spec {
+            what: WHAT,
+            file: &manifest.file,
+            cpu_file: manifest.cpu.as_ref().map(|cpu| cpu.file.as_str()),
+            outputs: all.into_iter().chain(&names.confidence).map(String::as_str).collect(),
+            tolerance: TOLERANCE,
+            probe: &|_| Ok(probe.inputs(&manifest)),
+        };
+        let network = Network::open(runtime, bundle, options, &spec)?;
+        Ok(Self { network, manifest: manifest.clone() })
+    }
+
+    /// Runs every size with the usual numbers of views, where a device computes it: the first run
+    /// of a shape takes a second there.
+    ///
+    /// # Errors
+    /// As [`Self::run`].
+    pub fn warm(&self) -> Result<()> {
+        if self.provider() == Provider::Cpu {
+            return Ok(());
+        }
+        let manifest = &self.manifest;
+        let counts = WARM_VIEWS.into_iter().filter(|views| *views <= manifest.views_max);
+        for views in counts {
+            for &bucket in &manifest.buckets {
+                let probe = Tensors::probe(manifest, bucket, views);
+                self.network.run(&probe.inputs(manifest), |_| Ok(()))?;
+            }
+        }
+        Ok(())
     }
 
     /// The network's section of the manifest.
@@ -58,7 +97,13 @@ impl Geometry {
     /// What computes it.
     #[must_use]
     pub fn provider(&self) -> Provider {
-        self.provider
+        self.network.provider()
+    }
+
+    /// Why it is not computed where it was to be; `None` where it is.
+    #[must_use]
+    pub fn remark(&self) -> Option<String> {
+        self.network.remark()
     }
 
     /// A Gaussian for each pixel of each view of the set, in world units.
@@ -68,27 +113,23 @@ impl Geometry {
     /// the network, or the network fails or answers with other shapes than its manifest says.
     pub fn run(&self, input: &GeometryInput<'_>) -> Result<Vec<ViewGaussians>> {
         let prepared = self.prepare(input)?;
-        let [height, width] = prepared.bucket;
+        let inputs = prepared.tensors.inputs(&self.manifest);
+        self.network.run(&inputs, |outputs| self.views(input, &prepared, outputs))
+    }
+
+    /// The outputs of a run, view by view.
+    fn views(
+        &self,
+        input: &GeometryInput<'_>,
+        prepared: &Prepared,
+        outputs: &dyn Outputs,
+    ) -> Result<Vec<ViewGaussians>> {
+        let [h, w] = prepared.tensors.bucket.map(|side| side as usize);
         let count = input.views.len();
-        let (h, w) = (height as usize, width as usize);
-        let names = &self.manifest.inputs;
-        let mut inputs: Vec<(&str, SessionInputValue<'_>)> = vec![
-            (&names.images, tensor(WHAT, &[count, 3, h, w], &prepared.images)?),
-            (&names.intrinsics, tensor(WHAT, &[count, 3, 3], &prepared.intrinsics)?),
-            (&names.camera_to_world, tensor(WHAT, &[count, 4, 4], &prepared.poses)?),
-            (&names.near, tensor(WHAT, &[count], &prepared.near)?),
-            (&names.far, tensor(WHAT, &[count], &prepared.far)?),
-        ];
-        if let Some(name) = &names.neighbors {
-            let shape = [count, input.neighbors[0].len()];
-            inputs.push((name, tensor(WHAT, &shape, &prepared.neighbors)?));
-        }
-        let mut session = self.pool.take();
-        let outputs = session.run(inputs).map_err(fault(WHAT, "run"))?;
         let names = &self.manifest.outputs;
         let get = |name: &str, tail: &[usize]| -> Result<&[f32]> {
             let wanted = [&[count, h, w], tail].concat();
-            let (found, data) = output(WHAT, &outputs, name)?;
+            let (found, data) = outputs.get(name)?;
             if found != wanted {
                 return Err(Error::internal(format!(
                     "{WHAT}: output {name:?} is {found:?}, not {wanted:?}"
@@ -104,8 +145,7 @@ impl Geometry {
 
         let pixels = h * w;
         let unit = narrow(prepared.frame.unit());
-        let views = input.views.iter().zip(prepared.fitted).enumerate();
-        let view = |(v, (&photo, fitted)): (usize, (&usize, FittedPhoto))| {
+        let view = |(v, (&photo, fitted)): (usize, (&usize, &FittedPhoto))| {
             let part = |data, each| part_of(data, v, pixels * each);
             let scaled = |data| chunks(part(data, 3)).map(|row| row.map(|x| x * unit)).collect();
             ViewGaussians {
@@ -124,10 +164,10 @@ impl Geometry {
                 sh: chunks(part(sh, sh_count * 3)).collect(),
                 confidence: confidence
                     .map_or_else(|| vec![1.0; pixels], |all| part(all, 1).to_vec()),
-                valid: fitted.valid,
+                valid: fitted.valid.clone(),
             }
         };
-        Ok(views.map(view).collect())
+        Ok(input.views.iter().zip(&prepared.fitted).enumerate().map(view).collect())
     }
 
     fn prepare(&self, input: &GeometryInput<'_>) -> Result<Prepared> {
@@ -170,7 +210,8 @@ impl Geometry {
             fitted.iter().map(|view| view.camera.camera_to_world).collect();
         let frame = ModelFrame::new(&cameras, manifest.translation)?;
         let ranges = || input.views.iter().map(|&v| input.near_far[v]);
-        Ok(Prepared {
+        let tensors = Tensors {
+            bucket,
             images: images(&fitted, manifest),
             intrinsics: fitted
                 .iter()
@@ -188,23 +229,84 @@ impl Geometry {
                 .flatten()
                 .map(|&n| i64::try_from(n).unwrap_or_default())
                 .collect(),
-            fitted,
-            frame,
-            bucket,
-        })
+        };
+        Ok(Prepared { frame, fitted, tensors })
     }
 }
 
 struct Prepared {
-    bucket: [u32; 2],
     frame: ModelFrame,
     fitted: Vec<FittedPhoto>,
+    tensors: Tensors,
+}
+
+/// What the network takes for one set of views.
+struct Tensors {
+    bucket: [u32; 2],
     images: Vec<f32>,
     intrinsics: Vec<f32>,
     poses: Vec<f32>,
     near: Vec<f32>,
     far: Vec<f32>,
     neighbors: Vec<i64>,
+}
+
+impl Tensors {
+    /// A fixed input of the network's own size: a textured plane before cameras side by side.
+    fn probe(manifest: &GeometryManifest, bucket: [u32; 2], views: usize) -> Self {
+        let [h, w] = bucket.map(f64::from);
+        let place = |v: usize| v as f64 / (views - 1).max(1) as f64;
+        // On the plane z = 5, in model units.
+        let texture = |x: f64, y: f64, c: f64| {
+            let (u, v) = (5.0 * (x / w - 0.5) / FOCAL, 5.0 * (y - 0.5 * h) / (FOCAL * w));
+            let waves = (7.0 * u + 3.0 * v + c).sin() + (23.0 * u - 17.0 * v).sin();
+            narrow(0.5 + 0.2 * waves + 0.1 * (31.0 * u * v + 2.0 * c).cos())
+        };
+        let mut images = Vec::new();
+        for v in 0..views {
+            let shift = place(v) * FOCAL * w / 5.0;
+            for (c, (mean, std)) in manifest.mean.iter().zip(manifest.std).enumerate() {
+                let (height, width) = (bucket[0], bucket[1]);
+                let places = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+                images.extend(places.map(|(x, y)| {
+                    (texture(f64::from(x) + shift, f64::from(y), c as f64) - mean) / std
+                }));
+            }
+        }
+        let (fx, fy) = (narrow(FOCAL), narrow(FOCAL * w / h));
+        let pose = |v: usize| {
+            let x = narrow(place(v));
+            [1.0, 0.0, 0.0, x, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+        };
+        let each = (views - 1).min(manifest.neighbors_max);
+        let other = |v: usize, n: usize| i64::try_from((v + 1 + n) % views).unwrap_or_default();
+        Self {
+            bucket,
+            images,
+            intrinsics: [fx, 0.0, 0.5, 0.0, fy, 0.5, 0.0, 0.0, 1.0].repeat(views),
+            poses: (0..views).flat_map(pose).collect(),
+            near: vec![3.0; views],
+            far: vec![15.0; views],
+            neighbors: (0..views).flat_map(|v| (0..each).map(move |n| other(v, n))).collect(),
+        }
+    }
+
+    fn inputs<'a>(&'a self, manifest: &'a GeometryManifest) -> Vec<Input<'a>> {
+        let (count, names) = (self.near.len(), &manifest.inputs);
+        let [h, w] = self.bucket.map(|side| side as usize);
+        let mut inputs = vec![
+            Input::new(&names.images, &[count, 3, h, w], &*self.images),
+            Input::new(&names.intrinsics, &[count, 3, 3], &*self.intrinsics),
+            Input::new(&names.camera_to_world, &[count, 4, 4], &*self.poses),
+            Input::new(&names.near, &[count], &*self.near),
+            Input::new(&names.far, &[count], &*self.far),
+        ];
+        if let Some(name) = &names.neighbors {
+            let each = self.neighbors.len() / count.max(1);
+            inputs.push(Input::new(name, &[count, each], &*self.neighbors));
+        }
+        inputs
+    }
 }
 
 /// `[V, 3, H, W]`, normalised as the manifest says.

@@ -1,8 +1,7 @@
 //! The image tower and the text tower: crops and texts to embeddings of length 1 in one space.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, sync::Arc};
 
-use ort::session::SessionOutputs;
 use tokenizers::Tokenizer;
 
 use crate::{
@@ -10,7 +9,7 @@ use crate::{
     models::{
         Bundle, ImageTextManifest, NetworkOptions, Provider, Runtime,
         manifest::unavailable,
-        pool::{Pool, fault, fixed, input_shape, output, tensor},
+        network::{Input, Network, Outputs, Spec, Takes, fixed},
         resize::{planes, resize},
     },
     scene::{Crop, TextEmbedding},
@@ -24,8 +23,8 @@ const TEXT: &str = "text tower";
 #[derive(Debug)]
 pub struct ImageText {
     manifest: ImageTextManifest,
-    image: Pool,
-    text: Pool,
+    image: Network,
+    text: Network,
     tokenizer: Tokenizer,
     unknown: Option<u32>,
     /// Crops a run of the image tower, where its file fixes them.
@@ -34,9 +33,10 @@ pub struct ImageText {
     tokens: Option<usize>,
     /// Texts a run of the text tower, where its file fixes them.
     texts: Option<usize>,
-    provider: Provider,
 }
 
+/// Largest difference of a provider to the CPU, of embeddings.
+const TOLERANCE: f64 = 2e-3;
 /// Texts a run of the text tower where its file leaves that free.
 const TEXTS_A_RUN: usize = 64;
 
@@ -57,28 +57,58 @@ impl ImageText {
     /// # Errors
     /// `model_unavailable` when the provider asked for is not there, or a file does not load.
     pub fn open(
-        runtime: &Runtime,
+        runtime: &Arc<Runtime>,
         bundle: &Bundle,
         options: &NetworkOptions,
     ) -> Result<Option<Self>> {
         let Some(manifest) = bundle.image_text().cloned() else { return Ok(None) };
-        let open = |what, file: &str| Pool::open(runtime, bundle, options, what, file);
-        let (image, provider) = open(IMAGE, &manifest.image.file)?;
-        let (text, _) = open(TEXT, &manifest.text.file)?;
         let tokenizer = read_tokenizer(bundle, &manifest.text.tokenizer)?;
-        let size = |shape: &[i64], axis: usize| shape.get(axis).copied().and_then(fixed);
-        let pictures = input_shape(&image.take(), &manifest.image.input).unwrap_or_default();
-        let ids = input_shape(&text.take(), &manifest.text.input_ids).unwrap_or_default();
+        let tower = &manifest.image;
+        let side = tower.size as usize;
+        let spec = Spec {
+            what: IMAGE,
+            file: &tower.file,
+            cpu_file: None,
+            outputs: vec![&tower.output],
+            tolerance: TOLERANCE,
+            probe: &|takes| {
+                let count = size(takes, &tower.input, 0).unwrap_or(tower.batch);
+                let wave = |i: usize| (i as f32 * 0.013).sin() + (i as f32 * 0.000_7).cos();
+                let images: Vec<f32> = (0..count * 3 * side * side).map(wave).collect();
+                Ok(vec![Input::new(&tower.input, &[count, 3, side, side], images)])
+            },
+        };
+        let image = Network::open(runtime, bundle, options, &spec)?;
+        let tower = &manifest.text;
+        let spec = Spec {
+            what: TEXT,
+            file: &tower.file,
+            cpu_file: None,
+            outputs: vec![&tower.output],
+            tolerance: TOLERANCE,
+            probe: &|takes| {
+                let length = size(takes, &tower.input_ids, 1).unwrap_or(tower.context.min(8));
+                let count = size(takes, &tower.input_ids, 0).unwrap_or(3);
+                let known = i64::try_from(tokenizer.get_vocab_size(false)).unwrap_or(1).max(1);
+                let ids: Vec<i64> =
+                    (1..).map(|i: i64| i * 37 % known).take(count * length).collect();
+                let mut inputs = vec![Input::new(&tower.input_ids, &[count, length], ids)];
+                if let Some(name) = &tower.attention_mask {
+                    inputs.push(Input::new(name, &[count, length], vec![1_i64; count * length]));
+                }
+                Ok(inputs)
+            },
+        };
+        let text = Network::open(runtime, bundle, options, &spec)?;
         Ok(Some(Self {
-            crops: size(&pictures, 0),
-            tokens: size(&ids, 1),
-            texts: size(&ids, 0),
+            crops: size(image.takes(), &manifest.image.input, 0),
+            tokens: size(text.takes(), &manifest.text.input_ids, 1),
+            texts: size(text.takes(), &manifest.text.input_ids, 0),
             unknown: tokenizer.token_to_id(&manifest.text.unknown),
-            manifest,
             image,
             text,
-            tokenizer,
-            provider,
+            tokenizer: tokenizer.clone(),
+            manifest: manifest.clone(),
         }))
     }
 
@@ -91,7 +121,13 @@ impl ImageText {
     /// What computes them.
     #[must_use]
     pub fn provider(&self) -> Provider {
-        self.provider
+        self.image.provider()
+    }
+
+    /// Why a tower is not computed where it was to be; `None` where both are.
+    #[must_use]
+    pub fn remark(&self) -> Option<String> {
+        self.image.remark().or_else(|| self.text.remark())
     }
 
     /// `[crops * dim]`, rows of unit length; a row that has no length stays 0.
@@ -112,11 +148,10 @@ impl ImageText {
                 images.extend(planes(&pixels, [side; 2], side, tower.mean, tower.std));
             }
             images.resize(count * 3 * side * side, 0.0);
-            let input = tensor(IMAGE, &[count, 3, side, side], &images)?;
-            let mut session = self.image.take();
-            let outputs = session.run(vec![(tower.input.as_str(), input)]);
-            let outputs = outputs.map_err(fault(IMAGE, "run"))?;
-            let found = self.rows(&outputs, &tower.output, count, IMAGE)?;
+            let input = Input::new(&tower.input, &[count, 3, side, side], images);
+            let found = self
+                .image
+                .run(&[input], |outputs| self.rows(outputs, &tower.output, count, IMAGE))?;
             rows.extend(found.into_iter().take(batch.len() * self.manifest.dim));
         }
         Ok(rows)
@@ -202,13 +237,11 @@ impl ImageText {
             ids = ids.into_iter().cycle().take(count * length).collect();
             there = there.into_iter().cycle().take(count * length).collect();
         }
-        let mut inputs = vec![(tower.input_ids.as_str(), tensor(TEXT, &[count, length], &ids)?)];
+        let mut inputs = vec![Input::new(&tower.input_ids, &[count, length], ids)];
         if let Some(name) = &tower.attention_mask {
-            inputs.push((name, tensor(TEXT, &[count, length], &there)?));
+            inputs.push(Input::new(name, &[count, length], there));
         }
-        let mut session = self.text.take();
-        let outputs = session.run(inputs).map_err(fault(TEXT, "run"))?;
-        self.rows(&outputs, &tower.output, count, TEXT)
+        self.text.run(&inputs, |outputs| self.rows(outputs, &tower.output, count, TEXT))
     }
 
     /// Id that fills up a text.
@@ -219,13 +252,13 @@ impl ImageText {
     /// Rows of an output, made unit length in f64.
     fn rows(
         &self,
-        outputs: &SessionOutputs<'_>,
+        outputs: &dyn Outputs,
         name: &str,
         count: usize,
         what: &str,
     ) -> Result<Vec<f32>> {
         let dim = self.manifest.dim;
-        let (shape, data) = output(what, outputs, name)?;
+        let (shape, data) = outputs.get(name)?;
         let wanted = [count, dim];
         if shape != wanted {
             return Err(Error::internal(format!("{what}: output is {shape:?}, not {wanted:?}")));
@@ -243,6 +276,11 @@ impl ImageText {
         }
         Ok(rows)
     }
+}
+
+/// A dimension of an input, where the file fixes it.
+fn size(takes: &Takes, input: &str, axis: usize) -> Option<usize> {
+    takes.get(input)?.shape.get(axis).copied().and_then(fixed)
 }
 
 /// The tokenizer's file, whose own truncation and padding are switched off: both are done here.

@@ -91,6 +91,8 @@ pub struct GeometryManifest {
     pub file: String,
     /// Its sha256, hex.
     pub sha256: String,
+    /// The same network as the CPU runs it, where that is another file.
+    pub cpu: Option<CpuFile>,
     /// Licence of the weights.
     pub licence: String,
     /// Where the weights come from.
@@ -119,9 +121,23 @@ pub struct GeometryManifest {
     pub outputs: GeometryOutputs,
 }
 
+/// A file for the CPU alone: 8-bit arithmetic, and operators of this program. It may take weights
+/// from the network's main file.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CpuFile {
+    /// File in the bundle's folder.
+    pub file: String,
+    /// Its sha256, hex.
+    pub sha256: String,
+}
+
 impl GeometryManifest {
     pub(super) fn validate(&self) -> Result<()> {
         check_file("geometry", &self.file, &self.sha256)?;
+        if let Some(cpu) = &self.cpu {
+            check_file("geometry.cpu", &cpu.file, &cpu.sha256)?;
+        }
         let bad = |side: &u32| !(1..=BUCKET_SIDE_MAX).contains(side);
         if self.buckets.is_empty() || self.buckets.iter().flatten().any(bad) {
             let must = format!("hold [height, width] pairs of 1 to {BUCKET_SIDE_MAX}");

@@ -3,17 +3,14 @@
 //! The manifest's `adapter` names one of two signatures. The inputs of a file (a batch of prompts
 //! or one, a former mask, the photo's size) are read from the file itself.
 
-use ort::{
-    session::{Session, SessionInputValue},
-    value::{TensorElementType, ValueType},
-};
+use std::sync::Arc;
 
 use crate::{
     error::{Error, Result},
     models::{
         Bundle, MaskAdapter, MasksManifest, NetworkOptions, Runtime,
         manifest::unavailable,
-        pool::{Pool, fault, fixed, input_shape, output, tensor},
+        network::{self, Input, Network, Outputs, Spec, fixed},
         resize::{planes, resize},
     },
     scene::{MaskLogits, Photo},
@@ -22,6 +19,8 @@ use crate::{
 /// Names of the two files in messages.
 const ENCODER: &str = "mask encoder";
 const DECODER: &str = "mask decoder";
+/// Largest difference of a provider to the CPU, of embeddings and of logits.
+const TOLERANCE: f64 = 2e-3;
 /// Side of the logits of an `efficient_sam` decoder, before it enlarges them.
 const EFFICIENT_SAM_LOGITS: u32 = 256;
 
@@ -29,8 +28,8 @@ const EFFICIENT_SAM_LOGITS: u32 = 256;
 #[derive(Debug)]
 pub struct MaskNetwork {
     manifest: MasksManifest,
-    encoder: Pool,
-    decoder: Pool,
+    encoder: Network,
+    decoder: Network,
     takes: Takes,
 }
 
@@ -45,6 +44,8 @@ pub struct PhotoEmbedding {
 /// What the decoder's file takes.
 #[derive(Clone, Debug)]
 struct Takes {
+    /// The signature `efficient_sam`.
+    efficient: bool,
     /// Prompts a run.
     batch: usize,
     /// Points of a prompt: the prompt itself, then padding.
@@ -52,7 +53,8 @@ struct Takes {
     /// Shape of the former mask, where there is such an input.
     mask: Option<Vec<usize>>,
     has_mask: bool,
-    size: Option<TensorElementType>,
+    /// Whether the photo's size is an input, and of whole numbers.
+    size: Option<bool>,
 }
 
 impl PhotoEmbedding {
@@ -60,6 +62,12 @@ impl PhotoEmbedding {
     #[must_use]
     pub fn resized(&self) -> [u32; 2] {
         self.resized
+    }
+
+    /// All numbers, one tensor after the other.
+    #[must_use]
+    pub fn numbers(&self) -> Vec<f32> {
+        self.tensors.iter().flat_map(|(_, _, data)| data).copied().collect()
     }
 }
 
@@ -71,18 +79,53 @@ impl MaskNetwork {
     /// `model_unavailable` when the provider asked for is not there, a file does not load, or its
     /// inputs are not those of the manifest.
     pub fn open(
-        runtime: &Runtime,
+        runtime: &Arc<Runtime>,
         bundle: &Bundle,
         options: &NetworkOptions,
     ) -> Result<Option<Self>> {
         let Some(manifest) = bundle.masks().cloned() else { return Ok(None) };
-        let open = |what, file: &str| -> Result<Pool> {
-            Ok(Pool::open(runtime, bundle, options, what, file)?.0)
+        let photo = probe();
+        let (names, resized, image) =
+            (&manifest.encoder, placed(&manifest, &photo), image(&manifest, &photo));
+        let side = manifest.size as usize;
+        let input = || Input::new(&names.input, &[1, 3, side, side], &*image);
+        let features = names.features.iter();
+        let spec = Spec {
+            what: ENCODER,
+            file: &names.file,
+            cpu_file: None,
+            outputs: [&names.output].into_iter().chain(features).map(String::as_str).collect(),
+            tolerance: TOLERANCE,
+            probe: &|_| Ok(vec![input()]),
         };
-        let encoder = open(ENCODER, &manifest.encoder.file)?;
-        let decoder = open(DECODER, &manifest.decoder.file)?;
-        let takes = Takes::of(&decoder.take(), &manifest)?;
-        Ok(Some(Self { manifest, encoder, decoder, takes }))
+        let encoder = Network::open(runtime, bundle, options, &spec)?;
+        let read = |outputs: &dyn Outputs| embedding(&manifest, resized, outputs);
+        let seen = encoder.run(&[input()], read)?;
+        let points: Vec<[f32; 2]> = (0..manifest.points_per_batch)
+            .map(|i| [(i % 8) as f32 / 8.0 + 0.05, (i / 8 % 8) as f32 / 8.0 + 0.05])
+            .collect();
+        let outputs = vec![&*manifest.decoder.low_res_masks, &*manifest.decoder.iou_predictions];
+        let spec = Spec {
+            what: DECODER,
+            file: &manifest.decoder.file,
+            cpu_file: None,
+            outputs,
+            tolerance: TOLERANCE,
+            probe: &|found| {
+                let takes = Takes::of(found, &manifest)?;
+                let points = &points[..takes.batch.min(points.len())];
+                Ok(takes.inputs(&manifest, &seen, points))
+            },
+        };
+        let decoder = Network::open(runtime, bundle, options, &spec)?;
+        let takes = Takes::of(decoder.takes(), &manifest)?;
+        Ok(Some(Self { encoder, decoder, takes, manifest: manifest.clone() }))
+    }
+
+    /// Why a part is not computed where it was to be; `None` where all are.
+    #[must_use]
+    pub fn remark(&self) -> Option<String> {
+        self.encoder.remark().or_else(|| self.decoder.remark())
     }
 
     /// The network's section of the manifest.
@@ -96,28 +139,11 @@ impl MaskNetwork {
     /// # Errors
     /// `internal` when the network fails or has not the outputs of its manifest.
     pub fn encode(&self, photo: &Photo) -> Result<PhotoEmbedding> {
-        let (m, side) = (&self.manifest, self.manifest.size);
-        let resized = match m.adapter {
-            MaskAdapter::Sam => longest(photo, side),
-            MaskAdapter::EfficientSam => [side, side],
-        };
-        let [width, height] = resized.map(|v| v as usize);
-        let pixels =
-            resize(&photo.rgb, [photo.width as usize, photo.height as usize], [width, height]);
-        let side = side as usize;
-        let image = planes(&pixels, [width, height], side, m.mean, m.std);
-        let input = tensor(ENCODER, &[1, 3, side, side], &image)?;
-        let mut session = self.encoder.take();
-        let inputs = vec![(m.encoder.input.as_str(), input)];
-        let outputs = session.run(inputs).map_err(fault(ENCODER, "run"))?;
-        let main = (&m.encoder.output, &m.decoder.image_embeddings);
-        let names = [main].into_iter().chain(m.encoder.features.iter().map(|name| (name, name)));
-        let mut tensors = Vec::new();
-        for (from, to) in names {
-            let (shape, data) = output(ENCODER, &outputs, from)?;
-            tensors.push((to.clone(), shape, data.to_vec()));
-        }
-        Ok(PhotoEmbedding { resized, tensors })
+        let (manifest, side) = (&self.manifest, self.manifest.size as usize);
+        let image = image(manifest, photo);
+        let input = Input::new(&manifest.encoder.input, &[1, 3, side, side], &*image);
+        let resized = placed(manifest, photo);
+        self.encoder.run(&[input], |outputs| embedding(manifest, resized, outputs))
     }
 
     /// Masks of each point; points are shares 0..1 of the photo's width and height.
@@ -158,53 +184,16 @@ impl MaskNetwork {
         (points_in_all, iou_over): (usize, f32),
         all: &mut MaskLogits,
     ) -> Result<()> {
-        let (names, takes) = (&self.manifest.decoder, &self.takes);
-        let (count, each) = (points.len(), takes.points);
-        let efficient = self.manifest.adapter == MaskAdapter::EfficientSam;
-        // EfficientSAM takes points in pixels of the size that its masks come back in.
-        let frame = if efficient { [EFFICIENT_SAM_LOGITS; 2] } else { embedding.resized };
-        let mut coords = vec![0.0_f32; count * each * 2];
-        let mut labels = vec![-1.0_f32; count * each];
-        for (i, point) in points.iter().enumerate() {
-            for axis in 0..2 {
-                coords[i * each * 2 + axis] = point[axis] * frame[axis] as f32;
-            }
-            labels[i * each] = 1.0;
-        }
-        let mut inputs: Vec<(&str, SessionInputValue<'_>)> = Vec::new();
-        for (name, shape, data) in &embedding.tensors {
-            inputs.push((name, tensor(DECODER, shape, data)?));
-        }
-        let lead: &[usize] = if efficient { &[1] } else { &[] };
-        inputs.push((
-            &names.point_coords,
-            tensor(DECODER, &[lead, &[count, each, 2]].concat(), &coords)?,
-        ));
-        inputs.push((
-            &names.point_labels,
-            tensor(DECODER, &[lead, &[count, each]].concat(), &labels)?,
-        ));
-        let mask = vec![0.0_f32; takes.mask.iter().flatten().product()];
-        if let Some(shape) = &takes.mask {
-            inputs.push((&names.mask_input, tensor(DECODER, shape, &mask)?));
-        }
-        if takes.has_mask {
-            inputs.push((&names.has_mask_input, tensor(DECODER, &[1], &[0.0_f32])?));
-        }
-        // SAM's decoder enlarges its masks to this size. Nobody reads these, so it is the smallest.
-        let size = if efficient { frame } else { [1, 1] };
-        let (floats, ints) = (size.map(|v| v as f32), size.map(i64::from));
-        match takes.size {
-            Some(TensorElementType::Int64) => {
-                inputs.push((&names.orig_im_size, tensor(DECODER, &[2], &ints)?));
-            }
-            Some(_) => inputs.push((&names.orig_im_size, tensor(DECODER, &[2], &floats)?)),
-            None => {}
-        }
-        let mut session = self.decoder.take();
-        let outputs = session.run(inputs).map_err(fault(DECODER, "run"))?;
+        let inputs = self.takes.inputs(&self.manifest, embedding, points);
+        self.decoder.run(&inputs, |outputs| self.append(points.len(), outputs, all))
+    }
+
+    /// Appends the masks that one run of the decoder gave for `count` points.
+    fn append(&self, count: usize, outputs: &dyn Outputs, all: &mut MaskLogits) -> Result<()> {
+        let names = &self.manifest.decoder;
+        let lead: &[usize] = if self.takes.efficient { &[1] } else { &[] };
         let get = |name: &str, tail: usize| -> Result<(Vec<usize>, &[f32])> {
-            let (shape, data) = output(DECODER, &outputs, name)?;
+            let (shape, data) = outputs.get(name)?;
             let wanted = [lead, &[count]].concat();
             if shape.len() != wanted.len() + tail || shape[..wanted.len()] != wanted {
                 return Err(Error::internal(format!(
@@ -245,10 +234,11 @@ impl MaskNetwork {
 
 impl Takes {
     /// Reads the inputs of the decoder's file.
-    fn of(session: &Session, manifest: &MasksManifest) -> Result<Self> {
+    fn of(file: &network::Takes, manifest: &MasksManifest) -> Result<Self> {
         let names = &manifest.decoder;
-        let wanted = if manifest.adapter == MaskAdapter::EfficientSam { 4 } else { 3 };
-        let coords = input_shape(session, &names.point_coords).unwrap_or_default();
+        let efficient = manifest.adapter == MaskAdapter::EfficientSam;
+        let wanted = if efficient { 4 } else { 3 };
+        let coords = file.get(&names.point_coords).map_or(&[][..], |taken| &taken.shape);
         if coords.len() != wanted {
             return Err(unavailable(format!(
                 "{DECODER}: input {:?} of {} has {} dimensions, not {wanted}",
@@ -259,22 +249,112 @@ impl Takes {
         }
         // A padding point follows the prompt, as SAM's own code adds one where there is no box.
         // EfficientSAM pads by itself.
-        let points = fixed(coords[wanted - 2]).unwrap_or(if wanted == 4 { 1 } else { 2 });
+        let points = fixed(coords[wanted - 2]).unwrap_or(if efficient { 1 } else { 2 });
         let most = manifest.points_per_batch as usize;
         Ok(Self {
+            efficient,
             batch: fixed(coords[wanted - 3]).map_or(most, |batch| batch.min(most)),
             points,
-            mask: input_shape(session, &names.mask_input)
-                .map(|shape| shape.iter().map(|&n| fixed(n).unwrap_or(1)).collect()),
-            has_mask: input_shape(session, &names.has_mask_input).is_some(),
-            size: session.inputs().iter().find(|i| i.name() == names.orig_im_size).map(|input| {
-                match input.dtype() {
-                    ValueType::Tensor { ty, .. } => *ty,
-                    _ => TensorElementType::Float32,
-                }
-            }),
+            mask: file
+                .get(&names.mask_input)
+                .map(|taken| taken.shape.iter().map(|&n| fixed(n).unwrap_or(1)).collect()),
+            has_mask: file.get(&names.has_mask_input).is_some(),
+            size: file.get(&names.orig_im_size).map(|taken| taken.whole),
         })
     }
+
+    /// The inputs of one run for these points, shares of the photo's sides.
+    fn inputs<'a>(
+        &self,
+        manifest: &'a MasksManifest,
+        embedding: &'a PhotoEmbedding,
+        points: &[[f32; 2]],
+    ) -> Vec<Input<'a>> {
+        let (names, count, each) = (&manifest.decoder, points.len(), self.points);
+        // EfficientSAM takes points in pixels of the size that its masks come back in.
+        let frame = if self.efficient { [EFFICIENT_SAM_LOGITS; 2] } else { embedding.resized };
+        let mut coords = vec![0.0_f32; count * each * 2];
+        let mut labels = vec![-1.0_f32; count * each];
+        for (i, point) in points.iter().enumerate() {
+            for axis in 0..2 {
+                coords[i * each * 2 + axis] = point[axis] * frame[axis] as f32;
+            }
+            labels[i * each] = 1.0;
+        }
+        let tensors = embedding.tensors.iter();
+        let mut inputs: Vec<Input<'_>> =
+            tensors.map(|(name, shape, data)| Input::new(name, shape, &**data)).collect();
+        let lead: &[usize] = if self.efficient { &[1] } else { &[] };
+        let coords_shape = [lead, &[count, each, 2]].concat();
+        inputs.push(Input::new(&names.point_coords, &coords_shape, coords));
+        let labels_shape = [lead, &[count, each]].concat();
+        inputs.push(Input::new(&names.point_labels, &labels_shape, labels));
+        if let Some(shape) = &self.mask {
+            let mask = vec![0.0_f32; shape.iter().product()];
+            inputs.push(Input::new(&names.mask_input, shape, mask));
+        }
+        if self.has_mask {
+            inputs.push(Input::new(&names.has_mask_input, &[1], vec![0.0_f32]));
+        }
+        // SAM's decoder enlarges its masks to this size. Nobody reads these, so it is the smallest.
+        let size = if self.efficient { frame } else { [1, 1] };
+        let name = &names.orig_im_size;
+        match self.size {
+            Some(true) => inputs.push(Input::new(name, &[2], size.map(i64::from).to_vec())),
+            Some(false) => inputs.push(Input::new(name, &[2], size.map(|v| v as f32).to_vec())),
+            None => {}
+        }
+        inputs
+    }
+}
+
+/// `[width, height]` of the photo in the encoder's square.
+fn placed(manifest: &MasksManifest, photo: &Photo) -> [u32; 2] {
+    match manifest.adapter {
+        MaskAdapter::Sam => longest(photo, manifest.size),
+        MaskAdapter::EfficientSam => [manifest.size; 2],
+    }
+}
+
+/// `[3, size, size]`: the photo as the encoder takes it.
+fn image(manifest: &MasksManifest, photo: &Photo) -> Vec<f32> {
+    let placed = placed(manifest, photo).map(|side| side as usize);
+    let from = [photo.width, photo.height].map(|side| side as usize);
+    let pixels = resize(&photo.rgb, from, placed);
+    planes(&pixels, placed, manifest.size as usize, manifest.mean, manifest.std)
+}
+
+/// The encoder's outputs under the decoder's names.
+fn embedding(
+    manifest: &MasksManifest,
+    resized: [u32; 2],
+    outputs: &dyn Outputs,
+) -> Result<PhotoEmbedding> {
+    let main = (&manifest.encoder.output, &manifest.decoder.image_embeddings);
+    let features = manifest.encoder.features.iter().map(|name| (name, name));
+    let tensor = |(from, to): (&String, &String)| {
+        let (shape, data) = outputs.get(from)?;
+        Ok((to.clone(), shape, data.to_vec()))
+    };
+    let tensors = [main].into_iter().chain(features).map(tensor).collect::<Result<_>>()?;
+    Ok(PhotoEmbedding { resized, tensors })
+}
+
+/// The fixed photo that a provider is held to the CPU with: shapes of several sizes.
+fn probe() -> Photo {
+    let (width, height) = (320, 240);
+    let pixel = |(x, y): (u32, u32)| {
+        let (u, v) = (f64::from(x) / 40.0, f64::from(y) / 40.0);
+        let disc = if (u - 4.0).hypot(v - 3.0) < 1.6 { 90.0 } else { 0.0 };
+        [0.0, 1.3, 2.6].map(|c| {
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 250")]
+            let level =
+                (80.0 + disc + 40.0 * (u + c).sin() + 40.0 * (3.0 * v * u.cos()).cos()) as u8;
+            level
+        })
+    };
+    let rgb = (0..height).flat_map(|y| (0..width).map(move |x| (x, y))).flat_map(pixel).collect();
+    Photo { width, height, rgb, valid: None }
 }
 
 /// `[width, height]` with the longer side at `side`, rounded as Segment Anything does.

@@ -1,4 +1,4 @@
-//! The networks: a bundle with its manifest, ONNX Runtime, a pool of sessions, one adapter each.
+//! The networks: a bundle with its manifest, ONNX Runtime, sessions, one adapter for each network.
 //!
 //! [`Geometry`]: photos with cameras, depth ranges and neighbours to [`ViewGaussians`].
 //! [`MaskNetwork`]: a photo and points in it to masks. [`ImageText`]: crops and texts to embeddings
@@ -8,15 +8,16 @@
 //! [`ViewGaussians`]: crate::scene::ViewGaussians
 
 mod bundle;
+mod correlate;
 mod fit;
 mod frame;
 mod geometry;
 mod image_text;
 mod manifest;
 mod masks;
+mod network;
 mod options;
 mod places;
-mod pool;
 mod resize;
 mod runtime;
 
@@ -26,8 +27,9 @@ pub use frame::ModelFrame;
 pub use geometry::{Geometry, GeometryInput};
 pub use image_text::ImageText;
 pub use manifest::{
-    GeometryManifest, ImageTextManifest, ImageTowerManifest, MaskAdapter, MaskDecoderManifest,
-    MaskEncoderManifest, MasksManifest, OutputFrame, TextTowerManifest, Translation,
+    CpuFile, GeometryManifest, ImageTextManifest, ImageTowerManifest, MaskAdapter,
+    MaskDecoderManifest, MaskEncoderManifest, MasksManifest, OutputFrame, TextTowerManifest,
+    Translation,
 };
 pub use masks::{MaskNetwork, PhotoEmbedding};
 pub use options::{NetworkOptions, ProviderChoice};

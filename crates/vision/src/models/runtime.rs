@@ -2,8 +2,9 @@
 //!
 //! Search order: `--ort-library` / `SEGSPLAT_ORT_LIBRARY`, `ORT_DYLIB_PATH`, beside the executable,
 //! `../share/segsplat`, `target/ort` of the checkout or of the working folder, the system's
-//! folders. A library that the operator *named* is always loaded. A warning tells when its hash is
-//! not pinned (a CUDA build, a newer release). A library that was only *found* must be one of the
+//! folders. In each of them a folder `cuda` or `webgpu` comes first for that provider, and `cuda`
+//! for `auto`. A library that the operator *named* is always loaded. A warning tells when its hash
+//! is not pinned (a newer release). A library that was only *found* must be one of the
 //! pinned builds, or the server does not start.
 
 use std::{
@@ -12,15 +13,17 @@ use std::{
 };
 
 use ort::{
-    ep::{self, ExecutionProvider},
-    session::Session,
+    ep::{self, ExecutionProvider, cuda::ConvAlgorithmSearch},
+    session::{Session, builder::PrepackedWeights},
 };
 use parking_lot::Mutex;
 use tracing::{info, warn};
 
 use crate::{
     error::Result,
-    models::{NetworkOptions, ProviderChoice, bundle::sha256_of, manifest::unavailable, places},
+    models::{
+        NetworkOptions, ProviderChoice, bundle::sha256_of, correlate, manifest::unavailable, places,
+    },
 };
 
 /// The one command that gets the library.
@@ -60,6 +63,18 @@ impl Provider {
             Self::Webgpu => "webgpu",
         }
     }
+}
+
+/// How a session computes with weights that are stored in 8 bits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Arithmetic {
+    /// In 8 bits where ONNX Runtime finds that faster: some of the CPU's products of matrices.
+    Fast,
+    /// In f32: devices, and the CPU where it judges them. No kernel for 8 bits is needed.
+    F32,
+    /// In 8 bits all through, as the file says. Processors that lack 8-bit dot products get a form
+    /// in which sums of products do not overflow; it breaks files that only store a weight so.
+    EightBits,
 }
 
 /// The loaded library: one in a process.
@@ -110,6 +125,9 @@ impl Runtime {
                 )));
             }
         }
+        if matches!(options.provider, ProviderChoice::Auto | ProviderChoice::Cuda) {
+            preload_cuda(&path);
+        }
         let environment = ort::init_from(&path)
             .map_err(|e| {
                 unavailable(format!(
@@ -144,25 +162,46 @@ impl Runtime {
         self.pinned
     }
 
-    /// Opens `model` on `provider`, `threads` threads an operator, spinning off.
+    /// Opens `model` on `provider`, `threads` threads an operator, spinning off. Sessions that get
+    /// the same `weights` share what the CPU's kernels make of them.
+    ///
+    /// CUDA computes in f32: TF32 is off. Its convolutions are chosen by a search, which takes
+    /// about a second at the first run of a shape; the heuristic's are several times slower.
     pub(super) fn session(
         &self,
         model: &Path,
         provider: Provider,
         threads: usize,
-    ) -> std::result::Result<Session, ort::Error> {
+        weights: Option<&PrepackedWeights>,
+        arithmetic: Arithmetic,
+    ) -> ort::Result<Session> {
         let providers = match provider {
             Provider::Cpu => vec![],
-            Provider::Cuda => vec![ep::CUDA::default().build().error_on_failure()],
+            Provider::Cuda => vec![
+                ep::CUDA::default()
+                    .with_tf32(false)
+                    .with_conv_algorithm_search(ConvAlgorithmSearch::Exhaustive)
+                    .build()
+                    .error_on_failure(),
+            ],
             Provider::Webgpu => vec![ep::WebGPU::default().build().error_on_failure()],
         };
-        Session::builder(&self.environment)?
+        let mut builder = Session::builder(&self.environment)?
             .with_intra_threads(threads)?
             .with_inter_threads(1)?
             .with_intra_op_spinning(false)?
             .with_inter_op_spinning(false)?
-            .with_execution_providers(providers)?
-            .commit_from_file(model)
+            .with_operators(correlate::domain()?)?
+            .with_execution_providers(providers)?;
+        if let Some(weights) = weights {
+            builder = builder.with_prepacked_weights(weights)?;
+        }
+        match arithmetic {
+            Arithmetic::Fast => builder,
+            Arithmetic::F32 => builder.with_quant_qdq(false)?,
+            Arithmetic::EightBits => builder.with_precise_qmm()?,
+        }
+        .commit_from_file(model)
     }
 
     /// Providers to try for a choice, best first.
@@ -179,8 +218,8 @@ impl Runtime {
             (ProviderChoice::Auto, true) => Ok(vec![provider, Provider::Cpu]),
             (_, true) => Ok(vec![provider]),
             (_, false) => Err(unavailable(format!(
-                "execution provider {}: this ONNX Runtime library was built without it; name one \
-                 that has it with SEGSPLAT_ORT_LIBRARY, or use --provider auto",
+                "execution provider {0}: this ONNX Runtime library was built without it; run \
+                 `{SETUP_COMMAND} --provider {0}`, or use --provider auto",
                 provider.name()
             ))),
         }
@@ -213,11 +252,14 @@ fn locate(options: &NetworkOptions) -> Result<(PathBuf, bool)> {
     }
     let target = std::env::var_os("CARGO_TARGET_DIR").map(|dir| PathBuf::from(dir).join("ort"));
     let own = places::folders();
-    own.iter()
+    let folders = own
+        .iter()
         .cloned()
         .chain(target)
         .chain(own.iter().map(|folder| folder.join("target/ort")))
-        .chain(SYSTEM.iter().map(PathBuf::from))
+        .chain(SYSTEM.iter().map(PathBuf::from));
+    folders
+        .flat_map(|folder| builds(options.provider).iter().map(move |build| folder.join(build)))
         .find_map(|folder| folder.join(LIBRARY).canonicalize().ok())
         .map(|path| (path, false))
         .ok_or_else(|| {
@@ -227,6 +269,28 @@ fn locate(options: &NetworkOptions) -> Result<(PathBuf, bool)> {
                  `{SETUP_COMMAND}` (24 MB, checked by sha256)"
             ))
         })
+}
+
+/// Folders of the builds for a choice, beside or in the folder that is searched, best first.
+fn builds(choice: ProviderChoice) -> &'static [&'static str] {
+    match choice {
+        ProviderChoice::Cpu => &[""],
+        ProviderChoice::Auto | ProviderChoice::Cuda => &["cuda", ""],
+        ProviderChoice::Webgpu => &["webgpu", ""],
+    }
+}
+
+/// Loads CUDA's libraries that lie beside the library, so that the loader needs no path.
+fn preload_cuda(library: &Path) {
+    let names = ep::cuda::CUDA_DYLIBS.iter().chain(ep::cuda::CUDNN_DYLIBS);
+    for name in names.copied() {
+        let path = library.with_file_name(name);
+        if path.is_file()
+            && let Err(e) = ort::util::preload_dylib(&path)
+        {
+            warn!(library = name, error = %e, "a library of CUDA does not load");
+        }
+    }
 }
 
 #[cfg(test)]

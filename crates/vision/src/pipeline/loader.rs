@@ -40,6 +40,13 @@ impl PipelineLoader {
             }
             // This thread alone sets it.
             let _ = of_thread.set(pipeline);
+            // Photos of the first size, two at a time, are fast already. The rest becomes so beside
+            // the first jobs.
+            if let Some(Ok(pipeline)) = of_thread.get()
+                && let Err(error) = pipeline.geometry().warm()
+            {
+                tracing::warn!(%error, "the geometry network was not made ready for every size");
+            }
         };
         let thread = std::thread::Builder::new().name("networks".to_owned()).spawn(open);
         let opening =

@@ -21,7 +21,7 @@ use crate::{
     lift,
     limits::Limits,
     meter,
-    models::{Bundle, Geometry, GeometryInput, NetworkOptions, Runtime},
+    models::{Bundle, Geometry, GeometryInput, NetworkOptions, Provider, Runtime},
     photos,
     scene::{
         Backdrop, Camera, Capture, Density, Gaussians, HealthReport, Intrinsics, Photo, PosedPhoto,
@@ -62,7 +62,22 @@ impl Pipeline {
             .build()
             .map_err(|e| Error::internal("pipeline: no worker threads").caused_by(e))?;
         let lazy = semantics::SemanticNetworks::new(options);
-        Ok(Self { runtime, bundle, geometry, workers, lazy })
+        let pipeline = Self { runtime, bundle, geometry, workers, lazy };
+        // A device takes seconds for its first run, so that no text should wait for it. It is also
+        // where a provider that computes the semantics wrong is refused.
+        if pipeline.geometry.provider() != Provider::Cpu
+            && pipeline.bundle.lacks_semantics().is_none()
+        {
+            pipeline.masks()?;
+            pipeline.image_text()?;
+        }
+        Ok(pipeline)
+    }
+
+    /// Why a network is not computed where it was to be; `None` where all are.
+    #[must_use]
+    pub fn remark(&self) -> Option<String> {
+        self.geometry.remark().or_else(|| self.lazy.remark())
     }
 
     /// The bundle.

@@ -87,6 +87,13 @@ impl SemanticNetworks {
     pub(super) fn new(options: &NetworkOptions) -> Self {
         Self { options: options.clone(), masks: Mutex::default(), image_text: Mutex::default() }
     }
+
+    /// Why an open network is not computed where it was to be; one that is being opened says
+    /// nothing yet.
+    pub(super) fn remark(&self) -> Option<String> {
+        let masks = || self.masks.try_lock()?.as_ref()?.remark();
+        masks().or_else(|| self.image_text.try_lock()?.as_ref()?.remark())
+    }
 }
 
 /// The network in `place`; it is opened if it is not there yet. A failure is not kept.

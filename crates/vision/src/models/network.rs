@@ -1,0 +1,620 @@
+//! A network as its adapters run it: on one execution provider, with the CPU behind it.
+//!
+//! A provider other than the CPU is held to the CPU's answer when the network opens. One that
+//! differs, or that does not open, is refused. A run that fails later is answered by the CPU.
+
+use std::{
+    borrow::Cow,
+    fmt::Debug,
+    path::PathBuf,
+    sync::{
+        Arc,
+        atomic::{AtomicU32, Ordering},
+    },
+};
+
+use ort::{
+    session::{Session, SessionInputValue, SessionOutputs, builder::PrepackedWeights},
+    value::{TensorElementType, TensorRef, ValueType},
+};
+use parking_lot::{Condvar, Mutex};
+use tracing::{info, warn};
+
+use crate::{
+    error::{Error, Result},
+    meter,
+    models::{
+        Bundle, NetworkOptions, Provider, ProviderChoice, Runtime, manifest::unavailable,
+        runtime::Arithmetic,
+    },
+};
+
+/// Failed runs in a row after which a provider is not asked again.
+const FAILURES_MAX: u32 = 3;
+
+/// Numbers of a tensor.
+#[derive(Clone, Debug)]
+pub(super) enum Data<'a> {
+    F32(Cow<'a, [f32]>),
+    I64(Cow<'a, [i64]>),
+}
+
+impl<'a> From<&'a [f32]> for Data<'a> {
+    fn from(data: &'a [f32]) -> Self {
+        Self::F32(Cow::Borrowed(data))
+    }
+}
+
+impl<'a> From<&'a [i64]> for Data<'a> {
+    fn from(data: &'a [i64]) -> Self {
+        Self::I64(Cow::Borrowed(data))
+    }
+}
+
+impl From<Vec<f32>> for Data<'_> {
+    fn from(data: Vec<f32>) -> Self {
+        Self::F32(Cow::Owned(data))
+    }
+}
+
+impl From<Vec<i64>> for Data<'_> {
+    fn from(data: Vec<i64>) -> Self {
+        Self::I64(Cow::Owned(data))
+    }
+}
+
+/// A tensor that goes in.
+#[derive(Clone, Debug)]
+pub(super) struct Input<'a> {
+    name: &'a str,
+    shape: Vec<usize>,
+    data: Data<'a>,
+}
+
+impl<'a> Input<'a> {
+    pub(super) fn new(name: &'a str, shape: &[usize], data: impl Into<Data<'a>>) -> Self {
+        Self { name, shape: shape.to_vec(), data: data.into() }
+    }
+
+    fn value(&self) -> ort::Result<SessionInputValue<'_>> {
+        let shape = self.shape.clone();
+        Ok(match &self.data {
+            Data::F32(data) => TensorRef::from_array_view((shape, &**data))?.into(),
+            Data::I64(data) => TensorRef::from_array_view((shape, &**data))?.into(),
+        })
+    }
+}
+
+/// What a run gave.
+pub(super) trait Outputs {
+    /// Shape and numbers of an output.
+    fn get(&self, name: &str) -> Result<(Vec<usize>, &[f32])>;
+}
+
+impl Outputs for SessionOutputs<'_> {
+    fn get(&self, name: &str) -> Result<(Vec<usize>, &[f32])> {
+        let value = SessionOutputs::get(self, name)
+            .ok_or_else(|| Error::internal(format!("no output {name:?}")))?;
+        let (shape, data) = value
+            .try_extract_tensor::<f32>()
+            .map_err(|e| Error::internal(format!("output {name:?} is not of f32")).caused_by(e))?;
+        Ok((shape.iter().map(|&n| usize::try_from(n).unwrap_or(0)).collect(), data))
+    }
+}
+
+/// Takes the outputs of a run.
+type Read<'a> = dyn FnMut(&dyn Outputs) -> Result<()> + 'a;
+
+/// Why a run gave nothing.
+#[derive(Debug)]
+pub(super) enum Failure {
+    /// The provider failed.
+    Run(Box<dyn std::error::Error + Send + Sync>),
+    /// The outputs are not what their reader expects.
+    Read(Error),
+}
+
+/// Something that runs: a session, or the stand-in of a test.
+pub(super) trait Runner: Debug + Send {
+    fn run(
+        &mut self,
+        inputs: &[Input<'_>],
+        read: &mut Read<'_>,
+    ) -> std::result::Result<(), Failure>;
+}
+
+impl Runner for Session {
+    fn run(
+        &mut self,
+        inputs: &[Input<'_>],
+        read: &mut Read<'_>,
+    ) -> std::result::Result<(), Failure> {
+        let failed = |e: ort::Error| Failure::Run(Box::new(e));
+        let values: Vec<(&str, SessionInputValue<'_>)> = inputs
+            .iter()
+            .map(|input| Ok((input.name, input.value()?)))
+            .collect::<ort::Result<_>>()
+            .map_err(failed)?;
+        let outputs = Self::run(self, values).map_err(failed)?;
+        read(&outputs).map_err(Failure::Read)
+    }
+}
+
+/// Sessions of one network, lent one at a time.
+#[derive(Debug)]
+struct Pool {
+    idle: Mutex<Vec<Box<dyn Runner>>>,
+    returned: Condvar,
+}
+
+impl Pool {
+    fn new(runners: Vec<Box<dyn Runner>>) -> Self {
+        Self { idle: Mutex::new(runners), returned: Condvar::new() }
+    }
+
+    /// Runs on an idle session, and waits for one.
+    fn run(&self, inputs: &[Input<'_>], read: &mut Read<'_>) -> std::result::Result<(), Failure> {
+        let mut idle = self.idle.lock();
+        let runner = loop {
+            match idle.pop() {
+                Some(runner) => break runner,
+                None => self.returned.wait(&mut idle),
+            }
+        };
+        drop(idle);
+        let mut lent = Lent { pool: self, runner: Some(runner) };
+        lent.runner.as_mut().map_or(Ok(()), |runner| runner.run(inputs, read))
+    }
+}
+
+/// A borrowed session; goes back when dropped.
+struct Lent<'a> {
+    pool: &'a Pool,
+    runner: Option<Box<dyn Runner>>,
+}
+
+impl Drop for Lent<'_> {
+    fn drop(&mut self) {
+        self.pool.idle.lock().extend(self.runner.take());
+        self.pool.returned.notify_one();
+    }
+}
+
+/// What a file takes under one name.
+#[derive(Clone, Debug)]
+pub(super) struct Taken {
+    name: String,
+    /// -1 where it is free.
+    pub(super) shape: Vec<i64>,
+    /// Whole numbers, not f32.
+    pub(super) whole: bool,
+}
+
+/// The inputs of a file.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Takes(Vec<Taken>);
+
+impl Takes {
+    fn of(session: &Session) -> Self {
+        let inputs = session.inputs().iter().map(|input| {
+            let (shape, whole) = match input.dtype() {
+                ValueType::Tensor { ty, shape, .. } => {
+                    (shape.to_vec(), *ty == TensorElementType::Int64)
+                }
+                _ => (Vec::new(), false),
+            };
+            Taken { name: input.name().to_owned(), shape, whole }
+        });
+        Self(inputs.collect())
+    }
+
+    /// The input of this name; `None` where the file has none.
+    pub(super) fn get(&self, name: &str) -> Option<&Taken> {
+        self.0.iter().find(|taken| taken.name == name)
+    }
+}
+
+/// A dimension of a file; `None` where the file leaves it free.
+pub(super) fn fixed(dimension: i64) -> Option<usize> {
+    usize::try_from(dimension).ok().filter(|&n| n > 0)
+}
+
+/// Which network, and how a provider is held to the CPU.
+pub(super) struct Spec<'a> {
+    /// Its name in messages.
+    pub(super) what: &'static str,
+    /// File of the bundle.
+    pub(super) file: &'a str,
+    /// The file that the CPU runs, where it is another one.
+    pub(super) cpu_file: Option<&'a str>,
+    /// The outputs that are compared.
+    pub(super) outputs: Vec<&'a str>,
+    /// The largest relative difference of an output to the CPU's, root of mean squares.
+    pub(super) tolerance: f64,
+    /// The fixed input of the comparison.
+    pub(super) probe: &'a dyn Fn(&Takes) -> Result<Vec<Input<'a>>>,
+}
+
+/// Opens sessions of one network.
+#[derive(Clone)]
+struct Opener {
+    runtime: Arc<Runtime>,
+    options: NetworkOptions,
+    file: PathBuf,
+    /// The CPU's own file, in 8 bits.
+    cpu_file: Option<PathBuf>,
+}
+
+impl Opener {
+    /// A session a job on the CPU, with the weights of all in memory once. One session on a device:
+    /// it runs one network at a time whatever the number of jobs.
+    fn open(&self, provider: Provider) -> ort::Result<(Pool, Takes)> {
+        let (count, threads) = match provider {
+            Provider::Cpu => shares(self.options.threads, self.options.jobs),
+            Provider::Cuda | Provider::Webgpu => (1, self.options.threads),
+        };
+        let own = self.cpu_file.as_ref().filter(|_| provider == Provider::Cpu);
+        let file = own.unwrap_or(&self.file);
+        let arithmetic = match (provider, own) {
+            (Provider::Cpu, Some(_)) => Arithmetic::EightBits,
+            (Provider::Cpu, None) => Arithmetic::Fast,
+            (Provider::Cuda | Provider::Webgpu, _) => Arithmetic::F32,
+        };
+        let weights = PrepackedWeights::new();
+        let sessions: Vec<Session> = (0..count)
+            .map(|_| self.runtime.session(file, provider, threads, Some(&weights), arithmetic))
+            .collect::<ort::Result<_>>()?;
+        let takes = sessions.first().map(Takes::of).unwrap_or_default();
+        let runners = sessions.into_iter().map(|session| Box::new(session) as Box<dyn Runner>);
+        Ok((Pool::new(runners.collect()), takes))
+    }
+
+    /// The CPU's own answer in f32 from the file that devices run.
+    fn reference(&self) -> ort::Result<Pool> {
+        let threads = self.options.threads;
+        let session =
+            self.runtime.session(&self.file, Provider::Cpu, threads, None, Arithmetic::F32)?;
+        Ok(Pool::new(vec![Box::new(session)]))
+    }
+}
+
+/// What opens the sessions of the CPU when a provider fails.
+type OpenCpu = Box<dyn Fn() -> Result<Pool> + Send + Sync>;
+
+/// A network, ready to run from any thread.
+pub(super) struct Network {
+    what: &'static str,
+    takes: Takes,
+    pool: Pool,
+    provider: Provider,
+    /// Failed runs in a row.
+    failures: AtomicU32,
+    cpu: Mutex<Option<Arc<Pool>>>,
+    open_cpu: OpenCpu,
+    /// Why a better provider was refused.
+    refused: Option<String>,
+}
+
+impl Debug for Network {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let provider = self.provider();
+        f.debug_struct("Network").field("what", &self.what).field("provider", &provider).finish()
+    }
+}
+
+impl Network {
+    /// Opens a file of the bundle on the first provider of the choice that takes it and gives the
+    /// CPU's answer.
+    ///
+    /// # Errors
+    /// `model_unavailable`, naming network and provider, and the difference where that is it.
+    pub(super) fn open(
+        runtime: &Arc<Runtime>,
+        bundle: &Bundle,
+        options: &NetworkOptions,
+        spec: &Spec<'_>,
+    ) -> Result<Self> {
+        let what = spec.what;
+        let opener = Opener {
+            runtime: Arc::clone(runtime),
+            options: options.clone(),
+            file: bundle.path(spec.file),
+            cpu_file: spec.cpu_file.map(|file| bundle.path(file)),
+        };
+        let mut refused = None;
+        for provider in runtime.candidates(options.provider)? {
+            let name = provider.name();
+            let opened = opener.open(provider).map_err(|e| {
+                unavailable(format!("{what}: {name} does not open {}", spec.file)).caused_by(e)
+            });
+            let checked = opened.and_then(|(pool, takes)| {
+                if provider != Provider::Cpu {
+                    let reference = opener.reference().map_err(|e| {
+                        unavailable(format!("{what}: cpu does not open {}", spec.file)).caused_by(e)
+                    })?;
+                    let probe = (spec.probe)(&takes)?;
+                    let off = check(spec, name, &pool, &reference, &probe)?;
+                    info!(network = what, provider = name, off, "held to the CPU's answer");
+                }
+                Ok((pool, takes))
+            });
+            match checked {
+                Ok((pool, takes)) => {
+                    info!(network = what, provider = name, "open");
+                    let open_cpu = move || {
+                        let opened = opener.open(Provider::Cpu).map(|(pool, _)| pool);
+                        opened.map_err(|e| {
+                            unavailable(format!("{what}: cpu does not open it")).caused_by(e)
+                        })
+                    };
+                    return Ok(Self {
+                        refused: refused.map(|e: Error| e.message().to_owned()),
+                        ..Self::of(what, provider, pool, takes, Box::new(open_cpu))
+                    });
+                }
+                Err(error) => {
+                    warn!(network = what, provider = name, %error, "refused");
+                    if options.provider != ProviderChoice::Auto || provider == Provider::Cpu {
+                        return Err(error);
+                    }
+                    refused = Some(error);
+                }
+            }
+        }
+        Err(refused.unwrap_or_else(|| unavailable(format!("{what}: no provider"))))
+    }
+
+    fn of(
+        what: &'static str,
+        provider: Provider,
+        pool: Pool,
+        takes: Takes,
+        open_cpu: OpenCpu,
+    ) -> Self {
+        Self {
+            what,
+            takes,
+            pool,
+            provider,
+            failures: AtomicU32::new(0),
+            cpu: Mutex::default(),
+            open_cpu,
+            refused: None,
+        }
+    }
+
+    /// What the file takes.
+    pub(super) fn takes(&self) -> &Takes {
+        &self.takes
+    }
+
+    /// What computes it now.
+    pub(super) fn provider(&self) -> Provider {
+        if self.lost() { Provider::Cpu } else { self.provider }
+    }
+
+    /// Why it is not computed where it was to be; `None` where it is.
+    pub(super) fn remark(&self) -> Option<String> {
+        let lost = || format!("{}: {} was lost", self.what, self.provider.name());
+        self.refused.clone().or_else(|| self.lost().then(lost))
+    }
+
+    fn lost(&self) -> bool {
+        self.failures.load(Ordering::Relaxed) >= FAILURES_MAX
+    }
+
+    /// Runs the network and gives its outputs to `read`. Where the provider fails, the CPU answers.
+    ///
+    /// # Errors
+    /// Those of `read`; `internal` when the CPU fails too.
+    pub(super) fn run<T>(
+        &self,
+        inputs: &[Input<'_>],
+        read: impl FnOnce(&dyn Outputs) -> Result<T>,
+    ) -> Result<T> {
+        let (mut read, mut answer) = (Some(read), None);
+        let mut once = |outputs: &dyn Outputs| {
+            answer = read.take().map(|read| read(outputs)).transpose()?;
+            Ok(())
+        };
+        self.run_dyn(inputs, &mut once)?;
+        answer.ok_or_else(|| Error::internal(format!("{}: no answer", self.what)))
+    }
+
+    fn run_dyn(&self, inputs: &[Input<'_>], read: &mut Read<'_>) -> Result<()> {
+        let what = self.what;
+        let failed = |e| Error::internal(format!("{what}: run failed")).caused_by(e);
+        if !self.lost() {
+            match self.pool.run(inputs, read) {
+                Ok(()) => {
+                    self.failures.store(0, Ordering::Relaxed);
+                    return Ok(());
+                }
+                Err(Failure::Read(error)) => return Err(error),
+                Err(Failure::Run(e)) if self.provider == Provider::Cpu => return Err(failed(e)),
+                Err(Failure::Run(e)) => {
+                    let failures = self.failures.fetch_add(1, Ordering::Relaxed) + 1;
+                    let from = self.provider.name();
+                    warn!(network = what, from, failures, error = %e, "failed; the CPU answers");
+                }
+            }
+        }
+        meter::fallback(what);
+        let mut kept = self.cpu.lock();
+        let cpu = match &*kept {
+            Some(cpu) => Arc::clone(cpu),
+            None => Arc::clone(kept.insert(Arc::new((self.open_cpu)()?))),
+        };
+        drop(kept);
+        cpu.run(inputs, read).map_err(|failure| match failure {
+            Failure::Run(e) => failed(e),
+            Failure::Read(error) => error,
+        })
+    }
+}
+
+/// Holds a provider to the reference on one input: the largest relative difference of an output,
+/// root of mean squares.
+///
+/// # Errors
+/// `model_unavailable` when a run fails or the difference is over the tolerance.
+fn check(
+    spec: &Spec<'_>,
+    provider: &str,
+    pool: &Pool,
+    reference: &Pool,
+    probe: &[Input<'_>],
+) -> Result<f64> {
+    let what = spec.what;
+    let answers = |pool: &Pool, name: &str| {
+        let mut answers: Vec<Vec<f32>> = Vec::new();
+        let mut read = |outputs: &dyn Outputs| {
+            for name in &spec.outputs {
+                answers.push(outputs.get(name)?.1.to_vec());
+            }
+            Ok(())
+        };
+        match pool.run(probe, &mut read) {
+            Ok(()) => Ok(answers),
+            Err(Failure::Read(error)) => Err(error),
+            Err(Failure::Run(e)) => {
+                Err(unavailable(format!("{what}: {name} does not run")).caused_by(e))
+            }
+        }
+    };
+    let (found, wanted) = (answers(pool, provider)?, answers(reference, "cpu")?);
+    let differences = found.iter().zip(&wanted).map(|(found, wanted)| difference(found, wanted));
+    let off = differences.fold(0.0, f64::max);
+    if off <= spec.tolerance {
+        return Ok(off);
+    }
+    Err(unavailable(format!(
+        "{what}: {provider} differs from the CPU by {off:.1e} of its answer, over {:.0e}; it is \
+         refused",
+        spec.tolerance
+    )))
+}
+
+/// Root of the mean squared difference as a share of that of `wanted`; infinite where a number or
+/// their count is no match.
+fn difference(found: &[f32], wanted: &[f32]) -> f64 {
+    let squares = |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>();
+    let pairs = found.iter().zip(wanted);
+    let off = squares(&mut pairs.map(|(a, b)| f64::from(*a) - f64::from(*b)));
+    let all = squares(&mut wanted.iter().map(|v| f64::from(*v)));
+    let share = (off / all.max(f64::MIN_POSITIVE)).sqrt();
+    if found.len() == wanted.len() && share.is_finite() { share } else { f64::INFINITY }
+}
+
+/// Sessions, and threads of an operator in each: a session for each job, together at most
+/// `threads`.
+fn shares(threads: usize, jobs: usize) -> (usize, usize) {
+    let sessions = jobs.clamp(1, threads.max(1));
+    (sessions, (threads / sessions).max(1))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::error::ErrorCode;
+
+    /// Gives its one number, or fails.
+    #[derive(Debug)]
+    struct Fake(Option<f32>);
+
+    struct One([f32; 1]);
+
+    impl Outputs for One {
+        fn get(&self, _: &str) -> Result<(Vec<usize>, &[f32])> {
+            Ok((vec![1], &self.0))
+        }
+    }
+
+    impl Runner for Fake {
+        fn run(
+            &mut self,
+            _: &[Input<'_>],
+            read: &mut Read<'_>,
+        ) -> std::result::Result<(), Failure> {
+            match self.0 {
+                Some(value) => read(&One([value])).map_err(Failure::Read),
+                None => Err(Failure::Run("CUDA error 700".into())),
+            }
+        }
+    }
+
+    fn pool(fakes: impl IntoIterator<Item = Option<f32>>) -> Pool {
+        let boxed = |fake| Box::new(Fake(fake)) as Box<dyn Runner>;
+        Pool::new(fakes.into_iter().map(boxed).collect())
+    }
+
+    fn held(found: f32, wanted: f32) -> Result<f64> {
+        let spec = Spec {
+            what: "fake network",
+            file: "fake.onnx",
+            cpu_file: None,
+            outputs: vec!["answer"],
+            tolerance: 1e-2,
+            probe: &|_| Ok(Vec::new()),
+        };
+        check(&spec, "cuda", &pool([Some(found)]), &pool([Some(wanted)]), &[])
+    }
+
+    #[test]
+    fn a_provider_that_differs_is_refused_by_name_with_the_figure() {
+        assert!(held(1.005, 1.0).is_ok(), "within the tolerance");
+        for wrong in [1.02, -1.0, f32::NAN, f32::INFINITY] {
+            let error = held(wrong, 1.0).unwrap_err();
+            assert_eq!(error.code(), ErrorCode::ModelUnavailable, "{error}");
+            let message = error.message();
+            assert!(message.contains("fake network: cuda differs from the CPU by"), "{message}");
+        }
+        assert!(held(1.02, 1.0).unwrap_err().message().contains("2.0e-2"), "names the figure");
+    }
+
+    #[test]
+    fn the_cpu_answers_for_a_provider_that_is_gone() {
+        let gone = |fake: Option<f32>| {
+            let cpu = || Ok(pool([Some(7.0)]));
+            let takes = Takes::default();
+            Network::of("fake network", Provider::Cuda, pool([fake]), takes, Box::new(cpu))
+        };
+        let answer =
+            |network: &Network| network.run(&[], |outputs| Ok(outputs.get("answer")?.1[0]));
+        let well = gone(Some(3.0));
+        assert_eq!(answer(&well).unwrap(), 3.0, "the provider answers while it is there");
+        assert_eq!(well.remark(), None);
+        let network = gone(None);
+        for run in 1..=5 {
+            assert_eq!(answer(&network).unwrap(), 7.0, "run {run}");
+            let lost = run >= FAILURES_MAX;
+            let wanted = if lost { Provider::Cpu } else { Provider::Cuda };
+            assert_eq!(network.provider(), wanted, "run {run}");
+            assert_eq!(network.remark().is_some(), lost, "run {run}");
+        }
+    }
+
+    #[test]
+    fn a_failure_of_the_cpu_is_an_error() {
+        let none = || Ok(pool([]));
+        let takes = Takes::default();
+        let network =
+            Network::of("fake network", Provider::Cpu, pool([None]), takes, Box::new(none));
+        let error = network.run(&[], |_| Ok(())).unwrap_err();
+        assert_eq!(error.code(), ErrorCode::Internal, "{error}");
+        assert_eq!(network.provider(), Provider::Cpu);
+    }
+
+    #[test]
+    fn threads_are_never_oversubscribed() {
+        for threads in 1..20 {
+            for jobs in 1..20 {
+                let (sessions, each) = shares(threads, jobs);
+                assert!(sessions * each <= threads, "{threads} threads, {jobs} jobs");
+                assert!(sessions >= 1 && each >= 1, "{threads} threads, {jobs} jobs");
+            }
+        }
+        assert_eq!(shares(2, 1), (1, 2), "one job gets all threads");
+        assert_eq!(shares(8, 2), (2, 4), "two jobs share");
+    }
+}
