@@ -38,27 +38,24 @@ pub enum Skip {
     EllipseParts,
     /// Gaussians behind the rest where all rays of a tile (on the CPU: of a part) have ended.
     EndedRays,
-    /// Sorting Gaussians that no tile of the picture sees.
+    /// Sorting Gaussians that no tile of the picture sees. CPU only: a GPU sorts the lists of tiles.
     Unseen,
     /// Directions to Gaussians, and on a GPU the stage that shades, of a scene whose colours are
     /// the same from everywhere.
     FlatColor,
     /// Blending tiles that nothing falls on. CPU only: on a GPU it is no step of its own.
     EmptyTiles,
-    /// Digits of the depth sort that are the same for all. GPU only: on the CPU it saved nothing.
-    EqualDigits,
 }
 
 impl Skip {
     /// All of them.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 6] = [
         Self::EllipseTiles,
         Self::EllipseParts,
         Self::EndedRays,
         Self::Unseen,
         Self::FlatColor,
         Self::EmptyTiles,
-        Self::EqualDigits,
     ];
 
     /// The constant of the shaders that is true while it is on, in those that know it.

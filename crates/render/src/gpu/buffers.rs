@@ -3,7 +3,6 @@
 #![expect(missing_docs, reason = "shaders/common/structs.wgsl describes the fields")]
 
 use bytemuck::{Pod, Zeroable};
-use glam::DVec3;
 
 use super::{device::Gpu, recorder::SceneBuffers};
 use crate::{
@@ -77,34 +76,13 @@ pub struct FootprintRow {
     pub depth: f32,
 }
 
-/// `Plan` of the shaders.
+/// `Plan` of the shaders. Zeros before the first stage.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct PlanRow {
     pub isects: u32,
     pub needed: u32,
     pub visible: u32,
-    pub sorted: u32,
-    pub key_min: u32,
-    pub key_max: u32,
-    pub passes: u32,
-    pub reserved: u32,
-}
-
-impl Default for PlanRow {
-    /// Before the first stage.
-    fn default() -> Self {
-        Self { key_min: u32::MAX, ..Self::zeroed() }
-    }
-}
-
-/// `SortParams` of the shaders.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-pub struct SortParams {
-    pub shift: u32,
-    pub pass_at: u32,
-    pub by_tile: u32,
     pub reserved: u32,
 }
 
@@ -158,8 +136,6 @@ pub(super) struct DeviceScene {
     pub(super) gaussians: wgpu::Buffer,
     /// `[N, K, 3]` f32.
     pub(super) sh: wgpu::Buffer,
-    /// Smallest and largest mean along each axis, relative to the origin.
-    pub(super) bounds: [DVec3; 2],
     /// Uploaded when a request first asks for labels.
     pub(super) labels: Option<DeviceLabels>,
 }
@@ -210,13 +186,8 @@ impl DeviceScene {
                 reserved: 0.0,
             })
             .collect();
-        let means = || source.means().iter().map(|mean| glam::Vec3::from(*mean).as_dvec3());
         Ok(Self {
             shape: source.shape_identity(),
-            bounds: [
-                means().reduce(DVec3::min).unwrap_or_default(),
-                means().reduce(DVec3::max).unwrap_or_default(),
-            ],
             count: narrow("gaussians", source.len())?,
             sh_count: source.sh_count() as u32,
             gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows))?,

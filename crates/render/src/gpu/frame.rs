@@ -10,10 +10,10 @@ use rayon::prelude::*;
 use super::{
     buffers::{DeviceScene, PlanRow, ViewRow},
     device::Gpu,
-    pipelines::{FAST_KEY_BITS, Kernels, NO_PICTURE, RasterLabels},
+    pipelines::{Kernels, NO_PICTURE, RasterLabels},
     profile::Marks,
     readback,
-    recorder::{DIGIT_BITS, DIGITS_MAX, LabelInputs, Recorder, sorted_half, tile_bits},
+    recorder::{LabelInputs, Recorder},
     scratch::{Need, Scratch, WEIGHT_SLOTS_MIN},
 };
 use crate::{
@@ -30,8 +30,8 @@ const ISECT_CAPACITY_MIN: u32 = 1 << 16;
 const ATTEMPTS_MAX: u32 = 3;
 /// Factor by which the room for weights grows when it is too small.
 const WEIGHT_SLOTS_GROWTH: u32 = 4;
-/// Bytes of a tile pair: key and Gaussian, each stored twice.
-const PAIR_BYTES_A_BUFFER: u64 = 8;
+/// Bytes of a tile pair: key and Gaussian, stored twice.
+const PAIR_BYTES: u64 = 16;
 const PLAN_BYTES: u64 = size_of::<PlanRow>() as u64;
 /// Pictures of more bytes than this are copied by all cores.
 const PARALLEL_BYTES: usize = 4 << 20;
@@ -69,7 +69,7 @@ type Part<'a, 'b> = (&'a mut Drawing<'b>, &'a Layout, PlanRow, &'a [u8], &'a [u3
 
 /// Result of one view of a submission.
 struct Ended {
-    /// Counts of the device. The digits of the first view are those of all.
+    /// Counts of the device.
     plan: PlanRow,
     drawn: bool,
     /// New room of a pixel, in weights, if the old one was too small.
@@ -89,8 +89,6 @@ pub(super) struct Tools<'a> {
 /// A frame in work. Its bands are drawn from top to bottom.
 pub(super) struct Drawing<'a> {
     row: ViewRow,
-    /// Digits that the depth sort can take.
-    digits: u32,
     request: &'a RenderRequest,
     frame: Frame,
     /// Weights of the bands drawn.
@@ -112,12 +110,7 @@ impl<'a> Drawing<'a> {
         (row.gaussian_count, row.sh_count) = (scene.count, scene.sh_count);
         // The bands are appended.
         let frame = Frame::blank([view.width, view.height], request, 0);
-        let mut bits = view.depth_bits(scene.bounds);
-        if request.quality == Quality::Fast {
-            bits = bits.min(FAST_KEY_BITS);
-        }
-        let digits = bits.div_ceil(DIGIT_BITS).max(1);
-        Ok(Self { row, digits, request, frame, weights: Vec::new(), weights_max: 0 })
+        Ok(Self { row, request, frame, weights: Vec::new(), weights_max: 0 })
     }
 
     /// The frame of all bands.
@@ -234,7 +227,7 @@ impl Tools<'_> {
         let single = rows.end - rows.start == 1;
         let bytes = layout.picture_bytes() + layout.slot_bytes();
         let bytes_max = self.gpu.binding_bytes_max - PLAN_BYTES;
-        if single || bytes.max((u64::from(layout.tiles) + 1) * 4) <= bytes_max {
+        if single || bytes.max((u64::from(layout.tiles) + 1) * 8) <= bytes_max {
             let (mut needed, mut attempts, capacity_max) = (0, 0, self.capacity_max(1));
             while attempts < ATTEMPTS_MAX && needed <= capacity_max {
                 let capacity = self.capacity(1);
@@ -290,7 +283,7 @@ impl Tools<'_> {
     }
 
     fn capacity_max(&self, views: u32) -> u32 {
-        let bound = self.gpu.binding_bytes_max / (PAIR_BYTES_A_BUFFER * u64::from(views));
+        let bound = self.gpu.binding_bytes_max / (PAIR_BYTES * u64::from(views));
         self.isects_max.min(u32::try_from(bound).unwrap_or(u32::MAX))
     }
 
@@ -311,12 +304,9 @@ impl Tools<'_> {
         capacity: u32,
     ) -> Result<Vec<Ended>> {
         let views = drawings.len() as u32;
-        let most_tiles = layouts.iter().map(|layout| layout.tiles).max().unwrap_or(1);
-        let bits = tile_bits(most_tiles);
-        let pair_half = sorted_half(bits) * views * capacity;
         let mut rows = Vec::with_capacity(drawings.len());
         let mut grid = [0; 2];
-        let (mut words, mut slot_words, mut ranges) = (0_u64, 0_u64, 0_u32);
+        let (mut words, mut slot_words, mut tiles) = (0_u64, 0_u64, 0_u32);
         let mut table: Vec<[f32; BLEND_WIDTH]> = Vec::new();
         for (i, ((drawing, band), layout)) in drawings.iter().zip(bands).zip(layouts).enumerate() {
             let after = |start: u32| match start {
@@ -335,14 +325,14 @@ impl Tools<'_> {
                 table_start: table.len() as u32,
                 weight_slots: layout.slots,
                 slot_start: slot_words as u32,
-                range_start: ranges,
-                pair_start: pair_half + i as u32 * capacity,
+                range_start: tiles,
+                pair_start: i as u32 * capacity,
                 ..drawing.row
             });
             grid = [grid[0].max(drawing.row.tiles_x), grid[1].max(band.end - band.start)];
             words += layout.words;
             slot_words += layout.slot_bytes() / 4;
-            ranges += layout.tiles + 1;
+            tiles += layout.tiles + 1;
             table.extend_from_slice(drawing.table());
         }
         let plan_bytes = PLAN_BYTES * u64::from(views);
@@ -351,11 +341,6 @@ impl Tools<'_> {
         let (gpu, scene) = (self.gpu, self.scene);
         let colored = drawings.iter().any(|drawing| drawing.request.kinds.color);
         let deep = drawings.iter().any(|drawing| drawing.request.kinds.depth);
-        // The device may need fewer digits. The others are dispatches without work.
-        let digits = match self.kernels.sorts_all() {
-            true => DIGITS_MAX,
-            false => drawings.iter().map(|drawing| drawing.digits).max().unwrap_or(DIGITS_MAX),
-        };
         let shades = colored && !self.kernels.flat(scene.sh_count);
         let room = self.scratch.room(
             gpu,
@@ -363,7 +348,7 @@ impl Tools<'_> {
                 views,
                 count: scene.count,
                 capacity,
-                ranges,
+                tiles,
                 shades,
                 picture_bytes,
                 table_bytes: size_of_val(table.as_slice()) as u64,
@@ -381,7 +366,7 @@ impl Tools<'_> {
         let bindings = &mut self.scratch.bindings;
         let (kernels, marks) = (self.kernels, self.marks.as_deref_mut());
         gpu.scoped("render", || {
-            room.begin(gpu, &rows);
+            room.begin(gpu, &rows, tiles);
             if !table.is_empty() {
                 gpu.queue.write_buffer(&room.table, 0, bytemuck::cast_slice(&table));
             }
@@ -391,11 +376,9 @@ impl Tools<'_> {
             if shades {
                 stages.shade(buffers);
             }
-            stages.depth_sort(digits);
             stages.prefix_sum();
             stages.emit_isects();
-            stages.tile_sort(bits);
-            stages.tile_ranges();
+            stages.tile_sort(grid);
             stages.rasterize(buffers, labels, (colored, deep), grid);
             stages.submit(&[
                 (&room.plans, 0, &room.staging, 0, plan_bytes),
@@ -423,12 +406,6 @@ impl Tools<'_> {
                 _ => parts.into_par_iter().map(take).collect::<Vec<_>>(),
             }
         })?;
-        let passes = ended.first().map_or(0, |ended| ended.plan.passes);
-        if passes > digits {
-            return Err(Error::internal(format!(
-                "render: depths differ in {passes} digits where the scene's box has {digits}"
-            )));
-        }
         self.scratch.isects = ended.iter().map(|ended| ended.plan.needed).max().unwrap_or(0);
         let more_slots = ended.iter().filter_map(|ended| ended.more_slots).max();
         self.scratch.weight_slots = more_slots.unwrap_or(self.scratch.weight_slots);

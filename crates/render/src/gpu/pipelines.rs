@@ -16,28 +16,12 @@ shared! { pub(super) u32;
     WORKGROUP_SIZE = 256;
     /// Views that one submission draws at most.
     VIEWS_MAX = 8;
-    /// Invocations of a workgroup that moves pairs.
-    SORT_SIZE = 128;
-    /// Pairs that one workgroup sorts.
-    SORT_BLOCK = 2048;
-    /// Gaussians whose tile pairs one workgroup emits.
-    SCAN_BLOCK = 1024;
+    /// Pairs of a tile that one workgroup sorts at once: 16 KiB, the portable floor.
+    SORT_RUN = 2048;
+    /// Tiles of a Gaussian above which a whole workgroup visits them.
+    LARGE_TILES = 64;
     /// Workgroups along x at most; more go to y. Under the portable 65,535.
     GROUPS_X_MAX = 32_768;
-    /// First row of workgroup counts of digits 1 to 3 of the depth sort, by blocks.
-    GROUPS_DEPTH = 0;
-    /// The same, by values of the digit.
-    GROUPS_DIGITS = 3;
-    /// Row of workgroup counts of the tile sort.
-    GROUPS_TILES = 6;
-    /// Row of workgroup counts of the tile ranges.
-    GROUPS_RANGES = 7;
-    /// Bits of a fast view's depth keys: two digits of the sort.
-    FAST_KEY_BITS = 16;
-    /// Depth key of a dropped Gaussian.
-    DROPPED_KEY = u32::MAX;
-    /// Value of a pair that was counted and not emitted.
-    NO_GAUSSIAN = u32::MAX;
     /// Start of a picture that was not asked for.
     NO_PICTURE = u32::MAX;
 }
@@ -80,13 +64,12 @@ macro_rules! shader {
 }
 
 /// Every shader, in the order of the stages.
-pub const SHADERS: [Shader; 9] = [
+pub const SHADERS: [Shader; 8] = [
     shader!("project", "project", "camera", "tiles"),
-    shader!("radix_sort", "radix_sort", "sum_before"),
-    shader!("prefix_sum", "prefix_sum", "sum_before"),
     shader!("shade", "shade", "sh"),
-    shader!("emit_isects", "emit_isects", "tiles", "sum_before"),
-    shader!("tile_ranges", "tile_ranges"),
+    shader!("prefix_sum", "prefix_sum", "sum_before"),
+    shader!("emit_isects", "emit_isects", "tiles"),
+    shader!("tile_sort", "tile_sort"),
     shader!("rasterize", "rasterize", "labels_none"),
     shader!("rasterize_blend", "rasterize", "labels_entries", "labels_blend"),
     shader!("rasterize_weights", "rasterize", "labels_entries", "labels_weights"),
@@ -96,14 +79,10 @@ pub const SHADERS: [Shader; 9] = [
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(super) enum Kernel {
     Project,
-    Histogram,
-    Spine,
-    Scatter,
-    SumBlocks,
-    ScanSums,
     Shade,
+    PrefixSum,
     EmitIsects,
-    TileRanges,
+    TileSort,
     Rasterize { color: bool, depth: bool, labels: RasterLabels },
 }
 
@@ -117,31 +96,18 @@ pub(super) enum RasterLabels {
 
 impl Kernel {
     /// Those that every view needs.
-    const ALWAYS: [Self; 9] = [
-        Self::Project,
-        Self::Histogram,
-        Self::Spine,
-        Self::Scatter,
-        Self::SumBlocks,
-        Self::ScanSums,
-        Self::Shade,
-        Self::EmitIsects,
-        Self::TileRanges,
-    ];
+    const ALWAYS: [Self; 5] =
+        [Self::Project, Self::Shade, Self::PrefixSum, Self::EmitIsects, Self::TileSort];
 
     /// Name in measurements, name of the shader, and entry point on a GPU and on a software
     /// adapter.
     fn row(self) -> (&'static str, &'static str, [&'static str; 2]) {
         match self {
             Self::Project => ("project", "project", ["main"; 2]),
-            Self::Histogram => ("histogram", "radix_sort", ["histogram"; 2]),
-            Self::Spine => ("spine", "radix_sort", ["spine", "spine_serial"]),
-            Self::Scatter => ("scatter", "radix_sort", ["scatter", "scatter_serial"]),
-            Self::SumBlocks => ("sum_blocks", "prefix_sum", ["sum_blocks"; 2]),
-            Self::ScanSums => ("scan_sums", "prefix_sum", ["scan_sums"; 2]),
             Self::Shade => ("shade", "shade", ["main"; 2]),
+            Self::PrefixSum => ("prefix_sum", "prefix_sum", ["main"; 2]),
             Self::EmitIsects => ("emit_isects", "emit_isects", ["main"; 2]),
-            Self::TileRanges => ("tile_ranges", "tile_ranges", ["main"; 2]),
+            Self::TileSort => ("tile_sort", "tile_sort", ["main", "serial"]),
             Self::Rasterize { labels, .. } => {
                 let shader = match labels {
                     RasterLabels::None => "rasterize",
@@ -214,11 +180,6 @@ impl Kernels {
     /// shade.
     pub(super) fn flat(&self, sh_count: u32) -> bool {
         sh_count == 1 && self.without != Some(Skip::FlatColor)
-    }
-
-    /// Whether digits that are the same for all are sorted too.
-    pub(super) fn sorts_all(&self) -> bool {
-        self.without == Some(Skip::EqualDigits)
     }
 
     /// The pipeline of a kernel.
