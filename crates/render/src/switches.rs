@@ -43,21 +43,18 @@ pub enum Skip {
     /// Directions to Gaussians, and on a GPU the stage that shades, of a scene whose colours are
     /// the same from everywhere.
     FlatColor,
-    /// Blending tiles that nothing falls on. CPU only: on a GPU it is no step of its own.
-    EmptyTiles,
     /// Digits of the depth sort that are the same for all. GPU only: on the CPU it saved nothing.
     EqualDigits,
 }
 
 impl Skip {
     /// All of them.
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 6] = [
         Self::EllipseTiles,
         Self::EllipseParts,
         Self::EndedRays,
         Self::Unseen,
         Self::FlatColor,
-        Self::EmptyTiles,
         Self::EqualDigits,
     ];
 
