@@ -18,8 +18,10 @@ use segsplat::{
             prefix_sum,
             project::{Projected, project},
             radix_sort,
-            rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
-            shade, tile_ranges,
+            rasterize::{Tile, TileScratch, rasterize_tile},
+            shade,
+            store::RowOut,
+            tile_ranges,
             tiles::Grid,
         },
         oracle,
@@ -118,7 +120,8 @@ impl Stages {
 
     fn project(&mut self, width: Width) {
         let options = KernelOptions { width, ..KernelOptions::default() };
-        project(&self.gaussians, &self.view, false, options, &mut self.projected);
+        let Self { gaussians, request, view, projected, .. } = self;
+        project(gaussians, request, view, options, projected);
     }
 
     fn shade(&mut self) {
@@ -147,7 +150,7 @@ impl Stages {
     /// All tiles into pictures that every request has.
     fn rasterize(&self, request: &RenderRequest, width: Width, scratch: &mut TileScratch) {
         let options = KernelOptions { width, ..KernelOptions::default() };
-        let paint = Paint::new(request, self.gaussians.semantic_index(), options);
+        let paint = Paint::new(request, &self.view, self.gaussians.semantic_index(), options);
         let stride = (SIDE * TILE) as usize;
         let (mut color, mut depth) = (vec![[0.0; 3]; stride], vec![0.0; stride]);
         let mut blend = vec![[0.0; 4]; stride];
@@ -164,7 +167,8 @@ impl Stages {
                 let tile = Tile { x: tile_x * TILE, y: tile_y * TILE, width: TILE, height: TILE };
                 let footprints = &self.projected.footprints;
                 let isects = &self.isects[range];
-                rasterize_tile(footprints, isects, tile, &paint, SIDE, scratch, &mut out);
+                let tools = (&paint, &mut *scratch);
+                rasterize_tile(footprints, isects, tile, tools, SIDE, &mut out);
             }
         }
         black_box((color, depth, blend));
@@ -196,7 +200,7 @@ fn stages(criterion: &mut Criterion) {
         ("mask", Kinds::NONE, table.clone()),
         ("color_depth_mask", all, table),
     ] {
-        let request = RenderRequest { kinds, labels, ..stages.request };
+        let request = RenderRequest { kinds, labels, ..stages.request.clone() };
         for width in widths.clone() {
             criterion.bench_function(&format!("stage/rasterize/{name}/{width:?}"), |b| {
                 b.iter(|| stages.rasterize(&request, width, &mut scratch));
@@ -206,7 +210,7 @@ fn stages(criterion: &mut Criterion) {
     // Weights are joined from rows of tiles, which the renderer does: whole frames.
     let cpu = CpuRenderer::new(1).expect("a thread");
     for (name, kinds) in [("weights", Kinds::NONE), ("color_depth_weights", all)] {
-        let request = RenderRequest { kinds, labels: Labels::Weights, ..stages.request };
+        let request = RenderRequest { kinds, labels: Labels::Weights, ..stages.request.clone() };
         criterion.bench_function(&format!("labels/{name}/1_threads"), |b| {
             b.iter(|| cpu.render(&stages.gaussians, &request).expect("weights"));
         });

@@ -27,15 +27,43 @@ pub enum Labels {
     Blend(Arc<[[f32; BLEND_WIDTH]]>),
     /// The weights of all entries that a pixel shows: [`PixelWeights`].
     Weights,
+    /// A mask: 255 where the blend of the table is [`selected`], else 0.
+    Mask {
+        /// As that of [`Self::Blend`]: the coverage, then three scores.
+        table: Arc<[[f32; BLEND_WIDTH]]>,
+        /// Least coverage of a pixel that is selected.
+        coverage_floor: f32,
+    },
+}
+
+/// Whether a blended row selects its pixel: its coverage is at least the floor, no score is under
+/// 0, and not all of them are 0.
+#[inline(always)]
+pub fn selected([coverage, scores @ ..]: [f32; BLEND_WIDTH], coverage_floor: f32) -> bool {
+    let all = scores.iter().all(|&score| score >= 0.0);
+    coverage >= coverage_floor && all && scores.iter().any(|&score| score > 0.0)
 }
 
 impl Labels {
-    /// Refuses a table with a number that is not finite.
+    /// The table that is blended.
+    pub fn table(&self) -> Option<&[[f32; BLEND_WIDTH]]> {
+        match self {
+            Self::Blend(table) | Self::Mask { table, .. } => Some(table),
+            Self::None | Self::Weights => None,
+        }
+    }
+
+    /// Refuses a table or a floor with a number that is not finite.
     ///
     /// # Errors
     /// `invalid_request` with the row and the number.
     pub fn check(&self) -> Result<()> {
-        let Self::Blend(table) = self else { return Ok(()) };
+        if let Self::Mask { coverage_floor: floor, .. } = self
+            && !floor.is_finite()
+        {
+            return Err(Error::invalid(format!("labels: the coverage floor is {floor}")));
+        }
+        let Some(table) = self.table() else { return Ok(()) };
         match table.iter().enumerate().find(|(_, row)| row.iter().any(|v| !v.is_finite())) {
             Some((m, row)) => {
                 Err(Error::invalid(format!("labels: row {m} is {row:?}; numbers must be finite")))
@@ -79,7 +107,9 @@ impl WeightRows {
     /// Errors: `limit_exceeded` when there are more weights than [`PIXEL_WEIGHTS_MAX`].
     pub(super) fn join(parts: Vec<Self>) -> Result<PixelWeights> {
         let total: usize = parts.iter().flat_map(|part| &part.rows).map(Vec::len).sum();
-        check_total(total)?;
+        if total as u64 > PIXEL_WEIGHTS_MAX {
+            return Err(Error::limit("render: weights of one view", total, PIXEL_WEIGHTS_MAX));
+        }
         let pixels = parts.iter().map(|part| part.counts.len()).sum::<usize>();
         let mut all = PixelWeights {
             offsets: Vec::with_capacity(pixels + 1),
@@ -102,55 +132,9 @@ impl WeightRows {
     }
 }
 
-/// `front` over `behind`, of which pixel i shows the share `room(i)`, 0..1.
-/// Errors: `limit_exceeded` when there are more weights than [`PIXEL_WEIGHTS_MAX`].
-pub(super) fn over(
-    front: &PixelWeights,
-    behind: &PixelWeights,
-    room: impl Fn(usize) -> f32,
-) -> Result<PixelWeights> {
-    let mut all = PixelWeights { offsets: vec![0], ..PixelWeights::default() };
-    for i in 0..front.pixels() {
-        let room = room(i);
-        let mut under = behind.pixel(i).map(|(m, w)| (m, w * room)).peekable();
-        let mut add = |(entry, weight): (u16, f32)| {
-            if weight > 0.0 {
-                all.entries.push(entry);
-                all.weights.push(weight);
-            }
-        };
-        for (entry, weight) in front.pixel(i) {
-            while let Some(before) = under.next_if(|other| other.0 < entry) {
-                add(before);
-            }
-            let same = under.next_if(|other| other.0 == entry);
-            add((entry, weight + same.map_or(0.0, |other| other.1)));
-        }
-        under.for_each(add);
-        check_total(all.entries.len())?;
-        all.offsets.push(all.entries.len() as u32);
-    }
-    Ok(all)
-}
-
-fn check_total(total: usize) -> Result<()> {
-    if total as u64 > PIXEL_WEIGHTS_MAX {
-        return Err(Error::limit("render: weights of one view", total, PIXEL_WEIGHTS_MAX));
-    }
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn weights(pixels: &[&[(u16, f32)]]) -> PixelWeights {
-        let mut rows = WeightRows::new(1, pixels.len());
-        for (column, pixel) in pixels.iter().enumerate() {
-            pixel.iter().for_each(|&(entry, weight)| rows.push(column, 0, entry, weight));
-        }
-        WeightRows::join(vec![rows]).expect("few weights")
-    }
 
     #[test]
     fn rows_are_joined_in_their_order_whatever_order_they_were_filled_in() {
@@ -166,17 +150,5 @@ mod tests {
         assert_eq!(all.weights, [0.25, 0.75, 0.5, 1.0], "weights");
         assert_eq!(all.coverage(0), 1.0, "coverage of the first pixel");
         assert_eq!((all.pixels(), all.coverage(1)), (6, 0.0), "a pixel without weights");
-    }
-
-    #[test]
-    fn over_merges_by_entry_and_drops_what_is_hidden() {
-        let front = weights(&[&[(2, 0.5), (5, 0.25)], &[(1, 1.0)], &[]]);
-        let behind =
-            weights(&[&[(1, 0.5), (2, 0.5), (9, 1.0)], &[(1, 0.5), (3, 0.5)], &[(4, 0.5)]]);
-        let rooms = [0.25, 0.0, 1.0];
-        let all = over(&front, &behind, |i| rooms[i]).expect("few weights");
-        let want =
-            weights(&[&[(1, 0.125), (2, 0.625), (5, 0.25), (9, 0.25)], &[(1, 1.0)], &[(4, 0.5)]]);
-        assert_eq!(all, want);
     }
 }

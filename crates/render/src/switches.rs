@@ -43,19 +43,16 @@ pub enum Skip {
     /// Directions to Gaussians, and on a GPU the stage that shades, of a scene whose colours are
     /// the same from everywhere.
     FlatColor,
-    /// Blending tiles that nothing falls on. CPU only: on a GPU it is no step of its own.
-    EmptyTiles,
 }
 
 impl Skip {
     /// All of them.
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 5] = [
         Self::EllipseTiles,
         Self::EllipseParts,
         Self::EndedRays,
         Self::Unseen,
         Self::FlatColor,
-        Self::EmptyTiles,
     ];
 
     /// The constant of the shaders that is true while it is on, in those that know it.

@@ -4,7 +4,7 @@
 use glam::{DMat3, DVec3};
 
 use super::{
-    RenderRequest,
+    Background, RenderRequest,
     constants::{FRUSTUM_MARGIN, TILE_SIZE},
 };
 use crate::error::{Error, Result};
@@ -46,8 +46,8 @@ impl View {
     ///
     /// # Errors
     /// `invalid_request` when the intrinsics are unusable, the near plane is not a finite number
-    /// over 0, or background or labels are not finite; `limit_exceeded` for a picture beyond
-    /// memory.
+    /// over 0, or background, sources or labels are not finite; `limit_exceeded` for a picture
+    /// beyond memory.
     pub fn new(origin: DVec3, request: &RenderRequest) -> Result<Self> {
         let lens = request.camera.intrinsics.validated("camera")?;
         let drawn = match request.crop {
@@ -60,8 +60,13 @@ impl View {
                 "near is {near}; it must be a finite number over 0"
             )));
         }
-        if let Some(value) = request.background.iter().find(|value| !value.is_finite()) {
+        if let Background::Color(color) = &request.background
+            && let Some(value) = color.iter().find(|value| !value.is_finite())
+        {
             return Err(Error::invalid(format!("background holds {value}, not a finite number")));
+        }
+        for (i, source) in request.sources.iter().enumerate() {
+            source.check(i)?;
         }
         request.labels.check()?;
         let pixels = u64::from(drawn.width) * u64::from(drawn.height);

@@ -12,6 +12,8 @@ pub mod project;
 pub mod radix_sort;
 pub mod rasterize;
 pub mod shade;
+mod sky;
+pub mod store;
 pub mod tile_ranges;
 pub mod tiles;
 
@@ -25,12 +27,13 @@ use self::{
     paint::Paint,
     project::Projected,
     radix_sort::{key, pack, value},
-    rasterize::{RowOut, Tile, TileScratch},
+    rasterize::{Tile, TileScratch},
+    store::RowOut,
     tiles::Grid,
 };
 use super::{
     Frame, Labels, RenderRequest, Renderer,
-    constants::{ISECTS_MAX, TILE_SIZE},
+    constants::{BEHIND_BIT, ISECTS_MAX, TILE_SIZE},
     labels::WeightRows,
     switches::{Skip, Switches},
     view::View,
@@ -96,13 +99,18 @@ impl CpuRenderer {
         let mut scratch = self.frames.take();
         let FrameScratch { projected, sorted, spare, .. } = &mut scratch;
         let options = self.options;
-        project::project(gaussians, &view, request.antialiased, options, projected);
+        project::project(gaussians, request, &view, options, projected);
         let all = !options.skips(Skip::Unseen);
         let kept = |&(_, &tiles): &(u32, &u32)| tiles > 0 || all;
         let kept = (0_u32..).zip(&projected.tiles_per_gauss).filter(kept);
         sorted.clear();
-        // t.z is over 0, so its bits sort like its value.
-        sorted.extend(kept.map(|(i, _)| pack(projected.footprints[i as usize].depth.to_bits(), i)));
+        sorted.extend(kept.map(|(i, _)| {
+            let view = usize::from(gaussians.source()[i as usize].view);
+            let behind = request.sources.get(view).is_some_and(|source| source.behind);
+            // t.z is over 0, so its bits sort like its value.
+            let depth = projected.footprints[i as usize].depth.to_bits();
+            pack(if behind { depth | BEHIND_BIT } else { depth }, i)
+        }));
         radix_sort::radix_sort(sorted, spare, u32::BITS);
         if request.kinds.color {
             shade::shade(gaussians, &view, options, projected);
@@ -110,7 +118,7 @@ impl CpuRenderer {
         let visible = projected.tiles_per_gauss.iter().filter(|&&tiles| tiles > 0);
         frame.stats.visible = visible.count() as u64;
         let grid = Grid::whole(&view, options);
-        let paint = Paint::new(request, gaussians.semantic_index(), options);
+        let paint = Paint::new(request, &view, gaussians.semantic_index(), options);
         let mut band = Band { paint, weights: Vec::new() };
         self.draw_band(&grid, &mut band, &mut scratch, &mut frame)?;
         if request.labels == Labels::Weights {
@@ -119,7 +127,7 @@ impl CpuRenderer {
         if gaussians.len() <= KEPT_GAUSSIANS_MAX {
             self.frames.give(scratch);
         }
-        Ok(frame)
+        Ok(frame.finish(request.samples))
     }
 
     /// Draws the rows of tiles of `grid`; halves them while their pairs are over the budget.
@@ -169,30 +177,20 @@ impl CpuRenderer {
         scratch: &FrameScratch,
         frame: &mut Frame,
     ) {
-        let tiles_x = grid.tiles_x();
+        let tiles_x = grid.tiles_x() as usize;
         let paint = band.paint;
         let rows = band_rows(frame, grid, *paint.labels == Labels::Weights);
         let drawn = rows.into_par_iter().with_max_len(1).enumerate().map(|(row, mut out)| {
             let mut tile_scratch = self.tiles.take();
             let y = (grid.tile_rows.start + row as u32) * TILE_SIZE;
-            for tile_x in 0..tiles_x {
-                let x = tile_x * TILE_SIZE;
-                let [width, height] =
-                    [grid.width - x, grid.height - y].map(|side| TILE_SIZE.min(side));
-                let tile = Tile { x, y, width, height };
-                let id = row * tiles_x as usize + tile_x as usize;
+            for (tile_x, tile) in row_tiles(grid, y).enumerate() {
+                let id = row * tiles_x + tile_x;
                 let range = scratch.ranges[id] as usize..scratch.ranges[id + 1] as usize;
                 let isects = &scratch.isects[range];
                 debug_assert!(isects.iter().all(|&isect| key(isect) as usize == id));
-                rasterize::rasterize_tile(
-                    &scratch.projected.footprints,
-                    isects,
-                    tile,
-                    &paint,
-                    grid.width,
-                    &mut tile_scratch,
-                    &mut out,
-                );
+                let footprints = &scratch.projected.footprints;
+                let tools = (&paint, &mut tile_scratch);
+                rasterize::rasterize_tile(footprints, isects, tile, tools, grid.width, &mut out);
             }
             self.tiles.give(tile_scratch);
             out.weights
@@ -200,6 +198,39 @@ impl CpuRenderer {
         let drawn: Vec<Option<WeightRows>> = drawn.collect();
         band.weights.extend(drawn.into_iter().flatten());
     }
+}
+
+/// A view without Gaussians.
+pub(super) fn background(view: &View, request: &RenderRequest) -> Result<Frame> {
+    let pixels = view.width as usize * view.height as usize;
+    let mut frame = Frame::blank([view.width, view.height], request, pixels);
+    let options = KernelOptions::default();
+    let grid = Grid::whole(view, options);
+    let paint = Paint::new(request, view, &[], options);
+    let rows = band_rows(&mut frame, &grid, request.labels == Labels::Weights);
+    let drawn = rows.into_par_iter().enumerate().map(|(row, mut out)| {
+        let mut scratch = TileScratch::default();
+        for tile in row_tiles(&grid, row as u32 * TILE_SIZE) {
+            let tools = (&paint, &mut scratch);
+            rasterize::rasterize_tile(&[], &[], tile, tools, grid.width, &mut out);
+        }
+        out.weights
+    });
+    let drawn: Vec<Option<WeightRows>> = drawn.collect();
+    if request.labels == Labels::Weights {
+        frame.weights = Some(WeightRows::join(drawn.into_iter().flatten().collect())?);
+    }
+    Ok(frame.finish(request.samples))
+}
+
+/// The tiles of the row of tiles that starts at pixel row `y`.
+fn row_tiles(grid: &Grid, y: u32) -> impl Iterator<Item = Tile> {
+    let [across, down] = [grid.width, grid.height];
+    (0..across.div_ceil(TILE_SIZE)).map(move |tile_x| {
+        let x = tile_x * TILE_SIZE;
+        let [width, height] = [across - x, down - y].map(|side| TILE_SIZE.min(side));
+        Tile { x, y, width, height }
+    })
 }
 
 impl Renderer for CpuRenderer {
@@ -250,24 +281,38 @@ impl<T: Default> Pool<T> {
 
 /// The pictures of a band, cut into rows of tiles.
 fn band_rows<'a>(frame: &'a mut Frame, grid: &Grid, weights: bool) -> Vec<RowOut<'a>> {
+    /// Rows of tiles of a picture from the first of the band on.
+    fn cut<'a, T>(
+        all: &'a mut Option<Vec<T>>,
+        (stride, first): (usize, usize),
+    ) -> impl FnMut() -> Option<&'a mut [T]> {
+        let mut rows = all.as_mut().map(|all| all.chunks_mut(stride).skip(first));
+        move || rows.as_mut().and_then(Iterator::next)
+    }
     let stride = frame.width as usize * TILE_SIZE as usize;
-    let first = grid.tile_rows.start as usize;
-    let mut color = frame.color.as_mut().map(|all| all.chunks_mut(stride).skip(first));
-    let mut depth = frame.depth.as_mut().map(|all| all.chunks_mut(stride).skip(first));
-    let mut alpha = frame.alpha.as_mut().map(|all| all.chunks_mut(stride).skip(first));
-    let mut blend = frame.blend.as_mut().map(|all| all.chunks_mut(stride).skip(first));
+    let place = (stride, grid.tile_rows.start as usize);
+    let mut color = cut(&mut frame.color, place);
+    let mut depth = cut(&mut frame.depth, place);
+    let mut alpha = cut(&mut frame.alpha, place);
+    let mut rgb = cut(&mut frame.levels.rgb, place);
+    let mut rgba = cut(&mut frame.levels.rgba, place);
+    let mut alpha_levels = cut(&mut frame.levels.alpha, place);
+    let mut blend = cut(&mut frame.blend, place);
+    let mut mask = cut(&mut frame.mask, place);
     let width = grid.width as usize;
-    grid.tile_rows
-        .clone()
-        .map(|tile_row| RowOut {
-            color: color.as_mut().and_then(Iterator::next),
-            depth: depth.as_mut().and_then(Iterator::next),
-            alpha: alpha.as_mut().and_then(Iterator::next),
-            blend: blend.as_mut().and_then(Iterator::next),
-            weights: weights.then(|| {
-                let rows = TILE_SIZE.min(grid.height - tile_row * TILE_SIZE);
-                WeightRows::new(rows as usize, width)
-            }),
-        })
-        .collect()
+    let row = |tile_row: u32| RowOut {
+        color: color(),
+        depth: depth(),
+        alpha: alpha(),
+        rgb: rgb(),
+        rgba: rgba(),
+        alpha_levels: alpha_levels(),
+        blend: blend(),
+        mask: mask(),
+        weights: weights.then(|| {
+            let rows = TILE_SIZE.min(grid.height - tile_row * TILE_SIZE);
+            WeightRows::new(rows as usize, width)
+        }),
+    };
+    grid.tile_rows.clone().map(row).collect()
 }

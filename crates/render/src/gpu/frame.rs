@@ -17,7 +17,7 @@ use super::{
     scratch::{Need, Scratch, WEIGHT_SLOTS_MIN},
 };
 use crate::{
-    Frame, Labels, Quality, RenderRequest,
+    Background, Frame, Labels, Quality, RenderRequest, Samples,
     constants::TILE_SIZE,
     error::{Error, Result},
     labels::{BLEND_WIDTH, WeightRows},
@@ -105,7 +105,8 @@ impl<'a> Drawing<'a> {
         scene: &DeviceScene,
     ) -> Result<Self> {
         let view = View::new(origin, request)?;
-        let mut row = ViewRow::new(&view, request.background, request.antialiased);
+        let background = plain(request)?;
+        let mut row = ViewRow::new(&view, background, request.antialiased);
         row.fast = u32::from(request.quality == Quality::Fast);
         (row.gaussian_count, row.sh_count) = (scene.count, scene.sh_count);
         // The bands are appended.
@@ -410,6 +411,18 @@ impl Tools<'_> {
         let more_slots = ended.iter().filter_map(|ended| ended.more_slots).max();
         self.scratch.weight_slots = more_slots.unwrap_or(self.scratch.weight_slots);
         Ok(ended)
+    }
+}
+
+/// The background of a request that the shaders know all of.
+pub(super) fn plain(request: &RenderRequest) -> Result<[f32; 3]> {
+    let RenderRequest { background, sources, samples, labels, .. } = request;
+    let known = sources.is_empty() && *samples == Samples::F32;
+    match (background, labels) {
+        (Background::Color(color), Labels::None | Labels::Blend(_) | Labels::Weights) if known => {
+            Ok(*color)
+        }
+        _ => Err(Error::internal("render: the shaders do not know this kind of view yet")),
     }
 }
 

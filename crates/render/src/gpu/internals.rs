@@ -7,6 +7,7 @@ use super::{
     GpuRenderer,
     adapter::{Adapter, OpenDevice},
     buffers::{DeviceScene, narrow},
+    frame::plain,
     pipelines::RasterLabels,
     readback,
     recorder::{Bindings, Copy, Recorder, SceneBuffers},
@@ -253,7 +254,7 @@ fn scene_row(gaussians: &Gaussians, request: &RenderRequest) -> Result<ViewRow> 
     Ok(ViewRow {
         gaussian_count: narrow("gaussians", gaussians.len())?,
         sh_count: gaussians.sh_count() as u32,
-        ..ViewRow::new(&view, request.background, request.antialiased)
+        ..ViewRow::new(&view, plain(request)?, request.antialiased)
     })
 }
 

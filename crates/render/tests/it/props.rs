@@ -16,7 +16,7 @@ use segsplat_render::{
 
 use segsplat_testing::{
     compare::{Tolerance, compare, samples},
-    scenes::{Random, camera, checked, cloud, look, push, request, two_views},
+    scenes::{BACKGROUND, Random, camera, checked, cloud, look, push, request, two_views},
 };
 
 const WIDTH: u32 = 49;
@@ -206,7 +206,7 @@ fn bands_of_a_small_budget_draw_the_same_picture() {
 fn an_empty_scene_is_a_clean_background() {
     let request = request(camera(33, 18));
     let frame = draw(&checked(RawGaussians::default()), &request);
-    assert_eq!(frame.color, Some(vec![request.background; 33 * 18]), "background");
+    assert_eq!(frame.color, Some(vec![BACKGROUND; 33 * 18]), "background");
     assert_eq!(frame.depth, Some(vec![0.0; 33 * 18]), "depth");
     assert_eq!(frame.alpha, Some(vec![0.0; 33 * 18]), "alpha");
     assert_eq!(frame.stats, Default::default(), "counts");
@@ -280,7 +280,7 @@ proptest! {
         let request = RenderRequest { near, ..request(camera) };
         let view = View::new(gaussians.origin(), &request).expect("a view");
         let mut projected = Projected::default();
-        project(&gaussians, &view, false, KernelOptions::default(), &mut projected);
+        project(&gaussians, &request, &view, KernelOptions::default(), &mut projected);
         let seen = projected.footprints.iter().zip(&projected.tiles_per_gauss);
         let keys = seen.filter(|(_, tiles)| **tiles > 0).map(|(one, _)| one.depth.to_bits());
         let (least, most) = keys.fold((u32::MAX, 0), |(a, b), key| (a.min(key), b.max(key)));

@@ -135,7 +135,7 @@ fn ellipses_in_lanes_touch_the_tiles_that_one_alone_touches() {
         let options = KernelOptions { width, ..KernelOptions::default() };
         let grid = Grid::whole(&view, options);
         let mut projected = Projected::default();
-        project(&gaussians, &view, false, options, &mut projected);
+        project(&gaussians, &request, &view, options, &mut projected);
         let (mut seen, mut tall) = (0, 0);
         for (i, footprint) in projected.footprints.iter().enumerate() {
             if footprint.opacity == 0.0 {

@@ -14,8 +14,10 @@ use segsplat_render::{
         prefix_sum, project,
         project::Projected,
         radix_sort,
-        rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
-        shade, tile_ranges,
+        rasterize::{Tile, TileScratch, rasterize_tile},
+        shade,
+        store::RowOut,
+        tile_ranges,
         tiles::{Grid, TileSpans},
     },
     gpu::internals::FootprintRow,
@@ -23,7 +25,9 @@ use segsplat_render::{
 };
 
 use crate::common::{both_kernels, gpu, judge, open, same};
-use segsplat_testing::scenes::{Random, camera, checked, cloud, look, push, request, two_views};
+use segsplat_testing::scenes::{
+    BACKGROUND, Random, camera, checked, cloud, look, push, request, two_views,
+};
 
 fn view_of(gaussians: &Gaussians, request: &RenderRequest) -> View {
     View::new(gaussians.origin(), request).expect("a test view")
@@ -38,7 +42,7 @@ fn projected(gaussians: &Gaussians, request: &RenderRequest) -> Projected {
     let mut projected = Projected::default();
     let view = view_of(gaussians, request);
     let options = KernelOptions::default();
-    project::project(gaussians, &view, request.antialiased, options, &mut projected);
+    project::project(gaussians, request, &view, options, &mut projected);
     projected
 }
 
@@ -284,6 +288,8 @@ fn rasterize_twin() {
         radix_sort::radix_sort(&mut isects, &mut Vec::new(), 16);
         tile_ranges::tile_ranges(&isects, grid.tile_count(), &mut ranges);
 
+        let entries = gaussians.semantic_index();
+        let paint = Paint::new(&request, &view, entries, KernelOptions::default());
         let pixels = 96 * 96;
         let (mut color, mut depth, mut alpha) =
             (vec![[0.0; 3]; pixels], vec![0.0; pixels], vec![0.0; pixels]);
@@ -302,9 +308,8 @@ fn rasterize_twin() {
                     &projected.footprints,
                     &isects[ranges[id] as usize..ranges[id + 1] as usize],
                     tile,
-                    &Paint::new(&request, gaussians.semantic_index(), KernelOptions::default()),
+                    (&paint, &mut TileScratch::default()),
                     96,
-                    &mut TileScratch::default(),
                     &mut out,
                 );
             }
@@ -314,7 +319,7 @@ fn rasterize_twin() {
         let ids: Vec<u32> = isects.iter().map(|&pair| radix_sort::value(pair)).collect();
         let got = gpu
             .internals()
-            .rasterize(&view, request.background, &rows, &colors, &ids, &ranges)
+            .rasterize(&view, BACKGROUND, &rows, &colors, &ids, &ranges)
             .expect("pictures");
         let want = Frame {
             width: 96,
