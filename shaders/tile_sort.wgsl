@@ -3,7 +3,7 @@
 //
 // Up to SORT_RUN pairs are sorted in workgroup memory, by a bitonic network. An invocation takes
 // eight numbers at a time through up to three stages of it. Longer lists are merged in the device's
-// memory. On a software adapter, where a barrier costs more than a merge, one invocation merges a
+// memory. On a software adapter, where a barrier costs more than a merge, few invocations merge a
 // list from single pairs on.
 
 @group(0) @binding(1) var<storage, read> starts: array<u32>;
@@ -13,8 +13,9 @@
 // First pair of each tile, sorted, and one past its last.
 @group(0) @binding(4) var<storage, read_write> lists: array<vec2<u32>>;
 
-// Invocations of a serial workgroup: lanes of a software adapter.
-const SERIAL_SIZE: u32 = 8u;
+// Invocations of a workgroup on a software adapter. It leaves loops after 65,535 turns, so one
+// alone could not merge a long list.
+const SERIAL_SIZE: u32 = 64u;
 
 var<workgroup> run: array<vec2<u32>, SORT_RUN>;
 var<private> eight: array<vec2<u32>, 8>;
@@ -149,15 +150,30 @@ fn merge(from_first: u32, to_first: u32, count: u32, width: u32, local: u32, sha
     }
 }
 
-// The list of a tile as emitted.
-fn list_of(tile: u32) -> vec2<u32> {
-    let first = views[which].pair_start;
-    return first + vec2(starts[tile], min(ends[tile], starts[tile + 1u]));
+// Merges the runs of `width` pairs of a tile's list until one is left.
+fn merge_all(tile: u32, list: vec2<u32>, width: u32, half: u32, local: u32, sharers: u32) {
+    let count = list.y - list.x;
+    let rounds = select(32u - countLeadingZeros((count - 1u) / width), 0u, count <= width);
+    for (var round = 0u; round < rounds; round++) {
+        storageBarrier();
+        let from_first = list.x + (round & 1u) * half;
+        let to_first = list.x + (1u - (round & 1u)) * half;
+        merge(from_first, to_first, count, width << round, local, sharers);
+    }
+    if local == 0u {
+        lists[tile] = list + (rounds & 1u) * half;
+    }
 }
 
-// How often runs of `width` pairs are merged until one is left.
-fn rounds_of(count: u32, width: u32) -> u32 {
-    return select(32u - countLeadingZeros((count - 1u) / width), 0u, count <= width);
+// The list of a tile as emitted.
+fn list_of(tile: u32) -> vec2<u32> {
+    return views[which].pair_start + vec2(starts[tile], min(ends[tile], starts[tile + 1u]));
+}
+
+fn is_tile(group: vec3<u32>) -> bool {
+    // Views of a batch may differ in size.
+    return group.x < views[which].tiles_x
+        && group.y < views[which].row_end - views[which].row_start;
 }
 
 @compute @workgroup_size(256)
@@ -167,28 +183,17 @@ fn main(
     @builtin(local_invocation_index) local: u32,
 ) {
     which = group.z;
-    // Views of a batch may differ in size.
-    if group.x >= views[which].tiles_x || group.y >= views[which].row_end - views[which].row_start {
+    if !is_tile(group) {
         return;
     }
     let tile = views[which].range_start + group.y * views[which].tiles_x + group.x;
     let list = list_of(tile);
-    let count = list.y - list.x;
-    for (var start = 0u; start < count; start += SORT_RUN) {
-        sort_run(list.x + start, min(count - start, SORT_RUN), local);
+    for (var start = list.x; start < list.y; start += SORT_RUN) {
+        sort_run(start, min(list.y - start, SORT_RUN), local);
         workgroupBarrier();
     }
     let half = groups.z * views[which].isect_capacity;
-    let rounds = rounds_of(count, SORT_RUN);
-    for (var round = 0u; round < rounds; round++) {
-        storageBarrier();
-        let from_first = list.x + (round & 1u) * half;
-        let to_first = list.x + (1u - (round & 1u)) * half;
-        merge(from_first, to_first, count, SORT_RUN << round, local, WORKGROUP_SIZE);
-    }
-    if local == 0u {
-        lists[tile] = list + (rounds & 1u) * half;
-    }
+    merge_all(tile, list, SORT_RUN, half, local, WORKGROUP_SIZE);
 }
 
 @compute @workgroup_size(SERIAL_SIZE)
@@ -198,20 +203,10 @@ fn serial(
     @builtin(local_invocation_index) local: u32,
 ) {
     which = group.z;
-    // As many workgroups come as there are tiles: the last ones find none left.
-    let column = group.x * SERIAL_SIZE + local;
-    if column >= views[which].tiles_x || group.y >= views[which].row_end - views[which].row_start {
+    if !is_tile(group) {
         return;
     }
-    let tile = views[which].range_start + group.y * views[which].tiles_x + column;
-    let list = list_of(tile);
-    let count = list.y - list.x;
+    let tile = views[which].range_start + group.y * views[which].tiles_x + group.x;
     let half = groups.z * views[which].isect_capacity;
-    let rounds = rounds_of(count, 1u);
-    for (var round = 0u; round < rounds; round++) {
-        let from_first = list.x + (round & 1u) * half;
-        let to_first = list.x + (1u - (round & 1u)) * half;
-        merge(from_first, to_first, count, 1u << round, 0u, 1u);
-    }
-    lists[tile] = list + (rounds & 1u) * half;
+    merge_all(tile, list_of(tile), 1u, half, local, SERIAL_SIZE);
 }

@@ -47,13 +47,8 @@ pub enum Skip {
 
 impl Skip {
     /// All of them.
-    pub const ALL: [Self; 5] = [
-        Self::EllipseTiles,
-        Self::EllipseParts,
-        Self::EndedRays,
-        Self::Unseen,
-        Self::FlatColor,
-    ];
+    pub const ALL: [Self; 5] =
+        [Self::EllipseTiles, Self::EllipseParts, Self::EndedRays, Self::Unseen, Self::FlatColor];
 
     /// The constant of the shaders that is true while it is on, in those that know it.
     pub fn constant(self) -> String {

@@ -4,8 +4,10 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use super::{device::Gpu, recorder::SceneBuffers};
+use super::{device::Gpu, pipelines::NO_PICTURE, recorder::SceneBuffers};
 use crate::{
+    Background, Labels, RenderRequest, Samples, Source,
+    constants::{HALF_LEVEL, OWN_SIZE},
     error::{Error, ErrorCode, Result},
     scene::Gaussians,
     view::View,
@@ -48,8 +50,36 @@ pub struct ViewRow {
     pub slot_start: u32,
     pub range_start: u32,
     pub pair_start: u32,
-    pub fast: u32,
-    pub reserved: u32,
+    pub levels: u32,
+    pub alpha_byte_start: u32,
+    pub mask_start: u32,
+    pub steps_start: u32,
+    pub backdrop_start: u32,
+    pub room_min: f32,
+    pub coverage_floor: f32,
+    pub own_focal: f32,
+    pub source_count: u32,
+    pub source_start: u32,
+    pub ray_first: [f32; 4],
+    pub ray_across: [f32; 4],
+    pub ray_down: [f32; 4],
+}
+
+/// `Source` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct SourceRow {
+    pub center: [f32; 3],
+    pub scale: f32,
+    pub axis: [f32; 3],
+    pub behind: u32,
+}
+
+impl From<&Source> for SourceRow {
+    fn from(source: &Source) -> Self {
+        let Source { center, axis, scale, behind } = *source;
+        Self { center, scale, axis, behind: u32::from(behind) }
+    }
 }
 
 /// `Gaussian` of the shaders.
@@ -60,7 +90,7 @@ pub struct GaussianRow {
     pub opacity: f32,
     pub quat: [f32; 4],
     pub scale: [f32; 3],
-    pub reserved: f32,
+    pub source: u32,
 }
 
 /// `Footprint` of the shaders.
@@ -83,7 +113,7 @@ pub struct PlanRow {
     pub isects: u32,
     pub needed: u32,
     pub visible: u32,
-    pub reserved: u32,
+    pub farthest: u32,
 }
 
 const _: () = assert!(size_of::<ViewRow>().is_multiple_of(16), "a uniform block");
@@ -119,7 +149,40 @@ impl ViewRow {
             row_start: 0,
             row_end: view.tiles_y(),
             antialiased: u32::from(antialiased),
+            color_start: NO_PICTURE,
+            depth_start: NO_PICTURE,
+            alpha_start: NO_PICTURE,
+            blend_start: NO_PICTURE,
+            alpha_byte_start: NO_PICTURE,
+            mask_start: NO_PICTURE,
+            steps_start: NO_PICTURE,
+            backdrop_start: NO_PICTURE,
             ..Self::zeroed()
+        }
+    }
+
+    /// The row of a request, of which `view` is the camera. The caller sets also where the view's
+    /// photos, its table and its backdrop start.
+    pub fn of(view: &View, request: &RenderRequest) -> Self {
+        let background = match &request.background {
+            Background::Color(color) => *color,
+            Background::Backdrop(_) => [0.0; 3],
+        };
+        let exact = request.samples == Samples::F32;
+        let [first, across, down] = view.rays().map(|[x, y, z]| [x, y, z, 0.0]);
+        Self {
+            levels: u32::from(!exact),
+            room_min: if exact { f32::MIN_POSITIVE } else { HALF_LEVEL },
+            coverage_floor: match request.labels {
+                Labels::Mask { coverage_floor, .. } => coverage_floor,
+                _ => 0.0,
+            },
+            own_focal: (view.focal[0].max(view.focal[1]) / f64::from(OWN_SIZE)) as f32,
+            source_count: request.sources.len() as u32,
+            ray_first: first,
+            ray_across: across,
+            ray_down: down,
+            ..Self::new(view, background, request.antialiased)
         }
     }
 }
@@ -183,7 +246,7 @@ impl DeviceScene {
                 opacity: source.opacities()[i],
                 quat: source.quats()[i],
                 scale: source.scales()[i],
-                reserved: 0.0,
+                source: source.source()[i].view.into(),
             })
             .collect();
         Ok(Self {

@@ -7,14 +7,13 @@ use super::{
     GpuRenderer,
     adapter::{Adapter, OpenDevice},
     buffers::{DeviceScene, narrow},
-    frame::plain,
-    pipelines::RasterLabels,
+    pipelines::{RasterKinds, RasterLabels},
     readback,
     recorder::{Bindings, Copy, Recorder, SceneBuffers},
     scratch::{BatchBuffers, Need},
 };
 pub use super::{
-    buffers::{FootprintRow, GaussianRow, PlanRow, ViewRow},
+    buffers::{FootprintRow, GaussianRow, PlanRow, SourceRow, ViewRow},
     pipelines::{SHADERS, SHARED, Shader},
 };
 use crate::{RenderRequest, error::Result, scene::Gaussians, view::View};
@@ -67,8 +66,10 @@ impl Internals<'_> {
     /// Stage 1.
     pub fn project(self, gaussians: &Gaussians, request: &RenderRequest) -> Result<ProjectedRows> {
         let row = scene_row(gaussians, request)?;
+        let sources: Vec<SourceRow> = request.sources.iter().map(SourceRow::from).collect();
         self.run(row, 0, Some(gaussians), |stage| {
             let (room, n) = (&stage.room, gaussians.len());
+            stage.write(&room.sources, &sources);
             let parts = [
                 (&room.footprints, 0, n * size_of::<FootprintRow>()),
                 (&room.touched, 0, n * 4),
@@ -122,7 +123,7 @@ impl Internals<'_> {
         request: &RenderRequest,
         tiles: &[u32],
     ) -> Result<Vec<[f32; 3]>> {
-        let row = scene_row(gaussians, request)?;
+        let row = ViewRow { color_start: 0, ..scene_row(gaussians, request)? };
         self.run(row, 0, Some(gaussians), |stage| {
             stage.write(&stage.room.touched, tiles);
             let parts = [(&stage.room.colors, 0, gaussians.len() * 12)];
@@ -216,7 +217,9 @@ impl Internals<'_> {
             stage.write(&room.lists, &lists);
             let tiles = [view.tiles_x(), view.tiles_y()];
             let [pictures] = stage.read([(&room.pictures, 0, size)], |stages| {
-                stages.rasterize(stage.scene(), (RasterLabels::None, None), (true, true), tiles);
+                let labels = RasterLabels::None;
+                let kinds = RasterKinds { color: true, depth: true, bytes: false, labels };
+                stages.rasterize(stage.scene(), kinds, None, tiles);
             })?;
             Ok(cast(&pictures))
         })
@@ -237,6 +240,7 @@ impl Internals<'_> {
                 capacity: row.isect_capacity,
                 tiles: row.tiles_x * row.tiles_y + 1,
                 shades: true,
+                source_bytes: u64::from(row.source_count) * size_of::<SourceRow>() as u64,
                 picture_bytes: picture_bytes as u64,
                 ..Need::default()
             };
@@ -254,7 +258,7 @@ fn scene_row(gaussians: &Gaussians, request: &RenderRequest) -> Result<ViewRow> 
     Ok(ViewRow {
         gaussian_count: narrow("gaussians", gaussians.len())?,
         sh_count: gaussians.sh_count() as u32,
-        ..ViewRow::new(&view, plain(request)?, request.antialiased)
+        ..ViewRow::of(&view, request)
     })
 }
 

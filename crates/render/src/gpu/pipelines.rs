@@ -6,8 +6,10 @@ use parking_lot::Mutex;
 
 use super::device::Gpu;
 use crate::{
+    Labels, RenderRequest, Samples,
     constants::shared,
     error::{Error, Result},
+    scene::Backdrop,
     switches::{Skip, Switches},
 };
 
@@ -22,6 +24,10 @@ shared! { pub(super) u32;
     LARGE_TILES = 64;
     /// Workgroups along x at most; more go to y. Under the portable 65,535.
     GROUPS_X_MAX = 32_768;
+    /// Cells of a backdrop, across.
+    BACKDROP_WIDTH = Backdrop::WIDTH as u32;
+    /// Cells of a backdrop, down.
+    BACKDROP_HEIGHT = Backdrop::HEIGHT as u32;
     /// Start of a picture that was not asked for.
     NO_PICTURE = u32::MAX;
 }
@@ -64,15 +70,16 @@ macro_rules! shader {
 }
 
 /// Every shader, in the order of the stages.
-pub const SHADERS: [Shader; 8] = [
+pub const SHADERS: [Shader; 9] = [
     shader!("project", "project", "camera", "tiles"),
     shader!("shade", "shade", "sh"),
     shader!("prefix_sum", "prefix_sum", "sum_before"),
     shader!("emit_isects", "emit_isects", "tiles"),
     shader!("tile_sort", "tile_sort"),
-    shader!("rasterize", "rasterize", "labels_none"),
-    shader!("rasterize_blend", "rasterize", "labels_entries", "labels_blend"),
-    shader!("rasterize_weights", "rasterize", "labels_entries", "labels_weights"),
+    shader!("rasterize", "rasterize", "backdrop", "labels_none"),
+    shader!("rasterize_blend", "rasterize", "backdrop", "labels_entries", "labels_blend"),
+    shader!("rasterize_weights", "rasterize", "backdrop", "labels_entries", "labels_weights"),
+    shader!("depth_steps", "depth_steps"),
 ];
 
 /// Kernels, in the order of the stages.
@@ -83,7 +90,36 @@ pub(super) enum Kernel {
     PrefixSum,
     EmitIsects,
     TileSort,
-    Rasterize { color: bool, depth: bool, labels: RasterLabels },
+    Rasterize(RasterKinds),
+    Farthest,
+    DepthSteps,
+}
+
+/// What a kernel of rasterize gives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(super) struct RasterKinds {
+    pub(super) color: bool,
+    pub(super) depth: bool,
+    /// Pictures of bytes: alpha in levels without colour, a mask.
+    pub(super) bytes: bool,
+    pub(super) labels: RasterLabels,
+}
+
+impl From<&RenderRequest> for RasterKinds {
+    fn from(request: &RenderRequest) -> Self {
+        let RenderRequest { kinds, labels, samples, .. } = request;
+        let alpha_bytes = kinds.alpha && !kinds.color && *samples != Samples::F32;
+        Self {
+            color: kinds.color,
+            depth: kinds.depth,
+            bytes: alpha_bytes || matches!(labels, Labels::Mask { .. }),
+            labels: match labels {
+                Labels::None => RasterLabels::None,
+                Labels::Blend(_) | Labels::Mask { .. } => RasterLabels::Blend,
+                Labels::Weights => RasterLabels::Weights,
+            },
+        }
+    }
 }
 
 /// Labels that a kernel of rasterize blends.
@@ -108,8 +144,10 @@ impl Kernel {
             Self::PrefixSum => ("prefix_sum", "prefix_sum", ["main"; 2]),
             Self::EmitIsects => ("emit_isects", "emit_isects", ["main"; 2]),
             Self::TileSort => ("tile_sort", "tile_sort", ["main", "serial"]),
-            Self::Rasterize { labels, .. } => {
-                let shader = match labels {
+            Self::Farthest => ("farthest", "depth_steps", ["farthest"; 2]),
+            Self::DepthSteps => ("depth_steps", "depth_steps", ["main"; 2]),
+            Self::Rasterize(kinds) => {
+                let shader = match kinds.labels {
                     RasterLabels::None => "rasterize",
                     RasterLabels::Blend => "rasterize_blend",
                     RasterLabels::Weights => "rasterize_weights",
@@ -131,7 +169,7 @@ pub(super) struct Kernels {
     /// In the order of [`SHADERS`].
     modules: Vec<wgpu::ShaderModule>,
     /// Those of rasterize are compiled for the first view that needs them: a server that is asked
-    /// for colour needs one of twelve.
+    /// for colour needs one of many.
     pipelines: Mutex<HashMap<Kernel, wgpu::ComputePipeline>>,
     /// Whether they are those for a software adapter.
     pub(super) serial: bool,
@@ -200,9 +238,9 @@ impl Kernels {
             return Err(Error::internal(format!("{name}: there is no shader {shader}")));
         };
         let mut constants = Vec::new();
-        if let Kernel::Rasterize { color, depth, .. } = kernel {
-            constants.push(("WITH_COLOR", f64::from(u8::from(color))));
-            constants.push(("WITH_DEPTH", f64::from(u8::from(depth))));
+        if let Kernel::Rasterize(RasterKinds { color, depth, bytes, .. }) = kernel {
+            let with = [("WITH_COLOR", color), ("WITH_DEPTH", depth), ("WITH_BYTES", bytes)];
+            constants.extend(with.map(|(name, with)| (name, f64::from(u8::from(with)))));
             // Pixels that an invocation blends.
             constants.push(("PIXELS", if self.serial { 8.0 } else { 1.0 }));
         }

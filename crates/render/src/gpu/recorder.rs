@@ -6,7 +6,7 @@ use wgpu::BindGroupEntry;
 
 use super::{
     device::Gpu,
-    pipelines::{GROUPS_X_MAX, Kernel, Kernels, RasterLabels, WORKGROUP_SIZE},
+    pipelines::{GROUPS_X_MAX, Kernel, Kernels, RasterKinds, RasterLabels, WORKGROUP_SIZE},
     profile::Marks,
     scratch::BatchBuffers,
 };
@@ -32,8 +32,8 @@ pub(super) struct SceneBuffers<'a> {
     pub(super) sh_count: u32,
 }
 
-/// The kind of labels that rasterize blends, and the entries of the Gaussians where it does.
-pub(super) type LabelInputs<'a> = (RasterLabels, Option<&'a wgpu::Buffer>);
+/// Workgroups that look for the farthest depth of a view.
+const FARTHEST_GROUPS: u32 = 64;
 
 /// Workgroups of a dispatch, over the views of the batch.
 enum Groups {
@@ -166,6 +166,7 @@ impl<'a> Recorder<'a> {
             (3, &room.touched),
             (4, &room.plans),
             (5, &room.ends),
+            (6, &room.sources),
         ];
         let groups = Groups::Row(self.count.div_ceil(WORKGROUP_SIZE));
         self.dispatch(Kernel::Project, &buffers, &groups);
@@ -221,12 +222,13 @@ impl<'a> Recorder<'a> {
         self.dispatch(Kernel::TileSort, &buffers, &Groups::Grid(tiles[0], tiles[1]));
     }
 
-    /// Stage 6 over `tiles` (columns, rows) of the largest view.
+    /// Stage 6 over `tiles` (columns, rows) of the largest view. Labels need the entries of the
+    /// Gaussians.
     pub(super) fn rasterize(
         &mut self,
         scene: SceneBuffers<'_>,
-        (labels, entries): LabelInputs<'_>,
-        (color, depth): (bool, bool),
+        kinds: RasterKinds,
+        entries: Option<&wgpu::Buffer>,
         tiles: [u32; 2],
     ) {
         let room = self.room;
@@ -239,13 +241,25 @@ impl<'a> Recorder<'a> {
             (3, &room.lists),
             (4, &room.pictures),
             (5, colors),
+            (8, &room.backdrops),
         ];
-        if let Some(entries) = entries {
-            let weights = labels == RasterLabels::Weights;
-            buffers.extend([(6, entries), (7, if weights { &room.slots } else { &room.table })]);
+        let inputs = match kinds.labels {
+            RasterLabels::None => None,
+            RasterLabels::Blend => entries.zip(Some(&room.table)),
+            RasterLabels::Weights => entries.zip(Some(&room.slots)),
+        };
+        if let Some((entries, rows)) = inputs {
+            buffers.extend([(6, entries), (7, rows)]);
         }
-        let kernel = Kernel::Rasterize { color, depth, labels };
-        self.dispatch(kernel, &buffers, &Groups::Grid(tiles[0], tiles[1]));
+        self.dispatch(Kernel::Rasterize(kinds), &buffers, &Groups::Grid(tiles[0], tiles[1]));
+    }
+
+    /// Stage 7 over pictures of at most `words` words.
+    pub(super) fn depth_steps(&mut self, words: u32) {
+        let room = self.room;
+        let buffers = [(0, &room.views), (1, &room.plans), (2, &room.pictures)];
+        self.dispatch(Kernel::Farthest, &buffers, &Groups::Grid(FARTHEST_GROUPS, 1));
+        self.dispatch(Kernel::DepthSteps, &buffers, &Groups::Row(words.div_ceil(WORKGROUP_SIZE)));
     }
 }
 

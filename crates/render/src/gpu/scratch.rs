@@ -1,20 +1,22 @@
 //! Buffers of a batch of views. They grow and serve the next batch too.
 
-use std::collections::HashMap;
+use std::{collections::HashMap, sync::Arc};
 
 use wgpu::BufferUsages;
 
 use super::{
     buffers::{FootprintRow, PlanRow, ViewRow},
     device::{Gpu, STORAGE},
-    pipelines::VIEWS_MAX,
+    pipelines::{BACKDROP_HEIGHT, BACKDROP_WIDTH, VIEWS_MAX},
     recorder::Bindings,
 };
-use crate::error::Result;
+use crate::{error::Result, scene::Backdrop};
 
 /// First room of a pixel, in weights: a pixel at an edge of an object shows about as many entries.
 pub(super) const WEIGHT_SLOTS_MIN: u32 = 8;
 const VIEW_BYTES: u64 = size_of::<ViewRow>() as u64 * VIEWS_MAX as u64;
+/// Bytes of a backdrop: a word for each cell.
+const BACKDROP_BYTES: u64 = 4 * (BACKDROP_WIDTH * BACKDROP_HEIGHT) as u64;
 const UNIFORM: BufferUsages = BufferUsages::UNIFORM.union(BufferUsages::COPY_DST);
 
 /// Sizes of a batch.
@@ -29,6 +31,7 @@ pub(super) struct Need {
     pub(super) tiles: u32,
     /// Whether shade has colours to write.
     pub(super) shades: bool,
+    pub(super) source_bytes: u64,
     pub(super) picture_bytes: u64,
     pub(super) table_bytes: u64,
     pub(super) slot_bytes: u64,
@@ -43,6 +46,10 @@ pub(super) struct BatchBuffers {
     pub(super) footprints: wgpu::Buffer,
     /// Tiles that each Gaussian touches.
     pub(super) touched: wgpu::Buffer,
+    /// Photos of all views.
+    pub(super) sources: wgpu::Buffer,
+    /// Maps of all views, up to [`VIEWS_MAX`].
+    pub(super) backdrops: wgpu::Buffer,
     pub(super) colors: wgpu::Buffer,
     pub(super) starts: wgpu::Buffer,
     pub(super) ends: wgpu::Buffer,
@@ -65,6 +72,8 @@ pub(super) struct Scratch {
     pub(super) isects: u32,
     /// Weights a pixel that the last views needed.
     pub(super) weight_slots: u32,
+    /// Those on the device.
+    backdrops: Vec<Arc<Backdrop>>,
 }
 
 impl Default for Scratch {
@@ -74,6 +83,7 @@ impl Default for Scratch {
             bindings: Bindings::default(),
             isects: 0,
             weight_slots: WEIGHT_SLOTS_MIN,
+            backdrops: Vec::new(),
         }
     }
 }
@@ -97,6 +107,8 @@ impl Scratch {
             plans: storage("plans", views * size_of::<PlanRow>() as u64)?,
             footprints: storage("footprints", views * count * footprint_bytes)?,
             touched: storage("tiles of Gaussians", views * count * 4)?,
+            sources: storage("photos", need.source_bytes)?,
+            backdrops: storage("backdrops", BACKDROP_BYTES * u64::from(VIEWS_MAX))?,
             colors: storage("colours", color_bytes)?,
             starts: storage("starts of lists", tiles * 4)?,
             ends: storage("ends of lists", tiles * 4)?,
@@ -107,6 +119,20 @@ impl Scratch {
             slots: storage("weight slots", need.slot_bytes)?,
             staging,
         })
+    }
+
+    /// Uploads the backdrops of a batch, unless they are there: first cells as [`first_cell`] says.
+    pub(super) fn put_backdrops(&mut self, gpu: &Gpu, to: &wgpu::Buffer, wanted: &[Arc<Backdrop>]) {
+        let there = wanted.iter().zip(&self.backdrops).all(|(one, held)| Arc::ptr_eq(one, held));
+        if there && wanted.len() <= self.backdrops.len() {
+            return;
+        }
+        for (at, backdrop) in wanted.iter().enumerate() {
+            let word = |&[r, g, b]: &[u8; 3]| u32::from_le_bytes([r, g, b, 0]);
+            let words: Vec<u32> = backdrop.cells().iter().map(word).collect();
+            gpu.queue.write_buffer(to, at as u64 * BACKDROP_BYTES, bytemuck::cast_slice(&words));
+        }
+        self.backdrops = wanted.to_vec();
     }
 
     /// The buffer of a label, replaced if it is shorter than `size_bytes`.
@@ -127,6 +153,11 @@ impl Scratch {
         self.buffers.insert(label, buffer.clone());
         Ok(buffer)
     }
+}
+
+/// First cell of backdrop `at` of a batch.
+pub(super) fn first_cell(at: usize) -> u32 {
+    at as u32 * BACKDROP_WIDTH * BACKDROP_HEIGHT
 }
 
 impl BatchBuffers {

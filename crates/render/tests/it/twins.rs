@@ -266,7 +266,7 @@ fn emit_isects_twin() {
         let key = |&[key, id]: &[u32; 2]| key == all.footprints[id as usize].depth.to_bits();
         assert!(lists.iter().flatten().all(key), "{name}: keys are depths");
         let many = all.touched.iter().filter(|&&n| n > 64).count();
-        assert_eq!(many > 20, name == "large", "{name}: {many} over many tiles");
+        assert!(many > 20, "{name}: {many} over many tiles");
     }
 }
 
