@@ -38,7 +38,7 @@ pub enum Skip {
     EllipseParts,
     /// Gaussians behind the rest where all rays of a tile (on the CPU: of a part) have ended.
     EndedRays,
-    /// Sorting Gaussians that no tile of the picture sees.
+    /// Sorting Gaussians that no tile of the picture sees. GPU only: the CPU sorts pairs alone.
     Unseen,
     /// Directions to Gaussians, and on a GPU the stage that shades, of a scene whose colours are
     /// the same from everywhere.
