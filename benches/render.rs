@@ -12,16 +12,14 @@ use segsplat::{
     render::{
         Kinds, Labels, RenderRequest, Renderer,
         cpu::{
-            CpuRenderer, emit_isects,
+            CpuRenderer,
+            bin::{Bins, Keys, bin},
             lanes::{KernelOptions, Width},
             paint::Paint,
-            prefix_sum,
             project::{Projected, project},
-            radix_sort,
             rasterize::{Tile, TileScratch, rasterize_tile},
             shade,
-            store::RowOut,
-            tile_ranges,
+            store::Part,
             tiles::Grid,
         },
         oracle,
@@ -91,11 +89,7 @@ struct Stages {
     view: View,
     grid: Grid,
     projected: Projected,
-    sorted: Vec<u64>,
-    spare: Vec<u64>,
-    offsets: Vec<u64>,
-    isects: Vec<u64>,
-    ranges: Vec<u32>,
+    bins: Vec<Bins>,
 }
 
 impl Stages {
@@ -104,18 +98,7 @@ impl Stages {
         let request = scenes::request(camera);
         let view = View::new(gaussians.origin(), &request).expect("a view");
         let grid = Grid::whole(&view, KernelOptions::default());
-        Self {
-            gaussians,
-            request,
-            view,
-            grid,
-            projected: Projected::default(),
-            sorted: Vec::new(),
-            spare: Vec::new(),
-            offsets: Vec::new(),
-            isects: Vec::new(),
-            ranges: Vec::new(),
-        }
+        Self { gaussians, request, view, grid, projected: Projected::default(), bins: Vec::new() }
     }
 
     fn project(&mut self, width: Width) {
@@ -129,22 +112,9 @@ impl Stages {
         shade::shade(&self.gaussians, &self.view, options, &mut self.projected);
     }
 
-    fn sort(&mut self) {
-        let Projected { footprints, tiles_per_gauss: tiles, .. } = &self.projected;
-        let visible = (0_u32..).zip(footprints.iter().zip(tiles)).filter(|(_, (_, t))| **t > 0);
-        self.sorted.clear();
-        self.sorted.extend(visible.map(|(i, (f, _))| radix_sort::pack(f.depth.to_bits(), i)));
-        radix_sort::radix_sort(&mut self.sorted, &mut self.spare, u32::BITS);
-    }
-
     fn bin(&mut self) {
-        let tiles = &self.projected.tiles_per_gauss;
-        let counts = self.sorted.iter().map(|&pair| tiles[radix_sort::value(pair) as usize]);
-        prefix_sum::prefix_sum(counts, &mut self.offsets);
-        let (projected, isects) = (&self.projected, &mut self.isects);
-        emit_isects::emit_isects(projected, &self.sorted, &self.grid, &self.offsets, isects);
-        radix_sort::radix_sort(isects, &mut self.spare, 8);
-        tile_ranges::tile_ranges(isects, self.grid.tile_count(), &mut self.ranges);
+        let keys = Keys::new(&self.gaussians, &[]);
+        bin(&self.projected, keys, &self.grid, u64::MAX, &mut self.bins);
     }
 
     /// All tiles into pictures that every request has.
@@ -154,21 +124,24 @@ impl Stages {
         let stride = (SIDE * TILE) as usize;
         let (mut color, mut depth) = (vec![[0.0; 3]; stride], vec![0.0; stride]);
         let mut blend = vec![[0.0; 4]; stride];
+        let width_of = SIDE as usize;
+        let mut pairs = Vec::new();
         for tile_y in 0..SIDE / TILE {
-            let mut out = RowOut {
-                color: request.kinds.color.then_some(&mut color),
-                depth: request.kinds.depth.then_some(&mut depth),
-                blend: matches!(request.labels, Labels::Blend(_)).then_some(&mut blend),
-                ..RowOut::default()
+            let blends = matches!(request.labels, Labels::Blend(_));
+            let mut out = Part {
+                color: request.kinds.color.then(|| color.chunks_mut(width_of).collect()),
+                depth: request.kinds.depth.then(|| depth.chunks_mut(width_of).collect()),
+                blend: blends.then(|| blend.chunks_mut(width_of).collect()),
+                ..Part::default()
             };
             for tile_x in 0..SIDE / TILE {
                 let id = (tile_y * SIDE / TILE + tile_x) as usize;
-                let range = self.ranges[id] as usize..self.ranges[id + 1] as usize;
                 let tile = Tile { x: tile_x * TILE, y: tile_y * TILE, width: TILE, height: TILE };
-                let footprints = &self.projected.footprints;
-                let isects = &self.isects[range];
+                pairs.clear();
+                self.bins.iter().for_each(|bins| pairs.extend(bins.of(id)));
+                let place = (tile, (tile_x * TILE) as usize);
                 let tools = (&paint, &mut *scratch);
-                rasterize_tile(footprints, isects, tile, tools, SIDE, &mut out);
+                rasterize_tile(&self.projected.footprints, &mut pairs, place, tools, &mut out);
             }
         }
         black_box((color, depth, blend));
@@ -186,7 +159,6 @@ fn stages(criterion: &mut Criterion) {
         });
     }
     criterion.bench_function("stage/shade", |b| b.iter(|| one.install(|| stages.shade())));
-    criterion.bench_function("stage/sort", |b| b.iter(|| stages.sort()));
     criterion.bench_function("stage/bin", |b| b.iter(|| one.install(|| stages.bin())));
     let table: Labels = Labels::Blend(vec![[0.5; 4]; 25].into());
     let count = stages.gaussians.len() as u32;

@@ -7,6 +7,8 @@
 
 use std::sync::Arc;
 
+use rayon::prelude::*;
+
 use super::constants::PIXEL_WEIGHTS_MAX;
 use crate::{
     error::{Error, Result},
@@ -103,31 +105,66 @@ impl WeightRows {
         self.rows[row].push((entry, weight));
     }
 
+    /// Joins parts of the same rows of pixels, from left to right.
+    pub(super) fn beside(mut parts: Vec<Self>) -> Option<Self> {
+        if parts.len() < 2 {
+            return parts.pop();
+        }
+        let rows = parts[0].rows.len();
+        let mut all = Self::new(rows, parts.iter().map(|part| part.width).sum());
+        let mut first = 0;
+        for part in parts {
+            for (row, pairs) in part.rows.into_iter().enumerate() {
+                let to = row * all.width + first;
+                let counts = &part.counts[row * part.width..(row + 1) * part.width];
+                all.counts[to..to + part.width].copy_from_slice(counts);
+                all.rows[row].extend(pairs);
+            }
+            first += part.width;
+        }
+        Some(all)
+    }
+
+    fn total(&self) -> usize {
+        self.rows.iter().map(Vec::len).sum()
+    }
+
     /// Joins bands of a view, from top to bottom.
     /// Errors: `limit_exceeded` when there are more weights than [`PIXEL_WEIGHTS_MAX`].
     pub(super) fn join(parts: Vec<Self>) -> Result<PixelWeights> {
-        let total: usize = parts.iter().flat_map(|part| &part.rows).map(Vec::len).sum();
+        let total: usize = parts.iter().map(Self::total).sum();
         if total as u64 > PIXEL_WEIGHTS_MAX {
             return Err(Error::limit("render: weights of one view", total, PIXEL_WEIGHTS_MAX));
         }
         let pixels = parts.iter().map(|part| part.counts.len()).sum::<usize>();
         let mut all = PixelWeights {
-            offsets: Vec::with_capacity(pixels + 1),
-            entries: Vec::with_capacity(total),
-            weights: Vec::with_capacity(total),
+            offsets: vec![0; pixels + 1],
+            entries: vec![0; total],
+            weights: vec![0.0; total],
         };
-        let mut end = 0;
-        all.offsets.push(0);
+        let mut offsets = &mut all.offsets[1..];
+        let (mut entries, mut weights) = (&mut all.entries[..], &mut all.weights[..]);
+        let mut tasks = Vec::with_capacity(parts.len());
+        let mut start = 0;
         for part in parts {
-            all.offsets.extend(part.counts.iter().map(|count| {
-                end += count;
-                end
-            }));
-            for row in part.rows {
-                all.entries.extend(row.iter().map(|pair| pair.0));
-                all.weights.extend(row.iter().map(|pair| pair.1));
-            }
+            let (mine, mine_entries, mine_weights);
+            (mine, offsets) = offsets.split_at_mut(part.counts.len());
+            (mine_entries, entries) = entries.split_at_mut(part.total());
+            (mine_weights, weights) = weights.split_at_mut(part.total());
+            let first = start;
+            start += mine_entries.len() as u32;
+            tasks.push((part, first, mine, mine_entries, mine_weights));
         }
+        tasks.into_par_iter().for_each(|(part, mut end, offsets, entries, weights)| {
+            for (offset, count) in offsets.iter_mut().zip(&part.counts) {
+                end += count;
+                *offset = end;
+            }
+            let pairs = part.rows.iter().flatten();
+            for ((entry, weight), pair) in entries.iter_mut().zip(weights).zip(pairs) {
+                (*entry, *weight) = *pair;
+            }
+        });
         Ok(all)
     }
 }
@@ -150,5 +187,18 @@ mod tests {
         assert_eq!(all.weights, [0.25, 0.75, 0.5, 1.0], "weights");
         assert_eq!(all.coverage(0), 1.0, "coverage of the first pixel");
         assert_eq!((all.pixels(), all.coverage(1)), (6, 0.0), "a pixel without weights");
+    }
+
+    #[test]
+    fn parts_of_rows_are_joined_from_left_to_right() {
+        let (mut left, mut right) = (WeightRows::new(2, 1), WeightRows::new(2, 2));
+        right.push(1, 0, 7, 0.5);
+        left.push(0, 0, 3, 0.25);
+        right.push(0, 1, 4, 0.75);
+        let all = WeightRows::beside(vec![left, right]).expect("two parts");
+        let all = WeightRows::join(vec![all]).expect("few weights");
+        assert_eq!(all.offsets, [0, 1, 1, 2, 2, 3, 3], "offsets");
+        assert_eq!(all.entries, [3, 7, 4], "entries");
+        assert!(WeightRows::beside(Vec::new()).is_none(), "no parts");
     }
 }

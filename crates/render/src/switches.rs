@@ -66,8 +66,6 @@ pub enum Skip {
     EllipseParts,
     /// Gaussians behind the rest where all rays of a tile (on the CPU: of a part) have ended.
     EndedRays,
-    /// Sorting Gaussians that no tile of the picture sees. CPU only: a GPU sorts the lists of tiles.
-    Unseen,
     /// Directions to Gaussians, and on a GPU the stage that shades, of a scene whose colours are
     /// the same from everywhere.
     FlatColor,
@@ -75,8 +73,8 @@ pub enum Skip {
 
 impl Skip {
     /// All of them.
-    pub const ALL: [Self; 5] =
-        [Self::EllipseTiles, Self::EllipseParts, Self::EndedRays, Self::Unseen, Self::FlatColor];
+    pub const ALL: [Self; 4] =
+        [Self::EllipseTiles, Self::EllipseParts, Self::EndedRays, Self::FlatColor];
 
     /// The constant of the shaders that is true while it is on, in those that know it.
     pub fn constant(self) -> String {

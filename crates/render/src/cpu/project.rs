@@ -14,7 +14,6 @@ use crate::{
     RenderRequest, Source,
     constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK, OWN_SIZE},
     scene::Gaussians,
-    switches::Skip,
     view::View,
 };
 
@@ -78,10 +77,6 @@ impl LaneKernel for Chunk<'_> {
         let (mut block, mut ellipses) = (Block::default(), Ellipses::default());
         for (at, ((footprints, spans), tiles)) in out {
             tiles.fill(0);
-            if !options.skips(Skip::Unseen) {
-                // The spans of dropped Gaussians are read too.
-                spans.fill(TileSpans::default());
-            }
             let first = self.first + at * BLOCK;
             block.load(self.gaussians, first, footprints.len());
             if magnifies {

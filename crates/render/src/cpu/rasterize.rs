@@ -12,11 +12,11 @@
 //! size of the bank does not matter.
 
 use super::{
+    bin::value,
     footprint::Footprint,
     lanes::{LaneKernel, Lanes, exp2_neg},
     paint::{CHANNELS, Paint},
-    radix_sort,
-    store::{RowOut, Store},
+    store::{Part, Store},
 };
 use crate::{
     Labels,
@@ -33,6 +33,8 @@ pub(super) const ACROSS: usize = SIDE / CELL;
 pub(super) const CELLS: usize = ACROSS * ACROSS;
 /// Pixels of a cell.
 pub(super) const PIXELS: usize = CELL * CELL;
+/// Pairs of a tile that are sorted first.
+const PORTION: usize = 512;
 /// Gaussians of a batch: their marks are transposed together.
 const GROUP: usize = 64;
 /// Centres of the cells, relative to the centre of the tile, pixels.
@@ -125,6 +127,8 @@ impl Cell {
 /// Scratch of one worker. Its contents are undefined between tiles.
 #[derive(Debug)]
 pub struct TileScratch {
+    /// Pairs of a tile.
+    pub(super) pairs: Vec<u64>,
     fetched: Vec<Footprint>,
     staged: Vec<Staged>,
     marks: [[u64; CELLS]; BATCH_SIZE / GROUP],
@@ -135,6 +139,7 @@ pub struct TileScratch {
 impl Default for TileScratch {
     fn default() -> Self {
         Self {
+            pairs: Vec::new(),
             fetched: vec![Footprint::default(); BATCH_SIZE],
             staged: vec![Staged::default(); BATCH_SIZE],
             marks: [[0; CELLS]; BATCH_SIZE / GROUP],
@@ -156,14 +161,14 @@ pub(super) struct Bins {
 }
 
 impl Bins {
-    /// Makes a bin for each entry over 0 of the Gaussians `isects`. All sums are 0.
-    fn open(&mut self, isects: &[u64], entries: &[u16]) {
+    /// Makes a bin for each entry over 0 of the Gaussians of `pairs`. All sums are 0.
+    fn open(&mut self, pairs: &[u64], entries: &[u16]) {
         self.bin_of.resize(1 << u16::BITS, NO_BIN);
         for left in self.present.drain(..) {
             self.bin_of[usize::from(left)] = NO_BIN;
         }
-        for &isect in isects {
-            let entry = entries[radix_sort::value(isect) as usize];
+        for &pair in pairs {
+            let entry = entries[value(pair) as usize];
             let bin = &mut self.bin_of[usize::from(entry)];
             if entry != 0 && *bin == NO_BIN {
                 *bin = 0;
@@ -199,27 +204,26 @@ pub struct Tile {
     pub height: u32,
 }
 
-/// Blends the Gaussians `isects` (depth order) over the pixels of `tile`. `picture_width` is the
-/// stride of `out`, which starts at the tile's first row.
+/// Blends the Gaussians of the pairs, in any order, over the pixels of `tile`, and writes them to
+/// `out` from row 0 and `column` on.
 pub fn rasterize_tile(
     footprints: &[Footprint],
-    isects: &[u64],
-    tile: Tile,
+    pairs: &mut [u64],
+    (tile, column): (Tile, usize),
     (paint, scratch): (&Paint<'_>, &mut TileScratch),
-    picture_width: u32,
-    out: &mut RowOut<'_>,
+    out: &mut Part<'_>,
 ) {
     if *paint.labels == Labels::Weights {
-        scratch.bins.open(isects, paint.entries);
+        scratch.bins.open(pairs, paint.entries);
     }
-    paint.options.width.run(Blend { footprints, isects, tile, paint, scratch: &mut *scratch });
-    paint.options.width.run(Store { tile, paint, picture_width, scratch, out });
+    paint.options.width.run(Blend { footprints, pairs, tile, paint, scratch: &mut *scratch });
+    paint.options.width.run(Store { tile, paint, column, scratch, out });
 }
 
 /// A tile, its Gaussians and the scratch to blend them in.
 struct Blend<'a> {
     footprints: &'a [Footprint],
-    isects: &'a [u64],
+    pairs: &'a mut [u64],
     tile: Tile,
     paint: &'a Paint<'a>,
     scratch: &'a mut TileScratch,
@@ -250,20 +254,30 @@ impl LaneKernel for Blend<'_> {
 impl Blend<'_> {
     #[inline(always)]
     fn blend<S: Lanes, const K: usize, const WEIGHTS: bool>(self, simd: S) {
-        let Self { footprints, isects, tile, paint, scratch } = self;
+        let Self { footprints, pairs, tile, paint, scratch } = self;
         let by_parts = paint.options.skips(Skip::EllipseParts);
         let ends = paint.options.skips(Skip::EndedRays);
         let mut open = clear(&mut scratch.cells, tile);
-        for batch in isects.chunks(BATCH_SIZE) {
+        let mut rest = Rest { pairs, portion: PORTION };
+        let mut sorted: &[u64] = &[];
+        while open != 0 {
+            if sorted.is_empty() {
+                sorted = rest.nearest();
+            }
+            let batch = &sorted[..BATCH_SIZE.min(sorted.len())];
+            sorted = &sorted[batch.len()..];
+            if batch.is_empty() {
+                break;
+            }
             // Footprints lie far apart in memory. This loop is short, so that the processor fetches
             // many of them at the same time.
             let fetched = &mut scratch.fetched[..batch.len()];
             for (fetched, &isect) in fetched.iter_mut().zip(batch) {
-                *fetched = footprints[radix_sort::value(isect) as usize];
+                *fetched = footprints[value(isect) as usize];
             }
             let staged = &mut scratch.staged[..batch.len()];
             for ((staged, footprint), &isect) in staged.iter_mut().zip(fetched).zip(batch) {
-                let id = radix_sort::value(isect) as usize;
+                let id = value(isect) as usize;
                 let bin = match WEIGHTS {
                     true => scratch.bins.bin_of[usize::from(paint.entries[id])],
                     false => NO_BIN,
@@ -296,10 +310,30 @@ impl Blend<'_> {
                     open &= !(1 << at);
                 }
             }
-            if open == 0 {
-                break;
-            }
         }
+    }
+}
+
+/// Pairs that are not sorted yet. Most rays end after few Gaussians, so the nearest are sorted first.
+struct Rest<'a> {
+    pairs: &'a mut [u64],
+    portion: usize,
+}
+
+impl<'a> Rest<'a> {
+    /// The nearest of the rest, sorted; empty if there are none. Each portion is twice the last.
+    #[inline(never)]
+    fn nearest(&mut self) -> &'a [u64] {
+        let pairs = std::mem::take(&mut self.pairs);
+        let count = self.portion.min(pairs.len());
+        if count < pairs.len() {
+            pairs.select_nth_unstable(count);
+        }
+        let (near, far) = pairs.split_at_mut(count);
+        near.sort_unstable();
+        self.pairs = far;
+        self.portion *= 2;
+        near
     }
 }
 
@@ -470,6 +504,26 @@ fn blend_cell<S: Lanes, const K: usize, const WEIGHTS: bool>(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn portions_come_in_order_and_hold_every_pair() {
+        let mut random = 9_u32;
+        for count in [0, 1, PORTION, PORTION + 1, 5 * PORTION] {
+            let mut pairs: Vec<u64> = (0..count as u64)
+                .map(|id| {
+                    random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                    u64::from(random >> 24) << 32 | id
+                })
+                .collect();
+            let mut want = pairs.clone();
+            want.sort_unstable();
+            let mut rest = Rest { pairs: &mut pairs, portion: PORTION };
+            let portions = std::iter::repeat_with(|| rest.nearest());
+            let got: Vec<u64> =
+                portions.take_while(|all| !all.is_empty()).flatten().copied().collect();
+            assert_eq!(got, want, "{count} pairs");
+        }
+    }
 
     #[test]
     fn transposed_marks_are_the_same_marks() {

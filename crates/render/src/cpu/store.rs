@@ -1,6 +1,8 @@
 //! Stage 8, the end: from the sums of a tile to its pixels. What lies behind is put under colour,
 //! and numbers become levels where those are asked for. Shader: `shaders/rasterize.wgsl`
 
+use std::{ops::Range, slice::ChunksMut};
+
 use super::{
     lanes::{LaneKernel, Lanes},
     paint::{Behind, Paint},
@@ -17,44 +19,80 @@ use crate::{
     levels::level,
 };
 
-/// A row of tiles of the pictures; `None` for kinds not asked for.
+/// Rows of pixels of a part of a picture.
+pub type Pixels<'a, T> = Option<Vec<&'a mut [T]>>;
+
+/// A part of the pictures, row of pixels by row; `None` for kinds not asked for.
 #[derive(Debug, Default)]
-pub struct RowOut<'a> {
-    /// `[rows * width]` colours.
-    pub color: Option<&'a mut [[f32; 3]]>,
-    /// `[rows * width]` expected depths.
-    pub depth: Option<&'a mut [f32]>,
-    /// `[rows * width]` opacities.
-    pub alpha: Option<&'a mut [f32]>,
-    /// `[rows * width]` colours in levels.
-    pub rgb: Option<&'a mut [[u8; 3]]>,
-    /// `[rows * width]` colours and opacities in levels.
-    pub rgba: Option<&'a mut [[u8; 4]]>,
-    /// `[rows * width]` opacities in levels.
-    pub alpha_levels: Option<&'a mut [u8]>,
-    /// `[rows * width]` blended labels.
-    pub blend: Option<&'a mut [[f32; BLEND_WIDTH]]>,
-    /// `[rows * width]` mask.
-    pub mask: Option<&'a mut [u8]>,
+pub struct Part<'a> {
+    /// Colours.
+    pub color: Pixels<'a, [f32; 3]>,
+    /// Expected depths.
+    pub depth: Pixels<'a, f32>,
+    /// Opacities.
+    pub alpha: Pixels<'a, f32>,
+    /// Colours in levels.
+    pub rgb: Pixels<'a, [u8; 3]>,
+    /// Colours and opacities in levels.
+    pub rgba: Pixels<'a, [u8; 4]>,
+    /// Opacities in levels.
+    pub alpha_levels: Pixels<'a, u8>,
+    /// Blended labels.
+    pub blend: Pixels<'a, [f32; BLEND_WIDTH]>,
+    /// Mask.
+    pub mask: Pixels<'a, u8>,
     /// Weights of the rows.
     pub weights: Option<WeightRows>,
 }
 
-/// A blended tile and where its pixels go: `out` starts at the tile's first row and has rows of
-/// `picture_width` pixels.
+/// Cuts rows of pixels into parts of `width` columns, from left to right.
+fn columns<'a, T>(rows: Pixels<'a, T>, width: usize) -> impl FnMut() -> Pixels<'a, T> {
+    let mut cut = rows.map(|rows| rows.into_iter().map(|row| row.chunks_mut(width)).collect());
+    move || {
+        let cut: &mut Vec<ChunksMut<'a, T>> = cut.as_mut()?;
+        Some(cut.iter_mut().filter_map(Iterator::next).collect())
+    }
+}
+
+impl<'a> Part<'a> {
+    /// Cuts a part without weights into parts of `width` columns, the last one smaller.
+    pub(super) fn split(self, count: usize, width: usize) -> Vec<Self> {
+        let mut color = columns(self.color, width);
+        let mut depth = columns(self.depth, width);
+        let mut alpha = columns(self.alpha, width);
+        let mut rgb = columns(self.rgb, width);
+        let mut rgba = columns(self.rgba, width);
+        let mut alpha_levels = columns(self.alpha_levels, width);
+        let mut blend = columns(self.blend, width);
+        let mut mask = columns(self.mask, width);
+        let part = |_| Part {
+            color: color(),
+            depth: depth(),
+            alpha: alpha(),
+            rgb: rgb(),
+            rgba: rgba(),
+            alpha_levels: alpha_levels(),
+            blend: blend(),
+            mask: mask(),
+            weights: None,
+        };
+        (0..count).map(part).collect()
+    }
+}
+
+/// A blended tile and the part where its pixels go, from row 0 and this column on.
 pub(super) struct Store<'a, 'b> {
     pub(super) tile: Tile,
     pub(super) paint: &'a Paint<'a>,
-    pub(super) picture_width: u32,
+    pub(super) column: usize,
     pub(super) scratch: &'a mut TileScratch,
-    pub(super) out: &'a mut RowOut<'b>,
+    pub(super) out: &'a mut Part<'b>,
 }
 
 impl LaneKernel for Store<'_, '_> {
     #[inline(always)]
     fn run<S: Lanes>(self, simd: S) {
-        let Self { tile, paint, picture_width, scratch, out } = self;
-        let width = picture_width as usize;
+        let Self { tile, paint, column, scratch, out } = self;
         for at in 0..CELLS {
             let (x, y) = (at % ACROSS * CELL, at / ACROSS * CELL);
             let columns = (tile.width as usize).saturating_sub(x).min(CELL);
@@ -74,12 +112,12 @@ impl LaneKernel for Store<'_, '_> {
                 }
             }
             for row in 0..rows {
-                let first = (y + row) * width + tile.x as usize + x;
-                write(paint, cell, row * CELL, first..first + columns, out);
+                let first = column + x;
+                write(paint, cell, row * CELL, (y + row, first..first + columns), out);
             }
         }
         if let Some(weights) = &mut out.weights {
-            list(tile, scratch, weights);
+            list(tile, column, scratch, weights);
         }
     }
 }
@@ -140,69 +178,61 @@ fn over_sky<S: Lanes>(
     }
 }
 
-/// Writes a row of a cell, from number `first` of its pixels on, to the places `to`.
+/// Writes a row of a cell, from number `first` of its pixels on, to columns of a row of `out`.
 #[inline(always)]
 fn write(
     paint: &Paint<'_>,
     cell: &Cell,
     first: usize,
-    to: std::ops::Range<usize>,
-    out: &mut RowOut<'_>,
+    (row, to): (usize, Range<usize>),
+    out: &mut Part<'_>,
 ) {
     let [depth_at, label_at, _] = paint.layout();
     let Cell { alpha, channels, .. } = cell;
+    let alpha = &alpha.0;
     let color = |i: usize| [channels[0].0[i], channels[1].0[i], channels[2].0[i]];
     let labels = |i: usize| {
         let at = |k: usize| channels[label_at + k].0[i];
         [at(0), at(1), at(2), at(3)]
     };
-    if let Some(out) = &mut out.color {
-        for (i, out) in (first..).zip(&mut out[to.clone()]) {
-            *out = color(i);
-        }
+    let place = (row, first, to);
+    put(&mut out.color, &place, color);
+    put(&mut out.depth, &place, |i| match alpha[i] > 0.0 {
+        true => channels[depth_at].0[i] / alpha[i],
+        false => 0.0,
+    });
+    put(&mut out.alpha, &place, |i| alpha[i]);
+    put(&mut out.rgb, &place, |i| {
+        let [r, g, b] = color(i);
+        [level(r), level(g), level(b)]
+    });
+    put(&mut out.rgba, &place, |i| {
+        let [r, g, b] = color(i);
+        [level(r), level(g), level(b), level(alpha[i])]
+    });
+    put(&mut out.alpha_levels, &place, |i| level(alpha[i]));
+    put(&mut out.blend, &place, labels);
+    if let Labels::Mask { coverage_floor, .. } = paint.labels {
+        put(&mut out.mask, &place, |i| u8::from(selected(labels(i), *coverage_floor)) * u8::MAX);
     }
-    if let Some(out) = &mut out.depth {
-        for (i, out) in (first..).zip(&mut out[to.clone()]) {
-            let alpha = alpha.0[i];
-            *out = if alpha > 0.0 { channels[depth_at].0[i] / alpha } else { 0.0 };
-        }
-    }
-    if let Some(out) = &mut out.alpha {
-        for (i, out) in (first..).zip(&mut out[to.clone()]) {
-            *out = alpha.0[i];
-        }
-    }
-    if let Some(out) = &mut out.rgb {
-        for (i, out) in (first..).zip(&mut out[to.clone()]) {
-            let [r, g, b] = color(i);
-            *out = [level(r), level(g), level(b)];
-        }
-    }
-    if let Some(out) = &mut out.rgba {
-        for (i, out) in (first..).zip(&mut out[to.clone()]) {
-            let [r, g, b] = color(i);
-            *out = [level(r), level(g), level(b), level(alpha.0[i])];
-        }
-    }
-    if let Some(out) = &mut out.alpha_levels {
-        for (i, out) in (first..).zip(&mut out[to.clone()]) {
-            *out = level(alpha.0[i]);
-        }
-    }
-    if let Some(out) = &mut out.blend {
-        for (i, out) in (first..).zip(&mut out[to.clone()]) {
-            *out = labels(i);
-        }
-    }
-    if let (Some(out), Labels::Mask { coverage_floor, .. }) = (&mut out.mask, paint.labels) {
-        for (i, out) in (first..).zip(&mut out[to]) {
-            *out = u8::from(selected(labels(i), *coverage_floor)) * u8::MAX;
+}
+
+/// Puts what `of` gives for a cell's pixels from `first` on into some columns of a row.
+#[inline(always)]
+fn put<T>(
+    out: &mut Pixels<'_, T>,
+    (row, first, to): &(usize, usize, Range<usize>),
+    of: impl Fn(usize) -> T,
+) {
+    if let Some(rows) = out {
+        for (i, pixel) in (*first..).zip(&mut rows[*row][to.clone()]) {
+            *pixel = of(i);
         }
     }
 }
 
 /// Lists the weights of a tile's pixels, row by row.
-fn list(tile: Tile, scratch: &mut TileScratch, weights: &mut WeightRows) {
+fn list(tile: Tile, first: usize, scratch: &mut TileScratch, weights: &mut WeightRows) {
     for row in 0..tile.height as usize {
         for column in 0..tile.width as usize {
             let cell = row / CELL * ACROSS + column / CELL;
@@ -211,7 +241,7 @@ fn list(tile: Tile, scratch: &mut TileScratch, weights: &mut WeightRows) {
             let sums = &scratch.bins.sums[cell * count..(cell + 1) * count];
             for (entry, sum) in scratch.bins.present.iter().zip(sums) {
                 if sum.0[pixel] > 0.0 {
-                    weights.push(tile.x as usize + column, row, *entry, sum.0[pixel]);
+                    weights.push(first + column, row, *entry, sum.0[pixel]);
                 }
             }
         }

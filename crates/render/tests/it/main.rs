@@ -21,6 +21,7 @@ mod oracle;
 mod pitfalls;
 mod pool;
 mod props;
+mod reference;
 mod shader_layout;
 mod skips;
 mod stages;

@@ -221,8 +221,7 @@ fn every_stage_has_a_cpu_stage_and_every_file_is_used() {
     assert_eq!(files, stems, "files in shaders/ against SHADERS");
     for stem in &stems {
         let twin = match stem.as_str() {
-            // The CPU sorts all Gaussians at once.
-            "tile_sort" => "cpu/radix_sort",
+            "prefix_sum" | "emit_isects" | "tile_sort" => "cpu/bin",
             "depth_steps" => "levels",
             stem => &format!("cpu/{stem}"),
         };

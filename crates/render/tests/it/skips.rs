@@ -9,10 +9,8 @@ use segsplat_render::{
         footprint::Footprint,
         lanes::KernelOptions,
         paint::Paint,
-        project::{Projected, project},
         rasterize::{Tile, TileScratch, rasterize_tile},
-        store::RowOut,
-        tiles::TileSpans,
+        store::Part,
     },
     gpu::internals::SHADERS,
     view::View,
@@ -21,13 +19,6 @@ use segsplat_render::{
 use crate::common::open;
 use segsplat_testing::labels::{labelled, table};
 use segsplat_testing::scenes::{camera, checked, cloud, look, push, request, two_views};
-
-/// Skips of the CPU renderer.
-const OF_CPU: [Skip; 5] =
-    [Skip::EllipseTiles, Skip::EllipseParts, Skip::EndedRays, Skip::Unseen, Skip::FlatColor];
-/// Skips of the shaders, by their constants.
-const OF_SHADERS: [Skip; 4] =
-    [Skip::EllipseTiles, Skip::EllipseParts, Skip::EndedRays, Skip::FlatColor];
 
 /// Scenes and views in which every skip has something to leave out: Gaussians beside the picture
 /// and behind the camera, tiles without any, walls, harmonics, labels.
@@ -67,7 +58,7 @@ fn on_the_cpu_no_bit_changes() {
     let mut boxed = 0;
     for (name, gaussians, request) in cases() {
         let want = draw(None, &gaussians, &request);
-        for skip in OF_CPU {
+        for skip in Skip::ALL {
             boxed += same(skip, name, draw(Some(skip), &gaussians, &request), &want);
         }
     }
@@ -82,7 +73,7 @@ fn on_a_gpu_no_bit_changes() {
         let draw = |(_, gaussians, request): &(_, _, _)| gpu.render(gaussians, request);
         let wanted: Vec<_> = scenes.iter().map(|case| draw(case).expect("a frame")).collect();
         let mut boxed = 0;
-        for skip in OF_SHADERS {
+        for skip in Skip::ALL {
             let Some(gpu) = open(|options| {
                 options.switches.serial = Some(serial);
                 options.switches.without = Some(skip);
@@ -103,7 +94,7 @@ fn the_shaders_know_their_switches() {
         let name = skip.constant();
         // Declared, and asked for at least once.
         let used = SHADERS.iter().any(|shader| shader.source.matches(&name).count() > 1);
-        assert_eq!(used, OF_SHADERS.contains(&skip), "{name}");
+        assert!(used, "{name}");
     }
 }
 
@@ -141,12 +132,12 @@ fn tile(footprints: &[Footprint], without: Option<Skip>) -> Vec<[f32; 3]> {
     let options = KernelOptions { without, ..KernelOptions::default() };
     let view = View::new(glam::DVec3::ZERO, &request).expect("a view");
     let paint = Paint::new(&request, &view, &entries, options);
-    let isects: Vec<u64> = (0..footprints.len() as u64).collect();
+    let mut pairs: Vec<u64> = (0..footprints.len() as u64).collect();
     let mut color = vec![[9.0; 3]; 256];
-    let mut out = RowOut { color: Some(&mut color), ..RowOut::default() };
+    let mut out = Part { color: Some(color.chunks_mut(16).collect()), ..Part::default() };
     let place = Tile { x: 0, y: 0, width: 16, height: 16 };
     let mut scratch = TileScratch::default();
-    rasterize_tile(footprints, &isects, place, (&paint, &mut scratch), 16, &mut out);
+    rasterize_tile(footprints, &mut pairs, (place, 0), (&paint, &mut scratch), &mut out);
     color
 }
 
@@ -174,22 +165,4 @@ fn every_switch_of_the_blend_on_the_cpu_does_switch() {
     let has_nan = |pixels: &[[f32; 3]]| pixels.iter().flatten().any(|value| value.is_nan());
     assert!(!has_nan(&tile(&behind, None)), "ended rays see nothing");
     assert!(has_nan(&tile(&behind, Some(Skip::EndedRays))), "ended rays are blended on");
-}
-
-#[test]
-fn the_switch_of_unseen_gaussians_on_the_cpu_does_switch() {
-    let (one, seen) = (one(), request(camera(40, 40)));
-    let mut away = seen.clone();
-    away.camera.camera_to_world = look(glam::DVec3::ZERO, glam::DVec3::NEG_Z);
-    for (without, kept) in [(None, true), (Some(Skip::Unseen), false)] {
-        let mut projected = Projected::default();
-        for request in [&seen, &away] {
-            let view = View::new(one.origin(), request).expect("a view");
-            let options = KernelOptions { without, ..KernelOptions::default() };
-            project(&one, request, &view, options, &mut projected);
-        }
-        assert_eq!(projected.tiles_per_gauss, [0], "it is behind the camera");
-        // Spans of a Gaussian that is not sorted are never read, so nobody clears them.
-        assert_eq!(projected.tile_spans[0] != TileSpans::default(), kept, "{without:?}");
-    }
 }

@@ -7,17 +7,15 @@ use segsplat_core::{
 use segsplat_render::{
     Frame, Kinds, RenderRequest, Renderer,
     cpu::{
-        emit_isects,
+        bin,
         footprint::Footprint,
         lanes::KernelOptions,
         paint::Paint,
-        prefix_sum, project,
+        project,
         project::Projected,
-        radix_sort,
         rasterize::{Tile, TileScratch, rasterize_tile},
         shade,
-        store::RowOut,
-        tile_ranges,
+        store::Part,
         tiles::{Grid, TileSpans},
     },
     gpu::internals::FootprintRow,
@@ -25,6 +23,7 @@ use segsplat_render::{
 };
 
 use crate::common::{both_kernels, gpu, judge, open, same};
+use crate::reference::{emit_isects, prefix_sum, radix_sort, tile_ranges};
 use segsplat_testing::scenes::{
     BACKGROUND, Random, camera, checked, cloud, look, push, request, two_views,
 };
@@ -295,23 +294,22 @@ fn rasterize_twin() {
             (vec![[0.0; 3]; pixels], vec![0.0; pixels], vec![0.0; pixels]);
         for tile_y in 0..view.tiles_y() {
             let first = (tile_y * 16 * 96) as usize;
-            let mut out = RowOut {
-                color: Some(&mut color[first..]),
-                depth: Some(&mut depth[first..]),
-                alpha: Some(&mut alpha[first..]),
-                ..RowOut::default()
+            let mut out = Part {
+                color: Some(color[first..].chunks_mut(96).take(16).collect()),
+                depth: Some(depth[first..].chunks_mut(96).take(16).collect()),
+                alpha: Some(alpha[first..].chunks_mut(96).take(16).collect()),
+                ..Part::default()
             };
             for tile_x in 0..view.tiles_x() {
                 let id = (tile_y * view.tiles_x() + tile_x) as usize;
                 let tile = Tile { x: tile_x * 16, y: tile_y * 16, width: 16, height: 16 };
-                rasterize_tile(
-                    &projected.footprints,
-                    &isects[ranges[id] as usize..ranges[id + 1] as usize],
-                    tile,
-                    (&paint, &mut TileScratch::default()),
-                    96,
-                    &mut out,
-                );
+                let sorted = &isects[ranges[id] as usize..ranges[id + 1] as usize];
+                let ids = sorted.iter().map(|&isect| radix_sort::value(isect));
+                let mut pairs: Vec<u64> =
+                    (0..).zip(ids).map(|(at, id)| bin::pack(at, id)).collect();
+                let place = (tile, tile_x as usize * 16);
+                let tools = (&paint, &mut TileScratch::default());
+                rasterize_tile(&projected.footprints, &mut pairs, place, tools, &mut out);
             }
         }
         let rows: Vec<_> = projected.footprints.iter().map(to_row).collect();
