@@ -87,3 +87,42 @@ fn count_tiles(footprint: Footprint, row_start: u32, row_end: u32) -> u32 {
     }
     return count;
 }
+
+// Visits the tiles that a footprint touches in the band: of its rows of tiles every `lines`-th from
+// `line`, of each row every `steps`-th tile from `step`. A shader says what a visit does.
+fn visit_tiles(footprint: Footprint, id: u32, line: u32, lines: u32, step: u32, steps: u32) {
+    let first_row = views[which].row_start;
+    let extent = extent_of(footprint, first_row, views[which].row_end);
+    if extent.top > extent.bottom {
+        return;
+    }
+    let size = i32(TILE_SIZE);
+    let last = extent.bottom / size;
+    for (var tile_y = extent.top / size + i32(line); tile_y <= last; tile_y += i32(lines)) {
+        let span = tile_span(footprint, extent, tile_y);
+        let row = (u32(tile_y) - first_row) * views[which].tiles_x + views[which].range_start;
+        for (var tile_x = span.x + step; tile_x < span.y; tile_x += steps) {
+            visit(row + tile_x, footprint, id);
+        }
+    }
+}
+
+// Gaussians of this workgroup that touch many tiles: all its invocations visit those together.
+var<workgroup> large: array<u32, WORKGROUP_SIZE>;
+var<workgroup> large_count: atomic<u32>;
+var<workgroup> larges: u32;
+
+fn begin_visits(local: u32) {
+    if local == 0u {
+        atomicStore(&large_count, 0u);
+    }
+    workgroupBarrier();
+}
+
+fn visit_or_defer(footprint: Footprint, id: u32, touched: u32) {
+    if touched > LARGE_TILES {
+        large[atomicAdd(&large_count, 1u)] = id;
+    } else if touched > 0u {
+        visit_tiles(footprint, id, 0u, 1u, 0u, 1u);
+    }
+}

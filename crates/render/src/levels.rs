@@ -36,13 +36,19 @@ impl Default for DepthSteps {
 }
 
 impl DepthSteps {
+    /// No depths, in steps for those up to `farthest`, world units.
+    pub(crate) fn to(farthest: f32) -> Self {
+        let scale = if farthest > 0.0 { f64::from(farthest) / STEPS } else { 1.0 };
+        Self { steps: Vec::new(), scale }
+    }
+
     /// From depths in world units, 0 or under where there is none.
     pub fn of(depth: &[f32]) -> Self {
         let farthest = |depths: &[f32]| {
             depths.iter().copied().filter(|d| d.is_finite()).fold(0.0_f32, f32::max)
         };
         let farthest = depth.par_chunks(PIXELS_EACH).map(farthest).reduce(|| 0.0, f32::max);
-        let scale = if farthest > 0.0 { f64::from(farthest) / STEPS } else { 1.0 };
+        let scale = Self::to(farthest).scale;
         let step = |&d: &f32| match d > 0.0 {
             true => (f64::from(d) / scale).round().clamp(1.0, STEPS) as u16,
             false => 0,

@@ -38,25 +38,15 @@ pub enum Skip {
     EllipseParts,
     /// Gaussians behind the rest where all rays of a tile (on the CPU: of a part) have ended.
     EndedRays,
-    /// Sorting Gaussians that no tile of the picture sees. GPU only: the CPU sorts pairs alone.
-    Unseen,
     /// Directions to Gaussians, and on a GPU the stage that shades, of a scene whose colours are
     /// the same from everywhere.
     FlatColor,
-    /// Digits of the depth sort that are the same for all. GPU only: on the CPU it saved nothing.
-    EqualDigits,
 }
 
 impl Skip {
     /// All of them.
-    pub const ALL: [Self; 6] = [
-        Self::EllipseTiles,
-        Self::EllipseParts,
-        Self::EndedRays,
-        Self::Unseen,
-        Self::FlatColor,
-        Self::EqualDigits,
-    ];
+    pub const ALL: [Self; 4] =
+        [Self::EllipseTiles, Self::EllipseParts, Self::EndedRays, Self::FlatColor];
 
     /// The constant of the shaders that is true while it is on, in those that know it.
     pub fn constant(self) -> String {

@@ -3,8 +3,6 @@
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
-use glam::DVec3;
-
 use super::lanes::Lanes;
 use crate::{constants::ATAN, scene::Backdrop, view::View};
 
@@ -23,19 +21,8 @@ pub(super) struct Sky<'a> {
 
 impl<'a> Sky<'a> {
     pub(super) fn new(backdrop: &'a Backdrop, view: &View) -> Self {
-        let to_world = view.rotation.transpose();
-        let ray = |x: f64, y: f64| {
-            let [x, y] = [(x, 0), (y, 1)].map(|(at, k)| (at - view.principal[k]) / view.focal[k]);
-            to_world * DVec3::new(x, y, 1.0)
-        };
-        let first = ray(0.5, 0.5);
-        let last = ray(f64::from(view.width), f64::from(view.height));
-        // No ray is so long that its square is no f32.
-        let scale = first.length().max(last.length()).recip();
-        let scaled = |v: DVec3| (v * scale).as_vec3().to_array();
-        let across = to_world * DVec3::X / view.focal[0];
-        let down = to_world * DVec3::Y / view.focal[1];
-        Self { backdrop, first: scaled(first), across: scaled(across), down: scaled(down) }
+        let [first, across, down] = view.rays();
+        Self { backdrop, first, across, down }
     }
 
     /// Places in the map of the pixels in columns `x` and rows `y` of the picture: longitude and

@@ -23,7 +23,7 @@ use segsplat_testing::{
 use crate::common::cpu;
 
 /// A camera of 41 x 30 at `x`, looking along +z.
-fn at(x: f64) -> Camera {
+pub(crate) fn at(x: f64) -> Camera {
     let mut camera = camera(41, 30);
     camera.camera_to_world = look(DVec3::new(x, 0.0, 0.0), DVec3::new(x, 0.0, 4.0));
     camera
@@ -31,7 +31,7 @@ fn at(x: f64) -> Camera {
 
 /// `photos` photos in a row, 0.5 apart, each with 150 Gaussians of its own, entries 1..=4, and a
 /// backdrop of random colours. The photos' pixels are `coarse` times larger than those of [`at`].
-fn scene(photos: u16, opacity: [f32; 2], coarse: f64) -> Scene {
+pub(crate) fn scene(photos: u16, opacity: [f32; 2], coarse: f64) -> Scene {
     let (mut raw, mut random) = (RawGaussians::default(), Random(5));
     raw.origin = DVec3::new(0.25, -0.5, 0.125);
     for view in 0..photos {

@@ -16,6 +16,7 @@ mod fast;
 mod fuzz;
 mod label_twins;
 mod labels;
+mod one_pass;
 mod oracle;
 mod pitfalls;
 mod pool;

@@ -26,7 +26,11 @@ fn requests(count: u32, labels: &Labels) -> Vec<RenderRequest> {
 }
 
 /// Draws all at once, each on a thread of its own.
-fn at_once(gpu: &GpuRenderer, scene: &Gaussians, wanted: &[RenderRequest]) -> Vec<Frame> {
+pub(crate) fn at_once(
+    gpu: &GpuRenderer,
+    scene: &Gaussians,
+    wanted: &[RenderRequest],
+) -> Vec<Frame> {
     let start = Barrier::new(wanted.len());
     std::thread::scope(|scope| {
         let threads: Vec<_> = wanted
