@@ -1,5 +1,5 @@
 // Stage 5: the list of each tile in the order of depth, then of the scene.
-// CPU: crates/render/src/cpu/bin.rs
+// CPU: crates/render/src/cpu/rasterize.rs (in portions)
 //
 // Up to SORT_RUN pairs are sorted in workgroup memory, by a bitonic network. An invocation takes
 // eight numbers at a time through up to three stages of it. Longer lists are merged in the device's

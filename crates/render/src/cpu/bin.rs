@@ -1,7 +1,9 @@
-//! Stage 3: the Gaussians of each tile. The shaders sort all Gaussians by depth, write their pairs
-//! of tile and Gaussian in that order and sort those by tile. Here each chunk of Gaussians sorts
-//! its own pairs by tile, and the blend of a tile takes those of all chunks and sorts them by depth:
-//! no step waits for another chunk, and what is sorted stays in the cache.
+//! Stages 3 and 4: the Gaussians of each tile. Shaders: `shaders/prefix_sum.wgsl`,
+//! `shaders/emit_isects.wgsl`
+//!
+//! Each chunk of Gaussians orders its own pairs by tile. The blend of a tile takes those of all
+//! chunks and sorts them by depth: no step waits for another chunk, and what is sorted stays in the
+//! cache.
 
 use std::{
     ops::Range,
@@ -10,8 +12,15 @@ use std::{
 
 use rayon::prelude::*;
 
-use super::{project::Projected, tiles::Grid};
-use crate::{Source, constants::BEHIND_BIT, scene::Gaussians};
+use super::{
+    project::Projected,
+    tiles::{Grid, TileSpans},
+};
+use crate::{
+    Source,
+    constants::{BEHIND_BIT, TILE_SIZE},
+    scene::Gaussians,
+};
 
 /// Fewest Gaussians of a chunk: enough to hide the cost of a task.
 const CHUNK_MIN: usize = 2048;
@@ -22,7 +31,7 @@ const ENDS_MAX: usize = 1 << 22;
 /// Most tiles times chunks may leave too few chunks; this many there are always.
 const CHUNKS_MIN: usize = 8;
 
-/// Packs a depth key and a Gaussian: pairs sort by depth, then by number.
+/// Packs a key and a Gaussian: pairs sort by key, then by number.
 #[inline]
 pub fn pack(key: u32, id: u32) -> u64 {
     u64::from(key) << 32 | u64::from(id)
@@ -34,12 +43,20 @@ pub fn value(pair: u64) -> u32 {
     pair as u32
 }
 
+/// The key of a pair.
+#[inline]
+fn key(pair: u64) -> u32 {
+    (pair >> 32) as u32
+}
+
 /// The pairs of a chunk, tile by tile.
 #[derive(Debug, Default)]
 pub struct Bins {
     /// Where the pairs of each tile end, `[tiles]`.
     ends: Vec<u32>,
     pairs: Vec<u64>,
+    /// Tiles, each with a Gaussian, in the order of the scene: from them the others are made.
+    emitted: Vec<u64>,
 }
 
 impl Bins {
@@ -98,39 +115,77 @@ pub fn bin(
     bins.par_iter_mut().enumerate().with_max_len(1).for_each(|(at, bins)| {
         let first = at * chunk;
         let ids = first..count.min(first + chunk);
+        let mine = pairs_of(projected, ids.clone(), grid);
+        let before = total.fetch_add(mine, Ordering::Relaxed);
         bins.ends.clear();
         bins.ends.resize(tiles, 0);
-        walk(projected, ids.clone(), grid, |_, tile| bins.ends[tile as usize] += 1);
-        let mut end = 0;
-        for count in &mut bins.ends {
-            // For now where the pairs of the tile start.
-            end += std::mem::replace(count, end);
-        }
-        let before = total.fetch_add(end.into(), Ordering::Relaxed);
         bins.pairs.clear();
-        if before + u64::from(end) > isects_max {
-            return;
+        if before + mine <= isects_max {
+            emit(projected, ids, grid, &mut bins.emitted, mine as usize);
+            bins.sort(projected, keys);
         }
-        bins.pairs.resize(end as usize, 0);
-        walk(projected, ids, grid, |id, tile| {
-            let place = &mut bins.ends[tile as usize];
-            bins.pairs[*place as usize] = keys.pair(projected.footprints[id].depth, id);
-            *place += 1;
-        });
     });
     total.into_inner()
 }
 
-/// Calls `touch` with each of the Gaussians `ids` and each tile of `grid` that it touches, counted
-/// from the first of the grid.
-#[inline(always)]
-fn walk(projected: &Projected, ids: Range<usize>, grid: &Grid, mut touch: impl FnMut(usize, u32)) {
+impl Bins {
+    /// Orders what was emitted by tile, stable, and puts depth keys in the place of tiles.
+    fn sort(&mut self, projected: &Projected, keys: Keys<'_>) {
+        let Self { ends, pairs, emitted } = self;
+        for &tile in &*emitted {
+            ends[key(tile) as usize] += 1;
+        }
+        let mut end = 0;
+        for count in ends.iter_mut() {
+            // For now where the pairs of the tile start.
+            end += std::mem::replace(count, end);
+        }
+        pairs.resize(emitted.len(), 0);
+        for &tile in &*emitted {
+            let (place, id) = (&mut ends[key(tile) as usize], value(tile) as usize);
+            pairs[*place as usize] = keys.pair(projected.footprints[id].depth, id);
+            *place += 1;
+        }
+    }
+}
+
+/// Number of pairs of the Gaussians `ids` in `grid`.
+fn pairs_of(projected: &Projected, ids: Range<usize>, grid: &Grid) -> u64 {
+    let tiles = &projected.tiles_per_gauss[ids.clone()];
+    if grid.tile_rows == (0..grid.height.div_ceil(TILE_SIZE)) {
+        return tiles.iter().map(|&tiles| u64::from(tiles)).sum();
+    }
+    let seen = ids.zip(tiles).filter(|(_, tiles)| **tiles > 0);
+    let count = |id: usize| projected.tile_spans[id].count(&projected.footprints[id], grid);
+    seen.map(|(id, _)| u64::from(count(id))).sum()
+}
+
+/// Writes the tiles of the Gaussians `ids`, counted from the first of the grid, each with its
+/// Gaussian: `count` of them.
+fn emit(projected: &Projected, ids: Range<usize>, grid: &Grid, to: &mut Vec<u64>, count: usize) {
     let spans = &projected.tile_spans[ids.clone()];
     let tiles = &projected.tiles_per_gauss[ids.clone()];
+    // Room for what is written and not kept.
+    to.resize(count + TileSpans::FEW, 0);
+    let mut end = 0;
     for ((id, spans), _) in ids.zip(spans).zip(tiles).filter(|(_, tiles)| **tiles > 0) {
+        if let Some(few) = spans.few(grid) {
+            // Most Gaussians touch one to four tiles. All four are written and some kept: a branch
+            // for each would be guessed wrong every other time.
+            for (tile, kept) in few {
+                to[end] = pack(tile, id as u32);
+                end += usize::from(kept);
+            }
+            continue;
+        }
         spans.replay(&projected.footprints[id], grid, |tile_y, tiles| {
             let row = (tile_y - grid.tile_rows.start) * grid.tiles_x();
-            tiles.for_each(|tile_x| touch(id, row + tile_x));
+            for tile_x in tiles {
+                to[end] = pack(row + tile_x, id as u32);
+                end += 1;
+            }
         });
     }
+    debug_assert_eq!(end, count, "count and emission disagree; this is a bug");
+    to.truncate(end);
 }

@@ -1,5 +1,5 @@
-//! The tiled CPU renderer: the stages of the GPU renderer, one file each, named like the shader;
-//! `bin` stands for the sorts and what belongs to them.
+//! The tiled CPU renderer: the stages of the GPU renderer, one file each, named like the shader
+//! (`bin` does what `prefix_sum` and `emit_isects` do, and the blend of a tile sorts it).
 //!
 //! It serves where there is no adapter. A frame is the same to the last bit for any number of
 //! threads: each task writes to places that are fixed in advance, and no sum goes across tasks. No

@@ -34,7 +34,7 @@ pub(super) const CELLS: usize = ACROSS * ACROSS;
 /// Pixels of a cell.
 pub(super) const PIXELS: usize = CELL * CELL;
 /// Pairs of a tile that are sorted first.
-const PORTION: usize = 512;
+const PORTION: usize = 1024;
 /// Gaussians of a batch: their marks are transposed together.
 const GROUP: usize = 64;
 /// Centres of the cells, relative to the centre of the tile, pixels.
