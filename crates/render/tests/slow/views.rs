@@ -11,7 +11,7 @@ use std::sync::OnceLock;
 use glam::DVec3;
 use segsplat_core::scene::Gaussians;
 use segsplat_render::{
-    Frame, RenderRequest, Renderer,
+    RenderRequest, Renderer,
     cpu::CpuRenderer,
     oracle::{self, OraclePixel},
 };
