@@ -12,14 +12,14 @@ use segsplat::{
     render::{
         Kinds, Labels, RenderRequest, Renderer,
         cpu::{
-            CpuRenderer, emit_isects,
+            CpuRenderer,
+            bin::{Bins, Keys, bin},
             lanes::{KernelOptions, Width},
             paint::Paint,
-            prefix_sum,
             project::{Projected, project},
-            radix_sort,
-            rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
-            shade, tile_ranges,
+            rasterize::{Tile, TileScratch, rasterize_tile},
+            shade,
+            store::Part,
             tiles::Grid,
         },
         oracle,
@@ -89,11 +89,7 @@ struct Stages {
     view: View,
     grid: Grid,
     projected: Projected,
-    sorted: Vec<u64>,
-    spare: Vec<u64>,
-    offsets: Vec<u64>,
-    isects: Vec<u64>,
-    ranges: Vec<u32>,
+    bins: Vec<Bins>,
 }
 
 impl Stages {
@@ -102,23 +98,13 @@ impl Stages {
         let request = scenes::request(camera);
         let view = View::new(gaussians.origin(), &request).expect("a view");
         let grid = Grid::whole(&view, KernelOptions::default());
-        Self {
-            gaussians,
-            request,
-            view,
-            grid,
-            projected: Projected::default(),
-            sorted: Vec::new(),
-            spare: Vec::new(),
-            offsets: Vec::new(),
-            isects: Vec::new(),
-            ranges: Vec::new(),
-        }
+        Self { gaussians, request, view, grid, projected: Projected::default(), bins: Vec::new() }
     }
 
     fn project(&mut self, width: Width) {
         let options = KernelOptions { width, ..KernelOptions::default() };
-        project(&self.gaussians, &self.view, false, options, &mut self.projected);
+        let Self { gaussians, request, view, projected, .. } = self;
+        project(gaussians, request, view, options, projected);
     }
 
     fn shade(&mut self) {
@@ -126,45 +112,36 @@ impl Stages {
         shade::shade(&self.gaussians, &self.view, options, &mut self.projected);
     }
 
-    fn sort(&mut self) {
-        let Projected { footprints, tiles_per_gauss: tiles, .. } = &self.projected;
-        let visible = (0_u32..).zip(footprints.iter().zip(tiles)).filter(|(_, (_, t))| **t > 0);
-        self.sorted.clear();
-        self.sorted.extend(visible.map(|(i, (f, _))| radix_sort::pack(f.depth.to_bits(), i)));
-        radix_sort::radix_sort(&mut self.sorted, &mut self.spare, u32::BITS);
-    }
-
     fn bin(&mut self) {
-        let tiles = &self.projected.tiles_per_gauss;
-        let counts = self.sorted.iter().map(|&pair| tiles[radix_sort::value(pair) as usize]);
-        prefix_sum::prefix_sum(counts, &mut self.offsets);
-        let (projected, isects) = (&self.projected, &mut self.isects);
-        emit_isects::emit_isects(projected, &self.sorted, &self.grid, &self.offsets, isects);
-        radix_sort::radix_sort(isects, &mut self.spare, 8);
-        tile_ranges::tile_ranges(isects, self.grid.tile_count(), &mut self.ranges);
+        let keys = Keys::new(&self.gaussians, &[]);
+        bin(&self.projected, keys, &self.grid, u64::MAX, &mut self.bins);
     }
 
     /// All tiles into pictures that every request has.
     fn rasterize(&self, request: &RenderRequest, width: Width, scratch: &mut TileScratch) {
         let options = KernelOptions { width, ..KernelOptions::default() };
-        let paint = Paint::new(request, self.gaussians.semantic_index(), options);
+        let paint = Paint::new(request, &self.view, self.gaussians.semantic_index(), options);
         let stride = (SIDE * TILE) as usize;
         let (mut color, mut depth) = (vec![[0.0; 3]; stride], vec![0.0; stride]);
         let mut blend = vec![[0.0; 4]; stride];
+        let width_of = SIDE as usize;
+        let mut pairs = Vec::new();
         for tile_y in 0..SIDE / TILE {
-            let mut out = RowOut {
-                color: request.kinds.color.then_some(&mut color),
-                depth: request.kinds.depth.then_some(&mut depth),
-                blend: matches!(request.labels, Labels::Blend(_)).then_some(&mut blend),
-                ..RowOut::default()
+            let blends = matches!(request.labels, Labels::Blend(_));
+            let mut out = Part {
+                color: request.kinds.color.then(|| color.chunks_mut(width_of).collect()),
+                depth: request.kinds.depth.then(|| depth.chunks_mut(width_of).collect()),
+                blend: blends.then(|| blend.chunks_mut(width_of).collect()),
+                ..Part::default()
             };
             for tile_x in 0..SIDE / TILE {
                 let id = (tile_y * SIDE / TILE + tile_x) as usize;
-                let range = self.ranges[id] as usize..self.ranges[id + 1] as usize;
                 let tile = Tile { x: tile_x * TILE, y: tile_y * TILE, width: TILE, height: TILE };
-                let footprints = &self.projected.footprints;
-                let isects = &self.isects[range];
-                rasterize_tile(footprints, isects, tile, &paint, SIDE, scratch, &mut out);
+                pairs.clear();
+                self.bins.iter().for_each(|bins| pairs.extend(bins.of(id)));
+                let place = (tile, (tile_x * TILE) as usize);
+                let tools = (&paint, &mut *scratch);
+                rasterize_tile(&self.projected.footprints, &mut pairs, place, tools, &mut out);
             }
         }
         black_box((color, depth, blend));
@@ -182,7 +159,6 @@ fn stages(criterion: &mut Criterion) {
         });
     }
     criterion.bench_function("stage/shade", |b| b.iter(|| one.install(|| stages.shade())));
-    criterion.bench_function("stage/sort", |b| b.iter(|| stages.sort()));
     criterion.bench_function("stage/bin", |b| b.iter(|| one.install(|| stages.bin())));
     let table: Labels = Labels::Blend(vec![[0.5; 4]; 25].into());
     let count = stages.gaussians.len() as u32;
@@ -196,7 +172,7 @@ fn stages(criterion: &mut Criterion) {
         ("mask", Kinds::NONE, table.clone()),
         ("color_depth_mask", all, table),
     ] {
-        let request = RenderRequest { kinds, labels, ..stages.request };
+        let request = RenderRequest { kinds, labels, ..stages.request.clone() };
         for width in widths.clone() {
             criterion.bench_function(&format!("stage/rasterize/{name}/{width:?}"), |b| {
                 b.iter(|| stages.rasterize(&request, width, &mut scratch));
@@ -206,7 +182,7 @@ fn stages(criterion: &mut Criterion) {
     // Weights are joined from rows of tiles, which the renderer does: whole frames.
     let cpu = CpuRenderer::new(1).expect("a thread");
     for (name, kinds) in [("weights", Kinds::NONE), ("color_depth_weights", all)] {
-        let request = RenderRequest { kinds, labels: Labels::Weights, ..stages.request };
+        let request = RenderRequest { kinds, labels: Labels::Weights, ..stages.request.clone() };
         criterion.bench_function(&format!("labels/{name}/1_threads"), |b| {
             b.iter(|| cpu.render(&stages.gaussians, &request).expect("weights"));
         });

@@ -1,41 +1,30 @@
-// Stage 5: one (tile, Gaussian) pair for each tile that a Gaussian touches, in depth order.
-// CPU: crates/render/src/cpu/emit_isects.rs
+// Stage 4: each Gaussian into the list of each tile that it touches, in no order.
+// CPU: crates/render/src/cpu/bin.rs (in the order of the scene)
 
 @group(0) @binding(1) var<storage, read_write> plans: array<Plan>;
 @group(0) @binding(2) var<storage, read> footprints: array<Footprint>;
 @group(0) @binding(3) var<storage, read> tiles: array<u32>;
-// Gaussians in depth order: [2][views][N].
-@group(0) @binding(4) var<storage, read> depth_ids: array<u32>;
-// First place of each block: [views][blocks].
-@group(0) @binding(5) var<storage, read> block_sums: array<u32>;
-@group(0) @binding(6) var<storage, read_write> tile_keys: array<u32>;
-@group(0) @binding(7) var<storage, read_write> isect_ids: array<u32>;
+// Where the list of each tile starts; one more number ends the last one.
+@group(0) @binding(4) var<storage, read> starts: array<u32>;
+// Where the list of each tile ends so far.
+@group(0) @binding(5) var<storage, read_write> ends: array<atomic<u32>>;
+// [2][views][capacity] of (depth key, Gaussian).
+@group(0) @binding(6) var<storage, read_write> pairs: array<vec2<u32>>;
 
-// First place of each Gaussian of the block, and one past the last.
-var<workgroup> offsets: array<u32, 1025>;
+// Whether pairs get their places, or are counted in bins for that.
+var<private> placing: bool;
 
-fn emit_one(id: u32, start: u32, count: u32) {
-    let total = views[which].gaussian_count;
-    let footprint = footprints[which * total + id];
-    var slot = start;
-    let end = slot + count;
-    let extent = extent_of(footprint, views[which].row_start, views[which].row_end);
-    if extent.top <= extent.bottom {
-        let size = i32(TILE_SIZE);
-        for (var tile_y = extent.top / size; tile_y <= extent.bottom / size; tile_y++) {
-            let span = tile_span(footprint, extent, tile_y);
-            let row = (u32(tile_y) - views[which].row_start) * views[which].tiles_x;
-            for (var tile_x = span.x; tile_x < span.y && slot < end; tile_x++) {
-                tile_keys[slot] = row + tile_x;
-                isect_ids[slot] = id;
-                slot++;
-            }
-        }
+fn visit(tile: vec2<u32>, footprint: Footprint, id: u32) {
+    let bin = bin_of(tile);
+    var place = 0u;
+    if bin < BINS {
+        place = atomicAdd(&bins[bin], 1u);
+    } else if placing {
+        place = atomicAdd(&ends[number_of(tile)], 1u);
     }
-    // Two compilations of one function may round differently; no slot stays unwritten.
-    for (; slot < end; slot++) {
-        tile_keys[slot] = 0u;
-        isect_ids[slot] = NO_GAUSSIAN;
+    // Two compilations of one function may round differently: what was not counted has no room.
+    if placing && place < starts[number_of(tile) + 1u] {
+        pairs[views[which].pair_start + place] = vec2(bitcast<u32>(footprint.depth), id);
     }
 }
 
@@ -47,44 +36,44 @@ fn main(
 ) {
     which = group.z;
     let total = views[which].gaussian_count;
-    let blocks = (total + SCAN_BLOCK - 1u) / SCAN_BLOCK;
-    let block = group.y * groups.x + group.x;
+    let i = (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
+    let first = which * total;
+    begin_visits(local);
+    var footprint: Footprint;
+    var visits = false;
     // No pairs where there is no room for them.
-    let count = select(0u, atomicLoad(&plans[which].sorted), plans[which].isects > 0u);
-    let half = atomicLoad(&plans[0].passes) & 1u;
-    let ids = (half * groups.z + which) * total;
-    for (var k = local; k < SCAN_BLOCK; k += WORKGROUP_SIZE) {
-        let i = block * SCAN_BLOCK + k;
-        var touched = 0u;
-        if i < count {
-            touched = tiles[which * total + depth_ids[ids + i]];
+    if i < total && plans[which].isects > 0u {
+        let touched = tiles[first + i];
+        if touched > 0u {
+            footprint = footprints[first + i];
+            visits = see(footprint, i, touched);
         }
-        offsets[k] = touched;
     }
-    workgroupBarrier();
-    var sum = 0u;
-    for (var k = 0u; k < 4u; k++) {
-        sum += offsets[local * 4u + k];
-    }
-    var before = sum_before(local, sum);
-    if block < blocks {
-        before += block_sums[which * blocks + block];
-    }
-    for (var k = 0u; k < 4u; k++) {
-        let touched = offsets[local * 4u + k];
-        offsets[local * 4u + k] = before;
-        before += touched;
-    }
-    if local == WORKGROUP_SIZE - 1u {
-        offsets[SCAN_BLOCK] = before;
-    }
-    workgroupBarrier();
-    for (var k = local; k < SCAN_BLOCK; k += WORKGROUP_SIZE) {
-        let i = block * SCAN_BLOCK + k;
-        if i < count {
-            let id = depth_ids[ids + i];
-            let start = which * views[which].isect_capacity + offsets[k];
-            emit_one(id, start, offsets[k + 1u] - offsets[k]);
+    open_bins();
+    // First all count, then all place: one body, so that it finds the same tiles both times.
+    for (var turn = 0u; turn < 2u; turn++) {
+        placing = turn == 1u;
+        if visits && (placing || bin_sides.x > 0u) {
+            visit_tiles(footprint, i, 0u, 1u, 0u, 1u);
         }
+        workgroupBarrier();
+        if !placing {
+            for (var bin = local; bin < bin_sides.x * bin_sides.y; bin += WORKGROUP_SIZE) {
+                let sum = atomicLoad(&bins[bin]);
+                if sum > 0u {
+                    atomicStore(&bins[bin], atomicAdd(&ends[number_of(tile_of(bin))], sum));
+                }
+            }
+        }
+        workgroupBarrier();
+    }
+    if local == 0u {
+        larges = atomicLoad(&large_count);
+    }
+    let count = workgroupUniformLoad(&larges);
+    bin_sides = vec2(0u);
+    for (var k = 0u; k < count; k++) {
+        let id = large[k];
+        visit_tiles(footprints[first + id], id, local / 8u, 32u, local % 8u, 8u);
     }
 }

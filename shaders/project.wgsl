@@ -1,12 +1,27 @@
-// Stage 1: Gaussians to footprints; some are dropped.
+// Stage 1: Gaussians to footprints; some are dropped. The others are counted in their tiles.
 // CPU: crates/render/src/cpu/project.rs (in f64; here only depth is exact).
 
 @group(0) @binding(1) var<storage, read> gaussians: array<Gaussian>;
 @group(0) @binding(2) var<storage, read_write> footprints: array<Footprint>;
-@group(0) @binding(3) var<storage, read_write> depth_keys: array<u32>;
 // Tiles touched in the band.
-@group(0) @binding(4) var<storage, read_write> tiles: array<u32>;
-@group(0) @binding(5) var<storage, read_write> plans: array<Plan>;
+@group(0) @binding(3) var<storage, read_write> tiles: array<u32>;
+@group(0) @binding(4) var<storage, read_write> plans: array<Plan>;
+// Gaussians that touch each tile of the band. 0 before.
+@group(0) @binding(5) var<storage, read_write> ends: array<atomic<u32>>;
+// Photos of the views.
+@group(0) @binding(6) var<storage, read> sources: array<Source>;
+
+// Scales with what the blur lost given back, where the view shows the Gaussian larger than its
+// photo did (crates/render/src/plan.rs).
+fn magnified(gaussian: Gaussian, source: Source, depth: f32) -> vec3<f32> {
+    let width = max(dot(gaussian.mean - source.center, source.axis), 0.0) * source.scale;
+    let p = width * views[which].own_focal / depth;
+    if !(p > 1.0) {
+        return gaussian.scale;
+    }
+    let lost = BLUR_PX2 * width * width * (1.0 - 1.0 / (p * p));
+    return sqrt(gaussian.scale * gaussian.scale + lost);
+}
 
 // EWA projection of Gaussian i; opacity 0 when it cannot be seen.
 fn project_one(i: u32) -> Footprint {
@@ -16,15 +31,21 @@ fn project_one(i: u32) -> Footprint {
     if !(t.z >= views[which].near && is_finite(t.z)) {
         return footprint;
     }
+    var scale = gaussian.scale;
+    if gaussian.source < views[which].source_count {
+        let source = sources[views[which].source_start + gaussian.source];
+        scale = magnified(gaussian, source, t.z);
+        footprint.depth = select(t.z, -t.z, source.behind != 0u);
+    }
     let slope = t.xy / t.z;
     let clamped = clamp(slope, views[which].slope_min, views[which].slope_max);
     let focal = views[which].focal / t.z;
 
     // Rows of M = J W R diag(scales), so that the 2D covariance is M Mᵀ.
     let rotation = rotation_of(gaussian.quat);
-    let row_x = (views[which].rotation_x.xyz * rotation) * gaussian.scale;
-    let row_y = (views[which].rotation_y.xyz * rotation) * gaussian.scale;
-    let row_z = (views[which].rotation_z.xyz * rotation) * gaussian.scale;
+    let row_x = (views[which].rotation_x.xyz * rotation) * scale;
+    let row_y = (views[which].rotation_y.xyz * rotation) * scale;
+    let row_z = (views[which].rotation_z.xyz * rotation) * scale;
     let m0 = (row_x - row_z * clamped.x) * focal.x;
     let m1 = (row_y - row_z * clamped.y) * focal.y;
 
@@ -60,9 +81,16 @@ fn project_one(i: u32) -> Footprint {
     return footprint;
 }
 
-var<workgroup> lows: array<u32, 256>;
-var<workgroup> highs: array<u32, 256>;
-var<workgroup> seen: array<u32, 256>;
+fn visit(tile: vec2<u32>, footprint: Footprint, id: u32) {
+    let bin = bin_of(tile);
+    if bin < BINS {
+        atomicAdd(&bins[bin], 1u);
+    } else {
+        atomicAdd(&ends[number_of(tile)], 1u);
+    }
+}
+
+var<workgroup> seen: atomic<u32>;
 
 @compute @workgroup_size(256)
 fn main(
@@ -72,49 +100,55 @@ fn main(
 ) {
     which = group.z;
     let i = (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
-    var key = DROPPED_KEY;
-    var whole = 0u;
+    let first = which * views[which].gaussian_count;
+    if local == 0u {
+        atomicStore(&seen, 0u);
+    }
+    begin_visits(local);
+    var footprint: Footprint;
+    var visits = false;
     if i < views[which].gaussian_count {
-        let at = which * views[which].gaussian_count + i;
-        let footprint = project_one(i);
+        footprint = project_one(i);
         var touched = 0u;
         if footprint.opacity > 0.0 {
             touched = count_tiles(footprint, views[which].row_start, views[which].row_end);
-            whole = touched;
+            var whole = touched;
             if views[which].row_end - views[which].row_start < views[which].tiles_y {
                 whole = count_tiles(footprint, 0u, views[which].tiles_y);
             }
+            if whole > 0u {
+                atomicAdd(&seen, 1u);
+            }
             if touched > 0u {
-                footprints[at] = footprint;
-                key = bitcast<u32>(footprint.depth);
+                footprints[first + i] = footprint;
+                visits = see(footprint, i, touched);
             }
         }
-        tiles[at] = touched;
-        depth_keys[at] = key;
+        tiles[first + i] = touched;
     }
-    lows[local] = key;
-    highs[local] = select(key, 0u, key == DROPPED_KEY);
-    seen[local] = select(0u, 1u, whole > 0u);
-    workgroupBarrier();
-    // An invocation reads numbers of its own residue alone, so writing its own disturbs nobody.
-    if local < 16u {
-        for (var k = local + 16u; k < WORKGROUP_SIZE; k += 16u) {
-            lows[local] = min(lows[local], lows[k]);
-            highs[local] = max(highs[local], highs[k]);
-            seen[local] += seen[k];
-        }
+    storageBarrier();
+    open_bins();
+    if visits {
+        visit_tiles(footprint, i, 0u, 1u, 0u, 1u);
     }
-    workgroupBarrier();
     if local == 0u {
-        for (var k = 1u; k < 16u; k++) {
-            lows[0] = min(lows[0], lows[k]);
-            highs[0] = max(highs[0], highs[k]);
-            seen[0] += seen[k];
+        larges = atomicLoad(&large_count);
+        let visible = atomicLoad(&seen);
+        if visible > 0u {
+            atomicAdd(&plans[which].visible, visible);
         }
-        if seen[0] > 0u {
-            atomicMin(&plans[which].key_min, lows[0]);
-            atomicMax(&plans[which].key_max, highs[0]);
-            atomicAdd(&plans[which].visible, seen[0]);
+    }
+    let count = workgroupUniformLoad(&larges);
+    for (var bin = local; bin < bin_sides.x * bin_sides.y; bin += WORKGROUP_SIZE) {
+        let sum = atomicLoad(&bins[bin]);
+        if sum > 0u {
+            atomicAdd(&ends[number_of(tile_of(bin))], sum);
         }
+    }
+    // Those are not counted in bins: their sums are out already.
+    bin_sides = vec2(0u);
+    for (var k = 0u; k < count; k++) {
+        let id = large[k];
+        visit_tiles(footprints[first + id], id, local / 8u, 32u, local % 8u, 8u);
     }
 }

@@ -1,4 +1,4 @@
-// Stage 8: front-to-back blend of a tile's Gaussians: colour, alpha, expected depth, labels.
+// Stage 6: front-to-back blend of a tile's Gaussians: colour, alpha, expected depth, labels.
 // CPU: crates/render/src/cpu/rasterize.rs (which cuts tiles into cells of 4 x 4 pixels)
 // common/labels_*.wgsl define label_of, label_row, add_label and store_labels.
 //
@@ -10,10 +10,11 @@
 // where reading a staged Gaussian costs more than blending it.
 
 @group(0) @binding(1) var<storage, read> footprints: array<Footprint>;
-@group(0) @binding(2) var<storage, read> isect_ids: array<u32>;
-@group(0) @binding(3) var<storage, read> ranges: array<u32>;
-// The pictures of the band one after another, each row-major: f32 as bits. Of a fast view colour
-// and alpha share a word of four levels.
+// (depth key, Gaussian)
+@group(0) @binding(2) var<storage, read> pairs: array<vec2<u32>>;
+// First pair of each tile, sorted, and one past its last.
+@group(0) @binding(3) var<storage, read> lists: array<vec2<u32>>;
+// The pictures of the band one after another, each row-major: f32 as bits, or levels.
 @group(0) @binding(4) var<storage, read_write> pictures: array<u32>;
 // [views][N, 3] as shade gives them; of a scene of degree 0 its harmonics, [N, 3].
 @group(0) @binding(5) var<storage, read> colors: array<f32>;
@@ -42,6 +43,8 @@ override LANES: u32 = WORKGROUP_SIZE / PIXELS;
 // A kernel is compiled for each set of pictures.
 override WITH_COLOR: bool = true;
 override WITH_DEPTH: bool = true;
+// Pictures of bytes.
+override WITH_BYTES: bool = false;
 // Work that is left out because no pixel changes (crates/render/src/switches.rs).
 override SKIP_ELLIPSE_PARTS: bool = true;
 override SKIP_ENDED_RAYS: bool = true;
@@ -108,15 +111,12 @@ fn fetch(at: u32, end: u32) -> Staged {
     if at >= end {
         return staged;
     }
-    let id = isect_ids[views[which].pair_start + at];
-    if id == NO_GAUSSIAN {
-        return staged;
-    }
+    let id = pairs[at].y;
     staged.some = true;
     staged.footprint = footprints[which * views[which].gaussian_count + id];
     staged.label = label_of(id);
     if WITH_COLOR || WITH_DEPTH {
-        staged.paint.w = staged.footprint.depth;
+        staged.paint.w = abs(staged.footprint.depth);
         if WITH_COLOR {
             staged.paint = vec4(color_of(id), staged.paint.w);
         }
@@ -142,17 +142,22 @@ struct Pixel {
 // The pixels of this invocation.
 var<private> pixels: array<Pixel, PIXELS_MAX>;
 
-fn blend(q: u32, shape: vec4<f32>, weight: vec4<f32>, paint: vec4<f32>, row: vec4<f32>) {
+// Half the squared distance of a pixel to a Gaussian, and its alpha there.
+fn alpha_of(q: u32, shape: vec4<f32>, weight: vec4<f32>) -> vec2<f32> {
     let d = pixels[q].center - shape.xy;
     let across = shape.w * (d.x - shape.z * d.y);
     let along = weight.x * d.y;
     let power = across * across + along * along;
-    let alpha = min(ALPHA_MAX, weight.y * exp(-power));
+    return vec2(power, min(ALPHA_MAX, weight.y * exp(-power)));
+}
+
+fn blend(q: u32, some: bool, one: vec2<f32>, weight: vec4<f32>, paint: vec4<f32>, row: vec4<f32>) {
+    let alpha = one.y;
     let transmittance = pixels[q].transmittance;
     let left = transmittance * (1.0 - alpha);
     // Hardly a branch: invocations that part ways take as long as both ways together. Over its
     // power_max alpha is under ALPHA_MIN for certain; a NaN is skipped too.
-    let hit = power <= weight.z && alpha >= ALPHA_MIN && !pixels[q].done;
+    let hit = some && one.x <= weight.z && alpha >= ALPHA_MIN && !pixels[q].done;
     let ends = hit && left <= TRANSMITTANCE_MIN;
     let adds = hit && !ends;
     pixels[q].done = pixels[q].done || ends;
@@ -171,13 +176,47 @@ fn blend(q: u32, shape: vec4<f32>, weight: vec4<f32>, paint: vec4<f32>, row: vec
     pixels[q].transmittance = select(transmittance, left, adds);
 }
 
-fn store(q: u32) {
+// Blends Gaussian k, and k_next behind it if `two`. The alphas of both are on their way at once.
+fn blend_two(q: u32, k: u32, k_next: u32, two: bool) {
+    let weight = weights[k];
+    let weight_next = weights[k_next];
+    let one = alpha_of(q, shapes[k], weight);
+    let next = alpha_of(q, shapes[k_next], weight_next);
+    let paint = paints[k];
+    let paint_next = paints[k_next];
+    blend(q, true, one, weight, paint, row_of(u32(weight.w), paint));
+    blend(q, two, next, weight_next, paint_next, row_of(u32(weight_next.w), paint_next));
+}
+
+// Colours of the pixels of this invocation in 24 bits.
+var<private> rgbs: array<u32, PIXELS_MAX>;
+
+fn level(value: f32) -> u32 {
+    return u32(clamp(value, 0.0, 1.0) * 255.0 + 0.5);
+}
+
+// The colour of a pixel, over what is behind it.
+fn composed(q: u32, alpha: f32, corner: vec2<f32>) -> vec3<f32> {
+    let room = 1.0 - alpha;
+    if views[which].backdrop_start == NO_PICTURE {
+        return pixels[q].color + room * views[which].background.xyz;
+    }
+    if room < views[which].room_min {
+        return pixels[q].color;
+    }
+    return pixels[q].color + room * backdrop_behind(corner + pixels[q].center - 0.5);
+}
+
+fn store(q: u32, corner: vec2<f32>) {
     let at = pixels[q].at;
     let alpha = min(pixels[q].alpha, 1.0);
     if WITH_COLOR && views[which].color_start != NO_PICTURE {
-        let out = pixels[q].color + (1.0 - alpha) * views[which].background.xyz;
-        if views[which].fast != 0u {
-            pictures[views[which].color_start + at] = pack4x8unorm(vec4(out, alpha));
+        let out = composed(q, alpha, corner);
+        let rgb = level(out.x) | (level(out.y) << 8u) | (level(out.z) << 16u);
+        if views[which].levels == LEVELS_RGB {
+            rgbs[q] = rgb;
+        } else if views[which].levels == LEVELS_RGBA {
+            pictures[views[which].color_start + at] = rgb | (level(alpha) << 24u);
         } else {
             let to = views[which].color_start + at * 3u;
             pictures[to] = bitcast<u32>(out.x);
@@ -196,6 +235,67 @@ fn store(q: u32) {
     store_labels(q, at);
 }
 
+// Place of pixel q of this invocation in the tile.
+fn place_of(local: u32, q: u32) -> vec2<u32> {
+    let part = local * PIXELS / 8u;
+    let lane = local * PIXELS % 8u + q;
+    return vec2((part & 3u) * 4u + (lane & 3u), (part >> 2u) * 2u + (lane >> 2u));
+}
+
+// The lowest bytes of four numbers in a word.
+fn pack_bytes(of_four: vec4<u32>) -> u32 {
+    let bytes = of_four & vec4(0xffu);
+    return bytes.x | (bytes.y << 8u) | (bytes.z << 16u) | (bytes.w << 24u);
+}
+
+// Writes the pictures whose pixels share words, by way of `met` and `words`.
+fn store_bytes(local: u32, tile: vec2<u32>) {
+    for (var q = 0u; q < PIXELS; q++) {
+        let place = place_of(local, q);
+        let to = place.y * TILE_SIZE + place.x;
+        let inside = pixels[q].at != NO_PICTURE;
+        let bytes = level(min(pixels[q].alpha, 1.0)) | (mask_byte(q) << 8u);
+        met[to] = select(0u, bytes, inside);
+        words[to] = select(0u, rgbs[q], inside);
+    }
+    workgroupBarrier();
+    let bottom = min(views[which].row_end * TILE_SIZE, views[which].height);
+    let rows = bottom - views[which].row_start * TILE_SIZE;
+    // Four pixels are a word of alpha or mask and three of colour.
+    let stride = (views[which].width + 3u) / 4u;
+    let color_stride = (views[which].width * 3u + 3u) / 4u;
+    for (var i = local; i < 64u; i += LANES) {
+        let x = tile.x * 4u + i % 4u;
+        let y = tile.y * TILE_SIZE + i / 4u;
+        if x >= stride || y >= rows {
+            continue;
+        }
+        var bytes: vec4<u32>;
+        var rgb: vec4<u32>;
+        for (var k = 0u; k < 4u; k++) {
+            bytes[k] = met[i * 4u + k];
+            rgb[k] = words[i * 4u + k];
+        }
+        if views[which].alpha_byte_start != NO_PICTURE {
+            pictures[views[which].alpha_byte_start + y * stride + x] = pack_bytes(bytes);
+        }
+        if views[which].mask_start != NO_PICTURE {
+            pictures[views[which].mask_start + y * stride + x] = pack_bytes(bytes >> vec4(8u));
+        }
+        if views[which].levels == LEVELS_RGB && views[which].color_start != NO_PICTURE {
+            let to = views[which].color_start + y * color_stride + x * 3u;
+            let left = color_stride - x * 3u;
+            pictures[to] = rgb.x | (rgb.y << 24u);
+            if left > 1u {
+                pictures[to + 1u] = (rgb.y >> 8u) | (rgb.z << 16u);
+            }
+            if left > 2u {
+                pictures[to + 2u] = (rgb.z >> 16u) | (rgb.w << 8u);
+            }
+        }
+    }
+}
+
 @compute @workgroup_size(LANES)
 fn main(
     @builtin(workgroup_id) tile: vec3<u32>,
@@ -210,9 +310,9 @@ fn main(
     var start = 0u;
     var end = 0u;
     if tiled {
-        let range = views[which].range_start + tile.y * views[which].tiles_x + tile.x;
-        start = ranges[range];
-        end = ranges[range + 1u];
+        let list = lists[views[which].range_start + tile.y * views[which].tiles_x + tile.x];
+        start = list.x;
+        end = list.y;
     }
 
     if local == 0u {
@@ -221,8 +321,7 @@ fn main(
     workgroupBarrier();
     var open = 0u;
     for (var q = 0u; q < PIXELS; q++) {
-        let lane = local * PIXELS % 8u + q;
-        let at = vec2((part & 3u) * 4u + (lane & 3u), (part >> 2u) * 2u + (lane >> 2u));
+        let at = place_of(local, q);
         let x = tile.x * TILE_SIZE + at.x;
         let y = tile.y * TILE_SIZE + at.y;
         let inside = tiled && x < views[which].width
@@ -287,15 +386,14 @@ fn main(
             }
             let k = w * 32u + firstTrailingBit(word);
             word &= word - 1u;
-            let shape = shapes[k];
-            let weight = weights[k];
-            let paint = paints[k];
-            let row = row_of(u32(weight.w), paint);
+            let two = word != 0u;
+            let k_next = select(k, w * 32u + firstTrailingBit(word), two);
+            word &= max(word, 1u) - 1u;
             // No loop where there is one: GPUs' compilers make less of a loop within a loop.
-            blend(0u, shape, weight, paint, row);
+            blend_two(0u, k, k_next, two);
             if PIXELS > 1u {
                 for (var q = 1u; q < PIXELS; q++) {
-                    blend(q, shape, weight, paint, row);
+                    blend_two(q, k, k_next, two);
                 }
             }
         }
@@ -311,7 +409,14 @@ fn main(
     }
     for (var q = 0u; q < PIXELS; q++) {
         if pixels[q].at != NO_PICTURE {
-            store(q);
+            store(q, corner);
+        }
+    }
+    if WITH_BYTES {
+        // All have read what `met` and `words` held.
+        workgroupBarrier();
+        if tiled {
+            store_bytes(local, tile.xy);
         }
     }
 }

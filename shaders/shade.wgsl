@@ -1,4 +1,4 @@
-// Stage 4: colour of each Gaussian that touches the band, seen from the camera.
+// Stage 2: colour of each Gaussian that touches the band, seen from the camera.
 // CPU: crates/render/src/cpu/shade.rs
 //
 // A scene of degree 0 has one colour for all cameras. rasterize reads it directly.

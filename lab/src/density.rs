@@ -11,7 +11,7 @@ use crate::{
     error::Result,
     metrics::{clamped, psnr, to_unit},
     pipeline::Pipeline,
-    render::{Kinds, ViewPlanner, cpu::CpuRenderer},
+    render::{Kinds, Renderer, cpu::CpuRenderer, plan::served},
     rows::{Rows, median, ms},
     scene::{Camera, CameraToWorld, Density, PosedPhoto, Scene, SceneOptions},
     scenes::{is_posed, make, scene_of, squares, use_of, view_request},
@@ -64,7 +64,6 @@ fn compare(
         camera_to_world: CameraToWorld::between(&a.camera_to_world, &b.camera_to_world, t),
         ..a
     });
-    let planner = ViewPlanner::default();
     let mut times = [Vec::new(), Vec::new()];
     let mut views = [Vec::new(), Vec::new()];
     for camera in [target.camera, a, b].into_iter().chain(between) {
@@ -72,7 +71,7 @@ fn compare(
             for (i, scene) in scenes.iter().enumerate() {
                 let begun = Instant::now();
                 let request = view_request(camera, Kinds::COLOR, scene.meta.report.median_depth);
-                let frame = planner.render(renderer, scene, &request, true)?;
+                let frame = renderer.render(&scene.gaussians, &served(scene, request))?;
                 times[i].push(ms(begun));
                 if run == 0 {
                     views[i].push(clamped(frame.color));

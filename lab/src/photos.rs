@@ -14,7 +14,7 @@ use crate::{
     grid,
     metrics::{clamped, psnr, ssim, to_unit},
     pipeline::Pipeline,
-    render::{Kinds, ViewPlanner, cpu::CpuRenderer},
+    render::{Kinds, Renderer, cpu::CpuRenderer, plan::served},
     rows::{Rows, each, means, ms, progress},
     scene::{PosedPhoto, SceneOptions},
     scenes::{SIDE, is_posed, make, means_by_use, scene_of, squares, use_of, view_request},
@@ -115,7 +115,7 @@ fn judge(
     let target = &squares[triple.target];
     let kinds = Kinds { color: true, depth: true, alpha: false };
     let request = view_request(target.camera, kinds, report.median_depth);
-    let frame = ViewPlanner::default().render(renderer, &scene, &request, true)?;
+    let frame = renderer.render(&scene.gaussians, &served(&scene, request))?;
     let color = clamped(frame.color);
     let (truth, valid) = (to_unit(&target.photo), target.photo.valid.as_deref());
     let pair = triple.pair.map(|i| &squares[i]);

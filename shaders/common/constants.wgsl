@@ -14,30 +14,28 @@ const SH_C3 = array<f32, 7>(
     -0.5900436, 2.8906114, -0.4570458, 0.37317633, -0.4570458, 1.4453057, -0.5900436,
 );
 const SH_OFFSET: f32 = 0.5;
+const ATAN = array<f32, 7>(
+    0.9999961, -0.3331737, 0.19807816, -0.13233343, 0.07962367, -0.03360422, 0.0068117934,
+);
 
 // Numbers of the kernels: the list of crates/render/src/gpu/pipelines.rs.
 // Invocations of a workgroup, the portable floor; also the values of a radix digit.
 const WORKGROUP_SIZE: u32 = 256u;
 // Views that one submission draws at most: the workgroup's z says which.
 const VIEWS_MAX: u32 = 8u;
-// Invocations of a workgroup that moves pairs, and the pairs that it moves.
-const SORT_SIZE: u32 = 128u;
-const SORT_BLOCK: u32 = 2048u;
-// Gaussians whose tile pairs one workgroup emits.
-const SCAN_BLOCK: u32 = 1024u;
+// Pairs of a tile that one workgroup sorts at once.
+const SORT_RUN: u32 = 2048u;
+// Tiles of a Gaussian above which a whole workgroup visits them.
+const LARGE_TILES: u32 = 64u;
+// Tiles in which a workgroup counts by itself.
+const BINS: u32 = 1024u;
 // Workgroups along x at most; more go to y.
 const GROUPS_X_MAX: u32 = 32768u;
-// Rows of four numbers in `groups_of`: digits 1 to 3 of the depth sort by blocks, then by digit
-// values; the tile sort; tile_ranges.
-const GROUPS_DEPTH: u32 = 0u;
-const GROUPS_DIGITS: u32 = 3u;
-const GROUPS_TILES: u32 = 6u;
-const GROUPS_RANGES: u32 = 7u;
-// Bits of a fast view's depth keys: two digits of the sort.
-const FAST_KEY_BITS: u32 = 16u;
-// Depth key of a dropped Gaussian: after every finite depth.
-const DROPPED_KEY: u32 = 0xffffffffu;
-// Value of a pair that was counted and not emitted: blends nothing.
-const NO_GAUSSIAN: u32 = 0xffffffffu;
+// Values of View::levels but 0.
+const LEVELS_RGB: u32 = 1u;
+const LEVELS_RGBA: u32 = 2u;
+// Cells of a backdrop.
+const BACKDROP_WIDTH: u32 = 128u;
+const BACKDROP_HEIGHT: u32 = 64u;
 // Start of a picture that was not asked for.
 const NO_PICTURE: u32 = 0xffffffffu;

@@ -1,4 +1,4 @@
-// Labels::Blend: each Gaussian adds its weight times one row of a table.
+// Labels::Blend and Labels::Mask: each Gaussian adds its weight times one row of a table.
 
 @group(0) @binding(7) var<storage, read> table: array<vec4<f32>>;
 
@@ -20,10 +20,21 @@ fn add_label(label: u32, row: vec4<f32>, share: f32, q: u32, pixel: u32) {
 }
 
 fn store_labels(q: u32, pixel: u32) {
+    if views[which].blend_start == NO_PICTURE {
+        return;
+    }
     let first = views[which].blend_start + pixel * 4u;
     let bits = bitcast<vec4<u32>>(blended[q]);
     pictures[first] = bits.x;
     pictures[first + 1u] = bits.y;
     pictures[first + 2u] = bits.z;
     pictures[first + 3u] = bits.w;
+}
+
+// CPU: selected in crates/render/src/labels.rs
+fn mask_byte(q: u32) -> u32 {
+    let row = blended[q];
+    let all = min(row.y, min(row.z, row.w)) >= 0.0;
+    let some = max(row.y, max(row.z, row.w)) > 0.0;
+    return select(0u, 255u, row.x >= views[which].coverage_floor && all && some);
 }

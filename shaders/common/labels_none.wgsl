@@ -11,3 +11,7 @@ fn label_row(label: u32) -> vec4<f32> {
 fn add_label(label: u32, row: vec4<f32>, share: f32, q: u32, pixel: u32) {}
 
 fn store_labels(q: u32, pixel: u32) {}
+
+fn mask_byte(q: u32) -> u32 {
+    return 0u;
+}

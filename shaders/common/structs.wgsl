@@ -34,7 +34,7 @@ struct View {
     isect_capacity: u32,
     // Always 0, and no compiler knows it.
     zero: u32,
-    // First float of each picture in `pictures`, or NO_PICTURE.
+    // First word of each picture in `pictures`, or NO_PICTURE.
     color_start: u32,
     depth_start: u32,
     alpha_start: u32,
@@ -45,12 +45,44 @@ struct View {
     // Entries that a pixel has room for, and where they start in `slots`.
     weight_slots: u32,
     slot_start: u32,
-    // First number in `ranges`, and first sorted tile pair.
+    // First tile in `starts`, `ends` and `lists`, and first tile pair.
     range_start: u32,
     pair_start: u32,
-    // Not 0: pictures of 8 bits and a blunt order by depth, see conventions.md.
-    fast: u32,
-    reserved: u32,
+    // How colour is written: 0 f32, LEVELS_RGB three bytes, LEVELS_RGBA four with alpha. Rows start
+    // at whole words.
+    levels: u32,
+    // Pictures of bytes, whose rows start at whole words: alpha in levels, the mask.
+    alpha_byte_start: u32,
+    mask_start: u32,
+    // Depth in steps of 16 bits, whose rows start at whole words.
+    steps_start: u32,
+    // First cell in `backdrops`; NO_PICTURE: `background` is behind colour.
+    backdrop_start: u32,
+    // Light that must pass the Gaussians for the backdrop to show.
+    room_min: f32,
+    // Least coverage that a mask selects.
+    coverage_floor: f32,
+    // Larger focal length over OWN_SIZE.
+    own_focal: f32,
+    // Photos of the view, and where they start in `sources`.
+    source_count: u32,
+    source_start: u32,
+    // World ray of the first pixel's centre, and its change to the next column and row.
+    ray_first: vec4<f32>,
+    ray_across: vec4<f32>,
+    ray_down: vec4<f32>,
+}
+
+// A photo that Gaussians were seen in.
+struct Source {
+    // Camera centre from the origin.
+    center: vec3<f32>,
+    // 1 / focal length in pixels of the photo; 0 where nothing is known.
+    scale: f32,
+    // Axis of the camera.
+    axis: vec3<f32>,
+    // Not 0: its Gaussians are behind all of the others.
+    behind: u32,
 }
 
 struct Gaussian {
@@ -59,7 +91,8 @@ struct Gaussian {
     // wxyz, unit.
     quat: vec4<f32>,
     scale: vec3<f32>,
-    reserved: f32,
+    // Its photo.
+    source: u32,
 }
 
 // A Gaussian on the picture. With d = pixel - mean, half the squared Mahalanobis distance is
@@ -72,6 +105,7 @@ struct Footprint {
     // The largest half squared distance at which alpha is ALPHA_MIN, with slack.
     power_max: f32,
     opacity: f32,
+    // Under 0: it is behind all that are over 0. The bits are the sort key.
     depth: f32,
 }
 
@@ -83,23 +117,6 @@ struct Plan {
     needed: u32,
     // Gaussians that touch the whole picture.
     visible: atomic<u32>,
-    // Gaussians that touch the band: those sorted by depth.
-    sorted: atomic<u32>,
-    // Least and largest depth key of them.
-    key_min: atomic<u32>,
-    key_max: atomic<u32>,
-    // Digits that the depth sort takes; in the first view's plan, for all views of the batch.
-    passes: atomic<u32>,
-    reserved: u32,
-}
-
-// One digit of a radix sort.
-struct SortParams {
-    // Lowest bit of the digit.
-    shift: u32,
-    // Digits sorted before this one.
-    pass_at: u32,
-    // 0 sorts Gaussians by depth, 1 tile pairs by tile.
-    by_tile: u32,
-    reserved: u32,
+    // Bits of the largest depth, where depth is asked for in steps.
+    farthest: atomic<u32>,
 }

@@ -1,5 +1,7 @@
 //! A picture of numbers as a file: PNG, JPEG, WebP, or NPY with every bit of the f32.
 
+use std::borrow::Cow;
+
 use image::{
     ExtendedColorType, ImageEncoder,
     codecs::{jpeg::JpegEncoder, png::PngEncoder, webp::WebPEncoder},
@@ -8,13 +10,11 @@ use image::{
 use super::request::{Format, Kind};
 use crate::{
     error::{Error, Result},
-    render::Frame,
+    render::{DepthSteps, Frame, levels::level},
     semantics::colour,
 };
 
 const JPEG_QUALITY: u8 = 90;
-/// Largest value of a 16-bit depth PNG; 0 is kept for "nothing there".
-const DEPTH_STEPS: f32 = 65_535.0;
 
 /// A file, and for a 16-bit depth PNG the world units of one step.
 #[derive(Debug)]
@@ -26,25 +26,36 @@ pub(super) struct Encoded {
 /// One picture, a value a pixel.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Layer<'a> {
-    /// sRGB, 0..1.
+    /// sRGB, 0..1, for NPY.
     Color(&'a [[f32; 3]]),
-    /// World units.
+    /// sRGB in levels.
+    Rgb(&'a [[u8; 3]]),
+    /// World units, for NPY.
     Depth(&'a [f32]),
+    /// Depth in steps.
+    Steps(&'a DepthSteps),
     /// Alpha or relevancy, 0..1.
     Share(&'a [f32]),
+    /// Alpha, or a mask as it was drawn, in levels.
+    Levels(&'a [u8]),
     /// Entries of the bank; a picture shows their colours, NPY has their numbers.
     Entries(&'a [u16]),
     /// Black or white.
     Mask(&'a [bool]),
 }
 
-/// Colour, depth or alpha of a frame.
+/// A picture of a frame.
 pub(super) fn layer(frame: &Frame, kind: Kind) -> Result<Layer<'_>> {
+    let Frame { color, depth, alpha, mask, levels, .. } = frame;
+    let rgb = || levels.rgb.as_deref().map(Layer::Rgb);
+    let steps = || levels.depth.as_ref().map(Layer::Steps);
+    let grey = || levels.alpha.as_deref().map(Layer::Levels);
     let layer = match kind {
-        Kind::Color => frame.color.as_deref().map(Layer::Color),
-        Kind::Depth => frame.depth.as_deref().map(Layer::Depth),
-        Kind::Alpha => frame.alpha.as_deref().map(Layer::Share),
-        Kind::Semantics | Kind::Relevancy | Kind::Mask => None,
+        Kind::Color => color.as_deref().map(Layer::Color).or_else(rgb),
+        Kind::Depth => depth.as_deref().map(Layer::Depth).or_else(steps),
+        Kind::Alpha => alpha.as_deref().map(Layer::Share).or_else(grey),
+        Kind::Mask => mask.as_deref().map(Layer::Levels),
+        Kind::Semantics | Kind::Relevancy => None,
     };
     layer.ok_or_else(|| Error::internal(format!("the renderer gave no {kind}")))
 }
@@ -67,6 +78,7 @@ pub(super) fn check(kind: Kind, format: Format) -> Result<()> {
 ///
 /// Values of 0..1 are clamped and rounded to the nearest of 256 levels, except as NPY.
 pub(super) fn encode(layer: Layer<'_>, width: u32, height: u32, format: Format) -> Result<Encoded> {
+    let unfit = || Error::internal(format!("the renderer gave other numbers than {format} has"));
     if format == Format::Npy {
         let plain = |values: &[f32]| npy(values, &[height, width]);
         let bytes = match layer {
@@ -76,28 +88,28 @@ pub(super) fn encode(layer: Layer<'_>, width: u32, height: u32, format: Format) 
                 plain(&entries.iter().map(|m| f32::from(*m)).collect::<Vec<_>>())
             }
             Layer::Mask(mask) => plain(&mask.iter().map(|on| f32::from(*on)).collect::<Vec<_>>()),
+            Layer::Levels(levels) => {
+                plain(&levels.iter().map(|v| f32::from(*v) / 255.0).collect::<Vec<_>>())
+            }
+            Layer::Rgb(_) | Layer::Steps(_) => return Err(unfit()),
         };
         return Ok(Encoded { bytes, depth_scale: None });
     }
-    let grey = |levels: Vec<u8>| match format {
-        // WebP knows no grey.
-        Format::Webp => (levels.iter().flat_map(|v| [*v; 3]).collect(), ExtendedColorType::Rgb8),
-        _ => (levels, ExtendedColorType::L8),
-    };
     let mut depth_scale = None;
-    let (samples, color) = match layer {
-        Layer::Color(color) => (levels(color.as_flattened()), ExtendedColorType::Rgb8),
+    let (samples, color): (Cow<'_, [u8]>, _) = match layer {
+        Layer::Rgb(rgb) => (rgb.as_flattened().into(), ExtendedColorType::Rgb8),
         Layer::Entries(entries) => {
-            let colours: Vec<f32> = entries.iter().flat_map(|m| colour(*m)).collect();
-            (levels(&colours), ExtendedColorType::Rgb8)
+            let colours = entries.iter().flat_map(|m| colour(*m)).map(level);
+            (colours.collect(), ExtendedColorType::Rgb8)
         }
-        Layer::Depth(depth) => {
-            let (steps, scale) = depth_steps(depth);
-            depth_scale = Some(scale);
-            (steps, ExtendedColorType::L16)
+        Layer::Steps(DepthSteps { steps, scale }) => {
+            depth_scale = Some(*scale);
+            (steps.iter().flat_map(|step| step.to_ne_bytes()).collect(), ExtendedColorType::L16)
         }
-        Layer::Share(values) => grey(levels(values)),
-        Layer::Mask(mask) => grey(mask.iter().map(|on| u8::from(*on) * 255).collect()),
+        Layer::Share(values) => grey(values.iter().map(|v| level(*v)).collect(), format),
+        Layer::Levels(levels) => grey(levels.into(), format),
+        Layer::Mask(mask) => grey(mask.iter().map(|on| u8::from(*on) * 255).collect(), format),
+        Layer::Color(_) | Layer::Depth(_) => return Err(unfit()),
     };
     let mut bytes = Vec::new();
     let to = &mut bytes;
@@ -113,24 +125,13 @@ pub(super) fn encode(layer: Layer<'_>, width: u32, height: u32, format: Format) 
     Ok(Encoded { bytes, depth_scale })
 }
 
-/// 0..1 as 0..255, rounded; NaN is 0.
-fn levels(values: &[f32]) -> Vec<u8> {
-    let level = |v: &f32| (v.clamp(0.0, 1.0) * 255.0 + 0.5) as u8;
-    values.iter().map(level).collect()
-}
-
-/// Depths as native-endian 16-bit steps of the scale; a depth over 0 is at least 1.
-fn depth_steps(depth: &[f32]) -> (Vec<u8>, f64) {
-    let farthest = depth.iter().copied().filter(|d| d.is_finite()).fold(0.0_f32, f32::max);
-    let scale = if farthest > 0.0 { f64::from(farthest) / f64::from(DEPTH_STEPS) } else { 1.0 };
-    let step = |&d: &f32| -> u16 {
-        if d > 0.0 {
-            (f64::from(d) / scale).round().clamp(1.0, f64::from(DEPTH_STEPS)) as u16
-        } else {
-            0
-        }
-    };
-    (depth.iter().map(step).flat_map(u16::to_ne_bytes).collect(), scale)
+/// Levels as an encoder takes them.
+fn grey(levels: Cow<'_, [u8]>, format: Format) -> (Cow<'_, [u8]>, ExtendedColorType) {
+    match format {
+        // WebP knows no grey.
+        Format::Webp => (levels.iter().flat_map(|v| [*v; 3]).collect(), ExtendedColorType::Rgb8),
+        _ => (levels, ExtendedColorType::L8),
+    }
 }
 
 /// `NumPy`'s format version 1.0, C order.

@@ -176,7 +176,6 @@ impl Service {
     /// Puts other caps in force; names those that only the next start can follow.
     pub fn reload(&self, limits: Limits) -> Vec<&'static str> {
         let later = self.inner.config.limits.changed_for_next_start(&limits);
-        self.inner.backend.planner.set_limits(&limits);
         *self.inner.limits.write() = Arc::new(limits);
         later
     }

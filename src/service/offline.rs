@@ -92,7 +92,7 @@ impl OfflineService {
     /// As there.
     pub fn pick(&self, scene: &Scene, spec: &PickSpec) -> Result<Picked> {
         let view = pick::pick_view(&self.limits, scene, spec)?;
-        pick::pick(&self.backend.planner, scene, &view, [spec.x, spec.y])
+        pick::pick(scene, &view, [spec.x, spec.y])
     }
 
     /// The Gaussians that a text selects.

@@ -15,7 +15,7 @@ use crate::{
     error::{Error, Result},
     limits::Limits,
     names::shown,
-    render::{Kinds, ViewPlanner},
+    render::{Kinds, oracle::contributions},
     scene::{Scene, SceneId},
 };
 
@@ -30,13 +30,8 @@ pub(super) fn pick_view<'a>(
 }
 
 /// Depth, point and Gaussian of a pixel of a view.
-pub(super) fn pick(
-    planner: &ViewPlanner,
-    scene: &Scene,
-    view: &Resolved,
-    [x, y]: [f64; 2],
-) -> Result<Picked> {
-    let request = view.labels_request(Kinds::NONE);
+pub(super) fn pick(scene: &Scene, view: &Resolved, [x, y]: [f64; 2]) -> Result<Picked> {
+    let request = view.request(scene, Kinds::NONE);
     let lens = request.camera.intrinsics;
     let pixel = [(x, lens.width, "x", "wide"), (y, lens.height, "y", "high")];
     let mut whole = [0; 2];
@@ -49,7 +44,7 @@ pub(super) fn pick(
         }
         *whole = value.floor() as u32;
     }
-    let found = planner.contributions(scene, &request, whole)?;
+    let found = contributions(&scene.gaussians, &request, whole)?;
     let alpha: f64 = found.iter().map(|one| one.weight).sum();
     let mut picked = Picked { alpha: alpha as f32, ..Picked::default() };
     if alpha <= 0.0 {
@@ -116,7 +111,7 @@ impl Service {
                     Some(understood) => Arc::clone(&understood.scene),
                     None => shared.load(&scene)?,
                 };
-                let mut picked = pick(&shared.backend.planner, &scene, &view, [spec.x, spec.y])?;
+                let mut picked = pick(&scene, &view, [spec.x, spec.y])?;
                 if let (Some(understood), Some(entry)) = (&understood, picked.entry) {
                     picked.labels = shared.labels(understood, &spec, &labels, entry)?;
                 }

@@ -45,7 +45,7 @@ pub(super) fn answer(
     if let Some(view) = view {
         let started = Instant::now();
         let key = view.labels_key(texts.of.tag, &texts.backend.renderer.name())?;
-        let (found, new) = texts.view(&view.labels_request(Kinds::NONE), key)?;
+        let (found, new) = texts.view(&view.request(texts.of.scene, Kinds::NONE), key)?;
         render_ms = Some(if new { started.elapsed().as_secs_f64() * 1e3 } else { 0.0 });
         labelled = Some(found);
     }

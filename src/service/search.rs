@@ -15,7 +15,7 @@ use crate::{
     error::{Error, Result},
     jobs::{Phrases, SemanticNetworks},
     limits::Limits,
-    render::{Labels, PixelWeights, RenderRequest, Renderer, ViewPlanner},
+    render::{Labels, PixelWeights, RenderRequest, Renderer},
     scene::{Gaussians, PAPER_PHRASES, PAPER_TAU, Scene, ScoringProfile, Semantics, TextEmbedding},
     semantics::{Components, InstanceOptions, Scorer, Scoring, TextScores, ViewNorms},
 };
@@ -24,7 +24,6 @@ use crate::{
 /// belong on a blocking thread.
 pub(super) struct Backend {
     pub(super) renderer: Arc<dyn Renderer>,
-    pub(super) planner: ViewPlanner,
     networks: Arc<dyn SemanticNetworks>,
     /// By text; each weighs 1.
     embeddings: Cache<String, Arc<TextEmbedding>>,
@@ -44,7 +43,6 @@ impl Backend {
     ) -> Self {
         Self {
             renderer,
-            planner: ViewPlanner::new(limits),
             networks,
             embeddings: Cache::new(limits.texts_cached_max as u64),
             scorers: Cache::new(limits.scorers_cache_bytes_max),
@@ -269,8 +267,7 @@ impl<'a> SceneTexts<'a> {
             return Ok((known, false));
         }
         let request = RenderRequest { labels: Labels::Weights, ..request.clone() };
-        let Backend { renderer, planner, .. } = self.backend;
-        let frame = planner.render(&**renderer, self.of.scene, &request, false)?;
+        let frame = self.backend.renderer.render(&self.of.scene.gaussians, &request)?;
         let weights =
             frame.weights.ok_or_else(|| Error::internal("the renderer gave no weights"))?;
         Ok((self.keep_view(key, [frame.width, frame.height], weights), true))

@@ -17,7 +17,10 @@ use super::{
     camera,
     create::blocking,
     encode::{self, Encoded, Layer},
-    request::{CameraSpec, Kind, PictureOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec},
+    request::{
+        Background, CameraSpec, Format, Kind, PictureOptions, TextOptions, ViewOptions, ViewSpec,
+        ViewsSpec,
+    },
     schedule::Slot,
     search::{Backend, LabelledView, SceneTexts},
     semantics::{Understood, meaning_tag},
@@ -29,11 +32,10 @@ use crate::{
     limits::Limits,
     names::shown,
     render::{
-        Frame, Kinds, Labels, RenderRequest,
-        plan::{NEAR_RANGE, default_near},
+        self, Frame, Kinds, Labels, RenderRequest, Samples,
+        plan::{self, NEAR_RANGE, default_near},
     },
     scene::{Camera, Intrinsics, Scene, SceneCamera, SceneId, ScoringProfile},
-    semantics::mask_from_blend,
     store::{Record, hex},
     telemetry::meter,
 };
@@ -51,14 +53,6 @@ pub(super) struct Resolved {
     /// As in the request, with the size and the near plane that were found.
     options: ViewOptions,
     picture: PictureOptions,
-}
-
-/// The drawn labels of a view, from which the pictures of texts are computed.
-enum ViewLabels {
-    /// Weights over the bank, which answer every text.
-    Weights(Arc<LabelledView>),
-    /// A blend, which answers the one text that it was drawn for.
-    Blend(Vec<[f32; 4]>),
 }
 
 impl Resolved {
@@ -85,14 +79,22 @@ impl Resolved {
         words(&(tag, renderer, self.camera, &self.options, self.picture.crop))
     }
 
-    /// A request of these pictures without labels.
-    pub(super) fn labels_request(&self, kinds: Kinds) -> RenderRequest {
+    /// A request of these pictures of the scene, without labels.
+    pub(super) fn request(&self, scene: &Scene, kinds: Kinds) -> RenderRequest {
         RenderRequest {
             camera: self.camera,
             crop: self.picture.crop,
             kinds,
             labels: Labels::None,
-            background: self.picture.background.color().unwrap_or_default(),
+            background: match self.picture.background {
+                Background::Backdrop => render::Background::Backdrop(Arc::clone(&scene.backdrop)),
+                Background::Color(color) => render::Background::Color(color),
+            },
+            sources: plan::sources(scene, &self.camera),
+            samples: match self.picture.format {
+                Format::Npy => Samples::F32,
+                Format::Png | Format::Jpeg | Format::Webp => Samples::Levels,
+            },
             antialiased: self.options.antialiased,
             near: self.near,
             quality: self.options.quality,
@@ -111,46 +113,43 @@ impl Resolved {
         Ok(hash(&words(&(scene, version, renderer, request, texts))?))
     }
 
-    /// One drawing for the pixel kinds and, where they are not known, for the labels.
+    /// One drawing for the pixel kinds and, where they are not known, for the labels; and the
+    /// weights where texts need them.
     fn drawn(
         &self,
         backend: &Backend,
         scene: &Scene,
         texts: Option<&SceneTexts<'_>>,
-    ) -> Result<(Frame, Option<ViewLabels>)> {
-        let mut request = self.labels_request(self.kinds());
-        let Some(texts) = texts else { return Ok((self.frame(backend, scene, &request)?, None)) };
+    ) -> Result<(Frame, Option<Arc<LabelledView>>)> {
+        let mut request = self.request(scene, self.kinds());
+        let draw = |request: &RenderRequest| backend.renderer.render(&scene.gaussians, request);
+        let Some(texts) = texts else { return Ok((draw(&request)?, None)) };
         let key = self.labels_key(texts.of.tag, &backend.renderer.name())?;
         if let Some(known) = texts.known_view(&key) {
             let (width, height) = (known.width, known.height);
             let frame = match request.kinds {
                 Kinds::NONE => Frame { width, height, ..Frame::default() },
-                _ => self.frame(backend, scene, &request)?,
+                _ => draw(&request)?,
             };
-            return Ok((frame, Some(ViewLabels::Weights(known))));
+            return Ok((frame, Some(known)));
         }
         request.labels = self.labels(texts);
-        let mut frame = self.frame(backend, scene, &request)?;
+        let mut frame = draw(&request)?;
         let size = [frame.width, frame.height];
-        let labels = match (frame.weights.take(), frame.blend.take()) {
-            (Some(weights), _) => Some(ViewLabels::Weights(texts.keep_view(key, size, weights))),
-            (None, blend) => blend.map(ViewLabels::Blend),
-        };
-        Ok((frame, labels))
+        let weights = frame.weights.take().map(|weights| texts.keep_view(key, size, weights));
+        Ok((frame, weights))
     }
 
-    fn frame(&self, backend: &Backend, scene: &Scene, request: &RenderRequest) -> Result<Frame> {
-        let backdrop = self.picture.background.color().is_none();
-        backend.planner.render(&*backend.renderer, scene, request, backdrop)
-    }
-
-    /// A mask alone is the blend of a few numbers; all else needs the weights.
+    /// A mask alone is drawn as such; all else needs the weights.
     fn labels(&self, texts: &SceneTexts<'_>) -> Labels {
         let mask_alone =
             self.kinds.iter().all(|kind| !kind.needs_semantics() || *kind == Kind::Mask);
         let tables = texts.texts.first().map(|text| text.scores.tables()).unwrap_or_default();
         match <[_; 1]>::try_from(tables) {
-            Ok([table]) if mask_alone => Labels::Blend(table),
+            Ok([table]) if mask_alone => {
+                let coverage_floor = texts.scorer.scoring().coverage_floor() as f32;
+                Labels::Mask { table, coverage_floor }
+            }
             _ => Labels::Weights,
         }
     }
@@ -166,7 +165,7 @@ impl Resolved {
         drawn: impl FnOnce(),
     ) -> Result<Vec<RenderedView>> {
         let started = Instant::now();
-        let (frame, labels) = self.drawn(backend, scene, texts)?;
+        let (frame, weights) = self.drawn(backend, scene, texts)?;
         drawn();
         let render_ms = started.elapsed().as_secs_f64() * 1e3;
         meter::stage("render", render_ms / 1e3);
@@ -174,8 +173,8 @@ impl Resolved {
         let view = |&kind: &Kind| -> Result<RenderedView> {
             let encoding = Instant::now();
             let texts = texts.filter(|_| kind.needs_semantics());
-            let encoded = match (texts, &labels) {
-                (Some(texts), Some(labels)) => self.text_picture(kind, texts, labels, &frame)?,
+            let encoded = match (texts, &weights) {
+                (Some(texts), Some(weights)) => self.text_picture(kind, texts, weights, &frame)?,
                 _ => self.encode(encode::layer(&frame, kind)?, &frame)?,
             };
             let encode_ms = encoding.elapsed().as_secs_f64() * 1e3;
@@ -207,24 +206,18 @@ impl Resolved {
         &self,
         kind: Kind,
         texts: &SceneTexts<'_>,
-        labels: &ViewLabels,
+        view: &LabelledView,
         frame: &Frame,
     ) -> Result<Encoded> {
         let (scorer, text) = (&texts.scorer, texts.texts.first());
-        match (kind, labels, text) {
-            (Kind::Mask, ViewLabels::Blend(blend), _) => {
-                let mask = mask_from_blend(&[blend.as_slice()], scorer.scoring());
-                self.encode(Layer::Mask(&mask), frame)
-            }
-            (Kind::Mask, ViewLabels::Weights(view), Some(text)) => {
+        match (kind, text) {
+            (Kind::Mask, Some(text)) => {
                 self.encode(Layer::Mask(&scorer.mask(&text.scores, &view.weights)?), frame)
             }
-            (Kind::Relevancy, ViewLabels::Weights(view), Some(text)) => {
+            (Kind::Relevancy, Some(text)) => {
                 self.encode(Layer::Share(&view.relevancy(scorer, &text.scores)?), frame)
             }
-            (Kind::Semantics, ViewLabels::Weights(view), _) => {
-                self.encode(Layer::Entries(&view.strongest(scorer)), frame)
-            }
+            (Kind::Semantics, _) => self.encode(Layer::Entries(&view.strongest(scorer)), frame),
             _ => Err(Error::internal(format!("kind={kind} was not drawn"))),
         }
     }

@@ -17,6 +17,7 @@ use segsplat::{
         PictureOptions, PoseSpec, QuerySpec, RenderedView, Rle, TextOptions, ViewOptions, ViewSpec,
     },
 };
+use segsplat_testing::frames::rounded;
 
 /// Answers every request with one frame.
 struct Given(Frame);
@@ -30,8 +31,8 @@ impl Renderer for Given {
         1
     }
 
-    fn render(&self, _: &Gaussians, _: &RenderRequest) -> Result<Frame> {
-        Ok(self.0.clone())
+    fn render(&self, _: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        Ok(rounded(self.0.clone(), request.samples))
     }
 }
 

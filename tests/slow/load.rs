@@ -167,7 +167,6 @@ async fn ten_times_the_load_takes_little_of_what_is_answered() {
     let folder = tempfile::tempdir().unwrap();
     let limits = format!(
         "queued_renders_max = 16\nqueued_jobs_max = 4\ncache_bytes_max = 64000000\n\
-         layers_cache_bytes_max = 64000000\nmagnified_cache_bytes_max = 64000000\n\
          memory_bytes_max = {MEMORY_BYTES_MAX}"
     );
     let server = Arc::new(server(folder.path(), &limits));

@@ -88,10 +88,6 @@ limits! {
     scorers_cache_bytes_max: u64 = 512 << 20, restart;
     /// Bytes of views' semantic entries kept in memory, so that the next text draws nothing.
     entries_cache_bytes_max: u64 = 512 << 20, restart;
-    /// Bytes of layers kept for views to come: three camera sets of a scene of sixteen photos.
-    layers_cache_bytes_max: u64 = 512 << 20;
-    /// Bytes of magnified Gaussians kept for views to come: thirty views of a scene of two photos.
-    magnified_cache_bytes_max: u64 = 256 << 20;
     /// Bytes kept of the parts of scenes that were looked for to give boxes.
     pieces_cache_bytes_max: u64 = 128 << 20;
     /// Parts of one text's selection that an answer lists, the largest first.

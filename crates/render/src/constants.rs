@@ -53,6 +53,24 @@ pub const SH_C3: [f32; 7] = [
     -0.590_043_6,
 ];
 
+/// Magnification up to which a Gaussian counts as seen at the network's own size.
+pub const OWN_SIZE: f32 = 1.25;
+/// Bit of a depth key that puts a Gaussian behind all those without it: depths are over 0, so the
+/// sign of their f32 is free.
+pub const BEHIND_BIT: u32 = 1 << 31;
+/// Half a level of 255: what needs no background in [`crate::Samples::Levels`] leaves less light.
+pub const HALF_LEVEL: f32 = 0.5 / 255.0;
+/// atan(x) over 0..1 to 3e-7, as x times a polynomial of x² (least largest error, by Remez).
+pub const ATAN: [f32; 7] = [
+    0.999_996_1,
+    -0.333_173_7,
+    0.198_078_16,
+    -0.132_333_43,
+    0.079_623_67,
+    -0.033_604_22,
+    0.006_811_793_4,
+];
+
 /// Gaussian-tile pairs held at once (8 bytes each, twice for the sort): 512 MiB. A frame with more
 /// is drawn in bands of tile rows.
 pub const ISECTS_MAX: u32 = 1 << 25;

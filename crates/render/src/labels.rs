@@ -7,6 +7,8 @@
 
 use std::sync::Arc;
 
+use rayon::prelude::*;
+
 use super::constants::PIXEL_WEIGHTS_MAX;
 use crate::{
     error::{Error, Result},
@@ -27,15 +29,43 @@ pub enum Labels {
     Blend(Arc<[[f32; BLEND_WIDTH]]>),
     /// The weights of all entries that a pixel shows: [`PixelWeights`].
     Weights,
+    /// A mask: 255 where the blend of the table is [`selected`], else 0.
+    Mask {
+        /// As that of [`Self::Blend`]: the coverage, then three scores.
+        table: Arc<[[f32; BLEND_WIDTH]]>,
+        /// Least coverage of a pixel that is selected.
+        coverage_floor: f32,
+    },
+}
+
+/// Whether a blended row selects its pixel: its coverage is at least the floor, no score is under
+/// 0, and not all of them are 0.
+#[inline(always)]
+pub fn selected([coverage, scores @ ..]: [f32; BLEND_WIDTH], coverage_floor: f32) -> bool {
+    let all = scores.iter().all(|&score| score >= 0.0);
+    coverage >= coverage_floor && all && scores.iter().any(|&score| score > 0.0)
 }
 
 impl Labels {
-    /// Refuses a table with a number that is not finite.
+    /// The table that is blended.
+    pub fn table(&self) -> Option<&[[f32; BLEND_WIDTH]]> {
+        match self {
+            Self::Blend(table) | Self::Mask { table, .. } => Some(table),
+            Self::None | Self::Weights => None,
+        }
+    }
+
+    /// Refuses a table or a floor with a number that is not finite.
     ///
     /// # Errors
     /// `invalid_request` with the row and the number.
     pub fn check(&self) -> Result<()> {
-        let Self::Blend(table) = self else { return Ok(()) };
+        if let Self::Mask { coverage_floor: floor, .. } = self
+            && !floor.is_finite()
+        {
+            return Err(Error::invalid(format!("labels: the coverage floor is {floor}")));
+        }
+        let Some(table) = self.table() else { return Ok(()) };
         match table.iter().enumerate().find(|(_, row)| row.iter().any(|v| !v.is_finite())) {
             Some((m, row)) => {
                 Err(Error::invalid(format!("labels: row {m} is {row:?}; numbers must be finite")))
@@ -75,82 +105,73 @@ impl WeightRows {
         self.rows[row].push((entry, weight));
     }
 
+    /// Joins parts of the same rows of pixels, from left to right.
+    pub(super) fn beside(mut parts: Vec<Self>) -> Option<Self> {
+        if parts.len() < 2 {
+            return parts.pop();
+        }
+        let rows = parts[0].rows.len();
+        let mut all = Self::new(rows, parts.iter().map(|part| part.width).sum());
+        let mut first = 0;
+        for part in parts {
+            for (row, pairs) in part.rows.into_iter().enumerate() {
+                let to = row * all.width + first;
+                let counts = &part.counts[row * part.width..(row + 1) * part.width];
+                all.counts[to..to + part.width].copy_from_slice(counts);
+                all.rows[row].extend(pairs);
+            }
+            first += part.width;
+        }
+        Some(all)
+    }
+
+    fn total(&self) -> usize {
+        self.rows.iter().map(Vec::len).sum()
+    }
+
     /// Joins bands of a view, from top to bottom.
     /// Errors: `limit_exceeded` when there are more weights than [`PIXEL_WEIGHTS_MAX`].
     pub(super) fn join(parts: Vec<Self>) -> Result<PixelWeights> {
-        let total: usize = parts.iter().flat_map(|part| &part.rows).map(Vec::len).sum();
-        check_total(total)?;
+        let total: usize = parts.iter().map(Self::total).sum();
+        if total as u64 > PIXEL_WEIGHTS_MAX {
+            return Err(Error::limit("render: weights of one view", total, PIXEL_WEIGHTS_MAX));
+        }
         let pixels = parts.iter().map(|part| part.counts.len()).sum::<usize>();
         let mut all = PixelWeights {
-            offsets: Vec::with_capacity(pixels + 1),
-            entries: Vec::with_capacity(total),
-            weights: Vec::with_capacity(total),
+            offsets: vec![0; pixels + 1],
+            entries: vec![0; total],
+            weights: vec![0.0; total],
         };
-        let mut end = 0;
-        all.offsets.push(0);
+        let mut offsets = &mut all.offsets[1..];
+        let (mut entries, mut weights) = (&mut all.entries[..], &mut all.weights[..]);
+        let mut tasks = Vec::with_capacity(parts.len());
+        let mut start = 0;
         for part in parts {
-            all.offsets.extend(part.counts.iter().map(|count| {
-                end += count;
-                end
-            }));
-            for row in part.rows {
-                all.entries.extend(row.iter().map(|pair| pair.0));
-                all.weights.extend(row.iter().map(|pair| pair.1));
-            }
+            let (mine, mine_entries, mine_weights);
+            (mine, offsets) = offsets.split_at_mut(part.counts.len());
+            (mine_entries, entries) = entries.split_at_mut(part.total());
+            (mine_weights, weights) = weights.split_at_mut(part.total());
+            let first = start;
+            start += mine_entries.len() as u32;
+            tasks.push((part, first, mine, mine_entries, mine_weights));
         }
+        tasks.into_par_iter().for_each(|(part, mut end, offsets, entries, weights)| {
+            for (offset, count) in offsets.iter_mut().zip(&part.counts) {
+                end += count;
+                *offset = end;
+            }
+            let pairs = part.rows.iter().flatten();
+            for ((entry, weight), pair) in entries.iter_mut().zip(weights).zip(pairs) {
+                (*entry, *weight) = *pair;
+            }
+        });
         Ok(all)
     }
-}
-
-/// `front` over `behind`, of which pixel i shows the share `room(i)`, 0..1.
-/// Errors: `limit_exceeded` when there are more weights than [`PIXEL_WEIGHTS_MAX`].
-pub(super) fn over(
-    front: &PixelWeights,
-    behind: &PixelWeights,
-    room: impl Fn(usize) -> f32,
-) -> Result<PixelWeights> {
-    let mut all = PixelWeights { offsets: vec![0], ..PixelWeights::default() };
-    for i in 0..front.pixels() {
-        let room = room(i);
-        let mut under = behind.pixel(i).map(|(m, w)| (m, w * room)).peekable();
-        let mut add = |(entry, weight): (u16, f32)| {
-            if weight > 0.0 {
-                all.entries.push(entry);
-                all.weights.push(weight);
-            }
-        };
-        for (entry, weight) in front.pixel(i) {
-            while let Some(before) = under.next_if(|other| other.0 < entry) {
-                add(before);
-            }
-            let same = under.next_if(|other| other.0 == entry);
-            add((entry, weight + same.map_or(0.0, |other| other.1)));
-        }
-        under.for_each(add);
-        check_total(all.entries.len())?;
-        all.offsets.push(all.entries.len() as u32);
-    }
-    Ok(all)
-}
-
-fn check_total(total: usize) -> Result<()> {
-    if total as u64 > PIXEL_WEIGHTS_MAX {
-        return Err(Error::limit("render: weights of one view", total, PIXEL_WEIGHTS_MAX));
-    }
-    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn weights(pixels: &[&[(u16, f32)]]) -> PixelWeights {
-        let mut rows = WeightRows::new(1, pixels.len());
-        for (column, pixel) in pixels.iter().enumerate() {
-            pixel.iter().for_each(|&(entry, weight)| rows.push(column, 0, entry, weight));
-        }
-        WeightRows::join(vec![rows]).expect("few weights")
-    }
 
     #[test]
     fn rows_are_joined_in_their_order_whatever_order_they_were_filled_in() {
@@ -169,14 +190,15 @@ mod tests {
     }
 
     #[test]
-    fn over_merges_by_entry_and_drops_what_is_hidden() {
-        let front = weights(&[&[(2, 0.5), (5, 0.25)], &[(1, 1.0)], &[]]);
-        let behind =
-            weights(&[&[(1, 0.5), (2, 0.5), (9, 1.0)], &[(1, 0.5), (3, 0.5)], &[(4, 0.5)]]);
-        let rooms = [0.25, 0.0, 1.0];
-        let all = over(&front, &behind, |i| rooms[i]).expect("few weights");
-        let want =
-            weights(&[&[(1, 0.125), (2, 0.625), (5, 0.25), (9, 0.25)], &[(1, 1.0)], &[(4, 0.5)]]);
-        assert_eq!(all, want);
+    fn parts_of_rows_are_joined_from_left_to_right() {
+        let (mut left, mut right) = (WeightRows::new(2, 1), WeightRows::new(2, 2));
+        right.push(1, 0, 7, 0.5);
+        left.push(0, 0, 3, 0.25);
+        right.push(0, 1, 4, 0.75);
+        let all = WeightRows::beside(vec![left, right]).expect("two parts");
+        let all = WeightRows::join(vec![all]).expect("few weights");
+        assert_eq!(all.offsets, [0, 1, 1, 2, 2, 3, 3], "offsets");
+        assert_eq!(all.entries, [3, 7, 4], "entries");
+        assert!(WeightRows::beside(Vec::new()).is_none(), "no parts");
     }
 }

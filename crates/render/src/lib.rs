@@ -9,11 +9,14 @@ pub mod constants;
 pub mod cpu;
 pub mod gpu;
 pub mod labels;
+pub mod levels;
 pub mod oracle;
 pub mod plan;
 pub mod select;
 pub mod switches;
 pub mod view;
+
+use std::sync::Arc;
 
 pub use segsplat_core::scene::PixelWeights;
 use serde::{Deserialize, Serialize};
@@ -21,14 +24,13 @@ use utoipa::ToSchema;
 
 pub use self::{
     labels::Labels,
-    plan::ViewPlanner,
+    levels::{DepthSteps, Levels},
     select::{RendererChoice, RendererOptions},
     switches::{Skip, Switches},
 };
 use crate::{
-    error::Result,
-    scene::{Camera, Gaussians, Intrinsics, Region},
-    view::View,
+    error::{Error, Result},
+    scene::{Backdrop, Camera, Gaussians, Intrinsics, Region},
 };
 use segsplat_core::{error, limits, scene};
 
@@ -70,6 +72,59 @@ impl Quality {
 
 segsplat_core::names::display_names!(Quality);
 
+/// What lies behind the Gaussians: a pixel is `colour + (1 - alpha) * background`.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Background {
+    /// One colour, 0..1, sRGB like the photos.
+    Color([f32; 3]),
+    /// The photos' colours by direction.
+    Backdrop(Arc<Backdrop>),
+}
+
+impl Background {
+    /// Black.
+    pub const BLACK: Self = Self::Color([0.0; 3]);
+}
+
+/// The numbers of a picture.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Samples {
+    /// f32, not clamped.
+    #[default]
+    F32,
+    /// Colour and alpha in 8 bits, depth in 16: [`Levels`]. Where less than half a level of light
+    /// passes the Gaussians, nothing is put behind them.
+    Levels,
+    /// As [`Self::Levels`]; colour has alpha as its fourth channel.
+    LevelsRgba,
+}
+
+/// A photo of the scene as a view needs it: where its Gaussians were seen from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Source {
+    /// Camera centre from the Gaussians' origin, world axes.
+    pub center: [f32; 3],
+    /// Axis of the camera, length 1, world axes.
+    pub axis: [f32; 3],
+    /// 1 / focal length in pixels of the network's picture; 0 where nothing is known.
+    pub scale: f32,
+    /// Whether its Gaussians are drawn behind all of the others.
+    pub behind: bool,
+}
+
+impl Source {
+    /// Refuses row `i` where a number is not finite or the scale is under 0.
+    fn check(&self, i: usize) -> Result<()> {
+        let Self { center, axis, scale, .. } = self;
+        let finite = center.iter().chain(axis).all(|v| v.is_finite());
+        if finite && scale.is_finite() && *scale >= 0.0 {
+            return Ok(());
+        }
+        let what = format!("center {center:?}, axis {axis:?}, scale {scale}");
+        Err(Error::invalid(format!("source {i} has {what}; numbers must be finite, scale >= 0")))
+    }
+}
+
 /// One view to render.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RenderRequest {
@@ -82,8 +137,13 @@ pub struct RenderRequest {
     pub kinds: Kinds,
     /// Labels wanted, from the same pass.
     pub labels: Labels,
-    /// Background colour, 0..1, sRGB like the photos.
-    pub background: [f32; 3],
+    /// What lies behind colour.
+    pub background: Background,
+    /// The photos that `source` of the Gaussians names by `view`: layers and magnification
+    /// (docs/conventions.md). A Gaussian without a row is in front, as large as it is.
+    pub sources: Arc<[Source]>,
+    /// Numbers of the pictures.
+    pub samples: Samples,
     /// gsplat's antialiased mode: opacity compensated for the 0.3 px² blur.
     pub antialiased: bool,
     /// Near plane, world units along t.z.
@@ -101,7 +161,9 @@ impl RenderRequest {
             crop: None,
             kinds,
             labels: Labels::None,
-            background: [0.0; 3],
+            background: Background::BLACK,
+            sources: Arc::default(),
+            samples: Samples::F32,
             antialiased: false,
             near,
             quality: Quality::Exact,
@@ -124,50 +186,63 @@ pub struct FrameStats {
     pub intersections: u64,
 }
 
-/// The pictures, row-major; `None` for kinds not asked for.
+/// The pictures, row-major; `None` for kinds not asked for. Colour, depth and alpha are either in
+/// f32 or in `levels`, as [`RenderRequest::samples`] says.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Frame {
     /// Width, pixels.
     pub width: u32,
     /// Height, pixels.
     pub height: u32,
-    /// `[H * W]` colours, not clamped above 1.
+    /// `[H * W]` colours over the background, not clamped above 1.
     pub color: Option<Vec<[f32; 3]>>,
     /// `[H * W]` expected depth, world units.
     pub depth: Option<Vec<f32>>,
     /// `[H * W]` accumulated opacity, 0..1.
     pub alpha: Option<Vec<f32>>,
+    /// Colour, depth and alpha in levels.
+    pub levels: Levels,
     /// `[H * W]` rows of [`Labels::Blend`], blended.
     pub blend: Option<Vec<[f32; 4]>>,
     /// What [`Labels::Weights`] asks for.
     pub weights: Option<PixelWeights>,
+    /// `[H * W]` 255 where [`Labels::Mask`] selects, else 0.
+    pub mask: Option<Vec<u8>>,
     /// Counts.
     pub stats: FrameStats,
 }
 
 impl Frame {
-    /// Pictures of zeros, `filled` pixels of each kind that is asked for. Without weights.
+    /// Pictures of zeros, `filled` pixels of each kind that is asked for; depth is f32 until
+    /// [`Self::finish`]. Without weights.
     fn blank([width, height]: [u32; 2], request: &RenderRequest, filled: usize) -> Self {
-        let RenderRequest { kinds, labels, .. } = request;
+        let RenderRequest { kinds, labels, samples, .. } = request;
+        let (exact, rgba) = (*samples == Samples::F32, *samples == Samples::LevelsRgba);
         Self {
             width,
             height,
-            color: kinds.color.then(|| vec![[0.0; 3]; filled]),
+            color: (kinds.color && exact).then(|| vec![[0.0; 3]; filled]),
             depth: kinds.depth.then(|| vec![0.0; filled]),
-            alpha: kinds.alpha.then(|| vec![0.0; filled]),
+            alpha: (kinds.alpha && exact).then(|| vec![0.0; filled]),
+            levels: Levels {
+                rgb: (kinds.color && !exact && !rgba).then(|| vec![[0; 3]; filled]),
+                rgba: (kinds.color && rgba).then(|| vec![[0; 4]; filled]),
+                depth: None,
+                alpha: (kinds.alpha && !exact).then(|| vec![0; filled]),
+            },
             blend: matches!(labels, Labels::Blend(_)).then(|| vec![[0.0; 4]; filled]),
             weights: None,
+            mask: matches!(labels, Labels::Mask { .. }).then(|| vec![0; filled]),
             stats: FrameStats::default(),
         }
     }
 
-    /// A frame without Gaussians.
-    fn background(view: &View, request: &RenderRequest) -> Self {
-        let pixels = view.width as usize * view.height as usize;
-        let mut frame = Self::blank([view.width, view.height], request, pixels);
-        frame.color.iter_mut().for_each(|color| color.fill(request.background));
-        frame.weights = (request.labels == Labels::Weights).then(|| PixelWeights::none(pixels));
-        frame
+    /// Depth in steps where levels are asked for: their size depends on the farthest of all pixels.
+    fn finish(mut self, samples: Samples) -> Self {
+        if samples != Samples::F32 {
+            self.levels.depth = self.depth.take().map(|depth| DepthSteps::of(&depth));
+        }
+        self
     }
 }
 

@@ -5,17 +5,18 @@
 //! to its end, or two depths close to each other. Another renderer may decide differently there and
 //! still be right. The oracle marks such pixels.
 
-use std::collections::BTreeMap;
+use std::{cmp::Ordering, collections::BTreeMap};
 
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::{
-    Labels, RenderRequest,
+    Background, Labels, RenderRequest, Source,
     constants::{
-        ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FRUSTUM_MARGIN, SH_C0, SH_C1, SH_C2, SH_C3, SH_OFFSET,
-        TRANSMITTANCE_MIN,
+        ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FRUSTUM_MARGIN, OWN_SIZE, SH_C0, SH_C1, SH_C2, SH_C3,
+        SH_OFFSET, TRANSMITTANCE_MIN,
     },
+    labels::BLEND_WIDTH,
 };
 use crate::{
     error::Result,
@@ -29,6 +30,10 @@ pub const CLIFF_ALPHA: f64 = 1e-4;
 pub const CLIFF_TRANSMITTANCE: f64 = 1e-3;
 /// Relative difference of two depths under which f32 arithmetic may swap them.
 pub const CLIFF_DEPTH: f64 = 1e-6;
+/// Distance of a blended number to a bound of a mask, as a share of what was summed.
+pub const CLIFF_MASK: f64 = 1e-5;
+/// Angle to the vertical, radians, within which f32 does not know a longitude.
+pub const CLIFF_POLE: f64 = 1e-5;
 
 /// Why a pixel may rightly differ.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -42,17 +47,21 @@ pub struct Cliff {
     /// A contribution's alpha would pass 1/255 if its centre moved by what f32 leaves of a place
     /// on the picture.
     pub place: bool,
+    /// A number that decides whether a mask selects the pixel is next to its bound.
+    pub mask: bool,
+    /// The backdrop shows, next to one of its poles.
+    pub pole: bool,
 }
 
 impl Cliff {
     /// Whether a renderer that sorts by the very key of the oracle may differ here.
     pub fn same_order(self) -> bool {
-        self.alpha || self.transmittance
+        self.alpha || self.transmittance || self.mask || self.pole
     }
 
     /// Whether a renderer with depths and places of its own, in f32, may differ here.
     pub fn any(self) -> bool {
-        self.alpha || self.transmittance || self.depth || self.place
+        self.same_order() || self.depth || self.place
     }
 }
 
@@ -66,7 +75,9 @@ pub struct OraclePixel {
     /// Accumulated opacity.
     pub alpha: f64,
     /// Blended rows of the request's table; zeros where none was given.
-    pub blend: [f64; 4],
+    pub blend: [f64; BLEND_WIDTH],
+    /// Whether the request's mask selects it; `false` where none was asked for.
+    pub mask: bool,
     /// Weight of each entry but 0, where weights were asked for.
     pub weights: BTreeMap<u16, f64>,
     /// Edges it stands on.
@@ -99,8 +110,7 @@ pub fn render_pixels(
     let corner = request.crop.map_or([0, 0], |crop| [crop.x, crop.y]);
     let mut splats: Vec<Splat> =
         (0..gaussians.len()).filter_map(|i| splat(gaussians, i, request, &lens)).collect();
-    // t.z narrowed to f32 is the key of the model. Stable, so ties stay in the order of the scene.
-    splats.sort_by(|a, b| (a.depth as f32).total_cmp(&(b.depth as f32)));
+    splats.sort_by(Splat::order);
     // Pixels of one row share the list of Gaussians that can reach the row.
     let mut by_row: Vec<usize> = (0..pixels.len()).collect();
     by_row.sort_by_key(|&i| pixels[i][1]);
@@ -154,7 +164,7 @@ pub fn contributions(
         .filter_map(|i| Some((i, splat(gaussians, i, request, &lens)?)))
         .filter(|(_, splat)| splat.alpha(center) >= f64::from(ALPHA_MIN))
         .collect();
-    near.sort_by(|a, b| (a.1.depth as f32).total_cmp(&(b.1.depth as f32)));
+    near.sort_by(|a, b| Splat::order(&a.1, &b.1));
     let mut transmittance = 1.0;
     let mut found = Vec::new();
     for (gaussian, splat) in near {
@@ -177,12 +187,21 @@ struct Splat {
     /// Beyond this height alpha is under 1/255 by more than the width of a cliff.
     half_height: f64,
     opacity: f64,
+    /// Whether it is drawn behind all those that are not.
+    behind: bool,
     depth: f64,
     color: DVec3,
     entry: u16,
 }
 
 impl Splat {
+    /// Front to back: t.z narrowed to f32 is the key of the model. For a stable sort, so that ties
+    /// stay in the order of the scene.
+    fn order(&self, other: &Self) -> Ordering {
+        let depths = (self.depth as f32).total_cmp(&(other.depth as f32));
+        self.behind.cmp(&other.behind).then(depths)
+    }
+
     /// Alpha at a place of the picture.
     fn alpha(&self, at: DVec2) -> f64 {
         let d = at - self.mean;
@@ -227,7 +246,10 @@ fn splat(
     );
     let [qw, qx, qy, qz] = gaussians.quats()[i].map(f64::from);
     let r = DMat3::from_quat(DQuat::from_xyzw(qx, qy, qz, qw).normalize());
-    let s = DMat3::from_diagonal(DVec3::from(gaussians.scales()[i].map(f64::from)));
+    let source = request.sources.get(usize::from(gaussians.source()[i].view));
+    let lost = source.map_or(0.0, |source| blur_lost(source, mean, t.z, lens));
+    let scales = gaussians.scales()[i].map(|s| f64::from(s).powi(2) + lost).map(f64::sqrt);
+    let s = DMat3::from_diagonal(DVec3::from(scales));
     // S2 = J W S Wᵀ Jᵀ with S = (R s)(R s)ᵀ, as A Aᵀ: its determinant is the squared length of the
     // cross product of A's rows, which stays exact for the longest needles.
     let a = jacobian * w * r * s;
@@ -255,10 +277,20 @@ fn splat(
         conic,
         half_height: (reach * (yy + blur)).sqrt(),
         opacity,
+        behind: source.is_some_and(|source| source.behind),
         depth: t.z,
         color: color(&gaussians.sh()[i * k..(i + 1) * k], from_eye.normalize_or_zero()),
         entry: gaussians.semantic_index()[i],
     })
+}
+
+/// What the blur lost of a Gaussian's variance, where a view shows it larger than its photo did:
+/// see [`crate::plan`].
+fn blur_lost(source: &Source, mean: DVec3, depth: f64, lens: &Intrinsics) -> f64 {
+    let [center, axis] = [source.center, source.axis].map(|v| DVec3::from(v.map(f64::from)));
+    let width = (mean - center).dot(axis).max(0.0) * f64::from(source.scale);
+    let p = width * lens.fx.max(lens.fy) / depth / f64::from(OWN_SIZE);
+    if p > 1.0 { f64::from(BLUR_PX2) * width.powi(2) * (1.0 - 1.0 / (p * p)) } else { 0.0 }
 }
 
 /// 3DGS harmonics at a unit direction, +0.5, negatives to 0.
@@ -296,10 +328,12 @@ fn pixel(near: &[&Splat], center: DVec2, request: &RenderRequest) -> OraclePixel
     let stop = f64::from(TRANSMITTANCE_MIN);
     let mut transmittance = 1.0;
     let (mut color, mut depth, mut alpha_sum) = (DVec3::ZERO, 0.0, 0.0);
-    let mut blend = [0.0; 4];
+    let mut blend = [0.0; BLEND_WIDTH];
+    // Sums of absolute values: f32 rounds in proportion to them.
+    let mut summed = [0.0; BLEND_WIDTH];
     let mut weights = BTreeMap::new();
     let mut cliff = Cliff::default();
-    let mut last_depth = f64::NEG_INFINITY;
+    let mut last: Option<&Splat> = None;
     for splat in near {
         let alpha = splat.alpha(center);
         let from_cliff = (alpha / alpha_min - 1.0).abs();
@@ -308,8 +342,8 @@ fn pixel(near: &[&Splat], center: DVec2, request: &RenderRequest) -> OraclePixel
         if alpha < alpha_min {
             continue;
         }
-        cliff.depth |= splat.depth - last_depth <= CLIFF_DEPTH * splat.depth;
-        last_depth = splat.depth;
+        let neighbour = last.replace(splat).filter(|last| last.behind == splat.behind);
+        cliff.depth |= neighbour.is_some_and(|n| splat.depth - n.depth <= CLIFF_DEPTH * n.depth);
         let next = transmittance * (1.0 - alpha);
         cliff.transmittance |= (next / stop - 1.0).abs() < CLIFF_TRANSMITTANCE;
         if next <= stop {
@@ -319,25 +353,44 @@ fn pixel(near: &[&Splat], center: DVec2, request: &RenderRequest) -> OraclePixel
         color += weight * splat.color;
         depth += weight * splat.depth;
         alpha_sum += weight;
-        match &request.labels {
-            Labels::None => {}
-            Labels::Blend(table) => {
-                let row = table.get(usize::from(splat.entry)).or_else(|| table.first());
-                for (sum, value) in blend.iter_mut().zip(row.into_iter().flatten()) {
-                    *sum += weight * f64::from(*value);
-                }
+        if let Some(table) = request.labels.table() {
+            for (k, value) in Labels::row(table, splat.entry).into_iter().enumerate() {
+                blend[k] += weight * f64::from(value);
+                summed[k] += weight * f64::from(value).abs();
             }
-            Labels::Weights if splat.entry == 0 => {}
-            Labels::Weights => *weights.entry(splat.entry).or_insert(0.0) += weight,
+        }
+        if request.labels == Labels::Weights && splat.entry != 0 {
+            *weights.entry(splat.entry).or_insert(0.0) += weight;
         }
         transmittance = next;
     }
-    let background = DVec3::from(request.background.map(f64::from));
+    let mut mask = false;
+    if let Labels::Mask { coverage_floor, .. } = request.labels {
+        let [coverage, scores @ ..] = blend;
+        let floor = f64::from(coverage_floor);
+        let all = scores.iter().all(|&score| score >= 0.0);
+        mask = coverage >= floor && all && scores.iter().any(|&score| score > 0.0);
+        let next_to = |k: usize, bound: f64| {
+            summed[k] > 0.0 && (blend[k] - bound).abs() <= CLIFF_MASK * summed[k]
+        };
+        cliff.mask = next_to(0, floor) || (1..BLEND_WIDTH).any(|k| next_to(k, 0.0));
+    }
+    let behind = match &request.background {
+        Background::Color(color) => DVec3::from(color.map(f64::from)),
+        Background::Backdrop(backdrop) => {
+            let pose = request.camera.camera_to_world;
+            let ray = request.camera.intrinsics.unproject(center.x, center.y, 1.0);
+            let direction = pose.rotation() * ray;
+            cliff.pole = direction.x.hypot(direction.z) < CLIFF_POLE * direction.y.abs();
+            DVec3::from(backdrop.color(direction).map(f64::from))
+        }
+    };
     OraclePixel {
-        color: (color + (1.0 - alpha_sum) * background).into(),
+        color: (color + (1.0 - alpha_sum) * behind).into(),
         depth: if alpha_sum > 0.0 { depth / alpha_sum } else { 0.0 },
         alpha: alpha_sum,
         blend,
+        mask,
         weights,
         cliff,
     }

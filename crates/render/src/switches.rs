@@ -1,6 +1,12 @@
 //! Switches that tests and the laboratory set. The product leaves all of them at their defaults.
 
-use std::path::PathBuf;
+use std::{
+    path::PathBuf,
+    sync::{
+        Arc,
+        atomic::{AtomicU32, Ordering},
+    },
+};
 
 use crate::cpu::lanes::Width;
 
@@ -24,6 +30,28 @@ pub struct Switches {
     /// Whether the kernels for software adapters are used, where one invocation does what many
     /// share on a GPU. `None`: on software adapters alone.
     pub serial: Option<bool>,
+    /// Faults to come on GPU devices.
+    pub faults: Arc<FaultsToCome>,
+}
+
+/// How often something of a GPU device still fails.
+#[derive(Debug, Default)]
+pub struct FaultsToCome {
+    /// Buffers for which there is no memory.
+    pub memory: AtomicU32,
+    /// Looks at the device that find it lost.
+    pub lost: AtomicU32,
+    /// Tries to open a device.
+    pub open: AtomicU32,
+}
+
+impl FaultsToCome {
+    /// Whether this one fails; then there is one less to come.
+    pub(crate) fn comes(fault: &AtomicU32) -> bool {
+        let less = |left: u32| left.checked_sub(1);
+        fault.load(Ordering::Relaxed) > 0
+            && fault.fetch_update(Ordering::Relaxed, Ordering::Relaxed, less).is_ok()
+    }
 }
 
 /// One kind of work that a renderer leaves out because no pixel changes. Tests switch each kind off
@@ -38,28 +66,15 @@ pub enum Skip {
     EllipseParts,
     /// Gaussians behind the rest where all rays of a tile (on the CPU: of a part) have ended.
     EndedRays,
-    /// Sorting Gaussians that no tile of the picture sees.
-    Unseen,
     /// Directions to Gaussians, and on a GPU the stage that shades, of a scene whose colours are
     /// the same from everywhere.
     FlatColor,
-    /// Blending tiles that nothing falls on. CPU only: on a GPU it is no step of its own.
-    EmptyTiles,
-    /// Digits of the depth sort that are the same for all. GPU only: on the CPU it saved nothing.
-    EqualDigits,
 }
 
 impl Skip {
     /// All of them.
-    pub const ALL: [Self; 7] = [
-        Self::EllipseTiles,
-        Self::EllipseParts,
-        Self::EndedRays,
-        Self::Unseen,
-        Self::FlatColor,
-        Self::EmptyTiles,
-        Self::EqualDigits,
-    ];
+    pub const ALL: [Self; 4] =
+        [Self::EllipseTiles, Self::EllipseParts, Self::EndedRays, Self::FlatColor];
 
     /// The constant of the shaders that is true while it is on, in those that know it.
     pub fn constant(self) -> String {

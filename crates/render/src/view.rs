@@ -4,7 +4,7 @@
 use glam::{DMat3, DVec3};
 
 use super::{
-    RenderRequest,
+    Background, RenderRequest,
     constants::{FRUSTUM_MARGIN, TILE_SIZE},
 };
 use crate::error::{Error, Result};
@@ -13,8 +13,6 @@ use crate::error::{Error, Result};
 const PIXELS_MAX: u64 = 1 << 27;
 /// Longest side: ids of tiles stay in 16 bits a side.
 const SIDE_MAX: u32 = 1 << 18;
-/// Room for what rounding moves a depth, as a share of it.
-const DEPTH_SLACK: f64 = 1e-5;
 
 /// Camera of one frame, relative to the scene's origin.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -46,8 +44,8 @@ impl View {
     ///
     /// # Errors
     /// `invalid_request` when the intrinsics are unusable, the near plane is not a finite number
-    /// over 0, or background or labels are not finite; `limit_exceeded` for a picture beyond
-    /// memory.
+    /// over 0, or background, sources or labels are not finite; `limit_exceeded` for a picture
+    /// beyond memory.
     pub fn new(origin: DVec3, request: &RenderRequest) -> Result<Self> {
         let lens = request.camera.intrinsics.validated("camera")?;
         let drawn = match request.crop {
@@ -60,8 +58,13 @@ impl View {
                 "near is {near}; it must be a finite number over 0"
             )));
         }
-        if let Some(value) = request.background.iter().find(|value| !value.is_finite()) {
+        if let Background::Color(color) = &request.background
+            && let Some(value) = color.iter().find(|value| !value.is_finite())
+        {
             return Err(Error::invalid(format!("background holds {value}, not a finite number")));
+        }
+        for (i, source) in request.sources.iter().enumerate() {
+            source.check(i)?;
         }
         request.labels.check()?;
         let pixels = u64::from(drawn.width) * u64::from(drawn.height);
@@ -94,16 +97,20 @@ impl View {
         })
     }
 
-    /// Bits in which the depth keys (t.z as f32) of Gaussians with means in the box `low` to `high`
-    /// can differ from the least of them: a bound, with room for a renderer's rounding.
-    pub fn depth_bits(&self, [low, high]: [DVec3; 2]) -> u32 {
-        let axis = self.rotation.row(2);
-        let middle = axis.dot(low.midpoint(high)) + self.translation.z;
-        let reach = axis.abs().dot(0.5 * (high - low));
-        let key = |depth: f64| (depth as f32).clamp(f32::MIN_POSITIVE, f32::MAX).to_bits();
-        let near = (middle - reach).max(self.near) * (1.0 - DEPTH_SLACK);
-        let far = (middle + reach) * (1.0 + DEPTH_SLACK);
-        u32::BITS - key(far).saturating_sub(key(near)).leading_zeros()
+    /// The ray of the first pixel's centre, and its change to the next column and row: world axes,
+    /// of a length whose square is an f32.
+    pub(crate) fn rays(&self) -> [[f32; 3]; 3] {
+        let to_world = self.rotation.transpose();
+        let ray = |x: f64, y: f64| {
+            let [x, y] = [(x, 0), (y, 1)].map(|(at, k)| (at - self.principal[k]) / self.focal[k]);
+            to_world * DVec3::new(x, y, 1.0)
+        };
+        let first = ray(0.5, 0.5);
+        let last = ray(f64::from(self.width), f64::from(self.height));
+        let scale = first.length().max(last.length()).recip();
+        let across = to_world * DVec3::X / self.focal[0];
+        let down = to_world * DVec3::Y / self.focal[1];
+        [first, across, down].map(|v| (v * scale).as_vec3().to_array())
     }
 
     /// Tiles in a row of tiles.

@@ -8,7 +8,7 @@ use segsplat_testing::scenes;
 use super::Args;
 use crate::{
     error::{Error, Result},
-    render::{Frame, RenderRequest},
+    render::{Background, Frame, RenderRequest},
     scene::{Camera, Gaussians, Intrinsics},
 };
 
@@ -46,7 +46,10 @@ pub(super) fn dump(
     let mut camera: Vec<f32> = viewmat.iter().map(|&v| v as f32).collect();
     camera.extend([lens.fx, lens.fy, lens.cx, lens.cy].map(|v| v as f32));
     camera.extend([lens.width as f32, lens.height as f32, request.near]);
-    camera.extend(request.background);
+    let Background::Color(background) = request.background else {
+        return Err(Error::internal("a generated scene has a backdrop"));
+    };
+    camera.extend(background);
     let color = frame.color.as_deref().unwrap_or_default();
     let (width, height) = (frame.width as usize, frame.height as usize);
     let k = gaussians.sh_count();

@@ -14,7 +14,9 @@ use crate::{
         Pipeline, Reconstruction, masks,
         semantics::{SemanticsInput, SemanticsOptions, understand},
     },
-    render::{Kinds, Labels, PixelWeights, RenderRequest, ViewPlanner, cpu::CpuRenderer},
+    render::{
+        Kinds, Labels, PixelWeights, RenderRequest, Renderer, cpu::CpuRenderer, plan::served,
+    },
     scene::{Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, Watch},
     scenes::{make, scene_of, view_request},
 };
@@ -85,7 +87,7 @@ impl<'a> Tools<'a> {
             view_request(photos[target].camera, Kinds::COLOR, reconstruction.report.median_depth);
         let request = RenderRequest { labels: Labels::Weights, ..plain };
         let scene = scene_of(Reconstruction { gaussians, ..reconstruction });
-        let frame = ViewPlanner::default().render(self.renderer, &scene, &request, true)?;
+        let frame = self.renderer.render(&scene.gaussians, &served(&scene, request))?;
         let weights = frame.weights.ok_or_else(|| Error::internal("the view has no weights"))?;
         let weight: f64 = weights.weights.iter().map(|w| f64::from(*w)).sum();
         let report = json!({

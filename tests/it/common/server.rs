@@ -19,7 +19,7 @@ use segsplat::{
     error::{Error, ErrorCode, Result},
     jobs::{NoSemantics, SceneNetworks},
     pipeline::{PhotoSet, Reconstruction},
-    render::{Frame, FrameStats, Labels, PixelWeights, RenderRequest, Renderer},
+    render::{Frame, FrameStats, Labels, PixelWeights, RenderRequest, Renderer, labels::selected},
     sample::{self, SampleOptions},
     scene::{
         Backdrop, Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SceneId,
@@ -31,6 +31,7 @@ use segsplat::{
     },
     store::Place,
 };
+use segsplat_testing::frames::{behind, rounded};
 use tempfile::TempDir;
 use tokio::{net::TcpListener, sync::oneshot, task::JoinHandle};
 
@@ -238,16 +239,16 @@ fn wall(photos: &[PosedPhoto]) -> RawGaussians {
 pub(crate) struct CountingRenderer {
     /// Views drawn.
     pub(crate) drawn: AtomicUsize,
-    /// Those with blended labels.
-    pub(crate) blends: AtomicUsize,
+    /// Those with a mask.
+    pub(crate) masks: AtomicUsize,
     /// Those with pixel weights.
     pub(crate) weights: AtomicUsize,
 }
 
 impl CountingRenderer {
-    /// Views drawn, those with blended labels, those with pixel weights.
+    /// Views drawn, those with a mask, those with pixel weights.
     pub(crate) fn counts(&self) -> [usize; 3] {
-        [&self.drawn, &self.blends, &self.weights].map(|count| count.load(Ordering::Acquire))
+        [&self.drawn, &self.masks, &self.weights].map(|count| count.load(Ordering::Acquire))
     }
 }
 
@@ -263,8 +264,8 @@ impl Renderer for CountingRenderer {
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         self.drawn.fetch_add(1, Ordering::AcqRel);
         match request.labels {
-            Labels::None => {}
-            Labels::Blend(_) => drop(self.blends.fetch_add(1, Ordering::AcqRel)),
+            Labels::None | Labels::Blend(_) => {}
+            Labels::Mask { .. } => drop(self.masks.fetch_add(1, Ordering::AcqRel)),
             Labels::Weights => drop(self.weights.fetch_add(1, Ordering::AcqRel)),
         }
         PointRenderer.render(gaussians, request)
@@ -288,7 +289,9 @@ impl Renderer for PointRenderer {
         let lens = request.camera.intrinsics;
         let viewmat = request.camera.camera_to_world.viewmat();
         let pixels = lens.width as usize * lens.height as usize;
-        let (mut color, mut depth) = (vec![request.background; pixels], vec![0.0_f32; pixels]);
+        let place = |i: usize| [i as u32 % lens.width, i as u32 / lens.width];
+        let mut color: Vec<_> = (0..pixels).map(|i| behind(request, place(i))).collect();
+        let mut depth = vec![0.0_f32; pixels];
         let mut labels = vec![0; pixels];
         let mut stats = FrameStats::default();
         for (i, (mean, sh)) in gaussians.means().iter().zip(gaussians.sh()).enumerate() {
@@ -309,10 +312,11 @@ impl Renderer for PointRenderer {
             stats.visible += 1;
         }
         let alpha: Vec<f32> = depth.iter().map(|&z| f32::from(u8::from(z > 0.0))).collect();
-        let blend = match &request.labels {
-            Labels::Blend(table) => {
+        let mask = match &request.labels {
+            Labels::Mask { table, coverage_floor } => {
                 let row = |(&m, &a): (&u16, &f32)| Labels::row(table, m).map(|v| v * a);
-                Some(labels.iter().zip(&alpha).map(row).collect())
+                let on = |row| u8::from(selected(row, *coverage_floor)) * u8::MAX;
+                Some(labels.iter().zip(&alpha).map(row).map(on).collect())
             }
             _ => None,
         };
@@ -325,15 +329,17 @@ impl Renderer for PointRenderer {
             weights.weights = vec![1.0; weights.entries.len()];
             weights
         });
-        Ok(Frame {
+        let frame = Frame {
             width: lens.width,
             height: lens.height,
             color: request.kinds.color.then_some(color),
             depth: request.kinds.depth.then_some(depth),
             alpha: request.kinds.alpha.then_some(alpha),
-            blend,
             weights,
+            mask,
             stats,
-        })
+            ..Frame::default()
+        };
+        Ok(rounded(frame, request.samples))
     }
 }

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use segsplat_core::scene::{Gaussians, RawGaussians};
-use segsplat_render::{Kinds, Labels, PixelWeights, RenderRequest, Renderer};
+use segsplat_render::{Background, Kinds, Labels, PixelWeights, RenderRequest, Renderer};
 
 use crate::scenes::{Random, checked, cloud};
 
@@ -50,7 +50,7 @@ pub fn literal(
     let black = RenderRequest {
         kinds: Kinds::COLOR,
         labels: Labels::None,
-        background: [0.0; 3],
+        background: Background::BLACK,
         ..request.clone()
     };
     for first in (1..=m).step_by(3) {

@@ -9,6 +9,7 @@
 )]
 
 pub mod compare;
+pub mod frames;
 pub mod labels;
 pub mod scenes;
 

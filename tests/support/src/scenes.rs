@@ -4,7 +4,7 @@ use glam::{DVec3, Quat, Vec3};
 use segsplat_core::scene::{
     Camera, CameraToWorld, Gaussians, Intrinsics, RawGaussians, SourcePixel,
 };
-use segsplat_render::{Kinds, RenderRequest};
+use segsplat_render::{Background, Kinds, RenderRequest};
 
 /// A small seeded generator (`SplitMix64`), so that scenes never change with a library.
 #[derive(Clone, Debug)]
@@ -74,9 +74,13 @@ pub fn look(eye: DVec3, target: DVec3) -> CameraToWorld {
     CameraToWorld::look_at(eye, target, DVec3::NEG_Y, "test camera").expect("a test camera")
 }
 
+/// The background of [`request`].
+pub const BACKGROUND: [f32; 3] = [0.1, 0.2, 0.3];
+
 /// A request for everything.
 pub fn request(camera: Camera) -> RenderRequest {
-    RenderRequest { background: [0.1, 0.2, 0.3], ..RenderRequest::plain(camera, Kinds::ALL, 0.05) }
+    let background = Background::Color(BACKGROUND);
+    RenderRequest { background, ..RenderRequest::plain(camera, Kinds::ALL, 0.05) }
 }
 
 /// What two photos of `side` x `side` pixels give: a Gaussian a pixel on a smooth surface with

@@ -57,7 +57,7 @@ pub struct Scene {
     /// The Gaussians.
     pub gaussians: Gaussians,
     /// The photos' colours by direction, behind everything.
-    pub backdrop: Backdrop,
+    pub backdrop: Arc<Backdrop>,
     /// Its semantics, once they are ready; the Gaussians then have its entries.
     pub semantics: Option<Arc<Semantics>>,
 }
@@ -65,7 +65,7 @@ pub struct Scene {
 impl Scene {
     /// A scene without semantics.
     pub fn new(meta: SceneMeta, gaussians: Gaussians, backdrop: Backdrop) -> Self {
-        Self { meta, gaussians, backdrop, semantics: None }
+        Self { meta, gaussians, backdrop: Arc::new(backdrop), semantics: None }
     }
 
     /// Bytes held by its arrays.
@@ -98,7 +98,7 @@ impl Scene {
         Ok(Self {
             meta: self.meta.clone(),
             gaussians: self.gaussians.with_semantic_index(semantics.index.clone())?,
-            backdrop: self.backdrop.clone(),
+            backdrop: Arc::clone(&self.backdrop),
             semantics: Some(semantics),
         })
     }

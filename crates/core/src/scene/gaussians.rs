@@ -251,19 +251,6 @@ impl Gaussians {
         Self::new(self.raw.only(keep))
     }
 
-    /// The same Gaussians with other scales, `[N, 3]`, clamped into range.
-    ///
-    /// # Panics
-    /// When the number of scales is another: a bug of the caller.
-    #[expect(clippy::manual_clamp, reason = "`clamp` would keep a NaN; this makes it the smallest")]
-    pub fn with_scales(&self, mut scales: Vec<[f32; 3]>) -> Self {
-        assert_eq!(scales.len(), self.len(), "one scale a Gaussian; this is a bug");
-        for scale in scales.iter_mut().flatten() {
-            *scale = scale.max(Self::SCALE_MIN).min(Self::SCALE_MAX);
-        }
-        Self::new(RawGaussians { scales, ..self.raw.clone() })
-    }
-
     /// The same Gaussians with other entries of the bank, `[N]`.
     ///
     /// # Errors

@@ -1,38 +1,41 @@
-//! The tiled CPU renderer: the stages of the GPU renderer, one file each, named like the shader.
+//! The tiled CPU renderer: the stages of the GPU renderer, one file each, named like the shader
+//! (`bin` does what `prefix_sum` and `emit_isects` do, and the blend of a tile sorts it).
 //!
 //! It serves where there is no adapter. A frame is the same to the last bit for any number of
-//! threads: each task writes to places that are fixed in advance, and no sum goes across tasks.
+//! threads: each task writes to places that are fixed in advance, and no sum goes across tasks. No
+//! stage runs on one thread alone.
 
-pub mod emit_isects;
+pub mod bin;
 pub mod footprint;
 pub mod lanes;
 pub mod paint;
-pub mod prefix_sum;
 pub mod project;
-pub mod radix_sort;
 pub mod rasterize;
 pub mod shade;
-pub mod tile_ranges;
+mod sky;
+pub mod store;
 pub mod tiles;
 
-use std::ops::Range;
+use std::{ops::Range, time::Instant};
 
 use parking_lot::Mutex;
 use rayon::prelude::*;
 
 use self::{
+    bin::{Bins, Keys},
+    footprint::Footprint,
     lanes::KernelOptions,
     paint::Paint,
     project::Projected,
-    radix_sort::{key, pack, value},
-    rasterize::{RowOut, Tile, TileScratch},
+    rasterize::{Tile, TileScratch},
+    store::{Part, Pixels},
     tiles::Grid,
 };
 use super::{
-    Frame, Labels, RenderRequest, Renderer,
+    DeviceTimes, DispatchTime, Frame, Labels, RenderRequest, Renderer,
     constants::{ISECTS_MAX, TILE_SIZE},
     labels::WeightRows,
-    switches::{Skip, Switches},
+    switches::Switches,
     view::View,
 };
 use crate::{
@@ -42,6 +45,8 @@ use crate::{
 
 /// Scratch with more Gaussians than this is freed after the frame instead of kept.
 const KEPT_GAUSSIANS_MAX: usize = 2 << 20;
+/// Tasks of the blend for each thread: tiles differ much in their work.
+const TASKS_A_THREAD: usize = 16;
 
 /// Renders on the processor with its own threads.
 #[derive(Debug)]
@@ -89,37 +94,48 @@ impl CpuRenderer {
         })
     }
 
-    fn draw(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+    /// The frame, and how long each stage took.
+    fn draw(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+    ) -> Result<(Frame, Vec<DispatchTime>)> {
+        let mut watch = Watch::new();
         let view = View::new(gaussians.origin(), request)?;
         let pixels = view.width as usize * view.height as usize;
         let mut frame = Frame::blank([view.width, view.height], request, pixels);
         let mut scratch = self.frames.take();
-        let FrameScratch { projected, sorted, spare, .. } = &mut scratch;
         let options = self.options;
-        project::project(gaussians, &view, request.antialiased, options, projected);
-        let all = !options.skips(Skip::Unseen);
-        let kept = |&(_, &tiles): &(u32, &u32)| tiles > 0 || all;
-        let kept = (0_u32..).zip(&projected.tiles_per_gauss).filter(kept);
-        sorted.clear();
-        // t.z is over 0, so its bits sort like its value.
-        sorted.extend(kept.map(|(i, _)| pack(projected.footprints[i as usize].depth.to_bits(), i)));
-        radix_sort::radix_sort(sorted, spare, u32::BITS);
+        watch.ended("begin");
+        project::project(gaussians, request, &view, options, &mut scratch.projected);
+        watch.ended("project");
         if request.kinds.color {
-            shade::shade(gaussians, &view, options, projected);
+            shade::shade(gaussians, &view, options, &mut scratch.projected);
+            watch.ended("shade");
         }
-        let visible = projected.tiles_per_gauss.iter().filter(|&&tiles| tiles > 0);
-        frame.stats.visible = visible.count() as u64;
-        let grid = Grid::whole(&view, options);
-        let paint = Paint::new(request, gaussians.semantic_index(), options);
-        let mut band = Band { paint, weights: Vec::new() };
-        self.draw_band(&grid, &mut band, &mut scratch, &mut frame)?;
+        let seen = scratch.projected.tiles_per_gauss.par_iter().with_min_len(1 << 14);
+        frame.stats.visible = seen.filter(|&&tiles| tiles > 0).count() as u64;
+        let mut band = Band {
+            keys: Keys::new(gaussians, &request.sources),
+            paint: Paint::new(request, &view, gaussians.semantic_index(), options),
+            weights: Vec::new(),
+        };
+        self.draw_band(
+            &Grid::whole(&view, options),
+            &mut band,
+            &mut scratch,
+            &mut frame,
+            &mut watch,
+        )?;
         if request.labels == Labels::Weights {
             frame.weights = Some(WeightRows::join(band.weights)?);
         }
         if gaussians.len() <= KEPT_GAUSSIANS_MAX {
             self.frames.give(scratch);
         }
-        Ok(frame)
+        let frame = frame.finish(request.samples);
+        watch.ended("end");
+        Ok((frame, watch.stages))
     }
 
     /// Draws the rows of tiles of `grid`; halves them while their pairs are over the budget.
@@ -129,17 +145,11 @@ impl CpuRenderer {
         band: &mut Band<'_>,
         scratch: &mut FrameScratch,
         frame: &mut Frame,
+        watch: &mut Watch,
     ) -> Result<()> {
-        let FrameScratch { projected, sorted, spare, isect_offsets, .. } = scratch;
-        let whole = grid.tile_rows == (0..grid.height.div_ceil(TILE_SIZE));
-        let counts = sorted.iter().map(|&pair| {
-            let id = value(pair) as usize;
-            match whole {
-                true => projected.tiles_per_gauss[id],
-                false => projected.tile_spans[id].count(&projected.footprints[id], grid),
-            }
-        });
-        let total = prefix_sum::prefix_sum(counts, isect_offsets);
+        let FrameScratch { projected, bins } = scratch;
+        let total = bin::bin(projected, band.keys, grid, self.isects_max, bins);
+        watch.ended("bin");
         let Range { start, end } = grid.tile_rows;
         if total > self.isects_max {
             if end - start == 1 {
@@ -148,57 +158,96 @@ impl CpuRenderer {
             }
             let middle = start.midpoint(end);
             for tile_rows in [start..middle, middle..end] {
-                self.draw_band(&Grid { tile_rows, ..grid.clone() }, band, scratch, frame)?;
+                let part = Grid { tile_rows, ..grid.clone() };
+                self.draw_band(&part, band, scratch, frame, watch)?;
             }
             return Ok(());
         }
         frame.stats.intersections += total;
-        emit_isects::emit_isects(projected, sorted, grid, isect_offsets, &mut scratch.isects);
-        let tile_bits = u32::BITS - (grid.tile_count() - 1).leading_zeros();
-        radix_sort::radix_sort(&mut scratch.isects, spare, tile_bits);
-        tile_ranges::tile_ranges(&scratch.isects, grid.tile_count(), &mut scratch.ranges);
-        self.rasterize(grid, band, scratch, frame);
+        let inputs = (&projected.footprints[..], &bins[..]);
+        band.weights.extend(rasterize(grid, &band.paint, inputs, &self.tiles, frame));
+        watch.ended("rasterize");
         Ok(())
     }
+}
 
-    /// Blends the tiles of a band, one task a row of tiles.
-    fn rasterize(
-        &self,
-        grid: &Grid,
-        band: &mut Band<'_>,
-        scratch: &FrameScratch,
-        frame: &mut Frame,
-    ) {
-        let tiles_x = grid.tiles_x();
-        let paint = band.paint;
-        let rows = band_rows(frame, grid, *paint.labels == Labels::Weights);
-        let drawn = rows.into_par_iter().with_max_len(1).enumerate().map(|(row, mut out)| {
-            let mut tile_scratch = self.tiles.take();
-            let y = (grid.tile_rows.start + row as u32) * TILE_SIZE;
-            for tile_x in 0..tiles_x {
-                let x = tile_x * TILE_SIZE;
-                let [width, height] =
-                    [grid.width - x, grid.height - y].map(|side| TILE_SIZE.min(side));
-                let tile = Tile { x, y, width, height };
-                let id = row * tiles_x as usize + tile_x as usize;
-                let range = scratch.ranges[id] as usize..scratch.ranges[id + 1] as usize;
-                let isects = &scratch.isects[range];
-                debug_assert!(isects.iter().all(|&isect| key(isect) as usize == id));
-                rasterize::rasterize_tile(
-                    &scratch.projected.footprints,
-                    isects,
-                    tile,
-                    &paint,
-                    grid.width,
-                    &mut tile_scratch,
-                    &mut out,
-                );
+/// Blends the tiles of a band. Returns the weights of each row of tiles, where they are asked for.
+fn rasterize(
+    grid: &Grid,
+    paint: &Paint<'_>,
+    (footprints, bins): (&[Footprint], &[Bins]),
+    scratches: &Pool<TileScratch>,
+    frame: &mut Frame,
+) -> Vec<WeightRows> {
+    let tiles_x = grid.tiles_x() as usize;
+    // Tiles of a task, all in one row of tiles.
+    let tasks = rayon::current_num_threads() * TASKS_A_THREAD;
+    let across = (grid.tile_count() as usize / tasks).clamp(1, tiles_x);
+    let weighs = *paint.labels == Labels::Weights;
+    let side = TILE_SIZE as usize;
+    let rows = band_rows(frame, grid).into_par_iter().with_max_len(1).enumerate();
+    let drawn = rows.map(|(row, out)| {
+        let y = (grid.tile_rows.start + row as u32) * TILE_SIZE;
+        let height = TILE_SIZE.min(grid.height - y);
+        let parts = out.split(tiles_x.div_ceil(across), across * side);
+        let parts = parts.into_par_iter().with_max_len(1).enumerate();
+        let drawn = parts.map(|(part, mut out)| {
+            let first = part * across;
+            let last = tiles_x.min(first + across);
+            let columns = (grid.width as usize).min(last * side) - first * side;
+            out.weights = weighs.then(|| WeightRows::new(height as usize, columns));
+            let mut scratch = scratches.take();
+            for tile_x in first..last {
+                let x = tile_x as u32 * TILE_SIZE;
+                let tile = Tile { x, y, width: TILE_SIZE.min(grid.width - x), height };
+                let mut pairs = std::mem::take(&mut scratch.pairs);
+                pairs.clear();
+                bins.iter().for_each(|bins| pairs.extend(bins.of(row * tiles_x + tile_x)));
+                let place = (tile, (tile_x - first) * side);
+                let tools = (paint, &mut scratch);
+                rasterize::rasterize_tile(footprints, &mut pairs, place, tools, &mut out);
+                scratch.pairs = pairs;
             }
-            self.tiles.give(tile_scratch);
+            scratches.give(scratch);
             out.weights
         });
         let drawn: Vec<Option<WeightRows>> = drawn.collect();
-        band.weights.extend(drawn.into_iter().flatten());
+        WeightRows::beside(drawn.into_iter().flatten().collect())
+    });
+    let drawn: Vec<Option<WeightRows>> = drawn.collect();
+    drawn.into_iter().flatten().collect()
+}
+
+/// A view without Gaussians.
+pub(super) fn background(view: &View, request: &RenderRequest) -> Result<Frame> {
+    let pixels = view.width as usize * view.height as usize;
+    let mut frame = Frame::blank([view.width, view.height], request, pixels);
+    let options = KernelOptions::default();
+    let grid = Grid::whole(view, options);
+    let paint = Paint::new(request, view, &[], options);
+    let weights = rasterize(&grid, &paint, (&[], &[]), &Pool::default(), &mut frame);
+    if request.labels == Labels::Weights {
+        frame.weights = Some(WeightRows::join(weights)?);
+    }
+    Ok(frame.finish(request.samples))
+}
+
+/// How long stages take.
+struct Watch {
+    begun: Instant,
+    stages: Vec<DispatchTime>,
+}
+
+impl Watch {
+    fn new() -> Self {
+        Self { begun: Instant::now(), stages: Vec::new() }
+    }
+
+    fn ended(&mut self, stage: &'static str) {
+        let now = Instant::now();
+        let ms = now.duration_since(self.begun).as_secs_f64() * 1e3;
+        self.stages.push(DispatchTime { stage, ms });
+        self.begun = now;
     }
 }
 
@@ -209,16 +258,27 @@ impl Renderer for CpuRenderer {
 
     /// A view uses every thread; a second one fills the gaps of the first.
     fn concurrency(&self) -> usize {
-        (self.threads.current_num_threads() / 2).clamp(1, 8)
+        (self.threads.current_num_threads() / 2).clamp(2, 8)
     }
 
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
-        self.threads.install(|| self.draw(gaussians, request))
+        self.threads.install(|| self.draw(gaussians, request)).map(|(frame, _)| frame)
+    }
+
+    fn device_times(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+    ) -> Result<Option<DeviceTimes>> {
+        let (_, stages) = self.threads.install(|| self.draw(gaussians, request))?;
+        let total_ms = stages.iter().map(|stage| stage.ms).sum();
+        Ok(Some(DeviceTimes { total_ms, stages }))
     }
 }
 
 /// Data that the bands of a frame share, and their weights from top to bottom.
 struct Band<'a> {
+    keys: Keys<'a>,
     paint: Paint<'a>,
     weights: Vec<WeightRows>,
 }
@@ -227,11 +287,7 @@ struct Band<'a> {
 #[derive(Debug, Default)]
 struct FrameScratch {
     projected: Projected,
-    sorted: Vec<u64>,
-    spare: Vec<u64>,
-    isect_offsets: Vec<u64>,
-    isects: Vec<u64>,
-    ranges: Vec<u32>,
+    bins: Vec<Bins>,
 }
 
 /// Values that are used again.
@@ -248,26 +304,36 @@ impl<T: Default> Pool<T> {
     }
 }
 
-/// The pictures of a band, cut into rows of tiles.
-fn band_rows<'a>(frame: &'a mut Frame, grid: &Grid, weights: bool) -> Vec<RowOut<'a>> {
-    let stride = frame.width as usize * TILE_SIZE as usize;
-    let first = grid.tile_rows.start as usize;
-    let mut color = frame.color.as_mut().map(|all| all.chunks_mut(stride).skip(first));
-    let mut depth = frame.depth.as_mut().map(|all| all.chunks_mut(stride).skip(first));
-    let mut alpha = frame.alpha.as_mut().map(|all| all.chunks_mut(stride).skip(first));
-    let mut blend = frame.blend.as_mut().map(|all| all.chunks_mut(stride).skip(first));
-    let width = grid.width as usize;
-    grid.tile_rows
-        .clone()
-        .map(|tile_row| RowOut {
-            color: color.as_mut().and_then(Iterator::next),
-            depth: depth.as_mut().and_then(Iterator::next),
-            alpha: alpha.as_mut().and_then(Iterator::next),
-            blend: blend.as_mut().and_then(Iterator::next),
-            weights: weights.then(|| {
-                let rows = TILE_SIZE.min(grid.height - tile_row * TILE_SIZE);
-                WeightRows::new(rows as usize, width)
-            }),
-        })
-        .collect()
+/// The pictures of a band, cut into rows of tiles. Without weights.
+fn band_rows<'a>(frame: &'a mut Frame, grid: &Grid) -> Vec<Part<'a>> {
+    /// Rows of tiles of a picture from the first of the band on.
+    fn cut<'a, T>(
+        all: &'a mut Option<Vec<T>>,
+        (width, first): (usize, usize),
+    ) -> impl FnMut() -> Pixels<'a, T> {
+        let stride = width * TILE_SIZE as usize;
+        let mut rows = all.as_mut().map(|all| all.chunks_mut(stride).skip(first));
+        move || Some(rows.as_mut()?.next()?.chunks_mut(width).collect())
+    }
+    let place = (frame.width as usize, grid.tile_rows.start as usize);
+    let mut color = cut(&mut frame.color, place);
+    let mut depth = cut(&mut frame.depth, place);
+    let mut alpha = cut(&mut frame.alpha, place);
+    let mut rgb = cut(&mut frame.levels.rgb, place);
+    let mut rgba = cut(&mut frame.levels.rgba, place);
+    let mut alpha_levels = cut(&mut frame.levels.alpha, place);
+    let mut blend = cut(&mut frame.blend, place);
+    let mut mask = cut(&mut frame.mask, place);
+    let row = |_| Part {
+        color: color(),
+        depth: depth(),
+        alpha: alpha(),
+        rgb: rgb(),
+        rgba: rgba(),
+        alpha_levels: alpha_levels(),
+        blend: blend(),
+        mask: mask(),
+        weights: None,
+    };
+    grid.tile_rows.clone().map(row).collect()
 }

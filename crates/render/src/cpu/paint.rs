@@ -1,18 +1,28 @@
-//! What the blend of a frame computes: the channels of a Gaussian and the options of the kernels.
+//! What the blend of a frame computes: the channels of a Gaussian, what lies behind them, and the
+//! options of the kernels.
 
-use super::{footprint::Footprint, lanes::KernelOptions};
-use crate::{Kinds, Labels, RenderRequest, labels::BLEND_WIDTH};
+use super::{footprint::Footprint, lanes::KernelOptions, sky::Sky};
+use crate::{Background, Kinds, Labels, RenderRequest, Samples, labels::BLEND_WIDTH, view::View};
 
 /// Most channels: colour, depth, labels.
 pub(super) const CHANNELS: usize = 3 + 1 + BLEND_WIDTH;
+
+/// What lies behind colour.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Behind<'a> {
+    Color([f32; 3]),
+    Sky(Sky<'a>),
+}
 
 /// What the blend computes, chosen once for each frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Paint<'a> {
     /// Pictures asked for.
     kinds: Kinds,
-    /// Background colour.
-    pub(super) background: [f32; 3],
+    /// What lies behind colour.
+    pub(super) behind: Behind<'a>,
+    /// Numbers of the pictures.
+    pub(super) samples: Samples,
     /// Labels asked for.
     pub(super) labels: &'a Labels,
     /// `[N]` entry of each Gaussian.
@@ -21,17 +31,32 @@ pub struct Paint<'a> {
 }
 
 impl<'a> Paint<'a> {
-    /// The blend of `request`, of Gaussians with these entries, `[N]`.
-    pub fn new(request: &'a RenderRequest, entries: &'a [u16], options: KernelOptions) -> Self {
-        let RenderRequest { kinds, background, labels, .. } = request;
-        Self { kinds: *kinds, background: *background, labels, entries, options }
+    /// The blend of `request`, of which `view` is the camera, of Gaussians with these entries,
+    /// `[N]`.
+    pub fn new(
+        request: &'a RenderRequest,
+        view: &View,
+        entries: &'a [u16],
+        options: KernelOptions,
+    ) -> Self {
+        let RenderRequest { kinds, background, samples, labels, .. } = request;
+        let behind = match background {
+            Background::Color(color) => Behind::Color(*color),
+            Background::Backdrop(backdrop) => Behind::Sky(Sky::new(backdrop, view)),
+        };
+        Self { kinds: *kinds, behind, samples: *samples, labels, entries, options }
+    }
+
+    /// Whether colour is asked for.
+    pub(super) fn has_color(&self) -> bool {
+        self.kinds.color
     }
 
     /// First channel of depth and of labels, and the number of all.
     pub(super) fn layout(&self) -> [usize; 3] {
         let depth = if self.kinds.color { 3 } else { 0 };
         let label = depth + usize::from(self.kinds.depth);
-        let blend = matches!(self.labels, Labels::Blend(_));
+        let blend = self.labels.table().is_some();
         [depth, label, label + if blend { BLEND_WIDTH } else { 0 }]
     }
 
@@ -46,7 +71,7 @@ impl<'a> Paint<'a> {
         if self.kinds.depth {
             channels[depth] = footprint.depth;
         }
-        if let Labels::Blend(table) = self.labels {
+        if let Some(table) = self.labels.table() {
             let row = Labels::row(table, self.entries[id]);
             channels[label..label + BLEND_WIDTH].copy_from_slice(&row);
         }

@@ -11,9 +11,9 @@ use super::{
     tiles::{BLOCK, Ellipses, Grid, TileSpans},
 };
 use crate::{
-    constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK},
+    RenderRequest, Source,
+    constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK, OWN_SIZE},
     scene::Gaussians,
-    switches::Skip,
     view::View,
 };
 
@@ -31,12 +31,12 @@ pub struct Projected {
     pub tiles_per_gauss: Vec<u32>,
 }
 
-/// Projects every Gaussian; `antialiased` is gsplat's mode. `tiles_per_gauss[i]` is 0 if Gaussian i
-/// is dropped.
+/// Projects every Gaussian of `request`, of which `view` is the camera. `tiles_per_gauss[i]` is 0 if
+/// Gaussian i is dropped.
 pub fn project(
     gaussians: &Gaussians,
+    request: &RenderRequest,
     view: &View,
-    antialiased: bool,
     options: KernelOptions,
     projected: &mut Projected,
 ) {
@@ -52,15 +52,15 @@ pub fn project(
     chunks.enumerate().for_each(|(chunk, ((footprints, spans), tiles))| {
         let first = chunk * CHUNK;
         let out = (footprints, spans, tiles);
-        options.width.run(Chunk { gaussians, view, antialiased, options, first, out });
+        options.width.run(Chunk { gaussians, request, view, options, first, out });
     });
 }
 
 /// Gaussians of a task and where their footprints go.
 struct Chunk<'a> {
     gaussians: &'a Gaussians,
+    request: &'a RenderRequest,
     view: &'a View,
-    antialiased: bool,
     options: KernelOptions,
     first: usize,
     out: (&'a mut [Footprint], &'a mut [TileSpans], &'a mut [u32]),
@@ -69,20 +69,20 @@ struct Chunk<'a> {
 impl LaneKernel for Chunk<'_> {
     #[inline(always)]
     fn run<S: Lanes>(self, simd: S) {
-        let Self { view, antialiased, options, out: (footprints, spans, tiles), .. } = self;
+        let Self { request, view, options, out: (footprints, spans, tiles), .. } = self;
+        let magnifies = !request.sources.is_empty();
         let grid = Grid::whole(view, options);
         let out = footprints.chunks_mut(BLOCK).zip(spans.chunks_mut(BLOCK));
         let out = out.zip(tiles.chunks_mut(BLOCK)).enumerate();
         let (mut block, mut ellipses) = (Block::default(), Ellipses::default());
         for (at, ((footprints, spans), tiles)) in out {
             tiles.fill(0);
-            if !options.skips(Skip::Unseen) {
-                // The spans of dropped Gaussians are read too.
-                spans.fill(TileSpans::default());
-            }
             let first = self.first + at * BLOCK;
             block.load(self.gaussians, first, footprints.len());
-            if !block.project(simd, view, antialiased) {
+            if magnifies {
+                block.load_widths(self.gaussians, first, footprints.len(), &request.sources);
+            }
+            if !block.project(simd, view, request.antialiased, magnifies) {
                 continue;
             }
             let mut seen = 0_u32;
@@ -109,6 +109,8 @@ struct Block {
     mean: [Row; 3],
     quat: [Row; 4],
     scale: [Row; 3],
+    /// Width of the source pixel in the world; 0 where it is not known.
+    width: Row,
     opacity: Row,
     center: [Row; 2],
     conic_shear: Row,
@@ -140,9 +142,37 @@ impl Block {
         }
     }
 
-    /// EWA projection of the block. Returns whether any Gaussian may be visible.
     #[inline(always)]
-    fn project<S: Lanes>(&mut self, simd: S, view: &View, antialiased: bool) -> bool {
+    fn load_widths(
+        &mut self,
+        gaussians: &Gaussians,
+        first: usize,
+        count: usize,
+        sources: &[Source],
+    ) {
+        for (k, of) in gaussians.source()[first..first + count].iter().enumerate() {
+            self.width[k] = 0.0;
+            if let Some(source) = sources.get(usize::from(of.view)) {
+                let mut depth = 0.0;
+                for (axis, mean) in self.mean.iter().enumerate() {
+                    let from = mean[k] - f64::from(source.center[axis]);
+                    depth += from * f64::from(source.axis[axis]);
+                }
+                self.width[k] = depth.max(0.0) * f64::from(source.scale);
+            }
+        }
+    }
+
+    /// EWA projection of the block; `magnifies` if its widths are loaded. Returns whether any
+    /// Gaussian may be visible.
+    #[inline(always)]
+    fn project<S: Lanes>(
+        &mut self,
+        simd: S,
+        view: &View,
+        antialiased: bool,
+        magnifies: bool,
+    ) -> bool {
         let mut any = false;
         self.kept = [0.0; BLOCK];
         // No `map` of arrays from here on: what it calls is not compiled for the processor.
@@ -155,6 +185,8 @@ impl Block {
             }
             *moved = number(view.translation[row]);
         }
+        let blur = number(f64::from(BLUR_PX2));
+        let larger_focal = view.focal[0].max(view.focal[1]) / f64::from(OWN_SIZE);
         for i in 0..BLOCK / S::F64_LANES {
             let at = |row: &Row| Wide::at(simd, row, i);
             let mean = [at(&self.mean[0]), at(&self.mean[1]), at(&self.mean[2])];
@@ -177,9 +209,20 @@ impl Block {
             // Rows of M = J W R diag(scales), so that the 2D covariance is M Mᵀ.
             let quat = [at(&self.quat[0]), at(&self.quat[1]), at(&self.quat[2]), at(&self.quat[3])];
             let columns = rotation(number(1.0), number(2.0), quat);
+            // What the blur lost: see `plan`.
+            let mut lost = number(0.0);
+            if magnifies {
+                let width = at(&self.width);
+                let p = width * number(larger_focal) * per_z;
+                let share = (number(1.0) - number(1.0) / (p * p)).only(p.at_least(number(1.0)));
+                lost = blur * width * width * share;
+            }
             let mut local = w;
             for (k, column) in columns.into_iter().enumerate() {
-                let scale = at(&self.scale[k]);
+                let mut scale = at(&self.scale[k]);
+                if magnifies {
+                    scale = scale.times_plus(scale, lost).sqrt();
+                }
                 for row in 0..3 {
                     local[row][k] = dot(w[row], column) * scale;
                 }
@@ -187,7 +230,6 @@ impl Block {
             let [row_x, row_y, row_z] = local;
             let m0 = image_row(row_x, row_z, bounded[0], number(view.focal[0]) * per_z);
             let m1 = image_row(row_y, row_z, bounded[1], number(view.focal[1]) * per_z);
-            let blur = number(f64::from(BLUR_PX2));
             let (xx, yy) = (dot(m0, m0), dot(m1, m1));
             // det(M Mᵀ) as a sum of squares (Cauchy-Binet): it cannot cancel or go negative.
             let cross = [

@@ -1,4 +1,4 @@
-//! Stage 8: front-to-back blend of colour, depth, alpha and labels.
+//! Stage 8: front-to-back blend of colour, depth, alpha and labels. `store` then writes the pictures.
 //! Shader: `shaders/rasterize.wgsl`
 //!
 //! A tile is cut into cells of 4 x 4 pixels. Gaussians are staged in batches. Each one marks the
@@ -12,35 +12,37 @@
 //! size of the bank does not matter.
 
 use super::{
+    bin::value,
     footprint::Footprint,
     lanes::{LaneKernel, Lanes, exp2_neg},
     paint::{CHANNELS, Paint},
-    radix_sort,
+    store::{Part, Store},
 };
 use crate::{
     Labels,
     constants::{ALPHA_MAX, ALPHA_MIN, BATCH_SIZE, TILE_SIZE, TRANSMITTANCE_MIN},
-    labels::{BLEND_WIDTH, WeightRows},
     switches::Skip,
 };
 
 const SIDE: usize = TILE_SIZE as usize;
 /// Side of a cell, pixels.
-const CELL: usize = 4;
+pub(super) const CELL: usize = 4;
 /// Cells in a row of a tile.
-const ACROSS: usize = SIDE / CELL;
+pub(super) const ACROSS: usize = SIDE / CELL;
 /// Cells of a tile.
-const CELLS: usize = ACROSS * ACROSS;
+pub(super) const CELLS: usize = ACROSS * ACROSS;
 /// Pixels of a cell.
-const PIXELS: usize = CELL * CELL;
+pub(super) const PIXELS: usize = CELL * CELL;
+/// Pairs of a tile that are sorted first.
+const PORTION: usize = 1024;
 /// Gaussians of a batch: their marks are transposed together.
 const GROUP: usize = 64;
 /// Centres of the cells, relative to the centre of the tile, pixels.
-const CELL_X: Numbers = along(ACROSS, false, CELL as f32);
-const CELL_Y: Numbers = along(ACROSS, true, CELL as f32);
+pub(super) const CELL_X: Numbers = along(ACROSS, false, CELL as f32);
+pub(super) const CELL_Y: Numbers = along(ACROSS, true, CELL as f32);
 /// Centres of a cell's pixels, relative to the centre of the cell.
-const PIXEL_X: Numbers = along(CELL, false, 1.0);
-const PIXEL_Y: Numbers = along(CELL, true, 1.0);
+pub(super) const PIXEL_X: Numbers = along(CELL, false, 1.0);
+pub(super) const PIXEL_Y: Numbers = along(CELL, true, 1.0);
 /// Powers are exponents of 2: half the squared distance times log2 e.
 const SQRT_LOG2_E: f64 = 1.201_122_408_786_449_8;
 /// Slack for the rounding of a cell's bound, in addition to the footprint's slack.
@@ -49,21 +51,21 @@ const POWER_SLACK: f32 = 1e-4;
 /// One number for each of 16 pixels or cells, in one line of the cache.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[repr(C, align(64))]
-struct Numbers([f32; 16]);
+pub(super) struct Numbers(pub(super) [f32; 16]);
 
 impl Numbers {
-    const ZERO: Self = Self([0.0; 16]);
+    pub(super) const ZERO: Self = Self([0.0; 16]);
     const ONE: Self = Self([1.0; 16]);
 
     /// Vector `i`.
     #[inline(always)]
-    fn at<S: Lanes>(&self, simd: S, i: usize) -> S::f32s {
+    pub(super) fn at<S: Lanes>(&self, simd: S, i: usize) -> S::f32s {
         simd.load(&self.0, i)
     }
 
     /// Writes vector `i`.
     #[inline(always)]
-    fn put<S: Lanes>(&mut self, simd: S, i: usize, value: S::f32s) {
+    pub(super) fn put<S: Lanes>(&mut self, simd: S, i: usize, value: S::f32s) {
         simd.store(&mut self.0, i, value);
     }
 }
@@ -105,13 +107,13 @@ struct Staged {
 
 /// The pixels of a cell, one row for each number.
 #[derive(Clone, Copy, Debug)]
-struct Cell {
+pub(super) struct Cell {
     /// Transmittance while the ray goes on, 0 after it has ended.
     transmittance: Numbers,
     /// Accumulated opacity.
-    alpha: Numbers,
+    pub(super) alpha: Numbers,
     /// Accumulated channels.
-    channels: [Numbers; CHANNELS],
+    pub(super) channels: [Numbers; CHANNELS],
 }
 
 impl Cell {
@@ -125,16 +127,19 @@ impl Cell {
 /// Scratch of one worker. Its contents are undefined between tiles.
 #[derive(Debug)]
 pub struct TileScratch {
+    /// Pairs of a tile.
+    pub(super) pairs: Vec<u64>,
     fetched: Vec<Footprint>,
     staged: Vec<Staged>,
     marks: [[u64; CELLS]; BATCH_SIZE / GROUP],
-    cells: [Cell; CELLS],
-    bins: Bins,
+    pub(super) cells: [Cell; CELLS],
+    pub(super) bins: Bins,
 }
 
 impl Default for TileScratch {
     fn default() -> Self {
         Self {
+            pairs: Vec::new(),
             fetched: vec![Footprint::default(); BATCH_SIZE],
             staged: vec![Staged::default(); BATCH_SIZE],
             marks: [[0; CELLS]; BATCH_SIZE / GROUP],
@@ -146,24 +151,24 @@ impl Default for TileScratch {
 
 /// Weights of the entries that occur in a tile.
 #[derive(Debug, Default)]
-struct Bins {
+pub(super) struct Bins {
     /// Entries that occur, ascending. Bin b belongs to `present[b]`.
-    present: Vec<u16>,
+    pub(super) present: Vec<u16>,
     /// `[65536]` bin of each entry, [`NO_BIN`] if it does not occur; empty before the first tile.
     bin_of: Vec<u32>,
     /// `[CELLS, present.len()]` sums.
-    sums: Vec<Numbers>,
+    pub(super) sums: Vec<Numbers>,
 }
 
 impl Bins {
-    /// Makes a bin for each entry over 0 of the Gaussians `isects`. All sums are 0.
-    fn open(&mut self, isects: &[u64], entries: &[u16]) {
+    /// Makes a bin for each entry over 0 of the Gaussians of `pairs`. All sums are 0.
+    fn open(&mut self, pairs: &[u64], entries: &[u16]) {
         self.bin_of.resize(1 << u16::BITS, NO_BIN);
         for left in self.present.drain(..) {
             self.bin_of[usize::from(left)] = NO_BIN;
         }
-        for &isect in isects {
-            let entry = entries[radix_sort::value(isect) as usize];
+        for &pair in pairs {
+            let entry = entries[value(pair) as usize];
             let bin = &mut self.bin_of[usize::from(entry)];
             if entry != 0 && *bin == NO_BIN {
                 *bin = 0;
@@ -186,21 +191,6 @@ impl Bins {
     }
 }
 
-/// A row of tiles of the pictures; `None` for kinds not asked for.
-#[derive(Debug, Default)]
-pub struct RowOut<'a> {
-    /// `[rows * width]` colours.
-    pub color: Option<&'a mut [[f32; 3]]>,
-    /// `[rows * width]` expected depths.
-    pub depth: Option<&'a mut [f32]>,
-    /// `[rows * width]` opacities.
-    pub alpha: Option<&'a mut [f32]>,
-    /// `[rows * width]` blended labels.
-    pub blend: Option<&'a mut [[f32; BLEND_WIDTH]]>,
-    /// Weights of the rows.
-    pub weights: Option<WeightRows>,
-}
-
 /// Place and size of a tile, pixels.
 #[derive(Clone, Copy, Debug)]
 pub struct Tile {
@@ -214,31 +204,26 @@ pub struct Tile {
     pub height: u32,
 }
 
-/// Blends the Gaussians `isects` (depth order) over the pixels of `tile`. `picture_width` is the
-/// stride of `out`, which starts at the tile's first row.
+/// Blends the Gaussians of the pairs, in any order, over the pixels of `tile`, and writes them to
+/// `out` from row 0 and `column` on.
 pub fn rasterize_tile(
     footprints: &[Footprint],
-    isects: &[u64],
-    tile: Tile,
-    paint: &Paint<'_>,
-    picture_width: u32,
-    scratch: &mut TileScratch,
-    out: &mut RowOut<'_>,
+    pairs: &mut [u64],
+    (tile, column): (Tile, usize),
+    (paint, scratch): (&Paint<'_>, &mut TileScratch),
+    out: &mut Part<'_>,
 ) {
-    if isects.is_empty() && paint.options.skips(Skip::EmptyTiles) {
-        return store_empty(tile, paint, picture_width, out);
-    }
     if *paint.labels == Labels::Weights {
-        scratch.bins.open(isects, paint.entries);
+        scratch.bins.open(pairs, paint.entries);
     }
-    paint.options.width.run(Blend { footprints, isects, tile, paint, scratch: &mut *scratch });
-    store(tile, paint, picture_width, scratch, out);
+    paint.options.width.run(Blend { footprints, pairs, tile, paint, scratch: &mut *scratch });
+    paint.options.width.run(Store { tile, paint, column, scratch, out });
 }
 
 /// A tile, its Gaussians and the scratch to blend them in.
 struct Blend<'a> {
     footprints: &'a [Footprint],
-    isects: &'a [u64],
+    pairs: &'a mut [u64],
     tile: Tile,
     paint: &'a Paint<'a>,
     scratch: &'a mut TileScratch,
@@ -269,20 +254,30 @@ impl LaneKernel for Blend<'_> {
 impl Blend<'_> {
     #[inline(always)]
     fn blend<S: Lanes, const K: usize, const WEIGHTS: bool>(self, simd: S) {
-        let Self { footprints, isects, tile, paint, scratch } = self;
+        let Self { footprints, pairs, tile, paint, scratch } = self;
         let by_parts = paint.options.skips(Skip::EllipseParts);
         let ends = paint.options.skips(Skip::EndedRays);
         let mut open = clear(&mut scratch.cells, tile);
-        for batch in isects.chunks(BATCH_SIZE) {
+        let mut rest = Rest { pairs, portion: PORTION };
+        let mut sorted: &[u64] = &[];
+        while open != 0 {
+            if sorted.is_empty() {
+                sorted = rest.nearest();
+            }
+            let batch = &sorted[..BATCH_SIZE.min(sorted.len())];
+            sorted = &sorted[batch.len()..];
+            if batch.is_empty() {
+                break;
+            }
             // Footprints lie far apart in memory. This loop is short, so that the processor fetches
             // many of them at the same time.
             let fetched = &mut scratch.fetched[..batch.len()];
             for (fetched, &isect) in fetched.iter_mut().zip(batch) {
-                *fetched = footprints[radix_sort::value(isect) as usize];
+                *fetched = footprints[value(isect) as usize];
             }
             let staged = &mut scratch.staged[..batch.len()];
             for ((staged, footprint), &isect) in staged.iter_mut().zip(fetched).zip(batch) {
-                let id = radix_sort::value(isect) as usize;
+                let id = value(isect) as usize;
                 let bin = match WEIGHTS {
                     true => scratch.bins.bin_of[usize::from(paint.entries[id])],
                     false => NO_BIN,
@@ -315,10 +310,30 @@ impl Blend<'_> {
                     open &= !(1 << at);
                 }
             }
-            if open == 0 {
-                break;
-            }
         }
+    }
+}
+
+/// Pairs that are not sorted yet. Most rays end after few Gaussians, so the nearest are sorted first.
+struct Rest<'a> {
+    pairs: &'a mut [u64],
+    portion: usize,
+}
+
+impl<'a> Rest<'a> {
+    /// The nearest of the rest, sorted; empty if there are none. Each portion is twice the last.
+    #[inline(never)]
+    fn nearest(&mut self) -> &'a [u64] {
+        let pairs = std::mem::take(&mut self.pairs);
+        let count = self.portion.min(pairs.len());
+        if count < pairs.len() {
+            pairs.select_nth_unstable(count);
+        }
+        let (near, far) = pairs.split_at_mut(count);
+        near.sort_unstable();
+        self.pairs = far;
+        self.portion *= 2;
+        near
     }
 }
 
@@ -486,68 +501,29 @@ fn blend_cell<S: Lanes, const K: usize, const WEIGHTS: bool>(
     goes_on
 }
 
-/// Writes a tile without Gaussians.
-fn store_empty(tile: Tile, paint: &Paint<'_>, picture_width: u32, out: &mut RowOut<'_>) {
-    for row in 0..tile.height as usize {
-        let first = row * picture_width as usize + tile.x as usize;
-        let pixels = first..first + tile.width as usize;
-        if let Some(color) = &mut out.color {
-            color[pixels.clone()].fill(paint.background);
-        }
-        for plane in [&mut out.depth, &mut out.alpha].into_iter().flatten() {
-            plane[pixels.clone()].fill(0.0);
-        }
-        if let Some(blend) = &mut out.blend {
-            blend[pixels].fill([0.0; BLEND_WIDTH]);
-        }
-    }
-}
-
-/// Writes every pixel of the tile, colour blended over the background.
-fn store(
-    tile: Tile,
-    paint: &Paint<'_>,
-    picture_width: u32,
-    scratch: &TileScratch,
-    out: &mut RowOut<'_>,
-) {
-    let [depth_at, label_at, _] = paint.layout();
-    for row in 0..tile.height as usize {
-        for column in 0..tile.width as usize {
-            let at = row * picture_width as usize + tile.x as usize + column;
-            let cell_at = row / CELL * ACROSS + column / CELL;
-            let cell = &scratch.cells[cell_at];
-            let pixel = row % CELL * CELL + column % CELL;
-            let alpha = cell.alpha.0[pixel].min(1.0);
-            if let Some(color) = &mut out.color {
-                color[at] = std::array::from_fn(|channel| {
-                    cell.channels[channel].0[pixel] + (1.0 - alpha) * paint.background[channel]
-                });
-            }
-            if let Some(depth) = &mut out.depth {
-                let sum = cell.channels[depth_at].0[pixel];
-                depth[at] = if alpha > 0.0 { sum / cell.alpha.0[pixel] } else { 0.0 };
-            }
-            if let Some(out) = &mut out.alpha {
-                out[at] = alpha;
-            }
-            if let Some(blend) = &mut out.blend {
-                blend[at] = std::array::from_fn(|k| cell.channels[label_at + k].0[pixel]);
-            }
-            if let Some(weights) = &mut out.weights {
-                let Bins { present, sums, .. } = &scratch.bins;
-                let sums = &sums[cell_at * present.len()..];
-                for (entry, sum) in present.iter().zip(sums).filter(|(_, sum)| sum.0[pixel] > 0.0) {
-                    weights.push(tile.x as usize + column, row, *entry, sum.0[pixel]);
-                }
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn portions_come_in_order_and_hold_every_pair() {
+        let mut random = 9_u32;
+        for count in [0, 1, PORTION, PORTION + 1, 5 * PORTION] {
+            let mut pairs: Vec<u64> = (0..count as u64)
+                .map(|id| {
+                    random = random.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                    u64::from(random >> 24) << 32 | id
+                })
+                .collect();
+            let mut want = pairs.clone();
+            want.sort_unstable();
+            let mut rest = Rest { pairs: &mut pairs, portion: PORTION };
+            let portions = std::iter::repeat_with(|| rest.nearest());
+            let got: Vec<u64> =
+                portions.take_while(|all| !all.is_empty()).flatten().copied().collect();
+            assert_eq!(got, want, "{count} pairs");
+        }
+    }
 
     #[test]
     fn transposed_marks_are_the_same_marks() {

@@ -100,6 +100,31 @@ impl TileSpans {
         }
     }
 
+    /// Most tiles of [`Self::few`].
+    pub(super) const FEW: usize = 4;
+
+    /// Where a footprint touches at most two tiles in each of at most two rows: four tiles counted
+    /// from the first of `grid`, and which of them are touched.
+    #[inline(always)]
+    pub(super) fn few(&self, grid: &Grid) -> Option<[(u32, bool); Self::FEW]> {
+        let [[a, a_end], [b, b_end]] = self.spans.map(|span| span.map(u32::from));
+        if self.rows > 2 || a_end > a + 2 || b_end > b + 2 {
+            return None;
+        }
+        let Range { start, end } = grid.tile_rows;
+        let first = u32::from(self.first_row);
+        let inside = |row: u32| (start..end).contains(&row);
+        let (top, low) = (inside(first), inside(first + 1));
+        let row = |row: u32| row.wrapping_sub(start).wrapping_mul(grid.tiles_x());
+        let (top_row, low_row) = (row(first), row(first + 1));
+        Some([
+            (top_row.wrapping_add(a), top & (a < a_end)),
+            (top_row.wrapping_add(a + 1), top & (a + 1 < a_end)),
+            (low_row.wrapping_add(b), low & (b < b_end)),
+            (low_row.wrapping_add(b + 1), low & (b + 1 < b_end)),
+        ])
+    }
+
     /// Number of tiles touched in `grid`, which may be a band of the first grid.
     pub fn count(&self, footprint: &Footprint, grid: &Grid) -> u32 {
         let mut count = 0;

@@ -3,10 +3,15 @@
 #![expect(missing_docs, reason = "shaders/common/structs.wgsl describes the fields")]
 
 use bytemuck::{Pod, Zeroable};
-use glam::DVec3;
 
-use super::{device::Gpu, recorder::SceneBuffers};
+use super::{
+    device::Gpu,
+    pipelines::{LEVELS_RGB, LEVELS_RGBA, NO_PICTURE},
+    recorder::SceneBuffers,
+};
 use crate::{
+    Background, Labels, RenderRequest, Samples, Source,
+    constants::{HALF_LEVEL, OWN_SIZE},
     error::{Error, ErrorCode, Result},
     scene::Gaussians,
     view::View,
@@ -49,8 +54,36 @@ pub struct ViewRow {
     pub slot_start: u32,
     pub range_start: u32,
     pub pair_start: u32,
-    pub fast: u32,
-    pub reserved: u32,
+    pub levels: u32,
+    pub alpha_byte_start: u32,
+    pub mask_start: u32,
+    pub steps_start: u32,
+    pub backdrop_start: u32,
+    pub room_min: f32,
+    pub coverage_floor: f32,
+    pub own_focal: f32,
+    pub source_count: u32,
+    pub source_start: u32,
+    pub ray_first: [f32; 4],
+    pub ray_across: [f32; 4],
+    pub ray_down: [f32; 4],
+}
+
+/// `Source` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct SourceRow {
+    pub center: [f32; 3],
+    pub scale: f32,
+    pub axis: [f32; 3],
+    pub behind: u32,
+}
+
+impl From<&Source> for SourceRow {
+    fn from(source: &Source) -> Self {
+        let Source { center, axis, scale, behind } = *source;
+        Self { center, scale, axis, behind: u32::from(behind) }
+    }
 }
 
 /// `Gaussian` of the shaders.
@@ -61,7 +94,7 @@ pub struct GaussianRow {
     pub opacity: f32,
     pub quat: [f32; 4],
     pub scale: [f32; 3],
-    pub reserved: f32,
+    pub source: u32,
 }
 
 /// `Footprint` of the shaders.
@@ -77,35 +110,14 @@ pub struct FootprintRow {
     pub depth: f32,
 }
 
-/// `Plan` of the shaders.
+/// `Plan` of the shaders. Zeros before the first stage.
 #[repr(C)]
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Pod, Zeroable)]
 pub struct PlanRow {
     pub isects: u32,
     pub needed: u32,
     pub visible: u32,
-    pub sorted: u32,
-    pub key_min: u32,
-    pub key_max: u32,
-    pub passes: u32,
-    pub reserved: u32,
-}
-
-impl Default for PlanRow {
-    /// Before the first stage.
-    fn default() -> Self {
-        Self { key_min: u32::MAX, ..Self::zeroed() }
-    }
-}
-
-/// `SortParams` of the shaders.
-#[repr(C)]
-#[derive(Clone, Copy, Debug, Pod, Zeroable)]
-pub struct SortParams {
-    pub shift: u32,
-    pub pass_at: u32,
-    pub by_tile: u32,
-    pub reserved: u32,
+    pub farthest: u32,
 }
 
 const _: () = assert!(size_of::<ViewRow>().is_multiple_of(16), "a uniform block");
@@ -141,7 +153,44 @@ impl ViewRow {
             row_start: 0,
             row_end: view.tiles_y(),
             antialiased: u32::from(antialiased),
+            color_start: NO_PICTURE,
+            depth_start: NO_PICTURE,
+            alpha_start: NO_PICTURE,
+            blend_start: NO_PICTURE,
+            alpha_byte_start: NO_PICTURE,
+            mask_start: NO_PICTURE,
+            steps_start: NO_PICTURE,
+            backdrop_start: NO_PICTURE,
             ..Self::zeroed()
+        }
+    }
+
+    /// The row of a request, of which `view` is the camera. The caller sets also where the view's
+    /// photos, its table and its backdrop start.
+    pub fn of(view: &View, request: &RenderRequest) -> Self {
+        let background = match &request.background {
+            Background::Color(color) => *color,
+            Background::Backdrop(_) => [0.0; 3],
+        };
+        let exact = request.samples == Samples::F32;
+        let [first, across, down] = view.rays().map(|[x, y, z]| [x, y, z, 0.0]);
+        Self {
+            levels: match request.samples {
+                Samples::F32 => 0,
+                Samples::Levels => LEVELS_RGB,
+                Samples::LevelsRgba => LEVELS_RGBA,
+            },
+            room_min: if exact { f32::MIN_POSITIVE } else { HALF_LEVEL },
+            coverage_floor: match request.labels {
+                Labels::Mask { coverage_floor, .. } => coverage_floor,
+                _ => 0.0,
+            },
+            own_focal: (view.focal[0].max(view.focal[1]) / f64::from(OWN_SIZE)) as f32,
+            source_count: request.sources.len() as u32,
+            ray_first: first,
+            ray_across: across,
+            ray_down: down,
+            ..Self::new(view, background, request.antialiased)
         }
     }
 }
@@ -158,8 +207,6 @@ pub(super) struct DeviceScene {
     pub(super) gaussians: wgpu::Buffer,
     /// `[N, K, 3]` f32.
     pub(super) sh: wgpu::Buffer,
-    /// Smallest and largest mean along each axis, relative to the origin.
-    pub(super) bounds: [DVec3; 2],
     /// Uploaded when a request first asks for labels.
     pub(super) labels: Option<DeviceLabels>,
 }
@@ -207,16 +254,11 @@ impl DeviceScene {
                 opacity: source.opacities()[i],
                 quat: source.quats()[i],
                 scale: source.scales()[i],
-                reserved: 0.0,
+                source: source.source()[i].view.into(),
             })
             .collect();
-        let means = || source.means().iter().map(|mean| glam::Vec3::from(*mean).as_dvec3());
         Ok(Self {
             shape: source.shape_identity(),
-            bounds: [
-                means().reduce(DVec3::min).unwrap_or_default(),
-                means().reduce(DVec3::max).unwrap_or_default(),
-            ],
             count: narrow("gaussians", source.len())?,
             sh_count: source.sh_count() as u32,
             gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows))?,

@@ -1,26 +1,27 @@
 //! One submission: it makes room for the Gaussian-tile pairs of a batch of views, draws them and
 //! reads their pictures back. A view that does not fit is drawn in bands.
 
-use std::ops::Range;
+use std::{ops::Range, sync::Arc};
 
 use bytemuck::Pod;
 use glam::DVec3;
 use rayon::prelude::*;
 
 use super::{
-    buffers::{DeviceScene, PlanRow, ViewRow},
+    buffers::{DeviceScene, PlanRow, SourceRow, ViewRow},
     device::Gpu,
-    pipelines::{FAST_KEY_BITS, Kernels, NO_PICTURE, RasterLabels},
+    pipelines::{Kernels, NO_PICTURE, RasterKinds},
     profile::Marks,
     readback,
-    recorder::{DIGIT_BITS, DIGITS_MAX, LabelInputs, Recorder, sorted_half, tile_bits},
-    scratch::{Need, Scratch, WEIGHT_SLOTS_MIN},
+    recorder::Recorder,
+    scratch::{Need, Scratch, WEIGHT_SLOTS_MIN, first_cell},
 };
 use crate::{
-    Frame, Labels, Quality, RenderRequest,
+    Background, DepthSteps, Frame, Labels, RenderRequest, Samples,
     constants::TILE_SIZE,
     error::{Error, Result},
     labels::{BLEND_WIDTH, WeightRows},
+    scene::Backdrop,
     view::View,
 };
 
@@ -30,22 +31,27 @@ const ISECT_CAPACITY_MIN: u32 = 1 << 16;
 const ATTEMPTS_MAX: u32 = 3;
 /// Factor by which the room for weights grows when it is too small.
 const WEIGHT_SLOTS_GROWTH: u32 = 4;
-/// Bytes of a tile pair: key and Gaussian, each stored twice.
-const PAIR_BYTES_A_BUFFER: u64 = 8;
+/// Bytes of a tile pair: key and Gaussian, stored twice.
+const PAIR_BYTES: u64 = 16;
 const PLAN_BYTES: u64 = size_of::<PlanRow>() as u64;
 /// Pictures of more bytes than this are copied by all cores.
 const PARALLEL_BYTES: usize = 4 << 20;
 
-/// Sizes of a band of a view in the buffers of its batch.
+/// Places of a band's pictures in the buffers of its batch: first words, or [`NO_PICTURE`].
 struct Layout {
     color: u32,
+    /// In f32. Where it is asked for in steps it is not read back: it lies behind all pictures that
+    /// are.
     depth: u32,
     alpha: u32,
     blend: u32,
-    /// Words of all pictures.
+    alpha_bytes: u32,
+    mask: u32,
+    steps: u32,
+    /// Words of the pictures that are read back.
     words: u64,
-    /// Whether colour and alpha are packed as four 8-bit levels in a word.
-    fast: bool,
+    /// Words of those that are not.
+    inner_words: u64,
     /// Pixels of the band.
     pixels: u64,
     /// Room of a pixel, in weights; 0 if none are asked for.
@@ -62,6 +68,10 @@ impl Layout {
     fn slot_bytes(&self) -> u64 {
         if self.slots == 0 { 0 } else { self.pixels * 4 * (1 + 2 * u64::from(self.slots)) }
     }
+
+    fn all_bytes(&self) -> u64 {
+        self.picture_bytes() + self.inner_words * 4 + self.slot_bytes()
+    }
 }
 
 /// The band of one view after the read-back, with its pictures and slots.
@@ -69,7 +79,7 @@ type Part<'a, 'b> = (&'a mut Drawing<'b>, &'a Layout, PlanRow, &'a [u8], &'a [u3
 
 /// Result of one view of a submission.
 struct Ended {
-    /// Counts of the device. The digits of the first view are those of all.
+    /// Counts of the device.
     plan: PlanRow,
     drawn: bool,
     /// New room of a pixel, in weights, if the old one was too small.
@@ -89,8 +99,6 @@ pub(super) struct Tools<'a> {
 /// A frame in work. Its bands are drawn from top to bottom.
 pub(super) struct Drawing<'a> {
     row: ViewRow,
-    /// Digits that the depth sort can take.
-    digits: u32,
     request: &'a RenderRequest,
     frame: Frame,
     /// Weights of the bands drawn.
@@ -107,17 +115,11 @@ impl<'a> Drawing<'a> {
         scene: &DeviceScene,
     ) -> Result<Self> {
         let view = View::new(origin, request)?;
-        let mut row = ViewRow::new(&view, request.background, request.antialiased);
-        row.fast = u32::from(request.quality == Quality::Fast);
+        let mut row = ViewRow::of(&view, request);
         (row.gaussian_count, row.sh_count) = (scene.count, scene.sh_count);
         // The bands are appended.
         let frame = Frame::blank([view.width, view.height], request, 0);
-        let mut bits = view.depth_bits(scene.bounds);
-        if request.quality == Quality::Fast {
-            bits = bits.min(FAST_KEY_BITS);
-        }
-        let digits = bits.div_ceil(DIGIT_BITS).max(1);
-        Ok(Self { row, digits, request, frame, weights: Vec::new(), weights_max: 0 })
+        Ok(Self { row, request, frame, weights: Vec::new(), weights_max: 0 })
     }
 
     /// The frame of all bands.
@@ -127,7 +129,9 @@ impl<'a> Drawing<'a> {
             scratch.weight_slots = self.weights_max.next_power_of_two().max(WEIGHT_SLOTS_MIN);
             self.frame.weights = Some(WeightRows::join(self.weights)?);
         }
-        Ok(self.frame)
+        // Depth in steps came so from the device, unless it was drawn in bands.
+        let stepped = self.frame.levels.depth.is_some();
+        Ok(if stepped { self.frame } else { self.frame.finish(self.request.samples) })
     }
 
     /// All rows of tiles.
@@ -138,27 +142,57 @@ impl<'a> Drawing<'a> {
     fn layout(&self, rows: &Range<u32>, slots: u32) -> Layout {
         let pixel_rows = (rows.end * TILE_SIZE).min(self.row.height) - rows.start * TILE_SIZE;
         let pixels = u64::from(pixel_rows) * u64::from(self.row.width);
-        let (kinds, fast) = (self.request.kinds, self.row.fast != 0);
+        let RenderRequest { kinds, labels, samples, .. } = self.request;
+        let exact = *samples == Samples::F32;
         let mut words = 0;
-        let mut take = |wanted: bool, channels: u64| {
+        let mut take = |wanted: bool, size: u64| {
             let start = if wanted { words as u32 } else { NO_PICTURE };
-            words += if wanted { channels * pixels } else { 0 };
+            words += if wanted { size } else { 0 };
             start
         };
-        let color = take(kinds.color, if fast { 1 } else { 3 });
-        let depth = take(kinds.depth, 1);
-        let alpha = take(kinds.alpha && !(fast && kinds.color), 1);
-        let blend = take(matches!(self.request.labels, Labels::Blend(_)), BLEND_WIDTH as u64);
+        // Rows of numbers that share words start at whole ones.
+        let packed = |bytes: u32| {
+            u64::from(pixel_rows) * (u64::from(self.row.width) * u64::from(bytes)).div_ceil(4)
+        };
+        // Steps are of one size in all bands.
+        let stepped = kinds.depth && !exact && *rows == self.whole();
+        let color_words = match samples {
+            Samples::F32 => 3 * pixels,
+            Samples::Levels => packed(3),
+            Samples::LevelsRgba => pixels,
+        };
+        let color = take(kinds.color, color_words);
+        let alpha = take(kinds.alpha && exact, pixels);
+        let blend = take(matches!(labels, Labels::Blend(_)), BLEND_WIDTH as u64 * pixels);
+        let alpha_bytes = take(kinds.alpha && !exact, packed(1));
+        let mask = take(matches!(labels, Labels::Mask { .. }), packed(1));
+        let steps = take(stepped, packed(2));
+        let depth = take(kinds.depth && !stepped, pixels);
+        let depth = if stepped { 0 } else { depth };
+        let inner_words = if stepped { pixels } else { 0 };
         let tiles = self.row.tiles_x * (rows.end - rows.start);
-        Layout { color, depth, alpha, blend, words, fast, pixels, slots, tiles }
+        Layout {
+            color,
+            depth,
+            alpha,
+            blend,
+            alpha_bytes,
+            mask,
+            steps,
+            words,
+            inner_words,
+            pixels,
+            slots,
+            tiles,
+        }
     }
 
     /// Rows of the table to blend. An empty table is one row of zeros.
     fn table(&self) -> &[[f32; BLEND_WIDTH]] {
-        match &self.request.labels {
-            Labels::Blend(table) if table.is_empty() => &[[0.0; BLEND_WIDTH]],
-            Labels::Blend(table) => &table[..table.len().min(1 << u16::BITS)],
-            _ => &[],
+        match self.request.labels.table() {
+            Some([]) => &[[0.0; BLEND_WIDTH]],
+            Some(table) => &table[..table.len().min(1 << u16::BITS)],
+            None => &[],
         }
     }
 
@@ -181,7 +215,7 @@ impl<'a> Drawing<'a> {
             ended.more_slots = Some(layout.slots.saturating_mul(WEIGHT_SLOTS_GROWTH));
             return ended;
         }
-        self.store(layout, pictures, slots);
+        self.store(layout, plan.farthest, pictures, slots);
         self.weights_max = self.weights_max.max(weights);
         let stats = &mut self.frame.stats;
         stats.visible = stats.visible.max(u64::from(plan.visible));
@@ -189,40 +223,50 @@ impl<'a> Drawing<'a> {
         Ended { drawn: true, ..ended }
     }
 
-    /// Copies the pictures and weights of a band out of the read-back.
-    fn store(&mut self, layout: &Layout, pictures: &[u8], slots: &[u32]) {
+    /// Copies the pictures and weights of a band out of the read-back. `farthest` has the bits of
+    /// the largest depth, where depth is in steps.
+    fn store(&mut self, layout: &Layout, farthest: u32, pictures: &[u8], slots: &[u32]) {
         let pixels = layout.pixels as usize;
-        let all = self.row.width as usize * self.row.height as usize;
+        let width = self.row.width as usize;
+        let all = width * self.row.height as usize;
         let part = |start: u32, words: usize| {
             let start = start as usize * 4;
             &pictures[start..start + pixels * words * 4]
         };
-        let frame = &mut self.frame;
-        if let Some(color) = &mut frame.color {
-            if layout.fast {
-                let levels = part(layout.color, 1);
-                let level = |byte: u8| f32::from(byte) / 255.0;
-                append(color, all, levels, |[r, g, b, _]: [u8; 4]| [r, g, b].map(level));
-                if let Some(alpha) = &mut frame.alpha {
-                    append(alpha, all, levels, |word: [u8; 4]| level(word[3]));
-                }
-            } else {
-                append(color, all, part(layout.color, 3), |color| color);
-            }
+        let from = |start: u32| &pictures[start as usize * 4..];
+        let rows = pixels / width;
+        let Frame { color, depth, alpha, levels, blend, mask, .. } = &mut self.frame;
+        if let Some(color) = color {
+            append(color, all, part(layout.color, 3), |color| color);
         }
-        if let Some(depth) = &mut frame.depth {
-            append(depth, all, part(layout.depth, 1), |depth| depth);
+        if let Some(rgb) = &mut levels.rgb {
+            append_rows(rgb, all, from(layout.color), [width, rows]);
         }
-        if let Some(alpha) = &mut frame.alpha
-            && layout.alpha != NO_PICTURE
-        {
+        if let Some(rgba) = &mut levels.rgba {
+            append(rgba, all, part(layout.color, 1), |word: [u8; 4]| word);
+        }
+        if let Some(alpha) = &mut levels.alpha {
+            append_rows(alpha, all, from(layout.alpha_bytes), [width, rows]);
+        }
+        if let Some(alpha) = alpha {
             append(alpha, all, part(layout.alpha, 1), |alpha| alpha);
         }
-        if let Some(blend) = &mut frame.blend {
+        if layout.steps != NO_PICTURE {
+            let mut steps = Vec::new();
+            append_rows(&mut steps, all, from(layout.steps), [width, rows]);
+            levels.depth = Some(DepthSteps { steps, ..DepthSteps::to(f32::from_bits(farthest)) });
+            *depth = None;
+        } else if let Some(depth) = depth {
+            append(depth, all, part(layout.depth, 1), |depth| depth);
+        }
+        if let Some(blend) = blend {
             append(blend, all, part(layout.blend, BLEND_WIDTH), |row| row);
         }
+        if let Some(mask) = mask {
+            append_rows(mask, all, from(layout.mask), [width, rows]);
+        }
         if layout.slots > 0 {
-            self.weights.push(weight_rows(slots, layout, self.row.width as usize));
+            self.weights.push(weight_rows(slots, layout, width));
         }
     }
 }
@@ -232,9 +276,9 @@ impl Tools<'_> {
     pub(super) fn rows(&mut self, drawing: &mut Drawing<'_>, rows: Range<u32>) -> Result<()> {
         let layout = drawing.layout(&rows, self.weight_slots(drawing));
         let single = rows.end - rows.start == 1;
-        let bytes = layout.picture_bytes() + layout.slot_bytes();
+        let bytes = layout.all_bytes();
         let bytes_max = self.gpu.binding_bytes_max - PLAN_BYTES;
-        if single || bytes.max((u64::from(layout.tiles) + 1) * 4) <= bytes_max {
+        if single || bytes.max((u64::from(layout.tiles) + 1) * 8) <= bytes_max {
             let (mut needed, mut attempts, capacity_max) = (0, 0, self.capacity_max(1));
             while attempts < ATTEMPTS_MAX && needed <= capacity_max {
                 let capacity = self.capacity(1);
@@ -267,8 +311,7 @@ impl Tools<'_> {
             .iter()
             .map(|drawing| drawing.layout(&drawing.whole(), self.weight_slots(drawing)))
             .collect();
-        let sum = |bytes: fn(&Layout) -> u64| layouts.iter().map(bytes).sum::<u64>();
-        let bytes = sum(Layout::picture_bytes) + sum(Layout::slot_bytes);
+        let bytes = layouts.iter().map(Layout::all_bytes).sum::<u64>();
         let views = drawings.len() as u32;
         let capacity = self.capacity(views);
         if bytes + PLAN_BYTES * u64::from(views) > self.gpu.binding_bytes_max {
@@ -290,7 +333,7 @@ impl Tools<'_> {
     }
 
     fn capacity_max(&self, views: u32) -> u32 {
-        let bound = self.gpu.binding_bytes_max / (PAIR_BYTES_A_BUFFER * u64::from(views));
+        let bound = self.gpu.binding_bytes_max / (PAIR_BYTES * u64::from(views));
         self.isects_max.min(u32::try_from(bound).unwrap_or(u32::MAX))
     }
 
@@ -311,61 +354,83 @@ impl Tools<'_> {
         capacity: u32,
     ) -> Result<Vec<Ended>> {
         let views = drawings.len() as u32;
-        let most_tiles = layouts.iter().map(|layout| layout.tiles).max().unwrap_or(1);
-        let bits = tile_bits(most_tiles);
-        let pair_half = sorted_half(bits) * views * capacity;
         let mut rows = Vec::with_capacity(drawings.len());
         let mut grid = [0; 2];
-        let (mut words, mut slot_words, mut ranges) = (0_u64, 0_u64, 0_u32);
+        let (mut words, mut slot_words, mut tiles, mut step_words) = (0_u64, 0_u64, 0, 0);
         let mut table: Vec<[f32; BLEND_WIDTH]> = Vec::new();
+        let mut sources: Vec<SourceRow> = Vec::new();
+        let mut backdrops: Vec<Arc<Backdrop>> = Vec::new();
+        // Pictures that are not read back come after all others.
+        let mut inner = layouts.iter().map(|layout| layout.words).sum::<u64>();
         for (i, ((drawing, band), layout)) in drawings.iter().zip(bands).zip(layouts).enumerate() {
             let after = |start: u32| match start {
                 NO_PICTURE => NO_PICTURE,
                 start => start + words as u32,
+            };
+            let backdrop_start = match &drawing.request.background {
+                Background::Backdrop(wanted) if drawing.request.kinds.color => {
+                    let known = backdrops.iter().position(|one| Arc::ptr_eq(one, wanted));
+                    first_cell(known.unwrap_or_else(|| {
+                        backdrops.push(Arc::clone(wanted));
+                        backdrops.len() - 1
+                    }))
+                }
+                _ => NO_PICTURE,
             };
             rows.push(ViewRow {
                 row_start: band.start,
                 row_end: band.end,
                 isect_capacity: capacity,
                 color_start: after(layout.color),
-                depth_start: after(layout.depth),
+                depth_start: match layout.steps {
+                    NO_PICTURE => after(layout.depth),
+                    _ => inner as u32,
+                },
                 alpha_start: after(layout.alpha),
                 blend_start: after(layout.blend),
+                alpha_byte_start: after(layout.alpha_bytes),
+                mask_start: after(layout.mask),
+                steps_start: after(layout.steps),
+                backdrop_start,
+                source_start: sources.len() as u32,
                 label_rows: drawing.table().len() as u32,
                 table_start: table.len() as u32,
                 weight_slots: layout.slots,
                 slot_start: slot_words as u32,
-                range_start: ranges,
-                pair_start: pair_half + i as u32 * capacity,
+                range_start: tiles,
+                pair_start: i as u32 * capacity,
                 ..drawing.row
             });
             grid = [grid[0].max(drawing.row.tiles_x), grid[1].max(band.end - band.start)];
             words += layout.words;
+            inner += layout.inner_words;
+            step_words = step_words.max(match layout.steps {
+                NO_PICTURE => 0,
+                _ => drawing.row.width.div_ceil(2) * drawing.row.height,
+            });
             slot_words += layout.slot_bytes() / 4;
-            ranges += layout.tiles + 1;
+            tiles += layout.tiles + 1;
             table.extend_from_slice(drawing.table());
+            sources.extend(drawing.request.sources.iter().map(SourceRow::from));
         }
         let plan_bytes = PLAN_BYTES * u64::from(views);
         let (picture_bytes, slot_bytes) = (words * 4, slot_words * 4);
         let staging_bytes = plan_bytes + picture_bytes + slot_bytes;
         let (gpu, scene) = (self.gpu, self.scene);
-        let colored = drawings.iter().any(|drawing| drawing.request.kinds.color);
-        let deep = drawings.iter().any(|drawing| drawing.request.kinds.depth);
-        // The device may need fewer digits. The others are dispatches without work.
-        let digits = match self.kernels.sorts_all() {
-            true => DIGITS_MAX,
-            false => drawings.iter().map(|drawing| drawing.digits).max().unwrap_or(DIGITS_MAX),
+        let Some(kinds) = drawings.first().map(|one| RasterKinds::from(one.request)) else {
+            return Ok(Vec::new());
         };
-        let shades = colored && !self.kernels.flat(scene.sh_count);
+        let shades = kinds.color && !self.kernels.flat(scene.sh_count);
         let room = self.scratch.room(
             gpu,
             &Need {
                 views,
                 count: scene.count,
                 capacity,
-                ranges,
+                tiles,
                 shades,
-                picture_bytes,
+                source_bytes: size_of_val(sources.as_slice()) as u64,
+                picture_bytes: inner * 4,
                 table_bytes: size_of_val(table.as_slice()) as u64,
                 slot_bytes,
                 staging_bytes,
@@ -373,36 +438,41 @@ impl Tools<'_> {
         )?;
         let buffers = scene.buffers();
         let entries = self.scene.labels.as_ref().map(|labels| &labels.entries);
-        let labels: LabelInputs<'_> = match drawings.first().map(|one| &one.request.labels) {
-            Some(Labels::Blend(_)) => (RasterLabels::Blend, entries),
-            Some(Labels::Weights) => (RasterLabels::Weights, entries),
-            _ => (RasterLabels::None, None),
-        };
+        // Nothing is known to be there while an upload may fail.
+        let held = std::mem::take(&mut self.scratch.backdrops);
         let bindings = &mut self.scratch.bindings;
         let (kernels, marks) = (self.kernels, self.marks.as_deref_mut());
         gpu.scoped("render", || {
-            room.begin(gpu, &rows);
+            room.put_backdrops(gpu, &backdrops, &held);
+            gpu.queue.write_buffer(&room.views, 0, bytemuck::cast_slice(&rows));
             if !table.is_empty() {
                 gpu.queue.write_buffer(&room.table, 0, bytemuck::cast_slice(&table));
             }
+            if !sources.is_empty() {
+                gpu.queue.write_buffer(&room.sources, 0, bytemuck::cast_slice(&sources));
+            }
             let sizes = (views, scene.count);
-            let mut stages = Recorder::new(gpu, kernels, bindings, &room, sizes, marks);
+            let mut stages =
+                Recorder::new(gpu, kernels, bindings, (&room, &room.zeros()), sizes, marks);
             stages.project(buffers);
             if shades {
                 stages.shade(buffers);
             }
-            stages.depth_sort(digits);
             stages.prefix_sum();
             stages.emit_isects();
-            stages.tile_sort(bits);
-            stages.tile_ranges();
-            stages.rasterize(buffers, labels, (colored, deep), grid);
+            stages.tile_sort(grid);
+            stages.rasterize(buffers, kinds, entries, grid);
+            if step_words > 0 {
+                stages.depth_steps(step_words);
+            }
             stages.submit(&[
                 (&room.plans, 0, &room.staging, 0, plan_bytes),
                 (&room.pictures, 0, &room.staging, plan_bytes, picture_bytes),
                 (&room.slots, 0, &room.staging, plan_bytes + picture_bytes, slot_bytes),
             ])
         })??;
+        backdrops.extend(held.into_iter().skip(backdrops.len()));
+        self.scratch.backdrops = backdrops;
         let ended = readback::read(gpu, &room.staging, staging_bytes, |bytes| {
             let (plans, rest) = bytes.split_at(plan_bytes as usize);
             let (mut pictures, slots) = rest.split_at(picture_bytes as usize);
@@ -423,12 +493,6 @@ impl Tools<'_> {
                 _ => parts.into_par_iter().map(take).collect::<Vec<_>>(),
             }
         })?;
-        let passes = ended.first().map_or(0, |ended| ended.plan.passes);
-        if passes > digits {
-            return Err(Error::internal(format!(
-                "render: depths differ in {passes} digits where the scene's box has {digits}"
-            )));
-        }
         self.scratch.isects = ended.iter().map(|ended| ended.plan.needed).max().unwrap_or(0);
         let more_slots = ended.iter().filter_map(|ended| ended.more_slots).max();
         self.scratch.weight_slots = more_slots.unwrap_or(self.scratch.weight_slots);
@@ -451,6 +515,23 @@ fn append<F: Pod + Send + Sync, T: Send>(
     } else {
         let values = values.par_iter().with_min_len(PARALLEL_BYTES / 16);
         to.par_extend(values.map(|value| read(*value)));
+    }
+}
+
+/// Copies rows of numbers that share words to the end of `to`, as [`append`] does.
+fn append_rows<T: Pod + Send + Sync>(
+    to: &mut Vec<T>,
+    all: usize,
+    bytes: &[u8],
+    [width, rows]: [usize; 2],
+) {
+    let stride = (width * size_of::<T>()).next_multiple_of(4);
+    if stride == width * size_of::<T>() {
+        return append(to, all, &bytes[..stride * rows], |value| value);
+    }
+    to.reserve_exact(all - to.len());
+    for row in bytes.chunks_exact(stride).take(rows) {
+        to.extend_from_slice(bytemuck::cast_slice(&row[..width * size_of::<T>()]));
     }
 }
 

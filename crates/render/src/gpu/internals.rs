@@ -7,24 +7,16 @@ use super::{
     GpuRenderer,
     adapter::{Adapter, OpenDevice},
     buffers::{DeviceScene, narrow},
-    pipelines::{
-        self, GROUPS_RANGES, GROUPS_TILES, GROUPS_X_MAX, RasterLabels, SCAN_BLOCK, SORT_BLOCK,
-        WORKGROUP_SIZE,
-    },
+    pipelines::{RasterKinds, RasterLabels},
     readback,
-    recorder::{Bindings, Copy, DIGITS_MAX, Recorder, SceneBuffers, sorted_half},
+    recorder::{Bindings, Copy, Recorder, SceneBuffers},
     scratch::{BatchBuffers, Need},
 };
 pub use super::{
-    buffers::{FootprintRow, GaussianRow, PlanRow, SortParams, ViewRow},
+    buffers::{FootprintRow, GaussianRow, PlanRow, SourceRow, ViewRow},
     pipelines::{SHADERS, SHARED, Shader},
 };
 use crate::{RenderRequest, error::Result, scene::Gaussians, view::View};
-
-/// Depth key of a dropped Gaussian.
-pub const DROPPED_KEY: u32 = pipelines::DROPPED_KEY;
-/// Value of a pair that was counted and not emitted.
-pub const NO_GAUSSIAN: u32 = pipelines::NO_GAUSSIAN;
 
 /// The inside of a [`GpuRenderer`]. Stages run on its first device.
 #[derive(Clone, Copy, Debug)]
@@ -36,15 +28,15 @@ pub struct ProjectedRows {
     /// `[N]`; means nothing for a dropped Gaussian.
     pub footprints: Vec<FootprintRow>,
     /// `[N]` tiles touched, 0 for a dropped Gaussian.
+    pub touched: Vec<u32>,
+    /// Gaussians that touch each tile.
     pub tiles: Vec<u32>,
-    /// `[N]` bits of t.z, or `DROPPED_KEY`.
-    pub depth_keys: Vec<u32>,
     /// Gaussians that touch the picture.
     pub visible: u32,
 }
 
-/// Keys and values, or tiles and Gaussians.
-pub type KeysValues = (Vec<u32>, Vec<u32>);
+/// (depth key, Gaussian) of each tile.
+pub type TileLists = Vec<Vec<[u32; 2]>>;
 
 impl GpuRenderer {
     /// The inside, for tests.
@@ -74,138 +66,128 @@ impl Internals<'_> {
     /// Stage 1.
     pub fn project(self, gaussians: &Gaussians, request: &RenderRequest) -> Result<ProjectedRows> {
         let row = scene_row(gaussians, request)?;
+        let sources: Vec<SourceRow> = request.sources.iter().map(SourceRow::from).collect();
         self.run(row, 0, Some(gaussians), |stage| {
             let (room, n) = (&stage.room, gaussians.len());
+            stage.write(&room.sources, &sources);
             let parts = [
                 (&room.footprints, 0, n * size_of::<FootprintRow>()),
-                (&room.tiles, 0, n * 4),
-                (&room.depth_keys, 0, n * 4),
+                (&room.touched, 0, n * 4),
+                (&room.ends, 0, (row.tiles_x * row.tiles_y) as usize * 4),
                 (&room.plans, 0, size_of::<PlanRow>()),
             ];
-            let [footprints, tiles, depth_keys, plans] =
+            let [footprints, touched, tiles, plans] =
                 stage.read(parts, |stages| stages.project(stage.scene()))?;
             Ok(ProjectedRows {
                 footprints: cast(&footprints),
+                touched: cast(&touched),
                 tiles: cast(&tiles),
-                depth_keys: cast(&depth_keys),
                 visible: cast::<PlanRow>(&plans)[0].visible,
             })
         })
     }
 
-    /// Stage 2: the order of `keys` that are not `DROPPED_KEY`; equal ones keep their order.
-    pub fn depth_sort(self, keys: &[u32]) -> Result<Vec<u32>> {
-        let gaussian_count = narrow("keys", keys.len())?;
-        self.run(ViewRow { gaussian_count, ..ViewRow::zeroed() }, 0, None, |stage| {
-            let room = &stage.room;
-            let kept = || keys.iter().copied().filter(|&key| key != DROPPED_KEY);
-            let plan = PlanRow {
-                key_min: kept().min().unwrap_or(u32::MAX),
-                key_max: kept().max().unwrap_or(0),
-                ..PlanRow::default()
-            };
-            stage.write(&room.depth_keys, keys);
-            stage.write(&room.plans, &[plan]);
-            let parts =
-                [(&room.depth_ids, 0, 8 * keys.len()), (&room.plans, 0, size_of::<PlanRow>())];
-            let [ids, plans] = stage.read(parts, |stages| stages.depth_sort(DIGITS_MAX))?;
-            let plan = cast::<PlanRow>(&plans)[0];
-            let first = (plan.passes as usize & 1) * keys.len();
-            Ok(cast::<u32>(&ids)[first..first + plan.sorted as usize].to_vec())
-        })
-    }
-
-    /// Stage 6: a stable sort by the lowest `key_bits` bits.
-    pub fn radix_sort(self, keys: &[u32], values: &[u32], key_bits: u32) -> Result<KeysValues> {
-        let count = narrow("pairs", keys.len())?;
-        let row = ViewRow { gaussian_count: 1, isect_capacity: count, ..ViewRow::zeroed() };
+    /// Stage 3: of the counts of `columns` by rows of tiles, the sum before each, and the whole
+    /// sum; sums stay at `u32::MAX`.
+    pub fn prefix_sum(self, counts: &[u32], columns: u32) -> Result<Vec<u32>> {
+        let tiles = narrow("tiles", counts.len())?;
+        let row = ViewRow {
+            gaussian_count: 1,
+            tiles_x: columns,
+            tiles_y: tiles / columns,
+            row_end: tiles / columns,
+            ..ViewRow::zeroed()
+        };
         self.run(row, 0, None, |stage| {
             let room = &stage.room;
-            stage.write(&room.tile_keys, keys);
-            stage.write(&room.isect_ids, values);
-            stage.plan_pairs(count);
-            let (half, start) = (keys.len() * 4, sorted_half(key_bits) as usize * keys.len() * 4);
-            let parts = [(&room.tile_keys, start, half), (&room.isect_ids, start, half)];
-            let [keys, values] = stage.read(parts, |stages| stages.tile_sort(key_bits))?;
-            Ok((cast(&keys), cast(&values)))
+            stage.write(&room.ends, counts);
+            let parts = [
+                (&room.starts, 0, (counts.len() + 1) * 4),
+                (&room.ends, 0, counts.len() * 4),
+                (&room.plans, 0, size_of::<PlanRow>()),
+            ];
+            let [sums, ends, plans] = stage.read(parts, |stages| stages.prefix_sum())?;
+            let (sums, ends): (Vec<u32>, Vec<u32>) = (cast(&sums), cast(&ends));
+            let needed = cast::<PlanRow>(&plans)[0].needed;
+            if sums.last() != Some(&needed) || ends != sums[..counts.len()] {
+                return Err(crate::error::Error::internal("starts and ends differ"));
+            }
+            Ok(sums)
         })
     }
 
-    /// Stage 3: of `numbers`, the sum before each block of `SCAN_BLOCK`, and the whole sum; sums
-    /// stay at `u32::MAX`.
-    pub fn prefix_sum(self, numbers: &[u32]) -> Result<(Vec<u32>, u32)> {
-        let gaussian_count = narrow("numbers", numbers.len())?;
-        self.run(ViewRow { gaussian_count, ..ViewRow::zeroed() }, 0, None, |stage| {
-            let room = &stage.room;
-            stage.in_order(numbers);
-            let blocks = gaussian_count.div_ceil(SCAN_BLOCK) as usize;
-            let parts = [(&room.block_sums, 0, blocks * 4), (&room.plans, 0, size_of::<PlanRow>())];
-            let [sums, plans] = stage.read(parts, |stages| stages.prefix_sum())?;
-            Ok((cast(&sums), cast::<PlanRow>(&plans)[0].needed))
-        })
-    }
-
-    /// Stage 4: colours of the Gaussians that touch `tiles` tiles; the others' mean nothing.
+    /// Stage 2: colours of the Gaussians that touch `tiles` tiles; the others' mean nothing.
     pub fn shade(
         self,
         gaussians: &Gaussians,
         request: &RenderRequest,
         tiles: &[u32],
     ) -> Result<Vec<[f32; 3]>> {
-        let row = scene_row(gaussians, request)?;
+        let row = ViewRow { color_start: 0, ..scene_row(gaussians, request)? };
         self.run(row, 0, Some(gaussians), |stage| {
-            stage.write(&stage.room.tiles, tiles);
+            stage.write(&stage.room.touched, tiles);
             let parts = [(&stage.room.colors, 0, gaussians.len() * 12)];
             let [colors] = stage.read(parts, |stages| stages.shade(stage.scene()))?;
             Ok(cast(&colors))
         })
     }
 
-    /// Stages 3 and 5: the pairs of `footprints`, which are in depth order and touch `tiles` tiles.
-    pub fn emit_isects(
-        self,
-        view: &View,
-        footprints: &[FootprintRow],
-        tiles: &[u32],
-    ) -> Result<KeysValues> {
-        let total: u32 = tiles.iter().sum();
+    /// Stages 3 to 5: the lists of the tiles, sorted, from what `project` gives.
+    pub fn lists(self, view: &View, rows: &ProjectedRows) -> Result<TileLists> {
+        let total: u32 = rows.tiles.iter().sum();
         let row = ViewRow {
-            gaussian_count: narrow("footprints", footprints.len())?,
+            gaussian_count: narrow("footprints", rows.footprints.len())?,
             isect_capacity: total,
             ..ViewRow::new(view, [0.0; 3], false)
         };
         self.run(row, 0, None, |stage| {
-            let (room, size) = (&stage.room, total as usize * 4);
-            stage.in_order(tiles);
-            stage.write(&room.footprints, footprints);
-            let parts = [(&room.tile_keys, 0, size), (&room.isect_ids, 0, size)];
-            let [keys, ids] = stage.read(parts, |stages| {
+            let (room, tiles) = (&stage.room, [view.tiles_x(), view.tiles_y()]);
+            stage.write(&room.footprints, &rows.footprints);
+            stage.write(&room.touched, &rows.touched);
+            stage.write(&room.ends, &rows.tiles);
+            let parts =
+                [(&room.lists, 0, rows.tiles.len() * 8), (&room.pairs, 0, total as usize * 16)];
+            let [lists, pairs] = stage.read(parts, |stages| {
                 stages.prefix_sum();
                 stages.emit_isects();
+                stages.tile_sort(tiles);
             })?;
-            Ok((cast(&keys), cast(&ids)))
+            let pairs: Vec<[u32; 2]> = cast(&pairs);
+            let list = |&[first, end]: &[u32; 2]| pairs[first as usize..end as usize].to_vec();
+            Ok(cast(&lists).iter().map(list).collect())
         })
     }
 
-    /// Stage 7 over sorted tile keys; one more number than there are tiles.
-    pub fn tile_ranges(self, view: &View, tile_keys: &[u32]) -> Result<Vec<u32>> {
-        let count = narrow("tile pairs", tile_keys.len())?;
+    /// Stage 5: the lists `lists` of as many tiles, sorted.
+    pub fn tile_sort(self, lists: &[Vec<[u32; 2]>]) -> Result<TileLists> {
+        let pairs = lists.concat();
+        let tiles = narrow("tiles", lists.len())?;
         let row = ViewRow {
             gaussian_count: 1,
-            isect_capacity: count,
-            ..ViewRow::new(view, [0.0; 3], false)
+            isect_capacity: narrow("pairs", pairs.len())?,
+            tiles_x: tiles,
+            tiles_y: 1,
+            row_end: 1,
+            ..ViewRow::zeroed()
         };
+        let mut starts = vec![0];
+        for list in lists {
+            starts.push(starts[starts.len() - 1] + list.len() as u32);
+        }
         self.run(row, 0, None, |stage| {
-            stage.write(&stage.room.tile_keys, tile_keys);
-            stage.plan_pairs(count);
-            let size = (view.tiles_x() * view.tiles_y() + 1) as usize * 4;
-            let [ranges] =
-                stage.read([(&stage.room.ranges, 0, size)], |stages| stages.tile_ranges())?;
-            Ok(cast(&ranges))
+            let room = &stage.room;
+            stage.write(&room.starts, &starts);
+            stage.write(&room.ends, &starts[1..]);
+            stage.write(&room.pairs, &pairs);
+            let parts = [(&room.lists, 0, lists.len() * 8), (&room.pairs, 0, pairs.len() * 16)];
+            let [lists, pairs] = stage.read(parts, |stages| stages.tile_sort([tiles, 1]))?;
+            let pairs: Vec<[u32; 2]> = cast(&pairs);
+            let list = |&[first, end]: &[u32; 2]| pairs[first as usize..end as usize].to_vec();
+            Ok(cast(&lists).iter().map(list).collect())
         })
     }
 
-    /// Stage 8: `[H, W]` of colour, depth and alpha, in this order: `[5 * H * W]` floats.
+    /// Stage 6: `[H, W]` of colour, depth and alpha, in this order: `[5 * H * W]` floats.
     pub fn rasterize(
         self,
         view: &View,
@@ -215,6 +197,8 @@ impl Internals<'_> {
         isect_ids: &[u32],
         ranges: &[u32],
     ) -> Result<Vec<f32>> {
+        let pairs: Vec<[u32; 2]> = isect_ids.iter().map(|&id| [0, id]).collect();
+        let lists: Vec<[u32; 2]> = ranges.windows(2).map(|ends| [ends[0], ends[1]]).collect();
         let pixels = view.width * view.height;
         let row = ViewRow {
             gaussian_count: narrow("footprints", footprints.len())?,
@@ -229,11 +213,13 @@ impl Internals<'_> {
             let room = &stage.room;
             stage.write(&room.footprints, footprints);
             stage.write(&room.colors, colors);
-            stage.write(&room.isect_ids, isect_ids);
-            stage.write(&room.ranges, ranges);
+            stage.write(&room.pairs, &pairs);
+            stage.write(&room.lists, &lists);
             let tiles = [view.tiles_x(), view.tiles_y()];
             let [pictures] = stage.read([(&room.pictures, 0, size)], |stages| {
-                stages.rasterize(stage.scene(), (RasterLabels::None, None), (true, true), tiles);
+                let labels = RasterLabels::None;
+                let kinds = RasterKinds { color: true, depth: true, bytes: false, labels };
+                stages.rasterize(stage.scene(), kinds, None, tiles);
             })?;
             Ok(cast(&pictures))
         })
@@ -252,15 +238,19 @@ impl Internals<'_> {
                 views: 1,
                 count: row.gaussian_count,
                 capacity: row.isect_capacity,
-                ranges: row.tiles_x * row.tiles_y + 1,
+                tiles: row.tiles_x * row.tiles_y + 1,
                 shades: true,
+                source_bytes: u64::from(row.source_count) * size_of::<SourceRow>() as u64,
                 picture_bytes: picture_bytes as u64,
                 ..Need::default()
             };
             let scene = gaussians.map(|gaussians| context.scene(gaussians, false)).transpose()?;
             let room = context.scratch.room(&context.on.gpu, &need)?;
-            room.begin(&context.on.gpu, std::slice::from_ref(&row));
-            work(&Stage { on: context.on.clone(), room, row, scene })
+            let stage = Stage { on: context.on.clone(), room, row, scene };
+            stage.write(&stage.room.views, &[row]);
+            stage.write(&stage.room.plans, &[PlanRow::default()]);
+            stage.write(&stage.room.ends, &vec![0_u32; need.tiles as usize]);
+            work(&stage)
         })
     }
 }
@@ -271,7 +261,7 @@ fn scene_row(gaussians: &Gaussians, request: &RenderRequest) -> Result<ViewRow> 
     Ok(ViewRow {
         gaussian_count: narrow("gaussians", gaussians.len())?,
         sh_count: gaussians.sh_count() as u32,
-        ..ViewRow::new(&view, request.background, request.antialiased)
+        ..ViewRow::of(&view, request)
     })
 }
 
@@ -295,30 +285,6 @@ impl Stage {
         self.on.gpu.queue.write_buffer(to, 0, bytemuck::cast_slice(values));
     }
 
-    /// Sets `tiles` as the counts of Gaussians that lie in depth order.
-    fn in_order(&self, tiles: &[u32]) {
-        let ids: Vec<u32> = (0..tiles.len() as u32).collect();
-        self.write(&self.room.tiles, tiles);
-        self.write(&self.room.depth_ids, &ids);
-        self.write(&self.room.plans, &[PlanRow { sorted: ids.len() as u32, ..PlanRow::default() }]);
-    }
-
-    /// Sets the plan of `count` pairs, as `scan_sums` makes it.
-    fn plan_pairs(&self, count: u32) {
-        let plan = PlanRow { isects: count, needed: count, ..PlanRow::default() };
-        self.write(&self.room.plans, &[plan]);
-        let blocks = [
-            (GROUPS_TILES, count.div_ceil(SORT_BLOCK)),
-            (GROUPS_RANGES, (count + WORKGROUP_SIZE) / WORKGROUP_SIZE),
-        ];
-        for (at, blocks) in blocks {
-            let x = blocks.clamp(1, GROUPS_X_MAX);
-            let groups = [x, blocks.div_ceil(x), 1, 0];
-            let (to, at) = (&self.room.groups, u64::from(at) * 16);
-            self.on.gpu.queue.write_buffer(to, at, bytemuck::cast_slice(&groups));
-        }
-    }
-
     /// Runs what is recorded, and reads parts of buffers: first byte, bytes.
     fn read<const N: usize>(
         &self,
@@ -337,8 +303,8 @@ impl Stage {
         });
         gpu.scoped("stage", || {
             let (mut bindings, sizes) = (Bindings::default(), (1, self.row.gaussian_count));
-            let kernels = &self.on.kernels;
-            let mut stages = Recorder::new(gpu, kernels, &mut bindings, &self.room, sizes, None);
+            let (kernels, room) = (&self.on.kernels, (&self.room, [].as_slice()));
+            let mut stages = Recorder::new(gpu, kernels, &mut bindings, room, sizes, None);
             record(&mut stages);
             stages.submit(&copies)
         })??;

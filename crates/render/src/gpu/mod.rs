@@ -98,7 +98,7 @@ impl Renderer for GpuRenderer {
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         let view = View::new(gaussians.origin(), request)?;
         if gaussians.is_empty() {
-            return Ok(Frame::background(&view, request));
+            return crate::cpu::background(&view, request);
         }
         let adapter = self.adapter_for(gaussians);
         match adapter.render(gaussians, request) {

@@ -6,8 +6,10 @@ use parking_lot::Mutex;
 
 use super::device::Gpu;
 use crate::{
+    Labels, RenderRequest, Samples,
     constants::shared,
     error::{Error, Result},
+    scene::Backdrop,
     switches::{Skip, Switches},
 };
 
@@ -16,28 +18,22 @@ shared! { pub(super) u32;
     WORKGROUP_SIZE = 256;
     /// Views that one submission draws at most.
     VIEWS_MAX = 8;
-    /// Invocations of a workgroup that moves pairs.
-    SORT_SIZE = 128;
-    /// Pairs that one workgroup sorts.
-    SORT_BLOCK = 2048;
-    /// Gaussians whose tile pairs one workgroup emits.
-    SCAN_BLOCK = 1024;
+    /// Pairs of a tile that one workgroup sorts at once: 16 KiB, the portable floor.
+    SORT_RUN = 2048;
+    /// Tiles of a Gaussian above which a whole workgroup visits them.
+    LARGE_TILES = 64;
+    /// Tiles in which a workgroup counts by itself.
+    BINS = 1024;
     /// Workgroups along x at most; more go to y. Under the portable 65,535.
     GROUPS_X_MAX = 32_768;
-    /// First row of workgroup counts of digits 1 to 3 of the depth sort, by blocks.
-    GROUPS_DEPTH = 0;
-    /// The same, by values of the digit.
-    GROUPS_DIGITS = 3;
-    /// Row of workgroup counts of the tile sort.
-    GROUPS_TILES = 6;
-    /// Row of workgroup counts of the tile ranges.
-    GROUPS_RANGES = 7;
-    /// Bits of a fast view's depth keys: two digits of the sort.
-    FAST_KEY_BITS = 16;
-    /// Depth key of a dropped Gaussian.
-    DROPPED_KEY = u32::MAX;
-    /// Value of a pair that was counted and not emitted.
-    NO_GAUSSIAN = u32::MAX;
+    /// Colour in three bytes, of 8 bits each.
+    LEVELS_RGB = 1;
+    /// Colour and alpha in four bytes.
+    LEVELS_RGBA = 2;
+    /// Cells of a backdrop, across.
+    BACKDROP_WIDTH = Backdrop::WIDTH as u32;
+    /// Cells of a backdrop, down.
+    BACKDROP_HEIGHT = Backdrop::HEIGHT as u32;
     /// Start of a picture that was not asked for.
     NO_PICTURE = u32::MAX;
 }
@@ -82,29 +78,55 @@ macro_rules! shader {
 /// Every shader, in the order of the stages.
 pub const SHADERS: [Shader; 9] = [
     shader!("project", "project", "camera", "tiles"),
-    shader!("radix_sort", "radix_sort", "sum_before"),
-    shader!("prefix_sum", "prefix_sum", "sum_before"),
     shader!("shade", "shade", "sh"),
-    shader!("emit_isects", "emit_isects", "tiles", "sum_before"),
-    shader!("tile_ranges", "tile_ranges"),
-    shader!("rasterize", "rasterize", "labels_none"),
-    shader!("rasterize_blend", "rasterize", "labels_entries", "labels_blend"),
-    shader!("rasterize_weights", "rasterize", "labels_entries", "labels_weights"),
+    shader!("prefix_sum", "prefix_sum", "sum_before"),
+    shader!("emit_isects", "emit_isects", "tiles"),
+    shader!("tile_sort", "tile_sort"),
+    shader!("rasterize", "rasterize", "backdrop", "labels_none"),
+    shader!("rasterize_blend", "rasterize", "backdrop", "labels_entries", "labels_blend"),
+    shader!("rasterize_weights", "rasterize", "backdrop", "labels_entries", "labels_weights"),
+    shader!("depth_steps", "depth_steps"),
 ];
 
 /// Kernels, in the order of the stages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(super) enum Kernel {
     Project,
-    Histogram,
-    Spine,
-    Scatter,
-    SumBlocks,
-    ScanSums,
     Shade,
+    PrefixSum,
     EmitIsects,
-    TileRanges,
-    Rasterize { color: bool, depth: bool, labels: RasterLabels },
+    TileSort,
+    Rasterize(RasterKinds),
+    Farthest,
+    DepthSteps,
+}
+
+/// What a kernel of rasterize gives.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(super) struct RasterKinds {
+    pub(super) color: bool,
+    pub(super) depth: bool,
+    /// Pictures whose pixels share words: colour and alpha in levels, a mask.
+    pub(super) bytes: bool,
+    pub(super) labels: RasterLabels,
+}
+
+impl From<&RenderRequest> for RasterKinds {
+    fn from(request: &RenderRequest) -> Self {
+        let RenderRequest { kinds, labels, samples, .. } = request;
+        let rgb = kinds.color && *samples == Samples::Levels;
+        let alpha = kinds.alpha && *samples != Samples::F32;
+        Self {
+            color: kinds.color,
+            depth: kinds.depth,
+            bytes: rgb || alpha || matches!(labels, Labels::Mask { .. }),
+            labels: match labels {
+                Labels::None => RasterLabels::None,
+                Labels::Blend(_) | Labels::Mask { .. } => RasterLabels::Blend,
+                Labels::Weights => RasterLabels::Weights,
+            },
+        }
+    }
 }
 
 /// Labels that a kernel of rasterize blends.
@@ -117,33 +139,22 @@ pub(super) enum RasterLabels {
 
 impl Kernel {
     /// Those that every view needs.
-    const ALWAYS: [Self; 9] = [
-        Self::Project,
-        Self::Histogram,
-        Self::Spine,
-        Self::Scatter,
-        Self::SumBlocks,
-        Self::ScanSums,
-        Self::Shade,
-        Self::EmitIsects,
-        Self::TileRanges,
-    ];
+    const ALWAYS: [Self; 5] =
+        [Self::Project, Self::Shade, Self::PrefixSum, Self::EmitIsects, Self::TileSort];
 
     /// Name in measurements, name of the shader, and entry point on a GPU and on a software
     /// adapter.
     fn row(self) -> (&'static str, &'static str, [&'static str; 2]) {
         match self {
             Self::Project => ("project", "project", ["main"; 2]),
-            Self::Histogram => ("histogram", "radix_sort", ["histogram"; 2]),
-            Self::Spine => ("spine", "radix_sort", ["spine", "spine_serial"]),
-            Self::Scatter => ("scatter", "radix_sort", ["scatter", "scatter_serial"]),
-            Self::SumBlocks => ("sum_blocks", "prefix_sum", ["sum_blocks"; 2]),
-            Self::ScanSums => ("scan_sums", "prefix_sum", ["scan_sums"; 2]),
             Self::Shade => ("shade", "shade", ["main"; 2]),
+            Self::PrefixSum => ("prefix_sum", "prefix_sum", ["main"; 2]),
             Self::EmitIsects => ("emit_isects", "emit_isects", ["main"; 2]),
-            Self::TileRanges => ("tile_ranges", "tile_ranges", ["main"; 2]),
-            Self::Rasterize { labels, .. } => {
-                let shader = match labels {
+            Self::TileSort => ("tile_sort", "tile_sort", ["main", "serial"]),
+            Self::Farthest => ("farthest", "depth_steps", ["farthest"; 2]),
+            Self::DepthSteps => ("depth_steps", "depth_steps", ["main"; 2]),
+            Self::Rasterize(kinds) => {
+                let shader = match kinds.labels {
                     RasterLabels::None => "rasterize",
                     RasterLabels::Blend => "rasterize_blend",
                     RasterLabels::Weights => "rasterize_weights",
@@ -165,7 +176,7 @@ pub(super) struct Kernels {
     /// In the order of [`SHADERS`].
     modules: Vec<wgpu::ShaderModule>,
     /// Those of rasterize are compiled for the first view that needs them: a server that is asked
-    /// for colour needs one of twelve.
+    /// for colour needs one of many.
     pipelines: Mutex<HashMap<Kernel, wgpu::ComputePipeline>>,
     /// Whether they are those for a software adapter.
     pub(super) serial: bool,
@@ -216,11 +227,6 @@ impl Kernels {
         sh_count == 1 && self.without != Some(Skip::FlatColor)
     }
 
-    /// Whether digits that are the same for all are sorted too.
-    pub(super) fn sorts_all(&self) -> bool {
-        self.without == Some(Skip::EqualDigits)
-    }
-
     /// The pipeline of a kernel.
     /// Errors: `internal` when the driver refuses one that is needed for the first time.
     pub(super) fn get(&self, gpu: &Gpu, kernel: Kernel) -> Result<wgpu::ComputePipeline> {
@@ -239,9 +245,9 @@ impl Kernels {
             return Err(Error::internal(format!("{name}: there is no shader {shader}")));
         };
         let mut constants = Vec::new();
-        if let Kernel::Rasterize { color, depth, .. } = kernel {
-            constants.push(("WITH_COLOR", f64::from(u8::from(color))));
-            constants.push(("WITH_DEPTH", f64::from(u8::from(depth))));
+        if let Kernel::Rasterize(RasterKinds { color, depth, bytes, .. }) = kernel {
+            let with = [("WITH_COLOR", color), ("WITH_DEPTH", depth), ("WITH_BYTES", bytes)];
+            constants.extend(with.map(|(name, with)| (name, f64::from(u8::from(with)))));
             // Pixels that an invocation blends.
             constants.push(("PIXELS", if self.serial { 8.0 } else { 1.0 }));
         }

@@ -17,8 +17,9 @@ use std::{
 
 use parking_lot::{Condvar, Mutex};
 
+use super::pipelines::RasterKinds;
 use crate::{
-    Frame, Kinds, RenderRequest,
+    Frame, RenderRequest,
     error::{Error, Result},
 };
 
@@ -53,11 +54,8 @@ impl QueuedView {
     /// Whether both can be in one submission. The kernels must be the same, so that a view has the
     /// same bits alone and together with others.
     fn joins(&self, other: &Self) -> bool {
-        let kernels = |request: &RenderRequest| {
-            let Kinds { color, depth, .. } = request.kinds;
-            (color, depth, std::mem::discriminant(&request.labels))
-        };
-        self.scene == other.scene && kernels(&self.request) == kernels(&other.request)
+        let kinds = |view: &Self| RasterKinds::from(&view.request);
+        self.scene == other.scene && kinds(self) == kinds(other)
     }
 
     pub(super) fn answer(&self, answer: Result<Frame>) {
@@ -251,6 +249,7 @@ mod tests {
 
     use super::*;
     use crate::{
+        Kinds,
         error::ErrorCode,
         scene::{Camera, CameraToWorld, Intrinsics},
     };

@@ -6,7 +6,9 @@ use segsplat_core::{
     error::ErrorCode,
     scene::{Gaussians, RawGaussians},
 };
-use segsplat_render::{Frame, Labels, Quality, RenderRequest, Renderer, cpu::CpuRenderer};
+use segsplat_render::{
+    Background, Frame, Labels, Quality, RenderRequest, Renderer, Source, cpu::CpuRenderer,
+};
 
 use crate::common::gpu;
 use segsplat_testing::scenes::{Random, camera, checked, cloud, push, request};
@@ -173,7 +175,14 @@ fn a_request_that_cannot_be_drawn_is_refused_by_name() {
         (with(&|r| r.camera.intrinsics.width = 0), "0x20"),
         (with(&|r| r.camera.intrinsics.fx = 0.0), "fx"),
         (with(&|r| r.camera.intrinsics.cy = f64::NAN), "cy"),
-        (with(&|r| r.background[1] = f32::INFINITY), "background"),
+        (with(&|r| r.background = Background::Color([0.0, f32::INFINITY, 0.0])), "background"),
+        (
+            with(&|r| {
+                let (center, axis) = ([0.0, f32::NAN, 0.0], [0.0, 0.0, 1.0]);
+                r.sources = [Source { center, axis, scale: 0.0, behind: false }].into();
+            }),
+            "source 0",
+        ),
         (with(&|r| r.labels = Labels::Blend([[0.0, f32::NAN, 0.0, 0.0]].into())), "labels"),
     ];
     for (error, named) in invalid {

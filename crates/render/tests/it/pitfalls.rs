@@ -9,10 +9,12 @@ use std::f32::consts::TAU;
 
 use glam::DVec3;
 use segsplat_core::scene::{Gaussians, RawGaussians};
-use segsplat_render::{Frame, RenderRequest, Renderer, constants::ALPHA_MAX, cpu::CpuRenderer};
+use segsplat_render::{
+    Background, Frame, RenderRequest, Renderer, constants::ALPHA_MAX, cpu::CpuRenderer,
+};
 
 use crate::common::{gpu, open};
-use segsplat_testing::scenes::{camera, checked, cloud, look, push, request};
+use segsplat_testing::scenes::{BACKGROUND, camera, checked, cloud, look, push, request};
 
 /// No rotation.
 const UPRIGHT: [f32; 4] = [1.0, 0.0, 0.0, 0.0];
@@ -177,7 +179,7 @@ fn pixels_that_nobody_touches_hold_nothing_of_the_frame_before() {
     for (i, &alpha) in frame.alpha.iter().flatten().enumerate() {
         let (x, y) = (i as u32 % 160, i as u32 / 160);
         if alpha == 0.0 {
-            assert_eq!(color_at(&frame, x, y), full.background, "pixel {x}, {y}");
+            assert_eq!(color_at(&frame, x, y), BACKGROUND, "pixel {x}, {y}");
             assert_eq!(frame.depth.as_ref().expect("depth")[i], 0.0, "pixel {x}, {y}");
         }
     }
@@ -266,7 +268,7 @@ fn a_giant_covers_as_much_at_any_resolution() {
 #[test]
 fn colours_under_nothing_are_nothing() {
     let dark = scene(&[([0.0, 0.0, 4.0], [0.5; 3], 1.0, &[[-9.0, -9.0, 2.0]])]);
-    let black = RenderRequest { background: [0.0; 3], ..request(camera(33, 33)) };
+    let black = RenderRequest { background: Background::BLACK, ..request(camera(33, 33)) };
     each(&dark, &black, |name, frame| {
         let [red, green, blue] = color_at(frame, 16, 16);
         assert!(red == 0.0 && green == 0.0 && blue > 0.5, "{name}: {red} {green} {blue}");

@@ -7,7 +7,7 @@ use naga::{Expression, Literal, Module, TypeInner};
 use segsplat_render::{
     constants,
     gpu::internals::{
-        self, FootprintRow, GaussianRow, PlanRow, SHADERS, Shader, SortParams, ViewRow,
+        self, FootprintRow, GaussianRow, PlanRow, SHADERS, Shader, SourceRow, ViewRow,
     },
 };
 
@@ -127,22 +127,29 @@ fn structs_lie_in_memory_as_the_shaders_say() {
                 slot_start,
                 range_start,
                 pair_start,
-                fast,
-                reserved,
+                levels,
+                alpha_byte_start,
+                mask_start,
+                steps_start,
+                backdrop_start,
+                room_min,
+                coverage_floor,
+                own_focal,
+                source_count,
+                source_start,
+                ray_first,
+                ray_across,
+                ray_down,
             ]
         ),
-        layout!(GaussianRow, "Gaussian", [mean, opacity, quat, scale, reserved]),
+        layout!(GaussianRow, "Gaussian", [mean, opacity, quat, scale, source]),
         layout!(
             FootprintRow,
             "Footprint",
             [mean, conic_shear, conic_x, conic_y, power_max, opacity, depth]
         ),
-        layout!(
-            PlanRow,
-            "Plan",
-            [isects, needed, visible, sorted, key_min, key_max, passes, reserved]
-        ),
-        layout!(SortParams, "SortParams", [shift, pass_at, by_tile, reserved]),
+        layout!(SourceRow, "Source", [center, scale, axis, behind]),
+        layout!(PlanRow, "Plan", [isects, needed, visible, farthest]),
     ];
     for (name, offsets, size) in layouts {
         let mut seen = 0;
@@ -181,6 +188,7 @@ fn constants_are_those_of_the_host() {
     let narrow = |values: &[f32]| values.iter().map(|&v| f64::from(v)).collect::<Vec<_>>();
     let mut wanted: Vec<(&str, Vec<f64>)> = vec![
         ("TILE_SIZE", vec![f64::from(constants::TILE_SIZE)]),
+        ("ATAN", narrow(&constants::ATAN)),
         ("SH_C2", narrow(&constants::SH_C2)),
         ("SH_C3", narrow(&constants::SH_C3)),
     ];
@@ -212,7 +220,14 @@ fn every_stage_has_a_cpu_stage_and_every_file_is_used() {
     stems.dedup();
     assert_eq!(files, stems, "files in shaders/ against SHADERS");
     for stem in &stems {
-        let stage = root().join(format!("crates/render/src/cpu/{stem}.rs"));
+        let twin = match stem.as_str() {
+            "prefix_sum" | "emit_isects" => "cpu/bin",
+            // The blend of a tile sorts it first.
+            "tile_sort" => "cpu/rasterize",
+            "depth_steps" => "levels",
+            stem => &format!("cpu/{stem}"),
+        };
+        let stage = root().join(format!("crates/render/src/{twin}.rs"));
         assert!(stage.is_file(), "shaders/{stem}.wgsl has no {}", stage.display());
     }
 }

@@ -3,15 +3,14 @@
 
 use segsplat_core::scene::{Gaussians, RawGaussians};
 use segsplat_render::{
-    Frame, Kinds, Labels, RenderRequest, Renderer, Skip, Switches,
+    Background, Frame, Kinds, Labels, RenderRequest, Renderer, Skip, Switches,
     cpu::{
         CpuRenderer,
         footprint::Footprint,
         lanes::KernelOptions,
         paint::Paint,
-        project::{Projected, project},
-        rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
-        tiles::TileSpans,
+        rasterize::{Tile, TileScratch, rasterize_tile},
+        store::Part,
     },
     gpu::internals::SHADERS,
     view::View,
@@ -21,25 +20,6 @@ use crate::common::open;
 use segsplat_testing::labels::{labelled, table};
 use segsplat_testing::scenes::{camera, checked, cloud, look, push, request, two_views};
 
-/// Skips of the CPU renderer. Its sort has no digits to leave out.
-const OF_CPU: [Skip; 6] = [
-    Skip::EllipseTiles,
-    Skip::EllipseParts,
-    Skip::EndedRays,
-    Skip::Unseen,
-    Skip::FlatColor,
-    Skip::EmptyTiles,
-];
-/// Skips of the shaders, by their constants. An empty tile is no step of its own there.
-const OF_SHADERS: [Skip; 6] = [
-    Skip::EllipseTiles,
-    Skip::EllipseParts,
-    Skip::EndedRays,
-    Skip::Unseen,
-    Skip::FlatColor,
-    Skip::EqualDigits,
-];
-
 /// Scenes and views in which every skip has something to leave out: Gaussians beside the picture
 /// and behind the camera, tiles without any, walls, harmonics, labels.
 fn cases() -> Vec<(&'static str, Gaussians, RenderRequest)> {
@@ -47,7 +27,7 @@ fn cases() -> Vec<(&'static str, Gaussians, RenderRequest)> {
     let mut aside = camera(150, 90);
     aside.camera_to_world = look(glam::DVec3::new(2.0, 0.5, 4.0), glam::DVec3::new(9.0, 0.0, 7.0));
     let small = request(camera(70, 50));
-    let entered = RenderRequest { labels: Labels::Weights, ..small };
+    let entered = RenderRequest { labels: Labels::Weights, ..small.clone() };
     let blended = RenderRequest { labels: Labels::Blend(table(9, 8)), ..small };
     vec![
         ("a Gaussian a pixel", pair, request(middle)),
@@ -78,7 +58,7 @@ fn on_the_cpu_no_bit_changes() {
     let mut boxed = 0;
     for (name, gaussians, request) in cases() {
         let want = draw(None, &gaussians, &request);
-        for skip in OF_CPU {
+        for skip in Skip::ALL {
             boxed += same(skip, name, draw(Some(skip), &gaussians, &request), &want);
         }
     }
@@ -93,7 +73,7 @@ fn on_a_gpu_no_bit_changes() {
         let draw = |(_, gaussians, request): &(_, _, _)| gpu.render(gaussians, request);
         let wanted: Vec<_> = scenes.iter().map(|case| draw(case).expect("a frame")).collect();
         let mut boxed = 0;
-        for skip in OF_SHADERS {
+        for skip in Skip::ALL {
             let Some(gpu) = open(|options| {
                 options.switches.serial = Some(serial);
                 options.switches.without = Some(skip);
@@ -114,7 +94,7 @@ fn the_shaders_know_their_switches() {
         let name = skip.constant();
         // Declared, and asked for at least once.
         let used = SHADERS.iter().any(|shader| shader.source.matches(&name).count() > 1);
-        assert_eq!(used, OF_SHADERS.contains(&skip), "{name}");
+        assert!(used, "{name}");
     }
 }
 
@@ -133,29 +113,31 @@ fn dispatches(without: Option<Skip>) -> Option<Vec<&'static str>> {
 }
 
 #[test]
-fn a_gpu_runs_more_kernels_without_the_skips_of_the_host() {
+fn a_gpu_runs_one_more_kernel_without_the_skip_of_the_host() {
     let Some(want) = dispatches(None) else { return };
     let count = |all: &[&str], name| all.iter().filter(|&&one| one == name).count();
     assert_eq!(count(&want, "shade"), 0, "{want:?}");
     let shaded = dispatches(Some(Skip::FlatColor)).expect("the same adapter");
     assert_eq!(count(&shaded, "shade"), 1, "{shaded:?}");
-    let sorted = dispatches(Some(Skip::EqualDigits)).expect("the same adapter");
-    assert!(count(&sorted, "scatter") > count(&want, "scatter"), "{sorted:?}");
 }
 
 /// Pixels of a tile, blended from footprints that no stage gives, so that a skip shows.
 fn tile(footprints: &[Footprint], without: Option<Skip>) -> Vec<[f32; 3]> {
-    let request =
-        RenderRequest { kinds: Kinds::COLOR, background: [-0.0; 3], ..request(camera(16, 16)) };
+    let request = RenderRequest {
+        kinds: Kinds::COLOR,
+        background: Background::BLACK,
+        ..request(camera(16, 16))
+    };
     let entries = vec![0; footprints.len()];
     let options = KernelOptions { without, ..KernelOptions::default() };
-    let paint = Paint::new(&request, &entries, options);
-    let isects: Vec<u64> = (0..footprints.len() as u64).collect();
+    let view = View::new(glam::DVec3::ZERO, &request).expect("a view");
+    let paint = Paint::new(&request, &view, &entries, options);
+    let mut pairs: Vec<u64> = (0..footprints.len() as u64).collect();
     let mut color = vec![[9.0; 3]; 256];
-    let mut out = RowOut { color: Some(&mut color), ..RowOut::default() };
+    let mut out = Part { color: Some(color.chunks_mut(16).collect()), ..Part::default() };
     let place = Tile { x: 0, y: 0, width: 16, height: 16 };
     let mut scratch = TileScratch::default();
-    rasterize_tile(footprints, &isects, place, &paint, 16, &mut scratch, &mut out);
+    rasterize_tile(footprints, &mut pairs, (place, 0), (&paint, &mut scratch), &mut out);
     color
 }
 
@@ -175,34 +157,12 @@ fn every_switch_of_the_blend_on_the_cpu_does_switch() {
     };
     // It says that it ends beside its centre, where no pixel is.
     let short = Footprint { power_max: -1.0, ..wall };
-    assert_eq!(tile(&[short], None), [[-0.0; 3]; 256], "no part is touched");
-    assert_ne!(tile(&[short], Some(Skip::EllipseParts)), [[-0.0; 3]; 256], "all parts are");
+    assert_eq!(tile(&[short], None), [[0.0; 3]; 256], "no part is touched");
+    assert_ne!(tile(&[short], Some(Skip::EllipseParts)), [[0.0; 3]; 256], "all parts are");
     // Four walls end every ray. What is behind them has weight 0, and 0 times NaN is NaN.
     let bad = Footprint { color: [f32::NAN; 3], ..wall };
     let behind = [wall, wall, wall, wall, bad];
     let has_nan = |pixels: &[[f32; 3]]| pixels.iter().flatten().any(|value| value.is_nan());
     assert!(!has_nan(&tile(&behind, None)), "ended rays see nothing");
     assert!(has_nan(&tile(&behind, Some(Skip::EndedRays))), "ended rays are blended on");
-    // Zero and the background -0 are 0; the background alone is -0.
-    let negative = |pixels: &[[f32; 3]]| pixels.iter().flatten().all(|v| v.is_sign_negative());
-    assert!(negative(&tile(&[], None)), "an empty tile is filled");
-    assert!(!negative(&tile(&[], Some(Skip::EmptyTiles))), "an empty tile is blended");
-}
-
-#[test]
-fn the_switch_of_unseen_gaussians_on_the_cpu_does_switch() {
-    let (one, seen) = (one(), request(camera(40, 40)));
-    let mut away = seen.clone();
-    away.camera.camera_to_world = look(glam::DVec3::ZERO, glam::DVec3::NEG_Z);
-    for (without, kept) in [(None, true), (Some(Skip::Unseen), false)] {
-        let mut projected = Projected::default();
-        for request in [&seen, &away] {
-            let view = View::new(one.origin(), request).expect("a view");
-            let options = KernelOptions { without, ..KernelOptions::default() };
-            project(&one, &view, false, options, &mut projected);
-        }
-        assert_eq!(projected.tiles_per_gauss, [0], "it is behind the camera");
-        // Spans of a Gaussian that is not sorted are never read, so nobody clears them.
-        assert_eq!(projected.tile_spans[0] != TileSpans::default(), kept, "{without:?}");
-    }
 }

@@ -2,42 +2,55 @@
 
 use segsplat_core::scene::{Gaussians, RawGaussians};
 use segsplat_render::{
+    Source,
     constants::TILE_SIZE,
     cpu::{
+        bin::{Keys, bin, pack},
         footprint::Footprint,
         lanes::{KernelOptions, Width},
-        prefix_sum::prefix_sum,
         project::{Projected, project},
-        radix_sort::{key, pack, radix_sort},
         tiles::{Grid, TileSpans, touched_tiles},
     },
     view::View,
 };
-use segsplat_testing::scenes::{Random, camera, checked, push, request};
+use segsplat_testing::scenes::{Random, camera, checked, cloud, push, request};
 
 #[test]
-fn sums_do_not_wrap_at_32_bits() {
-    let mut offsets = vec![9];
-    let total = prefix_sum([u32::MAX, 0, u32::MAX].into_iter(), &mut offsets);
-    let max = u64::from(u32::MAX);
-    assert_eq!(offsets, [0, max, max, 2 * max], "exclusive sums");
-    assert_eq!(total, 2 * max, "total");
-}
-
-#[test]
-fn the_radix_sort_equals_the_standard_stable_sort() {
-    let mut state = 7_u32;
-    let mut next = || {
-        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-        state
-    };
-    for (len, key_bits) in [(0, 32), (1, 32), (5_000, 32), (70_000, 8), (70_000, 17)] {
-        let mask = u32::MAX >> (32 - key_bits);
-        let mut pairs: Vec<u64> = (0..len).map(|i| pack(next() & mask, i)).collect();
-        let mut want = pairs.clone();
-        want.sort_by_key(|&pair| key(pair));
-        radix_sort(&mut pairs, &mut Vec::new(), key_bits);
-        assert_eq!(pairs, want, "{len} pairs of {key_bits}-bit keys");
+fn each_tile_gets_the_gaussians_that_touch_it_those_of_photos_behind_last() {
+    // More than one chunk.
+    let gaussians = cloud(5_000, 0, 3);
+    let request = request(camera(203, 150));
+    let view = View::new(gaussians.origin(), &request).expect("a view");
+    let grid = Grid::whole(&view, KernelOptions::default());
+    let mut projected = Projected::default();
+    project(&gaussians, &request, &view, KernelOptions::default(), &mut projected);
+    let mut want = vec![Vec::new(); grid.tile_count() as usize];
+    let seen = |id: &usize| projected.tiles_per_gauss[*id] > 0;
+    for id in (0..gaussians.len()).filter(seen) {
+        let footprint = &projected.footprints[id];
+        touched_tiles(footprint, &grid, |tile_y, tiles| {
+            for tile_x in tiles {
+                let pair = pack(footprint.depth.to_bits(), id as u32);
+                want[(tile_y * grid.tiles_x() + tile_x) as usize].push(pair);
+            }
+        });
+    }
+    let total: usize = want.iter().map(Vec::len).sum();
+    let source = |behind| Source { center: [0.0; 3], axis: [0.0; 3], scale: 0.0, behind };
+    for behind in [false, true] {
+        let sources = [source(behind)];
+        let mut bins = Vec::new();
+        let keys = Keys::new(&gaussians, &sources);
+        let all = total as u64;
+        assert_eq!(bin(&projected, keys, &grid, all, &mut bins), all, "pairs");
+        assert!(bins.len() > 1, "one chunk");
+        for (tile, want) in want.iter().enumerate() {
+            let got: Vec<u64> = bins.iter().flat_map(|bins| bins.of(tile)).copied().collect();
+            let bit = u64::from(behind) << 63;
+            let want: Vec<u64> = want.iter().map(|pair| pair | bit).collect();
+            assert_eq!(got, want, "tile {tile}, behind: {behind}");
+        }
+        assert_eq!(bin(&projected, keys, &grid, all - 1, &mut bins), all, "the count is right");
     }
 }
 
@@ -135,7 +148,7 @@ fn ellipses_in_lanes_touch_the_tiles_that_one_alone_touches() {
         let options = KernelOptions { width, ..KernelOptions::default() };
         let grid = Grid::whole(&view, options);
         let mut projected = Projected::default();
-        project(&gaussians, &view, false, options, &mut projected);
+        project(&gaussians, &request, &view, options, &mut projected);
         let (mut seen, mut tall) = (0, 0);
         for (i, footprint) in projected.footprints.iter().enumerate() {
             if footprint.opacity == 0.0 {

@@ -7,23 +7,26 @@ use segsplat_core::{
 use segsplat_render::{
     Frame, Kinds, RenderRequest, Renderer,
     cpu::{
-        emit_isects,
+        bin,
         footprint::Footprint,
         lanes::KernelOptions,
         paint::Paint,
-        prefix_sum, project,
+        project,
         project::Projected,
-        radix_sort,
-        rasterize::{RowOut, Tile, TileScratch, rasterize_tile},
-        shade, tile_ranges,
+        rasterize::{Tile, TileScratch, rasterize_tile},
+        shade,
+        store::Part,
         tiles::{Grid, TileSpans},
     },
-    gpu::internals::{DROPPED_KEY, FootprintRow, NO_GAUSSIAN},
+    gpu::internals::FootprintRow,
     view::View,
 };
 
 use crate::common::{both_kernels, gpu, judge, open, same};
-use segsplat_testing::scenes::{Random, camera, checked, cloud, look, push, request, two_views};
+use crate::reference::{emit_isects, prefix_sum, radix_sort, tile_ranges};
+use segsplat_testing::scenes::{
+    BACKGROUND, Random, camera, checked, cloud, look, push, request, two_views,
+};
 
 fn view_of(gaussians: &Gaussians, request: &RenderRequest) -> View {
     View::new(gaussians.origin(), request).expect("a test view")
@@ -38,7 +41,7 @@ fn projected(gaussians: &Gaussians, request: &RenderRequest) -> Projected {
     let mut projected = Projected::default();
     let view = view_of(gaussians, request);
     let options = KernelOptions::default();
-    project::project(gaussians, &view, request.antialiased, options, &mut projected);
+    project::project(gaussians, request, &view, options, &mut projected);
     projected
 }
 
@@ -81,77 +84,50 @@ fn depth_order(projected: &Projected) -> Vec<u64> {
 fn prefix_sum_twin() {
     let Some(gpu) = gpu() else { return };
     let mut random = Random(1);
-    // The last takes three levels of blocks of 2,048.
-    for count in [1, 7, 255, 256, 1_023, 1_024, 1_025, 100_000, 4_000_000] {
-        let numbers: Vec<u32> = (0..count).map(|_| (random.bits() % 900) as u32).collect();
+    for (columns, rows) in [(1, 1), (7, 1), (16, 16), (257, 1), (120, 68), (600, 500)] {
+        let counts: Vec<u32> = (0..columns * rows).map(|_| (random.bits() % 900) as u32).collect();
         let mut want = Vec::new();
-        prefix_sum::prefix_sum(numbers.iter().copied(), &mut want);
-        let starts: Vec<u32> = want[..count].iter().step_by(1_024).map(|&sum| sum as u32).collect();
-        let (got, total) = gpu.internals().prefix_sum(&numbers).expect("sums");
-        assert!(got == starts, "{count} numbers: sums differ");
-        assert_eq!(u64::from(total), want[count], "{count} numbers: the whole sum");
+        prefix_sum::prefix_sum(counts.iter().copied(), &mut want);
+        let want: Vec<u32> = want.into_iter().map(|sum| sum as u32).collect();
+        let got = gpu.internals().prefix_sum(&counts, columns).expect("sums");
+        assert!(got == want, "{columns} x {rows} tiles: sums differ");
     }
     let mut huge = vec![0; 3 * 1_024];
     (huge[5], huge[1_500], huge[1_501], huge[3_000]) = (u32::MAX - 5, 3, 3, 9);
-    let (starts, total) = gpu.internals().prefix_sum(&huge).expect("sums");
+    let sums = gpu.internals().prefix_sum(&huge, 1_024).expect("sums");
     let near = u32::MAX - 5;
-    assert_eq!(starts, [0, near, u32::MAX], "sums stay at the largest number");
-    assert_eq!(total, u32::MAX, "the whole sum too");
+    assert_eq!((sums[5], sums[6], sums[1_501]), (0, near, near + 3), "sums");
+    assert_eq!((sums[1_502], sums[3_072]), (u32::MAX, u32::MAX), "they stay at the largest number");
+}
+
+/// A list of `count` pairs in no order, whose keys lie within `range`: equal ones too.
+fn list(count: u32, range: u64, random: &mut Random) -> Vec<[u32; 2]> {
+    let mut ids: Vec<u32> = (0..count).map(|i| 3 * i + 1).collect();
+    for i in (1..ids.len()).rev() {
+        ids.swap(i, (random.bits() % (i as u64 + 1)) as usize);
+    }
+    ids.into_iter().map(|id| [0x3f80_0000 + (random.bits() % range) as u32, id]).collect()
 }
 
 #[test]
-fn radix_sort_twin() {
+fn tile_sort_twin() {
     for gpu in both_kernels() {
         let mut random = Random(2);
-        for (count, key_bits) in
-            [(1, 32), (255, 32), (256, 8), (2_049, 32), (70_000, 32), (300_000, 9), (70_001, 1)]
+        let mut lists = Vec::new();
+        // Around the powers of two, around a run, and of several runs: an even and an odd number
+        // of rounds of merging.
+        for count in [0, 1, 2, 3, 7, 8, 9, 31, 64, 255, 256, 257, 1_000, 2_047, 2_048, 2_049, 5_000]
         {
-            let mask = u32::MAX >> (32 - key_bits);
-            let keys: Vec<u32> = (0..count).map(|_| random.bits() as u32 & mask).collect();
-            let values: Vec<u32> = (0..count).collect();
-            let mut want: Vec<u64> =
-                keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v)).collect();
-            radix_sort::radix_sort(&mut want, &mut Vec::new(), key_bits);
-            let (keys, values) =
-                gpu.internals().radix_sort(&keys, &values, key_bits).expect("a sort");
-            let got: Vec<u64> =
-                keys.iter().zip(&values).map(|(&k, &v)| radix_sort::pack(k, v)).collect();
-            assert!(got == want, "{count} pairs of {key_bits}-bit keys: order differs");
+            for range in [1, 40, 1 << 22, 0xc000_0000] {
+                lists.push(list(count, range, &mut random));
+            }
         }
-    }
-}
-
-#[test]
-fn depth_sort_leaves_the_dropped_behind() {
-    for gpu in both_kernels() {
-        let mut random = Random(22);
-        // Ranges of keys that take one to four digits; many equal; none at all.
-        for (count, low, range) in [
-            (1, 7, 1),
-            (5_000, 0x4000_0000, 200),
-            (70_000, 0x3f80_00ff, 3_000),
-            (131_072, 0x4012_3456, 1 << 23),
-            (40_000, 0x0080_0000, 0x7e00_0000_u64),
-            (300, 5, 0),
-        ] {
-            let keys: Vec<u32> = (0..count)
-                .map(|_| match (range, random.bits() % 5) {
-                    (0, _) | (_, 0) => DROPPED_KEY,
-                    _ => low + (random.bits() % range) as u32,
-                })
-                .collect();
-            let mut want: Vec<u64> = keys
-                .iter()
-                .enumerate()
-                .filter(|&(_, &key)| key != DROPPED_KEY)
-                .map(|(i, &key)| radix_sort::pack(key, i as u32))
-                .collect();
-            radix_sort::radix_sort(&mut want, &mut Vec::new(), 32);
-            let want: Vec<u32> = want.into_iter().map(radix_sort::value).collect();
-            assert!(
-                gpu.internals().depth_sort(&keys).expect("an order") == want,
-                "{count} keys over {range}"
-            );
+        lists.extend([10_000, 70_001].map(|count| list(count, 900, &mut random)));
+        lists.push(Vec::new());
+        let got = gpu.internals().tile_sort(&lists).expect("lists");
+        for (got, mut want) in got.into_iter().zip(lists) {
+            want.sort_unstable();
+            assert!(got == want, "a list of {} pairs: order differs", want.len());
         }
     }
 }
@@ -171,14 +147,13 @@ fn project_twin() {
         let (mut cpu_tiles, mut gpu_tiles) = (0_u64, 0_u64);
         for i in 0..gaussians.len() {
             let row = &got.footprints[i];
-            let seen_tiles = got.tiles[i];
-            assert_eq!(got.depth_keys[i] == DROPPED_KEY, seen_tiles == 0, "{i}: dropped or not");
+            let seen_tiles = got.touched[i];
             if tiles[i] == 0 || seen_tiles == 0 {
                 one_sided += u32::from(tiles[i] != seen_tiles);
                 continue;
             }
             both += 1;
-            keys_apart += u32::from(got.depth_keys[i] != footprints[i].depth.to_bits());
+            keys_apart += u32::from(row.depth.to_bits() != footprints[i].depth.to_bits());
             (cpu_tiles, gpu_tiles) =
                 (cpu_tiles + u64::from(tiles[i]), gpu_tiles + u64::from(seen_tiles));
             assert!(seen_tiles >= tiles[i], "{i}: {} tiles, not {}", seen_tiles, tiles[i]);
@@ -204,6 +179,8 @@ fn project_twin() {
         assert!(keys_apart * 10_000 <= both, "{keys_apart} of {both} depth keys differ");
         assert!(gpu_tiles * 100 <= cpu_tiles * 101, "{gpu_tiles} tiles against {cpu_tiles}");
         assert!(got.visible.abs_diff(both) <= one_sided, "{} visible, not {both}", got.visible);
+        let sum = |counts: &[u32]| counts.iter().map(|&n| u64::from(n)).sum::<u64>();
+        assert_eq!(sum(&got.tiles), sum(&got.touched), "counted in tiles");
     }
 }
 
@@ -229,62 +206,66 @@ fn shade_twin() {
     }
 }
 
-#[test]
-fn emit_isects_twin() {
-    let Some(gpu) = gpu() else { return };
-    let gaussians = cloud(8_000, 0, 5);
-    let request = request(camera(333, 222));
-    let view = view_of(&gaussians, &request);
-    let all = gpu.internals().project(&gaussians, &request).expect("footprints");
-    let seen: Vec<usize> = (0..gaussians.len()).filter(|&i| all.tiles[i] > 0).collect();
-    let rows: Vec<_> = seen.iter().map(|&i| all.footprints[i]).collect();
-    let tiles: Vec<_> = seen.iter().map(|&i| all.tiles[i]).collect();
-    let (tile_keys, ids) = gpu.internals().emit_isects(&view, &rows, &tiles).expect("pairs");
-    let unwritten = ids.iter().filter(|&&id| id == NO_GAUSSIAN).count();
-
-    let grid = whole(&view);
-    let footprints: Vec<_> = rows.iter().map(to_footprint).collect();
-    let touched = footprints.iter().map(|footprint| TileSpans::of(footprint, &grid));
-    let (tile_spans, tiles_per_gauss) = touched.unzip();
-    let footprints = Projected { footprints, tile_spans, tiles_per_gauss };
-    let in_order: Vec<u64> = (0..rows.len() as u32).map(|i| radix_sort::pack(0, i)).collect();
-    let mut want_offsets = Vec::new();
-    prefix_sum::prefix_sum(footprints.tiles_per_gauss.iter().copied(), &mut want_offsets);
-    let mut want = Vec::new();
-    emit_isects::emit_isects(&footprints, &in_order, &grid, &want_offsets, &mut want);
-
-    let got: std::collections::HashSet<u64> =
-        tile_keys.iter().zip(&ids).map(|(&tile, &id)| radix_sort::pack(tile, id)).collect();
-    println!("{} pairs, {} wanted, {unwritten} counted only", ids.len(), want.len());
-    assert_eq!(unwritten, 0, "counted and not emitted");
-    assert_eq!(got.len(), ids.len(), "a pair was emitted twice");
-    let missing = want.iter().filter(|pair| !got.contains(pair)).count();
-    assert_eq!(missing, 0, "tiles that the CPU touches and the GPU does not");
-    assert!(ids.len() * 100 <= want.len() * 101, "{} pairs against {}", ids.len(), want.len());
-    assert!(ids.is_sorted(), "pairs keep the depth order");
-    assert!(tile_keys.iter().all(|&tile| tile < grid.tile_count()), "a tile off the picture");
+/// Needles and walls over many tiles, which a whole workgroup visits, between specks.
+fn large_and_small() -> Gaussians {
+    let (mut raw, mut random) = (RawGaussians::default(), Random(77));
+    for i in 0..3_000 {
+        let z = random.range(1.0, 6.0);
+        let mean = [random.range(-0.8, 0.8) * z, random.range(-0.7, 0.7) * z, z];
+        let scale = match i % 50 {
+            0 => [random.range(0.1, 3.0), 1e-3, 1e-4],
+            1 => [random.range(0.2, 1.0); 3],
+            _ => [random.range(0.001, 0.02), random.range(0.001, 0.02), 0.01],
+        };
+        push(&mut raw, mean, random.quat(), scale, random.range(0.005, 1.0), &[[0.5; 3]]);
+    }
+    checked(raw)
 }
 
 #[test]
-fn tile_ranges_twin() {
-    let Some(gpu) = gpu() else { return };
-    let gaussians = checked(RawGaussians::default());
-    let view = view_of(&gaussians, &request(camera(100, 50)));
-    let tiles = view.tiles_x() * view.tiles_y();
-    let mut random = Random(6);
-    for count in [0, 1, 5, 3_000, 100_000] {
-        let mut keys: Vec<u32> = (0..count).map(|_| random.bits() as u32 % tiles).collect();
-        // Tiles without a pair in the middle and at the end.
-        keys.retain(|&tile| tile != 3 && tile != 4 && tile + 1 != tiles);
-        keys.sort_unstable();
-        let mut want = Vec::new();
-        let pairs: Vec<u64> = keys.iter().map(|&tile| radix_sort::pack(tile, 0)).collect();
-        tile_ranges::tile_ranges(&pairs, tiles, &mut want);
-        assert_eq!(
-            gpu.internals().tile_ranges(&view, &keys).expect("ranges"),
-            want,
-            "{count} pairs"
-        );
+fn emit_isects_twin() {
+    for (name, gaussians) in [("cloud", cloud(8_000, 0, 5)), ("large", large_and_small())] {
+        let Some(gpu) = gpu() else { return };
+        let request = request(camera(333, 222));
+        let view = view_of(&gaussians, &request);
+        let all = gpu.internals().project(&gaussians, &request).expect("footprints");
+        let lists = gpu.internals().lists(&view, &all).expect("lists");
+        let most = all.touched.iter().max();
+
+        let grid = whole(&view);
+        let rows = all.footprints.iter().zip(&all.touched);
+        let seen = |(row, touched): (&FootprintRow, &u32)| match touched {
+            0 => (TileSpans::default(), 0),
+            _ => TileSpans::of(&to_footprint(row), &grid),
+        };
+        let (tile_spans, tiles_per_gauss) = rows.clone().map(seen).unzip();
+        let footprints = all.footprints.iter().map(to_footprint).collect();
+        let projected = Projected { footprints, tile_spans, tiles_per_gauss };
+        let order = depth_order(&projected);
+        let (mut offsets, mut want) = (Vec::new(), Vec::new());
+        let counts =
+            order.iter().map(|&p| projected.tiles_per_gauss[radix_sort::value(p) as usize]);
+        prefix_sum::prefix_sum(counts, &mut offsets);
+        emit_isects::emit_isects(&projected, &order, &grid, &offsets, &mut want);
+
+        let tiles = lists.iter().enumerate();
+        let got: Vec<u64> = tiles
+            .flat_map(|(tile, list)| list.iter().map(move |&[_, id]| (tile as u32, id)))
+            .map(|(tile, id)| radix_sort::pack(tile, id))
+            .collect();
+        let set: std::collections::HashSet<u64> = got.iter().copied().collect();
+        println!("{name}: {} pairs, {} wanted, most of one {most:?}", got.len(), want.len());
+        let counted = |(list, &count): (&Vec<_>, &u32)| list.len() == count as usize;
+        assert!(lists.iter().zip(&all.tiles).all(counted), "{name}: counted and not emitted");
+        assert_eq!(set.len(), got.len(), "{name}: a pair was emitted twice");
+        let missing = want.iter().filter(|pair| !set.contains(pair)).count();
+        assert_eq!(missing, 0, "{name}: tiles that the CPU touches and the GPU does not");
+        assert!(got.len() * 100 <= want.len() * 101, "{} against {}", got.len(), want.len());
+        assert!(lists.iter().all(|list| list.is_sorted()), "{name}: lists are in order");
+        let key = |&[key, id]: &[u32; 2]| key == all.footprints[id as usize].depth.to_bits();
+        assert!(lists.iter().flatten().all(key), "{name}: keys are depths");
+        let many = all.touched.iter().filter(|&&n| n > 64).count();
+        assert!(many > 20, "{name}: {many} over many tiles");
     }
 }
 
@@ -306,29 +287,29 @@ fn rasterize_twin() {
         radix_sort::radix_sort(&mut isects, &mut Vec::new(), 16);
         tile_ranges::tile_ranges(&isects, grid.tile_count(), &mut ranges);
 
+        let entries = gaussians.semantic_index();
+        let paint = Paint::new(&request, &view, entries, KernelOptions::default());
         let pixels = 96 * 96;
         let (mut color, mut depth, mut alpha) =
             (vec![[0.0; 3]; pixels], vec![0.0; pixels], vec![0.0; pixels]);
         for tile_y in 0..view.tiles_y() {
             let first = (tile_y * 16 * 96) as usize;
-            let mut out = RowOut {
-                color: Some(&mut color[first..]),
-                depth: Some(&mut depth[first..]),
-                alpha: Some(&mut alpha[first..]),
-                ..RowOut::default()
+            let mut out = Part {
+                color: Some(color[first..].chunks_mut(96).take(16).collect()),
+                depth: Some(depth[first..].chunks_mut(96).take(16).collect()),
+                alpha: Some(alpha[first..].chunks_mut(96).take(16).collect()),
+                ..Part::default()
             };
             for tile_x in 0..view.tiles_x() {
                 let id = (tile_y * view.tiles_x() + tile_x) as usize;
                 let tile = Tile { x: tile_x * 16, y: tile_y * 16, width: 16, height: 16 };
-                rasterize_tile(
-                    &projected.footprints,
-                    &isects[ranges[id] as usize..ranges[id + 1] as usize],
-                    tile,
-                    &Paint::new(&request, gaussians.semantic_index(), KernelOptions::default()),
-                    96,
-                    &mut TileScratch::default(),
-                    &mut out,
-                );
+                let sorted = &isects[ranges[id] as usize..ranges[id + 1] as usize];
+                let ids = sorted.iter().map(|&isect| radix_sort::value(isect));
+                let mut pairs: Vec<u64> =
+                    (0..).zip(ids).map(|(at, id)| bin::pack(at, id)).collect();
+                let place = (tile, tile_x as usize * 16);
+                let tools = (&paint, &mut TileScratch::default());
+                rasterize_tile(&projected.footprints, &mut pairs, place, tools, &mut out);
             }
         }
         let rows: Vec<_> = projected.footprints.iter().map(to_row).collect();
@@ -336,7 +317,7 @@ fn rasterize_twin() {
         let ids: Vec<u32> = isects.iter().map(|&pair| radix_sort::value(pair)).collect();
         let got = gpu
             .internals()
-            .rasterize(&view, request.background, &rows, &colors, &ids, &ranges)
+            .rasterize(&view, BACKGROUND, &rows, &colors, &ids, &ranges)
             .expect("pictures");
         let want = Frame {
             width: 96,

@@ -30,8 +30,8 @@ fn cases() -> Vec<(&'static str, Gaussians, RenderRequest)> {
     let (pair, middle) = two_views(96, 3);
     let rgb = request(camera(161, 119));
     let smooth = RenderRequest { antialiased: true, ..rgb.clone() };
-    let blended = RenderRequest { labels: Labels::Blend(table(25, 8)), ..rgb };
-    let entered = RenderRequest { labels: Labels::Weights, ..rgb };
+    let blended = RenderRequest { labels: Labels::Blend(table(25, 8)), ..rgb.clone() };
+    let entered = RenderRequest { labels: Labels::Weights, ..rgb.clone() };
     vec![
         ("a Gaussian a pixel", pair, request(middle)),
         ("harmonics", cloud(4_000, 3, 5), rgb),

@@ -1,0 +1,249 @@
+//! Stage 8, the end: from the sums of a tile to its pixels. What lies behind is put under colour,
+//! and numbers become levels where those are asked for. Shader: `shaders/rasterize.wgsl`
+
+use std::{ops::Range, slice::ChunksMut};
+
+use super::{
+    lanes::{LaneKernel, Lanes},
+    paint::{Behind, Paint},
+    rasterize::{
+        ACROSS, CELL, CELL_X, CELL_Y, CELLS, Cell, Numbers, PIXEL_X, PIXEL_Y, PIXELS, Tile,
+        TileScratch,
+    },
+    sky::Sky,
+};
+use crate::{
+    Labels, Samples,
+    constants::{HALF_LEVEL, TILE_SIZE},
+    labels::{BLEND_WIDTH, WeightRows, selected},
+    levels::level,
+};
+
+/// Rows of pixels of a part of a picture.
+pub type Pixels<'a, T> = Option<Vec<&'a mut [T]>>;
+
+/// A part of the pictures, row of pixels by row; `None` for kinds not asked for.
+#[derive(Debug, Default)]
+pub struct Part<'a> {
+    /// Colours.
+    pub color: Pixels<'a, [f32; 3]>,
+    /// Expected depths.
+    pub depth: Pixels<'a, f32>,
+    /// Opacities.
+    pub alpha: Pixels<'a, f32>,
+    /// Colours in levels.
+    pub rgb: Pixels<'a, [u8; 3]>,
+    /// Colours and opacities in levels.
+    pub rgba: Pixels<'a, [u8; 4]>,
+    /// Opacities in levels.
+    pub alpha_levels: Pixels<'a, u8>,
+    /// Blended labels.
+    pub blend: Pixels<'a, [f32; BLEND_WIDTH]>,
+    /// Mask.
+    pub mask: Pixels<'a, u8>,
+    /// Weights of the rows.
+    pub weights: Option<WeightRows>,
+}
+
+/// Cuts rows of pixels into parts of `width` columns, from left to right.
+fn columns<'a, T>(rows: Pixels<'a, T>, width: usize) -> impl FnMut() -> Pixels<'a, T> {
+    let mut cut = rows.map(|rows| rows.into_iter().map(|row| row.chunks_mut(width)).collect());
+    move || {
+        let cut: &mut Vec<ChunksMut<'a, T>> = cut.as_mut()?;
+        Some(cut.iter_mut().filter_map(Iterator::next).collect())
+    }
+}
+
+impl<'a> Part<'a> {
+    /// Cuts a part without weights into parts of `width` columns, the last one smaller.
+    pub(super) fn split(self, count: usize, width: usize) -> Vec<Self> {
+        let mut color = columns(self.color, width);
+        let mut depth = columns(self.depth, width);
+        let mut alpha = columns(self.alpha, width);
+        let mut rgb = columns(self.rgb, width);
+        let mut rgba = columns(self.rgba, width);
+        let mut alpha_levels = columns(self.alpha_levels, width);
+        let mut blend = columns(self.blend, width);
+        let mut mask = columns(self.mask, width);
+        let part = |_| Part {
+            color: color(),
+            depth: depth(),
+            alpha: alpha(),
+            rgb: rgb(),
+            rgba: rgba(),
+            alpha_levels: alpha_levels(),
+            blend: blend(),
+            mask: mask(),
+            weights: None,
+        };
+        (0..count).map(part).collect()
+    }
+}
+
+/// A blended tile and the part where its pixels go, from row 0 and this column on.
+pub(super) struct Store<'a, 'b> {
+    pub(super) tile: Tile,
+    pub(super) paint: &'a Paint<'a>,
+    pub(super) column: usize,
+    pub(super) scratch: &'a mut TileScratch,
+    pub(super) out: &'a mut Part<'b>,
+}
+
+impl LaneKernel for Store<'_, '_> {
+    #[inline(always)]
+    fn run<S: Lanes>(self, simd: S) {
+        let Self { tile, paint, column, scratch, out } = self;
+        for at in 0..CELLS {
+            let (x, y) = (at % ACROSS * CELL, at / ACROSS * CELL);
+            let columns = (tile.width as usize).saturating_sub(x).min(CELL);
+            let rows = (tile.height as usize).saturating_sub(y).min(CELL);
+            if columns == 0 || rows == 0 {
+                continue;
+            }
+            let cell = &mut scratch.cells[at];
+            for i in 0..PIXELS / S::F32_LANES {
+                let alpha = simd.min_f32s(cell.alpha.at(simd, i), simd.splat_f32s(1.0));
+                cell.alpha.put(simd, i, alpha);
+            }
+            if paint.has_color() {
+                match &paint.behind {
+                    Behind::Color(color) => over_color(simd, cell, color),
+                    Behind::Sky(sky) => over_sky(simd, cell, (tile, at), sky, paint.samples),
+                }
+            }
+            for row in 0..rows {
+                let first = column + x;
+                write(paint, cell, row * CELL, (y + row, first..first + columns), out);
+            }
+        }
+        if let Some(weights) = &mut out.weights {
+            list(tile, column, scratch, weights);
+        }
+    }
+}
+
+/// Puts one colour behind a cell.
+#[inline(always)]
+fn over_color<S: Lanes>(simd: S, cell: &mut Cell, color: &[f32; 3]) {
+    for i in 0..PIXELS / S::F32_LANES {
+        let room = simd.sub_f32s(simd.splat_f32s(1.0), cell.alpha.at(simd, i));
+        for (sum, &behind) in cell.channels.iter_mut().zip(color) {
+            let under = simd.mul_f32s(room, simd.splat_f32s(behind));
+            sum.put(simd, i, simd.add_f32s(sum.at(simd, i), under));
+        }
+    }
+}
+
+/// Puts the backdrop behind cell `at` of a tile where enough light passes it.
+#[inline(always)]
+fn over_sky<S: Lanes>(
+    simd: S,
+    cell: &mut Cell,
+    (tile, at): (Tile, usize),
+    sky: &Sky<'_>,
+    samples: Samples,
+) {
+    let least = if samples == Samples::F32 { f32::MIN_POSITIVE } else { HALF_LEVEL };
+    let mut rooms = Numbers::ZERO;
+    let mut open = 0;
+    for i in 0..PIXELS / S::F32_LANES {
+        let room = simd.sub_f32s(simd.splat_f32s(1.0), cell.alpha.at(simd, i));
+        let shows = simd.less_than_or_equal_f32s(simd.splat_f32s(least), room);
+        open |= simd.bits(shows) << (i * S::F32_LANES);
+        rooms.put(simd, i, room);
+    }
+    if open == 0 {
+        return;
+    }
+    let middle = TILE_SIZE as f32 / 2.0 - 0.5;
+    let [x, y] = [(tile.x, &CELL_X), (tile.y, &CELL_Y)].map(|(first, cells)| {
+        // Columns and rows of the part drawn: whole numbers of at most 18 bits.
+        first as f32 + middle + cells.0[at]
+    });
+    let (mut us, mut vs) = (Numbers::ZERO, Numbers::ZERO);
+    for i in 0..PIXELS / S::F32_LANES {
+        let x = simd.add_f32s(PIXEL_X.at(simd, i), simd.splat_f32s(x));
+        let y = simd.add_f32s(PIXEL_Y.at(simd, i), simd.splat_f32s(y));
+        let (u, v) = sky.places(simd, x, y);
+        us.put(simd, i, u);
+        vs.put(simd, i, v);
+    }
+    while open != 0 {
+        let pixel = open.trailing_zeros() as usize;
+        open &= open - 1;
+        let behind = sky.color(us.0[pixel], vs.0[pixel]);
+        for (sum, behind) in cell.channels.iter_mut().zip(behind) {
+            sum.0[pixel] += rooms.0[pixel] * behind;
+        }
+    }
+}
+
+/// Writes a row of a cell, from number `first` of its pixels on, to columns of a row of `out`.
+#[inline(always)]
+fn write(
+    paint: &Paint<'_>,
+    cell: &Cell,
+    first: usize,
+    (row, to): (usize, Range<usize>),
+    out: &mut Part<'_>,
+) {
+    let [depth_at, label_at, _] = paint.layout();
+    let Cell { alpha, channels, .. } = cell;
+    let alpha = &alpha.0;
+    let color = |i: usize| [channels[0].0[i], channels[1].0[i], channels[2].0[i]];
+    let labels = |i: usize| {
+        let at = |k: usize| channels[label_at + k].0[i];
+        [at(0), at(1), at(2), at(3)]
+    };
+    let place = (row, first, to);
+    put(&mut out.color, &place, color);
+    put(&mut out.depth, &place, |i| match alpha[i] > 0.0 {
+        true => channels[depth_at].0[i] / alpha[i],
+        false => 0.0,
+    });
+    put(&mut out.alpha, &place, |i| alpha[i]);
+    put(&mut out.rgb, &place, |i| {
+        let [r, g, b] = color(i);
+        [level(r), level(g), level(b)]
+    });
+    put(&mut out.rgba, &place, |i| {
+        let [r, g, b] = color(i);
+        [level(r), level(g), level(b), level(alpha[i])]
+    });
+    put(&mut out.alpha_levels, &place, |i| level(alpha[i]));
+    put(&mut out.blend, &place, labels);
+    if let Labels::Mask { coverage_floor, .. } = paint.labels {
+        put(&mut out.mask, &place, |i| u8::from(selected(labels(i), *coverage_floor)) * u8::MAX);
+    }
+}
+
+/// Puts what `of` gives for a cell's pixels from `first` on into some columns of a row.
+#[inline(always)]
+fn put<T>(
+    out: &mut Pixels<'_, T>,
+    (row, first, to): &(usize, usize, Range<usize>),
+    of: impl Fn(usize) -> T,
+) {
+    if let Some(rows) = out {
+        for (i, pixel) in (*first..).zip(&mut rows[*row][to.clone()]) {
+            *pixel = of(i);
+        }
+    }
+}
+
+/// Lists the weights of a tile's pixels, row by row.
+fn list(tile: Tile, first: usize, scratch: &mut TileScratch, weights: &mut WeightRows) {
+    for row in 0..tile.height as usize {
+        for column in 0..tile.width as usize {
+            let cell = row / CELL * ACROSS + column / CELL;
+            let pixel = row % CELL * CELL + column % CELL;
+            let count = scratch.bins.present.len();
+            let sums = &scratch.bins.sums[cell * count..(cell + 1) * count];
+            for (entry, sum) in scratch.bins.present.iter().zip(sums) {
+                if sum.0[pixel] > 0.0 {
+                    weights.push(first + column, row, *entry, sum.0[pixel]);
+                }
+            }
+        }
+    }
+}
