@@ -1,5 +1,5 @@
-// Stage 4: each Gaussian into the list of each tile that it touches, in no order.
-// CPU: crates/render/src/cpu/bin.rs (in the order of the scene)
+// Stage 4: each Gaussian into the list of each tile that it touches, in no order there.
+// CPU: crates/render/src/cpu/bin.rs
 
 @group(0) @binding(1) var<storage, read_write> plans: array<Plan>;
 @group(0) @binding(2) var<storage, read> footprints: array<Footprint>;
@@ -11,10 +11,19 @@
 // [2][views][capacity] of (depth key, Gaussian).
 @group(0) @binding(6) var<storage, read_write> pairs: array<vec2<u32>>;
 
-fn visit(tile: u32, footprint: Footprint, id: u32) {
-    let place = atomicAdd(&ends[tile], 1u);
+// Whether pairs get their places, or are counted in bins for that.
+var<private> placing: bool;
+
+fn visit(tile: vec2<u32>, footprint: Footprint, id: u32) {
+    let bin = bin_of(tile);
+    var place = 0u;
+    if bin < BINS {
+        place = atomicAdd(&bins[bin], 1u);
+    } else if placing {
+        place = atomicAdd(&ends[number_of(tile)], 1u);
+    }
     // Two compilations of one function may round differently: what was not counted has no room.
-    if place < starts[tile + 1u] {
+    if placing && place < starts[number_of(tile) + 1u] {
         pairs[views[which].pair_start + place] = vec2(bitcast<u32>(footprint.depth), id);
     }
 }
@@ -30,18 +39,39 @@ fn main(
     let i = (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
     let first = which * total;
     begin_visits(local);
+    var footprint: Footprint;
+    var visits = false;
     // No pairs where there is no room for them.
     if i < total && plans[which].isects > 0u {
         let touched = tiles[first + i];
         if touched > 0u {
-            visit_or_defer(footprints[first + i], i, touched);
+            footprint = footprints[first + i];
+            visits = see(footprint, i, touched);
         }
     }
-    workgroupBarrier();
+    open_bins();
+    // First all count, then all place: one body, so that it finds the same tiles both times.
+    for (var turn = 0u; turn < 2u; turn++) {
+        placing = turn == 1u;
+        if visits && (placing || bin_sides.x > 0u) {
+            visit_tiles(footprint, i, 0u, 1u, 0u, 1u);
+        }
+        workgroupBarrier();
+        if !placing {
+            for (var bin = local; bin < bin_sides.x * bin_sides.y; bin += WORKGROUP_SIZE) {
+                let sum = atomicLoad(&bins[bin]);
+                if sum > 0u {
+                    atomicStore(&bins[bin], atomicAdd(&ends[number_of(tile_of(bin))], sum));
+                }
+            }
+        }
+        workgroupBarrier();
+    }
     if local == 0u {
         larges = atomicLoad(&large_count);
     }
     let count = workgroupUniformLoad(&larges);
+    bin_sides = vec2(0u);
     for (var k = 0u; k < count; k++) {
         let id = large[k];
         visit_tiles(footprints[first + id], id, local / 8u, 32u, local % 8u, 8u);

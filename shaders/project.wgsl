@@ -81,8 +81,13 @@ fn project_one(i: u32) -> Footprint {
     return footprint;
 }
 
-fn visit(tile: u32, footprint: Footprint, id: u32) {
-    atomicAdd(&ends[tile], 1u);
+fn visit(tile: vec2<u32>, footprint: Footprint, id: u32) {
+    let bin = bin_of(tile);
+    if bin < BINS {
+        atomicAdd(&bins[bin], 1u);
+    } else {
+        atomicAdd(&ends[number_of(tile)], 1u);
+    }
 }
 
 var<workgroup> seen: atomic<u32>;
@@ -100,8 +105,10 @@ fn main(
         atomicStore(&seen, 0u);
     }
     begin_visits(local);
+    var footprint: Footprint;
+    var visits = false;
     if i < views[which].gaussian_count {
-        let footprint = project_one(i);
+        footprint = project_one(i);
         var touched = 0u;
         if footprint.opacity > 0.0 {
             touched = count_tiles(footprint, views[which].row_start, views[which].row_end);
@@ -114,24 +121,34 @@ fn main(
             }
             if touched > 0u {
                 footprints[first + i] = footprint;
+                visits = see(footprint, i, touched);
             }
-            visit_or_defer(footprint, i, touched);
         }
         tiles[first + i] = touched;
     }
     storageBarrier();
+    open_bins();
+    if visits {
+        visit_tiles(footprint, i, 0u, 1u, 0u, 1u);
+    }
     if local == 0u {
         larges = atomicLoad(&large_count);
-    }
-    let count = workgroupUniformLoad(&larges);
-    for (var k = 0u; k < count; k++) {
-        let id = large[k];
-        visit_tiles(footprints[first + id], id, local / 8u, 32u, local % 8u, 8u);
-    }
-    if local == 0u {
         let visible = atomicLoad(&seen);
         if visible > 0u {
             atomicAdd(&plans[which].visible, visible);
         }
+    }
+    let count = workgroupUniformLoad(&larges);
+    for (var bin = local; bin < bin_sides.x * bin_sides.y; bin += WORKGROUP_SIZE) {
+        let sum = atomicLoad(&bins[bin]);
+        if sum > 0u {
+            atomicAdd(&ends[number_of(tile_of(bin))], sum);
+        }
+    }
+    // Those are not counted in bins: their sums are out already.
+    bin_sides = vec2(0u);
+    for (var k = 0u; k < count; k++) {
+        let id = large[k];
+        visit_tiles(footprints[first + id], id, local / 8u, 32u, local % 8u, 8u);
     }
 }

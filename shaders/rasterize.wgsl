@@ -142,17 +142,22 @@ struct Pixel {
 // The pixels of this invocation.
 var<private> pixels: array<Pixel, PIXELS_MAX>;
 
-fn blend(q: u32, shape: vec4<f32>, weight: vec4<f32>, paint: vec4<f32>, row: vec4<f32>) {
+// Half the squared distance of a pixel to a Gaussian, and its alpha there.
+fn alpha_of(q: u32, shape: vec4<f32>, weight: vec4<f32>) -> vec2<f32> {
     let d = pixels[q].center - shape.xy;
     let across = shape.w * (d.x - shape.z * d.y);
     let along = weight.x * d.y;
     let power = across * across + along * along;
-    let alpha = min(ALPHA_MAX, weight.y * exp(-power));
+    return vec2(power, min(ALPHA_MAX, weight.y * exp(-power)));
+}
+
+fn blend(q: u32, some: bool, one: vec2<f32>, weight: vec4<f32>, paint: vec4<f32>, row: vec4<f32>) {
+    let alpha = one.y;
     let transmittance = pixels[q].transmittance;
     let left = transmittance * (1.0 - alpha);
     // Hardly a branch: invocations that part ways take as long as both ways together. Over its
     // power_max alpha is under ALPHA_MIN for certain; a NaN is skipped too.
-    let hit = power <= weight.z && alpha >= ALPHA_MIN && !pixels[q].done;
+    let hit = some && one.x <= weight.z && alpha >= ALPHA_MIN && !pixels[q].done;
     let ends = hit && left <= TRANSMITTANCE_MIN;
     let adds = hit && !ends;
     pixels[q].done = pixels[q].done || ends;
@@ -170,6 +175,21 @@ fn blend(q: u32, shape: vec4<f32>, weight: vec4<f32>, paint: vec4<f32>, row: vec
     pixels[q].alpha += share;
     pixels[q].transmittance = select(transmittance, left, adds);
 }
+
+// Blends Gaussian k, and k_next behind it if `two`. The alphas of both are on their way at once.
+fn blend_two(q: u32, k: u32, k_next: u32, two: bool) {
+    let weight = weights[k];
+    let weight_next = weights[k_next];
+    let one = alpha_of(q, shapes[k], weight);
+    let next = alpha_of(q, shapes[k_next], weight_next);
+    let paint = paints[k];
+    let paint_next = paints[k_next];
+    blend(q, true, one, weight, paint, row_of(u32(weight.w), paint));
+    blend(q, two, next, weight_next, paint_next, row_of(u32(weight_next.w), paint_next));
+}
+
+// Colours of the pixels of this invocation in 24 bits.
+var<private> rgbs: array<u32, PIXELS_MAX>;
 
 fn level(value: f32) -> u32 {
     return u32(clamp(value, 0.0, 1.0) * 255.0 + 0.5);
@@ -192,9 +212,11 @@ fn store(q: u32, corner: vec2<f32>) {
     let alpha = min(pixels[q].alpha, 1.0);
     if WITH_COLOR && views[which].color_start != NO_PICTURE {
         let out = composed(q, alpha, corner);
-        if views[which].levels != 0u {
-            pictures[views[which].color_start + at] = level(out.x) | (level(out.y) << 8u)
-                | (level(out.z) << 16u) | (level(alpha) << 24u);
+        let rgb = level(out.x) | (level(out.y) << 8u) | (level(out.z) << 16u);
+        if views[which].levels == LEVELS_RGB {
+            rgbs[q] = rgb;
+        } else if views[which].levels == LEVELS_RGBA {
+            pictures[views[which].color_start + at] = rgb | (level(alpha) << 24u);
         } else {
             let to = views[which].color_start + at * 3u;
             pictures[to] = bitcast<u32>(out.x);
@@ -220,37 +242,58 @@ fn place_of(local: u32, q: u32) -> vec2<u32> {
     return vec2((part & 3u) * 4u + (lane & 3u), (part >> 2u) * 2u + (lane >> 2u));
 }
 
-// Writes the pictures of bytes. Four neighbours share a word; `met` takes their bytes together.
-fn store_bytes(local: u32, tile: vec2<u32>) {
-    for (var q = 0u; q < PIXELS; q++) {
-        let place = place_of(local, q);
-        let bytes = level(min(pixels[q].alpha, 1.0)) | (mask_byte(q) << 8u);
-        met[place.y * TILE_SIZE + place.x] = select(bytes, 0u, pixels[q].at == NO_PICTURE);
-    }
-    workgroupBarrier();
-    let words = (views[which].width + 3u) / 4u;
-    let bottom = min(views[which].row_end * TILE_SIZE, views[which].height);
-    let rows = bottom - views[which].row_start * TILE_SIZE;
-    for (var i = local; i < 64u; i += LANES) {
-        let x = tile.x * 4u + i % 4u;
-        let y = tile.y * TILE_SIZE + i / 4u;
-        let first = i * 4u;
-        let of_four = vec4(met[first], met[first + 1u], met[first + 2u], met[first + 3u]);
-        if x < words && y < rows {
-            if views[which].alpha_byte_start != NO_PICTURE {
-                pictures[views[which].alpha_byte_start + y * words + x] = pack_bytes(of_four);
-            }
-            if views[which].mask_start != NO_PICTURE {
-                pictures[views[which].mask_start + y * words + x] = pack_bytes(of_four >> vec4(8u));
-            }
-        }
-    }
-}
-
 // The lowest bytes of four numbers in a word.
 fn pack_bytes(of_four: vec4<u32>) -> u32 {
     let bytes = of_four & vec4(0xffu);
     return bytes.x | (bytes.y << 8u) | (bytes.z << 16u) | (bytes.w << 24u);
+}
+
+// Writes the pictures whose pixels share words, by way of `met` and `words`.
+fn store_bytes(local: u32, tile: vec2<u32>) {
+    for (var q = 0u; q < PIXELS; q++) {
+        let place = place_of(local, q);
+        let to = place.y * TILE_SIZE + place.x;
+        let inside = pixels[q].at != NO_PICTURE;
+        let bytes = level(min(pixels[q].alpha, 1.0)) | (mask_byte(q) << 8u);
+        met[to] = select(0u, bytes, inside);
+        words[to] = select(0u, rgbs[q], inside);
+    }
+    workgroupBarrier();
+    let bottom = min(views[which].row_end * TILE_SIZE, views[which].height);
+    let rows = bottom - views[which].row_start * TILE_SIZE;
+    // Four pixels are a word of alpha or mask and three of colour.
+    let stride = (views[which].width + 3u) / 4u;
+    let color_stride = (views[which].width * 3u + 3u) / 4u;
+    for (var i = local; i < 64u; i += LANES) {
+        let x = tile.x * 4u + i % 4u;
+        let y = tile.y * TILE_SIZE + i / 4u;
+        if x >= stride || y >= rows {
+            continue;
+        }
+        var bytes: vec4<u32>;
+        var rgb: vec4<u32>;
+        for (var k = 0u; k < 4u; k++) {
+            bytes[k] = met[i * 4u + k];
+            rgb[k] = words[i * 4u + k];
+        }
+        if views[which].alpha_byte_start != NO_PICTURE {
+            pictures[views[which].alpha_byte_start + y * stride + x] = pack_bytes(bytes);
+        }
+        if views[which].mask_start != NO_PICTURE {
+            pictures[views[which].mask_start + y * stride + x] = pack_bytes(bytes >> vec4(8u));
+        }
+        if views[which].levels == LEVELS_RGB && views[which].color_start != NO_PICTURE {
+            let to = views[which].color_start + y * color_stride + x * 3u;
+            let left = color_stride - x * 3u;
+            pictures[to] = rgb.x | (rgb.y << 24u);
+            if left > 1u {
+                pictures[to + 1u] = (rgb.y >> 8u) | (rgb.z << 16u);
+            }
+            if left > 2u {
+                pictures[to + 2u] = (rgb.z >> 16u) | (rgb.w << 8u);
+            }
+        }
+    }
 }
 
 @compute @workgroup_size(LANES)
@@ -343,15 +386,14 @@ fn main(
             }
             let k = w * 32u + firstTrailingBit(word);
             word &= word - 1u;
-            let shape = shapes[k];
-            let weight = weights[k];
-            let paint = paints[k];
-            let row = row_of(u32(weight.w), paint);
+            let two = word != 0u;
+            let k_next = select(k, w * 32u + firstTrailingBit(word), two);
+            word &= max(word, 1u) - 1u;
             // No loop where there is one: GPUs' compilers make less of a loop within a loop.
-            blend(0u, shape, weight, paint, row);
+            blend_two(0u, k, k_next, two);
             if PIXELS > 1u {
                 for (var q = 1u; q < PIXELS; q++) {
-                    blend(q, shape, weight, paint, row);
+                    blend_two(q, k, k_next, two);
                 }
             }
         }
@@ -371,7 +413,7 @@ fn main(
         }
     }
     if WITH_BYTES {
-        // All have read what `met` held.
+        // All have read what `met` and `words` held.
         workgroupBarrier();
         if tiled {
             store_bytes(local, tile.xy);

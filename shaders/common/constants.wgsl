@@ -27,8 +27,13 @@ const VIEWS_MAX: u32 = 8u;
 const SORT_RUN: u32 = 2048u;
 // Tiles of a Gaussian above which a whole workgroup visits them.
 const LARGE_TILES: u32 = 64u;
+// Tiles in which a workgroup counts by itself.
+const BINS: u32 = 1024u;
 // Workgroups along x at most; more go to y.
 const GROUPS_X_MAX: u32 = 32768u;
+// Values of View::levels but 0.
+const LEVELS_RGB: u32 = 1u;
+const LEVELS_RGBA: u32 = 2u;
 // Cells of a backdrop.
 const BACKDROP_WIDTH: u32 = 128u;
 const BACKDROP_HEIGHT: u32 = 64u;

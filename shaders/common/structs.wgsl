@@ -48,7 +48,8 @@ struct View {
     // First tile in `starts`, `ends` and `lists`, and first tile pair.
     range_start: u32,
     pair_start: u32,
-    // Not 0: colour and alpha as four levels of 8 bits in a word.
+    // How colour is written: 0 f32, LEVELS_RGB three bytes, LEVELS_RGBA four with alpha. Rows start
+    // at whole words.
     levels: u32,
     // Pictures of bytes, whose rows start at whole words: alpha in levels, the mask.
     alpha_byte_start: u32,

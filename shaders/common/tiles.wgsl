@@ -91,8 +91,7 @@ fn count_tiles(footprint: Footprint, row_start: u32, row_end: u32) -> u32 {
 // Visits the tiles that a footprint touches in the band: of its rows of tiles every `lines`-th from
 // `line`, of each row every `steps`-th tile from `step`. A shader says what a visit does.
 fn visit_tiles(footprint: Footprint, id: u32, line: u32, lines: u32, step: u32, steps: u32) {
-    let first_row = views[which].row_start;
-    let extent = extent_of(footprint, first_row, views[which].row_end);
+    let extent = extent_of(footprint, views[which].row_start, views[which].row_end);
     if extent.top > extent.bottom {
         return;
     }
@@ -100,29 +99,84 @@ fn visit_tiles(footprint: Footprint, id: u32, line: u32, lines: u32, step: u32, 
     let last = extent.bottom / size;
     for (var tile_y = extent.top / size + i32(line); tile_y <= last; tile_y += i32(lines)) {
         let span = tile_span(footprint, extent, tile_y);
-        let row = (u32(tile_y) - first_row) * views[which].tiles_x + views[which].range_start;
         for (var tile_x = span.x + step; tile_x < span.y; tile_x += steps) {
-            visit(row + tile_x, footprint, id);
+            visit(vec2(tile_x, u32(tile_y)), footprint, id);
         }
     }
 }
 
-// Gaussians of this workgroup that touch many tiles: all its invocations visit those together.
+// Number of a tile (column, row of the picture) in the batch.
+fn number_of(tile: vec2<u32>) -> u32 {
+    let row = tile.y - views[which].row_start;
+    return views[which].range_start + row * views[which].tiles_x + tile.x;
+}
+
+// A device adds slowly to one address, and Gaussians that are neighbours in memory touch the same
+// tiles. So a workgroup first counts by itself in the box of the tiles that its Gaussians touch,
+// where that box is small.
+var<workgroup> bins: array<atomic<u32>, BINS>;
+// Least column and row, largest column and row.
+var<workgroup> bin_box: array<atomic<u32>, 4>;
+// Gaussians that touch many tiles: all invocations of the workgroup visit those together.
 var<workgroup> large: array<u32, WORKGROUP_SIZE>;
 var<workgroup> large_count: atomic<u32>;
 var<workgroup> larges: u32;
 
+// First tile and sides of the box, once all have seen their Gaussian.
+var<private> bin_corner: vec2<u32>;
+var<private> bin_sides: vec2<u32>;
+
 fn begin_visits(local: u32) {
+    if local < 4u {
+        atomicStore(&bin_box[local], select(0u, 0xffffffffu, local < 2u));
+    }
     if local == 0u {
         atomicStore(&large_count, 0u);
+    }
+    for (var i = local; i < BINS; i += WORKGROUP_SIZE) {
+        atomicStore(&bins[i], 0u);
     }
     workgroupBarrier();
 }
 
-fn visit_or_defer(footprint: Footprint, id: u32, touched: u32) {
+// Whether this invocation visits the tiles of its Gaussian itself.
+fn see(footprint: Footprint, id: u32, touched: u32) -> bool {
     if touched > LARGE_TILES {
         large[atomicAdd(&large_count, 1u)] = id;
-    } else if touched > 0u {
-        visit_tiles(footprint, id, 0u, 1u, 0u, 1u);
+        return false;
     }
+    let extent = extent_of(footprint, views[which].row_start, views[which].row_end);
+    let size = i32(TILE_SIZE);
+    let last = i32(views[which].tiles_x) - 1;
+    let left = to_pixel(floor(footprint.mean.x - extent.wide)) / size;
+    let right = to_pixel(ceil(footprint.mean.x + extent.wide)) / size;
+    atomicMin(&bin_box[0], u32(clamp(left, 0, last)));
+    atomicMin(&bin_box[1], u32(extent.top / size));
+    atomicMax(&bin_box[2], u32(clamp(right, 0, last)));
+    atomicMax(&bin_box[3], u32(extent.bottom / size));
+    return true;
+}
+
+// After all have seen their Gaussian.
+fn open_bins() {
+    workgroupBarrier();
+    bin_corner = vec2(atomicLoad(&bin_box[0]), atomicLoad(&bin_box[1]));
+    let last = vec2(atomicLoad(&bin_box[2]), atomicLoad(&bin_box[3]));
+    bin_sides = vec2(0u);
+    if all(last >= bin_corner) {
+        let sides = last - bin_corner + vec2(1u);
+        bin_sides = select(vec2(0u), sides, max(sides.x, sides.y) <= BINS
+            && sides.x * sides.y <= BINS);
+    }
+}
+
+// Bin of a tile; BINS for those that have none.
+fn bin_of(tile: vec2<u32>) -> u32 {
+    let at = tile - bin_corner;
+    return select(BINS, at.y * bin_sides.x + at.x, all(at < bin_sides));
+}
+
+// Tile of a bin.
+fn tile_of(bin: u32) -> vec2<u32> {
+    return bin_corner + vec2(bin % bin_sides.x, bin / bin_sides.x);
 }

@@ -1,6 +1,12 @@
 //! Switches that tests and the laboratory set. The product leaves all of them at their defaults.
 
-use std::path::PathBuf;
+use std::{
+    path::PathBuf,
+    sync::{
+        Arc,
+        atomic::{AtomicU32, Ordering},
+    },
+};
 
 use crate::cpu::lanes::Width;
 
@@ -24,6 +30,28 @@ pub struct Switches {
     /// Whether the kernels for software adapters are used, where one invocation does what many
     /// share on a GPU. `None`: on software adapters alone.
     pub serial: Option<bool>,
+    /// Faults to come on GPU devices.
+    pub faults: Arc<FaultsToCome>,
+}
+
+/// How often something of a GPU device still fails.
+#[derive(Debug, Default)]
+pub struct FaultsToCome {
+    /// Buffers for which there is no memory.
+    pub memory: AtomicU32,
+    /// Looks at the device that find it lost.
+    pub lost: AtomicU32,
+    /// Tries to open a device.
+    pub open: AtomicU32,
+}
+
+impl FaultsToCome {
+    /// Whether this one fails; then there is one less to come.
+    pub(crate) fn comes(fault: &AtomicU32) -> bool {
+        let less = |left: u32| left.checked_sub(1);
+        fault.load(Ordering::Relaxed) > 0
+            && fault.fetch_update(Ordering::Relaxed, Ordering::Relaxed, less).is_ok()
+    }
 }
 
 /// One kind of work that a renderer leaves out because no pixel changes. Tests switch each kind off

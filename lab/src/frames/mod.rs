@@ -18,7 +18,7 @@ use self::generated::{dump, scene};
 use crate::{
     error::{Error, Result},
     render::{
-        DeviceTimes, DispatchTime, Frame, Kinds, Labels, Quality, RenderRequest, Renderer,
+        DeviceTimes, DispatchTime, Frame, Kinds, Labels, Quality, RenderRequest, Renderer, Samples,
         Switches,
         compare::{Compared, compare, compare_oracle},
         cpu::CpuRenderer,
@@ -63,6 +63,9 @@ pub(crate) struct Args {
     /// Also times this many callers at once
     #[arg(long, default_value_t = 0)]
     callers: usize,
+    /// Callers ask for levels of 8 bits, not for f32
+    #[arg(long)]
+    levels: bool,
     /// Folder whose files replace the built-in shaders
     #[arg(long)]
     shaders: Option<PathBuf>,
@@ -152,7 +155,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let device = drawing.device_times(args.frames)?;
     let callers = match args.callers {
         0 => Value::Null,
-        callers => drawing.call_together(callers, args.frames)?,
+        callers => drawing.call_together(callers, args)?,
     };
     let (labels, of_labels) = match args.labels {
         Some(labels) => drawing.label_times(args, labels)?,
@@ -223,8 +226,12 @@ impl Drawing<'_> {
     }
 
     /// Views a second of one caller and of `callers` at once, each view from a place of its own.
-    fn call_together(&self, callers: usize, frames: usize) -> Result<Value> {
-        let request = &RenderRequest { kinds: Kinds::COLOR, ..self.request.clone() };
+    fn call_together(&self, callers: usize, args: &Args) -> Result<Value> {
+        let (frames, samples) = match args.levels {
+            true => (args.frames, Samples::Levels),
+            false => (args.frames, Samples::F32),
+        };
+        let request = &RenderRequest { kinds: Kinds::COLOR, samples, ..self.request.clone() };
         let views = |caller: usize| -> Result<()> {
             for frame in 0..frames {
                 let place = 1e-4 * (caller * frames + frame) as f64;
@@ -245,7 +252,10 @@ impl Drawing<'_> {
         // The first round makes room.
         rate(callers)?;
         let (one, all) = (rate(1)?, rate(callers)?);
-        Ok(json!({ "callers": callers, "one_per_s": one, "all_per_s": all, "ratio": all / one }))
+        let levels = args.levels;
+        Ok(
+            json!({ "callers": callers, "levels": levels, "one_per_s": one, "all_per_s": all, "ratio": all / one }),
+        )
     }
 
     /// What labels cost beside colour: medians of frames drawn in turn, so that a noisy machine is

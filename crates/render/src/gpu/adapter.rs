@@ -108,7 +108,7 @@ impl Adapter {
     }
 
     fn open_device(&self) -> Result<OpenDevice> {
-        let gpu = Gpu::open(&self.adapter, self.options.switches.portable)?;
+        let gpu = Gpu::open(&self.adapter, &self.options.switches)?;
         let kernels = Kernels::compile(&gpu, &self.options.switches, self.report.software)?;
         let scenes = SceneCache::new(self.options.scene_bytes_max);
         Ok(OpenDevice { gpu, kernels: Arc::new(kernels), scenes: Arc::new(Mutex::new(scenes)) })

@@ -4,7 +4,11 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use super::{device::Gpu, pipelines::NO_PICTURE, recorder::SceneBuffers};
+use super::{
+    device::Gpu,
+    pipelines::{LEVELS_RGB, LEVELS_RGBA, NO_PICTURE},
+    recorder::SceneBuffers,
+};
 use crate::{
     Background, Labels, RenderRequest, Samples, Source,
     constants::{HALF_LEVEL, OWN_SIZE},
@@ -171,7 +175,11 @@ impl ViewRow {
         let exact = request.samples == Samples::F32;
         let [first, across, down] = view.rays().map(|[x, y, z]| [x, y, z, 0.0]);
         Self {
-            levels: u32::from(!exact),
+            levels: match request.samples {
+                Samples::F32 => 0,
+                Samples::Levels => LEVELS_RGB,
+                Samples::LevelsRgba => LEVELS_RGBA,
+            },
             room_min: if exact { f32::MIN_POSITIVE } else { HALF_LEVEL },
             coverage_floor: match request.labels {
                 Labels::Mask { coverage_floor, .. } => coverage_floor,

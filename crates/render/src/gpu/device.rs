@@ -14,6 +14,7 @@ use super::profile;
 use crate::{
     error::{Error, ErrorCode, Result},
     select::AdapterReport,
+    switches::{FaultsToCome, Switches},
 };
 
 /// Names of software adapters. Their device type is not always right.
@@ -27,9 +28,16 @@ pub(super) const STORAGE: BufferUsages =
 const UPLOAD_CHUNK: usize = 32 << 20;
 
 /// Storage buffers that a stage of the kernels needs.
-const STORAGE_BUFFERS: u32 = 7;
+const STORAGE_BUFFERS: u32 = 8;
 /// Bytes of workgroup storage that the kernels need.
 const WORKGROUP_BYTES: u32 = 16 << 10;
+
+const REFUSED: &str = "the GPU adapter refused a device";
+
+fn used_up(what: &str) -> Error {
+    let why = format!("{what}: the GPU's memory is used up");
+    Error::new(ErrorCode::LimitExceeded, why)
+}
 
 /// Describes all adapters of `backends`, in their order.
 fn list(backends: wgpu::Backends) -> Vec<(wgpu::Adapter, AdapterReport)> {
@@ -135,13 +143,18 @@ pub(super) struct Gpu {
     /// Number of buffers made so far.
     generation: Arc<AtomicU64>,
     faults: Arc<Faults>,
+    to_come: Arc<FaultsToCome>,
 }
 
 impl Gpu {
     /// Opens a device with the limits of the adapter, or with the smallest limits of WebGPU.
     /// Errors: `gpu_unavailable` when the adapter refuses or its limits are too small for the
     /// kernels.
-    pub(super) fn open(adapter: &wgpu::Adapter, portable: bool) -> Result<Self> {
+    pub(super) fn open(adapter: &wgpu::Adapter, switches: &Switches) -> Result<Self> {
+        let to_come = Arc::clone(&switches.faults);
+        if FaultsToCome::comes(&to_come.open) {
+            return Err(Error::new(ErrorCode::GpuUnavailable, REFUSED));
+        }
         let offered = adapter.limits();
         let wgpu::Limits {
             max_storage_buffers_per_shader_stage: buffers,
@@ -161,7 +174,7 @@ impl Gpu {
                 return Err(Error::new(ErrorCode::GpuUnavailable, why));
             }
         }
-        let limits = if portable { wgpu::Limits::default() } else { offered };
+        let limits = if switches.portable { wgpu::Limits::default() } else { offered };
         let binding_bytes_max =
             limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) & !0xff;
         let has_times = adapter.features().contains(profile::FEATURES);
@@ -171,9 +184,7 @@ impl Gpu {
             required_limits: limits,
             ..Default::default()
         }))
-        .map_err(|e| {
-            Error::new(ErrorCode::GpuUnavailable, "the GPU adapter refused a device").caused_by(e)
-        })?;
+        .map_err(|e| Error::new(ErrorCode::GpuUnavailable, REFUSED).caused_by(e))?;
         let faults = Arc::new(Faults::default());
         let uncaptured = Arc::clone(&faults);
         device.on_uncaptured_error(Arc::new(move |error| uncaptured.report(error.to_string())));
@@ -185,7 +196,7 @@ impl Gpu {
             }
         });
         let generation = Arc::default();
-        Ok(Self { device, queue, binding_bytes_max, has_times, generation, faults })
+        Ok(Self { device, queue, binding_bytes_max, has_times, generation, faults, to_come })
     }
 
     /// Changes when a buffer is made or dropped. Bind groups of an older generation are invalid.
@@ -213,6 +224,9 @@ impl Gpu {
     /// Checks for faults outside of any scope since the last call.
     /// Errors: `gpu_unavailable` when the device is lost, `internal` for any other fault.
     pub(super) fn check(&self) -> Result<()> {
+        if FaultsToCome::comes(&self.to_come.lost) {
+            return Err(self.give_up("the GPU device was lost".to_owned()));
+        }
         let message = self.faults.message.lock().take();
         if self.is_lost() {
             return Err(Error::new(ErrorCode::GpuUnavailable, "the GPU device was lost")
@@ -237,8 +251,7 @@ impl Gpu {
         let memory = pollster::block_on(memory.pop());
         self.check()?;
         if let Some(error) = memory {
-            let why = format!("{what}: the GPU's memory is used up");
-            return Err(Error::new(ErrorCode::LimitExceeded, why).caused_by(error));
+            return Err(used_up(what).caused_by(error));
         }
         match internal.or(validation) {
             Some(error) => {
@@ -260,6 +273,9 @@ impl Gpu {
         if size > self.binding_bytes_max {
             let what = format_args!("bytes of {label} on this GPU adapter");
             return Err(Error::limit(what, size, self.binding_bytes_max));
+        }
+        if FaultsToCome::comes(&self.to_come.memory) {
+            return Err(used_up(label));
         }
         self.forget();
         self.scoped(label, || {

@@ -151,14 +151,21 @@ impl<'a> Drawing<'a> {
             start
         };
         // Rows of numbers that share words start at whole ones.
-        let packed = |each: u32| u64::from(pixel_rows) * u64::from(self.row.width.div_ceil(each));
+        let packed = |bytes: u32| {
+            u64::from(pixel_rows) * (u64::from(self.row.width) * u64::from(bytes)).div_ceil(4)
+        };
         // Steps are of one size in all bands.
         let stepped = kinds.depth && !exact && *rows == self.whole();
-        let color = take(kinds.color, if exact { 3 * pixels } else { pixels });
+        let color_words = match samples {
+            Samples::F32 => 3 * pixels,
+            Samples::Levels => packed(3),
+            Samples::LevelsRgba => pixels,
+        };
+        let color = take(kinds.color, color_words);
         let alpha = take(kinds.alpha && exact, pixels);
         let blend = take(matches!(labels, Labels::Blend(_)), BLEND_WIDTH as u64 * pixels);
-        let alpha_bytes = take(kinds.alpha && !exact && !kinds.color, packed(4));
-        let mask = take(matches!(labels, Labels::Mask { .. }), packed(4));
+        let alpha_bytes = take(kinds.alpha && !exact, packed(1));
+        let mask = take(matches!(labels, Labels::Mask { .. }), packed(1));
         let steps = take(stepped, packed(2));
         let depth = take(kinds.depth && !stepped, pixels);
         let depth = if stepped { 0 } else { depth };
@@ -233,17 +240,13 @@ impl<'a> Drawing<'a> {
             append(color, all, part(layout.color, 3), |color| color);
         }
         if let Some(rgb) = &mut levels.rgb {
-            append(rgb, all, part(layout.color, 1), |[r, g, b, _]: [u8; 4]| [r, g, b]);
+            append_rows(rgb, all, from(layout.color), [width, rows]);
         }
         if let Some(rgba) = &mut levels.rgba {
             append(rgba, all, part(layout.color, 1), |word: [u8; 4]| word);
         }
         if let Some(alpha) = &mut levels.alpha {
-            if layout.alpha_bytes == NO_PICTURE {
-                append(alpha, all, part(layout.color, 1), |word: [u8; 4]| word[3]);
-            } else {
-                append_rows(alpha, all, from(layout.alpha_bytes), [width, rows]);
-            }
+            append_rows(alpha, all, from(layout.alpha_bytes), [width, rows]);
         }
         if let Some(alpha) = alpha {
             append(alpha, all, part(layout.alpha, 1), |alpha| alpha);
@@ -435,11 +438,13 @@ impl Tools<'_> {
         )?;
         let buffers = scene.buffers();
         let entries = self.scene.labels.as_ref().map(|labels| &labels.entries);
-        self.scratch.put_backdrops(gpu, &room.backdrops, &backdrops);
+        // Nothing is known to be there while an upload may fail.
+        let held = std::mem::take(&mut self.scratch.backdrops);
         let bindings = &mut self.scratch.bindings;
         let (kernels, marks) = (self.kernels, self.marks.as_deref_mut());
         gpu.scoped("render", || {
-            room.begin(gpu, &rows, tiles);
+            room.put_backdrops(gpu, &backdrops, &held);
+            gpu.queue.write_buffer(&room.views, 0, bytemuck::cast_slice(&rows));
             if !table.is_empty() {
                 gpu.queue.write_buffer(&room.table, 0, bytemuck::cast_slice(&table));
             }
@@ -447,7 +452,8 @@ impl Tools<'_> {
                 gpu.queue.write_buffer(&room.sources, 0, bytemuck::cast_slice(&sources));
             }
             let sizes = (views, scene.count);
-            let mut stages = Recorder::new(gpu, kernels, bindings, &room, sizes, marks);
+            let mut stages =
+                Recorder::new(gpu, kernels, bindings, (&room, &room.zeros()), sizes, marks);
             stages.project(buffers);
             if shades {
                 stages.shade(buffers);
@@ -465,6 +471,8 @@ impl Tools<'_> {
                 (&room.slots, 0, &room.staging, plan_bytes + picture_bytes, slot_bytes),
             ])
         })??;
+        backdrops.extend(held.into_iter().skip(backdrops.len()));
+        self.scratch.backdrops = backdrops;
         let ended = readback::read(gpu, &room.staging, staging_bytes, |bytes| {
             let (plans, rest) = bytes.split_at(plan_bytes as usize);
             let (mut pictures, slots) = rest.split_at(picture_bytes as usize);
@@ -511,11 +519,19 @@ fn append<F: Pod + Send + Sync, T: Send>(
 }
 
 /// Copies rows of numbers that share words to the end of `to`, as [`append`] does.
-fn append_rows<T: Pod>(to: &mut Vec<T>, all: usize, bytes: &[u8], [width, rows]: [usize; 2]) {
-    to.reserve_exact(all - to.len());
+fn append_rows<T: Pod + Send + Sync>(
+    to: &mut Vec<T>,
+    all: usize,
+    bytes: &[u8],
+    [width, rows]: [usize; 2],
+) {
     let stride = (width * size_of::<T>()).next_multiple_of(4);
+    if stride == width * size_of::<T>() {
+        return append(to, all, &bytes[..stride * rows], |value| value);
+    }
+    to.reserve_exact(all - to.len());
     for row in bytes.chunks_exact(stride).take(rows) {
-        to.extend_from_slice(&bytemuck::cast_slice(row)[..width]);
+        to.extend_from_slice(bytemuck::cast_slice(&row[..width * size_of::<T>()]));
     }
 }
 

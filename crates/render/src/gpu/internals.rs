@@ -246,8 +246,11 @@ impl Internals<'_> {
             };
             let scene = gaussians.map(|gaussians| context.scene(gaussians, false)).transpose()?;
             let room = context.scratch.room(&context.on.gpu, &need)?;
-            room.begin(&context.on.gpu, std::slice::from_ref(&row), need.tiles);
-            work(&Stage { on: context.on.clone(), room, row, scene })
+            let stage = Stage { on: context.on.clone(), room, row, scene };
+            stage.write(&stage.room.views, &[row]);
+            stage.write(&stage.room.plans, &[PlanRow::default()]);
+            stage.write(&stage.room.ends, &vec![0_u32; need.tiles as usize]);
+            work(&stage)
         })
     }
 }
@@ -300,8 +303,8 @@ impl Stage {
         });
         gpu.scoped("stage", || {
             let (mut bindings, sizes) = (Bindings::default(), (1, self.row.gaussian_count));
-            let kernels = &self.on.kernels;
-            let mut stages = Recorder::new(gpu, kernels, &mut bindings, &self.room, sizes, None);
+            let (kernels, room) = (&self.on.kernels, (&self.room, [].as_slice()));
+            let mut stages = Recorder::new(gpu, kernels, &mut bindings, room, sizes, None);
             record(&mut stages);
             stages.submit(&copies)
         })??;

@@ -22,8 +22,14 @@ shared! { pub(super) u32;
     SORT_RUN = 2048;
     /// Tiles of a Gaussian above which a whole workgroup visits them.
     LARGE_TILES = 64;
+    /// Tiles in which a workgroup counts by itself.
+    BINS = 1024;
     /// Workgroups along x at most; more go to y. Under the portable 65,535.
     GROUPS_X_MAX = 32_768;
+    /// Colour in three bytes, of 8 bits each.
+    LEVELS_RGB = 1;
+    /// Colour and alpha in four bytes.
+    LEVELS_RGBA = 2;
     /// Cells of a backdrop, across.
     BACKDROP_WIDTH = Backdrop::WIDTH as u32;
     /// Cells of a backdrop, down.
@@ -100,7 +106,7 @@ pub(super) enum Kernel {
 pub(super) struct RasterKinds {
     pub(super) color: bool,
     pub(super) depth: bool,
-    /// Pictures of bytes: alpha in levels without colour, a mask.
+    /// Pictures whose pixels share words: colour and alpha in levels, a mask.
     pub(super) bytes: bool,
     pub(super) labels: RasterLabels,
 }
@@ -108,11 +114,12 @@ pub(super) struct RasterKinds {
 impl From<&RenderRequest> for RasterKinds {
     fn from(request: &RenderRequest) -> Self {
         let RenderRequest { kinds, labels, samples, .. } = request;
-        let alpha_bytes = kinds.alpha && !kinds.color && *samples != Samples::F32;
+        let rgb = kinds.color && *samples == Samples::Levels;
+        let alpha = kinds.alpha && *samples != Samples::F32;
         Self {
             color: kinds.color,
             depth: kinds.depth,
-            bytes: alpha_bytes || matches!(labels, Labels::Mask { .. }),
+            bytes: rgb || alpha || matches!(labels, Labels::Mask { .. }),
             labels: match labels {
                 Labels::None => RasterLabels::None,
                 Labels::Blend(_) | Labels::Mask { .. } => RasterLabels::Blend,

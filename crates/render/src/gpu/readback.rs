@@ -12,6 +12,9 @@ use crate::error::{Error, Result};
 /// How long a submission may take before the device is given up. A software adapter needs seconds
 /// for a large picture; a hardware one that takes this long hangs.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(120);
+/// How long the device is looked at without a nap. Most views are done by then, and a nap of the
+/// system takes three times as long as asked for.
+const WATCH: Duration = Duration::from_micros(400);
 /// Least and greatest time between two looks at the device.
 const NAP_MIN: Duration = Duration::from_micros(20);
 const NAP_MAX: Duration = Duration::from_millis(1);
@@ -37,6 +40,7 @@ pub(super) fn read<T>(
     })?;
     // Not `PollType::Wait`: while one thread waits in the driver, no other can submit (an H200 then
     // stood idle between two callers), and a lone caller is woken later than by its own clock.
+    // Others that have work get the processor while this one watches.
     let begun = Instant::now();
     loop {
         if let Err(error) = gpu.device.poll(wgpu::PollType::Poll) {
@@ -56,6 +60,7 @@ pub(super) fn read<T>(
             Err(TryRecvError::Empty) if begun.elapsed() > ANSWER_TIMEOUT => {
                 return Err(gpu.give_up("the GPU device did not answer in time".to_owned()));
             }
+            Err(TryRecvError::Empty) if begun.elapsed() < WATCH => thread::yield_now(),
             Err(TryRecvError::Empty) => {
                 thread::sleep((begun.elapsed() / NAP_SHARE).clamp(NAP_MIN, NAP_MAX));
             }

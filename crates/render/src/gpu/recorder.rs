@@ -63,12 +63,13 @@ pub(super) struct Recorder<'a> {
 }
 
 impl<'a> Recorder<'a> {
-    /// Starts a submission of `views` views of `count` Gaussians in `room`.
+    /// Starts a submission of `views` views of `count` Gaussians in `room`. Sets the buffers
+    /// `cleared` to zeros.
     pub(super) fn new(
         gpu: &'a Gpu,
         kernels: &'a Kernels,
         bindings: &'a mut Bindings,
-        room: &'a BatchBuffers,
+        (room, cleared): (&'a BatchBuffers, &[&wgpu::Buffer]),
         (views, count): (u32, u32),
         mut marks: Option<&'a mut Marks>,
     ) -> Self {
@@ -78,6 +79,7 @@ impl<'a> Recorder<'a> {
             bindings.generation = generation;
         }
         let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        cleared.iter().for_each(|buffer| encoder.clear_buffer(buffer, 0, None));
         let mut pass = encoder.begin_compute_pass(&Default::default()).forget_lifetime();
         if let Some(marks) = &mut marks {
             marks.start(&mut pass);

@@ -72,8 +72,8 @@ pub(super) struct Scratch {
     pub(super) isects: u32,
     /// Weights a pixel that the last views needed.
     pub(super) weight_slots: u32,
-    /// Those on the device.
-    backdrops: Vec<Arc<Backdrop>>,
+    /// Those on the device, in their order.
+    pub(super) backdrops: Vec<Arc<Backdrop>>,
 }
 
 impl Default for Scratch {
@@ -121,20 +121,6 @@ impl Scratch {
         })
     }
 
-    /// Uploads the backdrops of a batch, unless they are there: first cells as [`first_cell`] says.
-    pub(super) fn put_backdrops(&mut self, gpu: &Gpu, to: &wgpu::Buffer, wanted: &[Arc<Backdrop>]) {
-        let there = wanted.iter().zip(&self.backdrops).all(|(one, held)| Arc::ptr_eq(one, held));
-        if there && wanted.len() <= self.backdrops.len() {
-            return;
-        }
-        for (at, backdrop) in wanted.iter().enumerate() {
-            let word = |&[r, g, b]: &[u8; 3]| u32::from_le_bytes([r, g, b, 0]);
-            let words: Vec<u32> = backdrop.cells().iter().map(word).collect();
-            gpu.queue.write_buffer(to, at as u64 * BACKDROP_BYTES, bytemuck::cast_slice(&words));
-        }
-        self.backdrops = wanted.to_vec();
-    }
-
     /// The buffer of a label, replaced if it is shorter than `size_bytes`.
     /// Errors: `limit_exceeded` when the adapter cannot hold or bind that many bytes.
     fn sized(
@@ -161,11 +147,26 @@ pub(super) fn first_cell(at: usize) -> u32 {
 }
 
 impl BatchBuffers {
-    /// Sets what the stages start from: the cameras, empty plans, and `tiles` counts of 0.
-    pub(super) fn begin(&self, gpu: &Gpu, views: &[ViewRow], tiles: u32) {
-        let plans = vec![PlanRow::default(); views.len()];
-        gpu.queue.write_buffer(&self.ends, 0, &vec![0; tiles as usize * 4]);
-        gpu.queue.write_buffer(&self.views, 0, bytemuck::cast_slice(views));
-        gpu.queue.write_buffer(&self.plans, 0, bytemuck::cast_slice(&plans));
+    /// Uploads the backdrops of a batch, unless they are those `held`.
+    pub(super) fn put_backdrops(
+        &self,
+        gpu: &Gpu,
+        wanted: &[Arc<Backdrop>],
+        held: &[Arc<Backdrop>],
+    ) {
+        for (at, backdrop) in wanted.iter().enumerate() {
+            if held.get(at).is_some_and(|held| Arc::ptr_eq(held, backdrop)) {
+                continue;
+            }
+            let word = |&[r, g, b]: &[u8; 3]| u32::from_le_bytes([r, g, b, 0]);
+            let words: Vec<u32> = backdrop.cells().iter().map(word).collect();
+            let start = u64::from(first_cell(at)) * 4;
+            gpu.queue.write_buffer(&self.backdrops, start, bytemuck::cast_slice(&words));
+        }
+    }
+
+    /// What the stages expect to be zeros: plans, and the counts of the tiles.
+    pub(super) fn zeros(&self) -> [&wgpu::Buffer; 2] {
+        [&self.plans, &self.ends]
     }
 }

@@ -7,8 +7,8 @@ use std::sync::OnceLock;
 
 use segsplat_core::scene::Gaussians;
 use segsplat_render::{
-    Frame, PixelWeights, RenderRequest, Renderer, RendererOptions, Switches, compare::psnr,
-    cpu::CpuRenderer, gpu::GpuRenderer, oracle,
+    Frame, PixelWeights, RenderRequest, Renderer, RendererOptions, Switches, cpu::CpuRenderer,
+    gpu::GpuRenderer, oracle,
 };
 use segsplat_testing::labels::{Drawn, apart, draw_labels, table};
 use segsplat_testing::{
@@ -136,12 +136,4 @@ pub(crate) fn judge_labels(
     let (px, seen) = (dense.len(), got.weights.entries.len());
     println!("{name}: {px} px, {seen} weights: max {worst:.2e}, {} flips", far.len());
     got
-}
-
-/// PSNR to colours that are clamped to 0..1, and the share of pixels over two levels of 255.
-pub(crate) fn colours_apart(got: &[[f32; 3]], want: &[[f32; 3]]) -> (f64, f64) {
-    let want: Vec<[f32; 3]> = want.iter().map(|c| c.map(|v| v.clamp(0.0, 1.0))).collect();
-    let far = |(a, b): &(&[f32; 3], &[f32; 3])| (0..3).any(|k| (a[k] - b[k]).abs() > 2.0 / 255.0);
-    let count = got.iter().zip(&want).filter(far).count();
-    (psnr(got, &want, None), count as f64 / want.len() as f64)
 }

@@ -164,7 +164,7 @@ fn an_index_beyond_the_table_counts_as_0_and_no_labels_is_a_legal_scene() {
 fn weights_are_the_share_of_the_pixel_that_an_index_covers() {
     let gaussians = labelled(3_000, 12, 61);
     let plain = request(camera(80, 60));
-    let request = RenderRequest { labels: Labels::Weights, ..plain.clone() };
+    let request = RenderRequest { labels: Labels::Weights, ..plain };
     let frame = cpu().render(&gaussians, &request).expect("a picture");
     let (weights, alpha) = (frame.weights.expect("weights"), frame.alpha.expect("alpha"));
     for (i, alpha) in alpha.iter().enumerate() {

@@ -1,13 +1,17 @@
 //! The devices that callers share: views drawn together, devices lost, memory and limits met.
 
-use std::{sync::Barrier, time::Duration, time::Instant};
+use std::{
+    sync::{Arc, Barrier, atomic::Ordering},
+    time::{Duration, Instant},
+};
 
 use segsplat_core::{error::ErrorCode, scene::Gaussians};
 use segsplat_render::{
-    Frame, Kinds, Labels, RenderRequest, Renderer, RendererOptions, gpu::GpuRenderer,
+    Frame, Kinds, Labels, RenderRequest, Renderer, RendererChoice, RendererOptions, Switches,
+    gpu::GpuRenderer, select::select, switches::FaultsToCome,
 };
 
-use crate::common::open;
+use crate::common::{cpu, open};
 use segsplat_testing::labels::{labelled, table};
 use segsplat_testing::scenes::{camera, cloud, request};
 
@@ -146,6 +150,64 @@ fn what_no_buffer_holds_is_refused_with_the_figures() {
     assert!(error.message().contains("134400000 is over 134217728"), "{error}");
     let small = cloud(100, 0, 68);
     gpu.render(&small, &request(camera(16, 16))).expect("others are drawn");
+}
+
+/// A renderer of which devices fail as `faults` says.
+fn failing(renderer: RendererChoice) -> Option<(Arc<dyn Renderer>, Arc<FaultsToCome>)> {
+    let name = open(|_| {})?.adapter().name.clone();
+    let switches = Switches { portable: true, ..Switches::default() };
+    let faults = Arc::clone(&switches.faults);
+    let options =
+        RendererOptions { renderer, adapter: Some(name), switches, ..RendererOptions::default() };
+    Some((select(&options).expect("the same adapter").0, faults))
+}
+
+#[test]
+fn a_device_lost_or_full_in_the_middle_is_answered_by_the_cpu_or_refused_by_name() {
+    const ALWAYS: u32 = u32::MAX;
+    let scene = labelled(3_000, 8, 69);
+    let one = request(camera(61, 47));
+    let larger = request(camera(500, 400));
+    let of_cpu = |request: &RenderRequest| cpu().render(&scene, request).expect("a view");
+    for (lost, open, memory) in [(1, ALWAYS, 0), (ALWAYS, 0, 0), (0, 0, ALWAYS)] {
+        let Some((auto, faults)) = failing(RendererChoice::Auto) else { return };
+        let of_gpu = auto.render(&scene, &one).expect("a view");
+        assert!(of_gpu != of_cpu(&one), "the renderers round otherwise");
+        let set = |faults: &FaultsToCome, [lost, open, memory]: [u32; 3]| {
+            faults.lost.store(lost, Ordering::Relaxed);
+            faults.open.store(open, Ordering::Relaxed);
+            faults.memory.store(memory, Ordering::Relaxed);
+        };
+        set(&faults, [lost, open, memory]);
+        let got = auto.render(&scene, &larger).expect("an answer");
+        assert!(got == of_cpu(&larger), "lost {lost}, open {open}, memory {memory}: the CPU's");
+        set(&faults, [0; 3]);
+        assert!(auto.render(&scene, &one).expect("a view") == of_gpu, "the GPU is back");
+
+        let Some((gpu, faults)) = failing(RendererChoice::Gpu) else { return };
+        assert!(gpu.render(&scene, &one).expect("a view") == of_gpu);
+        set(&faults, [lost, open, memory]);
+        let error = gpu.render(&scene, &larger).expect_err("no device");
+        let code = if memory > 0 { ErrorCode::LimitExceeded } else { ErrorCode::GpuUnavailable };
+        assert_eq!(error.code(), code, "{error}");
+        set(&faults, [0; 3]);
+        assert!(gpu.render(&scene, &one).expect("a view") == of_gpu, "the GPU is back");
+    }
+}
+
+#[test]
+fn a_device_full_or_lost_once_draws_the_same_view() {
+    let scene = labelled(3_000, 8, 70);
+    let larger = request(camera(500, 400));
+    let Some((gpu, _)) = failing(RendererChoice::Gpu) else { return };
+    let want = gpu.render(&scene, &larger).expect("a view");
+    for lost in [false, true] {
+        let Some((gpu, faults)) = failing(RendererChoice::Gpu) else { return };
+        let fault = if lost { &faults.lost } else { &faults.memory };
+        fault.store(1, Ordering::Relaxed);
+        assert!(gpu.render(&scene, &larger).expect("a view") == want, "lost: {lost}");
+        assert_eq!(fault.load(Ordering::Relaxed), 0, "it came");
+    }
 }
 
 #[test]

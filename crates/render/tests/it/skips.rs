@@ -28,7 +28,7 @@ fn cases() -> Vec<(&'static str, Gaussians, RenderRequest)> {
     aside.camera_to_world = look(glam::DVec3::new(2.0, 0.5, 4.0), glam::DVec3::new(9.0, 0.0, 7.0));
     let small = request(camera(70, 50));
     let entered = RenderRequest { labels: Labels::Weights, ..small.clone() };
-    let blended = RenderRequest { labels: Labels::Blend(table(9, 8)), ..small.clone() };
+    let blended = RenderRequest { labels: Labels::Blend(table(9, 8)), ..small };
     vec![
         ("a Gaussian a pixel", pair, request(middle)),
         ("few, seen from aside", cloud(300, 0, 4), request(aside)),
