@@ -1,5 +1,5 @@
-// Stage 4: each Gaussian into the list of each tile that it touches, in no order there.
-// CPU: crates/render/src/cpu/bin.rs
+// Stage 4: each Gaussian into the list of each tile that it touches, in no order.
+// CPU: crates/render/src/cpu/bin.rs (in the order of the scene)
 
 @group(0) @binding(1) var<storage, read_write> plans: array<Plan>;
 @group(0) @binding(2) var<storage, read> footprints: array<Footprint>;
