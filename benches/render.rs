@@ -13,7 +13,7 @@ use segsplat::{
         Kinds, Labels, RenderRequest, Renderer,
         cpu::{
             CpuRenderer,
-            bin::{Bins, Keys, bin},
+            bin::{Bins, DepthKeys, bin},
             lanes::{KernelOptions, Width},
             paint::Paint,
             project::{Projected, project},
@@ -113,7 +113,7 @@ impl Stages {
     }
 
     fn bin(&mut self) {
-        let keys = Keys::new(&self.gaussians, &[]);
+        let keys = DepthKeys::new(&self.gaussians, &[]);
         bin(&self.projected, keys, &self.grid, u64::MAX, &mut self.bins);
     }
 

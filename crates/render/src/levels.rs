@@ -1,4 +1,5 @@
 //! Pictures as files have them: 8-bit levels, and depth in 16-bit steps.
+//! Shader: `shaders/depth_steps.wgsl`
 
 use rayon::prelude::*;
 

@@ -18,6 +18,7 @@ pub mod view;
 
 use std::sync::Arc;
 
+use rayon::prelude::*;
 pub use segsplat_core::scene::PixelWeights;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -221,18 +222,18 @@ impl Frame {
         Self {
             width,
             height,
-            color: (kinds.color && exact).then(|| vec![[0.0; 3]; filled]),
-            depth: kinds.depth.then(|| vec![0.0; filled]),
-            alpha: (kinds.alpha && exact).then(|| vec![0.0; filled]),
+            color: (kinds.color && exact).then(|| zeros(filled)),
+            depth: kinds.depth.then(|| zeros(filled)),
+            alpha: (kinds.alpha && exact).then(|| zeros(filled)),
             levels: Levels {
-                rgb: (kinds.color && !exact && !rgba).then(|| vec![[0; 3]; filled]),
-                rgba: (kinds.color && rgba).then(|| vec![[0; 4]; filled]),
+                rgb: (kinds.color && !exact && !rgba).then(|| zeros(filled)),
+                rgba: (kinds.color && rgba).then(|| zeros(filled)),
                 depth: None,
-                alpha: (kinds.alpha && !exact).then(|| vec![0; filled]),
+                alpha: (kinds.alpha && !exact).then(|| zeros(filled)),
             },
-            blend: matches!(labels, Labels::Blend(_)).then(|| vec![[0.0; 4]; filled]),
+            blend: matches!(labels, Labels::Blend(_)).then(|| zeros(filled)),
             weights: None,
-            mask: matches!(labels, Labels::Mask { .. }).then(|| vec![0; filled]),
+            mask: matches!(labels, Labels::Mask { .. }).then(|| zeros(filled)),
             stats: FrameStats::default(),
         }
     }
@@ -244,6 +245,11 @@ impl Frame {
         }
         self
     }
+}
+
+/// A picture of zeros. All threads write them: new pages are most of the time of it.
+fn zeros<T: Copy + Default + Send>(pixels: usize) -> Vec<T> {
+    (0..pixels).into_par_iter().with_min_len(1 << 16).map(|_| T::default()).collect()
 }
 
 /// Time of one dispatch, by the device's own clock.

@@ -68,17 +68,17 @@ impl Bins {
     }
 }
 
-/// Depth keys of Gaussians: the bits of t.z, which is over 0, so that they sort like its value. Those
-/// of photos behind come after all others.
+/// Depth keys of Gaussians: the bits of t.z, which is over 0, so that they sort like its value.
+/// Those of photos behind come after all others.
 #[derive(Clone, Copy, Debug)]
-pub struct Keys<'a> {
+pub struct DepthKeys<'a> {
     gaussians: &'a Gaussians,
     /// Empty where no photo is behind.
     sources: &'a [Source],
 }
 
-impl<'a> Keys<'a> {
-    /// Keys of Gaussians that come from these photos.
+impl<'a> DepthKeys<'a> {
+    /// DepthKeys of Gaussians that come from these photos.
     pub fn new(gaussians: &'a Gaussians, sources: &'a [Source]) -> Self {
         let layered = sources.iter().any(|source| source.behind);
         Self { gaussians, sources: if layered { sources } else { &[] } }
@@ -101,7 +101,7 @@ impl<'a> Keys<'a> {
 /// that is over `isects_max`, the bins are not complete.
 pub fn bin(
     projected: &Projected,
-    keys: Keys<'_>,
+    keys: DepthKeys<'_>,
     grid: &Grid,
     isects_max: u64,
     bins: &mut Vec<Bins>,
@@ -130,7 +130,7 @@ pub fn bin(
 
 impl Bins {
     /// Orders what was emitted by tile, stable, and puts depth keys in the place of tiles.
-    fn sort(&mut self, projected: &Projected, keys: Keys<'_>) {
+    fn sort(&mut self, projected: &Projected, keys: DepthKeys<'_>) {
         let Self { ends, pairs, emitted } = self;
         for &tile in &*emitted {
             ends[key(tile) as usize] += 1;

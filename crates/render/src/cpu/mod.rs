@@ -22,7 +22,7 @@ use parking_lot::Mutex;
 use rayon::prelude::*;
 
 use self::{
-    bin::{Bins, Keys},
+    bin::{Bins, DepthKeys},
     footprint::Footprint,
     lanes::KernelOptions,
     paint::Paint,
@@ -116,7 +116,7 @@ impl CpuRenderer {
         let seen = scratch.projected.tiles_per_gauss.par_iter().with_min_len(1 << 14);
         frame.stats.visible = seen.filter(|&&tiles| tiles > 0).count() as u64;
         let mut band = Band {
-            keys: Keys::new(gaussians, &request.sources),
+            keys: DepthKeys::new(gaussians, &request.sources),
             paint: Paint::new(request, &view, gaussians.semantic_index(), options),
             weights: Vec::new(),
         };
@@ -278,7 +278,7 @@ impl Renderer for CpuRenderer {
 
 /// Data that the bands of a frame share, and their weights from top to bottom.
 struct Band<'a> {
-    keys: Keys<'a>,
+    keys: DepthKeys<'a>,
     paint: Paint<'a>,
     weights: Vec<WeightRows>,
 }

@@ -31,8 +31,8 @@ pub struct Projected {
     pub tiles_per_gauss: Vec<u32>,
 }
 
-/// Projects every Gaussian of `request`, of which `view` is the camera. `tiles_per_gauss[i]` is 0 if
-/// Gaussian i is dropped.
+/// Projects every Gaussian for `request`, of which `view` is the camera. `tiles_per_gauss[i]` is 0
+/// if Gaussian i is dropped.
 pub fn project(
     gaussians: &Gaussians,
     request: &RenderRequest,

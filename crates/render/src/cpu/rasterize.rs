@@ -1,5 +1,5 @@
-//! Stage 8: front-to-back blend of colour, depth, alpha and labels. `store` then writes the pictures.
-//! Shader: `shaders/rasterize.wgsl`
+//! The last stages: the Gaussians of a tile in the order of depth, then the front-to-back blend of
+//! colour, depth, alpha and labels. Shaders: `shaders/tile_sort.wgsl`, `shaders/rasterize.wgsl`
 //!
 //! A tile is cut into cells of 4 x 4 pixels. Gaussians are staged in batches. Each one marks the
 //! cells that its ellipse may touch. The marks are transposed, so that each cell has one bit for
@@ -314,7 +314,8 @@ impl Blend<'_> {
     }
 }
 
-/// Pairs that are not sorted yet. Most rays end after few Gaussians, so the nearest are sorted first.
+/// Pairs that are not sorted yet. Most rays end after few Gaussians, so the nearest are sorted
+/// first.
 struct Rest<'a> {
     pairs: &'a mut [u64],
     portion: usize,

@@ -9,8 +9,8 @@ use crate::{constants::ATAN, scene::Backdrop, view::View};
 const LAST_ROW: f32 = Backdrop::HEIGHT as f32 - 1.0;
 const LAST_COLUMN: f32 = Backdrop::WIDTH as f32 - 1.0;
 
-/// A backdrop and the rays of a view. The ray of a pixel's centre is `first + x * across + y * down`
-/// in world axes, of any length.
+/// A backdrop and the rays of a view. The ray of a pixel's centre is
+/// `first + x * across + y * down` in world axes, of any length.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Sky<'a> {
     backdrop: &'a Backdrop,

@@ -5,7 +5,7 @@ use segsplat_render::{
     Source,
     constants::TILE_SIZE,
     cpu::{
-        bin::{Keys, bin, pack},
+        bin::{DepthKeys, bin, pack},
         footprint::Footprint,
         lanes::{KernelOptions, Width},
         project::{Projected, project},
@@ -40,7 +40,7 @@ fn each_tile_gets_the_gaussians_that_touch_it_those_of_photos_behind_last() {
     for behind in [false, true] {
         let sources = [source(behind)];
         let mut bins = Vec::new();
-        let keys = Keys::new(&gaussians, &sources);
+        let keys = DepthKeys::new(&gaussians, &sources);
         let all = total as u64;
         assert_eq!(bin(&projected, keys, &grid, all, &mut bins), all, "pairs");
         assert!(bins.len() > 1, "one chunk");
