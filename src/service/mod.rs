@@ -17,6 +17,7 @@ mod schedule;
 mod search;
 mod semantics;
 mod texts;
+mod times;
 mod types;
 mod view;
 
@@ -35,6 +36,7 @@ pub use self::{
         TextOptions, ViewOptions, ViewSpec, ViewsSpec,
     },
     rle::Rle,
+    times::ViewTimes,
     types::{
         Created, Export, InstanceBox, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
         QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning,

@@ -78,13 +78,34 @@ pub enum Format {
     /// 8-bit RGB or grey; 16-bit grey for depth.
     #[default]
     Png,
-    /// 8-bit, quality 90; not for depth.
+    /// 8-bit, quality 90; not for depth. Over 512 x 512 pixels colour is halved each way (4:2:0).
     #[serde(alias = "jpg")]
     Jpeg,
     /// 8-bit, lossless; not for depth.
     Webp,
     /// `NumPy` array of little-endian f32, `[H, W, 3]` or `[H, W]`, not clamped.
     Npy,
+    /// Bytes without a header, `[H, W, 3]`: red, green and blue of `color`, over its background, or
+    /// of `semantics`. Equal to the samples of the PNG.
+    Rgb8,
+    /// Bytes without a header, `[H, W, 4]`: those of `rgb8`, then alpha. For `color` alone. Colour is
+    /// over its background and not divided by alpha, so over `black` it is premultiplied.
+    Rgba8,
+    /// Bytes without a header, `[H, W]`: `alpha`, `relevancy` or `mask`. Equal to the samples of
+    /// the PNG.
+    Grey8,
+}
+
+impl Format {
+    /// Samples of a pixel, one byte each, of a format without a codec.
+    pub fn samples(self) -> Option<u32> {
+        match self {
+            Self::Grey8 => Some(1),
+            Self::Rgb8 => Some(3),
+            Self::Rgba8 => Some(4),
+            Self::Png | Self::Jpeg | Self::Webp | Self::Npy => None,
+        }
+    }
 }
 
 /// Which boxes hold the parts of a selection.
@@ -324,7 +345,8 @@ pub struct ViewOptions {
 #[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub struct PictureOptions {
-    /// `png` (default), `jpeg`, `webp` or `npy`. For one view `Accept` decides where it is absent.
+    /// `png` (default), `jpeg`, `webp`, `npy`, or samples without a codec: `rgb8`, `rgba8`, `grey8`.
+    /// For one view `Accept` decides where it is absent.
     #[arg(skip)]
     #[param(inline)]
     pub format: Format,

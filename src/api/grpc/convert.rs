@@ -194,7 +194,8 @@ pub(super) fn picture(options: &pb::ViewOptions) -> Result<PictureOptions> {
 
 /// One encoded picture.
 pub(super) fn view(view: RenderedView) -> pb::View {
-    message!(View from view { width, height, depth_scale, etag, render_ms }
+    message!(View from view { width, height, depth_scale, etag }
+        render_ms: view.times.render_ms,
         camera_index: u32::try_from(view.camera_index).unwrap_or(u32::MAX),
         kind: pb::Kind::from(view.kind).into(),
         format: pb::Format::from(view.format).into(),
@@ -350,7 +351,7 @@ both_ways! {
     SemanticsMode = Semantics { Lazy, Eager, Off }
     Density = Density { Thinned, Full }
     Kind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }
-    Format = Format { Png, Jpeg, Webp, Npy }
+    Format = Format { Png, Jpeg, Webp, Npy, Rgb8, Rgba8, Grey8 }
     Quality = Quality { Exact, Fast }
     ScoringProfile = ScoringProfile { Default, Paper }
     Boxes = Boxes { Oriented, Aligned, None }
