@@ -177,9 +177,10 @@ pub enum Format {
     Npy = 4,
     /// Bytes without a header, \[H, W, 3\]: colour over its background, or semantics.
     Rgb8 = 5,
-    /// Bytes
+    /// Bytes without a header, \[H, W, 4\]: those of FORMAT_RGB8, then alpha. For colour alone. Colour
+    /// is over its background and not divided by alpha, so over black it is premultiplied.
     Rgba8 = 6,
-    /// Bytes
+    /// Bytes without a header, \[H, W\]: alpha, relevancy or mask.
     Grey8 = 7,
 }
 impl Format {

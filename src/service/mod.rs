@@ -31,7 +31,7 @@ use self::{memory::Memory, schedule::Scheduler, search::Backend};
 pub use self::{
     offline::OfflineService,
     request::{
-        Background, Boxes, CameraFields, CameraSpec, CreateScene, ExportFormat, Format, Kind,
+        BackgroundSpec, Boxes, CameraFields, CameraSpec, CreateScene, ExportFormat, Format, Kind,
         LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions, PoseSpec, QuerySpec,
         TextOptions, ViewOptions, ViewSpec, ViewsSpec,
     },

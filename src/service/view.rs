@@ -18,8 +18,8 @@ use super::{
     create::blocking,
     encode::{self, Layer},
     request::{
-        Background, CameraSpec, Format, Kind, PictureOptions, TextOptions, ViewOptions, ViewSpec,
-        ViewsSpec,
+        BackgroundSpec, CameraSpec, Format, Kind, PictureOptions, TextOptions, ViewOptions,
+        ViewSpec, ViewsSpec,
     },
     schedule::Slot,
     search::{Backend, LabelledView, SceneTexts},
@@ -88,8 +88,10 @@ impl Resolved {
             kinds,
             labels: Labels::None,
             background: match self.picture.background {
-                Background::Backdrop => render::Background::Backdrop(Arc::clone(&scene.backdrop)),
-                Background::Color(color) => render::Background::Color(color),
+                BackgroundSpec::Backdrop => {
+                    render::Background::Backdrop(Arc::clone(&scene.backdrop))
+                }
+                BackgroundSpec::Color(color) => render::Background::Color(color),
             },
             sources: plan::sources(scene, &self.camera),
             samples: match self.picture.format {

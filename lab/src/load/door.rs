@@ -225,6 +225,6 @@ impl Connection {
         let timing = answer.metadata().get_all("server-timing").iter();
         let timing = timing.filter_map(|value| Some(value.to_str().ok()?.to_owned())).collect();
         let view = answer.into_inner();
-        Ok(Answer { bytes: vec![view.data.into()], timing, etag: Some(view.etag) })
+        Ok(Answer { bytes: vec![view.data], timing, etag: Some(view.etag) })
     }
 }

@@ -77,7 +77,8 @@ pub(crate) struct Args {
     #[arg(long, default_value = "")]
     more: String,
     /// Most views of a row
-    #[arg(long, default_value_t = 2000, value_parser = clap::value_parser!(u64).range(1..=VIEWS_MAX))]
+    #[arg(long, default_value_t = 2000)]
+    #[arg(value_parser = clap::value_parser!(u64).range(1..=VIEWS_MAX))]
     views: u64,
     /// Longest time of a row, seconds
     #[arg(long, default_value_t = 5.0)]

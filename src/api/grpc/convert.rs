@@ -10,7 +10,7 @@ use crate::{
         StageTime, Warning,
     },
     service::{
-        Background, Boxes, CameraSpec, Density, Event, ExportFormat, Format, InstanceBox, Kind,
+        BackgroundSpec, Boxes, CameraSpec, Density, Event, ExportFormat, Format, InstanceBox, Kind,
         Label, LensSpec, MaskFormat, Peak, PickSpec, Picked, PictureOptions, PoseSpec, Quality,
         QueryAnswer, QuerySpec, RenderedView, SceneCamera, SceneError, SceneState, SceneStatus,
         SemanticsMode, SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView,
@@ -183,7 +183,7 @@ fn options_alone(given: Option<pb::ViewOptions>, call: &str) -> Result<ViewOptio
 /// How a view is encoded.
 pub(super) fn picture(options: &pb::ViewOptions) -> Result<PictureOptions> {
     #[expect(clippy::cast_possible_truncation, reason = "a colour fits f32")]
-    let color = |v: pb::Vec3| Background::Color([v.x as f32, v.y as f32, v.z as f32]);
+    let color = |v: pb::Vec3| BackgroundSpec::Color([v.x as f32, v.y as f32, v.z as f32]);
     let crop = |crop: pb::Region| [crop.x, crop.y, crop.width, crop.height].into();
     Ok(PictureOptions {
         format: value("format", options.format)?,
