@@ -8,6 +8,7 @@
 mod density;
 mod frames;
 mod grid;
+mod load;
 mod masks;
 pub mod metrics;
 mod networks;
@@ -63,6 +64,9 @@ enum Command {
     Skips(frames::Args),
     /// Time each stage from photos to a view
     Stages(stages::Args),
+    /// Ask a server for views and scenes, as its callers do
+    #[command(subcommand)]
+    Load(load::Command),
     /// Write the tables of docs/benchmarks.md from the rows
     Report(report::Args),
 }
@@ -101,6 +105,7 @@ pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
         Command::Frames(args) => frames::run(args, &mut rows)?,
         Command::Skips(args) => frames::skips::run(args, &mut rows)?,
         Command::Stages(args) => stages::run(args, &mut rows)?,
+        Command::Load(command) => load::run(command, &mut rows)?,
         Command::Report(args) => report::run(args)?,
     }
     Ok(rows.into_all())

@@ -86,6 +86,19 @@ impl Setup {
         self.threads.unwrap_or_else(|| NetworkOptions::default().threads)
     }
 
+    /// What makes `segsplat serve` choose the same renderer and threads.
+    pub(crate) fn serve_args(&self) -> Vec<String> {
+        let renderer = match self.renderer {
+            RendererChoice::Auto => "auto",
+            RendererChoice::Cpu => "cpu",
+            RendererChoice::Gpu => "gpu",
+        };
+        let (renderer, threads) = (renderer.to_owned(), self.threads().to_string());
+        let mut args = vec!["--renderer".to_owned(), renderer, "--threads".to_owned(), threads];
+        args.extend(self.adapter.iter().flat_map(|name| ["--adapter".to_owned(), name.clone()]));
+        args
+    }
+
     /// What opening the networks needs, for `jobs` scenes at a time.
     pub(crate) fn networks(&self, jobs: usize) -> NetworkOptions {
         NetworkOptions {

@@ -175,6 +175,13 @@ pub enum Format {
     Webp = 3,
     /// NumPy array of little-endian f32, \[H, W, 3\] or \[H, W\].
     Npy = 4,
+    /// Bytes without a header, \[H, W, 3\]: colour over its background, or semantics.
+    Rgb8 = 5,
+    /// Bytes without a header, \[H, W, 4\]: those of FORMAT_RGB8, then alpha. For colour alone. Colour
+    /// is over its background and not divided by alpha, so over black it is premultiplied.
+    Rgba8 = 6,
+    /// Bytes without a header, \[H, W\]: alpha, relevancy or mask.
+    Grey8 = 7,
 }
 impl Format {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -188,6 +195,9 @@ impl Format {
             Self::Jpeg => "FORMAT_JPEG",
             Self::Webp => "FORMAT_WEBP",
             Self::Npy => "FORMAT_NPY",
+            Self::Rgb8 => "FORMAT_RGB8",
+            Self::Rgba8 => "FORMAT_RGBA8",
+            Self::Grey8 => "FORMAT_GREY8",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -198,6 +208,9 @@ impl Format {
             "FORMAT_JPEG" => Some(Self::Jpeg),
             "FORMAT_WEBP" => Some(Self::Webp),
             "FORMAT_NPY" => Some(Self::Npy),
+            "FORMAT_RGB8" => Some(Self::Rgb8),
+            "FORMAT_RGBA8" => Some(Self::Rgba8),
+            "FORMAT_GREY8" => Some(Self::Grey8),
             _ => None,
         }
     }

@@ -84,6 +84,12 @@ fn log_error(error: &Error, ms: Option<f64>) {
     }
 }
 
+/// Stages and milliseconds as a `Server-Timing` value.
+fn server_timing<'a>(stages: impl Iterator<Item = (&'a str, f64)>) -> String {
+    let times = stages.map(|(stage, ms)| format!("{stage};dur={ms:.2}"));
+    times.collect::<Vec<_>>().join(", ")
+}
+
 /// The first characters of a text from a caller, for messages.
 fn short(text: &str) -> String {
     text.chars().take(80).collect()

@@ -80,7 +80,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         first.width,
         first.height,
         renderer.name(),
-        first.render_ms,
+        first.times.render_ms,
         error.pixels,
         error.max,
         error.mean,
@@ -95,7 +95,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         "frames": args.frames,
         "median_ms": median,
         "min_ms": least,
-        "first_ms": first.render_ms,
+        "first_ms": first.times.render_ms,
         "visible": frame.stats.visible,
         "error": error,
     });

@@ -28,7 +28,7 @@ use crate::{
 pub(super) struct Args {
     /// Scene file, a folder with one, or a 3DGS PLY
     scene: PathBuf,
-    /// Picture to write; its ending (png, jpg, webp, npy) is the format
+    /// Picture to write; its ending (png, jpg, webp, npy, rgb8, rgba8, grey8) is the format
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     #[command(flatten)]
@@ -66,7 +66,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         args.output.display(),
         view.width,
         view.height,
-        view.render_ms,
+        view.times.render_ms,
         renderer.name(),
         scale.unwrap_or_default()
     );
@@ -79,7 +79,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         "depth_scale": view.depth_scale,
         "camera": view.camera,
         "renderer": renderer.name(),
-        "render_ms": view.render_ms,
+        "render_ms": view.times.render_ms,
         "visible": view.stats.visible,
     });
     out.answer(&text, &value)
@@ -88,7 +88,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
 fn format_of(path: &Path) -> Result<Format> {
     named(&scene_file::ending(path)).map_err(|_| {
         Error::invalid(format!(
-            "{}: the ending must be that of a format: png, jpg, webp or npy",
+            "{}: the ending must be that of a format: png, jpg, webp, npy, rgb8, rgba8 or grey8",
             path.display()
         ))
     })

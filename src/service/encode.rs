@@ -1,11 +1,10 @@
-//! A picture of numbers as a file: PNG, JPEG, WebP, or NPY with every bit of the f32.
+//! A picture as a file: PNG, JPEG, WebP, samples without a codec, or NPY with every bit of the f32.
+//!
+//! Which encoders, and what they cost: docs/adr/0026.
 
 use std::borrow::Cow;
 
-use image::{
-    ExtendedColorType, ImageEncoder,
-    codecs::{jpeg::JpegEncoder, png::PngEncoder, webp::WebPEncoder},
-};
+use image::{ExtendedColorType, ImageEncoder, codecs::webp::WebPEncoder};
 
 use super::request::{Format, Kind};
 use crate::{
@@ -15,6 +14,9 @@ use crate::{
 };
 
 const JPEG_QUALITY: u8 = 90;
+/// Most pixels of a JPEG with chroma at every pixel. Larger pictures have it at every second one of
+/// each row and column, which halves their time and costs 0.4 to 0.6 dB there.
+const FULL_CHROMA_PIXELS_MAX: u64 = 512 * 512;
 
 /// A file, and for a 16-bit depth PNG the world units of one step.
 #[derive(Debug)]
@@ -24,114 +26,206 @@ pub(super) struct Encoded {
 }
 
 /// One picture, a value a pixel.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub(super) enum Layer<'a> {
     /// sRGB, 0..1, for NPY.
-    Color(&'a [[f32; 3]]),
+    Color(Vec<[f32; 3]>),
     /// sRGB in levels.
-    Rgb(&'a [[u8; 3]]),
+    Rgb(Vec<[u8; 3]>),
+    /// sRGB and alpha in levels.
+    Rgba(Vec<[u8; 4]>),
     /// World units, for NPY.
-    Depth(&'a [f32]),
+    Depth(Vec<f32>),
     /// Depth in steps.
-    Steps(&'a DepthSteps),
+    Steps(DepthSteps),
     /// Alpha or relevancy, 0..1.
-    Share(&'a [f32]),
+    Share(Cow<'a, [f32]>),
     /// Alpha, or a mask as it was drawn, in levels.
-    Levels(&'a [u8]),
+    Levels(Vec<u8>),
     /// Entries of the bank; a picture shows their colours, NPY has their numbers.
     Entries(&'a [u16]),
     /// Black or white.
     Mask(&'a [bool]),
 }
 
-/// A picture of a frame.
-pub(super) fn layer(frame: &Frame, kind: Kind) -> Result<Layer<'_>> {
+/// Takes a picture out of a frame.
+pub(super) fn layer(frame: &mut Frame, kind: Kind) -> Result<Layer<'static>> {
     let Frame { color, depth, alpha, mask, levels, .. } = frame;
-    let rgb = || levels.rgb.as_deref().map(Layer::Rgb);
-    let steps = || levels.depth.as_ref().map(Layer::Steps);
-    let grey = || levels.alpha.as_deref().map(Layer::Levels);
     let layer = match kind {
-        Kind::Color => color.as_deref().map(Layer::Color).or_else(rgb),
-        Kind::Depth => depth.as_deref().map(Layer::Depth).or_else(steps),
-        Kind::Alpha => alpha.as_deref().map(Layer::Share).or_else(grey),
-        Kind::Mask => mask.as_deref().map(Layer::Levels),
+        Kind::Color => color
+            .take()
+            .map(Layer::Color)
+            .or_else(|| levels.rgb.take().map(Layer::Rgb))
+            .or_else(|| levels.rgba.take().map(Layer::Rgba)),
+        Kind::Depth => {
+            depth.take().map(Layer::Depth).or_else(|| levels.depth.take().map(Layer::Steps))
+        }
+        Kind::Alpha => alpha
+            .take()
+            .map(|alpha| Layer::Share(alpha.into()))
+            .or_else(|| levels.alpha.take().map(Layer::Levels)),
+        Kind::Mask => mask.take().map(Layer::Levels),
         Kind::Semantics | Kind::Relevancy => None,
     };
     layer.ok_or_else(|| Error::internal(format!("the renderer gave no {kind}")))
 }
 
-/// Refuses pairs of kind and format that would lose the picture.
+/// Refuses pairs of kind and format that would lose the picture, or that have other samples.
 pub(super) fn check(kind: Kind, format: Format) -> Result<()> {
+    let refused = |why: &str| Err(Error::invalid(format!("kind={kind} {why}")));
     match (kind, format) {
-        (Kind::Depth, Format::Jpeg | Format::Webp) => Err(Error::invalid(
+        (_, Format::Png | Format::Npy) => Ok(()),
+        (Kind::Depth, _) => Err(Error::invalid(
             "depth does not fit 8 bits: ask for png (16-bit, with its scale) or npy (float32)",
         )),
         (Kind::Mask | Kind::Semantics, Format::Jpeg) => {
-            let why = "does not survive JPEG: ask for png, webp or npy";
-            Err(Error::invalid(format!("kind={kind} {why}")))
+            refused("does not survive JPEG: ask for png, webp or npy")
+        }
+        (Kind::Alpha | Kind::Relevancy | Kind::Mask, Format::Rgb8 | Format::Rgba8) => {
+            refused("has one sample a pixel: ask for grey8")
+        }
+        (Kind::Semantics, Format::Rgba8) => refused("has no alpha: ask for rgb8"),
+        (Kind::Color | Kind::Semantics, Format::Grey8) => {
+            refused("has three samples a pixel: ask for rgb8")
         }
         _ => Ok(()),
     }
+}
+
+/// Samples of a picture, row-major.
+enum Samples {
+    Grey(Vec<u8>),
+    Rgb(Vec<u8>),
+    Rgba(Vec<u8>),
+    Steps(DepthSteps),
 }
 
 /// A layer as a file.
 ///
 /// Values of 0..1 are clamped and rounded to the nearest of 256 levels, except as NPY.
 pub(super) fn encode(layer: Layer<'_>, width: u32, height: u32, format: Format) -> Result<Encoded> {
-    let unfit = || Error::internal(format!("the renderer gave other numbers than {format} has"));
+    let plain = |bytes| Ok(Encoded { bytes, depth_scale: None });
     if format == Format::Npy {
-        let plain = |values: &[f32]| npy(values, &[height, width]);
-        let bytes = match layer {
-            Layer::Color(color) => npy(color.as_flattened(), &[height, width, 3]),
-            Layer::Depth(values) | Layer::Share(values) => plain(values),
-            Layer::Entries(entries) => {
-                plain(&entries.iter().map(|m| f32::from(*m)).collect::<Vec<_>>())
-            }
-            Layer::Mask(mask) => plain(&mask.iter().map(|on| f32::from(*on)).collect::<Vec<_>>()),
-            Layer::Levels(levels) => {
-                plain(&levels.iter().map(|v| f32::from(*v) / 255.0).collect::<Vec<_>>())
-            }
-            Layer::Rgb(_) | Layer::Steps(_) => return Err(unfit()),
-        };
-        return Ok(Encoded { bytes, depth_scale: None });
+        return plain(numbers(layer, width, height)?);
     }
-    let mut depth_scale = None;
-    let (samples, color): (Cow<'_, [u8]>, _) = match layer {
-        Layer::Rgb(rgb) => (rgb.as_flattened().into(), ExtendedColorType::Rgb8),
-        Layer::Entries(entries) => {
-            let colours = entries.iter().flat_map(|m| colour(*m)).map(level);
-            (colours.collect(), ExtendedColorType::Rgb8)
-        }
-        Layer::Steps(DepthSteps { steps, scale }) => {
-            depth_scale = Some(*scale);
-            (steps.iter().flat_map(|step| step.to_ne_bytes()).collect(), ExtendedColorType::L16)
-        }
-        Layer::Share(values) => grey(values.iter().map(|v| level(*v)).collect(), format),
-        Layer::Levels(levels) => grey(levels.into(), format),
-        Layer::Mask(mask) => grey(mask.iter().map(|on| u8::from(*on) * 255).collect(), format),
+    let unfit = || Error::internal(format!("the renderer gave other numbers than {format} has"));
+    let samples = match layer {
+        Layer::Rgb(rgb) => Samples::Rgb(rgb.into_flattened()),
+        Layer::Rgba(rgba) => Samples::Rgba(rgba.into_flattened()),
+        Layer::Entries(entries) => Samples::Rgb(coloured(entries)),
+        Layer::Steps(steps) => Samples::Steps(steps),
+        Layer::Share(values) => Samples::Grey(values.iter().map(|v| level(*v)).collect()),
+        Layer::Levels(levels) => Samples::Grey(levels),
+        Layer::Mask(mask) => Samples::Grey(mask.iter().map(|on| u8::from(*on) * 255).collect()),
         Layer::Color(_) | Layer::Depth(_) => return Err(unfit()),
     };
-    let mut bytes = Vec::new();
-    let to = &mut bytes;
-    match format {
-        Format::Jpeg => JpegEncoder::new_with_quality(to, JPEG_QUALITY)
-            .write_image(&samples, width, height, color),
-        Format::Webp => WebPEncoder::new_lossless(to).write_image(&samples, width, height, color),
-        Format::Png | Format::Npy => {
-            PngEncoder::new(to).write_image(&samples, width, height, color)
+    let size = [width, height];
+    match (format, samples) {
+        (Format::Grey8, Samples::Grey(samples))
+        | (Format::Rgb8, Samples::Rgb(samples))
+        | (Format::Rgba8, Samples::Rgba(samples)) => plain(samples),
+        (Format::Png, Samples::Grey(samples)) => {
+            plain(png(&samples, size, png::ColorType::Grayscale, png::BitDepth::Eight)?)
         }
+        (Format::Png, Samples::Rgb(samples)) => {
+            plain(png(&samples, size, png::ColorType::Rgb, png::BitDepth::Eight)?)
+        }
+        (Format::Png, Samples::Steps(DepthSteps { steps, scale })) => {
+            let samples: Vec<u8> = steps.iter().flat_map(|step| step.to_be_bytes()).collect();
+            let bytes = png(&samples, size, png::ColorType::Grayscale, png::BitDepth::Sixteen)?;
+            Ok(Encoded { bytes, depth_scale: Some(scale) })
+        }
+        (Format::Jpeg, Samples::Grey(samples)) => {
+            plain(jpeg(&samples, size, jpeg_encoder::ColorType::Luma)?)
+        }
+        (Format::Jpeg, Samples::Rgb(samples)) => {
+            plain(jpeg(&samples, size, jpeg_encoder::ColorType::Rgb)?)
+        }
+        (Format::Webp, Samples::Rgb(samples)) => plain(webp(&samples, size)?),
+        // WebP knows no grey.
+        (Format::Webp, Samples::Grey(samples)) => {
+            let rgb: Vec<u8> = samples.iter().flat_map(|v| [*v; 3]).collect();
+            plain(webp(&rgb, size)?)
+        }
+        _ => Err(unfit()),
     }
-    .map_err(|e| Error::internal("the picture cannot be encoded").caused_by(e))?;
-    Ok(Encoded { bytes, depth_scale })
 }
 
-/// Levels as an encoder takes them.
-fn grey(levels: Cow<'_, [u8]>, format: Format) -> (Cow<'_, [u8]>, ExtendedColorType) {
-    match format {
-        // WebP knows no grey.
-        Format::Webp => (levels.iter().flat_map(|v| [*v; 3]).collect(), ExtendedColorType::Rgb8),
-        _ => (levels, ExtendedColorType::L8),
-    }
+/// The colours of entries.
+fn coloured(entries: &[u16]) -> Vec<u8> {
+    let most = entries.iter().copied().max().unwrap_or_default();
+    let colours: Vec<[u8; 3]> = (0..=most).map(|m| colour(m).map(level)).collect();
+    entries.iter().flat_map(|m| colours[usize::from(*m)]).collect()
+}
+
+fn failed(e: impl std::error::Error + Send + Sync + 'static) -> Error {
+    Error::internal("the picture cannot be encoded").caused_by(e)
+}
+
+/// One filter for all rows: trying each costs twice the time for the same size.
+fn png(
+    samples: &[u8],
+    [width, height]: [u32; 2],
+    color: png::ColorType,
+    depth: png::BitDepth,
+) -> Result<Vec<u8>> {
+    let mut bytes = Vec::with_capacity(samples.len() / 2);
+    let mut encoder = png::Encoder::new(&mut bytes, width, height);
+    encoder.set_color(color);
+    encoder.set_depth(depth);
+    encoder.set_compression(png::Compression::Fast);
+    encoder.set_filter(png::Filter::Paeth);
+    let mut writer = encoder.write_header().map_err(failed)?;
+    writer.write_image_data(samples).map_err(failed)?;
+    writer.finish().map_err(failed)?;
+    Ok(bytes)
+}
+
+fn jpeg(
+    samples: &[u8],
+    [width, height]: [u32; 2],
+    color: jpeg_encoder::ColorType,
+) -> Result<Vec<u8>> {
+    let mut bytes = Vec::with_capacity(samples.len() / 8);
+    let mut encoder = jpeg_encoder::Encoder::new(&mut bytes, JPEG_QUALITY);
+    let full = u64::from(width) * u64::from(height) <= FULL_CHROMA_PIXELS_MAX;
+    encoder.set_sampling_factor(match full {
+        true => jpeg_encoder::SamplingFactor::F_1_1,
+        false => jpeg_encoder::SamplingFactor::F_2_2,
+    });
+    let side = |side: u32| {
+        let max = u16::MAX;
+        u16::try_from(side).map_err(|_| Error::limit("jpeg: side", side, max))
+    };
+    encoder.encode(samples, side(width)?, side(height)?, color).map_err(failed)?;
+    Ok(bytes)
+}
+
+fn webp(rgb: &[u8], [width, height]: [u32; 2]) -> Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    let encoder = WebPEncoder::new_lossless(&mut bytes);
+    encoder.write_image(rgb, width, height, ExtendedColorType::Rgb8).map_err(failed)?;
+    Ok(bytes)
+}
+
+/// A layer as NPY.
+fn numbers(layer: Layer<'_>, width: u32, height: u32) -> Result<Vec<u8>> {
+    let plain = |values: &[f32]| npy(values, &[height, width]);
+    Ok(match layer {
+        Layer::Color(color) => npy(color.as_flattened(), &[height, width, 3]),
+        Layer::Depth(values) => plain(&values),
+        Layer::Share(values) => plain(&values),
+        Layer::Entries(entries) => {
+            plain(&entries.iter().map(|m| f32::from(*m)).collect::<Vec<_>>())
+        }
+        Layer::Mask(mask) => plain(&mask.iter().map(|on| f32::from(*on)).collect::<Vec<_>>()),
+        Layer::Levels(levels) => {
+            plain(&levels.iter().map(|v| f32::from(*v) / 255.0).collect::<Vec<_>>())
+        }
+        Layer::Rgb(_) | Layer::Rgba(_) | Layer::Steps(_) => {
+            return Err(Error::internal("the renderer gave other numbers than npy has"));
+        }
+    })
 }
 
 /// `NumPy`'s format version 1.0, C order.
@@ -144,7 +238,8 @@ fn npy(values: &[f32], shape: &[u32]) -> Vec<u8> {
     header.push_str(&" ".repeat(padded - header.len() - 1));
     header.push('\n');
     let length = header.len() as u16;
-    let mut file = b"\x93NUMPY\x01\x00".to_vec();
+    let mut file = Vec::with_capacity(10 + header.len() + 4 * values.len());
+    file.extend(b"\x93NUMPY\x01\x00");
     file.extend(length.to_le_bytes());
     file.extend(header.as_bytes());
     file.extend(values.iter().flat_map(|v| v.to_le_bytes()));

@@ -17,6 +17,7 @@ mod schedule;
 mod search;
 mod semantics;
 mod texts;
+mod times;
 mod types;
 mod view;
 
@@ -30,11 +31,12 @@ use self::{memory::Memory, schedule::Scheduler, search::Backend};
 pub use self::{
     offline::OfflineService,
     request::{
-        Background, Boxes, CameraFields, CameraSpec, CreateScene, ExportFormat, Format, Kind,
+        BackgroundSpec, Boxes, CameraFields, CameraSpec, CreateScene, ExportFormat, Format, Kind,
         LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions, PoseSpec, QuerySpec,
         TextOptions, ViewOptions, ViewSpec, ViewsSpec,
     },
     rle::Rle,
+    times::ViewTimes,
     types::{
         Created, Export, InstanceBox, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
         QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning,

@@ -7,6 +7,7 @@ use super::{
     request::{PickSpec, QuerySpec, ViewSpec},
     search::{Backend, SceneTexts, Subject},
     texts,
+    times::ViewTimes,
     types::{Picked, QueryAnswer, RenderedView},
     view::resolve_one,
 };
@@ -70,7 +71,8 @@ impl OfflineService {
             None
         };
         let tag = scene.meta.id.as_str();
-        let mut views = view.draw(&self.backend, scene, tag, texts.as_ref(), || ())?;
+        let mut views =
+            view.draw(&self.backend, scene, tag, texts.as_ref(), ViewTimes::default(), || ())?;
         views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
     }
 

@@ -156,7 +156,7 @@ fn text_view(
         MaskFormat::None => {}
     }
     if spec.relevancy {
-        view.relevancy_png = Some(png(Layer::Share(&relevancy))?);
+        view.relevancy_png = Some(png(Layer::Share(relevancy.as_slice().into()))?);
     }
     Ok(view)
 }

@@ -78,13 +78,34 @@ pub enum Format {
     /// 8-bit RGB or grey; 16-bit grey for depth.
     #[default]
     Png,
-    /// 8-bit, quality 90; not for depth.
+    /// 8-bit, quality 90; not for depth. Over 512 x 512 pixels colour is halved each way (4:2:0).
     #[serde(alias = "jpg")]
     Jpeg,
     /// 8-bit, lossless; not for depth.
     Webp,
     /// `NumPy` array of little-endian f32, `[H, W, 3]` or `[H, W]`, not clamped.
     Npy,
+    /// Bytes without a header, `[H, W, 3]`: red, green and blue of `color`, over its background, or
+    /// of `semantics`. Equal to the samples of the PNG.
+    Rgb8,
+    /// Bytes without a header, `[H, W, 4]`: those of `rgb8`, then alpha. For `color` alone. Colour
+    /// is over its background and not divided by alpha, so over `black` it is premultiplied.
+    Rgba8,
+    /// Bytes without a header, `[H, W]`: `alpha`, `relevancy` or `mask`. Equal to the samples of
+    /// the PNG.
+    Grey8,
+}
+
+impl Format {
+    /// Samples of a pixel, one byte each, of a format without a codec.
+    pub fn samples(self) -> Option<u32> {
+        match self {
+            Self::Grey8 => Some(1),
+            Self::Rgb8 => Some(3),
+            Self::Rgba8 => Some(4),
+            Self::Png | Self::Jpeg | Self::Webp | Self::Npy => None,
+        }
+    }
 }
 
 /// Which boxes hold the parts of a selection.
@@ -324,7 +345,8 @@ pub struct ViewOptions {
 #[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
 pub struct PictureOptions {
-    /// `png` (default), `jpeg`, `webp` or `npy`. For one view `Accept` decides where it is absent.
+    /// `png` (default), `jpeg`, `webp`, `npy`, or samples without a codec: `rgb8`, `rgba8` or
+    /// `grey8`. For one view `Accept` decides where it is absent.
     #[arg(skip)]
     #[param(inline)]
     pub format: Format,
@@ -333,7 +355,7 @@ pub struct PictureOptions {
     #[arg(long, default_value = "backdrop", value_name = "COLOR", hide_default_value = true)]
     #[param(value_type = String)]
     #[schema(value_type = serde_json::Value)]
-    pub background: Background,
+    pub background: BackgroundSpec,
     /// The part of the picture that is drawn: first column, first row, width and height in pixels
     /// of the whole, four whole numbers.
     #[arg(long, value_name = "X,Y,WIDTH,HEIGHT", value_parser = region)]
@@ -448,7 +470,7 @@ pub struct PickSpec {
 
 /// What is behind the Gaussians.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub enum Background {
+pub enum BackgroundSpec {
     /// The photos' colours by direction.
     #[default]
     Backdrop,
@@ -456,7 +478,7 @@ pub enum Background {
     Color([f32; 3]),
 }
 
-impl Background {
+impl BackgroundSpec {
     /// The one colour, where it is one.
     pub fn color(self) -> Option<[f32; 3]> {
         match self {
@@ -469,7 +491,7 @@ impl Background {
 /// What a background must be, for messages.
 const BACKGROUNDS: &str = "backdrop, black, white, #rrggbb or three numbers of 0..1";
 
-impl FromStr for Background {
+impl FromStr for BackgroundSpec {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
@@ -490,7 +512,7 @@ impl FromStr for Background {
     }
 }
 
-impl Serialize for Background {
+impl Serialize for BackgroundSpec {
     fn serialize<S: Serializer>(&self, to: S) -> Result<S::Ok, S::Error> {
         match self {
             Self::Backdrop => to.serialize_str("backdrop"),
@@ -499,23 +521,23 @@ impl Serialize for Background {
     }
 }
 
-impl<'de> Deserialize<'de> for Background {
+impl<'de> Deserialize<'de> for BackgroundSpec {
     fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
         struct Visitor;
         impl<'de> de::Visitor<'de> for Visitor {
-            type Value = Background;
+            type Value = BackgroundSpec;
 
             fn expecting(&self, to: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
                 to.write_str(BACKGROUNDS)
             }
 
-            fn visit_str<E: de::Error>(self, text: &str) -> Result<Background, E> {
+            fn visit_str<E: de::Error>(self, text: &str) -> Result<BackgroundSpec, E> {
                 text.parse().map_err(E::custom)
             }
 
-            fn visit_seq<A: de::SeqAccess<'de>>(self, list: A) -> Result<Background, A::Error> {
+            fn visit_seq<A: de::SeqAccess<'de>>(self, list: A) -> Result<BackgroundSpec, A::Error> {
                 let color = <[f32; 3]>::deserialize(de::value::SeqAccessDeserializer::new(list))?;
-                Ok(Background::Color(color))
+                Ok(BackgroundSpec::Color(color))
             }
         }
         from.deserialize_any(Visitor)

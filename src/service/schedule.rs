@@ -67,6 +67,8 @@ pub(super) struct Slot {
     scheduler: Arc<Scheduler>,
     pixels: u64,
     drawing: bool,
+    /// Milliseconds until the view had the slot and a thread.
+    pub(super) queue_ms: f64,
 }
 
 impl Slot {
@@ -169,7 +171,8 @@ impl Scheduler {
             state.drawing_small += usize::from(pixels <= SMALL_PIXELS);
             state.clock = state.clock.max(key.0);
             // A caller that stops to wait leaves the queue before it closes the channel.
-            let _ = start.send(Slot { scheduler: Arc::clone(self), pixels, drawing: true });
+            let scheduler = Arc::clone(self);
+            let _ = start.send(Slot { scheduler, pixels, drawing: true, queue_ms: 0.0 });
         }
     }
 

@@ -4,10 +4,14 @@
 //! The first text starts the job that makes the semantics. They are made once, however many callers
 //! wait for them.
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use super::{
-    Inner, Service, access::SceneAccess, create::blocking, search::Subject, view::scene_tag,
+    Inner, Service, access::SceneAccess, create::blocking, search::Subject, times::ms,
+    view::scene_tag,
 };
 use crate::{
     error::{Error, ErrorCode, Result},
@@ -26,6 +30,8 @@ pub(super) struct Understood {
     semantics: Arc<Semantics>,
     /// Tells scene and semantics from any others.
     tag: String,
+    /// Time until it was ready, milliseconds.
+    pub(super) load_ms: f64,
 }
 
 impl Understood {
@@ -69,17 +75,20 @@ impl Inner {
         &self,
         access: &SceneAccess,
     ) -> Result<Option<(Arc<Scene>, Arc<Semantics>)>> {
-        let scene = self.load(access)?;
-        let loaded = &self.models.bundle_sha256;
-        if let Some(semantics) = scene.semantics.clone() {
-            let made_by = &semantics.report.bundle_sha256;
-            if made_by == loaded || made_by.is_empty() {
-                return Ok(Some((scene, semantics)));
-            }
-            tracing::info!(scene = %access.id(), made_by, "another bundle: semantics again");
+        let found = self.semantics_of(self.load(access)?);
+        if found.is_none() {
+            tracing::info!(scene = %access.id(), "no semantics of this bundle: made again");
+            self.jobs.lose_semantics(access.id())?;
         }
-        self.jobs.lose_semantics(access.id())?;
-        Ok(None)
+        Ok(found)
+    }
+
+    /// A scene and its semantics, where the loaded bundle made them.
+    fn semantics_of(&self, scene: Arc<Scene>) -> Option<(Arc<Scene>, Arc<Semantics>)> {
+        let semantics = scene.semantics.clone()?;
+        let made_by = &semantics.report.bundle_sha256;
+        let ours = *made_by == self.models.bundle_sha256 || made_by.is_empty();
+        ours.then_some((scene, semantics))
     }
 
     /// The scene with its semantics, which are made now where they were not before.
@@ -91,6 +100,7 @@ impl Inner {
         what: &str,
         wait: Option<Duration>,
     ) -> Result<Understood> {
+        let begun = Instant::now();
         self.can_understand(what)?;
         Self::may_be_asked(scene.record(), what)?;
         let id = scene.id();
@@ -118,11 +128,17 @@ impl Inner {
                 _ => return Err(not_yet(&record.status, what)),
             }
             let access = scene.renewed(record);
-            let (inner, asked) = (Arc::clone(self), access.clone());
-            let found = blocking(move || inner.loaded_semantics(&asked)).await??;
+            let kept = self.store.scene_in_memory(id).and_then(|scene| self.semantics_of(scene));
+            let found = match kept {
+                Some(kept) => Some(kept),
+                None => {
+                    let (inner, asked) = (Arc::clone(self), access.clone());
+                    blocking(move || inner.loaded_semantics(&asked)).await??
+                }
+            };
             if let Some((scene, semantics)) = found {
-                let tag = meaning_tag(access.record());
-                return Ok(Understood { access, scene, semantics, tag });
+                let (tag, load_ms) = (meaning_tag(access.record()), ms(begun));
+                return Ok(Understood { access, scene, semantics, tag, load_ms });
             }
         }
     }

@@ -9,6 +9,7 @@ use utoipa::ToSchema;
 use super::{
     request::{Format, Kind},
     rle::Rle,
+    times::ViewTimes,
 };
 use crate::{
     render::FrameStats,
@@ -183,10 +184,20 @@ pub struct RenderedView {
     pub etag: String,
     /// Counts of the frame.
     pub stats: FrameStats,
-    /// Time of rendering, without waiting and encoding, milliseconds.
-    pub render_ms: f64,
-    /// Time of encoding, milliseconds.
-    pub encode_ms: f64,
+    /// Where the time went.
+    pub times: ViewTimes,
+}
+
+impl RenderedView {
+    /// Shape of the array of a format without a codec: height and width, and the samples of a pixel
+    /// where there are several.
+    pub fn shape(&self) -> Option<Vec<u32>> {
+        let (height, width) = (self.height, self.width);
+        match self.format.samples()? {
+            1 => Some(vec![height, width]),
+            samples => Some(vec![height, width, samples]),
+        }
+    }
 }
 
 impl fmt::Debug for RenderedView {

@@ -16,15 +16,16 @@ use super::{
     access::SceneAccess,
     camera,
     create::blocking,
-    encode::{self, Encoded, Layer},
+    encode::{self, Layer},
     request::{
-        Background, CameraSpec, Format, Kind, PictureOptions, TextOptions, ViewOptions, ViewSpec,
-        ViewsSpec,
+        BackgroundSpec, CameraSpec, Format, Kind, PictureOptions, TextOptions, ViewOptions,
+        ViewSpec, ViewsSpec,
     },
     schedule::Slot,
     search::{Backend, LabelledView, SceneTexts},
     semantics::{Understood, meaning_tag},
     texts,
+    times::{ViewTimes, ms, staged},
     types::RenderedView,
 };
 use crate::{
@@ -87,13 +88,18 @@ impl Resolved {
             kinds,
             labels: Labels::None,
             background: match self.picture.background {
-                Background::Backdrop => render::Background::Backdrop(Arc::clone(&scene.backdrop)),
-                Background::Color(color) => render::Background::Color(color),
+                BackgroundSpec::Backdrop => {
+                    render::Background::Backdrop(Arc::clone(&scene.backdrop))
+                }
+                BackgroundSpec::Color(color) => render::Background::Color(color),
             },
             sources: plan::sources(scene, &self.camera),
             samples: match self.picture.format {
                 Format::Npy => Samples::F32,
-                Format::Png | Format::Jpeg | Format::Webp => Samples::Levels,
+                Format::Rgba8 => Samples::LevelsRgba,
+                Format::Png | Format::Jpeg | Format::Webp | Format::Rgb8 | Format::Grey8 => {
+                    Samples::Levels
+                }
             },
             antialiased: self.options.antialiased,
             near: self.near,
@@ -154,71 +160,87 @@ impl Resolved {
         }
     }
 
-    /// The pictures of all kinds; `scene_tag` tells the scene in their tags. Calls `drawn` when
-    /// only the encoding is left to do.
+    /// The pictures of all kinds; `scene_tag` tells the scene in their tags, `times` has the stages
+    /// before. Calls `drawn` when only scores of pixels and the encoding are left to do.
     pub(super) fn draw(
         &self,
         backend: &Backend,
         scene: &Scene,
         scene_tag: &str,
         texts: Option<&SceneTexts<'_>>,
+        times: ViewTimes,
         drawn: impl FnOnce(),
     ) -> Result<Vec<RenderedView>> {
-        let started = Instant::now();
-        let (frame, weights) = self.drawn(backend, scene, texts)?;
+        let (frame, render_ms) = staged("render", || self.drawn(backend, scene, texts));
+        let (mut frame, weights) = frame?;
         drawn();
-        let render_ms = started.elapsed().as_secs_f64() * 1e3;
-        meter::stage("render", render_ms / 1e3);
         let name = backend.renderer.name();
+        let (width, height, format) = (frame.width, frame.height, self.picture.format);
         let view = |&kind: &Kind| -> Result<RenderedView> {
-            let encoding = Instant::now();
+            let mut times = ViewTimes { render_ms, ..times };
             let texts = texts.filter(|_| kind.needs_semantics());
-            let encoded = match (texts, &weights) {
-                (Some(texts), Some(weights)) => self.text_picture(kind, texts, weights, &frame)?,
-                _ => self.encode(encode::layer(&frame, kind)?, &frame)?,
+            let scored = match (texts, &weights) {
+                (Some(texts), Some(weights)) => {
+                    let (scored, ms) = staged("score", || Scored::new(kind, texts, weights));
+                    *times.score_ms.get_or_insert_default() += ms;
+                    Some(scored?)
+                }
+                _ => None,
             };
-            let encode_ms = encoding.elapsed().as_secs_f64() * 1e3;
-            meter::stage("encode", encode_ms / 1e3);
+            if texts.is_none() {
+                times.score_ms = None;
+            }
+            let layer = match &scored {
+                Some(scored) => scored.layer(),
+                None => encode::layer(&mut frame, kind)?,
+            };
+            let (encoded, ms) = staged("encode", || encode::encode(layer, width, height, format));
+            let encoded = encoded?;
+            times.encode_ms = ms;
             let texts = texts.map(SceneTexts::words).transpose()?.unwrap_or_default();
             Ok(RenderedView {
                 camera_index: self.camera_index,
                 kind,
-                format: self.picture.format,
-                width: frame.width,
-                height: frame.height,
+                format,
+                width,
+                height,
                 bytes: encoded.bytes,
                 depth_scale: encoded.depth_scale,
                 camera: self.seen(),
                 etag: self.etag(scene_tag, &name, kind, &texts)?,
                 stats: frame.stats,
-                render_ms,
-                encode_ms,
+                times,
             })
         };
         self.kinds.iter().map(view).collect()
     }
+}
 
-    fn encode(&self, layer: Layer<'_>, frame: &Frame) -> Result<Encoded> {
-        encode::encode(layer, frame.width, frame.height, self.picture.format)
-    }
+/// A picture that is computed from the weights of a view.
+enum Scored {
+    Mask(Vec<bool>),
+    Relevancy(Vec<f32>),
+    Entries(Vec<u16>),
+}
 
-    fn text_picture(
-        &self,
-        kind: Kind,
-        texts: &SceneTexts<'_>,
-        view: &LabelledView,
-        frame: &Frame,
-    ) -> Result<Encoded> {
+impl Scored {
+    fn new(kind: Kind, texts: &SceneTexts<'_>, view: &LabelledView) -> Result<Self> {
         let (scorer, text) = (&texts.scorer, texts.texts.first());
         match (kind, text) {
-            (Kind::Mask, Some(text)) => {
-                self.encode(Layer::Mask(&scorer.mask(&text.scores, &view.weights)?), frame)
-            }
+            (Kind::Mask, Some(text)) => Ok(Self::Mask(scorer.mask(&text.scores, &view.weights)?)),
             (Kind::Relevancy, Some(text)) => {
-                self.encode(Layer::Share(&view.relevancy(scorer, &text.scores)?), frame)
+                Ok(Self::Relevancy(view.relevancy(scorer, &text.scores)?))
             }
-            (Kind::Semantics, _) => self.encode(Layer::Entries(&view.strongest(scorer)), frame),
+            (Kind::Semantics, _) => Ok(Self::Entries(view.strongest(scorer))),
             _ => Err(Error::internal(format!("kind={kind} was not drawn"))),
+        }
+    }
+
+    fn layer(&self) -> Layer<'_> {
+        match self {
+            Self::Mask(mask) => Layer::Mask(mask),
+            Self::Relevancy(relevancy) => Layer::Share(relevancy.as_slice().into()),
+            Self::Entries(entries) => Layer::Entries(entries),
         }
     }
 }
@@ -325,9 +347,7 @@ fn resolve(
 impl Inner {
     /// The scene itself. It is marked as failed when its file is bad. Blocks on the store.
     pub(super) fn load(&self, access: &SceneAccess) -> Result<Arc<Scene>> {
-        let started = Instant::now();
-        let scene = self.store.scene(access.id());
-        meter::stage("load", started.elapsed().as_secs_f64());
+        let (scene, _ms) = staged("load", || self.store.scene(access.id()));
         scene.inspect_err(|error| {
             if error.code() == ErrorCode::SceneCorrupt {
                 self.jobs.spoil(access.id(), error);
@@ -366,14 +386,20 @@ impl Inner {
         let pixels = view.pixels();
         let work = move |slot: &mut Slot| {
             let (backend, tag) = (&inner.backend, scene_tag(scene.record()));
+            let mut times = ViewTimes { queue_ms: slot.queue_ms, ..ViewTimes::default() };
             let drawn = || slot.drawn();
             let Some((understood, ask)) = texts else {
+                let begun = Instant::now();
                 let scene = inner.load(&scene)?;
-                return view.draw(backend, &scene, &tag, None, drawn);
+                times.load_ms = ms(begun);
+                return view.draw(backend, &scene, &tag, None, times, drawn);
             };
             let subject = understood.subject();
-            let texts = SceneTexts::new(backend, subject, ask.profile, ask.text.as_slice())?;
-            view.draw(backend, subject.scene, &tag, Some(&texts), drawn)
+            let text = ask.text.as_slice();
+            let scored = || SceneTexts::new(backend, subject, ask.profile, text);
+            let (texts, ms) = staged("score", scored);
+            (times.load_ms, times.score_ms) = (understood.load_ms, Some(ms));
+            view.draw(backend, subject.scene, &tag, Some(&texts?), times, drawn)
         };
         self.scheduled(deadline, pixels, "the view", work).await
     }
@@ -390,9 +416,14 @@ impl Inner {
         let started = Instant::now();
         let limits = self.limits();
         let work = async {
-            let mut slot = self.scheduler.enter(pixels, &limits).await?;
-            meter::stage("queue", started.elapsed().as_secs_f64());
-            blocking(move || work(&mut slot)).await?
+            let span = tracing::info_span!("stage", stage = "queue");
+            let mut slot = self.scheduler.enter(pixels, &limits).instrument(span).await?;
+            blocking(move || {
+                slot.queue_ms = ms(started);
+                meter::stage("queue", slot.queue_ms / 1e3);
+                work(&mut slot)
+            })
+            .await?
         };
         let late = || {
             let ms = started.elapsed().as_millis();

@@ -255,6 +255,11 @@ impl Store {
         scene
     }
 
+    /// The scene where it is in memory. Never blocks on the store.
+    pub(crate) fn scene_in_memory(&self, id: &SceneId) -> Option<Arc<Scene>> {
+        self.cache.find(id)
+    }
+
     /// sha256 of a scene's file as it is kept, hex; `None` where there is none that is sound.
     pub(crate) fn scene_digest(&self, id: &SceneId) -> Result<Option<String>> {
         let file = self.objects.get("read the scene", of(id, SCENE))?;

@@ -111,7 +111,7 @@ pub fn uploaded(bytes: usize) {
 
 /// Values that are read when somebody asks for the metrics.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Levels {
+pub struct Readings {
     /// Whether the server takes new work.
     pub ready: bool,
     /// Jobs that wait.
@@ -130,7 +130,7 @@ pub struct Levels {
 ///
 /// # Errors
 /// `internal` when they cannot be written as text.
-pub fn text(levels: Levels) -> Result<String> {
+pub fn text(levels: Readings) -> Result<String> {
     METRICS.ready.set(f64::from(u8::from(levels.ready)));
     METRICS.jobs_queued.set(levels.jobs_queued as f64);
     METRICS.jobs_running.set(levels.jobs_running as f64);

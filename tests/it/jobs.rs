@@ -17,7 +17,7 @@ use segsplat::{
         SemanticsMode, Stage,
     },
     service::{
-        Background, CameraSpec, CreateScene, ExportFormat, Kind, LensSpec, PageRequest,
+        BackgroundSpec, CameraSpec, CreateScene, ExportFormat, Kind, LensSpec, PageRequest,
         PictureOptions, PoseSpec, Service, TextOptions, ViewOptions, ViewsSpec,
     },
     store::{self, Place, Record, Store},
@@ -344,7 +344,7 @@ async fn views_come_camera_by_camera_and_tags_tell_pictures_apart() {
     let tag = server.service.view_etag(&id, &one).await.unwrap();
     assert_eq!(server.service.render(&id, one.clone()).await.unwrap().etag, tag.clone().unwrap());
     let mut other = one.clone();
-    other.picture.background = Background::Color([0.0, 0.0, 0.5]);
+    other.picture.background = BackgroundSpec::Color([0.0, 0.0, 0.5]);
     assert_ne!(server.service.view_etag(&id, &other).await.unwrap(), tag);
     let mut late = one;
     late.options.deadline = Some(Duration::ZERO);

@@ -29,6 +29,7 @@ mod life;
 mod magnify;
 mod offline;
 mod proto;
+mod raw;
 mod schedule;
 mod slow_callers;
 mod store;

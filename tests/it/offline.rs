@@ -13,7 +13,7 @@ use segsplat::{
         RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
     },
     service::{
-        Background, CameraFields, CameraSpec, Format, Kind, LensSpec, OfflineService,
+        BackgroundSpec, CameraFields, CameraSpec, Format, Kind, LensSpec, OfflineService,
         PictureOptions, PoseSpec, QuerySpec, RenderedView, Rle, TextOptions, ViewOptions, ViewSpec,
     },
 };
@@ -216,7 +216,7 @@ fn fields_that_do_not_go_together_are_refused_by_name() {
 
 #[test]
 fn backgrounds_are_names_hex_or_numbers() {
-    let color = |text: &str| text.parse::<Background>().map(Background::color);
+    let color = |text: &str| text.parse::<BackgroundSpec>().map(BackgroundSpec::color);
     assert_eq!(color("backdrop").unwrap(), None);
     assert_eq!(color("white").unwrap(), Some([1.0; 3]));
     assert_eq!(color("#ff0000").unwrap(), Some([1.0, 0.0, 0.0]));
@@ -265,7 +265,7 @@ fn frame() -> Frame {
 }
 
 fn encode(frame: Frame, kind: Kind, format: Format) -> Result<RenderedView> {
-    let background = Background::Color([0.0; 3]);
+    let background = BackgroundSpec::Color([0.0; 3]);
     let picture = PictureOptions { format, background, ..PictureOptions::default() };
     render(frame, &ViewSpec { picture, ..view(kind) })
 }

@@ -46,7 +46,7 @@ const CONFINED: [(&str, &[&str]); 12] = [
         "utoipa",
         &["src/api/http", "src/service", "crates/core/src/scene", "crates/render/src/lib.rs"],
     ),
-    ("tonic", &["src/api/grpc"]),
+    ("tonic", &["src/api/grpc", "lab/src/load"]),
     ("tonic_health", &["src/api/grpc"]),
     ("tonic_reflection", &["src/api/grpc"]),
     ("prost", &["src/api/grpc"]),

@@ -10,7 +10,7 @@ use crate::scene::Stage;
 pub const STAGE_SECONDS: &str = "segsplat_stage_seconds";
 
 /// Stages of a view, and the wait of a job for its worker.
-const OTHERS: [&str; 5] = ["wait", "queue", "load", "render", "encode"];
+const OTHERS: [&str; 6] = ["wait", "queue", "load", "score", "render", "encode"];
 
 /// Stages of a scene, of its semantics, and of a view.
 pub fn stages() -> impl Iterator<Item = &'static str> {

@@ -10,7 +10,7 @@ use crate::{
         StageTime, Warning,
     },
     service::{
-        Background, Boxes, CameraSpec, Density, Event, ExportFormat, Format, InstanceBox, Kind,
+        BackgroundSpec, Boxes, CameraSpec, Density, Event, ExportFormat, Format, InstanceBox, Kind,
         Label, LensSpec, MaskFormat, Peak, PickSpec, Picked, PictureOptions, PoseSpec, Quality,
         QueryAnswer, QuerySpec, RenderedView, SceneCamera, SceneError, SceneState, SceneStatus,
         SemanticsMode, SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView,
@@ -183,7 +183,7 @@ fn options_alone(given: Option<pb::ViewOptions>, call: &str) -> Result<ViewOptio
 /// How a view is encoded.
 pub(super) fn picture(options: &pb::ViewOptions) -> Result<PictureOptions> {
     #[expect(clippy::cast_possible_truncation, reason = "a colour fits f32")]
-    let color = |v: pb::Vec3| Background::Color([v.x as f32, v.y as f32, v.z as f32]);
+    let color = |v: pb::Vec3| BackgroundSpec::Color([v.x as f32, v.y as f32, v.z as f32]);
     let crop = |crop: pb::Region| [crop.x, crop.y, crop.width, crop.height].into();
     Ok(PictureOptions {
         format: value("format", options.format)?,
@@ -194,7 +194,8 @@ pub(super) fn picture(options: &pb::ViewOptions) -> Result<PictureOptions> {
 
 /// One encoded picture.
 pub(super) fn view(view: RenderedView) -> pb::View {
-    message!(View from view { width, height, depth_scale, etag, render_ms }
+    message!(View from view { width, height, depth_scale, etag }
+        render_ms: view.times.render_ms,
         camera_index: u32::try_from(view.camera_index).unwrap_or(u32::MAX),
         kind: pb::Kind::from(view.kind).into(),
         format: pb::Format::from(view.format).into(),
@@ -350,7 +351,7 @@ both_ways! {
     SemanticsMode = Semantics { Lazy, Eager, Off }
     Density = Density { Thinned, Full }
     Kind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }
-    Format = Format { Png, Jpeg, Webp, Npy }
+    Format = Format { Png, Jpeg, Webp, Npy, Rgb8, Rgba8, Grey8 }
     Quality = Quality { Exact, Fast }
     ScoringProfile = ScoringProfile { Default, Paper }
     Boxes = Boxes { Oriented, Aligned, None }

@@ -12,12 +12,14 @@ use super::{
 };
 use crate::{
     api::{
-        Api, request_id,
+        Api, request_id, server_timing,
         upload::{UploadBuilder, UploadGuard, check_bundle},
     },
     error::{Error, Result},
     scene::{Upload, UploadCameras},
-    service::{CreateScene, Kind, PageRequest, SceneOptions, SemanticsMode, ViewSpec, ViewsSpec},
+    service::{
+        CreateScene, Kind, PageRequest, SceneOptions, SemanticsMode, ViewSpec, ViewTimes, ViewsSpec,
+    },
 };
 
 type Answer<T> = Result<Response<T>, Status>;
@@ -95,7 +97,12 @@ impl pb::scene_service_server::SceneService for Api {
     }
 
     async fn render_view(&self, request: Request<pb::RenderViewRequest>) -> Answer<pb::View> {
-        answer(self, request, render).await
+        let (view, times) = answer(self, request, render).await?.into_inner();
+        let mut answer = Response::new(view);
+        if let Ok(value) = server_timing(times.stages()).parse() {
+            answer.metadata_mut().insert("server-timing", value);
+        }
+        Ok(answer)
     }
 
     async fn render_views(
@@ -206,7 +213,7 @@ fn begin(
     Ok(header)
 }
 
-async fn render(api: Api, request: pb::RenderViewRequest) -> Result<pb::View> {
+async fn render(api: Api, request: pb::RenderViewRequest) -> Result<(pb::View, ViewTimes)> {
     let id = request.scene_id.parse()?;
     let given = request.options.unwrap_or_default();
     let spec = ViewSpec {
@@ -217,7 +224,8 @@ async fn render(api: Api, request: pb::RenderViewRequest) -> Result<pb::View> {
         picture: convert::picture(&given)?,
     };
     let view = api.service.render(&id, spec).await?;
-    Ok(convert::view(view))
+    let times = view.times;
+    Ok((convert::view(view), times))
 }
 
 async fn render_many(api: Api, request: pb::RenderViewsRequest) -> Result<Many<pb::View>> {

@@ -1,19 +1,21 @@
 //! A connection from its first byte to its last: HTTP/1.1 or HTTP/2, and the time limits of both.
 
 use std::{
-    io::{self, Cursor},
-    pin::pin,
+    io::{self, IoSlice},
+    pin::{Pin, pin},
+    task::{Context, Poll},
     time::Duration,
 };
 
 use axum::Router;
+use hyper::server::conn::{http1, http2};
 use hyper_util::{
     rt::{TokioExecutor, TokioIo, TokioTimer},
-    server::conn::auto::Builder,
+    server::graceful::GracefulConnection,
     service::TowerToHyperService,
 };
 use tokio::{
-    io::{AsyncRead, AsyncReadExt, AsyncWrite, join, split},
+    io::{AsyncRead, AsyncReadExt, AsyncWrite, ReadBuf},
     sync::watch,
     time::timeout,
 };
@@ -39,14 +41,26 @@ pub(super) async fn serve<S>(
         () = stopped(&mut stopping) => return,
     };
     let Ok(Ok(first)) = first else { return };
-    let (reader, writer) = split(stream);
-    let stream = TokioIo::new(join(Cursor::new(first).chain(reader), writer));
+    let is_http2 = first == PREFACE;
+    let (stream, app) = (TokioIo::new(Reread { first, stream }), TowerToHyperService::new(app));
+    if is_http2 {
+        let mut builder = http2::Builder::new(TokioExecutor::new());
+        builder.timer(TokioTimer::new());
+        builder.keep_alive_interval(head_max).keep_alive_timeout(head_max);
+        run(builder.serve_connection(stream, app), stopping).await;
+    } else {
+        let mut builder = http1::Builder::new();
+        builder.timer(TokioTimer::new()).header_read_timeout(head_max);
+        run(builder.serve_connection(stream, app), stopping).await;
+    }
+}
 
-    let mut builder = Builder::new(TokioExecutor::new());
-    builder.http1().timer(TokioTimer::new()).header_read_timeout(head_max);
-    let mut http2 = builder.http2();
-    http2.timer(TokioTimer::new()).keep_alive_interval(head_max).keep_alive_timeout(head_max);
-    let mut connection = pin!(builder.serve_connection(stream, TowerToHyperService::new(app)));
+/// Runs a connection to its end.
+async fn run<C>(connection: C, mut stopping: watch::Receiver<bool>)
+where
+    C: GracefulConnection<Error = hyper::Error>,
+{
+    let mut connection = pin!(connection);
     let ended = tokio::select! {
         ended = connection.as_mut() => ended,
         () = stopped(&mut stopping) => {
@@ -55,7 +69,7 @@ pub(super) async fn serve<S>(
         }
     };
     if let Err(error) = ended {
-        tracing::debug!(error = &*error, "a connection ended early");
+        tracing::debug!(error = &error as &dyn std::error::Error, "a connection ended early");
     }
 }
 
@@ -76,4 +90,56 @@ async fn first_bytes(stream: &mut (impl AsyncRead + Unpin)) -> io::Result<Vec<u8
         }
     }
     Ok(first)
+}
+
+/// A stream of which the first bytes were read already.
+struct Reread<S> {
+    first: Vec<u8>,
+    stream: S,
+}
+
+impl<S: AsyncRead + Unpin> AsyncRead for Reread<S> {
+    fn poll_read(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        to: &mut ReadBuf<'_>,
+    ) -> Poll<io::Result<()>> {
+        if self.first.is_empty() {
+            return Pin::new(&mut self.stream).poll_read(cx, to);
+        }
+        let count = self.first.len().min(to.remaining());
+        to.put_slice(&self.first[..count]);
+        self.first.drain(..count);
+        Poll::Ready(Ok(()))
+    }
+}
+
+impl<S: AsyncWrite + Unpin> AsyncWrite for Reread<S> {
+    fn poll_write(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        bytes: &[u8],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write(cx, bytes)
+    }
+
+    fn poll_flush(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_flush(cx)
+    }
+
+    fn poll_shutdown(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<io::Result<()>> {
+        Pin::new(&mut self.stream).poll_shutdown(cx)
+    }
+
+    fn poll_write_vectored(
+        mut self: Pin<&mut Self>,
+        cx: &mut Context<'_>,
+        pieces: &[IoSlice<'_>],
+    ) -> Poll<io::Result<usize>> {
+        Pin::new(&mut self.stream).poll_write_vectored(cx, pieces)
+    }
+
+    fn is_write_vectored(&self) -> bool {
+        self.stream.is_write_vectored()
+    }
 }

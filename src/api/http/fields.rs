@@ -402,7 +402,7 @@ impl<'de> Deserializer<'de> for Value {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::service::{Background, Boxes, CameraFields, Kind, PictureOptions, ViewOptions};
+    use crate::service::{BackgroundSpec, Boxes, CameraFields, Kind, PictureOptions, ViewOptions};
 
     // The messages are tested over HTTP, in `tests/it/fields.rs`.
     #[test]
@@ -427,7 +427,7 @@ mod tests {
         let options: ViewOptions = query.take().unwrap();
         assert_eq!((options.width, options.antialiased), (Some(8), true));
         let picture: PictureOptions = query.take().unwrap();
-        assert_eq!(picture.background, Background::Color([1.0, 0.0, 0.0]));
+        assert_eq!(picture.background, BackgroundSpec::Color([1.0, 0.0, 0.0]));
         assert_eq!(<[u32; 4]>::from(picture.crop.unwrap()), [1, 2, 3, 4]);
         assert_eq!(picture.format.to_string(), "jpeg");
         assert_eq!(query.all::<String>("label").unwrap(), ["cup", "a table"]);
@@ -445,7 +445,7 @@ mod tests {
         assert_eq!(body.value::<bool>("relevancy").unwrap(), Some(true));
         assert_eq!(body.take::<ViewOptions>().unwrap().near, Some(1.0));
         let picture: PictureOptions = body.take().unwrap();
-        assert_eq!(picture.background, Background::Color([0.0, 0.5, 1.0]));
+        assert_eq!(picture.background, BackgroundSpec::Color([0.0, 0.5, 1.0]));
         body.finish().unwrap();
     }
 }

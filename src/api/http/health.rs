@@ -13,7 +13,7 @@ use super::{error::ApiError, extract::CallerApi, fields::Fields};
 use crate::{
     api::Api,
     service::{ModelsInfo, Readiness},
-    telemetry::meter::{self, Levels},
+    telemetry::meter::{self, Readings},
 };
 
 /// Whether the process answers.
@@ -57,7 +57,7 @@ pub(super) async fn ready(State(api): State<Api>) -> Response {
 )]
 pub(super) async fn metrics(State(api): State<Api>) -> Result<Response, ApiError> {
     let readiness = api.service.ready();
-    let text = meter::text(Levels {
+    let text = meter::text(Readings {
         ready: readiness.ready && !api.drain.is_stopping(),
         jobs_queued: readiness.jobs_queued,
         jobs_running: readiness.jobs_running,

@@ -113,9 +113,13 @@ async fn within(
         Err(error) => transport.refusal(error),
         Ok(deadline) => {
             request.extensions_mut().insert(Deadline(deadline));
-            let max = deadline.unwrap_or(Duration::MAX);
-            let answered = tokio::time::timeout(max, next.run(request)).await;
-            answered.unwrap_or_else(|_| transport.refusal(deadline_passed(max)))
+            match deadline {
+                None => next.run(request).await,
+                Some(max) => {
+                    let answered = tokio::time::timeout(max, next.run(request)).await;
+                    answered.unwrap_or_else(|_| transport.refusal(deadline_passed(max)))
+                }
+            }
         }
     };
     if too_slow.load(Ordering::Acquire)

@@ -19,7 +19,7 @@ use super::{
     middleware::{Deadline, text_of},
 };
 use crate::{
-    api::short,
+    api::{server_timing, short},
     error::{Error, Result},
     service::{
         CameraFields, CameraSpec, ExportFormat, Format, Kind, PictureOptions, RenderedView,
@@ -55,7 +55,8 @@ pub(super) struct ExportParams {
     responses(
         (
             status = 200, content_type = "image/png", body = Vec<u8>,
-            description = "The picture; x-depth-scale is world units a step of a depth PNG"
+            description = "The picture. x-depth-scale: world units a step of a depth PNG. \
+                x-shape: height, width and samples of a pixel of rgb8, rgba8 and grey8"
         ),
         (status = 304, description = "If-None-Match names this picture"),
     )
@@ -115,22 +116,23 @@ pub(super) async fn export(
     Ok((headers, Body::from_stream(pieces)).into_response())
 }
 
-/// Headers of a picture: type, tag, camera, depth scale.
+/// Headers of a picture: type, tag, camera, depth scale, shape of samples without a codec.
 pub(super) fn view_headers(view: &RenderedView) -> HeaderMap {
     let mut headers = HeaderMap::new();
     let pose = view.camera.camera_to_world.to_row_major().map(|v| v.to_string()).join(",");
     let k = view.camera.intrinsics;
-    let times = format!("render;dur={:.2}, encode;dur={:.2}", view.render_ms, view.encode_ms);
     let texts = [
         ("content-type", content_type(view.format).to_owned()),
         ("etag", quoted(&view.etag)),
         ("cache-control", "private, no-cache".to_owned()),
-        ("server-timing", times),
+        ("server-timing", server_timing(view.times.stages())),
         ("x-camera-to-world", pose),
         ("x-intrinsics", format!("{},{},{},{}", k.fx, k.fy, k.cx, k.cy)),
     ];
     let scale = view.depth_scale.map(|scale| ("x-depth-scale", scale.to_string()));
-    for (name, text) in texts.into_iter().chain(scale) {
+    let shape = view.shape().map(|shape| shape.iter().map(u32::to_string).collect::<Vec<_>>());
+    let shape = shape.map(|sides| ("x-shape", sides.join(",")));
+    for (name, text) in texts.into_iter().chain(scale).chain(shape) {
         if let Ok(value) = HeaderValue::from_str(&text) {
             headers.insert(name, value);
         }
@@ -145,6 +147,9 @@ pub(super) fn content_type(format: Format) -> &'static str {
         Format::Jpeg => "image/jpeg",
         Format::Webp => "image/webp",
         Format::Npy => "application/x-npy",
+        Format::Rgb8 => "application/x-rgb8",
+        Format::Rgba8 => "application/x-rgba8",
+        Format::Grey8 => "application/x-grey8",
     }
 }
 
@@ -179,6 +184,9 @@ fn negotiate(accept: Option<&str>, kind: Kind) -> Result<Format> {
             "image/jpeg" if lossy => Format::Jpeg,
             "image/webp" if kind != Kind::Depth => Format::Webp,
             "application/x-npy" => Format::Npy,
+            "application/x-rgb8" => Format::Rgb8,
+            "application/x-rgba8" => Format::Rgba8,
+            "application/x-grey8" => Format::Grey8,
             _ => continue,
         };
         let weight = pieces

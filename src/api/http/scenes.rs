@@ -22,9 +22,8 @@ use super::{
     multipart::{UploadForm, read_upload},
 };
 use crate::{
-    api::{Api, request_id, upload::check_bundle},
+    api::{Api, request_id, server_timing, upload::check_bundle},
     error::{Error, Result},
-    scene::StageTime,
     service::{CreateScene, Event, Page, PageRequest, SceneOptions, SceneState, SceneStatus},
 };
 
@@ -68,7 +67,11 @@ pub(super) async fn create(
         SceneState::Done => StatusCode::CREATED,
         _ => StatusCode::ACCEPTED,
     };
-    let times = created.status.report.as_ref().map(|report| server_timing(&report.stages));
+    let times = created
+        .status
+        .report
+        .as_ref()
+        .map(|report| server_timing(report.stages.iter().map(|s| (s.stage.as_str(), s.ms))));
     let location = format!("/v1/scenes/{}", created.status.id);
     let body = Json(created.status);
     let mut answer = (status, [(header::LOCATION, location)], body).into_response();
@@ -79,12 +82,6 @@ pub(super) async fn create(
         answer.headers_mut().insert("idempotency-replayed", HeaderValue::from_static("true"));
     }
     Ok(answer)
-}
-
-/// `stage;dur=ms` of each stage.
-fn server_timing(stages: &[StageTime]) -> String {
-    let times = stages.iter().map(|time| format!("{};dur={:.2}", time.stage, time.ms));
-    times.collect::<Vec<_>>().join(", ")
 }
 
 /// A page of the scenes

@@ -115,9 +115,9 @@ fn file_name(view: &RenderedView) -> String {
 fn multipart(
     pictures: impl Stream<Item = Result<RenderedView>> + Send + 'static,
 ) -> impl Stream<Item = Result<Bytes, io::Error>> + Send + 'static {
-    let parts = pictures.map(|picture| {
+    let parts = pictures.flat_map(|picture| {
         let mut part = format!("--{BOUNDARY}\r\n").into_bytes();
-        match picture {
+        let body = match picture {
             Ok(view) => {
                 let headers = view_headers(&view);
                 for (name, value) in &headers {
@@ -130,7 +130,7 @@ fn multipart(
                      content-length: {length}\r\n\r\n"
                 );
                 part.extend_from_slice(rest.as_bytes());
-                part.extend_from_slice(&view.bytes);
+                view.bytes
             }
             Err(error) => {
                 let body = serde_json::json!({
@@ -138,11 +138,11 @@ fn multipart(
                     "message": error.message(),
                 });
                 part.extend_from_slice(b"content-type: application/json\r\n\r\n");
-                part.extend_from_slice(body.to_string().as_bytes());
+                body.to_string().into_bytes()
             }
-        }
-        part.extend_from_slice(b"\r\n");
-        Ok(Bytes::from(part))
+        };
+        let pieces = [Bytes::from(part), Bytes::from(body), Bytes::from_static(b"\r\n")];
+        stream::iter(pieces.map(Ok))
     });
     parts.chain(stream::once(async { Ok(Bytes::from(format!("--{BOUNDARY}--\r\n"))) }))
 }
@@ -184,6 +184,7 @@ fn index_row(name: &str, view: &RenderedView) -> serde_json::Value {
         "content_type": content_type(view.format),
         "camera": view.camera,
         "depth_scale": view.depth_scale,
+        "shape": view.shape(),
     })
 }
 

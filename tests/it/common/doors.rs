@@ -162,6 +162,9 @@ impl Ask {
             Some("jpeg") => pb::Format::Jpeg,
             Some("webp") => pb::Format::Webp,
             Some("npy") => pb::Format::Npy,
+            Some("rgb8") => pb::Format::Rgb8,
+            Some("rgba8") => pb::Format::Rgba8,
+            Some("grey8") => pb::Format::Grey8,
             Some(other) => panic!("format {other} is not in the proto"),
         };
         pb::ViewOptions {

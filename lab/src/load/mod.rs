@@ -1,0 +1,74 @@
+//! What callers get from a server: views and scenes, asked for over HTTP/1.1, HTTP/2 and gRPC.
+//!
+//! `load views` asks for a new view each time, in a closed loop (each caller asks again when it has
+//! its answer) or in an open one (a rate), and beside it the library draws the same views for as
+//! many callers. `load scenes` posts photos. The servers are given by path and run on loopback,
+//! several of them in turn, so that one run compares them.
+
+mod ask;
+mod door;
+mod library;
+mod path;
+mod photos;
+mod scenes;
+mod server;
+mod tally;
+mod views;
+
+/// Messages and services generated from `proto/segsplat/v1`.
+#[allow(
+    dead_code,
+    unreachable_pub,
+    missing_docs,
+    missing_debug_implementations,
+    clippy::all,
+    clippy::doc_markdown,
+    clippy::missing_errors_doc,
+    clippy::unwrap_used,
+    clippy::use_self,
+    clippy::allow_attributes_without_reason,
+    clippy::enum_glob_use,
+    clippy::semicolon_if_nothing_returned,
+    clippy::implicit_clone,
+    reason = "generated code"
+)]
+mod pb {
+    include!(concat!(env!("CARGO_MANIFEST_DIR"), "/../proto/generated/segsplat.v1.rs"));
+}
+
+use clap::Subcommand;
+
+use crate::{
+    error::{Error, Result},
+    rows::Rows,
+};
+
+/// What to ask for.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Views of one scene, a new one each time
+    Views(views::Args),
+    /// Scenes of two photos, and the mask of a text in each
+    Scenes(scenes::Args),
+}
+
+/// Makes the rows of the command.
+///
+/// # Errors
+/// Those of the command.
+pub(crate) fn run(command: &Command, rows: &mut Rows) -> Result<()> {
+    match command {
+        Command::Views(args) => views::run(args, rows),
+        Command::Scenes(args) => scenes::run(args, rows),
+    }
+}
+
+/// A runtime with few threads: the cores belong to the server.
+fn runtime(threads: Option<usize>) -> Result<tokio::runtime::Runtime> {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(threads.unwrap_or(cores / 4).max(1))
+        .enable_all()
+        .build()
+        .map_err(|e| Error::internal("the async runtime does not start").caused_by(e))
+}
