@@ -13,6 +13,7 @@ import sys
 import numpy as np
 import onnx
 import torch
+from onnx import numpy_helper
 
 OPSET = 17
 # A protobuf file holds at most 2 GiB. Larger weights go into a second file beside it.
@@ -48,6 +49,7 @@ def export(model, inputs, path, output_names, dynamic=None):
     torch.onnx.export(model, tuple(inputs.values()), path, input_names=list(inputs), output_names=output_names,
                       dynamic_axes=dynamic or {}, opset_version=OPSET, dynamo=False)
     graph = onnx.load(path)
+    single_precision(graph.graph)
     data = path + ".data"
     beside = {os.path.join(os.path.dirname(path), part.value)
               for tensor in graph.graph.initializer for part in tensor.external_data if part.key == "location"}
@@ -61,6 +63,28 @@ def export(model, inputs, path, output_names, dynamic=None):
     for part in beside - {data}:
         if os.path.exists(part):
             os.remove(part)
+
+
+def single_precision(graph):
+    """The exporter writes some arithmetic of whole numbers and fractions in f64; the networks are f32 all through."""
+    double, single = onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT
+
+    def narrowed(tensor):
+        if tensor.data_type == double:
+            tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float32), tensor.name))
+
+    for tensor in graph.initializer:
+        narrowed(tensor)
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.type == onnx.AttributeProto.TENSOR:
+                narrowed(attribute.t)
+            if node.op_type == "Cast" and attribute.name == "to" and attribute.i == double:
+                attribute.i = single
+            if attribute.type == onnx.AttributeProto.GRAPH:
+                single_precision(attribute.g)
+    # Types that the exporter noted; ONNX Runtime finds them again.
+    del graph.value_info[:]
 
 
 def entry(path):
