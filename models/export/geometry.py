@@ -61,6 +61,10 @@ def build(name, args):
         state = state.get("state_dict", state.get("model", state))
         state = {key.removeprefix("encoder."): value for key, value in state.items() if not key.startswith(("losses", "decoder"))}
         encoder.load_state_dict(state)
+    else:
+        # What training starts at 0 (harmonics, scales) would hide a fault.
+        for weight in encoder.parameters():
+            weight += 0.02 * torch.randn_like(weight) * (weight == 0)
     return encoder
 
 
