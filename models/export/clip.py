@@ -1,0 +1,138 @@
+"""CLIP (PyPI `open_clip_torch`) as the image-text section of a bundle.
+
+    python clip.py --model ViT-B-16 --checkpoint open_clip_pytorch_model.bin --out DIR     # laion2b_s34b_b88k
+    python clip.py --model ViT-B-16 --random 1 --out DIR
+
+The tokenizer is CLIP's byte-pair encoding, written as a `tokenizer.json` of the `tokenizers` library. It is held
+to OpenCLIP's own tokenizer on the phrases of `phrases()`.
+"""
+import gzip
+import os
+
+import open_clip
+import torch
+from tokenizers import Regex, Tokenizer, decoders, models, normalizers, pre_tokenizers, processors
+
+from common import arguments, entry, export, hold, prepare, session, sha256, write_section
+
+BEGIN, END = "<|startoftext|>", "<|endoftext|>"
+WORDS = r"""<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"""
+CONTEXT = 77
+
+
+class ImageTower(torch.nn.Module):
+    def __init__(self, clip):
+        super().__init__()
+        self.clip = clip
+
+    def forward(self, images):
+        return self.clip.encode_image(images, normalize=True)
+
+
+class TextTower(torch.nn.Module):
+    def __init__(self, clip):
+        super().__init__()
+        self.clip = clip
+
+    def forward(self, ids):
+        return self.clip.encode_text(ids, normalize=True)
+
+
+def tokenizer():
+    """CLIP's vocabulary and merges, as OpenCLIP packs them."""
+    from open_clip.tokenizer import bytes_to_unicode, default_bpe
+
+    with gzip.open(default_bpe()) as file:
+        merges = file.read().decode().split("\n")[1 : 49152 - 256 - 2 + 1]
+    merges = [tuple(line.split()) for line in merges]
+    letters = list(bytes_to_unicode().values())
+    words = letters + [letter + "</w>" for letter in letters] + ["".join(pair) for pair in merges] + [BEGIN, END]
+    vocabulary = {word: i for i, word in enumerate(words)}
+    made = Tokenizer(models.BPE(vocab=vocabulary, merges=merges, continuing_subword_prefix="", end_of_word_suffix="</w>", fuse_unk=False))
+    made.normalizer = normalizers.Sequence([normalizers.NFC(), normalizers.Replace(Regex(r"\s+"), " "), normalizers.Lowercase()])
+    made.pre_tokenizer = pre_tokenizers.Sequence([
+        pre_tokenizers.Split(Regex(WORDS), behavior="removed", invert=True), pre_tokenizers.ByteLevel(add_prefix_space=False)])
+    made.decoder = decoders.ByteLevel()
+    made.add_special_tokens([BEGIN, END])
+    made.post_processor = processors.TemplateProcessing(
+        single=f"{BEGIN} $A {END}", special_tokens=[(BEGIN, vocabulary[BEGIN]), (END, vocabulary[END])])
+    return made
+
+
+def phrases():
+    """1,000 phrases: things, colours, places, numbers, punctuation, accents."""
+    things = ["chair", "coffee mug", "game controller", "T-shirt", "dog's bed", "café table", "potted plant", "fire hydrant", "100 W lamp",
+              "remote-control", "sofa (grey)", "3D printer", "sœur", "Übergröße", "wine glass, half full", "it's a box", "window & curtain",
+              "picture of a fox", "stack of books!", "ping-pong ball"]
+    kinds = ["red", "small", "the old wooden", "A  shiny", "two", "Blue", "somebody's", "no. 7", "left-most", "biggest"]
+    places = ["", " on the desk", " in the corner", " near the door?", " under 2 windows"]
+    return [f"{kind} {thing}{place}" for thing in things for kind in kinds for place in places]
+
+
+def compare(args, clip, made, at):
+    official = open_clip.get_tokenizer(args.model)
+    texts = phrases()
+    wanted = official(texts, context_length=CONTEXT)
+    made.enable_padding(length=CONTEXT, pad_id=0)
+    ids = torch.tensor([e.ids for e in made.encode_batch(texts)])
+    hold(f"tokens of {len(texts)} phrases that differ", float((ids != wanted).any(1).sum()), 0)
+    some = ids[::40]
+    rows = torch.from_numpy(session(at("text_tower.onnx")).run(None, {"input_ids": some.numpy()})[0])
+    hold("texts: 1 - cosine", float(1 - (rows * clip.encode_text(wanted[::40], normalize=True)).sum(1).min()), 1e-4)
+    images = torch.randn(4, 3, *clip.visual.image_size)
+    rows = torch.from_numpy(session(at("image_tower.onnx")).run(None, {"images": images.numpy()})[0])
+    hold("images: 1 - cosine", float(1 - (rows * clip.encode_image(images, normalize=True)).sum(1).min()), 1e-4)
+
+
+def main():
+    ap = arguments(__doc__)
+    ap.add_argument("--model", default="ViT-B-16", help="a model of open_clip.list_models()")
+    args = ap.parse_args()
+    os.makedirs(args.out, exist_ok=True)
+    at = lambda name: os.path.join(args.out, name)  # noqa: E731
+    prepare(args)
+    clip = open_clip.create_model(args.model, pretrained=args.checkpoint).eval()
+    made = tokenizer()
+    made.save(at("tokenizer.json"))
+    side = clip.visual.image_size[0]
+    export(ImageTower(clip), {"images": torch.randn(2, 3, side, side)}, at("image_tower.onnx"), ["embeddings"],
+           {"images": {0: "crops"}, "embeddings": {0: "crops"}})
+    example = open_clip.get_tokenizer(args.model)(["a photo of a fox", "a box"], context_length=CONTEXT)
+    export(TextTower(clip), {"input_ids": example}, at("text_tower.onnx"), ["embeddings"],
+           {"input_ids": {0: "texts"}, "embeddings": {0: "texts"}})
+    if not args.skip_check:
+        compare(args, clip, made, at)
+    source = args.checkpoint or f"random weights, seed {args.random}"
+    dim = clip.encode_text(example).shape[1]
+    write_section(args, "image_text", f"""
+[image_text]
+licence = "MIT (OpenCLIP); weights: see their model card"
+source = "open_clip_torch {open_clip.__version__}, {args.model}, {os.path.basename(source)}"
+dim = {dim}
+tau = 10.0
+canon = ["object", "things", "stuff"]
+coverage_floor = 0.0
+
+[image_text.image]
+{entry(at("image_tower.onnx"))}
+input = "images"
+output = "embeddings"
+size = {side}
+mean = {[round(v, 8) for v in clip.visual.image_mean]}
+std = {[round(v, 8) for v in clip.visual.image_std]}
+crop_margin = 0.0
+batch = 16
+
+[image_text.text]
+{entry(at("text_tower.onnx"))}
+tokenizer = "tokenizer.json"
+tokenizer_sha256 = "{sha256(at("tokenizer.json"))}"
+context = {CONTEXT}
+unknown = "{END}"
+input_ids = "input_ids"
+output = "embeddings"
+""")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,138 @@
+"""What the exporters share: sections of a bundle, ONNX files with their hashes, parity with PyTorch.
+
+An exporter makes one section of a bundle (`geometry`, `masks` or `image_text`). All other sections and their
+files come from `--base`, so that exporters can follow one another on the same folder.
+"""
+import argparse
+import hashlib
+import os
+import re
+import shutil
+import sys
+
+import numpy as np
+import onnx
+import torch
+from onnx import numpy_helper
+
+OPSET = 17
+# A protobuf file holds at most 2 GiB. Larger weights go into a second file beside it.
+INLINE_BYTES_MAX = 1 << 30
+
+
+def arguments(doc):
+    """A parser with the options of every exporter."""
+    ap = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    ap.add_argument("--out", required=True, help="folder of the new bundle")
+    ap.add_argument("--base", help="bundle that gives the other sections (default: OUT itself where it is one, else the embedded bundle)")
+    weights = ap.add_mutually_exclusive_group(required=True)
+    weights.add_argument("--checkpoint", help="file of the published weights")
+    weights.add_argument("--random", type=int, metavar="SEED", help="the same network with random weights")
+    ap.add_argument("--skip-check", action="store_true", help="do not compare the ONNX files with PyTorch")
+    return ap
+
+
+def sha256(path):
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def prepare(args):
+    """Seeds PyTorch for random weights; no gradients, and no fused attention, which ONNX does not know."""
+    torch.manual_seed(args.random or 0)
+    torch.backends.mha.set_fastpath_enabled(False)
+    torch.set_grad_enabled(False)
+
+
+def export(model, inputs, path, output_names, dynamic=None):
+    """Writes `model` as ONNX. `inputs` is name to example tensor; `dynamic` is tensor name to {axis: name}."""
+    torch.onnx.export(model, tuple(inputs.values()), path, input_names=list(inputs), output_names=output_names,
+                      dynamic_axes=dynamic or {}, opset_version=OPSET, dynamo=False)
+    graph = onnx.load(path)
+    single_precision(graph.graph)
+    data = path + ".data"
+    beside = {os.path.join(os.path.dirname(path), part.value)
+              for tensor in graph.graph.initializer for part in tensor.external_data if part.key == "location"}
+    size = sum(len(tensor.raw_data) for tensor in graph.graph.initializer)
+    if os.path.exists(data):
+        os.remove(data)
+    if size > INLINE_BYTES_MAX:
+        onnx.save_model(graph, path, save_as_external_data=True, all_tensors_to_one_file=True, location=os.path.basename(data), size_threshold=1024)
+    else:
+        onnx.save_model(graph, path)
+    for part in beside - {data}:
+        if os.path.exists(part):
+            os.remove(part)
+
+
+def single_precision(graph):
+    """The exporter writes some arithmetic of whole numbers and fractions in f64; the networks are f32 all through."""
+    double, single = onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT
+
+    def narrowed(tensor):
+        if tensor.data_type == double:
+            tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float32), tensor.name))
+
+    for tensor in graph.initializer:
+        narrowed(tensor)
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.type == onnx.AttributeProto.TENSOR:
+                narrowed(attribute.t)
+            if node.op_type == "Cast" and attribute.name == "to" and attribute.i == double:
+                attribute.i = single
+            if attribute.type == onnx.AttributeProto.GRAPH:
+                single_precision(attribute.g)
+    # Types that the exporter noted; ONNX Runtime finds them again.
+    del graph.value_info[:]
+
+
+def entry(path):
+    """The lines of a manifest that name a file of the bundle."""
+    lines = [f'file = "{os.path.basename(path)}"', f'sha256 = "{sha256(path)}"']
+    if os.path.exists(path + ".data"):
+        lines += [f'data = "{os.path.basename(path)}.data"', f'data_sha256 = "{sha256(path + ".data")}"']
+    return "\n".join(lines)
+
+
+def files_of(section):
+    return re.findall(r'(?m)^(?:file|data|tokenizer) = "([^"]+)"', section)
+
+
+def write_section(args, name, text):
+    """Replaces section `name` (with its subsections) of the manifest; copies what the other sections need."""
+    here = os.path.join(args.out, "bundle.toml")
+    embedded = os.path.join(os.path.dirname(os.path.abspath(__file__)), "..", "embedded")
+    base = args.base or (args.out if os.path.exists(here) else embedded)
+    with open(os.path.join(base, "bundle.toml")) as file:
+        head, *sections = re.split(r"(?m)^(?=\[)", file.read())
+    mine = re.compile(rf"\[{name}[\].]")
+    kept = [section for section in sections if not mine.match(section)]
+    if not os.path.samefile(base, args.out):
+        for file in files_of("".join(kept)):
+            shutil.copyfile(os.path.join(base, file), os.path.join(args.out, file))
+    head = re.sub(r'(?m)^name = .*$', f'name = "{os.path.basename(os.path.abspath(args.out))}"', head)
+    with open(here, "w") as file:
+        file.write("".join([head, *kept]).rstrip() + "\n\n" + text.strip() + "\n")
+    used = set(files_of(open(here).read())) | {"bundle.toml"}
+    for file in sorted(used):
+        print(f"{file:32} {os.path.getsize(os.path.join(args.out, file)) / 2**20:10.2f} MiB")
+
+
+def gap(found, wanted):
+    """Largest difference as a share of the largest value."""
+    wanted = wanted.detach().numpy() if isinstance(wanted, torch.Tensor) else np.asarray(wanted)
+    return float(np.abs(found - wanted).max() / max(np.abs(wanted).max(), 1e-30))
+
+
+def hold(what, value, bound):
+    """Prints a figure of the comparison with PyTorch and ends the program where it is over its bound."""
+    print(f"{what}: {value:.2e} (at most {bound:.0e})")
+    if not value <= bound:
+        sys.exit(f"{what} differs from PyTorch by {value:.2e} of the largest value; at most {bound:.0e} is accepted")
+
+
+def session(path):
+    import onnxruntime
+
+    return onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])

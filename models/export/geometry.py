@@ -1,0 +1,145 @@
+"""MVSplat or DepthSplat, official code, as the geometry section of a bundle.
+
+    git clone https://github.com/donydchen/mvsplat && git clone https://github.com/cvg/depthsplat
+    python geometry.py mvsplat --repo mvsplat --checkpoint re10k.ckpt --out DIR
+    python geometry.py depthsplat --repo depthsplat --checkpoint depthsplat-gs-small-re10k-256x256-view2-cfeab6b1.pth --out DIR
+    python geometry.py depthsplat --repo depthsplat --dinov2 dinov2 --random 1 --size 448 768 --views 4 --out DIR
+
+The number of views and the size are fixed in the file: the official code counts views in Python. DepthSplat loads
+the code of DINOv2 by `torch.hub`; `--dinov2` names a checkout instead.
+"""
+import os
+
+import torch
+
+import official
+from common import arguments, entry, export, gap, hold, prepare, session, write_section
+
+NETWORKS = {
+    # near, far: what the published weights were trained with. A network whose scales follow its depths takes any
+    # unit of length; DepthSplat's are absolute, so that one unit is one of its training's.
+    "mvsplat": {"near": 1.0, "far": 100.0, "licence": "MIT (code); weights: see the repository"},
+    "depthsplat": {"near": 0.5, "far": 100.0, "licence": "MIT (code); weights: see the repository"},
+}
+# Packages of the official code for training and pictures alone.
+UNUSED = ["wandb", "moviepy", "svg", "colorspacious", "matplotlib", "cv2", "skvideo", "imageio", "pytorch_lightning", "plyfile", "lpips",
+          "skimage", "diff_gaussian_rasterization"]
+
+
+def configuration(name, args):
+    """The `model.encoder` of the repository's own experiment, as its dataclasses."""
+    from dacite import Config, from_dict
+    from omegaconf import OmegaConf
+
+    read = lambda *path: OmegaConf.load(os.path.join(args.repo, "config", *path))  # noqa: E731
+    encoder = {"mvsplat": "costvolume", "depthsplat": "depthsplat"}[name]
+    merged = OmegaConf.merge(read("model", "encoder", encoder + ".yaml"), read("experiment", "re10k.yaml").model.encoder,
+                             OmegaConf.from_dotlist(args.set))
+    return lambda kind: from_dict(kind, OmegaConf.to_container(merged), Config(check_types=False))
+
+
+def build(name, args):
+    """The official encoder."""
+    official.on_path(args.repo, UNUSED)
+    views = {"mode": "test", "dataset": {"view_sampler": {"num_context_views": args.views}}}
+    from omegaconf import OmegaConf
+
+    make = configuration(name, args)
+    if name == "mvsplat":
+        from src import global_cfg
+        global_cfg.set_cfg(OmegaConf.create(views))
+        from src.model.encoder.encoder_costvolume import EncoderCostVolume as Encoder, EncoderCostVolumeCfg as Cfg
+    else:
+        if args.dinov2:
+            load = torch.hub.load
+            torch.hub.load = lambda _, model, **kw: load(args.dinov2, model, source="local", pretrained=False)
+        from src.model.encoder.encoder_depthsplat import EncoderDepthSplat as Encoder, EncoderDepthSplatCfg as Cfg
+
+    encoder = Encoder(make(Cfg)).eval()
+    if args.checkpoint:
+        state = torch.load(args.checkpoint, map_location="cpu", weights_only=False)
+        state = state.get("state_dict", state.get("model", state))
+        state = {key.removeprefix("encoder."): value for key, value in state.items() if not key.startswith(("losses", "decoder"))}
+        encoder.load_state_dict(state)
+    else:
+        # What training starts at 0 (harmonics, scales) would hide a fault.
+        for weight in encoder.parameters():
+            weight += 0.02 * torch.randn_like(weight) * (weight == 0)
+    return encoder
+
+
+def compare(args, inputs, at, wanted):
+    """The file against the official encoder: its Gaussians, and covariances from scales and quaternions."""
+    found = dict(zip(official.OUTPUTS, session(at("geometry.onnx")).run(None, {k: v.numpy() for k, v in inputs.items()})))
+    rows = lambda name: torch.from_numpy(found[name]).flatten(0, 2)  # noqa: E731
+    kept = slice(-rows("means").shape[0], None)
+    hold("means", gap(rows("means").numpy(), wanted.means[0, kept]), 1e-4)
+    hold("covariances", gap(official.covariance(rows("scales"), rows("quats")).numpy(), wanted.covariances[0, kept]), 1e-3)
+    hold("opacities", gap(rows("opacities").numpy(), wanted.opacities[0, kept]), 1e-3)
+    sh = rows("sh").transpose(-1, -2)
+    hold("harmonics", gap(sh.numpy(), wanted.harmonics[0, kept][..., : sh.shape[-1]]), 1e-3)
+    rest = wanted.harmonics[0, kept][..., sh.shape[-1] :]
+    if rest.numel():
+        print(f"bands over {official.DEGREE_MAX} are cut: at most {float(rest.abs().sum(-1).max()):.1e} of a colour")
+
+
+def main():
+    ap = arguments(__doc__)
+    ap.add_argument("network", choices=NETWORKS)
+    ap.add_argument("--repo", required=True, help="checkout of the official code")
+    ap.add_argument("--dinov2", help="checkout of facebookresearch/dinov2")
+    ap.add_argument("--size", type=int, nargs=2, default=[256, 256], metavar=("HEIGHT", "WIDTH"))
+    ap.add_argument("--views", type=int, default=2)
+    ap.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="changes of the encoder's configuration, as in the model zoo")
+    args = ap.parse_args()
+    os.makedirs(args.out, exist_ok=True)
+    at = lambda name: os.path.join(args.out, name)  # noqa: E731
+    prepare(args)
+    known = NETWORKS[args.network]
+    encoder = build(args.network, args)
+    images = torch.rand(args.views, 3, *args.size)
+    inputs = dict(zip(official.INPUTS, (images, *official.cameras(args.views, known["near"], known["far"]))))
+    if not args.skip_check:
+        one = {"image": images[None], "intrinsics": inputs["intrinsics"][None], "extrinsics": inputs["camera_to_world"][None],
+               "near": inputs["near"][None], "far": inputs["far"][None]}
+        wanted = encoder(one, 0, deterministic=True)
+        wanted = wanted["gaussians"] if isinstance(wanted, dict) else wanted
+    with official.exportable():
+        export(official.Graph(encoder), inputs, at("geometry.onnx"), official.OUTPUTS)
+    if not args.skip_check:
+        compare(args, inputs, at, wanted)
+    degree = min(encoder.cfg.gaussian_adapter.sh_degree, official.DEGREE_MAX)
+    source = args.checkpoint or f"random weights, seed {args.random}"
+    write_section(args, "geometry", f"""
+[geometry]
+{entry(at("geometry.onnx"))}
+licence = "{known["licence"]}"
+source = "{args.network}, {os.path.basename(source)}"
+buckets = [[{args.size[0]}, {args.size[1]}]]
+views_min = {args.views}
+views_max = {args.views}
+neighbors_max = {args.views - 1}
+sh_degree = {degree}
+output_frame = "model"
+translation = "{"world" if args.network == "depthsplat" else "largest_baseline"}"
+mean = [0.0, 0.0, 0.0]
+std = [1.0, 1.0, 1.0]
+
+[geometry.inputs]
+images = "images"
+intrinsics = "intrinsics"
+camera_to_world = "camera_to_world"
+near = "near"
+far = "far"
+
+[geometry.outputs]
+means = "means"
+scales = "scales"
+quats = "quats"
+opacities = "opacities"
+sh = "sh"
+""")
+
+
+if __name__ == "__main__":
+    main()
