@@ -172,24 +172,22 @@ impl MaskNetwork {
             predicted_iou: Vec::new(),
         };
         for batch in points.chunks(self.takes.batch) {
-            self.decode_batch(embedding, batch, (points.len(), iou_over), &mut all)?;
+            let inputs = self.takes.inputs(&self.manifest, embedding, batch);
+            let counts = [batch.len(), points.len()];
+            self.decoder
+                .run(&inputs, |outputs| self.append(counts, iou_over, outputs, &mut all))?;
         }
         Ok(all)
     }
 
-    fn decode_batch(
+    /// Appends the masks that one run of the decoder gave for `count` points of `in_all`.
+    fn append(
         &self,
-        embedding: &PhotoEmbedding,
-        points: &[[f32; 2]],
-        (points_in_all, iou_over): (usize, f32),
+        [count, in_all]: [usize; 2],
+        iou_over: f32,
+        outputs: &dyn Outputs,
         all: &mut MaskLogits,
     ) -> Result<()> {
-        let inputs = self.takes.inputs(&self.manifest, embedding, points);
-        self.decoder.run(&inputs, |outputs| self.append(points.len(), outputs, all))
-    }
-
-    /// Appends the masks that one run of the decoder gave for `count` points.
-    fn append(&self, count: usize, outputs: &dyn Outputs, all: &mut MaskLogits) -> Result<()> {
         let names = &self.manifest.decoder;
         let lead: &[usize] = if self.takes.efficient { &[1] } else { &[] };
         let get = |name: &str, tail: usize| -> Result<(Vec<usize>, &[f32])> {
@@ -216,7 +214,7 @@ impl MaskNetwork {
         let cells = grid[0] * grid[1];
         if all.logits.is_empty() {
             // Zeroed memory that is never written takes no time.
-            all.logits = vec![0.0; points_in_all * levels.len() * cells];
+            all.logits = vec![0.0; in_all * levels.len() * cells];
         }
         for prompt in 0..count {
             for level in levels {
