@@ -253,9 +253,10 @@ impl Drawing<'_> {
         rate(callers)?;
         let (one, all) = (rate(1)?, rate(callers)?);
         let levels = args.levels;
-        Ok(
-            json!({ "callers": callers, "levels": levels, "one_per_s": one, "all_per_s": all, "ratio": all / one }),
-        )
+        let ratio = all / one;
+        Ok(json!({
+            "callers": callers, "levels": levels, "one_per_s": one, "all_per_s": all, "ratio": ratio,
+        }))
     }
 
     /// What labels cost beside colour: medians of frames drawn in turn, so that a noisy machine is

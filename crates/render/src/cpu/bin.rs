@@ -78,7 +78,7 @@ pub struct DepthKeys<'a> {
 }
 
 impl<'a> DepthKeys<'a> {
-    /// The keys of Gaussians that come from these photos.
+    /// Keys of Gaussians that come from these photos.
     pub fn new(gaussians: &'a Gaussians, sources: &'a [Source]) -> Self {
         let layered = sources.iter().any(|source| source.behind);
         Self { gaussians, sources: if layered { sources } else { &[] } }
