@@ -187,7 +187,7 @@ fn errors_name_what_is_wrong_and_exit_by_the_table() {
     render(&["--from", "7"], ErrorCode::InvalidRequest, "from is 7");
     render(&["--eye", "0,0,-1", "--target", "0,0,-1"], ErrorCode::InvalidRequest, "same point");
     let line = ["render", text(&good), "--camera", "0", "-o", text(&good), "--renderer", "cpu"];
-    refused(&line, ErrorCode::InvalidRequest, "png, jpg, webp or npy");
+    refused(&line, ErrorCode::InvalidRequest, "png, jpg, webp, npy, rgb8, rgba8 or grey8");
     assert!(!picture.exists(), "nothing was written");
     assert_eq!(segsplat(&["render"]).status.code(), Some(2), "usage");
     assert_eq!(segsplat(&["--help"]).status.code(), Some(0));

@@ -255,7 +255,8 @@ impl Drawing<'_> {
         let levels = args.levels;
         let ratio = all / one;
         Ok(json!({
-            "callers": callers, "levels": levels, "one_per_s": one, "all_per_s": all, "ratio": ratio,
+            "callers": callers, "levels": levels, "one_per_s": one, "all_per_s": all,
+            "ratio": ratio,
         }))
     }
 
