@@ -27,7 +27,7 @@ pub struct ImageText {
     text: Network,
     tokenizer: Tokenizer,
     unknown: Option<u32>,
-    /// Crops a run of the image tower, where its file fixes them.
+    /// Crops a run of the image tower, where its file or a device fixes them.
     crops: Option<usize>,
     /// Tokens a run of the text tower, where its file fixes them.
     tokens: Option<usize>,
@@ -101,7 +101,9 @@ impl ImageText {
         };
         let text = Network::open(runtime, bundle, options, &spec)?;
         Ok(Some(Self {
-            crops: size(image.takes(), &manifest.image.input, 0),
+            // A device looks for its fastest kernels again at each new shape.
+            crops: size(image.takes(), &manifest.image.input, 0)
+                .or((image.provider() != Provider::Cpu).then_some(manifest.image.batch)),
             tokens: size(text.takes(), &manifest.text.input_ids, 1),
             texts: size(text.takes(), &manifest.text.input_ids, 0),
             unknown: tokenizer.token_to_id(&manifest.text.unknown),
@@ -139,7 +141,7 @@ impl ImageText {
         let side = tower.size as usize;
         let mut rows = Vec::with_capacity(crops.len() * self.manifest.dim);
         for batch in crops.chunks(self.crops.unwrap_or(tower.batch)) {
-            // A file of fixed batch gets its last one filled up.
+            // Where the number of crops is fixed, the last run is filled up.
             let count = self.crops.unwrap_or(batch.len());
             let mut images = Vec::with_capacity(count * 3 * side * side);
             for crop in batch {

@@ -34,19 +34,16 @@ impl PipelineLoader {
         let open = move || {
             let begun = Instant::now();
             let pipeline = Pipeline::open_bundle(&named, &options);
-            if pipeline.is_ok() {
+            if let Ok(pipeline) = &pipeline {
+                // Beside the first jobs it would make them wait for seconds.
+                if let Err(error) = pipeline.geometry().warm() {
+                    tracing::warn!(%error, "the geometry network was not run in every size");
+                }
                 let ms = begun.elapsed().as_secs_f64() * 1e3;
                 tracing::info!(ms, "the networks are open");
             }
             // This thread alone sets it.
             let _ = of_thread.set(pipeline);
-            // Photos of the first size, two at a time, are fast already. The rest becomes so beside
-            // the first jobs.
-            if let Some(Ok(pipeline)) = of_thread.get()
-                && let Err(error) = pipeline.geometry().warm()
-            {
-                tracing::warn!(%error, "the geometry network was not made ready for every size");
-            }
         };
         let thread = std::thread::Builder::new().name("networks".to_owned()).spawn(open);
         let opening =
