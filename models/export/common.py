@@ -119,6 +119,29 @@ def write_section(args, name, text):
         print(f"{file:32} {os.path.getsize(os.path.join(args.out, file)) / 2**20:10.2f} MiB")
 
 
+def write_masks(args, at, section, size):
+    """The section of a mask network whose files are `mask_encoder.onnx` and `mask_decoder.onnx`; `section` has its own keys."""
+    weights = os.path.basename(args.checkpoint or f"random weights, seed {args.random}")
+    write_section(args, "masks", f"""
+[masks]
+{section.strip().format(weights=weights)}
+licence = "Apache-2.0"
+size = {size}
+points_per_side = 32
+points_per_batch = 64
+stability_score_offset = 1.0
+box_nms_thresh = 0.7
+
+[masks.encoder]
+{entry(at("mask_encoder.onnx"))}
+input = "images"
+output = "image_embeddings"
+
+[masks.decoder]
+{entry(at("mask_decoder.onnx"))}
+""")
+
+
 def gap(found, wanted):
     """Largest difference as a share of the largest value."""
     wanted = wanted.detach().numpy() if isinstance(wanted, torch.Tensor) else np.asarray(wanted)

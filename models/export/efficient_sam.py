@@ -11,7 +11,7 @@ import sys
 
 import torch
 
-from common import arguments, entry, export, gap, hold, prepare, session, write_section
+from common import arguments, export, gap, hold, prepare, session, write_masks
 
 SIDE, LOGITS = 1024, 256
 MODELS = {"vitt": (192, 3), "vits": (384, 6)}
@@ -63,32 +63,16 @@ def main():
     export(Decoder(sam), example, at("mask_decoder.onnx"), ["low_res_masks", "iou_predictions"], dynamic)
     if not args.skip_check:
         compare(sam, at)
-    source = args.checkpoint or f"random weights, seed {args.random}"
     rows = lambda values: [round(float(v), 6) for v in values.flatten()]  # noqa: E731
-    write_section(args, "masks", f"""
-[masks]
+    write_masks(args, at, f"""
 adapter = "efficient_sam"
-licence = "Apache-2.0"
-source = "EfficientSAM, {args.model}, {os.path.basename(source)}"
-size = {SIDE}
+source = "EfficientSAM, {args.model}, {{weights}}"
 mean = {rows(sam.pixel_mean)}
 std = {rows(sam.pixel_std)}
 levels = [0, 1, 2]
-points_per_side = 32
-points_per_batch = 64
 pred_iou_thresh = 0.7
 stability_score_thresh = 0.9
-stability_score_offset = 1.0
-box_nms_thresh = 0.7
-
-[masks.encoder]
-{entry(at("mask_encoder.onnx"))}
-input = "images"
-output = "image_embeddings"
-
-[masks.decoder]
-{entry(at("mask_decoder.onnx"))}
-""")
+""", SIDE)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ import os
 import torch
 from segment_anything import sam_model_registry
 
-from common import arguments, entry, export, gap, hold, prepare, session, write_section
+from common import arguments, export, gap, hold, prepare, session, write_masks
 
 SIDE = 1024
 MEAN, STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
@@ -84,31 +84,15 @@ def main():
     export(Decoder(sam), example, at("mask_decoder.onnx"), ["low_res_masks", "iou_predictions"], dynamic)
     if not args.skip_check:
         compare(args, sam, at)
-    source = args.checkpoint or f"random weights, seed {args.random}"
-    write_section(args, "masks", f"""
-[masks]
+    write_masks(args, at, f"""
 adapter = "sam"
-licence = "Apache-2.0"
-source = "segment-anything 1.0, {args.model}, {os.path.basename(source)}"
-size = {SIDE}
+source = "segment-anything 1.0, {args.model}, {{weights}}"
 mean = {[round(v / 255, 7) for v in MEAN]}
 std = {[round(v / 255, 7) for v in STD]}
 levels = [1, 2, 3]
-points_per_side = 32
-points_per_batch = 64
 pred_iou_thresh = 0.88
 stability_score_thresh = 0.95
-stability_score_offset = 1.0
-box_nms_thresh = 0.7
-
-[masks.encoder]
-{entry(at("mask_encoder.onnx"))}
-input = "images"
-output = "image_embeddings"
-
-[masks.decoder]
-{entry(at("mask_decoder.onnx"))}
-""")
+""", SIDE)
 
 
 if __name__ == "__main__":
