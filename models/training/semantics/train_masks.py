@@ -1,7 +1,9 @@
 """Trains the mask network on rendered scenes (exact instances) and photographs with drawn regions.
 
     torchrun --standalone --nproc-per-node N train_masks.py --pack PACK --out OUT --seconds S \
-        [--init weights.pt] [--look FOLDER_OF_PHOTOS]
+        [--init weights.pt] [--look FOLDER_OF_PHOTOS] [--rooms 8] [--photos 16]
+
+PACK: geometry/prepare.py's meshes and textures, lite2.pt, and the .tar files of views.SETS.
 
 A prompt is a pixel of a thing, chosen so that small things are asked for as well. Level 2 learns the
 whole thing, level 0 the part under the pixel, level 1 whichever is nearer. Loss: BCE + dice, and the
@@ -156,14 +158,15 @@ def main():
     ap.add_argument("--init")
     ap.add_argument("--look")
     ap.add_argument("--lr", type=float, default=8e-4)
-    ap.add_argument("--batch", type=int, default=8)
+    ap.add_argument("--rooms", type=int, default=8, help="rendered pictures a step; 0 to try the script on a processor")
+    ap.add_argument("--photos", type=int, default=8, help="photographs a step")
     args = ap.parse_args()
     rank, world, device = join()
     torch.manual_seed(100 + rank), random.seed(rank), np.random.seed(rank)
     torch.backends.cuda.matmul.allow_tf32 = True
     torch.backends.cudnn.benchmark = True
     start = time.time()
-    rooms = Rooms(extension(), args.pack, device, 1000 + rank)
+    rooms = Rooms(extension(), args.pack, device, 1000 + rank) if args.rooms else None
     photos = Photographs(args.pack, "train", device, 2000 + rank)
     held = Photographs(args.pack, "heldout", device, 3000)
     gen = torch.Generator(device=device).manual_seed(4000 + rank)
@@ -193,7 +196,11 @@ def main():
         for source in SETS:
             pick = [i for i, k in enumerate(held.kind) if k[0] == source]
             got = [score(ema, held.rgb[i : i + 1].float() / 255, held.whole[i : i + 1].int(), held.fine[i : i + 1].int(), i) for i in pick]
-            rows[source] = [round(float(np.mean([g[c] for g in got])), 3) for c in range(3)]
+            if got:
+                rows[source] = [round(float(np.mean([g[c] for g in got])), 3) for c in range(3)]
+        if rooms is None:
+            print(tag, json.dumps(rows), flush=True)
+            return
         fresh = Rooms.__new__(Rooms)
         fresh.__dict__ = dict(rooms.__dict__)
         fresh.gen = torch.Generator(device=device).manual_seed(77)
@@ -217,12 +224,14 @@ def main():
         for group in opt.param_groups:
             group["lr"] = args.lr * group["k"] * warm * (0.5 + 0.5 * math.cos(math.pi * min(t, 1)) + 0.01)
         net.train()
-        r = rooms.views(args.batch, SIDE)
-        p = photos.batch(args.batch)
-        if step % 2:
-            p = photos.paste(*p, photos.batch(args.batch))
-        rgb = torch.cat([r[0], p[0]])
-        whole, part = torch.cat([r[1].int(), p[1].int()]), torch.cat([r[2].int(), p[2].int()])
+        pictures = photos.batch(args.photos)
+        if rooms is not None:
+            r = rooms.views(args.rooms, SIDE)
+            pictures = [torch.cat([a, b.to(a.dtype)]) for a, b in zip(pictures, r)]
+        # Up to three real things over a photograph or a rendered room.
+        for number in range(step % 4):
+            pictures = photos.paste(*pictures, photos.batch(len(pictures[0]), things=True), number)
+        rgb, whole, part = pictures
         loss, iou = loss_of(model, rgb, whole, part, gen)
         opt.zero_grad(set_to_none=True)
         loss.backward()

@@ -8,6 +8,7 @@ import json
 import os
 import sys
 import tarfile
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ GEOMETRY = os.path.join(HERE, "..", "geometry")
 sys.path.insert(0, GEOMETRY)
 from scenes import World  # noqa: E402
 
+from cuts import SETS as SEGMENTS  # noqa: E402
 from heldout import heldout  # noqa: E402
 
 
@@ -119,7 +121,12 @@ def _regions(label):
     return out
 
 
-SETS = ("coco_panoptic_200", "bsds500", "camvid", "human_seg")
+# Photographs with segments, some of them with "not labelled" as 0, and three sets of other forms.
+SETS = SEGMENTS + ("bsds500", "camvid", "human_seg")
+# How often a set is drawn, for each of its photographs; and those whose things are pasted elsewhere.
+WEIGHT = {"coco_panoptic_200": 3.0, "coco_instances": 3.0, "furniture_seg": 0.7, "household_polygons": 0.7, "pets_trimaps": 0.5, "ade20k_samples": 3.0,
+          "bsds500": 1.0, "camvid": 0.5, "human_seg": 1.0}
+THINGS = ("coco_panoptic_200", "coco_instances", "household_polygons", "pets_trimaps", "human_seg")
 
 
 def regions(data, part, sets=SETS):
@@ -133,27 +140,35 @@ def _of_set(data, name, want):
     """One set's photographs whose `heldout` is `want`."""
     t = tarfile.open(os.path.join(data, name + ".tar"))
     files = sorted(n for n in t.getnames() if n.startswith("images/") and n.endswith(".jpg"))
-    read = lambda n: Image.open(io.BytesIO(t.extractfile(n).read()))
-    mask = lambda n: _fit(read(n), 512, Image.NEAREST).astype(np.int32)
-    segments = json.load(t.extractfile("segments.json")) if name == "coco_panoptic_200" else None
-    for i, f in enumerate(files):
-        if heldout(i) != want:
-            continue
+    files = [f for i, f in enumerate(files) if heldout(i) == want]
+    segments = json.load(t.extractfile("segments.json")) if name in SEGMENTS else None
+    # Read in order, decoded side by side.
+    folders = ["masks"] if name in SEGMENTS or name == "human_seg" else ["segs"] if name == "bsds500" else ["labels"]
+    ends = ["_0", "_2"] if name == "bsds500" else [""]
+    blobs = []
+    for f in files:
         stem = os.path.basename(f)[:-4]
-        rgb = _fit(read(f).convert("RGB"), 512, Image.BILINEAR)
-        if name == "coco_panoptic_200":
-            m = mask(f"masks/{stem}.png")
-            info = {s["index"]: s for s in segments[stem]["segments"]}
-            whole = np.where(np.isin(m, [k for k, s in info.items() if not s["iscrowd"]]), m, -1)
-            yield name, rgb, whole, None, {k: s["name"] for k, s in info.items()}
-        elif name == "bsds500":
-            yield name, rgb, mask(f"segs/{stem}_0.png"), mask(f"segs/{stem}_2.png"), {}
-        elif name == "camvid":
-            m = mask(f"labels/{stem}.png")
-            yield name, rgb, np.where(m == 11, -1, _regions(m)), None, {"class_of": m}
-        else:
-            m = _fit(read(f"masks/{stem}.png").convert("L"), 512, Image.NEAREST)
-            yield name, rgb, np.where(m > 127, 1, -1), None, {1: "person"}
+        blobs.append((stem, t.extractfile(f).read(), [t.extractfile(f"{folders[0]}/{stem}{e}.png").read() for e in ends]))
+    with ThreadPoolExecutor(min(16, os.cpu_count() or 1)) as pool:
+        yield from pool.map(lambda b: (name, *_decoded(name, segments, *b)), blobs)
+
+
+def _decoded(name, segments, stem, image, masks):
+    """rgb, whole, part and names of one photograph of a set."""
+    rgb = _fit(Image.open(io.BytesIO(image)).convert("RGB"), 512, Image.BILINEAR)
+    read = lambda i: _fit(Image.open(io.BytesIO(masks[i])), 512, Image.NEAREST).astype(np.int32)
+    if name in SEGMENTS:
+        m = read(0)
+        info = {s["index"]: s for s in segments[stem]["segments"]}
+        whole = np.where(np.isin(m, [k for k, s in info.items() if not s.get("iscrowd")]), m, -1)
+        return rgb, whole, None, {k: s["name"] for k, s in info.items()}
+    if name == "bsds500":
+        return rgb, read(0), read(1), {}
+    if name == "camvid":
+        m = read(0)
+        return rgb, np.where(m == 11, -1, _regions(m)), None, {"class_of": m}
+    m = _fit(Image.open(io.BytesIO(masks[0])).convert("L"), 512, Image.NEAREST)
+    return rgb, np.where(m > 127, 1, -1), None, {1: "person"}
 
 
 class Photographs:
@@ -171,18 +186,19 @@ class Photographs:
         self.whole, self.fine = torch.stack(whole).to(device), torch.stack(fine).to(device)
         self.kind, self.size, self.device = kind, size, device
         self.shape = torch.tensor([k[1] for k in kind], device=device).float()
-        weight = {"coco_panoptic_200": 3.0, "bsds500": 1.0, "camvid": 0.5, "human_seg": 1.0}
-        self.weight = torch.tensor([weight[k[0]] for k in kind], device=device)
+        self.weight = torch.tensor([WEIGHT[k[0]] for k in kind], device=device)
+        self.things = torch.tensor([WEIGHT[k[0]] * (k[0] in THINGS) for k in kind], device=device)
         self.gen = torch.Generator(device=device).manual_seed(seed)
 
     def __len__(self):
         return len(self.kind)
 
     @torch.no_grad()
-    def batch(self, B):
+    def batch(self, B, things=False):
+        """`B` pictures; with `things` of the sets whose things are outlined one by one."""
         S, dev, g = self.size, self.device, self.gen
         u = lambda *s: torch.rand(*s, device=dev, generator=g)
-        pick = torch.multinomial(self.weight, B, True, generator=g)
+        pick = torch.multinomial(self.things if things else self.weight, B, True, generator=g)
         hw = self.shape[pick]
         # Window: mostly the whole photo, at times a closer or a farther one; square or not.
         k = torch.where(u(B) < 0.4, torch.ones(B, device=dev), torch.exp(u(B) * 1.3 - 1.1))
@@ -209,8 +225,9 @@ class Photographs:
         return rgb, whole, fine
 
     @torch.no_grad()
-    def paste(self, rgb, whole, part, donor):
-        """Things of another batch, moved and scaled, over this one: new outlines for free."""
+    def paste(self, rgb, whole, part, donor, number=0):
+        """Things of another batch, moved and scaled, over this one: new outlines for free. `number` tells
+        one paste of a picture from the next."""
         drgb, dwhole, _ = donor
         B, S = len(rgb), rgb.shape[-1]
         g = self.gen
@@ -229,7 +246,7 @@ class Photographs:
         m = (m > 0.5).float() * F.avg_pool2d(m, 3, 1, 1)
         c = F.grid_sample(drgb, grid, align_corners=False)
         on = m[:, 0] > 0.5
-        return rgb * (1 - m) + c * m, torch.where(on, 9000, whole), torch.where(on, 900000, part)
+        return rgb * (1 - m) + c * m, torch.where(on, 9000 + number, whole), torch.where(on, 900000 + number, part)
 
 
 def _any_pixel(whole, gen):
