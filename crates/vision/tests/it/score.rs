@@ -179,13 +179,18 @@ fn texts_on_one_pool_do_not_wait_for_each_other() {
     let (tell, told) = mpsc::channel();
     // A thread of its own: it never ends where they do.
     std::thread::spawn(move || {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(8).build().unwrap();
-        let rows: Vec<[f32; 2]> = (0..200).map(|i| [(i as f32).cos(), (i as f32).sin()]).collect();
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(4).build().unwrap();
+        // The products take long enough for others to take a part of them.
+        let (dim, rows) = (1024, 256);
+        let rows: Vec<f32> = (0..dim * rows).map(|i| (i as f32).sin()).collect();
+        let bank = Bank { dim, rows };
+        let canon = vec![bank.row(0).to_vec()];
+        let scoring = Arc::new(Scoring::new(ScoringProfile::Paper, canon, 10.0, 0.05).unwrap());
         let view = view(&[&[(1, 0.5), (7, 0.25)], &[(200, 1.0)]]);
-        for _ in 0..200 {
-            let scorer = scorer(&rows, ScoringProfile::Default);
+        for _ in 0..60 {
+            let scorer = Scorer::new(&bank, Arc::clone(&scoring)).unwrap();
             let text = |_| drop(scorer.norms(&view).unwrap());
-            pool.install(|| (0..64).into_par_iter().with_max_len(1).for_each(text));
+            pool.install(|| (0..4).into_par_iter().with_max_len(1).for_each(text));
         }
         tell.send(()).unwrap();
     });
