@@ -112,9 +112,10 @@ def write_section(args, name, text):
         for file in files_of("".join(kept)):
             shutil.copyfile(os.path.join(base, file), os.path.join(args.out, file))
     head = re.sub(r'(?m)^name = .*$', f'name = "{os.path.basename(os.path.abspath(args.out))}"', head)
+    manifest = "".join([head, *kept]).rstrip() + "\n\n" + text.strip() + "\n"
     with open(here, "w") as file:
-        file.write("".join([head, *kept]).rstrip() + "\n\n" + text.strip() + "\n")
-    used = set(files_of(open(here).read())) | {"bundle.toml"}
+        file.write(manifest)
+    used = set(files_of(manifest)) | {"bundle.toml"}
     for file in sorted(used):
         print(f"{file:32} {os.path.getsize(os.path.join(args.out, file)) / 2**20:10.2f} MiB")
 

@@ -18,6 +18,8 @@ use crate::{
 /// # Errors
 /// `model_unavailable`, `gpu_unavailable`, each with what is missing.
 pub fn parts(config: &Config) -> Result<(Parts, Arc<PipelineLoader>)> {
+    // For loops that belong to no renderer. It can be set once: another call keeps the first.
+    let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads).build_global();
     let engine = Arc::new(PipelineLoader::open(&config.networks())?);
     let renderer = renderer(config)?;
     let models = models_info(engine.bundle(), "opening");

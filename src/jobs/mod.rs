@@ -22,6 +22,7 @@ use std::{
         atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering},
     },
     thread::JoinHandle,
+    time::Duration,
 };
 
 use parking_lot::{Condvar, Mutex};
@@ -89,7 +90,10 @@ impl Jobs {
             records: Records::default(),
             queue: Queue::new(parts.limits.queued_jobs_max),
             running: Running::default(),
-            uploads: ReadUploads::new(parts.limits.read_uploads_bytes_max),
+            uploads: ReadUploads::new(
+                parts.limits.read_uploads_bytes_max,
+                Duration::from_millis(parts.limits.first_text_photos_ms),
+            ),
             room: Room::new(parts.limits.photos_max),
             replicas: replicas::of(&parts)?,
             workers: AtomicUsize::new(parts.workers),

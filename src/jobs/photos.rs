@@ -1,6 +1,10 @@
 //! Photos of jobs in memory: jobs do not read again what the create call read.
 
-use std::{collections::HashMap, sync::Arc};
+use std::{
+    collections::HashMap,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use parking_lot::Mutex;
 
@@ -16,33 +20,124 @@ pub(super) struct ReadUpload {
     pub(super) photos: PhotoSet,
 }
 
-/// Uploads of scenes whose jobs wait or run, bounded by the bytes of their photos. One that does
-/// not fit is read from the store when its job begins.
+/// Uploads of scenes whose jobs wait or run, and for a time those of scenes that may be asked their
+/// first text; bounded by the bytes of their photos. One that is not here is read from the store
+/// when its job begins.
 #[derive(Debug)]
 pub(super) struct ReadUploads {
     bytes_max: u64,
-    uploads: Mutex<HashMap<SceneId, Arc<ReadUpload>>>,
+    /// How long an upload stays for a first text.
+    left_for: Duration,
+    uploads: Mutex<HashMap<SceneId, Kept>>,
+}
+
+#[derive(Debug)]
+struct Kept {
+    upload: Arc<ReadUpload>,
+    /// End of its time; none where a job waits for it.
+    until: Option<Instant>,
+}
+
+impl Kept {
+    fn is_fresh(&self, now: Instant) -> bool {
+        self.until.is_none_or(|until| now < until)
+    }
 }
 
 impl ReadUploads {
-    pub(super) fn new(bytes_max: u64) -> Self {
-        Self { bytes_max, uploads: Mutex::default() }
+    pub(super) fn new(bytes_max: u64, left_for: Duration) -> Self {
+        Self { bytes_max, left_for, uploads: Mutex::default() }
     }
 
-    /// Keeps an upload until it is forgotten, where it fits.
+    /// Keeps an upload until it is forgotten, where it fits. Those that wait for a first text make
+    /// room, the oldest first.
     pub(super) fn keep(&self, id: &SceneId, upload: Arc<ReadUpload>) {
+        self.insert(id, Kept { upload, until: None });
+    }
+
+    /// Keeps an upload for a first text, where it fits.
+    pub(super) fn leave(&self, id: &SceneId, upload: Arc<ReadUpload>) {
+        self.insert(id, Kept { upload, until: Some(Instant::now() + self.left_for) });
+    }
+
+    fn insert(&self, id: &SceneId, new: Kept) {
         let mut uploads = self.uploads.lock();
-        let kept: u64 = uploads.values().map(|upload| upload.photos.size_bytes()).sum();
-        if kept + upload.photos.size_bytes() <= self.bytes_max {
-            uploads.insert(id.clone(), upload);
+        let size = |kept: &Kept| kept.upload.photos.size_bytes();
+        uploads.remove(id);
+        let needed: u64 = uploads.values().filter(|kept| kept.until.is_none()).map(size).sum();
+        if needed + size(&new) > self.bytes_max {
+            return;
         }
+        while uploads.values().map(size).sum::<u64>() + size(&new) > self.bytes_max {
+            let left = uploads.iter().filter_map(|(id, kept)| Some((kept.until?, id)));
+            let Some(oldest) = left.min_by_key(|(until, _)| *until) else { break };
+            let oldest = oldest.1.clone();
+            uploads.remove(&oldest);
+        }
+        uploads.insert(id.clone(), new);
     }
 
     pub(super) fn find(&self, id: &SceneId) -> Option<Arc<ReadUpload>> {
-        self.uploads.lock().get(id).cloned()
+        let uploads = self.uploads.lock();
+        let kept = uploads.get(id).filter(|kept| kept.is_fresh(Instant::now()));
+        kept.map(|kept| Arc::clone(&kept.upload))
+    }
+
+    /// No job waits for an upload any more: its time for a first text begins.
+    pub(super) fn renew(&self, id: &SceneId) {
+        if let Some(kept) = self.uploads.lock().get_mut(id) {
+            kept.until = Some(Instant::now() + self.left_for);
+        }
     }
 
     pub(super) fn forget(&self, id: &SceneId) {
         self.uploads.lock().remove(id);
+    }
+
+    /// Drops those whose time is over.
+    pub(super) fn forget_old(&self, now: Instant) {
+        self.uploads.lock().retain(|_, kept| kept.is_fresh(now));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::scene::{Camera, CameraToWorld, Intrinsics, Photo, PosedPhoto};
+
+    fn upload(bytes: usize) -> Arc<ReadUpload> {
+        let intrinsics = Intrinsics { fx: 1.0, fy: 1.0, cx: 0.0, cy: 0.0, width: 1, height: 1 };
+        let pose = [1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1.];
+        let camera_to_world = CameraToWorld::from_row_major(&pose, "test").unwrap();
+        let camera = Camera { intrinsics, camera_to_world };
+        let photo = Photo { width: 1, height: 1, rgb: vec![0; bytes], valid: None };
+        let posed = PosedPhoto { file: String::new(), photo, camera, intrinsics_made_for: None };
+        let photos = PhotoSet { photos: vec![posed], read_ms: 0.0 };
+        Arc::new(ReadUpload { files: Vec::new(), photos })
+    }
+
+    #[test]
+    fn photos_for_a_first_text_make_room_and_go_in_their_time() {
+        let uploads = ReadUploads::new(10, Duration::from_secs(60));
+        let ids: Vec<SceneId> = (0..5).map(|byte| SceneId::from_bytes([byte; 16])).collect();
+        let kept = || -> Vec<bool> { ids.iter().map(|id| uploads.find(id).is_some()).collect() };
+        uploads.leave(&ids[0], upload(4));
+        uploads.leave(&ids[1], upload(4));
+        uploads.keep(&ids[2], upload(4));
+        assert_eq!(kept(), [false, true, true, false, false], "the oldest makes room");
+        uploads.leave(&ids[3], upload(7));
+        assert_eq!(kept(), [false, true, true, false, false], "what cannot fit drops no other");
+        uploads.leave(&ids[3], upload(6));
+        assert_eq!(kept(), [false, false, true, true, false], "never one that a job needs");
+        uploads.keep(&ids[4], upload(6));
+        assert_eq!(kept(), [false, false, true, false, true]);
+        uploads.leave(&ids[4], upload(6));
+        uploads.forget_old(Instant::now() + Duration::from_secs(50));
+        assert_eq!(kept(), [false, false, true, false, true], "its time is not over");
+        uploads.forget_old(Instant::now() + Duration::from_secs(70));
+        assert_eq!(kept(), [false, false, true, false, false], "a job's photos have no time");
+        uploads.renew(&ids[2]);
+        uploads.forget_old(Instant::now() + Duration::from_secs(70));
+        assert_eq!(kept(), [false; 5], "until no job waits for them");
     }
 }

@@ -117,10 +117,10 @@ impl Jobs {
         let reconstruction = self.within_time(job, |watch| {
             (watch.progress)(Stage::Photos, 0.0);
             let upload = self.photos(id, watch)?;
-            if record.options.semantics == SemanticsMode::Eager {
-                self.uploads.keep(id, Arc::clone(&upload));
-            } else {
-                self.uploads.forget(id);
+            match record.options.semantics {
+                SemanticsMode::Eager => self.uploads.keep(id, Arc::clone(&upload)),
+                SemanticsMode::Lazy => self.uploads.leave(id, Arc::clone(&upload)),
+                SemanticsMode::Off => self.uploads.forget(id),
             }
             let _room = self.room.take(upload.photos.photos.len(), watch.cancel)?;
             self.parts.scenes.make(&upload.photos, &record.options, watch)

@@ -8,7 +8,7 @@ use std::{
         atomic::Ordering,
         mpsc::{self, RecvTimeoutError},
     },
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use super::{
@@ -49,16 +49,25 @@ impl Jobs {
                 self.end_failed(&job, &error);
             }
             self.running.end(&job);
-            let record = self.records.find(&job.scene);
-            // Its semantics are queued already, by this job or by a caller.
-            let follows =
-                |record: Arc<Record>| record.status.semantics.state == SemanticsState::Running;
-            if !record.is_some_and(follows) {
-                self.release(&job.scene);
-            }
+            self.leave(&job);
         }
         if kind == Kind::Scene {
             self.workers.fetch_sub(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Gives back what an ended job had, except where its scene's semantics follow or may follow.
+    fn leave(&self, job: &Job) {
+        let record = self.records.find(&job.scene);
+        let next = record.filter(|record| record.status.state == SceneState::Done);
+        match next.map(|record| record.status.semantics.state) {
+            // They are queued already, by this job or by a caller.
+            Some(SemanticsState::Running) => {}
+            Some(SemanticsState::None) if job.kind == Kind::Scene => {
+                self.uploads.renew(&job.scene);
+                self.replicas.release(&job.scene);
+            }
+            _ => self.release(&job.scene),
         }
     }
 
@@ -197,19 +206,28 @@ impl Jobs {
         }
     }
 
-    /// The life of the thread that removes what crashes and deletions left in the store.
+    /// The life of the thread that removes what crashes and deletions left in the store, and photos
+    /// in memory that no text asked for.
     pub(super) fn sweep(&self) {
         let limits = &self.parts.limits;
         // By then no job of a deleted scene can still run, on any replica.
         let buried = Duration::from_millis(limits.scene_timeout_ms.saturating_mul(2))
             + Duration::from_millis(limits.replica_lease_ms);
+        let every = Duration::from_millis(limits.sweep_every_ms.max(1_000));
+        let look = Duration::from_millis(limits.first_text_photos_ms.max(1_000)).min(every);
+        let mut next = Instant::now();
         loop {
-            match self.parts.store.sweep(buried) {
-                Ok(0) => {}
-                Ok(removed) => tracing::info!(removed, "left-overs removed from the store"),
-                Err(error) => tracing::warn!(%error, "the store cannot be swept"),
+            let now = Instant::now();
+            self.uploads.forget_old(now);
+            if now >= next {
+                next = now + every;
+                match self.parts.store.sweep(buried) {
+                    Ok(0) => {}
+                    Ok(removed) => tracing::info!(removed, "left-overs removed from the store"),
+                    Err(error) => tracing::warn!(%error, "the store cannot be swept"),
+                }
             }
-            if self.queue.pause(Duration::from_millis(limits.sweep_every_ms.max(1_000))) {
+            if self.queue.pause(look) {
                 return;
             }
         }

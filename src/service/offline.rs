@@ -85,7 +85,7 @@ impl OfflineService {
         let view = query::query_view(&self.limits, scene, spec)?;
         let subject = self.subject(scene, "query")?;
         let texts = SceneTexts::new(&self.backend, subject, spec.profile, &texts)?;
-        query::answer(&texts, &self.limits, spec, view.as_ref(), || ())
+        query::answer(&texts, &self.limits, spec, view.as_ref(), ViewTimes::default(), || ())
     }
 
     /// As [`super::Service::pick`], without labels.

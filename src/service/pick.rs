@@ -104,6 +104,9 @@ impl Service {
             (labels, Some(inner.understood(&scene, "labels", spec.wait).await?))
         };
         let deadline = inner.deadline(&spec.options);
+        if let Some(understood) = &understood {
+            inner.embed(understood, spec.profile, &labels, deadline).await?;
+        }
         let shared = Arc::clone(inner);
         inner
             .scheduled(deadline, 1, "the pick", move |_slot| {

@@ -1,7 +1,7 @@
 //! Many texts for one scene: scores of the bank, parts in 3D, and with a camera one drawing of the
 //! view for all of them.
 
-use std::{collections::HashMap, sync::Arc, time::Instant};
+use std::{collections::HashMap, sync::Arc};
 
 use rayon::prelude::*;
 
@@ -12,6 +12,7 @@ use super::{
     rle::Rle,
     search::{LabelledView, SceneTexts, ScoredText},
     texts,
+    times::{ViewTimes, staged},
     types::{InstanceBox, Peak, QueryAnswer, TextResult, TextView},
     view::{Inputs, Resolved, resolve_one},
 };
@@ -26,6 +27,9 @@ use crate::{
 /// Relevancy from which a text selects.
 const SELECTED: f32 = 0.5;
 
+/// What each set of entries selects.
+type Selections = HashMap<Vec<u16>, Selection>;
+
 /// A set of entries, what it selects, and in which parts.
 struct Selection {
     gaussians: u64,
@@ -33,25 +37,31 @@ struct Selection {
 }
 
 /// Answers the texts; `view` is that of the camera, where one was given. Calls `drawn` when it is
-/// drawn.
+/// drawn. `times` has the stages before.
 pub(super) fn answer(
     texts: &SceneTexts<'_>,
     limits: &Limits,
     spec: &QuerySpec,
     view: Option<&Resolved>,
+    mut times: ViewTimes,
     drawn: impl FnOnce(),
 ) -> Result<QueryAnswer> {
     let (mut labelled, mut render_ms) = (None, None);
     if let Some(view) = view {
-        let started = Instant::now();
         let key = view.labels_key(texts.of.tag, &texts.backend.renderer.name())?;
-        let (found, new) = texts.view(&view.request(texts.of.scene, Kinds::NONE), key)?;
-        render_ms = Some(if new { started.elapsed().as_secs_f64() * 1e3 } else { 0.0 });
+        let request = view.request(texts.of.scene, Kinds::NONE);
+        let (found, ms) = staged("render", || texts.view(&request, key));
+        let (found, new) = found?;
+        times.render_ms = ms;
+        render_ms = Some(if new { ms } else { 0.0 });
+        // Once, before the texts need them side by side.
+        let (norms, ms) = staged("score", || found.norms(&texts.scorer).map(drop));
+        norms?;
+        *times.score_ms.get_or_insert_default() += ms;
         labelled = Some(found);
     }
     drawn();
-    let selections = selections(texts, limits, spec.boxes);
-    let result = |text: &ScoredText| -> Result<TextResult> {
+    let result = |text: &ScoredText, selections: &Selections| -> Result<TextResult> {
         let entries = text.selected();
         let selection = selections.get(&entries);
         let view = labelled.as_ref().map(|view| text_view(view, &texts.scorer, text, spec));
@@ -65,12 +75,18 @@ pub(super) fn answer(
             view: view.transpose()?,
         })
     };
+    let (results, ms) = staged("encode", || {
+        let selections = selections(texts, limits, spec.boxes);
+        texts.texts.par_iter().map(|text| result(text, &selections)).collect::<Result<_>>()
+    });
+    times.encode_ms = ms;
     Ok(QueryAnswer {
         bank_size: u32::try_from(texts.of.semantics.bank.len()).unwrap_or(u32::MAX),
         profile: spec.profile,
         camera: view.map(Resolved::camera),
         render_ms,
-        results: texts.texts.par_iter().map(result).collect::<Result<_>>()?,
+        results: results?,
+        times,
     })
 }
 
@@ -86,11 +102,7 @@ pub(super) fn query_view<'a>(
 }
 
 /// What each set of entries selects; texts that select the same share it.
-fn selections(
-    texts: &SceneTexts<'_>,
-    limits: &Limits,
-    boxes: Boxes,
-) -> HashMap<Vec<u16>, Selection> {
+fn selections(texts: &SceneTexts<'_>, limits: &Limits, boxes: Boxes) -> Selections {
     let mut sets: Vec<Vec<u16>> = texts.texts.iter().map(ScoredText::selected).collect();
     sets.sort_unstable();
     sets.dedup();
@@ -180,13 +192,21 @@ impl Service {
         let view = query_view(&self.limits(), scene.record(), &spec)?;
         let understood = inner.understood(&scene, "query", spec.wait).await?;
         let deadline = inner.deadline(&spec.options);
+        let embed_ms = inner.embed(&understood, spec.profile, &texts, deadline).await?;
         let shared = Arc::clone(inner);
         let pixels = view.as_ref().map_or(0, Resolved::pixels);
         inner
             .scheduled(deadline, pixels, "the query", move |slot| {
                 let subject = understood.subject();
-                let texts = SceneTexts::new(&shared.backend, subject, spec.profile, &texts)?;
-                answer(&texts, &shared.limits(), &spec, view.as_ref(), || slot.drawn())
+                let scored = || SceneTexts::new(&shared.backend, subject, spec.profile, &texts);
+                let (texts, ms) = staged("score", scored);
+                let times = ViewTimes {
+                    queue_ms: slot.queue_ms,
+                    load_ms: understood.load_ms,
+                    score_ms: Some(embed_ms + ms),
+                    ..ViewTimes::default()
+                };
+                answer(&texts?, &shared.limits(), &spec, view.as_ref(), times, || slot.drawn())
             })
             .await
     }

@@ -56,6 +56,12 @@ impl Backend {
         self.networks.lacks()
     }
 
+    /// Whether texts can be scored for a scene without a network.
+    pub(super) fn knows(&self, of: Subject<'_>, profile: ScoringProfile, texts: &[String]) -> bool {
+        self.scorers.find(&scorer_key(of.tag, profile)).is_some()
+            && texts.iter().all(|text| self.embeddings.find(text).is_some())
+    }
+
     /// Embeddings of texts: known ones from memory, all others from one run of the network.
     fn embedded(&self, texts: &[String]) -> Result<Vec<Arc<TextEmbedding>>> {
         let known =
@@ -83,7 +89,7 @@ impl Backend {
         semantics: &Semantics,
         profile: ScoringProfile,
     ) -> Result<Arc<Scorer>> {
-        let key = format!("{tag} {profile:?}");
+        let key = scorer_key(tag, profile);
         if let Some(known) = self.scorers.find(&key) {
             return Ok(known);
         }
@@ -106,6 +112,11 @@ impl Backend {
         self.scorers.insert(key, Arc::clone(&scorer), bytes);
         Ok(scorer)
     }
+}
+
+/// Tells the scorer of a scene, its semantics and a profile from all others.
+fn scorer_key(tag: &str, profile: ScoringProfile) -> String {
+    format!("{tag} {profile:?}")
 }
 
 /// A text, how the bank scores it, and what makes that doubtful.
@@ -135,20 +146,24 @@ pub(super) struct LabelledView {
 }
 
 impl LabelledView {
-    /// `[H * W]` relevancy of a text.
-    pub(super) fn relevancy(&self, scorer: &Scorer, text: &TextScores) -> Result<Vec<f32>> {
+    /// Lengths of the pixels' features, for all texts.
+    pub(super) fn norms(&self, scorer: &Scorer) -> Result<&ViewNorms> {
         let kept = match scorer.scoring().profile() {
             ScoringProfile::Default => &self.norms[0],
             ScoringProfile::Paper => &self.norms[1],
         };
-        let norms = match kept.get() {
-            Some(norms) => norms,
+        match kept.get() {
+            Some(norms) => Ok(norms),
             None => {
                 let norms = scorer.norms(&self.weights)?;
-                kept.get_or_init(|| norms)
+                Ok(kept.get_or_init(|| norms))
             }
-        };
-        scorer.relevancy(text, &self.weights, norms)
+        }
+    }
+
+    /// `[H * W]` relevancy of a text.
+    pub(super) fn relevancy(&self, scorer: &Scorer, text: &TextScores) -> Result<Vec<f32>> {
+        scorer.relevancy(text, &self.weights, self.norms(scorer)?)
     }
 
     /// `[H * W]` entry of the largest weight, 0 where the weights are too small together.

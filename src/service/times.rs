@@ -1,10 +1,10 @@
-//! Where the time of a view goes: each stage as a metric, as a span, and in the answer.
+//! Where the time of a view or a query goes: each stage as a metric, as a span, and in the answer.
 
 use std::time::Instant;
 
 use crate::telemetry::meter;
 
-/// Milliseconds of the stages of a view.
+/// Milliseconds of the stages of a view, or of a query.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ViewTimes {
     /// Waiting for a place among the views that are drawn, and for a thread.
@@ -17,7 +17,7 @@ pub struct ViewTimes {
     pub score_ms: Option<f64>,
     /// Drawing, with the waiting for other views on the same device.
     pub render_ms: f64,
-    /// Encoding.
+    /// Encoding; for a query the parts in space too.
     pub encode_ms: f64,
 }
 

@@ -50,6 +50,9 @@ pub struct QueryAnswer {
     pub render_ms: Option<f64>,
     /// One result a text, in their order.
     pub results: Vec<TextResult>,
+    /// Where the time went; a header of the answer.
+    #[serde(skip)]
+    pub times: ViewTimes,
 }
 
 /// What a text found.

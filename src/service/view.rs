@@ -216,6 +216,14 @@ impl Resolved {
     }
 }
 
+/// A text that is embedded, and the scene that it asks about.
+#[derive(Clone)]
+struct Asked {
+    understood: Understood,
+    ask: TextOptions,
+    embed_ms: f64,
+}
+
 /// A picture that is computed from the weights of a view.
 enum Scored {
     Mask(Vec<bool>),
@@ -379,7 +387,7 @@ impl Inner {
         self: &Arc<Self>,
         scene: SceneAccess,
         view: Resolved,
-        texts: Option<(Understood, TextOptions)>,
+        texts: Option<Asked>,
         deadline: Instant,
     ) -> Result<Vec<RenderedView>> {
         let inner = Arc::clone(self);
@@ -388,7 +396,7 @@ impl Inner {
             let (backend, tag) = (&inner.backend, scene_tag(scene.record()));
             let mut times = ViewTimes { queue_ms: slot.queue_ms, ..ViewTimes::default() };
             let drawn = || slot.drawn();
-            let Some((understood, ask)) = texts else {
+            let Some(Asked { understood, ask, embed_ms }) = texts else {
                 let begun = Instant::now();
                 let scene = inner.load(&scene)?;
                 times.load_ms = ms(begun);
@@ -398,7 +406,7 @@ impl Inner {
             let text = ask.text.as_slice();
             let scored = || SceneTexts::new(backend, subject, ask.profile, text);
             let (texts, ms) = staged("score", scored);
-            (times.load_ms, times.score_ms) = (understood.load_ms, Some(ms));
+            (times.load_ms, times.score_ms) = (understood.load_ms, Some(embed_ms + ms));
             view.draw(backend, subject.scene, &tag, Some(&texts?), times, drawn)
         };
         self.scheduled(deadline, pixels, "the view", work).await
@@ -425,19 +433,62 @@ impl Inner {
             })
             .await?
         };
-        let late = || {
-            let ms = started.elapsed().as_millis();
-            Error::new(ErrorCode::DeadlineExceeded, format!("{what} was not ready after {ms} ms"))
-        };
-        if deadline <= started {
-            return Err(late());
+        in_time(deadline, what, work).await
+    }
+
+    /// Embeds texts that are not known yet, for no slot may wait for a network. Milliseconds that
+    /// it took.
+    pub(super) async fn embed(
+        self: &Arc<Self>,
+        understood: &Understood,
+        profile: ScoringProfile,
+        texts: &[String],
+        deadline: Instant,
+    ) -> Result<f64> {
+        if self.backend.knows(understood.subject(), profile, texts) {
+            return Ok(0.0);
         }
-        tokio::time::timeout_at(deadline.into(), work).await.map_err(|_elapsed| late())?
+        let (inner, of, texts) = (Arc::clone(self), understood.clone(), texts.to_vec());
+        let embed =
+            move || SceneTexts::new(&inner.backend, of.subject(), profile, &texts).map(drop);
+        let embed = async { blocking(|| staged("score", embed)).await };
+        let (embedded, ms) = in_time(deadline, "the text", embed).await?;
+        embedded.map(|()| ms)
+    }
+
+    /// The text of a view, embedded; `None` where the view has none.
+    async fn asked(
+        self: &Arc<Self>,
+        understood: Option<Understood>,
+        ask: TextOptions,
+        deadline: Instant,
+    ) -> Result<Option<Asked>> {
+        let Some(understood) = understood else { return Ok(None) };
+        let text = ask.text.as_slice();
+        let embed_ms = self.embed(&understood, ask.profile, text, deadline).await?;
+        Ok(Some(Asked { understood, ask, embed_ms }))
     }
 
     pub(super) fn deadline(&self, options: &ViewOptions) -> Instant {
         until(options.deadline, self.limits().render_timeout_ms)
     }
+}
+
+/// What `work` gives within the deadline; `what` names it in the error.
+async fn in_time<T>(
+    deadline: Instant,
+    what: &str,
+    work: impl Future<Output = Result<T>>,
+) -> Result<T> {
+    let started = Instant::now();
+    let late = || {
+        let ms = started.elapsed().as_millis();
+        Error::new(ErrorCode::DeadlineExceeded, format!("{what} was not ready after {ms} ms"))
+    };
+    if deadline <= started {
+        return Err(late());
+    }
+    tokio::time::timeout_at(deadline.into(), work).await.map_err(|_elapsed| late())?
 }
 
 /// The caller's deadline, at most `most_ms` from now.
@@ -480,7 +531,7 @@ impl Service {
         let inner = &self.inner;
         let understood = inner.understood_for(&scene, &[spec.kind], &ask).await?;
         let deadline = inner.deadline(&spec.options);
-        let texts = understood.map(|understood| (understood, ask));
+        let texts = inner.asked(understood, ask, deadline).await?;
         let mut views = inner.render_one(scene, view, texts, deadline).await?;
         views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
     }
@@ -540,7 +591,7 @@ impl Service {
         let task = async move {
             let views = async {
                 let understood = inner.understood_for(&scene, &kinds, &ask).await?;
-                let texts = understood.map(|understood| (understood, ask));
+                let texts = inner.asked(understood, ask, last).await?;
                 // Each on a task of its own: a slot must not wait for a slow reader.
                 let render = |one: Resolved| {
                     let deadline = last.min(inner.deadline(&ViewOptions::default()));

@@ -2,13 +2,18 @@
 //! is refused.
 
 use std::{
-    sync::{Arc, atomic::Ordering},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
     time::Duration,
 };
 
 use futures_util::{StreamExt, future::join_all};
 use segsplat::{
     error::ErrorCode,
+    limits::Limits,
+    pipeline::read,
     scene::{
         Event, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState, Stage,
     },
@@ -202,4 +207,29 @@ async fn deleting_a_scene_stops_its_semantics_and_tells_who_waits() {
     meaning.hold.store(false, Ordering::Release);
     let other = scene(&server, SemanticsMode::Eager).await;
     assert_eq!(other.semantics.state, SemanticsState::Ready, "the next scene has its turn");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_first_text_takes_the_photos_from_memory_or_reads_the_same_ones() {
+    for (kept_ms, kept) in [(PATIENCE.as_millis() as u64, true), (0, false)] {
+        let meaning = Arc::new(PhotoMeaning::default());
+        let given = Arc::clone(&meaning);
+        let server = TestServer::with(|config, parts| {
+            parts.semantics = given;
+            config.limits.first_text_photos_ms = kept_ms;
+        })
+        .await;
+        let [first, second] = [
+            scene(&server, SemanticsMode::Lazy).await.id,
+            scene(&server, SemanticsMode::Lazy).await.id,
+        ];
+        server.service.understand(&first, Some(PATIENCE)).await.expect("semantics");
+        let photos = read(&upload(), &Limits::default(), &AtomicBool::new(false)).unwrap().photos;
+        let pixels: Vec<u8> = photos.into_iter().flat_map(|posed| posed.photo.rgb).collect();
+        assert_eq!(*meaning.pixels.lock().unwrap(), pixels, "kept: {kept}");
+        let folder = server.data_dir().join("scenes").join(second.as_str());
+        std::fs::remove_file(folder.join("upload.segsplat")).unwrap();
+        let answer = server.service.understand(&second, Some(PATIENCE)).await;
+        assert_eq!(answer.is_ok(), kept, "without the store: {:?}", answer.err());
+    }
 }

@@ -398,3 +398,65 @@ async fn http_gives_pictures_of_texts_as_files_and_in_json() {
         assert!(fault.message.starts_with(key) && fault.message.contains(value), "{fault:?}");
     }
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn views_are_drawn_while_texts_wait_for_a_network() {
+    let fixture = fixture().await;
+    let id = fixture.scene(SemanticsMode::Eager).await;
+    let (service, meaning) = (&fixture.server.service, &fixture.meaning);
+    service.understand(&id, Some(PATIENCE)).await.expect("semantics");
+    meaning.hold_texts.store(true, Ordering::Release);
+    let ask = || service.query(&id, in_view(&["photo 0"]));
+    let mask = || {
+        let text = TextOptions { text: Some("photo 1".to_owned()), ..TextOptions::default() };
+        service.render(&id, ViewSpec { kind: Kind::Mask, text, ..first_view() })
+    };
+    let texts = async { tokio::join!(ask(), mask()) };
+    let color = async {
+        // Both wait for the phrases that every text is compared with: three texts each.
+        while meaning.embedded.load(Ordering::Acquire) < 6 {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+        let drawn = tokio::time::timeout(PATIENCE / 4, service.render(&id, first_view())).await;
+        meaning.hold_texts.store(false, Ordering::Release);
+        drawn.expect("a view does not wait for texts").expect("a view");
+    };
+    let ((answer, mask), ()) = tokio::join!(texts, color);
+    let times = answer.expect("a query").times;
+    assert!(times.score_ms > Some(0.0), "the network's time is in {times:?}");
+    mask.expect("a mask");
+}
+
+#[tokio::test]
+async fn queries_say_where_their_time_went_over_both_doors() {
+    let fixture = fixture().await;
+    let id = fixture.scene(SemanticsMode::Eager).await;
+    let body = serde_json::json!({ "texts": ["photo 0"], "camera": { "from": 0 } });
+    let url = fixture.server.url(&format!("/v1/scenes/{id}/query"));
+    let answer = crate::common::client().post(url).json(&body).send().await.unwrap();
+    let lines = answer.headers().get_all("server-timing").iter().map(|v| v.to_str().unwrap());
+    let http = lines.collect::<Vec<_>>().join(", ");
+    let mut client = segsplat::api::grpc::pb::scene_service_client::SceneServiceClient::new(
+        crate::common::doors::channel(fixture.server.addr).await,
+    );
+    let query = segsplat::api::grpc::pb::QueryRequest {
+        scene_id: id.to_string(),
+        texts: texts(&["photo 0"]),
+        camera: Some(Ask::first().camera()),
+        ..Default::default()
+    };
+    let answer = client.query(query).await.unwrap();
+    let lines = answer.metadata().get_all("server-timing").iter().map(|v| v.to_str().unwrap());
+    let grpc = lines.collect::<Vec<_>>().join(", ");
+    for (door, line) in [("HTTP", http), ("gRPC", grpc)] {
+        let times: Vec<(&str, f64)> = line
+            .split(", ")
+            .filter_map(|entry| entry.split_once(";dur="))
+            .map(|(stage, ms)| (stage, ms.parse().unwrap()))
+            .collect();
+        let stages: Vec<&str> = times.iter().map(|(stage, _)| *stage).collect();
+        assert_eq!(stages, ["queue", "load", "score", "render", "encode", "total"], "{door}");
+        let sum: f64 = times[..5].iter().map(|(_, ms)| ms).sum();
+        assert!(sum > 0.0 && sum <= times[5].1 + 0.06, "{door}: {times:?}");
+    }
+}

@@ -6,7 +6,9 @@ use std::{
     sync::{
         Mutex,
         atomic::{AtomicBool, Ordering},
+        mpsc,
     },
+    time::Duration,
 };
 
 use segsplat::{
@@ -320,4 +322,37 @@ fn a_scene_of_the_pipeline_says_which_pixels_made_it() {
         assert_eq!(*m, map.at(x / 120.0, y / 64.0), "{source:?}");
     }
     assert!(meant.report.labelled > 0, "{:?}", meant.report);
+}
+
+#[test]
+fn a_job_that_waits_keeps_no_other_job_waiting() {
+    let Some(engine) = engine(1) else { return };
+    let (wall, engine) = (wall(), &engine);
+    let options = SampleOptions { photos: 2, width: 96, height: 64, seed: 4 };
+    let photos = sample::photos(&options).unwrap();
+    let (waits, waiting) = mpsc::channel();
+    let (goes_on, go_on) = mpsc::channel();
+    let go_on = Mutex::new(go_on);
+    let patience = Duration::from_secs(120);
+    std::thread::scope(|scope| {
+        let photos = &photos;
+        scope.spawn(move || {
+            waiting.recv_timeout(patience).expect("the semantics begin");
+            let made =
+                reconstruct(engine, photos, &SceneOptions::default(), &|_, _| (), &NO_CANCEL);
+            made.expect("a scene");
+            goes_on.send(()).expect("the other job waits");
+        });
+        // It waits in its first stage, as for a network, until the other job has its scene.
+        let begun = AtomicBool::new(false);
+        let progress = |_: Stage, _: f32| {
+            if !begun.swap(true, Ordering::AcqRel) {
+                waits.send(()).expect("the other job listens");
+                let other = go_on.lock().unwrap().recv_timeout(patience);
+                other.expect("a scene is made while semantics wait");
+            }
+        };
+        let watch = Watch { progress: &progress, cancel: &NO_CANCEL };
+        understand(engine, &wall.parts(), &SemanticsOptions::default(), watch).unwrap();
+    });
 }

@@ -95,6 +95,9 @@ limits! {
     /// Bytes of photos that the create call read, kept in memory for the jobs of their scenes. A
     /// job whose photos do not fit reads them again.
     read_uploads_bytes_max: u64 = 512 << 20, restart;
+    /// Milliseconds for which the photos of a scene that was made with `semantics=lazy` stay in
+    /// memory after it is done, within `read_uploads_bytes_max`: its first text need not read them.
+    first_text_photos_ms: u64 = 120_000, restart;
     /// Jobs that wait; one more is refused as `overloaded`.
     queued_jobs_max: usize = 64, restart;
     /// Renders at work or waiting; one more is refused as `overloaded`.

@@ -1,9 +1,9 @@
 //! A view as a caller asks for it.
 
-use super::{
-    door::{Answer, Call, Connection},
-    pb,
-};
+use segsplat::api::grpc::pb;
+use serde_json::json;
+
+use super::door::{Answer, Call, Connection};
 use crate::{
     error::{Error, Result},
     scene::Camera,
@@ -41,6 +41,62 @@ impl Ask {
                 connection.call(call).await
             }
         }
+    }
+
+    /// Asks for the views of many cameras in one call.
+    pub(super) async fn views(
+        &self,
+        connection: &mut Connection,
+        cameras: &[Camera],
+    ) -> Result<Answer> {
+        let (http, request) = (!matches!(connection, Connection::Grpc(_)), self.messages(cameras)?);
+        let answer = match http {
+            true => connection.call(self.posted(cameras)).await?.parted()?,
+            false => connection.render_many(request).await?,
+        };
+        if answer.bytes.len() != cameras.len() {
+            let (views, cameras) = (answer.bytes.len(), cameras.len());
+            return Err(Error::internal(format!("{views} views of {cameras} cameras")));
+        }
+        Ok(answer)
+    }
+
+    fn posted(&self, cameras: &[Camera]) -> Call {
+        let fields = cameras.iter().map(|camera| {
+            let lens = camera.intrinsics;
+            let pose = camera.camera_to_world.to_row_major();
+            json!({
+                "camera_to_world": pose.as_slice(),
+                "fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy,
+            })
+        });
+        let mut body = json!({
+            "cameras": fields.collect::<Vec<_>>(),
+            "kinds": [self.kind],
+            "format": self.format,
+        });
+        if let Some(camera) = cameras.first() {
+            body["width"] = json!(camera.intrinsics.width);
+            body["height"] = json!(camera.intrinsics.height);
+        }
+        if self.takes_text() {
+            body["text"] = json!(self.text);
+        }
+        let target = format!("/v1/scenes/{}/views", self.scene);
+        Call::post(target, body.to_string().into_bytes(), "application/json".to_owned())
+    }
+
+    fn messages(&self, cameras: &[Camera]) -> Result<pb::RenderViewsRequest> {
+        let each: Vec<_> = cameras.iter().map(|c| self.message(c)).collect::<Result<_>>()?;
+        let first = each.first().cloned().unwrap_or_default();
+        Ok(pb::RenderViewsRequest {
+            scene_id: first.scene_id,
+            cameras: each.into_iter().filter_map(|one| one.camera).collect(),
+            kinds: vec![first.kind],
+            options: first.options,
+            text: first.text,
+            ..Default::default()
+        })
     }
 
     /// Whether the kind answers a text.

@@ -13,7 +13,8 @@ use serde_json::Value;
 use tokio::net::TcpStream;
 use tonic::transport::{Channel, Endpoint};
 
-use super::pb::{self, scene_service_client::SceneServiceClient};
+use segsplat::api::grpc::pb::{self, scene_service_client::SceneServiceClient};
+
 use crate::error::{Error, ErrorCode, Result};
 
 /// Windows of HTTP/2: a large picture must not wait for the other side's word.
@@ -104,6 +105,31 @@ impl Answer {
 
     pub(super) fn body(&self) -> Vec<u8> {
         self.bytes.concat()
+    }
+
+    /// The parts of a `multipart/mixed` answer as pieces, with the times that their heads say.
+    pub(super) fn parted(self) -> Result<Self> {
+        let broken = || Error::invalid("the answer is no sequence of views");
+        let body = Bytes::from(self.body());
+        let (mut bytes, mut timing, mut at) = (Vec::new(), self.timing, 0);
+        loop {
+            let rest = &body[at..];
+            let end = rest.windows(4).position(|four| four == b"\r\n\r\n");
+            // The last line closes the parts and has no head.
+            let Some(end) = end else { break };
+            let head = std::str::from_utf8(&rest[..end]).map_err(|_| broken())?;
+            let field = |name: &str| head.lines().find_map(|line| line.strip_prefix(name));
+            let length = field("content-length: ").and_then(|n| n.parse::<usize>().ok());
+            // A part without a length holds an error.
+            let length = length.ok_or_else(broken)?;
+            timing.extend(field("server-timing: ").map(str::to_owned));
+            at += end + 4;
+            bytes.push(
+                body.get(at..at + length).map(|part| body.slice_ref(part)).ok_or_else(broken)?,
+            );
+            at += length + 2;
+        }
+        Ok(Self { bytes, timing, etag: None })
     }
 }
 
@@ -215,6 +241,20 @@ impl Connection {
         serde_json::from_slice(&answer).map_err(unlike)
     }
 
+    /// Asks for many views over gRPC.
+    pub(super) async fn render_many(&mut self, request: pb::RenderViewsRequest) -> Result<Answer> {
+        let Self::Grpc(client) = self else {
+            return Err(Error::internal("a gRPC call over HTTP"));
+        };
+        let refused = |status: tonic::Status| Error::invalid(status.message().to_owned());
+        let mut views = client.render_views(request).await.map_err(refused)?.into_inner();
+        let mut bytes = Vec::new();
+        while let Some(view) = views.message().await.map_err(refused)? {
+            bytes.push(view.data);
+        }
+        Ok(Answer { bytes, timing: Vec::new(), etag: None })
+    }
+
     /// Asks for a view over gRPC.
     pub(super) async fn render(&mut self, request: pb::RenderViewRequest) -> Result<Answer> {
         let Self::Grpc(client) = self else {
@@ -226,5 +266,32 @@ impl Connection {
         let timing = timing.filter_map(|value| Some(value.to_str().ok()?.to_owned())).collect();
         let view = answer.into_inner();
         Ok(Answer { bytes: vec![view.data], timing, etag: Some(view.etag) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parted(body: &str) -> Result<Answer> {
+        let body = Bytes::copy_from_slice(body.as_bytes());
+        Answer { bytes: vec![body], timing: vec!["total;dur=9".to_owned()], etag: None }.parted()
+    }
+
+    #[test]
+    fn parts_are_pieces_with_the_times_of_their_heads() {
+        let part = |ms: u32, body: &str| {
+            let length = body.len();
+            let head = format!("server-timing: render;dur={ms}\r\ncontent-length: {length}");
+            format!("--b\r\n{head}\r\n\r\n{body}\r\n")
+        };
+        // A picture may hold what ends a head.
+        let whole = format!("{}{}--b--\r\n", part(1, "ab\r\n\r\n--b"), part(2, ""));
+        let answer = parted(&whole).unwrap();
+        assert_eq!(answer.bytes, ["ab\r\n\r\n--b", ""]);
+        assert_eq!(answer.timing, ["total;dur=9", "render;dur=1", "render;dur=2"]);
+        let fault = "--b\r\ncontent-type: application/json\r\n\r\n{}\r\n--b--\r\n";
+        assert!(parted(&format!("{}{fault}", part(1, "a"))).is_err(), "a part with an error");
+        assert!(parted(&whole[..whole.len() - 20]).is_err(), "cut off");
     }
 }

@@ -15,27 +15,6 @@ mod server;
 mod tally;
 mod views;
 
-/// Messages and services generated from `proto/segsplat/v1`.
-#[allow(
-    dead_code,
-    unreachable_pub,
-    missing_docs,
-    missing_debug_implementations,
-    clippy::all,
-    clippy::doc_markdown,
-    clippy::missing_errors_doc,
-    clippy::unwrap_used,
-    clippy::use_self,
-    clippy::allow_attributes_without_reason,
-    clippy::enum_glob_use,
-    clippy::semicolon_if_nothing_returned,
-    clippy::implicit_clone,
-    reason = "generated code"
-)]
-mod pb {
-    include!(concat!(env!("CARGO_MANIFEST_DIR"), "/../proto/generated/segsplat.v1.rs"));
-}
-
 use clap::Subcommand;
 
 use crate::{

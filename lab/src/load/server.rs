@@ -23,6 +23,10 @@ use crate::{
 /// Longest wait for a scene, its semantics among it.
 const WAIT_MS: u64 = 300_000;
 
+/// Looks at whether a server's networks are open, a tenth of a second apart. On a device that takes
+/// a minute.
+const READY_LOOKS: u32 = 1_800;
+
 /// Which servers.
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Servers {
@@ -109,7 +113,7 @@ impl Servers {
 impl Server {
     async fn wait_until_ready(&mut self) -> Result<()> {
         let mut connection = Connection::http1(&self.address).await?;
-        for _ in 0..600 {
+        for _ in 0..READY_LOOKS {
             let state = connection.json(Call::get("/readyz".to_owned())).await;
             if state.is_ok_and(|state| state["networks"] == "open") {
                 let models = connection.json(Call::get("/v1/models".to_owned())).await?;
@@ -118,7 +122,7 @@ impl Server {
             }
             tokio::time::sleep(Duration::from_millis(100)).await;
         }
-        Err(Error::invalid(format!("server {:?} did not get ready in a minute", self.name)))
+        Err(Error::invalid(format!("server {:?} did not get ready in three minutes", self.name)))
     }
 
     /// Posts an upload and waits for the scene, and for its semantics where it has them `eager`.

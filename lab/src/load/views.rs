@@ -73,6 +73,9 @@ pub(crate) struct Args {
     /// Text of masks and relevancies
     #[arg(long, default_value = "fox")]
     text: String,
+    /// Views of one call: over 1 by `POST /v1/scenes/{id}/views`, or `RenderViews` of gRPC
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=64))]
+    together: u64,
     /// More parameters of each view over HTTP: `&quality=fast`
     #[arg(long, default_value = "")]
     more: String,
@@ -116,6 +119,9 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     if !args.seconds.is_finite() || args.rate.is_some_and(|rate| !(rate > 0.0 && rate < 1e6)) {
         return Err(Error::invalid("seconds must be finite, and rate over 0 and under 1e6"));
     }
+    if args.together > 1 && (!args.more.is_empty() || args.formats.iter().any(|f| f == KNOWN)) {
+        return Err(Error::invalid("more and the format `known` are of single views"));
+    }
     let upload = Photos::read(&args.photos_dir)?.upload(0, args.photos)?;
     let runtime = runtime(args.load_threads)?;
     let servers = runtime.block_on(args.servers.start(&args.setup))?;
@@ -151,7 +157,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                         more: args.more.clone(),
                     };
                     progress(&format!("{} {} {kind} {format} {callers}", server.name, door.name()));
-                    let load = Load { ask, path: path.clone(), rate: args.rate, first, bounds };
+                    let (path, rate, together) = (path.clone(), args.rate, args.together);
+                    let load = Load { ask, path, rate, together, first, bounds };
                     let known = format == KNOWN;
                     let asked = runtime.block_on(load.ask(server, door, callers, known));
                     let mut row = json!({
@@ -164,6 +171,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                         "width": args.width,
                         "height": args.height,
                         "callers": callers,
+                        "together": args.together,
                         "rate": args.rate,
                         "library_per_s": library_per_s,
                     });
@@ -222,6 +230,8 @@ struct Load {
     ask: Ask,
     path: Path,
     rate: Option<f64>,
+    /// Views of one call.
+    together: u64,
     first: u64,
     bounds: Bounds,
 }
@@ -248,7 +258,7 @@ impl Load {
         Ok((tally, per_s))
     }
 
-    /// Every connection is a caller: it takes the next view until a bound is met.
+    /// Every connection is a caller: it takes the next views until a bound is met.
     async fn drive(
         &self,
         connections: Vec<Connection>,
@@ -263,7 +273,7 @@ impl Load {
             tokio::spawn(async move {
                 let mut tally = Tally::default();
                 loop {
-                    let n = next.fetch_add(1, Ordering::Relaxed);
+                    let n = next.fetch_add(load.together, Ordering::Relaxed);
                     let mut due = Instant::now();
                     if let Some(rate) = load.rate {
                         let clock = begun + Duration::from_secs_f64(n as f64 / rate);
@@ -279,11 +289,18 @@ impl Load {
                         return Ok::<_, Error>((connection, tally));
                     }
                     let view = if etag.is_some() { load.first } else { first + n };
-                    let camera = load.path.camera(view)?;
-                    match load.ask.view(&mut connection, &camera, etag.clone()).await {
+                    let cameras = view..view + load.together;
+                    let cameras: Vec<_> =
+                        cameras.map(|n| load.path.camera(n)).collect::<Result<_>>()?;
+                    let answer = match &cameras[..] {
+                        [camera] => load.ask.view(&mut connection, camera, etag.clone()).await,
+                        cameras => load.ask.views(&mut connection, cameras).await,
+                    };
+                    match answer {
                         Ok(answer) => {
                             let timing = answer.timing.iter().map(String::as_str);
-                            tally.answered(due.elapsed(), answer.len(), timing);
+                            let bytes = answer.len() / cameras.len();
+                            tally.answered(due.elapsed(), bytes, timing);
                         }
                         Err(error) => tally.failed(error.message().to_owned()),
                     }
@@ -298,8 +315,8 @@ impl Load {
             connections.push(connection);
             all.add(tally);
         }
-        let per_s = all.count() as f64 / begun.elapsed().as_secs_f64();
-        Ok((connections, all, per_s))
+        let views = all.count() as f64 * self.together as f64;
+        Ok((connections, all, views / begun.elapsed().as_secs_f64()))
     }
 
     /// How far some pictures are from the library's, levels of 8 bits; none for what is no picture

@@ -97,12 +97,7 @@ impl pb::scene_service_server::SceneService for Api {
     }
 
     async fn render_view(&self, request: Request<pb::RenderViewRequest>) -> Answer<pb::View> {
-        let (view, times) = answer(self, request, render).await?.into_inner();
-        let mut answer = Response::new(view);
-        if let Ok(value) = server_timing(times.stages()).parse() {
-            answer.metadata_mut().insert("server-timing", value);
-        }
-        Ok(answer)
+        answer(self, request, render).await.map(timed)
     }
 
     async fn render_views(
@@ -115,9 +110,12 @@ impl pb::scene_service_server::SceneService for Api {
     async fn query(&self, request: Request<pb::QueryRequest>) -> Answer<pb::QueryResponse> {
         answer(self, request, |api, request| async move {
             let id = request.scene_id.parse()?;
-            Ok(convert::answer(api.service.query(&id, convert::query(request)?).await?))
+            let answer = api.service.query(&id, convert::query(request)?).await?;
+            let times = answer.times;
+            Ok((convert::answer(answer), times))
         })
         .await
+        .map(timed)
     }
 
     async fn pick(&self, request: Request<pb::PickRequest>) -> Answer<pb::PickResponse> {
@@ -131,6 +129,16 @@ impl pb::scene_service_server::SceneService for Api {
     async fn export(&self, request: Request<pb::ExportRequest>) -> Answer<Self::ExportStream> {
         answer(self, request, export).await
     }
+}
+
+/// A message with its stages as metadata.
+fn timed<T>(answer: Response<(T, ViewTimes)>) -> Response<T> {
+    let (message, times) = answer.into_inner();
+    let mut answer = Response::new(message);
+    if let Ok(value) = server_timing(times.stages()).parse() {
+        answer.metadata_mut().insert("server-timing", value);
+    }
+    answer
 }
 
 async fn create(

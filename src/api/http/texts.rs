@@ -14,6 +14,7 @@ use super::{
     render::camera,
 };
 use crate::{
+    api::server_timing,
     scene::ScoringProfile,
     service::{CameraFields, PickSpec, Picked, QueryAnswer, QuerySpec, ViewOptions},
 };
@@ -29,7 +30,7 @@ pub(super) async fn query(
     Id(id): Id,
     Extension(Deadline(deadline)): Extension<Deadline>,
     JsonBody(mut body): JsonBody,
-) -> Result<Json<QueryAnswer>, ApiError> {
+) -> Result<([(&'static str, String); 1], Json<QueryAnswer>), ApiError> {
     let f = &mut body;
     let of_view: Option<CameraFields> = f.value("camera")?;
     let spec = QuerySpec {
@@ -43,7 +44,8 @@ pub(super) async fn query(
         wait: f.value("wait_ms")?.map(Duration::from_millis),
     };
     body.finish()?;
-    Ok(Json(api.service.query(&id, spec).await?))
+    let answer = api.service.query(&id, spec).await?;
+    Ok(([("server-timing", server_timing(answer.times.stages()))], Json(answer)))
 }
 
 /// A pixel, and texts that may name what is under it.

@@ -28,6 +28,8 @@ pub(crate) enum Wrong {
     Stalls,
     /// There is no room.
     Full,
+    /// A local store misses a folder that a deletion emptied and removed meanwhile.
+    NoFolder,
 }
 
 type Plan = Box<dyn FnMut(&str, &Path) -> Option<Wrong> + Send>;
@@ -87,6 +89,7 @@ impl ObjectStore for FaultStore {
             None => self.inner.put_opts(location, payload, opts).await,
             Some(Wrong::Fails) => Err(error(ErrorKind::ConnectionReset)),
             Some(Wrong::Full) => Err(error(ErrorKind::StorageFull)),
+            Some(Wrong::NoFolder) => Err(error(ErrorKind::NotFound)),
             Some(Wrong::Lost) => {
                 self.inner.put_opts(location, payload, opts).await?;
                 Err(error(ErrorKind::ConnectionReset))
@@ -137,7 +140,7 @@ impl ObjectStore for FaultStore {
         let inner = Arc::clone(&self.inner);
         let wrong = self.wrong("delete", &Path::default());
         match wrong {
-            None | Some(Wrong::Full | Wrong::Tears | Wrong::Stalls) => {
+            None | Some(Wrong::Full | Wrong::NoFolder | Wrong::Tears | Wrong::Stalls) => {
                 inner.delete_stream(locations)
             }
             Some(Wrong::Fails) => locations

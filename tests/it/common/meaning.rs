@@ -32,8 +32,12 @@ pub(crate) struct PhotoMeaning {
     pub(crate) lack: Option<&'static str>,
     /// Calls of `make`.
     pub(crate) calls: AtomicUsize,
-    /// Texts embedded.
+    /// Pixels of the photos of the last call, one photo after the other.
+    pub(crate) pixels: std::sync::Mutex<Vec<u8>>,
+    /// Texts embedded, from the begin of their call on.
     pub(crate) embedded: AtomicUsize,
+    /// The text tower is held back while true.
+    pub(crate) hold_texts: AtomicBool,
 }
 
 impl PhotoMeaning {
@@ -59,6 +63,11 @@ impl SemanticNetworks for PhotoMeaning {
 
     fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
         self.embedded.fetch_add(texts.len(), Ordering::AcqRel);
+        let begun = Instant::now();
+        while self.hold_texts.load(Ordering::Acquire) {
+            assert!(begun.elapsed() < PATIENCE, "nobody let go of the text tower");
+            std::thread::sleep(Duration::from_millis(2));
+        }
         let embed = |text: &String| {
             let photo = text.strip_prefix("photo ").and_then(|n| n.parse::<usize>().ok());
             let row = match photo {
@@ -73,6 +82,8 @@ impl SemanticNetworks for PhotoMeaning {
 
     fn make(&self, given: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics> {
         self.calls.fetch_add(1, Ordering::AcqRel);
+        let pixels = given.iter().flat_map(|posed| &posed.photo.rgb).copied().collect();
+        *self.pixels.lock().expect("no panic holds it") = pixels;
         (watch.progress)(Stage::Masks, Self::HELD_AT);
         let begun = Instant::now();
         while self.hold.load(Ordering::Acquire) {

@@ -151,3 +151,17 @@ pub fn literal_of(
         frame.color.expect("colour").into_iter().map(|c| c.map(f64::from)).collect()
     })
 }
+
+/// `[P]` the mask of a text from the blended pictures of its tables, coverage and three scores
+/// each. A pixel is in it where the coverage reaches the floor, no score is under 0 and not all
+/// are 0.
+pub fn mask_of_blends(pictures: &[&[[f32; 4]]], coverage_floor: f64) -> Vec<bool> {
+    let inside = |p: usize| {
+        let rows = || pictures.iter().map(|picture| picture[p]);
+        let scores = || rows().flat_map(|[_, scores @ ..]| scores);
+        rows().all(|[coverage, ..]| f64::from(coverage) >= coverage_floor)
+            && scores().all(|score| score >= 0.0)
+            && scores().any(|score| score > 0.0)
+    };
+    (0..pictures.first().map_or(0, |picture| picture.len())).map(inside).collect()
+}

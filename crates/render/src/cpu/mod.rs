@@ -28,7 +28,7 @@ use self::{
     paint::Paint,
     project::Projected,
     rasterize::{Tile, TileScratch},
-    store::{Part, Pixels},
+    store::{Cut, Part},
     tiles::Grid,
 };
 use super::{
@@ -185,11 +185,13 @@ fn rasterize(
     let across = (grid.tile_count() as usize / tasks).clamp(1, tiles_x);
     let weighs = *paint.labels == Labels::Weights;
     let side = TILE_SIZE as usize;
-    let rows = band_rows(frame, grid).into_par_iter().with_max_len(1).enumerate();
+    let band = Part::of(frame, grid.tile_rows.start as usize * side);
+    let rows = band.split(grid.tile_rows.len(), Cut::Rows(side));
+    let rows = rows.into_par_iter().with_max_len(1).enumerate();
     let drawn = rows.map(|(row, out)| {
         let y = (grid.tile_rows.start + row as u32) * TILE_SIZE;
         let height = TILE_SIZE.min(grid.height - y);
-        let parts = out.split(tiles_x.div_ceil(across), across * side);
+        let parts = out.split(tiles_x.div_ceil(across), Cut::Columns(across * side));
         let parts = parts.into_par_iter().with_max_len(1).enumerate();
         let drawn = parts.map(|(part, mut out)| {
             let first = part * across;
@@ -302,38 +304,4 @@ impl<T: Default> Pool<T> {
     fn give(&self, thing: T) {
         self.0.lock().push(thing);
     }
-}
-
-/// The pictures of a band, cut into rows of tiles. Without weights.
-fn band_rows<'a>(frame: &'a mut Frame, grid: &Grid) -> Vec<Part<'a>> {
-    /// Rows of tiles of a picture from the first of the band on.
-    fn cut<'a, T>(
-        all: &'a mut Option<Vec<T>>,
-        (width, first): (usize, usize),
-    ) -> impl FnMut() -> Pixels<'a, T> {
-        let stride = width * TILE_SIZE as usize;
-        let mut rows = all.as_mut().map(|all| all.chunks_mut(stride).skip(first));
-        move || Some(rows.as_mut()?.next()?.chunks_mut(width).collect())
-    }
-    let place = (frame.width as usize, grid.tile_rows.start as usize);
-    let mut color = cut(&mut frame.color, place);
-    let mut depth = cut(&mut frame.depth, place);
-    let mut alpha = cut(&mut frame.alpha, place);
-    let mut rgb = cut(&mut frame.levels.rgb, place);
-    let mut rgba = cut(&mut frame.levels.rgba, place);
-    let mut alpha_levels = cut(&mut frame.levels.alpha, place);
-    let mut blend = cut(&mut frame.blend, place);
-    let mut mask = cut(&mut frame.mask, place);
-    let row = |_| Part {
-        color: color(),
-        depth: depth(),
-        alpha: alpha(),
-        rgb: rgb(),
-        rgba: rgba(),
-        alpha_levels: alpha_levels(),
-        blend: blend(),
-        mask: mask(),
-        weights: None,
-    };
-    grid.tile_rows.clone().map(row).collect()
 }

@@ -1,7 +1,7 @@
 //! Stage 8, the end: from the sums of a tile to its pixels. What lies behind is put under colour,
 //! and numbers become levels where those are asked for. Shader: `shaders/rasterize.wgsl`
 
-use std::{ops::Range, slice::ChunksMut};
+use std::ops::Range;
 
 use super::{
     lanes::{LaneKernel, Lanes},
@@ -13,7 +13,7 @@ use super::{
     sky::Sky,
 };
 use crate::{
-    Labels, Samples,
+    Frame, Labels, Samples,
     constants::{HALF_LEVEL, TILE_SIZE},
     labels::{BLEND_WIDTH, WeightRows, selected},
     levels::level,
@@ -45,26 +45,63 @@ pub struct Part<'a> {
     pub weights: Option<WeightRows>,
 }
 
-/// Cuts rows of pixels into parts of `width` columns, from left to right.
-fn columns<'a, T>(rows: Pixels<'a, T>, width: usize) -> impl FnMut() -> Pixels<'a, T> {
-    let mut cut = rows.map(|rows| rows.into_iter().map(|row| row.chunks_mut(width)).collect());
+/// How large the pieces of a part are; the last one may be smaller.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Cut {
+    /// So many rows, from the top.
+    Rows(usize),
+    /// So many columns, from the left.
+    Columns(usize),
+}
+
+/// Gives rows of pixels piece by piece.
+fn pieces<'a, T>(mut all: Pixels<'a, T>, cut: Cut) -> impl FnMut() -> Pixels<'a, T> {
+    let left = |row: &mut &'a mut [T], width: usize| {
+        let whole = std::mem::take(row);
+        let (left, rest) = whole.split_at_mut(width.min(whole.len()));
+        *row = rest;
+        left
+    };
     move || {
-        let cut: &mut Vec<ChunksMut<'a, T>> = cut.as_mut()?;
-        Some(cut.iter_mut().filter_map(Iterator::next).collect())
+        let all = all.as_mut()?;
+        Some(match cut {
+            Cut::Rows(height) => all.drain(..height.min(all.len())).collect(),
+            Cut::Columns(width) => all.iter_mut().map(|row| left(row, width)).collect(),
+        })
     }
 }
 
 impl<'a> Part<'a> {
-    /// Cuts a part without weights into parts of `width` columns, the last one smaller.
-    pub(super) fn split(self, count: usize, width: usize) -> Vec<Self> {
-        let mut color = columns(self.color, width);
-        let mut depth = columns(self.depth, width);
-        let mut alpha = columns(self.alpha, width);
-        let mut rgb = columns(self.rgb, width);
-        let mut rgba = columns(self.rgba, width);
-        let mut alpha_levels = columns(self.alpha_levels, width);
-        let mut blend = columns(self.blend, width);
-        let mut mask = columns(self.mask, width);
+    /// The pictures of a frame from a row of pixels on, without weights.
+    pub(super) fn of(frame: &'a mut Frame, first: usize) -> Self {
+        fn rows<T>(all: &mut Option<Vec<T>>, (width, first): (usize, usize)) -> Pixels<'_, T> {
+            Some(all.as_mut()?.chunks_mut(width).skip(first).collect())
+        }
+        let place = (frame.width as usize, first);
+        let levels = &mut frame.levels;
+        Self {
+            color: rows(&mut frame.color, place),
+            depth: rows(&mut frame.depth, place),
+            alpha: rows(&mut frame.alpha, place),
+            rgb: rows(&mut levels.rgb, place),
+            rgba: rows(&mut levels.rgba, place),
+            alpha_levels: rows(&mut levels.alpha, place),
+            blend: rows(&mut frame.blend, place),
+            mask: rows(&mut frame.mask, place),
+            weights: None,
+        }
+    }
+
+    /// Cuts a part without weights into `count` pieces.
+    pub(super) fn split(self, count: usize, cut: Cut) -> Vec<Self> {
+        let mut color = pieces(self.color, cut);
+        let mut depth = pieces(self.depth, cut);
+        let mut alpha = pieces(self.alpha, cut);
+        let mut rgb = pieces(self.rgb, cut);
+        let mut rgba = pieces(self.rgba, cut);
+        let mut alpha_levels = pieces(self.alpha_levels, cut);
+        let mut blend = pieces(self.blend, cut);
+        let mut mask = pieces(self.mask, cut);
         let part = |_| Part {
             color: color(),
             depth: depth(),

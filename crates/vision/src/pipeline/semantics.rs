@@ -174,8 +174,9 @@ pub fn understand(
         crop_margin: f64::from(image.crop_margin),
         batch: image.batch,
     };
-    let mut semantics =
-        pipeline.workers.install(|| understand_with(&tools, input, options, watch))?;
+    // Not on a thread of the pool: one that waits for a network would be missing there, and one
+    // that waits for its own tasks might begin another job.
+    let mut semantics = understand_with(&tools, input, options, watch)?;
     semantics.report.bundle_sha256 = pipeline.bundle.sha256().to_owned();
     semantics.report.execution_provider = towers.provider().name().to_owned();
     Ok(semantics)

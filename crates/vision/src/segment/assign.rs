@@ -1,5 +1,7 @@
 //! Joins masks to whole objects and gives each pixel to one mask.
 
+use rayon::prelude::*;
+
 use crate::{
     scene::{IndexMap, MaskInfo, Photo, PhotoMasks},
     segment::{Bitset, PhotoGrid, Proposal, Proposals, Settings, filter::blank},
@@ -26,13 +28,17 @@ pub(super) fn one_a_pixel(
     let resample = (scale > 1).then(|| photo_grid.to_map([width, height]));
     let blank = blank(photo, [width, height]);
     let mut taken = blank.unwrap_or_else(|| Bitset::empty(cells));
-    let mut kept: Vec<(usize, Bitset)> = Vec::new();
-    for at in wholes {
+    let fine = |&at: &usize| {
         let proposal = &found.masks[at];
-        let mut mask = match &resample {
+        let mask = match &resample {
             Some(to) => Bitset::over(&to.apply(&proposal.logits.spread(photo_grid.grid)), 0.0),
             None => proposal.mask.clone(),
         };
+        (at, mask)
+    };
+    let fine: Vec<(usize, Bitset)> = wholes.par_iter().map(fine).collect();
+    let mut kept: Vec<(usize, Bitset)> = Vec::new();
+    for (at, mut mask) in fine {
         mask.subtract(&taken);
         let left = mask.count();
         if left > 0 && f64::from(left) >= settings.min_area * cells as f64 {

@@ -22,7 +22,7 @@ pub use self::{
     crops::Cutter,
     instances::{Box3, Components, Instance, InstanceOptions},
     palette::{colour, palette_table},
-    score::{Scorer, Scoring, TextScores, ViewNorms, mask_from_blend},
+    score::{Scorer, Scoring, TextScores, ViewNorms},
     views::{Views, merge},
 };
 

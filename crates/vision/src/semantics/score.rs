@@ -103,7 +103,8 @@ pub struct TextScores {
 
 impl TextScores {
     /// Tables to blend, one for each group of three phrases: `[M + 1]` rows of the coverage and
-    /// three scores. [`mask_from_blend`] reads the blended pictures.
+    /// three scores. A pixel is selected where its coverage reaches the floor, no blended score is
+    /// under 0 and not all of them are 0.
     #[must_use]
     pub fn tables(&self) -> Vec<Arc<[[f32; 4]]>> {
         #[expect(clippy::cast_possible_truncation, reason = "renderers blend f32")]
@@ -269,7 +270,15 @@ impl Scorer {
     /// `internal` when the arrays of `weights` do not belong together.
     pub fn norms(&self, weights: &PixelWeights) -> Result<ViewNorms> {
         weights.check()?;
-        let gram = self.gram.get_or_init(|| gram(&self.bank));
+        let gram = match self.gram.get() {
+            Some(gram) => gram,
+            None => {
+                // Not inside of the lock: a thread that waits for its part of the work may begin
+                // another text, which would wait for the lock.
+                let made = gram(&self.bank);
+                self.gram.get_or_init(|| made)
+            }
+        };
         let rows = self.rows();
         let inverse = (0..weights.pixels())
             .into_par_iter()
@@ -345,23 +354,6 @@ impl Scorer {
         };
         Ok((0..weights.pixels()).into_par_iter().with_min_len(PIXELS_EACH).map(inside).collect())
     }
-}
-
-/// `[P]` the mask of a text, from the blended pictures of [`TextScores::tables`], in their order.
-#[must_use]
-pub fn mask_from_blend(pictures: &[&[[f32; 4]]], scoring: &Scoring) -> Vec<bool> {
-    let pixels = pictures.iter().map(|picture| picture.len()).min().unwrap_or(0);
-    let inside = |p: usize| {
-        let (mut least, mut most) = (f32::INFINITY, f32::NEG_INFINITY);
-        let mut coverage = 0.0;
-        for [weight, scores @ ..] in pictures.iter().map(|picture| picture[p]) {
-            coverage = weight;
-            least = scores.into_iter().fold(least, f32::min);
-            most = scores.into_iter().fold(most, f32::max);
-        }
-        f64::from(coverage) >= scoring.coverage_floor && selected(least.into(), most.into())
-    };
-    (0..pixels).into_par_iter().with_min_len(PIXELS_EACH).map(inside).collect()
 }
 
 /// `[M]` dot products of the rows with a vector.

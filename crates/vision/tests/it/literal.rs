@@ -8,9 +8,9 @@ use std::sync::Arc;
 
 use segsplat_core::scene::{Bank, Gaussians, PixelWeights, ScoringProfile};
 use segsplat_render::{Labels, RenderRequest, Renderer, cpu::CpuRenderer};
-use segsplat_vision::semantics::{Scorer, Scoring, mask_from_blend};
+use segsplat_vision::semantics::{Scorer, Scoring};
 
-use segsplat_testing::labels::{alone, labelled, literal_of};
+use segsplat_testing::labels::{alone, labelled, literal_of, mask_of_blends};
 use segsplat_testing::scenes::{Random, camera, request};
 
 const DIM: usize = 48;
@@ -152,7 +152,7 @@ impl View<'_> {
             })
             .collect();
         let pictures: Vec<&[[f32; 4]]> = pictures.iter().map(Vec::as_slice).collect();
-        let blended = mask_from_blend(&pictures, scorer.scoring());
+        let blended = mask_of_blends(&pictures, scorer.scoring().coverage_floor());
         let listed = scorer.mask(&scores, &self.weights).expect("a mask");
         let norms = scorer.norms(&self.weights).expect("norms");
         let map = scorer.relevancy(&scores, &self.weights, &norms).expect("a relevancy");
@@ -272,7 +272,7 @@ fn a_scene_without_masks_is_legal_and_nothing_in_it_is_relevant() {
         let scores = scorer.text(&unit(&mut random)).expect("a text");
         let labels = Labels::Blend(Arc::clone(&scores.tables()[0]));
         let blend = renderer.render(&gaussians, &alone(&request, labels)).expect("a blend");
-        let mask = mask_from_blend(&[&blend.blend.expect("asked for")], scorer.scoring());
+        let mask = mask_of_blends(&[&blend.blend.expect("asked for")], FLOOR);
         let drawn = renderer.render(&gaussians, &alone(&request, Labels::Weights)).expect("E");
         let sparse = &drawn.weights.expect("asked for");
         let norms = scorer.norms(sparse).expect("norms");

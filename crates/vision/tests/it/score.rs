@@ -1,9 +1,14 @@
 //! Scores of a text, by numbers that are worked out by hand.
 
-use std::sync::Arc;
+use std::{
+    sync::{Arc, mpsc},
+    time::Duration,
+};
 
+use rayon::prelude::*;
 use segsplat_core::scene::{Bank, PixelWeights, ScoringProfile};
-use segsplat_vision::semantics::{Scorer, Scoring, ViewNorms, mask_from_blend};
+use segsplat_testing::labels::mask_of_blends;
+use segsplat_vision::semantics::{Scorer, Scoring, ViewNorms};
 
 fn scoring(profile: ScoringProfile, canon: &[[f32; 2]]) -> Arc<Scoring> {
     let canon = canon.iter().map(|c| c.to_vec()).collect();
@@ -120,7 +125,7 @@ fn the_worst_phrase_decides_and_blended_tables_say_the_same() {
         };
         let pictures: Vec<Vec<[f32; 4]>> = tables.iter().map(blend).collect();
         let pictures: Vec<&[[f32; 4]]> = pictures.iter().map(Vec::as_slice).collect();
-        let mask = mask_from_blend(&pictures, &scoring);
+        let mask = mask_of_blends(&pictures, scoring.coverage_floor());
         assert_eq!(mask, scorer.mask(&text, &view).unwrap(), "{count} phrases");
         assert!(mask[0] && !mask[3], "{count} phrases: {mask:?}");
         // Far from the text, but farther from every phrase.
@@ -167,4 +172,27 @@ fn what_does_not_belong_together_is_refused() {
     assert!(scorer.relevancy(&text, &view, &ViewNorms::default()).is_err());
     let broken = PixelWeights { offsets: vec![0, 2], entries: vec![1], weights: vec![0.5] };
     assert!(scorer.mask(&text, &broken).is_err() && scorer.norms(&broken).is_err());
+}
+
+#[test]
+fn texts_on_one_pool_do_not_wait_for_each_other() {
+    let (tell, told) = mpsc::channel();
+    // A thread of its own: it never ends where they do.
+    std::thread::spawn(move || {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(4).build().unwrap();
+        // The products take long enough for others to take a part of them.
+        let (dim, rows) = (1024, 256);
+        let rows: Vec<f32> = (0..dim * rows).map(|i| (i as f32).sin()).collect();
+        let bank = Bank { dim, rows };
+        let canon = vec![bank.row(0).to_vec()];
+        let scoring = Arc::new(Scoring::new(ScoringProfile::Paper, canon, 10.0, 0.05).unwrap());
+        let view = view(&[&[(1, 0.5), (7, 0.25)], &[(200, 1.0)]]);
+        for _ in 0..60 {
+            let scorer = Scorer::new(&bank, Arc::clone(&scoring)).unwrap();
+            let text = |_| drop(scorer.norms(&view).unwrap());
+            pool.install(|| (0..4).into_par_iter().with_max_len(1).for_each(text));
+        }
+        tell.send(()).unwrap();
+    });
+    told.recv_timeout(Duration::from_secs(120)).expect("the texts are scored");
 }

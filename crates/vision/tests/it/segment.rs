@@ -255,3 +255,16 @@ fn a_cancelled_scene_stops_and_a_senseless_decoder_is_named() {
     let masks = everything(&Broken(poison, [64, 64]), &photo(), &settings, &[], &cancel).unwrap();
     assert!(masks.masks.is_empty(), "numbers that are none are no masks");
 }
+
+#[test]
+fn masks_are_the_same_for_any_number_of_threads() {
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| run(&room(), &Settings::default(), &[]))
+    };
+    let alone = on(1);
+    for threads in [2, 5] {
+        let many = on(threads);
+        assert_eq!((&many.map, &many.masks), (&alone.map, &alone.masks), "{threads} threads");
+    }
+}
