@@ -1,4 +1,6 @@
-"""A real server, photos for it, and scenes. `SEGSPLAT_BIN` names the program."""
+"""A real server, photos for it, and scenes. `SEGSPLAT_BIN` names the program. It is run in the
+root of the repository, where it finds its networks.
+"""
 
 from __future__ import annotations
 
@@ -13,22 +15,13 @@ import pytest
 from segsplat import Client, Scene
 
 ROOT = Path(__file__).parents[3]
-PROGRAM = os.environ.get("SEGSPLAT_BIN", str(ROOT / "target/debug/segsplat"))
+PROGRAM = Path(os.environ.get("SEGSPLAT_BIN", ROOT / "target/debug/segsplat")).absolute()
 
 
 def run(*args: str | Path) -> str:
     """What the program writes."""
-    done = subprocess.run([PROGRAM, *args], env=settings(), stdout=subprocess.PIPE, check=True)
+    done = subprocess.run([PROGRAM, *args], cwd=ROOT, stdout=subprocess.PIPE, check=True)
     return done.stdout.decode()
-
-
-def settings() -> dict[str, str]:
-    """The surroundings of the program: its networks and its runtime, unless they are set."""
-    ours = {
-        "SEGSPLAT_BUNDLE": str(ROOT / "models/embedded"),
-        "SEGSPLAT_ORT_LIBRARY": str(ROOT / "target/ort/libonnxruntime.so"),
-    }
-    return {**ours, **os.environ}
 
 
 @contextmanager
@@ -37,7 +30,7 @@ def served(data: Path, *flags: str | Path) -> Iterator[str]:
     command = [PROGRAM, "serve", "--listen", "127.0.0.1:0", "--data-dir", data, *flags]
     with (
         (data.parent / f"{data.name}.log").open("w") as log,
-        subprocess.Popen(command, env=settings(), stdout=subprocess.PIPE, stderr=log) as server,
+        subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=log) as server,
     ):
         assert server.stdout
         try:

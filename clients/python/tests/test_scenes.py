@@ -94,7 +94,15 @@ def test_a_scene_that_fails_says_why(client: Client, photos: Path, tmp_path: Pat
     with pytest.raises(SegSplatError) as mirrored:
         client.scene(tmp_path)
     assert mirrored.value.code == "invalid_request" and "0001" in mirrored.value.message
-    # The form cannot be read: no camera description at all.
-    (tmp_path / "transforms.json").write_text("{}")
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["{}", "[]", "no json", '{"frames": [1]}', '{"frames": [{"file_path": "../outside.png"}]}'],
+)
+def test_a_description_is_read_before_photos_are_sent(tmp_path: Path, text: str) -> None:
+    (tmp_path / "outside.png").touch()
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "transforms.json").write_text(text)
     with pytest.raises(InvalidRequest):
-        client.scene(tmp_path)
+        Client("http://127.0.0.1:9").scene(tmp_path / "photos")

@@ -12,6 +12,7 @@ from ._version import __version__
 from .client import AsyncClient, AsyncScene, Client, Scene
 from .errors import *  # noqa: F403
 from .errors import __all__ as _errors
+from .gaussians import Gaussians
 from .types import (
     Box,
     Camera,
@@ -38,6 +39,7 @@ __all__ = [
     "Client",
     "Doubt",
     "Event",
+    "Gaussians",
     "Label",
     "Match",
     "Matches",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from typing_extensions import Unpack
 
 from .errors import BadAnswer, ConnectionLost, InvalidRequest, SceneNotFound, SegSplatError
+from .gaussians import Gaussians
 from .progress import show_bar
 from .types import (
     Camera,
@@ -84,31 +86,46 @@ def create(
 def parts_of(source: Source) -> list[Part]:
     """The parts of an upload. Photos are read while they are sent."""
     if isinstance(source, Mapping):
-        cameras = [{"file": str(file), **camera.to_json()} for file, camera in source.items()]
+        if not source:
+            raise InvalidRequest("there are no photos")
+        files = [Path(file).absolute() for file in source]
+        top = os.path.commonpath([file.parent for file in files])
+        names = [file.relative_to(top).as_posix() for file in files]
+        told = zip(names, source.values(), strict=True)
+        cameras = [{"file": name, **camera.to_json()} for name, camera in told]
         parts = [Part("cameras", "cameras.json", json.dumps({"cameras": cameras}).encode())]
-        return parts + [Part("photo", str(file), Path(file)) for file in source]
+        return parts + [Part("photo", *one) for one in zip(names, files, strict=True)]
     path = Path(source)
     if path.is_file():
         return [Part("archive", path.name, path)]
     for field in ("transforms", "cameras"):
         described = path / f"{field}.json"
         if described.is_file():
-            names = _files_of(json.loads(described.read_bytes()))
-            photos = [Part("photo", name, path / name) for name in names]
+            photos = [_photo(path, name) for name in _files_of(described)]
             return [Part(field, described.name, described), *photos]
     raise FileNotFoundError(
         f"{path}: no archive, and no folder with transforms.json or cameras.json"
     )
 
 
-def _files_of(cameras: Any) -> list[str]:
+def _photo(folder: Path, name: str) -> Part:
+    """A photo, which lies in the folder: a description from elsewhere must not send other files."""
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InvalidRequest(
+            f"photo {name!r}: the path must be relative and stay inside the folder"
+        )
+    return Part("photo", name, folder / name)
+
+
+def _files_of(described: Path) -> list[str]:
     """The photos that a camera description names."""
     try:
+        cameras = json.loads(described.read_bytes())
         if "frames" in cameras:
             return [frame["file_path"] for frame in cameras["frames"]]
         return [camera["file"] for camera in cameras["cameras"]]
-    except (KeyError, TypeError) as wrong:
-        raise InvalidRequest(f"the camera description lacks {wrong}") from wrong
+    except (ValueError, KeyError, TypeError) as wrong:
+        raise InvalidRequest(f"{described.name}: {type(wrong).__name__}: {wrong}") from wrong
 
 
 def scenes(policy: Policy, page: int | None) -> Flow[None]:
@@ -349,6 +366,13 @@ def pick(
 
 
 # Files
+
+
+def gaussians(scene: Handle, text: str | None = None) -> Flow[Gaussians]:
+    """The Gaussians of the scene, or those that a text selects, as arrays."""
+    params = _query_string({"format": "ply", "text": text})
+    request = Request("GET", f"/v1/scenes/{scene.id}/export", params=params)
+    return Gaussians.of_ply((yield from send(scene.policy, request)).body)
 
 
 def export(

@@ -403,6 +403,7 @@ class Scene(_Scene):
     query = _now(calls.query)
     pick = _now(calls.pick)
     export = _now(calls.export)
+    gaussians = _now(calls.gaussians)
     events = _many(calls.events, Event)
     views = _many(calls.views, View)
 
@@ -424,5 +425,6 @@ class AsyncScene(_Scene):
     query = _later(calls.query)
     pick = _later(calls.pick)
     export = _later(calls.export)
+    gaussians = _later(calls.gaussians)
     events = _many_later(calls.events, Event)
     views = _many_later(calls.views, View)
