@@ -187,11 +187,13 @@ def cut(length: int) -> Answering:
 def test_views_go_on_where_a_stream_broke(scene: Scene, url: str, slept: list[float]) -> None:
     spots: list[Any] = [{"from_": 0, "to": 1, "t": i / 9} for i in range(10)]
     whole = [view.image for view in scene.views(spots, width=32)]
-    faulty = Faulty("/views", cut(0), cut(9_000), cut(9_000))
+    line = {"content-type": "multipart/mixed; boundary=x"}
+    ended = httpx.Response(200, headers=line, content=b"--x--\r\n")
+    faulty = Faulty("/views", cut(0), cut(9_000), cut(9_000), ended)
     again = Client(url, transport=faulty).get(scene.id)
     views = [view.image for view in again.views(spots, width=32)]
     assert np.array_equal(views, whole)
-    assert len(faulty.seen) == 4 and len(slept) == 3
+    assert len(faulty.seen) == 5 and len(slept) == 4
 
 
 def test_views_go_on_after_a_fault_in_the_stream(
@@ -217,9 +219,9 @@ def test_views_go_on_after_a_fault_in_the_stream(
 def test_events_and_exports_begin_again(
     scene: Scene, url: str, slept: list[float], tmp_path: Path
 ) -> None:
-    faulty = Faulty("/events", cut(0), cut(11))
+    faulty = Faulty("/events", cut(0), cut(11), httpx.Response(200, content=b""))
     again = Client(url, transport=faulty).get(scene.id)
-    assert [event.event for event in again.events()] == ["done"] and len(slept) == 2
+    assert [event.event for event in again.events()] == ["done"] and len(slept) == 3
     faulty = Faulty("/export", cut(100_000))
     again = Client(url, transport=faulty).get(scene.id)
     whole = scene.export(path=tmp_path / "whole.ply").read_bytes()
@@ -228,6 +230,14 @@ def test_events_and_exports_begin_again(
     with pytest.raises(segsplat.ConnectionLost):
         again.export(path=tmp_path / "never.ply")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["again.ply", "whole.ply"]
+
+
+def test_a_scene_that_failed_raises_its_code(scene: Scene, url: str) -> None:
+    told = b'data: {"event":"failed","code":"deadline_exceeded","message":"over 600 s"}\n\n'
+    faulty = Faulty("/events", httpx.Response(200, content=b"event: failed\n" + told))
+    with pytest.raises(segsplat.DeadlineExceeded, match="over 600 s") as failed:
+        Client(url, transport=faulty).get(scene.id).wait()
+    assert failed.value.scene == scene.id
 
 
 def test_a_server_that_is_not_there(slept: list[float]) -> None:

@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 
-from segsplat import Client, Event, InvalidRequest, Scene, SceneNotFound, SegSplatError
+from segsplat import Cancelled, Client, Event, InvalidRequest, Scene, SceneNotFound, SegSplatError
 
 
 def test_a_scene_tells_how_it_was_made(scene: Scene, client: Client) -> None:
@@ -94,6 +94,12 @@ def test_a_scene_that_fails_says_why(client: Client, photos: Path, tmp_path: Pat
     with pytest.raises(SegSplatError) as mirrored:
         client.scene(tmp_path)
     assert mirrored.value.code == "invalid_request" and "0001" in mirrored.value.message
+    # One that is deleted while it is being made.
+    scene = client.scene(photos, wait=False)
+    stop = iter([scene.delete])
+    with pytest.raises(Cancelled) as stopped:
+        scene.wait(lambda _: next(stop, lambda: None)())
+    assert stopped.value.scene == scene.id
 
 
 @pytest.mark.parametrize(
