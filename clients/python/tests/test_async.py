@@ -9,7 +9,7 @@ import anyio
 import numpy as np
 import pytest
 
-from segsplat import AsyncClient, AsyncScene, Client, Scene, SceneNotFound
+from segsplat import AsyncClient, AsyncScene, Client, Scene, SceneNotFound, Viewpoint
 
 
 def test_both_clients_have_the_same_calls() -> None:
@@ -59,17 +59,20 @@ def test_many_at_once(scene: Scene, url: str) -> None:
     async def ask() -> None:
         async with AsyncClient(url) as client:
             twin = await client.get(scene.id)
-            views = {}
+            drawn = {}
 
-            async def draw(i: int) -> None:
-                views[i] = await twin.view(from_=0, to=1, t=i / 7, width=32)
+            async def draw(task: int) -> None:
+                spots: list[Viewpoint] = [
+                    {"from_": 0, "to": 1, "t": (4 * task + i) / 15} for i in range(4)
+                ]
+                drawn[task] = [view.image async for view in twin.views(spots, width=32)]
 
             async with anyio.create_task_group() as group:
-                for i in range(8):
-                    group.start_soon(draw, i)
-            for i in range(8):
-                same = scene.view(from_=0, to=1, t=i / 7, width=32)
-                assert np.array_equal(views[i].image, same.image)
+                for task in range(4):
+                    group.start_soon(draw, task)
+            for i in range(16):
+                same = scene.view(from_=0, to=1, t=i / 15, width=32)
+                assert np.array_equal(drawn[i // 4][i % 4], same.image)
 
     anyio.run(ask)
 
