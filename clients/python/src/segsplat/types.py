@@ -39,10 +39,9 @@ def _hints(kind: Any) -> dict[str, Any]:
 def _value(hint: Any, value: Any) -> Any:
     if isinstance(hint, types.UnionType):  # X | None
         return None if value is None else _value(hint.__args__[0], value)
-    origin = typing.get_origin(hint)
-    if origin is tuple:
+    if typing.get_origin(hint) is tuple:
         return tuple(_value(hint.__args__[0], one) for one in value)
-    if origin is np.ndarray:
+    if hint == Floats:
         return np.asarray(value, np.float64)
     if hint is Camera:
         return Camera.of_json(value)
