@@ -2,6 +2,8 @@
 # make serve   the server on 127.0.0.1:8080; flags: make serve ARGS='--listen 0.0.0.0:8080'
 # make check   format, lints and the fast tests: the loop while you work
 # make test    everything that CI checks: format, lints, docs, all tests, licences
+# make client   the Python client: its types, and its tests with a real server (SEGSPLAT_BIN=file: a
+#               program that is built already)
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
 # make eval-scenes   labelled scenes of held-out things, rendered to target/eval/scenes (g++, PYTHON)
 # make report   the tables of docs/benchmarks.md from benches/runs
@@ -20,7 +22,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: client demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -59,6 +61,18 @@ FUZZ_SECONDS ?= 600
 fuzz: setup
 	FUZZ_SECONDS=$(FUZZ_SECONDS) FUZZ_SEED=$$(date +%s) $(CARGO) test --locked --release --test slow \
 		fuzz_input:: -- --nocapture --test-threads=1
+
+# Debian's python3 has no venv; pip brings virtualenv.
+CLIENT := $(abspath $(TARGET))/client
+client: $(if $(SEGSPLAT_BIN),,setup)
+	$(if $(SEGSPLAT_BIN),,$(CARGO) build --locked)
+	python3 -m pip install --quiet --disable-pip-version-check --upgrade --target $(CLIENT)/tools \
+		$$(grep '^virtualenv' clients/python/tests/requirements.txt)
+	PYTHONPATH=$(CLIENT)/tools python3 -m virtualenv --quiet $(CLIENT)/venv
+	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check -e clients/python \
+		-r clients/python/tests/requirements.txt
+	cd clients/python && SEGSPLAT_BIN=$(abspath $(or $(SEGSPLAT_BIN),$(TARGET)/debug/segsplat)) \
+		$(CLIENT)/venv/bin/python -m pytest
 
 bench: setup
 	$(CARGO) bench --locked

@@ -1,0 +1,57 @@
+"""Client of SegSplat Server: photos with known cameras in, views, depth and text masks out.
+
+>>> from segsplat import Client
+>>> scene = Client().scene("photos/")
+>>> scene.view(from_=0, to=1, t=0.5).save("view.png")
+
+Frames and units: the world is that of the uploaded cameras, in their units. Cameras are OpenCV: x
+right, y down, z forward. Arrays are [height, width]. The centre of the first pixel is (0.5, 0.5).
+"""
+
+from ._version import __version__
+from .client import AsyncClient, AsyncScene, Client, Scene
+from .errors import *  # noqa: F403
+from .errors import __all__ as _errors
+from .gaussians import Gaussians
+from .types import (
+    Box,
+    Camera,
+    Doubt,
+    Event,
+    Label,
+    Match,
+    Matches,
+    Models,
+    Photo,
+    Picked,
+    Report,
+    SceneStatus,
+    Semantics,
+    Viewpoint,
+)
+from .view import View
+
+__all__ = [
+    "AsyncClient",
+    "AsyncScene",
+    "Box",
+    "Camera",
+    "Client",
+    "Doubt",
+    "Event",
+    "Gaussians",
+    "Label",
+    "Match",
+    "Matches",
+    "Models",
+    "Photo",
+    "Picked",
+    "Report",
+    "Scene",
+    "SceneStatus",
+    "Semantics",
+    "View",
+    "Viewpoint",
+    "__version__",
+]
+__all__ += _errors

@@ -1,0 +1,483 @@
+"""Every call, written once: what is sent and what the answer means. `client.py` runs them."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+from uuid import uuid4
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import Unpack
+
+from .errors import BadAnswer, ConnectionLost, InvalidRequest, SceneNotFound, SegSplatError
+from .gaussians import Gaussians
+from .progress import show_bar
+from .types import (
+    Camera,
+    Event,
+    Kind,
+    Matches,
+    Models,
+    Photo,
+    Picked,
+    QueryCall,
+    SceneOptions,
+    SceneStatus,
+    ViewCall,
+    Viewpoint,
+    ViewsCall,
+    parse,
+)
+from .view import FORMATS, View, picture
+from .wire import Flow, Item, Multipart, Part, Policy, Read, Request, ServerSentEvents, pause, send
+
+#: Cameras of one call; more go as more calls.
+CAMERAS_MAX = 64
+
+#: A folder with photos and `transforms.json` or `cameras.json`; an archive of one; or photos and
+#: their cameras.
+Source: TypeAlias = str | Path | Mapping[str | Path, Camera]
+#: A scene as the server shows it.
+Shown: TypeAlias = tuple[SceneStatus, tuple[Photo, ...]]
+#: Who is told of each event; True for a bar on standard error; None for a bar on terminals alone.
+Progress: TypeAlias = Callable[[Event], None] | bool | None
+Kinds: TypeAlias = Kind | Sequence[Kind]
+
+
+class Handle:
+    """A scene as calls know it."""
+
+    def __init__(self, policy: Policy, shown: Shown) -> None:
+        self.policy = policy
+        self.shown = shown
+
+    @property
+    def id(self) -> str:
+        """32 hex digits."""
+        return self.shown[0].id
+
+
+# Scenes
+
+
+def create(
+    policy: Policy,
+    source: Source,
+    options: SceneOptions,
+    idempotency_key: str | None,
+) -> Flow[Shown]:
+    """Uploads photos. A second try never makes a second scene: both carry one key."""
+    request = Request(
+        "POST",
+        "/v1/scenes",
+        params=dict(options),
+        upload=parts_of(source),
+        headers={"idempotency-key": idempotency_key or str(uuid4())},
+    )
+    answer = yield from send(policy, request)
+    return parse(SceneStatus, _json(answer.body)), ()
+
+
+def parts_of(source: Source) -> list[Part]:
+    """The parts of an upload. Photos are read while they are sent."""
+    if isinstance(source, Mapping):
+        if not source:
+            raise InvalidRequest("there are no photos")
+        files = [Path(file).absolute() for file in source]
+        top = os.path.commonpath([file.parent for file in files])
+        names = [file.relative_to(top).as_posix() for file in files]
+        told = zip(names, source.values(), strict=True)
+        cameras = [{"file": name, **camera.to_json()} for name, camera in told]
+        parts = [Part("cameras", "cameras.json", json.dumps({"cameras": cameras}).encode())]
+        return parts + [Part("photo", *one) for one in zip(names, files, strict=True)]
+    path = Path(source)
+    if path.is_file():
+        return [Part("archive", path.name, path)]
+    for field in ("transforms", "cameras"):
+        described = path / f"{field}.json"
+        if described.is_file():
+            photos = [_photo(path, name) for name in _files_of(described)]
+            return [Part(field, described.name, described), *photos]
+    raise FileNotFoundError(
+        f"{path}: no archive, and no folder with transforms.json or cameras.json"
+    )
+
+
+def _photo(folder: Path, name: str) -> Part:
+    """A photo, which lies in the folder: a description from elsewhere must not send other files."""
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise InvalidRequest(
+            f"photo {name!r}: the path must be relative and stay inside the folder"
+        )
+    return Part("photo", name, folder / name)
+
+
+def _files_of(described: Path) -> list[str]:
+    """The photos that a camera description names."""
+    try:
+        cameras = json.loads(described.read_bytes())
+        if "frames" in cameras:
+            return [frame["file_path"] for frame in cameras["frames"]]
+        return [camera["file"] for camera in cameras["cameras"]]
+    except (ValueError, KeyError, TypeError) as wrong:
+        raise InvalidRequest(f"{described.name}: {type(wrong).__name__}: {wrong}") from wrong
+
+
+def scenes(policy: Policy, page: int | None) -> Flow[None]:
+    """Items: each scene as shown, newest first, page by page."""
+    params: dict[str, Any] = {} if page is None else {"limit": page}
+    while True:
+        data = _json((yield from send(policy, Request("GET", "/v1/scenes", params=params))).body)
+        for scene in data["scenes"]:
+            yield Item((parse(SceneStatus, scene), ()))
+        if not data.get("next"):
+            return
+        params["after"] = data["next"]
+
+
+def models(policy: Policy) -> Flow[Models]:
+    """What makes the scenes: networks, renderer, version."""
+    answer = yield from send(policy, Request("GET", "/v1/models"))
+    return parse(Models, _json(answer.body))
+
+
+def get(policy: Policy, id: str) -> Flow[Shown]:
+    """The scene of an id: its status and its photos."""
+    data = _json((yield from send(policy, Request("GET", f"/v1/scenes/{id}"))).body)
+    photos = (Photo(camera["file"], Camera.of_json(camera)) for camera in data.get("cameras", []))
+    return parse(SceneStatus, data), tuple(photos)
+
+
+def refresh(scene: Handle) -> Flow[None]:
+    """Asks the server for the present status, report and photos."""
+    scene.shown = yield from get(scene.policy, scene.id)
+
+
+def delete(scene: Handle) -> Flow[None]:
+    """Deletes the scene, and stops it where it is being made."""
+    lost = False
+    for again in range(scene.policy.retries + 1):
+        try:
+            yield from send(Policy(0, 0, False), Request("DELETE", f"/v1/scenes/{scene.id}"))
+            return
+        except SceneNotFound:
+            # The answer to the first try was lost.
+            if lost:
+                return
+            raise
+        except SegSplatError as error:
+            lost = isinstance(error, ConnectionLost)
+            yield from pause(scene.policy, error, again)
+
+
+def events(scene: Handle, tell: Callable[[Event], None] | None = None) -> Flow[None]:
+    """Items: what happens to the scene, from its present state to its last event."""
+    again = 0
+    while True:
+        try:
+            request = Request("GET", f"/v1/scenes/{scene.id}/events", stream=True)
+            yield from send(scene.policy, request)
+            reader = ServerSentEvents()
+            while piece := (yield Read()):
+                for data in reader.feed(piece):
+                    again, event = 0, parse(Event, _json(data))
+                    if tell:
+                        tell(event)
+                    else:
+                        yield Item(event)
+                    if event.is_last:
+                        return
+            raise ConnectionLost("the events broke off")
+        except ConnectionLost as lost:
+            yield from pause(scene.policy, lost, again)
+            again += 1
+
+
+def wait(scene: Handle, progress: Progress = None) -> Flow[None]:
+    """Waits until the scene is made; raises why it was not.
+
+    progress: True shows a bar; a function is told of each event; by default a bar on terminals.
+    """
+    if progress is None:
+        progress = sys.stderr.isatty()
+    show = show_bar if progress is True else progress or None
+    last: list[Event] = []
+
+    def tell(event: Event) -> None:
+        last[:] = [event]
+        if show:
+            show(event)
+
+    yield from events(scene, tell)
+    if last[0].event != "done":
+        code = last[0].code or "cancelled"
+        kind = SegSplatError.of_code.get(code, SegSplatError)
+        raise kind(last[0].message or "the scene was stopped", code=code, scene=scene.id)
+    yield from refresh(scene)
+
+
+# Views
+
+
+def view(
+    scene: Handle, kinds: Kinds = "color", *, text: str | None = None, **options: Unpack[ViewCall]
+) -> Flow[View]:
+    """Draws the scene from one camera.
+
+    kinds: "color", "depth", "alpha", "semantics", and with a `text` "relevancy" and "mask"; one or
+        several, which are drawn once.
+    from_, to, t: between two photos; by default at the first photo.
+    eye, target, up: at a point (world units), looking at another.
+    camera_to_world: [4, 4] pose, OpenCV (x right, y down, z forward), world of the upload.
+    K, fov, camera: the lens: [3, 3] in pixels; or vertical degrees; or a whole `Camera`.
+    width, height: pixels.
+    """
+    asked = _kinds(kinds)
+    spot, rest = _split(dict(options))
+    if len(asked) > 1:
+        found: list[View] = []
+        yield from _views(scene, [_camera(spot)], asked, text, rest, found.append)
+        return found[0]
+    fields = {**_camera(spot), **_drawing(rest), "text": text, "kind": asked[0]}
+    fields["format"] = FORMATS.get(asked[0], "npy")
+    request = Request("GET", f"/v1/scenes/{scene.id}/view", params=_query_string(fields))
+    answer = yield from send(scene.policy, request)
+    camera, array = picture(asked[0], answer.headers, answer.body)
+    return View(camera, {asked[0]: array})
+
+
+def views(
+    scene: Handle,
+    viewpoints: Iterable[Viewpoint],
+    kinds: Kinds = "color",
+    *,
+    text: str | None = None,
+    **options: Unpack[ViewsCall],
+) -> Flow[None]:
+    """Iterates over the views from many cameras, in their order, as they are made.
+
+    viewpoints: any number of `{"from_": 0, "to": 1, "t": 0.5}`, `{"eye": …, "target": …}` and so
+        on: the camera's options of `view`.
+    """
+    cameras = [_camera(dict(spot)) for spot in viewpoints]
+    for start in range(0, len(cameras), CAMERAS_MAX):
+        batch = cameras[start : start + CAMERAS_MAX]
+        yield from _views(scene, batch, _kinds(kinds), text, _drawing(dict(options)), None)
+
+
+def _views(
+    scene: Handle,
+    cameras: list[dict[str, Any]],
+    kinds: list[Kind],
+    text: str | None,
+    options: dict[str, Any],
+    take: Callable[[View], None] | None,
+) -> Flow[None]:
+    """Items: a view for each camera. What a fault leaves undone is asked for again."""
+    path = f"/v1/scenes/{scene.id}/views"
+    formats = {FORMATS.get(kind, "npy") for kind in kinds}
+    body = {**_drawing(options), "kinds": kinds, "text": text}
+    body["format"] = formats.pop() if len(formats) == 1 else "npy"
+    done = again = 0
+    while done < len(cameras):
+        request = Request(
+            "POST", path, json=_given({**body, "cameras": cameras[done:]}), stream=True
+        )
+        try:
+            answer = yield from send(scene.policy, request)
+            reader = Multipart(answer.headers.get("content-type", ""))
+            arrays: dict[Kind, NDArray[Any]] = {}
+            while piece := (yield Read()):
+                for headers, content in reader.feed(piece):
+                    if headers.get("content-type") == "application/json":
+                        raise _in_between(content)
+                    kind = kinds[len(arrays)]
+                    camera, arrays[kind] = picture(kind, headers, content)
+                    if len(arrays) < len(kinds):
+                        continue
+                    done, again = done + 1, 0
+                    drawn, arrays = View(camera, arrays), {}
+                    if take:
+                        take(drawn)
+                    else:
+                        yield Item(drawn)
+            if done < len(cameras):
+                raise ConnectionLost(f"the answer broke off before view {done}")
+        except SegSplatError as error:
+            yield from pause(scene.policy, error, again)
+            again += 1
+
+
+def _in_between(content: bytes) -> SegSplatError:
+    """The error in the middle of a stream, which does not say when to try again."""
+    told = _json(content)
+    kind = SegSplatError.of_code.get(told["code"], SegSplatError)
+    return kind(told["message"], code=told["code"], retry_after=1.0)
+
+
+# Texts
+
+
+def query(
+    scene: Handle,
+    *texts: str,
+    masks: bool = True,
+    boxes: Literal["oriented", "aligned", "none"] = "oriented",
+    **options: Unpack[QueryCall],
+) -> Flow[Matches]:
+    """Asks where things are: boxes and Gaussians in 3D, and masks in one view.
+
+    texts: 1 to 128.
+    masks: False asks in 3D alone, which draws nothing.
+    boxes: along the part's own axes, those of the world, or none.
+    from_, eye, camera, width and so on: the view of the masks, as in `view`; by default that of the
+        first photo.
+    """
+    spot, rest = _split(dict(options))
+    fields = {**_drawing(rest), "texts": texts, "boxes": boxes, "mask": "rle" if masks else "none"}
+    if masks:
+        camera = _camera(spot)
+        # The size belongs to the drawing.
+        fields.update({side: camera.pop(side) for side in ("width", "height") if side in camera})
+        fields["camera"] = camera
+    request = Request("POST", f"/v1/scenes/{scene.id}/query", json=_given(fields))
+    return Matches(_json((yield from send(scene.policy, request)).body))
+
+
+def pick(
+    scene: Handle, x: float, y: float, *, labels: Sequence[str] = (), **options: Unpack[QueryCall]
+) -> Flow[Picked]:
+    """Says what is under a pixel of a view: depth, point, Gaussian, and which label names it best.
+
+    x, y: pixels of the view; the centre of the first is (0.5, 0.5).
+    labels: texts that may name it.
+    from_, eye, camera, width and so on: the view, as in `view`; by default that of the first photo.
+    """
+    spot, rest = _split(dict(options))
+    fields = {**_camera(spot), **_drawing(rest), "x": x, "y": y, "label": list(labels)}
+    params = _query_string(fields)
+    request = Request("GET", f"/v1/scenes/{scene.id}/pick", params=params)
+    return parse(Picked, _json((yield from send(scene.policy, request)).body))
+
+
+# Files
+
+
+def gaussians(scene: Handle, text: str | None = None) -> Flow[Gaussians]:
+    """The Gaussians of the scene, or those that a text selects, as arrays."""
+    params = _query_string({"format": "ply", "text": text})
+    request = Request("GET", f"/v1/scenes/{scene.id}/export", params=params)
+    return Gaussians.of_ply((yield from send(scene.policy, request)).body)
+
+
+def export(
+    scene: Handle,
+    format: Literal["ply"] = "ply",
+    path: str | Path | None = None,
+    *,
+    text: str | None = None,
+) -> Flow[Path]:
+    """Writes the scene, or what a text selects of it, to a file as it comes, and tells its path.
+
+    format: "ply", as 3DGS writes it.
+    path: by default the scene's id with the format as its ending, in the current folder.
+    """
+    target = Path(path) if path is not None else Path(f"{scene.id}.{format}")
+    part = target.with_name(target.name + ".part")
+    params = _query_string({"format": format, "text": text})
+    request = Request("GET", f"/v1/scenes/{scene.id}/export", params=params, stream=True)
+    for again in range(scene.policy.retries + 1):
+        try:
+            yield from send(scene.policy, request)
+            with part.open("wb") as file:
+                while piece := (yield Read()):
+                    file.write(piece)
+            return part.replace(target)
+        except ConnectionLost as lost:
+            yield from pause(scene.policy, lost, again)
+        finally:
+            part.unlink(missing_ok=True)
+    raise AssertionError("unreachable")
+
+
+# Fields of requests
+
+
+def _json(data: str | bytes) -> Any:
+    try:
+        return json.loads(data)
+    except ValueError as wrong:
+        raise BadAnswer(f"the answer is no JSON: {data[:100]!r}") from wrong
+
+
+def _given(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields that are not None."""
+    return {name: value for name, value in fields.items() if value is not None}
+
+
+def _kinds(kinds: Kinds) -> list[Kind]:
+    asked: list[Kind] = [kinds] if isinstance(kinds, str) else list(dict.fromkeys(kinds))
+    if not asked:
+        raise ValueError("kinds is empty")
+    return asked
+
+
+def _split(options: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The camera's options, and the others."""
+    spot = {name: options.pop(name) for name in Viewpoint.__optional_keys__ if name in options}
+    return spot, options
+
+
+def _camera(spot: Mapping[str, Any]) -> dict[str, Any]:
+    """The server's fields of a camera."""
+    fields: dict[str, Any] = {}
+    rest = dict(spot)
+    if camera := rest.pop("camera", None):
+        fields.update(width=camera.width, height=camera.height)
+        rest = {"K": camera.K, "camera_to_world": camera.camera_to_world, **rest}
+    if (k := rest.pop("K", None)) is not None:
+        k = _numbers("K", k, (3, 3))
+        fields.update(fx=k[0][0], fy=k[1][1], cx=k[0][2], cy=k[1][2])
+    if (pose := rest.pop("camera_to_world", None)) is not None:
+        fields["camera_to_world"] = sum(_numbers("camera_to_world", pose, (4, 4)), [])
+    for name in ("eye", "target", "up"):
+        if (point := rest.pop(name, None)) is not None:
+            fields[name] = _numbers(name, point, (3,))
+    if not fields.keys() & {"camera_to_world", "eye"}:
+        fields["from"] = rest.pop("from_", 0)
+    elif "from_" in rest:
+        fields["from"] = rest.pop("from_")
+    return {**fields, **rest}
+
+
+def _numbers(name: str, value: Any, shape: tuple[int, ...]) -> Any:
+    array = np.asarray(value, np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{name} has the shape {list(array.shape)}, not {list(shape)}")
+    return array.tolist()
+
+
+def _drawing(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The server's fields of how a view is drawn and a text is scored."""
+    fields = dict(options)
+    if (seconds := fields.pop("wait", None)) is not None:
+        fields["wait_ms"] = round(1000 * seconds)
+    return fields
+
+
+def _query_string(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Numbers joined by commas; lists of texts as they are, each under its name."""
+
+    def text(value: Any) -> Any:
+        if isinstance(value, bool):
+            return "true" if value else "false"
+        if isinstance(value, (list, tuple)) and not all(isinstance(one, str) for one in value):
+            return ",".join(str(one) for one in value)
+        return value
+
+    return {name: text(value) for name, value in _given(fields).items()}

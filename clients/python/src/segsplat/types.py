@@ -1,0 +1,492 @@
+"""What the server tells, as plain typed data. Unknown fields of newer servers are left out."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Literal, TypeAlias, TypeVar, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from typing_extensions import TypedDict
+
+from .png import encode_png
+
+Floats: TypeAlias = NDArray[np.float64]
+Kind = Literal["color", "depth", "alpha", "semantics", "relevancy", "mask"]
+Profile = Literal["default", "paper"]
+State = Literal["queued", "running", "done", "failed", "cancelled"]
+
+T = TypeVar("T")
+
+
+def parse(kind: type[T], data: Mapping[str, Any]) -> T:
+    """A dataclass of this kind from the JSON object of the same field names."""
+    hints = _hints(typing.cast(Any, kind))
+    return kind(**{name: _value(hints[name], data[name]) for name in hints if name in data})
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    hints = typing.get_type_hints(kind)
+    return {f.name: hints[f.name] for f in dataclasses.fields(kind)}
+
+
+def _value(hint: Any, value: Any) -> Any:
+    if isinstance(hint, types.UnionType):  # X | None
+        return None if value is None else _value(hint.__args__[0], value)
+    if typing.get_origin(hint) is tuple:
+        return tuple(_value(hint.__args__[0], one) for one in value)
+    if hint == Floats:
+        return np.asarray(value, np.float64)
+    if hint is Camera:
+        return Camera.of_json(value)
+    if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+        return parse(hint, value)
+    return value
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera. OpenCV: x right, y down, z forward; world frame of the upload."""
+
+    #: [3, 3] intrinsics in pixels; the centre of the first pixel is (0.5, 0.5).
+    K: Floats
+    #: [4, 4] rigid pose.
+    camera_to_world: Floats
+    #: Pixels.
+    width: int
+    #: Pixels.
+    height: int
+
+    @staticmethod
+    def of_json(data: Mapping[str, Any]) -> Camera:
+        """From the server's `{"intrinsics", "camera_to_world"}`."""
+        lens = data["intrinsics"]
+        return Camera(
+            intrinsics(lens["fx"], lens["fy"], lens["cx"], lens["cy"]),
+            np.reshape(np.asarray(data["camera_to_world"], np.float64), (4, 4)),
+            lens["width"],
+            lens["height"],
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """As `cameras.json` has it."""
+        k = np.asarray(self.K, np.float64)
+        lens = {"fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2], "cy": k[1, 2]}
+        pose = np.asarray(self.camera_to_world, np.float64)
+        return {
+            "intrinsics": {**lens, "width": self.width, "height": self.height},
+            "camera_to_world": pose.reshape(16).tolist(),
+        }
+
+    def project(self, points: ArrayLike) -> Floats:
+        """[N, 2] pixels of [N, 3] world points; NaN where a point is not in front."""
+        world = np.asarray(points, np.float64).reshape(-1, 3)
+        rotation, centre = self.camera_to_world[:3, :3], self.camera_to_world[:3, 3]
+        seen = (world - centre) @ rotation @ self.K.T
+        depth = np.where(seen[:, 2:] > 0, seen[:, 2:], np.nan)
+        return np.asarray(seen[:, :2] / depth)
+
+    def unproject(self, depth: ArrayLike) -> Floats:
+        """[H, W, 3] world points of [H, W] depths along the axis; NaN where the depth is 0."""
+        z = np.asarray(depth, np.float64)
+        v, u = np.indices(z.shape) + 0.5
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(self.K).T
+        there = rays * np.where(z > 0, z, np.nan)[..., None]
+        return np.asarray(
+            there @ self.camera_to_world[:3, :3].T + self.camera_to_world[:3, 3], np.float64
+        )
+
+
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Floats:
+    """The [3, 3] matrix."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
+
+
+class Viewpoint(TypedDict, total=False):
+    """Where to look from. One pose: `camera`, `camera_to_world`, `eye` or `from_`; without any, the
+    first photo's. One lens: `camera`, `K` or `fov`; without any, the photos'.
+    """
+
+    #: Pose, lens and size in one.
+    camera: Camera
+    #: [4, 4], OpenCV, world frame of the upload.
+    camera_to_world: ArrayLike
+    #: [3, 3] in pixels of the picture asked for.
+    K: ArrayLike
+    #: Vertical field of view, degrees.
+    fov: float
+    #: [3] camera centre, world units; goes with `target`.
+    eye: ArrayLike
+    #: [3] point in the middle of the picture.
+    target: ArrayLike
+    #: [3] up in the picture; as in the photos by default.
+    up: ArrayLike
+    #: Index of a photo.
+    from_: int
+    #: Index of another photo.
+    to: int
+    #: 0 at `from_`, 1 at `to`.
+    t: float
+
+
+class Drawing(TypedDict, total=False):
+    """How a view is drawn."""
+
+    #: Pixels; by default at most 384, in the photos' shape.
+    width: int
+    #: Pixels.
+    height: int
+    #: Opacity compensated for the blur of small Gaussians.
+    antialiased: bool
+    #: Near plane, world units.
+    near: float
+    #: "fast" may leave out precision within a stated bound.
+    quality: Literal["exact", "fast"]
+
+
+class ViewOptions(Drawing, total=False):
+    """How a view is drawn, and over what."""
+
+    #: "backdrop", "black", "white", "#rrggbb" or [3] of 0 to 1.
+    background: str | Sequence[float]
+    #: First column, first row, width, height of the part that is drawn, pixels.
+    crop: tuple[int, int, int, int]
+
+
+class TextOptions(TypedDict, total=False):
+    """How a text is scored."""
+
+    #: "paper" scores as the paper does.
+    profile: Profile
+    #: Seconds to wait for semantics that are being made; the server's limit by default.
+    wait: float
+
+
+class ViewCall(Viewpoint, ViewOptions, TextOptions, total=False):
+    """Options of one view."""
+
+
+class ViewsCall(ViewOptions, TextOptions, total=False):
+    """Options of many views."""
+
+
+class QueryCall(Viewpoint, Drawing, TextOptions, total=False):
+    """Options of a query or a pick."""
+
+
+class SceneOptions(TypedDict, total=False):
+    """How a scene is made."""
+
+    #: When texts can be asked: "lazy" from the first one on, "eager" at once, "off" never.
+    semantics: Literal["lazy", "eager", "off"]
+    #: "full" keeps one Gaussian a pixel, "thinned" fewer where photos are flat.
+    density: Literal["thinned", "full"]
+    #: Photos that the network takes at once.
+    max_views: int
+    #: Name of the bundle of networks; the loaded one by default.
+    bundle: str
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """Time of one stage."""
+
+    stage: str
+    #: Milliseconds.
+    ms: float
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Something that looks wrong: with a capture, or with a text."""
+
+    #: Stable snake_case code.
+    code: str
+    #: A sentence.
+    message: str
+    #: The measured figure; None of a text.
+    value: float | None = None
+
+
+@dataclass(frozen=True)
+class SceneFault:
+    """Why a scene failed."""
+
+    #: Code of the table of errors.
+    code: str
+    #: Names input, value and bound.
+    message: str
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """How the making of a scene went."""
+
+    photos: int
+    views_used: int
+    gaussians: int
+    #: [2] nearest and farthest depth searched, world units.
+    depth_range: Floats
+    #: Median depth of the Gaussians from the cameras, world units.
+    median_depth: float
+    #: Mean share of a photo's pixels found in its best partner, 0 to 1.
+    overlap: float
+    stages: tuple[StageTime, ...]
+    execution_provider: str
+    #: What looks wrong with the capture.
+    warnings: tuple[Doubt, ...] = ()
+
+
+@dataclass(frozen=True)
+class Semantics:
+    """What can be asked of a scene by text."""
+
+    available: bool
+    state: Literal["off", "none", "running", "ready", "failed"]
+    #: Share of their making that is done, 0 to 1.
+    fraction: float
+    stage: str | None = None
+    reason: str | None = None
+    #: Entries of the bank (M).
+    bank_size: int | None = None
+    error: SceneFault | None = None
+
+
+@dataclass(frozen=True)
+class SceneStatus:
+    """A scene at one moment."""
+
+    #: 32 hex digits.
+    id: str
+    state: State
+    #: Share of the work that is done, 0 to 1.
+    fraction: float
+    #: Milliseconds since 1970.
+    created_ms: int
+    #: Milliseconds since 1970.
+    updated_ms: int
+    semantics: Semantics
+    stage: str | None = None
+    error: SceneFault | None = None
+    report: Report | None = None
+
+
+@dataclass(frozen=True)
+class Photo:
+    """An input photo."""
+
+    #: File name.
+    file: str
+    #: Camera of the undistorted photo.
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Event:
+    """What happens to a scene."""
+
+    #: "done", "failed" and "cancelled" are last.
+    event: State
+    #: Stage at work while running.
+    stage: str | None = None
+    #: Share of the work that is done, 0 to 1.
+    fraction: float = 0.0
+    #: Jobs that go first while queued.
+    ahead: int = 0
+    #: Code of the table of errors, when failed.
+    code: str | None = None
+    #: Why it failed.
+    message: str | None = None
+
+    @property
+    def is_last(self) -> bool:
+        """Whether no event follows."""
+        return self.event in ("done", "failed", "cancelled")
+
+
+@dataclass(frozen=True)
+class Models:
+    """What makes the scenes."""
+
+    bundle: str
+    bundle_sha256: str
+    execution_provider: str
+    renderer: str
+    server_version: str
+
+
+@dataclass(frozen=True, eq=False)
+class Box:
+    """A connected part of what a text found, and its box in the world frame of the upload."""
+
+    #: Gaussians in it.
+    gaussians: int
+    #: [3] centre, world units.
+    center: Floats
+    #: [3, 3] unit axes, one a row.
+    axes: Floats
+    #: [3] full lengths along the axes, world units.
+    size: Floats
+
+    @property
+    def corners(self) -> Floats:
+        """[8, 3] world points; corner 4a + 2b + c is at the far end of axis 0 where a is 1, of
+        axis 1 where b is 1, of axis 2 where c is 1.
+        """
+        ends = np.indices((2, 2, 2)).reshape(3, 8).T - 0.5
+        return np.asarray(self.center + (ends * self.size) @ self.axes)
+
+
+@dataclass(frozen=True)
+class Peak:
+    """The pixel of the highest relevancy."""
+
+    x: int
+    y: int
+    #: 0 to 1.
+    relevancy: float
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """What one text found."""
+
+    text: str
+    #: [M] relevancy of each entry of the scene's bank, 0 to 1; `scores[m - 1]` is of entry m.
+    scores: Floats
+    #: Entries selected, counted from 1.
+    entries: tuple[int, ...]
+    #: Gaussians selected.
+    gaussians: int
+    #: One box for each connected part, the largest first.
+    boxes: tuple[Box, ...]
+    #: What makes the answer doubtful.
+    warnings: tuple[Doubt, ...]
+    #: [H, W] bool, the pixels of the view.
+    mask: NDArray[np.bool_]
+    #: Where the relevancy is highest in the view.
+    peak: Peak | None
+
+    @property
+    def score(self) -> float:
+        """The best relevancy of any entry, 0 to 1; from 0.5 on the text is found."""
+        return float(self.scores.max(initial=0.0))
+
+    @staticmethod
+    def of_json(data: Mapping[str, Any]) -> Match:
+        """From a result of the server's query."""
+        view = data.get("view") or {}
+        return Match(
+            text=data["text"],
+            scores=np.asarray(data["scores"], np.float64),
+            entries=tuple(data["entries"]),
+            gaussians=data["gaussians"],
+            boxes=tuple(parse(Box, part) for part in data["parts"]),
+            warnings=tuple(parse(Doubt, one) for one in data["warnings"]),
+            mask=decode_rle(view["mask_rle"]) if "mask_rle" in view else np.zeros((0, 0), bool),
+            peak=parse(Peak, view["peak"]) if view.get("peak") else None,
+        )
+
+    def _repr_png_(self) -> bytes | None:
+        return encode_png(self.mask.astype(np.uint8) * 255) if self.mask.size else None
+
+
+class Matches(Sequence[Match]):
+    """What the texts of a query found, in their order; also by text: `found["chair"]`."""
+
+    def __init__(self, data: Mapping[str, Any]) -> None:
+        self._all = tuple(Match.of_json(result) for result in data["results"])
+        #: Camera of the masks; None where none were asked for.
+        self.camera: Camera | None = Camera.of_json(data["camera"]) if "camera" in data else None
+        #: Entries of the scene's bank (M).
+        self.bank_size: int = data["bank_size"]
+        #: How texts were scored.
+        self.profile: Profile = data["profile"]
+
+    @property
+    def masks(self) -> NDArray[np.bool_]:
+        """[T, H, W], one mask for each text."""
+        return np.stack([match.mask for match in self._all])
+
+    @property
+    def boxes(self) -> tuple[Box, ...]:
+        """The boxes of all texts."""
+        return tuple(box for match in self._all for box in match.boxes)
+
+    @overload
+    def __getitem__(self, which: int | str) -> Match: ...
+    @overload
+    def __getitem__(self, which: slice) -> Sequence[Match]: ...
+    def __getitem__(self, which: int | str | slice) -> Match | Sequence[Match]:
+        if isinstance(which, str):
+            for match in self._all:
+                if match.text == which.strip():
+                    return match
+            raise KeyError(which)
+        return self._all[which]
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+    def __iter__(self) -> Iterator[Match]:
+        return iter(self._all)
+
+    def __repr__(self) -> str:
+        told = (f"{m.text!r}: {m.score:.2f}, {len(m.boxes)} boxes" for m in self._all)
+        return f"<Matches {'; '.join(told)}>"
+
+    def _repr_png_(self) -> bytes | None:
+        masks = self.masks.astype(np.uint8) * 255
+        return encode_png(np.hstack(list(masks))) if masks.size else None
+
+
+@dataclass(frozen=True)
+class Label:
+    """A text and how well it names what is under a pixel."""
+
+    text: str
+    #: 0 to 1; under 0.5 it does not name it.
+    relevancy: float
+
+
+@dataclass(frozen=True, eq=False)
+class Picked:
+    """What is under a pixel."""
+
+    #: Accumulated opacity, 0 to 1.
+    alpha: float
+    #: Depth along the camera's axis, world units; None where nothing is.
+    depth: float | None = None
+    #: [3] point at that depth, world frame of the upload.
+    point: Floats | None = None
+    #: The Gaussian that adds most, counted from 0.
+    gaussian: int | None = None
+    #: Its entry of the bank, counted from 1.
+    entry: int | None = None
+    #: The labels asked for, the best first.
+    labels: tuple[Label, ...] = ()
+
+
+def decode_rle(rle: Mapping[str, Any]) -> NDArray[np.bool_]:
+    """The [H, W] mask of COCO's compressed run lengths."""
+    height, width = rle["size"]
+    runs: list[int] = []
+    value = shift = 0
+    for char in rle["counts"].encode():
+        bits = char - 48
+        value |= (bits & 0x1F) << shift
+        shift += 5
+        if bits & 0x20:
+            continue
+        if bits & 0x10:
+            value -= 1 << shift
+        runs.append(value + runs[-2] if len(runs) > 2 else value)
+        value = shift = 0
+    on = np.arange(len(runs)) % 2 == 1
+    return np.repeat(on, runs).reshape(width, height).T

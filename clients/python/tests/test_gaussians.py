@@ -1,0 +1,42 @@
+"""The Gaussians as arrays, and in viser where it is installed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from segsplat import BadAnswer, Box, Gaussians, Scene
+
+
+def test_gaussians_are_those_of_the_scene(scene: Scene) -> None:
+    gaussians = scene.gaussians()
+    report, bank = scene.report, scene.status.semantics.bank_size
+    assert report and len(gaussians.means) == report.gaussians
+    assert np.allclose(np.linalg.norm(gaussians.quats, axis=1), 1)
+    assert gaussians.scales.min() > 0 and gaussians.semantic_index.max() == bank
+    assert gaussians.opacities.min() > 1 / 256 and gaussians.opacities.max() <= 1
+    # In front of the first photo, at about the depth that the server reports.
+    camera = scene.photos[0].camera
+    depth = (gaussians.means - camera.camera_to_world[:3, 3]) @ camera.camera_to_world[:3, 2]
+    assert np.median(depth) == pytest.approx(report.median_depth, rel=0.1)
+    # Eigenvalues of the covariance are the squared scales.
+    sides = np.linalg.eigvalsh(gaussians.covariances[:100])
+    assert np.allclose(np.sqrt(sides), np.sort(gaussians.scales[:100], axis=1), rtol=1e-3)
+    found = scene.query("box", masks=False)[0]
+    assert len(scene.gaussians(text="box").means) == found.gaussians
+    assert np.isin(gaussians.semantic_index, found.entries).sum() == found.gaussians
+
+
+def test_another_file_is_refused() -> None:
+    with pytest.raises(BadAnswer):
+        Gaussians.of_ply(b"ply\nformat ascii 1.0\nend_header\n")
+
+
+def test_viser_shows_a_scene(scene: Scene) -> None:
+    viser = pytest.importorskip("segsplat.viser")
+    box = Box(1, np.zeros(3), np.eye(3), np.array([1.0, 2, 3]))
+    edges = viser.edges_of(box)
+    assert edges.shape == (12, 2, 3)
+    lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
+    assert sorted(lengths) == [1] * 4 + [2] * 4 + [3] * 4
+    viser.show(scene, [box]).stop()

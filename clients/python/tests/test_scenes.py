@@ -1,0 +1,114 @@
+"""Making, finding, watching, exporting and deleting scenes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from segsplat import Cancelled, Client, Event, InvalidRequest, Scene, SceneNotFound, SegSplatError
+
+
+def test_a_scene_tells_how_it_was_made(scene: Scene, client: Client) -> None:
+    assert scene.status.state == "done" and scene.status.semantics.state == "ready"
+    report = scene.report
+    assert report and report.photos == 2 and report.gaussians > 10_000
+    assert {stage.stage for stage in report.stages} >= {"geometry", "lift"}
+    assert report.depth_range[0] < report.median_depth < report.depth_range[1]
+    assert [photo.file for photo in scene.photos] == ["images/0000.png", "images/0001.png"]
+    assert client.get(scene.id).report is not None
+    assert f"{report.gaussians} Gaussians" in repr(scene)
+
+
+def test_events_end_with_the_last(client: Client, photos: Path) -> None:
+    scene = client.scene(photos, wait=False, semantics="off", density="full")
+    events = list(scene.events())
+    assert events[-1] == Event("done")
+    fractions = [event.fraction for event in events[:-1] if event.event == "running"]
+    assert fractions == sorted(fractions) and fractions
+    assert all(event.stage for event in events if event.event == "running")
+    scene.wait()
+    assert scene.report and scene.report.gaussians > 50_000
+    scene.delete()
+    with pytest.raises(SceneNotFound):
+        scene.refresh()
+    with pytest.raises(SceneNotFound):
+        scene.delete()
+
+
+def test_a_bar_is_drawn_when_asked(
+    client: Client, scene: Scene, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene.wait()
+    assert capsys.readouterr().err == "", "no terminal, no bar"
+    scene.wait(True)
+    assert capsys.readouterr().err.endswith("#" * 24 + " 100% done        \n")
+    told: list[Event] = []
+    scene.wait(told.append)
+    assert told == [Event("done")]
+
+
+def test_pages_are_one_iterator(client: Client, scene: Scene, photos: Path) -> None:
+    made = [client.scene(photos, wait=False, semantics="off") for _ in range(3)]
+    ids = [one.id for one in client.scenes(page=1)]
+    assert ids[:3] == [one.id for one in reversed(made)] and scene.id in ids
+    assert ids == [one.id for one in client.scenes()]
+    for one in made:
+        one.delete()
+    assert not {one.id for one in made} & {one.id for one in client.scenes(page=2)}
+
+
+def test_an_export_is_streamed_to_a_file(
+    scene: Scene, url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = scene.export("ply")
+    assert path == Path(f"{scene.id}.ply")
+    whole = httpx.get(f"{url}/v1/scenes/{scene.id}/export", params={"format": "ply"}).content
+    assert path.read_bytes() == whole and whole.startswith(b"ply\n")
+    part = scene.export(path=tmp_path / "box.ply", text="box")
+    assert 0 < part.stat().st_size < len(whole)
+    with pytest.raises(InvalidRequest):
+        scene.export(path=tmp_path / "none.ply", text="")
+    assert sorted(tmp_path.iterdir()) == sorted([part, tmp_path / path])
+
+
+def test_archives_and_folders(client: Client, scene: Scene, photos: Path, tmp_path: Path) -> None:
+    archive = shutil.make_archive(str(tmp_path / "photos"), "zip", photos)
+    twin = client.scene(archive, semantics="off")
+    assert np.array_equal(twin.view(width=64).image, scene.view(width=64).image)
+    twin.delete()
+    with pytest.raises(FileNotFoundError, match="no folder with transforms.json"):
+        client.scene(tmp_path)
+
+
+def test_a_scene_that_fails_says_why(client: Client, photos: Path, tmp_path: Path) -> None:
+    shutil.copytree(photos, tmp_path, dirs_exist_ok=True)
+    transforms = json.loads((photos / "transforms.json").read_text())
+    transforms["frames"][1]["transform_matrix"] = np.diag([1.0, 1, -1, 1]).tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(transforms))
+    with pytest.raises(SegSplatError) as mirrored:
+        client.scene(tmp_path)
+    assert mirrored.value.code == "invalid_request" and "0001" in mirrored.value.message
+    # One that is deleted while it is being made.
+    scene = client.scene(photos, wait=False)
+    stop = iter([scene.delete])
+    with pytest.raises(Cancelled) as stopped:
+        scene.wait(lambda _: next(stop, lambda: None)())
+    assert stopped.value.scene == scene.id
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["{}", "[]", "no json", '{"frames": [1]}', '{"frames": [{"file_path": "../outside.png"}]}'],
+)
+def test_a_description_is_read_before_photos_are_sent(tmp_path: Path, text: str) -> None:
+    (tmp_path / "outside.png").touch()
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "transforms.json").write_text(text)
+    with pytest.raises(InvalidRequest):
+        Client("http://127.0.0.1:9").scene(tmp_path / "photos")

@@ -1,0 +1,85 @@
+"""Texts asked of a scene."""
+
+from __future__ import annotations
+
+import httpx
+import numpy as np
+import pytest
+
+from segsplat import InvalidRequest, Scene
+from segsplat.types import decode_rle
+
+
+def test_a_query_is_typed_and_that_of_the_server(scene: Scene, url: str) -> None:
+    found = scene.query("box", " floor ", from_=1, width=64)
+    body = {"texts": ["box", "floor"], "camera": {"from": 1}, "width": 64}
+    told = httpx.post(f"{url}/v1/scenes/{scene.id}/query", json=body, timeout=60).json()
+    assert len(found) == 2 and [match.text for match in found] == ["box", "floor"]
+    assert found["floor"] is found[1] and found.bank_size == told["bank_size"]
+    for match, raw in zip(found, told["results"], strict=True):
+        assert match.scores.tolist() == raw["scores"] and match.score == max(raw["scores"])
+        assert match.entries == tuple(raw["entries"]) and match.gaussians == raw["gaussians"]
+        assert match.mask.sum() == raw["view"]["area"]
+        assert [box.gaussians for box in match.boxes] == [p["gaussians"] for p in raw["parts"]]
+        if match.mask.any():
+            rows, columns = np.nonzero(match.mask)
+            left, top = columns.min(), rows.min()
+            assert raw["view"]["bbox"] == [
+                left,
+                top,
+                columns.max() - left + 1,
+                rows.max() - top + 1,
+            ]
+    assert found.masks.shape == (2, 48, 64) and found.masks.any()
+    assert found.camera is not None and found.camera.width == 64
+    # The mask of a query is that of a view.
+    assert np.array_equal(found[0].mask, scene.view("mask", text="box", from_=1, width=64).mask)
+    assert (found._repr_png_() or b"").startswith(b"\x89PNG")
+
+
+def test_without_a_camera_the_masks_are_in_the_first_photo(scene: Scene) -> None:
+    found = scene.query("box")
+    assert found.masks.shape == (1, 240, 320)
+    assert np.array_equal(found[0].mask, scene.query("box", camera=scene.photos[0].camera)[0].mask)
+    alone = scene.query("box", masks=False)
+    assert alone.camera is None and alone[0].mask.size == 0
+    assert alone[0].scores.tolist() == found[0].scores.tolist()
+
+
+def test_corners_are_those_of_the_box(scene: Scene) -> None:
+    boxes = scene.query("box", "floor").boxes
+    assert boxes
+    for box in boxes:
+        corners = box.corners
+        assert corners.shape == (8, 3) and np.allclose(corners.mean(0), box.center)
+        for axis, step in enumerate((4, 2, 1)):
+            assert np.allclose(corners[step] - corners[0], box.axes[axis] * box.size[axis])
+    aligned = scene.query("floor", boxes="aligned", masks=False).boxes[0]
+    assert np.allclose(np.abs(aligned.axes), np.eye(3))
+
+
+def test_a_pick_names_what_is_there(scene: Scene) -> None:
+    picked = scene.pick(160.5, 200.5, labels=["floor", "box"])
+    assert picked.point is not None and picked.point.shape == (3,)
+    assert [label.relevancy for label in picked.labels] == sorted(
+        (label.relevancy for label in picked.labels), reverse=True
+    )
+    assert {label.text for label in picked.labels} == {"floor", "box"}
+
+
+def test_doubts_and_faults_of_texts(scene: Scene) -> None:
+    (match,) = scene.query("a box " * 40, masks=False)
+    assert [doubt.code for doubt in match.warnings] == ["text_cut"]
+    with pytest.raises(InvalidRequest):
+        scene.query("")
+    with pytest.raises(KeyError):
+        scene.query("box", masks=False)["chair"]
+
+
+def test_run_lengths_of_coco() -> None:
+    """Known answers of pycocotools: `encode(np.asfortranarray(mask))`."""
+    mask = np.zeros((3, 4), bool)
+    mask[1, 1:3] = True
+    assert np.array_equal(decode_rle({"size": [3, 4], "counts": "41202"}), mask)
+    assert not decode_rle({"size": [2, 3], "counts": "6"}).any()
+    assert decode_rle({"size": [2, 3], "counts": "06"}).all()
