@@ -9,14 +9,14 @@ use std::{
     sync::{Arc, OnceLock},
 };
 
-use super::{types::TextWarning, view::text_words};
+use super::{request::ScoringOptions, texts, types::TextWarning, view::text_words};
 use crate::{
     cache::Cache,
     error::{Error, Result},
-    jobs::{Phrases, SemanticNetworks},
+    jobs::SemanticNetworks,
     limits::Limits,
     render::{Labels, PixelWeights, RenderRequest, Renderer},
-    scene::{Gaussians, PAPER_PHRASES, PAPER_TAU, Scene, ScoringProfile, Semantics, TextEmbedding},
+    scene::{Gaussians, Preset, Scene, ScoringMethod, Semantics, TextEmbedding},
     semantics::{Components, InstanceOptions, Scorer, Scoring, TextScores, ViewNorms},
 };
 
@@ -27,7 +27,7 @@ pub(super) struct Backend {
     networks: Arc<dyn SemanticNetworks>,
     /// By text; each weighs 1.
     embeddings: Cache<String, Arc<TextEmbedding>>,
-    /// By scene, semantics and profile; by bytes.
+    /// By scene, semantics and scoring; by bytes.
     scorers: Cache<String, Arc<Scorer>>,
     /// By scene and semantics; by bytes.
     components: Cache<String, Arc<Components>>,
@@ -76,29 +76,29 @@ impl Backend {
         texts.iter().map(|text| found.get(text).cloned().ok_or_else(lost)).collect()
     }
 
-    /// A bank ready to be scored under a profile; `tag` tells scene and semantics.
+    /// How texts are scored under a preset with these changes.
+    fn scoring(&self, preset: Preset, changes: &ScoringOptions) -> Result<ScoringMethod> {
+        let phrases = self.networks.phrases()?;
+        let (tau, floor) = (f64::from(phrases.tau), f64::from(phrases.coverage_floor));
+        let method = changes.change(ScoringMethod::of(preset, phrases.canon, tau, floor));
+        method.check()?;
+        Ok(method)
+    }
+
+    /// A bank ready to be scored; `tag` tells scene and semantics.
     fn scorer(
         &self,
         tag: &str,
         semantics: &Semantics,
-        profile: ScoringProfile,
+        method: &ScoringMethod,
     ) -> Result<Arc<Scorer>> {
-        let key = format!("{tag} {profile:?}");
+        let key = super::view::words(&(tag, method))?;
         if let Some(known) = self.scorers.find(&key) {
             return Ok(known);
         }
-        let phrases = match profile {
-            ScoringProfile::Default => self.networks.phrases()?,
-            ScoringProfile::Paper => Phrases {
-                canon: PAPER_PHRASES.map(str::to_owned).to_vec(),
-                tau: PAPER_TAU,
-                coverage_floor: 0.0,
-            },
-        };
-        let canon = self.embedded(&phrases.canon)?;
+        let canon = self.embedded(&method.canon)?;
         let canon = canon.iter().map(|embedding| embedding.row.clone()).collect();
-        let (tau, floor) = (f64::from(phrases.tau), f64::from(phrases.coverage_floor));
-        let scoring = Arc::new(Scoring::new(profile, canon, tau, floor)?);
+        let scoring = Arc::new(Scoring::new(method, canon)?);
         let scorer = Arc::new(Scorer::new(&semantics.bank, scoring)?);
         let rows = semantics.bank.len() as u64;
         // Rows, and the products of each two of them.
@@ -130,17 +130,14 @@ pub(super) struct LabelledView {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) weights: PixelWeights,
-    /// One for each scoring profile.
+    /// Of plain rows, and of rows of length 1.
     norms: [OnceLock<ViewNorms>; 2],
 }
 
 impl LabelledView {
     /// `[H * W]` relevancy of a text.
     pub(super) fn relevancy(&self, scorer: &Scorer, text: &TextScores) -> Result<Vec<f32>> {
-        let kept = match scorer.scoring().profile() {
-            ScoringProfile::Default => &self.norms[0],
-            ScoringProfile::Paper => &self.norms[1],
-        };
+        let kept = &self.norms[usize::from(scorer.scoring().unit_rows())];
         let norms = match kept.get() {
             Some(norms) => norms,
             None => {
@@ -168,7 +165,7 @@ impl LabelledView {
     }
 
     fn size_bytes(&self) -> u64 {
-        // Norms of both profiles, also where they are not computed yet.
+        // Norms of both kinds, also where they are not computed yet.
         self.weights.size_bytes() + 2 * 4 * self.weights.pixels() as u64
     }
 }
@@ -187,18 +184,23 @@ pub(super) struct SceneTexts<'a> {
     pub(super) backend: &'a Backend,
     pub(super) of: Subject<'a>,
     pub(super) scorer: Arc<Scorer>,
+    pub(super) scoring: ScoringMethod,
+    /// The preset and the changes of it.
+    asked: (Preset, ScoringOptions),
     pub(super) texts: Vec<ScoredText>,
 }
 
 impl<'a> SceneTexts<'a> {
-    /// Scores checked texts under a profile.
+    /// Scores checked texts under a preset, that of the scene where none is named, with `changes`.
     pub(super) fn new(
         backend: &'a Backend,
         of: Subject<'a>,
-        profile: ScoringProfile,
+        (preset, changes): (Option<Preset>, &ScoringOptions),
         texts: &[String],
     ) -> Result<Self> {
-        let scorer = backend.scorer(of.tag, of.semantics, profile)?;
+        let preset = preset.unwrap_or(of.scene.meta.report.method.preset);
+        let scoring = backend.scoring(preset, changes)?;
+        let scorer = backend.scorer(of.tag, of.semantics, &scoring)?;
         let scored = |(text, embedding): (&String, Arc<TextEmbedding>)| {
             Ok(ScoredText {
                 text: text.clone(),
@@ -208,13 +210,14 @@ impl<'a> SceneTexts<'a> {
         };
         let embeddings = backend.embedded(texts)?;
         let texts = texts.iter().zip(embeddings).map(scored).collect::<Result<_>>()?;
-        Ok(Self { backend, of, scorer, texts })
+        let asked = (preset, changes.clone());
+        Ok(Self { backend, of, scorer, scoring, asked, texts })
     }
 
     /// What tells the first text, how it is scored and the scene from all others, in tags.
     pub(super) fn words(&self) -> Result<String> {
         let text = self.texts.first().map(|text| text.text.as_str());
-        text_words(self.of.tag, text, self.scorer.scoring().profile())
+        text_words(self.of.tag, text, (self.asked.0, &self.asked.1))
     }
 
     /// The connected components of the scene's entries.
@@ -271,6 +274,18 @@ impl<'a> SceneTexts<'a> {
         let weights =
             frame.weights.ok_or_else(|| Error::internal("the renderer gave no weights"))?;
         Ok((self.keep_view(key, [frame.width, frame.height], weights), true))
+    }
+}
+
+/// Checks the changes of a request before anything is made for it: numbers, and canonical texts as
+/// other texts.
+pub(super) fn check_scoring(changes: &ScoringOptions, limits: &Limits) -> Result<()> {
+    let canon = ScoringMethod::CANON.map(str::to_owned).to_vec();
+    changes.change(ScoringMethod::of(Preset::Paper, canon, 1.0, 0.0)).check()?;
+    if changes.canon.is_empty() {
+        Ok(())
+    } else {
+        texts::all_checked(&changes.canon, "canon", limits).map(drop)
     }
 }
 

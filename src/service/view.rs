@@ -18,8 +18,8 @@ use super::{
     create::blocking,
     encode::{self, Layer},
     request::{
-        BackgroundSpec, CameraSpec, Format, Kind, PictureOptions, TextOptions, ViewOptions,
-        ViewSpec, ViewsSpec,
+        BackgroundSpec, CameraSpec, Format, Kind, PictureOptions, ScoringOptions, TextOptions,
+        ViewOptions, ViewSpec, ViewsSpec,
     },
     schedule::Slot,
     search::{Backend, LabelledView, SceneTexts},
@@ -34,9 +34,9 @@ use crate::{
     names::shown,
     render::{
         self, Frame, Kinds, Labels, RenderRequest, Samples,
-        plan::{self, NEAR_RANGE, default_near},
+        plan::{self, NEAR_RANGE, ViewMethod, default_near},
     },
-    scene::{Camera, Intrinsics, Scene, SceneCamera, SceneId, ScoringProfile},
+    scene::{Camera, Intrinsics, Method, Preset, Scene, SceneCamera, SceneId},
     store::{Record, hex},
     telemetry::meter,
 };
@@ -51,7 +51,10 @@ pub(super) struct Resolved {
     camera: Camera,
     kinds: Vec<Kind>,
     near: f32,
-    /// As in the request, with the size and the near plane that were found.
+    method: ViewMethod,
+    /// The preset that was named, or that of the scene.
+    preset: Preset,
+    /// As in the request, with the size, near plane and method that were found.
     options: ViewOptions,
     picture: PictureOptions,
 }
@@ -88,12 +91,13 @@ impl Resolved {
             kinds,
             labels: Labels::None,
             background: match self.picture.background {
+                BackgroundSpec::Backdrop if !self.method.backdrop => render::Background::BLACK,
                 BackgroundSpec::Backdrop => {
                     render::Background::Backdrop(Arc::clone(&scene.backdrop))
                 }
                 BackgroundSpec::Color(color) => render::Background::Color(color),
             },
-            sources: plan::sources(scene, &self.camera),
+            sources: plan::sources(scene, &self.camera, self.method),
             samples: match self.picture.format {
                 Format::Npy => Samples::F32,
                 Format::Rgba8 => Samples::LevelsRgba,
@@ -115,7 +119,7 @@ impl Resolved {
     /// Hash of scene, renderer and request for one kind; `texts` are the words of [`text_words`].
     fn etag(&self, scene: &str, renderer: &str, kind: Kind, texts: &str) -> Result<String> {
         let version = env!("CARGO_PKG_VERSION");
-        let request = (self.camera, kind, &self.options, &self.picture);
+        let request = (self.camera, kind, &self.options, &self.picture, self.method.backdrop);
         Ok(hash(&words(&(scene, version, renderer, request, texts))?))
     }
 
@@ -152,7 +156,7 @@ impl Resolved {
             self.kinds.iter().all(|kind| !kind.needs_semantics() || *kind == Kind::Mask);
         let tables = texts.texts.first().map(|text| text.scores.tables()).unwrap_or_default();
         match <[_; 1]>::try_from(tables) {
-            Ok([table]) if mask_alone => {
+            Ok([table]) if mask_alone && texts.scorer.scoring().is_signed() => {
                 let coverage_floor = texts.scorer.scoring().coverage_floor() as f32;
                 Labels::Mask { table, coverage_floor }
             }
@@ -246,7 +250,7 @@ impl Scored {
 }
 
 /// Values as text: equal text means equal values. Numbers are written to their last bit.
-fn words(values: &impl Serialize) -> Result<String> {
+pub(super) fn words(values: &impl Serialize) -> Result<String> {
     serde_json::to_string(values)
         .map_err(|e| Error::internal("a request cannot be written down").caused_by(e))
 }
@@ -266,18 +270,40 @@ pub(super) fn scene_tag(record: &Record) -> String {
 pub(super) struct Inputs<'a> {
     cameras: &'a [SceneCamera],
     median_depth: f64,
+    /// `None`: that of the default.
+    method: Option<&'a Method>,
 }
 
 impl<'a> From<&'a Record> for Inputs<'a> {
     fn from(record: &'a Record) -> Self {
-        let median_depth = record.status.report.as_ref().map_or(0.0, |report| report.median_depth);
-        Self { cameras: &record.status.cameras, median_depth }
+        let report = record.status.report.as_ref();
+        let median_depth = report.map_or(0.0, |report| report.median_depth);
+        let method = report.map(|report| &report.method);
+        Self { cameras: &record.status.cameras, median_depth, method }
     }
 }
 
 impl<'a> From<&'a Scene> for Inputs<'a> {
     fn from(scene: &'a Scene) -> Self {
-        Self { cameras: &scene.meta.cameras, median_depth: scene.meta.report.median_depth }
+        let report = &scene.meta.report;
+        let (median_depth, method) = (report.median_depth, Some(&report.method));
+        Self { cameras: &scene.meta.cameras, median_depth, method }
+    }
+}
+
+impl Inputs<'_> {
+    /// How a view is drawn: as the scene was made, or by the preset that is named, with the changes
+    /// of the request.
+    fn look(&self, options: &ViewOptions) -> Result<(ViewMethod, Preset)> {
+        let own = self.method.cloned().unwrap_or_default();
+        let of = options.preset.map_or(own, Method::of);
+        let changed = Method {
+            front_photos: options.front_photos.unwrap_or(of.front_photos),
+            magnify: options.magnify.unwrap_or(of.magnify),
+            ..of
+        };
+        changed.check()?;
+        Ok((ViewMethod::from(&changed), changed.preset))
     }
 }
 
@@ -317,6 +343,7 @@ fn resolve(
         }
         None => default_near(inputs.median_depth),
     };
+    let (method, preset) = inputs.look(options)?;
     let resolved = |(camera_index, spec)| {
         let what = match cameras.len() {
             1 => "camera".to_owned(),
@@ -329,10 +356,15 @@ fn resolve(
             camera,
             kinds: kinds.to_vec(),
             near,
+            method,
+            preset,
             options: ViewOptions {
                 width: Some(width),
                 height: Some(height),
                 near: Some(near),
+                preset: None,
+                front_photos: Some(method.front_photos),
+                magnify: Some(method.magnify),
                 ..options.clone()
             },
             picture: PictureOptions {
@@ -396,7 +428,8 @@ impl Inner {
             };
             let subject = understood.subject();
             let text = ask.text.as_slice();
-            let scored = || SceneTexts::new(backend, subject, ask.profile, text);
+            let how = (Some(view.preset), &ask.scoring);
+            let scored = || SceneTexts::new(backend, subject, how, text);
             let (texts, ms) = staged("score", scored);
             (times.load_ms, times.score_ms) = (understood.load_ms, Some(ms));
             view.draw(backend, subject.scene, &tag, Some(&texts?), times, drawn)
@@ -447,8 +480,12 @@ fn until(deadline: Option<Duration>, most_ms: u64) -> Instant {
 }
 
 /// A text of a scene and how it is scored, in tags; `tag` tells scene and semantics.
-pub(super) fn text_words(tag: &str, text: Option<&str>, profile: ScoringProfile) -> Result<String> {
-    words(&(tag, text, profile))
+pub(super) fn text_words(
+    tag: &str,
+    text: Option<&str>,
+    how: (Preset, &ScoringOptions),
+) -> Result<String> {
+    words(&(tag, text, how))
 }
 
 impl Service {
@@ -462,7 +499,10 @@ impl Service {
         let record = scene.record();
         let texts = match (spec.kind.needs_semantics(), &record.semantics_sha256) {
             (false, _) => String::new(),
-            (true, Some(_)) => text_words(&meaning_tag(record), ask.text.as_deref(), ask.profile)?,
+            (true, Some(_)) => {
+                let how = (view.preset, &ask.scoring);
+                text_words(&meaning_tag(record), ask.text.as_deref(), how)?
+            }
             (true, None) => return Ok(None),
         };
         let name = self.inner.backend.renderer.name();

@@ -27,22 +27,27 @@ pub(super) fn one_a_pixel(
     let blank = blank(photo, [width, height]);
     let mut taken = blank.unwrap_or_else(|| Bitset::empty(cells));
     let mut kept: Vec<(usize, Bitset)> = Vec::new();
+    let mut runs: Vec<Vec<[u32; 2]>> = Vec::new();
     for at in wholes {
         let proposal = &found.masks[at];
         let mut mask = match &resample {
             Some(to) => Bitset::over(&to.apply(&proposal.logits.spread(photo_grid.grid)), 0.0),
             None => proposal.mask.clone(),
         };
+        let before = settings.keep_wholes.then(|| mask.runs());
         mask.subtract(&taken);
         let left = mask.count();
         if left > 0 && f64::from(left) >= settings.min_area * cells as f64 {
             taken.add(&mask);
             kept.push((at, mask));
+            runs.extend(before);
         }
     }
     kept.reverse();
     kept.truncate(MASKS_MAX);
-    let mut map = PhotoMasks::default();
+    runs.reverse();
+    runs.truncate(MASKS_MAX);
+    let mut map = PhotoMasks { wholes: runs, ..PhotoMasks::default() };
     let mut index = vec![0_u16; cells];
     for (k, (at, mask)) in (1..).zip(&kept) {
         mask.cells().for_each(|cell| index[cell] = k);
