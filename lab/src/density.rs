@@ -54,7 +54,7 @@ fn compare(
     let inputs = triple.inputs(squares, photos);
     let given: Vec<PosedPhoto> = inputs.iter().map(|&i| squares[i].clone()).collect();
     let scene = |density| -> Result<Scene> {
-        let options = SceneOptions { density, ..SceneOptions::default() };
+        let options = SceneOptions { density: Some(density), ..SceneOptions::default() };
         Ok(scene_of(make(engine, &given, &options)?))
     };
     let scenes = [scene(Density::Full)?, scene(Density::Thinned)?];

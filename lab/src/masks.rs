@@ -23,7 +23,7 @@ use crate::{
     photo_files,
     pipeline::{Pipeline, masks as stage, masks::SeenPhoto},
     rows::{Rows, means, progress},
-    scene::{Gaussians, MaskLogits, Photo, PhotoMasks, PosedPhoto, SceneOptions},
+    scene::{Gaussians, MaskLogits, Method, Photo, PhotoMasks, PosedPhoto, SceneOptions},
     scenes::{is_posed, make, nearest},
     segment::{self, Bitset, PromptDecoder, Proposals, Seed, Settings},
     setup::Inputs,
@@ -100,7 +100,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     }
     let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
     let network = engine.masks()?;
-    let variants = variants(&stage::settings(network.manifest()), args.short);
+    let variants = variants(&stage::settings(network.manifest(), &Method::default()), args.short);
     let mut measured: Vec<Vec<Value>> = vec![Vec::new(); variants.len()];
     for (name, dir) in args.inputs.find(is_posed)? {
         let photos = photo_files::read_dir(&dir, &Limits::default())?;
@@ -315,6 +315,7 @@ mod tests {
 
     fn masks(index: [u16; 16], count: usize) -> PhotoMasks {
         PhotoMasks {
+            wholes: Vec::new(),
             map: IndexMap { width: 4, height: 4, index: index.to_vec() },
             masks: vec![MaskInfo::default(); count],
         }

@@ -7,6 +7,7 @@
 
 use std::{path::PathBuf, time::Instant};
 
+use segsplat_core::names::named;
 use serde_json::{Value, json};
 
 use crate::{
@@ -16,7 +17,7 @@ use crate::{
     pipeline::Pipeline,
     render::{Kinds, Renderer, cpu::CpuRenderer, plan::served},
     rows::{Rows, each, means, ms, progress},
-    scene::{PosedPhoto, SceneOptions},
+    scene::{PosedPhoto, Preset, SceneOptions},
     scenes::{SIDE, is_posed, make, means_by_use, scene_of, squares, use_of, view_request},
     setup::Inputs,
     triples::{Triple, triples},
@@ -34,6 +35,12 @@ pub(crate) struct Args {
     /// Take every n-th triple only
     #[arg(long, default_value_t = 1)]
     every: usize,
+    /// How scenes are made and drawn: default, or paper
+    #[arg(long, value_parser = named::<Preset>, default_value = "default")]
+    preset: Preset,
+    /// A change of the method: `--method prune=true`; docs/method.md has all
+    #[arg(long, value_name = "NAME=VALUE")]
+    method: Vec<String>,
     /// Folder for picture grids, one a scene
     #[arg(long, value_name = "DIR")]
     pictures: Option<PathBuf>,
@@ -53,12 +60,14 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let at_once = args.at_once.min(threads);
     let engine = Pipeline::open(&args.inputs.setup.networks(at_once))?;
     let renderer = CpuRenderer::new((threads / at_once).max(1))?;
+    let options = SceneOptions { preset: args.preset, ..SceneOptions::default() };
+    let options = options.with(&args.method)?;
     let mut scenes = Vec::new();
     for (name, dir) in args.inputs.find(is_posed)? {
         let squares = squares(&dir)?;
         let chosen: Vec<Triple> = triples(&squares).into_iter().step_by(args.every).collect();
         let mut judged = each(chosen.len(), at_once, |i| {
-            judge(&engine, &renderer, &squares, &chosen[i], photos).map_err(|e| {
+            judge(&engine, &renderer, &squares, &chosen[i], (photos, &options)).map_err(|e| {
                 let target = &squares[chosen[i].target].file;
                 Error::new(e.code(), format!("{name}, target {target}: {e}")).caused_by(e)
             })
@@ -66,6 +75,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         let mut row = means(judged.iter().map(|(row, _)| row));
         row["scene"] = json!(name);
         row["use"] = json!(use_of(&name));
+        row["preset"] = json!(args.preset);
         row["photos"] = json!(photos);
         row["triples"] = json!(judged.len());
         row["each"] = judged.iter().map(|(row, _)| row.clone()).collect();
@@ -104,12 +114,12 @@ fn judge(
     renderer: &CpuRenderer,
     squares: &[PosedPhoto],
     triple: &Triple,
-    photos: usize,
+    (photos, options): (usize, &SceneOptions),
 ) -> Result<(Value, grid::Row)> {
     let inputs = triple.inputs(squares, photos);
     let given: Vec<PosedPhoto> = inputs.iter().map(|&i| squares[i].clone()).collect();
     let begun = Instant::now();
-    let scene = scene_of(make(engine, &given, &SceneOptions::default())?);
+    let scene = scene_of(make(engine, &given, options)?);
     let total_ms = ms(begun);
     let report = &scene.meta.report;
     let target = &squares[triple.target];

@@ -144,6 +144,16 @@ pub struct ViewOptions {
     /// How closely to keep to the rendering model.
     #[prost(enumeration = "Quality", tag = "8")]
     pub quality: i32,
+    /// How it is drawn and texts are scored; left out: as the scene was made.
+    #[prost(enumeration = "Preset", tag = "9")]
+    pub preset: i32,
+    /// Photos whose Gaussians are in front, 0: those of all; left out: that of the preset.
+    #[prost(uint32, optional, tag = "10")]
+    pub front_photos: ::core::option::Option<u32>,
+    /// Whether magnified Gaussians are blurred as the network learnt them; left out: that of the
+    /// preset.
+    #[prost(bool, optional, tag = "11")]
+    pub magnify: ::core::option::Option<bool>,
 }
 /// A part of a picture, pixels of the whole one.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -215,6 +225,39 @@ impl Format {
         }
     }
 }
+/// A set of values for every choice of the method.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum Preset {
+    /// As PRESET_DEFAULT where a scene is made; else that of the scene.
+    Unspecified = 0,
+    /// What measured best.
+    Default = 1,
+    /// What the paper does.
+    Paper = 2,
+}
+impl Preset {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "PRESET_UNSPECIFIED",
+            Self::Default => "PRESET_DEFAULT",
+            Self::Paper => "PRESET_PAPER",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "PRESET_UNSPECIFIED" => Some(Self::Unspecified),
+            "PRESET_DEFAULT" => Some(Self::Default),
+            "PRESET_PAPER" => Some(Self::Paper),
+            _ => None,
+        }
+    }
+}
 /// How closely a renderer keeps to the model.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
@@ -248,6 +291,25 @@ impl Quality {
         }
     }
 }
+/// How texts are scored. In a request, what is left out is that of the preset.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Scoring {
+    /// Canonical texts that a text is compared with.
+    #[prost(string, repeated, tag = "1")]
+    pub canon: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// Sharpness of the comparison.
+    #[prost(double, optional, tag = "2")]
+    pub tau: ::core::option::Option<f64>,
+    /// Relevancy from which a text selects, 0..1.
+    #[prost(double, optional, tag = "3")]
+    pub cut: ::core::option::Option<f64>,
+    /// Whether the bank's rows are brought to length 1 before they are blended.
+    #[prost(bool, optional, tag = "4")]
+    pub unit_rows: ::core::option::Option<bool>,
+    /// Coverage under which a pixel has no relevancy, 0..1.
+    #[prost(double, optional, tag = "5")]
+    pub coverage_floor: ::core::option::Option<f64>,
+}
 /// Texts asked of a scene.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct QueryRequest {
@@ -273,8 +335,8 @@ pub struct QueryRequest {
     #[prost(bool, tag = "7")]
     pub relevancy: bool,
     /// How texts are scored.
-    #[prost(enumeration = "ScoringProfile", tag = "8")]
-    pub profile: i32,
+    #[prost(message, optional, tag = "10")]
+    pub scoring: ::core::option::Option<Scoring>,
     /// How long to wait for semantics that are being made, milliseconds; 0 answers at once.
     #[prost(uint64, optional, tag = "9")]
     pub semantics_wait_ms: ::core::option::Option<u64>,
@@ -286,8 +348,8 @@ pub struct QueryResponse {
     #[prost(uint32, tag = "1")]
     pub bank_size: u32,
     /// How texts were scored.
-    #[prost(enumeration = "ScoringProfile", tag = "2")]
-    pub profile: i32,
+    #[prost(message, optional, tag = "7")]
+    pub scoring: ::core::option::Option<Scoring>,
     /// Lens of the view.
     #[prost(message, optional, tag = "3")]
     pub intrinsics: ::core::option::Option<Intrinsics>,
@@ -310,7 +372,7 @@ pub struct TextResult {
     /// Relevancy of each entry of the bank, 0..1; the first is entry 1.
     #[prost(float, repeated, tag = "2")]
     pub scores: ::prost::alloc::vec::Vec<f32>,
-    /// Entries selected: those of relevancy 0.5 and more.
+    /// Entries selected: those whose relevancy is at the cut or over it.
     #[prost(uint32, repeated, tag = "3")]
     pub entries: ::prost::alloc::vec::Vec<u32>,
     /// Gaussians selected.
@@ -409,8 +471,8 @@ pub struct PickRequest {
     #[prost(string, repeated, tag = "6")]
     pub labels: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
     /// How labels are scored.
-    #[prost(enumeration = "ScoringProfile", tag = "7")]
-    pub profile: i32,
+    #[prost(message, optional, tag = "9")]
+    pub scoring: ::core::option::Option<Scoring>,
     /// How long to wait for semantics that are being made, milliseconds.
     #[prost(uint64, optional, tag = "8")]
     pub semantics_wait_ms: ::core::option::Option<u64>,
@@ -446,39 +508,6 @@ pub struct Label {
     /// Relevancy, 0..1; under 0.5 it does not name it.
     #[prost(float, tag = "2")]
     pub relevancy: f32,
-}
-/// How texts are scored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
-#[repr(i32)]
-pub enum ScoringProfile {
-    /// As SCORING_PROFILE_DEFAULT.
-    Unspecified = 0,
-    /// Unit centroids, a coverage floor, the bundle's phrases.
-    Default = 1,
-    /// As the paper: plain centroids, no floor, its three phrases.
-    Paper = 2,
-}
-impl ScoringProfile {
-    /// String value of the enum field names used in the ProtoBuf definition.
-    ///
-    /// The values are not transformed in any way and thus are considered stable
-    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
-    pub fn as_str_name(&self) -> &'static str {
-        match self {
-            Self::Unspecified => "SCORING_PROFILE_UNSPECIFIED",
-            Self::Default => "SCORING_PROFILE_DEFAULT",
-            Self::Paper => "SCORING_PROFILE_PAPER",
-        }
-    }
-    /// Creates an enum from field names used in the ProtoBuf definition.
-    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
-        match value {
-            "SCORING_PROFILE_UNSPECIFIED" => Some(Self::Unspecified),
-            "SCORING_PROFILE_DEFAULT" => Some(Self::Default),
-            "SCORING_PROFILE_PAPER" => Some(Self::Paper),
-            _ => None,
-        }
-    }
 }
 /// Which boxes hold the parts of a selection.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
@@ -554,15 +583,73 @@ impl MaskFormat {
         }
     }
 }
+/// How a scene is made, understood and shown. In a request, what is left out is that of the preset.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Method {
+    /// The preset that the other fields start from.
+    #[prost(enumeration = "Preset", tag = "1")]
+    pub preset: i32,
+    /// Whether Gaussians that add nothing are dropped.
+    #[prost(bool, optional, tag = "2")]
+    pub prune: ::core::option::Option<bool>,
+    /// Photos that may keep Gaussians of one surface; 0 keeps those of all.
+    #[prost(uint32, optional, tag = "3")]
+    pub fuse_layers: ::core::option::Option<u32>,
+    /// How many Gaussians are kept.
+    #[prost(enumeration = "Density", tag = "4")]
+    pub density: i32,
+    /// Whether views have the photos' colours by direction behind them.
+    #[prost(bool, optional, tag = "5")]
+    pub backdrop: ::core::option::Option<bool>,
+    /// Masks of a prompt that are taken.
+    #[prost(enumeration = "MaskLevel", tag = "6")]
+    pub mask_level: i32,
+    /// Whether prompts are skipped where a mask lies already.
+    #[prost(bool, optional, tag = "7")]
+    pub skip_covered: ::core::option::Option<bool>,
+    /// Whether a photo is asked first where masks of earlier photos reappear.
+    #[prost(bool, optional, tag = "8")]
+    pub seeds: ::core::option::Option<bool>,
+    /// Whether masks are judged at the photo's own pixels.
+    #[prost(bool, optional, tag = "9")]
+    pub full_resolution: ::core::option::Option<bool>,
+    /// Whether masks are also held to each other's pixels and to bounds on their area.
+    #[prost(bool, optional, tag = "10")]
+    pub mask_filters: ::core::option::Option<bool>,
+    /// Whether the crop of a mask shows all of it, also where a smaller mask lies on it.
+    #[prost(bool, optional, tag = "11")]
+    pub crop_whole: ::core::option::Option<bool>,
+    /// Whether the crop of a mask has the bundle's margin.
+    #[prost(bool, optional, tag = "12")]
+    pub crop_margin: ::core::option::Option<bool>,
+    /// Rows of the bank over the mean number of masks of a photo.
+    #[prost(double, optional, tag = "13")]
+    pub lambda: ::core::option::Option<f64>,
+    /// Rows of the bank (M); 0: by lambda.
+    #[prost(uint32, optional, tag = "14")]
+    pub bank_rows: ::core::option::Option<u32>,
+    /// Whether all photos that show a Gaussian vote for its entry.
+    #[prost(bool, optional, tag = "15")]
+    pub votes: ::core::option::Option<bool>,
+    /// Least cosine of two entries that become one; 0: no two do.
+    #[prost(double, optional, tag = "16")]
+    pub merge_cosine: ::core::option::Option<f64>,
+    /// Photos whose Gaussians are in front in a view; 0: those of all.
+    #[prost(uint32, optional, tag = "17")]
+    pub front_photos: ::core::option::Option<u32>,
+    /// Whether a view that magnifies the photos blurs the Gaussians as the network learnt them.
+    #[prost(bool, optional, tag = "18")]
+    pub magnify: ::core::option::Option<bool>,
+}
 /// One message of the upload.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct CreateSceneRequest {
     #[prost(oneof = "create_scene_request::Part", tags = "1, 2, 3")]
     pub part: ::core::option::Option<create_scene_request::Part>,
 }
 /// Nested message and enum types in `CreateSceneRequest`.
 pub mod create_scene_request {
-    #[derive(Clone, PartialEq, Eq, Hash, ::prost::Oneof)]
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Part {
         /// First message, once.
         #[prost(message, tag = "1")]
@@ -576,7 +663,7 @@ pub mod create_scene_request {
     }
 }
 /// Cameras and options of a scene.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct CreateSceneHeader {
     /// When the semantic bank is made.
     #[prost(enumeration = "Semantics", tag = "3")]
@@ -593,9 +680,9 @@ pub struct CreateSceneHeader {
     /// Two calls with one key and the same content make one scene.
     #[prost(string, tag = "7")]
     pub idempotency_key: ::prost::alloc::string::String,
-    /// How many Gaussians are kept.
-    #[prost(enumeration = "Density", tag = "8")]
-    pub density: i32,
+    /// How the scene is made and understood.
+    #[prost(message, optional, tag = "9")]
+    pub method: ::core::option::Option<Method>,
     /// Camera description; left out when it is in the archive.
     #[prost(oneof = "create_scene_header::Cameras", tags = "1, 2")]
     pub cameras: ::core::option::Option<create_scene_header::Cameras>,
@@ -710,9 +797,9 @@ pub struct SemanticsReport {
     /// sha256 of the bundle's manifest, hex.
     #[prost(string, tag = "4")]
     pub bundle_sha256: ::prost::alloc::string::String,
-    /// Scoring profile they were made under.
-    #[prost(enumeration = "ScoringProfile", tag = "5")]
-    pub profile: i32,
+    /// How they were made.
+    #[prost(message, optional, tag = "8")]
+    pub method: ::core::option::Option<Method>,
     /// Time of each stage.
     #[prost(message, repeated, tag = "6")]
     pub stages: ::prost::alloc::vec::Vec<StageTime>,
@@ -759,6 +846,9 @@ pub struct HealthReport {
     /// Focal length of each photo in the network's picture of it, pixels; 0 where it was not used.
     #[prost(double, repeated, tag = "12")]
     pub network_focal_px: ::prost::alloc::vec::Vec<f64>,
+    /// How it was made.
+    #[prost(message, optional, tag = "13")]
+    pub method: ::core::option::Option<Method>,
 }
 /// How many Gaussians were dropped or clamped for one reason.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -888,12 +978,12 @@ pub struct RenderViewRequest {
     /// What to look for, for KIND_RELEVANCY and KIND_MASK.
     #[prost(string, tag = "5")]
     pub text: ::prost::alloc::string::String,
-    /// How the text is scored.
-    #[prost(enumeration = "ScoringProfile", tag = "6")]
-    pub profile: i32,
     /// How long to wait for semantics that are being made, milliseconds.
     #[prost(uint64, optional, tag = "7")]
     pub semantics_wait_ms: ::core::option::Option<u64>,
+    /// How the text is scored.
+    #[prost(message, optional, tag = "8")]
+    pub scoring: ::core::option::Option<Scoring>,
 }
 /// Many cameras and kinds.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -913,12 +1003,12 @@ pub struct RenderViewsRequest {
     /// What to look for, for KIND_RELEVANCY and KIND_MASK.
     #[prost(string, tag = "5")]
     pub text: ::prost::alloc::string::String,
-    /// How the text is scored.
-    #[prost(enumeration = "ScoringProfile", tag = "6")]
-    pub profile: i32,
     /// How long to wait for semantics that are being made, milliseconds.
     #[prost(uint64, optional, tag = "7")]
     pub semantics_wait_ms: ::core::option::Option<u64>,
+    /// How the text is scored.
+    #[prost(message, optional, tag = "8")]
+    pub scoring: ::core::option::Option<Scoring>,
 }
 /// One encoded picture.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -961,7 +1051,7 @@ pub struct View {
     pub visible: u64,
 }
 /// Which scene to write, and how.
-#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+#[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ExportRequest {
     /// Id.
     #[prost(string, tag = "1")]
@@ -972,11 +1062,36 @@ pub struct ExportRequest {
     /// Writes only what this text selects; empty: everything.
     #[prost(string, tag = "3")]
     pub text: ::prost::alloc::string::String,
-    /// How the text is scored.
-    #[prost(enumeration = "ScoringProfile", tag = "4")]
-    pub profile: i32,
     /// How long to wait for semantics that are being made, milliseconds.
     #[prost(uint64, optional, tag = "5")]
+    pub semantics_wait_ms: ::core::option::Option<u64>,
+    /// How the text is scored; left out: as the scene was made.
+    #[prost(enumeration = "Preset", tag = "6")]
+    pub preset: i32,
+    /// Changes of that.
+    #[prost(message, optional, tag = "7")]
+    pub scoring: ::core::option::Option<Scoring>,
+}
+/// Which view, and what of it.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct FeaturesRequest {
+    /// Id.
+    #[prost(string, tag = "1")]
+    pub scene_id: ::prost::alloc::string::String,
+    /// Camera.
+    #[prost(message, optional, tag = "2")]
+    pub camera: ::core::option::Option<CameraSpec>,
+    /// Size and the rest of the view; its format does not count.
+    #[prost(message, optional, tag = "3")]
+    pub options: ::core::option::Option<ViewOptions>,
+    /// E or F.
+    #[prost(enumeration = "FeatureKind", tag = "4")]
+    pub kind: i32,
+    /// How the rows of F are blended.
+    #[prost(message, optional, tag = "5")]
+    pub scoring: ::core::option::Option<Scoring>,
+    /// How long to wait for semantics that are being made, milliseconds.
+    #[prost(uint64, optional, tag = "6")]
     pub semantics_wait_ms: ::core::option::Option<u64>,
 }
 /// A piece of the file.
@@ -985,7 +1100,7 @@ pub struct ExportChunk {
     /// Bytes.
     #[prost(bytes = "bytes", tag = "1")]
     pub data: ::prost::bytes::Bytes,
-    /// On the first piece: size of the whole file.
+    /// On the first piece: size of the whole file, where it is known.
     #[prost(uint64, optional, tag = "2")]
     pub size_bytes: ::core::option::Option<u64>,
     /// On the first piece: proposed file name.
@@ -1058,6 +1173,47 @@ impl Density {
             "DENSITY_UNSPECIFIED" => Some(Self::Unspecified),
             "DENSITY_THINNED" => Some(Self::Thinned),
             "DENSITY_FULL" => Some(Self::Full),
+            _ => None,
+        }
+    }
+}
+/// Which mask of a prompt is taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum MaskLevel {
+    /// As MASK_LEVEL_WIDEST; in a request that of the preset.
+    Unspecified = 0,
+    /// The most whole one that passes the filters.
+    Widest = 1,
+    /// The whole, or none.
+    Whole = 2,
+    /// The part, or none.
+    Part = 3,
+    /// The part of a part, or none.
+    Subpart = 4,
+}
+impl MaskLevel {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "MASK_LEVEL_UNSPECIFIED",
+            Self::Widest => "MASK_LEVEL_WIDEST",
+            Self::Whole => "MASK_LEVEL_WHOLE",
+            Self::Part => "MASK_LEVEL_PART",
+            Self::Subpart => "MASK_LEVEL_SUBPART",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "MASK_LEVEL_UNSPECIFIED" => Some(Self::Unspecified),
+            "MASK_LEVEL_WIDEST" => Some(Self::Widest),
+            "MASK_LEVEL_WHOLE" => Some(Self::Whole),
+            "MASK_LEVEL_PART" => Some(Self::Part),
+            "MASK_LEVEL_SUBPART" => Some(Self::Subpart),
             _ => None,
         }
     }
@@ -1209,6 +1365,8 @@ pub enum ExportFormat {
     Unspecified = 0,
     /// Standard 3DGS PLY.
     Ply = 1,
+    /// The semantics as NumPy arrays.
+    Npz = 2,
 }
 impl ExportFormat {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -1219,6 +1377,7 @@ impl ExportFormat {
         match self {
             Self::Unspecified => "EXPORT_FORMAT_UNSPECIFIED",
             Self::Ply => "EXPORT_FORMAT_PLY",
+            Self::Npz => "EXPORT_FORMAT_NPZ",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -1226,6 +1385,40 @@ impl ExportFormat {
         match value {
             "EXPORT_FORMAT_UNSPECIFIED" => Some(Self::Unspecified),
             "EXPORT_FORMAT_PLY" => Some(Self::Ply),
+            "EXPORT_FORMAT_NPZ" => Some(Self::Npz),
+            _ => None,
+        }
+    }
+}
+/// What the pixels of a view are described by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum FeatureKind {
+    /// As FEATURE_KIND_WEIGHTS.
+    Unspecified = 0,
+    /// E: the entries that a pixel shows and their weights. Arrays size, offsets, entries, weights.
+    Weights = 1,
+    /// F: \[H, W, D\] f32 of length 1. Array features.
+    Features = 2,
+}
+impl FeatureKind {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "FEATURE_KIND_UNSPECIFIED",
+            Self::Weights => "FEATURE_KIND_WEIGHTS",
+            Self::Features => "FEATURE_KIND_FEATURES",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "FEATURE_KIND_UNSPECIFIED" => Some(Self::Unspecified),
+            "FEATURE_KIND_WEIGHTS" => Some(Self::Weights),
+            "FEATURE_KIND_FEATURES" => Some(Self::Features),
             _ => None,
         }
     }
@@ -1560,6 +1753,31 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("segsplat.v1.SceneService", "Export"));
             self.inner.server_streaming(req, path, codec).await
         }
+        /// The pixels of a view over the bank as arrays: an npz file in pieces.
+        pub async fn features(
+            &mut self,
+            request: impl tonic::IntoRequest<super::FeaturesRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::ExportChunk>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/segsplat.v1.SceneService/Features",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("segsplat.v1.SceneService", "Features"));
+            self.inner.server_streaming(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -1653,6 +1871,17 @@ pub mod scene_service_server {
             &self,
             request: tonic::Request<super::ExportRequest>,
         ) -> std::result::Result<tonic::Response<Self::ExportStream>, tonic::Status>;
+        /// Server streaming response type for the Features method.
+        type FeaturesStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::ExportChunk, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// The pixels of a view over the bank as arrays: an npz file in pieces.
+        async fn features(
+            &self,
+            request: tonic::Request<super::FeaturesRequest>,
+        ) -> std::result::Result<tonic::Response<Self::FeaturesStream>, tonic::Status>;
     }
     /// Posed photos in, a 3D Gaussian scene by id, views at any pose out.
     #[derive(Debug)]
@@ -2168,6 +2397,52 @@ pub mod scene_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = ExportSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/segsplat.v1.SceneService/Features" => {
+                    #[allow(non_camel_case_types)]
+                    struct FeaturesSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::ServerStreamingService<super::FeaturesRequest>
+                    for FeaturesSvc<T> {
+                        type Response = super::ExportChunk;
+                        type ResponseStream = T::FeaturesStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::FeaturesRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::features(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = FeaturesSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

@@ -20,10 +20,11 @@ use crate::{
 
 /// The gRPC methods of the one service: name in metrics and the scope that each needs. The HTTP
 /// routes have their own list. A test compares the two.
-const RPCS: [(&str, &str, Scope); 10] = [
+const RPCS: [(&str, &str, Scope); 11] = [
     ("CreateScene", "create_scene", Scope::Write),
     ("DeleteScene", "delete_scene", Scope::Write),
     ("Export", "export", Scope::Read),
+    ("Features", "features", Scope::Read),
     ("GetScene", "get_scene", Scope::Read),
     ("ListScenes", "list_scenes", Scope::Read),
     ("Pick", "pick", Scope::Read),

@@ -7,6 +7,7 @@
 mod bench;
 mod camera;
 pub mod engine;
+mod features;
 mod health;
 mod inspect;
 mod keys;
@@ -61,6 +62,8 @@ enum Command {
     Render(Box<render::Args>),
     /// Search a scene by text, in 3D and in a view
     Query(Box<query::Args>),
+    /// Write the bank of a scene, or the pixels of a view over it, as NumPy arrays
+    Features(Box<features::Args>),
     /// Show what is in a scene file
     Inspect(inspect::Args),
     /// The model bundle and ONNX Runtime
@@ -80,6 +83,7 @@ impl Command {
             Self::Reconstruct(args) => common(&args.config),
             Self::Render(args) => common(&args.config),
             Self::Query(args) => common(&args.config),
+            Self::Features(args) => common(&args.config),
             Self::Models(args) => common(&args.config),
             Self::Bench(args) => common(&args.config),
             Self::Inspect(_) | Self::Sample(_) | Self::Keys(_) => AllArgs::default(),
@@ -95,9 +99,7 @@ pub fn main() -> ExitCode {
 }
 
 fn run(args: impl IntoIterator<Item = OsString>) -> ExitCode {
-    // `--paper` is the old name of `--profile=paper`.
-    let today = |arg: OsString| if arg == "--paper" { "--profile=paper".into() } else { arg };
-    let args: Vec<OsString> = args.into_iter().map(today).collect();
+    let args: Vec<OsString> = args.into_iter().collect();
     let cli = match Cli::try_parse_from(&args) {
         Ok(cli) => cli,
         // A wrong value is an error like any other, also as JSON.
@@ -150,6 +152,7 @@ fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
         Command::Reconstruct(args) => reconstruct::run(args, &config, out),
         Command::Render(args) => render::run(args, &config, out),
         Command::Query(args) => query::run(args, &config, out),
+        Command::Features(args) => features::run(args, &config, out),
         Command::Inspect(args) => inspect::run(args, &config, out),
         Command::Models(args) => models::run(args, &config, out),
         Command::Bench(args) => bench::run(args, &config, out),

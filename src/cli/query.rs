@@ -10,11 +10,11 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
     names::named,
-    scene::ScoringProfile,
     service::{
-        Boxes, CameraFields, MaskFormat, OfflineService, QuerySpec, TextResult, ViewOptions,
+        Boxes, CameraFields, MaskFormat, OfflineService, QuerySpec, ScoringOptions, TextResult,
+        ViewOptions,
     },
-    store::ply::PlyWriter,
+    store::ply::{PlyFile, PlyWriter},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -32,13 +32,12 @@ pub(super) struct Args {
     /// Boxes of the parts: oriented, aligned or none
     #[arg(long, default_value = "oriented", value_parser = named::<Boxes>)]
     boxes: Boxes,
-    /// How texts are scored: default, or paper
-    #[arg(long, default_value = "default", value_parser = named::<ScoringProfile>)]
-    profile: ScoringProfile,
     #[command(flatten)]
     camera: CameraFields,
     #[command(flatten)]
     options: ViewOptions,
+    #[command(flatten)]
+    scoring: ScoringOptions,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
 }
@@ -49,14 +48,13 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     if ending == Some(Ending::Png) && of_view.is_none() {
         return Err(camera::no_camera());
     }
-    let profile = args.profile;
     let spec = QuerySpec {
         texts: args.texts.clone(),
         camera: of_view,
         options: args.options.clone(),
         boxes: args.boxes,
         mask: if ending == Some(Ending::Png) { MaskFormat::Png } else { MaskFormat::Rle },
-        profile,
+        scoring: args.scoring.clone(),
         ..QuerySpec::default()
     };
     let opened = scene_file::open(&args.scene, &config.limits)?;
@@ -70,7 +68,8 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         let path = numbered(output, i, answer.results.len());
         match ending {
             Some(Ending::Ply) => {
-                let chosen = service.select(&opened.scene, &found.text, profile)?;
+                let chosen = service.select(&opened.scene, &found.text, &spec)?;
+                let chosen = PlyFile::new(chosen, None)?;
                 let file: Vec<u8> = PlyWriter::new(&chosen).flatten().collect();
                 scene_file::write(&path, &file)?;
             }

@@ -22,10 +22,14 @@ use crate::{
     photos,
     pipeline::{
         self, Pipeline,
-        semantics::{SemanticsInput, SemanticsOptions, understand},
+        semantics::{SemanticsInput, understand},
     },
-    scene::{Density, Scene, SceneId, SceneOptions, SemanticsMode, Stage, Upload, Watch},
-    store::{self, ply::PlyWriter, write_scene_file, write_semantics_file},
+    scene::{Density, Preset, Scene, SceneId, SceneOptions, SemanticsMode, Stage, Upload, Watch},
+    store::{
+        self,
+        ply::{PlyFile, PlyWriter},
+        write_scene_file, write_semantics_file,
+    },
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -42,8 +46,14 @@ pub(super) struct Args {
     #[arg(long, value_parser = semantics, default_value = "off")]
     semantics: SemanticsMode,
     /// Gaussians kept: `thinned`, one for up to 16 neighbours where the photos are flat, or `full`
-    #[arg(long, value_parser = named::<Density>, default_value = "thinned")]
-    density: Density,
+    #[arg(long, value_parser = named::<Density>)]
+    density: Option<Density>,
+    /// How the scene is made and understood: `default`, or `paper`
+    #[arg(long, value_parser = named::<Preset>, default_value = "default")]
+    preset: Preset,
+    /// A change of the method: `--method lambda=0.8 --method votes=false`; docs/method.md has all
+    #[arg(long, value_name = "NAME=VALUE")]
+    method: Vec<String>,
     #[command(flatten)]
     pub(super) config: ConfigArgs,
 }
@@ -54,14 +64,13 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let options = SceneOptions {
         max_views: args.max_views,
         semantics: args.semantics,
+        preset: args.preset,
         density: args.density,
+        ..SceneOptions::default()
     };
+    let options = options.with(&args.method)?;
+    options.method().check()?;
     let eager = args.semantics == SemanticsMode::Eager;
-    if eager && is_ply(&args.output) {
-        return Err(Error::invalid(
-            "--semantics eager: a PLY cannot hold semantics; write a scene file",
-        ));
-    }
     if let (true, Some(lack)) = (eager, engine.bundle().lacks_semantics()) {
         let message = format!("--semantics eager: the bundle has {lack}");
         return Err(Error::new(ErrorCode::ModelUnavailable, message));
@@ -86,10 +95,15 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     if eager {
         let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
         let parts = SemanticsInput { photos: &photos.photos, cameras, gaussians };
-        let made = understand(&engine, &parts, &SemanticsOptions::default(), watch)?;
+        let made = understand(&engine, &parts, &scene.meta.report.method, watch)?;
         let semantics = Arc::new(made);
-        write_semantics_file(&semantics_path(&path), &scene.meta.id, &semantics)?;
+        if !is_ply(&path) {
+            write_semantics_file(&semantics_path(&path), &scene.meta.id, &semantics)?;
+        }
         scene = scene.with_semantics(semantics)?;
+        if is_ply(&path) {
+            write(&path, &scene)?;
+        }
     } else if !is_ply(&path) {
         remove(&semantics_path(&path))?;
     }
@@ -130,9 +144,10 @@ fn write(path: &Path, scene: &Scene) -> Result<()> {
     if !is_ply(path) {
         return write_scene_file(path, scene);
     }
+    let ply = PlyFile::new(scene.gaussians.clone(), scene.semantics.as_deref())?;
     let write = || -> std::io::Result<()> {
         let mut file = fs_err::File::create(path)?;
-        for piece in PlyWriter::new(&scene.gaussians) {
+        for piece in PlyWriter::new(&ply) {
             file.write_all(&piece)?;
         }
         file.sync_all()

@@ -69,7 +69,7 @@ pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
     let path = path_of(path);
     if is_ply(&path) {
         let file = fs_err::File::open(&path).map_err(|e| unreadable(&path, e))?;
-        let (gaussians, counts) = read_ply(BufReader::new(file), limits.gaussians_max)?;
+        let (gaussians, counts, semantics) = read_ply(BufReader::new(file), limits.gaussians_max)?;
         let dropped = counts
             .counts()
             .into_iter()
@@ -87,7 +87,10 @@ pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
             report,
             provenance: Provenance::default(),
         };
-        let scene = Scene::new(meta, gaussians, Backdrop::default());
+        let mut scene = Scene::new(meta, gaussians, Backdrop::default());
+        if let Some(semantics) = semantics {
+            scene = scene.with_semantics(Arc::new(semantics))?;
+        }
         return Ok(Opened { scene, format: "ply", sha256: None });
     }
     let file = fs_err::read(&path).map_err(|e| unreadable(&path, e))?;

@@ -6,7 +6,7 @@ use crate::{
     error::{Error, ErrorCode, Result},
     pipeline::{
         self, PhotoSet, PipelineLoader, Reconstruction,
-        semantics::{SemanticsInput, SemanticsOptions, understand},
+        semantics::{SemanticsInput, understand},
     },
     scene::{PosedPhoto, Scene, SceneOptions, Semantics, TextEmbedding, Watch},
 };
@@ -179,6 +179,6 @@ impl SemanticNetworks for PipelineNetworks {
     fn make(&self, photos: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics> {
         let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
         let parts = SemanticsInput { photos, cameras, gaussians };
-        understand(self.0.get()?, &parts, &SemanticsOptions::default(), watch)
+        understand(self.0.get()?, &parts, &scene.meta.report.method, watch)
     }
 }

@@ -183,6 +183,7 @@ fn check_request(
             limits.photos_min, limits.photos_max
         )));
     }
+    options.method().check()?;
     match key.map(str::len) {
         Some(0) => Err(Error::invalid("the idempotency key is empty")),
         Some(bytes) if bytes > IDEMPOTENCY_KEY_BYTES_MAX => {

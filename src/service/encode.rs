@@ -6,7 +6,10 @@ use std::borrow::Cow;
 
 use image::{ExtendedColorType, ImageEncoder, codecs::webp::WebPEncoder};
 
-use super::request::{Format, Kind};
+use super::{
+    npz,
+    request::{Format, Kind},
+};
 use crate::{
     error::{Error, Result},
     render::{DepthSteps, Frame, levels::level},
@@ -228,20 +231,10 @@ fn numbers(layer: Layer<'_>, width: u32, height: u32) -> Result<Vec<u8>> {
     })
 }
 
-/// `NumPy`'s format version 1.0, C order.
+/// An array in C order.
 fn npy(values: &[f32], shape: &[u32]) -> Vec<u8> {
-    let sides: Vec<String> = shape.iter().map(u32::to_string).collect();
-    let mut header =
-        format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({}), }}", sides.join(", "));
-    // Magic, version and length take 10 bytes; the data starts at a multiple of 64.
-    let padded = (10 + header.len() + 1).next_multiple_of(64) - 10;
-    header.push_str(&" ".repeat(padded - header.len() - 1));
-    header.push('\n');
-    let length = header.len() as u16;
-    let mut file = Vec::with_capacity(10 + header.len() + 4 * values.len());
-    file.extend(b"\x93NUMPY\x01\x00");
-    file.extend(length.to_le_bytes());
-    file.extend(header.as_bytes());
-    file.extend(values.iter().flat_map(|v| v.to_le_bytes()));
+    let shape: Vec<usize> = shape.iter().map(|side| *side as usize).collect();
+    let mut file = npz::header::<f32>(&shape);
+    file.extend_from_slice(bytemuck::cast_slice(values));
     file
 }

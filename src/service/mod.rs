@@ -7,7 +7,9 @@ mod camera;
 mod create;
 mod encode;
 mod export;
+mod features;
 mod memory;
+mod npz;
 mod offline;
 mod pick;
 mod query;
@@ -31,9 +33,9 @@ use self::{memory::Memory, schedule::Scheduler, search::Backend};
 pub use self::{
     offline::OfflineService,
     request::{
-        BackgroundSpec, Boxes, CameraFields, CameraSpec, CreateScene, ExportFormat, Format, Kind,
-        LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions, PoseSpec, QuerySpec,
-        TextOptions, ViewOptions, ViewSpec, ViewsSpec,
+        BackgroundSpec, Boxes, CameraFields, CameraSpec, CreateScene, ExportFormat, FeatureKind,
+        FeaturesSpec, Format, Kind, LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions,
+        PoseSpec, QuerySpec, ScoringOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec,
     },
     rle::Rle,
     times::ViewTimes,
@@ -44,8 +46,8 @@ pub use self::{
 };
 pub use crate::render::{Quality, plan::default_near};
 pub use crate::scene::{
-    Density, Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
-    SemanticsState, SemanticsStatus, Upload, UploadCameras, UploadFile,
+    Density, Event, MaskLevel, Method, Preset, SceneCamera, SceneError, SceneOptions, SceneState,
+    SceneStatus, SemanticsMode, SemanticsState, SemanticsStatus, Upload, UploadCameras, UploadFile,
 };
 use crate::{
     config::Config,

@@ -1,11 +1,11 @@
 //! The same answers for a scene that lies in a file, without a server.
 
-use std::sync::Arc;
+use std::{io::Write, sync::Arc};
 
 use super::{
-    pick, query,
-    request::{PickSpec, QuerySpec, ViewSpec},
-    search::{Backend, SceneTexts, Subject},
+    features, pick, query,
+    request::{FeaturesSpec, PickSpec, QuerySpec, ViewSpec},
+    search::{Backend, SceneTexts, Subject, check_scoring},
     texts,
     times::ViewTimes,
     types::{Picked, QueryAnswer, RenderedView},
@@ -16,7 +16,7 @@ use crate::{
     jobs::SemanticNetworks,
     limits::Limits,
     render::Renderer,
-    scene::{Gaussians, Scene, ScoringProfile},
+    scene::{Gaussians, Scene},
 };
 
 /// The use cases of [`super::Service`] for scenes that lie in files: no store, jobs or owners.
@@ -66,7 +66,8 @@ impl OfflineService {
         let texts = if spec.kind.needs_semantics() {
             let subject = self.subject(scene, &format!("kind={}", spec.kind))?;
             let text = ask.text.as_slice();
-            Some(SceneTexts::new(&self.backend, subject, ask.profile, text)?)
+            let how = (spec.options.preset, &ask.scoring);
+            Some(SceneTexts::new(&self.backend, subject, how, text)?)
         } else {
             None
         };
@@ -84,7 +85,9 @@ impl OfflineService {
         let texts = texts::all_checked(&spec.texts, "texts", &self.limits)?;
         let view = query::query_view(&self.limits, scene, spec)?;
         let subject = self.subject(scene, "query")?;
-        let texts = SceneTexts::new(&self.backend, subject, spec.profile, &texts)?;
+        check_scoring(&spec.scoring, &self.limits)?;
+        let how = (spec.options.preset, &spec.scoring);
+        let texts = SceneTexts::new(&self.backend, subject, how, &texts)?;
         query::answer(&texts, &self.limits, spec, view.as_ref(), ViewTimes::default(), || ())
     }
 
@@ -97,13 +100,35 @@ impl OfflineService {
         pick::pick(scene, &view, [spec.x, spec.y])
     }
 
-    /// The Gaussians that a text selects.
+    /// As [`super::Service::export`] of the semantics, and as [`super::Service::features`] where
+    /// there is a view: an npz file, written to `to`.
+    ///
+    /// # Errors
+    /// As there; `semantics_off` where the scene has no semantics.
+    pub fn arrays(
+        &self,
+        scene: &Scene,
+        spec: Option<&FeaturesSpec>,
+        to: &mut dyn Write,
+    ) -> Result<()> {
+        let subject = self.subject(scene, "arrays")?;
+        let Some(spec) = spec else { return features::write_semantics(subject, to) };
+        let view = features::features_view(&self.limits, scene, spec)?;
+        let how = (spec.options.preset, &spec.scoring);
+        let texts = SceneTexts::new(&self.backend, subject, how, &[])?;
+        let weights = features::drawn(&texts, &view)?;
+        features::check_size(&texts, &weights, spec.kind, &self.limits)?;
+        features::write(&texts, &weights, spec.kind, to)
+    }
+
+    /// The Gaussians that a text selects, scored as `spec` says.
     ///
     /// # Errors
     /// As [`Self::query`].
-    pub fn select(&self, scene: &Scene, text: &str, profile: ScoringProfile) -> Result<Gaussians> {
+    pub fn select(&self, scene: &Scene, text: &str, spec: &QuerySpec) -> Result<Gaussians> {
         let text = texts::checked(text, "text", &self.limits)?;
         let subject = self.subject(scene, "text")?;
-        Ok(SceneTexts::new(&self.backend, subject, profile, &[text])?.gaussians())
+        let how = (spec.options.preset, &spec.scoring);
+        Ok(SceneTexts::new(&self.backend, subject, how, &[text])?.gaussians())
     }
 }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::{
     Inner, Service,
     request::{Kind, PickSpec, PictureOptions},
-    search::SceneTexts,
+    search::{SceneTexts, check_scoring},
     semantics::Understood,
     texts,
     types::{Label, Picked},
@@ -74,7 +74,8 @@ impl Inner {
         entry: u16,
     ) -> Result<Vec<Label>> {
         let subject = understood.subject();
-        let texts = SceneTexts::new(&self.backend, subject, spec.profile, labels)?.texts;
+        let how = (spec.options.preset, &spec.scoring);
+        let texts = SceneTexts::new(&self.backend, subject, how, labels)?.texts;
         let score = |scores: &[f32]| scores.get(usize::from(entry)).copied().unwrap_or(0.0);
         let named = texts
             .into_iter()
@@ -100,12 +101,14 @@ impl Service {
             (Vec::new(), None)
         } else {
             inner.can_understand("labels")?;
+            check_scoring(&spec.scoring, &self.limits())?;
             let labels = texts::all_checked(&spec.labels, "labels", &self.limits())?;
             (labels, Some(inner.understood(&scene, "labels", spec.wait).await?))
         };
         let deadline = inner.deadline(&spec.options);
         if let Some(understood) = &understood {
-            inner.embed(understood, spec.profile, &labels, deadline).await?;
+            let how = (spec.options.preset, &spec.scoring);
+            inner.embed(understood, how, &labels, deadline).await?;
         }
         let shared = Arc::clone(inner);
         inner

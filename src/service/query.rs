@@ -10,7 +10,7 @@ use super::{
     encode::{self, Layer},
     request::{Boxes, Format, Kind, MaskFormat, PictureOptions, QuerySpec},
     rle::Rle,
-    search::{LabelledView, SceneTexts, ScoredText},
+    search::{self, LabelledView, SceneTexts, ScoredText},
     texts,
     times::{ViewTimes, staged},
     types::{InstanceBox, Peak, QueryAnswer, TextResult, TextView},
@@ -23,9 +23,6 @@ use crate::{
     scene::SceneId,
     semantics::{Instance, InstanceOptions, Scorer},
 };
-
-/// Relevancy from which a text selects.
-const SELECTED: f32 = 0.5;
 
 /// What each set of entries selects.
 type Selections = HashMap<Vec<u16>, Selection>;
@@ -82,7 +79,7 @@ pub(super) fn answer(
     times.encode_ms = ms;
     Ok(QueryAnswer {
         bank_size: u32::try_from(texts.of.semantics.bank.len()).unwrap_or(u32::MAX),
-        profile: spec.profile,
+        scoring: texts.scoring.clone(),
         camera: view.map(Resolved::camera),
         render_ms,
         results: results?,
@@ -140,17 +137,17 @@ fn text_view(
     spec: &QuerySpec,
 ) -> Result<TextView> {
     let relevancy = labelled.relevancy(scorer, &text.scores)?;
-    // A relevancy under 0.5 is 0, so this is the mask of the short form too.
-    let mask: Vec<bool> = relevancy.iter().map(|score| *score >= SELECTED).collect();
+    // A relevancy under the cut is 0, so this is the mask of the short form too.
+    let mask: Vec<bool> = relevancy.iter().map(|score| *score > 0.0).collect();
     let (width, height) = (labelled.width, labelled.height);
     let png = |layer| Ok(encode::encode(layer, width, height, Format::Png)?.bytes);
     let (mut view, mut corners) = (TextView::default(), None::<[u32; 4]>);
     let mut best = 0.0_f32;
     for (y, row) in (0..height).zip(relevancy.chunks_exact(width.max(1) as usize)) {
-        if row.iter().all(|score| *score < SELECTED) {
+        if row.iter().all(|score| *score == 0.0) {
             continue;
         }
-        for (x, score) in (0..width).zip(row).filter(|(_, score)| **score >= SELECTED) {
+        for (x, score) in (0..width).zip(row).filter(|(_, score)| **score > 0.0) {
             view.area += 1;
             let [left, top, right, bottom] = corners.unwrap_or([x, y, x, y]);
             corners = Some([left.min(x), top.min(y), right.max(x), bottom.max(y)]);
@@ -188,17 +185,20 @@ impl Service {
         let inner = &self.inner;
         inner.can_understand("query")?;
         let texts = texts::all_checked(&spec.texts, "texts", &self.limits())?;
+        search::check_scoring(&spec.scoring, &self.limits())?;
         let scene = scene.finished()?;
         let view = query_view(&self.limits(), scene.record(), &spec)?;
         let understood = inner.understood(&scene, "query", spec.wait).await?;
         let deadline = inner.deadline(&spec.options);
-        let embed_ms = inner.embed(&understood, spec.profile, &texts, deadline).await?;
+        let how = (spec.options.preset, &spec.scoring);
+        let embed_ms = inner.embed(&understood, how, &texts, deadline).await?;
         let shared = Arc::clone(inner);
         let pixels = view.as_ref().map_or(0, Resolved::pixels);
         inner
             .scheduled(deadline, pixels, "the query", move |slot| {
                 let subject = understood.subject();
-                let scored = || SceneTexts::new(&shared.backend, subject, spec.profile, &texts);
+                let how = (spec.options.preset, &spec.scoring);
+                let scored = || SceneTexts::new(&shared.backend, subject, how, &texts);
                 let (texts, ms) = staged("score", scored);
                 let times = ViewTimes {
                     queue_ms: slot.queue_ms,

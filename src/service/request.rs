@@ -11,7 +11,7 @@ use crate::{
     error::{Error, Result},
     names::{display_names, named},
     render::Quality,
-    scene::{Region, SceneOptions, ScoringProfile, Upload},
+    scene::{Preset, Region, SceneOptions, ScoringMethod, Upload},
 };
 
 /// Everything needed to make a scene.
@@ -138,12 +138,27 @@ pub enum MaskFormat {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum ExportFormat {
-    /// Standard 3DGS PLY with `semantic_index` as an extra attribute.
+    /// Standard 3DGS PLY with `semantic_index` as an extra attribute and, after the vertices, the
+    /// semantics where they are made.
     #[default]
     Ply,
+    /// The semantics as `NumPy` arrays: the bank, the row of each mask, the entry of each Gaussian
+    /// and of each cell of the photos.
+    Npz,
 }
 
-display_names!(Kind, Format, Boxes, MaskFormat, ExportFormat);
+/// What the pixels of a view are described by.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum FeatureKind {
+    /// E: the entries of the bank that a pixel shows and their weights, sparse.
+    #[default]
+    Weights,
+    /// F: `E^T B` at length 1, dense.
+    Features,
+}
+
+display_names!(Kind, Format, Boxes, MaskFormat, ExportFormat, FeatureKind);
 
 /// A camera as its separate fields: one pose, at most one lens.
 #[derive(
@@ -332,10 +347,60 @@ pub struct ViewOptions {
     #[arg(long, default_value = "exact", value_parser = named::<Quality>)]
     #[param(inline)]
     pub quality: Quality,
+    /// How it is drawn and texts are scored: `default` or `paper`. By default as the scene was
+    /// made.
+    #[arg(long, value_parser = named::<Preset>)]
+    #[param(inline)]
+    pub preset: Option<Preset>,
+    /// Photos whose Gaussians are in front, the nearest ones; 0: those of all. By default that of
+    /// the preset.
+    #[arg(long)]
+    pub front_photos: Option<u32>,
+    /// Whether magnified Gaussians are blurred as the network learnt them. By default that of the
+    /// preset.
+    #[arg(long)]
+    pub magnify: Option<bool>,
     /// The caller's own deadline; never over `limits.render_timeout_ms`.
     #[arg(skip)]
     #[serde(skip)]
     pub deadline: Option<Duration>,
+}
+
+/// Changes of how texts are scored; what is left out is that of the preset.
+#[derive(
+    Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema, IntoParams, clap::Args,
+)]
+#[serde(default, deny_unknown_fields)]
+#[into_params(parameter_in = Query)]
+pub struct ScoringOptions {
+    /// Canonical texts that a text is compared with; may be given many times.
+    #[arg(long, value_name = "TEXT")]
+    pub canon: Vec<String>,
+    /// Sharpness of the comparison.
+    #[arg(long)]
+    pub tau: Option<f64>,
+    /// Relevancy from which a text selects, 0 to 1.
+    #[arg(long)]
+    pub cut: Option<f64>,
+    /// Whether the bank's rows are brought to length 1 before they are blended.
+    #[arg(long)]
+    pub unit_rows: Option<bool>,
+    /// Coverage under which a pixel has no relevancy, 0 to 1.
+    #[arg(long)]
+    pub coverage_floor: Option<f64>,
+}
+
+impl ScoringOptions {
+    /// The method `of` a preset with these changes.
+    pub fn change(&self, of: ScoringMethod) -> ScoringMethod {
+        ScoringMethod {
+            canon: if self.canon.is_empty() { of.canon } else { self.canon.clone() },
+            tau: self.tau.unwrap_or(of.tau),
+            cut: self.cut.unwrap_or(of.cut),
+            unit_rows: self.unit_rows.unwrap_or(of.unit_rows),
+            coverage_floor: self.coverage_floor.unwrap_or(of.coverage_floor),
+        }
+    }
 }
 
 /// What a picture looks like as a file.
@@ -366,7 +431,7 @@ pub struct PictureOptions {
 
 /// A text and how it is scored.
 #[derive(
-    Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema, IntoParams, clap::Args,
+    Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema, IntoParams, clap::Args,
 )]
 #[serde(default, deny_unknown_fields)]
 #[into_params(parameter_in = Query)]
@@ -374,10 +439,11 @@ pub struct TextOptions {
     /// What to look for: for `relevancy`, `mask`, and an export of what the text selects.
     #[arg(long)]
     pub text: Option<String>,
-    /// How texts are scored: `default`, or `paper`.
-    #[arg(long, default_value = "default", value_parser = named::<ScoringProfile>)]
-    #[param(inline)]
-    pub profile: ScoringProfile,
+    /// How it is scored.
+    #[command(flatten)]
+    #[serde(flatten, skip_deserializing)]
+    #[param(ignore)]
+    pub scoring: ScoringOptions,
     /// Milliseconds to wait for semantics that are being made; 0 answers `scene_not_ready` at once.
     #[arg(skip)]
     #[serde(rename = "wait_ms", with = "millis")]
@@ -442,7 +508,8 @@ pub struct QuerySpec {
     /// Whether the view's relevancy is given too, as an 8-bit grey PNG.
     pub relevancy: bool,
     /// How texts are scored.
-    pub profile: ScoringProfile,
+    #[serde(flatten)]
+    pub scoring: ScoringOptions,
     /// Milliseconds to wait for semantics that are being made; 0 answers `scene_not_ready` at once.
     #[serde(rename = "wait_ms", with = "millis")]
     #[schema(value_type = Option<u64>)]
@@ -463,7 +530,22 @@ pub struct PickSpec {
     /// Texts to name the entry with; without them it needs no semantics.
     pub labels: Vec<String>,
     /// How labels are scored.
-    pub profile: ScoringProfile,
+    pub scoring: ScoringOptions,
+    /// How long to wait for semantics that are being made; `None`: `limits.text_wait_ms`.
+    pub wait: Option<Duration>,
+}
+
+/// The pixels of a view over the bank.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FeaturesSpec {
+    /// Camera.
+    pub camera: CameraSpec,
+    /// Size and the rest of the view.
+    pub options: ViewOptions,
+    /// E or F.
+    pub kind: FeatureKind,
+    /// How the rows of F are blended; texts do not matter.
+    pub scoring: ScoringOptions,
     /// How long to wait for semantics that are being made; `None`: `limits.text_wait_ms`.
     pub wait: Option<Duration>,
 }

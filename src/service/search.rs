@@ -9,16 +9,19 @@ use std::{
     sync::{Arc, OnceLock},
 };
 
-use super::{types::TextWarning, view::text_words};
+use super::{request::ScoringOptions, texts, types::TextWarning, view::text_words};
 use crate::{
     cache::Cache,
     error::{Error, Result},
-    jobs::{Phrases, SemanticNetworks},
+    jobs::SemanticNetworks,
     limits::Limits,
     render::{Labels, PixelWeights, RenderRequest, Renderer},
-    scene::{Gaussians, PAPER_PHRASES, PAPER_TAU, Scene, ScoringProfile, Semantics, TextEmbedding},
+    scene::{Gaussians, Preset, Scene, ScoringMethod, Semantics, TextEmbedding},
     semantics::{Components, InstanceOptions, Scorer, Scoring, TextScores, ViewNorms},
 };
+
+/// The preset by which texts are scored, that of the scene where none is named, and changes of it.
+pub(super) type ScoringChoice<'a> = (Option<Preset>, &'a ScoringOptions);
 
 /// What answers are computed with, and what was kept from earlier texts. Its calls block; they
 /// belong on a blocking thread.
@@ -27,7 +30,7 @@ pub(super) struct Backend {
     networks: Arc<dyn SemanticNetworks>,
     /// By text; each weighs 1.
     embeddings: Cache<String, Arc<TextEmbedding>>,
-    /// By scene, semantics and profile; by bytes.
+    /// By scene, semantics and scoring; by bytes.
     scorers: Cache<String, Arc<Scorer>>,
     /// By scene and semantics; by bytes.
     components: Cache<String, Arc<Components>>,
@@ -57,9 +60,15 @@ impl Backend {
     }
 
     /// Whether texts can be scored for a scene without a network.
-    pub(super) fn knows(&self, of: Subject<'_>, profile: ScoringProfile, texts: &[String]) -> bool {
-        self.scorers.find(&scorer_key(of.tag, profile)).is_some()
-            && texts.iter().all(|text| self.embeddings.find(text).is_some())
+    pub(super) fn knows(
+        &self,
+        of: Subject<'_>,
+        how: ScoringChoice<'_>,
+        texts: &[String],
+    ) -> Result<bool> {
+        let key = scorer_key(of.tag, &self.scoring(of, how)?)?;
+        Ok(self.scorers.find(&key).is_some()
+            && texts.iter().all(|text| self.embeddings.find(text).is_some()))
     }
 
     /// Embeddings of texts: known ones from memory, all others from one run of the network.
@@ -82,29 +91,34 @@ impl Backend {
         texts.iter().map(|text| found.get(text).cloned().ok_or_else(lost)).collect()
     }
 
-    /// A bank ready to be scored under a profile; `tag` tells scene and semantics.
+    /// How texts are scored for a scene.
+    fn scoring(
+        &self,
+        of: Subject<'_>,
+        (preset, changes): ScoringChoice<'_>,
+    ) -> Result<ScoringMethod> {
+        let preset = of.preset(preset);
+        let phrases = self.networks.phrases()?;
+        let (tau, floor) = (f64::from(phrases.tau), f64::from(phrases.coverage_floor));
+        let method = changes.change(ScoringMethod::of(preset, phrases.canon, tau, floor));
+        method.check()?;
+        Ok(method)
+    }
+
+    /// A bank ready to be scored; `tag` tells scene and semantics.
     fn scorer(
         &self,
         tag: &str,
         semantics: &Semantics,
-        profile: ScoringProfile,
+        method: &ScoringMethod,
     ) -> Result<Arc<Scorer>> {
-        let key = scorer_key(tag, profile);
+        let key = scorer_key(tag, method)?;
         if let Some(known) = self.scorers.find(&key) {
             return Ok(known);
         }
-        let phrases = match profile {
-            ScoringProfile::Default => self.networks.phrases()?,
-            ScoringProfile::Paper => Phrases {
-                canon: PAPER_PHRASES.map(str::to_owned).to_vec(),
-                tau: PAPER_TAU,
-                coverage_floor: 0.0,
-            },
-        };
-        let canon = self.embedded(&phrases.canon)?;
+        let canon = self.embedded(&method.canon)?;
         let canon = canon.iter().map(|embedding| embedding.row.clone()).collect();
-        let (tau, floor) = (f64::from(phrases.tau), f64::from(phrases.coverage_floor));
-        let scoring = Arc::new(Scoring::new(profile, canon, tau, floor)?);
+        let scoring = Arc::new(Scoring::new(method, canon)?);
         let scorer = Arc::new(Scorer::new(&semantics.bank, scoring)?);
         let rows = semantics.bank.len() as u64;
         // Rows, and the products of each two of them.
@@ -114,9 +128,9 @@ impl Backend {
     }
 }
 
-/// Tells the scorer of a scene, its semantics and a profile from all others.
-fn scorer_key(tag: &str, profile: ScoringProfile) -> String {
-    format!("{tag} {profile:?}")
+/// Tells the scorer of a scene, its semantics and a method from all others.
+fn scorer_key(tag: &str, method: &ScoringMethod) -> Result<String> {
+    super::view::words(&(tag, method))
 }
 
 /// A text, how the bank scores it, and what makes that doubtful.
@@ -141,17 +155,14 @@ pub(super) struct LabelledView {
     pub(super) width: u32,
     pub(super) height: u32,
     pub(super) weights: PixelWeights,
-    /// One for each scoring profile.
+    /// Of plain rows, and of rows of length 1.
     norms: [OnceLock<ViewNorms>; 2],
 }
 
 impl LabelledView {
     /// Lengths of the pixels' features, for all texts.
     pub(super) fn norms(&self, scorer: &Scorer) -> Result<&ViewNorms> {
-        let kept = match scorer.scoring().profile() {
-            ScoringProfile::Default => &self.norms[0],
-            ScoringProfile::Paper => &self.norms[1],
-        };
+        let kept = &self.norms[usize::from(scorer.scoring().unit_rows())];
         match kept.get() {
             Some(norms) => Ok(norms),
             None => {
@@ -183,7 +194,7 @@ impl LabelledView {
     }
 
     fn size_bytes(&self) -> u64 {
-        // Norms of both profiles, also where they are not computed yet.
+        // Norms of both kinds, also where they are not computed yet.
         self.weights.size_bytes() + 2 * 4 * self.weights.pixels() as u64
     }
 }
@@ -197,23 +208,34 @@ pub(super) struct Subject<'a> {
     pub(super) tag: &'a str,
 }
 
+impl Subject<'_> {
+    /// The preset that is named, else that of the scene.
+    fn preset(&self, named: Option<Preset>) -> Preset {
+        named.unwrap_or(self.scene.meta.report.method.preset)
+    }
+}
+
 /// A scene and its scored texts.
 pub(super) struct SceneTexts<'a> {
     pub(super) backend: &'a Backend,
     pub(super) of: Subject<'a>,
     pub(super) scorer: Arc<Scorer>,
+    pub(super) scoring: ScoringMethod,
+    /// The preset and the changes of it.
+    asked: (Preset, ScoringOptions),
     pub(super) texts: Vec<ScoredText>,
 }
 
 impl<'a> SceneTexts<'a> {
-    /// Scores checked texts under a profile.
+    /// Scores checked texts.
     pub(super) fn new(
         backend: &'a Backend,
         of: Subject<'a>,
-        profile: ScoringProfile,
+        how: ScoringChoice<'_>,
         texts: &[String],
     ) -> Result<Self> {
-        let scorer = backend.scorer(of.tag, of.semantics, profile)?;
+        let scoring = backend.scoring(of, how)?;
+        let scorer = backend.scorer(of.tag, of.semantics, &scoring)?;
         let scored = |(text, embedding): (&String, Arc<TextEmbedding>)| {
             Ok(ScoredText {
                 text: text.clone(),
@@ -223,13 +245,14 @@ impl<'a> SceneTexts<'a> {
         };
         let embeddings = backend.embedded(texts)?;
         let texts = texts.iter().zip(embeddings).map(scored).collect::<Result<_>>()?;
-        Ok(Self { backend, of, scorer, texts })
+        let asked = (of.preset(how.0), how.1.clone());
+        Ok(Self { backend, of, scorer, scoring, asked, texts })
     }
 
     /// What tells the first text, how it is scored and the scene from all others, in tags.
     pub(super) fn words(&self) -> Result<String> {
         let text = self.texts.first().map(|text| text.text.as_str());
-        text_words(self.of.tag, text, self.scorer.scoring().profile())
+        text_words(self.of.tag, text, (self.asked.0, &self.asked.1))
     }
 
     /// The connected components of the scene's entries.
@@ -286,6 +309,18 @@ impl<'a> SceneTexts<'a> {
         let weights =
             frame.weights.ok_or_else(|| Error::internal("the renderer gave no weights"))?;
         Ok((self.keep_view(key, [frame.width, frame.height], weights), true))
+    }
+}
+
+/// Checks the changes of a request before anything is made for it: numbers, and canonical texts as
+/// other texts.
+pub(super) fn check_scoring(changes: &ScoringOptions, limits: &Limits) -> Result<()> {
+    let canon = ScoringMethod::CANON.map(str::to_owned).to_vec();
+    changes.change(ScoringMethod::of(Preset::Paper, canon, 1.0, 0.0)).check()?;
+    if changes.canon.is_empty() {
+        Ok(())
+    } else {
+        texts::all_checked(&changes.canon, "canon", limits).map(drop)
     }
 }
 

@@ -1,6 +1,9 @@
 //! Checks of the texts of a request: how many, how long, of what.
 
-use super::request::{Kind, TextOptions};
+use super::{
+    request::{Kind, TextOptions},
+    search::check_scoring,
+};
 use crate::{
     error::{Error, Result},
     limits::Limits,
@@ -29,6 +32,7 @@ pub(super) fn checked(text: &str, what: &str, limits: &Limits) -> Result<String>
 /// Refuses a text without a kind that takes one, and such a kind without a text; gives the text
 /// checked.
 pub(super) fn check_ask(kinds: &[Kind], ask: &TextOptions, limits: &Limits) -> Result<TextOptions> {
+    check_scoring(&ask.scoring, limits)?;
     let takes = kinds.iter().find(|kind| kind.takes_text());
     let text = match (&ask.text, takes) {
         (None, None) => None,

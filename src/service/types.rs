@@ -1,6 +1,6 @@
 //! What the use cases answer: plain data. The requests are in `request.rs`.
 
-use std::fmt;
+use std::{fmt, io};
 
 use base64::{Engine as _, prelude::BASE64_STANDARD};
 use serde::{Deserialize, Serialize, Serializer};
@@ -13,7 +13,7 @@ use super::{
 };
 use crate::{
     render::FrameStats,
-    scene::{Camera, SceneStatus, ScoringProfile},
+    scene::{Camera, SceneStatus, ScoringMethod},
 };
 
 /// Answer of a create call.
@@ -41,7 +41,7 @@ pub struct QueryAnswer {
     /// Entries of the scene's bank (M).
     pub bank_size: u32,
     /// How texts were scored.
-    pub profile: ScoringProfile,
+    pub scoring: ScoringMethod,
     /// Camera of the view.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub camera: Option<Camera>,
@@ -62,7 +62,7 @@ pub struct TextResult {
     pub text: String,
     /// `[M]` relevancy of each entry of the bank, 0..1; entry m is the m-th, counted from 1.
     pub scores: Vec<f32>,
-    /// Entries selected: those of relevancy 0.5 and more.
+    /// Entries selected: those whose relevancy is at the cut or over it.
     pub entries: Vec<u16>,
     /// Gaussians selected.
     pub gaussians: u64,
@@ -211,21 +211,23 @@ impl fmt::Debug for RenderedView {
     }
 }
 
-/// A file being written; its size is known from the start.
+/// A file being written.
 #[derive(Debug)]
 pub struct Export {
     /// Proposed file name.
     pub file_name: String,
-    /// Whole size.
-    pub size_bytes: u64,
+    /// Whole size, where it is known before the end.
+    pub size_bytes: Option<u64>,
     /// Hash of scene and format.
     pub etag: String,
-    pub(super) chunks: tokio::sync::mpsc::Receiver<Vec<u8>>,
+    pub(super) chunks: tokio::sync::mpsc::Receiver<io::Result<Vec<u8>>>,
 }
 
 impl Export {
-    /// The parts as a stream.
-    pub fn into_stream(self) -> impl futures_util::Stream<Item = Vec<u8>> + Send + 'static {
+    /// The parts as a stream; a fault ends it.
+    pub fn into_stream(
+        self,
+    ) -> impl futures_util::Stream<Item = io::Result<Vec<u8>>> + Send + 'static {
         tokio_stream::wrappers::ReceiverStream::new(self.chunks)
     }
 }

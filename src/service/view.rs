@@ -18,11 +18,11 @@ use super::{
     create::blocking,
     encode::{self, Layer},
     request::{
-        BackgroundSpec, CameraSpec, Format, Kind, PictureOptions, TextOptions, ViewOptions,
-        ViewSpec, ViewsSpec,
+        BackgroundSpec, CameraSpec, Format, Kind, PictureOptions, ScoringOptions, TextOptions,
+        ViewOptions, ViewSpec, ViewsSpec,
     },
     schedule::Slot,
-    search::{Backend, LabelledView, SceneTexts},
+    search::{Backend, LabelledView, SceneTexts, ScoringChoice},
     semantics::{Understood, meaning_tag},
     texts,
     times::{ViewTimes, ms, staged},
@@ -34,9 +34,9 @@ use crate::{
     names::shown,
     render::{
         self, Frame, Kinds, Labels, RenderRequest, Samples,
-        plan::{self, NEAR_RANGE, default_near},
+        plan::{self, NEAR_RANGE, ViewMethod, default_near},
     },
-    scene::{Camera, Intrinsics, Scene, SceneCamera, SceneId, ScoringProfile},
+    scene::{Camera, Intrinsics, Method, Preset, Scene, SceneCamera, SceneId},
     store::{Record, hex},
     telemetry::meter,
 };
@@ -51,7 +51,10 @@ pub(super) struct Resolved {
     camera: Camera,
     kinds: Vec<Kind>,
     near: f32,
-    /// As in the request, with the size and the near plane that were found.
+    method: ViewMethod,
+    /// The preset that was named, or that of the scene.
+    preset: Preset,
+    /// As in the request, with the size, near plane and method that were found.
     options: ViewOptions,
     picture: PictureOptions,
 }
@@ -88,12 +91,13 @@ impl Resolved {
             kinds,
             labels: Labels::None,
             background: match self.picture.background {
+                BackgroundSpec::Backdrop if !self.method.backdrop => render::Background::BLACK,
                 BackgroundSpec::Backdrop => {
                     render::Background::Backdrop(Arc::clone(&scene.backdrop))
                 }
                 BackgroundSpec::Color(color) => render::Background::Color(color),
             },
-            sources: plan::sources(scene, &self.camera),
+            sources: plan::sources(scene, &self.camera, self.method),
             samples: match self.picture.format {
                 Format::Npy => Samples::F32,
                 Format::Rgba8 => Samples::LevelsRgba,
@@ -115,7 +119,7 @@ impl Resolved {
     /// Hash of scene, renderer and request for one kind; `texts` are the words of [`text_words`].
     fn etag(&self, scene: &str, renderer: &str, kind: Kind, texts: &str) -> Result<String> {
         let version = env!("CARGO_PKG_VERSION");
-        let request = (self.camera, kind, &self.options, &self.picture);
+        let request = (self.camera, kind, &self.options, &self.picture, self.method.backdrop);
         Ok(hash(&words(&(scene, version, renderer, request, texts))?))
     }
 
@@ -152,7 +156,7 @@ impl Resolved {
             self.kinds.iter().all(|kind| !kind.needs_semantics() || *kind == Kind::Mask);
         let tables = texts.texts.first().map(|text| text.scores.tables()).unwrap_or_default();
         match <[_; 1]>::try_from(tables) {
-            Ok([table]) if mask_alone => {
+            Ok([table]) if mask_alone && texts.scorer.scoring().is_signed() => {
                 let coverage_floor = texts.scorer.scoring().coverage_floor() as f32;
                 Labels::Mask { table, coverage_floor }
             }
@@ -254,7 +258,7 @@ impl Scored {
 }
 
 /// Values as text: equal text means equal values. Numbers are written to their last bit.
-fn words(values: &impl Serialize) -> Result<String> {
+pub(super) fn words(values: &impl Serialize) -> Result<String> {
     serde_json::to_string(values)
         .map_err(|e| Error::internal("a request cannot be written down").caused_by(e))
 }
@@ -274,18 +278,40 @@ pub(super) fn scene_tag(record: &Record) -> String {
 pub(super) struct Inputs<'a> {
     cameras: &'a [SceneCamera],
     median_depth: f64,
+    /// `None`: that of the default.
+    method: Option<&'a Method>,
 }
 
 impl<'a> From<&'a Record> for Inputs<'a> {
     fn from(record: &'a Record) -> Self {
-        let median_depth = record.status.report.as_ref().map_or(0.0, |report| report.median_depth);
-        Self { cameras: &record.status.cameras, median_depth }
+        let report = record.status.report.as_ref();
+        let median_depth = report.map_or(0.0, |report| report.median_depth);
+        let method = report.map(|report| &report.method);
+        Self { cameras: &record.status.cameras, median_depth, method }
     }
 }
 
 impl<'a> From<&'a Scene> for Inputs<'a> {
     fn from(scene: &'a Scene) -> Self {
-        Self { cameras: &scene.meta.cameras, median_depth: scene.meta.report.median_depth }
+        let report = &scene.meta.report;
+        let (median_depth, method) = (report.median_depth, Some(&report.method));
+        Self { cameras: &scene.meta.cameras, median_depth, method }
+    }
+}
+
+impl Inputs<'_> {
+    /// How a view is drawn: as the scene was made, or by the preset that is named, with the changes
+    /// of the request.
+    fn look(&self, options: &ViewOptions) -> Result<(ViewMethod, Preset)> {
+        let own = self.method.cloned().unwrap_or_default();
+        let of = options.preset.map_or(own, Method::of);
+        let changed = Method {
+            front_photos: options.front_photos.unwrap_or(of.front_photos),
+            magnify: options.magnify.unwrap_or(of.magnify),
+            ..of
+        };
+        changed.check()?;
+        Ok((ViewMethod::from(&changed), changed.preset))
     }
 }
 
@@ -325,6 +351,7 @@ fn resolve(
         }
         None => default_near(inputs.median_depth),
     };
+    let (method, preset) = inputs.look(options)?;
     let resolved = |(camera_index, spec)| {
         let what = match cameras.len() {
             1 => "camera".to_owned(),
@@ -337,10 +364,15 @@ fn resolve(
             camera,
             kinds: kinds.to_vec(),
             near,
+            method,
+            preset,
             options: ViewOptions {
                 width: Some(width),
                 height: Some(height),
                 near: Some(near),
+                preset: None,
+                front_photos: Some(method.front_photos),
+                magnify: Some(method.magnify),
                 ..options.clone()
             },
             picture: PictureOptions {
@@ -404,7 +436,8 @@ impl Inner {
             };
             let subject = understood.subject();
             let text = ask.text.as_slice();
-            let scored = || SceneTexts::new(backend, subject, ask.profile, text);
+            let how = (Some(view.preset), &ask.scoring);
+            let scored = || SceneTexts::new(backend, subject, how, text);
             let (texts, ms) = staged("score", scored);
             (times.load_ms, times.score_ms) = (understood.load_ms, Some(embed_ms + ms));
             view.draw(backend, subject.scene, &tag, Some(&texts?), times, drawn)
@@ -441,16 +474,18 @@ impl Inner {
     pub(super) async fn embed(
         self: &Arc<Self>,
         understood: &Understood,
-        profile: ScoringProfile,
+        how: ScoringChoice<'_>,
         texts: &[String],
         deadline: Instant,
     ) -> Result<f64> {
-        if self.backend.knows(understood.subject(), profile, texts) {
+        if self.backend.knows(understood.subject(), how, texts)? {
             return Ok(0.0);
         }
         let (inner, of, texts) = (Arc::clone(self), understood.clone(), texts.to_vec());
-        let embed =
-            move || SceneTexts::new(&inner.backend, of.subject(), profile, &texts).map(drop);
+        let (preset, changes) = (how.0, how.1.clone());
+        let embed = move || {
+            SceneTexts::new(&inner.backend, of.subject(), (preset, &changes), &texts).map(drop)
+        };
         let embed = async { blocking(|| staged("score", embed)).await };
         let (embedded, ms) = in_time(deadline, "the text", embed).await?;
         embedded.map(|()| ms)
@@ -461,11 +496,13 @@ impl Inner {
         self: &Arc<Self>,
         understood: Option<Understood>,
         ask: TextOptions,
+        preset: Option<Preset>,
         deadline: Instant,
     ) -> Result<Option<Asked>> {
         let Some(understood) = understood else { return Ok(None) };
         let text = ask.text.as_slice();
-        let embed_ms = self.embed(&understood, ask.profile, text, deadline).await?;
+        let how = (preset, &ask.scoring);
+        let embed_ms = self.embed(&understood, how, text, deadline).await?;
         Ok(Some(Asked { understood, ask, embed_ms }))
     }
 
@@ -498,8 +535,12 @@ fn until(deadline: Option<Duration>, most_ms: u64) -> Instant {
 }
 
 /// A text of a scene and how it is scored, in tags; `tag` tells scene and semantics.
-pub(super) fn text_words(tag: &str, text: Option<&str>, profile: ScoringProfile) -> Result<String> {
-    words(&(tag, text, profile))
+pub(super) fn text_words(
+    tag: &str,
+    text: Option<&str>,
+    how: (Preset, &ScoringOptions),
+) -> Result<String> {
+    words(&(tag, text, how))
 }
 
 impl Service {
@@ -513,7 +554,10 @@ impl Service {
         let record = scene.record();
         let texts = match (spec.kind.needs_semantics(), &record.semantics_sha256) {
             (false, _) => String::new(),
-            (true, Some(_)) => text_words(&meaning_tag(record), ask.text.as_deref(), ask.profile)?,
+            (true, Some(_)) => {
+                let how = (view.preset, &ask.scoring);
+                text_words(&meaning_tag(record), ask.text.as_deref(), how)?
+            }
             (true, None) => return Ok(None),
         };
         let name = self.inner.backend.renderer.name();
@@ -531,7 +575,7 @@ impl Service {
         let inner = &self.inner;
         let understood = inner.understood_for(&scene, &[spec.kind], &ask).await?;
         let deadline = inner.deadline(&spec.options);
-        let texts = inner.asked(understood, ask, deadline).await?;
+        let texts = inner.asked(understood, ask, spec.options.preset, deadline).await?;
         let mut views = inner.render_one(scene, view, texts, deadline).await?;
         views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
     }
@@ -587,11 +631,12 @@ impl Service {
         }
         let last = until(spec.options.deadline, limits.views_timeout_ms);
         let at_once = self.inner.scheduler.views_at_once(pixels / (all.len() * kinds.len()) as u64);
+        let preset = spec.options.preset;
         let (to, pictures) = mpsc::channel(READY_MAX);
         let task = async move {
             let views = async {
                 let understood = inner.understood_for(&scene, &kinds, &ask).await?;
-                let texts = inner.asked(understood, ask, last).await?;
+                let texts = inner.asked(understood, ask, preset, last).await?;
                 // Each on a task of its own: a slot must not wait for a slow reader.
                 let render = |one: Resolved| {
                     let deadline = last.min(inner.deadline(&ViewOptions::default()));

@@ -146,6 +146,11 @@ impl<'a> Container<'a> {
         })
     }
 
+    /// Whether there is an array of this name.
+    pub(super) fn has(&self, name: &str) -> bool {
+        self.tensors.tensor(name).is_ok()
+    }
+
     /// An array of the type expected as rows of `T`, copied so that alignment does not matter.
     pub(super) fn rows<T: Pod>(&self, name: &str, dtype: Dtype) -> Result<Vec<T>> {
         let bad = |why: String| Error::new(ErrorCode::SceneCorrupt, format!("array {name}: {why}"));

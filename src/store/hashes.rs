@@ -46,12 +46,16 @@ fn hash(files: &[PhotoHash], rest: &str) -> String {
     hex(&hash.finalize())
 }
 
-/// The options that differ from the defaults, as JSON sorted by name: an option that a later
-/// program adds changes no hash of a request that does not use it.
+/// The options and the fields of the method that differ from the defaults, as JSON sorted by name:
+/// an option that a later program adds changes no hash of a request that does not use it.
 fn canonical(options: &SceneOptions) -> String {
-    let fields = |options: &SceneOptions| match serde_json::to_value(options) {
-        Ok(Value::Object(fields)) => fields.into_iter().collect(),
-        _ => BTreeMap::new(),
+    let fields = |options: &SceneOptions| {
+        let values = [serde_json::to_value(options), serde_json::to_value(options.method())];
+        let objects = values.into_iter().filter_map(|value| match value {
+            Ok(Value::Object(fields)) => Some(fields),
+            _ => None,
+        });
+        objects.flatten().collect::<BTreeMap<String, Value>>()
     };
     let default = fields(&SceneOptions::default());
     let mut set = fields(options);
@@ -62,13 +66,13 @@ fn canonical(options: &SceneOptions) -> String {
 /// The text that was hashed for the options before [`canonical`] was. An option that no such
 /// program had is left out.
 fn before_canonical(options: &SceneOptions) -> String {
-    let SceneOptions { max_views, semantics, density } = options;
+    let SceneOptions { max_views, semantics, density, .. } = options;
     let semantics = match semantics {
         SemanticsMode::Lazy => "Lazy",
         SemanticsMode::Eager => "Eager",
         SemanticsMode::Off => "Off",
     };
-    let density = match density {
+    let density = match density.unwrap_or_default() {
         Density::Thinned => "Thinned",
         Density::Full => "Full",
     };

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::container::{self, Array, Container, Label};
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Bank, IndexMap, SceneId, Semantics, SemanticsReport},
+    scene::{Bank, BankMask, IndexMap, SceneId, Semantics, SemanticsReport},
 };
 
 const LABEL: Label = Label { kind: "segsplat-semantics", version: 1 };
@@ -41,10 +41,13 @@ pub fn write_semantics(
         report: semantics.report.clone(),
     })?;
     let cells: Vec<u16> = semantics.photos.iter().flat_map(|map| map.index.clone()).collect();
+    let masks: Vec<[u32; 3]> =
+        semantics.masks.iter().map(|m| [m.photo, m.mask, u32::from(m.entry)]).collect();
     let arrays = [
         Array::new("bank", Dtype::F32, &[bank.len(), bank.dim], &bank.rows),
         Array::new("index", Dtype::U16, &[semantics.index.len()], &semantics.index),
         Array::new("photos", Dtype::U16, &[cells.len()], &cells),
+        Array::new("masks", Dtype::U32, &[masks.len(), 3], &masks),
     ];
     container::write(to, &LABEL, &header, &arrays)
 }
@@ -77,5 +80,17 @@ pub fn read_semantics(file: &[u8], id: &SceneId) -> Result<(Semantics, String)> 
         cells = rest;
     }
     let index = container.rows("index", Dtype::U16)?;
-    Ok((Semantics { bank, index, photos, report: header.report }, container.sha256))
+    let mask = |[photo, mask, entry]: [u32; 3]| {
+        let entry = u16::try_from(entry).ok().filter(|m| usize::from(*m) <= bank.len());
+        let entry = entry.ok_or_else(|| corrupt(format!("mask {mask} has no row of the bank")))?;
+        Ok(BankMask { photo, mask, entry })
+    };
+    // Earlier programs kept no masks.
+    let masks = match container.has("masks") {
+        true => {
+            container.rows("masks", Dtype::U32)?.into_iter().map(mask).collect::<Result<_>>()?
+        }
+        false => Vec::new(),
+    };
+    Ok((Semantics { bank, index, photos, masks, report: header.report }, container.sha256))
 }

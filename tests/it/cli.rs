@@ -13,7 +13,10 @@ use segsplat::{
         Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, Provenance,
         RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
     },
-    store::{ply::PlyWriter, write_scene},
+    store::{
+        ply::{PlyFile, PlyWriter},
+        write_scene,
+    },
 };
 use serde_json::Value;
 
@@ -94,7 +97,8 @@ fn files() -> tempfile::TempDir {
     let mut file = Vec::new();
     write_scene(&mut file, &scene()).unwrap();
     std::fs::write(folder.path().join("scene.segsplat"), file).unwrap();
-    let ply: Vec<u8> = PlyWriter::new(&scene().gaussians).flatten().collect();
+    let ply: Vec<u8> =
+        PlyWriter::new(&PlyFile::new(scene().gaussians, None).unwrap()).flatten().collect();
     std::fs::write(folder.path().join("plate.ply"), ply).unwrap();
     folder
 }

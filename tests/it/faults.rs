@@ -13,7 +13,7 @@ use object_store::{ObjectStore, local::LocalFileSystem};
 use segsplat::{
     error::ErrorCode,
     sample::{self, SampleOptions},
-    scene::{SceneId, SceneState, ScoringProfile, Upload},
+    scene::{SceneId, SceneState, Upload},
     service::{CreateScene, ExportFormat, PageRequest, Service, TextOptions},
     store::Place,
 };
@@ -25,7 +25,9 @@ use crate::common::{
 };
 
 /// No text.
-const ASK: TextOptions = TextOptions { text: None, profile: ScoringProfile::Default, wait: None };
+fn ask() -> TextOptions {
+    TextOptions::default()
+}
 
 /// Reproducible numbers.
 struct Random(u64);
@@ -48,9 +50,9 @@ fn request(seed: u64) -> CreateScene {
 }
 
 async fn export(service: &Service, id: &SceneId) -> Result<Vec<u8>, ErrorCode> {
-    let export = service.export(id, ExportFormat::Ply, &ASK).await;
+    let export = service.export(id, ExportFormat::Ply, None, &ask()).await;
     let export = export.map_err(|error| error.code())?;
-    Ok(export.into_stream().concat().await)
+    Ok(export.into_stream().map(Result::unwrap).concat().await)
 }
 
 /// Ids of all scenes that the server lists.

@@ -27,7 +27,8 @@ async fn messages_name_the_field_the_value_and_what_it_must_be() {
         ("view?from=0&from=1", "from is given twice".to_owned()),
         (
             "export?limti=1",
-            "unknown parameter \"limti\"; this call takes format, text, profile, wait_ms"
+            "unknown parameter \"limti\"; this call takes format, preset, canon, tau, cut, \
+             unit_rows, coverage_floor, text, wait_ms"
                 .to_owned(),
         ),
         ("pick?from=0&x=1", "y is missing".to_owned()),

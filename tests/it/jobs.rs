@@ -12,10 +12,7 @@ use segsplat::{
     keys::Caller,
     limits::Limits,
     sample::{self, SampleOptions},
-    scene::{
-        Density, Event, SceneId, SceneOptions, SceneState, SceneStatus, ScoringProfile,
-        SemanticsMode, Stage,
-    },
+    scene::{Density, Event, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, Stage},
     service::{
         BackgroundSpec, CameraSpec, CreateScene, ExportFormat, Kind, LensSpec, PageRequest,
         PictureOptions, PoseSpec, Service, TextOptions, ViewOptions, ViewsSpec,
@@ -28,7 +25,9 @@ use sha2::{Digest, Sha256};
 use crate::common::server::{PATIENCE, TestServer, WallNetworks, first_view, upload};
 
 /// No text.
-const ASK: TextOptions = TextOptions { text: None, profile: ScoringProfile::Default, wait: None };
+fn ask() -> TextOptions {
+    TextOptions::default()
+}
 
 fn request() -> CreateScene {
     CreateScene { upload: upload(), ..CreateScene::default() }
@@ -254,8 +253,12 @@ async fn a_job_that_stops_waiting_for_the_same_content_lets_no_other_make_it() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_key_that_an_earlier_program_kept_still_answers_for_its_scene() {
     let server = TestServer::start().await;
-    let set =
-        SceneOptions { max_views: Some(2), semantics: SemanticsMode::Off, density: Density::Full };
+    let set = SceneOptions {
+        max_views: Some(2),
+        semantics: SemanticsMode::Off,
+        density: Some(Density::Full),
+        ..SceneOptions::default()
+    };
     // That program hashed the Rust text of the options.
     let cases = [
         (SceneOptions::default(), "max_views: None, semantics: Lazy, density: Thinned"),
@@ -366,7 +369,8 @@ async fn a_scene_spoiled_on_disk_says_so_and_the_server_lives() {
     let middle = file.len() / 2;
     file[middle] ^= 1;
     std::fs::write(&path, file).unwrap();
-    let export = || server.service.export(&id, ExportFormat::Ply, &ASK);
+    let ask = ask();
+    let export = || server.service.export(&id, ExportFormat::Ply, None, &ask);
     assert_eq!(export().await.unwrap_err().code(), ErrorCode::SceneCorrupt);
     let status = server.service.get(&id).await.unwrap();
     assert_eq!(
@@ -374,7 +378,7 @@ async fn a_scene_spoiled_on_disk_says_so_and_the_server_lives() {
         (SceneState::Failed, "scene_corrupt")
     );
     let server = server.restart().await;
-    let again = server.service.export(&id, ExportFormat::Ply, &ASK).await.unwrap_err();
+    let again = server.service.export(&id, ExportFormat::Ply, None, &ask).await.unwrap_err();
     assert_eq!(again.code(), ErrorCode::SceneCorrupt, "also after a restart");
     assert_eq!(server.scene().await.state, SceneState::Done);
 }
@@ -383,7 +387,8 @@ async fn a_scene_spoiled_on_disk_says_so_and_the_server_lives() {
 async fn an_export_has_the_size_it_says() {
     let server = TestServer::start().await;
     let id = server.scene().await.id;
-    let export = server.service.export(&id, ExportFormat::Ply, &ASK).await.unwrap();
+    let export = server.service.export(&id, ExportFormat::Ply, None, &ask()).await.unwrap();
     let size = export.size_bytes;
-    assert_eq!(export.into_stream().concat().await.len() as u64, size);
+    let file = export.into_stream().map(Result::unwrap).concat().await;
+    assert_eq!(size, Some(file.len() as u64));
 }

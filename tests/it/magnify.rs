@@ -1,7 +1,11 @@
 //! Views larger than the network's own pictures: no dot grid, and no change at its own size.
 
 use segsplat::{
-    render::{Frame, Kinds, RenderRequest, Renderer, cpu::CpuRenderer, plan::sources},
+    render::{
+        Frame, Kinds, RenderRequest, Renderer,
+        cpu::CpuRenderer,
+        plan::{ViewMethod, sources},
+    },
     scene::{
         Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, Provenance,
         RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
@@ -62,7 +66,7 @@ fn drawn(scene: &Scene, camera: Camera, magnified: bool) -> Frame {
     let kinds = Kinds { color: false, depth: false, alpha: true };
     let mut request = RenderRequest::plain(camera, kinds, 0.01);
     if magnified {
-        request.sources = sources(scene, &camera);
+        request.sources = sources(scene, &camera, ViewMethod::from(&scene.meta.report.method));
     }
     let frame = CpuRenderer::new(1).and_then(|cpu| cpu.render(&scene.gaussians, &request));
     frame.expect("a wall renders")

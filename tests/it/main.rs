@@ -28,6 +28,7 @@ mod licences;
 mod life;
 mod magnify;
 mod offline;
+mod paper;
 mod proto;
 mod raw;
 mod schedule;

@@ -9,13 +9,13 @@ use segsplat::{
     error::{ErrorCode, Result},
     limits::Limits,
     scene::{
-        Backdrop, Gaussians, HealthReport, PhotoHash, Provenance, RawGaussians, SanitizeReport,
-        Scene, SceneId, SceneMeta, SceneOptions, SceneState, SceneStatus, SourcePixel, Upload,
-        UploadCameras, UploadFile,
+        Backdrop, Bank, BankMask, Gaussians, HealthReport, IndexMap, PhotoHash, Provenance,
+        RawGaussians, SanitizeReport, Scene, SceneId, SceneMeta, SceneOptions, SceneState,
+        SceneStatus, Semantics, SemanticsReport, SourcePixel, Upload, UploadCameras, UploadFile,
     },
     store::{
         KeyUse, Place, Record, Store,
-        ply::{PlyWriter, ply_size_bytes, read_ply},
+        ply::{PlyFile, PlyWriter, read_ply},
         provenance, read_scene, request_sha256, write_scene,
     },
 };
@@ -357,11 +357,47 @@ fn one_process_holds_a_folder() {
 }
 
 fn ply_of(gaussians: &Gaussians) -> Vec<u8> {
-    PlyWriter::new(gaussians).flatten().collect()
+    PlyWriter::new(&PlyFile::new(gaussians.clone(), None).unwrap()).flatten().collect()
 }
 
 fn read(file: &[u8]) -> Result<(Gaussians, SanitizeReport)> {
-    read_ply(Cursor::new(file), 100_000)
+    let (gaussians, report, semantics) = read_ply(Cursor::new(file), 100_000)?;
+    assert_eq!(semantics, None);
+    Ok((gaussians, report))
+}
+
+#[test]
+fn a_ply_carries_index_and_bank_together_and_programs_that_know_no_bank_stop_before_it() {
+    let index = (0..50).map(|i| i % 3).collect::<Vec<u16>>();
+    let gaussians = gaussians(50, 0).with_semantic_index(index.clone()).unwrap();
+    let masks = [(0, 0, 1), (0, 1, 2), (1, 0, 1)];
+    let masks = masks.map(|(photo, mask, entry)| BankMask { photo, mask, entry }).to_vec();
+    let semantics = Semantics {
+        bank: Bank { dim: 2, rows: vec![0.5, 0.25, -1.0, 3.0] },
+        index,
+        photos: vec![IndexMap { width: 2, height: 1, index: vec![1, 2] }],
+        masks,
+        report: SemanticsReport::default(),
+    };
+    let file = PlyFile::new(gaussians.clone(), Some(&semantics)).unwrap();
+    let bytes: Vec<u8> = PlyWriter::new(&file).flatten().collect();
+    assert_eq!(bytes.len() as u64, file.size_bytes());
+    let (back, _, read) = read_ply(Cursor::new(&bytes), 100).unwrap();
+    assert_eq!((back.semantic_index(), read.as_ref()), (&semantics.index[..], Some(&semantics)));
+    assert_eq!(read.unwrap().row_sizes(), [2, 1]);
+    // Its header says where the vertices end, as that of any PLY.
+    let end = bytes.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    let text = std::str::from_utf8(&bytes[..end]).unwrap();
+    let said = text.lines().find_map(|line| line.strip_prefix("comment segsplat_semantics_bytes "));
+    let after: usize = said.unwrap().parse().unwrap();
+    let stride = 4 * text.matches("property float").count() + 2;
+    assert_eq!(end + 50 * stride + after, bytes.len());
+    let cut = read_ply(Cursor::new(&bytes[..bytes.len() - 1]), 100).unwrap_err();
+    assert!(cut.message().contains("the semantics end after"), "{cut}");
+    let mut broken = bytes;
+    *broken.last_mut().unwrap() ^= 1;
+    let error = read_ply(Cursor::new(&broken), 100).unwrap_err();
+    assert_eq!(error.code(), ErrorCode::InvalidRequest, "{error}");
 }
 
 #[test]
@@ -369,7 +405,7 @@ fn ply_goes_out_and_comes_in() {
     for degree in 0..=3 {
         let out = gaussians(20_000, degree);
         let file = ply_of(&out);
-        assert_eq!(file.len() as u64, ply_size_bytes(&out));
+        assert_eq!(file.len() as u64, PlyFile::new(out.clone(), None).unwrap().size_bytes());
         let (back, report) = read(&file).unwrap();
         assert_eq!(report, SanitizeReport::default());
         let (a, b) = (out.as_raw(), back.as_raw());

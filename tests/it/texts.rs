@@ -10,10 +10,10 @@ use std::{
 use futures_util::StreamExt;
 use segsplat::{
     error::ErrorCode,
-    scene::{SceneId, SceneOptions, ScoringProfile, SemanticsMode, SemanticsState},
+    scene::{Preset, SceneId, SceneOptions, SemanticsMode, SemanticsState},
     service::{
         Boxes, CreateScene, ExportFormat, Format, Kind, MaskFormat, PickSpec, PictureOptions,
-        QuerySpec, Rle, TextOptions, ViewOptions, ViewSpec,
+        QuerySpec, Rle, ScoringOptions, TextOptions, ViewOptions, ViewSpec,
     },
 };
 
@@ -150,9 +150,13 @@ async fn a_hundred_texts_take_one_drawing_and_a_known_view_takes_none() {
     service.render(&id, view(Kind::Semantics, None, Format::Png)).await.unwrap();
     assert_eq!(fixture.renderer.counts(), [1, 0, 1], "E of the view answers every text");
     assert_eq!(fixture.meaning.embedded.load(Ordering::Acquire), 106, "three new words");
-    let paper = QuerySpec { profile: ScoringProfile::Paper, ..in_view(&["photo 2"]) };
+    let paper = {
+        let spec = in_view(&["photo 2"]);
+        let options = ViewOptions { preset: Some(Preset::Paper), ..spec.options };
+        QuerySpec { options, ..spec }
+    };
     let paper = service.query(&id, paper).await.unwrap();
-    assert_eq!((paper.profile, paper.render_ms), (ScoringProfile::Paper, Some(0.0)));
+    assert_eq!((paper.scoring.unit_rows, paper.scoring.tau), (false, 10.0));
     let wide = ViewOptions { width: Some(40), ..ViewOptions::default() };
     let other = QuerySpec { options: wide, ..in_view(&["photo 2"]) };
     service.query(&id, other).await.unwrap();
@@ -198,7 +202,7 @@ async fn a_pick_tells_depth_point_gaussian_entry_and_labels() {
         y: 20.5,
         options: ViewOptions::default(),
         labels: texts(labels),
-        profile: ScoringProfile::Default,
+        scoring: ScoringOptions::default(),
         wait: None,
     };
     let bare = service.pick(&id, pick(&[])).await.unwrap();
@@ -229,10 +233,10 @@ async fn an_export_of_a_text_holds_what_it_selects() {
     let service = &fixture.server.service;
     let export = async |text: Option<&str>| {
         let ask = TextOptions { text: text.map(str::to_owned), ..TextOptions::default() };
-        let export = service.export(&id, ExportFormat::Ply, &ask).await.unwrap();
+        let export = service.export(&id, ExportFormat::Ply, None, &ask).await.unwrap();
         let (size, etag) = (export.size_bytes, export.etag.clone());
-        let file: Vec<u8> = export.into_stream().concat().await;
-        assert_eq!(size, file.len() as u64);
+        let file: Vec<u8> = export.into_stream().map(Result::unwrap).concat().await;
+        assert_eq!(size, Some(file.len() as u64));
         let count = String::from_utf8_lossy(&file[..400])
             .lines()
             .find_map(|line| line.strip_prefix("element vertex ")?.parse::<u64>().ok())
@@ -390,7 +394,7 @@ async fn http_gives_pictures_of_texts_as_files_and_in_json() {
     let found = &answer["results"][0];
     assert!(found["view"]["mask_png"].as_str().unwrap().starts_with("iVBOR"), "{found}");
     assert_eq!(found["parts"][0]["axes"][0], serde_json::json!([1.0, 0.0, 0.0]));
-    for (key, value) in [("boxes", "round"), ("mask", "gif"), ("profile", "best")] {
+    for (key, value) in [("boxes", "round"), ("mask", "gif"), ("preset", "best")] {
         let mut body = body.clone();
         body[key] = value.into();
         let fault = bytes(client.post(url.clone()).json(&body).send().await.unwrap()).await;

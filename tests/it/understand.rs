@@ -16,14 +16,12 @@ use segsplat::{
     error::{ErrorCode, Result},
     pipeline::{
         Pipeline, reconstruct,
-        semantics::{
-            SemanticsInput, SemanticsOptions, SemanticsTools, understand, understand_with,
-        },
+        semantics::{SemanticsInput, SemanticsTools, understand, understand_with},
     },
     sample::{self, SampleOptions},
     scene::{
-        Camera, CameraToWorld, Crop, Gaussians, IndexMap, Intrinsics, MaskInfo, Photo, PhotoMasks,
-        PosedPhoto, RawGaussians, SceneCamera, SceneOptions, ScoringProfile, Semantics,
+        Camera, CameraToWorld, Crop, Gaussians, IndexMap, Intrinsics, MaskInfo, Method, Photo,
+        PhotoMasks, PosedPhoto, Preset, RawGaussians, SceneCamera, SceneOptions, Semantics,
         SourcePixel, Stage, Watch,
     },
     semantics::Scorer,
@@ -96,7 +94,7 @@ fn two_masks(v: u32) -> PhotoMasks {
     let order = if v == 0 { [1, 2] } else { [2, 1] };
     let row: Vec<u16> = (0..2 * SIDE).map(|x| order[usize::from(x >= edge)]).collect();
     let map = IndexMap { width: 2 * SIDE, height: 4, index: row.repeat(4) };
-    PhotoMasks { map, masks: vec![MaskInfo::default(); 2] }
+    PhotoMasks { wholes: Vec::new(), map, masks: vec![MaskInfo::default(); 2] }
 }
 
 /// Mean colour of what is not black, unit length.
@@ -119,7 +117,7 @@ fn tools<'a>(masks: Masks<'a>, embed: Embed<'a>) -> SemanticsTools<'a> {
     SemanticsTools { masks, embed, dim: 3, crop_margin: 0.1, batch: 3 }
 }
 
-fn made(wall: &Wall, tools: &SemanticsTools<'_>, options: SemanticsOptions) -> Result<Semantics> {
+fn made(wall: &Wall, tools: &SemanticsTools<'_>, options: Method) -> Result<Semantics> {
     let watch = Watch { progress: &|_, _| (), cancel: &NO_CANCEL };
     understand_with(tools, &wall.parts(), &options, watch)
 }
@@ -138,7 +136,7 @@ fn each_gaussian_takes_the_bank_row_of_its_pixel() {
         },
         cancel: &NO_CANCEL,
     };
-    let options = SemanticsOptions::default();
+    let options = Method::default();
     let made = understand_with(&tools(masks, &colour_of), &wall.parts(), &options, watch).unwrap();
     assert_eq!((made.bank.len(), made.bank.dim), (2, 3), "four masks of two colours");
     assert_eq!(made.report.masks, [2, 2]);
@@ -167,11 +165,11 @@ fn each_gaussian_takes_the_bank_row_of_its_pixel() {
 fn a_photo_without_masks_and_a_scene_without_any_are_legal() {
     let wall = wall();
     let one: Masks<'_> = &|_| Ok(vec![two_masks(0), PhotoMasks::default()]);
-    let options = SemanticsOptions { votes: true, ..SemanticsOptions::default() };
-    let half = made(&wall, &tools(one, &colour_of), options).unwrap();
+    let options = Method { votes: true, ..Method::default() };
+    let half = made(&wall, &tools(one, &colour_of), options.clone()).unwrap();
     assert_eq!(half.report.masks, [2, 0]);
     assert!(half.index[..256].iter().all(|m| *m > 0), "photo 0 has its own");
-    let alone = SemanticsOptions { votes: false, ..options };
+    let alone = Method { votes: false, ..options.clone() };
     let plain = made(&wall, &tools(one, &colour_of), alone).unwrap();
     assert!(plain.index[256..].iter().all(|m| *m == 0), "photo 1 has none");
     let filled = half.index[256..].iter().filter(|m| **m > 0).count();
@@ -196,7 +194,7 @@ fn masks_that_mean_nothing_stay_background() {
         rows.chunks_exact_mut(3).filter(|row| row[1] > 0.5).for_each(|row| row.fill(0.0));
         Ok(rows)
     };
-    let made = made(&wall, &tools(masks, embed), SemanticsOptions::default()).unwrap();
+    let made = made(&wall, &tools(masks, embed), Method::default()).unwrap();
     assert_eq!((made.bank.len(), made.report.masks[0]), (1, 3));
     assert_eq!((made.index[0], made.index[15]), (1, 0), "red has a row, green has none");
 }
@@ -206,6 +204,7 @@ fn two_sides_of_one_thing_are_joined_only_when_asked() {
     let wall = wall();
     // Each photo has one mask over all; photo 1's embedding leans another way.
     let whole = || PhotoMasks {
+        wholes: Vec::new(),
         map: IndexMap { width: 1, height: 1, index: vec![1] },
         masks: vec![MaskInfo::default()],
     };
@@ -217,12 +216,12 @@ fn two_sides_of_one_thing_are_joined_only_when_asked() {
         Ok(if second { vec![0.6, 0.8, 0.0] } else { vec![1.0, 0.0, 0.0] })
     };
     // 1.2 masks a photo make two rows.
-    let with = |merge| SemanticsOptions { merge, ..SemanticsOptions::default() };
-    let apart = made(&wall, &tools(masks, embed), with(None)).unwrap();
+    let with = |merge_cosine| Method { merge_cosine, ..Method::default() };
+    let apart = made(&wall, &tools(masks, embed), with(0.0)).unwrap();
     assert_eq!((apart.bank.len(), apart.index[0] == apart.index[300]), (2, false));
-    let strict = made(&wall, &tools(masks, embed), with(Some(0.7))).unwrap();
+    let strict = made(&wall, &tools(masks, embed), with(0.7)).unwrap();
     assert_eq!(strict.bank.len(), 2, "the rows' cosine is 0.6");
-    let joined = made(&wall, &tools(masks, embed), with(Some(0.5))).unwrap();
+    let joined = made(&wall, &tools(masks, embed), with(0.5)).unwrap();
     assert_eq!((joined.bank.len(), joined.report.bank_size), (1, 1));
     assert!(joined.index.iter().all(|m| *m == 1));
     assert_eq!(joined.photos[1].index, [1]);
@@ -233,9 +232,8 @@ fn two_sides_of_one_thing_are_joined_only_when_asked() {
 fn wrong_answers_and_wrong_scenes_are_refused_by_name() {
     let good = wall();
     let masks: Masks<'_> = &|_| Ok((0..2).map(two_masks).collect());
-    let fails = |wall: &Wall, tools: &SemanticsTools<'_>| {
-        made(wall, tools, SemanticsOptions::default()).unwrap_err()
-    };
+    let fails =
+        |wall: &Wall, tools: &SemanticsTools<'_>| made(wall, tools, Method::default()).unwrap_err();
     let few: Masks<'_> = &|_| Ok(vec![two_masks(0)]);
     let error = fails(&good, &tools(few, &colour_of));
     assert!(error.message().contains("masks of 1 photos, not of 2"), "{error}");
@@ -250,7 +248,7 @@ fn wrong_answers_and_wrong_scenes_are_refused_by_name() {
     assert_eq!(error.code(), ErrorCode::InvalidRequest);
     let stop = AtomicBool::new(true);
     let watch = Watch { progress: &|_, _| (), cancel: &stop };
-    let options = SemanticsOptions::default();
+    let options = Method::default();
     let error = understand_with(&tools(masks, &colour_of), &good.parts(), &options, watch);
     assert_eq!(error.unwrap_err().code(), ErrorCode::Cancelled);
 }
@@ -265,7 +263,7 @@ fn engine(threads: usize) -> Option<Pipeline> {
 
 fn understood(engine: &Pipeline, wall: &Wall) -> Semantics {
     let watch = Watch { progress: &|_, _| (), cancel: &NO_CANCEL };
-    understand(engine, &wall.parts(), &SemanticsOptions::default(), watch).unwrap()
+    understand(engine, &wall.parts(), &Method::default(), watch).unwrap()
 }
 
 #[test]
@@ -283,7 +281,7 @@ fn the_bundles_networks_give_a_bank_that_words_select_and_the_same_one_every_tim
     assert_eq!(bits(&made), bits(&again), "the bank, bit for bit");
     assert_eq!((&made.index, &made.photos), (&again.index, &again.photos));
 
-    let scoring = engine.scoring(ScoringProfile::Default).unwrap();
+    let scoring = engine.scoring(&engine.scoring_method(Preset::Default).unwrap()).unwrap();
     let scorer = Scorer::new(&made.bank, scoring.into()).unwrap();
     let towers = engine.image_text().unwrap();
     let mut right = 0;
@@ -311,7 +309,7 @@ fn a_scene_of_the_pipeline_says_which_pixels_made_it() {
     let parts =
         SemanticsInput { photos: &photos, cameras: &made.cameras, gaussians: &made.gaussians };
     let watch = Watch { progress: &|_, _| (), cancel: &NO_CANCEL };
-    let alone = SemanticsOptions { votes: false, ..SemanticsOptions::default() };
+    let alone = Method { votes: false, ..Method::default() };
     let meant = understand(&engine, &parts, &alone, watch).unwrap();
     assert_eq!(meant.index.len(), made.gaussians.len());
     assert_eq!(meant.photos.len(), 3);
@@ -353,6 +351,6 @@ fn a_job_that_waits_keeps_no_other_job_waiting() {
             }
         };
         let watch = Watch { progress: &progress, cancel: &NO_CANCEL };
-        understand(engine, &wall.parts(), &SemanticsOptions::default(), watch).unwrap();
+        understand(engine, &wall.parts(), &Method::default(), watch).unwrap();
     });
 }

@@ -27,7 +27,7 @@ use segsplat::{
         SemanticsReport, Upload, UploadCameras,
     },
     store::{
-        ply::{PlyWriter, read_ply},
+        ply::{PlyFile, PlyWriter, read_ply},
         read_scene, read_semantics, write_scene, write_semantics,
     },
 };
@@ -317,7 +317,13 @@ fn semantics() -> Semantics {
     let bank = Bank { dim: 3, rows: vec![0.5; 6] };
     let map = IndexMap { width: 3, height: 2, index: vec![0, 1, 2, 0, 1, 2] };
     let report = SemanticsReport::default();
-    Semantics { bank, index: vec![1; 20], photos: vec![map.clone(), map], report }
+    Semantics {
+        bank,
+        index: vec![1; 20],
+        photos: vec![map.clone(), map],
+        masks: Vec::new(),
+        report,
+    }
 }
 
 #[test]
@@ -347,7 +353,9 @@ fn containers_of_scenes_and_semantics() {
 
 #[test]
 fn ply_files() {
-    let ply: Vec<u8> = PlyWriter::new(&cloud(20, 1, 3)).flatten().collect();
+    let ply: Vec<u8> = PlyWriter::new(&PlyFile::new(cloud(20, 1, 3), Some(&semantics())).unwrap())
+        .flatten()
+        .collect();
     Cases::new("ply", vec![ply]).run(600, |case| read_ply(case, 10_000).map(drop));
 }
 

@@ -73,7 +73,7 @@ fn a_thinned_sample_is_drawn_as_the_full_one_by_fewer_gaussians() {
     let renderer = CpuRenderer::new(0).unwrap();
     let [(full, all, none), (thinned, left, merged)] =
         [Density::Full, Density::Thinned].map(|density| {
-            let options = SceneOptions { density, ..SceneOptions::default() };
+            let options = SceneOptions { density: Some(density), ..SceneOptions::default() };
             let made = reconstruct(&engine, &options);
             let request = request(&made, Kinds { color: true, depth: false, alpha: false });
             let merged = made.report.dropped.iter().find(|d| d.reason == "merged").map(|d| d.count);

@@ -88,6 +88,8 @@ limits! {
     scorers_cache_bytes_max: u64 = 512 << 20, restart;
     /// Bytes of views' semantic entries kept in memory, so that the next text draws nothing.
     entries_cache_bytes_max: u64 = 512 << 20, restart;
+    /// Bytes of the features (F) of one view: 1024 x 512 pixels of 512 numbers.
+    features_bytes_max: u64 = 1 << 30;
     /// Bytes kept of the parts of scenes that were looked for to give boxes.
     pieces_cache_bytes_max: u64 = 128 << 20;
     /// Parts of one text's selection that an answer lists, the largest first.

@@ -15,21 +15,21 @@
 //!
 //! **Backdrop.** Rays that meet no Gaussian show the photos' colours by direction.
 //!
+//! Each of the three is a field of [`ViewMethod`] and can be left out.
+//!
 //! [`OWN_SIZE`]: crate::constants::OWN_SIZE
 
 use std::sync::Arc;
 
 use crate::{
     Background, RenderRequest, Source,
-    scene::{Camera, Scene},
+    scene::{Camera, Method, Scene},
 };
 
 /// Near plane where none is asked for, as a share of the scene's median depth.
 const NEAR_SHARE: f64 = 0.01;
 /// Near planes accepted, world units.
 pub const NEAR_RANGE: [f32; 2] = [1e-9, 1e9];
-/// Photos that make a view together: as many as the network is trained to compose.
-const FRONT_PHOTOS: usize = 4;
 /// What a turn of one radian costs against a step of one median depth.
 const TURN_COST: f64 = 0.5;
 
@@ -39,28 +39,48 @@ pub fn default_near(median_depth: f64) -> f32 {
     if near.is_finite() && near > 0.0 { near.clamp(NEAR_RANGE[0], NEAR_RANGE[1]) } else { 0.01 }
 }
 
-/// `request` for a view of `scene` as it is served: with the scene's photos, over its backdrop.
-#[must_use]
-pub fn served(scene: &Scene, request: RenderRequest) -> RenderRequest {
-    RenderRequest {
-        sources: sources(scene, &request.camera),
-        background: Background::Backdrop(Arc::clone(&scene.backdrop)),
-        ..request
+/// What a view does beyond blending the Gaussians.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ViewMethod {
+    /// Photos that are in front, the closest ones: as many as the network is trained to compose;
+    /// 0: all.
+    pub front_photos: u32,
+    /// Whether magnified Gaussians get back the blur that they were learnt with.
+    pub magnify: bool,
+    /// Whether the scene's backdrop is behind the Gaussians.
+    pub backdrop: bool,
+}
+
+impl From<&Method> for ViewMethod {
+    fn from(method: &Method) -> Self {
+        let Method { front_photos, magnify, backdrop, .. } = *method;
+        Self { front_photos, magnify, backdrop }
     }
 }
 
-/// A row for each photo of a scene, for a view from `camera`. Where many photos made the scene, all
-/// but the closest ones are behind.
-pub fn sources(scene: &Scene, camera: &Camera) -> Arc<[Source]> {
+/// `request` for a view of `scene` as it is served: by the method of the scene.
+#[must_use]
+pub fn served(scene: &Scene, request: RenderRequest) -> RenderRequest {
+    let method = ViewMethod::from(&scene.meta.report.method);
+    let background = match method.backdrop {
+        true => Background::Backdrop(Arc::clone(&scene.backdrop)),
+        false => Background::BLACK,
+    };
+    RenderRequest { sources: sources(scene, &request.camera, method), background, ..request }
+}
+
+/// A row for each photo of a scene, for a view from `camera`. Where more photos made the scene than
+/// are in front, all others are behind.
+pub fn sources(scene: &Scene, camera: &Camera, method: ViewMethod) -> Arc<[Source]> {
     let origin = scene.gaussians.origin();
     let focals = &scene.meta.report.network_focal_px;
-    let photos = scene.meta.cameras.iter().zip(focals).zip(behind(scene, camera));
+    let photos = scene.meta.cameras.iter().zip(focals).zip(behind(scene, camera, method));
     let row = |((photo, focal), behind): ((&crate::scene::SceneCamera, &f64), bool)| {
         let pose = &photo.camera.camera_to_world;
         Source {
             center: (pose.center() - origin).as_vec3().to_array(),
             axis: pose.axis().as_vec3().to_array(),
-            scale: if *focal > 0.0 { focal.recip() as f32 } else { 0.0 },
+            scale: if method.magnify && *focal > 0.0 { focal.recip() as f32 } else { 0.0 },
             behind,
         }
     };
@@ -69,7 +89,8 @@ pub fn sources(scene: &Scene, camera: &Camera) -> Arc<[Source]> {
 
 /// Whether each photo is behind in a view from `camera`. A photo of which nothing is known never is
 /// in front of others.
-fn behind(scene: &Scene, camera: &Camera) -> Vec<bool> {
+fn behind(scene: &Scene, camera: &Camera, method: ViewMethod) -> Vec<bool> {
+    let front = method.front_photos as usize;
     let focals = &scene.meta.report.network_focal_px;
     let depth = scene.meta.report.median_depth;
     let photos = scene.meta.cameras.iter().zip(focals).enumerate();
@@ -83,9 +104,9 @@ fn behind(scene: &Scene, camera: &Camera) -> Vec<bool> {
             (i, step + TURN_COST * turn)
         })
         .collect();
-    let layered = costs.len() > FRONT_PHOTOS && depth > 0.0;
+    let layered = front > 0 && costs.len() > front && depth > 0.0;
     let mut behind = vec![layered; scene.meta.cameras.len()];
     costs.sort_by(|a, b| a.1.total_cmp(&b.1).then(a.0.cmp(&b.0)));
-    costs.iter().take(FRONT_PHOTOS).for_each(|(i, _)| behind[*i] = false);
+    costs.iter().take(front).for_each(|(i, _)| behind[*i] = false);
     behind
 }

@@ -1,8 +1,8 @@
 //! What texts select in views of labelled scenes.
 //!
 //! The paper's protocol: a labelled photo is the target, the photos nearest to it are the input,
-//! and the class names are asked in a view from the target's camera. Both scoring profiles are
-//! judged from one scene. The *flat* baseline has no 3D: each mask of the nearest photo is scored
+//! and the class names are asked in a view from the target's camera. Each preset makes a scene of
+//! its own, and scores it. The *flat* baseline has no 3D: each mask of the nearest photo is scored
 //! by the same text, and the masks are laid over the target as they are.
 
 pub mod labels;
@@ -12,29 +12,28 @@ mod views;
 
 use std::path::PathBuf;
 
+use segsplat_core::names::named;
 use serde_json::{Value, json};
 
 use self::{
     labels::{LabelledFrame, LabelledScene, NOT_SEEN},
     tally::{Tally, TextMap},
-    views::{Seen, Tools},
+    views::{Seen, Tools, Way},
 };
 use crate::{
     error::{Error, Result},
     grid,
     limits::Limits,
-    pipeline::{Pipeline, semantics::SemanticsOptions},
+    pipeline::Pipeline,
     render::cpu::CpuRenderer,
     rows::{Rows, progress},
-    scene::ScoringProfile,
+    scene::{Preset, SceneOptions},
     scenes::{means_by_use, nearest, use_of},
     setup::Inputs,
 };
 
 /// Words for what is in no scene. A scene that has a class of this name does not ask the word.
 const ABSENT: &str = "airplane,elephant,church,waterfall,bicycle,violin,helmet,bridge";
-/// Profiles in the order they are judged: `paper`, `default`.
-const PROFILES: [ScoringProfile; 2] = [ScoringProfile::Paper, ScoringProfile::Default];
 /// Width of the pictures of a grid.
 const PICTURE_WIDTH: u32 = 320;
 
@@ -49,30 +48,22 @@ pub(crate) struct Args {
     /// Words for what is in no scene, separated by commas
     #[arg(long, value_delimiter = ',', default_value = ABSENT)]
     absent: Vec<String>,
-    /// Ask a photo first where masks of earlier photos reappear [default: as the service]
-    #[arg(long)]
-    seeds: Option<bool>,
-    /// Let all photos that show a Gaussian vote for its entry [default: as the service]
-    #[arg(long)]
-    votes: Option<bool>,
-    /// Join bank entries that are one thing, at least this alike (cosine); 0: none [default: as
-    /// the service]
-    #[arg(long, value_name = "COSINE")]
-    merge: Option<f64>,
+    /// How scenes are made, understood and scored, separated by commas: default, paper
+    #[arg(long, value_delimiter = ',', value_parser = named::<Preset>, default_value = "default")]
+    preset: Vec<Preset>,
+    /// A change of the method of every preset: `--method lambda=0.8`; docs/method.md has all
+    #[arg(long, value_name = "NAME=VALUE")]
+    method: Vec<String>,
     /// Folder for picture grids, one a scene
     #[arg(long, value_name = "DIR")]
     pictures: Option<PathBuf>,
 }
 
 impl Args {
-    fn understanding(&self) -> SemanticsOptions {
-        let mut options = SemanticsOptions::default();
-        options.seeds = self.seeds.unwrap_or(options.seeds);
-        options.votes = self.votes.unwrap_or(options.votes);
-        if let Some(cosine) = self.merge {
-            options.merge = (cosine > 0.0).then_some(cosine);
-        }
-        options
+    fn way(&self, engine: &Pipeline, preset: Preset) -> Result<Way> {
+        let options = SceneOptions { preset, ..SceneOptions::default() }.with(&self.method)?;
+        let scoring = engine.scoring(&engine.scoring_method(preset)?)?.into();
+        Ok(Way { options, scoring })
     }
 }
 
@@ -87,12 +78,15 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     }
     let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
     let renderer = CpuRenderer::new(args.inputs.setup.threads())?;
-    let tools = Tools::open(&engine, &renderer, args.understanding())?;
+    let ways = args.preset.iter().map(|preset| args.way(&engine, *preset));
+    let ways = ways.collect::<Result<Vec<Way>>>()?;
+    let tools = Tools::open(&engine, &renderer)?;
     let bundle = format!("{} {}", engine.bundle().name(), engine.bundle().version());
     let mut push = |mut row: Value| {
         row["bundle"] = json!(bundle);
         row["photos"] = json!(args.inputs.photos);
-        let miou = row["default"]["scene"]["miou"].as_f64().unwrap_or(f64::NAN);
+        let first = args.preset.first().copied().unwrap_or_default().to_string();
+        let miou = row[first]["scene"]["miou"].as_f64().unwrap_or(f64::NAN);
         let scene = row["scene"].as_str().unwrap_or_default();
         progress(&format!("{scene}: mIoU {miou:.3}"));
         rows.push(json!({ "one_less_miou": 1.0 - miou }), row)
@@ -100,22 +94,28 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let mut scenes = Vec::new();
     for (name, dir) in args.inputs.find(labels::is_labelled)? {
         let scene = labels::read(&dir, &Limits::default())?;
-        let row = judge(&tools, &name, &scene, args)?;
+        let row = judge(&tools, &ways, &name, &scene, args)?;
         push(row.clone())?;
         scenes.push(row);
     }
     means_by_use(&scenes).into_iter().try_for_each(push)
 }
 
-/// All targets of one scene: for each profile the figures of the scene (texts asked of it, at the
+/// All targets of one scene: for each preset the figures of the scene (texts asked of it, at the
 /// target's camera) and of the flat baseline.
-fn judge(tools: &Tools<'_>, name: &str, scene: &LabelledScene, args: &Args) -> Result<Value> {
+fn judge(
+    tools: &Tools<'_>,
+    ways: &[Way],
+    name: &str,
+    scene: &LabelledScene,
+    args: &Args,
+) -> Result<Value> {
     let is_class =
         |word: &&String| scene.classes.iter().any(|class| class.name.eq_ignore_ascii_case(word));
     let absent: Vec<String> = args.absent.iter().filter(|w| !is_class(w)).cloned().collect();
     let blank = Tally::new(&scene.classes, &absent);
     let texts = tools.texts(&blank.texts())?;
-    let mut tallies = [[blank.clone(), blank.clone()], [blank.clone(), blank]];
+    let mut tallies = vec![[blank.clone(), blank]; ways.len()];
     let every = match args.targets {
         0 => 1,
         most => scene.frames.len().div_ceil(most).max(1),
@@ -130,31 +130,32 @@ fn judge(tools: &Tools<'_>, name: &str, scene: &LabelledScene, args: &Args) -> R
         if inputs.len() < args.inputs.photos {
             return Err(fault(Error::invalid(format!("{} photos beside it", inputs.len()))));
         }
-        let seen = tools.see(&scene.photos, frame.photo, &inputs).map_err(fault)?;
-        let mut all_maps = Vec::new();
-        for (tallies, scoring) in tallies.iter_mut().zip(&tools.scorings) {
-            for (tally, way) in tallies.iter_mut().zip(&seen.ways) {
-                let maps = way.maps(scoring, &texts)?;
+        let (mut all_maps, mut color) = (Vec::new(), None);
+        for (tallies, way) in tallies.iter_mut().zip(ways) {
+            let seen = tools.see(&scene.photos, frame.photo, &inputs, way).map_err(fault)?;
+            for (tally, bank) in tallies.iter_mut().zip(&seen.banks) {
+                let maps = bank.maps(&way.scoring, &texts)?;
                 tally.add(&frame.label, &maps);
                 all_maps.push(maps);
             }
+            targets.push(seen.report.clone());
+            color.get_or_insert(seen);
         }
-        if args.pictures.is_some() {
+        if let (true, Some(seen)) = (args.pictures.is_some(), color) {
             pictures.push(shown(scene, frame, &seen, &all_maps));
         }
-        targets.push(seen.report);
     }
     if let Some(out) = &args.pictures {
         grid::write(out, name, &pictures.iter().collect::<Vec<_>>())?;
     }
     let mut row = json!({ "scene": name, "use": use_of(name), "targets": targets });
-    for (profile, [scene, flat]) in ["paper", "default"].into_iter().zip(&tallies) {
-        row[profile] = json!({ "scene": scene.scores(), "flat": flat.scores() });
+    for (preset, [scene, flat]) in args.preset.iter().zip(&tallies) {
+        row[preset.to_string()] = json!({ "scene": scene.scores(), "flat": flat.scores() });
     }
     Ok(row)
 }
 
-/// One target's pictures: photo, view, labels, then for each profile the best selecting text of
+/// One target's pictures: photo, view, labels, then for each preset the best selecting text of
 /// the scene and of the flat baseline.
 fn shown(
     scene: &LabelledScene,

@@ -6,18 +6,18 @@ use std::sync::{Arc, atomic::AtomicBool};
 use segsplat_vision::semantics::{Cutter, Scorer, Scoring};
 use serde_json::{Value, json};
 
-use super::{PROFILES, tally::TextMap};
+use super::tally::TextMap;
 use crate::{
     error::{Error, Result},
     models::ImageText,
     pipeline::{
         Pipeline, Reconstruction, masks,
-        semantics::{SemanticsInput, SemanticsOptions, understand},
+        semantics::{SemanticsInput, understand},
     },
     render::{
         Kinds, Labels, PixelWeights, RenderRequest, Renderer, cpu::CpuRenderer, plan::served,
     },
-    scene::{Bank, Camera, Crop, PhotoMasks, PosedPhoto, SceneOptions, Watch},
+    scene::{Bank, Camera, Crop, Method, PhotoMasks, PosedPhoto, SceneOptions, Watch},
     scenes::{make, scene_of, view_request},
 };
 
@@ -26,9 +26,12 @@ pub(super) struct Tools<'a> {
     engine: &'a Pipeline,
     renderer: &'a CpuRenderer,
     towers: Arc<ImageText>,
-    understanding: SemanticsOptions,
-    /// How each profile scores, as [`PROFILES`].
-    pub(super) scorings: Vec<Arc<Scoring>>,
+}
+
+/// How a scene is made and understood, and how texts are scored.
+pub(super) struct Way {
+    pub(super) options: SceneOptions,
+    pub(super) scoring: Arc<Scoring>,
 }
 
 /// One target, seen from its inputs.
@@ -39,7 +42,7 @@ pub(super) struct Seen {
     /// went; the mean sum of the weights of a pixel of the target over the bank, 0 to 1.
     pub(super) report: Value,
     /// The view of the scene, and the nearest photo taken for the target.
-    pub(super) ways: [BankView; 2],
+    pub(super) banks: [BankView; 2],
 }
 
 /// A bank and the weights of each pixel of the target over it.
@@ -49,15 +52,8 @@ pub(super) struct BankView {
 }
 
 impl<'a> Tools<'a> {
-    pub(super) fn open(
-        engine: &'a Pipeline,
-        renderer: &'a CpuRenderer,
-        understanding: SemanticsOptions,
-    ) -> Result<Self> {
-        let scorings = PROFILES.iter().map(|&profile| Ok(Arc::new(engine.scoring(profile)?)));
-        let scorings = scorings.collect::<Result<_>>()?;
-        let towers = engine.image_text()?;
-        Ok(Self { engine, renderer, towers, understanding, scorings })
+    pub(super) fn open(engine: &'a Pipeline, renderer: &'a CpuRenderer) -> Result<Self> {
+        Ok(Self { engine, renderer, towers: engine.image_text()? })
     }
 
     /// Unit embeddings of texts.
@@ -71,17 +67,19 @@ impl<'a> Tools<'a> {
         photos: &[PosedPhoto],
         target: usize,
         inputs: &[usize],
+        way: &Way,
     ) -> Result<Seen> {
         let given: Vec<PosedPhoto> = inputs.iter().map(|&i| photos[i].clone()).collect();
         let cancel = AtomicBool::new(false);
-        let reconstruction = make(self.engine, &given, &SceneOptions::default())?;
+        let reconstruction = make(self.engine, &given, &way.options)?;
+        let method = reconstruction.report.method.clone();
         let parts = SemanticsInput {
             photos: &given,
             cameras: &reconstruction.cameras,
             gaussians: &reconstruction.gaussians,
         };
         let watch = Watch { progress: &|_, _| (), cancel: &cancel };
-        let meaning = understand(self.engine, &parts, &self.understanding, watch)?;
+        let meaning = understand(self.engine, &parts, &method, watch)?;
         let gaussians = reconstruction.gaussians.with_semantic_index(meaning.index)?;
         let plain =
             view_request(photos[target].camera, Kinds::COLOR, reconstruction.report.median_depth);
@@ -100,9 +98,9 @@ impl<'a> Tools<'a> {
         });
         Ok(Seen {
             color: frame.color.unwrap_or_default(),
-            ways: [
+            banks: [
                 BankView { bank: meaning.bank, weights },
-                self.flat(&given[0], &photos[target].camera, &cancel)?,
+                self.flat(&given[0], &photos[target].camera, &method, &cancel)?,
             ],
             report,
         })
@@ -110,16 +108,25 @@ impl<'a> Tools<'a> {
 
     /// The masks of one photo, each with a row of its own, laid over a picture of the size of the
     /// target.
-    fn flat(&self, photo: &PosedPhoto, target: &Camera, cancel: &AtomicBool) -> Result<BankView> {
+    fn flat(
+        &self,
+        photo: &PosedPhoto,
+        target: &Camera,
+        method: &Method,
+        cancel: &AtomicBool,
+    ) -> Result<BankView> {
         let network = self.engine.masks()?;
-        let settings = masks::settings(network.manifest());
+        let settings = masks::settings(network.manifest(), method);
         let photos = std::slice::from_ref(photo);
         let found = masks::photo_masks(&network, photos, None, &settings, &|_| (), cancel)?;
         let none = PhotoMasks::default();
         let masks = found.first().unwrap_or(&none);
         let cutter = Cutter::new(&photo.photo, masks);
         let manifest = self.towers.manifest();
-        let margin = f64::from(manifest.image.crop_margin);
+        let margin = match method.crop_margin {
+            true => f64::from(manifest.image.crop_margin),
+            false => 0.0,
+        };
         let cut = |k: usize| cutter.cut(k, margin).unwrap_or(Crop { side: 1, rgb: vec![0; 3] });
         let crops: Vec<Crop> = (0..masks.masks.len()).map(cut).collect();
         let rows = self.towers.embed_images(&crops)?;

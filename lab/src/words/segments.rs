@@ -132,7 +132,8 @@ impl SegmentedImage {
         values.iter().for_each(|v| count[usize::from(*v)] += 1);
         let index = values.iter().map(|v| first[usize::from(*v)]).collect();
         let map = IndexMap { width: mask.width(), height: mask.height(), index };
-        let masks = PhotoMasks { map, masks: vec![MaskInfo::default(); wanted.len()] };
+        let masks =
+            PhotoMasks { wholes: Vec::new(), map, masks: vec![MaskInfo::default(); wanted.len()] };
         let cutter = Cutter::new(&photo, &masks);
         let least = SHARE_MIN * values.len() as f64;
         let cut = |(k, segment): (usize, &&Segment)| {

@@ -6,13 +6,14 @@ use super::pb;
 use crate::{
     error::{Error, Result},
     scene::{
-        CameraToWorld, DropCount, HealthReport, Intrinsics, ScoringProfile, SemanticsReport,
+        CameraToWorld, DropCount, HealthReport, Intrinsics, ScoringMethod, SemanticsReport,
         StageTime, Warning,
     },
     service::{
-        BackgroundSpec, Boxes, CameraSpec, Density, Event, ExportFormat, Format, InstanceBox, Kind,
-        Label, LensSpec, MaskFormat, Peak, PickSpec, Picked, PictureOptions, PoseSpec, Quality,
-        QueryAnswer, QuerySpec, RenderedView, SceneCamera, SceneError, SceneState, SceneStatus,
+        BackgroundSpec, Boxes, CameraSpec, Density, Event, ExportFormat, FeatureKind, FeaturesSpec,
+        Format, InstanceBox, Kind, Label, LensSpec, MaskFormat, MaskLevel, Method, Peak, PickSpec,
+        Picked, PictureOptions, PoseSpec, Preset, Quality, QueryAnswer, QuerySpec, RenderedView,
+        SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, ScoringOptions,
         SemanticsMode, SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView,
         TextWarning, ViewOptions,
     },
@@ -47,7 +48,7 @@ fn semantics_status(status: SemanticsStatus) -> pb::SemanticsStatus {
     let report = |report: SemanticsReport| {
         message!(SemanticsReport from report
             { masks, bank_size, labelled, bundle_sha256, execution_provider }
-            profile: pb::ScoringProfile::from(report.profile).into(),
+            method: Some(method(&report.method)),
             stages: report.stages.into_iter().map(stage_time).collect(),
         )
     };
@@ -84,6 +85,7 @@ fn report(report: HealthReport) -> pb::HealthReport {
         dropped: report.dropped.into_iter().map(drop_count).collect(),
         depth_near,
         depth_far,
+        method: Some(method(&report.method)),
         stages: report.stages.into_iter().map(stage_time).collect(),
         warnings: report.warnings.into_iter().map(warning).collect(),
     )
@@ -166,9 +168,11 @@ fn vec3(v: &pb::Vec3) -> [f64; 3] {
 
 /// How a view is rendered.
 pub(super) fn options(options: &pb::ViewOptions) -> Result<ViewOptions> {
-    let &pb::ViewOptions { width, height, antialiased, near, .. } = options;
+    let &pb::ViewOptions { width, height, antialiased, near, front_photos, magnify, .. } = options;
     let quality = value("quality", options.quality)?;
-    Ok(ViewOptions { width, height, antialiased, near, quality, deadline: None })
+    let preset = given("preset", options.preset)?;
+    let of_view = ViewOptions { width, height, antialiased, near, quality, ..Default::default() };
+    Ok(ViewOptions { preset, front_photos, magnify, ..of_view })
 }
 
 /// The same for a call that returns no picture.
@@ -178,6 +182,76 @@ fn options_alone(given: Option<pb::ViewOptions>, call: &str) -> Result<ViewOptio
         None => options(&given),
         Some(_) => Err(Error::invalid(format!("crop is for views, not for {call}"))),
     }
+}
+
+/// Fields of a method that both sides have under one name and type.
+macro_rules! method_fields {
+    ($same:ident) => {
+        $same! {
+            prune, fuse_layers, backdrop, skip_covered, seeds, full_resolution, mask_filters,
+            crop_whole, crop_margin, lambda, bank_rows, votes, merge_cosine, front_photos, magnify
+        }
+    };
+}
+
+/// How a scene was made.
+fn method(method: &Method) -> pb::Method {
+    macro_rules! message {
+        ($($name:ident),+) => {
+            pb::Method {
+                preset: pb::Preset::from(method.preset).into(),
+                density: pb::Density::from(method.density).into(),
+                mask_level: pb::MaskLevel::from(method.mask_level).into(),
+                $($name: Some(method.$name),)+
+            }
+        };
+    }
+    method_fields!(message)
+}
+
+/// How a scene is to be made.
+pub(super) fn scene_options(header: &pb::CreateSceneHeader) -> Result<SceneOptions> {
+    let method = header.method.unwrap_or_default();
+    macro_rules! options {
+        ($($name:ident),+) => {
+            SceneOptions {
+                max_views: header.max_views.map(|views| views as usize),
+                semantics: value("semantics", header.semantics)?,
+                preset: value("preset", method.preset)?,
+                density: given("density", method.density)?,
+                mask_level: given("mask_level", method.mask_level)?,
+                $($name: method.$name,)+
+            }
+        };
+    }
+    Ok(method_fields!(options))
+}
+
+/// Changes of how texts are scored.
+fn scoring(scoring: Option<pb::Scoring>) -> ScoringOptions {
+    let pb::Scoring { canon, tau, cut, unit_rows, coverage_floor } = scoring.unwrap_or_default();
+    ScoringOptions { canon, tau, cut, unit_rows, coverage_floor }
+}
+
+fn scored(method: ScoringMethod) -> pb::Scoring {
+    pb::Scoring {
+        canon: method.canon,
+        tau: Some(method.tau),
+        cut: Some(method.cut),
+        unit_rows: Some(method.unit_rows),
+        coverage_floor: Some(method.coverage_floor),
+    }
+}
+
+/// The features of a view.
+pub(super) fn features(request: pb::FeaturesRequest) -> Result<FeaturesSpec> {
+    Ok(FeaturesSpec {
+        camera: camera(request.camera, "features")?,
+        options: options_alone(request.options, "features")?,
+        kind: value("kind", request.kind)?,
+        scoring: scoring(request.scoring),
+        wait: request.semantics_wait_ms.map(Duration::from_millis),
+    })
 }
 
 /// How a view is encoded.
@@ -212,12 +286,12 @@ pub(super) fn not_empty(text: String) -> Option<String> {
 }
 
 /// The text of a view or an export, and how it is scored.
-pub(super) fn text(text: String, profile: i32, wait_ms: Option<u64>) -> Result<TextOptions> {
-    Ok(TextOptions {
+pub(super) fn text(text: String, how: Option<pb::Scoring>, wait_ms: Option<u64>) -> TextOptions {
+    TextOptions {
         text: not_empty(text),
-        profile: value("profile", profile)?,
+        scoring: scoring(how),
         wait: wait_ms.map(Duration::from_millis),
-    })
+    }
 }
 
 /// A query.
@@ -230,7 +304,7 @@ pub(super) fn query(request: pb::QueryRequest) -> Result<QuerySpec> {
         boxes: value("boxes", request.boxes)?,
         mask: value("mask", request.mask)?,
         relevancy: request.relevancy,
-        profile: value("profile", request.profile)?,
+        scoring: scoring(request.scoring),
         wait: request.semantics_wait_ms.map(Duration::from_millis),
     })
 }
@@ -239,7 +313,7 @@ pub(super) fn query(request: pb::QueryRequest) -> Result<QuerySpec> {
 pub(super) fn answer(answer: QueryAnswer) -> pb::QueryResponse {
     let camera = answer.camera;
     message!(QueryResponse from answer { bank_size, render_ms }
-        profile: pb::ScoringProfile::from(answer.profile).into(),
+        scoring: Some(scored(answer.scoring)),
         intrinsics: camera.map(|camera| intrinsics(camera.intrinsics)),
         camera_to_world: camera.map_or_else(Vec::new, |camera| matrix(&camera.camera_to_world)),
         results: answer.results.into_iter().map(result).collect(),
@@ -289,7 +363,7 @@ pub(super) fn pick(request: pb::PickRequest) -> Result<PickSpec> {
         y: request.y,
         options: options_alone(request.options, "pick")?,
         labels: request.labels,
-        profile: value("profile", request.profile)?,
+        scoring: scoring(request.scoring),
         wait: request.semantics_wait_ms.map(Duration::from_millis),
     })
 }
@@ -308,6 +382,11 @@ pub(super) fn picked(picked: Picked) -> pb::PickResponse {
 pub(super) fn value<T: FromNumber>(name: &str, number: i32) -> Result<T> {
     T::from_number(number)
         .ok_or_else(|| Error::invalid(format!("{name} is {number}; there is no such value")))
+}
+
+/// The same where 0 says nothing.
+pub(super) fn given<T: FromNumber>(name: &str, number: i32) -> Result<Option<T>> {
+    if number == 0 { Ok(None) } else { value(name, number).map(Some) }
 }
 
 /// An enum that a message has as a number. Any number may come; 0 is the default.
@@ -353,8 +432,10 @@ both_ways! {
     Kind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }
     Format = Format { Png, Jpeg, Webp, Npy, Rgb8, Rgba8, Grey8 }
     Quality = Quality { Exact, Fast }
-    ScoringProfile = ScoringProfile { Default, Paper }
+    Preset = Preset { Default, Paper }
+    MaskLevel = MaskLevel { Widest, Whole, Part, Subpart }
+    FeatureKind = FeatureKind { Weights, Features }
     Boxes = Boxes { Oriented, Aligned, None }
     MaskFormat = MaskFormat { Rle, Png, None }
-    ExportFormat = ExportFormat { Ply }
+    ExportFormat = ExportFormat { Ply, Npz }
 }

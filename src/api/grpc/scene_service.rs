@@ -1,6 +1,6 @@
 //! `segsplat.v1.SceneService`: messages to requests, calls of the service, answers to messages.
 
-use std::{pin::Pin, time::Duration};
+use std::{io, pin::Pin, time::Duration};
 
 use futures_util::{Stream, StreamExt, stream};
 use tonic::{Request, Response, Status, Streaming};
@@ -18,7 +18,7 @@ use crate::{
     error::{Error, Result},
     scene::{Upload, UploadCameras},
     service::{
-        CreateScene, Kind, PageRequest, SceneOptions, SemanticsMode, ViewSpec, ViewTimes, ViewsSpec,
+        CreateScene, Export, Kind, PageRequest, SemanticsMode, ViewSpec, ViewTimes, ViewsSpec,
     },
 };
 
@@ -41,6 +41,7 @@ impl pb::scene_service_server::SceneService for Api {
     type WatchSceneStream = Many<pb::SceneEvent>;
     type RenderViewsStream = Many<pb::View>;
     type ExportStream = Many<pb::ExportChunk>;
+    type FeaturesStream = Many<pb::ExportChunk>;
 
     async fn create_scene(
         &self,
@@ -129,6 +130,17 @@ impl pb::scene_service_server::SceneService for Api {
     async fn export(&self, request: Request<pb::ExportRequest>) -> Answer<Self::ExportStream> {
         answer(self, request, export).await
     }
+
+    async fn features(
+        &self,
+        request: Request<pb::FeaturesRequest>,
+    ) -> Answer<Self::FeaturesStream> {
+        answer(self, request, |api, request| async move {
+            let id = request.scene_id.parse()?;
+            Ok(chunks(api.service.features(&id, convert::features(request)?).await?))
+        })
+        .await
+    }
 }
 
 /// A message with its stages as metadata.
@@ -150,11 +162,7 @@ async fn create(
     let wait = header.wait_ms.map(Duration::from_millis);
     let request = CreateScene {
         upload,
-        options: SceneOptions {
-            max_views: header.max_views.map(|views| views as usize),
-            semantics: convert::value("semantics", header.semantics)?,
-            density: convert::value("density", header.density)?,
-        },
+        options: convert::scene_options(&header)?,
         idempotency_key: not_empty(header.idempotency_key),
         wait,
         request_id,
@@ -226,7 +234,7 @@ async fn render(api: Api, request: pb::RenderViewRequest) -> Result<(pb::View, V
     let given = request.options.unwrap_or_default();
     let spec = ViewSpec {
         kind: convert::value("kind", request.kind)?,
-        text: convert::text(request.text, request.profile, request.semantics_wait_ms)?,
+        text: convert::text(request.text, request.scoring, request.semantics_wait_ms),
         camera: convert::camera(request.camera, "view")?,
         options: convert::options(&given)?,
         picture: convert::picture(&given)?,
@@ -238,7 +246,7 @@ async fn render(api: Api, request: pb::RenderViewRequest) -> Result<(pb::View, V
 
 async fn render_many(api: Api, request: pb::RenderViewsRequest) -> Result<Many<pb::View>> {
     let id = request.scene_id.parse()?;
-    let text = convert::text(request.text, request.profile, request.semantics_wait_ms)?;
+    let text = convert::text(request.text, request.scoring, request.semantics_wait_ms);
     let kinds = match request.kinds.as_slice() {
         [] => vec![Kind::Color],
         kinds => kinds.iter().map(|kind| convert::value("kind", *kind)).collect::<Result<_>>()?,
@@ -256,16 +264,22 @@ async fn render_many(api: Api, request: pb::RenderViewsRequest) -> Result<Many<p
 
 async fn export(api: Api, request: pb::ExportRequest) -> Result<Many<pb::ExportChunk>> {
     let id = request.scene_id.parse()?;
-    let text = convert::text(request.text, request.profile, request.semantics_wait_ms)?;
+    let text = convert::text(request.text, request.scoring, request.semantics_wait_ms);
     let format = convert::value("format", request.format)?;
-    let export = api.service.export(&id, format, &text).await?;
+    let preset = convert::given("preset", request.preset)?;
+    Ok(chunks(api.service.export(&id, format, preset, &text).await?))
+}
+
+/// A file in pieces.
+fn chunks(export: Export) -> Many<pb::ExportChunk> {
     let first = pb::ExportChunk {
-        size_bytes: Some(export.size_bytes),
+        size_bytes: export.size_bytes,
         file_name: export.file_name.clone(),
         ..Default::default()
     };
-    let pieces = export
-        .into_stream()
-        .map(|data| Ok(pb::ExportChunk { data: data.into(), ..Default::default() }));
-    Ok(stream::once(async { Ok(first) }).chain(pieces).boxed())
+    let piece = |data: io::Result<Vec<u8>>| match data {
+        Ok(data) => Ok(pb::ExportChunk { data: data.into(), ..Default::default() }),
+        Err(e) => Err(logged(&Error::internal("the file broke off").caused_by(e))),
+    };
+    stream::once(async { Ok(first) }).chain(export.into_stream().map(piece)).boxed()
 }

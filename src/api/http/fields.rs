@@ -201,7 +201,9 @@ impl Fields {
     /// Refuses names that are left.
     pub(super) fn finish(self) -> Result<()> {
         let Some((name, _)) = self.given.first() else { return Ok(()) };
-        let known = match self.known.as_slice() {
+        let mut known = self.known.clone();
+        known.dedup();
+        let known = match known.as_slice() {
             [] => "no parameters".to_owned(),
             known => known.join(", "),
         };

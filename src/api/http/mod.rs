@@ -74,6 +74,7 @@ pub fn routes() -> Vec<Route> {
         ("POST", "/v1/scenes/{id}/query", "query", read, post(texts::query)),
         ("GET", "/v1/scenes/{id}/pick", "pick", read, get(texts::pick)),
         ("GET", "/v1/scenes/{id}/export", "export", read, get(render::export)),
+        ("GET", "/v1/scenes/{id}/features", "features", read, get(render::features)),
         ("GET", "/v1/models", "models", read, get(health::models)),
         ("GET", "/metrics", METRICS, admin, get(health::metrics)),
         ("GET", "/healthz", "live", none, get(health::live)),

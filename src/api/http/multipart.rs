@@ -20,7 +20,7 @@ use crate::{
         upload::{UploadBuilder, UploadGuard},
     },
     error::{Error, Result},
-    scene::{Upload, UploadCameras},
+    scene::{SceneOptions, Upload, UploadCameras},
 };
 
 /// Bytes still read of an upload that was refused, so that the caller gets the answer.
@@ -32,7 +32,7 @@ const HEAD_BYTES_MAX: usize = 1 << 20;
 /// Longest option as a text part.
 const OPTION_BYTES_MAX: usize = 256;
 /// Options that may come as text parts as well as in the query string.
-const OPTIONS: [&str; 5] = ["semantics", "bundle", "max_views", "density", "wait_ms"];
+const OPTIONS: [&[&str]; 2] = [SceneOptions::NAMES, &["bundle", "wait_ms"]];
 
 /// Parts of the upload, for `/openapi.json`: no value has this type, parts are read as they come.
 #[derive(ToSchema)]
@@ -111,7 +111,8 @@ async fn parts(
 ) -> Result<(Upload, UploadGuard)> {
     let limits = api.service.limits();
     let mut upload = UploadBuilder::new(&limits, &api.uploads);
-    let mut options = OPTIONS.to_vec();
+    let all = OPTIONS.concat();
+    let mut options = all.clone();
     loop {
         let Some(mut field) = form.next_field().await.map_err(broken)? else { break };
         body.progressed();
@@ -120,7 +121,7 @@ async fn parts(
             "transforms" => upload.begin_cameras(UploadCameras::Transforms(Vec::new()))?,
             "cameras" => upload.begin_cameras(UploadCameras::Cameras(Vec::new()))?,
             "archive" => upload.begin_archive(),
-            option if OPTIONS.contains(&option) => {
+            option if all.contains(&option) => {
                 // Each once, or options alone could fill the memory.
                 let Some(at) = options.iter().position(|left| *left == option) else {
                     return Err(Error::invalid(format!("upload: {option} is given twice")));
@@ -202,7 +203,7 @@ fn photo_name(part: &str, file: Option<&str>) -> Result<String> {
             "upload: unknown part {:?}; there are transforms, cameras, archive, {}, and photos, \
              each with the name of its file",
             short(part),
-            OPTIONS.join(", ")
+            OPTIONS.concat().join(", ")
         ))),
     }
 }

@@ -31,8 +31,8 @@ pub(super) async fn document() -> Json<openapi::OpenApi> {
     ),
     paths(
         scenes::create, scenes::list, scenes::get, scenes::delete, scenes::events, render::view,
-        views::views, texts::query, texts::pick, render::export, health::models, health::live,
-        health::ready, health::metrics, document, viewer::index,
+        views::views, texts::query, texts::pick, render::export, render::features, health::models,
+        health::live, health::ready, health::metrics, document, viewer::index,
     ),
     components(schemas(ErrorBody)),
     tags(

@@ -1,6 +1,6 @@
 //! One rendered view, and the scene as a file.
 
-use std::convert::Infallible;
+use std::time::Duration;
 
 use axum::{
     Extension,
@@ -8,7 +8,6 @@ use axum::{
     http::{HeaderMap, HeaderValue, StatusCode, header},
     response::{IntoResponse, Response},
 };
-use futures_util::StreamExt;
 use serde::Deserialize;
 use utoipa::IntoParams;
 
@@ -22,8 +21,8 @@ use crate::{
     api::{server_timing, short},
     error::{Error, Result},
     service::{
-        CameraFields, CameraSpec, ExportFormat, Format, Kind, PictureOptions, RenderedView,
-        TextOptions, ViewOptions, ViewSpec,
+        CameraFields, CameraSpec, Export, ExportFormat, FeatureKind, FeaturesSpec, Format, Kind,
+        PictureOptions, Preset, RenderedView, ScoringOptions, TextOptions, ViewOptions, ViewSpec,
     },
 };
 
@@ -43,15 +42,32 @@ pub(super) struct ViewParams {
 #[serde(default)]
 #[into_params(parameter_in = Query)]
 pub(super) struct ExportParams {
-    /// `ply` (default).
+    /// `ply` (default), or `npz`: the semantics as arrays.
     #[param(inline)]
     format: ExportFormat,
+    /// How a text is scored: `default` or `paper`. By default as the scene was made.
+    #[param(inline)]
+    preset: Option<Preset>,
+}
+
+/// What features are, and of what.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct FeaturesParams {
+    /// `weights` (default): E, sparse. `features`: F, `[H, W, D]`.
+    #[param(inline)]
+    kind: FeatureKind,
+    /// Milliseconds to wait for semantics that are being made.
+    wait_ms: Option<u64>,
 }
 
 /// One view of a scene
 #[utoipa::path(
     get, path = "/v1/scenes/{id}/view", operation_id = "render_view", tag = "views",
-    params(Id, CameraFields, ViewParams, ViewOptions, PictureOptions, TextOptions),
+    params(
+        Id, CameraFields, ViewParams, ViewOptions, PictureOptions, TextOptions, ScoringOptions
+    ),
     responses(
         (
             status = 200, content_type = "image/png", body = Vec<u8>,
@@ -83,10 +99,10 @@ pub(super) async fn view(
 /// The scene, or what a text selects of it, as a file
 #[utoipa::path(
     get, path = "/v1/scenes/{id}/export", operation_id = "export", tag = "views",
-    params(Id, ExportParams, TextOptions),
+    params(Id, ExportParams, TextOptions, ScoringOptions),
     responses((
         status = 200, content_type = "application/octet-stream", body = Vec<u8>,
-        description = "Standard 3DGS PLY"
+        description = "Standard 3DGS PLY, or an npz of arrays"
     ))
 )]
 pub(super) async fn export(
@@ -95,25 +111,69 @@ pub(super) async fn export(
     headers: HeaderMap,
     mut fields: Fields,
 ) -> Result<Response, ApiError> {
-    let ExportParams { format } = fields.take()?;
-    let ask: TextOptions = fields.take()?;
+    let ExportParams { format, preset } = fields.take()?;
+    let ask = text(&mut fields)?;
     fields.finish()?;
-    let export = api.service.export(&id, format, &ask).await?;
-    if let Some(answer) = not_modified(&headers, &export.etag) {
-        return Ok(answer);
+    Ok(file(&headers, api.service.export(&id, format, preset, &ask).await?))
+}
+
+/// The pixels of a view over the bank, as arrays
+#[utoipa::path(
+    get, path = "/v1/scenes/{id}/features", operation_id = "features", tag = "views",
+    params(Id, CameraFields, FeaturesParams, ViewOptions, ScoringOptions),
+    responses((
+        status = 200, content_type = "application/octet-stream", body = Vec<u8>,
+        description = "npz. weights: size, offsets, entries, weights. features: features"
+    ))
+)]
+pub(super) async fn features(
+    CallerApi(api): CallerApi,
+    Id(id): Id,
+    Extension(Deadline(deadline)): Extension<Deadline>,
+    headers: HeaderMap,
+    mut fields: Fields,
+) -> Result<Response, ApiError> {
+    let f = &mut fields;
+    let camera = camera(f.take()?, "camera")?;
+    let FeaturesParams { kind, wait_ms } = f.take()?;
+    let options = ViewOptions { deadline, ..f.take()? };
+    let wait = wait_ms.map(Duration::from_millis);
+    let spec = FeaturesSpec { camera, options, kind, scoring: scoring(f)?, wait };
+    fields.finish()?;
+    Ok(file(&headers, api.service.features(&id, spec).await?))
+}
+
+/// A file that is written while it is sent, unless the caller has it.
+fn file(headers: &HeaderMap, export: Export) -> Response {
+    if let Some(answer) = not_modified(headers, &export.etag) {
+        return answer;
     }
     let disposition = format!("attachment; filename=\"{}\"", export.file_name);
     let headers = [
         (header::CONTENT_TYPE, "application/octet-stream".to_owned()),
-        (header::CONTENT_LENGTH, export.size_bytes.to_string()),
         // It is written while it is sent, always from its start.
         (header::ACCEPT_RANGES, "none".to_owned()),
         (header::CONTENT_DISPOSITION, disposition),
         (header::ETAG, quoted(&export.etag)),
         (header::CACHE_CONTROL, "private, no-cache".to_owned()),
     ];
-    let pieces = export.into_stream().map(Ok::<_, Infallible>);
-    Ok((headers, Body::from_stream(pieces)).into_response())
+    let size = export.size_bytes.map(|bytes| [(header::CONTENT_LENGTH, bytes.to_string())]);
+    let body = Body::from_stream(export.into_stream());
+    match size {
+        Some(size) => (headers, size, body).into_response(),
+        None => (headers, body).into_response(),
+    }
+}
+
+/// The changes of how texts are scored, from a query string.
+pub(super) fn scoring(fields: &mut Fields) -> Result<ScoringOptions> {
+    let canon = fields.all("canon")?;
+    Ok(ScoringOptions { canon, ..fields.take()? })
+}
+
+/// A text and how it is scored, from a query string.
+fn text(fields: &mut Fields) -> Result<TextOptions> {
+    Ok(TextOptions { scoring: scoring(fields)?, ..fields.take()? })
 }
 
 /// Headers of a picture: type, tag, camera, depth scale, shape of samples without a codec.
@@ -164,7 +224,7 @@ fn spec_of(mut fields: Fields, accept: Option<&str>) -> Result<ViewSpec> {
     let format_given = f.has("format");
     let camera = camera(f.take()?, "camera")?;
     let ViewParams { kind } = f.take()?;
-    let (options, mut picture, text) = (f.take()?, f.take::<PictureOptions>()?, f.take()?);
+    let (options, mut picture, text) = (f.take()?, f.take::<PictureOptions>()?, text(f)?);
     fields.finish()?;
     if !format_given {
         picture.format = negotiate(accept, kind)?;

@@ -11,12 +11,13 @@ use super::{
     extract::{CallerApi, Id, JsonBody},
     fields::Fields,
     middleware::Deadline,
-    render::camera,
+    render::{camera, scoring},
 };
 use crate::{
     api::server_timing,
-    scene::ScoringProfile,
-    service::{CameraFields, PickSpec, Picked, QueryAnswer, QuerySpec, ViewOptions},
+    service::{
+        CameraFields, PickSpec, Picked, QueryAnswer, QuerySpec, ScoringOptions, ViewOptions,
+    },
 };
 
 /// Search a scene by texts, in 3D and in a view
@@ -40,7 +41,7 @@ pub(super) async fn query(
         boxes: f.value("boxes")?.unwrap_or_default(),
         mask: f.value("mask")?.unwrap_or_default(),
         relevancy: f.value("relevancy")?.unwrap_or_default(),
-        profile: f.value("profile")?.unwrap_or_default(),
+        scoring: f.take()?,
         wait: f.value("wait_ms")?.map(Duration::from_millis),
     };
     body.finish()?;
@@ -59,10 +60,6 @@ pub(super) struct PickParams {
     /// A text that may name the entry; may be given many times.
     #[serde(default)]
     label: Vec<String>,
-    /// How labels are scored: `default`, or `paper`.
-    #[serde(default)]
-    #[param(inline)]
-    profile: ScoringProfile,
     /// Milliseconds to wait for semantics that are being made.
     wait_ms: Option<u64>,
 }
@@ -70,7 +67,7 @@ pub(super) struct PickParams {
 /// What is under a pixel of a view
 #[utoipa::path(
     get, path = "/v1/scenes/{id}/pick", operation_id = "pick", tag = "texts",
-    params(Id, PickParams, CameraFields, ViewOptions),
+    params(Id, PickParams, CameraFields, ViewOptions, ScoringOptions),
     responses((status = 200, description = "What is under the pixel", body = Picked))
 )]
 pub(super) async fn pick(
@@ -83,14 +80,14 @@ pub(super) async fn pick(
     let camera = camera(f.take()?, "camera")?;
     let labels = f.all("label")?;
     let params = PickParams { label: labels, ..f.take()? };
-    let PickParams { x, y, label, profile, wait_ms } = params;
+    let PickParams { x, y, label, wait_ms } = params;
     let spec = PickSpec {
         camera,
         x,
         y,
         options: ViewOptions { deadline, ..f.take()? },
         labels: label,
-        profile,
+        scoring: scoring(f)?,
         wait: wait_ms.map(Duration::from_millis),
     };
     fields.finish()?;

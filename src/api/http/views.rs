@@ -25,7 +25,7 @@ use super::{
 };
 use crate::{
     error::Result,
-    service::{CameraFields, Format, Kind, RenderedView, ViewOptions, ViewsSpec},
+    service::{CameraFields, Format, Kind, RenderedView, TextOptions, ViewOptions, ViewsSpec},
 };
 
 /// Between the parts of a multipart answer; the pictures' own bytes cannot hold it by accident.
@@ -62,7 +62,7 @@ impl ViewsBody {
             kinds: f.value("kinds")?.unwrap_or_else(|| vec![Kind::Color]),
             options: f.take()?,
             picture: f.take()?,
-            text: f.take()?,
+            text: TextOptions { scoring: f.take()?, ..f.take()? },
         };
         let container = f.value("container")?;
         body.finish()?;

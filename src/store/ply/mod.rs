@@ -3,10 +3,14 @@
 //! Per vertex: `x y z nx ny nz f_dc_0..2 f_rest_0..3(K-1) opacity scale_0..2 rot_0..3`, all
 //! little-endian f32, then `ushort semantic_index`. Scales are natural logarithms, opacity is a
 //! logit, `rot` is wxyz, `f_rest` is channel-major: all red coefficients, then green, then blue.
+//! After the last vertex comes the container of the semantics, where they are made: the bank, the
+//! rows of the masks, the index maps. A comment says how many bytes it has. Readers of PLY stop at
+//! the last vertex.
+//!
 //! Positions are world coordinates; what f32 cannot hold of a far origin is lost in this format.
 
 mod read;
 mod write;
 
 pub use read::read_ply;
-pub use write::{PlyWriter, ply_size_bytes};
+pub use write::{PlyFile, PlyWriter};

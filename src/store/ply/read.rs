@@ -6,17 +6,23 @@ use glam::DVec3;
 
 use crate::{
     error::{Error, Result},
-    scene::{Gaussians, RawGaussians, SanitizeReport, SourcePixel},
+    scene::{Gaussians, RawGaussians, SanitizeReport, SceneId, Semantics, SourcePixel},
+    store::read_semantics,
 };
+
+use super::write::SEMANTICS;
 
 /// Longest header, bytes.
 const HEADER_BYTES_MAX: u64 = 64 << 10;
 /// Most attributes of a vertex: 62 are standard.
 const ATTRIBUTES_MAX: usize = 256;
+/// Most bytes of semantics after the vertices, an eighth of what a scene may have.
+const SEMANTICS_BYTES_MAX: u64 = 1 << 30;
 /// Gaussians reserved for before any is read: a header may claim anything.
 const RESERVED_MAX: usize = 65_536;
 
-/// Reads a file. `gaussians_max` bounds what the header may claim.
+/// Reads a file, with the semantics after its vertices if there are some. `gaussians_max` bounds
+/// what the header may claim.
 ///
 /// # Errors
 /// `invalid_request` when it is no binary PLY of Gaussians or is cut short, naming what is wrong;
@@ -25,7 +31,7 @@ const RESERVED_MAX: usize = 65_536;
 pub fn read_ply(
     mut from: impl BufRead,
     gaussians_max: usize,
-) -> Result<(Gaussians, SanitizeReport)> {
+) -> Result<(Gaussians, SanitizeReport, Option<Semantics>)> {
     let header = Header::read(&mut from)?;
     if header.count > gaussians_max {
         return Err(Error::limit("PLY: Gaussians", header.count, gaussians_max));
@@ -39,7 +45,27 @@ pub fn read_ply(
         from.read_exact(&mut vertex).map_err(|cause| cut_short(cause, i, header.count))?;
         layout.push(&header, &vertex, &mut raw);
     }
-    Gaussians::sanitize(raw)
+    let (gaussians, report) = Gaussians::sanitize(raw)?;
+    let semantics = header.semantics.map(|bytes| semantics_after(from, bytes)).transpose()?;
+    // The vertices say which entry is whose, also where some were dropped.
+    let index = gaussians.semantic_index().to_vec();
+    let semantics = semantics.map(|semantics| Semantics { index, ..semantics });
+    Ok((gaussians, report, semantics))
+}
+
+/// The container of `bytes` bytes that follows the vertices.
+fn semantics_after(from: impl Read, bytes: u64) -> Result<Semantics> {
+    if bytes > SEMANTICS_BYTES_MAX {
+        return Err(Error::limit("PLY: bytes of semantics", bytes, SEMANTICS_BYTES_MAX));
+    }
+    let mut file = Vec::new();
+    let read = from.take(bytes).read_to_end(&mut file);
+    read.map_err(|cause| crate::store::files::unavailable("read the PLY", cause))?;
+    if (file.len() as u64) < bytes {
+        return Err(bad(format!("the semantics end after {} of {bytes} bytes", file.len())));
+    }
+    let read = read_semantics(&file, &SceneId::from_bytes([0; 16]));
+    read.map(|(semantics, _)| semantics).map_err(|e| bad(e.message()))
 }
 
 fn cut_short(cause: io::Error, read: usize, count: usize) -> Error {
@@ -116,6 +142,8 @@ struct Header {
     big_endian: bool,
     count: usize,
     attributes: Vec<Attribute>,
+    /// Bytes of semantics after the vertices.
+    semantics: Option<u64>,
 }
 
 impl Header {
@@ -138,12 +166,19 @@ impl Header {
             return Err(bad("the file does not begin with the line `ply`"));
         }
         let (mut big_endian, mut count, mut attributes) = (None, None, Vec::new());
+        let mut semantics = None;
         let mut in_vertex = false;
         loop {
             let line = line("`end_header`")?;
             let words: Vec<&str> = line.split_ascii_whitespace().collect();
             match words[..] {
                 ["end_header"] => break,
+                ["comment", name, bytes] if name == SEMANTICS => {
+                    semantics =
+                        Some(bytes.parse().map_err(|e| {
+                            bad(format!("bytes of semantics {:?}: {e}", shown(bytes)))
+                        })?);
+                }
                 [] | ["comment" | "obj_info", ..] => {}
                 ["format", "binary_little_endian", "1.0"] => big_endian = Some(false),
                 ["format", "binary_big_endian", "1.0"] => big_endian = Some(true),
@@ -171,6 +206,7 @@ impl Header {
             big_endian: big_endian.ok_or_else(|| bad("the header has no `format`"))?,
             count: count.ok_or_else(|| bad("the header has no `element vertex`"))?,
             attributes,
+            semantics,
         })
     }
 

@@ -1,24 +1,58 @@
 //! Gaussians as a PLY, part by part, so that no whole file is in memory.
 
-use crate::scene::Gaussians;
+use crate::{
+    error::{Error, Result},
+    scene::{Gaussians, SceneId, Semantics},
+    store::write_semantics,
+};
 
+/// The comment that says how many bytes of semantics follow the vertices.
+pub(super) const SEMANTICS: &str = "segsplat_semantics_bytes";
 /// Gaussians of a part.
 const PART: usize = 16_384;
 /// Opacity 1 has no finite logit; this one reads back as 1 within f32's step.
 const OPACITY_MAX: f64 = 1.0 - 5e-8;
 
-/// Iterates over the parts of the file: the header, then vertices.
+/// What a PLY holds: Gaussians, and after them the container of their semantics.
+#[derive(Debug)]
+pub struct PlyFile {
+    gaussians: Gaussians,
+    semantics: Vec<u8>,
+}
+
+impl PlyFile {
+    /// Gaussians with their semantics, where there are some.
+    ///
+    /// # Errors
+    /// `internal` when the semantics cannot be packed.
+    pub fn new(gaussians: Gaussians, semantics: Option<&Semantics>) -> Result<Self> {
+        let mut packed = Vec::new();
+        if let Some(semantics) = semantics {
+            write_semantics(&mut packed, &SceneId::from_bytes([0; 16]), semantics)
+                .map_err(|e| Error::internal("the semantics cannot be packed").caused_by(e))?;
+        }
+        Ok(Self { gaussians, semantics: packed })
+    }
+
+    /// Size of the whole file.
+    pub fn size_bytes(&self) -> u64 {
+        let vertices = self.gaussians.len() * vertex_bytes(&self.gaussians);
+        (header(self).len() + vertices + self.semantics.len()) as u64
+    }
+}
+
+/// Iterates over the parts of the file: the header, vertices, semantics.
 #[derive(Debug)]
 pub struct PlyWriter<'a> {
-    gaussians: &'a Gaussians,
+    file: &'a PlyFile,
     /// Next Gaussian; `None` before the header.
     next: Option<usize>,
 }
 
 impl<'a> PlyWriter<'a> {
     /// A writer at the start of the file.
-    pub fn new(gaussians: &'a Gaussians) -> Self {
-        Self { gaussians, next: None }
+    pub fn new(file: &'a PlyFile) -> Self {
+        Self { file, next: None }
     }
 }
 
@@ -28,31 +62,36 @@ impl Iterator for PlyWriter<'_> {
     fn next(&mut self) -> Option<Vec<u8>> {
         let Some(from) = self.next else {
             self.next = Some(0);
-            return Some(header(self.gaussians).into_bytes());
+            return Some(header(self.file).into_bytes());
         };
-        let to = (from + PART).min(self.gaussians.len());
-        if from == to {
+        let gaussians = &self.file.gaussians;
+        if from == gaussians.len() {
+            self.next = Some(usize::MAX);
+            return Some(self.file.semantics.clone()).filter(|packed| !packed.is_empty());
+        }
+        if from > gaussians.len() {
             return None;
         }
+        let to = (from + PART).min(gaussians.len());
         self.next = Some(to);
-        let mut part = Vec::with_capacity((to - from) * vertex_bytes(self.gaussians));
+        let mut part = Vec::with_capacity((to - from) * vertex_bytes(gaussians));
         for i in from..to {
-            vertex(self.gaussians, i, &mut part);
+            vertex(gaussians, i, &mut part);
         }
         Some(part)
     }
-}
-
-/// Size of the whole file.
-pub fn ply_size_bytes(gaussians: &Gaussians) -> u64 {
-    (header(gaussians).len() + gaussians.len() * vertex_bytes(gaussians)) as u64
 }
 
 fn vertex_bytes(gaussians: &Gaussians) -> usize {
     4 * (3 + 3 + 3 * gaussians.sh_count() + 1 + 3 + 4) + 2
 }
 
-fn header(gaussians: &Gaussians) -> String {
+fn header(file: &PlyFile) -> String {
+    let gaussians = &file.gaussians;
+    let after = match file.semantics.len() {
+        0 => String::new(),
+        bytes => format!("comment {SEMANTICS} {bytes}\n"),
+    };
     let mut names: Vec<String> = ["x", "y", "z", "nx", "ny", "nz"].map(str::to_owned).to_vec();
     names.extend((0..3).map(|c| format!("f_dc_{c}")));
     names.extend((0..3 * (gaussians.sh_count() - 1)).map(|i| format!("f_rest_{i}")));
@@ -61,7 +100,7 @@ fn header(gaussians: &Gaussians) -> String {
     names.extend((0..4).map(|i| format!("rot_{i}")));
     let floats: String = names.iter().map(|name| format!("property float {name}\n")).collect();
     format!(
-        "ply\nformat binary_little_endian 1.0\ncomment SplatRenderMode: default\n\
+        "ply\nformat binary_little_endian 1.0\ncomment SplatRenderMode: default\n{after}\
          element vertex {}\n{floats}property ushort semantic_index\nend_header\n",
         gaussians.len()
     )

@@ -174,6 +174,15 @@ impl Ask {
             background: self.numbers("background").map(|v| pb::Vec3 { x: v[0], y: v[1], z: v[2] }),
             antialiased: self.get("antialiased") == Some("true"),
             near: self.number("near"),
+            preset: match self.get("preset") {
+                None => pb::Preset::Unspecified,
+                Some("default") => pb::Preset::Default,
+                Some("paper") => pb::Preset::Paper,
+                Some(other) => panic!("preset {other} is not in the proto"),
+            }
+            .into(),
+            front_photos: self.number("front_photos"),
+            magnify: self.number("magnify"),
             crop: self.numbers("crop").map(|v| {
                 let [x, y, width, height] = [0, 1, 2, 3].map(|k| v[k] as u32);
                 pb::Region { x, y, width, height }
@@ -501,7 +510,7 @@ pub(crate) fn messages(upload: &Upload, options: &Options) -> Vec<pb::CreateScen
         semantics: semantics.into(),
         bundle: options.bundle.unwrap_or_default().to_owned(),
         max_views: None,
-        density: pb::Density::Unspecified.into(),
+        method: None,
         wait_ms: options.wait_ms,
         idempotency_key: options.idempotency_key.clone().unwrap_or_default(),
     };

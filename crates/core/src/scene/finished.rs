@@ -19,7 +19,7 @@ pub struct PhotoHash {
 }
 
 /// The sources of a scene: all that is needed to make it again.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Provenance {
     /// Files of the upload: photos, or the archive, and the camera description.
     pub files: Vec<PhotoHash>,
@@ -72,7 +72,9 @@ impl Scene {
     pub fn size_bytes(&self) -> u64 {
         let semantics = self.semantics.as_ref().map_or(0, |semantics| {
             let photos: usize = semantics.photos.iter().map(|map| map.index.len()).sum();
-            4 * semantics.bank.rows.len() + 2 * (semantics.index.len() + photos)
+            4 * semantics.bank.rows.len()
+                + 2 * (semantics.index.len() + photos)
+                + 12 * semantics.masks.len()
         });
         self.gaussians.size_bytes() + semantics as u64
     }

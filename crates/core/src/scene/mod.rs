@@ -10,6 +10,7 @@ mod finished;
 mod gaussians;
 mod geometry;
 mod id;
+mod method;
 mod photo;
 mod report;
 mod semantics;
@@ -26,15 +27,16 @@ pub use finished::{PhotoHash, Provenance, Scene, SceneMeta};
 pub use gaussians::{BLUR_PX2, Gaussians, RawGaussians, SH_C0, SanitizeReport, SourcePixel};
 pub use geometry::ViewGaussians;
 pub use id::{SCENE_ID_CHARS, SceneId};
+pub use method::{MaskLevel, Method, Preset, SceneOptions, ScoringMethod};
 pub use photo::{Crop, Photo, PosedPhoto};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{
-    Bank, IndexMap, MaskInfo, MaskLogits, PAPER_PHRASES, PAPER_TAU, PhotoMasks, ScoringProfile,
-    Semantics, SemanticsReport, TextEmbedding,
+    Bank, BankMask, IndexMap, MaskInfo, MaskLogits, PhotoMasks, Semantics, SemanticsReport,
+    TextEmbedding,
 };
 pub use stage::{Stage, Watch, unless_cancelled};
 pub use status::{
-    Density, Event, SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, SemanticsMode,
+    Density, Event, SceneCamera, SceneError, SceneState, SceneStatus, SemanticsMode,
     SemanticsState, SemanticsStatus,
 };
 pub use upload::{Upload, UploadCameras, UploadFile};

@@ -3,6 +3,8 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use crate::scene::Method;
+
 /// What looks wrong with a capture; the scene was made all the same.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
@@ -66,6 +68,10 @@ pub struct StageTime {
 pub struct HealthReport {
     /// Photos given.
     pub photos: u32,
+    /// How it was made.
+    #[serde(default)]
+    #[schema(required = true)]
+    pub method: Method,
     /// Photos used.
     pub views_used: u32,
     /// Gaussians kept.

@@ -6,7 +6,7 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use crate::scene::StageTime;
+use crate::scene::{Method, StageTime};
 
 /// The entry of each cell of a grid over a whole photo; cells need not be square.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -51,6 +51,9 @@ pub struct PhotoMasks {
     pub map: IndexMap,
     /// What the network said of each.
     pub masks: Vec<MaskInfo>,
+    /// Cells of each mask before smaller ones were laid on it, as runs `[first, count]` over the
+    /// map; empty where crops are cut after that.
+    pub wholes: Vec<Vec<[u32; 2]>>,
 }
 
 /// Masks of a batch of points of a photo, as logits: over 0 is inside.
@@ -105,22 +108,6 @@ impl Bank {
     }
 }
 
-/// How what the paper leaves open is decided.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum ScoringProfile {
-    /// Rows of length 1, a coverage floor, phrases and tau of the bundle.
-    #[default]
-    Default,
-    /// Rows as they are, no coverage floor, three phrases and tau of the paper.
-    Paper,
-}
-
-/// What [`ScoringProfile::Paper`] compares texts with.
-pub const PAPER_PHRASES: [&str; 3] = ["object", "things", "stuff"];
-/// How sharply [`ScoringProfile::Paper`] compares.
-pub const PAPER_TAU: f32 = 10.0;
-
 /// Counts and times of making the semantics.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct SemanticsReport {
@@ -132,12 +119,25 @@ pub struct SemanticsReport {
     pub labelled: u64,
     /// sha256 of the bundle's manifest, hex.
     pub bundle_sha256: String,
-    /// Scoring profile it was made under.
-    pub profile: ScoringProfile,
+    /// How they were made.
+    #[serde(default)]
+    #[schema(required = true)]
+    pub method: Method,
     /// Time of each stage: `masks`, `embed`, `bank`, `assign`.
     pub stages: Vec<StageTime>,
     /// Execution provider of the networks.
     pub execution_provider: String,
+}
+
+/// A mask and the row of the bank that its embedding went into.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BankMask {
+    /// Index of the photo.
+    pub photo: u32,
+    /// Number of the mask in its photo, from 0, the largest first.
+    pub mask: u32,
+    /// Entry of the bank, from 1; 0 where the mask has no embedding.
+    pub entry: u16,
 }
 
 /// The semantics of a scene.
@@ -149,6 +149,21 @@ pub struct Semantics {
     pub index: Vec<u16>,
     /// Index maps of the photos, in their order.
     pub photos: Vec<IndexMap>,
+    /// All masks, photo by photo; empty where an older program made them.
+    pub masks: Vec<BankMask>,
     /// How it went.
     pub report: SemanticsReport,
+}
+
+impl Semantics {
+    /// `[M]` masks of each row of the bank.
+    pub fn row_sizes(&self) -> Vec<u32> {
+        let mut sizes = vec![0; self.bank.len()];
+        for mask in &self.masks {
+            if let Some(size) = sizes.get_mut(usize::from(mask.entry).wrapping_sub(1)) {
+                *size += 1;
+            }
+        }
+        sizes
+    }
 }

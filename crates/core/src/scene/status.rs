@@ -1,7 +1,7 @@
 //! The status of a scene, as the store keeps it and as callers and watchers see it.
 
 use serde::{Deserialize, Serialize};
-use utoipa::{IntoParams, ToSchema};
+use utoipa::ToSchema;
 
 use crate::{
     error::{Error, ErrorCode, TABLE},
@@ -31,23 +31,6 @@ pub enum Density {
     Thinned,
     /// One a pixel.
     Full,
-}
-
-/// Options of a scene, kept with it.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize, IntoParams)]
-#[serde(default, deny_unknown_fields)]
-#[into_params(parameter_in = Query)]
-pub struct SceneOptions {
-    /// Views the network takes at once; what the bundle says by default.
-    pub max_views: Option<usize>,
-    /// When a scene's semantics are made: `lazy` (default) with the first text, `eager` as soon as
-    /// it can be viewed, `off` never.
-    #[param(inline)]
-    pub semantics: SemanticsMode,
-    /// Gaussians kept: `thinned` (default), one for up to 16 neighbours where the photos are flat,
-    /// or `full`, one a pixel.
-    #[param(inline)]
-    pub density: Density,
 }
 
 /// Where a scene stands.

@@ -11,7 +11,7 @@ use segsplat_core::scene::{
 use segsplat_render::{
     Background, Frame, Kinds, Labels, RenderRequest, Renderer, Samples,
     oracle::{self, OraclePixel},
-    plan::{served, sources},
+    plan::{ViewMethod, served, sources},
 };
 use segsplat_testing::{
     compare::{Tolerance, compare, oracle_samples, samples},
@@ -68,7 +68,7 @@ pub(crate) fn scene(photos: u16, opacity: [f32; 2], coarse: f64) -> Scene {
 
 /// Photos in front of and behind a view.
 fn layers(scene: &Scene, x: f64) -> [Vec<usize>; 2] {
-    let rows = sources(scene, &at(x));
+    let rows = sources(scene, &at(x), ViewMethod::from(&scene.meta.report.method));
     let of = |behind| (0..rows.len()).filter(|&i| rows[i].behind == behind).collect();
     [of(false), of(true)]
 }

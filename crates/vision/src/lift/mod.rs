@@ -53,7 +53,11 @@ pub struct Lifted {
     pub median_depth: f64,
 }
 
-/// Lifts, fuses and thins. `cameras` are all cameras of the scene; their mean centre is the origin.
+/// Lifts, drops what adds nothing where `prune` is set, fuses and thins. `cameras` are all cameras
+/// of the scene; their mean centre is the origin.
+///
+/// Without `prune` every pixel of each view keeps its Gaussian. An opacity under 1/255 becomes
+/// 1/255, which is blended at the very centre alone.
 ///
 /// # Errors
 /// `internal` when arrays disagree in length or views in SH degree; `cancelled` once `cancel` is
@@ -61,6 +65,7 @@ pub struct Lifted {
 pub fn lift(
     views: Vec<ViewGaussians>,
     cameras: &[Camera],
+    prune: bool,
     fusing: &FuseOptions,
     thinning: Option<&ThinOptions>,
     cancel: &AtomicBool,
@@ -71,9 +76,13 @@ pub fn lift(
     }
     let mut counts = Counts::default();
     let mut views = best_of_each_photo(views, &mut counts);
+    if !prune {
+        let opacities = views.iter_mut().flat_map(|view| &mut view.opacities);
+        opacities.for_each(|opacity| *opacity = opacity.max(Gaussians::OPACITY_MIN));
+    }
     let judged = |view: &ViewGaussians| {
         unless_cancelled(cancel)?;
-        Ok(candidates(view))
+        Ok(if prune { candidates(view) } else { (vec![true; view.len()], [0; 3]) })
     };
     let judged: Vec<(Vec<bool>, [u64; 3])> = views.par_iter().map(judged).collect::<Result<_>>()?;
     let mut candidate = Vec::with_capacity(views.len());

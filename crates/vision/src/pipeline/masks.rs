@@ -12,7 +12,7 @@ use crate::{
     center_of,
     error::Result,
     models::{MaskNetwork, MasksManifest, PhotoEmbedding},
-    scene::{Gaussians, MaskLogits, Photo, PhotoMasks, PosedPhoto, SourcePixel},
+    scene::{Gaussians, MaskLogits, Method, Photo, PhotoMasks, PosedPhoto, SourcePixel},
     seen_at,
     segment::{self, PromptDecoder, Seed, Settings},
 };
@@ -55,10 +55,10 @@ impl PromptDecoder for SeenPhoto<'_> {
     }
 }
 
-/// The thresholds of the bundle, with every saving on.
+/// The thresholds of the bundle, with the savings, level and filters of the method.
 #[must_use]
-pub fn settings(manifest: &MasksManifest) -> Settings {
-    Settings {
+pub fn settings(manifest: &MasksManifest, method: &Method) -> Settings {
+    let settings = Settings {
         points_per_side: manifest.points_per_side,
         pred_iou_thresh: manifest.pred_iou_thresh,
         stability_score_thresh: manifest.stability_score_thresh,
@@ -66,7 +66,16 @@ pub fn settings(manifest: &MasksManifest) -> Settings {
         box_nms_thresh: manifest.box_nms_thresh,
         mask_nms_thresh: manifest.mask_nms_thresh,
         min_area: manifest.min_area,
+        full_resolution: method.full_resolution,
+        skip_covered: method.skip_covered,
+        use_seeds: method.seeds,
+        level: method.mask_level,
+        keep_wholes: method.crop_whole,
         ..Settings::default()
+    };
+    match method.mask_filters {
+        true => settings,
+        false => Settings { mask_nms_thresh: 1.0, min_area: 0.0, max_area: 1.0, ..settings },
     }
 }
 

@@ -185,6 +185,8 @@ pub fn reconstruct(
     let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
     let manifest = pipeline.geometry.manifest();
     let views_max = views_max(options, manifest.views_min, manifest.views_max)?;
+    let method = options.method();
+    method.check()?;
 
     let (capture, sets) = stages.run(Stage::Capture, || {
         pipeline.workers.install(|| {
@@ -210,14 +212,22 @@ pub fn reconstruct(
     })?;
     let (lifted, backdrop) = stages.run(Stage::Lift, || {
         pipeline.workers.install(|| {
-            let thinning = match options.density {
+            let thinning = match method.density {
                 Density::Thinned => Some(lift::ThinOptions::default()),
                 Density::Full => None,
             };
-            let fusing = lift::FuseOptions::default();
+            let layers = match method.fuse_layers {
+                0 => usize::MAX,
+                layers => layers as usize,
+            };
+            let fusing = lift::FuseOptions { layers, ..lift::FuseOptions::default() };
+            let backdrop = || match method.backdrop {
+                true => lift::backdrop(photos),
+                false => Backdrop::default(),
+            };
             let (lifted, backdrop) = rayon::join(
-                || lift::lift(views, &cameras, &fusing, thinning.as_ref(), cancel),
-                || lift::backdrop(photos),
+                || lift::lift(views, &cameras, method.prune, &fusing, thinning.as_ref(), cancel),
+                backdrop,
             );
             Ok((lifted?, backdrop))
         })
@@ -235,6 +245,7 @@ pub fn reconstruct(
     let focal = |lens: &Option<Intrinsics>| lens.map_or(0.0, |lens| lens.fx.min(lens.fy));
     let report = HealthReport {
         photos: count(photos.len()),
+        method,
         views_used: count(used(&sets, photos.len())),
         gaussians: lifted.gaussians.len() as u64,
         dropped: lifted.dropped,

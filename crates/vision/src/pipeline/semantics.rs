@@ -2,7 +2,7 @@
 //!
 //! [`understand`] runs them with the pipeline's networks, which are opened at the first call;
 //! [`understand_with`] with whatever gives masks and embeddings. Every Gaussian takes the entry of
-//! the pixel that made it. [`SemanticsOptions`] says whether other photos vote.
+//! the pixel that made it. [`Method`] says whether other photos vote.
 
 use std::sync::Arc;
 
@@ -14,32 +14,11 @@ use crate::{
     error::{Error, ErrorCode, Result},
     models::{ImageText, MaskNetwork, NetworkOptions},
     scene::{
-        Bank, Crop, Gaussians, IndexMap, PAPER_PHRASES, PAPER_TAU, PhotoMasks, PosedPhoto,
-        SceneCamera, ScoringProfile, Semantics, SemanticsReport, Stage, Watch, unless_cancelled,
+        Bank, BankMask, Crop, Gaussians, IndexMap, Method, PhotoMasks, PosedPhoto, Preset,
+        SceneCamera, ScoringMethod, Semantics, SemanticsReport, Stage, Watch, unless_cancelled,
     },
     semantics::{self, Clusters, Cutter, Scoring, Views},
 };
-
-/// How alike two rows must be to become one, where two photos show them on one surface.
-const MERGE_COSINE_MIN: f64 = 0.7;
-
-/// What may be done beyond the paper.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct SemanticsOptions {
-    /// Ask a photo first where masks of earlier photos reappear.
-    pub seeds: bool,
-    /// Let all photos that show a Gaussian vote for its entry.
-    pub votes: bool,
-    /// Join entries that are one object seen from two sides, where their rows are at least this
-    /// alike (cosine); `None` joins none.
-    pub merge: Option<f64>,
-}
-
-impl Default for SemanticsOptions {
-    fn default() -> Self {
-        Self { seeds: true, votes: true, merge: Some(MERGE_COSINE_MIN) }
-    }
-}
 
 /// Gives the masks of each photo. Its argument takes the fraction that is done, 0..1.
 pub type MasksOfPhotos<'a> = dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> + Sync + 'a;
@@ -131,21 +110,25 @@ impl Pipeline {
         opened(&self.lazy.image_text, "image and text towers", open)
     }
 
-    /// How texts are scored under a profile: the bundle's phrases and sharpness, or the paper's.
+    /// How texts are scored under a preset, with the bundle's canonical texts for the default.
     ///
     /// # Errors
-    /// `model_unavailable` when the bundle has no text tower, `internal` when it fails.
-    pub fn scoring(&self, profile: ScoringProfile) -> Result<Scoring> {
+    /// `model_unavailable` when the bundle has no text tower.
+    pub fn scoring_method(&self, preset: Preset) -> Result<ScoringMethod> {
         let towers = self.image_text()?;
         let manifest = towers.manifest();
-        let (canon, tau) = match profile {
-            ScoringProfile::Default => (manifest.canon.clone(), f64::from(manifest.tau)),
-            ScoringProfile::Paper => {
-                (PAPER_PHRASES.map(str::to_owned).to_vec(), f64::from(PAPER_TAU))
-            }
-        };
-        let rows = towers.embed_texts(&canon)?.into_iter().map(|text| text.row).collect();
-        Scoring::new(profile, rows, tau, f64::from(manifest.coverage_floor))
+        let (tau, floor) = (f64::from(manifest.tau), f64::from(manifest.coverage_floor));
+        Ok(ScoringMethod::of(preset, manifest.canon.clone(), tau, floor))
+    }
+
+    /// The same, ready to score.
+    ///
+    /// # Errors
+    /// `model_unavailable` when the bundle has no text tower, `internal` when it fails,
+    /// `invalid_request` when a number is out of its bounds.
+    pub fn scoring(&self, method: &ScoringMethod) -> Result<Scoring> {
+        let rows = self.image_text()?.embed_texts(&method.canon)?;
+        Scoring::new(method, rows.into_iter().map(|text| text.row).collect())
     }
 }
 
@@ -157,13 +140,13 @@ impl Pipeline {
 pub fn understand(
     pipeline: &Pipeline,
     input: &SemanticsInput<'_>,
-    options: &SemanticsOptions,
+    method: &Method,
     watch: Watch<'_>,
 ) -> Result<Semantics> {
     check_input(input)?;
     let (network, towers) = (pipeline.masks()?, pipeline.image_text()?);
-    let settings = masks::settings(network.manifest());
-    let seeds = options.seeds.then_some(input.gaussians);
+    let settings = masks::settings(network.manifest(), method);
+    let seeds = method.seeds.then_some(input.gaussians);
     let image = &towers.manifest().image;
     let tools = SemanticsTools {
         masks: &|progress| {
@@ -171,12 +154,12 @@ pub fn understand(
         },
         embed: &|crops| towers.embed_images(crops),
         dim: towers.manifest().dim,
-        crop_margin: f64::from(image.crop_margin),
+        crop_margin: if method.crop_margin { f64::from(image.crop_margin) } else { 0.0 },
         batch: image.batch,
     };
     // Not on a thread of the pool: one that waits for a network would be missing there, and one
     // that waits for its own tasks might begin another job.
-    let mut semantics = understand_with(&tools, input, options, watch)?;
+    let mut semantics = understand_with(&tools, input, method, watch)?;
     semantics.report.bundle_sha256 = pipeline.bundle.sha256().to_owned();
     semantics.report.execution_provider = towers.provider().name().to_owned();
     Ok(semantics)
@@ -190,7 +173,7 @@ pub fn understand(
 pub fn understand_with(
     tools: &SemanticsTools<'_>,
     input: &SemanticsInput<'_>,
-    options: &SemanticsOptions,
+    method: &Method,
     watch: Watch<'_>,
 ) -> Result<Semantics> {
     check_input(input)?;
@@ -207,19 +190,23 @@ pub fn understand_with(
     }
     let embedded = stages.run(Stage::Embed, || embed(tools, input.photos, &masks, watch))?;
     let mut labels = stages.run(Stage::Bank, || {
-        let clusters = semantics::bank(&embedded.rows, tools.dim, input.photos.len())?;
+        let wanted = match method.bank_rows as usize {
+            0 => semantics::rows_wanted(embedded.of.len(), input.photos.len(), method.lambda),
+            rows => rows,
+        };
+        let clusters = semantics::bank(&embedded.rows, tools.dim, wanted)?;
         Ok(label(&masks, &embedded.of, clusters))
     })?;
-    let index = stages.run(Stage::Assign, || Ok(assign(&mut labels, input, options)))?;
+    let index = stages.run(Stage::Assign, || Ok(assign(&mut labels, input, method)))?;
     let report = SemanticsReport {
         masks: masks.iter().map(|of| count(of.masks.len())).collect(),
         bank_size: count(labels.bank.len()),
         labelled: index.iter().filter(|m| **m > 0).count() as u64,
-        profile: ScoringProfile::Default,
+        method: method.clone(),
         stages: stages.times,
         ..SemanticsReport::default()
     };
-    Ok(Semantics { bank: labels.bank, index, photos: labels.maps, report })
+    Ok(Semantics { bank: labels.bank, index, photos: labels.maps, masks: labels.masks, report })
 }
 
 /// Refuses a scene whose Gaussians cannot be found in its photos.
@@ -292,44 +279,57 @@ fn embed(
     Ok(found)
 }
 
-/// The bank, what the photos say, and how many masks each row has.
+/// The bank, what the photos say, and the row of each mask.
 #[derive(Debug)]
 struct Labels {
     bank: Bank,
-    counts: Vec<u32>,
     maps: Vec<IndexMap>,
+    masks: Vec<BankMask>,
 }
 
 /// Replaces the numbers of the masks by entries.
 fn label(masks: &[PhotoMasks], of: &[[usize; 2]], clusters: Clusters) -> Labels {
     let mut becomes: Vec<Vec<u16>> = masks.iter().map(|m| vec![0; m.masks.len()]).collect();
-    let mut counts = vec![0_u32; clusters.bank.len()];
     for ([photo, mask], entry) in of.iter().zip(&clusters.entries) {
         becomes[*photo][*mask] = *entry;
-        counts[usize::from(*entry) - 1] += 1;
     }
     let maps = masks
         .iter()
         .zip(&becomes)
         .map(|(m, becomes)| semantics::relabel(&m.map, becomes))
         .collect();
-    Labels { bank: clusters.bank, counts, maps }
+    let mask = |photo: usize, mask: usize, entry: u16| BankMask {
+        photo: count(photo),
+        mask: count(mask),
+        entry,
+    };
+    let of_photo = |(photo, entries): (usize, &Vec<u16>)| -> Vec<BankMask> {
+        entries.iter().enumerate().map(|(k, entry)| mask(photo, k, *entry)).collect()
+    };
+    let masks = becomes.iter().enumerate().flat_map(of_photo).collect();
+    Labels { bank: clusters.bank, maps, masks }
 }
 
-/// `[N]` entry of each Gaussian. With `merge` entries of one object are joined first.
-fn assign(labels: &mut Labels, input: &SemanticsInput<'_>, options: &SemanticsOptions) -> Vec<u16> {
+/// `[N]` entry of each Gaussian. With a `merge_cosine`, entries of one object are joined first.
+fn assign(labels: &mut Labels, input: &SemanticsInput<'_>, method: &Method) -> Vec<u16> {
     let mut own = semantics::from_source(input.gaussians.source(), input.cameras, &labels.maps);
-    if !options.votes && options.merge.is_none() {
+    let merge = Some(method.merge_cosine).filter(|cosine| *cosine > 0.0);
+    if !method.votes && merge.is_none() {
         return own;
     }
     let views = Views::new(input.gaussians, input.cameras);
-    if let Some(cosine_min) = options.merge {
+    if let Some(cosine_min) = merge {
         let group = views.same_things(&own, &labels.maps, &labels.bank, cosine_min);
-        let (bank, becomes) = semantics::merge(&labels.bank, &labels.counts, &group);
+        let mut counts = vec![0_u32; labels.bank.len()];
+        for mask in labels.masks.iter().filter(|mask| mask.entry > 0) {
+            counts[usize::from(mask.entry) - 1] += 1;
+        }
+        let (bank, becomes) = semantics::merge(&labels.bank, &counts, &group);
         let renamed = |map: &IndexMap| semantics::relabel(map, &becomes[1..]);
         labels.maps = labels.maps.iter().map(renamed).collect();
+        labels.masks.iter_mut().for_each(|mask| mask.entry = becomes[usize::from(mask.entry)]);
         own.iter_mut().for_each(|m| *m = becomes[usize::from(*m)]);
         labels.bank = bank;
     }
-    if options.votes { views.vote(&own, &labels.maps) } else { own }
+    if method.votes { views.vote(&own, &labels.maps) } else { own }
 }

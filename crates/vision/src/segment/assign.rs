@@ -38,17 +38,22 @@ pub(super) fn one_a_pixel(
     };
     let fine: Vec<(usize, Bitset)> = wholes.par_iter().map(fine).collect();
     let mut kept: Vec<(usize, Bitset)> = Vec::new();
+    let mut runs: Vec<Vec<[u32; 2]>> = Vec::new();
     for (at, mut mask) in fine {
+        let before = settings.keep_wholes.then(|| mask.runs());
         mask.subtract(&taken);
         let left = mask.count();
         if left > 0 && f64::from(left) >= settings.min_area * cells as f64 {
             taken.add(&mask);
             kept.push((at, mask));
+            runs.extend(before);
         }
     }
     kept.reverse();
     kept.truncate(MASKS_MAX);
-    let mut map = PhotoMasks::default();
+    runs.reverse();
+    runs.truncate(MASKS_MAX);
+    let mut map = PhotoMasks { wholes: runs, ..PhotoMasks::default() };
     let mut index = vec![0_u16; cells];
     for (k, (at, mask)) in (1..).zip(&kept) {
         mask.cells().for_each(|cell| index[cell] = k);

@@ -75,6 +75,21 @@ impl Bitset {
         })
     }
 
+    /// The cells of the set as runs `[first, count]`, ascending.
+    #[must_use]
+    pub fn runs(&self) -> Vec<[u32; 2]> {
+        let mut runs: Vec<[u32; 2]> = Vec::new();
+        for cell in self.cells() {
+            #[expect(clippy::cast_possible_truncation, reason = "a grid has under 2^32 cells")]
+            let cell = cell as u32;
+            match runs.last_mut() {
+                Some([first, count]) if *first + *count == cell => *count += 1,
+                _ => runs.push([cell, 1]),
+            }
+        }
+        runs
+    }
+
     /// The smallest box around the set in a grid of this width; all 0 if the set is empty.
     #[must_use]
     pub fn bounds(&self, width: usize) -> Box2 {

@@ -69,8 +69,8 @@ impl MaskFilter {
         self.map
     }
 
-    /// The masks that pass, in the order of points and levels; of each point only the most whole
-    /// one where `wholes` is set.
+    /// The masks that pass, in the order of points and levels; of each point only one
+    /// where `wholes` is set, by [`Settings::level`].
     pub(super) fn pass(
         &self,
         decoded: &MaskLogits,
@@ -99,10 +99,10 @@ impl MaskFilter {
                 let logits = &decoded.logits[at * cells..(at + 1) * cells];
                 self.passed(logits, decoded.predicted_iou[at], level, *point, wholes)
             };
-            if wholes {
-                (0..self.levels).rev().find_map(mask).into_iter().collect()
-            } else {
-                (0..self.levels).filter_map(mask).collect()
+            match self.settings.level.place(self.levels) {
+                _ if !wholes => (0..self.levels).filter_map(mask).collect(),
+                None => (0..self.levels).rev().find_map(mask).into_iter().collect(),
+                Some(level) => mask(level).into_iter().collect(),
             }
         };
         let each: Vec<Vec<Proposal>> = points.par_iter().enumerate().map(of_point).collect();

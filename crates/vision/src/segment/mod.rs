@@ -20,7 +20,7 @@ pub use bitset::{Bitset, Box2};
 use self::{filter::MaskFilter, photo_grid::PhotoGrid, prompts::Prompts};
 use crate::{
     error::Result,
-    scene::{MaskLogits, Photo, PhotoMasks, unless_cancelled},
+    scene::{MaskLevel, MaskLogits, Photo, PhotoMasks, unless_cancelled},
 };
 
 /// A photo and the network that gives masks for its points.
@@ -75,6 +75,10 @@ pub struct Settings {
     pub skip_covered: bool,
     /// Decode the seeds first.
     pub use_seeds: bool,
+    /// Which mask of a prompt [`everything`] takes.
+    pub level: MaskLevel,
+    /// Keep the cells of each mask from before smaller ones are laid on it.
+    pub keep_wholes: bool,
 }
 
 impl Default for Settings {
@@ -93,6 +97,8 @@ impl Default for Settings {
             full_resolution: false,
             skip_covered: true,
             use_seeds: true,
+            level: MaskLevel::Widest,
+            keep_wholes: false,
         }
     }
 }
@@ -162,7 +168,7 @@ pub fn proposals(
     Ok(passed(decoder, photo, settings, seeds, cancel, false)?.0)
 }
 
-/// What is in a photo: whole objects, at most one a pixel.
+/// What is in a photo: whole objects (or those of [`Settings::level`]), at most one a pixel.
 ///
 /// # Errors
 /// `cancelled`; `internal` when the decoder fails or its answer has no sense.
@@ -178,7 +184,8 @@ pub fn everything(
     Ok(masks.unwrap_or_default())
 }
 
-/// The masks that pass the filters and NMS. With `wholes` only the most whole mask of each point.
+/// The masks that pass the filters and NMS. With `wholes` one mask of each point,
+/// by [`Settings::level`].
 fn passed(
     decoder: &dyn PromptDecoder,
     photo: &Photo,

@@ -31,19 +31,23 @@ pub struct Clusters {
     pub entries: Vec<u16>,
 }
 
-/// Number of rows for this many embeddings and photos: 1.2 times the mean number of masks of a
+/// Number of rows for this many embeddings and photos: `lambda` times the mean number of masks of a
 /// photo, rounded up.
 #[must_use]
-pub fn rows_wanted(features: usize, views: usize) -> usize {
-    (6 * features).div_ceil(5 * views.max(1)).min(BANK_ROWS_MAX)
+pub fn rows_wanted(features: usize, views: usize, lambda: f64) -> usize {
+    let rows = lambda * features as f64 / views.max(1) as f64;
+    // 1.2 has no exact f64: what rounding puts over a whole number is no further row.
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates")]
+    let rows = (rows - 1e-9 * rows.max(1.0)).ceil() as usize;
+    rows.clamp(usize::from(features > 0), BANK_ROWS_MAX)
 }
 
-/// Clusters `[N * dim]` embeddings of `views` photos into [`rows_wanted`] rows, at most one for
-/// each distinct embedding. Without embeddings the bank is empty.
+/// Clusters `[N * dim]` embeddings into `wanted` rows, at most one for each distinct embedding.
+/// Without embeddings the bank is empty.
 ///
 /// # Errors
 /// `internal` when the length is not a multiple of `dim` or a number is not finite.
-pub fn bank(features: &[f32], dim: usize, views: usize) -> Result<Clusters> {
+pub fn bank(features: &[f32], dim: usize, wanted: usize) -> Result<Clusters> {
     if features.is_empty() {
         return Ok(Clusters { bank: Bank { dim, rows: Vec::new() }, entries: Vec::new() });
     }
@@ -57,7 +61,7 @@ pub fn bank(features: &[f32], dim: usize, views: usize) -> Result<Clusters> {
         return Err(Error::internal(format!("bank: feature {} is not finite", at / dim)));
     }
     let rows: Vec<&[f32]> = features.chunks_exact(dim).collect();
-    let wanted = rows_wanted(rows.len(), views).min(distinct(&rows)).max(1);
+    let wanted = wanted.min(distinct(&rows)).max(1);
     let mut centres = seeds(&rows, wanted);
     let mut nearest = assign(&rows, &centres);
     for _ in 0..ROUNDS_MAX {

@@ -1,4 +1,7 @@
 //! Cuts a mask out of its photo: its box with a margin, as a square, black outside the mask.
+//!
+//! Where the masks come with their whole cells ([`PhotoMasks::wholes`]), a crop shows all of its
+//! mask, also what smaller masks cover in the index map.
 
 use crate::scene::{Crop, Photo, PhotoMasks};
 
@@ -21,6 +24,17 @@ pub struct Cutter<'a> {
     bounds: Vec<Option<Bounds>>,
 }
 
+/// Adds a pixel; rows come in order.
+fn grow(bounds: &mut Option<Bounds>, x: u32, y: u32) {
+    match bounds {
+        None => *bounds = Some(Bounds { x: [x, x], y: [y, y] }),
+        Some(b) => {
+            b.x = [b.x[0].min(x), b.x[1].max(x)];
+            b.y[1] = y;
+        }
+    }
+}
+
 /// The cell of each pixel's centre along one axis.
 fn cells_of(pixels: u32, cells: u32) -> Vec<usize> {
     let (pixels_u64, cells) = (u64::from(pixels.max(1)), u64::from(cells));
@@ -39,22 +53,52 @@ impl<'a> Cutter<'a> {
             .into_iter()
             .map(|row| row * map.width as usize)
             .collect();
-        let mut bounds: Vec<Option<Bounds>> = vec![None; masks.masks.len()];
-        for (y, row) in (0..).zip(&rows) {
-            for (x, column) in (0..).zip(&columns) {
-                let mask = map.index.get(row + column).copied().unwrap_or(0);
+        let mut cutter = Self { photo, masks, columns, rows, bounds: Vec::new() };
+        cutter.bounds = match masks.wholes.len() == masks.masks.len() {
+            true => (0..masks.masks.len()).map(|k| cutter.bounds_of_whole(k)).collect(),
+            false => cutter.bounds_in_map(),
+        };
+        cutter
+    }
+
+    /// The boxes of all masks as they lie in the index map.
+    fn bounds_in_map(&self) -> Vec<Option<Bounds>> {
+        let mut bounds: Vec<Option<Bounds>> = vec![None; self.masks.masks.len()];
+        for (y, row) in (0..).zip(&self.rows) {
+            for (x, column) in (0..).zip(&self.columns) {
+                let mask = self.masks.map.index.get(row + column).copied().unwrap_or(0);
                 let Some(of) = usize::from(mask).checked_sub(1) else { continue };
                 let Some(found) = bounds.get_mut(of) else { continue };
-                match found {
-                    None => *found = Some(Bounds { x: [x, x], y: [y, y] }),
-                    Some(b) => {
-                        b.x = [b.x[0].min(x), b.x[1].max(x)];
-                        b.y[1] = y;
-                    }
+                grow(found, x, y);
+            }
+        }
+        bounds
+    }
+
+    /// The box of a whole mask.
+    fn bounds_of_whole(&self, k: usize) -> Option<Bounds> {
+        let whole = self.whole(k)?;
+        let mut bounds = None;
+        for (y, row) in (0..).zip(&self.rows) {
+            for (x, column) in (0..).zip(&self.columns) {
+                if whole.get(row + column).copied().unwrap_or(false) {
+                    grow(&mut bounds, x, y);
                 }
             }
         }
-        Self { photo, masks, columns, rows, bounds }
+        bounds
+    }
+
+    /// Whether each cell of the map is in mask `k` before smaller masks; `None` if that is unknown.
+    fn whole(&self, k: usize) -> Option<Vec<bool>> {
+        let mut cells = vec![false; self.masks.map.index.len()];
+        for [first, count] in self.masks.wholes.get(k)? {
+            let run = *first as usize..(*first as usize).saturating_add(*count as usize);
+            if let Some(run) = cells.get_mut(run) {
+                run.fill(true);
+            }
+        }
+        Some(cells)
     }
 
     /// The crop of mask `k`, counted from 0, with a margin of `margin` times the longer side of its
@@ -75,15 +119,18 @@ impl<'a> Cutter<'a> {
             |[first, last]: [u32; 2]| i64::from(first) - i64::from(side - (last - first + 1)) / 2;
         let (left, top) = (start(bounds.x), start(bounds.y));
         let mut rgb = vec![0; side as usize * side as usize * 3];
-        let wanted = k + 1;
+        let (wanted, whole) = (k + 1, self.whole(k));
+        let inside = |cell: usize| match &whole {
+            Some(whole) => whole.get(cell).copied().unwrap_or(false),
+            None => usize::from(self.masks.map.index.get(cell).copied().unwrap_or(0)) == wanted,
+        };
         for y in bounds.y[0]..=bounds.y[1] {
             let into = (i64::from(y) - top) as usize * side as usize;
             for x in bounds.x[0]..=bounds.x[1] {
                 let cell = self.rows[y as usize] + self.columns[x as usize];
-                let mask = self.masks.map.index.get(cell).copied().unwrap_or(0);
                 let from = y as usize * self.photo.width as usize + x as usize;
                 let sourced = self.photo.valid.as_ref().is_none_or(|valid| valid[from]);
-                if usize::from(mask) == wanted && sourced {
+                if inside(cell) && sourced {
                     let to = (into + (i64::from(x) - left) as usize) * 3;
                     rgb[to..to + 3].copy_from_slice(&self.photo.rgb[from * 3..from * 3 + 3]);
                 }

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use super::{dot, norm, unit_rows};
 use crate::{
     error::{Error, Result},
-    scene::{Bank, PixelWeights, ScoringProfile},
+    scene::{Bank, PixelWeights, ScoringMethod},
 };
 
 /// Phrases in one blend of four numbers; the fourth number is the coverage.
@@ -20,44 +20,39 @@ const GROUP: usize = 3;
 /// Pixels of a task.
 const PIXELS_EACH: usize = 4096;
 
-/// The phrases that a text is compared with, and tau. The bundle and the profile choose them.
+/// A [`ScoringMethod`] with the embeddings of its canonical texts.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scoring {
-    profile: ScoringProfile,
+    unit_rows: bool,
     canon: Vec<Vec<f32>>,
     tau: f64,
     coverage_floor: f64,
+    /// Least difference of cosines that is selected: the relevancy there is the cut.
+    margin: f64,
 }
 
 impl Scoring {
-    /// From phrases as embeddings of length 1, tau, and the coverage floor (the profile `paper`
-    /// ignores it).
+    /// From the embeddings of the method's canonical texts, each of length 1.
     ///
     /// # Errors
-    /// `internal` when there is no phrase, lengths differ, or a number is out of range.
-    pub fn new(
-        profile: ScoringProfile,
-        canon: Vec<Vec<f32>>,
-        tau: f64,
-        coverage_floor: f64,
-    ) -> Result<Self> {
+    /// `invalid_request` when a number of the method is out of its bounds; `internal` when the
+    /// embeddings are not those of its texts, differ in length, or have a number that is not
+    /// finite.
+    pub fn new(method: &ScoringMethod, canon: Vec<Vec<f32>>) -> Result<Self> {
+        method.check()?;
         let dim = canon.first().map_or(0, Vec::len);
-        if dim == 0 || canon.iter().any(|c| c.len() != dim || c.iter().any(|v| !v.is_finite())) {
+        let fit = canon.iter().all(|c| c.len() == dim && c.iter().all(|v| v.is_finite()));
+        if dim == 0 || canon.len() != method.canon.len() || !fit {
             return Err(Error::internal(format!(
-                "scoring: {} canonical phrases, not all of {dim} finite numbers",
-                canon.len()
+                "scoring: {} embeddings, not all of {dim} finite numbers, for {} canonical texts",
+                canon.len(),
+                method.canon.len()
             )));
         }
-        if !(tau.is_finite() && tau > 0.0 && (0.0..=1.0).contains(&coverage_floor)) {
-            return Err(Error::internal(format!(
-                "scoring: tau {tau} must be over 0, coverage floor {coverage_floor} in 0..1"
-            )));
-        }
-        let coverage_floor = match profile {
-            ScoringProfile::Default => coverage_floor,
-            ScoringProfile::Paper => 0.0,
-        };
-        Ok(Self { profile, canon, tau, coverage_floor })
+        let ScoringMethod { unit_rows, tau, coverage_floor, cut, .. } = *method;
+        // Exactly 0 for a cut of 0.5.
+        let margin = (cut / (1.0 - cut)).ln() / tau;
+        Ok(Self { unit_rows, canon, tau, coverage_floor, margin })
     }
 
     /// A pixel with less coverage has relevancy 0.
@@ -66,15 +61,22 @@ impl Scoring {
         self.coverage_floor
     }
 
-    /// The profile.
+    /// Whether rows are brought to length 1. Two scorings that agree in this share [`ViewNorms`].
     #[must_use]
-    pub fn profile(&self) -> ScoringProfile {
-        self.profile
+    pub fn unit_rows(&self) -> bool {
+        self.unit_rows
+    }
+
+    /// Whether a text selects where it is nearer than every canonical text (a cut of 0.5), so that
+    /// a mask is the sign of a blend and needs no norms.
+    #[must_use]
+    pub fn is_signed(&self) -> bool {
+        self.margin == 0.0
     }
 }
 
-/// 1 / length of the feature of each pixel of a view; 0 where the coverage is too small. It serves
-/// every text.
+/// 1 / length of the feature of each pixel of a view; 0 where it has no length. It serves every
+/// text.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ViewNorms {
     inverse: Vec<f32>,
@@ -99,6 +101,10 @@ pub struct TextScores {
     /// `[M + 1]` bit c is set if the row is nearer to phrase c than to the text. If all rows of a
     /// pixel share a bit, no weights can select the pixel. Row 0 adds nothing, so it has all bits.
     nearer: Vec<u64>,
+    /// `[M]` lengths of the rows, shared with the scorer.
+    norms: Arc<[f64]>,
+    /// That of the scoring.
+    margin: f64,
 }
 
 impl TextScores {
@@ -121,11 +127,14 @@ impl TextScores {
     /// Whether no pixel can be selected, because all rows are nearer to the same phrase.
     #[must_use]
     pub fn selects_nothing(&self) -> bool {
-        self.nearer.iter().fold(u64::MAX, |all, row| all & row) != 0
+        self.margin >= 0.0 && self.nearer.iter().fold(u64::MAX, |all, row| all & row) != 0
     }
 
     /// Whether the rows of pixel `p` exclude it, so that no blend is needed.
     fn ruled_out(&self, weights: &PixelWeights, p: usize) -> bool {
+        if self.margin < 0.0 {
+            return false;
+        }
         let rows = weights.slices(p).0.iter();
         let nearer = |m: &u16| self.nearer.get(usize::from(*m)).copied().unwrap_or(u64::MAX);
         rows.fold(u64::MAX, |all, m| all & nearer(m)) != 0
@@ -137,7 +146,16 @@ impl TextScores {
         // The rule of the masks, so that 3D and views agree on ties.
         let known = m > 0 && usize::from(m) < self.relevancies.len();
         let [least, most, _] = self.blend(&[m], &[1.0]);
-        known && selected(least, most)
+        let length = usize::from(m).checked_sub(1).and_then(|row| self.norms.get(row));
+        known && self.takes([least, most], length.map_or(0.0, |length| length.recip()))
+    }
+
+    /// Whether a feature with these smallest and largest scores, and this 1 / length, is selected.
+    fn takes(&self, [least, most]: [f64; 2], inverse: f64) -> bool {
+        if self.margin == 0.0 {
+            return selected(least, most);
+        }
+        inverse.is_finite() && inverse > 0.0 && least * inverse >= self.margin
     }
 
     fn blend_pixel(&self, weights: &PixelWeights, p: usize) -> [f64; 3] {
@@ -171,13 +189,13 @@ fn selected(least: f64, most: f64) -> bool {
     least >= 0.0 && most > 0.0
 }
 
-/// A bank under a scoring profile, ready for texts.
+/// A bank under a scoring method, ready for texts.
 #[derive(Debug)]
 pub struct Scorer {
     bank: Bank,
     scoring: Arc<Scoring>,
     /// `[M]` lengths of the rows.
-    norms: Vec<f64>,
+    norms: Arc<[f64]>,
     /// Canonical phrase by row.
     canon_scores: Vec<Vec<f64>>,
     /// Lower triangle of B B^T, row by row. The first call of [`Self::norms`] computes it.
@@ -185,7 +203,7 @@ pub struct Scorer {
 }
 
 impl Scorer {
-    /// Prepares a bank of plain centroids for a profile.
+    /// Prepares a bank of plain centroids.
     ///
     /// # Errors
     /// `internal` when the bank's rows and the canonical phrases differ in length.
@@ -197,20 +215,23 @@ impl Scorer {
                 bank.dim
             )));
         }
-        let rows = match scoring.profile {
-            ScoringProfile::Default => unit_rows(bank),
-            ScoringProfile::Paper => bank.rows.clone(),
-        };
+        let rows = if scoring.unit_rows { unit_rows(bank) } else { bank.rows.clone() };
         let bank = Bank { dim, rows };
         let norms = bank.rows.chunks_exact(dim).map(norm).collect();
         let canon_scores = scoring.canon.iter().map(|c| scores(&bank, c)).collect();
         Ok(Self { bank, scoring, norms, canon_scores, gram: OnceLock::new() })
     }
 
-    /// The phrases, tau and profile.
+    /// How it scores.
     #[must_use]
     pub fn scoring(&self) -> &Scoring {
         &self.scoring
+    }
+
+    /// The rows as they are blended: plain centroids, or these at length 1.
+    #[must_use]
+    pub fn bank(&self) -> &Bank {
+        &self.bank
     }
 
     /// Rows of the bank (M).
@@ -247,8 +268,10 @@ impl Scorer {
             groups: self.canon_scores.chunks(GROUP).map(group).collect(),
             relevancies: vec![0.0],
             nearer: std::iter::once(u64::MAX).chain((0..own.len()).map(nearer)).collect(),
+            norms: Arc::clone(&self.norms),
+            margin: self.scoring.margin,
         };
-        let alone = (1..).zip(&self.norms).map(|(m, length)| {
+        let alone = (1..).zip(&*self.norms).map(|(m, length)| {
             let [least, ..] = text.blend(&[m], &[1.0]);
             if *length > 0.0 { self.sharpen(least / length) } else { 0.0 }
         });
@@ -284,20 +307,19 @@ impl Scorer {
             .into_par_iter()
             .with_min_len(PIXELS_EACH)
             .map(|p| {
-                let (mut square, mut coverage) = (0.0_f64, 0.0_f64);
+                let mut square = 0.0_f64;
                 let of = weights
                     .pixel(p)
                     .map(|(m, weight)| (usize::from(m), f64::from(weight)))
                     .filter(|(m, _)| (1..=rows).contains(m));
                 for (i, (m, weight)) in of.clone().enumerate() {
-                    coverage += weight;
                     let mut across = 0.0;
                     for (n, other) in of.clone().take(i) {
                         across += other * gram[triangle(m - 1, n - 1)];
                     }
                     square += weight * (weight * gram[triangle(m - 1, m - 1)] + 2.0 * across);
                 }
-                if square <= 0.0 || coverage < self.scoring.coverage_floor {
+                if square <= 0.0 {
                     return 0.0;
                 }
                 #[expect(clippy::cast_possible_truncation, reason = "a relevancy is f32")]
@@ -308,7 +330,7 @@ impl Scorer {
         Ok(ViewNorms { inverse })
     }
 
-    /// `[P]` relevancy of each pixel, 0.5 to 1, or 0 where the text does not apply.
+    /// `[P]` relevancy of each pixel, from the cut to 1, or 0 where the text does not apply.
     ///
     /// # Errors
     /// `internal` when `weights` and `norms` are not of one view.
@@ -333,18 +355,26 @@ impl Scorer {
             if *inverse <= 0.0 || text.ruled_out(weights, p) {
                 return 0.0;
             }
-            let [least, most, _] = text.blend_pixel(weights, p);
-            if selected(least, most) { self.sharpen(least * f64::from(*inverse)) } else { 0.0 }
+            let [least, most, coverage] = text.blend_pixel(weights, p);
+            let inverse = f64::from(*inverse);
+            let takes = coverage >= self.scoring.coverage_floor;
+            let takes = takes && text.takes([least, most], inverse);
+            if takes { self.sharpen(least * inverse) } else { 0.0 }
         };
         Ok(norms.inverse.par_iter().enumerate().with_min_len(PIXELS_EACH).map(score).collect())
     }
 
-    /// `[P]` whether the relevancy is 0.5 or more. It needs no norm and no exponential.
+    /// `[P]` whether the relevancy is at the cut or over it. For a cut of 0.5 it needs no norm and
+    /// no exponential.
     ///
     /// # Errors
     /// `internal` when the arrays of `weights` do not belong together.
     pub fn mask(&self, text: &TextScores, weights: &PixelWeights) -> Result<Vec<bool>> {
         weights.check()?;
+        if !self.scoring.is_signed() {
+            let map = self.relevancy(text, weights, &self.norms(weights)?)?;
+            return Ok(map.into_iter().map(|relevancy| relevancy > 0.0).collect());
+        }
         let inside = |p: usize| {
             if text.ruled_out(weights, p) {
                 return false;
@@ -376,6 +406,7 @@ fn gram(bank: &Bank) -> Vec<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::Preset;
 
     #[test]
     fn rows_rule_a_pixel_out_only_where_no_blend_of_them_is_selected() {
@@ -385,7 +416,9 @@ mod tests {
         let bank = Bank { dim: 2, rows: rows.concat() };
         let canon: Vec<[f32; 2]> = [3, 17, 31, 45, 59].map(around).to_vec();
         let canon = canon.iter().map(|c| c.to_vec()).collect();
-        let scoring = Scoring::new(ScoringProfile::Paper, canon, 10.0, 0.05).unwrap();
+        let method = ScoringMethod::of(Preset::Paper, Vec::new(), 10.0, 0.05);
+        let names = (0..5).map(|c: u8| c.to_string()).collect();
+        let scoring = Scoring::new(&ScoringMethod { canon: names, ..method }, canon).unwrap();
         let scorer = Scorer::new(&bank, Arc::new(scoring)).unwrap();
         let mut view = PixelWeights::none(0);
         for p in 0..400_u16 {

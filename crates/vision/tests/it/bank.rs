@@ -29,9 +29,9 @@ fn threads(count: usize) -> rayon::ThreadPool {
 fn rows_are_1_2_times_the_masks_of_a_photo_rounded_up() {
     let cases = [(0, 2, 0), (1, 2, 1), (10, 2, 6), (40, 2, 24), (41, 2, 25), (5, 1, 6)];
     for (features, views, rows) in cases {
-        assert_eq!(rows_wanted(features, views), rows, "{features} of {views}");
+        assert_eq!(rows_wanted(features, views, 1.2), rows, "{features} of {views}");
     }
-    assert_eq!(rows_wanted(1_000_000, 1), BANK_ROWS_MAX);
+    assert_eq!(rows_wanted(1_000_000, 1, 1.2), BANK_ROWS_MAX);
 }
 
 #[test]

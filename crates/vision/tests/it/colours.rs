@@ -9,7 +9,7 @@ use std::sync::{
 use segsplat_core::{
     error::ErrorCode,
     scene::{
-        Camera, CameraToWorld, Crop, Gaussians, Intrinsics, MaskLogits, Photo, PosedPhoto,
+        Camera, CameraToWorld, Crop, Gaussians, Intrinsics, MaskLogits, Method, Photo, PosedPhoto,
         RawGaussians, SourcePixel,
     },
 };
@@ -185,7 +185,7 @@ fn posed(photo: Photo, x: f64) -> PosedPhoto {
 fn photos_give_masks_and_seeds_say_where_they_reappear() {
     let Some(runtime) = runtime() else { return };
     let network = MaskNetwork::open(&runtime, &bundle(), &network_options()).unwrap().unwrap();
-    let settings = masks::settings(network.manifest());
+    let settings = masks::settings(network.manifest(), &Method::default());
     assert!((settings.pred_iou_thresh - 0.7).abs() < 1e-6, "the bundle's thresholds");
     let photos = [posed(photo(64, 64), 0.0), posed(photo(64, 64), 0.25)];
     let cancel = AtomicBool::new(false);

@@ -12,6 +12,7 @@ fn photo() -> Photo {
 /// Masks on a grid of 3 x 2 cells of 2 x 2 pixels.
 fn masks(index: &[u16], count: usize) -> PhotoMasks {
     PhotoMasks {
+        wholes: Vec::new(),
         map: IndexMap { width: 3, height: 2, index: index.to_vec() },
         masks: vec![MaskInfo::default(); count],
     }
@@ -67,7 +68,11 @@ fn cells_follow_the_centres_of_pixels_for_any_ratio() {
         let rgb = (1..=pixels).flat_map(|x| [(x % 256) as u8, (x / 256) as u8, 0]).collect();
         let photo = Photo { width: pixels, height: 1, rgb, valid: None };
         let map = IndexMap { width: cells, height: 1, index: (1..).take(cells as usize).collect() };
-        let masks = PhotoMasks { masks: vec![MaskInfo::default(); cells as usize], map };
+        let masks = PhotoMasks {
+            wholes: Vec::new(),
+            masks: vec![MaskInfo::default(); cells as usize],
+            map,
+        };
         let cutter = Cutter::new(&photo, &masks);
         let mut found = vec![0; pixels as usize];
         for mask in 0..cells as usize {

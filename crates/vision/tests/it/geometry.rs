@@ -70,7 +70,8 @@ fn run(network: &Geometry, photos: &[PosedPhoto]) -> Result<Vec<ViewGaussians>> 
 
 fn lifted(network: &Geometry, photos: &[PosedPhoto]) -> Lifted {
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera).collect();
-    lift(run(network, photos).unwrap(), &cameras, &FuseOptions::default(), None, &GO_ON).unwrap()
+    lift(run(network, photos).unwrap(), &cameras, true, &FuseOptions::default(), None, &GO_ON)
+        .unwrap()
 }
 
 #[test]

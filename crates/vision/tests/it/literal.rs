@@ -6,7 +6,7 @@
 
 use std::sync::Arc;
 
-use segsplat_core::scene::{Bank, Gaussians, PixelWeights, ScoringProfile};
+use segsplat_core::scene::{Bank, Gaussians, PixelWeights, Preset, ScoringMethod};
 use segsplat_render::{Labels, RenderRequest, Renderer, cpu::CpuRenderer};
 use segsplat_vision::semantics::{Scorer, Scoring};
 
@@ -63,6 +63,12 @@ fn bank(m: u16, kind: Rows, random: &mut Random) -> Bank {
     Bank { dim: DIM, rows: rows.concat() }
 }
 
+fn scoring(preset: Preset, canon: &[Vec<f32>]) -> Scoring {
+    let names: Vec<String> = (0..canon.len()).map(|c| c.to_string()).collect();
+    let method = ScoringMethod::of(preset, names.clone(), TAU, FLOOR);
+    Scoring::new(&ScoringMethod { canon: names, ..method }, canon.to_vec()).expect("a scoring")
+}
+
 /// What the plain definition gives for a pixel.
 struct Truth {
     coverage: f64,
@@ -75,7 +81,7 @@ struct Truth {
 fn literal_pixel(
     weights: &[f64],
     bank: &Bank,
-    profile: ScoringProfile,
+    profile: Preset,
     text: &[f32],
     canon: &[Vec<f32>],
 ) -> Truth {
@@ -83,8 +89,8 @@ fn literal_pixel(
     for (m, weight) in weights.iter().enumerate().filter(|(_, weight)| **weight != 0.0) {
         let row: Vec<f64> = bank.row(m).iter().map(|v| f64::from(*v)).collect();
         let length = match profile {
-            ScoringProfile::Default => row.iter().map(|v| v * v).sum::<f64>().sqrt().max(1e-300),
-            ScoringProfile::Paper => 1.0,
+            Preset::Default => row.iter().map(|v| v * v).sum::<f64>().sqrt().max(1e-300),
+            Preset::Paper => 1.0,
         };
         feature.iter_mut().zip(row).for_each(|(sum, v)| *sum += weight * v / length);
     }
@@ -95,7 +101,7 @@ fn literal_pixel(
     };
     let differences = canon.iter().map(|c| score(text) - score(c));
     let least = differences.fold(f64::INFINITY, f64::min);
-    let floor = if profile == ScoringProfile::Default { FLOOR } else { 0.0 };
+    let floor = if profile == Preset::Default { FLOOR } else { 0.0 };
     let mut relevancy = 0.0;
     if norm > 0.0 && coverage >= floor {
         // min over phrases of the sigmoid = sigmoid of the least difference of cosines.
@@ -140,7 +146,8 @@ impl View<'_> {
         text: &[f32],
         all: &mut Tally,
     ) {
-        let profile = scorer.scoring().profile();
+        let unit = scorer.scoring().unit_rows();
+        let profile = if unit { Preset::Default } else { Preset::Paper };
         let scores = scorer.text(text).expect("a text");
         let pictures: Vec<Vec<[f32; 4]>> = scores
             .tables()
@@ -240,10 +247,10 @@ fn fifty_scene_view_text_cases_equal_the_plain_definition() {
             weights: draw.weights.expect("weights were asked for"),
         };
         let of = if kind == Grouped { &mut all } else { &mut special };
-        for profile in [ScoringProfile::Default, ScoringProfile::Paper] {
+        for profile in [Preset::Default, Preset::Paper] {
             let canon: Vec<Vec<f32>> =
                 (0..if seed % 2 == 0 { 3 } else { 5 }).map(|_| unit(&mut random)).collect();
-            let scoring = Scoring::new(profile, canon.clone(), TAU, FLOOR).expect("scoring");
+            let scoring = scoring(profile, &canon);
             let scorer = Scorer::new(&bank, Arc::new(scoring)).expect("a scorer");
             for text in texts(&bank, &canon, &mut random) {
                 view.compare(&scorer, &bank, &canon, &text, of);
@@ -267,7 +274,7 @@ fn a_scene_without_masks_is_legal_and_nothing_in_it_is_relevant() {
     let canon = vec![unit(&mut random)];
     for bank in [Bank { dim: DIM, rows: Vec::new() }, bank(3, Rows::Grouped, &mut random)] {
         let gaussians = labelled(300, 0, 5);
-        let scoring = Scoring::new(ScoringProfile::Paper, canon.clone(), TAU, FLOOR).expect("one");
+        let scoring = scoring(Preset::Paper, &canon);
         let scorer = Scorer::new(&bank, Arc::new(scoring)).expect("a scorer");
         let scores = scorer.text(&unit(&mut random)).expect("a text");
         let labels = Labels::Blend(Arc::clone(&scores.tables()[0]));

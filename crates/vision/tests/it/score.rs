@@ -6,19 +6,26 @@ use std::{
 };
 
 use rayon::prelude::*;
-use segsplat_core::scene::{Bank, PixelWeights, ScoringProfile};
+use segsplat_core::error::Result;
+use segsplat_core::scene::{Bank, PixelWeights, Preset, ScoringMethod};
 use segsplat_testing::labels::mask_of_blends;
 use segsplat_vision::semantics::{Scorer, Scoring, ViewNorms};
 
-fn scoring(profile: ScoringProfile, canon: &[[f32; 2]]) -> Arc<Scoring> {
+fn scoring(profile: Preset, canon: &[[f32; 2]]) -> Arc<Scoring> {
     let canon = canon.iter().map(|c| c.to_vec()).collect();
-    Arc::new(Scoring::new(profile, canon, 10.0, 0.05).unwrap())
+    Arc::new(new(profile, canon, 10.0, 0.05).unwrap())
+}
+
+fn new(preset: Preset, canon: Vec<Vec<f32>>, tau: f64, floor: f64) -> Result<Scoring> {
+    let names: Vec<String> = (0..canon.len()).map(|c| c.to_string()).collect();
+    let method = ScoringMethod::of(preset, names.clone(), tau, floor);
+    Scoring::new(&ScoringMethod { canon: names, tau, ..method }, canon)
 }
 
 const X: [f32; 2] = [1.0, 0.0];
 const Y: [f32; 2] = [0.0, 1.0];
 
-fn scorer(rows: &[[f32; 2]], profile: ScoringProfile) -> Scorer {
+fn scorer(rows: &[[f32; 2]], profile: Preset) -> Scorer {
     let bank = Bank { dim: 2, rows: rows.concat() };
     Scorer::new(&bank, scoring(profile, &[Y])).unwrap()
 }
@@ -36,7 +43,7 @@ fn view(pixels: &[&[(u16, f32)]]) -> PixelWeights {
 
 #[test]
 fn a_row_that_is_the_text_scores_as_the_formula_says() {
-    let scorer = scorer(&[X, Y, [3.0, 4.0]], ScoringProfile::Paper);
+    let scorer = scorer(&[X, Y, [3.0, 4.0]], Preset::Paper);
     let text = scorer.text(&X).unwrap();
     let close = |a: f32, b: f64| (f64::from(a) - b).abs() < 1e-6;
     let sigmoid = |v: f64| 1.0 / (1.0 + (-10.0 * v).exp());
@@ -49,7 +56,7 @@ fn a_row_that_is_the_text_scores_as_the_formula_says() {
 
 #[test]
 fn pixels_blend_their_rows_and_forget_the_rest() {
-    let scorer = scorer(&[X, Y], ScoringProfile::Paper);
+    let scorer = scorer(&[X, Y], Preset::Paper);
     let text = scorer.text(&X).unwrap();
     let view = view(&[&[(1, 0.4), (2, 0.3)], &[(1, 0.3), (2, 0.4)], &[], &[(9, 1.0), (0, 1.0)]]);
     let norms = scorer.norms(&view).unwrap();
@@ -62,7 +69,7 @@ fn pixels_blend_their_rows_and_forget_the_rest() {
 }
 
 #[test]
-fn the_default_profile_has_unit_rows_and_a_coverage_floor_the_paper_has_neither() {
+fn the_default_has_unit_rows_and_a_coverage_floor_the_paper_has_neither() {
     let rows = [[0.1, 0.0], Y];
     let view = view(&[&[(1, 0.5), (2, 0.3)], &[(1, 0.04)], &[(1, 0.05)]]);
     let mask = |profile| {
@@ -75,13 +82,13 @@ fn the_default_profile_has_unit_rows_and_a_coverage_floor_the_paper_has_neither(
         assert_eq!(mask, from_map, "{profile:?}: the mask and the relevancy agree");
         mask
     };
-    assert_eq!(mask(ScoringProfile::Default), [true, false, true]);
-    assert_eq!(mask(ScoringProfile::Paper), [false, true, true]);
+    assert_eq!(mask(Preset::Default), [true, false, true]);
+    assert_eq!(mask(Preset::Paper), [false, true, true]);
 }
 
 #[test]
 fn opposite_rows_cancel_to_no_relevancy_and_never_nan() {
-    let scorer = scorer(&[X, [-1.0, 0.0], [0.0, 0.0]], ScoringProfile::Default);
+    let scorer = scorer(&[X, [-1.0, 0.0], [0.0, 0.0]], Preset::Default);
     let text = scorer.text(&X).unwrap();
     let view = view(&[&[(1, 0.5), (2, 0.5)], &[(3, 1.0)], &[(1, 0.5), (3, 0.5)]]);
     let norms = scorer.norms(&view).unwrap();
@@ -102,7 +109,7 @@ fn the_worst_phrase_decides_and_blended_tables_say_the_same() {
                 [turn.cos(), turn.sin()]
             })
             .collect();
-        let scoring = scoring(ScoringProfile::Default, &canon);
+        let scoring = scoring(Preset::Default, &canon);
         let scorer = Scorer::new(&bank, Arc::clone(&scoring)).unwrap();
         let text = scorer.text(&X).unwrap();
         let want = 1.0 / (1.0 + (-10.0 * (1.0 - f64::from(canon[count - 1][0]))).exp());
@@ -135,7 +142,7 @@ fn the_worst_phrase_decides_and_blended_tables_say_the_same() {
 
 #[test]
 fn an_empty_bank_has_no_relevancy_anywhere() {
-    let scorer = scorer(&[], ScoringProfile::Default);
+    let scorer = scorer(&[], Preset::Default);
     let text = scorer.text(&X).unwrap();
     assert_eq!((text.relevancies().len(), text.tables()[0].len()), (1, 1));
     let view = view(&[&[], &[(1, 1.0)]]);
@@ -147,7 +154,7 @@ fn an_empty_bank_has_no_relevancy_anywhere() {
 #[test]
 fn a_great_tau_saturates_without_overflow() {
     let canon = vec![Y.to_vec()];
-    let scoring = Scoring::new(ScoringProfile::Paper, canon, 1e6, 0.05).unwrap();
+    let scoring = new(Preset::Paper, canon, 1e6, 0.05).unwrap();
     let bank = Bank { dim: 2, rows: [X, Y].concat() };
     let text = Scorer::new(&bank, Arc::new(scoring)).unwrap().text(&X).unwrap();
     assert_eq!(text.relevancies(), [0.0, 1.0, 0.0]);
@@ -155,18 +162,17 @@ fn a_great_tau_saturates_without_overflow() {
 
 #[test]
 fn what_does_not_belong_together_is_refused() {
-    let new =
-        |canon: Vec<Vec<f32>>, tau, floor| Scoring::new(ScoringProfile::Default, canon, tau, floor);
+    let new = |canon: Vec<Vec<f32>>, tau, floor| new(Preset::Default, canon, tau, floor);
     assert!(new(vec![], 10.0, 0.0).is_err() && new(vec![vec![]], 10.0, 0.0).is_err());
     assert!(new(vec![X.to_vec(), vec![1.0]], 10.0, 0.0).is_err());
     assert!(new(vec![vec![f32::NAN]], 10.0, 0.0).is_err());
     assert!(new(vec![X.to_vec()], 0.0, 0.0).is_err());
     assert!(new(vec![X.to_vec()], f64::NAN, 0.0).is_err());
     assert!(new(vec![X.to_vec()], 10.0, 1.5).is_err());
-    let scorer = scorer(&[X], ScoringProfile::Default);
+    let scorer = scorer(&[X], Preset::Default);
     assert!(scorer.text(&[1.0]).is_err() && scorer.text(&[1.0, f32::INFINITY]).is_err());
     let wide = Bank { dim: 3, rows: vec![1.0; 3] };
-    assert!(Scorer::new(&wide, scoring(ScoringProfile::Default, &[Y])).is_err());
+    assert!(Scorer::new(&wide, scoring(Preset::Default, &[Y])).is_err());
     let view = view(&[&[(1, 0.5)]]);
     let text = scorer.text(&X).unwrap();
     assert!(scorer.relevancy(&text, &view, &ViewNorms::default()).is_err());
@@ -185,7 +191,7 @@ fn texts_on_one_pool_do_not_wait_for_each_other() {
         let rows: Vec<f32> = (0..dim * rows).map(|i| (i as f32).sin()).collect();
         let bank = Bank { dim, rows };
         let canon = vec![bank.row(0).to_vec()];
-        let scoring = Arc::new(Scoring::new(ScoringProfile::Paper, canon, 10.0, 0.05).unwrap());
+        let scoring = Arc::new(new(Preset::Paper, canon, 10.0, 0.05).unwrap());
         let view = view(&[&[(1, 0.5), (7, 0.25)], &[(200, 1.0)]]);
         for _ in 0..60 {
             let scorer = Scorer::new(&bank, Arc::clone(&scoring)).unwrap();
@@ -195,4 +201,32 @@ fn texts_on_one_pool_do_not_wait_for_each_other() {
         tell.send(()).unwrap();
     });
     told.recv_timeout(Duration::from_secs(120)).expect("the texts are scored");
+}
+
+#[test]
+fn a_cut_selects_from_its_relevancy_on_and_no_less() {
+    let bank = Bank { dim: 2, rows: [X, [0.6, 0.8], Y].concat() };
+    let view = view(&[&[(1, 0.5)], &[(2, 0.9)], &[(1, 0.2), (2, 0.3)], &[(3, 0.7)], &[]]);
+    let with = |cut: f64| {
+        let method = ScoringMethod::of(Preset::Paper, Vec::new(), 10.0, 0.0);
+        let method = ScoringMethod { canon: vec!["y".to_owned()], cut, ..method };
+        let scoring = Arc::new(Scoring::new(&method, vec![Y.to_vec()]).unwrap());
+        let scorer = Scorer::new(&bank, scoring).unwrap();
+        let text = scorer.text(&X).unwrap();
+        let map = scorer.relevancy(&text, &view, &scorer.norms(&view).unwrap()).unwrap();
+        let mask = scorer.mask(&text, &view).unwrap();
+        let rows: Vec<bool> = (1..=3).map(|m| text.selects(m)).collect();
+        (map, mask, rows)
+    };
+    let (all, everything, rows) = with(0.0);
+    assert_eq!((everything, rows), (vec![true, true, true, true, false], vec![true; 3]));
+    for cut in [0.001, 0.2, 0.45, 0.5, 0.55, 0.9, 0.9999] {
+        let (map, mask, rows) = with(cut);
+        for (p, raw) in all.iter().enumerate() {
+            let over = f64::from(*raw) >= cut;
+            assert_eq!((mask[p], map[p] > 0.0), (over, over), "cut {cut}, pixel {p}: {raw}");
+            assert!(!over || (map[p] - raw).abs() < 1e-6, "cut {cut}, pixel {p}");
+        }
+        assert_eq!([rows[0], rows[1], rows[2]], [mask[0], mask[1], mask[3]], "cut {cut}");
+    }
 }

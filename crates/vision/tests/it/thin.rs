@@ -47,7 +47,7 @@ fn wall(
 fn lifted(view: ViewGaussians, options: Option<&ThinOptions>) -> Gaussians {
     let cameras = [view.camera];
     let go_on = AtomicBool::new(false);
-    lift(vec![view], &cameras, &FuseOptions::default(), options, &go_on).unwrap().gaussians
+    lift(vec![view], &cameras, true, &FuseOptions::default(), options, &go_on).unwrap().gaussians
 }
 
 fn thinned(view: ViewGaussians) -> Gaussians {
