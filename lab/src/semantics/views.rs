@@ -119,8 +119,9 @@ impl<'a> Tools<'a> {
         let masks = found.first().unwrap_or(&none);
         let cutter = Cutter::new(&photo.photo, masks);
         let manifest = self.towers.manifest();
-        let margin = f64::from(manifest.image.crop_margin);
-        let cut = |k: usize| cutter.cut(k, margin).unwrap_or(Crop { side: 1, rgb: vec![0; 3] });
+        let (margin, shape) = (f64::from(manifest.image.crop_margin), manifest.image.crop_shape);
+        let black = || Crop { width: 1, height: 1, rgb: vec![0; 3] };
+        let cut = |k: usize| cutter.cut(k, margin, shape).unwrap_or_else(black);
         let crops: Vec<Crop> = (0..masks.masks.len()).map(cut).collect();
         let rows = self.towers.embed_images(&crops)?;
         let lens = target.intrinsics;

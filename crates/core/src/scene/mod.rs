@@ -26,7 +26,7 @@ pub use finished::{PhotoHash, Provenance, Scene, SceneMeta};
 pub use gaussians::{BLUR_PX2, Gaussians, RawGaussians, SH_C0, SanitizeReport, SourcePixel};
 pub use geometry::ViewGaussians;
 pub use id::{SCENE_ID_CHARS, SceneId};
-pub use photo::{Crop, Photo, PosedPhoto};
+pub use photo::{Crop, CropShape, Photo, PosedPhoto};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{
     Bank, IndexMap, MaskInfo, MaskLogits, PAPER_PHRASES, PAPER_TAU, PhotoMasks, ScoringProfile,

@@ -65,6 +65,8 @@ pub fn settings(manifest: &MasksManifest) -> Settings {
         stability_score_offset: manifest.stability_score_offset,
         box_nms_thresh: manifest.box_nms_thresh,
         mask_nms_thresh: manifest.mask_nms_thresh,
+        min_mask_region_area: manifest.min_mask_region_area,
+        full_resolution: manifest.min_mask_region_area > 0,
         min_area: manifest.min_area,
         ..Settings::default()
     }

@@ -14,8 +14,9 @@ use crate::{
     error::{Error, ErrorCode, Result},
     models::{ImageText, MaskNetwork, NetworkOptions},
     scene::{
-        Bank, Crop, Gaussians, IndexMap, PAPER_PHRASES, PAPER_TAU, PhotoMasks, PosedPhoto,
-        SceneCamera, ScoringProfile, Semantics, SemanticsReport, Stage, Watch, unless_cancelled,
+        Bank, Crop, CropShape, Gaussians, IndexMap, PAPER_PHRASES, PAPER_TAU, PhotoMasks,
+        PosedPhoto, SceneCamera, ScoringProfile, Semantics, SemanticsReport, Stage, Watch,
+        unless_cancelled,
     },
     semantics::{self, Clusters, Cutter, Scoring, Views},
 };
@@ -54,6 +55,8 @@ pub struct SemanticsTools<'a> {
     pub dim: usize,
     /// Added around a mask's box on each side, share of its longer side.
     pub crop_margin: f64,
+    /// What a crop shows of a box that is no square.
+    pub crop_shape: CropShape,
     /// Crops that are embedded together, and so in memory together.
     pub batch: usize,
 }
@@ -172,6 +175,7 @@ pub fn understand(
         embed: &|crops| towers.embed_images(crops),
         dim: towers.manifest().dim,
         crop_margin: f64::from(image.crop_margin),
+        crop_shape: image.crop_shape,
         batch: image.batch,
     };
     let mut semantics =
@@ -266,7 +270,7 @@ fn embed(
             unless_cancelled(watch.cancel)?;
             (watch.progress)(Stage::Embed, fraction(done, all));
             done += batch.len();
-            let cut = |&k: &usize| Some((k, cutter.cut(k, tools.crop_margin)?));
+            let cut = |&k: &usize| Some((k, cutter.cut(k, tools.crop_margin, tools.crop_shape)?));
             let (of, crops): (Vec<usize>, Vec<Crop>) = batch.par_iter().filter_map(cut).unzip();
             if crops.is_empty() {
                 continue;
