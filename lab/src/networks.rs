@@ -99,7 +99,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         take(&[Box::new(|| decode(&cpu.0)), Box::new(|| decode(&device.0))], args.runs)?,
     )?;
     let crop = |i: usize| Crop {
-        side: 128,
+        width: 128,
+        height: 128,
         rgb: photo.rgb.iter().cycle().skip(i * 3 * 997).take(128 * 128 * 3).copied().collect(),
     };
     let crops: Vec<Crop> = (0..40).map(crop).collect();
@@ -125,6 +126,7 @@ fn geometry(network: &Geometry, photos: &[PosedPhoto]) -> Result<Vec<f32>> {
         photos,
         views: &views,
         near_far: &vec![[1.5, 8.0]; photos.len()],
+        median_depth: 3.0,
         neighbors: &neighbors,
     };
     let found = network.run(&input)?;

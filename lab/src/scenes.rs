@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use crate::{
     error::Result,
     limits::Limits,
-    models::fit,
+    models::{ResizeFilter, fit},
     photo_files,
     pipeline::{Pipeline, Reconstruction, reconstruct},
     render::{Kinds, RenderRequest, plan::default_near},
@@ -50,7 +50,7 @@ pub(crate) fn is_posed(dir: &Path) -> bool {
 pub(crate) fn squares(dir: &Path) -> Result<Vec<PosedPhoto>> {
     let photos = photo_files::read_dir(dir, &Limits::default())?;
     let square = |posed: &PosedPhoto| {
-        let fitted = fit(&posed.photo, &posed.camera, [SIDE, SIDE]);
+        let fitted = fit(&posed.photo, &posed.camera, [SIDE, SIDE], ResizeFilter::Triangle);
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..255")]
         let rgb = fitted.rgb.iter().map(|v| (v * 255.0).round() as u8).collect();
         PosedPhoto {

@@ -2,6 +2,7 @@
 
 use std::io::{Cursor, Write as _};
 
+use segsplat_core::scene::CropShape;
 use segsplat_lab::words::{npz::Labelled, segments::Segmented};
 
 use crate::npy;
@@ -87,9 +88,9 @@ fn things_are_cut_out_with_their_names_and_crowds_are_not() {
     file.as_file().write_all(&tar.into_inner().unwrap()).unwrap();
     let set = Segmented::open(file.path(), 1 << 20).unwrap();
     assert_eq!(set.class_names().into_iter().collect::<Vec<_>>(), ["cup", "people"]);
-    let cut = set.images[0].cut(0.0).unwrap();
+    let cut = set.images[0].cut(0.0, CropShape::Square).unwrap();
     assert_eq!(cut.len(), 1);
     let (crop, name) = &cut[0];
-    assert_eq!((name.as_str(), crop.side), ("cup", 2));
+    assert_eq!((name.as_str(), crop.width), ("cup", 2));
     assert_eq!(crop.rgb, [1, 7, 7, 2, 7, 7, 1, 7, 7, 2, 7, 7]);
 }

@@ -120,6 +120,7 @@ output = "embeddings"
 size = {side}
 mean = {[round(v, 8) for v in clip.visual.image_mean]}
 std = {[round(v, 8) for v in clip.visual.image_std]}
+resize = "bicubic"
 crop_margin = 0.0
 batch = 16
 

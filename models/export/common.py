@@ -111,6 +111,7 @@ def write_section(args, name, text):
     if not os.path.samefile(base, args.out):
         for file in files_of("".join(kept)):
             shutil.copyfile(os.path.join(base, file), os.path.join(args.out, file))
+    head = re.sub(r"(?m)^#.*\n", "", head)
     head = re.sub(r'(?m)^name = .*$', f'name = "{os.path.basename(os.path.abspath(args.out))}"', head)
     manifest = "".join([head, *kept]).rstrip() + "\n\n" + text.strip() + "\n"
     with open(here, "w") as file:

@@ -16,11 +16,14 @@ import official
 from common import arguments, entry, export, gap, hold, prepare, session, write_section
 
 NETWORKS = {
-    # near, far: what the published weights were trained with. A network whose scales follow its depths takes any
-    # unit of length; DepthSplat's are absolute, so that one unit is one of its training's.
+    # near, far: what the published weights were trained with, in units of RealEstate10K.
     "mvsplat": {"near": 1.0, "far": 100.0, "licence": "MIT (code); weights: see the repository"},
     "depthsplat": {"near": 0.5, "far": 100.0, "licence": "MIT (code); weights: see the repository"},
 }
+# RealEstate10K scales each sequence so that its near content lies at 1.25 units (Zhou et al. 2018, section 4), and the
+# server's measured near has a margin before that content: it becomes 1.
+# Both networks know that unit: DepthSplat's scales are absolute, and both look for depths between near and far.
+NEAR_CONTENT = 1.0
 # Packages of the official code for training and pictures alone.
 UNUSED = ["wandb", "moviepy", "svg", "colorspacious", "matplotlib", "cv2", "skvideo", "imageio", "pytorch_lightning", "plyfile", "lpips",
           "skimage", "diff_gaussian_rasterization"]
@@ -90,6 +93,7 @@ def main():
     ap.add_argument("--dinov2", help="checkout of facebookresearch/dinov2")
     ap.add_argument("--size", type=int, nargs=2, default=[256, 256], metavar=("HEIGHT", "WIDTH"))
     ap.add_argument("--views", type=int, default=2)
+    ap.add_argument("--world", action="store_true", help="poses are in the units of the training already, as RealEstate10K's own are")
     ap.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="changes of the encoder's configuration, as in the model zoo")
     args = ap.parse_args()
     os.makedirs(args.out, exist_ok=True)
@@ -121,7 +125,9 @@ views_max = {args.views}
 neighbors_max = {args.views - 1}
 sh_degree = {degree}
 output_frame = "model"
-translation = "{"world" if args.network == "depthsplat" else "largest_baseline"}"
+translation = {'"world"' if args.world else f"{{ near = {NEAR_CONTENT} }}"}
+near_far = [{known["near"]}, {known["far"]}]
+resize = "lanczos"
 mean = [0.0, 0.0, 0.0]
 std = [1.0, 1.0, 1.0]
 

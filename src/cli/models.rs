@@ -1,6 +1,6 @@
 //! `segsplat models`: what the bundle holds, and a check of bundle and library.
 
-use std::fmt::Write as _;
+use std::{fmt::Write as _, path::PathBuf};
 
 use clap::Subcommand;
 use serde_json::json;
@@ -8,8 +8,8 @@ use serde_json::json;
 use super::{engine::models_info, output::Output};
 use crate::{
     config::{Config, ConfigArgs},
-    error::Result,
-    models::{Bundle, Runtime},
+    error::{Error, ErrorCode, Result},
+    models::{self, Bundle, BundleCheck, Runtime},
     pipeline::Pipeline,
     service::ModelsInfo,
 };
@@ -22,18 +22,35 @@ pub(super) struct Args {
     pub(super) config: ConfigArgs,
 }
 
-#[derive(Clone, Copy, Debug, Subcommand)]
+#[derive(Clone, Debug, Subcommand)]
 enum Action {
     /// List the networks of the bundle
     List,
     /// Check every file against its sha256, and open the networks
     Verify,
+    /// Look at everything in a bundle: manifest, hashes, opsets, names and shapes of tensors; run
+    /// each network; name all that does not fit
+    Check {
+        /// Folder of the bundle
+        dir: PathBuf,
+    },
 }
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
-    match args.action {
+    match &args.action {
         Action::List => list(config, out),
         Action::Verify => verify(config, out),
+        Action::Check { dir } => {
+            let found = models::check(dir, &config.networks())?;
+            out.answer(&table(&found), &as_json(&found))?;
+            match found.faults.len() {
+                0 => Ok(()),
+                n => Err(Error::new(
+                    ErrorCode::ModelUnavailable,
+                    format!("model bundle: {n} of its things do not fit"),
+                )),
+            }
+        }
     }
 }
 
@@ -54,6 +71,45 @@ fn summary(info: &ModelsInfo) -> String {
         let _ = writeln!(text, ", {}\n    sha256 {}", model.licence, model.sha256);
     }
     text
+}
+
+/// Files, runs and faults of a checked bundle.
+fn table(found: &BundleCheck) -> String {
+    let mut text = format!("bundle {}\n", found.name);
+    for file in &found.files {
+        let mib = file.bytes as f64 / f64::from(1 << 20);
+        let opset = file.opset.map(|n| format!("opset {n}")).unwrap_or_default();
+        let fits = if file.fits { "ok" } else { "WRONG" };
+        let (part, name) = (file.part, &file.file);
+        let _ = writeln!(text, "  {part:20} {name:28} {mib:9.2} MiB  {opset:8}  {fits}");
+    }
+    for (name, [opened, ran]) in &found.ran {
+        let _ =
+            writeln!(text, "  {name:20} opened in {opened:.2} s, ran in {ran:.2} s, all finite");
+    }
+    for fault in &found.faults {
+        let _ = writeln!(text, "- {fault}");
+    }
+    text
+}
+
+fn as_json(found: &BundleCheck) -> serde_json::Value {
+    let files = found.files.iter().map(|file| {
+        json!({
+            "part": file.part, "file": file.file, "bytes": file.bytes, "opset": file.opset,
+            "fits": file.fits,
+        })
+    });
+    let ran = found
+        .ran
+        .iter()
+        .map(|(name, [opened, ran])| json!({ "network": name, "opened_s": opened, "ran_s": ran }));
+    json!({
+        "bundle": found.name,
+        "files": files.collect::<Vec<_>>(),
+        "ran": ran.collect::<Vec<_>>(),
+        "faults": found.faults,
+    })
 }
 
 fn verify(config: &Config, out: &Output) -> Result<()> {

@@ -40,6 +40,14 @@ pub(super) fn run(
     }
     config.check_open_to_others()?;
     let (parts, engine) = engine::parts(&config)?;
+    // A network that takes no fewer photos says so at the door, and not in the job.
+    let views_min = engine.bundle().geometry().views_min;
+    let at_the_door = move |mut config: Config| {
+        config.limits.photos_min = config.limits.photos_min.max(views_min);
+        config
+    };
+    let config = at_the_door(config);
+    let read_again = move || read_again().map(at_the_door);
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()

@@ -265,6 +265,33 @@ fn models_say_their_licences_and_views_only_where_they_take_some() {
     }
 }
 
+#[test]
+fn a_bundle_is_checked_and_its_faults_are_counted_by_the_exit_code() {
+    if Runtime::load(&NetworkOptions::default()).is_err() {
+        return skipped("no ONNX Runtime (scripts/setup gets it)");
+    }
+    let from = crate::common::root().join("tests/fixtures/plane");
+    let whole = ok(&["models", "check", text(&from)]);
+    assert!(whole.contains("plane.onnx") && whole.contains("opset 17"), "{whole}");
+    assert!(whole.contains("geometry") && whole.contains("all finite"), "{whole}");
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let manifest = std::fs::read_to_string(from.join("bundle.toml")).unwrap();
+    std::fs::write(at("bundle.toml"), manifest.replace("sh_degree = 0", "sh_degree = 9")).unwrap();
+    std::fs::copy(from.join("plane.onnx"), at("other.onnx")).unwrap();
+    let output = segsplat(&["models", "check", text(folder.path()), "--json"]);
+    let exit = ErrorCode::ModelUnavailable.row().exit;
+    assert_eq!(output.status.code(), Some(i32::from(exit)), "{output:?}");
+    let answer: Value = serde_json::from_slice(&output.stdout).unwrap();
+    let faults: Vec<&str> =
+        answer["faults"].as_array().unwrap().iter().filter_map(Value::as_str).collect();
+    assert_eq!(faults.len(), 2, "{faults:?}");
+    assert!(faults[0].contains("geometry.sh_degree is 9"), "{faults:?}");
+    assert!(faults[1].contains("plane.onnx cannot be read"), "{faults:?}");
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(said.contains("2 of its things do not fit"), "{said}");
+}
+
 /// The program as a package installs it, and as cargo builds it in a checkout: called from a folder
 /// that holds neither bundle nor library.
 #[cfg(unix)]

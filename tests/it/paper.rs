@@ -85,7 +85,7 @@ fn crop(photo: &Photo, map: &IndexMap, runs: &[[u32; 2]]) -> Crop {
         let (to, from) = ((v * side as usize + u) * 3, ((y * photo.width + x) * 3) as usize);
         rgb[to..to + 3].copy_from_slice(&photo.rgb[from..from + 3]);
     }
-    Crop { side, rgb }
+    Crop { width: side, height: side, rgb }
 }
 
 fn distance(a: &[f32], b: &[f32]) -> f64 {

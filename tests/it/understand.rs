@@ -20,8 +20,8 @@ use segsplat::{
     },
     sample::{self, SampleOptions},
     scene::{
-        Camera, CameraToWorld, Crop, Gaussians, IndexMap, Intrinsics, MaskInfo, Method, Photo,
-        PhotoMasks, PosedPhoto, Preset, RawGaussians, SceneCamera, SceneOptions, Semantics,
+        Camera, CameraToWorld, Crop, CropShape, Gaussians, IndexMap, Intrinsics, MaskInfo, Method,
+        Photo, PhotoMasks, PosedPhoto, Preset, RawGaussians, SceneCamera, SceneOptions, Semantics,
         SourcePixel, Stage, Watch,
     },
     semantics::Scorer,
@@ -114,7 +114,14 @@ type Masks<'a> = &'a (dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> +
 type Embed<'a> = &'a (dyn Fn(&[Crop]) -> Result<Vec<f32>> + Sync);
 
 fn tools<'a>(masks: Masks<'a>, embed: Embed<'a>) -> SemanticsTools<'a> {
-    SemanticsTools { masks, embed, dim: 3, crop_margin: 0.1, batch: 3 }
+    SemanticsTools {
+        masks,
+        embed,
+        dim: 3,
+        crop_margin: 0.1,
+        crop_shape: CropShape::Square,
+        batch: 3,
+    }
 }
 
 fn made(wall: &Wall, tools: &SemanticsTools<'_>, options: Method) -> Result<Semantics> {

@@ -127,7 +127,9 @@ impl<'a> Tools<'a> {
             true => f64::from(manifest.image.crop_margin),
             false => 0.0,
         };
-        let cut = |k: usize| cutter.cut(k, margin).unwrap_or(Crop { side: 1, rgb: vec![0; 3] });
+        let black = || Crop { width: 1, height: 1, rgb: vec![0; 3] };
+        let shape = manifest.image.crop_shape;
+        let cut = |k: usize| cutter.cut(k, margin, shape).unwrap_or_else(black);
         let crops: Vec<Crop> = (0..masks.masks.len()).map(cut).collect();
         let rows = self.towers.embed_images(&crops)?;
         let lens = target.intrinsics;

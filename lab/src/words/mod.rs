@@ -146,7 +146,8 @@ fn stride(count: usize, max: usize) -> usize {
 /// Embeds what is held out of a set.
 fn embed(path: &Path, towers: &ImageText, names: &mut Names, images_max: usize) -> Result<Set> {
     let bytes_max = Limits::default().archive_unpacked_bytes_max;
-    let margin = f64::from(towers.manifest().image.crop_margin);
+    let image = &towers.manifest().image;
+    let margin = f64::from(image.crop_margin);
     // Crops with the index of their name.
     let mut things: Vec<(Crop, usize)> = Vec::new();
     let npz = path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("npz"));
@@ -165,7 +166,7 @@ fn embed(path: &Path, towers: &ImageText, names: &mut Names, images_max: usize) 
         let own = set.class_names().into_iter().filter_map(|class| names.add(class)).collect();
         let mut cut = Vec::new();
         for i in held_out(set.images.len()) {
-            cut.extend(set.images[i].cut(margin)?);
+            cut.extend(set.images[i].cut(margin, image.crop_shape)?);
         }
         let every = stride(cut.len(), images_max);
         let named = |(crop, class): (Crop, String)| Some((crop, names.add(&class)?));
@@ -197,7 +198,7 @@ fn square(photo: &image::RgbImage) -> Crop {
     let mut whole = image::RgbImage::new(side, side);
     let middle = |n: u32| i64::from((side - n) / 2);
     image::imageops::replace(&mut whole, photo, middle(width), middle(height));
-    Crop { side, rgb: whole.into_raw() }
+    Crop { width: side, height: side, rgb: whole.into_raw() }
 }
 
 /// How many `names` there are, and the shares of images whose name is the nearest of them (`top1`)
@@ -260,7 +261,7 @@ mod tests {
     #[test]
     fn a_wide_photo_stands_in_the_middle_of_its_square() {
         let crop = square(&image::RgbImage::from_pixel(4, 2, image::Rgb([9; 3])));
-        assert_eq!(crop.side, 4);
+        assert_eq!([crop.width, crop.height], [4; 2]);
         let rows: Vec<u8> = crop.rgb.chunks(12).map(|row| row[0]).collect();
         assert_eq!(rows, [0, 9, 9, 0]);
     }

@@ -13,7 +13,7 @@ use serde::Deserialize;
 use super::decode;
 use crate::{
     error::{Error, Result},
-    scene::{Crop, IndexMap, MaskInfo, Photo, PhotoMasks},
+    scene::{Crop, CropShape, IndexMap, MaskInfo, Photo, PhotoMasks},
 };
 use segsplat_vision::semantics::Cutter;
 
@@ -116,7 +116,7 @@ impl SegmentedImage {
     ///
     /// # Errors
     /// `invalid_request` where photograph or mask is no picture.
-    pub fn cut(&self, margin: f64) -> Result<Vec<(Crop, String)>> {
+    pub fn cut(&self, margin: f64, shape: CropShape) -> Result<Vec<(Crop, String)>> {
         let rgb = decode(&self.photo, &self.name)?;
         let mask = decode(&self.mask, &self.name)?;
         let photo =
@@ -138,7 +138,7 @@ impl SegmentedImage {
         let least = SHARE_MIN * values.len() as f64;
         let cut = |(k, segment): (usize, &&Segment)| {
             let large = count[usize::from(segment.index)] as f64 >= least;
-            let crop = large.then(|| cutter.cut(k, margin)).flatten()?;
+            let crop = large.then(|| cutter.cut(k, margin, shape)).flatten()?;
             Some((crop, segment.name.clone()))
         };
         Ok(wanted.iter().enumerate().filter_map(cut).collect())

@@ -28,7 +28,7 @@ pub use gaussians::{BLUR_PX2, Gaussians, RawGaussians, SH_C0, SanitizeReport, So
 pub use geometry::ViewGaussians;
 pub use id::{SCENE_ID_CHARS, SceneId};
 pub use method::{MaskLevel, Method, Preset, SceneOptions, ScoringMethod};
-pub use photo::{Crop, Photo, PosedPhoto};
+pub use photo::{Crop, CropShape, Photo, PosedPhoto};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{
     Bank, BankMask, IndexMap, MaskInfo, MaskLogits, PhotoMasks, Semantics, SemanticsReport,

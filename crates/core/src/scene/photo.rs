@@ -1,5 +1,7 @@
 //! Photos with known cameras. Their lens distortion is already undone.
 
+use serde::Deserialize;
+
 use crate::scene::Camera;
 
 /// 8-bit sRGB pixels, row-major, with the pixels that have a source.
@@ -15,13 +17,26 @@ pub struct Photo {
     pub valid: Option<Vec<bool>>,
 }
 
-/// A square cut of a photo around one thing, black elsewhere: what an image tower is shown.
+/// A cut of a photo around one thing, black elsewhere: what an image tower is shown.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Crop {
-    /// Width and height, pixels of the photo.
-    pub side: u32,
-    /// `[side * side * 3]`, sRGB as stored; 0 outside the thing and outside the photo.
+    /// Width, pixels of the photo.
+    pub width: u32,
+    /// Height, pixels of the photo.
+    pub height: u32,
+    /// `[height * width * 3]`, sRGB as stored; 0 outside the thing and outside the photo.
     pub rgb: Vec<u8>,
+}
+
+/// What a crop shows of a box that is no square.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum CropShape {
+    /// The box in the middle of a square, with black beside it.
+    #[default]
+    Square,
+    /// The box alone: the image tower sees it stretched to its square.
+    Stretched,
 }
 
 /// A photo, its camera (of the undistorted pixels, same size) and the file it came from.

@@ -12,17 +12,21 @@ const SHARED: usize = 2;
 /// Groups the photos into overlapping sets of at most `views_max`, each view with
 /// `min(views - 1, neighbors_max)` sources of the same set.
 ///
+/// A set has at least `views_min` views where there are as many photos: photos of other sets fill
+/// it up, and then the nearest ones.
+///
 /// Every photo that overlaps another is in at least one set; those that overlap none are in none.
 /// Without any overlap all photos are grouped by distance of their cameras. Deterministic.
 #[must_use]
 pub fn view_sets(
     capture: &Capture,
     photos: &[PosedPhoto],
-    views_max: usize,
+    [views_min, views_max]: [usize; 2],
     neighbors_max: usize,
 ) -> Vec<ViewSet> {
     let n = photos.len();
     let (views_max, neighbors_max) = (views_max.max(2), neighbors_max.max(1));
+    let center = |i: usize| photos[i].camera.camera_to_world.center();
     let worth = worth(capture, photos);
     let usable: Vec<usize> =
         (0..n).filter(|&i| (0..n).any(|j| j != i && worth[i][j] > 0.0)).collect();
@@ -43,9 +47,15 @@ pub fn view_sets(
             views.push(best);
         }
         // A rest of one or two photos sees more with company.
-        while views.len() < views_max.min(4) {
+        while views.len() < views_max.min(views_min.max(4)) {
             let Some(best) = best_of(usable.iter().copied(), &views, &worth) else { break };
             views.push(best);
+        }
+        // A network of a fixed number of views takes no fewer.
+        while (2..views_min).contains(&views.len()) {
+            let others = (0..n).filter(|i| !views.contains(i));
+            let Some(near) = best_by(others, |i| -center(i).distance(center(seed))) else { break };
+            views.push(near);
         }
         for &i in &views {
             covered[i] = true;

@@ -5,6 +5,7 @@
 
 use std::{
     io::Read,
+    ops::RangeInclusive,
     path::{Path, PathBuf},
 };
 
@@ -15,7 +16,11 @@ use crate::{
     error::{Error, Result},
     models::{
         NetworkOptions, SETUP_COMMAND,
-        manifest::{GeometryManifest, ImageTextManifest, MANIFEST, MasksManifest, unavailable},
+        manifest::{
+            Faults, GeometryManifest, ImageTextManifest, MANIFEST, MasksManifest, is_plain,
+            unavailable,
+        },
+        onnx::OnnxHeader,
         places,
     },
 };
@@ -24,6 +29,12 @@ use crate::{
 const EMBEDDED: &str = "models/embedded";
 /// Largest manifest read, bytes.
 const MANIFEST_BYTES_MAX: u64 = 1 << 20;
+/// Largest file of a bundle, bytes: eight times Segment Anything's ViT-H.
+const FILE_BYTES_MAX: u64 = 20 << 30;
+/// Versions of ONNX's operators that the pinned ONNX Runtime takes.
+const OPSETS: RangeInclusive<u64> = 7..=26;
+/// Ending of a network's file.
+const NETWORK: &str = ".onnx";
 
 /// A bundle whose files are those of its manifest.
 #[derive(Clone, Debug)]
@@ -43,11 +54,15 @@ struct BundleManifest {
     image_text: Option<ImageTextManifest>,
 }
 
+/// The keys of weights beside a network, `data` and `data_sha256`.
+type Data<'a> = [&'a Option<String>; 2];
+
 /// A file that the manifest names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BundleFile<'a> {
     /// What it is for: `geometry`, `geometry.cpu`, `masks.encoder`, `masks.decoder`,
-    /// `image_text.image`, `image_text.text`, `image_text.tokenizer`.
+    /// `image_text.image`, `image_text.text`, `image_text.tokenizer`. A file of weights beside
+    /// another has that one's name.
     pub part: &'static str,
     /// Name in the bundle's folder.
     pub file: &'a str,
@@ -101,6 +116,15 @@ impl Bundle {
     }
 
     fn read(dir: &Path) -> Result<Self> {
+        let (bundle, faults) = Self::parse(dir)?;
+        if faults.is_empty() {
+            return Ok(bundle);
+        }
+        Err(unavailable(format!("model bundle: {MANIFEST}: {}", faults.join("; and "))))
+    }
+
+    /// The manifest, and what in it is out of range.
+    pub(super) fn parse(dir: &Path) -> Result<(Self, Vec<String>)> {
         let path = dir.join(MANIFEST);
         let size = fs_err::metadata(&path).map_err(|e| missing(MANIFEST, e))?.len();
         if size > MANIFEST_BYTES_MAX {
@@ -111,14 +135,16 @@ impl Bundle {
         let text = fs_err::read_to_string(&path).map_err(|e| missing(MANIFEST, e))?;
         let manifest: BundleManifest = toml::from_str(&text)
             .map_err(|e| unavailable(format!("model bundle: {MANIFEST}: {e}")))?;
-        manifest.geometry.validate()?;
+        let mut faults = Faults::default();
+        manifest.geometry.validate(&mut faults);
         if let Some(masks) = &manifest.masks {
-            masks.validate()?;
+            masks.validate(&mut faults);
         }
         if let Some(image_text) = &manifest.image_text {
-            image_text.validate()?;
+            image_text.validate(&mut faults);
         }
-        Ok(Self { dir: dir.to_owned(), sha256: hex(&Sha256::digest(&text)), manifest })
+        let sha256 = hex(&Sha256::digest(&text));
+        Ok((Self { dir: dir.to_owned(), sha256, manifest }, faults.0))
     }
 
     /// Checks every file's sha256 again.
@@ -126,16 +152,51 @@ impl Bundle {
     /// # Errors
     /// `model_unavailable`, naming the file and both hashes.
     pub fn verify(&self) -> Result<()> {
-        for BundleFile { file, sha256, .. } in self.files() {
-            let found = sha256_of(&self.path(file)).map_err(|e| missing(file, e))?;
-            if found != sha256.to_lowercase() {
-                return Err(unavailable(format!(
-                    "model bundle: {file} is not the file of {MANIFEST}: sha256 {found}, not \
-                     {sha256}; restore it (`git checkout -- {EMBEDDED}`)"
-                )));
-            }
+        self.files().iter().try_for_each(|file| self.verify_file(file).map(|_| ()))
+    }
+
+    /// Checks the sha256 of a file of [`Self::files`]. A network may keep weights only in files
+    /// that the manifest names, since only those were checked.
+    pub(super) fn verify_file(&self, file: &BundleFile<'_>) -> Result<Option<OnnxHeader>> {
+        let BundleFile { file, sha256, .. } = file;
+        let path = self.path(file);
+        if !is_plain(file) {
+            return Err(unavailable(format!("model bundle: {file:?} is no plain file name")));
         }
-        Ok(())
+        let size = fs_err::metadata(&path).map_err(|e| missing(file, e))?.len();
+        if size > FILE_BYTES_MAX {
+            return Err(unavailable(format!(
+                "model bundle: {file} has {size} bytes, over {FILE_BYTES_MAX}"
+            )));
+        }
+        let found = sha256_of(&path).map_err(|e| missing(file, e))?;
+        if found != sha256.to_lowercase() {
+            return Err(unavailable(format!(
+                "model bundle: {file} is not the file of {MANIFEST}: sha256 {found}, not \
+                 {sha256}; restore it (`git checkout -- {EMBEDDED}`)"
+            )));
+        }
+        if !file.ends_with(NETWORK) {
+            return Ok(None);
+        }
+        let header = OnnxHeader::read(&path).map_err(|e| {
+            unavailable(format!("model bundle: {file} is no ONNX file: {e}")).caused_by(e)
+        })?;
+        if header.opset().is_some_and(|opset| !OPSETS.contains(&opset)) {
+            let (first, last) = (OPSETS.start(), OPSETS.end());
+            return Err(unavailable(format!(
+                "model bundle: {file} has opset {}; it must be {first} to {last}",
+                header.opset().unwrap_or_default()
+            )));
+        }
+        let named = self.files();
+        match header.external.iter().find(|data| named.iter().all(|entry| entry.file != **data)) {
+            None => Ok(Some(header)),
+            Some(data) => Err(unavailable(format!(
+                "model bundle: {file} keeps weights in {data:?}, which {MANIFEST} does not name; \
+                 give its `data` and `data_sha256`"
+            ))),
+        }
     }
 
     /// Name of the bundle.
@@ -187,34 +248,39 @@ impl Bundle {
 
     /// Every file that the manifest names, itself left out.
     #[must_use]
-    pub fn files(&self) -> Vec<BundleFile<'_>> {
+    pub fn files<'a>(&'a self) -> Vec<BundleFile<'a>> {
         let BundleManifest { geometry, masks, image_text, .. } = &self.manifest;
-        let mut files = vec![BundleFile {
-            part: "geometry",
-            file: &geometry.file,
-            sha256: &geometry.sha256,
-            licence: &geometry.licence,
-        }];
-        if let Some(cpu) = &geometry.cpu {
-            files.push(BundleFile {
-                part: "geometry.cpu",
-                file: &cpu.file,
-                sha256: &cpu.sha256,
-                licence: &geometry.licence,
-            });
+        let mut files = Vec::new();
+        let mut network = |part, licence, [file, sha256]: [&'a str; 2], data: Data<'a>| {
+            files.push(BundleFile { part, file, sha256, licence });
+            if let [Some(file), Some(sha256)] = data {
+                files.push(BundleFile { part, file, sha256, licence });
+            }
+        };
+        let g = geometry;
+        network("geometry", &*g.licence, [&g.file, &g.sha256], [&g.data, &g.data_sha256]);
+        if let Some(cpu) = &g.cpu {
+            network("geometry.cpu", &g.licence, [&cpu.file, &cpu.sha256], [&None, &None]);
         }
-        if let Some(MasksManifest { encoder, decoder, licence, .. }) = masks {
-            let entry = |part, file, sha256| BundleFile { part, file, sha256, licence };
-            files.push(entry("masks.encoder", &encoder.file, &encoder.sha256));
-            files.push(entry("masks.decoder", &decoder.file, &decoder.sha256));
+        if let Some(MasksManifest { encoder: e, decoder: d, licence, .. }) = masks {
+            network("masks.encoder", licence, [&e.file, &e.sha256], [&e.data, &e.data_sha256]);
+            network("masks.decoder", licence, [&d.file, &d.sha256], [&d.data, &d.data_sha256]);
         }
-        if let Some(ImageTextManifest { image, text, licence, .. }) = image_text {
-            let entry = |part, file, sha256| BundleFile { part, file, sha256, licence };
-            files.push(entry("image_text.image", &image.file, &image.sha256));
-            files.push(entry("image_text.text", &text.file, &text.sha256));
-            files.push(entry("image_text.tokenizer", &text.tokenizer, &text.tokenizer_sha256));
+        if let Some(ImageTextManifest { image: i, text: t, licence, .. }) = image_text {
+            network("image_text.image", licence, [&i.file, &i.sha256], [&i.data, &i.data_sha256]);
+            network("image_text.text", licence, [&t.file, &t.sha256], [&t.data, &t.data_sha256]);
+            let tokenizer = [&*t.tokenizer, &t.tokenizer_sha256];
+            network("image_text.tokenizer", licence, tokenizer, [&None, &None]);
         }
         files
+    }
+
+    /// Bytes of a network: its file and the weights beside it.
+    pub(super) fn network_bytes(&self, file: &str) -> u64 {
+        let files = self.files();
+        let part = files.iter().find(|entry| entry.file == file).map(|entry| entry.part);
+        let own = files.iter().filter(|entry| Some(entry.part) == part);
+        own.map(|entry| self.size_bytes(entry.file)).sum()
     }
 
     /// Where a file of [`Self::files`] lies.

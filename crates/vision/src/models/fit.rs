@@ -1,11 +1,15 @@
 //! Crops and resizes a photo to the network's working size, and changes its intrinsics to match.
 //!
 //! The crop is central and has the shape of the bucket. It may start between pixels. The filter is
-//! the triangle, widened by the reduction: it does not alias, and the training used it.
+//! the manifest's, widened by the reduction: it does not alias, and the training used it. The
+//! result is Pillow's `resize` with a `box`, without the rounding to 8 bits.
 
 use rayon::prelude::*;
 
-use crate::scene::{Camera, Intrinsics, Photo};
+use crate::{
+    models::ResizeFilter,
+    scene::{Camera, Intrinsics, Photo},
+};
 
 /// A photo at a network's working size.
 #[derive(Clone, Debug)]
@@ -47,7 +51,12 @@ pub fn bucket_for(photos: &[Intrinsics], buckets: &[[u32; 2]]) -> Option<[u32; 2
 
 /// Crops the middle of `photo` to the aspect of `height` x `width` and resizes it to that size.
 #[must_use]
-pub fn fit(photo: &Photo, camera: &Camera, [height, width]: [u32; 2]) -> FittedPhoto {
+pub fn fit(
+    photo: &Photo,
+    camera: &Camera,
+    [height, width]: [u32; 2],
+    filter: ResizeFilter,
+) -> FittedPhoto {
     let lens = camera.intrinsics;
     let (w, h) = (f64::from(photo.width), f64::from(photo.height));
     let aspect = f64::from(width) / f64::from(height);
@@ -62,47 +71,26 @@ pub fn fit(photo: &Photo, camera: &Camera, [height, width]: [u32; 2]) -> FittedP
         width,
         height,
     };
-    let columns = Taps::new(photo.width, x0, crop_w, width);
-    let rows = Taps::new(photo.height, y0, crop_h, height);
+    #[expect(clippy::cast_possible_truncation, reason = "weights need no more than f32")]
+    let narrow = |weight: f64| weight as f32;
+    let columns = filter.taps(photo.width, [x0, crop_w], width, narrow);
+    let rows = filter.taps(photo.height, [y0, crop_h], height, narrow);
     let (rgb, weight) = resample(photo, &columns, &rows);
     let valid = photo.valid.as_ref().map(|_| weight.iter().map(|&w| w >= 0.5).collect());
     FittedPhoto { camera: Camera { intrinsics, ..*camera }, rgb, valid }
 }
 
 /// For each output pixel of one axis: the first source pixel and the weights from there on.
-struct Taps(Vec<(usize, Vec<f32>)>);
-
-impl Taps {
-    /// Triangle filter from `length` source pixels beginning at `start` to `outputs` pixels.
-    fn new(size: u32, start: f64, length: f64, outputs: u32) -> Self {
-        let scale = length / f64::from(outputs);
-        let support = scale.max(1.0);
-        let taps = (0..outputs).map(|i| {
-            let centre = start + (f64::from(i) + 0.5) * scale;
-            let first = (centre - support).floor().max(0.0);
-            let last = (centre + support).ceil().min(f64::from(size));
-            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "in range")]
-            let (first, last) = (first as usize, (last as usize).max(first as usize + 1));
-            let raw: Vec<f64> = (first..last)
-                .map(|j| (1.0 - ((j as f64 + 0.5 - centre) / support).abs()).max(0.0))
-                .collect();
-            let sum: f64 = raw.iter().sum();
-            #[expect(clippy::cast_possible_truncation, reason = "weights need no more than f32")]
-            let weights = raw.iter().map(|w| (w / sum) as f32).collect();
-            (first, weights)
-        });
-        Self(taps.collect())
-    }
-}
+type Taps = [(usize, Vec<f32>)];
 
 /// Rows first, then columns; invalid pixels carry no weight. Also the valid weight of each pixel.
 fn resample(photo: &Photo, columns: &Taps, rows: &Taps) -> (Vec<f32>, Vec<f32>) {
     let width = photo.width as usize;
-    let out_width = columns.0.len();
-    let mut rgb = vec![0.0_f32; rows.0.len() * out_width * 3];
-    let mut weight = vec![0.0_f32; rows.0.len() * out_width];
+    let out_width = columns.len();
+    let mut rgb = vec![0.0_f32; rows.len() * out_width * 3];
+    let mut weight = vec![0.0_f32; rows.len() * out_width];
     let out = rgb.par_chunks_mut(out_width * 3).zip(weight.par_chunks_mut(out_width));
-    rows.0.par_iter().zip(out).for_each(|((first, weights), (rgb, weight))| {
+    rows.par_iter().zip(out).for_each(|((first, weights), (rgb, weight))| {
         let mut line = vec![[0.0_f32; 4]; width];
         for (y, weight) in (*first..).zip(weights) {
             for (x, sum) in line.iter_mut().enumerate() {
@@ -116,7 +104,7 @@ fn resample(photo: &Photo, columns: &Taps, rows: &Taps) -> (Vec<f32>, Vec<f32>) 
             }
         }
         let pixels = rgb.chunks_exact_mut(3).zip(weight);
-        for ((first, weights), (rgb, valid)) in columns.0.iter().zip(pixels) {
+        for ((first, weights), (rgb, valid)) in columns.iter().zip(pixels) {
             let mut sum = [0.0_f32; 4];
             for (x, weight) in (*first..).zip(weights) {
                 for (s, v) in sum.iter_mut().zip(line[x]) {

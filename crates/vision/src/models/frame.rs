@@ -17,18 +17,26 @@ pub struct ModelFrame {
 }
 
 impl ModelFrame {
-    /// The frame of `cameras`, the first of which becomes the identity.
+    /// The frame of `cameras`, the first of which becomes the identity. `near` is the nearest depth
+    /// of their photos and `median_depth` the median one, world units.
     ///
     /// # Errors
     /// `invalid_request` when there is no camera, or all stand at one place and the scale is the
     /// largest baseline.
-    pub fn new(cameras: &[CameraToWorld], translation: Translation) -> Result<Self> {
+    pub fn new(
+        cameras: &[CameraToWorld],
+        translation: Translation,
+        near: f64,
+        median_depth: f64,
+    ) -> Result<Self> {
         let first = *cameras
             .first()
             .ok_or_else(|| Error::invalid("a set of views must have at least one camera"))?;
         let unit = match translation {
             Translation::World => 1.0,
             Translation::LargestBaseline => largest_baseline(cameras),
+            Translation::Near(units) => near / units,
+            Translation::MedianDepth(units) => median_depth / units,
         };
         if !unit.is_finite() || unit <= 0.0 {
             return Err(Error::invalid(

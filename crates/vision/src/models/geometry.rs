@@ -1,15 +1,17 @@
 //! The geometry network: it fits the photos, makes the model frame, runs a session and returns to
 //! world units.
 
-use std::sync::Arc;
+use std::{borrow::Cow, collections::BTreeSet, sync::Arc};
 
 use crate::{
     error::{Error, Result},
     models::{
         Bundle, GeometryManifest, ModelFrame, NetworkOptions, OutputFrame, Provider, Runtime,
-        bucket_for, fit,
+        bucket_for,
+        check::Signature,
+        fit,
         fit::FittedPhoto,
-        network::{Input, Network, Outputs, Spec},
+        network::{Input, Network, Outputs, Side, Spec, Wanted},
     },
     scene::{CameraToWorld, Intrinsics, PosedPhoto, ViewGaussians},
 };
@@ -33,6 +35,8 @@ pub struct GeometryInput<'a> {
     pub views: &'a [usize],
     /// `[nearest, farthest]` depth of each *photo of the scene*, world units.
     pub near_far: &'a [[f64; 2]],
+    /// Median depth of all photos, world units.
+    pub median_depth: f64,
     /// Row v: positions in `views` of the source views of view v.
     pub neighbors: &'a [Vec<usize>],
 }
@@ -53,14 +57,12 @@ impl Geometry {
     /// model does not load.
     pub fn open(runtime: &Arc<Runtime>, bundle: &Bundle, options: &NetworkOptions) -> Result<Self> {
         let manifest = bundle.geometry().clone();
-        let probe = Tensors::probe(&manifest, manifest.buckets[0], 2);
-        let names = &manifest.outputs;
-        let all = [&names.means, &names.scales, &names.quats, &names.opacities, &names.sh];
+        let probe = Tensors::probe(&manifest, manifest.buckets[0], manifest.views_min.max(2));
         let spec = Spec {
             what: WHAT,
             file: &manifest.file,
             cpu_file: manifest.cpu.as_ref().map(|cpu| cpu.file.as_str()),
-            outputs: all.into_iter().chain(&names.confidence).map(String::as_str).collect(),
+            signature: signature(&manifest),
             tolerance: TOLERANCE,
             probe: &|_| Ok(probe.inputs(&manifest)),
         };
@@ -78,11 +80,30 @@ impl Geometry {
             return Ok(());
         }
         let manifest = &self.manifest;
-        let counts = WARM_VIEWS.into_iter().filter(|views| *views <= manifest.views_max);
+        let range = manifest.views_min..=manifest.views_max;
+        let counts = WARM_VIEWS.into_iter().filter(|views| range.contains(views));
         for views in counts {
             for &bucket in &manifest.buckets {
                 let probe = Tensors::probe(manifest, bucket, views);
                 self.network.run(&probe.inputs(manifest), |_| Ok(()))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Runs every size with the fewest and with the most views, and looks at all numbers.
+    ///
+    /// # Errors
+    /// `internal` when a run fails, or an output has another shape than the manifest says or holds
+    /// a number that is not finite.
+    pub(super) fn try_out(&self) -> Result<()> {
+        let manifest = &self.manifest;
+        for views in BTreeSet::from([manifest.views_min.max(2), manifest.views_max]) {
+            for &bucket in &manifest.buckets {
+                let probe = Tensors::probe(manifest, bucket, views);
+                self.network.run(&probe.inputs(manifest), |outputs| {
+                    Answer::read(manifest, bucket, views, outputs)?.finite()
+                })?;
             }
         }
         Ok(())
@@ -125,24 +146,9 @@ impl Geometry {
         outputs: &dyn Outputs,
     ) -> Result<Vec<ViewGaussians>> {
         let [h, w] = prepared.tensors.bucket.map(|side| side as usize);
-        let count = input.views.len();
-        let names = &self.manifest.outputs;
-        let get = |name: &str, tail: &[usize]| -> Result<&[f32]> {
-            let wanted = [&[count, h, w], tail].concat();
-            let (found, data) = outputs.get(name)?;
-            if found != wanted {
-                return Err(Error::internal(format!(
-                    "{WHAT}: output {name:?} is {found:?}, not {wanted:?}"
-                )));
-            }
-            Ok(data)
-        };
-        let sh_count = (usize::from(self.manifest.sh_degree) + 1).pow(2);
-        let (means, scales) = (get(&names.means, &[3])?, get(&names.scales, &[3])?);
-        let (quats, opacities) = (get(&names.quats, &[4])?, get(&names.opacities, &[])?);
-        let sh = get(&names.sh, &[sh_count, 3])?;
-        let confidence = names.confidence.as_ref().map(|name| get(name, &[])).transpose()?;
-
+        let bucket = prepared.tensors.bucket;
+        let answer = Answer::read(&self.manifest, bucket, input.views.len(), outputs)?;
+        let sh_count = sh_count(&self.manifest);
         let pixels = h * w;
         let unit = narrow(prepared.frame.unit());
         let view = |(v, (&photo, fitted)): (usize, (&usize, &FittedPhoto))| {
@@ -155,14 +161,16 @@ impl Geometry {
                     OutputFrame::Camera => fitted.camera.camera_to_world,
                     OutputFrame::Model => prepared.frame.pose(),
                 },
-                near_far: input.near_far[photo],
-                means: scaled(means),
-                scales: scaled(scales),
-                quats: chunks(part(quats, 4)).collect(),
-                opacities: part(opacities, 1).to_vec(),
+                near_far: prepared.near_far(v),
+                means: scaled(&answer.means),
+                scales: scaled(&answer.scales),
+                quats: chunks(part(&answer.quats, 4)).collect(),
+                opacities: part(&answer.opacities, 1).to_vec(),
                 sh_degree: self.manifest.sh_degree,
-                sh: chunks(part(sh, sh_count * 3)).collect(),
-                confidence: confidence
+                sh: chunks(part(&answer.sh, sh_count * 3)).collect(),
+                confidence: answer
+                    .confidence
+                    .as_ref()
                     .map_or_else(|| vec![1.0; pixels], |all| part(all, 1).to_vec()),
                 valid: fitted.valid.clone(),
             }
@@ -204,12 +212,18 @@ impl Geometry {
         let fitted: Vec<FittedPhoto> = input
             .views
             .iter()
-            .map(|&v| fit(&input.photos[v].photo, &input.photos[v].camera, bucket))
+            .map(|&v| fit(&input.photos[v].photo, &input.photos[v].camera, bucket, manifest.resize))
             .collect();
         let cameras: Vec<CameraToWorld> =
             fitted.iter().map(|view| view.camera.camera_to_world).collect();
-        let frame = ModelFrame::new(&cameras, manifest.translation)?;
-        let ranges = || input.views.iter().map(|&v| input.near_far[v]);
+        let measured = || input.views.iter().map(|&v| input.near_far[v]);
+        let nearest = measured().map(|[near, _]| near).fold(f64::INFINITY, f64::min);
+        let frame = ModelFrame::new(&cameras, manifest.translation, nearest, input.median_depth)?;
+        let ranges = || {
+            measured().map(|range| {
+                manifest.near_far.unwrap_or(range.map(|depth| (depth / frame.unit()).min(1e6)))
+            })
+        };
         let tensors = Tensors {
             bucket,
             images: images(&fitted, manifest),
@@ -221,8 +235,8 @@ impl Geometry {
                 .iter()
                 .flat_map(|c| frame.camera(c).transpose().to_cols_array().map(narrow))
                 .collect(),
-            near: ranges().map(|[near, _]| narrow(near / frame.unit())).collect(),
-            far: ranges().map(|[_, far]| narrow((far / frame.unit()).min(1e6))).collect(),
+            near: ranges().map(|[near, _]| narrow(near)).collect(),
+            far: ranges().map(|[_, far]| narrow(far)).collect(),
             neighbors: input
                 .neighbors
                 .iter()
@@ -238,6 +252,107 @@ struct Prepared {
     frame: ModelFrame,
     fitted: Vec<FittedPhoto>,
     tensors: Tensors,
+}
+
+impl Prepared {
+    /// Nearest and farthest depth that the network looked at in view `v`, world units.
+    fn near_far(&self, v: usize) -> [f64; 2] {
+        [self.tensors.near[v], self.tensors.far[v]]
+            .map(|depth| f64::from(depth) * self.frame.unit())
+    }
+}
+
+/// What the network gave, with the shapes of the manifest.
+struct Answer<'a> {
+    means: Cow<'a, [f32]>,
+    scales: Cow<'a, [f32]>,
+    quats: Cow<'a, [f32]>,
+    opacities: Cow<'a, [f32]>,
+    sh: Cow<'a, [f32]>,
+    confidence: Option<Cow<'a, [f32]>>,
+}
+
+impl<'a> Answer<'a> {
+    fn read(
+        manifest: &GeometryManifest,
+        bucket: [u32; 2],
+        views: usize,
+        outputs: &'a dyn Outputs,
+    ) -> Result<Self> {
+        let [h, w] = bucket.map(|side| side as usize);
+        let get = |name: &str, tail: &[usize]| -> Result<Cow<'a, [f32]>> {
+            let wanted = [&[views, h, w], tail].concat();
+            let (found, data) = outputs.get(name)?;
+            if found != wanted {
+                return Err(Error::internal(format!(
+                    "{WHAT}: output {name:?} is {found:?}, not {wanted:?}"
+                )));
+            }
+            Ok(data)
+        };
+        let names = &manifest.outputs;
+        Ok(Self {
+            means: get(&names.means, &[3])?,
+            scales: get(&names.scales, &[3])?,
+            quats: get(&names.quats, &[4])?,
+            opacities: get(&names.opacities, &[])?,
+            sh: get(&names.sh, &[sh_count(manifest), 3])?,
+            confidence: names.confidence.as_ref().map(|name| get(name, &[])).transpose()?,
+        })
+    }
+
+    fn finite(&self) -> Result<()> {
+        let all = [&self.means, &self.scales, &self.quats, &self.opacities, &self.sh];
+        if all.into_iter().chain(&self.confidence).all(|data| data.iter().all(|v| v.is_finite())) {
+            return Ok(());
+        }
+        Err(Error::internal(format!("{WHAT}: an output holds a number that is not finite")))
+    }
+}
+
+/// Harmonics of a Gaussian.
+fn sh_count(manifest: &GeometryManifest) -> usize {
+    (usize::from(manifest.sh_degree) + 1).pow(2)
+}
+
+/// Each file with its tensors.
+pub(super) fn signatures(manifest: &GeometryManifest) -> Vec<Signature<'_>> {
+    let cpu = manifest.cpu.iter().map(|cpu| &cpu.file);
+    let files = [&manifest.file].into_iter().chain(cpu);
+    files.map(|file| (WHAT, &**file, signature(manifest))).collect()
+}
+
+/// The tensors of the manifest.
+fn signature(manifest: &GeometryManifest) -> Vec<Wanted<'_>> {
+    let (inputs, outputs) = (&manifest.inputs, &manifest.outputs);
+    let views: Vec<usize> = (manifest.views_min.max(2)..=manifest.views_max).collect();
+    let side = |axis: usize| manifest.buckets.iter().map(|b| b[axis] as usize).collect::<Vec<_>>();
+    let of = |side, name, tail: &[&[usize]]| {
+        let shape = [&[&*views], tail].concat().into_iter().map(<[usize]>::to_vec).collect();
+        Wanted::new(side, name, shape)
+    };
+    let (h, w) = (&*side(0), &*side(1));
+    let pixel = |name, tail: &[usize]| {
+        let tail: Vec<&[usize]> = tail.iter().map(std::slice::from_ref).collect();
+        of(Side::Output, name, &[&[h, w], &*tail].concat())
+    };
+    let mut all = vec![
+        of(Side::Input, &*inputs.images, &[&[3], h, w]),
+        of(Side::Input, &inputs.intrinsics, &[&[3], &[3]]),
+        of(Side::Input, &inputs.camera_to_world, &[&[4], &[4]]),
+        of(Side::Input, &inputs.near, &[]),
+        of(Side::Input, &inputs.far, &[]),
+        pixel(&*outputs.means, &[3]),
+        pixel(&outputs.scales, &[3]),
+        pixel(&outputs.quats, &[4]),
+        pixel(&outputs.opacities, &[]),
+        pixel(&outputs.sh, &[sh_count(manifest), 3]),
+    ];
+    if let Some(name) = &inputs.neighbors {
+        all.push(Wanted { whole: Some(true), ..of(Side::Input, name, &[&[]]) });
+    }
+    all.extend(outputs.confidence.iter().map(|name| pixel(name, &[])));
+    all
 }
 
 /// What the network takes for one set of views.

@@ -8,8 +8,9 @@ use crate::{
     error::{Error, Result},
     models::{
         Bundle, ImageTextManifest, NetworkOptions, Provider, Runtime,
+        check::Signature,
         manifest::unavailable,
-        network::{Input, Network, Outputs, Spec, Takes, fixed},
+        network::{Input, Network, Outputs, Side, Spec, Takes, Wanted, fixed},
         resize::{planes, resize},
     },
     scene::{Crop, TextEmbedding},
@@ -69,7 +70,7 @@ impl ImageText {
             what: IMAGE,
             file: &tower.file,
             cpu_file: None,
-            outputs: vec![&tower.output],
+            signature: image_signature(&manifest),
             tolerance: TOLERANCE,
             probe: &|takes| {
                 let count = size(takes, &tower.input, 0).unwrap_or(tower.batch);
@@ -84,7 +85,7 @@ impl ImageText {
             what: TEXT,
             file: &tower.file,
             cpu_file: None,
-            outputs: vec![&tower.output],
+            signature: text_signature(&manifest),
             tolerance: TOLERANCE,
             probe: &|takes| {
                 let length = size(takes, &tower.input_ids, 1).unwrap_or(tower.context.min(8));
@@ -112,6 +113,21 @@ impl ImageText {
             tokenizer: tokenizer.clone(),
             manifest: manifest.clone(),
         }))
+    }
+
+    /// Embeds crops and texts: one, and more than a batch.
+    ///
+    /// # Errors
+    /// `internal` when a run fails, or an output has another shape than the manifest says or holds
+    /// a number that is not finite.
+    pub(super) fn try_out(&self) -> Result<()> {
+        let crop = Crop { width: 3, height: 2, rgb: (0..18).map(|i| i * 13).collect() };
+        let text = |i: usize| format!("a photo of {} boxes", i + 1);
+        for count in [1, self.manifest.image.batch + 1] {
+            self.embed_images(&vec![crop.clone(); count])?;
+            self.embed_texts(&(0..count).map(text).collect::<Vec<_>>())?;
+        }
+        Ok(())
     }
 
     /// The section of the manifest.
@@ -145,8 +161,8 @@ impl ImageText {
             let count = self.crops.unwrap_or(batch.len());
             let mut images = Vec::with_capacity(count * 3 * side * side);
             for crop in batch {
-                let from = [crop.side as usize; 2];
-                let pixels = resize(&crop.rgb, from, [side; 2]);
+                let from = [crop.width, crop.height].map(|side| side as usize);
+                let pixels = resize(&crop.rgb, from, [side; 2], tower.resize);
                 images.extend(planes(&pixels, [side; 2], side, tower.mean, tower.std));
             }
             images.resize(count * 3 * side * side, 0.0);
@@ -278,6 +294,33 @@ impl ImageText {
         }
         Ok(rows)
     }
+}
+
+/// Each file with its tensors.
+pub(super) fn signatures(manifest: &ImageTextManifest) -> Vec<Signature<'_>> {
+    let (image, text) = (&manifest.image, &manifest.text);
+    vec![
+        (IMAGE, &image.file, image_signature(manifest)),
+        (TEXT, &text.file, text_signature(manifest)),
+    ]
+}
+
+fn image_signature(manifest: &ImageTextManifest) -> Vec<Wanted<'_>> {
+    let (tower, side) = (&manifest.image, manifest.image.size as usize);
+    let square = vec![vec![], vec![3], vec![side], vec![side]];
+    vec![
+        Wanted::new(Side::Input, &tower.input, square),
+        Wanted::new(Side::Output, &tower.output, vec![vec![], vec![manifest.dim]]),
+    ]
+}
+
+fn text_signature(manifest: &ImageTextManifest) -> Vec<Wanted<'_>> {
+    let tower = &manifest.text;
+    let tokens =
+        |name| Wanted { whole: Some(true), ..Wanted::new(Side::Input, name, vec![vec![], vec![]]) };
+    let inputs = [&tower.input_ids].into_iter().chain(&tower.attention_mask);
+    let output = Wanted::new(Side::Output, &tower.output, vec![vec![], vec![manifest.dim]]);
+    inputs.map(|name| tokens(&**name)).chain([output]).collect()
 }
 
 /// A dimension of an input, where the file fixes it.

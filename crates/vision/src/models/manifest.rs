@@ -9,13 +9,19 @@ use std::{
 
 use serde::Deserialize;
 
-use crate::error::{Error, ErrorCode, Result};
+use crate::{
+    error::{Error, ErrorCode},
+    models::ResizeFilter,
+    scene::CropShape,
+};
 
 /// Name of the manifest in a bundle's folder.
 pub(super) const MANIFEST: &str = "bundle.toml";
 /// Largest side of a bucket, pixels: `SourcePixel` counts in u16 and memory grows with the area.
 pub(super) const BUCKET_SIDE_MAX: u32 = 4_096;
 
+/// Views in one run of a geometry network.
+const VIEWS_MAX: usize = 64;
 /// Points along one side of the grid of prompts: 65,536 prompts a photo are minutes of work.
 const POINTS_PER_SIDE_MAX: u32 = 256;
 /// Prompts in one run of a decoder: their logits are in memory together.
@@ -38,13 +44,17 @@ pub enum OutputFrame {
 }
 
 /// How camera translations are scaled into the model frame.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Translation {
     /// The largest distance between two cameras of the set is 1.
     LargestBaseline,
     /// World units.
     World,
+    /// The nearest measured depth of the set's photos is this many model units.
+    Near(f64),
+    /// The median measured depth of all photos is this many model units.
+    MedianDepth(f64),
 }
 
 /// Input tensor names of a geometry network.
@@ -91,6 +101,10 @@ pub struct GeometryManifest {
     pub file: String,
     /// Its sha256, hex.
     pub sha256: String,
+    /// File of the weights that are not in `file`.
+    pub data: Option<String>,
+    /// Its sha256, hex.
+    pub data_sha256: Option<String>,
     /// The same network as the CPU runs it, where that is another file.
     pub cpu: Option<CpuFile>,
     /// Licence of the weights.
@@ -111,6 +125,11 @@ pub struct GeometryManifest {
     pub output_frame: OutputFrame,
     /// Scale of the model frame.
     pub translation: Translation,
+    /// `[near, far]` that every view gets, model units; absent: what is measured in each photo.
+    pub near_far: Option<[f64; 2]>,
+    /// Filter that brings a photo to the size of its bucket.
+    #[serde(default)]
+    pub resize: ResizeFilter,
     /// Subtracted from the 0..1 channels.
     pub mean: [f32; 3],
     /// Divides them after that.
@@ -133,28 +152,40 @@ pub struct CpuFile {
 }
 
 impl GeometryManifest {
-    pub(super) fn validate(&self) -> Result<()> {
-        check_file("geometry", &self.file, &self.sha256)?;
+    pub(super) fn validate(&self, faults: &mut Faults) {
+        faults.file("geometry", &self.file, &self.sha256);
+        faults.data("geometry", &self.data, &self.data_sha256);
         if let Some(cpu) = &self.cpu {
-            check_file("geometry.cpu", &cpu.file, &cpu.sha256)?;
+            faults.file("geometry.cpu", &cpu.file, &cpu.sha256);
         }
         let bad = |side: &u32| !(1..=BUCKET_SIDE_MAX).contains(side);
         if self.buckets.is_empty() || self.buckets.iter().flatten().any(bad) {
             let must = format!("hold [height, width] pairs of 1 to {BUCKET_SIDE_MAX}");
-            return wrong("geometry.buckets", &self.buckets, &must);
+            faults.wrong("geometry.buckets", &self.buckets, &must);
         }
         if self.views_min < 1 || self.views_max < self.views_min || self.views_max < 2 {
-            return Err(unavailable(format!(
-                "model bundle: {MANIFEST}: geometry.views_min {} and views_max {} must be in \
-                 order, and views_max at least 2",
+            faults.0.push(format!(
+                "geometry.views_min {} and views_max {} must be in order, and views_max at least 2",
                 self.views_min, self.views_max
-            )));
+            ));
         }
+        faults.range("geometry.views_max", self.views_max, 0..=VIEWS_MAX);
         if self.neighbors_max < 1 {
-            return wrong("geometry.neighbors_max", &self.neighbors_max, "be at least 1");
+            faults.wrong("geometry.neighbors_max", &self.neighbors_max, "be at least 1");
         }
-        check_range("geometry.sh_degree", self.sh_degree, 0..=3)?;
-        check_channels("geometry", self.mean, self.std)
+        faults.range("geometry.sh_degree", self.sh_degree, 0..=3);
+        let positive = |v: f64| v.is_finite() && v > 0.0;
+        if let Translation::Near(depth) | Translation::MedianDepth(depth) = self.translation
+            && !positive(depth)
+        {
+            faults.wrong("geometry.translation", &self.translation, "hold a number over 0");
+        }
+        if let Some([near, far]) = self.near_far
+            && !(positive(near) && positive(far) && near < far)
+        {
+            faults.wrong("geometry.near_far", &[near, far], "hold 0 < near < far");
+        }
+        faults.channels("geometry", self.mean, self.std);
     }
 }
 
@@ -185,6 +216,9 @@ pub struct MasksManifest {
     pub mean: [f32; 3],
     /// Divides them after that.
     pub std: [f32; 3],
+    /// Filter that brings a photo into the square.
+    #[serde(default)]
+    pub resize: ResizeFilter,
     /// Which of the decoder's masks are used, from parts to the whole object.
     pub levels: Vec<usize>,
     /// Points along one side of the grid of prompts.
@@ -208,6 +242,10 @@ pub struct MasksManifest {
     /// Of two masks with more IoU than this the less sure one goes.
     #[serde(default = "defaults::nms_thresh")]
     pub mask_nms_thresh: f32,
+    /// Holes and islands of fewer pixels go from a mask; 0: none. Masks are judged at the photo's
+    /// pixels then, which takes longer than on the decoder's grid.
+    #[serde(default)]
+    pub min_mask_region_area: u32,
     /// Smallest mask, share of the photo.
     #[serde(default = "defaults::min_area")]
     pub min_area: f64,
@@ -225,6 +263,10 @@ pub struct MaskEncoderManifest {
     pub file: String,
     /// Its sha256, hex.
     pub sha256: String,
+    /// File of the weights that are not in `file`.
+    pub data: Option<String>,
+    /// Its sha256, hex.
+    pub data_sha256: Option<String>,
     /// Input: `[1, 3, size, size]` f32.
     pub input: String,
     /// Output that becomes the decoder's `image_embeddings`.
@@ -243,6 +285,10 @@ pub struct MaskDecoderManifest {
     pub file: String,
     /// Its sha256, hex.
     pub sha256: String,
+    /// File of the weights that are not in `file`.
+    pub data: Option<String>,
+    /// Its sha256, hex.
+    pub data_sha256: Option<String>,
     /// The encoder's output.
     #[serde(default = "defaults::image_embeddings")]
     pub image_embeddings: String,
@@ -300,6 +346,10 @@ pub struct ImageTowerManifest {
     pub file: String,
     /// Its sha256, hex.
     pub sha256: String,
+    /// File of the weights that are not in `file`.
+    pub data: Option<String>,
+    /// Its sha256, hex.
+    pub data_sha256: Option<String>,
     /// Input: `[B, 3, size, size]` f32.
     pub input: String,
     /// Output: `[B, dim]` f32, of any length.
@@ -310,9 +360,15 @@ pub struct ImageTowerManifest {
     pub mean: [f32; 3],
     /// Divides them after that.
     pub std: [f32; 3],
+    /// Filter that brings a crop to that side.
+    #[serde(default)]
+    pub resize: ResizeFilter,
     /// Added around a mask's box on each side, share of the box's longer side.
     #[serde(default)]
     pub crop_margin: f32,
+    /// What a crop shows of a box that is no square.
+    #[serde(default)]
+    pub crop_shape: CropShape,
     /// Crops in one run, where the file takes several.
     #[serde(default = "defaults::batch")]
     pub batch: usize,
@@ -326,6 +382,10 @@ pub struct TextTowerManifest {
     pub file: String,
     /// Its sha256, hex.
     pub sha256: String,
+    /// File of the weights that are not in `file`.
+    pub data: Option<String>,
+    /// Its sha256, hex.
+    pub data_sha256: Option<String>,
     /// Tokenizer file in the bundle's folder.
     pub tokenizer: String,
     /// Its sha256, hex.
@@ -379,88 +439,110 @@ pub(super) fn unavailable(message: impl Into<String>) -> Error {
     Error::new(ErrorCode::ModelUnavailable, message)
 }
 
-/// Fails with the manifest's name, the key and what it must be.
-fn wrong<T>(key: &str, value: &dyn Debug, must: &str) -> Result<T> {
-    Err(unavailable(format!("model bundle: {MANIFEST}: {key} is {value:?}; it must {must}")))
+/// Whether a file of this name lies in the bundle's folder itself.
+pub(super) fn is_plain(file: &str) -> bool {
+    !file.is_empty() && Path::new(file).components().count() == 1 && !file.starts_with('.')
 }
 
-/// A file of the bundle: its name and hash.
-fn check_file(section: &str, file: &str, sha256: &str) -> Result<()> {
-    if file.is_empty() || Path::new(file).components().count() != 1 || file.starts_with('.') {
-        return wrong(&format!("{section}.file"), &file, "be a plain file name");
-    }
-    if sha256.len() != 64 || !sha256.bytes().all(|b| b.is_ascii_hexdigit()) {
-        return wrong(&format!("{section}.sha256"), &sha256, "be 64 hex digits");
-    }
-    Ok(())
-}
+/// Everything that does not fit in a manifest: each with its key, its value and what it must be.
+#[derive(Debug, Default)]
+pub(super) struct Faults(pub(super) Vec<String>);
 
-/// A number between two bounds, both included.
-fn check_range<T: Copy + PartialOrd + Debug + Display>(
-    key: &str,
-    value: T,
-    range: RangeInclusive<T>,
-) -> Result<()> {
-    if range.contains(&value) {
-        return Ok(());
+impl Faults {
+    fn wrong(&mut self, key: &str, value: &dyn Debug, must: &str) {
+        self.0.push(format!("{key} is {value:?}; it must {must}"));
     }
-    wrong(key, &value, &format!("be {} to {}", range.start(), range.end()))
-}
 
-/// The normalisation of channels.
-fn check_channels(section: &str, mean: [f32; 3], std: [f32; 3]) -> Result<()> {
-    if mean.iter().any(|v| !v.is_finite()) {
-        return wrong(&format!("{section}.mean"), &mean, "hold numbers");
+    /// A file of the bundle: its name and hash.
+    fn file(&mut self, section: &str, file: &str, sha256: &str) {
+        if !is_plain(file) {
+            self.wrong(&format!("{section}.file"), &file, "be a plain file name");
+        }
+        if sha256.len() != 64 || !sha256.bytes().all(|b| b.is_ascii_hexdigit()) {
+            self.wrong(&format!("{section}.sha256"), &sha256, "be 64 hex digits");
+        }
     }
-    if std.iter().any(|v| !v.is_finite() || *v <= 0.0) {
-        return wrong(&format!("{section}.std"), &std, "hold numbers over 0");
+
+    /// The file of weights beside it: both keys or none.
+    fn data(&mut self, section: &str, data: &Option<String>, sha256: &Option<String>) {
+        match (data, sha256) {
+            (Some(file), Some(sha256)) => self.file(&format!("{section}.data"), file, sha256),
+            (None, None) => {}
+            _ => self.0.push(format!("{section}.data and data_sha256 go together")),
+        }
     }
-    Ok(())
+
+    /// A number between two bounds, both included.
+    fn range<T: Copy + PartialOrd + Debug + Display>(
+        &mut self,
+        key: &str,
+        value: T,
+        range: RangeInclusive<T>,
+    ) {
+        if !range.contains(&value) {
+            self.wrong(key, &value, &format!("be {} to {}", range.start(), range.end()));
+        }
+    }
+
+    /// The normalisation of channels.
+    fn channels(&mut self, section: &str, mean: [f32; 3], std: [f32; 3]) {
+        if mean.iter().any(|v| !v.is_finite()) {
+            self.wrong(&format!("{section}.mean"), &mean, "hold numbers");
+        }
+        if std.iter().any(|v| !v.is_finite() || *v <= 0.0) {
+            self.wrong(&format!("{section}.std"), &std, "hold numbers over 0");
+        }
+    }
 }
 
 impl MasksManifest {
-    pub(super) fn validate(&self) -> Result<()> {
-        check_file("masks.encoder", &self.encoder.file, &self.encoder.sha256)?;
-        check_file("masks.decoder", &self.decoder.file, &self.decoder.sha256)?;
-        check_range("masks.size", self.size, 1..=BUCKET_SIDE_MAX)?;
-        check_channels("masks", self.mean, self.std)?;
+    pub(super) fn validate(&self, faults: &mut Faults) {
+        let (encoder, decoder) = (&self.encoder, &self.decoder);
+        faults.file("masks.encoder", &encoder.file, &encoder.sha256);
+        faults.data("masks.encoder", &encoder.data, &encoder.data_sha256);
+        faults.file("masks.decoder", &decoder.file, &decoder.sha256);
+        faults.data("masks.decoder", &decoder.data, &decoder.data_sha256);
+        faults.range("masks.size", self.size, 1..=BUCKET_SIDE_MAX);
+        faults.channels("masks", self.mean, self.std);
         if self.levels.is_empty() || self.levels.iter().any(|&level| level > 15) {
-            return wrong("masks.levels", &self.levels, "hold 1 or more of 0 to 15");
+            faults.wrong("masks.levels", &self.levels, "hold 1 or more of 0 to 15");
         }
-        check_range("masks.points_per_side", self.points_per_side, 1..=POINTS_PER_SIDE_MAX)?;
-        check_range("masks.points_per_batch", self.points_per_batch, 1..=POINTS_PER_BATCH_MAX)?;
-        check_range("masks.pred_iou_thresh", self.pred_iou_thresh, 0.0..=1.0)?;
-        check_range("masks.stability_score_thresh", self.stability_score_thresh, 0.0..=1.0)?;
-        check_range("masks.box_nms_thresh", self.box_nms_thresh, 0.0..=1.0)?;
-        check_range("masks.mask_nms_thresh", self.mask_nms_thresh, 0.0..=1.0)?;
-        if !self.stability_score_offset.is_finite() || self.stability_score_offset < 0.0 {
-            return wrong("masks.stability_score_offset", &self.stability_score_offset, "be >= 0");
+        faults.range("masks.points_per_side", self.points_per_side, 1..=POINTS_PER_SIDE_MAX);
+        faults.range("masks.points_per_batch", self.points_per_batch, 1..=POINTS_PER_BATCH_MAX);
+        faults.range("masks.pred_iou_thresh", self.pred_iou_thresh, 0.0..=1.0);
+        faults.range("masks.stability_score_thresh", self.stability_score_thresh, 0.0..=1.0);
+        faults.range("masks.box_nms_thresh", self.box_nms_thresh, 0.0..=1.0);
+        faults.range("masks.mask_nms_thresh", self.mask_nms_thresh, 0.0..=1.0);
+        let offset = self.stability_score_offset;
+        if !offset.is_finite() || offset < 0.0 {
+            faults.wrong("masks.stability_score_offset", &offset, "be >= 0");
         }
         if !(0.0..1.0).contains(&self.min_area) {
-            return wrong("masks.min_area", &self.min_area, "be 0 to 1");
+            faults.wrong("masks.min_area", &self.min_area, "be 0 to 1");
         }
-        Ok(())
     }
 }
 
 impl ImageTextManifest {
-    pub(super) fn validate(&self) -> Result<()> {
+    pub(super) fn validate(&self, faults: &mut Faults) {
         let (image, text) = (&self.image, &self.text);
-        check_file("image_text.image", &image.file, &image.sha256)?;
-        check_file("image_text.text", &text.file, &text.sha256)?;
-        check_file("image_text.text.tokenizer", &text.tokenizer, &text.tokenizer_sha256)?;
-        check_range("image_text.image.size", image.size, 1..=BUCKET_SIDE_MAX)?;
-        check_channels("image_text.image", image.mean, image.std)?;
-        check_range("image_text.dim", self.dim, 1..=DIM_MAX)?;
+        faults.file("image_text.image", &image.file, &image.sha256);
+        faults.data("image_text.image", &image.data, &image.data_sha256);
+        faults.file("image_text.text", &text.file, &text.sha256);
+        faults.data("image_text.text", &text.data, &text.data_sha256);
+        faults.file("image_text.text.tokenizer", &text.tokenizer, &text.tokenizer_sha256);
+        faults.range("image_text.image.size", image.size, 1..=BUCKET_SIDE_MAX);
+        faults.channels("image_text.image", image.mean, image.std);
+        faults.range("image_text.dim", self.dim, 1..=DIM_MAX);
         if !self.tau.is_finite() || self.tau <= 0.0 {
-            return wrong("image_text.tau", &self.tau, "be a number over 0");
+            faults.wrong("image_text.tau", &self.tau, "be a number over 0");
         }
         if self.canon.is_empty() || self.canon.iter().any(|phrase| phrase.trim().is_empty()) {
-            return wrong("image_text.canon", &self.canon, "hold 1 or more phrases");
+            faults.wrong("image_text.canon", &self.canon, "hold 1 or more phrases");
         }
-        check_range("image_text.coverage_floor", self.coverage_floor, 0.0..=1.0)?;
-        check_range("image_text.image.crop_margin", image.crop_margin, 0.0..=4.0)?;
-        check_range("image_text.image.batch", image.batch, 1..=BATCH_MAX)?;
-        check_range("image_text.text.context", text.context, 1..=CONTEXT_MAX)
+        faults.range("image_text.coverage_floor", self.coverage_floor, 0.0..=1.0);
+        faults.range("image_text.image.crop_margin", image.crop_margin, 0.0..=4.0);
+        faults.range("image_text.image.batch", image.batch, 1..=BATCH_MAX);
+        faults.range("image_text.text.context", text.context, 1..=CONTEXT_MAX);
     }
 }

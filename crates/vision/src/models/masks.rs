@@ -3,14 +3,15 @@
 //! The manifest's `adapter` names one of two signatures. The inputs of a file (a batch of prompts
 //! or one, a former mask, the photo's size) are read from the file itself.
 
-use std::sync::Arc;
+use std::{borrow::Cow, sync::Arc};
 
 use crate::{
     error::{Error, Result},
     models::{
         Bundle, MaskAdapter, MasksManifest, NetworkOptions, Runtime,
+        check::Signature,
         manifest::unavailable,
-        network::{self, Input, Network, Outputs, Spec, fixed},
+        network::{self, Input, Network, Outputs, Side, Spec, Wanted, fixed},
         resize::{planes, resize},
     },
     scene::{MaskLogits, Photo},
@@ -89,12 +90,11 @@ impl MaskNetwork {
             (&manifest.encoder, placed(&manifest, &photo), image(&manifest, &photo));
         let side = manifest.size as usize;
         let input = || Input::new(&names.input, &[1, 3, side, side], &*image);
-        let features = names.features.iter();
         let spec = Spec {
             what: ENCODER,
             file: &names.file,
             cpu_file: None,
-            outputs: [&names.output].into_iter().chain(features).map(String::as_str).collect(),
+            signature: encoder_signature(&manifest),
             tolerance: TOLERANCE,
             probe: &|_| Ok(vec![input()]),
         };
@@ -104,12 +104,11 @@ impl MaskNetwork {
         let points: Vec<[f32; 2]> = (0..manifest.points_per_batch)
             .map(|i| [(i % 8) as f32 / 8.0 + 0.05, (i / 8 % 8) as f32 / 8.0 + 0.05])
             .collect();
-        let outputs = vec![&*manifest.decoder.low_res_masks, &*manifest.decoder.iou_predictions];
         let spec = Spec {
             what: DECODER,
             file: &manifest.decoder.file,
             cpu_file: None,
-            outputs,
+            signature: decoder_signature(&manifest),
             tolerance: TOLERANCE,
             probe: &|found| {
                 let takes = Takes::of(found, &manifest)?;
@@ -120,6 +119,22 @@ impl MaskNetwork {
         let decoder = Network::open(runtime, bundle, options, &spec)?;
         let takes = Takes::of(decoder.takes(), &manifest)?;
         Ok(Some(Self { encoder, decoder, takes, manifest: manifest.clone() }))
+    }
+
+    /// Encodes a photo and decodes points of it, one and a batch, and looks at all numbers.
+    ///
+    /// # Errors
+    /// `internal` when a run fails, or an output has another shape than the manifest says or holds
+    /// a number that is not finite.
+    pub(super) fn try_out(&self) -> Result<()> {
+        let embedding = self.encode(&probe())?;
+        for count in [1, self.manifest.points_per_batch as usize + 1] {
+            let found = self.decode(&embedding, &vec![[0.5; 2]; count])?;
+            if !found.logits.iter().chain(&found.predicted_iou).all(|v| v.is_finite()) {
+                return Err(Error::internal(format!("{DECODER}: a number is not finite")));
+            }
+        }
+        Ok(())
     }
 
     /// Why a part is not computed where it was to be; `None` where all are.
@@ -190,7 +205,7 @@ impl MaskNetwork {
     ) -> Result<()> {
         let names = &self.manifest.decoder;
         let lead: &[usize] = if self.takes.efficient { &[1] } else { &[] };
-        let get = |name: &str, tail: usize| -> Result<(Vec<usize>, &[f32])> {
+        let get = |name: &str, tail: usize| -> Result<(Vec<usize>, Cow<'_, [f32]>)> {
             let (shape, data) = outputs.get(name)?;
             let wanted = [lead, &[count]].concat();
             if shape.len() != wanted.len() + tail || shape[..wanted.len()] != wanted {
@@ -257,7 +272,7 @@ impl Takes {
                 .get(&names.mask_input)
                 .map(|taken| taken.shape.iter().map(|&n| fixed(n).unwrap_or(1)).collect()),
             has_mask: file.get(&names.has_mask_input).is_some(),
-            size: file.get(&names.orig_im_size).map(|taken| taken.whole),
+            size: file.get(&names.orig_im_size).map(network::Taken::whole),
         })
     }
 
@@ -318,8 +333,48 @@ fn placed(manifest: &MasksManifest, photo: &Photo) -> [u32; 2] {
 fn image(manifest: &MasksManifest, photo: &Photo) -> Vec<f32> {
     let placed = placed(manifest, photo).map(|side| side as usize);
     let from = [photo.width, photo.height].map(|side| side as usize);
-    let pixels = resize(&photo.rgb, from, placed);
+    let pixels = resize(&photo.rgb, from, placed, manifest.resize);
     planes(&pixels, placed, manifest.size as usize, manifest.mean, manifest.std)
+}
+
+/// Each file with its tensors.
+pub(super) fn signatures(manifest: &MasksManifest) -> Vec<Signature<'_>> {
+    let (encoder, decoder) = (encoder_signature(manifest), decoder_signature(manifest));
+    vec![(ENCODER, &manifest.encoder.file, encoder), (DECODER, &manifest.decoder.file, decoder)]
+}
+
+/// The encoder's tensors; what its outputs are is between the two files.
+fn encoder_signature(manifest: &MasksManifest) -> Vec<Wanted<'_>> {
+    let (names, side) = (&manifest.encoder, manifest.size as usize);
+    let shape = [1, 3, side, side].map(|size| vec![size]).to_vec();
+    let outputs = [&names.output].into_iter().chain(&names.features);
+    [Wanted::new(Side::Input, &names.input, shape)]
+        .into_iter()
+        .chain(outputs.map(|name| Wanted::unshaped(Side::Output, name)))
+        .collect()
+}
+
+/// The decoder's tensors; prompts and points of a prompt are read from the file.
+fn decoder_signature(manifest: &MasksManifest) -> Vec<Wanted<'_>> {
+    let names = &manifest.decoder;
+    let any = Vec::new;
+    let lead = match manifest.adapter {
+        MaskAdapter::Sam => vec![],
+        MaskAdapter::EfficientSam => vec![vec![1]],
+    };
+    let of = |side, name, tail: &[Vec<usize>]| Wanted::new(side, name, [&lead, tail].concat());
+    let mut all = vec![
+        of(Side::Input, &*names.point_coords, &[any(), any(), vec![2]]),
+        of(Side::Input, &names.point_labels, &[any(), any()]),
+        of(Side::Output, &names.low_res_masks, &[any(), any(), any(), any()]),
+        of(Side::Output, &names.iou_predictions, &[any(), any()]),
+        Wanted::new(Side::MayTake, &names.mask_input, vec![any(), any(), any(), any()]),
+        Wanted::new(Side::MayTake, &names.has_mask_input, vec![vec![1]]),
+        Wanted { whole: None, ..Wanted::new(Side::MayTake, &names.orig_im_size, vec![vec![2]]) },
+    ];
+    let features = [&names.image_embeddings].into_iter().chain(&manifest.encoder.features);
+    all.extend(features.map(|name| Wanted::unshaped(Side::Input, name)));
+    all
 }
 
 /// The encoder's outputs under the decoder's names.
@@ -332,7 +387,7 @@ fn embedding(
     let features = manifest.encoder.features.iter().map(|name| (name, name));
     let tensor = |(from, to): (&String, &String)| {
         let (shape, data) = outputs.get(from)?;
-        Ok((to.clone(), shape, data.to_vec()))
+        Ok((to.clone(), shape, data.into_owned()))
     };
     let tensors = [main].into_iter().chain(features).map(tensor).collect::<Result<_>>()?;
     Ok(PhotoEmbedding { resized, tensors })

@@ -8,6 +8,7 @@
 //! [`ViewGaussians`]: crate::scene::ViewGaussians
 
 mod bundle;
+mod check;
 mod correlate;
 mod fit;
 mod frame;
@@ -16,12 +17,14 @@ mod image_text;
 mod manifest;
 mod masks;
 mod network;
+mod onnx;
 mod options;
 mod places;
 mod resize;
 mod runtime;
 
 pub use bundle::{Bundle, BundleFile};
+pub use check::{BundleCheck, CheckedFile, check};
 pub use fit::{FittedPhoto, bucket_for, fit};
 pub use frame::ModelFrame;
 pub use geometry::{Geometry, GeometryInput};
@@ -33,4 +36,5 @@ pub use manifest::{
 };
 pub use masks::{MaskNetwork, PhotoEmbedding};
 pub use options::{NetworkOptions, ProviderChoice};
+pub use resize::ResizeFilter;
 pub use runtime::{Provider, Runtime, SETUP_COMMAND};

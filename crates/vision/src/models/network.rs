@@ -13,9 +13,10 @@ use std::{
     },
 };
 
+use half::f16;
 use ort::{
     session::{Session, SessionInputValue, SessionOutputs, builder::PrepackedWeights},
-    value::{TensorElementType, TensorRef, ValueType},
+    value::{Outlet, Shape, Tensor, TensorElementType, TensorRef, ValueType},
 };
 use parking_lot::{Condvar, Mutex};
 use tracing::{info, warn};
@@ -31,6 +32,8 @@ use crate::{
 
 /// Failed runs in a row after which a provider is not asked again.
 const FAILURES_MAX: u32 = 3;
+/// A network of more bytes has one session on the CPU, which runs for one job at a time.
+const SHARED_BYTES: u64 = 256 << 20;
 
 /// Numbers of a tensor.
 #[derive(Clone, Debug)]
@@ -76,9 +79,14 @@ impl<'a> Input<'a> {
         Self { name, shape: shape.to_vec(), data: data.into() }
     }
 
-    fn value(&self) -> ort::Result<SessionInputValue<'_>> {
+    /// For a session; `half` where its file takes f16.
+    fn value(&self, half: bool) -> ort::Result<SessionInputValue<'_>> {
         let shape = self.shape.clone();
         Ok(match &self.data {
+            Data::F32(data) if half => {
+                let data: Vec<f16> = data.iter().map(|v| f16::from_f32(*v)).collect();
+                Tensor::from_array((shape, data))?.into()
+            }
             Data::F32(data) => TensorRef::from_array_view((shape, &**data))?.into(),
             Data::I64(data) => TensorRef::from_array_view((shape, &**data))?.into(),
         })
@@ -87,18 +95,24 @@ impl<'a> Input<'a> {
 
 /// What a run gave.
 pub(super) trait Outputs {
-    /// Shape and numbers of an output.
-    fn get(&self, name: &str) -> Result<(Vec<usize>, &[f32])>;
+    /// Shape and numbers of an output; those of an f16 are widened.
+    fn get(&self, name: &str) -> Result<(Vec<usize>, Cow<'_, [f32]>)>;
 }
 
 impl Outputs for SessionOutputs<'_> {
-    fn get(&self, name: &str) -> Result<(Vec<usize>, &[f32])> {
+    fn get(&self, name: &str) -> Result<(Vec<usize>, Cow<'_, [f32]>)> {
         let value = SessionOutputs::get(self, name)
             .ok_or_else(|| Error::internal(format!("no output {name:?}")))?;
+        let sizes = |shape: &Shape| -> Vec<usize> {
+            shape.iter().map(|&n| usize::try_from(n).unwrap_or(0)).collect()
+        };
+        if let Ok((shape, data)) = value.try_extract_tensor::<f16>() {
+            return Ok((sizes(shape), data.iter().map(|v| v.to_f32()).collect()));
+        }
         let (shape, data) = value
             .try_extract_tensor::<f32>()
             .map_err(|e| Error::internal(format!("output {name:?} is not of f32")).caused_by(e))?;
-        Ok((shape.iter().map(|&n| usize::try_from(n).unwrap_or(0)).collect(), data))
+        Ok((sizes(shape), data.into()))
     }
 }
 
@@ -132,7 +146,11 @@ impl Runner for Session {
         let failed = |e: ort::Error| Failure::Run(Box::new(e));
         let values: Vec<(&str, SessionInputValue<'_>)> = inputs
             .iter()
-            .map(|input| Ok((input.name, input.value()?)))
+            .map(|input| {
+                let taken = self.inputs().iter().find(|taken| taken.name() == input.name);
+                let kind = taken.and_then(|taken| taken.dtype().tensor_type());
+                Ok((input.name, input.value(kind == Some(TensorElementType::Float16))?))
+            })
             .collect::<ort::Result<_>>()
             .map_err(failed)?;
         let outputs = Self::run(self, values).map_err(failed)?;
@@ -180,37 +198,134 @@ impl Drop for Lent<'_> {
     }
 }
 
-/// What a file takes under one name.
+/// A tensor of a file.
 #[derive(Clone, Debug)]
 pub(super) struct Taken {
     name: String,
-    /// -1 where it is free.
+    /// -1 where it is free; empty where the file says nothing.
     pub(super) shape: Vec<i64>,
-    /// Whole numbers, not f32.
-    pub(super) whole: bool,
+    kind: TensorElementType,
 }
 
-/// The inputs of a file.
+impl Taken {
+    fn of(outlet: &Outlet) -> Self {
+        let (shape, kind) = match outlet.dtype() {
+            ValueType::Tensor { ty, shape, .. } => (shape.to_vec(), *ty),
+            _ => (Vec::new(), TensorElementType::Undefined),
+        };
+        Self { name: outlet.name().to_owned(), shape, kind }
+    }
+
+    /// Whole numbers, not f32 or f16.
+    pub(super) fn whole(&self) -> bool {
+        self.kind == TensorElementType::Int64
+    }
+}
+
+/// The inputs and outputs of a file.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Takes(Vec<Taken>);
+pub(super) struct Takes {
+    inputs: Vec<Taken>,
+    outputs: Vec<Taken>,
+}
 
 impl Takes {
     fn of(session: &Session) -> Self {
-        let inputs = session.inputs().iter().map(|input| {
-            let (shape, whole) = match input.dtype() {
-                ValueType::Tensor { ty, shape, .. } => {
-                    (shape.to_vec(), *ty == TensorElementType::Int64)
-                }
-                _ => (Vec::new(), false),
-            };
-            Taken { name: input.name().to_owned(), shape, whole }
-        });
-        Self(inputs.collect())
+        let all = |outlets: &[Outlet]| outlets.iter().map(Taken::of).collect();
+        Self { inputs: all(session.inputs()), outputs: all(session.outputs()) }
     }
 
     /// The input of this name; `None` where the file has none.
     pub(super) fn get(&self, name: &str) -> Option<&Taken> {
-        self.0.iter().find(|taken| taken.name == name)
+        self.inputs.iter().find(|taken| taken.name == name)
+    }
+
+    /// What the file has otherwise than the manifest says, all of it.
+    fn misfits(&self, wanted: &[Wanted<'_>]) -> Vec<String> {
+        let mut faults: Vec<String> = wanted.iter().filter_map(|want| want.misfit(self)).collect();
+        let known = |taken: &&Taken| wanted.iter().any(|want| want.name == taken.name);
+        faults.extend(
+            self.inputs
+                .iter()
+                .filter(|taken| !known(taken))
+                .map(|taken| format!("takes {:?}, which nothing gives it", taken.name)),
+        );
+        faults
+    }
+}
+
+/// Which side of a network a tensor is on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Side {
+    Input,
+    /// An input that a file may lack.
+    MayTake,
+    Output,
+}
+
+/// A tensor that a network must have.
+#[derive(Clone, Debug)]
+pub(super) struct Wanted<'a> {
+    pub(super) side: Side,
+    pub(super) name: &'a str,
+    /// Whole numbers (i64); `None`: either kind.
+    pub(super) whole: Option<bool>,
+    /// For each dimension every size that is used, where an empty list is any; `None`: any shape.
+    pub(super) shape: Option<Vec<Vec<usize>>>,
+}
+
+impl<'a> Wanted<'a> {
+    /// A tensor of f32 (or f16).
+    pub(super) fn new(side: Side, name: &'a str, shape: Vec<Vec<usize>>) -> Self {
+        Self { side, name, whole: Some(false), shape: Some(shape) }
+    }
+
+    /// The same of any shape.
+    pub(super) fn unshaped(side: Side, name: &'a str) -> Self {
+        Self { side, name, whole: Some(false), shape: None }
+    }
+
+    fn misfit(&self, takes: &Takes) -> Option<String> {
+        let (word, all) = match self.side {
+            Side::Input | Side::MayTake => ("input", &takes.inputs),
+            Side::Output => ("output", &takes.outputs),
+        };
+        let name = self.name;
+        let Some(found) = all.iter().find(|taken| taken.name == name) else {
+            let needed = self.side != Side::MayTake;
+            return needed.then(|| format!("has no {word} {name:?}"));
+        };
+        let real = matches!(found.kind, TensorElementType::Float32 | TensorElementType::Float16);
+        let kind_fits = match self.whole {
+            Some(true) => found.whole(),
+            Some(false) => real,
+            None => real || found.whole(),
+        };
+        // A file that fixes a size takes no other.
+        let fits = |(have, want): (&i64, &Vec<usize>)| {
+            fixed(*have).is_none_or(|have| want.iter().all(|size| *size == have))
+        };
+        let unknown = found.shape.is_empty() && self.side == Side::Output;
+        let shape = self.shape.as_ref().filter(|_| !unknown);
+        let shape_fits = shape.is_none_or(|shape| {
+            found.shape.len() == shape.len() && found.shape.iter().zip(shape).all(fits)
+        });
+        if kind_fits && shape_fits {
+            return None;
+        }
+        let size = |sizes: &Vec<usize>| match (sizes.iter().min(), sizes.iter().max()) {
+            (Some(first), Some(last)) if first == last => first.to_string(),
+            (Some(first), Some(last)) => format!("{first}..{last}"),
+            _ => "any".to_owned(),
+        };
+        let shape: Vec<String> = self.shape.iter().flatten().map(size).collect();
+        let kind = if self.whole == Some(true) { "i64" } else { "f32" };
+        Some(format!(
+            "{word} {name:?} is {} {:?}, not {kind} [{}]",
+            found.kind,
+            found.shape,
+            shape.join(", ")
+        ))
     }
 }
 
@@ -227,8 +342,8 @@ pub(super) struct Spec<'a> {
     pub(super) file: &'a str,
     /// The file that the CPU runs, where it is another one.
     pub(super) cpu_file: Option<&'a str>,
-    /// The outputs that are compared.
-    pub(super) outputs: Vec<&'a str>,
+    /// The tensors that it must have; its outputs are compared.
+    pub(super) signature: Vec<Wanted<'a>>,
     /// The largest relative difference of an output to the CPU's, root of mean squares.
     pub(super) tolerance: f64,
     /// The fixed input of the comparison.
@@ -243,13 +358,16 @@ struct Opener {
     file: PathBuf,
     /// The CPU's own file, in 8 bits.
     cpu_file: Option<PathBuf>,
+    /// One session, whatever the number of jobs.
+    shared: bool,
 }
 
 impl Opener {
-    /// A session a job on the CPU, with the weights of all in memory once. One session on a device:
-    /// it runs one network at a time whatever the number of jobs.
+    /// A session a job on the CPU, or one that all jobs wait for where the network is large. One
+    /// session on a device: it runs one network at a time whatever the number of jobs.
     fn open(&self, provider: Provider) -> ort::Result<(Pool, Takes)> {
         let (count, threads) = match provider {
+            Provider::Cpu if self.shared => (1, self.options.threads),
             Provider::Cpu => shares(self.options.threads, self.options.jobs),
             Provider::Cuda | Provider::Webgpu => (1, self.options.threads),
         };
@@ -320,6 +438,7 @@ impl Network {
             options: options.clone(),
             file: bundle.path(spec.file),
             cpu_file: spec.cpu_file.map(|file| bundle.path(file)),
+            shared: bundle.network_bytes(spec.file) > SHARED_BYTES,
         };
         let mut refused = None;
         for provider in runtime.candidates(options.provider)? {
@@ -328,6 +447,11 @@ impl Network {
                 unavailable(format!("{what}: {name} does not open {}", spec.file)).caused_by(e)
             });
             let checked = opened.and_then(|(pool, takes)| {
+                let misfits = takes.misfits(&spec.signature);
+                if !misfits.is_empty() {
+                    let (file, all) = (spec.file, misfits.join("; and "));
+                    return Err(unavailable(format!("{what}: {file} {all}")));
+                }
                 if provider != Provider::Cpu {
                     let reference = opener.reference().map_err(|e| {
                         unavailable(format!("{what}: cpu does not open {}", spec.file)).caused_by(e)
@@ -453,6 +577,25 @@ impl Network {
     }
 }
 
+/// What a network's file has otherwise than its manifest says; or why the CPU does not open it.
+pub(super) fn misfits(
+    runtime: &Runtime,
+    bundle: &Bundle,
+    options: &NetworkOptions,
+    (what, file): (&str, &str),
+    wanted: &[Wanted<'_>],
+) -> Vec<String> {
+    let path = bundle.path(file);
+    match runtime.session(&path, Provider::Cpu, options.threads, None, Arithmetic::Fast) {
+        Ok(session) => Takes::of(&session)
+            .misfits(wanted)
+            .into_iter()
+            .map(|fault| format!("{what}: {file} {fault}"))
+            .collect(),
+        Err(e) => vec![format!("{what}: cpu does not open {file}: {e}")],
+    }
+}
+
 /// Holds a provider to the reference on one input: the largest relative difference of an output,
 /// root of mean squares.
 ///
@@ -469,8 +612,8 @@ fn check(
     let answers = |pool: &Pool, name: &str| {
         let mut answers: Vec<Vec<f32>> = Vec::new();
         let mut read = |outputs: &dyn Outputs| {
-            for name in &spec.outputs {
-                answers.push(outputs.get(name)?.1.to_vec());
+            for output in spec.signature.iter().filter(|wanted| wanted.side == Side::Output) {
+                answers.push(outputs.get(output.name)?.1.into_owned());
             }
             Ok(())
         };
@@ -525,8 +668,8 @@ mod tests {
     struct One([f32; 1]);
 
     impl Outputs for One {
-        fn get(&self, _: &str) -> Result<(Vec<usize>, &[f32])> {
-            Ok((vec![1], &self.0))
+        fn get(&self, _: &str) -> Result<(Vec<usize>, Cow<'_, [f32]>)> {
+            Ok((vec![1], self.0.as_slice().into()))
         }
     }
 
@@ -553,7 +696,7 @@ mod tests {
             what: "fake network",
             file: "fake.onnx",
             cpu_file: None,
-            outputs: vec!["answer"],
+            signature: vec![Wanted::new(Side::Output, "answer", vec![vec![1]])],
             tolerance: 1e-2,
             probe: &|_| Ok(Vec::new()),
         };

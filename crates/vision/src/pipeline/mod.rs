@@ -187,11 +187,19 @@ pub fn reconstruct(
     let views_max = views_max(options, manifest.views_min, manifest.views_max)?;
     let method = options.method();
     method.check()?;
+    if photos.len() < manifest.views_min {
+        return Err(Error::invalid(format!(
+            "{} photos; the geometry network of this bundle takes at least {}",
+            photos.len(),
+            manifest.views_min
+        )));
+    }
 
     let (capture, sets) = stages.run(Stage::Capture, || {
         pipeline.workers.install(|| {
             let capture = capture::analyse(photos, cancel)?;
-            let sets = capture::view_sets(&capture, photos, views_max, manifest.neighbors_max);
+            let views = [manifest.views_min, views_max];
+            let sets = capture::view_sets(&capture, photos, views, manifest.neighbors_max);
             Ok((capture, sets))
         })
     })?;
@@ -204,6 +212,7 @@ pub fn reconstruct(
                 photos,
                 views: &set.views,
                 near_far: &capture.near_far,
+                median_depth: capture.median_depth,
                 neighbors: &set.neighbors,
             };
             views.extend(pipeline.geometry.run(&input)?);

@@ -14,8 +14,9 @@ use crate::{
     error::{Error, ErrorCode, Result},
     models::{ImageText, MaskNetwork, NetworkOptions},
     scene::{
-        Bank, BankMask, Crop, Gaussians, IndexMap, Method, PhotoMasks, PosedPhoto, Preset,
-        SceneCamera, ScoringMethod, Semantics, SemanticsReport, Stage, Watch, unless_cancelled,
+        Bank, BankMask, Crop, CropShape, Gaussians, IndexMap, Method, PhotoMasks, PosedPhoto,
+        Preset, SceneCamera, ScoringMethod, Semantics, SemanticsReport, Stage, Watch,
+        unless_cancelled,
     },
     semantics::{self, Clusters, Cutter, Scoring, Views},
 };
@@ -33,6 +34,8 @@ pub struct SemanticsTools<'a> {
     pub dim: usize,
     /// Added around a mask's box on each side, share of its longer side.
     pub crop_margin: f64,
+    /// What a crop shows of a box that is no square.
+    pub crop_shape: CropShape,
     /// Crops that are embedded together, and so in memory together.
     pub batch: usize,
 }
@@ -155,6 +158,7 @@ pub fn understand(
         embed: &|crops| towers.embed_images(crops),
         dim: towers.manifest().dim,
         crop_margin: if method.crop_margin { f64::from(image.crop_margin) } else { 0.0 },
+        crop_shape: image.crop_shape,
         batch: image.batch,
     };
     // Not on a thread of the pool: one that waits for a network would be missing there, and one
@@ -254,7 +258,7 @@ fn embed(
             unless_cancelled(watch.cancel)?;
             (watch.progress)(Stage::Embed, fraction(done, all));
             done += batch.len();
-            let cut = |&k: &usize| Some((k, cutter.cut(k, tools.crop_margin)?));
+            let cut = |&k: &usize| Some((k, cutter.cut(k, tools.crop_margin, tools.crop_shape)?));
             let (of, crops): (Vec<usize>, Vec<Crop>) = batch.par_iter().filter_map(cut).unzip();
             if crops.is_empty() {
                 continue;

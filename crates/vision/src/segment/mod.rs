@@ -12,6 +12,7 @@ mod filter;
 mod nms;
 mod photo_grid;
 mod prompts;
+mod regions;
 
 use std::sync::atomic::AtomicBool;
 
@@ -60,6 +61,9 @@ pub struct Settings {
     pub box_nms_thresh: f32,
     /// Of two masks with more IoU than this the less sure one goes; 1 switches it off.
     pub mask_nms_thresh: f32,
+    /// Holes and islands of fewer cells go from a mask after NMS; 0: none. Judged at the photo's
+    /// pixels where `full_resolution` is set.
+    pub min_mask_region_area: u32,
     /// Smallest mask, share of the photo.
     pub min_area: f64,
     /// Largest mask, share of the photo.
@@ -90,6 +94,7 @@ impl Default for Settings {
             stability_score_offset: 1.0,
             box_nms_thresh: 0.7,
             mask_nms_thresh: 0.7,
+            min_mask_region_area: 0,
             min_area: 0.0005,
             max_area: 0.95,
             part_thresh: 0.85,
@@ -217,5 +222,8 @@ fn passed(
     }
     let kept = nms::suppress(&found.masks, settings.box_nms_thresh, settings.mask_nms_thresh);
     found.masks = kept.into_iter().map(|at| std::mem::take(&mut found.masks[at])).collect();
+    if settings.min_mask_region_area > 0 {
+        regions::clean(&mut found, settings.min_mask_region_area as usize, settings.box_nms_thresh);
+    }
     Ok((found, filter.map(|filter| filter.photo_grid())))
 }

@@ -19,7 +19,7 @@ pub(super) fn suppress(masks: &[Proposal], box_threshold: f32, mask_threshold: f
 }
 
 /// Removes from `order` each mask that is too similar to an earlier one that stays.
-fn greedy(order: &[usize], alike: impl Fn(usize, usize) -> bool) -> Vec<usize> {
+pub(super) fn greedy(order: &[usize], alike: impl Fn(usize, usize) -> bool) -> Vec<usize> {
     let mut kept: Vec<usize> = Vec::new();
     for &mask in order {
         if !kept.iter().any(|&before| alike(before, mask)) {

@@ -1,9 +1,9 @@
-//! Cuts a mask out of its photo: its box with a margin, as a square, black outside the mask.
+//! Cuts a mask out of its photo: its box with a margin, black outside the mask.
 //!
 //! Where the masks come with their whole cells ([`PhotoMasks::wholes`]), a crop shows all of its
 //! mask, also what smaller masks cover in the index map.
 
-use crate::scene::{Crop, Photo, PhotoMasks};
+use crate::scene::{Crop, CropShape, Photo, PhotoMasks};
 
 /// First and last column and row of a mask, pixels of the photo.
 #[derive(Clone, Copy, Debug)]
@@ -104,28 +104,34 @@ impl<'a> Cutter<'a> {
     /// The crop of mask `k`, counted from 0, with a margin of `margin` times the longer side of its
     /// box. `None` if the mask has no pixel of the photo.
     #[must_use]
-    pub fn cut(&self, k: usize, margin: f64) -> Option<Crop> {
+    pub fn cut(&self, k: usize, margin: f64, shape: CropShape) -> Option<Crop> {
         let bounds = (*self.bounds.get(k)?)?;
-        let longer = (bounds.x[1] - bounds.x[0]).max(bounds.y[1] - bounds.y[0]) + 1;
+        let [wide, high] = [bounds.x, bounds.y].map(|[first, last]| last - first + 1);
+        let longer = wide.max(high);
         #[expect(
             clippy::cast_possible_truncation,
             clippy::cast_sign_loss,
             reason = "a margin is a small share of a photo's side"
         )]
         let border = (margin.max(0.0) * f64::from(longer)).round().min(f64::from(longer)) as u32;
-        let side = longer + 2 * border;
+        let box_size = match shape {
+            CropShape::Square => [longer; 2],
+            CropShape::Stretched => [wide, high],
+        };
+        let [width, height] = box_size.map(|side| side + 2 * border);
         // The box is in the middle. An odd pixel goes to the right and to the bottom.
-        let start =
-            |[first, last]: [u32; 2]| i64::from(first) - i64::from(side - (last - first + 1)) / 2;
-        let (left, top) = (start(bounds.x), start(bounds.y));
-        let mut rgb = vec![0; side as usize * side as usize * 3];
+        let start = |[first, last]: [u32; 2], side: u32| {
+            i64::from(first) - i64::from(side - (last - first + 1)) / 2
+        };
+        let (left, top) = (start(bounds.x, width), start(bounds.y, height));
+        let mut rgb = vec![0; width as usize * height as usize * 3];
         let (wanted, whole) = (k + 1, self.whole(k));
         let inside = |cell: usize| match &whole {
             Some(whole) => whole.get(cell).copied().unwrap_or(false),
             None => usize::from(self.masks.map.index.get(cell).copied().unwrap_or(0)) == wanted,
         };
         for y in bounds.y[0]..=bounds.y[1] {
-            let into = (i64::from(y) - top) as usize * side as usize;
+            let into = (i64::from(y) - top) as usize * width as usize;
             for x in bounds.x[0]..=bounds.x[1] {
                 let cell = self.rows[y as usize] + self.columns[x as usize];
                 let from = y as usize * self.photo.width as usize + x as usize;
@@ -136,6 +142,6 @@ impl<'a> Cutter<'a> {
                 }
             }
         }
-        Some(Crop { side, rgb })
+        Some(Crop { width, height, rgb })
     }
 }

@@ -108,7 +108,7 @@ fn overlap_falls_with_distance_and_sets_follow_it() {
     let capture = analyse(&posed).unwrap();
     assert!(capture.overlap[0][1] > 0.8, "{}", capture.overlap[0][1]);
     assert!(capture.overlap[0][8] < capture.overlap[0][1]);
-    let sets = capture::view_sets(&capture, &posed, 4, 3);
+    let sets = capture::view_sets(&capture, &posed, [2, 4], 3);
     let shared = |a: &[usize], b: &[usize]| a.iter().filter(|v| b.contains(v)).count();
     for pair in sets.windows(2) {
         let earlier = sets.iter().take_while(|s| *s != &pair[1]);
@@ -127,10 +127,21 @@ fn overlap_falls_with_distance_and_sets_follow_it() {
     }
     assert!(seen.iter().all(|&n| n >= 1), "every photo is used: {seen:?}");
     assert!(seen.iter().any(|&n| n >= 2), "sets overlap: {seen:?}");
-    let one = capture::view_sets(&capture, &posed, 16, 3);
+    let one = capture::view_sets(&capture, &posed, [2, 16], 3);
     assert_eq!(one.len(), 1);
     assert_eq!(one[0].views.len(), 9);
-    assert_eq!(one, capture::view_sets(&capture, &posed, 16, 3), "deterministic");
+    assert_eq!(one, capture::view_sets(&capture, &posed, [2, 16], 3), "deterministic");
+    // A network of exactly 4 views: the last set is filled up with photos of the others.
+    for fixed in [2, 4, 6] {
+        let sets = capture::view_sets(&capture, &posed, [fixed; 2], 3);
+        assert!(sets.iter().all(|set| set.views.len() == fixed), "{fixed} views: {sets:?}");
+        let all = |i: usize| sets.iter().any(|set| set.views.contains(&i));
+        assert!((0..9).all(all), "every photo is used: {sets:?}");
+        for set in &sets {
+            let once = |v: &usize| set.views.iter().filter(|w| w == &v).count() == 1;
+            assert!(set.views.iter().all(once), "no photo twice: {set:?}");
+        }
+    }
 }
 
 #[test]
@@ -378,4 +389,21 @@ fn ranges_of_a_real_room_hold_what_a_depth_camera_saw() {
             assert!(share > 0.93, "photo {i} of {pair:?}: {share} in {range:?}");
         }
     }
+}
+
+#[test]
+fn a_set_of_fixed_size_takes_photos_that_share_nothing_where_no_others_are_left() {
+    let posed = sample::photos(&options(4)).unwrap();
+    let mut capture = analyse(&posed).unwrap();
+    // Photos 0 and 1 overlap each other, 2 and 3 overlap nothing.
+    for (i, row) in capture.overlap.iter_mut().enumerate() {
+        for (j, share) in row.iter_mut().enumerate() {
+            *share = f64::from(u8::from(i == j || (i < 2 && j < 2)));
+        }
+    }
+    let views = |min| capture::view_sets(&capture, &posed, [min, 4], 3);
+    assert_eq!(views(2).iter().map(|set| set.views.len()).collect::<Vec<_>>(), [2], "the pair");
+    let filled = views(4);
+    assert_eq!(filled.len(), 1, "{filled:?}");
+    assert_eq!(filled[0].views.len(), 4, "{filled:?}");
 }

@@ -227,7 +227,11 @@ fn photos_give_masks_and_seeds_say_where_they_reappear() {
 
 fn crop(colour: [u8; 3], side: u32) -> Crop {
     let pixel = |x: u32| if x < side / 4 { [0; 3] } else { colour };
-    Crop { side, rgb: (0..side * side).flat_map(|at| pixel(at % side)).collect() }
+    Crop {
+        width: side,
+        height: side,
+        rgb: (0..side * side).flat_map(|at| pixel(at % side)).collect(),
+    }
 }
 
 fn cosine(a: &[f32], b: &[f32]) -> f32 {

@@ -1,7 +1,7 @@
 //! Photos at the size of the geometry network.
 
 use segsplat_core::scene::{Camera, CameraToWorld, Intrinsics, Photo};
-use segsplat_vision::models::{bucket_for, fit};
+use segsplat_vision::models::{ResizeFilter, bucket_for, fit};
 
 fn camera(width: u32, height: u32) -> Camera {
     let pose = [1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1., 0., 0., 0., 0., 1.];
@@ -23,7 +23,7 @@ fn intrinsics_follow_the_crop_and_resize() {
     for (size, bucket) in [((100, 61), [32, 48]), ((61, 100), [32, 32]), ((90, 33), [48, 32])] {
         let photo = ramp(size.0, size.1);
         let camera = camera(size.0, size.1);
-        let fitted = fit(&photo, &camera, bucket);
+        let fitted = fit(&photo, &camera, bucket, ResizeFilter::Triangle);
         // The pixel that shows a point must show the colour the photo has at that point.
         for (x, y) in [(10, 12), (16, 20), (25, 9)] {
             let z = 3.0;
@@ -43,10 +43,46 @@ fn intrinsics_follow_the_crop_and_resize() {
 #[test]
 fn the_same_size_changes_no_pixel() {
     let photo = ramp(48, 32);
-    let fitted = fit(&photo, &camera(48, 32), [32, 48]);
+    let fitted = fit(&photo, &camera(48, 32), [32, 48], ResizeFilter::Triangle);
     let same = fitted.rgb.iter().zip(&photo.rgb).all(|(a, b)| (a * 255.0).round() == f32::from(*b));
     assert!(same, "identity");
     assert_eq!(fitted.camera, camera(48, 32), "camera unchanged");
+}
+
+#[test]
+fn the_filters_are_pillows() {
+    // numpy: (np.arange(7 * 5 * 3) * 37 % 256).reshape(5, 7, 3); Image.resize((3, 2), LANCZOS,
+    // box=(0, 1 / 6, 7, 5 - 1 / 6)), and so on: the crop of 7x5 to the shape 3:2.
+    let rgb: Vec<u8> = (0..105).map(|i| (i * 37 % 256) as u8).collect();
+    let photo = Photo { width: 7, height: 5, rgb, valid: None };
+    let pillow: [(ResizeFilter, [u8; 18]); 3] = [
+        (
+            ResizeFilter::Triangle,
+            [
+                104, 86, 123, 146, 123, 100, 123, 160, 142, 106, 104, 141, 146, 123, 118, 141, 162,
+                132,
+            ],
+        ),
+        (
+            ResizeFilter::Bicubic,
+            [
+                100, 79, 126, 158, 124, 87, 117, 166, 149, 100, 103, 146, 153, 119, 111, 141, 166,
+                134,
+            ],
+        ),
+        (
+            ResizeFilter::Lanczos,
+            [101, 73, 128, 164, 126, 82, 113, 172, 152, 98, 102, 149, 155, 117, 110, 142, 169, 132],
+        ),
+    ];
+    for (filter, wanted) in pillow {
+        let found = fit(&photo, &camera(7, 5), [2, 3], filter).rgb;
+        for (found, wanted) in found.iter().zip(wanted) {
+            // Pillow rounds to 8 bits after the columns and after the rows.
+            let off = (found * 255.0 - f32::from(wanted)).abs();
+            assert!(off < 1.01, "{filter:?}: {} for {wanted}", found * 255.0);
+        }
+    }
 }
 
 #[test]
@@ -57,7 +93,7 @@ fn a_reduction_averages_and_does_not_alias() {
         .flat_map(|y| (0..w).flat_map(move |x| [if (x + y) % 2 == 0 { 255 } else { 0 }; 3]))
         .collect();
     let photo = Photo { width: w, height: h, rgb, valid: None };
-    let fitted = fit(&photo, &camera(w, h), [32, 32]);
+    let fitted = fit(&photo, &camera(w, h), [32, 32], ResizeFilter::Triangle);
     for y in 2..30 {
         for x in 2..30 {
             let v = fitted.rgb[(y * 32 + x) * 3];
@@ -76,7 +112,7 @@ fn pixels_without_a_source_do_not_bleed() {
         }
     }
     photo.valid = Some(valid);
-    let fitted = fit(&photo, &camera(64, 64), [32, 32]);
+    let fitted = fit(&photo, &camera(64, 64), [32, 32], ResizeFilter::Triangle);
     let mask = fitted.valid.unwrap();
     assert!(!mask[5] && mask[15], "the mask follows");
     for (i, ok) in mask.iter().enumerate() {

@@ -64,6 +64,7 @@ fn run(network: &Geometry, photos: &[PosedPhoto]) -> Result<Vec<ViewGaussians>> 
         photos,
         views: &views,
         near_far: &vec![[DEPTH, 10.0 * DEPTH]; photos.len()],
+        median_depth: DEPTH,
         neighbors: &neighbors,
     })
 }

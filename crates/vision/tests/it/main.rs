@@ -13,6 +13,7 @@ mod bank;
 mod bitset;
 mod bundle;
 mod capture;
+mod check;
 mod colours;
 mod crops;
 mod fit;

@@ -38,6 +38,7 @@ fn depth_error(network: &Geometry, seed: u64) -> f64 {
         photos: &photos,
         views: &[0, 1],
         near_far: &[[1.5, 8.0]; 2],
+        median_depth: 3.0,
         neighbors: &[vec![1], vec![0]],
     };
     let mut errors = Vec::new();
@@ -74,6 +75,7 @@ fn answer(bundle: &Bundle, runtime: &Arc<Runtime>) -> Vec<f32> {
         photos: &photos,
         views: &[0, 1],
         near_far: &[[1.5, 8.0]; 2],
+        median_depth: 3.0,
         neighbors: &[vec![1], vec![0]],
     };
     let views = network.run(&input).unwrap();
@@ -180,7 +182,7 @@ type Colour = [u8; 3];
 /// A drawing by what covers each pixel, on black as cut-outs are.
 fn drawing(colour: impl Fn(f64, f64) -> Option<Colour>) -> Crop {
     let pixel = |i: u32| colour(f64::from(i % SIDE), f64::from(i / SIDE)).unwrap_or([0; 3]);
-    Crop { side: SIDE, rgb: (0..SIDE * SIDE).flat_map(pixel).collect() }
+    Crop { width: SIDE, height: SIDE, rgb: (0..SIDE * SIDE).flat_map(pixel).collect() }
 }
 
 /// A ball with light from above.
