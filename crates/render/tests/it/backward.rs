@@ -311,10 +311,10 @@ fn a_view_of_more_pairs_than_are_held_is_refused() {
     let loss = linear(90 * 70, 6);
     let (scene, mut found) = (cloud(30, 0, 1), Gradients::default());
     let told = cpu.backward(&scene, &small(90, 70), &mut |_| Ok(loss.clone()), &mut found);
-    assert!(told.err().expect("too many pairs").message().contains("20"), "names the bound");
+    assert!(told.expect_err("too many pairs").message().contains("20"), "names the bound");
     let none = &mut |_: &_| Ok(linear(3, 1));
     let told = CpuRenderer::new(1).unwrap().backward(&scene, &small(90, 70), none, &mut found);
-    assert!(told.err().expect("another size").message().contains("6300"), "names the size");
+    assert!(told.expect_err("another size").message().contains("6300"), "names the size");
 }
 
 #[test]
