@@ -1,8 +1,8 @@
 //! The backward pass of the one model: from what a loss says of a frame to what it says of the
 //! Gaussians.
 //!
-//! [`oracle`] judges the others: f64, pixel by pixel; finite differences of the forward oracle judge
-//! it. [`crate::cpu::backward`] is the tiled kernel. A renderer that has a backward pass is a
+//! [`oracle`] judges the others: f64, pixel by pixel. Finite differences of the forward oracle
+//! judge it. [`crate::cpu::backward`] is the tiled kernel. A renderer that has a backward pass is a
 //! [`DifferentiableRenderer`].
 //!
 //! For a pixel with Gaussians i front to back, `w_i = alpha_i T_i`, `A = sum w_i` and `B` behind:

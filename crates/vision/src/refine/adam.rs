@@ -140,8 +140,8 @@ impl Adam {
                     let more = (-rates.scales * step(7 + c, by.scales[i][c] * *scale)).exp();
                     *scale = (*scale * more).clamp(Gaussians::SCALE_MIN, Gaussians::SCALE_MAX);
                 }
-                for c in 0..4 {
-                    quats[j][c] -= rates.quats * step(3 + c, by.quats[i][c]);
+                for (c, (value, by)) in quats[j].iter_mut().zip(by.quats[i]).enumerate() {
+                    *value -= rates.quats * step(3 + c, by);
                 }
                 let opacity = opacities[j].clamp(Gaussians::OPACITY_MIN, OPACITY_MAX);
                 let slope = opacity * (1.0 - opacity);

@@ -142,7 +142,7 @@ fn blurred(values: &[f32], stride: usize) -> Vec<f32> {
     out
 }
 
-/// The transpose of [`blurred`]: gives each number's weight to the pixels under its window. `stride`
+/// The transpose of [`blurred`]: gives each number to the pixels under its window. `stride`
 /// is that of the larger picture.
 fn spread(values: &[f32], stride: usize) -> Vec<f32> {
     let inner = stride - (WINDOW - 1) * CHANNELS;

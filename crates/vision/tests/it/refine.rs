@@ -168,7 +168,7 @@ fn a_disturbed_scene_gets_better_on_photos_that_were_held_out() {
     assert!(published.last().unwrap().gaussians.as_raw().means == best.gaussians.as_raw().means);
     // Entries stay with their Gaussians, which stay in order.
     let entries = best.gaussians.semantic_index();
-    assert!(entries.len() <= start.len() && entries.iter().any(|&e| e == 6), "entries");
+    assert!(entries.len() <= start.len() && entries.contains(&6), "entries");
     let again = refined(&start, &photos, 150, &mut Vec::new());
     assert!(again.gaussians.as_raw().means == best.gaussians.as_raw().means, "the same steps");
     assert_eq!(again.report, best.report);
