@@ -41,8 +41,9 @@ pub(crate) struct Args {
     /// Refine for so many milliseconds
     #[arg(long)]
     refine_ms: Option<u64>,
-    /// Longer side of the photos that refinement sees, pixels
-    #[arg(long, default_value_t = 256)]
+    /// Longer side of the photos that refinement sees, pixels: what is learnt smaller than it is
+    /// shown has gaps
+    #[arg(long, default_value_t = 640)]
     refine_side: u32,
     /// Most Gaussians that refinement begins with
     #[arg(long)]
