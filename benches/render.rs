@@ -11,6 +11,7 @@ use criterion::{Criterion, criterion_group, criterion_main};
 use segsplat::{
     render::{
         Kinds, Labels, RenderRequest, Renderer,
+        backward::{DifferentiableRenderer as _, FrameGradients, Gradients},
         cpu::{
             CpuRenderer,
             bin::{Bins, DepthKeys, bin},
@@ -189,9 +190,32 @@ fn stages(criterion: &mut Criterion) {
     }
 }
 
+/// A frame, and a frame with its backward pass, of 100,000 Gaussians at 256 x 256.
+fn backward(criterion: &mut Criterion) {
+    let gaussians = scenes::cloud(100_000, 0, 2);
+    let request = scenes::request(scenes::camera(SIDE, SIDE));
+    let pixels = (SIDE * SIDE) as usize;
+    let loss = FrameGradients { color: Some(vec![[0.1, -0.2, 0.3]; pixels]), ..Default::default() };
+    for threads in [1, 2] {
+        let cpu = CpuRenderer::new(threads).expect("threads");
+        let name = format!("cloud_100000/256x256/{threads}_threads");
+        criterion.bench_function(&format!("backward/forward_alone/{name}"), |b| {
+            b.iter(|| cpu.render(black_box(&gaussians), &request).expect("a picture"));
+        });
+        let mut gradients = Gradients::default();
+        criterion.bench_function(&format!("backward/both/{name}"), |b| {
+            let mut loss = |_: &_| Ok(loss.clone());
+            b.iter(|| {
+                cpu.backward(black_box(&gaussians), &request, &mut loss, &mut gradients)
+                    .expect("gradients")
+            });
+        });
+    }
+}
+
 criterion_group! {
     name = benches;
     config = Criterion::default().sample_size(20);
-    targets = render, stages
+    targets = render, stages, backward
 }
 criterion_main!(benches);

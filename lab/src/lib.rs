@@ -9,6 +9,7 @@ mod density;
 mod frames;
 mod grid;
 mod load;
+mod many;
 mod masks;
 pub mod metrics;
 mod networks;
@@ -29,7 +30,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 use segsplat_core::{error, limits, scene};
 use segsplat_render as render;
-use segsplat_vision::{models, photos as photo_files, pipeline, sample, segment};
+use segsplat_vision::{models, photos as photo_files, pipeline, refine, sample, segment};
 
 use self::rows::{Record, Rows};
 use crate::error::Result;
@@ -48,6 +49,8 @@ pub struct Cli {
 enum Command {
     /// Compare views of scenes with photos that were held out
     Photos(photos::Args),
+    /// Compare scenes of many photos with photos that were held out, refined or not
+    Many(many::Args),
     /// Compare thinned scenes with scenes of all Gaussians
     Density(setup::Inputs),
     /// Compare what texts select with labels
@@ -97,6 +100,7 @@ pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
     let mut rows = Rows::open(&cli.record)?;
     match &cli.command {
         Command::Photos(args) => photos::run(args, &mut rows)?,
+        Command::Many(args) => many::run(args, &mut rows)?,
         Command::Density(args) => density::run(args, &mut rows)?,
         Command::Semantics(args) => semantics::run(args, &mut rows)?,
         Command::Masks(args) => masks::run(args, &mut rows)?,

@@ -4,6 +4,7 @@
 //! the product. [`gpu`] has the same stages in WGSL. All three take a [`RenderRequest`]; [`cpu`]
 //! and [`gpu`] give a [`Frame`].
 
+pub mod backward;
 pub mod compare;
 pub mod constants;
 pub mod cpu;

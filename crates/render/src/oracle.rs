@@ -181,29 +181,29 @@ pub fn contributions(
 
 /// A Gaussian on the picture.
 #[derive(Clone, Copy, Debug)]
-struct Splat {
-    mean: DVec2,
-    conic: DMat2,
+pub(crate) struct Splat {
+    pub(crate) mean: DVec2,
+    pub(crate) conic: DMat2,
     /// Beyond this height alpha is under 1/255 by more than the width of a cliff.
     half_height: f64,
-    opacity: f64,
+    pub(crate) opacity: f64,
     /// Whether it is drawn behind all those that are not.
     behind: bool,
-    depth: f64,
-    color: DVec3,
+    pub(crate) depth: f64,
+    pub(crate) color: DVec3,
     entry: u16,
 }
 
 impl Splat {
     /// Front to back: t.z narrowed to f32 is the key of the model. For a stable sort, so that ties
     /// stay in the order of the scene.
-    fn order(&self, other: &Self) -> Ordering {
+    pub(crate) fn order(&self, other: &Self) -> Ordering {
         let depths = (self.depth as f32).total_cmp(&(other.depth as f32));
         self.behind.cmp(&other.behind).then(depths)
     }
 
     /// Alpha at a place of the picture.
-    fn alpha(&self, at: DVec2) -> f64 {
+    pub(crate) fn alpha(&self, at: DVec2) -> f64 {
         let d = at - self.mean;
         let power = 0.5 * d.dot(self.conic * d);
         (self.opacity * (-power).exp()).min(f64::from(ALPHA_MAX))
@@ -216,7 +216,7 @@ impl Splat {
     }
 }
 
-fn splat(
+pub(crate) fn splat(
     gaussians: &Gaussians,
     i: usize,
     request: &RenderRequest,
@@ -294,12 +294,22 @@ fn blur_lost(source: &Source, mean: DVec3, depth: f64, lens: &Intrinsics) -> f64
 }
 
 /// 3DGS harmonics at a unit direction, +0.5, negatives to 0.
-fn color(sh: &[[f32; 3]], DVec3 { x, y, z }: DVec3) -> DVec3 {
+fn color(sh: &[[f32; 3]], direction: DVec3) -> DVec3 {
+    let sum: DVec3 = sh
+        .iter()
+        .zip(basis(direction))
+        .map(|(&c, weight)| weight * DVec3::from(c.map(f64::from)))
+        .sum();
+    (sum + f64::from(SH_OFFSET)).max(DVec3::ZERO)
+}
+
+/// The 16 basis functions up to degree 3 at a unit direction.
+pub(crate) fn basis(DVec3 { x, y, z }: DVec3) -> [f64; 16] {
     let c1 = f64::from(SH_C1);
     let c2 = SH_C2.map(f64::from);
     let c3 = SH_C3.map(f64::from);
     let (xx, yy, zz) = (x * x, y * y, z * z);
-    let basis = [
+    [
         f64::from(SH_C0),
         -c1 * y,
         c1 * z,
@@ -316,10 +326,7 @@ fn color(sh: &[[f32; 3]], DVec3 { x, y, z }: DVec3) -> DVec3 {
         c3[4] * x * (4.0 * zz - xx - yy),
         c3[5] * z * (xx - yy),
         c3[6] * x * (xx - 3.0 * yy),
-    ];
-    let sum: DVec3 =
-        sh.iter().zip(basis).map(|(&c, weight)| weight * DVec3::from(c.map(f64::from))).sum();
-    (sum + f64::from(SH_OFFSET)).max(DVec3::ZERO)
+    ]
 }
 
 /// Composites the Gaussians of `near` (depth order) at one pixel centre.

@@ -3,6 +3,7 @@
 //! | layer | modules | may use |
 //! |---|---|---|
 //! | L1 stages | [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`sample`] | `segsplat_core`; never each other |
+//! | L1 stages | [`refine`] | `segsplat_core`, `segsplat_render` |
 //! | L2 order | [`pipeline`] | L1; the only place that knows their order |
 
 pub mod capture;
@@ -10,6 +11,7 @@ pub mod lift;
 pub mod models;
 pub mod photos;
 pub mod pipeline;
+pub mod refine;
 pub mod sample;
 pub mod segment;
 pub mod semantics;

@@ -107,9 +107,8 @@ pub fn bin(
     bins: &mut Vec<Bins>,
 ) -> u64 {
     let tiles = grid.tile_count() as usize;
-    let chunks_max = (ENDS_MAX / tiles.max(1)).clamp(CHUNKS_MIN, CHUNKS_MAX);
     let count = projected.tiles_per_gauss.len();
-    let chunk = count.div_ceil(chunks_max).max(CHUNK_MIN);
+    let chunk = chunk_of(count, grid);
     bins.resize_with(count.div_ceil(chunk), Bins::default);
     let total = AtomicU64::new(0);
     bins.par_iter_mut().enumerate().with_max_len(1).for_each(|(at, bins)| {
@@ -126,6 +125,13 @@ pub fn bin(
         }
     });
     total.into_inner()
+}
+
+/// Gaussians of a chunk, of `count` in all.
+pub(super) fn chunk_of(count: usize, grid: &Grid) -> usize {
+    let tiles = grid.tile_count() as usize;
+    let chunks_max = (ENDS_MAX / tiles.max(1)).clamp(CHUNKS_MIN, CHUNKS_MAX);
+    count.div_ceil(chunks_max).max(CHUNK_MIN)
 }
 
 impl Bins {

@@ -5,6 +5,7 @@
 //! threads: each task writes to places that are fixed in advance, and no sum goes across tasks. No
 //! stage runs on one thread alone.
 
+pub mod backward;
 pub mod bin;
 pub mod footprint;
 pub mod lanes;
@@ -22,6 +23,7 @@ use parking_lot::Mutex;
 use rayon::prelude::*;
 
 use self::{
+    backward::BackwardScratch,
     bin::{Bins, DepthKeys},
     footprint::Footprint,
     lanes::KernelOptions,
@@ -55,6 +57,7 @@ pub struct CpuRenderer {
     /// Buffers between frames; one set for each frame drawn at the same time.
     frames: Pool<FrameScratch>,
     tiles: Pool<TileScratch>,
+    backwards: Pool<BackwardScratch>,
     isects_max: u64,
     options: KernelOptions,
 }
@@ -89,6 +92,7 @@ impl CpuRenderer {
             threads: pool,
             frames: Pool::default(),
             tiles: Pool::default(),
+            backwards: Pool::default(),
             isects_max: switches.isects_max.unwrap_or(ISECTS_MAX).into(),
             options: KernelOptions::new(switches),
         })
@@ -100,11 +104,25 @@ impl CpuRenderer {
         gaussians: &Gaussians,
         request: &RenderRequest,
     ) -> Result<(Frame, Vec<DispatchTime>)> {
+        let mut scratch = self.frames.take();
+        let drawn = self.draw_into(gaussians, request, &mut scratch)?;
+        if gaussians.len() <= KEPT_GAUSSIANS_MAX {
+            self.frames.give(scratch);
+        }
+        Ok(drawn)
+    }
+
+    /// The same; footprints, and the pairs of the last band, stay in `scratch`.
+    fn draw_into(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        scratch: &mut FrameScratch,
+    ) -> Result<(Frame, Vec<DispatchTime>)> {
         let mut watch = Watch::new();
         let view = View::new(gaussians.origin(), request)?;
         let pixels = view.width as usize * view.height as usize;
         let mut frame = Frame::blank([view.width, view.height], request, pixels);
-        let mut scratch = self.frames.take();
         let options = self.options;
         watch.ended("begin");
         project::project(gaussians, request, &view, options, &mut scratch.projected);
@@ -120,18 +138,9 @@ impl CpuRenderer {
             paint: Paint::new(request, &view, gaussians.semantic_index(), options),
             weights: Vec::new(),
         };
-        self.draw_band(
-            &Grid::whole(&view, options),
-            &mut band,
-            &mut scratch,
-            &mut frame,
-            &mut watch,
-        )?;
+        self.draw_band(&Grid::whole(&view, options), &mut band, scratch, &mut frame, &mut watch)?;
         if request.labels == Labels::Weights {
             frame.weights = Some(WeightRows::join(band.weights)?);
-        }
-        if gaussians.len() <= KEPT_GAUSSIANS_MAX {
-            self.frames.give(scratch);
         }
         let frame = frame.finish(request.samples);
         watch.ended("end");

@@ -44,7 +44,7 @@ pub(super) const CELL_Y: Numbers = along(ACROSS, true, CELL as f32);
 pub(super) const PIXEL_X: Numbers = along(CELL, false, 1.0);
 pub(super) const PIXEL_Y: Numbers = along(CELL, true, 1.0);
 /// Powers are exponents of 2: half the squared distance times log2 e.
-const SQRT_LOG2_E: f64 = 1.201_122_408_786_449_8;
+pub(super) const SQRT_LOG2_E: f64 = 1.201_122_408_786_449_8;
 /// Slack for the rounding of a cell's bound, in addition to the footprint's slack.
 const POWER_SLACK: f32 = 1e-4;
 
@@ -91,7 +91,7 @@ const NO_BIN: u32 = u32::MAX;
 /// So f32 is precise enough.
 #[derive(Clone, Copy, Debug, Default)]
 #[repr(C, align(64))]
-struct Staged {
+pub(super) struct Staged {
     ux: f32,
     uy: f32,
     u0: f32,
@@ -99,8 +99,8 @@ struct Staged {
     v0: f32,
     /// Power at which alpha is under 1/255, with slack.
     power_max: f32,
-    opacity: f32,
-    channels: [f32; CHANNELS],
+    pub(super) opacity: f32,
+    pub(super) channels: [f32; CHANNELS],
     /// Bin of its entry, if weights are asked for.
     bin: u32,
 }
@@ -258,7 +258,7 @@ impl Blend<'_> {
         let by_parts = paint.options.skips(Skip::EllipseParts);
         let ends = paint.options.skips(Skip::EndedRays);
         let mut open = clear(&mut scratch.cells, tile);
-        let mut rest = Rest { pairs, portion: PORTION };
+        let mut rest = Rest::new(pairs);
         let mut sorted: &[u64] = &[];
         while open != 0 {
             if sorted.is_empty() {
@@ -316,15 +316,20 @@ impl Blend<'_> {
 
 /// Pairs that are not sorted yet. Most rays end after few Gaussians, so the nearest are sorted
 /// first.
-struct Rest<'a> {
+pub(super) struct Rest<'a> {
     pairs: &'a mut [u64],
     portion: usize,
 }
 
 impl<'a> Rest<'a> {
+    /// All of these.
+    pub(super) fn new(pairs: &'a mut [u64]) -> Self {
+        Self { pairs, portion: PORTION }
+    }
+
     /// The nearest of the rest, sorted; empty if there are none. Each portion is twice the last.
     #[inline(never)]
-    fn nearest(&mut self) -> &'a [u64] {
+    pub(super) fn nearest(&mut self) -> &'a [u64] {
         let pairs = std::mem::take(&mut self.pairs);
         let count = self.portion.min(pairs.len());
         if count < pairs.len() {
@@ -387,13 +392,18 @@ fn clear(cells: &mut [Cell; CELLS], tile: Tile) -> u32 {
 
 /// Column and row in the tile of a pixel of a cell.
 #[inline(always)]
-const fn place(cell: usize, pixel: usize) -> (usize, usize) {
+pub(super) const fn place(cell: usize, pixel: usize) -> (usize, usize) {
     (cell % ACROSS * CELL + pixel % CELL, cell / ACROSS * CELL + pixel / CELL)
 }
 
 /// The footprint, relative to the tile. Computed in f64; the small results become f32.
 #[inline(always)]
-fn stage(footprint: &Footprint, tile: Tile, channels: [f32; CHANNELS], bin: u32) -> Staged {
+pub(super) fn stage(
+    footprint: &Footprint,
+    tile: Tile,
+    channels: [f32; CHANNELS],
+    bin: u32,
+) -> Staged {
     let half = f64::from(TILE_SIZE) / 2.0;
     let x = footprint.mean[0] - (f64::from(tile.x) + half);
     let y = footprint.mean[1] - (f64::from(tile.y) + half);
@@ -415,7 +425,7 @@ fn stage(footprint: &Footprint, tile: Tile, channels: [f32; CHANNELS], bin: u32)
 /// One bit for each cell that the ellipse may touch. In a cell, u and v stay within a box. Its
 /// distance from 0 is compared with `power_max`.
 #[inline(always)]
-fn met<S: Lanes>(simd: S, gaussian: &Staged) -> u16 {
+pub(super) fn met<S: Lanes>(simd: S, gaussian: &Staged) -> u16 {
     let mut bits = 0;
     let half = (CELL - 1) as f32 / 2.0;
     let wide = simd.splat_f32s(half * (gaussian.ux.abs() + gaussian.uy.abs()));
@@ -435,7 +445,12 @@ fn met<S: Lanes>(simd: S, gaussian: &Staged) -> u16 {
 
 /// u and v at places from the middle of the tile.
 #[inline(always)]
-fn along_axes<S: Lanes>(simd: S, gaussian: &Staged, x: S::f32s, y: S::f32s) -> (S::f32s, S::f32s) {
+pub(super) fn along_axes<S: Lanes>(
+    simd: S,
+    gaussian: &Staged,
+    x: S::f32s,
+    y: S::f32s,
+) -> (S::f32s, S::f32s) {
     let u = simd.fused(y, simd.splat_f32s(gaussian.uy), simd.splat_f32s(gaussian.u0));
     let u = simd.fused(x, simd.splat_f32s(gaussian.ux), u);
     let v = simd.fused(y, simd.splat_f32s(gaussian.vy), simd.splat_f32s(gaussian.v0));
@@ -518,7 +533,7 @@ mod tests {
                 .collect();
             let mut want = pairs.clone();
             want.sort_unstable();
-            let mut rest = Rest { pairs: &mut pairs, portion: PORTION };
+            let mut rest = Rest::new(&mut pairs);
             let portions = std::iter::repeat_with(|| rest.nearest());
             let got: Vec<u64> =
                 portions.take_while(|all| !all.is_empty()).flatten().copied().collect();

@@ -60,7 +60,7 @@ pub fn color(sh: &[[f32; 3]], toward: DVec3) -> [f32; 3] {
 
 /// The 16 basis functions up to degree 3 at a unit direction, signs of 3DGS included.
 #[inline]
-fn basis([x, y, z]: [f32; 3]) -> [f32; 16] {
+pub(super) fn basis([x, y, z]: [f32; 3]) -> [f32; 16] {
     let (xx, yy, zz) = (x * x, y * y, z * z);
     [
         SH_C0,

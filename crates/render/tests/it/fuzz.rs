@@ -41,7 +41,7 @@ const POISON: [f32; 24] = [
     1e38,
 ];
 
-fn environment(name: &str, default: u64) -> u64 {
+pub(crate) fn environment(name: &str, default: u64) -> u64 {
     std::env::var(name).ok().and_then(|v| v.parse().ok()).unwrap_or(default)
 }
 
@@ -54,7 +54,7 @@ fn assert_clean(frame: &Frame, what: &str) {
 }
 
 /// One number in five is poison.
-fn poisoned(random: &mut Random, count: u64, sh_degree: u8) -> RawGaussians {
+pub(crate) fn poisoned(random: &mut Random, count: u64, sh_degree: u8) -> RawGaussians {
     let mut raw = RawGaussians { sh_degree, ..RawGaussians::default() };
     for _ in 0..count {
         let mut number = |low: f32, high: f32| match random.bits() % 5 {

@@ -24,6 +24,7 @@ mod literal;
 mod palette;
 mod photos;
 mod quality;
+mod refine;
 mod room;
 mod sample;
 mod score;

@@ -1,0 +1,585 @@
+//! The backward pass of the CPU renderer: see [`crate::backward`] for what it computes.
+//!
+//! 1. The frame is drawn; its footprints and bins stay.
+//! 2. Each tile goes through its Gaussians front to back once more, with the statements of the
+//!    blend, so that the same ones count. What all Gaussians behind one are worth is the worth of
+//!    the pixel, which the frame tells, less what came before. Each Gaussian of the tile gets ten
+//!    sums over its pixels. With `p = u² + v²` for the power, the sums are those of `dL/dp` times
+//!    1, u, v, u², uv and v²: they stay exact for the longest needles.
+//! 3. Each chunk of Gaussians adds up the sums of its pairs, in the order of the tiles, and goes
+//!    back through the projection in f64.
+//!
+//! No number is shared by two tasks, and no sum depends on the number of threads.
+
+use glam::{DMat3, DVec3};
+use rayon::prelude::*;
+
+use super::{
+    CpuRenderer, background,
+    bin::{self, Bins, chunk_of},
+    footprint::Footprint,
+    lanes::{LaneKernel, Lanes, exp2_neg},
+    paint::Paint,
+    project::Projected,
+    rasterize::{
+        CELL_X, CELL_Y, CELLS, Numbers, PIXEL_X, PIXEL_Y, PIXELS, Rest, SQRT_LOG2_E, Staged, Tile,
+        along_axes, met, place, stage,
+    },
+    shade,
+    tiles::Grid,
+};
+use crate::{
+    Frame, RenderRequest,
+    backward::{DifferentiableRenderer, FrameGradients, Gradients, basis_slopes, drawn},
+    constants::{
+        ALPHA_MAX, ALPHA_MIN, BATCH_SIZE, BLUR_PX2, OWN_SIZE, TILE_SIZE, TRANSMITTANCE_MIN,
+    },
+    error::{Error, Result},
+    scene::Gaussians,
+    view::View,
+};
+
+/// Sums of a Gaussian over pixels: of dL/dpower times 1, u, v, u², uv, v²; of the weight times
+/// dL/dcolour; of the weight times dL/d(sum of depths).
+const SUMS: usize = 10;
+type Sums = [f32; SUMS];
+
+/// Scratch of one worker. Its contents are undefined between tiles.
+#[derive(Debug, Default)]
+pub(super) struct BackwardScratch {
+    pairs: Vec<u64>,
+    staged: Vec<Staged>,
+    cells: Vec<Seeds>,
+}
+
+/// What a cell's pixels say, one row for each number.
+#[derive(Clone, Copy, Debug)]
+struct Seeds {
+    /// Transmittance while the ray goes on, 0 after it has ended.
+    transmittance: Numbers,
+    /// What the Gaussians from here on are worth.
+    rest: Numbers,
+    /// dL/dcolour.
+    color: [Numbers; 3],
+    /// dL/d(sum of depths): dL/ddepth over alpha.
+    depth: Numbers,
+    /// The worth of a weight without colour and depth of its own.
+    base: Numbers,
+}
+
+impl Seeds {
+    const NONE: Self = Self {
+        transmittance: Numbers::ZERO,
+        rest: Numbers::ZERO,
+        color: [Numbers::ZERO; 3],
+        depth: Numbers::ZERO,
+        base: Numbers::ZERO,
+    };
+}
+
+/// What a tile says of its Gaussians.
+#[derive(Debug, Default)]
+struct TileSums {
+    /// Where the pairs of each chunk start.
+    starts: Vec<u32>,
+    /// Of each pair, in the order of the scene.
+    sums: Vec<Sums>,
+}
+
+impl DifferentiableRenderer for CpuRenderer {
+    fn backward(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
+        gradients: &mut Gradients,
+    ) -> Result<Frame> {
+        let request = drawn(request);
+        let mut scratch = self.frames.take();
+        let (frame, _) =
+            self.threads.install(|| self.draw_into(gaussians, &request, &mut scratch))?;
+        if frame.stats.intersections > self.isects_max {
+            let what = "backward: Gaussian-tile pairs of a view";
+            return Err(Error::limit(what, frame.stats.intersections, self.isects_max));
+        }
+        let by_frame = loss(&frame)?;
+        by_frame.check(frame.width as usize * frame.height as usize)?;
+        gradients.clear(gaussians.len(), gaussians.sh_count());
+        self.threads.install(|| {
+            let view = View::new(gaussians.origin(), &request)?;
+            let behind = background(&view, &request)?;
+            let pass = Pass {
+                renderer: self,
+                gaussians,
+                request: &request,
+                view: &view,
+                grid: Grid::whole(&view, self.options),
+                projected: &scratch.projected,
+                bins: &scratch.bins,
+                pictures: Pictures { frame: &frame, behind: &behind, by: &by_frame },
+            };
+            let tiles = pass.tiles();
+            pass.gather(&tiles, gradients);
+            Ok::<_, Error>(())
+        })?;
+        self.frames.give(scratch);
+        Ok(frame)
+    }
+}
+
+/// A frame, what lies behind it, and what the loss says of it.
+#[derive(Clone, Copy)]
+struct Pictures<'a> {
+    frame: &'a Frame,
+    behind: &'a Frame,
+    by: &'a FrameGradients,
+}
+
+impl Pictures<'_> {
+    /// What pixel `at` of the picture says: rest, dL/dcolour, dL/d(sum of depths), base.
+    fn seed(&self, at: usize) -> [f32; 6] {
+        let number = |of: &Option<Vec<f32>>| of.as_ref().map_or(0.0, |of| f64::from(of[at]));
+        let color = |of: &Option<Vec<[f32; 3]>>| of.as_ref().map_or([0.0; 3], |of| of[at]);
+        let by_color = color(&self.by.color);
+        let (shown, behind) = (color(&self.frame.color), color(&self.behind.color));
+        let dot = |of: [f32; 3]| -> f64 {
+            by_color.iter().zip(of).map(|(&g, v)| f64::from(g) * f64::from(v)).sum()
+        };
+        let alpha = number(&self.frame.alpha);
+        let by_alpha = number(&self.by.alpha);
+        let by_depth = if alpha > 0.0 { number(&self.by.depth) / alpha } else { 0.0 };
+        let rest = dot(shown) - dot(behind) + by_alpha * alpha;
+        let base = by_alpha - dot(behind) - by_depth * number(&self.frame.depth);
+        let [r, g, b] = by_color;
+        [rest as f32, r, g, b, by_depth as f32, base as f32]
+    }
+}
+
+/// One backward pass.
+struct Pass<'a> {
+    renderer: &'a CpuRenderer,
+    gaussians: &'a Gaussians,
+    request: &'a RenderRequest,
+    view: &'a View,
+    grid: Grid,
+    projected: &'a Projected,
+    bins: &'a [Bins],
+    pictures: Pictures<'a>,
+}
+
+impl Pass<'_> {
+    /// What each tile says.
+    fn tiles(&self) -> Vec<TileSums> {
+        let paint = Paint::new(self.request, self.view, &[], self.renderer.options);
+        let tiles_x = self.grid.tiles_x();
+        let of_tile = |tile: u32| {
+            let mut out = TileSums::default();
+            let mut scratch = self.renderer.backwards.take();
+            scratch.pairs.clear();
+            for bins in self.bins {
+                out.starts.push(scratch.pairs.len() as u32);
+                scratch.pairs.extend(bins.of(tile as usize));
+            }
+            out.sums.resize(scratch.pairs.len(), [0.0; SUMS]);
+            if !scratch.pairs.is_empty() {
+                let (x, y) = (tile % tiles_x * TILE_SIZE, tile / tiles_x * TILE_SIZE);
+                let place = Tile {
+                    x,
+                    y,
+                    width: TILE_SIZE.min(self.grid.width - x),
+                    height: TILE_SIZE.min(self.grid.height - y),
+                };
+                let ids: Vec<u32> = scratch.pairs.iter().map(|&pair| bin::value(pair)).collect();
+                // Pairs come in the order of the scene: places sort like numbers do.
+                for (at, pair) in scratch.pairs.iter_mut().enumerate() {
+                    *pair = *pair >> 32 << 32 | at as u64;
+                }
+                let (footprints, scratch) = (&self.projected.footprints[..], &mut scratch);
+                let (pictures, ids, sums) = (self.pictures, &ids[..], &mut out.sums[..]);
+                self.renderer.options.width.run(TileBackward {
+                    footprints,
+                    ids,
+                    tile: place,
+                    paint: &paint,
+                    pictures,
+                    scratch,
+                    sums,
+                });
+            }
+            self.renderer.backwards.give(scratch);
+            out
+        };
+        (0..self.grid.tile_count()).into_par_iter().with_max_len(1).map(of_tile).collect()
+    }
+
+    /// Adds up what the tiles say of each Gaussian and goes back through the projection.
+    fn gather(&self, tiles: &[TileSums], gradients: &mut Gradients) {
+        let chunk = chunk_of(self.gaussians.len(), &self.grid);
+        let k = self.gaussians.sh_count();
+        let Gradients { means, quats, scales, opacities, sh, seen } = gradients;
+        let out = means.par_chunks_mut(chunk).zip(quats.par_chunks_mut(chunk));
+        let out = out.zip(scales.par_chunks_mut(chunk)).zip(opacities.par_chunks_mut(chunk));
+        let out = out.zip(sh.par_chunks_mut(chunk * k)).zip(seen.par_chunks_mut(chunk));
+        let out = out.with_max_len(1).enumerate();
+        out.for_each(|(at, (((((means, quats), scales), opacities), sh), seen))| {
+            let first = at * chunk;
+            let mut sums = vec![[0.0; SUMS]; means.len()];
+            for (tile, found) in tiles.iter().enumerate() {
+                let start = found.starts[at] as usize;
+                let pairs = self.bins[at].of(tile);
+                for (&pair, more) in pairs.iter().zip(&found.sums[start..]) {
+                    let sum: &mut Sums = &mut sums[bin::value(pair) as usize - first];
+                    sum.iter_mut().zip(more).for_each(|(sum, more)| *sum += more);
+                }
+            }
+            for (i, sums) in sums.iter().enumerate() {
+                seen[i] = self.projected.tiles_per_gauss[first + i] > 0;
+                if *sums == [0.0; SUMS] {
+                    continue;
+                }
+                let back = self.back(first + i, sums);
+                means[i] = back.mean.map(narrowed);
+                quats[i] = back.quat.map(narrowed);
+                scales[i] = back.scales.map(narrowed);
+                opacities[i] = narrowed(back.opacity);
+                let by_sh = &mut sh[i * k..(i + 1) * k];
+                for (channel, weights) in by_sh.iter_mut().zip(back.basis) {
+                    *channel = back.color.map(|by| narrowed(by * weights));
+                }
+            }
+        });
+    }
+}
+
+/// An f32 that is finite: what f64 holds and f32 does not says nothing.
+fn narrowed(value: f64) -> f32 {
+    let narrow = value as f32;
+    if narrow.is_finite() { narrow } else { 0.0 }
+}
+
+/// A tile and its Gaussians.
+struct TileBackward<'a> {
+    footprints: &'a [Footprint],
+    /// Gaussian of each pair, in the order of the scene.
+    ids: &'a [u32],
+    tile: Tile,
+    paint: &'a Paint<'a>,
+    pictures: Pictures<'a>,
+    scratch: &'a mut BackwardScratch,
+    sums: &'a mut [Sums],
+}
+
+impl LaneKernel for TileBackward<'_> {
+    #[inline(always)]
+    fn run<S: Lanes>(self, simd: S) {
+        if self.pictures.by.depth.is_some() {
+            self.back::<S, true>(simd);
+        } else {
+            self.back::<S, false>(simd);
+        }
+    }
+}
+
+impl TileBackward<'_> {
+    #[inline(always)]
+    fn back<S: Lanes, const DEPTH: bool>(self, simd: S) {
+        let Self { footprints, ids, tile, paint, pictures, scratch, sums } = self;
+        let BackwardScratch { pairs, staged, cells } = scratch;
+        let mut open = seed(cells, tile, pictures);
+        let mut rest = Rest::new(pairs);
+        let mut sorted: &[u64] = &[];
+        while open != 0 {
+            if sorted.is_empty() {
+                sorted = rest.nearest();
+            }
+            let batch = &sorted[..BATCH_SIZE.min(sorted.len())];
+            sorted = &sorted[batch.len()..];
+            if batch.is_empty() {
+                break;
+            }
+            staged.clear();
+            staged.extend(batch.iter().map(|&pair| {
+                let id = ids[bin::value(pair) as usize] as usize;
+                let footprint = footprints[id];
+                stage(&footprint, tile, paint.channels(&footprint, id), 0)
+            }));
+            for (gaussian, &pair) in staged.iter().zip(batch) {
+                let met = u32::from(met(simd, gaussian)) & open;
+                if met != 0 {
+                    let sum = &mut sums[bin::value(pair) as usize];
+                    open = gaussian_back::<S, DEPTH>(simd, gaussian, cells, (met, open), sum);
+                }
+            }
+        }
+    }
+}
+
+/// Fills the cells. Returns one bit for each cell with pixels inside the picture.
+fn seed(cells: &mut Vec<Seeds>, tile: Tile, pictures: Pictures<'_>) -> u32 {
+    cells.clear();
+    cells.resize(CELLS, Seeds::NONE);
+    let width = pictures.frame.width as usize;
+    let mut open = 0;
+    for (at, cell) in cells.iter_mut().enumerate() {
+        for pixel in 0..PIXELS {
+            let (x, y) = place(at, pixel);
+            if x >= tile.width as usize || y >= tile.height as usize {
+                continue;
+            }
+            let of_pixel = (tile.y as usize + y) * width + tile.x as usize + x;
+            let [rest, r, g, b, depth, base] = pictures.seed(of_pixel);
+            cell.transmittance.0[pixel] = 1.0;
+            cell.rest.0[pixel] = rest;
+            cell.depth.0[pixel] = depth;
+            cell.base.0[pixel] = base;
+            for (row, value) in cell.color.iter_mut().zip([r, g, b]) {
+                row.0[pixel] = value;
+            }
+            open |= 1 << at;
+        }
+    }
+    open
+}
+
+/// Takes one Gaussian through the cells that it may touch. Returns the cells whose rays go on.
+#[inline(always)]
+fn gaussian_back<S: Lanes, const DEPTH: bool>(
+    simd: S,
+    gaussian: &Staged,
+    cells: &mut [Seeds],
+    (mut met, mut open): (u32, u32),
+    out: &mut Sums,
+) -> u32 {
+    let zero = simd.splat_f32s(0.0);
+    let one = simd.splat_f32s(1.0);
+    let end = simd.splat_f32s(TRANSMITTANCE_MIN);
+    let mut sums = [zero; SUMS];
+    while met != 0 {
+        let at = met.trailing_zeros() as usize;
+        met &= met - 1;
+        let cell = &mut cells[at];
+        let mut goes_on = false;
+        for i in 0..PIXELS / S::F32_LANES {
+            let x = simd.add_f32s(PIXEL_X.at(simd, i), simd.splat_f32s(CELL_X.0[at]));
+            let y = simd.add_f32s(PIXEL_Y.at(simd, i), simd.splat_f32s(CELL_Y.0[at]));
+            // The statements of the blend.
+            let (u, v) = along_axes(simd, gaussian, x, y);
+            let power = simd.fused(u, u, simd.mul_f32s(v, v));
+            let full = simd.mul_f32s(exp2_neg(simd, power), simd.splat_f32s(gaussian.opacity));
+            let alpha = simd.min_f32s(full, simd.splat_f32s(ALPHA_MAX));
+            let counts = simd.less_than_or_equal_f32s(simd.splat_f32s(ALPHA_MIN), alpha);
+            let transmittance = cell.transmittance.at(simd, i);
+            if simd.bits(counts) == 0 {
+                goes_on |= simd.bits(simd.greater_than_f32s(transmittance, zero)) != 0;
+                continue;
+            }
+            let alpha = simd.select_f32s(counts, alpha, zero);
+            let passes = simd.sub_f32s(one, alpha);
+            let next = simd.mul_f32s(transmittance, passes);
+            let lives = simd.greater_than_f32s(next, end);
+            let weight = simd.select_f32s(lives, simd.mul_f32s(alpha, transmittance), zero);
+            let by_color =
+                [cell.color[0].at(simd, i), cell.color[1].at(simd, i), cell.color[2].at(simd, i)];
+            let by_depth = cell.depth.at(simd, i);
+            let mut worth = cell.base.at(simd, i);
+            for (by, &value) in by_color.iter().zip(&gaussian.channels) {
+                worth = simd.fused(*by, simd.splat_f32s(value), worth);
+            }
+            if DEPTH {
+                worth = simd.fused(by_depth, simd.splat_f32s(gaussian.channels[3]), worth);
+            }
+            let rest = simd.sub_f32s(cell.rest.at(simd, i), simd.mul_f32s(weight, worth));
+            cell.rest.put(simd, i, rest);
+            cell.transmittance.put(simd, i, simd.select_f32s(lives, next, zero));
+            goes_on |= simd.bits(lives) != 0;
+            let by_alpha =
+                simd.sub_f32s(simd.mul_f32s(transmittance, worth), simd.div_f32s(rest, passes));
+            let free = simd.and_m32s(lives, simd.less_than_f32s(full, simd.splat_f32s(ALPHA_MAX)));
+            let by_power =
+                simd.select_f32s(free, simd.mul_f32s(simd.sub_f32s(zero, alpha), by_alpha), zero);
+            let (by_u, by_v) = (simd.mul_f32s(by_power, u), simd.mul_f32s(by_power, v));
+            sums[0] = simd.add_f32s(sums[0], by_power);
+            sums[1] = simd.add_f32s(sums[1], by_u);
+            sums[2] = simd.add_f32s(sums[2], by_v);
+            sums[3] = simd.fused(by_u, u, sums[3]);
+            sums[4] = simd.fused(by_u, v, sums[4]);
+            sums[5] = simd.fused(by_v, v, sums[5]);
+            for (sum, by) in sums[6..9].iter_mut().zip(by_color) {
+                *sum = simd.fused(weight, by, *sum);
+            }
+            if DEPTH {
+                sums[9] = simd.fused(weight, by_depth, sums[9]);
+            }
+        }
+        if !goes_on {
+            open &= !(1 << at);
+        }
+    }
+    for (out, sum) in out.iter_mut().zip(sums) {
+        *out = simd.reduce_sum_f32s(sum);
+    }
+    open
+}
+
+/// Derivatives by the numbers of a Gaussian, before they become f32.
+struct Back {
+    mean: [f64; 3],
+    quat: [f64; 4],
+    scales: [f64; 3],
+    opacity: f64,
+    /// By the colour before its negatives became 0, and the weights of the coefficients in it.
+    color: [f64; 3],
+    basis: [f64; 16],
+}
+
+impl Pass<'_> {
+    /// From a footprint's sums to the Gaussian, by `Σ = M Mᵀ + blur`, `M = J W R diag(scales)`.
+    fn back(&self, i: usize, sums: &Sums) -> Back {
+        let (gaussians, view, request) = (self.gaussians, self.view, self.request);
+        let footprint = &self.projected.footprints[i];
+        let [by_power, u, v, uu, uv, vv, red, green, blue, by_depth] = sums.map(f64::from);
+        let [u, v] = [u, v].map(|sum| sum / SQRT_LOG2_E);
+        let [uu, uv, vv] = [uu, uv, vv].map(|sum| sum / (SQRT_LOG2_E * SQRT_LOG2_E));
+        let (cx, cy) = (f64::from(footprint.conic_x), f64::from(footprint.conic_y));
+        // dpower/dplace = a u + b v, for a step of the pixel against the centre.
+        let (a, b) = ([2.0 * cx, -2.0 * cx * footprint.conic_shear], [0.0, 2.0 * cy]);
+        let by_place = [-(a[0] * u), -(a[1] * u + b[1] * v)];
+        let by_xx = -0.5 * a[0] * a[0] * uu;
+        let by_xy = -0.5 * (a[0] * a[1] * uu + a[0] * b[1] * uv);
+        let by_yy = -0.5 * (a[1] * a[1] * uu + 2.0 * a[1] * b[1] * uv + b[1] * b[1] * vv);
+
+        let mean = DVec3::from(gaussians.means()[i].map(f64::from));
+        let t = view.rotation * mean + view.translation;
+        let per_z = t.z.recip();
+        let [fx, fy] = view.focal;
+        let slope = [t.x * per_z, t.y * per_z];
+        let bounded: [f64; 2] =
+            std::array::from_fn(|k| slope[k].max(view.slope_min[k]).min(view.slope_max[k]));
+        let [qw, qx, qy, qz] = gaussians.quats()[i].map(f64::from);
+        let turn = rotation([qw, qx, qy, qz]);
+        let turned = view.rotation * turn;
+        let (lost, by_width, by_z) = self.lost(i, mean, t.z);
+        let given = gaussians.scales()[i].map(f64::from);
+        let scales = given.map(|scale| (scale * scale + lost).sqrt());
+        // Rows of J W R, then of M.
+        let row =
+            |k: usize, focal: f64| (turned.row(k) - turned.row(2) * bounded[k]) * (focal * per_z);
+        let sharp = [row(0, fx), row(1, fy)];
+        let scale = DVec3::from(scales);
+        let m = sharp.map(|row| row * scale);
+        let (xx, xy, yy) = (m[0].dot(m[0]), m[0].dot(m[1]), m[1].dot(m[1]));
+        let mut opacity = -by_power / f64::from(footprint.opacity);
+        let (mut by_xx, mut by_xy, mut by_yy) = (by_xx, by_xy, by_yy);
+        if request.antialiased {
+            let blur = f64::from(BLUR_PX2);
+            let sharp_det = m[0].cross(m[1]).length_squared();
+            let det = sharp_det + blur * (xx + yy) + blur * blur;
+            let share = (sharp_det / det).sqrt();
+            if sharp_det > 0.0 {
+                let half = 0.5 * opacity * f64::from(gaussians.opacities()[i]);
+                let (narrow, wide) = (half / (sharp_det * det).sqrt(), half * share / det);
+                by_xx += narrow * yy - wide * (yy + blur);
+                by_xy -= (narrow - wide) * xy;
+                by_yy += narrow * xx - wide * (xx + blur);
+            }
+            opacity *= share;
+        }
+        let by_m = [2.0 * (by_xx * m[0] + by_xy * m[1]), 2.0 * (by_xy * m[0] + by_yy * m[1])];
+        let by_scale = by_m[0] * sharp[0] + by_m[1] * sharp[1];
+        let by_sharp = by_m.map(|row| row * scale);
+        // J W R: its rows are rows of W R times the focal length over z, less the slope's share.
+        let by_row = [by_sharp[0] * (fx * per_z), by_sharp[1] * (fy * per_z)];
+        let by_row_z = -(by_row[0] * bounded[0] + by_row[1] * bounded[1]);
+        let by_turned = DMat3::from_cols(by_row[0], by_row[1], by_row_z).transpose();
+        let by_turn = view.rotation.transpose() * by_turned;
+        let by_bound: [f64; 2] = std::array::from_fn(|k| -by_row[k].dot(turned.row(2)));
+        let by_lost: f64 = (0..3).map(|k| by_scale[k] / (2.0 * scales[k])).sum();
+        let mut by_t = DVec3::new(by_place[0] * fx * per_z, by_place[1] * fy * per_z, 0.0);
+        for k in 0..2 {
+            if bounded[k] == slope[k] {
+                by_t[k] += by_bound[k] * per_z;
+            }
+            by_t.z -= by_t[k] * slope[k];
+        }
+        by_t.z -= (by_sharp[0].dot(sharp[0]) + by_sharp[1].dot(sharp[1])) * per_z;
+        by_t.z += by_depth + by_lost * by_z;
+        let (color, basis, by_place) = self.color(i, mean, [red, green, blue]);
+        let by_mean = view.rotation.transpose() * by_t + by_width * by_lost + by_place;
+        Back {
+            mean: by_mean.into(),
+            quat: of_rotation([qw, qx, qy, qz], &by_turn),
+            scales: std::array::from_fn(|k| by_scale[k] * given[k] / scales[k]),
+            opacity,
+            color,
+            basis,
+        }
+    }
+
+    /// The variance that the blur lost, and its derivatives by the centre and by t.z. See
+    /// [`crate::plan`].
+    fn lost(&self, i: usize, mean: DVec3, z: f64) -> (f64, DVec3, f64) {
+        let source = self.request.sources.get(usize::from(self.gaussians.source()[i].view));
+        let Some(source) = source else { return (0.0, DVec3::ZERO, 0.0) };
+        let [center, axis] = [source.center, source.axis].map(|v| DVec3::from(v.map(f64::from)));
+        let (scale, blur) = (f64::from(source.scale), f64::from(BLUR_PX2));
+        let width = (mean - center).dot(axis).max(0.0) * scale;
+        let least = f64::from(OWN_SIZE) / self.view.focal[0].max(self.view.focal[1]);
+        if width <= least * z {
+            return (0.0, DVec3::ZERO, 0.0);
+        }
+        let lost = blur * (width * width - (least * z).powi(2));
+        (lost, axis * (2.0 * blur * width * scale), -2.0 * blur * least * least * z)
+    }
+
+    /// By the sums of the harmonics, the weight of each coefficient in them, and by the centre.
+    fn color(&self, i: usize, mean: DVec3, by: [f64; 3]) -> ([f64; 3], [f64; 16], DVec3) {
+        let k = self.gaussians.sh_count();
+        let sh = &self.gaussians.sh()[i * k..(i + 1) * k];
+        let toward = mean - self.view.center;
+        let direction = toward.normalize_or_zero();
+        let shown = self.projected.footprints[i].color;
+        let by: [f64; 3] = std::array::from_fn(|c| if shown[c] > 0.0 { by[c] } else { 0.0 });
+        let basis = shade::basis(direction.as_vec3().into()).map(f64::from);
+        if k == 1 {
+            return (by, basis, DVec3::ZERO);
+        }
+        let mut by_direction = DVec3::ZERO;
+        for (coefficient, slope) in sh.iter().zip(basis_slopes(direction.into())) {
+            let worth: f64 = coefficient.iter().zip(by).map(|(&c, by)| f64::from(c) * by).sum();
+            by_direction += DVec3::from(slope) * worth;
+        }
+        let across = by_direction - direction * by_direction.dot(direction);
+        let length = toward.length();
+        (by, basis, if length > 0.0 { across / length } else { DVec3::ZERO })
+    }
+}
+
+/// The rotation of a quaternion of any length, wxyz.
+fn rotation([w, x, y, z]: [f64; 4]) -> DMat3 {
+    let s = 2.0 / (w * w + x * x + y * y + z * z);
+    DMat3::from_cols(
+        DVec3::new(1.0 - s * (y * y + z * z), s * (x * y + w * z), s * (x * z - w * y)),
+        DVec3::new(s * (x * y - w * z), 1.0 - s * (x * x + z * z), s * (y * z + w * x)),
+        DVec3::new(s * (x * z + w * y), s * (y * z - w * x), 1.0 - s * (x * x + y * y)),
+    )
+}
+
+/// By the quaternion, at right angles to it, from what is known by its rotation.
+fn of_rotation(quat: [f64; 4], by: &DMat3) -> [f64; 4] {
+    let length = quat.iter().map(|v| v * v).sum::<f64>().sqrt();
+    let [w, x, y, z] = quat.map(|v| v / length);
+    let at = |row: usize, column: usize| by.col(column)[row];
+    // Sums and differences of the two numbers beside the diagonal.
+    let [yz, zx, xy] = [at(2, 1) + at(1, 2), at(0, 2) + at(2, 0), at(1, 0) + at(0, 1)];
+    let [dx, dy, dz] = [at(2, 1) - at(1, 2), at(0, 2) - at(2, 0), at(1, 0) - at(0, 1)];
+    let [xx, yy, zz] = [at(0, 0), at(1, 1), at(2, 2)];
+    let by = [
+        x * dx + y * dy + z * dz,
+        w * dx - 2.0 * x * (yy + zz) + y * xy + z * zx,
+        w * dy + x * xy - 2.0 * y * (xx + zz) + z * yz,
+        w * dz + x * zx + y * yz - 2.0 * z * (xx + yy),
+    ];
+    let along: f64 = by.iter().zip([w, x, y, z]).map(|(by, q)| by * q).sum();
+    let unit = [w, x, y, z];
+    std::array::from_fn(|k| 2.0 * (by[k] - unit[k] * along) / length)
+}
