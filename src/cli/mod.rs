@@ -62,7 +62,7 @@ enum Command {
     Render(Box<render::Args>),
     /// Search a scene by text, in 3D and in a view
     Query(Box<query::Args>),
-    /// Write the bank of a scene, or the pixels of a view over it, as NumPy arrays
+    /// Write the bank of a scene, or the pixels of a view over it, as an npz file
     Features(Box<features::Args>),
     /// Show what is in a scene file
     Inspect(inspect::Args),

@@ -19,7 +19,7 @@ use crate::common::{
 };
 
 /// Every call, named as the gRPC methods are, and what it needs.
-const CALLS: [(&str, Scope); 10] = [
+const CALLS: [(&str, Scope); 11] = [
     ("CreateScene", Scope::Write),
     ("ListScenes", Scope::Read),
     ("GetScene", Scope::Read),
@@ -29,6 +29,7 @@ const CALLS: [(&str, Scope); 10] = [
     ("Query", Scope::Read),
     ("Pick", Scope::Read),
     ("Export", Scope::Read),
+    ("Features", Scope::Read),
     ("DeleteScene", Scope::Write),
 ];
 
@@ -73,6 +74,7 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
         ("DeleteScene", _) => door.delete(id).await,
         ("RenderView", _) => door.view(id, &view).await.map(drop),
         ("Export", _) => door.export(id).await.map(drop),
+        ("Features", _) => door.features(id, &view).await.map(drop),
         ("Query", _) => door.query(id, &["box"], None, None).await.map(drop),
         (_, Door::Http { base, client }) => {
             let request = match name {
@@ -142,7 +144,7 @@ async fn each_caller_may_make_each_call_or_not_over_both_doors() {
                     "reader" if scope == Scope::Write => "permission_denied",
                     "stranger" if of_scene => "scene_not_found",
                     // This server's maker knows no texts; the caller was let in.
-                    _ if name == "Query" => "model_unavailable",
+                    _ if ["Query", "Features"].contains(&name) => "model_unavailable",
                     _ => "ok",
                 };
                 assert_eq!(code(&answer), want, "{what}: {answer:?}");

@@ -379,7 +379,7 @@ fn a_ply_carries_index_and_bank_together_and_programs_that_know_no_bank_stop_bef
         masks,
         report: SemanticsReport::default(),
     };
-    let file = PlyFile::new(gaussians.clone(), Some(&semantics)).unwrap();
+    let file = PlyFile::new(gaussians, Some(&semantics)).unwrap();
     let bytes: Vec<u8> = PlyWriter::new(&file).flatten().collect();
     assert_eq!(bytes.len() as u64, file.size_bytes());
     let (back, _, read) = read_ply(Cursor::new(&bytes), 100).unwrap();

@@ -160,7 +160,7 @@ async fn a_hundred_texts_take_one_drawing_and_a_known_view_takes_none() {
     let wide = ViewOptions { width: Some(40), ..ViewOptions::default() };
     let other = QuerySpec { options: wide, ..in_view(&["photo 2"]) };
     service.query(&id, other).await.unwrap();
-    assert_eq!(fixture.renderer.counts(), [2, 0, 2], "another size is another view");
+    assert_eq!(fixture.renderer.counts(), [3, 0, 3], "another method or size is another view");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -224,6 +224,23 @@ async fn a_pick_tells_depth_point_gaussian_entry_and_labels() {
     let outside = PickSpec { x: 64.0, ..pick(&[]) };
     let error = service.pick(&id, outside).await.unwrap_err();
     assert_eq!(error.message(), "x is 64; the picture is 64 px wide");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn both_doors_give_the_same_features() {
+    let fixture = fixture().await;
+    let id = fixture.scene(SemanticsMode::Lazy).await.to_string();
+    let mut files = Vec::new();
+    for door in both(fixture.server.addr).await {
+        let dense = Ask::first().with("kind", "features").with("preset", "paper");
+        let weights = door.features(&id, &Ask::first()).await.unwrap();
+        let features = door.features(&id, &dense).await.unwrap();
+        assert!(features.len() > weights.len(), "{} and {}", features.len(), weights.len());
+        files.push([weights, features]);
+        let odd = door.features(&id, &Ask::first().with("front_photos", 5000)).await.unwrap_err();
+        assert_eq!(odd.message, "front_photos is 5000; it must be 0 to 1024");
+    }
+    assert_eq!(files[0], files[1]);
 }
 
 #[tokio::test(flavor = "multi_thread")]

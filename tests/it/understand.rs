@@ -124,9 +124,9 @@ fn tools<'a>(masks: Masks<'a>, embed: Embed<'a>) -> SemanticsTools<'a> {
     }
 }
 
-fn made(wall: &Wall, tools: &SemanticsTools<'_>, options: Method) -> Result<Semantics> {
+fn made(wall: &Wall, tools: &SemanticsTools<'_>, options: &Method) -> Result<Semantics> {
     let watch = Watch { progress: &|_, _| (), cancel: &NO_CANCEL };
-    understand_with(tools, &wall.parts(), &options, watch)
+    understand_with(tools, &wall.parts(), options, watch)
 }
 
 #[test]
@@ -173,16 +173,16 @@ fn a_photo_without_masks_and_a_scene_without_any_are_legal() {
     let wall = wall();
     let one: Masks<'_> = &|_| Ok(vec![two_masks(0), PhotoMasks::default()]);
     let options = Method { votes: true, ..Method::default() };
-    let half = made(&wall, &tools(one, &colour_of), options.clone()).unwrap();
+    let half = made(&wall, &tools(one, &colour_of), &options).unwrap();
     assert_eq!(half.report.masks, [2, 0]);
     assert!(half.index[..256].iter().all(|m| *m > 0), "photo 0 has its own");
-    let alone = Method { votes: false, ..options.clone() };
-    let plain = made(&wall, &tools(one, &colour_of), alone).unwrap();
+    let alone = Method { votes: false, ..options };
+    let plain = made(&wall, &tools(one, &colour_of), &alone).unwrap();
     assert!(plain.index[256..].iter().all(|m| *m == 0), "photo 1 has none");
     let filled = half.index[256..].iter().filter(|m| **m > 0).count();
     assert!(filled > 200, "photo 0 votes for what photo 1 also shows: {filled}");
     let none: Masks<'_> = &|_| Ok(vec![PhotoMasks::default(); 2]);
-    let empty = made(&wall, &tools(none, &colour_of), options).unwrap();
+    let empty = made(&wall, &tools(none, &colour_of), &options).unwrap();
     assert_eq!((empty.bank.len(), empty.bank.dim, empty.report.labelled), (0, 3, 0));
     assert_eq!(empty.index, vec![0; 512]);
 }
@@ -201,7 +201,7 @@ fn masks_that_mean_nothing_stay_background() {
         rows.chunks_exact_mut(3).filter(|row| row[1] > 0.5).for_each(|row| row.fill(0.0));
         Ok(rows)
     };
-    let made = made(&wall, &tools(masks, embed), Method::default()).unwrap();
+    let made = made(&wall, &tools(masks, embed), &Method::default()).unwrap();
     assert_eq!((made.bank.len(), made.report.masks[0]), (1, 3));
     assert_eq!((made.index[0], made.index[15]), (1, 0), "red has a row, green has none");
 }
@@ -224,11 +224,11 @@ fn two_sides_of_one_thing_are_joined_only_when_asked() {
     };
     // 1.2 masks a photo make two rows.
     let with = |merge_cosine| Method { merge_cosine, ..Method::default() };
-    let apart = made(&wall, &tools(masks, embed), with(0.0)).unwrap();
+    let apart = made(&wall, &tools(masks, embed), &with(0.0)).unwrap();
     assert_eq!((apart.bank.len(), apart.index[0] == apart.index[300]), (2, false));
-    let strict = made(&wall, &tools(masks, embed), with(0.7)).unwrap();
+    let strict = made(&wall, &tools(masks, embed), &with(0.7)).unwrap();
     assert_eq!(strict.bank.len(), 2, "the rows' cosine is 0.6");
-    let joined = made(&wall, &tools(masks, embed), with(0.5)).unwrap();
+    let joined = made(&wall, &tools(masks, embed), &with(0.5)).unwrap();
     assert_eq!((joined.bank.len(), joined.report.bank_size), (1, 1));
     assert!(joined.index.iter().all(|m| *m == 1));
     assert_eq!(joined.photos[1].index, [1]);
@@ -239,8 +239,9 @@ fn two_sides_of_one_thing_are_joined_only_when_asked() {
 fn wrong_answers_and_wrong_scenes_are_refused_by_name() {
     let good = wall();
     let masks: Masks<'_> = &|_| Ok((0..2).map(two_masks).collect());
-    let fails =
-        |wall: &Wall, tools: &SemanticsTools<'_>| made(wall, tools, Method::default()).unwrap_err();
+    let fails = |wall: &Wall, tools: &SemanticsTools<'_>| {
+        made(wall, tools, &Method::default()).unwrap_err()
+    };
     let few: Masks<'_> = &|_| Ok(vec![two_masks(0)]);
     let error = fails(&good, &tools(few, &colour_of));
     assert!(error.message().contains("masks of 1 photos, not of 2"), "{error}");

@@ -113,10 +113,15 @@ impl Answer {
         let body = Bytes::from(self.body());
         let (mut bytes, mut timing, mut at) = (Vec::new(), self.timing, 0);
         loop {
-            let rest = &body[at..];
+            let rest = body.get(at..).ok_or_else(broken)?;
             let end = rest.windows(4).position(|four| four == b"\r\n\r\n");
             // The last line closes the parts and has no head.
-            let Some(end) = end else { break };
+            let Some(end) = end else {
+                if rest.ends_with(b"--\r\n") {
+                    break;
+                }
+                return Err(broken());
+            };
             let head = std::str::from_utf8(&rest[..end]).map_err(|_| broken())?;
             let field = |name: &str| head.lines().find_map(|line| line.strip_prefix(name));
             let length = field("content-length: ").and_then(|n| n.parse::<usize>().ok());

@@ -340,17 +340,46 @@ impl Door {
                 let request =
                     pb::ExportRequest { scene_id: id.to_owned(), format: 1, ..Default::default() };
                 let chunks = client.clone().export(request).await.map_err(fault_of)?;
-                let mut chunks = chunks.into_inner();
-                let (mut file, mut size) = (Vec::new(), None);
-                while let Some(chunk) = chunks.message().await.map_err(fault_of)? {
-                    size = size.or(chunk.size_bytes);
-                    file.extend_from_slice(&chunk.data);
-                }
+                let (file, size) = whole(chunks.into_inner()).await?;
                 assert_eq!(size, Some(file.len() as u64), "the size said first");
                 Ok(file)
             }
         }
     }
+
+    /// The features of a view as `Features` gives them, of the kind in the ask.
+    pub(crate) async fn features(&self, id: &str, ask: &Ask) -> Result<Vec<u8>, Fault> {
+        match self {
+            Self::Http { base, client } => {
+                let url = url(base, &format!("/v1/scenes/{id}/features"), &ask.pairs);
+                bytes(client.get(url).send().await.expect("an answer")).await
+            }
+            Self::Grpc { client } => {
+                let dense = ask.get("kind") == Some("features");
+                let request = pb::FeaturesRequest {
+                    scene_id: id.to_owned(),
+                    camera: Some(ask.camera()),
+                    options: Some(ask.options()),
+                    kind: if dense { 2 } else { 0 },
+                    ..Default::default()
+                };
+                let chunks = client.clone().features(request).await.map_err(fault_of)?;
+                Ok(whole(chunks.into_inner()).await?.0)
+            }
+        }
+    }
+}
+
+/// All pieces of a file, and the size that was said.
+async fn whole(
+    mut chunks: tonic::Streaming<pb::ExportChunk>,
+) -> Result<(Vec<u8>, Option<u64>), Fault> {
+    let (mut file, mut size) = (Vec::new(), None);
+    while let Some(chunk) = chunks.message().await.map_err(fault_of)? {
+        size = size.or(chunk.size_bytes);
+        file.extend_from_slice(&chunk.data);
+    }
+    Ok((file, size))
 }
 
 /// What a text found, as far as both doors say the same.

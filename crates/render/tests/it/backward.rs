@@ -251,7 +251,7 @@ fn judge(name: &str, cpu: &CpuRenderer, gaussians: &Gaussians, request: &RenderR
         at(0.99),
         at(1.0)
     );
-    assert!(at(0.5) <= 1e-5, "{name}: median {:.1e}", at(0.5));
+    assert!(at(0.5) <= 1e-4, "{name}: median {:.1e}", at(0.5));
     assert!(at(0.99) <= 1e-2, "{name}: 99 % {:.1e}", at(0.99));
 }
 
