@@ -26,7 +26,7 @@ def test_both_clients_have_the_same_calls() -> None:
 
 def test_a_notebook_completes_the_options() -> None:
     known = inspect.signature(Scene.view).parameters
-    assert {"kinds", "text", "from_", "eye", "K", "width", "crop", "profile", "wait"} <= set(known)
+    assert {"kinds", "text", "from_", "eye", "K", "width", "crop", "preset", "wait"} <= set(known)
 
 
 def test_the_answers_are_the_same(scene: Scene, url: str, tmp_path: Path) -> None:

@@ -37,6 +37,13 @@ def test_a_query_is_typed_and_that_of_the_server(scene: Scene, url: str) -> None
     assert (found._repr_png_() or b"").startswith(b"\x89PNG")
 
 
+def test_a_query_says_how_it_scored(scene: Scene) -> None:
+    paper = scene.query("box", masks=False, preset="paper", cut=0.25).scoring
+    assert paper.canon == ("object", "things", "stuff") and not paper.unit_rows
+    assert (paper.tau, paper.cut) == (10.0, 0.25)
+    assert scene.query("box", masks=False).scoring.unit_rows
+
+
 def test_without_a_camera_the_masks_are_in_the_first_photo(scene: Scene) -> None:
     found = scene.query("box")
     assert found.masks.shape == (1, 240, 320)

@@ -26,6 +26,7 @@ from .types import (
     Picked,
     Report,
     SceneStatus,
+    Scoring,
     Semantics,
     Viewpoint,
 )
@@ -49,6 +50,7 @@ __all__ = [
     "Report",
     "Scene",
     "SceneStatus",
+    "Scoring",
     "Semantics",
     "View",
     "Viewpoint",

@@ -199,7 +199,7 @@ class Client(_Connection):
         wait: False gives the scene at once; `scene.wait()` waits for it.
         progress: True shows a bar; a function is told of each event; by default a bar on terminals.
         idempotency_key: calls with one key make one scene; by default a new key for each call.
-        semantics, density, max_views, bundle: how the scene is made, see `SceneOptions`.
+        semantics, density, preset, max_views, bundle: how the scene is made, see `SceneOptions`.
         """
         made = calls.create(self.policy, source, options, idempotency_key)
         scene = Scene(self, self._run(made))

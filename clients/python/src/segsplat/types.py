@@ -18,7 +18,7 @@ from .png import encode_png
 
 Floats: TypeAlias = NDArray[np.float64]
 Kind = Literal["color", "depth", "alpha", "semantics", "relevancy", "mask"]
-Profile = Literal["default", "paper"]
+Preset = Literal["default", "paper"]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
 
 T = TypeVar("T")
@@ -148,6 +148,8 @@ class Drawing(TypedDict, total=False):
     near: float
     #: "fast" may leave out precision within a stated bound.
     quality: Literal["exact", "fast"]
+    #: "paper" draws and scores as the paper does; that of the scene by default.
+    preset: Preset
 
 
 class ViewOptions(Drawing, total=False):
@@ -162,8 +164,10 @@ class ViewOptions(Drawing, total=False):
 class TextOptions(TypedDict, total=False):
     """How a text is scored."""
 
-    #: "paper" scores as the paper does.
-    profile: Profile
+    #: Relevancy from which a text selects, 0 to 1; that of the preset by default.
+    cut: float
+    #: Sharpness of the comparison with canonical texts; that of the preset by default.
+    tau: float
     #: Seconds to wait for semantics that are being made; the server's limit by default.
     wait: float
 
@@ -187,6 +191,8 @@ class SceneOptions(TypedDict, total=False):
     semantics: Literal["lazy", "eager", "off"]
     #: "full" keeps one Gaussian a pixel, "thinned" fewer where photos are flat.
     density: Literal["thinned", "full"]
+    #: "paper" makes, understands, draws and scores the scene as the paper does.
+    preset: Preset
     #: Photos that the network takes at once.
     max_views: int
     #: Name of the bundle of networks; the loaded one by default.
@@ -397,6 +403,22 @@ class Match:
         return encode_png(self.mask.astype(np.uint8) * 255) if self.mask.size else None
 
 
+@dataclass(frozen=True)
+class Scoring:
+    """How texts were scored."""
+
+    #: Whether the bank's rows were brought to length 1 before they were blended.
+    unit_rows: bool
+    #: Canonical texts that a text is compared with.
+    canon: tuple[str, ...]
+    #: Sharpness of the comparison.
+    tau: float
+    #: Coverage under which a pixel has no relevancy, 0 to 1.
+    coverage_floor: float
+    #: Relevancy from which a text selects, 0 to 1.
+    cut: float
+
+
 class Matches(Sequence[Match]):
     """What the texts of a query found, in their order; also by text: `found["chair"]`."""
 
@@ -407,7 +429,7 @@ class Matches(Sequence[Match]):
         #: Entries of the scene's bank (M).
         self.bank_size: int = data["bank_size"]
         #: How texts were scored.
-        self.profile: Profile = data["profile"]
+        self.scoring = parse(Scoring, data["scoring"])
 
     @property
     def masks(self) -> NDArray[np.bool_]:
