@@ -30,8 +30,8 @@ pub(super) struct Backend {
     networks: Arc<dyn SemanticNetworks>,
     /// By text; each weighs 1.
     embeddings: Cache<String, Arc<TextEmbedding>>,
-    /// By scene, semantics and scoring; by bytes.
-    scorers: Cache<String, Arc<Scorer>>,
+    /// By scene, semantics and the choice of scoring, with what the choice came to; by bytes.
+    scorers: Cache<String, (ScoringMethod, Arc<Scorer>)>,
     /// By scene and semantics; by bytes.
     components: Cache<String, Arc<Components>>,
     /// By scene, semantics, renderer and camera; by bytes.
@@ -59,15 +59,14 @@ impl Backend {
         self.networks.lacks()
     }
 
-    /// Whether texts can be scored for a scene without a network.
+    /// Whether texts can be scored for a scene without a network. Does not block.
     pub(super) fn knows(
         &self,
         of: Subject<'_>,
         how: ScoringChoice<'_>,
         texts: &[String],
     ) -> Result<bool> {
-        let key = scorer_key(of.tag, &self.scoring(of, how)?)?;
-        Ok(self.scorers.find(&key).is_some()
+        Ok(self.scorers.find(&scorer_key(of, how)?).is_some()
             && texts.iter().all(|text| self.embeddings.find(text).is_some()))
     }
 
@@ -105,32 +104,33 @@ impl Backend {
         Ok(method)
     }
 
-    /// A bank ready to be scored; `tag` tells scene and semantics.
+    /// How texts are scored for a scene, and its bank ready for that.
     fn scorer(
         &self,
-        tag: &str,
-        semantics: &Semantics,
-        method: &ScoringMethod,
-    ) -> Result<Arc<Scorer>> {
-        let key = scorer_key(tag, method)?;
+        of: Subject<'_>,
+        how: ScoringChoice<'_>,
+    ) -> Result<(ScoringMethod, Arc<Scorer>)> {
+        let key = scorer_key(of, how)?;
         if let Some(known) = self.scorers.find(&key) {
             return Ok(known);
         }
+        let method = self.scoring(of, how)?;
         let canon = self.embedded(&method.canon)?;
         let canon = canon.iter().map(|embedding| embedding.row.clone()).collect();
-        let scoring = Arc::new(Scoring::new(method, canon)?);
-        let scorer = Arc::new(Scorer::new(&semantics.bank, scoring)?);
-        let rows = semantics.bank.len() as u64;
+        let scoring = Arc::new(Scoring::new(&method, canon)?);
+        let bank = &of.semantics.bank;
+        let made = (method, Arc::new(Scorer::new(bank, scoring)?));
+        let rows = bank.len() as u64;
         // Rows, and the products of each two of them.
-        let bytes = 4 * semantics.bank.rows.len() as u64 + 4 * rows * (rows + 1);
-        self.scorers.insert(key, Arc::clone(&scorer), bytes);
-        Ok(scorer)
+        let bytes = 4 * bank.rows.len() as u64 + 4 * rows * (rows + 1);
+        self.scorers.insert(key, made.clone(), bytes);
+        Ok(made)
     }
 }
 
-/// Tells the scorer of a scene, its semantics and a method from all others.
-fn scorer_key(tag: &str, method: &ScoringMethod) -> Result<String> {
-    super::view::words(&(tag, method))
+/// Tells the scorer of a scene, its semantics and a choice from all others.
+fn scorer_key(of: Subject<'_>, (preset, changes): ScoringChoice<'_>) -> Result<String> {
+    text_words(of.tag, None, (of.preset(preset), changes))
 }
 
 /// A text, how the bank scores it, and what makes that doubtful.
@@ -234,8 +234,7 @@ impl<'a> SceneTexts<'a> {
         how: ScoringChoice<'_>,
         texts: &[String],
     ) -> Result<Self> {
-        let scoring = backend.scoring(of, how)?;
-        let scorer = backend.scorer(of.tag, of.semantics, &scoring)?;
+        let (scoring, scorer) = backend.scorer(of, how)?;
         let scored = |(text, embedding): (&String, Arc<TextEmbedding>)| {
             Ok(ScoredText {
                 text: text.clone(),

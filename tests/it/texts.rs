@@ -449,6 +449,18 @@ async fn views_are_drawn_while_texts_wait_for_a_network() {
 }
 
 #[tokio::test]
+async fn the_text_tower_is_asked_on_no_async_thread() {
+    let fixture = fixture().await;
+    let id = fixture.scene(SemanticsMode::Eager).await;
+    let (service, meaning) = (&fixture.server.service, &fixture.meaning);
+    service.understand(&id, Some(PATIENCE)).await.expect("semantics");
+    service.query(&id, in_view(&["photo 0"])).await.expect("a query");
+    let asked_on = meaning.asked_on.lock().unwrap();
+    let here = std::thread::current().id();
+    assert!(!asked_on.is_empty() && !asked_on.contains(&here), "{here:?} in {asked_on:?}");
+}
+
+#[tokio::test]
 async fn queries_say_where_their_time_went_over_both_doors() {
     let fixture = fixture().await;
     let id = fixture.scene(SemanticsMode::Eager).await;

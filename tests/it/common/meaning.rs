@@ -5,6 +5,7 @@
 
 use std::{
     sync::atomic::{AtomicBool, AtomicUsize, Ordering},
+    thread::ThreadId,
     time::{Duration, Instant},
 };
 
@@ -38,6 +39,8 @@ pub(crate) struct PhotoMeaning {
     pub(crate) embedded: AtomicUsize,
     /// The text tower is held back while true.
     pub(crate) hold_texts: AtomicBool,
+    /// Threads on which the text tower was asked: it may have to be opened there.
+    pub(crate) asked_on: std::sync::Mutex<Vec<ThreadId>>,
 }
 
 impl PhotoMeaning {
@@ -57,11 +60,13 @@ impl SemanticNetworks for PhotoMeaning {
     }
 
     fn phrases(&self) -> Result<Phrases> {
+        self.asked_on.lock().unwrap().push(std::thread::current().id());
         let canon = ["object", "things", "stuff"].map(str::to_owned).to_vec();
         Ok(Phrases { canon, tau: 10.0, coverage_floor: 0.05 })
     }
 
     fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
+        self.asked_on.lock().unwrap().push(std::thread::current().id());
         self.embedded.fetch_add(texts.len(), Ordering::AcqRel);
         let begun = Instant::now();
         while self.hold_texts.load(Ordering::Acquire) {
