@@ -101,11 +101,16 @@ impl Running {
         self.0.lock().retain(|other| !Arc::ptr_eq(other, job));
     }
 
-    /// Stops the jobs of a scene, or all; whether there were any.
-    pub(super) fn stop(&self, scene: Option<&SceneId>, reason: Reason) -> bool {
+    /// Stops the jobs of a scene, or all.
+    pub(super) fn stop(&self, scene: Option<&SceneId>, reason: Reason) {
         let running = self.0.lock();
         let jobs = running.iter().filter(|job| scene.is_none_or(|scene| job.scene == *scene));
-        jobs.map(|job| job.stop(reason)).count() > 0
+        jobs.for_each(|job| job.stop(reason));
+    }
+
+    /// Whether a job of this scene runs.
+    pub(super) fn has(&self, scene: &SceneId) -> bool {
+        self.0.lock().iter().any(|job| job.scene == *scene)
     }
 
     /// Scenes of the running jobs of a kind.

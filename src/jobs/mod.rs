@@ -291,7 +291,7 @@ impl Jobs {
     pub(crate) fn delete(&self, id: &SceneId) -> Result<()> {
         let record = self.record(id)?;
         self.queue.remove(id);
-        let running = self.running.stop(Some(id), Reason::Cancelled);
+        self.running.stop(Some(id), Reason::Cancelled);
         let removed = self.parts.store.remove(&record);
         let removed_here = removed.is_ok();
         match removed {
@@ -308,16 +308,24 @@ impl Jobs {
             }
             _ => {}
         }
-        if !running {
+        // What watches the other replicas may have seen first that it is gone.
+        let existed = self.records.remove(id) || removed_here;
+        // Only now: a job that ends meanwhile either is seen here, or sees there that its scene is
+        // gone.
+        if !self.running.has(id) {
             self.release(id);
         }
-        // What watches the other replicas may have seen first that it is gone.
-        if self.records.remove(id) || removed_here { Ok(()) } else { Err(not_found(id)) }
+        if existed { Ok(()) } else { Err(not_found(id)) }
     }
 
     /// Marks a finished scene as failed: its file turned out to be bad.
     pub(crate) fn spoil(&self, id: &SceneId, error: &Error) {
         self.fail(Kind::Scene, id, error);
+    }
+
+    /// Bytes of photos in memory, for jobs and for first texts.
+    pub(crate) fn photos_bytes(&self) -> u64 {
+        self.uploads.size_bytes()
     }
 
     /// Scenes that wait for a worker, and scenes that a worker makes.

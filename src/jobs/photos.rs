@@ -42,6 +42,10 @@ impl Kept {
     fn is_fresh(&self, now: Instant) -> bool {
         self.until.is_none_or(|until| now < until)
     }
+
+    fn size_bytes(&self) -> u64 {
+        self.upload.photos.size_bytes()
+    }
 }
 
 impl ReadUploads {
@@ -62,13 +66,13 @@ impl ReadUploads {
 
     fn insert(&self, id: &SceneId, new: Kept) {
         let mut uploads = self.uploads.lock();
-        let size = |kept: &Kept| kept.upload.photos.size_bytes();
         uploads.remove(id);
-        let needed: u64 = uploads.values().filter(|kept| kept.until.is_none()).map(size).sum();
-        if needed + size(&new) > self.bytes_max {
+        let needed = uploads.values().filter(|kept| kept.until.is_none());
+        if needed.map(Kept::size_bytes).sum::<u64>() + new.size_bytes() > self.bytes_max {
             return;
         }
-        while uploads.values().map(size).sum::<u64>() + size(&new) > self.bytes_max {
+        let all = |uploads: &HashMap<_, Kept>| uploads.values().map(Kept::size_bytes).sum::<u64>();
+        while all(&uploads) + new.size_bytes() > self.bytes_max {
             let left = uploads.iter().filter_map(|(id, kept)| Some((kept.until?, id)));
             let Some(oldest) = left.min_by_key(|(until, _)| *until) else { break };
             let oldest = oldest.1.clone();
@@ -92,6 +96,11 @@ impl ReadUploads {
 
     pub(super) fn forget(&self, id: &SceneId) {
         self.uploads.lock().remove(id);
+    }
+
+    /// Bytes of all photos here.
+    pub(super) fn size_bytes(&self) -> u64 {
+        self.uploads.lock().values().map(Kept::size_bytes).sum()
     }
 
     /// Drops those whose time is over.

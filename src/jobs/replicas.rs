@@ -222,6 +222,7 @@ impl OtherReplicas {
     fn lose(&self, jobs: &Jobs, id: &SceneId) {
         jobs.records.remove(id);
         jobs.parts.store.forget(id);
+        jobs.uploads.forget(id);
         self.fresh.lock().remove(id);
     }
 

@@ -309,6 +309,11 @@ impl Service {
         self.inner.store.cached_bytes()
     }
 
+    /// Bytes of photos in memory, for jobs and for first texts.
+    pub fn photos_bytes(&self) -> u64 {
+        self.inner.jobs.photos_bytes()
+    }
+
     /// Takes no more jobs and stops the running ones; the next start continues them. Blocks.
     pub fn shut_down(&self) {
         self.inner.jobs.shut_down();

@@ -23,6 +23,7 @@ struct Metrics {
     jobs_running: Gauge,
     renders: Gauge,
     cache_bytes: Gauge,
+    photos_bytes: Gauge,
     uploaded: IntCounter,
     uploads_held: Gauge,
     ready: Gauge,
@@ -66,6 +67,7 @@ impl Metrics {
             jobs_running: gauge("segsplat_jobs_running", "Jobs at work")?,
             renders: gauge("segsplat_renders_inside", "Renders at work or waiting")?,
             cache_bytes: gauge("segsplat_scene_cache_bytes", "Bytes of scenes in memory")?,
+            photos_bytes: gauge("segsplat_photos_bytes", "Bytes of photos in memory for jobs")?,
             uploaded: register_int_counter!(
                 "segsplat_upload_bytes_total",
                 "Bytes of uploads received"
@@ -122,6 +124,8 @@ pub struct Readings {
     pub renders: usize,
     /// Bytes of scenes in memory.
     pub cache_bytes: u64,
+    /// Bytes of photos in memory, for jobs and for first texts.
+    pub photos_bytes: u64,
     /// Bytes of uploads in memory.
     pub uploads_held_bytes: usize,
 }
@@ -136,6 +140,7 @@ pub fn text(levels: Readings) -> Result<String> {
     METRICS.jobs_running.set(levels.jobs_running as f64);
     METRICS.renders.set(levels.renders as f64);
     METRICS.cache_bytes.set(levels.cache_bytes as f64);
+    METRICS.photos_bytes.set(levels.photos_bytes as f64);
     METRICS.uploads_held.set(levels.uploads_held_bytes as f64);
     if let Some(bytes) = resident_bytes() {
         METRICS.resident.set(bytes);

@@ -63,6 +63,7 @@ pub(super) async fn metrics(State(api): State<Api>) -> Result<Response, ApiError
         jobs_running: readiness.jobs_running,
         renders: readiness.renders,
         cache_bytes: api.service.cached_bytes(),
+        photos_bytes: api.service.photos_bytes(),
         uploads_held_bytes: api.uploads.held_bytes(),
     })?;
     Ok(([(header::CONTENT_TYPE, "text/plain; version=0.0.4; charset=utf-8")], text).into_response())
