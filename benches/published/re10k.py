@@ -2,11 +2,12 @@
 
     python re10k.py SEGSPLAT DATA INDEX OUT [--bundle DIR --count N --lpips FILE.onnx]
 
-DATA is the folder `test` of pixelSplat's conversion: `*.torch`, each a list of sequences, and `index.json`
-(sequence to file). INDEX is DepthSplat's `assets/evaluation_index_re10k.json`: sequence to `context` and `target`
-frames. Photos are resized by Lanczos and cropped to 256 x 256 as there. Scenes are made with `preset=paper`.
-PSNR, SSIM as scikit-image counts it (Gaussian weights, window 11), and LPIPS where `--lpips` names an ONNX file
-of two inputs `[1,3,H,W]` in -1 to 1 with one number as output. OUT takes a row a sequence and their mean.
+DATA is the folder `test` of pixelSplat's conversion: `*.torch`, each a list of sequences, and
+`index.json` (sequence to file). INDEX is DepthSplat's `assets/evaluation_index_re10k.json`:
+sequence to `context` and `target` frames. Photos are resized by Lanczos and cropped to 256 x
+256 as there. Scenes are made with `preset=paper`. PSNR, SSIM as scikit-image counts it
+(Gaussian weights, window 11), and LPIPS where `--lpips` names an ONNX file of two inputs
+`[1,3,H,W]` in -1 to 1 with one number as output. OUT takes a row a sequence and their mean.
 
 Needs numpy, pillow, scipy."""
 
@@ -36,11 +37,13 @@ class Sequence:
 
     def picture(self, at):
         """`[SIDE, SIDE, 3]` u8: covered by the resized photo, the middle kept."""
-        photo = Image.open(io.BytesIO(np.ascontiguousarray(self.images[at]).tobytes())).convert("RGB")
+        photo = Image.open(io.BytesIO(np.ascontiguousarray(self.images[at]).tobytes())).convert(
+            "RGB"
+        )
         scale = max(SIDE / photo.width, SIDE / photo.height)
         width, height = round(photo.width * scale), round(photo.height * scale)
         x, y = (width - SIDE) // 2, (height - SIDE) // 2
-        return np.array(photo.resize((width, height), Image.LANCZOS))[y:y + SIDE, x:x + SIDE]
+        return np.array(photo.resize((width, height), Image.LANCZOS))[y : y + SIDE, x : x + SIDE]
 
     def camera(self, at):
         """Pixels of the picture, and the pose camera to world, row-major."""
@@ -49,8 +52,12 @@ class Sequence:
         scale = max(SIDE / width, SIDE / height)
         width, height = round(width * scale), round(height * scale)
         world_to_camera = np.vstack([np.reshape(pose, (3, 4)), [0, 0, 0, 1]])
-        lens = {"fx": fx * width, "fy": fy * height, "cx": cx * width - (width - SIDE) // 2,
-                "cy": cy * height - (height - SIDE) // 2}
+        lens = {
+            "fx": fx * width,
+            "fy": fy * height,
+            "cx": cx * width - (width - SIDE) // 2,
+            "cy": cy * height - (height - SIDE) // 2,
+        }
         return lens, [float(v) for v in np.linalg.inv(world_to_camera).ravel()]
 
 
@@ -74,9 +81,9 @@ def psnr(a, b):
 
 
 def ssim(a, b):
-    """skimage.metrics.structural_similarity(win_size=11, gaussian_weights=True, channel_axis=2, data_range=1)."""
+    """`structural_similarity` of scikit-image with `win_size=11` and `gaussian_weights=True`."""
     window, pad = 11, 5
-    unbiased = window ** 2 / (window ** 2 - 1)
+    unbiased = window**2 / (window**2 - 1)
 
     def blurred(x):
         return gaussian_filter(x, 1.5, truncate=3.5, axes=(0, 1))
@@ -85,8 +92,8 @@ def ssim(a, b):
     ua, ub = blurred(a), blurred(b)
     va, vb = unbiased * (blurred(a * a) - ua * ua), unbiased * (blurred(b * b) - ub * ub)
     vab = unbiased * (blurred(a * b) - ua * ub)
-    c1, c2 = 0.01 ** 2, 0.03 ** 2
-    found = (2 * ua * ub + c1) * (2 * vab + c2) / ((ua ** 2 + ub ** 2 + c1) * (va + vb + c2))
+    c1, c2 = 0.01**2, 0.03**2
+    found = (2 * ua * ub + c1) * (2 * vab + c2) / ((ua**2 + ub**2 + c1) * (va + vb + c2))
     return float(found[pad:-pad, pad:-pad].mean())
 
 
@@ -112,15 +119,31 @@ def judged(args, perceptual, name, frames, context, targets):
         for at in targets:
             lens, pose = frames.camera(at)
             out = place / "view.png"
-            run(args, "render", scene, "-o", out, "--camera-to-world=" + ",".join(map(repr, pose)),
-                "--width", SIDE, "--height", SIDE, *[f"--{key}={value}" for key, value in lens.items()])
+            run(
+                args,
+                "render",
+                scene,
+                "-o",
+                out,
+                "--camera-to-world=" + ",".join(map(repr, pose)),
+                "--width",
+                SIDE,
+                "--height",
+                SIDE,
+                *[f"--{key}={value}" for key, value in lens.items()],
+            )
             truth = frames.picture(at) / 255
             view = np.array(Image.open(out).convert("RGB")) / 255
             figures.append({"psnr": psnr(truth, view), "ssim": ssim(truth, view)})
             if perceptual:
                 figures[-1]["lpips"] = perceptual(truth, view)
     means = {key: statistics.fmean(row[key] for row in figures) for key in figures[0]}
-    return {"sequence": name, "views": len(figures), "gaussians": made["report"]["gaussians"], **means}
+    return {
+        "sequence": name,
+        "views": len(figures),
+        "gaussians": made["report"]["gaussians"],
+        **means,
+    }
 
 
 def lpips(file):
@@ -130,7 +153,10 @@ def lpips(file):
 
     def distance(a, b):
         names = [given.name for given in session.get_inputs()]
-        feed = {name: (2 * x - 1).transpose(2, 0, 1)[None].astype(np.float32) for name, x in zip(names, (a, b))}
+        feed = {
+            name: (2 * x - 1).transpose(2, 0, 1)[None].astype(np.float32)
+            for name, x in zip(names, (a, b))
+        }
         return float(np.ravel(session.run(None, feed)[0])[0])
 
     return distance

@@ -1,5 +1,5 @@
-"""The loaders on small folders of the exact layout: `python -m pytest benches/published` (with torch and
-scikit-image where they are installed)."""
+"""The loaders on small folders of the exact layout: `python -m pytest benches/published` (with
+torch and scikit-image where they are installed)."""
 
 import io
 import json
@@ -27,8 +27,10 @@ def data(tmp_path):
     pose = torch.tensor([1.0, 0, 0, 0.5, 0, 1, 0, -0.25, 0, 0, 1, 2])
     lens = torch.tensor([0.5, 0.9, 0.5, 0.5, 0, 0])
     example = {
-        "url": "https://example.org/watch", "timestamps": torch.arange(3),
-        "cameras": torch.cat([lens, pose]).repeat(3, 1), "key": "abc",
+        "url": "https://example.org/watch",
+        "timestamps": torch.arange(3),
+        "cameras": torch.cat([lens, pose]).repeat(3, 1),
+        "key": "abc",
         "images": [photo(640, 360, seed) for seed in range(3)],
     }
     other = {**example, "key": "left out"}
@@ -54,7 +56,11 @@ def test_a_file_that_makes_other_things_is_refused(tmp_path):
 
 
 def test_frames_are_cropped_with_their_cameras(data):
-    index = {"abc": {"context": [0, 2], "target": [1]}, "left out": None, "elsewhere": {"context": [], "target": []}}
+    index = {
+        "abc": {"context": [0, 2], "target": [1]},
+        "left out": None,
+        "elsewhere": {"context": [], "target": []},
+    }
     ((name, frames, context, target),) = re10k.sequences(data, index)
     assert (name, context, target) == ("abc", [0, 2], [1])
     assert frames.picture(1).shape == (256, 256, 3)
@@ -69,6 +75,8 @@ def test_ssim_is_that_of_scikit_image():
     rng = np.random.default_rng(0)
     a = rng.random((40, 50, 3))
     b = np.clip(a + rng.normal(0, 0.1, a.shape), 0, 1)
-    want = metrics.structural_similarity(a, b, win_size=11, gaussian_weights=True, channel_axis=2, data_range=1)
+    want = metrics.structural_similarity(
+        a, b, win_size=11, gaussian_weights=True, channel_axis=2, data_range=1
+    )
     assert re10k.ssim(a, b) == pytest.approx(want, abs=1e-9)
     assert re10k.psnr(np.zeros((2, 2)), np.full((2, 2), 0.1)) == pytest.approx(20)

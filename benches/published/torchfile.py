@@ -8,8 +8,14 @@ import zipfile
 
 import numpy as np
 
-TYPES = {"FloatStorage": "<f4", "DoubleStorage": "<f8", "LongStorage": "<i8", "IntStorage": "<i4",
-         "ByteStorage": "u1", "UntypedStorage": "u1"}
+TYPES = {
+    "FloatStorage": "<f4",
+    "DoubleStorage": "<f8",
+    "LongStorage": "<i8",
+    "IntStorage": "<i4",
+    "ByteStorage": "u1",
+    "UntypedStorage": "u1",
+}
 
 
 def tensor(storage, offset, size, stride, *_):
@@ -29,7 +35,9 @@ class Reader(pickle.Unpickler):
             return collections.OrderedDict
         if module in ("torch", "torch.storage") and name in TYPES:
             return name
-        raise pickle.UnpicklingError(f"{module}.{name} is no tensor, list, dictionary, text or number")
+        raise pickle.UnpicklingError(
+            f"{module}.{name} is no tensor, list, dictionary, text or number"
+        )
 
     def persistent_load(self, told):
         _, kind, key, _, count = told
@@ -42,5 +50,7 @@ class Reader(pickle.Unpickler):
 def load(path):
     """The value in a `.torch` or `.pt` file; tensors are numpy arrays."""
     with zipfile.ZipFile(path) as archive:
-        (root,) = [name[:-len("/data.pkl")] for name in archive.namelist() if name.endswith("/data.pkl")]
+        (root,) = [
+            name[: -len("/data.pkl")] for name in archive.namelist() if name.endswith("/data.pkl")
+        ]
         return Reader(archive, root).load()
