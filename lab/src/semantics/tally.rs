@@ -5,7 +5,7 @@
 //! the 3D-OVS benchmark does. *Open*: every pixel takes the best of the texts that select it, or
 //! none; a pixel of the surroundings is right where nothing is selected.
 //!
-//! IoUs are over all views of a scene. The *Jaccard* score of the first two readings is as 3D-OVS
+//! An IoU is over all views of a scene. The *Jaccard* score of the first two readings is as 3D-OVS
 //! averages scikit-learn's `jaccard_score`: over every class and view, 0 where a class is neither
 //! there nor selected.
 
