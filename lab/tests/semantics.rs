@@ -1,6 +1,8 @@
 //! `semantics` from a labelled folder to its figures, with the fixture's small networks.
 
-use segsplat_core::error::ErrorCode;
+use std::path::Path;
+
+use segsplat_core::error::{ErrorCode, Result};
 use segsplat_testing::{root, skipped};
 use serde_json::{Value, json};
 
@@ -63,24 +65,54 @@ fn folder() -> tempfile::TempDir {
     dir
 }
 
-#[test]
-fn words_find_their_boxes_in_a_view_and_a_word_for_nothing_does_not() {
-    let dir = folder();
+/// The rows of `semantics` for a folder; `None` without ONNX Runtime.
+fn judged(folder: &Path, rest: &[&str]) -> Option<Result<Vec<Value>>> {
     let bundle = root().join("tests/fixtures/colours");
-    let grids = dir.path().join("grids");
-    let [folder, pictures, bundle] = [dir.path(), &grids, &bundle].map(|p| p.to_str().unwrap());
-    let mut line = vec!["semantics", folder, "--absent", "blue,red", "--pictures", pictures];
+    let [folder, bundle] = [folder, &bundle].map(|p| p.to_str().unwrap());
+    let mut line = vec!["semantics", folder, "--absent", "blue,red"];
     line.extend(["--bundle", bundle, "--threads", "2"]);
+    line.extend(rest);
     // The program may be built outside of the checkout, where it does not find its library.
     let library = root().join("target/ort/libonnxruntime.so");
     let named = ["SEGSPLAT_ORT_LIBRARY", "ORT_DYLIB_PATH", "CARGO_TARGET_DIR"];
     if library.is_file() && named.iter().all(|name| std::env::var_os(name).is_none()) {
         line.extend(["--ort-library", library.to_str().unwrap()]);
     }
-    let rows = match lab(&line) {
-        Err(e) if e.code() == ErrorCode::ModelUnavailable => return skipped(&e.to_string()),
-        rows => rows.unwrap(),
+    match lab(&line) {
+        Err(e) if e.code() == ErrorCode::ModelUnavailable => {
+            skipped(&e.to_string());
+            None
+        }
+        rows => Some(rows),
+    }
+}
+
+#[test]
+fn scoring_is_changed_as_the_making_of_scenes_is() {
+    let dir = folder();
+    let selected = |rest: &[&str]| -> Option<f64> {
+        let rows = judged(dir.path(), rest)?.unwrap();
+        rows[0]["default"]["scene"]["miou"].as_f64()
     };
+    let Some(plain) = selected(&[]) else { return };
+    assert!(plain > 0.5, "{plain}");
+    // With itself among the canonical texts no word is over a cut above a half.
+    let none =
+        ["--method", "cut=0.9", "--method", r#"canon=["red","green"]"#, "--method", "votes=true"];
+    assert!(selected(&none).unwrap() < 0.01, "nothing is selected");
+    for (bad, why) in [("cut=2", "cut is 2"), ("tau=x", "tau=x"), ("beta=1", "beta=1")] {
+        let fault = judged(dir.path(), &["--method", bad]).unwrap().unwrap_err();
+        assert!(fault.message().contains(why), "{fault}");
+    }
+}
+
+#[test]
+fn words_find_their_boxes_in_a_view_and_a_word_for_nothing_does_not() {
+    let dir = folder();
+    let grids = dir.path().join("grids");
+    let pictures = ["--pictures", grids.to_str().unwrap()];
+    let Some(rows) = judged(dir.path(), &pictures) else { return };
+    let rows = rows.unwrap();
     let targets = rows[0]["targets"].as_array().unwrap();
     assert_eq!((rows.len(), targets.len()), (1, 3));
     // The middle photo is seen from the two beside it.

@@ -48,6 +48,9 @@ fn three_readings_of_one_view() {
     // Best selecting text: cup, none, cup, cup; 1 of 4 right.
     assert_eq!([&cup["iou_open"], &plate["iou_open"]], [0.25, 0.0]);
     assert_eq!(scores["accuracy_open"], 0.25);
+    // As 3D-OVS: own masks; then the best text of every pixel: cup, none, plate, cup.
+    assert_eq!(scores["jaccard"], 0.125);
+    assert_eq!(scores["jaccard_closed"], f64::midpoint(1.0 / 3.0, 1.0));
     // "car" selects one of four.
     assert_eq!(scores["absent_words"][0]["selected"], 0.25);
     assert_eq!([&cup["share"], &plate["share"]], [0.5, 0.25]);
@@ -63,4 +66,6 @@ fn a_class_that_no_view_shows_is_left_out() {
     for figure in ["miou", "accuracy_closed", "accuracy_open"] {
         assert_eq!(scores[figure], 1.0, "{figure}");
     }
+    // But 3D-OVS counts it as 0.
+    assert_eq!([&scores["jaccard"], &scores["jaccard_closed"]], [0.5, 0.5]);
 }

@@ -5,7 +5,7 @@ use glam::DVec3;
 use super::request::{CameraSpec, LensSpec, PoseSpec, ViewOptions};
 use crate::{
     error::{Error, Result},
-    limits::Limits,
+    limits::{FOCAL_RANGE, FOV_RANGE, Limits},
     names::shown,
     scene::{Camera, CameraToWorld, Intrinsics, SceneCamera},
 };
@@ -13,12 +13,8 @@ use crate::{
 /// Longer side of a picture when a request gives no size, pixels. It is near the size that the
 /// network reads, so no gaps show between its pixels.
 const DEFAULT_SIDE: f64 = 384.0;
-/// Focal lengths and principal points accepted, pixels: a view is at most some thousands wide.
-const FOCAL_RANGE: [f64; 2] = [1.0, 1e6];
 /// Vertical field of view of a scene without cameras, degrees.
 const DEFAULT_FOV: f64 = 60.0;
-/// Vertical fields of view accepted, degrees.
-const FOV_RANGE: [f64; 2] = [0.1, 170.0];
 /// Largest coordinate of a camera centre: that of a Gaussian.
 const COORDINATE_MAX: f64 = 1e9;
 

@@ -3,12 +3,15 @@
 
 use std::{collections::HashMap, sync::Arc};
 
+use glam::DMat4;
 use rayon::prelude::*;
 
 use super::{
     Service,
     encode::{self, Layer},
-    request::{Boxes, Format, Kind, MaskFormat, PictureOptions, QuerySpec},
+    request::{
+        Boxes, CameraSpec, Format, Kind, LensSpec, MaskFormat, PictureOptions, PoseSpec, QuerySpec,
+    },
     rle::Rle,
     search::{self, LabelledView, SceneTexts, ScoredText},
     texts,
@@ -93,9 +96,12 @@ pub(super) fn query_view<'a>(
     inputs: impl Into<Inputs<'a>>,
     spec: &QuerySpec,
 ) -> Result<Option<Resolved>> {
-    let Some(camera) = spec.camera else { return Ok(None) };
     let options = (&spec.options, &PictureOptions::default());
-    resolve_one(limits, inputs, camera, Kind::Mask, options).map(Some)
+    // The options of a view that is not asked for are checked all the same.
+    let any = PoseSpec::CameraToWorld(DMat4::IDENTITY.to_cols_array());
+    let camera = spec.camera.unwrap_or(CameraSpec { pose: any, lens: LensSpec::default() });
+    let view = resolve_one(limits, inputs, camera, Kind::Mask, options)?;
+    Ok(spec.camera.map(|_| view))
 }
 
 /// What each set of entries selects; texts that select the same share it.

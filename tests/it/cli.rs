@@ -250,6 +250,37 @@ fn photos_become_a_scene_that_can_be_looked_at() {
 }
 
 #[test]
+fn the_bank_and_the_features_of_a_view_are_written_as_arrays() {
+    if !with_network() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
+    let (photos, scene, file) = (at("photos"), at("made.segsplat"), at("x.npz"));
+    ok(&["sample", "-o", &photos, "--photos", "2", "--size", "120x80"]);
+    let bundle = ["--bundle", "tests/fixtures/colours"];
+    let made = ["reconstruct", &photos, "-o", &scene, "--preset", "paper"];
+    ok(&[&made[..], &bundle].concat());
+    let write =
+        |rest: &[&'static str]| [&["features", &scene, "-o", &file], rest, &bundle, &CPU].concat();
+    refused(&write(&[]), ErrorCode::SemanticsOff, "semantics");
+    ok(&[&made[..], &["--semantics", "eager"], &bundle].concat());
+    let arrays = || -> Vec<String> {
+        let mut zip = zip::ZipArchive::new(std::fs::File::open(&file).unwrap()).unwrap();
+        (0..zip.len()).map(|i| zip.by_index(i).unwrap().name().unwrap().into_owned()).collect()
+    };
+    let view = ["--camera", "0", "--width", "24", "--height", "16"];
+    let dense = [&view[..], &["--kind", "features"]].concat();
+    for (rest, first) in [(&[][..], "bank.npy"), (&view, "size.npy"), (&dense, "features.npy")] {
+        let said = ok_json(&write(rest));
+        let bytes = std::fs::metadata(&file).unwrap().len();
+        assert_eq!((&said["output"], said["size_bytes"].as_u64()), (&(&*file).into(), Some(bytes)));
+        assert_eq!(arrays()[0], first, "{rest:?}");
+    }
+    refused(&write(&["--camera", "7"]), ErrorCode::InvalidRequest, "from is 7");
+}
+
+#[test]
 fn models_say_their_licences_and_views_only_where_they_take_some() {
     let listed = ok(&["models", "list"]);
     assert!(
@@ -288,6 +319,7 @@ fn a_bundle_is_checked_and_its_faults_are_counted_by_the_exit_code() {
     assert_eq!(faults.len(), 2, "{faults:?}");
     assert!(faults[0].contains("geometry.sh_degree is 9"), "{faults:?}");
     assert!(faults[1].contains("plane.onnx cannot be read"), "{faults:?}");
+    assert!(faults[1].contains(text(folder.path())) && !faults[1].contains("git"), "{faults:?}");
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(said.contains("2 of its things do not fit"), "{said}");
 }

@@ -223,6 +223,51 @@ async fn real_answers_have_the_fields_that_the_document_says() {
     assert!(broken.len() > 3, "the check finds nothing wrong with nonsense: {broken:?}");
 }
 
+#[tokio::test]
+async fn the_document_has_the_bodies_and_the_bounds_that_the_server_takes() {
+    let stand = CpuServer::with(PlaneNetworks::default(), |config| {
+        config.limits.view_side_max = 300;
+        config.limits.page_max = 7;
+        config.limits.texts_max = 3;
+    })
+    .await;
+    let document = document(&stand).await;
+    let schemas = &document["components"]["schemas"];
+    let mut faults = Vec::new();
+    let common = json!({
+        "width": 8, "height": 8, "antialiased": true, "near": 0.1, "quality": "fast",
+        "preset": "paper", "front_photos": 0, "magnify": true, "canon": ["thing"], "tau": 1.0,
+        "cut": 0.2, "unit_rows": true, "coverage_floor": 0.1, "wait_ms": 0,
+    });
+    let [mut query, mut views] = [common.clone(), common];
+    query["texts"] = json!(["a chair"]);
+    query["camera"] = json!({ "from": 0, "fov": 40.0 });
+    views["cameras"] = json!([{ "eye": [0, 0, 0], "target": [0, 0, 1] }]);
+    views["background"] = json!("white");
+    views["container"] = json!("zip");
+    for (name, body) in [("QueryBody", query), ("ViewsRequest", views)] {
+        check(&document, name, &body, &mut faults);
+        assert_eq!(schemas[name]["additionalProperties"], false, "{name}");
+    }
+    assert!(faults.is_empty(), "{}", faults.join("\n"));
+    for (name, schema) in schemas.as_object().unwrap() {
+        assert!(schema.get("allOf").is_none(), "{name}: closed objects in allOf have no value");
+    }
+    assert_eq!(schemas["Event"]["oneOf"].as_array().map(Vec::len), Some(5), "events");
+    let texts = &schemas["QueryBody"]["properties"]["texts"];
+    assert_eq!((&texts["minItems"], &texts["maxItems"]), (&json!(1), &json!(3)), "{texts}");
+    for (path, name, range) in [
+        ("/v1/scenes/{id}/view", "width", [json!(1), json!(300)]),
+        ("/v1/scenes/{id}/view", "fov", [json!(0.1), json!(170.0)]),
+        ("/v1/scenes/{id}/view", "deadline_ms", [json!(1), Value::Null]),
+        ("/v1/scenes", "limit", [json!(1), json!(7)]),
+    ] {
+        let given = document["paths"][path]["get"]["parameters"].as_array().unwrap();
+        let schema = &given.iter().find(|given| given["name"] == name).unwrap()["schema"];
+        assert_eq!([&schema["minimum"], &schema["maximum"]], range.each_ref(), "{path} {name}");
+    }
+}
+
 /// Compares `value` with the schema `name`: no field unknown, none missing, those below too.
 fn check(document: &Value, name: &str, value: &Value, faults: &mut Vec<String>) {
     let schema = &document["components"]["schemas"][name];
@@ -230,23 +275,6 @@ fn check(document: &Value, name: &str, value: &Value, faults: &mut Vec<String>) 
         if !names.contains(value) {
             faults.push(format!("{name}: {value} is none of {names:?}"));
         }
-        return;
-    }
-    // A type that holds another one's fields beside its own has both in `allOf`.
-    for part in schema["allOf"].as_array().into_iter().flatten() {
-        let of = |part: &Value| match part["$ref"].as_str() {
-            Some(name) => {
-                document["components"]["schemas"][name.rsplit('/').next().unwrap()].clone()
-            }
-            None => part.clone(),
-        };
-        let part = of(part);
-        let required = part["required"].as_array().into_iter().flatten();
-        for key in required.filter(|key| value.get(key.as_str().unwrap()).is_none()) {
-            faults.push(format!("{name}: `{key}` is missing"));
-        }
-    }
-    if schema["allOf"].is_array() {
         return;
     }
     let fields = schema["properties"].as_object().unwrap_or_else(|| panic!("no schema {name}"));

@@ -10,7 +10,7 @@ use std::{
 use futures_util::StreamExt;
 use segsplat::{
     error::ErrorCode,
-    scene::{Preset, SceneId, SceneOptions, SemanticsMode, SemanticsState},
+    scene::{Method, Preset, SceneId, SceneOptions, SemanticsMode, SemanticsState},
     service::{
         Boxes, CreateScene, ExportFormat, Format, Kind, MaskFormat, PickSpec, PictureOptions,
         QuerySpec, Rle, ScoringOptions, TextOptions, ViewOptions, ViewSpec,
@@ -18,7 +18,8 @@ use segsplat::{
 };
 
 use crate::common::{
-    doors::{Ask, both, bytes, json},
+    cpu_server::{self, CpuServer},
+    doors::{Ask, Options, both, bytes, json},
     meaning::PhotoMeaning,
     server::{CountingRenderer, PATIENCE, TestServer, first_view, upload},
 };
@@ -241,6 +242,44 @@ async fn both_doors_give_the_same_features() {
         assert_eq!(odd.message, "front_photos is 5000; it must be 0 to 1024");
     }
     assert_eq!(files[0], files[1]);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn features_over_their_limit_are_refused_and_weights_are_not() {
+    let meaning: Arc<PhotoMeaning> = Arc::default();
+    let server = TestServer::with(|config, parts| {
+        config.limits.features_bytes_max = 1 << 10;
+        parts.semantics = meaning;
+        parts.renderer = Arc::new(CountingRenderer::default());
+    });
+    let fixture =
+        Fixture { server: server.await, meaning: Arc::default(), renderer: Arc::default() };
+    let id = fixture.scene(SemanticsMode::Lazy).await.to_string();
+    for door in both(fixture.server.addr).await {
+        door.features(&id, &Ask::first()).await.unwrap();
+        let dense = Ask::first().with("kind", "features");
+        let fault = door.features(&id, &dense).await.unwrap_err();
+        assert_eq!(fault.code, "limit_exceeded", "{}", door.name());
+        let told = ["64x48 px", "bytes", "1024 bytes"];
+        assert!(told.iter().all(|part| fault.message.contains(part)), "{}", fault.message);
+    }
+}
+
+/// The method that a scene was made by, as each door's caller asked.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_scene_is_made_by_the_preset_that_each_door_names() {
+    let server = CpuServer::start().await;
+    for door in both(server.addr).await {
+        let mut made = Vec::new();
+        for preset in [None, Some("paper")] {
+            let options = Options { preset, ..Options::wait() };
+            let (id, _) = door.create(&cpu_server::upload(), &options).await.unwrap();
+            let status = server.service.get(&id.parse().unwrap()).await.unwrap();
+            made.push(status.report.unwrap().method);
+        }
+        let want = [Preset::Default, Preset::Paper].map(Method::of);
+        assert_eq!(made, want, "{}", door.name());
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

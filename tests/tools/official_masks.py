@@ -2,11 +2,13 @@
 
     segsplat-lab masks SCENES --dump OUT [--bundle DIR]
     python3 official_masks.py OUT BUNDLE_DIR [--report FILE]
+    python3 official_masks.py OUT BUNDLE_DIR --torch vit_b --random 1 --alike 0.99
 
 OUT holds each photo as our networks saw it (PNG) and our masks before level choice and before the
 one-mask-a-pixel rule (JSON). `SamAutomaticMaskGenerator` of the package `segment-anything` gets the
-bundle's ONNX files behind the interface of its own model, and the bundle's thresholds. Needs
-segment-anything, torch, torchvision, onnxruntime, numpy, pillow.
+bundle's thresholds and its ONNX files behind the interface of its own model; with `--torch` its own
+model on PyTorch, with the weights that `models/export/sam.py` exported (`--checkpoint`, or the
+seed of `--random`). Needs segment-anything, torch, torchvision, onnxruntime, numpy, pillow.
 """
 import argparse
 import json
@@ -18,10 +20,8 @@ import numpy as np
 import onnxruntime
 import torch
 from PIL import Image
-from segment_anything import SamAutomaticMaskGenerator
+from segment_anything import SamAutomaticMaskGenerator, sam_model_registry
 from segment_anything.modeling.sam import Sam
-
-ALIKE = 0.95
 
 
 class OnnxSam(torch.nn.Module):
@@ -148,13 +148,22 @@ def main():
     parser.add_argument("bundle", type=pathlib.Path)
     parser.add_argument("--report", type=pathlib.Path)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--alike", type=float, default=0.95, help="IoU of masks that are the same")
+    parser.add_argument("--torch", choices=["vit_b", "vit_l", "vit_h"], help="the model on PyTorch")
+    parser.add_argument("--checkpoint", help="its weights")
+    parser.add_argument("--random", type=int, default=0, help="its seed, without --checkpoint")
     args = parser.parse_args()
     masks = tomllib.loads((args.bundle / "bundle.toml").read_text())["masks"]
     assert masks["adapter"] == "sam", "only networks with SAM's signature fit its own code"
-    model = OnnxSam(args.bundle, masks, args.threads)
+    if args.torch:
+        torch.set_num_threads(args.threads)
+        torch.manual_seed(args.random)
+        model = sam_model_registry[args.torch](checkpoint=args.checkpoint).eval()
+    else:
+        model = OnnxSam(args.bundle, masks, args.threads)
     keys = ["points_per_side", "points_per_batch", "pred_iou_thresh", "stability_score_thresh",
-            "stability_score_offset", "box_nms_thresh"]
-    defaults = dict(zip(keys, [32, 64, .8, .9, 1., .7]))
+            "stability_score_offset", "box_nms_thresh", "min_mask_region_area"]
+    defaults = dict(zip(keys, [32, 64, .8, .9, 1., .7, 0]))
     generator = SamAutomaticMaskGenerator(model, **{k: masks.get(k, defaults[k]) for k in keys})
     rows = []
     for file in sorted(args.dump.glob("*.json")):
@@ -167,8 +176,8 @@ def main():
         for road, found in entry.items():
             mine = [at_size(m, *photo.shape[:2]) for m in ours(found)]
             there, back = best(official, mine), best(mine, official)
-            row[road] = {"masks": len(mine), "alike": int((there >= ALIKE).sum()),
-                         "alike_back": int((back >= ALIKE).sum()),
+            row[road] = {"masks": len(mine), "alike": int((there >= args.alike).sum()),
+                         "alike_back": int((back >= args.alike).sum()),
                          "iou": float(there.mean()) if len(there) else 1.,
                          "iou_back": float(back.mean()) if len(back) else 1.}
         rows.append(row)

@@ -203,7 +203,8 @@ def test_views_go_on_after_a_fault_in_the_stream(
         body = answer.read()
         line = b"--" + answer.headers["content-type"].split("=")[1].encode()
         first = body.split(line)[1]
-        fault = b'\r\ncontent-type: application/json\r\n\r\n{"code":"overloaded","message":"busy"}'
+        told = refusal(429, "overloaded", 2).content
+        fault = b"\r\ncontent-type: application/json\r\n\r\n" + told
         del answer.headers["transfer-encoding"]
         content = line + first + line + fault + b"\r\n" + line + b"--\r\n"
         return httpx.Response(200, headers=answer.headers, content=content)
@@ -213,7 +214,7 @@ def test_views_go_on_after_a_fault_in_the_stream(
     again = Client(url, transport=faulty).get(scene.id)
     views = [view.image for view in again.views(spots, width=32)]
     assert np.array_equal(views, [view.image for view in scene.views(spots, width=32)])
-    assert slept == [1] and len(faulty.seen) == 2
+    assert slept == [2] and len(faulty.seen) == 2
 
 
 def test_events_and_exports_begin_again(

@@ -12,6 +12,25 @@ pub const IDEMPOTENCY_KEY_BYTES_MAX: usize = 256;
 /// bounds what the products of all pairs of rows take.
 pub const BANK_ROWS_MAX: usize = 4_096;
 
+/// Photos of `fuse_layers` and `front_photos`: no scene has more.
+pub const SCENE_PHOTOS_MAX: u32 = 1_024;
+
+/// Canonical texts that a text is compared with: LERF has four.
+pub const CANON_MAX: usize = 64;
+
+/// Least and largest `lambda`: rows of the bank over the mean number of masks of a photo.
+pub const LAMBDA_RANGE: [f64; 2] = [0.01, 100.0];
+
+/// Least and largest `tau`, the sharpness of the comparison of texts: LERF has 10.
+pub const TAU_RANGE: [f64; 2] = [1e-3, 1e6];
+
+/// Vertical fields of view, degrees: a picture is flat, so it must stay under 180.
+pub const FOV_RANGE: [f64; 2] = [0.1, 170.0];
+
+/// Focal lengths, pixels; principal points lie within the largest of the origin. A view is at most
+/// some thousands wide.
+pub const FOCAL_RANGE: [f64; 2] = [1.0, 1e6];
+
 /// Declares the limits: name, type and default; `restart` where a new number counts only after a
 /// restart, because it sizes something at start.
 macro_rules! limits {

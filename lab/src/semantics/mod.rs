@@ -12,6 +12,7 @@ mod views;
 
 use std::path::PathBuf;
 
+use segsplat::service::ScoringOptions;
 use segsplat_core::names::named;
 use serde_json::{Value, json};
 
@@ -27,7 +28,7 @@ use crate::{
     pipeline::Pipeline,
     render::cpu::CpuRenderer,
     rows::{Rows, progress},
-    scene::{Preset, SceneOptions},
+    scene::{Preset, SceneOptions, with_pairs},
     scenes::{means_by_use, nearest, use_of},
     setup::Inputs,
 };
@@ -51,7 +52,8 @@ pub(crate) struct Args {
     /// How scenes are made, understood and scored, separated by commas: default, paper
     #[arg(long, value_delimiter = ',', value_parser = named::<Preset>, default_value = "default")]
     preset: Vec<Preset>,
-    /// A change of the method of every preset: `--method lambda=0.8`; docs/method.md has all
+    /// A change of the method of every preset, of scenes or of scoring: `--method lambda=0.8`,
+    /// `--method tau=20`, `--method 'canon=["object"]'`; docs/method.md has all
     #[arg(long, value_name = "NAME=VALUE")]
     method: Vec<String>,
     /// Folder for picture grids, one a scene
@@ -61,9 +63,18 @@ pub(crate) struct Args {
 
 impl Args {
     fn way(&self, engine: &Pipeline, preset: Preset) -> Result<Way> {
-        let options = SceneOptions { preset, ..SceneOptions::default() }.with(&self.method)?;
-        let scoring = engine.scoring(&engine.scoring_method(preset)?)?.into();
-        Ok(Way { options, scoring })
+        // Names of neither are told by those of scenes.
+        let known = json!(ScoringOptions::default());
+        let scores =
+            |pair: &&String| pair.split_once('=').is_some_and(|p| known.get(p.0).is_some());
+        let (scores, makes): (Vec<_>, Vec<_>) = self.method.iter().partition(scores);
+        let [scores, makes] =
+            [scores, makes].map(|all| all.into_iter().cloned().collect::<Vec<_>>());
+        let options = SceneOptions { preset, ..SceneOptions::default() }.with(&makes)?;
+        options.method().check()?;
+        let changes = with_pairs(&ScoringOptions::default(), &scores)?;
+        let method = changes.change(engine.scoring_method(preset)?);
+        Ok(Way { options, scoring: engine.scoring(&method)?.into() })
     }
 }
 

@@ -4,6 +4,10 @@
 //! the product answers. *Closed*: every labelled pixel takes its best text, whatever its score, as
 //! the 3D-OVS benchmark does. *Open*: every pixel takes the best of the texts that select it, or
 //! none; a pixel of the surroundings is right where nothing is selected.
+//!
+//! An IoU is over all views of a scene. The *Jaccard* score of the first two readings is as 3D-OVS
+//! averages scikit-learn's `jaccard_score`: over every class and view, 0 where a class is neither
+//! there nor selected.
 
 use serde_json::{Value, json};
 
@@ -53,6 +57,8 @@ pub struct Tally {
     closed_right: [u64; 2],
     open_right: [u64; 2],
     absent: Vec<(String, [u64; 2])>,
+    /// Of each view: the mean Jaccard score of the classes, by threshold and closed.
+    jaccard: [Vec<f64>; 2],
 }
 
 impl Tally {
@@ -70,6 +76,7 @@ impl Tally {
             closed_right: [0; 2],
             open_right: [0; 2],
             absent: absent.iter().map(|word| (word.clone(), [0; 2])).collect(),
+            jaccard: [Vec::new(), Vec::new()],
         }
     }
 
@@ -82,6 +89,7 @@ impl Tally {
     /// Adds a view: labels as in [`super::labels::LabelledFrame`], and a map of each text.
     pub fn add(&mut self, label: &[u16], maps: &[TextMap]) {
         let (classes, absent) = maps.split_at(self.asked.len());
+        let mut of_view = [(); 2].map(|()| vec![Overlap::default(); classes.len()]);
         for (p, &label) in label.iter().enumerate() {
             if label == NOT_SEEN {
                 continue;
@@ -94,6 +102,8 @@ impl Tally {
             let chosen = best_selected(classes, p);
             for (c, map) in classes.iter().enumerate() {
                 self.threshold[c].add(map.mask[p], truth == Some(c));
+                of_view[0][c].add(map.mask[p], truth == Some(c));
+                of_view[1][c].add(best == Some(c), truth == Some(c));
                 self.open[c].add(chosen == Some(c), truth == Some(c));
                 if truth.is_some() {
                     self.closed[c].add(best == Some(c), truth == Some(c));
@@ -106,6 +116,9 @@ impl Tally {
             for ((_, counted), map) in self.absent.iter_mut().zip(absent) {
                 count(counted, map.mask[p]);
             }
+        }
+        for (all, of_view) in self.jaccard.iter_mut().zip(of_view) {
+            all.push(mean(of_view.into_iter().map(|class| class.iou().unwrap_or(0.0))));
         }
     }
 
@@ -135,6 +148,8 @@ impl Tally {
             "miou": over(&classes, "iou"),
             "miou_closed": over(&classes, "iou_closed"),
             "accuracy_closed": share(self.closed_right),
+            "jaccard": mean(self.jaccard[0].iter().copied()),
+            "jaccard_closed": mean(self.jaccard[1].iter().copied()),
             "miou_open": over(&classes, "iou_open"),
             "accuracy_open": share(self.open_right),
             "absent": over(&absent_words, "selected"),

@@ -82,10 +82,10 @@ impl ApiError {
         &self.error
     }
 
-    /// Writes body and headers into `response`.
-    pub(super) fn write(&self, response: Response, request_id: &str) -> Response {
+    /// What a caller is told of it.
+    pub(super) fn body(&self, request_id: &str) -> ErrorBody {
         let error = self.error();
-        let body = ErrorBody {
+        ErrorBody {
             code: error.code().name(),
             message: error.message().to_owned(),
             request_id: request_id.to_owned(),
@@ -94,7 +94,13 @@ impl ApiError {
                 retry_after_s: retry_after_s(error),
                 scene: self.scene.as_ref().map(ToString::to_string),
             },
-        };
+        }
+    }
+
+    /// Writes body and headers into `response`.
+    pub(super) fn write(&self, response: Response, request_id: &str) -> Response {
+        let error = self.error();
+        let body = self.body(request_id);
         let (mut parts, _) = response.into_parts();
         parts.headers.remove(header::CONTENT_LENGTH);
         parts.headers.remove(header::CONTENT_TYPE);

@@ -132,8 +132,8 @@ pub(super) async fn delete(
     get, path = "/v1/scenes/{id}/events", operation_id = "watch_scene", tag = "scenes",
     params(Id),
     responses((
-        status = 200, content_type = "text/event-stream", body = String,
-        description = "Events queued, running, done, failed, cancelled, each with JSON data"
+        status = 200, content_type = "text/event-stream", body = Event,
+        description = "Server-sent events; the data of each is an Event as JSON"
     ))
 )]
 pub(super) async fn events(

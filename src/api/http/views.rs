@@ -17,14 +17,15 @@ use utoipa::ToSchema;
 use zip::{CompressionMethod, ZipWriter, write::SimpleFileOptions};
 
 use super::{
-    error::ApiError,
+    error::{ApiError, ErrorBody},
     extract::{CallerApi, Id, JsonBody},
     fields::Fields,
     middleware::{Deadline, text_of},
     render::{camera, content_type, view_headers},
 };
 use crate::{
-    error::Result,
+    api::request_id,
+    error::{Error, Result},
     service::{CameraFields, Format, Kind, RenderedView, TextOptions, ViewOptions, ViewsSpec},
 };
 
@@ -75,8 +76,9 @@ impl ViewsBody {
     post, path = "/v1/scenes/{id}/views", operation_id = "render_views", tag = "views",
     params(Id), request_body = ViewsBody,
     responses((
-        status = 200, content_type = "multipart/mixed", body = Vec<u8>,
-        description = "The pictures camera by camera; or application/zip"
+        status = 200, content((Vec<u8> = "multipart/mixed"), (Vec<u8> = "application/zip")),
+        description = "The pictures camera by camera. A part of multipart/mixed that is \
+            application/json is an ErrorBody, and the last"
     ))
 )]
 pub(super) async fn views(
@@ -92,10 +94,12 @@ pub(super) async fn views(
     let options = ViewOptions { deadline, ..spec.options };
     let spec = ViewsSpec { options, ..spec };
     let pictures = api.service.render_many(&id, &spec).await?.boxed();
+    let request_id = text_of(&headers, request_id::HEADER).unwrap_or_default().to_owned();
+    let fault = move |error| ApiError::of_scene(error, &id).body(&request_id);
     let (kind, body) = match container.unwrap_or(accepted) {
         Container::Multipart => (
             format!("multipart/mixed; boundary={BOUNDARY}"),
-            Body::from_stream(multipart(pictures)),
+            Body::from_stream(multipart(pictures, fault)),
         ),
         Container::Zip => ("application/zip".to_owned(), Body::from_stream(zip(pictures))),
     };
@@ -111,11 +115,12 @@ fn file_name(view: &RenderedView) -> String {
     }
 }
 
-/// Parts with the headers of a single view; a fault ends it with a part that holds the error.
+/// Parts with the headers of a single view; a fault ends it with a part that holds its body.
 fn multipart(
     pictures: impl Stream<Item = Result<RenderedView>> + Send + 'static,
+    fault: impl Fn(Error) -> ErrorBody + Send + 'static,
 ) -> impl Stream<Item = Result<Bytes, io::Error>> + Send + 'static {
-    let parts = pictures.flat_map(|picture| {
+    let parts = pictures.flat_map(move |picture| {
         let mut part = format!("--{BOUNDARY}\r\n").into_bytes();
         let body = match picture {
             Ok(view) => {
@@ -133,12 +138,8 @@ fn multipart(
                 view.bytes
             }
             Err(error) => {
-                let body = serde_json::json!({
-                    "code": error.code().name(),
-                    "message": error.message(),
-                });
                 part.extend_from_slice(b"content-type: application/json\r\n\r\n");
-                body.to_string().into_bytes()
+                serde_json::to_vec(&fault(error)).unwrap_or_default()
             }
         };
         let pieces = [Bytes::from(part), Bytes::from(body), Bytes::from_static(b"\r\n")];
@@ -207,5 +208,26 @@ impl Write for Outbox {
 
     fn flush(&mut self) -> io::Result<()> {
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{error::ErrorCode, scene::SceneId};
+
+    #[tokio::test]
+    async fn an_error_between_the_pictures_says_what_any_other_says() {
+        let id: SceneId = "0".repeat(32).parse().unwrap();
+        let fault = move |error| ApiError::of_scene(error, &id).body("r1");
+        let pictures = stream::iter([Err(Error::new(ErrorCode::Overloaded, "busy"))]);
+        let parts: Vec<_> = multipart(pictures, fault).map(Result::unwrap).collect().await;
+        let text = String::from_utf8(parts.concat()).unwrap();
+        let body = text.split("\r\n").nth(3).unwrap();
+        let told: serde_json::Value = serde_json::from_str(body).unwrap();
+        let details =
+            serde_json::json!({ "retry": true, "retry_after_s": 1, "scene": "0".repeat(32) });
+        assert_eq!((&told["code"], &told["request_id"]), (&"overloaded".into(), &"r1".into()));
+        assert_eq!(told["details"], details);
     }
 }

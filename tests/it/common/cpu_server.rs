@@ -37,7 +37,7 @@ impl SceneNetworks for PlaneNetworks {
     fn make(
         &self,
         photos: &PhotoSet,
-        _: &SceneOptions,
+        options: &SceneOptions,
         watch: Watch<'_>,
     ) -> Result<Reconstruction> {
         if let Some(code) = self.fails {
@@ -49,6 +49,7 @@ impl SceneNetworks for PlaneNetworks {
         (watch.progress)(Stage::Lift, 0.5);
         let (gaussians, _) = Gaussians::sanitize(plane(&photos[0], capture.median_depth))?;
         let report = HealthReport {
+            method: options.method(),
             photos: u32::try_from(photos.len()).expect("few photos"),
             views_used: u32::try_from(photos.len()).expect("few photos"),
             gaussians: gaussians.len() as u64,

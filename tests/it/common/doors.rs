@@ -174,13 +174,7 @@ impl Ask {
             background: self.numbers("background").map(|v| pb::Vec3 { x: v[0], y: v[1], z: v[2] }),
             antialiased: self.get("antialiased") == Some("true"),
             near: self.number("near"),
-            preset: match self.get("preset") {
-                None => pb::Preset::Unspecified,
-                Some("default") => pb::Preset::Default,
-                Some("paper") => pb::Preset::Paper,
-                Some(other) => panic!("preset {other} is not in the proto"),
-            }
-            .into(),
+            preset: preset(self.get("preset")).into(),
             front_photos: self.number("front_photos"),
             magnify: self.number("magnify"),
             crop: self.numbers("crop").map(|v| {
@@ -211,12 +205,22 @@ impl Ask {
     }
 }
 
+fn preset(name: Option<&str>) -> pb::Preset {
+    match name {
+        None => pb::Preset::Unspecified,
+        Some("default") => pb::Preset::Default,
+        Some("paper") => pb::Preset::Paper,
+        Some(other) => panic!("preset {other} is not in the proto"),
+    }
+}
+
 /// Options of a create call.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Options {
     pub(crate) wait_ms: Option<u64>,
     pub(crate) semantics: Option<&'static str>,
     pub(crate) bundle: Option<&'static str>,
+    pub(crate) preset: Option<&'static str>,
     pub(crate) idempotency_key: Option<String>,
 }
 
@@ -254,6 +258,7 @@ impl Door {
                 query.extend(options.wait_ms.map(|ms| ("wait_ms", ms.to_string())));
                 query.extend(options.semantics.map(|s| ("semantics", s.to_owned())));
                 query.extend(options.bundle.map(|s| ("bundle", s.to_owned())));
+                query.extend(options.preset.map(|s| ("preset", s.to_owned())));
                 let url = url(base, "/v1/scenes", &query);
                 let mut request = client.post(url).multipart(form(upload));
                 if let Some(key) = &options.idempotency_key {
@@ -539,7 +544,9 @@ pub(crate) fn messages(upload: &Upload, options: &Options) -> Vec<pb::CreateScen
         semantics: semantics.into(),
         bundle: options.bundle.unwrap_or_default().to_owned(),
         max_views: None,
-        method: None,
+        method: options
+            .preset
+            .map(|name| pb::Method { preset: preset(Some(name)).into(), ..pb::Method::default() }),
         wait_ms: options.wait_ms,
         idempotency_key: options.idempotency_key.clone().unwrap_or_default(),
     };

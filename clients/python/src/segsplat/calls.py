@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Unpack
 
-from .errors import BadAnswer, ConnectionLost, InvalidRequest, SceneNotFound, SegSplatError
+from .errors import (
+    BadAnswer,
+    ConnectionLost,
+    InvalidRequest,
+    SceneNotFound,
+    SegSplatError,
+    error_of,
+)
 from .gaussians import Gaussians
 from .progress import show_bar
 from .types import (
@@ -295,7 +302,7 @@ def _views(
             while piece := (yield Read()):
                 for headers, content in reader.feed(piece):
                     if headers.get("content-type") == "application/json":
-                        raise _in_between(content)
+                        raise error_of(200, headers, content)
                     kind = kinds[len(arrays)]
                     camera, arrays[kind] = picture(kind, headers, content)
                     if len(arrays) < len(kinds):
@@ -311,13 +318,6 @@ def _views(
         except SegSplatError as error:
             yield from pause(scene.policy, error, again)
             again += 1
-
-
-def _in_between(content: bytes) -> SegSplatError:
-    """The error in the middle of a stream, which does not say when to try again."""
-    told = _json(content)
-    kind = SegSplatError.of_code.get(told["code"], SegSplatError)
-    return kind(told["message"], code=told["code"], retry_after=1.0)
 
 
 # Texts

@@ -216,7 +216,7 @@ class VersionWarning(UserWarning):
 
 
 def error_of(status: int, headers: Mapping[str, str], body: bytes) -> SegSplatError:
-    """The error of an answer with a status of 400 or more."""
+    """The error of an answer with a status of 400 or more, or of a part in a stream."""
     after = headers.get("retry-after", "")
     retry_after = float(after) if after.isdigit() else None
     request_id = headers.get("x-request-id")

@@ -3,12 +3,12 @@
 //! A [`Preset`] fills all fields, and options change single ones. A stage reads its own field and
 //! knows no preset. `docs/method.md` lists the fields beside what the paper does.
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use utoipa::{IntoParams, ToSchema};
 
 use crate::{
     error::{Error, Result},
-    limits::BANK_ROWS_MAX,
+    limits::{BANK_ROWS_MAX, CANON_MAX, LAMBDA_RANGE, SCENE_PHOTOS_MAX, TAU_RANGE},
     names::display_names,
     scene::{Density, SemanticsMode},
 };
@@ -167,18 +167,26 @@ impl SceneOptions {
     /// # Errors
     /// `invalid_request` with the name or the value that does not fit.
     pub fn with(&self, pairs: &[String]) -> Result<Self> {
-        let wrong = |why: &dyn std::fmt::Display| Error::invalid(format!("method: {why}"));
-        let mut fields = serde_json::to_value(self).map_err(|e| wrong(&e))?;
-        for pair in pairs {
-            let (name, value) =
-                pair.split_once('=').ok_or_else(|| wrong(&format!("{pair:?} is no NAME=VALUE")))?;
-            let value = serde_json::from_str(value).unwrap_or_else(|_| value.into());
-            fields[name] = value;
-            let read = serde_json::from_value::<Self>(fields.clone());
-            read.map_err(|e| wrong(&format!("{pair:?}: {e}")))?;
-        }
-        serde_json::from_value(fields).map_err(|e| wrong(&e))
+        with_pairs(self, pairs)
     }
+}
+
+/// Options of serde's with others set, each as `NAME=VALUE`; a value is JSON or a text.
+///
+/// # Errors
+/// `invalid_request` with the name or the value that does not fit.
+pub fn with_pairs<T: Serialize + DeserializeOwned>(options: &T, pairs: &[String]) -> Result<T> {
+    let wrong = |why: &dyn std::fmt::Display| Error::invalid(format!("method: {why}"));
+    let mut fields = serde_json::to_value(options).map_err(|e| wrong(&e))?;
+    for pair in pairs {
+        let (name, value) =
+            pair.split_once('=').ok_or_else(|| wrong(&format!("{pair:?} is no NAME=VALUE")))?;
+        let value = serde_json::from_str(value).unwrap_or_else(|_| value.into());
+        fields[name] = value;
+        let read = serde_json::from_value::<T>(fields.clone());
+        read.map_err(|e| wrong(&format!("{pair:?}: {e}")))?;
+    }
+    serde_json::from_value(fields).map_err(|e| wrong(&e))
 }
 
 impl Default for Method {
@@ -187,22 +195,18 @@ impl Default for Method {
     }
 }
 
-/// Least and largest `lambda`.
-const LAMBDA: [f64; 2] = [0.01, 100.0];
-/// Most photos of `fuse_layers` and `front_photos`: no scene has more.
-const PHOTOS: u32 = 1_024;
-
 impl Method {
     /// Checks the numbers.
     ///
     /// # Errors
     /// `invalid_request` with the field, the value and its bounds.
     pub fn check(&self) -> Result<()> {
-        within("lambda", self.lambda, LAMBDA)?;
+        let photos = [0.0, f64::from(SCENE_PHOTOS_MAX)];
+        within("lambda", self.lambda, LAMBDA_RANGE)?;
         within("merge_cosine", self.merge_cosine, [0.0, 1.0])?;
         within("bank_rows", f64::from(self.bank_rows), [0.0, BANK_ROWS_MAX as f64])?;
-        within("fuse_layers", f64::from(self.fuse_layers), [0.0, f64::from(PHOTOS)])?;
-        within("front_photos", f64::from(self.front_photos), [0.0, f64::from(PHOTOS)])
+        within("fuse_layers", f64::from(self.fuse_layers), photos)?;
+        within("front_photos", f64::from(self.front_photos), photos)
     }
 }
 
@@ -228,8 +232,6 @@ impl ScoringMethod {
     pub const TAU: f64 = 10.0;
     /// Where a text is nearer than every canonical text.
     pub const CUT: f64 = 0.5;
-    /// Most canonical texts.
-    pub const CANON_MAX: usize = 64;
 
     /// The values of a preset; `default` takes those of the bundle.
     pub fn of(preset: Preset, canon: Vec<String>, tau: f64, coverage_floor: f64) -> Self {
@@ -250,13 +252,13 @@ impl ScoringMethod {
     /// # Errors
     /// `invalid_request` with the field, the value and its bounds.
     pub fn check(&self) -> Result<()> {
-        let (count, max) = (self.canon.len(), Self::CANON_MAX);
+        let (count, max) = (self.canon.len(), CANON_MAX);
         if !(1..=max).contains(&count) {
             return Err(Error::invalid(format!(
                 "canon has {count} texts; it must have 1 to {max}"
             )));
         }
-        within("tau", self.tau, [1e-3, 1e6])?;
+        within("tau", self.tau, TAU_RANGE)?;
         within("coverage_floor", self.coverage_floor, [0.0, 1.0])?;
         within("cut", self.cut, [0.0, 1.0])
     }

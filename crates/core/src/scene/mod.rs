@@ -27,7 +27,7 @@ pub use finished::{PhotoHash, Provenance, Scene, SceneMeta};
 pub use gaussians::{BLUR_PX2, Gaussians, RawGaussians, SH_C0, SanitizeReport, SourcePixel};
 pub use geometry::ViewGaussians;
 pub use id::{SCENE_ID_CHARS, SceneId};
-pub use method::{MaskLevel, Method, Preset, SceneOptions, ScoringMethod};
+pub use method::{MaskLevel, Method, Preset, SceneOptions, ScoringMethod, with_pairs};
 pub use photo::{Crop, CropShape, Photo, PosedPhoto};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{

@@ -216,7 +216,7 @@ impl SceneStatus {
 }
 
 /// What a watcher sees. The newest event is always delivered; those between may be skipped.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum Event {
     /// Waits; `ahead` jobs go first.

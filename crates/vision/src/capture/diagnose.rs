@@ -131,7 +131,8 @@ impl Mistake {
     }
 }
 
-/// What looks wrong. Photos that share nothing are refused.
+/// What looks wrong. Photos that share nothing, and cameras that see nothing in common, are
+/// refused.
 pub(super) fn warnings(
     photos: &[PosedPhoto],
     views: &[GrayView],
@@ -145,6 +146,7 @@ pub(super) fn warnings(
         let warning = mistake.warning(photos, answer.given, corrected);
         return Ok([warning].into_iter().chain(point).collect());
     }
+    refuse_apart(photos, views, found)?;
     let distinct = answer.given >= DISTINCT_MIN && answer.given >= DISTINCT_RATIO * answer.rival;
     let found_wrong = if !distinct && found.iter().all(|p| p.best() < CHANCE) {
         vec![principal_point(photos), Some(nothing_agrees(photos, views, found)?)]
@@ -159,6 +161,23 @@ pub(super) fn warnings(
         ]
     };
     Ok(found_wrong.into_iter().flatten().collect())
+}
+
+/// Refuses cameras of which no two see the same place: there is no depth, whatever photos show.
+fn refuse_apart(photos: &[PosedPhoto], views: &[GrayView], found: &[PairFound]) -> Result<()> {
+    let blank = |v: &usize| views[*v].candidates.is_empty();
+    if found.iter().any(|pair| pair.inside > 0 || pair.views.iter().any(blank)) {
+        return Ok(());
+    }
+    let Some(least) = found.iter().min_by(|a, b| a.angle.total_cmp(&b.angle)) else {
+        return Ok(());
+    };
+    let [a, b] = least.views.map(|view| name(photos, view));
+    Err(Error::invalid(format!(
+        "under the given cameras no two photos see the same place; {a} and {b}, which are turned \
+         least from each other, look {:.0} degrees apart: their poses or lenses must be wrong",
+        least.angle
+    )))
 }
 
 /// Scale of K that would bring the principal point to the centre, where x and y imply the same.

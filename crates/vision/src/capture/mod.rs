@@ -42,8 +42,9 @@ const MANY_PHOTOS: usize = 32;
 /// Measures a capture. It stops before the next comparison of two photos once `cancel` is true.
 ///
 /// # Errors
-/// `invalid_request` for fewer than two photos, cameras all at one place, or photos that share
-/// nothing; the message names the photos and the figure. `cancelled`.
+/// `invalid_request` for fewer than two photos, cameras all at one place, cameras of which no two
+/// see the same place, or photos that share nothing; the message names the photos and the figure.
+/// `cancelled`.
 pub fn analyse(photos: &[PosedPhoto], cancel: &AtomicBool) -> Result<Capture> {
     if photos.len() < 2 {
         return Err(Error::invalid(format!(

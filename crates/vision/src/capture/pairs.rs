@@ -32,6 +32,8 @@ pub(super) struct PairFound {
     pub(super) agreement: [f64; 2],
     /// Share of the matched candidates whose best plane was the nearest one, each direction.
     pub(super) at_nearest: [f64; 2],
+    /// Candidates of either photo that could lie in the other.
+    pub(super) inside: usize,
     /// Distance between the cameras.
     pub(super) baseline: f64,
     /// Angle between the viewing axes, degrees.
@@ -173,6 +175,7 @@ fn joined(
         views: indices,
         agreement: [0, 1].map(|s| share(matches[s].len(), sweeps[s].inside)),
         at_nearest: [0, 1].map(|s| share(sweeps[s].at_nearest, sweeps[s].inside)),
+        inside: forward.inside + backward.inside,
         matches,
         baseline: baseline(&a.camera, &b.camera),
         angle: angle(&a.camera, &b.camera),

@@ -126,13 +126,14 @@ impl Bundle {
     /// The manifest, and what in it is out of range.
     pub(super) fn parse(dir: &Path) -> Result<(Self, Vec<String>)> {
         let path = dir.join(MANIFEST);
-        let size = fs_err::metadata(&path).map_err(|e| missing(MANIFEST, e))?.len();
+        let missing = |e| missing(dir, MANIFEST, e);
+        let size = fs_err::metadata(&path).map_err(missing)?.len();
         if size > MANIFEST_BYTES_MAX {
             return Err(unavailable(format!(
                 "model bundle: {MANIFEST} has {size} bytes, over {MANIFEST_BYTES_MAX}"
             )));
         }
-        let text = fs_err::read_to_string(&path).map_err(|e| missing(MANIFEST, e))?;
+        let text = fs_err::read_to_string(&path).map_err(missing)?;
         let manifest: BundleManifest = toml::from_str(&text)
             .map_err(|e| unavailable(format!("model bundle: {MANIFEST}: {e}")))?;
         let mut faults = Faults::default();
@@ -163,17 +164,19 @@ impl Bundle {
         if !is_plain(file) {
             return Err(unavailable(format!("model bundle: {file:?} is no plain file name")));
         }
-        let size = fs_err::metadata(&path).map_err(|e| missing(file, e))?.len();
+        let missing = |e| missing(&self.dir, file, e);
+        let size = fs_err::metadata(&path).map_err(missing)?.len();
         if size > FILE_BYTES_MAX {
             return Err(unavailable(format!(
                 "model bundle: {file} has {size} bytes, over {FILE_BYTES_MAX}"
             )));
         }
-        let found = sha256_of(&path).map_err(|e| missing(file, e))?;
+        let found = sha256_of(&path).map_err(missing)?;
         if found != sha256.to_lowercase() {
             return Err(unavailable(format!(
                 "model bundle: {file} is not the file of {MANIFEST}: sha256 {found}, not \
-                 {sha256}; restore it (`git checkout -- {EMBEDDED}`)"
+                 {sha256}; {}",
+                remedy(&self.dir)
             )));
         }
         if !file.ends_with(NETWORK) {
@@ -315,11 +318,19 @@ fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
-fn missing(file: &str, cause: std::io::Error) -> Error {
-    unavailable(format!(
-        "model bundle: {file} cannot be read ({}); the bundle is part of the repository: restore \
-         it (`git checkout -- {EMBEDDED}`), run `{SETUP_COMMAND}`, or name another with --bundle",
-        cause.kind()
-    ))
-    .caused_by(cause)
+fn missing(dir: &Path, file: &str, cause: std::io::Error) -> Error {
+    let (kind, remedy) = (cause.kind(), remedy(dir));
+    unavailable(format!("model bundle: {file} cannot be read ({kind}); {remedy}")).caused_by(cause)
+}
+
+/// What to do about a file of the bundle in `dir` that is not there or is another.
+fn remedy(dir: &Path) -> String {
+    if dir.ends_with(EMBEDDED) {
+        format!(
+            "the bundle is part of the repository: restore it (`git checkout -- {EMBEDDED}`), run \
+             `{SETUP_COMMAND}`, or name another with --bundle"
+        )
+    } else {
+        format!("put the right file in {}, or name another bundle with --bundle", dir.display())
+    }
 }

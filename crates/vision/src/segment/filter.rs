@@ -118,7 +118,9 @@ impl MaskFilter {
         keep_logits: bool,
     ) -> Option<Proposal> {
         let s = &self.settings;
-        if predicted_iou.is_nan() || predicted_iou <= s.pred_iou_thresh {
+        // As in Segment Anything, a threshold of 0 asks nothing.
+        let sure = s.pred_iou_thresh <= 0.0 || predicted_iou > s.pred_iou_thresh;
+        if predicted_iou.is_nan() || !sure {
             return None;
         }
         let values = match &self.resample {

@@ -81,6 +81,30 @@ fn the_depth_range_holds_the_true_depths_and_little_else() {
 }
 
 #[test]
+fn cameras_that_look_away_from_each_other_are_refused_and_a_single_one_is_left_out() {
+    let turned = |mut photos: Vec<PosedPhoto>| {
+        let last = photos.last_mut().unwrap();
+        let mut m = last.camera.camera_to_world.to_row_major();
+        // Half a turn about the camera's own y axis.
+        for row in 0..3 {
+            m[row * 4] *= -1.0;
+            m[row * 4 + 2] *= -1.0;
+        }
+        last.camera.camera_to_world = CameraToWorld::from_row_major(&m, "turned").unwrap();
+        analyse(&photos)
+    };
+    let posed = sample::photos(&options(5)).unwrap();
+    let error = turned(picked(&posed, &[0, 1])).unwrap_err();
+    assert_eq!(error.code(), ErrorCode::InvalidRequest);
+    for told in [posed[0].file.as_str(), posed[1].file.as_str(), "no two photos", "apart"] {
+        assert!(error.message().contains(told), "{error}");
+    }
+    let capture = turned(posed.clone()).unwrap();
+    let unused = capture.warnings.iter().find(|w| w.code == WarningCode::PhotosUnused).unwrap();
+    assert!(unused.message.contains(&posed[4].file), "{unused:?}");
+}
+
+#[test]
 fn depth_follows_the_unit_of_the_cameras() {
     let posed = sample::photos(&options(2)).unwrap();
     let near_far = ranges_of(&posed, &[0, 1]);

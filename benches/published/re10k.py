@@ -1,0 +1,192 @@
+"""RealEstate10K as DepthSplat and the paper evaluate it: two photos in, views between them out.
+
+    python re10k.py SEGSPLAT DATA INDEX OUT [--bundle DIR --count N --lpips FILE.onnx]
+
+DATA is the folder `test` of pixelSplat's conversion: `*.torch`, each a list of sequences, and
+`index.json` (sequence to file). INDEX is DepthSplat's `assets/evaluation_index_re10k.json`:
+sequence to `context` and `target` frames. Photos are resized by Lanczos and cropped to 256 x
+256 as there. Scenes are made with `preset=paper`. PSNR, SSIM as scikit-image counts it
+(Gaussian weights, window 11), and LPIPS where `--lpips` names an ONNX file of two inputs
+`[1,3,H,W]` in -1 to 1 with one number as output. OUT takes a row a sequence and their mean.
+
+Needs numpy, pillow, scipy."""
+
+import argparse
+import io
+import json
+import pathlib
+import statistics
+import subprocess
+import tempfile
+import time
+
+import numpy as np
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from torchfile import load
+
+SIDE = 256
+
+
+class Sequence:
+    """The frames of a sequence: pictures of SIDE x SIDE, and cameras in OpenCV axes."""
+
+    def __init__(self, example):
+        self.images, self.cameras = example["images"], np.asarray(example["cameras"], np.float64)
+
+    def picture(self, at):
+        """`[SIDE, SIDE, 3]` u8: covered by the resized photo, the middle kept."""
+        photo = Image.open(io.BytesIO(np.ascontiguousarray(self.images[at]).tobytes())).convert(
+            "RGB"
+        )
+        scale = max(SIDE / photo.width, SIDE / photo.height)
+        width, height = round(photo.width * scale), round(photo.height * scale)
+        x, y = (width - SIDE) // 2, (height - SIDE) // 2
+        return np.array(photo.resize((width, height), Image.LANCZOS))[y : y + SIDE, x : x + SIDE]
+
+    def camera(self, at):
+        """Pixels of the picture, and the pose camera to world, row-major."""
+        fx, fy, cx, cy, _, _, *pose = self.cameras[at]
+        width, height = Image.open(io.BytesIO(np.ascontiguousarray(self.images[at]).tobytes())).size
+        scale = max(SIDE / width, SIDE / height)
+        width, height = round(width * scale), round(height * scale)
+        world_to_camera = np.vstack([np.reshape(pose, (3, 4)), [0, 0, 0, 1]])
+        lens = {
+            "fx": fx * width,
+            "fy": fy * height,
+            "cx": cx * width - (width - SIDE) // 2,
+            "cy": cy * height - (height - SIDE) // 2,
+        }
+        return lens, [float(v) for v in np.linalg.inv(world_to_camera).ravel()]
+
+
+def sequences(data, index):
+    """Name, frames, context and target of each sequence of the index that the data hold."""
+    files = json.loads((data / "index.json").read_text())
+    wanted = {}
+    for key, views in index.items():
+        if views is not None and key in files:
+            wanted.setdefault(files[key], {})[key] = views
+    for file, keys in sorted(wanted.items()):
+        for example in load(data / file):
+            if example["key"] in keys:
+                views = keys[example["key"]]
+                yield example["key"], Sequence(example), views["context"], views["target"]
+
+
+def psnr(a, b):
+    """Of pictures in 0..1."""
+    return float(-10 * np.log10(max(((a - b) ** 2).mean(), 1e-12)))
+
+
+def ssim(a, b):
+    """`structural_similarity` of scikit-image with `win_size=11` and `gaussian_weights=True`."""
+    window, pad = 11, 5
+    unbiased = window**2 / (window**2 - 1)
+
+    def blurred(x):
+        return gaussian_filter(x, 1.5, truncate=3.5, axes=(0, 1))
+
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    ua, ub = blurred(a), blurred(b)
+    va, vb = unbiased * (blurred(a * a) - ua * ua), unbiased * (blurred(b * b) - ub * ub)
+    vab = unbiased * (blurred(a * b) - ua * ub)
+    c1, c2 = 0.01**2, 0.03**2
+    found = (2 * ua * ub + c1) * (2 * vab + c2) / ((ua**2 + ub**2 + c1) * (va + vb + c2))
+    return float(found[pad:-pad, pad:-pad].mean())
+
+
+def run(args, *line):
+    command = [args.segsplat, *map(str, line), "--bundle", args.bundle, "--json"]
+    return json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True).stdout)
+
+
+def judged(args, perceptual, name, frames, context, targets):
+    """The row of one sequence."""
+    with tempfile.TemporaryDirectory() as place:
+        place = pathlib.Path(place)
+        cameras = []
+        for at in context:
+            lens, pose = frames.camera(at)
+            Image.fromarray(frames.picture(at)).save(place / f"{at:05}.png")
+            lens |= {"width": SIDE, "height": SIDE}
+            cameras.append({"file": f"{at:05}.png", "intrinsics": lens, "camera_to_world": pose})
+        (place / "cameras.json").write_text(json.dumps({"cameras": cameras}))
+        scene = place / "scene.segsplat"
+        made = run(args, "reconstruct", place, "-o", scene, "--preset", "paper")
+        figures = []
+        for at in targets:
+            lens, pose = frames.camera(at)
+            out = place / "view.png"
+            run(
+                args,
+                "render",
+                scene,
+                "-o",
+                out,
+                "--camera-to-world=" + ",".join(map(repr, pose)),
+                "--width",
+                SIDE,
+                "--height",
+                SIDE,
+                *[f"--{key}={value}" for key, value in lens.items()],
+            )
+            truth = frames.picture(at) / 255
+            view = np.array(Image.open(out).convert("RGB")) / 255
+            figures.append({"psnr": psnr(truth, view), "ssim": ssim(truth, view)})
+            if perceptual:
+                figures[-1]["lpips"] = perceptual(truth, view)
+    means = {key: statistics.fmean(row[key] for row in figures) for key in figures[0]}
+    return {
+        "sequence": name,
+        "views": len(figures),
+        "gaussians": made["report"]["gaussians"],
+        **means,
+    }
+
+
+def lpips(file):
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+
+    def distance(a, b):
+        names = [given.name for given in session.get_inputs()]
+        feed = {
+            name: (2 * x - 1).transpose(2, 0, 1)[None].astype(np.float32)
+            for name, x in zip(names, (a, b))
+        }
+        return float(np.ravel(session.run(None, feed)[0])[0])
+
+    return distance
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("segsplat")
+    parser.add_argument("data", type=pathlib.Path)
+    parser.add_argument("index", type=pathlib.Path)
+    parser.add_argument("out", type=pathlib.Path)
+    parser.add_argument("--bundle", default="models/embedded")
+    parser.add_argument("--count", type=int, help="sequences, the first ones [default: all]")
+    parser.add_argument("--lpips")
+    args = parser.parse_args()
+    perceptual, rows = lpips(args.lpips) if args.lpips else None, []
+    for sequence in sequences(args.data, json.loads(args.index.read_text())):
+        if len(rows) == args.count:
+            break
+        rows.append(judged(args, perceptual, *sequence))
+        print(json.dumps(rows[-1]), flush=True)
+    if not rows:
+        raise SystemExit(f"{args.data} holds no sequence of {args.index}")
+    keys = [key for key in ("psnr", "ssim", "lpips") if key in rows[0]]
+    means = {key: statistics.fmean(row[key] for row in rows) for key in keys}
+    rows.append({"sequence": "mean", "sequences": len(rows), "unix_s": int(time.time()), **means})
+    with args.out.open("a") as file:
+        file.writelines(json.dumps({"command": "re10k.py", **row}) + "\n" for row in rows)
+    print(f"{'ours':24}", *(f"{key} {value:.4f}" for key, value in means.items()))
+
+
+if __name__ == "__main__":
+    main()
