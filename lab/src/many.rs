@@ -39,7 +39,7 @@ const TARGET_FIRST: usize = 3;
 pub(crate) struct Args {
     #[command(flatten)]
     inputs: Inputs,
-    /// Options of the scenes, each as NAME=VALUE: max_views=8, front_photos=0
+    /// Options of the scenes, each as NAME=VALUE: `max_views=8`, `front_photos=0`
     #[arg(long, value_name = "NAME=VALUE", value_delimiter = ',')]
     method: Vec<String>,
     /// Refine in so many steps

@@ -366,7 +366,8 @@ struct Opener {
 
 impl Opener {
     /// A session a job on the CPU, or one that all jobs wait for where the network is large or the
-    /// threads are few. One session on a device: it runs one network at a time whatever the number of jobs.
+    /// threads are few. One session on a device: it runs one network at a time whatever the number
+    /// of jobs.
     fn open(&self, provider: Provider) -> ort::Result<(Pool, Takes)> {
         let (count, threads) = match provider {
             Provider::Cpu if self.shared => (1, self.options.threads),

@@ -31,7 +31,7 @@ use crate::{
 };
 
 /// Views that go through the geometry network together, where none are asked for: memory grows with
-/// them, scenes do not get better.
+/// them, and scenes get no better in the mean (docs/adr/0034-many-photos.md).
 const VIEWS_A_RUN: usize = 4;
 
 /// Library, bundle, networks and threads that make scenes. All jobs share one.

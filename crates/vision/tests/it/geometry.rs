@@ -71,8 +71,7 @@ fn run(network: &Geometry, photos: &[PosedPhoto]) -> Result<Vec<ViewGaussians>> 
 
 fn lifted(network: &Geometry, photos: &[PosedPhoto]) -> Lifted {
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera).collect();
-    lift(run(network, photos).unwrap(), &cameras, true, &Fusion::default(), None, &GO_ON)
-        .unwrap()
+    lift(run(network, photos).unwrap(), &cameras, true, &Fusion::default(), None, &GO_ON).unwrap()
 }
 
 #[test]
