@@ -19,10 +19,14 @@ use crate::{
     photo_files,
     pipeline::Pipeline,
     refine::{RefineBudget, RefineOptions, held_out, refine, split},
-    render::{Background, Kinds, RenderRequest, Renderer, cpu::CpuRenderer, plan::default_near},
+    render::{
+        Background, Frame, Kinds, RenderRequest, Renderer,
+        cpu::CpuRenderer,
+        plan::{default_near, served},
+    },
     rows::{Rows, ms, progress},
-    scene::{Gaussians, Photo, PosedPhoto, Scene, SceneOptions},
-    scenes::{is_posed, make, scene_of, use_of},
+    scene::{Camera, Gaussians, Photo, PosedPhoto, SceneOptions},
+    scenes::{is_posed, make, scene_of, use_of, view_request},
     setup::Inputs,
 };
 
@@ -35,6 +39,9 @@ const TARGET_FIRST: usize = 3;
 pub(crate) struct Args {
     #[command(flatten)]
     inputs: Inputs,
+    /// Options of the scenes, each as NAME=VALUE: `max_views=8`, `front_photos=0`
+    #[arg(long, value_name = "NAME=VALUE", value_delimiter = ',')]
+    method: Vec<String>,
     /// Refine in so many steps
     #[arg(long, conflicts_with = "refine_ms")]
     refine_steps: Option<u32>,
@@ -60,6 +67,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
     let renderer = CpuRenderer::new(args.inputs.setup.threads())?;
+    let options = SceneOptions::default().with(&args.method)?;
     for (name, dir) in args.inputs.find(is_posed)? {
         let all = photo_files::read_dir(&dir, &Limits::default())?;
         let (targets, given) = given(&all, args.inputs.photos);
@@ -69,10 +77,23 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         let refines = args.refine_steps.is_some() || args.refine_ms.is_some();
         let (learnt, out) = if refines { split(&given) } else { (given.clone(), Vec::new()) };
         let begun = Instant::now();
-        let scene = scene_of(make(&engine, &learnt, &SceneOptions::default())?);
+        let scene = scene_of(make(&engine, &learnt, &options)?);
         let create_ms = ms(begun);
-        let judge = |gaussians: &Gaussians| judge(&renderer, &scene, gaussians, &targets);
+        let judge = |gaussians: &Gaussians| {
+            let near = default_near(scene.meta.report.median_depth);
+            let background = Background::Backdrop(Arc::clone(&scene.backdrop));
+            mean_psnr(&targets, |camera| {
+                let plain = RenderRequest::plain(camera, Kinds::COLOR, near);
+                renderer
+                    .render(gaussians, &RenderRequest { background: background.clone(), ..plain })
+            })
+        };
         let before = judge(&scene.gaussians)?;
+        let as_served = mean_psnr(&targets, |camera| {
+            let median_depth = scene.meta.report.median_depth;
+            let plain = view_request(camera, Kinds::COLOR, median_depth);
+            renderer.render(&scene.gaussians, &served(&scene, plain))
+        })?;
         let mut row = json!({
             "scene": name,
             "use": use_of(&name),
@@ -80,6 +101,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             "gaussians": scene.gaussians.len(),
             "create_ms": create_ms,
             "psnr": before,
+            "served_psnr": as_served,
+            "peak_mib": peak_mib(),
         });
         if refines {
             let budget = match (args.refine_steps, args.refine_ms) {
@@ -147,23 +170,23 @@ fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
     PosedPhoto { photo, camera: fitted.camera, ..posed.clone() }
 }
 
-/// Mean PSNR at the targets.
-fn judge(
-    renderer: &CpuRenderer,
-    scene: &Scene,
-    gaussians: &Gaussians,
-    targets: &[PosedPhoto],
-) -> Result<f64> {
+/// Mean PSNR of what `draw` gives at the targets' cameras.
+fn mean_psnr(targets: &[PosedPhoto], draw: impl Fn(Camera) -> Result<Frame>) -> Result<f64> {
     let mut sum = 0.0;
     for target in targets {
-        let near = default_near(scene.meta.report.median_depth);
-        let background = Background::Backdrop(Arc::clone(&scene.backdrop));
-        let plain = RenderRequest::plain(target.camera, Kinds::COLOR, near);
-        let frame = renderer.render(gaussians, &RenderRequest { background, ..plain })?;
+        let frame = draw(target.camera)?;
         let truth = to_unit(&target.photo);
         sum += psnr(&clamped(frame.color), &truth, target.photo.valid.as_deref());
     }
     Ok(sum / targets.len() as f64)
+}
+
+/// Most memory that this process had, MiB; NaN where the system does not tell.
+fn peak_mib() -> f64 {
+    let status = fs_err::read_to_string("/proc/self/status").unwrap_or_default();
+    let peak = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    let kib = peak.and_then(|text| text.split_whitespace().next()?.parse::<f64>().ok());
+    kib.map_or(f64::NAN, |kib| kib / 1024.0)
 }
 
 /// Seconds of processor time of this process, NaN where the system does not tell.

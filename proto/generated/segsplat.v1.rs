@@ -671,7 +671,7 @@ pub struct CreateSceneHeader {
     /// Name of the model bundle; empty: the one loaded.
     #[prost(string, tag = "4")]
     pub bundle: ::prost::alloc::string::String,
-    /// Views the network takes at once; left out: what the bundle says.
+    /// Views the network takes at once; left out: 4 where the bundle takes as many.
     #[prost(uint32, optional, tag = "5")]
     pub max_views: ::core::option::Option<u32>,
     /// How long to wait for the scene before answering, milliseconds.

@@ -39,7 +39,7 @@ pub(super) struct Args {
     /// Scene file to write; with the ending .ply a 3DGS PLY
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
-    /// Views that the network takes at once [default: what the bundle says]
+    /// Views that the network takes at once [default: 4]
     #[arg(long)]
     max_views: Option<usize>,
     /// `eager` also makes the semantics, in a file beside the scene's; `off` makes none

@@ -27,6 +27,8 @@ use crate::{
 
 /// Time between two checks whether the networks are open.
 const NETWORKS_LOOK: Duration = Duration::from_millis(5);
+/// Time in which freed memory goes back to the system.
+const GIVE_BACK_EVERY: Duration = Duration::from_secs(10);
 
 impl Jobs {
     /// The life of a worker thread.
@@ -50,6 +52,7 @@ impl Jobs {
             }
             self.running.end(&job);
             self.leave(&job);
+            give_memory_back();
         }
         if kind == Kind::Scene {
             self.workers.fetch_sub(1, Ordering::Relaxed);
@@ -215,10 +218,13 @@ impl Jobs {
             + Duration::from_millis(limits.replica_lease_ms);
         let every = Duration::from_millis(limits.sweep_every_ms.max(1_000));
         let look = Duration::from_millis(limits.first_text_photos_ms.max(1_000)).min(every);
+        let look = look.min(GIVE_BACK_EVERY);
         let mut next = Instant::now();
         loop {
             let now = Instant::now();
             self.uploads.forget_old(now);
+            // What was deleted, or left the caches.
+            give_memory_back();
             if now >= next {
                 next = now + every;
                 match self.parts.store.sweep(buried) {
@@ -233,6 +239,17 @@ impl Jobs {
         }
     }
 }
+
+/// Gives what is free in the heaps back to the system. The allocator keeps it otherwise.
+#[cfg(all(target_os = "linux", target_env = "gnu"))]
+fn give_memory_back() {
+    #[expect(unsafe_code, reason = "a call into the C library")]
+    // SAFETY: any thread may call it at any time.
+    let _released = unsafe { libc::malloc_trim(0) };
+}
+
+#[cfg(not(all(target_os = "linux", target_env = "gnu")))]
+fn give_memory_back() {}
 
 fn panicked(kind: Kind, panic: &(dyn Any + Send)) -> Error {
     let text = panic

@@ -12,7 +12,7 @@ use std::{
 use reqwest::Client;
 use segsplat::{
     sample::{self, SampleOptions},
-    scene::Upload,
+    scene::{Photo, PosedPhoto, Upload, UploadCameras, UploadFile},
 };
 use serde_json::json;
 
@@ -20,6 +20,8 @@ use crate::common::process::{self, Process, Start, can_serve, long};
 
 /// The budget of the loaded server.
 const MEMORY_BYTES_MAX: u64 = 512 << 20;
+/// The most that stays resident when all scenes are deleted.
+const LEFT_BYTES_MAX: u64 = 716 << 20;
 
 fn upload(seed: u64, photos: usize, width: u32, height: u32) -> Upload {
     sample::upload(&SampleOptions { photos, width, height, seed }).expect("in range")
@@ -89,6 +91,103 @@ async fn photos_bytes(client: &Client, server: &Process) -> u64 {
     let text = answer.text().await.expect("text");
     let value = text.lines().find_map(|line| line.strip_prefix("segsplat_photos_bytes "));
     value.expect("the gauge").parse().expect("a number")
+}
+
+/// Large JPEG photos of a room: small ones enlarged, with the cameras of the small ones.
+fn large_photos(seed: u64, photos: usize, [width, height]: [u32; 2]) -> Upload {
+    let options = SampleOptions { photos, width: width / 10, height: height / 10, seed };
+    let posed = sample::photos(&options).expect("in range");
+    let file = tempfile::Builder::new().suffix(".jpg").tempfile().expect("a file");
+    let enlarged = |posed: &PosedPhoto| {
+        let Photo { width: w, height: h, rgb, .. } = &posed.photo;
+        let small = image::RgbImage::from_raw(*w, *h, rgb.clone()).expect("three bytes a pixel");
+        // What is not generic is optimised where it is defined.
+        let filter = image::imageops::FilterType::Triangle;
+        let large = image::DynamicImage::from(small).resize_exact(width, height, filter);
+        large.save(file.path()).expect("encoded");
+        let bytes = std::fs::read(file.path()).expect("written");
+        UploadFile { name: posed.file.clone(), bytes }
+    };
+    Upload {
+        cameras: Some(UploadCameras::Transforms(sample::transforms_json(&posed))),
+        photos: posed.iter().map(enlarged).collect(),
+        archive: None,
+    }
+}
+
+/// Makes `jobs` scenes of large photos at once and asks each a text; then all are deleted. The
+/// longest form is that of the bar: 64 photos of 24 megapixels. `MEMORY_PHOTOS`: for a short look.
+async fn hold_memory(jobs: usize, peak_max: u64) {
+    if !can_serve() {
+        return;
+    }
+    let asked = || std::env::var("MEMORY_PHOTOS").ok().and_then(|text| text.parse().ok());
+    let (photos, size, bundle) = match long() {
+        true => (asked().unwrap_or(64), [6_000, 4_000], "../../models/embedded"),
+        false => (6, [1_600, 1_200], "colours"),
+    };
+    // Photos and networks of the short form are small, and so are its bounds.
+    let share = if long() { 1 } else { 3 };
+    let (peak_max, left_max) = (peak_max / share, LEFT_BYTES_MAX / share);
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("segsplat.toml");
+    // Whatever else the machine does.
+    std::fs::write(&config, "[limits]\nscene_timeout_ms = 3600000\nwait_ms_max = 3600000\n")
+        .unwrap();
+    let server = Start::on(&folder.path().join("data"))
+        .bundle(bundle)
+        .arg("--jobs")
+        .arg(&jobs.to_string())
+        .arg("--config")
+        .arg(&config.display().to_string())
+        .start();
+    let client = crate::common::client();
+    // Before any is sent: a caller that pauses in the middle is cut off.
+    let uploads: Vec<Upload> =
+        (0..jobs as u64).map(|seed| large_photos(seed, photos, size)).collect();
+    let begun = Instant::now();
+    let one = async |upload: Upload| {
+        let answer = process::create(&client, &server.url, &upload, 3_600_000, None).await;
+        let (status, said) = answer.unwrap();
+        assert_eq!((status, said["state"].as_str()), (201, Some("done")), "{said}");
+        let (id, made) = (said["id"].as_str().unwrap().to_owned(), server.peak());
+        let url = server.url(&format!("/v1/scenes/{id}/query"));
+        let asked = json!({ "texts": ["red"], "wait_ms": 3_600_000 });
+        let (status, said) = process::post(&client, &url, &asked).await.unwrap();
+        assert_eq!(status, 200, "{said}");
+        (id, made)
+    };
+    let scenes = futures_util::future::join_all(uploads.into_iter().map(one)).await;
+    let (took, peak) = (begun.elapsed(), server.peak());
+    for (id, _) in &scenes {
+        let url = server.url(&format!("/v1/scenes/{id}"));
+        assert_eq!(process::delete(&client, &url).await.unwrap(), 204);
+    }
+    let deleted = Instant::now();
+    let left = process::eventually("memory is given back", async || {
+        let left = server.resident();
+        (left <= left_max).then_some(left)
+    });
+    let left = left.await;
+    println!(
+        "{jobs} scenes of {photos} photos of {size:?} in {took:?}: at most {} MiB resident while \
+         made, {} MiB with texts, {} MiB {:?} after all is deleted",
+        scenes.iter().map(|(_, made)| made >> 20).max().unwrap_or(0),
+        peak >> 20,
+        left >> 20,
+        deleted.elapsed()
+    );
+    assert!(peak <= peak_max, "{} MiB of {}", peak >> 20, peak_max >> 20);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn one_scene_of_many_large_photos_takes_bounded_memory_and_gives_it_back() {
+    hold_memory(1, 1_536 << 20).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn two_scenes_of_many_large_photos_take_bounded_memory_and_give_it_back() {
+    hold_memory(2, 2_560 << 20).await;
 }
 
 /// What some callers met.

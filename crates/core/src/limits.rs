@@ -80,9 +80,11 @@ limits! {
     json_values_max: usize = 250_000;
     /// Pixels of one photo, read from the header before decoding.
     photo_pixels_max: u64 = 24_000_000;
-    /// Longer side in pixels to which a photo is reduced after decoding: no stage looks closer, and
-    /// it bounds the memory of a full upload.
+    /// Longer side in pixels to which a photo is reduced after decoding: no stage looks closer.
     photo_side_kept_max: u32 = 2_048;
+    /// Pixels of all photos of one scene together after decoding, three bytes each: 16 photos keep
+    /// a longer side of 2048, 64 keep 1,100. Photos are reduced alike until they fit.
+    photos_pixels_kept_max: u64 = 50_000_000;
     /// Files and folders in an archive.
     archive_entries_max: usize = 1_024;
     /// Bytes of one archive unpacked: what a zip bomb meets.

@@ -86,7 +86,7 @@ macro_rules! method {
         #[serde(default, deny_unknown_fields)]
         #[into_params(parameter_in = Query)]
         pub struct SceneOptions {
-            /// Views the network takes at once; what the bundle says by default.
+            /// Views the network takes at once, 4 by default where the bundle takes as many.
             pub max_views: Option<usize>,
             /// When a scene's semantics are made: `lazy` (default) with the first text, `eager` as
             /// soon as it can be viewed, `off` never.

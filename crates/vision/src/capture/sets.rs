@@ -6,8 +6,8 @@ use crate::scene::{Capture, PosedPhoto, ViewSet};
 const OVERLAP_MIN: f64 = 0.05;
 /// Angle between two rays to the scene, radians, that serves depth best: about 5 degrees.
 const BEST_ANGLE: f64 = 0.09;
-/// Views of an earlier set that a set starts with, so that sets overlap.
-const SHARED: usize = 2;
+/// One view in so many of a set is of an earlier set, so that sets overlap.
+const SHARED_EVERY: usize = 4;
 
 /// Groups the photos into overlapping sets of at most `views_max`, each view with
 /// `min(views - 1, neighbors_max)` sources of the same set.
@@ -36,7 +36,7 @@ pub fn view_sets(
         let mut views = vec![seed];
         // Ties to what is there already, then as many new ones as fit.
         let known = usable.iter().copied().filter(|&i| covered[i]);
-        let wanted = SHARED.min(views_max - 1);
+        let wanted = (views_max / SHARED_EVERY).max(1);
         for _ in 0..wanted {
             let Some(best) = best_of(known.clone(), &views, &worth) else { break };
             views.push(best);

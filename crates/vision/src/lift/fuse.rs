@@ -7,6 +7,7 @@
 
 use std::sync::atomic::AtomicBool;
 
+use glam::DVec3;
 use rayon::prelude::*;
 
 use crate::{
@@ -42,19 +43,37 @@ pub(super) enum Fate {
     Keep,
     /// Was not a candidate: dropped for another reason before.
     Absent,
+    /// It hides what other photos see.
+    FreeSpace,
     /// The surface has enough layers already.
     Duplicate,
     /// Thinning merged it with its neighbours.
     Merged,
 }
 
+impl Fate {
+    /// What is no candidate is absent; all others are kept.
+    pub(super) fn of_candidates(candidate: &[Vec<bool>]) -> Vec<Vec<Self>> {
+        let fate = |there: &bool| if *there { Self::Keep } else { Self::Absent };
+        candidate.iter().map(|row| row.iter().map(fate).collect()).collect()
+    }
+}
+
 /// A view and what fusion needs of each of its pixels.
-struct Surface<'a> {
-    view: &'a ViewGaussians,
+pub(super) struct Surface<'a> {
+    pub(super) view: &'a ViewGaussians,
     /// `[H * W]` z in this view's camera of the pixel's own Gaussian; NaN where it is absent.
-    depth: Vec<f32>,
-    /// `[H * W]` which of them were kept; `None` until this view was decided.
-    kept: Option<Vec<bool>>,
+    pub(super) depth: Vec<f32>,
+}
+
+/// A Gaussian as another photo shows it.
+pub(super) struct Look {
+    /// Pixel of the photo.
+    pub(super) at: usize,
+    /// Depth of the Gaussian in the photo's camera.
+    pub(super) z: f64,
+    /// Depth of the photo's own Gaussian there.
+    pub(super) surface: f64,
 }
 
 /// The fate of each Gaussian of each view; `candidate` says which are there at all.
@@ -64,27 +83,23 @@ pub(super) fn fuse(
     options: &FuseOptions,
     cancel: &AtomicBool,
 ) -> Result<Vec<Vec<Fate>>> {
-    let mut fates: Vec<Vec<Fate>> = candidate
-        .iter()
-        .map(|row| row.iter().map(|&c| if c { Fate::Keep } else { Fate::Absent }).collect())
-        .collect();
+    let mut fates = Fate::of_candidates(candidate);
     if views.len() <= options.layers {
         return Ok(fates);
     }
-    let mut surfaces: Vec<Surface<'_>> =
+    let surfaces: Vec<Surface<'_>> =
         views.iter().zip(candidate).map(|(view, keep)| Surface::new(view, keep)).collect();
+    let mut before: Vec<usize> = Vec::with_capacity(views.len());
     for v in surest_first(views) {
         unless_cancelled(cancel)?;
-        let decided: Vec<Fate> = (0..views[v].len())
-            .into_par_iter()
-            .map(|i| match fates[v][i] {
-                Fate::Keep => fate_of(&surfaces, options, v, i),
-                other => other,
-            })
-            .collect();
-        let kept = decided.iter().map(|fate| *fate == Fate::Keep).collect();
-        surfaces[v].kept = Some(kept);
-        fates[v] = decided;
+        let mut own = std::mem::take(&mut fates[v]);
+        own.par_iter_mut().enumerate().for_each(|(i, fate)| {
+            if *fate == Fate::Keep && is_covered(&surfaces, &fates, &before, options, v, i) {
+                *fate = Fate::Duplicate;
+            }
+        });
+        fates[v] = own;
+        before.push(v);
     }
     Ok(fates)
 }
@@ -95,33 +110,36 @@ pub(super) fn sum_of_confidence(view: &ViewGaussians) -> f64 {
 }
 
 /// Views by mean confidence, the surest first; ties by index.
-fn surest_first(views: &[ViewGaussians]) -> Vec<usize> {
+pub(super) fn surest_first(views: &[ViewGaussians]) -> Vec<usize> {
     let sure = |v: usize| -> f64 { sum_of_confidence(&views[v]) / views[v].len().max(1) as f64 };
     let mut order: Vec<(usize, f64)> = (0..views.len()).map(|v| (v, sure(v))).collect();
     order.sort_by(|a, b| b.1.total_cmp(&a.1));
     order.into_iter().map(|(v, _)| v).collect()
 }
 
-fn fate_of(surfaces: &[Surface<'_>], options: &FuseOptions, v: usize, i: usize) -> Fate {
-    let own = &surfaces[v];
-    let world = own.view.frame_to_world.matrix().transform_point3(point(own.view.means[i]));
-    let own_footprint = f64::from(own.depth[i]) / own.view.camera.intrinsics.fx;
-    let mut covered = 0;
-    for (w, other) in surfaces.iter().enumerate() {
-        let (Some(kept), true) = (&other.kept, w != v) else { continue };
-        let Some((at, z)) = other.look(world) else { continue };
-        let seen = f64::from(other.depth[at]);
-        let fine =
-            seen / other.view.camera.intrinsics.fx <= own_footprint * options.footprint_ratio_max;
-        if kept[at] && fine && ((z - seen) / seen).abs() <= options.same_surface {
-            covered += 1;
-        }
-    }
-    if covered >= options.layers { Fate::Duplicate } else { Fate::Keep }
+/// Whether enough of the views `before` kept a Gaussian of the surface of Gaussian `i` of view `v`.
+fn is_covered(
+    surfaces: &[Surface<'_>],
+    fates: &[Vec<Fate>],
+    before: &[usize],
+    options: &FuseOptions,
+    v: usize,
+    i: usize,
+) -> bool {
+    let (world, own_footprint) = (surfaces[v].world(i), surfaces[v].footprint(i));
+    let covers = |&&w: &&usize| {
+        let other = &surfaces[w];
+        other.look(world).is_some_and(|Look { at, z, surface }| {
+            fates[w][at] == Fate::Keep
+                && other.footprint(at) <= own_footprint * options.footprint_ratio_max
+                && ((z - surface) / surface).abs() <= options.same_surface
+        })
+    };
+    before.iter().filter(covers).take(options.layers).count() >= options.layers
 }
 
 impl<'a> Surface<'a> {
-    fn new(view: &'a ViewGaussians, keep: &[bool]) -> Self {
+    pub(super) fn new(view: &'a ViewGaussians, keep: &[bool]) -> Self {
         let to_camera = view.camera.camera_to_world.viewmat() * view.frame_to_world.matrix();
         #[expect(clippy::cast_possible_truncation, reason = "a depth compared to per cents")]
         let depth =
@@ -132,14 +150,33 @@ impl<'a> Surface<'a> {
                     if keep { to_camera.transform_point3(point(*mean)).z as f32 } else { f32::NAN }
                 })
                 .collect();
-        Self { view, depth, kept: None }
+        Self { view, depth }
     }
 
-    /// Pixel that shows a world point, and the depth of the point there.
-    fn look(&self, world: glam::DVec3) -> Option<(usize, f64)> {
+    /// World point of the centre of Gaussian `i`.
+    pub(super) fn world(&self, i: usize) -> DVec3 {
+        self.view.frame_to_world.matrix().transform_point3(point(self.view.means[i]))
+    }
+
+    /// Width in the world of the pixel of Gaussian `i`.
+    pub(super) fn footprint(&self, i: usize) -> f64 {
+        f64::from(self.depth[i]) / self.view.camera.intrinsics.fx
+    }
+
+    /// How sure the network is of the depth of Gaussian `i`; 0 where it says no number.
+    pub(super) fn confidence(&self, i: usize) -> f64 {
+        let confidence = f64::from(self.view.confidence[i]);
+        if confidence.is_finite() { confidence } else { 0.0 }
+    }
+
+    /// What this view has where it shows a world point; `None` where it shows none, or nothing is
+    /// there.
+    pub(super) fn look(&self, world: DVec3) -> Option<Look> {
         let (seen, x, y) = seen_at(&self.view.camera, world)?;
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "inside")]
         let (x, y) = (x as usize, y as usize);
-        Some((y * self.view.camera.intrinsics.width as usize + x, seen.z))
+        let at = y * self.view.camera.intrinsics.width as usize + x;
+        let surface = f64::from(self.depth[at]);
+        (surface > 0.0).then_some(Look { at, z: seen.z, surface })
     }
 }

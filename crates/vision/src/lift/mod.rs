@@ -8,6 +8,7 @@ mod backdrop;
 mod fuse;
 mod sh;
 mod thin;
+mod union;
 
 pub use backdrop::backdrop;
 
@@ -21,6 +22,7 @@ use crate::{
     lift::{
         fuse::{Fate, fuse},
         sh::ShRotation,
+        union::unite,
     },
     point,
     scene::{
@@ -31,6 +33,22 @@ use crate::{
 
 pub use fuse::FuseOptions;
 pub use thin::ThinOptions;
+pub use union::UnionOptions;
+
+/// How the Gaussians of all photos become one scene.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Fusion {
+    /// For views that draw the nearest photos in front of all others.
+    Layers(FuseOptions),
+    /// For views of one set, which know nothing of the photos.
+    OneSet(UnionOptions),
+}
+
+impl Default for Fusion {
+    fn default() -> Self {
+        Self::Layers(FuseOptions::default())
+    }
+}
 
 /// How far beyond the searched depths a Gaussian may lie: less than half of the nearest or more
 /// than twice the farthest was not measured.
@@ -66,7 +84,7 @@ pub fn lift(
     views: Vec<ViewGaussians>,
     cameras: &[Camera],
     prune: bool,
-    fusing: &FuseOptions,
+    fusing: &Fusion,
     thinning: Option<&ThinOptions>,
     cancel: &AtomicBool,
 ) -> Result<Lifted> {
@@ -91,7 +109,10 @@ pub fn lift(
         reasons.into_iter().zip(dropped).for_each(|(reason, count)| counts.add(reason, count));
         candidate.push(kept);
     }
-    let mut fates = fuse(&views, &candidate, fusing, cancel)?;
+    let mut fates = match fusing {
+        Fusion::Layers(options) => fuse(&views, &candidate, options, cancel)?,
+        Fusion::OneSet(options) => unite(&mut views, &candidate, options, cancel)?,
+    };
     if let Some(thinning) = thinning {
         views.par_iter_mut().zip(&mut fates).try_for_each(|(view, fates)| {
             unless_cancelled(cancel)?;
@@ -99,7 +120,9 @@ pub fn lift(
             Ok::<_, Error>(())
         })?;
     }
-    for (reason, dropped) in [("duplicate", Fate::Duplicate), ("merged", Fate::Merged)] {
+    let reasons =
+        [("free_space", Fate::FreeSpace), ("duplicate", Fate::Duplicate), ("merged", Fate::Merged)];
+    for (reason, dropped) in reasons {
         let of_view = |fates: &Vec<Fate>| fates.iter().filter(|fate| **fate == dropped).count();
         counts.add(reason, fates.par_iter().map(of_view).sum::<usize>() as u64);
     }

@@ -34,6 +34,8 @@ use crate::{
 const FAILURES_MAX: u32 = 3;
 /// A network of more bytes has one session on the CPU, which runs for one job at a time.
 const SHARED_BYTES: u64 = 256 << 20;
+/// Threads for which a job has a session of its own on the CPU.
+const THREADS_A_SESSION: usize = 4;
 
 /// Numbers of a tensor.
 #[derive(Clone, Debug)]
@@ -363,8 +365,9 @@ struct Opener {
 }
 
 impl Opener {
-    /// A session a job on the CPU, or one that all jobs wait for where the network is large. One
-    /// session on a device: it runs one network at a time whatever the number of jobs.
+    /// A session a job on the CPU, or one that all jobs wait for where the network is large or the
+    /// threads are few. One session on a device: it runs one network at a time whatever the number
+    /// of jobs.
     fn open(&self, provider: Provider) -> ort::Result<(Pool, Takes)> {
         let (count, threads) = match provider {
             Provider::Cpu if self.shared => (1, self.options.threads),
@@ -649,10 +652,11 @@ fn difference(found: &[f32], wanted: &[f32]) -> f64 {
     if found.len() == wanted.len() && share.is_finite() { share } else { f64::INFINITY }
 }
 
-/// Sessions, and threads of an operator in each: a session for each job, together at most
-/// `threads`.
+/// Sessions, and threads of an operator in each, together at most `threads`. Each job has a session
+/// of its own where it has [`THREADS_A_SESSION`]: on fewer, runs side by side take the memory of
+/// both and end no sooner.
 fn shares(threads: usize, jobs: usize) -> (usize, usize) {
-    let sessions = jobs.clamp(1, threads.max(1));
+    let sessions = jobs.clamp(1, (threads / THREADS_A_SESSION).max(1));
     (sessions, (threads / sessions).max(1))
 }
 
@@ -758,6 +762,7 @@ mod tests {
             }
         }
         assert_eq!(shares(2, 1), (1, 2), "one job gets all threads");
+        assert_eq!(shares(2, 2), (1, 2), "few threads are not parted");
         assert_eq!(shares(8, 2), (2, 4), "two jobs share");
     }
 }

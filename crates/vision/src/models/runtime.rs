@@ -176,7 +176,8 @@ impl Runtime {
         arithmetic: Arithmetic,
     ) -> ort::Result<Session> {
         let providers = match provider {
-            Provider::Cpu => vec![],
+            // What a run took goes back after it: an arena keeps the largest of every shape.
+            Provider::Cpu => vec![ep::CPU::default().with_arena_allocator(false).build()],
             Provider::Cuda => vec![
                 ep::CUDA::default()
                     .with_tf32(false)
@@ -191,6 +192,7 @@ impl Runtime {
             .with_inter_threads(1)?
             .with_intra_op_spinning(false)?
             .with_inter_op_spinning(false)?
+            .with_memory_pattern(false)?
             .with_operators(correlate::domain()?)?
             .with_execution_providers(providers)?;
         if let Some(weights) = weights {

@@ -18,6 +18,13 @@ pub(super) struct Header {
     pub(super) height: u32,
 }
 
+impl Header {
+    /// Width and height, pixels.
+    pub(super) fn size(&self) -> [u32; 2] {
+        [self.width, self.height]
+    }
+}
+
 /// A decoder that takes memory for the deepest pixel (RGBA of 16 bits) and working space at most.
 fn reader<'a>(
     bytes: &'a [u8],
@@ -155,7 +162,7 @@ pub(super) fn pixels(bytes: &[u8], header: &Header, what: &str, limits: &Limits)
 
 /// The photo with its longer side at most `side_max`, intrinsics following exactly.
 ///
-/// No stage looks closer than that, and 64 photos of 24 megapixels would take 4.6 GB.
+/// 64 photos of 24 megapixels would take 4.6 GB.
 pub(super) fn at_most(photo: Photo, k: Intrinsics, side_max: u32) -> (Photo, Intrinsics) {
     let longer = photo.width.max(photo.height);
     if longer <= side_max {

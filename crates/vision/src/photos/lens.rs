@@ -60,6 +60,13 @@ struct Distortion {
     radius_max: f64,
 }
 
+impl LensAtSize {
+    /// The same lens of the photo reduced to the size of `intrinsics`.
+    pub(super) fn of_smaller(self, intrinsics: Intrinsics) -> Self {
+        Self { intrinsics, ..self }
+    }
+}
+
 impl Lens {
     /// The lens for a photo of `width` x `height`, all numbers checked.
     ///

@@ -18,17 +18,21 @@ use std::{
 use crate::{
     capture,
     error::{Error, Result},
-    lift,
+    lift::{self, FuseOptions, Fusion, UnionOptions},
     limits::Limits,
     meter,
     models::{Bundle, Geometry, GeometryInput, NetworkOptions, Provider, Runtime},
     photos,
     scene::{
-        Backdrop, Camera, Capture, Density, Gaussians, HealthReport, Intrinsics, Photo, PosedPhoto,
-        Provenance, Scene, SceneCamera, SceneId, SceneMeta, SceneOptions, Stage, StageTime, Upload,
-        ViewSet, Watch, unless_cancelled,
+        Backdrop, Camera, Capture, Density, Gaussians, HealthReport, Intrinsics, Method, Photo,
+        PosedPhoto, Provenance, Scene, SceneCamera, SceneId, SceneMeta, SceneOptions, Stage,
+        StageTime, Upload, ViewSet, Watch, unless_cancelled,
     },
 };
+
+/// Views that go through the geometry network together, where none are asked for: memory grows with
+/// them, and scenes get no better in the mean (docs/adr/0034-many-photos.md).
+const VIEWS_A_RUN: usize = 4;
 
 /// Library, bundle, networks and threads that make scenes. All jobs share one.
 #[derive(Debug)]
@@ -225,11 +229,7 @@ pub fn reconstruct(
                 Density::Thinned => Some(lift::ThinOptions::default()),
                 Density::Full => None,
             };
-            let layers = match method.fuse_layers {
-                0 => usize::MAX,
-                layers => layers as usize,
-            };
-            let fusing = lift::FuseOptions { layers, ..lift::FuseOptions::default() };
+            let fusing = fusing(&method);
             let backdrop = || match method.backdrop {
                 true => lift::backdrop(photos),
                 false => Backdrop::default(),
@@ -297,12 +297,21 @@ impl<'a> Stages<'a> {
 /// Views the network takes at once: the caller's wish, within what the network can.
 fn views_max(options: &SceneOptions, least: usize, most: usize) -> Result<usize> {
     match options.max_views {
-        None => Ok(most),
+        None => Ok(most.min(VIEWS_A_RUN.max(least))),
         Some(wish) if (least.max(2)..=most).contains(&wish) => Ok(wish),
         Some(wish) => Err(Error::invalid(format!(
             "max_views is {wish}; this network takes {} to {most} views at once",
             least.max(2)
         ))),
+    }
+}
+
+/// Where views put no photos in front, the Gaussians of all photos are one set that agrees.
+fn fusing(method: &Method) -> Fusion {
+    match (method.fuse_layers as usize, method.front_photos) {
+        (0, _) => Fusion::Layers(FuseOptions { layers: usize::MAX, ..FuseOptions::default() }),
+        (_, 0) => Fusion::OneSet(UnionOptions::default()),
+        (layers, _) => Fusion::Layers(FuseOptions { layers, ..FuseOptions::default() }),
     }
 }
 

@@ -9,7 +9,7 @@ use segsplat_core::{
     scene::{Camera, CameraToWorld, Intrinsics, Photo, PosedPhoto, ViewGaussians},
 };
 use segsplat_vision::{
-    lift::{FuseOptions, Lifted, lift},
+    lift::{Fusion, Lifted, lift},
     models::{Bundle, Geometry, GeometryInput, Runtime},
 };
 
@@ -71,8 +71,7 @@ fn run(network: &Geometry, photos: &[PosedPhoto]) -> Result<Vec<ViewGaussians>> 
 
 fn lifted(network: &Geometry, photos: &[PosedPhoto]) -> Lifted {
     let cameras: Vec<Camera> = photos.iter().map(|p| p.camera).collect();
-    lift(run(network, photos).unwrap(), &cameras, true, &FuseOptions::default(), None, &GO_ON)
-        .unwrap()
+    lift(run(network, photos).unwrap(), &cameras, true, &Fusion::default(), None, &GO_ON).unwrap()
 }
 
 #[test]

@@ -30,6 +30,7 @@ mod sample;
 mod score;
 mod segment;
 mod thin;
+mod union;
 mod votes;
 
 use segsplat_vision::models::NetworkOptions;

@@ -6,7 +6,7 @@ use glam::{DMat3, DQuat, DVec3};
 use segsplat_core::scene::{
     BLUR_PX2, Camera, CameraToWorld, Gaussians, Intrinsics, SH_C0, ViewGaussians,
 };
-use segsplat_vision::lift::{FuseOptions, ThinOptions, lift};
+use segsplat_vision::lift::{Fusion, ThinOptions, lift};
 
 const SIDE: usize = 16;
 const FOCAL: f64 = 20.0;
@@ -47,7 +47,7 @@ fn wall(
 fn lifted(view: ViewGaussians, options: Option<&ThinOptions>) -> Gaussians {
     let cameras = [view.camera];
     let go_on = AtomicBool::new(false);
-    lift(vec![view], &cameras, true, &FuseOptions::default(), options, &go_on).unwrap().gaussians
+    lift(vec![view], &cameras, true, &Fusion::default(), options, &go_on).unwrap().gaussians
 }
 
 fn thinned(view: ViewGaussians) -> Gaussians {
