@@ -63,6 +63,7 @@ impl Geometry {
             file: &manifest.file,
             cpu_file: manifest.cpu.as_ref().map(|cpu| cpu.file.as_str()),
             signature: signature(&manifest),
+            keeps_memory: false,
             tolerance: TOLERANCE,
             probe: &|_| Ok(probe.inputs(&manifest)),
         };

@@ -71,6 +71,7 @@ impl ImageText {
             file: &tower.file,
             cpu_file: None,
             signature: image_signature(&manifest),
+            keeps_memory: true,
             tolerance: TOLERANCE,
             probe: &|takes| {
                 let count = size(takes, &tower.input, 0).unwrap_or(tower.batch);
@@ -86,6 +87,7 @@ impl ImageText {
             file: &tower.file,
             cpu_file: None,
             signature: text_signature(&manifest),
+            keeps_memory: true,
             tolerance: TOLERANCE,
             probe: &|takes| {
                 let length = size(takes, &tower.input_ids, 1).unwrap_or(tower.context.min(8));

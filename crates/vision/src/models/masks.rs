@@ -95,6 +95,7 @@ impl MaskNetwork {
             file: &names.file,
             cpu_file: None,
             signature: encoder_signature(&manifest),
+            keeps_memory: true,
             tolerance: TOLERANCE,
             probe: &|_| Ok(vec![input()]),
         };
@@ -109,6 +110,7 @@ impl MaskNetwork {
             file: &manifest.decoder.file,
             cpu_file: None,
             signature: decoder_signature(&manifest),
+            keeps_memory: true,
             tolerance: TOLERANCE,
             probe: &|found| {
                 let takes = Takes::of(found, &manifest)?;

@@ -346,6 +346,8 @@ pub(super) struct Spec<'a> {
     pub(super) cpu_file: Option<&'a str>,
     /// The tensors that it must have; its outputs are compared.
     pub(super) signature: Vec<Wanted<'a>>,
+    /// Whether its shapes are few and small, so that memory of a run is kept for the next.
+    pub(super) keeps_memory: bool,
     /// The largest relative difference of an output to the CPU's, root of mean squares.
     pub(super) tolerance: f64,
     /// The fixed input of the comparison.
@@ -362,6 +364,8 @@ struct Opener {
     cpu_file: Option<PathBuf>,
     /// One session, whatever the number of jobs.
     shared: bool,
+    /// [`Spec::keeps_memory`].
+    keeps_memory: bool,
 }
 
 impl Opener {
@@ -382,9 +386,11 @@ impl Opener {
             (Provider::Cuda | Provider::Webgpu, _) => Arithmetic::F32,
         };
         let weights = PrepackedWeights::new();
-        let sessions: Vec<Session> = (0..count)
-            .map(|_| self.runtime.session(file, provider, threads, Some(&weights), arithmetic))
-            .collect::<ort::Result<_>>()?;
+        let session = |_| {
+            let weights = Some(&weights);
+            self.runtime.session(file, provider, threads, weights, arithmetic, self.keeps_memory)
+        };
+        let sessions: Vec<Session> = (0..count).map(session).collect::<ort::Result<_>>()?;
         let takes = sessions.first().map(Takes::of).unwrap_or_default();
         let runners = sessions.into_iter().map(|session| Box::new(session) as Box<dyn Runner>);
         Ok((Pool::new(runners.collect()), takes))
@@ -393,8 +399,14 @@ impl Opener {
     /// The CPU's own answer in f32 from the file that devices run.
     fn reference(&self) -> ort::Result<Pool> {
         let threads = self.options.threads;
-        let session =
-            self.runtime.session(&self.file, Provider::Cpu, threads, None, Arithmetic::F32)?;
+        let session = self.runtime.session(
+            &self.file,
+            Provider::Cpu,
+            threads,
+            None,
+            Arithmetic::F32,
+            false,
+        )?;
         Ok(Pool::new(vec![Box::new(session)]))
     }
 }
@@ -442,6 +454,7 @@ impl Network {
             file: bundle.path(spec.file),
             cpu_file: spec.cpu_file.map(|file| bundle.path(file)),
             shared: bundle.network_bytes(spec.file) > SHARED_BYTES,
+            keeps_memory: spec.keeps_memory,
         };
         let mut refused = None;
         for provider in runtime.candidates(options.provider)? {
@@ -589,7 +602,7 @@ pub(super) fn misfits(
     wanted: &[Wanted<'_>],
 ) -> Vec<String> {
     let path = bundle.path(file);
-    match runtime.session(&path, Provider::Cpu, options.threads, None, Arithmetic::Fast) {
+    match runtime.session(&path, Provider::Cpu, options.threads, None, Arithmetic::Fast, false) {
         Ok(session) => Takes::of(&session)
             .misfits(wanted)
             .into_iter()
@@ -701,6 +714,7 @@ mod tests {
             file: "fake.onnx",
             cpu_file: None,
             signature: vec![Wanted::new(Side::Output, "answer", vec![vec![1]])],
+            keeps_memory: true,
             tolerance: 1e-2,
             probe: &|_| Ok(Vec::new()),
         };

@@ -163,7 +163,8 @@ impl Runtime {
     }
 
     /// Opens `model` on `provider`, `threads` threads an operator, spinning off. Sessions that get
-    /// the same `weights` share what the CPU's kernels make of them.
+    /// the same `weights` share what the CPU's kernels make of them. One that `keeps_memory` takes
+    /// that of a run from the last one: faster, but it holds the largest of every shape for good.
     ///
     /// CUDA computes in f32: TF32 is off. Its convolutions are chosen by a search, which takes
     /// about a second at the first run of a shape; the heuristic's are several times slower.
@@ -174,10 +175,10 @@ impl Runtime {
         threads: usize,
         weights: Option<&PrepackedWeights>,
         arithmetic: Arithmetic,
+        keeps_memory: bool,
     ) -> ort::Result<Session> {
         let providers = match provider {
-            // What a run took goes back after it: an arena keeps the largest of every shape.
-            Provider::Cpu => vec![ep::CPU::default().with_arena_allocator(false).build()],
+            Provider::Cpu => vec![ep::CPU::default().with_arena_allocator(keeps_memory).build()],
             Provider::Cuda => vec![
                 ep::CUDA::default()
                     .with_tf32(false)
@@ -192,7 +193,7 @@ impl Runtime {
             .with_inter_threads(1)?
             .with_intra_op_spinning(false)?
             .with_inter_op_spinning(false)?
-            .with_memory_pattern(false)?
+            .with_memory_pattern(keeps_memory)?
             .with_operators(correlate::domain()?)?
             .with_execution_providers(providers)?;
         if let Some(weights) = weights {
