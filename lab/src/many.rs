@@ -19,7 +19,7 @@ use crate::{
     photo_files,
     pipeline::Pipeline,
     refine::{RefineBudget, RefineOptions, held_out, refine, split},
-    render::{Background, Kinds, RenderRequest, Renderer, cpu::CpuRenderer, plan::default_near},
+    render::{Background, Kinds, RenderRequest, Renderer, Switches, plan::default_near},
     rows::{Rows, ms, progress},
     scene::{Gaussians, Photo, PosedPhoto, Scene, SceneOptions},
     scenes::{is_posed, make, scene_of, use_of},
@@ -59,7 +59,7 @@ pub(crate) struct Args {
 /// `invalid_request` when there is no scene or too few photos, else whatever a stage says.
 pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
-    let renderer = CpuRenderer::new(args.inputs.setup.threads())?;
+    let (renderer, _adapters) = args.inputs.setup.renderer(Switches::default())?;
     for (name, dir) in args.inputs.find(is_posed)? {
         let all = photo_files::read_dir(&dir, &Limits::default())?;
         let (targets, given) = given(&all, args.inputs.photos);
@@ -71,7 +71,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         let begun = Instant::now();
         let scene = scene_of(make(&engine, &learnt, &SceneOptions::default())?);
         let create_ms = ms(begun);
-        let judge = |gaussians: &Gaussians| judge(&renderer, &scene, gaussians, &targets);
+        let judge = |gaussians: &Gaussians| judge(&*renderer, &scene, gaussians, &targets);
         let before = judge(&scene.gaussians)?;
         let mut row = json!({
             "scene": name,
@@ -103,7 +103,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             };
             let start = (&scene.gaussians, &scene.backdrop);
             let no = AtomicBool::new(false);
-            let best = refine(&renderer, start.0, start.1, photos, extent, &options, &no, publish)?;
+            let best =
+                refine(&*renderer, start.0, start.1, photos, extent, &options, &no, publish)?;
             row["refine_ms"] = json!(ms(begun));
             row["refine_cpu_s"] = json!(cpu_seconds() - cpu);
             row["steps"] = json!(steps);
@@ -149,7 +150,7 @@ fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
 
 /// Mean PSNR at the targets.
 fn judge(
-    renderer: &CpuRenderer,
+    renderer: &dyn Renderer,
     scene: &Scene,
     gaussians: &Gaussians,
     targets: &[PosedPhoto],
