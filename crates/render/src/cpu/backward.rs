@@ -1,5 +1,6 @@
-//! The backward pass of the CPU renderer: see [`crate::backward`] for what it computes. Its twins are
-//! shaders/rasterize_backward.wgsl, shaders/project_backward.wgsl and shaders/shade_backward.wgsl.
+//! The backward pass of the CPU renderer: see [`crate::backward`] for what it computes. Its twins
+//! are `shaders/rasterize_backward.wgsl`, `shaders/project_backward.wgsl` and
+//! `shaders/shade_backward.wgsl`.
 //!
 //! 1. The frame is drawn; its footprints and bins stay.
 //! 2. Each tile goes through its Gaussians front to back once more, with the statements of the
