@@ -314,7 +314,7 @@ fn the_shaders_agree_with_the_kernel_whatever_the_loss_depends_on() {
     let none = FrameGradients::default();
     let color = FrameGradients { color: all.color.clone(), ..none.clone() };
     let depth = FrameGradients { depth: all.depth.clone(), ..none.clone() };
-    let alpha = FrameGradients { alpha: all.alpha.clone(), ..none.clone() };
+    let alpha = FrameGradients { alpha: all.alpha, ..none.clone() };
     for gpu in both_kernels() {
         for (name, loss) in
             [("none", &none), ("colour", &color), ("depth", &depth), ("alpha", &alpha)]
