@@ -1,23 +1,13 @@
 // Stage 6: front-to-back blend of a tile's Gaussians: colour, alpha, expected depth, labels.
 // CPU: crates/render/src/cpu/rasterize.rs (which cuts tiles into cells of 4 x 4 pixels)
+// common/parts.wgsl says which parts of a tile a Gaussian meets.
 // common/labels_*.wgsl define label_of, label_row, add_label and store_labels.
 //
-// A tile is 32 parts of 4 x 2 pixels. Gaussians are staged in batches, each with one bit for every
-// part that the box around its footprint touches. The invocations of a part walk only its own bits.
-// The box is never too small, so no pixel changes.
-//
-// An invocation blends PIXELS pixels of a part: one on a GPU, all eight on a software adapter,
-// where reading a staged Gaussian costs more than blending it.
+// Gaussians are staged in batches, each with one bit for every part that it meets. The invocations
+// of a part walk only its own bits.
 
-@group(0) @binding(1) var<storage, read> footprints: array<Footprint>;
-// (depth key, Gaussian)
-@group(0) @binding(2) var<storage, read> pairs: array<vec2<u32>>;
-// First pair of each tile, sorted, and one past its last.
-@group(0) @binding(3) var<storage, read> lists: array<vec2<u32>>;
 // The pictures of the band one after another, each row-major: f32 as bits, or levels.
 @group(0) @binding(4) var<storage, read_write> pictures: array<u32>;
-// [views][N, 3] as shade gives them; of a scene of degree 0 its harmonics, [N, 3].
-@group(0) @binding(5) var<storage, read> colors: array<f32>;
 
 // mean - tile corner, conic_shear, conic_x
 var<workgroup> shapes: array<vec4<f32>, 256>;
@@ -32,13 +22,7 @@ var<workgroup> words: array<u32, 256>;
 var<workgroup> done_count: atomic<u32>;
 var<workgroup> all_done: u32;
 
-const PARTS: u32 = 32u;
 const WORDS: u32 = 8u;
-// Pixels of a part.
-const PIXELS_MAX: u32 = 8u;
-
-override PIXELS: u32 = 1u;
-override LANES: u32 = WORKGROUP_SIZE / PIXELS;
 
 // A kernel is compiled for each set of pictures.
 override WITH_COLOR: bool = true;
@@ -46,49 +30,7 @@ override WITH_DEPTH: bool = true;
 // Pictures of bytes.
 override WITH_BYTES: bool = false;
 // Work that is left out because no pixel changes (crates/render/src/switches.rs).
-override SKIP_ELLIPSE_PARTS: bool = true;
 override SKIP_ENDED_RAYS: bool = true;
-override SKIP_FLAT_COLOR: bool = true;
-
-// Bits of the parts that meet the box around a footprint, whose mean is relative to the tile.
-fn parts_of(footprint: Footprint, mean: vec2<f32>) -> u32 {
-    if !SKIP_ELLIPSE_PARTS {
-        return 0xffffffffu;
-    }
-    let root = sqrt(footprint.power_max);
-    let tall = root / footprint.conic_y;
-    let across = root / footprint.conic_x;
-    let lean = abs(footprint.conic_shear) * tall;
-    // √(across² + lean²) without squares, which may overflow. The slack is far over f32's rounding.
-    let large = max(across, lean);
-    let ratio = min(across, lean) / large;
-    let half = vec2(large * sqrt(1.0 + ratio * ratio), tall) * 1.0001 + 0.02;
-    let low = mean - half;
-    let high = mean + half;
-    // Pixel centres of column c of the parts are 4 c + 0.5 to 4 c + 3.5, of row r 2 r + 0.5 and
-    // 2 r + 1.5. Written so that a NaN meets everything.
-    var columns = 0u;
-    for (var c = 0u; c < 4u; c++) {
-        let first = f32(c) * 4.0 + 0.5;
-        columns |= select(0x11111111u << c, 0u, low.x > first + 3.0 || high.x < first);
-    }
-    var rows = 0u;
-    for (var r = 0u; r < 8u; r++) {
-        let first = f32(r) * 2.0 + 0.5;
-        rows |= select(0xfu << (r * 4u), 0u, low.y > first + 1.0 || high.y < first);
-    }
-    return columns & rows;
-}
-
-fn color_of(id: u32) -> vec3<f32> {
-    if SKIP_FLAT_COLOR && views[which].sh_count == 1u {
-        let at = id * 3u;
-        let c = vec3(colors[at], colors[at + 1u], colors[at + 2u]);
-        return max(vec3(SH_OFFSET) + SH_C0 * c, vec3(0.0));
-    }
-    let at = (which * views[which].gaussian_count + id) * 3u;
-    return vec3(colors[at], colors[at + 1u], colors[at + 2u]);
-}
 
 // A Gaussian on its way from the scene to the workgroup.
 struct Staged {
@@ -144,10 +86,8 @@ var<private> pixels: array<Pixel, PIXELS_MAX>;
 
 // Half the squared distance of a pixel to a Gaussian, and its alpha there.
 fn alpha_of(q: u32, shape: vec4<f32>, weight: vec4<f32>) -> vec2<f32> {
-    let d = pixels[q].center - shape.xy;
-    let across = shape.w * (d.x - shape.z * d.y);
-    let along = weight.x * d.y;
-    let power = across * across + along * along;
+    let at = along_axes(pixels[q].center, shape, weight.x);
+    let power = at.x * at.x + at.y * at.y;
     return vec2(power, min(ALPHA_MAX, weight.y * exp(-power)));
 }
 
@@ -233,13 +173,6 @@ fn store(q: u32, corner: vec2<f32>) {
         pictures[views[which].alpha_start + at] = bitcast<u32>(alpha);
     }
     store_labels(q, at);
-}
-
-// Place of pixel q of this invocation in the tile.
-fn place_of(local: u32, q: u32) -> vec2<u32> {
-    let part = local * PIXELS / 8u;
-    let lane = local * PIXELS % 8u + q;
-    return vec2((part & 3u) * 4u + (lane & 3u), (part >> 2u) * 2u + (lane >> 2u));
 }
 
 // The lowest bytes of four numbers in a word.

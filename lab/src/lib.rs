@@ -63,6 +63,8 @@ enum Command {
     Networks(networks::Args),
     /// Time frames of a generated scene
     Frames(frames::Args),
+    /// Time frames with their backward passes
+    Backward(frames::Args),
     /// Time frames without each kind of skipped work
     Skips(frames::Args),
     /// Time each stage from photos to a view
@@ -107,6 +109,7 @@ pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
         Command::Words(args) => words::run(args, &mut rows)?,
         Command::Networks(args) => networks::run(args, &mut rows)?,
         Command::Frames(args) => frames::run(args, &mut rows)?,
+        Command::Backward(args) => frames::backward::run(args, &mut rows)?,
         Command::Skips(args) => frames::skips::run(args, &mut rows)?,
         Command::Stages(args) => stages::run(args, &mut rows)?,
         Command::Load(command) => load::run(command, &mut rows)?,

@@ -20,8 +20,7 @@ use crate::{
     pipeline::Pipeline,
     refine::{RefineBudget, RefineOptions, held_out, refine, split},
     render::{
-        Background, Frame, Kinds, RenderRequest, Renderer,
-        cpu::CpuRenderer,
+        Background, Frame, Kinds, RenderRequest, Renderer, Switches,
         plan::{default_near, served},
     },
     rows::{Rows, ms, progress},
@@ -66,7 +65,7 @@ pub(crate) struct Args {
 /// `invalid_request` when there is no scene or too few photos, else whatever a stage says.
 pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
-    let renderer = CpuRenderer::new(args.inputs.setup.threads())?;
+    let (renderer, _adapters) = args.inputs.setup.renderer(Switches::default())?;
     let options = SceneOptions::default().with(&args.method)?;
     for (name, dir) in args.inputs.find(is_posed)? {
         let all = photo_files::read_dir(&dir, &Limits::default())?;
@@ -126,7 +125,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             };
             let start = (&scene.gaussians, &scene.backdrop);
             let no = AtomicBool::new(false);
-            let best = refine(&renderer, start.0, start.1, photos, extent, &options, &no, publish)?;
+            let best =
+                refine(&*renderer, start.0, start.1, photos, extent, &options, &no, publish)?;
             row["refine_ms"] = json!(ms(begun));
             row["refine_cpu_s"] = json!(cpu_seconds() - cpu);
             row["steps"] = json!(steps);

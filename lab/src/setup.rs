@@ -11,7 +11,8 @@ use crate::{
     error::{Error, Result},
     models::NetworkOptions,
     render::{
-        Renderer, RendererChoice, RendererOptions, Switches,
+        RendererChoice, RendererOptions, Switches,
+        backward::DifferentiableRenderer,
         select::{AdapterReport, select},
     },
 };
@@ -114,7 +115,7 @@ impl Setup {
     pub(crate) fn renderer(
         &self,
         switches: Switches,
-    ) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
+    ) -> Result<(Arc<dyn DifferentiableRenderer>, Vec<AdapterReport>)> {
         select(&RendererOptions {
             renderer: self.renderer,
             adapter: self.adapter.clone(),

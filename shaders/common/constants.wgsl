@@ -34,6 +34,10 @@ const GROUPS_X_MAX: u32 = 32768u;
 // Values of View::levels but 0.
 const LEVELS_RGB: u32 = 1u;
 const LEVELS_RGBA: u32 = 2u;
+// Sums that a tile gives for each of its pairs in the backward pass.
+const PAIR_SUMS: u32 = 10u;
+// Derivatives of a Gaussian but for its harmonics, and whether it is seen.
+const GRADIENT_WORDS: u32 = 12u;
 // Cells of a backdrop.
 const BACKDROP_WIDTH: u32 = 128u;
 const BACKDROP_HEIGHT: u32 = 64u;

@@ -37,7 +37,7 @@ use crate::{
 use segsplat_core::{error, limits, scene};
 
 /// Which pictures a request pays for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Kinds {
     /// `[H, W, 3]` colour over the background.
     pub color: bool,

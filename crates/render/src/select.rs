@@ -6,7 +6,10 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    DeviceTimes, Frame, RenderRequest, Renderer, cpu::CpuRenderer, gpu::GpuRenderer,
+    DeviceTimes, Frame, RenderRequest, Renderer,
+    backward::{DifferentiableRenderer, FrameGradients, Gradients},
+    cpu::CpuRenderer,
+    gpu::GpuRenderer,
     switches::Switches,
 };
 use crate::{
@@ -80,7 +83,9 @@ pub struct AdapterReport {
 /// # Errors
 /// `gpu_unavailable` when an adapter was asked for and none fits, `internal` when threads or
 /// kernels cannot be started.
-pub fn select(options: &RendererOptions) -> Result<(Arc<dyn Renderer>, Vec<AdapterReport>)> {
+pub fn select(
+    options: &RendererOptions,
+) -> Result<(Arc<dyn DifferentiableRenderer>, Vec<AdapterReport>)> {
     let cpu = CpuRenderer::with_switches(options.threads, &options.switches)?;
     if options.renderer == RendererChoice::Cpu {
         tracing::info!(renderer = "cpu", "renderer chosen as configured");
@@ -99,7 +104,7 @@ pub fn select(options: &RendererOptions) -> Result<(Arc<dyn Renderer>, Vec<Adapt
         );
     }
     let named = options.adapter.is_some() || options.renderer == RendererChoice::Gpu;
-    let renderer: Arc<dyn Renderer> = match gpu {
+    let renderer: Arc<dyn DifferentiableRenderer> = match gpu {
         Ok(gpu) => {
             tracing::info!(renderer = gpu.name(), "renderer chosen");
             if options.renderer == RendererChoice::Gpu {
@@ -131,6 +136,20 @@ fn cpu_draws_after(code: ErrorCode) -> bool {
     )
 }
 
+/// The GPU renderer's answer, or what the CPU renderer draws instead.
+fn or_else(answer: Result<Frame>, cpu: impl FnOnce() -> Result<Frame>) -> Result<Frame> {
+    let error = match answer {
+        Err(error) if cpu_draws_after(error.code()) => error,
+        answer => return answer,
+    };
+    tracing::warn!(
+        reason = error.message(),
+        source = std::error::Error::source(&error).map(tracing::field::display),
+        "the GPU renderer refused a view; the CPU renderer draws it"
+    );
+    cpu()
+}
+
 /// A GPU renderer, and the CPU renderer for the views that it fails to draw, each logged.
 #[derive(Debug)]
 struct WithCpu {
@@ -148,16 +167,7 @@ impl Renderer for WithCpu {
     }
 
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
-        let error = match self.gpu.render(gaussians, request) {
-            Err(error) if cpu_draws_after(error.code()) => error,
-            answer => return answer,
-        };
-        tracing::warn!(
-            reason = error.message(),
-            source = std::error::Error::source(&error).map(tracing::field::display),
-            "the GPU renderer refused a view; the CPU renderer draws it"
-        );
-        self.cpu.render(gaussians, request)
+        or_else(self.gpu.render(gaussians, request), || self.cpu.render(gaussians, request))
     }
 
     fn device_times(
@@ -166,6 +176,29 @@ impl Renderer for WithCpu {
         request: &RenderRequest,
     ) -> Result<Option<DeviceTimes>> {
         self.gpu.device_times(gaussians, request)
+    }
+}
+
+impl DifferentiableRenderer for WithCpu {
+    fn backward(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
+        gradients: &mut Gradients,
+    ) -> Result<Frame> {
+        or_else(self.gpu.backward(gaussians, request, loss, gradients), || {
+            self.cpu.backward(gaussians, request, loss, gradients)
+        })
+    }
+
+    fn backward_times(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        by: &FrameGradients,
+    ) -> Result<Option<DeviceTimes>> {
+        self.gpu.backward_times(gaussians, request, by)
     }
 }
 

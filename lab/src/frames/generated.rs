@@ -33,12 +33,14 @@ pub(super) fn scene(args: &Args) -> Result<(Gaussians, Camera)> {
 }
 
 /// Writes a safetensors file: the scene as its arrays, `camera` as `[viewmat 16, fx, fy, cx, cy,
-/// width, height, near, background 3]`, `color` as the renderer drew it.
+/// width, height, near, background 3]`, `color` as the renderer drew it, and `more` by name,
+/// `[n, m]`.
 pub(super) fn dump(
     path: &Path,
     gaussians: &Gaussians,
     request: &RenderRequest,
     frame: &Frame,
+    more: &[(&str, [usize; 2], &[f32])],
 ) -> Result<()> {
     let n = gaussians.len();
     let lens = request.camera.intrinsics;
@@ -64,8 +66,12 @@ pub(super) fn dump(
         ("color", Dtype::F32, vec![height, width, 3], bytemuck::cast_slice(color)),
     ];
     let fault = |e| Error::internal("bench: the scene cannot be written").caused_by(e);
+    let more = more.iter().map(|(name, shape, numbers)| {
+        (*name, Dtype::F32, shape.to_vec(), bytemuck::cast_slice::<f32, u8>(numbers))
+    });
     let views = arrays
         .into_iter()
+        .chain(more)
         .map(|(name, dtype, shape, bytes)| Ok((name, TensorView::new(dtype, shape, bytes)?)))
         .collect::<std::result::Result<Vec<_>, safetensors::SafeTensorError>>()
         .map_err(fault)?;

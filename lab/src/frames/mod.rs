@@ -4,6 +4,7 @@
 //! cameras a fifth of the depth apart, drawn from between them. Its Gaussians have bank entries in
 //! patches, as things do: `--labels` times labels beside colour.
 
+pub(crate) mod backward;
 mod generated;
 pub(crate) mod skips;
 
@@ -149,7 +150,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let frame = drawing.frame()?;
     let first_ms = ms(begun);
     if let Some(path) = &args.dump {
-        dump(path, &gaussians, &request, &frame)?;
+        dump(path, &gaussians, &request, &frame, &[])?;
     }
     let times = drawing.times(args.frames)?;
     let device = drawing.device_times(args.frames)?;

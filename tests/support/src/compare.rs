@@ -1,7 +1,7 @@
 //! Compares the pictures of two renderers. Pixels may differ only at cliffs of the oracle, and
-//! those are counted and few.
+//! those are counted and few. Also compares gradients.
 
-use segsplat_render::{Frame, oracle::OraclePixel};
+use segsplat_render::{Frame, backward::Gradients, oracle::OraclePixel};
 
 /// How far two pictures may be apart.
 #[derive(Clone, Copy, Debug)]
@@ -121,4 +121,32 @@ pub fn samples(frame: &Frame) -> Vec<Sample> {
 /// Samples of the oracle's pixels.
 pub fn oracle_samples(pixels: &[OraclePixel]) -> Vec<Sample> {
     pixels.iter().map(|p| Sample { color: p.color, depth: p.depth, alpha: p.alpha }).collect()
+}
+
+/// Relative errors of all derivatives that are over 1e-6 of the largest of their kind, sorted: of
+/// numbers under that, sums in f32 hold few digits.
+pub fn gradient_errors<T: Copy + Into<f64>>(got: &Gradients, want: &Gradients<T>) -> Vec<f64> {
+    fn flat<T: Copy + Into<f64>, const N: usize>(
+        got: &[[f32; N]],
+        want: &[[T; N]],
+    ) -> Vec<(f64, f64)> {
+        let both = got.as_flattened().iter().zip(want.as_flattened());
+        both.map(|(&got, &want)| (got.into(), want.into())).collect()
+    }
+    let opacities = got.opacities.iter().zip(&want.opacities);
+    let kinds = [
+        flat(&got.means, &want.means),
+        flat(&got.quats, &want.quats),
+        flat(&got.scales, &want.scales),
+        opacities.map(|(&got, &want)| (got.into(), want.into())).collect(),
+        flat(&got.sh, &want.sh),
+    ];
+    let mut errors = Vec::new();
+    for kind in kinds {
+        let most = kind.iter().fold(0.0_f64, |most, (_, want)| most.max(want.abs()));
+        let counted = kind.iter().filter(|(_, want)| want.abs() > 1e-6 * most);
+        errors.extend(counted.map(|(got, want)| (got - want).abs() / want.abs()));
+    }
+    errors.sort_by(f64::total_cmp);
+    errors
 }

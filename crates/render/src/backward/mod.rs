@@ -2,8 +2,8 @@
 //! Gaussians.
 //!
 //! [`oracle`] judges the others: f64, pixel by pixel. Finite differences of the forward oracle
-//! judge it. [`crate::cpu::backward`] is the tiled kernel. A renderer that has a backward pass is a
-//! [`DifferentiableRenderer`].
+//! judge it. [`crate::cpu::backward`] is the tiled kernel, shaders/*_backward.wgsl its twin. A
+//! renderer that has a backward pass is a [`DifferentiableRenderer`].
 //!
 //! For a pixel with Gaussians i front to back, `w_i = alpha_i T_i`, `A = sum w_i` and `B` behind:
 //! the colour is `sum w_i c_i + (1 - A) B`, the depth `sum w_i z_i / A`. With `g` for what the loss
@@ -17,7 +17,7 @@
 pub mod oracle;
 
 use crate::{
-    Frame, Kinds, RenderRequest, Renderer,
+    DeviceTimes, Frame, Kinds, RenderRequest, Renderer,
     error::{Error, Result},
     scene::Gaussians,
 };
@@ -52,6 +52,14 @@ impl FrameGradients {
                 length.unwrap_or_default()
             ))),
         }
+    }
+
+    /// Refuses pictures of another size than those of `frame`, and depth where it has none.
+    pub(crate) fn check_of(&self, frame: &Frame) -> Result<()> {
+        if self.depth.is_some() && frame.depth.is_none() {
+            return Err(Error::internal("backward: the loss depends on depth, which is not drawn"));
+        }
+        self.check(frame.width as usize * frame.height as usize)
     }
 }
 
@@ -93,7 +101,8 @@ impl<T: Copy + Default> Gradients<T> {
 pub trait DifferentiableRenderer: Renderer {
     /// Renders one view, asks `loss` what it says of the frame, and writes what that means for each
     /// Gaussian into `gradients`, whose old content is lost. Returns the frame: colour, alpha and
-    /// what the request asks for, in f32. Labels of the request are not drawn.
+    /// what the request asks for, in f32. Labels of the request are not drawn. Where a device fails
+    /// meanwhile, `loss` is asked again, of the same view.
     ///
     /// # Errors
     /// As [`Renderer::render`]; `limit_exceeded` when the view needs more Gaussian-tile pairs than
@@ -105,6 +114,20 @@ pub trait DifferentiableRenderer: Renderer {
         loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
         gradients: &mut Gradients,
     ) -> Result<Frame>;
+
+    /// Draws one view and goes back by `by`, for the times of it on the device; `None` where none
+    /// keeps them.
+    ///
+    /// # Errors
+    /// As [`Self::backward`].
+    fn backward_times(
+        &self,
+        _gaussians: &Gaussians,
+        _request: &RenderRequest,
+        _by: &FrameGradients,
+    ) -> Result<Option<DeviceTimes>> {
+        Ok(None)
+    }
 }
 
 /// The request as it is drawn for a backward pass.

@@ -1,4 +1,6 @@
-//! The backward pass of the CPU renderer: see [`crate::backward`] for what it computes.
+//! The backward pass of the CPU renderer: see [`crate::backward`] for what it computes. Its twins
+//! are `shaders/rasterize_backward.wgsl`, `shaders/project_backward.wgsl` and
+//! `shaders/shade_backward.wgsl`.
 //!
 //! 1. The frame is drawn; its footprints and bins stay.
 //! 2. Each tile goes through its Gaussians front to back once more, with the statements of the
@@ -103,7 +105,7 @@ impl DifferentiableRenderer for CpuRenderer {
             return Err(Error::limit(what, frame.stats.intersections, self.isects_max));
         }
         let by_frame = loss(&frame)?;
-        by_frame.check(frame.width as usize * frame.height as usize)?;
+        by_frame.check_of(&frame)?;
         gradients.clear(gaussians.len(), gaussians.sh_count());
         self.threads.install(|| {
             let view = View::new(gaussians.origin(), &request)?;

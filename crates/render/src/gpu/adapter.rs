@@ -18,6 +18,7 @@ use super::{
 };
 use crate::{
     DeviceTimes, DispatchTime, Frame, Labels, RenderRequest, RendererOptions,
+    backward::{FrameGradients, Gradients},
     constants::ISECTS_MAX,
     error::{ErrorCode, Result},
     scene::Gaussians,
@@ -54,6 +55,16 @@ impl Context {
     ) -> Tools<'a> {
         let (gpu, kernels, scratch) = (&self.on.gpu, &*self.on.kernels, &mut self.scratch);
         Tools { gpu, kernels, scratch, scene, isects_max, marks }
+    }
+
+    /// The Gaussians of a backward pass, which no view is expected to draw.
+    fn learnt(&mut self, gaussians: &Gaussians) -> Result<DeviceScene> {
+        let learnt = &mut self.scratch.learnt;
+        let scene = match learnt.take() {
+            Some(scene) if scene.has_shape(gaussians.shape_identity()) => scene,
+            old => DeviceScene::upload(&self.on.gpu, gaussians, old)?,
+        };
+        Ok(learnt.insert(scene).clone())
     }
 
     /// The scene of `gaussians`; if `labelled`, with its entries.
@@ -235,19 +246,54 @@ impl Adapter {
     }
 
     fn alone(&self, gaussians: &Gaussians, view: &QueuedView) -> Result<Frame> {
-        let drawn = self.persistently(|context| self.one(context, gaussians, &view.request, None));
-        match drawn {
+        self.with_room(|context| self.one(context, gaussians, &view.request, None))
+    }
+
+    /// As [`Self::persistently`]; where memory is short, `work` runs again with that of others.
+    fn with_room<T>(&self, mut work: impl FnMut(&mut Context) -> Result<T>) -> Result<T> {
+        match self.persistently(&mut work) {
             // Other scenes and larger views may hold the memory: free it and try once more.
             Err(error) if error.code() == ErrorCode::LimitExceeded => {
                 self.persistently(|context| {
                     self.state.lock().idle.clear();
                     context.on.scenes.lock().clear(&context.on.gpu);
                     context.scratch = Scratch::default();
-                    self.one(context, gaussians, &view.request, None)
+                    work(context)
                 })
             }
             other => other,
         }
+    }
+
+    /// A frame and its backward pass.
+    pub(super) fn backward(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
+        gradients: &mut Gradients,
+    ) -> Result<Frame> {
+        self.with_room(|context| {
+            let scene = context.learnt(gaussians)?;
+            let mut tools = context.tools(&scene, self.isects_max(), None);
+            Ok(tools.backward(gaussians.origin(), request, loss, gradients)?.0)
+        })
+    }
+
+    /// Times of a frame and its backward pass by the clock of the device.
+    pub(super) fn backward_times(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        by: &FrameGradients,
+    ) -> Result<Option<DeviceTimes>> {
+        let mut gradients = Gradients::default();
+        self.timed(|context, marks| {
+            let scene = context.learnt(gaussians)?;
+            let mut tools = context.tools(&scene, self.isects_max(), Some(marks));
+            let loss = &mut |_: &_| Ok(by.clone());
+            Ok(tools.backward(gaussians.origin(), request, loss, &mut gradients)?.1)
+        })
     }
 
     /// Views of one submission. `None` stands for a view that needs more room than expected.
@@ -291,14 +337,24 @@ impl Adapter {
         gaussians: &Gaussians,
         request: &RenderRequest,
     ) -> Result<Option<DeviceTimes>> {
+        self.timed(|context, marks| {
+            self.one(context, gaussians, request, Some(marks))?;
+            marks.read(&context.on.gpu)
+        })
+    }
+
+    /// Times of the dispatches that `run` submits and returns.
+    fn timed(
+        &self,
+        mut run: impl FnMut(&mut Context, &mut Marks) -> Result<Vec<DispatchTime>>,
+    ) -> Result<Option<DeviceTimes>> {
         self.with_context(|context| {
             if !context.on.gpu.has_times {
                 return Ok(None);
             }
             let mut times = |each| -> Result<Vec<DispatchTime>> {
                 let mut marks = Marks::new(&context.on.gpu, each)?;
-                self.one(context, gaussians, request, Some(&mut marks))?;
-                marks.read(&context.on.gpu)
+                run(context, &mut marks)
             };
             let total_ms = times(false)?.iter().map(|stage| stage.ms).sum();
             Ok(Some(DeviceTimes { total_ms, stages: times(true)? }))

@@ -3,10 +3,11 @@
 #![expect(missing_docs, reason = "shaders/common/structs.wgsl describes the fields")]
 
 use bytemuck::{Pod, Zeroable};
+use rayon::prelude::*;
 
 use super::{
     device::Gpu,
-    pipelines::{LEVELS_RGB, LEVELS_RGBA, NO_PICTURE},
+    pipelines::{GRADIENT_WORDS, LEVELS_RGB, LEVELS_RGBA, NO_PICTURE},
     recorder::SceneBuffers,
 };
 use crate::{
@@ -120,6 +121,18 @@ pub struct PlanRow {
     pub farthest: u32,
 }
 
+/// What `project_backward` writes of each Gaussian: [`GRADIENT_WORDS`] numbers.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub(super) struct GradientRow {
+    pub(super) mean: [f32; 3],
+    pub(super) opacity: f32,
+    pub(super) quat: [f32; 4],
+    pub(super) scale: [f32; 3],
+    pub(super) seen: f32,
+}
+
+const _: () = assert!(size_of::<GradientRow>() == 4 * GRADIENT_WORDS as usize, "its words");
 const _: () = assert!(size_of::<ViewRow>().is_multiple_of(16), "a uniform block");
 const _: () = assert!(size_of::<GaussianRow>() == 48, "three rows of four");
 const _: () = assert!(size_of::<FootprintRow>() == 32, "two rows of four");
@@ -230,12 +243,17 @@ impl DeviceLabels {
         // Uploads are whole words.
         let mut padded = entries.to_vec();
         padded.resize(entries.len().next_multiple_of(2), 0);
-        let entries = gpu.upload("bank entries", bytemuck::cast_slice(&padded))?;
+        let entries = gpu.upload("bank entries", bytemuck::cast_slice(&padded), None)?;
         Ok(Self { identity: source.identity(), entries, distinct })
     }
 }
 
 impl DeviceScene {
+    /// Whether these are the Gaussians of that shape.
+    pub(super) fn has_shape(&self, shape: u64) -> bool {
+        self.shape == shape
+    }
+
     /// What the stages read.
     pub(super) fn buffers(&self) -> SceneBuffers<'_> {
         let Self { gaussians, sh, sh_count, .. } = self;
@@ -247,8 +265,13 @@ impl DeviceScene {
         self.gaussians.size() + self.sh.size() + labels
     }
 
-    fn upload(gpu: &Gpu, source: &Gaussians) -> Result<Self> {
+    /// Uploads `source`, into the buffers of `old` where they have room.
+    /// Errors: `limit_exceeded` when it does not fit the adapter's limits or memory.
+    pub(super) fn upload(gpu: &Gpu, source: &Gaussians, old: Option<Self>) -> Result<Self> {
+        let (old_gaussians, old_sh) = old.map(|old| (old.gaussians, old.sh)).unzip();
         let rows: Vec<GaussianRow> = (0..source.len())
+            .into_par_iter()
+            .with_min_len(1 << 14)
             .map(|i| GaussianRow {
                 mean: source.means()[i],
                 opacity: source.opacities()[i],
@@ -261,8 +284,8 @@ impl DeviceScene {
             shape: source.shape_identity(),
             count: narrow("gaussians", source.len())?,
             sh_count: source.sh_count() as u32,
-            gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows))?,
-            sh: gpu.upload("sh", bytemuck::cast_slice(source.sh()))?,
+            gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows), old_gaussians)?,
+            sh: gpu.upload("sh", bytemuck::cast_slice(source.sh()), old_sh)?,
             labels: None,
         })
     }
@@ -305,11 +328,11 @@ impl SceneCache {
 
     /// Uploads a scene. Others leave to make room, the least recently drawn first.
     fn upload(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<DeviceScene> {
-        let scene = match DeviceScene::upload(gpu, source) {
+        let scene = match DeviceScene::upload(gpu, source, None) {
             // The other scenes may hold the memory: drop them and try once more.
             Err(error) if error.code() == ErrorCode::LimitExceeded && !self.scenes.is_empty() => {
                 self.clear(gpu);
-                DeviceScene::upload(gpu, source)?
+                DeviceScene::upload(gpu, source, None)?
             }
             other => other?,
         };

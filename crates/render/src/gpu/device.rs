@@ -288,9 +288,17 @@ impl Gpu {
         })
     }
 
-    /// A storage buffer that holds `bytes`.
-    pub(super) fn upload(&self, label: &'static str, bytes: &[u8]) -> Result<wgpu::Buffer> {
-        let buffer = self.create_buffer(label, bytes.len() as u64, STORAGE)?;
+    /// A storage buffer that holds `bytes`: `old`, where that has room for them.
+    pub(super) fn upload(
+        &self,
+        label: &'static str,
+        bytes: &[u8],
+        old: Option<wgpu::Buffer>,
+    ) -> Result<wgpu::Buffer> {
+        let buffer = match old.filter(|old| old.size() >= bytes.len() as u64) {
+            Some(old) => old,
+            None => self.create_buffer(label, bytes.len() as u64, STORAGE)?,
+        };
         self.scoped(label, || {
             for (chunk, bytes) in bytes.chunks(UPLOAD_CHUNK).enumerate() {
                 self.queue.write_buffer(&buffer, (chunk * UPLOAD_CHUNK) as u64, bytes);

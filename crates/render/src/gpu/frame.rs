@@ -14,7 +14,7 @@ use super::{
     profile::Marks,
     readback,
     recorder::Recorder,
-    scratch::{Need, Scratch, WEIGHT_SLOTS_MIN, first_cell},
+    scratch::{BatchBuffers, Need, Scratch, WEIGHT_SLOTS_MIN, first_cell},
 };
 use crate::{
     Background, DepthSteps, Frame, Labels, RenderRequest, Samples,
@@ -28,7 +28,7 @@ use crate::{
 /// Smallest room, in Gaussian-tile pairs.
 const ISECT_CAPACITY_MIN: u32 = 1 << 16;
 /// How often a band is drawn: the first try may lack room, the second knows what it needs.
-const ATTEMPTS_MAX: u32 = 3;
+pub(super) const ATTEMPTS_MAX: u32 = 3;
 /// Factor by which the room for weights grows when it is too small.
 const WEIGHT_SLOTS_GROWTH: u32 = 4;
 /// Bytes of a tile pair: key and Gaussian, stored twice.
@@ -38,12 +38,12 @@ const PLAN_BYTES: u64 = size_of::<PlanRow>() as u64;
 const PARALLEL_BYTES: usize = 4 << 20;
 
 /// Places of a band's pictures in the buffers of its batch: first words, or [`NO_PICTURE`].
-struct Layout {
-    color: u32,
+pub(super) struct Layout {
+    pub(super) color: u32,
     /// In f32. Where it is asked for in steps it is not read back: it lies behind all pictures that
     /// are.
-    depth: u32,
-    alpha: u32,
+    pub(super) depth: u32,
+    pub(super) alpha: u32,
     blend: u32,
     alpha_bytes: u32,
     mask: u32,
@@ -60,7 +60,7 @@ struct Layout {
 }
 
 impl Layout {
-    fn picture_bytes(&self) -> u64 {
+    pub(super) fn picture_bytes(&self) -> u64 {
         self.words * 4
     }
 
@@ -78,10 +78,10 @@ impl Layout {
 type Part<'a, 'b> = (&'a mut Drawing<'b>, &'a Layout, PlanRow, &'a [u8], &'a [u32]);
 
 /// Result of one view of a submission.
-struct Ended {
+pub(super) struct Ended {
     /// Counts of the device.
-    plan: PlanRow,
-    drawn: bool,
+    pub(super) plan: PlanRow,
+    pub(super) drawn: bool,
     /// New room of a pixel, in weights, if the old one was too small.
     more_slots: Option<u32>,
 }
@@ -139,7 +139,12 @@ impl<'a> Drawing<'a> {
         0..self.row.tiles_y
     }
 
-    fn layout(&self, rows: &Range<u32>, slots: u32) -> Layout {
+    /// Columns and rows of tiles.
+    pub(super) fn tiles(&self) -> [u32; 2] {
+        [self.row.tiles_x, self.row.tiles_y]
+    }
+
+    pub(super) fn layout(&self, rows: &Range<u32>, slots: u32) -> Layout {
         let pixel_rows = (rows.end * TILE_SIZE).min(self.row.height) - rows.start * TILE_SIZE;
         let pixels = u64::from(pixel_rows) * u64::from(self.row.width);
         let RenderRequest { kinds, labels, samples, .. } = self.request;
@@ -283,7 +288,8 @@ impl Tools<'_> {
             while attempts < ATTEMPTS_MAX && needed <= capacity_max {
                 let capacity = self.capacity(1);
                 let (alone, band) = (std::slice::from_mut(drawing), std::slice::from_ref(&rows));
-                let ended = self.attempt(alone, band, std::slice::from_ref(&layout), capacity)?;
+                let (ended, _) =
+                    self.attempt(alone, band, std::slice::from_ref(&layout), capacity)?;
                 if ended[0].drawn {
                     return Ok(());
                 }
@@ -318,7 +324,7 @@ impl Tools<'_> {
             return Ok(vec![false; drawings.len()]);
         }
         let bands: Vec<_> = drawings.iter().map(Drawing::whole).collect();
-        let ended = self.attempt(drawings, &bands, &layouts, capacity)?;
+        let (ended, _) = self.attempt(drawings, &bands, &layouts, capacity)?;
         Ok(ended.into_iter().map(|ended| ended.drawn).collect())
     }
 
@@ -332,27 +338,28 @@ impl Tools<'_> {
         }
     }
 
-    fn capacity_max(&self, views: u32) -> u32 {
+    pub(super) fn capacity_max(&self, views: u32) -> u32 {
         let bound = self.gpu.binding_bytes_max / (PAIR_BYTES * u64::from(views));
         self.isects_max.min(u32::try_from(bound).unwrap_or(u32::MAX))
     }
 
     /// Room of each of `views` views, in tile pairs.
-    fn capacity(&self, views: u32) -> u32 {
+    pub(super) fn capacity(&self, views: u32) -> u32 {
         let guess = self.scene.count.saturating_mul(4).max(ISECT_CAPACITY_MIN);
         // A quarter more than the last view needed.
         let seen = self.scratch.isects.saturating_add(self.scratch.isects / 4);
         guess.max(seen).min(self.capacity_max(views))
     }
 
-    /// Runs all stages over one band of each view, with room for `capacity` pairs in each.
-    fn attempt(
+    /// Runs all stages over one band of each view, with room for `capacity` pairs in each. Also the
+    /// buffers, in which everything is left.
+    pub(super) fn attempt(
         &mut self,
         drawings: &mut [Drawing<'_>],
         bands: &[Range<u32>],
         layouts: &[Layout],
         capacity: u32,
-    ) -> Result<Vec<Ended>> {
+    ) -> Result<(Vec<Ended>, BatchBuffers)> {
         let views = drawings.len() as u32;
         let mut rows = Vec::with_capacity(drawings.len());
         let mut grid = [0; 2];
@@ -417,9 +424,8 @@ impl Tools<'_> {
         let (picture_bytes, slot_bytes) = (words * 4, slot_words * 4);
         let staging_bytes = plan_bytes + picture_bytes + slot_bytes;
         let (gpu, scene) = (self.gpu, self.scene);
-        let Some(kinds) = drawings.first().map(|one| RasterKinds::from(one.request)) else {
-            return Ok(Vec::new());
-        };
+        // All have the same.
+        let kinds = RasterKinds::from(drawings[0].request);
         let shades = kinds.color && !self.kernels.flat(scene.sh_count);
         let room = self.scratch.room(
             gpu,
@@ -496,7 +502,7 @@ impl Tools<'_> {
         self.scratch.isects = ended.iter().map(|ended| ended.plan.needed).max().unwrap_or(0);
         let more_slots = ended.iter().filter_map(|ended| ended.more_slots).max();
         self.scratch.weight_slots = more_slots.unwrap_or(self.scratch.weight_slots);
-        Ok(ended)
+        Ok((ended, room))
     }
 }
 

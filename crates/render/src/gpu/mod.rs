@@ -8,6 +8,7 @@
 //! are drawn on a new one.
 
 mod adapter;
+mod backward;
 mod buffers;
 mod device;
 mod frame;
@@ -21,7 +22,10 @@ mod scratch;
 
 use self::adapter::Adapter;
 use super::{
-    DeviceTimes, Frame, RenderRequest, Renderer, RendererOptions, select::AdapterReport, view::View,
+    DeviceTimes, Frame, RenderRequest, Renderer, RendererOptions,
+    backward::{DifferentiableRenderer, FrameGradients, Gradients, drawn},
+    select::AdapterReport,
+    view::View,
 };
 use crate::{
     error::{ErrorCode, Result},
@@ -123,5 +127,37 @@ impl Renderer for GpuRenderer {
             return Ok(None);
         }
         self.adapter_for(gaussians).device_times(gaussians, request)
+    }
+}
+
+impl DifferentiableRenderer for GpuRenderer {
+    fn backward(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
+        gradients: &mut Gradients,
+    ) -> Result<Frame> {
+        let request = drawn(request);
+        if gaussians.is_empty() {
+            let frame =
+                crate::cpu::background(&View::new(gaussians.origin(), &request)?, &request)?;
+            loss(&frame)?.check_of(&frame)?;
+            gradients.clear(0, gaussians.sh_count());
+            return Ok(frame);
+        }
+        self.adapter_for(gaussians).backward(gaussians, &request, loss, gradients)
+    }
+
+    fn backward_times(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        by: &FrameGradients,
+    ) -> Result<Option<DeviceTimes>> {
+        if gaussians.is_empty() {
+            return Ok(None);
+        }
+        self.adapter_for(gaussians).backward_times(gaussians, &drawn(request), by)
     }
 }

@@ -6,7 +6,7 @@ use parking_lot::Mutex;
 
 use super::device::Gpu;
 use crate::{
-    Labels, RenderRequest, Samples,
+    Kinds, Labels, RenderRequest, Samples,
     constants::shared,
     error::{Error, Result},
     scene::Backdrop,
@@ -30,6 +30,10 @@ shared! { pub(super) u32;
     LEVELS_RGB = 1;
     /// Colour and alpha in four bytes.
     LEVELS_RGBA = 2;
+    /// Sums that a tile gives for each of its pairs in the backward pass.
+    PAIR_SUMS = 10;
+    /// Derivatives of a Gaussian but for its harmonics, and whether it is seen.
+    GRADIENT_WORDS = 12;
     /// Cells of a backdrop, across.
     BACKDROP_WIDTH = Backdrop::WIDTH as u32;
     /// Cells of a backdrop, down.
@@ -76,16 +80,26 @@ macro_rules! shader {
 }
 
 /// Every shader, in the order of the stages.
-pub const SHADERS: [Shader; 9] = [
+pub const SHADERS: [Shader; 12] = [
     shader!("project", "project", "camera", "tiles"),
     shader!("shade", "shade", "sh"),
     shader!("prefix_sum", "prefix_sum", "sum_before"),
     shader!("emit_isects", "emit_isects", "tiles"),
     shader!("tile_sort", "tile_sort"),
-    shader!("rasterize", "rasterize", "backdrop", "labels_none"),
-    shader!("rasterize_blend", "rasterize", "backdrop", "labels_entries", "labels_blend"),
-    shader!("rasterize_weights", "rasterize", "backdrop", "labels_entries", "labels_weights"),
+    shader!("rasterize", "rasterize", "parts", "backdrop", "labels_none"),
+    shader!("rasterize_blend", "rasterize", "parts", "backdrop", "labels_entries", "labels_blend"),
+    shader!(
+        "rasterize_weights",
+        "rasterize",
+        "parts",
+        "backdrop",
+        "labels_entries",
+        "labels_weights"
+    ),
     shader!("depth_steps", "depth_steps"),
+    shader!("rasterize_backward", "rasterize_backward", "parts", "backdrop"),
+    shader!("project_backward", "project_backward", "camera", "tiles"),
+    shader!("shade_backward", "shade_backward", "camera", "sh"),
 ];
 
 /// Kernels, in the order of the stages.
@@ -99,6 +113,10 @@ pub(super) enum Kernel {
     Rasterize(RasterKinds),
     Farthest,
     DepthSteps,
+    /// With the pictures that the loss depends on.
+    RasterizeBackward(Kinds),
+    ProjectBackward,
+    ShadeBackward,
 }
 
 /// What a kernel of rasterize gives.
@@ -153,6 +171,9 @@ impl Kernel {
             Self::TileSort => ("tile_sort", "tile_sort", ["main", "serial"]),
             Self::Farthest => ("farthest", "depth_steps", ["farthest"; 2]),
             Self::DepthSteps => ("depth_steps", "depth_steps", ["main"; 2]),
+            Self::RasterizeBackward(_) => ("rasterize_backward", "rasterize_backward", ["main"; 2]),
+            Self::ProjectBackward => ("project_backward", "project_backward", ["main"; 2]),
+            Self::ShadeBackward => ("shade_backward", "shade_backward", ["main"; 2]),
             Self::Rasterize(kinds) => {
                 let shader = match kinds.labels {
                     RasterLabels::None => "rasterize",
@@ -245,10 +266,18 @@ impl Kernels {
             return Err(Error::internal(format!("{name}: there is no shader {shader}")));
         };
         let mut constants = Vec::new();
-        if let Kernel::Rasterize(RasterKinds { color, depth, bytes, .. }) = kernel {
-            let with = [("WITH_COLOR", color), ("WITH_DEPTH", depth), ("WITH_BYTES", bytes)];
+        let with = match kernel {
+            Kernel::Rasterize(RasterKinds { color, depth, bytes, .. }) => {
+                Some([("WITH_COLOR", color), ("WITH_DEPTH", depth), ("WITH_BYTES", bytes)])
+            }
+            Kernel::RasterizeBackward(Kinds { color, depth, alpha }) => {
+                Some([("BY_COLOR", color), ("BY_DEPTH", depth), ("BY_ALPHA", alpha)])
+            }
+            _ => None,
+        };
+        if let Some(with) = with {
             constants.extend(with.map(|(name, with)| (name, f64::from(u8::from(with)))));
-            // Pixels that an invocation blends.
+            // Pixels that an invocation works for.
             constants.push(("PIXELS", if self.serial { 8.0 } else { 1.0 }));
         }
         // The shader does the work that its constant names, if it knows that work.

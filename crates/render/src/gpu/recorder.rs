@@ -8,9 +8,12 @@ use super::{
     device::Gpu,
     pipelines::{GROUPS_X_MAX, Kernel, Kernels, RasterKinds, RasterLabels, WORKGROUP_SIZE},
     profile::Marks,
-    scratch::BatchBuffers,
+    scratch::{BackwardBuffers, BatchBuffers},
 };
-use crate::error::{Error, Result};
+use crate::{
+    Kinds,
+    error::{Error, Result},
+};
 
 /// Number of bind groups kept: those of a few frames.
 const BINDINGS_MAX: usize = 256;
@@ -234,15 +237,13 @@ impl<'a> Recorder<'a> {
         tiles: [u32; 2],
     ) {
         let room = self.room;
-        let flat = self.kernels.flat(scene.sh_count);
-        let colors = if flat { scene.sh } else { &room.colors };
         let mut buffers = vec![
             (0, &room.views),
             (1, &room.footprints),
             (2, &room.pairs),
             (3, &room.lists),
             (4, &room.pictures),
-            (5, colors),
+            (5, self.colors(scene)),
             (8, &room.backdrops),
         ];
         let inputs = match kinds.labels {
@@ -254,6 +255,55 @@ impl<'a> Recorder<'a> {
             buffers.extend([(6, entries), (7, rows)]);
         }
         self.dispatch(Kernel::Rasterize(kinds), &buffers, &Groups::Grid(tiles[0], tiles[1]));
+    }
+
+    /// Where rasterize finds colours.
+    fn colors<'b>(&self, scene: SceneBuffers<'b>) -> &'b wgpu::Buffer
+    where
+        'a: 'b,
+    {
+        if self.kernels.flat(scene.sh_count) { scene.sh } else { &self.room.colors }
+    }
+
+    /// The backward pass of one whole view of `tiles` (columns, rows), of which all stages so far
+    /// have left their buffers: of the pictures `kinds`.
+    pub(super) fn backward(
+        &mut self,
+        scene: SceneBuffers<'_>,
+        kinds: Kinds,
+        backward: &BackwardBuffers,
+        tiles: [u32; 2],
+    ) {
+        let room = self.room;
+        let buffers = [
+            (0, &room.views),
+            (1, &room.footprints),
+            (2, &room.pairs),
+            (3, &room.lists),
+            (4, &room.pictures),
+            (5, self.colors(scene)),
+            (6, &backward.by_pictures),
+            (7, &backward.sums),
+            (8, &room.backdrops),
+        ];
+        let groups = Groups::Grid(tiles[0], tiles[1]);
+        self.dispatch(Kernel::RasterizeBackward(kinds), &buffers, &groups);
+        let groups = Groups::Row(self.count.div_ceil(WORKGROUP_SIZE));
+        let buffers = [
+            (0, &room.views),
+            (1, scene.gaussians),
+            (2, &room.footprints),
+            (3, &room.touched),
+            (4, &room.lists),
+            (5, &room.pairs),
+            (6, &backward.sums),
+            (7, &room.sources),
+            (8, &backward.gradients),
+        ];
+        self.dispatch(Kernel::ProjectBackward, &buffers, &groups);
+        let buffers =
+            [(0, &room.views), (1, scene.gaussians), (2, scene.sh), (3, &backward.gradients)];
+        self.dispatch(Kernel::ShadeBackward, &buffers, &groups);
     }
 
     /// Stage 7 over pictures of at most `words` words.

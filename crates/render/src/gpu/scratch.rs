@@ -5,7 +5,7 @@ use std::{collections::HashMap, sync::Arc};
 use wgpu::BufferUsages;
 
 use super::{
-    buffers::{FootprintRow, PlanRow, ViewRow},
+    buffers::{DeviceScene, FootprintRow, PlanRow, ViewRow},
     device::{Gpu, STORAGE},
     pipelines::{BACKDROP_HEIGHT, BACKDROP_WIDTH, VIEWS_MAX},
     recorder::Bindings,
@@ -62,6 +62,18 @@ pub(super) struct BatchBuffers {
     pub(super) staging: wgpu::Buffer,
 }
 
+/// What a backward pass has beside the buffers of its frame.
+#[derive(Clone, Debug)]
+pub(super) struct BackwardBuffers {
+    /// What the loss says of the pictures, in their places.
+    pub(super) by_pictures: wgpu::Buffer,
+    /// Of each tile pair.
+    pub(super) sums: wgpu::Buffer,
+    /// Of each Gaussian, then of the harmonics.
+    pub(super) gradients: wgpu::Buffer,
+    pub(super) staging: wgpu::Buffer,
+}
+
 /// Buffers of earlier batches, and what the last views needed.
 #[derive(Debug)]
 pub(super) struct Scratch {
@@ -74,6 +86,9 @@ pub(super) struct Scratch {
     pub(super) weight_slots: u32,
     /// Those on the device, in their order.
     pub(super) backdrops: Vec<Arc<Backdrop>>,
+    /// Gaussians of the last backward pass: a refinement brings others with each step, which take
+    /// their place.
+    pub(super) learnt: Option<DeviceScene>,
 }
 
 impl Default for Scratch {
@@ -84,6 +99,7 @@ impl Default for Scratch {
             isects: 0,
             weight_slots: WEIGHT_SLOTS_MIN,
             backdrops: Vec::new(),
+            learnt: None,
         }
     }
 }
@@ -118,6 +134,22 @@ impl Scratch {
             table: storage("label table", need.table_bytes)?,
             slots: storage("weight slots", need.slot_bytes)?,
             staging,
+        })
+    }
+
+    /// Buffers of a backward pass: bytes of the pictures, of the sums and of the derivatives.
+    /// Errors: `limit_exceeded` when the adapter cannot hold or bind as much.
+    pub(super) fn backward_room(
+        &mut self,
+        gpu: &Gpu,
+        [picture_bytes, sum_bytes, gradient_bytes]: [u64; 3],
+    ) -> Result<BackwardBuffers> {
+        let staging = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
+        Ok(BackwardBuffers {
+            by_pictures: self.sized(gpu, "loss", STORAGE, picture_bytes)?,
+            sums: self.sized(gpu, "sums of tile pairs", STORAGE, sum_bytes)?,
+            gradients: self.sized(gpu, "gradients", STORAGE, gradient_bytes)?,
+            staging: self.sized(gpu, "staging", staging, gradient_bytes)?,
         })
     }
 

@@ -1,19 +1,25 @@
 //! The backward pass: the oracle against finite differences of the forward oracle, the CPU kernel
-//! against the oracle.
+//! and the shaders against the oracle.
 
 use std::sync::Arc;
 
 use segsplat_core::scene::{Backdrop, Gaussians, RawGaussians, SourcePixel};
 use segsplat_render::{
     Background, Kinds, RenderRequest, Source,
-    backward::{DifferentiableRenderer as _, FrameGradients, Gradients, oracle as backward},
+    backward::{DifferentiableRenderer, FrameGradients, Gradients, oracle as backward},
     cpu::{CpuRenderer, lanes::Width},
     oracle,
     switches::Switches,
 };
-use segsplat_testing::scenes::{Random, camera, checked, cloud, push, request, two_views};
+use segsplat_testing::{
+    compare::gradient_errors,
+    scenes::{Random, camera, checked, cloud, push, request, two_views},
+};
 
-use crate::fuzz::{environment, poisoned};
+use crate::{
+    common::{both_kernels, open},
+    fuzz::{environment, poisoned},
+};
 
 /// A loss that is linear in every number of the frame.
 fn linear(pixels: usize, seed: u64) -> FrameGradients {
@@ -210,38 +216,22 @@ fn the_oracle_agrees_with_finite_differences() {
     }
 }
 
-/// Relative errors of all numbers that are over 1e-6 of the largest of their kind, sorted.
-fn errors(got: &Gradients, want: &Gradients<f64>) -> Vec<f64> {
-    fn flat<const N: usize>(got: &[[f32; N]], want: &[[f64; N]]) -> Vec<(f64, f64)> {
-        got.iter().flatten().map(|&v| f64::from(v)).zip(want.iter().flatten().copied()).collect()
-    }
-    let opacities = got.opacities.iter().map(|&v| f64::from(v)).zip(want.opacities.iter().copied());
-    let kinds = [
-        flat(&got.means, &want.means),
-        flat(&got.quats, &want.quats),
-        flat(&got.scales, &want.scales),
-        opacities.collect(),
-        flat(&got.sh, &want.sh),
-    ];
-    let mut errors = Vec::new();
-    for kind in kinds {
-        let most = kind.iter().fold(0.0_f64, |most, (_, want)| most.max(want.abs()));
-        let counted = kind.iter().filter(|(_, want)| want.abs() > 1e-6 * most);
-        errors.extend(counted.map(|(got, want)| (got - want).abs() / want.abs()));
-    }
-    errors.sort_by(f64::total_cmp);
-    errors
-}
-
-/// The kernel against the oracle on pixels that are no cliff.
-fn judge(name: &str, cpu: &CpuRenderer, gaussians: &Gaussians, request: &RenderRequest) {
+/// A renderer against the oracle on pixels that are no cliff.
+fn judge(
+    name: &str,
+    renderer: &dyn DifferentiableRenderer,
+    gaussians: &Gaussians,
+    request: &RenderRequest,
+) {
     let truth = oracle::render(gaussians, request).expect("the truth");
     let keep: Vec<bool> = truth.iter().map(|pixel| !pixel.cliff.any()).collect();
     let loss = only(&linear(truth.len(), 5), &keep);
     let want = backward::gradients(gaussians, request, &loss).expect("the truth");
     let mut got = Gradients::default();
-    cpu.backward(gaussians, request, &mut |_| Ok(loss.clone()), &mut got).expect("gradients");
-    let errors = errors(&got, &want);
+    renderer.backward(gaussians, request, &mut |_| Ok(loss.clone()), &mut got).expect("gradients");
+    let mut counts = want.opacities.iter().zip(&got.seen).filter(|(by, _)| **by != 0.0);
+    assert!(counts.all(|(_, seen)| *seen), "{name}: what counts is seen");
+    let errors = gradient_errors(&got, &want);
     let at = |share: f64| errors[(share * (errors.len() - 1) as f64) as usize];
     println!(
         "{name}: {} Gaussians, {} numbers: relative error median {:.1e}, 99 % {:.1e}, max {:.1e}",
@@ -255,11 +245,10 @@ fn judge(name: &str, cpu: &CpuRenderer, gaussians: &Gaussians, request: &RenderR
     assert!(at(0.99) <= 1e-2, "{name}: 99 % {:.1e}", at(0.99));
 }
 
-#[test]
-fn the_kernel_agrees_with_the_oracle() {
-    let cpu = CpuRenderer::new(2).expect("two threads");
+/// Views in which a backward pass does all that it can.
+fn judge_all(renderer: &dyn DifferentiableRenderer) {
     let (pair, middle) = two_views(32, 1);
-    judge("two views", &cpu, &pair, &RenderRequest { kinds: Kinds::ALL, ..request(middle) });
+    judge("two views", renderer, &pair, &RenderRequest { kinds: Kinds::ALL, ..request(middle) });
     for (name, sh_degree, change) in [
         ("cloud", 0, (|_| ()) as fn(&mut RenderRequest)),
         ("sky, degree 2", 2, |request| request.background = sky()),
@@ -268,14 +257,148 @@ fn the_kernel_agrees_with_the_oracle() {
     ] {
         let mut request = small(70, 45);
         change(&mut request);
-        judge(name, &cpu, &cloud(3_000, sh_degree, 8), &request);
+        judge(name, renderer, &cloud(3_000, sh_degree, 8), &request);
     }
     let mut raw = cloud(2_000, 0, 9).into_raw();
     for (i, source) in raw.source.iter_mut().enumerate() {
         *source = SourcePixel { view: (i % 3) as u16, ..*source };
     }
     let request = RenderRequest { sources: sources(), ..small(64, 48) };
-    judge("layers and magnification", &cpu, &checked(raw), &request);
+    judge("layers and magnification", renderer, &checked(raw), &request);
+    // Most of 130 tiles each.
+    let large = fog(200, 1.2, [0.4, 0.05]);
+    judge("large ones", renderer, &large, &small(200, 150));
+    // Lists of two and three runs of the sort, which end in either half of the pairs, and more
+    // parts met than a workgroup holds at once.
+    for count in [3_000, 5_000] {
+        judge("one tile", renderer, &fog(count, 0.4, [0.6, 0.005]), &small(16, 16));
+    }
+}
+
+/// `count` Gaussians of about `size` in front of the camera, within `spread` of its axis, of about
+/// `opacity`.
+fn fog(count: usize, size: f32, [spread, opacity]: [f32; 2]) -> Gaussians {
+    let mut random = Random(91);
+    let mut raw = RawGaussians::default();
+    for _ in 0..count {
+        let depth = random.range(2.0, 6.0);
+        let mean = [random.range(-spread, spread) * depth, random.range(-spread, spread) * depth];
+        let scales = [(); 3].map(|()| size * random.range(0.3, 1.0));
+        let color = [(); 3].map(|()| random.range(-1.0, 1.2));
+        let opacity = opacity * random.range(0.9, 1.9);
+        push(&mut raw, [mean[0], mean[1], depth], random.quat(), scales, opacity, &[color]);
+    }
+    checked(raw)
+}
+
+#[test]
+fn the_kernel_agrees_with_the_oracle() {
+    judge_all(&CpuRenderer::new(2).expect("two threads"));
+}
+
+#[test]
+fn the_shaders_agree_with_the_oracle() {
+    for gpu in both_kernels() {
+        judge_all(gpu);
+    }
+}
+
+#[test]
+fn the_shaders_agree_with_the_kernel_whatever_the_loss_depends_on() {
+    let cpu = CpuRenderer::new(2).expect("two threads");
+    let gaussians = cloud(2_000, 1, 12);
+    let request = RenderRequest { background: sky(), ..small(60, 50) };
+    let truth = oracle::render(&gaussians, &request).expect("the truth");
+    let keep: Vec<bool> = truth.iter().map(|pixel| !pixel.cliff.any()).collect();
+    let all = only(&linear(keep.len(), 8), &keep);
+    let none = FrameGradients::default();
+    let color = FrameGradients { color: all.color.clone(), ..none.clone() };
+    let depth = FrameGradients { depth: all.depth.clone(), ..none.clone() };
+    let alpha = FrameGradients { alpha: all.alpha, ..none.clone() };
+    for gpu in both_kernels() {
+        for (name, loss) in
+            [("none", &none), ("colour", &color), ("depth", &depth), ("alpha", &alpha)]
+        {
+            let of = |renderer: &dyn DifferentiableRenderer| {
+                let mut found = Gradients::default();
+                let loss = &mut |_: &_| Ok(loss.clone());
+                let frame = renderer.backward(&gaussians, &request, loss, &mut found);
+                (found, frame.expect("a pass"))
+            };
+            let ((got, shown), (want, seen)) = (of(gpu), of(&cpu));
+            let near = shown
+                .color
+                .unwrap()
+                .iter()
+                .flatten()
+                .zip(seen.color.unwrap().as_flattened())
+                .filter(|(a, b)| (*a - *b).abs() < 1e-3)
+                .count();
+            assert!(near * 100 > 99 * 3 * keep.len(), "{name}: the frame, {near} numbers");
+            let errors = gradient_errors(&got, &want);
+            if name == "none" {
+                assert!(errors.is_empty() && got.sh.iter().flatten().all(|v| *v == 0.0));
+                continue;
+            }
+            let (median, most) = (errors[errors.len() / 2], errors[errors.len() * 99 / 100]);
+            println!("{name}: {} numbers, {median:.1e}, 99 % {most:.1e}", errors.len());
+            // Both have errors of their own.
+            assert!(median <= 2e-4 && most <= 2e-2, "{name}: {median:.1e}, 99 % {most:.1e}");
+        }
+    }
+}
+
+#[test]
+fn the_shaders_give_the_same_bits_whatever_was_before() {
+    let (one, other) = (cloud(3_000, 1, 30), cloud(9_000, 2, 31));
+    for gpu in both_kernels() {
+        let of = |gaussians: &Gaussians, width: u32, height: u32| {
+            let loss = linear((width * height) as usize, 6);
+            let request = RenderRequest { background: sky(), ..small(width, height) };
+            let mut found = Gradients::default();
+            gpu.backward(gaussians, &request, &mut |_| Ok(loss.clone()), &mut found).unwrap();
+            found
+        };
+        let first = of(&one, 90, 70);
+        assert!(first == of(&one, 90, 70), "twice the same");
+        let _larger = of(&other, 120, 90);
+        assert!(first == of(&one, 90, 70), "after others");
+    }
+}
+
+#[test]
+fn a_device_lost_between_frame_and_gradients_is_opened_again() {
+    let Some(gpu) = open(|_| {}) else { return };
+    let (gaussians, loss) = (cloud(500, 0, 3), linear(40 * 30, 6));
+    let (mut asked, mut found) = (0, Gradients::default());
+    let mut lossy = |_: &_| {
+        asked += 1;
+        if asked == 1 {
+            gpu.internals().lose_devices();
+        }
+        Ok(loss.clone())
+    };
+    gpu.backward(&gaussians, &small(40, 30), &mut lossy, &mut found).expect("on a new device");
+    assert_eq!(asked, 2, "of an equal frame");
+    let mut again = Gradients::default();
+    gpu.backward(&gaussians, &small(40, 30), &mut |_| Ok(loss.clone()), &mut again).unwrap();
+    assert!(found == again, "the same numbers");
+}
+
+#[test]
+fn no_gaussians_have_no_gradients() {
+    let empty = checked(RawGaussians::default());
+    let renderers: Vec<&dyn DifferentiableRenderer> =
+        both_kernels().map(|gpu| gpu as &dyn DifferentiableRenderer).collect();
+    let cpu = CpuRenderer::new(1).expect("a thread");
+    for renderer in renderers.into_iter().chain([&cpu as &dyn DifferentiableRenderer]) {
+        let (loss, mut found) = (linear(12, 6), Gradients::default());
+        found.clear(3, 1);
+        let frame =
+            renderer.backward(&empty, &small(4, 3), &mut |_| Ok(loss.clone()), &mut found).unwrap();
+        assert_eq!(frame.color.map(|color| color.len()), Some(12), "the background");
+        assert!(found.means.is_empty() && found.seen.is_empty(), "nothing is left");
+    }
 }
 
 #[test]
@@ -306,22 +429,45 @@ fn the_kernel_is_the_same_for_any_threads_and_near_for_any_lanes() {
 
 #[test]
 fn a_view_of_more_pairs_than_are_held_is_refused() {
-    let switches = Switches { isects_max: Some(20), ..Switches::default() };
-    let cpu = CpuRenderer::with_switches(1, &switches).expect("a thread");
+    let switches = || Switches { isects_max: Some(20), ..Switches::default() };
+    let few = CpuRenderer::with_switches(1, &switches()).expect("a thread");
+    check_refusals(&few, &CpuRenderer::new(1).expect("a thread"));
+    if let Some(few) = open(|options| options.switches.isects_max = Some(20)) {
+        both_kernels().take(1).for_each(|gpu| check_refusals(&few, gpu));
+    }
+}
+
+/// `few` holds 20 pairs.
+fn check_refusals(few: &dyn DifferentiableRenderer, renderer: &dyn DifferentiableRenderer) {
     let loss = linear(90 * 70, 6);
     let (scene, mut found) = (cloud(30, 0, 1), Gradients::default());
-    let told = cpu.backward(&scene, &small(90, 70), &mut |_| Ok(loss.clone()), &mut found);
+    let told = few.backward(&scene, &small(90, 70), &mut |_| Ok(loss.clone()), &mut found);
     assert!(told.expect_err("too many pairs").message().contains("20"), "names the bound");
     let none = &mut |_: &_| Ok(linear(3, 1));
-    let told = CpuRenderer::new(1).unwrap().backward(&scene, &small(90, 70), none, &mut found);
+    let told = renderer.backward(&scene, &small(90, 70), none, &mut found);
     assert!(told.expect_err("another size").message().contains("6300"), "names the size");
+    let unasked = RenderRequest { kinds: Kinds::COLOR, ..small(90, 70) };
+    let told = renderer.backward(&scene, &unasked, &mut |_| Ok(loss.clone()), &mut found);
+    assert!(told.expect_err("no depth").message().contains("depth"), "names the picture");
 }
 
 #[test]
 fn poisoned_gaussians_never_make_a_bad_gradient() {
     let cpu = CpuRenderer::new(2).expect("two threads");
-    let (seed, scenes) = (environment("FUZZ_SEED", 41), environment("FUZZ_SCENES", 300));
-    let most = environment("FUZZ_GAUSSIANS", 80);
+    fuzz(&cpu, environment("FUZZ_SCENES", 300), environment("FUZZ_GAUSSIANS", 80));
+}
+
+/// The long form: `FUZZ_SCENES=1000 FUZZ_GAUSSIANS=2001`, about 10^6 Gaussians for each form of the
+/// kernels.
+#[test]
+fn poisoned_gaussians_never_make_a_bad_gradient_on_a_gpu() {
+    for gpu in both_kernels() {
+        fuzz(gpu, environment("FUZZ_SCENES", 40), environment("FUZZ_GAUSSIANS", 80));
+    }
+}
+
+fn fuzz(renderer: &dyn DifferentiableRenderer, scenes: u64, most: u64) {
+    let seed = environment("FUZZ_SEED", 41);
     let (mut fuzzed, mut told) = (0, 0);
     let mut found = Gradients::default();
     for iteration in 0..scenes {
@@ -335,7 +481,9 @@ fn poisoned_gaussians_never_make_a_bad_gradient() {
         let antialiased = random.bits().is_multiple_of(2);
         let request = RenderRequest { near, antialiased, ..small(width, height) };
         let loss = linear((width * height) as usize, iteration);
-        cpu.backward(&gaussians, &request, &mut |_| Ok(loss.clone()), &mut found).expect("a pass");
+        renderer
+            .backward(&gaussians, &request, &mut |_| Ok(loss.clone()), &mut found)
+            .expect("a pass");
         let numbers = found.means.iter().flatten().chain(found.quats.iter().flatten());
         let numbers = numbers.chain(found.scales.iter().flatten()).chain(&found.opacities);
         for value in numbers.chain(found.sh.iter().flatten()) {

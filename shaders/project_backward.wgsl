@@ -1,0 +1,231 @@
+// Backward pass of stage 1: each Gaussian adds up what the tiles say of it, and goes back through
+// the projection: Σ = M Mᵀ + blur, M = J W R diag(scales).
+// CPU: crates/render/src/cpu/backward.rs (in f64)
+//
+// A Gaussian finds its pairs again as they were emitted: in the list of each tile that it touches,
+// which is sorted, in the order of the tiles.
+
+@group(0) @binding(1) var<storage, read> gaussians: array<Gaussian>;
+@group(0) @binding(2) var<storage, read> footprints: array<Footprint>;
+// Tiles touched.
+@group(0) @binding(3) var<storage, read> tiles: array<u32>;
+@group(0) @binding(4) var<storage, read> lists: array<vec2<u32>>;
+// (depth key, Gaussian)
+@group(0) @binding(5) var<storage, read> pairs: array<vec2<u32>>;
+// [capacity, PAIR_SUMS] of rasterize_backward.
+@group(0) @binding(6) var<storage, read> sums: array<f32>;
+@group(0) @binding(7) var<storage, read> sources: array<Source>;
+// [N, GRADIENT_WORDS] by mean, opacity, quaternion, scales, and whether it is seen; then [N, K, 3]
+// by the harmonics. Here the first three of K * 3 are by the colour: shade_backward goes on with
+// them.
+@group(0) @binding(8) var<storage, read_write> gradients: array<f32>;
+
+var<private> found: array<f32, PAIR_SUMS>;
+// Sums of each invocation, and of 16 each.
+var<workgroup> shares: array<f32, 2560>;
+var<workgroup> shares_of_16: array<f32, 160>;
+
+fn visit(tile: vec2<u32>, footprint: Footprint, id: u32) {
+    let list = lists[number_of(tile)];
+    let key = bitcast<u32>(footprint.depth);
+    var low = list.x;
+    var high = list.y;
+    while low < high {
+        let middle = low + (high - low) / 2u;
+        let pair = pairs[middle];
+        if pair.x < key || (pair.x == key && pair.y < id) {
+            low = middle + 1u;
+        } else {
+            high = middle;
+        }
+    }
+    if low < list.y && pairs[low].y == id {
+        let at = low % views[which].isect_capacity * PAIR_SUMS;
+        for (var k = 0u; k < PAIR_SUMS; k++) {
+            found[k] += sums[at + k];
+        }
+    }
+}
+
+// What one number of a Gaussian says: 0 where f32 does not hold it.
+fn put(at: u32, value: f32) {
+    gradients[at] = select(0.0, value, is_finite(value));
+}
+
+// The derivatives by Gaussian i, of `found`.
+fn back(i: u32, footprint: Footprint) {
+    let gaussian = gaussians[i];
+    // dpower/dplace = a u + b v, for a step of the pixel against the centre.
+    let a = vec2(2.0, -2.0 * footprint.conic_shear) * footprint.conic_x;
+    let b = 2.0 * footprint.conic_y;
+    let by_place = -(a * found[1] + vec2(0.0, b * found[2]));
+    var by_xx = -0.5 * a.x * a.x * found[3];
+    var by_xy = -0.5 * a.x * (a.y * found[3] + b * found[4]);
+    var by_yy = -0.5 * (a.y * a.y * found[3] + 2.0 * a.y * b * found[4] + b * b * found[5]);
+
+    let t = camera_point(gaussian.mean);
+    let per_z = 1.0 / t.z;
+    let focal = views[which].focal * per_z;
+    let slope = t.xy * per_z;
+    let bounded = clamp(slope, views[which].slope_min, views[which].slope_max);
+    // The variance that the blur lost, and its derivatives by the centre and by t.z.
+    var lost = 0.0;
+    var lost_by_mean = vec3(0.0);
+    var lost_by_z = 0.0;
+    if gaussian.source < views[which].source_count {
+        let source = sources[views[which].source_start + gaussian.source];
+        let width = max(dot(gaussian.mean - source.center, source.axis), 0.0) * source.scale;
+        let least = t.z / views[which].own_focal;
+        if width > least {
+            lost = BLUR_PX2 * (width - least) * (width + least);
+            lost_by_mean = source.axis * (2.0 * BLUR_PX2 * width * source.scale);
+            lost_by_z = -2.0 * BLUR_PX2 * least / views[which].own_focal;
+        }
+    }
+    let scale = sqrt(gaussian.scale * gaussian.scale + lost);
+    let rotation = rotation_of(gaussian.quat);
+    let turned_x = views[which].rotation_x.xyz * rotation;
+    let turned_y = views[which].rotation_y.xyz * rotation;
+    let turned_z = views[which].rotation_z.xyz * rotation;
+    // Rows of J W R, then of M.
+    let sharp_x = (turned_x - turned_z * bounded.x) * focal.x;
+    let sharp_y = (turned_y - turned_z * bounded.y) * focal.y;
+    let m_x = sharp_x * scale;
+    let m_y = sharp_y * scale;
+    var opacity = -found[0] / footprint.opacity;
+    if views[which].antialiased != 0u {
+        let xx = dot(m_x, m_x);
+        let xy = dot(m_x, m_y);
+        let yy = dot(m_y, m_y);
+        let normal = cross(m_x, m_y);
+        let sharp_det = dot(normal, normal);
+        let det = sharp_det + BLUR_PX2 * (xx + yy) + BLUR_PX2 * BLUR_PX2;
+        let share = sqrt(sharp_det / det);
+        if sharp_det > 0.0 {
+            let half = 0.5 * opacity * gaussian.opacity;
+            let narrow = half / (sqrt(sharp_det) * sqrt(det));
+            let wide = half * share / det;
+            by_xx += narrow * yy - wide * (yy + BLUR_PX2);
+            by_xy -= (narrow - wide) * xy;
+            by_yy += narrow * xx - wide * (xx + BLUR_PX2);
+        }
+        opacity *= share;
+    }
+    let by_m_x = 2.0 * (by_xx * m_x + by_xy * m_y);
+    let by_m_y = 2.0 * (by_xy * m_x + by_yy * m_y);
+    let by_scale = by_m_x * sharp_x + by_m_y * sharp_y;
+    let by_sharp_x = by_m_x * scale;
+    let by_sharp_y = by_m_y * scale;
+    // J W R: its rows are rows of W R times the focal length over z, less the slope's share.
+    let by_x = by_sharp_x * focal.x;
+    let by_y = by_sharp_y * focal.y;
+    let by_z = -(by_x * bounded.x + by_y * bounded.y);
+    let by_slope = vec2(-dot(by_x, turned_z), -dot(by_y, turned_z));
+    let by_lost = dot(by_scale, 0.5 / scale);
+    let free = select(vec2(0.0), by_slope * per_z, bounded == slope);
+    let by_t = by_place * focal + free;
+    let by_depth = found[9] + by_lost * lost_by_z - dot(by_t, slope)
+        - (dot(by_sharp_x, sharp_x) + dot(by_sharp_y, sharp_y)) * per_z;
+    let by_mean = by_t.x * views[which].rotation_x.xyz + by_t.y * views[which].rotation_y.xyz
+        + by_depth * views[which].rotation_z.xyz + by_lost * lost_by_mean;
+
+    // By R, as columns, then by the quaternion: sums and differences of the two numbers beside the
+    // diagonal.
+    let r_x = views[which].rotation_x.xyz;
+    let r_y = views[which].rotation_y.xyz;
+    let r_z = views[which].rotation_z.xyz;
+    let c0 = r_x * by_x.x + r_y * by_y.x + r_z * by_z.x;
+    let c1 = r_x * by_x.y + r_y * by_y.y + r_z * by_z.y;
+    let c2 = r_x * by_x.z + r_y * by_y.z + r_z * by_z.z;
+    let both = vec3(c1.z + c2.y, c2.x + c0.z, c0.y + c1.x);
+    let apart = vec3(c1.z - c2.y, c2.x - c0.z, c0.y - c1.x);
+    let unit = gaussian.quat;
+    let v = unit.yzw;
+    let by_vector = unit.x * apart - 2.0 * v * vec3(c1.y + c2.z, c0.x + c2.z, c0.x + c1.y)
+        + v.yzx * both.zxy + v.zxy * both.yzx;
+    let by_unit = vec4(dot(v, apart), by_vector);
+    let by_quat = 2.0 * (by_unit - unit * dot(by_unit, unit));
+    let by_own = by_scale * gaussian.scale / scale;
+
+    let to = i * GRADIENT_WORDS;
+    for (var k = 0u; k < 3u; k++) {
+        put(to + k, by_mean[k]);
+        put(to + 8u + k, by_own[k]);
+    }
+    put(to + 3u, opacity);
+    for (var k = 0u; k < 4u; k++) {
+        put(to + 4u + k, by_quat[k]);
+    }
+    gradients[to + 11u] = 1.0;
+}
+
+@compute @workgroup_size(256)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
+) {
+    which = group.z;
+    let total = views[which].gaussian_count;
+    let i = (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
+    if local == 0u {
+        atomicStore(&large_count, 0u);
+    }
+    workgroupBarrier();
+    var touched = 0u;
+    var footprint: Footprint;
+    if i < total {
+        touched = tiles[i];
+        if touched > 0u {
+            footprint = footprints[i];
+        }
+        if touched > LARGE_TILES {
+            large[atomicAdd(&large_count, 1u)] = i;
+        } else if touched > 0u {
+            visit_tiles(footprint, i, 0u, 1u, 0u, 1u);
+        }
+    }
+    var own = found;
+    workgroupBarrier();
+    if local == 0u {
+        larges = atomicLoad(&large_count);
+    }
+    let count = workgroupUniformLoad(&larges);
+    for (var one = 0u; one < count; one++) {
+        let id = large[one];
+        found = array<f32, PAIR_SUMS>();
+        visit_tiles(footprints[id], id, local / 8u, 32u, local % 8u, 8u);
+        for (var k = 0u; k < PAIR_SUMS; k++) {
+            shares[local * PAIR_SUMS + k] = found[k];
+        }
+        workgroupBarrier();
+        if local < 16u * PAIR_SUMS {
+            var sum = 0.0;
+            for (var k = 0u; k < 16u; k++) {
+                sum += shares[(local / PAIR_SUMS * 16u + k) * PAIR_SUMS + local % PAIR_SUMS];
+            }
+            shares_of_16[local] = sum;
+        }
+        workgroupBarrier();
+        if id == i {
+            for (var k = 0u; k < 16u * PAIR_SUMS; k++) {
+                own[k % PAIR_SUMS] += shares_of_16[k];
+            }
+        }
+    }
+    if i >= total {
+        return;
+    }
+    found = own;
+    let by_color = total * GRADIENT_WORDS + i * views[which].sh_count * 3u;
+    for (var k = 0u; k < 3u; k++) {
+        put(by_color + k, found[6u + k]);
+    }
+    if touched > 0u {
+        back(i, footprint);
+    } else {
+        for (var k = 0u; k < GRADIENT_WORDS; k++) {
+            gradients[i * GRADIENT_WORDS + k] = 0.0;
+        }
+    }
+}
