@@ -1,20 +1,26 @@
 // Draws a scene by WebGL2, by the model of docs/conventions.md: quads, farthest first, into
-// half-float buffers, then one pass that puts the backdrop, the words' colours or a depth picture on
-// the canvas.
+// half-float buffers, then one pass that puts the backdrop, the words' colours or a depth picture
+// on the canvas.
 const ROW = 2048; // Gaussians a row of the texture
-const WORDS = [[0.96, 0.36, 0.1], [0.1, 0.55, 0.98], [0.35, 0.75, 0.2], [0.85, 0.3, 0.85]];
+const WORDS = [
+  [0.96, 0.36, 0.1],
+  [0.1, 0.55, 0.98],
+  [0.35, 0.75, 0.2],
+  [0.85, 0.3, 0.85],
+];
 
-const QUADS = `#version 300 es
+// Each Gaussian on the picture, once a frame: centre, depth and opacity; the axes of its ellipse,
+// one standard deviation long.
+const PROJECT = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
-uniform usampler2D packed; uniform sampler2D photos, scores;
+uniform usampler2D packed; uniform sampler2D photos;
 uniform mat3 turn; uniform vec3 eye; uniform vec4 lens; uniform vec2 size;
 uniform float near, extent;
-in uint gaussian;
-out vec2 at; flat out vec4 tint; flat out vec4 score; flat out vec2 more;
+layout(location = 0) out vec4 place; layout(location = 1) out vec4 axes;
 float half15(uint q) { return (float(q & 0x7fffu) / 32767. - .5) * 1.41421356; }
 void main() {
-  gl_Position = vec4(2., 2., 2., 1.);
-  ivec2 cell = ivec2((gaussian & 2047u) << 1, gaussian >> 11);
+  place = axes = vec4(0.);
+  ivec2 cell = ivec2(gl_FragCoord.xy) * ivec2(2, 1);
   uvec4 a = texelFetch(packed, cell, 0), b = texelFetch(packed, cell + ivec2(1, 0), 0);
   vec3 mean = uintBitsToFloat(a.xyz), t = turn * (mean - eye);
   if (t.z < near) return;
@@ -52,16 +58,38 @@ void main() {
   float large = middle + apart;
   vec3 area = cross(row0, row1);
   float small = (dot(area, area) + .3 * (xx - .3 + yy - .3) + .09) / large;
-  if (opacity < 1. / 255.) return;
-  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2. - 1.;
-  at = corner * sqrt(2. * log(opacity * 255.) + 2e-4);
-  vec2 place = lens.xy * t.xy / t.z + lens.zw
-    + axis * (at.x * sqrt(large)) + vec2(-axis.y, axis.x) * (at.y * sqrt(small));
-  gl_Position = vec4(place / size * vec2(2., -2.) + vec2(-1., 1.), 0., 1.);
-  tint = vec4(vec3(a.w & 255u, (a.w >> 8) & 255u, (a.w >> 16) & 255u) / 255., opacity);
-  int entry = int(b.w >> 16);
+  axes = vec4(axis * sqrt(large), vec2(-axis.y, axis.x) * sqrt(small));
+  place = vec4(f * t.xy + lens.zw, t.z / extent, opacity);
+}`;
+
+// Four corners of a quad around the ellipse where alpha is 1/255.
+const QUADS = `#version 300 es
+precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
+uniform usampler2D packed, order; uniform sampler2D places, axes, scores;
+uniform vec2 size;
+out vec2 at; flat out vec4 tint; flat out vec4 score; flat out vec2 more;
+void main() {
+  gl_Position = vec4(2., 2., 2., 1.);
+  int quad = gl_VertexID / 6, k = gl_VertexID % 6;
+  uint gaussian = texelFetch(order, ivec2(quad & 2047, quad >> 11), 0).x;
+  ivec2 cell = ivec2(gaussian & 2047u, gaussian >> 11);
+  vec4 place = texelFetch(places, cell, 0);
+  if (place.w < 1. / 255.) return;
+  vec4 axis = texelFetch(axes, cell, 0);
+  if (k > 2) k -= 2; // two triangles: 0 1 2 and 1 2 3
+  vec2 corner = vec2(k & 1, k >> 1) * 2. - 1.;
+  at = corner * sqrt(2. * log(place.w * 255.) + 2e-4);
+  vec2 spot = place.xy + axis.xy * at.x + axis.zw * at.y;
+  gl_Position = vec4(spot / size * vec2(2., -2.) + vec2(-1., 1.), 0., 1.);
+  uint rgb = texelFetch(packed, cell * ivec2(2, 1), 0).w;
+  tint = vec4(vec3(rgb & 255u, (rgb >> 8) & 255u, (rgb >> 16) & 255u) / 255., place.w);
+  score = vec4(0.);
+  more = vec2(place.z, 0.);
+#ifdef MORE
+  int entry = int(texelFetch(packed, cell * ivec2(2, 1) + ivec2(1, 0), 0).w >> 16);
   score = texelFetch(scores, ivec2(entry & 255, entry >> 8), 0);
-  more = vec2(t.z / extent, entry > 0 ? 1. : 0.);
+  more.y = entry > 0 ? 1. : 0.;
+#endif
 }`;
 
 const BLEND = `#version 300 es
@@ -127,23 +155,24 @@ class Drawing {
     }
     this.gl = gl;
     this.lost = false;
-    canvas.addEventListener('webglcontextlost', (e) => { e.preventDefault(); this.lost = true; });
+    canvas.addEventListener('webglcontextlost', (e) => {
+      e.preventDefault();
+      this.lost = true;
+    });
+    const more = (text) => text.replace('es\n', 'es\n#define MORE\n');
+    this.project = this.program(WHOLE, PROJECT);
     this.plain = this.program(QUADS, BLEND);
-    this.full = this.program(QUADS, BLEND.replace('es\n', 'es\n#define MORE\n'));
+    this.full = this.program(more(QUADS), more(BLEND));
     this.show = this.program(WHOLE, SHOW);
-    this.order = gl.createBuffer();
-    this.quads = gl.createVertexArray();
-    gl.bindVertexArray(this.quads);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
+    this.order = this.texture();
     this.none = gl.createVertexArray();
     this.backdrop = this.texture();
     this.photos = this.texture();
     this.scores = this.texture();
     this.buffers = [0, 1, 2].map(() => this.texture());
     this.frame = gl.createFramebuffer();
+    this.projected = [0, 1].map(() => this.texture());
+    this.spots = gl.createFramebuffer();
     this.size = [0, 0];
     this.worker = startSorter();
     this.worker.onmessage = ({ data }) => this.sorted(data);
@@ -160,8 +189,12 @@ class Drawing {
   }
 
   program(vertex, fragment) {
-    const gl = this.gl, program = gl.createProgram();
-    for (const [type, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+    const gl = this.gl,
+      program = gl.createProgram();
+    for (const [type, text] of [
+      [gl.VERTEX_SHADER, vertex],
+      [gl.FRAGMENT_SHADER, fragment],
+    ]) {
       const shader = gl.createShader(type);
       gl.shaderSource(shader, text);
       gl.compileShader(shader);
@@ -170,7 +203,6 @@ class Drawing {
         throw new Error(gl.getShaderInfoLog(shader));
       }
     }
-    gl.bindAttribLocation(program, 0, 'gaussian');
     gl.linkProgram(program);
     const at = {};
     const n = gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS) || 0;
@@ -182,7 +214,8 @@ class Drawing {
   }
 
   texture() {
-    const gl = this.gl, texture = gl.createTexture();
+    const gl = this.gl,
+      texture = gl.createTexture();
     gl.bindTexture(gl.TEXTURE_2D, texture);
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
       gl.texParameteri(gl.TEXTURE_2D, side, gl.NEAREST);
@@ -212,11 +245,19 @@ class Drawing {
     const rows = Math.max(1, Math.ceil(count / ROW));
     if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error('too many Gaussians');
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, 2 * ROW, rows);
+    this.rows = rows;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.spots);
+    this.projected.forEach((texture, k) => {
+      this.fill(texture, gl.RGBA32F, ROW, rows, gl.FLOAT, null);
+      gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + k, gl.TEXTURE_2D, texture, 0);
+    });
+    gl.drawBuffers([gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1]);
     this.fill(this.backdrop, gl.RGB8, ...CELLS, gl.UNSIGNED_BYTE, cells);
     for (const side of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
       gl.texParameteri(gl.TEXTURE_2D, side, gl.LINEAR);
     }
-    const cameras = header.cameras, rowsOf = new Float32Array(8 * Math.max(1, cameras.length));
+    const cameras = header.cameras,
+      rowsOf = new Float32Array(8 * Math.max(1, cameras.length));
     cameras.forEach(({ camera_to_world: m }, i) => {
       const focal = header.network_focal_px[i];
       const scale = header.magnify && focal > 0 ? 1 / focal : 0;
@@ -230,16 +271,28 @@ class Drawing {
 
   // More Gaussians; the last row of the texture may be filled twice.
   append(first, words) {
-    const gl = this.gl, from = Math.floor(first / ROW) * ROW;
+    const gl = this.gl,
+      from = Math.floor(first / ROW) * ROW;
     const joined = new Uint32Array(this.rest.length + words.length);
     joined.set(this.rest);
     joined.set(words, this.rest.length);
-    const n = joined.length / 8, rows = Math.ceil(n / ROW), padded = new Uint32Array(8 * ROW * rows);
+    const n = joined.length / 8,
+      rows = Math.ceil(n / ROW),
+      padded = new Uint32Array(8 * ROW * rows);
     padded.set(joined);
     gl.bindTexture(gl.TEXTURE_2D, this.packed);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, from / ROW, 2 * ROW, rows, gl.RGBA_INTEGER,
-      gl.UNSIGNED_INT, padded);
-    this.rest = joined.slice(8 * (n - n % ROW));
+    gl.texSubImage2D(
+      gl.TEXTURE_2D,
+      0,
+      0,
+      from / ROW,
+      2 * ROW,
+      rows,
+      gl.RGBA_INTEGER,
+      gl.UNSIGNED_INT,
+      padded,
+    );
+    this.rest = joined.slice(8 * (n - (n % ROW)));
     this.loaded = first + words.length / 8;
     this.worker.postMessage({ first, words }, [words.buffer]);
     this.asked = '';
@@ -248,32 +301,38 @@ class Drawing {
 
   // Up to four words, each { scores: [M] relevancies, cut }; a look-up by entry, no new download.
   ask(words, floor) {
-    const gl = this.gl, entries = 1 + Math.max(0, ...words.map((word) => word.scores.length));
+    const gl = this.gl,
+      entries = 1 + Math.max(0, ...words.map((word) => word.scores.length));
     const table = new Float32Array(4 * 256 * Math.max(1, Math.ceil(entries / 256)));
-    words.forEach(({ scores }, k) => scores.forEach((r, m) => {
-      // The difference of cosines times tau; its sign is the mask.
-      table[4 * (m + 1) + k] = Math.max(-16, Math.min(16, Math.log(r / (1 - r))));
-    }));
+    words.forEach(({ scores }, k) =>
+      scores.forEach((r, m) => {
+        // The difference of cosines times tau; its sign is the mask.
+        table[4 * (m + 1) + k] = Math.max(-16, Math.min(16, Math.log(r / (1 - r))));
+      }),
+    );
     this.fill(this.scores, gl.RGBA32F, 256, table.length / 1024, gl.FLOAT, table);
     this.words = words;
     this.floor = floor;
     this.changed();
   }
 
-  sorted({ order, number, known, ms }) {
+  sorted({ order, drawn, number, known, ms }) {
     const gl = this.gl;
     this.done = number;
     this.sortMs = ms;
     this.sortKnown = known;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this.order);
-    gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
-    this.drawn = order.length;
+    const rows = Math.max(1, Math.ceil(drawn / ROW));
+    gl.bindTexture(gl.TEXTURE_2D, this.order);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, ROW, rows, 0, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
+    this.drawn = drawn;
     this.fresh = true;
     this.changed();
   }
 
   // Whether the order on the device is that of the last camera and of all that has come.
-  get settled() { return this.asked === this.shown && this.sent === this.done; }
+  get settled() {
+    return this.asked === this.shown && this.sent === this.done;
+  }
 
   resize(width, height) {
     if (this.size[0] === width && this.size[1] === height) return;
@@ -293,12 +352,14 @@ class Drawing {
   sort(camera, moving) {
     const header = this.header;
     if (!header) return false;
-    const axis = axesOf(camera)[2], eye = add(camera.eye, header.origin, -1);
+    const axis = axesOf(camera)[2],
+      eye = add(camera.eye, header.origin, -1);
     this.asked = `${camera.eye} ${axis} ${this.loaded}`;
     if (this.asked !== this.shown && this.sent === this.done) {
       this.shown = this.asked;
       this.sent += 1;
-      const behind = behindOf(header, camera), near = header.near;
+      const behind = behindOf(header, camera),
+        near = header.near;
       this.worker.postMessage({ eye, axis, near, behind, number: this.sent });
     }
     const worth = moving || this.fresh || this.settled;
@@ -308,9 +369,12 @@ class Drawing {
 
   // One frame from a camera. kind: 0 colour, 1 depth, 2 alpha, 3 mask.
   draw(camera, kind) {
-    const gl = this.gl, header = this.header, [width, height] = this.size;
+    const gl = this.gl,
+      header = this.header,
+      [width, height] = this.size;
     if (!header || this.lost || !width) return;
-    const [x, y, z] = axesOf(camera), eye = add(camera.eye, header.origin, -1);
+    const [x, y, z] = axesOf(camera),
+      eye = add(camera.eye, header.origin, -1);
     const focal = focalOf(camera, height);
     const more = kind === 1 || this.words.length > 0;
     const { program, at } = more ? this.full : this.plain;
@@ -321,26 +385,37 @@ class Drawing {
       gl.bindTexture(gl.TEXTURE_2D, texture);
       gl.uniform1i(place, k);
     };
+    const project = this.project.at;
+    gl.disable(gl.BLEND);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.spots);
+    gl.viewport(0, 0, ROW, this.rows);
+    gl.useProgram(this.project.program);
+    bind(this.packed, 0, project.packed);
+    bind(this.photos, 1, project.photos);
+    gl.uniformMatrix3fv(project.turn, false, turn);
+    gl.uniform3fv(project.eye, eye);
+    gl.uniform4fv(project.lens, lens);
+    gl.uniform2f(project.size, width, height);
+    gl.uniform1f(project.near, header.near);
+    gl.uniform1f(project.extent, header.unit);
+    gl.bindVertexArray(this.none);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.viewport(0, 0, width, height);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.frame);
-    const targets = [0, 1, 2].map((k) => more || k === 0 ? gl.COLOR_ATTACHMENT0 + k : gl.NONE);
-    gl.drawBuffers(targets);
+    gl.drawBuffers([0, 1, 2].map((k) => (more || k === 0 ? gl.COLOR_ATTACHMENT0 + k : gl.NONE)));
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.useProgram(program);
     bind(this.packed, 0, at.packed);
-    bind(this.photos, 1, at.photos);
-    if (at.scores) bind(this.scores, 2, at.scores);
-    gl.uniformMatrix3fv(at.turn, false, turn);
-    gl.uniform3fv(at.eye, eye);
-    gl.uniform4fv(at.lens, lens);
+    bind(this.projected[0], 1, at.places);
+    bind(this.projected[1], 2, at.axes);
+    bind(this.order, 4, at.order);
+    if (more) bind(this.scores, 3, at.scores);
     gl.uniform2f(at.size, width, height);
-    gl.uniform1f(at.near, header.near);
-    gl.uniform1f(at.extent, header.unit);
-    gl.bindVertexArray(this.quads);
-    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.drawn);
+    // Not instances: software draws each one by itself.
+    gl.drawArrays(gl.TRIANGLES, 0, 6 * this.drawn);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.disable(gl.BLEND);
     const show = this.show.at;
@@ -355,8 +430,11 @@ class Drawing {
     gl.uniform1i(show.kind, kind);
     gl.uniform1i(show.words, this.words.length);
     gl.uniform1f(show.floorOf, this.floor);
-    const margin = ({ cut }) => cut === 0.5 ? 0 : Math.log(cut / (1 - cut));
-    gl.uniform4fv(show.margins, [0, 1, 2, 3].map((k) => this.words[k] ? margin(this.words[k]) : 0));
+    const margin = ({ cut }) => (cut === 0.5 ? 0 : Math.log(cut / (1 - cut)));
+    gl.uniform4fv(
+      show.margins,
+      [0, 1, 2, 3].map((k) => (this.words[k] ? margin(this.words[k]) : 0)),
+    );
     gl.uniform3fv(show.colors, WORDS.flat());
     gl.uniform1i(show.sky, header.backdrop ? 1 : 0);
     gl.bindVertexArray(this.none);
@@ -366,7 +444,9 @@ class Drawing {
 
   // World point under a pixel of the frame drawn last, by its blended depth; null where nothing is.
   pointAt(px, py) {
-    const gl = this.gl, [width, height] = this.size, camera = this.camera;
+    const gl = this.gl,
+      [width, height] = this.size,
+      camera = this.camera;
     if (!camera) return null;
     if (!this.words.length) this.draw(camera, 1);
     const pixel = new Float32Array(4);
@@ -376,9 +456,11 @@ class Drawing {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     this.changed();
     if (!(pixel[3] > 0.05)) return null;
-    const depth = pixel[0] / pixel[3] * this.header.unit, focal = focalOf(camera, height);
+    const depth = (pixel[0] / pixel[3]) * this.header.unit,
+      focal = focalOf(camera, height);
     const [x, y, z] = axesOf(camera);
-    const u = (Math.floor(px) + 0.5 - width / 2) / focal, v = (Math.floor(py) + 0.5 - height / 2) / focal;
+    const u = (Math.floor(px) + 0.5 - width / 2) / focal,
+      v = (Math.floor(py) + 0.5 - height / 2) / focal;
     return add(add(add(camera.eye, z, depth), x, u * depth), y, v * depth);
   }
 }

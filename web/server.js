@@ -1,12 +1,21 @@
 // Calls of the server. Where it wants a key, the key stays in this tab.
 const server = {
-  get key() { return sessionStorage.getItem('key') || ''; },
-  set key(value) { sessionStorage.setItem('key', value); },
-  get headers() { return this.key ? { authorization: `Bearer ${this.key}` } : {}; },
+  get key() {
+    return sessionStorage.getItem('key') || '';
+  },
+  set key(value) {
+    sessionStorage.setItem('key', value);
+  },
+  get headers() {
+    return this.key ? { authorization: `Bearer ${this.key}` } : {};
+  },
 
   // The answer, or an Error with the server's own words and its code.
   async call(path, options = {}) {
-    const answer = await fetch(path, { ...options, headers: { ...this.headers, ...options.headers } });
+    const answer = await fetch(path, {
+      ...options,
+      headers: { ...this.headers, ...options.headers },
+    });
     if (answer.ok) return answer;
     const fault = await answer.json().catch(() => ({}));
     const error = new Error(fault.message || `${answer.status} ${answer.statusText}`);
@@ -15,19 +24,26 @@ const server = {
     throw error;
   },
 
-  json(path, options) { return this.call(path, options).then((answer) => answer.json()); },
+  json(path, options) {
+    return this.call(path, options).then((answer) => answer.json());
+  },
 
   // Posts a form and tells the share that is sent.
   send(path, form, sent) {
     return new Promise((resolve, reject) => {
       const request = new XMLHttpRequest();
       request.open('POST', path);
-      for (const [name, value] of Object.entries(this.headers)) request.setRequestHeader(name, value);
+      for (const [name, value] of Object.entries(this.headers))
+        request.setRequestHeader(name, value);
       request.upload.onprogress = (e) => e.lengthComputable && sent(e.loaded / e.total);
       request.onerror = () => reject(new Error('the server cannot be reached'));
       request.onload = () => {
         let body = {};
-        try { body = JSON.parse(request.responseText); } catch { /* no JSON: the status says it */ }
+        try {
+          body = JSON.parse(request.responseText);
+        } catch {
+          /* no JSON: the status says it */
+        }
         if (request.status < 300) return resolve(body);
         const error = new Error(body.message || `${request.status} ${request.statusText}`);
         error.status = request.status;

@@ -1,12 +1,12 @@
-//! A scene as the page draws it: 32 bytes a Gaussian, those that cover most first, so that the start
-//! of the file is already a picture.
+//! A scene as the page draws it: 32 bytes a Gaussian, those that cover most first, so that the
+//! start of the file is already a picture.
 //!
 //! Little-endian: the length of the JSON header in bytes (u32); the header, filled with blanks to a
 //! multiple of four bytes; the cells of the backdrop, `[64, 128, 3]` u8; then for each Gaussian
 //! eight u32: the centre (three f32, relative to `origin`), colour and opacity (four u8), then
 //! eight u16. These are the three scales (`ln(scale / unit)` from -16 to 4 in 65,535 steps), the
-//! rotation, the photo it comes from, and its entry of the bank. The rotation (w x y z, unit) is its
-//! three smallest numbers, each from -√½ to √½ in 32,767 steps; the number left out, which is
+//! rotation, the photo it comes from, and its entry of the bank. The rotation (w x y z, unit) is
+//! its three smallest numbers, each from -√½ to √½ in 32,767 steps; the number left out, which is
 //! positive, is the top bit of the first plus twice that of the second.
 //!
 //! Colours are those of degree 0: a scene of a higher degree loses its shine.

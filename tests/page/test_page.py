@@ -137,7 +137,7 @@ def test_photos_are_dropped_and_the_scene_is_flown_asked_clicked_shared_and_kept
     waited.value.save_as(kept)
     alone = page.context.new_page()
     calls: list[str] = []
-    alone.on("request", lambda request: request.url.startswith("http") and calls.append(request.url))
+    alone.on("request", lambda one: one.url.startswith("http") and calls.append(one.url))
     alone.goto(kept.as_uri() + "#" + link.split("#")[1])
     expect(alone.locator("#words li strong")).to_have_text(["box"])
     assert np.abs(pixels(alone).astype(float) - before).mean() < 0.5
