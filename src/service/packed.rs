@@ -53,7 +53,6 @@ pub(super) fn write_packed(scene: &Scene, to: &mut dyn Write) -> Result<()> {
         Error::new(ErrorCode::StoreUnavailable, "the scene cannot be written").caused_by(cause)
     };
     let (gaussians, report) = (&scene.gaussians, &scene.meta.report);
-    #[expect(clippy::cast_possible_truncation, reason = "the page counts in f32")]
     let unit = if report.median_depth > 0.0 { report.median_depth as f32 } else { 1.0 };
     let header = Header {
         version: 1,
@@ -98,9 +97,7 @@ fn largest_first(gaussians: &Gaussians) -> Vec<usize> {
 
 /// `value` of 0..1 in steps of `1 / most`; what is outside is clamped.
 fn steps(value: f32, most: u16) -> u32 {
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "clamped")]
-    let step = (value.clamp(0.0, 1.0) * f32::from(most) + 0.5) as u32;
-    step
+    (value.clamp(0.0, 1.0) * f32::from(most) + 0.5) as u32
 }
 
 fn packed(gaussians: &Gaussians, i: usize, unit: f32) -> [u32; 8] {
