@@ -4,6 +4,7 @@
 # make test    everything that CI checks: format, lints, docs, all tests, licences
 # make client   the Python client: its types, and its tests with a real server (SEGSPLAT_BIN=file: a
 #               program that is built already)
+# make page    the page in a headless Chromium, with a real server (SEGSPLAT_BIN as above)
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
 # make eval-scenes   labelled scenes of held-out things, rendered to target/eval/scenes (g++, PYTHON)
 # make report   the tables of docs/benchmarks.md from benches/runs
@@ -22,7 +23,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: client demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: client venv page demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -64,15 +65,23 @@ fuzz: setup
 
 # Debian's python3 has no venv; pip brings virtualenv.
 CLIENT := $(abspath $(TARGET))/client
-client: $(if $(SEGSPLAT_BIN),,setup)
+PROGRAM = $(abspath $(or $(SEGSPLAT_BIN),$(TARGET)/debug/segsplat))
+venv: $(if $(SEGSPLAT_BIN),,setup)
 	$(if $(SEGSPLAT_BIN),,$(CARGO) build --locked)
 	python3 -m pip install --quiet --disable-pip-version-check --upgrade --target $(CLIENT)/tools \
 		$$(grep '^virtualenv' clients/python/tests/requirements.txt)
 	PYTHONPATH=$(CLIENT)/tools python3 -m virtualenv --quiet $(CLIENT)/venv
+
+client: venv
 	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check -e clients/python \
 		-r clients/python/tests/requirements.txt
-	cd clients/python && SEGSPLAT_BIN=$(abspath $(or $(SEGSPLAT_BIN),$(TARGET)/debug/segsplat)) \
-		$(CLIENT)/venv/bin/python -m pytest
+	cd clients/python && SEGSPLAT_BIN=$(PROGRAM) $(CLIENT)/venv/bin/python -m pytest
+
+# The browser is one that `scripts/setup --ci` finds or gets, or SEGSPLAT_BROWSER.
+page: venv
+	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check \
+		-r tests/page/requirements.txt
+	SEGSPLAT_BIN=$(PROGRAM) $(CLIENT)/venv/bin/python -m pytest tests/page
 
 bench: setup
 	$(CARGO) bench --locked

@@ -1367,6 +1367,10 @@ pub enum ExportFormat {
     Ply = 1,
     /// The semantics as NumPy arrays.
     Npz = 2,
+    /// The scene as the page draws it: 32 bytes a Gaussian.
+    Packed = 3,
+    /// The page with the scene in it; text may have several texts, one a line.
+    Html = 4,
 }
 impl ExportFormat {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -1378,6 +1382,8 @@ impl ExportFormat {
             Self::Unspecified => "EXPORT_FORMAT_UNSPECIFIED",
             Self::Ply => "EXPORT_FORMAT_PLY",
             Self::Npz => "EXPORT_FORMAT_NPZ",
+            Self::Packed => "EXPORT_FORMAT_PACKED",
+            Self::Html => "EXPORT_FORMAT_HTML",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -1386,6 +1392,8 @@ impl ExportFormat {
             "EXPORT_FORMAT_UNSPECIFIED" => Some(Self::Unspecified),
             "EXPORT_FORMAT_PLY" => Some(Self::Ply),
             "EXPORT_FORMAT_NPZ" => Some(Self::Npz),
+            "EXPORT_FORMAT_PACKED" => Some(Self::Packed),
+            "EXPORT_FORMAT_HTML" => Some(Self::Html),
             _ => None,
         }
     }

@@ -11,10 +11,14 @@ use super::{
     Service,
     create::blocking,
     features,
-    request::{ExportFormat, TextOptions},
+    packed::write_packed,
+    page::write_page,
+    query,
+    request::{ExportFormat, QuerySpec, TextOptions},
     search::{SceneTexts, check_scoring},
     semantics::meaning_tag,
     texts,
+    times::ViewTimes,
     types::Export,
     view::{hash, text_words},
 };
@@ -31,7 +35,8 @@ const PART_BYTES: usize = 256 << 10;
 
 impl Service {
     /// The scene, or what a text selects of it, as a file for other programs; as `npz` its
-    /// semantics, which are made where they are not there.
+    /// semantics, which are made where they are not there; as `packed` and `html` what the page
+    /// draws. For `html` each line of the text is a text that the page can show.
     ///
     /// # Errors
     /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; with a text, and for `npz`, also what
@@ -56,10 +61,21 @@ impl Service {
             let file_name = format!("{id}.npz");
             return Ok(Export { file_name, size_bytes: None, etag, chunks: stream(write) });
         }
+        if format == ExportFormat::Html {
+            return self.page(id, preset, ask).await;
+        }
+        if format == ExportFormat::Packed && ask.text.is_some() {
+            return Err(Error::invalid("text goes with format=ply or html, not with packed"));
+        }
         let Some(text) = &ask.text else {
             let access = access.finished()?;
             let digest = hash(&meaning_tag(access.record()));
             let scene = blocking(move || inner.load(&access)).await??;
+            if format == ExportFormat::Packed {
+                let (file_name, etag) = (format!("{id}.segsplat"), format!("{digest}-packed"));
+                let chunks = stream(move |to: &mut dyn Write| write_packed(&scene, to));
+                return Ok(Export { file_name, size_bytes: None, etag, chunks });
+            }
             let file = PlyFile::new(scene.gaussians.clone(), scene.semantics.as_deref())?;
             return Ok(ply(format!("{id}.ply"), format!("{digest}-ply"), file));
         };
@@ -78,6 +94,43 @@ impl Service {
         })
         .await??;
         Ok(ply(format!("{id}-part.ply"), format!("{etag}-ply"), file))
+    }
+}
+
+impl Service {
+    /// The page with the scene in it.
+    async fn page(
+        &self,
+        id: &SceneId,
+        preset: Option<Preset>,
+        ask: &TextOptions,
+    ) -> Result<Export> {
+        let (inner, limits) = (Arc::clone(&self.inner), self.limits());
+        let access = self.scene(id).await?.finished()?;
+        let lines: Vec<String> =
+            ask.text.iter().flat_map(|text| text.lines().map(str::to_owned)).collect();
+        let how = format!("{lines:?} {preset:?} {:?} {}", ask.scoring, env!("CARGO_PKG_VERSION"));
+        let etag = format!("{}-html", hash(&(meaning_tag(access.record()) + &how)));
+        let file_name = format!("{id}.html");
+        if lines.is_empty() {
+            let scene = blocking(move || inner.load(&access)).await??;
+            let chunks = stream(move |to: &mut dyn Write| write_page(&scene, None, to));
+            return Ok(Export { file_name, size_bytes: None, etag, chunks });
+        }
+        inner.can_understand("text")?;
+        let texts = texts::all_checked(&lines, "text", &limits)?;
+        check_scoring(&ask.scoring, &limits)?;
+        let understood = inner.understood(&access, "text", ask.wait).await?;
+        let scoring = ask.scoring.clone();
+        let chunks = stream(move |to: &mut dyn Write| {
+            let of = understood.subject();
+            let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &texts)?;
+            let spec = QuerySpec::default();
+            let times = ViewTimes::default();
+            let answer = query::answer(&texts, &limits, &spec, None, times, || ())?;
+            write_page(of.scene, Some(&answer), to)
+        });
+        Ok(Export { file_name, size_bytes: None, etag, chunks })
     }
 }
 

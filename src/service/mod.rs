@@ -11,6 +11,8 @@ mod features;
 mod memory;
 mod npz;
 mod offline;
+mod packed;
+mod page;
 mod pick;
 mod query;
 mod request;
@@ -29,6 +31,7 @@ use futures_util::{Stream, stream};
 use parking_lot::RwLock;
 use tokio::sync::Semaphore;
 
+pub use self::page::{VIEWER, ViewerPage};
 use self::{memory::Memory, schedule::Scheduler, search::Backend};
 pub use self::{
     offline::OfflineService,

@@ -145,6 +145,11 @@ pub enum ExportFormat {
     /// The semantics as `NumPy` arrays: the bank, the row of each mask, the entry of each Gaussian
     /// and of each cell of the photos.
     Npz,
+    /// The scene as the page draws it: 32 bytes a Gaussian, those that cover most first.
+    Packed,
+    /// The page with the scene in it, as one file for a disk. It shows the texts of `text`, one a
+    /// line, and needs no server.
+    Html,
 }
 
 /// What the pixels of a view are described by.

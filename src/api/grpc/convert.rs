@@ -437,5 +437,5 @@ both_ways! {
     FeatureKind = FeatureKind { Weights, Features }
     Boxes = Boxes { Oriented, Aligned, None }
     MaskFormat = MaskFormat { Rle, Png, None }
-    ExportFormat = ExportFormat { Ply, Npz }
+    ExportFormat = ExportFormat { Ply, Npz, Packed, Html }
 }

@@ -42,7 +42,8 @@ pub(super) struct ViewParams {
 #[serde(default)]
 #[into_params(parameter_in = Query)]
 pub(super) struct ExportParams {
-    /// `ply` (default), or `npz`: the semantics as arrays.
+    /// `ply` (default); `npz`: the semantics as arrays; `packed`: the scene as the page draws it;
+    /// `html`: the page with the scene in it, and what it shows of each line of `text`.
     #[param(inline)]
     format: ExportFormat,
     /// How a text is scored: `default` or `paper`. By default as the scene was made.
@@ -102,7 +103,7 @@ pub(super) async fn view(
     params(Id, ExportParams, TextOptions, ScoringOptions),
     responses((
         status = 200, content_type = "application/octet-stream", body = Vec<u8>,
-        description = "Standard 3DGS PLY, or an npz of arrays"
+        description = "Standard 3DGS PLY, an npz of arrays, the packed scene, or an HTML page"
     ))
 )]
 pub(super) async fn export(

@@ -1,16 +1,11 @@
-//! The small viewer page at `/`: one file, no scripts from elsewhere.
+//! The page at `/`: one file, no scripts from elsewhere.
 
 use axum::{
     http::header,
     response::{Html, IntoResponse, Response},
 };
 
-const PAGE: &str = include_str!("../../../web/index.html");
-
-/// The page talks to this server alone.
-const POLICY: &str = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; \
-                      img-src 'self' blob: data:; connect-src 'self'; form-action 'self'; \
-                      base-uri 'none'; frame-ancestors 'none'";
+use crate::service::VIEWER;
 
 /// The viewer page
 #[utoipa::path(
@@ -20,5 +15,6 @@ const POLICY: &str = "default-src 'none'; script-src 'unsafe-inline'; style-src 
     ))
 )]
 pub(super) async fn index() -> Response {
-    ([(header::CONTENT_SECURITY_POLICY, POLICY)], Html(PAGE)).into_response()
+    let policy = [(header::CONTENT_SECURITY_POLICY, VIEWER.policy.as_str())];
+    (policy, Html(VIEWER.html.as_str())).into_response()
 }

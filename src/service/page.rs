@@ -1,0 +1,116 @@
+//! The page: the files of `web` as one HTML document, for the server, or with a scene in it for a
+//! disk. Its policy names its one script and its one style by their hashes, so that nothing else
+//! runs.
+
+use std::{
+    io::{self, Write},
+    sync::LazyLock,
+};
+
+use base64::{Engine as _, prelude::BASE64_STANDARD, write::EncoderWriter};
+use sha2::{Digest, Sha256};
+
+use super::{packed::write_packed, types::QueryAnswer};
+use crate::{
+    error::{Error, ErrorCode, Result},
+    scene::Scene,
+};
+
+const SHELL: &str = include_str!("../../web/index.html");
+const STYLE: &str = include_str!("../../web/page.css");
+const SCRIPT: &str = concat!(
+    include_str!("../../web/math.js"),
+    include_str!("../../web/scene.js"),
+    include_str!("../../web/draw.js"),
+    include_str!("../../web/server.js"),
+    include_str!("../../web/capture.js"),
+    include_str!("../../web/page.js"),
+);
+
+/// The page without a scene, and its policy.
+#[derive(Debug)]
+pub struct ViewerPage {
+    /// The document.
+    pub html: String,
+    /// Its Content-Security-Policy. Styles and scripts that are not the page's own do not run.
+    pub policy: String,
+}
+
+/// The page of the server.
+pub static VIEWER: LazyLock<ViewerPage> = LazyLock::new(|| {
+    let policy = format!("{}; form-action 'self'; frame-ancestors 'none'", policy("'self'"));
+    ViewerPage { html: document("", ""), policy }
+});
+
+/// What the page may do; `connect` is where it may call.
+fn policy(connect: &str) -> String {
+    let hash = |text: &str| format!("'sha256-{}'", BASE64_STANDARD.encode(Sha256::digest(text)));
+    let (script, style) = (hash(SCRIPT), hash(STYLE));
+    format!(
+        "default-src 'none'; script-src {script}; style-src {style}; worker-src blob:; \
+         img-src 'self' blob: data:; connect-src {connect}; base-uri 'none'"
+    )
+}
+
+/// The whole document; `head` and `data` go into its head and before its script.
+fn document(head: &str, data: &str) -> String {
+    let [start, end] = around_data();
+    format!("{}{data}{end}", start.replace("<!--policy-->", head))
+}
+
+/// The document before and after the place of a scene.
+fn around_data() -> [String; 2] {
+    let (start, end) = SHELL.split_once("<!--scene-->").unwrap_or((SHELL, ""));
+    let filled = |part: &str| part.replace("/*style*/", STYLE).replace("/*script*/", SCRIPT);
+    [filled(start), filled(end)]
+}
+
+/// Writes the page with a scene, and what some texts found in it.
+pub(super) fn write_page(
+    scene: &Scene,
+    texts: Option<&QueryAnswer>,
+    to: &mut dyn Write,
+) -> Result<()> {
+    let unwritten = |cause: io::Error| {
+        Error::new(ErrorCode::StoreUnavailable, "the page cannot be written").caused_by(cause)
+    };
+    let texts = serde_json::to_string(&texts)
+        .map_err(|e| Error::internal("the texts have no JSON").caused_by(e))?;
+    let policy = policy("'none'");
+    let meta = format!(r#"<meta http-equiv="Content-Security-Policy" content="{policy}">"#);
+    let [start, end] = around_data();
+    let mut put = |text: &str| to.write_all(text.as_bytes()).map_err(unwritten);
+    put(&start.replace("<!--policy-->", &meta))?;
+    // A text cannot end the element that it stands in.
+    put(r#"<script type="application/json" id="texts">"#)?;
+    put(&texts.replace('<', "\\u003c"))?;
+    put(r#"</script><script type="application/octet-stream" id="packed">"#)?;
+    let mut coded = EncoderWriter::new(&mut *to, &BASE64_STANDARD);
+    write_packed(scene, &mut coded)?;
+    coded.finish().map_err(unwritten)?;
+    drop(coded);
+    to.write_all(b"</script>").and_then(|()| to.write_all(end.as_bytes())).map_err(unwritten)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_page_is_one_small_file_whose_policy_allows_its_own_script_alone() {
+        let ViewerPage { html, policy } = &*VIEWER;
+        assert!(html.len() <= 200 << 10, "{} bytes", html.len());
+        assert!(!policy.contains("unsafe") && !policy.contains("http"), "{policy}");
+        for (open, close) in [("<style>", "</style>"), ("<script type=\"module\">", "</script>")] {
+            let (_, rest) = html.split_once(open).unwrap();
+            let (text, _) = rest.split_once(close).unwrap();
+            let hash = BASE64_STANDARD.encode(Sha256::digest(text));
+            assert!(policy.contains(&format!("'sha256-{hash}'")), "{open}");
+        }
+        for mark in ["<!--policy", "<!--scene", "/*style*/", "/*script*/", "://", " style="] {
+            // Names of XML languages are no addresses.
+            let html = html.replace("http://www.w3.org/", "");
+            assert!(!html.contains(mark), "{mark}");
+        }
+    }
+}

@@ -1,0 +1,879 @@
+// The page: what is shown, and what hands do to it. All text from outside goes into text nodes.
+const $ = (id) => document.getElementById(id);
+const make = (tag, fields = {}, ...children) => {
+  const node = Object.assign(document.createElement(tag), fields);
+  node.append(...children);
+  return node;
+};
+const say = (text) => {
+  $('says').textContent = text;
+};
+const failed = (error) => {
+  $('key-form').hidden = error.status !== 401 && error.status !== 403;
+  say(error.message);
+};
+const count = (n) => n.toLocaleString('en');
+const KINDS = ['colour', 'depth', 'alpha', 'mask'];
+const NAMES = [
+  'chair',
+  'table',
+  'cup',
+  'box',
+  'book',
+  'plant',
+  'flower',
+  'person',
+  'animal',
+  'toy',
+  'lamp',
+  'screen',
+  'bottle',
+  'bag',
+  'shoe',
+  'ball',
+  'car',
+  'bicycle',
+  'building',
+  'tree',
+  'grass',
+  'sky',
+  'wall',
+  'floor',
+  'door',
+  'window',
+  'picture',
+  'bed',
+  'sofa',
+  'shelf',
+  'food',
+  'fruit',
+  'tool',
+  'stone',
+];
+
+const state = {
+  scene: null,
+  camera: null,
+  home: null,
+  kind: 0,
+  words: [],
+  known: [],
+  kept: [],
+  marks: [],
+  frusta: false,
+  measuring: false,
+  scale: 1,
+  moving: 0,
+  alone: false,
+  understood: false,
+};
+let drawing = null,
+  loading = null,
+  asked = false,
+  watching = null;
+
+// ---- drawing --------------------------------------------------------------------------------
+function invalidate() {
+  if (asked) return;
+  asked = true;
+  requestAnimationFrame(() => {
+    asked = false;
+    frame();
+  });
+}
+
+let lastFrame = 0;
+function frame() {
+  if (!drawing || !state.camera) return;
+  const box = $('stage').getBoundingClientRect(),
+    dense = Math.min(devicePixelRatio, 2);
+  const moving = performance.now() - state.moving < 250;
+  // While it moves, slow frames are drawn smaller; at rest the frame is whole.
+  const taken = performance.now() - lastFrame;
+  if (moving && taken < 2000)
+    state.scale = Math.min(
+      1,
+      Math.max(0.25, state.scale * (taken > 90 ? 0.8 : taken < 30 ? 1.1 : 1)),
+    );
+  lastFrame = performance.now();
+  const scale = dense * (moving ? state.scale : 1);
+  drawing.resize(
+    Math.max(1, Math.round(box.width * scale)),
+    Math.max(1, Math.round(box.height * scale)),
+  );
+  if (drawing.sort(state.camera, moving)) drawing.draw(state.camera, state.kind);
+  over(box.width, box.height);
+  const settled =
+    drawing.settled &&
+    !moving &&
+    drawing.loaded === drawing.count &&
+    drawing.sortKnown === drawing.count;
+  $('view').dataset.state = settled ? 'settled' : 'busy';
+  if (moving) invalidate();
+}
+
+// Lines over the scene: cameras, boxes of parts, measured points.
+function over(width, height) {
+  const canvas = $('over'),
+    dense = Math.min(devicePixelRatio, 2),
+    pen = canvas.getContext('2d');
+  canvas.width = width * dense;
+  canvas.height = height * dense;
+  pen.scale(dense, dense);
+  const { camera, scene } = state,
+    [x, y, z] = axesOf(camera),
+    focal = focalOf(camera, height);
+  const near = 1e-3 * length(add(camera.target, camera.eye, -1));
+  const seen = (p) => {
+    const d = add(p, camera.eye, -1);
+    return [dot(d, x), dot(d, y), dot(d, z)];
+  };
+  const flat = ([a, b, c]) => [width / 2 + (focal * a) / c, height / 2 + (focal * b) / c];
+  const line = (p, q) => {
+    let [a, b] = [seen(p), seen(q)];
+    if (a[2] < near && b[2] < near) return;
+    if (a[2] < near) a = mix(a, b, (near - a[2]) / (b[2] - a[2]));
+    if (b[2] < near) b = mix(b, a, (near - b[2]) / (a[2] - b[2]));
+    pen.moveTo(...flat(a));
+    pen.lineTo(...flat(b));
+  };
+  const draw = (color, lines) => {
+    for (const [style, wide] of [
+      ['#000a', 4],
+      [color, 2],
+    ]) {
+      pen.strokeStyle = style;
+      pen.lineWidth = wide;
+      pen.beginPath();
+      for (const [p, q] of lines) line(p, q);
+      pen.stroke();
+    }
+  };
+  if (state.frusta) {
+    for (const { camera_to_world: m, intrinsics: k } of scene.cameras) {
+      const deep = 0.12 * scene.unit,
+        eye = [m[3], m[7], m[11]];
+      const corners = [
+        [0, 0],
+        [k.width, 0],
+        [k.width, k.height],
+        [0, k.height],
+      ].map(([u, v]) => {
+        const ray = [((u - k.cx) / k.fx) * deep, ((v - k.cy) / k.fy) * deep, deep];
+        return eye.map(
+          (e, i) => e + m[4 * i] * ray[0] + m[4 * i + 1] * ray[1] + m[4 * i + 2] * ray[2],
+        );
+      });
+      draw(
+        '#fff',
+        corners.flatMap((c, i) => [
+          [eye, c],
+          [c, corners[(i + 1) % 4]],
+        ]),
+      );
+    }
+  }
+  state.words.forEach((word, k) => {
+    for (const { center, axes, size } of word.parts.slice(0, 24)) {
+      const corner = (i) =>
+        axes.reduce((p, axis, j) => add(p, axis, ((i >> j) & 1 ? 0.5 : -0.5) * size[j]), center);
+      const edges = [];
+      for (let i = 0; i < 8; i++)
+        for (let j = 0; j < 3; j++)
+          if (!((i >> j) & 1)) edges.push([corner(i), corner(i | (1 << j))]);
+      draw(css(k), edges);
+    }
+  });
+  if (state.marks.length) {
+    if (state.marks.length > 1) draw('#ff0', [state.marks]);
+    for (const mark of state.marks) {
+      const at = seen(mark);
+      if (at[2] < near) continue;
+      pen.beginPath();
+      pen.arc(...flat(at), 5, 0, 7);
+      pen.fillStyle = '#ff0';
+      pen.fill();
+      pen.strokeStyle = '#000';
+      pen.stroke();
+    }
+  }
+}
+const css = (k) => `rgb(${WORDS[k].map((v) => Math.round(255 * v))})`;
+
+// ---- the camera -----------------------------------------------------------------------------
+function look(camera, still) {
+  state.camera = camera;
+  if (!still) {
+    state.moving = performance.now();
+    clearTimeout(look.timer);
+    look.timer = setTimeout(() => {
+      remember();
+      invalidate();
+    }, 300);
+  }
+  $('view').dataset.state = 'busy';
+  invalidate();
+}
+
+const hands = {
+  orbit(dx, dy) {
+    const { eye, target, up } = state.camera,
+      right = axesOf(state.camera)[0];
+    let arm = turned(turned(add(eye, target, -1), unit(up), dx), right, -dy);
+    look({ ...state.camera, eye: add(target, arm), up: turned(up, right, -dy) });
+  },
+  pan(dx, dy) {
+    const { eye, target } = state.camera,
+      [x, y] = axesOf(state.camera);
+    const reach = length(add(target, eye, -1)),
+      shift = add(
+        x.map((v) => -v * dx * reach),
+        y,
+        -dy * reach,
+      );
+    look({ ...state.camera, eye: add(eye, shift), target: add(target, shift) });
+  },
+  turn(dx, dy) {
+    const { eye, target, up } = state.camera,
+      right = axesOf(state.camera)[0];
+    const arm = turned(turned(add(target, eye, -1), unit(up), dx), right, -dy);
+    look({ ...state.camera, target: add(eye, arm), up: turned(up, right, -dy) });
+  },
+  zoom(factor) {
+    const { eye, target } = state.camera;
+    look({ ...state.camera, eye: add(target, add(eye, target, -1), factor) });
+  },
+  fly(right, down, ahead) {
+    const { eye, target } = state.camera,
+      [x, y, z] = axesOf(state.camera);
+    const step = 0.05 * (state.scene.unit || 1);
+    const shift = add(
+      add(
+        x.map((v) => v * right * step),
+        y,
+        down * step,
+      ),
+      z,
+      ahead * step,
+    );
+    look({ ...state.camera, eye: add(eye, shift), target: add(target, shift) });
+  },
+};
+
+// Flies there in steps that show the way; at once for those who asked for less motion.
+function flyTo(goal) {
+  const from = state.camera,
+    still = matchMedia('(prefers-reduced-motion: reduce)').matches;
+  const flight = (flyTo.now = {});
+  const begun = performance.now();
+  const step = () => {
+    if (flyTo.now !== flight) return;
+    const t = still ? 1 : Math.min(1, (performance.now() - begun) / 700),
+      s = t * t * (3 - 2 * t);
+    look({
+      eye: mix(from.eye, goal.eye, s),
+      target: mix(from.target, goal.target, s),
+      up: unit(mix(from.up, goal.up, s)),
+      fov: from.fov + s * (goal.fov - from.fov),
+    });
+    if (t < 1) requestAnimationFrame(step);
+  };
+  step();
+}
+
+const touches = new Map();
+let pressed = null;
+function bindView() {
+  const view = $('view');
+  view.addEventListener('pointerdown', (e) => {
+    if (!state.camera) return;
+    view.setPointerCapture(e.pointerId);
+    touches.set(e.pointerId, [e.clientX, e.clientY]);
+    pressed = touches.size === 1 ? [e.clientX, e.clientY] : null;
+    flyTo.now = null;
+  });
+  view.addEventListener('pointermove', (e) => {
+    const last = touches.get(e.pointerId);
+    if (!last || !state.camera) return;
+    const [dx, dy] = [e.clientX - last[0], e.clientY - last[1]];
+    const before = [...touches.values()];
+    touches.set(e.pointerId, [e.clientX, e.clientY]);
+    const high = $('stage').clientHeight;
+    if (touches.size === 2) {
+      const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
+      hands.zoom(apart(before) / apart([...touches.values()]));
+      hands.pan(dx / high / 2, dy / high / 2);
+    } else if (!pressed || Math.hypot(e.clientX - pressed[0], e.clientY - pressed[1]) > 4) {
+      pressed = null;
+      const how = $('drag').selectedIndex;
+      if (e.shiftKey || how === 1 || e.buttons & 2) hands.pan(dx / high, dy / high);
+      else if (e.ctrlKey || how === 2) hands.turn(dx / 400, dy / 400);
+      else hands.orbit(dx / 300, dy / 300);
+    }
+  });
+  const end = (e) => {
+    touches.delete(e.pointerId);
+  };
+  view.addEventListener('pointerup', (e) => {
+    end(e);
+    if (pressed && e.button === 0)
+      clicked(e).catch((error) => {
+        $('picked').textContent = error.message;
+      });
+    pressed = null;
+  });
+  view.addEventListener('pointercancel', end);
+  view.addEventListener('contextmenu', (e) => e.preventDefault());
+  view.addEventListener(
+    'wheel',
+    (e) => {
+      if (!state.camera) return;
+      e.preventDefault();
+      hands.zoom(Math.exp(e.deltaY / 600));
+    },
+    { passive: false },
+  );
+  view.addEventListener('keydown', (e) => {
+    if (!state.camera || e.ctrlKey || e.metaKey || e.altKey) return;
+    const keys = {
+      ArrowLeft: () => (e.shiftKey ? hands.pan : hands.orbit)(-0.08, 0),
+      ArrowRight: () => (e.shiftKey ? hands.pan : hands.orbit)(0.08, 0),
+      ArrowUp: () => (e.shiftKey ? hands.pan : hands.orbit)(0, -0.08),
+      ArrowDown: () => (e.shiftKey ? hands.pan : hands.orbit)(0, 0.08),
+      w: () => hands.fly(0, 0, 1),
+      s: () => hands.fly(0, 0, -1),
+      a: () => hands.fly(-1, 0, 0),
+      d: () => hands.fly(1, 0, 0),
+      q: () => hands.fly(0, 1, 0),
+      e: () => hands.fly(0, -1, 0),
+      '+': () => hands.zoom(0.9),
+      '-': () => hands.zoom(1.1),
+      Home: () => flyTo(state.home),
+    };
+    const act = keys[e.key] || keys[e.key.toLowerCase()];
+    if (act) {
+      e.preventDefault();
+      act();
+    }
+  });
+  new ResizeObserver(invalidate).observe($('stage'));
+}
+
+// ---- what is there, measuring ---------------------------------------------------------------
+async function clicked(event) {
+  const box = $('view').getBoundingClientRect(),
+    [width, height] = drawing.size;
+  const x = ((event.clientX - box.left) / box.width) * width,
+    y = ((event.clientY - box.top) / box.height) * height;
+  const local = drawing.pointAt(x, y);
+  if (state.alone) {
+    if (!local) {
+      $('picked').textContent = 'Nothing is there.';
+      return;
+    }
+    if (state.measuring) return mark(local);
+    const depth = dot(add(local, state.camera.eye, -1), axesOf(state.camera)[2]);
+    $('picked').textContent = `${depth.toPrecision(3)} from the camera`;
+    return;
+  }
+  const query = new URLSearchParams({
+    camera_to_world: matrixOf(state.camera),
+    fx: focalOf(state.camera, height),
+    width,
+    height,
+    x,
+    y,
+  });
+  if (state.understood && !state.measuring) {
+    for (const name of new Set([...state.words.map((word) => word.text), ...NAMES]))
+      query.append('label', name);
+  }
+  if (!state.measuring) $('picked').textContent = 'looking …';
+  const found = await server.json(`/v1/scenes/${state.scene.id}/pick?${query}`);
+  if (!found.point) {
+    $('picked').textContent = 'Nothing is there.';
+    return;
+  }
+  if (state.measuring) return mark(found.point);
+  const names = found.labels
+    .filter(({ relevancy }) => relevancy >= 0.5)
+    .slice(0, 3)
+    .map(({ text, relevancy }) => `${text} (${relevancy.toFixed(2)})`);
+  const what = names.length
+    ? `This looks like: ${names.join(', ')}.`
+    : state.understood
+      ? 'No name of the list fits.'
+      : 'Names are known after the first word.';
+  $('picked').textContent =
+    `${what} ${found.depth.toPrecision(3)} from the camera, at ` +
+    `${found.point.map((v) => v.toPrecision(4)).join(', ')}.`;
+}
+
+function mark(point) {
+  state.marks = state.marks.length === 1 ? [...state.marks, point] : [point];
+  const [a, b] = state.marks;
+  $('picked').textContent = b
+    ? `${length(add(a, b, -1)).toPrecision(4)} units of the capture between the two points.`
+    : 'Now click the second point.';
+  invalidate();
+}
+
+// ---- words ----------------------------------------------------------------------------------
+async function find(text) {
+  text = text.trim();
+  if (!text || !state.scene) return;
+  if (state.words.some((word) => word.text === text)) return;
+  let result = state.known.find((one) => one.text === text),
+    floor = state.floor || 0;
+  if (!result) {
+    if (state.alone)
+      throw new Error(
+        `This file knows: ${state.known.map((one) => one.text).join(', ') || 'no words'}.`,
+      );
+    say('looking …');
+    const id = state.scene.id,
+      stop = new AbortController();
+    // The first text has the semantics made, and their stages come as events meanwhile.
+    if (!state.understood) server.watch(id, (e) => progress(e), stop.signal).catch(() => {});
+    try {
+      const body = JSON.stringify({ texts: [text] });
+      const answer = await server.json(`/v1/scenes/${id}/query`, { method: 'POST', body });
+      result = answer.results[0];
+      floor = state.floor = answer.scoring.coverage_floor;
+    } finally {
+      stop.abort();
+      $('progress').hidden = true;
+    }
+    state.known.push(result);
+    // Entries of the Gaussians are new: once.
+    if (!state.understood) await load(id, state.camera);
+  }
+  if (state.words.length === WORDS.length) state.words.shift();
+  state.words.push({ ...result, cut: Number($('cut').value) });
+  showWords();
+  const parts = result.parts.length;
+  say(
+    [
+      `${text}: ${count(result.gaussians)} Gaussians in ${parts} part${parts === 1 ? '' : 's'}`,
+      ...result.warnings.map((warning) => warning.message),
+    ].join('\n'),
+  );
+}
+
+function showWords() {
+  drawing.ask(state.words, state.floor || 0);
+  $('words').replaceChildren(
+    ...state.words.map((word, k) => {
+      const swatch = make('span', { className: 'swatch' });
+      swatch.style.background = css(k);
+      const remove = make('button', { textContent: '×', title: `Remove ${word.text}` });
+      remove.setAttribute('aria-label', `Remove ${word.text}`);
+      remove.onclick = () => {
+        state.words.splice(k, 1);
+        showWords();
+      };
+      const parts = make(
+        'div',
+        { className: 'parts' },
+        ...word.parts.slice(0, 8).map((part, i) => {
+          const go = make('button', { textContent: `part ${i + 1}` });
+          go.setAttribute(
+            'aria-label',
+            `Fly to part ${i + 1} of ${word.text}, ${part.gaussians} Gaussians`,
+          );
+          go.onclick = () => {
+            const away = Math.max(1.2 * length(part.size), 0.1 * state.scene.unit);
+            const back = unit(add(state.camera.eye, part.center, -1));
+            flyTo({ ...state.camera, target: part.center, eye: add(part.center, back, away) });
+          };
+          return go;
+        }),
+      );
+      return make('li', {}, swatch, make('strong', { textContent: word.text }), ' ', remove, parts);
+    }),
+  );
+  remember();
+}
+
+// ---- scenes ---------------------------------------------------------------------------------
+async function list(after) {
+  const page = await server.json(
+    '/v1/scenes' + (after ? `?after=${encodeURIComponent(after)}` : ''),
+  );
+  if (!after) $('scenes').replaceChildren();
+  for (const item of page.scenes) {
+    const when = new Date(item.created_ms);
+    const button = make('button', {
+      textContent: `${item.id.slice(0, 8)} · ${item.state} · ${when.toLocaleString('en-GB')}`,
+      onclick: () => open(item.id).catch(failed),
+    });
+    button.dataset.id = item.id;
+    button.setAttribute('aria-current', String(state.scene?.id === item.id));
+    $('scenes').append(make('li', {}, button));
+  }
+  $('more').hidden = !page.next;
+  $('more').onclick = () => list(page.next).catch(failed);
+}
+
+function progress(event) {
+  if (event.event === 'queued') say(`waiting, ${event.ahead} ahead`);
+  if (event.event !== 'running') return;
+  say(`${event.stage}: ${Math.round(100 * event.fraction)} %`);
+  $('progress').hidden = false;
+  $('progress').value = event.fraction;
+}
+
+// Opens a scene: waits for one that is being made, then loads and shows it.
+async function open(id, camera, words = []) {
+  watching?.abort();
+  watching = new AbortController();
+  const { signal } = watching;
+  const path = `/v1/scenes/${encodeURIComponent(id)}`;
+  let scene = await server.json(path);
+  if (scene.state === 'queued' || scene.state === 'running') {
+    try {
+      await server.watch(id, (e) => progress(e), signal);
+    } catch (e) {
+      if (signal.aborted) return;
+      throw e;
+    }
+    scene = await server.json(path);
+    list().catch(failed);
+  }
+  $('progress').hidden = true;
+  if (scene.state !== 'done') {
+    const why = scene.error ? scene.error.message : `the scene is ${scene.state}`;
+    blame(why);
+    throw new Error(why);
+  }
+  if (state.scene?.id !== id) Object.assign(state, { words: [], known: [], kept: [], marks: [] });
+  for (const warning of scene.report.warnings) blame(warning.message);
+  await load(id, camera);
+  about(scene.report);
+  for (const b of $('scenes').querySelectorAll('button'))
+    b.setAttribute('aria-current', String(b.dataset.id === id));
+  for (const word of words) await find(word);
+}
+
+// Loads the Gaussians, the largest first, and shows them as they come.
+async function load(id, camera) {
+  loading?.abort();
+  loading = new AbortController();
+  const begun = performance.now();
+  const answer = await server.call(`/v1/scenes/${id}/export?format=packed`, {
+    signal: loading.signal,
+  });
+  await take(answer.body, camera);
+  say(`${count(drawing.count)} Gaussians, ${Math.round(performance.now() - begun)} ms`);
+}
+
+async function take(stream, camera) {
+  await readPacked(
+    stream,
+    (header, backdrop, most) => {
+      state.scene = header;
+      state.understood = header.understood;
+      document.body.classList.add('shown');
+      drawing.begin(header, backdrop, most);
+      state.home = cameraOf(header.cameras[0], header.unit);
+      $('photo').replaceChildren(
+        make('option', { textContent: 'go to …', value: '' }),
+        ...header.cameras.map((one, i) => make('option', { textContent: one.file, value: i })),
+      );
+      if (state.words.length) showWords();
+      look(camera || state.home, true);
+      if (header.gaussians > most)
+        say(`The ${count(most)} largest of ${count(header.gaussians)} Gaussians.`);
+    },
+    (first, words) => drawing.append(first, words),
+  );
+  remember();
+}
+
+function about(report) {
+  const times = report.stages
+    .map(({ stage, ms }) => `${stage} ${(ms / 1000).toFixed(1)} s`)
+    .join(', ');
+  $('about').textContent = [
+    `${count(report.gaussians)} Gaussians of ${report.views_used} of ${report.photos} photos`,
+    times,
+    ...report.warnings.map((warning) => `${warning.code}: ${warning.message}`),
+  ].join('\n');
+}
+
+// ---- the link -------------------------------------------------------------------------------
+// The scene, the pose, the words and the picture are in the fragment, which no server sees.
+function fragment() {
+  const { eye, target, up, fov } = state.camera,
+    parts = new URLSearchParams();
+  if (!state.alone) parts.set('scene', state.scene.id);
+  parts.set('pose', [...eye, ...target, ...up, fov].map((v) => Number(v.toPrecision(9))).join(','));
+  for (const word of state.words) parts.append('text', word.text);
+  if (state.kind) parts.set('kind', KINDS[state.kind]);
+  return `#${parts}`;
+}
+
+function remember() {
+  if (state.scene && state.camera) history.replaceState(null, '', fragment());
+}
+
+function fromLink() {
+  const parts = new URLSearchParams(location.hash.slice(1));
+  const numbers = (parts.get('pose') || '').split(',').map(Number);
+  let camera = null;
+  if (numbers.length === 10 && numbers.every(Number.isFinite)) {
+    camera = {
+      eye: numbers.slice(0, 3),
+      target: numbers.slice(3, 6),
+      up: numbers.slice(6, 9),
+      fov: numbers[9],
+    };
+  }
+  const kind = Math.max(0, KINDS.indexOf(parts.get('kind')));
+  return {
+    scene: parts.get('scene'),
+    camera,
+    words: parts.getAll('text').slice(0, WORDS.length),
+    kind,
+  };
+}
+
+// ---- a capture ------------------------------------------------------------------------------
+let rows = [];
+function showCapture(capture) {
+  rows = capture.rows;
+  $('faults').replaceChildren(...capture.faults.map((text) => make('li', { textContent: text })));
+  $('photos').replaceChildren(
+    ...rows.map((row) => {
+      row.node = make('li', {}, make('span', { textContent: row.name }));
+      for (const text of row.faults)
+        row.node.append(make('div', { className: 'fault', textContent: text }));
+      if (row.note) row.node.append(make('div', { textContent: row.note }));
+      return row.node;
+    }),
+  );
+}
+
+// Puts what the server says to the photos that it names, or above all of them.
+function blame(message) {
+  const named = rows.filter((row) => message.includes(fileName(row.name)));
+  for (const row of named)
+    row.node.append(make('div', { className: 'fault', textContent: message }));
+  if (!named.length && rows.length) $('faults').append(make('li', { textContent: message }));
+}
+
+async function upload(files) {
+  if (!files.length) return;
+  const capture = await readCapture(files);
+  showCapture(capture);
+  const wrong = capture.rows.filter((row) => row.faults.length).length;
+  if (capture.faults.length || wrong) {
+    say(
+      wrong
+        ? `${wrong} photo${wrong === 1 ? ' is' : 's are'} wrong; nothing was sent.`
+        : 'Nothing was sent.',
+    );
+    return;
+  }
+  say('sending …');
+  $('progress').hidden = false;
+  try {
+    const made = await server.send('/v1/scenes', capture.form, (share) => {
+      $('progress').value = share;
+    });
+    await list();
+    await open(made.id);
+  } catch (error) {
+    $('progress').hidden = true;
+    blame(error.message);
+    failed(error);
+  }
+}
+
+// ---- files out ------------------------------------------------------------------------------
+function download(blob, name) {
+  const url = URL.createObjectURL(blob),
+    link = make('a', { href: url, download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(url), 60000);
+}
+
+function picture() {
+  drawing.draw(state.camera, state.kind);
+  $('view').toBlob((blob) =>
+    download(blob, `segsplat-${(state.scene.id || 'scene').slice(0, 8)}.png`),
+  );
+  invalidate();
+}
+
+async function exportAs(format) {
+  const query = new URLSearchParams({ format });
+  if (format === 'html' && state.words.length)
+    query.set('text', state.words.map((word) => word.text).join('\n'));
+  say('writing the file …');
+  const answer = await server.call(`/v1/scenes/${state.scene.id}/export?${query}`);
+  const name = /filename="([^"]+)"/.exec(answer.headers.get('content-disposition') || '');
+  download(await answer.blob(), name ? name[1] : `scene.${format}`);
+  say('the file is written');
+}
+
+// ---- begin ----------------------------------------------------------------------------------
+function bind() {
+  bindView();
+  const ready = (act) => () => state.camera && act();
+  $('kind').onchange = () => {
+    state.kind = Number($('kind').value);
+    remember();
+    invalidate();
+  };
+  $('photo').onchange = ready(() => {
+    const photo = state.scene.cameras[Number($('photo').value)];
+    if ($('photo').value !== '' && photo) flyTo(cameraOf(photo, state.scene.unit));
+  });
+  const toggle = (id, name) =>
+    ready(() => {
+      state[name] = !state[name];
+      $(id).setAttribute('aria-pressed', String(state[name]));
+      if (name === 'measuring') {
+        state.marks = [];
+        $('picked').textContent = state.measuring ? 'Click two points.' : '';
+      }
+      invalidate();
+    });
+  $('frusta').onclick = toggle('frusta', 'frusta');
+  $('measure').onclick = toggle('measure', 'measuring');
+  $('save').onclick = ready(() => {
+    const camera = state.camera,
+      button = make('button', { textContent: `view ${state.kept.length + 1}` });
+    state.kept.push(camera);
+    button.onclick = () => flyTo(camera);
+    $('kept').append(make('li', {}, button));
+  });
+  $('share').onclick = ready(async () => {
+    remember();
+    try {
+      await navigator.clipboard.writeText(location.href);
+      say('The link is copied: it has the scene, the view and the words.');
+    } catch {
+      say(`The link: ${location.href}`);
+    }
+  });
+  $('shot').onclick = ready(picture);
+  $('export').onchange = ready(() => {
+    const format = $('export').value;
+    $('export').value = '';
+    if (format) exportAs(format).catch(failed);
+  });
+  $('ask').onsubmit = (e) => {
+    e.preventDefault();
+    find($('text').value)
+      .then(() => {
+        $('text').value = '';
+      })
+      .catch(failed);
+  };
+  $('cut').oninput = () => {
+    const cut = Number($('cut').value);
+    $('cut-says').textContent = cut.toFixed(2);
+    for (const word of state.words) word.cut = cut;
+    invalidate();
+  };
+  $('files').onchange = $('folder').onchange = (e) => {
+    const files = [...e.target.files].map((file) => ({
+      path: file.webkitRelativePath || file.name,
+      file,
+    }));
+    upload(files).catch(failed);
+    e.target.value = '';
+  };
+  addEventListener('dragover', (e) => {
+    e.preventDefault();
+    $('drop').classList.add('over');
+  });
+  addEventListener('dragleave', () => $('drop').classList.remove('over'));
+  addEventListener('drop', (e) => {
+    e.preventDefault();
+    $('drop').classList.remove('over');
+    if (!state.alone) dropped(e.dataTransfer).then(upload).catch(failed);
+  });
+  $('key-form').onsubmit = (e) => {
+    e.preventDefault();
+    server.key = $('key').value;
+    $('key-form').hidden = true;
+    list()
+      .then(() => say('Choose a scene.'))
+      .catch(failed);
+  };
+  $('theme').onclick = () => {
+    const dark =
+      getComputedStyle(document.documentElement).getPropertyValue('color-scheme').trim() ===
+        'dark' ||
+      (!document.documentElement.dataset.theme &&
+        matchMedia('(prefers-color-scheme: dark)').matches);
+    document.documentElement.dataset.theme = dark ? 'light' : 'dark';
+  };
+  addEventListener('hashchange', () => follow().catch(failed));
+}
+
+async function follow() {
+  const { scene, camera, words, kind } = fromLink();
+  state.kind = kind;
+  $('kind').value = String(kind);
+  if (state.alone) {
+    if (camera) look(camera, true);
+    return;
+  }
+  if (scene) await open(scene, camera, words);
+}
+
+async function begin() {
+  bind();
+  drawing = new Drawing($('view'), invalidate);
+  const packed = $('packed');
+  if (!packed) {
+    await Promise.all([list(), follow()]);
+    return;
+  }
+  state.alone = true;
+  document.body.classList.add('alone');
+  const answer = JSON.parse($('texts').textContent),
+    link = fromLink();
+  state.known = answer ? answer.results : [];
+  state.floor = answer ? answer.scoring.coverage_floor : 0;
+  $('known').append(...state.known.map(({ text }) => make('option', { value: text })));
+  const coded = packed.textContent,
+    step = 1 << 20;
+  let at = 0;
+  await take(
+    new ReadableStream({
+      pull(to) {
+        if (at >= coded.length) return to.close();
+        to.enqueue(Uint8Array.from(atob(coded.slice(at, (at += step))), (c) => c.charCodeAt(0)));
+      },
+    }),
+    link.camera,
+  );
+  state.kind = link.kind;
+  const names = state.known.map((one) => one.text).join(', ');
+  say(`${count(drawing.count)} Gaussians. ${names && `Words: ${names}`}`);
+  const words = link.words.length ? link.words : state.known.slice(0, 1).map((one) => one.text);
+  for (const word of words) await find(word);
+}
+
+// For other pages' scripts and for tests: the camera, and one frame as it is drawn now.
+globalThis.segsplat = {
+  state,
+  look,
+  find,
+  cameraOf,
+  matrixOf,
+  focalOf,
+  get drawing() {
+    return drawing;
+  },
+  pixels() {
+    drawing.draw(state.camera, state.kind);
+    return $('view').toDataURL('image/png');
+  },
+};
+begin().catch(failed);

@@ -1,0 +1,116 @@
+// Reads a packed scene (src/service/packed.rs) as it comes, and sorts it in a worker.
+const RECORD = 32,
+  MOST = 4 << 20,
+  CELLS = [128, 64];
+
+// Calls head(header, backdrop, count) once, then part(first, words) for whole Gaussians as they
+// come, the largest first. Of a scene over MOST Gaussians the smallest are left out.
+async function readPacked(stream, head, part) {
+  const reader = stream.getReader();
+  let kept = new Uint8Array(0),
+    header = null,
+    done = 0,
+    count = 0;
+  const backdrop = 3 * CELLS[0] * CELLS[1];
+  for (;;) {
+    const { value, done: end } = await reader.read();
+    if (value) {
+      const joined = new Uint8Array(kept.length + value.length);
+      joined.set(kept);
+      joined.set(value, kept.length);
+      kept = joined;
+    }
+    if (!header && kept.length >= 4) {
+      const size = new DataView(kept.buffer).getUint32(0, true),
+        start = 4 + size + backdrop;
+      if (kept.length >= start) {
+        header = JSON.parse(new TextDecoder().decode(kept.subarray(4, 4 + size)));
+        count = Math.min(header.gaussians, MOST);
+        head(header, kept.slice(4 + size, start), count);
+        kept = kept.slice(start);
+      }
+    }
+    // Parts of some size: each costs a copy to the worker.
+    const whole = header ? Math.min(Math.floor(kept.length / RECORD), count - done) : 0;
+    if (whole > 0 && (end || done + whole === count || kept.length > 1 << 20)) {
+      const bytes = kept.slice(0, whole * RECORD);
+      part(done, new Uint32Array(bytes.buffer));
+      done += whole;
+      kept = kept.slice(whole * RECORD);
+    }
+    if (header && done === count) {
+      reader.cancel();
+      return header;
+    }
+    if (end) throw new Error('the scene ended early');
+  }
+}
+
+// Runs in the worker: a counting sort of 16 bits, farthest first. A key is the upper bits of the
+// f32 depth; what is behind has the top bit.
+function sorter() {
+  let places = new Float32Array(0),
+    photos = new Uint16Array(0),
+    known = 0;
+  let depths = new Float32Array(0);
+  onmessage = ({ data }) => {
+    if (data.count !== undefined) {
+      places = new Float32Array(3 * data.count);
+      photos = new Uint16Array(data.count);
+      depths = new Float32Array(data.count);
+      known = 0;
+    } else if (data.words) {
+      const floats = new Float32Array(data.words.buffer),
+        n = data.words.length / 8;
+      for (let i = 0; i < n; i++) {
+        places.set(floats.subarray(8 * i, 8 * i + 3), 3 * (data.first + i));
+        photos[data.first + i] = data.words[8 * i + 7] & 0xffff;
+      }
+      known = data.first + n;
+    } else {
+      const begun = performance.now();
+      const {
+        eye,
+        axis: [ax, ay, az],
+        near,
+        behind,
+      } = data;
+      const bits = new Uint32Array(depths.buffer),
+        shift0 = ax * eye[0] + ay * eye[1] + az * eye[2];
+      let low = 0xffffffff,
+        high = 0,
+        n = 0;
+      for (let i = 0; i < known; i++) {
+        const z = ax * places[3 * i] + ay * places[3 * i + 1] + az * places[3 * i + 2] - shift0;
+        depths[i] = z;
+        if (!(z >= near)) {
+          depths[i] = 0;
+          continue;
+        }
+        n++;
+        const b = bits[i];
+        if (b < low) low = b;
+        if (b > high) high = b;
+      }
+      let shift = 0;
+      while (high > low && (high - low) >>> shift > 0x7fff) shift++;
+      const starts = new Uint32Array(0x10001);
+      // Whole rows of a texture.
+      const order = new Uint32Array(2048 * Math.max(1, Math.ceil(n / 2048)));
+      const key = (i) => 0xffff - (((bits[i] - low) >>> shift) | (behind[photos[i]] ? 0x8000 : 0));
+      for (let i = 0; i < known; i++) if (bits[i]) starts[key(i) + 1]++;
+      for (let k = 0; k < 0x10000; k++) starts[k + 1] += starts[k];
+      for (let i = 0; i < known; i++) if (bits[i]) order[starts[key(i)]++] = i;
+      const ms = performance.now() - begun;
+      postMessage({ order, drawn: n, number: data.number, known, ms }, [order.buffer]);
+    }
+  };
+}
+
+// A worker of this page's own text: the policy allows workers of blobs alone.
+function startSorter() {
+  const url = URL.createObjectURL(new Blob([`(${sorter})()`], { type: 'text/javascript' }));
+  const worker = new Worker(url);
+  URL.revokeObjectURL(url);
+  return worker;
+}
