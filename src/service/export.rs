@@ -58,8 +58,8 @@ impl Service {
         }
         let Some(text) = &ask.text else {
             let access = access.finished()?;
-            let digest = hash(&meaning_tag(access.record()));
             let scene = blocking(move || inner.load(&access)).await??;
+            let digest = hash(&meaning_tag(&scene));
             let file = PlyFile::new(scene.gaussians.clone(), scene.semantics.as_deref())?;
             return Ok(ply(format!("{id}.ply"), format!("{digest}-ply"), file));
         };

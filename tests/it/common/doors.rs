@@ -540,6 +540,7 @@ pub(crate) fn messages(upload: &Upload, options: &Options) -> Vec<pb::CreateScen
         bundle: options.bundle.unwrap_or_default().to_owned(),
         max_views: None,
         method: None,
+        refine: String::new(),
         wait_ms: options.wait_ms,
         idempotency_key: options.idempotency_key.clone().unwrap_or_default(),
     };
