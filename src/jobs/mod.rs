@@ -1,8 +1,8 @@
 //! Jobs: a bounded queue, workers, progress for watchers, and a way to stop each job.
 //!
-//! A job makes a scene of an upload, or the semantics of a scene, or refines it. In: an upload, safe in the store
-//! before `Jobs::submit` returns. Out: a scene in the store. Invariant: an acknowledged scene is
-//! made, fails with a code, or is cancelled, over any restart.
+//! A job makes a scene of an upload, or the semantics of a scene, or refines it. In: an upload,
+//! safe in the store before `Jobs::submit` returns. Out: a scene in the store. Invariant: an
+//! acknowledged scene is made, fails with a code, or is cancelled, over any restart.
 
 mod job;
 mod networks;
@@ -82,8 +82,8 @@ pub(crate) struct Jobs {
     replicas: Box<dyn Replicas>,
     /// Workers that make scenes and live.
     workers: AtomicUsize,
-    /// Content hashes that workers make scenes of, ids of scenes that they change, and a signal when
-    /// one ends.
+    /// Content hashes that workers make scenes of, ids of scenes that they change, and a
+    /// signal when one ends.
     contents: Mutex<HashSet<String>>,
     content_free: Condvar,
     /// Milliseconds that the last scenes took, smoothed; 0 before the first.

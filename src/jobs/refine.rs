@@ -3,8 +3,8 @@
 //!
 //! It goes behind everything else: before each step it waits until no scene and no semantics are
 //! made and no view was drawn for a moment. Where views never end it takes a step now and then. It
-//! holds no slot and no room. What it still has to do is in the record, so that a start goes on from
-//! the version that was published last.
+//! holds no slot and no room. What it still has to do is in the record, so that a start goes on
+//! from the version that was published last.
 
 use std::{
     sync::Arc,

@@ -21,8 +21,8 @@ pub(super) fn check(refine: Refine, limits: &Limits) -> Result<()> {
 }
 
 impl Service {
-    /// Refines a finished scene while it is served, or ends its refinement (`off`). Gives its status
-    /// at once. A refinement that is on its way goes on as it was asked for.
+    /// Refines a finished scene while it is served, or ends its refinement (`off`). Gives its
+    /// status at once. A refinement that is on its way goes on as it was asked for.
     ///
     /// # Errors
     /// `scene_not_found`, `scene_not_ready`; `invalid_request` for a time out of range, and where

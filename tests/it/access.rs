@@ -233,7 +233,8 @@ fn every_call_of_both_doors_has_its_scope_in_the_table() {
         .filter(|route| route.scope == Some(Scope::Write))
         .map(|route| format!("{} {}", route.method, route.path))
         .collect();
-    assert_eq!(writes, ["POST /v1/scenes", "DELETE /v1/scenes/{id}"]);
+    let want = ["POST /v1/scenes", "DELETE /v1/scenes/{id}", "POST /v1/scenes/{id}/refine"];
+    assert_eq!(writes, want);
 }
 
 #[tokio::test]

@@ -160,7 +160,7 @@ pub(super) async fn refine(
     params(Id),
     responses((
         status = 200, content_type = "text/event-stream", body = String,
-        description = "Events queued, running, done, version, failed, cancelled, each with JSON data"
+        description = "Events queued, running, done, version, failed, cancelled, with JSON data"
     ))
 )]
 pub(super) async fn events(

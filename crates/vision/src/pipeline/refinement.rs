@@ -1,5 +1,5 @@
-//! What refinement needs of the other stages: photos at the size at which they are learnt, the scene
-//! of the photos that are not held out, and semantics that follow other Gaussians.
+//! What refinement needs of the other stages: photos at the size at which they are learnt, the
+//! scene of the photos that are not held out, and semantics that follow other Gaussians.
 
 use super::Reconstruction;
 use crate::{

@@ -11,8 +11,8 @@
 //! scene as it is served. They must not be in the Gaussians that come in either: make the scene of
 //! the others ([`split`]).
 //!
-//! **One set.** A scene that comes in may be served in layers and with magnification. What comes out
-//! is plain: the same Gaussians for every view and for other programs.
+//! **One set.** A scene that comes in may be served in layers and with magnification. What comes
+//! out is plain: the same Gaussians for every view and for other programs.
 
 mod adam;
 mod loss;
@@ -244,8 +244,9 @@ struct Refinement<'a> {
 
 /// Refines `start` on the photos that are learnt and watches the held-out ones, none of which is in
 /// `start`. The photos are used at the size that they have. Before each step `pace` gets the share
-/// of the budget that is spent, 0..1; it may wait, which is not counted, and its error ends the work.
-/// Each better version goes to `publish`. Returns the best one: `start` itself where none was better.
+/// of the budget that is spent, 0..1; it may wait, which is not counted, and its error ends the
+/// work. Each better version goes to `publish`. Returns the best one: `start` itself where none was
+/// better.
 ///
 /// A scene that was refined before goes on as its report says. Without held-out photos at most
 /// [`UNWATCHED_STEPS_MAX`] steps are taken, and the last version is the one.
