@@ -116,6 +116,17 @@ impl Jobs {
         kept
     }
 
+    /// Keeps a record of the job. A refinement that is ended meanwhile stays ended in the store.
+    fn keep_beside_orders(&self, record: &Record) -> Result<()> {
+        self.parts.store.put_record(record)?;
+        match self.records.find(&record.status.id) {
+            Some(now) if now.refine.is_some() != record.refine.is_some() => {
+                self.parts.store.put_record(&now)
+            }
+            _ => Ok(()),
+        }
+    }
+
     /// The refinement that a scene is to have once it is done, where its create call or the
     /// configuration asks for one and the queue has room.
     pub(super) fn first_order(&self, done: &Record) -> Option<RefineOrder> {
@@ -147,7 +158,7 @@ impl Jobs {
         });
         let Some(record) = begun else { return Ok(()) };
         let Some(order) = record.refine else { return Ok(()) };
-        self.parts.store.put_record(&record)?;
+        self.keep_beside_orders(&record)?;
         if order.attempts > ATTEMPTS_MAX {
             return Err(Error::internal(format!(
                 "given up: the server stopped {ATTEMPTS_MAX} times without a better version"
@@ -208,10 +219,9 @@ impl Jobs {
             let made = [Kind::Scene, Kind::Semantics];
             let makes = |kind| self.queue.len(kind) > 0 || !self.running.scenes(kind).is_empty();
             let drawn = (self.parts.drawn)();
-            if !made.into_iter().any(makes) {
-                if drawn.is_none_or(|ago| ago >= QUIET) || begun.elapsed() >= PATIENCE {
-                    return Ok(());
-                }
+            let quiet = drawn.is_none_or(|ago| ago >= QUIET) || begun.elapsed() >= PATIENCE;
+            if quiet && !made.into_iter().any(makes) {
+                return Ok(());
             }
             std::thread::sleep(LOOK);
         }
@@ -236,10 +246,8 @@ impl Jobs {
         };
         change(&mut record);
         store.put_status(&record)?;
-        let shown = self.records.update(id, change);
-        // Where it was ended just now, the record that is kept must say so too.
-        if let Some(shown) = shown.filter(|shown| shown.refine.is_none()) {
-            store.put_status(&shown)?;
+        if let Some(shown) = self.records.update(id, change) {
+            self.keep_beside_orders(&shown)?;
         }
         let psnr = version.report.psnr_after;
         tracing::info!(scene = %id, version = record.status.version, psnr, "refined");

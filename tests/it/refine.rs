@@ -137,7 +137,7 @@ async fn better_versions_take_the_place_of_a_scene_and_its_watchers_are_told() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_refinement_goes_on_after_a_restart_until_it_is_ended_and_its_version_stays() {
-    let (server, _) = server(8_000).await;
+    let (server, _) = server(16_000).await;
     let options = SceneOptions { refine: Some(LONG), ..SceneOptions::default() };
     let made = scene(&server, options).await;
     assert_eq!((made.state, made.refinement.state), (SceneState::Done, RefineState::Running));

@@ -157,7 +157,8 @@ fn refined(
     published: &mut Vec<RefinedVersion>,
 ) -> RefinedVersion {
     let cpu = CpuRenderer::new(2).expect("two threads");
-    let (learnt, out) = split(photos.to_vec());
+    let all = photos.to_vec();
+    let (learnt, out) = split(all);
     let options = RefineOptions { budget: RefineBudget::steps(steps), ..RefineOptions::default() };
     let publish = &mut |version: &RefinedVersion| {
         published.push(version.clone());
