@@ -15,6 +15,7 @@ use crate::{
     models::{NetworkOptions, ProviderChoice},
     names::named,
     render::{RendererChoice, RendererOptions},
+    scene::Refine,
 };
 
 /// Threads for each scene that is made at the same time as others, and most such scenes.
@@ -128,6 +129,10 @@ options! {
         /// Scenes made at the same time, each on its share of the threads; 0: one for each four
         /// threads, and one at a time in a network [default: 0]
         "SEGSPLAT_JOBS" jobs: usize = 0,
+        /// Whether finished scenes are refined where the create call does not say: where it is
+        /// known to help, never, or for so many milliseconds [default: off]
+        #[arg(value_name = "auto|off|MILLISECONDS")]
+        "SEGSPLAT_REFINE" refine: Refine = Refine::Off,
         /// File of API keys (TOML, made by `segsplat keys new`); read again at SIGHUP
         #[arg(value_name = "FILE")]
         "SEGSPLAT_KEYS" keys: PathBuf,
@@ -273,7 +278,12 @@ impl Config {
                 || (!name.is_empty() && name.bytes().all(plain))
         };
         let odd_host = self.allowed_hosts.iter().find(|name| !is_host(name));
-        let wrong = if !(1..=1024).contains(&self.threads) {
+        let refine_max = limits.refine_ms_max;
+        let wrong = if let Refine::Ms(ms) = self.refine
+            && !(1..=refine_max).contains(&ms)
+        {
+            format!("refine is {ms} ms; it must be 1 to {refine_max}")
+        } else if !(1..=1024).contains(&self.threads) {
             format!("threads is {}; it must be 1 to 1024", self.threads)
         } else if self.jobs > 64 {
             format!("jobs is {}; it must be 0 to 64", self.jobs)

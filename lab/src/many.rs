@@ -5,7 +5,7 @@
 //! are whole photos of one set of Gaussians over the backdrop, without layers.
 
 use std::{
-    sync::{Arc, atomic::AtomicBool},
+    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -15,16 +15,15 @@ use crate::{
     error::{Error, Result},
     limits::Limits,
     metrics::{clamped, psnr, to_unit},
-    models::{ResizeFilter, fit},
     photo_files,
-    pipeline::Pipeline,
+    pipeline::{Pipeline, refinement::at_side},
     refine::{RefineBudget, RefineOptions, held_out, refine, split},
     render::{
-        Background, Frame, Kinds, RenderRequest, Renderer, Switches,
+        Background, Frame, Kinds, RenderRequest, Switches,
         plan::{default_near, served},
     },
     rows::{Rows, ms, progress},
-    scene::{Camera, Gaussians, Photo, PosedPhoto, SceneOptions},
+    scene::{Camera, Gaussians, PosedPhoto, SceneOptions},
     scenes::{is_posed, make, scene_of, use_of, view_request},
     setup::Inputs,
 };
@@ -49,8 +48,8 @@ pub(crate) struct Args {
     refine_ms: Option<u64>,
     /// Longer side of the photos that refinement sees, pixels: what is learnt smaller than it is
     /// shown has gaps
-    #[arg(long, default_value_t = 640)]
-    refine_side: u32,
+    #[arg(long)]
+    refine_side: Option<u32>,
     /// Most Gaussians that refinement begins with
     #[arg(long)]
     gaussians_max: Option<usize>,
@@ -74,7 +73,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             return Err(Error::invalid(format!("{name}: {} photos are too few", all.len())));
         }
         let refines = args.refine_steps.is_some() || args.refine_ms.is_some();
-        let (learnt, out) = if refines { split(&given) } else { (given.clone(), Vec::new()) };
+        let (learnt, out) =
+            if refines { split(given.clone()) } else { (given.clone(), Vec::new()) };
         let begun = Instant::now();
         let scene = scene_of(make(&engine, &learnt, &options)?);
         let create_ms = ms(begun);
@@ -105,28 +105,28 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         });
         if refines {
             let budget = match (args.refine_steps, args.refine_ms) {
-                (Some(steps), _) => RefineBudget::Steps(steps),
-                (_, ms) => RefineBudget::Time(Duration::from_millis(ms.unwrap_or_default())),
+                (Some(steps), _) => RefineBudget::steps(steps),
+                (_, ms) => {
+                    let time = Duration::from_millis(ms.unwrap_or_default());
+                    RefineBudget { steps: u32::MAX, time }
+                }
             };
             let plain = RefineOptions::default();
             let rates = plain.rates.scaled(args.rate);
             let gaussians_max = args.gaussians_max.unwrap_or(plain.gaussians_max);
-            let options = RefineOptions { budget, rates, gaussians_max, ..plain };
-            let side = |photos: &[PosedPhoto]| -> Vec<PosedPhoto> {
-                photos.iter().map(|photo| at_side(photo, args.refine_side)).collect()
+            let side = args.refine_side.unwrap_or(plain.side);
+            let options = RefineOptions { budget, rates, gaussians_max, side, ..plain };
+            let sized = |photos: &[PosedPhoto]| -> Vec<PosedPhoto> {
+                photos.iter().map(|photo| at_side(photo, side)).collect()
             };
-            let photos = (&side(&learnt)[..], &side(&out)[..]);
+            let photos = (&sized(&learnt)[..], &sized(&out)[..]);
             let (begun, cpu) = (Instant::now(), cpu_seconds());
-            let extent = scene.meta.report.median_depth;
             let mut steps = 0;
             let publish = &mut |version: &crate::refine::RefinedVersion| {
                 steps = version.report.steps;
                 Ok(())
             };
-            let start = (&scene.gaussians, &scene.backdrop);
-            let no = AtomicBool::new(false);
-            let best =
-                refine(&*renderer, start.0, start.1, photos, extent, &options, &no, publish)?;
+            let best = refine(&*renderer, &scene, photos, &options, &mut |_| Ok(()), publish)?;
             row["refine_ms"] = json!(ms(begun));
             row["refine_cpu_s"] = json!(cpu_seconds() - cpu);
             row["steps"] = json!(steps);
@@ -152,22 +152,6 @@ fn given(all: &[PosedPhoto], count: usize) -> (Vec<PosedPhoto>, Vec<PosedPhoto>)
     let pick = |i: &usize| all[*i].clone();
     let given = (0..count).map(|k| pick(&rest[spread(k)])).collect();
     (targets.iter().map(pick).collect(), given)
-}
-
-/// A photo whose longer side is `side` pixels, or as it is if that is shorter.
-fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
-    let (width, height) = (posed.photo.width, posed.photo.height);
-    let longer = width.max(height);
-    if longer <= side {
-        return posed.clone();
-    }
-    let scaled = |length: u32| (length * side).div_ceil(longer).max(1);
-    let size = [scaled(height), scaled(width)];
-    let fitted = fit(&posed.photo, &posed.camera, size, ResizeFilter::default());
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..255")]
-    let rgb = fitted.rgb.iter().map(|v| (v * 255.0).round() as u8).collect();
-    let photo = Photo { width: scaled(width), height: scaled(height), rgb, valid: fitted.valid };
-    PosedPhoto { photo, camera: fitted.camera, ..posed.clone() }
 }
 
 /// Mean PSNR of what `draw` gives at the targets' cameras.

@@ -683,6 +683,10 @@ pub struct CreateSceneHeader {
     /// How the scene is made and understood.
     #[prost(message, optional, tag = "9")]
     pub method: ::core::option::Option<Method>,
+    /// Whether the finished scene is refined: auto, off, or so many milliseconds; empty: as the server
+    /// is set.
+    #[prost(string, tag = "10")]
+    pub refine: ::prost::alloc::string::String,
     /// Camera description; left out when it is in the archive.
     #[prost(oneof = "create_scene_header::Cameras", tags = "1, 2")]
     pub cameras: ::core::option::Option<create_scene_header::Cameras>,
@@ -743,6 +747,51 @@ pub struct Scene {
     /// What can be asked of it by text.
     #[prost(message, optional, tag = "10")]
     pub semantics: ::core::option::Option<SemanticsStatus>,
+    /// Counts what was served under this id: 0 until it is done, then 1, and one more with each
+    /// better version.
+    #[prost(uint32, tag = "11")]
+    pub version: u32,
+    /// How far its refinement is.
+    #[prost(message, optional, tag = "12")]
+    pub refinement: ::core::option::Option<RefineStatus>,
+}
+/// How far the refinement of a scene is.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct RefineStatus {
+    /// Where it stands.
+    #[prost(enumeration = "RefineState", tag = "1")]
+    pub state: i32,
+    /// Share of its time that is spent, 0..1.
+    #[prost(float, tag = "2")]
+    pub fraction: f32,
+    /// Why it failed.
+    #[prost(message, optional, tag = "3")]
+    pub error: ::core::option::Option<SceneError>,
+}
+/// What refinement made of a scene. The held-out photos are in neither its Gaussians nor its steps.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct RefineReport {
+    /// Steps behind the version that is served; 0: none was better than the scene as it was made.
+    #[prost(uint32, tag = "1")]
+    pub steps: u32,
+    /// Seconds of work until that version.
+    #[prost(double, tag = "2")]
+    pub seconds: f64,
+    /// Photos held out, counted from 0 in the order of the cameras.
+    #[prost(uint32, repeated, tag = "3")]
+    pub held_out: ::prost::alloc::vec::Vec<u32>,
+    /// PSNR on the held-out photos before the first step, dB; left out where none is held out.
+    #[prost(double, optional, tag = "4")]
+    pub psnr_before: ::core::option::Option<f64>,
+    /// The same of the version that is served.
+    #[prost(double, optional, tag = "5")]
+    pub psnr_after: ::core::option::Option<f64>,
+    /// Gaussians before the first step.
+    #[prost(uint64, tag = "6")]
+    pub gaussians_before: u64,
+    /// Gaussians of the version that is served.
+    #[prost(uint64, tag = "7")]
+    pub gaussians_after: u64,
 }
 /// Why a scene failed.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -849,6 +898,9 @@ pub struct HealthReport {
     /// How it was made.
     #[prost(message, optional, tag = "13")]
     pub method: ::core::option::Option<Method>,
+    /// What refinement made of it, once it was refined.
+    #[prost(message, optional, tag = "14")]
+    pub refinement: ::core::option::Option<RefineReport>,
 }
 /// How many Gaussians were dropped or clamped for one reason.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -922,6 +974,10 @@ pub struct SceneEvent {
     /// When failed: why.
     #[prost(message, optional, tag = "5")]
     pub error: ::core::option::Option<SceneError>,
+    /// When done and being refined: the version that is served, and in `fraction` the share of the
+    /// refinement's time that is spent. The first event of a scene that is done has none.
+    #[prost(uint32, optional, tag = "6")]
+    pub version: ::core::option::Option<u32>,
 }
 /// Which scene.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -960,6 +1016,16 @@ pub struct DeleteSceneRequest {
 /// Nothing to say.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct DeleteSceneResponse {}
+/// How a scene is to be refined.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct RefineSceneRequest {
+    /// Id.
+    #[prost(string, tag = "1")]
+    pub scene_id: ::prost::alloc::string::String,
+    /// auto (also where it is empty), off, or so many milliseconds.
+    #[prost(string, tag = "2")]
+    pub refine: ::prost::alloc::string::String,
+}
 /// One view.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct RenderViewRequest {
@@ -1259,6 +1325,47 @@ impl SceneState {
             "SCENE_STATE_DONE" => Some(Self::Done),
             "SCENE_STATE_FAILED" => Some(Self::Failed),
             "SCENE_STATE_CANCELLED" => Some(Self::Cancelled),
+            _ => None,
+        }
+    }
+}
+/// Where the refinement of a scene stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum RefineState {
+    /// Not used.
+    Unspecified = 0,
+    /// Not asked for.
+    None = 1,
+    /// Waiting for its turn, or at work; the scene is served meanwhile.
+    Running = 2,
+    /// Over. The report has its figures.
+    Done = 3,
+    /// Broken off; `error` says why. The version that is served stays.
+    Failed = 4,
+}
+impl RefineState {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "REFINE_STATE_UNSPECIFIED",
+            Self::None => "REFINE_STATE_NONE",
+            Self::Running => "REFINE_STATE_RUNNING",
+            Self::Done => "REFINE_STATE_DONE",
+            Self::Failed => "REFINE_STATE_FAILED",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "REFINE_STATE_UNSPECIFIED" => Some(Self::Unspecified),
+            "REFINE_STATE_NONE" => Some(Self::None),
+            "REFINE_STATE_RUNNING" => Some(Self::Running),
+            "REFINE_STATE_DONE" => Some(Self::Done),
+            "REFINE_STATE_FAILED" => Some(Self::Failed),
             _ => None,
         }
     }
@@ -1645,6 +1752,28 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("segsplat.v1.SceneService", "DeleteScene"));
             self.inner.unary(req, path, codec).await
         }
+        /// Refines a finished scene, or ends its refinement; answers at once.
+        pub async fn refine_scene(
+            &mut self,
+            request: impl tonic::IntoRequest<super::RefineSceneRequest>,
+        ) -> std::result::Result<tonic::Response<super::Scene>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/segsplat.v1.SceneService/RefineScene",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("segsplat.v1.SceneService", "RefineScene"));
+            self.inner.unary(req, path, codec).await
+        }
         /// One rendered view.
         pub async fn render_view(
             &mut self,
@@ -1839,6 +1968,11 @@ pub mod scene_service_server {
             tonic::Response<super::DeleteSceneResponse>,
             tonic::Status,
         >;
+        /// Refines a finished scene, or ends its refinement; answers at once.
+        async fn refine_scene(
+            &self,
+            request: tonic::Request<super::RefineSceneRequest>,
+        ) -> std::result::Result<tonic::Response<super::Scene>, tonic::Status>;
         /// One rendered view.
         async fn render_view(
             &self,
@@ -2181,6 +2315,51 @@ pub mod scene_service_server {
                     let inner = self.inner.clone();
                     let fut = async move {
                         let method = DeleteSceneSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/segsplat.v1.SceneService/RefineScene" => {
+                    #[allow(non_camel_case_types)]
+                    struct RefineSceneSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::UnaryService<super::RefineSceneRequest>
+                    for RefineSceneSvc<T> {
+                        type Response = super::Scene;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::RefineSceneRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::refine_scene(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = RefineSceneSvc(inner);
                         let codec = tonic_prost::ProstCodec::default();
                         let mut grpc = tonic::server::Grpc::new(codec)
                             .apply_compression_config(

@@ -20,7 +20,7 @@ use crate::{
 
 /// The gRPC methods of the one service: name in metrics and the scope that each needs. The HTTP
 /// routes have their own list. A test compares the two.
-const RPCS: [(&str, &str, Scope); 11] = [
+const RPCS: [(&str, &str, Scope); 12] = [
     ("CreateScene", "create_scene", Scope::Write),
     ("DeleteScene", "delete_scene", Scope::Write),
     ("Export", "export", Scope::Read),
@@ -29,6 +29,7 @@ const RPCS: [(&str, &str, Scope); 11] = [
     ("ListScenes", "list_scenes", Scope::Read),
     ("Pick", "pick", Scope::Read),
     ("Query", "query", Scope::Read),
+    ("RefineScene", "refine_scene", Scope::Write),
     ("RenderView", "render_view", Scope::Read),
     ("RenderViews", "render_views", Scope::Read),
     ("WatchScene", "watch_scene", Scope::Read),

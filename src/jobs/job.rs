@@ -19,6 +19,8 @@ pub(super) enum Kind {
     Scene,
     /// The semantics of a finished scene.
     Semantics,
+    /// Better versions of a finished scene.
+    Refine,
 }
 
 impl Kind {
@@ -27,6 +29,7 @@ impl Kind {
         match self {
             Self::Scene => ("scene", "the scene"),
             Self::Semantics => ("semantics", "the scene's semantics"),
+            Self::Refine => ("refine", "the scene's refinement"),
         }
     }
 
@@ -34,6 +37,12 @@ impl Kind {
     pub(super) fn show(self, record: &mut Record, stage: Stage, fraction: f32) {
         let status = &mut record.status;
         let (shown, done) = match self {
+            // The parts of its start are none of a refinement's own time.
+            Self::Refine if stage != Stage::Refine => return,
+            Self::Refine => {
+                status.refinement.fraction = fraction;
+                return;
+            }
             Self::Scene => (&mut status.stage, &mut status.fraction),
             Self::Semantics => (&mut status.semantics.stage, &mut status.semantics.fraction),
         };
@@ -111,6 +120,13 @@ impl Running {
     /// Whether a job of this scene runs.
     pub(super) fn has(&self, scene: &SceneId) -> bool {
         self.0.lock().iter().any(|job| job.scene == *scene)
+    }
+
+    /// Stops the jobs of a kind that a scene has.
+    pub(super) fn stop_kind(&self, kind: Kind, scene: &SceneId, reason: Reason) {
+        let running = self.0.lock();
+        let jobs = running.iter().filter(|job| job.kind == kind && job.scene == *scene);
+        jobs.for_each(|job| job.stop(reason));
     }
 
     /// Scenes of the running jobs of a kind.

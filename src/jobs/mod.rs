@@ -1,14 +1,15 @@
 //! Jobs: a bounded queue, workers, progress for watchers, and a way to stop each job.
 //!
-//! A job makes a scene of an upload, or the semantics of a scene. In: an upload, safe in the store
-//! before `Jobs::submit` returns. Out: a scene in the store. Invariant: an acknowledged scene is
-//! made, fails with a code, or is cancelled, over any restart.
+//! A job makes a scene of an upload, or the semantics of a scene, or refines it. In: an upload,
+//! safe in the store before `Jobs::submit` returns. Out: a scene in the store. Invariant: an
+//! acknowledged scene is made, fails with a code, or is cancelled, over any restart.
 
 mod job;
 mod networks;
 mod photos;
 mod queue;
 mod records;
+mod refine;
 mod replicas;
 mod room;
 mod scene;
@@ -44,7 +45,8 @@ use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
     pipeline,
-    scene::{PhotoHash, SceneId, SceneState, SemanticsMode, SemanticsState, Upload},
+    render::backward::DifferentiableRenderer,
+    scene::{PhotoHash, Refine, SceneId, SceneState, SemanticsMode, SemanticsState, Upload},
     store::{self, KeyUse, Record, Store, not_found},
 };
 
@@ -59,6 +61,13 @@ pub(crate) struct JobParts {
     pub(crate) workers: usize,
     /// Whether the photos of finished scenes are kept.
     pub(crate) keep_photos: bool,
+    /// Whether scenes are refined whose create call does not say.
+    pub(crate) refine: Refine,
+    /// What refines them, with so many threads of the processor.
+    pub(crate) refiner: Arc<dyn DifferentiableRenderer>,
+    pub(crate) threads: usize,
+    /// How long ago a view was drawn, waited or was encoded; `None`: never.
+    pub(crate) drawn: Box<dyn Fn() -> Option<Duration> + Send + Sync>,
 }
 
 /// The queue, its workers and the state of every scene. The calls block on the store and fail
@@ -73,7 +82,8 @@ pub(crate) struct Jobs {
     replicas: Box<dyn Replicas>,
     /// Workers that make scenes and live.
     workers: AtomicUsize,
-    /// Content hashes that workers make scenes of, and a signal when one ends.
+    /// Content hashes that workers make scenes of, ids of scenes that they change, and a
+    /// signal when one ends.
     contents: Mutex<HashSet<String>>,
     content_free: Condvar,
     /// Milliseconds that the last scenes took, smoothed; 0 before the first.
@@ -120,6 +130,7 @@ impl Jobs {
                 start(format!("scene-{i}"), |jobs| jobs.work(Kind::Scene))?;
                 start(format!("semantics-{i}"), |jobs| jobs.work(Kind::Semantics))?;
             }
+            start("refine".to_owned(), |jobs| jobs.work(Kind::Refine))?;
             start("sweeper".to_owned(), Self::sweep)?;
             if jobs.replicas.name().is_some() {
                 start("replicas".to_owned(), |jobs| jobs.replicas.watch(jobs))?;
@@ -376,7 +387,15 @@ impl Jobs {
         if eager {
             record.status.semantics.state = SemanticsState::Running;
         }
+        let refined = record.refine.is_some() && record.status.state == SceneState::Done;
+        if refined {
+            self.mend(&mut record);
+        }
         self.records.insert(record);
+        if refined {
+            self.replicas.hold(&id);
+            self.queue.push(Kind::Refine, id.clone(), owner.as_deref());
+        }
         if eager || unfinished {
             let kind = if eager { Kind::Semantics } else { Kind::Scene };
             self.replicas.hold(&id);

@@ -156,6 +156,14 @@ impl Queue {
         });
     }
 
+    /// Takes the waiting job of one kind that a scene has out.
+    pub(super) fn remove_kind(&self, kind: Kind, id: &SceneId) {
+        self.inner.lock().lanes.retain_mut(|(lane, jobs)| {
+            jobs.retain(|other| lane.kind != kind || other != id);
+            !jobs.is_empty()
+        });
+    }
+
     /// Jobs that go before the scene `id` now; `None` when it does not wait.
     pub(crate) fn ahead(&self, id: &SceneId) -> Option<usize> {
         let inner = self.inner.lock();

@@ -15,6 +15,7 @@ use parking_lot::Mutex;
 use super::{
     JobParts, Jobs,
     job::{Kind, Reason},
+    refine,
     scene::requeue,
     semantics,
 };
@@ -216,6 +217,7 @@ impl OtherReplicas {
             jobs.parts.store.forget(id);
         }
         semantics::reset(&mut record);
+        refine::reset(&mut record);
         jobs.records.put(record);
     }
 

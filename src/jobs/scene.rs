@@ -13,8 +13,8 @@ use crate::{
     error::{Error, ErrorCode, Result},
     pipeline::Reconstruction,
     scene::{
-        Provenance, Scene, SceneId, SceneMeta, SceneState, SemanticsMode, SemanticsState,
-        SemanticsStatus, Stage, unless_cancelled,
+        Provenance, RefineState, RefineStatus, Scene, SceneId, SceneMeta, SceneState,
+        SemanticsMode, SemanticsState, SemanticsStatus, Stage, unless_cancelled,
     },
     store::{self, Record},
     telemetry::meter,
@@ -39,15 +39,16 @@ enum Made {
     New(Box<Reconstruction>, Box<Provenance>),
 }
 
-/// Keeps other workers from making a scene of the same content, until it is dropped.
-struct ContentLock<'a> {
+/// Keeps other workers from making a scene of the same content, or from changing the same scene,
+/// until it is dropped.
+pub(super) struct WorkLock<'a> {
     jobs: &'a Jobs,
-    content: String,
+    name: String,
 }
 
-impl Drop for ContentLock<'_> {
+impl Drop for WorkLock<'_> {
     fn drop(&mut self) {
-        self.jobs.contents.lock().remove(&self.content);
+        self.jobs.contents.lock().remove(&self.name);
         self.jobs.content_free.notify_all();
     }
 }
@@ -97,7 +98,7 @@ impl Jobs {
 
     /// The scene of this record: kept already, that of the same content, or made now. With it the
     /// lock of the content, where there is one.
-    fn find_or_make(&self, job: &Job, record: &Record) -> Result<(Made, Option<ContentLock<'_>>)> {
+    fn find_or_make(&self, job: &Job, record: &Record) -> Result<(Made, Option<WorkLock<'_>>)> {
         let (id, store) = (&job.scene, &self.parts.store);
         if record.attempts > 1
             && let Some((scene, digest)) = self.kept_scene(id)?
@@ -110,7 +111,7 @@ impl Jobs {
             None => store::hashes(&store.upload(id)?),
         };
         let provenance = store::provenance(files, &record.options, &networks);
-        let lock = Some(self.lock_content(&provenance.content_sha256, job)?);
+        let lock = Some(self.lock(&provenance.content_sha256, job)?);
         if let Some(known) = self.scene_of_content(&provenance.content_sha256, record)? {
             return Ok((Made::Known(known), lock));
         }
@@ -168,15 +169,16 @@ impl Jobs {
         Ok(scene.filter(|scene| scene.meta.provenance.content_sha256 == content))
     }
 
-    /// Waits until no other worker here makes a scene of the same content.
-    fn lock_content(&self, content: &str, job: &Job) -> Result<ContentLock<'_>> {
-        let mut contents = self.contents.lock();
-        while contents.contains(content) {
+    /// Waits until no other worker here has the lock of this content, or of this scene.
+    /// Fails with `cancelled`.
+    pub(super) fn lock(&self, name: &str, job: &Job) -> Result<WorkLock<'_>> {
+        let mut names = self.contents.lock();
+        while names.contains(name) {
             unless_cancelled(&job.cancel)?;
-            self.content_free.wait_for(&mut contents, Duration::from_millis(50));
+            self.content_free.wait_for(&mut names, Duration::from_millis(50));
         }
-        contents.insert(content.to_owned());
-        Ok(ContentLock { jobs: self, content: content.to_owned() })
+        names.insert(name.to_owned());
+        Ok(WorkLock { jobs: self, name: name.to_owned() })
     }
 
     /// The scene is kept under its digest, and its semantics under theirs: its record is kept, then
@@ -197,6 +199,11 @@ impl Jobs {
         done.status.updated_ms = store::now_ms();
         done.status.report = Some(meta.report.clone());
         done.status.cameras.clone_from(&meta.cameras);
+        done.status.version = 1;
+        done.refine = self.first_order(&done);
+        if done.refine.is_some() {
+            done.status.refinement = RefineStatus::new(RefineState::Running);
+        }
         if let (Some(digest), Some(semantics)) = (semantics, &scene.semantics) {
             done.semantics_sha256 = Some(digest);
             done.status.semantics = SemanticsStatus::ready(semantics.report.clone());
@@ -208,9 +215,12 @@ impl Jobs {
         if eager {
             done.status.semantics = SemanticsStatus::new(SemanticsState::Running);
         }
-        let owner = done.owner.clone();
+        let (owner, refined) = (done.owner.clone(), done.refine.is_some());
         self.records.update(id, |record| *record = done);
         tracing::info!(scene = %id, "done");
+        if refined {
+            self.queue.push(Kind::Refine, id.clone(), owner.as_deref());
+        }
         if eager {
             self.queue.push(Kind::Semantics, id.clone(), owner.as_deref());
         }
@@ -223,7 +233,7 @@ impl Jobs {
         if let Err(error) = noted.and_then(|()| store.settle(id)) {
             tracing::warn!(scene = %id, %error, "left for the next start");
         }
-        if !eager && !self.parts.keep_photos {
+        if !eager && !refined && !self.parts.keep_photos {
             store.drop_upload(id)?;
         }
         Ok(())

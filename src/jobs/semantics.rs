@@ -75,6 +75,8 @@ impl Jobs {
 
     pub(super) fn make_semantics(&self, job: &Job) -> Result<()> {
         let (id, store) = (&job.scene, &self.parts.store);
+        // No version is published while they are made of the one before.
+        let _lock = self.lock(id.as_str(), job)?;
         let named = |e: Error| {
             let message = format!("{}: {}", job.kind.names().1, e.message());
             Error::new(e.code(), message).caused_by(e)
@@ -106,9 +108,18 @@ impl Jobs {
         let Some(ready) = make().map_err(named)? else { return Ok(()) };
         let bank_size = ready.status.semantics.bank_size;
         let eager = ready.options.semantics == SemanticsMode::Eager;
-        self.records.update(id, |record| *record = ready);
+        let (status, digest) = (ready.status.semantics.clone(), ready.semantics_sha256.clone());
+        let refine = ready.refine;
+        let shown = self.records.update(id, |record| {
+            record.status.semantics = status;
+            record.semantics_sha256 = digest;
+        });
+        // Where a refinement was asked for just now, the record that is kept must say so too.
+        if let Some(shown) = shown.filter(|shown| shown.refine != refine) {
+            store.put_record(&shown)?;
+        }
         tracing::info!(scene = %id, bank_size, "semantics ready");
-        if eager && !self.parts.keep_photos {
+        if eager && refine.is_none() && !self.parts.keep_photos {
             store.drop_upload(id).map_err(named)?;
         }
         Ok(())

@@ -20,7 +20,10 @@ use super::{
 use crate::{
     error::{Error, ErrorCode, Result},
     pipeline,
-    scene::{SceneError, SceneId, SceneState, SemanticsState, SemanticsStatus, Stage, Watch},
+    scene::{
+        RefineState, RefineStatus, SceneError, SceneId, SceneState, SemanticsState,
+        SemanticsStatus, Stage, Watch,
+    },
     store::{self, Record},
     telemetry::{self, meter},
 };
@@ -44,6 +47,7 @@ impl Jobs {
             let run = AssertUnwindSafe(|| match kind {
                 Kind::Scene => self.make_scene(&job),
                 Kind::Semantics => self.make_semantics(&job),
+                Kind::Refine => self.refine_scene(&job),
             });
             let outcome = catch_unwind(run).unwrap_or_else(|panic| Err(panicked(kind, &*panic)));
             meter::job(kind.names().0, job.outcome(outcome.is_ok()));
@@ -63,9 +67,11 @@ impl Jobs {
     fn leave(&self, job: &Job) {
         let record = self.records.find(&job.scene);
         let next = record.filter(|record| record.status.state == SceneState::Done);
+        let refined = next.as_ref().is_some_and(|record| record.status.is_refined_now());
         match next.map(|record| record.status.semantics.state) {
-            // They are queued already, by this job or by a caller.
+            // What follows is queued already, by this job or by a caller.
             Some(SemanticsState::Running) => {}
+            Some(_) if refined => {}
             Some(SemanticsState::None) if job.kind == Kind::Scene => {
                 self.uploads.renew(&job.scene);
                 self.replicas.release(&job.scene);
@@ -92,8 +98,10 @@ impl Jobs {
     /// A span of the job. That of a scene belongs to the trace of the call that created it.
     fn span(&self, job: &Job) -> tracing::Span {
         let id = &job.scene;
-        if job.kind == Kind::Semantics {
-            return tracing::info_span!("semantics", scene = %id);
+        match job.kind {
+            Kind::Scene => {}
+            Kind::Semantics => return tracing::info_span!("semantics", scene = %id),
+            Kind::Refine => return tracing::info_span!("refine", scene = %id),
         }
         let Some(record) = self.records.find(id) else { return tracing::Span::none() };
         let request_id = record.request_id.as_deref();
@@ -154,6 +162,18 @@ impl Jobs {
                 let message = format!("{what} took longer than {} s", limit.as_secs_f64());
                 Some(Error::new(ErrorCode::DeadlineExceeded, message))
             }
+            (Some(Reason::Shutdown), Kind::Refine) => {
+                // The next start goes on; this one was no failure.
+                let queued = self.records.update(id, |record| {
+                    if let Some(order) = &mut record.refine {
+                        order.attempts = order.attempts.saturating_sub(1);
+                    }
+                });
+                if let Some(record) = queued {
+                    self.keep_record(&record);
+                }
+                return;
+            }
             (Some(Reason::Shutdown), Kind::Semantics) => {
                 let message = format!("{what}: the server is stopping");
                 Some(Error::new(ErrorCode::Overloaded, message).retry_after_s(10))
@@ -172,7 +192,7 @@ impl Jobs {
         self.fail(job.kind, id, stopped.as_ref().unwrap_or(error));
     }
 
-    /// Makes a failure known to watchers; that of a scene also to the store.
+    /// Makes a failure known to watchers; that of a scene or a refinement also to the store.
     pub(super) fn fail(&self, kind: Kind, id: &SceneId, error: &Error) {
         let (code, (_, what)) = (error.code().name(), kind.names());
         if error.code().row().http >= 500 {
@@ -189,6 +209,13 @@ impl Jobs {
                 record.status.updated_ms = now;
                 record.status.error = Some(SceneError::from(error));
             }
+            Kind::Refine => {
+                record.refine = None;
+                record.status.refinement = RefineStatus {
+                    error: Some(SceneError::from(error)),
+                    ..RefineStatus::new(RefineState::Failed)
+                };
+            }
             Kind::Semantics => {
                 record.status.semantics = SemanticsStatus {
                     error: Some(SceneError::from(error)),
@@ -196,14 +223,14 @@ impl Jobs {
                 };
             }
         };
-        if let (Kind::Scene, Some(mut failed)) = (kind, self.records.find(id)) {
+        if let (Kind::Scene | Kind::Refine, Some(mut failed)) = (kind, self.records.find(id)) {
             change(Arc::make_mut(&mut failed));
             self.keep_record(&failed);
         }
         self.records.update(id, change);
     }
 
-    fn keep_record(&self, record: &Record) {
+    pub(super) fn keep_record(&self, record: &Record) {
         if let Err(error) = self.parts.store.put_record(record) {
             tracing::error!(scene = %record.status.id, %error, "its status is not kept");
         }

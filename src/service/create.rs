@@ -4,7 +4,7 @@ use std::{sync::Arc, time::Duration};
 
 use sha2::{Digest, Sha256};
 
-use super::{Inner, Service, request::CreateScene, types::Created};
+use super::{Inner, Service, refine, request::CreateScene, types::Created};
 use crate::{
     error::{Error, Result},
     keys::Caller,
@@ -184,6 +184,7 @@ fn check_request(
         )));
     }
     options.method().check()?;
+    options.refine.map_or(Ok(()), |refine| refine::check(refine, limits))?;
     match key.map(str::len) {
         Some(0) => Err(Error::invalid("the idempotency key is empty")),
         Some(bytes) if bytes > IDEMPOTENCY_KEY_BYTES_MAX => {

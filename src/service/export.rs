@@ -24,7 +24,7 @@ use super::{
 };
 use crate::{
     error::{Error, Result},
-    scene::{Gaussians, Preset, SceneId, Semantics},
+    scene::{Gaussians, Preset, Scene, SceneId, Semantics},
     store::ply::{PlyFile, PlyWriter},
 };
 
@@ -69,8 +69,8 @@ impl Service {
         }
         let Some(text) = &ask.text else {
             let access = access.finished()?;
-            let digest = hash(&meaning_tag(access.record()));
             let scene = blocking(move || inner.load(&access)).await??;
+            let digest = hash(&meaning_tag(&scene));
             if format == ExportFormat::Packed {
                 let (file_name, etag) = (format!("{id}.segsplat"), format!("{digest}-packed"));
                 let chunks = stream(move |to: &mut dyn Write| write_packed(&scene, to));
@@ -110,10 +110,11 @@ impl Service {
         let lines: Vec<String> =
             ask.text.iter().flat_map(|text| text.lines().map(str::to_owned)).collect();
         let how = format!("{lines:?} {preset:?} {:?} {}", ask.scoring, env!("CARGO_PKG_VERSION"));
-        let etag = format!("{}-html", hash(&(meaning_tag(access.record()) + &how)));
+        let tag = move |scene: &Scene| format!("{}-html", hash(&(meaning_tag(scene) + &how)));
         let file_name = format!("{id}.html");
         if lines.is_empty() {
             let scene = blocking(move || inner.load(&access)).await??;
+            let etag = tag(&scene);
             let chunks = stream(move |to: &mut dyn Write| write_page(&scene, None, to));
             return Ok(Export { file_name, size_bytes: None, etag, chunks });
         }
@@ -121,7 +122,7 @@ impl Service {
         let texts = texts::all_checked(&lines, "text", &limits)?;
         check_scoring(&ask.scoring, &limits)?;
         let understood = inner.understood(&access, "text", ask.wait).await?;
-        let scoring = ask.scoring.clone();
+        let (scoring, etag) = (ask.scoring.clone(), tag(understood.subject().scene));
         let chunks = stream(move |to: &mut dyn Write| {
             let of = understood.subject();
             let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &texts)?;

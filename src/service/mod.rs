@@ -15,6 +15,7 @@ mod packed;
 mod page;
 mod pick;
 mod query;
+mod refine;
 mod request;
 mod rle;
 mod schedule;
@@ -58,7 +59,7 @@ use crate::{
     jobs::{JobParts, Jobs, NetworkState, SceneNetworks, SemanticNetworks},
     keys::Caller,
     limits::Limits,
-    render::Renderer,
+    render::{Renderer, cpu::CpuRenderer},
     scene::{SceneId, Stage},
     store::{Place, Record, Store},
 };
@@ -136,6 +137,13 @@ impl Service {
     pub fn open(place: &Place, config: Config, parts: Parts) -> Result<Self> {
         let (store, records) = Store::open(place, &config.limits)?;
         let store = Arc::new(store);
+        let scheduler = Scheduler::new(parts.renderer.concurrency(), &config.limits);
+        let drawn = Arc::clone(&scheduler);
+        let refiner = match Arc::clone(&parts.renderer).differentiable() {
+            Some(renderer) => renderer,
+            // Threads of its own: a view never waits for a step.
+            None => Arc::new(CpuRenderer::new(config.threads)?),
+        };
         let job_parts = JobParts {
             store: Arc::clone(&store),
             scenes: parts.scenes,
@@ -143,6 +151,10 @@ impl Service {
             limits: config.limits.clone(),
             workers: config.workers(),
             keep_photos: config.keep_photos,
+            refine: config.refine,
+            refiner,
+            threads: config.threads,
+            drawn: Box::new(move || drawn.idle()),
         };
         let jobs = Jobs::start(job_parts, records)?;
         let models = ModelsInfo {
@@ -153,7 +165,7 @@ impl Service {
         let inner = Inner {
             store,
             jobs,
-            scheduler: Scheduler::new(parts.renderer.concurrency(), &config.limits),
+            scheduler,
             backend: Backend::new(parts.renderer, parts.semantics, &config.limits),
             models,
             reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
@@ -242,15 +254,30 @@ impl Service {
     pub async fn watch(&self, id: &SceneId) -> Result<impl Stream<Item = Event> + Send + use<>> {
         let watcher = self.inner.jobs.watch(self.scene(id).await?.id())?;
         let service = self.clone();
-        let first = Some((service, watcher, true));
+        let first = Some((service, watcher, None));
         Ok(stream::unfold(first, async |state| {
-            let (service, mut watcher, first) = state?;
-            if !first && watcher.changed().await.is_err() {
-                return None;
+            let (service, mut watcher, before) = state?;
+            loop {
+                if before.is_some() && watcher.changed().await.is_err() {
+                    return None;
+                }
+                let status = watcher.borrow_and_update().status.clone();
+                let event = match service.event(&status) {
+                    Event::Done if before.as_ref().is_some_and(is_version) => {
+                        let fraction = status.refinement.fraction;
+                        Event::Version { version: status.version, fraction }
+                    }
+                    event => event,
+                };
+                // How far a refinement is, is told with the next version, or with its end.
+                let goes_on = status.is_refined_now();
+                if goes_on && before.as_ref().is_some_and(|before| same_version(before, &event)) {
+                    continue;
+                }
+                let last = event.is_last() || is_version(&event);
+                let next = (!last || goes_on).then(|| (service, watcher, Some(event.clone())));
+                return Some((event, next));
             }
-            let event = service.event(&watcher.borrow_and_update().status);
-            let next = (!event.is_last()).then_some((service, watcher, false));
-            Some((event, next))
         }))
     }
 
@@ -320,6 +347,20 @@ impl Service {
     /// Takes no more jobs and stops the running ones; the next start continues them. Blocks.
     pub fn shut_down(&self) {
         self.inner.jobs.shut_down();
+    }
+}
+
+/// Whether it says what is served of a scene that is done.
+fn is_version(event: &Event) -> bool {
+    matches!(event, Event::Done | Event::Version { .. })
+}
+
+fn same_version(one: &Event, other: &Event) -> bool {
+    match (one, other) {
+        (Event::Version { version: a, .. }, Event::Version { version: b, .. }) => a == b,
+        // A scene is done as its first version.
+        (Event::Done, Event::Version { version, .. }) => *version == 1,
+        _ => false,
     }
 }
 

@@ -10,7 +10,11 @@
 //!
 //! [`Renderer::concurrency`]: crate::render::Renderer::concurrency
 
-use std::{collections::BTreeMap, sync::Arc};
+use std::{
+    collections::BTreeMap,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use parking_lot::Mutex;
 use tokio::sync::oneshot;
@@ -50,6 +54,8 @@ struct State {
     /// Views that are drawn, and the small ones of them.
     drawing: usize,
     drawing_small: usize,
+    /// When the last view came or ended.
+    used: Option<Instant>,
     /// Place in the order of the view that was started last.
     clock: u64,
     arrivals: u64,
@@ -87,6 +93,7 @@ impl Drop for Slot {
     fn drop(&mut self) {
         self.drawn();
         let mut state = self.scheduler.state.lock();
+        state.used = Some(Instant::now());
         state.active -= 1;
         state.active_pixels -= self.pixels;
         self.scheduler.start_next(&mut state);
@@ -127,6 +134,15 @@ impl Scheduler {
     pub(super) fn len(&self) -> usize {
         let state = self.state.lock();
         state.waiting.len() + state.active
+    }
+
+    /// Time since the last view ended, 0 while there are views; `None` before the first.
+    pub(super) fn idle(&self) -> Option<Duration> {
+        let state = self.state.lock();
+        match state.waiting.len() + state.active {
+            0 => state.used.map(|used| used.elapsed()),
+            _ => Some(Duration::ZERO),
+        }
     }
 
     /// Waits until a view of so many pixels may be drawn. A caller who goes away gives its place

@@ -10,8 +10,12 @@ use std::{
 };
 
 use super::{
-    Inner, Service, access::SceneAccess, create::blocking, search::Subject, times::ms,
-    view::scene_tag,
+    Inner, Service,
+    access::SceneAccess,
+    create::blocking,
+    search::Subject,
+    times::ms,
+    view::{record_tag, scene_tag},
 };
 use crate::{
     error::{Error, ErrorCode, Result},
@@ -40,10 +44,15 @@ impl Understood {
     }
 }
 
-/// Tells a scene and its semantics from any others.
-pub(super) fn meaning_tag(record: &Record) -> String {
+/// Tells a version of a scene and its semantics from any others.
+pub(super) fn meaning_tag(scene: &Scene) -> String {
+    format!("{} {}", scene_tag(scene), scene.semantics_sha256)
+}
+
+/// The same of the version that a record names.
+pub(super) fn record_meaning_tag(record: &Record) -> String {
     let semantics = record.semantics_sha256.as_deref().unwrap_or_default();
-    format!("{} {semantics}", scene_tag(record))
+    format!("{} {semantics}", record_tag(record))
 }
 
 impl Inner {
@@ -137,7 +146,7 @@ impl Inner {
                 }
             };
             if let Some((scene, semantics)) = found {
-                let (tag, load_ms) = (meaning_tag(access.record()), ms(begun));
+                let (tag, load_ms) = (meaning_tag(&scene), ms(begun));
                 return Ok(Understood { access, scene, semantics, tag, load_ms });
             }
         }

@@ -23,7 +23,7 @@ use super::{
     },
     schedule::Slot,
     search::{Backend, LabelledView, SceneTexts, ScoringChoice},
-    semantics::{Understood, meaning_tag},
+    semantics::{Understood, record_meaning_tag},
     texts,
     times::{ViewTimes, ms, staged},
     types::RenderedView,
@@ -268,9 +268,18 @@ pub(super) fn hash(words: &str) -> String {
     hex(&Sha256::digest(words)[..16])
 }
 
-/// Tells a scene from all others, in tags.
-pub(super) fn scene_tag(record: &Record) -> String {
-    format!("{} {}", record.scene_sha256.as_deref().unwrap_or_default(), record.status.id)
+/// Tells a version of a scene from all others, in tags.
+pub(super) fn scene_tag(scene: &Scene) -> String {
+    tag(&scene.sha256, &scene.meta.id)
+}
+
+/// The tag of the version that a record names. Another one may be served a moment later.
+pub(super) fn record_tag(record: &Record) -> String {
+    tag(record.scene_sha256.as_deref().unwrap_or_default(), &record.status.id)
+}
+
+fn tag(sha256: &str, id: &SceneId) -> String {
+    format!("{sha256} {id}")
 }
 
 /// What views of a scene are resolved against.
@@ -425,14 +434,14 @@ impl Inner {
         let inner = Arc::clone(self);
         let pixels = view.pixels();
         let work = move |slot: &mut Slot| {
-            let (backend, tag) = (&inner.backend, scene_tag(scene.record()));
+            let backend = &inner.backend;
             let mut times = ViewTimes { queue_ms: slot.queue_ms, ..ViewTimes::default() };
             let drawn = || slot.drawn();
             let Some(Asked { understood, ask, embed_ms }) = texts else {
                 let begun = Instant::now();
                 let scene = inner.load(&scene)?;
                 times.load_ms = ms(begun);
-                return view.draw(backend, &scene, &tag, None, times, drawn);
+                return view.draw(backend, &scene, &scene_tag(&scene), None, times, drawn);
             };
             let subject = understood.subject();
             let text = ask.text.as_slice();
@@ -440,6 +449,7 @@ impl Inner {
             let scored = || SceneTexts::new(backend, subject, how, text);
             let (texts, ms) = staged("score", scored);
             (times.load_ms, times.score_ms) = (understood.load_ms, Some(embed_ms + ms));
+            let tag = scene_tag(subject.scene);
             view.draw(backend, subject.scene, &tag, Some(&texts?), times, drawn)
         };
         self.scheduled(deadline, pixels, "the view", work).await
@@ -556,12 +566,12 @@ impl Service {
             (false, _) => String::new(),
             (true, Some(_)) => {
                 let how = (view.preset, &ask.scoring);
-                text_words(&meaning_tag(record), ask.text.as_deref(), how)?
+                text_words(&record_meaning_tag(record), ask.text.as_deref(), how)?
             }
             (true, None) => return Ok(None),
         };
         let name = self.inner.backend.renderer.name();
-        view.etag(&scene_tag(record), &name, spec.kind, &texts).map(Some)
+        view.etag(&record_tag(record), &name, spec.kind, &texts).map(Some)
     }
 
     /// Renders and encodes one view.

@@ -46,7 +46,7 @@ pub use self::{
     hashes::{provenance, request_sha256},
     index::KeyUse,
     open::Place,
-    record::Record,
+    record::{Record, RefineOrder},
     scene_file::{read_scene, write_scene},
     semantics_file::{read_semantics, write_semantics},
     upload_file::hashes,
@@ -196,7 +196,7 @@ impl Store {
         let mut file = Vec::with_capacity(scene.gaussians.size_bytes() as usize + (64 << 10));
         let mut digest = write_scene(&mut file, &scene)
             .map_err(|e| Error::internal("the scene cannot be packed").caused_by(e))?;
-        let mut scene = Arc::new(scene);
+        let mut scene = Arc::new(Scene { sha256: digest.clone(), ..scene });
         if !self.shared {
             self.objects.put(what, of(&id, SCENE), file)?;
         } else if !self.objects.create(what, of(&id, SCENE), file.clone())? {
@@ -213,6 +213,23 @@ impl Store {
         Ok((scene, digest))
     }
 
+    /// Keeps another version of a finished scene in place of the one before, also in memory; gives
+    /// it. A start finds the one or the other, whole.
+    ///
+    /// # Errors
+    /// `store_unavailable`; `scene_not_found` when the scene was deleted.
+    pub fn put_version(&self, scene: Scene) -> Result<Arc<Scene>> {
+        let (id, what) = (scene.meta.id.clone(), "keep a version of the scene");
+        let mut file = Vec::with_capacity(scene.gaussians.size_bytes() as usize + (64 << 10));
+        let sha256 = write_scene(&mut file, &scene)
+            .map_err(|e| Error::internal("the scene cannot be packed").caused_by(e))?;
+        self.objects.put(what, of(&id, SCENE), file)?;
+        self.unless_deleted(&id)?;
+        let scene = Arc::new(Scene { sha256, ..scene });
+        self.keep(Arc::clone(&scene));
+        Ok(scene)
+    }
+
     /// Keeps the semantics of a scene, and does `beside` with their file's sha256, hex, at the same
     /// time; gives the scene that carries them, the sha256, and what `beside` gave.
     /// Fails as [`Self::scene`] and as `beside`; `scene_corrupt` also when they are of other
@@ -224,10 +241,11 @@ impl Store {
         beside: impl FnOnce(&str) -> Result<T>,
     ) -> Result<(Arc<Scene>, String, T)> {
         let semantics = Arc::new(semantics);
-        let scene = Arc::new(self.scene(id)?.with_semantics(Arc::clone(&semantics))?);
+        let scene = self.scene(id)?.with_semantics(Arc::clone(&semantics))?;
         let mut file = Vec::new();
         let digest = write_semantics(&mut file, id, &semantics)
             .map_err(|e| Error::internal("the semantics cannot be packed").caused_by(e))?;
+        let scene = Arc::new(Scene { semantics_sha256: digest.clone(), ..scene });
         let put = || self.objects.put("keep the scene's semantics", of(id, SEMANTICS), file);
         let (kept, beside) = side_by_side(put, || beside(&digest));
         kept?;
@@ -299,13 +317,22 @@ impl Store {
         Ok(scene)
     }
 
-    /// The scene with the semantics that are kept beside it, if any are and they are sound.
-    fn with_its_semantics(&self, scene: Scene) -> Result<Scene> {
+    /// The scene with the semantics that are kept beside it, if any are and they are sound. A
+    /// version that was made after them has their entries itself.
+    fn with_its_semantics(&self, mut scene: Scene) -> Result<Scene> {
         let id = scene.meta.id.clone();
+        let entries_of = std::mem::take(&mut scene.semantics_sha256);
+        let own = (!entries_of.is_empty()).then(|| scene.gaussians.semantic_index().to_vec());
+        if let Some(own) = &own {
+            scene.gaussians = scene.gaussians.with_semantic_index(vec![0; own.len()])?;
+        }
         let file = self.objects.get("read the scene's semantics", of(&id, SEMANTICS))?;
         let Some(file) = file else { return Ok(scene) };
-        let checked = read_semantics(&file, &id)
-            .and_then(|(semantics, _)| scene.with_semantics(Arc::new(semantics)));
+        let checked = read_semantics(&file, &id).and_then(|(semantics, sha256)| {
+            let index = own.filter(|_| sha256 == entries_of).unwrap_or(semantics.index);
+            let with = scene.with_semantics(Arc::new(Semantics { index, ..semantics }))?;
+            Ok(Scene { semantics_sha256: sha256, ..with })
+        });
         checked.or_else(|error| {
             tracing::error!(scene = %id, %error, "semantics are put aside, to be made again");
             self.quarantine(&id, SEMANTICS);

@@ -243,6 +243,7 @@ fn from_scene(store: &Store, id: &SceneId) -> Result<Option<Record>> {
         fraction: 1.0,
         report: Some(meta.report),
         cameras: meta.cameras,
+        version: 1,
         ..SceneStatus::new(id.clone(), SceneState::Done, meta.created_ms)
     };
     // Without the upload only an admin sees it: better than the wrong owner.

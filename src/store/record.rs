@@ -9,6 +9,16 @@ use crate::{
 };
 use sha2::{Digest, Sha256};
 
+/// A refinement that goes on after any restart.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RefineOrder {
+    /// Milliseconds of work that it is given.
+    pub ms: u64,
+    /// How often it was begun since it last published a version; bounds how often one that stops
+    /// the server is begun again.
+    pub attempts: u32,
+}
+
 /// A scene's status and the request it came from.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Record {
@@ -25,6 +35,9 @@ pub struct Record {
     pub request_sha256: String,
     /// How often a worker has begun; bounds how often a scene that stops the server is retried.
     pub attempts: u32,
+    /// The refinement that waits or is at work.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub refine: Option<RefineOrder>,
     /// sha256 of the scene container, hex, once done.
     pub scene_sha256: Option<String>,
     /// sha256 of the semantics container, hex, once they are ready.
@@ -54,6 +67,7 @@ impl Record {
             idempotency_key: None,
             request_sha256: String::new(),
             attempts: 0,
+            refine: None,
             scene_sha256: None,
             semantics_sha256: None,
             content_sha256: None,

@@ -20,6 +20,10 @@ struct Header {
     origin: [f64; 3],
     sh_degree: u8,
     meta: SceneMeta,
+    /// sha256 of the file of the semantics whose entries the Gaussians have; those of that file may
+    /// be for other Gaussians.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    entries_of: Option<String>,
 }
 
 /// Writes a scene container and gives its sha256, hex.
@@ -33,6 +37,7 @@ pub fn write_scene(to: &mut dyn Write, scene: &Scene) -> io::Result<String> {
         origin: raw.origin.to_array(),
         sh_degree: raw.sh_degree,
         meta: scene.meta.clone(),
+        entries_of: Some(scene.semantics_sha256.clone()).filter(|sha256| !sha256.is_empty()),
     })?;
     let source: Vec<[u16; 3]> = raw.source.iter().map(|s| [s.view, s.x, s.y]).collect();
     let backdrop_shape = [Backdrop::HEIGHT, Backdrop::WIDTH, 3];
@@ -49,7 +54,8 @@ pub fn write_scene(to: &mut dyn Write, scene: &Scene) -> io::Result<String> {
     container::write(to, &LABEL, &header, &arrays)
 }
 
-/// Reads a scene container and gives it with its sha256, hex.
+/// Reads a scene container and gives it with its sha256, hex. Its `semantics_sha256` says whose
+/// entries its Gaussians have.
 ///
 /// # Errors
 /// `scene_corrupt` when any byte differs from what was written, or the version is unknown.
@@ -73,5 +79,7 @@ pub fn read_scene(file: &[u8]) -> Result<(Scene, String)> {
     };
     let backdrop = Backdrop::from_cells(container.rows("backdrop", Dtype::U8)?)?;
     let scene = Scene::new(header.meta, Gaussians::restore(raw)?, backdrop);
-    Ok((scene, container.sha256))
+    let semantics_sha256 = header.entries_of.unwrap_or_default();
+    let sha256 = container.sha256.clone();
+    Ok((Scene { sha256, semantics_sha256, ..scene }, container.sha256))
 }

@@ -19,11 +19,12 @@ use crate::common::{
 };
 
 /// Every call, named as the gRPC methods are, and what it needs.
-const CALLS: [(&str, Scope); 11] = [
+const CALLS: [(&str, Scope); 12] = [
     ("CreateScene", Scope::Write),
     ("ListScenes", Scope::Read),
     ("GetScene", Scope::Read),
     ("WatchScene", Scope::Read),
+    ("RefineScene", Scope::Write),
     ("RenderView", Scope::Read),
     ("RenderViews", Scope::Read),
     ("Query", Scope::Read),
@@ -84,6 +85,7 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
                 "RenderViews" => client
                     .post(format!("{base}/v1/scenes/{id}/views"))
                     .body("{\"cameras\":[{\"from\":0}],\"width\":32,\"height\":24}"),
+                "RefineScene" => client.post(format!("{base}/v1/scenes/{id}/refine?refine=off")),
                 other => panic!("{other} is not a call"),
             };
             bytes(request.send().await.unwrap()).await.map(drop)
@@ -103,6 +105,10 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
                     let at =
                         pb::PickRequest { scene_id, camera, x: 9.0, y: 9.0, ..Default::default() };
                     client.pick(at).await.map(drop)
+                }
+                "RefineScene" => {
+                    let off = pb::RefineSceneRequest { scene_id, refine: "off".to_owned() };
+                    client.refine_scene(off).await.map(drop)
                 }
                 "RenderViews" => {
                     let cameras = vec![camera];
@@ -227,7 +233,8 @@ fn every_call_of_both_doors_has_its_scope_in_the_table() {
         .filter(|route| route.scope == Some(Scope::Write))
         .map(|route| format!("{} {}", route.method, route.path))
         .collect();
-    assert_eq!(writes, ["POST /v1/scenes", "DELETE /v1/scenes/{id}"]);
+    let want = ["POST /v1/scenes", "DELETE /v1/scenes/{id}", "POST /v1/scenes/{id}/refine"];
+    assert_eq!(writes, want);
 }
 
 #[tokio::test]

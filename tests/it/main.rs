@@ -31,6 +31,7 @@ mod offline;
 mod paper;
 mod proto;
 mod raw;
+mod refine;
 mod schedule;
 mod slow_callers;
 mod store;

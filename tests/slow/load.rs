@@ -57,7 +57,7 @@ async fn memory_stays_as_it_is_over_many_scenes_of_many_shapes() {
             upload(i, photos, width, height)
         })
         .collect();
-    // The most of the first creates and the most of all later: it goes up and down from one to the next.
+    // The most of the first creates, and the most of all later: one reading may lie far below.
     let (all, settled, most) = if long() { (1_000, 100, 1.05) } else { (60, 30, 1.2) };
     let (mut first, mut last) = (0, 0);
     for i in 0..all {

@@ -14,5 +14,6 @@ mod conventions;
 mod fuzz_input;
 mod kill;
 mod load;
+mod refine_kill;
 mod replicas;
 mod sample;

@@ -150,6 +150,12 @@ limits! {
     render_timeout_ms: u64 = 30_000;
     /// Milliseconds one scene may take.
     scene_timeout_ms: u64 = 600_000, restart;
+    /// Milliseconds of work that one refinement may be given.
+    refine_ms_max: u64 = 600_000;
+    /// Steps of one refinement: those of ten minutes on 64 cores.
+    refine_steps_max: u32 = 20_000;
+    /// Gaussians that a refinement begins with; of more, as many are chosen and made wider.
+    refine_gaussians_max: usize = 150_000;
     /// Milliseconds a caller may hold a request open with `wait_ms`.
     wait_ms_max: u64 = 600_000;
     /// Requests a second of one API key that says no number of its own; a second's worth at once.

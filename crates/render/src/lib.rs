@@ -287,6 +287,11 @@ pub trait Renderer: Send + Sync {
     /// background.
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame>;
 
+    /// The same renderer where it has a backward pass of its own that is worth its device.
+    fn differentiable(self: Arc<Self>) -> Option<Arc<dyn backward::DifferentiableRenderer>> {
+        None
+    }
+
     /// Renders one view for the times of it on the device; `None` where none keeps them.
     ///
     /// # Errors

@@ -170,6 +170,10 @@ impl Renderer for WithCpu {
         or_else(self.gpu.render(gaussians, request), || self.cpu.render(gaussians, request))
     }
 
+    fn differentiable(self: Arc<Self>) -> Option<Arc<dyn DifferentiableRenderer>> {
+        if self.gpu.adapter().software { None } else { Some(self) }
+    }
+
     fn device_times(
         &self,
         gaussians: &Gaussians,

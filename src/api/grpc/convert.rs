@@ -4,10 +4,11 @@ use std::time::Duration;
 
 use super::pb;
 use crate::{
+    api::short,
     error::{Error, Result},
     scene::{
-        CameraToWorld, DropCount, HealthReport, Intrinsics, ScoringMethod, SemanticsReport,
-        StageTime, Warning,
+        CameraToWorld, DropCount, HealthReport, Intrinsics, Refine, RefineReport, RefineState,
+        ScoringMethod, SemanticsReport, StageTime, Warning,
     },
     service::{
         BackgroundSpec, Boxes, CameraSpec, Density, Event, ExportFormat, FeatureKind, FeaturesSpec,
@@ -41,7 +42,19 @@ pub(super) fn scene(status: SceneStatus) -> pb::Scene {
         report: status.report.map(report),
         cameras: status.cameras.into_iter().map(camera).collect(),
         semantics: Some(semantics_status(status.semantics)),
+        version: status.version,
+        refinement: Some(pb::RefineStatus {
+            state: pb::RefineState::from(status.refinement.state).into(),
+            fraction: status.refinement.fraction,
+            error: status.refinement.error.map(scene_error),
+        }),
     )
+}
+
+/// `auto`, `off` or milliseconds; `None` where nothing is said.
+pub(super) fn refine(text: &str) -> Result<Option<Refine>> {
+    let wrong = |why: String| Error::invalid(format!("refine is {:?}; {why}", short(text)));
+    if text.is_empty() { Ok(None) } else { text.parse().map(Some).map_err(wrong) }
 }
 
 fn semantics_status(status: SemanticsStatus) -> pb::SemanticsStatus {
@@ -88,6 +101,15 @@ fn report(report: HealthReport) -> pb::HealthReport {
         method: Some(method(&report.method)),
         stages: report.stages.into_iter().map(stage_time).collect(),
         warnings: report.warnings.into_iter().map(warning).collect(),
+        refinement: report.refinement.map(refine_report),
+    )
+}
+
+fn refine_report(report: RefineReport) -> pb::RefineReport {
+    message!(RefineReport from report
+        {
+            steps, seconds, held_out, psnr_before, psnr_after, gaussians_before, gaussians_after
+        }
     )
 }
 
@@ -110,6 +132,10 @@ pub(super) fn event(event: Event) -> pb::SceneEvent {
             pb::SceneEvent { stage, fraction, ..of(pb::SceneState::Running) }
         }
         Event::Done => of(pb::SceneState::Done),
+        Event::Version { version, fraction } => {
+            let version = Some(version);
+            pb::SceneEvent { version, fraction, ..of(pb::SceneState::Done) }
+        }
         Event::Failed(error) => {
             pb::SceneEvent { error: Some(scene_error(error)), ..of(pb::SceneState::Failed) }
         }
@@ -217,6 +243,7 @@ pub(super) fn scene_options(header: &pb::CreateSceneHeader) -> Result<SceneOptio
             SceneOptions {
                 max_views: header.max_views.map(|views| views as usize),
                 semantics: value("semantics", header.semantics)?,
+                refine: refine(&header.refine)?,
                 preset: value("preset", method.preset)?,
                 density: given("density", method.density)?,
                 mask_level: given("mask_level", method.mask_level)?,
@@ -423,6 +450,7 @@ macro_rules! both_ways {
 
 to_number! {
     SceneState = SceneState { Queued, Running, Done, Failed, Cancelled }
+    RefineState = RefineState { None, Running, Done, Failed }
     SemanticsState = SemanticsState { Off, None, Running, Ready, Failed }
 }
 

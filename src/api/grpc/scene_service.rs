@@ -97,6 +97,14 @@ impl pb::scene_service_server::SceneService for Api {
         .await
     }
 
+    async fn refine_scene(&self, request: Request<pb::RefineSceneRequest>) -> Answer<pb::Scene> {
+        answer(self, request, |api, request| async move {
+            let refine = convert::refine(&request.refine)?.unwrap_or_default();
+            Ok(convert::scene(api.service.refine(&request.scene_id.parse()?, refine).await?))
+        })
+        .await
+    }
+
     async fn render_view(&self, request: Request<pb::RenderViewRequest>) -> Answer<pb::View> {
         answer(self, request, render).await.map(timed)
     }
@@ -220,6 +228,7 @@ fn begin(
     upload: &mut UploadBuilder<'_>,
 ) -> Result<pb::CreateSceneHeader> {
     convert::value::<SemanticsMode>("semantics", header.semantics)?;
+    convert::refine(&header.refine)?;
     check_bundle(&header.bundle, &api.service.models())?;
     let cameras = header.cameras.take().map(|cameras| match cameras {
         Cameras::TransformsJson(json) => UploadCameras::Transforms(json.into()),

@@ -297,6 +297,9 @@ impl<'de> Deserializer<'de> for Value {
         let wrong = self.must_be(&visitor as &dyn de::Expected);
         let read: Result<V::Value, FieldError> = match (&self.given, self.given.text()) {
             (_, Some(text)) => visitor.visit_str(text),
+            (Given::Json(serde_json::Value::Number(number)), _) if number.is_u64() => {
+                visitor.visit_u64(number.as_u64().unwrap_or_default())
+            }
             (Given::List(_), _) => self.deserialize_seq(visitor),
             _ => return Err(wrong),
         };

@@ -69,6 +69,7 @@ pub fn routes() -> Vec<Route> {
         ("GET", "/v1/scenes/{id}", "get_scene", read, get(scenes::get)),
         ("DELETE", "/v1/scenes/{id}", "delete_scene", write, delete(scenes::delete)),
         ("GET", "/v1/scenes/{id}/events", "watch_scene", read, get(scenes::events)),
+        ("POST", "/v1/scenes/{id}/refine", "refine_scene", write, post(scenes::refine)),
         ("GET", "/v1/scenes/{id}/view", "render_view", read, get(render::view)),
         ("POST", "/v1/scenes/{id}/views", "render_views", read, post(views::views)),
         ("POST", "/v1/scenes/{id}/query", "query", read, post(texts::query)),

@@ -43,9 +43,9 @@ pub(super) async fn document(State(api): State<Api>) -> Json<Value> {
         description = "Posed photos in; views at any pose, and answers to texts, out."
     ),
     paths(
-        scenes::create, scenes::list, scenes::get, scenes::delete, scenes::events, render::view,
-        views::views, texts::query, texts::pick, render::export, render::features, health::models,
-        health::live, health::ready, health::metrics, document, viewer::index,
+        scenes::create, scenes::list, scenes::get, scenes::delete, scenes::events, scenes::refine,
+        render::view, views::views, texts::query, texts::pick, render::export, render::features,
+        health::models, health::live, health::ready, health::metrics, document, viewer::index,
     ),
     components(schemas(ErrorBody)),
     tags(

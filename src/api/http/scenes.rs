@@ -24,6 +24,7 @@ use super::{
 use crate::{
     api::{Api, request_id, server_timing, upload::check_bundle},
     error::{Error, Result},
+    scene::Refine,
     service::{CreateScene, Event, Page, PageRequest, SceneOptions, SceneState, SceneStatus},
 };
 
@@ -125,6 +126,32 @@ pub(super) async fn delete(
     fields.finish()?;
     api.service.delete(&id).await?;
     Ok(StatusCode::NO_CONTENT)
+}
+
+/// How a scene is refined.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[serde(default)]
+#[into_params(parameter_in = Query)]
+pub(super) struct RefineParams {
+    /// `auto` (default), so many milliseconds, or `off`, which ends a refinement.
+    #[param(value_type = Option<String>)]
+    refine: Refine,
+}
+
+/// Refine a scene, or end its refinement
+#[utoipa::path(
+    post, path = "/v1/scenes/{id}/refine", operation_id = "refine_scene", tag = "scenes",
+    params(Id, RefineParams),
+    responses((status = 202, description = "The scene; it is served meanwhile", body = SceneStatus))
+)]
+pub(super) async fn refine(
+    CallerApi(api): CallerApi,
+    Id(id): Id,
+    mut fields: Fields,
+) -> Result<(StatusCode, Json<SceneStatus>), ApiError> {
+    let RefineParams { refine } = fields.take()?;
+    fields.finish()?;
+    Ok((StatusCode::ACCEPTED, Json(api.service.refine(&id, refine).await?)))
 }
 
 /// What happens to a scene, as it happens

@@ -547,6 +547,7 @@ pub(crate) fn messages(upload: &Upload, options: &Options) -> Vec<pb::CreateScen
         method: options
             .preset
             .map(|name| pb::Method { preset: preset(Some(name)).into(), ..pb::Method::default() }),
+        refine: String::new(),
         wait_ms: options.wait_ms,
         idempotency_key: options.idempotency_key.clone().unwrap_or_default(),
     };

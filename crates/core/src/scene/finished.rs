@@ -60,12 +60,23 @@ pub struct Scene {
     pub backdrop: Arc<Backdrop>,
     /// Its semantics, once they are ready; the Gaussians then have its entries.
     pub semantics: Option<Arc<Semantics>>,
+    /// sha256 of the file that it is kept in, hex; empty where it is in none.
+    pub sha256: String,
+    /// sha256 of the file of its semantics, hex; empty where they are in none.
+    pub semantics_sha256: String,
 }
 
 impl Scene {
     /// A scene without semantics.
     pub fn new(meta: SceneMeta, gaussians: Gaussians, backdrop: Backdrop) -> Self {
-        Self { meta, gaussians, backdrop: Arc::new(backdrop), semantics: None }
+        Self {
+            meta,
+            gaussians,
+            backdrop: Arc::new(backdrop),
+            semantics: None,
+            sha256: String::new(),
+            semantics_sha256: String::new(),
+        }
     }
 
     /// Bytes held by its arrays.
@@ -98,10 +109,9 @@ impl Scene {
             ));
         }
         Ok(Self {
-            meta: self.meta.clone(),
             gaussians: self.gaussians.with_semantic_index(semantics.index.clone())?,
-            backdrop: Arc::clone(&self.backdrop),
             semantics: Some(semantics),
+            ..self.clone()
         })
     }
 }

@@ -10,7 +10,7 @@ use crate::{
     error::{Error, Result},
     limits::{BANK_ROWS_MAX, CANON_MAX, LAMBDA_RANGE, SCENE_PHOTOS_MAX, TAU_RANGE},
     names::display_names,
-    scene::{Density, SemanticsMode},
+    scene::{Density, Refine, SemanticsMode},
 };
 
 /// A set of values for every choice.
@@ -92,6 +92,11 @@ macro_rules! method {
             /// soon as it can be viewed, `off` never.
             #[param(inline)]
             pub semantics: SemanticsMode,
+            /// Whether the finished scene is refined: `auto`, `off`, or so many milliseconds. By
+            /// default as the server is set.
+            #[serde(skip_serializing_if = "Option::is_none")]
+            #[param(value_type = Option<String>)]
+            pub refine: Option<Refine>,
             /// `default`, or `paper`: the method of the paper. The options below change single
             /// fields of it.
             #[param(inline)]
@@ -107,7 +112,7 @@ macro_rules! method {
         impl SceneOptions {
             /// Names of all options.
             pub const NAMES: &[&str] =
-                &["max_views", "semantics", "preset", $(stringify!($name),)+];
+                &["max_views", "semantics", "refine", "preset", $(stringify!($name),)+];
 
             /// The method that these options spell.
             pub fn method(&self) -> Method {

@@ -12,6 +12,7 @@ mod geometry;
 mod id;
 mod method;
 mod photo;
+mod refinement;
 mod report;
 mod semantics;
 mod stage;
@@ -29,6 +30,7 @@ pub use geometry::ViewGaussians;
 pub use id::{SCENE_ID_CHARS, SceneId};
 pub use method::{MaskLevel, Method, Preset, SceneOptions, ScoringMethod, with_pairs};
 pub use photo::{Crop, CropShape, Photo, PosedPhoto};
+pub use refinement::{Refine, RefineReport, RefineState, RefineStatus};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{
     Bank, BankMask, IndexMap, MaskInfo, MaskLogits, PhotoMasks, Semantics, SemanticsReport,

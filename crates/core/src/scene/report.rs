@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use crate::scene::Method;
+use crate::scene::{Method, RefineReport};
 
 /// What looks wrong with a capture; the scene was made all the same.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
@@ -88,6 +88,9 @@ pub struct HealthReport {
     #[serde(default)]
     #[schema(required = true)]
     pub network_focal_px: Vec<f64>,
+    /// What refinement made of it, once it was refined.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub refinement: Option<RefineReport>,
     /// Time of each stage.
     pub stages: Vec<StageTime>,
     /// Execution provider of the geometry network.

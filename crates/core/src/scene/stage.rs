@@ -7,7 +7,7 @@ use std::{
 
 use crate::error::{Error, ErrorCode, Result};
 
-/// A stage of making a scene, or of making its semantics.
+/// A stage of making a scene, of making its semantics, or of refining it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Stage {
     /// The upload becomes undistorted photos with cameras.
@@ -28,6 +28,8 @@ pub enum Stage {
     Bank,
     /// An index for each Gaussian.
     Assign,
+    /// Gradient steps of a finished scene.
+    Refine,
 }
 
 impl Stage {
@@ -61,6 +63,7 @@ impl Stage {
             Self::Embed => ("embed", [0.6, 0.95]),
             Self::Bank => ("bank", [0.95, 0.98]),
             Self::Assign => ("assign", [0.98, 1.0]),
+            Self::Refine => ("refine", [0.0, 1.0]),
         }
     }
 }

@@ -6,7 +6,9 @@ use utoipa::ToSchema;
 use crate::{
     error::{Error, ErrorCode, TABLE},
     names::display_names,
-    scene::{Camera, HealthReport, Intrinsics, SceneId, SemanticsReport},
+    scene::{
+        Camera, HealthReport, Intrinsics, RefineState, RefineStatus, SceneId, SemanticsReport,
+    },
 };
 
 /// When the semantics of a scene are made.
@@ -190,6 +192,15 @@ pub struct SceneStatus {
     #[serde(default)]
     #[schema(required = true)]
     pub semantics: SemanticsStatus,
+    /// Counts what was served under this id: 0 until it is done, then 1, and one more with each
+    /// better version that refinement publishes. Tags of views change with it.
+    #[serde(default)]
+    #[schema(required = true)]
+    pub version: u32,
+    /// How far its refinement is.
+    #[serde(default)]
+    #[schema(required = true)]
+    pub refinement: RefineStatus,
 }
 
 impl SceneStatus {
@@ -206,10 +217,18 @@ impl SceneStatus {
             report: None,
             cameras: Vec::new(),
             semantics: SemanticsStatus::default(),
+            version: 0,
+            refinement: RefineStatus::default(),
         }
     }
 
-    /// Whether nothing happens to it now: neither it nor its semantics are being made.
+    /// Whether it waits for a refinement, or one is at work.
+    pub fn is_refined_now(&self) -> bool {
+        self.refinement.state == RefineState::Running
+    }
+
+    /// Whether nothing happens to it now: neither it nor its semantics are being made. It may be
+    /// refined.
     pub fn is_settled(&self) -> bool {
         self.state.is_final() && self.semantics.state != SemanticsState::Running
     }
@@ -231,8 +250,16 @@ pub enum Event {
         /// Share of that work that is done, 0..1.
         fraction: f32,
     },
-    /// Made, and its semantics are not at work. Last event.
+    /// Made, and its semantics are not at work. Last event, unless it is being refined.
     Done,
+    /// It is done and being refined: another version is served, or the refinement is over. Last
+    /// event when it is over.
+    Version {
+        /// The version that is served.
+        version: u32,
+        /// Share of the refinement's time that is spent, 0..1.
+        fraction: f32,
+    },
     /// Failed. Last event.
     Failed(SceneError),
     /// Stopped by the caller, or deleted. Last event.
@@ -240,7 +267,7 @@ pub enum Event {
 }
 
 impl Event {
-    /// Whether no event follows.
+    /// Whether it is the end of making a scene. Only versions follow.
     pub fn is_last(&self) -> bool {
         matches!(self, Self::Done | Self::Failed(_) | Self::Cancelled)
     }

@@ -20,6 +20,8 @@ mod readback;
 mod recorder;
 mod scratch;
 
+use std::sync::Arc;
+
 use self::adapter::Adapter;
 use super::{
     DeviceTimes, Frame, RenderRequest, Renderer, RendererOptions,
@@ -116,6 +118,10 @@ impl Renderer for GpuRenderer {
             }
             other => other,
         }
+    }
+
+    fn differentiable(self: Arc<Self>) -> Option<Arc<dyn DifferentiableRenderer>> {
+        if self.adapter().software { None } else { Some(self) }
     }
 
     fn device_times(

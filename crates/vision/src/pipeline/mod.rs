@@ -6,6 +6,7 @@
 
 mod loader;
 pub mod masks;
+pub mod refinement;
 pub mod semantics;
 
 pub use self::loader::PipelineLoader;
@@ -264,6 +265,7 @@ pub fn reconstruct(
         network_focal_px: lifted.lenses.iter().map(focal).collect(),
         stages: stages.times,
         execution_provider: pipeline.geometry.provider().name().to_owned(),
+        refinement: None,
         warnings: capture.warnings,
     };
     Ok(Reconstruction { gaussians: lifted.gaussians, backdrop, report, cameras })

@@ -1,29 +1,31 @@
 //! Refinement: gradient steps that bring a scene's Gaussians closer to its photos.
 //!
-//! In: Gaussians, what lies behind them, photos. Out: better Gaussians, version by version. A step
+//! In: a scene and photos. Out: better Gaussians, version by version. A step
 //! draws one photo or several, compares ([`photo_loss`]), goes back through the renderer
 //! ([`segsplat_render::backward`]) and moves what the photo shows ([`LearningRates`]). A gain and a
 //! bias for each photo and channel take up its exposure. Gaussians that become transparent are
 //! dropped as it goes.
 //!
 //! **Held out.** Of five photos and more, every eighth is held out ([`held_out`]): the steps never
-//! see it, and a version counts as better only where its PSNR on these photos is. They must not be
-//! in the Gaussians that come in either: make the scene of the others ([`split`]).
+//! see it, and a version counts as better only where its PSNR on these photos is over that of the
+//! scene as it is served. They must not be in the Gaussians that come in either: make the scene of
+//! the others ([`split`]).
+//!
+//! **One set.** A scene that comes in may be served in layers and with magnification. What comes
+//! out is plain: the same Gaussians for every view and for other programs.
 
 mod adam;
 mod loss;
 
-use std::{
-    sync::{Arc, atomic::AtomicBool},
-    time::{Duration, Instant},
-};
+use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
 use segsplat_render::{
     Background, Frame, Kinds, RenderRequest,
     backward::{DifferentiableRenderer, FrameGradients, Gradients},
     compare::psnr,
-    plan::default_near,
+    constants::OWN_SIZE,
+    plan::{default_near, served},
 };
 
 pub use self::{
@@ -32,8 +34,9 @@ pub use self::{
 };
 use crate::{
     error::{Error, Result},
+    point,
     refine::adam::{Adam, Moments},
-    scene::{Backdrop, Camera, Gaussians, PosedPhoto, unless_cancelled},
+    scene::{BLUR_PX2, Camera, Gaussians, PosedPhoto, RefineReport, Scene},
 };
 
 /// Fewest photos of which one is held out.
@@ -54,13 +57,22 @@ const EXPOSURE_COST: f32 = 1.0;
 /// Largest change of a gain, or bias, of a photo.
 const EXPOSURE_MAX: f32 = 0.5;
 
-/// How long to refine.
+/// How long to refine: until either is spent. With steps alone the result is the same on every
+/// machine with the same lanes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum RefineBudget {
-    /// So many steps: the result is the same on every machine with the same lanes.
-    Steps(u32),
+pub struct RefineBudget {
+    /// So many steps.
+    pub steps: u32,
     /// So much time.
-    Time(Duration),
+    pub time: Duration,
+}
+
+impl RefineBudget {
+    /// So many steps, however long they take.
+    #[must_use]
+    pub fn steps(steps: u32) -> Self {
+        Self { steps, time: Duration::MAX }
+    }
 }
 
 /// How to refine.
@@ -70,6 +82,9 @@ pub struct RefineOptions {
     pub budget: RefineBudget,
     /// Photos of a step.
     pub batch: usize,
+    /// Longer side at which the photos are learnt, pixels: what is learnt smaller than it is shown
+    /// has gaps.
+    pub side: u32,
     /// How far numbers move.
     pub rates: LearningRates,
     /// Most Gaussians to begin with: of more, this many are chosen at random and made wider.
@@ -85,8 +100,9 @@ pub struct RefineOptions {
 impl Default for RefineOptions {
     fn default() -> Self {
         Self {
-            budget: RefineBudget::Steps(400),
+            budget: RefineBudget::steps(400),
             batch: 1,
+            side: 640,
             rates: LearningRates::default(),
             gaussians_max: 150_000,
             opacity_min: 0.01,
@@ -96,26 +112,13 @@ impl Default for RefineOptions {
     }
 }
 
-/// What was refined and how good it is.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct RefineReport {
-    /// Steps behind this version.
-    pub steps: u32,
-    /// Numbers of the held-out photos.
-    pub held_out: Vec<usize>,
-    /// PSNR on the held-out photos before the first step, dB; `None` where none is held out.
-    pub psnr_before: Option<f64>,
-    /// The same for this version.
-    pub psnr_after: Option<f64>,
-}
-
 /// A version of a scene.
 #[derive(Clone, Debug)]
 pub struct RefinedVersion {
     /// Its Gaussians: a part of those that came in, moved, in their order. Entries and sources came
     /// with them.
     pub gaussians: Gaussians,
-    /// How good it is.
+    /// How good it is; which photos are held out is for the caller to say.
     pub report: RefineReport,
 }
 
@@ -132,12 +135,12 @@ pub fn held_out(count: usize) -> Vec<usize> {
 /// Photos to learn from, and those held out: what makes the scene that is refined must see the
 /// first alone.
 #[must_use]
-pub fn split(photos: &[PosedPhoto]) -> (Vec<PosedPhoto>, Vec<PosedPhoto>) {
+pub fn split(photos: Vec<PosedPhoto>) -> (Vec<PosedPhoto>, Vec<PosedPhoto>) {
     let held = held_out(photos.len());
     let (mut learnt, mut out) = (Vec::new(), Vec::new());
-    for (i, photo) in photos.iter().enumerate() {
+    for (i, photo) in photos.into_iter().enumerate() {
         let to = if held.contains(&i) { &mut out } else { &mut learnt };
-        to.push(photo.clone());
+        to.push(photo);
     }
     (learnt, out)
 }
@@ -208,17 +211,20 @@ impl Exposure {
 struct Clock {
     budget: RefineBudget,
     begun: Instant,
+    /// Time in which others went first.
+    waited: Duration,
 }
 
 impl Clock {
+    fn worked(&self) -> Duration {
+        self.begun.elapsed().saturating_sub(self.waited)
+    }
+
     /// Share of the budget that is spent after `steps`, 0..1.
     fn spent(&self, steps: u32) -> f32 {
-        let share = match self.budget {
-            RefineBudget::Steps(all) => f64::from(steps) / f64::from(all.max(1)),
-            RefineBudget::Time(all) => {
-                self.begun.elapsed().as_secs_f64() / all.as_secs_f64().max(1e-3)
-            }
-        };
+        let RefineBudget { steps: all, time } = self.budget;
+        let of_steps = f64::from(steps) / f64::from(all.max(1));
+        let share = of_steps.max(self.worked().as_secs_f64() / time.as_secs_f64().max(1e-3));
         #[expect(clippy::cast_possible_truncation, reason = "a share")]
         let share = share.min(1.0) as f32;
         share
@@ -228,7 +234,7 @@ impl Clock {
 /// A refinement at work.
 struct Refinement<'a> {
     renderer: &'a dyn DifferentiableRenderer,
-    backdrop: Arc<Backdrop>,
+    start: &'a Scene,
     near: f32,
     extent: f32,
     options: &'a RefineOptions,
@@ -236,82 +242,93 @@ struct Refinement<'a> {
     looks: Vec<Target>,
 }
 
-/// Refines `start` on `learnt` and watches `held_out`, none of which is in `start`. `extent` is the
-/// scene's median depth, world units. The photos are used at the size that they have. Each better
-/// version goes to `publish`. Returns the best one: `start` itself where none was better.
+/// Refines `start` on the photos that are learnt and watches the held-out ones, none of which is in
+/// `start`. The photos are used at the size that they have. Before each step `pace` gets the share
+/// of the budget that is spent, 0..1; it may wait, which is not counted, and its error ends the
+/// work. Each better version goes to `publish`. Returns the best one: `start` itself where none was
+/// better.
 ///
-/// Without held-out photos at most [`UNWATCHED_STEPS_MAX`] steps are taken, and the last version is
-/// the one.
+/// A scene that was refined before goes on as its report says. Without held-out photos at most
+/// [`UNWATCHED_STEPS_MAX`] steps are taken, and the last version is the one.
 ///
 /// # Errors
-/// `cancelled` once `cancel` is true, which is read before each step; `invalid_request` for options
-/// out of range; what the renderer or `publish` says. What was published stays.
-#[expect(clippy::too_many_arguments, reason = "each is another thing")]
+/// `invalid_request` for options out of range; what the renderer, `pace` or `publish` says. What
+/// was published stays.
 pub fn refine(
     renderer: &dyn DifferentiableRenderer,
-    start: &Gaussians,
-    backdrop: &Arc<Backdrop>,
+    start: &Scene,
     (learnt, held_out): (&[PosedPhoto], &[PosedPhoto]),
-    extent: f64,
     options: &RefineOptions,
-    cancel: &AtomicBool,
+    pace: &mut dyn FnMut(f32) -> Result<()>,
     publish: &mut dyn FnMut(&RefinedVersion) -> Result<()>,
 ) -> Result<RefinedVersion> {
     if options.batch == 0 || options.prune_every == 0 || options.gaussians_max == 0 {
         return Err(Error::invalid("refine: batch, prune_every and gaussians_max must be over 0"));
     }
+    let extent = start.meta.report.median_depth;
     #[expect(clippy::cast_possible_truncation, reason = "a length")]
     let extent_f32 = if extent.is_finite() && extent > 0.0 { extent as f32 } else { 1.0 };
     let work = Refinement {
         renderer,
-        backdrop: Arc::clone(backdrop),
+        start,
         near: default_near(extent),
         extent: extent_f32,
         options,
         targets: learnt.par_iter().map(Target::new).collect(),
         looks: held_out.par_iter().map(Target::new).collect(),
     };
-    work.run(start, cancel, publish)
+    work.run(pace, publish)
 }
 
 impl Refinement<'_> {
     fn run(
         mut self,
-        start: &Gaussians,
-        cancel: &AtomicBool,
+        pace: &mut dyn FnMut(f32) -> Result<()>,
         publish: &mut dyn FnMut(&RefinedVersion) -> Result<()>,
     ) -> Result<RefinedVersion> {
-        let options = self.options;
-        let clock = Clock { budget: options.budget, begun: Instant::now() };
+        let (start, options) = (self.start, self.options);
+        let begun = Instant::now();
+        let mut clock = Clock { budget: options.budget, begun, waited: Duration::ZERO };
         let watched = !self.looks.is_empty();
-        let psnr_before = self.look(start)?;
-        let report =
-            RefineReport { psnr_before, psnr_after: psnr_before, ..RefineReport::default() };
-        let mut best = RefinedVersion { gaussians: start.clone(), report };
-        if self.targets.is_empty() || start.is_empty() {
+        let earlier = start.meta.report.refinement.clone();
+        let report = match &earlier {
+            Some(earlier) => earlier.clone(),
+            None => self.as_served()?,
+        };
+        let before = RefineReport { psnr_before: report.psnr_before, ..report.clone() };
+        let mut best = RefinedVersion { gaussians: start.gaussians.clone(), report };
+        if self.targets.is_empty() || start.gaussians.is_empty() {
             return Ok(best);
         }
         let mut random = options.seed;
-        let mut gaussians = fewer(start, options.gaussians_max, &mut random)?;
+        let mut gaussians = fewer(&one_set(start, options.side)?, options, &mut random)?;
         let mut adam = Adam::new(&gaussians);
         let mut order: Vec<usize> = Vec::new();
         let (mut steps, mut looked, mut waited) = (0, 0, 0);
         let mut found = (Gradients::default(), Gradients::default());
         loop {
-            unless_cancelled(cancel)?;
             let spent = clock.spent(steps);
+            let paused = Instant::now();
+            pace(spent)?;
+            clock.waited += paused.elapsed();
             let last = spent >= 1.0 || (!watched && steps >= UNWATCHED_STEPS_MAX);
             if last || (watched && spent * LOOKS as f32 >= (looked + 1) as f32) {
                 looked += 1;
                 waited += 1;
-                let after = self.look(&gaussians)?;
+                let after = self.look(&gaussians, &|camera| self.request(camera))?;
                 let better = match (after, best.report.psnr_after) {
                     (Some(after), Some(before)) => after > before,
                     _ => last && steps > 0,
                 };
                 if better {
                     waited = 0;
-                    let report = RefineReport { steps, psnr_after: after, ..best.report };
+                    let report = RefineReport {
+                        steps: before.steps + steps,
+                        seconds: before.seconds + clock.worked().as_secs_f64(),
+                        psnr_after: after,
+                        gaussians_after: gaussians.len() as u64,
+                        ..before.clone()
+                    };
                     best = RefinedVersion { gaussians: gaussians.clone(), report };
                     publish(&best)?;
                 }
@@ -340,16 +357,37 @@ impl Refinement<'_> {
         }
     }
 
+    /// The report of the scene before any step: as it is served, in layers where it has some.
+    fn as_served(&self) -> Result<RefineReport> {
+        let (scene, count) = (self.start, self.start.gaussians.len() as u64);
+        let view = |camera| served(scene, RenderRequest::plain(camera, Kinds::COLOR, self.near));
+        let psnr = self.look(&scene.gaussians, &view)?;
+        let counts = RefineReport {
+            gaussians_before: count,
+            gaussians_after: count,
+            ..RefineReport::default()
+        };
+        Ok(RefineReport { psnr_before: psnr, psnr_after: psnr, ..counts })
+    }
+
+    /// A plain view over what the scene has behind its Gaussians.
     fn request(&self, camera: Camera) -> RenderRequest {
-        let background = Background::Backdrop(Arc::clone(&self.backdrop));
-        RenderRequest { background, ..RenderRequest::plain(camera, Kinds::COLOR, self.near) }
+        let plain = RenderRequest::plain(camera, Kinds::COLOR, self.near);
+        let Background::Backdrop(_) = served(self.start, plain.clone()).background else {
+            return RenderRequest { background: Background::BLACK, ..plain };
+        };
+        RenderRequest { background: Background::Backdrop(self.start.backdrop.clone()), ..plain }
     }
 
     /// Mean PSNR on the held-out photos, colours as 8 bits hold them.
-    fn look(&self, gaussians: &Gaussians) -> Result<Option<f64>> {
+    fn look(
+        &self,
+        gaussians: &Gaussians,
+        view: &dyn Fn(Camera) -> RenderRequest,
+    ) -> Result<Option<f64>> {
         let mut sum = 0.0;
         for target in &self.looks {
-            let frame = self.renderer.render(gaussians, &self.request(target.camera))?;
+            let frame = self.renderer.render(gaussians, &view(target.camera))?;
             let mut color = frame.color.unwrap_or_default();
             color.iter_mut().flatten().for_each(|v| *v = v.clamp(0.0, 1.0));
             sum += psnr(&color, &target.rgb, target.valid.as_deref());
@@ -412,9 +450,43 @@ fn shuffled(count: usize, random: &mut u64) -> Vec<usize> {
     order.into_iter().map(|(_, i)| i).collect()
 }
 
-/// At most `most` of the Gaussians, chosen at random; as much wider as there are fewer, so that
-/// together they cover what all did.
-fn fewer(all: &Gaussians, most: usize, random: &mut u64) -> Result<Gaussians> {
+/// The Gaussians of a scene as one set: what its views add to those that are shown larger than in
+/// the network's picture ([`segsplat_render::plan`], magnification) is added for good, for photos
+/// whose longer side is `side`.
+fn one_set(scene: &Scene, side: u32) -> Result<Gaussians> {
+    let (report, cameras) = (&scene.meta.report, &scene.meta.cameras);
+    if !report.method.magnify {
+        return Ok(scene.gaussians.clone());
+    }
+    let origin = scene.gaussians.origin();
+    // Of each photo: centre, axis, width of a source pixel at depth 1, and share of the blur lost.
+    let rows = cameras.iter().zip(&report.network_focal_px).map(|(photo, focal)| {
+        let (lens, pose) = (photo.camera.intrinsics, &photo.camera.camera_to_world);
+        let shown = lens.fx * (f64::from(side) / f64::from(lens.width.max(lens.height))).min(1.0);
+        let larger = (shown / focal / f64::from(OWN_SIZE)).max(1.0);
+        let lost = f64::from(BLUR_PX2) * (1.0 - larger.powi(-2));
+        (*focal > 0.0 && lost > 0.0)
+            .then(|| (pose.center() - origin, pose.axis(), lost / focal / focal))
+    });
+    let rows: Vec<_> = rows.collect();
+    let mut raw = scene.gaussians.as_raw().clone();
+    let scales = raw.scales.par_iter_mut().zip(&raw.means).zip(&raw.source);
+    scales.for_each(|((scales, mean), source)| {
+        let Some(Some((center, axis, lost))) = rows.get(usize::from(source.view)) else { return };
+        let depth = (point(*mean) - *center).dot(*axis);
+        #[expect(clippy::cast_possible_truncation, reason = "scales are f32")]
+        let wider = (lost * depth * depth) as f32;
+        for scale in scales {
+            *scale = (*scale * *scale + wider).sqrt().min(Gaussians::SCALE_MAX);
+        }
+    });
+    adam::checked(raw)
+}
+
+/// At most as many of the Gaussians as `options` say, chosen at random; as much wider as there are
+/// fewer, so that together they cover what all did.
+fn fewer(all: &Gaussians, options: &RefineOptions, random: &mut u64) -> Result<Gaussians> {
+    let most = options.gaussians_max;
     if all.len() <= most {
         return Ok(all.clone());
     }

@@ -1,0 +1,309 @@
+//! The job that refines a finished scene. The scene is served meanwhile; each better version takes
+//! the place of the one before in one step.
+//!
+//! It goes behind everything else: before each step it waits until no scene and no semantics are
+//! made and no view was drawn for a moment. Where views never end it takes a step now and then. It
+//! holds no slot and no room. What it still has to do is in the record, so that a start goes on
+//! from the version that was published last.
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use super::{
+    Jobs,
+    job::{Job, Kind, Reason},
+};
+use crate::{
+    error::{Error, Result},
+    pipeline::{
+        PhotoSet,
+        refinement::{at_side, start_of, version_of},
+    },
+    refine::{
+        HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion, held_out, refine, split,
+    },
+    scene::{
+        PosedPhoto, Refine, RefineReport, RefineState, RefineStatus, Scene, SceneId, Stage, Watch,
+        unless_cancelled,
+    },
+    store::{self, Record, RefineOrder},
+};
+
+/// Starts without a better version before a refinement is given up: one that kills the server must
+/// not do so forever.
+const ATTEMPTS_MAX: u32 = 3;
+/// Processor time that `auto` takes, and the least and most milliseconds of it.
+const AUTO_CPU_MS: u64 = 120_000;
+const AUTO_MS: [u64; 2] = [10_000, 60_000];
+/// Time without views after which it goes on, and the time after which it goes on all the same.
+const QUIET: Duration = Duration::from_millis(250);
+const PATIENCE: Duration = Duration::from_secs(1);
+/// Time between two looks at whether it may go on.
+const LOOK: Duration = Duration::from_millis(10);
+/// A change of the fraction that watchers are told.
+const TOLD: f32 = 0.01;
+
+/// Milliseconds that a scene of so many photos is to be refined for; `None`: not at all.
+pub(super) fn budget_ms(refine: Refine, photos: usize, threads: usize) -> Option<u64> {
+    match refine {
+        Refine::Off => None,
+        Refine::Ms(ms) => Some(ms),
+        // With fewer photos none is held out, and nothing tells whether it helps.
+        Refine::Auto if photos < HOLDS_OUT_FROM => None,
+        Refine::Auto => Some((AUTO_CPU_MS / threads.max(1) as u64).clamp(AUTO_MS[0], AUTO_MS[1])),
+    }
+}
+
+/// Forgets a refinement that another process has.
+pub(super) fn reset(record: &mut Record) {
+    record.refine = None;
+    if record.status.is_refined_now() {
+        record.status.refinement = RefineStatus::default();
+    }
+}
+
+impl Jobs {
+    /// Queues the refinement of a finished scene, or ends it; one that is on its way stays.
+    /// Fails with `scene_not_found`; `overloaded` when too many wait, or the server stops;
+    /// `store_unavailable`.
+    pub(crate) fn refine(&self, id: &SceneId, how: Refine) -> Result<()> {
+        let record = self.record(id)?;
+        let photos = record.status.cameras.len();
+        let Some(ms) = budget_ms(how, photos, self.parts.threads) else {
+            return self.end_refinement(id);
+        };
+        if record.refine.is_some() {
+            return Ok(());
+        }
+        let reserved = self.queue.reserve(Kind::Refine, record.owner.as_deref());
+        let place = reserved.map_err(|full| self.overloaded(full))?;
+        if self.order(id, Some(RefineOrder { ms, attempts: 0 }))? {
+            self.replicas.hold(id);
+            place.fill(id.clone());
+        }
+        Ok(())
+    }
+
+    fn end_refinement(&self, id: &SceneId) -> Result<()> {
+        self.queue.remove_kind(Kind::Refine, id);
+        self.running.stop_kind(Kind::Refine, id, Reason::Cancelled);
+        self.order(id, None).map(drop)
+    }
+
+    /// Keeps what is to be refined, in the record and in the store; whether it was otherwise.
+    fn order(&self, id: &SceneId, order: Option<RefineOrder>) -> Result<bool> {
+        let mut kept = Ok(false);
+        self.records.update(id, |record| {
+            // Under the record's lock: of many callers one is the first.
+            if record.refine.is_some() == order.is_some() {
+                return;
+            }
+            let before = record.clone();
+            record.refine = order;
+            let state = match (&order, &record.status.report) {
+                (Some(_), _) => RefineState::Running,
+                (None, Some(report)) if report.refinement.is_some() => RefineState::Done,
+                (None, _) => RefineState::None,
+            };
+            record.status.refinement = RefineStatus::new(state);
+            kept = self.parts.store.put_record(record).map(|()| true);
+            if kept.is_err() {
+                *record = before;
+            }
+        });
+        kept
+    }
+
+    /// Keeps a record of the job. A refinement that is ended meanwhile stays ended in the store.
+    fn keep_beside_orders(&self, record: &Record) -> Result<()> {
+        self.parts.store.put_record(record)?;
+        match self.records.find(&record.status.id) {
+            Some(now) if now.refine.is_some() != record.refine.is_some() => {
+                self.parts.store.put_record(&now)
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// The refinement that a scene is to have once it is done, where its create call or the
+    /// configuration asks for one and the queue has room.
+    pub(super) fn first_order(&self, done: &Record) -> Option<RefineOrder> {
+        if done.status.report.as_ref().is_some_and(|report| report.refinement.is_some()) {
+            return None; // a copy of a scene that was refined
+        }
+        let how = done.options.refine.unwrap_or(self.parts.refine);
+        let ms = budget_ms(how, done.status.cameras.len(), self.parts.threads)?;
+        self.queue.reserve(Kind::Refine, done.owner.as_deref()).ok()?;
+        Some(RefineOrder { ms, attempts: 0 })
+    }
+
+    /// Where a version was published and its record was not: the record of that version.
+    pub(super) fn mend(&self, record: &mut Record) {
+        let id = &record.status.id;
+        let Ok(scene) = self.parts.store.scene(id) else { return };
+        if record.scene_sha256.as_ref() != Some(&scene.sha256) {
+            shows(record, &scene);
+            self.keep_record(record);
+        }
+    }
+
+    pub(super) fn refine_scene(&self, job: &Job) -> Result<()> {
+        let id = &job.scene;
+        let begun = self.records.update(id, |record| {
+            if let Some(order) = &mut record.refine {
+                order.attempts += 1;
+            }
+        });
+        let Some(record) = begun else { return Ok(()) };
+        let Some(order) = record.refine else { return Ok(()) };
+        self.keep_beside_orders(&record)?;
+        if order.attempts > ATTEMPTS_MAX {
+            return Err(Error::internal(format!(
+                "given up: the server stopped {ATTEMPTS_MAX} times without a better version"
+            )));
+        }
+        let mut told = 0.0;
+        let progress = |_: Stage, _: f32| drop(self.give_way(job));
+        let watch = Watch { progress: &progress, cancel: &job.cancel };
+        self.give_way(job)?;
+        let scene = self.parts.store.scene(id)?;
+        let photos = self.photos(id, watch)?;
+        let photos = match Arc::try_unwrap(photos) {
+            Ok(own) => own.photos.photos,
+            Err(shared) => shared.photos.photos.clone(),
+        };
+        let (learnt, out) = split(photos);
+        let (start, learnt) = match scene.meta.report.refinement {
+            Some(_) => (Scene::clone(&scene), learnt),
+            None => {
+                let learnt = PhotoSet { photos: learnt, read_ms: 0.0 };
+                let made = self.parts.scenes.make(&learnt, &record.options, watch)?;
+                (start_of(&scene, made)?, learnt.photos)
+            }
+        };
+        drop(scene);
+        let done_s = start.meta.report.refinement.as_ref().map_or(0.0, |report| report.seconds);
+        let left = Duration::from_millis(order.ms).saturating_sub(Duration::from_secs_f64(done_s));
+        let limits = &self.parts.limits;
+        let options = RefineOptions {
+            budget: RefineBudget { steps: limits.refine_steps_max, time: left },
+            gaussians_max: limits.refine_gaussians_max,
+            ..RefineOptions::default()
+        };
+        let sized = |photos: Vec<PosedPhoto>| -> Vec<PosedPhoto> {
+            photos.into_iter().map(|photo| at_side(&photo, options.side)).collect()
+        };
+        let (learnt, out) = (sized(learnt), sized(out));
+        let mut pace = |spent: f32| {
+            if spent >= told + TOLD {
+                told = spent;
+                self.show(job, Stage::Refine, spent);
+            }
+            self.give_way(job)
+        };
+        let mut publish = |version: &RefinedVersion| self.publish(job, &start, version);
+        let renderer = &*self.parts.refiner;
+        let photos = (&learnt[..], &out[..]);
+        let best = refine(renderer, &start, photos, &options, &mut pace, &mut publish)?;
+        self.finish_refinement(job, &best)
+    }
+
+    /// Waits until nothing else is to be done.
+    /// Fails with `cancelled`.
+    fn give_way(&self, job: &Job) -> Result<()> {
+        let begun = Instant::now();
+        loop {
+            unless_cancelled(&job.cancel)?;
+            let made = [Kind::Scene, Kind::Semantics];
+            let makes = |kind| self.queue.len(kind) > 0 || !self.running.scenes(kind).is_empty();
+            let drawn = (self.parts.drawn)();
+            let quiet = drawn.is_none_or(|ago| ago >= QUIET) || begun.elapsed() >= PATIENCE;
+            if quiet && !made.into_iter().any(makes) {
+                return Ok(());
+            }
+            std::thread::sleep(LOOK);
+        }
+    }
+
+    /// A better version takes the place of the one that is served.
+    fn publish(&self, job: &Job, start: &Scene, version: &RefinedVersion) -> Result<()> {
+        let (id, store) = (&job.scene, &self.parts.store);
+        // No semantics are made of Gaussians that are replaced meanwhile.
+        let _lock = self.lock(id.as_str(), job)?;
+        let served = store.scene(id)?;
+        let scene = store.put_version(version_of(start, &served, version)?)?;
+        let Some(mut record) = self.records.find(id).map(Arc::unwrap_or_clone) else {
+            return Ok(());
+        };
+        let change = |record: &mut Record| {
+            shows(record, &scene);
+            record.status.version += 1;
+            if let Some(order) = &mut record.refine {
+                order.attempts = 0;
+            }
+        };
+        change(&mut record);
+        store.put_status(&record)?;
+        if let Some(shown) = self.records.update(id, change) {
+            self.keep_beside_orders(&shown)?;
+        }
+        let psnr = version.report.psnr_after;
+        tracing::info!(scene = %id, version = record.status.version, psnr, "refined");
+        Ok(())
+    }
+
+    fn finish_refinement(&self, job: &Job, best: &RefinedVersion) -> Result<()> {
+        let (id, store) = (&job.scene, &self.parts.store);
+        let _lock = self.lock(id.as_str(), job)?;
+        let Some(mut record) = self.records.find(id).map(Arc::unwrap_or_clone) else {
+            return Ok(());
+        };
+        let held_out = held_out(record.status.cameras.len());
+        let held_out: Vec<u32> =
+            held_out.into_iter().filter_map(|i| u32::try_from(i).ok()).collect();
+        let change = |record: &mut Record| {
+            record.refine = None;
+            record.status.refinement =
+                RefineStatus { fraction: 1.0, ..RefineStatus::new(RefineState::Done) };
+            // Where no version was better, the record alone says what came out.
+            if let Some(report) = &mut record.status.report {
+                report.refinement.get_or_insert_with(|| RefineReport {
+                    held_out: held_out.clone(),
+                    ..best.report.clone()
+                });
+            }
+        };
+        change(&mut record);
+        store.put_status(&record)?;
+        self.records.update(id, change);
+        tracing::info!(scene = %id, steps = best.report.steps, "refinement is over");
+        if !self.parts.keep_photos && record.status.is_settled() {
+            store.drop_upload(id)?;
+        }
+        Ok(())
+    }
+}
+
+/// The record says what the scene says of itself.
+fn shows(record: &mut Record, scene: &Scene) {
+    record.scene_sha256 = Some(scene.sha256.clone());
+    record.status.report = Some(scene.meta.report.clone());
+    record.status.cameras.clone_from(&scene.meta.cameras);
+    record.status.updated_ms = store::now_ms();
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn auto_takes_what_the_machine_has_and_leaves_few_photos_alone() {
+        let auto = |photos, threads| budget_ms(Refine::Auto, photos, threads);
+        assert_eq!([auto(4, 2), auto(5, 2), auto(5, 1)], [None, Some(60_000), Some(60_000)]);
+        assert_eq!([auto(64, 8), auto(64, 64)], [Some(15_000), Some(10_000)]);
+        assert_eq!(budget_ms(Refine::Off, 9, 2), None);
+        assert_eq!(budget_ms(Refine::Ms(7), 2, 2), Some(7));
+    }
+}

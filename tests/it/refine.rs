@@ -1,0 +1,232 @@
+//! Refinement as a job: the scene is served meanwhile, better versions take its place whole, and it
+//! ends with its scene.
+
+use std::sync::{Arc, atomic::Ordering};
+
+use futures_util::StreamExt;
+use segsplat::{
+    error::{ErrorCode, Result},
+    jobs::SceneNetworks,
+    pipeline::{PhotoSet, Reconstruction},
+    sample::{self, SampleOptions},
+    scene::{
+        Event, Refine, RefineState, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode,
+        Upload, Watch,
+    },
+    service::{CreateScene, QuerySpec},
+};
+
+use crate::common::{
+    doors::bytes,
+    meaning::PhotoMeaning,
+    process::eventually,
+    server::{PATIENCE, TestServer, WallNetworks, first_view},
+};
+
+/// The stand-in, whose pictures are the photos themselves: Gaussians know their pixels.
+#[derive(Debug, Default)]
+struct LensedNetworks(WallNetworks);
+
+impl SceneNetworks for LensedNetworks {
+    fn identity(&self) -> String {
+        self.0.identity()
+    }
+
+    fn make(
+        &self,
+        photos: &PhotoSet,
+        options: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<Reconstruction> {
+        let mut made = self.0.make(photos, options, watch)?;
+        for camera in &mut made.cameras {
+            camera.network = Some(camera.camera.intrinsics);
+        }
+        Ok(made)
+    }
+}
+
+/// So long that steps end it, or a test does.
+const LONG: Refine = Refine::Ms(600_000);
+
+fn upload() -> Upload {
+    let options = SampleOptions { photos: 6, width: 64, height: 48, seed: 5 };
+    sample::upload(&options).expect("the options are in range")
+}
+
+/// A server whose refinements take at most so many steps, and its networks.
+async fn server(steps: u32) -> (TestServer, Arc<LensedNetworks>) {
+    let networks = Arc::new(LensedNetworks::default());
+    let given = Arc::clone(&networks);
+    let server = TestServer::with(|config, parts| {
+        parts.scenes = given;
+        parts.semantics = Arc::new(PhotoMeaning::default());
+        config.limits.refine_steps_max = steps;
+    });
+    (server.await, networks)
+}
+
+async fn scene(server: &TestServer, options: SceneOptions) -> SceneStatus {
+    let wait = Some(PATIENCE);
+    let request = CreateScene { upload: upload(), options, wait, ..CreateScene::default() };
+    server.service.create_scene(request).await.expect("a good upload").status
+}
+
+async fn until(
+    server: &TestServer,
+    id: &SceneId,
+    is: impl Fn(&SceneStatus) -> bool,
+) -> SceneStatus {
+    eventually("the refinement", async || Some(server.service.get(id).await.unwrap()).filter(&is))
+        .await
+}
+
+async fn texts(server: &TestServer, id: &SceneId) -> u64 {
+    let spec = QuerySpec {
+        texts: vec!["photo 0".to_owned()],
+        wait: Some(PATIENCE),
+        ..QuerySpec::default()
+    };
+    server.service.query(id, spec).await.expect("texts are answered").results[0].gaussians
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn better_versions_take_the_place_of_a_scene_and_its_watchers_are_told() {
+    let (server, networks) = server(60).await;
+    let service = &server.service;
+    let made = scene(&server, SceneOptions::default()).await;
+    assert_eq!((made.version, made.refinement.state), (1, RefineState::None), "off by default");
+    let first = service.render(&made.id, first_view()).await.unwrap();
+    networks.0.hold.store(true, Ordering::Release);
+    let taken = service.refine(&made.id, LONG).await.unwrap();
+    assert_eq!((taken.state, taken.refinement.state), (SceneState::Done, RefineState::Running));
+    let events = service.watch(&made.id).await.unwrap();
+    networks.0.hold.store(false, Ordering::Release);
+    let events: Vec<Event> = events.collect().await;
+    let done = service.get(&made.id).await.unwrap();
+    let versions: Vec<u32> = events[1..]
+        .iter()
+        .map(|event| match event {
+            Event::Version { version, .. } => *version,
+            other => panic!("{other:?}"),
+        })
+        .collect();
+    assert_eq!(events[0], Event::Done, "it is done all the time");
+    assert!(versions.is_sorted() && versions.last() == Some(&done.version), "{versions:?}");
+    assert!(done.version > 1 && done.refinement.state == RefineState::Done, "{done:?}");
+    let report = done.report.unwrap();
+    let refined = report.refinement.expect("a report");
+    assert!(refined.psnr_after > refined.psnr_before && refined.steps > 0, "{refined:?}");
+    assert_eq!((refined.held_out, refined.gaussians_after), (vec![3], report.gaussians));
+    assert_eq!((report.method.front_photos, report.method.magnify), (0, false), "one set");
+    let now = service.render(&made.id, first_view()).await.unwrap();
+    assert!(now.etag != first.etag && now.bytes != first.bytes, "another picture, another tag");
+    assert_eq!(service.view_etag(&made.id, &first_view()).await.unwrap(), Some(now.etag.clone()));
+    let url = server.url(&format!("/v1/scenes/{}/export", made.id));
+    let sent = crate::common::client().get(url).send().await.unwrap();
+    let ply = bytes(sent).await.unwrap();
+    let head = String::from_utf8_lossy(&ply[..200]).into_owned();
+    assert!(head.contains(&format!("element vertex {}\n", report.gaussians)), "{head}");
+    let id = made.id.clone();
+    let server = server.restart().await;
+    let again = server.service.render(&id, first_view()).await.unwrap();
+    assert!(again.bytes == now.bytes, "the last version is kept");
+    let kept = server.service.view_etag(&id, &first_view()).await.unwrap();
+    assert_eq!(kept, Some(again.etag), "the record and the scene are of one version");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_refinement_goes_on_after_a_restart_until_it_is_ended_and_its_version_stays() {
+    let (server, _) = server(16_000).await;
+    let options = SceneOptions { refine: Some(LONG), ..SceneOptions::default() };
+    let made = scene(&server, options).await;
+    assert_eq!((made.state, made.refinement.state), (SceneState::Done, RefineState::Running));
+    // A version comes with every tenth of the steps, so it ends long after the first.
+    let better = until(&server, &made.id, |status| status.version > 1).await;
+    let server = server.restart().await;
+    let found = server.service.get(&made.id).await.unwrap();
+    assert!(found.version >= better.version && found.is_refined_now(), "{found:?}");
+    server.service.render(&made.id, first_view()).await.unwrap();
+    let ended = server.service.refine(&made.id, Refine::Off).await.unwrap();
+    assert_eq!(ended.refinement.state, RefineState::Done, "it was refined");
+    assert!(ended.version >= better.version);
+    let server = server.restart().await;
+    assert!(!server.service.get(&made.id).await.unwrap().is_refined_now(), "it stays ended");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_scene_that_is_deleted_while_it_is_refined_is_gone() {
+    let (server, networks) = server(20_000).await;
+    let made = scene(&server, SceneOptions::default()).await;
+    networks.0.hold.store(true, Ordering::Release);
+    let calls = networks.0.calls.load(Ordering::Acquire);
+    server.service.refine(&made.id, LONG).await.unwrap();
+    eventually("its start", async || {
+        (networks.0.calls.load(Ordering::Acquire) > calls).then_some(())
+    })
+    .await;
+    server.service.delete(&made.id).await.unwrap();
+    let told = server.service.get(&made.id).await.unwrap_err();
+    assert_eq!(told.code(), ErrorCode::SceneNotFound);
+    // The same again, in the middle of the steps.
+    networks.0.hold.store(false, Ordering::Release);
+    let options = SceneOptions { refine: Some(LONG), ..SceneOptions::default() };
+    let second = scene(&server, options).await;
+    until(&server, &second.id, |status| status.version > 1).await;
+    server.service.delete(&second.id).await.unwrap();
+    let folder = server.data_dir().join("scenes");
+    eventually("the files", async || {
+        let left = std::fs::read_dir(&folder).into_iter().flatten().flatten();
+        let files = left.filter_map(|scene| std::fs::read_dir(scene.path()).ok()).flatten();
+        (files.count() == 0).then_some(())
+    })
+    .await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn texts_are_answered_before_while_and_after_a_scene_is_refined() {
+    let (server, networks) = server(60).await;
+    let options = SceneOptions { semantics: SemanticsMode::Eager, ..SceneOptions::default() };
+    let id = scene(&server, options).await.id;
+    let before = texts(&server, &id).await;
+    networks.0.hold.store(true, Ordering::Release);
+    server.service.refine(&id, LONG).await.unwrap();
+    assert_eq!(texts(&server, &id).await, before, "while it waits");
+    networks.0.hold.store(false, Ordering::Release);
+    let done = until(&server, &id, |status| !status.is_refined_now()).await;
+    let all = done.report.unwrap().gaussians;
+    let after = texts(&server, &id).await;
+    assert!(done.version > 1 && 0 < after && after < all, "{after} of {all}, {before} before");
+    // The entries of the refined Gaussians are in the scene's own file.
+    let server = server.restart().await;
+    assert_eq!(texts(&server, &id).await, after, "after a restart");
+    let later =
+        scene(&server, SceneOptions { max_views: Some(2), ..SceneOptions::default() }).await;
+    server.service.refine(&later.id, LONG).await.unwrap();
+    until(&server, &later.id, |status| !status.is_refined_now()).await;
+    assert!(texts(&server, &later.id).await > 0, "semantics of refined Gaussians");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_cannot_be_refined_is_refused_with_its_bound() {
+    let server = TestServer::with(|config, _| config.keep_photos = false).await;
+    let id = server.scene().await.id;
+    let client = crate::common::client();
+    for (value, want) in [
+        ("0", "refine is 0 ms; it must be 1 to 600000"),
+        ("600001", "refine is 600001 ms; it must be 1 to 600000"),
+        ("on", "refine is \"on\"; it must be auto, off or a whole number of milliseconds"),
+        ("500", "refine: this server does not keep the photos of finished scenes (keep_photos)"),
+    ] {
+        let url = server.url(&format!("/v1/scenes/{id}/refine?refine={value}"));
+        let told = bytes(client.post(url).send().await.unwrap()).await.unwrap_err();
+        assert_eq!(told.message, want);
+    }
+    let options = SceneOptions { refine: Some(Refine::Ms(600_001)), ..SceneOptions::default() };
+    let request = CreateScene { upload: upload(), options, ..CreateScene::default() };
+    let told = server.service.create_scene(request).await.unwrap_err();
+    assert!(told.message().ends_with("it must be 1 to 600000"), "{told}");
+    let absent = SceneId::from_bytes([7; 16]);
+    let told = server.service.refine(&absent, Refine::Auto).await.unwrap_err();
+    assert_eq!(told.code(), ErrorCode::SceneNotFound);
+}
