@@ -39,7 +39,7 @@ pub struct ViewerPage {
 /// The page of the server.
 pub static VIEWER: LazyLock<ViewerPage> = LazyLock::new(|| {
     let policy = format!("{}; form-action 'self'; frame-ancestors 'none'", policy("'self'"));
-    ViewerPage { html: document("", ""), policy }
+    ViewerPage { html: around_data().concat().replace("<!--policy-->", ""), policy }
 });
 
 /// What the page may do; `connect` is where it may call.
@@ -50,12 +50,6 @@ fn policy(connect: &str) -> String {
         "default-src 'none'; script-src {script}; style-src {style}; worker-src blob:; \
          img-src 'self' blob: data:; connect-src {connect}; base-uri 'none'"
     )
-}
-
-/// The whole document; `head` and `data` go into its head and before its script.
-fn document(head: &str, data: &str) -> String {
-    let [start, end] = around_data();
-    format!("{}{data}{end}", start.replace("<!--policy-->", head))
 }
 
 /// The document before and after the place of a scene.
