@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use segsplat_core::error::{ErrorCode, Result};
-use segsplat_testing::{root, skipped};
+use segsplat_testing::{opened, ort_library, root};
 use serde_json::{Value, json};
 
 use crate::lab;
@@ -72,17 +72,12 @@ fn judged(folder: &Path, rest: &[&str]) -> Option<Result<Vec<Value>>> {
     let mut line = vec!["semantics", folder, "--absent", "blue,red"];
     line.extend(["--bundle", bundle, "--threads", "2"]);
     line.extend(rest);
-    // The program may be built outside of the checkout, where it does not find its library.
-    let library = root().join("target/ort/libonnxruntime.so");
-    let named = ["SEGSPLAT_ORT_LIBRARY", "ORT_DYLIB_PATH", "CARGO_TARGET_DIR"];
-    if library.is_file() && named.iter().all(|name| std::env::var_os(name).is_none()) {
+    let library = ort_library();
+    if let Some(library) = &library {
         line.extend(["--ort-library", library.to_str().unwrap()]);
     }
     match lab(&line) {
-        Err(e) if e.code() == ErrorCode::ModelUnavailable => {
-            skipped(&e.to_string());
-            None
-        }
+        Err(e) if e.code() == ErrorCode::ModelUnavailable => opened(Err(e)),
         rows => Some(rows),
     }
 }

@@ -23,6 +23,16 @@ pub fn root() -> &'static Path {
     Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."))
 }
 
+/// The ONNX Runtime that tests name to the program: `SEGSPLAT_ORT_LIBRARY`, else the checkout's, which
+/// a test program that is built elsewhere does not find; `None` where it finds one by itself.
+#[must_use]
+pub fn ort_library() -> Option<PathBuf> {
+    let named = std::env::var_os("SEGSPLAT_ORT_LIBRARY").map(PathBuf::from);
+    let found =
+        ["ORT_DYLIB_PATH", "CARGO_TARGET_DIR"].iter().any(|v| std::env::var_os(v).is_some());
+    named.or_else(|| Some(root().join("target/ort")).filter(|folder| !found && folder.is_dir()))
+}
+
 /// True where the absence of a library or an adapter is a failure and not a skip.
 #[must_use]
 pub fn strict() -> bool {
@@ -39,7 +49,9 @@ pub fn skipped(why: &str) {
 pub fn opened<T>(result: Result<T>) -> Option<T> {
     match result {
         Err(e) if e.code() == ErrorCode::ModelUnavailable => {
-            skipped(e.message());
+            // What the library itself said is the source.
+            let source = std::error::Error::source(&e).map(ToString::to_string);
+            skipped(&format!("{e}: {}", source.unwrap_or_default()));
             None
         }
         opened => Some(opened.expect("networks that open")),

@@ -84,6 +84,8 @@ pub struct Runtime {
     path: PathBuf,
     sha256: String,
     pinned: Option<&'static str>,
+    /// Whether a session has told the library the domain of our operators.
+    domain_known: Mutex<bool>,
 }
 
 /// The process's library. `ort` can load one only, so a second one is an error, not a surprise.
@@ -139,7 +141,8 @@ impl Runtime {
             .with_telemetry(false)
             .build()
             .map_err(|e| unavailable("ONNX Runtime: the library does not start").caused_by(e))?;
-        let runtime = Arc::new(Self { environment, path, sha256, pinned });
+        let runtime =
+            Arc::new(Self { environment, path, sha256, pinned, domain_known: Mutex::new(false) });
         *loaded = Some(Arc::clone(&runtime));
         Ok(runtime)
     }
@@ -199,12 +202,21 @@ impl Runtime {
         if let Some(weights) = weights {
             builder = builder.with_prepacked_weights(weights)?;
         }
-        match arithmetic {
+        let mut builder = match arithmetic {
             Arithmetic::Fast => builder,
             Arithmetic::F32 => builder.with_quant_qdq(false)?,
             Arithmetic::EightBits => builder.with_precise_qmm()?,
+        };
+        // The library asks whether it knows the domain of our operators and then adds it, without
+        // a lock: of two first sessions at once, one fails. So the first one is opened alone.
+        let mut known = self.domain_known.lock();
+        if *known {
+            drop(known);
+            return builder.commit_from_file(model);
         }
-        .commit_from_file(model)
+        let session = builder.commit_from_file(model)?;
+        *known = true;
+        Ok(session)
     }
 
     /// Providers to try for a choice, best first.

@@ -35,12 +35,7 @@ mod votes;
 
 use segsplat_vision::models::NetworkOptions;
 
-/// The defaults, with the library that `scripts/setup` put into the repository's target folder:
-/// these tests do not run in the root of the repository, where the search begins.
+/// The defaults, with the library that tests use.
 fn network_options() -> NetworkOptions {
-    let library = segsplat_testing::root().join("target/ort");
-    let named =
-        ["ORT_DYLIB_PATH", "CARGO_TARGET_DIR"].iter().any(|v| std::env::var_os(v).is_some());
-    let ort_library = (!named && library.is_dir()).then_some(library);
-    NetworkOptions { ort_library, ..NetworkOptions::default() }
+    NetworkOptions { ort_library: segsplat_testing::ort_library(), ..NetworkOptions::default() }
 }
