@@ -1,7 +1,7 @@
 //! The program itself: what it prints, where, and with which exit code.
 
 use std::{
-    io::{BufRead, BufReader},
+    io::{BufRead, BufReader, ErrorKind},
     path::Path,
     process::{Child, Command, Output, Stdio},
 };
@@ -350,12 +350,15 @@ fn bundle_and_library_are_found_from_any_folder() {
         std::fs::copy(env!("CARGO_BIN_EXE_segsplat"), at(program)).unwrap();
         symlink(crate::common::root().join("models/embedded"), at(bundle)).unwrap();
         symlink(runtime.path(), at(library)).unwrap();
-        let verified = Command::new(folder.path().join(program))
-            .current_dir(elsewhere.path())
-            .env_clear()
-            .args(["models", "verify", "--json"])
-            .output()
-            .unwrap();
+        let mut verify = Command::new(folder.path().join(program));
+        verify.current_dir(elsewhere.path()).env_clear().args(["models", "verify", "--json"]);
+        // A child that another test starts meanwhile holds the copy open until it is a program.
+        let verified = loop {
+            match verify.output() {
+                Err(e) if e.kind() == ErrorKind::ExecutableFileBusy => std::thread::yield_now(),
+                other => break other.unwrap(),
+            }
+        };
         let said = String::from_utf8_lossy(&verified.stderr);
         assert!(verified.status.success(), "{program}: {said}");
         let said: Value = serde_json::from_slice(&verified.stdout).unwrap();
