@@ -15,9 +15,9 @@ const SURENESS_OF_SIZE: f32 = 0.1;
 
 /// The index map of the masks, sorted by area, the largest first.
 ///
-/// A mask that lies in the mask of a whole object is dropped. Of the others, the surest for its size
-/// has a pixel, or the smallest ([`Settings::surest_first`]). A mask with too few visible pixels is
-/// dropped.
+/// A mask that lies in the mask of a whole object is dropped. Of the others, the surest for its
+/// size has a pixel, or the smallest ([`Settings::surest_first`]). A mask with too few visible
+/// pixels is dropped.
 pub(super) fn one_a_pixel(
     found: &Proposals,
     photo_grid: PhotoGrid,
