@@ -36,32 +36,28 @@ def normalised(rgb):
 def prompts(whole, part, P, gen, exponent=0.6):
     """Points [B,P,2,2] (x, y), labels [B,P,2] and soft masks whole, part [B,P,128,128]."""
     B, dev = len(whole), whole.device
-    small = whole[:, 2::4, 2::4].reshape(B, -1)
-    coords, labels, tw, tp = [], [], [], []
-    for b in range(B):
-        _, inverse, counts = torch.unique(small[b], return_inverse=True, return_counts=True)
-        weight = counts.float()[inverse] ** -exponent * (small[b] >= 0)
-        if weight.sum() <= 0:
-            weight = torch.ones_like(weight)
-        at = torch.multinomial(weight, P, True, generator=gen)
-        y = (at // 128 * 4 + torch.randint(0, 4, (P,), device=dev, generator=gen)).clamp(max=SIDE - 1)
-        x = (at % 128 * 4 + torch.randint(0, 4, (P,), device=dev, generator=gen)).clamp(max=SIDE - 1)
-        w_id, p_id = whole[b, y, x], part[b, y, x]
-        w = (whole[b][None] == w_id[:, None, None]) & (w_id >= 0)[:, None, None]
-        p = (part[b][None] == p_id[:, None, None]) & w
-        w4, p4 = F.avg_pool2d(w[:, None].float(), 4)[:, 0], F.avg_pool2d(p[:, None].float(), 4)[:, 0]
-        kind = torch.rand(P, device=dev, generator=gen)
-        pool = torch.where((kind < 0.2)[:, None], w4.flatten(1), 1 - w4.flatten(1)) + 1e-6
-        more = torch.multinomial(pool, 1, generator=gen)[:, 0]
-        label = torch.where(kind < 0.2, 1, torch.where(kind < 0.3, 0, -1))
-        second = torch.stack([more % 128 * 4 + 2, more // 128 * 4 + 2], -1).float()
-        coords.append(torch.stack([torch.stack([x, y], -1).float(), second], 1))
-        labels.append(torch.stack([(w_id >= 0).int() * 2 - 1, label.int()], 1))
-        # A second point on the thing but off the part asks for the thing.
-        ask = (label == 1) & (p4.flatten(1).gather(1, more[:, None])[:, 0] < 0.5)
-        tw.append(w4)
-        tp.append(torch.where(ask[:, None, None], w4, p4))
-    return torch.stack(coords), torch.stack(labels), torch.stack(tw), torch.stack(tp)
+    rand = lambda high: torch.randint(0, high, (B, P), device=dev, generator=gen)
+    pick = torch.arange(B, device=dev)[:, None]
+    small = whole[:, 2::4, 2::4].flatten(1).long()
+    # Cells of each thing of each picture; -1 is a number, too.
+    keys = small + 1 + pick * (small.amax() + 2)
+    weight = torch.bincount(keys.flatten())[keys].float() ** -exponent * (small >= 0)
+    weight = torch.where(weight.sum(1, keepdim=True) > 0, weight, 1.0)
+    at = torch.multinomial(weight, P, True, generator=gen)
+    y, x = at // 128 * 4 + rand(4), at % 128 * 4 + rand(4)
+    w_id, p_id = whole[pick, y, x], part[pick, y, x]
+    w = (whole[:, None] == w_id[..., None, None]) & (w_id >= 0)[..., None, None]
+    p = (part[:, None] == p_id[..., None, None]) & w
+    w4, p4 = F.avg_pool2d(w.float(), 4), F.avg_pool2d(p.float(), 4)
+    kind = torch.rand(B, P, device=dev, generator=gen)
+    pool = torch.where((kind < 0.2)[..., None], w4.flatten(2), 1 - w4.flatten(2)) + 1e-6
+    more = torch.multinomial(pool.flatten(0, 1), 1, generator=gen).reshape(B, P)
+    label = torch.where(kind < 0.2, 1, torch.where(kind < 0.3, 0, -1))
+    coords = torch.stack([torch.stack([x, y], -1), torch.stack([more % 128, more // 128], -1) * 4 + 2], 2).float()
+    labels = torch.stack([(w_id >= 0).int() * 2 - 1, label.int()], -1)
+    # A second point on the thing but off the part asks for the thing.
+    ask = (label == 1) & (p4.flatten(2).gather(2, more[..., None])[..., 0] < 0.5)
+    return coords, labels, w4, torch.where(ask[..., None, None], w4, p4)
 
 
 def distance(logits, target):

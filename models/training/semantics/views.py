@@ -212,9 +212,9 @@ class Photographs:
         x = torch.where(flip[:, None], x.flip(1), x)
         inside = ((x >= 0) & (x < hw[:, 1:]))[:, None] & ((y >= 0) & (y < hw[:, :1]))[..., None]
         xy = torch.stack([x[:, None].expand(B, S, S), y[..., None].expand(B, S, S)], -1) / S * 2 - 1
-        rgb = torch.stack([F.grid_sample(self.rgb[p : p + 1].float() / 255, g_[None], mode="bilinear", padding_mode="border", align_corners=False)[0] for p, g_ in zip(pick.tolist(), xy)])
+        rgb = F.grid_sample(self.rgb[pick].float() / 255, xy, mode="bilinear", padding_mode="border", align_corners=False)
         xi, yi = x.long().clamp(0, S - 1), y.long().clamp(0, S - 1)
-        take = lambda a: torch.where(inside, torch.stack([a[p][yi[i]][:, xi[i]] for i, p in enumerate(pick.tolist())]).int(), -1)
+        take = lambda a: torch.where(inside, a[pick[:, None, None], yi[..., None], xi[:, None]].int(), -1)
         whole, fine = take(self.whole), take(self.fine)
         gain = torch.exp((u(B, 3, 1, 1) - 0.5) * 0.2 + (u(B, 1, 1, 1) - 0.5) * 0.5)
         c = torch.exp((u(B, 1, 1, 1) - 0.5) * 0.4)
@@ -232,7 +232,7 @@ class Photographs:
         B, S = len(rgb), rgb.shape[-1]
         g = self.gen
         u = lambda *s: torch.rand(*s, device=self.device, generator=g)
-        px = torch.stack([_any_pixel(w, g) for w in dwhole])
+        px = torch.multinomial((dwhole.flatten(1) >= 0).float() + 1e-6, 1, generator=g)[:, 0]
         label = dwhole.flatten(1).gather(1, px[:, None])[..., None]
         mask = (dwhole == label) & (label >= 0)
         share = mask.float().mean((1, 2))
@@ -247,8 +247,3 @@ class Photographs:
         c = F.grid_sample(drgb, grid, align_corners=False)
         on = m[:, 0] > 0.5
         return rgb * (1 - m) + c * m, torch.where(on, 9000 + number, whole), torch.where(on, 900000 + number, part)
-
-
-def _any_pixel(whole, gen):
-    ok = (whole.flatten() >= 0).float()
-    return torch.multinomial(ok + 1e-6, 1, generator=gen)[0]

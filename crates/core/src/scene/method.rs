@@ -145,9 +145,9 @@ method! {
     /// Whether masks are judged at the photo's own pixels, and not on the decoder's grid.
     full_resolution: bool = false, true;
     /// Whether masks are also held to each other's pixels (NMS) and to bounds on their area, and
-    /// not only to Segment Anything's own filters.
+    /// the surest has a pixel, and not only to Segment Anything's own filters.
     mask_filters: bool = true, false;
-    /// Whether the crop of a mask shows all of it, also where a smaller mask lies on it.
+    /// Whether the crop of a mask shows all of it, also where another mask lies on it.
     crop_whole: bool = false, true;
     /// Whether the crop of a mask has the bundle's margin.
     crop_margin: bool = true, false;

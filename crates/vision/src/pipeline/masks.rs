@@ -76,7 +76,13 @@ pub fn settings(manifest: &MasksManifest, method: &Method) -> Settings {
     };
     match method.mask_filters {
         true => settings,
-        false => Settings { mask_nms_thresh: 1.0, min_area: 0.0, max_area: 1.0, ..settings },
+        false => Settings {
+            mask_nms_thresh: 1.0,
+            min_area: 0.0,
+            max_area: 1.0,
+            surest_first: false,
+            ..settings
+        },
     }
 }
 

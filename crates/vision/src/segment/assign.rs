@@ -9,11 +9,15 @@ use crate::{
 
 /// Most masks of a photo: a mask number is a u16, and 0 is none.
 const MASKS_MAX: usize = u16::MAX as usize;
+/// What a mask e times as large must have more of sureness to keep its pixels: a cup lies on its
+/// table. Chosen on labelled photographs that no training saw; 0 to 0.2 do nearly the same.
+const SURENESS_OF_SIZE: f32 = 0.1;
 
 /// The index map of the masks, sorted by area, the largest first.
 ///
-/// A mask that lies in the mask of a whole object is dropped. Of the others, small masks lie on
-/// large ones. A mask with too few visible pixels is dropped.
+/// A mask that lies in the mask of a whole object is dropped. Of the others, the surest for its
+/// size has a pixel, or the smallest ([`Settings::surest_first`]). A mask with too few visible
+/// pixels is dropped.
 pub(super) fn one_a_pixel(
     found: &Proposals,
     photo_grid: PhotoGrid,
@@ -21,7 +25,15 @@ pub(super) fn one_a_pixel(
     settings: &Settings,
 ) -> PhotoMasks {
     let mut wholes = wholes(&found.masks, settings.part_thresh);
-    wholes.sort_by_key(|&at| found.masks[at].area);
+    if settings.surest_first {
+        let rank = |at: usize| {
+            let mask = &found.masks[at];
+            mask.sureness(settings) - SURENESS_OF_SIZE * (mask.area.max(1) as f32).ln()
+        };
+        wholes.sort_by(|&a, &b| rank(b).total_cmp(&rank(a)));
+    } else {
+        wholes.sort_by_key(|&at| found.masks[at].area);
+    }
     let scale = if settings.full_resolution { 1 } else { settings.map_scale.max(1) as usize };
     let [width, height] = [found.width * scale, found.height * scale];
     let cells = width * height;
@@ -37,27 +49,24 @@ pub(super) fn one_a_pixel(
         (at, mask)
     };
     let fine: Vec<(usize, Bitset)> = wholes.par_iter().map(fine).collect();
-    let mut kept: Vec<(usize, Bitset)> = Vec::new();
-    let mut runs: Vec<Vec<[u32; 2]>> = Vec::new();
+    let mut kept = Vec::new();
     for (at, mut mask) in fine {
         let before = settings.keep_wholes.then(|| mask.runs());
         mask.subtract(&taken);
         let left = mask.count();
         if left > 0 && f64::from(left) >= settings.min_area * cells as f64 {
             taken.add(&mask);
-            kept.push((at, mask));
-            runs.extend(before);
+            kept.push((at, mask, before));
         }
     }
-    kept.reverse();
+    kept.sort_by_key(|(at, ..)| std::cmp::Reverse(found.masks[*at].area));
     kept.truncate(MASKS_MAX);
-    runs.reverse();
-    runs.truncate(MASKS_MAX);
-    let mut map = PhotoMasks { wholes: runs, ..PhotoMasks::default() };
+    let mut map = PhotoMasks::default();
     let mut index = vec![0_u16; cells];
-    for (k, (at, mask)) in (1..).zip(&kept) {
+    for (k, (at, mask, whole)) in (1..).zip(kept) {
         mask.cells().for_each(|cell| index[cell] = k);
-        let proposal = &found.masks[*at];
+        map.wholes.extend(whole);
+        let proposal = &found.masks[at];
         map.masks.push(MaskInfo {
             area: f64::from(mask.count()) / cells as f64,
             predicted_iou: proposal.predicted_iou,

@@ -81,8 +81,11 @@ pub struct Settings {
     pub use_seeds: bool,
     /// Which mask of a prompt [`everything`] takes.
     pub level: MaskLevel,
-    /// Keep the cells of each mask from before smaller ones are laid on it.
+    /// Keep the cells of each mask from before others are laid on it.
     pub keep_wholes: bool,
+    /// A pixel goes to the mask that is surest for its size, and stability counts as sureness
+    /// ([`Proposal::sureness`]); else to the smallest, and predicted IoU alone counts.
+    pub surest_first: bool,
 }
 
 impl Default for Settings {
@@ -104,6 +107,7 @@ impl Default for Settings {
             use_seeds: true,
             level: MaskLevel::Widest,
             keep_wholes: false,
+            surest_first: true,
         }
     }
 }
@@ -120,6 +124,7 @@ impl Settings {
             full_resolution: true,
             skip_covered: false,
             use_seeds: false,
+            surest_first: false,
             ..self.clone()
         }
     }
@@ -144,6 +149,15 @@ pub struct Proposal {
     pub point: [f32; 2],
     /// Logits of its box and one cell around it, where a finer map is wanted.
     logits: filter::Patch,
+}
+
+impl Proposal {
+    /// Predicted IoU, times stability with [`Settings::surest_first`]. A network is unsure of the
+    /// IoU on photos of a kind that it has not seen; whether the outline is sharp says more then.
+    #[must_use]
+    pub fn sureness(&self, settings: &Settings) -> f32 {
+        if settings.surest_first { self.predicted_iou * self.stability } else { self.predicted_iou }
+    }
 }
 
 /// The masks of a photo that passed.
@@ -220,7 +234,7 @@ fn passed(
         prompts.cover(&masks, filter.map(), decoded.levels);
         found.masks.extend(masks);
     }
-    let kept = nms::suppress(&found.masks, settings.box_nms_thresh, settings.mask_nms_thresh);
+    let kept = nms::suppress(&found.masks, settings);
     found.masks = kept.into_iter().map(|at| std::mem::take(&mut found.masks[at])).collect();
     if settings.min_mask_region_area > 0 {
         regions::clean(&mut found, settings.min_mask_region_area as usize, settings.box_nms_thresh);

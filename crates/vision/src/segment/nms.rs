@@ -1,14 +1,16 @@
 //! Of masks that are nearly equal only the best one stays.
 
-use crate::segment::Proposal;
+use crate::segment::{Proposal, Settings};
 
 /// Positions of the masks that stay, surest first: greedy, as torchvision's `nms` over boxes and
 /// then the same over the masks themselves. A threshold of 1 or more keeps everything.
 ///
-/// In a tie of the predicted IoU the earlier mask stays.
-pub(super) fn suppress(masks: &[Proposal], box_threshold: f32, mask_threshold: f32) -> Vec<usize> {
+/// In a tie of [`Proposal::sureness`] the earlier mask stays.
+pub(super) fn suppress(masks: &[Proposal], settings: &Settings) -> Vec<usize> {
+    let sureness = |at: usize| masks[at].sureness(settings);
+    let [box_threshold, mask_threshold] = [settings.box_nms_thresh, settings.mask_nms_thresh];
     let mut order: Vec<usize> = (0..masks.len()).collect();
-    order.sort_by(|&a, &b| masks[b].predicted_iou.total_cmp(&masks[a].predicted_iou));
+    order.sort_by(|&a, &b| sureness(b).total_cmp(&sureness(a)));
     let boxed = greedy(&order, |a, b| masks[a].bounds.iou(masks[b].bounds) > box_threshold);
     greedy(&boxed, |a, b| {
         let (a, b) = (&masks[a], &masks[b]);
@@ -45,7 +47,12 @@ mod tests {
         let values: Vec<f32> = (0..64).map(|i| f32::from(u8::from(cells.contains(&i)))).collect();
         let mask = Bitset::over(&values, 0.5);
         let (area, bounds) = (mask.count(), mask.bounds(8));
-        Proposal { mask, area, bounds, predicted_iou, ..Proposal::default() }
+        Proposal { mask, area, bounds, predicted_iou, stability: 1.0, ..Proposal::default() }
+    }
+
+    fn suppress(masks: &[Proposal], box_nms_thresh: f32, mask_nms_thresh: f32) -> Vec<usize> {
+        let settings = Settings { box_nms_thresh, mask_nms_thresh, ..Settings::default() };
+        super::suppress(masks, &settings)
     }
 
     #[test]
@@ -63,6 +70,15 @@ mod tests {
         assert_eq!(suppress(&masks, 1.0, 0.5), [1, 2], "by stricter masks");
         assert_eq!(suppress(&masks, 1.0, 1.0), [1, 0, 2, 3], "not at all");
         assert!((iou(&masks[0], &masks[1]) - 8.0 / 9.0).abs() < 1e-6, "IoU");
+    }
+
+    #[test]
+    fn a_blurred_outline_makes_a_mask_less_sure() {
+        let blurred = Proposal { stability: 0.5, ..proposal(0.8, &[0, 1, 8, 9]) };
+        let masks = [blurred, proposal(0.6, &[0, 1, 8, 9])];
+        assert_eq!(suppress(&masks, 0.7, 0.7), [1], "0.6 is more than 0.4");
+        let settings = Settings { surest_first: false, ..Settings::default() };
+        assert_eq!(super::suppress(&masks, &settings), [0], "by predicted IoU alone");
     }
 
     #[test]

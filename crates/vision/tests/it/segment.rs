@@ -111,6 +111,55 @@ fn each_thing_is_one_mask_and_small_ones_lie_on_large_ones() {
     assert!((counted as f64 / all - shares).abs() < 1e-9, "areas are those of the map");
 }
 
+/// Two masks that overlap in the third of four columns: of points on the left three columns with
+/// 0.9 of predicted IoU, and of others the last two columns' upper half.
+struct Rivals {
+    small: f32,
+}
+
+impl PromptDecoder for Rivals {
+    fn batch(&self) -> usize {
+        8
+    }
+
+    fn placed(&self) -> (u32, [u32; 2]) {
+        (64, [64, 64])
+    }
+
+    fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits> {
+        let mut decoded = MaskLogits { levels: 1, grid: [4, 4], ..MaskLogits::default() };
+        for point in points {
+            let large = point[0] < 0.5;
+            let inside = |at: usize| if large { at % 4 < 3 } else { at % 4 > 1 && at < 8 };
+            decoded.logits.extend((0..16).map(|at| if inside(at) { 9.0_f32 } else { -9.0 }));
+            decoded.predicted_iou.push(if large { 0.9 } else { self.small });
+        }
+        Ok(decoded)
+    }
+}
+
+#[test]
+fn a_pixel_goes_to_the_surest_mask_and_nearly_as_sure_a_small_one_lies_on_a_large_one() {
+    let settings = Settings {
+        points_per_side: 4,
+        pred_iou_thresh: 0.3,
+        skip_covered: false,
+        map_scale: 1,
+        ..Settings::default()
+    };
+    let owner = |small: f32, surest_first: bool| {
+        let settings = Settings { surest_first, ..settings.clone() };
+        let cancel = AtomicBool::new(false);
+        let masks = everything(&Rivals { small }, &photo(), &settings, &[], &cancel).unwrap();
+        assert_eq!(masks.masks.len(), 2, "{:?}", masks.masks);
+        assert_eq!([masks.map.at(0.1, 0.1), masks.map.at(0.9, 0.1)], [1, 2], "the largest first");
+        masks.map.at(0.6, 0.1)
+    };
+    assert_eq!(owner(0.5, true), 1, "the small one is far less sure");
+    assert_eq!(owner(0.85, true), 2, "a third of the area is worth 0.11 of sureness");
+    assert_eq!(owner(0.5, false), 2, "the smallest, however sure");
+}
+
 #[test]
 fn each_skip_leaves_the_masks_as_they_are_and_asks_less() {
     let all = Settings { skip_covered: false, ..Settings::default() };
