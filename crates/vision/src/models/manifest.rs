@@ -12,8 +12,7 @@ use serde::Deserialize;
 use crate::{
     error::{Error, ErrorCode},
     models::ResizeFilter,
-    scene::CropShape,
-    segment::OverlapNms,
+    scene::{CropShape, OverlapNms},
 };
 
 /// Name of the manifest in a bundle's folder.

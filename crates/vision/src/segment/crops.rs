@@ -58,8 +58,9 @@ pub(super) fn add(
     Ok(())
 }
 
-/// The parts of all layers, as `generate_crop_boxes` of `segment_anything.utils.amg` has them: layer
-/// `i` has `2^i` of them each way, which overlap by a share of the photo's short side.
+/// The parts of all layers, as `generate_crop_boxes` of `segment_anything.utils.amg` has them.
+///
+/// Layer `i` has `2^i` parts each way, which overlap by a share of the photo's short side.
 fn parts(photo: &Photo, layers: u32, overlap_ratio: f64) -> Vec<Part> {
     let size = [photo.width, photo.height];
     let mut parts = Vec::new();
@@ -164,6 +165,8 @@ mod tests {
         let first = [[0, 0, 40, 32], [0, 16, 40, 48], [24, 0, 64, 32], [24, 16, 64, 48]];
         assert_eq!((&found[..4], found.len()), (&first[..], 20), "4 and 16");
         assert_eq!((found[5], found[19]), ([0, 10, 22, 28], [42, 30, 64, 48]), "columns first");
+        let odd = [[0, 0, 201, 161], [0, 80, 201, 240], [120, 0, 320, 161], [120, 80, 320, 240]];
+        assert_eq!(boxes(&photo(320, 240), 1), odd, "sizes that do not divide");
         assert_eq!(boxes(&photo(64, 48), 0), [[0; 4]; 0], "no layers");
         assert!(boxes(&photo(1, 1), 3).iter().all(|b| *b == [0, 0, 1, 1]), "one pixel");
     }

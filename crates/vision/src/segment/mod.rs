@@ -19,12 +19,11 @@ use std::sync::atomic::AtomicBool;
 
 pub use bitset::{Bitset, Box2};
 pub use filter::iou_over;
-use serde::Deserialize;
 
 use self::{filter::MaskFilter, photo_grid::PhotoGrid, prompts::Prompts};
 use crate::{
     error::Result,
-    scene::{MaskLevel, MaskLogits, Photo, PhotoMasks, unless_cancelled},
+    scene::{MaskLevel, MaskLogits, OverlapNms, Photo, PhotoMasks, unless_cancelled},
 };
 
 /// A photo and the network that gives masks for its points.
@@ -46,19 +45,6 @@ pub trait PromptDecoder: Sync {
     /// # Errors
     /// What the network says.
     fn on<'a>(&'a self, photo: &'a Photo) -> Result<Box<dyn PromptDecoder + 'a>>;
-}
-
-/// `LangSplat`'s choice among masks that overlap; its settings are 0.8, 0.7 and 0.5.
-#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct OverlapNms {
-    /// A mask with more IoU than this with a surer one goes.
-    pub iou: f32,
-    /// A mask must have more predicted IoU times stability than this.
-    pub score: f32,
-    /// Of two masks of which one lies in the other the inner one goes where the product of the
-    /// shares that they have in common is less than this.
-    pub inner: f32,
 }
 
 /// A prompt that is known from elsewhere: where a mask of another photo reappears.

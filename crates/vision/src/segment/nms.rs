@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::segment::{OverlapNms, Proposal};
+use crate::{scene::OverlapNms, segment::Proposal};
 
 /// A mask lies in another where the other has this share of it, and it less than [`FILLED_MAX`] of
 /// the other.
@@ -124,14 +124,14 @@ mod tests {
             overlap(&mut left, &OverlapNms { iou, score, inner });
             left.iter().map(|mask| mask.level).collect::<Vec<_>>()
         };
-        assert_eq!(kept(0.8, 0.5, 0.5), [7, 12, 3, 9], "its own inner");
-        assert_eq!(kept(0.3, 0.5, 0.2), [4, 7, 12, 2], "less IoU, and the score");
-        assert_eq!(kept(1.0, 0.0, 0.3), [4, 13, 7, 6, 12, 3, 9, 8, 0], "the inner one alone");
+        assert_eq!(kept(0.8, 0.5, 0.5), [4, 13, 2, 9], "its own inner");
+        assert_eq!(kept(0.3, 0.5, 0.2), [12, 7, 4, 13], "less IoU, and the score");
+        assert_eq!(kept(1.0, 0.0, 0.3), [6, 4, 10, 13, 2, 9], "the inner one alone");
     }
 
     /// Boxes of an 8x8 grid and their scores, from a generator that Python repeats.
     fn random_masks() -> Vec<Proposal> {
-        let mut state = 1_u32;
+        let mut state = 34_u32;
         let mut next = |below: u32| {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             (state >> 16) % below

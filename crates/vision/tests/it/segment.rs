@@ -75,7 +75,7 @@ impl PromptDecoder for Shapes {
         let part = [x / 160.0, y / 120.0];
         let size = [f64::from(photo.width) / 320.0, f64::from(photo.height) / 240.0];
         let seen = |b: &[f64; 4]| [0, 1, 2, 3].map(|i| (b[i] - part[i % 2]) / size[i % 2]);
-        Ok(Box::new(Shapes::new(&self.boxes.iter().map(seen).collect::<Vec<_>>())))
+        Ok(Box::new(Self::new(&self.boxes.iter().map(seen).collect::<Vec<_>>())))
     }
 }
 
@@ -218,16 +218,17 @@ fn parts_of_the_photo_give_their_own_masks_where_they_are() {
     };
     let once = found(&exact);
     assert_eq!((once.asked, wholes(&once).len()), (36, 1), "6 x 6 points miss the thing");
-    let parts = found(&Settings { crop_n_layers: 1, ..exact.clone() });
+    let layer = Settings { crop_n_layers: 1, ..exact };
+    let parts = found(&layer);
     assert_eq!(parts.asked, 5 * 36, "the photo and four parts");
     let [thing, table] = wholes(&parts)[..] else { panic!("{:?}", wholes(&parts)) };
     let near = |a: u32, b: f64| (f64::from(a) - b).abs() <= 5.0;
     assert!(near(thing.x0, 192.0) && near(thing.x1, 211.0), "{thing:?}");
     assert!(near(thing.y0, 132.0) && near(thing.y1, 151.0), "{thing:?}");
     assert_eq!(table, wholes(&once)[0], "cut tables went, the whole one stays, last");
-    let fewer = Settings { crop_n_layers: 1, crop_n_points_downscale_factor: 2, ..exact.clone() };
+    let fewer = Settings { crop_n_points_downscale_factor: 2, ..layer };
     assert_eq!(found(&fewer).asked, 36 + 4 * 9, "fewer points in parts");
-    let coarse = Settings { crop_n_layers: 1, full_resolution: false, ..exact };
+    let coarse = Settings { full_resolution: false, ..layer };
     assert_eq!(found(&coarse).asked, 36, "at the photo's pixels only");
 }
 
@@ -274,7 +275,7 @@ fn a_cancelled_scene_stops_and_a_senseless_decoder_is_named() {
             Ok(self.0.clone())
         }
         fn on<'a>(&'a self, _: &'a Photo) -> Result<Box<dyn PromptDecoder + 'a>> {
-            Ok(Box::new(Broken(self.0.clone(), self.1)))
+            Ok(Box::new(Self(self.0.clone(), self.1)))
         }
     }
     let whole = MaskLogits {
