@@ -66,7 +66,7 @@ struct Counted<'a> {
     photo: &'a Photo,
     once: bool,
     batch: Option<usize>,
-    asked: AtomicUsize,
+    asked: &'a AtomicUsize,
 }
 
 impl PromptDecoder for Counted<'_> {
@@ -84,6 +84,11 @@ impl PromptDecoder for Counted<'_> {
             return self.seen.decode(points);
         }
         SeenPhoto::new(self.network, self.photo)?.decode(points)
+    }
+
+    fn on<'b>(&'b self, photo: &'b Photo) -> Result<Box<dyn PromptDecoder + 'b>> {
+        let seen = SeenPhoto::new(self.network, photo)?;
+        Ok(Box::new(Counted { seen, photo, ..*self }))
     }
 }
 
@@ -198,21 +203,21 @@ fn drive(
             }
             _ => Vec::new(),
         };
-        let begun = start.elapsed();
+        let (begun, asked) = (start.elapsed(), AtomicUsize::new(0));
         let counted = Counted {
             seen: SeenPhoto::new(network, &posed.photo)?,
             network,
             photo: &posed.photo,
             once: variant.once,
             batch: variant.batch,
-            asked: 0.into(),
+            asked: &asked,
         };
         let encode_seconds = (start.elapsed() - begun).as_secs_f64();
         let masks = segment::everything(&counted, &posed.photo, &variant.settings, &seeds, &never)?;
         rows.push(json!({
             "seconds": start.elapsed().as_secs_f64(),
             "encode_seconds": encode_seconds,
-            "asked": counted.asked.into_inner(),
+            "asked": asked.into_inner(),
             "masks": masks.masks.len(),
             "covered": masks.masks.iter().map(|mask| mask.area).sum::<f64>(),
         }));

@@ -304,6 +304,46 @@ fn check(document: &Value, name: &str, value: &Value, faults: &mut Vec<String>) 
 }
 
 #[tokio::test]
+async fn null_is_documented_where_it_is_taken() {
+    let stand = CpuServer::start().await;
+    let [http, _] = both(stand.addr).await;
+    let Door::Http { base, client } = http else { panic!("the first door is HTTP") };
+    let document = client.get(format!("{base}/openapi.json")).send().await.unwrap();
+    let document: Value = serde_json::from_slice(&document.bytes().await.unwrap()).unwrap();
+    for (call, name, needed) in [
+        ("query", "QueryBody", json!({ "texts": ["x"] })),
+        ("views", "ViewsRequest", json!({ "cameras": [{ "from": 0 }] })),
+    ] {
+        let schema = &document["components"]["schemas"][name];
+        let null = json!("null");
+        let taken = |field: &Value| {
+            let kinds = field["type"].as_array();
+            let any =
+                field["oneOf"].as_array().is_some_and(|of| of.iter().any(|s| s["type"] == null));
+            // `background` is of any kind.
+            let free = ["type", "oneOf", "$ref"].iter().all(|key| field.get(key).is_none());
+            any || free || kinds.is_some_and(|kinds| kinds.contains(&null))
+        };
+        let fields = schema["properties"].as_object().unwrap();
+        assert!(fields.len() > 10, "{fields:?}");
+        for (field, of) in fields {
+            let must = schema["required"].as_array().unwrap().contains(&json!(field));
+            assert_eq!(taken(of), !must, "{name}.{field}: {of}");
+            if must {
+                continue;
+            }
+            let mut body = needed.clone();
+            body[field.as_str()] = Value::Null;
+            let url = format!("{base}/v1/scenes/00000000000000000000000000000000/{call}");
+            let post = client.post(url).header("content-type", "application/json");
+            let answer = post.body(body.to_string()).send().await.unwrap();
+            let fault = crate::common::doors::bytes(answer).await.expect_err(field);
+            assert_eq!(fault.code, "scene_not_found", "{name}.{field}: {}", fault.message);
+        }
+    }
+}
+
+#[tokio::test]
 async fn a_request_of_ours_is_never_answered_with_another_shape() {
     let stand = CpuServer::start().await;
     let [http, _] = both(stand.addr).await;

@@ -162,8 +162,9 @@ def main():
     else:
         model = OnnxSam(args.bundle, masks, args.threads)
     keys = ["points_per_side", "points_per_batch", "pred_iou_thresh", "stability_score_thresh",
-            "stability_score_offset", "box_nms_thresh", "min_mask_region_area"]
-    defaults = dict(zip(keys, [32, 64, .8, .9, 1., .7, 0]))
+            "stability_score_offset", "box_nms_thresh", "min_mask_region_area", "crop_n_layers",
+            "crop_overlap_ratio", "crop_n_points_downscale_factor", "crop_nms_thresh"]
+    defaults = dict(zip(keys, [32, 64, .8, .9, 1., .7, 0, 0, 512 / 1500, 1, .7]))
     generator = SamAutomaticMaskGenerator(model, **{k: masks.get(k, defaults[k]) for k in keys})
     rows = []
     for file in sorted(args.dump.glob("*.json")):

@@ -98,9 +98,11 @@ fn within(limits: &Limits) -> Value {
         let needed = schemas[name]["required"].as_array().cloned().unwrap_or_default();
         for (field, schema) in schemas[name]["properties"].as_object_mut().into_iter().flatten() {
             merge(schema, &bounds[field]);
-            // What must be given has no default.
-            if let (true, Some(schema)) = (needed.contains(&json!(field)), schema.as_object_mut()) {
-                schema.remove("default");
+            // What must be given has no default; elsewhere `null` and nothing are the same.
+            match schema.as_object_mut() {
+                Some(schema) if needed.contains(&json!(field)) => drop(schema.remove("default")),
+                Some(schema) => or_null(schema),
+                None => {}
             }
         }
     }
@@ -111,6 +113,16 @@ fn within(limits: &Limits) -> Value {
         merge(&mut parameter["schema"], bound);
     }
     document
+}
+
+/// A schema of one type, or a name of another schema, that takes `null` too.
+fn or_null(schema: &mut Map<String, Value>) {
+    if let Some(name) = schema.remove("$ref") {
+        schema.insert("oneOf".to_owned(), json!([{ "$ref": name }, { "type": "null" }]));
+    } else if let Some(Value::String(kind)) = schema.get("type") {
+        let kinds = json!([kind, "null"]);
+        schema.insert("type".to_owned(), kinds);
+    }
 }
 
 /// A struct that takes in others as one object. `allOf` of closed objects would have no value:

@@ -44,6 +44,19 @@ pub struct MaskInfo {
     pub point: [f32; 2],
 }
 
+/// `LangSplat`'s choice among masks that overlap; its settings are 0.8, 0.7 and 0.5.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OverlapNms {
+    /// A mask with more IoU than this with a surer one goes.
+    pub iou: f32,
+    /// A mask must have more predicted IoU times stability than this.
+    pub score: f32,
+    /// Of two masks of which one lies in the other the inner one goes where the product of the
+    /// shares that they have in common is less than this.
+    pub inner: f32,
+}
+
 /// The masks of one photo: at most one a pixel.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct PhotoMasks {

@@ -12,7 +12,7 @@ use serde::Deserialize;
 use crate::{
     error::{Error, ErrorCode},
     models::ResizeFilter,
-    scene::CropShape,
+    scene::{CropShape, OverlapNms},
 };
 
 /// Name of the manifest in a bundle's folder.
@@ -24,6 +24,8 @@ pub(super) const BUCKET_SIDE_MAX: u32 = 4_096;
 const VIEWS_MAX: usize = 64;
 /// Points along one side of the grid of prompts: 65,536 prompts a photo are minutes of work.
 const POINTS_PER_SIDE_MAX: u32 = 256;
+/// 1 + 4 + 16 + 64 runs of the encoder a photo.
+const CROP_LAYERS_MAX: u32 = 3;
 /// Prompts in one run of a decoder: their logits are in memory together.
 const POINTS_PER_BATCH_MAX: u32 = 1_024;
 /// Crops in one run of an image tower.
@@ -246,6 +248,22 @@ pub struct MasksManifest {
     /// pixels then, which takes longer than on the decoder's grid.
     #[serde(default)]
     pub min_mask_region_area: u32,
+    /// Layers of parts of a photo that the network sees again; 0: none. Layer `i` has `4^i` parts.
+    /// Masks are judged at the photo's pixels then.
+    #[serde(default)]
+    pub crop_n_layers: u32,
+    /// How much the parts of layer 1 overlap, share of the photo's short side; the next half of it.
+    #[serde(default = "defaults::crop_overlap_ratio")]
+    pub crop_overlap_ratio: f64,
+    /// In layer `i` the points of a side are divided by this to the power of `i`.
+    #[serde(default = "defaults::crop_n_points_downscale_factor")]
+    pub crop_n_points_downscale_factor: u32,
+    /// Of two masks of different parts whose boxes have more IoU than this that of the smaller part
+    /// stays.
+    #[serde(default = "defaults::nms_thresh")]
+    pub crop_nms_thresh: f32,
+    /// `LangSplat`'s NMS by IoU, score and overlap, at the end; none where absent.
+    pub overlap_nms: Option<OverlapNms>,
     /// Smallest mask, share of the photo.
     #[serde(default = "defaults::min_area")]
     pub min_area: f64,
@@ -419,6 +437,8 @@ mod defaults {
         stability_score_thresh: f32 = 0.9_f32;
         stability_score_offset: f32 = 1.0_f32;
         nms_thresh: f32 = 0.7_f32;
+        crop_overlap_ratio: f64 = 512.0 / 1500.0;
+        crop_n_points_downscale_factor: u32 = 1_u32;
         min_area: f64 = 0.0005;
         coverage_floor: f32 = 0.05_f32;
         batch: usize = 16_usize;
@@ -513,6 +533,16 @@ impl MasksManifest {
         faults.range("masks.stability_score_thresh", self.stability_score_thresh, 0.0..=1.0);
         faults.range("masks.box_nms_thresh", self.box_nms_thresh, 0.0..=1.0);
         faults.range("masks.mask_nms_thresh", self.mask_nms_thresh, 0.0..=1.0);
+        faults.range("masks.crop_n_layers", self.crop_n_layers, 0..=CROP_LAYERS_MAX);
+        faults.range("masks.crop_overlap_ratio", self.crop_overlap_ratio, 0.0..=1.0);
+        let fewer = self.crop_n_points_downscale_factor;
+        faults.range("masks.crop_n_points_downscale_factor", fewer, 1..=POINTS_PER_SIDE_MAX);
+        faults.range("masks.crop_nms_thresh", self.crop_nms_thresh, 0.0..=1.0);
+        if let Some(nms) = &self.overlap_nms {
+            faults.range("masks.overlap_nms.iou", nms.iou, 0.0..=1.0);
+            faults.range("masks.overlap_nms.score", nms.score, 0.0..=1.0);
+            faults.range("masks.overlap_nms.inner", nms.inner, 0.0..=1.0);
+        }
         let offset = self.stability_score_offset;
         if !offset.is_finite() || offset < 0.0 {
             faults.wrong("masks.stability_score_offset", &offset, "be >= 0");

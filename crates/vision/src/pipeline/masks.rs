@@ -50,14 +50,19 @@ impl PromptDecoder for SeenPhoto<'_> {
 
     fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits> {
         // Masks under the threshold are dropped by the filter, which does not look at them.
-        let iou_over = self.network.manifest().pred_iou_thresh;
-        self.network.decode_over(&self.embedding, points, iou_over)
+        let least = segment::iou_over(self.network.manifest().pred_iou_thresh);
+        self.network.decode_over(&self.embedding, points, least)
+    }
+
+    fn on<'b>(&'b self, photo: &'b Photo) -> Result<Box<dyn PromptDecoder + 'b>> {
+        Ok(Box::new(SeenPhoto::new(self.network, photo)?))
     }
 }
 
 /// The thresholds of the bundle, with the savings, level and filters of the method.
 #[must_use]
 pub fn settings(manifest: &MasksManifest, method: &Method) -> Settings {
+    let at_pixels = manifest.min_mask_region_area > 0 || manifest.crop_n_layers > 0;
     let settings = Settings {
         points_per_side: manifest.points_per_side,
         pred_iou_thresh: manifest.pred_iou_thresh,
@@ -66,8 +71,13 @@ pub fn settings(manifest: &MasksManifest, method: &Method) -> Settings {
         box_nms_thresh: manifest.box_nms_thresh,
         mask_nms_thresh: manifest.mask_nms_thresh,
         min_mask_region_area: manifest.min_mask_region_area,
+        crop_n_layers: manifest.crop_n_layers,
+        crop_overlap_ratio: manifest.crop_overlap_ratio,
+        crop_n_points_downscale_factor: manifest.crop_n_points_downscale_factor,
+        crop_nms_thresh: manifest.crop_nms_thresh,
+        overlap_nms: manifest.overlap_nms,
         min_area: manifest.min_area,
-        full_resolution: method.full_resolution || manifest.min_mask_region_area > 0,
+        full_resolution: method.full_resolution || at_pixels,
         skip_covered: method.skip_covered,
         use_seeds: method.seeds,
         level: method.mask_level,

@@ -36,6 +36,18 @@ impl Bitset {
         Self { words: values.chunks(64).map(word).collect() }
     }
 
+    /// The set of these cells, of a grid of `cells` cells; others than the grid's are left out.
+    #[must_use]
+    pub fn of(cells: usize, inside: impl IntoIterator<Item = usize>) -> Self {
+        let mut set = Self::empty(cells);
+        for cell in inside {
+            if let Some(word) = set.words.get_mut(cell / 64) {
+                *word |= 1 << (cell % 64);
+            }
+        }
+        set
+    }
+
     /// Whether a cell is in the set.
     #[must_use]
     pub fn has(&self, cell: usize) -> bool {

@@ -31,6 +31,13 @@ pub(super) struct Patch {
     values: Vec<f16>,
 }
 
+/// What a predicted IoU must be over. As in Segment Anything a threshold of 0 asks nothing, so that
+/// a mask stays whose predicted IoU is less than 0.
+#[must_use]
+pub fn iou_over(pred_iou_thresh: f32) -> f32 {
+    if pred_iou_thresh > 0.0 { pred_iou_thresh } else { f32::NEG_INFINITY }
+}
+
 impl MaskFilter {
     /// Knows the grid from the first answer.
     pub(super) fn new(
@@ -118,9 +125,8 @@ impl MaskFilter {
         keep_logits: bool,
     ) -> Option<Proposal> {
         let s = &self.settings;
-        // As in Segment Anything, a threshold of 0 asks nothing.
-        let sure = s.pred_iou_thresh <= 0.0 || predicted_iou > s.pred_iou_thresh;
-        if predicted_iou.is_nan() || !sure {
+        let sure = predicted_iou > iou_over(s.pred_iou_thresh);
+        if !sure {
             return None;
         }
         let values = match &self.resample {

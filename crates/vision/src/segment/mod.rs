@@ -8,6 +8,7 @@
 
 mod assign;
 mod bitset;
+mod crops;
 mod filter;
 mod nms;
 mod photo_grid;
@@ -17,11 +18,12 @@ mod regions;
 use std::sync::atomic::AtomicBool;
 
 pub use bitset::{Bitset, Box2};
+pub use filter::iou_over;
 
 use self::{filter::MaskFilter, photo_grid::PhotoGrid, prompts::Prompts};
 use crate::{
     error::Result,
-    scene::{MaskLevel, MaskLogits, Photo, PhotoMasks, unless_cancelled},
+    scene::{MaskLevel, MaskLogits, OverlapNms, Photo, PhotoMasks, unless_cancelled},
 };
 
 /// A photo and the network that gives masks for its points.
@@ -37,6 +39,12 @@ pub trait PromptDecoder: Sync {
     /// # Errors
     /// What the network says.
     fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits>;
+
+    /// The same network on another photo: a part of this one, at its full size.
+    ///
+    /// # Errors
+    /// What the network says.
+    fn on<'a>(&'a self, photo: &'a Photo) -> Result<Box<dyn PromptDecoder + 'a>>;
 }
 
 /// A prompt that is known from elsewhere: where a mask of another photo reappears.
@@ -64,6 +72,18 @@ pub struct Settings {
     /// Holes and islands of fewer cells go from a mask after NMS; 0: none. Judged at the photo's
     /// pixels where `full_resolution` is set.
     pub min_mask_region_area: u32,
+    /// Layers of parts of the photo that the network sees again, where `full_resolution` is set;
+    /// layer `i` has `2^i` parts each way.
+    pub crop_n_layers: u32,
+    /// How much the parts of layer 1 overlap, share of the photo's short side; the next half of it.
+    pub crop_overlap_ratio: f64,
+    /// In layer `i` the points of a side are divided by this to the power of `i`.
+    pub crop_n_points_downscale_factor: u32,
+    /// Of two masks of different parts whose boxes have more IoU than this that of the smaller part
+    /// stays.
+    pub crop_nms_thresh: f32,
+    /// At the end, among all masks that are left.
+    pub overlap_nms: Option<OverlapNms>,
     /// Smallest mask, share of the photo.
     pub min_area: f64,
     /// Largest mask, share of the photo.
@@ -98,6 +118,11 @@ impl Default for Settings {
             box_nms_thresh: 0.7,
             mask_nms_thresh: 0.7,
             min_mask_region_area: 0,
+            crop_n_layers: 0,
+            crop_overlap_ratio: 512.0 / 1500.0,
+            crop_n_points_downscale_factor: 1,
+            crop_nms_thresh: 0.7,
+            overlap_nms: None,
             min_area: 0.0005,
             max_area: 0.95,
             part_thresh: 0.85,
@@ -114,11 +139,12 @@ impl Default for Settings {
 
 impl Settings {
     /// These thresholds, but everything computed as Segment Anything does: full resolution, every
-    /// point of the grid, no NMS of masks, no bounds on areas.
+    /// point of the grid, no NMS of masks and none of `LangSplat`, no bounds on areas.
     #[must_use]
     pub fn exact(&self) -> Self {
         Self {
             mask_nms_thresh: 1.0,
+            overlap_nms: None,
             min_area: 0.0,
             max_area: 1.0,
             full_resolution: true,
@@ -167,7 +193,7 @@ pub struct Proposals {
     pub width: usize,
     /// Rows.
     pub height: usize,
-    /// The masks, surest first.
+    /// The masks, surest first; those of the smallest parts of the photo before.
     pub masks: Vec<Proposal>,
     /// Points that were decoded.
     pub asked: usize,
@@ -213,6 +239,30 @@ fn passed(
     cancel: &AtomicBool,
     wholes: bool,
 ) -> Result<(Proposals, Option<PhotoGrid>)> {
+    let (mut found, photo_grid) = decoded(decoder, photo, settings, seeds, cancel, wholes)?;
+    nms::suppress(&mut found.masks, settings);
+    if settings.full_resolution && settings.crop_n_layers > 0 {
+        crops::add(&mut found, decoder, photo, settings, cancel, wholes)?;
+    }
+    if settings.min_mask_region_area > 0 {
+        let boxes = settings.box_nms_thresh.max(settings.crop_nms_thresh);
+        regions::clean(&mut found, settings.min_mask_region_area as usize, boxes);
+    }
+    if let Some(nms) = &settings.overlap_nms {
+        nms::overlap(&mut found.masks, nms);
+    }
+    Ok((found, photo_grid))
+}
+
+/// The masks that pass the filters, in the order of points; arguments as [`passed`].
+fn decoded(
+    decoder: &dyn PromptDecoder,
+    photo: &Photo,
+    settings: &Settings,
+    seeds: &[Seed],
+    cancel: &AtomicBool,
+    wholes: bool,
+) -> Result<(Proposals, Option<PhotoGrid>)> {
     let seeds = if settings.use_seeds { seeds } else { &[] };
     let mut prompts = Prompts::new(settings, seeds);
     let mut found = Proposals::default();
@@ -233,11 +283,6 @@ fn passed(
         [found.width, found.height] = filter.map();
         prompts.cover(&masks, filter.map(), decoded.levels);
         found.masks.extend(masks);
-    }
-    let kept = nms::suppress(&found.masks, settings);
-    found.masks = kept.into_iter().map(|at| std::mem::take(&mut found.masks[at])).collect();
-    if settings.min_mask_region_area > 0 {
-        regions::clean(&mut found, settings.min_mask_region_area as usize, settings.box_nms_thresh);
     }
     Ok((found, filter.map(|filter| filter.photo_grid())))
 }

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use crate::segment::{Bitset, Proposal, Proposals, nms};
 
 /// Fills holes and removes islands of fewer than `least` cells in every mask. Of two masks whose
-/// boxes then have more IoU than `box_threshold` one that was not changed stays, else the surer.
+/// boxes then have more IoU than `box_threshold` one that was not changed stays, else the first.
 pub(super) fn clean(found: &mut Proposals, least: usize, box_threshold: f32) {
     let map = [found.width, found.height];
     let changed = |proposal: &mut Proposal| {

@@ -9,7 +9,9 @@ use segsplat_core::{
     error::{ErrorCode, Result},
     scene::{MaskLogits, Photo, PhotoMasks},
 };
-use segsplat_vision::segment::{PromptDecoder, Seed, Settings, everything, proposals};
+use segsplat_vision::segment::{
+    PromptDecoder, Proposal, Proposals, Seed, Settings, everything, iou_over, proposals,
+};
 
 /// Cells of the grid each way; the photo fills its upper three quarters.
 const GRID: usize = 64;
@@ -66,10 +68,20 @@ impl PromptDecoder for Shapes {
         }
         Ok(decoded)
     }
+
+    /// The part is found by the colour of its first pixel, which [`photo`] makes its place.
+    fn on<'a>(&'a self, photo: &'a Photo) -> Result<Box<dyn PromptDecoder + 'a>> {
+        let [x, y] = [0, 1].map(|channel| f64::from(photo.rgb[channel]));
+        let part = [x / 160.0, y / 120.0];
+        let size = [f64::from(photo.width) / 320.0, f64::from(photo.height) / 240.0];
+        let seen = |b: &[f64; 4]| [0, 1, 2, 3].map(|i| (b[i] - part[i % 2]) / size[i % 2]);
+        Ok(Box::new(Self::new(&self.boxes.iter().map(seen).collect::<Vec<_>>())))
+    }
 }
 
 fn photo() -> Photo {
-    Photo { width: 320, height: 240, rgb: vec![0; 320 * 240 * 3], valid: None }
+    let place = |at: u32| [(at % 320 / 2) as u8, (at / 320 / 2) as u8, 0];
+    Photo { width: 320, height: 240, rgb: (0..320 * 240).flat_map(place).collect(), valid: None }
 }
 
 fn run(shapes: &Shapes, settings: &Settings, seeds: &[Seed]) -> PhotoMasks {
@@ -135,6 +147,10 @@ impl PromptDecoder for Rivals {
             decoded.predicted_iou.push(if large { 0.9 } else { self.small });
         }
         Ok(decoded)
+    }
+
+    fn on<'a>(&'a self, _: &'a Photo) -> Result<Box<dyn PromptDecoder + 'a>> {
+        Ok(Box::new(Self { small: self.small }))
     }
 }
 
@@ -241,6 +257,41 @@ fn proposals_are_parts_and_wholes_above_the_thresholds() {
 }
 
 #[test]
+fn parts_of_the_photo_give_their_own_masks_where_they_are() {
+    // A small thing in the part at the right bottom, and a table that every part cuts.
+    let shapes = || Shapes::new(&[[0.05, 0.1, 0.95, 0.95], [0.6, 0.55, 0.66, 0.63]]);
+    let exact = Settings { points_per_side: 6, ..Settings::default().exact() };
+    let found = |settings: &Settings| {
+        let never = AtomicBool::new(false);
+        proposals(&shapes(), &photo(), settings, &[], &never).unwrap()
+    };
+    let wholes = |found: &Proposals| {
+        let whole = |mask: &&Proposal| mask.level == 2;
+        found.masks.iter().filter(whole).map(|mask| mask.bounds).collect::<Vec<_>>()
+    };
+    let once = found(&exact);
+    assert_eq!((once.asked, wholes(&once).len()), (36, 1), "6 x 6 points miss the thing");
+    let layer = Settings { crop_n_layers: 1, ..exact };
+    let parts = found(&layer);
+    assert_eq!(parts.asked, 5 * 36, "the photo and four parts");
+    let [thing, table] = wholes(&parts)[..] else { panic!("{:?}", wholes(&parts)) };
+    let near = |a: u32, b: f64| (f64::from(a) - b).abs() <= 5.0;
+    assert!(near(thing.x0, 192.0) && near(thing.x1, 211.0), "{thing:?}");
+    assert!(near(thing.y0, 132.0) && near(thing.y1, 151.0), "{thing:?}");
+    assert_eq!(table, wholes(&once)[0], "cut tables went, the whole one stays, last");
+    let fewer = Settings { crop_n_points_downscale_factor: 2, ..layer };
+    assert_eq!(found(&fewer).asked, 36 + 4 * 9, "fewer points in parts");
+    let coarse = Settings { full_resolution: false, ..layer };
+    assert_eq!(found(&coarse).asked, 36, "at the photo's pixels only");
+}
+
+#[test]
+fn a_threshold_of_0_asks_nothing() {
+    // Networks predict IoUs under 0 too. What is not over `iou_over` need not be decoded.
+    assert!(iou_over(0.0) < -1e6 && iou_over(0.5) > 0.49, "0 is no bound");
+}
+
+#[test]
 fn a_picture_of_nothing_has_no_masks_and_a_mask_of_everything_is_none() {
     let empty = run(&Shapes::new(&[]), &Settings::default(), &[]);
     assert!(empty.masks.is_empty() && empty.map.index.iter().all(|&k| k == 0), "nothing");
@@ -275,6 +326,9 @@ fn a_cancelled_scene_stops_and_a_senseless_decoder_is_named() {
         }
         fn decode(&self, _: &[[f32; 2]]) -> Result<MaskLogits> {
             Ok(self.0.clone())
+        }
+        fn on<'a>(&'a self, _: &'a Photo) -> Result<Box<dyn PromptDecoder + 'a>> {
+            Ok(Box::new(Self(self.0.clone(), self.1)))
         }
     }
     let whole = MaskLogits {
