@@ -239,7 +239,9 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
                 0 => plain["served_psnr"].clone(),
                 _ => json!(judge(&best.gaussians)?),
             };
-            picture(text, one_set(&best.gaussians, camera)?)?;
+            if best.report.steps > 0 {
+                picture(text, one_set(&best.gaussians, camera)?)?;
+            }
             progress(&format!("{name}: {row}"));
             rows.push(json!({ "psnr_db": row["refined_psnr"] }), row)?;
         }

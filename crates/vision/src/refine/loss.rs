@@ -1,8 +1,8 @@
 //! How far a frame is from its photo, and what that says of each pixel.
 //!
-//! `(1 - s) mean|x - y| + s (1 - mean SSIM(x, y))` over pixels and channels, the loss of 3DGS (Kerbl
-//! et al. 2023), where `s` is 0.2. SSIM has the 11 x 11 Gaussian window of sigma 1.5, taken where it lies inside the
-//! picture, per channel. A pixel without a source counts as equal.
+//! `(1 - s) mean|x - y| + s (1 - mean SSIM(x, y))` over pixels and channels, the loss of 3DGS
+//! (Kerbl et al. 2023), where `s` is 0.2. SSIM has the 11 x 11 Gaussian window of sigma 1.5, taken
+//! where it lies inside the picture, per channel. A pixel without a source counts as equal.
 
 use std::borrow::Cow;
 

@@ -265,14 +265,13 @@ struct Refinement<'a> {
 }
 
 /// Refines `first` on the photos that are learnt and watches the held-out ones. `start` is what is
-/// served of the learnt photos alone, and `first` the same as one set of Gaussians: what was
-/// refined before, or what was made for it. The photos are used at the size that they have. Before each step `pace` gets the share
-/// of the budget that is spent, 0..1; it may wait, which is not counted, and its error ends the
-/// work. Each better version goes to `publish`. Returns the best one: `start` itself where none was
-/// better.
+/// served of the learnt photos alone, and `first` the same as one set of Gaussians. The photos are
+/// used at the size that they have. Before each step `pace` gets the share of the budget that is
+/// spent, 0..1; it may wait, which is not counted, and its error ends the work. Each better version
+/// goes to `publish`. Returns the best one: `start` itself where none was better.
 ///
-/// A scene that was refined before goes on as its report says. Without held-out photos at most
-/// [`UNWATCHED_STEPS_MAX`] steps are taken, and the last version is the one.
+/// Without held-out photos the last version is the one. Of fewer than [`HOLDS_OUT_FROM`] at most
+/// [`UNWATCHED_STEPS_MAX`] steps are taken.
 ///
 /// # Errors
 /// `invalid_request` for options out of range; what the renderer, `pace` or `publish` says. What
