@@ -130,9 +130,9 @@ options! {
         /// threads, and one at a time in a network [default: 0]
         "SEGSPLAT_JOBS" jobs: usize = 0,
         /// Whether finished scenes are refined where the create call does not say: where it is
-        /// known to help, never, or for so many milliseconds [default: off]
+        /// known to help, never, or for so many milliseconds [default: auto]
         #[arg(value_name = "auto|off|MILLISECONDS")]
-        "SEGSPLAT_REFINE" refine: Refine = Refine::Off,
+        "SEGSPLAT_REFINE" refine: Refine = Refine::Auto,
         /// File of API keys (TOML, made by `segsplat keys new`); read again at SIGHUP
         #[arg(value_name = "FILE")]
         "SEGSPLAT_KEYS" keys: PathBuf,

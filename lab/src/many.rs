@@ -5,10 +5,12 @@
 //! are whole photos of one set of Gaussians over the backdrop, without layers.
 
 use std::{
-    sync::Arc,
+    path::{Path, PathBuf},
+    sync::{Arc, atomic::AtomicBool},
     time::{Duration, Instant},
 };
 
+use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use crate::{
@@ -16,15 +18,15 @@ use crate::{
     limits::Limits,
     metrics::{clamped, psnr, to_unit},
     photo_files,
-    pipeline::{Pipeline, refinement::at_side},
-    refine::{RefineBudget, RefineOptions, held_out, refine, split},
+    pipeline::{Pipeline, reconstruct_for_refinement, refinement::at_side},
+    refine::{LearningRates, RefineBudget, RefineOptions, held_out, refine, split},
     render::{
         Background, Frame, Kinds, RenderRequest, Switches,
         plan::{default_near, served},
     },
     rows::{Rows, ms, progress},
-    scene::{Camera, Gaussians, PosedPhoto, SceneOptions},
-    scenes::{is_posed, make, scene_of, use_of, view_request},
+    scene::{Camera, Gaussians, PosedPhoto, SceneOptions, Watch, with_pairs},
+    scenes::{is_posed, scene_of, use_of, view_request},
     setup::Inputs,
 };
 
@@ -40,105 +42,209 @@ pub(crate) struct Args {
     /// Options of the scenes, each as NAME=VALUE: `max_views=8`, `front_photos=0`
     #[arg(long, value_name = "NAME=VALUE", value_delimiter = ',')]
     method: Vec<String>,
-    /// Refine in so many steps
-    #[arg(long, conflicts_with = "refine_ms")]
-    refine_steps: Option<u32>,
-    /// Refine for so many milliseconds
+    /// A refinement to measure, as NAME=VALUE,...: `ms=5000,rate=2`; each is a row of its own
+    #[arg(long, value_name = "NAME=VALUE,...")]
+    refine: Vec<String>,
+    /// Folder for pictures of the first target: the photo, and the scene before and after
     #[arg(long)]
-    refine_ms: Option<u64>,
-    /// Longer side of the photos that refinement sees, pixels: what is learnt smaller than it is
-    /// shown has gaps
-    #[arg(long)]
-    refine_side: Option<u32>,
-    /// Most Gaussians that refinement begins with
-    #[arg(long)]
-    gaussians_max: Option<usize>,
-    /// Factor on all learning rates
-    #[arg(long, default_value_t = 1.0)]
-    rate: f32,
+    pictures: Option<PathBuf>,
 }
 
-/// Makes a row for each scene: PSNR at the targets before and after refinement.
+/// How a scene is refined: what is not named is as the product does it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Variant {
+    /// Whether it begins with the Gaussians that are served in layers.
+    layers: bool,
+    /// Whether it is done once more with all photos.
+    whole: bool,
+    /// So many steps, or so much time.
+    steps: u32,
+    ms: u64,
+    side: u32,
+    gaussians_max: usize,
+    batch: usize,
+    prune_every: u32,
+    opacity_min: f32,
+    ssim_share: f32,
+    /// Factors on learning rates: on all, and on single ones.
+    rate: f32,
+    means: f32,
+    quats: f32,
+    scales: f32,
+    opacities: f32,
+    sh: f32,
+}
+
+impl Default for Variant {
+    fn default() -> Self {
+        let RefineOptions {
+            side, gaussians_max, batch, prune_every, opacity_min, ssim_share, ..
+        } = RefineOptions::default();
+        Self {
+            layers: false,
+            whole: false,
+            steps: u32::MAX,
+            ms: u64::MAX,
+            side,
+            gaussians_max,
+            batch,
+            prune_every,
+            opacity_min,
+            ssim_share,
+            rate: 1.0,
+            means: 1.0,
+            quats: 1.0,
+            scales: 1.0,
+            opacities: 1.0,
+            sh: 1.0,
+        }
+    }
+}
+
+impl Variant {
+    fn options(&self) -> RefineOptions {
+        let plain = RefineOptions::default();
+        let rates = plain.rates.scaled(self.rate);
+        RefineOptions {
+            budget: RefineBudget { steps: self.steps, time: Duration::from_millis(self.ms) },
+            batch: self.batch,
+            side: self.side,
+            rates: LearningRates {
+                means: rates.means * self.means,
+                quats: rates.quats * self.quats,
+                scales: rates.scales * self.scales,
+                opacities: rates.opacities * self.opacities,
+                sh: rates.sh * self.sh,
+                sh_rest: rates.sh_rest * self.sh,
+            },
+            gaussians_max: self.gaussians_max,
+            opacity_min: self.opacity_min,
+            prune_every: self.prune_every,
+            ssim_share: self.ssim_share,
+            ..plain
+        }
+    }
+}
+
+/// Makes a row for each scene and refinement: PSNR at the targets before and after it.
 ///
 /// # Errors
 /// `invalid_request` when there is no scene or too few photos, else whatever a stage says.
 pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
+    let pairs = |text: &String| text.split(',').map(str::to_owned).collect::<Vec<_>>();
+    let variants = args.refine.iter().map(|text| {
+        let variant = with_pairs(&Variant::default(), &pairs(text))?;
+        Ok((text, variant))
+    });
+    let variants: Vec<(&String, Variant)> = variants.collect::<Result<_>>()?;
     let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
     let (renderer, _adapters) = args.inputs.setup.renderer(Switches::default())?;
-    let options = SceneOptions::default().with(&args.method)?;
+    let scene_options = SceneOptions::default().with(&args.method)?;
     for (name, dir) in args.inputs.find(is_posed)? {
         let all = photo_files::read_dir(&dir, &Limits::default())?;
         let (targets, given) = given(&all, args.inputs.photos);
         if given.len() < 2 || targets.is_empty() {
             return Err(Error::invalid(format!("{name}: {} photos are too few", all.len())));
         }
-        let refines = args.refine_steps.is_some() || args.refine_ms.is_some();
-        let (learnt, out) =
-            if refines { split(given.clone()) } else { (given.clone(), Vec::new()) };
+        let (learnt, out) = match variants.is_empty() {
+            true => (given.clone(), Vec::new()),
+            false => split(given.clone()),
+        };
         let begun = Instant::now();
-        let scene = scene_of(make(&engine, &learnt, &options)?);
+        let watch = Watch { progress: &|_, _| (), cancel: &AtomicBool::new(false) };
+        let (made, first) = reconstruct_for_refinement(&engine, &learnt, &scene_options, watch)?;
+        let scene = scene_of(made);
         let create_ms = ms(begun);
-        let judge = |gaussians: &Gaussians| {
+        let one_set = |gaussians: &Gaussians, camera| {
             let near = default_near(scene.meta.report.median_depth);
             let background = Background::Backdrop(Arc::clone(&scene.backdrop));
-            mean_psnr(&targets, |camera| {
-                let plain = RenderRequest::plain(camera, Kinds::COLOR, near);
-                renderer
-                    .render(gaussians, &RenderRequest { background: background.clone(), ..plain })
-            })
+            let plain = RenderRequest::plain(camera, Kinds::COLOR, near);
+            renderer.render(gaussians, &RenderRequest { background, ..plain })
         };
-        let before = judge(&scene.gaussians)?;
-        let as_served = mean_psnr(&targets, |camera| {
-            let median_depth = scene.meta.report.median_depth;
-            let plain = view_request(camera, Kinds::COLOR, median_depth);
+        let judge =
+            |gaussians: &Gaussians| mean_psnr(&targets, |camera| one_set(gaussians, camera));
+        let as_served = |camera| {
+            let plain = view_request(camera, Kinds::COLOR, scene.meta.report.median_depth);
             renderer.render(&scene.gaussians, &served(&scene, plain))
-        })?;
-        let mut row = json!({
+        };
+        let picture = |what: &str, frame: Frame| match &args.pictures {
+            Some(dir) => {
+                let file = dir.join(format!("{name}-{}-{what}.png", given.len()));
+                let size = targets[0].camera.intrinsics;
+                save(&file, size.width, size.height, &clamped(frame.color))
+            }
+            None => Ok(()),
+        };
+        let camera = targets[0].camera;
+        let photo = Frame { color: Some(to_unit(&targets[0].photo)), ..Frame::default() };
+        picture("photo", photo)?;
+        picture("served", as_served(camera)?)?;
+        let plain = json!({
             "scene": name,
             "use": use_of(&name),
             "photos": given.len(),
+            "method": args.method,
             "gaussians": scene.gaussians.len(),
             "create_ms": create_ms,
-            "psnr": before,
-            "served_psnr": as_served,
+            "psnr": judge(&scene.gaussians)?,
+            "first_psnr": judge(&first)?,
+            "served_psnr": mean_psnr(&targets, as_served)?,
             "peak_mib": peak_mib(),
         });
-        if refines {
-            let budget = match (args.refine_steps, args.refine_ms) {
-                (Some(steps), _) => RefineBudget::steps(steps),
-                (_, ms) => {
-                    let time = Duration::from_millis(ms.unwrap_or_default());
-                    RefineBudget { steps: u32::MAX, time }
-                }
-            };
-            let plain = RefineOptions::default();
-            let rates = plain.rates.scaled(args.rate);
-            let gaussians_max = args.gaussians_max.unwrap_or(plain.gaussians_max);
-            let side = args.refine_side.unwrap_or(plain.side);
-            let options = RefineOptions { budget, rates, gaussians_max, side, ..plain };
+        if variants.is_empty() {
+            progress(&format!("{name}: {plain}"));
+            rows.push(json!({ "psnr_db": plain["psnr"] }), plain.clone())?;
+        }
+        for (text, variant) in &variants {
+            let mut row = plain.clone();
+            let mut options = variant.options();
+            if variant.whole {
+                options.budget.time /= 2;
+            }
             let sized = |photos: &[PosedPhoto]| -> Vec<PosedPhoto> {
-                photos.iter().map(|photo| at_side(photo, side)).collect()
+                photos.iter().map(|photo| at_side(photo, options.side)).collect()
             };
             let photos = (&sized(&learnt)[..], &sized(&out)[..]);
             let (begun, cpu) = (Instant::now(), cpu_seconds());
-            let mut steps = 0;
-            let publish = &mut |version: &crate::refine::RefinedVersion| {
-                steps = version.report.steps;
-                Ok(())
-            };
-            let best = refine(&*renderer, &scene, photos, &options, &mut |_| Ok(()), publish)?;
-            row["refine_ms"] = json!(ms(begun));
+            let start = (&scene, if variant.layers { &scene.gaussians } else { &first });
+            let free = &mut |_| Ok(());
+            let mut best = refine(&*renderer, start, photos, &options, free, &mut |_| Ok(()))?;
+            let mut made_ms = 0.0;
+            if variant.whole && best.report.steps > 0 {
+                // The same with all photos, as the server does it.
+                let begun = Instant::now();
+                let (made, one_set) =
+                    reconstruct_for_refinement(&engine, &given, &scene_options, watch)?;
+                made_ms = ms(begun);
+                let all = scene_of(made);
+                row["whole_psnr"] = json!(judge(&one_set)?);
+                let budget = RefineBudget::steps(best.report.steps);
+                let again = RefineOptions { budget, ..options };
+                let start = (&all, if variant.layers { &all.gaussians } else { &one_set });
+                let photos = (&sized(&given)[..], &[][..]);
+                let whole = refine(&*renderer, start, photos, &again, free, &mut |_| Ok(()))?;
+                best.gaussians = whole.gaussians;
+            }
+            row["refine"] = json!(text);
+            row["refine_ms"] = json!(ms(begun) - made_ms);
             row["refine_cpu_s"] = json!(cpu_seconds() - cpu);
-            row["steps"] = json!(steps);
+            row["steps"] = json!(best.report.steps);
             row["held_out"] = json!(held_out(given.len()));
             row["own_psnr_before"] = json!(best.report.psnr_before);
             row["own_psnr_after"] = json!(best.report.psnr_after);
             row["refined_gaussians"] = json!(best.gaussians.len());
-            row["refined_psnr"] = json!(judge(&best.gaussians)?);
+            // Where no version was better, what is served stays.
+            row["refined_psnr"] = match best.report.steps {
+                0 => plain["served_psnr"].clone(),
+                _ => json!(judge(&best.gaussians)?),
+            };
+            if best.report.steps > 0 {
+                picture(text, one_set(&best.gaussians, camera)?)?;
+            }
+            progress(&format!("{name}: {row}"));
+            rows.push(json!({ "psnr_db": row["refined_psnr"] }), row)?;
         }
-        progress(&format!("{name}: {row}"));
-        let error = row.get("refined_psnr").unwrap_or(&row["psnr"]).clone();
-        rows.push(json!({ "psnr_db": error }), row)?;
     }
     Ok(())
 }
@@ -152,6 +258,15 @@ fn given(all: &[PosedPhoto], count: usize) -> (Vec<PosedPhoto>, Vec<PosedPhoto>)
     let pick = |i: &usize| all[*i].clone();
     let given = (0..count).map(|k| pick(&rest[spread(k)])).collect();
     (targets.iter().map(pick).collect(), given)
+}
+
+/// Writes a picture of colours in 0..1 as a PNG.
+fn save(file: &Path, width: u32, height: u32, color: &[[f32; 3]]) -> Result<()> {
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..255")]
+    let bytes = color.as_flattened().iter().map(|v| (v * 255.0).round() as u8).collect();
+    let failed = |why: &dyn std::fmt::Display| Error::internal(format!("a picture: {why}"));
+    let picture = image::RgbImage::from_raw(width, height, bytes);
+    picture.ok_or_else(|| failed(&"its size"))?.save(file).map_err(|e| failed(&e))
 }
 
 /// Mean PSNR of what `draw` gives at the targets' cameras.

@@ -8,7 +8,7 @@ use crate::{
         self, PhotoSet, PipelineLoader, Reconstruction,
         semantics::{SemanticsInput, understand},
     },
-    scene::{PosedPhoto, Scene, SceneOptions, Semantics, TextEmbedding, Watch},
+    scene::{Gaussians, PosedPhoto, Scene, SceneOptions, Semantics, TextEmbedding, Watch},
 };
 
 /// Whether the networks are open.
@@ -61,6 +61,22 @@ pub trait SceneNetworks: Send + Sync {
         options: &SceneOptions,
         watch: Watch<'_>,
     ) -> Result<Reconstruction>;
+
+    /// As [`Self::make`], and the Gaussians with which refinement begins: one set of the same
+    /// photos (`front_photos` = 0), or what was made.
+    ///
+    /// # Errors
+    /// As [`Self::make`].
+    fn make_for_refinement(
+        &self,
+        photos: &PhotoSet,
+        options: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<(Reconstruction, Gaussians)> {
+        let made = self.make(photos, options, watch)?;
+        let one_set = made.gaussians.clone();
+        Ok((made, one_set))
+    }
 }
 
 /// What the bundle compares texts with, and how.
@@ -154,6 +170,15 @@ impl SceneNetworks for PipelineNetworks {
         watch: Watch<'_>,
     ) -> Result<Reconstruction> {
         pipeline::make(self.0.get()?, photos, options, watch)
+    }
+
+    fn make_for_refinement(
+        &self,
+        photos: &PhotoSet,
+        options: &SceneOptions,
+        watch: Watch<'_>,
+    ) -> Result<(Reconstruction, Gaussians)> {
+        pipeline::reconstruct_for_refinement(self.0.get()?, &photos.photos, options, watch)
     }
 }
 

@@ -1,10 +1,13 @@
-//! The job that refines a finished scene. The scene is served meanwhile; each better version takes
-//! the place of the one before in one step.
+//! The job that refines a finished scene. The scene is served meanwhile; the better version takes
+//! its place in one step.
+//!
+//! First a scene of the photos that are not held out is refined: that says whether it helps, how
+//! much, and with how many steps. Then the scene of all photos is refined with as many, and served.
 //!
 //! It goes behind everything else: before each step it waits until no scene and no semantics are
 //! made and no view was drawn for a moment. Where views never end it takes a step now and then. It
-//! holds no slot and no room. What it still has to do is in the record, so that a start goes on
-//! from the version that was published last.
+//! holds no slot and no room. What it still has to do is in the record, so that a start begins it
+//! again.
 
 use std::{
     sync::Arc,
@@ -22,7 +25,8 @@ use crate::{
         refinement::{at_side, start_of, version_of},
     },
     refine::{
-        HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion, held_out, refine, split,
+        HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out,
+        refine, split,
     },
     scene::{
         PosedPhoto, Refine, RefineReport, RefineState, RefineStatus, Scene, SceneId, Stage, Watch,
@@ -62,6 +66,14 @@ pub(super) fn reset(record: &mut Record) {
     if record.status.is_refined_now() {
         record.status.refinement = RefineStatus::default();
     }
+}
+
+/// What a refinement works on.
+struct Work<'a> {
+    job: &'a Job,
+    record: &'a Record,
+    scene: &'a Scene,
+    watch: Watch<'a>,
 }
 
 impl Jobs {
@@ -164,7 +176,6 @@ impl Jobs {
                 "given up: the server stopped {ATTEMPTS_MAX} times without a better version"
             )));
         }
-        let mut told = 0.0;
         let progress = |_: Stage, _: f32| drop(self.give_way(job));
         let watch = Watch { progress: &progress, cancel: &job.cancel };
         self.give_way(job)?;
@@ -174,40 +185,68 @@ impl Jobs {
             Ok(own) => own.photos.photos,
             Err(shared) => shared.photos.photos.clone(),
         };
-        let (learnt, out) = split(photos);
-        let (start, learnt) = match scene.meta.report.refinement {
-            Some(_) => (Scene::clone(&scene), learnt),
-            None => {
-                let learnt = PhotoSet { photos: learnt, read_ms: 0.0 };
-                let made = self.parts.scenes.make(&learnt, &record.options, watch)?;
-                (start_of(&scene, made)?, learnt.photos)
-            }
+        let work = Work { job, record: &record, scene: &scene, watch };
+        let time = Duration::from_millis(order.ms);
+        let held = held_out(photos.len());
+        if held.is_empty() {
+            let budget = RefineBudget { steps: UNWATCHED_STEPS_MAX, time };
+            let (start, version) = self.refined(&work, (photos, Vec::new()), budget, [0.0, 1.0])?;
+            self.publish(job, &start, &version)?;
+            return self.finish_refinement(job, &version.report);
+        }
+        // Without the photos that are held out: whether it helps, and with how many steps.
+        let budget = RefineBudget { steps: self.parts.limits.refine_steps_max, time: time / 2 };
+        let (_, proof) = self.refined(&work, split(photos.clone()), budget, [0.0, 0.5])?;
+        let proof = proof.report;
+        let earlier = scene.meta.report.refinement.as_ref().and_then(|report| report.psnr_after);
+        if proof.steps == 0 || proof.psnr_after <= earlier {
+            return self.finish_refinement(job, &proof);
+        }
+        // The same with all photos: what is served lacks none.
+        let budget = RefineBudget::steps(proof.steps);
+        let (start, mut version) = self.refined(&work, (photos, Vec::new()), budget, [0.5, 1.0])?;
+        version.report = RefineReport {
+            seconds: proof.seconds + version.report.seconds,
+            psnr_before: proof.psnr_before,
+            psnr_after: proof.psnr_after,
+            ..version.report
         };
-        drop(scene);
-        let done_s = start.meta.report.refinement.as_ref().map_or(0.0, |report| report.seconds);
-        let left = Duration::from_millis(order.ms).saturating_sub(Duration::from_secs_f64(done_s));
-        let limits = &self.parts.limits;
-        let options = RefineOptions {
-            budget: RefineBudget { steps: limits.refine_steps_max, time: left },
-            gaussians_max: limits.refine_gaussians_max,
-            ..RefineOptions::default()
-        };
+        self.publish(job, &start, &version)?;
+        self.finish_refinement(job, &version.report)
+    }
+
+    /// Refines what the networks make of the photos that are learnt, and watches those held out.
+    /// `part` is where it begins and ends in the whole refinement.
+    fn refined(
+        &self,
+        work: &Work<'_>,
+        (learnt, out): (Vec<PosedPhoto>, Vec<PosedPhoto>),
+        budget: RefineBudget,
+        part: [f32; 2],
+    ) -> Result<(Scene, RefinedVersion)> {
+        let Work { job, record, scene, watch } = *work;
+        let held = if out.is_empty() { Vec::new() } else { held_out(scene.meta.cameras.len()) };
+        let learnt = PhotoSet { photos: learnt, read_ms: 0.0 };
+        let made = self.parts.scenes.make_for_refinement(&learnt, &record.options, watch)?;
+        let (start, first) = start_of(scene, &held, made)?;
+        let gaussians_max = self.parts.limits.refine_gaussians_max;
+        let options = RefineOptions { budget, gaussians_max, ..RefineOptions::default() };
         let sized = |photos: Vec<PosedPhoto>| -> Vec<PosedPhoto> {
             photos.into_iter().map(|photo| at_side(&photo, options.side)).collect()
         };
-        let (learnt, out) = (sized(learnt), sized(out));
+        let (learnt, out) = (sized(learnt.photos), sized(out));
+        let (mut told, [begin, end]) = (0.0, part);
         let mut pace = |spent: f32| {
             if spent >= told + TOLD {
                 told = spent;
-                self.show(job, Stage::Refine, spent);
+                self.show(job, Stage::Refine, begin + (end - begin) * spent);
             }
             self.give_way(job)
         };
-        let mut publish = |version: &RefinedVersion| self.publish(job, &start, version);
-        let renderer = &*self.parts.refiner;
-        let photos = (&learnt[..], &out[..]);
-        let best = refine(renderer, &start, photos, &options, &mut pace, &mut publish)?;
-        self.finish_refinement(job, &best)
+        let (renderer, photos) = (&*self.parts.refiner, (&learnt[..], &out[..]));
+        let begin = (&start, &first);
+        let version = refine(renderer, begin, photos, &options, &mut pace, &mut |_| Ok(()))?;
+        Ok((start, version))
     }
 
     /// Waits until nothing else is to be done.
@@ -254,7 +293,7 @@ impl Jobs {
         Ok(())
     }
 
-    fn finish_refinement(&self, job: &Job, best: &RefinedVersion) -> Result<()> {
+    fn finish_refinement(&self, job: &Job, found: &RefineReport) -> Result<()> {
         let (id, store) = (&job.scene, &self.parts.store);
         let _lock = self.lock(id.as_str(), job)?;
         let Some(mut record) = self.records.find(id).map(Arc::unwrap_or_clone) else {
@@ -271,14 +310,14 @@ impl Jobs {
             if let Some(report) = &mut record.status.report {
                 report.refinement.get_or_insert_with(|| RefineReport {
                     held_out: held_out.clone(),
-                    ..best.report.clone()
+                    ..found.clone()
                 });
             }
         };
         change(&mut record);
         store.put_status(&record)?;
         self.records.update(id, change);
-        tracing::info!(scene = %id, steps = best.report.steps, "refinement is over");
+        tracing::info!(scene = %id, steps = found.steps, "refinement is over");
         if !self.parts.keep_photos && record.status.is_settled() {
             store.drop_upload(id)?;
         }

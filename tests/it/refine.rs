@@ -95,7 +95,7 @@ async fn better_versions_take_the_place_of_a_scene_and_its_watchers_are_told() {
     let (server, networks) = server(60).await;
     let service = &server.service;
     let made = scene(&server, SceneOptions::default()).await;
-    assert_eq!((made.version, made.refinement.state), (1, RefineState::None), "off by default");
+    assert_eq!((made.version, made.refinement.state), (1, RefineState::None), "nobody asked");
     let first = service.render(&made.id, first_view()).await.unwrap();
     networks.0.hold.store(true, Ordering::Release);
     let taken = service.refine(&made.id, LONG).await.unwrap();
@@ -136,22 +136,30 @@ async fn better_versions_take_the_place_of_a_scene_and_its_watchers_are_told() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn a_refinement_goes_on_after_a_restart_until_it_is_ended_and_its_version_stays() {
-    let (server, _) = server(16_000).await;
-    let options = SceneOptions { refine: Some(LONG), ..SceneOptions::default() };
-    let made = scene(&server, options).await;
-    assert_eq!((made.state, made.refinement.state), (SceneState::Done, RefineState::Running));
-    // A version comes with every tenth of the steps, so it ends long after the first.
-    let better = until(&server, &made.id, |status| status.version > 1).await;
+async fn a_refinement_goes_on_after_a_restart_until_it_is_ended_and_a_version_stays() {
+    let (server, networks) = server(60).await;
+    let made = scene(&server, SceneOptions::default()).await;
+    networks.0.hold.store(true, Ordering::Release);
+    server.service.refine(&made.id, LONG).await.unwrap();
     let server = server.restart().await;
     let found = server.service.get(&made.id).await.unwrap();
-    assert!(found.version >= better.version && found.is_refined_now(), "{found:?}");
+    assert!(found.version == 1 && found.is_refined_now(), "{found:?}");
     server.service.render(&made.id, first_view()).await.unwrap();
     let ended = server.service.refine(&made.id, Refine::Off).await.unwrap();
-    assert_eq!(ended.refinement.state, RefineState::Done, "it was refined");
-    assert!(ended.version >= better.version);
+    assert_eq!(ended.refinement.state, RefineState::None, "it was not refined");
     let server = server.restart().await;
     assert!(!server.service.get(&made.id).await.unwrap().is_refined_now(), "it stays ended");
+    networks.0.hold.store(false, Ordering::Release);
+    server.service.refine(&made.id, LONG).await.unwrap();
+    let better = until(&server, &made.id, |status| !status.is_refined_now()).await;
+    assert_eq!((better.version, better.refinement.state), (2, RefineState::Done));
+    // Another refinement takes its place only where it is better on the held-out photos.
+    server.service.refine(&made.id, LONG).await.unwrap();
+    let again = until(&server, &made.id, |status| !status.is_refined_now()).await;
+    let psnr = |status: &SceneStatus| {
+        status.report.as_ref().and_then(|report| report.refinement.as_ref()?.psnr_after)
+    };
+    assert_eq!(again.version > 2, psnr(&again) > psnr(&better), "{again:?}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -172,7 +180,7 @@ async fn a_scene_that_is_deleted_while_it_is_refined_is_gone() {
     networks.0.hold.store(false, Ordering::Release);
     let options = SceneOptions { refine: Some(LONG), ..SceneOptions::default() };
     let second = scene(&server, options).await;
-    until(&server, &second.id, |status| status.version > 1).await;
+    until(&server, &second.id, |status| status.refinement.fraction > 0.0).await;
     server.service.delete(&second.id).await.unwrap();
     let folder = server.data_dir().join("scenes");
     eventually("the files", async || {

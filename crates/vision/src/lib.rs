@@ -47,15 +47,15 @@ fn seen_at(camera: &scene::Camera, world: DVec3) -> Option<(DVec3, f64, f64)> {
 
 /// Runs `kernel` compiled for the widest vectors of this processor. What the kernel calls is
 /// compiled with it where it is inlined. Nothing is fused or reordered: the numbers are the same.
-fn vectorised(kernel: impl FnOnce()) {
+fn vectorised<T>(kernel: impl FnOnce() -> T) -> T {
     struct Kernel<F>(F);
-    impl<F: FnOnce()> pulp::WithSimd for Kernel<F> {
-        type Output = ();
+    impl<T, F: FnOnce() -> T> pulp::WithSimd for Kernel<F> {
+        type Output = T;
 
         #[inline(always)]
-        fn with_simd<S: pulp::Simd>(self, _: S) {
-            self.0();
+        fn with_simd<S: pulp::Simd>(self, _: S) -> T {
+            self.0()
         }
     }
-    pulp::Arch::new().dispatch(Kernel(kernel));
+    pulp::Arch::new().dispatch(Kernel(kernel))
 }

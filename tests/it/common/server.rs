@@ -22,7 +22,7 @@ use segsplat::{
     render::{Frame, FrameStats, Labels, PixelWeights, RenderRequest, Renderer, labels::selected},
     sample::{self, SampleOptions},
     scene::{
-        Backdrop, Gaussians, HealthReport, PosedPhoto, RawGaussians, SceneCamera, SceneId,
+        Backdrop, Gaussians, HealthReport, PosedPhoto, RawGaussians, Refine, SceneCamera, SceneId,
         SceneOptions, SceneStatus, SourcePixel, Stage, Upload, Watch,
     },
     service::{
@@ -72,6 +72,8 @@ impl TestServer {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let mut config = Config::default();
         config.data_dir = folder.path().join("data");
+        // Versions of scenes come where a test asks for them.
+        config.refine = Refine::Off;
         let mut parts = Parts {
             scenes: Arc::new(WallNetworks::default()),
             semantics: Arc::new(NoSemantics),

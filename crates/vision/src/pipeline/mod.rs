@@ -174,6 +174,22 @@ pub fn make(
     Ok(reconstruction)
 }
 
+/// As [`reconstruct`], and the same Gaussians as one set that agrees (`front_photos` = 0), with
+/// which refinement begins: of one run of the network.
+///
+/// # Errors
+/// As [`reconstruct`].
+pub fn reconstruct_for_refinement(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    options: &SceneOptions,
+    watch: Watch<'_>,
+) -> Result<(Reconstruction, Gaussians)> {
+    let (made, one_set) = run(pipeline, photos, options, watch, true)?;
+    let one_set = one_set.unwrap_or_else(|| made.gaussians.clone());
+    Ok((made, one_set))
+}
+
 /// Photos to Gaussians. `progress` gets each stage with its fraction, 0 to 1; the loops of each
 /// stage look at `cancel`.
 ///
@@ -186,7 +202,19 @@ pub fn reconstruct(
     progress: &(dyn Fn(Stage, f32) + Sync),
     cancel: &AtomicBool,
 ) -> Result<Reconstruction> {
-    let mut stages = Stages::new(Watch { progress, cancel });
+    run(pipeline, photos, options, Watch { progress, cancel }, false).map(|(made, _)| made)
+}
+
+/// The stages; with `as_one_set` the Gaussians once more as one set, where they are not one yet.
+fn run(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    options: &SceneOptions,
+    watch: Watch<'_>,
+    as_one_set: bool,
+) -> Result<(Reconstruction, Option<Gaussians>)> {
+    let Watch { progress, cancel } = watch;
+    let mut stages = Stages::new(watch);
     let cameras: Vec<Camera> = photos.iter().map(|photo| photo.camera).collect();
     let manifest = pipeline.geometry.manifest();
     let views_max = views_max(options, manifest.views_min, manifest.views_max)?;
@@ -224,22 +252,25 @@ pub fn reconstruct(
         }
         Ok(views)
     })?;
-    let (lifted, backdrop) = stages.run(Stage::Lift, || {
+    let (lifted, backdrop, one_set) = stages.run(Stage::Lift, || {
         pipeline.workers.install(|| {
             let thinning = match method.density {
                 Density::Thinned => Some(lift::ThinOptions::default()),
                 Density::Full => None,
             };
-            let fusing = fusing(&method);
+            let lift = |views, fusing: &Fusion| {
+                lift::lift(views, &cameras, method.prune, fusing, thinning.as_ref(), cancel)
+            };
+            let fusion = fusing(&method);
+            let layered = as_one_set && matches!(fusion, Fusion::Layers(_));
+            let again = layered.then(|| views.clone());
             let backdrop = || match method.backdrop {
                 true => lift::backdrop(photos),
                 false => Backdrop::default(),
             };
-            let (lifted, backdrop) = rayon::join(
-                || lift::lift(views, &cameras, method.prune, &fusing, thinning.as_ref(), cancel),
-                backdrop,
-            );
-            Ok((lifted?, backdrop))
+            let (lifted, backdrop) = rayon::join(|| lift(views, &fusion), backdrop);
+            let one_set = again.map(|views| lift(views, &Fusion::OneSet(UnionOptions::default())));
+            Ok((lifted?, backdrop, one_set.transpose()?.map(|lifted| lifted.gaussians)))
         })
     })?;
 
@@ -268,7 +299,7 @@ pub fn reconstruct(
         refinement: None,
         warnings: capture.warnings,
     };
-    Ok(Reconstruction { gaussians: lifted.gaussians, backdrop, report, cameras })
+    Ok((Reconstruction { gaussians: lifted.gaussians, backdrop, report, cameras }, one_set))
 }
 
 /// The stages of one job. Each is reported and timed. None begins after the job is cancelled.

@@ -30,20 +30,27 @@ pub fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
     PosedPhoto { photo, camera: fitted.camera, ..posed.clone() }
 }
 
-/// The scene that refinement begins with: `learnt` was made of the photos that [`refine::split`]
-/// does not hold out of those of `scene`, and gets the place of `scene`. Photos keep their numbers.
+/// What refinement begins with: `learnt` and `one_set` were made of the photos of `scene` less
+/// those held out, and get its place. Photos keep their numbers.
 ///
 /// # Errors
 /// `internal` when it is not a scene of these photos.
-pub fn start_of(scene: &Scene, learnt: Reconstruction) -> Result<Scene> {
-    let held = refine::held_out(scene.meta.cameras.len());
+pub fn start_of(
+    scene: &Scene,
+    held: &[usize],
+    (learnt, one_set): (Reconstruction, Gaussians),
+) -> Result<(Scene, Gaussians)> {
     let kept = |i: &usize| !held.contains(i);
     let numbers: Vec<usize> = (0..scene.meta.cameras.len()).filter(kept).collect();
-    let mut raw = learnt.gaussians.into_raw();
-    for source in &mut raw.source {
-        let number = numbers.get(usize::from(source.view)).copied().unwrap_or(usize::MAX);
-        source.view = u16::try_from(number).unwrap_or(u16::MAX);
-    }
+    let numbered = |gaussians: Gaussians| {
+        let mut raw = gaussians.into_raw();
+        for source in &mut raw.source {
+            let number = numbers.get(usize::from(source.view)).copied().unwrap_or(usize::MAX);
+            source.view = u16::try_from(number).unwrap_or(u16::MAX);
+        }
+        Gaussians::restore(raw)
+    };
+    let gaussians = numbered(learnt.gaussians)?;
     let mut cameras: Vec<SceneCamera> = scene.meta.cameras.clone();
     let mut focals = vec![0.0; cameras.len()];
     cameras.iter_mut().for_each(|camera| camera.network = None);
@@ -52,14 +59,15 @@ pub fn start_of(scene: &Scene, learnt: Reconstruction) -> Result<Scene> {
         focals[number] = learnt.report.network_focal_px.get(i).copied().unwrap_or(0.0);
     }
     let report = HealthReport {
-        gaussians: raw.means.len() as u64,
+        gaussians: gaussians.len() as u64,
+        method: learnt.report.method,
         median_depth: learnt.report.median_depth,
         network_focal_px: focals,
         refinement: None,
         ..scene.meta.report.clone()
     };
     let meta = SceneMeta { cameras, report, ..scene.meta.clone() };
-    Ok(Scene::new(meta, Gaussians::restore(raw)?, learnt.backdrop))
+    Ok((Scene::new(meta, gaussians, learnt.backdrop), numbered(one_set)?))
 }
 
 /// A version as a scene: of `start`, with the semantics that `served` has now.

@@ -11,6 +11,9 @@
 //! scene as it is served. They must not be in the Gaussians that come in either: make the scene of
 //! the others ([`split`]).
 //!
+//! That says whether it helps and how many steps are good. What is served then is refined with as
+//! many steps from a scene of all photos, so that it lacks none.
+//!
 //! **One set.** A scene that comes in may be served in layers and with magnification. What comes
 //! out is plain: the same Gaussians for every view and for other programs.
 
@@ -43,17 +46,21 @@ use crate::{
 pub const HOLDS_OUT_FROM: usize = 5;
 /// Every so many photos one is held out.
 pub const HELD_OUT_EVERY: usize = 8;
-/// Most steps where no photo tells when to stop.
+/// Most steps of a scene of few photos, where none is held out to tell when to stop.
 pub const UNWATCHED_STEPS_MAX: u32 = 30;
 /// Looks at the held-out photos in a whole budget.
 const LOOKS: u32 = 10;
 /// Looks without a better version after which it stops.
 const PATIENCE: u32 = 3;
+/// Rates as multiples of those of 3DGS, which takes 30,000 steps: docs/adr/0039.
+const RATE: f32 = 2.5;
 /// Rates fall to this share over the budget.
 const LAST_RATE: f32 = 0.1;
 /// How fast an exposure moves, and what it costs to be another than gain 1, bias 0.
 const EXPOSURE_RATE: f32 = 5e-3;
 const EXPOSURE_COST: f32 = 1.0;
+/// Pixels of a task.
+const PIXELS_A_TASK: usize = 1 << 13;
 /// Largest change of a gain, or bias, of a photo.
 const EXPOSURE_MAX: f32 = 0.5;
 
@@ -93,6 +100,8 @@ pub struct RefineOptions {
     pub opacity_min: f32,
     /// Steps between two times of dropping.
     pub prune_every: u32,
+    /// Share of SSIM in the loss, 0..1.
+    pub ssim_share: f32,
     /// Seed of all that is random.
     pub seed: u64,
 }
@@ -103,10 +112,11 @@ impl Default for RefineOptions {
             budget: RefineBudget::steps(400),
             batch: 1,
             side: 640,
-            rates: LearningRates::default(),
+            rates: LearningRates::default().scaled(RATE),
             gaussians_max: 150_000,
             opacity_min: 0.01,
             prune_every: 50,
+            ssim_share: 0.2,
             seed: 1,
         }
     }
@@ -190,12 +200,23 @@ impl Exposure {
     /// Moves by what the loss says of the exposed picture.
     fn step(&mut self, picture: &[[f32; 3]], by: &[[f32; 3]], rate: f32) {
         self.count = self.count.saturating_add(1);
+        let parts: Vec<[[f32; 3]; 2]> = picture
+            .par_chunks(PIXELS_A_TASK)
+            .zip(by.par_chunks(PIXELS_A_TASK))
+            .map(|(picture, by)| {
+                let mut sums = [[0.0; 3]; 2];
+                for (color, by) in picture.iter().zip(by) {
+                    for c in 0..3 {
+                        sums[0][c] += color[c] * by[c];
+                        sums[1][c] += by[c];
+                    }
+                }
+                sums
+            })
+            .collect();
         for c in 0..3 {
-            let (mut by_gain, mut by_bias) = (0.0, 0.0);
-            for (color, by) in picture.iter().zip(by) {
-                by_gain += color[c] * by[c];
-                by_bias += by[c];
-            }
+            let [mut by_gain, mut by_bias] =
+                [0, 1].map(|which: usize| parts.iter().map(|part| part[which][c]).sum::<f32>());
             by_gain += 2.0 * EXPOSURE_COST * (self.gain[c] - 1.0);
             by_bias += 2.0 * EXPOSURE_COST * self.bias[c];
             let [gain, bias] = &mut self.moments[c];
@@ -235,6 +256,7 @@ impl Clock {
 struct Refinement<'a> {
     renderer: &'a dyn DifferentiableRenderer,
     start: &'a Scene,
+    first: &'a Gaussians,
     near: f32,
     extent: f32,
     options: &'a RefineOptions,
@@ -242,21 +264,21 @@ struct Refinement<'a> {
     looks: Vec<Target>,
 }
 
-/// Refines `start` on the photos that are learnt and watches the held-out ones, none of which is in
-/// `start`. The photos are used at the size that they have. Before each step `pace` gets the share
-/// of the budget that is spent, 0..1; it may wait, which is not counted, and its error ends the
-/// work. Each better version goes to `publish`. Returns the best one: `start` itself where none was
-/// better.
+/// Refines `first` on the photos that are learnt and watches the held-out ones. `start` is what is
+/// served of the learnt photos alone, and `first` the same as one set of Gaussians. The photos are
+/// used at the size that they have. Before each step `pace` gets the share of the budget that is
+/// spent, 0..1; it may wait, which is not counted, and its error ends the work. Each better version
+/// goes to `publish`. Returns the best one: `start` itself where none was better.
 ///
-/// A scene that was refined before goes on as its report says. Without held-out photos at most
-/// [`UNWATCHED_STEPS_MAX`] steps are taken, and the last version is the one.
+/// Without held-out photos the last version is the one. Of fewer than [`HOLDS_OUT_FROM`] at most
+/// [`UNWATCHED_STEPS_MAX`] steps are taken.
 ///
 /// # Errors
 /// `invalid_request` for options out of range; what the renderer, `pace` or `publish` says. What
 /// was published stays.
 pub fn refine(
     renderer: &dyn DifferentiableRenderer,
-    start: &Scene,
+    (start, first): (&Scene, &Gaussians),
     (learnt, held_out): (&[PosedPhoto], &[PosedPhoto]),
     options: &RefineOptions,
     pace: &mut dyn FnMut(f32) -> Result<()>,
@@ -271,6 +293,7 @@ pub fn refine(
     let work = Refinement {
         renderer,
         start,
+        first,
         near: default_near(extent),
         extent: extent_f32,
         options,
@@ -297,31 +320,36 @@ impl Refinement<'_> {
         };
         let before = RefineReport { psnr_before: report.psnr_before, ..report.clone() };
         let mut best = RefinedVersion { gaussians: start.gaussians.clone(), report };
-        if self.targets.is_empty() || start.gaussians.is_empty() {
+        if self.targets.is_empty() || self.first.is_empty() {
             return Ok(best);
         }
         let mut random = options.seed;
-        let mut gaussians = fewer(&one_set(start, options.side)?, options, &mut random)?;
+        let mut gaussians =
+            fewer(&blurred(self.first, start, options.side)?, options, &mut random)?;
         let mut adam = Adam::new(&gaussians);
         let mut order: Vec<usize> = Vec::new();
-        let (mut steps, mut looked, mut waited) = (0, 0, 0);
+        let (mut steps, mut looked, mut waited, mut highest) = (0, 0, 0, None);
         let mut found = (Gradients::default(), Gradients::default());
         loop {
             let spent = clock.spent(steps);
             let paused = Instant::now();
             pace(spent)?;
             clock.waited += paused.elapsed();
-            let last = spent >= 1.0 || (!watched && steps >= UNWATCHED_STEPS_MAX);
+            let few = self.targets.len() < HOLDS_OUT_FROM && steps >= UNWATCHED_STEPS_MAX;
+            let last = spent >= 1.0 || (!watched && few);
             if last || (watched && spent * LOOKS as f32 >= (looked + 1) as f32) {
                 looked += 1;
                 waited += 1;
                 let after = self.look(&gaussians, &|camera| self.request(camera))?;
+                if after > highest {
+                    (highest, waited) = (after, 0);
+                }
+                tracing::debug!(steps, psnr = after, gaussians = gaussians.len(), "looked");
                 let better = match (after, best.report.psnr_after) {
                     (Some(after), Some(before)) => after > before,
                     _ => last && steps > 0,
                 };
                 if better {
-                    waited = 0;
                     let report = RefineReport {
                         steps: before.steps + steps,
                         seconds: before.seconds + clock.worked().as_secs_f64(),
@@ -404,15 +432,17 @@ impl Refinement<'_> {
         into: &mut Gradients,
     ) -> Result<()> {
         let request = self.request(self.targets[at].camera);
+        let ssim_share = self.options.ssim_share;
         let target = &mut self.targets[at];
         let mut loss = |frame: &Frame| {
             let plain = frame.color.as_deref().unwrap_or_default();
-            let shown: Vec<[f32; 3]> = plain.iter().map(|c| target.exposure.of(*c)).collect();
+            let shown: Vec<[f32; 3]> = plain.par_iter().map(|c| target.exposure.of(*c)).collect();
             let width = target.width();
-            let mut by = photo_loss(&shown, &target.rgb, width, target.valid.as_deref()).gradient;
+            let valid = target.valid.as_deref();
+            let mut by = photo_loss(&shown, &target.rgb, width, valid, ssim_share).gradient;
             let gain = target.exposure.gain;
             target.exposure.step(plain, &by, EXPOSURE_RATE * rate);
-            by.iter_mut().for_each(|by| *by = std::array::from_fn(|c| by[c] * gain[c]));
+            by.par_iter_mut().for_each(|by| *by = std::array::from_fn(|c| by[c] * gain[c]));
             Ok(FrameGradients { color: Some(by), ..FrameGradients::default() })
         };
         self.renderer.backward(gaussians, &request, &mut loss, into)?;
@@ -450,15 +480,15 @@ fn shuffled(count: usize, random: &mut u64) -> Vec<usize> {
     order.into_iter().map(|(_, i)| i).collect()
 }
 
-/// The Gaussians of a scene as one set: what its views add to those that are shown larger than in
-/// the network's picture ([`segsplat_render::plan`], magnification) is added for good, for photos
-/// whose longer side is `side`.
-fn one_set(scene: &Scene, side: u32) -> Result<Gaussians> {
+/// Gaussians of a scene with its magnification: what its views add to those that are shown larger
+/// than in the network's picture ([`segsplat_render::plan`]) is added for good, for photos whose
+/// longer side is `side`.
+fn blurred(gaussians: &Gaussians, scene: &Scene, side: u32) -> Result<Gaussians> {
     let (report, cameras) = (&scene.meta.report, &scene.meta.cameras);
     if !report.method.magnify {
-        return Ok(scene.gaussians.clone());
+        return Ok(gaussians.clone());
     }
-    let origin = scene.gaussians.origin();
+    let origin = gaussians.origin();
     // Of each photo: centre, axis, width of a source pixel at depth 1, and share of the blur lost.
     let rows = cameras.iter().zip(&report.network_focal_px).map(|(photo, focal)| {
         let (lens, pose) = (photo.camera.intrinsics, &photo.camera.camera_to_world);
@@ -469,7 +499,7 @@ fn one_set(scene: &Scene, side: u32) -> Result<Gaussians> {
             .then(|| (pose.center() - origin, pose.axis(), lost / focal / focal))
     });
     let rows: Vec<_> = rows.collect();
-    let mut raw = scene.gaussians.as_raw().clone();
+    let mut raw = gaussians.as_raw().clone();
     let scales = raw.scales.par_iter_mut().zip(&raw.means).zip(&raw.source);
     scales.for_each(|((scales, mean), source)| {
         let Some(Some((center, axis, lost))) = rows.get(usize::from(source.view)) else { return };

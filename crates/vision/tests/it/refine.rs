@@ -53,7 +53,7 @@ fn the_loss_and_its_gradient_are_those_of_the_plain_form() {
     let mut picture = |_| [(); 3].map(|()| random.range(0.0, 1.0));
     let photo: Vec<[f32; 3]> = (0..width * height).map(&mut picture).collect();
     let shown: Vec<[f32; 3]> = (0..width * height).map(&mut picture).collect();
-    let found = photo_loss(&shown, &photo, width, None);
+    let found = photo_loss(&shown, &photo, width, None, 0.2);
     let want = plain_loss(&shown, &photo, width);
     assert!((found.value - want).abs() < 1e-6, "{} is not {want}", found.value);
     let most = found.gradient.as_flattened().iter().fold(0.0_f32, |most, by| most.max(by.abs()));
@@ -82,12 +82,12 @@ fn pixels_without_a_source_and_small_pictures_are_allowed_for() {
     shown[17] = [0.9, 0.1, 0.4];
     let mut valid = vec![true; 15 * 15];
     valid[17] = false;
-    let found = photo_loss(&shown, &photo, 15, Some(&valid));
+    let found = photo_loss(&shown, &photo, 15, Some(&valid), 0.2);
     assert!(found.value.abs() < 1e-6, "{} for the same picture", found.value);
     assert!(found.gradient[17] == [0.0; 3], "a pixel that does not count pulls");
-    let small = photo_loss(&shown[..20], &photo[..20], 5, None);
+    let small = photo_loss(&shown[..20], &photo[..20], 5, None, 0.2);
     assert!(small.value > 0.0 && small.gradient[17][0] > 0.0, "no window fits: L1 alone");
-    assert!(photo_loss(&[], &[], 0, None).gradient.is_empty(), "no picture");
+    assert!(photo_loss(&[], &[], 0, None, 0.2).gradient.is_empty(), "no picture");
 }
 
 #[test]
@@ -165,7 +165,8 @@ fn refined(
         Ok(())
     };
     let photos = (&learnt[..], &out[..]);
-    refine(&cpu, &scene(start, 3.0), photos, &options, &mut |_| Ok(()), publish).expect("refined")
+    let start = (&scene(start, 3.0), start);
+    refine(&cpu, start, photos, &options, &mut |_| Ok(()), publish).expect("refined")
 }
 
 #[test]
@@ -210,10 +211,10 @@ fn a_cancelled_refinement_stops_and_odd_input_is_taken_or_refused() {
             true => Err(Error::new(ErrorCode::Cancelled, "stopped")),
             false => Ok(()),
         };
-        let start = scene(start, f64::NAN);
-        refine(&cpu, &start, (photos, &[]), options, &mut pace, &mut |_| Ok(()))
+        let start = (&scene(start, f64::NAN), start);
+        refine(&cpu, start, (photos, &[]), options, &mut pace, &mut |_| Ok(()))
     };
-    let options = RefineOptions::default();
+    let options = RefineOptions { budget: RefineBudget::steps(30), ..RefineOptions::default() };
     let told = run(&truth, &photos, &options, true).expect_err("cancelled");
     assert_eq!(told.code(), ErrorCode::Cancelled);
     let told = run(&truth, &photos, &RefineOptions { batch: 0, ..options }, false);
