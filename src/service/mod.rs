@@ -60,7 +60,7 @@ use crate::{
     keys::Caller,
     limits::Limits,
     render::{Renderer, cpu::CpuRenderer},
-    scene::{SceneId, Stage},
+    scene::{Refine, SceneId, Stage},
     store::{Place, Record, Store},
 };
 
@@ -139,7 +139,13 @@ impl Service {
         let store = Arc::new(store);
         let scheduler = Scheduler::new(parts.renderer.concurrency(), &config.limits);
         let drawn = Arc::clone(&scheduler);
-        let refiner = match Arc::clone(&parts.renderer).differentiable() {
+        let device = Arc::clone(&parts.renderer).differentiable();
+        let refine = match config.refine {
+            // Not measured to help in the time of processors, so it is for calls that ask.
+            Refine::Auto if device.is_none() => Refine::Off,
+            how => how,
+        };
+        let refiner = match device {
             Some(renderer) => renderer,
             // Threads of its own: a view never waits for a step.
             None => Arc::new(CpuRenderer::new(config.threads)?),
@@ -151,7 +157,7 @@ impl Service {
             limits: config.limits.clone(),
             workers: config.workers(),
             keep_photos: config.keep_photos,
-            refine: config.refine,
+            refine,
             refiner,
             threads: config.threads,
             drawn: Box::new(move || drawn.idle()),
