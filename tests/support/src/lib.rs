@@ -23,8 +23,8 @@ pub fn root() -> &'static Path {
     Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."))
 }
 
-/// The ONNX Runtime that tests name to the program: `SEGSPLAT_ORT_LIBRARY`, else the checkout's, which
-/// a test program that is built elsewhere does not find; `None` where it finds one by itself.
+/// The ONNX Runtime that tests name to the program: `SEGSPLAT_ORT_LIBRARY`, else the checkout's,
+/// which a test program that is built elsewhere does not find; `None` where it finds one by itself.
 #[must_use]
 pub fn ort_library() -> Option<PathBuf> {
     let named = std::env::var_os("SEGSPLAT_ORT_LIBRARY").map(PathBuf::from);

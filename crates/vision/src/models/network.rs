@@ -382,8 +382,8 @@ struct Opener {
 
 impl Opener {
     /// A session a job on the CPU, or one that all jobs wait for where the network is large or the
-    /// threads are few. On CUDA [`CUDA_SESSIONS`] of a small network: its kernels are many and short,
-    /// so that one job's run leaves the device idle. Else one session on a device.
+    /// threads are few. On CUDA [`CUDA_SESSIONS`] of a small network: its kernels are many and
+    /// short, so that one job's run leaves the device idle. Else one session on a device.
     fn open(&self, provider: Provider) -> ort::Result<(Pool, Takes)> {
         let (count, threads) = match provider {
             Provider::Cpu if self.shared => (1, self.options.threads),
