@@ -141,7 +141,7 @@ impl Service {
         let drawn = Arc::clone(&scheduler);
         let device = Arc::clone(&parts.renderer).differentiable();
         let refine = match config.refine {
-            // Not measured to help in the time of processors, so it is for calls that ask.
+            // It takes all processors for a minute after each scene, so it is for calls that ask.
             Refine::Auto if device.is_none() => Refine::Off,
             how => how,
         };
