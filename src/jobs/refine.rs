@@ -22,7 +22,7 @@ use crate::{
     error::{Error, Result},
     pipeline::{
         PhotoSet,
-        refinement::{at_side, start_of, version_of},
+        refinement::{at_side, reported, start_of, version_of},
     },
     refine::{
         HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out,
@@ -299,19 +299,14 @@ impl Jobs {
         let Some(mut record) = self.records.find(id).map(Arc::unwrap_or_clone) else {
             return Ok(());
         };
-        let held_out = held_out(record.status.cameras.len());
-        let held_out: Vec<u32> =
-            held_out.into_iter().filter_map(|i| u32::try_from(i).ok()).collect();
+        let found = reported(record.status.cameras.len(), found);
         let change = |record: &mut Record| {
             record.refine = None;
             record.status.refinement =
                 RefineStatus { fraction: 1.0, ..RefineStatus::new(RefineState::Done) };
             // Where no version was better, the record alone says what came out.
             if let Some(report) = &mut record.status.report {
-                report.refinement.get_or_insert_with(|| RefineReport {
-                    held_out: held_out.clone(),
-                    ..found.clone()
-                });
+                report.refinement.get_or_insert_with(|| found.clone());
             }
         };
         change(&mut record);

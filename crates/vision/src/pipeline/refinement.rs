@@ -7,8 +7,8 @@ use crate::{
     models::{ResizeFilter, fit},
     refine,
     scene::{
-        Gaussians, HealthReport, Method, Photo, PosedPhoto, Scene, SceneCamera, SceneMeta,
-        Semantics,
+        Gaussians, HealthReport, Method, Photo, PosedPhoto, RefineReport, Scene, SceneCamera,
+        SceneMeta, Semantics,
     },
     semantics::{Views, from_source},
 };
@@ -70,6 +70,14 @@ pub fn start_of(
     Ok((Scene::new(meta, gaussians, learnt.backdrop), numbered(one_set)?))
 }
 
+/// A report with the numbers of the photos that are held out of `photos`.
+#[must_use]
+pub fn reported(photos: usize, found: &RefineReport) -> RefineReport {
+    let held = refine::held_out(photos).into_iter();
+    let held_out = held.filter_map(|i| u32::try_from(i).ok()).collect();
+    RefineReport { held_out, ..found.clone() }
+}
+
 /// A version as a scene: of `start`, with the semantics that `served` has now.
 ///
 /// # Errors
@@ -79,14 +87,12 @@ pub fn version_of(
     served: &Scene,
     version: &refine::RefinedVersion,
 ) -> Result<Scene> {
-    let held = refine::held_out(start.meta.cameras.len());
-    let held_out = held.into_iter().filter_map(|i| u32::try_from(i).ok()).collect();
     // One set of Gaussians: plain views show what was learnt.
     let method = Method { front_photos: 0, magnify: false, ..start.meta.report.method.clone() };
     let report = HealthReport {
         gaussians: version.gaussians.len() as u64,
         method,
-        refinement: Some(crate::scene::RefineReport { held_out, ..version.report.clone() }),
+        refinement: Some(reported(start.meta.cameras.len(), &version.report)),
         ..start.meta.report.clone()
     };
     let meta = SceneMeta { report, ..start.meta.clone() };
