@@ -169,6 +169,19 @@ fn each_gaussian_takes_the_bank_row_of_its_pixel() {
 }
 
 #[test]
+fn masks_of_several_photos_fill_a_batch() {
+    let wall = wall();
+    let masks: Masks<'_> = &|_| Ok((0..2).map(two_masks).collect());
+    let batches = Mutex::new(Vec::new());
+    let embed: Embed<'_> = &|crops| {
+        batches.lock().unwrap().push(crops.len());
+        colour_of(crops)
+    };
+    made(&wall, &tools(masks, embed), &Method::default()).unwrap();
+    assert_eq!(batches.into_inner().unwrap(), [3, 1], "two masks each of two photos");
+}
+
+#[test]
 fn a_photo_without_masks_and_a_scene_without_any_are_legal() {
     let wall = wall();
     let one: Masks<'_> = &|_| Ok(vec![two_masks(0), PhotoMasks::default()]);
@@ -216,11 +229,9 @@ fn two_sides_of_one_thing_are_joined_only_when_asked() {
         masks: vec![MaskInfo::default()],
     };
     let masks: Masks<'_> = &|_| Ok(vec![whole(), whole()]);
-    let called = AtomicBool::new(false);
     let embed: Embed<'_> = &|crops| {
-        assert_eq!(crops.len(), 1);
-        let second = called.fetch_xor(true, Ordering::Relaxed);
-        Ok(if second { vec![0.6, 0.8, 0.0] } else { vec![1.0, 0.0, 0.0] })
+        assert_eq!(crops.len(), 2);
+        Ok(vec![1.0, 0.0, 0.0, 0.6, 0.8, 0.0])
     };
     // 1.2 masks a photo make two rows.
     let with = |merge_cosine| Method { merge_cosine, ..Method::default() };
@@ -246,7 +257,7 @@ fn wrong_answers_and_wrong_scenes_are_refused_by_name() {
     let error = fails(&good, &tools(few, &colour_of));
     assert!(error.message().contains("masks of 1 photos, not of 2"), "{error}");
     let error = fails(&good, &tools(masks, &|_| Ok(vec![1.0])));
-    assert!(error.message().contains("1 numbers for 2 crops"), "{error}");
+    assert!(error.message().contains("1 numbers for 3 crops"), "{error}");
     let mut other = wall();
     other.photos[1].file = "x.png".to_owned();
     assert_eq!(fails(&other, &tools(masks, &colour_of)).code(), ErrorCode::Internal);

@@ -240,8 +240,8 @@ struct Embedded {
     of: Vec<[usize; 2]>,
 }
 
-/// Cuts and embeds every mask, a batch at a time. A mask without pixels, or whose embedding has
-/// no length, has no meaning and stays background.
+/// Cuts and embeds the masks of all photos, a batch at a time; only the last batch is not full. A
+/// mask without pixels, or whose embedding has no length, has no meaning and stays background.
 fn embed(
     tools: &SemanticsTools<'_>,
     photos: &[PosedPhoto],
@@ -249,34 +249,34 @@ fn embed(
     watch: Watch<'_>,
 ) -> Result<Embedded> {
     let mut found = Embedded::default();
-    let all: usize = masks.iter().map(|of| of.masks.len()).sum();
-    let mut done = 0;
-    for (photo, (posed, masks)) in photos.iter().zip(masks).enumerate() {
-        let cutter = Cutter::new(&posed.photo, masks);
-        let wanted: Vec<usize> = (0..masks.masks.len()).collect();
-        for batch in wanted.chunks(tools.batch.max(1)) {
-            unless_cancelled(watch.cancel)?;
-            (watch.progress)(Stage::Embed, fraction(done, all));
-            done += batch.len();
-            let cut = |&k: &usize| Some((k, cutter.cut(k, tools.crop_margin, tools.crop_shape)?));
-            let (of, crops): (Vec<usize>, Vec<Crop>) = batch.par_iter().filter_map(cut).unzip();
-            if crops.is_empty() {
-                continue;
-            }
-            let rows = (tools.embed)(&crops)?;
-            if rows.len() != crops.len() * tools.dim {
-                return Err(Error::internal(format!(
-                    "semantics: {} numbers for {} crops of {}",
-                    rows.len(),
-                    crops.len(),
-                    tools.dim
-                )));
-            }
-            for (k, row) in of.into_iter().zip(rows.chunks_exact(tools.dim.max(1))) {
-                if row.iter().any(|v| *v != 0.0) {
-                    found.rows.extend_from_slice(row);
-                    found.of.push([photo, k]);
-                }
+    let both = photos.par_iter().zip(masks);
+    let cutters: Vec<_> = both.map(|(posed, of)| Cutter::new(&posed.photo, of)).collect();
+    let of_photo = |(photo, of): (usize, &PhotoMasks)| (0..of.masks.len()).map(move |k| [photo, k]);
+    let all: Vec<[usize; 2]> = masks.iter().enumerate().flat_map(of_photo).collect();
+    let size = tools.batch.max(1);
+    for (i, batch) in all.chunks(size).enumerate() {
+        unless_cancelled(watch.cancel)?;
+        (watch.progress)(Stage::Embed, fraction(i * size, all.len()));
+        let cut = |&[photo, k]: &[usize; 2]| {
+            Some(([photo, k], cutters[photo].cut(k, tools.crop_margin, tools.crop_shape)?))
+        };
+        let (of, crops): (Vec<[usize; 2]>, Vec<Crop>) = batch.par_iter().filter_map(cut).unzip();
+        if crops.is_empty() {
+            continue;
+        }
+        let rows = (tools.embed)(&crops)?;
+        if rows.len() != crops.len() * tools.dim {
+            return Err(Error::internal(format!(
+                "semantics: {} numbers for {} crops of {}",
+                rows.len(),
+                crops.len(),
+                tools.dim
+            )));
+        }
+        for (of, row) in of.into_iter().zip(rows.chunks_exact(tools.dim.max(1))) {
+            if row.iter().any(|v| *v != 0.0) {
+                found.rows.extend_from_slice(row);
+                found.of.push(of);
             }
         }
     }
