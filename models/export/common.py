@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import sys
+import tempfile
 
 import numpy as np
 import onnx
@@ -46,13 +47,14 @@ def prepare(args):
 
 def export(model, inputs, path, output_names, dynamic=None):
     """Writes `model` as ONNX. `inputs` is name to example tensor; `dynamic` is tensor name to {axis: name}."""
-    torch.onnx.export(model, tuple(inputs.values()), path, input_names=list(inputs), output_names=output_names,
-                      dynamic_axes=dynamic or {}, opset_version=OPSET, dynamo=False)
-    graph = onnx.load(path)
-    single_precision(graph.graph)
     data = path + ".data"
-    beside = {os.path.join(os.path.dirname(path), part.value)
-              for tensor in graph.graph.initializer for part in tensor.external_data if part.key == "location"}
+    # Over 2 GiB the exporter writes a file for each tensor: they go with the folder.
+    with tempfile.TemporaryDirectory(dir=os.path.dirname(path)) as place:
+        first = os.path.join(place, "first.onnx")
+        torch.onnx.export(model, tuple(inputs.values()), first, input_names=list(inputs), output_names=output_names,
+                          dynamic_axes=dynamic or {}, opset_version=OPSET, dynamo=False)
+        graph = onnx.load(first)
+    single_precision(graph.graph)
     size = sum(len(tensor.raw_data) for tensor in graph.graph.initializer)
     if os.path.exists(data):
         os.remove(data)
@@ -60,9 +62,6 @@ def export(model, inputs, path, output_names, dynamic=None):
         onnx.save_model(graph, path, save_as_external_data=True, all_tensors_to_one_file=True, location=os.path.basename(data), size_threshold=1024)
     else:
         onnx.save_model(graph, path)
-    for part in beside - {data}:
-        if os.path.exists(part):
-            os.remove(part)
 
 
 def single_precision(graph):

@@ -48,6 +48,8 @@ impl Service {
         preset: Option<Preset>,
         ask: &TextOptions,
     ) -> Result<Export> {
+        // How texts are scored is checked also where no text is asked.
+        check_scoring(&ask.scoring, &self.limits())?;
         let access = self.scene(id).await?;
         let inner = Arc::clone(&self.inner);
         if format == ExportFormat::Npz {
@@ -81,7 +83,6 @@ impl Service {
         };
         inner.can_understand("text")?;
         let text = texts::checked(text, "text", &self.limits())?;
-        check_scoring(&ask.scoring, &self.limits())?;
         let understood = inner.understood(&access.finished()?, "text", ask.wait).await?;
         let of = understood.subject();
         let named = preset.unwrap_or(of.scene.meta.report.method.preset);
@@ -120,7 +121,6 @@ impl Service {
         }
         inner.can_understand("text")?;
         let texts = texts::all_checked(&lines, "text", &limits)?;
-        check_scoring(&ask.scoring, &limits)?;
         let understood = inner.understood(&access, "text", ask.wait).await?;
         let (scoring, etag) = (ask.scoring.clone(), tag(understood.subject().scene));
         let chunks = stream(move |to: &mut dyn Write| {

@@ -31,6 +31,8 @@ async fn messages_name_the_field_the_value_and_what_it_must_be() {
              unit_rows, coverage_floor, text, wait_ms"
                 .to_owned(),
         ),
+        // Without a text too.
+        ("export?canon=", "canon[0] is empty; say what to look for".to_owned()),
         ("pick?from=0&x=1", "y is missing".to_owned()),
         ("pick?from=0&label=cup&x=1&label=a%20table&y=1", format!("no scene has the id {ABSENT}")),
     ] {
