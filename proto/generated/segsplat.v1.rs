@@ -1478,6 +1478,14 @@ pub enum ExportFormat {
     Packed = 3,
     /// The page with the scene in it; text may have several texts, one a line.
     Html = 4,
+    /// The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian.
+    CompressedPly = 5,
+    /// SPZ, version 3: under 16 bytes a Gaussian.
+    Spz = 6,
+    /// Binary glTF with KHR_gaussian_splatting, the entries of the bank and the semantics.
+    Glb = 7,
+    /// .splat: 32 bytes a Gaussian.
+    Splat = 8,
 }
 impl ExportFormat {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -1491,6 +1499,10 @@ impl ExportFormat {
             Self::Npz => "EXPORT_FORMAT_NPZ",
             Self::Packed => "EXPORT_FORMAT_PACKED",
             Self::Html => "EXPORT_FORMAT_HTML",
+            Self::CompressedPly => "EXPORT_FORMAT_COMPRESSED_PLY",
+            Self::Spz => "EXPORT_FORMAT_SPZ",
+            Self::Glb => "EXPORT_FORMAT_GLB",
+            Self::Splat => "EXPORT_FORMAT_SPLAT",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -1501,6 +1513,10 @@ impl ExportFormat {
             "EXPORT_FORMAT_NPZ" => Some(Self::Npz),
             "EXPORT_FORMAT_PACKED" => Some(Self::Packed),
             "EXPORT_FORMAT_HTML" => Some(Self::Html),
+            "EXPORT_FORMAT_COMPRESSED_PLY" => Some(Self::CompressedPly),
+            "EXPORT_FORMAT_SPZ" => Some(Self::Spz),
+            "EXPORT_FORMAT_GLB" => Some(Self::Glb),
+            "EXPORT_FORMAT_SPLAT" => Some(Self::Splat),
             _ => None,
         }
     }

@@ -10,7 +10,8 @@ use crate::{config::Config, error::Result, scene::Gaussians};
 
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
-    /// Scene file, a folder with one, or a 3DGS PLY
+    /// Scene file, a folder with one, or a file of Gaussians (PLY, compressed PLY, SPZ, GLB,
+    /// .splat)
     scene: PathBuf,
 }
 

@@ -7,6 +7,7 @@
 mod bench;
 mod camera;
 pub mod engine;
+mod export;
 mod features;
 mod health;
 mod inspect;
@@ -64,6 +65,8 @@ enum Command {
     Query(Box<query::Args>),
     /// Write the bank of a scene, or the pixels of a view over it, as an npz file
     Features(Box<features::Args>),
+    /// Write the Gaussians of a scene for other programs: PLY, SPZ, GLB, .splat
+    Export(export::Args),
     /// Show what is in a scene file
     Inspect(inspect::Args),
     /// The model bundle and ONNX Runtime
@@ -86,7 +89,9 @@ impl Command {
             Self::Features(args) => common(&args.config),
             Self::Models(args) => common(&args.config),
             Self::Bench(args) => common(&args.config),
-            Self::Inspect(_) | Self::Sample(_) | Self::Keys(_) => AllArgs::default(),
+            Self::Export(_) | Self::Inspect(_) | Self::Sample(_) | Self::Keys(_) => {
+                AllArgs::default()
+            }
         }
     }
 }
@@ -153,6 +158,7 @@ fn dispatch(cli: &Cli, out: &Output) -> Result<()> {
         Command::Render(args) => render::run(args, &config, out),
         Command::Query(args) => query::run(args, &config, out),
         Command::Features(args) => features::run(args, &config, out),
+        Command::Export(args) => export::run(args, &config, out),
         Command::Inspect(args) => inspect::run(args, &config, out),
         Command::Models(args) => models::run(args, &config, out),
         Command::Bench(args) => bench::run(args, &config, out),

@@ -14,7 +14,7 @@ use crate::{
         Boxes, CameraFields, MaskFormat, OfflineService, QuerySpec, ScoringOptions, TextResult,
         ViewOptions,
     },
-    store::ply::{PlyFile, PlyWriter},
+    store::splats::{FORMATS, SplatFile, SplatFormat},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -25,8 +25,8 @@ pub(super) struct Args {
     /// What to look for; several texts may be given
     #[arg(required = true)]
     texts: Vec<String>,
-    /// File of the mask in the view (.png) or of the selected Gaussians (.ply); with several texts,
-    /// one file each
+    /// File of the mask in the view (.png) or of the selected Gaussians (.ply, .spz,
+    /// .glb …); with several texts, one file each
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Boxes of the parts: oriented, aligned or none
@@ -45,7 +45,8 @@ pub(super) struct Args {
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let ending = args.output.as_deref().map(ending_of).transpose()?;
     let of_view = camera::spec(&args.camera)?;
-    if ending == Some(Ending::Png) && of_view.is_none() {
+    let is_mask = matches!(ending, Some(Ending::Png));
+    if is_mask && of_view.is_none() {
         return Err(camera::no_camera());
     }
     let spec = QuerySpec {
@@ -53,7 +54,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         camera: of_view,
         options: args.options.clone(),
         boxes: args.boxes,
-        mask: if ending == Some(Ending::Png) { MaskFormat::Png } else { MaskFormat::Rle },
+        mask: if is_mask { MaskFormat::Png } else { MaskFormat::Rle },
         scoring: args.scoring.clone(),
         ..QuerySpec::default()
     };
@@ -67,11 +68,9 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         let Some(output) = &args.output else { continue };
         let path = numbered(output, i, answer.results.len());
         match ending {
-            Some(Ending::Ply) => {
+            Some(Ending::Gaussians(format)) => {
                 let chosen = service.select(&opened.scene, &found.text, &spec)?;
-                let chosen = PlyFile::new(chosen, None)?;
-                let file: Vec<u8> = PlyWriter::new(&chosen).flatten().collect();
-                scene_file::write(&path, &file)?;
+                scene_file::write_splats(&path, &SplatFile::new(format, chosen, None)?)?;
             }
             _ => {
                 let mask = found.view.as_ref().and_then(|view| view.mask_png.as_deref());
@@ -87,21 +86,23 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     out.answer(&text, &answer)
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug)]
 enum Ending {
     Png,
-    Ply,
+    Gaussians(&'static SplatFormat),
 }
 
 fn ending_of(path: &Path) -> Result<Ending> {
-    match scene_file::ending(path).as_str() {
-        "png" => Ok(Ending::Png),
-        "ply" => Ok(Ending::Ply),
-        _ => Err(Error::invalid(format!(
-            "{}: the ending must be png (for the mask) or ply (for the Gaussians)",
-            path.display()
-        ))),
+    if scene_file::ending(path) == "png" {
+        return Ok(Ending::Png);
     }
+    scene_file::splat_format(path).map(Ending::Gaussians).ok_or_else(|| {
+        let endings = FORMATS.map(|format| format.ending).join(", ");
+        let path = path.display();
+        Error::invalid(format!(
+            "{path}: the ending must be png (for the mask) or one of {endings} (for the Gaussians)"
+        ))
+    })
 }
 
 /// `mask.png` of one text, `mask-2.png` of the third of several.
@@ -109,8 +110,9 @@ fn numbered(path: &Path, i: usize, count: usize) -> PathBuf {
     if count == 1 {
         return path.to_owned();
     }
-    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
-    let end = path.extension().unwrap_or_default().to_string_lossy();
+    let end = scene_file::splat_format(path).map_or("png", |format| format.ending);
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let stem = &name[..name.len().saturating_sub(end.len() + 1)];
     path.with_file_name(format!("{stem}-{i}.{end}"))
 }
 

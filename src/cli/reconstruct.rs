@@ -1,8 +1,8 @@
-//! `segsplat reconstruct`: a folder or archive of photos and cameras becomes a scene file or PLY.
+//! `segsplat reconstruct`: a folder or archive of photos and cameras becomes a scene file, or a
+//! file of Gaussians for other programs.
 
 use std::{
     fmt::Write as _,
-    io::Write as _,
     path::{Path, PathBuf},
     sync::{Arc, atomic::AtomicBool},
     time::Instant,
@@ -13,7 +13,7 @@ use sha2::{Digest, Sha256};
 
 use super::{
     output::Output,
-    scene_file::{is_ply, path_of, semantics_path, unreadable, unwritable},
+    scene_file::{path_of, semantics_path, splat_format, unreadable, unwritable, write_splats},
 };
 use crate::{
     config::{Config, ConfigArgs},
@@ -25,18 +25,14 @@ use crate::{
         semantics::{SemanticsInput, understand},
     },
     scene::{Density, Preset, Scene, SceneId, SceneOptions, SemanticsMode, Stage, Upload, Watch},
-    store::{
-        self,
-        ply::{PlyFile, PlyWriter},
-        write_scene_file, write_semantics_file,
-    },
+    store::{self, splats::SplatFile, write_scene_file, write_semantics_file},
 };
 
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
     /// Folder with transforms.json or cameras.json and its photos, or a zip or tar of one
     photos: PathBuf,
-    /// Scene file to write; with the ending .ply a 3DGS PLY
+    /// Scene file to write; with the ending ply, compressed.ply, spz, glb or splat that format
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Views that the network takes at once [default: 4]
@@ -91,20 +87,21 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     id.copy_from_slice(&hash.finalize()[..16]);
     let mut scene = made.into_scene(SceneId::from_bytes(id), store::now_ms(), provenance);
     let path = path_of(&args.output);
+    let for_others = splat_format(&path).is_some();
     write(&path, &scene)?;
     if eager {
         let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
         let parts = SemanticsInput { photos: &photos.photos, cameras, gaussians };
         let made = understand(&engine, &parts, &scene.meta.report.method, watch)?;
         let semantics = Arc::new(made);
-        if !is_ply(&path) {
+        if !for_others {
             write_semantics_file(&semantics_path(&path), &scene.meta.id, &semantics)?;
         }
         scene = scene.with_semantics(semantics)?;
-        if is_ply(&path) {
+        if for_others {
             write(&path, &scene)?;
         }
-    } else if !is_ply(&path) {
+    } else if !for_others {
         remove(&semantics_path(&path))?;
     }
     let total_ms = begun.elapsed().as_secs_f64() * 1e3;
@@ -141,18 +138,9 @@ fn semantics(name: &str) -> Result<SemanticsMode, String> {
 }
 
 fn write(path: &Path, scene: &Scene) -> Result<()> {
-    if !is_ply(path) {
-        return write_scene_file(path, scene);
-    }
-    let ply = PlyFile::new(scene.gaussians.clone(), scene.semantics.as_deref())?;
-    let write = || -> std::io::Result<()> {
-        let mut file = fs_err::File::create(path)?;
-        for piece in PlyWriter::new(&ply) {
-            file.write_all(&piece)?;
-        }
-        file.sync_all()
-    };
-    write().map_err(|e| unwritable(path, e))
+    let Some(format) = splat_format(path) else { return write_scene_file(path, scene) };
+    let semantics = scene.semantics.as_deref();
+    write_splats(path, &SplatFile::new(format, scene.gaussians.clone(), semantics)?)
 }
 
 fn describe(path: &Path, scene: &Scene, total_ms: f64, out: &Output) -> Result<()> {

@@ -1,4 +1,4 @@
-//! `segsplat render`: one view of a scene file or PLY as a picture.
+//! `segsplat render`: one view of a scene file, or of a file of Gaussians, as a picture.
 
 use std::{
     path::{Path, PathBuf},
@@ -26,7 +26,8 @@ use crate::{
 #[derive(Clone, Debug, clap::Args)]
 #[command(allow_negative_numbers = true)]
 pub(super) struct Args {
-    /// Scene file, a folder with one, or a 3DGS PLY
+    /// Scene file, a folder with one, or a file of Gaussians (PLY, compressed PLY, SPZ, GLB,
+    /// .splat)
     scene: PathBuf,
     /// Picture to write; its ending (png, jpg, webp, npy, rgb8, rgba8, grey8) is the format
     #[arg(short, long, value_name = "FILE")]

@@ -1,7 +1,7 @@
-//! Files of the command line: a scene file, a folder with one, or a PLY.
+//! Files of the command line: a scene file, a folder with one, or Gaussians of another program.
 
 use std::{
-    io::{self, BufReader},
+    io::{self, BufReader, Write as _},
     path::{Path, PathBuf},
     sync::Arc,
 };
@@ -10,7 +10,10 @@ use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
     scene::{Backdrop, DropCount, HealthReport, Provenance, Scene, SceneId, SceneMeta},
-    store::{ply::read_ply, read_scene, read_semantics},
+    store::{
+        read_scene, read_semantics,
+        splats::{SplatFile, SplatFormat, read_splats},
+    },
 };
 
 /// Name of the scene file where a folder is named.
@@ -20,7 +23,7 @@ const IN_FOLDER: &str = "scene.segsplat";
 #[derive(Debug)]
 pub(super) struct Opened {
     pub(super) scene: Scene,
-    /// `segsplat` or `ply`.
+    /// `segsplat`, or the name of a format of Gaussians.
     pub(super) format: &'static str,
     /// sha256 of a scene file, hex.
     pub(super) sha256: Option<String>,
@@ -39,8 +42,20 @@ pub(super) fn path_of(path: &Path) -> PathBuf {
     if path.is_dir() { path.join(IN_FOLDER) } else { path.to_owned() }
 }
 
-pub(super) fn is_ply(path: &Path) -> bool {
-    ending(path) == "ply"
+/// The format of Gaussians that the ending of a file says.
+pub(super) fn splat_format(path: &Path) -> Option<&'static SplatFormat> {
+    SplatFormat::of_file(&path.file_name()?.to_string_lossy())
+}
+
+/// Writes Gaussians as a file for other programs.
+pub(super) fn write_splats(path: &Path, file: &SplatFile) -> Result<()> {
+    let write = || -> io::Result<()> {
+        let mut to = io::BufWriter::new(fs_err::File::create(path)?);
+        file.write(&mut to)?;
+        to.flush()?;
+        to.get_ref().sync_all()
+    };
+    write().map_err(|e| unwritable(path, e))
 }
 
 /// The error of a file that cannot be read.
@@ -67,9 +82,10 @@ pub(super) fn ending(path: &Path) -> String {
 /// Opens a scene with its semantics, where there are some.
 pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
     let path = path_of(path);
-    if is_ply(&path) {
+    if let Some(format) = splat_format(&path) {
         let file = fs_err::File::open(&path).map_err(|e| unreadable(&path, e))?;
-        let (gaussians, counts, semantics) = read_ply(BufReader::new(file), limits.gaussians_max)?;
+        let (gaussians, counts, semantics) =
+            read_splats(&mut BufReader::new(file), &path.to_string_lossy(), limits.gaussians_max)?;
         let dropped = counts
             .counts()
             .into_iter()
@@ -91,7 +107,7 @@ pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
         if let Some(semantics) = semantics {
             scene = scene.with_semantics(Arc::new(semantics))?;
         }
-        return Ok(Opened { scene, format: "ply", sha256: None });
+        return Ok(Opened { scene, format: format.name, sha256: None });
     }
     let file = fs_err::read(&path).map_err(|e| unreadable(&path, e))?;
     let (mut scene, sha256) = read_scene(&file)?;

@@ -25,7 +25,7 @@ use super::{
 use crate::{
     error::{Error, Result},
     scene::{Gaussians, Preset, Scene, SceneId, Semantics},
-    store::ply::{PlyFile, PlyWriter},
+    store::splats::{SplatFile, SplatFormat},
 };
 
 /// Parts that wait for the caller to take them.
@@ -39,8 +39,8 @@ impl Service {
     /// draws. For `html` each line of the text is a text that the page can show.
     ///
     /// # Errors
-    /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; with a text, and for `npz`, also what
-    /// [`Service::query`] says.
+    /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; `invalid_request` for a scene that
+    /// the format cannot hold; with a text, and for `npz`, also what [`Service::query`] says.
     pub async fn export(
         &self,
         id: &SceneId,
@@ -54,20 +54,24 @@ impl Service {
         let inner = Arc::clone(&self.inner);
         if format == ExportFormat::Npz {
             if ask.text.is_some() {
-                return Err(Error::invalid("text goes with format=ply, not with npz"));
+                return Err(Error::invalid(
+                    "text goes with the formats of Gaussians and html, not with npz",
+                ));
             }
             let understood = inner.understood(&access.finished()?, "npz", ask.wait).await?;
             let etag = format!("{}-npz", hash(understood.subject().tag));
             let write =
                 move |to: &mut dyn Write| features::write_semantics(understood.subject(), to);
             let file_name = format!("{id}.npz");
-            return Ok(Export { file_name, size_bytes: None, etag, chunks: stream(write) });
+            return Ok(Export::new(file_name, etag, stream(write)));
         }
         if format == ExportFormat::Html {
             return self.page(id, preset, ask).await;
         }
         if format == ExportFormat::Packed && ask.text.is_some() {
-            return Err(Error::invalid("text goes with format=ply or html, not with packed"));
+            return Err(Error::invalid(
+                "text goes with the formats of Gaussians and html, not with packed",
+            ));
         }
         let Some(text) = &ask.text else {
             let access = access.finished()?;
@@ -76,10 +80,12 @@ impl Service {
             if format == ExportFormat::Packed {
                 let (file_name, etag) = (format!("{id}.segsplat"), format!("{digest}-packed"));
                 let chunks = stream(move |to: &mut dyn Write| write_packed(&scene, to));
-                return Ok(Export { file_name, size_bytes: None, etag, chunks });
+                return Ok(Export::new(file_name, etag, chunks));
             }
-            let file = PlyFile::new(scene.gaussians.clone(), scene.semantics.as_deref())?;
-            return Ok(ply(format!("{id}.ply"), format!("{digest}-ply"), file));
+            let splats = splats(format)?;
+            let write =
+                move || SplatFile::new(splats, scene.gaussians.clone(), scene.semantics.as_deref());
+            return Ok(gaussians(&id.to_string(), &digest, blocking(write).await??));
         };
         inner.can_understand("text")?;
         let text = texts::checked(text, "text", &self.limits())?;
@@ -87,14 +93,14 @@ impl Service {
         let of = understood.subject();
         let named = preset.unwrap_or(of.scene.meta.report.method.preset);
         let etag = hash(&text_words(of.tag, Some(&text), (named, &ask.scoring))?);
-        let scoring = ask.scoring.clone();
+        let (scoring, splats) = (ask.scoring.clone(), splats(format)?);
         let file = blocking(move || {
             let of = understood.subject();
             let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &[text])?;
-            part(texts.gaussians(), of.semantics)
+            part(splats, texts.gaussians(), of.semantics)
         })
         .await??;
-        Ok(ply(format!("{id}-part.ply"), format!("{etag}-ply"), file))
+        Ok(gaussians(&format!("{id}-part"), &etag, file))
     }
 }
 
@@ -117,7 +123,7 @@ impl Service {
             let scene = blocking(move || inner.load(&access)).await??;
             let etag = tag(&scene);
             let chunks = stream(move |to: &mut dyn Write| write_page(&scene, None, to));
-            return Ok(Export { file_name, size_bytes: None, etag, chunks });
+            return Ok(Export::new(file_name, etag, chunks));
         }
         inner.can_understand("text")?;
         let texts = texts::all_checked(&lines, "text", &limits)?;
@@ -131,28 +137,41 @@ impl Service {
             let answer = query::answer(&texts, &limits, &spec, None, times, || ())?;
             write_page(of.scene, Some(&answer), to)
         });
-        Ok(Export { file_name, size_bytes: None, etag, chunks })
+        Ok(Export::new(file_name, etag, chunks))
     }
 }
 
-/// Some Gaussians of a scene with its bank.
-fn part(gaussians: Gaussians, of: &Semantics) -> Result<PlyFile> {
-    let semantics = Semantics { index: gaussians.semantic_index().to_vec(), ..of.clone() };
-    PlyFile::new(gaussians, Some(&semantics))
+impl Export {
+    /// A file of octets whose size is known when it is written.
+    pub(super) fn new(
+        file_name: String,
+        etag: String,
+        chunks: mpsc::Receiver<io::Result<Vec<u8>>>,
+    ) -> Self {
+        Self { file_name, media_type: "application/octet-stream", size_bytes: None, etag, chunks }
+    }
 }
 
-fn ply(file_name: String, etag: String, file: PlyFile) -> Export {
-    let size_bytes = Some(file.size_bytes());
-    let (to, chunks) = mpsc::channel(PARTS_MAX);
-    tokio::task::spawn_blocking(move || {
-        for part in PlyWriter::new(&file) {
-            // The caller stopped listening and wants no more.
-            if to.blocking_send(Ok(part)).is_err() {
-                return;
-            }
-        }
-    });
-    Export { file_name, size_bytes, etag, chunks }
+/// The format of files with Gaussians.
+fn splats(format: ExportFormat) -> Result<&'static SplatFormat> {
+    SplatFormat::named(&format.to_string())
+        .ok_or_else(|| Error::internal(format!("{format} is no format of Gaussians")))
+}
+
+/// Some Gaussians of a scene with its bank.
+fn part(splats: &'static SplatFormat, gaussians: Gaussians, of: &Semantics) -> Result<SplatFile> {
+    let semantics = Semantics { index: gaussians.semantic_index().to_vec(), ..of.clone() };
+    SplatFile::new(splats, gaussians, Some(&semantics))
+}
+
+/// A file with Gaussians; `stem` is its name without the ending.
+fn gaussians(stem: &str, digest: &str, file: SplatFile) -> Export {
+    let &SplatFormat { name, ending, media_type, .. } = file.format();
+    let size_bytes = file.size_bytes();
+    let unwritten = |cause| Error::internal("the file is not whole").caused_by(cause);
+    let chunks = stream(move |to: &mut dyn Write| file.write(to).map_err(unwritten));
+    let (file_name, etag) = (format!("{stem}.{ending}"), format!("{digest}-{name}"));
+    Export { media_type, size_bytes, ..Export::new(file_name, etag, chunks) }
 }
 
 /// The parts of a file that `write` writes on a blocking thread. A fault ends them.

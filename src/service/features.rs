@@ -173,6 +173,6 @@ impl Service {
             })
             .await?;
         let file_name = format!("{id}-view.npz");
-        Ok(Export { file_name, size_bytes: None, etag, chunks: stream(write) })
+        Ok(Export::new(file_name, etag, stream(write)))
     }
 }

@@ -142,6 +142,14 @@ pub enum ExportFormat {
     /// semantics where they are made.
     #[default]
     Ply,
+    /// The compressed PLY of `PlayCanvas` and `SuperSplat`: 16 bytes a Gaussian.
+    CompressedPly,
+    /// SPZ, version 3: under 16 bytes a Gaussian.
+    Spz,
+    /// Binary glTF with `KHR_gaussian_splatting`, the entries of the bank and the semantics.
+    Glb,
+    /// `.splat`: 32 bytes a Gaussian.
+    Splat,
     /// The semantics as `NumPy` arrays: the bank, the row of each mask, the entry of each Gaussian
     /// and of each cell of the photos.
     Npz,

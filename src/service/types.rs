@@ -216,6 +216,8 @@ impl fmt::Debug for RenderedView {
 pub struct Export {
     /// Proposed file name.
     pub file_name: String,
+    /// Media type.
+    pub media_type: &'static str,
     /// Whole size, where it is known before the end.
     pub size_bytes: Option<u64>,
     /// Hash of scene and format.

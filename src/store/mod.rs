@@ -21,11 +21,11 @@ mod hashes;
 mod index;
 mod objects;
 mod open;
-pub mod ply;
 mod record;
 mod scene_file;
 mod semantics_file;
 mod shared;
+pub mod splats;
 mod sweep;
 mod upload_file;
 

@@ -14,7 +14,7 @@ use segsplat::{
         RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
     },
     store::{
-        ply::{PlyFile, PlyWriter},
+        splats::{PLY, SplatFile},
         write_scene,
     },
 };
@@ -97,8 +97,8 @@ fn files() -> tempfile::TempDir {
     let mut file = Vec::new();
     write_scene(&mut file, &scene()).unwrap();
     std::fs::write(folder.path().join("scene.segsplat"), file).unwrap();
-    let ply: Vec<u8> =
-        PlyWriter::new(&PlyFile::new(scene().gaussians, None).unwrap()).flatten().collect();
+    let mut ply = Vec::new();
+    SplatFile::new(&PLY, scene().gaussians, None).unwrap().write(&mut ply).unwrap();
     std::fs::write(folder.path().join("plate.ply"), ply).unwrap();
     folder
 }

@@ -14,9 +14,9 @@ use segsplat::{
         SceneStatus, Semantics, SemanticsReport, SourcePixel, Upload, UploadCameras, UploadFile,
     },
     store::{
-        KeyUse, Place, Record, Store,
-        ply::{PlyFile, PlyWriter, read_ply},
-        provenance, read_scene, request_sha256, write_scene,
+        KeyUse, Place, Record, Store, provenance, read_scene, request_sha256,
+        splats::{PLY, SplatFile, read_splats},
+        write_scene,
     },
 };
 
@@ -357,11 +357,18 @@ fn one_process_holds_a_folder() {
 }
 
 fn ply_of(gaussians: &Gaussians) -> Vec<u8> {
-    PlyWriter::new(&PlyFile::new(gaussians.clone(), None).unwrap()).flatten().collect()
+    bytes_of(&SplatFile::new(&PLY, gaussians.clone(), None).unwrap())
+}
+
+fn bytes_of(file: &SplatFile) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    file.write(&mut bytes).unwrap();
+    assert_eq!(file.size_bytes().unwrap_or(bytes.len() as u64), bytes.len() as u64);
+    bytes
 }
 
 fn read(file: &[u8]) -> Result<(Gaussians, SanitizeReport)> {
-    let (gaussians, report, semantics) = read_ply(Cursor::new(file), 100_000)?;
+    let (gaussians, report, semantics) = read_splats(&mut Cursor::new(file), "a.ply", 100_000)?;
     assert_eq!(semantics, None);
     Ok((gaussians, report))
 }
@@ -379,10 +386,8 @@ fn a_ply_carries_index_and_bank_together_and_programs_that_know_no_bank_stop_bef
         masks,
         report: SemanticsReport::default(),
     };
-    let file = PlyFile::new(gaussians, Some(&semantics)).unwrap();
-    let bytes: Vec<u8> = PlyWriter::new(&file).flatten().collect();
-    assert_eq!(bytes.len() as u64, file.size_bytes());
-    let (back, _, read) = read_ply(Cursor::new(&bytes), 100).unwrap();
+    let bytes = bytes_of(&SplatFile::new(&PLY, gaussians, Some(&semantics)).unwrap());
+    let (back, _, read) = read_splats(&mut Cursor::new(&bytes), "a.ply", 100).unwrap();
     assert_eq!((back.semantic_index(), read.as_ref()), (&semantics.index[..], Some(&semantics)));
     assert_eq!(read.unwrap().row_sizes(), [2, 1]);
     // Its header says where the vertices end, as that of any PLY.
@@ -392,11 +397,11 @@ fn a_ply_carries_index_and_bank_together_and_programs_that_know_no_bank_stop_bef
     let after: usize = said.unwrap().parse().unwrap();
     let stride = 4 * text.matches("property float").count() + 2;
     assert_eq!(end + 50 * stride + after, bytes.len());
-    let cut = read_ply(Cursor::new(&bytes[..bytes.len() - 1]), 100).unwrap_err();
+    let cut = read_splats(&mut Cursor::new(&bytes[..bytes.len() - 1]), "a.ply", 100).unwrap_err();
     assert!(cut.message().contains("the semantics end after"), "{cut}");
     let mut broken = bytes;
     *broken.last_mut().unwrap() ^= 1;
-    let error = read_ply(Cursor::new(&broken), 100).unwrap_err();
+    let error = read_splats(&mut Cursor::new(&broken), "a.ply", 100).unwrap_err();
     assert_eq!(error.code(), ErrorCode::InvalidRequest, "{error}");
 }
 
@@ -405,7 +410,6 @@ fn ply_goes_out_and_comes_in() {
     for degree in 0..=3 {
         let out = gaussians(20_000, degree);
         let file = ply_of(&out);
-        assert_eq!(file.len() as u64, PlyFile::new(out.clone(), None).unwrap().size_bytes());
         let (back, report) = read(&file).unwrap();
         assert_eq!(report, SanitizeReport::default());
         let (a, b) = (out.as_raw(), back.as_raw());
@@ -532,9 +536,9 @@ fn hostile_ply_is_refused_with_a_typed_error() {
     };
     let many: String = (0..300).map(|i| format!("property float a{i}\n")).collect();
     let cases: Vec<(Vec<u8>, &str)> = vec![
-        (Vec::new(), "`ply`"),
+        (Vec::new(), "none of Gaussians"),
         (b"plyx\n".to_vec(), "does not begin"),
-        (vec![b'a'; 1 << 20], "is missing in the first"),
+        ([b"ply".to_vec(), vec![b'a'; 1 << 20]].concat(), "is missing in the first"),
         (b"ply\n\xff\xfe\n".to_vec(), "not text"),
         (with("binary_little_endian", "ascii"), "only binary"),
         (with("element vertex 3", "element vertex -3"), "number of vertices"),

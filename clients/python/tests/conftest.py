@@ -25,12 +25,20 @@ def run(*args: str | Path) -> str:
 
 
 @contextmanager
-def served(data: Path, *flags: str | Path) -> Iterator[str]:
+def served(
+    data: Path,
+    *flags: str | Path,
+    program: Path = PROGRAM,
+    cwd: Path = ROOT,
+    env: dict[str, str] | None = None,
+) -> Iterator[str]:
     """The address of a server of its own."""
-    command = [PROGRAM, "serve", "--listen", "127.0.0.1:0", "--data-dir", data, *flags]
+    command = [program, "serve", "--listen", "127.0.0.1:0", "--data-dir", data, *flags]
     with (
         (data.parent / f"{data.name}.log").open("w") as log,
-        subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=log) as server,
+        subprocess.Popen(
+            command, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=log
+        ) as server,
     ):
         assert server.stdout
         try:

@@ -112,3 +112,26 @@ def test_a_description_is_read_before_photos_are_sent(tmp_path: Path, text: str)
     (tmp_path / "photos" / "transforms.json").write_text(text)
     with pytest.raises(InvalidRequest):
         Client("http://127.0.0.1:9").scene(tmp_path / "photos")
+
+
+def test_every_format_of_gaussians(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    begins = {
+        "ply": b"ply\n",
+        "compressed.ply": b"ply\n",
+        "spz": b"\x1f\x8b",
+        "glb": b"glTF",
+        "splat": b"",
+    }
+    paths = [
+        scene.export("ply"),
+        scene.export("compressed_ply"),
+        scene.export("spz"),
+        scene.export("glb"),
+        scene.export("splat"),
+    ]
+    for path, (ending, start) in zip(paths, begins.items(), strict=True):
+        assert path.name == f"{scene.id}.{ending}"
+        assert path.read_bytes().startswith(start) and path.stat().st_size > 1000

@@ -465,5 +465,5 @@ both_ways! {
     FeatureKind = FeatureKind { Weights, Features }
     Boxes = Boxes { Oriented, Aligned, None }
     MaskFormat = MaskFormat { Rle, Png, None }
-    ExportFormat = ExportFormat { Ply, Npz, Packed, Html }
+    ExportFormat = ExportFormat { Ply, Npz, Packed, Html, CompressedPly, Spz, Glb, Splat }
 }

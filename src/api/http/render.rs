@@ -42,8 +42,9 @@ pub(super) struct ViewParams {
 #[serde(default)]
 #[into_params(parameter_in = Query)]
 pub(super) struct ExportParams {
-    /// `ply` (default); `npz`: the semantics as arrays; `packed`: the scene as the page draws it;
-    /// `html`: the page with the scene in it, and what it shows of each line of `text`.
+    /// `ply` (default), `compressed_ply`, `spz`, `glb` or `splat`: Gaussians for other programs;
+    /// `npz`: the semantics as arrays; `packed`: the scene as the page draws it; `html`: the page
+    /// with the scene in it, and what it shows of each line of `text`.
     #[param(inline)]
     format: ExportFormat,
     /// How a text is scored: `default` or `paper`. By default as the scene was made.
@@ -102,8 +103,10 @@ pub(super) async fn view(
     get, path = "/v1/scenes/{id}/export", operation_id = "export", tag = "views",
     params(Id, ExportParams, TextOptions, ScoringOptions),
     responses((
-        status = 200, content_type = "application/octet-stream", body = Vec<u8>,
-        description = "Standard 3DGS PLY, an npz of arrays, the packed scene, or an HTML page"
+        status = 200,
+        content((Vec<u8> = "application/octet-stream"), (Vec<u8> = "model/gltf-binary")),
+        description = "Gaussians as PLY, compressed PLY, SPZ, GLB or .splat, an npz of arrays, \
+            the packed scene, or an HTML page"
     ))
 )]
 pub(super) async fn export(
@@ -151,7 +154,7 @@ fn file(headers: &HeaderMap, export: Export) -> Response {
     }
     let disposition = format!("attachment; filename=\"{}\"", export.file_name);
     let headers = [
-        (header::CONTENT_TYPE, "application/octet-stream".to_owned()),
+        (header::CONTENT_TYPE, export.media_type.to_owned()),
         // It is written while it is sent, always from its start.
         (header::ACCEPT_RANGES, "none".to_owned()),
         (header::CONTENT_DISPOSITION, disposition),

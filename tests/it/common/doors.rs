@@ -334,19 +334,26 @@ impl Door {
         }
     }
 
-    /// The bytes of an export.
+    /// The bytes of an export as PLY.
     pub(crate) async fn export(&self, id: &str) -> Result<Vec<u8>, Fault> {
+        self.export_as(id, "ply").await
+    }
+
+    /// The bytes of an export in this format.
+    pub(crate) async fn export_as(&self, id: &str, format: &str) -> Result<Vec<u8>, Fault> {
         match self {
             Self::Http { base, client } => {
-                let url = format!("{base}/v1/scenes/{id}/export?format=ply");
+                let url = format!("{base}/v1/scenes/{id}/export?format={format}");
                 bytes(client.get(url).send().await.expect("an answer")).await
             }
             Self::Grpc { client } => {
+                let name = format!("EXPORT_FORMAT_{}", format.to_ascii_uppercase());
+                let format = pb::ExportFormat::from_str_name(&name).expect("a format").into();
                 let request =
-                    pb::ExportRequest { scene_id: id.to_owned(), format: 1, ..Default::default() };
+                    pb::ExportRequest { scene_id: id.to_owned(), format, ..Default::default() };
                 let chunks = client.clone().export(request).await.map_err(fault_of)?;
                 let (file, size) = whole(chunks.into_inner()).await?;
-                assert_eq!(size, Some(file.len() as u64), "the size said first");
+                assert!(size.is_none_or(|size| size == file.len() as u64), "the size said first");
                 Ok(file)
             }
         }

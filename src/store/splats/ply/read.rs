@@ -1,16 +1,22 @@
 //! A 3DGS PLY as Gaussians: attributes in any order and of any scalar type, strangers skipped.
 
-use std::io::{self, BufRead, Read};
+use std::io::{BufRead, Read};
 
 use glam::DVec3;
 
 use crate::{
     error::{Error, Result},
-    scene::{Gaussians, RawGaussians, SanitizeReport, SceneId, Semantics, SourcePixel},
+    scene::{Gaussians, RawGaussians, SceneId, Semantics, SourcePixel},
     store::read_semantics,
 };
 
-use super::write::SEMANTICS;
+use super::{
+    super::{
+        SplatsRead, begun, cut_short,
+        packed_ply::{self, BOUNDS, PACKED, PackedLayout},
+    },
+    write::SEMANTICS,
+};
 
 /// Longest header, bytes.
 const HEADER_BYTES_MAX: u64 = 64 << 10;
@@ -18,32 +24,27 @@ const HEADER_BYTES_MAX: u64 = 64 << 10;
 const ATTRIBUTES_MAX: usize = 256;
 /// Most bytes of semantics after the vertices, an eighth of what a scene may have.
 const SEMANTICS_BYTES_MAX: u64 = 1 << 30;
-/// Gaussians reserved for before any is read: a header may claim anything.
-const RESERVED_MAX: usize = 65_536;
+/// The element that a compressed PLY begins with, and the one that may end it.
+const CHUNK: &str = "chunk";
+const SH: &str = "sh";
 
-/// Reads a file, with the semantics after its vertices if there are some. `gaussians_max` bounds
-/// what the header may claim.
-///
-/// # Errors
-/// `invalid_request` when it is no binary PLY of Gaussians or is cut short, naming what is wrong;
-/// `limit_exceeded`; `store_unavailable` when reading fails. Poisoned Gaussians are no error: they
-/// are dropped or clamped and counted.
-pub fn read_ply(
-    mut from: impl BufRead,
-    gaussians_max: usize,
-) -> Result<(Gaussians, SanitizeReport, Option<Semantics>)> {
-    let header = Header::read(&mut from)?;
-    if header.count > gaussians_max {
-        return Err(Error::limit("PLY: Gaussians", header.count, gaussians_max));
+/// Reads a file, with the semantics after its vertices if there are some.
+pub(in super::super) fn read(from: &mut dyn BufRead, gaussians_max: usize) -> Result<SplatsRead> {
+    let header = Header::read(from)?;
+    let vertices = header.vertices()?;
+    if vertices.count > gaussians_max {
+        return Err(Error::limit("PLY: Gaussians", vertices.count, gaussians_max));
     }
-    let layout = Layout::of(&header)?;
-    let mut raw = RawGaussians { sh_degree: layout.sh_degree, ..RawGaussians::default() };
-    let reserved = header.count.min(RESERVED_MAX);
-    raw.means.reserve(reserved);
-    let mut vertex = vec![0; header.stride()];
-    for i in 0..header.count {
-        from.read_exact(&mut vertex).map_err(|cause| cut_short(cause, i, header.count))?;
-        layout.push(&header, &vertex, &mut raw);
+    if header.elements[0].name == CHUNK {
+        return packed_ply::read(from, &header.packed()?);
+    }
+    let layout = Layout::of(vertices)?;
+    let mut raw = begun(vertices.count, layout.sh_degree);
+    let mut vertex = vec![0; vertices.stride()];
+    for i in 0..vertices.count {
+        from.read_exact(&mut vertex)
+            .map_err(|cause| cut_short("PLY", cause, i, vertices.count, "Gaussians"))?;
+        layout.push(&header, vertices, &vertex, &mut raw);
     }
     let (gaussians, report) = Gaussians::sanitize(raw)?;
     let semantics = header.semantics.map(|bytes| semantics_after(from, bytes)).transpose()?;
@@ -54,7 +55,7 @@ pub fn read_ply(
 }
 
 /// The container of `bytes` bytes that follows the vertices.
-fn semantics_after(from: impl Read, bytes: u64) -> Result<Semantics> {
+fn semantics_after(from: &mut dyn Read, bytes: u64) -> Result<Semantics> {
     if bytes > SEMANTICS_BYTES_MAX {
         return Err(Error::limit("PLY: bytes of semantics", bytes, SEMANTICS_BYTES_MAX));
     }
@@ -66,14 +67,6 @@ fn semantics_after(from: impl Read, bytes: u64) -> Result<Semantics> {
     }
     let read = read_semantics(&file, &SceneId::from_bytes([0; 16]));
     read.map(|(semantics, _)| semantics).map_err(|e| bad(e.message()))
-}
-
-fn cut_short(cause: io::Error, read: usize, count: usize) -> Error {
-    if cause.kind() == io::ErrorKind::UnexpectedEof {
-        bad(format!("the file ends after {read} of {count} Gaussians"))
-    } else {
-        crate::store::files::unavailable("read the PLY", cause)
-    }
 }
 
 fn bad(why: impl std::fmt::Display) -> Error {
@@ -138,17 +131,25 @@ struct Attribute {
     offset: usize,
 }
 
-struct Header {
-    big_endian: bool,
+/// Rows of one kind.
+struct Element {
+    name: String,
     count: usize,
     attributes: Vec<Attribute>,
+}
+
+struct Header {
+    big_endian: bool,
+    /// Those that are read: the vertices, with chunks before and harmonics after where it is
+    /// compressed.
+    elements: Vec<Element>,
     /// Bytes of semantics after the vertices.
     semantics: Option<u64>,
 }
 
 impl Header {
-    fn read(from: &mut impl BufRead) -> Result<Self> {
-        let mut from = from.by_ref().take(HEADER_BYTES_MAX);
+    fn read(mut from: &mut dyn BufRead) -> Result<Self> {
+        let mut from = Read::take(&mut from, HEADER_BYTES_MAX);
         let mut line = |what: &str| -> Result<String> {
             let mut line = Vec::new();
             from.read_until(b'\n', &mut line)
@@ -165,9 +166,9 @@ impl Header {
         if line("the line `ply`")? != "ply" {
             return Err(bad("the file does not begin with the line `ply`"));
         }
-        let (mut big_endian, mut count, mut attributes) = (None, None, Vec::new());
-        let mut semantics = None;
-        let mut in_vertex = false;
+        let (mut big_endian, mut semantics) = (None, None);
+        let mut elements: Vec<Element> = Vec::new();
+        let mut is_read = false;
         loop {
             let line = line("`end_header`")?;
             let words: Vec<&str> = line.split_ascii_whitespace().collect();
@@ -185,31 +186,83 @@ impl Header {
                 ["format", ..] => {
                     return Err(bad(format!("`{}`; only binary is read", shown(&line))));
                 }
-                ["element", "vertex", number] if count.is_none() => {
-                    let number = number
-                        .parse()
-                        .map_err(|e| bad(format!("number of vertices {:?}: {e}", shown(number))))?;
-                    count = Some(number);
-                    in_vertex = true;
+                ["element", name, number] => {
+                    let names: Vec<&str> = elements.iter().map(|e| e.name.as_str()).collect();
+                    is_read = match (&names[..], name) {
+                        ([] | [CHUNK], "vertex") | ([], CHUNK) | ([CHUNK, "vertex"], SH) => true,
+                        ([] | [CHUNK], _) => {
+                            return Err(bad(format!(
+                                "`{}` stands before the vertices",
+                                shown(&line)
+                            )));
+                        }
+                        // What follows the vertices is not read.
+                        _ => false,
+                    };
+                    if is_read {
+                        let what = if name == "vertex" { "vertices" } else { name };
+                        let count = number.parse().map_err(|e| {
+                            bad(format!("number of {what} {:?}: {e}", shown(number)))
+                        })?;
+                        elements.push(Element {
+                            name: name.to_owned(),
+                            count,
+                            attributes: Vec::new(),
+                        });
+                    }
                 }
-                // What follows the vertices is not read.
-                ["element", _, _] if count.is_some() => in_vertex = false,
-                ["element", ..] => {
-                    return Err(bad(format!("`{}` stands before the vertices", shown(&line))));
-                }
-                ["property", ..] if !in_vertex => {}
-                ["property", scalar, name] => push_attribute(&mut attributes, scalar, name)?,
+                ["property", ..] if !is_read => {}
+                ["property", scalar, name] => match elements.last_mut() {
+                    Some(element) => push_attribute(&mut element.attributes, scalar, name)?,
+                    None => return Err(bad("a property stands before the first element")),
+                },
                 _ => return Err(bad(format!("header line {:?} is not known", shown(&line)))),
             }
         }
-        Ok(Self {
-            big_endian: big_endian.ok_or_else(|| bad("the header has no `format`"))?,
-            count: count.ok_or_else(|| bad("the header has no `element vertex`"))?,
-            attributes,
-            semantics,
-        })
+        let big_endian = big_endian.ok_or_else(|| bad("the header has no `format`"))?;
+        Ok(Self { big_endian, elements, semantics })
     }
 
+    fn vertices(&self) -> Result<&Element> {
+        let vertices = self.elements.iter().find(|element| element.name == "vertex");
+        vertices.ok_or_else(|| bad("the header has no `element vertex`"))
+    }
+
+    /// Where the numbers of a compressed PLY are. Chunks are read first, vertices second.
+    fn packed(&self) -> Result<PackedLayout> {
+        let [chunks, vertices, sh @ ..] = &self.elements[..] else {
+            return Err(bad("the header has no `element vertex`"));
+        };
+        let count = vertices.count;
+        if self.big_endian {
+            return Err(bad("a compressed PLY is little-endian"));
+        }
+        if chunks.count != count.div_ceil(packed_ply::CHUNK) {
+            let each = packed_ply::CHUNK;
+            let chunks = chunks.count;
+            return Err(bad(format!("{chunks} chunks for {count} vertices; {each} go into one")));
+        }
+        let colors = chunks.find("min_r").is_some();
+        let bounds = BOUNDS.iter().take(if colors { 18 } else { 12 });
+        let bounds = bounds.map(|name| chunks.offset(name, Scalar::F32)).collect::<Result<_>>()?;
+        let mut packed = [0; 4];
+        for (at, name) in packed.iter_mut().zip(PACKED) {
+            *at = vertices.offset(name, Scalar::Unsigned(4))?;
+        }
+        let (sh_degree, of_sh) = match sh {
+            [] => (0, 0),
+            [sh, ..] if sh.count != count => {
+                let rows = sh.count;
+                return Err(bad(format!("{rows} rows of harmonics for {count} vertices")));
+            }
+            [sh, ..] => (sh.packed_degree()?, sh.stride()),
+        };
+        let strides = [chunks.stride(), vertices.stride(), of_sh];
+        Ok(PackedLayout { count, sh_degree, strides, bounds, packed })
+    }
+}
+
+impl Element {
     fn stride(&self) -> usize {
         self.attributes.last().map_or(0, |last| last.offset + last.scalar.size())
     }
@@ -226,9 +279,32 @@ impl Header {
         Ok(found)
     }
 
-    fn value(&self, vertex: &[u8], attribute: usize) -> f64 {
-        let Attribute { scalar, offset, .. } = self.attributes[attribute];
-        scalar.value(&vertex[offset..], self.big_endian)
+    /// Where the attribute is in a row; it must be of this type.
+    fn offset(&self, name: &str, scalar: Scalar) -> Result<usize> {
+        let element = &self.name;
+        let at = self.find(name);
+        let at = at.ok_or_else(|| bad(format!("element {element} has no `{name}`")))?;
+        let attribute = &self.attributes[at];
+        if attribute.scalar != scalar {
+            let is = attribute.scalar;
+            return Err(bad(format!("`{name}` of {element} is {is:?}, not {scalar:?}")));
+        }
+        Ok(attribute.offset)
+    }
+
+    /// The degree of harmonics of one byte each, `f_rest_0` to the last.
+    fn packed_degree(&self) -> Result<u8> {
+        let right = self.attributes.iter().enumerate().all(|(i, attribute)| {
+            attribute.name == format!("f_rest_{i}") && attribute.scalar == Scalar::Unsigned(1)
+        });
+        match (self.attributes.len(), right) {
+            (9, true) => Ok(1),
+            (24, true) => Ok(2),
+            (45, true) => Ok(3),
+            (count, _) => Err(bad(format!(
+                "{count} attributes of harmonics; 9, 24 or 45 uchar from `f_rest_0` are read"
+            ))),
+        }
     }
 }
 
@@ -265,8 +341,8 @@ struct Layout {
 }
 
 impl Layout {
-    fn of(header: &Header) -> Result<Self> {
-        let rest: Vec<usize> = (0..).map_while(|i| header.find(&format!("f_rest_{i}"))).collect();
+    fn of(vertices: &Element) -> Result<Self> {
+        let rest: Vec<usize> = (0..).map_while(|i| vertices.find(&format!("f_rest_{i}"))).collect();
         let sh_degree = match rest.len() {
             0 => 0,
             9 => 1,
@@ -277,22 +353,26 @@ impl Layout {
             }
         };
         Ok(Self {
-            position: header.require(["x", "y", "z"])?,
-            dc: header.require(["f_dc_0", "f_dc_1", "f_dc_2"])?,
+            position: vertices.require(["x", "y", "z"])?,
+            dc: vertices.require(["f_dc_0", "f_dc_1", "f_dc_2"])?,
             rest,
-            opacity: header.require(["opacity"])?[0],
-            scale: header.require(["scale_0", "scale_1", "scale_2"])?,
-            rotation: header.require(["rot_0", "rot_1", "rot_2", "rot_3"])?,
-            semantic_index: header.find("semantic_index"),
+            opacity: vertices.require(["opacity"])?[0],
+            scale: vertices.require(["scale_0", "scale_1", "scale_2"])?,
+            rotation: vertices.require(["rot_0", "rot_1", "rot_2", "rot_3"])?,
+            semantic_index: vertices.find("semantic_index"),
             sh_degree,
         })
     }
 
-    fn push(&self, header: &Header, vertex: &[u8], raw: &mut RawGaussians) {
-        let value = |attribute| header.value(vertex, attribute);
+    fn push(&self, header: &Header, vertices: &Element, vertex: &[u8], raw: &mut RawGaussians) {
+        let attributes = &vertices.attributes;
+        let value = |attribute: usize| {
+            let Attribute { scalar, offset, .. } = attributes[attribute];
+            scalar.value(&vertex[offset..], header.big_endian)
+        };
         let narrow = |attribute| value(attribute) as f32;
         let position = DVec3::from_array(self.position.map(value));
-        let wide = self.position.iter().any(|&i| header.attributes[i].scalar == Scalar::F64);
+        let wide = self.position.iter().any(|&i| attributes[i].scalar == Scalar::F64);
         if raw.means.is_empty() && wide && position.is_finite() {
             // f64 positions are kept near the first one, where f32 is fine enough.
             raw.origin = position;

@@ -7,10 +7,12 @@
 //! rows of the masks, the index maps. A comment says how many bytes it has. Readers of PLY stop at
 //! the last vertex.
 //!
+//! The compressed PLY of `PlayCanvas` and `SuperSplat` is read here too: see `packed_ply`.
+//!
 //! Positions are world coordinates; what f32 cannot hold of a far origin is lost in this format.
 
 mod read;
 mod write;
 
-pub use read::read_ply;
-pub use write::{PlyFile, PlyWriter};
+pub(super) use read::read;
+pub(super) use write::{size_bytes, write};

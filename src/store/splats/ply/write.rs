@@ -1,0 +1,71 @@
+//! Gaussians as a PLY.
+
+use std::io::{self, Write};
+
+use super::super::SplatFile;
+use crate::scene::Gaussians;
+
+/// The comment that says how many bytes of semantics follow the vertices.
+pub(super) const SEMANTICS: &str = "segsplat_semantics_bytes";
+/// Opacity 1 has no finite logit; this one reads back as 1 within f32's step.
+const OPACITY_MAX: f64 = 1.0 - 5e-8;
+
+pub(in super::super) fn size_bytes(file: &SplatFile) -> u64 {
+    let vertices = file.gaussians.len() * vertex_bytes(&file.gaussians);
+    (header(file).len() + vertices + file.semantics.len()) as u64
+}
+
+pub(in super::super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+    to.write_all(header(file).as_bytes())?;
+    let mut row = Vec::new();
+    for i in 0..file.gaussians.len() {
+        row.clear();
+        vertex(&file.gaussians, i, &mut row);
+        to.write_all(&row)?;
+    }
+    to.write_all(&file.semantics)
+}
+
+fn vertex_bytes(gaussians: &Gaussians) -> usize {
+    4 * (3 + 3 + 3 * gaussians.sh_count() + 1 + 3 + 4) + 2
+}
+
+fn header(file: &SplatFile) -> String {
+    let gaussians = &file.gaussians;
+    let after = match file.semantics.len() {
+        0 => String::new(),
+        bytes => format!("comment {SEMANTICS} {bytes}\n"),
+    };
+    let mut names: Vec<String> = ["x", "y", "z", "nx", "ny", "nz"].map(str::to_owned).to_vec();
+    names.extend((0..3).map(|c| format!("f_dc_{c}")));
+    names.extend((0..3 * (gaussians.sh_count() - 1)).map(|i| format!("f_rest_{i}")));
+    names.push("opacity".to_owned());
+    names.extend((0..3).map(|i| format!("scale_{i}")));
+    names.extend((0..4).map(|i| format!("rot_{i}")));
+    let floats: String = names.iter().map(|name| format!("property float {name}\n")).collect();
+    format!(
+        "ply\nformat binary_little_endian 1.0\ncomment SplatRenderMode: default\n{after}\
+         element vertex {}\n{floats}property ushort semantic_index\nend_header\n",
+        gaussians.len()
+    )
+}
+
+fn vertex(gaussians: &Gaussians, i: usize, to: &mut Vec<u8>) {
+    let raw = gaussians.as_raw();
+    let k = gaussians.sh_count();
+    let sh = &raw.sh[i * k..(i + 1) * k];
+    let mut put = |value: f64| to.extend_from_slice(&(value as f32).to_le_bytes());
+    for (mean, origin) in raw.means[i].iter().zip(raw.origin.to_array()) {
+        put(f64::from(*mean) + origin);
+    }
+    (0..3).for_each(|_normal| put(0.0));
+    sh[0].iter().for_each(|&value| put(f64::from(value)));
+    for channel in 0..3 {
+        sh[1..].iter().for_each(|row| put(f64::from(row[channel])));
+    }
+    let opacity = f64::from(raw.opacities[i]).min(OPACITY_MAX);
+    put((opacity / (1.0 - opacity)).ln());
+    raw.scales[i].iter().for_each(|&scale| put(f64::from(scale).ln()));
+    raw.quats[i].iter().for_each(|&value| put(f64::from(value)));
+    to.extend_from_slice(&raw.semantic_index[i].to_le_bytes());
+}

@@ -1,0 +1,82 @@
+"""splat-transform (PlayCanvas) reads the files of Gaussians that this program writes: the right
+number of them, the right bounds. Khronos' validator, which does not know the extension, finds
+nothing wrong with a GLB but the names of its attributes. `make judge` gets Node and both.
+
+python3 judge_splats.py SEGSPLAT NODE SPLAT_TRANSFORM_CLI SOURCE.ply
+"""
+
+import json
+import math
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+segsplat, node, cli, source = map(Path, sys.argv[1:])
+# Largest differences of positions, logarithms of scales, opacities and colours.
+STEPS = {
+    "ply": (1e-6, 1e-5, 1e-5, 1e-6),
+    "compressed.ply": (3e-3, 3e-3, 3e-3, 0.01),
+    "spz": (1e-5, 0.032, 3e-3, 0.015),
+    "splat": (1e-6, 1e-5, 3e-3, 0.015),
+}
+COLUMNS = [["x", "y", "z"], ["scale_0", "scale_1", "scale_2"], ["opacity"],
+           ["f_dc_0", "f_dc_1", "f_dc_2"]]
+# It takes the numbers of an SPZ as those of a PLY. The format has y up and z back.
+TURNED = {"spz": {"y", "z"}}
+
+
+def seen(path: Path) -> tuple[int, dict[str, list[float]]]:
+    """How many Gaussians it finds, and least and largest numbers of each column."""
+    told = subprocess.run([node, cli, "-q", path, "null", "--stats", "json"],
+                          stdout=subprocess.PIPE, check=True)
+    stats = json.loads(told.stdout)
+    lod = stats["stats"][0]
+    ranges = zip(lod["data"]["min"], lod["data"]["max"], strict=True)
+    return stats["numGaussians"], dict(zip(lod["columns"], map(list, ranges), strict=True))
+
+
+VALIDATE = """
+const file = new Uint8Array(require("fs").readFileSync(process.argv[1]));
+require("gltf-validator").validateBytes(file).then((r) => console.log(JSON.stringify(r.issues)));
+"""
+
+
+def faults_of_glb(path: Path) -> list[str]:
+    """What is wrong with a GLB."""
+    told = subprocess.run([node, "-e", VALIDATE, path], stdout=subprocess.PIPE, check=True,
+                          env={"NODE_PATH": str(cli.absolute().parents[3])})
+    found = [one for one in json.loads(told.stdout)["messages"] if one["severity"] < 2]
+    named = "attributes/KHR_gaussian_splatting:"
+    return [f"glb: {one}" for one in found if named not in one["pointer"]]
+
+
+count, truth = seen(source)
+faults = []
+with tempfile.TemporaryDirectory() as folder:
+    for ending, steps in STEPS.items():
+        path = Path(folder) / f"ours.{ending}"
+        subprocess.run([segsplat, "export", source, "-o", path], check=True,
+                       stdout=subprocess.DEVNULL)
+        found, columns = seen(path)
+        worst = []
+        for names, step in zip(COLUMNS, steps, strict=True):
+            offs = []
+            for name in names:
+                want, got = truth[name], columns[name]
+                if name in TURNED.get(ending, ()):
+                    got = [-got[1], -got[0]]
+                if name.startswith("scale"):
+                    want, got = [[math.log(v) for v in pair] for pair in (want, got)]
+                offs += [abs(a - b) for a, b in zip(want, got, strict=True)]
+            worst.append(max(offs))
+            if worst[-1] > step:
+                faults.append(f"{ending}: {names}: {worst[-1]} over {step}")
+        if found != count:
+            faults.append(f"{ending}: {found} of {count} Gaussians")
+        print(f"{ending}: {found} Gaussians, bounds within", *(f"{v:.2g}" for v in worst))
+    path = Path(folder) / "ours.glb"
+    subprocess.run([segsplat, "export", source, "-o", path], check=True, stdout=subprocess.DEVNULL)
+    faults += (wrong := faults_of_glb(path))
+    print(f"glb: {len(wrong)} faults")
+sys.exit("\n".join(faults) or None)
