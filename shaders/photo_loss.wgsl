@@ -68,22 +68,18 @@ fn exposed(at: vec2<u32>, channel: u32, photo: vec4<f32>) -> f32 {
     return select(photo[channel], shown, photo.w > 0.0);
 }
 
-// Sums over the workgroup of three numbers of each invocation, in its first invocation.
-fn sums_of(local: u32, numbers: vec3<f32>) -> vec3<f32> {
+// Sum of a number of each invocation, for all of them.
+fn sum_of(local: u32, number: f32) -> f32 {
     workgroupBarrier();
-    first[local] = numbers.x;
-    second[local] = numbers.y;
-    third[local] = numbers.z;
+    first[local] = number;
     workgroupBarrier();
     for (var half = WORKGROUP_SIZE / 2u; half > 0u; half /= 2u) {
         if local < half {
             first[local] += first[local + half];
-            second[local] += second[local + half];
-            third[local] += third[local + half];
         }
         workgroupBarrier();
     }
-    return vec3(first[0], second[0], third[0]);
+    return first[0];
 }
 
 @compute @workgroup_size(256)
@@ -149,9 +145,9 @@ fn windows(
         by_windows[window_place(2u, channel, at)] = by_product;
         ssim = value;
     }
-    let sums = sums_of(local, vec3(ssim, 0.0, 0.0));
+    let sum = sum_of(local, ssim);
     if local == 0u {
-        partials[group.y * groups.x + group.x].w = sums.x;
+        partials[group.y * groups.x + group.x].w = sum;
     }
 }
 
@@ -210,9 +206,11 @@ fn main(
         by_pictures[place] = by_x * exposures[training.photo * EXPOSURE_WORDS + channel];
         numbers = vec3(pictures[place] * by_x, by_x, abs(x - y));
     }
-    let sums = sums_of(local, numbers);
+    let by_gain = sum_of(local, numbers.x);
+    let by_bias = sum_of(local, numbers.y);
+    let away = sum_of(local, numbers.z);
     if local == 0u {
         let place = group.y * groups.x + group.x;
-        partials[place] = vec4(sums, partials[place].w);
+        partials[place] = vec4(by_gain, by_bias, away, partials[place].w);
     }
 }
