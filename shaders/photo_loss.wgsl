@@ -10,7 +10,8 @@
 @group(0) @binding(3) var<storage, read> photos: array<u32>;
 // [photos, EXPOSURE_WORDS]
 @group(0) @binding(4) var<storage, read> exposures: array<f32>;
-// [3, 3, rows, columns]: derivative of SSIM by the means of x, x² and x y of each channel's windows.
+// [3, 3, rows, columns]: derivatives of SSIM by the means of x, x² and x y of the windows of each
+// channel.
 @group(0) @binding(5) var<storage, read_write> by_windows: array<f32>;
 // [workgroups]: the sums of a workgroup by gain, by bias, of |x - y|, and of SSIM.
 @group(0) @binding(6) var<storage, read_write> partials: array<vec4<f32>>;

@@ -1,4 +1,5 @@
 //! The numbers of Gaussians that are learnt, and Adam (Kingma and Ba 2015) for them.
+//! WGSL: `shaders/adam.wgsl`.
 //!
 //! Scales move as logarithms and opacities as logits, as in 3DGS. Only Gaussians that the picture
 //! shows move, and each counts its own steps for the correction of the moments.

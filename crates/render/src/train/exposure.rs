@@ -1,4 +1,5 @@
 //! The exposure of each photo: a gain and a bias of each channel, which the steps move too.
+//! WGSL: `shaders/exposure.wgsl`.
 
 use rayon::prelude::*;
 
