@@ -87,7 +87,8 @@ fn refined(
     photos: &[PosedPhoto],
     steps: u32,
 ) -> RefinedVersion {
-    let (learnt, out) = split(photos.to_vec());
+    let all = photos.to_vec();
+    let (learnt, out) = split(all);
     let options = RefineOptions { budget: RefineBudget::steps(steps), ..RefineOptions::default() };
     let photos = (&learnt[..], &out[..]);
     let start = (&scene(start, 3.0), start);
