@@ -18,8 +18,8 @@ use crate::{
     limits::Limits,
     metrics::{clamped, psnr, to_unit},
     photo_files,
-    pipeline::{Pipeline, reconstruct_for_refinement, refinement::at_side},
-    refine::{LearningRates, RefineBudget, RefineOptions, held_out, refine, split},
+    pipeline::{Pipeline, reconstruct_for_refinement, refinement::refined},
+    refine::{LearningRates, RefineBudget, RefineOptions, held_out, split},
     render::{
         Background, Frame, Kinds, RenderRequest, Switches,
         plan::{default_near, served},
@@ -56,8 +56,6 @@ pub(crate) struct Args {
 struct Variant {
     /// Whether it begins with the Gaussians that are served in layers.
     layers: bool,
-    /// Whether it is done once more with all photos.
-    whole: bool,
     /// So many steps, or so much time.
     steps: u32,
     ms: u64,
@@ -67,6 +65,8 @@ struct Variant {
     prune_every: u32,
     opacity_min: f32,
     ssim_share: f32,
+    proof_share: f32,
+    device_bytes_max: u64,
     /// Factors on learning rates: on all, and on single ones.
     rate: f32,
     means: f32,
@@ -79,11 +79,18 @@ struct Variant {
 impl Default for Variant {
     fn default() -> Self {
         let RefineOptions {
-            side, gaussians_max, batch, prune_every, opacity_min, ssim_share, ..
+            side,
+            gaussians_max,
+            batch,
+            prune_every,
+            opacity_min,
+            ssim_share,
+            proof_share,
+            device_bytes_max,
+            ..
         } = RefineOptions::default();
         Self {
             layers: false,
-            whole: false,
             steps: u32::MAX,
             ms: u64::MAX,
             side,
@@ -92,6 +99,8 @@ impl Default for Variant {
             prune_every,
             opacity_min,
             ssim_share,
+            proof_share,
+            device_bytes_max,
             rate: 1.0,
             means: 1.0,
             quats: 1.0,
@@ -122,6 +131,8 @@ impl Variant {
             opacity_min: self.opacity_min,
             prune_every: self.prune_every,
             ssim_share: self.ssim_share,
+            proof_share: self.proof_share,
+            device_bytes_max: self.device_bytes_max,
             ..plain
         }
     }
@@ -147,15 +158,19 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         if given.len() < 2 || targets.is_empty() {
             return Err(Error::invalid(format!("{name}: {} photos are too few", all.len())));
         }
-        let (learnt, out) = match variants.is_empty() {
-            true => (given.clone(), Vec::new()),
-            false => split(given.clone()),
-        };
         let begun = Instant::now();
         let watch = Watch { progress: &|_, _| (), cancel: &AtomicBool::new(false) };
-        let (made, first) = reconstruct_for_refinement(&engine, &learnt, &scene_options, watch)?;
-        let scene = scene_of(made);
+        let whole = reconstruct_for_refinement(&engine, &given, &scene_options, watch)?;
+        let (scene, first) = (scene_of(whole.0.clone()), whole.1.clone());
         let create_ms = ms(begun);
+        // Once for all variants, whose time it is no part of.
+        let part = match variants.is_empty() {
+            true => whole.clone(),
+            false => {
+                let (learnt, _) = split(given.clone());
+                reconstruct_for_refinement(&engine, &learnt, &scene_options, watch)?
+            }
+        };
         let one_set = |gaussians: &Gaussians, camera| {
             let near = default_near(scene.meta.report.median_depth);
             let background = Background::Backdrop(Arc::clone(&scene.backdrop));
@@ -198,49 +213,35 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         }
         for (text, variant) in &variants {
             let mut row = plain.clone();
-            let mut options = variant.options();
-            if variant.whole {
-                options.budget.time /= 2;
-            }
-            let sized = |photos: &[PosedPhoto]| -> Vec<PosedPhoto> {
-                photos.iter().map(|photo| at_side(photo, options.side)).collect()
+            let mut remake = |photos: Vec<PosedPhoto>| {
+                let known = if photos.len() == given.len() { &whole } else { &part };
+                let (made, one_set) = known.clone();
+                Ok(if variant.layers { (made.clone(), made.gaussians) } else { (made, one_set) })
             };
-            let photos = (&sized(&learnt)[..], &sized(&out)[..]);
+            let mut paces = 0_u32;
+            let mut pace = |_: f32| {
+                paces += 1;
+                Ok(())
+            };
             let (begun, cpu) = (Instant::now(), cpu_seconds());
-            let start = (&scene, if variant.layers { &scene.gaussians } else { &first });
-            let free = &mut |_| Ok(());
-            let mut best = refine(&*renderer, start, photos, &options, free, &mut |_| Ok(()))?;
-            let mut made_ms = 0.0;
-            if variant.whole && best.report.steps > 0 {
-                // The same with all photos, as the server does it.
-                let begun = Instant::now();
-                let (made, one_set) =
-                    reconstruct_for_refinement(&engine, &given, &scene_options, watch)?;
-                made_ms = ms(begun);
-                let all = scene_of(made);
-                row["whole_psnr"] = json!(judge(&one_set)?);
-                let budget = RefineBudget::steps(best.report.steps);
-                let again = RefineOptions { budget, ..options };
-                let start = (&all, if variant.layers { &all.gaussians } else { &one_set });
-                let photos = (&sized(&given)[..], &[][..]);
-                let whole = refine(&*renderer, start, photos, &again, free, &mut |_| Ok(()))?;
-                best.gaussians = whole.gaussians;
-            }
+            let (options, renderer) = (variant.options(), &*renderer);
+            let found = refined(renderer, &scene, &given, &options, &mut remake, &mut pace)?;
+            let refine_ms = ms(begun);
             row["refine"] = json!(text);
-            row["refine_ms"] = json!(ms(begun) - made_ms);
+            row["refine_ms"] = json!(refine_ms);
+            row["step_ms"] = json!(refine_ms / f64::from(paces.max(1)));
+            row["steps_made"] = json!(paces);
             row["refine_cpu_s"] = json!(cpu_seconds() - cpu);
-            row["steps"] = json!(best.report.steps);
+            row["steps"] = json!(found.report.steps);
             row["held_out"] = json!(held_out(given.len()));
-            row["own_psnr_before"] = json!(best.report.psnr_before);
-            row["own_psnr_after"] = json!(best.report.psnr_after);
-            row["refined_gaussians"] = json!(best.gaussians.len());
+            row["own_psnr_before"] = json!(found.report.psnr_before);
+            row["own_psnr_after"] = json!(found.report.psnr_after);
             // Where no version was better, what is served stays.
-            row["refined_psnr"] = match best.report.steps {
-                0 => plain["served_psnr"].clone(),
-                _ => json!(judge(&best.gaussians)?),
-            };
-            if best.report.steps > 0 {
-                picture(text, one_set(&best.gaussians, camera)?)?;
+            row["refined_psnr"] = plain["served_psnr"].clone();
+            if let Some((_, version)) = &found.version {
+                row["refined_psnr"] = json!(judge(&version.gaussians)?);
+                row["refined_gaussians"] = json!(version.gaussians.len());
+                picture(text, one_set(&version.gaussians, camera)?)?;
             }
             progress(&format!("{name}: {row}"));
             rows.push(json!({ "psnr_db": row["refined_psnr"] }), row)?;

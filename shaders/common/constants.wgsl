@@ -38,6 +38,8 @@ const LEVELS_RGBA: u32 = 2u;
 const PAIR_SUMS: u32 = 10u;
 // Derivatives of a Gaussian but for its harmonics, and whether it is seen.
 const GRADIENT_WORDS: u32 = 12u;
+// Numbers of a photo's exposure, with its moments and the loss.
+const EXPOSURE_WORDS: u32 = 20u;
 // Cells of a backdrop.
 const BACKDROP_WIDTH: u32 = 128u;
 const BACKDROP_HEIGHT: u32 = 64u;

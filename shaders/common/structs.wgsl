@@ -120,3 +120,25 @@ struct Plan {
     // Bits of the largest depth, where depth is asked for in steps.
     farthest: atomic<u32>,
 }
+
+// A step of training.
+struct Training {
+    // How far numbers move in it.
+    means: f32,
+    quats: f32,
+    scales: f32,
+    opacities: f32,
+    // Harmonics of degree 0, and of higher ones.
+    sh: f32,
+    sh_rest: f32,
+    exposure: f32,
+    // Gaussians under this opacity are dropped.
+    opacity_min: f32,
+    // Share of SSIM in the loss.
+    ssim_share: f32,
+    // The photo, and its first pixel in `photos`.
+    photo: u32,
+    photo_start: u32,
+    // Not used: a uniform block has whole rows of four.
+    rest: u32,
+}

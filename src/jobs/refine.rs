@@ -1,9 +1,6 @@
 //! The job that refines a finished scene. The scene is served meanwhile; the better version takes
 //! its place in one step.
 //!
-//! First a scene of the photos that are not held out is refined: that says whether it helps, how
-//! much, and with how many steps. Then the scene of all photos is refined with as many, and served.
-//!
 //! It goes behind everything else: before each step it waits until no scene and no semantics are
 //! made and no view was drawn for a moment. Where views never end it takes a step now and then. It
 //! holds no slot and no room. What it still has to do is in the record, so that a start begins it
@@ -22,12 +19,9 @@ use crate::{
     error::{Error, Result},
     pipeline::{
         PhotoSet,
-        refinement::{at_side, reported, start_of, version_of},
+        refinement::{refined, reported, version_of},
     },
-    refine::{
-        HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out,
-        refine, split,
-    },
+    refine::{HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion},
     scene::{
         PosedPhoto, Refine, RefineReport, RefineState, RefineStatus, Scene, SceneId, Stage, Watch,
         unless_cancelled,
@@ -66,14 +60,6 @@ pub(super) fn reset(record: &mut Record) {
     if record.status.is_refined_now() {
         record.status.refinement = RefineStatus::default();
     }
-}
-
-/// What a refinement works on.
-struct Work<'a> {
-    job: &'a Job,
-    record: &'a Record,
-    scene: &'a Scene,
-    watch: Watch<'a>,
 }
 
 impl Jobs {
@@ -181,72 +167,33 @@ impl Jobs {
         self.give_way(job)?;
         let scene = self.parts.store.scene(id)?;
         let photos = self.photos(id, watch)?;
-        let photos = match Arc::try_unwrap(photos) {
-            Ok(own) => own.photos.photos,
-            Err(shared) => shared.photos.photos.clone(),
-        };
-        let work = Work { job, record: &record, scene: &scene, watch };
+        let photos = &photos.photos.photos;
+        let limits = &self.parts.limits;
         let time = Duration::from_millis(order.ms);
-        let held = held_out(photos.len());
-        if held.is_empty() {
-            let budget = RefineBudget { steps: UNWATCHED_STEPS_MAX, time };
-            let (start, version) = self.refined(&work, (photos, Vec::new()), budget, [0.0, 1.0])?;
-            self.publish(job, &start, &version)?;
-            return self.finish_refinement(job, &version.report);
-        }
-        // Without the photos that are held out: whether it helps, and with how many steps.
-        let budget = RefineBudget { steps: self.parts.limits.refine_steps_max, time: time / 2 };
-        let (_, proof) = self.refined(&work, split(photos.clone()), budget, [0.0, 0.5])?;
-        let proof = proof.report;
-        let earlier = scene.meta.report.refinement.as_ref().and_then(|report| report.psnr_after);
-        if proof.steps == 0 || proof.psnr_after <= earlier {
-            return self.finish_refinement(job, &proof);
-        }
-        // The same with all photos: what is served lacks none.
-        let budget = RefineBudget::steps(proof.steps);
-        let (start, mut version) = self.refined(&work, (photos, Vec::new()), budget, [0.5, 1.0])?;
-        version.report = RefineReport {
-            seconds: proof.seconds + version.report.seconds,
-            psnr_before: proof.psnr_before,
-            psnr_after: proof.psnr_after,
-            ..version.report
+        let options = RefineOptions {
+            budget: RefineBudget { steps: limits.refine_steps_max, time },
+            gaussians_max: limits.refine_gaussians_max,
+            device_bytes_max: limits.refine_device_bytes_max,
+            ..RefineOptions::default()
         };
-        self.publish(job, &start, &version)?;
-        self.finish_refinement(job, &version.report)
-    }
-
-    /// Refines what the networks make of the photos that are learnt, and watches those held out.
-    /// `part` is where it begins and ends in the whole refinement.
-    fn refined(
-        &self,
-        work: &Work<'_>,
-        (learnt, out): (Vec<PosedPhoto>, Vec<PosedPhoto>),
-        budget: RefineBudget,
-        part: [f32; 2],
-    ) -> Result<(Scene, RefinedVersion)> {
-        let Work { job, record, scene, watch } = *work;
-        let held = if out.is_empty() { Vec::new() } else { held_out(scene.meta.cameras.len()) };
-        let learnt = PhotoSet { photos: learnt, read_ms: 0.0 };
-        let made = self.parts.scenes.make_for_refinement(&learnt, &record.options, watch)?;
-        let (start, first) = start_of(scene, &held, made)?;
-        let gaussians_max = self.parts.limits.refine_gaussians_max;
-        let options = RefineOptions { budget, gaussians_max, ..RefineOptions::default() };
-        let sized = |photos: Vec<PosedPhoto>| -> Vec<PosedPhoto> {
-            photos.into_iter().map(|photo| at_side(&photo, options.side)).collect()
+        let mut remake = |photos: Vec<PosedPhoto>| {
+            let photos = PhotoSet { photos, read_ms: 0.0 };
+            self.parts.scenes.make_for_refinement(&photos, &record.options, watch)
         };
-        let (learnt, out) = (sized(learnt.photos), sized(out));
-        let (mut told, [begin, end]) = (0.0, part);
+        let mut told = 0.0;
         let mut pace = |spent: f32| {
             if spent >= told + TOLD {
                 told = spent;
-                self.show(job, Stage::Refine, begin + (end - begin) * spent);
+                self.show(job, Stage::Refine, spent);
             }
             self.give_way(job)
         };
-        let (renderer, photos) = (&*self.parts.refiner, (&learnt[..], &out[..]));
-        let begin = (&start, &first);
-        let version = refine(renderer, begin, photos, &options, &mut pace, &mut |_| Ok(()))?;
-        Ok((start, version))
+        let renderer = &*self.parts.refiner;
+        let found = refined(renderer, &scene, photos, &options, &mut remake, &mut pace)?;
+        if let Some((start, version)) = &found.version {
+            self.publish(job, start, version)?;
+        }
+        self.finish_refinement(job, &found.report)
     }
 
     /// Waits until nothing else is to be done.

@@ -156,6 +156,9 @@ limits! {
     refine_steps_max: u32 = 20_000;
     /// Gaussians that a refinement begins with; of more, as many are chosen and made wider.
     refine_gaussians_max: usize = 150_000;
+    /// Bytes that a refinement may take on a GPU device; what needs more is refined on the
+    /// processor.
+    refine_device_bytes_max: u64 = 1 << 30;
     /// Milliseconds a caller may hold a request open with `wait_ms`.
     wait_ms_max: u64 = 600_000;
     /// Requests a second of one API key that says no number of its own; a second's worth at once.

@@ -15,6 +15,7 @@ pub mod oracle;
 pub mod plan;
 pub mod select;
 pub mod switches;
+pub mod train;
 pub mod view;
 
 use std::sync::Arc;
@@ -251,6 +252,21 @@ impl Frame {
 /// A picture of zeros. All threads write them: new pages are most of the time of it.
 fn zeros<T: Copy + Default + Send>(pixels: usize) -> Vec<T> {
     (0..pixels).into_par_iter().with_min_len(1 << 16).map(|_| T::default()).collect()
+}
+
+/// Runs `kernel` compiled for the widest vectors of this processor. What the kernel calls is
+/// compiled with it where it is inlined. Nothing is fused or reordered: the numbers are the same.
+pub fn vectorised<T>(kernel: impl FnOnce() -> T) -> T {
+    struct Kernel<F>(F);
+    impl<T, F: FnOnce() -> T> pulp::WithSimd for Kernel<F> {
+        type Output = T;
+
+        #[inline(always)]
+        fn with_simd<S: pulp::Simd>(self, _: S) -> T {
+            self.0()
+        }
+    }
+    pulp::Arch::new().dispatch(Kernel(kernel))
 }
 
 /// Time of one dispatch, by the device's own clock.

@@ -11,6 +11,7 @@ use super::{
     cpu::CpuRenderer,
     gpu::GpuRenderer,
     switches::Switches,
+    train::{Trainer, TrainingSet},
 };
 use crate::{
     error::{ErrorCode, Result},
@@ -203,6 +204,10 @@ impl DifferentiableRenderer for WithCpu {
         by: &FrameGradients,
     ) -> Result<Option<DeviceTimes>> {
         self.gpu.backward_times(gaussians, request, by)
+    }
+
+    fn trainer<'a>(&'a self, set: &TrainingSet<'a>) -> Result<Option<Box<dyn Trainer + 'a>>> {
+        self.gpu.trainer(set)
     }
 }
 

@@ -2,7 +2,7 @@
 //!
 //! | layer | modules | may use |
 //! |---|---|---|
-//! | L1 stages | [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`sample`] | `segsplat_core`; never each other |
+//! | L1 stages | [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`sample`] | `segsplat_core` (and [`segsplat_render::vectorised`]); never each other |
 //! | L1 stages | [`refine`] | `segsplat_core`, `segsplat_render` |
 //! | L2 order | [`pipeline`] | L1; the only place that knows their order |
 
@@ -18,6 +18,7 @@ pub mod semantics;
 
 use glam::DVec3;
 use segsplat_core::{error, limits, meter, scene};
+use segsplat_render::vectorised;
 
 /// How a photo is called in messages: `photo 3 ("images/0003.jpg")`.
 fn photo_label(index: usize, file: &str) -> String {
@@ -43,19 +44,4 @@ fn seen_at(camera: &scene::Camera, world: DVec3) -> Option<(DVec3, f64, f64)> {
     let (width, height) = (camera.intrinsics.width.into(), camera.intrinsics.height.into());
     (seen.z > 0.0 && (0.0..width).contains(&u) && (0.0..height).contains(&v))
         .then_some((seen, u, v))
-}
-
-/// Runs `kernel` compiled for the widest vectors of this processor. What the kernel calls is
-/// compiled with it where it is inlined. Nothing is fused or reordered: the numbers are the same.
-fn vectorised<T>(kernel: impl FnOnce() -> T) -> T {
-    struct Kernel<F>(F);
-    impl<T, F: FnOnce() -> T> pulp::WithSimd for Kernel<F> {
-        type Output = T;
-
-        #[inline(always)]
-        fn with_simd<S: pulp::Simd>(self, _: S) -> T {
-            self.0()
-        }
-    }
-    pulp::Arch::new().dispatch(Kernel(kernel))
 }

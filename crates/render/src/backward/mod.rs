@@ -20,6 +20,7 @@ use crate::{
     DeviceTimes, Frame, Kinds, RenderRequest, Renderer,
     error::{Error, Result},
     scene::Gaussians,
+    train::{Trainer, TrainingSet},
 };
 
 /// What a loss says of a frame: its derivative by each number of the pictures, `[H * W]`; `None`
@@ -126,6 +127,15 @@ pub trait DifferentiableRenderer: Renderer {
         _request: &RenderRequest,
         _by: &FrameGradients,
     ) -> Result<Option<DeviceTimes>> {
+        Ok(None)
+    }
+
+    /// A trainer that keeps photos and Gaussians on a device; `None` where there is none, and
+    /// [`crate::train::HostTrainer`] is the one.
+    ///
+    /// # Errors
+    /// `limit_exceeded` where they do not fit the device; as [`Self::backward`].
+    fn trainer<'a>(&'a self, _set: &TrainingSet<'a>) -> Result<Option<Box<dyn Trainer + 'a>>> {
         Ok(None)
     }
 }

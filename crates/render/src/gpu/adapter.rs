@@ -15,6 +15,7 @@ use super::{
     pool::{QueuedView, SUBMISSIONS_MAX, ViewQueue},
     profile::Marks,
     scratch::Scratch,
+    trainer::DeviceTrainer,
 };
 use crate::{
     DeviceTimes, DispatchTime, Frame, Labels, RenderRequest, RendererOptions,
@@ -23,6 +24,7 @@ use crate::{
     error::{ErrorCode, Result},
     scene::Gaussians,
     select::AdapterReport,
+    train::TrainingSet,
 };
 
 /// How often one submission is tried on a new device before its views fail.
@@ -294,6 +296,12 @@ impl Adapter {
             let loss = &mut |_: &_| Ok(by.clone());
             Ok(tools.backward(gaussians.origin(), request, loss, &mut gradients)?.1)
         })
+    }
+
+    /// A trainer with buffers of its own on the device.
+    pub(super) fn trainer(&self, set: &TrainingSet<'_>) -> Result<DeviceTrainer> {
+        let on = self.persistently(|context| Ok(context.on.clone()))?;
+        DeviceTrainer::new(on, self.isects_max(), set)
     }
 
     /// Views of one submission. `None` stands for a view that needs more room than expected.

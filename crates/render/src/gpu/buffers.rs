@@ -121,6 +121,24 @@ pub struct PlanRow {
     pub farthest: u32,
 }
 
+/// `Training` of the shaders: a step of training.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct TrainingRow {
+    pub means: f32,
+    pub quats: f32,
+    pub scales: f32,
+    pub opacities: f32,
+    pub sh: f32,
+    pub sh_rest: f32,
+    pub exposure: f32,
+    pub opacity_min: f32,
+    pub ssim_share: f32,
+    pub photo: u32,
+    pub photo_start: u32,
+    pub rest: u32,
+}
+
 /// What `project_backward` writes of each Gaussian: [`GRADIENT_WORDS`] numbers.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
@@ -134,6 +152,7 @@ pub(super) struct GradientRow {
 
 const _: () = assert!(size_of::<GradientRow>() == 4 * GRADIENT_WORDS as usize, "its words");
 const _: () = assert!(size_of::<ViewRow>().is_multiple_of(16), "a uniform block");
+const _: () = assert!(size_of::<TrainingRow>().is_multiple_of(16), "a uniform block");
 const _: () = assert!(size_of::<GaussianRow>() == 48, "three rows of four");
 const _: () = assert!(size_of::<FootprintRow>() == 32, "two rows of four");
 

@@ -33,7 +33,7 @@ pub(super) const ATTEMPTS_MAX: u32 = 3;
 const WEIGHT_SLOTS_GROWTH: u32 = 4;
 /// Bytes of a tile pair: key and Gaussian, stored twice.
 const PAIR_BYTES: u64 = 16;
-const PLAN_BYTES: u64 = size_of::<PlanRow>() as u64;
+pub(super) const PLAN_BYTES: u64 = size_of::<PlanRow>() as u64;
 /// Pictures of more bytes than this are copied by all cores.
 const PARALLEL_BYTES: usize = 4 << 20;
 
@@ -142,6 +142,22 @@ impl<'a> Drawing<'a> {
     /// Columns and rows of tiles.
     pub(super) fn tiles(&self) -> [u32; 2] {
         [self.row.tiles_x, self.row.tiles_y]
+    }
+
+    /// The row of the whole picture, alone in its submission, with room for `capacity` pairs.
+    pub(super) fn alone(&self, layout: &Layout, capacity: u32) -> ViewRow {
+        let backdrop_start = match self.request.background {
+            Background::Backdrop(_) if self.request.kinds.color => first_cell(0),
+            _ => NO_PICTURE,
+        };
+        ViewRow {
+            isect_capacity: capacity,
+            color_start: layout.color,
+            depth_start: layout.depth,
+            alpha_start: layout.alpha,
+            backdrop_start,
+            ..self.row
+        }
     }
 
     pub(super) fn layout(&self, rows: &Range<u32>, slots: u32) -> Layout {
@@ -460,14 +476,7 @@ impl Tools<'_> {
             let sizes = (views, scene.count);
             let mut stages =
                 Recorder::new(gpu, kernels, bindings, (&room, &room.zeros()), sizes, marks);
-            stages.project(buffers);
-            if shades {
-                stages.shade(buffers);
-            }
-            stages.prefix_sum();
-            stages.emit_isects();
-            stages.tile_sort(grid);
-            stages.rasterize(buffers, kinds, entries, grid);
+            stages.draw(buffers, kinds, entries, grid);
             if step_words > 0 {
                 stages.depth_steps(step_words);
             }

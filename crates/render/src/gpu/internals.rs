@@ -13,10 +13,16 @@ use super::{
     scratch::{BatchBuffers, Need},
 };
 pub use super::{
-    buffers::{FootprintRow, GaussianRow, PlanRow, SourceRow, ViewRow},
+    buffers::{FootprintRow, GaussianRow, PlanRow, SourceRow, TrainingRow, ViewRow},
     pipelines::{SHADERS, SHARED, Shader},
 };
-use crate::{RenderRequest, error::Result, scene::Gaussians, view::View};
+use crate::{
+    RenderRequest,
+    error::Result,
+    scene::Gaussians,
+    train::{Trainer as _, TrainingSet, TrainingStep},
+    view::View,
+};
 
 /// The inside of a [`GpuRenderer`]. Stages run on its first device.
 #[derive(Clone, Copy, Debug)]
@@ -61,6 +67,19 @@ impl Internals<'_> {
     /// Makes every device seem lost at once, whatever runs on it.
     pub fn lose_devices(self) {
         self.0.adapters.iter().for_each(Adapter::lose_device);
+    }
+
+    /// What the loss says of the picture that a trainer of `set` draws first, `[H * W]` by colour,
+    /// as photo `at` was exposed, after its first step.
+    pub fn loss_gradient(
+        self,
+        set: &TrainingSet<'_>,
+        at: usize,
+        step: &TrainingStep,
+    ) -> Result<Vec<[f32; 3]>> {
+        let mut trainer = self.0.adapters[0].trainer(set)?;
+        trainer.step(&[at], step)?;
+        trainer.by_picture(at)
     }
 
     /// Stage 1.

@@ -19,14 +19,17 @@ mod profile;
 mod readback;
 mod recorder;
 mod scratch;
+mod trainer;
 
 use std::sync::Arc;
 
 use self::adapter::Adapter;
+pub(crate) use self::trainer::trainer_bytes;
 use super::{
     DeviceTimes, Frame, RenderRequest, Renderer, RendererOptions,
     backward::{DifferentiableRenderer, FrameGradients, Gradients, drawn},
     select::AdapterReport,
+    train::{Trainer, TrainingSet},
     view::View,
 };
 use crate::{
@@ -165,5 +168,12 @@ impl DifferentiableRenderer for GpuRenderer {
             return Ok(None);
         }
         self.adapter_for(gaussians).backward_times(gaussians, &drawn(request), by)
+    }
+
+    fn trainer<'a>(&'a self, set: &TrainingSet<'a>) -> Result<Option<Box<dyn Trainer + 'a>>> {
+        if set.gaussians.is_empty() {
+            return Ok(None);
+        }
+        Ok(Some(Box::new(self.adapter_for(set.gaussians).trainer(set)?)))
     }
 }

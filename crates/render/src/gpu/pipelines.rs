@@ -34,6 +34,8 @@ shared! { pub(super) u32;
     PAIR_SUMS = 10;
     /// Derivatives of a Gaussian but for its harmonics, and whether it is seen.
     GRADIENT_WORDS = 12;
+    /// Numbers of a photo's exposure, with its moments and the loss.
+    EXPOSURE_WORDS = 20;
     /// Cells of a backdrop, across.
     BACKDROP_WIDTH = Backdrop::WIDTH as u32;
     /// Cells of a backdrop, down.
@@ -80,7 +82,7 @@ macro_rules! shader {
 }
 
 /// Every shader, in the order of the stages.
-pub const SHADERS: [Shader; 12] = [
+pub const SHADERS: [Shader; 15] = [
     shader!("project", "project", "camera", "tiles"),
     shader!("shade", "shade", "sh"),
     shader!("prefix_sum", "prefix_sum", "sum_before"),
@@ -100,6 +102,9 @@ pub const SHADERS: [Shader; 12] = [
     shader!("rasterize_backward", "rasterize_backward", "parts", "backdrop"),
     shader!("project_backward", "project_backward", "camera", "tiles"),
     shader!("shade_backward", "shade_backward", "camera", "sh"),
+    shader!("photo_loss", "photo_loss"),
+    shader!("exposure", "exposure", "camera", "moments"),
+    shader!("adam", "adam", "camera", "moments"),
 ];
 
 /// Kernels, in the order of the stages.
@@ -117,6 +122,11 @@ pub(super) enum Kernel {
     RasterizeBackward(Kinds),
     ProjectBackward,
     ShadeBackward,
+    LossWindows,
+    PhotoLoss,
+    Exposure,
+    AddEarlier,
+    Adam,
 }
 
 /// What a kernel of rasterize gives.
@@ -160,6 +170,17 @@ impl Kernel {
     const ALWAYS: [Self; 5] =
         [Self::Project, Self::Shade, Self::PrefixSum, Self::EmitIsects, Self::TileSort];
 
+    /// Those of a step of training beside the ones of its picture.
+    pub(super) const TRAINING: [Self; 7] = [
+        Self::LossWindows,
+        Self::PhotoLoss,
+        Self::Exposure,
+        Self::RasterizeBackward(Kinds::COLOR),
+        Self::ProjectBackward,
+        Self::ShadeBackward,
+        Self::Adam,
+    ];
+
     /// Name in measurements, name of the shader, and entry point on a GPU and on a software
     /// adapter.
     fn row(self) -> (&'static str, &'static str, [&'static str; 2]) {
@@ -174,6 +195,11 @@ impl Kernel {
             Self::RasterizeBackward(_) => ("rasterize_backward", "rasterize_backward", ["main"; 2]),
             Self::ProjectBackward => ("project_backward", "project_backward", ["main"; 2]),
             Self::ShadeBackward => ("shade_backward", "shade_backward", ["main"; 2]),
+            Self::LossWindows => ("loss_windows", "photo_loss", ["windows"; 2]),
+            Self::PhotoLoss => ("photo_loss", "photo_loss", ["main"; 2]),
+            Self::Exposure => ("exposure", "exposure", ["main"; 2]),
+            Self::AddEarlier => ("add_earlier", "adam", ["add_earlier"; 2]),
+            Self::Adam => ("adam", "adam", ["main"; 2]),
             Self::Rasterize(kinds) => {
                 let shader = match kinds.labels {
                     RasterLabels::None => "rasterize",

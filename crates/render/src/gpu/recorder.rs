@@ -9,6 +9,7 @@ use super::{
     pipelines::{GROUPS_X_MAX, Kernel, Kernels, RasterKinds, RasterLabels, WORKGROUP_SIZE},
     profile::Marks,
     scratch::{BackwardBuffers, BatchBuffers},
+    trainer::TrainingBuffers,
 };
 use crate::{
     Kinds,
@@ -161,6 +162,24 @@ impl<'a> Recorder<'a> {
         }
     }
 
+    /// The stages of pictures of `kinds`, over `tiles` (columns, rows) of the largest view.
+    pub(super) fn draw(
+        &mut self,
+        scene: SceneBuffers<'_>,
+        kinds: RasterKinds,
+        entries: Option<&wgpu::Buffer>,
+        tiles: [u32; 2],
+    ) {
+        self.project(scene);
+        if kinds.color && !self.kernels.flat(scene.sh_count) {
+            self.shade(scene);
+        }
+        self.prefix_sum();
+        self.emit_isects();
+        self.tile_sort(tiles);
+        self.rasterize(scene, kinds, entries, tiles);
+    }
+
     /// Stage 1.
     pub(super) fn project(&mut self, scene: SceneBuffers<'_>) {
         let room = self.room;
@@ -304,6 +323,65 @@ impl<'a> Recorder<'a> {
         let buffers =
             [(0, &room.views), (1, scene.gaussians), (2, scene.sh), (3, &backward.gradients)];
         self.dispatch(Kernel::ShadeBackward, &buffers, &groups);
+    }
+
+    /// Compares the picture of one whole view of `tiles` (columns, rows) with its photo: what that
+    /// says of the picture, and the step of the photo's exposure.
+    pub(super) fn compare(
+        &mut self,
+        training: &TrainingBuffers,
+        backward: &BackwardBuffers,
+        tiles: [u32; 2],
+    ) {
+        let room = self.room;
+        let groups = Groups::Grid(3 * tiles[0], tiles[1]);
+        let mut buffers = vec![
+            (0, &room.views),
+            (1, &training.row),
+            (2, &room.pictures),
+            (3, &training.photos),
+            (4, &training.exposures),
+            (5, &training.by_windows),
+            (6, &training.partials),
+        ];
+        self.dispatch(Kernel::LossWindows, &buffers, &groups);
+        buffers.push((7, &backward.by_pictures));
+        self.dispatch(Kernel::PhotoLoss, &buffers, &groups);
+        let buffers = [
+            (0, &room.views),
+            (1, &training.row),
+            (2, &room.plans),
+            (3, &training.partials),
+            (4, &training.exposures),
+        ];
+        self.dispatch(Kernel::Exposure, &buffers, &Groups::Row(1));
+    }
+
+    /// Adds what earlier photos of a step say to what this one says.
+    pub(super) fn add_earlier(&mut self, earlier: &wgpu::Buffer, backward: &BackwardBuffers) {
+        let buffers = [(0, &self.room.views), (3, &backward.gradients), (7, earlier)];
+        let groups = Groups::Row(self.count.div_ceil(WORKGROUP_SIZE));
+        self.dispatch(Kernel::AddEarlier, &buffers, &groups);
+    }
+
+    /// Moves the Gaussians.
+    pub(super) fn adam(
+        &mut self,
+        scene: SceneBuffers<'_>,
+        training: &TrainingBuffers,
+        backward: &BackwardBuffers,
+    ) {
+        let buffers = [
+            (0, &self.room.views),
+            (1, &training.row),
+            (2, &self.room.plans),
+            (3, &backward.gradients),
+            (4, scene.gaussians),
+            (5, scene.sh),
+            (6, &training.moments),
+        ];
+        let groups = Groups::Row(self.count.div_ceil(WORKGROUP_SIZE));
+        self.dispatch(Kernel::Adam, &buffers, &groups);
     }
 
     /// Stage 7 over pictures of at most `words` words.

@@ -153,6 +153,13 @@ impl Scratch {
         })
     }
 
+    /// A buffer to read `size_bytes` from.
+    /// Errors: `limit_exceeded` when the adapter cannot hold as much.
+    pub(super) fn staging(&mut self, gpu: &Gpu, size_bytes: u64) -> Result<wgpu::Buffer> {
+        let usage = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
+        self.sized(gpu, "staging", usage, size_bytes)
+    }
+
     /// The buffer of a label, replaced if it is shorter than `size_bytes`.
     /// Errors: `limit_exceeded` when the adapter cannot hold or bind that many bytes.
     fn sized(

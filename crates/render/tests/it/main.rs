@@ -26,5 +26,6 @@ mod reference;
 mod shader_layout;
 mod skips;
 mod stages;
+mod train;
 mod twins;
 mod widths;

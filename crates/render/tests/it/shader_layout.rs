@@ -7,7 +7,7 @@ use naga::{Expression, Literal, Module, TypeInner};
 use segsplat_render::{
     constants,
     gpu::internals::{
-        self, FootprintRow, GaussianRow, PlanRow, SHADERS, Shader, SourceRow, ViewRow,
+        self, FootprintRow, GaussianRow, PlanRow, SHADERS, Shader, SourceRow, TrainingRow, ViewRow,
     },
 };
 
@@ -150,6 +150,24 @@ fn structs_lie_in_memory_as_the_shaders_say() {
         ),
         layout!(SourceRow, "Source", [center, scale, axis, behind]),
         layout!(PlanRow, "Plan", [isects, needed, visible, farthest]),
+        layout!(
+            TrainingRow,
+            "Training",
+            [
+                means,
+                quats,
+                scales,
+                opacities,
+                sh,
+                sh_rest,
+                exposure,
+                opacity_min,
+                ssim_share,
+                photo,
+                photo_start,
+                rest,
+            ]
+        ),
     ];
     for (name, offsets, size) in layouts {
         let mut seen = 0;
@@ -225,6 +243,7 @@ fn every_stage_has_a_cpu_stage_and_every_file_is_used() {
             // The blend of a tile sorts it first.
             "tile_sort" => "cpu/rasterize",
             "depth_steps" => "levels",
+            "photo_loss" | "exposure" | "adam" => &format!("train/{stem}"),
             stem if stem.ends_with("_backward") => "cpu/backward",
             stem => &format!("cpu/{stem}"),
         };

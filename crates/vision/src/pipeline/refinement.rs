@@ -1,11 +1,17 @@
-//! What refinement needs of the other stages: photos at the size at which they are learnt, the
-//! scene of the photos that are not held out, and semantics that follow other Gaussians.
+//! A whole refinement: first without the photos that are held out, which says whether it helps and
+//! with how many steps, then with all. And what it needs of the other stages: photos at the size at
+//! which they are learnt, the scene of the photos that are not held out, and semantics that follow
+//! other Gaussians.
+
+use std::time::Duration;
+
+use segsplat_render::backward::DifferentiableRenderer;
 
 use super::Reconstruction;
 use crate::{
     error::Result,
     models::{ResizeFilter, fit},
-    refine,
+    refine::{self, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out},
     scene::{
         Gaussians, HealthReport, Method, Photo, PosedPhoto, RefineReport, Scene, SceneCamera,
         SceneMeta, Semantics,
@@ -13,9 +19,85 @@ use crate::{
     semantics::{Views, from_source},
 };
 
+/// What a refinement came to.
+#[derive(Clone, Debug)]
+pub struct Refined {
+    /// Its figures.
+    pub report: RefineReport,
+    /// What it began with and the better version; `None` where none was better.
+    pub version: Option<(Scene, RefinedVersion)>,
+}
+
+/// What the networks make of photos: [`super::reconstruct_for_refinement`].
+pub type Remake<'a> = &'a mut dyn FnMut(Vec<PosedPhoto>) -> Result<(Reconstruction, Gaussians)>;
+
+/// Refines `scene`, which was made of `photos`, within the budget of `options`.
+///
+/// A scene without the held-out photos is refined in a share of the time
+/// ([`RefineOptions::proof_share`]). Where its PSNR on these photos rises over that of what was
+/// served, a scene of all photos is refined with as many steps for each second that is left. Of too
+/// few photos none is held out, and few steps are taken.
+///
+/// # Errors
+/// Those of `remake`, of `pace` and of [`refine::refine`].
+pub fn refined(
+    renderer: &dyn DifferentiableRenderer,
+    scene: &Scene,
+    photos: &[PosedPhoto],
+    options: &RefineOptions,
+    remake: Remake<'_>,
+    pace: &mut dyn FnMut(f32) -> Result<()>,
+) -> Result<Refined> {
+    let held = held_out(photos.len());
+    let sized: Vec<PosedPhoto> = photos.iter().map(|photo| at_side(photo, options.side)).collect();
+    // `held` are left out, of the photos as they are and of those that are learnt.
+    let mut part = |held: &[usize], budget: RefineBudget, [begin, end]: [f32; 2]| {
+        let kept = |all: &[PosedPhoto], inside: bool| -> Vec<PosedPhoto> {
+            let kept = all.iter().enumerate().filter(|(i, _)| held.contains(i) != inside);
+            kept.map(|(_, photo)| photo.clone()).collect()
+        };
+        let (start, first) = start_of(scene, held, remake(kept(photos, true))?)?;
+        let (learnt, out) = (kept(&sized, true), kept(&sized, false));
+        let mut pace = |spent: f32| pace(begin + (end - begin) * spent);
+        let options = RefineOptions { budget, ..*options };
+        let photos = (&learnt[..], &out[..]);
+        let version = refine::refine(renderer, (&start, &first), photos, &options, &mut pace)?;
+        Ok((start, version))
+    };
+    let RefineBudget { steps, time } = options.budget;
+    if held.is_empty() {
+        let budget = RefineBudget { steps: steps.min(UNWATCHED_STEPS_MAX), time };
+        let (start, version) = part(&[], budget, [0.0, 1.0])?;
+        return Ok(Refined { report: version.report.clone(), version: Some((start, version)) });
+    }
+    let share = options.proof_share.clamp(0.01, 0.99);
+    let budget = RefineBudget { steps, time: of_time(time, share) };
+    let proof = part(&held, budget, [0.0, share])?.1.report;
+    let earlier = scene.meta.report.refinement.as_ref().and_then(|report| report.psnr_after);
+    if proof.steps == 0 || proof.psnr_after <= earlier {
+        return Ok(Refined { report: proof, version: None });
+    }
+    let more = ((1.0 - share) / share).max(1.0);
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few steps")]
+    let as_many = (proof.steps as f32 * more).round() as u32;
+    let budget = RefineBudget::steps(as_many.min(steps));
+    let (start, mut version) = part(&[], budget, [share, 1.0])?;
+    version.report = RefineReport {
+        seconds: proof.seconds + version.report.seconds,
+        psnr_before: proof.psnr_before,
+        psnr_after: proof.psnr_after,
+        ..version.report
+    };
+    Ok(Refined { report: version.report.clone(), version: Some((start, version)) })
+}
+
+/// A share of a time that may be endless.
+fn of_time(time: Duration, share: f32) -> Duration {
+    Duration::try_from_secs_f64(time.as_secs_f64() * f64::from(share)).unwrap_or(Duration::MAX)
+}
+
 /// A photo whose longer side is `side` pixels, or as it is if that is shorter.
-#[must_use]
-pub fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
+fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
     let (width, height) = (posed.photo.width, posed.photo.height);
     let longer = width.max(height);
     if longer <= side {
@@ -32,10 +114,8 @@ pub fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
 
 /// What refinement begins with: `learnt` and `one_set` were made of the photos of `scene` less
 /// those held out, and get its place. Photos keep their numbers.
-///
-/// # Errors
-/// `internal` when it is not a scene of these photos.
-pub fn start_of(
+/// Errors: `internal` when it is not a scene of these photos.
+fn start_of(
     scene: &Scene,
     held: &[usize],
     (learnt, one_set): (Reconstruction, Gaussians),

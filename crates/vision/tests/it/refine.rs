@@ -1,94 +1,25 @@
-//! Refinement: the loss against finite differences, and scenes that get better.
+//! Refinement: scenes that get better.
 
 use std::sync::Arc;
 
 use segsplat_core::{
-    error::{Error, ErrorCode},
+    error::{Error, ErrorCode, Result},
     scene::{
         Backdrop, Camera, Gaussians, HealthReport, Photo, PosedPhoto, Provenance, Scene, SceneId,
         SceneMeta,
     },
 };
-use segsplat_render::{Background, Kinds, RenderRequest, Renderer as _, cpu::CpuRenderer};
+use segsplat_render::{
+    Background, Frame, Kinds, RenderRequest, Renderer,
+    backward::{DifferentiableRenderer, FrameGradients, Gradients},
+    cpu::CpuRenderer,
+    train::{Trainer, TrainingSet},
+};
 use segsplat_testing::scenes::{Random, camera, checked, cloud, look};
 use segsplat_vision::refine::{
     HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out,
-    photo_loss, refine, split,
+    refine, split,
 };
-
-/// SSIM as its paper has it, f64, window by window.
-fn plain_loss(picture: &[[f32; 3]], photo: &[[f32; 3]], width: usize) -> f64 {
-    let height = photo.len() / width;
-    let weight = |i: usize| (-(i as f64 - 5.0).powi(2) / 4.5).exp();
-    let sum: f64 = (0..11).map(weight).sum();
-    let (mut ssim, mut windows) = (0.0, 0.0);
-    for c in 0..3 {
-        for y in 0..height - 10 {
-            for x in 0..width - 10 {
-                let mut m = [0.0; 5];
-                for k in 0..121 {
-                    let at = (y + k / 11) * width + x + k % 11;
-                    let w = weight(k / 11) * weight(k % 11) / (sum * sum);
-                    let (a, b) = (f64::from(picture[at][c]), f64::from(photo[at][c]));
-                    for (m, v) in m.iter_mut().zip([a, b, a * a, b * b, a * b]) {
-                        *m += w * v;
-                    }
-                }
-                let [a, b, aa, bb, ab] = m;
-                let top = (2.0 * a * b + 1e-4) * (2.0 * (ab - a * b) + 9e-4);
-                ssim += top / ((a * a + b * b + 1e-4) * (aa - a * a + bb - b * b + 9e-4));
-                windows += 1.0;
-            }
-        }
-    }
-    let numbers = picture.as_flattened().iter().zip(photo.as_flattened());
-    let away: f64 = numbers.map(|(a, b)| (f64::from(*a) - f64::from(*b)).abs()).sum();
-    0.8 * away / (3 * photo.len()) as f64 + 0.2 * (1.0 - ssim / windows)
-}
-
-#[test]
-fn the_loss_and_its_gradient_are_those_of_the_plain_form() {
-    let (width, height) = (19, 14);
-    let mut random = Random(3);
-    let mut picture = |_| [(); 3].map(|()| random.range(0.0, 1.0));
-    let photo: Vec<[f32; 3]> = (0..width * height).map(&mut picture).collect();
-    let shown: Vec<[f32; 3]> = (0..width * height).map(&mut picture).collect();
-    let found = photo_loss(&shown, &photo, width, None, 0.2);
-    let want = plain_loss(&shown, &photo, width);
-    assert!((found.value - want).abs() < 1e-6, "{} is not {want}", found.value);
-    let most = found.gradient.as_flattened().iter().fold(0.0_f32, |most, by| most.max(by.abs()));
-    for (i, by) in found.gradient.iter().enumerate() {
-        for c in 0..3 {
-            let moved = |by: f32| {
-                let mut moved = shown.clone();
-                moved[i][c] += by;
-                plain_loss(&moved, &photo, width)
-            };
-            let step = 2.0_f32.powi(-10);
-            if (shown[i][c] - photo[i][c]).abs() < 2.0 * step {
-                continue; // the kink of the absolute difference
-            }
-            let want = (moved(step) - moved(-step)) / f64::from(2.0 * step);
-            let error = (f64::from(by[c]) - want).abs() / f64::from(most);
-            assert!(error < 1e-3, "pixel {i}, channel {c}: {} is not {want}", by[c]);
-        }
-    }
-}
-
-#[test]
-fn pixels_without_a_source_and_small_pictures_are_allowed_for() {
-    let photo = vec![[0.5; 3]; 15 * 15];
-    let mut shown = photo.clone();
-    shown[17] = [0.9, 0.1, 0.4];
-    let mut valid = vec![true; 15 * 15];
-    valid[17] = false;
-    let found = photo_loss(&shown, &photo, 15, Some(&valid), 0.2);
-    assert!(found.value.abs() < 1e-6, "{} for the same picture", found.value);
-    assert!(found.gradient[17] == [0.0; 3], "a pixel that does not count pulls");
-    let small = photo_loss(&shown[..20], &photo[..20], 5, None, 0.2);
-    assert!(small.value > 0.0 && small.gradient[17][0] > 0.0, "no window fits: L1 alone");
-    assert!(photo_loss(&[], &[], 0, None, 0.2).gradient.is_empty(), "no picture");
-}
 
 #[test]
 fn every_eighth_photo_is_held_out_and_none_of_few() {
@@ -151,41 +82,37 @@ fn scene(gaussians: &Gaussians, median_depth: f64) -> Scene {
 }
 
 fn refined(
+    renderer: &dyn DifferentiableRenderer,
     start: &Gaussians,
     photos: &[PosedPhoto],
     steps: u32,
-    published: &mut Vec<RefinedVersion>,
 ) -> RefinedVersion {
-    let cpu = CpuRenderer::new(2).expect("two threads");
     let all = photos.to_vec();
     let (learnt, out) = split(all);
     let options = RefineOptions { budget: RefineBudget::steps(steps), ..RefineOptions::default() };
-    let publish = &mut |version: &RefinedVersion| {
-        published.push(version.clone());
-        Ok(())
-    };
     let photos = (&learnt[..], &out[..]);
     let start = (&scene(start, 3.0), start);
-    refine(&cpu, start, photos, &options, &mut |_| Ok(()), publish).expect("refined")
+    refine(renderer, start, photos, &options, &mut |_| Ok(())).expect("refined")
+}
+
+fn cpu() -> CpuRenderer {
+    CpuRenderer::new(2).expect("two threads")
 }
 
 #[test]
 fn a_disturbed_scene_gets_better_on_photos_that_were_held_out() {
     let (truth, photos) = captured(9);
     let start = disturbed(&truth);
-    let mut published = Vec::new();
-    let best = refined(&start, &photos, 150, &mut published);
+    let best = refined(&cpu(), &start, &photos, 150);
     let report = &best.report;
     let (before, after) = (report.psnr_before.unwrap(), report.psnr_after.unwrap());
     println!("{before:.2} dB before, {after:.2} dB after {} steps", report.steps);
     assert!(after > before + 2.0, "{after} dB after, {before} before");
-    let rising = published.windows(2).all(|v| v[1].report.psnr_after > v[0].report.psnr_after);
-    assert!(!published.is_empty() && rising, "each version is better than the last");
-    assert!(published.last().unwrap().gaussians.as_raw().means == best.gaussians.as_raw().means);
     // Entries stay with their Gaussians, which stay in order.
     let entries = best.gaussians.semantic_index();
     assert!(entries.len() <= start.len() && entries.contains(&6), "entries");
-    let again = refined(&start, &photos, 150, &mut Vec::new());
+    // Also where a device has no room: the same steps.
+    let again = refined(&Full(cpu()), &start, &photos, 150);
     assert!(again.gaussians.as_raw().means == best.gaussians.as_raw().means, "the same steps");
     let untimed = |version: &RefinedVersion| segsplat_core::scene::RefineReport {
         seconds: 0.0,
@@ -194,10 +121,43 @@ fn a_disturbed_scene_gets_better_on_photos_that_were_held_out() {
     assert_eq!(untimed(&again), untimed(&best));
 }
 
+/// A renderer whose device has no room for a trainer.
+struct Full(CpuRenderer);
+
+impl Renderer for Full {
+    fn name(&self) -> String {
+        self.0.name()
+    }
+
+    fn concurrency(&self) -> usize {
+        self.0.concurrency()
+    }
+
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        self.0.render(gaussians, request)
+    }
+}
+
+impl DifferentiableRenderer for Full {
+    fn backward(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
+        gradients: &mut Gradients,
+    ) -> Result<Frame> {
+        self.0.backward(gaussians, request, loss, gradients)
+    }
+
+    fn trainer<'a>(&'a self, set: &TrainingSet<'a>) -> Result<Option<Box<dyn Trainer + 'a>>> {
+        Err(Error::limit("bytes", set.device_bytes(), 0))
+    }
+}
+
 #[test]
 fn few_photos_take_few_steps_and_nothing_is_claimed() {
     let (truth, photos) = captured(3);
-    let best = refined(&disturbed(&truth), &photos, 100_000, &mut Vec::new());
+    let best = refined(&cpu(), &disturbed(&truth), &photos, 100_000);
     assert_eq!(best.report.steps, UNWATCHED_STEPS_MAX);
     assert_eq!((best.report.psnr_before, best.report.psnr_after), (None, None));
 }
@@ -212,7 +172,7 @@ fn a_cancelled_refinement_stops_and_odd_input_is_taken_or_refused() {
             false => Ok(()),
         };
         let start = (&scene(start, f64::NAN), start);
-        refine(&cpu, start, (photos, &[]), options, &mut pace, &mut |_| Ok(()))
+        refine(&cpu, start, (photos, &[]), options, &mut pace)
     };
     let options = RefineOptions { budget: RefineBudget::steps(30), ..RefineOptions::default() };
     let told = run(&truth, &photos, &options, true).expect_err("cancelled");

@@ -1,13 +1,14 @@
 //! The numbers of Gaussians that are learnt, and Adam (Kingma and Ba 2015) for them.
+//! WGSL: `shaders/adam.wgsl`.
 //!
 //! Scales move as logarithms and opacities as logits, as in 3DGS. Only Gaussians that the picture
 //! shows move, and each counts its own steps for the correction of the moments.
 
 use rayon::prelude::*;
-use segsplat_render::backward::Gradients;
 
 use crate::{
-    error::Result,
+    backward::Gradients,
+    error::{Error, Result},
     scene::{Gaussians, RawGaussians},
 };
 
@@ -15,7 +16,7 @@ use crate::{
 const DECAY: [f32; 2] = [0.9, 0.999];
 const EPSILON: f32 = 1e-15;
 /// Numbers of a Gaussian beside its colours: mean, quaternion, log-scales, logit of the opacity.
-const SHAPE: usize = 3 + 4 + 3 + 1;
+pub(crate) const SHAPE: usize = 3 + 4 + 3 + 1;
 /// Largest opacity that is learnt: its logit is finite.
 const OPACITY_MAX: f32 = 0.9999;
 /// Largest |coefficient| that is learnt: far beyond any colour.
@@ -23,10 +24,11 @@ const SH_LEARNT_MAX: f32 = 64.0;
 /// Gaussians of a task.
 const CHUNK: usize = 1 << 12;
 
-/// How far a number moves in a step: the values of 3DGS, `means` as a share of the scene's extent.
+/// How far a number moves in a step. The default has the values of 3DGS, `means` as a share of the
+/// scene's extent.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LearningRates {
-    /// Centres, shares of the extent.
+    /// Centres, world units.
     pub means: f32,
     /// Quaternions.
     pub quats: f32,
@@ -102,7 +104,7 @@ impl Adam {
         Self { moments: vec![Moments::default(); count * width], counts: vec![0; count], width }
     }
 
-    /// Moves the Gaussians that were seen; `extent` is that of the scene, world units.
+    /// Moves the Gaussians that were seen.
     ///
     /// # Errors
     /// `internal` when a Gaussian would be lost, which is a fault of ours.
@@ -111,11 +113,9 @@ impl Adam {
         gaussians: Gaussians,
         by: &Gradients,
         rates: &LearningRates,
-        extent: f32,
     ) -> Result<Gaussians> {
         let k = gaussians.sh_count();
         let mut raw = gaussians.into_raw();
-        let rates = LearningRates { means: rates.means * extent, ..*rates };
         let out = raw.means.par_chunks_mut(CHUNK).zip(raw.quats.par_chunks_mut(CHUNK));
         let out = out.zip(raw.scales.par_chunks_mut(CHUNK));
         let out =
@@ -177,11 +177,14 @@ impl Adam {
 }
 
 /// The Gaussians of arrays that lose none.
-pub(super) fn checked(raw: RawGaussians) -> Result<Gaussians> {
+///
+/// # Errors
+/// `internal` where one is lost.
+pub fn checked(raw: RawGaussians) -> Result<Gaussians> {
     let count = raw.means.len();
     let (gaussians, report) = Gaussians::sanitize(raw)?;
     match gaussians.len() == count {
         true => Ok(gaussians),
-        false => Err(crate::error::Error::internal(format!("refine: Gaussians lost: {report:?}"))),
+        false => Err(Error::internal(format!("training: Gaussians lost: {report:?}"))),
     }
 }

@@ -1,4 +1,5 @@
 //! How far a frame is from its photo, and what that says of each pixel.
+//! WGSL: `shaders/photo_loss.wgsl`.
 //!
 //! `(1 - s) mean|x - y| + s (1 - mean SSIM(x, y))` over pixels and channels, the loss of 3DGS
 //! (Kerbl et al. 2023), where `s` is 0.2. SSIM has the 11 x 11 Gaussian window of sigma 1.5, taken

@@ -1,0 +1,413 @@
+//! Steps on the device: photos and Gaussians go up once, a step is one submission for each photo,
+//! and of each only the number of its tile pairs comes back.
+
+use bytemuck::Zeroable;
+use glam::DVec3;
+use rayon::prelude::*;
+use wgpu::BufferUsages;
+
+use super::{
+    adapter::OpenDevice,
+    buffers::{DeviceScene, GaussianRow, PlanRow, SourceRow, TrainingRow, narrow},
+    device::{Gpu, STORAGE},
+    frame::{ATTEMPTS_MAX, Drawing, Layout, PLAN_BYTES, Tools},
+    pipelines::{EXPOSURE_WORDS, GRADIENT_WORDS, Kernel, PAIR_SUMS, RasterKinds},
+    readback,
+    recorder::Recorder,
+    scratch::{BackwardBuffers, BatchBuffers, Need, Scratch},
+};
+use crate::{
+    Background, Frame, Kinds, RenderRequest,
+    backward::drawn,
+    constants::TILE_SIZE,
+    error::{Error, Result},
+    scene::{Gaussians, Photo},
+    train::{Exposure, Trainer, TrainingPhoto, TrainingSet, TrainingStep, absent, adam, checked},
+};
+
+const ROW_BYTES: u64 = size_of::<TrainingRow>() as u64;
+/// Bytes of a tile pair: its place in both halves, and its sums.
+const PAIR_BYTES: u64 = 16 + 4 * PAIR_SUMS as u64;
+/// Tile pairs of a Gaussian that are expected.
+const PAIRS_A_GAUSSIAN: u64 = 4;
+/// Photos that go up at once.
+const PHOTO_CHUNK_BYTES: u64 = 32 << 20;
+
+/// Bytes that a trainer of `set` takes on a device, about.
+pub(crate) fn trainer_bytes(set: &TrainingSet<'_>) -> u64 {
+    let pixels = |at: &TrainingPhoto<'_>| u64::from(at.photo.width) * u64::from(at.photo.height);
+    let most = set.photos.iter().map(pixels).max().unwrap_or(0);
+    let numbers = 3 * set.gaussians.sh_count() as u64;
+    let rows = size_of::<GaussianRow>() as u64 + 4 * numbers + gradient_bytes(1, numbers);
+    let each = rows + moment_bytes(1, numbers) + PAIRS_A_GAUSSIAN * PAIR_BYTES;
+    // Pictures, what the loss says of them, and SSIM's windows.
+    let pictures = most * 4 * (4 + 4 + 9);
+    4 * set.photos.iter().map(pixels).sum::<u64>() + pictures + each * set.gaussians.len() as u64
+}
+
+/// Of `count` Gaussians with so many numbers of harmonics.
+fn gradient_bytes(count: u64, numbers: u64) -> u64 {
+    4 * count * (u64::from(GRADIENT_WORDS) + numbers)
+}
+
+fn moment_bytes(count: u64, numbers: u64) -> u64 {
+    4 * count * (1 + 2 * (adam::SHAPE as u64 + numbers))
+}
+
+/// What a step has beside the buffers of a backward pass.
+#[derive(Clone, Debug)]
+pub(super) struct TrainingBuffers {
+    pub(super) row: wgpu::Buffer,
+    /// Pixels of all photos, RGBA.
+    pub(super) photos: wgpu::Buffer,
+    pub(super) exposures: wgpu::Buffer,
+    pub(super) by_windows: wgpu::Buffer,
+    pub(super) partials: wgpu::Buffer,
+    pub(super) moments: wgpu::Buffer,
+}
+
+/// A photo of the trainer.
+#[derive(Debug)]
+struct Target {
+    request: RenderRequest,
+    /// Its first pixel.
+    start: u32,
+}
+
+/// A [`Trainer`] on a device, with buffers of its own.
+#[derive(Debug)]
+pub(super) struct DeviceTrainer {
+    on: OpenDevice,
+    isects_max: u32,
+    scratch: Scratch,
+    /// As they came in.
+    start: Gaussians,
+    /// As they are now. One that was dropped has opacity 0.
+    scene: DeviceScene,
+    training: TrainingBuffers,
+    /// Gradients of the photos before the last one of a step; there for steps of several.
+    earlier: Option<wgpu::Buffer>,
+    targets: Vec<Target>,
+    ssim_share: f32,
+    /// Most tile pairs that a step has needed.
+    isects: u32,
+}
+
+/// A submission of a step.
+struct Submission<'a> {
+    target: &'a Target,
+    row: TrainingRow,
+    /// Whether it adds what earlier photos say, and whether it moves the Gaussians.
+    adds: bool,
+    moves: bool,
+}
+
+impl DeviceTrainer {
+    /// Uploads all that `set` has.
+    /// Errors: `limit_exceeded` where it does not fit; `internal` for a photo of another size than
+    /// its view.
+    pub(super) fn new(on: OpenDevice, isects_max: u32, set: &TrainingSet<'_>) -> Result<Self> {
+        set.check()?;
+        let (gpu, count) = (&on.gpu, set.gaussians.len() as u64);
+        // No step waits for a compiler.
+        for kernel in Kernel::TRAINING {
+            on.kernels.get(gpu, kernel)?;
+        }
+        let numbers = 3 * set.gaussians.sh_count() as u64;
+        let (mut targets, mut pixels, mut most) = (Vec::new(), 0_usize, [0_u32; 2]);
+        for TrainingPhoto { photo, request } in &set.photos {
+            let start = narrow("pixels of photos", pixels)?;
+            targets.push(Target { request: drawn(request), start });
+            pixels += photo.width as usize * photo.height as usize;
+            most = [most[0].max(photo.width), most[1].max(photo.height)];
+        }
+        let tiles = most.map(|side| u64::from(side.div_ceil(TILE_SIZE)));
+        let storage = |label, bytes| gpu.create_buffer(label, bytes, STORAGE);
+        let training = TrainingBuffers {
+            row: gpu.create_buffer(
+                "training",
+                ROW_BYTES,
+                BufferUsages::UNIFORM | BufferUsages::COPY_DST,
+            )?,
+            photos: storage("photos to learn", 4 * pixels as u64)?,
+            exposures: storage("exposures", 4 * u64::from(EXPOSURE_WORDS) * targets.len() as u64)?,
+            by_windows: storage("windows", 36 * u64::from(most[0]) * u64::from(most[1]))?,
+            partials: storage("sums of the loss", 48 * tiles[0] * tiles[1])?,
+            moments: storage("moments", moment_bytes(count, numbers))?,
+        };
+        put_photos(gpu, &training.photos, &set.photos)?;
+        let mut exposure = [0.0_f32; EXPOSURE_WORDS as usize];
+        exposure[..3].fill(1.0);
+        exposure[EXPOSURE_WORDS as usize - 1] = f32::NAN;
+        let exposures = exposure.repeat(targets.len());
+        let scene = DeviceScene::upload(gpu, set.gaussians, None)?;
+        gpu.scoped("training", || {
+            gpu.queue.write_buffer(&training.exposures, 0, bytemuck::cast_slice(&exposures));
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            encoder.clear_buffer(&training.moments, 0, None);
+            gpu.queue.submit([encoder.finish()]);
+        })?;
+        Ok(Self {
+            isects_max,
+            scratch: Scratch::default(),
+            start: set.gaussians.clone(),
+            scene,
+            training,
+            earlier: None,
+            targets,
+            ssim_share: set.ssim_share,
+            isects: 0,
+            on,
+        })
+    }
+
+    /// Takes a submission, with more room until its tile pairs fit.
+    fn submit(&mut self, at: usize, step: &TrainingStep, [adds, moves]: [bool; 2]) -> Result<()> {
+        let target = self.targets.get(at).ok_or_else(|| absent(at))?;
+        let rates = &step.rates;
+        let row = TrainingRow {
+            means: rates.means,
+            quats: rates.quats,
+            scales: rates.scales,
+            opacities: rates.opacities,
+            sh: rates.sh,
+            sh_rest: rates.sh_rest,
+            exposure: step.exposure,
+            opacity_min: step.opacity_min,
+            ssim_share: self.ssim_share,
+            photo: at as u32,
+            photo_start: target.start,
+            ..TrainingRow::zeroed()
+        };
+        let submission = Submission { target, row, adds, moves };
+        let Self { on, scratch, scene, training, earlier, isects, isects_max, .. } = self;
+        scratch.isects = *isects;
+        let (marks, isects_max) = (None, *isects_max);
+        let (gpu, kernels) = (&on.gpu, &*on.kernels);
+        let mut tools = Tools { gpu, kernels, scratch, scene, isects_max, marks };
+        let capacity_max = tools.capacity_max(1);
+        let (mut needed, mut attempts) = (0, 0);
+        while attempts < ATTEMPTS_MAX && needed <= capacity_max {
+            let capacity = tools.capacity(1);
+            let plan = tools.train(
+                self.start.origin(),
+                &submission,
+                (&*training, earlier.as_ref()),
+                capacity,
+            )?;
+            needed = plan.needed;
+            *isects = needed.max(*isects);
+            tools.scratch.isects = *isects;
+            if needed <= capacity {
+                return Ok(());
+            }
+            attempts += 1;
+        }
+        Err(Error::limit("training: Gaussian-tile pairs of a view", needed, capacity_max))
+    }
+
+    /// Bytes of a buffer.
+    fn read<T>(
+        &mut self,
+        parts: &[(&wgpu::Buffer, u64)],
+        take: impl FnOnce(&[u8]) -> T,
+    ) -> Result<T> {
+        let gpu = &self.on.gpu;
+        let total = parts.iter().map(|part| part.1).sum::<u64>();
+        let staging = self.scratch.staging(gpu, total)?;
+        gpu.scoped("training", || {
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            let mut to = 0;
+            for (buffer, bytes) in parts {
+                encoder.copy_buffer_to_buffer(buffer, 0, &staging, to, Some(*bytes));
+                to += bytes;
+            }
+            gpu.queue.submit([encoder.finish()]);
+        })?;
+        readback::read(gpu, &staging, total, take)
+    }
+
+    /// What the loss says of the last picture, which photo `at` has the size of; `[H * W]`.
+    pub(super) fn by_picture(&mut self, at: usize) -> Result<Vec<[f32; 3]>> {
+        let target = self.targets.get(at).ok_or_else(|| absent(at))?;
+        let lens = target.request.lens();
+        let bytes = 12 * u64::from(lens.width) * u64::from(lens.height);
+        let by = self.scratch.backward_room(&self.on.gpu, [0; 3])?.by_pictures;
+        self.read(&[(&by, bytes)], bytemuck::pod_collect_to_vec)
+    }
+}
+
+impl Trainer for DeviceTrainer {
+    fn step(&mut self, photos: &[usize], step: &TrainingStep) -> Result<()> {
+        if photos.len() > 1 && self.earlier.is_none() {
+            let bytes = gradient_bytes(self.scene.count.into(), 3 * u64::from(self.scene.sh_count));
+            self.earlier = Some(self.on.gpu.create_buffer("earlier gradients", bytes, STORAGE)?);
+        }
+        for (place, &at) in photos.iter().enumerate() {
+            self.submit(at, step, [place > 0, place + 1 == photos.len()])?;
+        }
+        Ok(())
+    }
+
+    fn render(&mut self, request: &RenderRequest) -> Result<Frame> {
+        let Self { on, scratch, scene, isects_max, .. } = self;
+        let (gpu, kernels) = (&on.gpu, &*on.kernels);
+        let mut drawing = Drawing::new(self.start.origin(), request, scene)?;
+        let rows = drawing.whole();
+        let isects_max = *isects_max;
+        let mut tools = Tools { gpu, kernels, scratch, scene, isects_max, marks: None };
+        tools.rows(&mut drawing, rows)?;
+        drawing.finish(&mut self.scratch)
+    }
+
+    fn gaussians(&mut self) -> Result<Gaussians> {
+        let (count, k) = (self.start.len(), self.start.sh_count());
+        let row_bytes = size_of::<GaussianRow>() * count;
+        let (rows, sh) = (self.scene.gaussians.clone(), self.scene.sh.clone());
+        let parts = [(&rows, row_bytes as u64), (&sh, 12 * (count * k) as u64)];
+        let mut raw = self.start.as_raw().clone();
+        self.read(&parts, |bytes| {
+            let (rows, sh) = bytes.split_at(row_bytes);
+            raw.sh.copy_from_slice(bytemuck::cast_slice(sh));
+            let rows: &[GaussianRow] = bytemuck::cast_slice(rows);
+            let out = raw.means.par_iter_mut().zip(&mut raw.quats).zip(&mut raw.scales);
+            let out = out.zip(&mut raw.opacities).zip(rows).with_min_len(1 << 14);
+            out.for_each(|((((mean, quat), scale), opacity), row)| {
+                (*mean, *quat, *scale) = (row.mean, row.quat, row.scale);
+                *opacity = row.opacity;
+            });
+        })?;
+        // Those that were dropped are under the smallest opacity.
+        let dropped = |opacity: &f32| *opacity < Gaussians::OPACITY_MIN;
+        let dropped: Vec<bool> = raw.opacities.iter().map(dropped).collect();
+        let raised = |opacity: &mut f32| *opacity = opacity.max(Gaussians::OPACITY_MIN);
+        raw.opacities.iter_mut().for_each(raised);
+        let all = checked(raw)?;
+        Ok(if dropped.contains(&true) { all.only(|i| !dropped[i]) } else { all })
+    }
+
+    fn exposures(&mut self) -> Result<Vec<(Exposure, f64)>> {
+        let exposures = self.training.exposures.clone();
+        let bytes = 4 * u64::from(EXPOSURE_WORDS) * self.targets.len() as u64;
+        self.read(&[(&exposures, bytes)], |bytes| {
+            let rows: &[[f32; EXPOSURE_WORDS as usize]] = bytemuck::cast_slice(bytes);
+            let read = |row: &[f32; EXPOSURE_WORDS as usize]| {
+                let (gain, bias) = ([row[0], row[1], row[2]], [row[3], row[4], row[5]]);
+                (Exposure::new(gain, bias), f64::from(row[19]))
+            };
+            rows.iter().map(read).collect()
+        })
+    }
+}
+
+/// Uploads the pixels of all photos, one after another.
+fn put_photos(gpu: &Gpu, to: &wgpu::Buffer, photos: &[TrainingPhoto<'_>]) -> Result<()> {
+    gpu.scoped("photos to learn", || {
+        let (mut start, mut unsent) = (0, 0);
+        for TrainingPhoto { photo, .. } in photos {
+            let words = words(photo);
+            let bytes: &[u8] = bytemuck::cast_slice(&words);
+            gpu.queue.write_buffer(to, start, bytes);
+            start += bytes.len() as u64;
+            unsent += bytes.len() as u64;
+            if unsent >= PHOTO_CHUNK_BYTES {
+                gpu.queue.submit([]);
+                unsent = 0;
+            }
+        }
+    })
+}
+
+/// Pixels as the shaders read them: RGBA, A = 0 where none is known.
+fn words(photo: &Photo) -> Vec<[u8; 4]> {
+    let known = |i: usize| photo.valid.as_ref().is_none_or(|valid| valid[i]);
+    let pixels = photo.rgb.chunks_exact(3).enumerate();
+    pixels.map(|(i, c)| [c[0], c[1], c[2], if known(i) { 255 } else { 0 }]).collect()
+}
+
+impl Tools<'_> {
+    /// Draws, compares, goes back and moves, in one submission of one view with room for `capacity`
+    /// tile pairs. Returns the plan: where it needs more, nothing was moved.
+    fn train(
+        &mut self,
+        origin: DVec3,
+        submission: &Submission<'_>,
+        (training, earlier): (&TrainingBuffers, Option<&wgpu::Buffer>),
+        capacity: u32,
+    ) -> Result<PlanRow> {
+        let Submission { target: Target { request, .. }, row, adds, moves } = submission;
+        let (gpu, scene, kernels) = (self.gpu, self.scene, self.kernels);
+        let drawing = Drawing::new(origin, request, scene)?;
+        let layout = drawing.layout(&drawing.whole(), 0);
+        let (tiles, kinds) = (drawing.tiles(), RasterKinds::from(request));
+        let sources: Vec<SourceRow> = request.sources.iter().map(SourceRow::from).collect();
+        let gradient_bytes = gradient_bytes(scene.count.into(), 3 * u64::from(scene.sh_count));
+        let (room, backward) =
+            self.training_room(&layout, capacity, tiles, &sources, gradient_bytes)?;
+        let view = drawing.alone(&layout, capacity);
+        let backdrop = match &request.background {
+            Background::Backdrop(backdrop) => vec![std::sync::Arc::clone(backdrop)],
+            Background::Color(_) => Vec::new(),
+        };
+        let held = std::mem::take(&mut self.scratch.backdrops);
+        let bindings = &mut self.scratch.bindings;
+        gpu.scoped("training", || {
+            room.put_backdrops(gpu, &backdrop, &held);
+            gpu.queue.write_buffer(&room.views, 0, bytemuck::bytes_of(&view));
+            gpu.queue.write_buffer(&training.row, 0, bytemuck::bytes_of(row));
+            if !sources.is_empty() {
+                gpu.queue.write_buffer(&room.sources, 0, bytemuck::cast_slice(&sources));
+            }
+            let [plans, ends] = room.zeros();
+            let zeros = [plans, ends, &backward.sums];
+            let sizes = (1, scene.count);
+            let mut stages = Recorder::new(gpu, kernels, bindings, (&room, &zeros), sizes, None);
+            stages.draw(scene.buffers(), kinds, None, tiles);
+            stages.compare(training, &backward, tiles);
+            stages.backward(scene.buffers(), Kinds::COLOR, &backward, tiles);
+            if let (true, Some(earlier)) = (adds, earlier) {
+                stages.add_earlier(earlier, &backward);
+            }
+            let plan = (&room.plans, 0, &room.staging, 0, PLAN_BYTES);
+            match (moves, earlier) {
+                (false, Some(earlier)) => {
+                    let kept = (&backward.gradients, 0, earlier, 0, gradient_bytes);
+                    stages.submit(&[plan, kept])
+                }
+                _ => {
+                    stages.adam(scene.buffers(), training, &backward);
+                    stages.submit(&[plan])
+                }
+            }
+        })??;
+        self.scratch.backdrops = backdrop;
+        readback::read(gpu, &room.staging, PLAN_BYTES, bytemuck::pod_read_unaligned)
+    }
+
+    /// The buffers of one submission.
+    fn training_room(
+        &mut self,
+        layout: &Layout,
+        capacity: u32,
+        tiles: [u32; 2],
+        sources: &[SourceRow],
+        gradient_bytes: u64,
+    ) -> Result<(BatchBuffers, BackwardBuffers)> {
+        let need = Need {
+            views: 1,
+            count: self.scene.count,
+            capacity,
+            tiles: tiles[0] * tiles[1] + 1,
+            shades: !self.kernels.flat(self.scene.sh_count),
+            source_bytes: size_of_val(sources) as u64,
+            picture_bytes: layout.picture_bytes(),
+            staging_bytes: PLAN_BYTES,
+            ..Need::default()
+        };
+        let sums = 4 * u64::from(capacity) * u64::from(PAIR_SUMS);
+        let sizes = [layout.picture_bytes(), sums, gradient_bytes];
+        // First, for both share a staging buffer, which this one needs the larger one of.
+        let backward = self.scratch.backward_room(self.gpu, sizes)?;
+        Ok((self.scratch.room(self.gpu, &need)?, backward))
+    }
+}

@@ -1,0 +1,124 @@
+//! Steps of which a renderer takes the drawing and going back, and the processor the rest.
+
+use rayon::prelude::*;
+
+use super::{
+    Exposure, PhotoLoss, Trainer, TrainingPhoto, TrainingSet, TrainingStep, absent, adam::Adam,
+    photo_loss, unit,
+};
+use crate::{
+    Frame, RenderRequest,
+    backward::{DifferentiableRenderer, FrameGradients, Gradients},
+    error::Result,
+    scene::Gaussians,
+};
+
+/// A photo as the loss needs it.
+#[derive(Debug)]
+struct Target {
+    request: RenderRequest,
+    /// `[H * W]` 0..1.
+    rgb: Vec<[f32; 3]>,
+    valid: Option<Vec<bool>>,
+    exposure: Exposure,
+    loss: f64,
+}
+
+impl Target {
+    fn new(TrainingPhoto { photo, request }: &TrainingPhoto<'_>) -> Self {
+        let (request, valid) = (request.clone(), photo.valid.clone());
+        Self { request, rgb: unit(photo), valid, exposure: Exposure::default(), loss: f64::NAN }
+    }
+
+    /// What the loss says of a frame; the exposure moves.
+    fn compare(&mut self, frame: &Frame, ssim_share: f32, rate: f32) -> FrameGradients {
+        let plain = frame.color.as_deref().unwrap_or_default();
+        let exposure = self.exposure;
+        let shown: Vec<[f32; 3]> = plain.par_iter().map(|color| exposure.of(*color)).collect();
+        let (width, valid) = (frame.width as usize, self.valid.as_deref());
+        let PhotoLoss { value, gradient } = photo_loss(&shown, &self.rgb, width, valid, ssim_share);
+        let mut by = gradient;
+        self.loss = value;
+        self.exposure.step(plain, &by, rate);
+        let gain = exposure.gain;
+        by.par_iter_mut().for_each(|by| *by = std::array::from_fn(|c| by[c] * gain[c]));
+        FrameGradients { color: Some(by), ..FrameGradients::default() }
+    }
+}
+
+/// A [`Trainer`] on the processor, over any renderer.
+#[expect(missing_debug_implementations, reason = "renderers have none")]
+pub struct HostTrainer<'a> {
+    renderer: &'a dyn DifferentiableRenderer,
+    gaussians: Gaussians,
+    adam: Adam,
+    targets: Vec<Target>,
+    ssim_share: f32,
+    /// Of a step, and of one of its photos.
+    found: (Gradients, Gradients),
+}
+
+impl<'a> HostTrainer<'a> {
+    /// A trainer that draws with `renderer`.
+    ///
+    /// # Errors
+    /// `internal` for a photo of another size than its view.
+    pub fn new(renderer: &'a dyn DifferentiableRenderer, set: &TrainingSet<'_>) -> Result<Self> {
+        set.check()?;
+        Ok(Self {
+            renderer,
+            gaussians: set.gaussians.clone(),
+            adam: Adam::new(set.gaussians),
+            targets: set.photos.par_iter().map(Target::new).collect(),
+            ssim_share: set.ssim_share,
+            found: Default::default(),
+        })
+    }
+}
+
+impl Trainer for HostTrainer<'_> {
+    fn step(&mut self, photos: &[usize], step: &TrainingStep) -> Result<()> {
+        let Self { renderer, gaussians, adam, targets, ssim_share, found } = self;
+        for (place, &at) in photos.iter().enumerate() {
+            let target = targets.get_mut(at).ok_or_else(|| absent(at))?;
+            let request = target.request.clone();
+            let mut loss = |frame: &Frame| Ok(target.compare(frame, *ssim_share, step.exposure));
+            let into = if place == 0 { &mut found.0 } else { &mut found.1 };
+            renderer.backward(gaussians, &request, &mut loss, into)?;
+            if place > 0 {
+                add(&mut found.0, &found.1);
+            }
+        }
+        *gaussians = adam.step(std::mem::take(gaussians), &found.0, &step.rates)?;
+        if step.opacity_min > 0.0 {
+            *gaussians = adam.prune(gaussians, step.opacity_min);
+        }
+        Ok(())
+    }
+
+    fn render(&mut self, request: &RenderRequest) -> Result<Frame> {
+        self.renderer.render(&self.gaussians, request)
+    }
+
+    fn gaussians(&mut self) -> Result<Gaussians> {
+        Ok(self.gaussians.clone())
+    }
+
+    fn exposures(&mut self) -> Result<Vec<(Exposure, f64)>> {
+        Ok(self.targets.iter().map(|target| (target.exposure, target.loss)).collect())
+    }
+}
+
+/// Adds the gradients of another photo.
+fn add(sum: &mut Gradients, more: &Gradients) {
+    fn all<const N: usize>(sum: &mut [[f32; N]], more: &[[f32; N]]) {
+        let numbers = sum.as_flattened_mut().iter_mut().zip(more.as_flattened());
+        numbers.for_each(|(sum, more)| *sum += more);
+    }
+    all(&mut sum.means, &more.means);
+    all(&mut sum.quats, &more.quats);
+    all(&mut sum.scales, &more.scales);
+    all(&mut sum.sh, &more.sh);
+    sum.opacities.iter_mut().zip(&more.opacities).for_each(|(sum, more)| *sum += more);
+    sum.seen.iter_mut().zip(&more.seen).for_each(|(sum, more)| *sum |= more);
+}

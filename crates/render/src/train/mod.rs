@@ -1,0 +1,124 @@
+//! Gradient steps that bring Gaussians closer to photos.
+//!
+//! A step draws a photo's view or several, as the photo was exposed ([`Exposure`]), compares
+//! ([`photo_loss`]), goes back through the renderer ([`crate::backward`]) and moves what the photos
+//! show ([`LearningRates`]). A [`Trainer`] is where that runs. [`HostTrainer`] does all but the
+//! drawing on the processor. The GPU renderer has one on the device (`shaders/photo_loss.wgsl`,
+//! `exposure.wgsl`, `adam.wgsl`): photos and Gaussians go up once, and only what is asked for comes
+//! back. [`oracle`] judges the loss.
+
+pub mod adam;
+pub mod exposure;
+mod host;
+pub mod oracle;
+pub mod photo_loss;
+
+pub use self::{
+    adam::{LearningRates, checked},
+    exposure::Exposure,
+    host::HostTrainer,
+    photo_loss::{PhotoLoss, photo_loss},
+};
+use crate::{
+    Frame, RenderRequest,
+    error::{Error, Result},
+    gpu::trainer_bytes,
+    scene::{Gaussians, Photo},
+};
+
+/// A photo to learn from.
+#[derive(Clone, Debug)]
+pub struct TrainingPhoto<'a> {
+    /// Its pixels.
+    pub photo: &'a Photo,
+    /// The view of the scene that should look like it, of the same size.
+    pub request: RenderRequest,
+}
+
+/// What a [`Trainer`] begins with.
+#[derive(Clone, Debug)]
+pub struct TrainingSet<'a> {
+    /// The Gaussians to move.
+    pub gaussians: &'a Gaussians,
+    /// The photos, which steps name by their numbers.
+    pub photos: Vec<TrainingPhoto<'a>>,
+    /// Share of SSIM in the loss, 0..1.
+    pub ssim_share: f32,
+}
+
+impl TrainingSet<'_> {
+    /// Refuses a photo of another size than its view.
+    ///
+    /// # Errors
+    /// `internal`, with both sizes.
+    pub(crate) fn check(&self) -> Result<()> {
+        for TrainingPhoto { photo, request } in &self.photos {
+            let lens = request.lens();
+            let (has, shown) = ([photo.width, photo.height], [lens.width, lens.height]);
+            if has != shown {
+                return Err(Error::internal(format!(
+                    "training: a photo of {has:?}, not {shown:?}"
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    /// Bytes of a device that a trainer of these needs, about: four Gaussian-tile pairs a Gaussian.
+    #[must_use]
+    pub fn device_bytes(&self) -> u64 {
+        trainer_bytes(self)
+    }
+}
+
+/// How a step moves what it moves.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TrainingStep {
+    /// How far numbers of Gaussians move.
+    pub rates: LearningRates,
+    /// How far gains and biases move.
+    pub exposure: f32,
+    /// Gaussians under this opacity are dropped after the step; 0 drops none.
+    pub opacity_min: f32,
+}
+
+/// A place where steps are taken. Twins: from the same start they come to the same numbers, to the
+/// rounding of f32.
+pub trait Trainer {
+    /// Takes one step by the sum of what the photos of these numbers say.
+    ///
+    /// # Errors
+    /// Those of [`crate::backward::DifferentiableRenderer::backward`]; `internal` for a photo that
+    /// is not there. After an error the trainer is of no use.
+    fn step(&mut self, photos: &[usize], step: &TrainingStep) -> Result<()>;
+
+    /// Draws the Gaussians as they are now.
+    ///
+    /// # Errors
+    /// Those of [`crate::Renderer::render`].
+    fn render(&mut self, request: &RenderRequest) -> Result<Frame>;
+
+    /// The Gaussians as they are now: those of the start that were not dropped, in their order.
+    ///
+    /// # Errors
+    /// As [`Self::step`].
+    fn gaussians(&mut self) -> Result<Gaussians>;
+
+    /// The exposure of each photo, and its loss before its last step: NaN where there was none.
+    ///
+    /// # Errors
+    /// As [`Self::step`].
+    fn exposures(&mut self) -> Result<Vec<(Exposure, f64)>>;
+}
+
+/// A number of a photo.
+pub(crate) fn absent(at: usize) -> Error {
+    Error::internal(format!("training: there is no photo {at}"))
+}
+
+/// Pixels in 0..1, `[H * W]`.
+#[must_use]
+pub fn unit(photo: &Photo) -> Vec<[f32; 3]> {
+    let pixels = photo.rgb.chunks_exact(3);
+    pixels.map(|c| [c[0], c[1], c[2]].map(|v| f32::from(v) / 255.0)).collect()
+}
