@@ -7,10 +7,10 @@ fn main() -> ExitCode {
     segsplat::cli::main()
 }
 
-/// Limits the heaps of the system's allocator to one a core. By default it makes up to eight a core,
-/// and each keeps the memory that it once had: the memory of a server grew over hundreds of scenes.
-/// With fewer than cores, calls wait for each other: on 16 cores, two heaps gave 33,000 answers of
-/// 304 a second, eight 87,000, 32 gave 138,000. Large arrays are outside of these heaps.
+/// Limits the heaps of the system's allocator to one a core. By default it makes up to eight a
+/// core, and each keeps the memory that it once had: the memory of a server grew over hundreds of
+/// scenes. With fewer than cores, calls wait for each other: on 16 cores, two heaps gave 33,000
+/// answers of 304 a second, eight 87,000, 32 gave 138,000. Large arrays are outside of these heaps.
 #[cfg(all(target_os = "linux", target_env = "gnu"))]
 fn bound_arenas() {
     const ARENAS_MAX: usize = 64;
