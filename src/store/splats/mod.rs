@@ -4,7 +4,7 @@
 //! in the module of each. PLY and GLB hold the entries of the bank and the semantics too.
 //!
 //! Axes are those of each format's own specification: PLY and `.splat` are in the axes of the scene
-//! (OpenCV: y down, z forward), SPZ and glTF have y up and z back. [`TURN`] turns between them.
+//! (OpenCV: y down, z forward), SPZ and glTF have y up and z back. `TURN` turns between them.
 
 mod glb;
 mod packed_ply;
