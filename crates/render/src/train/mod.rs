@@ -1,9 +1,9 @@
 //! Gradient steps that bring Gaussians closer to photos.
 //!
 //! A step draws a photo's view or several, as the photo was exposed ([`Exposure`]), compares
-//! ([`photo_loss`]), goes back through the renderer ([`crate::backward`]) and moves what the photos
-//! show ([`LearningRates`]). A [`Trainer`] is where that runs. [`HostTrainer`] does all but the
-//! drawing on the processor. The GPU renderer has one on the device (`shaders/photo_loss.wgsl`,
+//! ([`photo_loss()`]), goes back through the renderer ([`crate::backward`]) and moves what the
+//! photos show ([`LearningRates`]). A [`Trainer`] is where that runs. [`HostTrainer`] does all but
+//! the drawing on the processor. The GPU renderer has one on the device (`shaders/photo_loss.wgsl`,
 //! `exposure.wgsl`, `adam.wgsl`): photos and Gaussians go up once, and only what is asked for comes
 //! back. [`oracle`] judges the loss.
 
