@@ -78,29 +78,19 @@ struct Variant {
 
 impl Default for Variant {
     fn default() -> Self {
-        let RefineOptions {
-            side,
-            gaussians_max,
-            batch,
-            prune_every,
-            opacity_min,
-            ssim_share,
-            proof_share,
-            device_bytes_max,
-            ..
-        } = RefineOptions::default();
+        let plain = RefineOptions::default();
         Self {
             layers: false,
             steps: u32::MAX,
             ms: u64::MAX,
-            side,
-            gaussians_max,
-            batch,
-            prune_every,
-            opacity_min,
-            ssim_share,
-            proof_share,
-            device_bytes_max,
+            side: plain.side,
+            gaussians_max: plain.gaussians_max,
+            batch: plain.batch,
+            prune_every: plain.prune_every,
+            opacity_min: plain.opacity_min,
+            ssim_share: plain.ssim_share,
+            proof_share: plain.proof_share,
+            device_bytes_max: plain.device_bytes_max,
             rate: 1.0,
             means: 1.0,
             quats: 1.0,
@@ -167,7 +157,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         let part = match variants.is_empty() {
             true => whole.clone(),
             false => {
-                let (learnt, _) = split(given.clone());
+                let (learnt, _) = split(&given, &held_out(given.len()));
                 reconstruct_for_refinement(&engine, &learnt, &scene_options, watch)?
             }
         };

@@ -9,7 +9,7 @@ use super::{output::Output, scene_file};
 use crate::{
     config::Config,
     error::{Error, Result},
-    store::splats::{FORMATS, SplatFile},
+    store::splats::{SplatFile, endings},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -24,7 +24,7 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let format = scene_file::splat_format(&args.output).ok_or_else(|| {
-        let endings = FORMATS.map(|format| format.ending).join(", ");
+        let endings = endings();
         let path = args.output.display();
         Error::invalid(format!("{path}: the ending must be that of a format: {endings}"))
     })?;

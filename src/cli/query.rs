@@ -14,7 +14,7 @@ use crate::{
         Boxes, CameraFields, MaskFormat, OfflineService, QuerySpec, ScoringOptions, TextResult,
         ViewOptions,
     },
-    store::splats::{FORMATS, SplatFile, SplatFormat},
+    store::splats::{SplatFile, SplatFormat, endings},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -97,7 +97,7 @@ fn ending_of(path: &Path) -> Result<Ending> {
         return Ok(Ending::Png);
     }
     scene_file::splat_format(path).map(Ending::Gaussians).ok_or_else(|| {
-        let endings = FORMATS.map(|format| format.ending).join(", ");
+        let endings = endings();
         let path = path.display();
         Error::invalid(format!(
             "{path}: the ending must be png (for the mask) or one of {endings} (for the Gaussians)"

@@ -98,6 +98,11 @@ pub static SPLAT: SplatFormat = SplatFormat {
 /// All formats. Where the ending of one ends that of another, the longer one comes first.
 pub static FORMATS: [&SplatFormat; 5] = [&COMPRESSED_PLY, &PLY, &SPZ, &GLB, &SPLAT];
 
+/// The endings of all formats, for messages.
+pub fn endings() -> String {
+    FORMATS.map(|format| format.ending).join(", ")
+}
+
 impl SplatFormat {
     /// The format of this name.
     pub fn named(name: &str) -> Option<&'static Self> {

@@ -11,7 +11,9 @@ use super::Reconstruction;
 use crate::{
     error::Result,
     models::{ResizeFilter, fit},
-    refine::{self, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out},
+    refine::{
+        self, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out, split,
+    },
     scene::{
         Gaussians, HealthReport, Method, Photo, PosedPhoto, RefineReport, Scene, SceneCamera,
         SceneMeta, Semantics,
@@ -52,12 +54,8 @@ pub fn refined(
     let sized: Vec<PosedPhoto> = photos.iter().map(|photo| at_side(photo, options.side)).collect();
     // `held` are left out, of the photos as they are and of those that are learnt.
     let mut part = |held: &[usize], budget: RefineBudget, [begin, end]: [f32; 2]| {
-        let kept = |all: &[PosedPhoto], inside: bool| -> Vec<PosedPhoto> {
-            let kept = all.iter().enumerate().filter(|(i, _)| held.contains(i) != inside);
-            kept.map(|(_, photo)| photo.clone()).collect()
-        };
-        let (start, first) = start_of(scene, held, remake(kept(photos, true))?)?;
-        let (learnt, out) = (kept(&sized, true), kept(&sized, false));
+        let (start, first) = start_of(scene, held, remake(split(photos, held).0)?)?;
+        let (learnt, out) = split(&sized, held);
         let mut pace = |spent: f32| pace(begin + (end - begin) * spent);
         let options = RefineOptions { budget, ..*options };
         let photos = (&learnt[..], &out[..]);

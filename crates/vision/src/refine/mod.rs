@@ -138,17 +138,15 @@ pub fn held_out(count: usize) -> Vec<usize> {
     (HELD_OUT_EVERY / 2 - 1..count).step_by(HELD_OUT_EVERY).collect()
 }
 
-/// Photos to learn from, and those held out: what makes the scene that is refined must see the
-/// first alone.
+/// Photos to learn from, and those of the numbers `held`: what makes the scene that is refined must
+/// see the first alone.
 #[must_use]
-pub fn split(photos: Vec<PosedPhoto>) -> (Vec<PosedPhoto>, Vec<PosedPhoto>) {
-    let held = held_out(photos.len());
-    let (mut learnt, mut out) = (Vec::new(), Vec::new());
-    for (i, photo) in photos.into_iter().enumerate() {
-        let to = if held.contains(&i) { &mut out } else { &mut learnt };
-        to.push(photo);
-    }
-    (learnt, out)
+pub fn split(photos: &[PosedPhoto], held: &[usize]) -> (Vec<PosedPhoto>, Vec<PosedPhoto>) {
+    let of = |inside: bool| {
+        let kept = photos.iter().enumerate().filter(|(i, _)| held.contains(i) == inside);
+        kept.map(|(_, photo)| photo.clone()).collect()
+    };
+    (of(false), of(true))
 }
 
 /// A held-out photo.

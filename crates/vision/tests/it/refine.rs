@@ -27,7 +27,7 @@ fn every_eighth_photo_is_held_out_and_none_of_few() {
     assert_eq!(held_out(5), [3]);
     assert_eq!(held_out(20), [3, 11, 19]);
     let (_, photos) = captured(9);
-    let (learnt, out) = split(photos);
+    let (learnt, out) = split(&photos, &held_out(photos.len()));
     assert_eq!((learnt.len(), out.len()), (8, 1));
     assert!(learnt.iter().all(|photo| photo.file != out[0].file), "a photo on both sides");
 }
@@ -87,8 +87,7 @@ fn refined(
     photos: &[PosedPhoto],
     steps: u32,
 ) -> RefinedVersion {
-    let all = photos.to_vec();
-    let (learnt, out) = split(all);
+    let (learnt, out) = split(photos, &held_out(photos.len()));
     let options = RefineOptions { budget: RefineBudget::steps(steps), ..RefineOptions::default() };
     let photos = (&learnt[..], &out[..]);
     let start = (&scene(start, 3.0), start);
