@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use crate::{
     config::Config,
-    error::Result,
+    error::{Error, ErrorCode, Result},
     jobs::{NoSemantics, PipelineNetworks, SemanticNetworks},
     models::Bundle,
     pipeline::{Pipeline, PipelineLoader},
     render::{Renderer, select::select},
-    service::{ModelInfo, ModelsInfo, Parts},
+    service::{KnownWord, ModelInfo, ModelsInfo, Parts},
 };
 
 /// Bundle, networks and renderer as the server runs them. A thread of the engine still opens the
@@ -22,7 +22,7 @@ pub fn parts(config: &Config) -> Result<(Parts, Arc<PipelineLoader>)> {
     let _ = rayon::ThreadPoolBuilder::new().num_threads(config.threads).build_global();
     let engine = Arc::new(PipelineLoader::open(&config.networks())?);
     let renderer = renderer(config)?;
-    let models = models_info(engine.bundle(), "opening");
+    let models = models_info(engine.bundle(), "opening")?;
     let networks = Arc::new(PipelineNetworks(Arc::clone(&engine)));
     let semantics = Arc::clone(&networks) as Arc<dyn SemanticNetworks>;
     Ok((Parts { scenes: networks, semantics, renderer, models }, engine))
@@ -50,8 +50,10 @@ pub fn renderer(config: &Config) -> Result<Arc<dyn Renderer>> {
 }
 
 /// The description of a bundle for callers.
-#[must_use]
-pub fn models_info(bundle: &Bundle, execution_provider: &str) -> ModelsInfo {
+///
+/// # Errors
+/// `model_unavailable` when its file of words cannot be read.
+pub fn models_info(bundle: &Bundle, execution_provider: &str) -> Result<ModelsInfo> {
     let geometry = bundle.geometry();
     let models = bundle.files().into_iter().map(|entry| {
         let (views_max, sizes) = match entry.part {
@@ -72,11 +74,24 @@ pub fn models_info(bundle: &Bundle, execution_provider: &str) -> ModelsInfo {
             sizes,
         }
     });
-    ModelsInfo {
+    Ok(ModelsInfo {
         bundle: bundle.name().to_owned(),
         bundle_sha256: bundle.sha256().to_owned(),
         models: models.collect(),
+        words: known_words(bundle)?,
         execution_provider: execution_provider.to_owned(),
         ..ModelsInfo::default()
-    }
+    })
+}
+
+/// What the bundle says of everyday words.
+fn known_words(bundle: &Bundle) -> Result<Vec<KnownWord>> {
+    let Some(named) = bundle.image_text().and_then(|towers| towers.words.as_ref()) else {
+        return Ok(Vec::new());
+    };
+    let refused = |why: String| {
+        Error::new(ErrorCode::ModelUnavailable, format!("model bundle: {}: {why}", named.file))
+    };
+    let text = fs_err::read(bundle.path(&named.file)).map_err(|e| refused(e.kind().to_string()))?;
+    serde_json::from_slice(&text).map_err(|e| refused(e.to_string()))
 }

@@ -56,7 +56,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
 
 fn list(config: &Config, out: &Output) -> Result<()> {
     let bundle = Bundle::find(&config.networks())?;
-    let info = models_info(&bundle, "");
+    let info = models_info(&bundle, "")?;
     out.answer(&summary(&info), &json!({ "bundle": info.bundle, "models": info.models }))
 }
 
@@ -117,7 +117,7 @@ fn verify(config: &Config, out: &Output) -> Result<()> {
     let runtime = Runtime::load(&config.networks())?;
     let engine = Pipeline::open(&config.networks())?;
     let provider = engine.geometry().provider().name();
-    let info = models_info(engine.bundle(), provider);
+    let info = models_info(engine.bundle(), provider)?;
     let build = runtime.build().unwrap_or("a library that is not pinned");
     let mut text = summary(&info);
     let _ = writeln!(text, "  every file matches its sha256");

@@ -44,7 +44,7 @@ pub use self::{
     rle::Rle,
     times::ViewTimes,
     types::{
-        Created, Export, InstanceBox, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
+        Created, Export, InstanceBox, KnownWord, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
         QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning,
     },
 };

@@ -244,6 +244,8 @@ pub struct ModelsInfo {
     pub bundle_sha256: String,
     /// Networks of the bundle.
     pub models: Vec<ModelInfo>,
+    /// What was measured of everyday words; empty where the bundle does not say.
+    pub words: Vec<KnownWord>,
     /// Execution provider in use; in brackets why it is not the one that was to be used.
     pub execution_provider: String,
     /// Renderer in use: `cpu`, or the adapter's name.
@@ -257,7 +259,7 @@ pub struct ModelsInfo {
 #[schema(as = Model)]
 pub struct ModelInfo {
     /// What it does: `geometry`, `geometry.cpu`, `masks.encoder`, `masks.decoder`,
-    /// `image_text.image`, `image_text.text`, `image_text.tokenizer`.
+    /// `image_text.image`, `image_text.text`, `image_text.tokenizer`, `image_text.words`.
     pub name: String,
     /// File in the bundle.
     pub file: String,
@@ -271,6 +273,39 @@ pub struct ModelInfo {
     pub views_max: usize,
     /// Working sizes, `[height, width]`.
     pub sizes: Vec<[u32; 2]>,
+}
+
+/// How well the towers of the bundle know a word, on photographs that no training saw.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct KnownWord {
+    /// The word.
+    pub word: String,
+    /// What to expect of it.
+    pub trust: Trust,
+    /// Things that it may be said of, cut out along their outlines.
+    pub things: u32,
+    /// Share of them that it selects, 0 to 1; null where there are none.
+    pub things_found: Option<f32>,
+    /// Whole photographs that it may be said of.
+    pub photographs: u32,
+    /// Share of them that it selects, 0 to 1; null where there are none.
+    pub photographs_found: Option<f32>,
+    /// Share of all others that it selects, 0 to 1.
+    pub absent: f32,
+}
+
+/// What to expect of a word.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Trust {
+    /// It selects most of what it names, and hardly anything else.
+    Good,
+    /// Between the two.
+    Fair,
+    /// It misses most of what it names, or selects much else.
+    Poor,
+    /// Too few photographs show it.
+    Unmeasured,
 }
 
 /// What `/readyz` says.

@@ -24,6 +24,7 @@ mod hostile;
 mod http;
 mod jobs;
 mod keys;
+mod known_words;
 mod licences;
 mod life;
 mod magnify;

@@ -61,8 +61,8 @@ type Data<'a> = [&'a Option<String>; 2];
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BundleFile<'a> {
     /// What it is for: `geometry`, `geometry.cpu`, `masks.encoder`, `masks.decoder`,
-    /// `image_text.image`, `image_text.text`, `image_text.tokenizer`. A file of weights beside
-    /// another has that one's name.
+    /// `image_text.image`, `image_text.text`, `image_text.tokenizer`, `image_text.words`. A file of
+    /// weights beside another has that one's name.
     pub part: &'static str,
     /// Name in the bundle's folder.
     pub file: &'a str,
@@ -269,11 +269,15 @@ impl Bundle {
             network("masks.encoder", licence, [&e.file, &e.sha256], [&e.data, &e.data_sha256]);
             network("masks.decoder", licence, [&d.file, &d.sha256], [&d.data, &d.data_sha256]);
         }
-        if let Some(ImageTextManifest { image: i, text: t, licence, .. }) = image_text {
+        if let Some(image_text) = image_text {
+            let ImageTextManifest { image: i, text: t, licence, .. } = image_text;
             network("image_text.image", licence, [&i.file, &i.sha256], [&i.data, &i.data_sha256]);
             network("image_text.text", licence, [&t.file, &t.sha256], [&t.data, &t.data_sha256]);
             let tokenizer = [&*t.tokenizer, &t.tokenizer_sha256];
             network("image_text.tokenizer", licence, tokenizer, [&None, &None]);
+            if let Some(words) = &image_text.words {
+                network("image_text.words", licence, [&words.file, &words.sha256], [&None, &None]);
+            }
         }
         files
     }

@@ -107,8 +107,9 @@ pub struct GeometryManifest {
     pub data: Option<String>,
     /// Its sha256, hex.
     pub data_sha256: Option<String>,
-    /// The same network as the CPU runs it, where that is another file.
-    pub cpu: Option<CpuFile>,
+    /// The same network as the CPU runs it, where that is another file: 8-bit arithmetic, and
+    /// operators of this program. It may take weights from the network's main file.
+    pub cpu: Option<PlainFile>,
     /// Licence of the weights.
     pub licence: String,
     /// Where the weights come from.
@@ -142,11 +143,10 @@ pub struct GeometryManifest {
     pub outputs: GeometryOutputs,
 }
 
-/// A file for the CPU alone: 8-bit arithmetic, and operators of this program. It may take weights
-/// from the network's main file.
+/// A file that has no section of its own.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct CpuFile {
+pub struct PlainFile {
     /// File in the bundle's folder.
     pub file: String,
     /// Its sha256, hex.
@@ -354,6 +354,8 @@ pub struct ImageTextManifest {
     pub image: ImageTowerManifest,
     /// The text tower.
     pub text: TextTowerManifest,
+    /// What was measured of everyday words: JSON, a list of words.
+    pub words: Option<PlainFile>,
 }
 
 /// The image tower.
@@ -561,6 +563,9 @@ impl ImageTextManifest {
         faults.file("image_text.text", &text.file, &text.sha256);
         faults.data("image_text.text", &text.data, &text.data_sha256);
         faults.file("image_text.text.tokenizer", &text.tokenizer, &text.tokenizer_sha256);
+        if let Some(words) = &self.words {
+            faults.file("image_text.words", &words.file, &words.sha256);
+        }
         faults.range("image_text.image.size", image.size, 1..=BUCKET_SIDE_MAX);
         faults.channels("image_text.image", image.mean, image.std);
         faults.range("image_text.dim", self.dim, 1..=DIM_MAX);

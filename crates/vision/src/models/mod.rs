@@ -30,9 +30,8 @@ pub use frame::ModelFrame;
 pub use geometry::{Geometry, GeometryInput};
 pub use image_text::ImageText;
 pub use manifest::{
-    CpuFile, GeometryManifest, ImageTextManifest, ImageTowerManifest, MaskAdapter,
-    MaskDecoderManifest, MaskEncoderManifest, MasksManifest, OutputFrame, TextTowerManifest,
-    Translation,
+    GeometryManifest, ImageTextManifest, ImageTowerManifest, MaskAdapter, MaskDecoderManifest,
+    MaskEncoderManifest, MasksManifest, OutputFrame, PlainFile, TextTowerManifest, Translation,
 };
 pub use masks::{MaskNetwork, PhotoEmbedding};
 pub use options::{NetworkOptions, ProviderChoice};
