@@ -3,7 +3,7 @@
     python clip.py --model ViT-B-16 --checkpoint open_clip_pytorch_model.bin --out DIR     # laion2b_s34b_b88k
     python clip.py --model ViT-B-16 --random 1 --out DIR
 
-The tokenizer is CLIP's byte-pair encoding, written as a `tokenizer.json` of the `tokenizers` library. It is held
+`--half` writes the image tower in f16, for a GPU. The tokenizer is CLIP's byte-pair encoding, written as a `tokenizer.json` of the `tokenizers` library. It is held
 to OpenCLIP's own tokenizer on the phrases of `phrases()`.
 """
 import gzip
@@ -13,11 +13,13 @@ import open_clip
 import torch
 from tokenizers import Regex, Tokenizer, decoders, models, normalizers, pre_tokenizers, processors
 
-from common import arguments, entry, export, hold, prepare, session, sha256, write_section
+from common import TOLERANCES, arguments, entry, export, hold, prepare, session, sha256, write_section
 
 BEGIN, END = "<|startoftext|>", "<|endoftext|>"
 WORDS = r"""<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"""
 CONTEXT = 77
+# Crops in one run, for a CPU and for a GPU.
+BATCHES = {False: 16, True: 64}
 
 
 class ImageTower(torch.nn.Module):
@@ -87,6 +89,7 @@ def compare(args, clip, made, at):
 def main():
     ap = arguments(__doc__)
     ap.add_argument("--model", default="ViT-B-16", help="a model of open_clip.list_models()")
+    ap.add_argument("--half", action="store_true", help="the image tower in f16")
     args = ap.parse_args()
     os.makedirs(args.out, exist_ok=True)
     at = lambda name: os.path.join(args.out, name)  # noqa: E731
@@ -96,7 +99,7 @@ def main():
     made.save(at("tokenizer.json"))
     side = clip.visual.image_size[0]
     export(ImageTower(clip), {"images": torch.randn(2, 3, side, side)}, at("image_tower.onnx"), ["embeddings"],
-           {"images": {0: "crops"}, "embeddings": {0: "crops"}})
+           {"images": {0: "crops"}, "embeddings": {0: "crops"}}, half=args.half)
     example = open_clip.get_tokenizer(args.model)(["a photo of a fox", "a box"], context_length=CONTEXT)
     export(TextTower(clip), {"input_ids": example}, at("text_tower.onnx"), ["embeddings"],
            {"input_ids": {0: "texts"}, "embeddings": {0: "texts"}})
@@ -122,7 +125,8 @@ mean = {[round(v, 8) for v in clip.visual.image_mean]}
 std = {[round(v, 8) for v in clip.visual.image_std]}
 resize = "bicubic"
 crop_margin = 0.0
-batch = 16
+batch = {BATCHES[args.half]}
+tolerance = {TOLERANCES[args.half]}
 
 [image_text.text]
 {entry(at("text_tower.onnx"))}

@@ -20,6 +20,9 @@ OPSET = 17
 # A protobuf file holds at most 2 GiB. Larger weights go into a second file beside it.
 INLINE_BYTES_MAX = 1 << 30
 
+# How much a device may differ from a CPU, in f32 and in f16: share of the answer, root of mean squares.
+TOLERANCES = {False: 0.002, True: 0.02}
+
 
 def arguments(doc):
     """A parser with the options of every exporter."""
@@ -161,7 +164,7 @@ def write_section(args, name, text):
         print(f"{file:32} {os.path.getsize(os.path.join(args.out, file)) / 2**20:10.2f} MiB")
 
 
-def write_masks(args, at, section, size):
+def write_masks(args, at, section, size, batch=64):
     """The section of a mask network whose files are `mask_encoder.onnx` and `mask_decoder.onnx`; `section` has its own keys."""
     weights = os.path.basename(args.checkpoint or f"random weights, seed {args.random}")
     write_section(args, "masks", f"""
@@ -170,7 +173,7 @@ def write_masks(args, at, section, size):
 licence = "Apache-2.0"
 size = {size}
 points_per_side = 32
-points_per_batch = 64
+points_per_batch = {batch}
 stability_score_offset = 1.0
 box_nms_thresh = 0.7
 

@@ -17,12 +17,12 @@ import torch
 from segment_anything import sam_model_registry
 from torch.nn.functional import layer_norm
 
-from common import OPSET, arguments, export, gap, half_precision, hold, prepare, session, write_masks
+from common import OPSET, TOLERANCES, arguments, export, gap, half_precision, hold, prepare, session, write_masks
 
 SIDE = 1024
 MEAN, STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
-# How much a device may differ from a CPU: share of the values, root of mean squares.
-TOLERANCE, HALF_TOLERANCE = 0.002, 0.02
+# Prompts in one run, for a CPU and for a GPU.
+BATCHES = {False: 64, True: 256}
 
 # The last part of the decoder: masks at the photo's pixels, as Segment Anything judges them. The two matrices
 # are its bilinear steps, to the square and to the photo. Cells are packed row by row, the first in the lowest bit.
@@ -262,8 +262,8 @@ std = {[round(v / 255, 7) for v in STD]}
 levels = [1, 2, 3]
 pred_iou_thresh = 0.88
 stability_score_thresh = 0.95
-tolerance = {HALF_TOLERANCE if args.half else TOLERANCE}
-""", SIDE)
+tolerance = {TOLERANCES[args.half]}
+""", SIDE, BATCHES[args.half])
 
 
 if __name__ == "__main__":
