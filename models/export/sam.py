@@ -17,59 +17,13 @@ import torch
 from segment_anything import sam_model_registry
 from torch.nn.functional import layer_norm
 
-from common import OPSET, TOLERANCES, arguments, export, gap, half_precision, hold, prepare, session, write_masks
+from common import TOLERANCES, arguments, export, gap, half_precision, hold, prepare, session, write_masks
+from judge import with_judge
 
 SIDE = 1024
 MEAN, STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 # Prompts in one run, for a CPU and for a GPU.
 BATCHES = {False: 64, True: 256}
-
-# The last part of the decoder: masks at the photo's pixels, as Segment Anything judges them. The two matrices
-# are its bilinear steps, to the square and to the photo. Cells are packed row by row, the first in the lowest bit.
-JUDGE = """
-<ir_version: 8, opset_import: ["": OPSET]>
-judge (float[prompts, kinds, GRID, GRID] masks, int64[levels] judged_levels, float[height, GRID] photo_rows,
-       float[GRID, width] photo_columns, float[1] stability_offset)
-    => (uint8[prompts, levels, bytes] mask_bits, float[prompts, levels, 2] mask_counts)
-{
-    flat = Constant <value_ints = [0, 0, -1]> ()
-    bytes_of_cells = Constant <value_ints = [0, 0, -1, 8]> ()
-    last = Constant <value_ints = [-1]> ()
-    first = Constant <value_ints = [0]> ()
-    cells_axis = Constant <value_ints = [2]> ()
-    word = Constant <value_ints = [64]> ()
-    word_less_one = Constant <value_ints = [63]> ()
-    end_of_word = Constant <value_ints = [0, 0, 0, 0, 0, 63]> ()
-    zero = Constant <value_float = 0.0> ()
-    bit_values = Constant <value_floats = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0]> ()
-
-    judged = Gather <axis = 1> (masks, judged_levels)
-    wide = MatMul (judged, photo_columns)
-    pixels = MatMul (photo_rows, wide)
-    values = Reshape (pixels, flat)
-    over = Greater (values, stability_offset)
-    over_float = Cast <to = 1> (over)
-    strict = ReduceSum <keepdims = 1> (over_float, last)
-    lower = Neg (stability_offset)
-    above = Greater (values, lower)
-    above_float = Cast <to = 1> (above)
-    loose = ReduceSum <keepdims = 1> (above_float, last)
-    mask_counts = Concat <axis = 2> (strict, loose)
-
-    inside = Greater (values, zero)
-    inside_float = Cast <to = 1> (inside)
-    padded = Pad (inside_float, end_of_word, zero)
-    shape = Shape (values)
-    cells = Gather <axis = 0> (shape, cells_axis)
-    rounded = Add (cells, word_less_one)
-    words = Div (rounded, word)
-    end = Mul (words, word)
-    whole = Slice (padded, first, end, cells_axis)
-    eights = Reshape (whole, bytes_of_cells)
-    packed = MatMul (eights, bit_values)
-    mask_bits = Cast <to = 2> (packed)
-}
-"""
 
 
 class ChannelNorm(torch.nn.Module):
@@ -198,14 +152,10 @@ def export_decoder(sam, path, half):
     prompts, decoder = onnx.load(part("prompts")), onnx.load(part("decoder"))
     if half:
         half_precision(decoder.graph)
-    judge = onnx.parser.parse_model(JUDGE.replace("GRID", str(side // 4)).replace("OPSET", str(OPSET)))
-    for model, name in [(prompts, "prompts"), (judge, "judge")]:
-        model.ir_version = decoder.ir_version
-        onnx.compose.add_prefix(model, f"{name}/", rename_inputs=False, rename_outputs=False, inplace=True)
+    onnx.compose.add_prefix(prompts, "prompts/", rename_inputs=False, rename_outputs=False, inplace=True)
+    prompts.ir_version = decoder.ir_version
     both = onnx.compose.merge_models(prompts, decoder, [("prompt_tokens", "prompt_tokens")])
-    whole = onnx.compose.merge_models(both, judge, [("low_res_masks", "masks")],
-                                      outputs=["low_res_masks", "iou_predictions", "mask_bits", "mask_counts"])
-    onnx.save_model(whole, path)
+    onnx.save_model(with_judge(both, side // 4), path)
     os.remove(part("prompts")), os.remove(part("decoder"))
 
 

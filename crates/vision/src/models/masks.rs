@@ -5,6 +5,8 @@
 
 use std::{borrow::Cow, sync::Arc};
 
+use tracing::warn;
+
 use crate::{
     error::{Error, Result},
     models::{
@@ -29,6 +31,8 @@ const MASK_BITS: &str = "mask_bits";
 const MASK_COUNTS: &str = "mask_counts";
 /// Most pixels of masks that are judged in one run: a quarter of a gigabyte of f32, a few times.
 const JUDGED_PIXELS_MAX: usize = 1 << 26;
+/// Largest share of judged pixels that may differ from the logits: those next to a threshold.
+const JUDGED_OFF_MAX: f64 = 5e-3;
 /// Side of the logits of an `efficient_sam` decoder, before it enlarges them.
 const EFFICIENT_SAM_LOGITS: u32 = 256;
 
@@ -129,7 +133,69 @@ impl MaskNetwork {
         };
         let decoder = Network::open(runtime, bundle, options, &spec)?;
         let takes = Takes::of(decoder.takes(), &manifest)?;
-        Ok(Some(Self { encoder, decoder, takes, manifest: manifest.clone() }))
+        let mut network = Self { encoder, decoder, takes, manifest: manifest.clone() };
+        if network.judges().is_some()
+            && network.provider() != Provider::Cpu
+            && let Err(error) = network.hold_judge(&seen)
+        {
+            warn!(network = DECODER, %error, "its masks are judged by the CPU");
+            network.takes.judged = None;
+        }
+        Ok(Some(network))
+    }
+
+    /// Holds masks that the decoder judges to its own logits.
+    ///
+    /// # Errors
+    /// `internal` when a run fails or more than [`JUDGED_OFF_MAX`] of the pixels differ.
+    fn hold_judge(&self, seen: &PhotoEmbedding) -> Result<()> {
+        let points = [[0.2_f32, 0.3], [0.6, 0.5], [0.9, 0.8]];
+        let logits = self.decode(seen, &points)?;
+        let ([width, height], [columns, rows]) = (logits.grid, [45, 37]);
+        // As a photo's: each pixel lies between two cells.
+        let weight = |cell: usize, cells: usize, at: usize, all: usize| {
+            let place = (at as f32 + 0.5) * cells as f32 / all as f32 - 0.5;
+            (1.0 - (place - cell as f32).abs()).max(0.0)
+        };
+        let row = |y| (0..height).map(move |cell| weight(cell, height, y, rows));
+        let of_cell = |cell| (0..columns).map(move |x| weight(cell, width, x, columns));
+        let judging = MaskJudging {
+            levels: (0..logits.levels).collect(),
+            pixels: [columns, rows],
+            rows: (0..rows).flat_map(row).collect(),
+            columns: (0..width).flat_map(of_cell).collect(),
+            stability_offset: self.manifest.stability_score_offset,
+        };
+        let found = self.judge(seen, &points, &judging)?;
+        let (all, bytes) = (columns * rows, (columns * rows).div_ceil(64) * 8);
+        let mut off = 0;
+        for (at, grid) in logits.logits.chunks_exact(width * height).enumerate() {
+            let value = |pixel: usize| -> f32 {
+                let (x, y) = (pixel % columns, pixel / columns);
+                let of_line = |cell: usize| -> f32 {
+                    let cells = grid[cell * width..].iter().take(width).enumerate();
+                    cells.map(|(i, v)| v * judging.columns[i * columns + x]).sum()
+                };
+                let weights = judging.rows[y * height..].iter().take(height).enumerate();
+                weights.filter(|(_, w)| **w > 0.0).map(|(cell, w)| w * of_line(cell)).sum()
+            };
+            let values: Vec<f32> = (0..all).map(value).collect();
+            let over = |least: f32| values.iter().filter(|v| **v > least).count();
+            let bit = |i: usize| found.bits[at * bytes + i / 8] >> (i % 8) & 1 == 1;
+            off += (0..all).filter(|&i| bit(i) != (values[i] > 0.0)).count();
+            for (count, sign) in found.counts[2 * at..].iter().zip([1.0, -1.0]) {
+                let wanted = over(sign * judging.stability_offset) as f32;
+                off += (wanted - count).abs().round() as usize;
+            }
+        }
+        let share = off as f64 / (3 * all * points.len() * logits.levels) as f64;
+        if share <= JUDGED_OFF_MAX {
+            return Ok(());
+        }
+        Err(Error::internal(format!(
+            "{DECODER}: {share:.1e} of the pixels that it judges are not those of its logits, over \
+             {JUDGED_OFF_MAX:.0e}"
+        )))
     }
 
     /// Encodes a photo and decodes points of it, one and a batch, and looks at all numbers.
@@ -144,6 +210,9 @@ impl MaskNetwork {
             if !found.logits.iter().chain(&found.predicted_iou).all(|v| v.is_finite()) {
                 return Err(Error::internal(format!("{DECODER}: a number is not finite")));
             }
+        }
+        if self.judges().is_some() {
+            self.hold_judge(&embedding)?;
         }
         Ok(())
     }
@@ -232,6 +301,9 @@ impl MaskNetwork {
         points: &[[f32; 2]],
         judging: &MaskJudging,
     ) -> Result<JudgedMasks> {
+        if self.takes.judged.is_none() {
+            return Err(Error::internal(format!("{DECODER}: its file does not judge masks")));
+        }
         let kinds = judging.levels.len();
         let pixels = judging.pixels[0] * judging.pixels[1];
         let most = (JUDGED_PIXELS_MAX / (kinds * pixels).max(1)).max(1);
