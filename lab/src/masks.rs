@@ -23,7 +23,10 @@ use crate::{
     photo_files,
     pipeline::{Pipeline, masks as stage, masks::SeenPhoto},
     rows::{Rows, means, progress},
-    scene::{Gaussians, MaskLogits, Method, Photo, PhotoMasks, PosedPhoto, SceneOptions},
+    scene::{
+        Gaussians, JudgedMasks, MaskJudging, MaskLogits, Method, Photo, PhotoMasks, PosedPhoto,
+        SceneOptions,
+    },
     scenes::{is_posed, make, nearest},
     segment::{self, Bitset, PromptDecoder, Proposals, Seed, Settings},
     setup::Inputs,
@@ -84,6 +87,15 @@ impl PromptDecoder for Counted<'_> {
             return self.seen.decode(points);
         }
         SeenPhoto::new(self.network, self.photo)?.decode(points)
+    }
+
+    fn judges(&self) -> Option<(usize, [usize; 2])> {
+        self.seen.judges()
+    }
+
+    fn judge(&self, points: &[[f32; 2]], judging: &MaskJudging) -> Result<JudgedMasks> {
+        self.asked.fetch_add(points.len(), Ordering::Relaxed);
+        self.seen.judge(points, judging)
     }
 
     fn on<'b>(&'b self, photo: &'b Photo) -> Result<Box<dyn PromptDecoder + 'b>> {

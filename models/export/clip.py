@@ -3,7 +3,7 @@
     python clip.py --model ViT-B-16 --checkpoint open_clip_pytorch_model.bin --out DIR     # laion2b_s34b_b88k
     python clip.py --model ViT-B-16 --random 1 --out DIR
 
-The tokenizer is CLIP's byte-pair encoding, written as a `tokenizer.json` of the `tokenizers` library. It is held
+`--half` writes the image tower in f16, for a GPU. The tokenizer is CLIP's byte-pair encoding, written as a `tokenizer.json` of the `tokenizers` library. It is held
 to OpenCLIP's own tokenizer on the phrases of `phrases()`.
 """
 import gzip
@@ -11,13 +11,16 @@ import os
 
 import open_clip
 import torch
+from torch.nn.functional import linear, normalize
 from tokenizers import Regex, Tokenizer, decoders, models, normalizers, pre_tokenizers, processors
 
-from common import arguments, entry, export, hold, prepare, session, sha256, write_section
+from common import TOLERANCES, arguments, entry, export, hold, prepare, session, sha256, write_section
 
 BEGIN, END = "<|startoftext|>", "<|endoftext|>"
 WORDS = r"""<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"""
 CONTEXT = 77
+# Crops in one run, for a CPU and for a GPU.
+BATCHES = {False: 16, True: 64}
 
 
 class ImageTower(torch.nn.Module):
@@ -27,6 +30,24 @@ class ImageTower(torch.nn.Module):
 
     def forward(self, images):
         return self.clip.encode_image(images, normalize=True)
+
+
+class Attention(torch.nn.Module):
+    """`MultiheadAttention` over the whole sequence, with fewer operators: PyTorch's export of it is 40 nodes of
+    shapes, of which ONNX Runtime brings some back to the CPU, and in f16 the CPU provider of its release 1.31 ends
+    with a segmentation fault when it optimises them (`NchwcTransformer`)."""
+
+    def __init__(self, own):
+        super().__init__()
+        self.own = own
+
+    def forward(self, query, key, value, need_weights=False, attn_mask=None):
+        own, length = self.own, int(query.shape[1])
+        every = linear(query, own.in_proj_weight, own.in_proj_bias)
+        heads = every.reshape(-1, length, 3, own.num_heads, own.head_dim).permute(2, 0, 3, 1, 4)
+        q, k, v = heads.unbind(0)
+        found = (q * own.head_dim**-0.5 @ k.transpose(2, 3)).softmax(dim=-1) @ v
+        return own.out_proj(found.transpose(1, 2).reshape(-1, length, own.embed_dim)), None
 
 
 class TextTower(torch.nn.Module):
@@ -81,12 +102,14 @@ def compare(args, clip, made, at):
     hold("texts: 1 - cosine", float(1 - (rows * clip.encode_text(wanted[::40], normalize=True)).sum(1).min()), 1e-4)
     images = torch.randn(4, 3, *clip.visual.image_size)
     rows = torch.from_numpy(session(at("image_tower.onnx")).run(None, {"images": images.numpy()})[0])
+    rows = normalize(rows)  # in f16 a length of 1 is not exact
     hold("images: 1 - cosine", float(1 - (rows * clip.encode_image(images, normalize=True)).sum(1).min()), 1e-4)
 
 
 def main():
     ap = arguments(__doc__)
     ap.add_argument("--model", default="ViT-B-16", help="a model of open_clip.list_models()")
+    ap.add_argument("--half", action="store_true", help="the image tower in f16")
     args = ap.parse_args()
     os.makedirs(args.out, exist_ok=True)
     at = lambda name: os.path.join(args.out, name)  # noqa: E731
@@ -95,8 +118,11 @@ def main():
     made = tokenizer()
     made.save(at("tokenizer.json"))
     side = clip.visual.image_size[0]
+    if args.half:
+        for block in clip.visual.transformer.resblocks:
+            block.attn = Attention(block.attn)
     export(ImageTower(clip), {"images": torch.randn(2, 3, side, side)}, at("image_tower.onnx"), ["embeddings"],
-           {"images": {0: "crops"}, "embeddings": {0: "crops"}})
+           {"images": {0: "crops"}, "embeddings": {0: "crops"}}, half=args.half)
     example = open_clip.get_tokenizer(args.model)(["a photo of a fox", "a box"], context_length=CONTEXT)
     export(TextTower(clip), {"input_ids": example}, at("text_tower.onnx"), ["embeddings"],
            {"input_ids": {0: "texts"}, "embeddings": {0: "texts"}})
@@ -122,7 +148,8 @@ mean = {[round(v, 8) for v in clip.visual.image_mean]}
 std = {[round(v, 8) for v in clip.visual.image_std]}
 resize = "bicubic"
 crop_margin = 0.0
-batch = 16
+batch = {BATCHES[args.half]}
+tolerance = {TOLERANCES[args.half]}
 
 [image_text.text]
 {entry(at("text_tower.onnx"))}

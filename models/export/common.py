@@ -20,6 +20,9 @@ OPSET = 17
 # A protobuf file holds at most 2 GiB. Larger weights go into a second file beside it.
 INLINE_BYTES_MAX = 1 << 30
 
+# How much a device may differ from a CPU, in f32 and in f16: share of the answer, root of mean squares.
+TOLERANCES = {False: 0.002, True: 0.02}
+
 
 def arguments(doc):
     """A parser with the options of every exporter."""
@@ -45,8 +48,9 @@ def prepare(args):
     torch.set_grad_enabled(False)
 
 
-def export(model, inputs, path, output_names, dynamic=None):
-    """Writes `model` as ONNX. `inputs` is name to example tensor; `dynamic` is tensor name to {axis: name}."""
+def export(model, inputs, path, output_names, dynamic=None, half=False):
+    """Writes `model` as ONNX. `inputs` is name to example tensor; `dynamic` is tensor name to {axis: name}. With `half`
+    the file computes in f16; its inputs and outputs stay f32."""
     data = path + ".data"
     # Over 2 GiB the exporter writes a file for each tensor: they go with the folder.
     with tempfile.TemporaryDirectory(dir=os.path.dirname(path)) as place:
@@ -55,6 +59,8 @@ def export(model, inputs, path, output_names, dynamic=None):
                           dynamic_axes=dynamic or {}, opset_version=OPSET, dynamo=False)
         graph = onnx.load(first)
     single_precision(graph.graph)
+    if half:
+        half_precision(graph.graph)
     size = sum(len(tensor.raw_data) for tensor in graph.graph.initializer)
     if os.path.exists(data):
         os.remove(data)
@@ -84,6 +90,44 @@ def single_precision(graph):
                 single_precision(attribute.g)
     # Types that the exporter noted; ONNX Runtime finds them again.
     del graph.value_info[:]
+
+
+def half_precision(graph):
+    """A graph of f32 computes in f16 between its inputs and outputs, which stay f32. Norms and softmax still add up
+    in f32 there: ONNX Runtime's kernels do."""
+    single, half = onnx.TensorProto.FLOAT, onnx.TensorProto.FLOAT16
+
+    def narrowed(tensor):
+        if tensor.data_type == single:
+            tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float16), tensor.name))
+
+    for tensor in graph.initializer:
+        narrowed(tensor)
+    renamed = {}
+    for node in graph.node:
+        for attribute in node.attribute:
+            if attribute.type == onnx.AttributeProto.TENSOR:
+                narrowed(attribute.t)
+            if node.op_type == "Cast" and attribute.name == "to" and attribute.i == single:
+                attribute.i = half
+            if attribute.type == onnx.AttributeProto.GRAPH or attribute.name in ("value_float", "value_floats"):
+                sys.exit(f"{node.name}: {node.op_type} is not known in f16")
+    weights = {tensor.name for tensor in graph.initializer}
+    first, last = [], []
+    for value in graph.input:
+        if value.type.tensor_type.elem_type == single and value.name not in weights:
+            renamed[value.name] = value.name + "/half"
+            first.append(onnx.helper.make_node("Cast", [value.name], [renamed[value.name]], to=half, name=value.name + "/to_half"))
+    for value in graph.output:
+        if value.type.tensor_type.elem_type == single:
+            renamed[value.name] = value.name + "/half"
+            last.append(onnx.helper.make_node("Cast", [renamed[value.name]], [value.name], to=single, name=value.name + "/to_single"))
+    for node in graph.node:
+        node.input[:] = [renamed.get(name, name) for name in node.input]
+        node.output[:] = [renamed.get(name, name) for name in node.output]
+    nodes = [*first, *graph.node, *last]
+    del graph.node[:]
+    graph.node.extend(nodes)
 
 
 def entry(path):
@@ -120,7 +164,7 @@ def write_section(args, name, text):
         print(f"{file:32} {os.path.getsize(os.path.join(args.out, file)) / 2**20:10.2f} MiB")
 
 
-def write_masks(args, at, section, size):
+def write_masks(args, at, section, size, batch=64):
     """The section of a mask network whose files are `mask_encoder.onnx` and `mask_decoder.onnx`; `section` has its own keys."""
     weights = os.path.basename(args.checkpoint or f"random weights, seed {args.random}")
     write_section(args, "masks", f"""
@@ -129,7 +173,7 @@ def write_masks(args, at, section, size):
 licence = "Apache-2.0"
 size = {size}
 points_per_side = 32
-points_per_batch = 64
+points_per_batch = {batch}
 stability_score_offset = 1.0
 box_nms_thresh = 0.7
 

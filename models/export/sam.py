@@ -3,29 +3,102 @@
     python sam.py --model vit_h --checkpoint sam_vit_h_4b8939.pth --out DIR
     python sam.py --model vit_b --random 1 --out DIR
 
-The encoder is the official one. The decoder is the official one over a batch of prompts: the published ONNX
-script fixes the batch at one prompt and enlarges every mask to the photo, which nothing here reads.
+Encoder and decoder are the official ones, with some products in another order; the decoder takes a batch of
+prompts. The published ONNX script fixes the batch at one prompt. `--half` stores and computes both in f16. The
+decoder's file also judges masks at the photo's pixels, so that a device gives bits and not logits back.
 Levels are SAM's: 0 is the mask of several points, 1 to 3 are part, object and whole.
 """
+import copy
 import os
 
+import numpy as np
+import onnx
 import torch
 from segment_anything import sam_model_registry
+from torch.nn.functional import layer_norm
 
-from common import arguments, export, gap, hold, prepare, session, write_masks
+from common import TOLERANCES, arguments, export, gap, half_precision, hold, prepare, session, write_masks
+from judge import with_judge
 
 SIDE = 1024
 MEAN, STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
+# Prompts in one run, for a CPU and for a GPU.
+BATCHES = {False: 64, True: 256}
 
 
-class Decoder(torch.nn.Module):
-    """`SamOnnxModel` without former masks and without enlarging, for any number of prompts."""
+class ChannelNorm(torch.nn.Module):
+    """SAM's `LayerNorm2d` as one operator, whose sums are of f32 also where its tensors are not."""
+
+    def __init__(self, norm):
+        super().__init__()
+        self.norm = norm
+
+    def forward(self, x):
+        n = self.norm
+        return layer_norm(x.permute(0, 2, 3, 1), n.weight.shape, n.weight, n.bias, n.eps).permute(0, 3, 1, 2)
+
+
+class FoldedAttention(torch.nn.Module):
+    """SAM's attention of the encoder. The positions along both axes, `rel_h` and `rel_w`, are further channels of
+    the queries, and the keys say there in which row and column they are: one product, not three passes over
+    the largest tensor."""
+
+    def __init__(self, attention):
+        super().__init__()
+        self.own = attention
+
+    @staticmethod
+    def offsets(size):
+        places = torch.arange(size)
+        return places[:, None] - places[None, :] + size - 1
+
+    def forward(self, x):
+        own, (batch, height, width, channels) = self.own, x.shape
+        height, width, heads = int(height), int(width), own.num_heads
+        if len(own.rel_pos_h) != 2 * height - 1 or len(own.rel_pos_w) != 2 * width - 1:
+            raise SystemExit("the encoder's tables of positions are of another size")
+        qkv = own.qkv(x).reshape(-1, height * width, 3, heads, channels // heads).permute(2, 0, 3, 1, 4)
+        q, k, v = qkv.reshape(3, -1, height * width, channels // heads).unbind(0)
+        by_row = q.reshape(-1, height, width, channels // heads)
+        of_row = own.rel_pos_h[self.offsets(height)].transpose(1, 2)
+        of_column = own.rel_pos_w[self.offsets(width)].transpose(1, 2)
+
+        def product(batched, table):  # [i, B, j, c] x [i, c, k], one product for each i
+            size, rows, others = batched.shape[0], batched.shape[1], batched.shape[2]
+            return (batched.reshape(size, -1, channels // heads) @ table).reshape(size, rows, others, -1)
+
+        rel_h = product(by_row.permute(1, 0, 2, 3), of_row).permute(1, 0, 2, 3).reshape(-1, height * width, height)
+        rel_w = product(by_row.permute(2, 0, 1, 3), of_column).permute(1, 2, 0, 3).reshape(-1, height * width, width)
+        rows = torch.eye(height).repeat_interleave(width, dim=0)
+        columns = torch.eye(width).repeat(height, 1)
+        place = torch.cat([rows, columns], dim=1).expand(k.shape[0], -1, -1)
+        scores = torch.cat([q * own.scale, rel_h, rel_w], dim=2) @ torch.cat([k, place], dim=2).transpose(1, 2)
+        found = (scores.softmax(dim=-1) @ v).reshape(-1, heads, height, width, channels // heads)
+        return own.proj(found.permute(0, 2, 3, 1, 4).reshape(-1, height, width, channels))
+
+
+def encoder_of(sam):
+    """The official encoder with the same weights, whose attention and norms are of fewer operators."""
+    encoder = copy.copy(sam.image_encoder)
+    encoder._modules = dict(encoder._modules)
+    encoder.neck = torch.nn.Sequential(*[ChannelNorm(m) if type(m).__name__ == "LayerNorm2d" else m for m in encoder.neck])
+    blocks = []
+    for block in encoder.blocks:
+        block = copy.copy(block)
+        block._modules = {**block._modules, "attn": FoldedAttention(block.attn)}
+        blocks.append(block)
+    encoder.blocks = torch.nn.ModuleList(blocks)
+    return encoder
+
+
+class Prompts(torch.nn.Module):
+    """Points and their labels as tokens; f32 in every file, because the sines of places need it."""
 
     def __init__(self, sam):
         super().__init__()
-        self.prompts, self.masks, self.side = sam.prompt_encoder, sam.mask_decoder, sam.image_encoder.img_size
+        self.prompts, self.side = sam.prompt_encoder, sam.image_encoder.img_size
 
-    def points(self, coords, labels):
+    def forward(self, coords, labels):
         code = self.prompts.pe_layer._pe_encoding((coords + 0.5) / self.side)
         labels = labels.unsqueeze(-1)
         code = code * (labels != -1) + self.prompts.not_a_point_embed.weight * (labels == -1)
@@ -33,55 +106,102 @@ class Decoder(torch.nn.Module):
             code = code + embedding.weight * (labels == i)
         return code
 
-    def forward(self, image_embeddings, point_coords, point_labels):
-        sparse = self.points(point_coords, point_labels)
-        count = sparse.shape[0]
-        m = self.masks
+
+class Decoder(torch.nn.Module):
+    """`SamOnnxModel` without former masks and without enlarging, for any number of prompts. What is the same for
+    all prompts is computed once, and both steps of the enlarging are products of matrices, channels last."""
+
+    def __init__(self, sam):
+        super().__init__()
+        self.masks, self.side = sam.mask_decoder, sam.image_encoder.img_size // 16
+        self.register_buffer("places", sam.prompt_encoder.get_dense_pe())
+        self.register_buffer("dense", sam.prompt_encoder.no_mask_embed.weight.reshape(1, -1, 1, 1))
+
+    @staticmethod
+    def doubled(step, x):
+        """A transposed convolution of 2 x 2 and stride 2: each cell makes four, `[..., c]` to `[..., 4, c']`."""
+        channels = step.bias.shape[0]
+        matrix = step.weight.permute(0, 2, 3, 1).reshape(-1, 4 * channels)
+        return (x @ matrix).unflatten(-1, (4, channels)) + step.bias
+
+    def forward(self, image_embeddings, prompt_tokens):
+        m, side, count = self.masks, self.side, prompt_tokens.shape[0]
         tokens = torch.cat([m.iou_token.weight, m.mask_tokens.weight]).unsqueeze(0).expand(count, -1, -1)
-        dense = self.prompts.no_mask_embed.weight.reshape(1, -1, 1, 1)
-        source = (image_embeddings + dense).expand(count, -1, -1, -1)
-        places = self.prompts.get_dense_pe().expand(count, -1, -1, -1)
-        hidden, source = m.transformer(source, places, torch.cat((tokens, sparse), dim=1))
-        side = image_embeddings.shape[-1]
-        source = source.transpose(1, 2).reshape(count, -1, side, side)
-        enlarged = m.output_upscaling(source)
+        tokens = torch.cat((tokens, prompt_tokens), dim=1)
+        hidden, cells = m.transformer(image_embeddings + self.dense, self.places, tokens)
+        first, norm, gelu, second, last = m.output_upscaling
+        fine = gelu(layer_norm(self.doubled(first, cells), norm.weight.shape, norm.weight, norm.bias, norm.eps))
+        fine = last(self.doubled(second, fine)).reshape(count, 16 * side * side, -1)
         rows = [m.output_hypernetworks_mlps[i](hidden[:, 1 + i]) for i in range(m.num_mask_tokens)]
-        masks = (torch.stack(rows, dim=1) @ enlarged.flatten(2)).reshape(count, -1, 4 * side, 4 * side)
-        return masks, m.iou_prediction_head(hidden[:, 0])
+        masks = fine @ torch.stack(rows, dim=2)
+        masks = masks.reshape(count, side, side, 2, 2, 2, 2, m.num_mask_tokens).permute(0, 7, 1, 3, 5, 2, 4, 6)
+        return masks.reshape(count, m.num_mask_tokens, 4 * side, 4 * side), m.iou_prediction_head(hidden[:, 0])
+
+
+def export_decoder(sam, path, half):
+    """Prompts, decoder and judge as one file."""
+    part = lambda name: f"{path}.{name}"  # noqa: E731
+    side = sam.image_encoder.img_size
+    coords, labels = torch.rand(3, 2, 2) * side, torch.tensor([[1.0, -1.0]]).repeat(3, 1)
+    dynamic = lambda *names: {name: {0: "prompts"} for name in names}  # noqa: E731
+    export(Prompts(sam), {"point_coords": coords, "point_labels": labels}, part("prompts"), ["prompt_tokens"],
+           dynamic("point_coords", "point_labels", "prompt_tokens"))
+    example = {"image_embeddings": torch.randn(1, 256, side // 16, side // 16), "prompt_tokens": Prompts(sam)(coords, labels)}
+    export(Decoder(sam), example, part("decoder"), ["low_res_masks", "iou_predictions"],
+           dynamic("prompt_tokens", "low_res_masks", "iou_predictions"))
+    prompts, decoder = onnx.load(part("prompts")), onnx.load(part("decoder"))
+    if half:
+        half_precision(decoder.graph)
+    onnx.compose.add_prefix(prompts, "prompts/", rename_inputs=False, rename_outputs=False, inplace=True)
+    prompts.ir_version = decoder.ir_version
+    both = onnx.compose.merge_models(prompts, decoder, [("prompt_tokens", "prompt_tokens")])
+    onnx.save_model(with_judge(both, side // 4), path)
+    os.remove(part("prompts")), os.remove(part("decoder"))
 
 
 def compare(args, sam, at):
-    """Both files against the official modules, with one prompt and with several."""
+    """Both files against the official modules, with one prompt and with several; the judge against NumPy."""
+    bound = 0.05 if args.half else 1e-3
     image = torch.randn(1, 3, SIDE, SIDE)
     embedding = sam.image_encoder(image)
     found = session(at("mask_encoder.onnx")).run(None, {"images": image.numpy()})[0]
-    hold("encoder", gap(found, embedding), 1e-3)
+    hold("encoder", gap(found, embedding), bound)
     decoder = session(at("mask_decoder.onnx"))
+    rows, columns = torch.rand(30, SIDE // 4).softmax(1), torch.rand(SIDE // 4, 45).softmax(0)
     for count in (1, 5, 64):
         coords = torch.rand(count, 2, 2) * SIDE
         labels = torch.tensor([[1.0, -1.0]]).repeat(count, 1)
         coords[:, 1] = 0
         sparse, dense = sam.prompt_encoder(points=(coords[:, :1], labels[:, :1]), boxes=None, masks=None)
         masks, iou = sam.mask_decoder.predict_masks(embedding, sam.prompt_encoder.get_dense_pe(), sparse, dense)
-        feed = {"image_embeddings": embedding.numpy(), "point_coords": coords.numpy(), "point_labels": labels.numpy()}
+        # A threshold between the values, so that both sides have some.
+        offset = float((rows @ masks @ columns).abs().median())
+        feed = {"image_embeddings": embedding.numpy(), "point_coords": coords.numpy(), "point_labels": labels.numpy(),
+                "judged_levels": np.array([3, 1]), "photo_rows": rows.numpy(), "photo_columns": columns.numpy(),
+                "stability_offset": np.array([offset], np.float32)}
         found = decoder.run(None, feed)
-        hold(f"decoder, {count} prompts, masks", gap(found[0], masks), 1e-3)
-        hold(f"decoder, {count} prompts, IoU", gap(found[1], iou), 1e-3)
+        hold(f"decoder, {count} prompts, masks", gap(found[0], masks), bound)
+        hold(f"decoder, {count} prompts, IoU", gap(found[1], iou), bound)
+        pixels = (rows.numpy() @ found[0][:, [3, 1]] @ columns.numpy()).reshape(count, 2, -1)
+        bits = np.unpackbits(found[2], axis=2, bitorder="little")
+        wrong = (bits[..., : pixels.shape[2]] != (pixels > 0)).mean() + bits[..., pixels.shape[2] :].sum()
+        hold(f"decoder, {count} prompts, pixels that differ", float(wrong), 1e-3)
+        counts = np.stack([(pixels > offset).sum(2), (pixels > -offset).sum(2)], axis=2)
+        hold(f"decoder, {count} prompts, counts", float(np.abs(found[3] - counts).max() / pixels.shape[2]), 2e-3)
 
 
 def main():
     ap = arguments(__doc__)
     ap.add_argument("--model", required=True, choices=["vit_b", "vit_l", "vit_h"])
+    ap.add_argument("--half", action="store_true", help="f16: half of the size, and several times as fast on a GPU")
     args = ap.parse_args()
     os.makedirs(args.out, exist_ok=True)
     at = lambda name: os.path.join(args.out, name)  # noqa: E731
     prepare(args)
     sam = sam_model_registry[args.model](checkpoint=args.checkpoint).eval()
-    export(sam.image_encoder, {"images": torch.randn(1, 3, SIDE, SIDE)}, at("mask_encoder.onnx"), ["image_embeddings"])
-    example = {"image_embeddings": torch.randn(1, 256, SIDE // 16, SIDE // 16), "point_coords": torch.rand(3, 2, 2) * SIDE,
-               "point_labels": torch.tensor([[1.0, -1.0]]).repeat(3, 1)}
-    dynamic = {name: {0: "prompts"} for name in ("point_coords", "point_labels", "low_res_masks", "iou_predictions")}
-    export(Decoder(sam), example, at("mask_decoder.onnx"), ["low_res_masks", "iou_predictions"], dynamic)
+    image = {"images": torch.randn(1, 3, SIDE, SIDE)}
+    export(encoder_of(sam), image, at("mask_encoder.onnx"), ["image_embeddings"], half=args.half)
+    export_decoder(sam, at("mask_decoder.onnx"), args.half)
     if not args.skip_check:
         compare(args, sam, at)
     write_masks(args, at, f"""
@@ -92,7 +212,8 @@ std = {[round(v / 255, 7) for v in STD]}
 levels = [1, 2, 3]
 pred_iou_thresh = 0.88
 stability_score_thresh = 0.95
-""", SIDE)
+tolerance = {TOLERANCES[args.half]}
+""", SIDE, BATCHES[args.half])
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Makes weights of Segment Anything that need no download and whose masks lie at their prompts.
 
-    python3 local_sam.py OUT.pth [--model vit_b] [--seed 1]
+    python3 local_sam.py OUT.pth [--model vit_b] [--seed 1] [--sharpness 60]
 
 Random weights give masks that are all alike and cover the photo: box NMS leaves one of them. Here
 some weights of the prompts and of the decoder are set, so that everything-mode can be compared with
@@ -54,7 +54,7 @@ def attend_by_distance(sam):
         step.weight.copy_(step.weight[..., :1, :1].expand_as(step.weight))
 
 
-def fit(sam):
+def fit(sam, sharpness=SHARPNESS):
     """Fits the masks' rows and the predicted IoU on random prompts and a random embedding."""
     decoder, side = sam.mask_decoder, sam.image_encoder.img_size
     embedding = torch.randn(1, 256, side // 16, side // 16)
@@ -86,7 +86,7 @@ def fit(sam):
         common = (found & (wanted > 0)).sum() / (found | (wanted > 0)).sum()
         print(f"radius {radius}: IoU with the discs {float(common):.2f}")
         mlp.layers[-1].weight *= 0.01
-        mlp.layers[-1].bias[:] = SHARPNESS * fitted
+        mlp.layers[-1].bias[:] = sharpness * fitted
     head = decoder.iou_prediction_head.layers[-1]
     scale = 0.03 / scores.std(dim=0)
     head.bias[:] = 0.93 + (head.bias - scores.mean(dim=0)) * scale
@@ -98,12 +98,14 @@ def main():
     parser.add_argument("out")
     parser.add_argument("--model", default="vit_b", choices=["vit_b", "vit_l", "vit_h"])
     parser.add_argument("--seed", type=int, default=1)
+    # More of it, more masks are stable enough.
+    parser.add_argument("--sharpness", type=float, default=SHARPNESS)
     args = parser.parse_args()
     torch.manual_seed(args.seed)
     torch.set_grad_enabled(False)
     sam = sam_model_registry[args.model]().eval()
     attend_by_distance(sam)
-    fit(sam)
+    fit(sam, args.sharpness)
     torch.save(sam.state_dict(), args.out)
 
 

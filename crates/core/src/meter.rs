@@ -38,6 +38,7 @@ static SECONDS: LazyLock<HistogramVec> = LazyLock::new(|| {
 pub fn register() {
     LazyLock::force(&SECONDS);
     LazyLock::force(&FALLBACKS);
+    LazyLock::force(&RUNS);
 }
 
 /// Name of the metric: runs that the CPU answered because the provider failed, by `network`.
@@ -46,6 +47,20 @@ pub const NETWORK_FALLBACKS: &str = "segsplat_network_fallbacks_total";
 /// Names of the networks.
 const NETWORKS: [&str; 5] =
     ["geometry network", "mask encoder", "mask decoder", "image tower", "text tower"];
+
+/// Name of the metric: time of each run of a network, copies to and from the device included, by
+/// `network`.
+pub const NETWORK_SECONDS: &str = "segsplat_network_seconds";
+
+static RUNS: LazyLock<HistogramVec> = LazyLock::new(|| {
+    let help = "Time of each run of a network, copies to and from the device included";
+    let seconds = register_histogram_vec!(NETWORK_SECONDS, help, &["network"], BUCKETS.to_vec())
+        .expect("the name is registered once; this is a bug");
+    for network in NETWORKS {
+        seconds.with_label_values(&[network]);
+    }
+    seconds
+});
 
 static FALLBACKS: LazyLock<IntCounterVec> = LazyLock::new(|| {
     let help = "Runs of a network that the CPU answered because the provider failed";
@@ -62,6 +77,13 @@ static FALLBACKS: LazyLock<IntCounterVec> = LazyLock::new(|| {
 pub fn fallback(network: &str) {
     if NETWORKS.contains(&network) {
         FALLBACKS.with_label_values(&[network]).inc();
+    }
+}
+
+/// Records the seconds of a run of `network`; another name is not recorded.
+pub fn network(network: &str, seconds: f64) {
+    if NETWORKS.contains(&network) {
+        RUNS.with_label_values(&[network]).observe(seconds);
     }
 }
 

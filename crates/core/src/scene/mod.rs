@@ -33,8 +33,8 @@ pub use photo::{Crop, CropShape, Photo, PosedPhoto};
 pub use refinement::{Refine, RefineReport, RefineState, RefineStatus};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{
-    Bank, BankMask, IndexMap, MaskInfo, MaskLogits, OverlapNms, PhotoMasks, Semantics,
-    SemanticsReport, TextEmbedding,
+    Bank, BankMask, IndexMap, JudgedMasks, MaskInfo, MaskJudging, MaskLogits, OverlapNms,
+    PhotoMasks, Semantics, SemanticsReport, TextEmbedding,
 };
 pub use stage::{Stage, Watch, unless_cancelled};
 pub use status::{

@@ -82,6 +82,32 @@ pub struct MaskLogits {
     pub predicted_iou: Vec<f32>,
 }
 
+/// How masks are judged at the photo's pixels where the network runs.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct MaskJudging {
+    /// Which of the decoder's masks (K), counted as in [`MaskLogits::levels`].
+    pub levels: Vec<usize>,
+    /// `[width, height]` of the photo, pixels.
+    pub pixels: [usize; 2],
+    /// `[height * grid height]`: weights that make rows of pixels of rows of logits.
+    pub rows: Vec<f32>,
+    /// `[grid width * width]`: the same for columns.
+    pub columns: Vec<f32>,
+    /// Logits between the stricter and the looser threshold, each side of 0.
+    pub stability_offset: f32,
+}
+
+/// Masks of a batch of points at the photo's pixels.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct JudgedMasks {
+    /// `[B * K * ceil(pixels / 64) * 8]`: pixels over 0, row by row, the first in the lowest bit.
+    pub bits: Vec<u8>,
+    /// `[B * K * 2]`: pixels over the stricter and over the looser threshold.
+    pub counts: Vec<f32>,
+    /// `[B * K]`.
+    pub predicted_iou: Vec<f32>,
+}
+
 /// A text as the text tower sees it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TextEmbedding {

@@ -2,6 +2,7 @@
 
 use std::{collections::BTreeMap, sync::Arc};
 
+use rayon::prelude::*;
 use tokenizers::Tokenizer;
 
 use crate::{
@@ -36,7 +37,7 @@ pub struct ImageText {
     texts: Option<usize>,
 }
 
-/// Largest difference of a provider to the CPU, of embeddings.
+/// Largest difference of a provider to the CPU, of embeddings of texts.
 const TOLERANCE: f64 = 2e-3;
 /// Texts a run of the text tower where its file leaves that free.
 const TEXTS_A_RUN: usize = 64;
@@ -72,7 +73,7 @@ impl ImageText {
             cpu_file: None,
             signature: image_signature(&manifest),
             keeps_memory: true,
-            tolerance: TOLERANCE,
+            tolerance: tower.tolerance,
             probe: &|takes| {
                 let count = size(takes, &tower.input, 0).unwrap_or(tower.batch);
                 let wave = |i: usize| (i as f32 * 0.013).sin() + (i as f32 * 0.000_7).cos();
@@ -161,13 +162,12 @@ impl ImageText {
         for batch in crops.chunks(self.crops.unwrap_or(tower.batch)) {
             // Where the number of crops is fixed, the last run is filled up.
             let count = self.crops.unwrap_or(batch.len());
-            let mut images = Vec::with_capacity(count * 3 * side * side);
-            for crop in batch {
+            let mut images = vec![0.0; count * 3 * side * side];
+            images.par_chunks_exact_mut(3 * side * side).zip(batch).for_each(|(out, crop)| {
                 let from = [crop.width, crop.height].map(|side| side as usize);
                 let pixels = resize(&crop.rgb, from, [side; 2], tower.resize);
-                images.extend(planes(&pixels, [side; 2], side, tower.mean, tower.std));
-            }
-            images.resize(count * 3 * side * side, 0.0);
+                out.copy_from_slice(&planes(&pixels, [side; 2], side, tower.mean, tower.std));
+            });
             let input = Input::new(&tower.input, &[count, 3, side, side], images);
             let found = self
                 .image

@@ -28,6 +28,8 @@ const POINTS_PER_SIDE_MAX: u32 = 256;
 const CROP_LAYERS_MAX: u32 = 3;
 /// Prompts in one run of a decoder: their logits are in memory together.
 const POINTS_PER_BATCH_MAX: u32 = 1_024;
+/// Over this an answer is another one.
+const TOLERANCE_MAX: f64 = 0.1;
 /// Crops in one run of an image tower.
 const BATCH_MAX: usize = 256;
 /// Numbers of one embedding.
@@ -267,6 +269,10 @@ pub struct MasksManifest {
     /// Smallest mask, share of the photo.
     #[serde(default = "defaults::min_area")]
     pub min_area: f64,
+    /// Most by which a device may differ from the CPU, root of mean squares, share of the answer;
+    /// files of f16 need more than the default.
+    #[serde(default = "defaults::tolerance")]
+    pub tolerance: f64,
     /// The image encoder.
     pub encoder: MaskEncoderManifest,
     /// The prompt decoder.
@@ -392,6 +398,10 @@ pub struct ImageTowerManifest {
     /// Crops in one run, where the file takes several.
     #[serde(default = "defaults::batch")]
     pub batch: usize,
+    /// Most by which a device may differ from the CPU, root of mean squares, share of the answer;
+    /// a file of f16 needs more than the default.
+    #[serde(default = "defaults::tolerance")]
+    pub tolerance: f64,
 }
 
 /// The text tower.
@@ -444,6 +454,7 @@ mod defaults {
         min_area: f64 = 0.0005;
         coverage_floor: f32 = 0.05_f32;
         batch: usize = 16_usize;
+        tolerance: f64 = 2e-3;
         image_embeddings: String = "image_embeddings";
         point_coords: String = "point_coords";
         point_labels: String = "point_labels";
@@ -529,6 +540,7 @@ impl MasksManifest {
         if self.levels.is_empty() || self.levels.iter().any(|&level| level > 15) {
             faults.wrong("masks.levels", &self.levels, "hold 1 or more of 0 to 15");
         }
+        faults.range("masks.tolerance", self.tolerance, 0.0..=TOLERANCE_MAX);
         faults.range("masks.points_per_side", self.points_per_side, 1..=POINTS_PER_SIDE_MAX);
         faults.range("masks.points_per_batch", self.points_per_batch, 1..=POINTS_PER_BATCH_MAX);
         faults.range("masks.pred_iou_thresh", self.pred_iou_thresh, 0.0..=1.0);
@@ -577,6 +589,7 @@ impl ImageTextManifest {
         }
         faults.range("image_text.coverage_floor", self.coverage_floor, 0.0..=1.0);
         faults.range("image_text.image.crop_margin", image.crop_margin, 0.0..=4.0);
+        faults.range("image_text.image.tolerance", image.tolerance, 0.0..=TOLERANCE_MAX);
         faults.range("image_text.image.batch", image.batch, 1..=BATCH_MAX);
         faults.range("image_text.text.context", text.context, 1..=CONTEXT_MAX);
     }

@@ -5,23 +5,34 @@
 
 use std::{borrow::Cow, sync::Arc};
 
+use tracing::warn;
+
 use crate::{
     error::{Error, Result},
     models::{
-        Bundle, MaskAdapter, MasksManifest, NetworkOptions, Runtime,
+        Bundle, MaskAdapter, MasksManifest, NetworkOptions, Provider, Runtime,
         check::Signature,
         manifest::unavailable,
         network::{self, Input, Network, Outputs, Side, Spec, Wanted, fixed},
         resize::{planes, resize},
     },
-    scene::{MaskLogits, Photo},
+    scene::{JudgedMasks, MaskJudging, MaskLogits, Photo},
 };
 
 /// Names of the two files in messages.
 const ENCODER: &str = "mask encoder";
 const DECODER: &str = "mask decoder";
-/// Largest difference of a provider to the CPU, of embeddings and of logits.
-const TOLERANCE: f64 = 2e-3;
+/// Tensors of a decoder's file that judges masks at the photo's pixels; `models/export/sam.py`.
+const JUDGED_LEVELS: &str = "judged_levels";
+const PHOTO_ROWS: &str = "photo_rows";
+const PHOTO_COLUMNS: &str = "photo_columns";
+const STABILITY_OFFSET: &str = "stability_offset";
+const MASK_BITS: &str = "mask_bits";
+const MASK_COUNTS: &str = "mask_counts";
+/// Most pixels of masks that are judged in one run: a quarter of a gigabyte of f32, a few times.
+const JUDGED_PIXELS_MAX: usize = 1 << 26;
+/// Largest share of judged pixels that may differ from the logits: those next to a threshold.
+const JUDGED_OFF_MAX: f64 = 5e-3;
 /// Side of the logits of an `efficient_sam` decoder, before it enlarges them.
 const EFFICIENT_SAM_LOGITS: u32 = 256;
 
@@ -56,6 +67,8 @@ struct Takes {
     has_mask: bool,
     /// Whether the photo's size is an input, and of whole numbers.
     size: Option<bool>,
+    /// `[width, height]` of the grid of logits, where the file judges masks.
+    judged: Option<[usize; 2]>,
 }
 
 impl PhotoEmbedding {
@@ -96,7 +109,7 @@ impl MaskNetwork {
             cpu_file: None,
             signature: encoder_signature(&manifest),
             keeps_memory: true,
-            tolerance: TOLERANCE,
+            tolerance: manifest.tolerance,
             probe: &|_| Ok(vec![input()]),
         };
         let encoder = Network::open(runtime, bundle, options, &spec)?;
@@ -111,16 +124,78 @@ impl MaskNetwork {
             cpu_file: None,
             signature: decoder_signature(&manifest),
             keeps_memory: true,
-            tolerance: TOLERANCE,
+            tolerance: manifest.tolerance,
             probe: &|found| {
                 let takes = Takes::of(found, &manifest)?;
                 let points = &points[..takes.batch.min(points.len())];
-                Ok(takes.inputs(&manifest, &seen, points))
+                Ok(takes.inputs(&manifest, &seen, points, None))
             },
         };
         let decoder = Network::open(runtime, bundle, options, &spec)?;
         let takes = Takes::of(decoder.takes(), &manifest)?;
-        Ok(Some(Self { encoder, decoder, takes, manifest: manifest.clone() }))
+        let mut network = Self { encoder, decoder, takes, manifest: manifest.clone() };
+        if network.judges().is_some()
+            && network.provider() != Provider::Cpu
+            && let Err(error) = network.hold_judge(&seen)
+        {
+            warn!(network = DECODER, %error, "its masks are judged by the CPU");
+            network.takes.judged = None;
+        }
+        Ok(Some(network))
+    }
+
+    /// Holds masks that the decoder judges to its own logits.
+    ///
+    /// # Errors
+    /// `internal` when a run fails or more than [`JUDGED_OFF_MAX`] of the pixels differ.
+    fn hold_judge(&self, seen: &PhotoEmbedding) -> Result<()> {
+        let points = [[0.2_f32, 0.3], [0.6, 0.5], [0.9, 0.8]];
+        let logits = self.decode(seen, &points)?;
+        let ([width, height], [columns, rows]) = (logits.grid, [45, 37]);
+        // As a photo's: each pixel lies between two cells.
+        let weight = |cell: usize, cells: usize, at: usize, all: usize| {
+            let place = (at as f32 + 0.5) * cells as f32 / all as f32 - 0.5;
+            (1.0 - (place - cell as f32).abs()).max(0.0)
+        };
+        let row = |y| (0..height).map(move |cell| weight(cell, height, y, rows));
+        let of_cell = |cell| (0..columns).map(move |x| weight(cell, width, x, columns));
+        let judging = MaskJudging {
+            levels: (0..logits.levels).collect(),
+            pixels: [columns, rows],
+            rows: (0..rows).flat_map(row).collect(),
+            columns: (0..width).flat_map(of_cell).collect(),
+            stability_offset: self.manifest.stability_score_offset,
+        };
+        let found = self.judge(seen, &points, &judging)?;
+        let (all, bytes) = (columns * rows, (columns * rows).div_ceil(64) * 8);
+        let mut off = 0;
+        for (at, grid) in logits.logits.chunks_exact(width * height).enumerate() {
+            let value = |pixel: usize| -> f32 {
+                let (x, y) = (pixel % columns, pixel / columns);
+                let of_line = |cell: usize| -> f32 {
+                    let cells = grid[cell * width..].iter().take(width).enumerate();
+                    cells.map(|(i, v)| v * judging.columns[i * columns + x]).sum()
+                };
+                let weights = judging.rows[y * height..].iter().take(height).enumerate();
+                weights.filter(|(_, w)| **w > 0.0).map(|(cell, w)| w * of_line(cell)).sum()
+            };
+            let values: Vec<f32> = (0..all).map(value).collect();
+            let over = |least: f32| values.iter().filter(|v| **v > least).count();
+            let bit = |i: usize| found.bits[at * bytes + i / 8] >> (i % 8) & 1 == 1;
+            off += (0..all).filter(|&i| bit(i) != (values[i] > 0.0)).count();
+            for (count, sign) in found.counts[2 * at..].iter().zip([1.0, -1.0]) {
+                let wanted = over(sign * judging.stability_offset) as f32;
+                off += (wanted - count).abs().round() as usize;
+            }
+        }
+        let share = off as f64 / (3 * all * points.len() * logits.levels) as f64;
+        if share <= JUDGED_OFF_MAX {
+            return Ok(());
+        }
+        Err(Error::internal(format!(
+            "{DECODER}: {share:.1e} of the pixels that it judges are not those of its logits, over \
+             {JUDGED_OFF_MAX:.0e}"
+        )))
     }
 
     /// Encodes a photo and decodes points of it, one and a batch, and looks at all numbers.
@@ -135,6 +210,9 @@ impl MaskNetwork {
             if !found.logits.iter().chain(&found.predicted_iou).all(|v| v.is_finite()) {
                 return Err(Error::internal(format!("{DECODER}: a number is not finite")));
             }
+        }
+        if self.judges().is_some() {
+            self.hold_judge(&embedding)?;
         }
         Ok(())
     }
@@ -188,11 +266,78 @@ impl MaskNetwork {
             logits: Vec::new(),
             predicted_iou: Vec::new(),
         };
+        let names = &self.manifest.decoder;
+        let only = [&*names.low_res_masks, &*names.iou_predictions];
         for batch in points.chunks(self.takes.batch) {
-            let inputs = self.takes.inputs(&self.manifest, embedding, batch);
+            let inputs = self.takes.inputs(&self.manifest, embedding, batch, None);
             let counts = [batch.len(), points.len()];
-            self.decoder
-                .run(&inputs, |outputs| self.append(counts, iou_over, outputs, &mut all))?;
+            let read = |outputs: &dyn Outputs| self.append(counts, iou_over, outputs, &mut all);
+            self.decoder.run_for(&inputs, &only, read)?;
+        }
+        Ok(all)
+    }
+
+    /// `[width, height]` of the decoder's grid of logits, where its file judges masks at the
+    /// photo's pixels ([`Self::judge`]).
+    #[must_use]
+    pub fn judges(&self) -> Option<[usize; 2]> {
+        self.takes.judged
+    }
+
+    /// What computes the decoder.
+    #[must_use]
+    pub fn provider(&self) -> Provider {
+        self.decoder.provider()
+    }
+
+    /// Masks of each point at the photo's pixels: a device gives bits back, and no logits.
+    ///
+    /// # Errors
+    /// `internal` when the network fails, answers with other shapes than asked for, or its file
+    /// does not judge.
+    pub fn judge(
+        &self,
+        embedding: &PhotoEmbedding,
+        points: &[[f32; 2]],
+        judging: &MaskJudging,
+    ) -> Result<JudgedMasks> {
+        if self.takes.judged.is_none() {
+            return Err(Error::internal(format!("{DECODER}: its file does not judge masks")));
+        }
+        let kinds = judging.levels.len();
+        let pixels = judging.pixels[0] * judging.pixels[1];
+        let most = (JUDGED_PIXELS_MAX / (kinds * pixels).max(1)).max(1);
+        let iou_predictions = &*self.manifest.decoder.iou_predictions;
+        let only = [iou_predictions, MASK_BITS, MASK_COUNTS];
+        let mut all = JudgedMasks::default();
+        for batch in points.chunks(self.takes.batch.min(most)) {
+            let inputs = self.takes.inputs(&self.manifest, embedding, batch, Some(judging));
+            self.decoder.run_for(&inputs, &only, |outputs| {
+                let (bits_shape, bits) = outputs.bytes(MASK_BITS)?;
+                let (counts_shape, counts) = outputs.get(MASK_COUNTS)?;
+                let (iou_shape, iou) = outputs.get(iou_predictions)?;
+                let of = |last: usize| [batch.len(), kinds, last];
+                let all_kinds = iou_shape.get(1).copied().unwrap_or(0);
+                let levels = &self.manifest.levels;
+                let own: Vec<usize> = judging.levels.iter().map(|&at| levels[at]).collect();
+                if bits_shape != of(pixels.div_ceil(64) * 8)
+                    || counts_shape != of(2)
+                    || iou_shape != [batch.len(), all_kinds]
+                    || own.iter().any(|&level| level >= all_kinds)
+                {
+                    return Err(Error::internal(format!(
+                        "{DECODER}: {} prompts and levels {own:?} of {pixels} pixels are judged \
+                         by {bits_shape:?} bytes, {counts_shape:?} counts and {iou_shape:?} IoUs",
+                        batch.len()
+                    )));
+                }
+                all.bits.extend_from_slice(bits);
+                all.counts.extend_from_slice(&counts);
+                for of_point in iou.chunks_exact(all_kinds) {
+                    all.predicted_iou.extend(own.iter().map(|&level| of_point[level]));
+                }
+                Ok(())
+            })?;
         }
         Ok(all)
     }
@@ -275,6 +420,12 @@ impl Takes {
                 .map(|taken| taken.shape.iter().map(|&n| fixed(n).unwrap_or(1)).collect()),
             has_mask: file.get(&names.has_mask_input).is_some(),
             size: file.get(&names.orig_im_size).map(network::Taken::whole),
+            judged: file.get(PHOTO_ROWS).zip(file.get(PHOTO_COLUMNS)).and_then(
+                |(rows, columns)| {
+                    let side = |taken: &network::Taken, axis: usize| fixed(*taken.shape.get(axis)?);
+                    Some([side(columns, 0)?, side(rows, 1)?])
+                },
+            ),
         })
     }
 
@@ -284,6 +435,7 @@ impl Takes {
         manifest: &'a MasksManifest,
         embedding: &'a PhotoEmbedding,
         points: &[[f32; 2]],
+        judging: Option<&'a MaskJudging>,
     ) -> Vec<Input<'a>> {
         let (names, count, each) = (&manifest.decoder, points.len(), self.points);
         // EfficientSAM takes points in pixels of the size that its masks come back in.
@@ -319,8 +471,34 @@ impl Takes {
             Some(false) => inputs.push(Input::new(name, &[2], size.map(|v| v as f32).to_vec())),
             None => {}
         }
+        if let Some([width, height]) = self.judged {
+            inputs.extend(judged_inputs(manifest, [width, height], judging));
+        }
         inputs
     }
+}
+
+/// What a file that judges masks takes for that; without `judging` one pixel of the first level,
+/// which nobody reads.
+fn judged_inputs<'a>(
+    manifest: &MasksManifest,
+    [grid_width, grid_height]: [usize; 2],
+    judging: Option<&'a MaskJudging>,
+) -> [Input<'a>; 4] {
+    let [width, height] = judging.map_or([1, 1], |how| how.pixels);
+    let level = |at: &usize| i64::try_from(manifest.levels[*at]).unwrap_or(i64::MAX);
+    let levels: Vec<i64> = judging.map_or(&[0][..], |how| &how.levels).iter().map(level).collect();
+    let (rows, columns): (Cow<'a, [f32]>, Cow<'a, [f32]>) = match judging {
+        Some(how) => ((&how.rows).into(), (&how.columns).into()),
+        None => (vec![0.0; grid_height].into(), vec![0.0; grid_width].into()),
+    };
+    let offset = judging.map_or(0.0, |how| how.stability_offset);
+    [
+        Input::new(JUDGED_LEVELS, &[levels.len()], levels),
+        Input::new(PHOTO_ROWS, &[height, grid_height], rows),
+        Input::new(PHOTO_COLUMNS, &[grid_width, width], columns),
+        Input::new(STABILITY_OFFSET, &[1], vec![offset]),
+    ]
 }
 
 /// `[width, height]` of the photo in the encoder's square.
@@ -374,6 +552,14 @@ fn decoder_signature(manifest: &MasksManifest) -> Vec<Wanted<'_>> {
         Wanted::new(Side::MayTake, &names.has_mask_input, vec![vec![1]]),
         Wanted { whole: None, ..Wanted::new(Side::MayTake, &names.orig_im_size, vec![vec![2]]) },
     ];
+    all.extend([
+        Wanted { whole: Some(true), ..Wanted::new(Side::MayTake, JUDGED_LEVELS, vec![any()]) },
+        Wanted::new(Side::MayTake, PHOTO_ROWS, vec![any(), any()]),
+        Wanted::new(Side::MayTake, PHOTO_COLUMNS, vec![any(), any()]),
+        Wanted::new(Side::MayTake, STABILITY_OFFSET, vec![vec![1]]),
+        Wanted::new(Side::MayGive, MASK_BITS, vec![any(), any(), any()]),
+        Wanted::new(Side::MayGive, MASK_COUNTS, vec![any(), any(), any()]),
+    ]);
     let features = [&names.image_embeddings].into_iter().chain(&manifest.encoder.features);
     all.extend(features.map(|name| Wanted::unshaped(Side::Input, name)));
     all

@@ -11,11 +11,15 @@ use std::{
         Arc,
         atomic::{AtomicU32, Ordering},
     },
+    time::Instant,
 };
 
 use half::f16;
 use ort::{
-    session::{Session, SessionInputValue, SessionOutputs, builder::PrepackedWeights},
+    session::{
+        OutputSelector, RunOptions, Session, SessionInputValue, SessionOutputs,
+        builder::PrepackedWeights,
+    },
     value::{Outlet, Shape, Tensor, TensorElementType, TensorRef, ValueType},
 };
 use parking_lot::{Condvar, Mutex};
@@ -56,6 +60,12 @@ impl<'a> From<&'a [f32]> for Data<'a> {
 impl<'a> From<&'a [i64]> for Data<'a> {
     fn from(data: &'a [i64]) -> Self {
         Self::I64(Cow::Borrowed(data))
+    }
+}
+
+impl<'a> From<Cow<'a, [f32]>> for Data<'a> {
+    fn from(data: Cow<'a, [f32]>) -> Self {
+        Self::F32(data)
     }
 }
 
@@ -102,15 +112,14 @@ impl<'a> Input<'a> {
 pub(super) trait Outputs {
     /// Shape and numbers of an output; those of an f16 are widened.
     fn get(&self, name: &str) -> Result<(Vec<usize>, Cow<'_, [f32]>)>;
+
+    /// Shape and bytes of an output of u8.
+    fn bytes(&self, name: &str) -> Result<(Vec<usize>, &[u8])>;
 }
 
 impl Outputs for SessionOutputs<'_> {
     fn get(&self, name: &str) -> Result<(Vec<usize>, Cow<'_, [f32]>)> {
-        let value = SessionOutputs::get(self, name)
-            .ok_or_else(|| Error::internal(format!("no output {name:?}")))?;
-        let sizes = |shape: &Shape| -> Vec<usize> {
-            shape.iter().map(|&n| usize::try_from(n).unwrap_or(0)).collect()
-        };
+        let value = SessionOutputs::get(self, name).ok_or_else(|| lacking(name))?;
         if let Ok((shape, data)) = value.try_extract_tensor::<f16>() {
             return Ok((sizes(shape), data.iter().map(|v| v.to_f32()).collect()));
         }
@@ -119,6 +128,22 @@ impl Outputs for SessionOutputs<'_> {
             .map_err(|e| Error::internal(format!("output {name:?} is not of f32")).caused_by(e))?;
         Ok((sizes(shape), data.into()))
     }
+
+    fn bytes(&self, name: &str) -> Result<(Vec<usize>, &[u8])> {
+        let value = SessionOutputs::get(self, name).ok_or_else(|| lacking(name))?;
+        let (shape, data) = value
+            .try_extract_tensor::<u8>()
+            .map_err(|e| Error::internal(format!("output {name:?} is not of u8")).caused_by(e))?;
+        Ok((sizes(shape), data))
+    }
+}
+
+fn lacking(name: &str) -> Error {
+    Error::internal(format!("no output {name:?}"))
+}
+
+fn sizes(shape: &Shape) -> Vec<usize> {
+    shape.iter().map(|&n| usize::try_from(n).unwrap_or(0)).collect()
 }
 
 /// Takes the outputs of a run.
@@ -135,9 +160,11 @@ pub(super) enum Failure {
 
 /// Something that runs: a session, or the stand-in of a test.
 pub(super) trait Runner: Debug + Send {
+    /// Gives the outputs of these names, or all where there is none.
     fn run(
         &mut self,
         inputs: &[Input<'_>],
+        only: &[&str],
         read: &mut Read<'_>,
     ) -> std::result::Result<(), Failure>;
 }
@@ -146,6 +173,7 @@ impl Runner for Session {
     fn run(
         &mut self,
         inputs: &[Input<'_>],
+        only: &[&str],
         read: &mut Read<'_>,
     ) -> std::result::Result<(), Failure> {
         let failed = |e: ort::Error| Failure::Run(Box::new(e));
@@ -158,7 +186,15 @@ impl Runner for Session {
             })
             .collect::<ort::Result<_>>()
             .map_err(failed)?;
-        let outputs = Self::run(self, values).map_err(failed)?;
+        let mut names = OutputSelector::no_default();
+        if only.is_empty() {
+            names = OutputSelector::default();
+        }
+        for name in only {
+            names = names.with(*name);
+        }
+        let options = RunOptions::new().map_err(failed)?.with_outputs(names);
+        let outputs = self.run_with_options(values, &options).map_err(failed)?;
         read(&outputs).map_err(Failure::Read)
     }
 }
@@ -176,7 +212,12 @@ impl Pool {
     }
 
     /// Runs on an idle session, and waits for one.
-    fn run(&self, inputs: &[Input<'_>], read: &mut Read<'_>) -> std::result::Result<(), Failure> {
+    fn run(
+        &self,
+        inputs: &[Input<'_>],
+        only: &[&str],
+        read: &mut Read<'_>,
+    ) -> std::result::Result<(), Failure> {
         let mut idle = self.idle.lock();
         let runner = loop {
             match idle.pop() {
@@ -186,16 +227,17 @@ impl Pool {
         };
         drop(idle);
         let mut lent = Lent { pool: self, runner: Some(runner) };
-        lent.runner.as_mut().map_or(Ok(()), |runner| runner.run(inputs, read))
+        lent.runner.as_mut().map_or(Ok(()), |runner| runner.run(inputs, only, read))
     }
 
     /// Runs on every session, one after the other; for a pool that is not in use yet.
     fn run_each(
         &self,
         inputs: &[Input<'_>],
+        only: &[&str],
         read: &mut Read<'_>,
     ) -> std::result::Result<(), Failure> {
-        self.idle.lock().iter_mut().try_for_each(|runner| runner.run(inputs, read))
+        self.idle.lock().iter_mut().try_for_each(|runner| runner.run(inputs, only, read))
     }
 }
 
@@ -275,6 +317,8 @@ pub(super) enum Side {
     /// An input that a file may lack.
     MayTake,
     Output,
+    /// An output that a file may lack; it is not compared.
+    MayGive,
 }
 
 /// A tensor that a network must have.
@@ -302,14 +346,15 @@ impl<'a> Wanted<'a> {
     fn misfit(&self, takes: &Takes) -> Option<String> {
         let (word, all) = match self.side {
             Side::Input | Side::MayTake => ("input", &takes.inputs),
-            Side::Output => ("output", &takes.outputs),
+            Side::Output | Side::MayGive => ("output", &takes.outputs),
         };
         let name = self.name;
         let Some(found) = all.iter().find(|taken| taken.name == name) else {
-            let needed = self.side != Side::MayTake;
+            let needed = !matches!(self.side, Side::MayTake | Side::MayGive);
             return needed.then(|| format!("has no {word} {name:?}"));
         };
-        let real = matches!(found.kind, TensorElementType::Float32 | TensorElementType::Float16);
+        let real = matches!(found.kind, TensorElementType::Float32 | TensorElementType::Float16)
+            || (self.side == Side::MayGive && found.kind == TensorElementType::Uint8);
         let kind_fits = match self.whole {
             Some(true) => found.whole(),
             Some(false) => real,
@@ -319,7 +364,8 @@ impl<'a> Wanted<'a> {
         let fits = |(have, want): (&i64, &Vec<usize>)| {
             fixed(*have).is_none_or(|have| want.iter().all(|size| *size == have))
         };
-        let unknown = found.shape.is_empty() && self.side == Side::Output;
+        let output = matches!(self.side, Side::Output | Side::MayGive);
+        let unknown = found.shape.is_empty() && output;
         let shape = self.shape.as_ref().filter(|_| !unknown);
         let shape_fits = shape.is_none_or(|shape| {
             found.shape.len() == shape.len() && found.shape.iter().zip(shape).all(fits)
@@ -565,20 +611,35 @@ impl Network {
         inputs: &[Input<'_>],
         read: impl FnOnce(&dyn Outputs) -> Result<T>,
     ) -> Result<T> {
+        self.run_for(inputs, &[], read)
+    }
+
+    /// The same, with the outputs of these names only: no other comes back from a device.
+    ///
+    /// # Errors
+    /// Those of [`Self::run`].
+    pub(super) fn run_for<T>(
+        &self,
+        inputs: &[Input<'_>],
+        only: &[&str],
+        read: impl FnOnce(&dyn Outputs) -> Result<T>,
+    ) -> Result<T> {
         let (mut read, mut answer) = (Some(read), None);
         let mut once = |outputs: &dyn Outputs| {
             answer = read.take().map(|read| read(outputs)).transpose()?;
             Ok(())
         };
-        self.run_dyn(inputs, &mut once)?;
+        let begun = Instant::now();
+        self.run_dyn(inputs, only, &mut once)?;
+        meter::network(self.what, begun.elapsed().as_secs_f64());
         answer.ok_or_else(|| Error::internal(format!("{}: no answer", self.what)))
     }
 
-    fn run_dyn(&self, inputs: &[Input<'_>], read: &mut Read<'_>) -> Result<()> {
+    fn run_dyn(&self, inputs: &[Input<'_>], only: &[&str], read: &mut Read<'_>) -> Result<()> {
         let what = self.what;
         let failed = |e| Error::internal(format!("{what}: run failed")).caused_by(e);
         if !self.lost() {
-            match self.pool.run(inputs, read) {
+            match self.pool.run(inputs, only, read) {
                 Ok(()) => {
                     self.failures.store(0, Ordering::Relaxed);
                     return Ok(());
@@ -599,7 +660,7 @@ impl Network {
             None => Arc::clone(kept.insert(Arc::new((self.open_cpu)()?))),
         };
         drop(kept);
-        cpu.run(inputs, read).map_err(|failure| match failure {
+        cpu.run(inputs, only, read).map_err(|failure| match failure {
             Failure::Run(e) => failed(e),
             Failure::Read(error) => error,
         })
@@ -638,16 +699,18 @@ fn check(
     probe: &[Input<'_>],
 ) -> Result<f64> {
     let what = spec.what;
+    let compared = spec.signature.iter().filter(|wanted| wanted.side == Side::Output);
+    let compared: Vec<&str> = compared.map(|wanted| wanted.name).collect();
     let answers = |pool: &Pool, name: &str| {
         let mut answers: Vec<Vec<f32>> = Vec::new();
         let mut read = |outputs: &dyn Outputs| {
-            for output in spec.signature.iter().filter(|wanted| wanted.side == Side::Output) {
-                answers.push(outputs.get(output.name)?.1.into_owned());
+            for output in &compared {
+                answers.push(outputs.get(output)?.1.into_owned());
             }
             Ok(())
         };
         // Every session: a device looks for its fastest kernels at the first run of each.
-        match pool.run_each(probe, &mut read) {
+        match pool.run_each(probe, &compared, &mut read) {
             Ok(()) => Ok(answers),
             Err(Failure::Read(error)) => Err(error),
             Err(Failure::Run(e)) => {
@@ -703,12 +766,17 @@ mod tests {
         fn get(&self, _: &str) -> Result<(Vec<usize>, Cow<'_, [f32]>)> {
             Ok((vec![1], self.0.as_slice().into()))
         }
+
+        fn bytes(&self, name: &str) -> Result<(Vec<usize>, &[u8])> {
+            Err(lacking(name))
+        }
     }
 
     impl Runner for Fake {
         fn run(
             &mut self,
             _: &[Input<'_>],
+            _: &[&str],
             read: &mut Read<'_>,
         ) -> std::result::Result<(), Failure> {
             match self.0 {

@@ -73,6 +73,8 @@ impl ResizeFilter {
     }
 }
 
+/// Lines of a plane that one thread makes at a time.
+const LINES_A_TASK: usize = 32;
 /// Bits of a weight after the point: 8 bits of pixel and 2 of head room are left of 32.
 const WEIGHT_BITS: u32 = 32 - 8 - 2;
 
@@ -139,15 +141,21 @@ pub(super) fn planes(
     mean: [f32; 3],
     std: [f32; 3],
 ) -> Vec<f32> {
+    let of_level = |c: usize| {
+        (0..=u8::MAX).map(move |level| (f32::from(level) / 255.0 - mean[c]) / std[c]).collect()
+    };
+    let levels: [Vec<f32>; 3] = [0, 1, 2].map(of_level);
     let mut planes = vec![0.0; 3 * side * side];
-    for (c, plane) in planes.chunks_exact_mut(side * side).enumerate() {
-        let lines = plane.chunks_exact_mut(side).zip(rgb.chunks_exact(width * 3)).take(height);
-        for (out, line) in lines {
+    let lines = planes.par_chunks_exact_mut(side).with_min_len(LINES_A_TASK).enumerate();
+    lines.for_each(|(at, out)| {
+        let (c, y) = (at / side, at % side);
+        if y < height {
+            let line = &rgb[y * width * 3..(y + 1) * width * 3];
             for (v, pixel) in out.iter_mut().zip(line.chunks_exact(3)) {
-                *v = (f32::from(pixel[c]) / 255.0 - mean[c]) / std[c];
+                *v = levels[c][usize::from(pixel[c])];
             }
         }
-    }
+    });
     planes
 }
 

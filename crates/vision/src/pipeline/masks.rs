@@ -11,8 +11,11 @@ use rayon::prelude::*;
 use crate::{
     center_of,
     error::Result,
-    models::{MaskNetwork, MasksManifest, PhotoEmbedding},
-    scene::{Gaussians, MaskLogits, Method, Photo, PhotoMasks, PosedPhoto, SourcePixel},
+    models::{MaskNetwork, MasksManifest, PhotoEmbedding, Provider},
+    scene::{
+        Gaussians, JudgedMasks, MaskJudging, MaskLogits, Method, Photo, PhotoMasks, PosedPhoto,
+        SourcePixel,
+    },
     seen_at,
     segment::{self, PromptDecoder, Seed, Settings},
 };
@@ -52,6 +55,17 @@ impl PromptDecoder for SeenPhoto<'_> {
         // Masks under the threshold are dropped by the filter, which does not look at them.
         let least = segment::iou_over(self.network.manifest().pred_iou_thresh);
         self.network.decode_over(&self.embedding, points, least)
+    }
+
+    /// Where a device decodes: on a CPU the sparse sums of the filter are faster than products of
+    /// matrices.
+    fn judges(&self) -> Option<(usize, [usize; 2])> {
+        let grid = self.network.judges().filter(|_| self.network.provider() != Provider::Cpu)?;
+        Some((self.network.manifest().levels.len(), grid))
+    }
+
+    fn judge(&self, points: &[[f32; 2]], judging: &MaskJudging) -> Result<JudgedMasks> {
+        self.network.judge(&self.embedding, points, judging)
     }
 
     fn on<'b>(&'b self, photo: &'b Photo) -> Result<Box<dyn PromptDecoder + 'b>> {

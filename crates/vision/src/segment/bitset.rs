@@ -36,6 +36,14 @@ impl Bitset {
         Self { words: values.chunks(64).map(word).collect() }
     }
 
+    /// The set of these bits, the first cell in the lowest bit of the first byte; eight bytes a
+    /// word.
+    #[must_use]
+    pub fn of_bytes(bytes: &[u8]) -> Self {
+        let (words, _) = bytes.as_chunks::<8>();
+        Self { words: words.iter().map(|word| u64::from_le_bytes(*word)).collect() }
+    }
+
     /// The set of these cells, of a grid of `cells` cells; others than the grid's are left out.
     #[must_use]
     pub fn of(cells: usize, inside: impl IntoIterator<Item = usize>) -> Self {

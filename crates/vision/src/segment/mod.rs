@@ -22,8 +22,11 @@ pub use filter::iou_over;
 
 use self::{filter::MaskFilter, photo_grid::PhotoGrid, prompts::Prompts};
 use crate::{
-    error::Result,
-    scene::{MaskLevel, MaskLogits, OverlapNms, Photo, PhotoMasks, unless_cancelled},
+    error::{Error, Result},
+    scene::{
+        JudgedMasks, MaskJudging, MaskLevel, MaskLogits, OverlapNms, Photo, PhotoMasks,
+        unless_cancelled,
+    },
 };
 
 /// A photo and the network that gives masks for its points.
@@ -39,6 +42,20 @@ pub trait PromptDecoder: Sync {
     /// # Errors
     /// What the network says.
     fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits>;
+
+    /// Levels and `[width, height]` of the grid of a decoder that judges masks at the photo's
+    /// pixels by itself, and is to be asked for that.
+    fn judges(&self) -> Option<(usize, [usize; 2])> {
+        None
+    }
+
+    /// As [`Self::decode`], judged at the photo's pixels.
+    ///
+    /// # Errors
+    /// What the network says; `internal` of a decoder that does not judge.
+    fn judge(&self, _: &[[f32; 2]], _: &MaskJudging) -> Result<JudgedMasks> {
+        Err(Error::internal("masks: the decoder does not judge masks"))
+    }
 
     /// The same network on another photo: a part of this one, at its full size.
     ///
@@ -266,22 +283,33 @@ fn decoded(
     let seeds = if settings.use_seeds { seeds } else { &[] };
     let mut prompts = Prompts::new(settings, seeds);
     let mut found = Proposals::default();
-    let mut filter: Option<MaskFilter> = None;
+    let of = |answer| MaskFilter::new(decoder.placed(), answer, photo, settings);
+    let judges = decoder.judges().filter(|_| settings.full_resolution);
+    let mut filter: Option<MaskFilter> = judges.map(of).transpose()?;
+    let judging = filter.as_ref().and_then(|filter| filter.judging(wholes));
     loop {
         let points = prompts.next(decoder.batch());
         if points.is_empty() {
             break;
         }
         unless_cancelled(cancel)?;
-        let decoded = decoder.decode(&points)?;
-        let filter = match &mut filter {
-            Some(filter) => filter,
-            none => none.insert(MaskFilter::new(decoder.placed(), &decoded, photo, settings)?),
+        let (masks, filter) = match (&judging, &mut filter) {
+            (Some(how), Some(filter)) => {
+                let judged = decoder.judge(&points, how)?;
+                (filter.pass_judged(&judged, how, &points, wholes)?, filter)
+            }
+            (_, filter) => {
+                let decoded = decoder.decode(&points)?;
+                let filter = match filter {
+                    Some(filter) => filter,
+                    none => none.insert(of((decoded.levels, decoded.grid))?),
+                };
+                (filter.pass(&decoded, &points, wholes)?, filter)
+            }
         };
-        let masks = filter.pass(&decoded, &points, wholes)?;
         found.asked += points.len();
         [found.width, found.height] = filter.map();
-        prompts.cover(&masks, filter.map(), decoded.levels);
+        prompts.cover(&masks, filter.map(), filter.levels());
         found.masks.extend(masks);
     }
     Ok((found, filter.map(|filter| filter.photo_grid())))

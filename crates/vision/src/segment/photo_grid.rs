@@ -100,7 +100,29 @@ impl Axis {
     }
 }
 
+impl Axis {
+    /// The weights as a matrix, `[outputs * sources]`.
+    fn dense(&self, sources: usize) -> Vec<f32> {
+        let mut matrix = vec![0.0; self.0.len() * sources];
+        for (row, (first, weights)) in matrix.chunks_exact_mut(sources).zip(&self.0) {
+            // A weight that has no source is 0.
+            row[*first..].iter_mut().zip(weights).for_each(|(out, weight)| *out += weight);
+        }
+        matrix
+    }
+}
+
 impl Resample {
+    /// The weights as two matrices, `[height * grid height]` and `[grid width * width]`: between
+    /// them the grid becomes the map.
+    pub(super) fn matrices(&self) -> [Vec<f32>; 2] {
+        let ([width, height], columns) = (self.grid, self.columns.dense(self.grid[0]));
+        let outputs = self.columns.0.len();
+        let turned = (0..width).flat_map(|x| (0..outputs).map(move |i| [i, x]));
+        let turned = turned.map(|[i, x]| columns[i * width + x]).collect();
+        [self.rows.dense(height), turned]
+    }
+
     /// `[width, height]` of the result.
     pub(super) fn size(&self) -> [usize; 2] {
         [self.columns.0.len(), self.rows.0.len()]

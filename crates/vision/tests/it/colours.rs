@@ -7,16 +7,16 @@ use std::sync::{
 };
 
 use segsplat_core::{
-    error::ErrorCode,
+    error::{ErrorCode, Result},
     scene::{
-        Camera, CameraToWorld, Crop, Gaussians, Intrinsics, MaskLogits, Method, Photo, PosedPhoto,
-        RawGaussians, SourcePixel,
+        Camera, CameraToWorld, Crop, Gaussians, Intrinsics, JudgedMasks, MaskJudging, MaskLevel,
+        MaskLogits, Method, Photo, PosedPhoto, RawGaussians, SourcePixel,
     },
 };
 use segsplat_vision::{
-    models::{Bundle, ImageText, MaskNetwork, Runtime},
-    pipeline::masks,
-    segment::Seed,
+    models::{Bundle, ImageText, MaskNetwork, PhotoEmbedding, Runtime},
+    pipeline::masks::{self, SeenPhoto},
+    segment::{self, PromptDecoder, Seed},
 };
 
 use segsplat_testing::{opened, root};
@@ -154,6 +154,81 @@ fn every_signature_of_a_decoder_gives_the_same_masks() {
     let at =
         |u: f64, v: f64| found.logits[2 * 1024 + (v * 32.0) as usize * 32 + (u * 32.0) as usize];
     assert!(at(0.25, 0.7) > 0.0 && at(0.25, 0.8) < 0.0 && at(0.75, 0.5) < 0.0, "the red box");
+}
+
+/// A photo whose masks the network judges, also on a CPU.
+struct Judged<'a> {
+    network: &'a MaskNetwork,
+    embedding: PhotoEmbedding,
+}
+
+impl PromptDecoder for Judged<'_> {
+    fn batch(&self) -> usize {
+        64
+    }
+
+    fn placed(&self) -> (u32, [u32; 2]) {
+        (64, self.embedding.resized())
+    }
+
+    fn decode(&self, _: &[[f32; 2]]) -> Result<MaskLogits> {
+        panic!("it judges");
+    }
+
+    fn judges(&self) -> Option<(usize, [usize; 2])> {
+        Some((3, self.network.judges().unwrap()))
+    }
+
+    fn judge(&self, points: &[[f32; 2]], how: &MaskJudging) -> Result<JudgedMasks> {
+        self.network.judge(&self.embedding, points, how)
+    }
+
+    fn on<'a>(&'a self, _: &'a Photo) -> Result<Box<dyn PromptDecoder + 'a>> {
+        panic!("no crop layers are asked for");
+    }
+}
+
+#[test]
+fn a_decoder_that_judges_gives_the_masks_of_its_logits() {
+    let Some(runtime) = runtime() else { return };
+    let (_kept, judging) = with_decoder(
+        "masks_decoder_judging.onnx",
+        "c586fac6a90b9af4c39ba92dac1778d712257f69d97ab73ec6c7135ff89a1b9a",
+        &[],
+    );
+    let open =
+        |bundle: &Bundle| MaskNetwork::open(&runtime, bundle, &network_options()).unwrap().unwrap();
+    let (plain, network) = (open(&bundle()), open(&judging));
+    assert_eq!((plain.judges(), network.judges()), (None, Some([32, 32])), "read from the files");
+    let cancel = AtomicBool::new(false);
+    for (width, height) in [(64, 64), (128, 64), (90, 170), (250, 130)] {
+        let photo = photo(width, height);
+        for level in [MaskLevel::Widest, MaskLevel::Whole, MaskLevel::Subpart] {
+            let method = Method { full_resolution: true, mask_level: level, ..Method::default() };
+            let settings = masks::settings(network.manifest(), &method);
+            let masks_of = |decoder: &dyn PromptDecoder| {
+                segment::everything(decoder, &photo, &settings, &[], &cancel).unwrap()
+            };
+            let wanted = masks_of(&SeenPhoto::new(&plain, &photo).unwrap());
+            let embedding = network.encode(&photo).unwrap();
+            let found = masks_of(&Judged { network: &network, embedding });
+            let name = format!("{level:?} of {width}x{height}");
+            assert!(wanted.masks.len() >= 2, "{name}: {:?}", wanted.masks);
+            assert_eq!(found.masks.len(), wanted.masks.len(), "{name}");
+            // Sums in another order may move a pixel whose logit is next to 0.
+            let pairs = found.map.index.iter().zip(&wanted.map.index);
+            let off = pairs.filter(|(a, b)| a != b).count();
+            assert!(off * 500 <= wanted.map.index.len(), "{name}: {off} pixels differ");
+            for (a, b) in found.masks.iter().zip(&wanted.masks) {
+                assert!((a.stability - b.stability).abs() < 0.01, "{name}: {a:?} {b:?}");
+                assert!((a.predicted_iou - b.predicted_iou).abs() < 1e-4, "{name}: {a:?} {b:?}");
+            }
+        }
+    }
+    let nothing = MaskJudging { levels: vec![0], pixels: [1, 1], ..MaskJudging::default() };
+    let embedding = plain.encode(&photo(64, 64)).unwrap();
+    let error = plain.judge(&embedding, &[[0.5, 0.5]], &nothing).unwrap_err();
+    assert_eq!(error.code(), ErrorCode::Internal, "{error}");
 }
 
 #[test]

@@ -7,7 +7,7 @@ use std::sync::{
 
 use segsplat_core::{
     error::{ErrorCode, Result},
-    scene::{MaskLogits, Photo, PhotoMasks},
+    scene::{JudgedMasks, MaskJudging, MaskLevel, MaskLogits, Photo, PhotoMasks},
 };
 use segsplat_vision::segment::{
     PromptDecoder, Proposal, Proposals, Seed, Settings, everything, iou_over, proposals,
@@ -76,6 +76,83 @@ impl PromptDecoder for Shapes {
         let size = [f64::from(photo.width) / 320.0, f64::from(photo.height) / 240.0];
         let seen = |b: &[f64; 4]| [0, 1, 2, 3].map(|i| (b[i] - part[i % 2]) / size[i % 2]);
         Ok(Box::new(Self::new(&self.boxes.iter().map(seen).collect::<Vec<_>>())))
+    }
+}
+
+/// The same shapes by a decoder that judges masks itself, by dense products in f64.
+struct Judge(Shapes);
+
+impl PromptDecoder for Judge {
+    fn batch(&self) -> usize {
+        self.0.batch()
+    }
+
+    fn placed(&self) -> (u32, [u32; 2]) {
+        self.0.placed()
+    }
+
+    fn decode(&self, _: &[[f32; 2]]) -> Result<MaskLogits> {
+        panic!("it is to judge");
+    }
+
+    fn judges(&self) -> Option<(usize, [usize; 2])> {
+        Some((3, [GRID; 2]))
+    }
+
+    fn judge(&self, points: &[[f32; 2]], how: &MaskJudging) -> Result<JudgedMasks> {
+        let decoded = self.0.decode(points)?;
+        let [width, height] = how.pixels;
+        let of = |logits: &[f32], x: usize, y: usize| -> f64 {
+            let cell = |at: usize| f64::from(logits[at]);
+            let weight = |row: usize, column: usize| {
+                f64::from(how.rows[y * GRID + row]) * f64::from(how.columns[column * width + x])
+            };
+            let (rows, columns) = (y / 5, x / 5);
+            let near = |at: usize| at.saturating_sub(3)..(at + 4).min(GRID);
+            // 320 pixels lie over 64 cells: the weights of all others are 0.
+            let cells = near(rows).flat_map(|row| near(columns).map(move |column| (row, column)));
+            cells.map(|(row, column)| weight(row, column) * cell(row * GRID + column)).sum()
+        };
+        let mut judged = JudgedMasks::default();
+        for point in 0..points.len() {
+            for level in &how.levels {
+                let at = point * 3 + level;
+                let logits = &decoded.logits[at * GRID * GRID..(at + 1) * GRID * GRID];
+                let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+                let values: Vec<f64> = pixels.map(|(x, y)| of(logits, x, y)).collect();
+                let offset = f64::from(how.stability_offset);
+                let over = |least: f64| values.iter().filter(|v| **v > least).count() as f32;
+                let bit = |(i, v): (usize, &f64)| u8::from(*v > 0.0) << i;
+                judged
+                    .bits
+                    .extend(values.chunks(8).map(|c| c.iter().enumerate().map(bit).sum::<u8>()));
+                judged.counts.extend([over(offset), over(-offset)]);
+                judged.predicted_iou.push(decoded.predicted_iou[at]);
+            }
+        }
+        Ok(judged)
+    }
+
+    fn on<'a>(&'a self, _: &'a Photo) -> Result<Box<dyn PromptDecoder + 'a>> {
+        panic!("no crop layers are asked for");
+    }
+}
+
+#[test]
+fn masks_that_the_decoder_judges_are_those_of_its_logits() {
+    for level in [MaskLevel::Widest, MaskLevel::Whole, MaskLevel::Part] {
+        let settings = Settings { points_per_side: 8, level, ..Settings::default().exact() };
+        let cancel = AtomicBool::new(false);
+        let wanted = run(&room(), &settings, &[]);
+        let found = everything(&Judge(room()), &photo(), &settings, &[], &cancel).unwrap();
+        assert!(wanted.masks.len() >= 3, "{level:?}: {:?}", wanted.masks);
+        assert_eq!((&found.map, &found.masks), (&wanted.map, &wanted.masks), "{level:?}");
+        let all = |decoder: &dyn PromptDecoder| {
+            let found = proposals(decoder, &photo(), &settings, &[], &cancel).unwrap();
+            let key = |p: &Proposal| (p.area, p.bounds, p.level, p.point, p.stability);
+            found.masks.iter().map(key).collect::<Vec<_>>()
+        };
+        assert_eq!(all(&Judge(room())), all(&room()), "{level:?}: every level");
     }
 }
 
