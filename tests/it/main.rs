@@ -34,6 +34,7 @@ mod raw;
 mod refine;
 mod schedule;
 mod slow_callers;
+mod splat_scenes;
 mod splats;
 mod store;
 mod telemetry;

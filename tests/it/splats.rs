@@ -8,11 +8,11 @@ use flate2::{Compression, read::GzDecoder, write::GzEncoder};
 use glam::DVec3;
 use segsplat::{
     error::{ErrorCode, Result},
+    limits::Limits,
     render::{Kinds, RenderRequest, Renderer as _, compare::psnr, cpu::CpuRenderer},
     scene::{Bank, BankMask, Gaussians, IndexMap, SanitizeReport, Semantics, SemanticsReport},
     store::splats::{
-        COMPRESSED_PLY, FORMATS, GLB, PLY, SPLAT, SPZ, SplatFile, SplatFormat, SplatsRead,
-        read_splats,
+        COMPRESSED_PLY, FORMATS, GLB, PLY, SPLAT, SPZ, SplatFile, SplatFormat, read_splats,
     },
 };
 use segsplat_testing::scenes::{camera, cloud};
@@ -34,8 +34,17 @@ fn bytes_of(format: &'static SplatFormat, gaussians: &Gaussians) -> Vec<u8> {
     bytes
 }
 
-fn read(format: &SplatFormat, bytes: &[u8]) -> Result<SplatsRead> {
-    read_splats(&mut Cursor::new(bytes), &format!("a.{}", format.ending), 100_000)
+type Read = (Gaussians, SanitizeReport, Option<Semantics>);
+
+fn limits(gaussians_max: usize) -> Limits {
+    Limits { gaussians_max, ..Limits::default() }
+}
+
+fn read(format: &SplatFormat, bytes: &[u8]) -> Result<Read> {
+    let name = format!("a.{}", format.ending);
+    let read = read_splats(&mut Cursor::new(bytes), &name, &limits(100_000))?;
+    assert_eq!(read.format.name, format.name);
+    Ok((read.gaussians, read.dropped, read.semantics))
 }
 
 fn round_trip(format: &'static SplatFormat, gaussians: &Gaussians) -> Gaussians {
@@ -541,7 +550,7 @@ fn damaged_splat_files_are_refused_by_name() {
     cases.extend([(cut(32 * 30 - 1), "29 of 30"), (vec![b'x'; 32 * 100_001], "100000")]);
     refused(&SPLAT, cases);
     // What has no name with this ending is not taken for it.
-    let error = read_splats(&mut Cursor::new(&good), "a.bin", 100).unwrap_err();
+    let error = read_splats(&mut Cursor::new(&good), "a.bin", &limits(100)).unwrap_err();
     assert!(error.message().contains("none of Gaussians"), "{error}");
     // Numbers that are none are dropped and counted.
     let nan = patched(&good, 0, &f32::NAN.to_le_bytes());

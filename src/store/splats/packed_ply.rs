@@ -12,7 +12,7 @@ use std::{
     io::{self, Read, Write},
 };
 
-use super::{SplatFile, SplatsRead, begun, cut_short, fill_rest, steps, world};
+use super::{COMPRESSED_PLY, SplatFile, SplatsRead, begun, cut_short, fill_rest, steps, world};
 use crate::{
     error::Result,
     scene::{Gaussians, SH_C0},
@@ -255,6 +255,5 @@ pub(super) fn read(from: &mut dyn Read, layout: &PackedLayout) -> Result<SplatsR
         }
     }
     fill_rest(&mut raw);
-    let (gaussians, report) = Gaussians::sanitize(raw)?;
-    Ok((gaussians, report, None))
+    SplatsRead::new(&COMPRESSED_PLY, raw, None)
 }

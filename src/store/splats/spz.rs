@@ -20,11 +20,12 @@ use flate2::{Compression, bufread::GzDecoder, write::GzEncoder};
 use half::f16;
 
 use super::{
-    SplatFile, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, cut_short, fill_rest, some, times,
-    world,
+    SPZ, SplatFile, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count, cut_short, fill_rest,
+    some, times, world,
 };
 use crate::{
     error::{Error, Result},
+    limits::Limits,
     scene::{Gaussians, RawGaussians},
 };
 
@@ -136,7 +137,7 @@ fn packed_sh(value: f32, j: usize) -> u8 {
     ((steps + bucket / 2).div_euclid(bucket) * bucket).clamp(0, 255) as u8
 }
 
-pub(super) fn read(from: &mut dyn BufRead, gaussians_max: usize) -> Result<SplatsRead> {
+pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let mut from = Blocks { from: GzDecoder::new(from), count: 0 };
     let head: [u8; 16] = from.row(0, "bytes of the header")?;
     let word = |k: usize| u32::from_le_bytes([head[k], head[k + 1], head[k + 2], head[k + 3]]);
@@ -147,14 +148,12 @@ pub(super) fn read(from: &mut dyn BufRead, gaussians_max: usize) -> Result<Splat
     if !(1..=VERSION).contains(&version) {
         return Err(bad(format!("version {version}; 1 to {VERSION} are read")));
     }
-    if count > gaussians_max {
-        return Err(Error::limit("SPZ: Gaussians", count, gaussians_max));
-    }
-    if count == 0 {
-        return Err(bad("the header says 0 Gaussians"));
-    }
     if sh_degree > 3 {
         return Err(bad(format!("harmonics of degree {sh_degree}; 0 to 3 are read")));
+    }
+    check_count("SPZ: Gaussians", count, sh_degree, limits)?;
+    if count == 0 {
+        return Err(bad("the header says 0 Gaussians"));
     }
     if bits > 30 {
         return Err(bad(format!("{bits} bits behind the point; 0 to 30 are read")));
@@ -164,8 +163,7 @@ pub(super) fn read(from: &mut dyn BufRead, gaussians_max: usize) -> Result<Splat
     from.read(&mut raw, version, f64::from(1_u32 << bits))?;
     from.end()?;
     fill_rest(&mut raw);
-    let (gaussians, report) = Gaussians::sanitize(raw)?;
-    Ok((gaussians, report, None))
+    SplatsRead::new(&SPZ, raw, None)
 }
 
 fn bad(why: impl std::fmt::Display) -> Error {

@@ -43,11 +43,13 @@ from .types import (
 from .view import FORMATS, View, picture
 from .wire import Flow, Item, Multipart, Part, Policy, Read, Request, ServerSentEvents, pause, send
 
+#: Endings of files of Gaussians.
+SPLATS = (".ply", ".spz", ".glb", ".splat")
 #: Cameras of one call; more go as more calls.
 CAMERAS_MAX = 64
 
-#: A folder with photos and `transforms.json` or `cameras.json`; an archive of one; or photos and
-#: their cameras.
+#: A folder with photos and `transforms.json` or `cameras.json`; an archive of one; a file of
+#: Gaussians (PLY, SPZ, GLB, .splat); or photos and their cameras.
 Source: TypeAlias = str | Path | Mapping[str | Path, Camera]
 #: A scene as the server shows it.
 Shown: TypeAlias = tuple[SceneStatus, tuple[Photo, ...]]
@@ -103,6 +105,8 @@ def parts_of(source: Source) -> list[Part]:
         parts = [Part("cameras", "cameras.json", json.dumps({"cameras": cameras}).encode())]
         return parts + [Part("photo", *one) for one in zip(names, files, strict=True)]
     path = Path(source)
+    if path.suffix.lower() in SPLATS and not path.is_dir():
+        return [Part("splats", path.name, path)]
     if path.is_file():
         return [Part("archive", path.name, path)]
     for field in ("transforms", "cameras"):
@@ -111,7 +115,7 @@ def parts_of(source: Source) -> list[Part]:
             photos = [_photo(path, name) for name in _files_of(described)]
             return [Part(field, described.name, described), *photos]
     raise FileNotFoundError(
-        f"{path}: no archive, and no folder with transforms.json or cameras.json"
+        f"{path}: no archive, no file of Gaussians and no folder with transforms.json or cameras.json"
     )
 
 
