@@ -1502,6 +1502,8 @@ pub enum ExportFormat {
     Glb = 7,
     /// .splat: 32 bytes a Gaussian.
     Splat = 8,
+    /// SPZ, version 4, which fewer programs read.
+    Spz4 = 9,
 }
 impl ExportFormat {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -1519,6 +1521,7 @@ impl ExportFormat {
             Self::Spz => "EXPORT_FORMAT_SPZ",
             Self::Glb => "EXPORT_FORMAT_GLB",
             Self::Splat => "EXPORT_FORMAT_SPLAT",
+            Self::Spz4 => "EXPORT_FORMAT_SPZ4",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -1533,6 +1536,7 @@ impl ExportFormat {
             "EXPORT_FORMAT_SPZ" => Some(Self::Spz),
             "EXPORT_FORMAT_GLB" => Some(Self::Glb),
             "EXPORT_FORMAT_SPLAT" => Some(Self::Splat),
+            "EXPORT_FORMAT_SPZ4" => Some(Self::Spz4),
             _ => None,
         }
     }

@@ -20,7 +20,8 @@ use segsplat::{
     store::{
         Place, Store,
         splats::{
-            COMPRESSED_PLY, FORMATS, GLB, PLY, SPLAT, SPZ, SplatFile, SplatFormat, read_splats,
+            COMPRESSED_PLY, FORMATS, GLB, PLY, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
+            read_splats,
         },
     },
 };
@@ -109,9 +110,14 @@ async fn a_scene_that_is_exported_and_posted_again_gives_the_same_views() {
     let ask = ask.with("format", "npy");
     let [http, grpc] = doors::both(server.addr).await;
     let truth = pixels(&http.view(id, &ask).await.unwrap());
-    for (format, floor) in
-        [(&PLY, 110.0), (&GLB, 120.0), (&SPLAT, 50.0), (&SPZ, 45.0), (&COMPRESSED_PLY, 45.0)]
-    {
+    for (format, floor) in [
+        (&PLY, 110.0),
+        (&GLB, 120.0),
+        (&SPLAT, 50.0),
+        (&SPZ, 45.0),
+        (&SPZ4, 45.0),
+        (&COMPRESSED_PLY, 45.0),
+    ] {
         let file = http.export_as(id, format.name).await.unwrap();
         let sent = upload(&format!("a.{}", format.ending), file);
         let (again, state) = http.create(&sent, &Options::wait()).await.unwrap();
@@ -285,6 +291,7 @@ async fn files_that_cannot_be_a_scene_are_refused_at_once() {
     let cases = [
         ("a.ply", good(&PLY)[..5_000].to_vec(), "invalid_request", "of 300 Gaussians"),
         ("a.spz", good(&SPZ)[..200].to_vec(), "invalid_request", "SPZ"),
+        ("a.spz", good(&SPZ4)[..200].to_vec(), "invalid_request", "SPZ: stream"),
         ("a.glb", b"glTF\x02".to_vec(), "invalid_request", "GLB"),
         ("a.splat", vec![0; 33], "invalid_request", "1 of 2"),
         ("a.splat", Vec::new(), "invalid_request", "the file is empty"),

@@ -12,7 +12,7 @@ use segsplat::{
     render::{Kinds, RenderRequest, Renderer as _, compare::psnr, cpu::CpuRenderer},
     scene::{Bank, BankMask, Gaussians, IndexMap, SanitizeReport, Semantics, SemanticsReport},
     store::splats::{
-        COMPRESSED_PLY, FORMATS, GLB, PLY, SPLAT, SPZ, SplatFile, SplatFormat, read_splats,
+        COMPRESSED_PLY, FORMATS, GLB, PLY, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat, read_splats,
     },
 };
 use segsplat_testing::scenes::{camera, cloud};
@@ -92,12 +92,14 @@ fn differences(a: &Gaussians, b: &Gaussians) -> [f64; 6] {
 fn numbers_come_back_to_the_step_of_the_format() {
     // Position, ln scale, opacity, rotation, degree 0, degrees above.
     let exact = 3e-6;
-    let spz_bits = 2_f64.powi(-19);
+    let (bits, color) = (2_f64.powi(-19), 0.5 / 255.0 / 0.15);
+    let spz = [bits, 0.5 / 16.0, 0.5 / 255.0, 2.2 / 723.0, color, 8.51 / 128.0];
     let cases = [
         (&PLY, [1e-6, exact, exact, exact, 0.0, 0.0]),
         (&GLB, [0.0; 6]),
         (&SPLAT, [1e-6, exact, 0.5 / 255.0, 1.1 / 128.0, 0.5 / 255.0 / 0.282, 9.0]),
-        (&SPZ, [spz_bits, 0.5 / 16.0, 0.5 / 255.0, 2.2 / 723.0, 0.5 / 255.0 / 0.15, 8.51 / 128.0]),
+        (&SPZ, spz),
+        (&SPZ4, spz),
     ];
     for degree in 0..=3 {
         let gaussians = cloud(COUNT, degree, 5);
@@ -118,7 +120,7 @@ fn numbers_come_back_to_the_step_of_the_format() {
 #[test]
 fn a_second_round_trip_changes_nothing() {
     let gaussians = cloud(COUNT, 2, 6);
-    for format in [&GLB, &SPZ, &SPLAT] {
+    for format in [&GLB, &SPZ, &SPZ4, &SPLAT] {
         let once = round_trip(format, &gaussians);
         let [position, scale, opacity, _, color, rest] =
             differences(&once, &round_trip(format, &once));
@@ -138,9 +140,14 @@ fn every_format_keeps_the_picture() {
     let renderer = CpuRenderer::new(1).unwrap();
     let draw = |gaussians: &Gaussians| renderer.render(gaussians, &request).unwrap().color.unwrap();
     let truth = draw(&gaussians);
-    for (format, floor) in
-        [(&PLY, 105.0), (&GLB, 120.0), (&SPLAT, 58.0), (&SPZ, 49.0), (&COMPRESSED_PLY, 46.0)]
-    {
+    for (format, floor) in [
+        (&PLY, 105.0),
+        (&GLB, 120.0),
+        (&SPLAT, 58.0),
+        (&SPZ, 49.0),
+        (&SPZ4, 49.0),
+        (&COMPRESSED_PLY, 46.0),
+    ] {
         let found = psnr(&draw(&round_trip(format, &gaussians)), &truth, None);
         println!("{}: {found:.1} dB", format.name);
         assert!(found > floor, "{}: {found:.1} dB, not {floor}", format.name);
@@ -156,7 +163,7 @@ fn harmonics_turn_with_the_axes() {
     let renderer = CpuRenderer::new(1).unwrap();
     let draw = |gaussians: &Gaussians| renderer.render(gaussians, &request).unwrap().color.unwrap();
     let truth = draw(&gaussians);
-    for (format, floor) in [(&GLB, 90.0), (&SPZ, 32.0), (&COMPRESSED_PLY, 30.0)] {
+    for (format, floor) in [(&GLB, 90.0), (&SPZ, 32.0), (&SPZ4, 32.0), (&COMPRESSED_PLY, 30.0)] {
         let found = psnr(&draw(&round_trip(format, &gaussians)), &truth, None);
         assert!(found > floor, "{}: {found:.1} dB, not {floor}", format.name);
     }
@@ -267,10 +274,12 @@ fn files_of_another_program_are_read() {
     assert!(found[0] < 2e-3 && found[1] < 2e-3 && found[2] < 3e-3, "{found:?}");
     assert!(found[3] < 2e-3 && found[4] < 0.01 && found[5] < 0.032, "{found:?}");
     // It writes the numbers of the PLY into SPZ as they are. The format's axes are y up, z back.
-    let spz = theirs(&SPZ, "theirs.spz");
-    let untold = half_turn(&spz, [1.0, -1.0, -1.0], [1.0, 1.0, -1.0, -1.0]);
-    let found = differences(&source, &untold);
-    assert!(found[0] < 2.0_f64.powi(-12) && found[1] < 0.032 && found[3] < 2e-3, "{found:?}");
+    for (format, name) in [(&SPZ, "theirs.spz"), (&SPZ4, "theirs.v4.spz")] {
+        let untold = theirs(format, name);
+        let untold = half_turn(&untold, [1.0, -1.0, -1.0], [1.0, 1.0, -1.0, -1.0]);
+        let found = differences(&source, &untold);
+        assert!(found[0] < 2.0_f64.powi(-12) && found[1] < 0.032 && found[3] < 2e-3, "{found:?}");
+    }
     // It turns a PLY about z into glTF's axes, we turn about x: between both is half a turn about
     // y.
     let glb = theirs(&GLB, "theirs.glb");
@@ -431,7 +440,7 @@ fn damaged_spz_files_are_refused_by_name() {
         (torn, "SPZ"),
         (bent, "SPZ"),
         (vec![0x1f, 0x8b], "SPZ"),
-        (b"NGSP\x04\0\0\0".to_vec(), "version 4"),
+        (b"NGSP\x04\0\0\0".to_vec(), "bytes of the header"),
         (b"PK\x03\x04".to_vec(), "zip"),
         (Vec::new(), "none of Gaussians"),
     ];
@@ -504,6 +513,69 @@ fn damaged_glb_files_are_refused_by_name() {
         (changed(|d| d["extras"] = serde_json::json!({"segsplat": {"semantics": 99}})), "99"),
     ];
     refused(&GLB, cases);
+}
+
+/// The blocks of both versions are alike, and the reference skips records that it does not know.
+#[test]
+fn spz_4_has_the_blocks_of_spz_3_and_skips_unknown_records() {
+    let gaussians = cloud(300, 2, 3);
+    let of = |format| differences(&gaussians, &round_trip(format, &gaussians));
+    assert_eq!(of(&SPZ4), of(&SPZ));
+    let good = bytes_of(&SPZ4, &gaussians);
+    let record = |kind: u32| {
+        let mut file = patched(&good[..32], 14, &[2]);
+        file = patched(&file, 16, &(32_u32 + 12).to_le_bytes());
+        let words = [kind, 4, 7].map(u32::to_le_bytes).concat();
+        [&file, &words, &good[32..]].concat()
+    };
+    assert_eq!(read(&SPZ4, &record(0x0001_0001)).unwrap().0.len(), 300);
+    let refused = read(&SPZ4, &record(0xADBE_0003)).unwrap_err();
+    assert!(refused.message().contains("SPZ_ADOBE_coordinate_system"), "{refused}");
+    // The same record at the end of a file of version 3.
+    let mut whole = Vec::new();
+    GzDecoder::new(&bytes_of(&SPZ, &gaussians)[..]).read_to_end(&mut whole).unwrap();
+    whole[14] = 2;
+    whole.extend([0xADBE_0003_u32, 4, 7].map(u32::to_le_bytes).concat());
+    let refused = read(&SPZ, &gzip(&whole)).unwrap_err();
+    assert!(refused.message().contains("SPZ_ADOBE_coordinate_system"), "{refused}");
+}
+
+#[test]
+fn damaged_spz_4_files_are_refused_by_name() {
+    let good = bytes_of(&SPZ4, &cloud(30, 1, 3));
+    let with = |at: usize, bytes: &[u8]| patched(&good, at, bytes);
+    let cut = |to: usize| good[..to].to_vec();
+    let mut bent = good.clone();
+    let last = bent.len() - 4;
+    bent[last..].fill(0xff);
+    let size = |stream: usize| 32 + 16 * stream;
+    let cases = vec![
+        (cut(4), "bytes of the header"),
+        (cut(15), "bytes of the header"),
+        (cut(31), "bytes of the header"),
+        (cut(40), "the table of the streams ends after 8 of 16"),
+        (cut(size(6)), "stream 0 ends after 0"),
+        (cut(good.len() - 1), "stream 5 ends after"),
+        (with(4, &3_u32.to_le_bytes()), "version 3"),
+        (with(4, &5_u32.to_le_bytes()), "version 5"),
+        (with(8, &0_u32.to_le_bytes()), "0 Gaussians"),
+        (with(8, &200_000_u32.to_le_bytes()), "200000"),
+        (with(8, &31_u32.to_le_bytes()), "stream 0 is of 270 bytes; it must be of 279"),
+        (with(12, &[4]), "degree 4"),
+        (with(12, &[0]), "6 streams; of degree 0 there are 5"),
+        (with(12, &[2]), "stream 5 is of 270 bytes; it must be of 720"),
+        (with(13, &[31]), "31 bits"),
+        (with(15, &[5]), "5 streams"),
+        (with(16, &31_u32.to_le_bytes()), "byte 31"),
+        (with(16, &u32::MAX.to_le_bytes()), "byte 4294967295"),
+        (with(16, &1_000_000_u32.to_le_bytes()), "the block of extensions ends after"),
+        (with(size(0) + 8, &u64::MAX.to_le_bytes()), "stream 0 is of"),
+        (with(size(0), &u64::MAX.to_le_bytes()), "stream 0 ends after"),
+        (with(size(0), &3_u64.to_le_bytes()), "stream 0: the compressed bytes are damaged"),
+        (with(size(6), &[0; 4]), "stream 0: the compressed bytes are damaged"),
+        (bent, "stream 5: the compressed bytes are damaged"),
+    ];
+    refused(&SPZ4, cases);
 }
 
 #[test]
@@ -595,7 +667,7 @@ fn the_command_line_turns_each_format_into_each_other() {
         let json: serde_json::Value = serde_json::from_slice(&text).unwrap();
         (done.status.code(), json)
     };
-    for from in [&PLY, &GLB, &SPLAT, &SPZ, &COMPRESSED_PLY] {
+    for from in [&PLY, &GLB, &SPLAT, &SPZ, &SPZ4, &COMPRESSED_PLY] {
         for to in FORMATS {
             let (source, target) = (at(from), folder.path().join(format!("b.{}", to.ending)));
             let words = ["export".as_ref(), source.as_os_str(), "-o".as_ref(), target.as_os_str()];

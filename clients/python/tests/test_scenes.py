@@ -122,6 +122,7 @@ def test_every_format_of_gaussians(
         "ply": b"ply\n",
         "compressed.ply": b"ply\n",
         "spz": b"\x1f\x8b",
+        "v4.spz": b"NGSP\x04",
         "glb": b"glTF",
         "splat": b"",
     }
@@ -129,6 +130,7 @@ def test_every_format_of_gaussians(
         scene.export("ply"),
         scene.export("compressed_ply"),
         scene.export("spz"),
+        scene.export("spz4"),
         scene.export("glb"),
         scene.export("splat"),
     ]

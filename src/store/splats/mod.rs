@@ -101,6 +101,16 @@ pub static SPZ: SplatFormat = SplatFormat {
     size_bytes: |_| None,
     write: spz::write,
 };
+/// SPZ, version 4.
+pub static SPZ4: SplatFormat = SplatFormat {
+    name: "spz4",
+    ending: "v4.spz",
+    media_type: OCTETS,
+    semantics: false,
+    check: spz::check,
+    size_bytes: |_| None,
+    write: spz::write_4,
+};
 /// Binary glTF with `KHR_gaussian_splatting`.
 pub static GLB: SplatFormat = SplatFormat {
     name: "glb",
@@ -122,7 +132,7 @@ pub static SPLAT: SplatFormat = SplatFormat {
     write: splat::write,
 };
 /// All formats. Where the ending of one ends that of another, the longer one comes first.
-pub static FORMATS: [&SplatFormat; 5] = [&COMPRESSED_PLY, &PLY, &SPZ, &GLB, &SPLAT];
+pub static FORMATS: [&SplatFormat; 6] = [&COMPRESSED_PLY, &PLY, &SPZ4, &SPZ, &GLB, &SPLAT];
 
 /// The endings of all formats, for messages.
 pub fn endings() -> String {
@@ -207,9 +217,7 @@ pub fn read_splats(from: &mut dyn BufRead, name: &str, limits: &Limits) -> Resul
         [b'p', b'l', b'y', ..] => ply::read(from, limits),
         [0x1f, 0x8b, ..] => spz::read(from, limits),
         b"glTF" => glb::read(from, limits),
-        b"NGSP" => {
-            Err(Error::invalid("SPZ: version 4 and later are not read; write version 3 instead"))
-        }
+        b"NGSP" => spz::read_4(from, limits),
         [b'P', b'K', ..] => Err(Error::invalid(
             "a zip is no file of Gaussians that is read (SOG is not); there are PLY, compressed \
              PLY, SPZ, GLB and .splat",

@@ -381,18 +381,19 @@ def gaussians(scene: Handle, text: str | None = None) -> Flow[Gaussians]:
 
 def export(
     scene: Handle,
-    format: Literal["ply", "compressed_ply", "spz", "glb", "splat"] = "ply",
+    format: Literal["ply", "compressed_ply", "spz", "spz4", "glb", "splat"] = "ply",
     path: str | Path | None = None,
     *,
     text: str | None = None,
 ) -> Flow[Path]:
     """Writes the scene, or what a text selects of it, to a file as it comes, and tells its path.
 
-    format: "ply", as 3DGS writes it; "compressed_ply" (PlayCanvas, SuperSplat), "spz", "glb"
-        (KHR_gaussian_splatting) and "splat" for other programs.
+    format: "ply", as 3DGS writes it; "compressed_ply" (PlayCanvas, SuperSplat), "spz" (version 3),
+        "spz4", "glb" (KHR_gaussian_splatting) and "splat" for other programs.
     path: by default the scene's id with the ending of the format, in the current folder.
     """
-    target = Path(path) if path is not None else Path(f"{scene.id}.{format.replace('_', '.')}")
+    ending = {"compressed_ply": "compressed.ply", "spz4": "v4.spz"}.get(format, format)
+    target = Path(path) if path is not None else Path(f"{scene.id}.{ending}")
     part = target.with_name(target.name + ".part")
     params = _query_string({"format": format, "text": text})
     request = Request("GET", f"/v1/scenes/{scene.id}/export", params=params, stream=True)
