@@ -1,7 +1,7 @@
 // What was dropped: photos and their cameras, and what is wrong with each, before it is sent.
 const PHOTO = /\.(jpe?g|png|webp)$/i,
   ARCHIVE = /\.(zip|tar)$/i,
-  SPLATS = /\.(ply|spz|glb|splat)$/i;
+  SPLATS = /\.(ply|spz|sog|glb|splat)$/i;
 const fileName = (path) => path.split('/').pop();
 
 // All files of a drop, with the paths that they have in dropped folders.

@@ -660,7 +660,7 @@ pub mod create_scene_request {
         /// A piece of the archive: a zip or tar of a folder of photos with its camera JSON.
         #[prost(bytes, tag = "3")]
         Archive(::prost::bytes::Bytes),
-        /// A piece of a file of Gaussians, which is a whole scene: PLY, SPZ, GLB or .splat.
+        /// A piece of a file of Gaussians, which is a whole scene: PLY, SPZ, SOG, GLB or .splat.
         #[prost(message, tag = "4")]
         Splats(super::SplatsChunk),
     }
@@ -1504,6 +1504,8 @@ pub enum ExportFormat {
     Splat = 8,
     /// SPZ, version 4, which fewer programs read.
     Spz4 = 9,
+    /// SOG, the bundle of pictures of PlayCanvas, without harmonics over degree 0.
+    Sog = 10,
 }
 impl ExportFormat {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -1522,6 +1524,7 @@ impl ExportFormat {
             Self::Glb => "EXPORT_FORMAT_GLB",
             Self::Splat => "EXPORT_FORMAT_SPLAT",
             Self::Spz4 => "EXPORT_FORMAT_SPZ4",
+            Self::Sog => "EXPORT_FORMAT_SOG",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -1537,6 +1540,7 @@ impl ExportFormat {
             "EXPORT_FORMAT_GLB" => Some(Self::Glb),
             "EXPORT_FORMAT_SPLAT" => Some(Self::Splat),
             "EXPORT_FORMAT_SPZ4" => Some(Self::Spz4),
+            "EXPORT_FORMAT_SOG" => Some(Self::Sog),
             _ => None,
         }
     }

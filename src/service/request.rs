@@ -148,6 +148,8 @@ pub enum ExportFormat {
     Spz,
     /// SPZ, version 4, which fewer programs read.
     Spz4,
+    /// SOG, the bundle of pictures of `PlayCanvas`, without harmonics over degree 0.
+    Sog,
     /// Binary glTF with `KHR_gaussian_splatting`, the entries of the bank and the semantics.
     Glb,
     /// `.splat`: 32 bytes a Gaussian.

@@ -20,7 +20,7 @@ use segsplat::{
     store::{
         Place, Store,
         splats::{
-            COMPRESSED_PLY, FORMATS, GLB, PLY, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
+            COMPRESSED_PLY, FORMATS, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
             read_splats,
         },
     },
@@ -116,6 +116,7 @@ async fn a_scene_that_is_exported_and_posted_again_gives_the_same_views() {
         (&SPLAT, 50.0),
         (&SPZ, 45.0),
         (&SPZ4, 45.0),
+        (&SOG, 40.0),
         (&COMPRESSED_PLY, 45.0),
     ] {
         let file = http.export_as(id, format.name).await.unwrap();

@@ -12,7 +12,8 @@ use segsplat::{
     render::{Kinds, RenderRequest, Renderer as _, compare::psnr, cpu::CpuRenderer},
     scene::{Bank, BankMask, Gaussians, IndexMap, SanitizeReport, Semantics, SemanticsReport},
     store::splats::{
-        COMPRESSED_PLY, FORMATS, GLB, PLY, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat, read_splats,
+        COMPRESSED_PLY, FORMATS, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
+        read_splats,
     },
 };
 use segsplat_testing::scenes::{camera, cloud};
@@ -56,7 +57,7 @@ fn round_trip(format: &'static SplatFormat, gaussians: &Gaussians) -> Gaussians 
 
 /// Harmonics that are left.
 fn degree(format: &SplatFormat, gaussians: &Gaussians) -> u8 {
-    if format.name == SPLAT.name { 0 } else { gaussians.sh_degree() }
+    if [SPLAT.name, SOG.name].contains(&format.name) { 0 } else { gaussians.sh_degree() }
 }
 
 fn world(gaussians: &Gaussians, i: usize) -> DVec3 {
@@ -116,6 +117,39 @@ fn numbers_come_back_to_the_step_of_the_format() {
     }
 }
 
+/// SOG has the Gaussians in another order, positions in steps of a logarithm, and scales and colours
+/// in tables that follow their density.
+#[test]
+fn sog_keeps_numbers_to_the_steps_of_its_tables() {
+    let gaussians = cloud(400, 2, 5);
+    let back = round_trip(&SOG, &gaussians);
+    let order = nearest(&back, &gaussians);
+    let mut all = order.clone();
+    all.sort_unstable();
+    assert!(all.into_iter().eq(0..400), "each Gaussian is there once");
+    let [position, scale, opacity, rotation, color, _] =
+        differences(&chosen(&gaussians, &order), &back);
+    assert!(position < 5e-4 && opacity <= 0.5 / 255.0 + 1e-6, "{position} {opacity}");
+    assert!(rotation < 2.2 * 0.5 * 2_f64.sqrt() / 255.0, "{rotation}");
+    // No number is farther from its table than 1/256 of their range.
+    let range = |numbers: &mut dyn Iterator<Item = f32>| {
+        let ends = numbers.fold([f32::MAX, f32::MIN], |[a, b], v| [a.min(v), b.max(v)]);
+        f64::from(ends[1] - ends[0]) / 256.0 + 1e-4
+    };
+    let scales = range(&mut gaussians.scales().iter().flatten().map(|scale| scale.ln()));
+    let colors = range(&mut gaussians.sh().iter().step_by(9).flatten().copied());
+    assert!(scale < scales && color < colors, "{scale} of {scales}, {color} of {colors}");
+}
+
+/// For each Gaussian the number of the nearest of others.
+fn nearest(of: &Gaussians, among: &Gaussians) -> Vec<usize> {
+    let nearest = |i: usize| {
+        let far = |j: &usize| world(of, i).distance(world(among, *j));
+        (0..among.len()).min_by(|a, b| far(a).total_cmp(&far(b))).unwrap()
+    };
+    (0..of.len()).map(nearest).collect()
+}
+
 /// What was read once does not change any more.
 #[test]
 fn a_second_round_trip_changes_nothing() {
@@ -146,6 +180,7 @@ fn every_format_keeps_the_picture() {
         (&SPLAT, 58.0),
         (&SPZ, 49.0),
         (&SPZ4, 49.0),
+        (&SOG, 49.0),
         (&COMPRESSED_PLY, 46.0),
     ] {
         let found = psnr(&draw(&round_trip(format, &gaussians)), &truth, None);
@@ -265,14 +300,14 @@ fn files_of_another_program_are_read() {
     };
     // Their order is along a curve: the nearest of the source is the same Gaussian.
     let packed = theirs(&COMPRESSED_PLY, "theirs.compressed.ply");
-    let nearest = |i: usize| {
-        let far = |j: &usize| world(&packed, i).distance(world(&source, *j));
-        (0..40).min_by(|a, b| far(a).total_cmp(&far(b))).unwrap()
-    };
-    let order: Vec<usize> = (0..40).map(nearest).collect();
-    let found = differences(&chosen(&source, &order), &packed);
+    let found = differences(&chosen(&source, &nearest(&packed, &source)), &packed);
     assert!(found[0] < 2e-3 && found[1] < 2e-3 && found[2] < 3e-3, "{found:?}");
     assert!(found[3] < 2e-3 && found[4] < 0.01 && found[5] < 0.032, "{found:?}");
+    let sog = theirs(&SOG, "theirs.sog");
+    let found = differences(&chosen(&source, &nearest(&sog, &source)), &sog);
+    // It rounds down, and its palette of harmonics has fewer rows than there are Gaussians.
+    assert!(found[0] < 5e-4 && found[1] < 0.06 && found[2] < 4e-3 && found[3] < 8e-3, "{found:?}");
+    assert!(found[4] < 0.03 && found[5] < 0.8, "{found:?}");
     // It writes the numbers of the PLY into SPZ as they are. The format's axes are y up, z back.
     for (format, name) in [(&SPZ, "theirs.spz"), (&SPZ4, "theirs.v4.spz")] {
         let untold = theirs(format, name);
@@ -578,6 +613,80 @@ fn damaged_spz_4_files_are_refused_by_name() {
     refused(&SPZ4, cases);
 }
 
+/// The bundle with another `meta.json`, and with other bytes of a file, or without it.
+fn rebundled(
+    bundle: &[u8],
+    change: impl FnOnce(&mut serde_json::Value),
+    other: Option<(&str, Option<&[u8]>)>,
+) -> Vec<u8> {
+    let mut zip = zip::ZipArchive::new(Cursor::new(bundle)).unwrap();
+    let mut to = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    let mut change = Some(change);
+    for i in 0..zip.len() {
+        let mut file = zip.by_index(i).unwrap();
+        let name = file.name().unwrap().into_owned();
+        let mut bytes = Vec::new();
+        file.read_to_end(&mut bytes).unwrap();
+        if name == "meta.json" {
+            let mut meta = serde_json::from_slice(&bytes).unwrap();
+            change.take().unwrap()(&mut meta);
+            bytes = meta.to_string().into_bytes();
+        }
+        match other.filter(|(wanted, _)| *wanted == name) {
+            Some((_, None)) => continue,
+            Some((_, Some(new))) => bytes = new.to_vec(),
+            None => {}
+        }
+        to.start_file(name, zip::write::SimpleFileOptions::default()).unwrap();
+        to.write_all(&bytes).unwrap();
+    }
+    to.finish().unwrap().into_inner()
+}
+
+#[test]
+fn damaged_sog_files_are_refused_by_name() {
+    let good = fixture("theirs.sog");
+    let meta = |change: fn(&mut serde_json::Value)| rebundled(&good, change, None);
+    let file = |name: &str, bytes: Option<&[u8]>| rebundled(&good, |_| {}, Some((name, bytes)));
+    let one = |side: u32| {
+        let mut webp = Cursor::new(Vec::new());
+        image::RgbaImage::new(side, side).write_to(&mut webp, image::ImageFormat::WebP).unwrap();
+        webp.into_inner()
+    };
+    let mut many = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    for i in 0..65 {
+        many.start_file(i.to_string(), zip::write::SimpleFileOptions::default()).unwrap();
+    }
+    let cases = vec![
+        (good[..20].to_vec(), "the zip is damaged"),
+        (good[..good.len() - 30].to_vec(), "the zip is damaged"),
+        (b"PK\x05\x06".to_vec(), "the zip is damaged"),
+        (many.finish().unwrap().into_inner(), "65"),
+        (file("meta.json", None), "the zip has no \"meta.json\""),
+        (file("meta.json", Some(b"{")), "meta.json: EOF"),
+        (file("meta.json", Some(&vec![b' '; 2 << 20])), "1048576"),
+        (meta(|m| m["version"] = 3.into()), "version 3"),
+        (meta(|m| m["version"] = serde_json::Value::Null), "version 1 is not read"),
+        (meta(|m| m["count"] = 0.into()), "0 Gaussians"),
+        (meta(|m| m["count"] = (-1).into()), "meta.json: "),
+        (meta(|m| m["count"] = 100_001.into()), "100001"),
+        (meta(|m| m["count"] = 5_000.into()), "5000 to"),
+        (meta(|m| m["means"] = serde_json::Value::Null), "no \"means\""),
+        (meta(|m| m["sh0"] = serde_json::Value::Null), "no \"sh0\""),
+        (meta(|m| m["scales"]["codebook"] = "x".into()), "meta.json: "),
+        (meta(|m| m["quats"]["files"][0] = "../q.webp".into()), "has no \"../q.webp\""),
+        (meta(|m| m["shN"]["bands"] = 4.into()), "degree 4"),
+        (meta(|m| m["shN"]["bands"] = 2.into()), "shN_centroids.webp"),
+        (meta(|m| m["shN"]["count"] = 1.into()), "there are 1 centroids"),
+        (meta(|m| m["shN"]["count"] = 70_000.into()), "70000"),
+        (file("quats.webp", None), "has no \"quats.webp\""),
+        (file("quats.webp", Some(b"RIFF")), "is no WebP picture"),
+        (file("means_l.webp", Some(&one(2))), "\"means_l.webp\" has 2 x 2 pixels; 40 to"),
+        (file("scales.webp", Some(&one(1100))), "1100 x 1100 pixels"),
+    ];
+    refused(&SOG, cases);
+}
+
 #[test]
 fn damaged_compressed_plys_are_refused_by_name() {
     let good = bytes_of(&COMPRESSED_PLY, &cloud(300, 1, 3));
@@ -667,7 +776,7 @@ fn the_command_line_turns_each_format_into_each_other() {
         let json: serde_json::Value = serde_json::from_slice(&text).unwrap();
         (done.status.code(), json)
     };
-    for from in [&PLY, &GLB, &SPLAT, &SPZ, &SPZ4, &COMPRESSED_PLY] {
+    for from in [&PLY, &GLB, &SPLAT, &SPZ, &SPZ4, &SOG, &COMPRESSED_PLY] {
         for to in FORMATS {
             let (source, target) = (at(from), folder.path().join(format!("b.{}", to.ending)));
             let words = ["export".as_ref(), source.as_os_str(), "-o".as_ref(), target.as_os_str()];

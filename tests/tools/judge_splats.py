@@ -19,6 +19,7 @@ STEPS = {
     "compressed.ply": (3e-3, 3e-3, 3e-3, 0.01),
     "spz": (1e-5, 0.032, 3e-3, 0.015),
     "v4.spz": (1e-5, 0.032, 3e-3, 0.015),
+    "sog": (1e-3, 0.05, 3e-3, 0.02),
     "splat": (1e-6, 1e-5, 3e-3, 0.015),
 }
 COLUMNS = [["x", "y", "z"], ["scale_0", "scale_1", "scale_2"], ["opacity"],

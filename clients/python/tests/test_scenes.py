@@ -123,6 +123,7 @@ def test_every_format_of_gaussians(
         "compressed.ply": b"ply\n",
         "spz": b"\x1f\x8b",
         "v4.spz": b"NGSP\x04",
+        "sog": b"PK",
         "glb": b"glTF",
         "splat": b"",
     }
@@ -131,6 +132,7 @@ def test_every_format_of_gaussians(
         scene.export("compressed_ply"),
         scene.export("spz"),
         scene.export("spz4"),
+        scene.export("sog"),
         scene.export("glb"),
         scene.export("splat"),
     ]

@@ -466,5 +466,7 @@ both_ways! {
     FeatureKind = FeatureKind { Weights, Features }
     Boxes = Boxes { Oriented, Aligned, None }
     MaskFormat = MaskFormat { Rle, Png, None }
-    ExportFormat = ExportFormat { Ply, Npz, Packed, Html, CompressedPly, Spz, Spz4, Glb, Splat }
+    ExportFormat = ExportFormat {
+        Ply, Npz, Packed, Html, CompressedPly, Spz, Spz4, Sog, Glb, Splat
+    }
 }

@@ -10,6 +10,7 @@ mod glb;
 mod packed_ply;
 mod ply;
 mod scene;
+mod sog;
 mod splat;
 mod spz;
 
@@ -111,6 +112,16 @@ pub static SPZ4: SplatFormat = SplatFormat {
     size_bytes: |_| None,
     write: spz::write_4,
 };
+/// The bundle of pictures of `PlayCanvas`.
+pub static SOG: SplatFormat = SplatFormat {
+    name: "sog",
+    ending: "sog",
+    media_type: OCTETS,
+    semantics: false,
+    check: sog::check,
+    size_bytes: |_| None,
+    write: sog::write,
+};
 /// Binary glTF with `KHR_gaussian_splatting`.
 pub static GLB: SplatFormat = SplatFormat {
     name: "glb",
@@ -132,7 +143,7 @@ pub static SPLAT: SplatFormat = SplatFormat {
     write: splat::write,
 };
 /// All formats. Where the ending of one ends that of another, the longer one comes first.
-pub static FORMATS: [&SplatFormat; 6] = [&COMPRESSED_PLY, &PLY, &SPZ4, &SPZ, &GLB, &SPLAT];
+pub static FORMATS: [&SplatFormat; 7] = [&COMPRESSED_PLY, &PLY, &SPZ4, &SPZ, &SOG, &GLB, &SPLAT];
 
 /// The endings of all formats, for messages.
 pub fn endings() -> String {
@@ -218,16 +229,13 @@ pub fn read_splats(from: &mut dyn BufRead, name: &str, limits: &Limits) -> Resul
         [0x1f, 0x8b, ..] => spz::read(from, limits),
         b"glTF" => glb::read(from, limits),
         b"NGSP" => spz::read_4(from, limits),
-        [b'P', b'K', ..] => Err(Error::invalid(
-            "a zip is no file of Gaussians that is read (SOG is not); there are PLY, compressed \
-             PLY, SPZ, GLB and .splat",
-        )),
+        [b'P', b'K', ..] => sog::read(from, limits),
         _ if SplatFormat::of_file(name).is_some_and(|named| named.name == SPLAT.name) => {
             splat::read(from, limits)
         }
         other => Err(Error::invalid(format!(
-            "the file is none of Gaussians: it begins with {:?}; PLY, compressed PLY, SPZ and GLB \
-             are known by their first bytes, .splat by the ending of its name",
+            "the file is none of Gaussians: it begins with {:?}; PLY, compressed PLY, SPZ, SOG and \
+             GLB are known by their first bytes, .splat by the ending of its name",
             String::from_utf8_lossy(other)
         ))),
     }

@@ -118,7 +118,7 @@ pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
 }
 
 /// The Gaussians along a Morton curve, 21 bits an axis.
-fn morton_order(gaussians: &Gaussians) -> Vec<u32> {
+pub(super) fn morton_order(gaussians: &Gaussians) -> Vec<u32> {
     let means = gaussians.means();
     let fold = |f: fn(f32, f32) -> f32, start| {
         means.iter().fold([start; 3], |a, b| std::array::from_fn(|k| f(a[k], b[k])))

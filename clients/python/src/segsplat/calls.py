@@ -44,12 +44,12 @@ from .view import FORMATS, View, picture
 from .wire import Flow, Item, Multipart, Part, Policy, Read, Request, ServerSentEvents, pause, send
 
 #: Endings of files of Gaussians.
-SPLATS = (".ply", ".spz", ".glb", ".splat")
+SPLATS = (".ply", ".spz", ".sog", ".glb", ".splat")
 #: Cameras of one call; more go as more calls.
 CAMERAS_MAX = 64
 
 #: A folder with photos and `transforms.json` or `cameras.json`; an archive of one; a file of
-#: Gaussians (PLY, SPZ, GLB, .splat); or photos and their cameras.
+#: Gaussians (PLY, SPZ, SOG, GLB, .splat); or photos and their cameras.
 Source: TypeAlias = str | Path | Mapping[str | Path, Camera]
 #: A scene as the server shows it.
 Shown: TypeAlias = tuple[SceneStatus, tuple[Photo, ...]]
@@ -381,7 +381,7 @@ def gaussians(scene: Handle, text: str | None = None) -> Flow[Gaussians]:
 
 def export(
     scene: Handle,
-    format: Literal["ply", "compressed_ply", "spz", "spz4", "glb", "splat"] = "ply",
+    format: Literal["ply", "compressed_ply", "spz", "spz4", "sog", "glb", "splat"] = "ply",
     path: str | Path | None = None,
     *,
     text: str | None = None,
@@ -389,7 +389,7 @@ def export(
     """Writes the scene, or what a text selects of it, to a file as it comes, and tells its path.
 
     format: "ply", as 3DGS writes it; "compressed_ply" (PlayCanvas, SuperSplat), "spz" (version 3),
-        "spz4", "glb" (KHR_gaussian_splatting) and "splat" for other programs.
+        "spz4", "sog", "glb" (KHR_gaussian_splatting) and "splat" for other programs.
     path: by default the scene's id with the ending of the format, in the current folder.
     """
     ending = {"compressed_ply": "compressed.ply", "spz4": "v4.spz"}.get(format, format)
