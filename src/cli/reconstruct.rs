@@ -38,8 +38,8 @@ pub(super) struct Args {
     /// Folder with transforms.json or cameras.json and its photos, a zip or tar of one, or a file
     /// of Gaussians (PLY, compressed PLY, SPZ, SOG, GLB, .splat), which keeps its semantics
     photos: PathBuf,
-    /// Scene file to write; with the ending ply, compressed.ply, spz, v4.spz, sog, glb or splat that
-    /// format
+    /// Scene file to write; with the ending ply, compressed.ply, spz, v4.spz, sog, glb or splat
+    /// that format
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Views that the network takes at once [default: 4]

@@ -117,8 +117,8 @@ fn numbers_come_back_to_the_step_of_the_format() {
     }
 }
 
-/// SOG has the Gaussians in another order, positions in steps of a logarithm, and scales and colours
-/// in tables that follow their density.
+/// SOG has the Gaussians in another order, positions in steps of a logarithm, and scales and
+/// colours in tables that follow their density.
 #[test]
 fn sog_keeps_numbers_to_the_steps_of_its_tables() {
     let gaussians = cloud(400, 2, 5);
