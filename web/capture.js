@@ -1,6 +1,7 @@
 // What was dropped: photos and their cameras, and what is wrong with each, before it is sent.
 const PHOTO = /\.(jpe?g|png|webp)$/i,
-  ARCHIVE = /\.(zip|tar)$/i;
+  ARCHIVE = /\.(zip|tar)$/i,
+  SPLATS = /\.(ply|spz|sog|glb|splat)$/i;
 const fileName = (path) => path.split('/').pop();
 
 // All files of a drop, with the paths that they have in dropped folders.
@@ -41,6 +42,13 @@ async function readCapture(files) {
     return { form, rows, faults };
   }
   const photos = files.filter(({ path }) => PHOTO.test(path));
+  const splats = files.find(({ path }) => SPLATS.test(path));
+  // COLMAP's points beside photos are no scene.
+  if (splats && !photos.length) {
+    form.append('splats', splats.file, fileName(splats.path));
+    rows.push({ name: splats.path, faults: [] });
+    return { form, rows, faults };
+  }
   const find = (test) => files.find(({ path }) => test.test(fileName(path)));
   const json = find(/^transforms.*\.json$/i) || find(/\.json$/i);
   let list = [],

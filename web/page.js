@@ -595,7 +595,9 @@ function about(report) {
     .map(({ stage, ms }) => `${stage} ${(ms / 1000).toFixed(1)} s`)
     .join(', ');
   $('about').textContent = [
-    `${count(report.gaussians)} Gaussians of ${report.views_used} of ${report.photos} photos`,
+    report.file_format
+      ? `${count(report.gaussians)} Gaussians of a file (${report.file_format})`
+      : `${count(report.gaussians)} Gaussians of ${report.views_used} of ${report.photos} photos`,
     times,
     ...report.warnings.map((warning) => `${warning.code}: ${warning.message}`),
   ].join('\n');

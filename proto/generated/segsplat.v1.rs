@@ -644,7 +644,7 @@ pub struct Method {
 /// One message of the upload.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct CreateSceneRequest {
-    #[prost(oneof = "create_scene_request::Part", tags = "1, 2, 3")]
+    #[prost(oneof = "create_scene_request::Part", tags = "1, 2, 3, 4")]
     pub part: ::core::option::Option<create_scene_request::Part>,
 }
 /// Nested message and enum types in `CreateSceneRequest`.
@@ -660,6 +660,9 @@ pub mod create_scene_request {
         /// A piece of the archive: a zip or tar of a folder of photos with its camera JSON.
         #[prost(bytes, tag = "3")]
         Archive(::prost::bytes::Bytes),
+        /// A piece of a file of Gaussians, which is a whole scene: PLY, SPZ, SOG, GLB or .splat.
+        #[prost(message, tag = "4")]
+        Splats(super::SplatsChunk),
     }
 }
 /// Cameras and options of a scene.
@@ -708,6 +711,16 @@ pub mod create_scene_header {
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct PhotoChunk {
     /// File name on the photo's first piece; empty on the following ones.
+    #[prost(string, tag = "1")]
+    pub name: ::prost::alloc::string::String,
+    /// Bytes.
+    #[prost(bytes = "bytes", tag = "2")]
+    pub data: ::prost::bytes::Bytes,
+}
+/// A piece of a file of Gaussians.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SplatsChunk {
+    /// File name on the first piece; empty on the following ones. A .splat is known by its ending.
     #[prost(string, tag = "1")]
     pub name: ::prost::alloc::string::String,
     /// Bytes.
@@ -901,6 +914,9 @@ pub struct HealthReport {
     /// What refinement made of it, once it was refined.
     #[prost(message, optional, tag = "14")]
     pub refinement: ::core::option::Option<RefineReport>,
+    /// Format of the file of Gaussians that the scene is; empty where it was made of photos.
+    #[prost(string, tag = "15")]
+    pub file_format: ::prost::alloc::string::String,
 }
 /// How many Gaussians were dropped or clamped for one reason.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -1486,6 +1502,10 @@ pub enum ExportFormat {
     Glb = 7,
     /// .splat: 32 bytes a Gaussian.
     Splat = 8,
+    /// SPZ, version 4, which fewer programs read.
+    Spz4 = 9,
+    /// SOG, the bundle of pictures of PlayCanvas, without harmonics over degree 0.
+    Sog = 10,
 }
 impl ExportFormat {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -1503,6 +1523,8 @@ impl ExportFormat {
             Self::Spz => "EXPORT_FORMAT_SPZ",
             Self::Glb => "EXPORT_FORMAT_GLB",
             Self::Splat => "EXPORT_FORMAT_SPLAT",
+            Self::Spz4 => "EXPORT_FORMAT_SPZ4",
+            Self::Sog => "EXPORT_FORMAT_SOG",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -1517,6 +1539,8 @@ impl ExportFormat {
             "EXPORT_FORMAT_SPZ" => Some(Self::Spz),
             "EXPORT_FORMAT_GLB" => Some(Self::Glb),
             "EXPORT_FORMAT_SPLAT" => Some(Self::Splat),
+            "EXPORT_FORMAT_SPZ4" => Some(Self::Spz4),
+            "EXPORT_FORMAT_SOG" => Some(Self::Sog),
             _ => None,
         }
     }
@@ -1646,7 +1670,7 @@ pub mod scene_service_client {
             self.inner = self.inner.max_encoding_message_size(limit);
             self
         }
-        /// Makes a scene. First a header, then the photos in pieces, or one archive in pieces.
+        /// Makes a scene. First a header, then the photos, one archive or a file of Gaussians in pieces.
         /// Answers at once, or when done where the header says how long to wait.
         pub async fn create_scene(
             &mut self,
@@ -1946,7 +1970,7 @@ pub mod scene_service_server {
     /// Generated trait containing gRPC methods that should be implemented for use with SceneServiceServer.
     #[async_trait]
     pub trait SceneService: std::marker::Send + std::marker::Sync + 'static {
-        /// Makes a scene. First a header, then the photos in pieces, or one archive in pieces.
+        /// Makes a scene. First a header, then the photos, one archive or a file of Gaussians in pieces.
         /// Answers at once, or when done where the header says how long to wait.
         async fn create_scene(
             &self,

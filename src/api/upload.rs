@@ -42,6 +42,7 @@ enum Current {
     Cameras,
     Photo,
     Archive,
+    Splats,
 }
 
 /// An upload that is being read.
@@ -81,14 +82,8 @@ impl<'a> UploadBuilder<'a> {
 
     /// Begins the photo `name`.
     pub(super) fn begin_photo(&mut self, name: &str) -> Result<()> {
-        let (count, max) = (self.upload.photos.len(), self.limits.file_name_bytes_max);
-        if name.len() > max {
-            return Err(Error::limit(
-                format!("photo {count}: file name"),
-                format!("{} bytes", name.len()),
-                format!("{max} bytes"),
-            ));
-        }
+        let count = self.upload.photos.len();
+        self.check_name(&format!("photo {count}"), name)?;
         if count >= self.limits.photos_max {
             return Err(Error::limit(
                 "upload",
@@ -101,6 +96,17 @@ impl<'a> UploadBuilder<'a> {
         }
         self.upload.photos.push(UploadFile { name: name.to_owned(), bytes: Vec::new() });
         self.current = Current::Photo;
+        Ok(())
+    }
+
+    /// Begins the file of Gaussians `name`.
+    pub(super) fn begin_splats(&mut self, name: &str) -> Result<()> {
+        if self.upload.splats.is_some() {
+            return Err(Error::invalid("upload: two files of Gaussians; a scene is one"));
+        }
+        self.check_name("splats", name)?;
+        self.upload.splats = Some(UploadFile { name: name.to_owned(), bytes: Vec::new() });
+        self.current = Current::Splats;
         Ok(())
     }
 
@@ -122,6 +128,7 @@ impl<'a> UploadBuilder<'a> {
                 .map(|(UploadCameras::Transforms(json) | UploadCameras::Cameras(json))| json),
             Current::Photo => upload.photos.last_mut().map(|photo| &mut photo.bytes),
             Current::Archive => upload.archive.as_mut(),
+            Current::Splats => upload.splats.as_mut().map(|file| &mut file.bytes),
         };
         let file = file.ok_or_else(|| Error::invalid("upload: bytes before any file's name"))?;
         file.extend_from_slice(bytes);
@@ -133,6 +140,11 @@ impl<'a> UploadBuilder<'a> {
         let upload = self.upload;
         let (min, max, photos) =
             (self.limits.photos_min, self.limits.photos_max, upload.photos.len());
+        if upload.splats.is_some() {
+            let others = photos > 0 || upload.cameras.is_some() || upload.archive.is_some();
+            let why = "upload: a file of Gaussians is a whole scene; send it without other files";
+            return if others { Err(Error::invalid(why)) } else { Ok((upload, self.guard)) };
+        }
         let wrong = match (&upload.archive, &upload.cameras) {
             (Some(_), Some(_)) => {
                 "an archive holds its own camera description; send one or the other".to_owned()
@@ -142,7 +154,7 @@ impl<'a> UploadBuilder<'a> {
             }
             (None, None) if photos == 0 => format!(
                 "no photos and no cameras; send transforms or cameras and {min} to {max} photos, \
-                 or an archive"
+                 an archive, or splats"
             ),
             (None, None) => {
                 "no camera description; send a part named transforms or cameras".to_owned()
@@ -154,6 +166,15 @@ impl<'a> UploadBuilder<'a> {
             _ => return Ok((upload, self.guard)),
         };
         Err(Error::invalid(format!("upload: {wrong}")))
+    }
+
+    fn check_name(&self, what: &str, name: &str) -> Result<()> {
+        let (bytes, max) = (name.len(), self.limits.file_name_bytes_max);
+        if bytes > max {
+            let what = format!("{what}: file name");
+            return Err(Error::limit(what, format!("{bytes} bytes"), format!("{max} bytes")));
+        }
+        Ok(())
     }
 
     fn account(&mut self, bytes: usize) -> Result<()> {

@@ -14,10 +14,10 @@ use crate::{
 
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
-    /// Scene file, a folder with one, or a file of Gaussians (PLY, compressed PLY, SPZ, GLB,
+    /// Scene file, a folder with one, or a file of Gaussians (PLY, compressed PLY, SPZ, SOG, GLB,
     /// .splat)
     scene: PathBuf,
-    /// File to write; its ending (ply, compressed.ply, spz, glb, splat) is the format
+    /// File to write; its ending (ply, compressed.ply, spz, v4.spz, sog, glb, splat) is the format
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
 }

@@ -10,7 +10,7 @@ use crate::{config::Config, error::Result, scene::Gaussians};
 
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
-    /// Scene file, a folder with one, or a file of Gaussians (PLY, compressed PLY, SPZ, GLB,
+    /// Scene file, a folder with one, or a file of Gaussians (PLY, compressed PLY, SPZ, SOG, GLB,
     /// .splat)
     scene: PathBuf,
 }

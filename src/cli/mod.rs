@@ -65,7 +65,7 @@ enum Command {
     Query(Box<query::Args>),
     /// Write the bank of a scene, or the pixels of a view over it, as an npz file
     Features(Box<features::Args>),
-    /// Write the Gaussians of a scene for other programs: PLY, SPZ, GLB, .splat
+    /// Write the Gaussians of a scene for other programs: PLY, SPZ, SOG, GLB, .splat
     Export(export::Args),
     /// Show what is in a scene file
     Inspect(inspect::Args),

@@ -1,5 +1,5 @@
-//! `segsplat reconstruct`: a folder or archive of photos and cameras becomes a scene file, or a
-//! file of Gaussians for other programs.
+//! `segsplat reconstruct`: a folder or archive of photos and cameras, or a file of Gaussians,
+//! becomes a scene file, or a file of Gaussians for other programs.
 
 use std::{
     fmt::Write as _,
@@ -13,7 +13,9 @@ use sha2::{Digest, Sha256};
 
 use super::{
     output::Output,
-    scene_file::{path_of, semantics_path, splat_format, unreadable, unwritable, write_splats},
+    scene_file::{
+        open_splats, path_of, semantics_path, splat_format, unreadable, unwritable, write_splats,
+    },
 };
 use crate::{
     config::{Config, ConfigArgs},
@@ -24,15 +26,20 @@ use crate::{
         self, Pipeline,
         semantics::{SemanticsInput, understand},
     },
-    scene::{Density, Preset, Scene, SceneId, SceneOptions, SemanticsMode, Stage, Upload, Watch},
+    scene::{
+        Density, PhotoHash, Preset, Provenance, Scene, SceneId, SceneMeta, SceneOptions,
+        SemanticsMode, Stage, Upload, Watch,
+    },
     store::{self, splats::SplatFile, write_scene_file, write_semantics_file},
 };
 
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
-    /// Folder with transforms.json or cameras.json and its photos, or a zip or tar of one
+    /// Folder with transforms.json or cameras.json and its photos, a zip or tar of one, or a file
+    /// of Gaussians (PLY, compressed PLY, SPZ, SOG, GLB, .splat), which keeps its semantics
     photos: PathBuf,
-    /// Scene file to write; with the ending ply, compressed.ply, spz, glb or splat that format
+    /// Scene file to write; with the ending ply, compressed.ply, spz, v4.spz, sog, glb or splat
+    /// that format
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
     /// Views that the network takes at once [default: 4]
@@ -55,8 +62,6 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
-    let upload = upload_of(&args.photos, config)?;
-    let engine = Pipeline::open(&config.networks())?;
     let options = SceneOptions {
         max_views: args.max_views,
         semantics: args.semantics,
@@ -66,6 +71,11 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     };
     let options = options.with(&args.method)?;
     options.method().check()?;
+    if !args.photos.is_dir() && splat_format(&args.photos).is_some() {
+        return import(args, config, &options, out);
+    }
+    let upload = upload_of(&args.photos, config)?;
+    let engine = Pipeline::open(&config.networks())?;
     let eager = args.semantics == SemanticsMode::Eager;
     if let (true, Some(lack)) = (eager, engine.bundle().lacks_semantics()) {
         let message = format!("--semantics eager: the bundle has {lack}");
@@ -79,13 +89,8 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let photos = pipeline::read(&upload, &config.limits, watch.cancel)?;
     let made = pipeline::make(&engine, &photos, &options, watch)?;
     let provenance = store::provenance(store::hashes(&upload), &options, engine.bundle().sha256());
-    let mut hash = Sha256::new();
-    for file in &provenance.files {
-        hash.update(format!("{} {}\n", file.sha256, file.file));
-    }
-    let mut id = [0; 16];
-    id.copy_from_slice(&hash.finalize()[..16]);
-    let mut scene = made.into_scene(SceneId::from_bytes(id), store::now_ms(), provenance);
+    let id = id_of(&provenance);
+    let mut scene = made.into_scene(id, store::now_ms(), provenance);
     let path = path_of(&args.output);
     let for_others = splat_format(&path).is_some();
     write(&path, &scene)?;
@@ -107,6 +112,40 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let total_ms = begun.elapsed().as_secs_f64() * 1e3;
     out.progress("done", 1.0);
     describe(&path, &scene, total_ms, out)
+}
+
+/// A file of Gaussians becomes a scene file. No network is needed.
+fn import(args: &Args, config: &Config, options: &SceneOptions, out: &Output) -> Result<()> {
+    let begun = Instant::now();
+    let file = fs_err::read(&args.photos).map_err(|e| unreadable(&args.photos, e))?;
+    let sha256 = store::sha256(&file);
+    drop(file);
+    // What the file has is kept.
+    let options = SceneOptions { semantics: SemanticsMode::Lazy, ..options.clone() };
+    let scene = open_splats(&args.photos, &config.limits)?.into_scene(&options)?;
+    let name = args.photos.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let provenance = store::provenance(vec![PhotoHash { file: name, sha256 }], &options, "");
+    let (id, created_ms) = (id_of(&provenance), store::now_ms());
+    let scene = Scene { meta: SceneMeta { id, created_ms, provenance, ..scene.meta }, ..scene };
+    let path = path_of(&args.output);
+    write(&path, &scene)?;
+    match &scene.semantics {
+        _ if splat_format(&path).is_some() => {}
+        Some(made) => write_semantics_file(&semantics_path(&path), &scene.meta.id, made)?,
+        None => remove(&semantics_path(&path))?,
+    }
+    describe(&path, &scene, begun.elapsed().as_secs_f64() * 1e3, out)
+}
+
+/// The same files have the same id.
+fn id_of(provenance: &Provenance) -> SceneId {
+    let mut hash = Sha256::new();
+    for file in &provenance.files {
+        hash.update(format!("{} {}\n", file.sha256, file.file));
+    }
+    let mut id = [0; 16];
+    id.copy_from_slice(&hash.finalize()[..16]);
+    SceneId::from_bytes(id)
 }
 
 fn upload_of(path: &Path, config: &Config) -> Result<Upload> {
@@ -146,10 +185,13 @@ fn write(path: &Path, scene: &Scene) -> Result<()> {
 fn describe(path: &Path, scene: &Scene, total_ms: f64, out: &Output) -> Result<()> {
     let report = &scene.meta.report;
     let mut text = format!(
-        "{}: {} Gaussians of {} photos in {total_ms:.0} ms\n",
+        "{}: {} Gaussians of {} in {total_ms:.0} ms\n",
         path.display(),
         report.gaussians,
-        report.views_used
+        match &report.file_format {
+            Some(format) => format!("a file ({format})"),
+            None => format!("{} photos", report.views_used),
+        }
     );
     let semantics = scene.semantics.as_ref().map(|semantics| &semantics.report);
     let of_semantics = semantics.iter().flat_map(|semantics| &semantics.stages);

@@ -9,10 +9,10 @@ use std::{
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    scene::{Backdrop, DropCount, HealthReport, Provenance, Scene, SceneId, SceneMeta},
+    scene::{Scene, SceneOptions},
     store::{
         read_scene, read_semantics,
-        splats::{SplatFile, SplatFormat, read_splats},
+        splats::{SplatFile, SplatFormat, SplatsRead, read_splats},
     },
 };
 
@@ -79,34 +79,18 @@ pub(super) fn ending(path: &Path) -> String {
     path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase()
 }
 
+/// Reads a file of Gaussians, as many as may be: it is the caller's own.
+pub(super) fn open_splats(path: &Path, limits: &Limits) -> Result<SplatsRead> {
+    let file = fs_err::File::open(path).map_err(|e| unreadable(path, e))?;
+    let limits = Limits { splats_bytes_max: u64::MAX, ..limits.clone() };
+    read_splats(&mut BufReader::new(file), &path.to_string_lossy(), &limits)
+}
+
 /// Opens a scene with its semantics, where there are some.
 pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
     let path = path_of(path);
     if let Some(format) = splat_format(&path) {
-        let file = fs_err::File::open(&path).map_err(|e| unreadable(&path, e))?;
-        let (gaussians, counts, semantics) =
-            read_splats(&mut BufReader::new(file), &path.to_string_lossy(), limits.gaussians_max)?;
-        let dropped = counts
-            .counts()
-            .into_iter()
-            .filter(|(_, count)| *count > 0)
-            .map(|(reason, count)| DropCount { reason: reason.to_owned(), count });
-        let report = HealthReport {
-            gaussians: gaussians.len() as u64,
-            dropped: dropped.collect(),
-            ..HealthReport::default()
-        };
-        let meta = SceneMeta {
-            id: SceneId::from_bytes([0; 16]),
-            created_ms: 0,
-            cameras: Vec::new(),
-            report,
-            provenance: Provenance::default(),
-        };
-        let mut scene = Scene::new(meta, gaussians, Backdrop::default());
-        if let Some(semantics) = semantics {
-            scene = scene.with_semantics(Arc::new(semantics))?;
-        }
+        let scene = open_splats(&path, limits)?.into_scene(&SceneOptions::default())?;
         return Ok(Opened { scene, format: format.name, sha256: None });
     }
     let file = fs_err::read(&path).map_err(|e| unreadable(&path, e))?;

@@ -44,7 +44,6 @@ use self::{
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    pipeline,
     render::backward::DifferentiableRenderer,
     scene::{PhotoHash, Refine, SceneId, SceneState, SemanticsMode, SemanticsState, Upload},
     store::{self, KeyUse, Record, Store, not_found},
@@ -154,14 +153,15 @@ impl Jobs {
         mut record: Record,
         limits: &Limits,
     ) -> Result<SceneId> {
-        let (photos, files) = rayon::join(
-            || pipeline::read(&upload, limits, &AtomicBool::new(false)),
-            || store::hashes(&upload),
-        );
-        let photos = photos?;
-        record.request_sha256 = store::request_sha256(&files, &record.options);
+        let read = ReadUpload::of(&upload, &record.options, limits, &AtomicBool::new(false))?;
+        record.options.semantics = read.semantics(record.options.semantics);
+        if record.options.semantics == SemanticsMode::Off {
+            record.status.semantics.state = SemanticsState::Off;
+        }
+        let files = &read.files;
+        record.request_sha256 = store::request_sha256(files, &record.options);
         // First, so that a full queue still answers for scenes that it holds.
-        if let Some(earlier) = self.earlier(&files, &record)? {
+        if let Some(earlier) = self.earlier(files, &record)? {
             return Ok(earlier);
         }
         let reserved = self.queue.reserve(Kind::Scene, record.owner.as_deref());
@@ -170,7 +170,7 @@ impl Jobs {
         let id = record.status.id.clone();
         self.replicas.hold(&id);
         let kept = || -> Result<Option<SceneId>> {
-            if let Some(other) = self.use_key(&files, &record)? {
+            if let Some(other) = self.use_key(files, &record)? {
                 return Ok(Some(other));
             }
             self.parts.store.put_upload(upload, &record).inspect_err(|_| {
@@ -185,7 +185,7 @@ impl Jobs {
             self.release(&id);
             return Ok(other);
         }
-        self.uploads.keep(&id, Arc::new(ReadUpload { files, photos }));
+        self.uploads.keep(&id, Arc::new(read));
         self.records.insert(record);
         place.fill(id.clone());
         Ok(id)

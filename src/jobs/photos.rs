@@ -1,28 +1,105 @@
-//! Photos of jobs in memory: jobs do not read again what the create call read.
+//! Uploads of jobs in memory: jobs do not read again what the create call read.
 
 use std::{
     collections::HashMap,
-    sync::Arc,
+    sync::{Arc, atomic::AtomicBool},
     time::{Duration, Instant},
 };
 
 use parking_lot::Mutex;
 
 use crate::{
-    pipeline::PhotoSet,
-    scene::{PhotoHash, SceneId},
+    error::{Error, Result},
+    limits::Limits,
+    pipeline::{self, PhotoSet},
+    scene::{PhotoHash, Scene, SceneId, SceneOptions, SemanticsMode, Stage, StageTime, Upload},
+    store::{self, splats::read_splats},
 };
 
 /// An upload as its jobs need it.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct ReadUpload {
     pub(super) files: Vec<PhotoHash>,
-    pub(super) photos: PhotoSet,
+    pub(super) content: Content,
+}
+
+/// What an upload holds.
+#[derive(Clone, Debug)]
+pub(super) enum Content {
+    Photos(PhotoSet),
+    /// A file of Gaussians as a scene that has no id yet.
+    Splats(Box<Scene>),
+}
+
+impl ReadUpload {
+    /// Reads an upload, until it is cancelled.
+    /// Fails as [`pipeline::read`], [`read_splats`] and `SplatsRead::into_scene` do.
+    pub(super) fn of(
+        upload: &Upload,
+        options: &SceneOptions,
+        limits: &Limits,
+        cancel: &AtomicBool,
+    ) -> Result<Self> {
+        let read = || match &upload.splats {
+            None => pipeline::read(upload, limits, cancel).map(Content::Photos),
+            Some(file) => {
+                let begun = Instant::now();
+                let read = read_splats(&mut &file.bytes[..], &file.name, limits)?;
+                let mut scene = read.into_scene(options)?;
+                let ms = begun.elapsed().as_secs_f64() * 1e3;
+                let stage = Stage::Photos.name().to_owned();
+                scene.meta.report.stages.push(StageTime { stage, ms });
+                Ok(Content::Splats(Box::new(scene)))
+            }
+        };
+        let (content, files) = rayon::join(read, || store::hashes(upload));
+        Ok(Self { files, content: content? })
+    }
+
+    /// The photos.
+    /// Fails with `invalid_request` where it is a file of Gaussians.
+    pub(super) fn photos(&self) -> Result<&PhotoSet> {
+        match &self.content {
+            Content::Photos(photos) => Ok(photos),
+            Content::Splats(_) => {
+                Err(Error::invalid("the scene is a file of Gaussians; it has no photos"))
+            }
+        }
+    }
+
+    /// When the semantics of its scene are made, where the call says `asked`: those of a file are
+    /// in it, or are never made.
+    pub(super) fn semantics(&self, asked: SemanticsMode) -> SemanticsMode {
+        match &self.content {
+            Content::Splats(scene) if scene.semantics.is_none() => SemanticsMode::Off,
+            _ => asked,
+        }
+    }
+
+    /// Room that its scene takes while it is made: its photos; of a file as large a share of all
+    /// room as of the bytes that one may have.
+    pub(super) fn room(&self, limits: &Limits) -> usize {
+        match &self.content {
+            Content::Photos(photos) => photos.photos.len(),
+            Content::Splats(scene) => {
+                let share = scene.size_bytes() as f64 / limits.splats_bytes_max.max(1) as f64;
+                (share * limits.photos_max as f64).ceil() as usize
+            }
+        }
+    }
+
+    /// Bytes of its photos or Gaussians.
+    pub(super) fn size_bytes(&self) -> u64 {
+        match &self.content {
+            Content::Photos(photos) => photos.size_bytes(),
+            Content::Splats(scene) => scene.size_bytes(),
+        }
+    }
 }
 
 /// Uploads of scenes whose jobs wait or run, and for a time those of scenes that may be asked their
-/// first text; bounded by the bytes of their photos. One that is not here is read from the store
-/// when its job begins.
+/// first text; bounded by the bytes of their photos and Gaussians. One that is not here is read
+/// from the store when its job begins.
 #[derive(Debug)]
 pub(super) struct ReadUploads {
     bytes_max: u64,
@@ -44,7 +121,7 @@ impl Kept {
     }
 
     fn size_bytes(&self) -> u64 {
-        self.upload.photos.size_bytes()
+        self.upload.size_bytes()
     }
 }
 
@@ -98,7 +175,7 @@ impl ReadUploads {
         self.uploads.lock().remove(id);
     }
 
-    /// Bytes of all photos here.
+    /// Bytes of all photos and Gaussians here.
     pub(super) fn size_bytes(&self) -> u64 {
         self.uploads.lock().values().map(Kept::size_bytes).sum()
     }
@@ -122,7 +199,7 @@ mod tests {
         let photo = Photo { width: 1, height: 1, rgb: vec![0; bytes], valid: None };
         let posed = PosedPhoto { file: String::new(), photo, camera, intrinsics_made_for: None };
         let photos = PhotoSet { photos: vec![posed], read_ms: 0.0 };
-        Arc::new(ReadUpload { files: Vec::new(), photos })
+        Arc::new(ReadUpload { files: Vec::new(), content: Content::Photos(photos) })
     }
 
     #[test]

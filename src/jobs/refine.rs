@@ -128,8 +128,9 @@ impl Jobs {
     /// The refinement that a scene is to have once it is done, where its create call or the
     /// configuration asks for one and the queue has room.
     pub(super) fn first_order(&self, done: &Record) -> Option<RefineOrder> {
-        if done.status.report.as_ref().is_some_and(|report| report.refinement.is_some()) {
-            return None; // a copy of a scene that was refined
+        let report = done.status.report.as_ref()?;
+        if report.refinement.is_some() || report.file_format.is_some() {
+            return None; // a copy of a scene that was refined, or one without photos
         }
         let how = done.options.refine.unwrap_or(self.parts.refine);
         let ms = budget_ms(how, done.status.cameras.len(), self.parts.threads)?;
@@ -166,8 +167,8 @@ impl Jobs {
         let watch = Watch { progress: &progress, cancel: &job.cancel };
         self.give_way(job)?;
         let scene = self.parts.store.scene(id)?;
-        let photos = self.photos(id, watch)?;
-        let photos = &photos.photos.photos;
+        let upload = self.upload(id, watch)?;
+        let photos = &upload.photos()?.photos;
         let limits = &self.parts.limits;
         let time = Duration::from_millis(order.ms);
         let options = RefineOptions {

@@ -1,4 +1,4 @@
-//! The job that makes a scene of photos, and keeps it.
+//! The job that makes a scene of photos, or of a file of Gaussians, and keeps it.
 
 use std::{
     sync::{Arc, atomic::Ordering},
@@ -8,10 +8,10 @@ use std::{
 use super::{
     Jobs,
     job::{Job, Kind},
+    photos::{Content, ReadUpload},
 };
 use crate::{
     error::{Error, ErrorCode, Result},
-    pipeline::Reconstruction,
     scene::{
         Provenance, RefineState, RefineStatus, Scene, SceneId, SceneMeta, SceneState,
         SemanticsMode, SemanticsState, SemanticsStatus, Stage, unless_cancelled,
@@ -36,7 +36,7 @@ enum Made {
     Kept(Arc<Scene>, String),
     /// A scene of the same content.
     Known(Arc<Scene>),
-    New(Box<Reconstruction>, Box<Provenance>),
+    New(Box<Scene>),
 }
 
 /// Keeps other workers from making a scene of the same content, or from changing the same scene,
@@ -55,7 +55,7 @@ impl Drop for WorkLock<'_> {
 
 impl Jobs {
     pub(super) fn make_scene(&self, job: &Job) -> Result<()> {
-        let (begun, id, store) = (Instant::now(), &job.scene, &self.parts.store);
+        let (begun, id) = (Instant::now(), &job.scene);
         let Some(record) = self.records.update(id, |record| {
             record.attempts += 1;
             record.status.state = SceneState::Running;
@@ -75,23 +75,23 @@ impl Jobs {
         let (started, made) = store::side_by_side(started, || self.find_or_make(job, &record));
         started?;
         let (made, _lock) = made?;
-        let (reconstruction, provenance) = match made {
+        let scene = match made {
             Made::Kept(scene, digest) => return self.finish(&scene, digest, None),
             Made::Known(known) => {
                 tracing::info!(scene = %id, of = %known.meta.id, "copied: the same content");
-                return self.copy(&record, &known);
+                let created_ms = record.status.created_ms;
+                let meta = SceneMeta { id: id.clone(), created_ms, ..known.meta.clone() };
+                return self.keep(Scene { meta, ..(*known).clone() });
             }
-            Made::New(reconstruction, provenance) => (reconstruction, provenance),
+            Made::New(scene) => *scene,
         };
         self.show(job, Stage::Store, 0.0);
         let took = u64::try_from(begun.elapsed().as_millis()).unwrap_or(u64::MAX);
         let before = self.scene_ms.load(Ordering::Relaxed);
         let smoothed = if before == 0 { took } else { (3 * before + took) / 4 };
         self.scene_ms.store(smoothed.max(1), Ordering::Relaxed);
-        let scene = reconstruction.into_scene(id.clone(), record.status.created_ms, *provenance);
         let stored = Instant::now();
-        let (scene, digest) = store.put_scene(scene)?;
-        let finished = self.finish(&scene, digest, None);
+        let finished = self.keep(scene);
         meter::stage(Stage::Store.name(), stored.elapsed().as_secs_f64());
         finished
     }
@@ -100,44 +100,55 @@ impl Jobs {
     /// lock of the content, where there is one.
     fn find_or_make(&self, job: &Job, record: &Record) -> Result<(Made, Option<WorkLock<'_>>)> {
         let (id, store) = (&job.scene, &self.parts.store);
+        // What was kept of a file may lack its semantics, which are kept after it.
         if record.attempts > 1
             && let Some((scene, digest)) = self.kept_scene(id)?
+            && scene.meta.report.file_format.is_none()
         {
             return Ok((Made::Kept(scene, digest), None));
         }
-        let networks = self.parts.scenes.identity();
-        let files = match self.uploads.find(id) {
-            Some(upload) => upload.files.clone(),
-            None => store::hashes(&store.upload(id)?),
+        let (files, of_photos) = match self.uploads.find(id) {
+            Some(upload) => (upload.files.clone(), upload.photos().is_ok()),
+            None => {
+                let upload = store.upload(id)?;
+                (store::hashes(&upload), upload.splats.is_none())
+            }
         };
+        let networks = if of_photos { self.parts.scenes.identity() } else { String::new() };
         let provenance = store::provenance(files, &record.options, &networks);
         let lock = Some(self.lock(&provenance.content_sha256, job)?);
         if let Some(known) = self.scene_of_content(&provenance.content_sha256, record)? {
             return Ok((Made::Known(known), lock));
         }
-        let reconstruction = self.within_time(job, |watch| {
+        let created_ms = record.status.created_ms;
+        let scene = self.within_time(job, |watch| {
             (watch.progress)(Stage::Photos, 0.0);
-            let upload = self.photos(id, watch)?;
+            let upload = self.upload(id, watch)?;
+            let room = upload.room(&self.parts.limits);
+            let _room = self.room.take(room, watch.cancel)?;
+            let Content::Photos(photos) = &upload.content else {
+                self.uploads.forget(id);
+                return of_file(upload, id, created_ms, provenance);
+            };
             match record.options.semantics {
                 SemanticsMode::Eager => self.uploads.keep(id, Arc::clone(&upload)),
                 SemanticsMode::Lazy => self.uploads.leave(id, Arc::clone(&upload)),
                 SemanticsMode::Off => self.uploads.forget(id),
             }
-            let _room = self.room.take(upload.photos.photos.len(), watch.cancel)?;
-            self.parts.scenes.make(&upload.photos, &record.options, watch)
+            let made = self.parts.scenes.make(photos, &record.options, watch)?;
+            Ok(made.into_scene(id.clone(), created_ms, provenance))
         })?;
-        Ok((Made::New(Box::new(reconstruction), Box::new(provenance)), lock))
+        Ok((Made::New(Box::new(scene)), lock))
     }
 
-    /// Keeps an earlier scene of the same content under this record.
-    fn copy(&self, record: &Record, known: &Scene) -> Result<()> {
-        let id = &record.status.id;
-        let created_ms = record.status.created_ms;
-        let meta = SceneMeta { id: id.clone(), created_ms, ..known.meta.clone() };
-        let (mut scene, digest) = self.parts.store.put_scene(Scene { meta, ..known.clone() })?;
+    /// Keeps a scene with the semantics that it has, and its record.
+    fn keep(&self, scene: Scene) -> Result<()> {
+        let (id, semantics) = (scene.meta.id.clone(), scene.semantics.clone());
+        let (mut scene, digest) = self.parts.store.put_scene(scene)?;
         let mut semantics_digest = None;
-        if let Some(semantics) = &known.semantics {
-            let kept = self.parts.store.put_semantics(id, (**semantics).clone(), |_| Ok(()))?;
+        if let Some(semantics) = semantics {
+            let semantics = Arc::unwrap_or_clone(semantics);
+            let kept = self.parts.store.put_semantics(&id, semantics, |_| Ok(()))?;
             (scene, semantics_digest) = (kept.0, Some(kept.1));
         }
         self.finish(&scene, digest, semantics_digest)
@@ -238,4 +249,19 @@ impl Jobs {
         }
         Ok(())
     }
+}
+
+/// The scene of an upload that is a file of Gaussians, under this id.
+fn of_file(
+    upload: Arc<ReadUpload>,
+    id: &SceneId,
+    created_ms: u64,
+    provenance: Provenance,
+) -> Result<Scene> {
+    // Not copied where nobody else has it.
+    let Content::Splats(scene) = Arc::unwrap_or_clone(upload).content else {
+        return Err(Error::internal("an upload of photos is no file of Gaussians"));
+    };
+    let meta = SceneMeta { id: id.clone(), created_ms, provenance, ..scene.meta };
+    Ok(Scene { meta, ..*scene })
 }

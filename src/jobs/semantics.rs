@@ -98,9 +98,10 @@ impl Jobs {
                 return keep(semantics.report.clone(), None);
             }
             let semantics = self.within_time(job, |watch| {
-                let upload = self.photos(id, watch)?;
-                let _room = self.room.take(upload.photos.photos.len(), watch.cancel)?;
-                self.parts.semantics.make(&upload.photos.photos, &scene, watch)
+                let upload = self.upload(id, watch)?;
+                let photos = &upload.photos()?.photos;
+                let _room = self.room.take(photos.len(), watch.cancel)?;
+                self.parts.semantics.make(photos, &scene, watch)
             })?;
             let report = semantics.report.clone();
             Ok(store.put_semantics(id, semantics, |digest| keep(report, Some(digest)))?.2)

@@ -19,7 +19,6 @@ use super::{
 };
 use crate::{
     error::{Error, ErrorCode, Result},
-    pipeline,
     scene::{
         RefineState, RefineStatus, SceneError, SceneId, SceneState, SemanticsState,
         SemanticsStatus, Stage, Watch,
@@ -137,14 +136,14 @@ impl Jobs {
         self.records.update(&job.scene, |record| job.kind.show(record, stage, fraction));
     }
 
-    /// The photos of a job: as the create call read them, else read from the store.
-    pub(super) fn photos(&self, id: &SceneId, watch: Watch<'_>) -> Result<Arc<ReadUpload>> {
+    /// The upload of a job: as the create call read it, else read from the store.
+    pub(super) fn upload(&self, id: &SceneId, watch: Watch<'_>) -> Result<Arc<ReadUpload>> {
         if let Some(kept) = self.uploads.find(id) {
             return Ok(kept);
         }
         let upload = self.parts.store.upload(id)?;
-        let photos = pipeline::read(&upload, &self.parts.limits, watch.cancel)?;
-        Ok(Arc::new(ReadUpload { files: store::hashes(&upload), photos }))
+        let options = &self.record(id)?.options;
+        ReadUpload::of(&upload, options, &self.parts.limits, watch.cancel).map(Arc::new)
     }
 
     /// What becomes of a job that failed or was stopped.

@@ -9,9 +9,7 @@ use crate::{
     error::{Error, Result},
     keys::Caller,
     limits::IDEMPOTENCY_KEY_BYTES_MAX,
-    scene::{
-        SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState, Upload,
-    },
+    scene::{SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, Upload},
     store::{self, Record},
     telemetry,
 };
@@ -62,7 +60,8 @@ impl Service {
         if options.semantics == SemanticsMode::Eager {
             self.inner.can_understand("semantics=eager")?;
         }
-        if options.semantics == SemanticsMode::Lazy && !self.inner.config.keep_photos {
+        let needs_photos = options.semantics == SemanticsMode::Lazy && upload.splats.is_none();
+        if needs_photos && !self.inner.config.keep_photos {
             // Without photos there is no later.
             let can = self.inner.can_understand("semantics").is_ok();
             options.semantics = if can { SemanticsMode::Eager } else { SemanticsMode::Off };
@@ -136,14 +135,11 @@ impl Inner {
     ) -> Result<(SceneId, bool)> {
         let id = store::new_id()?;
         let status = SceneStatus::new(id.clone(), SceneState::Queued, store::now_ms());
-        let mut record = record(Record {
+        let record = record(Record {
             owner: caller.owner().map(str::to_owned),
             traceparent: telemetry::traceparent(),
             ..Record::new(status)
         });
-        if record.options.semantics == SemanticsMode::Off {
-            record.status.semantics.state = SemanticsState::Off;
-        }
         let photos = upload.photos.len();
         let queued = self.jobs.submit(upload, record, &self.limits())?;
         let replayed = queued != id;

@@ -30,6 +30,14 @@ impl Service {
     pub async fn refine(&self, id: &SceneId, refine: Refine) -> Result<SceneStatus> {
         check(refine, &self.limits())?;
         let scene = self.scene(id).await?.finished()?;
+        let file = &scene.record().status.report.as_ref().and_then(|r| r.file_format.as_ref());
+        if let (Some(name), false) = (file, refine == Refine::Off) {
+            let id = scene.id();
+            return Err(Error::invalid(format!(
+                "refine: scene {id} is a file of Gaussians ({name}); it has no photos to come \
+                 closer to"
+            )));
+        }
         if refine != Refine::Off && !self.inner.config.keep_photos {
             let why = "this server does not keep the photos of finished scenes (keep_photos)";
             return Err(Error::invalid(format!("refine: {why}")));

@@ -146,6 +146,10 @@ pub enum ExportFormat {
     CompressedPly,
     /// SPZ, version 3: under 16 bytes a Gaussian.
     Spz,
+    /// SPZ, version 4, which fewer programs read.
+    Spz4,
+    /// SOG, the bundle of pictures of `PlayCanvas`, without harmonics over degree 0.
+    Sog,
     /// Binary glTF with `KHR_gaussian_splatting`, the entries of the bank and the semantics.
     Glb,
     /// `.splat`: 32 bytes a Gaussian.

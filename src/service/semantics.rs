@@ -73,9 +73,22 @@ impl Inner {
         if record.options.semantics != SemanticsMode::Off {
             return Ok(());
         }
-        let id = &record.status.id;
-        let why = "was made with semantics=off; make it again with lazy or eager";
+        let (id, why) = (&record.status.id, why_off(&record.status));
         Err(Error::new(ErrorCode::SemanticsOff, format!("{what}: scene {id} {why}")))
+    }
+
+    /// Why the semantics that a file of Gaussians brought cannot be used: other networks made them,
+    /// and there are no photos to make them again.
+    fn why_foreign(&self, format: Option<&String>, made_by: &str) -> Option<String> {
+        let ours = &self.models.bundle_sha256;
+        let format = format.filter(|_| !is_of(made_by, ours))?;
+        Some(format!(
+            "is a file of Gaussians ({format}) with semantics of the bundle {}; this server has \
+             {:?} ({}), which cannot be compared with it",
+            start(made_by),
+            self.models.bundle,
+            start(ours)
+        ))
     }
 
     /// The scene with its semantics; `None` where they must be made again: their file was put
@@ -84,8 +97,18 @@ impl Inner {
         &self,
         access: &SceneAccess,
     ) -> Result<Option<(Arc<Scene>, Arc<Semantics>)>> {
-        let found = self.semantics_of(self.load(access)?);
+        let scene = self.load(access)?;
+        let found = self.semantics_of(Arc::clone(&scene));
         if found.is_none() {
+            if let Some(semantics) = &scene.semantics
+                && let Some(why) = self.why_foreign(
+                    scene.meta.report.file_format.as_ref(),
+                    &semantics.report.bundle_sha256,
+                )
+            {
+                let message = format!("scene {} {why}", access.id());
+                return Err(Error::new(ErrorCode::ModelUnavailable, message));
+            }
             tracing::info!(scene = %access.id(), "no semantics of this bundle: made again");
             self.jobs.lose_semantics(access.id())?;
         }
@@ -95,9 +118,8 @@ impl Inner {
     /// A scene and its semantics, where the loaded bundle made them.
     fn semantics_of(&self, scene: Arc<Scene>) -> Option<(Arc<Scene>, Arc<Semantics>)> {
         let semantics = scene.semantics.clone()?;
-        let made_by = &semantics.report.bundle_sha256;
-        let ours = *made_by == self.models.bundle_sha256 || made_by.is_empty();
-        ours.then_some((scene, semantics))
+        is_of(&semantics.report.bundle_sha256, &self.models.bundle_sha256)
+            .then_some((scene, semantics))
     }
 
     /// The scene with its semantics, which are made now where they were not before.
@@ -153,6 +175,27 @@ impl Inner {
     }
 }
 
+/// Whether a bundle made semantics that name theirs; those of the first programs name none.
+fn is_of(made_by: &str, bundle_sha256: &str) -> bool {
+    made_by == bundle_sha256 || made_by.is_empty()
+}
+
+/// The start of a hash, for a message.
+fn start(sha256: &str) -> String {
+    sha256.chars().take(12).collect()
+}
+
+/// Why a scene has no semantics.
+fn why_off(status: &SceneStatus) -> String {
+    match status.report.as_ref().and_then(|report| report.file_format.as_ref()) {
+        Some(format) => format!(
+            "is a file of Gaussians ({format}) without semantics, and has no photos to make them \
+             of; a ply or glb that this program wrote of a scene with semantics has them"
+        ),
+        None => "was made with semantics=off; make it again with lazy or eager".to_owned(),
+    }
+}
+
 /// The semantics are being made; says how far the job is.
 fn not_yet(status: &SceneStatus, what: &str) -> Error {
     let semantics = &status.semantics;
@@ -181,8 +224,12 @@ impl Service {
 
     /// A status that says whether texts can be answered for the scene now.
     pub(super) fn shown(&self, mut status: SceneStatus) -> SceneStatus {
-        let reason = match status.semantics.state {
-            SemanticsState::Off => Some("the scene was made with semantics=off".to_owned()),
+        let file = status.report.as_ref().and_then(|report| report.file_format.as_ref());
+        let made_by = status.semantics.report.as_ref().map(|report| &report.bundle_sha256);
+        let foreign = made_by.and_then(|made_by| self.inner.why_foreign(file, made_by));
+        let reason = match (status.semantics.state, foreign) {
+            (SemanticsState::Off, _) => Some(format!("the scene {}", why_off(&status))),
+            (_, Some(foreign)) => Some(format!("the scene {foreign}")),
             _ => self.inner.backend.lacks().map(|lack| self.inner.lacking(&lack)),
         };
         status.semantics.available = reason.is_none();

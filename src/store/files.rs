@@ -7,6 +7,8 @@ use std::{
 
 use fs_err::{self as fs, File};
 
+use sha2::{Digest, Sha256};
+
 use crate::error::{Error, ErrorCode};
 
 /// Ending of files that are being written; after a crash such a file is useless.
@@ -51,6 +53,11 @@ pub(super) fn unavailable(what: &str, cause: io::Error) -> Error {
         format!("the store cannot {what} now: {}", cause.kind()),
     )
     .caused_by(cause)
+}
+
+/// sha256 of bytes, lower-case hex.
+pub fn sha256(bytes: &[u8]) -> String {
+    hex(&Sha256::digest(bytes))
 }
 
 /// Lower-case hex.

@@ -43,6 +43,7 @@ use parking_lot::Mutex;
 use self::objects::Objects;
 pub(crate) use self::{files::hex, hashes::is_of_request};
 pub use self::{
+    files::sha256,
     hashes::{provenance, request_sha256},
     index::KeyUse,
     open::Place,

@@ -5,11 +5,10 @@ use std::io;
 use object_store::PutPayload;
 use safetensors::Dtype;
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 
 use super::{
     container::{self, Array, Container, Label},
-    files::hex,
+    files::sha256,
 };
 use crate::{
     error::Result,
@@ -25,6 +24,7 @@ enum Part {
     Cameras,
     Archive,
     Photo,
+    Splats,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -41,17 +41,15 @@ fn parts(upload: &Upload) -> Vec<(Part, &str, &[u8])> {
     });
     let archive = upload.archive.iter().map(|bytes| (Part::Archive, "archive", &bytes[..]));
     let photos = upload.photos.iter().map(|p| (Part::Photo, p.name.as_str(), &p.bytes[..]));
-    cameras.chain(archive).chain(photos).collect()
+    let splats = upload.splats.iter().map(|s| (Part::Splats, s.name.as_str(), &s.bytes[..]));
+    cameras.chain(archive).chain(photos).chain(splats).collect()
 }
 
 /// Name and sha256 of every file of an upload.
 pub fn hashes(upload: &Upload) -> Vec<PhotoHash> {
     parts(upload)
         .into_iter()
-        .map(|(_, name, bytes)| PhotoHash {
-            file: name.to_owned(),
-            sha256: hex(&Sha256::digest(bytes)),
-        })
+        .map(|(_, name, bytes)| PhotoHash { file: name.to_owned(), sha256: sha256(bytes) })
         .collect()
 }
 
@@ -71,8 +69,8 @@ pub(super) fn pack(upload: Upload, record: &super::Record) -> io::Result<PutPayl
     let cameras = upload.cameras.map(|cameras| match cameras {
         UploadCameras::Transforms(json) | UploadCameras::Cameras(json) => json,
     });
-    let photos = upload.photos.into_iter().map(|photo| photo.bytes);
-    let bytes = cameras.into_iter().chain(upload.archive).chain(photos);
+    let files = upload.photos.into_iter().chain(upload.splats).map(|file| file.bytes);
+    let bytes = cameras.into_iter().chain(upload.archive).chain(files);
     let parts = std::iter::once(head).chain(bytes).chain([digest.to_vec()]);
     // A payload takes each part over as it is.
     Ok(parts.flat_map(PutPayload::from).collect())
@@ -90,6 +88,7 @@ pub(super) fn read(file: &[u8]) -> Result<(Upload, super::Record)> {
             Part::Cameras => upload.cameras = Some(UploadCameras::Cameras(bytes)),
             Part::Archive => upload.archive = Some(bytes),
             Part::Photo => upload.photos.push(UploadFile { name, bytes }),
+            Part::Splats => upload.splats = Some(UploadFile { name, bytes }),
         }
     }
     Ok((upload, header.record))

@@ -35,6 +35,7 @@ mod raw;
 mod refine;
 mod schedule;
 mod slow_callers;
+mod splat_scenes;
 mod splats;
 mod store;
 mod telemetry;

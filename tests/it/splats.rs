@@ -8,10 +8,11 @@ use flate2::{Compression, read::GzDecoder, write::GzEncoder};
 use glam::DVec3;
 use segsplat::{
     error::{ErrorCode, Result},
+    limits::Limits,
     render::{Kinds, RenderRequest, Renderer as _, compare::psnr, cpu::CpuRenderer},
     scene::{Bank, BankMask, Gaussians, IndexMap, SanitizeReport, Semantics, SemanticsReport},
     store::splats::{
-        COMPRESSED_PLY, FORMATS, GLB, PLY, SPLAT, SPZ, SplatFile, SplatFormat, SplatsRead,
+        COMPRESSED_PLY, FORMATS, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
         read_splats,
     },
 };
@@ -34,8 +35,17 @@ fn bytes_of(format: &'static SplatFormat, gaussians: &Gaussians) -> Vec<u8> {
     bytes
 }
 
-fn read(format: &SplatFormat, bytes: &[u8]) -> Result<SplatsRead> {
-    read_splats(&mut Cursor::new(bytes), &format!("a.{}", format.ending), 100_000)
+type Read = (Gaussians, SanitizeReport, Option<Semantics>);
+
+fn limits(gaussians_max: usize) -> Limits {
+    Limits { gaussians_max, ..Limits::default() }
+}
+
+fn read(format: &SplatFormat, bytes: &[u8]) -> Result<Read> {
+    let name = format!("a.{}", format.ending);
+    let read = read_splats(&mut Cursor::new(bytes), &name, &limits(100_000))?;
+    assert_eq!(read.format.name, format.name);
+    Ok((read.gaussians, read.dropped, read.semantics))
 }
 
 fn round_trip(format: &'static SplatFormat, gaussians: &Gaussians) -> Gaussians {
@@ -47,7 +57,7 @@ fn round_trip(format: &'static SplatFormat, gaussians: &Gaussians) -> Gaussians 
 
 /// Harmonics that are left.
 fn degree(format: &SplatFormat, gaussians: &Gaussians) -> u8 {
-    if format.name == SPLAT.name { 0 } else { gaussians.sh_degree() }
+    if [SPLAT.name, SOG.name].contains(&format.name) { 0 } else { gaussians.sh_degree() }
 }
 
 fn world(gaussians: &Gaussians, i: usize) -> DVec3 {
@@ -83,12 +93,14 @@ fn differences(a: &Gaussians, b: &Gaussians) -> [f64; 6] {
 fn numbers_come_back_to_the_step_of_the_format() {
     // Position, ln scale, opacity, rotation, degree 0, degrees above.
     let exact = 3e-6;
-    let spz_bits = 2_f64.powi(-19);
+    let (bits, color) = (2_f64.powi(-19), 0.5 / 255.0 / 0.15);
+    let spz = [bits, 0.5 / 16.0, 0.5 / 255.0, 2.2 / 723.0, color, 8.51 / 128.0];
     let cases = [
         (&PLY, [1e-6, exact, exact, exact, 0.0, 0.0]),
         (&GLB, [0.0; 6]),
         (&SPLAT, [1e-6, exact, 0.5 / 255.0, 1.1 / 128.0, 0.5 / 255.0 / 0.282, 9.0]),
-        (&SPZ, [spz_bits, 0.5 / 16.0, 0.5 / 255.0, 2.2 / 723.0, 0.5 / 255.0 / 0.15, 8.51 / 128.0]),
+        (&SPZ, spz),
+        (&SPZ4, spz),
     ];
     for degree in 0..=3 {
         let gaussians = cloud(COUNT, degree, 5);
@@ -105,11 +117,44 @@ fn numbers_come_back_to_the_step_of_the_format() {
     }
 }
 
+/// SOG has the Gaussians in another order, positions in steps of a logarithm, and scales and
+/// colours in tables that follow their density.
+#[test]
+fn sog_keeps_numbers_to_the_steps_of_its_tables() {
+    let gaussians = cloud(400, 2, 5);
+    let back = round_trip(&SOG, &gaussians);
+    let order = nearest(&back, &gaussians);
+    let mut all = order.clone();
+    all.sort_unstable();
+    assert!(all.into_iter().eq(0..400), "each Gaussian is there once");
+    let [position, scale, opacity, rotation, color, _] =
+        differences(&chosen(&gaussians, &order), &back);
+    assert!(position < 5e-4 && opacity <= 0.5 / 255.0 + 1e-6, "{position} {opacity}");
+    assert!(rotation < 2.2 * 0.5 * 2_f64.sqrt() / 255.0, "{rotation}");
+    // No number is farther from its table than 1/256 of their range.
+    let range = |numbers: &mut dyn Iterator<Item = f32>| {
+        let ends = numbers.fold([f32::MAX, f32::MIN], |[a, b], v| [a.min(v), b.max(v)]);
+        f64::from(ends[1] - ends[0]) / 256.0 + 1e-4
+    };
+    let scales = range(&mut gaussians.scales().iter().flatten().map(|scale| scale.ln()));
+    let colors = range(&mut gaussians.sh().iter().step_by(9).flatten().copied());
+    assert!(scale < scales && color < colors, "{scale} of {scales}, {color} of {colors}");
+}
+
+/// For each Gaussian the number of the nearest of others.
+fn nearest(of: &Gaussians, among: &Gaussians) -> Vec<usize> {
+    let nearest = |i: usize| {
+        let far = |j: &usize| world(of, i).distance(world(among, *j));
+        (0..among.len()).min_by(|a, b| far(a).total_cmp(&far(b))).unwrap()
+    };
+    (0..of.len()).map(nearest).collect()
+}
+
 /// What was read once does not change any more.
 #[test]
 fn a_second_round_trip_changes_nothing() {
     let gaussians = cloud(COUNT, 2, 6);
-    for format in [&GLB, &SPZ, &SPLAT] {
+    for format in [&GLB, &SPZ, &SPZ4, &SPLAT] {
         let once = round_trip(format, &gaussians);
         let [position, scale, opacity, _, color, rest] =
             differences(&once, &round_trip(format, &once));
@@ -129,9 +174,15 @@ fn every_format_keeps_the_picture() {
     let renderer = CpuRenderer::new(1).unwrap();
     let draw = |gaussians: &Gaussians| renderer.render(gaussians, &request).unwrap().color.unwrap();
     let truth = draw(&gaussians);
-    for (format, floor) in
-        [(&PLY, 105.0), (&GLB, 120.0), (&SPLAT, 58.0), (&SPZ, 49.0), (&COMPRESSED_PLY, 46.0)]
-    {
+    for (format, floor) in [
+        (&PLY, 105.0),
+        (&GLB, 120.0),
+        (&SPLAT, 58.0),
+        (&SPZ, 49.0),
+        (&SPZ4, 49.0),
+        (&SOG, 49.0),
+        (&COMPRESSED_PLY, 46.0),
+    ] {
         let found = psnr(&draw(&round_trip(format, &gaussians)), &truth, None);
         println!("{}: {found:.1} dB", format.name);
         assert!(found > floor, "{}: {found:.1} dB, not {floor}", format.name);
@@ -147,7 +198,7 @@ fn harmonics_turn_with_the_axes() {
     let renderer = CpuRenderer::new(1).unwrap();
     let draw = |gaussians: &Gaussians| renderer.render(gaussians, &request).unwrap().color.unwrap();
     let truth = draw(&gaussians);
-    for (format, floor) in [(&GLB, 90.0), (&SPZ, 32.0), (&COMPRESSED_PLY, 30.0)] {
+    for (format, floor) in [(&GLB, 90.0), (&SPZ, 32.0), (&SPZ4, 32.0), (&COMPRESSED_PLY, 30.0)] {
         let found = psnr(&draw(&round_trip(format, &gaussians)), &truth, None);
         assert!(found > floor, "{}: {found:.1} dB, not {floor}", format.name);
     }
@@ -249,19 +300,21 @@ fn files_of_another_program_are_read() {
     };
     // Their order is along a curve: the nearest of the source is the same Gaussian.
     let packed = theirs(&COMPRESSED_PLY, "theirs.compressed.ply");
-    let nearest = |i: usize| {
-        let far = |j: &usize| world(&packed, i).distance(world(&source, *j));
-        (0..40).min_by(|a, b| far(a).total_cmp(&far(b))).unwrap()
-    };
-    let order: Vec<usize> = (0..40).map(nearest).collect();
-    let found = differences(&chosen(&source, &order), &packed);
+    let found = differences(&chosen(&source, &nearest(&packed, &source)), &packed);
     assert!(found[0] < 2e-3 && found[1] < 2e-3 && found[2] < 3e-3, "{found:?}");
     assert!(found[3] < 2e-3 && found[4] < 0.01 && found[5] < 0.032, "{found:?}");
+    let sog = theirs(&SOG, "theirs.sog");
+    let found = differences(&chosen(&source, &nearest(&sog, &source)), &sog);
+    // It rounds down, and its palette of harmonics has fewer rows than there are Gaussians.
+    assert!(found[0] < 5e-4 && found[1] < 0.06 && found[2] < 4e-3 && found[3] < 8e-3, "{found:?}");
+    assert!(found[4] < 0.03 && found[5] < 0.8, "{found:?}");
     // It writes the numbers of the PLY into SPZ as they are. The format's axes are y up, z back.
-    let spz = theirs(&SPZ, "theirs.spz");
-    let untold = half_turn(&spz, [1.0, -1.0, -1.0], [1.0, 1.0, -1.0, -1.0]);
-    let found = differences(&source, &untold);
-    assert!(found[0] < 2.0_f64.powi(-12) && found[1] < 0.032 && found[3] < 2e-3, "{found:?}");
+    for (format, name) in [(&SPZ, "theirs.spz"), (&SPZ4, "theirs.v4.spz")] {
+        let untold = theirs(format, name);
+        let untold = half_turn(&untold, [1.0, -1.0, -1.0], [1.0, 1.0, -1.0, -1.0]);
+        let found = differences(&source, &untold);
+        assert!(found[0] < 2.0_f64.powi(-12) && found[1] < 0.032 && found[3] < 2e-3, "{found:?}");
+    }
     // It turns a PLY about z into glTF's axes, we turn about x: between both is half a turn about
     // y.
     let glb = theirs(&GLB, "theirs.glb");
@@ -422,7 +475,7 @@ fn damaged_spz_files_are_refused_by_name() {
         (torn, "SPZ"),
         (bent, "SPZ"),
         (vec![0x1f, 0x8b], "SPZ"),
-        (b"NGSP\x04\0\0\0".to_vec(), "version 4"),
+        (b"NGSP\x04\0\0\0".to_vec(), "bytes of the header"),
         (b"PK\x03\x04".to_vec(), "zip"),
         (Vec::new(), "none of Gaussians"),
     ];
@@ -497,6 +550,143 @@ fn damaged_glb_files_are_refused_by_name() {
     refused(&GLB, cases);
 }
 
+/// The blocks of both versions are alike, and the reference skips records that it does not know.
+#[test]
+fn spz_4_has_the_blocks_of_spz_3_and_skips_unknown_records() {
+    let gaussians = cloud(300, 2, 3);
+    let of = |format| differences(&gaussians, &round_trip(format, &gaussians));
+    assert_eq!(of(&SPZ4), of(&SPZ));
+    let good = bytes_of(&SPZ4, &gaussians);
+    let record = |kind: u32| {
+        let mut file = patched(&good[..32], 14, &[2]);
+        file = patched(&file, 16, &(32_u32 + 12).to_le_bytes());
+        let words = [kind, 4, 7].map(u32::to_le_bytes).concat();
+        [&file, &words, &good[32..]].concat()
+    };
+    assert_eq!(read(&SPZ4, &record(0x0001_0001)).unwrap().0.len(), 300);
+    let refused = read(&SPZ4, &record(0xADBE_0003)).unwrap_err();
+    assert!(refused.message().contains("SPZ_ADOBE_coordinate_system"), "{refused}");
+    // The same record at the end of a file of version 3.
+    let mut whole = Vec::new();
+    GzDecoder::new(&bytes_of(&SPZ, &gaussians)[..]).read_to_end(&mut whole).unwrap();
+    whole[14] = 2;
+    whole.extend([0xADBE_0003_u32, 4, 7].map(u32::to_le_bytes).concat());
+    let refused = read(&SPZ, &gzip(&whole)).unwrap_err();
+    assert!(refused.message().contains("SPZ_ADOBE_coordinate_system"), "{refused}");
+}
+
+#[test]
+fn damaged_spz_4_files_are_refused_by_name() {
+    let good = bytes_of(&SPZ4, &cloud(30, 1, 3));
+    let with = |at: usize, bytes: &[u8]| patched(&good, at, bytes);
+    let cut = |to: usize| good[..to].to_vec();
+    let mut bent = good.clone();
+    let last = bent.len() - 4;
+    bent[last..].fill(0xff);
+    let size = |stream: usize| 32 + 16 * stream;
+    let cases = vec![
+        (cut(4), "bytes of the header"),
+        (cut(15), "bytes of the header"),
+        (cut(31), "bytes of the header"),
+        (cut(40), "the table of the streams ends after 8 of 16"),
+        (cut(size(6)), "stream 0 ends after 0"),
+        (cut(good.len() - 1), "stream 5 ends after"),
+        (with(4, &3_u32.to_le_bytes()), "version 3"),
+        (with(4, &5_u32.to_le_bytes()), "version 5"),
+        (with(8, &0_u32.to_le_bytes()), "0 Gaussians"),
+        (with(8, &200_000_u32.to_le_bytes()), "200000"),
+        (with(8, &31_u32.to_le_bytes()), "stream 0 is of 270 bytes; it must be of 279"),
+        (with(12, &[4]), "degree 4"),
+        (with(12, &[0]), "6 streams; of degree 0 there are 5"),
+        (with(12, &[2]), "stream 5 is of 270 bytes; it must be of 720"),
+        (with(13, &[31]), "31 bits"),
+        (with(15, &[5]), "5 streams"),
+        (with(16, &31_u32.to_le_bytes()), "byte 31"),
+        (with(16, &u32::MAX.to_le_bytes()), "byte 4294967295"),
+        (with(16, &1_000_000_u32.to_le_bytes()), "the block of extensions ends after"),
+        (with(size(0) + 8, &u64::MAX.to_le_bytes()), "stream 0 is of"),
+        (with(size(0), &u64::MAX.to_le_bytes()), "stream 0 ends after"),
+        (with(size(0), &3_u64.to_le_bytes()), "stream 0: the compressed bytes are damaged"),
+        (with(size(6), &[0; 4]), "stream 0: the compressed bytes are damaged"),
+        (bent, "stream 5: the compressed bytes are damaged"),
+    ];
+    refused(&SPZ4, cases);
+}
+
+/// The bundle with another `meta.json`, and with other bytes of a file, or without it.
+fn rebundled(
+    bundle: &[u8],
+    change: impl FnOnce(&mut serde_json::Value),
+    other: Option<(&str, Option<&[u8]>)>,
+) -> Vec<u8> {
+    let mut zip = zip::ZipArchive::new(Cursor::new(bundle)).unwrap();
+    let mut to = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    let mut change = Some(change);
+    for i in 0..zip.len() {
+        let mut file = zip.by_index(i).unwrap();
+        let name = file.name().unwrap().into_owned();
+        let mut bytes = Vec::new();
+        file.read_to_end(&mut bytes).unwrap();
+        if name == "meta.json" {
+            let mut meta = serde_json::from_slice(&bytes).unwrap();
+            change.take().unwrap()(&mut meta);
+            bytes = meta.to_string().into_bytes();
+        }
+        match other.filter(|(wanted, _)| *wanted == name) {
+            Some((_, None)) => continue,
+            Some((_, Some(new))) => bytes = new.to_vec(),
+            None => {}
+        }
+        to.start_file(name, zip::write::SimpleFileOptions::default()).unwrap();
+        to.write_all(&bytes).unwrap();
+    }
+    to.finish().unwrap().into_inner()
+}
+
+#[test]
+fn damaged_sog_files_are_refused_by_name() {
+    let good = fixture("theirs.sog");
+    let meta = |change: fn(&mut serde_json::Value)| rebundled(&good, change, None);
+    let file = |name: &str, bytes: Option<&[u8]>| rebundled(&good, |_| {}, Some((name, bytes)));
+    let one = |side: u32| {
+        let mut webp = Cursor::new(Vec::new());
+        image::RgbaImage::new(side, side).write_to(&mut webp, image::ImageFormat::WebP).unwrap();
+        webp.into_inner()
+    };
+    let mut many = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    for i in 0..65 {
+        many.start_file(i.to_string(), zip::write::SimpleFileOptions::default()).unwrap();
+    }
+    let cases = vec![
+        (good[..20].to_vec(), "the zip is damaged"),
+        (good[..good.len() - 30].to_vec(), "the zip is damaged"),
+        (b"PK\x05\x06".to_vec(), "the zip is damaged"),
+        (many.finish().unwrap().into_inner(), "65"),
+        (file("meta.json", None), "the zip has no \"meta.json\""),
+        (file("meta.json", Some(b"{")), "meta.json: EOF"),
+        (file("meta.json", Some(&vec![b' '; 2 << 20])), "1048576"),
+        (meta(|m| m["version"] = 3.into()), "version 3"),
+        (meta(|m| m["version"] = serde_json::Value::Null), "version 1 is not read"),
+        (meta(|m| m["count"] = 0.into()), "0 Gaussians"),
+        (meta(|m| m["count"] = (-1).into()), "meta.json: "),
+        (meta(|m| m["count"] = 100_001.into()), "100001"),
+        (meta(|m| m["count"] = 5_000.into()), "5000 to"),
+        (meta(|m| m["means"] = serde_json::Value::Null), "no \"means\""),
+        (meta(|m| m["sh0"] = serde_json::Value::Null), "no \"sh0\""),
+        (meta(|m| m["scales"]["codebook"] = "x".into()), "meta.json: "),
+        (meta(|m| m["quats"]["files"][0] = "../q.webp".into()), "has no \"../q.webp\""),
+        (meta(|m| m["shN"]["bands"] = 4.into()), "degree 4"),
+        (meta(|m| m["shN"]["bands"] = 2.into()), "shN_centroids.webp"),
+        (meta(|m| m["shN"]["count"] = 1.into()), "there are 1 centroids"),
+        (meta(|m| m["shN"]["count"] = 70_000.into()), "70000"),
+        (file("quats.webp", None), "has no \"quats.webp\""),
+        (file("quats.webp", Some(b"RIFF")), "is no WebP picture"),
+        (file("means_l.webp", Some(&one(2))), "\"means_l.webp\" has 2 x 2 pixels; 40 to"),
+        (file("scales.webp", Some(&one(1100))), "1100 x 1100 pixels"),
+    ];
+    refused(&SOG, cases);
+}
+
 #[test]
 fn damaged_compressed_plys_are_refused_by_name() {
     let good = bytes_of(&COMPRESSED_PLY, &cloud(300, 1, 3));
@@ -541,7 +731,7 @@ fn damaged_splat_files_are_refused_by_name() {
     cases.extend([(cut(32 * 30 - 1), "29 of 30"), (vec![b'x'; 32 * 100_001], "100000")]);
     refused(&SPLAT, cases);
     // What has no name with this ending is not taken for it.
-    let error = read_splats(&mut Cursor::new(&good), "a.bin", 100).unwrap_err();
+    let error = read_splats(&mut Cursor::new(&good), "a.bin", &limits(100)).unwrap_err();
     assert!(error.message().contains("none of Gaussians"), "{error}");
     // Numbers that are none are dropped and counted.
     let nan = patched(&good, 0, &f32::NAN.to_le_bytes());
@@ -586,7 +776,7 @@ fn the_command_line_turns_each_format_into_each_other() {
         let json: serde_json::Value = serde_json::from_slice(&text).unwrap();
         (done.status.code(), json)
     };
-    for from in [&PLY, &GLB, &SPLAT, &SPZ, &COMPRESSED_PLY] {
+    for from in [&PLY, &GLB, &SPLAT, &SPZ, &SPZ4, &SOG, &COMPRESSED_PLY] {
         for to in FORMATS {
             let (source, target) = (at(from), folder.path().join(format!("b.{}", to.ending)));
             let words = ["export".as_ref(), source.as_os_str(), "-o".as_ref(), target.as_os_str()];

@@ -15,7 +15,7 @@ use segsplat::{
     },
     store::{
         KeyUse, Place, Record, Store, provenance, read_scene, request_sha256,
-        splats::{PLY, SplatFile, read_splats},
+        splats::{PLY, SplatFile, SplatsRead, read_splats},
         write_scene,
     },
 };
@@ -101,6 +101,7 @@ fn upload() -> Upload {
         cameras: Some(UploadCameras::Cameras(b"{\"cameras\":[]}".to_vec())),
         photos: vec![photo("../../a.png", &[1, 2, 3]), photo("b", &[])],
         archive: Some(vec![9; 1000]),
+        splats: Some(photo("a.splat", &[7; 32])),
     }
 }
 
@@ -367,8 +368,13 @@ fn bytes_of(file: &SplatFile) -> Vec<u8> {
     bytes
 }
 
+fn read_ply(file: &[u8], gaussians_max: usize) -> Result<SplatsRead> {
+    let limits = Limits { gaussians_max, ..Limits::default() };
+    read_splats(&mut Cursor::new(file), "a.ply", &limits)
+}
+
 fn read(file: &[u8]) -> Result<(Gaussians, SanitizeReport)> {
-    let (gaussians, report, semantics) = read_splats(&mut Cursor::new(file), "a.ply", 100_000)?;
+    let SplatsRead { gaussians, dropped: report, semantics, .. } = read_ply(file, 100_000)?;
     assert_eq!(semantics, None);
     Ok((gaussians, report))
 }
@@ -387,7 +393,7 @@ fn a_ply_carries_index_and_bank_together_and_programs_that_know_no_bank_stop_bef
         report: SemanticsReport::default(),
     };
     let bytes = bytes_of(&SplatFile::new(&PLY, gaussians, Some(&semantics)).unwrap());
-    let (back, _, read) = read_splats(&mut Cursor::new(&bytes), "a.ply", 100).unwrap();
+    let SplatsRead { gaussians: back, semantics: read, .. } = read_ply(&bytes, 100).unwrap();
     assert_eq!((back.semantic_index(), read.as_ref()), (&semantics.index[..], Some(&semantics)));
     assert_eq!(read.unwrap().row_sizes(), [2, 1]);
     // Its header says where the vertices end, as that of any PLY.
@@ -397,11 +403,11 @@ fn a_ply_carries_index_and_bank_together_and_programs_that_know_no_bank_stop_bef
     let after: usize = said.unwrap().parse().unwrap();
     let stride = 4 * text.matches("property float").count() + 2;
     assert_eq!(end + 50 * stride + after, bytes.len());
-    let cut = read_splats(&mut Cursor::new(&bytes[..bytes.len() - 1]), "a.ply", 100).unwrap_err();
+    let cut = read_ply(&bytes[..bytes.len() - 1], 100).unwrap_err();
     assert!(cut.message().contains("the semantics end after"), "{cut}");
     let mut broken = bytes;
     *broken.last_mut().unwrap() ^= 1;
-    let error = read_splats(&mut Cursor::new(&broken), "a.ply", 100).unwrap_err();
+    let error = read_ply(&broken, 100).unwrap_err();
     assert_eq!(error.code(), ErrorCode::InvalidRequest, "{error}");
 }
 

@@ -35,6 +35,8 @@ async fn limits_stop_an_upload_at_the_first_byte_over_and_name_the_bound() {
             (photos(4), ["\"3.png\" is number 4", "3 photos"]),
             (Form::new().part("photo", file("a.png", 101)), ["101 bytes", "100 bytes"]),
             (Form::new().part("photo", file(&"x".repeat(257), 1)), ["257 bytes", "256 bytes"]),
+            (Form::new().part("splats", file(&"x".repeat(257), 1)), ["257 bytes", "256 bytes"]),
+            (Form::new().part("splats", file("a.ply", 101)), ["101 bytes", "100 bytes"]),
         ] {
             let fault = refused(&server, form).await;
             assert_eq!(fault.code, "limit_exceeded", "{fault:?}");
@@ -58,6 +60,12 @@ async fn an_upload_that_cannot_be_a_scene_says_what_is_missing() {
         (photo(cameras(), "photo", "a.png"), "1 photo; a scene needs at least 2"),
         (cameras().text("transforms", "{}"), "camera description given twice"),
         (cameras().part("archive", file("a.zip", 1)), "its own camera description"),
+        (cameras().part("splats", file("a.ply", 1)), "without other files"),
+        (photo(Form::new().part("splats", file("a.ply", 1)), "p", "a.png"), "without other files"),
+        (
+            Form::new().part("splats", file("a.ply", 1)).part("splats", file("b.ply", 1)),
+            "two files of Gaussians",
+        ),
         (photo(Form::new().part("archive", file("a.zip", 1)), "p", "a.png"), "its own photos"),
         // A photo is named by its part where that has an extension, else by its file.
         (

@@ -145,6 +145,22 @@ def test_photos_are_dropped_and_the_scene_is_flown_asked_clicked_shared_and_kept
     alone.close()
 
 
+def test_a_file_of_gaussians_is_dropped_and_shown(page: Page, url: str) -> None:
+    page.goto(url)
+    source = Path(__file__).parents[1] / "fixtures/splats/source.ply"
+    drop(page, {"source.ply": source.read_bytes()})
+    settled(page)
+    expect(page.locator("#photos li")).to_have_text(["source.ply"])
+    expect(page.locator("#about")).to_contain_text("40 Gaussians of a file (ply)")
+    seen = pixels(page)
+    # Its colours do not depend on the direction as much as the page leaves out.
+    want = served(page, url, seen.shape)
+    assert seen.std() > 10 and np.abs(seen.astype(float) - want).mean() < 12
+    page.fill("#text", "box")
+    page.press("#text", "Enter")
+    expect(page.locator("#says")).to_contain_text("(ply) without semantics")
+
+
 def test_the_canvas_is_the_servers_view(page: Page, url: str, scene: str) -> None:
     page.goto(f"{url}/#scene={scene}")
     settled(page)

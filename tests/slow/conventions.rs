@@ -27,7 +27,7 @@ fn changed(folder: &Path, frames: Range<usize>, change: impl Fn(&mut Value)) -> 
         .collect();
     change(&mut transforms);
     let cameras = Some(UploadCameras::Transforms(transforms.to_string().into_bytes()));
-    Upload { cameras, photos, archive: None }
+    Upload { cameras, photos, ..Upload::default() }
 }
 
 fn matrices(transforms: &mut Value, change: impl Fn(&mut [[f64; 4]; 4])) {

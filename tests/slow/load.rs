@@ -111,7 +111,7 @@ fn large_photos(seed: u64, photos: usize, [width, height]: [u32; 2]) -> Upload {
     Upload {
         cameras: Some(UploadCameras::Transforms(sample::transforms_json(&posed))),
         photos: posed.iter().map(enlarged).collect(),
-        archive: None,
+        ..Upload::default()
     }
 }
 

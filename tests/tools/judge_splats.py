@@ -18,12 +18,14 @@ STEPS = {
     "ply": (1e-6, 1e-5, 1e-5, 1e-6),
     "compressed.ply": (3e-3, 3e-3, 3e-3, 0.01),
     "spz": (1e-5, 0.032, 3e-3, 0.015),
+    "v4.spz": (1e-5, 0.032, 3e-3, 0.015),
+    "sog": (1e-3, 0.05, 3e-3, 0.02),
     "splat": (1e-6, 1e-5, 3e-3, 0.015),
 }
 COLUMNS = [["x", "y", "z"], ["scale_0", "scale_1", "scale_2"], ["opacity"],
            ["f_dc_0", "f_dc_1", "f_dc_2"]]
 # It takes the numbers of an SPZ as those of a PLY. The format has y up and z back.
-TURNED = {"spz": {"y", "z"}}
+TURNED = {"spz": {"y", "z"}, "v4.spz": {"y", "z"}}
 
 
 def seen(path: Path) -> tuple[int, dict[str, list[float]]]:

@@ -122,6 +122,8 @@ def test_every_format_of_gaussians(
         "ply": b"ply\n",
         "compressed.ply": b"ply\n",
         "spz": b"\x1f\x8b",
+        "v4.spz": b"NGSP\x04",
+        "sog": b"PK",
         "glb": b"glTF",
         "splat": b"",
     }
@@ -129,9 +131,34 @@ def test_every_format_of_gaussians(
         scene.export("ply"),
         scene.export("compressed_ply"),
         scene.export("spz"),
+        scene.export("spz4"),
+        scene.export("sog"),
         scene.export("glb"),
         scene.export("splat"),
     ]
     for path, (ending, start) in zip(paths, begins.items(), strict=True):
         assert path.name == f"{scene.id}.{ending}"
         assert path.read_bytes().startswith(start) and path.stat().st_size > 1000
+
+
+def test_a_file_of_gaussians_is_a_scene(client: Client, scene: Scene, tmp_path: Path) -> None:
+    camera = scene.photos[0].camera
+    own = scene.view(camera=camera, width=64, near=0.05, background="black").image
+    paths = [scene.export("glb", tmp_path / "a.glb"), scene.export("spz", tmp_path / "a.spz")]
+    for path, semantics in zip(paths, ["ready", "off"], strict=True):
+        made = client.scene(path)
+        assert made.report and made.report.file_format == path.suffix[1:]
+        assert made.report.photos == 0
+        assert made.status.semantics.state == semantics
+        assert [photo.file for photo in made.photos] == ["overview"]
+        assert made.view(width=64).image.any(), "its own camera sees it"
+        seen = made.view(camera=camera, width=64, near=0.05).image
+        assert np.abs(seen.astype(int) - own).mean() < 6
+        if semantics == "ready":
+            assert made.query("box", masks=False)["box"].gaussians > 0
+        else:
+            with pytest.raises(SegSplatError, match="without semantics"):
+                made.query("box", masks=False)
+        made.delete()
+    with pytest.raises(FileNotFoundError):
+        client.scene(tmp_path / "none.ply")

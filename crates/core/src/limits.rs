@@ -180,8 +180,11 @@ limits! {
     memory_bytes_max: u64 = 0;
     /// Scenes on one page of a list.
     page_max: usize = 100;
-    /// Gaussians in one scene, made or imported.
+    /// Gaussians in one scene, made of photos or read from a file.
     gaussians_max: usize = 16_777_216;
+    /// Bytes that the Gaussians of a file that is sent may take in memory: what a small packed file
+    /// with many of them meets. As many as `gaussians_max` of degree 0, 4.4 million of degree 3.
+    splats_bytes_max: u64 = 1 << 30;
 }
 
 impl Limits {

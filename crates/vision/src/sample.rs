@@ -180,7 +180,7 @@ pub fn upload(options: &SampleOptions) -> Result<Upload> {
     Ok(Upload {
         cameras: Some(UploadCameras::Transforms(transforms_json(&posed))),
         photos: png_files(&posed)?,
-        archive: None,
+        ..Upload::default()
     })
 }
 

@@ -65,7 +65,7 @@ impl Photos {
             })
             .unzip();
         let cameras = json!({ "cameras": cameras }).to_string().into_bytes();
-        Ok(Upload { cameras: Some(UploadCameras::Cameras(cameras)), photos, archive: None })
+        Ok(Upload { cameras: Some(UploadCameras::Cameras(cameras)), photos, ..Upload::default() })
     }
 }
 

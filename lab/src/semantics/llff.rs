@@ -52,7 +52,11 @@ pub(super) fn upload(dir: &Path, limits: &Limits) -> Result<Upload> {
     }
     let cameras = serde_json::to_vec(&json!({ "cameras": cameras }))
         .map_err(|e| Error::internal("cameras").caused_by(e))?;
-    Ok(Upload { cameras: Some(UploadCameras::Cameras(cameras)), photos: files, archive: None })
+    Ok(Upload {
+        cameras: Some(UploadCameras::Cameras(cameras)),
+        photos: files,
+        ..Upload::default()
+    })
 }
 
 /// The JSON of a camera; the focal length is scaled from the size it was written for.

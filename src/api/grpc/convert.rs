@@ -102,6 +102,7 @@ fn report(report: HealthReport) -> pb::HealthReport {
         stages: report.stages.into_iter().map(stage_time).collect(),
         warnings: report.warnings.into_iter().map(warning).collect(),
         refinement: report.refinement.map(refine_report),
+        file_format: report.file_format.unwrap_or_default(),
     )
 }
 
@@ -465,5 +466,7 @@ both_ways! {
     FeatureKind = FeatureKind { Weights, Features }
     Boxes = Boxes { Oriented, Aligned, None }
     MaskFormat = MaskFormat { Rle, Png, None }
-    ExportFormat = ExportFormat { Ply, Npz, Packed, Html, CompressedPly, Spz, Glb, Splat }
+    ExportFormat = ExportFormat {
+        Ply, Npz, Packed, Html, CompressedPly, Spz, Spz4, Sog, Glb, Splat
+    }
 }

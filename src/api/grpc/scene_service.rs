@@ -210,6 +210,12 @@ async fn read_upload(
                 }
                 upload.extend(&piece.data)?;
             }
+            (Part::Splats(piece), Some(_)) => {
+                if !piece.name.is_empty() {
+                    upload.begin_splats(&piece.name)?;
+                }
+                upload.extend(&piece.data)?;
+            }
             (Part::Archive(piece), Some(_)) => {
                 upload.begin_archive();
                 upload.extend(&piece)?;

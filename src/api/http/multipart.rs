@@ -48,6 +48,11 @@ pub(super) struct UploadForm {
     /// A zip or tar of a folder of photos and its camera JSON, instead of all other parts.
     #[schema(content_media_type = "application/octet-stream")]
     archive: Option<String>,
+    /// A file of Gaussians (PLY, compressed PLY, SPZ, SOG, GLB with `KHR_gaussian_splatting`,
+    /// `.splat`), instead of all other parts. A `.splat` is known by the ending of the file's name
+    /// alone.
+    #[schema(content_media_type = "application/octet-stream")]
+    splats: Option<String>,
     /// Any other part is a photo, named by its part or file.
     #[schema(content_media_type = "image/*")]
     photo: Option<Vec<String>>,
@@ -121,6 +126,7 @@ async fn parts(
             "transforms" => upload.begin_cameras(UploadCameras::Transforms(Vec::new()))?,
             "cameras" => upload.begin_cameras(UploadCameras::Cameras(Vec::new()))?,
             "archive" => upload.begin_archive(),
+            "splats" => upload.begin_splats(field.file_name().unwrap_or_default())?,
             option if all.contains(&option) => {
                 // Each once, or options alone could fill the memory.
                 let Some(at) = options.iter().position(|left| *left == option) else {
@@ -200,8 +206,8 @@ fn photo_name(part: &str, file: Option<&str>) -> Result<String> {
         // Its length is refused with the bound.
         None if part.len() > OPTION_BYTES_MAX => Ok(part.to_owned()),
         None => Err(Error::invalid(format!(
-            "upload: unknown part {:?}; there are transforms, cameras, archive, {}, and photos, \
-             each with the name of its file",
+            "upload: unknown part {:?}; there are transforms, cameras, archive, splats, {}, and \
+             photos, each with the name of its file",
             short(part),
             OPTIONS.concat().join(", ")
         ))),

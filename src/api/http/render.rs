@@ -42,9 +42,9 @@ pub(super) struct ViewParams {
 #[serde(default)]
 #[into_params(parameter_in = Query)]
 pub(super) struct ExportParams {
-    /// `ply` (default), `compressed_ply`, `spz`, `glb` or `splat`: Gaussians for other programs;
-    /// `npz`: the semantics as arrays; `packed`: the scene as the page draws it; `html`: the page
-    /// with the scene in it, and what it shows of each line of `text`.
+    /// `ply` (default), `compressed_ply`, `spz`, `spz4`, `sog`, `glb` or `splat`: Gaussians for
+    /// other programs; `npz`: the semantics as arrays; `packed`: the scene as the page draws it;
+    /// `html`: the page with the scene in it, and what it shows of each line of `text`.
     #[param(inline)]
     format: ExportFormat,
     /// How a text is scored: `default` or `paper`. By default as the scene was made.

@@ -39,7 +39,7 @@ pub(super) struct CreateParams {
     wait_ms: Option<u64>,
 }
 
-/// Make a scene of photos and their cameras
+/// Make a scene of photos and their cameras, or of a file of Gaussians
 #[utoipa::path(
     post, path = "/v1/scenes", operation_id = "create_scene", tag = "scenes",
     params(SceneOptions, CreateParams, ("Idempotency-Key" = Option<String>, Header)),

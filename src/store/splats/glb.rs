@@ -20,10 +20,12 @@ use serde::Deserialize;
 use serde_json::json;
 
 use super::{
-    SplatFile, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, cut_short, some, times, unreadable,
+    GLB, SplatFile, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count, cut_short, some,
+    times, unreadable,
 };
 use crate::{
     error::{Error, Result},
+    limits::Limits,
     scene::{Gaussians, RawGaussians, SH_C0, SceneId, Semantics, SourcePixel},
     store::read_semantics,
 };
@@ -321,7 +323,7 @@ fn chunk(from: &mut dyn BufRead, kind: u32, name: &str, bytes_max: usize) -> Res
     Ok(chunk)
 }
 
-pub(super) fn read(from: &mut dyn BufRead, gaussians_max: usize) -> Result<SplatsRead> {
+pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let mut head = [0; 12];
     from.read_exact(&mut head).map_err(|e| cut_short("GLB", e, 0, 12, "bytes of the header"))?;
     let version = u32::from_le_bytes([head[4], head[5], head[6], head[7]]);
@@ -340,23 +342,18 @@ pub(super) fn read(from: &mut dyn BufRead, gaussians_max: usize) -> Result<Splat
         let uri: String = uri.chars().take(80).collect();
         return Err(bad(format!("a buffer is in the other file {uri:?}; one file is read")));
     }
-    let file = Opened { document, binary, gaussians_max };
-    let raw = file.gaussians()?;
-    let (gaussians, report) = Gaussians::sanitize(raw)?;
-    let semantics = file.semantics()?;
-    let index = gaussians.semantic_index().to_vec();
-    let semantics = semantics.map(|semantics| Semantics { index, ..semantics });
-    Ok((gaussians, report, semantics))
+    let file = Opened { document, binary, limits };
+    SplatsRead::new(&GLB, file.gaussians()?, file.semantics()?)
 }
 
 /// A file whose JSON is read.
-struct Opened {
+struct Opened<'a> {
     document: Document,
     binary: Vec<u8>,
-    gaussians_max: usize,
+    limits: &'a Limits,
 }
 
-impl Opened {
+impl Opened<'_> {
     fn gaussians(&self) -> Result<RawGaussians> {
         let nodes = &self.document.nodes;
         let scene = self.document.scenes.get(self.document.scene);
@@ -416,9 +413,7 @@ impl Opened {
                 "primitives have harmonics of degree {other} and {sh_degree}"
             )));
         }
-        if raw.means.len() + n > self.gaussians_max {
-            return Err(Error::limit("GLB: Gaussians", raw.means.len() + n, self.gaussians_max));
-        }
+        check_count("GLB: Gaussians", raw.means.len() + n, sh_degree, self.limits)?;
         let (rotations, scales) = (own("ROTATION", 4)?, own("SCALE", 3)?);
         let opacities = own("OPACITY", 1)?;
         let sh = (0..k).map(|j| of(&sh_name(j), 3)).collect::<Result<Vec<_>>>()?;
@@ -490,9 +485,7 @@ impl Opened {
         if accessor.sparse.is_some() {
             return Err(fault("sparse arrays are not read".to_owned()));
         }
-        if accessor.count > self.gaussians_max {
-            return Err(Error::limit(format!("GLB: {name}"), accessor.count, self.gaussians_max));
-        }
+        check_count(&format!("GLB: {name}"), accessor.count, 0, self.limits)?;
         let view = accessor.buffer_view;
         let view = view.ok_or_else(|| fault("it has no buffer view".to_owned()))?;
         let (view, bytes) = self.view(view)?;

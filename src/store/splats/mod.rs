@@ -9,6 +9,8 @@
 mod glb;
 mod packed_ply;
 mod ply;
+mod scene;
+mod sog;
 mod splat;
 mod spz;
 
@@ -18,12 +20,37 @@ use glam::DVec3;
 
 use crate::{
     error::{Error, Result},
+    limits::Limits,
     scene::{Gaussians, RawGaussians, SanitizeReport, SceneId, Semantics, SourcePixel},
     store::write_semantics,
 };
 
-/// What a file holds: Gaussians, what was dropped of them, and their semantics where it has some.
-pub type SplatsRead = (Gaussians, SanitizeReport, Option<Semantics>);
+/// What a file holds.
+#[derive(Clone, Debug)]
+pub struct SplatsRead {
+    /// Its format.
+    pub format: &'static SplatFormat,
+    /// The Gaussians.
+    pub gaussians: Gaussians,
+    /// How many were dropped or changed.
+    pub dropped: SanitizeReport,
+    /// Their semantics, where it has some.
+    pub semantics: Option<Semantics>,
+}
+
+impl SplatsRead {
+    /// What was read, checked. The Gaussians say which entry is whose, also where some are dropped.
+    fn new(
+        format: &'static SplatFormat,
+        raw: RawGaussians,
+        semantics: Option<Semantics>,
+    ) -> Result<Self> {
+        let (gaussians, dropped) = Gaussians::sanitize(raw)?;
+        let index = || gaussians.semantic_index().to_vec();
+        let semantics = semantics.map(|semantics| Semantics { index: index(), ..semantics });
+        Ok(Self { format, gaussians, dropped, semantics })
+    }
+}
 
 /// A format of files.
 #[derive(Debug)]
@@ -75,6 +102,26 @@ pub static SPZ: SplatFormat = SplatFormat {
     size_bytes: |_| None,
     write: spz::write,
 };
+/// SPZ, version 4.
+pub static SPZ4: SplatFormat = SplatFormat {
+    name: "spz4",
+    ending: "v4.spz",
+    media_type: OCTETS,
+    semantics: false,
+    check: spz::check,
+    size_bytes: |_| None,
+    write: spz::write_4,
+};
+/// The bundle of pictures of `PlayCanvas`.
+pub static SOG: SplatFormat = SplatFormat {
+    name: "sog",
+    ending: "sog",
+    media_type: OCTETS,
+    semantics: false,
+    check: sog::check,
+    size_bytes: |_| None,
+    write: sog::write,
+};
 /// Binary glTF with `KHR_gaussian_splatting`.
 pub static GLB: SplatFormat = SplatFormat {
     name: "glb",
@@ -96,7 +143,7 @@ pub static SPLAT: SplatFormat = SplatFormat {
     write: splat::write,
 };
 /// All formats. Where the ending of one ends that of another, the longer one comes first.
-pub static FORMATS: [&SplatFormat; 5] = [&COMPRESSED_PLY, &PLY, &SPZ, &GLB, &SPLAT];
+pub static FORMATS: [&SplatFormat; 7] = [&COMPRESSED_PLY, &PLY, &SPZ4, &SPZ, &SOG, &GLB, &SPLAT];
 
 /// The endings of all formats, for messages.
 pub fn endings() -> String {
@@ -169,34 +216,43 @@ impl SplatFile {
 }
 
 /// Reads a file of any of these formats. Its first bytes say which one it is; `.splat` has none, so
-/// `name` must say it. `gaussians_max` bounds what the file may claim.
+/// `name` must say it. `gaussians_max` and `splats_bytes_max` of `limits` bound what it may claim.
 ///
 /// # Errors
 /// `invalid_request` when it is none of these or is damaged, naming what is wrong;
 /// `limit_exceeded`; `store_unavailable` when reading fails. Poisoned Gaussians are no error: they
 /// are dropped or clamped and counted.
-pub fn read_splats(from: &mut dyn BufRead, name: &str, gaussians_max: usize) -> Result<SplatsRead> {
+pub fn read_splats(from: &mut dyn BufRead, name: &str, limits: &Limits) -> Result<SplatsRead> {
     let start = from.fill_buf().map_err(unreadable)?;
     match start.get(..4).unwrap_or(start) {
-        [b'p', b'l', b'y', ..] => ply::read(from, gaussians_max),
-        [0x1f, 0x8b, ..] => spz::read(from, gaussians_max),
-        b"glTF" => glb::read(from, gaussians_max),
-        b"NGSP" => {
-            Err(Error::invalid("SPZ: version 4 and later are not read; write version 3 instead"))
-        }
-        [b'P', b'K', ..] => Err(Error::invalid(
-            "a zip is no file of Gaussians that is read (SOG is not); there are PLY, compressed \
-             PLY, SPZ, GLB and .splat",
-        )),
+        [b'p', b'l', b'y', ..] => ply::read(from, limits),
+        [0x1f, 0x8b, ..] => spz::read(from, limits),
+        b"glTF" => glb::read(from, limits),
+        b"NGSP" => spz::read_4(from, limits),
+        [b'P', b'K', ..] => sog::read(from, limits),
         _ if SplatFormat::of_file(name).is_some_and(|named| named.name == SPLAT.name) => {
-            splat::read(from, gaussians_max)
+            splat::read(from, limits)
         }
         other => Err(Error::invalid(format!(
-            "the file is none of Gaussians: it begins with {:?}; PLY, compressed PLY, SPZ and GLB \
-             are known by their first bytes, .splat by the ending of its name",
+            "the file is none of Gaussians: it begins with {:?}; PLY, compressed PLY, SPZ, SOG and \
+             GLB are known by their first bytes, .splat by the ending of its name",
             String::from_utf8_lossy(other)
         ))),
     }
+}
+
+/// Refuses more Gaussians of this degree than a scene may have, or than may be in memory.
+fn check_count(what: &str, count: usize, sh_degree: u8, limits: &Limits) -> Result<()> {
+    let (max, bytes_max) = (limits.gaussians_max, limits.splats_bytes_max);
+    if count > max {
+        return Err(Error::limit(what, count, max));
+    }
+    let bytes = Gaussians::bytes_of(count, sh_degree);
+    if bytes > bytes_max {
+        let value = format!("{count} of degree {sh_degree}, {bytes} bytes in memory");
+        return Err(Error::limit(what, value, format!("{bytes_max} bytes")));
+    }
+    Ok(())
 }
 
 /// Most formats hold one Gaussian or more.

@@ -12,7 +12,7 @@ use std::{
     io::{self, Read, Write},
 };
 
-use super::{SplatFile, SplatsRead, begun, cut_short, fill_rest, steps, world};
+use super::{COMPRESSED_PLY, SplatFile, SplatsRead, begun, cut_short, fill_rest, steps, world};
 use crate::{
     error::Result,
     scene::{Gaussians, SH_C0},
@@ -118,7 +118,7 @@ pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
 }
 
 /// The Gaussians along a Morton curve, 21 bits an axis.
-fn morton_order(gaussians: &Gaussians) -> Vec<u32> {
+pub(super) fn morton_order(gaussians: &Gaussians) -> Vec<u32> {
     let means = gaussians.means();
     let fold = |f: fn(f32, f32) -> f32, start| {
         means.iter().fold([start; 3], |a, b| std::array::from_fn(|k| f(a[k], b[k])))
@@ -255,6 +255,5 @@ pub(super) fn read(from: &mut dyn Read, layout: &PackedLayout) -> Result<SplatsR
         }
     }
     fill_rest(&mut raw);
-    let (gaussians, report) = Gaussians::sanitize(raw)?;
-    Ok((gaussians, report, None))
+    SplatsRead::new(&COMPRESSED_PLY, raw, None)
 }

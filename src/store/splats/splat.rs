@@ -7,10 +7,11 @@
 
 use std::io::{self, BufRead, Write};
 
-use super::{SplatFile, SplatsRead, begun, cut_short, fill_rest, steps, world};
+use super::{SPLAT, SplatFile, SplatsRead, begun, check_count, cut_short, fill_rest, steps, world};
 use crate::{
     error::{Error, Result},
-    scene::{Gaussians, SH_C0},
+    limits::Limits,
+    scene::SH_C0,
 };
 
 const BYTES: usize = 32;
@@ -39,14 +40,12 @@ pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     Ok(())
 }
 
-pub(super) fn read(from: &mut dyn BufRead, gaussians_max: usize) -> Result<SplatsRead> {
+pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let mut raw = begun(0, 0);
     let mut row = [0; BYTES];
     while !from.fill_buf().map_err(super::unreadable)?.is_empty() {
         let n = raw.means.len();
-        if n == gaussians_max {
-            return Err(Error::limit("splat: Gaussians", "one more", gaussians_max));
-        }
+        check_count("splat: Gaussians", n + 1, 0, limits)?;
         from.read_exact(&mut row).map_err(|e| cut_short("splat", e, n, n + 1, "Gaussians"))?;
         let number = |k: usize| f32::from_le_bytes([row[k], row[k + 1], row[k + 2], row[k + 3]]);
         raw.means.push([number(0), number(4), number(8)]);
@@ -59,6 +58,5 @@ pub(super) fn read(from: &mut dyn BufRead, gaussians_max: usize) -> Result<Splat
         return Err(Error::invalid("splat: the file is empty"));
     }
     fill_rest(&mut raw);
-    let (gaussians, report) = Gaussians::sanitize(raw)?;
-    Ok((gaussians, report, None))
+    SplatsRead::new(&SPLAT, raw, None)
 }

@@ -1,6 +1,9 @@
-//! SPZ, as nianticlabs/spz packs it: written as version 3, read as versions 1 to 3.
+//! SPZ, as nianticlabs/spz packs it: versions 3 and 4 are written, 1 to 4 are read.
 //!
-//! One gzip stream: a header of 16 bytes, then a block of bytes for each attribute: positions
+//! Versions 1 to 3 are one gzip stream: a header of 16 bytes, then a block of bytes for each
+//! attribute. Version 4 has the header plain (32 bytes), then records of extensions, a table with
+//! the packed and the whole size of each block, and each block as a stream of Zstandard. The blocks
+//! are alike: positions
 //! (three numbers of 24 bits with a fixed point), opacities (u8), colours (three u8), scales (three
 //! u8), rotations (the three smallest numbers, 10 bits each; before version 3 the first three, 8
 //! bits each), harmonics over degree 0 (u8). Version 1 has positions as half floats. Axes: y up, z
@@ -18,18 +21,26 @@ use std::{
 
 use flate2::{Compression, bufread::GzDecoder, write::GzEncoder};
 use half::f16;
+use ruzstd::{
+    decoding::StreamingDecoder,
+    encoding::{CompressionLevel, compress_to_vec},
+};
 
 use super::{
-    SplatFile, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, cut_short, fill_rest, some, times,
-    world,
+    SPZ, SPZ4, SplatFile, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count, cut_short,
+    fill_rest, some, times, unreadable, world,
 };
 use crate::{
     error::{Error, Result},
+    limits::Limits,
     scene::{Gaussians, RawGaussians},
 };
 
 const MAGIC: [u8; 4] = *b"NGSP";
-const VERSION: u32 = 3;
+/// Bytes of the header of version 4.
+const HEAD_4_BYTES: usize = 32;
+/// The record of an extension that says other axes, `SPZ_ADOBE_coordinate_system`.
+const OTHER_AXES: u32 = 0xADBE_0003;
 /// Most bits behind the point of a position.
 const BITS_MAX: u32 = 20;
 /// Largest number of a position, in steps.
@@ -60,42 +71,84 @@ fn bits(gaussians: &Gaussians) -> Result<u32> {
     })
 }
 
+/// What writes a block of bytes, one row a Gaussian.
+type Block = fn(&Gaussians, u32, &mut dyn Write) -> io::Result<()>;
+
+/// The blocks in their order. The last is empty without harmonics over degree 0.
+const BLOCKS: [Block; 6] = [
+    |gaussians, bits, to| {
+        for i in 0..gaussians.len() {
+            for (value, sign) in world(gaussians, i).to_array().into_iter().zip(TURN) {
+                let steps = (value * f64::from(sign) * f64::from(1_u32 << bits)).round() as i32;
+                to.write_all(&steps.to_le_bytes()[..3])?;
+            }
+        }
+        Ok(())
+    },
+    |gaussians, _, to| {
+        gaussians.opacities().iter().try_for_each(|o| to.write_all(&[byte(o * 255.0)]))
+    },
+    |gaussians, _, to| {
+        let colors = gaussians.sh().iter().step_by(gaussians.sh_count());
+        let bytes = |color: &[f32; 3]| color.map(|c| byte((c * COLOR_SCALE + 0.5) * 255.0));
+        colors.map(bytes).try_for_each(|color| to.write_all(&color))
+    },
+    |gaussians, _, to| {
+        let bytes = |scale: &[f32; 3]| scale.map(|s| byte((s.ln() + 10.0) * 16.0));
+        gaussians.scales().iter().map(bytes).try_for_each(|scale| to.write_all(&scale))
+    },
+    |gaussians, _, to| {
+        let word = |quat: &[f32; 4]| packed_quat(times(*quat, TURN_QUAT)).to_le_bytes();
+        gaussians.quats().iter().map(word).try_for_each(|quat| to.write_all(&quat))
+    },
+    |gaussians, _, to| {
+        for row in gaussians.sh().chunks_exact(gaussians.sh_count()) {
+            for (j, coefficient) in row.iter().enumerate().skip(1) {
+                to.write_all(&coefficient.map(|c| packed_sh(c * TURN_SH[j], j)))?;
+            }
+        }
+        Ok(())
+    },
+];
+
+/// The 16 bytes that a file of any version begins with. The last one is the number of streams,
+/// from version 4 on.
+fn head(gaussians: &Gaussians, version: u32, bits: u32, streams: u8) -> io::Result<Vec<u8>> {
+    let count = u32::try_from(gaussians.len()).map_err(io::Error::other)?;
+    let words = [u32::from_le_bytes(MAGIC), version, count];
+    let mut head: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
+    head.extend([gaussians.sh_degree(), bits as u8, 0, streams]);
+    Ok(head)
+}
+
 pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
-    let (n, k) = (gaussians.len(), gaussians.sh_count());
-    let count = u32::try_from(n).map_err(io::Error::other)?;
     let bits = bits(gaussians).map_err(io::Error::other)?;
     let mut to = GzEncoder::new(to, Compression::default());
-    to.write_all(&MAGIC)?;
-    to.write_all(&VERSION.to_le_bytes())?;
-    to.write_all(&count.to_le_bytes())?;
-    to.write_all(&[gaussians.sh_degree(), bits as u8, 0, 0])?;
-    for i in 0..n {
-        let at = world(gaussians, i).to_array();
-        for (value, sign) in at.into_iter().zip(TURN) {
-            let steps = (value * f64::from(sign) * f64::from(1_u32 << bits)).round() as i32;
-            to.write_all(&steps.to_le_bytes()[..3])?;
-        }
-    }
-    for opacity in gaussians.opacities() {
-        to.write_all(&[byte(opacity * 255.0)])?;
-    }
-    for i in 0..n {
-        let color = gaussians.sh()[i * k].map(|c| byte((c * COLOR_SCALE + 0.5) * 255.0));
-        to.write_all(&color)?;
-    }
-    for scale in gaussians.scales() {
-        to.write_all(&scale.map(|s| byte((s.ln() + 10.0) * 16.0)))?;
-    }
-    for quat in gaussians.quats() {
-        to.write_all(&packed_quat(times(*quat, TURN_QUAT)).to_le_bytes())?;
-    }
-    for row in gaussians.sh().chunks_exact(k) {
-        for (j, coefficient) in row.iter().enumerate().skip(1) {
-            to.write_all(&coefficient.map(|c| packed_sh(c * TURN_SH[j], j)))?;
-        }
-    }
+    to.write_all(&head(gaussians, 3, bits, 0)?)?;
+    BLOCKS.iter().try_for_each(|block| block(gaussians, bits, &mut to))?;
     to.finish().map(drop)
+}
+
+/// The table of the streams is before them, so that all are packed before the first is written.
+pub(super) fn write_4(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+    let gaussians = &file.gaussians;
+    let bits = bits(gaussians).map_err(io::Error::other)?;
+    let (mut table, mut packed) = (Vec::new(), Vec::new());
+    for block in BLOCKS {
+        let mut whole = Vec::new();
+        block(gaussians, bits, &mut whole)?;
+        if !whole.is_empty() {
+            let stream = compress_to_vec(&whole[..], CompressionLevel::Fastest);
+            table.extend([stream.len() as u64, whole.len() as u64]);
+            packed.push(stream);
+        }
+    }
+    to.write_all(&head(gaussians, 4, bits, packed.len() as u8)?)?;
+    to.write_all(&(HEAD_4_BYTES as u32).to_le_bytes())?;
+    to.write_all(&[0; 12])?;
+    table.iter().try_for_each(|size| to.write_all(&size.to_le_bytes()))?;
+    packed.iter().try_for_each(|stream| to.write_all(stream))
 }
 
 fn byte(value: f32) -> u8 {
@@ -136,36 +189,136 @@ fn packed_sh(value: f32, j: usize) -> u8 {
     ((steps + bucket / 2).div_euclid(bucket) * bucket).clamp(0, 255) as u8
 }
 
-pub(super) fn read(from: &mut dyn BufRead, gaussians_max: usize) -> Result<SplatsRead> {
+/// What the first 16 bytes of a file say.
+struct Head {
+    version: u32,
+    count: usize,
+    sh_degree: u8,
+    /// Steps of a position in a unit.
+    unit: f64,
+    /// Whether records of extensions are in the file.
+    extended: bool,
+    streams: u8,
+}
+
+impl Head {
+    fn read(head: [u8; 16], versions: [u32; 2], limits: &Limits) -> Result<Self> {
+        let word = |k: usize| u32::from_le_bytes([head[k], head[k + 1], head[k + 2], head[k + 3]]);
+        let (version, count) = (word(4), word(8) as usize);
+        let [sh_degree, bits, flags, streams] = word(12).to_le_bytes();
+        if head[..4] != MAGIC {
+            return Err(bad("the unpacked bytes do not begin with NGSP"));
+        }
+        let [least, most] = versions;
+        if !(least..=most).contains(&version) {
+            return Err(bad(format!("version {version}; 1 to 3 are read as gzip, 4 by its head")));
+        }
+        if sh_degree > 3 {
+            return Err(bad(format!("harmonics of degree {sh_degree}; 0 to 3 are read")));
+        }
+        check_count("SPZ: Gaussians", count, sh_degree, limits)?;
+        if count == 0 {
+            return Err(bad("the header says 0 Gaussians"));
+        }
+        if bits > 30 {
+            return Err(bad(format!("{bits} bits behind the point; 0 to 30 are read")));
+        }
+        let (unit, extended) = (f64::from(1_u32 << bits), flags & 2 != 0);
+        Ok(Self { version, count, sh_degree, unit, extended, streams })
+    }
+
+    fn read_blocks<R: Read>(&self, blocks: &mut Blocks<R>) -> Result<RawGaussians> {
+        let mut raw = begun(self.count, self.sh_degree);
+        blocks.count = self.count;
+        blocks.read(&mut raw, self.version, self.unit)?;
+        fill_rest(&mut raw);
+        Ok(raw)
+    }
+
+    /// Bytes of each block of version 4; that of harmonics is left out where it is empty.
+    fn block_bytes(&self) -> Vec<u64> {
+        let harmonics = 3 * ((u64::from(self.sh_degree) + 1).pow(2) - 1);
+        let each = [9, 1, 3, 3, 4, harmonics].into_iter().filter(|bytes| *bytes > 0);
+        each.map(|bytes| bytes * self.count as u64).collect()
+    }
+}
+
+/// Versions 1 to 3.
+pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let mut from = Blocks { from: GzDecoder::new(from), count: 0 };
-    let head: [u8; 16] = from.row(0, "bytes of the header")?;
-    let word = |k: usize| u32::from_le_bytes([head[k], head[k + 1], head[k + 2], head[k + 3]]);
-    let (version, count, sh_degree, bits) = (word(4), word(8) as usize, head[12], head[13]);
-    if head[..4] != MAGIC {
-        return Err(bad("the unpacked bytes do not begin with NGSP"));
+    let head = Head::read(from.row(0, "bytes of the header")?, [1, 3], limits)?;
+    let raw = head.read_blocks(&mut from)?;
+    let rest = from.end()?;
+    if head.extended {
+        check_extensions(&rest)?;
     }
-    if !(1..=VERSION).contains(&version) {
-        return Err(bad(format!("version {version}; 1 to {VERSION} are read")));
+    SplatsRead::new(&SPZ, raw, None)
+}
+
+/// Version 4.
+pub(super) fn read_4(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+    let mut from = Blocks { from, count: HEAD_4_BYTES };
+    let head = Head::read(from.row(0, "bytes of the header")?, [4, 4], limits)?;
+    let rest: [u8; 16] = from.row(16, "bytes of the header")?;
+    let table_at = u64::from(u32::from_le_bytes([rest[0], rest[1], rest[2], rest[3]]));
+    let records = table_at.checked_sub(HEAD_4_BYTES as u64).filter(|bytes| *bytes <= REST_MAX);
+    let records = records.ok_or_else(|| {
+        bad(format!(
+            "the table of the streams is at byte {table_at}; {HEAD_4_BYTES} to 1 MiB is read"
+        ))
+    })?;
+    let records = from.bytes(records, "the block of extensions")?;
+    if head.extended {
+        check_extensions(&records)?;
     }
-    if count > gaussians_max {
-        return Err(Error::limit("SPZ: Gaussians", count, gaussians_max));
+    let sizes = head.block_bytes();
+    if usize::from(head.streams) != sizes.len() {
+        let (streams, degree) = (head.streams, head.sh_degree);
+        let want = sizes.len();
+        return Err(bad(format!("{streams} streams; of degree {degree} there are {want}")));
     }
-    if count == 0 {
-        return Err(bad("the header says 0 Gaussians"));
+    let mut table = Vec::new();
+    for (i, size) in sizes.iter().enumerate() {
+        let row = from.bytes(16, "the table of the streams")?;
+        let word = |k: usize| row[k..k + 8].iter().rev().fold(0, |n, b| n << 8 | u64::from(*b));
+        let whole = word(8);
+        if whole != *size {
+            return Err(bad(format!("stream {i} is of {whole} bytes; it must be of {size}")));
+        }
+        table.push((word(0), whole));
     }
-    if sh_degree > 3 {
-        return Err(bad(format!("harmonics of degree {sh_degree}; 0 to 3 are read")));
+    let mut blocks = Vec::new();
+    for (i, (packed, whole)) in table.into_iter().enumerate() {
+        let packed = from.bytes(packed, &format!("stream {i}"))?;
+        let damaged = || bad(format!("stream {i}: the compressed bytes are damaged"));
+        let mut stream = StreamingDecoder::new(&packed[..]).map_err(|_| damaged())?;
+        let read = (&mut stream).take(whole + 1).read_to_end(&mut blocks);
+        let read = read.map_err(|_| damaged())?;
+        let said = stream.decoder.get_checksum_from_data();
+        if said.is_some() && said != stream.decoder.get_calculated_checksum() {
+            return Err(damaged());
+        }
+        if read as u64 != whole {
+            return Err(bad(format!("stream {i} unpacks to {read} bytes, not {whole}")));
+        }
     }
-    if bits > 30 {
-        return Err(bad(format!("{bits} bits behind the point; 0 to 30 are read")));
+    let raw = head.read_blocks(&mut Blocks { from: &blocks[..], count: 0 })?;
+    SplatsRead::new(&SPZ4, raw, None)
+}
+
+/// Refuses records that change what the numbers mean; others are skipped, as the reference does.
+fn check_extensions(mut records: &[u8]) -> Result<()> {
+    while let Some((head, rest)) = records.split_at_checked(8) {
+        let word = |k: usize| u32::from_le_bytes([head[k], head[k + 1], head[k + 2], head[k + 3]]);
+        if word(0) == OTHER_AXES {
+            return Err(bad(
+                "it has the extension SPZ_ADOBE_coordinate_system; axes other than y up and z back \
+                 are not read",
+            ));
+        }
+        records = rest.get(word(4) as usize..).unwrap_or_default();
     }
-    from.count = count;
-    let mut raw = begun(count, sh_degree);
-    from.read(&mut raw, version, f64::from(1_u32 << bits))?;
-    from.end()?;
-    fill_rest(&mut raw);
-    let (gaussians, report) = Gaussians::sanitize(raw)?;
-    Ok((gaussians, report, None))
+    Ok(())
 }
 
 fn bad(why: impl std::fmt::Display) -> Error {
@@ -186,15 +339,25 @@ impl<R: Read> Blocks<R> {
         Ok(row)
     }
 
-    /// Goes to the end of the stream, where gzip's sum of all bytes is checked.
-    fn end(&mut self) -> Result<()> {
-        let count = self.count;
-        let rest = io::copy(&mut (&mut self.from).take(REST_MAX + 1), &mut io::sink());
-        match rest.map_err(|e| cut_short("SPZ", e, count, count, "Gaussians"))? {
+    /// So many bytes that `of` names.
+    fn bytes(&mut self, bytes: u64, of: &str) -> Result<Vec<u8>> {
+        let mut read = Vec::new();
+        (&mut self.from).take(bytes).read_to_end(&mut read).map_err(unreadable)?;
+        match read.len() as u64 {
+            all if all == bytes => Ok(read),
+            some => Err(bad(format!("{of} ends after {some} of {bytes} bytes"))),
+        }
+    }
+
+    /// What follows, to the end of the stream, where gzip's sum of all bytes is checked.
+    fn end(&mut self) -> Result<Vec<u8>> {
+        let (count, mut rest) = (self.count, Vec::new());
+        let read = (&mut self.from).take(REST_MAX + 1).read_to_end(&mut rest);
+        match read.map_err(|e| cut_short("SPZ", e, count, count, "Gaussians"))? as u64 {
             bytes if bytes > REST_MAX => {
                 Err(Error::limit("SPZ: bytes after the Gaussians", "more", REST_MAX))
             }
-            _ => Ok(()),
+            _ => Ok(rest),
         }
     }
 

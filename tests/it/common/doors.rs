@@ -526,6 +526,9 @@ pub(crate) fn form(upload: &Upload) -> reqwest::multipart::Form {
     if let Some(archive) = &upload.archive {
         form = form.part("archive", part(archive));
     }
+    if let Some(file) = &upload.splats {
+        form = form.part("splats", part(&file.bytes).file_name(file.name.clone()));
+    }
     upload.photos.iter().fold(form, |form, photo| {
         let file = photo.name.rsplit('/').next().unwrap_or_default().to_owned();
         form.part(photo.name.clone(), part(&photo.bytes).file_name(file))
@@ -571,6 +574,13 @@ pub(crate) fn messages(upload: &Upload, options: &Options) -> Vec<pb::CreateScen
     }
     for piece in upload.archive.iter().flat_map(|archive| archive.chunks(PIECE)) {
         parts.push(Part::Archive(piece.to_vec().into()));
+    }
+    if let Some(file) = &upload.splats {
+        let mut name = file.name.clone();
+        for piece in file.bytes.chunks(PIECE) {
+            let name = std::mem::take(&mut name);
+            parts.push(Part::Splats(pb::SplatsChunk { name, data: piece.to_vec().into() }));
+        }
     }
     parts.into_iter().map(|part| pb::CreateSceneRequest { part: Some(part) }).collect()
 }

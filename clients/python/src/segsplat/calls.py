@@ -43,11 +43,13 @@ from .types import (
 from .view import FORMATS, View, picture
 from .wire import Flow, Item, Multipart, Part, Policy, Read, Request, ServerSentEvents, pause, send
 
+#: Endings of files of Gaussians.
+SPLATS = (".ply", ".spz", ".sog", ".glb", ".splat")
 #: Cameras of one call; more go as more calls.
 CAMERAS_MAX = 64
 
-#: A folder with photos and `transforms.json` or `cameras.json`; an archive of one; or photos and
-#: their cameras.
+#: A folder with photos and `transforms.json` or `cameras.json`; an archive of one; a file of
+#: Gaussians (PLY, SPZ, SOG, GLB, .splat); or photos and their cameras.
 Source: TypeAlias = str | Path | Mapping[str | Path, Camera]
 #: A scene as the server shows it.
 Shown: TypeAlias = tuple[SceneStatus, tuple[Photo, ...]]
@@ -103,6 +105,8 @@ def parts_of(source: Source) -> list[Part]:
         parts = [Part("cameras", "cameras.json", json.dumps({"cameras": cameras}).encode())]
         return parts + [Part("photo", *one) for one in zip(names, files, strict=True)]
     path = Path(source)
+    if path.suffix.lower() in SPLATS and not path.is_dir():
+        return [Part("splats", path.name, path)]
     if path.is_file():
         return [Part("archive", path.name, path)]
     for field in ("transforms", "cameras"):
@@ -111,7 +115,7 @@ def parts_of(source: Source) -> list[Part]:
             photos = [_photo(path, name) for name in _files_of(described)]
             return [Part(field, described.name, described), *photos]
     raise FileNotFoundError(
-        f"{path}: no archive, and no folder with transforms.json or cameras.json"
+        f"{path}: no archive, no file of Gaussians and no folder with transforms.json or cameras.json"
     )
 
 
@@ -377,18 +381,19 @@ def gaussians(scene: Handle, text: str | None = None) -> Flow[Gaussians]:
 
 def export(
     scene: Handle,
-    format: Literal["ply", "compressed_ply", "spz", "glb", "splat"] = "ply",
+    format: Literal["ply", "compressed_ply", "spz", "spz4", "sog", "glb", "splat"] = "ply",
     path: str | Path | None = None,
     *,
     text: str | None = None,
 ) -> Flow[Path]:
     """Writes the scene, or what a text selects of it, to a file as it comes, and tells its path.
 
-    format: "ply", as 3DGS writes it; "compressed_ply" (PlayCanvas, SuperSplat), "spz", "glb"
-        (KHR_gaussian_splatting) and "splat" for other programs.
+    format: "ply", as 3DGS writes it; "compressed_ply" (PlayCanvas, SuperSplat), "spz" (version 3),
+        "spz4", "sog", "glb" (KHR_gaussian_splatting) and "splat" for other programs.
     path: by default the scene's id with the ending of the format, in the current folder.
     """
-    target = Path(path) if path is not None else Path(f"{scene.id}.{format.replace('_', '.')}")
+    ending = {"compressed_ply": "compressed.ply", "spz4": "v4.spz"}.get(format, format)
+    target = Path(path) if path is not None else Path(f"{scene.id}.{ending}")
     part = target.with_name(target.name + ".part")
     params = _query_string({"format": format, "text": text})
     request = Request("GET", f"/v1/scenes/{scene.id}/export", params=params, stream=True)

@@ -247,6 +247,8 @@ class Report:
     execution_provider: str
     #: What looks wrong with the capture.
     warnings: tuple[Doubt, ...] = ()
+    #: Format of the file of Gaussians that the scene is; None where it was made of photos.
+    file_format: str | None = None
 
 
 @dataclass(frozen=True)

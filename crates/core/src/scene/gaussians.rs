@@ -320,8 +320,13 @@ impl Gaussians {
 
     /// Bytes held.
     pub fn size_bytes(&self) -> u64 {
-        let each = 12 + 16 + 12 + 4 + 2 + 6 + 12 * self.sh_count();
-        (self.len() * each) as u64
+        Self::bytes_of(self.len(), self.sh_degree())
+    }
+
+    /// Bytes that so many Gaussians of this degree hold.
+    pub fn bytes_of(count: usize, sh_degree: u8) -> u64 {
+        let coefficients = (u64::from(sh_degree) + 1).pow(2);
+        count as u64 * (12 + 16 + 12 + 4 + 2 + 6 + 12 * coefficients)
     }
 }
 

@@ -68,6 +68,9 @@ pub struct StageTime {
 pub struct HealthReport {
     /// Photos given.
     pub photos: u32,
+    /// Format of the file of Gaussians that the scene is; none where it was made of photos.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub file_format: Option<String>,
     /// How it was made.
     #[serde(default)]
     #[schema(required = true)]

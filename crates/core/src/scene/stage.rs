@@ -10,7 +10,7 @@ use crate::error::{Error, ErrorCode, Result};
 /// A stage of making a scene, of making its semantics, or of refining it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Stage {
-    /// The upload becomes undistorted photos with cameras.
+    /// The upload is read: undistorted photos with cameras, or the Gaussians of a file.
     Photos,
     /// Depth ranges, overlap and diagnosis from the photos themselves.
     Capture,

@@ -1,8 +1,8 @@
-//! An upload as bytes: camera JSON and photos, or one archive.
+//! An upload as bytes: camera JSON and photos, one archive, or a file of Gaussians.
 
 use std::fmt;
 
-/// One photo as sent.
+/// One file as sent.
 #[derive(Clone, PartialEq, Eq)]
 pub struct UploadFile {
     /// File name as sent; never joined to a path.
@@ -26,7 +26,8 @@ pub enum UploadCameras {
     Cameras(Vec<u8>),
 }
 
-/// Everything sent for one scene: cameras and photos, or an archive that holds both.
+/// Everything sent for one scene: cameras and photos, an archive that holds both, or a file of
+/// Gaussians.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Upload {
     /// Camera description; `None` when it is in the archive.
@@ -35,6 +36,8 @@ pub struct Upload {
     pub photos: Vec<UploadFile>,
     /// A zip or tar of a folder of photos and its camera description.
     pub archive: Option<Vec<u8>>,
+    /// A file of Gaussians, which is a whole scene.
+    pub splats: Option<UploadFile>,
 }
 
 impl Upload {
@@ -44,7 +47,8 @@ impl Upload {
             Some(UploadCameras::Transforms(json) | UploadCameras::Cameras(json)) => json.len(),
             None => 0,
         };
-        let photos: usize = self.photos.iter().map(|photo| photo.bytes.len()).sum();
-        cameras + photos + self.archive.as_ref().map_or(0, Vec::len)
+        let files = self.photos.iter().chain(&self.splats);
+        let files: usize = files.map(|file| file.bytes.len()).sum();
+        cameras + files + self.archive.as_ref().map_or(0, Vec::len)
     }
 }

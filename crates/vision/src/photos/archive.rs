@@ -74,7 +74,7 @@ fn folder(mut files: HashMap<String, Vec<u8>>) -> Result<Upload> {
         })
         .collect();
     photos.sort_by(|a, b| a.name.cmp(&b.name));
-    Ok(Upload { cameras: Some(cameras_named(&name, json)), photos, archive: None })
+    Ok(Upload { cameras: Some(cameras_named(&name, json)), photos, ..Upload::default() })
 }
 
 /// Counts entries and bytes of one archive against the limits.

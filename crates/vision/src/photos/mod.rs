@@ -104,7 +104,7 @@ pub fn upload_of_dir(dir: &Path, limits: &Limits) -> Result<Upload> {
         })?;
         photos.push(UploadFile { name, bytes });
     }
-    Ok(Upload { cameras: Some(cameras), photos, archive: None })
+    Ok(Upload { cameras: Some(cameras), photos, ..Upload::default() })
 }
 
 fn camera_file_of_dir(dir: &Path, limits: &Limits) -> Result<UploadCameras> {

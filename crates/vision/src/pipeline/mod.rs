@@ -286,6 +286,7 @@ fn run(
     let focal = |lens: &Option<Intrinsics>| lens.map_or(0.0, |lens| lens.fx.min(lens.fy));
     let report = HealthReport {
         photos: count(photos.len()),
+        file_format: None,
         method,
         views_used: count(used(&sets, photos.len())),
         gaussians: lifted.gaussians.len() as u64,

@@ -33,7 +33,7 @@ fn sent() -> (Vec<PosedPhoto>, Vec<UploadFile>) {
 }
 
 fn upload(cameras: UploadCameras, files: Vec<UploadFile>) -> Upload {
-    Upload { cameras: Some(cameras), photos: files, archive: None }
+    Upload { cameras: Some(cameras), photos: files, ..Upload::default() }
 }
 
 /// `cameras` JSON of the photos: this project's own form, OpenCV camera-to-world.
@@ -115,7 +115,7 @@ fn the_number_of_photos_is_bounded_on_both_sides() {
         .map(|i| UploadFile { name: format!("{i}.png"), bytes: files[0].bytes.clone() })
         .collect();
     refused(&with_transforms(&json, many), ErrorCode::LimitExceeded, &["photos", "65", "64"]);
-    let none = Upload { cameras: None, photos: files, archive: None };
+    let none = Upload { photos: files, ..Upload::default() };
     refused(&none, invalid, &["no cameras"]);
 }
 
@@ -324,7 +324,7 @@ fn tarred(entries: &[(&str, &[u8])], kind: tar::EntryType) -> Vec<u8> {
 }
 
 fn archive(bytes: Vec<u8>) -> Upload {
-    Upload { cameras: None, photos: vec![], archive: Some(bytes) }
+    Upload { archive: Some(bytes), ..Upload::default() }
 }
 
 fn folder_of(root: &str) -> Vec<(String, Vec<u8>)> {

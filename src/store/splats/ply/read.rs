@@ -6,13 +6,14 @@ use glam::DVec3;
 
 use crate::{
     error::{Error, Result},
-    scene::{Gaussians, RawGaussians, SceneId, Semantics, SourcePixel},
+    limits::Limits,
+    scene::{RawGaussians, SceneId, Semantics, SourcePixel},
     store::read_semantics,
 };
 
 use super::{
     super::{
-        SplatsRead, begun, cut_short,
+        PLY, SplatsRead, begun, check_count, cut_short,
         packed_ply::{self, BOUNDS, PACKED, PackedLayout},
     },
     write::SEMANTICS,
@@ -29,16 +30,18 @@ const CHUNK: &str = "chunk";
 const SH: &str = "sh";
 
 /// Reads a file, with the semantics after its vertices if there are some.
-pub(in super::super) fn read(from: &mut dyn BufRead, gaussians_max: usize) -> Result<SplatsRead> {
+pub(in super::super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let header = Header::read(from)?;
     let vertices = header.vertices()?;
-    if vertices.count > gaussians_max {
-        return Err(Error::limit("PLY: Gaussians", vertices.count, gaussians_max));
-    }
+    let check = |degree| check_count("PLY: Gaussians", vertices.count, degree, limits);
+    check(0)?;
     if header.elements[0].name == CHUNK {
-        return packed_ply::read(from, &header.packed()?);
+        let layout = header.packed()?;
+        check(layout.sh_degree)?;
+        return packed_ply::read(from, &layout);
     }
     let layout = Layout::of(vertices)?;
+    check(layout.sh_degree)?;
     let mut raw = begun(vertices.count, layout.sh_degree);
     let mut vertex = vec![0; vertices.stride()];
     for i in 0..vertices.count {
@@ -46,12 +49,8 @@ pub(in super::super) fn read(from: &mut dyn BufRead, gaussians_max: usize) -> Re
             .map_err(|cause| cut_short("PLY", cause, i, vertices.count, "Gaussians"))?;
         layout.push(&header, vertices, &vertex, &mut raw);
     }
-    let (gaussians, report) = Gaussians::sanitize(raw)?;
     let semantics = header.semantics.map(|bytes| semantics_after(from, bytes)).transpose()?;
-    // The vertices say which entry is whose, also where some were dropped.
-    let index = gaussians.semantic_index().to_vec();
-    let semantics = semantics.map(|semantics| Semantics { index, ..semantics });
-    Ok((gaussians, report, semantics))
+    SplatsRead::new(&PLY, raw, semantics)
 }
 
 /// The container of `bytes` bytes that follows the vertices.
