@@ -149,7 +149,7 @@ fn axes_and_focal_length_are_turned_to_ours() {
     assert_eq!(camera.camera_to_world.axis(), DVec3::Z);
     let lens = camera.intrinsics;
     assert_eq!((lens.fx, lens.fy, lens.cx, lens.cy), (10.0, 10.0, 4.0, 3.0));
-    std::fs::write(&path, &bytes[..bytes.len() - 17 * 8]).unwrap();
+    std::fs::write(&path, npy("<f8", "1, 17", &data[..17 * 8])).unwrap();
     let fault = read(dir.path(), &limits).unwrap_err().to_string();
     assert!(fault.contains("1 rows for 2 photos"), "{fault}");
 }

@@ -19,9 +19,8 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
     names::named,
-    photos,
     pipeline::{
-        self, Pipeline,
+        self, PhotoSet, Pipeline,
         semantics::{SemanticsInput, understand},
     },
     scene::{Density, Preset, Scene, SceneId, SceneOptions, SemanticsMode, Stage, Upload, Watch},
@@ -30,7 +29,7 @@ use crate::{
 
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
-    /// Folder with transforms.json or cameras.json and its photos, or a zip or tar of one
+    /// Folder of a capture (docs/captures.md has the layouts), or a zip or tar of one
     photos: PathBuf,
     /// Scene file to write; with the ending ply, compressed.ply, spz, glb or splat that format
     #[arg(short, long, value_name = "FILE")]
@@ -55,7 +54,6 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
-    let upload = upload_of(&args.photos, config)?;
     let engine = Pipeline::open(&config.networks())?;
     let options = SceneOptions {
         max_views: args.max_views,
@@ -76,7 +74,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         |stage: Stage, fraction: f32| out.progress(stage.name(), stage.overall(fraction));
     let watch = Watch { progress: &progress, cancel: &AtomicBool::new(false) };
     progress(Stage::Photos, 0.0);
-    let photos = pipeline::read(&upload, &config.limits, watch.cancel)?;
+    let (photos, upload) = read(&args.photos, config, watch.cancel)?;
     let made = pipeline::make(&engine, &photos, &options, watch)?;
     let provenance = store::provenance(store::hashes(&upload), &options, engine.bundle().sha256());
     let mut hash = Sha256::new();
@@ -109,9 +107,10 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     describe(&path, &scene, total_ms, out)
 }
 
-fn upload_of(path: &Path, config: &Config) -> Result<Upload> {
+/// The photos of a folder or an archive, and the files that were read.
+fn read(path: &Path, config: &Config, cancel: &AtomicBool) -> Result<(PhotoSet, Upload)> {
     if path.is_dir() {
-        return photos::upload_of_dir(path, &config.limits);
+        return pipeline::read_dir(path, &config.limits, cancel);
     }
     let size = fs_err::metadata(path).map_err(|e| unreadable(path, e))?.len();
     let max = config.limits.upload_bytes_max;
@@ -119,7 +118,8 @@ fn upload_of(path: &Path, config: &Config) -> Result<Upload> {
         return Err(Error::limit("upload bytes", size, max));
     }
     let archive = fs_err::read(path).map_err(|e| unreadable(path, e))?;
-    Ok(Upload { archive: Some(archive), ..Upload::default() })
+    let upload = Upload { archive: Some(archive), ..Upload::default() };
+    Ok((pipeline::read(&upload, &config.limits, cancel)?, upload))
 }
 
 /// Removes the semantics of a scene that was replaced.

@@ -166,8 +166,8 @@ impl Jobs {
         let watch = Watch { progress: &progress, cancel: &job.cancel };
         self.give_way(job)?;
         let scene = self.parts.store.scene(id)?;
-        let photos = self.photos(id, watch)?;
-        let photos = &photos.photos.photos;
+        let read = self.photos(id, watch)?;
+        let photos = &read.photos.photos;
         let limits = &self.parts.limits;
         let time = Duration::from_millis(order.ms);
         let options = RefineOptions {
@@ -177,7 +177,8 @@ impl Jobs {
             ..RefineOptions::default()
         };
         let mut remake = |photos: Vec<PosedPhoto>| {
-            let photos = PhotoSet { photos, read_ms: 0.0 };
+            let warnings = read.photos.warnings.clone();
+            let photos = PhotoSet { photos, warnings, read_ms: 0.0 };
             self.parts.scenes.make_for_refinement(&photos, &record.options, watch)
         };
         let mut told = 0.0;

@@ -43,7 +43,11 @@ pub(super) struct CreateParams {
 #[utoipa::path(
     post, path = "/v1/scenes", operation_id = "create_scene", tag = "scenes",
     params(SceneOptions, CreateParams, ("Idempotency-Key" = Option<String>, Header)),
-    request_body(content = UploadForm, content_type = "multipart/form-data"),
+    request_body(content(
+        (UploadForm = "multipart/form-data"),
+        (Vec<u8> = "application/zip"),
+        (Vec<u8> = "application/x-tar"),
+    )),
     responses(
         (status = 201, description = "Made", body = SceneStatus),
         (status = 202, description = "Taken; see Location", body = SceneStatus),

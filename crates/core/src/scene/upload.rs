@@ -1,8 +1,8 @@
-//! An upload as bytes: camera JSON and photos, or one archive.
+//! An upload as bytes: camera JSON and photos, the files of a capture, or one archive.
 
 use std::fmt;
 
-/// One photo as sent.
+/// One file as sent: a photo, or a camera file of a capture.
 #[derive(Clone, PartialEq, Eq)]
 pub struct UploadFile {
     /// File name as sent; never joined to a path.
@@ -26,14 +26,15 @@ pub enum UploadCameras {
     Cameras(Vec<u8>),
 }
 
-/// Everything sent for one scene: cameras and photos, or an archive that holds both.
+/// Everything sent for one scene: cameras and photos, the files of a capture that has its own
+/// camera files, or an archive of one.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Upload {
-    /// Camera description; `None` when it is in the archive.
+    /// Camera description; `None` when it is among the files or in the archive.
     pub cameras: Option<UploadCameras>,
-    /// Photos in the order sent.
+    /// Photos in the order sent, and the camera files of a capture.
     pub photos: Vec<UploadFile>,
-    /// A zip or tar of a folder of photos and its camera description.
+    /// A zip or tar of a folder with a capture.
     pub archive: Option<Vec<u8>>,
 }
 
