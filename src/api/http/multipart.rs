@@ -70,6 +70,12 @@ enum Sent {
     Archive(Body),
 }
 
+/// A zip or tar of a folder with a capture, as the whole body: for `/openapi.json` alone.
+#[derive(ToSchema)]
+#[schema(content_media_type = "application/octet-stream")]
+#[expect(dead_code, reason = "read by the derive alone")]
+pub(super) struct ArchiveBody(String);
+
 /// Reads the parts of `request`, or the archive that its body is; text parts that are options go to
 /// `fields`.
 pub(super) async fn read_upload(

@@ -19,7 +19,7 @@ use super::{
     error::ApiError,
     extract::{CallerApi, Id},
     fields::Fields,
-    multipart::{UploadForm, read_upload},
+    multipart::{ArchiveBody, UploadForm, read_upload},
 };
 use crate::{
     api::{Api, request_id, server_timing, upload::check_bundle},
@@ -45,8 +45,8 @@ pub(super) struct CreateParams {
     params(SceneOptions, CreateParams, ("Idempotency-Key" = Option<String>, Header)),
     request_body(content(
         (UploadForm = "multipart/form-data"),
-        (Vec<u8> = "application/zip"),
-        (Vec<u8> = "application/x-tar"),
+        (ArchiveBody = "application/zip"),
+        (ArchiveBody = "application/x-tar"),
     )),
     responses(
         (status = 201, description = "Made", body = SceneStatus),

@@ -4,7 +4,7 @@
 use std::{
     fmt::Write as _,
     io::{Cursor, Write as _},
-    sync::atomic::AtomicBool,
+    sync::{LazyLock, atomic::AtomicBool},
 };
 
 use segsplat_core::{
@@ -19,11 +19,15 @@ use segsplat_vision::{
 };
 use serde_json::{Value, json};
 
+/// Three photos and their files, made once.
 fn sent() -> (Vec<PosedPhoto>, Vec<UploadFile>) {
-    let posed =
-        sample::photos(&SampleOptions { photos: 3, width: 48, height: 36, seed: 5 }).unwrap();
-    let files = sample::png_files(&posed).unwrap();
-    (posed, files)
+    static MADE: LazyLock<(Vec<PosedPhoto>, Vec<UploadFile>)> = LazyLock::new(|| {
+        let options = SampleOptions { photos: 3, width: 48, height: 36, seed: 5 };
+        let posed = sample::photos(&options).unwrap();
+        let files = sample::png_files(&posed).unwrap();
+        (posed, files)
+    });
+    MADE.clone()
 }
 
 fn written(layout: &str) -> Vec<UploadFile> {
