@@ -1,11 +1,14 @@
 //! Collects an upload piece by piece and stops at the first byte over a limit.
 //!
-//! HTTP and gRPC feed it as the bytes arrive, so a camera JSON of 200 MB is refused after 8 MiB and
-//! the 65th photo before its first pixel. All uploads together have a budget of memory.
+//! HTTP and gRPC feed it as the bytes arrive, so a camera JSON of 200 MB is refused after 8 MiB.
+//! All uploads together have a budget of memory.
 
-use std::sync::{
-    Arc,
-    atomic::{AtomicUsize, Ordering},
+use std::{
+    collections::HashSet,
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+    },
 };
 
 use super::short;
@@ -52,6 +55,7 @@ pub(super) struct UploadBuilder<'a> {
     guard: UploadGuard,
     current: Current,
     upload: Upload,
+    names: HashSet<String>,
 }
 
 impl<'a> UploadBuilder<'a> {
@@ -62,6 +66,7 @@ impl<'a> UploadBuilder<'a> {
             guard: UploadGuard { budget: budget.clone(), held: 0 },
             current: Current::Nothing,
             upload: Upload::default(),
+            names: HashSet::new(),
         }
     }
 
@@ -80,18 +85,19 @@ impl<'a> UploadBuilder<'a> {
         self.check_json()
     }
 
-    /// Begins the photo `name`.
+    /// Begins the photo `name`, or a camera file of a capture.
     pub(super) fn begin_photo(&mut self, name: &str) -> Result<()> {
         let count = self.upload.photos.len();
         self.check_name(&format!("photo {count}"), name)?;
-        if count >= self.limits.photos_max {
+        let max = self.limits.archive_entries_max;
+        if count >= max {
             return Err(Error::limit(
                 "upload",
-                format!("photo {name:?} is number {}", count + 1),
-                format!("{} photos a scene", self.limits.photos_max),
+                format!("file {name:?} is number {}", count + 1),
+                format!("{max} files an upload"),
             ));
         }
-        if self.upload.photos.iter().any(|photo| photo.name == name) {
+        if !self.names.insert(name.to_owned()) {
             return Err(Error::invalid(format!("upload: photo {name:?} was sent twice")));
         }
         self.upload.photos.push(UploadFile { name: name.to_owned(), bytes: Vec::new() });
@@ -138,8 +144,7 @@ impl<'a> UploadBuilder<'a> {
     /// The whole upload; its bytes count against the budget until the guard is dropped.
     pub(super) fn finish(self) -> Result<(Upload, UploadGuard)> {
         let upload = self.upload;
-        let (min, max, photos) =
-            (self.limits.photos_min, self.limits.photos_max, upload.photos.len());
+        let (min, photos) = (self.limits.photos_min, upload.photos.len());
         if upload.splats.is_some() {
             let others = photos > 0 || upload.cameras.is_some() || upload.archive.is_some();
             let why = "upload: a file of Gaussians is a whole scene; send it without other files";
@@ -153,12 +158,9 @@ impl<'a> UploadBuilder<'a> {
                 "an archive holds its own photos; send one or the other".to_owned()
             }
             (None, None) if photos == 0 => format!(
-                "no photos and no cameras; send transforms or cameras and {min} to {max} photos, \
-                 an archive, or splats"
+                "no photos and no cameras; send transforms or cameras and {min} photos or more, \
+                 the files of a capture, an archive, or splats"
             ),
-            (None, None) => {
-                "no camera description; send a part named transforms or cameras".to_owned()
-            }
             (None, Some(_)) if photos < min => {
                 let s = if photos == 1 { "" } else { "s" };
                 format!("{photos} photo{s}; a scene needs at least {min}")

@@ -21,9 +21,8 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
     names::named,
-    photos,
     pipeline::{
-        self, Pipeline,
+        self, PhotoSet, Pipeline,
         semantics::{SemanticsInput, understand},
     },
     scene::{
@@ -35,8 +34,8 @@ use crate::{
 
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
-    /// Folder with transforms.json or cameras.json and its photos, a zip or tar of one, or a file
-    /// of Gaussians (PLY, compressed PLY, SPZ, SOG, GLB, .splat), which keeps its semantics
+    /// Folder of a capture (docs/captures.md has the layouts), a zip or tar of one, or a file of
+    /// Gaussians (PLY, compressed PLY, SPZ, SOG, GLB, .splat), which keeps its semantics
     photos: PathBuf,
     /// Scene file to write; with the ending ply, compressed.ply, spz, v4.spz, sog, glb or splat
     /// that format
@@ -74,7 +73,6 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     if !args.photos.is_dir() && splat_format(&args.photos).is_some() {
         return import(args, config, &options, out);
     }
-    let upload = upload_of(&args.photos, config)?;
     let engine = Pipeline::open(&config.networks())?;
     let eager = args.semantics == SemanticsMode::Eager;
     if let (true, Some(lack)) = (eager, engine.bundle().lacks_semantics()) {
@@ -86,7 +84,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         |stage: Stage, fraction: f32| out.progress(stage.name(), stage.overall(fraction));
     let watch = Watch { progress: &progress, cancel: &AtomicBool::new(false) };
     progress(Stage::Photos, 0.0);
-    let photos = pipeline::read(&upload, &config.limits, watch.cancel)?;
+    let (photos, upload) = read(&args.photos, config, watch.cancel)?;
     let made = pipeline::make(&engine, &photos, &options, watch)?;
     let provenance = store::provenance(store::hashes(&upload), &options, engine.bundle().sha256());
     let id = id_of(&provenance);
@@ -148,9 +146,10 @@ fn id_of(provenance: &Provenance) -> SceneId {
     SceneId::from_bytes(id)
 }
 
-fn upload_of(path: &Path, config: &Config) -> Result<Upload> {
+/// The photos of a folder or an archive, and the files that were read.
+fn read(path: &Path, config: &Config, cancel: &AtomicBool) -> Result<(PhotoSet, Upload)> {
     if path.is_dir() {
-        return photos::upload_of_dir(path, &config.limits);
+        return pipeline::read_dir(path, &config.limits, cancel);
     }
     let size = fs_err::metadata(path).map_err(|e| unreadable(path, e))?.len();
     let max = config.limits.upload_bytes_max;
@@ -158,7 +157,8 @@ fn upload_of(path: &Path, config: &Config) -> Result<Upload> {
         return Err(Error::limit("upload bytes", size, max));
     }
     let archive = fs_err::read(path).map_err(|e| unreadable(path, e))?;
-    Ok(Upload { archive: Some(archive), ..Upload::default() })
+    let upload = Upload { archive: Some(archive), ..Upload::default() };
+    Ok((pipeline::read(&upload, &config.limits, cancel)?, upload))
 }
 
 /// Removes the semantics of a scene that was replaced.

@@ -198,7 +198,7 @@ mod tests {
         let camera = Camera { intrinsics, camera_to_world };
         let photo = Photo { width: 1, height: 1, rgb: vec![0; bytes], valid: None };
         let posed = PosedPhoto { file: String::new(), photo, camera, intrinsics_made_for: None };
-        let photos = PhotoSet { photos: vec![posed], read_ms: 0.0 };
+        let photos = PhotoSet { photos: vec![posed], warnings: Vec::new(), read_ms: 0.0 };
         Arc::new(ReadUpload { files: Vec::new(), content: Content::Photos(photos) })
     }
 

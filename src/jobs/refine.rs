@@ -168,7 +168,7 @@ impl Jobs {
         self.give_way(job)?;
         let scene = self.parts.store.scene(id)?;
         let upload = self.upload(id, watch)?;
-        let photos = &upload.photos()?.photos;
+        let PhotoSet { photos, warnings, .. } = upload.photos()?;
         let limits = &self.parts.limits;
         let time = Duration::from_millis(order.ms);
         let options = RefineOptions {
@@ -178,7 +178,7 @@ impl Jobs {
             ..RefineOptions::default()
         };
         let mut remake = |photos: Vec<PosedPhoto>| {
-            let photos = PhotoSet { photos, read_ms: 0.0 };
+            let photos = PhotoSet { photos, warnings: warnings.clone(), read_ms: 0.0 };
             self.parts.scenes.make_for_refinement(&photos, &record.options, watch)
         };
         let mut told = 0.0;

@@ -45,7 +45,7 @@ pub use self::{
     times::ViewTimes,
     types::{
         Created, Export, InstanceBox, KnownWord, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
-        QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning,
+        QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning, Trust,
     },
 };
 pub use crate::render::{Quality, plan::default_near};

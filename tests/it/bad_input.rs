@@ -112,24 +112,6 @@ pub(crate) fn zipped(files: Vec<(&str, Vec<u8>)>) -> Upload {
     Upload { archive: Some(zip.finish().unwrap().into_inner()), ..Upload::default() }
 }
 
-/// 64 more photos than the one there is.
-fn many(count: usize) -> Upload {
-    let mut transforms = transforms();
-    let (frame, bytes) = (transforms["frames"][0].clone(), upload().photos[0].bytes.clone());
-    let mut frames = Vec::new();
-    let mut photos = Vec::new();
-    for i in 0..count {
-        let name = format!("images/{i:04}.png");
-        let mut frame = frame.clone();
-        frame["file_path"] = name.clone().into();
-        frame["transform_matrix"][0][3] = json!(i as f64 * 0.01);
-        frames.push(frame);
-        photos.push(UploadFile { name, bytes: bytes.clone() });
-    }
-    transforms["frames"] = frames.into();
-    Upload { photos, ..with(&transforms) }
-}
-
 /// Photos that see nothing in common: noise, another in each.
 fn strangers() -> Upload {
     let mut upload = upload();
@@ -183,7 +165,6 @@ pub(crate) fn uploads() -> Vec<(&'static str, Upload, &'static str, Vec<&'static
         ("nothing at all", Upload::default(), "invalid_request", vec!["upload"]),
         ("no cameras", photos_only, "invalid_request", vec!["no camera description"]),
         ("one photo", one(), "invalid_request", vec!["1 photo;", "2"]),
-        ("65 photos", many(65), "limit_exceeded", vec!["65", "64"]),
         ("text named .jpg", named_jpg(b"hello".repeat(9)), "photo_unreadable", vec!["0001.jpg"]),
         ("truncated JPEG", named_jpg(jpeg(900)), "photo_unreadable", vec!["cut short"]),
         ("empty photo", photo(Vec::new()), "photo_unreadable", vec!["0001.png", "empty"]),

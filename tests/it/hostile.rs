@@ -103,7 +103,7 @@ fn hostile() -> Vec<(String, Sent, &'static str)> {
         .collect();
     let unknown = format!("/v1/scenes/{}", "0".repeat(32));
     let small = |i: usize| part(&format!("name=\"photo\"; filename=\"{i}.png\""), b"x");
-    let many_files: Vec<_> = (0..2_000).map(|i| (format!("{i}.png"), vec![0; 9])).collect();
+    let many_files: Vec<_> = (0..20_000).map(|i| (format!("{i}.png"), vec![0; 9])).collect();
     let many_files = many_files.iter().map(|(name, bytes)| (&**name, bytes.clone())).collect();
     let deep = b"[".repeat(1 << 20);
     let frames = [b"{\"frames\":[".to_vec(), b"{},".repeat(2 << 20), b"{}]}".to_vec()].concat();
@@ -125,7 +125,7 @@ fn hostile() -> Vec<(String, Sent, &'static str)> {
     let (limit, bad, unread) = ("limit_exceeded", "invalid_request", "photo_unreadable");
     let more = vec![
         ("zip that lies of its size", archive(lying_zip()), unread),
-        ("zip of 2,000 files", Sent::Form(zipped(many_files)), limit),
+        ("zip of 20,000 files", Sent::Form(zipped(many_files)), limit),
         ("tar that claims 8 GiB", archive(tar_entry(tar::EntryType::Regular, 8 << 30)), limit),
         ("tar with a link", archive(tar_entry(tar::EntryType::Symlink, 0)), bad),
         ("gzip", archive([b"\x1f\x8b\x08".as_slice(), &[0; 1 << 16]].concat()), unread),
@@ -156,7 +156,7 @@ fn hostile() -> Vec<(String, Sent, &'static str)> {
         ),
         (
             "photos without end",
-            Sent::Post(SCENES, MULTIPART, (0..9_999).flat_map(small).collect()),
+            Sent::Post(SCENES, MULTIPART, (0..20_000).flat_map(small).collect()),
             limit,
         ),
         (

@@ -10,6 +10,7 @@
 mod access;
 mod asking;
 mod bad_input;
+mod captures;
 mod cli;
 mod colour_words;
 #[allow(unused_imports, reason = "the slow tests use the rest")]

@@ -19,7 +19,7 @@ fn file(name: &str, size: usize) -> Part {
 #[tokio::test]
 async fn limits_stop_an_upload_at_the_first_byte_over_and_name_the_bound() {
     let server = TestServer::with(|config, _| {
-        config.limits.photos_max = 3;
+        config.limits.archive_entries_max = 3;
         config.limits.json_bytes_max = 10;
         config.limits.upload_bytes_max = 100;
         config.limits.uploads_bytes_max = 150;
@@ -32,7 +32,7 @@ async fn limits_stop_an_upload_at_the_first_byte_over_and_name_the_bound() {
     for _ in 0..3 {
         for (form, words) in [
             (Form::new().part("transforms", file("t.json", 11)), ["11 bytes", "10 bytes"]),
-            (photos(4), ["\"3.png\" is number 4", "3 photos"]),
+            (photos(4), ["\"3.png\" is number 4", "3 files"]),
             (Form::new().part("photo", file("a.png", 101)), ["101 bytes", "100 bytes"]),
             (Form::new().part("photo", file(&"x".repeat(257), 1)), ["257 bytes", "256 bytes"]),
             (Form::new().part("splats", file(&"x".repeat(257), 1)), ["257 bytes", "256 bytes"]),

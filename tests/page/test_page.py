@@ -161,6 +161,24 @@ def test_a_file_of_gaussians_is_dropped_and_shown(page: Page, url: str) -> None:
     expect(page.locator("#says")).to_contain_text("(ply) without semantics")
 
 
+def test_the_server_recognises_a_capture_that_was_dropped(
+        page: Page, url: str, photos: Path) -> None:
+    page.goto(url)
+    files = sample(photos)
+    frames = json.loads(files.pop("transforms.json"))["frames"]
+    for i, frame in enumerate(frames):
+        rows = frame["transform_matrix"]
+        pose = {f"t_{r}{c}": rows[r][c] for r in range(3) for c in range(4)}
+        lens = {"fx": frame["fl_x"], "fy": frame["fl_y"], "cx": frame["cx"], "cy": frame["cy"]}
+        files[f"keyframes/cameras/{i:04}.json"] = json.dumps({**pose, **lens}).encode()
+    files = {f"keyframes/images/{name}" if name.endswith(".png") else name: data
+             for name, data in files.items()}
+    drop(page, files)
+    settled(page)
+    expect(page.locator("#photos li")).to_have_count(4)
+    assert pixels(page).std() > 20, "the canvas is flat"
+
+
 def test_the_canvas_is_the_servers_view(page: Page, url: str, scene: str) -> None:
     page.goto(f"{url}/#scene={scene}")
     settled(page)

@@ -34,6 +34,7 @@ use segsplat::{
         write_scene, write_semantics,
     },
 };
+use segsplat_testing::captures;
 use sha2::{Digest, Sha256};
 
 use crate::common::{
@@ -280,6 +281,24 @@ fn archives() {
     Cases::new("archive", seeds).run(400, |case| {
         read_upload(&Upload { archive: Some(case.to_vec()), ..Upload::default() })
     });
+}
+
+#[test]
+fn captures_of_every_layout() {
+    let upload = small();
+    let posed = photos::read(&upload, &Limits::default()).unwrap();
+    let lenses = [("colmap_bin", "sparse/0/cameras.bin"), ("colmap_txt", "sparse/0/cameras.txt")];
+    let described = captures::LAYOUTS.map(|(layout, _)| (layout, captures::described_by(layout)));
+    for (layout, file) in described.into_iter().chain(lenses) {
+        let files = captures::write(layout, &posed, &upload.photos);
+        let at = files.iter().position(|f| f.name == file).expect("the layout has its cameras");
+        let target = format!("{layout}-{}", file.rsplit('/').next().unwrap_or(file));
+        Cases::new(&target, vec![files[at].bytes.clone()]).run(100, |case| {
+            let mut photos = files.clone();
+            photos[at].bytes = case.to_vec();
+            read_upload(&Upload { photos, ..Upload::default() })
+        });
+    }
 }
 
 #[test]

@@ -82,8 +82,18 @@ def test_archives_and_folders(client: Client, scene: Scene, photos: Path, tmp_pa
     twin = client.scene(archive, semantics="off")
     assert np.array_equal(twin.view(width=64).image, scene.view(width=64).image)
     twin.delete()
-    with pytest.raises(FileNotFoundError, match="no folder with transforms.json"):
+    with pytest.raises(FileNotFoundError, match="no folder with files of cameras"):
         client.scene(tmp_path)
+    # A folder whose cameras lie deeper: the server finds them.
+    shutil.copytree(photos, tmp_path / "dslr")
+    (tmp_path / "dslr" / "nerfstudio").mkdir()
+    (tmp_path / "dslr" / "transforms.json").rename(
+        tmp_path / "dslr" / "nerfstudio" / "transforms.json"
+    )
+    (tmp_path / "photos.zip").unlink()
+    twin = client.scene(tmp_path, semantics="off")
+    assert np.array_equal(twin.view(width=64).image, scene.view(width=64).image)
+    twin.delete()
 
 
 def test_a_scene_that_fails_says_why(client: Client, photos: Path, tmp_path: Path) -> None:

@@ -27,8 +27,8 @@ pub const TAU_RANGE: [f64; 2] = [1e-3, 1e6];
 /// Vertical fields of view, degrees: a picture is flat, so it must stay under 180.
 pub const FOV_RANGE: [f64; 2] = [0.1, 170.0];
 
-/// Focal lengths, pixels; principal points lie within the largest of the origin. A view is at most
-/// some thousands wide.
+/// Focal lengths of views and photos, pixels; principal points of views lie within the largest of
+/// the origin. A picture is at most some thousands wide.
 pub const FOCAL_RANGE: [f64; 2] = [1.0, 1e6];
 
 /// Declares the limits: name, type and default; `restart` where a new number counts only after a
@@ -85,8 +85,12 @@ limits! {
     /// Pixels of all photos of one scene together after decoding, three bytes each: 16 photos keep
     /// a longer side of 2048, 64 keep 1,100. Photos are reduced alike until they fit.
     photos_pixels_kept_max: u64 = 50_000_000;
-    /// Files and folders in an archive.
-    archive_entries_max: usize = 1_024;
+    /// Files and folders in an archive, a form or a folder: captures of phones have six files a
+    /// photo.
+    archive_entries_max: usize = 16_384;
+    /// Bytes of one file of cameras that is no JSON: COLMAP's `images.bin` has 24 bytes for each
+    /// feature, 200 kB a photo.
+    camera_file_bytes_max: usize = 128 << 20;
     /// Bytes of one archive unpacked: what a zip bomb meets.
     archive_unpacked_bytes_max: u64 = 512 << 20;
     /// Length of a photo's file name in bytes.

@@ -10,12 +10,12 @@ use std::{
     collections::BTreeMap,
     io::Cursor,
     path::{Component, Path, PathBuf},
+    sync::atomic::AtomicBool,
 };
 
 use image::{DynamicImage, GrayImage, ImageFormat, RgbImage, imageops::FilterType};
 use serde_json::Value;
 
-use super::llff;
 use crate::{
     error::{Error, Result},
     limits::Limits,
@@ -74,19 +74,13 @@ pub fn is_labelled(dir: &Path) -> bool {
 /// # Errors
 /// `invalid_request` when a file is missing, lies outside the folder or cannot be read.
 pub fn read(dir: &Path, limits: &Limits) -> Result<LabelledScene> {
-    let upload = if dir.join("poses_bounds.npy").is_file()
-        && !photos::CAMERA_FILES.iter().any(|name| dir.join(name).is_file())
-    {
-        llff::upload(dir, limits)?
-    } else {
-        photos::upload_of_dir(dir, limits)?
-    };
+    let (read, upload) = photos::read_dir_until(dir, limits, &AtomicBool::new(false))?;
     let stored = if dir.join("masks/classes.json").is_file() {
         ours(dir, &upload)?
     } else {
         ovs(dir, &upload)?
     };
-    let photos = photos::read(&upload, limits)?;
+    let photos = read.photos;
     let frames = undo(&stored, &upload, &photos, limits)?;
     Ok(LabelledScene { photos, classes: stored.classes, frames })
 }
@@ -109,7 +103,7 @@ fn picture(dir: &Path, name: &str) -> Result<GrayImage> {
 }
 
 /// Width and height of a photo, from its header.
-pub(super) fn dimensions(file: &UploadFile) -> Result<(u32, u32)> {
+fn dimensions(file: &UploadFile) -> Result<(u32, u32)> {
     let wrong = || Error::photo(format!("{}: no photo", file.name));
     image::ImageReader::new(Cursor::new(&file.bytes))
         .with_guessed_format()
@@ -152,7 +146,7 @@ fn ours(dir: &Path, upload: &Upload) -> Result<Stored> {
             continue;
         };
         let photo = photo_called(upload, file)
-            .ok_or_else(|| wrong(&format!("{mask:?} belongs to no photo of the folder")))?;
+            .ok_or_else(|| wrong(&format!("{mask:?} is of {file:?}, no photo of the folder")))?;
         let mut map = picture(dir, mask)?;
         map.pixels_mut().for_each(|v| v.0[0] = class_of[usize::from(v.0[0])]);
         maps.push((photo, map));

@@ -6,7 +6,6 @@
 //! by the same text, and the masks are laid over the target as they are.
 
 pub mod labels;
-mod llff;
 pub mod tally;
 mod views;
 

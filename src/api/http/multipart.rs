@@ -1,4 +1,5 @@
-//! A multipart upload, read as it comes and refused at the first byte over a cap.
+//! An upload, a form or an archive alone, read as it comes and refused at the first byte over a
+//! cap.
 
 use std::{
     sync::{Arc, Mutex, MutexGuard, PoisonError},
@@ -45,7 +46,8 @@ pub(super) struct UploadForm {
     /// `{"cameras":[{"file","intrinsics","camera_to_world"}]}`.
     #[schema(content_media_type = "application/json")]
     cameras: Option<String>,
-    /// A zip or tar of a folder of photos and its camera JSON, instead of all other parts.
+    /// A zip or tar of a folder with a capture of any known layout (docs/captures.md), instead of
+    /// all other parts.
     #[schema(content_media_type = "application/octet-stream")]
     archive: Option<String>,
     /// A file of Gaussians (PLY, compressed PLY, SPZ, SOG, GLB with `KHR_gaussian_splatting`,
@@ -53,12 +55,34 @@ pub(super) struct UploadForm {
     /// alone.
     #[schema(content_media_type = "application/octet-stream")]
     splats: Option<String>,
-    /// Any other part is a photo, named by its part or file.
+    /// Any other part is a photo, or a camera file of a capture, named by its part or file. Without
+    /// `transforms` and `cameras` the files' paths tell the layout.
     #[schema(content_media_type = "image/*")]
     photo: Option<Vec<String>>,
 }
 
-/// Reads the parts of `request`; text parts that are options go to `fields`.
+/// Content types of an archive that is the whole body.
+const ARCHIVES: [&str; 4] = [
+    "application/zip",
+    "application/x-zip-compressed",
+    "application/x-tar",
+    "application/octet-stream",
+];
+
+/// What the body of a request is.
+enum Sent {
+    Form(Multipart),
+    Archive(Body),
+}
+
+/// A zip or tar of a folder with a capture, as the whole body: for `/openapi.json` alone.
+#[derive(ToSchema)]
+#[schema(content_media_type = "application/octet-stream")]
+#[expect(dead_code, reason = "read by the derive alone")]
+pub(super) struct ArchiveBody(String);
+
+/// Reads the parts of `request`, or the archive that its body is; text parts that are options go to
+/// `fields`.
 pub(super) async fn read_upload(
     api: &Api,
     request: Request,
@@ -68,21 +92,28 @@ pub(super) async fn read_upload(
     let length = text_of(request.headers(), "content-length");
     let length = length.and_then(|value| value.parse::<usize>().ok());
     let has_room = api.service.has_room(request.headers().contains_key("idempotency-key"));
+    let kind = text_of(request.headers(), "content-type").unwrap_or_default();
+    let kind = kind.split(';').next().unwrap_or_default().trim().to_ascii_lowercase();
     let (body, request) = WatchedBody::of(request);
-    let form = Multipart::from_request(request, api).await;
+    let sent = match ARCHIVES.contains(&kind.as_str()) {
+        true => Ok(Sent::Archive(request.into_body())),
+        false => Multipart::from_request(request, api).await.map(Sent::Form),
+    };
     // Parts' headers come on top of their bytes.
     let max = limits.upload_bytes_max + (1 << 20);
-    let read = match (length, has_room, form) {
+    let read = match (length, has_room, sent) {
         (Some(length), ..) if length > max => Err(Error::limit(
             "upload",
             format!("{length} bytes"),
             format!("{} bytes", limits.upload_bytes_max),
         )),
         (_, _, Err(_)) => Err(Error::invalid(
-            "body: not multipart/form-data with a boundary; send photos as parts",
+            "body: not multipart/form-data with a boundary; send photos as parts, or a zip or tar \
+             as application/zip or application/x-tar",
         )),
         (_, Err(full), _) => Err(full),
-        (_, Ok(()), Ok(mut form)) => parts(api, &mut form, fields, &body).await,
+        (_, Ok(()), Ok(Sent::Form(mut form))) => parts(api, &mut form, fields, &body).await,
+        (_, Ok(()), Ok(Sent::Archive(whole))) => archive(api, whole, &body).await,
     };
     let read = read.map_err(|error| body.too_long().unwrap_or(error));
     if read.is_err() {
@@ -106,6 +137,19 @@ pub(super) fn read_on(
         }
     };
     tokio::spawn(tokio::time::timeout(DRAIN_TIME_MAX, dropped));
+}
+
+async fn archive(api: &Api, whole: Body, body: &WatchedBody) -> Result<(Upload, UploadGuard)> {
+    let limits = api.service.limits();
+    let mut upload = UploadBuilder::new(&limits, &api.uploads);
+    upload.begin_archive();
+    let mut pieces = whole.into_data_stream();
+    while let Some(piece) = pieces.next().await {
+        let piece = piece.map_err(|e| Error::invalid("upload: the body broke off").caused_by(e))?;
+        body.progressed();
+        upload.extend(&piece)?;
+    }
+    upload.finish()
 }
 
 async fn parts(
@@ -194,11 +238,11 @@ impl WatchedBody {
     }
 }
 
-/// The name of a photo is that of its part where it has an extension, else that of its file. A part
-/// with neither is no photo.
+/// The name of a file is that of its part where it has an extension or a folder, else that of its
+/// file. A part with neither is no photo.
 fn photo_name(part: &str, file: Option<&str>) -> Result<String> {
     match file.filter(|file| !file.is_empty()) {
-        _ if part.contains('.') => Ok(part.to_owned()),
+        _ if part.contains(['.', '/']) => Ok(part.to_owned()),
         Some(file) => Ok(file.to_owned()),
         None if part.is_empty() => {
             Err(Error::invalid("upload: a part has no name; name each photo by its file"))

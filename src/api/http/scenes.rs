@@ -19,7 +19,7 @@ use super::{
     error::ApiError,
     extract::{CallerApi, Id},
     fields::Fields,
-    multipart::{UploadForm, read_upload},
+    multipart::{ArchiveBody, UploadForm, read_upload},
 };
 use crate::{
     api::{Api, request_id, server_timing, upload::check_bundle},
@@ -43,7 +43,11 @@ pub(super) struct CreateParams {
 #[utoipa::path(
     post, path = "/v1/scenes", operation_id = "create_scene", tag = "scenes",
     params(SceneOptions, CreateParams, ("Idempotency-Key" = Option<String>, Header)),
-    request_body(content = UploadForm, content_type = "multipart/form-data"),
+    request_body(content(
+        (UploadForm = "multipart/form-data"),
+        (ArchiveBody = "application/zip"),
+        (ArchiveBody = "application/x-tar"),
+    )),
     responses(
         (status = 201, description = "Made", body = SceneStatus),
         (status = 202, description = "Taken; see Location", body = SceneStatus),

@@ -43,7 +43,7 @@ impl SceneNetworks for PlaneNetworks {
         if let Some(code) = self.fails {
             return Err(Error::new(code, format!("made to fail with {}", code.name())));
         }
-        let photos = &photos.photos;
+        let PhotoSet { photos, warnings, .. } = photos;
         (watch.progress)(Stage::Capture, 0.5);
         let capture = capture::analyse(photos, watch.cancel)?;
         (watch.progress)(Stage::Lift, 0.5);
@@ -54,7 +54,7 @@ impl SceneNetworks for PlaneNetworks {
             views_used: u32::try_from(photos.len()).expect("few photos"),
             gaussians: gaussians.len() as u64,
             median_depth: capture.median_depth,
-            warnings: capture.warnings,
+            warnings: [&warnings[..], &capture.warnings].concat(),
             ..HealthReport::default()
         };
         let camera = |posed: &PosedPhoto| SceneCamera {

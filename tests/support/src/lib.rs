@@ -8,6 +8,7 @@
     reason = "helpers of tests are tests too"
 )]
 
+pub mod captures;
 pub mod compare;
 pub mod frames;
 pub mod labels;

@@ -48,7 +48,14 @@ SPLATS = (".ply", ".spz", ".sog", ".glb", ".splat")
 #: Cameras of one call; more go as more calls.
 CAMERAS_MAX = 64
 
-#: A folder with photos and `transforms.json` or `cameras.json`; an archive of one; a file of
+#: Endings of photos and of files of cameras; files of COLMAP and folders of phones that are not
+#: read.
+PHOTOS = frozenset({".png", ".jpg", ".jpeg", ".webp"})
+CAMERAS = frozenset({".json", ".txt", ".bin", ".npy", ".traj", ".pincam"})
+NOT_READ = frozenset({"points3D", "rigs", "frames", "project"})
+DEPTHS = frozenset({"depth", "confidence", "lowres_depth", "highres_depth"})
+
+#: A folder with a capture of any layout that the server knows; an archive of one; a file of
 #: Gaussians (PLY, SPZ, SOG, GLB, .splat); or photos and their cameras.
 Source: TypeAlias = str | Path | Mapping[str | Path, Camera]
 #: A scene as the server shows it.
@@ -114,9 +121,19 @@ def parts_of(source: Source) -> list[Part]:
         if described.is_file():
             photos = [_photo(path, name) for name in _files_of(described)]
             return [Part(field, described.name, described), *photos]
-    raise FileNotFoundError(
-        f"{path}: no archive, no file of Gaussians and no folder with transforms.json or cameras.json"
-    )
+    files = sorted(file for file in path.rglob("*") if _belongs(file.relative_to(path)))
+    if not any(file.suffix.lower() not in PHOTOS for file in files):
+        raise FileNotFoundError(
+            f"{path}: no archive, no file of Gaussians and no folder with files of cameras"
+        )
+    return [Part("photo", file.relative_to(path).as_posix(), file) for file in files]
+
+
+def _belongs(file: Path) -> bool:
+    """Whether the server could read a file of a capture: it says itself which it takes."""
+    hidden = any(part.startswith(".") or part in DEPTHS for part in file.parts)
+    known = file.suffix.lower() in PHOTOS | CAMERAS or file.name == "metadata"
+    return known and not hidden and file.stem not in NOT_READ
 
 
 def _photo(folder: Path, name: str) -> Part:

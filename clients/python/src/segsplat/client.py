@@ -194,9 +194,9 @@ class Client(_Connection):
     ) -> Scene:
         """Makes a scene of photos with known cameras, and waits until it is made.
 
-        source: a folder with photos and a `transforms.json` (OpenGL) or `cameras.json` (OpenCV); a
-            zip or tar of one; `{"photo.jpg": Camera(...)}`; or a file of Gaussians (PLY, SPZ, SOG,
-            GLB, .splat), which needs no photos.
+        source: a folder with a capture: `transforms.json`, COLMAP, Polycam and others, which the
+            server recognises; a zip or tar of one; `{"photo.jpg": Camera(...)}`; or a file of
+            Gaussians (PLY, SPZ, SOG, GLB, .splat), which needs no photos.
         wait: False gives the scene at once; `scene.wait()` waits for it.
         progress: True shows a bar; a function is told of each event; by default a bar on terminals.
         idempotency_key: calls with one key make one scene; by default a new key for each call.

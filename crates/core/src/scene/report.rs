@@ -26,8 +26,11 @@ pub enum WarningCode {
     DepthRangeHit,
     /// The photos do not agree under the given poses, and no known mistake explains it.
     PoorPoseAgreement,
-    /// Photos of the upload that were not used.
+    /// Photos of the upload that were not used: without a camera, kept for tests, more than a scene
+    /// takes, or with nothing in common with the others.
     PhotosUnused,
+    /// Photos that the cameras name and that were not sent.
+    PhotosMissing,
     /// Several photos are one picture, under different poses.
     SamePicture,
 }

@@ -1,8 +1,9 @@
-//! An upload as bytes: camera JSON and photos, one archive, or a file of Gaussians.
+//! An upload as bytes: camera JSON and photos, the files of a capture, one archive, or a file of
+//! Gaussians.
 
 use std::fmt;
 
-/// One file as sent.
+/// One file as sent: a photo, a camera file of a capture, or a file of Gaussians.
 #[derive(Clone, PartialEq, Eq)]
 pub struct UploadFile {
     /// File name as sent; never joined to a path.
@@ -26,15 +27,15 @@ pub enum UploadCameras {
     Cameras(Vec<u8>),
 }
 
-/// Everything sent for one scene: cameras and photos, an archive that holds both, or a file of
-/// Gaussians.
+/// Everything sent for one scene: cameras and photos, the files of a capture that has its own
+/// camera files, an archive of one, or a file of Gaussians.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Upload {
-    /// Camera description; `None` when it is in the archive.
+    /// Camera description; `None` when it is among the files or in the archive.
     pub cameras: Option<UploadCameras>,
-    /// Photos in the order sent.
+    /// Photos in the order sent, and the camera files of a capture.
     pub photos: Vec<UploadFile>,
-    /// A zip or tar of a folder of photos and its camera description.
+    /// A zip or tar of a folder with a capture.
     pub archive: Option<Vec<u8>>,
     /// A file of Gaussians, which is a whole scene.
     pub splats: Option<UploadFile>,

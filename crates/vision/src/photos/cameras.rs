@@ -1,13 +1,21 @@
-//! Camera JSON: nerfstudio / instant-ngp `transforms.json` and our own `cameras`.
+//! Cameras as every reader gives them, and the two camera JSONs: nerfstudio / instant-ngp
+//! `transforms.json` and our own `cameras`.
+//!
+//! What `transforms.json` says beside its frames: `applied_transform` and `applied_scale` tell how
+//! the file's world was made of another one. The poses have them already, and the scene keeps the
+//! world of the poses, as nerfstudio's own reader does. Frames that are kept for tests make no part
+//! of a scene: `test_frames`, those of `test_filenames` and `val_filenames` that are not in
+//! `train_filenames`, and those of `ScanNet++` with `is_bad`.
+
+use std::collections::HashSet;
 
 use serde_json::{Map, Value};
 
 use super::lens::Lens;
 use crate::{
     error::{Error, Result},
-    limits::Limits,
     photo_label as label,
-    scene::UploadCameras,
+    scene::CameraToWorld,
 };
 
 /// Axes of the camera in an uploaded pose.
@@ -19,33 +27,84 @@ pub(super) enum PoseAxes {
     OpenCv,
 }
 
-/// One camera of the JSON; its numbers are checked only when its photo is there.
+/// One camera as written; its numbers are checked only when its photo is there.
 #[derive(Clone, Debug)]
 pub(super) struct CameraEntry {
     /// Path of its photo as written.
     pub(super) file: String,
     /// Lens as written.
     pub(super) lens: Lens,
-    /// Axes of `pose`.
-    pub(super) axes: PoseAxes,
+    axes: PoseAxes,
+    /// Camera-to-world, row-major, as written.
     pose: std::result::Result<[f64; 16], String>,
 }
 
 impl CameraEntry {
-    /// Camera-to-world, row-major, as written.
-    pub(super) fn pose(&self) -> Result<[f64; 16]> {
-        self.pose.clone().map_err(Error::invalid)
+    /// A camera of a photo; `pose` is camera-to-world, row-major.
+    pub(super) fn new(file: String, lens: Lens, axes: PoseAxes, pose: [f64; 16]) -> Self {
+        Self { file, lens, axes, pose: Ok(pose) }
+    }
+
+    /// The pose, checked.
+    pub(super) fn pose(&self, what: &str) -> Result<CameraToWorld> {
+        let pose = self.pose.clone().map_err(Error::invalid)?;
+        match self.axes {
+            PoseAxes::OpenGl => CameraToWorld::from_opengl_row_major(&pose, what),
+            PoseAxes::OpenCv => CameraToWorld::from_row_major(&pose, what),
+        }
     }
 }
 
-/// All cameras of the JSON, in its order.
-pub(super) fn parse(cameras: &UploadCameras, limits: &Limits) -> Result<Vec<CameraEntry>> {
-    let (part, bytes, list_key) = match cameras {
-        UploadCameras::Transforms(bytes) => ("transforms", bytes, "frames"),
-        UploadCameras::Cameras(bytes) => ("cameras", bytes, "cameras"),
+/// What a camera file says.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Cameras {
+    /// All cameras, in its order.
+    pub(super) entries: Vec<CameraEntry>,
+    /// Photos that it keeps for tests.
+    pub(super) held_out: Vec<String>,
+}
+
+/// A `transforms.json`, whose size was checked.
+pub(super) fn transforms(bytes: &[u8]) -> Result<Cameras> {
+    let top = object(bytes, "transforms")?;
+    let mut cameras = list(&top, "transforms", "frames", transforms_frame)?;
+    let files = |key: &str| -> HashSet<String> {
+        let names = top.get(key).and_then(Value::as_array).into_iter().flatten();
+        names.filter_map(Value::as_str).map(str::to_owned).collect()
     };
-    limits.check_json(part, bytes)?;
-    let top = object(bytes, part)?;
+    let [train, test, val] = ["train_filenames", "test_filenames", "val_filenames"].map(files);
+    let bad = |i: usize| top["frames"][i].get("is_bad").and_then(Value::as_bool) == Some(true);
+    let mut i = 0;
+    cameras.entries.retain(|entry| {
+        let for_tests = (test.contains(&entry.file) || val.contains(&entry.file))
+            && !train.contains(&entry.file);
+        let kept = !for_tests && !bad(i);
+        if !kept {
+            cameras.held_out.push(entry.file.clone());
+        }
+        i += 1;
+        kept
+    });
+    let tests = top.get("test_frames").and_then(Value::as_array).into_iter().flatten();
+    let tests = tests.filter_map(|frame| frame.get("file_path").and_then(Value::as_str));
+    cameras.held_out.extend(tests.map(str::to_owned));
+    Ok(cameras)
+}
+
+/// Our own JSON, whose size was checked.
+pub(super) fn cameras(bytes: &[u8]) -> Result<Cameras> {
+    list(&object(bytes, "cameras")?, "cameras", "cameras", cameras_entry)
+}
+
+/// A JSON object.
+pub(super) type Fields = Map<String, Value>;
+
+fn list(
+    top: &Fields,
+    part: &str,
+    list_key: &str,
+    read: fn(usize, &Fields, &Fields) -> Result<CameraEntry>,
+) -> Result<Cameras> {
     let list = match top.get(list_key) {
         Some(Value::Array(list)) => list,
         Some(other) => {
@@ -54,19 +113,19 @@ pub(super) fn parse(cameras: &UploadCameras, limits: &Limits) -> Result<Vec<Came
         }
         None => return Err(Error::invalid(format!("{part}: the list `{list_key}` is missing"))),
     };
-    let transforms = matches!(cameras, UploadCameras::Transforms(_));
-    let read = if transforms { transforms_frame } else { cameras_entry };
     let entry = |(i, value): (usize, &Value)| match value {
-        Value::Object(fields) => read(i, fields, &top),
+        Value::Object(fields) => read(i, fields, top),
         other => {
             let kind = kind(other);
             Err(Error::invalid(format!("{part}: {list_key}[{i}] is {kind}, not an object")))
         }
     };
-    list.iter().enumerate().map(entry).collect()
+    let entries = list.iter().enumerate().map(entry).collect::<Result<_>>()?;
+    Ok(Cameras { entries, held_out: Vec::new() })
 }
 
-fn object(bytes: &[u8], part: &str) -> Result<Map<String, Value>> {
+/// The object of a JSON text; `part` names it in messages.
+pub(super) fn object(bytes: &[u8], part: &str) -> Result<Fields> {
     let text = std::str::from_utf8(bytes)
         .map_err(|e| Error::invalid(format!("{part}: not UTF-8 text")).caused_by(e))?;
     let text = text.strip_prefix('\u{feff}').unwrap_or(text);
@@ -121,7 +180,7 @@ fn kind(value: &Value) -> &'static str {
     }
 }
 
-fn text(fields: &Map<String, Value>, key: &str, what: &str) -> Result<Option<String>> {
+fn text(fields: &Fields, key: &str, what: &str) -> Result<Option<String>> {
     match fields.get(key) {
         None | Some(Value::Null) => Ok(None),
         Some(Value::String(text)) => Ok(Some(text.clone())),
@@ -130,7 +189,7 @@ fn text(fields: &Map<String, Value>, key: &str, what: &str) -> Result<Option<Str
 }
 
 /// A number, NaN where it is written as such or as null; `None` where the key is absent.
-fn number(fields: &Map<String, Value>, key: &str, what: &str) -> Result<Option<f64>> {
+pub(super) fn number(fields: &Fields, key: &str, what: &str) -> Result<Option<f64>> {
     match fields.get(key) {
         None => Ok(None),
         Some(Value::Null) => Ok(Some(f64::NAN)),
@@ -174,11 +233,7 @@ fn matrix(value: Option<&Value>, key: &str, what: &str) -> std::result::Result<[
 }
 
 /// One frame of `transforms.json`; what the frame lacks is taken from the top level.
-fn transforms_frame(
-    i: usize,
-    frame: &Map<String, Value>,
-    top: &Map<String, Value>,
-) -> Result<CameraEntry> {
+fn transforms_frame(i: usize, frame: &Fields, top: &Fields) -> Result<CameraEntry> {
     let unnamed = format!("transforms: frames[{i}]");
     let file = text(frame, "file_path", &unnamed)?
         .ok_or_else(|| Error::invalid(format!("{unnamed}: file_path is missing")))?;
@@ -214,11 +269,7 @@ fn transforms_frame(
 }
 
 /// One entry of our own JSON.
-fn cameras_entry(
-    i: usize,
-    entry: &Map<String, Value>,
-    _top: &Map<String, Value>,
-) -> Result<CameraEntry> {
+fn cameras_entry(i: usize, entry: &Fields, _top: &Fields) -> Result<CameraEntry> {
     let unnamed = format!("cameras: cameras[{i}]");
     let file = text(entry, "file", &unnamed)?
         .ok_or_else(|| Error::invalid(format!("{unnamed}: file is missing")))?;
@@ -245,7 +296,7 @@ fn cameras_entry(
     Ok(CameraEntry { file, lens, axes: PoseAxes::OpenCv, pose })
 }
 
-fn read_distortion(lens: &mut Lens, scope: &Map<String, Value>, what: &str) -> Result<()> {
+fn read_distortion(lens: &mut Lens, scope: &Fields, what: &str) -> Result<()> {
     let terms = lens.k.iter_mut().chain(&mut lens.p);
     for (slot, key) in terms.zip(["k1", "k2", "k3", "k4", "p1", "p2"]) {
         *slot = slot.or(number(scope, key, what)?);

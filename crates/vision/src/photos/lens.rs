@@ -3,12 +3,14 @@
 //! Perspective models are Brown-Conrady as in OpenCV and nerfstudio: with r² = x² + y²,
 //! x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + 2 p1 x y + p2 (r² + 2 x²), and y' likewise with
 //! p1 and p2 changing places. Fisheye models are OpenCV's equidistant one:
-//! θ' = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸). Undoing keeps the size and K.
+//! θ' = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸). [`Terms`] has the form that holds these and all
+//! other models of COLMAP. Undoing keeps the size and K.
 
 use rayon::prelude::*;
 
 use crate::{
     error::{Error, Result},
+    limits::FOCAL_RANGE,
     scene::{Intrinsics, Photo},
     vectorised,
 };
@@ -38,6 +40,113 @@ pub(super) struct Lens {
     pub(super) height: Option<f64>,
     pub(super) k: [Option<f64>; 4],
     pub(super) p: [Option<f64>; 2],
+    /// Whether focal lengths and principal point are shares of the photo's width and height.
+    pub(super) of_size: bool,
+    /// The distortion, where a reader knows it whole: `model`, `is_fisheye`, `k` and `p` are not
+    /// looked at then.
+    pub(super) terms: Option<Terms>,
+}
+
+/// How a lens bends rays: the point (x, y) of the plane z = 1 goes through `base`, then
+///
+/// `x' = x N(r²)/D(r²) + 2 p1 x y + p2 (r² + 2 x²) + s1 r² + s2 r⁴`, and y' with p1 and p2 changing
+/// places and s3, s4. `N = 1 + Σ k_i r^2i`, `D = 1 + Σ d_i r^2i`. Formulas and order of numbers are
+/// those of COLMAP's `src/colmap/sensor/models.h`.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Terms {
+    pub(super) base: Base,
+    pub(super) k: [f64; 6],
+    pub(super) d: [f64; 3],
+    pub(super) p: [f64; 2],
+    pub(super) s: [f64; 4],
+    /// Whether the terms of p and s are of the point that N/D has moved already
+    /// (`RAD_TAN_THIN_PRISM_FISHEYE`).
+    pub(super) after_radial: bool,
+}
+
+/// What is done to the radius before the polynomial.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) enum Base {
+    /// Nothing: the tangent of the angle to the axis.
+    #[default]
+    Tangent,
+    /// The angle itself, as fisheye models have it.
+    Angle,
+    /// `atan(2 r tan(ω/2)) / ω` (Devernay and Faugeras); ω is over 0.
+    Field(f64),
+    /// The root of `r = r' / (1 + k r'²)`, the division model.
+    Division(f64),
+    /// `r / (α √(β r² + 1) + 1 - α)`, the extended unified model.
+    Unified(f64, f64),
+}
+
+impl Base {
+    /// New over old radius at radius² `r2`; not a number where the model has none.
+    #[inline(always)]
+    fn factor(self, r2: f64) -> f64 {
+        let r = r2.sqrt();
+        match self {
+            Self::Tangent => 1.0,
+            _ if r < 1e-9 => match self {
+                Self::Field(omega) => 2.0 * (0.5 * omega).tan() / omega,
+                _ => 1.0,
+            },
+            Self::Angle => r.atan() / r,
+            Self::Field(omega) => (2.0 * r * (0.5 * omega).tan()).atan() / (r * omega),
+            Self::Division(k) => 2.0 / (1.0 + (1.0 - 4.0 * k * r2).sqrt()),
+            Self::Unified(alpha, beta) => 1.0 / (alpha * (beta * r2 + 1.0).sqrt() + (1.0 - alpha)),
+        }
+    }
+}
+
+impl Terms {
+    /// Whether it leaves every ray where it is.
+    fn is_none(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// The numbers, for a look at whether all are finite.
+    fn numbers(&self) -> impl Iterator<Item = f64> {
+        let base = match self.base {
+            Base::Tangent | Base::Angle => [0.0; 2],
+            Base::Field(a) | Base::Division(a) => [a, 0.0],
+            Base::Unified(a, b) => [a, b],
+        };
+        let Self { k, d, p, s, .. } = *self;
+        base.into_iter().chain(k).chain(d).chain(p).chain(s)
+    }
+
+    /// Distorted over undistorted radius at undistorted radius² `r2`, by the radial terms alone.
+    #[inline(always)]
+    fn radial(&self, r2: f64) -> f64 {
+        let base = self.base.factor(r2);
+        base * self.polynomial(r2 * base * base)
+    }
+
+    /// N/D at radius² `r2`.
+    #[inline(always)]
+    fn polynomial(&self, r2: f64) -> f64 {
+        let [k1, k2, k3, k4, k5, k6] = self.k;
+        let above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * (k4 + r2 * (k5 + r2 * k6)))));
+        let [d1, d2, d3] = self.d;
+        if self.d == [0.0; 3] { above } else { above / (1.0 + r2 * (d1 + r2 * (d2 + r2 * d3))) }
+    }
+
+    /// Where the ray (x, y, 1) falls on the image plane.
+    #[inline(always)]
+    pub(super) fn apply(&self, x: f64, y: f64) -> (f64, f64) {
+        let base = self.base.factor(x * x + y * y);
+        let (x, y) = (x * base, y * base);
+        let radial = self.polynomial(x * x + y * y);
+        let (to_x, to_y) = (x * radial, y * radial);
+        let (x, y) = if self.after_radial { (to_x, to_y) } else { (x, y) };
+        let r2 = x * x + y * y;
+        let ([p1, p2], [s1, s2, s3, s4]) = (self.p, self.s);
+        (
+            to_x + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) + r2 * (s1 + r2 * s2),
+            to_y + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y) + r2 * (s3 + r2 * s4),
+        )
+    }
 }
 
 /// A checked lens for one photo.
@@ -50,12 +159,10 @@ pub(super) struct LensAtSize {
     distortion: Option<Distortion>,
 }
 
-/// Distortion terms, at least one of them not zero.
+/// Terms that bend rays.
 #[derive(Clone, Copy, Debug)]
 struct Distortion {
-    fisheye: bool,
-    k: [f64; 4],
-    p: [f64; 2],
+    terms: Terms,
     /// Largest undistorted radius (tangent of the angle) up to which the model is one to one.
     radius_max: f64,
 }
@@ -73,15 +180,8 @@ impl Lens {
     /// Intrinsics written for another size of the same aspect are scaled to the photo; another
     /// aspect is refused: it is unknown what was cropped.
     pub(super) fn at_size(&self, width: u32, height: u32, what: &str) -> Result<LensAtSize> {
-        let fisheye = self.is_fisheye_model(what)?;
         let stated = self.stated_size(what)?;
         let [w, h] = stated.unwrap_or([width, height]);
-        let finite = |name: &str, value: Option<f64>| match value {
-            Some(v) if !v.is_finite() => {
-                Err(Error::invalid(format!("{what}: {name} is {v}, not a finite number")))
-            }
-            value => Ok(value),
-        };
         let focal = |name: &str, focal: Option<f64>, angle: Option<f64>, side: u32| {
             if let Some(focal) = focal {
                 return Ok(Some(focal));
@@ -95,6 +195,7 @@ impl Lens {
             }
             Ok(Some(0.5 * f64::from(side) / (0.5 * angle).tan()))
         };
+        let shares = if self.of_size { [w, h].map(f64::from) } else { [1.0; 2] };
         let fx = focal("x", self.fx, self.angle_x, w)?;
         let fy = focal("y", self.fy, self.angle_y, h)?;
         let (Some(fx), Some(fy)) = (fx.or(fy), fy.or(fx)) else {
@@ -102,15 +203,24 @@ impl Lens {
                 "{what}: no focal length; give fl_x and fl_y, or camera_angle_x"
             )));
         };
+        let [cx, cy] = [finite(what, "cx", self.cx)?, finite(what, "cy", self.cy)?];
         let written = Intrinsics {
-            fx,
-            fy,
-            cx: finite("cx", self.cx)?.unwrap_or(0.5 * f64::from(w)),
-            cy: finite("cy", self.cy)?.unwrap_or(0.5 * f64::from(h)),
+            fx: fx * shares[0],
+            fy: fy * shares[1],
+            cx: cx.map_or(0.5 * f64::from(w), |cx| cx * shares[0]),
+            cy: cy.map_or(0.5 * f64::from(h), |cy| cy * shares[1]),
             width: w,
             height: h,
         }
         .validated(what)?;
+        let [least, most] = FOCAL_RANGE;
+        for (name, focal) in [("fx", written.fx), ("fy", written.fy)] {
+            if !(least..=most).contains(&focal) {
+                return Err(Error::invalid(format!(
+                    "{what}: {name} is {focal:e} px; it must be {least} to {most}"
+                )));
+            }
+        }
         let made_for = ([w, h] != [width, height]).then_some([w, h]);
         if made_for.is_some() && !same_aspect([w, h], [width, height]) {
             return Err(Error::invalid(format!(
@@ -119,15 +229,33 @@ impl Lens {
             )));
         }
         let intrinsics = written.resized(width, height);
-        let mut k = [0.0; 4];
-        let mut p = [0.0; 2];
-        let terms = k.iter_mut().chain(&mut p).zip(self.k.iter().chain(&self.p));
-        for ((slot, &value), name) in terms.zip(["k1", "k2", "k3", "k4", "p1", "p2"]) {
-            *slot = finite(name, value)?.unwrap_or(0.0);
-        }
-        let distorted = fisheye || k.iter().chain(&p).any(|&v| v != 0.0);
-        let distortion = distorted.then(|| Distortion::new(fisheye, k, p, &intrinsics));
+        let terms = self.bending(what)?;
+        let distortion = (!terms.is_none()).then(|| Distortion::new(terms, &intrinsics));
         Ok(LensAtSize { intrinsics, made_for, distortion })
+    }
+
+    /// The distortion, all numbers finite.
+    fn bending(&self, what: &str) -> Result<Terms> {
+        if let Some(terms) = self.terms {
+            if let Some(wrong) = terms.numbers().find(|v| !v.is_finite()) {
+                let why = format!("{what}: a term of the lens is {wrong}, not a finite number");
+                return Err(Error::invalid(why));
+            }
+            return Ok(terms);
+        }
+        let mut terms = Terms::default();
+        if self.is_fisheye_model(what)? {
+            terms.base = Base::Angle;
+        }
+        let slots = terms.k[..4].iter_mut().chain(&mut terms.p);
+        let written = slots.zip(self.k.iter().chain(&self.p));
+        for ((slot, &value), name) in written.zip(["k1", "k2", "k3", "k4", "p1", "p2"]) {
+            *slot = finite(what, name, value)?.unwrap_or(0.0);
+        }
+        if terms.base == Base::Angle {
+            terms.p = [0.0; 2];
+        }
+        Ok(terms)
     }
 
     fn is_fisheye_model(&self, what: &str) -> Result<bool> {
@@ -169,6 +297,15 @@ impl Lens {
     }
 }
 
+fn finite(what: &str, name: &str, value: Option<f64>) -> Result<Option<f64>> {
+    match value {
+        Some(v) if !v.is_finite() => {
+            Err(Error::invalid(format!("{what}: {name} is {v}, not a finite number")))
+        }
+        value => Ok(value),
+    }
+}
+
 /// Whether one size is the other scaled, up to one pixel of rounding in the smaller.
 fn same_aspect(a: [u32; 2], b: [u32; 2]) -> bool {
     let [aw, ah] = a.map(f64::from);
@@ -180,21 +317,22 @@ fn same_aspect(a: [u32; 2], b: [u32; 2]) -> bool {
 }
 
 impl Distortion {
-    fn new(fisheye: bool, k: [f64; 4], p: [f64; 2], intrinsics: &Intrinsics) -> Self {
+    fn new(terms: Terms, intrinsics: &Intrinsics) -> Self {
         let reach = |c: f64, side: u32, f: f64| (c.abs().max((f64::from(side) - c).abs())) / f;
         let corner = reach(intrinsics.cx, intrinsics.width, intrinsics.fx).hypot(reach(
             intrinsics.cy,
             intrinsics.height,
             intrinsics.fy,
         ));
-        let mut this = Self { fisheye, k, p, radius_max: f64::INFINITY };
+        let mut this = Self { terms, radius_max: f64::INFINITY };
         // Past the first turn of the radial curve the model folds the picture over itself.
         const STEPS: u32 = 1024;
         let mut last = 0.0;
         for step in 1..=STEPS {
             let r = corner * f64::from(step) / f64::from(STEPS);
-            let distorted = r * this.radial(r * r);
-            if distorted <= last {
+            let distorted = r * terms.radial(r * r);
+            // Not a number where the model has no answer.
+            if distorted <= last || distorted.is_nan() {
                 this.radius_max = corner * f64::from(step - 1) / f64::from(STEPS);
                 break;
             }
@@ -203,39 +341,11 @@ impl Distortion {
         this
     }
 
-    /// Distorted over undistorted radius at undistorted radius² `r2`.
-    #[inline(always)]
-    fn radial(&self, r2: f64) -> f64 {
-        let [k1, k2, k3, k4] = self.k;
-        if self.fisheye {
-            let r = r2.sqrt();
-            if r < 1e-9 {
-                return 1.0;
-            }
-            let theta = r.atan();
-            let t2 = theta * theta;
-            theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r
-        } else {
-            1.0 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
-        }
-    }
-
     /// Where the ray (x, y, 1) fell on the image plane; `None` past the fold.
     #[inline(always)]
     fn apply(&self, x: f64, y: f64) -> Option<(f64, f64)> {
-        let r2 = x * x + y * y;
-        if r2.sqrt() > self.radius_max {
-            return None;
-        }
-        let d = self.radial(r2);
-        if self.fisheye {
-            return Some((x * d, y * d));
-        }
-        let [p1, p2] = self.p;
-        Some((
-            x * d + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
-            y * d + 2.0 * p2 * x * y + p1 * (r2 + 2.0 * y * y),
-        ))
+        let inside = (x * x + y * y).sqrt() <= self.radius_max;
+        inside.then(|| self.terms.apply(x, y))
     }
 }
 

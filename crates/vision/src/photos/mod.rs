@@ -1,21 +1,32 @@
-//! Photos in: camera JSON, photo files or an archive become [`PosedPhoto`]s.
+//! Photos in: camera JSON and photo files, or a capture of any known layout, become
+//! [`PosedPhoto`]s.
 //!
-//! Only this module converts conventions: OpenGL poses to OpenCV, photos of a lens to photos of a
-//! pinhole camera, intrinsics to the size of the photo. Faults in names, numbers and headers are
-//! refused before a pixel is decoded. Pixels are taken as stored: EXIF orientation is ignored, as
-//! COLMAP ignores it.
+//! Only this module converts conventions: the axes and units of each layout to OpenCV cameras in
+//! the world of the upload, photos of a lens to photos of a pinhole camera, intrinsics to the size
+//! of the photo. Faults in names, numbers and headers are refused before a pixel is decoded. Pixels
+//! are taken as stored: EXIF orientation is ignored, as COLMAP ignores it.
 //!
-//! Photos sent one by one each need a camera, but the JSON may describe more cameras than photos
-//! were sent. In a folder or an archive every camera needs its photo, and files that no camera
-//! names (masks, depth maps) are left alone.
+//! Photos sent beside a camera JSON each need a camera, but the JSON may describe more cameras than
+//! photos were sent. A capture (a folder, an archive, or files of a form that describe their
+//! cameras themselves) is recognised by its files; cameras without photo and photos without camera
+//! are warned of by name. Of more photos than a scene takes, the best are chosen.
 
-mod archive;
 mod cameras;
+mod choose;
 mod decode;
+mod folder;
+mod layouts;
 mod lens;
 mod names;
+pub mod npy;
 
-use std::{collections::HashSet, ops::Range, path::Path, sync::atomic::AtomicBool};
+use std::{
+    borrow::Cow,
+    collections::{HashMap, HashSet},
+    ops::Range,
+    path::Path,
+    sync::atomic::AtomicBool,
+};
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -25,15 +36,31 @@ use crate::{
     error::{Error, Result},
     limits::Limits,
     photo_label as label,
-    scene::{Camera, CameraToWorld, PosedPhoto, unless_cancelled},
+    scene::{Camera, CameraToWorld, PosedPhoto, Warning, WarningCode, unless_cancelled},
 };
-use cameras::{CameraEntry, PoseAxes};
-
-/// Names under which a folder or archive may hold its cameras.
-pub const CAMERA_FILES: [&str; 2] = ["transforms.json", "cameras.json"];
+use cameras::{CameraEntry, Cameras};
+use folder::Folder;
 
 /// Photos of the largest size that are decoded at the same time, some 7 bytes a pixel each.
 const DECODED_TOGETHER: u64 = 2;
+/// Files that one message names.
+const NAMED_MAX: usize = 4;
+/// Names of folders with the photos of cameras, where several have photos of these names: programs
+/// put smaller, larger and cut copies beside them.
+const PHOTO_FOLDERS: [&str; 5] = ["images", "resized_images", "rgb", "input", "blended_images"];
+/// Why photos are left out that a camera file keeps for tests.
+const KEPT_OUT: &str = "kept for tests, or marked as bad, by the capture; left out";
+/// The list of `ScanNet++` of the photos that are kept for tests.
+const TEST_LIST: &str = "train_test_lists.json";
+
+/// The photos of an upload with their cameras.
+#[derive(Clone, Debug)]
+pub struct ReadPhotos {
+    /// The photos, in the order of the cameras.
+    pub photos: Vec<PosedPhoto>,
+    /// What of the upload was not used or not there.
+    pub warnings: Vec<Warning>,
+}
 
 /// Reads an upload into photos with cameras, in the order of the cameras.
 ///
@@ -43,179 +70,385 @@ const DECODED_TOGETHER: u64 = 2;
 /// `invalid_request` for missing, surplus or impossible cameras, `photo_unreadable` for files that
 /// are not what they claim, `limit_exceeded`; each names photo, value and bound.
 pub fn read(upload: &Upload, limits: &Limits) -> Result<Vec<PosedPhoto>> {
-    read_until(upload, limits, &AtomicBool::new(false))
+    read_until(upload, limits, &AtomicBool::new(false)).map(|read| read.photos)
 }
 
-/// As [`read`]; stops before the next photo once `cancel` is true.
+/// As [`read`], with its warnings; stops before the next photo once `cancel` is true.
 ///
 /// # Errors
 /// As [`read`]; `cancelled`.
-pub fn read_until(
-    upload: &Upload,
-    limits: &Limits,
-    cancel: &AtomicBool,
-) -> Result<Vec<PosedPhoto>> {
+pub fn read_until(upload: &Upload, limits: &Limits, cancel: &AtomicBool) -> Result<ReadPhotos> {
     let total = upload.size_bytes();
     if total > limits.upload_bytes_max {
         return Err(Error::limit("upload bytes", total, limits.upload_bytes_max));
     }
-    match &upload.archive {
-        Some(archive) => {
-            if !upload.photos.is_empty() || upload.cameras.is_some() {
-                return Err(Error::invalid(
-                    "send either an archive or camera JSON and photos, not both",
-                ));
-            }
-            let unpacked = archive::unpack(archive, limits)?;
-            read_parts(&unpacked, limits, Every::Camera, cancel)
+    let found = match (&upload.archive, &upload.cameras) {
+        (Some(_), cameras) if !upload.photos.is_empty() || cameras.is_some() => {
+            return Err(Error::invalid(
+                "send either an archive or camera JSON and photos, not both",
+            ));
         }
-        None => read_parts(upload, limits, Every::Photo, cancel),
-    }
+        (Some(archive), _) => of_folder(&Folder::of_archive(archive, limits)?, limits)?,
+        (None, Some(cameras)) => of_form(cameras, &upload.photos, limits)?,
+        (None, None) if upload.photos.iter().all(|file| names::is_photo(&file.name)) => {
+            return Err(Error::invalid(
+                "upload: no camera description; send a part named transforms or cameras, the \
+                 camera files of a capture, or an archive with them",
+            ));
+        }
+        (None, None) => of_folder(&Folder::of_form(&upload.photos, limits)?, limits)?,
+    };
+    decoded(&found, limits, cancel)
 }
 
-/// Reads a folder with `transforms.json` or `cameras.json` and the photos it names.
+/// Reads a folder with a capture of any known layout.
 ///
 /// # Errors
-/// As [`read`]; also `invalid_request` where the folder has no camera file.
+/// As [`read`]; also `invalid_request` where the folder has no layout that is known.
 pub fn read_dir(dir: &Path, limits: &Limits) -> Result<Vec<PosedPhoto>> {
-    let never = AtomicBool::new(false);
-    read_parts(&upload_of_dir(dir, limits)?, limits, Every::Camera, &never)
+    read_dir_until(dir, limits, &AtomicBool::new(false)).map(|(read, _)| read.photos)
 }
 
-/// The camera file of a folder and the photos it names, as an upload.
+/// As [`read_dir`], with its warnings, and the files that were read as an upload: the photos in
+/// their order, then the files of cameras.
 ///
 /// # Errors
-/// `invalid_request` when there is no camera file, or a photo it names is missing or outside the
-/// folder.
-pub fn upload_of_dir(dir: &Path, limits: &Limits) -> Result<Upload> {
-    let cameras = camera_file_of_dir(dir, limits)?;
-    let entries = cameras::parse(&cameras, limits)?;
-    check_count(entries.len(), limits)?;
-    let mut photos = Vec::with_capacity(entries.len());
-    for (i, entry) in entries.iter().enumerate() {
-        let relative = names::normalise(&entry.file)
-            .ok_or_else(|| Error::invalid(outside(&label(i, &entry.file))))?;
-        let found = names::with_extensions(&relative).find(|name| dir.join(name).is_file());
-        let name = found.ok_or_else(|| {
-            Error::invalid(format!("{}: no such file in the folder", label(i, &entry.file)))
-        })?;
-        let bytes = fs_err::read(dir.join(&name)).map_err(|e| {
-            Error::photo(format!("{}: cannot be read", label(i, &entry.file))).caused_by(e)
-        })?;
-        photos.push(UploadFile { name, bytes });
-    }
-    Ok(Upload { cameras: Some(cameras), photos, ..Upload::default() })
-}
-
-fn camera_file_of_dir(dir: &Path, limits: &Limits) -> Result<UploadCameras> {
-    for name in CAMERA_FILES {
-        let path = dir.join(name);
-        let Ok(meta) = fs_err::metadata(&path) else { continue };
-        let (size, max) = (meta.len(), limits.json_bytes_max);
-        if size > max as u64 {
-            return Err(Error::limit(format!("{name}: bytes"), size, max));
-        }
-        let bytes = fs_err::read(&path)
-            .map_err(|e| Error::invalid(format!("{name}: cannot be read")).caused_by(e))?;
-        return Ok(cameras_named(name, bytes));
-    }
-    Err(Error::invalid("the folder has no transforms.json and no cameras.json"))
-}
-
-fn cameras_named(name: &str, bytes: Vec<u8>) -> UploadCameras {
-    if name == CAMERA_FILES[0] {
-        UploadCameras::Transforms(bytes)
-    } else {
-        UploadCameras::Cameras(bytes)
-    }
+/// As [`read_dir`]; `cancelled`.
+pub fn read_dir_until(
+    dir: &Path,
+    limits: &Limits,
+    cancel: &AtomicBool,
+) -> Result<(ReadPhotos, Upload)> {
+    let folder = Folder::of_dir(dir, limits)?;
+    let found = of_folder(&folder, limits)?;
+    let read = decoded(&found, limits, cancel)?;
+    let photos = found.taken.into_iter().map(|taken| (taken.path, taken.bytes.into_owned()));
+    let files = photos.chain(folder.into_cameras_read());
+    let photos = files.map(|(name, bytes)| UploadFile { name, bytes }).collect();
+    Ok((read, Upload { photos, ..Upload::default() }))
 }
 
 fn check_count(photos: usize, limits: &Limits) -> Result<()> {
-    match photos {
-        0 => Err(Error::invalid(format!(
-            "no photos; a scene needs {} to {}",
-            limits.photos_min, limits.photos_max
-        ))),
-        n if n < limits.photos_min => Err(Error::invalid(format!(
-            "{n} photo; a scene needs at least {} to see depth",
-            limits.photos_min
-        ))),
-        n if n > limits.photos_max => Err(Error::limit("photos", n, limits.photos_max)),
-        _ => Ok(()),
+    if photos >= limits.photos_min {
+        return Ok(());
     }
+    let least = limits.photos_min;
+    Err(Error::invalid(match photos {
+        0 => format!("no photos; a scene needs {least} or more"),
+        n => format!("{n} photo; a scene needs at least {least} to see depth"),
+    }))
 }
 
-fn outside(what: &str) -> String {
-    format!("{what}: the path must be relative and stay inside the folder")
+/// A camera and its photo, before the pixels are touched.
+struct Taken<'a> {
+    /// The photo as the scene calls it.
+    name: String,
+    /// The photo as the folder calls it.
+    path: String,
+    entry: CameraEntry,
+    pose: CameraToWorld,
+    bytes: Cow<'a, [u8]>,
 }
 
-/// What must find its partner: loose photos their camera, cameras of a folder their photo.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Every {
-    Photo,
-    Camera,
+/// The photos that make the scene, not decoded.
+struct Found<'a> {
+    taken: Vec<Taken<'a>>,
+    warnings: Vec<Warning>,
 }
 
-/// A camera and the file it belongs to, before the pixels are touched.
-struct Paired<'a> {
-    entry: &'a CameraEntry,
-    file: &'a UploadFile,
-    label: String,
-}
-
-fn read_parts(
-    upload: &Upload,
+/// The photos of a form whose cameras are one JSON part.
+fn of_form<'a>(
+    cameras: &UploadCameras,
+    files: &'a [UploadFile],
     limits: &Limits,
-    every: Every,
-    cancel: &AtomicBool,
-) -> Result<Vec<PosedPhoto>> {
-    if every == Every::Photo {
-        check_count(upload.photos.len(), limits)?;
+) -> Result<Found<'a>> {
+    check_count(files.len(), limits)?;
+    let Cameras { entries, held_out } = match cameras {
+        UploadCameras::Transforms(json) => {
+            limits.check_json("transforms", json)?;
+            cameras::transforms(json)?
+        }
+        UploadCameras::Cameras(json) => {
+            limits.check_json("cameras", json)?;
+            cameras::cameras(json)?
+        }
+    };
+    names::paths(files, limits)?;
+    let sent: Vec<&str> = files.iter().map(|file| file.name.as_str()).collect();
+    let (pairs, _) = paired(&entries, &sent)?;
+    let used: HashSet<usize> = pairs.iter().map(|(_, file)| *file).collect();
+    let held: HashSet<&str> = held_out.iter().map(|file| names::file_name(file)).collect();
+    let is_held = |i: &usize| held.contains(names::file_name(sent[*i]));
+    let (kept_out, lone): (Vec<usize>, Vec<usize>) =
+        (0..files.len()).filter(|i| !used.contains(i)).partition(is_held);
+    if let Some(&i) = lone.first() {
+        return Err(Error::invalid(format!(
+            "{}: no camera has this file; the camera file names {} others",
+            label(i, &files[i].name),
+            entries.len()
+        )));
     }
-    let cameras = upload.cameras.as_ref().ok_or_else(|| {
-        Error::invalid("no cameras: send a `transforms` or `cameras` part, or an archive with one")
-    })?;
-    let entries = cameras::parse(cameras, limits)?;
-    let paired = pair(&entries, &upload.photos, limits, every)?;
-    check_count(paired.len(), limits)?;
-    let poses: Vec<CameraToWorld> = paired
-        .iter()
-        .map(|p| match p.entry.axes {
-            PoseAxes::OpenGl => CameraToWorld::from_opengl_row_major(&p.entry.pose()?, &p.label),
-            PoseAxes::OpenCv => CameraToWorld::from_row_major(&p.entry.pose()?, &p.label),
-        })
-        .collect::<Result<_>>()?;
+    let size = |file: usize| files[file].bytes.len() as u64;
+    let mut warnings: Vec<Warning> = told(
+        WarningCode::PhotosUnused,
+        kept_out.len(),
+        KEPT_OUT,
+        kept_out.iter().map(|i| sent[*i]),
+    )
+    .into_iter()
+    .collect();
+    let (chosen, warning) = chosen(&entries, pairs, &sent, size, limits)?;
+    warnings.extend(warning);
+    let taken = chosen.into_iter().map(|(entry, file, pose)| {
+        let UploadFile { name, bytes } = &files[file];
+        let entry = entries[entry].clone();
+        Taken { name: name.clone(), path: name.clone(), entry, pose, bytes: bytes.into() }
+    });
+    Ok(Found { taken: taken.collect(), warnings })
+}
+
+/// The photos of a capture.
+fn of_folder<'a>(folder: &Folder<'a>, limits: &Limits) -> Result<Found<'a>> {
+    let described = layouts::read(folder)?;
+    let Cameras { mut entries, mut held_out } = described.cameras;
+    let listed = test_list(folder)?;
+    entries.retain(|entry| {
+        let kept = !listed.contains(names::file_name(&entry.file));
+        if !kept {
+            held_out.push(entry.file.clone());
+        }
+        kept
+    });
+    if entries.len() > limits.archive_entries_max {
+        let what = format!("{}: cameras", folder.what);
+        return Err(Error::limit(what, entries.len(), limits.archive_entries_max));
+    }
+    let place = photo_folder(folder, &described.root, &entries)?;
+    let inside = |path: &'_ str| -> Option<String> {
+        let rest =
+            if place.is_empty() { path } else { path.strip_prefix(&place)?.strip_prefix('/')? };
+        names::is_photo(rest).then(|| rest.to_owned())
+    };
+    let sent: Vec<String> = folder.paths().filter_map(inside).collect();
+    let sent: Vec<&str> = sent.iter().map(String::as_str).collect();
+    let (pairs, missing) = paired(&entries, &sent)?;
+    if pairs.is_empty() {
+        let first = entries.first().map_or("", |entry| entry.file.as_str());
+        return Err(Error::invalid(format!(
+            "{}: none of the {} cameras has its photo; the first is {first:?}",
+            folder.what,
+            entries.len()
+        )));
+    }
+    check_count(pairs.len(), limits)?;
+    let mut warnings = Vec::new();
+    let unused = without_camera(&sent, &pairs, &held_out);
+    warnings.extend(told(
+        WarningCode::PhotosMissing,
+        missing.len(),
+        "a camera, but no such photo; left out",
+        missing.iter().map(|i| entries[*i].file.as_str()),
+    ));
+    warnings.extend(told(
+        WarningCode::PhotosUnused,
+        unused.len(),
+        "no camera; left out",
+        unused.iter().copied(),
+    ));
+    warnings.extend(told(
+        WarningCode::PhotosUnused,
+        held_out.len(),
+        KEPT_OUT,
+        held_out.iter().map(String::as_str),
+    ));
+    let size = |file: usize| folder.size(&names::join(&place, sent[file]));
+    let (chosen, warning) = chosen(&entries, pairs, &sent, size, limits)?;
+    warnings.extend(warning);
+    let take = |(entry, file, pose): (usize, usize, CameraToWorld)| {
+        let (name, path) = (sent[file].to_owned(), names::join(&place, sent[file]));
+        let bytes = folder.read(&path)?;
+        Ok(Taken { name, path, entry: entries[entry].clone(), pose, bytes })
+    };
+    let taken = chosen.into_iter().map(take).collect::<Result<_>>()?;
+    Ok(Found { taken, warnings })
+}
+
+/// A warning that names files.
+fn told<'a>(
+    code: WarningCode,
+    count: usize,
+    why: &str,
+    files: impl Iterator<Item = &'a str>,
+) -> Option<Warning> {
+    let named: Vec<String> = files.take(NAMED_MAX).map(|file| format!("{file:?}")).collect();
+    if count == 0 {
+        return None;
+    }
+    let more = count - named.len();
+    let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+    let message = format!("{}{more}: {why}", named.join(", "));
+    Some(Warning { code, message, value: count as f64 })
+}
+
+/// File names of the photos that `ScanNet++` keeps for tests.
+fn test_list(folder: &Folder<'_>) -> Result<HashSet<String>> {
+    let Some(path) = folder.paths().find(|path| names::file_name(path) == TEST_LIST) else {
+        return Ok(HashSet::new());
+    };
+    let lists = cameras::object(&folder.read_json(path)?, path)?;
+    let tests = lists.get("test").and_then(|list| list.as_array()).into_iter().flatten();
+    Ok(tests.filter_map(|file| file.as_str()).map(str::to_owned).collect())
+}
+
+/// The folder under which most cameras have their photos, by path with or without its extension.
+///
+/// # Errors
+/// `invalid_request` where two folders are equally good.
+fn photo_folder(folder: &Folder<'_>, root: &str, entries: &[CameraEntry]) -> Result<String> {
+    let wanted: HashSet<String> = entries.iter().map(|entry| names::tail(&entry.file)).collect();
+    let mut counts: HashMap<&str, usize> = HashMap::new();
+    for path in folder.paths() {
+        let Some(stem) = names::stem(path) else { continue };
+        let starts = path.match_indices('/').map(|(at, _)| at + 1);
+        for start in std::iter::once(0).chain(starts) {
+            if wanted.contains(&path[start..])
+                || stem.get(start..).is_some_and(|s| wanted.contains(s))
+            {
+                *counts.entry(path[..start].trim_end_matches('/')).or_default() += 1;
+            }
+        }
+    }
+    let near = |place: &str| {
+        let parts = |path: &str| path.split('/').map(str::to_owned).collect::<Vec<_>>();
+        parts(place).iter().zip(parts(root)).take_while(|(a, b)| *a == b).count()
+    };
+    let known = |place: &str| {
+        let last = names::file_name(place);
+        PHOTO_FOLDERS.len()
+            - PHOTO_FOLDERS.iter().position(|p| *p == last).unwrap_or(PHOTO_FOLDERS.len())
+    };
+    let rank = |place: &str, count: usize| (count, place == root, near(place), known(place));
+    let mut ranked: Vec<_> = counts.iter().map(|(p, count)| (rank(p, *count), *p)).collect();
+    ranked.sort_unstable_by(|a, b| b.cmp(a));
+    match ranked[..] {
+        [] => Ok(root.to_owned()),
+        [(first, a), (second, b), ..] if first == second => Err(Error::invalid(format!(
+            "{}: the cameras have photos in {a:?} and in {b:?}; send one of them",
+            folder.what
+        ))),
+        [(_, place), ..] => Ok(place.to_owned()),
+    }
+}
+
+/// Photos without camera that lie where photos with cameras lie. A picture that is called after a
+/// photo, as `a_mask.png` is after `a.jpg`, belongs to it.
+fn without_camera<'a>(sent: &[&'a str], pairs: &[Pair], held_out: &[String]) -> Vec<&'a str> {
+    let used: HashSet<usize> = pairs.iter().map(|(_, file)| *file).collect();
+    let stems: HashSet<&str> = used.iter().filter_map(|i| names::stem(sent[*i])).collect();
+    let folders: HashSet<&str> = used.iter().map(|i| names::folder(sent[*i])).collect();
+    let held: HashSet<&str> = held_out.iter().map(|file| names::file_name(file)).collect();
+    let belongs = |stem: &str| {
+        let mut ends = stem.match_indices(['_', '.', '-']).map(|(at, _)| at).chain([stem.len()]);
+        ends.any(|end| stems.contains(&stem[..end]))
+    };
+    let lone = |(i, path): (usize, &&'a str)| {
+        let stem = names::stem(path)?;
+        let is_lone = !used.contains(&i)
+            && folders.contains(names::folder(path))
+            && !held.contains(names::file_name(path))
+            && !held.contains(names::file_name(stem))
+            && !belongs(stem);
+        is_lone.then_some(*path)
+    };
+    sent.iter().enumerate().filter_map(lone).collect()
+}
+
+/// The places of a camera and of its photo.
+type Pair = (usize, usize);
+
+/// Cameras with the photo of each, and cameras without one.
+fn paired(entries: &[CameraEntry], sent: &[&str]) -> Result<(Vec<Pair>, Vec<usize>)> {
+    let wanted: Vec<&str> = entries.iter().map(|entry| entry.file.as_str()).collect();
+    let files = names::matched(&wanted, sent)?;
+    let pairs = files.iter().enumerate().filter_map(|(i, file)| Some((i, (*file)?))).collect();
+    let missing = (0..files.len()).filter(|i| files[*i].is_none()).collect();
+    Ok((pairs, missing))
+}
+
+/// Camera, photo and pose of the photos that a scene takes.
+type Chosen = Vec<(usize, usize, CameraToWorld)>;
+
+/// Checks all poses, and chooses the photos of the scene where there are too many.
+fn chosen(
+    entries: &[CameraEntry],
+    pairs: Vec<Pair>,
+    sent: &[&str],
+    size: impl Fn(usize) -> u64,
+    limits: &Limits,
+) -> Result<(Chosen, Option<Warning>)> {
+    let pose =
+        |(i, (entry, _)): (usize, &Pair)| entries[*entry].pose(&label(i, &entries[*entry].file));
+    let poses: Vec<CameraToWorld> = pairs.iter().enumerate().map(pose).collect::<Result<_>>()?;
     check_places(&poses)?;
-    let mut headers = Vec::with_capacity(paired.len());
-    for p in &paired {
-        let header = decode::header(&p.file.bytes, &p.label, limits)?;
-        let lens = p.entry.lens.at_size(header.width, header.height, &p.label)?;
-        headers.push((header, lens));
+    let all = pairs.into_iter().zip(&poses).map(|((entry, file), pose)| (entry, file, *pose));
+    if poses.len() <= limits.photos_max {
+        return Ok((all.collect(), None));
     }
-    let sizes: Vec<[u32; 2]> = headers.iter().map(|(header, _)| header.size()).collect();
+    let all: Chosen = all.collect();
+    let candidates: Vec<choose::Candidate<'_>> = all
+        .iter()
+        .map(|(entry, file, pose)| {
+            let size = size(*file);
+            choose::Candidate { pose, bytes: size, kind: (&entries[*entry].lens).into() }
+        })
+        .collect();
+    let kept = choose::best(&candidates, limits.photos_max);
+    let left_out: Vec<&str> =
+        (0..all.len()).filter(|i| !kept.contains(i)).map(|i| sent[all[i].1]).collect();
+    let why = format!(
+        "left out; a scene takes {} of these {} photos: those that see most from different places, \
+         then the sharpest; `cameras` lists them",
+        limits.photos_max,
+        all.len()
+    );
+    let names = left_out.iter().copied();
+    let warning = told(WarningCode::PhotosUnused, left_out.len(), &why, names);
+    Ok((kept.into_iter().map(|i| all[i]).collect(), warning))
+}
+
+/// Decodes the photos, a few at a time, and removes the distortion of their lenses.
+fn decoded(found: &Found<'_>, limits: &Limits, cancel: &AtomicBool) -> Result<ReadPhotos> {
+    let mut headers = Vec::with_capacity(found.taken.len());
+    for (i, taken) in found.taken.iter().enumerate() {
+        let label = label(i, &taken.entry.file);
+        let header = decode::header(&taken.bytes, &label, limits)?;
+        let lens = taken.entry.lens.at_size(header.width, header.height, &label)?;
+        headers.push((label, header, lens));
+    }
+    let sizes: Vec<[u32; 2]> = headers.iter().map(|(_, header, _)| header.size()).collect();
     let side_max = side_kept(&sizes, limits);
     let read = |i: usize| {
         unless_cancelled(cancel)?;
-        let (p, (header, lens)) = (&paired[i], &headers[i]);
-        let photo = decode::pixels(&p.file.bytes, header, &p.label, limits)?;
+        let (taken, (label, header, lens)) = (&found.taken[i], &headers[i]);
+        let photo = decode::pixels(&taken.bytes, header, label, limits)?;
         // The lens after the size: its terms are of rays, not of pixels.
         let (photo, intrinsics) = decode::at_most(photo, lens.intrinsics, side_max);
         let photo = lens::undistort(photo, &lens.of_smaller(intrinsics));
         Ok(PosedPhoto {
-            file: p.file.name.clone(),
+            file: taken.name.clone(),
             photo,
-            camera: Camera { intrinsics, camera_to_world: poses[i] },
+            camera: Camera { intrinsics, camera_to_world: taken.pose },
             intrinsics_made_for: lens.made_for,
         })
     };
-    let mut photos = Vec::with_capacity(paired.len());
+    let mut photos = Vec::with_capacity(found.taken.len());
     for together in decoded_together(&sizes, limits.photo_pixels_max) {
         let some: Vec<Result<PosedPhoto>> = together.into_par_iter().map(read).collect();
         for photo in some {
             photos.push(photo?);
         }
     }
-    Ok(photos)
+    Ok(ReadPhotos { photos, warnings: found.warnings.clone() })
 }
 
 /// Longer side at which the photos of a scene are kept, so that all of them fit the limits.
@@ -257,58 +490,6 @@ fn decoded_together(sizes: &[[u32; 2]], photo_pixels_max: u64) -> Vec<Range<usiz
     }
     groups.push(begun..sizes.len());
     groups
-}
-
-fn pair<'a>(
-    entries: &'a [CameraEntry],
-    files: &'a [UploadFile],
-    limits: &Limits,
-    every: Every,
-) -> Result<Vec<Paired<'a>>> {
-    let mut seen = HashSet::new();
-    for (i, file) in files.iter().enumerate() {
-        if file.name.len() > limits.file_name_bytes_max {
-            let what = format!("{}: bytes of the file name", label(i, &file.name));
-            return Err(Error::limit(what, file.name.len(), limits.file_name_bytes_max));
-        }
-        if names::normalise(&file.name).is_none() {
-            return Err(Error::invalid(outside(&label(i, &file.name))));
-        }
-        if !seen.insert(file.name.as_str()) {
-            return Err(Error::invalid(format!(
-                "{}: two photos have this name; send paths as in the camera file",
-                label(i, &file.name)
-            )));
-        }
-    }
-    let wanted: Vec<&str> = entries.iter().map(|e| e.file.as_str()).collect();
-    let sent: Vec<&str> = files.iter().map(|f| f.name.as_str()).collect();
-    let file_of_entry = names::matched(&wanted, &sent)?;
-    if every == Every::Photo {
-        let used: HashSet<usize> = file_of_entry.iter().flatten().copied().collect();
-        if let Some(i) = (0..files.len()).find(|i| !used.contains(i)) {
-            return Err(Error::invalid(format!(
-                "{}: no camera has this file; the camera file names {} others",
-                label(i, &files[i].name),
-                entries.len()
-            )));
-        }
-    }
-    let mut paired = Vec::with_capacity(files.len());
-    for (i, (entry, found)) in entries.iter().zip(file_of_entry).enumerate() {
-        match found {
-            Some(at) => {
-                let label = label(paired.len(), &entry.file);
-                paired.push(Paired { entry, file: &files[at], label });
-            }
-            None if every == Every::Camera => {
-                let what = label(i, &entry.file);
-                return Err(Error::invalid(format!("{what}: a camera, but no such photo")));
-            }
-            None => {}
-        }
-    }
-    Ok(paired)
 }
 
 /// Refuses cameras that all stand at one place: they see no depth.

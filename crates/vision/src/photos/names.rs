@@ -1,8 +1,13 @@
 //! Which file belongs to which camera: by path, then by file name, then without the extension.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
-use crate::error::{Error, Result};
+use crate::{
+    error::{Error, Result},
+    limits::Limits,
+    photo_label as label,
+    scene::UploadFile,
+};
 
 /// Extensions tried where a camera's file has none, as instant-ngp does.
 const EXTENSIONS: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
@@ -26,20 +31,62 @@ pub(super) fn normalise(name: &str) -> Option<String> {
     (!parts.is_empty()).then(|| parts.join("/"))
 }
 
-/// The name itself, then the name with each known extension.
-pub(super) fn with_extensions(name: &str) -> impl Iterator<Item = String> + '_ {
-    std::iter::once(name.to_owned())
-        .chain(EXTENSIONS.iter().map(move |ext| format!("{name}.{ext}")))
+/// The paths of the files of a form, each within the limit, inside the folder and there once.
+///
+/// # Errors
+/// `invalid_request`, `limit_exceeded`, each names the file.
+pub(super) fn paths(files: &[UploadFile], limits: &Limits) -> Result<Vec<String>> {
+    let mut seen = HashSet::new();
+    let path = |(i, file): (usize, &UploadFile)| {
+        let what = label(i, &file.name);
+        let (bytes, max) = (file.name.len(), limits.file_name_bytes_max);
+        if bytes > max {
+            return Err(Error::limit(format!("{what}: bytes of the file name"), bytes, max));
+        }
+        let path = normalise(&file.name).ok_or_else(|| {
+            let why = "the path must be relative and stay inside the folder";
+            Error::invalid(format!("{what}: {why}"))
+        })?;
+        if !seen.insert(file.name.clone()) {
+            let why = "two photos have this name; send paths as in the camera file";
+            return Err(Error::invalid(format!("{what}: {why}")));
+        }
+        Ok(path)
+    };
+    files.iter().enumerate().map(path).collect()
 }
 
-fn file_name(path: &str) -> &str {
+/// Whether the name has the extension of a photo.
+pub(super) fn is_photo(path: &str) -> bool {
+    stem(path).is_some()
+}
+
+/// The folder of a file, without a slash at its end; empty at the top.
+pub(super) fn folder(path: &str) -> &str {
+    path.rsplit_once('/').map_or("", |(folder, _)| folder)
+}
+
+/// A file in a folder.
+pub(super) fn join(folder: &str, file: &str) -> String {
+    if folder.is_empty() { file.to_owned() } else { format!("{folder}/{file}") }
+}
+
+/// The last part of a path.
+pub(super) fn file_name(path: &str) -> &str {
     path.rsplit('/').next().unwrap_or(path)
 }
 
 /// The path without a photo's extension; `None` for other files.
-fn stem(path: &str) -> Option<&str> {
+pub(super) fn stem(path: &str) -> Option<&str> {
     let (stem, extension) = path.rsplit_once('.')?;
     EXTENSIONS.iter().any(|e| extension.eq_ignore_ascii_case(e)).then_some(stem)
+}
+
+/// The path that a camera file names. It may sit in a subfolder and point out of it: only the tail
+/// counts then.
+pub(super) fn tail(wanted: &str) -> String {
+    let tail = wanted.trim_start_matches("../");
+    normalise(tail).unwrap_or_else(|| file_name(tail).to_owned())
 }
 
 /// For each wanted path the index of the sent file, or `None` where it was not sent.
@@ -49,14 +96,7 @@ fn stem(path: &str) -> Option<&str> {
 /// # Errors
 /// `invalid_request` where two cameras claim one file, or two files fit one camera.
 pub(super) fn matched(wanted: &[&str], sent: &[&str]) -> Result<Vec<Option<usize>>> {
-    let wanted_paths: Vec<String> = wanted
-        .iter()
-        .map(|w| {
-            // A camera file may sit in a subfolder and point out of it: only the tail counts then.
-            let tail = w.trim_start_matches("../");
-            normalise(tail).unwrap_or_else(|| file_name(tail).to_owned())
-        })
-        .collect();
+    let wanted_paths: Vec<String> = wanted.iter().map(|w| tail(w)).collect();
     let sent_paths: Vec<String> =
         sent.iter().map(|s| normalise(s).unwrap_or_else(|| (*s).to_owned())).collect();
     type Key = for<'a> fn(&'a str) -> Option<&'a str>;
@@ -104,9 +144,11 @@ pub(super) fn matched(wanted: &[&str], sent: &[&str]) -> Result<Vec<Option<usize
         }
     }
     // A second camera for a file that an exact path took.
+    let places: HashMap<&str, usize> =
+        sent_paths.iter().enumerate().map(|(s, path)| (path.as_str(), s)).collect();
     for (w, path) in wanted_paths.iter().enumerate() {
         if found[w].is_none()
-            && let Some(s) = sent_paths.iter().position(|s| s == path)
+            && let Some(&s) = places.get(path.as_str())
             && let Some(other) = taken[s]
         {
             return Err(Error::invalid(format!(

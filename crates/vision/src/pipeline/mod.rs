@@ -12,6 +12,7 @@ pub mod semantics;
 pub use self::loader::PipelineLoader;
 
 use std::{
+    path::Path,
     sync::{Arc, atomic::AtomicBool},
     time::Instant,
 };
@@ -23,11 +24,11 @@ use crate::{
     limits::Limits,
     meter,
     models::{Bundle, Geometry, GeometryInput, NetworkOptions, Provider, Runtime},
-    photos,
+    photos::{self, ReadPhotos},
     scene::{
         Backdrop, Camera, Capture, Density, Gaussians, HealthReport, Intrinsics, Method, Photo,
         PosedPhoto, Provenance, Scene, SceneCamera, SceneId, SceneMeta, SceneOptions, Stage,
-        StageTime, Upload, ViewSet, Watch, unless_cancelled,
+        StageTime, Upload, ViewSet, Warning, Watch, unless_cancelled,
     },
 };
 
@@ -131,6 +132,8 @@ impl Reconstruction {
 pub struct PhotoSet {
     /// The photos, in the order of the cameras.
     pub photos: Vec<PosedPhoto>,
+    /// What of the upload was not used or not there.
+    pub warnings: Vec<Warning>,
     /// How long that took, milliseconds.
     pub read_ms: f64,
 }
@@ -150,11 +153,23 @@ impl PhotoSet {
 /// `invalid_request`, `photo_unreadable`, `limit_exceeded`, each names photo, value and bound;
 /// `cancelled`.
 pub fn read(upload: &Upload, limits: &Limits, cancel: &AtomicBool) -> Result<PhotoSet> {
+    timed(|| photos::read_until(upload, limits, cancel).map(|read| (read, ()))).map(|(set, ())| set)
+}
+
+/// Reads a folder: as [`read`], and the files that were read as an upload.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_dir(dir: &Path, limits: &Limits, cancel: &AtomicBool) -> Result<(PhotoSet, Upload)> {
+    timed(|| photos::read_dir_until(dir, limits, cancel))
+}
+
+fn timed<T>(read: impl FnOnce() -> Result<(ReadPhotos, T)>) -> Result<(PhotoSet, T)> {
     let begun = Instant::now();
-    let photos = photos::read_until(upload, limits, cancel)?;
+    let (ReadPhotos { photos, warnings }, more) = read()?;
     let read_ms = begun.elapsed().as_secs_f64() * 1e3;
     meter::stage(Stage::Photos.name(), read_ms / 1e3);
-    Ok(PhotoSet { photos, read_ms })
+    Ok((PhotoSet { photos, warnings, read_ms }, more))
 }
 
 /// The stages from read photos to Gaussians, the time of reading them in the report.
@@ -171,6 +186,7 @@ pub fn make(
         reconstruct(pipeline, &photos.photos, options, watch.progress, watch.cancel)?;
     let stage = Stage::Photos.name().to_owned();
     reconstruction.report.stages.insert(0, StageTime { stage, ms: photos.read_ms });
+    reconstruction.report.warnings.splice(0..0, photos.warnings.iter().cloned());
     Ok(reconstruction)
 }
 

@@ -13,6 +13,7 @@ mod bank;
 mod bitset;
 mod bundle;
 mod capture;
+mod captures;
 mod check;
 mod colours;
 mod crops;

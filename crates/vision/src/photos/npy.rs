@@ -1,17 +1,18 @@
-//! Just enough of `NumPy`'s `.npy` to read labelled photographs and LLFF cameras.
+//! Just enough of `NumPy`'s `.npy` to read LLFF cameras and the laboratory's labelled photographs.
 
 /// An array in C order.
 #[derive(Debug)]
-pub(crate) struct Array {
+pub struct Array {
     kind: String,
     /// Its sides, the slowest first.
-    pub(crate) shape: Vec<usize>,
+    pub shape: Vec<usize>,
     data: Vec<u8>,
 }
 
 impl Array {
     /// Reads a file; `None` where it is no such file or of Fortran order.
-    pub(crate) fn parse(mut bytes: Vec<u8>) -> Option<Self> {
+    #[must_use]
+    pub fn parse(mut bytes: Vec<u8>) -> Option<Self> {
         if bytes.get(..6)? != b"\x93NUMPY" {
             return None;
         }
@@ -32,12 +33,14 @@ impl Array {
     }
 
     /// The bytes of an array of bytes.
-    pub(crate) fn bytes(self) -> Option<Vec<u8>> {
+    #[must_use]
+    pub fn bytes(self) -> Option<Vec<u8>> {
         (self.kind == "|u1").then_some(self.data)
     }
 
     /// Whole numbers that are not negative.
-    pub(crate) fn counts(&self) -> Option<Vec<usize>> {
+    #[must_use]
+    pub fn counts(&self) -> Option<Vec<usize>> {
         match self.kind.as_str() {
             "<i4" => self.each(|c| i32::from_le_bytes(c).try_into().ok()),
             "<i8" => self.each(|c| i64::from_le_bytes(c).try_into().ok()),
@@ -46,13 +49,15 @@ impl Array {
     }
 
     /// Numbers of f64.
-    pub(crate) fn numbers(&self) -> Option<Vec<f64>> {
+    #[must_use]
+    pub fn numbers(&self) -> Option<Vec<f64>> {
         let wanted = self.kind == "<f8";
         self.each(|c| wanted.then_some(f64::from_le_bytes(c)))
     }
 
     /// Texts of fixed length in UTF-32, filled up with zeros.
-    pub(crate) fn texts(&self) -> Option<Vec<String>> {
+    #[must_use]
+    pub fn texts(&self) -> Option<Vec<String>> {
         let width = self.kind.strip_prefix("<U")?.parse::<usize>().ok().filter(|w| *w > 0)?;
         let letters = self.each(|c| char::from_u32(u32::from_le_bytes(c)))?;
         let text = |row: &[char]| row.iter().collect::<String>().trim_end_matches('\0').to_owned();

@@ -1,0 +1,168 @@
+//! The layouts of captures, one reader each. What a capture is, its file names tell, and a look
+//! into a file where names alone do not.
+
+mod arkit;
+mod colmap;
+mod json;
+mod llff;
+mod mvs;
+mod polycam;
+mod realestate;
+mod record3d;
+
+use glam::{DMat3, DQuat, DVec3};
+
+use super::{
+    cameras::{CameraEntry, Cameras, PoseAxes},
+    folder::Folder,
+    lens::Lens,
+};
+use crate::error::{Error, Result};
+
+/// A layout of captures: how its files are told, and how its cameras are read.
+trait Layout: Sync {
+    /// Its name in messages.
+    fn name(&self) -> &'static str;
+
+    /// Where each capture of this layout begins: a camera file, or the folder of several.
+    fn find(&self, folder: &Folder<'_>) -> Vec<String>;
+
+    /// The cameras of the capture at a place of [`Self::find`].
+    fn read(&self, folder: &Folder<'_>, at: &str) -> Result<Described>;
+}
+
+/// What a capture says of its cameras.
+pub(super) struct Described {
+    /// The folder that the files of the cameras are looked for from.
+    pub(super) root: String,
+    pub(super) cameras: Cameras,
+}
+
+impl Described {
+    fn new(root: &str, entries: Vec<CameraEntry>) -> Self {
+        Self { root: root.to_owned(), cameras: Cameras { entries, held_out: Vec::new() } }
+    }
+}
+
+/// All readers. Cameras of the first three are often made of those of the next, beside them.
+static LAYOUTS: [&dyn Layout; 9] = [
+    &json::Transforms,
+    &colmap::Colmap,
+    &llff::Llff,
+    &json::OurCameras,
+    &polycam::Polycam,
+    &record3d::Record3d,
+    &arkit::ArKitScenes,
+    &mvs::MvsNet,
+    &realestate::RealEstate,
+];
+/// The layouts at the head of [`LAYOUTS`] of which one is taken before those after it.
+const ONE_OF_ANOTHER: usize = 3;
+
+/// Finds which layout a folder has, and reads its cameras.
+///
+/// A `transforms.json` is taken before COLMAP's files and these before `poses_bounds.npy`: programs
+/// make one of the other and keep both. All other mixtures are refused.
+///
+/// # Errors
+/// `invalid_request` where it has no layout that is known, or several, and as the reader.
+pub(super) fn read(folder: &Folder<'_>) -> Result<Described> {
+    let mut found: Vec<(&dyn Layout, String)> = Vec::new();
+    let mut made_of_another = false;
+    for (i, layout) in LAYOUTS.iter().enumerate() {
+        if i < ONE_OF_ANOTHER && made_of_another {
+            continue;
+        }
+        let places = layout.find(folder);
+        made_of_another |= !places.is_empty();
+        found.extend(places.into_iter().map(|at| (*layout, at)));
+    }
+    let what = folder.what;
+    match &found[..] {
+        [(layout, at)] => {
+            folder.forget_cameras_read();
+            layout.read(folder, at)
+        }
+        [(a, at_a), (b, at_b), ..] => Err(Error::invalid(format!(
+            "{what}: two camera files, {at_a:?} ({}) and {at_b:?} ({}); a scene has one",
+            a.name(),
+            b.name()
+        ))),
+        [] => {
+            let others = LAYOUTS.map(|layout| layout.name()).join(", ");
+            Err(Error::invalid(format!(
+                "{what}: no transforms.json and no cameras.json in it, nor another layout with \
+                 cameras; {} files were looked at, and these layouts are known: {others}",
+                folder.paths().count()
+            )))
+        }
+    }
+}
+
+/// Camera-to-world, row-major, of a rotation and a centre.
+fn pose(rotation: DMat3, centre: DVec3) -> [f64; 16] {
+    let [x, y, z] = rotation.transpose().to_cols_array_2d();
+    let row = |r: [f64; 3], t: f64| [r[0], r[1], r[2], t];
+    let rows = [row(x, centre.x), row(y, centre.y), row(z, centre.z), [0.0, 0.0, 0.0, 1.0]];
+    let mut flat = [0.0; 16];
+    flat.copy_from_slice(rows.as_flattened());
+    flat
+}
+
+/// Camera-to-world, row-major, of a world-to-camera rotation and translation.
+fn inverse(rotation: DMat3, translation: DVec3) -> [f64; 16] {
+    let turned = rotation.transpose();
+    pose(turned, -(turned * translation))
+}
+
+/// Camera-to-world, row-major, of the first twelve numbers of a row-major world-to-camera matrix.
+fn inverse_of_rows(m: &[f64]) -> [f64; 16] {
+    let rotation = DMat3::from_cols_array(&[m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10]]);
+    inverse(rotation, DVec3::new(m[3], m[7], m[11]))
+}
+
+/// The rotation of a quaternion w x y z of any length but 0.
+fn rotation([w, x, y, z]: [f64; 4]) -> DMat3 {
+    DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize())
+}
+
+/// A pinhole lens; `size` is width and height where they are written.
+fn pinhole([fx, fy, cx, cy]: [f64; 4], size: Option<[f64; 2]>) -> Lens {
+    Lens {
+        fx: Some(fx),
+        fy: Some(fy),
+        cx: Some(cx),
+        cy: Some(cy),
+        width: size.map(|[width, _]| width),
+        height: size.map(|[_, height]| height),
+        ..Lens::default()
+    }
+}
+
+/// Refuses one entry more of a file than the limit, before memory is taken for it.
+fn count(entries: usize, max: usize, path: &str) -> Result<()> {
+    if entries < max {
+        return Ok(());
+    }
+    Err(Error::limit(format!("{path}: entries"), format!("more than {max}"), max))
+}
+
+/// The text of a camera file.
+fn text<'a>(bytes: &'a [u8], path: &str) -> Result<&'a str> {
+    std::str::from_utf8(bytes)
+        .map_err(|e| Error::invalid(format!("{path}: not UTF-8 text")).caused_by(e))
+}
+
+/// The numbers of a text between spaces; `None` where a word is none.
+fn numbers(text: &str) -> Option<Vec<f64>> {
+    text.split_ascii_whitespace().map(|word| word.parse().ok()).collect()
+}
+
+/// The numbers of a line, exactly `N`.
+fn numbers_of<const N: usize>(line: &str, path: &str, at: usize) -> Result<[f64; N]> {
+    let wrong = || {
+        let shown: String = line.chars().take(60).collect();
+        Error::invalid(format!("{path}: line {at} must be {N} numbers, it is {shown:?}"))
+    };
+    numbers(line).and_then(|numbers| numbers.try_into().ok()).ok_or_else(wrong)
+}

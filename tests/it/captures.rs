@@ -1,0 +1,87 @@
+//! A capture as files of a form, as an archive in a form, as the body itself and over gRPC: it is
+//! recognised, and each way gives the same scene and says what was left out.
+
+use std::io::{Cursor, Write as _};
+
+use reqwest::StatusCode;
+use segsplat::{
+    limits::Limits,
+    photos,
+    scene::{Upload, UploadFile},
+};
+use segsplat_testing::captures;
+
+use crate::common::{
+    client,
+    cpu_server::{CpuServer, upload},
+    doors::{Ask, Fault, Options, bytes, form, grpc, http, json},
+};
+
+/// The sample as COLMAP writes it, with a photo that has no camera.
+fn colmap() -> Vec<UploadFile> {
+    let posed = photos::read(&upload(), &Limits::default()).unwrap();
+    let mut files = captures::write("colmap_bin", &posed, &upload().photos);
+    files.push(UploadFile { name: "images/lone.png".to_owned(), bytes: b"?".to_vec() });
+    files
+}
+
+fn zipped(files: &[UploadFile]) -> Vec<u8> {
+    let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    for file in files {
+        zip.start_file(&*file.name, zip::write::SimpleFileOptions::default()).unwrap();
+        zip.write_all(&file.bytes).unwrap();
+    }
+    zip.finish().unwrap().into_inner()
+}
+
+#[tokio::test]
+async fn a_capture_is_recognised_at_every_door() {
+    let stand = CpuServer::start().await;
+    let files = colmap();
+    let zip = zipped(&files);
+    let of_files = Upload { photos: files, ..Upload::default() };
+    let of_zip = Upload { archive: Some(zip.clone()), ..Upload::default() };
+    let address = stand.url("/v1/scenes?wait_ms=120000&semantics=off");
+    let mut pictures = Vec::new();
+    let requests = [
+        client().post(&address).multipart(form(&of_files)),
+        client().post(&address).multipart(form(&of_zip)),
+        client().post(&address).header("content-type", "application/zip").body(zip.clone()),
+        client().post(&address).header("content-type", "application/octet-stream").body(zip),
+    ];
+    for request in requests {
+        let answer = request.send().await.unwrap();
+        assert_eq!(answer.status(), StatusCode::CREATED);
+        let scene = json(answer).await.unwrap();
+        let files: Vec<_> = scene["cameras"].as_array().unwrap().iter().collect();
+        assert_eq!(files.len(), 3, "{scene}");
+        assert_eq!(files[1]["file"], "0001.png");
+        let first = &scene["report"]["warnings"][0];
+        assert_eq!(first["code"], "photos_unused");
+        assert!(first["message"].as_str().unwrap().contains("lone.png"), "{first}");
+        let id = scene["id"].as_str().unwrap();
+        pictures.push(http(stand.addr).view(id, &Ask::first()).await.unwrap());
+    }
+    let door = grpc(stand.addr).await;
+    for upload in [&of_files, &of_zip] {
+        let scene = door.create(upload, &Options::wait()).await.unwrap();
+        pictures.push(door.view(&scene.0, &Ask::first()).await.unwrap());
+    }
+    assert!(pictures.iter().all(|picture| *picture == pictures[0]), "the same scene");
+}
+
+#[tokio::test]
+async fn a_body_that_is_no_archive_is_refused() {
+    let stand = CpuServer::start().await;
+    let send = async |kind: &str, body: Vec<u8>| -> Fault {
+        let request = client().post(stand.url("/v1/scenes")).header("content-type", kind);
+        bytes(request.body(body).send().await.unwrap()).await.expect_err("refused")
+    };
+    let fault = send("application/zip", b"hello".to_vec()).await;
+    assert_eq!((&*fault.code, fault.number), ("photo_unreadable", 422));
+    let fault = send("application/x-tar; a=b", Vec::new()).await;
+    assert_eq!(fault.code, "photo_unreadable");
+    let fault = send("text/plain", b"hello".to_vec()).await;
+    assert_eq!(fault.code, "invalid_request");
+    assert!(fault.message.contains("application/zip"), "{fault:?}");
+}
