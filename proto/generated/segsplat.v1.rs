@@ -654,10 +654,10 @@ pub mod create_scene_request {
         /// First message, once.
         #[prost(message, tag = "1")]
         Header(super::CreateSceneHeader),
-        /// A piece of a photo.
+        /// A piece of a photo, or of a camera file of a capture.
         #[prost(message, tag = "2")]
         Photo(super::PhotoChunk),
-        /// A piece of the archive: a zip or tar of a folder of photos with its camera JSON.
+        /// A piece of the archive: a zip or tar of a folder with a capture of any known layout.
         #[prost(bytes, tag = "3")]
         Archive(::prost::bytes::Bytes),
         /// A piece of a file of Gaussians, which is a whole scene: PLY, SPZ, SOG, GLB or .splat.
@@ -690,13 +690,13 @@ pub struct CreateSceneHeader {
     /// is set.
     #[prost(string, tag = "10")]
     pub refine: ::prost::alloc::string::String,
-    /// Camera description; left out when it is in the archive.
+    /// Camera description; left out when it is among the files or in the archive.
     #[prost(oneof = "create_scene_header::Cameras", tags = "1, 2")]
     pub cameras: ::core::option::Option<create_scene_header::Cameras>,
 }
 /// Nested message and enum types in `CreateSceneHeader`.
 pub mod create_scene_header {
-    /// Camera description; left out when it is in the archive.
+    /// Camera description; left out when it is among the files or in the archive.
     #[derive(Clone, PartialEq, Eq, Hash, ::prost::Oneof)]
     pub enum Cameras {
         /// A nerfstudio or instant-ngp transforms.json (OpenGL axes).
@@ -707,10 +707,10 @@ pub mod create_scene_header {
         CamerasJson(::prost::bytes::Bytes),
     }
 }
-/// A piece of a photo.
+/// A piece of a photo, or of a camera file of a capture.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct PhotoChunk {
-    /// File name on the photo's first piece; empty on the following ones.
+    /// Path of the file on its first piece; empty on the following ones.
     #[prost(string, tag = "1")]
     pub name: ::prost::alloc::string::String,
     /// Bytes.
@@ -1671,6 +1671,7 @@ pub mod scene_service_client {
             self
         }
         /// Makes a scene. First a header, then the photos, one archive or a file of Gaussians in pieces.
+        /// Without cameras in the header, the paths of the files tell the layout of the capture.
         /// Answers at once, or when done where the header says how long to wait.
         pub async fn create_scene(
             &mut self,
@@ -1971,6 +1972,7 @@ pub mod scene_service_server {
     #[async_trait]
     pub trait SceneService: std::marker::Send + std::marker::Sync + 'static {
         /// Makes a scene. First a header, then the photos, one archive or a file of Gaussians in pieces.
+        /// Without cameras in the header, the paths of the files tell the layout of the capture.
         /// Answers at once, or when done where the header says how long to wait.
         async fn create_scene(
             &self,

@@ -3,7 +3,8 @@
 use std::{
     path::{Path, PathBuf},
     sync::Arc,
-    time::Duration,
+    thread,
+    time::{Duration, Instant},
 };
 
 use fs_err as fs;
@@ -26,6 +27,9 @@ use crate::{
 
 /// How often a call to S3 is tried again, within `limits.store_timeout_ms`.
 const S3_RETRIES_MAX: usize = 4;
+/// Longest wait for the lock of a data folder, and the time between two looks at it.
+const LOCK_WAIT: Duration = Duration::from_secs(1);
+const LOCK_LOOK: Duration = Duration::from_millis(20);
 
 /// All that a store puts into its folder or bucket lies under these.
 const PREFIXES: [&str; 7] =
@@ -150,16 +154,23 @@ impl Store {
     }
 }
 
+/// The lock of a data folder. The process that had it may still be ending, or a child that it began
+/// may hold it for a moment, until the child is another program.
 fn lock(root: &Path) -> Result<fs::File> {
     let prepare = || -> std::io::Result<fs::File> {
         fs::create_dir_all(root)?;
         fs::OpenOptions::new().create(true).truncate(false).write(true).open(root.join("lock"))
     };
     let lock = prepare().map_err(|cause| files::unavailable("open the data folder", cause))?;
-    lock.file().try_lock().map_err(|cause| {
-        Error::new(ErrorCode::StoreUnavailable, "another process uses the data folder")
-            .caused_by(cause)
-    })?;
+    let begun = Instant::now();
+    while let Err(cause) = lock.file().try_lock() {
+        if begun.elapsed() >= LOCK_WAIT {
+            let taken = "another process uses the data folder";
+            let taken = Error::new(ErrorCode::StoreUnavailable, taken);
+            return Err(taken.caused_by(cause));
+        }
+        thread::sleep(LOCK_LOOK);
+    }
     Ok(lock)
 }
 
