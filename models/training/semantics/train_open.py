@@ -322,6 +322,7 @@ def main():
     ap.add_argument("--prepare", action="store_true", help="make the files of --prepared, and end")
     ap.add_argument("--limit", type=int, help="so many rows of each bank, to try the program")
     ap.add_argument("--name", default="")
+    ap.add_argument("--recipes", nargs="+", choices=list(RECIPES), default=list(RECIPES), help="one alone has twice the steps of two")
     args = ap.parse_args()
     device = torch.device(KIND)
     torch.manual_seed(args.seed)
@@ -436,7 +437,7 @@ def main():
     with torch.no_grad():
         sample = normalised(cuts.batch([k * (3 if KIND == "cuda" else 1) for k in args.batch])[0])
     students = []
-    for recipe in RECIPES:
+    for recipe in args.recipes:
         tower = ImageTower().to(device)
         unfold(tower, shipped, lite2, 0.0, sample)
         tower.requires_grad_(True)
@@ -533,7 +534,7 @@ def main():
                 save(s, s.name + ("_middle.pt" if 0.4 < mark < 0.5 else ".pt"))
     for s in students:
         save(s, s.name + ".pt")
-    for names in (["keep"], ["learn"], ["keep", "learn"]):
+    for names in [[r] for r in args.recipes] + [args.recipes] * (len(args.recipes) > 1):
         for share in (0.2, 0.35, 0.5, 0.65, 0.8, 1.0):
             said(f"{'+'.join(names)} end share {share}", measure(blended([s.ema for s in students if s.name in names], share)))
     tell("trained", step)
