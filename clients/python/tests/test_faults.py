@@ -263,3 +263,11 @@ def test_a_server_of_another_version_is_warned_of_once(
 
 def test_the_version_is_that_of_the_server(client: Client) -> None:
     assert client.models().server_version == segsplat.__version__
+
+
+def test_the_server_says_which_words_it_knows(client: Client) -> None:
+    words = {known.word: known for known in client.models().words}
+    chair = words["chair"]
+    assert isinstance(chair, segsplat.KnownWord) and chair.things > 0
+    assert chair.things_found is not None and 0 < chair.things_found <= 1
+    assert {known.trust for known in words.values()} == {"good", "fair", "poor", "unmeasured"}

@@ -319,6 +319,22 @@ class Event:
 
 
 @dataclass(frozen=True)
+class KnownWord:
+    """How well the server knows a word, on photographs that no training saw."""
+
+    word: str
+    #: What to expect of it; "unmeasured" where too few photographs show it.
+    trust: Literal["good", "fair", "poor", "unmeasured"]
+    #: Cut things and whole photographs that it may be said of, and the share of each that it selects.
+    things: int
+    things_found: float | None
+    photographs: int
+    photographs_found: float | None
+    #: Share of all others that it selects.
+    absent: float
+
+
+@dataclass(frozen=True)
 class Models:
     """What makes the scenes."""
 
@@ -327,6 +343,8 @@ class Models:
     execution_provider: str
     renderer: str
     server_version: str
+    #: What was measured of everyday words; empty where the bundle does not say.
+    words: tuple[KnownWord, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
