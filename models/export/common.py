@@ -70,13 +70,13 @@ def export(model, inputs, path, output_names, dynamic=None, half=False):
         onnx.save_model(graph, path)
 
 
-def single_precision(graph):
-    """The exporter writes some arithmetic of whole numbers and fractions in f64; the networks are f32 all through."""
-    double, single = onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT
+def narrow(graph, wide, to):
+    """Constants of the type `wide`, and casts to it, become those of the type `to`; graphs inside of nodes stay."""
+    numbers = onnx.helper.tensor_dtype_to_np_dtype(to)
 
     def narrowed(tensor):
-        if tensor.data_type == double:
-            tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float32), tensor.name))
+        if tensor.data_type == wide:
+            tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(numbers), tensor.name))
 
     for tensor in graph.initializer:
         narrowed(tensor)
@@ -84,8 +84,15 @@ def single_precision(graph):
         for attribute in node.attribute:
             if attribute.type == onnx.AttributeProto.TENSOR:
                 narrowed(attribute.t)
-            if node.op_type == "Cast" and attribute.name == "to" and attribute.i == double:
-                attribute.i = single
+            if node.op_type == "Cast" and attribute.name == "to" and attribute.i == wide:
+                attribute.i = to
+
+
+def single_precision(graph):
+    """The exporter writes some arithmetic of whole numbers and fractions in f64; the networks are f32 all through."""
+    narrow(graph, onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT)
+    for node in graph.node:
+        for attribute in node.attribute:
             if attribute.type == onnx.AttributeProto.GRAPH:
                 single_precision(attribute.g)
     # Types that the exporter noted; ONNX Runtime finds them again.
@@ -96,20 +103,10 @@ def half_precision(graph):
     """A graph of f32 computes in f16 between its inputs and outputs, which stay f32. Norms and softmax still add up
     in f32 there: ONNX Runtime's kernels do."""
     single, half = onnx.TensorProto.FLOAT, onnx.TensorProto.FLOAT16
-
-    def narrowed(tensor):
-        if tensor.data_type == single:
-            tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float16), tensor.name))
-
-    for tensor in graph.initializer:
-        narrowed(tensor)
+    narrow(graph, single, half)
     renamed = {}
     for node in graph.node:
         for attribute in node.attribute:
-            if attribute.type == onnx.AttributeProto.TENSOR:
-                narrowed(attribute.t)
-            if node.op_type == "Cast" and attribute.name == "to" and attribute.i == single:
-                attribute.i = half
             if attribute.type == onnx.AttributeProto.GRAPH or attribute.name in ("value_float", "value_floats"):
                 sys.exit(f"{node.name}: {node.op_type} is not known in f16")
     weights = {tensor.name for tensor in graph.initializer}

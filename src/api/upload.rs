@@ -16,7 +16,6 @@ use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
     scene::{Upload, UploadCameras, UploadFile},
-    service::ModelsInfo,
     telemetry::meter,
 };
 
@@ -213,12 +212,11 @@ impl<'a> UploadBuilder<'a> {
 }
 
 /// Refuses a bundle that is not the loaded one; an empty name stands for the loaded one.
-pub(super) fn check_bundle(asked: &str, models: &ModelsInfo) -> Result<()> {
-    if asked.is_empty() || asked == models.bundle {
+pub(super) fn check_bundle(asked: &str, loaded: &str) -> Result<()> {
+    if asked.is_empty() || asked == loaded {
         return Ok(());
     }
-    let message =
-        format!("bundle is {:?}; this server has {:?} loaded", short(asked), models.bundle);
+    let message = format!("bundle is {:?}; this server has {loaded:?} loaded", short(asked));
     Err(Error::new(ErrorCode::ModelUnavailable, message))
 }
 

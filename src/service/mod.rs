@@ -313,6 +313,11 @@ impl Service {
         }
     }
 
+    /// Name of the bundle.
+    pub fn bundle(&self) -> &str {
+        &self.inner.models.bundle
+    }
+
     /// What makes and renders the scenes.
     pub fn models(&self) -> ModelsInfo {
         let mut models = self.inner.models.clone();

@@ -165,9 +165,8 @@ fn lock(root: &Path) -> Result<fs::File> {
     let begun = Instant::now();
     while let Err(cause) = lock.file().try_lock() {
         if begun.elapsed() >= LOCK_WAIT {
-            let taken = "another process uses the data folder";
-            let taken = Error::new(ErrorCode::StoreUnavailable, taken);
-            return Err(taken.caused_by(cause));
+            let code = ErrorCode::StoreUnavailable;
+            return Err(Error::new(code, "another process uses the data folder").caused_by(cause));
         }
         thread::sleep(LOCK_LOOK);
     }

@@ -1,5 +1,7 @@
-"""Which of the eleven colour words is true of a picture under a mask (the order is prepare.py's COLOURS)."""
+"""The eleven colour words, and which of them is true of a picture under a mask."""
 import torch
+
+COLOURS = "red orange yellow green blue purple pink brown black white gray".split()
 
 
 def dominant_colour(rgb, keep):

@@ -14,13 +14,12 @@ import os
 import numpy as np
 import torch
 
-from colours import dominant_colour
+import cuts
+from colours import COLOURS, dominant_colour
 from naming import HERE, Bundle, Everyday, collect
 from train_real import SIDE, decode, letterbox
 from wordnet import WordNet
-import cuts
 
-COLOURS = ["red", "orange", "yellow", "green", "blue", "purple", "pink", "brown", "black", "white", "gray"]  # as colours.py
 FEWEST = 5  # things that a figure is trusted from
 GOOD, POOR = (0.7, 0.03), (0.4, 0.1)  # found at least, absent at most; found under, absent over
 

@@ -27,8 +27,9 @@ from PIL import Image
 
 import cuts
 import naming
+from colours import COLOURS
 from heldout import heldout
-from prepare import CALTECH, COLOURS, Vocabulary, labelled, webp
+from prepare import CALTECH, Vocabulary, labelled, webp
 from wordnet import BODILY, GENERAL, WordNet
 
 TINY_A_CLASS = 62

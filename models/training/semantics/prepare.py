@@ -24,10 +24,10 @@ from PIL import Image
 from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors, trainers
 
 import names as mesh_names
+from colours import COLOURS
 from heldout import heldout
 from wordnet import BODILY, GENERAL, WordNet
 
-COLOURS = "red orange yellow green blue purple pink brown black white gray".split()
 STUFF = {
     "wall-other": "wall", "sky-other": "sky", "building-other": "building", "floor-other": "floor", "window-other": "window",
     "food-other": "food", "door-stuff": "door", "wall-tile": "tiled wall", "floor-wood": "wooden floor", "wall-wood": "wooden wall",

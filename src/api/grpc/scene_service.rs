@@ -235,7 +235,7 @@ fn begin(
 ) -> Result<pb::CreateSceneHeader> {
     convert::value::<SemanticsMode>("semantics", header.semantics)?;
     convert::refine(&header.refine)?;
-    check_bundle(&header.bundle, &api.service.models())?;
+    check_bundle(&header.bundle, api.service.bundle())?;
     let cameras = header.cameras.take().map(|cameras| match cameras {
         Cameras::TransformsJson(json) => UploadCameras::Transforms(json.into()),
         Cameras::CamerasJson(json) => UploadCameras::Cameras(json.into()),

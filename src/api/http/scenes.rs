@@ -188,7 +188,7 @@ fn options(api: &Api, mut fields: Fields) -> Result<(SceneOptions, Option<Durati
     let options: SceneOptions = fields.take()?;
     let CreateParams { bundle, wait_ms } = fields.take()?;
     fields.finish()?;
-    check_bundle(&bundle.unwrap_or_default(), &api.service.models())?;
+    check_bundle(&bundle.unwrap_or_default(), api.service.bundle())?;
     Ok((options, wait_ms.map(Duration::from_millis)))
 }
 

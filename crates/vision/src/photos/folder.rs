@@ -366,7 +366,6 @@ fn entry_path(
             )));
         }
     };
-    let file = path.rsplit('/').next().unwrap_or(&path);
-    let left_by_macos = path.starts_with("__MACOSX/") || file.starts_with("._");
+    let left_by_macos = path.starts_with("__MACOSX/") || names::file_name(&path).starts_with("._");
     Ok((!folder && !left_by_macos).then_some(path))
 }

@@ -8,7 +8,9 @@
 
 use glam::{DMat3, DVec3};
 
-use super::{CameraEntry, Described, Layout, PoseAxes, count, inverse, numbers_of, pinhole, text};
+use super::{
+    CameraEntry, Described, Layout, PoseAxes, called, count, inverse, numbers_of, pinhole, text,
+};
 use crate::{
     error::Result,
     photos::{folder::Folder, names},
@@ -54,8 +56,7 @@ impl Layout for ArKitScenes {
     }
 
     fn find(&self, folder: &Folder<'_>) -> Vec<String> {
-        let is_traj = |path: &&str| names::file_name(path) == "lowres_wide.traj";
-        folder.paths().filter(is_traj).map(str::to_owned).collect()
+        called(folder, "lowres_wide.traj")
     }
 
     fn read(&self, folder: &Folder<'_>, at: &str) -> Result<Described> {

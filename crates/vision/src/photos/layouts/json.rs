@@ -1,7 +1,7 @@
 //! Captures that have one camera JSON: nerfstudio, instant-ngp, `NeRF` scenes of Blender,
 //! `ScanNet++` (`dslr/nerfstudio/transforms.json`), and our own.
 
-use super::{Described, Layout};
+use super::{Described, Layout, called};
 use crate::{
     error::Result,
     photos::{cameras, folder::Folder, names},
@@ -9,11 +9,6 @@ use crate::{
 
 pub(super) struct Transforms;
 pub(super) struct OurCameras;
-
-/// The files of this name.
-fn called(folder: &Folder<'_>, name: &str) -> Vec<String> {
-    folder.paths().filter(|path| names::file_name(path) == name).map(str::to_owned).collect()
-}
 
 impl Layout for Transforms {
     fn name(&self) -> &'static str {

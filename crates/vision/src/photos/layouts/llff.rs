@@ -4,7 +4,7 @@
 //! height, width and focal length; the last two are a depth range, which is not needed (LLFF's
 //! README, "Using your own poses without running COLMAP").
 
-use super::{CameraEntry, Described, Layout, PoseAxes, pinhole};
+use super::{CameraEntry, Described, Layout, PoseAxes, called, pinhole};
 use crate::{
     error::{Error, Result},
     photos::{folder::Folder, names, npy::Array},
@@ -21,8 +21,7 @@ impl Layout for Llff {
     }
 
     fn find(&self, folder: &Folder<'_>) -> Vec<String> {
-        let is_poses = |path: &&str| names::file_name(path) == "poses_bounds.npy";
-        folder.paths().filter(is_poses).map(str::to_owned).collect()
+        called(folder, "poses_bounds.npy")
     }
 
     fn read(&self, folder: &Folder<'_>, at: &str) -> Result<Described> {

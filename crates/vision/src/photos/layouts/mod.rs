@@ -16,6 +16,7 @@ use super::{
     cameras::{CameraEntry, Cameras, PoseAxes},
     folder::Folder,
     lens::Lens,
+    names,
 };
 use crate::error::{Error, Result};
 
@@ -97,6 +98,11 @@ pub(super) fn read(folder: &Folder<'_>) -> Result<Described> {
             )))
         }
     }
+}
+
+/// The files of this name.
+fn called(folder: &Folder<'_>, name: &str) -> Vec<String> {
+    folder.paths().filter(|path| names::file_name(path) == name).map(str::to_owned).collect()
 }
 
 /// Camera-to-world, row-major, of a rotation and a centre.
