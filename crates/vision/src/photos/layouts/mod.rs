@@ -1,5 +1,5 @@
-//! The layouts of captures, one reader each. What a capture is, its file names tell, and a look
-//! into a file where names alone do not.
+//! The layouts of captures, one reader each. A layout is recognised by the names of its files, and
+//! by a look into a file where names are not enough.
 
 mod arkit;
 mod colmap;
@@ -20,7 +20,7 @@ use super::{
 };
 use crate::error::{Error, Result};
 
-/// A layout of captures: how its files are told, and how its cameras are read.
+/// A layout of captures: how it is recognised by its files, and how its cameras are read.
 trait Layout: Sync {
     /// Its name in messages.
     fn name(&self) -> &'static str;
