@@ -21,6 +21,8 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 HEADS = 6
+# Sweeps whose samples are multiplied with a pixel's own features: the coarse one and the finer one.
+PRODUCTS = 2
 # Near the outputs 8 bits are seen: colours, the last depths, features that are compared.
 KEPT = ("/head_in/", "/out/", "/up_h/", "/r_out/", "/m2/", "/m4/", "/logits/", "/u4/", "/stem/")
 
@@ -55,6 +57,10 @@ class Graph:
         if maker.op_type == "DequantizeLinear":
             value = value * self.value(maker.input[1]).reshape([-1] + [1] * (value.ndim - 1))
         return value
+
+    def user(self, name, op):
+        """The first node of type `op` that takes the value; shapes of it are taken, too."""
+        return next((n for n in self.users.get(name, []) if n.op_type == op), None)
 
     def rename(self, names):
         for n in self.nodes:
@@ -123,7 +129,7 @@ def attention(g):
 
 def sweeps(g):
     """Places as planes; products with samples as one operator."""
-    names = {}
+    names, products = {}, 0
     one, two, four, least = (g.constant(f"sweep_{k}", np.float32(v)) for k, v in (("one", 1), ("two", 2), ("four", 4), ("minus_four", -4)))
     last, thirds = g.constant("sweep_last", np.array([3])), g.constant("sweep_thirds", np.array([1, 1, 1]))
     for sampled in [n for n in g.nodes if n.op_type == "GridSample"]:
@@ -156,16 +162,24 @@ def sweeps(g):
             places.append(node("Clip", [node("Where", [front, p, four], c + "3"), least, four], c + "4"))
         names[depth] = w
         names[distance.output[0]] = node("Max", [node("Abs", [p], c + "5") for c, p in zip("xy", places)], "distance")
-        product = g.users[sampled.output[0]][0]
-        if product.op_type == "Mul":
+        product = g.user(sampled.output[0], "Mul")
+        if product:
             own = g.makers[sampled.input[0]].input[0]
-            total = g.users[g.users[product.output[0]][0].output[0]][0]
-            if total.op_type != "ReduceSum":
+            parts = g.user(product.output[0], "Reshape")
+            total = parts and g.user(parts.output[0], "ReduceSum")
+            if not total:
                 raise SystemExit(f"{sampled.name} is not the product that this script knows")
             groups = 2 if sampled.name.endswith("GridSample") else 1
+            products += 1
             names[total.output[0]] = node("Correlate", [sampled.input[0], own, *places], "product", domain="segsplat", groups=groups)
+            # Others ask for the shape of the samples: that of the maps, and that of the places.
+            maps, at = (node("Shape", [x], c, start=first, end=first + 2) for x, c, first in ((sampled.input[0], "maps", 0), (places[0], "at", 1)))
+            shape = node("Concat", [maps, at], "shape", axis=0)
+            names |= {n.output[0]: shape for n in g.users[sampled.output[0]] if n.op_type == "Shape"}
         else:
             names[clip.output[0]] = node("Concat", [node("Unsqueeze", [p, last], c + "6") for c, p in zip("xy", places)], "places", axis=3)
+    if products != PRODUCTS:
+        raise SystemExit(f"{products} of {PRODUCTS} products with samples were found")
     g.rename(names)
 
 

@@ -11,7 +11,7 @@ use crate::{
         check::Signature,
         fit,
         fit::FittedPhoto,
-        network::{Input, Network, Outputs, Side, Spec, Wanted},
+        network::{Input, Network, Outputs, RunMemory, Side, Spec, Wanted},
     },
     scene::{CameraToWorld, Intrinsics, PosedPhoto, ViewGaussians},
 };
@@ -63,7 +63,7 @@ impl Geometry {
             file: &manifest.file,
             cpu_file: manifest.cpu.as_ref().map(|cpu| cpu.file.as_str()),
             signature: signature(&manifest),
-            keeps_memory: false,
+            memory: RunMemory::GivenBack,
             tolerance: TOLERANCE,
             probe: &|_| Ok(probe.inputs(&manifest)),
         };

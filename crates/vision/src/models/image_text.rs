@@ -11,7 +11,7 @@ use crate::{
         Bundle, ImageTextManifest, NetworkOptions, Provider, Runtime,
         check::Signature,
         manifest::unavailable,
-        network::{Input, Network, Outputs, Side, Spec, Takes, Wanted, fixed},
+        network::{Input, Network, Outputs, RunMemory, Side, Spec, Takes, Wanted, fixed},
         resize::{planes, resize},
     },
     scene::{Crop, TextEmbedding},
@@ -39,6 +39,9 @@ pub struct ImageText {
 
 /// Largest difference of a provider to the CPU, of embeddings of texts.
 const TOLERANCE: f64 = 2e-3;
+/// Crops a run of the image tower on a CPU, which takes as long for each as with 16, and a quarter
+/// of the memory (docs/adr/0034-many-photos.md).
+const CPU_CROPS: usize = 4;
 /// Texts a run of the text tower where its file leaves that free.
 const TEXTS_A_RUN: usize = 64;
 
@@ -72,7 +75,7 @@ impl ImageText {
             file: &tower.file,
             cpu_file: None,
             signature: image_signature(&manifest),
-            keeps_memory: true,
+            memory: RunMemory::KeptOnDevices,
             tolerance: tower.tolerance,
             probe: &|takes| {
                 let count = size(takes, &tower.input, 0).unwrap_or(tower.batch);
@@ -88,7 +91,7 @@ impl ImageText {
             file: &tower.file,
             cpu_file: None,
             signature: text_signature(&manifest),
-            keeps_memory: true,
+            memory: RunMemory::Kept,
             tolerance: TOLERANCE,
             probe: &|takes| {
                 let length = size(takes, &tower.input_ids, 1).unwrap_or(tower.context.min(8));
@@ -159,7 +162,7 @@ impl ImageText {
         let tower = &self.manifest.image;
         let side = tower.size as usize;
         let mut rows = Vec::with_capacity(crops.len() * self.manifest.dim);
-        for batch in crops.chunks(self.crops.unwrap_or(tower.batch)) {
+        for batch in crops.chunks(self.crops.unwrap_or(tower.batch.min(CPU_CROPS))) {
             // Where the number of crops is fixed, the last run is filled up.
             let count = self.crops.unwrap_or(batch.len());
             let mut images = vec![0.0; count * 3 * side * side];

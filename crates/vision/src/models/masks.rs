@@ -13,7 +13,7 @@ use crate::{
         Bundle, MaskAdapter, MasksManifest, NetworkOptions, Provider, Runtime,
         check::Signature,
         manifest::unavailable,
-        network::{self, Input, Network, Outputs, Side, Spec, Wanted, fixed},
+        network::{self, Input, Network, Outputs, RunMemory, Side, Spec, Wanted, fixed},
         resize::{planes, resize},
     },
     scene::{JudgedMasks, MaskJudging, MaskLogits, Photo},
@@ -29,6 +29,9 @@ const PHOTO_COLUMNS: &str = "photo_columns";
 const STABILITY_OFFSET: &str = "stability_offset";
 const MASK_BITS: &str = "mask_bits";
 const MASK_COUNTS: &str = "mask_counts";
+/// Prompts a run of the decoder on a CPU, which takes as long for each as with 64, and a quarter of
+/// the memory (docs/adr/0034-many-photos.md).
+const CPU_PROMPTS: usize = 16;
 /// Most pixels of masks that are judged in one run: a quarter of a gigabyte of f32, a few times.
 const JUDGED_PIXELS_MAX: usize = 1 << 26;
 /// Largest share of judged pixels that may differ from the logits: those next to a threshold.
@@ -108,7 +111,7 @@ impl MaskNetwork {
             file: &names.file,
             cpu_file: None,
             signature: encoder_signature(&manifest),
-            keeps_memory: true,
+            memory: RunMemory::KeptOnDevices,
             tolerance: manifest.tolerance,
             probe: &|_| Ok(vec![input()]),
         };
@@ -123,16 +126,20 @@ impl MaskNetwork {
             file: &manifest.decoder.file,
             cpu_file: None,
             signature: decoder_signature(&manifest),
-            keeps_memory: true,
+            memory: RunMemory::Kept,
             tolerance: manifest.tolerance,
             probe: &|found| {
-                let takes = Takes::of(found, &manifest)?;
+                let takes = Takes::of(found, &manifest, points.len())?;
                 let points = &points[..takes.batch.min(points.len())];
                 Ok(takes.inputs(&manifest, &seen, points, None))
             },
         };
         let decoder = Network::open(runtime, bundle, options, &spec)?;
-        let takes = Takes::of(decoder.takes(), &manifest)?;
+        let most = match decoder.provider() {
+            Provider::Cpu => points.len().min(CPU_PROMPTS),
+            Provider::Cuda | Provider::Webgpu => points.len(),
+        };
+        let takes = Takes::of(decoder.takes(), &manifest, most)?;
         let mut network = Self { encoder, decoder, takes, manifest: manifest.clone() };
         if network.judges().is_some()
             && network.provider() != Provider::Cpu
@@ -393,8 +400,8 @@ impl MaskNetwork {
 }
 
 impl Takes {
-    /// Reads the inputs of the decoder's file.
-    fn of(file: &network::Takes, manifest: &MasksManifest) -> Result<Self> {
+    /// Reads the inputs of the decoder's file; `most` prompts a run where it leaves that free.
+    fn of(file: &network::Takes, manifest: &MasksManifest, most: usize) -> Result<Self> {
         let names = &manifest.decoder;
         let efficient = manifest.adapter == MaskAdapter::EfficientSam;
         let wanted = if efficient { 4 } else { 3 };
@@ -410,10 +417,10 @@ impl Takes {
         // A padding point follows the prompt, as SAM's own code adds one where there is no box.
         // EfficientSAM pads by itself.
         let points = fixed(coords[wanted - 2]).unwrap_or(if efficient { 1 } else { 2 });
-        let most = manifest.points_per_batch as usize;
+        let batch = manifest.points_per_batch as usize;
         Ok(Self {
             efficient,
-            batch: fixed(coords[wanted - 3]).map_or(most, |batch| batch.min(most)),
+            batch: fixed(coords[wanted - 3]).map_or(most, |fixed| fixed.min(batch)),
             points,
             mask: file
                 .get(&names.mask_input)

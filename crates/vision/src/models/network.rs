@@ -394,6 +394,27 @@ pub(super) fn fixed(dimension: i64) -> Option<usize> {
     usize::try_from(dimension).ok().filter(|&n| n > 0)
 }
 
+/// What becomes of the memory of a run of a network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum RunMemory {
+    /// It is kept for the next one: shapes are few and runs are short.
+    Kept,
+    /// A device keeps it. On the CPU it goes back: a run is long beside the time to get it anew.
+    KeptOnDevices,
+    /// It goes back: shapes are many and large.
+    GivenBack,
+}
+
+impl RunMemory {
+    fn is_kept_on(self, provider: Provider) -> bool {
+        match self {
+            Self::Kept => true,
+            Self::KeptOnDevices => provider != Provider::Cpu,
+            Self::GivenBack => false,
+        }
+    }
+}
+
 /// Which network, and how a provider is held to the CPU.
 pub(super) struct Spec<'a> {
     /// Its name in messages.
@@ -404,8 +425,8 @@ pub(super) struct Spec<'a> {
     pub(super) cpu_file: Option<&'a str>,
     /// The tensors that it must have; its outputs are compared.
     pub(super) signature: Vec<Wanted<'a>>,
-    /// Whether its shapes are few and small, so that memory of a run is kept for the next.
-    pub(super) keeps_memory: bool,
+    /// What becomes of the memory of a run.
+    pub(super) memory: RunMemory,
     /// The largest relative difference of an output to the CPU's, root of mean squares.
     pub(super) tolerance: f64,
     /// The fixed input of the comparison.
@@ -422,8 +443,8 @@ struct Opener {
     cpu_file: Option<PathBuf>,
     /// One session, whatever the number of jobs.
     shared: bool,
-    /// [`Spec::keeps_memory`].
-    keeps_memory: bool,
+    /// [`Spec::memory`].
+    memory: RunMemory,
 }
 
 impl Opener {
@@ -434,7 +455,9 @@ impl Opener {
         let (count, threads) = match provider {
             Provider::Cpu if self.shared => (1, self.options.threads),
             Provider::Cpu => shares(self.options.threads, self.options.jobs),
-            Provider::Cuda if self.keeps_memory => (CUDA_SESSIONS, self.options.threads),
+            Provider::Cuda if self.memory.is_kept_on(provider) => {
+                (CUDA_SESSIONS, self.options.threads)
+            }
             Provider::Cuda | Provider::Webgpu => (1, self.options.threads),
         };
         let own = self.cpu_file.as_ref().filter(|_| provider == Provider::Cpu);
@@ -447,7 +470,8 @@ impl Opener {
         let weights = PrepackedWeights::new();
         let session = |_| {
             let weights = Some(&weights);
-            self.runtime.session(file, provider, threads, weights, arithmetic, self.keeps_memory)
+            let keeps_memory = self.memory.is_kept_on(provider);
+            self.runtime.session(file, provider, threads, weights, arithmetic, keeps_memory)
         };
         let sessions: Vec<Session> = (0..count).map(session).collect::<ort::Result<_>>()?;
         let takes = sessions.first().map(Takes::of).unwrap_or_default();
@@ -513,7 +537,7 @@ impl Network {
             file: bundle.path(spec.file),
             cpu_file: spec.cpu_file.map(|file| bundle.path(file)),
             shared: bundle.network_bytes(spec.file) > SHARED_BYTES,
-            keeps_memory: spec.keeps_memory,
+            memory: spec.memory,
         };
         let mut refused = None;
         for provider in runtime.candidates(options.provider)? {
@@ -798,7 +822,7 @@ mod tests {
             file: "fake.onnx",
             cpu_file: None,
             signature: vec![Wanted::new(Side::Output, "answer", vec![vec![1]])],
-            keeps_memory: true,
+            memory: RunMemory::Kept,
             tolerance: 1e-2,
             probe: &|_| Ok(Vec::new()),
         };
