@@ -38,8 +38,8 @@ const PART_BYTES: usize = 256 << 10;
 impl Service {
     /// The scene, or what a text selects of it, as a file for other programs; as `npz` its
     /// semantics, which are made where they are not there; as `packed` and `html` what the page
-    /// draws; as a folder in a zip what [`FolderFormat`] says. For `html`, `coco` and `labelme` each
-    /// line of the text is a text.
+    /// draws; as a folder in a zip what [`FolderFormat`] says. For `html`, `coco` and `labelme`
+    /// each line of the text is a text.
     ///
     /// # Errors
     /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; `invalid_request` for a scene that

@@ -110,7 +110,7 @@ mod tests {
                 .map(|i| {
                     state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
                     // Runs of all lengths.
-                    if case % 2 == 0 { (state >> 33) % 3 == 0 } else { i / (1 + case) % 2 == 0 }
+                    if case % 2 == 0 { (state >> 33) % 3 < 1 } else { i / (1 + case) % 2 == 0 }
                 })
                 .collect();
             assert_eq!(Rle::encode(&mask, width, height).decode(), mask, "case {case}");

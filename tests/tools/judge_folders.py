@@ -40,7 +40,8 @@ def check(is_so: bool, what: str) -> None:
 
 def run(*words: object) -> dict:
     """The program's answer."""
-    told = subprocess.run([segsplat, *map(str, words), "--json"], stdout=subprocess.PIPE, check=True)
+    line = [segsplat, *map(str, words), "--json"]
+    told = subprocess.run(line, stdout=subprocess.PIPE, check=True)
     return json.loads(told.stdout)
 
 
@@ -116,7 +117,9 @@ def judge_colmap(folder: Path, frames: list[dict], truth: list[np.ndarray]) -> N
     print(f"colmap: {len(model.images)} images, {len(model.points3D)} points, poses within {worst}")
 
 
-def judge_nerfstudio(folder: Path, frames: list[dict], truth: list[np.ndarray], points: int) -> None:
+def judge_nerfstudio(
+    folder: Path, frames: list[dict], truth: list[np.ndarray], points: int
+) -> None:
     """The capture against what the documentation of nerfstudio says."""
     told = json.loads((folder / "transforms.json").read_text())
     for frame, found, depth in zip(frames, told["frames"], truth, strict=True):

@@ -44,8 +44,8 @@ pub(super) struct ViewParams {
 pub(super) struct ExportParams {
     /// `ply` (default), `compressed_ply`, `spz`, `spz4`, `sog`, `glb` or `splat`: Gaussians for
     /// other programs; `npz`: the semantics as arrays; `packed`: the scene as the page draws it;
-    /// `html`: the page with the scene in it, and what it shows of each line of `text`; `colmap` and
-    /// `nerfstudio`: a zip of a folder with photos, cameras, points and depth maps; `coco` and
+    /// `html`: the page with the scene in it, and what it shows of each line of `text`; `colmap`
+    /// and `nerfstudio`: a zip of a folder with photos, cameras, points and depth maps; `coco` and
     /// `labelme`: a zip with what each line of `text` selects in each photo.
     #[param(inline)]
     format: ExportFormat,

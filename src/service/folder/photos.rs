@@ -125,9 +125,9 @@ fn names(cameras: &[SceneCamera]) -> Vec<String> {
 /// The parts of a path that lead nowhere but down, without what some system cannot write.
 fn parts(path: &str) -> Vec<String> {
     let odd = |c: char| c.is_control() || "<>:\"|?*".contains(c);
+    // Of `.` and `..` nothing is left.
     let part = |part: &str| part.replace(odd, "_").trim_matches([' ', '.']).to_owned();
-    let parts = path.split(['/', '\\']).filter(|part| !["", ".", ".."].contains(part));
-    parts.map(part).filter(|part| !part.is_empty()).collect()
+    path.split(['/', '\\']).map(part).filter(|part| !part.is_empty()).collect()
 }
 
 #[cfg(test)]
