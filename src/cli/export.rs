@@ -83,15 +83,14 @@ fn folder(args: &Args, format: &FolderFormat, config: &Config, out: &Output) -> 
     let semantics = engine::semantics(config, format.texts)?;
     let service = OfflineService::new(semantics, engine::renderer(config)?, config.limits.clone());
     let unwritable = |e| scene_file::unwritable(&args.output, e);
-    let mut file = fs_err::File::create(&args.output).map_err(unwritable)?;
+    // Half a zip is of no use, and what was there before stays until there is a whole one.
+    let part = args.output.with_added_extension("part");
+    let mut file = fs_err::File::create(&part).map_err(unwritable)?;
     let how = (&args.texts[..], args.preset, &args.scoring);
     let written = service.folder(&scene, format, how, upload.as_ref(), &mut file);
-    if written.is_err() {
-        // Half a zip is of no use.
-        let _ = fs_err::remove_file(&args.output);
-    }
-    let photos = written?;
+    let photos = written.inspect_err(|_| drop(fs_err::remove_file(&part)))?;
     let size_bytes = file.metadata().map_err(unwritable)?.len();
+    fs_err::rename(&part, &args.output).map_err(unwritable)?;
     let (path, name, views) = (args.output.display(), format.name, scene.meta.cameras.len());
     let value = json!({
         "output": path.to_string(), "format": name, "views": views, "photos": photos,

@@ -218,6 +218,8 @@ struct Parts {
 
 impl Write for Parts {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        // A view that is written at once would be one message.
+        let bytes = &bytes[..bytes.len().min(PART_BYTES)];
         let send = self.to.send(Ok(bytes.to_vec()));
         let sent = match self.until {
             None => self.runtime.block_on(send),
@@ -240,6 +242,22 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
+
+    #[tokio::test]
+    async fn what_is_written_at_once_comes_in_parts() {
+        let sent: Vec<u8> = (0..3 * PART_BYTES + 9).map(|i| (i % 251) as u8).collect();
+        let written = sent.clone();
+        let mut chunks = stream(move |to: &mut dyn Write| {
+            to.write_all(&written).map_err(|e| Error::internal("broken off").caused_by(e))
+        });
+        let mut taken = Vec::new();
+        while let Some(part) = chunks.recv().await {
+            let part = part.unwrap();
+            assert!(part.len() <= PART_BYTES, "{} bytes", part.len());
+            taken.extend(part);
+        }
+        assert!(taken == sent);
+    }
 
     #[tokio::test]
     async fn a_caller_who_takes_nothing_frees_the_thread_that_writes() {

@@ -20,7 +20,7 @@ use crate::{
         export::stream_until,
         request::{ScoringOptions, TextOptions},
         schedule::Slot,
-        search::SceneTexts,
+        search::{SceneTexts, check_scoring},
         semantics::{Understood, meaning_tag},
         texts,
         types::{Export, TextView},
@@ -125,18 +125,20 @@ impl Service {
         let access = self.scene(id).await?.finished()?;
         let record = access.record();
         let views = photo_views(&limits, &record.status.cameras, record, preset, texts.len())?;
-        let permit = inner.folder_permit()?;
-        let until = Instant::now() + Duration::from_millis(limits.views_timeout_ms);
         let (scene, texts) = if texts.is_empty() {
             let (inner, access) = (Arc::clone(&inner), access.clone());
             (blocking(move || inner.load(&access)).await??, None)
         } else {
             let understood = inner.understood(&access, "text", ask.wait).await?;
-            inner.embed(&understood, (preset, &ask.scoring), &texts, until).await?;
+            let most = Instant::now() + Duration::from_millis(limits.render_timeout_ms);
+            inner.embed(&understood, (preset, &ask.scoring), &texts, most).await?;
             let scoring = ask.scoring.clone();
             let scene = Arc::clone(&understood.scene);
             (scene, Some(Texts { understood, texts, preset, scoring }))
         };
+        // Not before: semantics can take minutes.
+        let permit = inner.folder_permit()?;
+        let until = Instant::now() + Duration::from_millis(limits.views_timeout_ms);
         let upload = {
             let (inner, id) = (Arc::clone(&inner), id.clone());
             blocking(move || inner.kept_upload(&id)).await??
@@ -199,6 +201,7 @@ impl OfflineService {
         to: &mut dyn Write,
     ) -> Result<usize> {
         let limits = &self.limits;
+        check_scoring(scoring, limits)?;
         let asked = format.checked(asked, limits)?;
         let views = photo_views(limits, &scene.meta.cameras, scene, preset, asked.len())?;
         let texts = if asked.is_empty() {
