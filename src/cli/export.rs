@@ -1,15 +1,18 @@
 //! `segsplat export`: the Gaussians of a scene as a file for other programs, or of such a file as
-//! another.
+//! another; or the scene as a zip of a folder with photos, cameras and depth, or masks of texts.
 
 use std::path::PathBuf;
 
 use serde_json::json;
 
-use super::{output::Output, scene_file};
+use super::{engine, output::Output, reconstruct, scene_file};
 use crate::{
-    config::Config,
+    config::{Config, ConfigArgs},
     error::{Error, Result},
-    store::splats::{SplatFile, endings},
+    names::named,
+    scene::Preset,
+    service::{FOLDER_FORMATS, FolderFormat, OfflineService, ScoringOptions},
+    store::splats::{SplatFile, SplatFormat, endings},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -17,17 +20,50 @@ pub(super) struct Args {
     /// Scene file, a folder with one, or a file of Gaussians (PLY, compressed PLY, SPZ, SOG, GLB,
     /// .splat)
     scene: PathBuf,
-    /// File to write; its ending (ply, compressed.ply, spz, v4.spz, sog, glb, splat) is the format
+    /// File to write; its ending is the format: ply, compressed.ply, spz, v4.spz, sog, glb, splat;
+    /// of a folder colmap.zip, nerfstudio.zip, coco.zip, labelme.zip
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
+    /// What the scene was made of, a folder or an archive, for a folder with its photos
+    #[arg(long, value_name = "PATH")]
+    photos: Option<PathBuf>,
+    /// What to look for, for coco.zip and labelme.zip; may be given many times
+    #[arg(long = "text", value_name = "TEXT")]
+    texts: Vec<String>,
+    /// How it is drawn and texts are scored: default or paper; by default as the scene was made
+    #[arg(long, value_parser = named::<Preset>)]
+    preset: Option<Preset>,
+    #[command(flatten)]
+    scoring: ScoringOptions,
+    #[command(flatten)]
+    pub(super) config: ConfigArgs,
 }
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
+    let name = args.output.file_name().unwrap_or_default().to_string_lossy();
+    if let Some(format) = FolderFormat::of_file(&name) {
+        return folder(args, format, config, out);
+    }
     let format = scene_file::splat_format(&args.output).ok_or_else(|| {
-        let endings = endings();
-        let path = args.output.display();
-        Error::invalid(format!("{path}: the ending must be that of a format: {endings}"))
+        let folders = FOLDER_FORMATS.map(|format| format.ending).join(", ");
+        let (endings, path) = (endings(), args.output.display());
+        let why = format!("the ending must be that of a format: {endings}, {folders}");
+        Error::invalid(format!("{path}: {why}"))
     })?;
+    if args.photos.is_some() || !args.texts.is_empty() {
+        let name = format.name;
+        let why = format!("--photos and --text go with folders, not with {name}");
+        return Err(Error::invalid(why));
+    }
+    gaussians(args, format, config, out)
+}
+
+fn gaussians(
+    args: &Args,
+    format: &'static SplatFormat,
+    config: &Config,
+    out: &Output,
+) -> Result<()> {
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
     let count = scene.gaussians.len();
     let file = SplatFile::new(format, scene.gaussians, scene.semantics.as_deref())?;
@@ -38,4 +74,28 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         "semantics": format.semantics && scene.semantics.is_some(),
     });
     out.answer(&format!("{path}: {count} Gaussians as {}", format.name), &value)
+}
+
+fn folder(args: &Args, format: &FolderFormat, config: &Config, out: &Output) -> Result<()> {
+    let scene = scene_file::open(&args.scene, &config.limits)?.scene;
+    let photos = args.photos.as_deref();
+    let upload = photos.map(|path| reconstruct::upload(path, config)).transpose()?;
+    let semantics = engine::semantics(config, format.texts)?;
+    let service = OfflineService::new(semantics, engine::renderer(config)?, config.limits.clone());
+    let unwritable = |e| scene_file::unwritable(&args.output, e);
+    // Half a zip is of no use, and what was there before stays until there is a whole one.
+    let part = args.output.with_added_extension("part");
+    let mut file = fs_err::File::create(&part).map_err(unwritable)?;
+    let how = (&args.texts[..], args.preset, &args.scoring);
+    let written = service.folder(&scene, format, how, upload.as_ref(), &mut file);
+    let photos = written.inspect_err(|_| drop(fs_err::remove_file(&part)))?;
+    let size_bytes = file.metadata().map_err(unwritable)?.len();
+    fs_err::rename(&part, &args.output).map_err(unwritable)?;
+    let (path, name, views) = (args.output.display(), format.name, scene.meta.cameras.len());
+    let value = json!({
+        "output": path.to_string(), "format": name, "views": views, "photos": photos,
+        "size_bytes": size_bytes,
+    });
+    let text = format!("{path}: {views} views as {name}, {photos} photos, {size_bytes} bytes");
+    out.answer(&text, &value)
 }

@@ -65,8 +65,9 @@ enum Command {
     Query(Box<query::Args>),
     /// Write the bank of a scene, or the pixels of a view over it, as an npz file
     Features(Box<features::Args>),
-    /// Write the Gaussians of a scene for other programs: PLY, SPZ, SOG, GLB, .splat
-    Export(export::Args),
+    /// Write a scene for other programs: PLY, SPZ, SOG, GLB, .splat, COLMAP, nerfstudio, COCO,
+    /// labelme
+    Export(Box<export::Args>),
     /// Show what is in a scene file
     Inspect(inspect::Args),
     /// The model bundle and ONNX Runtime
@@ -89,9 +90,8 @@ impl Command {
             Self::Features(args) => common(&args.config),
             Self::Models(args) => common(&args.config),
             Self::Bench(args) => common(&args.config),
-            Self::Export(_) | Self::Inspect(_) | Self::Sample(_) | Self::Keys(_) => {
-                AllArgs::default()
-            }
+            Self::Export(args) => common(&args.config),
+            Self::Inspect(_) | Self::Sample(_) | Self::Keys(_) => AllArgs::default(),
         }
     }
 }

@@ -151,14 +151,26 @@ fn read(path: &Path, config: &Config, cancel: &AtomicBool) -> Result<(PhotoSet, 
     if path.is_dir() {
         return pipeline::read_dir(path, &config.limits, cancel);
     }
+    let upload = archive(path, config)?;
+    Ok((pipeline::read(&upload, &config.limits, cancel)?, upload))
+}
+
+/// The files of a folder or an archive that a scene is made of.
+pub(super) fn upload(path: &Path, config: &Config) -> Result<Upload> {
+    match path.is_dir() {
+        true => read(path, config, &AtomicBool::new(false)).map(|(_, upload)| upload),
+        false => archive(path, config),
+    }
+}
+
+fn archive(path: &Path, config: &Config) -> Result<Upload> {
     let size = fs_err::metadata(path).map_err(|e| unreadable(path, e))?.len();
     let max = config.limits.upload_bytes_max;
     if size > max as u64 {
         return Err(Error::limit("upload bytes", size, max));
     }
     let archive = fs_err::read(path).map_err(|e| unreadable(path, e))?;
-    let upload = Upload { archive: Some(archive), ..Upload::default() };
-    Ok((pipeline::read(&upload, &config.limits, cancel)?, upload))
+    Ok(Upload { archive: Some(archive), ..Upload::default() })
 }
 
 /// Removes the semantics of a scene that was replaced.

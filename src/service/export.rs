@@ -3,14 +3,16 @@
 use std::{
     io::{self, Write},
     sync::Arc,
+    time::Instant,
 };
 
-use tokio::sync::mpsc;
+use tokio::{runtime::Handle, sync::mpsc};
 
 use super::{
     Service,
     create::blocking,
     features,
+    folder::FolderFormat,
     packed::write_packed,
     page::write_page,
     query,
@@ -36,7 +38,8 @@ const PART_BYTES: usize = 256 << 10;
 impl Service {
     /// The scene, or what a text selects of it, as a file for other programs; as `npz` its
     /// semantics, which are made where they are not there; as `packed` and `html` what the page
-    /// draws. For `html` each line of the text is a text that the page can show.
+    /// draws; as a folder in a zip what [`FolderFormat`] says. For `html`, `coco` and `labelme`
+    /// each line of the text is a text.
     ///
     /// # Errors
     /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; `invalid_request` for a scene that
@@ -50,6 +53,9 @@ impl Service {
     ) -> Result<Export> {
         // How texts are scored is checked also where no text is asked.
         check_scoring(&ask.scoring, &self.limits())?;
+        if let Some(format) = FolderFormat::named(&format.to_string()) {
+            return self.folder(id, format, preset, ask).await;
+        }
         let access = self.scene(id).await?;
         let inner = Arc::clone(&self.inner);
         if format == ExportFormat::Npz {
@@ -114,8 +120,7 @@ impl Service {
     ) -> Result<Export> {
         let (inner, limits) = (Arc::clone(&self.inner), self.limits());
         let access = self.scene(id).await?.finished()?;
-        let lines: Vec<String> =
-            ask.text.iter().flat_map(|text| text.lines().map(str::to_owned)).collect();
+        let lines = texts::lines(ask);
         let how = format!("{lines:?} {preset:?} {:?} {}", ask.scoring, env!("CARGO_PKG_VERSION"));
         let tag = move |scene: &Scene| format!("{}-html", hash(&(meaning_tag(scene) + &how)));
         let file_name = format!("{id}.html");
@@ -178,30 +183,97 @@ fn gaussians(stem: &str, digest: &str, file: SplatFile) -> Export {
 pub(super) fn stream(
     write: impl FnOnce(&mut dyn Write) -> Result<()> + Send + 'static,
 ) -> mpsc::Receiver<io::Result<Vec<u8>>> {
+    stream_until(None, write)
+}
+
+/// As [`stream`]; a caller who has not taken a part at a given time gets no more.
+pub(super) fn stream_until(
+    until: Option<Instant>,
+    write: impl FnOnce(&mut dyn Write) -> Result<()> + Send + 'static,
+) -> mpsc::Receiver<io::Result<Vec<u8>>> {
     let (to, chunks) = mpsc::channel(PARTS_MAX);
+    let runtime = Handle::current();
     tokio::task::spawn_blocking(move || {
-        let mut parts = io::BufWriter::with_capacity(PART_BYTES, Parts(to.clone()));
+        let parts = Parts { to: to.clone(), runtime: runtime.clone(), until };
+        let mut parts = io::BufWriter::with_capacity(PART_BYTES, parts);
         let written = write(&mut parts).and_then(|()| {
             parts.flush().map_err(|e| Error::internal("the file is not whole").caused_by(e))
         });
+        // What is left of a file that broke off is not sent.
+        drop(parts.into_parts());
         if let Err(error) = written {
-            let _ = to.blocking_send(Err(io::Error::other(error)));
+            // No thread waits for a caller who takes nothing.
+            runtime.spawn(async move { to.send(Err(io::Error::other(error))).await });
         }
     });
     chunks
 }
 
 /// Sends what is written to it.
-struct Parts(mpsc::Sender<io::Result<Vec<u8>>>);
+struct Parts {
+    to: mpsc::Sender<io::Result<Vec<u8>>>,
+    runtime: Handle,
+    until: Option<Instant>,
+}
 
 impl Write for Parts {
     fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
-        let gone = |_| io::Error::from(io::ErrorKind::BrokenPipe);
-        self.0.blocking_send(Ok(bytes.to_vec())).map_err(gone)?;
+        // A view that is written at once would be one message.
+        let bytes = &bytes[..bytes.len().min(PART_BYTES)];
+        let send = self.to.send(Ok(bytes.to_vec()));
+        let sent = match self.until {
+            None => self.runtime.block_on(send),
+            Some(until) => {
+                let taken = async { tokio::time::timeout_at(until.into(), send).await };
+                self.runtime.block_on(taken).map_err(|_| io::ErrorKind::TimedOut)?
+            }
+        };
+        sent.map_err(|_| io::ErrorKind::BrokenPipe)?;
         Ok(bytes.len())
     }
 
     fn flush(&mut self) -> io::Result<()> {
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn what_is_written_at_once_comes_in_parts() {
+        let sent: Vec<u8> = (0..3 * PART_BYTES + 9).map(|i| (i % 251) as u8).collect();
+        let written = sent.clone();
+        let mut chunks = stream(move |to: &mut dyn Write| {
+            to.write_all(&written).map_err(|e| Error::internal("broken off").caused_by(e))
+        });
+        let mut taken = Vec::new();
+        while let Some(part) = chunks.recv().await {
+            let part = part.unwrap();
+            assert!(part.len() <= PART_BYTES, "{} bytes", part.len());
+            taken.extend(part);
+        }
+        assert!(taken == sent);
+    }
+
+    #[tokio::test]
+    async fn a_caller_who_takes_nothing_frees_the_thread_that_writes() {
+        let (ended, end) = tokio::sync::oneshot::channel();
+        let until = Instant::now() + Duration::from_millis(50);
+        let mut chunks = stream_until(Some(until), move |to: &mut dyn Write| {
+            let written = (0..100).try_for_each(|_| to.write_all(&[0; PART_BYTES]));
+            let _ = ended.send(written.as_ref().map_err(io::Error::kind).copied());
+            written.map_err(|e| Error::internal("late").caused_by(e))
+        });
+        let written = tokio::time::timeout(Duration::from_secs(20), end).await.unwrap().unwrap();
+        assert_eq!(written, Err(io::ErrorKind::TimedOut));
+        let mut parts = 0;
+        while let Some(Ok(_)) = chunks.recv().await {
+            parts += 1;
+        }
+        assert_eq!(parts, PARTS_MAX, "then the fault, and not an end that looks whole");
     }
 }

@@ -8,6 +8,7 @@ mod create;
 mod encode;
 mod export;
 mod features;
+mod folder;
 mod memory;
 mod npz;
 mod offline;
@@ -32,6 +33,7 @@ use futures_util::{Stream, stream};
 use parking_lot::RwLock;
 use tokio::sync::Semaphore;
 
+pub use self::folder::{FOLDER_FORMATS, FolderFormat};
 pub use self::page::{VIEWER, ViewerPage};
 use self::{memory::Memory, schedule::Scheduler, search::Backend};
 pub use self::{
@@ -106,6 +108,8 @@ struct Inner {
     scheduler: Arc<Scheduler>,
     /// Permits to decode uploads.
     reading: Arc<Semaphore>,
+    /// Permits to write folders.
+    folders: Arc<Semaphore>,
     key_locks: [tokio::sync::Mutex<()>; create::KEY_LOCKS],
     memory: Memory,
 }
@@ -175,6 +179,7 @@ impl Service {
             backend: Backend::new(parts.renderer, parts.semantics, &config.limits),
             models,
             reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
+            folders: Arc::new(Semaphore::new(config.limits.folder_exports_max)),
             key_locks: Default::default(),
             memory: Memory::new(config.limits.memory_bytes_max),
             limits: RwLock::new(Arc::new(config.limits.clone())),

@@ -21,8 +21,8 @@ use crate::{
 
 /// The use cases of [`super::Service`] for scenes that lie in files: no store, jobs or owners.
 pub struct OfflineService {
-    backend: Backend,
-    limits: Limits,
+    pub(super) backend: Backend,
+    pub(super) limits: Limits,
 }
 
 impl std::fmt::Debug for OfflineService {
@@ -41,7 +41,7 @@ impl OfflineService {
         Self { backend: Backend::new(renderer, semantics, &limits), limits }
     }
 
-    fn subject<'a>(&self, scene: &'a Scene, what: &str) -> Result<Subject<'a>> {
+    pub(super) fn subject<'a>(&self, scene: &'a Scene, what: &str) -> Result<Subject<'a>> {
         if let Some(lack) = self.backend.lacks() {
             let message = format!("{what}: the bundle has {lack}");
             return Err(Error::new(ErrorCode::ModelUnavailable, message));

@@ -85,7 +85,7 @@ pub(super) fn write_packed(scene: &Scene, to: &mut dyn Write) -> Result<()> {
 }
 
 /// All Gaussians by what they cover: opacity times the product of the two larger scales.
-fn largest_first(gaussians: &Gaussians) -> Vec<usize> {
+pub(super) fn largest_first(gaussians: &Gaussians) -> Vec<usize> {
     let covers = |i: usize| {
         let [a, b, c] = gaussians.scales()[i];
         gaussians.opacities()[i] * (a * b).max(b * c).max(a * c)

@@ -162,6 +162,14 @@ pub enum ExportFormat {
     /// The page with the scene in it, as one file for a disk. It shows the texts of `text`, one a
     /// line, and needs no server.
     Html,
+    /// A folder as COLMAP has it, in a zip: photos, cameras, points and depth maps.
+    Colmap,
+    /// The same as nerfstudio has it.
+    Nerfstudio,
+    /// What each line of `text` selects in each photo as COCO's annotations, in a zip.
+    Coco,
+    /// The same as a JSON with polygons for `LabelMe` beside each photo.
+    Labelme,
 }
 
 /// What the pixels of a view are described by.

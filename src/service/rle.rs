@@ -40,6 +40,41 @@ impl Rle {
         runs.push(run);
         Self { size: [height, width], counts: text_of(&runs) }
     }
+
+    /// The mask, `[height * width]` row-major. Runs beyond its end are left out.
+    pub fn decode(&self) -> Vec<bool> {
+        let [height, width] = self.size.map(|side| side as usize);
+        let mut mask = vec![false; height * width];
+        let mut at = 0_usize;
+        for (i, run) in runs_of(&self.counts).into_iter().enumerate() {
+            let run = usize::try_from(run).unwrap_or(0);
+            let end = at.saturating_add(run).min(mask.len());
+            if i % 2 == 1 {
+                (at..end).for_each(|k| mask[k % height * width + k / height] = true);
+            }
+            at = end;
+        }
+        mask
+    }
+}
+
+/// The runs of a text of [`text_of`].
+fn runs_of(text: &str) -> Vec<i64> {
+    let (mut runs, mut run, mut bits) = (Vec::<i64>::new(), 0_i64, 0_u32);
+    for byte in text.bytes().map(|byte| i64::from(byte.wrapping_sub(48))) {
+        run |= (byte & 0x1f).unbounded_shl(bits);
+        bits += 5;
+        if byte & 0x20 != 0 {
+            continue;
+        }
+        if byte & 0x10 != 0 {
+            run |= (-1_i64).unbounded_shl(bits);
+        }
+        let before = if runs.len() > 2 { runs[runs.len() - 2] } else { 0 };
+        runs.push(run.wrapping_add(before));
+        (run, bits) = (0, 0);
+    }
+    runs
 }
 
 /// Each run as the difference to the one two before it (from the fourth on), in groups of five
@@ -60,4 +95,28 @@ fn text_of(runs: &[i64]) -> String {
         }
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_mask_comes_back() {
+        let mut state = 1_u64;
+        for case in 0..200_u32 {
+            let (width, height) = (1 + case % 37, 1 + case % 29);
+            let mask: Vec<bool> = (0..width * height)
+                .map(|i| {
+                    state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+                    // Runs of all lengths.
+                    if case % 2 == 0 { (state >> 33) % 3 < 1 } else { i / (1 + case) % 2 == 0 }
+                })
+                .collect();
+            assert_eq!(Rle::encode(&mask, width, height).decode(), mask, "case {case}");
+        }
+        assert!(Rle::default().decode().is_empty());
+        let odd = Rle { size: [2, 2], counts: "\u{7f}~~zz0123".to_owned() };
+        assert_eq!(odd.decode().len(), 4, "runs beyond the end are left out");
+    }
 }

@@ -51,6 +51,11 @@ pub(super) fn check_ask(kinds: &[Kind], ask: &TextOptions, limits: &Limits) -> R
     Ok(TextOptions { text, ..ask.clone() })
 }
 
+/// The texts of an export that shows several: one a line.
+pub(super) fn lines(ask: &TextOptions) -> Vec<String> {
+    ask.text.iter().flat_map(|text| text.lines().map(str::to_owned)).collect()
+}
+
 /// Refuses a list that is empty or longer than `max`; `what` names it.
 pub(super) fn check_count(what: &str, count: usize, max: usize) -> Result<()> {
     match count {

@@ -167,6 +167,37 @@ fn a_scene_is_inspected_for_people_and_for_machines() {
 }
 
 #[test]
+fn a_scene_is_written_as_a_folder_with_the_photos_that_are_named() {
+    let folder = files();
+    let at = |name: &str| folder.path().join(name);
+    let (scene, zip) = (at("scene.segsplat"), at("plate.colmap.zip"));
+    let line = ["export", text(&scene), "-o", text(&zip)];
+    let answer = ok_json(&[&line[..], &CPU].concat());
+    assert_eq!((answer["format"].as_str(), &answer["photos"]), (Some("colmap"), &0.into()));
+    assert_eq!(answer["size_bytes"].as_u64(), Some(std::fs::metadata(&zip).unwrap().len()));
+    let mut read = zip::ZipArchive::new(std::fs::File::open(&zip).unwrap()).unwrap();
+    let mut map = Vec::new();
+    let mut file = read.by_name("stereo/depth_maps/0.2.png.geometric.bin").unwrap();
+    std::io::Read::read_to_end(&mut file, &mut map).unwrap();
+    let middle = map.len() - 4 * (64 * 48 - (24 * 64 + 32));
+    let depth = f32::from_le_bytes(map[middle..middle + 4].try_into().unwrap());
+    assert!((depth - 2.0).abs() < 0.01, "{depth}");
+    let refuse = |output: &str, rest: &[&str], code, want: &str| {
+        let output = at(output);
+        refused(&[&["export", text(&scene), "-o", text(&output)], rest].concat(), code, want);
+        let names = std::fs::read_dir(folder.path()).unwrap();
+        let names = names.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let left = names.filter(|name| name.starts_with("x.")).collect::<Vec<_>>();
+        assert!(left.is_empty(), "nothing is written, not {left:?}");
+    };
+    let invalid = ErrorCode::InvalidRequest;
+    refuse("x.zip", &[], invalid, "splat, colmap.zip, nerfstudio.zip, coco.zip, labelme.zip");
+    refuse("x.ply", &["--text", "a"], invalid, "--photos and --text go with folders, not with ply");
+    refuse("x.colmap.zip", &["--text", "a", CPU[0], CPU[1]], invalid, "not with colmap");
+    refuse("x.colmap.zip", &["--photos", "none"], invalid, "cannot be read");
+}
+
+#[test]
 fn errors_name_what_is_wrong_and_exit_by_the_table() {
     let folder = files();
     let at = |name: &str| folder.path().join(name);

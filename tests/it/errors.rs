@@ -117,6 +117,52 @@ async fn a_full_queue_refuses_before_the_photos_come() {
     assert!(answer.starts_with("HTTP/1.1 429") && answer.contains("overloaded"), "{answer}");
 }
 
+/// Problem details (RFC 9457) are there where `Accept` names them, whoever refuses the call, and
+/// they say what our own body says.
+#[tokio::test]
+async fn problem_details_are_told_where_they_are_asked_for() {
+    let stand = CpuServer::start().await;
+    let none = format!("/v1/scenes/{}", "0".repeat(32));
+    for (path, status, code, title) in [
+        (&*none, 404, "scene_not_found", "Scene not found"),
+        ("/v1/scenes?limit=0", 400, "invalid_request", "Invalid request"),
+        ("/v1/nothing", 404, "not_found", "Not found"),
+        ("/v1/scenes?deadline_ms=0", 400, "invalid_request", "Invalid request"),
+    ] {
+        let ask = async |accept: &str| {
+            let call = crate::common::client().get(stand.url(path)).header("accept", accept);
+            let answer = call.header("x-request-id", "call-7").send().await.unwrap();
+            assert_eq!(answer.status(), status, "{path}");
+            let varies = answer.headers().get_all("vary").iter();
+            assert!(varies.into_iter().any(|v| v.to_str().unwrap().contains("accept")), "{path}");
+            let kind = answer.headers()["content-type"].to_str().unwrap().to_owned();
+            let body: Value = serde_json::from_slice(&answer.bytes().await.unwrap()).unwrap();
+            (kind, body)
+        };
+        let (kind, ours) = ask("application/json").await;
+        assert_eq!(kind, "application/json");
+        assert_eq!(ours["code"], code);
+        let (kind, problem) = ask("application/json;q=0.9, application/problem+json").await;
+        assert_eq!(kind, "application/problem+json");
+        let expected = json!({
+            "type": format!("urn:segsplat:error:{code}"),
+            "title": title,
+            "status": status,
+            "detail": ours["message"],
+            "instance": path.split('?').next(),
+            "code": code,
+            "request_id": "call-7",
+            "details": ours["details"],
+        });
+        assert_eq!(problem, expected);
+    }
+    let document = document(&stand).await;
+    let fault = &document["paths"]["/v1/scenes"]["get"]["responses"]["default"]["content"];
+    let schema = fault["application/problem+json"]["schema"]["$ref"].as_str().unwrap();
+    let schema = document.pointer(schema.trim_start_matches('#')).unwrap();
+    assert_eq!(schema["required"].as_array().unwrap().len(), 8, "{schema}");
+}
+
 async fn document(stand: &CpuServer) -> Value {
     body(crate::common::client().get(stand.url("/openapi.json")).send().await.unwrap())
         .await

@@ -241,6 +241,31 @@ async fn a_scene_exports_as_ply() {
     assert_eq!(fault(&stand, &path).await.code, "invalid_request");
 }
 
+/// `Prefer: wait=SECONDS` (RFC 7240) is `wait_ms`, and the answer says so. The query counts before
+/// it, and what is no such preference changes nothing.
+#[tokio::test]
+async fn a_caller_may_prefer_to_wait() {
+    let stand = CpuServer::start().await;
+    let post = async |query: &str, prefer: &[&str]| {
+        let mut request = crate::common::client().post(stand.url(&format!("/v1/scenes{query}")));
+        for prefer in prefer {
+            request = request.header("prefer", *prefer);
+        }
+        let answer = request.multipart(form(&upload())).send().await.unwrap();
+        let applied = answer.headers().get("preference-applied").cloned();
+        (answer.status().as_u16(), applied.map(|value| value.to_str().unwrap().to_owned()))
+    };
+    let applied = Some("wait=60".to_owned());
+    assert_eq!(post("", &["wait=60"]).await, (201, applied.clone()));
+    assert_eq!(post("", &["respond-async, Wait=\"60\"; a=b"]).await, (201, applied.clone()));
+    assert_eq!(post("", &["return=minimal", "wait=60", "wait=0"]).await, (201, applied));
+    assert_eq!(post("", &["wait=0"]).await, (202, Some("wait=0".to_owned())));
+    for ignored in ["wait", "wait=soon", "wait=-1", "waits=60", "wait=1e3", ""] {
+        assert_eq!(post("", &[ignored]).await, (202, None), "{ignored:?}");
+    }
+    assert_eq!(post("?wait_ms=0", &["wait=60"]).await, (202, None));
+}
+
 #[tokio::test]
 async fn one_idempotency_key_makes_one_scene() {
     let stand = CpuServer::start().await;

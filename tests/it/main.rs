@@ -20,6 +20,7 @@ mod crop;
 mod errors;
 mod faults;
 mod fields;
+mod folders;
 mod grpc;
 mod hostile;
 mod http;

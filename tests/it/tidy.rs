@@ -390,9 +390,10 @@ fn errors_page() -> String {
         "# Errors\n\nMade from the table in \
          [`crates/core/src/error.rs`](../crates/core/src/error.rs) by \
          `UPDATE_DOCS=1 cargo test --test it tidy`; a test holds the two together.\n\n\
-         The name is the truth for clients: HTTP answers it as `code` of the JSON body, gRPC as \
-         the\nmetadata entry `segsplat-code`, the command line on standard error. gRPC numbers \
-         are those of `google.rpc.Code`.\n\n\
+         The name is the truth for clients: HTTP answers it as `code` of the JSON body, also of\n\
+         `application/problem+json` (RFC 9457) where `Accept` names it; gRPC as the metadata\n\
+         entry `segsplat-code`; the command line on standard error. gRPC numbers are those of\n\
+         `google.rpc.Code`.\n\n\
          | code | HTTP | gRPC | exit | same call may succeed later | meaning |\n\
          |---|---|---|---|---|---|\n",
     );

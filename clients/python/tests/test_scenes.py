@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
+import zipfile
 from pathlib import Path
 
 import httpx
@@ -75,6 +77,38 @@ def test_an_export_is_streamed_to_a_file(
     with pytest.raises(InvalidRequest):
         scene.export(path=tmp_path / "none.ply", text="")
     assert sorted(tmp_path.iterdir()) == sorted([part, tmp_path / path])
+
+
+def test_folders_for_other_programs(
+    client: Client, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    colmap = scene.export("colmap")
+    assert colmap == Path(f"{scene.id}.colmap.zip")
+    with zipfile.ZipFile(colmap) as files:
+        maps = [name for name in files.namelist() if name.startswith("stereo/depth_maps/")]
+        assert len(maps) == len(scene.photos) and "sparse/0/points3D.bin" in files.namelist()
+    twin = client.scene(colmap, semantics="off")
+    for one, other in zip(scene.photos, twin.photos, strict=True):
+        assert np.allclose(one.camera.camera_to_world, other.camera.camera_to_world, atol=1e-12)
+        assert np.array_equal(one.camera.K, other.camera.K)
+    twin.delete()
+    nerfstudio = scene.export("nerfstudio", tmp_path / "n.zip")
+    with zipfile.ZipFile(nerfstudio) as files:
+        told = json.loads(files.read("transforms.json"))
+        depth = np.load(io.BytesIO(files.read(told["frames"][0]["depth_file_path"])))
+    photo = scene.photos[0].camera
+    seen = scene.view("depth", camera=photo).depth
+    assert np.allclose(depth * told["depth_unit_scale_factor"], seen, rtol=1e-6)
+    with zipfile.ZipFile(scene.export("coco", text=["box", "carpet"])) as files:
+        coco = json.loads(files.read("annotations.json"))
+    assert [one["name"] for one in coco["categories"]] == ["box", "carpet"]
+    found = scene.query("box", "carpet", camera=photo)
+    areas = [int(match.mask.sum()) for match in found if match.mask.any()]
+    assert [one["area"] for one in coco["annotations"] if one["image_id"] == 1] == areas
+    with pytest.raises(InvalidRequest, match="give 1 to 128"):
+        scene.export("labelme", tmp_path / "none.zip")
+    assert not (tmp_path / "none.zip").exists()
 
 
 def test_archives_and_folders(client: Client, scene: Scene, photos: Path, tmp_path: Path) -> None:

@@ -139,6 +139,12 @@ limits! {
     views_pixels_max: u64 = 512 << 20;
     /// Milliseconds one `views` request may take.
     views_timeout_ms: u64 = 300_000;
+    /// Points of an export as COLMAP or nerfstudio, those that cover most: as many as a sparse
+    /// model of some hundred photos has.
+    folder_points_max: usize = 100_000;
+    /// Exports as folders at work: each has the upload of a scene in memory. One more is refused
+    /// as `overloaded`.
+    folder_exports_max: usize = 2, restart;
     /// Bytes of scenes kept in memory.
     cache_bytes_max: u64 = 4 << 30, restart;
     /// Bytes of scenes kept on one GPU device: what a card of 8 GB has to spare beside its frames.

@@ -467,6 +467,7 @@ both_ways! {
     Boxes = Boxes { Oriented, Aligned, None }
     MaskFormat = MaskFormat { Rle, Png, None }
     ExportFormat = ExportFormat {
-        Ply, Npz, Packed, Html, CompressedPly, Spz, Spz4, Sog, Glb, Splat
+        Ply, Npz, Packed, Html, CompressedPly, Spz, Spz4, Sog, Glb, Splat, Colmap, Nerfstudio, Coco,
+        Labelme
     }
 }

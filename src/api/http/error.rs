@@ -1,4 +1,5 @@
-//! Errors as HTTP answers: status of the one table, body `{code, message, request_id, details}`.
+//! Errors as HTTP answers: status of the one table, body `{code, message, request_id, details}`, or
+//! problem details (RFC 9457) where a caller asks for them.
 
 use std::{any::Any, sync::Arc};
 
@@ -46,6 +47,59 @@ pub(super) struct ErrorDetails {
     /// The scene it is about.
     #[serde(skip_serializing_if = "Option::is_none")]
     scene: Option<String>,
+}
+
+/// The body of an error as problem details (RFC 9457), with the members of ours.
+#[derive(Debug, Serialize, ToSchema)]
+pub(super) struct ProblemBody {
+    /// A URI that names the code and leads nowhere.
+    #[serde(rename = "type")]
+    kind: String,
+    /// The code in words.
+    title: String,
+    /// The status of the answer.
+    status: u16,
+    /// Names input, value and bound.
+    detail: String,
+    /// The path that was asked.
+    instance: String,
+    /// Stable `snake_case` code.
+    code: &'static str,
+    /// Finds the call in the log; also in the header `x-request-id`.
+    request_id: String,
+    /// More about it.
+    details: ErrorDetails,
+}
+
+/// Media type of problem details.
+pub(super) const PROBLEM: &str = "application/problem+json";
+
+/// Whether a caller names the media type of problem details in `Accept`, with a weight over 0.
+pub(super) fn asks_for_problem(accept: Option<&str>) -> bool {
+    accept.into_iter().flat_map(|accept| accept.split(',')).any(|range| {
+        let mut pieces = range.split(';').map(str::trim);
+        let named = pieces.next().is_some_and(|kind| kind.eq_ignore_ascii_case(PROBLEM));
+        let weight = pieces.find_map(|piece| piece.strip_prefix("q="));
+        named && weight.is_none_or(|weight| weight.parse::<f32>().is_ok_and(|q| q > 0.0))
+    })
+}
+
+impl ProblemBody {
+    fn new(body: ErrorBody, status: StatusCode, path: &str) -> Self {
+        let ErrorBody { code, message, request_id, details } = body;
+        let words = code.replace('_', " ");
+        let title = words[..1].to_uppercase() + &words[1..];
+        Self {
+            kind: format!("urn:segsplat:error:{code}"),
+            title,
+            status: status.as_u16(),
+            detail: message,
+            instance: path.to_owned(),
+            code,
+            request_id,
+            details,
+        }
+    }
 }
 
 /// An error of a handler. It travels beside the answer to the middleware, which logs it and writes
@@ -97,14 +151,31 @@ impl ApiError {
         }
     }
 
-    /// Writes body and headers into `response`.
-    pub(super) fn write(&self, response: Response, request_id: &str) -> Response {
+    /// Writes body and headers into `response`; `problem_of` is the path of a caller who asks for
+    /// problem details.
+    pub(super) fn write(
+        &self,
+        response: Response,
+        request_id: &str,
+        problem_of: Option<&str>,
+    ) -> Response {
         let error = self.error();
         let body = self.body(request_id);
         let (mut parts, _) = response.into_parts();
         parts.headers.remove(header::CONTENT_LENGTH);
         parts.headers.remove(header::CONTENT_TYPE);
-        let mut answer = (parts.status, parts.headers, Json(body)).into_response();
+        parts.headers.append(header::VARY, HeaderValue::from_static("accept"));
+        let (status, headers) = (parts.status, parts.headers);
+        let mut answer = match problem_of {
+            None => (status, headers, Json(body)).into_response(),
+            Some(path) => {
+                let body = Json(ProblemBody::new(body, status, path));
+                let mut answer = (status, headers, body).into_response();
+                let kind = HeaderValue::from_static(PROBLEM);
+                answer.headers_mut().insert(header::CONTENT_TYPE, kind);
+                answer
+            }
+        };
         if error.code() == ErrorCode::Unauthenticated {
             let bearer = HeaderValue::from_static("Bearer realm=\"segsplat\"");
             answer.headers_mut().insert(header::WWW_AUTHENTICATE, bearer);
@@ -137,4 +208,20 @@ pub(super) fn panic_error(panic: Box<dyn Any + Send + 'static>) -> Error {
     let text = text.or_else(|panic| panic.downcast::<&'static str>().map(|text| text.to_string()));
     let text = text.unwrap_or_else(|_| "a panic without text".to_owned());
     Error::internal("a fault of the server; the request id finds it in the log").caused_by(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::asks_for_problem;
+
+    #[test]
+    fn problem_details_are_for_those_who_name_them() {
+        for accept in ["application/problem+json", "image/png, Application/Problem+JSON;q=0.5"] {
+            assert!(asks_for_problem(Some(accept)), "{accept}");
+        }
+        let others = ["*/*", "application/json", "application/problem+json;q=0", "q=1", ""];
+        for accept in others.map(Some).into_iter().chain([None]) {
+            assert!(!asks_for_problem(accept), "{accept:?}");
+        }
+    }
 }

@@ -16,7 +16,7 @@ use tracing::{Instrument, Span, field::Empty};
 
 use super::{
     body::{Pace, hold},
-    error::ApiError,
+    error::{ApiError, asks_for_problem},
 };
 use crate::{
     api::{Api, access, access::Access, grpc, log_error, request_id, short},
@@ -107,6 +107,7 @@ async fn within(
 ) -> Response {
     let started = Instant::now();
     let path = request.uri().path().to_owned();
+    let as_problem = asks_for_problem(text_of(request.headers(), "accept"));
     let (mut request, too_slow) = pace.watch(request);
     let allowed = access.check_hosts(hosts_of(&request));
     let mut response = match allowed.and_then(|()| transport.deadline(&request)) {
@@ -148,7 +149,7 @@ async fn within(
     if let Some(error) = error {
         log_error(error.error(), Some(ms));
         if transport == Transport::Http {
-            response = error.write(response, id);
+            response = error.write(response, id, as_problem.then_some(&path));
         }
     } else {
         tracing::debug!(status = response.status().as_u16(), ms, code, "served");

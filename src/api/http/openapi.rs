@@ -14,7 +14,10 @@ use utoipa::{
     },
 };
 
-use super::{error::ErrorBody, health, render, scenes, texts, viewer, views};
+use super::{
+    error::{ErrorBody, PROBLEM, ProblemBody},
+    health, render, scenes, texts, viewer, views,
+};
 use crate::{
     api::Api,
     limits::{
@@ -47,7 +50,7 @@ pub(super) async fn document(State(api): State<Api>) -> Json<Value> {
         render::view, views::views, texts::query, texts::pick, render::export, render::features,
         health::models, health::live, health::ready, health::metrics, document, viewer::index,
     ),
-    components(schemas(ErrorBody)),
+    components(schemas(ErrorBody, ProblemBody)),
     tags(
         (name = "scenes", description = "Make, list, show, watch and delete scenes"),
         (name = "views", description = "Pictures and files of a scene"),
@@ -63,10 +66,16 @@ struct EveryCall;
 
 impl Modify for EveryCall {
     fn modify(&self, document: &mut openapi::OpenApi) {
-        let error = openapi::Ref::from_schema_name("ErrorBody");
+        let [error, problem] = ["ErrorBody", "ProblemBody"].map(|name| {
+            let schema = Some(openapi::Ref::from_schema_name(name));
+            ContentBuilder::new().schema(schema).build()
+        });
         let fault: Response = ResponseBuilder::new()
-            .description("An error of the table in docs/errors.md")
-            .content("application/json", ContentBuilder::new().schema(Some(error)).build())
+            .description(
+                "An error of the table in docs/errors.md; problem details where Accept names them",
+            )
+            .content("application/json", error)
+            .content(PROBLEM, problem)
             .build();
         let deadline = ParameterBuilder::new()
             .name("deadline_ms")

@@ -44,7 +44,9 @@ pub(super) struct ViewParams {
 pub(super) struct ExportParams {
     /// `ply` (default), `compressed_ply`, `spz`, `spz4`, `sog`, `glb` or `splat`: Gaussians for
     /// other programs; `npz`: the semantics as arrays; `packed`: the scene as the page draws it;
-    /// `html`: the page with the scene in it, and what it shows of each line of `text`.
+    /// `html`: the page with the scene in it, and what it shows of each line of `text`; `colmap`
+    /// and `nerfstudio`: a zip of a folder with photos, cameras, points and depth maps; `coco` and
+    /// `labelme`: a zip with what each line of `text` selects in each photo.
     #[param(inline)]
     format: ExportFormat,
     /// How a text is scored: `default` or `paper`. By default as the scene was made.
@@ -104,9 +106,13 @@ pub(super) async fn view(
     params(Id, ExportParams, TextOptions, ScoringOptions),
     responses((
         status = 200,
-        content((Vec<u8> = "application/octet-stream"), (Vec<u8> = "model/gltf-binary")),
+        content(
+            (Vec<u8> = "application/octet-stream"),
+            (Vec<u8> = "model/gltf-binary"),
+            (Vec<u8> = "application/zip"),
+        ),
         description = "Gaussians as PLY, compressed PLY, SPZ, GLB or .splat, an npz of arrays, \
-            the packed scene, or an HTML page"
+            the packed scene, an HTML page, or a zip of a folder"
     ))
 )]
 pub(super) async fn export(

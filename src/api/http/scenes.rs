@@ -42,7 +42,11 @@ pub(super) struct CreateParams {
 /// Make a scene of photos and their cameras, or of a file of Gaussians
 #[utoipa::path(
     post, path = "/v1/scenes", operation_id = "create_scene", tag = "scenes",
-    params(SceneOptions, CreateParams, ("Idempotency-Key" = Option<String>, Header)),
+    params(
+        SceneOptions, CreateParams,
+        ("Idempotency-Key" = Option<String>, Header),
+        ("Prefer" = Option<String>, Header, description = "`wait=SECONDS` (RFC 7240)"),
+    ),
     request_body(content(
         (UploadForm = "multipart/form-data"),
         (ArchiveBody = "application/zip"),
@@ -59,10 +63,14 @@ pub(super) async fn create(
     request: Request,
 ) -> Result<Response, ApiError> {
     let idempotency_key = idempotency_key(request.headers())?;
+    let preferred = preferred_wait(request.headers());
     let request_id = request.headers().get(request_id::HEADER);
     let request_id = request_id.and_then(|id| id.to_str().ok()).map(str::to_owned);
     let (upload, _guard) = read_upload(&api, request, &mut fields).await?;
     let (options, wait) = options(&api, fields)?;
+    // What the query says counts.
+    let preferred = preferred.filter(|_| wait.is_none());
+    let wait = wait.or(preferred.map(|seconds| Duration::from_secs(seconds.into())));
     let request = CreateScene { upload, options, idempotency_key, wait, request_id };
     let created = api.service.create_scene(request).await?;
     if let (Some(error), Some(_)) = (&created.status.error, wait) {
@@ -82,6 +90,10 @@ pub(super) async fn create(
     let mut answer = (status, [(header::LOCATION, location)], body).into_response();
     if let Some(value) = times.and_then(|times| HeaderValue::from_str(&times).ok()) {
         answer.headers_mut().insert("server-timing", value);
+    }
+    if let Some(seconds) = preferred {
+        let applied = HeaderValue::from_str(&format!("wait={seconds}"));
+        applied.map(|value| answer.headers_mut().insert("preference-applied", value)).ok();
     }
     if created.replayed {
         answer.headers_mut().insert("idempotency-replayed", HeaderValue::from_static("true"));
@@ -190,6 +202,19 @@ fn options(api: &Api, mut fields: Fields) -> Result<(SceneOptions, Option<Durati
     fields.finish()?;
     check_bundle(&bundle.unwrap_or_default(), api.service.bundle())?;
     Ok((options, wait_ms.map(Duration::from_millis)))
+}
+
+/// Seconds of the preference `wait` (RFC 7240), the first one that is there. A preference that is
+/// not understood is left alone, as that document asks.
+fn preferred_wait(headers: &HeaderMap) -> Option<u32> {
+    let values = headers.get_all("prefer").into_iter().filter_map(|value| value.to_str().ok());
+    let mut preferences = values.flat_map(|value| value.split(','));
+    preferences.find_map(|preference| {
+        let first = preference.split(';').next()?;
+        let (name, value) = first.split_once('=')?;
+        let is_wait = name.trim().eq_ignore_ascii_case("wait");
+        is_wait.then(|| value.trim().trim_matches('"').parse().ok())?
+    })
 }
 
 /// 1 to 255 printable ASCII characters.

@@ -45,6 +45,14 @@ from .wire import Flow, Item, Multipart, Part, Policy, Read, Request, ServerSent
 
 #: Endings of files of Gaussians.
 SPLATS = (".ply", ".spz", ".sog", ".glb", ".splat")
+#: Formats of `export`, and the endings of those that are not called so.
+ExportFormat: TypeAlias = Literal[
+    "ply", "compressed_ply", "spz", "spz4", "sog", "glb", "splat",
+    "colmap", "nerfstudio", "coco", "labelme",
+]  # fmt: skip
+ENDINGS = {"compressed_ply": "compressed.ply", "spz4": "v4.spz"} | {
+    name: f"{name}.zip" for name in ("colmap", "nerfstudio", "coco", "labelme")
+}
 #: Cameras of one call; more go as more calls.
 CAMERAS_MAX = 64
 
@@ -398,21 +406,25 @@ def gaussians(scene: Handle, text: str | None = None) -> Flow[Gaussians]:
 
 def export(
     scene: Handle,
-    format: Literal["ply", "compressed_ply", "spz", "spz4", "sog", "glb", "splat"] = "ply",
+    format: ExportFormat = "ply",
     path: str | Path | None = None,
     *,
-    text: str | None = None,
+    text: str | Sequence[str] | None = None,
 ) -> Flow[Path]:
     """Writes the scene, or what a text selects of it, to a file as it comes, and tells its path.
 
     format: "ply", as 3DGS writes it; "compressed_ply" (PlayCanvas, SuperSplat), "spz" (version 3),
-        "spz4", "sog", "glb" (KHR_gaussian_splatting) and "splat" for other programs.
+        "spz4", "sog", "glb" (KHR_gaussian_splatting) and "splat" for other programs. A zip of a
+        folder: "colmap" and "nerfstudio" with photos, cameras, points and depth maps, "coco" and
+        "labelme" with what texts select in each photo.
     path: by default the scene's id with the ending of the format, in the current folder.
+    text: several texts for "coco" and "labelme", one for the others.
     """
-    ending = {"compressed_ply": "compressed.ply", "spz4": "v4.spz"}.get(format, format)
+    ending = ENDINGS.get(format, format)
     target = Path(path) if path is not None else Path(f"{scene.id}.{ending}")
     part = target.with_name(target.name + ".part")
-    params = _query_string({"format": format, "text": text})
+    lines = text if text is None or isinstance(text, str) else "\n".join(text)
+    params = _query_string({"format": format, "text": lines})
     request = Request("GET", f"/v1/scenes/{scene.id}/export", params=params, stream=True)
     for again in range(scene.policy.retries + 1):
         try:

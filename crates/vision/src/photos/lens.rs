@@ -172,6 +172,11 @@ impl LensAtSize {
     pub(super) fn of_smaller(self, intrinsics: Intrinsics) -> Self {
         Self { intrinsics, ..self }
     }
+
+    /// Whether it bends rays, so that photos must be undistorted.
+    pub(super) fn is_bent(&self) -> bool {
+        self.distortion.is_some()
+    }
 }
 
 impl Lens {

@@ -36,10 +36,12 @@ use crate::{
     error::{Error, Result},
     limits::Limits,
     photo_label as label,
-    scene::{Camera, CameraToWorld, PosedPhoto, Warning, WarningCode, unless_cancelled},
+    scene::{Camera, CameraToWorld, Photo, PosedPhoto, Warning, WarningCode, unless_cancelled},
 };
 use cameras::{CameraEntry, Cameras};
+use decode::Header;
 use folder::Folder;
+use lens::LensAtSize;
 
 /// Photos of the largest size that are decoded at the same time, some 7 bytes a pixel each.
 const DECODED_TOGETHER: u64 = 2;
@@ -78,27 +80,30 @@ pub fn read(upload: &Upload, limits: &Limits) -> Result<Vec<PosedPhoto>> {
 /// # Errors
 /// As [`read`]; `cancelled`.
 pub fn read_until(upload: &Upload, limits: &Limits, cancel: &AtomicBool) -> Result<ReadPhotos> {
+    let found = found_in(upload, limits)?;
+    decoded(&found, limits, cancel)
+}
+
+/// The photos of an upload, by what it holds.
+fn found_in<'a>(upload: &'a Upload, limits: &'a Limits) -> Result<Found<'a>> {
     let total = upload.size_bytes();
     if total > limits.upload_bytes_max {
         return Err(Error::limit("upload bytes", total, limits.upload_bytes_max));
     }
-    let found = match (&upload.archive, &upload.cameras) {
+    match (&upload.archive, &upload.cameras) {
         (Some(_), cameras) if !upload.photos.is_empty() || cameras.is_some() => {
-            return Err(Error::invalid(
-                "send either an archive or camera JSON and photos, not both",
-            ));
+            Err(Error::invalid("send either an archive or camera JSON and photos, not both"))
         }
-        (Some(archive), _) => of_folder(&Folder::of_archive(archive, limits)?, limits)?,
-        (None, Some(cameras)) => of_form(cameras, &upload.photos, limits)?,
+        (Some(archive), _) => of_folder(&Folder::of_archive(archive, limits)?, limits),
+        (None, Some(cameras)) => of_form(cameras, &upload.photos, limits),
         (None, None) if upload.photos.iter().all(|file| names::is_photo(&file.name)) => {
-            return Err(Error::invalid(
+            Err(Error::invalid(
                 "upload: no camera description; send a part named transforms or cameras, the \
                  camera files of a capture, or an archive with them",
-            ));
+            ))
         }
-        (None, None) => of_folder(&Folder::of_form(&upload.photos, limits)?, limits)?,
-    };
-    decoded(&found, limits, cancel)
+        (None, None) => of_folder(&Folder::of_form(&upload.photos, limits)?, limits),
+    }
 }
 
 /// Reads a folder with a capture of any known layout.
@@ -416,23 +421,39 @@ fn chosen(
     Ok((kept.into_iter().map(|i| all[i]).collect(), warning))
 }
 
-/// Decodes the photos, a few at a time, and removes the distortion of their lenses.
-fn decoded(found: &Found<'_>, limits: &Limits, cancel: &AtomicBool) -> Result<ReadPhotos> {
-    let mut headers = Vec::with_capacity(found.taken.len());
-    for (i, taken) in found.taken.iter().enumerate() {
-        let label = label(i, &taken.entry.file);
-        let header = decode::header(&taken.bytes, &label, limits)?;
-        let lens = taken.entry.lens.at_size(header.width, header.height, &label)?;
-        headers.push((label, header, lens));
+/// The photos of a scene whose headers are read, and whose pixels are not.
+struct Undecoded<'f, 'a> {
+    taken: &'f [Taken<'a>],
+    /// Name in messages, header and lens of each.
+    headers: Vec<(String, Header, LensAtSize)>,
+    /// Longer side at which they are kept.
+    side_max: u32,
+}
+
+impl<'f, 'a> Undecoded<'f, 'a> {
+    fn new(found: &'f Found<'a>, limits: &Limits) -> Result<Self> {
+        let taken = &found.taken[..];
+        let header = |(i, taken): (usize, &Taken<'_>)| {
+            let label = label(i, &taken.entry.file);
+            let header = decode::header(&taken.bytes, &label, limits)?;
+            let lens = taken.entry.lens.at_size(header.width, header.height, &label)?;
+            Ok((label, header, lens))
+        };
+        let headers: Vec<_> = taken.iter().enumerate().map(header).collect::<Result<_>>()?;
+        let sizes: Vec<[u32; 2]> = headers.iter().map(|(_, header, _)| header.size()).collect();
+        Ok(Self { taken, side_max: side_kept(&sizes, limits), headers })
     }
-    let sizes: Vec<[u32; 2]> = headers.iter().map(|(_, header, _)| header.size()).collect();
-    let side_max = side_kept(&sizes, limits);
-    let read = |i: usize| {
-        unless_cancelled(cancel)?;
-        let (taken, (label, header, lens)) = (&found.taken[i], &headers[i]);
+
+    fn sizes(&self) -> Vec<[u32; 2]> {
+        self.headers.iter().map(|(_, header, _)| header.size()).collect()
+    }
+
+    /// A photo, reduced and without the distortion of its lens.
+    fn read(&self, i: usize, limits: &Limits) -> Result<PosedPhoto> {
+        let (taken, (label, header, lens)) = (&self.taken[i], &self.headers[i]);
         let photo = decode::pixels(&taken.bytes, header, label, limits)?;
         // The lens after the size: its terms are of rays, not of pixels.
-        let (photo, intrinsics) = decode::at_most(photo, lens.intrinsics, side_max);
+        let (photo, intrinsics) = decode::at_most(photo, lens.intrinsics, self.side_max);
         let photo = lens::undistort(photo, &lens.of_smaller(intrinsics));
         Ok(PosedPhoto {
             file: taken.name.clone(),
@@ -440,9 +461,69 @@ fn decoded(found: &Found<'_>, limits: &Limits, cancel: &AtomicBool) -> Result<Re
             camera: Camera { intrinsics, camera_to_world: taken.pose },
             intrinsics_made_for: lens.made_for,
         })
+    }
+
+    /// Whether [`Self::read`] gives the pixels of the file as they are.
+    fn is_as_sent(&self, i: usize) -> bool {
+        let (_, header, lens) = &self.headers[i];
+        header.width.max(header.height) <= self.side_max && !lens.is_bent()
+    }
+}
+
+/// A photo of an upload as its scene has it.
+#[derive(Debug)]
+pub struct SentPhoto<'a> {
+    /// File name as uploaded.
+    pub file: &'a str,
+    /// Camera of the pixels.
+    pub camera: Camera,
+    /// The pixels.
+    pub pixels: SentPixels<'a>,
+}
+
+/// The pixels of a photo of an upload.
+#[derive(Debug)]
+pub enum SentPixels<'a> {
+    /// The file: its pixels are those of the scene.
+    File(&'a [u8]),
+    /// Reduced, or without the distortion of the lens.
+    Made(Photo),
+}
+
+/// Hands on the photos of an upload in the order of the cameras, one at a time. What need not be
+/// decoded is not.
+///
+/// # Errors
+/// As [`read`], and those of `see`.
+pub fn each(
+    upload: &Upload,
+    limits: &Limits,
+    mut see: impl FnMut(SentPhoto<'_>) -> Result<()>,
+) -> Result<()> {
+    let found = found_in(upload, limits)?;
+    let photos = Undecoded::new(&found, limits)?;
+    for (i, taken) in found.taken.iter().enumerate() {
+        let (file, camera_to_world) = (taken.name.as_str(), taken.pose);
+        if photos.is_as_sent(i) {
+            let camera = Camera { intrinsics: photos.headers[i].2.intrinsics, camera_to_world };
+            see(SentPhoto { file, camera, pixels: SentPixels::File(&taken.bytes) })?;
+        } else {
+            let PosedPhoto { photo, camera, .. } = photos.read(i, limits)?;
+            see(SentPhoto { file, camera, pixels: SentPixels::Made(photo) })?;
+        }
+    }
+    Ok(())
+}
+
+/// Decodes the photos, a few at a time, and removes the distortion of their lenses.
+fn decoded(found: &Found<'_>, limits: &Limits, cancel: &AtomicBool) -> Result<ReadPhotos> {
+    let undecoded = Undecoded::new(found, limits)?;
+    let read = |i: usize| {
+        unless_cancelled(cancel)?;
+        undecoded.read(i, limits)
     };
     let mut photos = Vec::with_capacity(found.taken.len());
-    for together in decoded_together(&sizes, limits.photo_pixels_max) {
+    for together in decoded_together(&undecoded.sizes(), limits.photo_pixels_max) {
         let some: Vec<Result<PosedPhoto>> = together.into_par_iter().map(read).collect();
         for photo in some {
             photos.push(photo?);

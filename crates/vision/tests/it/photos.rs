@@ -551,6 +551,41 @@ fn large_photos_are_kept_smaller_with_their_camera() {
     assert!(photo.rgb[3].abs_diff(15) <= 1, "{}", photo.rgb[3]);
 }
 
+/// One photo after another: the file where its pixels are those that all at once give, else these.
+#[test]
+fn each_photo_is_its_file_or_the_pixels_that_a_scene_has() {
+    let mut bent = transforms();
+    bent["k1"] = 0.05.into();
+    let small = Limits { photo_side_kept_max: 20, ..Limits::default() };
+    for (what, cameras, limits, as_sent) in [
+        ("as sent", transforms(), Limits::default(), true),
+        ("reduced", transforms(), small, false),
+        ("undistorted", bent, Limits::default(), false),
+    ] {
+        let upload = with_transforms(&cameras, sent().1);
+        let all = photos::read(&upload, &limits).unwrap();
+        let mut rest = all.iter();
+        photos::each(&upload, &limits, |one| {
+            let posed = rest.next().expect("no more than all");
+            assert_eq!((one.file, one.camera), (&*posed.file, posed.camera), "{what}");
+            let rgb = match one.pixels {
+                photos::SentPixels::File(file) => {
+                    assert!(as_sent, "{what}: the file");
+                    image::load_from_memory(file).unwrap().to_rgb8().into_raw()
+                }
+                photos::SentPixels::Made(photo) => {
+                    assert!(!as_sent, "{what}: other pixels");
+                    photo.rgb
+                }
+            };
+            assert!(rgb == posed.photo.rgb, "{what}: {}", one.file);
+            Ok(())
+        })
+        .unwrap();
+        assert!(rest.next().is_none(), "{what}: all of them");
+    }
+}
+
 /// Where a lens draws the ray (x, y, 1): OpenCV's two models. `k`: `k1 k2 k3 k4`, `p`: `p1 p2`.
 fn distorted([x, y]: [f64; 2], fisheye: bool, k: [f64; 4], p: [f64; 2]) -> [f64; 2] {
     let r = x.hypot(y);

@@ -1,0 +1,216 @@
+//! The calls that write folders: of a server, where each view waits for its turn with all others,
+//! and of the command line.
+
+use std::{
+    io::Write,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use tokio::{runtime::Handle, sync::OwnedSemaphorePermit};
+
+use super::{Contents, FolderFormat, Views, depth_of, masks_of, photo_views, write};
+use crate::{
+    error::{Error, ErrorCode, Result},
+    limits::Limits,
+    scene::{Preset, Scene, SceneId, Upload},
+    service::{
+        Inner, OfflineService, Service,
+        create::blocking,
+        export::stream_until,
+        request::{ScoringOptions, TextOptions},
+        schedule::Slot,
+        search::{SceneTexts, check_scoring},
+        semantics::{Understood, meaning_tag},
+        texts,
+        types::{Export, TextView},
+        view::{Resolved, hash, words},
+    },
+};
+
+/// When to ask again where folders are being written, seconds.
+const RETRY_AFTER_S: u32 = 5;
+
+/// Texts that are asked of a scene, and how they are scored.
+#[derive(Clone)]
+struct Texts {
+    understood: Understood,
+    texts: Vec<String>,
+    preset: Option<Preset>,
+    scoring: ScoringOptions,
+}
+
+/// Views of a server.
+struct Scheduled {
+    inner: Arc<Inner>,
+    runtime: Handle,
+    scene: Arc<Scene>,
+    texts: Option<Texts>,
+    until: Instant,
+}
+
+impl Scheduled {
+    /// Does `work` when it is the view's turn. Blocks.
+    fn take_turn<T: Send + 'static>(
+        &self,
+        view: &Resolved,
+        work: impl FnOnce(&mut Slot) -> Result<T> + Send + 'static,
+    ) -> Result<T> {
+        let most = Duration::from_millis(self.inner.limits().render_timeout_ms);
+        let deadline = self.until.min(Instant::now() + most);
+        let turn = self.inner.scheduled(deadline, view.pixels(), "a view of the folder", work);
+        self.runtime.block_on(turn)
+    }
+}
+
+impl Views for Scheduled {
+    fn depth(&mut self, view: &Resolved) -> Result<Vec<f32>> {
+        let (inner, scene, own) = (Arc::clone(&self.inner), Arc::clone(&self.scene), view.clone());
+        self.take_turn(view, move |slot| {
+            let depth = depth_of(&inner.backend, &scene, &own);
+            slot.drawn();
+            depth
+        })
+    }
+
+    fn masks(&mut self, view: &Resolved) -> Result<Vec<TextView>> {
+        let Some(asked) = self.texts.clone() else { return Ok(Vec::new()) };
+        let (inner, own) = (Arc::clone(&self.inner), view.clone());
+        self.take_turn(view, move |slot| {
+            let (of, how) = (asked.understood.subject(), (asked.preset, &asked.scoring));
+            let texts = SceneTexts::new(&inner.backend, of, how, &asked.texts)?;
+            masks_of(&texts, &inner.limits(), &own, || slot.drawn())
+        })
+    }
+}
+
+impl Inner {
+    /// A permit to write a folder.
+    fn folder_permit(&self) -> Result<OwnedSemaphorePermit> {
+        Arc::clone(&self.folders).try_acquire_owned().map_err(|_| {
+            let max = self.config.limits.folder_exports_max;
+            let why = format!("{max} folders are being written already, the most that may");
+            Error::new(ErrorCode::Overloaded, why).retry_after_s(RETRY_AFTER_S)
+        })
+    }
+
+    /// The upload of a scene; none where it is not kept. Blocks on the store.
+    fn kept_upload(&self, id: &SceneId) -> Result<Option<Upload>> {
+        // It goes a moment after the scene is done.
+        if !self.config.keep_photos {
+            return Ok(None);
+        }
+        match self.store.upload(id) {
+            Ok(upload) => Ok(Some(upload)),
+            Err(e) if e.code() == ErrorCode::SceneNotFound => Ok(None),
+            Err(error) => Err(error),
+        }
+    }
+}
+
+impl Service {
+    /// The scene as a folder in a zip. It must be taken in `limits.views_timeout_ms`.
+    ///
+    /// # Errors
+    /// As [`Service::export`]; `overloaded` where too many folders are being written.
+    pub(in crate::service) async fn folder(
+        &self,
+        id: &SceneId,
+        format: &'static FolderFormat,
+        preset: Option<Preset>,
+        ask: &TextOptions,
+    ) -> Result<Export> {
+        let (inner, limits) = (Arc::clone(&self.inner), self.limits());
+        let texts = format.checked(&texts::lines(ask), &limits)?;
+        let access = self.scene(id).await?.finished()?;
+        let record = access.record();
+        let views = photo_views(&limits, &record.status.cameras, record, preset, texts.len())?;
+        let (scene, texts) = if texts.is_empty() {
+            let (inner, access) = (Arc::clone(&inner), access.clone());
+            (blocking(move || inner.load(&access)).await??, None)
+        } else {
+            let understood = inner.understood(&access, "text", ask.wait).await?;
+            let most = Instant::now() + Duration::from_millis(limits.render_timeout_ms);
+            inner.embed(&understood, (preset, &ask.scoring), &texts, most).await?;
+            let scoring = ask.scoring.clone();
+            let scene = Arc::clone(&understood.scene);
+            (scene, Some(Texts { understood, texts, preset, scoring }))
+        };
+        // Not before: semantics can take minutes.
+        let permit = inner.folder_permit()?;
+        let until = Instant::now() + Duration::from_millis(limits.views_timeout_ms);
+        let upload = {
+            let (inner, id) = (Arc::clone(&inner), id.clone());
+            blocking(move || inner.kept_upload(&id)).await??
+        };
+        let asked = texts.as_ref().map(|asked| (&asked.texts, &asked.scoring));
+        let how = (meaning_tag(&scene), inner.backend.renderer.name(), preset, asked);
+        let etag = words(&(how, upload.is_some(), env!("CARGO_PKG_VERSION")))?;
+        let etag = format!("{}-{}", hash(&etag), format.name);
+        let runtime = Handle::current();
+        let chunks = stream_until(Some(until), move |to: &mut dyn Write| {
+            let _permit = permit;
+            let asked = texts.as_ref().map_or(&[][..], |asked| &asked.texts).to_vec();
+            let contents = Contents {
+                scene: &scene,
+                views,
+                upload: upload.as_ref(),
+                texts: &asked,
+                limits: &limits,
+            };
+            let scene = Arc::clone(&scene);
+            let mut views = Scheduled { inner, runtime, scene, texts, until };
+            write(format, &contents, &mut views, to).map(drop)
+        });
+        let file_name = format!("{id}.{}", format.ending);
+        Ok(Export { media_type: "application/zip", ..Export::new(file_name, etag, chunks) })
+    }
+}
+
+/// Views of a scene in a file.
+struct Alone<'a> {
+    service: &'a OfflineService,
+    scene: &'a Scene,
+    texts: Option<SceneTexts<'a>>,
+    limits: &'a Limits,
+}
+
+impl Views for Alone<'_> {
+    fn depth(&mut self, view: &Resolved) -> Result<Vec<f32>> {
+        depth_of(&self.service.backend, self.scene, view)
+    }
+
+    fn masks(&mut self, view: &Resolved) -> Result<Vec<TextView>> {
+        let Some(texts) = &self.texts else { return Ok(Vec::new()) };
+        masks_of(texts, self.limits, view, || ())
+    }
+}
+
+impl OfflineService {
+    /// As [`Service::export`] of a folder, written to `to`; `upload` is what the scene was made of,
+    /// where its photos are to be in it. Gives how many photos are in it.
+    ///
+    /// # Errors
+    /// As there; `semantics_off` for texts of a scene without semantics.
+    pub fn folder(
+        &self,
+        scene: &Scene,
+        format: &FolderFormat,
+        (asked, preset, scoring): (&[String], Option<Preset>, &ScoringOptions),
+        upload: Option<&Upload>,
+        to: &mut dyn Write,
+    ) -> Result<usize> {
+        let limits = &self.limits;
+        check_scoring(scoring, limits)?;
+        let asked = format.checked(asked, limits)?;
+        let views = photo_views(limits, &scene.meta.cameras, scene, preset, asked.len())?;
+        let texts = if asked.is_empty() {
+            None
+        } else {
+            let of = self.subject(scene, "text")?;
+            Some(SceneTexts::new(&self.backend, of, (preset, scoring), &asked)?)
+        };
+        let contents = Contents { scene, views, upload, texts: &asked, limits };
+        write(format, &contents, &mut Alone { service: self, scene, texts, limits }, to)
+    }
+}
