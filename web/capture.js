@@ -4,6 +4,7 @@ const PHOTO = /\.(jpe?g|png|webp)$/i,
   SPLATS = /\.(ply|spz|sog|glb|splat)$/i,
   // Files of cameras that the server knows by their paths (docs/captures.md).
   CAMERAS = /(\.(json|txt|bin|npy|traj|pincam)|(^|\/)metadata)$/i,
+  HIDDEN = /(^|\/)\./,
   UNREAD = /(^|\/)((points3D|rigs|frames|project)\.[^/]*$|(lowres_|highres_)?depth\/|confidence\/)/i;
 const fileName = (path) => path.split('/').pop();
 
@@ -35,6 +36,7 @@ async function dropped(transfer) {
 
 // The form to send, a row for each photo with what is wrong with it, and faults of the whole.
 async function readCapture(files) {
+  files = files.filter(({ path }) => !HIDDEN.test(path));
   const form = new FormData(),
     rows = [],
     faults = [];
