@@ -35,7 +35,8 @@ async function filmCodec(width, height) {
   );
 }
 
-// The file, as a Blob. Draws each frame on the canvas of the drawing; cameraAt(share) is its camera.
+// The file, as a Blob. Each frame is drawn on the canvas of the drawing; cameraAt(share) is where
+// from.
 async function makeFilm(drawing, cameraAt, { width, height, frames, kind, signal, progress }) {
   const { config, name } = await filmCodec(width, height);
   const chunks = [];

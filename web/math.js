@@ -47,7 +47,7 @@ const cameraOf = ({ camera_to_world: m, intrinsics: k }, depth) => {
   };
 };
 
-// What is up in a scene, as far as its photos tell: the mean of their own. Null where they disagree.
+// What is up in a scene, as far as its photos tell: their mean. Null where they disagree.
 const uprightOf = (cameras) => {
   const ups = cameras.map(({ camera_to_world: m }) => unit([-m[1], -m[5], -m[9]]));
   const sum = ups.reduce((a, b) => add(a, b), [0, 0, 0]);

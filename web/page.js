@@ -770,7 +770,8 @@ function proposeFilm(cameras) {
 }
 
 function filmPlan() {
-  const [width, height] = filmSize($('stage').getBoundingClientRect(), Number($('film-side').value));
+  const side = Number($('film-side').value),
+    [width, height] = filmSize($('stage').getBoundingClientRect(), side);
   const frames = FPS * Number($('film-seconds').value);
   $('film-says').textContent = `${frames} frames of ${width} × ${height}, ${FPS} a second`;
   return { width, height, frames, motion: $('film-motion').value };

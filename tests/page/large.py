@@ -1,4 +1,4 @@
-"""Many Gaussians as a `.splat` file: a room whose walls, floor and ceiling are full of small ones."""
+"""Many Gaussians as a `.splat` file: a room with walls, floor and ceiling of small ones."""
 
 from __future__ import annotations
 

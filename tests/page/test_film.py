@@ -18,7 +18,10 @@ PLAY = """async ([coded, times]) => {
   const video = document.createElement('video'), canvas = document.createElement('canvas');
   video.muted = true;
   video.src = URL.createObjectURL(new Blob([bytes], { type: 'video/webm' }));
-  await new Promise((ok, no) => { video.onloadeddata = ok; video.onerror = () => no(video.error); });
+  await new Promise((ok, no) => {
+    video.onloadeddata = ok;
+    video.onerror = () => no(video.error);
+  });
   const ended = new Promise((ok) => { video.onended = ok; });
   await video.play();
   await ended;
