@@ -578,6 +578,7 @@ async function open(id, camera, words = []) {
     throw new Error(why);
   }
   if (state.scene?.id !== id) forget();
+  if (made !== id) showCapture({ rows: [], faults: [] }); // it is of another scene
   for (const warning of scene.report.warnings) blame(warning.message);
   await load(id, camera);
   about(scene.report);
@@ -695,7 +696,8 @@ function fromLink() {
 }
 
 // ---- a capture ------------------------------------------------------------------------------
-let rows = [];
+let rows = [],
+  made = null; // the scene of these rows
 function showCapture(capture) {
   rows = capture.rows;
   $('faults').replaceChildren(...capture.faults.map((text) => make('li', { textContent: text })));
@@ -734,11 +736,12 @@ async function upload(files) {
   say('sending …');
   $('progress').hidden = false;
   try {
-    const made = await server.send('/v1/scenes', capture.form, (share) => {
+    const answer = await server.send('/v1/scenes', capture.form, (share) => {
       $('progress').value = share;
     });
+    made = answer.id;
     await list();
-    await open(made.id);
+    await open(made);
   } catch (error) {
     $('progress').hidden = true;
     blame(error.message);

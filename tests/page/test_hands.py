@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from acts import Camera, pixels, settled, until
+from acts import Camera, drop, pixels, sample, settled, until
 from playwright.sync_api import CDPSession, Page, expect
 
 CLOSE = {"rtol": 0.02, "atol": 1e-6}
@@ -210,23 +210,51 @@ def test_nothing_of_a_scene_stays_beside_the_next(page: Page, url: str, scene: s
         expect(page.locator(left)).to_have_count(0)
 
 
+def test_photos_of_one_scene_are_not_named_beside_another(
+        page: Page, url: str, photos: Path, splats: str) -> None:
+    page.goto(url)
+    files = {name: data for name, data in sample(photos).items() if name.endswith(".png")}
+    drop(page, files)
+    expect(page.locator("#faults li")).to_contain_text("No cameras")
+    page.click(f"#scenes button[data-id='{splats}']")
+    settled(page)
+    for left in ["#faults li", "#photos li"]:
+        expect(page.locator(left)).to_have_count(0)
+
+
+def test_a_server_that_is_gone_is_named(page: Page, url: str, splats: str) -> None:
+    page.goto(f"{url}/#scene={splats}")
+    settled(page)
+    page.route("**/v1/**", lambda route: route.abort())
+    page.fill("#text", "box")
+    page.press("#text", "Enter")
+    expect(page.locator("#says")).to_have_text("the server cannot be reached")
+
+
 def test_an_order_that_comes_late_does_not_stop_the_next_scene(
         page: Page, url: str, scene: str, splats: str) -> None:
     page.goto(f"{url}/#scene={scene}")
     settled(page)
-    # The next order is held back until the other scene has begun.
+    # The next order is held back, and comes when the other scene has just begun.
     page.evaluate("""() => {
       const { drawing, look, state } = segsplat, give = drawing.worker.onmessage;
+      const begin = drawing.begin.bind(drawing);
       drawing.worker.onmessage = (late) => {
-        globalThis.late = () => { drawing.worker.onmessage = give; give(late); };
+        drawing.worker.onmessage = give;
+        globalThis.held = true;
+        drawing.begin = (...scene) => {
+          const room = begin(...scene);
+          give(late);
+          globalThis.drawn = drawing.drawn;
+          return room;
+        };
       };
       look({ ...state.camera, eye: state.camera.eye.map((v) => v + 0.1) }, true); }""")
-    until(page, "globalThis.late")
+    until(page, "globalThis.held")
     page.evaluate("(id) => { location.hash = `scene=${id}`; }", splats)
     until(page, "segsplat.drawing.loaded === 40")
-    page.evaluate("late()")
     settled(page)
-    assert page.evaluate("segsplat.drawing.drawn") <= 40
+    assert page.evaluate("drawn") == 0, "an order of another scene was taken"
     assert pixels(page).std() > 10, "the canvas is flat"
 
 
