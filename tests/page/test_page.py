@@ -78,6 +78,8 @@ def test_photos_are_dropped_and_the_scene_is_flown_asked_clicked_shared_and_kept
     alone.goto(kept.as_uri() + "#" + link.split("#")[1])
     expect(alone.locator("#words li strong")).to_have_text(["box"])
     assert np.abs(pixels(alone).astype(float) - before).mean() < 0.5
+    # There is no server to ask for a file.
+    expect(alone.locator("#export")).to_be_hidden()
     assert not calls, calls
     alone.close()
 
