@@ -559,6 +559,7 @@ async function open(id, camera, words = []) {
   watching?.abort();
   watching = new AbortController();
   const { signal } = watching;
+  if (made !== id) showCapture({ rows: [], faults: [] }); // they are of another scene
   const path = `/v1/scenes/${encodeURIComponent(id)}`;
   let scene = await server.json(path);
   if (scene.state === 'queued' || scene.state === 'running') {
@@ -578,7 +579,6 @@ async function open(id, camera, words = []) {
     throw new Error(why);
   }
   if (state.scene?.id !== id) forget();
-  if (made !== id) showCapture({ rows: [], faults: [] }); // it is of another scene
   for (const warning of scene.report.warnings) blame(warning.message);
   await load(id, camera);
   about(scene.report);
