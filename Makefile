@@ -5,6 +5,7 @@
 # make client   the Python client: its types, and its tests with a real server (SEGSPLAT_BIN=file: a
 #               program that is built already)
 # make page    the page in a headless Chromium, with a real server (SEGSPLAT_BIN as above)
+# make page-long   a scene of 4,000,000 Gaussians in the page: bytes, times and memory
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
 # make eval-scenes   labelled scenes of held-out things, rendered to target/eval/scenes (g++, PYTHON)
 # make report   the tables of docs/benchmarks.md from benches/runs
@@ -23,7 +24,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: client venv page wheel judge judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: client venv page page-long wheel judge judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -78,10 +79,11 @@ client: venv
 	cd clients/python && SEGSPLAT_BIN=$(PROGRAM) $(CLIENT)/venv/bin/python -m pytest
 
 # The browser is one that `scripts/setup --ci` finds or gets, or SEGSPLAT_BROWSER.
-page: venv
+page page-long: venv
 	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check \
 		-r tests/page/requirements.txt
-	SEGSPLAT_BIN=$(PROGRAM) $(CLIENT)/venv/bin/python -m pytest tests/page
+	SEGSPLAT_BIN=$(PROGRAM) $(if $(filter page-long,$@),PAGE_GAUSSIANS=4000000) \
+		$(CLIENT)/venv/bin/python -m pytest $(if $(filter page-long,$@),-s tests/page/test_large.py,tests/page)
 
 wheel: $(if $(SEGSPLAT_BIN),,build)
 	SEGSPLAT_BIN=$(abspath $(or $(SEGSPLAT_BIN),$(SEGSPLAT))) python3 -m pip wheel --no-deps \

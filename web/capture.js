@@ -4,7 +4,10 @@ const PHOTO = /\.(jpe?g|png|webp)$/i,
   SPLATS = /\.(ply|spz|sog|glb|splat)$/i,
   // Files of cameras that the server knows by their paths (docs/captures.md).
   CAMERAS = /(\.(json|txt|bin|npy|traj|pincam)|(^|\/)metadata)$/i,
-  UNREAD = /(^|\/)((points3D|rigs|frames|project)\.[^/]*$|(lowres_|highres_)?depth\/|confidence\/)/i;
+  HIDDEN = /(^|\/)\./,
+  UNREAD_FILE = /(^|\/)(points3D|rigs|frames|project)\.[^/]*$/i,
+  UNREAD_FOLDER = /(^|\/)((lowres_|highres_)?depth|confidence)\//i,
+  unread = (path) => UNREAD_FILE.test(path) || UNREAD_FOLDER.test(path);
 const fileName = (path) => path.split('/').pop();
 
 // All files of a drop, with the paths that they have in dropped folders.
@@ -35,6 +38,7 @@ async function dropped(transfer) {
 
 // The form to send, a row for each photo with what is wrong with it, and faults of the whole.
 async function readCapture(files) {
+  files = files.filter(({ path }) => !HIDDEN.test(path));
   const form = new FormData(),
     rows = [],
     faults = [];
@@ -53,14 +57,14 @@ async function readCapture(files) {
     return { form, rows, faults };
   }
   const find = (test) => files.find(({ path }) => test.test(fileName(path)));
-  const described = files.filter(({ path }) => CAMERAS.test(path) && !UNREAD.test(path));
+  const described = files.filter(({ path }) => CAMERAS.test(path) && !unread(path));
   const json =
     find(/^(transforms|cameras)\.json$/i) ||
     find(/^transforms.*\.json$/i) ||
     (described.length === 1 && /\.json$/i.test(described[0].path) && described[0]);
   if (!json && described.length) {
     // The server reads it, and says what is wrong with it.
-    const shown = photos.filter(({ path }) => !UNREAD.test(path));
+    const shown = photos.filter(({ path }) => !unread(path));
     for (const { path, file } of [...shown, ...described]) form.append(path, file, path);
     for (const { path } of shown) rows.push({ name: path, faults: [] });
     if (!shown.length) faults.push('No photos: add PNG, JPEG or WebP files.');
@@ -83,7 +87,7 @@ async function readCapture(files) {
       }));
     } else {
       faults.push(
-        'No cameras: add a transforms.json, a cameras.json, or the folder of a capture with its cameras.',
+        'No cameras: add a transforms.json, a cameras.json, or the folder of a capture with them.',
       );
     }
   } catch (error) {

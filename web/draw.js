@@ -146,19 +146,36 @@ void main() {
 }`;
 
 class Drawing {
-  constructor(canvas, changed) {
+  // changed() asks for a frame. lost(true) says that the device dropped all that was on it, and
+  // lost(false) that it is back, with nothing on it.
+  constructor(canvas, changed, lost) {
     this.canvas = canvas;
     this.changed = changed;
-    const gl = canvas.getContext('webgl2', { alpha: false, antialias: false });
-    if (!gl || !gl.getExtension('EXT_color_buffer_float')) {
-      throw new Error('this browser has no WebGL2 with float buffers; try a newer one');
-    }
-    this.gl = gl;
     this.lost = false;
+    this.sent = this.done = this.stale = 0; // numbers of sorts
+    this.waiting = [];
+    this.gl = canvas.getContext('webgl2', { alpha: false, antialias: false });
     canvas.addEventListener('webglcontextlost', (e) => {
       e.preventDefault();
       this.lost = true;
+      lost(true);
     });
+    canvas.addEventListener('webglcontextrestored', () => {
+      this.lost = false;
+      this.setup();
+      lost(false);
+    });
+    this.worker = startSorter();
+    this.worker.onmessage = ({ data }) => this.sorted(data);
+    this.setup();
+  }
+
+  // What is on the device, without a scene.
+  setup() {
+    const gl = this.gl;
+    if (!gl || !gl.getExtension('EXT_color_buffer_float')) {
+      throw new Error('this browser has no WebGL2 with float buffers; try a newer one');
+    }
     const more = (text) => text.replace('es\n', 'es\n#define MORE\n');
     this.project = this.program(WHOLE, PROJECT);
     this.plain = this.program(QUADS, BLEND);
@@ -174,15 +191,14 @@ class Drawing {
     this.projected = [0, 1].map(() => this.texture());
     this.spots = gl.createFramebuffer();
     this.size = [0, 0];
-    this.worker = startSorter();
-    this.worker.onmessage = ({ data }) => this.sorted(data);
+    this.packed = null;
     this.empty();
   }
 
   empty() {
     this.header = null;
     this.count = this.loaded = this.drawn = 0;
-    this.sent = this.done = 0; // numbers of sorts
+    this.stale = this.sent; // the order of another scene may still come
     this.asked = this.shown = '';
     this.words = [];
     this.floor = 0;
@@ -232,23 +248,37 @@ class Drawing {
     gl.texImage2D(gl.TEXTURE_2D, 0, format, width, height, 0, of, type, data);
   }
 
-  // A new scene of so many Gaussians, none of which is there yet.
+  // Makes room for that many Gaussians, 68 bytes each on the device: half as many as long as the
+  // device has no memory for them. The number that there is room for.
+  room(count) {
+    const gl = this.gl;
+    count = Math.min(count, ROW * (gl.getParameter(gl.MAX_TEXTURE_SIZE) || ROW));
+    for (;;) {
+      this.rows = Math.max(1, Math.ceil(count / ROW));
+      while (![gl.NO_ERROR, gl.CONTEXT_LOST_WEBGL].includes(gl.getError()));
+      if (this.packed) gl.deleteTexture(this.packed);
+      this.packed = this.texture();
+      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, 2 * ROW, this.rows);
+      for (const texture of this.projected)
+        this.fill(texture, gl.RGBA32F, ROW, this.rows, gl.FLOAT, null);
+      gl.bindTexture(gl.TEXTURE_2D, this.order);
+      const [form, kind] = [gl.RED_INTEGER, gl.UNSIGNED_INT];
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, ROW, this.rows, 0, form, kind, null);
+      if (gl.getError() !== gl.OUT_OF_MEMORY) return count;
+      if (count <= ROW) throw new Error('this device has no memory for a scene');
+      count >>= 1;
+    }
+  }
+
+  // A new scene of so many Gaussians, none of which is there yet. How many of them it will take.
   begin(header, cells, count) {
     const gl = this.gl;
     this.empty();
     this.header = header;
-    this.count = count;
-    if (this.packed) gl.deleteTexture(this.packed);
-    this.packed = this.texture();
+    this.count = count = this.room(count);
     this.rest = new Uint32Array(0);
-    gl.bindTexture(gl.TEXTURE_2D, this.packed);
-    const rows = Math.max(1, Math.ceil(count / ROW));
-    if (rows > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error('too many Gaussians');
-    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, 2 * ROW, rows);
-    this.rows = rows;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.spots);
     this.projected.forEach((texture, k) => {
-      this.fill(texture, gl.RGBA32F, ROW, rows, gl.FLOAT, null);
       gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + k, gl.TEXTURE_2D, texture, 0);
     });
     gl.drawBuffers([gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1]);
@@ -267,6 +297,7 @@ class Drawing {
     this.fill(this.photos, gl.RGBA32F, 2, rowsOf.length / 8, gl.FLOAT, rowsOf);
     this.ask([], 0);
     this.worker.postMessage({ count });
+    return count;
   }
 
   // More Gaussians; the last row of the texture may be filled twice.
@@ -319,11 +350,14 @@ class Drawing {
   sorted({ order, drawn, number, known, ms }) {
     const gl = this.gl;
     this.done = number;
+    this.waiting.splice(0).forEach((go) => go());
+    if (number <= this.stale) return this.changed();
     this.sortMs = ms;
     this.sortKnown = known;
     const rows = Math.max(1, Math.ceil(drawn / ROW));
     gl.bindTexture(gl.TEXTURE_2D, this.order);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.R32UI, ROW, rows, 0, gl.RED_INTEGER, gl.UNSIGNED_INT, order);
+    const [form, kind] = [gl.RED_INTEGER, gl.UNSIGNED_INT];
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, ROW, rows, form, kind, order);
     this.drawn = drawn;
     this.fresh = true;
     this.changed();
@@ -354,7 +388,9 @@ class Drawing {
     if (!header) return false;
     const axis = axesOf(camera)[2],
       eye = add(camera.eye, header.origin, -1);
-    this.asked = `${camera.eye} ${axis} ${this.loaded}`;
+    // While it loads, there is a new order and a frame each time that half as much again has come.
+    const come = this.loaded < this.count && Math.floor(Math.log(this.loaded) / Math.log(1.5));
+    this.asked = `${camera.eye} ${axis} ${come}`;
     if (this.asked !== this.shown && this.sent === this.done) {
       this.shown = this.asked;
       this.sent += 1;
@@ -365,6 +401,15 @@ class Drawing {
     const worth = moving || this.fresh || this.settled;
     this.fresh = false;
     return worth;
+  }
+
+  // One frame of this size on the canvas, when its order is there.
+  async still(camera, width, height, kind) {
+    this.resize(width, height);
+    for (this.sort(camera); !this.settled; this.sort(camera))
+      await new Promise((go) => this.waiting.push(go));
+    if (this.lost) throw new Error('The graphics device is lost.');
+    this.draw(camera, kind);
   }
 
   // One frame from a camera. kind: 0 colour, 1 depth, 2 alpha, 3 mask.

@@ -47,6 +47,13 @@ const cameraOf = ({ camera_to_world: m, intrinsics: k }, depth) => {
   };
 };
 
+// What is up in a scene, as far as its photos tell: their mean. Null where they disagree.
+const uprightOf = (cameras) => {
+  const ups = cameras.map(({ camera_to_world: m }) => unit([-m[1], -m[5], -m[9]]));
+  const sum = ups.reduce((a, b) => add(a, b), [0, 0, 0]);
+  return length(sum) > 0.2 * ups.length ? unit(sum) : null;
+};
+
 // Whether each photo is behind, as crates/render/src/plan.rs: all but the nearest few.
 function behindOf(header, camera) {
   const axis = axesOf(camera)[2],

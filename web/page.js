@@ -9,6 +9,7 @@ const say = (text) => {
   $('says').textContent = text;
 };
 const failed = (error) => {
+  if (error.name === 'AbortError') return; // something else was opened
   $('key-form').hidden = error.status !== 401 && error.status !== 403;
   say(error.message);
 };
@@ -66,6 +67,8 @@ const state = {
   moving: 0,
   alone: false,
   understood: false,
+  upright: null,
+  filming: null,
 };
 let drawing = null,
   loading = null,
@@ -84,7 +87,7 @@ function invalidate() {
 
 let lastFrame = 0;
 function frame() {
-  if (!drawing || !state.camera) return;
+  if (!drawing || !state.camera || state.filming) return;
   const box = $('stage').getBoundingClientRect(),
     dense = Math.min(devicePixelRatio, 2);
   const moving = performance.now() - state.moving < 250;
@@ -215,29 +218,39 @@ function look(camera, still) {
   invalidate();
 }
 
+// The axis of a turn to the side, and of a turntable: the scene's up. A level horizon stays level.
+const axisOf = (camera) => state.upright || unit(camera.up);
+// An arm and the camera's up, turned about the axis, then about the picture's right.
+function swung(camera, arm, aside, over) {
+  const axis = axisOf(camera),
+    angle = dot(camera.up, axis) < 0 ? -aside : aside;
+  const right = turned(axesOf(camera)[0], axis, angle);
+  return [arm, camera.up].map((v) => turned(turned(v, axis, angle), right, over));
+}
+
+// What is near goes where a drag goes: an orbit turns the scene, a look turns the head.
 const hands = {
   orbit(dx, dy) {
-    const { eye, target, up } = state.camera,
-      right = axesOf(state.camera)[0];
-    let arm = turned(turned(add(eye, target, -1), unit(up), dx), right, -dy);
-    look({ ...state.camera, eye: add(target, arm), up: turned(up, right, -dy) });
+    const { eye, target } = state.camera;
+    const [arm, up] = swung(state.camera, add(eye, target, -1), -dx, -dy);
+    look({ ...state.camera, eye: add(target, arm), up });
   },
+  // dx and dy are in heights of the picture, at the depth of the target.
   pan(dx, dy) {
-    const { eye, target } = state.camera,
+    const { eye, target, fov } = state.camera,
       [x, y] = axesOf(state.camera);
-    const reach = length(add(target, eye, -1)),
-      shift = add(
-        x.map((v) => -v * dx * reach),
-        y,
-        -dy * reach,
-      );
+    const high = 2 * length(add(target, eye, -1)) * Math.tan((fov * Math.PI) / 360);
+    const shift = add(
+      x.map((v) => -v * dx * high),
+      y,
+      -dy * high,
+    );
     look({ ...state.camera, eye: add(eye, shift), target: add(target, shift) });
   },
   turn(dx, dy) {
-    const { eye, target, up } = state.camera,
-      right = axesOf(state.camera)[0];
-    const arm = turned(turned(add(target, eye, -1), unit(up), dx), right, -dy);
-    look({ ...state.camera, target: add(eye, arm), up: turned(up, right, -dy) });
+    const { eye, target } = state.camera;
+    const [arm, up] = swung(state.camera, add(target, eye, -1), dx, dy);
+    look({ ...state.camera, target: add(eye, arm), up });
   },
   zoom(factor) {
     const { eye, target } = state.camera;
@@ -282,13 +295,26 @@ function flyTo(goal) {
 }
 
 const touches = new Map();
-let pressed = null;
+let pressed = null,
+  held = null;
+// Two fingers: both have moved when the next frame is drawn, and are read together.
+function gesture() {
+  const [before, now] = [held, [...touches.values()]];
+  held = null;
+  if (!before || now.length !== 2) return;
+  const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
+  const high = $('stage').clientHeight,
+    [dx, dy] = [0, 1].map((k) => (now[0][k] + now[1][k] - before[0][k] - before[1][k]) / 2);
+  hands.zoom(apart(before) / apart(now));
+  hands.pan(dx / high, dy / high);
+}
 function bindView() {
   const view = $('view');
   view.addEventListener('pointerdown', (e) => {
     if (!state.camera) return;
     view.setPointerCapture(e.pointerId);
     touches.set(e.pointerId, [e.clientX, e.clientY]);
+    held = null;
     pressed = touches.size === 1 ? [e.clientX, e.clientY] : null;
     flyTo.now = null;
   });
@@ -300,9 +326,8 @@ function bindView() {
     touches.set(e.pointerId, [e.clientX, e.clientY]);
     const high = $('stage').clientHeight;
     if (touches.size === 2) {
-      const apart = ([a, b]) => Math.hypot(a[0] - b[0], a[1] - b[1]) || 1;
-      hands.zoom(apart(before) / apart([...touches.values()]));
-      hands.pan(dx / high / 2, dy / high / 2);
+      if (!held) requestAnimationFrame(gesture);
+      held ||= before;
     } else if (!pressed || Math.hypot(e.clientX - pressed[0], e.clientY - pressed[1]) > 4) {
       pressed = null;
       const how = $('drag').selectedIndex;
@@ -312,6 +337,7 @@ function bindView() {
     }
   });
   const end = (e) => {
+    gesture(); // the last movement before a finger goes
     touches.delete(e.pointerId);
   };
   view.addEventListener('pointerup', (e) => {
@@ -438,6 +464,7 @@ async function find(text) {
     try {
       const body = JSON.stringify({ texts: [text] });
       const answer = await server.json(`/v1/scenes/${id}/query`, { method: 'POST', body });
+      if (state.scene.id !== id) return; // another scene was opened meanwhile
       result = answer.results[0];
       floor = state.floor = answer.scoring.coverage_floor;
     } finally {
@@ -501,11 +528,15 @@ async function list(after) {
     '/v1/scenes' + (after ? `?after=${encodeURIComponent(after)}` : ''),
   );
   if (!after) $('scenes').replaceChildren();
+  $('none').hidden = Boolean(after) || page.scenes.length > 0;
   for (const item of page.scenes) {
     const when = new Date(item.created_ms);
     const button = make('button', {
       textContent: `${item.id.slice(0, 8)} · ${item.state} · ${when.toLocaleString('en-GB')}`,
-      onclick: () => open(item.id).catch(failed),
+      onclick: () => {
+        $('work').scrollIntoView({ block: 'nearest' });
+        open(item.id).catch(failed);
+      },
     });
     button.dataset.id = item.id;
     button.setAttribute('aria-current', String(state.scene?.id === item.id));
@@ -528,6 +559,7 @@ async function open(id, camera, words = []) {
   watching?.abort();
   watching = new AbortController();
   const { signal } = watching;
+  if (made !== id) showCapture({ rows: [], faults: [] }); // they are of another scene
   const path = `/v1/scenes/${encodeURIComponent(id)}`;
   let scene = await server.json(path);
   if (scene.state === 'queued' || scene.state === 'running') {
@@ -546,7 +578,7 @@ async function open(id, camera, words = []) {
     blame(why);
     throw new Error(why);
   }
-  if (state.scene?.id !== id) Object.assign(state, { words: [], known: [], kept: [], marks: [] });
+  if (state.scene?.id !== id) forget();
   for (const warning of scene.report.warnings) blame(warning.message);
   await load(id, camera);
   about(scene.report);
@@ -555,16 +587,34 @@ async function open(id, camera, words = []) {
   for (const word of words) await find(word);
 }
 
+// Nothing of the scene before stays beside another one.
+function forget() {
+  Object.assign(state, { words: [], known: [], kept: [], marks: [] });
+  for (const id of ['words', 'kept', 'picked']) $(id).replaceChildren();
+}
+
 // Loads the Gaussians, the largest first, and shows them as they come.
 async function load(id, camera) {
   loading?.abort();
+  state.filming?.abort();
   loading = new AbortController();
-  const begun = performance.now();
-  const answer = await server.call(`/v1/scenes/${id}/export?format=packed`, {
-    signal: loading.signal,
-  });
-  await take(answer.body, camera);
-  say(`${count(drawing.count)} Gaussians, ${Math.round(performance.now() - begun)} ms`);
+  const { signal } = loading,
+    begun = performance.now();
+  say('loading the scene …');
+  try {
+    const answer = await server.call(`/v1/scenes/${id}/export?format=packed`, { signal });
+    await take(answer.body, camera);
+  } finally {
+    if (!signal.aborted) $('progress').hidden = true;
+  }
+  say(`${shown()}, ${((performance.now() - begun) / 1000).toFixed(1)} s`);
+}
+
+// How many Gaussians there are, and which of them where the device has no room for all.
+function shown() {
+  const all = state.scene.gaussians;
+  if (drawing.count === all) return `${count(all)} Gaussians`;
+  return `The ${count(drawing.count)} largest of ${count(all)} Gaussians: more have no room here`;
 }
 
 async function take(stream, camera) {
@@ -574,7 +624,8 @@ async function take(stream, camera) {
       state.scene = header;
       state.understood = header.understood;
       document.body.classList.add('shown');
-      drawing.begin(header, backdrop, most);
+      const taken = drawing.begin(header, backdrop, most);
+      state.upright = uprightOf(header.cameras);
       state.home = cameraOf(header.cameras[0], header.unit);
       $('photo').replaceChildren(
         make('option', { textContent: 'go to …', value: '' }),
@@ -582,10 +633,14 @@ async function take(stream, camera) {
       );
       if (state.words.length) showWords();
       look(camera || state.home, true);
-      if (header.gaussians > most)
-        say(`The ${count(most)} largest of ${count(header.gaussians)} Gaussians.`);
+      proposeFilm(header.cameras);
+      return taken;
     },
-    (first, words) => drawing.append(first, words),
+    (first, words) => {
+      drawing.append(first, words);
+      $('progress').value = drawing.loaded / drawing.count;
+      $('progress').hidden = drawing.loaded === drawing.count;
+    },
   );
   remember();
 }
@@ -641,7 +696,8 @@ function fromLink() {
 }
 
 // ---- a capture ------------------------------------------------------------------------------
-let rows = [];
+let rows = [],
+  made = null; // the scene of these rows
 function showCapture(capture) {
   rows = capture.rows;
   $('faults').replaceChildren(...capture.faults.map((text) => make('li', { textContent: text })));
@@ -680,11 +736,12 @@ async function upload(files) {
   say('sending …');
   $('progress').hidden = false;
   try {
-    const made = await server.send('/v1/scenes', capture.form, (share) => {
+    const answer = await server.send('/v1/scenes', capture.form, (share) => {
       $('progress').value = share;
     });
+    made = answer.id;
     await list();
-    await open(made.id);
+    await open(made);
   } catch (error) {
     $('progress').hidden = true;
     blame(error.message);
@@ -700,12 +757,64 @@ function download(blob, name) {
   setTimeout(() => URL.revokeObjectURL(url), 60000);
 }
 
+const nameOf = (ending) => `segsplat-${(state.scene.id || 'scene').slice(0, 8)}.${ending}`;
+
 function picture() {
   drawing.draw(state.camera, state.kind);
-  $('view').toBlob((blob) =>
-    download(blob, `segsplat-${(state.scene.id || 'scene').slice(0, 8)}.png`),
-  );
+  $('view').toBlob((blob) => download(blob, nameOf('png')));
   invalidate();
+}
+
+// A film of photos that all look one way turns to and fro: nothing is known of what is behind.
+function proposeFilm(cameras) {
+  const [first, ...others] = cameras.map(({ camera_to_world: m }) => [m[2], m[6], m[10]]);
+  const around = !others.length || others.some((axis) => dot(first, axis) < 0);
+  $('film-motion').value = around ? 'turn' : 'swing';
+}
+
+function filmPlan() {
+  const side = Number($('film-side').value),
+    [width, height] = filmSize($('stage').getBoundingClientRect(), side);
+  const frames = FPS * Number($('film-seconds').value);
+  $('film-says').textContent = `${frames} frames of ${width} × ${height}, ${FPS} a second`;
+  return { width, height, frames, motion: $('film-motion').value };
+}
+
+async function makeAndKeepFilm() {
+  const { motion, ...plan } = filmPlan(),
+    camera = state.camera;
+  flyTo.now = null;
+  state.filming = new AbortController();
+  const running = (is) => {
+    $('film-make').disabled = is;
+    $('over').hidden = is; // its lines would stand still, and are not in the film
+    $('film-stop').hidden = $('progress').hidden = !is;
+  };
+  running(true);
+  $('view').dataset.state = 'busy';
+  say('making the video …');
+  $('progress').value = 0;
+  try {
+    const blob = await makeFilm(
+      drawing,
+      (share) => onTurntable(camera, axisOf(camera), motion, share),
+      {
+        ...plan,
+        kind: state.kind,
+        signal: state.filming.signal,
+        progress: (share) => ($('progress').value = share),
+      },
+    );
+    download(blob, nameOf('webm'));
+    say(`The video is written: ${(blob.size / 1e6).toFixed(1)} MB.`);
+  } catch (error) {
+    if (error.name !== 'AbortError') throw error;
+    say('The video is cancelled.');
+  } finally {
+    state.filming = null;
+    running(false);
+    look(state.camera, true);
+  }
 }
 
 async function exportAs(format) {
@@ -761,6 +870,17 @@ function bind() {
     }
   });
   $('shot').onclick = ready(picture);
+  $('film').onclick = () => {
+    const hidden = ($('film-form').hidden = !$('film-form').hidden);
+    $('film').setAttribute('aria-expanded', String(!hidden));
+    filmPlan();
+  };
+  $('film-form').onchange = filmPlan;
+  $('film-form').onsubmit = (e) => {
+    e.preventDefault();
+    if (state.camera && !state.filming) makeAndKeepFilm().catch(failed);
+  };
+  $('film-stop').onclick = () => state.filming?.abort();
   $('export').onchange = ready(() => {
     const format = $('export').value;
     $('export').value = '';
@@ -830,9 +950,13 @@ async function follow() {
 
 async function begin() {
   bind();
-  drawing = new Drawing($('view'), invalidate);
-  const packed = $('packed');
-  if (!packed) {
+  drawing = new Drawing($('view'), invalidate, (gone) => {
+    $('view').dataset.state = 'busy';
+    if (gone) say('The graphics device dropped the scene; it is loaded again when it is back.');
+    else if (state.alone) own(state.camera).catch(failed);
+    else if (state.scene) load(state.scene.id, state.camera).catch(failed);
+  });
+  if (!$('packed')) {
     await Promise.all([list(), follow()]);
     return;
   }
@@ -843,7 +967,15 @@ async function begin() {
   state.known = answer ? answer.results : [];
   state.floor = answer ? answer.scoring.coverage_floor : 0;
   $('known').append(...state.known.map(({ text }) => make('option', { value: text })));
-  const coded = packed.textContent,
+  await own(link.camera);
+  state.kind = link.kind;
+  const words = link.words.length ? link.words : state.known.slice(0, 1).map((one) => one.text);
+  for (const word of words) await find(word);
+}
+
+// Shows the scene that this file has in it.
+async function own(camera) {
+  const coded = $('packed').textContent,
     step = 1 << 20;
   let at = 0;
   await take(
@@ -853,13 +985,10 @@ async function begin() {
         to.enqueue(Uint8Array.from(atob(coded.slice(at, (at += step))), (c) => c.charCodeAt(0)));
       },
     }),
-    link.camera,
+    camera,
   );
-  state.kind = link.kind;
   const names = state.known.map((one) => one.text).join(', ');
-  say(`${count(drawing.count)} Gaussians. ${names && `Words: ${names}`}`);
-  const words = link.words.length ? link.words : state.known.slice(0, 1).map((one) => one.text);
-  for (const word of words) await find(word);
+  say(`${shown()}. ${names && `Words: ${names}`}`);
 }
 
 // For other pages' scripts and for tests: the camera, and one frame as it is drawn now.

@@ -3,8 +3,9 @@ const RECORD = 32,
   MOST = 4 << 20,
   CELLS = [128, 64];
 
-// Calls head(header, backdrop, count) once, then part(first, words) for whole Gaussians as they
-// come, the largest first. Of a scene over MOST Gaussians the smallest are left out.
+// Calls head(header, backdrop, count) once, which answers how many of them it takes, then
+// part(first, words) for whole Gaussians as they come, the largest first. Of a scene over MOST
+// Gaussians the smallest are left out.
 async function readPacked(stream, head, part) {
   const reader = stream.getReader();
   let kept = new Uint8Array(0),
@@ -25,8 +26,7 @@ async function readPacked(stream, head, part) {
         start = 4 + size + backdrop;
       if (kept.length >= start) {
         header = JSON.parse(new TextDecoder().decode(kept.subarray(4, 4 + size)));
-        count = Math.min(header.gaussians, MOST);
-        head(header, kept.slice(4 + size, start), count);
+        count = head(header, kept.slice(4 + size, start), Math.min(header.gaussians, MOST));
         kept = kept.slice(start);
       }
     }

@@ -12,9 +12,9 @@ const server = {
 
   // The answer, or an Error with the server's own words and its code.
   async call(path, options = {}) {
-    const answer = await fetch(path, {
-      ...options,
-      headers: { ...this.headers, ...options.headers },
+    const headers = { ...this.headers, ...options.headers };
+    const answer = await fetch(path, { ...options, headers }).catch((error) => {
+      throw error.name === 'AbortError' ? error : new Error('the server cannot be reached');
     });
     if (answer.ok) return answer;
     const fault = await answer.json().catch(() => ({}));

@@ -1,5 +1,5 @@
-"""Puts the program, its networks and its licences into the wheel. `SEGSPLAT_BIN` names a program that
-is not `target/release/segsplat`. The page is in the program.
+"""Puts the program, its networks and its licences into the wheel. `SEGSPLAT_BIN` names a program
+that is not `target/release/segsplat`. The page is in the program.
 """
 
 from __future__ import annotations

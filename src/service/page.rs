@@ -22,6 +22,7 @@ const SCRIPT: &str = concat!(
     include_str!("../../web/math.js"),
     include_str!("../../web/scene.js"),
     include_str!("../../web/draw.js"),
+    include_str!("../../web/film.js"),
     include_str!("../../web/server.js"),
     include_str!("../../web/capture.js"),
     include_str!("../../web/page.js"),

@@ -1,25 +1,24 @@
 """A real server, the generated photos, and a headless Chromium that draws by SwiftShader.
-`SEGSPLAT_BIN` names the program, `SEGSPLAT_BROWSER` the browser."""
+`SEGSPLAT_BROWSER` names the browser."""
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
-import subprocess
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from acts import WAIT_MS, post, sample
 from playwright.sync_api import Browser, Page, expect, sync_playwright
+from served import ROOT, run, served
 
-ROOT = Path(__file__).parents[2]
-PROGRAM = Path(os.environ.get("SEGSPLAT_BIN", ROOT / "target/debug/segsplat")).absolute()
 TARGET = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 BROWSERS = ["chromium-headless-shell", "chromium", "google-chrome"]
 SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-            "--ignore-gpu-blocklist"]
-# Software drawing on a busy machine: states are waited for, and this is the end of waiting.
-WAIT_MS = 300_000
+            "--ignore-gpu-blocklist", "--enable-precise-memory-info"]
 expect.set_options(timeout=WAIT_MS)
 
 
@@ -33,26 +32,33 @@ def browser_program() -> str:
 @pytest.fixture(scope="session")
 def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sample") / "photos"
-    subprocess.run([PROGRAM, "sample", "--photos", "4", "-o", folder], cwd=ROOT, check=True)
+    run("sample", "--photos", "4", "-o", folder)
     return folder
 
 
 @pytest.fixture(scope="session")
 def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    folder = tmp_path_factory.mktemp("server")
-    command = [PROGRAM, "serve", "--listen", "127.0.0.1:0", "--data-dir", folder / "data",
-               "--renderer", "cpu"]
-    with (
-        (folder / "log").open("w") as log,
-        subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=log) as server,
-    ):
-        assert server.stdout
-        try:
-            first = server.stdout.readline().decode()
-            assert first.startswith("listening on "), first
-            yield first.split()[-1]
-        finally:
-            server.terminate()
+    with served(tmp_path_factory.mktemp("server") / "data", "--renderer", "cpu") as address:
+        yield address
+
+
+@pytest.fixture(scope="session")
+def scene(url: str, photos: Path) -> str:
+    """The id of a scene with semantics that a program made, for the tests that only look."""
+    made = post(url, [("transforms", name, data) if name == "transforms.json"
+                      else ("photo", f"images/{name}", data)
+                      for name, data in sample(photos).items()])
+    ask = json.dumps({"texts": ["box"], "wait_ms": 600_000}).encode()
+    with urllib.request.urlopen(f"{url}/v1/scenes/{made}/query", ask) as answer:
+        assert json.load(answer)["results"][0]["gaussians"] > 0
+    return made
+
+
+@pytest.fixture(scope="session")
+def splats(url: str) -> str:
+    """The id of a scene of 40 Gaussians, of a file: quick to draw."""
+    source = ROOT / "tests/fixtures/splats/source.ply"
+    return post(url, [("splats", source.name, source.read_bytes())])
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import json
 import urllib.parse
@@ -10,7 +9,7 @@ import urllib.request
 from pathlib import Path
 
 import numpy as np
-import pytest
+from acts import drop, look, pixels, sample, settled
 from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
 from playwright.sync_api import Page, expect
@@ -18,46 +17,6 @@ from playwright.sync_api import Page, expect
 PSNR_DB, IOU = 35.0, 0.95
 # Poses: each photo's, and one between them that magnifies.
 POSES = [(0, [0, 0, 0]), (1, [0, 0, 0]), (2, [0, 0, 0]), (3, [0, 0, 0]), (0, [0.3, -0.1, 0.6])]
-
-
-def settled(page: Page) -> None:
-    page.wait_for_selector("#view[data-state=settled]")
-
-
-def drop(page: Page, files: dict[str, bytes]) -> None:
-    """Drops files onto the page as a person does."""
-    given = {name: base64.b64encode(data).decode() for name, data in files.items()}
-    page.evaluate(
-        """(given) => {
-          const transfer = new DataTransfer();
-          for (const [name, coded] of Object.entries(given)) {
-            const bytes = Uint8Array.from(atob(coded), (c) => c.charCodeAt(0));
-            transfer.items.add(new File([bytes], name));
-          }
-          document.getElementById('drop').dispatchEvent(
-            new DragEvent('drop', { dataTransfer: transfer, bubbles: true, cancelable: true }));
-        }""", given)
-
-
-def sample(photos: Path) -> dict[str, bytes]:
-    files = {path.name: path.read_bytes() for path in sorted((photos / "images").iterdir())}
-    return {**files, "transforms.json": (photos / "transforms.json").read_bytes()}
-
-
-def pixels(page: Page) -> np.ndarray:
-    """The canvas, `[H, W, 3]`."""
-    settled(page)
-    coded = page.evaluate("segsplat.pixels()").split(",")[1]
-    return np.asarray(Image.open(io.BytesIO(base64.b64decode(coded))).convert("RGB"))
-
-
-def look(page: Page, photo: int, shift: list[float]) -> None:
-    page.evaluate(
-        """([photo, shift]) => {
-          const { look, cameraOf, state } = segsplat;
-          const camera = cameraOf(state.scene.cameras[photo], state.scene.unit);
-          look({ ...camera, eye: camera.eye.map((v, i) => v + shift[i]) }, true);
-        }""", [photo, shift])
 
 
 def served(page: Page, url: str, shape: tuple[int, ...], **options: str) -> np.ndarray:
@@ -72,28 +31,6 @@ def served(page: Page, url: str, shape: tuple[int, ...], **options: str) -> np.n
         "height": height, "format": "png", **options})
     with urllib.request.urlopen(f"{url}/v1/scenes/{scene}/view?{query}") as answer:
         return np.asarray(Image.open(io.BytesIO(answer.read())).convert("RGB"))
-
-
-@pytest.fixture(scope="session")
-def scene(url: str, photos: Path) -> str:
-    """The id of a scene with semantics that a program made, for the tests that only look."""
-    line = "page"
-    parts = [("photo", f"images/{name}" if name != "transforms.json" else name, data)
-             for name, data in sample(photos).items()]
-    body = b"".join(
-        f'--{line}\r\nContent-Disposition: form-data; '
-        f'name="{"transforms" if name == "transforms.json" else field}"; filename="{name}"\r\n\r\n'
-        .encode() + data + b"\r\n" for field, name, data in parts) + f"--{line}--\r\n".encode()
-    request = urllib.request.Request(
-        f"{url}/v1/scenes?wait_ms=600000", body,
-        {"content-type": f"multipart/form-data; boundary={line}"})
-    with urllib.request.urlopen(request) as answer:
-        made = json.load(answer)
-    assert made["state"] == "done", made
-    ask = json.dumps({"texts": ["box"], "wait_ms": 600_000}).encode()
-    with urllib.request.urlopen(f"{url}/v1/scenes/{made['id']}/query", ask) as answer:
-        assert json.load(answer)["results"][0]["gaussians"] > 0
-    return made["id"]
 
 
 def test_photos_are_dropped_and_the_scene_is_flown_asked_clicked_shared_and_kept(
@@ -141,6 +78,8 @@ def test_photos_are_dropped_and_the_scene_is_flown_asked_clicked_shared_and_kept
     alone.goto(kept.as_uri() + "#" + link.split("#")[1])
     expect(alone.locator("#words li strong")).to_have_text(["box"])
     assert np.abs(pixels(alone).astype(float) - before).mean() < 0.5
+    # There is no server to ask for a file.
+    expect(alone.locator("#export")).to_be_hidden()
     assert not calls, calls
     alone.close()
 

@@ -1,53 +1,14 @@
-"""A real server, photos for it, and scenes. `SEGSPLAT_BIN` names the program. It is run in the
-root of the repository, where it finds its networks.
-"""
+"""A real server, photos for it, and scenes."""
 
 from __future__ import annotations
 
-import os
-import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from served import run, served
 
 from segsplat import Client, Scene
-
-ROOT = Path(__file__).parents[3]
-PROGRAM = Path(os.environ.get("SEGSPLAT_BIN", ROOT / "target/debug/segsplat")).absolute()
-
-
-def run(*args: str | Path) -> str:
-    """What the program writes."""
-    done = subprocess.run([PROGRAM, *args], cwd=ROOT, stdout=subprocess.PIPE, check=True)
-    return done.stdout.decode()
-
-
-@contextmanager
-def served(
-    data: Path,
-    *flags: str | Path,
-    program: Path = PROGRAM,
-    cwd: Path = ROOT,
-    env: dict[str, str] | None = None,
-) -> Iterator[str]:
-    """The address of a server of its own."""
-    command = [program, "serve", "--listen", "127.0.0.1:0", "--data-dir", data, *flags]
-    with (
-        (data.parent / f"{data.name}.log").open("w") as log,
-        subprocess.Popen(
-            command, cwd=cwd, env=env, stdout=subprocess.PIPE, stderr=log
-        ) as server,
-    ):
-        assert server.stdout
-        try:
-            first = server.stdout.readline().decode()
-            assert first.startswith("listening on "), first
-            yield first.split()[-1]
-        finally:
-            server.terminate()
-
 
 @pytest.fixture(scope="session")
 def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:

@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from conftest import ROOT, run, served
+from served import ROOT, run, served
 
 import segsplat
 from segsplat import Client, Scene, SegSplatError

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import httpx
 import pytest
-from conftest import PROGRAM, ROOT, served
+from served import PROGRAM, ROOT, served
 from test_package import checked
 
 from segsplat import Client

@@ -325,7 +325,8 @@ class KnownWord:
     word: str
     #: What to expect of it; "unmeasured" where too few photographs show it.
     trust: Literal["good", "fair", "poor", "unmeasured"]
-    #: Cut things and whole photographs that it may be said of, and the share of each that it selects.
+    #: Cut things and whole photographs that it may be said of, and the share of each that it
+    #: selects.
     things: int
     things_found: float | None
     photographs: int

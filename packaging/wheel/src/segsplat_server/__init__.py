@@ -1,4 +1,4 @@
-"""The program `segsplat` with its networks. Its ONNX Runtime is that of the package `onnxruntime`."""
+"""The program `segsplat` with its networks. ONNX Runtime is that of the package `onnxruntime`."""
 
 from __future__ import annotations
 
