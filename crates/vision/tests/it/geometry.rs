@@ -53,6 +53,19 @@ fn photo(width: u32, height: u32, center: DVec3, turn: f64) -> PosedPhoto {
     }
 }
 
+/// The CPU's file is made by a script that looks for the sweeps in an export. Without the operator
+/// all samples of a sweep are in memory: 576 MB for four photos, and their products.
+#[test]
+fn the_embedded_file_for_cpus_sweeps_by_the_operator_of_this_program() {
+    let file = std::fs::read(root().join("models/embedded/geometry_cpu.onnx")).unwrap();
+    // Field 4 of a node, its type: the tag, the length, the name.
+    let nodes = |name: &str| {
+        let field = [&[0x22, name.len() as u8], name.as_bytes()].concat();
+        file.windows(field.len()).filter(|bytes| **bytes == *field).count()
+    };
+    assert_eq!((nodes("Correlate"), nodes("GridSample")), (2, 1));
+}
+
 fn run(network: &Geometry, photos: &[PosedPhoto]) -> Result<Vec<ViewGaussians>> {
     let views: Vec<usize> = (0..photos.len()).collect();
     let count = (photos.len() - 1).min(3);
