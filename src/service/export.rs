@@ -60,9 +60,7 @@ impl Service {
         let inner = Arc::clone(&self.inner);
         if format == ExportFormat::Npz {
             if ask.text.is_some() {
-                return Err(Error::invalid(
-                    "text goes with the formats of Gaussians and html, not with npz",
-                ));
+                return Err(texts::not_with("npz"));
             }
             let understood = inner.understood(&access.finished()?, "npz", ask.wait).await?;
             let etag = format!("{}-npz", hash(understood.subject().tag));
@@ -75,9 +73,7 @@ impl Service {
             return self.page(id, preset, ask).await;
         }
         if format == ExportFormat::Packed && ask.text.is_some() {
-            return Err(Error::invalid(
-                "text goes with the formats of Gaussians and html, not with packed",
-            ));
+            return Err(texts::not_with("packed"));
         }
         let Some(text) = &ask.text else {
             let access = access.finished()?;

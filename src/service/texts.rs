@@ -56,6 +56,13 @@ pub(super) fn lines(ask: &TextOptions) -> Vec<String> {
     ask.text.iter().flat_map(|text| text.lines().map(str::to_owned)).collect()
 }
 
+/// The refusal of a text of an export whose format, `name`, takes none.
+pub(super) fn not_with(name: &str) -> Error {
+    Error::invalid(format!(
+        "text goes with the formats of Gaussians, html, coco and labelme, not with {name}"
+    ))
+}
+
 /// Refuses a list that is empty or longer than `max`; `what` names it.
 pub(super) fn check_count(what: &str, count: usize, max: usize) -> Result<()> {
     match count {

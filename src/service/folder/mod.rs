@@ -85,10 +85,7 @@ impl FolderFormat {
         match (self.texts, asked.is_empty()) {
             (true, _) => texts::all_checked(asked, "text", limits),
             (false, true) => Ok(Vec::new()),
-            (false, false) => Err(Error::invalid(format!(
-                "text goes with the formats of Gaussians, html, coco and labelme, not with {}",
-                self.name
-            ))),
+            (false, false) => Err(texts::not_with(self.name)),
         }
     }
 }
