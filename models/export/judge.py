@@ -47,7 +47,8 @@ judge (float[prompts, kinds, GRID, GRID] masks, int64[levels] judged_levels, flo
     end = Mul (words, word)
     whole = Slice (padded, first, end, cells_axis)
     eights = Reshape (whole, bytes_of_cells)
-    packed = MatMul (eights, bit_values)
+    weighed = Mul (eights, bit_values)
+    packed = ReduceSum <keepdims = 0> (weighed, last)
     mask_bits = Cast <to = 2> (packed)
 }
 """

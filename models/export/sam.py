@@ -15,7 +15,8 @@ import numpy as np
 import onnx
 import torch
 from segment_anything import sam_model_registry
-from torch.nn.functional import layer_norm
+from segment_anything.modeling import image_encoder
+from torch.nn.functional import gelu, layer_norm
 
 from common import TOLERANCES, arguments, export, gap, half_precision, hold, prepare, session, write_masks
 from judge import with_judge
@@ -77,8 +78,21 @@ class FoldedAttention(torch.nn.Module):
         return own.proj(found.permute(0, 2, 3, 1, 4).reshape(-1, height, width, channels))
 
 
+def windows(x, size):
+    """SAM's `window_partition`. Rows and columns of zeros are joined on: ONNX Runtime's `Pad` takes a third of the
+    encoder's time on a GPU."""
+    batch, height, width, channels = (int(n) for n in x.shape)
+    down, across = -height % size, -width % size
+    x = torch.cat([x, torch.zeros(batch, down, width, channels)], dim=1)
+    x = torch.cat([x, torch.zeros(batch, height + down, across, channels)], dim=2)
+    rows, columns = (height + down) // size, (width + across) // size
+    cut = x.reshape(batch, rows, size, columns, size, channels).permute(0, 1, 3, 2, 4, 5)
+    return cut.reshape(-1, size, size, channels), (height + down, width + across)
+
+
 def encoder_of(sam):
-    """The official encoder with the same weights, whose attention and norms are of fewer operators."""
+    """The official encoder with the same weights, whose attention, norms and windows are of fewer or faster operators."""
+    image_encoder.window_partition = windows
     encoder = copy.copy(sam.image_encoder)
     encoder._modules = dict(encoder._modules)
     encoder.neck = torch.nn.Sequential(*[ChannelNorm(m) if type(m).__name__ == "LayerNorm2d" else m for m in encoder.neck])
@@ -107,33 +121,102 @@ class Prompts(torch.nn.Module):
         return code
 
 
+def of_heads(rows, table):
+    """`[P, T, heads * c]` times `[heads, c, d]`, a product for each head: `[P, heads * T, d]`, the tokens of a head together."""
+    heads, width, _ = table.shape
+    count, tokens = rows.shape[0], rows.shape[1]
+    split = rows.reshape(count * tokens, heads, width).transpose(0, 1) @ table
+    return split.unflatten(1, (count, tokens)).transpose(0, 1).reshape(count, heads * tokens, -1)
+
+
+def tokens_see_image(attention, queries, placed, cells):
+    """SAM's attention of tokens `[P, T, C]` to cells `[P or 1, N, C]`; `placed` are the cells with their places. The keys'
+    matrix is multiplied with the few queries, and the values' matrix with the few mixtures, so that neither is applied to
+    all cells. The keys' bias is the same for all cells and has no effect."""
+    own, heads = attention, attention.num_heads
+    channels = own.q_proj.weight.shape[0] // heads
+    folded = of_heads(own.q_proj(queries) / channels**0.5, own.k_proj.weight.unflatten(0, (heads, channels)))
+    mixed = (folded @ placed.transpose(1, 2)).softmax(dim=-1) @ cells
+    count, tokens = queries.shape[0], queries.shape[1]
+    by_head = mixed.unflatten(1, (heads, tokens)).transpose(0, 1).reshape(heads, count * tokens, -1)
+    values = by_head @ own.v_proj.weight.unflatten(0, (heads, channels)).transpose(1, 2)
+    values = values.transpose(0, 1).reshape(count, tokens, heads * channels) + own.v_proj.bias
+    return own.out_proj(values)
+
+
+def image_sees_tokens(attention, placed, keys, values):
+    """SAM's attention of cells to tokens, without the last bias: the queries' matrix is multiplied with the few keys, and the
+    last matrix with the few values."""
+    own, heads = attention, attention.num_heads
+    channels = own.q_proj.weight.shape[0] // heads
+    tokens = keys.shape[1]
+    keys = own.k_proj(keys) / channels**0.5
+    folded = of_heads(keys, own.q_proj.weight.unflatten(0, (heads, channels)))
+    bias = of_heads(keys, own.q_proj.bias.unflatten(0, (heads, channels)).unsqueeze(2))
+    scores = placed @ folded.transpose(1, 2) + bias.transpose(1, 2)
+    shares = scores.unflatten(2, (heads, tokens)).softmax(dim=-1).flatten(2)
+    return shares @ of_heads(own.v_proj(values), own.out_proj.weight.transpose(0, 1).unflatten(0, (heads, channels)))
+
+
+class SumNorm(torch.autograd.Function):
+    """`layer_norm(x + skip + bias)` as one operator of ONNX Runtime; `skip` may be the same for all of the first axis."""
+
+    @staticmethod
+    def forward(ctx, x, skip, weight, shift, bias, epsilon):
+        return layer_norm(x + skip + bias, weight.shape, weight, shift, epsilon)
+
+    @staticmethod
+    def symbolic(g, x, skip, weight, shift, bias, epsilon):
+        return g.op("com.microsoft::SkipLayerNormalization", x, skip, weight, shift, bias, epsilon_f=epsilon)
+
+
 class Decoder(torch.nn.Module):
-    """`SamOnnxModel` without former masks and without enlarging, for any number of prompts. What is the same for
-    all prompts is computed once, and both steps of the enlarging are products of matrices, channels last."""
+    """`SamOnnxModel` without former masks and without enlarging, for any number of prompts, in an order that goes over the
+    cells of all prompts less often. What is the same for all prompts is computed once, and both steps of the enlarging
+    are products of matrices, channels last."""
 
     def __init__(self, sam):
         super().__init__()
         self.masks, self.side = sam.mask_decoder, sam.image_encoder.img_size // 16
-        self.register_buffer("places", sam.prompt_encoder.get_dense_pe())
-        self.register_buffer("dense", sam.prompt_encoder.no_mask_embed.weight.reshape(1, -1, 1, 1))
+        self.register_buffer("places", sam.prompt_encoder.get_dense_pe().flatten(2).permute(0, 2, 1))
+        self.register_buffer("dense", sam.prompt_encoder.no_mask_embed.weight)
+
+    def transformed(self, cells, tokens):
+        """SAM's two-way transformer: tokens `[P, T, C]`, cells `[P, N, C]`."""
+        own, found = self.masks.transformer, tokens
+        for layer in own.layers:
+            placed = cells + self.places
+            if layer.skip_first_layer_pe:
+                found = layer.norm1(layer.self_attn(found, found, found))
+            else:
+                at = found + tokens
+                found = layer.norm1(found + layer.self_attn(at, at, found))
+            found = layer.norm2(found + tokens_see_image(layer.cross_attn_token_to_image, found + tokens, placed, cells))
+            found = layer.norm3(found + layer.mlp(found))
+            attention, norm = layer.cross_attn_image_to_token, layer.norm4
+            more = image_sees_tokens(attention, placed, found + tokens, found)
+            cells = SumNorm.apply(more, cells, norm.weight, norm.bias, attention.out_proj.bias, norm.eps)
+        last = tokens_see_image(own.final_attn_token_to_image, found + tokens, cells + self.places, cells)
+        return own.norm_final_attn(found + last), cells
 
     @staticmethod
     def doubled(step, x):
-        """A transposed convolution of 2 x 2 and stride 2: each cell makes four, `[..., c]` to `[..., 4, c']`."""
+        """A transposed convolution of 2 x 2 and stride 2, without its bias: each cell makes four, `[R, c]` to `[4 R, c']`."""
         channels = step.bias.shape[0]
-        matrix = step.weight.permute(0, 2, 3, 1).reshape(-1, 4 * channels)
-        return (x @ matrix).unflatten(-1, (4, channels)) + step.bias
+        return (x @ step.weight.permute(0, 2, 3, 1).reshape(-1, 4 * channels)).reshape(-1, channels)
 
     def forward(self, image_embeddings, prompt_tokens):
         m, side, count = self.masks, self.side, prompt_tokens.shape[0]
         tokens = torch.cat([m.iou_token.weight, m.mask_tokens.weight]).unsqueeze(0).expand(count, -1, -1)
         tokens = torch.cat((tokens, prompt_tokens), dim=1)
-        hidden, cells = m.transformer(image_embeddings + self.dense, self.places, tokens)
-        first, norm, gelu, second, last = m.output_upscaling
-        fine = gelu(layer_norm(self.doubled(first, cells), norm.weight.shape, norm.weight, norm.bias, norm.eps))
-        fine = last(self.doubled(second, fine)).reshape(count, 16 * side * side, -1)
+        hidden, cells = self.transformed(image_embeddings.flatten(2).permute(0, 2, 1) + self.dense, tokens)
+        first, norm, _, second, _ = m.output_upscaling
+        channels = first.bias.shape[0]
+        fine = self.doubled(first, cells.reshape(count * side * side, -1)).reshape(-1, 1, channels)
+        fine = gelu(SumNorm.apply(fine, first.bias.reshape(1, 1, -1), norm.weight, norm.bias, torch.zeros_like(norm.bias), norm.eps))
+        fine = gelu(self.doubled(second, fine.reshape(-1, channels)) + second.bias)
         rows = [m.output_hypernetworks_mlps[i](hidden[:, 1 + i]) for i in range(m.num_mask_tokens)]
-        masks = fine @ torch.stack(rows, dim=2)
+        masks = fine.reshape(count, 16 * side * side, -1) @ torch.stack(rows, dim=2)
         masks = masks.reshape(count, side, side, 2, 2, 2, 2, m.num_mask_tokens).permute(0, 7, 1, 3, 5, 2, 4, 6)
         return masks.reshape(count, m.num_mask_tokens, 4 * side, 4 * side), m.iou_prediction_head(hidden[:, 0])
 
