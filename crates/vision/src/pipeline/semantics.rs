@@ -254,17 +254,26 @@ fn embed(
     let of_photo = |(photo, of): (usize, &PhotoMasks)| (0..of.masks.len()).map(move |k| [photo, k]);
     let all: Vec<[usize; 2]> = masks.iter().enumerate().flat_map(of_photo).collect();
     let size = tools.batch.max(1);
-    for (i, batch) in all.chunks(size).enumerate() {
+    let cut = |&[photo, k]: &[usize; 2]| {
+        Some(([photo, k], cutters[photo].cut(k, tools.crop_margin, tools.crop_shape)?))
+    };
+    let cut_all = |batch: &[[usize; 2]]| -> (Vec<[usize; 2]>, Vec<Crop>) {
+        batch.par_iter().filter_map(cut).unzip()
+    };
+    let batches: Vec<&[[usize; 2]]> = all.chunks(size).collect();
+    let mut next = batches.first().map(|batch| cut_all(batch));
+    for (i, batch) in batches.iter().enumerate() {
         unless_cancelled(watch.cancel)?;
         (watch.progress)(Stage::Embed, fraction(i * size, all.len()));
-        let cut = |&[photo, k]: &[usize; 2]| {
-            Some(([photo, k], cutters[photo].cut(k, tools.crop_margin, tools.crop_shape)?))
-        };
-        let (of, crops): (Vec<[usize; 2]>, Vec<Crop>) = batch.par_iter().filter_map(cut).unzip();
-        if crops.is_empty() {
-            continue;
-        }
-        let rows = (tools.embed)(&crops)?;
+        let (of, crops) = next.take().unwrap_or_else(|| cut_all(batch));
+        // The next batch is cut meanwhile.
+        let rows = std::thread::scope(|scope| {
+            let ahead = batches.get(i + 1).map(|batch| scope.spawn(|| cut_all(batch)));
+            let rows = if crops.is_empty() { Ok(Vec::new()) } else { (tools.embed)(&crops) };
+            // One that panicked is cut again, and panics where it can be seen.
+            next = ahead.and_then(|ahead| ahead.join().ok());
+            rows
+        })?;
         if rows.len() != crops.len() * tools.dim {
             return Err(Error::internal(format!(
                 "semantics: {} numbers for {} crops of {}",
