@@ -9,13 +9,15 @@ use serde_json::json;
 use super::{Args, Drawing, Reference, generated::dump};
 use crate::{
     error::{Error, Result},
+    refine::RefineOptions,
     render::{
         Kinds, RenderRequest,
         backward::{DifferentiableRenderer, FrameGradients, Gradients, oracle},
         cpu::CpuRenderer,
+        train::{LearningRates, TrainingPhoto, TrainingSet, TrainingStep},
     },
     rows::{Rows, median, ms},
-    scene::Gaussians,
+    scene::{Gaussians, Photo},
 };
 
 /// Most Gaussians times pixels that the oracle is asked for.
@@ -24,7 +26,8 @@ const ORACLE_MAX: usize = 1 << 28;
 /// Makes a row. The loss is linear in colour, by random numbers. `forward_ms` and `step_ms` are
 /// calls: the Gaussians of a step are new ones each time, as a refinement makes them, and go up,
 /// the frame comes down, the gradients by its pixels go up and those by the Gaussians come down.
-/// `device` has the times of the kernels. The error is relative, of all derivatives over 1e-6 of
+/// `trained_ms` is a step of a refinement on the device, with its loss and Adam, of one photo;
+/// `null` where the renderer takes none. `device` has the times of the kernels. The error is relative, of all derivatives over 1e-6 of
 /// the largest of their kind, against the oracle or the CPU kernel.
 ///
 /// # Errors
@@ -50,6 +53,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         pass(&*renderer, &moved, &request, &by, &mut found)?;
         step_ms.push(ms(begun));
     }
+    let trained_ms = trained(&*renderer, &gaussians, &request, args.frames)?;
     let device = renderer.backward_times(&gaussians, &request, &by)?;
     let errors = match args.compare {
         Reference::Cpu => {
@@ -91,10 +95,38 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         "intersections": frame.stats.intersections,
         "forward_ms": median(forward_ms),
         "step_ms": median(step_ms),
+        "trained_ms": trained_ms,
         "device": device,
     });
     let numbers = errors.len();
     rows.push(json!({ "median": at(0.5), "p99": at(0.99), "numbers": numbers }), row)
+}
+
+/// Median milliseconds of a step of the renderer's trainer towards a photo of random colours.
+fn trained(
+    renderer: &dyn DifferentiableRenderer,
+    gaussians: &Gaussians,
+    request: &RenderRequest,
+    steps: usize,
+) -> Result<Option<f64>> {
+    let (lens, mut random) = (request.lens(), Random(5));
+    let bytes = 3 * lens.width as usize * lens.height as usize;
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..255")]
+    let rgb = (0..bytes).map(|_| random.range(0.0, 255.0) as u8).collect();
+    let photo = Photo { width: lens.width, height: lens.height, rgb, valid: None };
+    let photos = vec![TrainingPhoto { photo: &photo, request: request.clone() }];
+    let set = TrainingSet { gaussians, photos, ssim_share: RefineOptions::default().ssim_share };
+    let Some(mut trainer) = renderer.trainer(&set)? else { return Ok(None) };
+    let rates = LearningRates::default();
+    let step = TrainingStep { rates, exposure: 5e-3, opacity_min: 0.0 };
+    let mut times = Vec::new();
+    for _ in 0..=steps {
+        let begun = Instant::now();
+        trainer.step(&[0], &step)?;
+        times.push(ms(begun));
+    }
+    // The first finds how much room a step needs.
+    Ok(Some(median(times.split_off(1))))
 }
 
 /// A frame and its backward pass.
