@@ -91,6 +91,7 @@ def once(args, at, files, transforms):
     status = json.loads(call(query, body, content)[0])
     if status["state"] != "done":
         raise SystemExit(f"the scene is {status}")
+    made_in = time.perf_counter() - begun
     scene = f"{args.url}/v1/scenes/{status['id']}"
     view = {"from": 0, "to": 1, "t": 0.0}
     # A text that no run before asked, so that its embedding is not known.
@@ -111,6 +112,8 @@ def once(args, at, files, transforms):
     median = lambda rows, name: statistics.median(row.get(name, 0) for row in rows)  # noqa: E731
     return {
         "total_ms": total * 1e3,
+        "scene_ms": made_in * 1e3,
+        "stages": made,
         "capture_ms": made["capture"],
         "gaussians_ms": made["geometry"],
         "masks_ms": made["masks"],
@@ -140,7 +143,7 @@ def main():
     args = parser.parse_args()
     files, transforms = photos(args.scene, args.frames, args.side)
     runs = [once(args, at, files, transforms) for at in range(args.runs + 1)][1:]
-    names = [name for name in runs[0] if name not in ("masks", "bank")]
+    names = [name for name in runs[0] if name not in ("masks", "bank", "stages")]
     middle = {name: statistics.median(run[name] for run in runs) for name in names}
     row = {
         "table": "paper-time",
@@ -154,6 +157,7 @@ def main():
         "runs": args.runs,
         **{name: float(f"{value:.4g}") for name, value in middle.items()},
         "slowest_ms": max(run["total_ms"] for run in runs),
+        "stages": {name: statistics.median(run["stages"][name] for run in runs) for name in runs[0]["stages"]},
         "masks": runs[0]["masks"],
         "bank": runs[0]["bank"],
     }
