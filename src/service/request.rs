@@ -115,6 +115,8 @@ pub enum Boxes {
     /// Turned along the part's own axes.
     #[default]
     Oriented,
+    /// The same with the last axis up, which is the mean of up in the photos.
+    Upright,
     /// Along the axes of the world.
     Aligned,
     /// No parts and no boxes.

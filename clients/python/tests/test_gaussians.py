@@ -34,7 +34,7 @@ def test_another_file_is_refused() -> None:
 
 def test_viser_shows_a_scene(scene: Scene) -> None:
     viser = pytest.importorskip("segsplat.viser")
-    box = Box(1, np.zeros(3), np.eye(3), np.array([1.0, 2, 3]))
+    box = Box(1, np.zeros(3), np.eye(3), np.array([1.0, 2, 3]), np.zeros(3), np.eye(3), np.ones(2))
     edges = viser.edges_of(box)
     assert edges.shape == (12, 2, 3)
     lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)

@@ -1,5 +1,6 @@
 //! The status of a scene, as the store keeps it and as callers and watchers see it.
 
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -95,6 +96,15 @@ pub struct SceneCamera {
     /// None where the photo was not used.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub network: Option<Intrinsics>,
+}
+
+impl SceneCamera {
+    /// Up in the pictures of all cameras, a unit vector of the world; -y where there are none.
+    #[must_use]
+    pub fn mean_up(cameras: &[Self]) -> DVec3 {
+        let sum: DVec3 = cameras.iter().map(|c| -c.camera.camera_to_world.rotation().y_axis).sum();
+        sum.try_normalize().unwrap_or(DVec3::NEG_Y)
+    }
 }
 
 /// Where the semantics of a scene stand.
