@@ -1,9 +1,15 @@
-"""The Gaussians as arrays, and in viser where it is installed."""
+"""The Gaussians as arrays, in a file for Rerun, and in viser where it is installed."""
 
 from __future__ import annotations
 
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
+from served import ROOT
 
 from segsplat import BadAnswer, Box, Gaussians, Scene
 
@@ -40,3 +46,21 @@ def test_viser_shows_a_scene(scene: Scene) -> None:
     lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
     assert sorted(lengths) == [1] * 4 + [2] * 4 + [3] * 4
     viser.show(scene, [box]).stop()
+
+
+def test_rerun_reads_what_the_example_writes(scene: Scene, tmp_path: Path) -> None:
+    name = "rerun_log"
+    path = ROOT / f"clients/python/examples/{name}.py"
+    example = importlib.util.spec_from_file_location(name, path)
+    assert example and example.loader
+    module = importlib.util.module_from_spec(example)
+    example.loader.exec_module(module)
+    out = tmp_path / "scene.rrd"
+    module.log(scene, str(out), ["floor", "box"])
+    reader = [sys.executable, "-m", "rerun", "rrd", "print", str(out)]
+    told = subprocess.run(reader, stdout=subprocess.PIPE, check=True, text=True).stdout
+    matches = scene.query("floor", "box", masks=False)
+    parts = [f"/scene/parts/{match.text}/0" for match in matches if match.boxes]
+    assert parts, "no text finds a part"
+    for entity in ["/scene/gaussians", "/scene/photos/0", "/scene/photos/1", *parts]:
+        assert entity in told, f"{entity} is not in the file"
