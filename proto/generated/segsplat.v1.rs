@@ -533,7 +533,7 @@ pub enum Boxes {
     Aligned = 2,
     /// No parts and no boxes.
     None = 3,
-    /// As BOXES_ORIENTED with the last axis up, which is the mean of up in the photos.
+    /// As BOXES_ORIENTED with the last axis up, as the photos tell it.
     Upright = 4,
 }
 impl Boxes {

@@ -115,7 +115,7 @@ pub enum Boxes {
     /// Turned along the part's own axes.
     #[default]
     Oriented,
-    /// The same with the last axis up, which is the mean of up in the photos.
+    /// The same with the last axis up, as the photos tell it.
     Upright,
     /// Along the axes of the world.
     Aligned,

@@ -455,7 +455,7 @@ async fn http_gives_pictures_of_texts_as_files_and_in_json() {
     let call = client.post(url.clone()).json(&upright);
     let part = json(call.send().await.unwrap()).await.unwrap()["results"][0]["parts"][0].clone();
     let cameras = server.service.get(&id).await.unwrap().cameras;
-    let up = SceneCamera::mean_up(&cameras).to_array();
+    let up = SceneCamera::level_up(&cameras).to_array();
     for (axis, up) in up.into_iter().enumerate() {
         assert!((part["axes"][2][axis].as_f64().unwrap() - up).abs() < 1e-9, "{part}");
     }

@@ -157,7 +157,7 @@ impl Components {
         join_cells(&mut bonds, &sites, options.reach);
 
         let mut components = Self {
-            up: SceneCamera::mean_up(cameras),
+            up: SceneCamera::level_up(cameras),
             photos: cameras.len(),
             seen: seen(gaussians, cameras),
             ..Self::default()

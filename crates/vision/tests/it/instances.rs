@@ -308,10 +308,39 @@ fn an_upright_box_stands_on_the_ground() {
 }
 
 #[test]
+fn up_is_that_of_gravity_though_the_photos_look_down() {
+    let gravity = DMat3::from_rotation_z(0.5) * DMat3::from_rotation_x(0.2);
+    // Down by 25 degrees, and to three sides. y of a camera is down.
+    let looking = |(yaw, camera): (f64, SceneCamera)| {
+        let turn = gravity
+            * DMat3::from_rotation_y(yaw.to_radians())
+            * DMat3::from_rotation_x(-25_f64.to_radians());
+        let rows = [turn.row(0), turn.row(1), turn.row(2)];
+        let m = rows.map(|row| [row.x, row.y, row.z, 0.0]).concat();
+        let m = [&m[..], &[0.0, 0.0, 0.0, 1.0]].concat();
+        let pose = CameraToWorld::from_row_major(&m.try_into().unwrap(), "test").unwrap();
+        SceneCamera { camera: Camera { camera_to_world: pose, ..camera.camera }, ..camera }
+    };
+    let of = |yaws: [f64; 3]| -> Vec<SceneCamera> {
+        yaws.into_iter().zip(cameras(3)).map(looking).collect()
+    };
+    let off = |up: DVec3| up.angle_between(-gravity.y_axis).to_degrees();
+    let around = of([-40.0, 0.0, 30.0]);
+    assert!(off(SceneCamera::level_up(&around)) < 1.0);
+    assert!(off(SceneCamera::mean_up(&around)) > 20.0);
+    // All to one side: no more is known than the mean says.
+    let alike = of([10.0; 3]);
+    let up = SceneCamera::level_up(&alike);
+    assert!(up.angle_between(SceneCamera::mean_up(&alike)) < 1e-6);
+    assert_eq!(SceneCamera::level_up(&[]), DVec3::NEG_Y);
+}
+
+#[test]
 fn parts_of_one_point_a_line_or_a_plane_have_boxes() {
+    type Place<'a> = &'a dyn Fn(usize) -> DVec3;
     let line = |i: usize| DVec3::new(1.0, 2.0, 2.0) / 3.0 * i as f64;
     let plane = |i: usize| DVec3::new((i % 8) as f64, (i / 8) as f64 * 0.5, 0.0);
-    let cases: [(usize, &dyn Fn(usize) -> DVec3, [f64; 3]); 4] = [
+    let cases: [(usize, Place<'_>, [f64; 3]); 4] = [
         (1, &|_| DVec3::Z, [0.0; 3]),
         (9, &|_| DVec3::ONE, [0.0; 3]),
         (5, &line, [4.0, 0.0, 0.0]),
