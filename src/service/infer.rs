@@ -77,7 +77,7 @@ impl Service {
     fn check_network(&self, name: &str) -> Result<()> {
         let models = &self.inner.models.models;
         let there = |part: &&str| models.iter().any(|model| model.name == **part);
-        let names: Vec<&str> = NETWORKS.into_iter().filter(|part| there(&part)).collect();
+        let names: Vec<&str> = NETWORKS.into_iter().filter(there).collect();
         if names.contains(&name) {
             return Ok(());
         }

@@ -297,7 +297,11 @@ async fn a_run_is_that_of_the_library_to_the_bit() {
         let name = last.0.clone();
         asked.outputs = vec![InferRequestedOutputTensor { name, ..Default::default() }];
         let answer = fixture.client().await.model_infer(asked).await.unwrap().into_inner();
-        assert_eq!(answer.raw_output_contents, [last.3.clone()], "{network}, one output");
+        assert_eq!(
+            answer.raw_output_contents,
+            std::slice::from_ref(&last.3),
+            "{network}, one output"
+        );
     }
 }
 
