@@ -24,7 +24,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: client venv page page-long wheel judge judge-folders judge-splats judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: client venv page page-long wheel judge judge-venv judge-folders judge-inference judge-splats judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -95,17 +95,22 @@ judge-tools: venv
 	PATH=$(CLIENT)/venv/bin:$$PATH timeout 180 npm install --silent --no-audit --no-fund \
 		--prefix $(JUDGE) @playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10
 
-judge: judge-folders judge-splats
+judge: judge-folders judge-inference judge-splats
 
 judge-splats: judge-tools
 	$(CLIENT)/venv/bin/python tests/tools/judge_splats.py $(PROGRAM) $(CLIENT)/venv/bin/node \
 		$(JUDGE)/node_modules/@playcanvas/splat-transform/bin/cli.mjs \
 		tests/fixtures/splats/source.ply
 
-judge-folders: venv
+judge-venv: venv
 	PYTHONPATH=$(CLIENT)/tools python3 -m virtualenv --quiet $(JUDGE)/venv
 	$(JUDGE)/venv/bin/pip install --quiet --disable-pip-version-check -r tests/tools/requirements.txt
+
+judge-folders: judge-venv
 	$(JUDGE)/venv/bin/python tests/tools/judge_folders.py $(PROGRAM)
+
+judge-inference: judge-venv
+	SEGSPLAT_BIN=$(PROGRAM) $(JUDGE)/venv/bin/python tests/tools/judge_inference.py
 
 bench: setup
 	$(CARGO) bench --locked

@@ -397,12 +397,24 @@ pub struct Part {
     /// Centre of the box.
     #[prost(message, optional, tag = "2")]
     pub center: ::core::option::Option<Vec3>,
-    /// Unit axes of the box.
+    /// Unit axes of the box, right-handed.
     #[prost(message, repeated, tag = "3")]
     pub axes: ::prost::alloc::vec::Vec<Vec3>,
-    /// Full lengths along the axes, world units.
+    /// Full lengths along the axes, world units. Of the centres of its Gaussians, half a per cent on
+    /// each side left out.
     #[prost(message, optional, tag = "4")]
     pub size: ::core::option::Option<Vec3>,
+    /// Mean centre of its Gaussians, world units.
+    #[prost(message, optional, tag = "5")]
+    pub centroid: ::core::option::Option<Vec3>,
+    /// 3x3 covariance of its Gaussians, each counted once: the mean of their own and the spread of
+    /// their centres. World units squared.
+    #[prost(double, repeated, tag = "6")]
+    pub covariance: ::prost::alloc::vec::Vec<f64>,
+    /// Share of its Gaussians that each photo of the scene shows, 0 to 1, in the order of the scene's
+    /// cameras.
+    #[prost(float, repeated, tag = "7")]
+    pub visibility: ::prost::alloc::vec::Vec<f32>,
 }
 /// Something that makes the answer to a text doubtful.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -521,6 +533,8 @@ pub enum Boxes {
     Aligned = 2,
     /// No parts and no boxes.
     None = 3,
+    /// As BOXES_ORIENTED with the last axis up, as the photos tell it.
+    Upright = 4,
 }
 impl Boxes {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -533,6 +547,7 @@ impl Boxes {
             Self::Oriented => "BOXES_ORIENTED",
             Self::Aligned => "BOXES_ALIGNED",
             Self::None => "BOXES_NONE",
+            Self::Upright => "BOXES_UPRIGHT",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -542,6 +557,7 @@ impl Boxes {
             "BOXES_ORIENTED" => Some(Self::Oriented),
             "BOXES_ALIGNED" => Some(Self::Aligned),
             "BOXES_NONE" => Some(Self::None),
+            "BOXES_UPRIGHT" => Some(Self::Upright),
             _ => None,
         }
     }

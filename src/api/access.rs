@@ -18,21 +18,44 @@ use crate::{
     keys::{Caller, Keys, Scope},
 };
 
-/// The gRPC methods of the one service: name in metrics and the scope that each needs. The HTTP
-/// routes have their own list. A test compares the two.
-const RPCS: [(&str, &str, Scope); 12] = [
-    ("CreateScene", "create_scene", Scope::Write),
-    ("DeleteScene", "delete_scene", Scope::Write),
-    ("Export", "export", Scope::Read),
-    ("Features", "features", Scope::Read),
-    ("GetScene", "get_scene", Scope::Read),
-    ("ListScenes", "list_scenes", Scope::Read),
-    ("Pick", "pick", Scope::Read),
-    ("Query", "query", Scope::Read),
-    ("RefineScene", "refine_scene", Scope::Write),
-    ("RenderView", "render_view", Scope::Read),
-    ("RenderViews", "render_views", Scope::Read),
-    ("WatchScene", "watch_scene", Scope::Read),
+/// Scopes that calls need; `None`: callers need no key.
+const NONE: Option<Scope> = None;
+const READ: Option<Scope> = Some(Scope::Read);
+const WRITE: Option<Scope> = Some(Scope::Write);
+
+/// The gRPC methods of a service: name in metrics and the scope that each needs. The HTTP routes
+/// have their own list. A test compares the two.
+type Rpcs = &'static [(&'static str, &'static str, Option<Scope>)];
+
+const SERVICES: [(&str, Rpcs); 2] = [
+    (
+        "/segsplat.v1.SceneService/",
+        &[
+            ("CreateScene", "create_scene", WRITE),
+            ("DeleteScene", "delete_scene", WRITE),
+            ("Export", "export", READ),
+            ("Features", "features", READ),
+            ("GetScene", "get_scene", READ),
+            ("ListScenes", "list_scenes", READ),
+            ("Pick", "pick", READ),
+            ("Query", "query", READ),
+            ("RefineScene", "refine_scene", WRITE),
+            ("RenderView", "render_view", READ),
+            ("RenderViews", "render_views", READ),
+            ("WatchScene", "watch_scene", READ),
+        ],
+    ),
+    (
+        "/inference.GRPCInferenceService/",
+        &[
+            ("ModelInfer", "model_infer", WRITE),
+            ("ModelMetadata", "model_metadata", READ),
+            ("ModelReady", "model_ready", READ),
+            ("ServerLive", "server_live", NONE),
+            ("ServerMetadata", "server_metadata", READ),
+            ("ServerReady", "server_ready", NONE),
+        ],
+    ),
 ];
 
 /// Name in metrics of all other calls: health, reflection, unknown routes.
@@ -41,16 +64,18 @@ pub(super) const OTHER: &str = "other";
 /// Name in metrics of a gRPC path, and the scope that it needs. Health and reflection say nothing
 /// of scenes and need none. A method that has no row here needs an admin's key.
 pub(super) fn of_rpc(path: &str) -> (&'static str, Option<Scope>) {
-    let Some(method) = path.strip_prefix("/segsplat.v1.SceneService/") else {
+    let method = |(service, rpcs): (&str, Rpcs)| Some((path.strip_prefix(service)?, rpcs));
+    let Some((method, rpcs)) = SERVICES.into_iter().find_map(method) else {
         return (OTHER, None);
     };
-    let row = RPCS.iter().find(|(name, ..)| *name == method);
-    row.map_or((OTHER, Some(Scope::Admin)), |(_, call, scope)| (call, Some(*scope)))
+    let row = rpcs.iter().find(|(name, ..)| *name == method);
+    row.map_or((OTHER, Some(Scope::Admin)), |(_, call, scope)| (call, *scope))
 }
 
 /// Names in metrics of all gRPC calls.
 pub(super) fn rpc_calls() -> impl Iterator<Item = &'static str> {
-    RPCS.iter().map(|(_, call, _)| *call).chain([OTHER])
+    let calls = SERVICES.into_iter().flat_map(|(_, rpcs)| rpcs);
+    calls.map(|(_, call, _)| *call).chain([OTHER])
 }
 
 /// A call that is allowed. The key's permit returns when this is dropped.

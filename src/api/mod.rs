@@ -9,6 +9,7 @@ pub mod http;
 mod access;
 mod drain;
 mod hosts;
+mod inference;
 mod request_id;
 mod upload;
 
@@ -49,6 +50,11 @@ impl Api {
     fn for_caller(&self, caller: Option<&Caller>) -> Result<Self> {
         let caller = caller.ok_or_else(|| Error::internal("the caller's key was not checked"))?;
         Ok(Self { service: self.service.for_caller(caller.clone()), ..self.clone() })
+    }
+
+    /// Whether the networks can be run by themselves now.
+    fn networks_ready(&self) -> bool {
+        self.service.networks_ready() && !self.drain.is_stopping()
     }
 
     /// Puts the keys and limits of `config` in force. On an error nothing changes.

@@ -62,7 +62,7 @@ impl<'a> UploadBuilder<'a> {
     pub(super) fn new(limits: &'a Limits, budget: &UploadBudget) -> Self {
         Self {
             limits,
-            guard: UploadGuard { budget: budget.clone(), held: 0 },
+            guard: UploadGuard::new(budget),
             current: Current::Nothing,
             upload: Upload::default(),
             names: HashSet::new(),
@@ -179,23 +179,7 @@ impl<'a> UploadBuilder<'a> {
     }
 
     fn account(&mut self, bytes: usize) -> Result<()> {
-        let guard = &mut self.guard;
-        guard.held += bytes;
-        meter::uploaded(bytes);
-        let all = guard.budget.held.fetch_add(bytes, Ordering::Relaxed) + bytes;
-        if guard.held > self.limits.upload_bytes_max {
-            return Err(Error::limit(
-                "upload",
-                format!("{} bytes so far", guard.held),
-                format!("{} bytes", self.limits.upload_bytes_max),
-            ));
-        }
-        if all > guard.budget.max {
-            let max = guard.budget.max;
-            let message = format!("all uploads hold {all} bytes, over {max} bytes; try again");
-            return Err(Error::new(ErrorCode::Overloaded, message).retry_after_s(2));
-        }
-        Ok(())
+        self.guard.account("upload", bytes, self.limits.upload_bytes_max)
     }
 
     fn check_json(&self) -> Result<()> {
@@ -234,6 +218,30 @@ pub(super) fn json_over(name: &str, len: usize, limits: &Limits) -> Error {
 pub(super) struct UploadGuard {
     budget: UploadBudget,
     held: usize,
+}
+
+impl UploadGuard {
+    /// Counts nothing yet.
+    pub(super) fn new(budget: &UploadBudget) -> Self {
+        Self { budget: budget.clone(), held: 0 }
+    }
+
+    /// Counts the next bytes of `what`, of which `max` are taken.
+    pub(super) fn account(&mut self, what: &str, bytes: usize, max: usize) -> Result<()> {
+        self.held += bytes;
+        meter::uploaded(bytes);
+        let all = self.budget.held.fetch_add(bytes, Ordering::Relaxed) + bytes;
+        if self.held > max {
+            let (held, max) = (format!("{} bytes so far", self.held), format!("{max} bytes"));
+            return Err(Error::limit(what, held, max));
+        }
+        let max = self.budget.max;
+        if all > max {
+            let message = format!("all uploads hold {all} bytes, over {max} bytes; try again");
+            return Err(Error::new(ErrorCode::Overloaded, message).retry_after_s(2));
+        }
+        Ok(())
+    }
 }
 
 impl Drop for UploadGuard {

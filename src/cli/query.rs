@@ -29,7 +29,7 @@ pub(super) struct Args {
     /// .glb …); with several texts, one file each
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
-    /// Boxes of the parts: oriented, aligned or none
+    /// Boxes of the parts: oriented, upright, aligned or none
     #[arg(long, default_value = "oriented", value_parser = named::<Boxes>)]
     boxes: Boxes,
     #[command(flatten)]

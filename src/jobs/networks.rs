@@ -5,11 +5,14 @@ use std::sync::Arc;
 use crate::{
     error::{Error, ErrorCode, Result},
     pipeline::{
-        self, PhotoSet, PipelineLoader, Reconstruction,
+        self, PhotoSet, Pipeline, PipelineLoader, Reconstruction,
         semantics::{SemanticsInput, understand},
     },
     scene::{Gaussians, PosedPhoto, Scene, SceneOptions, Semantics, TextEmbedding, Watch},
 };
+
+/// When to ask again for networks that are being opened, seconds.
+const OPENING_RETRY_S: u32 = 2;
 
 /// Whether the networks are open.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -49,6 +52,15 @@ pub trait SceneNetworks: Send + Sync {
     /// Why a network is not computed where it was to be; `None` where all are.
     fn remark(&self) -> Option<String> {
         None
+    }
+
+    /// The open networks, to run one by itself.
+    ///
+    /// # Errors
+    /// `model_unavailable` while they are being opened, where they do not open, or where there are
+    /// none.
+    fn pipeline(&self) -> Result<&Pipeline> {
+        Err(Error::new(ErrorCode::ModelUnavailable, "there are no networks"))
     }
 
     /// Does the whole work on the calling thread.
@@ -161,6 +173,13 @@ impl SceneNetworks for PipelineNetworks {
 
     fn remark(&self) -> Option<String> {
         self.0.peek()?.ok()?.remark()
+    }
+
+    fn pipeline(&self) -> Result<&Pipeline> {
+        self.0.peek().unwrap_or_else(|| {
+            let why = "the networks are being opened; ask again";
+            Err(Error::new(ErrorCode::ModelUnavailable, why).retry_after_s(OPENING_RETRY_S))
+        })
     }
 
     fn make(

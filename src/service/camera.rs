@@ -83,7 +83,7 @@ fn pose(spec: &CameraSpec, inputs: &[SceneCamera], what: &str) -> Result<CameraT
         PoseSpec::LookAt { eye, target, up } => CameraToWorld::look_at(
             DVec3::from_array(eye),
             DVec3::from_array(target),
-            up.map_or_else(|| mean_up(inputs), DVec3::from_array),
+            up.map_or_else(|| SceneCamera::mean_up(inputs), DVec3::from_array),
             what,
         )?,
         PoseSpec::Between { .. } => {
@@ -97,12 +97,6 @@ fn pose(spec: &CameraSpec, inputs: &[SceneCamera], what: &str) -> Result<CameraT
         )));
     }
     Ok(pose)
-}
-
-/// Up in the pictures of the input cameras; -y where there are none.
-fn mean_up(inputs: &[SceneCamera]) -> DVec3 {
-    let sum: DVec3 = inputs.iter().map(|c| -c.camera.camera_to_world.rotation().y_axis).sum();
-    sum.try_normalize().unwrap_or(DVec3::NEG_Y)
 }
 
 fn size(

@@ -9,6 +9,7 @@ mod encode;
 mod export;
 mod features;
 mod folder;
+mod infer;
 mod memory;
 mod npz;
 mod offline;
@@ -34,6 +35,7 @@ use parking_lot::RwLock;
 use tokio::sync::Semaphore;
 
 pub use self::folder::{FOLDER_FORMATS, FolderFormat};
+pub use self::infer::InferSpec;
 pub use self::page::{VIEWER, ViewerPage};
 use self::{memory::Memory, schedule::Scheduler, search::Backend};
 pub use self::{
@@ -103,6 +105,8 @@ struct Inner {
     limits: RwLock<Arc<Limits>>,
     store: Arc<Store>,
     jobs: Arc<Jobs>,
+    /// Networks that run by themselves; the jobs have the same.
+    networks: Arc<dyn SceneNetworks>,
     backend: Backend,
     models: ModelsInfo,
     scheduler: Arc<Scheduler>,
@@ -110,6 +114,8 @@ struct Inner {
     reading: Arc<Semaphore>,
     /// Permits to write folders.
     folders: Arc<Semaphore>,
+    /// Permits to run networks.
+    inferences: Arc<Semaphore>,
     key_locks: [tokio::sync::Mutex<()>; create::KEY_LOCKS],
     memory: Memory,
 }
@@ -154,6 +160,7 @@ impl Service {
             // Threads of its own: a view never waits for a step.
             None => Arc::new(CpuRenderer::new(config.threads)?),
         };
+        let networks = Arc::clone(&parts.scenes);
         let job_parts = JobParts {
             store: Arc::clone(&store),
             scenes: parts.scenes,
@@ -175,11 +182,13 @@ impl Service {
         let inner = Inner {
             store,
             jobs,
+            networks,
             scheduler,
             backend: Backend::new(parts.renderer, parts.semantics, &config.limits),
             models,
             reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
             folders: Arc::new(Semaphore::new(config.limits.folder_exports_max)),
+            inferences: Arc::new(Semaphore::new(config.limits.inferences_max)),
             key_locks: Default::default(),
             memory: Memory::new(config.limits.memory_bytes_max),
             limits: RwLock::new(Arc::new(config.limits.clone())),

@@ -118,12 +118,19 @@ fn selections(texts: &SceneTexts<'_>, limits: &Limits, boxes: Boxes) -> Selectio
     let wanted = boxes != Boxes::None && sets.iter().any(|set| !set.is_empty());
     let components = wanted.then(|| texts.components(&options));
     let boxed = |instance: Instance| {
-        let held = if boxes == Boxes::Aligned { instance.aligned } else { instance.oriented };
+        let held = match boxes {
+            Boxes::Aligned => instance.aligned(),
+            Boxes::Upright => instance.upright(),
+            Boxes::Oriented | Boxes::None => instance.oriented(),
+        };
         InstanceBox {
             gaussians: instance.gaussians.len() as u64,
             center: held.center,
             axes: held.axes,
             size: held.size,
+            centroid: instance.centroid,
+            covariance: instance.covariance,
+            visibility: instance.visibility,
         }
     };
     let selection = |set: Vec<u16>| {

@@ -115,6 +115,8 @@ pub enum Boxes {
     /// Turned along the part's own axes.
     #[default]
     Oriented,
+    /// The same with the last axis up, as the photos tell it.
+    Upright,
     /// Along the axes of the world.
     Aligned,
     /// No parts and no boxes.

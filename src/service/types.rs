@@ -92,10 +92,19 @@ pub struct InstanceBox {
     pub gaussians: u64,
     /// Centre of the box.
     pub center: [f64; 3],
-    /// Unit axes of the box, one a row.
+    /// Unit axes of the box, one a row, right-handed.
     pub axes: [[f64; 3]; 3],
-    /// Full lengths along the axes, world units.
+    /// Full lengths along the axes, world units. Of the centres of its Gaussians, half a per cent
+    /// on each side left out.
     pub size: [f64; 3],
+    /// Mean centre of its Gaussians, world units.
+    pub centroid: [f64; 3],
+    /// Covariance of its Gaussians, each counted once: the mean of their own and the spread of
+    /// their centres. World units squared.
+    pub covariance: [[f64; 3]; 3],
+    /// `[V]` share of its Gaussians that each photo of the scene shows, 0..1, in the order of the
+    /// scene's cameras.
+    pub visibility: Vec<f32>,
 }
 
 /// What a text found in a view.

@@ -205,6 +205,7 @@ async fn a_method_without_a_row_needs_an_admin_and_health_no_key() {
     let client = crate::common::client_builder().http2_prior_knowledge().build().unwrap();
     for (name, path, want) in [
         ("writer", "/segsplat.v1.SceneService/Nothing", "permission_denied"),
+        ("writer", "/inference.GRPCInferenceService/Nothing", "permission_denied"),
         ("boss", "/segsplat.v1.SceneService/Nothing", "not_found"),
         ("writer", "/grpc.health.v1.Health/Nothing", "not_found"),
     ] {
@@ -227,13 +228,20 @@ fn every_call_of_both_doors_has_its_scope_in_the_table() {
     assert_eq!(rpcs, CALLS.len(), "a method is missing from this table");
     let open: Vec<_> =
         routes().iter().filter(|r| r.scope.is_none()).map(|route| route.path).collect();
-    assert_eq!(open, ["/healthz", "/readyz", "/openapi.json", "/"], "routes without a key");
+    let health = ["/v2/health/live", "/v2/health/ready", "/healthz", "/readyz"];
+    let want = [&health[..], &["/openapi.json", "/"]].concat();
+    assert_eq!(open, want, "routes without a key");
     let writes: Vec<_> = routes()
         .iter()
         .filter(|route| route.scope == Some(Scope::Write))
         .map(|route| format!("{} {}", route.method, route.path))
         .collect();
-    let want = ["POST /v1/scenes", "DELETE /v1/scenes/{id}", "POST /v1/scenes/{id}/refine"];
+    let want = [
+        "POST /v1/scenes",
+        "DELETE /v1/scenes/{id}",
+        "POST /v1/scenes/{id}/refine",
+        "POST /v2/models/{name}/infer",
+    ];
     assert_eq!(writes, want);
 }
 

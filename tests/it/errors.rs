@@ -212,24 +212,29 @@ async fn the_openapi_document_has_the_routes_and_nothing_else() {
 async fn the_two_doors_have_the_same_calls() {
     let stand = CpuServer::start().await;
     let document = document(&stand).await;
-    let operations: BTreeSet<_> = document["paths"]
-        .as_object()
-        .unwrap()
-        .iter()
-        .filter(|(path, _)| path.starts_with("/v1/scenes"))
-        .flat_map(|(_, item)| item.as_object().unwrap().values())
-        .filter_map(|operation| operation.get("operationId"))
-        .map(|id| id.as_str().unwrap().to_owned())
-        .collect();
-    let proto = std::fs::read_to_string(root().join("proto/segsplat/v1/scene.proto")).unwrap();
-    let rpcs: BTreeSet<_> = proto
-        .lines()
-        .filter_map(|line| line.trim().strip_prefix("rpc "))
-        .map(|rest| snake(rest.split('(').next().unwrap()))
-        .collect();
-    assert_eq!(operations, rpcs, "HTTP operations and gRPC methods");
     let descriptors = String::from_utf8_lossy(DESCRIPTORS);
-    assert!(descriptors.contains("SceneService"), "the descriptors lack the service");
+    for (paths, file, service) in [
+        ("/v1/scenes", "segsplat/v1/scene.proto", "SceneService"),
+        ("/v2", "inference/open_inference_grpc.proto", "GRPCInferenceService"),
+    ] {
+        let operations: BTreeSet<_> = document["paths"]
+            .as_object()
+            .unwrap()
+            .iter()
+            .filter(|(path, _)| path.starts_with(paths))
+            .flat_map(|(_, item)| item.as_object().unwrap().values())
+            .filter_map(|operation| operation.get("operationId"))
+            .map(|id| id.as_str().unwrap().to_owned())
+            .collect();
+        let proto = std::fs::read_to_string(root().join("proto").join(file)).unwrap();
+        let rpcs: BTreeSet<_> = proto
+            .lines()
+            .filter_map(|line| line.trim().strip_prefix("rpc "))
+            .map(|rest| snake(rest.split('(').next().unwrap()))
+            .collect();
+        assert_eq!(operations, rpcs, "HTTP operations and gRPC methods");
+        assert!(descriptors.contains(service), "the descriptors lack {service}");
+    }
 }
 
 fn snake(camel: &str) -> String {

@@ -24,6 +24,7 @@ mod folders;
 mod grpc;
 mod hostile;
 mod http;
+mod inference;
 mod jobs;
 mod keys;
 mod known_words;

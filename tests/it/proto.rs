@@ -1,4 +1,4 @@
-//! The committed Rust of `proto/generated` is what `proto/segsplat` compiles to.
+//! The committed Rust of `proto/generated` is what the files of `proto` compile to.
 
 use std::fs;
 
@@ -11,14 +11,15 @@ use crate::common::root;
 fn generated_code_is_that_of_the_proto_files() {
     let made = tempfile::tempdir().unwrap();
     let proto = root().join("proto");
-    let descriptors = protox::compile(["segsplat/v1/scene.proto"], [&proto]).unwrap();
+    let files = ["segsplat/v1/scene.proto", "inference/open_inference_grpc.proto"];
+    let descriptors = protox::compile(files, [&proto]).unwrap();
     fs::write(made.path().join("descriptors.bin"), descriptors.encode_to_vec()).unwrap();
     tonic_prost_build::configure()
-        .bytes(".segsplat.v1")
+        .bytes(".")
         .out_dir(made.path())
         .compile_fds(descriptors)
         .unwrap();
-    for name in ["descriptors.bin", "segsplat.v1.rs"] {
+    for name in ["descriptors.bin", "segsplat.v1.rs", "inference.rs"] {
         let (new, kept) = (made.path().join(name), proto.join("generated").join(name));
         if std::env::var_os("UPDATE_DOCS").is_some() {
             fs::copy(&new, &kept).unwrap();
@@ -26,7 +27,7 @@ fn generated_code_is_that_of_the_proto_files() {
         let same = fs::read(&new).unwrap() == fs::read(&kept).unwrap_or_default();
         assert!(
             same,
-            "proto/generated/{name} differs from proto/segsplat: UPDATE_DOCS=1 writes it"
+            "proto/generated/{name} differs from the files of proto: UPDATE_DOCS=1 writes it"
         );
     }
 }

@@ -18,7 +18,9 @@ use std::{
 use flate2::{Compression, read::GzDecoder, write::GzEncoder};
 use prost::Message;
 use segsplat::{
-    api::grpc::pb,
+    api::grpc::{pb, pb_inference},
+    cli::engine,
+    config::Config,
     error::{ErrorCode, Result, TABLE},
     limits::Limits,
     photos,
@@ -35,11 +37,12 @@ use segsplat::{
     },
 };
 use segsplat_testing::captures;
+use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
 use crate::common::{
     doors::{Ask, Options, messages},
-    root,
+    opened, root,
     scenes::{Random, cloud},
     server::TestServer,
 };
@@ -544,6 +547,94 @@ async fn grpc_messages() {
             let Ok(answer) = answer else { continue };
             let text = |name: &str| answer.headers().get(name).and_then(|v| v.to_str().ok());
             cases.judge(text("segsplat-code").zip(text("grpc-message").or(Some(""))));
+        }
+    }
+    assert_eq!(
+        crate::common::client().get(server.url("/healthz")).send().await.unwrap().status(),
+        200
+    );
+}
+
+#[tokio::test]
+async fn runs_of_networks() {
+    let configured = |config: &mut Config| {
+        config.bundle = Some(root().join("tests/fixtures/colours"));
+        (config.threads, config.jobs) = (1, 1);
+    };
+    let mut config = Config::default();
+    configured(&mut config);
+    let opened = opened(engine::parts(&config).and_then(|(parts, all)| all.get().map(|_| parts)));
+    let Some(parts) = opened else { return };
+    let server = TestServer::with(|of_server, of_test| {
+        configured(of_server);
+        *of_test = parts;
+    })
+    .await;
+    let [ids, there] = [[1_i64, 2, 3, 3, 2, 0], [1, 1, 1, 1, 1, 0]];
+    let bytes = |data: [i64; 6]| data.map(i64::to_le_bytes).concat();
+    let http = |own: [Value; 2]| {
+        let inputs = ["input_ids", "attention_mask"].into_iter().zip(own).map(|(name, own)| {
+            let mut input = json!({ "name": name, "shape": [2, 3], "datatype": "INT64" });
+            input.as_object_mut().unwrap().extend(own.as_object().unwrap().clone());
+            input
+        });
+        let outputs = json!([{ "name": "embeddings", "parameters": { "binary_data": true } }]);
+        let inputs: Vec<Value> = inputs.collect();
+        json!({ "id": "7", "inputs": inputs, "outputs": outputs }).to_string().into_bytes()
+    };
+    let listed = http([json!({ "data": ids }), json!({ "data": [&there[..3], &there[3..]] })]);
+    let size = || json!({ "parameters": { "binary_data_size": 48 } });
+    let json = http([size(), size()]);
+    let behind = [&json[..], &bytes(ids), &bytes(there)].concat();
+    let input = |name: &str| pb_inference::model_infer_request::InferInputTensor {
+        name: name.to_owned(),
+        datatype: "INT64".to_owned(),
+        shape: vec![2, 3],
+        ..Default::default()
+    };
+    let message = pb_inference::ModelInferRequest {
+        model_name: "image_text.text".to_owned(),
+        inputs: vec![input("input_ids"), input("attention_mask")],
+        raw_input_contents: vec![bytes(ids).into(), bytes(there).into()],
+        ..Default::default()
+    };
+    let message = message.encode_to_vec();
+    let length = u32::try_from(message.len()).unwrap().to_be_bytes();
+    let framed = [&[0_u8][..], &length, &message].concat();
+    let path = "/v2/models/image_text.text/infer";
+    let rpc = "/inference.GRPCInferenceService/ModelInfer";
+    for (target, path, seed) in [
+        ("inference-json", path, listed),
+        ("inference-bytes", path, behind),
+        ("inference-grpc", rpc, framed),
+    ] {
+        let grpc = target.ends_with("grpc");
+        let client = crate::common::client_builder();
+        let client = if grpc { client.http2_prior_knowledge() } else { client };
+        let client = client.build().unwrap();
+        let mut cases = Cases::new(target, vec![seed]);
+        while let Some(case) = cases.next(150) {
+            let request = client.post(server.url(path)).body(case);
+            let request = match target {
+                "inference-bytes" => request.header("inference-header-content-length", json.len()),
+                "inference-grpc" => {
+                    request.header("content-type", "application/grpc").header("te", "trailers")
+                }
+                _ => request,
+            };
+            let Ok(answer) = tokio::time::timeout(ANSWER_MAX, request.send()).await else {
+                cases.fail("no answer")
+            };
+            // A stream that is reset is an answer too.
+            let Ok(answer) = answer else { continue };
+            if grpc {
+                let text = |name: &str| answer.headers().get(name).and_then(|v| v.to_str().ok());
+                cases.judge(text("segsplat-code").zip(text("grpc-message").or(Some(""))));
+                continue;
+            }
+            let status = answer.status().as_u16();
+            let refused = refusal(status, &answer.bytes().await.expect("a body"));
+            cases.judge(refused.as_ref().map(|(code, message)| (&**code, &**message)));
         }
     }
     assert_eq!(

@@ -1,9 +1,15 @@
-"""The Gaussians as arrays, and in viser where it is installed."""
+"""The Gaussians as arrays, in a file for Rerun, and in viser where it is installed."""
 
 from __future__ import annotations
 
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
+from served import ROOT
 
 from segsplat import BadAnswer, Box, Gaussians, Scene
 
@@ -34,9 +40,27 @@ def test_another_file_is_refused() -> None:
 
 def test_viser_shows_a_scene(scene: Scene) -> None:
     viser = pytest.importorskip("segsplat.viser")
-    box = Box(1, np.zeros(3), np.eye(3), np.array([1.0, 2, 3]))
+    box = Box(1, np.zeros(3), np.eye(3), np.array([1.0, 2, 3]), np.zeros(3), np.eye(3), np.ones(2))
     edges = viser.edges_of(box)
     assert edges.shape == (12, 2, 3)
     lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
     assert sorted(lengths) == [1] * 4 + [2] * 4 + [3] * 4
     viser.show(scene, [box]).stop()
+
+
+def test_rerun_reads_what_the_example_writes(scene: Scene, tmp_path: Path) -> None:
+    name = "rerun_log"
+    path = ROOT / f"clients/python/examples/{name}.py"
+    example = importlib.util.spec_from_file_location(name, path)
+    assert example and example.loader
+    module = importlib.util.module_from_spec(example)
+    example.loader.exec_module(module)
+    out = tmp_path / "scene.rrd"
+    module.log(scene, str(out), ["floor", "box"])
+    reader = [sys.executable, "-m", "rerun", "rrd", "print", str(out)]
+    told = subprocess.run(reader, stdout=subprocess.PIPE, check=True, text=True).stdout
+    matches = scene.query("floor", "box", masks=False)
+    parts = [f"/scene/parts/{match.text}/0" for match in matches if match.boxes]
+    assert parts, "no text finds a part"
+    for entity in ["/scene/gaussians", "/scene/photos/0", "/scene/photos/1", *parts]:
+        assert entity in told, f"{entity} is not in the file"

@@ -65,6 +65,18 @@ def test_corners_are_those_of_the_box(scene: Scene) -> None:
     assert np.allclose(np.abs(aligned.axes), np.eye(3))
 
 
+def test_parts_say_where_how_wide_and_how_well_seen_they_are(scene: Scene) -> None:
+    (part,) = scene.query("floor", boxes="upright", masks=False).boxes
+    # The two photos look down by 19 degrees; y is down in the room.
+    assert part.axes[2] @ [0, -1, 0] > np.cos(np.radians(8))
+    assert np.allclose(part.axes @ part.axes.T, np.eye(3)) and np.linalg.det(part.axes) > 0
+    assert part.covariance.shape == (3, 3) and np.linalg.eigvalsh(part.covariance).min() > 0
+    # A covariance is at most a quarter of the squared extent, and the centroid lies inside.
+    assert (np.diag(part.axes @ part.covariance @ part.axes.T) < part.size**2).all()
+    assert (np.abs(part.axes @ (part.centroid - part.center)) < part.size / 2).all()
+    assert part.visibility.shape == (len(scene.photos),) and part.visibility.max() > 0.3
+
+
 def test_a_pick_names_what_is_there(scene: Scene) -> None:
     picked = scene.pick(160.5, 200.5, labels=["floor", "box"])
     assert picked.point is not None and picked.point.shape == (3,)

@@ -145,6 +145,12 @@ limits! {
     /// Exports as folders at work: each has the upload of a scene in memory. One more is refused
     /// as `overloaded`.
     folder_exports_max: usize = 2, restart;
+    /// Bytes of one call that runs a network: the largest inputs of the published networks have 13
+    /// million.
+    inference_bytes_max: usize = 16 << 20, restart;
+    /// Calls that run a network, at work or waiting for its session. One more is refused as
+    /// `overloaded`.
+    inferences_max: usize = 8, restart;
     /// Bytes of scenes kept in memory.
     cache_bytes_max: u64 = 4 << 30, restart;
     /// Bytes of scenes kept on one GPU device: what a card of 8 GB has to spare beside its frames.

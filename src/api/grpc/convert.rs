@@ -352,7 +352,7 @@ fn result(found: TextResult) -> pb::TextResult {
     let warning = |TextWarning { code, message }: TextWarning| pb::TextWarning { code, message };
     message!(TextResult from found { text, scores, gaussians }
         entries: found.entries.into_iter().map(u32::from).collect(),
-        parts: found.parts.iter().map(part).collect(),
+        parts: found.parts.into_iter().map(part).collect(),
         warnings: found.warnings.into_iter().map(warning).collect(),
         view: found.view.map(text_view),
     )
@@ -362,12 +362,15 @@ fn point([x, y, z]: [f64; 3]) -> pb::Vec3 {
     pb::Vec3 { x, y, z }
 }
 
-fn part(part: &InstanceBox) -> pb::Part {
+fn part(part: InstanceBox) -> pb::Part {
     pb::Part {
         gaussians: part.gaussians,
         center: Some(point(part.center)),
         axes: part.axes.iter().copied().map(point).collect(),
         size: Some(point(part.size)),
+        centroid: Some(point(part.centroid)),
+        covariance: part.covariance.concat(),
+        visibility: part.visibility,
     }
 }
 
@@ -464,7 +467,7 @@ both_ways! {
     Preset = Preset { Default, Paper }
     MaskLevel = MaskLevel { Widest, Whole, Part, Subpart }
     FeatureKind = FeatureKind { Weights, Features }
-    Boxes = Boxes { Oriented, Aligned, None }
+    Boxes = Boxes { Oriented, Upright, Aligned, None }
     MaskFormat = MaskFormat { Rle, Png, None }
     ExportFormat = ExportFormat {
         Ply, Npz, Packed, Html, CompressedPly, Spz, Spz4, Sog, Glb, Splat, Colmap, Nerfstudio, Coco,

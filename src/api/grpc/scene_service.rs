@@ -22,11 +22,11 @@ use crate::{
     },
 };
 
-type Answer<T> = Result<Response<T>, Status>;
+pub(super) type Answer<T> = Result<Response<T>, Status>;
 type Many<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send + 'static>>;
 
 /// Does `work` for the caller of `request`. An error goes to the log and becomes a status.
-async fn answer<Q, A, F: Future<Output = Result<A>>>(
+pub(super) async fn answer<Q, A, F: Future<Output = Result<A>>>(
     api: &Api,
     request: Request<Q>,
     work: impl FnOnce(Api, Q) -> F,

@@ -34,6 +34,9 @@ pub(super) struct ErrorBody {
     request_id: String,
     /// More about it.
     details: ErrorDetails,
+    /// The message again, under the name that the Open Inference Protocol gives it (`/v2`).
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<String>,
 }
 
 /// More about an error.
@@ -86,7 +89,7 @@ pub(super) fn asks_for_problem(accept: Option<&str>) -> bool {
 
 impl ProblemBody {
     fn new(body: ErrorBody, status: StatusCode, path: &str) -> Self {
-        let ErrorBody { code, message, request_id, details } = body;
+        let ErrorBody { code, message, request_id, details, .. } = body;
         let words = code.replace('_', " ");
         let title = words[..1].to_uppercase() + &words[1..];
         Self {
@@ -140,6 +143,7 @@ impl ApiError {
     pub(super) fn body(&self, request_id: &str) -> ErrorBody {
         let error = self.error();
         ErrorBody {
+            error: None,
             code: error.code().name(),
             message: error.message().to_owned(),
             request_id: request_id.to_owned(),
@@ -151,24 +155,27 @@ impl ApiError {
         }
     }
 
-    /// Writes body and headers into `response`; `problem_of` is the path of a caller who asks for
-    /// problem details.
+    /// Writes body and headers into `response`, as problem details where the caller asks for them.
     pub(super) fn write(
         &self,
         response: Response,
         request_id: &str,
-        problem_of: Option<&str>,
+        path: &str,
+        as_problem: bool,
     ) -> Response {
         let error = self.error();
-        let body = self.body(request_id);
+        let mut body = self.body(request_id);
+        if path == "/v2" || path.starts_with("/v2/") {
+            body.error = Some(error.message().to_owned());
+        }
         let (mut parts, _) = response.into_parts();
         parts.headers.remove(header::CONTENT_LENGTH);
         parts.headers.remove(header::CONTENT_TYPE);
         parts.headers.append(header::VARY, HeaderValue::from_static("accept"));
         let (status, headers) = (parts.status, parts.headers);
-        let mut answer = match problem_of {
-            None => (status, headers, Json(body)).into_response(),
-            Some(path) => {
+        let mut answer = match as_problem {
+            false => (status, headers, Json(body)).into_response(),
+            true => {
                 let body = Json(ProblemBody::new(body, status, path));
                 let mut answer = (status, headers, body).into_response();
                 let kind = HeaderValue::from_static(PROBLEM);

@@ -149,7 +149,7 @@ async fn within(
     if let Some(error) = error {
         log_error(error.error(), Some(ms));
         if transport == Transport::Http {
-            response = error.write(response, id, as_problem.then_some(&path));
+            response = error.write(response, id, &path, as_problem);
         }
     } else {
         tracing::debug!(status = response.status().as_u16(), ms, code, "served");

@@ -9,6 +9,7 @@ mod error;
 mod extract;
 mod fields;
 mod health;
+mod inference;
 mod middleware;
 mod multipart;
 mod openapi;
@@ -77,6 +78,12 @@ pub fn routes() -> Vec<Route> {
         ("GET", "/v1/scenes/{id}/export", "export", read, get(render::export)),
         ("GET", "/v1/scenes/{id}/features", "features", read, get(render::features)),
         ("GET", "/v1/models", "models", read, get(health::models)),
+        ("GET", "/v2", "server_metadata", read, get(inference::server_metadata)),
+        ("GET", "/v2/health/live", "server_live", none, get(inference::server_live)),
+        ("GET", "/v2/health/ready", "server_ready", none, get(inference::server_ready)),
+        ("GET", "/v2/models/{name}", "model_metadata", read, get(inference::model_metadata)),
+        ("GET", "/v2/models/{name}/ready", "model_ready", read, get(inference::model_ready)),
+        ("POST", "/v2/models/{name}/infer", "model_infer", write, post(inference::model_infer)),
         ("GET", "/metrics", METRICS, admin, get(health::metrics)),
         ("GET", "/healthz", "live", none, get(health::live)),
         ("GET", "/readyz", "ready", none, get(health::ready)),

@@ -16,7 +16,7 @@ use utoipa::{
 
 use super::{
     error::{ErrorBody, PROBLEM, ProblemBody},
-    health, render, scenes, texts, viewer, views,
+    health, inference, render, scenes, texts, viewer, views,
 };
 use crate::{
     api::Api,
@@ -49,12 +49,15 @@ pub(super) async fn document(State(api): State<Api>) -> Json<Value> {
         scenes::create, scenes::list, scenes::get, scenes::delete, scenes::events, scenes::refine,
         render::view, views::views, texts::query, texts::pick, render::export, render::features,
         health::models, health::live, health::ready, health::metrics, document, viewer::index,
+        inference::server_metadata, inference::server_live, inference::server_ready,
+        inference::model_metadata, inference::model_ready, inference::model_infer,
     ),
     components(schemas(ErrorBody, ProblemBody)),
     tags(
         (name = "scenes", description = "Make, list, show, watch and delete scenes"),
         (name = "views", description = "Pictures and files of a scene"),
         (name = "texts", description = "Where is it? Texts to a scene"),
+        (name = "inference", description = "The networks, by the Open Inference Protocol v2"),
         (name = "server", description = "Health, models, this document"),
     ),
     modifiers(&EveryCall),

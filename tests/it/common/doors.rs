@@ -398,7 +398,8 @@ async fn whole(
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Found {
     pub(crate) gaussians: u64,
-    pub(crate) parts: usize,
+    /// Centroid, covariance and visibility of each part.
+    pub(crate) parts: Vec<Vec<f32>>,
     pub(crate) warnings: Vec<String>,
     pub(crate) area: Option<u64>,
     pub(crate) rle: Option<String>,
@@ -432,7 +433,7 @@ impl Door {
                 let answer = json(request.send().await.expect("an answer")).await?;
                 let found = |one: &Value| Found {
                     gaussians: one["gaussians"].as_u64().expect("a count"),
-                    parts: one["parts"].as_array().expect("a list").len(),
+                    parts: one["parts"].as_array().expect("a list").iter().map(numbers).collect(),
                     warnings: one["warnings"]
                         .as_array()
                         .expect("a list")
@@ -456,7 +457,7 @@ impl Door {
                 let answer = client.clone().query(request).await.map_err(fault_of)?.into_inner();
                 let found = |one: pb::TextResult| Found {
                     gaussians: one.gaussians,
-                    parts: one.parts.len(),
+                    parts: one.parts.into_iter().map(moments).collect(),
                     warnings: one.warnings.into_iter().map(|warning| warning.code).collect(),
                     area: one.view.as_ref().map(|view| view.area),
                     rle: one.view.map(|view| view.mask_rle),
@@ -625,6 +626,28 @@ pub(crate) fn fault_of(status: tonic::Status) -> Fault {
         retry_after: key("retry-after"),
         request_id: key("x-request-id").unwrap_or_default(),
     }
+}
+
+/// Centroid, covariance and visibility of a part.
+fn moments(part: pb::Part) -> Vec<f32> {
+    let pb::Vec3 { x, y, z } = part.centroid.expect("a centroid");
+    let moments = [x, y, z].into_iter().chain(part.covariance).map(|v| v as f32);
+    moments.chain(part.visibility).collect()
+}
+
+/// The same of JSON.
+fn numbers(part: &Value) -> Vec<f32> {
+    fn leaves(value: &Value, found: &mut Vec<f32>) {
+        match value {
+            Value::Array(values) => values.iter().for_each(|value| leaves(value, found)),
+            number => found.push(number.as_f64().expect("a number") as f32),
+        }
+    }
+    let mut found = Vec::new();
+    for name in ["centroid", "covariance", "visibility"] {
+        leaves(&part[name], &mut found);
+    }
+    found
 }
 
 fn text(value: &Value) -> String {

@@ -356,14 +356,15 @@ def query(
     scene: Handle,
     *texts: str,
     masks: bool = True,
-    boxes: Literal["oriented", "aligned", "none"] = "oriented",
+    boxes: Literal["oriented", "upright", "aligned", "none"] = "oriented",
     **options: Unpack[QueryCall],
 ) -> Flow[Matches]:
     """Asks where things are: boxes and Gaussians in 3D, and masks in one view.
 
     texts: 1 to 128.
     masks: False asks in 3D alone, which draws nothing.
-    boxes: along the part's own axes, those of the world, or none.
+    boxes: along the part's own axes, the same with the last axis up, along the axes of the world,
+        or none.
     from_, eye, camera, width and so on: the view of the masks, as in `view`; by default that of the
         first photo.
     """

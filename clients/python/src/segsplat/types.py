@@ -360,6 +360,12 @@ class Box:
     axes: Floats
     #: [3] full lengths along the axes, world units.
     size: Floats
+    #: [3] mean centre of its Gaussians, world units.
+    centroid: Floats
+    #: [3, 3] covariance of its Gaussians, each counted once, world units squared.
+    covariance: Floats
+    #: [V] share of its Gaussians that each photo of the scene shows, 0 to 1.
+    visibility: Floats
 
     @property
     def corners(self) -> Floats:

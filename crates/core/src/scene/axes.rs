@@ -1,6 +1,15 @@
 //! Axes of an ellipsoid: eigenvectors of a covariance.
 
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DQuat, DVec3};
+
+/// Covariance of a Gaussian, `R diag(scales²) Rᵀ`; `quat` is w x y z.
+#[must_use]
+pub fn covariance(quat: [f32; 4], scales: [f32; 3]) -> DMat3 {
+    let [w, x, y, z] = quat.map(f64::from);
+    let turn = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
+    let variances = DVec3::from_array(scales.map(|s| f64::from(s).powi(2)));
+    turn * DMat3::from_diagonal(variances) * turn.transpose()
+}
 
 /// Orthonormal eigenvectors of a symmetric matrix, by Jacobi's rotations; their order and signs are
 /// arbitrary.

@@ -20,7 +20,7 @@ mod status;
 mod upload;
 mod weights;
 
-pub use axes::principal_axes;
+pub use axes::{covariance, principal_axes};
 pub use backdrop::Backdrop;
 pub use camera::{Camera, CameraToWorld, Intrinsics, ORTHONORMAL_TOLERANCE, Region};
 pub use capture::{Capture, ViewSet};

@@ -1,5 +1,6 @@
 //! The status of a scene, as the store keeps it and as callers and watchers see it.
 
+use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -8,8 +9,12 @@ use crate::{
     names::display_names,
     scene::{
         Camera, HealthReport, Intrinsics, RefineState, RefineStatus, SceneId, SemanticsReport,
+        principal_axes,
     },
 };
+
+/// How far photos are rolled, radians squared: some two degrees.
+const ROLL_VARIANCE: f64 = 1e-3;
 
 /// When the semantics of a scene are made.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -95,6 +100,33 @@ pub struct SceneCamera {
     /// None where the photo was not used.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub network: Option<Intrinsics>,
+}
+
+impl SceneCamera {
+    /// Up in the pictures of all cameras, a unit vector of the world; -y where there are none.
+    #[must_use]
+    pub fn mean_up(cameras: &[Self]) -> DVec3 {
+        let sum: DVec3 = cameras.iter().map(|c| -c.camera.camera_to_world.rotation().y_axis).sum();
+        sum.try_normalize().unwrap_or(DVec3::NEG_Y)
+    }
+
+    /// Up of the world as the photos tell it, a unit vector: the direction that is most across to
+    /// the right of all pictures. So photos that look down or up count as those that look ahead,
+    /// as long as they are not rolled. Photos that all look the same way say less: then it is
+    /// [`Self::mean_up`] without its roll.
+    #[must_use]
+    pub fn level_up(cameras: &[Self]) -> DVec3 {
+        let mean = Self::mean_up(cameras);
+        let square = |v: DVec3| DMat3::from_cols(v * v.x, v * v.y, v * v.z);
+        let mut right = (DMat3::IDENTITY - square(mean)) * ROLL_VARIANCE * cameras.len() as f64;
+        for camera in cameras {
+            right += square(camera.camera.camera_to_world.rotation().x_axis);
+        }
+        let spread = |axis: &DVec3| axis.dot(right * *axis);
+        let least = principal_axes(right).into_iter();
+        let least = least.min_by(|a, b| spread(a).total_cmp(&spread(b))).unwrap_or(mean);
+        if cameras.is_empty() { mean } else { least * least.dot(mean).signum() }
+    }
 }
 
 /// Where the semantics of a scene stand.

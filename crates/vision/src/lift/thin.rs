@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use super::{fuse::Fate, sh::COUNT_MAX as SH_COUNT_MAX};
 use crate::{
     point,
-    scene::{BLUR_PX2, SH_C0, ViewGaussians, principal_axes},
+    scene::{BLUR_PX2, SH_C0, ViewGaussians, covariance, principal_axes},
 };
 
 /// How alike neighbours must be, and how often blocks of blocks are tried.
@@ -186,12 +186,7 @@ impl<'a> Blocks<'a> {
     /// `pixel`: width of a pixel of the picture at the block's depth, world units.
     fn mixture(&self, cell: usize, of: [usize; 4], pixel: f64) -> Option<Merged> {
         let view = self.view;
-        let covariances = of.map(|i| {
-            let [w, x, y, z] = view.quats[i].map(f64::from);
-            let turn = DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize());
-            let variances = DVec3::from_array(view.scales[i].map(|s| f64::from(s).powi(2)));
-            turn * DMat3::from_diagonal(variances) * turn.transpose()
-        });
+        let covariances = of.map(|i| covariance(view.quats[i], view.scales[i]));
         let footprint = |covariance: &DMat3| self.footprint(covariance, pixel);
         let masses: [f64; 4] =
             std::array::from_fn(|k| f64::from(view.opacities[of[k]]) * footprint(&covariances[k]));

@@ -12,6 +12,7 @@ use crate::{
         fit,
         fit::FittedPhoto,
         network::{Input, Network, Outputs, RunMemory, Side, Spec, Wanted},
+        tensors::Numbers,
     },
     scene::{CameraToWorld, Intrinsics, PosedPhoto, ViewGaussians},
 };
@@ -114,6 +115,12 @@ impl Geometry {
     #[must_use]
     pub fn manifest(&self) -> &GeometryManifest {
         &self.manifest
+    }
+
+    /// The network itself.
+    #[must_use]
+    pub fn network(&self) -> &Network {
+        &self.network
     }
 
     /// What computes it.
@@ -350,7 +357,8 @@ fn signature(manifest: &GeometryManifest) -> Vec<Wanted<'_>> {
         pixel(&outputs.sh, &[sh_count(manifest), 3]),
     ];
     if let Some(name) = &inputs.neighbors {
-        all.push(Wanted { whole: Some(true), ..of(Side::Input, name, &[&[]]) });
+        let each = of(Side::Input, name, &[&[]]).at_most(&[0, manifest.neighbors_max]);
+        all.push(Wanted { whole: Some(true), ..each.of(Numbers::OwnRows) });
     }
     all.extend(outputs.confidence.iter().map(|name| pixel(name, &[])));
     all

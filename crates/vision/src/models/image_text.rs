@@ -13,6 +13,7 @@ use crate::{
         manifest::unavailable,
         network::{Input, Network, Outputs, RunMemory, Side, Spec, Takes, Wanted, fixed},
         resize::{planes, resize},
+        tensors::Numbers,
     },
     scene::{Crop, TextEmbedding},
 };
@@ -90,7 +91,7 @@ impl ImageText {
             what: TEXT,
             file: &tower.file,
             cpu_file: None,
-            signature: text_signature(&manifest),
+            signature: text_signature(&manifest, tokenizer.get_vocab_size(true)),
             memory: RunMemory::Kept,
             tolerance: TOLERANCE,
             probe: &|takes| {
@@ -140,6 +141,18 @@ impl ImageText {
     #[must_use]
     pub fn manifest(&self) -> &ImageTextManifest {
         &self.manifest
+    }
+
+    /// The image tower itself.
+    #[must_use]
+    pub fn image_tower(&self) -> &Network {
+        &self.image
+    }
+
+    /// The text tower itself.
+    #[must_use]
+    pub fn text_tower(&self) -> &Network {
+        &self.text
     }
 
     /// What computes them.
@@ -306,7 +319,7 @@ pub(super) fn signatures(manifest: &ImageTextManifest) -> Vec<Signature<'_>> {
     let (image, text) = (&manifest.image, &manifest.text);
     vec![
         (IMAGE, &image.file, image_signature(manifest)),
-        (TEXT, &text.file, text_signature(manifest)),
+        (TEXT, &text.file, text_signature(manifest, usize::MAX)),
     ]
 }
 
@@ -314,18 +327,24 @@ fn image_signature(manifest: &ImageTextManifest) -> Vec<Wanted<'_>> {
     let (tower, side) = (&manifest.image, manifest.image.size as usize);
     let square = vec![vec![], vec![3], vec![side], vec![side]];
     vec![
-        Wanted::new(Side::Input, &tower.input, square),
+        Wanted::new(Side::Input, &tower.input, square).at_most(&[tower.batch.min(CPU_CROPS)]),
         Wanted::new(Side::Output, &tower.output, vec![vec![], vec![manifest.dim]]),
     ]
 }
 
-fn text_signature(manifest: &ImageTextManifest) -> Vec<Wanted<'_>> {
+/// `ids`: ids of the tokenizer.
+fn text_signature(manifest: &ImageTextManifest, ids: usize) -> Vec<Wanted<'_>> {
     let tower = &manifest.text;
-    let tokens =
-        |name| Wanted { whole: Some(true), ..Wanted::new(Side::Input, name, vec![vec![], vec![]]) };
-    let inputs = [&tower.input_ids].into_iter().chain(&tower.attention_mask);
+    let tokens = |name, most: usize| {
+        let tokens = Wanted::new(Side::Input, name, vec![vec![], vec![]])
+            .at_most(&[TEXTS_A_RUN, tower.context])
+            .of(Numbers::Within([0.0, most as f64]));
+        Wanted { whole: Some(true), ..tokens }
+    };
+    let ids = tokens(&*tower.input_ids, ids.saturating_sub(1));
+    let there = tower.attention_mask.iter().map(|name| tokens(&**name, 1));
     let output = Wanted::new(Side::Output, &tower.output, vec![vec![], vec![manifest.dim]]);
-    inputs.map(|name| tokens(&**name)).chain([output]).collect()
+    [ids].into_iter().chain(there).chain([output]).collect()
 }
 
 /// A dimension of an input, where the file fixes it.

@@ -15,6 +15,7 @@ use crate::{
         manifest::unavailable,
         network::{self, Input, Network, Outputs, RunMemory, Side, Spec, Wanted, fixed},
         resize::{planes, resize},
+        tensors::Numbers,
     },
     scene::{JudgedMasks, MaskJudging, MaskLogits, Photo},
 };
@@ -291,6 +292,18 @@ impl MaskNetwork {
         self.takes.judged
     }
 
+    /// The encoder itself.
+    #[must_use]
+    pub fn encoder(&self) -> &Network {
+        &self.encoder
+    }
+
+    /// The decoder itself.
+    #[must_use]
+    pub fn decoder(&self) -> &Network {
+        &self.decoder
+    }
+
     /// What computes the decoder.
     #[must_use]
     pub fn provider(&self) -> Provider {
@@ -549,7 +562,12 @@ fn decoder_signature(manifest: &MasksManifest) -> Vec<Wanted<'_>> {
         MaskAdapter::Sam => vec![],
         MaskAdapter::EfficientSam => vec![vec![1]],
     };
-    let of = |side, name, tail: &[Vec<usize>]| Wanted::new(side, name, [&lead, tail].concat());
+    let of = |side, name, tail: &[Vec<usize>]| {
+        let prompts = vec![CPU_PROMPTS; lead.len() + tail.len()];
+        Wanted::new(side, name, [&lead, tail].concat()).at_most(&prompts)
+    };
+    let kinds = manifest.levels.iter().max().map_or(0.0, |level| *level as f64);
+    let side = f64::from(EFFICIENT_SAM_LOGITS);
     let mut all = vec![
         of(Side::Input, &*names.point_coords, &[any(), any(), vec![2]]),
         of(Side::Input, &names.point_labels, &[any(), any()]),
@@ -557,10 +575,13 @@ fn decoder_signature(manifest: &MasksManifest) -> Vec<Wanted<'_>> {
         of(Side::Output, &names.iou_predictions, &[any(), any()]),
         Wanted::new(Side::MayTake, &names.mask_input, vec![any(), any(), any(), any()]),
         Wanted::new(Side::MayTake, &names.has_mask_input, vec![vec![1]]),
-        Wanted { whole: None, ..Wanted::new(Side::MayTake, &names.orig_im_size, vec![vec![2]]) },
+        Wanted { whole: None, ..Wanted::new(Side::MayTake, &names.orig_im_size, vec![vec![2]]) }
+            .of(Numbers::Within([1.0, side])),
     ];
     all.extend([
-        Wanted { whole: Some(true), ..Wanted::new(Side::MayTake, JUDGED_LEVELS, vec![any()]) },
+        Wanted { whole: Some(true), ..Wanted::new(Side::MayTake, JUDGED_LEVELS, vec![any()]) }
+            .at_most(&[manifest.levels.len()])
+            .of(Numbers::Within([0.0, kinds])),
         Wanted::new(Side::MayTake, PHOTO_ROWS, vec![any(), any()]),
         Wanted::new(Side::MayTake, PHOTO_COLUMNS, vec![any(), any()]),
         Wanted::new(Side::MayTake, STABILITY_OFFSET, vec![vec![1]]),

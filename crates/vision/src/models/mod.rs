@@ -22,6 +22,7 @@ mod options;
 mod places;
 mod resize;
 mod runtime;
+mod tensors;
 
 pub use bundle::{Bundle, BundleFile};
 pub use check::{BundleCheck, CheckedFile, check};
@@ -34,6 +35,8 @@ pub use manifest::{
     MaskEncoderManifest, MasksManifest, OutputFrame, PlainFile, TextTowerManifest, Translation,
 };
 pub use masks::{MaskNetwork, PhotoEmbedding};
+pub use network::Network;
 pub use options::{NetworkOptions, ProviderChoice};
 pub use resize::ResizeFilter;
 pub use runtime::{Provider, Runtime, SETUP_COMMAND};
+pub use tensors::{NetworkTensors, Tensor, TensorData, TensorKind, TensorSpec};

@@ -29,8 +29,10 @@ use crate::{
     error::{Error, Result},
     meter,
     models::{
-        Bundle, NetworkOptions, Provider, ProviderChoice, Runtime, manifest::unavailable,
+        Bundle, NetworkOptions, Provider, ProviderChoice, Runtime,
+        manifest::unavailable,
         runtime::Arithmetic,
+        tensors::{self, NetworkTensors, Numbers, TensorData, TensorKind, TensorSpec},
     },
 };
 
@@ -92,6 +94,16 @@ pub(super) struct Input<'a> {
 impl<'a> Input<'a> {
     pub(super) fn new(name: &'a str, shape: &[usize], data: impl Into<Data<'a>>) -> Self {
         Self { name, shape: shape.to_vec(), data: data.into() }
+    }
+
+    /// A tensor of a caller; `None` where no network takes its kind.
+    fn of(tensor: &'a tensors::Tensor) -> Option<Self> {
+        let data = match &tensor.data {
+            TensorData::F32(data) => data.as_slice().into(),
+            TensorData::I64(data) => data.as_slice().into(),
+            TensorData::U8(_) => return None,
+        };
+        Some(Self { name: &tensor.name, shape: tensor.shape.clone(), data })
     }
 
     /// For a session; `half` where its file takes f16.
@@ -260,21 +272,54 @@ pub(super) struct Taken {
     name: String,
     /// -1 where it is free; empty where the file says nothing.
     pub(super) shape: Vec<i64>,
+    /// Names of the dimensions; empty where they have none.
+    symbols: Vec<String>,
     kind: TensorElementType,
 }
 
 impl Taken {
     fn of(outlet: &Outlet) -> Self {
-        let (shape, kind) = match outlet.dtype() {
-            ValueType::Tensor { ty, shape, .. } => (shape.to_vec(), *ty),
-            _ => (Vec::new(), TensorElementType::Undefined),
+        let (shape, symbols, kind) = match outlet.dtype() {
+            ValueType::Tensor { ty, shape, dimension_symbols } => {
+                (shape.to_vec(), dimension_symbols.to_vec(), *ty)
+            }
+            _ => (Vec::new(), Vec::new(), TensorElementType::Undefined),
         };
-        Self { name: outlet.name().to_owned(), shape, kind }
+        Self { name: outlet.name().to_owned(), shape, symbols, kind }
     }
 
     /// Whole numbers, not f32 or f16.
     pub(super) fn whole(&self) -> bool {
         self.kind == TensorElementType::Int64
+    }
+
+    /// With what callers must keep to; `None` where its kind is none of ours.
+    fn spec(&self, wanted: &Wanted<'_>) -> Option<TensorSpec> {
+        let kind = match self.kind {
+            TensorElementType::Float32 | TensorElementType::Float16 => TensorKind::F32,
+            TensorElementType::Int64 => TensorKind::I64,
+            TensorElementType::Uint8 => TensorKind::U8,
+            _ => return None,
+        };
+        let used = |axis: usize| {
+            let mut sizes = wanted.shape.as_ref()?.get(axis)?.clone();
+            sizes.sort_unstable();
+            sizes.dedup();
+            Some(sizes)
+        };
+        let sizes = |(axis, size): (usize, &i64)| match fixed(*size) {
+            Some(size) => vec![size],
+            None => used(axis).unwrap_or_default(),
+        };
+        Some(TensorSpec {
+            name: self.name.clone(),
+            kind,
+            sizes: self.shape.iter().enumerate().map(sizes).collect(),
+            shape: self.shape.clone(),
+            symbols: self.symbols.clone(),
+            most: wanted.most.clone(),
+            numbers: wanted.numbers,
+        })
     }
 }
 
@@ -294,6 +339,20 @@ impl Takes {
     /// The input of this name; `None` where the file has none.
     pub(super) fn get(&self, name: &str) -> Option<&Taken> {
         self.inputs.iter().find(|taken| taken.name == name)
+    }
+
+    /// The tensors with what callers must keep to.
+    fn tensors(&self, wanted: &[Wanted<'_>]) -> NetworkTensors {
+        let specs = |of: &[Taken], sides: [Side; 2]| -> Vec<TensorSpec> {
+            let wanted = |name: &str| {
+                wanted.iter().find(|want| want.name == name && sides.contains(&want.side))
+            };
+            of.iter().filter_map(|taken| taken.spec(wanted(&taken.name)?)).collect()
+        };
+        NetworkTensors {
+            inputs: specs(&self.inputs, [Side::Input, Side::MayTake]),
+            outputs: specs(&self.outputs, [Side::Output, Side::MayGive]),
+        }
     }
 
     /// What the file has otherwise than the manifest says, all of it.
@@ -330,17 +389,32 @@ pub(super) struct Wanted<'a> {
     pub(super) whole: Option<bool>,
     /// For each dimension every size that is used, where an empty list is any; `None`: any shape.
     pub(super) shape: Option<Vec<Vec<usize>>>,
+    /// For each dimension the largest size that a caller may send.
+    pub(super) most: Vec<usize>,
+    /// The numbers that a caller may send.
+    pub(super) numbers: Numbers,
 }
 
 impl<'a> Wanted<'a> {
     /// A tensor of f32 (or f16).
     pub(super) fn new(side: Side, name: &'a str, shape: Vec<Vec<usize>>) -> Self {
-        Self { side, name, whole: Some(false), shape: Some(shape) }
+        Self { shape: Some(shape), ..Self::unshaped(side, name) }
     }
 
     /// The same of any shape.
     pub(super) fn unshaped(side: Side, name: &'a str) -> Self {
-        Self { side, name, whole: Some(false), shape: None }
+        let (most, numbers) = (Vec::new(), Numbers::Any);
+        Self { side, name, whole: Some(false), shape: None, most, numbers }
+    }
+
+    /// The same with the largest sizes that a caller may send.
+    pub(super) fn at_most(self, most: &[usize]) -> Self {
+        Self { most: most.to_vec(), ..self }
+    }
+
+    /// The same with the numbers that a caller may send.
+    pub(super) fn of(self, numbers: Numbers) -> Self {
+        Self { numbers, ..self }
     }
 
     fn misfit(&self, takes: &Takes) -> Option<String> {
@@ -498,9 +572,10 @@ impl Opener {
 type OpenCpu = Box<dyn Fn() -> Result<Pool> + Send + Sync>;
 
 /// A network, ready to run from any thread.
-pub(super) struct Network {
+pub struct Network {
     what: &'static str,
     takes: Takes,
+    tensors: NetworkTensors,
     pool: Pool,
     provider: Provider,
     /// Failed runs in a row.
@@ -547,6 +622,7 @@ impl Network {
             });
             let checked = opened.and_then(|(pool, takes)| {
                 let misfits = takes.misfits(&spec.signature);
+                let tensors = takes.tensors(&spec.signature);
                 if !misfits.is_empty() {
                     let (file, all) = (spec.file, misfits.join("; and "));
                     return Err(unavailable(format!("{what}: {file} {all}")));
@@ -559,10 +635,10 @@ impl Network {
                     let off = check(spec, name, &pool, &reference, &probe)?;
                     info!(network = what, provider = name, off, "held to the CPU's answer");
                 }
-                Ok((pool, takes))
+                Ok((pool, takes, tensors))
             });
             match checked {
-                Ok((pool, takes)) => {
+                Ok((pool, takes, tensors)) => {
                     info!(network = what, provider = name, "open");
                     let open_cpu = move || {
                         let opened = opener.open(Provider::Cpu).map(|(pool, _)| pool);
@@ -571,6 +647,7 @@ impl Network {
                         })
                     };
                     return Ok(Self {
+                        tensors,
                         refused: refused.map(|e: Error| e.message().to_owned()),
                         ..Self::of(what, provider, pool, takes, Box::new(open_cpu))
                     });
@@ -597,6 +674,7 @@ impl Network {
         Self {
             what,
             takes,
+            tensors: NetworkTensors::default(),
             pool,
             provider,
             failures: AtomicU32::new(0),
@@ -609,6 +687,61 @@ impl Network {
     /// What the file takes.
     pub(super) fn takes(&self) -> &Takes {
         &self.takes
+    }
+
+    /// Its tensors, for [`Self::infer`].
+    #[must_use]
+    pub fn tensors(&self) -> &NetworkTensors {
+        &self.tensors
+    }
+
+    /// Runs the network on tensors of a caller from outside and gives the outputs of these names,
+    /// or all where there is none. Waits for an idle session as every run does. A run that fails
+    /// is the caller's fault: the provider is asked again by others.
+    ///
+    /// # Errors
+    /// `invalid_request` where a tensor is not one that the network takes, or they do not fit each
+    /// other; `internal` where an output has another kind than the file says.
+    pub fn infer(
+        &self,
+        given: &[tensors::Tensor],
+        only: &[String],
+    ) -> Result<Vec<tensors::Tensor>> {
+        self.tensors.check(given)?;
+        let outputs = self.tensors.chosen(only)?;
+        let names: Vec<&str> = outputs.iter().map(|output| &*output.name).collect();
+        let inputs: Vec<Input<'_>> = given.iter().filter_map(Input::of).collect();
+        let mut found = Vec::with_capacity(outputs.len());
+        let mut read = |of: &dyn Outputs| {
+            for TensorSpec { name, kind, .. } in &outputs {
+                let (shape, data) = match kind {
+                    TensorKind::U8 => {
+                        let (shape, data) = of.bytes(name)?;
+                        (shape, TensorData::U8(data.to_vec()))
+                    }
+                    TensorKind::F32 | TensorKind::I64 => {
+                        let (shape, data) = of.get(name)?;
+                        (shape, TensorData::F32(data.into_owned()))
+                    }
+                };
+                found.push(tensors::Tensor { name: name.clone(), shape, data });
+            }
+            Ok(())
+        };
+        let begun = Instant::now();
+        let ran = match self.lost() {
+            false => self.pool.run(&inputs, &names, &mut read),
+            true => self.cpu()?.run(&inputs, &names, &mut read),
+        };
+        meter::network(self.what, begun.elapsed().as_secs_f64());
+        match ran {
+            Ok(()) => Ok(found),
+            Err(Failure::Read(error)) => Err(error),
+            Err(Failure::Run(e)) => {
+                let why = format!("{}: it does not run with these inputs", self.what);
+                Err(Error::invalid(why).caused_by(e))
+            }
+        }
     }
 
     /// What computes it now.
@@ -678,15 +811,18 @@ impl Network {
             }
         }
         meter::fallback(what);
-        let mut kept = self.cpu.lock();
-        let cpu = match &*kept {
-            Some(cpu) => Arc::clone(cpu),
-            None => Arc::clone(kept.insert(Arc::new((self.open_cpu)()?))),
-        };
-        drop(kept);
-        cpu.run(inputs, only, read).map_err(|failure| match failure {
+        self.cpu()?.run(inputs, only, read).map_err(|failure| match failure {
             Failure::Run(e) => failed(e),
             Failure::Read(error) => error,
+        })
+    }
+
+    /// Sessions of the CPU, for a provider that fails.
+    fn cpu(&self) -> Result<Arc<Pool>> {
+        let mut kept = self.cpu.lock();
+        Ok(match &*kept {
+            Some(cpu) => Arc::clone(cpu),
+            None => Arc::clone(kept.insert(Arc::new((self.open_cpu)()?))),
         })
     }
 }

@@ -19,11 +19,11 @@ use std::{
 
 use crate::{
     capture,
-    error::{Error, Result},
+    error::{Error, ErrorCode, Result},
     lift::{self, FuseOptions, Fusion, UnionOptions},
     limits::Limits,
     meter,
-    models::{Bundle, Geometry, GeometryInput, NetworkOptions, Provider, Runtime},
+    models::{Bundle, Geometry, GeometryInput, Network, NetworkOptions, Provider, Runtime},
     photos::{self, ReadPhotos},
     scene::{
         Backdrop, Camera, Capture, Density, Gaussians, HealthReport, Intrinsics, Method, Photo,
@@ -31,6 +31,10 @@ use crate::{
         StageTime, Upload, ViewSet, Warning, Watch, unless_cancelled,
     },
 };
+
+/// Parts of a bundle that are networks of their own, where it has them.
+pub const NETWORKS: [&str; 5] =
+    ["geometry", "masks.encoder", "masks.decoder", "image_text.image", "image_text.text"];
 
 /// Views that go through the geometry network together, where none are asked for: memory grows with
 /// them, and scenes get no better in the mean (docs/adr/0034-many-photos.md).
@@ -96,6 +100,29 @@ impl Pipeline {
     #[must_use]
     pub fn geometry(&self) -> &Geometry {
         &self.geometry
+    }
+
+    /// Does `work` with the network of this part of the bundle ([`BundleFile::part`]), which is
+    /// opened if it is not yet.
+    ///
+    /// # Errors
+    /// `not_found` where no network has that name, `model_unavailable` where the bundle has none or
+    /// it does not open, and those of `work`.
+    ///
+    /// [`BundleFile::part`]: crate::models::BundleFile::part
+    pub fn with_network<T>(
+        &self,
+        part: &str,
+        work: impl FnOnce(&Network) -> Result<T>,
+    ) -> Result<T> {
+        match part {
+            "geometry" => work(self.geometry.network()),
+            "masks.encoder" => work(self.masks()?.encoder()),
+            "masks.decoder" => work(self.masks()?.decoder()),
+            "image_text.image" => work(self.image_text()?.image_tower()),
+            "image_text.text" => work(self.image_text()?.text_tower()),
+            _ => Err(Error::new(ErrorCode::NotFound, "no network of this name")),
+        }
     }
 
     /// Threads for the stages outside the network.

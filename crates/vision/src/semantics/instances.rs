@@ -12,9 +12,10 @@ use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
+use super::Views;
 use crate::{
     point,
-    scene::{Gaussians, SceneCamera, principal_axes},
+    scene::{Gaussians, SceneCamera, covariance, principal_axes},
 };
 
 /// How Gaussians are joined to instances.
@@ -45,7 +46,7 @@ pub struct Box3 {
     pub center: [f64; 3],
     /// Full lengths along the axes, world units.
     pub size: [f64; 3],
-    /// Unit axes, one in each row, right-handed. An aligned box has those of the world.
+    /// Unit axes, one in each row, right-handed.
     pub axes: [[f64; 3]; 3],
 }
 
@@ -56,10 +57,67 @@ pub struct Instance {
     pub gaussians: Vec<u32>,
     /// Mean centre of its Gaussians, world units.
     pub centroid: [f64; 3],
-    /// Box along its own principal axes, the longest first.
-    pub oriented: Box3,
-    /// Box along the world's axes.
-    pub aligned: Box3,
+    /// Covariance of the mixture of its Gaussians, each counted once: the mean of their own and the
+    /// spread of their centres. World units squared.
+    pub covariance: [[f64; 3]; 3],
+    /// `[V]` share of its Gaussians that each photo shows, 0..1.
+    pub visibility: Vec<f32>,
+    /// Centres, relative to `origin`.
+    means: Vec<DVec3>,
+    origin: DVec3,
+    /// Up of the scene.
+    up: DVec3,
+    /// [`InstanceOptions::trim`].
+    trim: f64,
+}
+
+impl Instance {
+    /// The box of the centres along the principal axes of the covariance, the longest first.
+    #[must_use]
+    pub fn oriented(&self) -> Box3 {
+        let spread = DMat3::from_cols_array_2d(&self.covariance);
+        let own = self.bounds(principal_axes(spread));
+        boxed(longest_first(own), self.origin)
+    }
+
+    /// The box of the centres that stands upright: its last axis is up, the others are the
+    /// principal axes of the covariance as seen from above, the longer first.
+    #[must_use]
+    pub fn upright(&self) -> Box3 {
+        let spread = DMat3::from_cols_array_2d(&self.covariance);
+        let (a, b) = self.up.any_orthonormal_pair();
+        // Of a 2 x 2 matrix; 0 where no direction is longer.
+        let (aa, ab, bb) = (a.dot(spread * a), a.dot(spread * b), b.dot(spread * b));
+        let (sin, cos) = (0.5 * (2.0 * ab).atan2(aa - bb)).sin_cos();
+        let mut own = self.bounds([cos * a + sin * b, cos * b - sin * a, self.up]);
+        if length(&own[0]) < length(&own[1]) {
+            own.swap(0, 1);
+        }
+        own[0] = facing(own[0]);
+        // Right-handed, with up as it is.
+        if own[0].0.cross(own[1].0).dot(self.up) < 0.0 {
+            own[1] = turned(own[1]);
+        }
+        boxed(own, self.origin)
+    }
+
+    /// The box of the centres along the axes of the world.
+    #[must_use]
+    pub fn aligned(&self) -> Box3 {
+        boxed(self.bounds([DVec3::X, DVec3::Y, DVec3::Z]), self.origin)
+    }
+
+    /// Bounds along three axes. The share `trim` is left out on each side.
+    fn bounds(&self, axes: [DVec3; 3]) -> Bounds {
+        axes.map(|axis| {
+            let mut along: Vec<f64> = self.means.iter().map(|mean| mean.dot(axis)).collect();
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share")]
+            let out = (self.trim.clamp(0.0, 0.49) * along.len() as f64) as usize;
+            let last = along.len() - 1 - out;
+            let least = *along.select_nth_unstable_by(out, f64::total_cmp).1;
+            (axis, [least, *along.select_nth_unstable_by(last, f64::total_cmp).1])
+        })
+    }
 }
 
 /// The connected components of the Gaussians of each entry, and the pairs that touch.
@@ -71,12 +129,19 @@ pub struct Components {
     members: Vec<Vec<u32>>,
     /// Pairs of different entries that touch: each pair once, the smaller number first.
     touching: Vec<[u32; 2]>,
+    /// Up of the scene.
+    up: DVec3,
+    /// Photos of the scene.
+    photos: usize,
+    /// `[N * ⌈V / 64⌉]` a bit for each photo that shows a Gaussian with an entry.
+    seen: Vec<u64>,
 }
 
 impl Components {
     /// The components of all Gaussians that have an entry.
     ///
-    /// `cameras` are those of the scene. They give the spacing of the Gaussians of a surface.
+    /// `cameras` are those of the scene. They give up, the spacing of the Gaussians of a surface,
+    /// and which photo shows which of them.
     #[must_use]
     pub fn new(gaussians: &Gaussians, cameras: &[SceneCamera], options: &InstanceOptions) -> Self {
         let index = gaussians.semantic_index();
@@ -91,7 +156,12 @@ impl Components {
         join_pixels(&mut bonds, gaussians, &chosen, &sites, options.same_depth);
         join_cells(&mut bonds, &sites, options.reach);
 
-        let mut components = Self::default();
+        let mut components = Self {
+            up: SceneCamera::level_up(cameras),
+            photos: cameras.len(),
+            seen: seen(gaussians, cameras),
+            ..Self::default()
+        };
         let mut component_of = vec![0_u32; chosen.len()];
         for (at, i) in chosen.iter().enumerate() {
             // The root is the smallest member, so it comes first.
@@ -147,7 +217,36 @@ impl Components {
         // Parts of one size are ordered by their first Gaussian, which is never shared.
         found
             .sort_by_key(|instance| (std::cmp::Reverse(instance.len()), instance.first().copied()));
-        found.into_iter().map(|instance| describe(gaussians, instance, options.trim)).collect()
+        found.into_iter().map(|found| self.described(gaussians, found, options.trim)).collect()
+    }
+
+    fn described(&self, gaussians: &Gaussians, of: Vec<u32>, trim: f64) -> Instance {
+        let means: Vec<DVec3> = of.iter().map(|&i| point(gaussians.means()[i as usize])).collect();
+        let share = 1.0 / means.len() as f64;
+        let middle = means.iter().sum::<DVec3>() * share;
+        let mut spread = DMat3::ZERO;
+        let (mut shown, words) = (vec![0_u32; self.photos], self.photos.div_ceil(64));
+        for (mean, i) in means.iter().zip(of.iter().map(|&i| i as usize)) {
+            let d = *mean - middle;
+            spread += covariance(gaussians.quats()[i], gaussians.scales()[i]);
+            spread += DMat3::from_cols(d * d.x, d * d.y, d * d.z);
+            for (v, shown) in shown.iter_mut().enumerate() {
+                *shown += u32::from(self.seen[i * words + v / 64] >> (v % 64) & 1 == 1);
+            }
+        }
+        #[expect(clippy::cast_possible_truncation, reason = "a share")]
+        let visibility = shown.into_iter().map(|count| (f64::from(count) * share) as f32).collect();
+        let origin = gaussians.origin();
+        Instance {
+            centroid: (middle + origin).to_array(),
+            covariance: (spread * share).to_cols_array_2d(),
+            visibility,
+            means,
+            origin,
+            up: self.up,
+            trim,
+            gaussians: of,
+        }
     }
 
     /// Bytes in memory.
@@ -155,7 +254,7 @@ impl Components {
     pub fn size_bytes(&self) -> u64 {
         let members: usize = self.members.iter().map(Vec::len).sum();
         let each = size_of::<Vec<u32>>() + size_of::<u16>();
-        (self.entry.len() * each + members * 4 + self.touching.len() * 8) as u64
+        (self.entry.len() * each + members * 4 + (self.touching.len() + self.seen.len()) * 8) as u64
     }
 }
 
@@ -270,56 +369,49 @@ fn join_cells(bonds: &mut Bonds, sites: &[Site], reach: f64) {
     }
 }
 
-fn describe(gaussians: &Gaussians, instance: Vec<u32>, trim: f64) -> Instance {
-    let means: Vec<DVec3> =
-        instance.iter().map(|&i| point(gaussians.means()[i as usize])).collect();
-    let count = means.len().max(1) as f64;
-    let middle = means.iter().sum::<DVec3>() / count;
-    let mut spread = DMat3::ZERO;
-    for mean in &means {
-        let d = *mean - middle;
-        spread += DMat3::from_cols(d * d.x, d * d.y, d * d.z);
-    }
-    let origin = gaussians.origin();
-    let own = bounds(&means, principal_axes(spread * (1.0 / count)), trim);
-    Instance {
-        centroid: (middle + origin).to_array(),
-        oriented: boxed(longest_first(own), origin),
-        aligned: boxed(bounds(&means, [DVec3::X, DVec3::Y, DVec3::Z], trim), origin),
-        gaussians: instance,
-    }
+/// [`Components::seen`].
+fn seen(gaussians: &Gaussians, cameras: &[SceneCamera]) -> Vec<u64> {
+    let words = cameras.len().div_ceil(64);
+    let mut bits = vec![0; gaussians.len() * words];
+    let views = Views::new(gaussians, cameras);
+    let of = gaussians.semantic_index();
+    let each = bits.par_chunks_mut(words.max(1)).enumerate().filter(|(i, _)| of[*i] > 0);
+    each.for_each(|(i, bits)| {
+        let photos = views.show(i).enumerate().filter(|(_, shown)| *shown);
+        photos.for_each(|(v, _)| bits[v / 64] |= 1 << (v % 64));
+    });
+    bits
 }
 
-/// Axes, with the smallest and the largest place along each.
-type Bounds = [(DVec3, [f64; 2]); 3];
+/// An axis, with the smallest and the largest place along it.
+type Bound = (DVec3, [f64; 2]);
 
-/// Bounds along three axes. The share `trim` is left out on each side.
-fn bounds(means: &[DVec3], axes: [DVec3; 3], trim: f64) -> Bounds {
-    axes.map(|axis| {
-        let mut along: Vec<f64> = means.iter().map(|mean| mean.dot(axis)).collect();
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a share")]
-        let out = (trim.clamp(0.0, 0.49) * along.len() as f64) as usize;
-        let last = along.len() - 1 - out;
-        let least = *along.select_nth_unstable_by(out, f64::total_cmp).1;
-        (axis, [least, *along.select_nth_unstable_by(last, f64::total_cmp).1])
-    })
-}
+/// Three of them, orthonormal.
+type Bounds = [Bound; 3];
 
 /// Axes sorted by length, right-handed. The largest number of each axis is positive.
 fn longest_first(mut bounds: Bounds) -> Bounds {
-    bounds.sort_by(|(_, a), (_, b)| (b[1] - b[0]).total_cmp(&(a[1] - a[0])));
-    let turned = |(axis, [from, to]): (DVec3, [f64; 2])| (-axis, [-to, -from]);
-    for bound in &mut bounds[..2] {
-        let numbers = bound.0.to_array();
-        let largest = numbers.into_iter().max_by(|a, b| a.abs().total_cmp(&b.abs()));
-        if largest.is_some_and(|v| v < 0.0) {
-            *bound = turned(*bound);
-        }
-    }
+    bounds.sort_by(|a, b| length(b).total_cmp(&length(a)));
+    bounds[0] = facing(bounds[0]);
+    bounds[1] = facing(bounds[1]);
     if bounds[0].0.cross(bounds[1].0).dot(bounds[2].0) < 0.0 {
         bounds[2] = turned(bounds[2]);
     }
     bounds
+}
+
+/// Bounds along the same line, whose direction has a positive largest number.
+fn facing(bound: Bound) -> Bound {
+    let largest = bound.0.to_array().into_iter().max_by(|a, b| a.abs().total_cmp(&b.abs()));
+    if largest.is_some_and(|v| v < 0.0) { turned(bound) } else { bound }
+}
+
+fn turned((axis, [from, to]): Bound) -> Bound {
+    (-axis, [-to, -from])
+}
+
+fn length((_, [from, to]): &Bound) -> f64 {
+    to - from
 }
 
 fn boxed(bounds: Bounds, origin: DVec3) -> Box3 {

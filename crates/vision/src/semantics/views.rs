@@ -102,6 +102,17 @@ impl<'a> Views<'a> {
         Self { gaussians, views }
     }
 
+    /// `[V]` whether each photo shows Gaussian `i`; its own does.
+    pub(super) fn show(&self, i: usize) -> impl Iterator<Item = bool> + '_ {
+        let at = center_of(self.gaussians, i);
+        let source = usize::from(self.gaussians.source()[i].view);
+        let shows = move |view: &View| view.shows(at).is_some();
+        let look = move |(v, view): (usize, &Option<View>)| {
+            v == source || view.as_ref().is_some_and(shows)
+        };
+        self.views.iter().enumerate().map(look)
+    }
+
     /// `[V]` the vote of each photo for Gaussian `i`: an entry, or 0 if the photo does not show it
     /// or has no entry there. The vote of its own photo is `own`.
     fn said<'b>(
