@@ -324,6 +324,7 @@ def main():
     ap.add_argument("--limit", type=int, help="so many rows of each bank, to try the program")
     ap.add_argument("--name", default="")
     ap.add_argument("--recipes", nargs="+", choices=list(RECIPES), default=list(RECIPES), help="one alone has twice the steps of two")
+    ap.add_argument("--marks", type=float, nargs="*", default=[0.15, 0.3, 0.45, 0.6, 0.75, 0.9], help="shares of the time at which the tower is measured")
     args = ap.parse_args()
     device = torch.device(KIND)
     torch.manual_seed(args.seed)
@@ -509,7 +510,7 @@ def main():
         return loss, [loss, ce, bce, hold, kd, made]
 
     tell("ready")
-    begin, saved, step, marks = time.time(), time.time(), 0, [0.15, 0.3, 0.45, 0.6, 0.75, 0.9]
+    begin, saved, step, marks = time.time(), time.time(), 0, list(args.marks)
     torch.backends.cudnn.benchmark = True
     while True:
         t = (time.time() - begin) / args.seconds
