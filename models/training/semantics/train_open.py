@@ -37,6 +37,7 @@ from words_model import SIDE, ImageTower
 HERE = os.path.dirname(os.path.abspath(__file__))
 SOURCES = [1.0, 1.6, 7.0, 5.0]  # how often a photograph of each labelled set is seen
 TOP = 16  # likeliest names of EfficientNet-Lite2 that are kept
+SAVE_EVERY = 60  # seconds: a run that is cut off has weights of the last minute
 ABSENT = 0.015  # "found" is also measured at the canon where this share of false words is found
 # What the tower that training begins with is shown: brightness outside the outline, margin, weight.
 VIEWS = [(0.0, 0.0, 1.0), (1.0, 0.08, 0.6), (1.0, 0.3, 0.4)]
@@ -323,6 +324,7 @@ def main():
     ap.add_argument("--limit", type=int, help="so many rows of each bank, to try the program")
     ap.add_argument("--name", default="")
     ap.add_argument("--recipes", nargs="+", choices=list(RECIPES), default=list(RECIPES), help="one alone has twice the steps of two")
+    ap.add_argument("--marks", type=float, nargs="*", default=[0.15, 0.3, 0.45, 0.6, 0.75, 0.9], help="shares of the time at which the tower is measured")
     args = ap.parse_args()
     device = torch.device(KIND)
     torch.manual_seed(args.seed)
@@ -508,7 +510,7 @@ def main():
         return loss, [loss, ce, bce, hold, kd, made]
 
     tell("ready")
-    begin, step, marks = time.time(), 0, [0.15, 0.3, 0.45, 0.6, 0.75, 0.9]
+    begin, saved, step, marks = time.time(), time.time(), 0, list(args.marks)
     torch.backends.cudnn.benchmark = True
     while True:
         t = (time.time() - begin) / args.seconds
@@ -519,6 +521,13 @@ def main():
             s.train()
             s.update(*losses(s, batch), t)
         step += 1
+        if step == 1:
+            # The library has chosen its algorithms: what came before is no training.
+            tell(f"first step done, {time.time() - begin:.0f} s after the beginning")
+        if time.time() - saved > SAVE_EVERY:
+            saved = time.time()
+            for s in students:
+                save(s, s.name + ".pt")
         if step % (50 if KIND == "cuda" else 1) == 0:
             for s in students:
                 v = [round(x, 4) for x in (s.sums / s.n).tolist()]
@@ -531,7 +540,8 @@ def main():
             for s in students:
                 for share in (0.4, 1.0):
                     said(f"{s.name} at {mark:.2f} share {share}", measure(blended([s.ema], share)))
-                save(s, s.name + ("_middle.pt" if 0.4 < mark < 0.5 else ".pt"))
+                if 0.4 < mark < 0.5:
+                    save(s, s.name + "_middle.pt")
     for s in students:
         save(s, s.name + ".pt")
     for names in [[r] for r in args.recipes] + [args.recipes] * (len(args.recipes) > 1):
