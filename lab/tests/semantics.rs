@@ -95,6 +95,13 @@ fn scoring_is_changed_as_the_making_of_scenes_is() {
     let none =
         ["--method", "cut=0.9", "--method", r#"canon=["red","green"]"#, "--method", "votes=true"];
     assert!(selected(&none).unwrap() < 0.01, "nothing is selected");
+    for (bad, why) in [
+        (["--overlap", "1.5"], "overlap is 1.5; it must be 0 to 1"),
+        (["--photos", "3"], "no target has 3 photos beside it"),
+    ] {
+        let fault = judged(dir.path(), &bad).unwrap().unwrap_err();
+        assert!(fault.message().contains(why), "{fault}");
+    }
     for (bad, why) in [("cut=2", "cut is 2"), ("tau=x", "tau=x"), ("beta=1", "beta=1")] {
         let fault = judged(dir.path(), &["--method", bad]).unwrap().unwrap_err();
         assert!(fault.message().contains(why), "{fault}");
@@ -105,13 +112,15 @@ fn scoring_is_changed_as_the_making_of_scenes_is() {
 fn words_find_their_boxes_in_a_view_and_a_word_for_nothing_does_not() {
     let dir = folder();
     let grids = dir.path().join("grids");
-    let pictures = ["--pictures", grids.to_str().unwrap()];
-    let Some(rows) = judged(dir.path(), &pictures) else { return };
+    let rest = ["--pictures", grids.to_str().unwrap(), "--overlap", "0.6"];
+    let Some(rows) = judged(dir.path(), &rest) else { return };
     let rows = rows.unwrap();
     let targets = rows[0]["targets"].as_array().unwrap();
     assert_eq!((rows.len(), targets.len()), (1, 3));
     // The middle photo is seen from the two beside it.
     assert_eq!(targets[1]["inputs"], json!(["images/0.png", "images/2.png"]));
+    assert_eq!((&rows[0]["overlap"], &rows[0]["left_out"]), (&json!(0.6), &json!([])));
+    assert!(rows[0]["networks"].as_str().unwrap().starts_with("../plane/make.py; "), "{rows:?}");
     let judged = &rows[0]["default"];
     let figure = |of: &Value, name: &str| of[name].as_f64().unwrap();
     for (of, least) in [("scene", 0.8), ("flat", 0.6)] {
