@@ -72,8 +72,8 @@ fn a_class_that_no_view_shows_is_left_out() {
     assert_eq!([&scores["jaccard"], &scores["jaccard_closed"]], [0.5, 0.5]);
 }
 
-/// ScanNet++'s count, literally: every pixel's texts are sorted, and one matrix of labels and counted
-/// classes gives the IoU of each class that is in it.
+/// ScanNet++'s count, literally: every pixel's texts are sorted, and one matrix of labels and of
+/// counted classes gives the IoU of each class that is in it.
 fn top_k(views: &[(Vec<u16>, Vec<TextMap>)], classes: usize, k: usize) -> f64 {
     let mut matrix = vec![vec![0_u32; classes + 1]; classes];
     for (label, maps) in views {

@@ -1,9 +1,10 @@
 //! What texts select in views of labelled scenes.
 //!
 //! The paper's protocol: a labelled photo is the target, the photos nearest to it (with `--overlap`
-//! those that overlap so much) are the input, and the class names are asked in a view from the target's camera. Each preset makes a scene of
-//! its own, and scores it. The *flat* baseline has no 3D: each mask of the nearest photo is scored
-//! by the same text, and the masks are laid over the target as they are.
+//! those that overlap so much) are the input, and the class names are asked in a view from the
+//! target's camera. Each preset makes a scene of its own, and scores it. The *flat* baseline has no
+//! 3D: each mask of the nearest photo is scored by the same text, and the masks are laid over the
+//! target as they are.
 
 pub mod labels;
 pub mod tally;
