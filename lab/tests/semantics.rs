@@ -65,12 +65,15 @@ fn folder() -> tempfile::TempDir {
     dir
 }
 
-/// The rows of `semantics` for a folder; `None` without ONNX Runtime.
-fn judged(folder: &Path, rest: &[&str]) -> Option<Result<Vec<Value>>> {
-    let bundle = root().join("tests/fixtures/colours");
-    let [folder, bundle] = [folder, &bundle].map(|p| p.to_str().unwrap());
-    let mut line = vec!["semantics", folder, "--absent", "blue,red"];
-    line.extend(["--bundle", bundle, "--threads", "2"]);
+/// The rows of a command for a folder; `None` without ONNX Runtime.
+fn measured(
+    command: &str,
+    bundle: &Path,
+    folder: &Path,
+    rest: &[&str],
+) -> Option<Result<Vec<Value>>> {
+    let [folder, bundle] = [folder, bundle].map(|p| p.to_str().unwrap());
+    let mut line = vec![command, folder, "--bundle", bundle, "--threads", "2"];
     line.extend(rest);
     let library = ort_library();
     if let Some(library) = &library {
@@ -80,6 +83,12 @@ fn judged(folder: &Path, rest: &[&str]) -> Option<Result<Vec<Value>>> {
         Err(e) if e.code() == ErrorCode::ModelUnavailable => opened(Err(e)),
         rows => Some(rows),
     }
+}
+
+/// The rows of `semantics` for a folder; `None` without ONNX Runtime.
+fn judged(folder: &Path, rest: &[&str]) -> Option<Result<Vec<Value>>> {
+    let rest = [&["--absent", "blue,red"], rest].concat();
+    measured("semantics", &root().join("tests/fixtures/colours"), folder, &rest)
 }
 
 #[test]
@@ -134,4 +143,31 @@ fn words_find_their_boxes_in_a_view_and_a_word_for_nothing_does_not() {
     let words = judged["scene"]["absent_words"].as_array().unwrap();
     assert_eq!((words.len(), &words[0]["word"]), (1, &json!("blue")));
     assert_eq!(std::fs::read_dir(grids).unwrap().count(), 1);
+}
+
+#[test]
+fn masks_of_a_file_that_judges_are_those_of_its_logits() {
+    let (dir, bundle) = (folder(), tempfile::tempdir().unwrap());
+    let fixture = root().join("tests/fixtures/colours");
+    for entry in std::fs::read_dir(&fixture).unwrap().flatten() {
+        std::fs::copy(entry.path(), bundle.path().join(entry.file_name())).unwrap();
+    }
+    let own = "cc51938787230013556d70ad0313e0d36d16aa75d2ac6e855eb3d8b06cb9ab39";
+    let judging = "c586fac6a90b9af4c39ba92dac1778d712257f69d97ab73ec6c7135ff89a1b9a";
+    let manifest = std::fs::read_to_string(fixture.join("bundle.toml")).unwrap();
+    let manifest = manifest.replace(own, judging);
+    let manifest = manifest.replace("masks_decoder.onnx", "masks_decoder_judging.onnx");
+    std::fs::write(bundle.path().join("bundle.toml"), manifest).unwrap();
+    let masks = |bundle: &Path, rest: &[&str]| {
+        measured("masks", bundle, dir.path(), &[&["--short", "--photos", "1"], rest].concat())
+    };
+    let Some(plain) = masks(bundle.path(), &[]) else { return };
+    let (plain, judged) = (plain.unwrap(), masks(bundle.path(), &["--judged"]).unwrap().unwrap());
+    assert_eq!([&plain[0]["judged"], &judged[0]["judged"]], [&json!(0.0), &plain[0]["asked"]]);
+    assert!(plain[0]["masks"].as_f64().unwrap() >= 2.0, "{plain:?}");
+    for same in ["masks", "asked"] {
+        assert_eq!(judged[0][same], plain[0][same], "{same}");
+    }
+    let fault = masks(&fixture, &["--judged"]).unwrap().unwrap_err();
+    assert!(fault.message().contains("does not judge masks"), "{fault}");
 }
