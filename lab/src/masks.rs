@@ -114,7 +114,7 @@ impl PromptDecoder for Counted<'_> {
 }
 
 /// Makes a row for each variant; its error is the share of the first variant's masks that it lacks.
-/// A row has means over photos: seconds (also those of the encoder), points asked and those that the
+/// A row has means over photos: seconds (also those of the encoder), points asked, those that the
 /// file judged, masks, the share of the photo in some mask, and what [`compare`] says.
 ///
 /// # Errors

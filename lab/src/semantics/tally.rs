@@ -9,9 +9,9 @@
 //! averages scikit-learn's `jaccard_score`: over every class and view, 0 where a class is neither
 //! there nor selected.
 //!
-//! The *top-k* mIoU is ScanNet++'s (`semantic/eval` of its toolbox): a labelled pixel counts as its
-//! own class where that is among its k best texts, else as its best text. The mean is over the
-//! classes that are labelled or counted somewhere, so a class that is only wrongly counted has 0.
+//! The *top-k* mIoU is that of ScanNet++ (`semantic/eval` of its toolbox): a labelled pixel counts
+//! as its own class where that is among its k best texts, else as its best text. The mean is over
+//! the classes that are labelled or counted somewhere: one that is only wrongly counted has 0.
 
 use serde_json::{Value, json};
 
