@@ -7,7 +7,8 @@ DATA is the folder `test` of pixelSplat's conversion: `*.torch`, each a list of 
 sequence to `context` and `target` frames. Photos are resized by Lanczos and cropped to 256 x
 256 as there. Scenes are made with `preset=paper`. PSNR, SSIM as scikit-image counts it
 (Gaussian weights, window 11), and LPIPS where `--lpips` names an ONNX file of two inputs
-`[1,3,H,W]` in -1 to 1 with one number as output. OUT takes a row a sequence and their mean.
+`[1,3,H,W]` in -1 to 1 with one number as output. OUT takes a row a sequence and their mean;
+`segsplat-lab report --beside paper-views=OUT` prints it below the paper's rows.
 
 Needs numpy, pillow, scipy."""
 
@@ -19,6 +20,7 @@ import statistics
 import subprocess
 import tempfile
 import time
+import tomllib
 
 import numpy as np
 from PIL import Image
@@ -162,6 +164,11 @@ def lpips(file):
     return distance
 
 
+def networks(bundle):
+    """Where the geometry of a bundle comes from, as its manifest says."""
+    return tomllib.loads((pathlib.Path(bundle) / "bundle.toml").read_text())["geometry"]["source"]
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("segsplat")
@@ -171,6 +178,8 @@ def main():
     parser.add_argument("--bundle", default="models/embedded")
     parser.add_argument("--count", type=int, help="sequences, the first ones [default: all]")
     parser.add_argument("--lpips")
+    parser.add_argument("--machine", default="this machine")
+    parser.add_argument("--commit", default="")
     args = parser.parse_args()
     perceptual, rows = lpips(args.lpips) if args.lpips else None, []
     for sequence in sequences(args.data, json.loads(args.index.read_text())):
@@ -183,8 +192,10 @@ def main():
     keys = [key for key in ("psnr", "ssim", "lpips") if key in rows[0]]
     means = {key: statistics.fmean(row[key] for row in rows) for key in keys}
     rows.append({"sequence": "mean", "sequences": len(rows), "unix_s": int(time.time()), **means})
+    about = {"command": "re10k.py", "commit": args.commit, "machine": args.machine}
+    about["networks"] = networks(args.bundle)
     with args.out.open("a") as file:
-        file.writelines(json.dumps({"command": "re10k.py", **row}) + "\n" for row in rows)
+        file.writelines(json.dumps({**about, **row}) + "\n" for row in rows)
     print(f"{'ours':24}", *(f"{key} {value:.4f}" for key, value in means.items()))
 
 

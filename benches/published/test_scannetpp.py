@@ -1,6 +1,10 @@
-"""A small folder of ScanNet++'s layout: `python -m pytest benches/published`."""
+"""A small folder of ScanNet++'s layout: `python -m pytest benches/published`. With the laboratory's
+program in SEGSPLAT_LAB also from the folder to the figures."""
 
 import json
+import os
+import pathlib
+import subprocess
 
 import numpy as np
 import pytest
@@ -8,6 +12,9 @@ from PIL import Image
 
 import scannetpp
 
+ROOT = pathlib.Path(__file__).parents[2]
+# Of the squares: chair, table, wall, no class, chair.
+COLOURS = np.array([[204, 26, 26], [26, 178, 26], [128] * 3, [26, 26, 204], [204, 26, 26]])
 LENS = "1 OPENCV_FISHEYE 120 80 60 60 60 40 0.02 -0.01 0.003 -0.001"
 
 
@@ -51,12 +58,34 @@ def data(tmp_path):
     for i, (name, (w, y, x)) in enumerate(turns.items()):
         # World to camera: half a turn about y, or none, and a shift.
         images += f"{i + 1} {w} 0 {y} 0 {-x} 0 0 1 {name}.JPG\n1 1 -1\n"
-        picture = np.full((80, 120, 3), 40 * i, np.uint8)
-        Image.fromarray(picture).save(dslr / f"resized_images/{name}.JPG")
     (dslr / "colmap/images.txt").write_text(images)
+    points = np.array([row[:3] for row in rows], np.float64)
+    triangles = np.array([face[1] for face in faces])
+    for name, pose in scannetpp.poses(dslr / "colmap/images.txt").items():
+        picture = drawn(pose, points, triangles)
+        Image.fromarray(picture).save(dslr / f"resized_images/{name}", "JPEG", quality=95)
     lists = {"train": ["c.JPG", "a.JPG", "b.JPG"], "test": ["t.JPG"]}
     (dslr / "train_test_lists.json").write_text(json.dumps(lists))
     return tmp_path
+
+
+def drawn(pose, points, triangles):
+    """A photo of 120 x 80: the colours of the squares, with something to match by."""
+    lens = scannetpp.Lens(LENS, 120)
+    depth, shown = scannetpp.drawn(lens, pose, points, triangles)
+    y, x = np.mgrid[:80, :120] + 0.5
+    # The axis of each pixel, by fixed point iterations on the lens.
+    bent = np.stack([(x - lens.c[0]) / lens.f[0], (y - lens.c[1]) / lens.f[1]], 2)
+    size = np.maximum(np.linalg.norm(bent, axis=2), 1e-9)
+    angle = size
+    for _ in range(20):
+        angle = size / (1 + sum(k * angle ** (2 * i + 2) for i, k in enumerate(lens.k)))
+    way = bent / size[..., None] * np.tan(np.minimum(angle, 1.5))[..., None]
+    local = np.where(shown >= 0, depth, 0)[..., None] * np.dstack([way, np.ones((80, 120))])
+    world = (local - pose[:3, 3]) @ pose[:3, :3]
+    shade = 1 + 0.05 * np.sin(9 * world[..., 0]) * np.cos(11 * world[..., 1] + world[..., 0])
+    colour = COLOURS[np.maximum(shown, 0) // 4] * shade[..., None]
+    return np.where(shown[..., None] >= 0, colour, 0).clip(0, 255).astype(np.uint8)
 
 
 def test_labels_are_the_nearest_surface_through_the_lens(data, tmp_path):
@@ -97,3 +126,31 @@ def test_inputs_see_the_same_surface_and_keep_the_fisheye_lens(data, tmp_path):
     (lists,) = data.glob("data/abc/dslr/train_test_lists.json")
     lists.write_text(json.dumps({"train": ["a.JPG", "c.JPG"], "test": ["t.JPG"]}))
     assert scannetpp.convert(data, "abc", tmp_path / "none") == ([], ["t.JPG"])
+
+
+@pytest.mark.skipif("SEGSPLAT_LAB" not in os.environ, reason="the program is named nowhere")
+def test_the_folders_are_judged_by_the_best_three_texts(data, tmp_path):
+    (lists,) = data.glob("data/abc/dslr/train_test_lists.json")
+    lists.write_text(json.dumps({"train": ["a.JPG", "t.JPG"], "test": ["b.JPG"]}))
+    out, rows = tmp_path / "out", tmp_path / "rows.jsonl"
+    scannetpp.convert(data, "abc", out, side=120)
+    lists.write_text(json.dumps({"train": ["a.JPG", "b.JPG"], "test": ["t.JPG"]}))
+    scannetpp.convert(data, "abc", out, side=120)
+    # The words of the fixture's networks.
+    for folder in out.iterdir():
+        words = {"1": "grey", "2": "red", "3": "green"}
+        (folder / "masks/classes.json").write_text(json.dumps(words))
+    bundle = ROOT / "tests/fixtures/colours"
+    line = ["semantics", out, "--preset", "paper", "--bundle", bundle, "--out", rows]
+    subprocess.run([os.environ["SEGSPLAT_LAB"], *map(str, line)], check=True, cwd=ROOT)
+    found = [json.loads(row) for row in rows.read_text().splitlines()]
+    assert [row["scene"] for row in found] == [
+        "abc_b", "abc_t", "**mean of scenes**", "**all views together**"]
+    figures = found[-1]["paper"]["scene"]
+    # Three classes: the true one is among the best three wherever a Gaussian is.
+    assert figures["miou_top3"] > max(figures["miou_top1"], 0.9)
+    assert figures["miou_top1"] > 0.5
+    command = [os.environ["SEGSPLAT_LAB"], "report", "--beside", f"paper-scannetpp={rows}"]
+    printed = subprocess.run(command, check=True, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    (line,) = [line for line in printed.stdout.splitlines() if "this server" in line]
+    assert "../plane/make.py" in line and f"{100 * figures['miou_top3']:.1f} %" in line

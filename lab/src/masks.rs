@@ -46,6 +46,9 @@ pub(crate) struct Args {
     /// Only the variant without shortcuts and the product's
     #[arg(long)]
     short: bool,
+    /// The decoder's file judges masks at full resolution, as on a device, and not this program
+    #[arg(long)]
+    judged: bool,
     /// Folder for the photos and their masks before one mask a pixel is left
     #[arg(long, value_name = "DIR")]
     dump: Option<PathBuf>,
@@ -69,7 +72,10 @@ struct Counted<'a> {
     photo: &'a Photo,
     once: bool,
     batch: Option<usize>,
-    asked: &'a AtomicUsize,
+    /// The file judges masks, whatever runs it.
+    judged: bool,
+    /// Points that were asked, and those of them whose masks the file judged.
+    asked: &'a [AtomicUsize; 2],
 }
 
 impl PromptDecoder for Counted<'_> {
@@ -82,7 +88,7 @@ impl PromptDecoder for Counted<'_> {
     }
 
     fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits> {
-        let before = self.asked.fetch_add(points.len(), Ordering::Relaxed);
+        let before = self.asked[0].fetch_add(points.len(), Ordering::Relaxed);
         if self.once || before == 0 {
             return self.seen.decode(points);
         }
@@ -90,11 +96,14 @@ impl PromptDecoder for Counted<'_> {
     }
 
     fn judges(&self) -> Option<(usize, [usize; 2])> {
-        self.seen.judges()
+        let grid = self.network.judges().filter(|_| self.judged);
+        grid.map(|grid| (self.network.manifest().levels.len(), grid)).or_else(|| self.seen.judges())
     }
 
     fn judge(&self, points: &[[f32; 2]], judging: &MaskJudging) -> Result<JudgedMasks> {
-        self.asked.fetch_add(points.len(), Ordering::Relaxed);
+        for count in self.asked {
+            count.fetch_add(points.len(), Ordering::Relaxed);
+        }
         self.seen.judge(points, judging)
     }
 
@@ -105,8 +114,8 @@ impl PromptDecoder for Counted<'_> {
 }
 
 /// Makes a row for each variant; its error is the share of the first variant's masks that it lacks.
-/// A row has means over photos: seconds (also those of the encoder), points asked, masks, the share
-/// of the photo in some mask, and what [`compare`] says.
+/// A row has means over photos: seconds (also those of the encoder), points asked, those that the
+/// file judged, masks, the share of the photo in some mask, and what [`compare`] says.
 ///
 /// # Errors
 /// `invalid_request` when there is no scene or an option is out of range, `model_unavailable` when
@@ -117,6 +126,9 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     }
     let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
     let network = engine.masks()?;
+    if args.judged && network.judges().is_none() {
+        return Err(Error::invalid("the mask decoder of the bundle does not judge masks"));
+    }
     let variants = variants(&stage::settings(network.manifest(), &Method::default()), args.short);
     let mut measured: Vec<Vec<Value>> = vec![Vec::new(); variants.len()];
     for (name, dir) in args.inputs.find(is_posed)? {
@@ -130,7 +142,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         for (variant, of_variant) in variants.iter().zip(&mut measured) {
             let found = engine
                 .workers()
-                .install(|| drive(&network, &chosen, gaussians.as_ref(), variant))?;
+                .install(|| drive(&network, &chosen, gaussians.as_ref(), variant, args.judged))?;
             if first.is_empty() {
                 first = found.iter().map(|(masks, _)| masks.clone()).collect();
             }
@@ -144,7 +156,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         }
         if let Some(out) = &args.dump {
             for (i, posed) in chosen.iter().enumerate() {
-                dump(&network, posed, &variants, &out.join(format!("{name}_{i}")))?;
+                let to = out.join(format!("{name}_{i}"));
+                dump(&network, posed, &variants, args.judged, &to)?;
             }
         }
         progress(&format!("{name}: {} photos", chosen.len()));
@@ -204,6 +217,7 @@ fn drive(
     photos: &[PosedPhoto],
     gaussians: Option<&Gaussians>,
     variant: &Variant,
+    judged: bool,
 ) -> Result<Vec<(PhotoMasks, Value)>> {
     let never = AtomicBool::new(false);
     let (mut found, mut rows) = (Vec::new(), Vec::new());
@@ -215,13 +229,14 @@ fn drive(
             }
             _ => Vec::new(),
         };
-        let (begun, asked) = (start.elapsed(), AtomicUsize::new(0));
+        let (begun, asked) = (start.elapsed(), <[AtomicUsize; 2]>::default());
         let counted = Counted {
             seen: SeenPhoto::new(network, &posed.photo)?,
             network,
             photo: &posed.photo,
             once: variant.once,
             batch: variant.batch,
+            judged,
             asked: &asked,
         };
         let encode_seconds = (start.elapsed() - begun).as_secs_f64();
@@ -229,7 +244,8 @@ fn drive(
         rows.push(json!({
             "seconds": start.elapsed().as_secs_f64(),
             "encode_seconds": encode_seconds,
-            "asked": asked.into_inner(),
+            "asked": asked[0].load(Ordering::Relaxed),
+            "judged": asked[1].load(Ordering::Relaxed),
             "masks": masks.masks.len(),
             "covered": masks.masks.iter().map(|mask| mask.area).sum::<f64>(),
         }));
@@ -272,7 +288,13 @@ fn compare(a: &PhotoMasks, b: &PhotoMasks) -> [f64; 3] {
 
 /// Writes the photo and its proposals: all that is computed, coarsely judged, and coarsely judged
 /// where not covered.
-fn dump(network: &MaskNetwork, posed: &PosedPhoto, variants: &[Variant], to: &Path) -> Result<()> {
+fn dump(
+    network: &MaskNetwork,
+    posed: &PosedPhoto,
+    variants: &[Variant],
+    judged: bool,
+    to: &Path,
+) -> Result<()> {
     let exact = variants[0].settings.exact();
     let coarse = Settings { full_resolution: false, ..exact };
     let covered = Settings { skip_covered: true, ..coarse };
@@ -282,6 +304,8 @@ fn dump(network: &MaskNetwork, posed: &PosedPhoto, variants: &[Variant], to: &Pa
     let mut found = serde_json::Map::new();
     for (name, settings) in [("exact", exact), ("coarse", coarse), ("covered", covered)] {
         let seen = SeenPhoto::new(network, photo)?;
+        let asked = &<[AtomicUsize; 2]>::default();
+        let seen = Counted { seen, network, photo, once: true, batch: None, judged, asked };
         let proposals = segment::proposals(&seen, photo, &settings, &[], &never)?;
         found.insert(name.to_owned(), dumped(&proposals));
     }

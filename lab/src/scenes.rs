@@ -1,7 +1,8 @@
 //! Photos of scene folders, the scenes that are made of them, and which scenes are reported.
 
-use std::{path::Path, sync::atomic::AtomicBool};
+use std::{cmp::Ordering, path::Path, sync::atomic::AtomicBool};
 
+use glam::DVec3;
 use rayon::prelude::*;
 use serde_json::{Value, json};
 
@@ -72,6 +73,67 @@ pub fn nearest(photos: &[PosedPhoto], target: usize, count: usize) -> Vec<usize>
     others.sort_by(|a, b| away(a).total_cmp(&away(b)));
     others.truncate(count);
     others
+}
+
+/// The *projected overlap* of two photos, 0 to 1, by which pixelSplat, MVSplat and the paper choose
+/// pairs of inputs: the share of a photo's pixels whose ray, without an end, comes into the other's
+/// picture; of both shares the smaller one. Nothing is known of depth, so what hides what does not
+/// count, and cameras that look the same way overlap wholly.
+#[must_use]
+pub fn overlap(a: &Camera, b: &Camera) -> f64 {
+    crossing(a, b).min(crossing(b, a))
+}
+
+/// Share of the pixels of `from` whose ray comes into the picture of `to`.
+fn crossing(from: &Camera, to: &Camera) -> f64 {
+    let (lens, other) = (from.intrinsics, to.intrinsics);
+    let moved = to.camera_to_world.viewmat() * from.camera_to_world.matrix();
+    let [width, height] = [other.width, other.height].map(f64::from);
+    // Distances to the planes that bound what `to` sees: none is negative inside.
+    let sides = |p: DVec3| {
+        let (u, v) = (other.fx * p.x + other.cx * p.z, other.fy * p.y + other.cy * p.z);
+        [p.z, u, width * p.z - u, v, height * p.z - v]
+    };
+    let origin = sides(moved.w_axis.truncate());
+    let crosses = |x: u32, y: u32| {
+        let way = lens.unproject(f64::from(x) + 0.5, f64::from(y) + 0.5, 1.0);
+        let (mut near, mut far) = (0.0_f64, f64::INFINITY);
+        for (at, slope) in origin.into_iter().zip(sides(moved.transform_vector3(way))) {
+            match slope.total_cmp(&0.0) {
+                Ordering::Greater => near = near.max(-at / slope),
+                Ordering::Less => far = far.min(-at / slope),
+                Ordering::Equal if at < 0.0 => return false,
+                Ordering::Equal => (),
+            }
+        }
+        near < far
+    };
+    let row = |y: u32| (0..lens.width).filter(|x| crosses(*x, y)).count();
+    let count: usize = (0..lens.height).into_par_iter().map(row).sum();
+    count as f64 / (f64::from(lens.width) * f64::from(lens.height))
+}
+
+/// `count` photos beside the target, each two of which overlap by `least` or more: from the nearest
+/// one on, the nearest that fit. `None` where there are not so many.
+#[must_use]
+pub fn inputs(
+    photos: &[PosedPhoto],
+    target: usize,
+    count: usize,
+    least: f64,
+) -> Option<Vec<usize>> {
+    let near = nearest(photos, target, photos.len());
+    let fits =
+        |a: usize, b: usize| least <= 0.0 || overlap(&photos[a].camera, &photos[b].camera) >= least;
+    (0..near.len()).find_map(|first| {
+        let mut chosen = Vec::new();
+        for &next in &near[first..] {
+            if chosen.len() < count && chosen.iter().all(|&one| fits(one, next)) {
+                chosen.push(next);
+            }
+        }
+        (chosen.len() == count).then_some(chosen)
+    })
 }
 
 /// The Gaussians of the photos.

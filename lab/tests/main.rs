@@ -5,6 +5,7 @@ mod frames;
 mod labels;
 mod metrics;
 mod report;
+mod scenes;
 mod semantics;
 mod tally;
 mod triples;

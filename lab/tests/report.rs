@@ -2,7 +2,7 @@
 
 use std::{fs, path::Path};
 
-use segsplat_lab::report::page;
+use segsplat_lab::report::{beside, page};
 use segsplat_testing::root;
 use serde_json::{Value, json};
 
@@ -70,4 +70,44 @@ fn a_row_without_its_source_or_error_is_refused() {
         let dir = repository(columns, &[row(&json!({ "n": 1, key: value }))]);
         assert_eq!(table(dir.path()).unwrap_err(), format!("1.jsonl, row 1: no {key}"));
     }
+}
+
+/// As [`repository`], with a table of published figures and a row of it.
+fn published(source: &Value) -> tempfile::TempDir {
+    let columns = "columns = [['method', '{method}'], ['iou', '{iou:%}']]\n\
+                   [table.ours]\nrows = 'mine'\nkey = '{networks}'\npivot = '{scene}'\n\
+                   columns = ['ours, {key}', '{bed.iou:%}']";
+    let ours =
+        |scene, iou| json!({ "table": "mine", "networks": "small", "scene": scene, "iou": iou });
+    let dir = repository(columns, &[row(&ours("bed", 0.25)), row(&json!({ "table": "mine" }))]);
+    let folder = dir.path().join("benches/published");
+    fs::create_dir(&folder).unwrap();
+    let theirs = json!({ "table": "t", "source": source, "method": "theirs", "iou": 0.5 });
+    fs::write(folder.join("paper.jsonl"), theirs.to_string()).unwrap();
+    fs::write(dir.path().join("run.jsonl"), ours("bed", 0.75).to_string()).unwrap();
+    dir
+}
+
+#[test]
+fn published_rows_stand_with_their_source_and_ours_below_them() {
+    let dir = published(&json!("a paper, table 1"));
+    let theirs = "| method | iou |\n| --- | --- |\n| theirs | 50.0 % |\n";
+    // A row without networks is no line.
+    let wanted = format!(
+        "{theirs}| ours, small | 25.0 % |\n\nPublished: a paper, table 1. Ours: commit c; m.\n"
+    );
+    assert_eq!(table(dir.path()).unwrap(), wanted);
+    let file = dir.path().join("run.jsonl");
+    let asked = format!("t={}", file.display());
+    let wanted = format!("{theirs}| ours, small | 75.0 % |\n");
+    assert!(beside(dir.path(), &asked).unwrap().starts_with(&wanted));
+    for asked in ["t", "x=run.jsonl"] {
+        let fault = beside(dir.path(), asked).unwrap_err().to_string();
+        assert!(fault.contains("must be TABLE=FILE; tables: t"), "{fault}");
+    }
+    fs::write(&file, "{}").unwrap();
+    let fault = beside(dir.path(), &asked).unwrap_err().to_string();
+    assert!(fault.contains("no row fits the table t"), "{fault}");
+    let without = table(published(&json!("")).path()).unwrap_err();
+    assert_eq!(without, "paper.jsonl, row 1: no source");
 }

@@ -65,12 +65,15 @@ fn folder() -> tempfile::TempDir {
     dir
 }
 
-/// The rows of `semantics` for a folder; `None` without ONNX Runtime.
-fn judged(folder: &Path, rest: &[&str]) -> Option<Result<Vec<Value>>> {
-    let bundle = root().join("tests/fixtures/colours");
-    let [folder, bundle] = [folder, &bundle].map(|p| p.to_str().unwrap());
-    let mut line = vec!["semantics", folder, "--absent", "blue,red"];
-    line.extend(["--bundle", bundle, "--threads", "2"]);
+/// The rows of a command for a folder; `None` without ONNX Runtime.
+fn measured(
+    command: &str,
+    bundle: &Path,
+    folder: &Path,
+    rest: &[&str],
+) -> Option<Result<Vec<Value>>> {
+    let [folder, bundle] = [folder, bundle].map(|p| p.to_str().unwrap());
+    let mut line = vec![command, folder, "--bundle", bundle, "--threads", "2"];
     line.extend(rest);
     let library = ort_library();
     if let Some(library) = &library {
@@ -80,6 +83,12 @@ fn judged(folder: &Path, rest: &[&str]) -> Option<Result<Vec<Value>>> {
         Err(e) if e.code() == ErrorCode::ModelUnavailable => opened(Err(e)),
         rows => Some(rows),
     }
+}
+
+/// The rows of `semantics` for a folder; `None` without ONNX Runtime.
+fn judged(folder: &Path, rest: &[&str]) -> Option<Result<Vec<Value>>> {
+    let rest = [&["--absent", "blue,red"], rest].concat();
+    measured("semantics", &root().join("tests/fixtures/colours"), folder, &rest)
 }
 
 #[test]
@@ -95,6 +104,13 @@ fn scoring_is_changed_as_the_making_of_scenes_is() {
     let none =
         ["--method", "cut=0.9", "--method", r#"canon=["red","green"]"#, "--method", "votes=true"];
     assert!(selected(&none).unwrap() < 0.01, "nothing is selected");
+    for (bad, why) in [
+        (["--overlap", "1.5"], "overlap is 1.5; it must be 0 to 1"),
+        (["--photos", "3"], "no target has 3 photos beside it"),
+    ] {
+        let fault = judged(dir.path(), &bad).unwrap().unwrap_err();
+        assert!(fault.message().contains(why), "{fault}");
+    }
     for (bad, why) in [("cut=2", "cut is 2"), ("tau=x", "tau=x"), ("beta=1", "beta=1")] {
         let fault = judged(dir.path(), &["--method", bad]).unwrap().unwrap_err();
         assert!(fault.message().contains(why), "{fault}");
@@ -105,13 +121,15 @@ fn scoring_is_changed_as_the_making_of_scenes_is() {
 fn words_find_their_boxes_in_a_view_and_a_word_for_nothing_does_not() {
     let dir = folder();
     let grids = dir.path().join("grids");
-    let pictures = ["--pictures", grids.to_str().unwrap()];
-    let Some(rows) = judged(dir.path(), &pictures) else { return };
+    let rest = ["--pictures", grids.to_str().unwrap(), "--overlap", "0.6"];
+    let Some(rows) = judged(dir.path(), &rest) else { return };
     let rows = rows.unwrap();
     let targets = rows[0]["targets"].as_array().unwrap();
     assert_eq!((rows.len(), targets.len()), (1, 3));
     // The middle photo is seen from the two beside it.
     assert_eq!(targets[1]["inputs"], json!(["images/0.png", "images/2.png"]));
+    assert_eq!((&rows[0]["overlap"], &rows[0]["left_out"]), (&json!(0.6), &json!([])));
+    assert!(rows[0]["networks"].as_str().unwrap().starts_with("../plane/make.py; "), "{rows:?}");
     let judged = &rows[0]["default"];
     let figure = |of: &Value, name: &str| of[name].as_f64().unwrap();
     for (of, least) in [("scene", 0.8), ("flat", 0.6)] {
@@ -125,4 +143,31 @@ fn words_find_their_boxes_in_a_view_and_a_word_for_nothing_does_not() {
     let words = judged["scene"]["absent_words"].as_array().unwrap();
     assert_eq!((words.len(), &words[0]["word"]), (1, &json!("blue")));
     assert_eq!(std::fs::read_dir(grids).unwrap().count(), 1);
+}
+
+#[test]
+fn masks_of_a_file_that_judges_are_those_of_its_logits() {
+    let (dir, bundle) = (folder(), tempfile::tempdir().unwrap());
+    let fixture = root().join("tests/fixtures/colours");
+    for entry in std::fs::read_dir(&fixture).unwrap().flatten() {
+        std::fs::copy(entry.path(), bundle.path().join(entry.file_name())).unwrap();
+    }
+    let own = "cc51938787230013556d70ad0313e0d36d16aa75d2ac6e855eb3d8b06cb9ab39";
+    let judging = "c586fac6a90b9af4c39ba92dac1778d712257f69d97ab73ec6c7135ff89a1b9a";
+    let manifest = std::fs::read_to_string(fixture.join("bundle.toml")).unwrap();
+    let manifest = manifest.replace(own, judging);
+    let manifest = manifest.replace("masks_decoder.onnx", "masks_decoder_judging.onnx");
+    std::fs::write(bundle.path().join("bundle.toml"), manifest).unwrap();
+    let masks = |bundle: &Path, rest: &[&str]| {
+        measured("masks", bundle, dir.path(), &[&["--short", "--photos", "1"], rest].concat())
+    };
+    let Some(plain) = masks(bundle.path(), &[]) else { return };
+    let (plain, judged) = (plain.unwrap(), masks(bundle.path(), &["--judged"]).unwrap().unwrap());
+    assert_eq!([&plain[0]["judged"], &judged[0]["judged"]], [&json!(0.0), &plain[0]["asked"]]);
+    assert!(plain[0]["masks"].as_f64().unwrap() >= 2.0, "{plain:?}");
+    for same in ["masks", "asked"] {
+        assert_eq!(judged[0][same], plain[0][same], "{same}");
+    }
+    let fault = masks(&fixture, &["--judged"]).unwrap().unwrap_err();
+    assert!(fault.message().contains("does not judge masks"), "{fault}");
 }

@@ -165,6 +165,29 @@ class Graph(torch.nn.Module):
                 one(found.opacities), sh)
 
 
+class Double(torch.overrides.TorchFunctionMode):
+    """Where the official code says f32, f64 is meant."""
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        wide = lambda x: torch.float64 if x is torch.float32 else x  # noqa: E731
+        func = torch.Tensor.double if func is torch.Tensor.float else func
+        return func(*map(wide, args), **{name: wide(value) for name, value in (kwargs or {}).items()})
+
+
+def gaussians(encoder, context, double=False):
+    """What the official encoder predicts. With `double` all of it is computed in f64; the encoder stays so."""
+    if double:
+        encoder, context = encoder.double(), {name: value.double() for name, value in context.items()}
+    kept = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64 if double else kept)
+    try:
+        with Double() if double else contextlib.nullcontext():
+            found = encoder(context, 0, deterministic=True)
+    finally:
+        torch.set_default_dtype(kept)
+    return found["gaussians"] if isinstance(found, dict) else found
+
+
 INPUTS = ["images", "intrinsics", "camera_to_world", "near", "far"]
 OUTPUTS = ["means", "scales", "quats", "opacities", "sh"]
 

@@ -7,7 +7,9 @@ SCENE is a folder of photos with a `transforms.json`. Photos (the first and the 
 resized to the network's size before both sides get them, so that both see the same pixels; distortion is not undone.
 The server makes the scene with `density=full`, and answers a view and a text. Each Gaussian that it kept is compared
 with the official adapter's of the same pixel, in the world's frame: its mean, its covariance, its opacity and its
-colour in 32 directions, each as a share of the largest value.
+colour in 32 directions, each as a share of the largest value. With `--exact` the official code runs in f64 too, and
+both are compared with that: how far f32 itself is off, and whether the server is further off than PyTorch. It takes
+twice the memory and two to three times the time.
 """
 import argparse
 import glob
@@ -28,6 +30,7 @@ import official
 from common import gap, prepare
 
 DIRECTIONS = 32
+BOUNDS = {**geometry.BOUNDS, "colours": geometry.BOUNDS["harmonics"]}
 
 
 def photos(args):
@@ -132,6 +135,7 @@ def main():
     ap.add_argument("--views", type=int, default=2)
     ap.add_argument("--set", nargs="*", default=[])
     ap.add_argument("--near-content", type=float, default=geometry.NEAR_CONTENT, help="`near` of the bundle's translation")
+    ap.add_argument("--exact", action="store_true", help="compare both with the official code in f64, too")
     ap.add_argument("--no-text", action="store_true")
     args = ap.parse_args()
     files, pixels, lenses, poses = photos(args)
@@ -152,34 +156,48 @@ def main():
     encoder = geometry.build(args.network, args)
     context = {"image": pixels[None], "intrinsics": torch.from_numpy(lens).float()[None], "extrinsics": torch.from_numpy(model).float()[None],
                "near": full(known["near"]), "far": full(known["far"])}
-    wanted = encoder(context, 0, deterministic=True)
-    wanted = wanted["gaussians"] if isinstance(wanted, dict) else wanted
+    wanted = official.gaussians(encoder, context)
     count = args.views * height * width
 
     # The official Gaussians of the pixels that the server kept, in the world.
     view, x, y = ours["source"].astype(np.int64).T
     kept = (view * height + y) * width + x
-    rotation = first[:3, :3]
-    of = lambda value: value[0, -count:].double().numpy()[kept]  # noqa: E731
-    means = of(wanted.means) * unit @ rotation.T + first[:3, 3]
-    covariances = unit**2 * rotation @ of(wanted.covariances) @ rotation.T
+    rotation, camera = first[:3, :3], poses[view, :3, 3]
     directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     terms = ours["sh"].shape[1]
-    colours = of(wanted.harmonics)[..., :terms] @ basis(directions)[:, :terms].T
-    seen = ours["sh"].transpose(0, 2, 1) @ basis(directions @ rotation.T)[:, :terms].T
-    mine = ours["means"].astype(np.float64) + np.array(header["origin"])
-    mine_covariances = official.covariance(torch.from_numpy(ours["scales"]).double(), torch.from_numpy(ours["quats"]).double()).numpy()
+
+    def world(found):
+        of = lambda value: value[0, -count:].double().numpy()[kept]  # noqa: E731
+        return {"means": of(found.means) * unit @ rotation.T + first[:3, 3] - camera,
+                "covariances": unit**2 * rotation @ of(found.covariances) @ rotation.T,
+                "opacities": of(found.opacities), "colours": of(found.harmonics)[..., :terms] @ basis(directions)[:, :terms].T}
+
+    theirs = world(wanted)
+    mine = {"means": ours["means"].astype(np.float64) + np.array(header["origin"]) - camera,
+            "covariances": official.covariance(torch.from_numpy(ours["scales"]).double(), torch.from_numpy(ours["quats"]).double()).numpy(),
+            "opacities": ours["opacities"], "colours": ours["sh"].transpose(0, 2, 1) @ basis(directions @ rotation.T)[:, :terms].T}
     print(f"{len(kept)} of {count} Gaussians kept; dropped: {header['meta']['report']['dropped']}")
-    camera = poses[view, :3, 3]
-    distance = np.linalg.norm(means - camera, axis=1)
-    off = np.linalg.norm(mine - means, axis=1) / distance
-    print(f"means: relative to their distance: median {np.median(off):.1e}, 99.9 % {np.quantile(off, .999):.1e}, largest {off.max():.1e}")
-    rows = {"means": (mine - camera, means - camera), "covariances": (mine_covariances, covariances),
-            "opacities": (ours["opacities"], of(wanted.opacities)), "colours": (seen, colours)}
-    bounds = {"means": 1e-4, "covariances": 1e-3, "opacities": 1e-3, "colours": 1e-3}
-    for name, (found, want) in rows.items():
-        print(f"{name}: {gap(found, want):.2e} of the largest value (bound {bounds[name]:.0e})")
+    row = {"kept": len(kept), **compared("the server to PyTorch", mine, theirs)}
+    if args.exact:
+        exact = world(official.gaussians(encoder, context, double=True))
+        row["server_to_f64"] = compared("the server to PyTorch in f64", mine, exact)
+        row["pytorch_to_f64"] = compared("PyTorch in f32 to PyTorch in f64", theirs, exact)
+    print(json.dumps(row))
+
+
+def compared(what, found, wanted):
+    """Largest differences as shares of the largest value; of means also by their distance from the camera, and of its
+    inverse, in which MVSplat looks for depths, as a share of its largest."""
+    row = {name: gap(found[name], wanted[name]) for name in wanted}
+    for name, value in row.items():
+        print(f"{what}: {name} {value:.2e} of the largest value (bound {BOUNDS[name]:.0e})")
+    near, far = (np.linalg.norm(side["means"], axis=1) for side in (found, wanted))
+    off = np.linalg.norm(found["means"] - wanted["means"], axis=1) / far
+    row["means_by_distance"] = {name: float(np.quantile(off, at)) for name, at in (("median", 0.5), ("p999", 0.999), ("largest", 1))}
+    row["inverse_distances"] = gap(1 / near, 1 / far)
+    print(f"{what}: means by their distance {row['means_by_distance']}, inverse distances {row['inverse_distances']:.1e}")
+    return row
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 //! What texts select in views of labelled scenes.
 //!
-//! The paper's protocol: a labelled photo is the target, the photos nearest to it are the input,
-//! and the class names are asked in a view from the target's camera. Each preset makes a scene of
-//! its own, and scores it. The *flat* baseline has no 3D: each mask of the nearest photo is scored
-//! by the same text, and the masks are laid over the target as they are.
+//! The paper's protocol: a labelled photo is the target, the photos nearest to it (with `--overlap`
+//! those that overlap so much) are the input, and the class names are asked in a view from the
+//! target's camera. Each preset makes a scene of its own, and scores it. The *flat* baseline has no
+//! 3D: each mask of the nearest photo is scored by the same text, and the masks are laid over the
+//! target as they are.
 
 pub mod labels;
 pub mod tally;
@@ -28,7 +29,7 @@ use crate::{
     render::cpu::CpuRenderer,
     rows::{Rows, progress},
     scene::{Preset, SceneOptions, with_pairs},
-    scenes::{means_by_use, nearest, use_of},
+    scenes::{inputs, means_by_use, use_of},
     setup::Inputs,
 };
 
@@ -45,6 +46,9 @@ pub(crate) struct Args {
     /// Labelled photos of a scene to score, evenly spread; 0: all of them
     #[arg(long, default_value_t = 0)]
     targets: usize,
+    /// Least projected overlap of each two photos put in, 0 to 1; the paper's inputs have 0.6
+    #[arg(long, default_value_t = 0.0)]
+    overlap: f64,
     /// Words for what is in no scene, separated by commas
     #[arg(long, value_delimiter = ',', default_value = ABSENT)]
     absent: Vec<String>,
@@ -77,7 +81,8 @@ impl Args {
     }
 }
 
-/// Makes a row for each scene, and rows of means; the error is one less the mean IoU.
+/// Makes a row for each scene, rows of means, and one of the counts of all views together where
+/// every scene is asked the same texts; the error is one less the mean IoU.
 ///
 /// # Errors
 /// `invalid_request` when there is no labelled scene or an option is out of range, else whatever a
@@ -86,29 +91,67 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     if args.inputs.photos < 2 {
         return Err(Error::invalid("photos must be at least 2"));
     }
+    if !(0.0..=1.0).contains(&args.overlap) {
+        return Err(Error::invalid(format!("overlap is {}; it must be 0 to 1", args.overlap)));
+    }
     let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
     let renderer = CpuRenderer::new(args.inputs.setup.threads())?;
     let ways = args.preset.iter().map(|preset| args.way(&engine, *preset));
     let ways = ways.collect::<Result<Vec<Way>>>()?;
     let tools = Tools::open(&engine, &renderer)?;
-    let bundle = format!("{} {}", engine.bundle().name(), engine.bundle().version());
+    let bundle = engine.bundle();
+    let sources = [
+        Some(&bundle.geometry().source),
+        bundle.masks().map(|masks| &masks.source),
+        bundle.image_text().map(|towers| &towers.source),
+    ];
+    let networks: Vec<&str> = sources.into_iter().flatten().map(String::as_str).collect();
+    let (bundle, networks) =
+        (format!("{} {}", bundle.name(), bundle.version()), networks.join("; "));
     let mut push = |mut row: Value| {
         row["bundle"] = json!(bundle);
+        row["networks"] = json!(networks);
         row["photos"] = json!(args.inputs.photos);
+        row["overlap"] = json!(args.overlap);
         let first = args.preset.first().copied().unwrap_or_default().to_string();
         let miou = row[first]["scene"]["miou"].as_f64().unwrap_or(f64::NAN);
         let scene = row["scene"].as_str().unwrap_or_default();
         progress(&format!("{scene}: mIoU {miou:.3}"));
         rows.push(json!({ "one_less_miou": 1.0 - miou }), row)
     };
-    let mut scenes = Vec::new();
+    let (mut scenes, mut counted) = (Vec::new(), Vec::new());
     for (name, dir) in args.inputs.find(labels::is_labelled)? {
         let scene = labels::read(&dir, &Limits::default())?;
-        let row = judge(&tools, &ways, &name, &scene, args)?;
+        let (mut row, tallies) = judge(&tools, &ways, &name, &scene, args)?;
+        figures(&mut row, args, &tallies);
         push(row.clone())?;
         scenes.push(row);
+        counted.push(Some(tallies));
     }
-    means_by_use(&scenes).into_iter().try_for_each(push)
+    means_by_use(&scenes).into_iter().try_for_each(&mut push)?;
+    let together = counted.into_iter().reduce(|all, more| merged(all?, &more?)).flatten();
+    if let Some(tallies) = together.filter(|_| scenes.len() > 1) {
+        let mut row = json!({ "scene": "**all views together**", "use": "all" });
+        figures(&mut row, args, &tallies);
+        push(row)?;
+    }
+    Ok(())
+}
+
+/// Counts of the scene and of the flat baseline.
+type Tallies = [Tally; 2];
+
+/// Adds the figures of each preset to a row.
+fn figures(row: &mut Value, args: &Args, tallies: &[Tallies]) {
+    for (preset, [scene, flat]) in args.preset.iter().zip(tallies) {
+        row[preset.to_string()] = json!({ "scene": scene.scores(), "flat": flat.scores() });
+    }
+}
+
+/// The counts of both, for each preset; `None` where other texts were asked.
+fn merged(mut all: Vec<Tallies>, more: &[Tallies]) -> Option<Vec<Tallies>> {
+    let mut pairs = all.iter_mut().flatten().zip(more.iter().flatten());
+    pairs.all(|(all, more)| all.merge(more)).then_some(all)
 }
 
 /// All targets of one scene: for each preset the figures of the scene (texts asked of it, at the
@@ -119,7 +162,7 @@ fn judge(
     name: &str,
     scene: &LabelledScene,
     args: &Args,
-) -> Result<Value> {
+) -> Result<(Value, Vec<Tallies>)> {
     let is_class =
         |word: &&String| scene.classes.iter().any(|class| class.name.eq_ignore_ascii_case(word));
     let absent: Vec<String> = args.absent.iter().filter(|w| !is_class(w)).cloned().collect();
@@ -130,16 +173,16 @@ fn judge(
         0 => 1,
         most => scene.frames.len().div_ceil(most).max(1),
     };
-    let (mut targets, mut pictures) = (Vec::new(), Vec::new());
+    let (mut targets, mut left_out, mut pictures) = (Vec::new(), Vec::new(), Vec::new());
     for frame in scene.frames.iter().step_by(every) {
-        let inputs = nearest(&scene.photos, frame.photo, args.inputs.photos);
-        let fault = |e: Error| {
-            let file = &scene.photos[frame.photo].file;
-            Error::new(e.code(), format!("{name}, target {file}: {e}")).caused_by(e)
+        let file = &scene.photos[frame.photo].file;
+        let fault =
+            |e: Error| Error::new(e.code(), format!("{name}, target {file}: {e}")).caused_by(e);
+        let Some(inputs) = inputs(&scene.photos, frame.photo, args.inputs.photos, args.overlap)
+        else {
+            left_out.push(file);
+            continue;
         };
-        if inputs.len() < args.inputs.photos {
-            return Err(fault(Error::invalid(format!("{} photos beside it", inputs.len()))));
-        }
         let (mut all_maps, mut color) = (Vec::new(), None);
         for (tallies, way) in tallies.iter_mut().zip(ways) {
             let seen = tools.see(&scene.photos, frame.photo, &inputs, way).map_err(fault)?;
@@ -155,14 +198,18 @@ fn judge(
             pictures.push(shown(scene, frame, &seen, &all_maps));
         }
     }
+    if targets.is_empty() {
+        return Err(Error::invalid(format!(
+            "{name}: no target has {} photos beside it that overlap by {}",
+            args.inputs.photos, args.overlap
+        )));
+    }
     if let Some(out) = &args.pictures {
         grid::write(out, name, &pictures.iter().collect::<Vec<_>>())?;
     }
-    let mut row = json!({ "scene": name, "use": use_of(name), "targets": targets });
-    for (preset, [scene, flat]) in args.preset.iter().zip(&tallies) {
-        row[preset.to_string()] = json!({ "scene": scene.scores(), "flat": flat.scores() });
-    }
-    Ok(row)
+    let row =
+        json!({ "scene": name, "use": use_of(name), "targets": targets, "left_out": left_out });
+    Ok((row, tallies))
 }
 
 /// One target's pictures: photo, view, labels, then for each preset the best selecting text of

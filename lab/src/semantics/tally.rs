@@ -8,11 +8,18 @@
 //! An IoU is over all views of a scene. The *Jaccard* score of the first two readings is as 3D-OVS
 //! averages scikit-learn's `jaccard_score`: over every class and view, 0 where a class is neither
 //! there nor selected.
+//!
+//! The *top-k* mIoU is that of ScanNet++ (`semantic/eval` of its toolbox): a labelled pixel counts
+//! as its own class where that is among its k best texts, else as its best text. The mean is over
+//! the classes that are labelled or counted somewhere: one that is only wrongly counted has 0.
 
 use serde_json::{Value, json};
 
 use super::labels::{Class, NOT_SEEN};
 use crate::rows::mean;
+
+/// How many of the best texts may hold a pixel's class: as ScanNet++ reports it.
+const TOP: [usize; 2] = [1, 3];
 
 /// What one text says of each pixel of a view.
 #[derive(Clone, Debug)]
@@ -38,10 +45,21 @@ impl Overlap {
         self.truth += u64::from(truth);
     }
 
-    /// Intersection over union; `None` where the class is nowhere.
+    /// Intersection over union; `None` where nothing is labelled so.
     fn iou(self) -> Option<f64> {
+        self.iou_of_all().filter(|_| self.truth > 0)
+    }
+
+    /// Intersection over union; `None` where nothing is labelled or selected.
+    fn iou_of_all(self) -> Option<f64> {
         let union = self.selected + self.truth - self.both;
-        (self.truth > 0).then(|| self.both as f64 / union as f64)
+        (union > 0).then(|| self.both as f64 / union as f64)
+    }
+
+    fn merge(&mut self, other: Self) {
+        self.both += other.both;
+        self.selected += other.selected;
+        self.truth += other.truth;
     }
 }
 
@@ -52,7 +70,8 @@ pub struct Tally {
     asked: Vec<usize>,
     names: Vec<String>,
     threshold: Vec<Overlap>,
-    closed: Vec<Overlap>,
+    /// For each of [`TOP`]; the first is the closed reading.
+    top: [Vec<Overlap>; TOP.len()],
     open: Vec<Overlap>,
     closed_right: [u64; 2],
     open_right: [u64; 2],
@@ -71,7 +90,7 @@ impl Tally {
             names: asked.iter().map(|c| classes[*c].name.clone()).collect(),
             asked,
             threshold: none.clone(),
-            closed: none.clone(),
+            top: TOP.map(|_| none.clone()),
             open: none,
             closed_right: [0; 2],
             open_right: [0; 2],
@@ -98,18 +117,23 @@ impl Tally {
             let truth = usize::from(label)
                 .checked_sub(1)
                 .and_then(|class| self.asked.iter().position(|asked| *asked == class));
-            let best = best(classes, p, |_| true);
+            let ranked = ranked(classes, p);
+            let best = ranked.first().copied();
             let chosen = best_selected(classes, p);
             for (c, map) in classes.iter().enumerate() {
                 self.threshold[c].add(map.mask[p], truth == Some(c));
                 of_view[0][c].add(map.mask[p], truth == Some(c));
                 of_view[1][c].add(best == Some(c), truth == Some(c));
                 self.open[c].add(chosen == Some(c), truth == Some(c));
-                if truth.is_some() {
-                    self.closed[c].add(best == Some(c), truth == Some(c));
-                }
             }
             if truth.is_some() {
+                for (top, k) in self.top.iter_mut().zip(TOP) {
+                    let hit = truth.filter(|c| ranked.iter().take(k).any(|r| r == c));
+                    let counted = hit.or(best);
+                    for (c, class) in top.iter_mut().enumerate() {
+                        class.add(counted == Some(c), truth == Some(c));
+                    }
+                }
                 count(&mut self.closed_right, best == truth);
             }
             count(&mut self.open_right, chosen == truth);
@@ -120,6 +144,30 @@ impl Tally {
         for (all, of_view) in self.jaccard.iter_mut().zip(of_view) {
             all.push(mean(of_view.into_iter().map(|class| class.iou().unwrap_or(0.0))));
         }
+    }
+
+    /// Adds the counts of other views. `false`, and nothing is added, where other texts were asked.
+    pub fn merge(&mut self, other: &Self) -> bool {
+        if self.names != other.names || self.texts() != other.texts() {
+            return false;
+        }
+        let all = [&mut self.threshold, &mut self.open].into_iter().chain(&mut self.top);
+        let more = [&other.threshold, &other.open].into_iter().chain(&other.top);
+        for (all, more) in all.flatten().zip(more.flatten()) {
+            all.merge(*more);
+        }
+        let sum = |all: &mut [u64; 2], more: [u64; 2]| {
+            all.iter_mut().zip(more).for_each(|(all, more)| *all += more);
+        };
+        sum(&mut self.closed_right, other.closed_right);
+        sum(&mut self.open_right, other.open_right);
+        for ((_, all), (_, more)) in self.absent.iter_mut().zip(&other.absent) {
+            sum(all, *more);
+        }
+        for (all, more) in self.jaccard.iter_mut().zip(&other.jaccard) {
+            all.extend(more);
+        }
+        true
     }
 
     /// The figures: IoU of each class in the three readings, with the share of the judged pixels
@@ -133,7 +181,7 @@ impl Tally {
             Some(json!({
                 "name": self.names[c],
                 "iou": self.threshold[c].iou()?,
-                "iou_closed": self.closed[c].iou()?,
+                "iou_closed": self.top[0][c].iou()?,
                 "iou_open": self.open[c].iou()?,
                 "share": share([self.threshold[c].truth, self.open_right[1]]),
             }))
@@ -143,6 +191,8 @@ impl Tally {
         let absent_words: Vec<Value> = absent
             .map(|(word, counted)| json!({ "word": word, "selected": share(*counted) }))
             .collect();
+        let [top1, top3] =
+            self.top.each_ref().map(|of| mean(of.iter().filter_map(|class| class.iou_of_all())));
         let over = |all: &[Value], key: &str| mean(all.iter().filter_map(|one| one[key].as_f64()));
         json!({
             "miou": over(&classes, "iou"),
@@ -150,6 +200,8 @@ impl Tally {
             "accuracy_closed": share(self.closed_right),
             "jaccard": mean(self.jaccard[0].iter().copied()),
             "jaccard_closed": mean(self.jaccard[1].iter().copied()),
+            "miou_top1": top1,
+            "miou_top3": top3,
             "miou_open": over(&classes, "iou_open"),
             "accuracy_open": share(self.open_right),
             "absent": over(&absent_words, "selected"),
@@ -164,19 +216,26 @@ fn count([part, whole]: &mut [u64; 2], hit: bool) {
     *whole += 1;
 }
 
-/// The text of the largest score among those that count, the first of equals; none at -inf.
-fn best(maps: &[TextMap], p: usize, counts: impl Fn(&TextMap) -> bool) -> Option<usize> {
-    let mut found: Option<usize> = None;
-    for (c, map) in maps.iter().enumerate() {
-        let higher = map.score[p] > found.map_or(f64::NEG_INFINITY, |best| maps[best].score[p]);
-        if higher && counts(map) {
-            found = Some(c);
-        }
+/// The texts of the largest scores at a pixel, the best first and the first of equals before the
+/// others; as many as the largest of [`TOP`]. None at -inf.
+fn ranked(maps: &[TextMap], p: usize) -> Vec<usize> {
+    let score = |c: usize| maps[c].score[p];
+    let mut found = Vec::with_capacity(TOP[TOP.len() - 1] + 1);
+    for c in (0..maps.len()).filter(|c| score(*c) > f64::NEG_INFINITY) {
+        let at = found.partition_point(|better| score(*better) >= score(c));
+        found.insert(at, c);
+        found.truncate(TOP[TOP.len() - 1]);
     }
     found
 }
 
-/// The text of the largest score among those that select the pixel.
+/// The text of the largest score among those that select the pixel, the first of equals.
 pub(super) fn best_selected(maps: &[TextMap], p: usize) -> Option<usize> {
-    best(maps, p, |map| map.mask[p])
+    let mut found: Option<usize> = None;
+    for (c, map) in maps.iter().enumerate().filter(|(_, map)| map.mask[p]) {
+        if map.score[p] > found.map_or(f64::NEG_INFINITY, |best| maps[best].score[p]) {
+            found = Some(c);
+        }
+    }
+    found
 }

@@ -111,8 +111,9 @@ fn resample(photo: &Photo, columns: &Taps, rows: &Taps) -> (Vec<f32>, Vec<f32>) 
                     *s += weight * v;
                 }
             }
-            let scale = if sum[3] > 1e-6 { 1.0 / (255.0 * sum[3]) } else { 0.0 };
-            rgb.iter_mut().zip(sum).for_each(|(v, s)| *v = (s * scale).clamp(0.0, 1.0));
+            // One rounding: at its own size a photo has the numbers that others feed the network.
+            let whole = if sum[3] > 1e-6 { 255.0 * sum[3] } else { f32::INFINITY };
+            rgb.iter_mut().zip(sum).for_each(|(v, s)| *v = (s / whole).clamp(0.0, 1.0));
             *valid = sum[3];
         }
     });

@@ -132,3 +132,16 @@ fn the_bucket_keeps_most_of_all_photos() {
     let mixed = [size(640, 480), size(480, 640), size(480, 640)];
     assert_eq!(bucket_for(&mixed, &buckets), Some([352, 256]), "as most photos stand");
 }
+
+#[test]
+fn at_its_own_size_a_photo_keeps_its_levels() {
+    let levels: Vec<u8> = (0..=u8::MAX).flat_map(|v| [v, 255 - v, v ^ 0x55]).collect();
+    let photo = Photo { width: 16, height: 16, rgb: levels.clone(), valid: None };
+    let wanted: Vec<f32> = levels.iter().map(|v| f32::from(*v) / 255.0).collect();
+    for filter in [ResizeFilter::Triangle, ResizeFilter::Lanczos] {
+        let found = fit(&photo, &camera(16, 16), [16, 16], filter).rgb;
+        // Lanczos gives the neighbours weights of 1e-17. An ulp of a level is 1e-10 and more.
+        let far = |(a, b): (&f32, &f32)| (a - b).abs() > 1e-12;
+        assert!(!found.iter().zip(&wanted).any(far), "{filter:?}: not v / 255");
+    }
+}
