@@ -214,7 +214,8 @@ class Decoder(torch.nn.Module):
         channels = first.bias.shape[0]
         fine = self.doubled(first, cells.reshape(count * side * side, -1)).reshape(-1, 1, channels)
         fine = gelu(SumNorm.apply(fine, first.bias.reshape(1, 1, -1), norm.weight, norm.bias, torch.zeros_like(norm.bias), norm.eps))
-        fine = gelu(self.doubled(second, fine.reshape(-1, channels)) + second.bias)
+        # A bias of two axes: with one, ONNX Runtime makes one operator of it and GELU, which takes four times as long on a GPU.
+        fine = gelu(self.doubled(second, fine.reshape(-1, channels)) + second.bias.reshape(1, -1))
         rows = [m.output_hypernetworks_mlps[i](hidden[:, 1 + i]) for i in range(m.num_mask_tokens)]
         masks = fine.reshape(count, 16 * side * side, -1) @ torch.stack(rows, dim=2)
         masks = masks.reshape(count, side, side, 2, 2, 2, 2, m.num_mask_tokens).permute(0, 7, 1, 3, 5, 2, 4, 6)
