@@ -1,13 +1,13 @@
-"""3D Gaussian splatting from nothing, by gsplat's default strategy, on the photos of `segsplat-lab many`.
+"""3D Gaussian splatting from nothing by gsplat, on the photos of `segsplat-lab many`.
 
     python gsplat_scratch.py SITE OUT.jsonl SCENES --scenes fox,coke_can --photos 20 --seconds 1,5
 
-SITE holds gsplat (see build_gsplat.py), SCENES is a folder of folders with a `transforms.json`. Every
-sixth photo from the fourth is a target, PHOTOS of the others are given, spread evenly. It starts from
-50,000 random points with the rates, the loss (0.8 L1 + 0.2 (1 - SSIM)) and the strategy of gsplat's
-own `simple_trainer.py`; rates fall over the time that is given. Loading and judging take no part of
-it. OUT takes a row of the table `scratch` for each scene and time: PSNR at the targets, in dB, the
-mean of whole photos. Needs torch, numpy, opencv."""
+SITE holds gsplat (see build_gsplat.py), SCENES is a folder of folders with a `transforms.json`.
+Every sixth photo from the fourth is a target, PHOTOS of the others are given, spread evenly. It
+starts from 50,000 random points with the rates, the loss (0.8 L1 + 0.2 (1 - SSIM)) and the default
+strategy of gsplat's own `simple_trainer.py`; rates fall over the time that is given. Loading and
+judging take no part of it. OUT takes a row of the table `scratch` for each scene and time: PSNR at
+the targets, in dB, the mean of whole photos. Needs torch, numpy, opencv."""
 
 import argparse
 import json
@@ -46,7 +46,7 @@ device = torch.device("cuda")
 
 
 class View:
-    """A photo without its lens distortion: `rgb [H, W, 3]` 0..1, `valid [H, W]`, `K`, world to camera."""
+    """A photo without its lens distortion: `rgb [H, W, 3]` 0..1, `valid [H, W]`, `K`, pose."""
 
     def __init__(self, folder, lens, frame):
         at = {**lens, **frame}
@@ -59,7 +59,8 @@ class View:
         bent = np.array([at.get(name, 0.0) for name in ("k1", "k2", "p1", "p2")])
         valid = np.full((height, width), 255, np.uint8)
         if np.any(bent != 0):
-            maps = cv2.initUndistortRectifyMap(centred, bent, None, centred, (width, height), cv2.CV_32FC1)
+            size = (width, height)
+            maps = cv2.initUndistortRectifyMap(centred, bent, None, centred, size, cv2.CV_32FC1)
             photo = cv2.remap(photo, *maps, cv2.INTER_LINEAR)
             valid = cv2.remap(valid, *maps, cv2.INTER_LINEAR)
         pose = np.array(at["transform_matrix"], dtype=np.float64)
@@ -93,9 +94,10 @@ def load(folder):
 
 
 def start(extent):
-    """Random points in the cube of three extents, as `simple_trainer.py` has them, and their optimisers."""
+    """Random points in the cube of three extents, as `simple_trainer.py` has them, and Adam."""
     points = 3 * extent * (torch.rand(POINTS, 3, device=device) * 2 - 1)
-    near = torch.cat([torch.cdist(some, points).topk(4, largest=False).values[:, 1:] for some in points.split(2_000)])
+    near = [torch.cdist(some, points).topk(4, largest=False) for some in points.split(2_000)]
+    near = torch.cat([found.values[:, 1:] for found in near])
     colours = (torch.rand(POINTS, 1, 3, device=device) - 0.5) / 0.28209479177387814
     numbers = {
         "means": (points, 1.6e-4 * extent),
@@ -105,8 +107,12 @@ def start(extent):
         "sh0": (colours, 2.5e-3),
         "shN": (torch.zeros(POINTS, (DEGREE + 1) ** 2 - 1, 3, device=device), 2.5e-3 / 20),
     }
-    scene = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, (value, _) in numbers.items()})
-    steps = {name: torch.optim.Adam([scene[name]], lr=rate, eps=1e-15, fused=True) for name, (_, rate) in numbers.items()}
+    learnt = {name: torch.nn.Parameter(value) for name, (value, _) in numbers.items()}
+    scene = torch.nn.ParameterDict(learnt)
+    steps = {
+        name: torch.optim.Adam([scene[name]], rate, eps=1e-15, fused=True)
+        for name, (_, rate) in numbers.items()
+    }
     return scene, steps, numbers["means"][1]
 
 
@@ -114,8 +120,9 @@ def draw(scene, view, degree):
     height, width = view.rgb.shape[:2]
     colours = torch.cat([scene["sh0"], scene["shN"]], 1)
     image, _, info = rasterization(
-        scene["means"], scene["quats"], scene["scales"].exp(), scene["opacities"].sigmoid(), colours,
-        view.view[None], view.k[None], width, height, sh_degree=degree, packed=False)
+        scene["means"], scene["quats"], scene["scales"].exp(), scene["opacities"].sigmoid(),
+        colours, view.view[None], view.k[None], width, height, sh_degree=degree, packed=False,
+    )
     return image[0], info
 
 
@@ -130,7 +137,8 @@ def ssim(x, y):
     mx, my = blur(x), blur(y)
     vx, vy, vxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
     c1, c2 = 0.01**2, 0.03**2
-    return (((2 * mx * my + c1) * (2 * vxy + c2)) / ((mx * mx + my * my + c1) * (vx + vy + c2))).mean()
+    over = (2 * mx * my + c1) * (2 * vxy + c2)
+    return (over / ((mx * mx + my * my + c1) * (vx + vy + c2))).mean()
 
 
 @torch.no_grad()
@@ -174,9 +182,21 @@ for at, name in enumerate(args.scenes.split(",")):
         trained(targets, given, extent, 1.0)  # libraries choose their algorithms
     for seconds in map(float, args.seconds.split(",")):
         psnr, steps, count = trained(targets, given, extent, seconds)
-        row = {"table": "scratch", "scene": name, "photos": len(given), "targets": len(targets), "seconds": seconds, "steps": steps,
-               "gaussians": count, "psnr": psnr, "error": {"psnr_db": psnr}, "machine": args.machine, "commit": args.commit,
-               "unix_s": int(time.time()), "command": "benches/peers/gsplat_scratch.py SITE OUT SCENES"}
+        row = {
+            "table": "scratch",
+            "command": "benches/peers/gsplat_scratch.py SITE OUT SCENES",
+            "commit": args.commit,
+            "machine": args.machine,
+            "unix_s": int(time.time()),
+            "scene": name,
+            "photos": len(given),
+            "targets": len(targets),
+            "asked_s": seconds,
+            "steps": steps,
+            "gaussians": count,
+            "psnr": psnr,
+            "error": {"psnr_db": psnr},
+        }
         print(json.dumps(row), flush=True)
         with args.out.open("a") as out:
             out.write(json.dumps(row) + "\n")

@@ -4,10 +4,10 @@
 
 SITE holds gsplat (see build_gsplat.py), LAB is the program segsplat-lab, OUT takes one row. The
 loss is linear in colour, with the same random numbers for both. Step: the wall time of forward and
-backward. gsplat's Gaussians, pictures and gradients stay on the GPU; ours go up and down. Trained: a
-step of our refinement, where all stays there too, with its loss and Adam. Kernels:
-the sum of the kernels' own times by PyTorch's profiler against the sum of our dispatches' times by
-the device's clock. The error is that of our gradients to gsplat's."""
+backward. gsplat's Gaussians, pictures and gradients stay on the GPU; ours go up and down. Trained:
+a step of our refinement, where all stays there too, with its loss and Adam. Kernels: the sum of the
+kernels' own times by PyTorch's profiler against the sum of our dispatches' times by the device's
+clock. The error is that of our gradients to gsplat's."""
 
 import argparse
 import json
@@ -125,7 +125,7 @@ for _ in range(args.rounds):
     last = ours()
     stages = last["device"]["stages"]
     for name, value in (
-        ("step_ms", last["step_ms"]), ("trained_ms", last["trained_ms"]), ("forward_ms", last["forward_ms"]),
+        *((key, last[key]) for key in ("step_ms", "trained_ms", "forward_ms")),
         ("device_ms", last["device"]["total_ms"]),
         ("kernels_ms", sum(stage["ms"] for stage in stages)),
     ):

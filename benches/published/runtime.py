@@ -145,6 +145,8 @@ def main():
     runs = [once(args, at, files, transforms) for at in range(args.runs + 1)][1:]
     names = [name for name in runs[0] if name not in ("masks", "bank", "stages")]
     middle = {name: statistics.median(run[name] for run in runs) for name in names}
+    each = [run["stages"] for run in runs]
+    stages = {name: statistics.median(of[name] for of in each) for name in each[0]}
     row = {
         "table": "paper-time",
         "command": "benches/published/runtime.py URL SCENE OUT; segsplat serve --bundle BUNDLE",
@@ -157,7 +159,7 @@ def main():
         "runs": args.runs,
         **{name: float(f"{value:.4g}") for name, value in middle.items()},
         "slowest_ms": max(run["total_ms"] for run in runs),
-        "stages": {name: statistics.median(run["stages"][name] for run in runs) for name in runs[0]["stages"]},
+        "stages": stages,
         "masks": runs[0]["masks"],
         "bank": runs[0]["bank"],
     }

@@ -27,8 +27,9 @@ const ORACLE_MAX: usize = 1 << 28;
 /// calls: the Gaussians of a step are new ones each time, as a refinement makes them, and go up,
 /// the frame comes down, the gradients by its pixels go up and those by the Gaussians come down.
 /// `trained_ms` is a step of a refinement on the device, with its loss and Adam, of one photo;
-/// `null` where the renderer takes none. `device` has the times of the kernels. The error is relative, of all derivatives over 1e-6 of
-/// the largest of their kind, against the oracle or the CPU kernel.
+/// `null` where the renderer takes none. `device` has the times of the kernels. The error is
+/// relative, of all derivatives over 1e-6 of the largest of their kind, against the oracle or the
+/// CPU kernel.
 ///
 /// # Errors
 /// `invalid_request` when an argument is out of range, and those of the renderer.
