@@ -137,16 +137,11 @@ pub fn transforms_json(photos: &[PosedPhoto]) -> Vec<u8> {
     let frames: Vec<_> = photos
         .iter()
         .map(|posed| {
-            let mut m = posed.camera.camera_to_world.to_row_major();
-            for row in 0..3 {
-                m[row * 4 + 1] = -m[row * 4 + 1];
-                m[row * 4 + 2] = -m[row * 4 + 2];
-            }
             let k = posed.camera.intrinsics;
             json!({
                 "file_path": posed.file,
                 "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy, "w": k.width, "h": k.height,
-                "transform_matrix": [&m[0..4], &m[4..8], &m[8..12], &m[12..16]],
+                "transform_matrix": posed.camera.camera_to_world.to_opengl_rows(),
             })
         })
         .collect();

@@ -8,11 +8,7 @@
 use serde_json::{Value, json};
 
 use super::{Contents, Views, photos::FolderPhoto, points::points, zipped::ZipFolder};
-use crate::{
-    error::Result,
-    scene::{CameraToWorld, Intrinsics},
-    service::npz,
-};
+use crate::{error::Result, scene::Intrinsics, service::npz};
 
 /// World units of one unit of a depth map: nerfstudio's default.
 const DEPTH_UNIT: f64 = 0.001;
@@ -72,12 +68,6 @@ fn frame(photo: &FolderPhoto) -> Value {
         "depth_file_path": depth_file(photo),
         "w": k.width, "h": k.height,
         "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy,
-        "transform_matrix": opengl(&photo.camera.camera_to_world),
+        "transform_matrix": photo.camera.camera_to_world.to_opengl_rows(),
     })
-}
-
-/// Camera-to-world in OpenGL axes: y up, z back.
-fn opengl(pose: &CameraToWorld) -> [[f64; 4]; 4] {
-    let m = pose.to_row_major();
-    [0, 4, 8, 12].map(|row| [m[row], -m[row + 1], -m[row + 2], m[row + 3]])
 }

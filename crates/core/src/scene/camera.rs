@@ -199,6 +199,15 @@ impl CameraToWorld {
         Self::from_row_major(&cv, what)
     }
 
+    /// Rows of the same pose with OpenGL's axes, y up and z back: what
+    /// [`Self::from_opengl_row_major`] reads.
+    #[must_use]
+    pub fn to_opengl_rows(&self) -> [[f64; 4]; 4] {
+        let m = self.to_row_major();
+        let turned = |row: usize| [m[row], -m[row + 1], -m[row + 2], m[row + 3]];
+        [turned(0), turned(4), turned(8), [0.0, 0.0, 0.0, 1.0]]
+    }
+
     /// A camera at `eye` that looks at `target`; `up` is up in the picture.
     ///
     /// # Errors

@@ -165,20 +165,20 @@ fn seeds(rows: &[&[f32]], count: usize) -> Vec<Vec<f64>> {
     let mut distances: Vec<f64> = rows.par_iter().map(far).collect();
     while centres.len() < count {
         let total: f64 = distances.iter().sum();
-        let mut best: Option<(f64, Vec<f64>, Vec<f64>)> = None;
-        for _ in 0..draws {
-            let candidate = centre(pick(&distances, draw.share() * total));
+        let picked: Vec<usize> =
+            (0..draws).map(|_| pick(&distances, draw.share() * total)).collect();
+        let tried = picked.into_par_iter().map(|i| {
+            let candidate = centre(i);
             let closer: Vec<f64> = rows
                 .par_iter()
                 .zip(&distances)
                 .with_min_len(ROWS_A_SEED)
                 .map(|(row, old)| distance(row, &candidate).min(*old))
                 .collect();
-            let left: f64 = closer.iter().sum();
-            if best.as_ref().is_none_or(|(least, ..)| left < *least) {
-                best = Some((left, candidate, closer));
-            }
-        }
+            (closer.iter().sum::<f64>(), candidate, closer)
+        });
+        let tried: Vec<(f64, Vec<f64>, Vec<f64>)> = tried.collect();
+        let best = tried.into_iter().reduce(|a, b| if b.0 < a.0 { b } else { a });
         let Some((_, candidate, closer)) = best else { break };
         centres.push(candidate);
         distances = closer;
