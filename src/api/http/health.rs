@@ -43,8 +43,12 @@ pub(super) async fn live() -> Json<Liveness> {
 pub(super) async fn ready(State(api): State<Api>) -> Response {
     let mut readiness = api.service.ready();
     readiness.ready &= !api.drain.is_stopping();
-    let status = if readiness.ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE };
-    (status, Json(readiness)).into_response()
+    (status(readiness.ready), Json(readiness)).into_response()
+}
+
+/// The status that says whether something is ready.
+pub(super) fn status(ready: bool) -> StatusCode {
+    if ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE }
 }
 
 /// Metrics of the process

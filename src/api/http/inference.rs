@@ -5,7 +5,7 @@ use axum::{
     Json,
     body::Bytes,
     extract::{FromRequest, Path, Request, State},
-    http::{HeaderName, StatusCode, header},
+    http::{HeaderName, header},
     response::{IntoResponse, Response},
 };
 use futures_util::StreamExt;
@@ -14,7 +14,8 @@ use serde_json::{Map, Value};
 use utoipa::ToSchema;
 
 use super::{
-    error::ApiError, extract::CallerApi, fields::Fields, middleware::text_of, multipart::read_on,
+    error::ApiError, extract::CallerApi, fields::Fields, health::status, middleware::text_of,
+    multipart::read_on,
 };
 use crate::{
     api::{
@@ -249,10 +250,6 @@ pub(super) async fn model_ready(
     fields.finish()?;
     let ready = api.service.network_ready(&name)?;
     Ok((status(ready), Json(ModelReadiness { name, ready })).into_response())
-}
-
-fn status(ready: bool) -> StatusCode {
-    if ready { StatusCode::OK } else { StatusCode::SERVICE_UNAVAILABLE }
 }
 
 /// Run a network
