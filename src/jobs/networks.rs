@@ -4,11 +4,12 @@ use std::sync::Arc;
 
 use crate::{
     error::{Error, ErrorCode, Result},
+    models::Provider,
     pipeline::{
         self, PhotoSet, Pipeline, PipelineLoader, Reconstruction,
-        semantics::{SemanticsInput, understand},
+        semantics::{SemanticsInput, label_photos},
     },
-    scene::{Gaussians, PosedPhoto, Scene, SceneOptions, Semantics, TextEmbedding, Watch},
+    scene::{Gaussians, Method, PosedPhoto, Scene, SceneOptions, Semantics, TextEmbedding, Watch},
 };
 
 /// When to ask again for networks that are being opened, seconds.
@@ -119,11 +120,24 @@ pub trait SemanticNetworks: Send + Sync {
     /// `model_unavailable`, `internal`.
     fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>>;
 
-    /// Does the whole work on the calling thread. `photos` are those that the scene was made of.
+    /// Whether the semantics of a scene are best begun before the scene is made: they need its
+    /// Gaussians only at the end, and do not take the processor from the job that makes it.
+    fn begin_early(&self, _: &Method) -> bool {
+        false
+    }
+
+    /// Does the whole work on the calling thread. `photos` are those that the scene is made of;
+    /// `scene` gives it, and waits until it is made.
     ///
     /// # Errors
     /// Any code; it becomes the `error` of the scene's semantics.
-    fn make(&self, photos: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics>;
+    fn make(
+        &self,
+        photos: &[PosedPhoto],
+        method: &Method,
+        scene: &dyn Fn() -> Result<Arc<Scene>>,
+        watch: Watch<'_>,
+    ) -> Result<Semantics>;
 }
 
 /// Makes no semantics: the bundle has no networks for them.
@@ -149,7 +163,13 @@ impl SemanticNetworks for NoSemantics {
         Err(Self::refusal())
     }
 
-    fn make(&self, _: &[PosedPhoto], _: &Scene, _: Watch<'_>) -> Result<Semantics> {
+    fn make(
+        &self,
+        _: &[PosedPhoto],
+        _: &Method,
+        _: &dyn Fn() -> Result<Arc<Scene>>,
+        _: Watch<'_>,
+    ) -> Result<Semantics> {
         Err(Self::refusal())
     }
 }
@@ -220,9 +240,24 @@ impl SemanticNetworks for PipelineNetworks {
         self.0.get()?.image_text()?.embed_texts(texts)
     }
 
-    fn make(&self, photos: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics> {
+    fn begin_early(&self, method: &Method) -> bool {
+        let on_device = |engine: &Pipeline| engine.geometry().provider() != Provider::Cpu;
+        !method.seeds && self.pipeline().is_ok_and(on_device)
+    }
+
+    fn make(
+        &self,
+        photos: &[PosedPhoto],
+        method: &Method,
+        scene: &dyn Fn() -> Result<Arc<Scene>>,
+        watch: Watch<'_>,
+    ) -> Result<Semantics> {
+        let engine = self.0.get()?;
+        let seeds = if method.seeds { Some(scene()?) } else { None };
+        let gaussians = seeds.as_ref().map(|scene| &scene.gaussians);
+        let labelled = label_photos(engine, photos, gaussians, method, watch)?;
+        let scene = scene()?;
         let (cameras, gaussians) = (&scene.meta.cameras[..], &scene.gaussians);
-        let parts = SemanticsInput { photos, cameras, gaussians };
-        understand(self.0.get()?, &parts, &scene.meta.report.method, watch)
+        labelled.label_gaussians(&SemanticsInput { photos, cameras, gaussians }, watch)
     }
 }

@@ -131,7 +131,10 @@ impl Jobs {
                 return of_file(upload, id, created_ms, provenance);
             };
             match record.options.semantics {
-                SemanticsMode::Eager => self.uploads.keep(id, Arc::clone(&upload)),
+                SemanticsMode::Eager => {
+                    self.uploads.keep(id, Arc::clone(&upload));
+                    self.understand_early(record);
+                }
                 SemanticsMode::Lazy => self.uploads.leave(id, Arc::clone(&upload)),
                 SemanticsMode::Off => self.uploads.forget(id),
             }
@@ -223,16 +226,24 @@ impl Jobs {
         // In one change, so that no watcher takes `done` for the end.
         let ready = done.status.semantics.state == SemanticsState::Ready;
         let eager = done.options.semantics == SemanticsMode::Eager && !ready;
-        if eager {
-            done.status.semantics = SemanticsStatus::new(SemanticsState::Running);
-        }
         let (owner, refined) = (done.owner.clone(), done.refine.is_some());
-        self.records.update(id, |record| *record = done);
+        let mut waiting = false;
+        self.records.update(id, |record| {
+            // They may be under way already, or have failed.
+            waiting = eager && record.status.semantics.state == SemanticsState::None;
+            let begun = std::mem::take(&mut record.status.semantics);
+            *record = done;
+            if waiting {
+                record.status.semantics = SemanticsStatus::new(SemanticsState::Running);
+            } else if eager {
+                record.status.semantics = begun;
+            }
+        });
         tracing::info!(scene = %id, "done");
         if refined {
             self.queue.push(Kind::Refine, id.clone(), owner.as_deref());
         }
-        if eager {
+        if waiting {
             self.queue.push(Kind::Semantics, id.clone(), owner.as_deref());
         }
         // The scene is there, whatever comes of these. The content first: the next job with this

@@ -1,19 +1,26 @@
 //! The job that makes the semantics of a scene. It runs once, however many callers wait for it, and
-//! the scene can be viewed meanwhile.
+//! the scene can be viewed meanwhile. Where its networks run on a device and need no Gaussians, it
+//! begins while the scene is made.
 //!
 //! The record's `semantics` is the state of the job; watchers of the scene see its stages.
 
-use std::sync::Arc;
+use std::{sync::Arc, time::Duration};
 
 use super::{
     Jobs,
     job::{Job, Kind},
 };
 use crate::{
-    error::{Error, Result},
-    scene::{SceneId, SceneState, SemanticsMode, SemanticsReport, SemanticsState, SemanticsStatus},
+    error::{Error, ErrorCode, Result},
+    scene::{
+        Scene, SceneId, SceneState, SemanticsMode, SemanticsReport, SemanticsState,
+        SemanticsStatus, unless_cancelled,
+    },
     store::Record,
 };
+
+/// Time between two looks at whether a scene is made.
+const SCENE_LOOK: Duration = Duration::from_millis(2);
 
 /// Forgets a running job and a failure: only the process that has the job knows of them.
 pub(super) fn reset(record: &mut Record) {
@@ -73,8 +80,50 @@ impl Jobs {
         lost
     }
 
+    /// Queues the semantics of a scene whose making begins, where they are best begun early.
+    pub(super) fn understand_early(&self, record: &Record) {
+        let options = &record.options;
+        let eager = options.semantics == SemanticsMode::Eager;
+        if eager && self.parts.semantics.begin_early(&options.method()) {
+            let id = &record.status.id;
+            self.records.update(id, |record| {
+                record.status.semantics = SemanticsStatus::new(SemanticsState::Running);
+            });
+            self.queue.push(Kind::Semantics, id.clone(), record.owner.as_deref());
+        }
+    }
+
+    /// The scene of a job, once it is made.
+    /// Fails with `scene_not_found`, `cancelled`, and as the store does.
+    fn made_scene(&self, job: &Job) -> Result<Arc<Scene>> {
+        loop {
+            let state = self.record(&job.scene)?.status.state;
+            match state {
+                SceneState::Done => return self.parts.store.scene(&job.scene),
+                SceneState::Queued | SceneState::Running => unless_cancelled(&job.cancel)?,
+                SceneState::Failed | SceneState::Cancelled => {
+                    return Err(Error::new(ErrorCode::Cancelled, "the scene was not made"));
+                }
+            }
+            self.queue.pause(SCENE_LOOK);
+        }
+    }
+
+    /// Whether the scene failed while its semantics were made: then it never has any.
+    fn failed_before(&self, id: &SceneId) -> bool {
+        let shown = self.records.update(id, |record| {
+            if record.status.state == SceneState::Failed {
+                record.status.semantics = SemanticsStatus::default();
+            }
+        });
+        shown.is_some_and(|record| record.status.state == SceneState::Failed)
+    }
+
     pub(super) fn make_semantics(&self, job: &Job) -> Result<()> {
         let (id, store) = (&job.scene, &self.parts.store);
+        if self.failed_before(id) {
+            return Ok(());
+        }
         // No version is published while they are made of the one before.
         let _lock = self.lock(id.as_str(), job)?;
         let named = |e: Error| {
@@ -92,21 +141,29 @@ impl Jobs {
             Ok(Some(ready))
         };
         let make = || {
-            let scene = store.scene(id)?;
+            let record = self.record(id)?;
+            let report = record.status.report.as_ref();
+            let method = report.map_or_else(|| record.options.method(), |of| of.method.clone());
             // A start that lost the status but not the file has nothing to make.
-            if let Some(semantics) = &scene.semantics {
+            if record.status.state == SceneState::Done
+                && let Some(semantics) = &store.scene(id)?.semantics
+            {
                 return keep(semantics.report.clone(), None);
             }
             let semantics = self.within_time(job, |watch| {
                 let upload = self.upload(id, watch)?;
                 let photos = &upload.photos()?.photos;
                 let _room = self.room.take(photos.len(), watch.cancel)?;
-                self.parts.semantics.make(photos, &scene, watch)
+                self.parts.semantics.make(photos, &method, &|| self.made_scene(job), watch)
             })?;
             let report = semantics.report.clone();
             Ok(store.put_semantics(id, semantics, |digest| keep(report, Some(digest)))?.2)
         };
-        let Some(ready) = make().map_err(named)? else { return Ok(()) };
+        let made = make();
+        if made.is_err() && self.failed_before(id) {
+            return Ok(());
+        }
+        let Some(ready) = made.map_err(named)? else { return Ok(()) };
         let bank_size = ready.status.semantics.bank_size;
         let eager = ready.options.semantics == SemanticsMode::Eager;
         let (status, digest) = (ready.status.semantics.clone(), ready.semantics_sha256.clone());

@@ -62,8 +62,12 @@ impl Jobs {
         }
     }
 
-    /// Gives back what an ended job had, except where its scene's semantics follow or may follow.
+    /// Gives back what an ended job had, except where another of its scene runs, or its semantics
+    /// follow or may follow.
     fn leave(&self, job: &Job) {
+        if self.running.has(&job.scene) {
+            return;
+        }
         let record = self.records.find(&job.scene);
         let next = record.filter(|record| record.status.state == SceneState::Done);
         let refined = next.as_ref().is_some_and(|record| record.status.is_refined_now());

@@ -14,15 +14,17 @@ use segsplat::{
     error::ErrorCode,
     limits::Limits,
     pipeline::read,
+    sample::{self, SampleOptions},
     scene::{
-        Event, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState, Stage,
+        Event, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState,
+        Stage, Upload,
     },
     service::CreateScene,
 };
 
 use crate::common::{
     meaning::PhotoMeaning,
-    server::{PATIENCE, TestServer, upload},
+    server::{PATIENCE, TestServer, WallNetworks, first_view, panicking_upload, upload},
 };
 
 /// A server with the stand-in for the semantic networks, and the stand-in.
@@ -90,7 +92,7 @@ async fn the_scene_stays_done_while_its_semantics_run_and_watchers_see_their_sta
     let status = server.service.get(&id).await.unwrap();
     assert_eq!((status.state, status.semantics.state), (SceneState::Done, SemanticsState::Running));
     assert_eq!(status.semantics.stage.as_deref(), Some("masks"));
-    let view = server.service.view_etag(&id, &crate::common::server::first_view()).await;
+    let view = server.service.view_etag(&id, &first_view()).await;
     assert!(view.is_ok(), "it can be viewed meanwhile");
     meaning.hold.store(false, Ordering::Release);
     let rest: Vec<Event> = events.collect().await;
@@ -121,6 +123,110 @@ async fn eager_semantics_come_with_the_scene_and_watchers_do_not_leave_before() 
     assert_eq!(rest.last(), Some(&Event::Done));
     let other = scene(&server, SemanticsMode::Eager).await;
     assert_eq!(other.semantics.state, SemanticsState::Ready, "who waits waits for both");
+}
+
+/// A server whose semantics begin early, with both stand-ins on hold.
+async fn early_server() -> (TestServer, Arc<WallNetworks>, Arc<PhotoMeaning>) {
+    let networks = Arc::new(WallNetworks { hold: true.into(), ..WallNetworks::default() });
+    let meaning =
+        Arc::new(PhotoMeaning { early: true, hold: true.into(), ..PhotoMeaning::default() });
+    let given = (Arc::clone(&networks), Arc::clone(&meaning));
+    let server = TestServer::with(|_, parts| (parts.scenes, parts.semantics) = given).await;
+    (server, networks, meaning)
+}
+
+/// Creates a scene with eager semantics and waits until both of its jobs run.
+async fn both_run(server: &TestServer, meaning: &PhotoMeaning, upload: Upload) -> SceneId {
+    let options = SceneOptions { semantics: SemanticsMode::Eager, ..SceneOptions::default() };
+    let request = CreateScene { upload, options, ..CreateScene::default() };
+    let before = meaning.calls.load(Ordering::Acquire);
+    let id = server.service.create_scene(request).await.unwrap().status.id;
+    let shown = until(server, &id, |_| meaning.calls.load(Ordering::Acquire) > before).await;
+    assert_eq!(shown.state, SceneState::Running);
+    assert_eq!(shown.semantics.state, SemanticsState::Running);
+    id
+}
+
+/// The status of a scene as soon as it `is` so.
+async fn until(
+    server: &TestServer,
+    id: &SceneId,
+    is: impl Fn(&SceneStatus) -> bool,
+) -> SceneStatus {
+    let looks = async {
+        loop {
+            let status = server.service.get(id).await.unwrap();
+            if is(&status) {
+                return status;
+            }
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+    };
+    tokio::time::timeout(PATIENCE, looks).await.expect("it comes to that")
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn early_semantics_are_made_once_beside_the_scene_which_does_not_wait_for_them() {
+    let (server, networks, meaning) = early_server().await;
+    let id = both_run(&server, &meaning, upload()).await;
+    networks.hold.store(false, Ordering::Release);
+    let done = until(&server, &id, |status| status.state == SceneState::Done).await;
+    assert_eq!(done.semantics.state, SemanticsState::Running);
+    let view = server.service.view_etag(&id, &first_view()).await;
+    assert!(view.is_ok(), "it can be viewed meanwhile");
+    meaning.hold.store(false, Ordering::Release);
+    let ready = until(&server, &id, |s| s.semantics.state == SemanticsState::Ready).await;
+    assert_eq!(ready.semantics.bank_size, Some(3));
+    assert_eq!(meaning.calls.load(Ordering::Acquire), 1);
+    let copy = scene(&server, SemanticsMode::Eager).await;
+    assert_eq!(copy.semantics.state, SemanticsState::Ready, "of the same content");
+    // The other way round: the scene is made last.
+    networks.hold.store(true, Ordering::Release);
+    let other = sample::upload(&SampleOptions { photos: 3, width: 64, height: 48, seed: 6 });
+    let before = meaning.calls.load(Ordering::Acquire);
+    let id = both_run(&server, &meaning, other.unwrap()).await;
+    networks.hold.store(false, Ordering::Release);
+    until(&server, &id, |s| s.semantics.state == SemanticsState::Ready).await;
+    assert_eq!(meaning.calls.load(Ordering::Acquire), before + 1);
+    let server = server.restart().await;
+    assert_eq!(semantics_state(&server, &id).await, SemanticsState::Ready, "it is kept");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn early_semantics_of_a_scene_that_fails_or_is_deleted_end_with_it() {
+    let (server, networks, meaning) = early_server().await;
+    let id = both_run(&server, &meaning, panicking_upload()).await;
+    networks.hold.store(false, Ordering::Release);
+    until(&server, &id, |status| status.state == SceneState::Failed).await;
+    meaning.hold.store(false, Ordering::Release);
+    let failed = until(&server, &id, |s| s.semantics.state == SemanticsState::None).await;
+    assert_eq!(failed.error.unwrap().code, "internal");
+    assert!(failed.semantics.error.is_none(), "they did not fail: {:?}", failed.semantics);
+    networks.hold.store(true, Ordering::Release);
+    meaning.hold.store(true, Ordering::Release);
+    let id = both_run(&server, &meaning, upload()).await;
+    server.service.delete(&id).await.unwrap();
+    networks.hold.store(false, Ordering::Release);
+    meaning.hold.store(false, Ordering::Release);
+    let next = scene(&server, SemanticsMode::Eager).await;
+    assert_eq!(next.semantics.state, SemanticsState::Ready, "both workers are free");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn early_semantics_that_fail_leave_the_scene_and_the_next_text_tries_again() {
+    let (server, networks, meaning) = early_server().await;
+    *meaning.fails.lock().unwrap() = Some(ErrorCode::LimitExceeded);
+    let id = both_run(&server, &meaning, upload()).await;
+    meaning.hold.store(false, Ordering::Release);
+    until(&server, &id, |s| s.semantics.state == SemanticsState::Failed).await;
+    networks.hold.store(false, Ordering::Release);
+    let done = until(&server, &id, |status| status.state == SceneState::Done).await;
+    assert_eq!(done.semantics.state, SemanticsState::Failed);
+    assert_eq!(done.semantics.error.unwrap().code, "limit_exceeded");
+    *meaning.fails.lock().unwrap() = None;
+    let status = server.service.understand(&id, Some(PATIENCE)).await.unwrap();
+    assert_eq!(status.semantics.state, SemanticsState::Ready);
+    assert_eq!(meaning.calls.load(Ordering::Acquire), 2);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -7,7 +7,7 @@ use segsplat::{
     api::{grpc::DESCRIPTORS, http::routes},
     error::{Result, TABLE},
     jobs::{NoSemantics, Phrases, SemanticNetworks},
-    scene::{PosedPhoto, Scene, Semantics, TextEmbedding, Watch},
+    scene::{Method, PosedPhoto, Scene, Semantics, TextEmbedding, Watch},
 };
 use serde_json::{Value, json};
 
@@ -50,8 +50,14 @@ impl SemanticNetworks for Panics {
         NoSemantics.embed_texts(texts)
     }
 
-    fn make(&self, photos: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics> {
-        NoSemantics.make(photos, scene, watch)
+    fn make(
+        &self,
+        photos: &[PosedPhoto],
+        method: &Method,
+        scene: &dyn Fn() -> Result<Arc<Scene>>,
+        watch: Watch<'_>,
+    ) -> Result<Semantics> {
+        NoSemantics.make(photos, method, scene, watch)
     }
 }
 

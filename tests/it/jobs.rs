@@ -24,7 +24,7 @@ use sha2::{Digest, Sha256};
 
 use crate::common::{
     process::eventually,
-    server::{PATIENCE, TestServer, WallNetworks, first_view, upload},
+    server::{PATIENCE, TestServer, WallNetworks, first_view, panicking_upload, upload},
 };
 
 /// No text.
@@ -75,15 +75,7 @@ async fn a_scene_goes_through_its_states_and_a_late_watcher_sees_where_it_is() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_panicking_job_fails_alone() {
     let server = TestServer::start().await;
-    let mut bad = request();
-    let last = bad.upload.photos.len() - 1;
-    let old = bad.upload.photos[last].name.clone();
-    bad.upload.photos[last].name = "panic.png".to_owned();
-    let Some(segsplat::scene::UploadCameras::Transforms(json)) = &mut bad.upload.cameras else {
-        panic!("the sample sends transforms")
-    };
-    *json = String::from_utf8(json.clone()).unwrap().replace(&old, "panic.png").into_bytes();
-    bad.wait = Some(PATIENCE);
+    let bad = CreateScene { upload: panicking_upload(), wait: Some(PATIENCE), ..request() };
     let status = server.service.create_scene(bad).await.unwrap().status;
     assert_eq!(status.state, SceneState::Failed);
     assert_eq!(status.error.unwrap().code, "internal");

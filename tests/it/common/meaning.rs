@@ -4,7 +4,10 @@
 //! word is a direction of its own, and words that begin with `?` are unknown.
 
 use std::{
-    sync::atomic::{AtomicBool, AtomicUsize, Ordering},
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicUsize, Ordering},
+    },
     thread::ThreadId,
     time::{Duration, Instant},
 };
@@ -13,7 +16,8 @@ use segsplat::{
     error::{Error, ErrorCode, Result},
     jobs::{Phrases, SemanticNetworks},
     scene::{
-        Bank, IndexMap, PosedPhoto, Scene, Semantics, SemanticsReport, Stage, TextEmbedding, Watch,
+        Bank, IndexMap, Method, PosedPhoto, Scene, Semantics, SemanticsReport, Stage,
+        TextEmbedding, Watch,
     },
 };
 
@@ -25,6 +29,8 @@ pub(crate) const DIM: usize = 16;
 /// The stand-in, and what it was asked.
 #[derive(Debug, Default)]
 pub(crate) struct PhotoMeaning {
+    /// Whether it is begun while the scene is made.
+    pub(crate) early: bool,
     /// Held back while true.
     pub(crate) hold: AtomicBool,
     /// Fails with this code while set.
@@ -85,7 +91,17 @@ impl SemanticNetworks for PhotoMeaning {
         Ok(texts.iter().map(embed).collect())
     }
 
-    fn make(&self, given: &[PosedPhoto], scene: &Scene, watch: Watch<'_>) -> Result<Semantics> {
+    fn begin_early(&self, _: &Method) -> bool {
+        self.early
+    }
+
+    fn make(
+        &self,
+        given: &[PosedPhoto],
+        _: &Method,
+        scene: &dyn Fn() -> Result<Arc<Scene>>,
+        watch: Watch<'_>,
+    ) -> Result<Semantics> {
         self.calls.fetch_add(1, Ordering::AcqRel);
         let pixels = given.iter().flat_map(|posed| &posed.photo.rgb).copied().collect();
         *self.pixels.lock().expect("no panic holds it") = pixels;
@@ -101,6 +117,7 @@ impl SemanticNetworks for PhotoMeaning {
         if let Some(code) = *self.fails.lock().expect("no panic holds it") {
             return Err(Error::new(code, "made to fail"));
         }
+        let scene = scene()?;
         (watch.progress)(Stage::Assign, 0.75);
         let photos = scene.meta.cameras.len();
         assert_eq!(given.len(), photos, "the photos are kept with the scene");

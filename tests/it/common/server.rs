@@ -23,7 +23,7 @@ use segsplat::{
     sample::{self, SampleOptions},
     scene::{
         Backdrop, Gaussians, HealthReport, PosedPhoto, RawGaussians, Refine, SceneCamera, SceneId,
-        SceneOptions, SceneStatus, SourcePixel, Stage, Upload, Watch,
+        SceneOptions, SceneStatus, SourcePixel, Stage, Upload, UploadCameras, Watch,
     },
     service::{
         CameraSpec, CreateScene, Kind, LensSpec, ModelsInfo, Parts, PictureOptions, PoseSpec,
@@ -147,6 +147,18 @@ pub(crate) fn upload() -> Upload {
         sample::upload(&options).expect("the options are in range")
     });
     MADE.clone()
+}
+
+/// The same, with a last photo that makes [`WallNetworks`] panic.
+pub(crate) fn panicking_upload() -> Upload {
+    let mut bad = upload();
+    let last = bad.photos.last_mut().expect("three photos");
+    let old = std::mem::replace(&mut last.name, "panic.png".to_owned());
+    let Some(UploadCameras::Transforms(json)) = &mut bad.cameras else {
+        panic!("the sample sends transforms")
+    };
+    *json = String::from_utf8(json.clone()).unwrap().replace(&old, "panic.png").into_bytes();
+    bad
 }
 
 /// Colour from the first input camera.

@@ -1,8 +1,9 @@
 //! The order of the stages that give a scene its meaning: masks ▸ embed ▸ bank ▸ assign.
 //!
 //! [`understand`] runs them with the pipeline's networks, which are opened at the first call;
-//! [`understand_with`] with whatever gives masks and embeddings. Every Gaussian takes the entry of
-//! the pixel that made it. [`Method`] says whether other photos vote.
+//! [`understand_with`] with whatever gives masks and embeddings. All stages but the last need only
+//! the photos, so [`label_photos`] can run while the scene is made. Every Gaussian takes the entry
+//! of the pixel that made it. [`Method`] says whether other photos vote.
 
 use std::sync::Arc;
 
@@ -147,13 +148,28 @@ pub fn understand(
     watch: Watch<'_>,
 ) -> Result<Semantics> {
     check_input(input)?;
+    let seeds = method.seeds.then_some(input.gaussians);
+    label_photos(pipeline, input.photos, seeds, method, watch)?.label_gaussians(input, watch)
+}
+
+/// The stages that need no scene, with the pipeline's networks. `seeds` are the scene's Gaussians,
+/// where masks found in one photo are to be asked for in the next.
+///
+/// # Errors
+/// `model_unavailable`, `cancelled`, `internal`.
+pub fn label_photos(
+    pipeline: &Pipeline,
+    photos: &[PosedPhoto],
+    seeds: Option<&Gaussians>,
+    method: &Method,
+    watch: Watch<'_>,
+) -> Result<LabelledPhotos> {
     let (network, towers) = (pipeline.masks()?, pipeline.image_text()?);
     let settings = masks::settings(network.manifest(), method);
-    let seeds = method.seeds.then_some(input.gaussians);
     let image = &towers.manifest().image;
     let tools = SemanticsTools {
         masks: &|progress| {
-            masks::photo_masks(&network, input.photos, seeds, &settings, progress, watch.cancel)
+            masks::photo_masks(&network, photos, seeds, &settings, progress, watch.cancel)
         },
         embed: &|crops| towers.embed_images(crops),
         dim: towers.manifest().dim,
@@ -163,10 +179,10 @@ pub fn understand(
     };
     // Not on a thread of the pool: one that waits for a network would be missing there, and one
     // that waits for its own tasks might begin another job.
-    let mut semantics = understand_with(&tools, input, method, watch)?;
-    semantics.report.bundle_sha256 = pipeline.bundle.sha256().to_owned();
-    semantics.report.execution_provider = towers.provider().name().to_owned();
-    Ok(semantics)
+    let mut labelled = label_photos_with(&tools, photos, method, watch)?;
+    labelled.report.bundle_sha256 = pipeline.bundle.sha256().to_owned();
+    labelled.report.execution_provider = towers.provider().name().to_owned();
+    Ok(labelled)
 }
 
 /// Gives a scene its meaning with any masks and embeddings.
@@ -181,36 +197,73 @@ pub fn understand_with(
     watch: Watch<'_>,
 ) -> Result<Semantics> {
     check_input(input)?;
+    label_photos_with(tools, input.photos, method, watch)?.label_gaussians(input, watch)
+}
+
+fn label_photos_with(
+    tools: &SemanticsTools<'_>,
+    photos: &[PosedPhoto],
+    method: &Method,
+    watch: Watch<'_>,
+) -> Result<LabelledPhotos> {
     let mut stages = Stages::new(watch);
     let masks = stages.run(Stage::Masks, || {
         (tools.masks)(&|fraction| (watch.progress)(Stage::Masks, fraction))
     })?;
-    if masks.len() != input.photos.len() {
+    if masks.len() != photos.len() {
         return Err(Error::internal(format!(
             "masks of {} photos, not of {}",
             masks.len(),
-            input.photos.len()
+            photos.len()
         )));
     }
-    let embedded = stages.run(Stage::Embed, || embed(tools, input.photos, &masks, watch))?;
-    let mut labels = stages.run(Stage::Bank, || {
+    let embedded = stages.run(Stage::Embed, || embed(tools, photos, &masks, watch))?;
+    let labels = stages.run(Stage::Bank, || {
         let wanted = match method.bank_rows as usize {
-            0 => semantics::rows_wanted(embedded.of.len(), input.photos.len(), method.lambda),
+            0 => semantics::rows_wanted(embedded.of.len(), photos.len(), method.lambda),
             rows => rows,
         };
         let clusters = semantics::bank(&embedded.rows, tools.dim, wanted)?;
         Ok(label(&masks, &embedded.of, clusters))
     })?;
-    let index = stages.run(Stage::Assign, || Ok(assign(&mut labels, input, method)))?;
     let report = SemanticsReport {
         masks: masks.iter().map(|of| count(of.masks.len())).collect(),
-        bank_size: count(labels.bank.len()),
-        labelled: index.iter().filter(|m| **m > 0).count() as u64,
         method: method.clone(),
         stages: stages.times,
         ..SemanticsReport::default()
     };
-    Ok(Semantics { bank: labels.bank, index, photos: labels.maps, masks: labels.masks, report })
+    Ok(LabelledPhotos { labels, report })
+}
+
+/// The meaning of a scene's photos: the bank, and the entry of each of their pixels.
+#[derive(Debug)]
+pub struct LabelledPhotos {
+    labels: Labels,
+    /// Of the stages so far.
+    report: SemanticsReport,
+}
+
+impl LabelledPhotos {
+    /// Gives it to the scene that was made of these photos: the last stage.
+    ///
+    /// # Errors
+    /// `cancelled`; `internal` when the scene has other photos, `invalid_request` when it does not
+    /// say which pixel made each Gaussian.
+    pub fn label_gaussians(
+        self,
+        input: &SemanticsInput<'_>,
+        watch: Watch<'_>,
+    ) -> Result<Semantics> {
+        check_input(input)?;
+        let Self { mut labels, mut report } = self;
+        let mut stages = Stages::new(watch);
+        let method = &report.method;
+        let index = stages.run(Stage::Assign, || Ok(assign(&mut labels, input, method)))?;
+        report.bank_size = count(labels.bank.len());
+        report.labelled = index.iter().filter(|m| **m > 0).count() as u64;
+        report.stages.extend(stages.times);
+        Ok(Semantics { bank: labels.bank, index, photos: labels.maps, masks: labels.masks, report })
+    }
 }
 
 /// Refuses a scene whose Gaussians cannot be found in its photos.
