@@ -1,7 +1,7 @@
 //! Reads buffers of the device: one copy in the frame's own submission, one wait.
 
 use std::{
-    sync::mpsc::{self, TryRecvError},
+    sync::mpsc::{self, Receiver, TryRecvError},
     thread,
     time::{Duration, Instant},
 };
@@ -21,6 +21,14 @@ const NAP_MAX: Duration = Duration::from_millis(1);
 /// A nap's share of the time waited so far.
 const NAP_SHARE: u32 = 8;
 
+/// Bytes of a buffer that were asked for and are not here yet.
+#[derive(Debug)]
+pub(super) struct Asked {
+    staging: wgpu::Buffer,
+    size_bytes: u64,
+    mapped: Receiver<Result<(), wgpu::BufferAsyncError>>,
+}
+
 /// Waits until the device is done with `staging` and hands its first `size_bytes` to `take`.
 /// Errors: `gpu_unavailable` when the device is lost or does not answer, `internal` for another
 /// fault.
@@ -30,14 +38,27 @@ pub(super) fn read<T>(
     size_bytes: u64,
     take: impl FnOnce(&[u8]) -> T,
 ) -> Result<T> {
-    let slice = staging.slice(0..size_bytes);
+    wait(gpu, ask(gpu, staging, size_bytes)?, take)
+}
+
+/// Asks for the first `size_bytes` of `staging`, as they are after what was submitted so far. No
+/// submission may use it before they were taken.
+/// Errors: those of the device.
+pub(super) fn ask(gpu: &Gpu, staging: &wgpu::Buffer, size_bytes: u64) -> Result<Asked> {
     let (sender, mapped) = mpsc::channel();
     gpu.scoped("readback", || {
-        slice.map_async(wgpu::MapMode::Read, move |result| {
-            // Nobody listens any more when the wait below has failed.
+        staging.slice(0..size_bytes).map_async(wgpu::MapMode::Read, move |result| {
+            // Nobody listens any more when the wait has failed.
             let _ = sender.send(result);
         });
     })?;
+    Ok(Asked { staging: staging.clone(), size_bytes, mapped })
+}
+
+/// Waits for what was asked for.
+/// Errors: as [`read`].
+pub(super) fn wait<T>(gpu: &Gpu, asked: Asked, take: impl FnOnce(&[u8]) -> T) -> Result<T> {
+    let Asked { staging, size_bytes, mapped } = asked;
     // Not `PollType::Wait`: while one thread waits in the driver, no other can submit (an H200 then
     // stood idle between two callers), and a lone caller is woken later than by its own clock.
     // Others that have work get the processor while this one watches.
@@ -68,7 +89,7 @@ pub(super) fn read<T>(
     }
     gpu.check()?;
     let value = {
-        let view = slice.get_mapped_range().map_err(|error| {
+        let view = staging.slice(0..size_bytes).get_mapped_range().map_err(|error| {
             Error::internal("the GPU's pictures cannot be read").caused_by(error)
         })?;
         take(&view)

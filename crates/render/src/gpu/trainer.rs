@@ -1,5 +1,7 @@
 //! Steps on the device: photos and Gaussians go up once, a step is one submission for each photo,
-//! and of each only the number of its tile pairs comes back.
+//! and of each only the number of its tile pairs comes back. A step is written and submitted while
+//! the device has the one before. One that lacked room for its tile pairs moved nothing, and is
+//! taken again after the one that was under way.
 
 use bytemuck::Zeroable;
 use glam::DVec3;
@@ -67,7 +69,7 @@ pub(super) struct TrainingBuffers {
 }
 
 /// A photo of the trainer.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct Target {
     request: RenderRequest,
     /// Its first pixel.
@@ -91,15 +93,39 @@ pub(super) struct DeviceTrainer {
     ssim_share: f32,
     /// Most tile pairs that a step has needed.
     isects: u32,
+    /// Where the plans of submissions come back, by turns.
+    plans: [wgpu::Buffer; 2],
+    /// The last step, while it is not known whether it had room.
+    pending: Option<Pending>,
 }
 
-/// A submission of a step.
+/// A submission whose plan is not here yet.
+#[derive(Debug)]
+struct Pending {
+    turn: Turn,
+    /// Tile pairs that it had room for.
+    capacity: u32,
+    plan: readback::Asked,
+}
+
+/// What a submission does: the photo that it draws, the step, whether it adds what earlier photos
+/// say, and whether it moves the Gaussians.
+#[derive(Clone, Copy, Debug)]
+struct Turn {
+    at: usize,
+    step: TrainingStep,
+    adds: bool,
+    moves: bool,
+}
+
+/// A turn as the device takes it.
 struct Submission<'a> {
     target: &'a Target,
     row: TrainingRow,
-    /// Whether it adds what earlier photos say, and whether it moves the Gaussians.
     adds: bool,
     moves: bool,
+    /// Where its plan goes.
+    plan: &'a wgpu::Buffer,
 }
 
 impl DeviceTrainer {
@@ -135,6 +161,9 @@ impl DeviceTrainer {
             partials: storage("sums of the loss", 48 * tiles[0] * tiles[1])?,
             moments: storage("moments", moment_bytes(count, numbers))?,
         };
+        let back = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
+        let plan = || gpu.create_buffer("plan of a step", PLAN_BYTES, back);
+        let plans = [plan()?, plan()?];
         put_photos(gpu, &training.photos, &set.photos)?;
         let mut exposure = [0.0_f32; EXPOSURE_WORDS as usize];
         exposure[..3].fill(1.0);
@@ -157,13 +186,52 @@ impl DeviceTrainer {
             targets,
             ssim_share: set.ssim_share,
             isects: 0,
+            plans,
+            pending: None,
             on,
         })
     }
 
-    /// Takes a submission, with more room until its tile pairs fit.
-    fn submit(&mut self, at: usize, step: &TrainingStep, [adds, moves]: [bool; 2]) -> Result<()> {
-        let target = self.targets.get(at).ok_or_else(|| absent(at))?;
+    /// Takes a turn, with more room until its tile pairs fit.
+    fn take(&mut self, turn: Turn) -> Result<()> {
+        let capacity_max = self.tools().capacity_max(1);
+        let mut attempts = 0;
+        while attempts < ATTEMPTS_MAX && self.isects <= capacity_max {
+            let submitted = self.submit(turn)?;
+            if self.had_room(submitted)? {
+                return Ok(());
+            }
+            attempts += 1;
+        }
+        Err(Error::limit("training: Gaussian-tile pairs of a view", self.isects, capacity_max))
+    }
+
+    /// Waits for the step that is not known to be done, and takes it again where it lacked room.
+    fn settle(&mut self) -> Result<()> {
+        let Some(pending) = self.pending.take() else { return Ok(()) };
+        let turn = pending.turn;
+        if self.had_room(pending)? { Ok(()) } else { self.take(turn) }
+    }
+
+    /// Waits for a submission; whether its tile pairs had room. If not, there is more for the next.
+    fn had_room(&mut self, submitted: Pending) -> Result<bool> {
+        let Pending { capacity, plan, .. } = submitted;
+        let plan: PlanRow = readback::wait(&self.on.gpu, plan, bytemuck::pod_read_unaligned)?;
+        self.isects = plan.needed.max(self.isects);
+        Ok(plan.needed <= capacity)
+    }
+
+    fn tools(&mut self) -> Tools<'_> {
+        let Self { on, scratch, scene, isects, isects_max, .. } = self;
+        scratch.isects = *isects;
+        let (gpu, kernels) = (&on.gpu, &*on.kernels);
+        Tools { gpu, kernels, scratch, scene, isects_max: *isects_max, marks: None }
+    }
+
+    /// Submits a turn, and asks for its plan.
+    fn submit(&mut self, turn: Turn) -> Result<Pending> {
+        let Turn { at, step, adds, moves } = turn;
+        let target = self.targets.get(at).ok_or_else(|| absent(at))?.clone();
         let rates = &step.rates;
         let row = TrainingRow {
             means: rates.means,
@@ -179,31 +247,16 @@ impl DeviceTrainer {
             photo_start: target.start,
             ..TrainingRow::zeroed()
         };
-        let submission = Submission { target, row, adds, moves };
-        let Self { on, scratch, scene, training, earlier, isects, isects_max, .. } = self;
-        scratch.isects = *isects;
-        let (marks, isects_max) = (None, *isects_max);
-        let (gpu, kernels) = (&on.gpu, &*on.kernels);
-        let mut tools = Tools { gpu, kernels, scratch, scene, isects_max, marks };
-        let capacity_max = tools.capacity_max(1);
-        let (mut needed, mut attempts) = (0, 0);
-        while attempts < ATTEMPTS_MAX && needed <= capacity_max {
-            let capacity = tools.capacity(1);
-            let plan = tools.train(
-                self.start.origin(),
-                &submission,
-                (&*training, earlier.as_ref()),
-                capacity,
-            )?;
-            needed = plan.needed;
-            *isects = needed.max(*isects);
-            tools.scratch.isects = *isects;
-            if needed <= capacity {
-                return Ok(());
-            }
-            attempts += 1;
-        }
-        Err(Error::limit("training: Gaussian-tile pairs of a view", needed, capacity_max))
+        // That of the step before may still be under way in the other.
+        self.plans.reverse();
+        let (plan, training) = (self.plans[0].clone(), self.training.clone());
+        let (earlier, origin) = (self.earlier.clone(), self.start.origin());
+        let submission = Submission { target: &target, row, adds, moves, plan: &plan };
+        let mut tools = self.tools();
+        let capacity = tools.capacity(1);
+        tools.train(origin, &submission, (&training, earlier.as_ref()), capacity)?;
+        let plan = readback::ask(&self.on.gpu, &plan, PLAN_BYTES)?;
+        Ok(Pending { turn, capacity, plan })
     }
 
     /// Bytes of a buffer.
@@ -229,6 +282,7 @@ impl DeviceTrainer {
 
     /// What the loss says of the last picture, which photo `at` has the size of; `[H * W]`.
     pub(super) fn by_picture(&mut self, at: usize) -> Result<Vec<[f32; 3]>> {
+        self.settle()?;
         let target = self.targets.get(at).ok_or_else(|| absent(at))?;
         let lens = target.request.lens();
         let bytes = 12 * u64::from(lens.width) * u64::from(lens.height);
@@ -243,24 +297,35 @@ impl Trainer for DeviceTrainer {
             let bytes = gradient_bytes(self.scene.count.into(), 3 * u64::from(self.scene.sh_count));
             self.earlier = Some(self.on.gpu.create_buffer("earlier gradients", bytes, STORAGE)?);
         }
+        let step = *step;
+        if let [at] = *photos {
+            let next = self.submit(Turn { at, step, adds: false, moves: true })?;
+            let Some(last) = self.pending.replace(next) else { return Ok(()) };
+            let turn = last.turn;
+            if !self.had_room(last)? {
+                self.settle()?;
+                self.take(turn)?;
+            }
+            return Ok(());
+        }
+        // What the last photo moves needs what the others say.
+        self.settle()?;
         for (place, &at) in photos.iter().enumerate() {
-            self.submit(at, step, [place > 0, place + 1 == photos.len()])?;
+            self.take(Turn { at, step, adds: place > 0, moves: place + 1 == photos.len() })?;
         }
         Ok(())
     }
 
     fn render(&mut self, request: &RenderRequest) -> Result<Frame> {
-        let Self { on, scratch, scene, isects_max, .. } = self;
-        let (gpu, kernels) = (&on.gpu, &*on.kernels);
-        let mut drawing = Drawing::new(self.start.origin(), request, scene)?;
+        self.settle()?;
+        let mut drawing = Drawing::new(self.start.origin(), request, &self.scene)?;
         let rows = drawing.whole();
-        let isects_max = *isects_max;
-        let mut tools = Tools { gpu, kernels, scratch, scene, isects_max, marks: None };
-        tools.rows(&mut drawing, rows)?;
+        self.tools().rows(&mut drawing, rows)?;
         drawing.finish(&mut self.scratch)
     }
 
     fn gaussians(&mut self) -> Result<Gaussians> {
+        self.settle()?;
         let (count, k) = (self.start.len(), self.start.sh_count());
         let row_bytes = size_of::<GaussianRow>() * count;
         let (rows, sh) = (self.scene.gaussians.clone(), self.scene.sh.clone());
@@ -287,6 +352,7 @@ impl Trainer for DeviceTrainer {
     }
 
     fn exposures(&mut self) -> Result<Vec<(Exposure, f64)>> {
+        self.settle()?;
         let exposures = self.training.exposures.clone();
         let bytes = 4 * u64::from(EXPOSURE_WORDS) * self.targets.len() as u64;
         self.read(&[(&exposures, bytes)], |bytes| {
@@ -327,15 +393,15 @@ fn words(photo: &Photo) -> Vec<[u8; 4]> {
 
 impl Tools<'_> {
     /// Draws, compares, goes back and moves, in one submission of one view with room for `capacity`
-    /// tile pairs. Returns the plan: where it needs more, nothing was moved.
+    /// tile pairs. Where the plan says that it needs more, nothing is moved.
     fn train(
         &mut self,
         origin: DVec3,
         submission: &Submission<'_>,
         (training, earlier): (&TrainingBuffers, Option<&wgpu::Buffer>),
         capacity: u32,
-    ) -> Result<PlanRow> {
-        let Submission { target: Target { request, .. }, row, adds, moves } = submission;
+    ) -> Result<()> {
+        let Submission { target: Target { request, .. }, row, adds, moves, plan } = submission;
         let (gpu, scene, kernels) = (self.gpu, self.scene, self.kernels);
         let drawing = Drawing::new(origin, request, scene)?;
         let layout = drawing.layout(&drawing.whole(), 0);
@@ -368,7 +434,7 @@ impl Tools<'_> {
             if let (true, Some(earlier)) = (adds, earlier) {
                 stages.add_earlier(earlier, &backward);
             }
-            let plan = (&room.plans, 0, &room.staging, 0, PLAN_BYTES);
+            let plan = (&room.plans, 0, *plan, 0, PLAN_BYTES);
             match (moves, earlier) {
                 (false, Some(earlier)) => {
                     let kept = (&backward.gradients, 0, earlier, 0, gradient_bytes);
@@ -381,7 +447,7 @@ impl Tools<'_> {
             }
         })??;
         self.scratch.backdrops = backdrop;
-        readback::read(gpu, &room.staging, PLAN_BYTES, bytemuck::pod_read_unaligned)
+        Ok(())
     }
 
     /// The buffers of one submission.
@@ -401,7 +467,6 @@ impl Tools<'_> {
             shades: !self.kernels.flat(self.scene.sh_count),
             source_bytes: size_of_val(sources) as u64,
             picture_bytes: layout.picture_bytes(),
-            staging_bytes: PLAN_BYTES,
             ..Need::default()
         };
         let sums = 4 * u64::from(capacity) * u64::from(PAIR_SUMS);
