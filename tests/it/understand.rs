@@ -98,7 +98,8 @@ fn two_masks(v: u32) -> PhotoMasks {
 }
 
 /// Mean colour of what is not black, unit length.
-fn colour_of(crops: &[Crop]) -> Result<Vec<f32>> {
+#[expect(clippy::ptr_arg, reason = "as `Embed` takes them")]
+fn colour_of(crops: &Vec<Crop>) -> Result<Vec<f32>> {
     let mean = |crop: &Crop| {
         let mut sum = [0.0_f32; 3];
         for pixel in crop.rgb.chunks_exact(3) {
@@ -111,11 +112,14 @@ fn colour_of(crops: &[Crop]) -> Result<Vec<f32>> {
 }
 
 type Masks<'a> = &'a (dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> + Sync);
-type Embed<'a> = &'a (dyn Fn(&[Crop]) -> Result<Vec<f32>> + Sync);
+type Embed<'a> = &'a (dyn Fn(&Vec<Crop>) -> Result<Vec<f32>> + Sync);
 
-fn tools<'a>(masks: Masks<'a>, embed: Embed<'a>) -> SemanticsTools<'a> {
+type Tools<'a> = SemanticsTools<'a, Vec<Crop>>;
+
+fn tools<'a>(masks: Masks<'a>, embed: Embed<'a>) -> Tools<'a> {
     SemanticsTools {
         masks,
+        prepare: &|crops| crops.to_vec(),
         embed,
         dim: 3,
         crop_margin: 0.1,
@@ -124,7 +128,7 @@ fn tools<'a>(masks: Masks<'a>, embed: Embed<'a>) -> SemanticsTools<'a> {
     }
 }
 
-fn made(wall: &Wall, tools: &SemanticsTools<'_>, options: &Method) -> Result<Semantics> {
+fn made(wall: &Wall, tools: &Tools<'_>, options: &Method) -> Result<Semantics> {
     let watch = Watch { progress: &|_, _| (), cancel: &NO_CANCEL };
     understand_with(tools, &wall.parts(), options, watch)
 }
@@ -250,9 +254,7 @@ fn two_sides_of_one_thing_are_joined_only_when_asked() {
 fn wrong_answers_and_wrong_scenes_are_refused_by_name() {
     let good = wall();
     let masks: Masks<'_> = &|_| Ok((0..2).map(two_masks).collect());
-    let fails = |wall: &Wall, tools: &SemanticsTools<'_>| {
-        made(wall, tools, &Method::default()).unwrap_err()
-    };
+    let fails = |wall: &Wall, tools: &Tools<'_>| made(wall, tools, &Method::default()).unwrap_err();
     let few: Masks<'_> = &|_| Ok(vec![two_masks(0)]);
     let error = fails(&good, &tools(few, &colour_of));
     assert!(error.message().contains("masks of 1 photos, not of 2"), "{error}");

@@ -46,6 +46,14 @@ const CPU_CROPS: usize = 4;
 /// Texts a run of the text tower where its file leaves that free.
 const TEXTS_A_RUN: usize = 64;
 
+/// Crops as an image tower takes them.
+#[derive(Clone, Debug)]
+pub struct PreparedCrops {
+    crops: usize,
+    /// `[runs * crops of a run, 3, side, side]`.
+    pixels: Vec<f32>,
+}
+
 /// A text in the tokenizer's ids.
 struct Tokens {
     /// With markers of begin and end, cut to the network's context.
@@ -172,25 +180,53 @@ impl ImageText {
     /// # Errors
     /// `internal` when the network fails or answers with another shape than its manifest says.
     pub fn embed_images(&self, crops: &[Crop]) -> Result<Vec<f32>> {
-        let tower = &self.manifest.image;
-        let side = tower.size as usize;
         let mut rows = Vec::with_capacity(crops.len() * self.manifest.dim);
-        for batch in crops.chunks(self.crops.unwrap_or(tower.batch.min(CPU_CROPS))) {
-            // Where the number of crops is fixed, the last run is filled up.
-            let count = self.crops.unwrap_or(batch.len());
-            let mut images = vec![0.0; count * 3 * side * side];
-            images.par_chunks_exact_mut(3 * side * side).zip(batch).for_each(|(out, crop)| {
-                let from = [crop.width, crop.height].map(|side| side as usize);
-                let pixels = resize(&crop.rgb, from, [side; 2], tower.resize);
-                out.copy_from_slice(&planes(&pixels, [side; 2], side, tower.mean, tower.std));
-            });
-            let input = Input::new(&tower.input, &[count, 3, side, side], images);
-            let found = self
-                .image
-                .run(&[input], |outputs| self.rows(outputs, &tower.output, count, IMAGE))?;
-            rows.extend(found.into_iter().take(batch.len() * self.manifest.dim));
+        for batch in crops.chunks(self.manifest.image.batch.max(self.crops_a_run())) {
+            rows.extend(self.embed_prepared(&self.prepare(batch))?);
         }
         Ok(rows)
+    }
+
+    /// Crops as the image tower takes them, which needs no network.
+    #[must_use]
+    pub fn prepare(&self, crops: &[Crop]) -> PreparedCrops {
+        let tower = &self.manifest.image;
+        let side = tower.size as usize;
+        // Where the number of crops of a run is fixed, the last run is filled up.
+        let count = match self.crops {
+            Some(fixed) => crops.len().next_multiple_of(fixed),
+            None => crops.len(),
+        };
+        let mut pixels = vec![0.0; count * 3 * side * side];
+        pixels.par_chunks_exact_mut(3 * side * side).zip(crops).for_each(|(out, crop)| {
+            let from = [crop.width, crop.height].map(|side| side as usize);
+            let resized = resize(&crop.rgb, from, [side; 2], tower.resize);
+            out.copy_from_slice(&planes(&resized, [side; 2], side, tower.mean, tower.std));
+        });
+        PreparedCrops { crops: crops.len(), pixels }
+    }
+
+    /// `[crops * dim]` unit embeddings.
+    ///
+    /// # Errors
+    /// As [`Self::embed_images`].
+    pub fn embed_prepared(&self, prepared: &PreparedCrops) -> Result<Vec<f32>> {
+        let tower = &self.manifest.image;
+        let side = tower.size as usize;
+        let each = 3 * side * side;
+        let mut rows = Vec::with_capacity(prepared.crops * self.manifest.dim);
+        for pixels in prepared.pixels.chunks(self.crops_a_run() * each) {
+            let count = pixels.len() / each;
+            let input = Input::new(&tower.input, &[count, 3, side, side], pixels);
+            let read = |outputs: &dyn Outputs| self.rows(outputs, &tower.output, count, IMAGE);
+            rows.extend(self.image.run(&[input], read)?);
+        }
+        rows.truncate(prepared.crops * self.manifest.dim);
+        Ok(rows)
+    }
+
+    fn crops_a_run(&self) -> usize {
+        self.crops.unwrap_or(self.manifest.image.batch.min(CPU_CROPS)).max(1)
     }
 
     /// The embedding of each text. Texts of one length run together; a row depends on the others

@@ -29,7 +29,7 @@ pub use check::{BundleCheck, CheckedFile, check};
 pub use fit::{FittedPhoto, bucket_for, fit};
 pub use frame::ModelFrame;
 pub use geometry::{Geometry, GeometryInput};
-pub use image_text::ImageText;
+pub use image_text::{ImageText, PreparedCrops};
 pub use manifest::{
     GeometryManifest, ImageTextManifest, ImageTowerManifest, MaskAdapter, MaskDecoderManifest,
     MaskEncoderManifest, MasksManifest, OutputFrame, PlainFile, TextTowerManifest, Translation,

@@ -26,11 +26,13 @@ use crate::{
 pub type MasksOfPhotos<'a> = dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> + Sync + 'a;
 
 /// What gives masks and embeddings.
-pub struct SemanticsTools<'a> {
+pub struct SemanticsTools<'a, P> {
     /// The masks of each photo.
     pub masks: &'a MasksOfPhotos<'a>,
-    /// `[crops * dim]` unit embeddings.
-    pub embed: &'a (dyn Fn(&[Crop]) -> Result<Vec<f32>> + Sync),
+    /// A batch of crops as `embed` takes it.
+    pub prepare: &'a (dyn Fn(&[Crop]) -> P + Sync),
+    /// `[crops * dim]` unit embeddings of a batch; the next one is prepared meanwhile.
+    pub embed: &'a (dyn Fn(&P) -> Result<Vec<f32>> + Sync),
     /// Numbers of an embedding.
     pub dim: usize,
     /// Added around a mask's box on each side, share of its longer side.
@@ -41,7 +43,7 @@ pub struct SemanticsTools<'a> {
     pub batch: usize,
 }
 
-impl std::fmt::Debug for SemanticsTools<'_> {
+impl<P> std::fmt::Debug for SemanticsTools<'_, P> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("SemanticsTools").field("dim", &self.dim).finish_non_exhaustive()
     }
@@ -171,7 +173,8 @@ pub fn label_photos(
         masks: &|progress| {
             masks::photo_masks(&network, photos, seeds, &settings, progress, watch.cancel)
         },
-        embed: &|crops| towers.embed_images(crops),
+        prepare: &|crops| towers.prepare(crops),
+        embed: &|prepared| towers.embed_prepared(prepared),
         dim: towers.manifest().dim,
         crop_margin: if method.crop_margin { f64::from(image.crop_margin) } else { 0.0 },
         crop_shape: image.crop_shape,
@@ -190,8 +193,8 @@ pub fn label_photos(
 /// # Errors
 /// Those of the tools, `cancelled`, `internal` when an answer has another length than asked for;
 /// `invalid_request` when the scene does not say which pixel made each Gaussian.
-pub fn understand_with(
-    tools: &SemanticsTools<'_>,
+pub fn understand_with<P: Send>(
+    tools: &SemanticsTools<'_, P>,
     input: &SemanticsInput<'_>,
     method: &Method,
     watch: Watch<'_>,
@@ -200,8 +203,8 @@ pub fn understand_with(
     label_photos_with(tools, input.photos, method, watch)?.label_gaussians(input, watch)
 }
 
-fn label_photos_with(
-    tools: &SemanticsTools<'_>,
+fn label_photos_with<P: Send>(
+    tools: &SemanticsTools<'_, P>,
     photos: &[PosedPhoto],
     method: &Method,
     watch: Watch<'_>,
@@ -295,8 +298,8 @@ struct Embedded {
 
 /// Cuts and embeds the masks of all photos, a batch at a time; only the last batch is not full. A
 /// mask without pixels, or whose embedding has no length, has no meaning and stays background.
-fn embed(
-    tools: &SemanticsTools<'_>,
+fn embed<P: Send>(
+    tools: &SemanticsTools<'_, P>,
     photos: &[PosedPhoto],
     masks: &[PhotoMasks],
     watch: Watch<'_>,
@@ -310,28 +313,29 @@ fn embed(
     let cut = |&[photo, k]: &[usize; 2]| {
         Some(([photo, k], cutters[photo].cut(k, tools.crop_margin, tools.crop_shape)?))
     };
-    let cut_all = |batch: &[[usize; 2]]| -> (Vec<[usize; 2]>, Vec<Crop>) {
-        batch.par_iter().filter_map(cut).unzip()
+    let prepare = |batch: &[[usize; 2]]| {
+        let (of, crops): (Vec<_>, Vec<Crop>) = batch.par_iter().filter_map(cut).unzip();
+        let prepared = (!crops.is_empty()).then(|| (tools.prepare)(&crops));
+        (of, prepared)
     };
     let batches: Vec<&[[usize; 2]]> = all.chunks(size).collect();
-    let mut next = batches.first().map(|batch| cut_all(batch));
+    let mut next = batches.first().map(|batch| prepare(batch));
     for (i, batch) in batches.iter().enumerate() {
         unless_cancelled(watch.cancel)?;
         (watch.progress)(Stage::Embed, fraction(i * size, all.len()));
-        let (of, crops) = next.take().unwrap_or_else(|| cut_all(batch));
-        // The next batch is cut meanwhile.
+        let (of, prepared) = next.take().unwrap_or_else(|| prepare(batch));
         let rows = std::thread::scope(|scope| {
-            let ahead = batches.get(i + 1).map(|batch| scope.spawn(|| cut_all(batch)));
-            let rows = if crops.is_empty() { Ok(Vec::new()) } else { (tools.embed)(&crops) };
-            // One that panicked is cut again, and panics where it can be seen.
+            let ahead = batches.get(i + 1).map(|batch| scope.spawn(|| prepare(batch)));
+            let rows = prepared.as_ref().map_or(Ok(Vec::new()), tools.embed);
+            // One that panicked is prepared again, and panics where it can be seen.
             next = ahead.and_then(|ahead| ahead.join().ok());
             rows
         })?;
-        if rows.len() != crops.len() * tools.dim {
+        if rows.len() != of.len() * tools.dim {
             return Err(Error::internal(format!(
                 "semantics: {} numbers for {} crops of {}",
                 rows.len(),
-                crops.len(),
+                of.len(),
                 tools.dim
             )));
         }

@@ -3,7 +3,7 @@
 //! The result is the same to the last bit every time: a fixed seed, ties by number, f64 sums in the
 //! order of the embeddings. Threads never add to the same sum.
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 
 use rayon::prelude::*;
 
@@ -21,6 +21,8 @@ const ROUNDS_MAX: usize = 100;
 /// Embeddings that one thread compares at a time, with all centres and with one.
 const ROWS_A_TASK: usize = 4;
 const ROWS_A_SEED: usize = 128;
+/// Embeddings whose distances to all others are kept while seeds are drawn.
+const TRIED_MAX: usize = 512;
 
 /// A bank and the entry of each embedding.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -160,28 +162,31 @@ fn seeds(rows: &[&[f32]], count: usize) -> Vec<Vec<f64>> {
     )]
     let (first, draws) =
         ((draw.share() * rows.len() as f64) as usize, 2 + (count as f64).ln().floor() as usize);
-    let mut centres = vec![centre(first.min(rows.len() - 1))];
-    let far = |row: &&[f32]| distance(row, &centres[0]);
-    let mut distances: Vec<f64> = rows.par_iter().map(far).collect();
+    let to_all = |i: usize| -> Vec<f64> {
+        let centre = centre(i);
+        let rows = rows.par_iter().with_min_len(ROWS_A_SEED);
+        rows.map(|row| distance(row, &centre)).collect()
+    };
+    let first = first.min(rows.len() - 1);
+    let mut centres = vec![centre(first)];
+    let mut distances = to_all(first);
+    // An embedding that was tried once is likely to be tried again.
+    let mut tried: HashMap<usize, Vec<f64>> = HashMap::new();
     while centres.len() < count {
         let total: f64 = distances.iter().sum();
         let picked: Vec<usize> =
             (0..draws).map(|_| pick(&distances, draw.share() * total)).collect();
-        let tried = picked.into_par_iter().map(|i| {
-            let candidate = centre(i);
-            let closer: Vec<f64> = rows
-                .par_iter()
-                .zip(&distances)
-                .with_min_len(ROWS_A_SEED)
-                .map(|(row, old)| distance(row, &candidate).min(*old))
-                .collect();
-            (closer.iter().sum::<f64>(), candidate, closer)
-        });
-        let tried: Vec<(f64, Vec<f64>, Vec<f64>)> = tried.collect();
-        let best = tried.into_iter().reduce(|a, b| if b.0 < a.0 { b } else { a });
-        let Some((_, candidate, closer)) = best else { break };
-        centres.push(candidate);
-        distances = closer;
+        if tried.len() + draws > TRIED_MAX {
+            tried.clear();
+        }
+        let new: HashSet<usize> =
+            picked.iter().copied().filter(|i| !tried.contains_key(i)).collect();
+        tried.par_extend(new.into_par_iter().map(|i| (i, to_all(i))));
+        let closer = |i: usize| tried[&i].iter().zip(&distances).map(|(new, old)| new.min(*old));
+        let sums = picked.iter().map(|&i| (closer(i).sum::<f64>(), i));
+        let Some((_, best)) = sums.reduce(|a, b| if b.0 < a.0 { b } else { a }) else { break };
+        centres.push(centre(best));
+        distances = closer(best).collect();
     }
     centres
 }
