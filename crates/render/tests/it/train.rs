@@ -175,13 +175,21 @@ fn kinds(gaussians: &Gaussians) -> [(&'static str, Vec<f32>); 5] {
     ]
 }
 
-/// The trainer of `gpu` against that of the processor over the same renderer, after each of
-/// `steps`.
-fn judge(gpu: &GpuRenderer, name: &str, set: &TrainingSet<'_>, steps: &[(&[usize], f32)]) {
+type Steps<'a> = &'a [(&'a [usize], f32)];
+
+/// The trainer of `gpu` against that of the processor over the same renderer, after `steps`.
+fn judge(gpu: &GpuRenderer, name: &str, set: &TrainingSet<'_>, steps: Steps<'_>) {
+    judge_order(gpu, name, set, [steps, steps]);
+}
+
+/// The same, where the device takes the first `steps` in the order of the second.
+fn judge_order(gpu: &GpuRenderer, name: &str, set: &TrainingSet<'_>, steps: [Steps<'_>; 2]) {
     let mut device = gpu.trainer(set).expect("room").expect("a trainer");
     let mut host = HostTrainer::new(gpu, set).expect("a trainer");
-    for (photos, opacity_min) in steps {
+    for (photos, opacity_min) in steps[0] {
         device.step(photos, &step(*opacity_min)).expect("a step of the device");
+    }
+    for (photos, opacity_min) in steps[1] {
         host.step(photos, &step(*opacity_min)).expect("a step of the processor");
     }
     let (got, want) = (device.gaussians().unwrap(), host.gaussians().unwrap());
@@ -238,12 +246,22 @@ fn a_step_that_lacks_room_is_taken_once() {
     raw.scales.iter_mut().flatten().for_each(|scale| *scale = scale.max(1.5));
     raw.opacities.iter_mut().for_each(|opacity| *opacity = opacity.min(0.05));
     let truth = checked(raw);
-    let photos = photos(&truth, &[[150, 110]]);
+    let photos = photos(&truth, &[[150, 110], [40, 30]]);
     for gpu in both_kernels() {
-        let pairs = gpu.render(&truth, &photos[0].0).expect("a picture").stats.intersections;
-        assert!(pairs > 1 << 16, "{pairs} pairs have room at once");
+        let pairs: Vec<u64> = photos
+            .iter()
+            .map(|(request, _)| gpu.render(&truth, request).expect("a picture"))
+            .map(|frame| frame.stats.intersections.into())
+            .collect();
+        assert!(pairs[0] > 1 << 16 && pairs[1] < 1 << 16, "{pairs:?} pairs");
         let start = disturbed(&truth);
-        judge(gpu, "large ones", &set(&start, &photos), &[(&[0], 0.0)]);
+        let set = set(&start, &photos);
+        judge(gpu, "one alone", &set, &[(&[0], 0.0)]);
+        judge(gpu, "both lack room", &set, &[(&[0], 0.0), (&[0], 0.0), (&[1], 0.0)]);
+        // The next one was under way when it was known that the first lacked room.
+        let taken: [Steps<'_>; 2] =
+            [&[(&[0], 0.0), (&[1], 0.0), (&[1], 0.0)], &[(&[1], 0.0), (&[0], 0.0), (&[1], 0.0)]];
+        judge_order(gpu, "the first lacks room", &set, taken);
     }
 }
 
