@@ -2,7 +2,7 @@
 //! its place in one step.
 //!
 //! It goes behind everything else: before each step it waits until no scene and no semantics are
-//! made and no view was drawn for a moment. Where views never end it takes a step now and then. It
+//! made and no view was drawn for a moment. Where views never end it has a fourth of the time. It
 //! holds no slot and no room. What it still has to do is in the record, so that a start begins it
 //! again.
 
@@ -10,6 +10,8 @@ use std::{
     sync::Arc,
     time::{Duration, Instant},
 };
+
+use parking_lot::Mutex;
 
 use super::{
     Jobs,
@@ -35,8 +37,11 @@ const ATTEMPTS_MAX: u32 = 3;
 /// Processor time that `auto` takes, and the least and most milliseconds of it.
 const AUTO_CPU_MS: u64 = 120_000;
 const AUTO_MS: [u64; 2] = [10_000, 60_000];
-/// Time without views after which it goes on, and the time after which it goes on all the same.
+/// Time without views after which it goes on.
 const QUIET: Duration = Duration::from_millis(250);
+/// Where views never end it goes on after so many times the time that it worked, or so long: a
+/// step takes a millisecond of a device, and a tenth of a second of a processor.
+const WAITS: u32 = 3;
 const PATIENCE: Duration = Duration::from_secs(1);
 /// Time between two looks at whether it may go on.
 const LOOK: Duration = Duration::from_millis(10);
@@ -163,9 +168,10 @@ impl Jobs {
                 "given up: the server stopped {ATTEMPTS_MAX} times without a better version"
             )));
         }
-        let progress = |_: Stage, _: f32| drop(self.give_way(job));
+        let turns = Turns { jobs: self, job, resumed: Mutex::new(Instant::now()) };
+        let progress = |_: Stage, _: f32| drop(turns.give_way());
         let watch = Watch { progress: &progress, cancel: &job.cancel };
-        self.give_way(job)?;
+        turns.give_way()?;
         let scene = self.parts.store.scene(id)?;
         let upload = self.upload(id, watch)?;
         let PhotoSet { photos, warnings, .. } = upload.photos()?;
@@ -187,7 +193,7 @@ impl Jobs {
                 told = spent;
                 self.show(job, Stage::Refine, spent);
             }
-            self.give_way(job)
+            turns.give_way()
         };
         let renderer = &*self.parts.refiner;
         let found = refined(renderer, &scene, photos, &options, &mut remake, &mut pace)?;
@@ -195,23 +201,6 @@ impl Jobs {
             self.publish(job, start, version)?;
         }
         self.finish_refinement(job, &found.report)
-    }
-
-    /// Waits until nothing else is to be done.
-    /// Fails with `cancelled`.
-    fn give_way(&self, job: &Job) -> Result<()> {
-        let begun = Instant::now();
-        loop {
-            unless_cancelled(&job.cancel)?;
-            let made = [Kind::Scene, Kind::Semantics];
-            let makes = |kind| self.queue.len(kind) > 0 || !self.running.scenes(kind).is_empty();
-            let drawn = (self.parts.drawn)();
-            let quiet = drawn.is_none_or(|ago| ago >= QUIET) || begun.elapsed() >= PATIENCE;
-            if quiet && !made.into_iter().any(makes) {
-                return Ok(());
-            }
-            std::thread::sleep(LOOK);
-        }
     }
 
     /// A better version takes the place of the one that is served.
@@ -268,6 +257,42 @@ impl Jobs {
     }
 }
 
+/// When a refinement works and when it waits.
+struct Turns<'a> {
+    jobs: &'a Jobs,
+    job: &'a Job,
+    /// The end of its last wait.
+    resumed: Mutex<Instant>,
+}
+
+impl Turns<'_> {
+    /// Waits until nothing else is to be done, or nothing but views and those for long enough.
+    /// Fails with `cancelled`.
+    fn give_way(&self) -> Result<()> {
+        let Self { jobs, job, resumed } = self;
+        let mut resumed = resumed.lock();
+        let (worked, begun) = (resumed.elapsed(), Instant::now());
+        loop {
+            unless_cancelled(&job.cancel)?;
+            let made = [Kind::Scene, Kind::Semantics];
+            let makes = |kind| jobs.queue.len(kind) > 0 || !jobs.running.scenes(kind).is_empty();
+            let left = views_go_first((jobs.parts.drawn)(), worked, begun.elapsed());
+            if left.is_zero() && !made.into_iter().any(makes) {
+                *resumed = Instant::now();
+                return Ok(());
+            }
+            std::thread::sleep(if left.is_zero() { LOOK } else { left.min(LOOK) });
+        }
+    }
+}
+
+/// How much longer views go first: the last was drawn some time ago, and the refinement waits since
+/// it `worked` so long.
+fn views_go_first(drawn: Option<Duration>, worked: Duration, waited: Duration) -> Duration {
+    let quiet = drawn.map_or(Duration::ZERO, |ago| QUIET.saturating_sub(ago));
+    quiet.min((worked * WAITS).min(PATIENCE).saturating_sub(waited))
+}
+
 /// The record says what the scene says of itself.
 fn shows(record: &mut Record, scene: &Scene) {
     record.scene_sha256 = Some(scene.sha256.clone());
@@ -287,5 +312,17 @@ mod tests {
         assert_eq!([auto(64, 8), auto(64, 64)], [Some(15_000), Some(10_000)]);
         assert_eq!(budget_ms(Refine::Off, 9, 2), None);
         assert_eq!(budget_ms(Refine::Ms(7), 2, 2), Some(7));
+    }
+
+    #[test]
+    fn views_without_end_leave_a_fourth_of_the_time() {
+        let ms = Duration::from_millis;
+        let left = |drawn: Option<u64>, worked, waited| {
+            views_go_first(drawn.map(ms), ms(worked), ms(waited)).as_millis()
+        };
+        assert_eq!(left(None, 100, 0), 0, "nobody looks");
+        assert_eq!([left(Some(250), 100, 0), left(Some(240), 100, 0)], [0, 10], "a quiet moment");
+        assert_eq!([left(Some(0), 1, 0), left(Some(0), 1, 2), left(Some(0), 1, 3)], [3, 1, 0]);
+        assert_eq!([left(Some(0), 5_000, 900), left(Some(0), 5_000, 1_000)], [100, 0]);
     }
 }

@@ -91,6 +91,23 @@ async fn texts(server: &TestServer, id: &SceneId) -> u64 {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn views_without_end_do_not_stop_a_refinement() {
+    let (server, _) = server(60).await;
+    let id = scene(&server, SceneOptions::default()).await.id;
+    server.service.refine(&id, LONG).await.unwrap();
+    let looks = async {
+        loop {
+            server.service.render(&id, first_view()).await.expect("a view");
+        }
+    };
+    let done = until(&server, &id, |status| status.refinement.state == RefineState::Done);
+    tokio::select! {
+        () = looks => {}
+        status = done => assert!(status.version > 1, "{status:?}"),
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn better_versions_take_the_place_of_a_scene_and_its_watchers_are_told() {
     let (server, networks) = server(60).await;
     let service = &server.service;
