@@ -20,7 +20,7 @@ BEGIN, END = "<|startoftext|>", "<|endoftext|>"
 WORDS = r"""<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"""
 CONTEXT = 77
 # Crops in one run, for a CPU and for a GPU.
-BATCHES = {False: 16, True: 64}
+BATCHES = {False: 16, True: 32}
 
 
 class ImageTower(torch.nn.Module):

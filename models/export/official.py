@@ -95,6 +95,16 @@ def fixed_directions():
     return directions.float(), {n: torch.linalg.pinv(harmonics(n, directions)).float() for n in range(1, DEGREE_MAX + 1)}
 
 
+def turn(matrices, rows):
+    """Each row `[..., k]` times its matrix `[..., k, k]`. Where all pixels of a view have one matrix, that is a product for each
+    view: with one for each pixel a GPU took 11 of DepthSplat's 26 ms."""
+    k = rows.shape[-1]
+    if matrices.dim() != rows.dim() + 1 or any(side != 1 for side in matrices.shape[2:-2]):
+        return (matrices @ rows[..., None])[..., 0]
+    views = rows.shape[:2]
+    return (rows.reshape(*views, -1, k) @ matrices.reshape(*views, k, k).transpose(-1, -2)).reshape(rows.shape)
+
+
 def rotate_harmonics(coefficients, rotations):
     """`rotate_sh` of the official code for the bands that are kept; `[..., K]`, K up to 16."""
     directions, inverses = fixed_directions()
@@ -102,8 +112,7 @@ def rotate_harmonics(coefficients, rotations):
     while degree <= DEGREE_MAX and degree**2 < coefficients.shape[-1]:
         turned = harmonics(degree, directions @ rotations.transpose(-1, -2))
         matrix = (inverses[degree] @ turned).transpose(-1, -2)
-        band = coefficients[..., degree**2 : (degree + 1) ** 2]
-        bands.append((matrix @ band[..., None])[..., 0])
+        bands.append(turn(matrix, coefficients[..., degree**2 : (degree + 1) ** 2]))
         degree += 1
     return torch.cat(bands, -1)
 
