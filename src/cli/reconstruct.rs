@@ -12,6 +12,7 @@ use serde_json::json;
 use sha2::{Digest, Sha256};
 
 use super::{
+    engine,
     output::Output,
     scene_file::{
         open_splats, path_of, semantics_path, splat_format, unreadable, unwritable, write_splats,
@@ -20,15 +21,18 @@ use super::{
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
+    jobs::{budget_ms, refine_options, refiner},
     names::named,
     pipeline::{
-        self, PhotoSet, Pipeline,
+        self, PhotoSet, Pipeline, reconstruct_for_refinement,
+        refinement::{refined, reported, version_of},
         semantics::{SemanticsInput, understand},
     },
     scene::{
-        Density, PhotoHash, Preset, Provenance, Scene, SceneId, SceneMeta, SceneOptions,
-        SemanticsMode, Stage, Upload, Watch,
+        Density, PhotoHash, PosedPhoto, Preset, Provenance, Refine, RefineReport, Scene, SceneId,
+        SceneMeta, SceneOptions, SemanticsMode, Stage, Upload, Watch,
     },
+    service::check_refine,
     store::{self, splats::SplatFile, write_scene_file, write_semantics_file},
 };
 
@@ -47,6 +51,10 @@ pub(super) struct Args {
     /// `eager` also makes the semantics, in a file beside the scene's; `off` makes none
     #[arg(long, value_parser = semantics, default_value = "off")]
     semantics: SemanticsMode,
+    /// Bring the scene closer to its photos: for so many milliseconds, or `auto`, which takes 10 to
+    /// 60 s where there are five photos and more
+    #[arg(long, value_name = "off|auto|MILLISECONDS", default_value = "off")]
+    refine: Refine,
     /// Gaussians kept: `thinned`, one for up to 16 neighbours where the photos are flat, or `full`
     #[arg(long, value_parser = named::<Density>)]
     density: Option<Density>,
@@ -66,10 +74,12 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         semantics: args.semantics,
         preset: args.preset,
         density: args.density,
+        refine: Some(args.refine),
         ..SceneOptions::default()
     };
     let options = options.with(&args.method)?;
     options.method().check()?;
+    check_refine(args.refine, &config.limits)?;
     if !args.photos.is_dir() && splat_format(&args.photos).is_some() {
         return import(args, config, &options, out);
     }
@@ -88,7 +98,11 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let made = pipeline::make(&engine, &photos, &options, watch)?;
     let provenance = store::provenance(store::hashes(&upload), &options, engine.bundle().sha256());
     let id = id_of(&provenance);
-    let mut scene = made.into_scene(id, store::now_ms(), provenance);
+    let made = made.into_scene(id, store::now_ms(), provenance);
+    let mut scene = match budget_ms(args.refine, photos.photos.len(), config.threads) {
+        Some(ms) => refine(&engine, made, &photos, (ms, &options), config, watch)?,
+        None => made,
+    };
     let path = path_of(&args.output);
     let for_others = splat_format(&path).is_some();
     write(&path, &scene)?;
@@ -110,6 +124,33 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let total_ms = begun.elapsed().as_secs_f64() * 1e3;
     out.progress("done", 1.0);
     describe(&path, &scene, total_ms, out)
+}
+
+/// The scene after so many milliseconds of refinement; as it was where none was better.
+fn refine(
+    engine: &Pipeline,
+    scene: Scene,
+    photos: &PhotoSet,
+    (ms, options): (u64, &SceneOptions),
+    config: &Config,
+    watch: Watch<'_>,
+) -> Result<Scene> {
+    let refiner = refiner(engine::renderer(config)?.differentiable(), config.threads)?;
+    let how = refine_options(ms, &config.limits);
+    let silent = Watch { progress: &|_, _| (), cancel: watch.cancel };
+    let mut remake =
+        |photos: Vec<PosedPhoto>| reconstruct_for_refinement(engine, &photos, options, silent);
+    let mut pace = |spent: f32| {
+        (watch.progress)(Stage::Refine, spent);
+        Ok(())
+    };
+    let found = refined(&*refiner, &scene, &photos.photos, &how, &mut remake, &mut pace)?;
+    let Some((start, version)) = &found.version else {
+        let mut scene = scene;
+        scene.meta.report.refinement = Some(reported(photos.photos.len(), &found.report));
+        return Ok(scene);
+    };
+    version_of(start, &scene, version)
 }
 
 /// A file of Gaussians becomes a scene file. No network is needed.
@@ -216,6 +257,12 @@ fn describe(path: &Path, scene: &Scene, total_ms: f64, out: &Output) -> Result<(
             "  semantics: {} entries, {} Gaussians have one",
             semantics.bank_size, semantics.labelled
         );
+    }
+    if let Some(RefineReport { psnr_before, psnr_after, steps, .. }) = &report.refinement {
+        let of =
+            |psnr: &Option<f64>| psnr.map_or("unknown".to_owned(), |psnr| format!("{psnr:.2} dB"));
+        let (before, after) = (of(psnr_before), of(psnr_after));
+        let _ = writeln!(text, "  refined: {steps} steps, held-out photos {before} to {after}");
     }
     for warning in &report.warnings {
         let _ = writeln!(text, "  warning: {}", warning.message);

@@ -33,6 +33,8 @@ pub use self::networks::{
     NetworkState, NoSemantics, Phrases, PipelineNetworks, SceneNetworks, SemanticNetworks,
 };
 
+pub(crate) use self::refine::{budget_ms, refine_options, refiner};
+
 use self::{
     job::{Kind, Reason, Running},
     photos::{ReadUpload, ReadUploads},

@@ -19,11 +19,13 @@ use super::{
 };
 use crate::{
     error::{Error, Result},
+    limits::Limits,
     pipeline::{
         PhotoSet,
         refinement::{refined, reported, version_of},
     },
     refine::{HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion},
+    render::{backward::DifferentiableRenderer, cpu::CpuRenderer},
     scene::{
         PosedPhoto, Refine, RefineReport, RefineState, RefineStatus, Scene, SceneId, Stage, Watch,
         unless_cancelled,
@@ -48,8 +50,34 @@ const LOOK: Duration = Duration::from_millis(10);
 /// A change of the fraction that watchers are told.
 const TOLD: f32 = 0.01;
 
+/// What refines where views are drawn on a device that can, or on none.
+///
+/// # Errors
+/// `internal` when threads cannot be started.
+pub(crate) fn refiner(
+    device: Option<Arc<dyn DifferentiableRenderer>>,
+    threads: usize,
+) -> Result<Arc<dyn DifferentiableRenderer>> {
+    match device {
+        Some(device) => Ok(device),
+        // Threads of its own: a view never waits for a step.
+        None => Ok(Arc::new(CpuRenderer::new(threads)?)),
+    }
+}
+
+/// A refinement of so many milliseconds within the limits.
+pub(crate) fn refine_options(ms: u64, limits: &Limits) -> RefineOptions {
+    let time = Duration::from_millis(ms);
+    RefineOptions {
+        budget: RefineBudget { steps: limits.refine_steps_max, time },
+        gaussians_max: limits.refine_gaussians_max,
+        device_bytes_max: limits.refine_device_bytes_max,
+        ..RefineOptions::default()
+    }
+}
+
 /// Milliseconds that a scene of so many photos is to be refined for; `None`: not at all.
-pub(super) fn budget_ms(refine: Refine, photos: usize, threads: usize) -> Option<u64> {
+pub(crate) fn budget_ms(refine: Refine, photos: usize, threads: usize) -> Option<u64> {
     match refine {
         Refine::Off => None,
         Refine::Ms(ms) => Some(ms),
@@ -175,14 +203,7 @@ impl Jobs {
         let scene = self.parts.store.scene(id)?;
         let upload = self.upload(id, watch)?;
         let PhotoSet { photos, warnings, .. } = upload.photos()?;
-        let limits = &self.parts.limits;
-        let time = Duration::from_millis(order.ms);
-        let options = RefineOptions {
-            budget: RefineBudget { steps: limits.refine_steps_max, time },
-            gaussians_max: limits.refine_gaussians_max,
-            device_bytes_max: limits.refine_device_bytes_max,
-            ..RefineOptions::default()
-        };
+        let options = refine_options(order.ms, &self.parts.limits);
         let mut remake = |photos: Vec<PosedPhoto>| {
             let photos = PhotoSet { photos, warnings: warnings.clone(), read_ms: 0.0 };
             self.parts.scenes.make_for_refinement(&photos, &record.options, watch)

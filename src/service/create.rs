@@ -180,7 +180,7 @@ fn check_request(
         )));
     }
     options.method().check()?;
-    options.refine.map_or(Ok(()), |refine| refine::check(refine, limits))?;
+    options.refine.map_or(Ok(()), |refine| refine::check_refine(refine, limits))?;
     match key.map(str::len) {
         Some(0) => Err(Error::invalid("the idempotency key is empty")),
         Some(bytes) if bytes > IDEMPOTENCY_KEY_BYTES_MAX => {

@@ -37,6 +37,7 @@ use tokio::sync::Semaphore;
 pub use self::folder::{FOLDER_FORMATS, FolderFormat};
 pub use self::infer::InferSpec;
 pub use self::page::{VIEWER, ViewerPage};
+pub(crate) use self::refine::check_refine;
 use self::{memory::Memory, schedule::Scheduler, search::Backend};
 pub use self::{
     offline::OfflineService,
@@ -60,10 +61,10 @@ pub use crate::scene::{
 use crate::{
     config::Config,
     error::{Error, Result},
-    jobs::{JobParts, Jobs, NetworkState, SceneNetworks, SemanticNetworks},
+    jobs::{JobParts, Jobs, NetworkState, SceneNetworks, SemanticNetworks, refiner},
     keys::Caller,
     limits::Limits,
-    render::{Renderer, cpu::CpuRenderer},
+    render::Renderer,
     scene::{Refine, SceneId, Stage},
     store::{Place, Record, Store},
 };
@@ -155,11 +156,7 @@ impl Service {
             Refine::Auto if device.is_none() => Refine::Off,
             how => how,
         };
-        let refiner = match device {
-            Some(renderer) => renderer,
-            // Threads of its own: a view never waits for a step.
-            None => Arc::new(CpuRenderer::new(config.threads)?),
-        };
+        let refiner = refiner(device, config.threads)?;
         let networks = Arc::clone(&parts.scenes);
         let job_parts = JobParts {
             store: Arc::clone(&store),

@@ -10,7 +10,7 @@ use crate::{
 };
 
 /// Refuses more time than a refinement may have.
-pub(super) fn check(refine: Refine, limits: &Limits) -> Result<()> {
+pub(crate) fn check_refine(refine: Refine, limits: &Limits) -> Result<()> {
     let max = limits.refine_ms_max;
     match refine {
         Refine::Ms(ms) if ms == 0 || ms > max => {
@@ -28,7 +28,7 @@ impl Service {
     /// `scene_not_found`, `scene_not_ready`; `invalid_request` for a time out of range, and where
     /// the photos of finished scenes are not kept; `overloaded`, `store_unavailable`.
     pub async fn refine(&self, id: &SceneId, refine: Refine) -> Result<SceneStatus> {
-        check(refine, &self.limits())?;
+        check_refine(refine, &self.limits())?;
         let scene = self.scene(id).await?.finished()?;
         let file = &scene.record().status.report.as_ref().and_then(|r| r.file_format.as_ref());
         if let (Some(name), false) = (file, refine == Refine::Off) {

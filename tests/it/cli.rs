@@ -18,7 +18,7 @@ use segsplat::{
         write_scene,
     },
 };
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::common::{process::signal, skipped};
 
@@ -278,6 +278,26 @@ fn photos_become_a_scene_that_can_be_looked_at() {
     assert!(mean < 12.0, "an input camera sees its own photo, not {mean} levels off");
     let verified = ok_json(&["models", "verify"]);
     assert_eq!(verified["verified"], true);
+}
+
+#[test]
+fn a_scene_is_refined_for_as_long_as_asked() {
+    if !with_network() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (photos, scene) = (folder.path().join("photos"), folder.path().join("made.segsplat"));
+    ok(&["sample", "-o", text(&photos), "--photos", "6", "--size", "256x256"]);
+    let line = ["reconstruct", text(&photos), "-o", text(&scene), "--refine"];
+    refused(&[&line[..], &["0"]].concat(), ErrorCode::InvalidRequest, "refine is 0 ms");
+    let made = ok_json(&[&line[..], &["8000", "--semantics", "eager"], &CPU].concat());
+    let found = &made["report"]["refinement"];
+    let [before, after] = ["psnr_before", "psnr_after"].map(|name| found[name].as_f64().unwrap());
+    assert!(found["steps"].as_u64() > Some(0) && after > before, "{found}");
+    assert_eq!(found["held_out"], json!([3]));
+    let kept = ok_json(&["inspect", text(&scene)]);
+    assert_eq!(&kept["meta"]["report"]["refinement"], found, "the file has the refined scene");
+    assert!(made["semantics"]["labelled"].as_u64() > Some(0), "its semantics follow it");
 }
 
 #[test]
