@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import viser
 from viser.transforms import SE3
 
-from .client import Scene
-from .types import Box, Floats
+from .gaussians import Gaussians
+from .types import Box, Floats, Photo
 
 
-def show(
-    scene: Scene, boxes: Iterable[Box] = (), server: viser.ViserServer | None = None
+def draw(
+    server: viser.ViserServer | None,
+    gaussians: Gaussians,
+    photos: Sequence[Photo],
+    boxes: Iterable[Box],
+    depth: float,
 ) -> viser.ViserServer:
-    """Puts a scene into viser and gives its server; `scene.query("chair").boxes` are drawn too.
+    """Puts a scene into viser and gives its server.
 
-    server: by default one of its own on http://127.0.0.1:8081, for this machine alone.
+    server: by default one of its own on http://127.0.0.1:8081 (or the next free port), for this
+        machine alone.
+    depth: how far things are from the photos, world units.
     """
-    server = server or viser.ViserServer(host="127.0.0.1", port=8081)
-    if not scene.photos:
-        scene.refresh()
-    server.scene.set_up_direction(up_of([photo.camera.camera_to_world for photo in scene.photos]))
-    gaussians = scene.gaussians()
+    server = server or viser.ViserServer(host="127.0.0.1", port=8081, verbose=False)
+    if photos:
+        server.scene.set_up_direction(up_of([photo.camera.camera_to_world for photo in photos]))
     server.scene.add_gaussian_splats(
         "/scene",
         centers=gaussians.means,
@@ -31,14 +35,14 @@ def show(
         rgbs=gaussians.colors,
         opacities=gaussians.opacities[:, None],
     )
-    for i, photo in enumerate(scene.photos):
+    for i, photo in enumerate(photos):
         camera = photo.camera
         pose = SE3.from_matrix(camera.camera_to_world)
         server.scene.add_camera_frustum(
             f"/photos/{i}",
             fov=float(2 * np.arctan2(camera.height / 2, camera.K[1, 1])),
             aspect=camera.width / camera.height,
-            scale=0.05 * (scene.report.median_depth if scene.report else 1.0),
+            scale=0.05 * depth,
             wxyz=pose.rotation().wxyz,
             position=pose.translation(),
         )
@@ -46,6 +50,10 @@ def show(
         server.scene.add_line_segments(
             f"/boxes/{i}", points=edges_of(box).astype(np.float32), colors=(255, 200, 0)
         )
+    if photos:
+        start = photos[0].camera
+        server.initial_camera.position = start.camera_to_world[:3, 3]
+        server.initial_camera.look_at = start.camera_to_world[:3] @ [0, 0, depth, 1]
     return server
 
 
