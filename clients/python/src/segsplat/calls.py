@@ -471,7 +471,7 @@ def show(
         yield from refresh(scene)
     found = yield from gaussians(scene)
     status, photos = scene.shown
-    return draw(server, found, photos, boxes, status.report.median_depth if status.report else 1.0)
+    return draw(server, found, photos, boxes, status.report)
 
 
 # Fields of requests

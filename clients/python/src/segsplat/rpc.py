@@ -189,8 +189,8 @@ def _enum(kind: str, value: Any) -> str:
 
 
 def plain(message: Message) -> dict[str, Any]:
-    """The fields of a message as HTTP's JSON has them: null where nothing is said. An empty text
-    is not there.
+    """The fields of a message as HTTP's JSON has them: null where nothing is said. Pictures in
+    it are left out.
     """
     told: dict[str, Any] = {}
     for field in message.DESCRIPTOR.fields:
@@ -199,7 +199,7 @@ def plain(message: Message) -> dict[str, Any]:
             told[field.name] = None
         elif isinstance(value, Iterable) and not isinstance(value, (str, bytes)):
             told[field.name] = [_value(field, one) for one in value]
-        elif value not in ("", b""):
+        elif not isinstance(value, bytes):
             told[field.name] = _value(field, value)
     return told
 
@@ -237,9 +237,9 @@ def _found(fields: dict[str, Any]) -> dict[str, Any]:
         for part in result["parts"]:
             flat = part["covariance"]
             part["covariance"] = [flat[:3], flat[3:6], flat[6:]]
-        if counts := (result["view"] or {}).get("mask_rle"):
-            size = [lens["height"], lens["width"]]
-            result["view"]["mask_rle"] = {"size": size, "counts": counts}
+        view = result["view"] or {}
+        if counts := view.pop("mask_rle", ""):
+            view["mask_rle"] = {"size": [lens["height"], lens["width"]], "counts": counts}
     return fields
 
 
