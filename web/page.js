@@ -823,7 +823,9 @@ function filmPlan() {
   const side = Number($('film-side').value),
     [width, height] = filmSize($('stage').getBoundingClientRect(), side);
   const frames = FPS * Number($('film-seconds').value);
-  $('film-says').textContent = `${frames} frames of ${width} × ${height}, ${FPS} a second`;
+  // A recorder takes as many as the device draws.
+  const most = globalThis.VideoEncoder ? '' : 'up to ';
+  $('film-says').textContent = `${most}${frames} frames of ${width} × ${height}, ${FPS} a second`;
   return { width, height, frames, motion: $('film-motion').value };
 }
 

@@ -115,6 +115,7 @@ def test_without_an_encoder_the_browser_records(
     page.click("#film")
     page.select_option("#film-seconds", "2")
     page.select_option("#film-side", "640")
+    expect(page.locator("#film-says")).to_contain_text("up to 60 frames")
     begun = time.monotonic()
     with page.expect_download() as waited:
         page.click("#film-make")
