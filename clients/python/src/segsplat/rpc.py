@@ -282,9 +282,7 @@ def fault(error: Any) -> SegSplatError:
     """The error of a call: by the server's code, or that of the network."""
     told = {key: value for key, value in error.trailing_metadata() or ()}
     if code := told.get("segsplat-code"):
-        after = told.get("retry-after", "")
-        details = {"retry_after_s": int(after)} if after.isdigit() else {}
-        body = {"code": code, "message": error.details(), "details": details}
+        body = {"code": code, "message": error.details()}
         return error_of(400, told, json.dumps(body).encode())
     said = f"{error.code().name}: {error.details()}"
     if error.code() in (grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.INTERNAL):
