@@ -22,6 +22,8 @@ import urllib.request
 import zlib
 from pathlib import Path
 
+from form import form
+
 # Real scenes: name, frames to post (by position in transforms.json).
 REAL = [("fox", [0, 1, 2, 3]), ("red_kitchen", [0, 1]), ("sceaux_castle", [4, 5, 6])]
 # What each scene is asked for.
@@ -46,18 +48,6 @@ def call(url: str, body: bytes | None = None, kind: str | None = None) -> bytes:
             return answer.read()
     except urllib.error.HTTPError as error:
         sys.exit(f"demo: {url} answered {error.code}: {error.read().decode(errors='replace')}")
-
-
-def multipart(transforms: bytes, photos: list[tuple[str, bytes]]) -> tuple[bytes, str]:
-    """The body of POST /v1/scenes and its content type."""
-    line = f"demo{os.urandom(12).hex()}"
-    parts = [("transforms", "transforms.json", transforms)]
-    parts += [("photo", name, data) for name, data in photos]
-    body = b""
-    for field, name, data in parts:
-        head = f'--{line}\r\nContent-Disposition: form-data; name="{field}"; filename="{name}"'
-        body += head.encode() + b"\r\n\r\n" + data + b"\r\n"
-    return body + f"--{line}--\r\n".encode(), f"multipart/form-data; boundary={line}"
 
 
 def load(folder: Path, frames: list[int] | None) -> tuple[bytes, list[tuple[str, bytes]]]:
@@ -100,7 +90,8 @@ def depth_picture(npy: bytes) -> bytes:
 def show(server: str, name: str, folder: Path, frames: list[int] | None, out: Path) -> None:
     """Posts the photos of a folder and writes views of the scene."""
     transforms, photos = load(folder, frames)
-    body, kind = multipart(transforms, photos)
+    parts = [("transforms", "transforms.json", transforms)]
+    body, kind = form(parts + [("photo", name, data) for name, data in photos])
     begun = time.monotonic()
     scene = json.loads(call(f"{server}/v1/scenes?wait_ms={SCENE_S * 1000}", body, kind))
     if scene["state"] != "done":

@@ -1,4 +1,5 @@
-// A film of the scene: WebCodecs encodes the frames (VP9, or else VP8), and WebM holds them.
+// A film of the scene: WebCodecs encodes the frames (VP9, or else VP8), and WebM holds them. Where
+// there is no WebCodecs (plain http from another machine), the browser records what it draws.
 const FPS = 30,
   KEY_FRAMES = 2 * FPS, // one so often: a player jumps to these
   SWING = Math.PI / 12;
@@ -17,28 +18,28 @@ function filmSize(box, side) {
   return [box.width, box.height].map((v) => Math.max(16, 2 * Math.round((v * scale) / 2)));
 }
 
+const bitrateOf = (width, height) => Math.round(0.12 * width * height * FPS);
+
+// The first codec that can encode this; null: none can.
 async function filmCodec(width, height) {
-  const bitrate = Math.round(0.12 * width * height * FPS);
-  for (const [codec, name] of globalThis.VideoEncoder
-    ? [
-        ['vp09.00.51.08', 'V_VP9'],
-        ['vp8', 'V_VP8'],
-      ]
-    : []) {
-    const config = { codec, width, height, bitrate, framerate: FPS };
+  if (!globalThis.VideoEncoder) return null;
+  for (const [codec, name] of [
+    ['vp09.00.51.08', 'V_VP9'],
+    ['vp8', 'V_VP8'],
+  ]) {
+    const config = { codec, width, height, bitrate: bitrateOf(width, height), framerate: FPS };
     if ((await VideoEncoder.isConfigSupported(config)).supported) return { config, name };
   }
-  throw new Error(
-    isSecureContext
-      ? 'This browser cannot encode video.'
-      : 'Browsers encode video for pages over https or from localhost only, and this is neither.',
-  );
+  return null;
 }
 
 // The file, as a Blob. Each frame is drawn on the canvas of the drawing; cameraAt(share) is where
 // from.
-async function makeFilm(drawing, cameraAt, { width, height, frames, kind, signal, progress }) {
-  const { config, name } = await filmCodec(width, height);
+async function makeFilm(drawing, cameraAt, plan) {
+  const { width, height, frames, kind, signal, progress } = plan;
+  const found = await filmCodec(width, height);
+  if (!found) return recordFilm(drawing, cameraAt, plan);
+  const { config, name } = found;
   const chunks = [];
   let broken = null;
   const encoder = new VideoEncoder({
@@ -74,6 +75,38 @@ async function makeFilm(drawing, cameraAt, { width, height, frames, kind, signal
   }
   if (broken) throw broken;
   return webm({ chunks, name, width, height, ms: (frames * 1000) / FPS });
+}
+
+// The same in real time: a device that draws slowly gives fewer frames, over the same seconds.
+async function recordFilm(drawing, cameraAt, { width, height, frames, kind, signal, progress }) {
+  const types = ['video/webm;codecs=vp9', 'video/webm', 'video/mp4'];
+  const mimeType = types.find((type) => globalThis.MediaRecorder?.isTypeSupported(type));
+  if (!mimeType || !drawing.canvas.captureStream)
+    throw new Error('This browser can neither encode nor record video.');
+  const long = (frames * 1000) / FPS,
+    shown = () => new Promise((ok) => requestAnimationFrame(ok));
+  await drawing.still(cameraAt(0), width, height, kind);
+  const stream = drawing.canvas.captureStream(FPS),
+    bits = { videoBitsPerSecond: bitrateOf(width, height) },
+    recorder = new MediaRecorder(stream, { mimeType, ...bits });
+  const parts = [],
+    stopped = new Promise((ok) => (recorder.onstop = ok));
+  recorder.ondataavailable = ({ data }) => parts.push(data);
+  recorder.start();
+  try {
+    for (let share = 0, begun = performance.now(); share < 1; ) {
+      share = Math.min(1, (performance.now() - begun) / long);
+      await drawing.still(cameraAt(share), width, height, kind);
+      await shown();
+      signal.throwIfAborted();
+      progress(share);
+    }
+  } finally {
+    recorder.stop();
+    for (const track of stream.getTracks()) track.stop();
+  }
+  await stopped;
+  return new Blob(parts, { type: mimeType });
 }
 
 // WebM (RFC 8794 and 9559): one track, a cluster from each key frame, and an index of the clusters.

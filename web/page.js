@@ -14,6 +14,19 @@ const failed = (error) => {
   say(error.message);
 };
 const count = (n) => n.toLocaleString('en');
+const SHORT = { dateStyle: 'medium', timeStyle: 'short' };
+// What the server is at, for people.
+const STAGES = {
+  photos: 'reading the photos',
+  capture: 'checking the cameras',
+  geometry: 'finding the shapes',
+  lift: 'making Gaussians',
+  store: 'storing',
+  masks: 'finding things',
+  embed: 'finding out what they are',
+  bank: 'joining what is alike',
+  assign: 'marking the Gaussians',
+};
 const KINDS = ['colour', 'depth', 'alpha', 'mask'];
 const NAMES = [
   'chair',
@@ -530,9 +543,10 @@ async function list(after) {
   if (!after) $('scenes').replaceChildren();
   $('none').hidden = Boolean(after) || page.scenes.length > 0;
   for (const item of page.scenes) {
-    const when = new Date(item.created_ms);
+    const when = new Date(item.created_ms).toLocaleString('en-GB', SHORT);
+    const rest = item.state === 'done' ? '' : ` · ${item.state}`;
     const button = make('button', {
-      textContent: `${item.id.slice(0, 8)} · ${item.state} · ${when.toLocaleString('en-GB')}`,
+      textContent: `${when} · ${item.id.slice(0, 8)}${rest}`,
       onclick: () => {
         $('work').scrollIntoView({ block: 'nearest' });
         open(item.id).catch(failed);
@@ -540,16 +554,49 @@ async function list(after) {
     });
     button.dataset.id = item.id;
     button.setAttribute('aria-current', String(state.scene?.id === item.id));
-    $('scenes').append(make('li', {}, button));
+    const remove = make('button', {
+      textContent: '×',
+      title: 'Delete this scene',
+      onclick: () => askDeletion(item.id),
+    });
+    remove.setAttribute('aria-label', `Delete scene ${item.id.slice(0, 8)}`);
+    $('scenes').append(make('li', {}, button, remove));
   }
   $('more').hidden = !page.next;
   $('more').onclick = () => list(page.next).catch(failed);
 }
 
+// The dialog closes with what is chosen; Escape chooses nothing.
+function askDeletion(id) {
+  $('deletion-title').textContent = `Delete scene ${id.slice(0, 8)}?`;
+  $('deletion').returnValue = '';
+  $('deletion').onclose = () => {
+    if ($('deletion').returnValue) deleteScene(id).catch(failed);
+  };
+  $('deletion').showModal();
+}
+
+async function deleteScene(id) {
+  await server.call(`/v1/scenes/${id}`, { method: 'DELETE' });
+  if (state.scene?.id === id) close();
+  await list();
+  say(`Scene ${id.slice(0, 8)} is deleted.`);
+  $('scenes-title').focus(); // what was pressed is gone
+}
+
+// Shows no scene.
+function close() {
+  for (const work of [watching, loading, state.filming]) work?.abort();
+  forget();
+  Object.assign(state, { scene: null, camera: null });
+  document.body.classList.remove('shown');
+  history.replaceState(null, '', location.pathname);
+}
+
 function progress(event) {
   if (event.event === 'queued') say(`waiting, ${event.ahead} ahead`);
   if (event.event !== 'running') return;
-  say(`${event.stage}: ${Math.round(100 * event.fraction)} %`);
+  say(`${STAGES[event.stage] || event.stage}: ${Math.round(100 * event.fraction)} %`);
   $('progress').hidden = false;
   $('progress').value = event.fraction;
 }
@@ -776,7 +823,9 @@ function filmPlan() {
   const side = Number($('film-side').value),
     [width, height] = filmSize($('stage').getBoundingClientRect(), side);
   const frames = FPS * Number($('film-seconds').value);
-  $('film-says').textContent = `${frames} frames of ${width} × ${height}, ${FPS} a second`;
+  // A recorder takes as many as the device draws.
+  const most = globalThis.VideoEncoder ? '' : 'up to ';
+  $('film-says').textContent = `${most}${frames} frames of ${width} × ${height}, ${FPS} a second`;
   return { width, height, frames, motion: $('film-motion').value };
 }
 
@@ -805,7 +854,7 @@ async function makeAndKeepFilm() {
         progress: (share) => ($('progress').value = share),
       },
     );
-    download(blob, nameOf('webm'));
+    download(blob, nameOf(blob.type.startsWith('video/mp4') ? 'mp4' : 'webm'));
     say(`The video is written: ${(blob.size / 1e6).toFixed(1)} MB.`);
   } catch (error) {
     if (error.name !== 'AbortError') throw error;

@@ -14,11 +14,14 @@ import json
 import pathlib
 import re
 import statistics
+import sys
 import time
 import urllib.request
-import uuid
 
 from PIL import Image
+
+sys.path.append(str(pathlib.Path(__file__).parents[2] / "scripts"))
+from form import form  # noqa: E402
 
 # Calls of a known text and of a view.
 CALLS = 50
@@ -54,18 +57,6 @@ def photos(scene, frames, side):
     return files, {"frames": out}
 
 
-def form(files, transforms):
-    """The body of POST /v1/scenes and its content type."""
-    parts = [("transforms", "transforms.json", json.dumps(transforms).encode())]
-    parts += [("photo", f["file_path"], data) for f, data in zip(transforms["frames"], files)]
-    mark = uuid.uuid4().hex
-    body = b""
-    for name, file, data in parts:
-        head = f'--{mark}\r\ncontent-disposition: form-data; name="{name}"; filename="{file}"'
-        body += head.encode() + b"\r\n\r\n" + data + b"\r\n"
-    return body + f"--{mark}--\r\n".encode(), f"multipart/form-data; boundary={mark}"
-
-
 def timing(headers):
     """Stages of a `Server-Timing` header in milliseconds."""
     return {k: float(v) for k, v in re.findall(r"(\w+);dur=([\d.]+)", headers["server-timing"])}
@@ -85,7 +76,9 @@ def networks(url):
 
 def once(args, at, files, transforms):
     """Figures of one new scene by name; times in milliseconds."""
-    body, content = form(files, transforms)
+    parts = [("transforms", "transforms.json", json.dumps(transforms).encode())]
+    parts += [("photo", f["file_path"], data) for f, data in zip(transforms["frames"], files)]
+    body, content = form(parts)
     before, begun = networks(args.url), time.perf_counter()
     query = f"{args.url}/v1/scenes?preset=paper&semantics=eager&refine=off&wait_ms=60000"
     status = json.loads(call(query, body, content)[0])

@@ -22,6 +22,8 @@ from PIL import Image
 
 HERE = pathlib.Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
+sys.path.append(str(ROOT / "scripts"))
+from form import form  # noqa: E402
 
 
 def fetch(url, data=None, headers=None):
@@ -43,18 +45,6 @@ def until_up(url):
         except (urllib.error.URLError, ConnectionError):
             time.sleep(0.1)
     sys.exit(f"{url} never answered")
-
-
-def multipart(folder):
-    """The photos and transforms.json of a folder, as a form."""
-    edge, body = "edge", b""
-    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-        is_cameras = path.name == "transforms.json"
-        name = "transforms" if is_cameras else path.relative_to(folder).as_posix()
-        body += (f"--{edge}\r\nContent-Disposition: form-data; name=\"{name}\"; "
-                 f"filename=\"{path.name}\"\r\n\r\n").encode() + path.read_bytes() + b"\r\n"
-    headers = {"Content-Type": f"multipart/form-data; boundary={edge}"}
-    return body + f"--{edge}--\r\n".encode(), headers
 
 
 def load(urls, callers, seconds):
@@ -103,8 +93,11 @@ def main():
         theirs = None
         try:
             base = json.loads(ours.stdout.readline())["listening"]
-            body, headers = multipart(folder / "photos")
-            scene = json.loads(fetch(f"{base}/v1/scenes?wait_ms=600000", body, headers))
+            names = {"transforms.json": "transforms"}
+            body, kind = form([(names.get(path.name, "photo"), path.name, path.read_bytes())
+                               for path in (folder / "photos").rglob("*.*")])
+            made = fetch(f"{base}/v1/scenes?wait_ms=600000", body, {"Content-Type": kind})
+            scene = json.loads(made)
             ply = folder / "scene.ply"
             ply.write_bytes(fetch(f"{base}/v1/scenes/{scene['id']}/export?format=ply"))
             first, second = (c["camera_to_world"] for c in scene["cameras"][:2])

@@ -16,18 +16,21 @@ import glob
 import io
 import json
 import os
+import sys
 import time
 import urllib.error
 import urllib.request
-import uuid
 
 import numpy as np
 import torch
 from PIL import Image
 
+sys.path.append(os.path.join(os.path.dirname(__file__), "../../scripts"))
+
 import geometry
 import official
 from common import gap, prepare
+from form import form
 
 DIRECTIONS = 32
 BOUNDS = {**geometry.BOUNDS, "colours": geometry.BOUNDS["harmonics"]}
@@ -71,11 +74,9 @@ def served(args, files, lenses, poses):
               for i, (pose, lens) in enumerate(zip(poses, lenses))]
     parts = [("transforms", "transforms.json", json.dumps({"w": width, "h": height, "frames": frames}).encode())]
     parts += [("photos", f"{i}.png", png) for i, png in enumerate(files)]
-    mark = uuid.uuid4().hex
-    body = b"".join(b'--%s\r\ncontent-disposition: form-data; name="%s"; filename="%s"\r\n\r\n%s\r\n' % (mark.encode(), name.encode(), file.encode(), data)
-                    for name, file, data in parts) + b"--%s--\r\n" % mark.encode()
+    body, kind = form(parts)
     begun = time.perf_counter()
-    status = json.loads(call(f"{args.url}/v1/scenes?wait_ms=600000&density=full&semantics=lazy", body, f"multipart/form-data; boundary={mark}"))
+    status = json.loads(call(f"{args.url}/v1/scenes?wait_ms=600000&density=full&semantics=lazy", body, kind))
     while status["state"] not in ("done", "failed"):
         time.sleep(1)
         status = json.loads(call(f"{args.url}/v1/scenes/{status['id']}"))

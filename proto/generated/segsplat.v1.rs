@@ -1206,6 +1206,94 @@ pub struct ExportChunk {
     #[prost(string, tag = "3")]
     pub file_name: ::prost::alloc::string::String,
 }
+/// Nothing to say.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ModelsRequest {}
+/// What makes the scenes.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ModelsResponse {
+    /// Name of the bundle of networks.
+    #[prost(string, tag = "1")]
+    pub bundle: ::prost::alloc::string::String,
+    /// sha256 of its manifest, hex.
+    #[prost(string, tag = "2")]
+    pub bundle_sha256: ::prost::alloc::string::String,
+    /// Networks of the bundle.
+    #[prost(message, repeated, tag = "3")]
+    pub models: ::prost::alloc::vec::Vec<Model>,
+    /// What was measured of everyday words; empty where the bundle does not say.
+    #[prost(message, repeated, tag = "4")]
+    pub words: ::prost::alloc::vec::Vec<KnownWord>,
+    /// Execution provider in use; in brackets why it is not the one that was to be used.
+    #[prost(string, tag = "5")]
+    pub execution_provider: ::prost::alloc::string::String,
+    /// Renderer in use: cpu, or the adapter's name.
+    #[prost(string, tag = "6")]
+    pub renderer: ::prost::alloc::string::String,
+    /// Version of this server.
+    #[prost(string, tag = "7")]
+    pub server_version: ::prost::alloc::string::String,
+}
+/// One network.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Model {
+    /// What it does, as geometry, masks.encoder or image_text.text.
+    #[prost(string, tag = "1")]
+    pub name: ::prost::alloc::string::String,
+    /// File in the bundle.
+    #[prost(string, tag = "2")]
+    pub file: ::prost::alloc::string::String,
+    /// sha256, hex.
+    #[prost(string, tag = "3")]
+    pub sha256: ::prost::alloc::string::String,
+    /// Size.
+    #[prost(uint64, tag = "4")]
+    pub size_bytes: u64,
+    /// Licence of the weights.
+    #[prost(string, tag = "5")]
+    pub licence: ::prost::alloc::string::String,
+    /// Photos it takes at once; 0 where it takes none.
+    #[prost(uint32, tag = "6")]
+    pub views_max: u32,
+    /// Working sizes.
+    #[prost(message, repeated, tag = "7")]
+    pub sizes: ::prost::alloc::vec::Vec<Size>,
+}
+/// A size in pixels.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Size {
+    /// Height.
+    #[prost(uint32, tag = "1")]
+    pub height: u32,
+    /// Width.
+    #[prost(uint32, tag = "2")]
+    pub width: u32,
+}
+/// How well the networks know a word, on photographs that no training saw.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct KnownWord {
+    /// The word.
+    #[prost(string, tag = "1")]
+    pub word: ::prost::alloc::string::String,
+    /// What to expect of it.
+    #[prost(enumeration = "Trust", tag = "2")]
+    pub trust: i32,
+    /// Things that it may be said of, cut out along their outlines.
+    #[prost(uint32, tag = "3")]
+    pub things: u32,
+    /// Share of them that it selects, 0..1; left out where there are none.
+    #[prost(float, optional, tag = "4")]
+    pub things_found: ::core::option::Option<f32>,
+    /// Whole photographs that it may be said of.
+    #[prost(uint32, tag = "5")]
+    pub photographs: u32,
+    /// Share of them that it selects, 0..1; left out where there are none.
+    #[prost(float, optional, tag = "6")]
+    pub photographs_found: ::core::option::Option<f32>,
+    /// Share of all others that it selects, 0..1.
+    #[prost(float, tag = "7")]
+    pub absent: f32,
+}
 /// When the semantic bank of a scene is made.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
@@ -1611,6 +1699,47 @@ impl FeatureKind {
         }
     }
 }
+/// What to expect of a word.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum Trust {
+    /// Not used.
+    Unspecified = 0,
+    /// It selects most of what it names, and hardly anything else.
+    Good = 1,
+    /// Between the two.
+    Fair = 2,
+    /// It misses most of what it names, or selects much else.
+    Poor = 3,
+    /// Too few photographs show it.
+    Unmeasured = 4,
+}
+impl Trust {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "TRUST_UNSPECIFIED",
+            Self::Good => "TRUST_GOOD",
+            Self::Fair => "TRUST_FAIR",
+            Self::Poor => "TRUST_POOR",
+            Self::Unmeasured => "TRUST_UNMEASURED",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "TRUST_UNSPECIFIED" => Some(Self::Unspecified),
+            "TRUST_GOOD" => Some(Self::Good),
+            "TRUST_FAIR" => Some(Self::Fair),
+            "TRUST_POOR" => Some(Self::Poor),
+            "TRUST_UNMEASURED" => Some(Self::Unmeasured),
+            _ => None,
+        }
+    }
+}
 /// Generated client implementations.
 pub mod scene_service_client {
     #![allow(
@@ -1989,6 +2118,28 @@ pub mod scene_service_client {
                 .insert(GrpcMethod::new("segsplat.v1.SceneService", "Features"));
             self.inner.server_streaming(req, path, codec).await
         }
+        /// What makes the scenes: networks, renderer, version.
+        pub async fn models(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ModelsRequest>,
+        ) -> std::result::Result<tonic::Response<super::ModelsResponse>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static(
+                "/segsplat.v1.SceneService/Models",
+            );
+            let mut req = request.into_request();
+            req.extensions_mut()
+                .insert(GrpcMethod::new("segsplat.v1.SceneService", "Models"));
+            self.inner.unary(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -2099,6 +2250,11 @@ pub mod scene_service_server {
             &self,
             request: tonic::Request<super::FeaturesRequest>,
         ) -> std::result::Result<tonic::Response<Self::FeaturesStream>, tonic::Status>;
+        /// What makes the scenes: networks, renderer, version.
+        async fn models(
+            &self,
+            request: tonic::Request<super::ModelsRequest>,
+        ) -> std::result::Result<tonic::Response<super::ModelsResponse>, tonic::Status>;
     }
     /// Posed photos in, a 3D Gaussian scene by id, views at any pose out.
     #[derive(Debug)]
@@ -2716,6 +2872,51 @@ pub mod scene_service_server {
                                 max_encoding_message_size,
                             );
                         let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/segsplat.v1.SceneService/Models" => {
+                    #[allow(non_camel_case_types)]
+                    struct ModelsSvc<T: SceneService>(pub Arc<T>);
+                    impl<
+                        T: SceneService,
+                    > tonic::server::UnaryService<super::ModelsRequest>
+                    for ModelsSvc<T> {
+                        type Response = super::ModelsResponse;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ModelsRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as SceneService>::models(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ModelsSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
                         Ok(res)
                     };
                     Box::pin(fut)

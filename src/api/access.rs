@@ -37,6 +37,7 @@ const SERVICES: [(&str, Rpcs); 2] = [
             ("Features", "features", READ),
             ("GetScene", "get_scene", READ),
             ("ListScenes", "list_scenes", READ),
+            ("Models", "models", READ),
             ("Pick", "pick", READ),
             ("Query", "query", READ),
             ("RefineScene", "refine_scene", WRITE),

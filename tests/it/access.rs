@@ -19,7 +19,7 @@ use crate::common::{
 };
 
 /// Every call, named as the gRPC methods are, and what it needs.
-const CALLS: [(&str, Scope); 12] = [
+const CALLS: [(&str, Scope); 13] = [
     ("CreateScene", Scope::Write),
     ("ListScenes", Scope::Read),
     ("GetScene", Scope::Read),
@@ -31,8 +31,12 @@ const CALLS: [(&str, Scope); 12] = [
     ("Pick", Scope::Read),
     ("Export", Scope::Read),
     ("Features", Scope::Read),
+    ("Models", Scope::Read),
     ("DeleteScene", Scope::Write),
 ];
+
+/// Those of them that name no scene.
+const OF_THE_SERVER: [&str; 3] = ["CreateScene", "ListScenes", "Models"];
 
 /// Callers: name, owner, scope. The key is the name twice.
 const KEYS: [(&str, &str, &str); 4] = [
@@ -80,6 +84,7 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
         (_, Door::Http { base, client }) => {
             let request = match name {
                 "ListScenes" => client.get(format!("{base}/v1/scenes")),
+                "Models" => client.get(format!("{base}/v1/models")),
                 "WatchScene" => client.get(format!("{base}/v1/scenes/{id}/events")),
                 "Pick" => client.get(format!("{base}/v1/scenes/{id}/pick?from=0&x=9&y=9")),
                 "RenderViews" => client
@@ -97,6 +102,7 @@ async fn call(door: &Door, name: &str, id: &str) -> Result<(), Fault> {
                 "ListScenes" => {
                     client.list_scenes(pb::ListScenesRequest::default()).await.map(drop)
                 }
+                "Models" => client.models(pb::ModelsRequest {}).await.map(drop),
                 "WatchScene" => {
                     client.watch_scene(pb::WatchSceneRequest { scene_id }).await.map(drop)
                 }
@@ -144,7 +150,7 @@ async fn each_caller_may_make_each_call_or_not_over_both_doors() {
             for (name, scope) in CALLS {
                 let what = format!("{caller} calls {name} over {}", door.name());
                 let answer = call(door, name, &id).await;
-                let of_scene = !["CreateScene", "ListScenes"].contains(&name);
+                let of_scene = !OF_THE_SERVER.contains(&name);
                 let want = match caller {
                     "nobody" | "a liar" => "unauthenticated",
                     "reader" if scope == Scope::Write => "permission_denied",
@@ -172,9 +178,7 @@ async fn anothers_scene_is_as_one_that_does_not_exist() {
     let unknown = "0123456789abcdef".repeat(2);
     let strangers = both_with(stand.addr, Some(&secret("stranger"))).await;
     for door in &strangers {
-        for (name, _) in
-            CALLS.iter().filter(|(name, _)| !["CreateScene", "ListScenes"].contains(name))
-        {
+        for (name, _) in CALLS.iter().filter(|(name, _)| !OF_THE_SERVER.contains(name)) {
             let there = call(door, name, &id).await.expect_err(name);
             let absent = call(door, name, &unknown).await.expect_err(name);
             let message = absent.message.replace(&unknown, &id);

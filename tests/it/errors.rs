@@ -220,7 +220,7 @@ async fn the_two_doors_have_the_same_calls() {
     let document = document(&stand).await;
     let descriptors = String::from_utf8_lossy(DESCRIPTORS);
     for (paths, file, service) in [
-        ("/v1/scenes", "segsplat/v1/scene.proto", "SceneService"),
+        ("/v1/", "segsplat/v1/scene.proto", "SceneService"),
         ("/v2", "inference/open_inference_grpc.proto", "GRPCInferenceService"),
     ] {
         let operations: BTreeSet<_> = document["paths"]

@@ -14,20 +14,33 @@ fn generated_code_is_that_of_the_proto_files() {
     let files = ["segsplat/v1/scene.proto", "inference/open_inference_grpc.proto"];
     let descriptors = protox::compile(files, [&proto]).unwrap();
     fs::write(made.path().join("descriptors.bin"), descriptors.encode_to_vec()).unwrap();
+    let mut client = descriptors.clone();
+    client.file.retain(|file| file.package() == "segsplat.v1");
+    for file in &mut client.file {
+        file.source_code_info = None; // the comments
+    }
+    fs::write(made.path().join("client.bin"), client.encode_to_vec()).unwrap();
     tonic_prost_build::configure()
         .bytes(".")
         .out_dir(made.path())
         .compile_fds(descriptors)
         .unwrap();
-    for name in ["descriptors.bin", "segsplat.v1.rs", "inference.rs"] {
-        let (new, kept) = (made.path().join(name), proto.join("generated").join(name));
+    let generated = |name| (name, proto.join("generated").join(name));
+    let client = root().join("clients/python/src/segsplat/descriptors.bin");
+    for (name, kept) in ["descriptors.bin", "segsplat.v1.rs", "inference.rs"]
+        .map(generated)
+        .into_iter()
+        .chain([("client.bin", client)])
+    {
+        let new = made.path().join(name);
         if std::env::var_os("UPDATE_DOCS").is_some() {
             fs::copy(&new, &kept).unwrap();
         }
         let same = fs::read(&new).unwrap() == fs::read(&kept).unwrap_or_default();
         assert!(
             same,
-            "proto/generated/{name} differs from the files of proto: UPDATE_DOCS=1 writes it"
+            "{} differs from the files of proto: UPDATE_DOCS=1 writes it",
+            kept.display()
         );
     }
 }

@@ -9,6 +9,7 @@ import urllib.request
 from pathlib import Path
 
 import numpy as np
+from form import form
 from PIL import Image
 from playwright.sync_api import Page
 
@@ -50,13 +51,9 @@ def sample(photos: Path) -> dict[str, bytes]:
 
 def post(url: str, parts: list[tuple[str, str, bytes]]) -> str:
     """The id of the finished scene of an upload: fields, names of files, and the files."""
-    line = "page"
-    body = b"".join(
-        f'--{line}\r\nContent-Disposition: form-data; name="{field}"; filename="{name}"\r\n\r\n'
-        .encode() + data + b"\r\n" for field, name, data in parts) + f"--{line}--\r\n".encode()
+    body, kind = form(parts)
     request = urllib.request.Request(
-        f"{url}/v1/scenes?wait_ms=600000", body,
-        {"content-type": f"multipart/form-data; boundary={line}"})
+        f"{url}/v1/scenes?wait_ms=600000", body, {"content-type": kind})
     with urllib.request.urlopen(request) as answer:
         made = json.load(answer)
     assert made["state"] == "done", made

@@ -19,6 +19,8 @@ TARGET = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
 BROWSERS = ["chromium-headless-shell", "chromium", "google-chrome"]
 SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
             "--ignore-gpu-blocklist", "--enable-precise-memory-info"]
+# A name of loopback that a browser takes for another machine: plain http from there is not secure.
+FAR = "far.test"
 expect.set_options(timeout=WAIT_MS)
 
 
@@ -38,8 +40,15 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    with served(tmp_path_factory.mktemp("server") / "data", "--renderer", "cpu") as address:
+    with served(tmp_path_factory.mktemp("server") / "data", "--renderer", "cpu",
+                "--allowed-hosts", FAR) as address:
         yield address
+
+
+@pytest.fixture(scope="session")
+def far(url: str) -> str:
+    """The same server as another machine sees it."""
+    return url.replace("127.0.0.1", FAR)
 
 
 @pytest.fixture(scope="session")
@@ -64,7 +73,9 @@ def splats(url: str) -> str:
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=browser_program(), args=SOFTWARE)
+        browser = playwright.chromium.launch(
+            executable_path=browser_program(),
+            args=[*SOFTWARE, f"--host-resolver-rules=MAP {FAR} 127.0.0.1"])
         yield browser
         browser.close()
 

@@ -25,9 +25,10 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session")
-def client(url: str) -> Iterator[Client]:
-    with Client(url) as client:
+@pytest.fixture(scope="session", params=["http", "grpc"])
+def client(url: str, request: pytest.FixtureRequest) -> Iterator[Client]:
+    """What is asked of it holds over both doors."""
+    with Client(url.replace("http", request.param)) as client:
         yield client
 
 

@@ -1,4 +1,4 @@
-"""The Gaussians as arrays, in a file for Rerun, and in viser where it is installed."""
+"""The Gaussians as arrays, and in a file for Rerun."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from served import ROOT
 
-from segsplat import BadAnswer, Box, Gaussians, Scene
+from segsplat import BadAnswer, Gaussians, Scene
 
 
 def test_gaussians_are_those_of_the_scene(scene: Scene) -> None:
@@ -36,16 +36,6 @@ def test_gaussians_are_those_of_the_scene(scene: Scene) -> None:
 def test_another_file_is_refused() -> None:
     with pytest.raises(BadAnswer):
         Gaussians.of_ply(b"ply\nformat ascii 1.0\nend_header\n")
-
-
-def test_viser_shows_a_scene(scene: Scene) -> None:
-    viser = pytest.importorskip("segsplat.viser")
-    box = Box(1, np.zeros(3), np.eye(3), np.array([1.0, 2, 3]), np.zeros(3), np.eye(3), np.ones(2))
-    edges = viser.edges_of(box)
-    assert edges.shape == (12, 2, 3)
-    lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
-    assert sorted(lengths) == [1] * 4 + [2] * 4 + [3] * 4
-    viser.show(scene, [box]).stop()
 
 
 def test_rerun_reads_what_the_example_writes(scene: Scene, tmp_path: Path) -> None:

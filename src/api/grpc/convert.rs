@@ -12,11 +12,11 @@ use crate::{
     },
     service::{
         BackgroundSpec, Boxes, CameraSpec, Density, Event, ExportFormat, FeatureKind, FeaturesSpec,
-        Format, InstanceBox, Kind, Label, LensSpec, MaskFormat, MaskLevel, Method, Peak, PickSpec,
-        Picked, PictureOptions, PoseSpec, Preset, Quality, QueryAnswer, QuerySpec, RenderedView,
-        SceneCamera, SceneError, SceneOptions, SceneState, SceneStatus, ScoringOptions,
-        SemanticsMode, SemanticsState, SemanticsStatus, TextOptions, TextResult, TextView,
-        TextWarning, ViewOptions,
+        Format, InstanceBox, Kind, KnownWord, Label, LensSpec, MaskFormat, MaskLevel, Method,
+        ModelInfo, ModelsInfo, Peak, PickSpec, Picked, PictureOptions, PoseSpec, Preset, Quality,
+        QueryAnswer, QuerySpec, RenderedView, SceneCamera, SceneError, SceneOptions, SceneState,
+        SceneStatus, ScoringOptions, SemanticsMode, SemanticsState, SemanticsStatus, TextOptions,
+        TextResult, TextView, TextWarning, Trust, ViewOptions,
     },
 };
 
@@ -409,6 +409,28 @@ pub(super) fn picked(picked: Picked) -> pb::PickResponse {
     )
 }
 
+/// What makes the scenes.
+pub(super) fn models(info: ModelsInfo) -> pb::ModelsResponse {
+    let model = |model: ModelInfo| {
+        let size = |[height, width]: [u32; 2]| pb::Size { height, width };
+        message!(Model from model { name, file, sha256, size_bytes, licence }
+            views_max: u32::try_from(model.views_max).unwrap_or(u32::MAX),
+            sizes: model.sizes.into_iter().map(size).collect(),
+        )
+    };
+    let word = |known: KnownWord| {
+        message!(KnownWord from known
+            { word, things, things_found, photographs, photographs_found, absent }
+            trust: pb::Trust::from(known.trust).into(),
+        )
+    };
+    message!(ModelsResponse from info
+        { bundle, bundle_sha256, execution_provider, renderer, server_version }
+        models: info.models.into_iter().map(model).collect(),
+        words: info.words.into_iter().map(word).collect(),
+    )
+}
+
 /// The value of a message's enum; `name` names it in messages.
 pub(super) fn value<T: FromNumber>(name: &str, number: i32) -> Result<T> {
     T::from_number(number)
@@ -456,6 +478,7 @@ to_number! {
     SceneState = SceneState { Queued, Running, Done, Failed, Cancelled }
     RefineState = RefineState { None, Running, Done, Failed }
     SemanticsState = SemanticsState { Off, None, Running, Ready, Failed }
+    Trust = Trust { Good, Fair, Poor, Unmeasured }
 }
 
 both_ways! {

@@ -149,6 +149,11 @@ impl pb::scene_service_server::SceneService for Api {
         })
         .await
     }
+
+    async fn models(&self, request: Request<pb::ModelsRequest>) -> Answer<pb::ModelsResponse> {
+        answer(self, request, |api, _| async move { Ok(convert::models(api.service.models())) })
+            .await
+    }
 }
 
 /// A message with its stages as metadata.

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from uuid import uuid4
 
 import numpy as np
@@ -25,6 +25,7 @@ from .errors import (
 from .gaussians import Gaussians
 from .progress import show_bar
 from .types import (
+    Box,
     Camera,
     Event,
     Kind,
@@ -41,7 +42,22 @@ from .types import (
     parse,
 )
 from .view import FORMATS, View, picture
-from .wire import Flow, Item, Multipart, Part, Policy, Read, Request, ServerSentEvents, pause, send
+from .wire import (
+    Flow,
+    Item,
+    Multipart,
+    Part,
+    Pieces,
+    Policy,
+    Read,
+    Request,
+    ServerSentEvents,
+    pause,
+    send,
+)
+
+if TYPE_CHECKING:
+    from viser import ViserServer
 
 #: Endings of files of Gaussians.
 SPLATS = (".ply", ".spz", ".sog", ".glb", ".splat")
@@ -216,18 +232,16 @@ def events(scene: Handle, tell: Callable[[Event], None] | None = None) -> Flow[N
     again = 0
     while True:
         try:
-            request = Request("GET", f"/v1/scenes/{scene.id}/events", stream=True)
+            request = Request("GET", f"/v1/scenes/{scene.id}/events", stream=ServerSentEvents)
             yield from send(scene.policy, request)
-            reader = ServerSentEvents()
-            while piece := (yield Read()):
-                for data in reader.feed(piece):
-                    again, event = 0, parse(Event, _json(data))
-                    if tell:
-                        tell(event)
-                    else:
-                        yield Item(event)
-                    if event.is_last:
-                        return
+            while (data := (yield Read())) is not None:
+                again, event = 0, parse(Event, _json(data))
+                if tell:
+                    tell(event)
+                else:
+                    yield Item(event)
+                if event.is_last:
+                    return
             raise ConnectionLost("the events broke off")
         except ConnectionLost as lost:
             yield from pause(scene.policy, lost, again)
@@ -281,7 +295,7 @@ def view(
         return found[0]
     fields = {**_camera(spot), **_drawing(rest), "text": text, "kind": asked[0]}
     fields["format"] = FORMATS.get(asked[0], "npy")
-    request = Request("GET", f"/v1/scenes/{scene.id}/view", params=_query_string(fields))
+    request = Request("GET", f"/v1/scenes/{scene.id}/view", params=_given(fields))
     answer = yield from send(scene.policy, request)
     camera, array = picture(asked[0], answer.headers, answer.body)
     return View(camera, {asked[0]: array})
@@ -322,26 +336,25 @@ def _views(
     done = again = 0
     while done < len(cameras):
         request = Request(
-            "POST", path, json=_given({**body, "cameras": cameras[done:]}), stream=True
+            "POST", path, json=_given({**body, "cameras": cameras[done:]}), stream=Multipart
         )
         try:
-            answer = yield from send(scene.policy, request)
-            reader = Multipart(answer.headers.get("content-type", ""))
+            yield from send(scene.policy, request)
             arrays: dict[Kind, NDArray[Any]] = {}
-            while piece := (yield Read()):
-                for headers, content in reader.feed(piece):
-                    if headers.get("content-type") == "application/json":
-                        raise error_of(200, headers, content)
-                    kind = kinds[len(arrays)]
-                    camera, arrays[kind] = picture(kind, headers, content)
-                    if len(arrays) < len(kinds):
-                        continue
-                    done, again = done + 1, 0
-                    drawn, arrays = View(camera, arrays), {}
-                    if take:
-                        take(drawn)
-                    else:
-                        yield Item(drawn)
+            while (part := (yield Read())) is not None:
+                headers, content = part
+                if headers.get("content-type") == "application/json":
+                    raise error_of(200, headers, content)
+                kind = kinds[len(arrays)]
+                camera, arrays[kind] = picture(kind, headers, content)
+                if len(arrays) < len(kinds):
+                    continue
+                done, again = done + 1, 0
+                drawn, arrays = View(camera, arrays), {}
+                if take:
+                    take(drawn)
+                else:
+                    yield Item(drawn)
             if done < len(cameras):
                 raise ConnectionLost(f"the answer broke off before view {done}")
         except SegSplatError as error:
@@ -390,7 +403,7 @@ def pick(
     """
     spot, rest = _split(dict(options))
     fields = {**_camera(spot), **_drawing(rest), "x": x, "y": y, "label": list(labels)}
-    params = _query_string(fields)
+    params = _given(fields)
     request = Request("GET", f"/v1/scenes/{scene.id}/pick", params=params)
     return parse(Picked, _json((yield from send(scene.policy, request)).body))
 
@@ -400,7 +413,7 @@ def pick(
 
 def gaussians(scene: Handle, text: str | None = None) -> Flow[Gaussians]:
     """The Gaussians of the scene, or those that a text selects, as arrays."""
-    params = _query_string({"format": "ply", "text": text})
+    params = _given({"format": "ply", "text": text})
     request = Request("GET", f"/v1/scenes/{scene.id}/export", params=params)
     return Gaussians.of_ply((yield from send(scene.policy, request)).body)
 
@@ -425,13 +438,13 @@ def export(
     target = Path(path) if path is not None else Path(f"{scene.id}.{ending}")
     part = target.with_name(target.name + ".part")
     lines = text if text is None or isinstance(text, str) else "\n".join(text)
-    params = _query_string({"format": format, "text": lines})
-    request = Request("GET", f"/v1/scenes/{scene.id}/export", params=params, stream=True)
+    params = _given({"format": format, "text": lines})
+    request = Request("GET", f"/v1/scenes/{scene.id}/export", params=params, stream=Pieces)
     for again in range(scene.policy.retries + 1):
         try:
             yield from send(scene.policy, request)
             with part.open("wb") as file:
-                while piece := (yield Read()):
+                while (piece := (yield Read())) is not None:
                     file.write(piece)
             return part.replace(target)
         except ConnectionLost as lost:
@@ -439,6 +452,26 @@ def export(
         finally:
             part.unlink(missing_ok=True)
     raise AssertionError("unreachable")
+
+
+def show(
+    scene: Handle, boxes: Iterable[Box] = (), server: ViserServer | None = None
+) -> Flow[ViserServer]:
+    """Shows the scene in viser and gives viser's server: `pip install segsplat[viser]`.
+
+    boxes: drawn too, as those of `scene.query("chair").boxes`.
+    server: by default one of its own on http://127.0.0.1:8081 (or the next free port), for this
+        machine alone.
+    """
+    try:
+        from .viser import draw
+    except ImportError as missing:
+        raise ImportError(f"{missing}: pip install 'segsplat[viser]'") from missing
+    if not scene.shown[1]:
+        yield from refresh(scene)
+    found = yield from gaussians(scene)
+    status, photos = scene.shown
+    return draw(server, found, photos, boxes, status.report)
 
 
 # Fields of requests
@@ -504,16 +537,3 @@ def _drawing(options: Mapping[str, Any]) -> dict[str, Any]:
     if (seconds := fields.pop("wait", None)) is not None:
         fields["wait_ms"] = round(1000 * seconds)
     return fields
-
-
-def _query_string(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Numbers joined by commas; lists of texts as they are, each under its name."""
-
-    def text(value: Any) -> Any:
-        if isinstance(value, bool):
-            return "true" if value else "false"
-        if isinstance(value, (list, tuple)) and not all(isinstance(one, str) for one in value):
-            return ",".join(str(one) for one in value)
-        return value
-
-    return {name: text(value) for name, value in _given(fields).items()}

@@ -22,7 +22,7 @@ from .calls import Handle, Progress, Shown, Source
 from .errors import ConnectionLost
 from .types import Event, Models, Photo, Report, SceneOptions, SceneStatus
 from .view import View
-from .wire import Answer, Flow, Item, Policy, Read, Request, Run, Sleep, Step
+from .wire import Answer, Flow, Item, Policy, Read, Reader, Request, Run, Sleep, Step
 
 T = TypeVar("T")
 P = ParamSpec("P")
@@ -43,25 +43,38 @@ class _Connection:
         transport: Any = None,
     ) -> None:
         """
-        url: address of the server; by default $SEGSPLAT_URL, else http://127.0.0.1:8080.
+        url: address of the server; by default $SEGSPLAT_URL, else http://127.0.0.1:8080. With
+            grpc:// or grpcs:// (TLS) the same calls go over gRPC: `pip install segsplat[grpc]`.
         api_key: key of the server's file of keys, where it has one; by default $SEGSPLAT_API_KEY.
-        timeout: seconds without a byte from the server. A first text can take a minute.
+        timeout: seconds without a byte from the server; over gRPC seconds of a call that is not a
+            stream. A first text can take a minute.
         retries: times that a call is sent again, each after the time that the server names.
         retry_wait_max: longest such time, seconds; a longer one raises the error.
         verify: False, or a file of certificates, as in httpx.
-        transport: an httpx transport to use instead of the network.
+        transport: an httpx transport to use instead of the network; not over gRPC.
         """
         self.policy = Policy(retries, retry_wait_max)
         headers = {"user-agent": f"segsplat-python/{__version__}"}
         if api_key := api_key or os.environ.get("SEGSPLAT_API_KEY"):
             headers["authorization"] = f"Bearer {api_key}"
+        base_url = url or os.environ.get("SEGSPLAT_URL", "http://127.0.0.1:8080")
+        self._rpc = _rpc() if base_url.startswith(("grpc://", "grpcs://")) else None
         self._settings: dict[str, Any] = {
-            "base_url": url or os.environ.get("SEGSPLAT_URL", "http://127.0.0.1:8080"),
+            "base_url": base_url,
             "headers": headers,
             "timeout": httpx.Timeout(timeout, connect=10.0),
             "transport": transport,
             "verify": verify,
         }
+
+
+def _rpc() -> Any:
+    """The module for gRPC, which not everybody has installed."""
+    try:
+        from . import rpc
+    except ImportError as missing:
+        raise ImportError(f"{missing}: pip install 'segsplat[grpc]'") from missing
+    return rpc
 
 
 def _multipart(request: Request, stack: ExitStack) -> list[tuple[str, tuple[str, Any]]] | None:
@@ -80,21 +93,25 @@ def _built(
     return http.build_request(
         step.method,
         step.path,
-        params=dict(step.params),
+        params={name: _text(value) for name, value in step.params.items()},
         json=step.json,
         files=_multipart(step, stack),
         headers=dict(step.headers),
     )
 
 
-def _is_whole(step: Request, response: httpx.Response) -> bool:
-    """Whether the body is read at once: a stream that is an error is."""
-    return not step.stream or response.is_error
+def _text(value: Any) -> Any:
+    """Numbers joined by commas; lists of texts as they are, each under its name."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (list, tuple)) and not all(isinstance(one, str) for one in value):
+        return ",".join(str(one) for one in value)
+    return value
 
 
-def _answer(step: Request, response: httpx.Response) -> Answer:
-    body = response.content if _is_whole(step, response) else b""
-    return Answer(response.status_code, response.headers, body)
+def _reader(step: Request, response: httpx.Response) -> Reader | None:
+    """What reads the body as it comes; None: it is read at once, as that of an error is."""
+    return step.stream(response.headers) if step.stream and not response.is_error else None
 
 
 def _lost(error: httpx.TransportError) -> ConnectionLost:
@@ -109,24 +126,26 @@ class _Line:
     def __init__(self, http: httpx.Client) -> None:
         self._http = http
         self._response: httpx.Response | None = None
-        self._pieces: Iterator[bytes] = iter(())
+        self._items: Iterator[Any] = iter(())
 
-    def do(self, step: Step) -> Answer | bytes | ConnectionLost | None:
+    def do(self, step: Step) -> Any:
         """What came of a step."""
         try:
             if isinstance(step, Sleep):
                 time.sleep(step.seconds)
             elif isinstance(step, Read):
-                return next(self._pieces, b"")
+                return next(self._items, None)
             elif isinstance(step, Request):
                 self.__exit__()
                 with ExitStack() as files:
                     request = _built(self._http, step, files)
                     self._response = response = self._http.send(request, stream=True)
-                if _is_whole(step, response):
-                    response.read()
-                self._pieces = response.iter_bytes()
-                return _answer(step, response)
+                if reader := _reader(step, response):
+                    self._items = (
+                        item for piece in response.iter_bytes() for item in reader.feed(piece)
+                    )
+                body = b"" if reader else response.read()
+                return Answer(response.status_code, response.headers, body)
         except httpx.TransportError as error:
             return _lost(error)
         return None
@@ -145,24 +164,28 @@ class _AsyncLine:
     def __init__(self, http: httpx.AsyncClient) -> None:
         self._http = http
         self._response: httpx.Response | None = None
-        self._pieces: AsyncIterator[bytes]
+        self._items: AsyncIterator[Any]
 
-    async def do(self, step: Step) -> Answer | bytes | ConnectionLost | None:
+    async def do(self, step: Step) -> Any:
         """What came of a step."""
         try:
             if isinstance(step, Sleep):
                 await anyio.sleep(step.seconds)
             elif isinstance(step, Read):
-                return await anext(self._pieces, b"")
+                return await anext(self._items, None)
             elif isinstance(step, Request):
                 await self.__aexit__()
                 with ExitStack() as files:
                     request = _built(self._http, step, files)
                     self._response = response = await self._http.send(request, stream=True)
-                if _is_whole(step, response):
-                    await response.aread()
-                self._pieces = response.aiter_bytes()
-                return _answer(step, response)
+                if reader := _reader(step, response):
+                    self._items = (
+                        item
+                        async for piece in response.aiter_bytes()
+                        for item in reader.feed(piece)
+                    )
+                body = b"" if reader else await response.aread()
+                return Answer(response.status_code, response.headers, body)
         except httpx.TransportError as error:
             return _lost(error)
         return None
@@ -222,7 +245,7 @@ class Client(_Connection):
 
     def close(self) -> None:
         """Closes the connections."""
-        self._http.close()
+        self._door.close()
 
     def __enter__(self) -> Self:
         return self
@@ -231,19 +254,22 @@ class Client(_Connection):
         self.close()
 
     @cached_property
-    def _http(self) -> httpx.Client:
-        return httpx.Client(**self._settings)
+    def _door(self) -> Any:
+        return self._rpc.Door(**self._settings) if self._rpc else httpx.Client(**self._settings)
+
+    def _line(self) -> Any:
+        return self._rpc.Line(self._door) if self._rpc else _Line(self._door)
 
     def _run(self, flow: Flow[T]) -> T:
         run = Run(flow)
-        with _Line(self._http) as line:
+        with self._line() as line:
             while step := run.next():
                 run.reply = line.do(step)
         return run.value
 
     def _iterate(self, flow: Flow[Any]) -> Iterator[Any]:
         run = Run(flow)
-        with _Line(self._http) as line:
+        with self._line() as line:
             while step := run.next():
                 if isinstance(step, Item):
                     yield step.value
@@ -285,7 +311,7 @@ class AsyncClient(_Connection):
 
     async def close(self) -> None:
         """Closes the connections."""
-        await self._http.aclose()
+        await self._door.aclose()
 
     async def __aenter__(self) -> Self:
         return self
@@ -294,19 +320,24 @@ class AsyncClient(_Connection):
         await self.close()
 
     @cached_property
-    def _http(self) -> httpx.AsyncClient:
+    def _door(self) -> Any:
+        if self._rpc:
+            return self._rpc.Door(**self._settings, awaited=True)
         return httpx.AsyncClient(**self._settings)
+
+    def _line(self) -> Any:
+        return self._rpc.AsyncLine(self._door) if self._rpc else _AsyncLine(self._door)
 
     async def _run(self, flow: Flow[T]) -> T:
         run = Run(flow)
-        async with _AsyncLine(self._http) as line:
+        async with self._line() as line:
             while step := run.next():
                 run.reply = await line.do(step)
         return run.value
 
     async def _iterate(self, flow: Flow[Any]) -> AsyncIterator[Any]:
         run = Run(flow)
-        async with _AsyncLine(self._http) as line:
+        async with self._line() as line:
             while step := run.next():
                 if isinstance(step, Item):
                     yield step.value
@@ -405,6 +436,7 @@ class Scene(_Scene):
     pick = _now(calls.pick)
     export = _now(calls.export)
     gaussians = _now(calls.gaussians)
+    show = _now(calls.show)
     events = _many(calls.events, Event)
     views = _many(calls.views, View)
 
@@ -427,5 +459,6 @@ class AsyncScene(_Scene):
     pick = _later(calls.pick)
     export = _later(calls.export)
     gaussians = _later(calls.gaussians)
+    show = _later(calls.show)
     events = _many_later(calls.events, Event)
     views = _many_later(calls.views, View)

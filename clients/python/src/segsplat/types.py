@@ -37,8 +37,8 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 def _value(hint: Any, value: Any) -> Any:
-    if isinstance(hint, types.UnionType):  # X | None
-        return None if value is None else _value(hint.__args__[0], value)
+    if isinstance(hint, types.UnionType):  # X | None, which is empty in a message of gRPC
+        return None if value is None or value == "" else _value(hint.__args__[0], value)
     if typing.get_origin(hint) is tuple:
         return tuple(_value(hint.__args__[0], one) for one in value)
     if hint == Floats:
@@ -247,6 +247,9 @@ class Report:
     execution_provider: str
     #: What looks wrong with the capture.
     warnings: tuple[Doubt, ...] = ()
+    #: [V] focal length of each photo in the network's picture of it, pixels; 0 where it was not
+    #: used.
+    network_focal_px: tuple[float, ...] = ()
     #: Format of the file of Gaussians that the scene is; None where it was made of photos.
     file_format: str | None = None
 

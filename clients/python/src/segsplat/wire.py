@@ -1,8 +1,9 @@
 """What goes over the wire, without a socket.
 
 A call is a *flow*: a generator that yields steps (send this, read on, sleep) and is sent what came
-of each. The flow makes the requests, reads the answers and decides on retries. The two drivers in
-`client.py` only do the steps, one with blocking calls and one with `await`.
+of each. The flow makes the requests, reads the answers and decides on retries. The drivers only do
+the steps, with blocking calls or with `await`: those in `client.py` over HTTP, those in `rpc.py`
+over gRPC.
 """
 
 from __future__ import annotations
@@ -10,16 +11,23 @@ from __future__ import annotations
 import itertools
 import json
 import warnings
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
 from ._version import __version__
 from .errors import BadAnswer, ConnectionLost, SegSplatError, VersionWarning, error_of
 
 #: Waiting times of a lost connection, seconds.
 BACKOFF_S = (0.25, 0.5, 1.0, 2.0)
+
+
+class Reader(Protocol):
+    """Makes items of the pieces of a streamed body."""
+
+    def feed(self, piece: bytes) -> Iterable[Any]:
+        """The items that are whole by now."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +49,8 @@ class Request:
     json: Any = None
     upload: Sequence[Part] = ()
     headers: Mapping[str, str] = field(default_factory=dict)
-    #: The body comes piece by piece, by `Read`.
-    stream: bool = False
+    #: Makes what reads the body, which then comes item by item, by `Read`; it is given the headers.
+    stream: Callable[[Mapping[str, str]], Reader] | None = None
 
 
 @dataclass(frozen=True)
@@ -55,7 +63,7 @@ class Answer:
 
 
 class Read:
-    """Give the next piece of the streamed answer; the reply is empty at its end."""
+    """Give the next item of the streamed answer; the reply is None at its end."""
 
 
 @dataclass(frozen=True)
@@ -122,8 +130,8 @@ def send(policy: Policy, request: Request) -> Flow[Answer]:
             if answer.status < 400:
                 return answer
             error = error_of(answer.status, answer.headers, answer.body)
-        except ConnectionLost as lost:
-            error = lost
+        except SegSplatError as refused:
+            error = refused
         yield from pause(policy, error, again)
     raise AssertionError("unreachable")
 
@@ -157,7 +165,8 @@ def check_version() -> Flow[None]:
 class Multipart:
     """Reads `multipart/mixed` as it comes."""
 
-    def __init__(self, content_type: str) -> None:
+    def __init__(self, headers: Mapping[str, str]) -> None:
+        content_type = headers.get("content-type", "")
         _, found, boundary = content_type.partition("boundary=")
         if not found:
             raise BadAnswer(f"content-type {content_type!r} has no boundary")
@@ -196,7 +205,7 @@ class Multipart:
 class ServerSentEvents:
     """Reads `text/event-stream` as it comes: the `data` of each event."""
 
-    def __init__(self) -> None:
+    def __init__(self, _: Mapping[str, str]) -> None:
         self._held = b""
 
     def feed(self, piece: bytes) -> Iterable[str]:
@@ -207,3 +216,14 @@ class ServerSentEvents:
             data = [line[5:].strip() for line in lines if line.startswith("data:")]
             if data:
                 yield "\n".join(data)
+
+
+class Pieces:
+    """Reads a body as it comes, piece by piece."""
+
+    def __init__(self, _: Mapping[str, str]) -> None:
+        pass
+
+    def feed(self, piece: bytes) -> Iterable[bytes]:
+        """The piece."""
+        return (piece,)
