@@ -246,7 +246,7 @@ const CONFINED: &str = r#"
         --no-new-privs "$@"
 "#;
 
-/// As OpenShift runs the images. Needs the rights of root to give them up.
+/// As `OpenShift` runs the images. Needs the rights of root to give them up.
 #[tokio::test]
 async fn any_user_of_group_0_serves_from_a_read_only_root() {
     let mounts = Command::new("unshare").args(["--mount", "true"]).output();
