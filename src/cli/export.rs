@@ -66,7 +66,8 @@ fn gaussians(
 ) -> Result<()> {
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
     let count = scene.gaussians.len();
-    let file = SplatFile::new(format, scene.gaussians, scene.semantics.as_deref())?;
+    let semantics = scene.semantics.as_deref();
+    let file = SplatFile::of_scene(format, &scene, &scene.gaussians, semantics)?;
     scene_file::write_splats(&args.output, &file)?;
     let path = args.output.display();
     let value = json!({

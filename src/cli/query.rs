@@ -70,7 +70,8 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         match ending {
             Some(Ending::Gaussians(format)) => {
                 let chosen = service.select(&opened.scene, &found.text, &spec)?;
-                scene_file::write_splats(&path, &SplatFile::new(format, chosen, None)?)?;
+                let file = SplatFile::of_scene(format, &opened.scene, &chosen, None)?;
+                scene_file::write_splats(&path, &file)?;
             }
             _ => {
                 let mask = found.view.as_ref().and_then(|view| view.mask_png.as_deref());

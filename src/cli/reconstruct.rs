@@ -15,7 +15,7 @@ use super::{
     engine,
     output::Output,
     scene_file::{
-        open_splats, path_of, semantics_path, splat_format, unreadable, unwritable, write_splats,
+        path_of, semantics_path, splat_format, splats_of, unreadable, unwritable, write_splats,
     },
 };
 use crate::{
@@ -158,10 +158,10 @@ fn import(args: &Args, config: &Config, options: &SceneOptions, out: &Output) ->
     let begun = Instant::now();
     let file = fs_err::read(&args.photos).map_err(|e| unreadable(&args.photos, e))?;
     let sha256 = store::sha256(&file);
-    drop(file);
     // What the file has is kept.
     let options = SceneOptions { semantics: SemanticsMode::Lazy, ..options.clone() };
-    let scene = open_splats(&args.photos, &config.limits)?.into_scene(&options)?;
+    let scene = splats_of(&mut &file[..], &args.photos, &config.limits)?.into_scene(&options)?;
+    drop(file);
     let name = args.photos.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let provenance = store::provenance(vec![PhotoHash { file: name, sha256 }], &options, "");
     let (id, created_ms) = (id_of(&provenance), store::now_ms());
@@ -232,7 +232,7 @@ fn semantics(name: &str) -> Result<SemanticsMode, String> {
 fn write(path: &Path, scene: &Scene) -> Result<()> {
     let Some(format) = splat_format(path) else { return write_scene_file(path, scene) };
     let semantics = scene.semantics.as_deref();
-    write_splats(path, &SplatFile::new(format, scene.gaussians.clone(), semantics)?)
+    write_splats(path, &SplatFile::of_scene(format, scene, &scene.gaussians, semantics)?)
 }
 
 fn describe(path: &Path, scene: &Scene, total_ms: f64, out: &Output) -> Result<()> {

@@ -1,7 +1,7 @@
 //! Files of the command line: a scene file, a folder with one, or Gaussians of another program.
 
 use std::{
-    io::{self, BufReader, Write as _},
+    io::{self, BufRead, BufReader, Write as _},
     path::{Path, PathBuf},
     sync::Arc,
 };
@@ -79,18 +79,23 @@ pub(super) fn ending(path: &Path) -> String {
     path.extension().unwrap_or_default().to_string_lossy().to_ascii_lowercase()
 }
 
-/// Reads a file of Gaussians, as many as may be: it is the caller's own.
-pub(super) fn open_splats(path: &Path, limits: &Limits) -> Result<SplatsRead> {
-    let file = fs_err::File::open(path).map_err(|e| unreadable(path, e))?;
+/// Reads a file of Gaussians of this name, as many as may be: it is the caller's own.
+pub(super) fn splats_of(
+    from: &mut dyn BufRead,
+    path: &Path,
+    limits: &Limits,
+) -> Result<SplatsRead> {
     let limits = Limits { splats_bytes_max: u64::MAX, ..limits.clone() };
-    read_splats(&mut BufReader::new(file), &path.to_string_lossy(), &limits)
+    read_splats(from, &path.to_string_lossy(), &limits)
 }
 
 /// Opens a scene with its semantics, where there are some.
 pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
     let path = path_of(path);
     if let Some(format) = splat_format(&path) {
-        let scene = open_splats(&path, limits)?.into_scene(&SceneOptions::default())?;
+        let file = fs_err::File::open(&path).map_err(|e| unreadable(&path, e))?;
+        let read = splats_of(&mut BufReader::new(file), &path, limits)?;
+        let scene = read.into_scene(&SceneOptions::default())?;
         return Ok(Opened { scene, format: format.name, sha256: None });
     }
     let file = fs_err::read(&path).map_err(|e| unreadable(&path, e))?;

@@ -85,8 +85,10 @@ impl Service {
                 return Ok(Export::new(file_name, etag, chunks));
             }
             let splats = splats(format)?;
-            let write =
-                move || SplatFile::new(splats, scene.gaussians.clone(), scene.semantics.as_deref());
+            let write = move || {
+                let semantics = scene.semantics.as_deref();
+                SplatFile::of_scene(splats, &scene, &scene.gaussians, semantics)
+            };
             return Ok(gaussians(&id.to_string(), &digest, blocking(write).await??));
         };
         inner.can_understand("text")?;
@@ -99,7 +101,7 @@ impl Service {
         let file = blocking(move || {
             let of = understood.subject();
             let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &[text])?;
-            part(splats, texts.gaussians(), of.semantics)
+            part(splats, of.scene, &texts.gaussians(), of.semantics)
         })
         .await??;
         Ok(gaussians(&format!("{id}-part"), &etag, file))
@@ -160,9 +162,14 @@ fn splats(format: ExportFormat) -> Result<&'static SplatFormat> {
 }
 
 /// Some Gaussians of a scene with its bank.
-fn part(splats: &'static SplatFormat, gaussians: Gaussians, of: &Semantics) -> Result<SplatFile> {
+fn part(
+    splats: &'static SplatFormat,
+    scene: &Scene,
+    gaussians: &Gaussians,
+    of: &Semantics,
+) -> Result<SplatFile> {
     let semantics = Semantics { index: gaussians.semantic_index().to_vec(), ..of.clone() };
-    SplatFile::new(splats, gaussians, Some(&semantics))
+    SplatFile::of_scene(splats, scene, gaussians, Some(&semantics))
 }
 
 /// A file with Gaussians; `stem` is its name without the ending.

@@ -1,34 +1,21 @@
-"""A real server, the generated photos, and a headless Chromium that draws by SwiftShader.
-`SEGSPLAT_BROWSER` names the browser."""
+"""A real server, the generated photos, and the browser."""
 
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from acts import WAIT_MS, post, sample
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from browser import opened_browser
+from playwright.sync_api import Browser, Page, expect
 from served import ROOT, run, served
 
-TARGET = Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target"))
-BROWSERS = ["chromium-headless-shell", "chromium", "google-chrome"]
-SOFTWARE = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-            "--ignore-gpu-blocklist", "--enable-precise-memory-info"]
 # A name of loopback that a browser takes for another machine: plain http from there is not secure.
 FAR = "far.test"
 expect.set_options(timeout=WAIT_MS)
-
-
-def browser_program() -> str:
-    named = [os.environ.get("SEGSPLAT_BROWSER"), shutil.which(str(TARGET / "tools/chromium"))]
-    found = [one for one in [*named, *map(shutil.which, BROWSERS)] if one]
-    assert found, "no Chromium: run scripts/setup --ci, or set SEGSPLAT_BROWSER"
-    return found[0]
 
 
 @pytest.fixture(scope="session")
@@ -72,12 +59,8 @@ def splats(url: str) -> str:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=browser_program(),
-            args=[*SOFTWARE, f"--host-resolver-rules=MAP {FAR} 127.0.0.1"])
+    with opened_browser(f"--host-resolver-rules=MAP {FAR} 127.0.0.1") as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture

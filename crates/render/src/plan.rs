@@ -12,18 +12,23 @@
 //! photo gets back what the blur lost: with `w` the width of its source pixel in the world, a
 //! variance of `0.3 w² (1 - 1/p²)`. The sum of both is then what the network learnt. `w` is the
 //! depth in the photo times [`Source::scale`]; a magnification up to [`OWN_SIZE`] counts as none.
+//! [`widened`] adds it for good, for files and for refinement.
 //!
 //! **Backdrop.** Rays that meet no Gaussian show the photos' colours by direction.
 //!
 //! Each of the three is a field of [`ViewMethod`] and can be left out.
-//!
-//! [`OWN_SIZE`]: crate::constants::OWN_SIZE
 
 use std::sync::Arc;
 
+use glam::DVec3;
+use rayon::prelude::*;
+
 use crate::{
     Background, RenderRequest, Source,
-    scene::{Camera, Method, Scene},
+    constants::OWN_SIZE,
+    error::Result,
+    scene::{BLUR_PX2, Camera, Gaussians, Method, Scene, SceneCamera},
+    train::checked,
 };
 
 /// Near plane where none is asked for, as a share of the scene's median depth.
@@ -75,7 +80,7 @@ pub fn sources(scene: &Scene, camera: &Camera, method: ViewMethod) -> Arc<[Sourc
     let origin = scene.gaussians.origin();
     let focals = &scene.meta.report.network_focal_px;
     let photos = scene.meta.cameras.iter().zip(focals).zip(behind(scene, camera, method));
-    let row = |((photo, focal), behind): ((&crate::scene::SceneCamera, &f64), bool)| {
+    let row = |((photo, focal), behind): ((&SceneCamera, &f64), bool)| {
         let pose = &photo.camera.camera_to_world;
         Source {
             center: (pose.center() - origin).as_vec3().to_array(),
@@ -85,6 +90,44 @@ pub fn sources(scene: &Scene, camera: &Camera, method: ViewMethod) -> Arc<[Sourc
         }
     };
     photos.map(row).collect()
+}
+
+/// Some Gaussians of a scene with its magnification for good: what its views add to those that are
+/// shown larger than in the network's picture, for pictures whose longer side is `side` pixels.
+/// `None`: for pictures of any size, for programs that know no photos. Without a magnification in
+/// the scene's method they stay as they are.
+///
+/// # Errors
+/// `internal` where they cannot be Gaussians any more.
+pub fn widened(scene: &Scene, gaussians: &Gaussians, side: Option<u32>) -> Result<Gaussians> {
+    let (report, cameras) = (&scene.meta.report, &scene.meta.cameras);
+    if !report.method.magnify {
+        return Ok(gaussians.clone());
+    }
+    let origin = gaussians.origin();
+    // Of each photo: centre, axis, and the blur lost, at depth 1.
+    let row = |(photo, focal): (&SceneCamera, &f64)| {
+        let (lens, pose) = (photo.camera.intrinsics, &photo.camera.camera_to_world);
+        let shown = side.map_or(f64::INFINITY, |side| {
+            lens.fx * (f64::from(side) / f64::from(lens.width.max(lens.height))).min(1.0)
+        });
+        let larger = (shown / focal / f64::from(OWN_SIZE)).max(1.0);
+        let lost = f64::from(BLUR_PX2) * (1.0 - larger.powi(-2));
+        (*focal > 0.0 && lost > 0.0)
+            .then(|| (pose.center() - origin, pose.axis(), lost / focal / focal))
+    };
+    let rows: Vec<_> = cameras.iter().zip(&report.network_focal_px).map(row).collect();
+    let mut raw = gaussians.as_raw().clone();
+    let scales = raw.scales.par_iter_mut().zip(&raw.means).zip(&raw.source);
+    scales.for_each(|((scales, mean), source)| {
+        let Some(Some((center, axis, lost))) = rows.get(usize::from(source.view)) else { return };
+        let depth = (DVec3::from_array(mean.map(f64::from)) - *center).dot(*axis);
+        let wider = (lost * depth * depth) as f32;
+        for scale in scales {
+            *scale = (*scale * *scale + wider).sqrt().min(Gaussians::SCALE_MAX);
+        }
+    });
+    checked(raw)
 }
 
 /// Whether each photo is behind in a view from `camera`. A photo of which nothing is known never is

@@ -21,7 +21,8 @@ use glam::DVec3;
 use crate::{
     error::{Error, Result},
     limits::Limits,
-    scene::{Gaussians, RawGaussians, SanitizeReport, SceneId, Semantics, SourcePixel},
+    render::plan::widened,
+    scene::{Gaussians, RawGaussians, SanitizeReport, Scene, SceneId, Semantics, SourcePixel},
     store::write_semantics,
 };
 
@@ -194,6 +195,20 @@ impl SplatFile {
         let file = Self { format, gaussians, semantics: packed };
         (format.check)(&file)?;
         Ok(file)
+    }
+
+    /// Some Gaussians of a scene as a file that other programs draw: with the blur that the
+    /// scene's own views add to what they magnify.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn of_scene(
+        format: &'static SplatFormat,
+        scene: &Scene,
+        gaussians: &Gaussians,
+        semantics: Option<&Semantics>,
+    ) -> Result<Self> {
+        Self::new(format, widened(scene, gaussians, None)?, semantics)
     }
 
     /// Its format.

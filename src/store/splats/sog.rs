@@ -8,7 +8,9 @@
 //! `shN_centroids`, 64 to a row, whose numbers are in a table too, and a label in `shN_labels`.
 //! Axes are those of the scene.
 //!
-//! Lost in writing: harmonics over degree 0, the entries of the bank.
+//! Where there are more Gaussians than the palette has rows, those whose harmonics are alike share
+//! one: their set is cut in two at the median of its widest coefficient until there are as many
+//! parts. Lost in writing: the entries of the bank.
 
 use std::{
     f32::consts::{FRAC_1_SQRT_2, SQRT_2},
@@ -107,6 +109,48 @@ fn nearest(table: &[f32], value: f32) -> u8 {
     (if is_below { below } else { above }) as u8
 }
 
+/// Rows of `dim` numbers in parts of alike ones, `most` at most: which part each is in, and the mean
+/// of each part. Up to `most` rows are a part each.
+struct Palette {
+    labels: Vec<u16>,
+    centroids: Vec<f32>,
+}
+
+impl Palette {
+    fn of(rows: &[f32], dim: usize, most: usize) -> Self {
+        let n = rows.len() / dim;
+        let mut palette = Self { labels: vec![0; n], centroids: Vec::new() };
+        let mut all: Vec<u32> = (0..n as u32).collect();
+        palette.cut(rows, dim, &mut all, most.min(n));
+        palette
+    }
+
+    fn count(&self, dim: usize) -> usize {
+        self.centroids.len() / dim
+    }
+
+    /// Cuts some rows into so many parts.
+    fn cut(&mut self, rows: &[f32], dim: usize, of: &mut [u32], parts: usize) {
+        let number = |i: u32, d: usize| f64::from(rows[i as usize * dim + d]);
+        let moment = |d: usize, power: i32| {
+            of.iter().map(|i| number(*i, d).powi(power)).sum::<f64>() / of.len() as f64
+        };
+        let spread = |d: &usize| moment(*d, 2) - moment(*d, 1).powi(2);
+        if parts < 2 {
+            let label = self.count(dim) as u16;
+            self.centroids.extend((0..dim).map(|d| moment(d, 1) as f32));
+            of.iter().for_each(|i| self.labels[*i as usize] = label);
+            return;
+        }
+        let widest = (0..dim).max_by(|a, b| spread(a).total_cmp(&spread(b))).unwrap_or(0);
+        let middle = of.len() / 2;
+        of.select_nth_unstable_by(middle, |a, b| number(*a, widest).total_cmp(&number(*b, widest)));
+        let (low, high) = of.split_at_mut(middle);
+        self.cut(rows, dim, low, parts / 2);
+        self.cut(rows, dim, high, parts - parts / 2);
+    }
+}
+
 /// The three smaller numbers and 252 plus the place of the largest, which is positive.
 fn packed_quat(quat: [f32; 4]) -> [u8; 4] {
     let largest = (0..4).fold(0, |a, b| if quat[b].abs() > quat[a].abs() { b } else { a });
@@ -129,6 +173,17 @@ fn unpacked_quat([a, b, c, tag]: [u8; 4]) -> [f32; 4] {
     }
     quat[largest] = (1.0 - quat.iter().map(|q| q * q).sum::<f32>()).max(0.0).sqrt();
     quat
+}
+
+/// A picture of so many columns and rows; what is left of it is 0.
+fn webp([width, height]: [usize; 2], pixels: impl Iterator<Item = [u8; 4]>) -> io::Result<Vec<u8>> {
+    let mut rgba: Vec<u8> = pixels.flatten().collect();
+    rgba.resize(4 * width * height, 0);
+    let mut webp = Vec::new();
+    WebPEncoder::new_lossless(&mut webp)
+        .write_image(&rgba, width as u32, height as u32, ExtendedColorType::Rgba8)
+        .map_err(io::Error::other)?;
+    Ok(webp)
 }
 
 pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
@@ -163,14 +218,8 @@ pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
         zip.start_file(name, stored)?;
         zip.write_all(bytes)
     };
-    let picture = |pixel: &dyn Fn(usize) -> [u8; 4]| -> io::Result<Vec<u8>> {
-        let mut rgba: Vec<u8> = order.iter().flat_map(|&i| pixel(i as usize)).collect();
-        rgba.resize(4 * width * height, 0);
-        let mut webp = Vec::new();
-        WebPEncoder::new_lossless(&mut webp)
-            .write_image(&rgba, width as u32, height as u32, ExtendedColorType::Rgba8)
-            .map_err(io::Error::other)?;
-        Ok(webp)
+    let picture = |pixel: &dyn Fn(usize) -> [u8; 4]| {
+        webp([width, height], order.iter().map(|&i| pixel(i as usize)))
     };
     let byte = |i: usize, of: usize| {
         let [x, y, z] = position(i).map(|at| at.to_le_bytes()[of]);
@@ -193,7 +242,7 @@ pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
             [r, g, b, steps(gaussians.opacities()[i], 255).max(1) as u8]
         })?,
     )?;
-    let meta = json!({
+    let mut meta = json!({
         "version": 2,
         "asset": { "generator": concat!("segsplat ", env!("CARGO_PKG_VERSION")) },
         "count": n,
@@ -202,6 +251,31 @@ pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
         "quats": { "files": ["quats.webp"] },
         "sh0": { "codebook": colors, "files": ["sh0.webp"] },
     });
+    if k > 1 {
+        let dim = 3 * (k - 1);
+        let rest = gaussians.sh().chunks_exact(k).flat_map(|row| row[1..].as_flattened());
+        let rows: Vec<f32> = rest.copied().collect();
+        let palette = Palette::of(&rows, dim, CENTROIDS_MAX);
+        drop(rows);
+        let (numbers, count) = (&palette.centroids, palette.count(dim));
+        let codebook = table(numbers.iter().copied());
+        let (pixels, _) = numbers.as_chunks::<3>();
+        let pixels = pixels.iter().map(|&rgb| {
+            let [r, g, b] = rgb.map(|c| nearest(&codebook, c));
+            [r, g, b, 255]
+        });
+        let sides = [CENTROIDS_A_ROW * (k - 1), count.div_ceil(CENTROIDS_A_ROW)];
+        put("shN_centroids.webp", &webp(sides, pixels)?)?;
+        let label = |i: usize| {
+            let [low, high] = palette.labels[i].to_le_bytes();
+            [low, high, 0, 255]
+        };
+        put("shN_labels.webp", &picture(&label)?)?;
+        meta["shN"] = json!({
+            "count": count, "bands": gaussians.sh_degree(), "codebook": codebook,
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        });
+    }
     put("meta.json", meta.to_string().as_bytes())?;
     to.write_all(zip.finish()?.get_ref())
 }
@@ -402,5 +476,37 @@ impl Bundle<'_> {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_that_are_alike_share_a_part() {
+        // Eight places, far from each other, of 100 rows each, one after the other.
+        let place = |i: usize| [0, 1, 2].map(|d| if i >> d & 1 == 1 { 5.0_f32 } else { -5.0 });
+        let near = |i: usize, d: usize| ((i * 37 + d * 11) % 100) as f32 / 1000.0;
+        let row = |i: usize| [0, 1, 2].map(|d| place(i)[d] + near(i, d));
+        let rows: Vec<f32> = (0..800).flat_map(row).collect();
+        let palette = Palette::of(&rows, 3, 8);
+        assert_eq!(palette.count(3), 8);
+        for i in 0..800 {
+            let at = 3 * usize::from(palette.labels[i]);
+            let centroid = &palette.centroids[at..at + 3];
+            let off = centroid.iter().zip(row(i)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+            assert!(off < 0.1, "row {i}: {centroid:?}");
+        }
+        // As many parts as rows: each has its own numbers.
+        let palette = Palette::of(&rows, 3, 800);
+        let own = (0..800).all(|i| {
+            let at = 3 * usize::from(palette.labels[i]);
+            palette.centroids[at..at + 3] == row(i)
+        });
+        assert!(own && palette.count(3) == 800);
+        // Rows that are all the same.
+        let palette = Palette::of(&[0.5; 30], 3, 4);
+        assert!(palette.centroids.iter().all(|c| *c == 0.5));
     }
 }

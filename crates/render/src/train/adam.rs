@@ -185,6 +185,6 @@ pub fn checked(raw: RawGaussians) -> Result<Gaussians> {
     let (gaussians, report) = Gaussians::sanitize(raw)?;
     match gaussians.len() == count {
         true => Ok(gaussians),
-        false => Err(Error::internal(format!("training: Gaussians lost: {report:?}"))),
+        false => Err(Error::internal(format!("Gaussians lost: {report:?}"))),
     }
 }

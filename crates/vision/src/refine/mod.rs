@@ -23,8 +23,7 @@ use segsplat_render::{
     Background, Frame, Kinds, RenderRequest,
     backward::DifferentiableRenderer,
     compare::psnr,
-    constants::OWN_SIZE,
-    plan::{default_near, served},
+    plan::{default_near, served, widened},
     train::{HostTrainer, Trainer, TrainingPhoto, TrainingSet, TrainingStep, checked, unit},
 };
 
@@ -32,8 +31,7 @@ pub use segsplat_render::train::LearningRates;
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    point,
-    scene::{BLUR_PX2, Camera, Gaussians, PosedPhoto, RefineReport, Scene},
+    scene::{Camera, Gaussians, PosedPhoto, RefineReport, Scene},
 };
 
 /// Fewest photos of which one is held out.
@@ -238,7 +236,7 @@ pub fn refine(
         return Ok(work.unrefined());
     }
     let mut random = options.seed;
-    let gaussians = fewer(&blurred(first, start, options.side)?, options, &mut random)?;
+    let gaussians = fewer(&widened(start, first, Some(options.side))?, options, &mut random)?;
     let photos = learnt
         .iter()
         .map(|posed| TrainingPhoto { photo: &posed.photo, request: work.request(posed.camera) });
@@ -389,39 +387,6 @@ fn shuffled(count: usize, random: &mut u64) -> Vec<usize> {
     let mut order: Vec<(u64, usize)> = (0..count).map(|i| (next(random), i)).collect();
     order.sort_unstable();
     order.into_iter().map(|(_, i)| i).collect()
-}
-
-/// Gaussians of a scene with its magnification: what its views add to those that are shown larger
-/// than in the network's picture ([`segsplat_render::plan`]) is added for good, for photos whose
-/// longer side is `side`.
-fn blurred(gaussians: &Gaussians, scene: &Scene, side: u32) -> Result<Gaussians> {
-    let (report, cameras) = (&scene.meta.report, &scene.meta.cameras);
-    if !report.method.magnify {
-        return Ok(gaussians.clone());
-    }
-    let origin = gaussians.origin();
-    // Of each photo: centre, axis, width of a source pixel at depth 1, and share of the blur lost.
-    let rows = cameras.iter().zip(&report.network_focal_px).map(|(photo, focal)| {
-        let (lens, pose) = (photo.camera.intrinsics, &photo.camera.camera_to_world);
-        let shown = lens.fx * (f64::from(side) / f64::from(lens.width.max(lens.height))).min(1.0);
-        let larger = (shown / focal / f64::from(OWN_SIZE)).max(1.0);
-        let lost = f64::from(BLUR_PX2) * (1.0 - larger.powi(-2));
-        (*focal > 0.0 && lost > 0.0)
-            .then(|| (pose.center() - origin, pose.axis(), lost / focal / focal))
-    });
-    let rows: Vec<_> = rows.collect();
-    let mut raw = gaussians.as_raw().clone();
-    let scales = raw.scales.par_iter_mut().zip(&raw.means).zip(&raw.source);
-    scales.for_each(|((scales, mean), source)| {
-        let Some(Some((center, axis, lost))) = rows.get(usize::from(source.view)) else { return };
-        let depth = (point(*mean) - *center).dot(*axis);
-        #[expect(clippy::cast_possible_truncation, reason = "scales are f32")]
-        let wider = (lost * depth * depth) as f32;
-        for scale in scales {
-            *scale = (*scale * *scale + wider).sqrt().min(Gaussians::SCALE_MAX);
-        }
-    });
-    checked(raw)
 }
 
 /// At most as many of the Gaussians as `options` say, chosen at random; as much wider as there are

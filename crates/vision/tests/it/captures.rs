@@ -122,6 +122,23 @@ fn every_layout_gives_the_same_photos_however_it_is_sent() {
     }
 }
 
+/// Record3D's own file is a zip of another folder, with depth beside the photos.
+#[test]
+fn a_file_of_record3d_is_read_as_its_export() {
+    let mut files = written("record3d");
+    for file in &mut files {
+        file.name = file.name.replace("EXR_RGBD/", "").replace("rgb/", "rgbd/");
+    }
+    for name in ["rgbd/0.depth", "rgbd/0.conf", "icon", "sound.m4a"] {
+        files.push(UploadFile { name: name.to_owned(), bytes: b"?".to_vec() });
+    }
+    let ReadPhotos { photos, warnings } = from_archive(zipped(&files, ""));
+    assert_eq!(warnings, []);
+    let (posed, _) = sent();
+    assert_eq!(photos.len(), 3);
+    assert!(photos.iter().zip(&posed).all(|(a, b)| apart(a, b) < 1e-13));
+}
+
 /// Files of two captures in one folder.
 fn both(a: &str, b: &str) -> Vec<UploadFile> {
     let mut all = written(a);

@@ -1,4 +1,5 @@
-//! The "EXR + RGB" export of `Record3D`: the JSON file `metadata` and `rgb/0.jpg`, `rgb/1.jpg`, …
+//! `Record3D`: the JSON file `metadata` and `rgb/0.jpg`, `rgb/1.jpg`, … in its "EXR + RGB" export,
+//! `rgbd/0.jpg` beside `0.depth` and `0.conf` in its own `.r3d` file, which is a zip.
 //!
 //! `poses[i]` is camera-to-world of photo i: a quaternion x y z w and a translation, camera x
 //! right, y up, z backwards. `K` is column by column, for `w` x `h` pixels;
@@ -20,6 +21,17 @@ use crate::{
 
 pub(super) struct Record3d;
 
+/// Folders of photos beside the metadata.
+const FOLDERS: [&str; 2] = ["rgb", "rgbd"];
+
+/// The photos that belong to the metadata in `root`.
+fn photos<'a>(folder: &'a Folder<'_>, root: &'a str) -> impl Iterator<Item = &'a str> {
+    let dirs = FOLDERS.map(|name| names::join(root, name));
+    folder
+        .paths()
+        .filter(move |path| names::is_photo(path) && dirs.iter().any(|d| names::folder(path) == *d))
+}
+
 /// The first `N` numbers of a list, NaN where one is no number.
 fn list<const N: usize>(value: Option<&Value>) -> Option<[f64; N]> {
     let list = value?.as_array().filter(|list| list.len() >= N)?;
@@ -34,9 +46,7 @@ impl Layout for Record3d {
     fn find(&self, folder: &Folder<'_>) -> Vec<String> {
         let is_metadata = |path: &&str| {
             matches!(names::file_name(path), "metadata" | "metadata.json")
-                && folder
-                    .paths()
-                    .any(|photo| names::folder(photo) == names::join(names::folder(path), "rgb"))
+                && photos(folder, names::folder(path)).next().is_some()
         };
         folder.paths().filter(is_metadata).map(str::to_owned).collect()
     }
@@ -51,10 +61,7 @@ impl Layout for Record3d {
         let poses = poses.ok_or_else(|| missing("the list `poses` is missing"))?;
         let own = json.get("perFrameIntrinsicCoeffs");
         let root = names::folder(at);
-        let rgb = names::join(root, "rgb");
-        let mut photos: Vec<(usize, &str)> = folder
-            .paths()
-            .filter(|path| names::folder(path) == rgb)
+        let mut photos: Vec<(usize, &str)> = photos(folder, root)
             .filter_map(|path| {
                 let stem = names::stem(names::file_name(path))?;
                 Some((stem.parse().ok()?, path))
