@@ -230,3 +230,22 @@ fn a_cut_selects_from_its_relevancy_on_and_no_less() {
         assert_eq!([rows[0], rows[1], rows[2]], [mask[0], mask[1], mask[3]], "cut {cut}");
     }
 }
+
+#[test]
+fn an_entry_far_under_the_best_one_of_its_text_is_left_out() {
+    // Over the canon by 1, 0.95 and 0.2.
+    let rows = [X, [0.9988, 0.0488], [0.7763, 0.6303]];
+    let selected = |preset| {
+        let scorer = scorer(&rows, preset);
+        let text = scorer.text(&X).unwrap();
+        let view = view(&[&[(1, 1.0)], &[(2, 1.0)], &[(3, 1.0)], &[(1, 0.9), (3, 0.1)]]);
+        let mask = scorer.mask(&text, &view).unwrap();
+        let alone: Vec<bool> = (1..=3).map(|m| text.selects(m)).collect();
+        assert_eq!(alone, mask[..3], "{preset:?}");
+        let over: Vec<bool> = text.relevancies()[1..].iter().map(|v| *v >= 0.5).collect();
+        assert_eq!(alone, over, "{preset:?}");
+        mask
+    };
+    assert_eq!(selected(Preset::Default), [true, true, false, true]);
+    assert_eq!(selected(Preset::Paper), [true; 4]);
+}
