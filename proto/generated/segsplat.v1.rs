@@ -309,6 +309,9 @@ pub struct Scoring {
     /// Coverage under which a pixel has no relevancy, 0..1.
     #[prost(double, optional, tag = "5")]
     pub coverage_floor: ::core::option::Option<f64>,
+    /// An entry that fits a text by so much less than the best one (cosine, 0..2) is not selected.
+    #[prost(double, optional, tag = "6")]
+    pub near_best: ::core::option::Option<f64>,
 }
 /// Texts asked of a scene.
 #[derive(Clone, PartialEq, ::prost::Message)]

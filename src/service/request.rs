@@ -415,6 +415,10 @@ pub struct ScoringOptions {
     /// Coverage under which a pixel has no relevancy, 0 to 1.
     #[arg(long)]
     pub coverage_floor: Option<f64>,
+    /// An entry that fits a text by so much less than the best one (cosine, 0 to 2) is not
+    /// selected.
+    #[arg(long)]
+    pub near_best: Option<f64>,
 }
 
 impl ScoringOptions {
@@ -426,6 +430,7 @@ impl ScoringOptions {
             cut: self.cut.unwrap_or(of.cut),
             unit_rows: self.unit_rows.unwrap_or(of.unit_rows),
             coverage_floor: self.coverage_floor.unwrap_or(of.coverage_floor),
+            near_best: self.near_best.unwrap_or(of.near_best),
         }
     }
 }

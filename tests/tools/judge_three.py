@@ -73,8 +73,8 @@ def judged(page: Page, glb: Path, camera: dict, out: Path) -> list[str]:
     focal = k["fy"] * height / k["height"]
     pose = np.array(camera["camera_to_world"]).reshape(4, 4)
     fov = float(np.degrees(2 * np.arctan(height / 2 / focal)))
-    shown = page.evaluate("(given) => shown(...given)",
-                          ["/files/" + glb.name, (TURN @ pose @ TURN).ravel().tolist(), fov, width, height])
+    given = ["/files/" + glb.name, (TURN @ pose @ TURN).ravel().tolist(), fov, width, height]
+    shown = page.evaluate("(given) => shown(...given)", given)
     theirs = Image.open(io.BytesIO(base64.b64decode(shown["png"].split(",")[1]))).convert("RGB")
     ours = out / f"{glb.stem}.ours.png"
     run("render", glb, "-o", ours, "--camera-to-world", ",".join(map(repr, pose.ravel().tolist())),

@@ -257,8 +257,9 @@ pub(super) fn scene_options(header: &pb::CreateSceneHeader) -> Result<SceneOptio
 
 /// Changes of how texts are scored.
 fn scoring(scoring: Option<pb::Scoring>) -> ScoringOptions {
-    let pb::Scoring { canon, tau, cut, unit_rows, coverage_floor } = scoring.unwrap_or_default();
-    ScoringOptions { canon, tau, cut, unit_rows, coverage_floor }
+    let pb::Scoring { canon, tau, cut, unit_rows, coverage_floor, near_best } =
+        scoring.unwrap_or_default();
+    ScoringOptions { canon, tau, cut, unit_rows, coverage_floor, near_best }
 }
 
 fn scored(method: ScoringMethod) -> pb::Scoring {
@@ -268,6 +269,7 @@ fn scored(method: ScoringMethod) -> pb::Scoring {
         cut: Some(method.cut),
         unit_rows: Some(method.unit_rows),
         coverage_floor: Some(method.coverage_floor),
+        near_best: Some(method.near_best),
     }
 }
 

@@ -25,6 +25,7 @@ use crate::{
         TAU_RANGE,
     },
     render::plan::NEAR_RANGE,
+    scene::ScoringMethod,
 };
 
 /// Schemas of what callers send, whose fields have bounds. Those of answers have none.
@@ -201,6 +202,7 @@ fn bounds(limits: &Limits) -> Value {
         "canon": list(&text, CANON_MAX),
         "tau": range(TAU_RANGE),
         "cut": range([0.0, 1.0]), "coverage_floor": range([0.0, 1.0]),
+        "near_best": range([0.0, ScoringMethod::NEAR_BEST_MAX]),
         "cameras": some(&Value::Null, limits.cameras_max),
         "kinds": some(&Value::Null, limits.kinds_max),
     })

@@ -109,8 +109,8 @@ fn nearest(table: &[f32], value: f32) -> u8 {
     (if is_below { below } else { above }) as u8
 }
 
-/// Rows of `dim` numbers in parts of alike ones, `most` at most: which part each is in, and the mean
-/// of each part. Up to `most` rows are a part each.
+/// Rows of `dim` numbers in parts of alike ones, `most` at most: which part each is in, and the
+/// mean of each part. Up to `most` rows are a part each.
 struct Palette {
     labels: Vec<u16>,
     centroids: Vec<f32>,

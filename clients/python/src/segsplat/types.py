@@ -447,6 +447,8 @@ class Scoring:
     coverage_floor: float
     #: Relevancy from which a text selects, 0 to 1.
     cut: float
+    #: An entry that fits a text by so much less than the best one (cosine) was not selected.
+    near_best: float
 
 
 class Matches(Sequence[Match]):

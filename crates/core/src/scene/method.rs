@@ -228,6 +228,8 @@ pub struct ScoringMethod {
     pub coverage_floor: f64,
     /// Relevancy from which a text selects, 0..1.
     pub cut: f64,
+    /// An entry that fits a text by so much less than the best one (cosine, 0..2) is not selected.
+    pub near_best: f64,
 }
 
 impl ScoringMethod {
@@ -237,17 +239,29 @@ impl ScoringMethod {
     pub const TAU: f64 = 10.0;
     /// Where a text is nearer than every canonical text.
     pub const CUT: f64 = 0.5;
+    /// Of `default`; chosen on rendered scenes and held-out photographs.
+    pub const NEAR_BEST: f64 = 0.1;
+    /// No entry is left out: cosines are apart by 2 at most.
+    pub const NEAR_BEST_MAX: f64 = 2.0;
 
     /// The values of a preset; `default` takes those of the bundle.
     pub fn of(preset: Preset, canon: Vec<String>, tau: f64, coverage_floor: f64) -> Self {
         match preset {
-            Preset::Default => Self { unit_rows: true, canon, tau, coverage_floor, cut: Self::CUT },
+            Preset::Default => Self {
+                unit_rows: true,
+                canon,
+                tau,
+                coverage_floor,
+                cut: Self::CUT,
+                near_best: Self::NEAR_BEST,
+            },
             Preset::Paper => Self {
                 unit_rows: false,
                 canon: Self::CANON.map(str::to_owned).to_vec(),
                 tau: Self::TAU,
                 coverage_floor: 0.0,
                 cut: Self::CUT,
+                near_best: Self::NEAR_BEST_MAX,
             },
         }
     }
@@ -265,7 +279,8 @@ impl ScoringMethod {
         }
         within("tau", self.tau, TAU_RANGE)?;
         within("coverage_floor", self.coverage_floor, [0.0, 1.0])?;
-        within("cut", self.cut, [0.0, 1.0])
+        within("cut", self.cut, [0.0, 1.0])?;
+        within("near_best", self.near_best, [0.0, Self::NEAR_BEST_MAX])
     }
 }
 

@@ -17,6 +17,9 @@ use crate::{
 
 /// Phrases in one blend of four numbers; the fourth number is the coverage.
 const GROUP: usize = 3;
+/// Difference of cosines of an entry that fits a text much less than the best one does: under the
+/// canon, as entries of other things are.
+const LEFT_OUT: f64 = -0.05;
 /// Pixels of a task.
 const PIXELS_EACH: usize = 4096;
 
@@ -29,6 +32,8 @@ pub struct Scoring {
     coverage_floor: f64,
     /// Least difference of cosines that is selected: the relevancy there is the cut.
     margin: f64,
+    /// Difference of cosines by which an entry may fit a text less than the best entry does.
+    near_best: f64,
 }
 
 impl Scoring {
@@ -49,10 +54,10 @@ impl Scoring {
                 method.canon.len()
             )));
         }
-        let ScoringMethod { unit_rows, tau, coverage_floor, cut, .. } = *method;
+        let ScoringMethod { unit_rows, tau, coverage_floor, cut, near_best, .. } = *method;
         // Exactly 0 for a cut of 0.5.
         let margin = (cut / (1.0 - cut)).ln() / tau;
-        Ok(Self { unit_rows, canon, tau, coverage_floor, margin })
+        Ok(Self { unit_rows, canon, tau, coverage_floor, margin, near_best })
     }
 
     /// A pixel with less coverage has relevancy 0.
@@ -271,12 +276,22 @@ impl Scorer {
             norms: Arc::clone(&self.norms),
             margin: self.scoring.margin,
         };
-        let alone = (1..).zip(&*self.norms).map(|(m, length)| {
+        let leads = (1..).zip(&*self.norms).map(|(m, length)| {
             let [least, ..] = text.blend(&[m], &[1.0]);
-            if *length > 0.0 { self.sharpen(least / length) } else { 0.0 }
+            if *length > 0.0 { least / length } else { f64::NEG_INFINITY }
         });
-        let alone: Vec<f32> = alone.collect();
-        text.relevancies.extend(alone);
+        let mut leads: Vec<f64> = leads.collect();
+        // docs/adr/0062-near-the-best-entry.md
+        let best = leads.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+        for (row, lead) in leads.iter_mut().enumerate() {
+            if *lead >= 0.0 && *lead < best - self.scoring.near_best {
+                *lead = LEFT_OUT;
+                let score = LEFT_OUT * self.norms[row];
+                text.groups.iter_mut().for_each(|rows| rows[row + 1] = [1.0, score, score, score]);
+                text.nearer[row + 1] = u64::MAX;
+            }
+        }
+        text.relevancies.extend(leads.iter().map(|lead| self.sharpen(*lead)));
         Ok(text)
     }
 

@@ -22,6 +22,15 @@ fn new(preset: Preset, canon: Vec<Vec<f32>>, tau: f64, floor: f64) -> Result<Sco
     Scoring::new(&ScoringMethod { canon: names, tau, ..method }, canon)
 }
 
+/// The default, where no entry is left out for being far under the best one.
+fn all_over_the_canon(canon: &[[f32; 2]]) -> Arc<Scoring> {
+    let names: Vec<String> = (0..canon.len()).map(|c| c.to_string()).collect();
+    let near_best = ScoringMethod::NEAR_BEST_MAX;
+    let method = ScoringMethod::of(Preset::Default, names, 10.0, 0.05);
+    let canon = canon.iter().map(|c| c.to_vec()).collect();
+    Arc::new(Scoring::new(&ScoringMethod { near_best, ..method }, canon).unwrap())
+}
+
 const X: [f32; 2] = [1.0, 0.0];
 const Y: [f32; 2] = [0.0, 1.0];
 
@@ -109,7 +118,7 @@ fn the_worst_phrase_decides_and_blended_tables_say_the_same() {
                 [turn.cos(), turn.sin()]
             })
             .collect();
-        let scoring = scoring(Preset::Default, &canon);
+        let scoring = all_over_the_canon(&canon);
         let scorer = Scorer::new(&bank, Arc::clone(&scoring)).unwrap();
         let text = scorer.text(&X).unwrap();
         let want = 1.0 / (1.0 + (-10.0 * (1.0 - f64::from(canon[count - 1][0]))).exp());
@@ -229,4 +238,23 @@ fn a_cut_selects_from_its_relevancy_on_and_no_less() {
         }
         assert_eq!([rows[0], rows[1], rows[2]], [mask[0], mask[1], mask[3]], "cut {cut}");
     }
+}
+
+#[test]
+fn an_entry_far_under_the_best_one_of_its_text_is_left_out() {
+    // Over the canon by 1, 0.95 and 0.2.
+    let rows = [X, [0.9988, 0.0488], [0.7763, 0.6303]];
+    let selected = |preset| {
+        let scorer = scorer(&rows, preset);
+        let text = scorer.text(&X).unwrap();
+        let view = view(&[&[(1, 1.0)], &[(2, 1.0)], &[(3, 1.0)], &[(1, 0.9), (3, 0.1)]]);
+        let mask = scorer.mask(&text, &view).unwrap();
+        let alone: Vec<bool> = (1..=3).map(|m| text.selects(m)).collect();
+        assert_eq!(alone, mask[..3], "{preset:?}");
+        let over: Vec<bool> = text.relevancies()[1..].iter().map(|v| *v >= 0.5).collect();
+        assert_eq!(alone, over, "{preset:?}");
+        mask
+    };
+    assert_eq!(selected(Preset::Default), [true, true, false, true]);
+    assert_eq!(selected(Preset::Paper), [true; 4]);
 }
