@@ -251,7 +251,7 @@ fn a_step_that_lacks_room_is_taken_once() {
         let pairs: Vec<u64> = photos
             .iter()
             .map(|(request, _)| gpu.render(&truth, request).expect("a picture"))
-            .map(|frame| frame.stats.intersections.into())
+            .map(|frame| frame.stats.intersections)
             .collect();
         assert!(pairs[0] > 1 << 16 && pairs[1] < 1 << 16, "{pairs:?} pairs");
         let start = disturbed(&truth);
