@@ -270,7 +270,7 @@ async fn any_user_of_group_0_serves_from_a_read_only_root() {
         assert!(status.contains(line), "{line}: {status}");
     }
     let mounts = fs::read_to_string(format!("/proc/{}/mounts", server.id())).unwrap();
-    let root_fs = mounts.lines().filter(|line| line.split(' ').nth(1) == Some("/")).last();
+    let root_fs = mounts.lines().rfind(|line| line.split(' ').nth(1) == Some("/"));
     assert!(root_fs.is_some_and(|line| line.contains(" ro,")), "{mounts}");
 
     let options = SampleOptions { photos: 2, width: 64, height: 48, seed: 1 };

@@ -154,7 +154,7 @@ async fn a_file_has_the_blur_of_magnified_views() {
     let mut ask = Ask::default().with_numbers("camera_to_world", &numbers);
     // Four times as large as the photo.
     for name in ["fx", "fy", "cx", "cy", "width", "height"] {
-        ask = ask.with(name, &(4.0 * camera["intrinsics"][name].as_f64().unwrap()));
+        ask = ask.with(name, 4.0 * camera["intrinsics"][name].as_f64().unwrap());
     }
     let ask = ask.with("near", 0.05).with_numbers("background", &[0.0; 3]).with("format", "npy");
     let http = doors::http(server.addr);
