@@ -122,7 +122,7 @@ fn every_layout_gives_the_same_photos_however_it_is_sent() {
     }
 }
 
-/// Record3D's own file is a zip of another folder, with depth beside the photos.
+/// `Record3D`'s own file is a zip of another folder, with depth beside the photos.
 #[test]
 fn a_file_of_record3d_is_read_as_its_export() {
     let mut files = written("record3d");
