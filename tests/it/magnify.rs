@@ -1,6 +1,7 @@
 //! Views larger than the network's own pictures: no dot grid, and no change at its own size.
 
 use segsplat::{
+    limits::Limits,
     render::{
         Frame, Kinds, RenderRequest, Renderer,
         cpu::CpuRenderer,
@@ -8,8 +9,9 @@ use segsplat::{
     },
     scene::{
         Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, Provenance,
-        RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
+        RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SceneOptions, SourcePixel,
     },
+    store::splats::{GLB, SplatFile, read_splats},
 };
 
 const SIDE: u16 = 48;
@@ -94,4 +96,34 @@ fn a_magnified_wall_has_no_dot_grid() {
     let filled = least(drawn(&scene, camera(4), true));
     assert!(gap < 0.5 * own, "without it the wall has gaps: {gap} against {own}");
     assert!(filled > 0.85 * own, "with it the wall is whole: {filled} against {own}");
+}
+
+/// Programs that know nothing of photos show a file as views show the scene, near it too.
+#[test]
+fn a_file_has_the_blur_of_magnified_views() {
+    let scene = wall();
+    let mut files = vec![Vec::new(); 2];
+    let file = SplatFile::of_scene(&GLB, &scene, &scene.gaussians, None).expect("a file");
+    file.write(&mut files[0]).expect("memory");
+    let read = |file: &[u8]| {
+        let read = read_splats(&mut &file[..], "a.glb", &Limits::default()).expect("a file");
+        read.into_scene(&SceneOptions::default()).expect("a scene")
+    };
+    let again = read(&files[0]);
+    for zoom in [2, 4, 8] {
+        let camera = camera(zoom);
+        let [view, shown] =
+            [drawn(&scene, camera, true), drawn(&again, camera, false)].map(|frame| {
+                let pixels = frame.alpha.expect("alpha was asked for");
+                (pixels.iter().sum::<f32>() / pixels.len() as f32, pixels)
+            });
+        assert!((view.0 - shown.0).abs() < 0.05, "{zoom}: {} is not {}", shown.0, view.0);
+        let gap = least(drawn(&scene, camera, false));
+        let filled = least(drawn(&again, camera, false));
+        assert!(filled > 0.8, "{zoom}: {filled}, without the blur {gap}");
+    }
+    // It is there once: a file of a file is the same.
+    let file = SplatFile::of_scene(&GLB, &again, &again.gaussians, None).expect("a file");
+    file.write(&mut files[1]).expect("memory");
+    assert!(read(&files[1]).gaussians.scales() == again.gaussians.scales());
 }

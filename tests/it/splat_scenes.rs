@@ -143,38 +143,6 @@ async fn a_scene_that_is_exported_and_posted_again_gives_the_same_views() {
     server.stop().await;
 }
 
-/// Programs that know nothing of photos show a file as this one shows the scene, near it too.
-#[tokio::test]
-async fn a_file_has_the_blur_of_magnified_views() {
-    let server = CpuServer::start().await;
-    let made = post(&server, &cpu_server::upload(), "").await.unwrap();
-    let id = made["id"].as_str().unwrap();
-    let camera = &made["cameras"][1];
-    let numbers: Vec<f64> = serde_json::from_value(camera["camera_to_world"].clone()).unwrap();
-    let mut ask = Ask::default().with_numbers("camera_to_world", &numbers);
-    // Four times as large as the photo.
-    for name in ["fx", "fy", "cx", "cy", "width", "height"] {
-        ask = ask.with(name, 4.0 * camera["intrinsics"][name].as_f64().unwrap());
-    }
-    let ask = ask.with("near", 0.05).with_numbers("background", &[0.0; 3]).with("format", "npy");
-    let http = doors::http(server.addr);
-    let truth = pixels(&http.view(id, &ask).await.unwrap());
-    let without = ask.clone().with("magnify", false);
-    let without = psnr(&pixels(&http.view(id, &without).await.unwrap()), &truth, None);
-    let file = upload("a.glb", http.export_as(id, GLB.name).await.unwrap());
-    let (again, _) = http.create(&file, &Options::wait()).await.unwrap();
-    let found = psnr(&pixels(&http.view(&again, &ask).await.unwrap()), &truth, None);
-    println!("{found:.1} dB, without the blur {without:.1} dB");
-    assert!(found > 35.0 && found > without + 10.0, "{found:.1} dB, without {without:.1} dB");
-    // It is there once: a file of a file is the same.
-    let second = http.export_as(&again, GLB.name).await.unwrap();
-    let limits = server.service.limits();
-    let [one, two] = [&file.splats.unwrap().bytes, &second]
-        .map(|file| read_splats(&mut &file[..], "", &limits).unwrap().gaussians);
-    assert!(one.scales() == two.scales());
-    server.stop().await;
-}
-
 /// It has a camera, is listed, watched and deleted as any scene.
 #[tokio::test]
 async fn a_file_is_a_scene_like_any_other() {
