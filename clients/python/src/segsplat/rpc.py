@@ -40,7 +40,7 @@ METHODS = {
     **{"pick": "Pick", "export": "Export", "models": "Models"},
     **{"POST": "CreateScene", "GET": "GetScene", "DELETE": "DeleteScene"},
 }
-SCORING = ("canon", "tau", "cut", "unit_rows", "coverage_floor")
+SCORING = ("canon", "tau", "cut", "unit_rows", "coverage_floor", "near_best")
 NAMED = {"black": "#000000", "white": "#ffffff"}
 
 
