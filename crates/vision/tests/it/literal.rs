@@ -78,28 +78,55 @@ struct Truth {
     least: f64,
 }
 
+/// Rows far under the best one of a text, and whether a rounding could decide about one of them.
+fn left_out(bank: &Bank, text: &[f32], canon: &[Vec<f32>]) -> (Vec<bool>, bool) {
+    let cosine = |m: usize, with: &[f32]| -> f64 {
+        let of = |with: &[f32]| -> f64 {
+            bank.row(m).iter().zip(with).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum()
+        };
+        of(with) / of(bank.row(m)).sqrt().max(1e-300)
+    };
+    let lead = |m: usize| {
+        let differences = canon.iter().map(|c| cosine(m, text) - cosine(m, c));
+        differences.fold(f64::INFINITY, f64::min)
+    };
+    let leads: Vec<f64> = (0..bank.len()).map(lead).collect();
+    let edge = leads.iter().copied().fold(f64::NEG_INFINITY, f64::max) - ScoringMethod::NEAR_BEST;
+    let doubt = |lead: &f64| edge > 0.0 && (lead.abs() < 1e-6 || (lead - edge).abs() < 1e-6);
+    (leads.iter().map(|lead| (0.0..edge).contains(lead)).collect(), leads.iter().any(doubt))
+}
+
 fn literal_pixel(
     weights: &[f64],
     bank: &Bank,
     profile: Preset,
     text: &[f32],
     canon: &[Vec<f32>],
+    left_out: &[bool],
 ) -> Truth {
-    let mut feature = vec![0.0_f64; DIM];
+    // What is left out has the score of another thing, by docs/adr/0062-near-the-best-entry.md.
+    let (mut feature, mut near, mut under) = (vec![0.0_f64; DIM], vec![0.0_f64; DIM], 0.0);
     for (m, weight) in weights.iter().enumerate().filter(|(_, weight)| **weight != 0.0) {
         let row: Vec<f64> = bank.row(m).iter().map(|v| f64::from(*v)).collect();
         let length = match profile {
             Preset::Default => row.iter().map(|v| v * v).sum::<f64>().sqrt().max(1e-300),
             Preset::Paper => 1.0,
         };
-        feature.iter_mut().zip(row).for_each(|(sum, v)| *sum += weight * v / length);
+        let add = |to: &mut [f64]| {
+            to.iter_mut().zip(&row).for_each(|(sum, v)| *sum += weight * v / length);
+        };
+        add(&mut feature);
+        match left_out[m] {
+            true => under -= 0.05 * weight,
+            false => add(&mut near),
+        }
     }
     let coverage: f64 = weights.iter().sum();
     let norm = feature.iter().map(|v| v * v).sum::<f64>().sqrt();
     let score = |with: &[f32]| -> f64 {
-        feature.iter().zip(with).map(|(a, b)| a * f64::from(*b)).sum::<f64>()
+        near.iter().zip(with).map(|(a, b)| a * f64::from(*b)).sum::<f64>()
     };
-    let differences = canon.iter().map(|c| score(text) - score(c));
+    let differences = canon.iter().map(|c| score(text) - score(c) + under);
     let least = differences.fold(f64::INFINITY, f64::min);
     let floor = if profile == Preset::Default { FLOOR } else { 0.0 };
     let mut relevancy = 0.0;
@@ -107,7 +134,8 @@ fn literal_pixel(
         // min over phrases of the sigmoid = sigmoid of the least difference of cosines.
         relevancy = canon
             .iter()
-            .map(|c| 1.0 / (1.0 + (-TAU * (score(text) / norm - score(c) / norm)).exp()))
+            .map(|c| (score(text) - score(c) + under) / norm)
+            .map(|difference| 1.0 / (1.0 + (-TAU * difference).exp()))
             .fold(f64::INFINITY, f64::min);
     }
     if relevancy < 0.5 {
@@ -149,6 +177,13 @@ impl View<'_> {
         let unit = scorer.scoring().unit_rows();
         let profile = if unit { Preset::Default } else { Preset::Paper };
         let scores = scorer.text(text).expect("a text");
+        let (left_out, doubtful) = match profile {
+            Preset::Default => left_out(bank, text, canon),
+            Preset::Paper => (vec![false; bank.len()], false),
+        };
+        if doubtful {
+            return;
+        }
         let pictures: Vec<Vec<[f32; 4]>> = scores
             .tables()
             .into_iter()
@@ -170,7 +205,7 @@ impl View<'_> {
         all.cases += 1;
         let floor = scorer.scoring().coverage_floor();
         for (p, weights) in self.dense.iter().enumerate() {
-            let truth = literal_pixel(weights, bank, profile, text, canon);
+            let truth = literal_pixel(weights, bank, profile, text, canon, &left_out);
             all.pixels += 1;
             assert!(
                 map[p].is_finite() && (map[p] >= 0.5 || map[p] == 0.0),
