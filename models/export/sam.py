@@ -170,6 +170,46 @@ class SumNorm(torch.autograd.Function):
         return g.op("com.microsoft::SkipLayerNormalization", x, skip, weight, shift, bias, epsilon_f=epsilon)
 
 
+def doubled(weight, x):
+    """A transposed convolution of 2 x 2 and stride 2, without its bias: each cell makes four, `[R, c]` to `[4 R, c']`."""
+    channels = weight.shape[1]
+    return (x @ weight.permute(0, 2, 3, 1).reshape(-1, 4 * channels)).reshape(-1, channels)
+
+
+class CentredNorm(torch.nn.Module):
+    """The bias and the norm after a transposed convolution, whose weights are then `weight`: sums, products and one product
+    of matrices, each of which goes over all rows once. ONNX Runtime's norms have a thread block for each row, and here rows
+    are many and short. Weights and bias are centred over the channels, so that no row has a mean, and have the norm's own
+    weight. The mean of the squares of eight rows is a product with eight columns: one column alone is slow on a GPU."""
+
+    ROWS = 8
+
+    def __init__(self, step, norm, before):
+        super().__init__()
+        # A weight that is next to nothing hides what its channel adds to the squares: then it comes after them.
+        small = norm.weight.abs()
+        early = norm.weight if small.min() * 32 > small.max() else torch.ones_like(norm.weight)
+        centred = step.weight - step.weight.mean(dim=1, keepdim=True)
+        bias = step.bias - step.bias.mean()
+        # f16 holds squares of 0.01 to 255 well. Rows come from a norm, so their size is known: it becomes about 1, by a
+        # power of two.
+        size = centred.square() * (before.weight.square() + before.bias.square()).reshape(-1, 1, 1, 1)
+        scale = 2.0 ** -torch.log2((size.sum(0).mean() + bias.square().mean()).sqrt()).round()
+        self.register_buffer("weight", centred * early.reshape(1, -1, 1, 1) * scale)
+        self.register_buffer("bias", (bias * early * scale).reshape(1, -1))
+        self.register_buffer("late", (norm.weight / early).reshape(1, -1))
+        self.register_buffer("shift", norm.bias.reshape(1, -1))
+        self.register_buffer("means", torch.block_diag(*[1 / (len(early) * early.square()).reshape(-1, 1)] * self.ROWS))
+        self.whole = bool((self.late == 1).all())
+        self.epsilon = max(float(norm.eps * scale**2), 2.0**-20)
+
+    def forward(self, x):
+        x = x + self.bias
+        squares = ((x * x).reshape(-1, self.means.shape[0]) @ self.means).reshape(-1, 1)
+        x = x * (squares + self.epsilon).sqrt().reciprocal()
+        return (x if self.whole else x * self.late) + self.shift
+
+
 class Decoder(torch.nn.Module):
     """`SamOnnxModel` without former masks and without enlarging, for any number of prompts, in an order that goes over the
     cells of all prompts less often. What is the same for all prompts is computed once, and both steps of the enlarging
@@ -178,6 +218,8 @@ class Decoder(torch.nn.Module):
     def __init__(self, sam):
         super().__init__()
         self.masks, self.side = sam.mask_decoder, sam.image_encoder.img_size // 16
+        first, norm = sam.mask_decoder.output_upscaling[:2]
+        self.first = CentredNorm(first, norm, sam.mask_decoder.transformer.layers[-1].norm4)
         self.register_buffer("places", sam.prompt_encoder.get_dense_pe().flatten(2).permute(0, 2, 1))
         self.register_buffer("dense", sam.prompt_encoder.no_mask_embed.weight)
 
@@ -199,23 +241,15 @@ class Decoder(torch.nn.Module):
         last = tokens_see_image(own.final_attn_token_to_image, found + tokens, cells + self.places, cells)
         return own.norm_final_attn(found + last), cells
 
-    @staticmethod
-    def doubled(step, x):
-        """A transposed convolution of 2 x 2 and stride 2, without its bias: each cell makes four, `[R, c]` to `[4 R, c']`."""
-        channels = step.bias.shape[0]
-        return (x @ step.weight.permute(0, 2, 3, 1).reshape(-1, 4 * channels)).reshape(-1, channels)
-
     def forward(self, image_embeddings, prompt_tokens):
         m, side, count = self.masks, self.side, prompt_tokens.shape[0]
         tokens = torch.cat([m.iou_token.weight, m.mask_tokens.weight]).unsqueeze(0).expand(count, -1, -1)
         tokens = torch.cat((tokens, prompt_tokens), dim=1)
         hidden, cells = self.transformed(image_embeddings.flatten(2).permute(0, 2, 1) + self.dense, tokens)
-        first, norm, _, second, _ = m.output_upscaling
-        channels = first.bias.shape[0]
-        fine = self.doubled(first, cells.reshape(count * side * side, -1)).reshape(-1, 1, channels)
-        fine = gelu(SumNorm.apply(fine, first.bias.reshape(1, 1, -1), norm.weight, norm.bias, torch.zeros_like(norm.bias), norm.eps))
+        second = m.output_upscaling[3]
         # A bias of two axes: with one, ONNX Runtime makes one operator of it and GELU, which takes four times as long on a GPU.
-        fine = gelu(self.doubled(second, fine.reshape(-1, channels)) + second.bias.reshape(1, -1))
+        fine = gelu(self.first(doubled(self.first.weight, cells.reshape(count * side * side, -1))))
+        fine = gelu(doubled(second.weight, fine) + second.bias.reshape(1, -1))
         rows = [m.output_hypernetworks_mlps[i](hidden[:, 1 + i]) for i in range(m.num_mask_tokens)]
         masks = fine.reshape(count, 16 * side * side, -1) @ torch.stack(rows, dim=2)
         masks = masks.reshape(count, side, side, 2, 2, 2, 2, m.num_mask_tokens).permute(0, 7, 1, 3, 5, 2, 4, 6)
