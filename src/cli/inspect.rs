@@ -71,7 +71,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
 
 /// Smallest and largest coordinates of the centres, world frame.
 fn bounds(gaussians: &Gaussians) -> Option<[[f64; 3]; 2]> {
-    let origin = gaussians.as_raw().origin;
+    let origin = gaussians.origin();
     let worlds = gaussians.means().iter().map(|m| origin + DVec3::from_array(m.map(f64::from)));
     worlds
         .map(|at| (at, at))

@@ -31,23 +31,23 @@ struct Header {
 /// # Errors
 /// Those of the writer.
 pub fn write_scene(to: &mut dyn Write, scene: &Scene) -> io::Result<String> {
-    let raw = scene.gaussians.as_raw();
-    let (n, k) = (raw.means.len(), scene.gaussians.sh_count());
+    let gaussians = &scene.gaussians;
+    let (n, k) = (gaussians.len(), gaussians.sh_count());
     let header = serde_json::to_string(&Header {
-        origin: raw.origin.to_array(),
-        sh_degree: raw.sh_degree,
+        origin: gaussians.origin().to_array(),
+        sh_degree: gaussians.sh_degree(),
         meta: scene.meta.clone(),
         entries_of: Some(scene.semantics_sha256.clone()).filter(|sha256| !sha256.is_empty()),
     })?;
-    let source: Vec<[u16; 3]> = raw.source.iter().map(|s| [s.view, s.x, s.y]).collect();
+    let source: Vec<[u16; 3]> = gaussians.source().iter().map(|s| [s.view, s.x, s.y]).collect();
     let backdrop_shape = [Backdrop::HEIGHT, Backdrop::WIDTH, 3];
     let arrays = [
-        Array::new("means", Dtype::F32, &[n, 3], &raw.means),
-        Array::new("quats", Dtype::F32, &[n, 4], &raw.quats),
-        Array::new("scales", Dtype::F32, &[n, 3], &raw.scales),
-        Array::new("opacities", Dtype::F32, &[n], &raw.opacities),
-        Array::new("sh", Dtype::F32, &[n, k, 3], &raw.sh),
-        Array::new("semantic_index", Dtype::U16, &[n], &raw.semantic_index),
+        Array::new("means", Dtype::F32, &[n, 3], gaussians.means()),
+        Array::new("quats", Dtype::F32, &[n, 4], gaussians.quats()),
+        Array::new("scales", Dtype::F32, &[n, 3], gaussians.scales()),
+        Array::new("opacities", Dtype::F32, &[n], gaussians.opacities()),
+        Array::new("sh", Dtype::F32, &[n, k, 3], gaussians.sh()),
+        Array::new("semantic_index", Dtype::U16, &[n], gaussians.semantic_index()),
         Array::new("source", Dtype::U16, &[n, 3], &source),
         Array::new("backdrop", Dtype::U8, &backdrop_shape, scene.backdrop.cells()),
     ];

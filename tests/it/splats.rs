@@ -335,7 +335,7 @@ fn files_of_another_program_are_read() {
 
 /// The Gaussians of these numbers, in this order.
 fn chosen(from: &Gaussians, order: &[usize]) -> Gaussians {
-    let (all, k) = (from.as_raw(), from.sh_count());
+    let (all, k) = (from.clone().into_raw(), from.sh_count());
     let mut raw = segsplat::scene::RawGaussians {
         origin: all.origin,
         sh_degree: all.sh_degree,

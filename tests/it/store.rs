@@ -65,7 +65,7 @@ fn scene(id: u8, count: usize, sh_degree: u8) -> Scene {
 }
 
 fn bits(gaussians: &Gaussians) -> Vec<u32> {
-    let raw = gaussians.as_raw();
+    let raw = gaussians.clone().into_raw();
     let floats = [
         raw.means.as_flattened(),
         raw.quats.as_flattened(),
@@ -418,7 +418,7 @@ fn ply_goes_out_and_comes_in() {
         let file = ply_of(&out);
         let (back, report) = read(&file).unwrap();
         assert_eq!(report, SanitizeReport::default());
-        let (a, b) = (out.as_raw(), back.as_raw());
+        let (a, b) = (out.clone().into_raw(), back.clone().into_raw());
         assert_eq!((&a.means, &a.sh, &a.semantic_index), (&b.means, &b.sh, &b.semantic_index));
         let close = |x: &[f32], y: &[f32]| {
             assert_eq!(x.len(), y.len());
@@ -480,7 +480,7 @@ fn ply_of_other_programs_is_read() {
         other_ply("binary_big_endian", f64::to_be_bytes),
     ] {
         let (back, _) = read(&file).unwrap();
-        let raw = back.as_raw();
+        let raw = back.clone().into_raw();
         let at = raw.origin + DVec3::from_array(raw.means[0].map(f64::from));
         assert_eq!(at, DVec3::new(5e6 + 0.125, 2.0, 3.0), "f64 positions are kept");
         assert_eq!(raw.sh[0], [0.1, 0.2, 0.3]);

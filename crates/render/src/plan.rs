@@ -117,7 +117,7 @@ pub fn widened(scene: &Scene, gaussians: &Gaussians, side: Option<u32>) -> Resul
             .then(|| (pose.center() - origin, pose.axis(), lost / focal / focal))
     };
     let rows: Vec<_> = cameras.iter().zip(&report.network_focal_px).map(row).collect();
-    let mut raw = gaussians.as_raw().clone();
+    let mut raw = gaussians.clone().into_raw();
     let scales = raw.scales.par_iter_mut().zip(&raw.means).zip(&raw.source);
     scales.for_each(|((scales, mean), source)| {
         let Some(Some((center, axis, lost))) = rows.get(usize::from(source.view)) else { return };

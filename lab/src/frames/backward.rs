@@ -49,7 +49,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     // In turn, so that a noisy machine is as noisy to both.
     for _ in 0..args.frames {
         forward_ms.extend(drawing.times(1)?);
-        let moved = Gaussians::sanitize(gaussians.as_raw().clone())?.0;
+        let moved = Gaussians::sanitize(gaussians.clone().into_raw())?.0;
         let begun = Instant::now();
         pass(&*renderer, &moved, &request, &by, &mut found)?;
         step_ms.push(ms(begun));

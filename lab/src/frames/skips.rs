@@ -31,7 +31,7 @@ fn scenes(
         Ok(RenderRequest { camera, ..request.clone() })
     };
     let changed = |change: &dyn Fn(&mut RawGaussians)| -> Result<Gaussians> {
-        let mut raw = gaussians.as_raw().clone();
+        let mut raw = gaussians.clone().into_raw();
         change(&mut raw);
         Ok(Gaussians::sanitize(raw)?.0)
     };

@@ -309,7 +309,7 @@ impl Renderer for PointRenderer {
         let mut labels = vec![0; pixels];
         let mut stats = FrameStats::default();
         for (i, (mean, sh)) in gaussians.means().iter().zip(gaussians.sh()).enumerate() {
-            let world = DVec3::from_array(mean.map(f64::from)) + gaussians.as_raw().origin;
+            let world = DVec3::from_array(mean.map(f64::from)) + gaussians.origin();
             let at = viewmat.transform_point3(world);
             let (u, v) = lens.project(at);
             let inside =

@@ -35,7 +35,7 @@ fn one_hot(gaussians: &Gaussians, first: u16) -> Gaussians {
     let index = gaussians.semantic_index();
     let color = |m: u16| [0, 1, 2].map(|c| if m == first + c { 1.0 } else { 0.0 });
     let sh = index.iter().map(|&m| color(m).map(|v: f32| (v - 0.5) / SH_C0)).collect();
-    checked(RawGaussians { sh, sh_degree: 0, ..gaussians.as_raw().clone() })
+    checked(RawGaussians { sh, sh_degree: 0, ..gaussians.clone().into_raw() })
 }
 
 /// Dense E of entries 1..=m, `[H * W][m]`, from one-hot colours.

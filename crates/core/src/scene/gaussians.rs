@@ -83,7 +83,7 @@ impl RawGaussians {
         self.scales.push(from.scales[i]);
         self.opacities.push(from.opacities[i]);
         self.sh.extend_from_slice(&from.sh[i * k..(i + 1) * k]);
-        self.semantic_index.push(from.semantic_index[i]);
+        self.semantic_index.extend(from.semantic_index.get(i));
         self.source.push(from.source[i]);
     }
 
@@ -151,10 +151,12 @@ impl SanitizeReport {
 }
 
 /// Checked Gaussians: finite, unit quaternions, positive scales, opacity in [1/255, 1]. Nothing
-/// below checks again.
+/// below checks again. Clones share the arrays.
 #[derive(Clone, Debug, Default)]
 pub struct Gaussians {
-    raw: RawGaussians,
+    /// Without the entries.
+    raw: Arc<RawGaussians>,
+    semantic_index: Arc<Vec<u16>>,
     identity: u64,
     /// Shared by Gaussians that differ in their entries only.
     shape: u64,
@@ -177,9 +179,15 @@ impl Gaussians {
     /// Largest |coefficient| of a spherical harmonic.
     pub const SH_MAX: f32 = 1e4;
 
-    fn new(raw: RawGaussians) -> Self {
+    fn new(mut raw: RawGaussians) -> Self {
+        let semantic_index = std::mem::take(&mut raw.semantic_index);
+        Self::of(Arc::new(raw), semantic_index)
+    }
+
+    fn of(raw: Arc<RawGaussians>, semantic_index: Vec<u16>) -> Self {
         let identity = NEXT_IDENTITY.fetch_add(1, Ordering::Relaxed);
-        Self { raw, identity, shape: identity, life: Arc::default() }
+        let semantic_index = Arc::new(semantic_index);
+        Self { raw, semantic_index, identity, shape: identity, life: Arc::default() }
     }
 
     /// Drops what can never be drawn, clamps what is out of range, counts both.
@@ -248,7 +256,9 @@ impl Gaussians {
 
     /// The Gaussians whose number `keep` takes, in their order.
     pub fn only(&self, keep: impl Fn(usize) -> bool) -> Self {
-        Self::new(self.raw.only(keep))
+        let kept = self.semantic_index.iter().enumerate().filter(|(i, _)| keep(*i));
+        let semantic_index = kept.map(|(_, entry)| *entry).collect();
+        Self::of(Arc::new(self.raw.only(keep)), semantic_index)
     }
 
     /// The same Gaussians with other entries of the bank, `[N]`.
@@ -263,8 +273,7 @@ impl Gaussians {
                 self.len()
             )));
         }
-        let raw = RawGaussians { semantic_index, ..self.raw.clone() };
-        Ok(Self { shape: self.shape, ..Self::new(raw) })
+        Ok(Self { shape: self.shape, ..Self::of(Arc::clone(&self.raw), semantic_index) })
     }
 
     /// Number that no other content of this process has; clones share it, for they cannot change. A
@@ -308,14 +317,15 @@ impl Gaussians {
         self.raw.sh_count()
     }
 
-    /// The arrays, for a stage that makes new Gaussians of them.
+    /// The arrays, for a stage that makes new Gaussians of them; copies where clones have them too.
     pub fn into_raw(self) -> RawGaussians {
-        self.raw
+        let semantic_index = Arc::unwrap_or_clone(self.semantic_index);
+        RawGaussians { semantic_index, ..Arc::unwrap_or_clone(self.raw) }
     }
 
-    /// The arrays.
-    pub fn as_raw(&self) -> &RawGaussians {
-        &self.raw
+    /// `[N]` entries of the bank.
+    pub fn semantic_index(&self) -> &[u16] {
+        &self.semantic_index
     }
 
     /// Bytes held.
@@ -355,8 +365,6 @@ arrays! {
     opacities: f32;
     /// `[N, K, 3]` coefficients, flattened over N and K.
     sh: [f32; 3];
-    /// `[N]` entries of the bank.
-    semantic_index: u16;
     /// `[N]` sources.
     source: SourcePixel;
 }

@@ -4,7 +4,13 @@
 use std::collections::HashSet;
 
 use glam::DVec3;
-use segsplat_core::{cache::Cache, error::TABLE, limits::Limits, names::shown, scene::Backdrop};
+use segsplat_core::{
+    cache::Cache,
+    error::TABLE,
+    limits::Limits,
+    names::shown,
+    scene::{Backdrop, Gaussians, RawGaussians, SourcePixel},
+};
 
 #[test]
 fn the_least_recently_used_leaves_first_and_weights_are_given_back() {
@@ -37,6 +43,32 @@ fn a_smaller_bound_drops_what_no_longer_fits() {
     cache.set_weight_max(3);
     let left: Vec<i32> = (0..10).filter(|key| cache.find(key).is_some()).collect();
     assert_eq!(left, [7, 8, 9], "the last three");
+}
+
+#[test]
+fn gaussians_with_other_entries_have_the_same_arrays() {
+    let raw = RawGaussians {
+        means: vec![[0.0; 3], [1.0; 3]],
+        quats: vec![[1.0, 0.0, 0.0, 0.0]; 2],
+        scales: vec![[0.1; 3]; 2],
+        opacities: vec![0.5; 2],
+        sh: vec![[0.0; 3]; 2],
+        semantic_index: vec![3, 4],
+        source: vec![SourcePixel::default(); 2],
+        ..RawGaussians::default()
+    };
+    let old = Gaussians::restore(raw).unwrap();
+    let new = old.with_semantic_index(vec![5, 6]).unwrap();
+    assert!(std::ptr::eq(old.means(), new.means()), "not copied");
+    assert!(std::ptr::eq(old.sh(), old.clone().sh()), "nor by a clone");
+    assert_eq!((old.semantic_index(), new.semantic_index()), (&[3, 4][..], &[5, 6][..]));
+    assert_eq!(old.shape_identity(), new.shape_identity());
+    assert_ne!(old.identity(), new.identity());
+    let second = new.only(|i| i == 1);
+    assert_eq!((second.means(), second.semantic_index()), (&[[1.0; 3]][..], &[6][..]));
+    let raw = new.clone().into_raw();
+    assert_eq!((raw.means.len(), raw.semantic_index), (2, vec![5, 6]), "all arrays come out");
+    assert!(new.with_semantic_index(vec![1]).is_err(), "one too few");
 }
 
 #[test]

@@ -330,7 +330,7 @@ impl Trainer for DeviceTrainer {
         let row_bytes = size_of::<GaussianRow>() * count;
         let (rows, sh) = (self.scene.gaussians.clone(), self.scene.sh.clone());
         let parts = [(&rows, row_bytes as u64), (&sh, 12 * (count * k) as u64)];
-        let mut raw = self.start.as_raw().clone();
+        let mut raw = self.start.clone().into_raw();
         self.read(&parts, |bytes| {
             let (rows, sh) = bytes.split_at(row_bytes);
             raw.sh.copy_from_slice(bytemuck::cast_slice(sh));

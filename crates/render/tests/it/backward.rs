@@ -132,7 +132,7 @@ fn losses(
 fn check_differences(name: &str, raw: &RawGaussians, request: &RenderRequest) {
     let base = checked(raw.clone());
     assert_eq!(base.len(), raw.means.len(), "{name}: all are valid");
-    let raw = base.as_raw().clone();
+    let raw = base.clone().into_raw();
     let k = base.sh_count();
     let lens = request.camera.intrinsics;
     let loss = linear((lens.width * lens.height) as usize, 77);

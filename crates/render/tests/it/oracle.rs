@@ -160,7 +160,7 @@ fn a_large_picture_agrees_on_sampled_pixels() {
 fn coordinates_far_from_zero_agree_with_the_scene_at_zero() {
     let near = cloud(2_000, 1, 71);
     let far_off = glam::DVec3::new(1e7, -2e7, 3e7);
-    let mut raw = near.as_raw().clone();
+    let mut raw = near.clone().into_raw();
     raw.origin += far_off;
     let far = checked(raw);
     let here = request(camera(96, 64));

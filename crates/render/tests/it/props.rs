@@ -49,7 +49,7 @@ fn like(gaussians: &Gaussians) -> RawGaussians {
 
 /// Checked once more: checking normalises quaternions, which moves their last bit.
 fn again(gaussians: &Gaussians) -> Gaussians {
-    checked(gaussians.as_raw().clone())
+    checked(gaussians.clone().into_raw())
 }
 
 /// Whether two scenes give the same picture, to the last bit.
@@ -113,7 +113,7 @@ proptest! {
     #[test]
     fn unseen_gaussians_change_nothing(seed in 0_u64..1000) {
         let gaussians = cloud(200, 1, seed);
-        let mut more = gaussians.as_raw().clone();
+        let mut more = gaussians.clone().into_raw();
         let mut random = Random(seed + 2);
         for i in 0..60 {
             let z = match i % 3 {

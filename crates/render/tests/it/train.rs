@@ -117,7 +117,7 @@ fn photos(truth: &Gaussians, sides: &[[u32; 2]]) -> Vec<(RenderRequest, Photo)> 
 
 fn disturbed(gaussians: &Gaussians) -> Gaussians {
     let mut random = Random(8);
-    let mut raw = gaussians.as_raw().clone();
+    let mut raw = gaussians.clone().into_raw();
     for i in 0..raw.means.len() {
         raw.means[i][0] += random.range(-0.02, 0.02);
         raw.scales[i][1] *= random.range(0.6, 1.5);
@@ -165,7 +165,7 @@ fn the_shaders_of_the_loss_agree_with_the_oracle() {
 
 /// Numbers of Gaussians of each kind.
 fn kinds(gaussians: &Gaussians) -> [(&'static str, Vec<f32>); 5] {
-    let raw = gaussians.as_raw();
+    let raw = gaussians.clone().into_raw();
     [
         ("means", raw.means.as_flattened().to_vec()),
         ("quats", raw.quats.as_flattened().to_vec()),
@@ -194,7 +194,7 @@ fn judge_order(gpu: &GpuRenderer, name: &str, set: &TrainingSet<'_>, steps: [Ste
     }
     let (got, want) = (device.gaussians().unwrap(), host.gaussians().unwrap());
     assert_eq!(got.len(), want.len(), "{name}: Gaussians that are left");
-    assert!(got.as_raw().source == want.as_raw().source, "{name}: which are left");
+    assert!(got.source() == want.source(), "{name}: which are left");
     if got.len() == set.gaussians.len() {
         let numbers = kinds(&got).into_iter().zip(kinds(&want)).zip(kinds(set.gaussians));
         for (((kind, got), (_, want)), (_, start)) in numbers {

@@ -58,7 +58,7 @@ fn request(camera: Camera) -> RenderRequest {
 /// The cloud with every number moved.
 fn disturbed(gaussians: &Gaussians) -> Gaussians {
     let mut random = Random(8);
-    let mut raw = gaussians.as_raw().clone();
+    let mut raw = gaussians.clone().into_raw();
     for i in 0..raw.means.len() {
         raw.means[i][0] += random.range(-0.02, 0.02);
         raw.scales[i][1] *= random.range(0.6, 1.5);
@@ -112,7 +112,7 @@ fn a_disturbed_scene_gets_better_on_photos_that_were_held_out() {
     assert!(entries.len() <= start.len() && entries.contains(&6), "entries");
     // Also where a device has no room: the same steps.
     let again = refined(&Full(cpu()), &start, &photos, 150);
-    assert!(again.gaussians.as_raw().means == best.gaussians.as_raw().means, "the same steps");
+    assert!(again.gaussians.means() == best.gaussians.means(), "the same steps");
     let untimed = |version: &RefinedVersion| segsplat_core::scene::RefineReport {
         seconds: 0.0,
         ..version.report.clone()

@@ -51,11 +51,10 @@ fn header(file: &SplatFile) -> String {
 }
 
 fn vertex(gaussians: &Gaussians, i: usize, to: &mut Vec<u8>) {
-    let raw = gaussians.as_raw();
     let k = gaussians.sh_count();
-    let sh = &raw.sh[i * k..(i + 1) * k];
+    let sh = &gaussians.sh()[i * k..(i + 1) * k];
     let mut put = |value: f64| to.extend_from_slice(&(value as f32).to_le_bytes());
-    for (mean, origin) in raw.means[i].iter().zip(raw.origin.to_array()) {
+    for (mean, origin) in gaussians.means()[i].iter().zip(gaussians.origin().to_array()) {
         put(f64::from(*mean) + origin);
     }
     (0..3).for_each(|_normal| put(0.0));
@@ -63,9 +62,9 @@ fn vertex(gaussians: &Gaussians, i: usize, to: &mut Vec<u8>) {
     for channel in 0..3 {
         sh[1..].iter().for_each(|row| put(f64::from(row[channel])));
     }
-    let opacity = f64::from(raw.opacities[i]).min(OPACITY_MAX);
+    let opacity = f64::from(gaussians.opacities()[i]).min(OPACITY_MAX);
     put((opacity / (1.0 - opacity)).ln());
-    raw.scales[i].iter().for_each(|&scale| put(f64::from(scale).ln()));
-    raw.quats[i].iter().for_each(|&value| put(f64::from(value)));
-    to.extend_from_slice(&raw.semantic_index[i].to_le_bytes());
+    gaussians.scales()[i].iter().for_each(|&scale| put(f64::from(scale).ln()));
+    gaussians.quats()[i].iter().for_each(|&value| put(f64::from(value)));
+    to.extend_from_slice(&gaussians.semantic_index()[i].to_le_bytes());
 }
