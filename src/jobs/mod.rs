@@ -46,7 +46,7 @@ use self::{
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    render::backward::DifferentiableRenderer,
+    render::{Renderer, backward::DifferentiableRenderer},
     scene::{PhotoHash, Refine, SceneId, SceneState, SemanticsMode, SemanticsState, Upload},
     store::{self, KeyUse, Record, Store, not_found},
 };
@@ -64,6 +64,8 @@ pub(crate) struct JobParts {
     pub(crate) keep_photos: bool,
     /// Whether scenes are refined whose create call does not say.
     pub(crate) refine: Refine,
+    /// What draws scenes: it has a new one before its first view.
+    pub(crate) renderer: Arc<dyn Renderer>,
     /// What refines them, with so many threads of the processor.
     pub(crate) refiner: Arc<dyn DifferentiableRenderer>,
     pub(crate) threads: usize,
@@ -89,6 +91,8 @@ pub(crate) struct Jobs {
     content_free: Condvar,
     /// Milliseconds that the last scenes took, smoothed; 0 before the first.
     scene_ms: AtomicU64,
+    /// Whether a job ended since freed memory last went back to the system.
+    freed: AtomicBool,
     threads: Mutex<Vec<JoinHandle<()>>>,
 }
 
@@ -111,6 +115,7 @@ impl Jobs {
             contents: Mutex::default(),
             content_free: Condvar::new(),
             scene_ms: AtomicU64::new(0),
+            freed: AtomicBool::new(false),
             threads: Mutex::default(),
             parts,
         });

@@ -1,6 +1,7 @@
 //! The job that makes a scene of photos, or of a file of Gaussians, and keeps it.
 
 use std::{
+    panic::{AssertUnwindSafe, catch_unwind},
     sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
 };
@@ -255,10 +256,20 @@ impl Jobs {
         if let Err(error) = noted.and_then(|()| store.settle(id)) {
             tracing::warn!(scene = %id, %error, "left for the next start");
         }
+        self.prepare(scene);
         if !eager && !refined && !self.parts.keep_photos {
             store.drop_upload(id)?;
         }
         Ok(())
+    }
+
+    /// Puts a finished scene where its views are drawn. It is whole without that.
+    fn prepare(&self, scene: &Scene) {
+        let put = AssertUnwindSafe(|| self.parts.renderer.prepare(&scene.gaussians));
+        let panicked = |_| Err(Error::internal("a panic"));
+        if let Err(error) = catch_unwind(put).unwrap_or_else(panicked) {
+            tracing::warn!(scene = %scene.meta.id, %error, "its first view uploads it");
+        }
     }
 }
 

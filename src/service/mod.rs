@@ -166,6 +166,7 @@ impl Service {
             workers: config.workers(),
             keep_photos: config.keep_photos,
             refine,
+            renderer: Arc::clone(&parts.renderer),
             refiner,
             threads: config.threads,
             drawn: Box::new(move || drawn.idle()),

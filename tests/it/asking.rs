@@ -3,7 +3,7 @@
 
 use std::{
     sync::{
-        Arc,
+        Arc, Mutex,
         atomic::{AtomicBool, Ordering},
     },
     time::Duration,
@@ -11,20 +11,23 @@ use std::{
 
 use futures_util::{StreamExt, future::join_all};
 use segsplat::{
-    error::ErrorCode,
+    error::{Error, ErrorCode, Result},
     limits::Limits,
     pipeline::read,
+    render::{Frame, RenderRequest, Renderer},
     sample::{self, SampleOptions},
     scene::{
-        Event, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, SemanticsState,
-        Stage, Upload,
+        Event, Gaussians, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode,
+        SemanticsState, Stage, Upload,
     },
     service::CreateScene,
 };
 
 use crate::common::{
     meaning::PhotoMeaning,
-    server::{PATIENCE, TestServer, WallNetworks, first_view, panicking_upload, upload},
+    server::{
+        PATIENCE, PointRenderer, TestServer, WallNetworks, first_view, panicking_upload, upload,
+    },
 };
 
 /// A server with the stand-in for the semantic networks, and the stand-in.
@@ -198,18 +201,70 @@ async fn early_semantics_of_a_scene_that_fails_or_is_deleted_end_with_it() {
     let id = both_run(&server, &meaning, panicking_upload()).await;
     networks.hold.store(false, Ordering::Release);
     until(&server, &id, |status| status.state == SceneState::Failed).await;
-    meaning.hold.store(false, Ordering::Release);
+    // They are stopped where they are.
     let failed = until(&server, &id, |s| s.semantics.state == SemanticsState::None).await;
     assert_eq!(failed.error.unwrap().code, "internal");
     assert!(failed.semantics.error.is_none(), "they did not fail: {:?}", failed.semantics);
     networks.hold.store(true, Ordering::Release);
-    meaning.hold.store(true, Ordering::Release);
     let id = both_run(&server, &meaning, upload()).await;
     server.service.delete(&id).await.unwrap();
     networks.hold.store(false, Ordering::Release);
     meaning.hold.store(false, Ordering::Release);
     let next = scene(&server, SemanticsMode::Eager).await;
     assert_eq!(next.semantics.state, SemanticsState::Ready, "both workers are free");
+}
+
+/// Draws as [`PointRenderer`]; scenes are put there as `how` says.
+struct Placing {
+    how: fn() -> Result<()>,
+    /// Gaussians of the scenes that were to be put there.
+    put: Mutex<Vec<usize>>,
+}
+
+impl Renderer for Placing {
+    fn name(&self) -> String {
+        PointRenderer.name()
+    }
+
+    fn concurrency(&self) -> usize {
+        PointRenderer.concurrency()
+    }
+
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        PointRenderer.render(gaussians, request)
+    }
+
+    fn prepare(&self, gaussians: &Gaussians) -> Result<()> {
+        self.put.lock().unwrap().push(gaussians.len());
+        (self.how)()
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_new_scene_is_put_where_it_is_drawn_and_is_whole_where_that_fails() {
+    let full = || Err(Error::limit("bytes of Gaussians", 2, 1));
+    let how: [fn() -> Result<()>; 3] = [|| Ok(()), full, || panic!("on purpose")];
+    for how in how {
+        let meaning =
+            Arc::new(PhotoMeaning { early: true, hold: true.into(), ..PhotoMeaning::default() });
+        let renderer = Arc::new(Placing { how, put: Mutex::default() });
+        let given = (Arc::clone(&meaning), Arc::clone(&renderer));
+        let server = TestServer::with(|_, parts| (parts.semantics, parts.renderer) = given).await;
+        let options = SceneOptions { semantics: SemanticsMode::Eager, ..SceneOptions::default() };
+        let request = CreateScene { upload: upload(), options, ..CreateScene::default() };
+        let id = server.service.create_scene(request).await.unwrap().status.id;
+        let put = || renderer.put.lock().unwrap().clone();
+        let done = until(&server, &id, |_| !put().is_empty()).await;
+        assert_eq!((done.state, done.semantics.state), (SceneState::Done, SemanticsState::Running));
+        meaning.hold.store(false, Ordering::Release);
+        let ready = until(&server, &id, |s| s.semantics.state != SemanticsState::Running).await;
+        assert_eq!((ready.state, ready.semantics.state), (SceneState::Done, SemanticsState::Ready));
+        assert_eq!(put(), [ready.report.unwrap().gaussians as usize], "once");
+        assert!(server.service.render(&id, first_view()).await.is_ok());
+        let server = server.restart().await;
+        assert_eq!(semantics_state(&server, &id).await, SemanticsState::Ready);
+        assert_eq!(put().len(), 1, "not what a start finds");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

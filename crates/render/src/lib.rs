@@ -303,6 +303,15 @@ pub trait Renderer: Send + Sync {
     /// background.
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame>;
 
+    /// Puts a scene where its views are drawn, so that its first one need not wait for that. Views
+    /// of other scenes do not wait either. Nothing depends on it.
+    ///
+    /// # Errors
+    /// `limit_exceeded` when the device has no room, `gpu_unavailable` when it is lost.
+    fn prepare(&self, _gaussians: &Gaussians) -> Result<()> {
+        Ok(())
+    }
+
     /// The same renderer where it has a backward pass of its own that is worth its device.
     fn differentiable(self: Arc<Self>) -> Option<Arc<dyn backward::DifferentiableRenderer>> {
         None

@@ -171,6 +171,10 @@ impl Renderer for WithCpu {
         or_else(self.gpu.render(gaussians, request), || self.cpu.render(gaussians, request))
     }
 
+    fn prepare(&self, gaussians: &Gaussians) -> Result<()> {
+        self.gpu.prepare(gaussians)
+    }
+
     fn differentiable(self: Arc<Self>) -> Option<Arc<dyn DifferentiableRenderer>> {
         if self.gpu.adapter().software { None } else { Some(self) }
     }

@@ -213,6 +213,20 @@ impl Adapter {
         }
     }
 
+    /// Uploads a scene that no view was drawn of yet. Other scenes can be drawn meanwhile.
+    pub(super) fn prepare(&self, gaussians: &Gaussians) -> Result<()> {
+        // The next view opens a device that was lost.
+        let Some(on) = self.state.lock().opened.clone() else { return Ok(()) };
+        if self.holds(gaussians.shape_identity()) {
+            return Ok(());
+        }
+        let scene = DeviceScene::upload(&on.gpu, gaussians, None)?;
+        let mut scenes = on.scenes.lock();
+        scenes.put(&on.gpu, scene);
+        *self.shapes.lock() = scenes.shapes();
+        Ok(())
+    }
+
     /// Draws one view, together with waiting views of the same scene.
     pub(super) fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         let views_max = (BATCH_GAUSSIANS / gaussians.len().max(1)).clamp(1, VIEWS_MAX as usize);

@@ -355,13 +355,28 @@ impl SceneCache {
             }
             other => other?,
         };
+        self.make_room(gpu, &scene);
+        Ok(scene)
+    }
+
+    /// Takes a scene that is uploaded already, unless it is there or is larger than all may be.
+    pub(super) fn put(&mut self, gpu: &Gpu, scene: DeviceScene) {
+        if scene.size_bytes() <= self.bytes_max && !self.shapes().contains(&scene.shape) {
+            self.make_room(gpu, &scene);
+            self.scenes.push(scene);
+        } else {
+            drop(scene);
+            gpu.forget();
+        }
+    }
+
+    fn make_room(&mut self, gpu: &Gpu, scene: &DeviceScene) {
         let size_bytes = |scenes: &[_]| scenes.iter().map(DeviceScene::size_bytes).sum::<u64>();
         let bytes_max = self.bytes_max.saturating_sub(scene.size_bytes());
         while size_bytes(&self.scenes) > bytes_max {
             self.scenes.remove(0);
             gpu.forget();
         }
-        Ok(scene)
     }
 
     /// Shape identities of the scenes.

@@ -123,6 +123,10 @@ impl Renderer for GpuRenderer {
         }
     }
 
+    fn prepare(&self, gaussians: &Gaussians) -> Result<()> {
+        if gaussians.is_empty() { Ok(()) } else { self.adapter_for(gaussians).prepare(gaussians) }
+    }
+
     fn differentiable(self: Arc<Self>) -> Option<Arc<dyn DifferentiableRenderer>> {
         if self.adapter().software { None } else { Some(self) }
     }

@@ -141,6 +141,30 @@ fn scenes_leave_by_bytes_and_come_again() {
 }
 
 #[test]
+fn a_scene_is_uploaded_before_its_first_view_within_the_same_bytes() {
+    let scenes = [65, 66, 67].map(|seed| cloud(1_000, 0, seed));
+    let one = request(camera(48, 32));
+    let Some(gpu) = open(|options| options.scene_bytes_max = 130_000) else { return };
+    let held = || gpu.internals().scenes_held();
+    let want = gpu.render(&scenes[0], &one).expect("a view");
+    gpu.prepare(&scenes[1]).expect("room");
+    assert_eq!(held(), 2, "uploaded beside the first");
+    gpu.prepare(&scenes[1].clone()).expect("room");
+    assert_eq!(held(), 2, "and once");
+    gpu.prepare(&scenes[2]).expect("room");
+    assert_eq!(held(), 2, "the one that was drawn least recently has left");
+    assert!(gpu.render(&scenes[0], &one).expect("a view again") == want, "it came again");
+    let Some(fresh) = open(|_| {}) else { return };
+    let prepared = gpu.render(&scenes[2], &one).expect("a view of what was prepared");
+    assert!(fresh.render(&scenes[2], &one).expect("a view") == prepared, "the same picture");
+    gpu.prepare(&cloud(3_000, 0, 68)).expect("it is left out");
+    assert_eq!(held(), 2, "one that is larger than the room makes none leave");
+    gpu.internals().lose_devices();
+    assert!(gpu.prepare(&cloud(900, 0, 69)).is_err(), "a lost device is no fault of a view");
+    assert!(gpu.render(&scenes[0], &one).expect("a view") == want, "the next view opens it again");
+}
+
+#[test]
 fn what_no_buffer_holds_is_refused_with_the_figures() {
     let Some(gpu) = open(|options| options.switches.portable = true) else { return };
     // 2.8 million Gaussians of 48 bytes are over the portable 128 MiB of a binding.
