@@ -29,7 +29,9 @@ use crate::{
 
 /// Time between two checks whether the networks are open.
 const NETWORKS_LOOK: Duration = Duration::from_millis(5);
-/// Time in which freed memory goes back to the system.
+/// Time in which freed memory goes back to the system, after a job and without one. Not at the end
+/// of a job: while it goes, allocations wait, and that is when the callers of the job come back.
+const GIVE_BACK_AFTER_JOB: Duration = Duration::from_secs(1);
 const GIVE_BACK_EVERY: Duration = Duration::from_secs(10);
 
 impl Jobs {
@@ -55,7 +57,7 @@ impl Jobs {
             }
             self.running.end(&job);
             self.leave(&job);
-            give_memory_back();
+            self.freed.store(true, Ordering::Relaxed);
         }
         if kind == Kind::Scene {
             self.workers.fetch_sub(1, Ordering::Relaxed);
@@ -231,6 +233,10 @@ impl Jobs {
             self.keep_record(&failed);
         }
         self.records.update(id, change);
+        if kind == Kind::Scene {
+            // Those that began early are wanted no more.
+            self.running.stop_kind(Kind::Semantics, id, Reason::Cancelled);
+        }
     }
 
     pub(super) fn keep_record(&self, record: &Record) {
@@ -248,13 +254,16 @@ impl Jobs {
             + Duration::from_millis(limits.replica_lease_ms);
         let every = Duration::from_millis(limits.sweep_every_ms.max(1_000));
         let look = Duration::from_millis(limits.first_text_photos_ms.max(1_000)).min(every);
-        let look = look.min(GIVE_BACK_EVERY);
-        let mut next = Instant::now();
+        let look = look.min(GIVE_BACK_AFTER_JOB);
+        let (mut next, mut give_back) = (Instant::now(), Instant::now());
         loop {
             let now = Instant::now();
             self.uploads.forget_old(now);
-            // What was deleted, or left the caches.
-            give_memory_back();
+            // What jobs freed, what was deleted, or left the caches.
+            if self.freed.swap(false, Ordering::Relaxed) || now >= give_back {
+                give_back = now + GIVE_BACK_EVERY;
+                give_memory_back();
+            }
             if now >= next {
                 next = now + every;
                 match self.parts.store.sweep(buried) {
