@@ -3,9 +3,10 @@
 //! The first prompts of a photo lie where the masks of earlier photos reappear. The Gaussians of
 //! these masks give the places in the world.
 
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
 use glam::DVec3;
+use parking_lot::Mutex;
 use rayon::prelude::*;
 
 use crate::{
@@ -14,7 +15,7 @@ use crate::{
     models::{MaskNetwork, MasksManifest, PhotoEmbedding, Provider},
     scene::{
         Gaussians, JudgedMasks, MaskJudging, MaskLogits, Method, Photo, PhotoMasks, PosedPhoto,
-        SourcePixel,
+        SourcePixel, unless_cancelled,
     },
     seen_at,
     segment::{self, PromptDecoder, Seed, Settings},
@@ -25,11 +26,20 @@ const SEED_CELLS: usize = 32;
 /// Gaussians that one thread looks up at a time.
 const GAUSSIANS_A_TASK: usize = 1 << 12;
 
+/// Whose turn it is where photos of a scene are at work side by side: each part of the network runs
+/// for one of them at a time, so that a device needs no more memory than for one photo.
+#[derive(Debug, Default)]
+struct Turns {
+    encoder: Mutex<()>,
+    decoder: Mutex<()>,
+}
+
 /// A photo that the mask network has seen.
 #[derive(Debug)]
 pub struct SeenPhoto<'a> {
     network: &'a MaskNetwork,
     embedding: PhotoEmbedding,
+    turns: Option<&'a Turns>,
 }
 
 impl<'a> SeenPhoto<'a> {
@@ -38,7 +48,12 @@ impl<'a> SeenPhoto<'a> {
     /// # Errors
     /// `internal` when the network fails.
     pub fn new(network: &'a MaskNetwork, photo: &Photo) -> Result<Self> {
-        Ok(Self { network, embedding: network.encode(photo)? })
+        Self::in_turn(network, photo, None)
+    }
+
+    fn in_turn(network: &'a MaskNetwork, photo: &Photo, turns: Option<&'a Turns>) -> Result<Self> {
+        let _turn = turns.map(|turns| turns.encoder.lock());
+        Ok(Self { network, embedding: network.encode(photo)?, turns })
     }
 }
 
@@ -52,6 +67,7 @@ impl PromptDecoder for SeenPhoto<'_> {
     }
 
     fn decode(&self, points: &[[f32; 2]]) -> Result<MaskLogits> {
+        let _turn = self.turns.map(|turns| turns.decoder.lock());
         // Masks under the threshold are dropped by the filter, which does not look at them.
         let least = segment::iou_over(self.network.manifest().pred_iou_thresh);
         self.network.decode_over(&self.embedding, points, least)
@@ -65,11 +81,12 @@ impl PromptDecoder for SeenPhoto<'_> {
     }
 
     fn judge(&self, points: &[[f32; 2]], judging: &MaskJudging) -> Result<JudgedMasks> {
+        let _turn = self.turns.map(|turns| turns.decoder.lock());
         self.network.judge(&self.embedding, points, judging)
     }
 
     fn on<'b>(&'b self, photo: &'b Photo) -> Result<Box<dyn PromptDecoder + 'b>> {
-        Ok(Box::new(SeenPhoto::new(self.network, photo)?))
+        Ok(Box::new(SeenPhoto::in_turn(self.network, photo, self.turns)?))
     }
 }
 
@@ -123,13 +140,16 @@ pub fn photo_masks(
     progress: &(dyn Fn(f32) + Sync),
     cancel: &AtomicBool,
 ) -> Result<Vec<PhotoMasks>> {
+    let gaussians = gaussians.filter(|_| settings.use_seeds);
+    if gaussians.is_none() && network.provider() != Provider::Cpu {
+        return side_by_side(network, photos, settings, progress, cancel);
+    }
     let encoded = |posed: &PosedPhoto| SeenPhoto::new(network, &posed.photo);
     let mut masks: Vec<PhotoMasks> = Vec::new();
     let mut places: Vec<DVec3> = Vec::new();
     let mut next = photos.first().map(encoded);
     for (at, posed) in photos.iter().enumerate() {
         progress(at as f32 / photos.len() as f32);
-        let gaussians = gaussians.filter(|_| settings.use_seeds);
         let seeds = seeds_at(posed, &places);
         let seen = next.take().unwrap_or_else(|| encoded(posed))?;
         // The next photo is encoded meanwhile.
@@ -147,6 +167,48 @@ pub fn photo_masks(
     }
     progress(1.0);
     Ok(masks)
+}
+
+/// As [`photo_masks`] without seeds, two photos at a time: while the host judges the masks of one, a
+/// device decodes those of the other.
+///
+/// # Errors
+/// As [`photo_masks`].
+pub fn side_by_side(
+    network: &MaskNetwork,
+    photos: &[PosedPhoto],
+    settings: &Settings,
+    progress: &(dyn Fn(f32) + Sync),
+    cancel: &AtomicBool,
+) -> Result<Vec<PhotoMasks>> {
+    let (turns, next, done) = (Turns::default(), AtomicUsize::new(0), Mutex::new(0_usize));
+    let found = |posed: &PosedPhoto| {
+        unless_cancelled(cancel)?;
+        let seen = SeenPhoto::in_turn(network, &posed.photo, Some(&turns))?;
+        segment::everything(&seen, &posed.photo, settings, &[], cancel)
+    };
+    let work = || {
+        let mut mine = Vec::new();
+        loop {
+            let at = next.fetch_add(1, Ordering::Relaxed);
+            let Some(posed) = photos.get(at) else { return Ok(mine) };
+            // After a failure no other photo is begun.
+            let masks = found(posed).inspect_err(|_| next.store(photos.len(), Ordering::Relaxed));
+            mine.push((at, masks?));
+            let mut done = done.lock();
+            *done += 1;
+            progress(*done as f32 / photos.len() as f32);
+        }
+    };
+    let (mine, other) = std::thread::scope(|scope| {
+        let other = scope.spawn(work);
+        let mine = work();
+        (mine, other.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+    });
+    let mut all: Vec<(usize, PhotoMasks)> = mine?;
+    all.extend(other?);
+    all.sort_unstable_by_key(|(at, _)| *at);
+    Ok(all.into_iter().map(|(_, masks)| masks).collect())
 }
 
 /// Where the masks of earlier photos reappear in photo `to`: of each mask the Gaussian nearest to

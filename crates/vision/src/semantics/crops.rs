@@ -21,6 +21,7 @@ pub struct Cutter<'a> {
     columns: Vec<usize>,
     /// Start of the cell row of each pixel row.
     rows: Vec<usize>,
+    /// The boxes of all masks as they lie in the index map; none where the masks are whole.
     bounds: Vec<Option<Bounds>>,
 }
 
@@ -44,7 +45,7 @@ fn cells_of(pixels: u32, cells: u32) -> Vec<usize> {
 }
 
 impl<'a> Cutter<'a> {
-    /// Finds the box of every mask.
+    /// Finds the boxes of masks that are not whole; that of a whole one is found when it is cut.
     #[must_use]
     pub fn new(photo: &'a Photo, masks: &'a PhotoMasks) -> Self {
         let map = &masks.map;
@@ -54,14 +55,12 @@ impl<'a> Cutter<'a> {
             .map(|row| row * map.width as usize)
             .collect();
         let mut cutter = Self { photo, masks, columns, rows, bounds: Vec::new() };
-        cutter.bounds = match masks.wholes.len() == masks.masks.len() {
-            true => (0..masks.masks.len()).map(|k| cutter.bounds_of_whole(k)).collect(),
-            false => cutter.bounds_in_map(),
-        };
+        if masks.wholes.is_empty() {
+            cutter.bounds = cutter.bounds_in_map();
+        }
         cutter
     }
 
-    /// The boxes of all masks as they lie in the index map.
     fn bounds_in_map(&self) -> Vec<Option<Bounds>> {
         let mut bounds: Vec<Option<Bounds>> = vec![None; self.masks.masks.len()];
         for (y, row) in (0..).zip(&self.rows) {
@@ -75,9 +74,8 @@ impl<'a> Cutter<'a> {
         bounds
     }
 
-    /// The box of a whole mask.
-    fn bounds_of_whole(&self, k: usize) -> Option<Bounds> {
-        let whole = self.whole(k)?;
+    /// The box of these cells of the map.
+    fn bounds_of(&self, whole: &[bool]) -> Option<Bounds> {
         let mut bounds = None;
         for (y, row) in (0..).zip(&self.rows) {
             for (x, column) in (0..).zip(&self.columns) {
@@ -105,7 +103,11 @@ impl<'a> Cutter<'a> {
     /// box. `None` if the mask has no pixel of the photo.
     #[must_use]
     pub fn cut(&self, k: usize, margin: f64, shape: CropShape) -> Option<Crop> {
-        let bounds = (*self.bounds.get(k)?)?;
+        let whole = self.whole(k);
+        let bounds = match &whole {
+            Some(whole) => self.bounds_of(whole),
+            None => *self.bounds.get(k)?,
+        }?;
         let [wide, high] = [bounds.x, bounds.y].map(|[first, last]| last - first + 1);
         let longer = wide.max(high);
         #[expect(
@@ -125,7 +127,7 @@ impl<'a> Cutter<'a> {
         };
         let (left, top) = (start(bounds.x, width), start(bounds.y, height));
         let mut rgb = vec![0; width as usize * height as usize * 3];
-        let (wanted, whole) = (k + 1, self.whole(k));
+        let wanted = k + 1;
         let inside = |cell: usize| match &whole {
             Some(whole) => whole.get(cell).copied().unwrap_or(false),
             None => usize::from(self.masks.map.index.get(cell).copied().unwrap_or(0)) == wanted,

@@ -2,7 +2,7 @@
 //! colour. What the adapters feed and read must make them right for any shape of photo.
 
 use std::sync::{
-    Arc,
+    Arc, Mutex,
     atomic::{AtomicBool, Ordering},
 };
 
@@ -10,7 +10,7 @@ use segsplat_core::{
     error::{ErrorCode, Result},
     scene::{
         Camera, CameraToWorld, Crop, Gaussians, Intrinsics, JudgedMasks, MaskJudging, MaskLevel,
-        MaskLogits, Method, Photo, PosedPhoto, RawGaussians, SourcePixel,
+        MaskLogits, Method, Photo, PosedPhoto, Preset, RawGaussians, SourcePixel,
     },
 };
 use segsplat_vision::{
@@ -297,6 +297,29 @@ fn photos_give_masks_and_seeds_say_where_they_reappear() {
     assert!(masks::seeds(&gaussians, &photos, &[], 0).is_empty(), "the first photo has none");
     cancel.store(true, Ordering::Relaxed);
     let error = masks::photo_masks(&network, &photos, None, &settings, &|_| (), &cancel);
+    assert_eq!(error.unwrap_err().code(), ErrorCode::Cancelled, "cancelled");
+}
+
+#[test]
+fn photos_side_by_side_give_the_masks_of_one_after_the_other() {
+    let Some(runtime) = runtime() else { return };
+    let network = MaskNetwork::open(&runtime, &bundle(), &network_options()).unwrap().unwrap();
+    let settings = masks::settings(network.manifest(), &Method::of(Preset::Paper));
+    let sizes = [(64, 64), (48, 64), (64, 40), (32, 64), (64, 56)];
+    let photos = sizes.map(|(width, height)| posed(photo(width, height), 0.0));
+    let cancel = AtomicBool::new(false);
+    let none = |_: f32| {};
+    let want = masks::photo_masks(&network, &photos, None, &settings, &none, &cancel).unwrap();
+    assert!(want.iter().all(|of| of.masks.len() > 1), "{want:?}");
+    let told = Mutex::new(Vec::new());
+    let tell = |fraction| told.lock().unwrap().push(fraction);
+    let got = masks::side_by_side(&network, &photos, &settings, &tell, &cancel).unwrap();
+    assert_eq!(got, want, "in the order of the photos");
+    assert_eq!(told.into_inner().unwrap(), [0.2, 0.4, 0.6, 0.8, 1.0]);
+    assert!(masks::side_by_side(&network, &[], &settings, &none, &cancel).unwrap().is_empty());
+    // After the first photo it is cancelled: the answer is no list that lacks some.
+    let stop = |_: f32| cancel.store(true, Ordering::Relaxed);
+    let error = masks::side_by_side(&network, &photos, &settings, &stop, &cancel);
     assert_eq!(error.unwrap_err().code(), ErrorCode::Cancelled, "cancelled");
 }
 
