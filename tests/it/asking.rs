@@ -254,7 +254,8 @@ async fn a_new_scene_is_put_where_it_is_drawn_and_is_whole_where_that_fails() {
         let request = CreateScene { upload: upload(), options, ..CreateScene::default() };
         let id = server.service.create_scene(request).await.unwrap().status.id;
         let put = || renderer.put.lock().unwrap().clone();
-        let done = until(&server, &id, |_| !put().is_empty()).await;
+        let over = || !put().is_empty() && server.service.ready().jobs_running == 0;
+        let done = until(&server, &id, |_| over()).await;
         assert_eq!((done.state, done.semantics.state), (SceneState::Done, SemanticsState::Running));
         meaning.hold.store(false, Ordering::Release);
         let ready = until(&server, &id, |s| s.semantics.state != SemanticsState::Running).await;
@@ -262,7 +263,8 @@ async fn a_new_scene_is_put_where_it_is_drawn_and_is_whole_where_that_fails() {
         assert_eq!(put(), [ready.report.unwrap().gaussians as usize], "once");
         assert!(server.service.render(&id, first_view()).await.is_ok());
         let server = server.restart().await;
-        assert_eq!(semantics_state(&server, &id).await, SemanticsState::Ready);
+        let kept = server.service.get(&id).await.unwrap();
+        assert_eq!((kept.state, kept.semantics.state), (SceneState::Done, SemanticsState::Ready));
         assert_eq!(put().len(), 1, "not what a start finds");
     }
 }

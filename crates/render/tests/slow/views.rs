@@ -60,7 +60,7 @@ impl View {
             "pair" => two_views(count as u32, seed).0,
             _ => cloud(count, *degree as u8, seed),
         };
-        let mut raw = gaussians.clone().into_raw();
+        let mut raw = gaussians.into_raw();
         let away = DVec3::new(*shift, -0.5 * shift, 0.25 * shift);
         raw.origin += away;
         for scale in &mut raw.scales {
