@@ -169,8 +169,8 @@ pub fn photo_masks(
     Ok(masks)
 }
 
-/// As [`photo_masks`] without seeds, two photos at a time: while the host judges the masks of one, a
-/// device decodes those of the other.
+/// As [`photo_masks`] without seeds, two photos at a time: while the host filters the masks of one,
+/// a device decodes those of the other.
 ///
 /// # Errors
 /// As [`photo_masks`].
