@@ -41,7 +41,8 @@ pub(crate) fn trainer_bytes(set: &TrainingSet<'_>) -> u64 {
     let most = set.photos.iter().map(pixels).max().unwrap_or(0);
     let numbers = 3 * set.gaussians.sh_count() as u64;
     let rows = size_of::<GaussianRow>() as u64 + 4 * numbers + gradient_bytes(1, numbers);
-    let each = rows + moment_bytes(1, numbers) + PAIRS_A_GAUSSIAN * PAIR_BYTES;
+    let kept = size_of::<GaussianRow>() as u64 + 4 * numbers;
+    let each = rows + kept + moment_bytes(1, numbers) + PAIRS_A_GAUSSIAN * PAIR_BYTES;
     // Pictures, what the loss says of them, and SSIM's windows.
     let pictures = most * 4 * (4 + 4 + 9);
     4 * set.photos.iter().map(pixels).sum::<u64>() + pictures + each * set.gaussians.len() as u64
@@ -86,6 +87,8 @@ pub(super) struct DeviceTrainer {
     start: Gaussians,
     /// As they are now. One that was dropped has opacity 0.
     scene: DeviceScene,
+    /// Rows and harmonics as they were when they were kept.
+    kept: Option<[wgpu::Buffer; 2]>,
     training: TrainingBuffers,
     /// Gradients of the photos before the last one of a step; there for steps of several.
     earlier: Option<wgpu::Buffer>,
@@ -181,6 +184,7 @@ impl DeviceTrainer {
             scratch: Scratch::default(),
             start: set.gaussians.clone(),
             scene,
+            kept: None,
             training,
             earlier: None,
             targets,
@@ -280,6 +284,39 @@ impl DeviceTrainer {
         readback::read(gpu, &staging, total, take)
     }
 
+    /// Bytes of the rows and of the harmonics.
+    fn sizes(&self) -> [u64; 2] {
+        let count = self.start.len();
+        let rows = size_of::<GaussianRow>() * count;
+        [rows as u64, 12 * (count * self.start.sh_count()) as u64]
+    }
+
+    /// The Gaussians of buffers of rows and harmonics.
+    fn read_gaussians(&mut self, [rows, sh]: [wgpu::Buffer; 2]) -> Result<Gaussians> {
+        let sizes = self.sizes();
+        let row_bytes = size_of::<GaussianRow>() * self.start.len();
+        let parts = [(&rows, sizes[0]), (&sh, sizes[1])];
+        let mut raw = self.start.clone().into_raw();
+        self.read(&parts, |bytes| {
+            let (rows, sh) = bytes.split_at(row_bytes);
+            raw.sh.copy_from_slice(bytemuck::cast_slice(sh));
+            let rows: &[GaussianRow] = bytemuck::cast_slice(rows);
+            let out = raw.means.par_iter_mut().zip(&mut raw.quats).zip(&mut raw.scales);
+            let out = out.zip(&mut raw.opacities).zip(rows).with_min_len(1 << 14);
+            out.for_each(|((((mean, quat), scale), opacity), row)| {
+                (*mean, *quat, *scale) = (row.mean, row.quat, row.scale);
+                *opacity = row.opacity;
+            });
+        })?;
+        // Those that were dropped are under the smallest opacity.
+        let dropped = |opacity: &f32| *opacity < Gaussians::OPACITY_MIN;
+        let dropped: Vec<bool> = raw.opacities.iter().map(dropped).collect();
+        let raised = |opacity: &mut f32| *opacity = opacity.max(Gaussians::OPACITY_MIN);
+        raw.opacities.iter_mut().for_each(raised);
+        let all = checked(raw)?;
+        Ok(if dropped.contains(&true) { all.only(|i| !dropped[i]) } else { all })
+    }
+
     /// What the loss says of the last picture, which photo `at` has the size of; `[H * W]`.
     pub(super) fn by_picture(&mut self, at: usize) -> Result<Vec<[f32; 3]>> {
         self.settle()?;
@@ -326,29 +363,37 @@ impl Trainer for DeviceTrainer {
 
     fn gaussians(&mut self) -> Result<Gaussians> {
         self.settle()?;
-        let (count, k) = (self.start.len(), self.start.sh_count());
-        let row_bytes = size_of::<GaussianRow>() * count;
-        let (rows, sh) = (self.scene.gaussians.clone(), self.scene.sh.clone());
-        let parts = [(&rows, row_bytes as u64), (&sh, 12 * (count * k) as u64)];
-        let mut raw = self.start.clone().into_raw();
-        self.read(&parts, |bytes| {
-            let (rows, sh) = bytes.split_at(row_bytes);
-            raw.sh.copy_from_slice(bytemuck::cast_slice(sh));
-            let rows: &[GaussianRow] = bytemuck::cast_slice(rows);
-            let out = raw.means.par_iter_mut().zip(&mut raw.quats).zip(&mut raw.scales);
-            let out = out.zip(&mut raw.opacities).zip(rows).with_min_len(1 << 14);
-            out.for_each(|((((mean, quat), scale), opacity), row)| {
-                (*mean, *quat, *scale) = (row.mean, row.quat, row.scale);
-                *opacity = row.opacity;
-            });
+        let now = [self.scene.gaussians.clone(), self.scene.sh.clone()];
+        self.read_gaussians(now)
+    }
+
+    fn keep(&mut self) -> Result<()> {
+        self.settle()?;
+        let (gpu, sizes) = (&self.on.gpu, self.sizes());
+        let kept = match self.kept.take() {
+            Some(kept) => kept,
+            None => [
+                gpu.create_buffer("kept rows", sizes[0], STORAGE)?,
+                gpu.create_buffer("kept harmonics", sizes[1], STORAGE)?,
+            ],
+        };
+        gpu.scoped("training", || {
+            let mut encoder = gpu.device.create_command_encoder(&Default::default());
+            let now = [&self.scene.gaussians, &self.scene.sh];
+            for ((from, to), bytes) in now.into_iter().zip(&kept).zip(sizes) {
+                encoder.copy_buffer_to_buffer(from, 0, to, 0, Some(bytes));
+            }
+            gpu.queue.submit([encoder.finish()]);
         })?;
-        // Those that were dropped are under the smallest opacity.
-        let dropped = |opacity: &f32| *opacity < Gaussians::OPACITY_MIN;
-        let dropped: Vec<bool> = raw.opacities.iter().map(dropped).collect();
-        let raised = |opacity: &mut f32| *opacity = opacity.max(Gaussians::OPACITY_MIN);
-        raw.opacities.iter_mut().for_each(raised);
-        let all = checked(raw)?;
-        Ok(if dropped.contains(&true) { all.only(|i| !dropped[i]) } else { all })
+        self.kept = Some(kept);
+        Ok(())
+    }
+
+    fn kept(&mut self) -> Result<Gaussians> {
+        match self.kept.clone() {
+            Some(kept) => self.read_gaussians(kept),
+            None => self.gaussians(),
+        }
     }
 
     fn exposures(&mut self) -> Result<Vec<(Exposure, f64)>> {

@@ -51,6 +51,7 @@ impl Target {
 pub struct HostTrainer<'a> {
     renderer: &'a dyn DifferentiableRenderer,
     gaussians: Gaussians,
+    kept: Option<Gaussians>,
     adam: Adam,
     targets: Vec<Target>,
     ssim_share: f32,
@@ -68,6 +69,7 @@ impl<'a> HostTrainer<'a> {
         Ok(Self {
             renderer,
             gaussians: set.gaussians.clone(),
+            kept: None,
             adam: Adam::new(set.gaussians),
             targets: set.photos.par_iter().map(Target::new).collect(),
             ssim_share: set.ssim_share,
@@ -78,7 +80,7 @@ impl<'a> HostTrainer<'a> {
 
 impl Trainer for HostTrainer<'_> {
     fn step(&mut self, photos: &[usize], step: &TrainingStep) -> Result<()> {
-        let Self { renderer, gaussians, adam, targets, ssim_share, found } = self;
+        let Self { renderer, gaussians, adam, targets, ssim_share, found, .. } = self;
         for (place, &at) in photos.iter().enumerate() {
             let target = targets.get_mut(at).ok_or_else(|| absent(at))?;
             let request = target.request.clone();
@@ -102,6 +104,15 @@ impl Trainer for HostTrainer<'_> {
 
     fn gaussians(&mut self) -> Result<Gaussians> {
         Ok(self.gaussians.clone())
+    }
+
+    fn keep(&mut self) -> Result<()> {
+        self.kept = Some(self.gaussians.clone());
+        Ok(())
+    }
+
+    fn kept(&mut self) -> Result<Gaussians> {
+        Ok(self.kept.as_ref().unwrap_or(&self.gaussians).clone())
     }
 
     fn exposures(&mut self) -> Result<Vec<(Exposure, f64)>> {

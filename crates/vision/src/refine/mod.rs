@@ -48,6 +48,11 @@ const PATIENCE: u32 = 3;
 const RATE: f32 = 2.5;
 /// Rates fall to this share over the budget.
 const LAST_RATE: f32 = 0.1;
+/// Steps for each photo with which the rates are right, how rates grow where there are fewer, and
+/// how far: docs/adr/0041.
+const STEPS_A_PHOTO: f32 = 200.0;
+const HASTE_POWER: f32 = 0.4;
+const HASTE_MAX: f32 = 2.0;
 /// How fast an exposure moves.
 const EXPOSURE_RATE: f32 = 5e-3;
 
@@ -109,7 +114,7 @@ impl Default for RefineOptions {
             opacity_min: 0.01,
             prune_every: 50,
             ssim_share: 0.2,
-            proof_share: 0.34,
+            proof_share: 0.25,
             device_bytes_max: 1 << 30,
             seed: 1,
         }
@@ -279,7 +284,8 @@ impl Refinement<'_> {
         let begun = Instant::now();
         let mut clock = Clock { budget: options.budget, begun, waited: Duration::ZERO };
         let watched = !self.looks.is_empty();
-        let mut best = self.unrefined();
+        let few = !watched && self.learnt.len() < HOLDS_OUT_FROM;
+        let mut best: Option<RefineReport> = None;
         let mut order: Vec<usize> = Vec::new();
         let (mut steps, mut looked, mut waited, mut highest) = (0_u32, 0, 0, None);
         loop {
@@ -287,8 +293,7 @@ impl Refinement<'_> {
             let paused = Instant::now();
             pace(spent)?;
             clock.waited += paused.elapsed();
-            let few = self.learnt.len() < HOLDS_OUT_FROM && steps >= UNWATCHED_STEPS_MAX;
-            let last = spent >= 1.0 || (!watched && few);
+            let last = spent >= 1.0 || (few && steps >= UNWATCHED_STEPS_MAX);
             if last || (watched && spent * LOOKS as f32 >= (looked + 1) as f32) {
                 looked += 1;
                 waited += 1;
@@ -297,25 +302,24 @@ impl Refinement<'_> {
                     (highest, waited) = (after, 0);
                 }
                 tracing::debug!(steps, psnr = after, "looked");
-                let better = match (after, best.report.psnr_after) {
-                    (Some(after), Some(before)) => after > before,
+                let reached = best.as_ref().unwrap_or(&self.report).psnr_after;
+                let better = match (after, reached) {
+                    (Some(after), Some(reached)) => after > reached,
                     _ => last && steps > 0,
                 };
                 if better {
-                    best.gaussians = trainer.gaussians()?;
-                    best.report = RefineReport {
-                        steps: self.report.steps + steps,
-                        seconds: self.report.seconds + clock.worked().as_secs_f64(),
-                        psnr_after: after,
-                        gaussians_after: best.gaussians.len() as u64,
-                        ..self.report.clone()
-                    };
+                    trainer.keep()?;
+                    let seconds = self.report.seconds + clock.worked().as_secs_f64();
+                    let steps = self.report.steps + steps;
+                    let served = self.report.clone();
+                    best = Some(RefineReport { steps, seconds, psnr_after: after, ..served });
                 }
                 if last || waited >= PATIENCE {
-                    return Ok(best);
+                    break;
                 }
             }
-            let rate = LAST_RATE.powf(spent);
+            let haste = if few { 1.0 } else { self.haste(steps, spent) };
+            let rate = haste * LAST_RATE.powf(spent);
             let mut photos = Vec::with_capacity(options.batch);
             while photos.len() < options.batch {
                 if order.is_empty() {
@@ -332,6 +336,20 @@ impl Refinement<'_> {
             };
             trainer.step(&photos, &step)?;
         }
+        let Some(report) = best else { return Ok(self.unrefined()) };
+        let gaussians = trainer.kept()?;
+        let report = RefineReport { gaussians_after: gaussians.len() as u64, ..report };
+        Ok(RefinedVersion { gaussians, report })
+    }
+
+    /// How much larger rates are because few steps are expected for each photo, 1 to [`HASTE_MAX`],
+    /// after `steps` that took the share `spent` of the budget.
+    fn haste(&self, steps: u32, spent: f32) -> f32 {
+        if spent <= 0.0 {
+            return 1.0;
+        }
+        let a_photo = steps as f32 / spent / self.learnt.len() as f32;
+        (STEPS_A_PHOTO / a_photo).powf(HASTE_POWER).clamp(1.0, HASTE_MAX)
     }
 
     /// The scene that came in.
