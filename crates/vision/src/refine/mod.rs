@@ -152,6 +152,17 @@ pub fn split(photos: &[PosedPhoto], held: &[usize]) -> (Vec<PosedPhoto>, Vec<Pos
     (of(false), of(true))
 }
 
+/// How much larger rates are where few steps are expected for each photo, 1..=2; 1 where it is not
+/// known how many.
+#[must_use]
+pub fn haste(steps_a_photo: f32) -> f32 {
+    if steps_a_photo > 0.0 {
+        (STEPS_A_PHOTO / steps_a_photo).powf(HASTE_POWER).clamp(1.0, HASTE_MAX)
+    } else {
+        1.0
+    }
+}
+
 /// A held-out photo.
 struct Look {
     camera: Camera,
@@ -318,8 +329,8 @@ impl Refinement<'_> {
                     break;
                 }
             }
-            let haste = if few { 1.0 } else { self.haste(steps, spent) };
-            let rate = haste * LAST_RATE.powf(spent);
+            let expected = steps as f32 / spent / self.learnt.len() as f32;
+            let rate = LAST_RATE.powf(spent) * if few { 1.0 } else { haste(expected) };
             let mut photos = Vec::with_capacity(options.batch);
             while photos.len() < options.batch {
                 if order.is_empty() {
@@ -340,16 +351,6 @@ impl Refinement<'_> {
         let gaussians = trainer.kept()?;
         let report = RefineReport { gaussians_after: gaussians.len() as u64, ..report };
         Ok(RefinedVersion { gaussians, report })
-    }
-
-    /// How much larger rates are because few steps are expected for each photo, 1 to [`HASTE_MAX`],
-    /// after `steps` that took the share `spent` of the budget.
-    fn haste(&self, steps: u32, spent: f32) -> f32 {
-        if spent <= 0.0 {
-            return 1.0;
-        }
-        let a_photo = steps as f32 / spent / self.learnt.len() as f32;
-        (STEPS_A_PHOTO / a_photo).powf(HASTE_POWER).clamp(1.0, HASTE_MAX)
     }
 
     /// The scene that came in.
