@@ -110,13 +110,14 @@ fn the_same_photos_as_each_layout_of_captures_are_the_same_scene() {
     for (layout, same_numbers) in captures::LAYOUTS {
         let made = made(layout);
         let raw = made.gaussians.as_raw();
-        let off = furthest(raw, want) / reference.report.median_depth as f32;
+        let off = furthest(raw, want);
+        let moved = (raw.origin - want.origin).abs().max_element();
         let same = bits(&made) == bits(&reference);
         let count = raw.means.len();
-        println!("{layout}: {count} Gaussians, the same to the bit: {same}; {off:e} of the depth");
+        println!("{layout}: {count} Gaussians, all bits: {same}; {off:e}, origin {moved:e}");
         assert!(same || !same_numbers, "{layout}: {off:e}");
         assert_eq!(count, want.means.len(), "{layout}");
-        assert!(off < 1e-5, "{layout}: {off:e}");
+        assert!(off < 1e-5 && moved < 1e-12, "{layout}: {off:e}, origin {moved:e}");
     }
 }
 
@@ -136,8 +137,16 @@ fn bits(made: &Reconstruction) -> Vec<u8> {
     numbers.concat()
 }
 
-/// The largest distance of two centres of one number, world units.
+/// The largest difference of two numbers of 32 bits.
 fn furthest(a: &RawGaussians, b: &RawGaussians) -> f32 {
-    let apart = |(a, b): (&[f32; 3], &[f32; 3])| (0..3).map(|k| (a[k] - b[k]).abs()).sum::<f32>();
-    a.means.iter().zip(&b.means).map(apart).fold(0.0, f32::max)
+    let all = |raw: &RawGaussians| -> Vec<f32> {
+        let rows: [&[f32]; 4] = [
+            bytemuck::cast_slice(&raw.means),
+            bytemuck::cast_slice(&raw.quats),
+            bytemuck::cast_slice(&raw.scales),
+            bytemuck::cast_slice(&raw.sh),
+        ];
+        [&rows.concat()[..], &raw.opacities].concat()
+    };
+    all(a).iter().zip(all(b)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
 }

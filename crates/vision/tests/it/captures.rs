@@ -294,7 +294,9 @@ fn refused(layout: &str, file: &str, cases: Vec<(String, Vec<u8>)>) {
     assert!(files.len() >= 20, "{layout} {file}: {} files", files.len());
     println!("{layout} {file}: {} damaged files", files.len());
     let name = file.rsplit('/').next().unwrap_or(file);
-    let names = [name, name.trim_end_matches(".json"), "photo ", ".png"];
+    // All of one kind of JSON are called by it.
+    let kind = if layout == "blender" { "transforms" } else { name };
+    let names = [name, name.trim_end_matches(".json"), kind, "photo ", ".png"];
     for (what, bytes) in cases {
         let mut files = written(layout);
         files.iter_mut().find(|f| f.name == file).unwrap().bytes = bytes;
@@ -365,7 +367,12 @@ fn damaged_camera_jsons_are_refused() {
         ("polycam_corrected", "/t_12", "/fy", "/height"),
         ("record3d", "/poses/0/0", "/perFrameIntrinsicCoeffs/0/0", "/w"),
         ("r3d", "/poses/0/6", "/perFrameIntrinsicCoeffs/0/1", "/h"),
-        ("blender", "/frames/0/transform_matrix/2/3", "/camera_angle_x", "/camera_angle_x"),
+        (
+            "blender",
+            "/frames/0/transform_matrix/2/3",
+            "/camera_angle_x",
+            "/frames/0/transform_matrix/0/0",
+        ),
     ] {
         let file = captures::described_by(layout);
         let mut cases = spoilt_json(&content(layout, file), pose, focal, width);
