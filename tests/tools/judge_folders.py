@@ -215,15 +215,15 @@ def judge_converters(capture: Path, top: Path, frames: list[dict]) -> None:
     # nerfstudio takes one focal length and the middle of the picture.
     k = [first["fl_x"], 0, 0, 0, first["fl_x"], 0, first["w"] / 2, first["h"] / 2, 1]
     told = {"w": first["w"], "h": first["h"], "K": k, "poses": turned}
-    (record3d / "metadata").write_text(json.dumps(told))
+    (record3d / "metadata.json").write_text(json.dumps(told))
     (top / "of_record3d").mkdir()
     images = sorted((record3d / "rgb").iterdir(), key=lambda path: int(path.stem))
-    record3d_utils.record3d_to_json(images, record3d / "metadata", top / "of_record3d",
+    record3d_utils.record3d_to_json(images, record3d / "metadata.json", top / "of_record3d",
                                     np.arange(len(images)))
 
     # nerfstudio turns Polycam's world: z is up there. Its poses of Record3D are of 32 bits.
     turn = {"polycam": np.eye(4)[[2, 0, 1, 3]], "record3d": np.eye(4)}
-    for name, folder, most in (("polycam", polycam, 0.0), ("record3d", record3d.parent, 1e-6)):
+    for name, folder, most in (("polycam", polycam, 1e-12), ("record3d", record3d.parent, 1e-6)):
         ours = cameras_of(folder)
         theirs = json.loads((top / f"of_{name}/transforms.json").read_text())
         check(len(ours) == len(theirs["frames"]) == len(frames), f"{name}: {len(ours)} photos")
