@@ -440,8 +440,8 @@ fn length_of(file: &[u8]) -> usize {
     u32::from_le_bytes(file[12..16].try_into().unwrap()) as usize
 }
 
-/// Each file is refused as the caller's fault, in words that name the format and what is wrong: when
-/// it is read, or when a scene is made of it.
+/// Each file is refused as the caller's fault, in words that name the format and what is wrong:
+/// when it is read, or when a scene is made of it.
 fn refused(format: &SplatFormat, cases: Vec<(Vec<u8>, &str)>) {
     let files: HashSet<&[u8]> = cases.iter().map(|(file, _)| &file[..]).collect();
     assert!(files.len() == cases.len() && files.len() >= 20, "{}: {}", format.name, files.len());

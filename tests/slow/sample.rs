@@ -89,9 +89,9 @@ fn a_thinned_sample_is_drawn_as_the_full_one_by_fewer_gaussians() {
     assert!(fidelity > THINNED_PSNR_MIN, "{fidelity:.2} dB");
 }
 
-/// The same photos as each layout of captures: where a layout holds the numbers of a pose themselves the
-/// scene is the same to the bit. Others cost a rounding of the poses (1e-13 at most, as a test of the
-/// readers has it), and the scene is the same but for the last digits of its numbers.
+/// The same photos as each layout of captures: where a layout holds the numbers of a pose
+/// themselves the scene is the same to the bit. Others cost a rounding of the poses (1e-13 at most,
+/// as a test of the readers has it), and so the last digits of its numbers.
 #[test]
 fn the_same_photos_as_each_layout_of_captures_are_the_same_scene() {
     let Some(engine) = engine() else { return };

@@ -1,7 +1,7 @@
 """Other programs read the folders that this program writes of a scene of generated photos: COLMAP
 (pycolmap) its model and its depth maps, pycocotools the masks of texts, labelme the polygons. The
-truth is the capture itself, `segsplat render` and `segsplat query`. And it reads what others write: a
-rig of pycolmap, and captures of Polycam and Record3D as nerfstudio's own converters read them.
+truth is the capture itself, `segsplat render` and `segsplat query`. And it reads what others write:
+a rig of pycolmap, and captures of Polycam and Record3D as nerfstudio's own converters read them.
 
 python3 judge_folders.py SEGSPLAT
 """

@@ -1,6 +1,6 @@
 """splat-transform (PlayCanvas) reads the files of Gaussians that this program writes: the right
-number of them, the right bounds, the right harmonics of each; and this program reads of its files what it
-reads itself. Khronos' validator, which does not know the extension, finds
+number of them, the right bounds, the right harmonics of each; and this program reads of its files
+what it reads itself. Khronos' validator, which does not know the extension, finds
 nothing wrong with a GLB but the names of its attributes. `make judge` gets Node and both.
 
 python3 judge_splats.py SEGSPLAT NODE SPLAT_TRANSFORM_CLI SOURCE.ply
@@ -130,7 +130,8 @@ with tempfile.TemporaryDirectory() as folder:
                              turned)
         print(f"{ending}: harmonics of ours within {off:.2g}, of theirs within {back:.2g}")
         if off > HARMONICS[ending] or back > 1e-5:
-            faults.append(f"{ending}: harmonics: {off} over {HARMONICS[ending]}, or {back} over 1e-5")
+            bound = HARMONICS[ending]
+            faults.append(f"{ending}: harmonics: {off} over {bound}, or {back} over 1e-5")
     path = Path(folder) / "ours.glb"
     subprocess.run([segsplat, "export", source, "-o", path], check=True, stdout=subprocess.DEVNULL)
     faults += (wrong := faults_of_glb(path))
