@@ -127,6 +127,8 @@ judge-three: judge-tools
 judge-venv: venv
 	PYTHONPATH=$(CLIENT)/tools python3 -m virtualenv --quiet $(JUDGE)/venv
 	$(JUDGE)/venv/bin/pip install --quiet --disable-pip-version-check -r tests/tools/requirements.txt
+	# Of nerfstudio two converters are run; what it needs to train is not installed.
+	$(JUDGE)/venv/bin/pip install --quiet --disable-pip-version-check --no-deps nerfstudio==1.1.5
 
 judge-folders: judge-venv
 	$(JUDGE)/venv/bin/python tests/tools/judge_folders.py $(PROGRAM)

@@ -152,7 +152,7 @@ impl Jobs {
     ///
     /// # Errors
     /// `invalid_request`, `photo_unreadable`, `limit_exceeded` where the upload cannot be a scene;
-    /// `invalid_request` when the key was used for another upload; `overloaded` when the queue is
+    /// `idempotency_key_reused` when the key was used with others; `overloaded` when the queue is
     /// full or the server stops.
     pub(crate) fn submit(
         &self,
@@ -236,9 +236,9 @@ impl Jobs {
     fn replayed(&self, files: &[PhotoHash], record: &Record, used: KeyUse) -> Result<SceneId> {
         let id = used.id;
         if !store::is_of_request(&used.request_sha256, files, &record.options) {
-            return Err(Error::invalid(format!(
-                "the idempotency key was used for another upload (scene {id})"
-            )));
+            let message = "the idempotency key was used with other photos or options";
+            let message = format!("{message} (scene {id})");
+            return Err(Error::new(ErrorCode::IdempotencyKeyReused, message));
         }
         let over = self.records.find(&id).is_some_and(|known| known.status.state.is_final());
         if !over && !self.replicas.is_acknowledged(&self.parts.store, &id)? {

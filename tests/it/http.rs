@@ -7,12 +7,16 @@ use reqwest::{
     StatusCode,
     header::{self, HeaderValue},
 };
-use segsplat::{render::compare::psnr, scene::Upload};
+use segsplat::{
+    error::ErrorCode,
+    render::compare::psnr,
+    scene::{Upload, UploadCameras},
+};
 use serde_json::{Value, json};
 
 use crate::common::{
     cpu_server::{CpuServer, upload},
-    doors::{Fault, bytes, form, json as body},
+    doors::{self, Fault, Options, bytes, form, json as body},
 };
 
 /// Makes the sample's scene and waits for it.
@@ -267,22 +271,52 @@ async fn a_caller_may_prefer_to_wait() {
 }
 
 #[tokio::test]
-async fn one_idempotency_key_makes_one_scene() {
+async fn one_idempotency_key_makes_one_scene_and_is_refused_for_another() {
     let stand = CpuServer::start().await;
-    let post = async |upload: &Upload| {
+    let post = async || {
         let request = crate::common::client().post(stand.url("/v1/scenes?wait_ms=120000"));
-        let request = request.header("idempotency-key", "key-1").multipart(form(upload));
+        let request = request.header("idempotency-key", "key-1").multipart(form(&upload()));
         request.send().await.unwrap()
     };
-    let first = post(&upload()).await;
+    let first = post().await;
     assert!(!first.headers().contains_key("idempotency-replayed"));
-    let again = post(&upload()).await;
+    let again = post().await;
     assert_eq!(again.headers()["idempotency-replayed"], "true");
     let (first, again) = (body(first).await.unwrap(), body(again).await.unwrap());
     assert_eq!(first["id"], again["id"], "a second scene");
-    let mut other = upload();
-    other.photos.reverse();
-    assert_eq!(bytes(post(&other).await).await.unwrap_err().code, "invalid_request");
+    let id = first["id"].as_str().unwrap();
+    let same = Options { idempotency_key: Some("key-1".to_owned()), ..Options::wait() };
+    let changed = |change: fn(&mut Upload)| {
+        let mut other = upload();
+        change(&mut other);
+        (other, same.clone())
+    };
+    let others = [
+        changed(|other| other.photos.reverse()),
+        changed(|other| drop(other.photos.pop())),
+        changed(|other| other.photos[1].bytes = other.photos[0].bytes.clone()),
+        changed(|other| match &mut other.cameras {
+            Some(UploadCameras::Transforms(json)) => json.push(b' '),
+            sent => panic!("the sample has {sent:?}"),
+        }),
+        (upload(), Options { semantics: Some("off"), ..same.clone() }),
+        (upload(), Options { preset: Some("paper"), ..same.clone() }),
+    ];
+    let row = ErrorCode::IdempotencyKeyReused.row();
+    for door in doors::both(stand.addr).await {
+        // How long to wait is no part of what is asked for.
+        let short = Options { wait_ms: None, ..same.clone() };
+        assert_eq!(door.create(&upload(), &short).await.unwrap().0, id, "{}", door.name());
+        for (i, (other, options)) in others.iter().enumerate() {
+            let refused = door.create(other, options).await.unwrap_err();
+            let found = (&*refused.code, refused.number);
+            assert_eq!(found, (row.name, door.number_of(row)), "{i} {}", door.name());
+            assert!(refused.message.contains(id), "{refused:?}");
+        }
+    }
+    assert_eq!(row.http, 422, "as draft-ietf-httpapi-idempotency-key-header has it");
+    let list = crate::common::client().get(stand.url("/v1/scenes")).send().await.unwrap();
+    assert_eq!(body(list).await.unwrap()["scenes"].as_array().map(Vec::len), Some(1));
 }
 
 #[tokio::test]

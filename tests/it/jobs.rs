@@ -174,7 +174,7 @@ async fn one_key_makes_one_scene_also_after_a_restart() {
     let mut other = keyed();
     other.options.max_views = Some(2);
     let refused = server.service.create_scene(other).await.unwrap_err();
-    assert_eq!(refused.code(), ErrorCode::InvalidRequest, "{refused}");
+    assert_eq!(refused.code(), ErrorCode::IdempotencyKeyReused, "{refused}");
     server.service.delete(&first.status.id).await.unwrap();
     assert!(!server.service.create_scene(keyed()).await.unwrap().replayed);
 }

@@ -337,7 +337,7 @@ async fn one_key_makes_one_scene_of_a_file() {
     let (first, _) = http.create(&file(&GLB, ""), &key()).await.unwrap();
     assert_eq!(grpc.create(&file(&GLB, ""), &key()).await.unwrap().0, first);
     let other = http.create(&file(&PLY, ""), &key()).await.unwrap_err();
-    assert!(other.message.contains("used for another upload"), "{other:?}");
+    assert_eq!((&*other.code, other.number), ("idempotency_key_reused", 422), "{other:?}");
     // The same file under no key is a copy with the semantics.
     let (copy, _) = http.create(&file(&GLB, ""), &Options::wait()).await.unwrap();
     assert_ne!(copy, first);

@@ -1,7 +1,10 @@
 //! Gaussians as files of other programs: what each format loses, files that others wrote, files
 //! that are damaged, and the calls that give them.
 
-use std::io::{Cursor, Read as _, Write as _};
+use std::{
+    collections::HashSet,
+    io::{Cursor, Read as _, Write as _},
+};
 
 use axum::http::header;
 use flate2::{Compression, read::GzDecoder, write::GzEncoder};
@@ -10,7 +13,10 @@ use segsplat::{
     error::{ErrorCode, Result},
     limits::Limits,
     render::{Kinds, RenderRequest, Renderer as _, compare::psnr, cpu::CpuRenderer},
-    scene::{Bank, BankMask, Gaussians, IndexMap, SanitizeReport, Semantics, SemanticsReport},
+    scene::{
+        Bank, BankMask, Gaussians, IndexMap, SanitizeReport, SceneOptions, Semantics,
+        SemanticsReport,
+    },
     store::splats::{
         COMPRESSED_PLY, FORMATS, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
         read_splats,
@@ -434,14 +440,81 @@ fn length_of(file: &[u8]) -> usize {
     u32::from_le_bytes(file[12..16].try_into().unwrap()) as usize
 }
 
-/// Each file is refused as the caller's fault, in words that name the format and what is wrong.
+/// Each file is refused as the caller's fault, in words that name the format and what is wrong:
+/// when it is read, or when a scene is made of it.
 fn refused(format: &SplatFormat, cases: Vec<(Vec<u8>, &str)>) {
-    assert!(cases.len() >= 20 || format.name == SPLAT.name, "{}: {}", format.name, cases.len());
+    let files: HashSet<&[u8]> = cases.iter().map(|(file, _)| &file[..]).collect();
+    assert!(files.len() == cases.len() && files.len() >= 20, "{}: {}", format.name, files.len());
+    println!("{}: {} damaged files", format.name, files.len());
+    let name = format!("a.{}", format.ending);
     for (i, (file, says)) in cases.into_iter().enumerate() {
-        let error = read(format, &file).unwrap_err();
+        let read = read_splats(&mut &file[..], &name, &limits(100_000));
+        let error = read.and_then(|read| read.into_scene(&SceneOptions::default())).unwrap_err();
         let codes = [ErrorCode::InvalidRequest, ErrorCode::LimitExceeded];
         assert!(codes.contains(&error.code()), "{} {i}: {error}", format.name);
         assert!(error.message().contains(says), "{} {i}: {error:?} says not {says:?}", format.name);
+    }
+}
+
+/// A file whose rows, from the byte `start` on, all have this number in the byte `at`.
+fn poisoned(file: &[u8], [start, stride, at]: [usize; 3], number: f32) -> Vec<u8> {
+    let mut file = file.to_vec();
+    let rows = file[start..].chunks_exact_mut(stride);
+    rows.for_each(|row| row[at..at + 4].copy_from_slice(&number.to_le_bytes()));
+    file
+}
+
+#[test]
+fn damaged_plys_are_refused_by_name() {
+    let good = bytes_of(&PLY, &cloud(30, 1, 3));
+    let re = |from: &str, to: &str| reworded(&good, from, to);
+    let head = good.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
+    let stride = (good.len() - head) / 30;
+    let column = |name: &str, number| {
+        let text = String::from_utf8_lossy(&good[..head]).into_owned();
+        let at = text.lines().filter(|line| line.starts_with("property"));
+        let at = at.take_while(|line| !line.ends_with(&format!(" {name}"))).count() * 4;
+        poisoned(&good, [head, stride, at], number)
+    };
+    let many: String = (0..300).map(|i| format!("property float a{i}\n")).collect();
+    let cases = vec![
+        (Vec::new(), "none of Gaussians"),
+        (b"plyx\n".to_vec(), "does not begin"),
+        ([b"ply".to_vec(), vec![b'a'; 1 << 20]].concat(), "is missing in the first"),
+        (b"ply\n\xff\xfe\n".to_vec(), "not text"),
+        (re("format binary_little_endian 1.0\n", ""), "no `format`"),
+        (re("binary_little_endian", "ascii"), "only binary"),
+        (re("element vertex 30", "element vertex -3"), "number of vertices"),
+        (re("element vertex 30", "element vertex 99999999999999999999"), "number of vertices"),
+        (re("element vertex 30", "element vertex 100001"), "100001 is over 100000"),
+        (re("element vertex 30", "element vertex 90000"), "ends after 30 of 90000"),
+        (re("element vertex 30", "element vertex 0"), "it has none"),
+        (re("element vertex 30", "element face 30"), "before the vertices"),
+        (re("element vertex 30\n", ""), "PLY: "),
+        (re("property float scale_2\n", ""), "no `scale_2`"),
+        (re("property float y", "property float x"), "twice"),
+        (re("property float y", "property quad y"), "is not known"),
+        (re("property float y", "property list uchar float y"), "is not known"),
+        (re("end_header\n", &format!("{many}end_header\n")), "is over 256"),
+        (re("end_header\n", ""), "PLY: the header"),
+        (re("property float f_rest_8", "property float g_rest_8"), "8 `f_rest_`"),
+        (re("comment SplatRenderMode: default", "comment segsplat_semantics_bytes -1"), "-1"),
+        (re("comment SplatRenderMode: default", "comment segsplat_semantics_bytes 9"), "0 of 9"),
+        (
+            re("comment SplatRenderMode: default", "comment segsplat_semantics_bytes 9999999999"),
+            "9999999999 is over",
+        ),
+        (good[..head].to_vec(), "ends after 0 of 30"),
+        (good[..good.len() - 1].to_vec(), "ends after 29 of 30"),
+        (column("x", f32::NAN), "30 not_finite"),
+        (column("z", 1e30), "30 too_far"),
+        (column("opacity", -20.0), "30 opacity_below_1_255"),
+        (column("scale_1", f32::INFINITY), "30 not_finite"),
+        (column("scale_0", -1e30), "30 zero_scale"),
+    ];
+    refused(&PLY, cases);
+    for length in 0..good.len() {
+        assert!(read(&PLY, &good[..length]).is_err(), "cut to {length} bytes");
     }
 }
 
@@ -733,9 +806,32 @@ fn damaged_compressed_plys_are_refused_by_name() {
 fn damaged_splat_files_are_refused_by_name() {
     let good = bytes_of(&SPLAT, &cloud(30, 0, 3));
     let cut = |to: usize| good[..to].to_vec();
+    let column = |at: usize, number| poisoned(&good, [0, 32, at], number);
+    let bytes = |at: std::ops::Range<usize>, byte: u8| {
+        let mut file = good.clone();
+        file.chunks_exact_mut(32).for_each(|row| row[at.clone()].fill(byte));
+        file
+    };
     let mut cases: Vec<_> = [1, 4, 12, 24, 31].map(|to| (cut(to), "0 of 1")).into();
     cases.extend([33, 63].map(|to| (cut(to), "1 of 2")));
-    cases.extend([(cut(32 * 30 - 1), "29 of 30"), (vec![b'x'; 32 * 100_001], "100000")]);
+    cases.extend([
+        (cut(32 * 30 - 1), "29 of 30"),
+        ([&good[..], b"\n"].concat(), "30 of 31"),
+        (vec![b'x'; 32 * 100_001], "100000"),
+        (Vec::new(), "the file is empty"),
+        (column(0, f32::NAN), "30 not_finite"),
+        (column(4, f32::INFINITY), "30 not_finite"),
+        (column(8, f32::NEG_INFINITY), "30 not_finite"),
+        (column(8, 1e30), "30 too_far"),
+        (column(12, f32::NAN), "30 not_finite"),
+        (column(16, 0.0), "30 zero_scale"),
+        (column(20, -1.0), "30 zero_scale"),
+        (column(20, f32::INFINITY), "30 not_finite"),
+        (bytes(27..28, 0), "30 opacity_below_1_255"),
+        (bytes(28..32, 128), "30 zero_quat"),
+        (vec![0; 32 * 30], "30 opacity_below_1_255"),
+        (vec![0xff; 32 * 30], "30 not_finite"),
+    ]);
     refused(&SPLAT, cases);
     // What has no name with this ending is not taken for it.
     let error = read_splats(&mut Cursor::new(&good), "a.bin", &limits(100)).unwrap_err();

@@ -3,12 +3,14 @@
 use std::sync::atomic::AtomicBool;
 
 use segsplat::{
+    limits::Limits,
     models::NetworkOptions,
     pipeline::{self, Pipeline, Reconstruction},
     render::{Kinds, RenderRequest, Renderer, compare::psnr, cpu::CpuRenderer},
     sample::{self, Room, SampleOptions},
-    scene::{Density, SceneOptions},
+    scene::{Density, RawGaussians, SceneOptions, Upload},
 };
+use segsplat_testing::captures;
 
 use crate::common::opened;
 
@@ -85,4 +87,66 @@ fn a_thinned_sample_is_drawn_as_the_full_one_by_fewer_gaussians() {
     assert_eq!((none, merged), (None, Some(all - left)), "every Gaussian is kept or counted");
     assert!(left * 10 < all * 8, "{left} of {all} left");
     assert!(fidelity > THINNED_PSNR_MIN, "{fidelity:.2} dB");
+}
+
+/// The same photos as each layout of captures: where a layout holds the numbers of a pose
+/// themselves the scene is the same to the bit. Others cost a rounding of the poses (1e-13 at most,
+/// as a test of the readers has it), and so the last digits of its numbers.
+#[test]
+fn the_same_photos_as_each_layout_of_captures_are_the_same_scene() {
+    let Some(engine) = engine() else { return };
+    let go_on = AtomicBool::new(false);
+    let posed = sample::photos(&SAMPLE).unwrap();
+    let pngs = sample::png_files(&posed).unwrap();
+    let made = |layout: &str| {
+        let photos = captures::write(layout, &posed, &pngs);
+        let upload = Upload { photos, ..Upload::default() };
+        let photos = pipeline::read(&upload, &Limits::default(), &go_on).unwrap().photos;
+        let options = SceneOptions::default();
+        pipeline::reconstruct(&engine, &photos, &options, &|_, _| {}, &go_on).unwrap()
+    };
+    let reference = made("cameras");
+    let want = reference.gaussians.as_raw();
+    for (layout, same_numbers) in captures::LAYOUTS {
+        let made = made(layout);
+        let raw = made.gaussians.as_raw();
+        let off = furthest(raw, want);
+        let moved = (raw.origin - want.origin).abs().max_element();
+        let same = bits(&made) == bits(&reference);
+        let count = raw.means.len();
+        println!("{layout}: {count} Gaussians, all bits: {same}; {off:e}, origin {moved:e}");
+        assert!(same || !same_numbers, "{layout}: {off:e}");
+        assert_eq!(count, want.means.len(), "{layout}");
+        assert!(off < 1e-6 && moved < 1e-12, "{layout}: {off:e}, origin {moved:e}");
+    }
+}
+
+/// All numbers of Gaussians and backdrop.
+fn bits(made: &Reconstruction) -> Vec<u8> {
+    let raw = made.gaussians.as_raw();
+    let origin = raw.origin.to_array();
+    let numbers: [&[u8]; 7] = [
+        bytemuck::cast_slice(&origin),
+        bytemuck::cast_slice(&raw.means),
+        bytemuck::cast_slice(&raw.quats),
+        bytemuck::cast_slice(&raw.scales),
+        bytemuck::cast_slice(&raw.opacities),
+        bytemuck::cast_slice(&raw.sh),
+        bytemuck::cast_slice(made.backdrop.cells()),
+    ];
+    numbers.concat()
+}
+
+/// The largest difference of two numbers of 32 bits.
+fn furthest(a: &RawGaussians, b: &RawGaussians) -> f32 {
+    let all = |raw: &RawGaussians| -> Vec<f32> {
+        let rows: [&[f32]; 4] = [
+            bytemuck::cast_slice(&raw.means),
+            bytemuck::cast_slice(&raw.quats),
+            bytemuck::cast_slice(&raw.scales),
+            bytemuck::cast_slice(&raw.sh),
+        ];
+        [&rows.concat()[..], &raw.opacities].concat()
+    };
+    all(a).iter().zip(all(b)).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max)
 }

@@ -1,15 +1,18 @@
 """Other programs read the folders that this program writes of a scene of generated photos: COLMAP
 (pycolmap) its model and its depth maps, pycocotools the masks of texts, labelme the polygons. The
-truth is the capture itself, `segsplat render` and `segsplat query`.
+truth is the capture itself, `segsplat render` and `segsplat query`. And it reads what others write:
+a rig of pycolmap, and captures of Polycam and Record3D as nerfstudio's own converters read them.
 
 python3 judge_folders.py SEGSPLAT
 """
 
 import json
+import shutil
 import struct
 import subprocess
 import sys
 import tempfile
+import types
 import zipfile
 from pathlib import Path
 
@@ -18,6 +21,12 @@ import pycolmap
 import shapely
 from PIL import Image
 from pycocotools.coco import COCO
+from scipy.spatial.transform import Rotation
+
+# nerfstudio imports them to copy and crop pictures, which is not asked of it here.
+for pictures in ("cv2", "imageio", "newrawpy"):
+    sys.modules.setdefault(pictures, types.ModuleType(pictures))
+from nerfstudio.process_data import polycam_utils, record3d_utils
 
 try:
     import labelme.utils
@@ -117,6 +126,117 @@ def judge_colmap(folder: Path, frames: list[dict], truth: list[np.ndarray]) -> N
     print(f"colmap: {len(model.images)} images, {len(model.points3D)} points, poses within {worst}")
 
 
+def cameras_of(capture: Path, *words: object) -> list[dict]:
+    """The cameras that this program reads of a capture."""
+    made = run("reconstruct", capture, "-o", capture.parent / "again.segsplat", *words)
+    check(made["report"].get("warnings", []) == [], f"{capture.name}: {made['report']}")
+    return made["cameras"]
+
+
+def poses_of(cameras: list[dict]) -> np.ndarray:
+    """Camera-to-world, OpenCV axes."""
+    return np.array([camera["camera_to_world"] for camera in cameras]).reshape(-1, 4, 4)
+
+
+def lenses_of(cameras: list[dict]) -> list[list[float]]:
+    """Numbers of the lens of each."""
+    names = ("fx", "fy", "cx", "cy", "width", "height")
+    return [[camera["intrinsics"][name] for name in names] for camera in cameras]
+
+
+def judge_rig(capture: Path, top: Path, cameras: list[dict]) -> None:
+    """A rig of as many cameras as there are photos, in one frame, as pycolmap writes it."""
+    model, rig = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1)
+    frame = pycolmap.Frame(frame_id=1, rig_id=1)
+    images = []
+    for i, (camera, pose) in enumerate(zip(cameras, poses_of(cameras), strict=True), 1):
+        *k, width, height = lenses_of([camera])[0]
+        lens = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=k, camera_id=i)
+        model.add_camera(lens)
+        seen = pycolmap.Rigid3d(np.linalg.inv(pose)[:3])
+        if i == 1:
+            # The rig is where its first camera is.
+            rig_from_world = frame.rig_from_world = seen
+            rig.add_ref_sensor(lens.sensor_id)
+        else:
+            rig.add_sensor(lens.sensor_id, seen * rig_from_world.inverse())
+        name = Path(camera["file"]).name
+        images.append(pycolmap.Image(name=name, camera_id=i, image_id=i, frame_id=1))
+        frame.add_data_id(images[-1].data_id)
+    model.add_rig(rig)
+    model.add_frame(frame)
+    for image in images:
+        model.add_image(image)
+    model.register_frame(1)
+    for binary in (True, False):
+        folder = top / ("rig_bin" if binary else "rig_txt")
+        (folder / "sparse/0").mkdir(parents=True)
+        shutil.copytree(capture / "images", folder / "images")
+        (model.write_binary if binary else model.write_text)(folder / "sparse/0")
+        files = {path.stem for path in (folder / "sparse/0").iterdir()}
+        check({"rigs", "frames"} <= files, f"{folder.name}: {files}")
+        sensors = pycolmap.Reconstruction(folder / "sparse/0").rigs[1].num_sensors()
+        check(sensors == len(cameras), f"{folder.name}: {sensors} sensors")
+        again = cameras_of(folder)
+        check(lenses_of(again) == lenses_of(cameras), f"{folder.name}: {lenses_of(again)}")
+        off = np.abs(poses_of(again) - poses_of(cameras)).max()
+        check(off < 1e-12, f"{folder.name}: a pose is {off} off")
+        print(f"{folder.name}: a rig of {sensors} cameras, {len(again)} images, poses within {off}")
+
+
+def judge_converters(capture: Path, top: Path, frames: list[dict]) -> None:
+    """The same cameras of a capture of Polycam and of Record3D as nerfstudio finds."""
+    photos = [capture / frame["file_path"] for frame in frames]
+    poses = [np.array(frame["transform_matrix"]) for frame in frames]
+
+    polycam = top / "polycam"
+    for part in ("cameras", "images"):
+        (polycam / "keyframes" / part).mkdir(parents=True)
+    images = []
+    for i, (frame, pose, photo) in enumerate(zip(frames, poses, photos, strict=True)):
+        told = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+        # Each photo has a lens of its own.
+        told |= {"fx": frame["fl_x"] + i, "fy": frame["fl_y"] + 2 * i, "cx": frame["cx"] + 3 * i,
+                 "cy": frame["cy"] - i, "width": frame["w"], "height": frame["h"]}
+        stem = str(17_000 + 40 * i)
+        (polycam / f"keyframes/cameras/{stem}.json").write_text(json.dumps(told))
+        images.append(polycam / f"keyframes/images/{stem}{photo.suffix}")
+        shutil.copy(photo, images[-1])
+    (top / "of_polycam").mkdir()
+    polycam_utils.polycam_to_json(images, [], None, polycam / "keyframes/cameras",
+                                  top / "of_polycam")
+
+    record3d = top / "record3d/EXR_RGBD"
+    (record3d / "rgb").mkdir(parents=True)
+    first, turned = frames[0], []
+    for i, (pose, photo) in enumerate(zip(poses, photos, strict=True)):
+        turned.append([*Rotation.from_matrix(pose[:3, :3]).as_quat(), *pose[:3, 3]])
+        shutil.copy(photo, record3d / f"rgb/{i}{photo.suffix}")
+    # nerfstudio takes one focal length and the middle of the picture.
+    k = [first["fl_x"], 0, 0, 0, first["fl_x"], 0, first["w"] / 2, first["h"] / 2, 1]
+    told = {"w": first["w"], "h": first["h"], "K": k, "poses": turned}
+    (record3d / "metadata.json").write_text(json.dumps(told))
+    (top / "of_record3d").mkdir()
+    images = sorted((record3d / "rgb").iterdir(), key=lambda path: int(path.stem))
+    record3d_utils.record3d_to_json(images, record3d / "metadata.json", top / "of_record3d",
+                                    np.arange(len(images)))
+
+    # nerfstudio turns Polycam's world: z is up there. Its poses of Record3D are of 32 bits.
+    turn = {"polycam": np.eye(4)[[2, 0, 1, 3]], "record3d": np.eye(4)}
+    for name, folder, most in (("polycam", polycam, 1e-12), ("record3d", record3d.parent, 1e-6)):
+        ours = cameras_of(folder)
+        theirs = json.loads((top / f"of_{name}/transforms.json").read_text())
+        check(len(ours) == len(theirs["frames"]) == len(frames), f"{name}: {len(ours)} photos")
+        found = [[{**theirs, **frame}[key] for key in ("fl_x", "fl_y", "cx", "cy", "w", "h")]
+                 for frame in theirs["frames"]]
+        check(lenses_of(ours) == found, f"{name}: {lenses_of(ours)}, not {found}")
+        flip = np.diag([1.0, -1.0, -1.0, 1.0])
+        want = np.array([frame["transform_matrix"] for frame in theirs["frames"]]) @ flip
+        off = np.abs(turn[name] @ poses_of(ours) - want).max()
+        check(off <= most, f"{name}: a pose is {off} off")
+        print(f"{name}: nerfstudio's converter finds the same cameras, poses within {off}")
+
+
 def judge_nerfstudio(
     folder: Path, frames: list[dict], truth: list[np.ndarray], points: int
 ) -> None:
@@ -205,6 +325,8 @@ with tempfile.TemporaryDirectory() as name:
     words = [word for text in TEXTS for word in ("--text", text)]
     judge_masks(unpacked(top, scene, "coco", *words), unpacked(top, scene, "labelme", *words),
                 scene, cameras)
+    judge_rig(top / "capture", top, cameras)
+    judge_converters(top / "capture", top, frames)
     # The program reads its own folders: the same cameras.
     for format in ("colmap", "nerfstudio"):
         again = run("reconstruct", top / format, "-o", top / "again.segsplat")

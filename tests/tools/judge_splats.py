@@ -1,5 +1,6 @@
 """splat-transform (PlayCanvas) reads the files of Gaussians that this program writes: the right
-number of them, the right bounds. Khronos' validator, which does not know the extension, finds
+number of them, the right bounds, the right harmonics of each; and this program reads of its files
+what it reads itself. Khronos' validator, which does not know the extension, finds
 nothing wrong with a GLB but the names of its attributes. `make judge` gets Node and both.
 
 python3 judge_splats.py SEGSPLAT NODE SPLAT_TRANSFORM_CLI SOURCE.ply
@@ -7,6 +8,7 @@ python3 judge_splats.py SEGSPLAT NODE SPLAT_TRANSFORM_CLI SOURCE.ply
 
 import json
 import math
+import struct
 import subprocess
 import sys
 import tempfile
@@ -26,6 +28,10 @@ COLUMNS = [["x", "y", "z"], ["scale_0", "scale_1", "scale_2"], ["opacity"],
            ["f_dc_0", "f_dc_1", "f_dc_2"]]
 # It takes the numbers of an SPZ as those of a PLY. The format has y up and z back.
 TURNED = {"spz": {"y", "z"}, "v4.spz": {"y", "z"}}
+# What becomes of the coefficients of degree 1 there.
+TURN = (-1.0, -1.0, 1.0)
+# Largest differences of a coefficient over degree 0. A `.splat` has none; a SOG has a palette.
+HARMONICS = {"ply": 1e-6, "compressed.ply": 0.032, "spz": 0.036, "v4.spz": 0.036, "sog": 0.01}
 
 
 def seen(path: Path) -> tuple[int, dict[str, list[float]]]:
@@ -36,6 +42,39 @@ def seen(path: Path) -> tuple[int, dict[str, list[float]]]:
     lod = stats["stats"][0]
     ranges = zip(lod["data"]["min"], lod["data"]["max"], strict=True)
     return stats["numGaussians"], dict(zip(lod["columns"], map(list, ranges), strict=True))
+
+
+KINDS = {"float": "f", "uchar": "B", "ushort": "H", "uint": "I"}
+
+
+def rows_of(path: Path) -> list[dict[str, float]]:
+    """The vertices of a PLY."""
+    head, body = path.read_bytes().split(b"end_header\n", 1)
+    lines = [line.split() for line in head.decode().splitlines()]
+    number = next(int(words[2]) for words in lines if words[:2] == ["element", "vertex"])
+    columns = [words[1:] for words in lines if words[0] == "property"]
+    row = struct.Struct("<" + "".join(KINDS[kind] for kind, _ in columns))
+    names = [name for _, name in columns]
+    found = row.iter_unpack(body[:number * row.size])
+    return [dict(zip(names, values, strict=True)) for values in found]
+
+
+def harmonics_off(want: list[dict], found: list[dict], turned: bool) -> float:
+    """The largest difference of a coefficient of degree 1 of what lies at one place."""
+    signs = dict.fromkeys("xyz", 1.0) | (dict.fromkeys("yz", -1.0) if turned else {})
+    worst = 0.0
+    for one in want:
+        near = min(found, key=lambda row: sum((row[k] * signs[k] - one[k]) ** 2 for k in "xyz"))
+        for i in range(9):
+            sign = TURN[i % 3] if turned else 1.0
+            worst = max(worst, abs(near[f"f_rest_{i}"] * sign - one[f"f_rest_{i}"]))
+    return worst
+
+
+def turned_into(path: Path, ply: Path) -> list[dict]:
+    """What splat-transform reads of a file."""
+    subprocess.run([node, cli, "-q", "-w", path, ply], check=True, stdout=subprocess.DEVNULL)
+    return rows_of(ply)
 
 
 VALIDATE = """
@@ -77,6 +116,22 @@ with tempfile.TemporaryDirectory() as folder:
         if found != count:
             faults.append(f"{ending}: {found} of {count} Gaussians")
         print(f"{ending}: {found} Gaussians, bounds within", *(f"{v:.2g}" for v in worst))
+        if ending not in HARMONICS:
+            continue
+        turned = ending in TURNED
+        off = harmonics_off(rows_of(source), turned_into(path, path.with_suffix(".ply.ply")),
+                            turned)
+        # And of a file that it wrote itself, what it reads and what we read.
+        theirs = source.with_name(f"theirs.{ending}" if ending != "ply" else source.name)
+        ply = Path(folder) / "read.ply"
+        subprocess.run([segsplat, "export", theirs, "-o", ply], check=True,
+                       stdout=subprocess.DEVNULL)
+        back = harmonics_off(rows_of(ply), turned_into(theirs, path.with_suffix(".read.ply")),
+                             turned)
+        print(f"{ending}: harmonics of ours within {off:.2g}, of theirs within {back:.2g}")
+        if off > HARMONICS[ending] or back > 1e-5:
+            bound = HARMONICS[ending]
+            faults.append(f"{ending}: harmonics: {off} over {bound}, or {back} over 1e-5")
     path = Path(folder) / "ours.glb"
     subprocess.run([segsplat, "export", source, "-o", path], check=True, stdout=subprocess.DEVNULL)
     faults += (wrong := faults_of_glb(path))

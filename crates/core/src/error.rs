@@ -56,6 +56,8 @@ table! {
     PhotoUnreadable: "photo_unreadable", 422, 3, 2, false;
     /// A stated limit is exceeded; the message names limit, value and maximum.
     LimitExceeded: "limit_exceeded", 413, 3, 2, false;
+    /// An idempotency key was used again with other photos or options.
+    IdempotencyKeyReused: "idempotency_key_reused", 422, 3, 2, false;
     /// No scene of this id.
     SceneNotFound: "scene_not_found", 404, 5, 3, false;
     /// No such route or resource.

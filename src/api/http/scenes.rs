@@ -44,7 +44,10 @@ pub(super) struct CreateParams {
     post, path = "/v1/scenes", operation_id = "create_scene", tag = "scenes",
     params(
         SceneOptions, CreateParams,
-        ("Idempotency-Key" = Option<String>, Header),
+        (
+            "Idempotency-Key" = Option<String>, Header,
+            description = "Calls with one key make one scene; 422 with other photos or options",
+        ),
         ("Prefer" = Option<String>, Header, description = "`wait=SECONDS` (RFC 7240)"),
     ),
     request_body(content(

@@ -7,16 +7,18 @@ use segsplat_core::scene::{PosedPhoto, UploadFile};
 
 /// The layouts that [`write()`] knows, and whether they hold the numbers of a pose as JSON, so that
 /// not even a rounding is between two of them.
-pub const LAYOUTS: [(&str, bool); 12] = [
+pub const LAYOUTS: [(&str, bool); 14] = [
     ("transforms", true),
     ("cameras", true),
     ("scannetpp", true),
+    ("blender", false),
     ("polycam", true),
     ("polycam_corrected", true),
     ("llff", false),
     ("colmap_bin", false),
     ("colmap_txt", false),
     ("record3d", false),
+    ("r3d", false),
     ("mvsnet", false),
     ("realestate", false),
     ("arkitscenes", false),
@@ -29,12 +31,14 @@ pub fn described_by(layout: &str) -> &'static str {
         "transforms" => "transforms.json",
         "cameras" => "cameras.json",
         "scannetpp" => "dslr/nerfstudio/transforms.json",
+        "blender" => "transforms_train.json",
         "polycam" => "keyframes/cameras/1000.json",
         "polycam_corrected" => "keyframes/corrected_cameras/1000.json",
         "llff" => "poses_bounds.npy",
         "colmap_bin" => "sparse/0/images.bin",
         "colmap_txt" => "sparse/0/images.txt",
         "record3d" => "EXR_RGBD/metadata",
+        "r3d" => "metadata",
         "mvsnet" => "cams/00000000_cam.txt",
         "realestate" => "clip.txt",
         "arkitscenes" => "41069021/lowres_wide.traj",
@@ -135,6 +139,21 @@ pub fn write(layout: &str, posed: &[PosedPhoto], pngs: &[UploadFile]) -> Vec<Upl
             }
             files.push((main, format!("{{\"frames\":[{frames}],{more}}}").into()));
         }
+        "blender" => {
+            // One field of view for all photos, whose names have no ending.
+            let frames = joined(
+                cameras.iter().enumerate().map(|(i, c)| {
+                    let pose = json_rows(&c.opengl);
+                    format!("{{\"file_path\":\"./train/r_{i}\",\"transform_matrix\":{pose}}}")
+                }),
+                ",",
+            );
+            let c = &cameras[0];
+            let angle = 2.0 * (f64::from(c.size[0]) / 2.0 / c.k[0]).atan();
+            let json = format!("{{\"camera_angle_x\":{angle},\"frames\":[{frames}]}}");
+            files.push((main, json.into()));
+            photos = (0..posed.len()).map(|i| format!("train/r_{i}.png")).collect();
+        }
         "cameras" => {
             let camera = |(name, c): (&String, &Numbers)| {
                 let ([fx, fy, cx, cy], [w, h]) = (c.k, c.size);
@@ -225,7 +244,7 @@ pub fn write(layout: &str, posed: &[PosedPhoto], pngs: &[UploadFile]) -> Vec<Upl
             files.push((format!("sparse/0/cameras.{ending}"), lenses));
             files.push((main, images));
         }
-        "record3d" => {
+        "record3d" | "r3d" => {
             let first = &cameras[0];
             let [fx, fy, cx, cy] = first.k;
             let [w, h] = first.size;
@@ -243,7 +262,13 @@ pub fn write(layout: &str, posed: &[PosedPhoto], pngs: &[UploadFile]) -> Vec<Upl
                  \"perFrameIntrinsicCoeffs\":[{own}],\"poses\":[{poses}]}}"
             );
             files.push((main, json.into()));
-            photos = (0..posed.len()).map(|i| format!("EXR_RGBD/rgb/{i}.png")).collect();
+            // `Record3D`'s own file is a zip of another folder, with depth beside the photos.
+            let folder = if layout == "r3d" { "rgbd" } else { "EXR_RGBD/rgb" };
+            photos = (0..posed.len()).map(|i| format!("{folder}/{i}.png")).collect();
+            if layout == "r3d" {
+                let others = ["rgbd/0.depth", "rgbd/0.conf", "icon", "sound.m4a"];
+                files.extend(others.map(|name| (name.to_owned(), b"?".to_vec())));
+            }
         }
         "mvsnet" => {
             for (i, c) in cameras.iter().enumerate() {

@@ -12,6 +12,7 @@ __all__ = [
     "InvalidRequest",
     "PhotoUnreadable",
     "LimitExceeded",
+    "IdempotencyKeyReused",
     "SceneNotFound",
     "NotFound",
     "MethodNotAllowed",
@@ -93,6 +94,12 @@ class LimitExceeded(SegSplatError):
     """A stated limit is exceeded; the message names limit, value and maximum."""
 
     code = "limit_exceeded"
+
+
+class IdempotencyKeyReused(SegSplatError):
+    """An idempotency key was used again with other photos or options."""
+
+    code = "idempotency_key_reused"
 
 
 class SceneNotFound(SegSplatError):

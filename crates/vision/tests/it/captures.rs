@@ -2,6 +2,7 @@
 //! files that are damaged or lie are refused.
 
 use std::{
+    collections::HashSet,
     fmt::Write as _,
     io::{Cursor, Write as _},
     sync::{LazyLock, atomic::AtomicBool},
@@ -120,23 +121,6 @@ fn every_layout_gives_the_same_photos_however_it_is_sent() {
             }
         }
     }
-}
-
-/// `Record3D`'s own file is a zip of another folder, with depth beside the photos.
-#[test]
-fn a_file_of_record3d_is_read_as_its_export() {
-    let mut files = written("record3d");
-    for file in &mut files {
-        file.name = file.name.replace("EXR_RGBD/", "").replace("rgb/", "rgbd/");
-    }
-    for name in ["rgbd/0.depth", "rgbd/0.conf", "icon", "sound.m4a"] {
-        files.push(UploadFile { name: name.to_owned(), bytes: b"?".to_vec() });
-    }
-    let ReadPhotos { photos, warnings } = from_archive(zipped(&files, ""));
-    assert_eq!(warnings, []);
-    let (posed, _) = sent();
-    assert_eq!(photos.len(), 3);
-    assert!(photos.iter().zip(&posed).all(|(a, b)| apart(a, b) < 1e-13));
 }
 
 /// Files of two captures in one folder.
@@ -306,9 +290,13 @@ fn of_too_many_photos_the_best_are_taken_and_named() {
 /// Reads the capture with each of the other contents of one file: all must be refused, and the
 /// message names the file, or the photo.
 fn refused(layout: &str, file: &str, cases: Vec<(String, Vec<u8>)>) {
-    assert!(cases.len() >= 20, "{layout} {file}: {} cases", cases.len());
+    let files: HashSet<&[u8]> = cases.iter().map(|(_, bytes)| &bytes[..]).collect();
+    assert!(files.len() >= 20, "{layout} {file}: {} files", files.len());
+    println!("{layout} {file}: {} damaged files", files.len());
     let name = file.rsplit('/').next().unwrap_or(file);
-    let names = [name, name.trim_end_matches(".json"), "photo ", ".png"];
+    // All of one kind of JSON are called by it.
+    let kind = if layout == "blender" { "transforms" } else { name };
+    let names = [name, name.trim_end_matches(".json"), kind, "photo ", ".png"];
     for (what, bytes) in cases {
         let mut files = written(layout);
         files.iter_mut().find(|f| f.name == file).unwrap().bytes = bytes;
@@ -378,12 +366,20 @@ fn damaged_camera_jsons_are_refused() {
         ("polycam", "/t_00", "/fx", "/width"),
         ("polycam_corrected", "/t_12", "/fy", "/height"),
         ("record3d", "/poses/0/0", "/perFrameIntrinsicCoeffs/0/0", "/w"),
+        ("r3d", "/poses/0/6", "/perFrameIntrinsicCoeffs/0/1", "/h"),
+        (
+            "blender",
+            "/frames/0/transform_matrix/2/3",
+            "/camera_angle_x",
+            "/frames/0/transform_matrix/0/0",
+        ),
     ] {
         let file = captures::described_by(layout);
         let mut cases = spoilt_json(&content(layout, file), pose, focal, width);
         // Where a translation may be large, or a quaternion has any length.
         cases.retain(|(what, _)| {
-            let any_size = ["scannetpp", "record3d"].contains(&layout) && what.starts_with(pose);
+            let any_size = ["scannetpp", "record3d", "r3d", "blender"].contains(&layout)
+                && what.starts_with(pose);
             !(any_size && what.contains("300"))
         });
         refused(layout, file, cases);

@@ -7,6 +7,7 @@
     reason = "helpers of tests are tests too"
 )]
 
+mod archives;
 mod assign;
 mod backdrop;
 mod bank;
