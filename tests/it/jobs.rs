@@ -288,7 +288,7 @@ async fn a_key_that_an_earlier_program_kept_still_answers_for_its_scene() {
         assert_eq!((again.replayed, &again.status.id), (true, &first.id), "{text}");
         std::fs::write(&key, of(&"ab".repeat(32))).unwrap();
         let refused = server.service.create_scene(keyed()).await.unwrap_err();
-        assert_eq!(refused.code(), ErrorCode::InvalidRequest, "{text}: {refused}");
+        assert_eq!(refused.code(), ErrorCode::IdempotencyKeyReused, "{text}: {refused}");
     }
 }
 

@@ -79,7 +79,7 @@ async fn what_one_replica_makes_the_others_serve_list_and_delete() {
     let (_, again) = process::create(&client, &b.url, &upload(2), 0, Some("k")).await.unwrap();
     assert_eq!(one["id"], again["id"], "{one} {again}");
     let (status, _) = process::create(&client, &c.url, &upload(3), 0, Some("k")).await.unwrap();
-    assert_eq!(status, 400, "the key stands for another upload");
+    assert_eq!(status, 422, "the key stands for another upload");
 
     // Whoever watches at another replica sees the end of it.
     let events = c.url(&format!("/v1/scenes/{}/events", one["id"].as_str().unwrap()));

@@ -106,11 +106,11 @@ fn the_same_photos_as_each_layout_of_captures_are_the_same_scene() {
         pipeline::reconstruct(&engine, &photos, &options, &|_, _| {}, &go_on).unwrap()
     };
     let reference = made("cameras");
-    let want = reference.gaussians.as_raw();
+    let want = reference.gaussians.clone().into_raw();
     for (layout, same_numbers) in captures::LAYOUTS {
         let made = made(layout);
-        let raw = made.gaussians.as_raw();
-        let off = furthest(raw, want);
+        let raw = made.gaussians.clone().into_raw();
+        let off = furthest(&raw, &want);
         let moved = (raw.origin - want.origin).abs().max_element();
         let same = bits(&made) == bits(&reference);
         let count = raw.means.len();
@@ -123,7 +123,7 @@ fn the_same_photos_as_each_layout_of_captures_are_the_same_scene() {
 
 /// All numbers of Gaussians and backdrop.
 fn bits(made: &Reconstruction) -> Vec<u8> {
-    let raw = made.gaussians.as_raw();
+    let raw = made.gaussians.clone().into_raw();
     let origin = raw.origin.to_array();
     let numbers: [&[u8]; 7] = [
         bytemuck::cast_slice(&origin),
