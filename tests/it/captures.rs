@@ -1,15 +1,13 @@
 //! A capture as files of a form, as an archive in a form, as the body itself and over gRPC: it is
 //! recognised, and each way gives the same scene and says what was left out.
 
-use std::io::{Cursor, Write as _};
-
 use reqwest::StatusCode;
 use segsplat::{
     limits::Limits,
     photos,
     scene::{Upload, UploadFile},
 };
-use segsplat_testing::captures;
+use segsplat_testing::captures::{self, zipped};
 
 use crate::common::{
     client,
@@ -25,20 +23,11 @@ fn colmap() -> Vec<UploadFile> {
     files
 }
 
-fn zipped(files: &[UploadFile]) -> Vec<u8> {
-    let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
-    for file in files {
-        zip.start_file(&*file.name, zip::write::SimpleFileOptions::default()).unwrap();
-        zip.write_all(&file.bytes).unwrap();
-    }
-    zip.finish().unwrap().into_inner()
-}
-
 #[tokio::test]
 async fn a_capture_is_recognised_at_every_door() {
     let stand = CpuServer::start().await;
     let files = colmap();
-    let zip = zipped(&files);
+    let zip = zipped(&files, "");
     let of_files = Upload { photos: files, ..Upload::default() };
     let of_zip = Upload { archive: Some(zip.clone()), ..Upload::default() };
     let address = stand.url("/v1/scenes?wait_ms=120000&semantics=off");

@@ -1,6 +1,9 @@
 //! Captures in every layout that is read, written from photos with known cameras.
 
-use std::fmt::Write as _;
+use std::{
+    fmt::Write as _,
+    io::{Cursor, Write as _},
+};
 
 use glam::{DMat3, DQuat, DVec3};
 use segsplat_core::scene::{PosedPhoto, UploadFile};
@@ -320,4 +323,16 @@ pub fn write(layout: &str, posed: &[PosedPhoto], pngs: &[UploadFile]) -> Vec<Upl
     let pngs = photos.into_iter().zip(pngs).map(|(name, png)| (name, png.bytes.clone()));
     files.extend(pngs);
     files.into_iter().map(|(name, bytes)| UploadFile { name, bytes }).collect()
+}
+
+/// Files as a zip, their names behind `top`.
+#[must_use]
+pub fn zipped(files: &[UploadFile], top: &str) -> Vec<u8> {
+    let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    for file in files {
+        let name = format!("{top}{}", file.name);
+        zip.start_file(name, zip::write::SimpleFileOptions::default()).expect("an entry");
+        zip.write_all(&file.bytes).expect("in memory");
+    }
+    zip.finish().expect("in memory").into_inner()
 }

@@ -40,9 +40,10 @@ pub(crate) fn trainer_bytes(set: &TrainingSet<'_>) -> u64 {
     let pixels = |at: &TrainingPhoto<'_>| u64::from(at.photo.width) * u64::from(at.photo.height);
     let most = set.photos.iter().map(pixels).max().unwrap_or(0);
     let numbers = 3 * set.gaussians.sh_count() as u64;
-    let rows = size_of::<GaussianRow>() as u64 + 4 * numbers + gradient_bytes(1, numbers);
-    let kept = size_of::<GaussianRow>() as u64 + 4 * numbers;
-    let each = rows + kept + moment_bytes(1, numbers) + PAIRS_A_GAUSSIAN * PAIR_BYTES;
+    let row = size_of::<GaussianRow>() as u64 + 4 * numbers;
+    let learnt = gradient_bytes(1, numbers) + moment_bytes(1, numbers);
+    // As they are, and as they were kept.
+    let each = 2 * row + learnt + PAIRS_A_GAUSSIAN * PAIR_BYTES;
     // Pictures, what the loss says of them, and SSIM's windows.
     let pictures = most * 4 * (4 + 4 + 9);
     4 * set.photos.iter().map(pixels).sum::<u64>() + pictures + each * set.gaussians.len() as u64

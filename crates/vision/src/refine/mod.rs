@@ -51,8 +51,8 @@ const LAST_RATE: f32 = 0.1;
 /// Steps for each photo with which the rates are right, how rates grow where there are fewer, and
 /// how far: docs/adr/0041.
 const STEPS_A_PHOTO: f32 = 200.0;
-const HASTE_POWER: f32 = 0.4;
-const HASTE_MAX: f32 = 2.0;
+const RATE_FACTOR_POWER: f32 = 0.4;
+const RATE_FACTOR_MAX: f32 = 2.0;
 /// How fast an exposure moves.
 const EXPOSURE_RATE: f32 = 5e-3;
 
@@ -155,9 +155,9 @@ pub fn split(photos: &[PosedPhoto], held: &[usize]) -> (Vec<PosedPhoto>, Vec<Pos
 /// How much larger rates are where few steps are expected for each photo, 1..=2; 1 where it is not
 /// known how many.
 #[must_use]
-pub fn haste(steps_a_photo: f32) -> f32 {
+pub fn rate_factor(steps_a_photo: f32) -> f32 {
     if steps_a_photo > 0.0 {
-        (STEPS_A_PHOTO / steps_a_photo).powf(HASTE_POWER).clamp(1.0, HASTE_MAX)
+        (STEPS_A_PHOTO / steps_a_photo).powf(RATE_FACTOR_POWER).clamp(1.0, RATE_FACTOR_MAX)
     } else {
         1.0
     }
@@ -330,7 +330,7 @@ impl Refinement<'_> {
                 }
             }
             let expected = steps as f32 / spent / self.learnt.len() as f32;
-            let rate = LAST_RATE.powf(spent) * if few { 1.0 } else { haste(expected) };
+            let rate = LAST_RATE.powf(spent) * if few { 1.0 } else { rate_factor(expected) };
             let mut photos = Vec::with_capacity(options.batch);
             while photos.len() < options.batch {
                 if order.is_empty() {

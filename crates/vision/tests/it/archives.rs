@@ -1,15 +1,13 @@
 //! Archives that are cut, lie, climb or never end: each is refused by name.
 
-use std::{
-    collections::HashSet,
-    io::{Cursor, Write as _},
-};
+use std::{collections::HashSet, io::Cursor};
 
 use segsplat_core::{
     error::ErrorCode,
     limits::Limits,
     scene::{Upload, UploadFile},
 };
+use segsplat_testing::captures::zipped;
 use segsplat_vision::{
     photos,
     sample::{self, SampleOptions},
@@ -67,15 +65,6 @@ fn last(file: &[u8], bytes: &[u8]) -> usize {
     file.windows(bytes.len()).rposition(|window| window == bytes).expect("they are in it")
 }
 
-fn zipped(files: &[UploadFile]) -> Vec<u8> {
-    let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
-    for file in files {
-        zip.start_file(&*file.name, zip::write::SimpleFileOptions::default()).unwrap();
-        zip.write_all(&file.bytes).unwrap();
-    }
-    zip.finish().unwrap().into_inner()
-}
-
 /// A file of this name and these bytes beside the capture.
 fn beside(name: &str, bytes: &[u8]) -> Vec<UploadFile> {
     let mut files = capture();
@@ -85,17 +74,17 @@ fn beside(name: &str, bytes: &[u8]) -> Vec<UploadFile> {
 
 #[test]
 fn damaged_zips_are_refused_by_name() {
-    let good = zipped(&capture());
+    let good = zipped(&capture(), "");
     // Of the cameras: their record in the directory and their bytes; and the end record.
     let record = last(&good, b"PK\x01\x02");
     let end = last(&good, b"PK\x05\x06");
     let own = u32::from_le_bytes(good[record + 42..record + 46].try_into().unwrap()) as usize;
     let data = own + 30 + "transforms.json".len();
     let with = |at: usize, bytes: &[u8]| patched(&good, at, bytes);
-    let named = |name: &str| zipped(&beside(name, b"x"));
+    let named = |name: &str| zipped(&beside(name, b"x"), "");
     // The zip writer writes no name twice.
     let renamed = |from: &str, to: &[u8]| {
-        let mut zip = zipped(&beside(from, b"x"));
+        let mut zip = zipped(&beside(from, b"x"), "");
         while let Some(at) = zip.windows(from.len()).position(|w| w == from.as_bytes()) {
             zip[at..at + to.len()].copy_from_slice(to);
         }
@@ -125,8 +114,8 @@ fn damaged_zips_are_refused_by_name() {
         (with(record + 24, &10_u32.to_le_bytes()), "\"transforms.json\" is damaged"),
         (with(record + 24, &(8_u32 << 20).to_le_bytes()), "is over 1048576"),
         (with(data, &[0xff; 8]), "\"transforms.json\" is damaged"),
-        (zipped(&beside("bomb.png", &vec![0; 3 << 20])), "is over 1048576"),
-        (zipped(&many), "51 is over 50"),
+        (zipped(&beside("bomb.png", &vec![0; 3 << 20]), ""), "is over 1048576"),
+        (zipped(&many, ""), "51 is over 50"),
         (named("../evil.png"), "relative path"),
         (named("a/../../evil.png"), "relative path"),
         (named("/etc/evil.png"), "relative path"),

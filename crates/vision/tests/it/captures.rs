@@ -4,7 +4,6 @@
 use std::{
     collections::HashSet,
     fmt::Write as _,
-    io::{Cursor, Write as _},
     sync::{LazyLock, atomic::AtomicBool},
 };
 
@@ -13,7 +12,7 @@ use segsplat_core::{
     limits::Limits,
     scene::{PosedPhoto, Upload, UploadFile, WarningCode},
 };
-use segsplat_testing::captures::{self, LAYOUTS};
+use segsplat_testing::captures::{self, LAYOUTS, zipped};
 use segsplat_vision::{
     photos::{self, ReadPhotos},
     sample::{self, SampleOptions},
@@ -43,16 +42,6 @@ fn read(files: Vec<UploadFile>) -> Result<ReadPhotos, Error> {
 fn read_within(files: Vec<UploadFile>, limits: &Limits) -> Result<ReadPhotos, Error> {
     let upload = Upload { photos: files, ..Upload::default() };
     photos::read_until(&upload, limits, &AtomicBool::new(false))
-}
-
-fn zipped(files: &[UploadFile], top: &str) -> Vec<u8> {
-    let mut zip = zip::ZipWriter::new(Cursor::new(Vec::new()));
-    for file in files {
-        let name = format!("{top}{}", file.name);
-        zip.start_file(name, zip::write::SimpleFileOptions::default()).unwrap();
-        zip.write_all(&file.bytes).unwrap();
-    }
-    zip.finish().unwrap().into_inner()
 }
 
 fn tarred(files: &[UploadFile]) -> Vec<u8> {

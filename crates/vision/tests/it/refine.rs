@@ -17,8 +17,8 @@ use segsplat_render::{
 };
 use segsplat_testing::scenes::{Random, camera, checked, cloud, look};
 use segsplat_vision::refine::{
-    HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, haste,
-    held_out, refine, split,
+    HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out,
+    rate_factor, refine, split,
 };
 
 #[test]
@@ -155,7 +155,7 @@ impl DifferentiableRenderer for Full {
 
 #[test]
 fn rates_are_larger_where_few_steps_are_expected() {
-    let found = [f32::NAN, 0.0, 1.0, 40.0, 100.0, 200.0, 1e4].map(haste);
+    let found = [f32::NAN, 0.0, 1.0, 40.0, 100.0, 200.0, 1e4].map(rate_factor);
     assert_eq!(found[..3], [1.0, 1.0, 2.0]);
     assert!(found[3] > 1.8 && found[4] > 1.2 && found[3] > found[4], "{found:?}");
     assert_eq!(found[5..], [1.0, 1.0]);
