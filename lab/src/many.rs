@@ -45,6 +45,9 @@ pub(crate) struct Args {
     /// A refinement to measure, as NAME=VALUE,...: `ms=5000,rate=2`; each is a row of its own
     #[arg(long, value_name = "NAME=VALUE,...")]
     refine: Vec<String>,
+    /// Folder whose files replace the built-in shaders
+    #[arg(long)]
+    shaders: Option<PathBuf>,
     /// Folder for pictures of the first target: the photo, and the scene before and after
     #[arg(long)]
     pictures: Option<PathBuf>,
@@ -140,7 +143,8 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     });
     let variants: Vec<(&String, Variant)> = variants.collect::<Result<_>>()?;
     let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
-    let (renderer, _adapters) = args.inputs.setup.renderer(Switches::default())?;
+    let switches = Switches { shaders: args.shaders.clone(), ..Switches::default() };
+    let (renderer, _adapters) = args.inputs.setup.renderer(switches)?;
     let scene_options = SceneOptions::default().with(&args.method)?;
     for (name, dir) in args.inputs.find(is_posed)? {
         let all = photo_files::read_dir(&dir, &Limits::default())?;
