@@ -69,7 +69,11 @@ struct Variant {
     opacity_min: f32,
     ssim_share: f32,
     proof_share: f32,
+    overfit_max: f32,
     device_bytes_max: u64,
+    /// Milliseconds that a run of the networks takes, of which the result is at hand: a device rests
+    /// meanwhile.
+    networks_ms: u64,
     /// Factors on learning rates: on all, and on single ones.
     rate: f32,
     means: f32,
@@ -93,7 +97,9 @@ impl Default for Variant {
             opacity_min: plain.opacity_min,
             ssim_share: plain.ssim_share,
             proof_share: plain.proof_share,
+            overfit_max: plain.overfit_max,
             device_bytes_max: plain.device_bytes_max,
+            networks_ms: 0,
             rate: 1.0,
             means: 1.0,
             quats: 1.0,
@@ -125,6 +131,7 @@ impl Variant {
             prune_every: self.prune_every,
             ssim_share: self.ssim_share,
             proof_share: self.proof_share,
+            overfit_max: self.overfit_max,
             device_bytes_max: self.device_bytes_max,
             ..plain
         }
@@ -210,6 +217,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             let mut remake = |photos: Vec<PosedPhoto>| {
                 let known = if photos.len() == given.len() { &whole } else { &part };
                 let (made, one_set) = known.clone();
+                std::thread::sleep(Duration::from_millis(variant.networks_ms));
                 Ok(if variant.layers { (made.clone(), made.gaussians) } else { (made, one_set) })
             };
             let mut paces = 0_u32;
@@ -227,6 +235,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             row["steps_made"] = json!(paces);
             row["refine_cpu_s"] = json!(cpu_seconds() - cpu);
             row["steps"] = json!(found.report.steps);
+            row["overfit"] = json!(found.overfit);
             row["held_out"] = json!(held_out(given.len()));
             row["own_psnr_before"] = json!(found.report.psnr_before);
             row["own_psnr_after"] = json!(found.report.psnr_after);

@@ -213,6 +213,10 @@ impl DifferentiableRenderer for WithCpu {
     fn trainer<'a>(&'a self, set: &TrainingSet<'a>) -> Result<Option<Box<dyn Trainer + 'a>>> {
         self.gpu.trainer(set)
     }
+
+    fn slow_after_rest(&self) -> bool {
+        self.gpu.slow_after_rest()
+    }
 }
 
 #[cfg(test)]

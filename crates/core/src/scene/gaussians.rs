@@ -261,6 +261,34 @@ impl Gaussians {
         Self::of(Arc::new(self.raw.only(keep)), semantic_index)
     }
 
+    /// These Gaussians, then `more`, about the origin of these.
+    ///
+    /// # Errors
+    /// `internal` when the degrees of their harmonics differ; `scene_corrupt` when a centre is out
+    /// of range about this origin.
+    pub fn joined(&self, more: &Self) -> Result<Self> {
+        if self.sh_degree() != more.sh_degree() {
+            return Err(Error::internal(format!(
+                "gaussians: harmonics of degree {} beside {}",
+                self.sh_degree(),
+                more.sh_degree()
+            )));
+        }
+        let offset = more.origin() - self.origin();
+        let mut all = self.clone().into_raw();
+        let more = more.clone().into_raw();
+        let centre =
+            |mean: [f32; 3]| (DVec3::from(mean.map(f64::from)) + offset).as_vec3().to_array();
+        all.means.extend(more.means.into_iter().map(centre));
+        all.quats.extend(more.quats);
+        all.scales.extend(more.scales);
+        all.opacities.extend(more.opacities);
+        all.sh.extend(more.sh);
+        all.semantic_index.extend(more.semantic_index);
+        all.source.extend(more.source);
+        Self::restore(all)
+    }
+
     /// The same Gaussians with other entries of the bank, `[N]`.
     ///
     /// # Errors

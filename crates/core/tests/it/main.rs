@@ -72,6 +72,31 @@ fn gaussians_with_other_entries_have_the_same_arrays() {
 }
 
 #[test]
+fn joined_gaussians_stay_where_they_are_whatever_their_origins() {
+    let one = |origin: DVec3, sh_degree: u8| {
+        Gaussians::restore(RawGaussians {
+            origin,
+            means: vec![[1.0, 2.0, 3.0]],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]],
+            scales: vec![[0.1; 3]],
+            opacities: vec![0.5],
+            sh_degree,
+            sh: vec![[0.0; 3]; (usize::from(sh_degree) + 1).pow(2)],
+            semantic_index: vec![4],
+            source: vec![SourcePixel { view: 2, x: 0, y: 0 }],
+        })
+        .unwrap()
+    };
+    let (near, far) = (one(DVec3::ZERO, 0), one(DVec3::new(1e3, 0.0, -5.0), 0));
+    let both = near.joined(&far).unwrap();
+    assert_eq!(both.means(), [[1.0, 2.0, 3.0], [1001.0, 2.0, -2.0]]);
+    assert_eq!((both.len(), both.origin(), both.sh().len()), (2, DVec3::ZERO, 2));
+    assert_eq!((both.semantic_index()[1], both.source()[1].view), (4, 2));
+    let told = near.joined(&one(DVec3::ZERO, 1)).unwrap_err();
+    assert!(told.message().contains("degree 0 beside 1"), "{}", told.message());
+}
+
+#[test]
 fn names_are_unique_and_every_row_finds_itself() {
     let names: HashSet<_> = TABLE.iter().map(|row| row.name).collect();
     assert_eq!(names.len(), TABLE.len(), "two codes share a name");

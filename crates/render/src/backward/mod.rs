@@ -138,6 +138,12 @@ pub trait DifferentiableRenderer: Renderer {
     fn trainer<'a>(&'a self, _set: &TrainingSet<'a>) -> Result<Option<Box<dyn Trainer + 'a>>> {
         Ok(None)
     }
+
+    /// Whether it draws on a device whose clocks fall while nothing is drawn: one NVIDIA H200 is
+    /// two to six times as slow in the first half second after that.
+    fn slow_after_rest(&self) -> bool {
+        false
+    }
 }
 
 /// The request as it is drawn for a backward pass.

@@ -180,4 +180,8 @@ impl DifferentiableRenderer for GpuRenderer {
         }
         Ok(Some(Box::new(self.adapter_for(set.gaussians).trainer(set)?)))
     }
+
+    fn slow_after_rest(&self) -> bool {
+        !self.adapter().software
+    }
 }

@@ -3,29 +3,42 @@
 //! which they are learnt, the scene of the photos that are not held out, and semantics that follow
 //! other Gaussians.
 
-use std::time::Duration;
+use std::{
+    sync::mpsc::{RecvTimeoutError, channel},
+    thread,
+    time::Duration,
+};
 
-use segsplat_render::backward::DifferentiableRenderer;
+use segsplat_render::{Kinds, RenderRequest, backward::DifferentiableRenderer, plan::default_near};
 
 use super::Reconstruction;
 use crate::{
     error::Result,
     models::{ResizeFilter, fit},
     refine::{
-        self, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out, split,
+        self, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out,
+        mean_difference, ready, split,
     },
     scene::{
-        Gaussians, HealthReport, Method, Photo, PosedPhoto, RefineReport, Scene, SceneCamera,
-        SceneMeta, Semantics,
+        Camera, Gaussians, HealthReport, Method, Photo, PosedPhoto, RefineReport, Scene,
+        SceneCamera, SceneMeta, Semantics,
     },
     semantics::{Views, from_source},
 };
+
+/// Time between two views that keep a device from lowering its clocks, and their longer side,
+/// pixels.
+const AWAKE_EVERY: Duration = Duration::from_millis(4);
+const AWAKE_SIDE: u32 = 64;
 
 /// What a refinement came to.
 #[derive(Clone, Debug)]
 pub struct Refined {
     /// Its figures.
     pub report: RefineReport,
+    /// How much the proof's Gaussians differ from the held-out photos, as a multiple of how much they
+    /// differ from the learnt ones beside them; `None` where there was no proof, or nothing better.
+    pub overfit: Option<f64>,
     /// What it began with and the better version; `None` where none was better.
     pub version: Option<(Scene, RefinedVersion)>,
 }
@@ -35,10 +48,13 @@ pub type Remake<'a> = &'a mut dyn FnMut(Vec<PosedPhoto>) -> Result<(Reconstructi
 
 /// Refines `scene`, which was made of `photos`, within the budget of `options`.
 ///
-/// A scene without the held-out photos is refined in a share of the time
+/// First the proof: a scene without the held-out photos is refined in a share of the time
 /// ([`RefineOptions::proof_share`]). Where its PSNR on these photos rises over that of what was
-/// served, a scene of all photos is refined with as many steps for each second that is left. Of too
-/// few photos none is held out, and few steps are taken.
+/// served, a scene of all photos is refined with as many steps for each second that is left. It goes
+/// on from the proof's Gaussians, and those of the held-out photos, where the proof explains these
+/// nearly as well as photos that it learnt ([`RefineOptions::overfit_max`]); else it begins with
+/// those of the networks (docs/adr/0041). Of too few photos none is held out, and few steps are
+/// taken.
 ///
 /// # Errors
 /// Those of `remake`, of `pace` and of [`refine::refine`].
@@ -52,41 +68,84 @@ pub fn refined(
 ) -> Result<Refined> {
     let held = held_out(photos.len());
     let sized: Vec<PosedPhoto> = photos.iter().map(|photo| at_side(photo, options.side)).collect();
-    // `held` are left out, of the photos as they are and of those that are learnt.
-    let mut part = |held: &[usize], budget: RefineBudget, [begin, end]: [f32; 2]| {
-        let (start, first) = start_of(scene, held, remake(split(photos, held).0)?)?;
+    // The scene without the photos `held`, and what its refinement begins with.
+    let mut begin = |held: &[usize]| -> Result<(Scene, Gaussians)> {
+        let made = awake(renderer, scene, || remake(split(photos, held).0))?;
+        let (start, first) = start_of(scene, held, made)?;
+        let gaussians = ready(&start, &first, options)?;
+        Ok((start, gaussians))
+    };
+    let mut part = |start: (&Scene, &Gaussians), held: &[usize], budget, [begin, end]: [f32; 2]| {
         let (learnt, out) = split(&sized, held);
         let mut pace = |spent: f32| pace(begin + (end - begin) * spent);
         let options = RefineOptions { budget, ..*options };
-        let photos = (&learnt[..], &out[..]);
-        let version = refine::refine(renderer, (&start, &first), photos, &options, &mut pace)?;
-        Ok((start, version))
+        refine::refine(renderer, start, (&learnt[..], &out[..]), &options, &mut pace)
     };
     let RefineBudget { steps, time } = options.budget;
     if held.is_empty() {
+        let (start, gaussians) = begin(&[])?;
         let budget = RefineBudget { steps: steps.min(UNWATCHED_STEPS_MAX), time };
-        let (start, version) = part(&[], budget, [0.0, 1.0])?;
-        return Ok(Refined { report: version.report.clone(), version: Some((start, version)) });
+        let version = part((&start, &gaussians), &[], budget, [0.0, 1.0])?;
+        let report = version.report.clone();
+        return Ok(Refined { report, overfit: None, version: Some((start, version)) });
     }
     let share = options.proof_share.clamp(0.01, 0.99);
     let budget = RefineBudget { steps, time: of_time(time, share) };
-    let proof = part(&held, budget, [0.0, share])?.1.report;
+    let (start, gaussians) = begin(&held)?;
+    let proof = part((&start, &gaussians), &held, budget, [0.0, share])?;
     let earlier = scene.meta.report.refinement.as_ref().and_then(|report| report.psnr_after);
-    if proof.steps == 0 || proof.psnr_after <= earlier {
-        return Ok(Refined { report: proof, version: None });
+    if proof.report.steps == 0 || proof.report.psnr_after <= earlier {
+        return Ok(Refined { report: proof.report, overfit: None, version: None });
     }
+    let differs = |at: &dyn Fn(usize) -> usize| {
+        let photos: Vec<PosedPhoto> = held.iter().map(|&i| sized[at(i)].clone()).collect();
+        mean_difference(renderer, (&start, &proof.gaussians), &photos)
+    };
+    // The photo before each is learnt.
+    let overfit = differs(&|i| i)? / differs(&|i| i - 1)?;
     let more = ((1.0 - share) / share).max(1.0);
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few steps")]
-    let as_many = (proof.steps as f32 * more).round() as u32;
+    let as_many = (proof.report.steps as f32 * more).round() as u32;
     let budget = RefineBudget::steps(as_many.min(steps));
-    let (start, mut version) = part(&[], budget, [share, 1.0])?;
+    let (start, mut gaussians) = begin(&[])?;
+    if overfit <= f64::from(options.overfit_max) {
+        let of_held = |i: usize| held.contains(&usize::from(gaussians.source()[i].view));
+        gaussians = proof.gaussians.joined(&gaussians.only(of_held))?;
+    }
+    let mut version = part((&start, &gaussians), &[], budget, [share, 1.0])?;
     version.report = RefineReport {
-        seconds: proof.seconds + version.report.seconds,
-        psnr_before: proof.psnr_before,
-        psnr_after: proof.psnr_after,
+        seconds: proof.report.seconds + version.report.seconds,
+        psnr_before: proof.report.psnr_before,
+        psnr_after: proof.report.psnr_after,
         ..version.report
     };
-    Ok(Refined { report: version.report.clone(), version: Some((start, version)) })
+    let report = version.report.clone();
+    Ok(Refined { report, overfit: Some(overfit), version: Some((start, version)) })
+}
+
+/// Does `work`, and meanwhile draws a small view now and then, where a device would else rest.
+fn awake<T>(renderer: &dyn DifferentiableRenderer, scene: &Scene, work: impl FnOnce() -> T) -> T {
+    let Some(photo) = scene.meta.cameras.first().filter(|_| renderer.slow_after_rest()) else {
+        return work();
+    };
+    let near = default_near(scene.meta.report.median_depth);
+    let lens = photo.camera.intrinsics;
+    let longer = lens.width.max(lens.height);
+    let side = |length: u32| (length * AWAKE_SIDE / longer).max(1);
+    let intrinsics = lens.resized(side(lens.width), side(lens.height));
+    let small = RenderRequest::plain(Camera { intrinsics, ..photo.camera }, Kinds::COLOR, near);
+    let (working, done) = channel::<()>();
+    thread::scope(|scope| {
+        scope.spawn(move || {
+            while done.recv_timeout(AWAKE_EVERY) == Err(RecvTimeoutError::Timeout) {
+                // A device that fails says so in the step that comes.
+                let _ = renderer.render(&scene.gaussians, &small);
+            }
+        });
+        let made = work();
+        drop(working);
+        made
+    })
 }
 
 /// A share of a time that may be endless.

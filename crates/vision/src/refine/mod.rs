@@ -10,8 +10,8 @@
 //! scene as it is served. They must not be in the Gaussians that come in either: make the scene of
 //! the others ([`split`]).
 //!
-//! That says whether it helps and how many steps are good. What is served then is refined from a
-//! scene of all photos, so that it lacks none ([`crate::pipeline::refinement::refined`]).
+//! That says whether it helps and how many steps are good. What is served then learns all photos, so
+//! that it lacks none ([`crate::pipeline::refinement::refined`]).
 //!
 //! **One set.** A scene that comes in may be served in layers and with magnification. What comes
 //! out is plain: the same Gaussians for every view and for other programs.
@@ -24,7 +24,9 @@ use segsplat_render::{
     backward::DifferentiableRenderer,
     compare::psnr,
     plan::{default_near, served, widened},
-    train::{HostTrainer, Trainer, TrainingPhoto, TrainingSet, TrainingStep, checked, unit},
+    train::{
+        HostTrainer, Trainer, TrainingPhoto, TrainingSet, TrainingStep, checked, photo_loss, unit,
+    },
 };
 
 pub use segsplat_render::train::LearningRates;
@@ -97,6 +99,10 @@ pub struct RefineOptions {
     /// Share of the time that goes to the scene without the held-out photos, 0..1
     /// ([`crate::pipeline::refinement::refined`]).
     pub proof_share: f32,
+    /// Most that the proof's Gaussians may differ from the held-out photos, as a multiple of how much
+    /// they differ from learnt ones, for the work to go on from them
+    /// ([`crate::pipeline::refinement::refined`]).
+    pub overfit_max: f32,
     /// Bytes that it may take on a device; what needs more is refined on the processor.
     pub device_bytes_max: u64,
     /// Seed of all that is random.
@@ -115,6 +121,7 @@ impl Default for RefineOptions {
             prune_every: 50,
             ssim_share: 0.2,
             proof_share: 0.25,
+            overfit_max: 1.5,
             device_bytes_max: 1 << 30,
             seed: 1,
         }
@@ -150,6 +157,37 @@ pub fn split(photos: &[PosedPhoto], held: &[usize]) -> (Vec<PosedPhoto>, Vec<Pos
         kept.map(|(_, photo)| photo.clone()).collect()
     };
     (of(false), of(true))
+}
+
+/// Mean absolute difference of what `gaussians` show, over what is behind those of `start`, and the
+/// photos, in 0..1; NaN of no photo. Exposures are left out, for nothing knows those of held-out
+/// photos.
+///
+/// # Errors
+/// What the renderer says.
+pub fn mean_difference(
+    renderer: &dyn DifferentiableRenderer,
+    (start, gaussians): (&Scene, &Gaussians),
+    photos: &[PosedPhoto],
+) -> Result<f64> {
+    let mut sum = 0.0;
+    for posed in photos {
+        let frame = renderer.render(gaussians, &plain_view(start, posed.camera))?;
+        let (shown, photo) = (frame.color.unwrap_or_default(), unit(&posed.photo));
+        let (width, valid) = (posed.photo.width as usize, posed.photo.valid.as_deref());
+        sum += photo_loss(&shown, &photo, width, valid, 0.0).value;
+    }
+    Ok(sum / photos.len() as f64)
+}
+
+/// A view of one set of Gaussians over what `start` has behind its own.
+fn plain_view(start: &Scene, camera: Camera) -> RenderRequest {
+    let near = default_near(start.meta.report.median_depth);
+    let plain = RenderRequest::plain(camera, Kinds::COLOR, near);
+    let Background::Backdrop(_) = served(start, plain.clone()).background else {
+        return RenderRequest { background: Background::BLACK, ..plain };
+    };
+    RenderRequest { background: Background::Backdrop(start.backdrop.clone()), ..plain }
 }
 
 /// How much larger rates are where few steps are expected for each photo, 1..=2; 1 where it is not
@@ -206,15 +244,23 @@ impl Clock {
 struct Refinement<'a> {
     renderer: &'a dyn DifferentiableRenderer,
     start: &'a Scene,
-    near: f32,
     options: &'a RefineOptions,
     learnt: &'a [PosedPhoto],
     looks: Vec<Look>,
     report: RefineReport,
 }
 
-/// Refines `first` on the photos that are learnt and watches the held-out ones. `start` is what is
-/// served of the learnt photos alone, and `first` the same as one set of Gaussians. The photos are
+/// The Gaussians that the steps begin with: `first`, the one set of Gaussians of `start`, with its
+/// magnification for good, and no more of them than `options` say.
+///
+/// # Errors
+/// `internal` where they cannot be Gaussians any more.
+pub fn ready(start: &Scene, first: &Gaussians, options: &RefineOptions) -> Result<Gaussians> {
+    fewer(&widened(start, first, Some(options.side))?, options)
+}
+
+/// Refines `gaussians` on the photos that are learnt and watches the held-out ones. `start` is what
+/// is served of the learnt photos alone, and `gaussians` the same ([`ready`]). The photos are
 /// used at the size that they have. Before each step `pace` gets the share of the budget that is
 /// spent, 0..1; it may wait, which is not counted, and its error ends the work. Returns the best
 /// version: `start` itself where none was better.
@@ -226,7 +272,7 @@ struct Refinement<'a> {
 /// `invalid_request` for options out of range; what the renderer or `pace` says.
 pub fn refine(
     renderer: &dyn DifferentiableRenderer,
-    (start, first): (&Scene, &Gaussians),
+    (start, gaussians): (&Scene, &Gaussians),
     (learnt, held_out): (&[PosedPhoto], &[PosedPhoto]),
     options: &RefineOptions,
     pace: &mut dyn FnMut(f32) -> Result<()>,
@@ -238,7 +284,6 @@ pub fn refine(
     let mut work = Refinement {
         renderer,
         start,
-        near: default_near(extent),
         options,
         learnt,
         looks: held_out.par_iter().map(Look::new).collect(),
@@ -248,24 +293,23 @@ pub fn refine(
         Some(earlier) => earlier.clone(),
         None => work.as_served()?,
     };
-    if learnt.is_empty() || first.is_empty() {
+    if learnt.is_empty() || gaussians.is_empty() {
         return Ok(work.unrefined());
     }
-    let mut random = options.seed;
-    let gaussians = fewer(&widened(start, first, Some(options.side))?, options, &mut random)?;
-    let photos = learnt
-        .iter()
-        .map(|posed| TrainingPhoto { photo: &posed.photo, request: work.request(posed.camera) });
+    let photos = learnt.iter().map(|posed| TrainingPhoto {
+        photo: &posed.photo,
+        request: plain_view(start, posed.camera),
+    });
     let ssim_share = options.ssim_share;
-    let set = TrainingSet { gaussians: &gaussians, photos: photos.collect(), ssim_share };
+    let set = TrainingSet { gaussians, photos: photos.collect(), ssim_share };
     #[expect(clippy::cast_possible_truncation, reason = "a length")]
     let extent = if extent.is_finite() && extent > 0.0 { extent as f32 } else { 1.0 };
     let rates = LearningRates { means: options.rates.means * extent, ..options.rates };
     // The device first. What it has no room for, or what is lost with it, is done over.
     if set.device_bytes() <= options.device_bytes_max {
-        let made = renderer.trainer(&set).and_then(|trainer| {
-            trainer.map(|mut it| work.run(&mut *it, &rates, random, pace)).transpose()
-        });
+        let made = renderer
+            .trainer(&set)
+            .and_then(|trainer| trainer.map(|mut it| work.run(&mut *it, &rates, pace)).transpose());
         match made {
             Ok(None) => {}
             Ok(Some(version)) => return Ok(version),
@@ -275,7 +319,7 @@ pub fn refine(
             Err(error) => return Err(error),
         }
     }
-    work.run(&mut HostTrainer::new(renderer, &set)?, &rates, random, pace)
+    work.run(&mut HostTrainer::new(renderer, &set)?, &rates, pace)
 }
 
 /// Whether a device was at fault.
@@ -288,7 +332,6 @@ impl Refinement<'_> {
         &self,
         trainer: &mut dyn Trainer,
         rates: &LearningRates,
-        mut random: u64,
         pace: &mut dyn FnMut(f32) -> Result<()>,
     ) -> Result<RefinedVersion> {
         let options = self.options;
@@ -297,7 +340,7 @@ impl Refinement<'_> {
         let watched = !self.looks.is_empty();
         let few = !watched && self.learnt.len() < HOLDS_OUT_FROM;
         let mut best: Option<RefineReport> = None;
-        let mut order: Vec<usize> = Vec::new();
+        let (mut order, mut random) = (Vec::<usize>::new(), options.seed);
         let (mut steps, mut looked, mut waited, mut highest) = (0_u32, 0, 0, None);
         loop {
             let spent = clock.spent(steps);
@@ -308,7 +351,7 @@ impl Refinement<'_> {
             if last || (watched && spent * LOOKS as f32 >= (looked + 1) as f32) {
                 looked += 1;
                 waited += 1;
-                let after = self.look(|camera| trainer.render(&self.request(camera)))?;
+                let after = self.look(|camera| trainer.render(&plain_view(self.start, camera)))?;
                 if after > highest {
                     (highest, waited) = (after, 0);
                 }
@@ -361,7 +404,8 @@ impl Refinement<'_> {
     /// The report of the scene before any step: as it is served, in layers where it has some.
     fn as_served(&self) -> Result<RefineReport> {
         let (scene, count) = (self.start, self.start.gaussians.len() as u64);
-        let view = |camera| served(scene, RenderRequest::plain(camera, Kinds::COLOR, self.near));
+        let near = default_near(scene.meta.report.median_depth);
+        let view = |camera| served(scene, RenderRequest::plain(camera, Kinds::COLOR, near));
         let psnr = self.look(|camera| self.renderer.render(&scene.gaussians, &view(camera)))?;
         let counts = RefineReport {
             gaussians_before: count,
@@ -369,15 +413,6 @@ impl Refinement<'_> {
             ..RefineReport::default()
         };
         Ok(RefineReport { psnr_before: psnr, psnr_after: psnr, ..counts })
-    }
-
-    /// A plain view over what the scene has behind its Gaussians.
-    fn request(&self, camera: Camera) -> RenderRequest {
-        let plain = RenderRequest::plain(camera, Kinds::COLOR, self.near);
-        let Background::Backdrop(_) = served(self.start, plain.clone()).background else {
-            return RenderRequest { background: Background::BLACK, ..plain };
-        };
-        RenderRequest { background: Background::Backdrop(self.start.backdrop.clone()), ..plain }
     }
 
     /// Mean PSNR of what `draw` gives on the held-out photos, colours as 8 bits hold them.
@@ -410,13 +445,13 @@ fn shuffled(count: usize, random: &mut u64) -> Vec<usize> {
 
 /// At most as many of the Gaussians as `options` say, chosen at random; as much wider as there are
 /// fewer, so that together they cover what all did.
-fn fewer(all: &Gaussians, options: &RefineOptions, random: &mut u64) -> Result<Gaussians> {
-    let most = options.gaussians_max;
+fn fewer(all: &Gaussians, options: &RefineOptions) -> Result<Gaussians> {
+    let (most, mut random) = (options.gaussians_max, options.seed);
     if all.len() <= most {
         return Ok(all.clone());
     }
     let mut keep = vec![false; all.len()];
-    shuffled(all.len(), random).into_iter().take(most).for_each(|i| keep[i] = true);
+    shuffled(all.len(), &mut random).into_iter().take(most).for_each(|i| keep[i] = true);
     let wider = (all.len() as f32 / most as f32).sqrt();
     let mut raw = all.only(|i| keep[i]).into_raw();
     raw.scales.iter_mut().flatten().for_each(|scale| *scale *= wider);

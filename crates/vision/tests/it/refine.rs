@@ -1,12 +1,19 @@
 //! Refinement: scenes that get better.
 
-use std::sync::Arc;
+use std::{
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+    },
+    thread,
+    time::Duration,
+};
 
 use segsplat_core::{
     error::{Error, ErrorCode, Result},
     scene::{
-        Backdrop, Camera, Gaussians, HealthReport, Photo, PosedPhoto, Provenance, Scene, SceneId,
-        SceneMeta,
+        Backdrop, Camera, Gaussians, HealthReport, Photo, PosedPhoto, Provenance, Scene,
+        SceneCamera, SceneId, SceneMeta, SourcePixel,
     },
 };
 use segsplat_render::{
@@ -16,9 +23,15 @@ use segsplat_render::{
     train::{Trainer, TrainingSet},
 };
 use segsplat_testing::scenes::{Random, camera, checked, cloud, look};
-use segsplat_vision::refine::{
-    HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out,
-    rate_factor, refine, split,
+use segsplat_vision::{
+    pipeline::{
+        Reconstruction,
+        refinement::{self, Refined},
+    },
+    refine::{
+        HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out,
+        mean_difference, rate_factor, ready, refine, split,
+    },
 };
 
 #[test]
@@ -90,8 +103,9 @@ fn refined(
     let (learnt, out) = split(photos, &held_out(photos.len()));
     let options = RefineOptions { budget: RefineBudget::steps(steps), ..RefineOptions::default() };
     let photos = (&learnt[..], &out[..]);
-    let start = (&scene(start, 3.0), start);
-    refine(renderer, start, photos, &options, &mut |_| Ok(())).expect("refined")
+    let scene = scene(start, 3.0);
+    let gaussians = ready(&scene, start, &options).expect("Gaussians");
+    refine(renderer, (&scene, &gaussians), photos, &options, &mut |_| Ok(())).expect("refined")
 }
 
 fn cpu() -> CpuRenderer {
@@ -118,6 +132,131 @@ fn a_disturbed_scene_gets_better_on_photos_that_were_held_out() {
         ..version.report.clone()
     };
     assert_eq!(untimed(&again), untimed(&best));
+}
+
+/// A whole refinement of a scene of these photos: what the networks make is the disturbed cloud, whose
+/// Gaussians come from the photos by turns. `made` is called before each time they make it.
+fn refined_whole(
+    renderer: &dyn DifferentiableRenderer,
+    photos: &[PosedPhoto],
+    overfit_max: f32,
+    made: &dyn Fn(),
+) -> (Scene, Refined) {
+    let start = disturbed(&cloud(400, 0, 5));
+    let reconstruction = |photos: &[PosedPhoto]| {
+        let mut raw = start.clone().into_raw();
+        let views = (0..photos.len() as u16).cycle();
+        raw.source =
+            views.take(raw.means.len()).map(|view| SourcePixel { view, x: 0, y: 0 }).collect();
+        let camera = |posed: &PosedPhoto| SceneCamera {
+            file: posed.file.clone(),
+            camera: posed.camera,
+            network: None,
+        };
+        Reconstruction {
+            gaussians: checked(raw),
+            backdrop: Backdrop::default(),
+            report: HealthReport { median_depth: 3.0, ..HealthReport::default() },
+            cameras: photos.iter().map(camera).collect(),
+        }
+    };
+    let id = SceneId::from_bytes([1; 16]);
+    let scene = reconstruction(photos).into_scene(id, 0, Provenance::default());
+    let mut remake = |photos: Vec<PosedPhoto>| {
+        made();
+        let made = reconstruction(&photos);
+        let one_set = made.gaussians.clone();
+        Ok((made, one_set))
+    };
+    let budget = RefineBudget::steps(60);
+    let options = RefineOptions { budget, overfit_max, ..RefineOptions::default() };
+    let pace = &mut |_: f32| Ok(());
+    let found = refinement::refined(renderer, &scene, photos, &options, &mut remake, pace);
+    (scene, found.expect("refined"))
+}
+
+#[test]
+fn it_goes_on_from_the_proof_where_that_explains_photos_that_it_did_not_learn() {
+    let (_, photos) = captured(9);
+    let held = held_out(photos.len());
+    let differs = |(scene, found): &(Scene, Refined)| {
+        let (_, version) = found.version.as_ref().expect("a better version");
+        mean_difference(&cpu(), (scene, &version.gaussians), &photos).expect("views")
+    };
+    // Whether the Gaussians of held-out photos are behind the others.
+    let joined = |found: &Refined| {
+        let views = found.version.as_ref().expect("a better version").1.gaussians.source().to_vec();
+        let is_held = |pixel: &SourcePixel| held.contains(&usize::from(pixel.view));
+        let first = views.iter().position(is_held).expect("one of a held-out photo");
+        views[first..].iter().all(is_held)
+    };
+    let anew = refined_whole(&cpu(), &photos, 0.0, &|| ());
+    let on = refined_whole(&cpu(), &photos, f32::MAX, &|| ());
+    assert!(joined(&on.1) && !joined(&anew.1), "what it begins with");
+    println!("differs by {} and {}", differs(&on), differs(&anew));
+    assert!(differs(&on) < 0.9 * differs(&anew), "{} against {}", differs(&on), differs(&anew));
+    let overfit = on.1.overfit.expect("a proof");
+    assert!(overfit > 0.2 && overfit < 5.0 && anew.1.overfit == Some(overfit), "{overfit}");
+    // A bound beside what was found decides.
+    let near = |factor: f64| (overfit * factor) as f32;
+    assert!(joined(&refined_whole(&cpu(), &photos, near(1.01), &|| ()).1));
+    assert!(!joined(&refined_whole(&cpu(), &photos, near(0.99), &|| ()).1));
+}
+
+#[test]
+fn a_device_that_would_rest_draws_while_the_networks_work() {
+    let (_, photos) = captured(9);
+    for rests in [true, false] {
+        let renderer = Resting { cpu: cpu(), rests, drawn: AtomicUsize::new(0) };
+        let meanwhile = AtomicUsize::new(0);
+        let made = || {
+            let before = renderer.drawn.load(Ordering::SeqCst);
+            thread::sleep(Duration::from_millis(300));
+            let drawn = renderer.drawn.load(Ordering::SeqCst) - before;
+            meanwhile.fetch_add(drawn, Ordering::SeqCst);
+        };
+        refined_whole(&renderer, &photos, 0.0, &made);
+        let drawn = meanwhile.into_inner();
+        assert_eq!(drawn > 1, rests, "{drawn} views");
+    }
+}
+
+/// A renderer that may be slow after a rest, and counts its views.
+struct Resting {
+    cpu: CpuRenderer,
+    rests: bool,
+    drawn: AtomicUsize,
+}
+
+impl Renderer for Resting {
+    fn name(&self) -> String {
+        self.cpu.name()
+    }
+
+    fn concurrency(&self) -> usize {
+        self.cpu.concurrency()
+    }
+
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        self.drawn.fetch_add(1, Ordering::SeqCst);
+        self.cpu.render(gaussians, request)
+    }
+}
+
+impl DifferentiableRenderer for Resting {
+    fn backward(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
+        gradients: &mut Gradients,
+    ) -> Result<Frame> {
+        self.cpu.backward(gaussians, request, loss, gradients)
+    }
+
+    fn slow_after_rest(&self) -> bool {
+        self.rests
+    }
 }
 
 /// A renderer whose device has no room for a trainer.
@@ -178,8 +317,9 @@ fn a_cancelled_refinement_stops_and_odd_input_is_taken_or_refused() {
             true => Err(Error::new(ErrorCode::Cancelled, "stopped")),
             false => Ok(()),
         };
-        let start = (&scene(start, f64::NAN), start);
-        refine(&cpu, start, (photos, &[]), options, &mut pace)
+        let scene = scene(start, f64::NAN);
+        let gaussians = ready(&scene, start, options)?;
+        refine(&cpu, (&scene, &gaussians), (photos, &[]), options, &mut pace)
     };
     let options = RefineOptions { budget: RefineBudget::steps(30), ..RefineOptions::default() };
     let told = run(&truth, &photos, &options, true).expect_err("cancelled");
