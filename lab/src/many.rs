@@ -71,8 +71,8 @@ struct Variant {
     proof_share: f32,
     overfit_max: f32,
     device_bytes_max: u64,
-    /// Milliseconds that a run of the networks takes, of which the result is at hand: a device rests
-    /// meanwhile.
+    /// Milliseconds that a run of the networks takes, of which the result is at hand: a device
+    /// rests meanwhile.
     networks_ms: u64,
     /// Factors on learning rates: on all, and on single ones.
     rate: f32,
@@ -214,10 +214,13 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         }
         for (text, variant) in &variants {
             let mut row = plain.clone();
+            let mut rested = Duration::ZERO;
             let mut remake = |photos: Vec<PosedPhoto>| {
                 let known = if photos.len() == given.len() { &whole } else { &part };
                 let (made, one_set) = known.clone();
-                std::thread::sleep(Duration::from_millis(variant.networks_ms));
+                let rest = Duration::from_millis(variant.networks_ms);
+                std::thread::sleep(rest);
+                rested += rest;
                 Ok(if variant.layers { (made.clone(), made.gaussians) } else { (made, one_set) })
             };
             let mut paces = 0_u32;
@@ -228,7 +231,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             let (begun, cpu) = (Instant::now(), cpu_seconds());
             let (options, renderer) = (variant.options(), &*renderer);
             let found = refined(renderer, &scene, &given, &options, &mut remake, &mut pace)?;
-            let refine_ms = ms(begun);
+            let refine_ms = ms(begun) - rested.as_secs_f64() * 1e3;
             row["refine"] = json!(text);
             row["refine_ms"] = json!(refine_ms);
             row["step_ms"] = json!(refine_ms / f64::from(paces.max(1)));

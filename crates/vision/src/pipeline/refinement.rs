@@ -16,7 +16,7 @@ use crate::{
     error::Result,
     models::{ResizeFilter, fit},
     refine::{
-        self, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, held_out,
+        self, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, fewer, held_out,
         mean_difference, ready, split,
     },
     scene::{
@@ -36,8 +36,9 @@ const AWAKE_SIDE: u32 = 64;
 pub struct Refined {
     /// Its figures.
     pub report: RefineReport,
-    /// How much the proof's Gaussians differ from the held-out photos, as a multiple of how much they
-    /// differ from the learnt ones beside them; `None` where there was no proof, or nothing better.
+    /// How much the proof's Gaussians differ from the held-out photos, as a multiple of how much
+    /// they differ from the learnt ones beside them; `None` where there was no proof, or nothing
+    /// better.
     pub overfit: Option<f64>,
     /// What it began with and the better version; `None` where none was better.
     pub version: Option<(Scene, RefinedVersion)>,
@@ -50,11 +51,11 @@ pub type Remake<'a> = &'a mut dyn FnMut(Vec<PosedPhoto>) -> Result<(Reconstructi
 ///
 /// First the proof: a scene without the held-out photos is refined in a share of the time
 /// ([`RefineOptions::proof_share`]). Where its PSNR on these photos rises over that of what was
-/// served, a scene of all photos is refined with as many steps for each second that is left. It goes
-/// on from the proof's Gaussians, and those of the held-out photos, where the proof explains these
-/// nearly as well as photos that it learnt ([`RefineOptions::overfit_max`]); else it begins with
-/// those of the networks (docs/adr/0041). Of too few photos none is held out, and few steps are
-/// taken.
+/// served, a scene of all photos is refined with as many steps for each second that is left. It
+/// goes on from the proof's Gaussians, and those of the held-out photos, where the proof explains
+/// these nearly as well as photos that it learnt ([`RefineOptions::overfit_max`]); else it begins
+/// with those of the networks (docs/adr/0041). Of too few photos none is held out, and few steps
+/// are taken.
 ///
 /// # Errors
 /// Those of `remake`, of `pace` and of [`refine::refine`].
@@ -72,7 +73,10 @@ pub fn refined(
     let mut begin = |held: &[usize]| -> Result<(Scene, Gaussians)> {
         let made = awake(renderer, scene, || remake(split(photos, held).0))?;
         let (start, first) = start_of(scene, held, made)?;
-        let gaussians = ready(&start, &first, options)?;
+        // The proof leaves room for those of the photos that it lacks.
+        let all = options.gaussians_max.saturating_mul(photos.len() - held.len());
+        let gaussians_max = all / photos.len().max(1);
+        let gaussians = ready(&start, &first, &RefineOptions { gaussians_max, ..*options })?;
         Ok((start, gaussians))
     };
     let mut part = |start: (&Scene, &Gaussians), held: &[usize], budget, [begin, end]: [f32; 2]| {
@@ -110,7 +114,9 @@ pub fn refined(
     let (start, mut gaussians) = begin(&[])?;
     if overfit <= f64::from(options.overfit_max) {
         let of_held = |i: usize| held.contains(&usize::from(gaussians.source()[i].view));
-        gaussians = proof.gaussians.joined(&gaussians.only(of_held))?;
+        let room = options.gaussians_max.saturating_sub(proof.gaussians.len());
+        let more = fewer(&gaussians.only(of_held), room, options.seed)?;
+        gaussians = proof.gaussians.joined(&more)?;
     }
     let mut version = part((&start, &gaussians), &[], budget, [share, 1.0])?;
     version.report = RefineReport {

@@ -10,8 +10,8 @@
 //! scene as it is served. They must not be in the Gaussians that come in either: make the scene of
 //! the others ([`split`]).
 //!
-//! That says whether it helps and how many steps are good. What is served then learns all photos, so
-//! that it lacks none ([`crate::pipeline::refinement::refined`]).
+//! That says whether it helps and how many steps are good. What is served then learns all photos,
+//! so that it lacks none ([`crate::pipeline::refinement::refined`]).
 //!
 //! **One set.** A scene that comes in may be served in layers and with magnification. What comes
 //! out is plain: the same Gaussians for every view and for other programs.
@@ -99,8 +99,8 @@ pub struct RefineOptions {
     /// Share of the time that goes to the scene without the held-out photos, 0..1
     /// ([`crate::pipeline::refinement::refined`]).
     pub proof_share: f32,
-    /// Most that the proof's Gaussians may differ from the held-out photos, as a multiple of how much
-    /// they differ from learnt ones, for the work to go on from them
+    /// Most that the proof's Gaussians may differ from the held-out photos, as a multiple of how
+    /// much they differ from learnt ones, for the work to go on from them
     /// ([`crate::pipeline::refinement::refined`]).
     pub overfit_max: f32,
     /// Bytes that it may take on a device; what needs more is refined on the processor.
@@ -256,7 +256,8 @@ struct Refinement<'a> {
 /// # Errors
 /// `internal` where they cannot be Gaussians any more.
 pub fn ready(start: &Scene, first: &Gaussians, options: &RefineOptions) -> Result<Gaussians> {
-    fewer(&widened(start, first, Some(options.side))?, options)
+    let all = widened(start, first, Some(options.side))?;
+    fewer(&all, options.gaussians_max, options.seed)
 }
 
 /// Refines `gaussians` on the photos that are learnt and watches the held-out ones. `start` is what
@@ -443,14 +444,16 @@ fn shuffled(count: usize, random: &mut u64) -> Vec<usize> {
     order.into_iter().map(|(_, i)| i).collect()
 }
 
-/// At most as many of the Gaussians as `options` say, chosen at random; as much wider as there are
-/// fewer, so that together they cover what all did.
-fn fewer(all: &Gaussians, options: &RefineOptions) -> Result<Gaussians> {
-    let (most, mut random) = (options.gaussians_max, options.seed);
+/// At most `most` of the Gaussians, chosen at random; as much wider as there are fewer, so that
+/// together they cover what all did.
+///
+/// # Errors
+/// `internal` where they cannot be Gaussians any more.
+pub fn fewer(all: &Gaussians, most: usize, seed: u64) -> Result<Gaussians> {
     if all.len() <= most {
         return Ok(all.clone());
     }
-    let mut keep = vec![false; all.len()];
+    let (mut keep, mut random) = (vec![false; all.len()], seed);
     shuffled(all.len(), &mut random).into_iter().take(most).for_each(|i| keep[i] = true);
     let wider = (all.len() as f32 / most as f32).sqrt();
     let mut raw = all.only(|i| keep[i]).into_raw();

@@ -134,12 +134,12 @@ fn a_disturbed_scene_gets_better_on_photos_that_were_held_out() {
     assert_eq!(untimed(&again), untimed(&best));
 }
 
-/// A whole refinement of a scene of these photos: what the networks make is the disturbed cloud, whose
-/// Gaussians come from the photos by turns. `made` is called before each time they make it.
+/// A whole refinement of a scene of these photos: what the networks make is the disturbed cloud,
+/// whose Gaussians come from the photos by turns. `made` is called before each time they make it.
 fn refined_whole(
     renderer: &dyn DifferentiableRenderer,
     photos: &[PosedPhoto],
-    overfit_max: f32,
+    (overfit_max, gaussians_max): (f32, usize),
     made: &dyn Fn(),
 ) -> (Scene, Refined) {
     let start = disturbed(&cloud(400, 0, 5));
@@ -169,7 +169,7 @@ fn refined_whole(
         Ok((made, one_set))
     };
     let budget = RefineBudget::steps(60);
-    let options = RefineOptions { budget, overfit_max, ..RefineOptions::default() };
+    let options = RefineOptions { budget, overfit_max, gaussians_max, ..RefineOptions::default() };
     let pace = &mut |_: f32| Ok(());
     let found = refinement::refined(renderer, &scene, photos, &options, &mut remake, pace);
     (scene, found.expect("refined"))
@@ -190,8 +190,8 @@ fn it_goes_on_from_the_proof_where_that_explains_photos_that_it_did_not_learn() 
         let first = views.iter().position(is_held).expect("one of a held-out photo");
         views[first..].iter().all(is_held)
     };
-    let anew = refined_whole(&cpu(), &photos, 0.0, &|| ());
-    let on = refined_whole(&cpu(), &photos, f32::MAX, &|| ());
+    let anew = refined_whole(&cpu(), &photos, (0.0, usize::MAX), &|| ());
+    let on = refined_whole(&cpu(), &photos, (f32::MAX, usize::MAX), &|| ());
     assert!(joined(&on.1) && !joined(&anew.1), "what it begins with");
     println!("differs by {} and {}", differs(&on), differs(&anew));
     assert!(differs(&on) < 0.9 * differs(&anew), "{} against {}", differs(&on), differs(&anew));
@@ -199,8 +199,12 @@ fn it_goes_on_from_the_proof_where_that_explains_photos_that_it_did_not_learn() 
     assert!(overfit > 0.2 && overfit < 5.0 && anew.1.overfit == Some(overfit), "{overfit}");
     // A bound beside what was found decides.
     let near = |factor: f64| (overfit * factor) as f32;
-    assert!(joined(&refined_whole(&cpu(), &photos, near(1.01), &|| ()).1));
-    assert!(!joined(&refined_whole(&cpu(), &photos, near(0.99), &|| ()).1));
+    assert!(joined(&refined_whole(&cpu(), &photos, (near(1.01), usize::MAX), &|| ()).1));
+    assert!(!joined(&refined_whole(&cpu(), &photos, (near(0.99), usize::MAX), &|| ()).1));
+    // As many as are allowed, though the proof has those of its photos.
+    let (_, full) = refined_whole(&cpu(), &photos, (f32::MAX, 400), &|| ());
+    let count = full.version.as_ref().expect("a better version").1.gaussians.len();
+    assert!(joined(&full) && count <= 400 && count > 360, "{count} Gaussians");
 }
 
 #[test]
@@ -215,7 +219,7 @@ fn a_device_that_would_rest_draws_while_the_networks_work() {
             let drawn = renderer.drawn.load(Ordering::SeqCst) - before;
             meanwhile.fetch_add(drawn, Ordering::SeqCst);
         };
-        refined_whole(&renderer, &photos, 0.0, &made);
+        refined_whole(&renderer, &photos, (0.0, usize::MAX), &made);
         let drawn = meanwhile.into_inner();
         assert_eq!(drawn > 1, rests, "{drawn} views");
     }
