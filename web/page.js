@@ -100,7 +100,8 @@ function invalidate() {
 
 let lastFrame = 0;
 function frame() {
-  if (!drawing || !state.camera || state.filming) return;
+  // A device that is lost, or came back without its scene, shows nothing and is not settled.
+  if (!drawing?.header || drawing.lost || !state.camera || state.filming) return;
   const box = $('stage').getBoundingClientRect(),
     dense = Math.min(devicePixelRatio, 2);
   const moving = performance.now() - state.moving < 250;
