@@ -46,8 +46,15 @@ pub const UNWATCHED_STEPS_MAX: u32 = 30;
 const LOOKS: u32 = 10;
 /// Looks without a better version after which it stops.
 const PATIENCE: u32 = 3;
-/// Rates as multiples of those of 3DGS, which takes 30,000 steps: docs/adr/0039.
-const RATE: f32 = 2.5;
+/// 3DGS takes 30,000 steps; of fewer each must reach further, and scales furthest: docs/adr/0041.
+const RATES: LearningRates = LearningRates {
+    means: 2e-4,
+    quats: 5e-3,
+    scales: 7.5e-2,
+    opacities: 6.25e-2,
+    sh: 6.25e-3,
+    sh_rest: 3.125e-4,
+};
 /// Rates fall to this share over the budget.
 const LAST_RATE: f32 = 0.1;
 /// Steps for each photo with which the rates are right, how rates grow where there are fewer, and
@@ -115,7 +122,7 @@ impl Default for RefineOptions {
             budget: RefineBudget::steps(400),
             batch: 1,
             side: 640,
-            rates: LearningRates::default().scaled(RATE),
+            rates: RATES,
             gaussians_max: 150_000,
             opacity_min: 0.01,
             prune_every: 50,
