@@ -14,6 +14,7 @@ mod masks;
 pub mod metrics;
 mod networks;
 mod photos;
+mod refinements;
 pub mod report;
 pub mod rows;
 pub mod scenes;

@@ -10,7 +10,6 @@ use std::{
     time::{Duration, Instant},
 };
 
-use serde::{Deserialize, Serialize};
 use serde_json::json;
 
 use crate::{
@@ -19,13 +18,14 @@ use crate::{
     metrics::{clamped, psnr, to_unit},
     photo_files,
     pipeline::{Pipeline, reconstruct_for_refinement, refinement::refined},
-    refine::{LearningRates, RefineBudget, RefineOptions, held_out, split},
+    refine::{held_out, split},
+    refinements::Variant,
     render::{
         Background, Frame, Kinds, RenderRequest, Switches,
         plan::{default_near, served},
     },
     rows::{Rows, ms, progress},
-    scene::{Camera, Gaussians, PosedPhoto, SceneOptions, Watch, with_pairs},
+    scene::{Camera, Gaussians, PosedPhoto, SceneOptions, Watch},
     scenes::{is_posed, scene_of, use_of, view_request},
     setup::Inputs,
 };
@@ -53,101 +53,12 @@ pub(crate) struct Args {
     pictures: Option<PathBuf>,
 }
 
-/// How a scene is refined: what is not named is as the product does it.
-#[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct Variant {
-    /// Whether it begins with the Gaussians that are served in layers.
-    layers: bool,
-    /// So many steps, or so much time.
-    steps: u32,
-    ms: u64,
-    side: u32,
-    gaussians_max: usize,
-    batch: usize,
-    prune_every: u32,
-    opacity_min: f32,
-    ssim_share: f32,
-    proof_share: f32,
-    overfit_max: f32,
-    device_bytes_max: u64,
-    /// Milliseconds that a run of the networks takes, of which the result is at hand: a device
-    /// rests meanwhile.
-    networks_ms: u64,
-    /// Factors on learning rates: on all, and on single ones.
-    rate: f32,
-    means: f32,
-    quats: f32,
-    scales: f32,
-    opacities: f32,
-    sh: f32,
-}
-
-impl Default for Variant {
-    fn default() -> Self {
-        let plain = RefineOptions::default();
-        Self {
-            layers: false,
-            steps: u32::MAX,
-            ms: u64::MAX,
-            side: plain.side,
-            gaussians_max: plain.gaussians_max,
-            batch: plain.batch,
-            prune_every: plain.prune_every,
-            opacity_min: plain.opacity_min,
-            ssim_share: plain.ssim_share,
-            proof_share: plain.proof_share,
-            overfit_max: plain.overfit_max,
-            device_bytes_max: plain.device_bytes_max,
-            networks_ms: 0,
-            rate: 1.0,
-            means: 1.0,
-            quats: 1.0,
-            scales: 1.0,
-            opacities: 1.0,
-            sh: 1.0,
-        }
-    }
-}
-
-impl Variant {
-    fn options(&self) -> RefineOptions {
-        let plain = RefineOptions::default();
-        let rates = plain.rates.scaled(self.rate);
-        RefineOptions {
-            budget: RefineBudget { steps: self.steps, time: Duration::from_millis(self.ms) },
-            batch: self.batch,
-            side: self.side,
-            rates: LearningRates {
-                means: rates.means * self.means,
-                quats: rates.quats * self.quats,
-                scales: rates.scales * self.scales,
-                opacities: rates.opacities * self.opacities,
-                sh: rates.sh * self.sh,
-                sh_rest: rates.sh_rest * self.sh,
-            },
-            gaussians_max: self.gaussians_max,
-            opacity_min: self.opacity_min,
-            prune_every: self.prune_every,
-            ssim_share: self.ssim_share,
-            proof_share: self.proof_share,
-            overfit_max: self.overfit_max,
-            device_bytes_max: self.device_bytes_max,
-            ..plain
-        }
-    }
-}
-
 /// Makes a row for each scene and refinement: PSNR at the targets before and after it.
 ///
 /// # Errors
 /// `invalid_request` when there is no scene or too few photos, else whatever a stage says.
 pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
-    let pairs = |text: &String| text.split(',').map(str::to_owned).collect::<Vec<_>>();
-    let variants = args.refine.iter().map(|text| {
-        let variant = with_pairs(&Variant::default(), &pairs(text))?;
-        Ok((text, variant))
-    });
+    let variants = args.refine.iter().map(|text| Ok((text, text.parse::<Variant>()?)));
     let variants: Vec<(&String, Variant)> = variants.collect::<Result<_>>()?;
     let engine = Pipeline::open(&args.inputs.setup.networks(1))?;
     let switches = Switches { shaders: args.shaders.clone(), ..Switches::default() };

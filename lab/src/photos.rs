@@ -5,7 +5,7 @@
 //! and SSIM a row has the *hindsight warp*: the best PSNR that a warp of either input by one
 //! constant depth can have, when the depth is chosen by the answer.
 
-use std::{path::PathBuf, time::Instant};
+use std::{path::PathBuf, sync::atomic::AtomicBool, time::Instant};
 
 use segsplat_core::names::named;
 use serde_json::{Value, json};
@@ -14,10 +14,14 @@ use crate::{
     error::{Error, Result},
     grid,
     metrics::{clamped, psnr, ssim, to_unit},
-    pipeline::Pipeline,
+    pipeline::{
+        Pipeline, reconstruct_for_refinement,
+        refinement::{refined, version_of},
+    },
+    refinements::Variant,
     render::{Kinds, Renderer, cpu::CpuRenderer, plan::served},
     rows::{Rows, each, means, ms, progress},
-    scene::{PosedPhoto, Preset, SceneOptions},
+    scene::{PosedPhoto, Preset, SceneOptions, Watch},
     scenes::{SIDE, is_posed, make, means_by_use, scene_of, squares, use_of, view_request},
     setup::Inputs,
     triples::{Triple, triples},
@@ -41,6 +45,9 @@ pub(crate) struct Args {
     /// A change of the method: `--method prune=true`; docs/method.md has all
     #[arg(long, value_name = "NAME=VALUE")]
     method: Vec<String>,
+    /// A refinement of each scene, as NAME=VALUE,...: `ms=60000`; the row has both figures
+    #[arg(long, value_name = "NAME=VALUE,...")]
+    refine: Option<String>,
     /// Folder for picture grids, one a scene
     #[arg(long, value_name = "DIR")]
     pictures: Option<PathBuf>,
@@ -62,12 +69,14 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let renderer = CpuRenderer::new((threads / at_once).max(1))?;
     let options = SceneOptions { preset: args.preset, ..SceneOptions::default() };
     let options = options.with(&args.method)?;
+    let refinement = args.refine.as_deref().map(str::parse::<Variant>).transpose()?;
+    let method = (photos, &options, refinement.as_ref());
     let mut scenes = Vec::new();
     for (name, dir) in args.inputs.find(is_posed)? {
         let squares = squares(&dir)?;
         let chosen: Vec<Triple> = triples(&squares).into_iter().step_by(args.every).collect();
         let mut judged = each(chosen.len(), at_once, |i| {
-            judge(&engine, &renderer, &squares, &chosen[i], (photos, &options)).map_err(|e| {
+            judge(&engine, &renderer, &squares, &chosen[i], method).map_err(|e| {
                 let target = &squares[chosen[i].target].file;
                 Error::new(e.code(), format!("{name}, target {target}: {e}")).caused_by(e)
             })
@@ -114,7 +123,7 @@ fn judge(
     renderer: &CpuRenderer,
     squares: &[PosedPhoto],
     triple: &Triple,
-    (photos, options): (usize, &SceneOptions),
+    (photos, options, refinement): (usize, &SceneOptions, Option<&Variant>),
 ) -> Result<(Value, grid::Row)> {
     let inputs = triple.inputs(squares, photos);
     let given: Vec<PosedPhoto> = inputs.iter().map(|&i| squares[i].clone()).collect();
@@ -130,7 +139,7 @@ fn judge(
     let (truth, valid) = (to_unit(&target.photo), target.photo.valid.as_deref());
     let pair = triple.pair.map(|i| &squares[i]);
     let geometry = report.stages.iter().filter(|stage| stage.stage == "geometry");
-    let row = json!({
+    let mut row = json!({
         "target": target.file,
         "psnr": psnr(&color, &truth, valid),
         "ssim": ssim(&color, &truth, SIDE as usize, valid),
@@ -139,6 +148,20 @@ fn judge(
         "geometry_ms": geometry.map(|stage| stage.ms).sum::<f64>(),
         "total_ms": total_ms,
     });
+    if let Some(variant) = refinement {
+        let watch = Watch { progress: &|_, _| (), cancel: &AtomicBool::new(false) };
+        let mut remake =
+            |photos: Vec<PosedPhoto>| reconstruct_for_refinement(engine, &photos, options, watch);
+        let found =
+            refined(renderer, &scene, &given, &variant.options(), &mut remake, &mut |_| Ok(()))?;
+        row["refined_psnr"] = row["psnr"].clone();
+        if let Some((start, version)) = &found.version {
+            let scene = version_of(start, &scene, version)?;
+            let request = view_request(target.camera, Kinds::COLOR, report.median_depth);
+            let frame = renderer.render(&scene.gaussians, &served(&scene, request))?;
+            row["refined_psnr"] = json!(psnr(&clamped(frame.color), &truth, valid));
+        }
+    }
     let mut pictures: grid::Row = given.iter().map(|posed| grid::photo(&posed.photo)).collect();
     pictures.push(grid::photo(&target.photo));
     pictures.push(grid::color(&color, SIDE));

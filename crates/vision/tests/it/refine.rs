@@ -168,7 +168,7 @@ fn refined_whole(
         let one_set = made.gaussians.clone();
         Ok((made, one_set))
     };
-    let budget = RefineBudget::steps(60);
+    let budget = RefineBudget::steps(30);
     let options = RefineOptions { budget, overfit_max, gaussians_max, ..RefineOptions::default() };
     let pace = &mut |_: f32| Ok(());
     let found = refinement::refined(renderer, &scene, photos, &options, &mut remake, pace);

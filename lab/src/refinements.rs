@@ -1,0 +1,106 @@
+//! Refinements to measure, as the command line names them: `ms=5000,rate=2`.
+
+use std::{str::FromStr, time::Duration};
+
+use serde::{Deserialize, Serialize};
+
+use crate::{
+    error::{Error, Result},
+    refine::{LearningRates, RefineBudget, RefineOptions},
+    scene::with_pairs,
+};
+
+/// How a scene is refined: what is not named is as the product does it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub(crate) struct Variant {
+    /// Whether it begins with the Gaussians that are served in layers.
+    pub(crate) layers: bool,
+    /// So many steps, or so much time.
+    steps: u32,
+    ms: u64,
+    side: u32,
+    gaussians_max: usize,
+    batch: usize,
+    prune_every: u32,
+    opacity_min: f32,
+    ssim_share: f32,
+    proof_share: f32,
+    overfit_max: f32,
+    device_bytes_max: u64,
+    /// Milliseconds that a run of the networks takes, of which the result is at hand: a device
+    /// rests meanwhile.
+    pub(crate) networks_ms: u64,
+    /// Factors on learning rates: on all, and on single ones.
+    rate: f32,
+    means: f32,
+    quats: f32,
+    scales: f32,
+    opacities: f32,
+    sh: f32,
+}
+
+impl Default for Variant {
+    fn default() -> Self {
+        let plain = RefineOptions::default();
+        Self {
+            layers: false,
+            steps: u32::MAX,
+            ms: u64::MAX,
+            side: plain.side,
+            gaussians_max: plain.gaussians_max,
+            batch: plain.batch,
+            prune_every: plain.prune_every,
+            opacity_min: plain.opacity_min,
+            ssim_share: plain.ssim_share,
+            proof_share: plain.proof_share,
+            overfit_max: plain.overfit_max,
+            device_bytes_max: plain.device_bytes_max,
+            networks_ms: 0,
+            rate: 1.0,
+            means: 1.0,
+            quats: 1.0,
+            scales: 1.0,
+            opacities: 1.0,
+            sh: 1.0,
+        }
+    }
+}
+
+impl Variant {
+    /// The options of the product with these in their place.
+    pub(crate) fn options(&self) -> RefineOptions {
+        let plain = RefineOptions::default();
+        let rates = plain.rates.scaled(self.rate);
+        RefineOptions {
+            budget: RefineBudget { steps: self.steps, time: Duration::from_millis(self.ms) },
+            batch: self.batch,
+            side: self.side,
+            rates: LearningRates {
+                means: rates.means * self.means,
+                quats: rates.quats * self.quats,
+                scales: rates.scales * self.scales,
+                opacities: rates.opacities * self.opacities,
+                sh: rates.sh * self.sh,
+                sh_rest: rates.sh_rest * self.sh,
+            },
+            gaussians_max: self.gaussians_max,
+            opacity_min: self.opacity_min,
+            prune_every: self.prune_every,
+            ssim_share: self.ssim_share,
+            proof_share: self.proof_share,
+            overfit_max: self.overfit_max,
+            device_bytes_max: self.device_bytes_max,
+            ..plain
+        }
+    }
+}
+
+impl FromStr for Variant {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self> {
+        let pairs: Vec<String> = text.split(',').map(str::to_owned).collect();
+        with_pairs(&Self::default(), &pairs)
+    }
+}
