@@ -46,7 +46,8 @@ pub const UNWATCHED_STEPS_MAX: u32 = 30;
 const LOOKS: u32 = 10;
 /// Looks without a better version after which it stops.
 const PATIENCE: u32 = 3;
-/// 3DGS takes 30,000 steps; of fewer each must reach further, and scales furthest: docs/adr/0041.
+/// How far numbers move at first, `means` as a share of the median depth. 3DGS takes 30,000 steps
+/// that move less: docs/adr/0041.
 const RATES: LearningRates = LearningRates {
     means: 2e-4,
     quats: 5e-3,
