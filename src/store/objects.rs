@@ -103,14 +103,22 @@ impl Objects {
     /// Keeps an object, whatever was there.
     pub(super) fn put(&self, what: &str, path: Path, bytes: impl Into<PutPayload>) -> Result<()> {
         let bytes: PutPayload = bytes.into();
+        let file = self.folder.as_ref().map(|folder| folder.join(path.as_ref()));
         self.run(what, |store| async move {
-            for _ in 0..FOLDER_GONE_MAX {
+            let mut tries = 0..FOLDER_GONE_MAX;
+            let kept = loop {
                 match store.put(&path, bytes.clone()).await {
-                    Err(fault) if folder_is_gone(&fault) => {}
-                    done => return done.map(drop),
+                    Err(fault) if folder_is_gone(&fault) && tries.next().is_some() => {}
+                    kept => break kept.map(drop),
                 }
+            };
+            // A local store makes the object's folder first. One that holds others stays.
+            if let (Err(_), Some(mut folder)) = (&kept, file)
+                && folder.pop()
+            {
+                let _ = tokio::task::spawn_blocking(|| fs::remove_dir(folder)).await;
             }
-            store.put(&path, bytes).await.map(drop)
+            kept
         })
     }
 

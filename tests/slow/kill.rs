@@ -3,6 +3,7 @@
 
 use std::{
     collections::{BTreeMap, HashSet},
+    fs::File,
     path::Path,
     process::Command,
     sync::{
@@ -111,7 +112,9 @@ async fn caller(
                         let no_room = status == 503 && said["code"] == "store_unavailable";
                         assert!(no_room || [200, 201, 202, 429].contains(&status), "{said}");
                         deletions = if no_room { 6 } else { 0 };
-                        if let Some(id) = said["id"].as_str() {
+                        // A scene that found no room while its caller waited is there, failed.
+                        let id = said["id"].as_str().or(said["details"]["scene"].as_str());
+                        if let Some(id) = id {
                             note(&ledger, id, |_| {});
                         }
                     },
@@ -165,9 +168,8 @@ async fn check(server: &Process, ledger: &Ledger, room: Room) {
                 assert_eq!(now, Ok(first), "{id} changed");
             }
         }
-        if status == 404 {
-            note(ledger, &id, |known| known.gone = true);
-        }
+        // A deletion that the kill cut off was done or not; it is not done later.
+        note(ledger, &id, |known| (known.gone, known.doomed) = (status == 404, status == 404));
     }
 }
 
@@ -264,6 +266,30 @@ async fn nor_by_kill_9_on_a_full_disk() {
     }
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_create_that_finds_the_disk_full_leaves_nothing() {
+    if !can_serve() {
+        return;
+    }
+    let Some(disk) = SmallDisk::mount("4m") else { return };
+    let (folder, client) = (disk.0.path(), crate::common::client());
+    let config = tempfile::NamedTempFile::new().unwrap();
+    let server = start(&folder.join("data"), config.path()).start();
+    let ballast = folder.join("ballast");
+    let zeros = std::io::copy(&mut std::io::repeat(0), &mut File::create(&ballast).unwrap());
+    assert_eq!(zeros.unwrap_err().kind(), std::io::ErrorKind::StorageFull);
+    let upload = &uploads()[0];
+    for _ in 0..3 {
+        let (status, said) = process::create(&client, &server.url, upload, 0, None).await.unwrap();
+        assert_eq!((status, &said["code"]), (503, &"store_unavailable".into()), "{said}");
+    }
+    let left = std::fs::read_dir(folder.join("data/scenes")).into_iter().flatten().count();
+    assert_eq!(left, 0, "folders of scenes that are not there");
+    std::fs::remove_file(ballast).unwrap();
+    let (status, said) = process::create(&client, &server.url, upload, 5_000, None).await.unwrap();
+    assert_eq!(status, 201, "there is room again: {said}");
+}
+
 async fn killed(folder: &Path, kills: u64, room: Room) {
     let config = tempfile::NamedTempFile::new().unwrap();
     let data = folder.join("data");
@@ -275,6 +301,10 @@ async fn killed(folder: &Path, kills: u64, room: Room) {
     for round in 0..kills {
         let server = Arc::new(start.start());
         starts.push(server.started_in);
+        // From now on callers know them, and delete them too: a small disk would be full of them.
+        for id in unacknowledged(&server, &ledger).await {
+            note(&ledger, &id, |_| {});
+        }
         check(&server, &ledger, room).await;
         let progress = Arc::new(Progress::default());
         let callers: Vec<_> = (0..4)
@@ -323,7 +353,7 @@ async fn killed(folder: &Path, kills: u64, room: Room) {
         done += usize::from(state == "done");
     }
     check_after(&server, &ledger).await;
-    let unknown = unacknowledged(&client, &server, &ledger).await;
+    let unknown = unacknowledged(&server, &ledger).await;
     assert!(server.stop(), "it ends well");
     let swept = start.start();
     let begun = Instant::now();
@@ -368,11 +398,12 @@ async fn check_after(server: &Process, ledger: &Ledger) {
 }
 
 /// Scenes of the server whose id no caller got: the kill came before the answer.
-async fn unacknowledged(client: &Client, server: &Process, ledger: &Ledger) -> HashSet<String> {
+async fn unacknowledged(server: &Process, ledger: &Ledger) -> HashSet<String> {
+    let client = crate::common::client();
     let (mut ids, mut after) = (HashSet::new(), String::new());
     loop {
         let url = server.url(&format!("/v1/scenes?limit=100{after}"));
-        let (_, page) = process::get(client, &url).await.unwrap();
+        let (_, page) = process::get(&client, &url).await.unwrap();
         for scene in page["scenes"].as_array().unwrap() {
             ids.insert(scene["id"].as_str().unwrap().to_owned());
         }
