@@ -6,7 +6,7 @@
 
 use std::{
     path::{Path, PathBuf},
-    sync::{Arc, atomic::AtomicBool},
+    sync::Arc,
     time::{Duration, Instant},
 };
 
@@ -17,7 +17,7 @@ use crate::{
     limits::Limits,
     metrics::{clamped, psnr, to_unit},
     photo_files,
-    pipeline::{Pipeline, reconstruct_for_refinement, refinement::refined},
+    pipeline::{Pipeline, refinement::refined},
     refine::{held_out, split},
     refinements::Variant,
     render::{
@@ -25,8 +25,8 @@ use crate::{
         plan::{default_near, served},
     },
     rows::{Rows, ms, progress},
-    scene::{Camera, Gaussians, PosedPhoto, SceneOptions, Watch},
-    scenes::{is_posed, scene_of, use_of, view_request},
+    scene::{Camera, Gaussians, PosedPhoto, SceneOptions},
+    scenes::{is_posed, make_for_refinement, scene_of, use_of, view_request},
     setup::Inputs,
 };
 
@@ -71,8 +71,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             return Err(Error::invalid(format!("{name}: {} photos are too few", all.len())));
         }
         let begun = Instant::now();
-        let watch = Watch { progress: &|_, _| (), cancel: &AtomicBool::new(false) };
-        let whole = reconstruct_for_refinement(&engine, &given, &scene_options, watch)?;
+        let whole = make_for_refinement(&engine, &given, &scene_options)?;
         let (scene, first) = (scene_of(whole.0.clone()), whole.1.clone());
         let create_ms = ms(begun);
         // Once for all variants, whose time it is no part of.
@@ -80,7 +79,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             true => whole.clone(),
             false => {
                 let (learnt, _) = split(&given, &held_out(given.len()));
-                reconstruct_for_refinement(&engine, &learnt, &scene_options, watch)?
+                make_for_refinement(&engine, &learnt, &scene_options)?
             }
         };
         let one_set = |gaussians: &Gaussians, camera| {
@@ -128,11 +127,10 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             let mut rested = Duration::ZERO;
             let mut remake = |photos: Vec<PosedPhoto>| {
                 let known = if photos.len() == given.len() { &whole } else { &part };
-                let (made, one_set) = known.clone();
                 let rest = Duration::from_millis(variant.networks_ms);
                 std::thread::sleep(rest);
                 rested += rest;
-                Ok(if variant.layers { (made.clone(), made.gaussians) } else { (made, one_set) })
+                Ok(variant.start(known.clone()))
             };
             let mut paces = 0_u32;
             let mut pace = |_: f32| {

@@ -5,7 +5,7 @@
 //! and SSIM a row has the *hindsight warp*: the best PSNR that a warp of either input by one
 //! constant depth can have, when the depth is chosen by the answer.
 
-use std::{path::PathBuf, sync::atomic::AtomicBool, time::Instant};
+use std::{path::PathBuf, time::Instant};
 
 use segsplat_core::names::named;
 use serde_json::{Value, json};
@@ -15,14 +15,17 @@ use crate::{
     grid,
     metrics::{clamped, psnr, ssim, to_unit},
     pipeline::{
-        Pipeline, reconstruct_for_refinement,
+        Pipeline,
         refinement::{refined, version_of},
     },
     refinements::Variant,
     render::{Kinds, Renderer, cpu::CpuRenderer, plan::served},
     rows::{Rows, each, means, ms, progress},
-    scene::{PosedPhoto, Preset, SceneOptions, Watch},
-    scenes::{SIDE, is_posed, make, means_by_use, scene_of, squares, use_of, view_request},
+    scene::{PosedPhoto, Preset, Scene, SceneOptions},
+    scenes::{
+        SIDE, is_posed, make, make_for_refinement, means_by_use, scene_of, squares, use_of,
+        view_request,
+    },
     setup::Inputs,
     triples::{Triple, triples},
     warp::hindsight_warp,
@@ -70,6 +73,9 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let options = SceneOptions { preset: args.preset, ..SceneOptions::default() };
     let options = options.with(&args.method)?;
     let refinement = args.refine.as_deref().map(str::parse::<Variant>).transpose()?;
+    if refinement.as_ref().is_some_and(|variant| variant.networks_ms > 0) {
+        return Err(Error::invalid("refine: networks_ms is of `many`; here the networks run"));
+    }
     let method = (photos, &options, refinement.as_ref());
     let mut scenes = Vec::new();
     for (name, dir) in args.inputs.find(is_posed)? {
@@ -133,10 +139,13 @@ fn judge(
     let report = &scene.meta.report;
     let target = &squares[triple.target];
     let kinds = Kinds { color: true, depth: true, alpha: false };
-    let request = view_request(target.camera, kinds, report.median_depth);
-    let frame = renderer.render(&scene.gaussians, &served(&scene, request))?;
-    let color = clamped(frame.color);
+    let view = |scene: &Scene| {
+        let request = view_request(target.camera, kinds, report.median_depth);
+        renderer.render(&scene.gaussians, &served(scene, request))
+    };
     let (truth, valid) = (to_unit(&target.photo), target.photo.valid.as_deref());
+    let frame = view(&scene)?;
+    let color = clamped(frame.color);
     let pair = triple.pair.map(|i| &squares[i]);
     let geometry = report.stages.iter().filter(|stage| stage.stage == "geometry");
     let mut row = json!({
@@ -149,17 +158,15 @@ fn judge(
         "total_ms": total_ms,
     });
     if let Some(variant) = refinement {
-        let watch = Watch { progress: &|_, _| (), cancel: &AtomicBool::new(false) };
-        let mut remake =
-            |photos: Vec<PosedPhoto>| reconstruct_for_refinement(engine, &photos, options, watch);
+        let mut remake = |photos: Vec<PosedPhoto>| {
+            Ok(variant.start(make_for_refinement(engine, &photos, options)?))
+        };
         let found =
             refined(renderer, &scene, &given, &variant.options(), &mut remake, &mut |_| Ok(()))?;
         row["refined_psnr"] = row["psnr"].clone();
         if let Some((start, version)) = &found.version {
-            let scene = version_of(start, &scene, version)?;
-            let request = view_request(target.camera, Kinds::COLOR, report.median_depth);
-            let frame = renderer.render(&scene.gaussians, &served(&scene, request))?;
-            row["refined_psnr"] = json!(psnr(&clamped(frame.color), &truth, valid));
+            let refined = view(&version_of(start, &scene, version)?)?;
+            row["refined_psnr"] = json!(psnr(&clamped(refined.color), &truth, valid));
         }
     }
     let mut pictures: grid::Row = given.iter().map(|posed| grid::photo(&posed.photo)).collect();

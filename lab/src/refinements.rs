@@ -6,8 +6,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     error::{Error, Result},
+    pipeline::Reconstruction,
     refine::{LearningRates, RefineBudget, RefineOptions},
-    scene::with_pairs,
+    scene::{Gaussians, with_pairs},
 };
 
 /// How a scene is refined: what is not named is as the product does it.
@@ -15,7 +16,7 @@ use crate::{
 #[serde(default, deny_unknown_fields)]
 pub(crate) struct Variant {
     /// Whether it begins with the Gaussians that are served in layers.
-    pub(crate) layers: bool,
+    layers: bool,
     /// So many steps, or so much time.
     steps: u32,
     ms: u64,
@@ -68,6 +69,14 @@ impl Default for Variant {
 }
 
 impl Variant {
+    /// What it begins with, of a scene and its one set of Gaussians.
+    pub(crate) fn start(
+        &self,
+        (made, one_set): (Reconstruction, Gaussians),
+    ) -> (Reconstruction, Gaussians) {
+        if self.layers { (made.clone(), made.gaussians) } else { (made, one_set) }
+    }
+
     /// The options of the product with these in their place.
     pub(crate) fn options(&self) -> RefineOptions {
         let plain = RefineOptions::default();

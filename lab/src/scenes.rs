@@ -11,10 +11,12 @@ use crate::{
     limits::Limits,
     models::{ResizeFilter, fit},
     photo_files,
-    pipeline::{Pipeline, Reconstruction, reconstruct},
+    pipeline::{Pipeline, Reconstruction, reconstruct, reconstruct_for_refinement},
     render::{Kinds, RenderRequest, plan::default_near},
     rows::means,
-    scene::{Camera, Photo, PosedPhoto, Provenance, Scene, SceneId, SceneOptions},
+    scene::{
+        Camera, Gaussians, Photo, PosedPhoto, Provenance, Scene, SceneId, SceneOptions, Watch,
+    },
 };
 
 /// Side of the square photos that are compared, pixels.
@@ -143,6 +145,16 @@ pub(crate) fn make(
     options: &SceneOptions,
 ) -> Result<Reconstruction> {
     reconstruct(engine, photos, options, &|_, _| (), &AtomicBool::new(false))
+}
+
+/// As [`make`], and the one set of Gaussians with which refinement begins.
+pub(crate) fn make_for_refinement(
+    engine: &Pipeline,
+    photos: &[PosedPhoto],
+    options: &SceneOptions,
+) -> Result<(Reconstruction, Gaussians)> {
+    let watch = Watch { progress: &|_, _| (), cancel: &AtomicBool::new(false) };
+    reconstruct_for_refinement(engine, photos, options, watch)
 }
 
 /// A scene that is not stored.

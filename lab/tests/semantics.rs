@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
-use segsplat_core::error::{ErrorCode, Result};
-use segsplat_testing::{opened, ort_library, root};
+use segsplat_core::error::Result;
+use segsplat_testing::root;
 use serde_json::{Value, json};
 
-use crate::lab;
+use crate::measured;
 
 const SIZE: [u32; 2] = [96, 64];
 const FOCAL: f64 = 90.0;
@@ -63,26 +63,6 @@ fn folder() -> tempfile::TempDir {
     write("masks/classes.json", json!({ "1": "red", "2": "green", "3": "wall" }).to_string());
     write("scene.json", json!({ "surroundings": ["wall"] }).to_string());
     dir
-}
-
-/// The rows of a command for a folder; `None` without ONNX Runtime.
-fn measured(
-    command: &str,
-    bundle: &Path,
-    folder: &Path,
-    rest: &[&str],
-) -> Option<Result<Vec<Value>>> {
-    let [folder, bundle] = [folder, bundle].map(|p| p.to_str().unwrap());
-    let mut line = vec![command, folder, "--bundle", bundle, "--threads", "2"];
-    line.extend(rest);
-    let library = ort_library();
-    if let Some(library) = &library {
-        line.extend(["--ort-library", library.to_str().unwrap()]);
-    }
-    match lab(&line) {
-        Err(e) if e.code() == ErrorCode::ModelUnavailable => opened(Err(e)),
-        rows => Some(rows),
-    }
 }
 
 /// The rows of `semantics` for a folder; `None` without ONNX Runtime.
