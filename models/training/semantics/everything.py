@@ -1,9 +1,9 @@
 """What everything-mode keeps of each labelled thing: how the settings of the mask stage were chosen.
 
-    python everything.py --pack PACK --bundle ../../embedded [--points 32] [--every 1] \
+    python everything.py --data ../../../../shared/data --bundle ../../embedded [--points 32] [--every 1] \
         "surest=0,iou=0.35,stable=0.6" "surest=1,iou=0.2,stable=0.4"
 
-Photographs: drawn_held.npz, which no training sees. Each argument is a setting; a row says the mean IoU of the best
+Photographs: the held-out ones of the labelled sets (`cuts.py`), which no training sees. Each argument is a setting; a row says the mean IoU of the best
 mask of each labelled thing after NMS and with one mask a pixel, the share over 0.5, masks and points asked a photo.
 The first row is the best of all proposals, before any filter. As `crates/vision/src/segment`, without seeds, NMS of
 boxes and the finer map.
@@ -15,7 +15,7 @@ import numpy as np
 import onnxruntime as ort
 from PIL import Image
 
-from train_real import decode
+import cuts
 
 SIDE, BATCH, LEAST, MOST = 512, 64, 0.0008, 0.95
 STRIDES = (4, 2, 1)
@@ -102,7 +102,7 @@ def best(truth, masks):
 
 def main():
     ap = argparse.ArgumentParser()
-    ap.add_argument("--pack", required=True)
+    ap.add_argument("--data", required=True)
     ap.add_argument("--bundle", required=True)
     ap.add_argument("--points", type=int, default=32, help="along a side")
     ap.add_argument("--every", type=int, default=1, help="only every so many photographs")
@@ -111,13 +111,11 @@ def main():
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
     nets = [ort.InferenceSession(os.path.join(args.bundle, n), options, providers=["CPUExecutionProvider"]) for n in ("mask_encoder.onnx", "mask_decoder.onnx")]
-    z = np.load(os.path.join(args.pack, "drawn_held.npz"))
-    photos, labels, thing = decode(z), decode(z, "mask", "mask_at", "L"), z["thing"]
     rows = {s: ([], 0, 0) for s in ["all proposals", *args.settings]}
-    used = [p for p in range(0, len(photos), args.every) if (thing[:, 0] == p).any()]
-    for p in used:
-        masks, predicted, stability, hw = decoded(nets, photos[p], args.points)
-        truth = [np.asarray(Image.fromarray((labels[p] == n).astype(np.uint8) * 255).resize(hw[::-1], Image.BOX)).ravel() > 127 for n in thing[thing[:, 0] == p, 1]]
+    photographs = [p for name in cuts.SETS for p in cuts.things(os.path.join(args.data, "images"), name, "heldout")][:: args.every]
+    for _, photo, things in photographs:
+        masks, predicted, stability, hw = decoded(nets, photo, args.points)
+        truth = [np.asarray(Image.fromarray(m.astype(np.uint8) * 255).resize(hw[::-1], Image.BOX)).ravel() > 127 for _, m in things]
         for s, (values, count, points) in rows.items():
             if s == "all proposals":
                 found, asked = masks.reshape(-1, masks.shape[2]), len(masks)
@@ -128,7 +126,7 @@ def main():
             rows[s] = (values, count + len(found), points + asked)
     for s, (values, count, points) in rows.items():
         v = np.concatenate(values)
-        print(f"{s}: mean IoU {v.mean():.3f}, over 0.5 {(v > 0.5).mean():.3f}, {len(v)} things, masks {count / len(used):.1f}, asked {points / len(used):.0f}")
+        print(f"{s}: mean IoU {v.mean():.3f}, over 0.5 {(v > 0.5).mean():.3f}, {len(v)} things, masks {count / len(photographs):.1f}, asked {points / len(photographs):.0f}")
 
 
 if __name__ == "__main__":
