@@ -113,10 +113,9 @@ impl Objects {
                 }
             };
             // A local store makes the object's folder first. One that holds others stays.
-            if let (Err(_), Some(mut folder)) = (&kept, file)
-                && folder.pop()
-            {
-                let _ = tokio::task::spawn_blocking(|| fs::remove_dir(folder)).await;
+            if let (Err(_), Some(file)) = (&kept, file) {
+                let _ =
+                    tokio::task::spawn_blocking(move || file.parent().map(fs::remove_dir)).await;
             }
             kept
         })

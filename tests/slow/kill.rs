@@ -301,7 +301,8 @@ async fn killed(folder: &Path, kills: u64, room: Room) {
     for round in 0..kills {
         let server = Arc::new(start.start());
         starts.push(server.started_in);
-        // From now on callers know them, and delete them too: a small disk would be full of them.
+        // Scenes whose answer the kill cut off: callers know and delete them from now on, else
+        // they would fill a small disk.
         for id in unacknowledged(&server, &ledger).await {
             note(&ledger, &id, |_| {});
         }

@@ -3,12 +3,13 @@
     python everything.py --data ../../../../shared/data --bundle ../../embedded [--points 32] [--every 1] \
         "surest=0,iou=0.35,stable=0.6" "surest=1,iou=0.2,stable=0.4"
 
-Photographs: the held-out ones of the labelled sets (`cuts.py`), which no training sees. Each argument is a setting; a row says the mean IoU of the best
-mask of each labelled thing after NMS and with one mask a pixel, the share over 0.5, masks and points asked a photo.
-The first row is the best of all proposals, before any filter. As `crates/vision/src/segment`, without seeds, NMS of
+Photographs: the held-out ones of the labelled sets (`cuts.py`), which no training sees. Each argument is a setting; a
+row says the mean IoU of the best mask of each labelled thing after NMS and with one mask a pixel, the share over 0.5,
+masks and points asked a photo. The first row is the best of all proposals, before any filter. As `crates/vision/src/segment`, without seeds, NMS of
 boxes and the finer map.
 """
 import argparse
+import itertools
 import os
 
 import numpy as np
@@ -112,8 +113,10 @@ def main():
     options.intra_op_num_threads = 1
     nets = [ort.InferenceSession(os.path.join(args.bundle, n), options, providers=["CPUExecutionProvider"]) for n in ("mask_encoder.onnx", "mask_decoder.onnx")]
     rows = {s: ([], 0, 0) for s in ["all proposals", *args.settings]}
-    photographs = [p for name in cuts.SETS for p in cuts.things(os.path.join(args.data, "images"), name, "heldout")][:: args.every]
-    for _, photo, things in photographs:
+    images, photographs = os.path.join(args.data, "images"), 0
+    held_out = itertools.chain.from_iterable(cuts.things(images, name, "heldout") for name in cuts.SETS)
+    for _, photo, things in itertools.islice(held_out, 0, None, args.every):
+        photographs += 1
         masks, predicted, stability, hw = decoded(nets, photo, args.points)
         truth = [np.asarray(Image.fromarray(m.astype(np.uint8) * 255).resize(hw[::-1], Image.BOX)).ravel() > 127 for _, m in things]
         for s, (values, count, points) in rows.items():
@@ -126,7 +129,7 @@ def main():
             rows[s] = (values, count + len(found), points + asked)
     for s, (values, count, points) in rows.items():
         v = np.concatenate(values)
-        print(f"{s}: mean IoU {v.mean():.3f}, over 0.5 {(v > 0.5).mean():.3f}, {len(v)} things, masks {count / len(photographs):.1f}, asked {points / len(photographs):.0f}")
+        print(f"{s}: mean IoU {v.mean():.3f}, over 0.5 {(v > 0.5).mean():.3f}, {len(v)} things, masks {count / photographs:.1f}, asked {points / photographs:.0f}")
 
 
 if __name__ == "__main__":
