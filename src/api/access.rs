@@ -5,11 +5,12 @@
 //! been sent, or `unauthenticated`, `permission_denied`, `overloaded`. No key is ever logged.
 
 use std::{
-    sync::{Arc, Mutex, PoisonError, RwLock},
+    sync::{
+        Arc, Mutex, PoisonError, RwLock,
+        atomic::{AtomicUsize, Ordering},
+    },
     time::{Duration, Instant},
 };
-
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 use super::hosts::AllowedHosts;
 use crate::{
@@ -86,7 +87,7 @@ pub(super) struct Admission {
     pub(super) caller: Caller,
     /// Name of the key, for the log.
     pub(super) key: Option<Arc<str>>,
-    _permit: Option<OwnedSemaphorePermit>,
+    _open: Option<Open>,
 }
 
 /// Hosts and keys in force.
@@ -103,27 +104,41 @@ struct InForce {
 /// How much one key may call.
 #[derive(Debug)]
 struct Quota {
-    rate: Rate,
-    permits: Arc<Semaphore>,
-    permits_max: usize,
-}
-
-/// Requests a second, a second's worth at once (GCRA: the time at which the next request is due).
-#[derive(Debug)]
-struct Rate {
+    /// The time between two requests at the rate of the key.
     interval: Duration,
-    due: Mutex<Instant>,
+    open_max: usize,
+    used: Arc<Used>,
 }
 
-impl Rate {
-    fn per_second(requests: u32) -> Self {
-        let interval = Duration::from_secs(1) / requests.max(1);
-        Self { interval, due: Mutex::new(Instant::now()) }
-    }
+/// How much one key has called: it stays when the keys are read again.
+#[derive(Debug)]
+struct Used {
+    /// When the next request is due (GCRA).
+    due: Mutex<Instant>,
+    open: AtomicUsize,
+}
 
-    /// Counts one request at the time `now`, or says how long to wait for it.
+/// An open call of a key.
+#[derive(Debug)]
+struct Open(Arc<Used>);
+
+impl Drop for Open {
+    fn drop(&mut self) {
+        self.0.open.fetch_sub(1, Ordering::AcqRel);
+    }
+}
+
+impl Default for Used {
+    fn default() -> Self {
+        Self { due: Mutex::new(Instant::now()), open: AtomicUsize::new(0) }
+    }
+}
+
+impl Quota {
+    /// Counts one request at the time `now`, or says how long to wait for it. A second's worth may
+    /// come at once.
     fn take(&self, now: Instant) -> Result<(), Duration> {
-        let mut due = self.due.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut due = self.used.due.lock().unwrap_or_else(PoisonError::into_inner);
         let next = (*due).max(now) + self.interval;
         let early = next.saturating_duration_since(now + Duration::from_secs(1));
         if early.is_zero() {
@@ -132,33 +147,48 @@ impl Rate {
         }
         Err(early)
     }
+
+    /// One open call more, where the key may have it.
+    fn open(&self) -> Option<Open> {
+        let more = |open: usize| (open < self.open_max).then_some(open + 1);
+        let opened = self.used.open.fetch_update(Ordering::AcqRel, Ordering::Acquire, more);
+        opened.ok().map(|_| Open(Arc::clone(&self.used)))
+    }
 }
 
 impl InForce {
-    fn load(config: &Config) -> Result<Self> {
+    /// Reads the keys. Those that were in force `before` have used what they had used.
+    fn load(config: &Config, before: Option<&Self>) -> Result<Self> {
         let hosts = AllowedHosts::new(config);
         let Some(path) = &config.keys else { return Ok(Self { hosts, keys: None }) };
         let keys = Keys::load(path)?;
         let quotas = keys.iter().map(|key| {
             let per_s = key.requests_per_s.unwrap_or(config.limits.key_requests_per_s);
-            let permits_max = key.inflight_max.unwrap_or(config.limits.key_inflight_max);
-            let permits = Arc::new(Semaphore::new(permits_max));
-            Quota { rate: Rate::per_second(per_s), permits, permits_max }
+            let open_max = key.inflight_max.unwrap_or(config.limits.key_inflight_max);
+            let used = before.and_then(|before| before.used(&key.name)).unwrap_or_default();
+            Quota { interval: Duration::from_secs(1) / per_s.max(1), open_max, used }
         });
         let quotas = quotas.collect();
         Ok(Self { hosts, keys: Some((keys, quotas)) })
+    }
+
+    /// What the key of this name has used.
+    fn used(&self, name: &str) -> Option<Arc<Used>> {
+        let (keys, quotas) = self.keys.as_ref()?;
+        let known = keys.iter().zip(quotas).find(|(key, _)| &*key.name == name);
+        known.map(|(_, quota)| Arc::clone(&quota.used))
     }
 }
 
 impl Access {
     /// Reads the keys of the file that the configuration names.
     pub(super) fn new(config: &Config) -> Result<Self> {
-        Ok(Self(RwLock::new(Arc::new(InForce::load(config)?))))
+        Ok(Self(RwLock::new(Arc::new(InForce::load(config, None)?))))
     }
 
     /// Reads the file again and returns the number of keys. On an error the old keys stay.
     pub(super) fn reload(&self, config: &Config) -> Result<usize> {
-        let new = InForce::load(config)?;
+        let new = InForce::load(config, Some(&self.in_force()))?;
         let count = new.keys.as_ref().map_or(0, |(_, quotas)| quotas.len());
         *self.0.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(new);
         Ok(count)
@@ -178,7 +208,7 @@ impl Access {
     pub(super) fn admit(&self, shown: Option<&str>, scope: Scope) -> Result<Admission> {
         let in_force = self.in_force();
         let Some((keys, quotas)) = &in_force.keys else {
-            return Ok(Admission { caller: Caller::All, key: None, _permit: None });
+            return Ok(Admission { caller: Caller::All, key: None, _open: None });
         };
         let refused = |why: &str| Error::new(ErrorCode::Unauthenticated, why);
         let shown = shown.ok_or_else(|| refused("no key; send authorization: Bearer KEY"))?;
@@ -199,15 +229,15 @@ impl Access {
             let message = format!("key {:?} {why}", key.name);
             Error::new(ErrorCode::Overloaded, message).retry_after_s(seconds)
         };
-        quota.rate.take(Instant::now()).map_err(|wait| {
+        quota.take(Instant::now()).map_err(|wait| {
             let seconds = u32::try_from(wait.as_secs()).unwrap_or(u32::MAX).saturating_add(1);
             overloaded("has used up its requests a second".to_owned(), seconds)
         })?;
-        let permit = Arc::clone(&quota.permits).try_acquire_owned();
-        let permit = permit
-            .map_err(|_| overloaded(format!("has {} calls open already", quota.permits_max), 1))?;
+        let open = quota
+            .open()
+            .ok_or_else(|| overloaded(format!("has {} calls open already", quota.open_max), 1))?;
         let (caller, name) = (key.caller(), Arc::clone(&key.name));
-        Ok(Admission { caller, key: Some(name), _permit: Some(permit) })
+        Ok(Admission { caller, key: Some(name), _open: Some(open) })
     }
 
     fn in_force(&self) -> Arc<InForce> {
@@ -237,5 +267,33 @@ mod tests {
         let fourth = access.admit(shown, Scope::Read).unwrap_err();
         assert_eq!((fourth.code(), fourth.retry_after()), (ErrorCode::Overloaded, Some(1)));
         assert!(fourth.message().contains("requests a second"), "{fourth}");
+    }
+
+    #[test]
+    fn keys_that_are_read_again_have_used_what_they_had_used() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("keys.toml");
+        let write = |rest: &str| {
+            let entry = |name: &str| {
+                let sha256 = hash(name);
+                format!("[[key]]\nname = \"{name}\"\nsha256 = \"{sha256}\"\n{rest}\n")
+            };
+            let of = |name| entry(name) + "scopes = [\"read\"]\n";
+            std::fs::write(&path, of("a") + &of("b")).unwrap();
+        };
+        write("inflight_max = 1");
+        let config = Config { keys: Some(path.clone()), ..Config::default() };
+        let access = Access::new(&config).unwrap();
+        let admit = |name: &str| access.admit(Some(&format!("Bearer {name}")), Scope::Read);
+        let open = admit("a").unwrap();
+        access.reload(&config).unwrap();
+        assert!(admit("a").unwrap_err().message().contains("1 calls open"));
+        assert!(admit("b").is_ok(), "another key");
+        write("inflight_max = 2");
+        access.reload(&config).unwrap();
+        let second = admit("a").unwrap();
+        assert!(admit("a").is_err(), "the call from before counts");
+        drop((open, second));
+        assert!(admit("a").is_ok());
     }
 }

@@ -3,7 +3,7 @@
 use std::{
     sync::{
         Arc,
-        atomic::{AtomicBool, Ordering},
+        atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     time::Duration,
 };
@@ -27,6 +27,7 @@ struct State {
     open_calls: watch::Sender<usize>,
     stopping: watch::Sender<bool>,
     refusing: AtomicBool,
+    refused: AtomicUsize,
 }
 
 /// One call, until the last byte of its answer is sent.
@@ -48,10 +49,16 @@ impl Drain {
         meter::inflight(1.0);
         let call = OpenCall(self.clone());
         if self.0.refusing.load(Ordering::Acquire) {
+            self.0.refused.fetch_add(1, Ordering::Relaxed);
             return Err(Error::new(ErrorCode::Stopping, "the server is stopping; call again")
                 .retry_after_s(RETRY_AFTER_S));
         }
         Ok(call)
+    }
+
+    /// Calls that were refused.
+    pub(super) fn refused(&self) -> usize {
+        self.0.refused.load(Ordering::Relaxed)
     }
 
     pub(super) fn open_calls(&self) -> usize {

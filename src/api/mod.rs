@@ -13,12 +13,12 @@ mod inference;
 mod request_id;
 mod upload;
 
-use std::{error::Error as _, sync::Arc};
+use std::{any::Any, error::Error as _, sync::Arc};
 
 use self::{access::Access, drain::Drain, upload::UploadBudget};
 use crate::{
     config::Config,
-    error::{Error, Result},
+    error::{Error, ErrorCode, Result},
     keys::Caller,
     service::Service,
 };
@@ -72,8 +72,21 @@ impl Api {
     }
 }
 
-/// Logs an error with its causes: callers' faults at `info`, ours at `error`. `ms`: time of the
-/// call.
+/// What an answer holds until its last byte is sent. Handlers of both transports put it beside
+/// their answers.
+#[derive(Clone)]
+struct Held {
+    _what: Arc<dyn Any + Send + Sync>,
+}
+
+impl Held {
+    fn new(what: Arc<impl Send + Sync + 'static>) -> Self {
+        Self { _what: what }
+    }
+}
+
+/// Logs an error with its causes: callers' faults at `info`, ours at `error`, and what a server
+/// that stops refuses, which may be thousands, at `debug`. `ms`: time of the call.
 fn log_error(error: &Error, ms: Option<f64>) {
     let code = error.code().name();
     let mut message = error.message().to_owned();
@@ -83,7 +96,9 @@ fn log_error(error: &Error, ms: Option<f64>) {
         message.push_str(&cause.to_string());
         source = cause.source();
     }
-    if error.code().row().http >= 500 {
+    if error.code() == ErrorCode::Stopping {
+        tracing::debug!(code, ms, "{message}");
+    } else if error.code().row().http >= 500 {
         tracing::error!(code, ms, "{message}");
     } else {
         tracing::info!(code, ms, "{message}");

@@ -95,7 +95,8 @@ impl Service {
         if keyed { Ok(()) } else { self.inner.jobs.has_room(self.caller.owner()) }
     }
 
-    /// Waits until nothing more will happen to the scene, at most `limits.wait_ms_max`.
+    /// Waits until nothing more will happen to the scene, at most `limits.wait_ms_max`, and not
+    /// where the server stops.
     ///
     /// # Errors
     /// `scene_not_found`.
@@ -105,7 +106,10 @@ impl Service {
         let at_most = at_most.min(Duration::from_millis(self.limits().wait_ms_max));
         let end = watcher.wait_for(|record| record.status.is_settled());
         // Late or deleted: either way the present state is the answer.
-        let _ = tokio::time::timeout(at_most, end).await;
+        tokio::select! {
+            _ = tokio::time::timeout(at_most, end) => {}
+            () = self.inner.stopped_waiting() => {}
+        }
         let status = watcher.borrow().status.clone();
         Ok(self.shown(status))
     }

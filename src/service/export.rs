@@ -1,18 +1,28 @@
 //! A scene as a file for other programs, written part by part while it is sent.
+//!
+//! An [`Export`] knows its tag before anything is made. [`Export::begin`] takes a place among the
+//! exports, which is to be held until the file is sent. While a file is written it has a blocking
+//! thread, which waits for the caller: there are no more of them than places.
 
 use std::{
+    fmt,
     io::{self, Write},
     sync::Arc,
-    time::Instant,
+    time::{Duration, Instant},
 };
 
-use tokio::{runtime::Handle, sync::mpsc};
+use futures_util::Stream;
+use tokio::{
+    runtime::Handle,
+    sync::{OwnedSemaphorePermit, mpsc},
+};
 
 use super::{
-    Service,
+    Inner, Service,
     create::blocking,
     features,
     folder::FolderFormat,
+    memory::Share,
     packed::write_packed,
     page::write_page,
     query,
@@ -21,7 +31,6 @@ use super::{
     semantics::meaning_tag,
     texts,
     times::ViewTimes,
-    types::Export,
     view::{hash, text_words},
 };
 use crate::{
@@ -34,6 +43,106 @@ use crate::{
 const PARTS_MAX: usize = 4;
 /// Bytes of a part of a file of arrays.
 const PART_BYTES: usize = 256 << 10;
+
+/// Writes a file. Blocks.
+pub(super) type FileWriter = Box<dyn FnOnce(&mut dyn Write) -> Result<()> + Send>;
+/// Makes what a file is written of: its size, where it is known before the end. Blocks.
+type Build = Box<dyn FnOnce() -> Result<(Option<u64>, FileWriter)> + Send>;
+
+/// A file that can be written.
+pub struct Export {
+    /// Proposed file name.
+    pub file_name: String,
+    /// Media type.
+    pub media_type: &'static str,
+    /// Hash of scene and format.
+    pub etag: String,
+    /// Bytes in memory while it is written, beside the scene.
+    work_bytes: u64,
+    /// How long the caller may take, where that is bounded.
+    longest: Option<Duration>,
+    /// The place of a folder.
+    folder: Option<OwnedSemaphorePermit>,
+    build: Build,
+    inner: Arc<Inner>,
+}
+
+impl fmt::Debug for Export {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { file_name, etag, .. } = self;
+        write!(f, "Export({file_name}, {etag})")
+    }
+}
+
+impl Export {
+    /// A file of octets.
+    pub(super) fn new(
+        inner: &Arc<Inner>,
+        file_name: String,
+        etag: String,
+        write: impl FnOnce(&mut dyn Write) -> Result<()> + Send + 'static,
+    ) -> Self {
+        Self {
+            file_name,
+            media_type: "application/octet-stream",
+            etag,
+            work_bytes: 0,
+            longest: None,
+            folder: None,
+            build: Box::new(|| Ok((None, Box::new(write)))),
+            inner: Arc::clone(inner),
+        }
+    }
+
+    /// A zip of a folder, which the caller must take in a time.
+    pub(super) fn of_folder(self, place: OwnedSemaphorePermit, longest: Duration) -> Self {
+        let media_type = "application/zip";
+        Self { media_type, folder: Some(place), longest: Some(longest), ..self }
+    }
+
+    /// The same, which takes so many bytes in memory while it is written.
+    pub(super) fn working_in(self, work_bytes: u64) -> Self {
+        Self { work_bytes, ..self }
+    }
+
+    /// Begins to write the file.
+    ///
+    /// # Errors
+    /// `overloaded` where too many exports are being sent; `invalid_request` and `limit_exceeded`
+    /// for a scene that the format cannot hold.
+    pub async fn begin(self) -> Result<ExportBody> {
+        let Self { work_bytes, longest, folder, build, inner, .. } = self;
+        let shares = inner.memory.export(work_bytes, &inner.limits())?;
+        let place = Arc::new(ExportPlace { _shares: shares, _folder: folder });
+        let (size_bytes, write) = blocking(build).await??;
+        let until = longest.map(|longest| Instant::now() + longest);
+        Ok(ExportBody { size_bytes, place, chunks: stream_until(until, write) })
+    }
+}
+
+/// The place of a file among the exports.
+#[derive(Debug)]
+pub struct ExportPlace {
+    _shares: [Share; 2],
+    _folder: Option<OwnedSemaphorePermit>,
+}
+
+/// A file that is being written.
+#[derive(Debug)]
+pub struct ExportBody {
+    /// Whole size, where it is known before the end.
+    pub size_bytes: Option<u64>,
+    /// Its place, to be held until the last part is sent.
+    pub place: Arc<ExportPlace>,
+    chunks: mpsc::Receiver<io::Result<Vec<u8>>>,
+}
+
+impl ExportBody {
+    /// The parts as a stream; a fault ends it.
+    pub fn into_stream(self) -> impl Stream<Item = io::Result<Vec<u8>>> + Send + 'static {
+        tokio_stream::wrappers::ReceiverStream::new(self.chunks)
+    }
+}
 
 impl Service {
     /// The scene, or what a text selects of it, as a file for other programs; as `npz` its
@@ -66,8 +175,7 @@ impl Service {
             let etag = format!("{}-npz", hash(understood.subject().tag));
             let write =
                 move |to: &mut dyn Write| features::write_semantics(understood.subject(), to);
-            let file_name = format!("{id}.npz");
-            return Ok(Export::new(file_name, etag, stream(write)));
+            return Ok(Export::new(&self.inner, format!("{id}.npz"), etag, write));
         }
         if format == ExportFormat::Html {
             return self.page(id, preset, ask).await;
@@ -81,15 +189,18 @@ impl Service {
             let digest = hash(&meaning_tag(&scene));
             if format == ExportFormat::Packed {
                 let (file_name, etag) = (format!("{id}.segsplat"), format!("{digest}-packed"));
-                let chunks = stream(move |to: &mut dyn Write| write_packed(&scene, to));
-                return Ok(Export::new(file_name, etag, chunks));
+                let work_bytes = order_bytes(&scene.gaussians);
+                let write = move |to: &mut dyn Write| write_packed(&scene, to);
+                let export = Export::new(&self.inner, file_name, etag, write);
+                return Ok(export.working_in(work_bytes));
             }
             let splats = splats(format)?;
-            let write = move || {
+            let work_bytes = work_bytes(splats, &scene.gaussians);
+            let build = move || {
                 let semantics = scene.semantics.as_deref();
                 SplatFile::of_scene(splats, &scene, &scene.gaussians, semantics)
             };
-            return Ok(gaussians(&id.to_string(), &digest, blocking(write).await??));
+            return Ok(self.gaussians(&id.to_string(), &digest, splats, work_bytes, build));
         };
         inner.can_understand("text")?;
         let text = texts::checked(text, "text", &self.limits())?;
@@ -98,13 +209,35 @@ impl Service {
         let named = preset.unwrap_or(of.scene.meta.report.method.preset);
         let etag = hash(&text_words(of.tag, Some(&text), (named, &ask.scoring))?);
         let (scoring, splats) = (ask.scoring.clone(), splats(format)?);
-        let file = blocking(move || {
+        let work_bytes = work_bytes(splats, &of.scene.gaussians);
+        let build = move || {
             let of = understood.subject();
             let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &[text])?;
             part(splats, of.scene, &texts.gaussians(), of.semantics)
-        })
-        .await??;
-        Ok(gaussians(&format!("{id}-part"), &etag, file))
+        };
+        Ok(self.gaussians(&format!("{id}-part"), &etag, splats, work_bytes, build))
+    }
+
+    /// A file with Gaussians; `stem` is its name without the ending.
+    fn gaussians(
+        &self,
+        stem: &str,
+        digest: &str,
+        format: &'static SplatFormat,
+        work_bytes: u64,
+        build: impl FnOnce() -> Result<SplatFile> + Send + 'static,
+    ) -> Export {
+        let &SplatFormat { name, ending, media_type, .. } = format;
+        let unwritten = |cause| Error::internal("the file is not whole").caused_by(cause);
+        let build: Build = Box::new(move || {
+            let file = build()?;
+            let size_bytes = file.size_bytes();
+            let write = move |to: &mut dyn Write| file.write(to).map_err(unwritten);
+            Ok((size_bytes, Box::new(write)))
+        });
+        let (file_name, etag) = (format!("{stem}.{ending}"), format!("{digest}-{name}"));
+        let octets = Export::new(&self.inner, file_name, etag, |_| Ok(()));
+        Export { media_type, work_bytes, build, ..octets }
     }
 }
 
@@ -124,35 +257,39 @@ impl Service {
         let file_name = format!("{id}.html");
         if lines.is_empty() {
             let scene = blocking(move || inner.load(&access)).await??;
-            let etag = tag(&scene);
-            let chunks = stream(move |to: &mut dyn Write| write_page(&scene, None, to));
-            return Ok(Export::new(file_name, etag, chunks));
+            let (etag, work_bytes) = (tag(&scene), order_bytes(&scene.gaussians));
+            let write = move |to: &mut dyn Write| write_page(&scene, None, to);
+            let export = Export::new(&self.inner, file_name, etag, write);
+            return Ok(export.working_in(work_bytes));
         }
         inner.can_understand("text")?;
         let texts = texts::all_checked(&lines, "text", &limits)?;
         let understood = inner.understood(&access, "text", ask.wait).await?;
         let (scoring, etag) = (ask.scoring.clone(), tag(understood.subject().scene));
-        let chunks = stream(move |to: &mut dyn Write| {
+        let work_bytes = order_bytes(&understood.scene.gaussians);
+        let write = move |to: &mut dyn Write| {
             let of = understood.subject();
             let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &texts)?;
             let spec = QuerySpec::default();
             let times = ViewTimes::default();
             let answer = query::answer(&texts, &limits, &spec, None, times, || ())?;
             write_page(of.scene, Some(&answer), to)
-        });
-        Ok(Export::new(file_name, etag, chunks))
+        };
+        Ok(Export::new(&self.inner, file_name, etag, write).working_in(work_bytes))
     }
 }
 
-impl Export {
-    /// A file of octets whose size is known when it is written.
-    pub(super) fn new(
-        file_name: String,
-        etag: String,
-        chunks: mpsc::Receiver<io::Result<Vec<u8>>>,
-    ) -> Self {
-        Self { file_name, media_type: "application/octet-stream", size_bytes: None, etag, chunks }
-    }
+/// Bytes of an order of all Gaussians.
+fn order_bytes(gaussians: &Gaussians) -> u64 {
+    size_of::<usize>() as u64 * gaussians.len() as u64
+}
+
+/// Bytes that a file of these Gaussians takes in memory while it is written, at most: a copy of
+/// them, wider ones, and what the format makes of them.
+fn work_bytes(format: &SplatFormat, gaussians: &Gaussians) -> u64 {
+    // SOG: five pictures, the tables of their values, an order.
+    let of_one = if format.name == "sog" { 80 } else { 16 };
+    Gaussians::bytes_of(gaussians.len(), gaussians.sh_degree()) + of_one * gaussians.len() as u64
 }
 
 /// The format of files with Gaussians.
@@ -172,25 +309,9 @@ fn part(
     SplatFile::of_scene(splats, scene, gaussians, Some(&semantics))
 }
 
-/// A file with Gaussians; `stem` is its name without the ending.
-fn gaussians(stem: &str, digest: &str, file: SplatFile) -> Export {
-    let &SplatFormat { name, ending, media_type, .. } = file.format();
-    let size_bytes = file.size_bytes();
-    let unwritten = |cause| Error::internal("the file is not whole").caused_by(cause);
-    let chunks = stream(move |to: &mut dyn Write| file.write(to).map_err(unwritten));
-    let (file_name, etag) = (format!("{stem}.{ending}"), format!("{digest}-{name}"));
-    Export { media_type, size_bytes, ..Export::new(file_name, etag, chunks) }
-}
-
-/// The parts of a file that `write` writes on a blocking thread. A fault ends them.
-pub(super) fn stream(
-    write: impl FnOnce(&mut dyn Write) -> Result<()> + Send + 'static,
-) -> mpsc::Receiver<io::Result<Vec<u8>>> {
-    stream_until(None, write)
-}
-
-/// As [`stream`]; a caller who has not taken a part at a given time gets no more.
-pub(super) fn stream_until(
+/// The parts of a file that `write` writes on a blocking thread. A fault ends them. A caller who has
+/// not taken a part at a given time gets no more.
+fn stream_until(
     until: Option<Instant>,
     write: impl FnOnce(&mut dyn Write) -> Result<()> + Send + 'static,
 ) -> mpsc::Receiver<io::Result<Vec<u8>>> {
@@ -250,7 +371,7 @@ mod tests {
     async fn what_is_written_at_once_comes_in_parts() {
         let sent: Vec<u8> = (0..3 * PART_BYTES + 9).map(|i| (i % 251) as u8).collect();
         let written = sent.clone();
-        let mut chunks = stream(move |to: &mut dyn Write| {
+        let mut chunks = stream_until(None, move |to: &mut dyn Write| {
             to.write_all(&written).map_err(|e| Error::internal("broken off").caused_by(e))
         });
         let mut taken = Vec::new();

@@ -12,11 +12,10 @@ use rayon::prelude::*;
 
 use super::{
     Service,
-    export::stream,
+    export::Export,
     npz::NpzWriter,
     request::{FeatureKind, FeaturesSpec, Kind, PictureOptions},
     search::{LabelledView, SceneTexts, Subject, check_scoring},
-    types::Export,
     view::{Inputs, Resolved, hash, resolve_one, words},
 };
 use crate::{
@@ -157,7 +156,7 @@ impl Service {
         let renderer = inner.backend.renderer.name();
         let tag = view.labels_key(understood.subject().tag, &renderer)?;
         let etag = hash(&words(&(tag, spec.kind, spec.options.preset, &spec.scoring))?);
-        let write = inner
+        let (write, work_bytes) = inner
             .scheduled(deadline, pixels, "the features", move |slot| {
                 let how = (spec.options.preset, &spec.scoring);
                 let texts = SceneTexts::new(&shared.backend, understood.subject(), how, &[])?;
@@ -165,14 +164,17 @@ impl Service {
                 slot.drawn();
                 check_size(&texts, &weights, spec.kind, &limits)?;
                 drop(texts);
-                Ok(move |to: &mut dyn Write| -> Result<()> {
+                let (offsets, entries) = (&weights.weights.offsets, &weights.weights.entries);
+                let work_bytes = 4 * offsets.len() as u64 + 6 * entries.len() as u64;
+                let write = move |to: &mut dyn Write| -> Result<()> {
                     let how = (spec.options.preset, &spec.scoring);
                     let texts = SceneTexts::new(&shared.backend, understood.subject(), how, &[])?;
                     write(&texts, &weights, spec.kind, to)
-                })
+                };
+                Ok((write, work_bytes))
             })
             .await?;
         let file_name = format!("{id}-view.npz");
-        Ok(Export::new(file_name, etag, stream(write)))
+        Ok(Export::new(inner, file_name, etag, write).working_in(work_bytes))
     }
 }

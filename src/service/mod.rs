@@ -32,10 +32,12 @@ use std::{fmt, sync::Arc};
 
 use futures_util::{Stream, stream};
 use parking_lot::RwLock;
-use tokio::sync::Semaphore;
+use tokio::sync::{Semaphore, watch};
 
+pub use self::export::{Export, ExportBody, ExportPlace};
 pub use self::folder::{FOLDER_FORMATS, FolderFormat};
 pub use self::infer::InferSpec;
+pub use self::memory::Share;
 pub use self::page::{VIEWER, ViewerPage};
 pub(crate) use self::refine::check_refine;
 use self::{memory::Memory, schedule::Scheduler, search::Backend};
@@ -49,7 +51,7 @@ pub use self::{
     rle::Rle,
     times::ViewTimes,
     types::{
-        Created, Export, InstanceBox, KnownWord, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
+        Created, InstanceBox, KnownWord, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
         QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning, Trust,
     },
 };
@@ -60,7 +62,7 @@ pub use crate::scene::{
 };
 use crate::{
     config::Config,
-    error::{Error, Result},
+    error::{Error, ErrorCode, Result},
     jobs::{JobParts, Jobs, NetworkState, SceneNetworks, SemanticNetworks, refiner},
     keys::Caller,
     limits::Limits,
@@ -119,6 +121,8 @@ struct Inner {
     inferences: Arc<Semaphore>,
     key_locks: [tokio::sync::Mutex<()>; create::KEY_LOCKS],
     memory: Memory,
+    /// Whether callers who wait for what is being made are answered at once.
+    stopping: watch::Sender<bool>,
 }
 
 impl fmt::Debug for Inner {
@@ -130,6 +134,12 @@ impl fmt::Debug for Inner {
 impl Inner {
     fn limits(&self) -> Arc<Limits> {
         Arc::clone(&self.limits.read())
+    }
+
+    /// Resolves when nobody waits any more for what is being made.
+    async fn stopped_waiting(&self) {
+        // The sender lives as long as `self`.
+        let _ = self.stopping.subscribe().wait_for(|&stopping| stopping).await;
     }
 }
 
@@ -189,6 +199,7 @@ impl Service {
             inferences: Arc::new(Semaphore::new(config.limits.inferences_max)),
             key_locks: Default::default(),
             memory: Memory::new(config.limits.memory_bytes_max),
+            stopping: watch::Sender::default(),
             limits: RwLock::new(Arc::new(config.limits.clone())),
             config,
         };
@@ -265,7 +276,7 @@ impl Service {
         create::blocking(move || inner.jobs.delete(&gone)).await?
     }
 
-    /// What happens to a scene, from its present state to the last event.
+    /// What happens to a scene, from its present state to the last event, or until the server stops.
     ///
     /// # Errors
     /// `scene_not_found`.
@@ -276,8 +287,11 @@ impl Service {
         Ok(stream::unfold(first, async |state| {
             let (service, mut watcher, before) = state?;
             loop {
-                if before.is_some() && watcher.changed().await.is_err() {
-                    return None;
+                if before.is_some() {
+                    tokio::select! {
+                        changed = watcher.changed() => changed.ok()?,
+                        () = service.inner.stopped_waiting() => return None,
+                    }
                 }
                 let status = watcher.borrow_and_update().status.clone();
                 let event = match service.event(&status) {
@@ -297,6 +311,12 @@ impl Service {
                 return Some((event, next));
             }
         }))
+    }
+
+    /// From now on nobody waits for what is being made: calls that do are answered with what there
+    /// is.
+    pub fn stop_waiting(&self) {
+        self.inner.stopping.send_replace(true);
     }
 
     fn event(&self, status: &SceneStatus) -> Event {
@@ -319,7 +339,7 @@ impl Service {
             SceneState::Done => Event::Done,
             SceneState::Cancelled => Event::Cancelled,
             SceneState::Failed => Event::Failed(status.error.clone().unwrap_or(SceneError {
-                code: crate::error::ErrorCode::Internal.name().to_owned(),
+                code: ErrorCode::Internal.name().to_owned(),
                 message: "the reason was not kept".to_owned(),
             })),
         }

@@ -1,12 +1,13 @@
 //! What the use cases answer: plain data. The requests are in `request.rs`.
 
-use std::{fmt, io};
+use std::{fmt, sync::Arc};
 
 use base64::{Engine as _, prelude::BASE64_STANDARD};
 use serde::{Deserialize, Serialize, Serializer};
 use utoipa::ToSchema;
 
 use super::{
+    memory::Share,
     request::{Format, Kind},
     rle::Rle,
     times::ViewTimes,
@@ -198,6 +199,8 @@ pub struct RenderedView {
     pub stats: FrameStats,
     /// Where the time went.
     pub times: ViewTimes,
+    /// Its bytes in the budget of answers, until they are sent; `None` on the command line.
+    pub held: Option<Arc<Share>>,
 }
 
 impl RenderedView {
@@ -217,29 +220,6 @@ impl fmt::Debug for RenderedView {
         let Self { camera_index, kind, format, width, height, bytes, .. } = self;
         write!(f, "RenderedView(camera {camera_index}, {kind:?} as {format:?}, ")?;
         write!(f, "{width}x{height}, {} bytes)", bytes.len())
-    }
-}
-
-/// A file being written.
-#[derive(Debug)]
-pub struct Export {
-    /// Proposed file name.
-    pub file_name: String,
-    /// Media type.
-    pub media_type: &'static str,
-    /// Whole size, where it is known before the end.
-    pub size_bytes: Option<u64>,
-    /// Hash of scene and format.
-    pub etag: String,
-    pub(super) chunks: tokio::sync::mpsc::Receiver<io::Result<Vec<u8>>>,
-}
-
-impl Export {
-    /// The parts as a stream; a fault ends it.
-    pub fn into_stream(
-        self,
-    ) -> impl futures_util::Stream<Item = io::Result<Vec<u8>>> + Send + 'static {
-        tokio_stream::wrappers::ReceiverStream::new(self.chunks)
     }
 }
 

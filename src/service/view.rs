@@ -1,11 +1,12 @@
 //! Views: request to camera to frame to file, one render a camera, bounded in time and number.
 
 use std::{
+    pin::pin,
     sync::Arc,
     time::{Duration, Instant},
 };
 
-use futures_util::{Stream, StreamExt, stream};
+use futures_util::{Stream, StreamExt, TryFutureExt, TryStreamExt, stream};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
@@ -17,6 +18,7 @@ use super::{
     camera,
     create::blocking,
     encode::{self, Layer},
+    memory::Share,
     request::{
         BackgroundSpec, CameraSpec, Format, Kind, PictureOptions, ScoringOptions, TextOptions,
         ViewOptions, ViewSpec, ViewsSpec,
@@ -75,6 +77,12 @@ impl Resolved {
     pub(super) fn pixels(&self) -> u64 {
         let Intrinsics { width, height, .. } = self.seen().intrinsics;
         u64::from(width) * u64::from(height)
+    }
+
+    /// Most bytes that its pictures have as files.
+    fn bytes_max(&self) -> u64 {
+        let of_pixel = if self.picture.format == Format::Npy { 12 } else { 4 };
+        self.pixels() * of_pixel * self.kinds.len() as u64
     }
 
     /// Tells the labels of this view from those of all others. They do not depend on the
@@ -214,6 +222,7 @@ impl Resolved {
                 etag: self.etag(scene_tag, &name, kind, &texts)?,
                 stats: frame.stats,
                 times,
+                held: None,
             })
         };
         self.kinds.iter().map(view).collect()
@@ -423,17 +432,19 @@ impl Inner {
         texts::check_ask(kinds, ask, &self.limits())
     }
 
-    /// Renders on a blocking thread within the deadline; encodes each kind.
+    /// Renders on a blocking thread within the deadline; encodes each kind. `held` are the bytes of
+    /// the pictures; where there are none they are taken when the view is drawn.
     async fn render_one(
         self: &Arc<Self>,
         scene: SceneAccess,
         view: Resolved,
         texts: Option<Asked>,
+        held: Option<Share>,
         deadline: Instant,
     ) -> Result<Vec<RenderedView>> {
         let inner = Arc::clone(self);
-        let pixels = view.pixels();
-        let work = move |slot: &mut Slot| {
+        let (pixels, bytes_max) = (view.pixels(), view.bytes_max());
+        let draw = move |slot: &mut Slot| {
             let backend = &inner.backend;
             let mut times = ViewTimes { queue_ms: slot.queue_ms, ..ViewTimes::default() };
             let drawn = || slot.drawn();
@@ -451,6 +462,11 @@ impl Inner {
             (times.load_ms, times.score_ms) = (understood.load_ms, Some(embed_ms + ms));
             let tag = scene_tag(subject.scene);
             view.draw(backend, subject.scene, &tag, Some(&texts?), times, drawn)
+        };
+        let inner = Arc::clone(self);
+        let work = move |slot: &mut Slot| {
+            let held = held.map_or_else(|| inner.answer_bytes(bytes_max), Ok)?;
+            Ok(holding(draw(slot)?, held))
         };
         self.scheduled(deadline, pixels, "the view", work).await
     }
@@ -521,6 +537,14 @@ impl Inner {
     }
 }
 
+/// Pictures that hold their bytes until all of them are dropped.
+fn holding(mut views: Vec<RenderedView>, mut held: Share) -> Vec<RenderedView> {
+    held.shrink(views.iter().map(|view| view.bytes.len() as u64).sum());
+    let held = Arc::new(held);
+    views.iter_mut().for_each(|view| view.held = Some(Arc::clone(&held)));
+    views
+}
+
 /// What `work` gives within the deadline; `what` names it in the error.
 async fn in_time<T>(
     deadline: Instant,
@@ -586,7 +610,7 @@ impl Service {
         let understood = inner.understood_for(&scene, &[spec.kind], &ask).await?;
         let deadline = inner.deadline(&spec.options);
         let texts = inner.asked(understood, ask, spec.options.preset, deadline).await?;
-        let mut views = inner.render_one(scene, view, texts, deadline).await?;
+        let mut views = inner.render_one(scene, view, texts, None, deadline).await?;
         views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
     }
 
@@ -647,17 +671,29 @@ impl Service {
             let views = async {
                 let understood = inner.understood_for(&scene, &kinds, &ask).await?;
                 let texts = inner.asked(understood, ask, preset, last).await?;
+                // Bytes are taken in the order in which the pictures are sent, so that none waits
+                // for a later one.
+                let held = |one: Resolved| {
+                    let inner = Arc::clone(&inner);
+                    async move {
+                        let held = inner.answer_bytes_by(one.bytes_max(), last.into()).await?;
+                        Ok::<_, Error>((one, held))
+                    }
+                };
                 // Each on a task of its own: a slot must not wait for a slow reader.
-                let render = |one: Resolved| {
+                let render = |(one, held): (Resolved, Share)| {
                     let deadline = last.min(inner.deadline(&ViewOptions::default()));
                     let (inner, scene, texts) = (Arc::clone(&inner), scene.clone(), texts.clone());
-                    let views = async move { inner.render_one(scene, one, texts, deadline).await };
+                    let views = async move {
+                        inner.render_one(scene, one, texts, Some(held), deadline).await
+                    };
                     tokio::spawn(views.in_current_span())
+                        .map_err(|e| Error::internal("a view was broken off").caused_by(e))
                 };
-                let mut rendered = stream::iter(all).map(render).buffered(at_once);
-                while let Some(views) = rendered.next().await {
-                    let lost = |e| Error::internal("a view was broken off").caused_by(e);
-                    for view in views.map_err(lost)?? {
+                let rendered = stream::iter(all).then(held).map_ok(render);
+                let mut rendered = pin!(rendered.try_buffered(at_once));
+                while let Some(views) = rendered.try_next().await? {
+                    for view in views? {
                         // The caller stopped listening and wants no more.
                         if to.send(Ok(view)).await.is_err() {
                             return Ok(());

@@ -154,7 +154,10 @@ async fn accept_chooses_the_encoding_and_a_known_tag_saves_the_picture() {
     };
     let again = ask(tag.clone()).send().await.unwrap();
     assert_eq!(again.status(), StatusCode::NOT_MODIFIED);
-    assert_eq!(again.headers()[header::ETAG], tag);
+    for name in [header::ETAG, header::VARY, header::CACHE_CONTROL] {
+        assert_eq!(again.headers()[&name], first.headers()[&name], "{name}");
+    }
+    assert_eq!(again.headers()[header::VARY], "accept");
     assert!(again.bytes().await.unwrap().is_empty(), "304 with a body");
     let other = client.get(&url).header("if-none-match", tag.clone()).send().await.unwrap();
     assert_eq!(other.status(), StatusCode::OK, "PNG under the tag of a WebP");
@@ -168,7 +171,8 @@ async fn accept_chooses_the_encoding_and_a_known_tag_saves_the_picture() {
     }
     for (accept, kind, want) in [
         ("image/jpeg", "color", Some("image/jpeg")),
-        ("image/png;q=0.5, image/webp", "color", Some("image/webp")),
+        ("IMAGE/JPEG", "color", Some("image/jpeg")),
+        ("image/png;Q=0.5, image/webp", "color", Some("image/webp")),
         ("image/avif,image/webp,*/*;q=0.8", "depth", Some("image/png")),
         ("application/x-npy", "depth", Some("application/x-npy")),
         ("text/html", "color", None),
@@ -178,7 +182,10 @@ async fn accept_chooses_the_encoding_and_a_known_tag_saves_the_picture() {
         let answer = request.send().await.unwrap();
         match want {
             Some(want) => assert_eq!(answer.headers()[header::CONTENT_TYPE], want, "{accept}"),
-            None => assert_eq!(bytes(answer).await.unwrap_err().code, "invalid_request"),
+            None => {
+                let fault = bytes(answer).await.unwrap_err();
+                assert_eq!((fault.code.as_str(), fault.number), ("not_acceptable", 406));
+            }
         }
     }
 }
@@ -398,6 +405,80 @@ async fn request_ids_are_kept_and_deadlines_end_a_call() {
     let late = request.multipart(form(&upload())).send().await.unwrap();
     let late = bytes(late).await.unwrap_err();
     assert_eq!((late.code.as_str(), late.number), ("deadline_exceeded", 504));
+}
+
+#[tokio::test]
+async fn deadlines_and_keys_that_are_given_twice_or_hidden_are_not_overlooked() {
+    let stand = CpuServer::start().await;
+    for (query, says) in [
+        ("deadline_ms=60000&deadline_ms=1", "deadline_ms is given twice"),
+        ("deadline_ms=60000&deadline%5Fms=1", "deadline_ms is given twice"),
+        ("deadline%5Fms=soon", "deadline_ms is \"soon\""),
+    ] {
+        let odd = fault(&stand, &format!("/v1/scenes?{query}")).await;
+        assert_eq!((odd.code.as_str(), odd.number), ("invalid_request", 400), "{query}");
+        assert!(odd.message.contains(says), "{query}: {odd:?}");
+    }
+    for (keys, says) in [(&["a", "b"][..], "given twice"), (&["a\tb"], "printable ASCII")] {
+        let request = crate::common::client().post(stand.url("/v1/scenes"));
+        let request = keys.iter().fold(request, |r, key| r.header("idempotency-key", *key));
+        let odd = bytes(request.multipart(form(&upload())).send().await.unwrap()).await;
+        let odd = odd.expect_err(says);
+        assert_eq!(odd.code, "invalid_request", "{keys:?}");
+        assert!(odd.message.contains(says), "{keys:?}: {odd:?}");
+    }
+}
+
+#[tokio::test]
+async fn texts_are_packed_for_those_who_take_it_and_unpack_to_the_same() {
+    let stand = CpuServer::start().await;
+    let client = crate::common::client();
+    for path in ["/", "/openapi.json"] {
+        let plain = client.get(stand.url(path)).send().await.unwrap();
+        assert!(!plain.headers().contains_key(header::CONTENT_ENCODING), "{path}");
+        assert_eq!(plain.headers()[header::VARY], "accept-encoding", "{path}");
+        let plain = plain.bytes().await.unwrap();
+        let request = client.get(stand.url(path)).header("accept-encoding", "br, gzip");
+        let packed = request.send().await.unwrap();
+        assert_eq!(packed.headers()[header::CONTENT_ENCODING], "gzip", "{path}");
+        let length = packed.content_length();
+        let packed = packed.bytes().await.unwrap();
+        assert_eq!(length, Some(packed.len() as u64), "{path}");
+        assert!(packed.len() * 2 < plain.len(), "{path}: {} of {}", packed.len(), plain.len());
+        let mut unpacked = Vec::new();
+        std::io::Read::read_to_end(&mut flate2::read::GzDecoder::new(&packed[..]), &mut unpacked)
+            .unwrap();
+        assert!(unpacked == plain, "{path}");
+    }
+    // Pictures are packed by themselves; small answers go in one packet.
+    let id = made(&stand).await;
+    for path in [format!("/v1/scenes/{id}/view?from=0"), "/healthz".to_owned()] {
+        let request = client.get(stand.url(&path)).header("accept-encoding", "gzip");
+        let answer = request.send().await.unwrap();
+        assert!(!answer.headers().contains_key(header::CONTENT_ENCODING), "{path}");
+    }
+}
+
+#[tokio::test]
+async fn an_event_source_that_has_seen_the_end_is_told_to_end() {
+    let stand = CpuServer::start().await;
+    let id = made(&stand).await;
+    let client = crate::common::client();
+    let events = async |seen: Option<&str>| {
+        let request = client.get(stand.url(&format!("/v1/scenes/{id}/events")));
+        let request = seen.iter().fold(request, |r, id| r.header("last-event-id", *id));
+        let answer = request.send().await.unwrap();
+        (answer.status().as_u16(), answer.text().await.unwrap())
+    };
+    let (status, text) = events(None).await;
+    assert_eq!(status, 200);
+    let last = text.lines().filter_map(|line| line.strip_prefix("id:")).next_back();
+    let last = last.unwrap_or_else(|| panic!("no id: {text}")).trim();
+    assert_eq!(events(Some(last)).await, (204, String::new()));
+    // An id of an earlier version, or of nothing, is no end.
+    for other in ["done-0", "", "running"] {
+        assert_eq!(events(Some(other)).await, (200, text.clone()), "{other}");
+    }
 }
 
 #[tokio::test]

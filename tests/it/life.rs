@@ -11,15 +11,19 @@ use std::{
     time::{Duration, Instant},
 };
 
+use futures_util::{StreamExt, stream};
 use segsplat::{
+    api::grpc::pb,
     error::Result,
     jobs::{NetworkState, SceneNetworks},
     pipeline::{PhotoSet, Reconstruction},
     scene::{SceneOptions, Watch},
 };
 use serde_json::Value;
+use tokio::{sync::oneshot, task::JoinHandle};
 
 use crate::common::{
+    doors::{Door, Options, both, fault_of},
     process::{Start, can_serve, long},
     root,
     server::{TestServer, WallNetworks, upload},
@@ -47,18 +51,37 @@ async fn until(what: &str, mut check: impl AsyncFnMut() -> bool) {
     }
 }
 
+/// A call that is open until the sender is used: the end of its upload.
+async fn open_call(server: &TestServer) -> (oneshot::Sender<()>, JoinHandle<reqwest::Response>) {
+    let (end, ended) = oneshot::channel::<()>();
+    let rest = stream::once(async move {
+        ended.await.map_err(std::io::Error::other)?;
+        Ok::<_, std::io::Error>(b"--b--\r\n".to_vec())
+    });
+    let (begun, begins) = oneshot::channel();
+    let first = stream::once(async move {
+        let _ = begun.send(());
+        Ok(b"--b\r\ncontent-disposition: form-data; name=\"density\"\r\n\r\nfull\r\n".to_vec())
+    });
+    let request = crate::common::client()
+        .post(server.url("/v1/scenes"))
+        .header("content-type", "multipart/form-data; boundary=b")
+        .body(reqwest::Body::wrap_stream(first.chain(rest)));
+    let call = tokio::spawn(async move { request.send().await.expect("an answer") });
+    begins.await.expect("the body is asked for");
+    (end, call)
+}
+
 #[tokio::test]
 async fn a_drain_is_unready_first_then_refuses_new_calls_and_finishes_those_inside() {
-    let (networks, server) = on_hold(|config| {
+    let server = TestServer::with(|config, _| {
         config.drain_notice_ms = 4_000;
         config.drain_ms = 60_000;
     })
     .await;
     let url = |path: &str| server.url(path);
-    let (client, form) = (crate::common::client(), crate::common::doors::form(&upload()));
-    let making = client.post(url("/v1/scenes?wait_ms=60000")).multipart(form).send();
-    let making = tokio::spawn(making);
-    until("one scene at work", async || server.service.ready().jobs_running == 1).await;
+    let client = crate::common::client();
+    let (end, call) = open_call(&server).await;
     let (ready, list) = (url("/readyz"), url("/v1/scenes"));
     // HTTP/1.1: each client keeps its connections, which a listener that closes does not end.
     assert_eq!(client.get(&ready).send().await.unwrap().status(), 200);
@@ -79,26 +102,65 @@ async fn a_drain_is_unready_first_then_refuses_new_calls_and_finishes_those_insi
     };
     until("nobody new is let in", refused).await;
     assert!(!stopping.is_finished(), "one is inside");
-    networks.hold.store(false, Ordering::Release);
-    let made = making.await.unwrap().unwrap();
-    assert_eq!(made.status(), 201, "what was inside is finished");
-    made.bytes().await.unwrap();
+    end.send(()).unwrap();
+    let answer = call.await.unwrap();
+    assert_eq!(answer.status(), 400, "what was inside is answered: it sent no photos");
+    answer.bytes().await.unwrap();
     stopping.await.unwrap();
 }
 
 #[tokio::test]
 async fn a_drain_ends_when_its_time_is_over() {
-    let (_networks, server) = on_hold(|config| config.drain_ms = 100).await;
-    let form = crate::common::doors::form(&upload());
-    let making =
-        crate::common::client().post(server.url("/v1/scenes?wait_ms=60000")).multipart(form).send();
-    let making = tokio::spawn(making);
-    until("one scene at work", async || server.service.ready().jobs_running == 1).await;
+    let server = TestServer::with(|config, _| config.drain_ms = 100).await;
+    let (_end, call) = open_call(&server).await;
     let begun = Instant::now();
     server.stop().await;
     assert!(begun.elapsed() < Duration::from_secs(20), "{:?}", begun.elapsed());
     // The process would end now; here the caller's connection lives on.
-    making.abort();
+    call.abort();
+}
+
+#[tokio::test]
+async fn who_waits_for_what_is_being_made_is_answered_at_once_when_the_server_stops() {
+    let (_networks, server) = on_hold(|config| config.drain_ms = 3_600_000).await;
+    let [http, grpc] = both(server.addr).await;
+    let (Door::Http { client, .. }, Door::Grpc { client: rpc }) = (http, grpc) else { panic!() };
+    let form = crate::common::doors::form(&upload());
+    let making = client.post(server.url("/v1/scenes?wait_ms=600000")).multipart(form).send();
+    let making = tokio::spawn(making);
+    until("one scene at work", async || server.service.ready().jobs_running == 1).await;
+    let list = client.get(server.url("/v1/scenes")).send().await.unwrap();
+    let list: Value = list.json().await.unwrap();
+    let scene_id = list["scenes"][0]["id"].as_str().unwrap().to_owned();
+    let events = server.url(&format!("/v1/scenes/{scene_id}/events"));
+    let events = client.get(events).send().await.unwrap();
+    let request = pb::WatchSceneRequest { scene_id: scene_id.clone() };
+    let mut watch = rpc.clone().watch_scene(request).await.unwrap().into_inner();
+    let second = Options { wait_ms: Some(600_000), ..Options::default() };
+    let second =
+        tokio::spawn(async move { Door::Grpc { client: rpc }.create(&upload(), &second).await });
+    until("a second scene", async || server.service.ready().jobs_queued == 1).await;
+    let stopping = tokio::spawn(server.stop());
+    let answered = async {
+        let made = making.await.unwrap().unwrap();
+        assert_eq!(made.status(), 202, "taken, and not made yet");
+        let location = made.headers()["location"].to_str().unwrap().to_owned();
+        assert_eq!(location, format!("/v1/scenes/{scene_id}"));
+        let (_, state) = second.await.unwrap().expect("an answer over gRPC");
+        assert_eq!(state, "queued");
+        let events = events.text().await.expect("the events end in order");
+        assert!(events.contains("running") && !events.contains("done"), "{events}");
+        let end = loop {
+            match watch.message().await {
+                Ok(Some(_)) => {}
+                end => break end,
+            }
+        };
+        let fault = fault_of(end.expect_err("it is not the last event"));
+        assert_eq!(fault.code, "stopping", "{fault:?}");
+        stopping.await.unwrap();
+    };
+    tokio::time::timeout(crate::common::server::PATIENCE, answered).await.expect("at once");
 }
 
 #[tokio::test]

@@ -8,6 +8,7 @@
 )]
 
 mod access;
+mod answers;
 mod asking;
 mod bad_input;
 mod captures;

@@ -290,8 +290,10 @@ async fn an_export_of_a_text_holds_what_it_selects() {
     let export = async |text: Option<&str>| {
         let ask = TextOptions { text: text.map(str::to_owned), ..TextOptions::default() };
         let export = service.export(&id, ExportFormat::Ply, None, &ask).await.unwrap();
-        let (size, etag) = (export.size_bytes, export.etag.clone());
-        let file: Vec<u8> = export.into_stream().map(Result::unwrap).concat().await;
+        let etag = export.etag.clone();
+        let file = export.begin().await.unwrap();
+        let size = file.size_bytes;
+        let file: Vec<u8> = file.into_stream().map(Result::unwrap).concat().await;
         assert_eq!(size, Some(file.len() as u64));
         let count = String::from_utf8_lossy(&file[..400])
             .lines()

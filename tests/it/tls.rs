@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use futures_util::future::join_all;
 use reqwest::{Certificate, Version};
 use tokio::net::TcpStream;
 
@@ -66,6 +67,23 @@ async fn one_port_speaks_http_1_http_2_and_grpc_over_tls() {
     let strange = crate::common::client_builder().tls_certs_only([]).build().unwrap();
     assert!(strange.get(url("/readyz")).send().await.is_err(), "the certificate is not checked");
     drop(silent);
+    stand.stop().await;
+}
+
+#[tokio::test]
+async fn silent_connections_delay_no_handshake() {
+    let files = files();
+    let stand = stand(&files).await;
+    let silent = join_all((0..300).map(|_| TcpStream::connect(stand.addr))).await;
+    let client = crate::common::client_builder().tls_certs_only([files.root.clone()]);
+    let url = format!("https://localhost:{}/readyz", stand.addr.port());
+    let answer = client.build().unwrap().get(url).send().await.unwrap();
+    assert_eq!(answer.status(), 200);
+    // It was answered while each of them could still begin its handshake.
+    for stream in silent {
+        let fault = stream.expect("a connection").try_read(&mut [0]).expect_err("it is open");
+        assert_eq!(fault.kind(), std::io::ErrorKind::WouldBlock);
+    }
     stand.stop().await;
 }
 

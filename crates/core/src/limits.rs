@@ -162,6 +162,20 @@ limits! {
     body_bytes_min: usize = 8 << 10, restart;
     /// Milliseconds in which `body_bytes_min` must come: half a kilobyte a second, unless set.
     body_window_ms: u64 = 16_000, restart;
+    /// Bytes that an answer must lose to its caller in each `answer_window_ms` in which the server
+    /// waits for the caller. Else the connection is closed.
+    answer_bytes_min: usize = 128 << 10, restart;
+    /// Milliseconds in which `answer_bytes_min` must be taken: 8 kilobytes a second, unless set.
+    answer_window_ms: u64 = 16_000, restart;
+    /// Bytes of pictures and other whole answers in memory until their callers have taken them, and
+    /// at most a quarter of `memory_bytes_max`. One answer may take a quarter of what is left, or be
+    /// alone; else it is refused as `overloaded`.
+    answers_bytes_max: u64 = 1 << 30;
+    /// Exports that are being written or sent. One more is refused as `overloaded`.
+    exports_max: usize = 16;
+    /// Bytes that exports being written or sent may take in memory together, beside the scenes. One
+    /// more is refused as `overloaded`. One that takes more than three quarters counts as those.
+    exports_bytes_max: u64 = 512 << 20;
     /// Milliseconds one render may take.
     render_timeout_ms: u64 = 30_000;
     /// Milliseconds one scene may take.

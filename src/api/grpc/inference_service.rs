@@ -12,7 +12,7 @@ use super::{
         model_infer_request::InferInputTensor, model_infer_response::InferOutputTensor,
         model_metadata_response::TensorMetadata,
     },
-    scene_service::{Answer, answer},
+    scene_service::{Answer, answer, held, weighed},
 };
 use crate::{
     api::{
@@ -81,9 +81,10 @@ impl GrpcInferenceService for Api {
             let raw_output_contents = found.iter().map(|one| to_bytes(&one.data).into()).collect();
             let outputs = found.into_iter().map(output).collect();
             let told = ModelInferResponse { model_name, id, outputs, ..Default::default() };
-            Ok(ModelInferResponse { raw_output_contents, ..told })
+            weighed(&api, ModelInferResponse { raw_output_contents, ..told })
         })
         .await
+        .map(held)
     }
 }
 

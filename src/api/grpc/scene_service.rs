@@ -1,8 +1,9 @@
 //! `segsplat.v1.SceneService`: messages to requests, calls of the service, answers to messages.
 
-use std::{io, pin::Pin, time::Duration};
+use std::{future::ready, io, pin::Pin, sync::Arc, time::Duration};
 
 use futures_util::{Stream, StreamExt, stream};
+use prost::Message;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::{
@@ -12,17 +13,20 @@ use super::{
 };
 use crate::{
     api::{
-        Api, request_id, server_timing,
+        Api, Held, request_id, server_timing,
         upload::{UploadBuilder, UploadGuard, check_bundle},
     },
-    error::{Error, Result},
-    scene::{Upload, UploadCameras},
+    error::{Error, ErrorCode, Result},
+    scene::{SceneId, Upload, UploadCameras},
     service::{
-        CreateScene, Export, Kind, PageRequest, SemanticsMode, ViewSpec, ViewTimes, ViewsSpec,
+        CreateScene, Export, Kind, PageRequest, SceneStatus, SemanticsMode, ViewSpec, ViewTimes,
+        ViewsSpec,
     },
 };
 
 pub(super) type Answer<T> = Result<Response<T>, Status>;
+/// A file in pieces, and its place among the exports.
+type Chunks = (Many<pb::ExportChunk>, Option<Held>);
 type Many<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send + 'static>>;
 
 /// Does `work` for the caller of `request`. An error goes to the log and becomes a status.
@@ -57,8 +61,11 @@ impl pb::scene_service_server::SceneService for Api {
         request: Request<pb::WatchSceneRequest>,
     ) -> Answer<Self::WatchSceneStream> {
         answer(self, request, |api, request| async move {
-            let events = api.service.watch(&request.scene_id.parse()?).await?;
-            Ok(events.map(|event| Ok(convert::event(event))).boxed())
+            let id = request.scene_id.parse()?;
+            let events = api.service.watch(&id).await?;
+            let cut_off = stream::once(async move { unless_whole(&api, &id).await.err() });
+            let cut_off = cut_off.filter_map(|error| ready(error.map(|e| Err(logged(&e)))));
+            Ok(events.map(|event| Ok(convert::event(event))).chain(cut_off).boxed())
         })
         .await
     }
@@ -106,7 +113,7 @@ impl pb::scene_service_server::SceneService for Api {
     }
 
     async fn render_view(&self, request: Request<pb::RenderViewRequest>) -> Answer<pb::View> {
-        answer(self, request, render).await.map(timed)
+        answer(self, request, render).await.map(timed).map(held)
     }
 
     async fn render_views(
@@ -121,10 +128,11 @@ impl pb::scene_service_server::SceneService for Api {
             let id = request.scene_id.parse()?;
             let answer = api.service.query(&id, convert::query(request)?).await?;
             let times = answer.times;
-            Ok((convert::answer(answer), times))
+            Ok((weighed(&api, convert::answer(answer))?, times))
         })
         .await
         .map(timed)
+        .map(held)
     }
 
     async fn pick(&self, request: Request<pb::PickRequest>) -> Answer<pb::PickResponse> {
@@ -136,7 +144,7 @@ impl pb::scene_service_server::SceneService for Api {
     }
 
     async fn export(&self, request: Request<pb::ExportRequest>) -> Answer<Self::ExportStream> {
-        answer(self, request, export).await
+        answer(self, request, export).await.map(held)
     }
 
     async fn features(
@@ -145,15 +153,41 @@ impl pb::scene_service_server::SceneService for Api {
     ) -> Answer<Self::FeaturesStream> {
         answer(self, request, |api, request| async move {
             let id = request.scene_id.parse()?;
-            Ok(chunks(api.service.features(&id, convert::features(request)?).await?))
+            chunks(api.service.features(&id, convert::features(request)?).await?).await
         })
         .await
+        .map(held)
     }
 
     async fn models(&self, request: Request<pb::ModelsRequest>) -> Answer<pb::ModelsResponse> {
         answer(self, request, |api, _| async move { Ok(convert::models(api.service.models())) })
             .await
     }
+}
+
+/// Fails with `stopping` where the events of a scene have ended because the server stops.
+async fn unless_whole(api: &Api, id: &SceneId) -> Result<()> {
+    let goes_on = |status: SceneStatus| !status.is_settled() || status.is_refined_now();
+    let goes_on = api.service.get(id).await.is_ok_and(goes_on);
+    if goes_on && api.drain.is_stopping() {
+        return Err(Error::new(ErrorCode::Stopping, "the server is stopping; watch again"));
+    }
+    Ok(())
+}
+
+/// A message and its bytes of the budget.
+pub(super) fn weighed<T: Message>(api: &Api, message: T) -> Result<(T, Option<Held>)> {
+    let bytes = api.service.answer_bytes(message.encoded_len() as u64)?;
+    Ok((message, Some(Held::new(Arc::new(bytes)))))
+}
+
+/// A message, or messages, and what they hold until they are sent.
+pub(super) fn held<T>(answer: Response<(T, Option<Held>)>) -> Response<T> {
+    let (metadata, (message, held), mut extensions) = answer.into_parts();
+    if let Some(held) = held {
+        extensions.insert(held);
+    }
+    Response::from_parts(metadata, message, extensions)
 }
 
 /// A message with its stages as metadata.
@@ -249,7 +283,10 @@ fn begin(
     Ok(header)
 }
 
-async fn render(api: Api, request: pb::RenderViewRequest) -> Result<(pb::View, ViewTimes)> {
+async fn render(
+    api: Api,
+    request: pb::RenderViewRequest,
+) -> Result<((pb::View, Option<Held>), ViewTimes)> {
     let id = request.scene_id.parse()?;
     let given = request.options.unwrap_or_default();
     let spec = ViewSpec {
@@ -259,9 +296,9 @@ async fn render(api: Api, request: pb::RenderViewRequest) -> Result<(pb::View, V
         options: convert::options(&given)?,
         picture: convert::picture(&given)?,
     };
-    let view = api.service.render(&id, spec).await?;
-    let times = view.times;
-    Ok((convert::view(view), times))
+    let mut view = api.service.render(&id, spec).await?;
+    let (held, times) = (view.held.take().map(Held::new), view.times);
+    Ok(((convert::view(view), held), times))
 }
 
 async fn render_many(api: Api, request: pb::RenderViewsRequest) -> Result<Many<pb::View>> {
@@ -279,27 +316,34 @@ async fn render_many(api: Api, request: pb::RenderViewsRequest) -> Result<Many<p
     let (options, picture) = (convert::options(&given)?, convert::picture(&given)?);
     let spec = ViewsSpec { cameras, kinds, options, picture, text };
     let views = api.service.render_many(&id, &spec).await?;
-    Ok(views.map(|view| view.map(convert::view).map_err(|e| logged(&e))).boxed())
+    // tonic copies a message to encode it, and asks for the next one when that is sent.
+    let mut _sent = None;
+    let message = views.map(move |view| {
+        let mut view = view.map_err(|e| logged(&e))?;
+        _sent = view.held.take();
+        Ok(convert::view(view))
+    });
+    Ok(message.boxed())
 }
 
-async fn export(api: Api, request: pb::ExportRequest) -> Result<Many<pb::ExportChunk>> {
+async fn export(api: Api, request: pb::ExportRequest) -> Result<Chunks> {
     let id = request.scene_id.parse()?;
     let text = convert::text(request.text, request.scoring, request.semantics_wait_ms);
     let format = convert::value("format", request.format)?;
     let preset = convert::given("preset", request.preset)?;
-    Ok(chunks(api.service.export(&id, format, preset, &text).await?))
+    chunks(api.service.export(&id, format, preset, &text).await?).await
 }
 
 /// A file in pieces.
-fn chunks(export: Export) -> Many<pb::ExportChunk> {
-    let first = pb::ExportChunk {
-        size_bytes: export.size_bytes,
-        file_name: export.file_name.clone(),
-        ..Default::default()
-    };
+async fn chunks(export: Export) -> Result<Chunks> {
+    let file_name = export.file_name.clone();
+    let file = export.begin().await?;
+    let first = pb::ExportChunk { size_bytes: file.size_bytes, file_name, ..Default::default() };
     let piece = |data: io::Result<Vec<u8>>| match data {
         Ok(data) => Ok(pb::ExportChunk { data: data.into(), ..Default::default() }),
         Err(e) => Err(logged(&Error::internal("the file broke off").caused_by(e))),
     };
-    stream::once(async { Ok(first) }).chain(export.into_stream().map(piece)).boxed()
+    let place = Held::new(Arc::clone(&file.place));
+    let pieces = file.into_stream().map(piece);
+    Ok((stream::once(async { Ok(first) }).chain(pieces).boxed(), Some(place)))
 }

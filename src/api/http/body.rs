@@ -1,5 +1,5 @@
 //! Bodies with something around them: a request's body that must not be too slow, an answer's body
-//! that holds what must live until it is sent.
+//! that holds what must live as long as it.
 
 use std::{
     pin::Pin,
@@ -58,7 +58,7 @@ where
     Body::new(Through { body, each })
 }
 
-/// The same answer, which drops `held` when its last byte is sent or its caller is gone.
+/// The same answer, whose body holds `held`. [`super::answers`] keeps the body until it is written.
 pub(super) fn hold<T: Unpin + Send + 'static>(response: Response, held: T) -> Response {
     response.map(|body| {
         through(body, move |_, polled| {
@@ -68,17 +68,35 @@ pub(super) fn hold<T: Unpin + Send + 'static>(response: Response, held: T) -> Re
     })
 }
 
-/// How fast the body of a request must come.
+/// Bytes that hold `held` until the last of them is written.
+pub(super) fn held_bytes<T: Send + 'static>(bytes: Vec<u8>, held: T) -> Bytes {
+    struct Held<T>(Vec<u8>, T);
+    impl<T> AsRef<[u8]> for Held<T> {
+        fn as_ref(&self) -> &[u8] {
+            &self.0
+        }
+    }
+    Bytes::from_owner(Held(bytes, held))
+}
+
+/// How fast the body of a request must come, or that of an answer be taken.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Pace {
     /// Bytes that each `window` of waiting must bring.
-    bytes: usize,
-    window: Duration,
+    pub(super) bytes: usize,
+    pub(super) window: Duration,
 }
 
 impl Pace {
-    pub(super) fn new(limits: &Limits) -> Self {
+    /// That of requests.
+    pub(super) fn of_requests(limits: &Limits) -> Self {
         Self { bytes: limits.body_bytes_min, window: Duration::from_millis(limits.body_window_ms) }
+    }
+
+    /// That of answers.
+    pub(super) fn of_answers(limits: &Limits) -> Self {
+        let window = Duration::from_millis(limits.answer_window_ms);
+        Self { bytes: limits.answer_bytes_min, window }
     }
 
     /// The request with a body that fails where it comes too slowly, and whether it did. Only the

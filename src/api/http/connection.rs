@@ -7,8 +7,11 @@ use std::{
     time::Duration,
 };
 
-use axum::Router;
-use hyper::server::conn::{http1, http2};
+use axum::{Router, extract::Request, response::Response};
+use hyper::{
+    body::Incoming,
+    server::conn::{http1, http2},
+};
 use hyper_util::{
     rt::{TokioExecutor, TokioIo, TokioTimer},
     server::graceful::GracefulConnection,
@@ -19,53 +22,91 @@ use tokio::{
     sync::watch,
     time::timeout,
 };
+use tower::ServiceExt;
+
+use super::{answers::Answers, body::Pace};
+use crate::limits::Limits;
 
 /// The first bytes of HTTP/2. What begins otherwise is HTTP/1.
 const PREFACE: [u8; 24] = *b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
 
+/// How long a connection waits for its peer.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Patience {
+    /// For a handshake, for the head of a request, for the answer to an HTTP/2 ping.
+    pub(super) head_max: Duration,
+    /// For an answer to be taken.
+    answers: Pace,
+}
+
+impl Patience {
+    pub(super) fn new(limits: &Limits) -> Self {
+        let head_max = Duration::from_millis(limits.head_timeout_ms);
+        Self { head_max, answers: Pace::of_answers(limits) }
+    }
+}
+
 /// Serves `app` on one connection until either side ends it, or `stopping` becomes true: then it
 /// finishes its open calls.
 ///
-/// A head that is not whole after `head_max` ends the connection, and so does a peer that answers
-/// no HTTP/2 ping in that time.
+/// A head that is not whole in time ends the connection, and so does a peer that answers no HTTP/2
+/// ping in time, or takes an answer too slowly.
 pub(super) async fn serve<S>(
     mut stream: S,
     app: Router,
-    head_max: Duration,
+    patience: Patience,
     mut stopping: watch::Receiver<bool>,
 ) where
     S: AsyncRead + AsyncWrite + Unpin + Send + 'static,
 {
+    let head_max = patience.head_max;
     let first = tokio::select! {
         first = timeout(head_max, first_bytes(&mut stream)) => first,
         () = stopped(&mut stopping) => return,
     };
     let Ok(Ok(first)) = first else { return };
     let is_http2 = first == PREFACE;
+    let answers = Answers::new(patience.answers);
+    let owner = answers.clone();
+    let app = ServiceExt::<Request<Incoming>>::map_response(app, move |answer: Response| {
+        owner.own(answer)
+    });
     let (stream, app) = (TokioIo::new(Reread { first, stream }), TowerToHyperService::new(app));
     if is_http2 {
         let mut builder = http2::Builder::new(TokioExecutor::new());
         builder.timer(TokioTimer::new());
         builder.keep_alive_interval(head_max).keep_alive_timeout(head_max);
-        run(builder.serve_connection(stream, app), stopping).await;
+        run(builder.serve_connection(stream, app), &answers, stopping).await;
     } else {
         let mut builder = http1::Builder::new();
         builder.timer(TokioTimer::new()).header_read_timeout(head_max);
-        run(builder.serve_connection(stream, app), stopping).await;
+        run(builder.serve_connection(stream, app), &answers, stopping).await;
     }
 }
 
-/// Runs a connection to its end.
-async fn run<C>(connection: C, mut stopping: watch::Receiver<bool>)
+/// Runs a connection to its end. After an answer that is taken too slowly it takes no new calls;
+/// the other open ones have a moment to end.
+async fn run<C>(connection: C, answers: &Answers, mut stopping: watch::Receiver<bool>)
 where
     C: GracefulConnection<Error = hyper::Error>,
 {
     let mut connection = pin!(connection);
     let ended = tokio::select! {
-        ended = connection.as_mut() => ended,
-        () = stopped(&mut stopping) => {
+        ended = connection.as_mut() => Some(ended),
+        () = stopped(&mut stopping) => None,
+        () = answers.too_slow() => None,
+    };
+    let ended = match ended {
+        Some(ended) => ended,
+        None => {
             connection.as_mut().graceful_shutdown();
-            connection.await
+            tokio::select! {
+                ended = connection => ended,
+                () = answers.only_slow() => {
+                    tracing::debug!("a connection is closed: its caller takes too little");
+                    return;
+                }
+            }
         }
     };
     if let Err(error) = ended {
@@ -74,7 +115,7 @@ where
 }
 
 /// Resolves when the server stops. An error means that it has ended.
-async fn stopped(stopping: &mut watch::Receiver<bool>) {
+pub(super) async fn stopped(stopping: &mut watch::Receiver<bool>) {
     let _ = stopping.wait_for(|&stopping| stopping).await;
 }
 

@@ -7,7 +7,7 @@ use std::{
 
 use axum::{
     body::Body,
-    extract::{Request, State},
+    extract::{Query, Request, State},
     http::{HeaderMap, HeaderValue, StatusCode, header, uri::Authority},
     middleware::Next,
     response::{IntoResponse, Response},
@@ -19,11 +19,14 @@ use super::{
     error::{ApiError, asks_for_problem},
 };
 use crate::{
-    api::{Api, access, access::Access, grpc, log_error, request_id, short},
+    api::{Api, Held, access, access::Access, grpc, log_error, request_id, short},
     error::{Error, ErrorCode, Result},
     keys::Scope,
     telemetry::{self, meter},
 };
+
+/// Answers of fewer bytes are not counted.
+const LARGE_ANSWER_BYTES: u64 = 256 << 10;
 
 /// The caller's own deadline, for handlers that hand it on.
 #[derive(Clone, Copy, Debug)]
@@ -65,7 +68,7 @@ impl Transport {
 
     fn deadline(self, request: &Request) -> Result<Option<Duration>> {
         match self {
-            Self::Http => deadline_of_query(request.uri().query()),
+            Self::Http => deadline_of_query(request),
             Self::Grpc => Ok(deadline_of_grpc(request.headers())),
         }
     }
@@ -209,10 +212,28 @@ async fn admit(
         request.extensions_mut().insert(admission.caller.clone());
         Ok((call, admission))
     });
-    match admitted {
-        Ok(held) => hold(next.run(request).await, held),
-        Err(error) => answers.refusal(error),
+    let held = match admitted {
+        Ok(held) => held,
+        Err(error) => return answers.refusal(error),
+    };
+    let mut response = next.run(request).await;
+    let own = match response.extensions_mut().remove::<Held>() {
+        None => match whole_answer(api, &response) {
+            Ok(bytes) => bytes,
+            Err(error) => return answers.refusal(error),
+        },
+        own => own,
+    };
+    hold(response, (held, own))
+}
+
+/// The bytes of an answer that is in memory as a whole, where it is not small.
+fn whole_answer(api: &Api, response: &Response) -> Result<Option<Held>> {
+    let bytes = http_body::Body::size_hint(response.body()).exact().unwrap_or(0);
+    if bytes < LARGE_ANSWER_BYTES {
+        return Ok(None);
     }
+    api.service.answer_bytes(bytes).map(|bytes| Some(Held::new(Arc::new(bytes))))
 }
 
 /// Lets only what says that it is gRPC come to a method of gRPC: a page of the web can send bytes
@@ -309,16 +330,21 @@ fn deadline_passed(deadline: Duration) -> Error {
     )
 }
 
-/// `deadline_ms=` of a query string.
-fn deadline_of_query(query: Option<&str>) -> Result<Option<Duration>> {
-    let value =
-        query.unwrap_or_default().split('&').find_map(|pair| pair.strip_prefix("deadline_ms="));
-    let Some(value) = value else { return Ok(None) };
+/// `deadline_ms` of a query string, at most once.
+fn deadline_of_query(request: &Request) -> Result<Option<Duration>> {
+    let pairs = Query::<Vec<(String, String)>>::try_from_uri(request.uri());
+    // What cannot be read is refused where the rest is read.
+    let Ok(Query(pairs)) = pairs else { return Ok(None) };
+    let mut values = pairs.into_iter().filter(|(name, _)| name == "deadline_ms");
+    let Some((_, value)) = values.next() else { return Ok(None) };
+    if values.next().is_some() {
+        return Err(Error::invalid("deadline_ms is given twice"));
+    }
     match value.parse::<u64>() {
         Ok(ms) if ms > 0 => Ok(Some(Duration::from_millis(ms))),
         _ => {
             let must = "it must be a whole number over 0";
-            Err(Error::invalid(format!("deadline_ms is {:?}; {must}", short(value))))
+            Err(Error::invalid(format!("deadline_ms is {:?}; {must}", short(&value))))
         }
     }
 }

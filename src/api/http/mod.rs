@@ -2,12 +2,14 @@
 //!
 //! [`routes`] is the list of calls; `tests/it/errors.rs` compares `/openapi.json` with it.
 
+mod answers;
 mod body;
 mod connection;
 mod cors;
 mod error;
 mod extract;
 mod fields;
+mod gzip;
 mod health;
 mod inference;
 mod middleware;
@@ -26,7 +28,7 @@ use std::sync::Arc;
 use axum::{
     Router,
     extract::DefaultBodyLimit,
-    middleware::from_fn_with_state,
+    middleware::{from_fn, from_fn_with_state},
     routing::{MethodRouter, delete, get, post},
 };
 use tower_http::catch_panic::CatchPanicLayer;
@@ -106,7 +108,7 @@ fn app(api: &Api) -> Result<Router> {
         let open = route.call == METRICS && api.service.config().open_metrics;
         let scope = route.scope.filter(|_| !open);
         let guard = from_fn_with_state((api.clone(), route.call, scope), http_guard);
-        (route.path, route.handler.route_layer(guard))
+        (route.path, route.handler.route_layer(from_fn(gzip::pack)).route_layer(guard))
     };
     let http = routes()
         .into_iter()
@@ -116,7 +118,7 @@ fn app(api: &Api) -> Result<Router> {
         .with_state(api.clone())
         .fallback(error::no_such_route)
         .layer(DefaultBodyLimit::disable());
-    let pace = Pace::new(&api.service.limits());
+    let pace = Pace::of_requests(&api.service.limits());
     let state = |transport| (transport, Arc::clone(&api.access), pace);
     let both = surrounded(http, state(Transport::Http));
     let both = both.merge(surrounded(grpc, state(Transport::Grpc)));

@@ -1,11 +1,11 @@
 //! One rendered view, and the scene as a file.
 
-use std::time::Duration;
+use std::{sync::Arc, time::Duration};
 
 use axum::{
     Extension,
     body::Body,
-    http::{HeaderMap, HeaderValue, StatusCode, header},
+    http::{HeaderMap, HeaderName, HeaderValue, StatusCode, header},
     response::{IntoResponse, Response},
 };
 use serde::Deserialize;
@@ -18,13 +18,18 @@ use super::{
     middleware::{Deadline, text_of},
 };
 use crate::{
-    api::{server_timing, short},
-    error::{Error, Result},
+    api::{Held, server_timing, short},
+    error::{Error, ErrorCode, Result},
     service::{
         CameraFields, CameraSpec, Export, ExportFormat, FeatureKind, FeaturesSpec, Format, Kind,
         PictureOptions, Preset, RenderedView, ScoringOptions, TextOptions, ViewOptions, ViewSpec,
     },
 };
+
+/// A picture is a caller's own, and is asked for each time: its tag says whether it is the same.
+const CACHE: &str = "private, no-cache";
+/// `Accept` chooses the encoding of a picture.
+const VARY: [(HeaderName, &str); 1] = [(header::VARY, "accept")];
 
 /// What a view shows.
 #[derive(Debug, Default, Deserialize, IntoParams)]
@@ -94,10 +99,11 @@ pub(super) async fn view(
         && let Some(etag) = api.service.view_etag(&id, &spec).await?
         && let Some(answer) = not_modified(&headers, &etag)
     {
-        return Ok(answer);
+        return Ok((VARY, answer).into_response());
     }
-    let view = api.service.render(&id, spec).await?;
-    Ok((view_headers(&view), view.bytes).into_response())
+    let mut view = api.service.render(&id, spec).await?;
+    let held = view.held.take().map(|held| Extension(Held::new(held)));
+    Ok((view_headers(&view), VARY, held, view.bytes).into_response())
 }
 
 /// The scene, or what a text selects of it, as a file
@@ -124,7 +130,7 @@ pub(super) async fn export(
     let ExportParams { format, preset } = fields.take()?;
     let ask = text(&mut fields)?;
     fields.finish()?;
-    Ok(file(&headers, api.service.export(&id, format, preset, &ask).await?))
+    file(&headers, api.service.export(&id, format, preset, &ask).await?).await
 }
 
 /// The pixels of a view over the bank, as arrays
@@ -150,13 +156,13 @@ pub(super) async fn features(
     let wait = wait_ms.map(Duration::from_millis);
     let spec = FeaturesSpec { camera, options, kind, scoring: scoring(f)?, wait };
     fields.finish()?;
-    Ok(file(&headers, api.service.features(&id, spec).await?))
+    file(&headers, api.service.features(&id, spec).await?).await
 }
 
 /// A file that is written while it is sent, unless the caller has it.
-fn file(headers: &HeaderMap, export: Export) -> Response {
+async fn file(headers: &HeaderMap, export: Export) -> Result<Response, ApiError> {
     if let Some(answer) = not_modified(headers, &export.etag) {
-        return answer;
+        return Ok(answer);
     }
     let disposition = format!("attachment; filename=\"{}\"", export.file_name);
     let headers = [
@@ -165,14 +171,13 @@ fn file(headers: &HeaderMap, export: Export) -> Response {
         (header::ACCEPT_RANGES, "none".to_owned()),
         (header::CONTENT_DISPOSITION, disposition),
         (header::ETAG, quoted(&export.etag)),
-        (header::CACHE_CONTROL, "private, no-cache".to_owned()),
+        (header::CACHE_CONTROL, CACHE.to_owned()),
     ];
-    let size = export.size_bytes.map(|bytes| [(header::CONTENT_LENGTH, bytes.to_string())]);
-    let body = Body::from_stream(export.into_stream());
-    match size {
-        Some(size) => (headers, size, body).into_response(),
-        None => (headers, body).into_response(),
-    }
+    let file = export.begin().await?;
+    let size = file.size_bytes.map(|bytes| [(header::CONTENT_LENGTH, bytes.to_string())]);
+    let place = Extension(Held::new(Arc::clone(&file.place)));
+    let body = Body::from_stream(file.into_stream());
+    Ok((headers, size, place, body).into_response())
 }
 
 /// The changes of how texts are scored, from a query string.
@@ -194,7 +199,7 @@ pub(super) fn view_headers(view: &RenderedView) -> HeaderMap {
     let texts = [
         ("content-type", content_type(view.format).to_owned()),
         ("etag", quoted(&view.etag)),
-        ("cache-control", "private, no-cache".to_owned()),
+        ("cache-control", CACHE.to_owned()),
         ("server-timing", server_timing(view.times.stages())),
         ("x-camera-to-world", pose),
         ("x-intrinsics", format!("{},{},{},{}", k.fx, k.fy, k.cx, k.cy)),
@@ -248,6 +253,7 @@ fn negotiate(accept: Option<&str>, kind: Kind) -> Result<Format> {
     let lossy = !matches!(kind, Kind::Depth | Kind::Semantics | Kind::Mask);
     let mut best: Option<(f32, Format)> = None;
     for range in accept.split(',') {
+        let range = range.to_ascii_lowercase();
         let mut pieces = range.split(';').map(str::trim);
         let format = match pieces.next().unwrap_or_default() {
             "image/png" | "image/*" | "*/*" => Format::Png,
@@ -267,12 +273,13 @@ fn negotiate(accept: Option<&str>, kind: Kind) -> Result<Format> {
         }
     }
     best.map(|(_, format)| format).ok_or_else(|| {
-        Error::invalid(format!(
+        let message = format!(
             "Accept is {:?}; a kind={kind} picture can be image/png{}{}, application/x-npy",
             short(accept),
             if lossy { ", image/jpeg" } else { "" },
             if kind == Kind::Depth { "" } else { ", image/webp" },
-        ))
+        );
+        Error::new(ErrorCode::NotAcceptable, message)
     })
 }
 
@@ -284,7 +291,8 @@ fn quoted(etag: &str) -> String {
 fn not_modified(headers: &HeaderMap, etag: &str) -> Option<Response> {
     let etag = quoted(etag);
     let has = matches_etag(text_of(headers, "if-none-match")?, &etag);
-    has.then(|| (StatusCode::NOT_MODIFIED, [(header::ETAG, etag)]).into_response())
+    let headers = [(header::ETAG, etag), (header::CACHE_CONTROL, CACHE.to_owned())];
+    has.then(|| (StatusCode::NOT_MODIFIED, headers).into_response())
 }
 
 fn matches_etag(known: &str, etag: &str) -> bool {

@@ -11,7 +11,7 @@ use axum::{
         sse::{self, KeepAlive, Sse},
     },
 };
-use futures_util::{Stream, StreamExt};
+use futures_util::StreamExt;
 use serde::Deserialize;
 use utoipa::IntoParams;
 
@@ -19,12 +19,13 @@ use super::{
     error::ApiError,
     extract::{CallerApi, Id},
     fields::Fields,
+    middleware::text_of,
     multipart::{ArchiveBody, UploadForm, read_upload},
 };
 use crate::{
     api::{Api, request_id, server_timing, upload::check_bundle},
     error::{Error, Result},
-    scene::Refine,
+    scene::{Refine, SceneId},
     service::{CreateScene, Event, Page, PageRequest, SceneOptions, SceneState, SceneStatus},
 };
 
@@ -176,20 +177,48 @@ pub(super) async fn refine(
 /// What happens to a scene, as it happens
 #[utoipa::path(
     get, path = "/v1/scenes/{id}/events", operation_id = "watch_scene", tag = "scenes",
-    params(Id),
-    responses((
-        status = 200, content_type = "text/event-stream", body = Event,
-        description = "Server-sent events; the data of each is an Event as JSON"
-    ))
+    params(
+        Id,
+        ("Last-Event-ID" = Option<String>, Header, description = "The id of the last event seen"),
+    ),
+    responses(
+        (
+            status = 200, content_type = "text/event-stream", body = Event,
+            description = "Server-sent events; the data of each is an Event as JSON"
+        ),
+        (status = 204, description = "The caller has seen the last event: an EventSource ends"),
+    )
 )]
 pub(super) async fn events(
     CallerApi(api): CallerApi,
     Id(id): Id,
+    headers: HeaderMap,
     fields: Fields,
-) -> Result<Sse<impl Stream<Item = Result<sse::Event, Infallible>>>, ApiError> {
+) -> Result<Response, ApiError> {
     fields.finish()?;
-    let events = api.service.watch(&id).await?.map(|event| Ok(sse_event(&event)));
-    Ok(Sse::new(events).keep_alive(KeepAlive::new().interval(Duration::from_secs(15))))
+    let events = api.service.watch(&id).await?;
+    let seen = text_of(&headers, "last-event-id");
+    if seen.is_some() && seen == end_of(&api, &id).await.as_deref() {
+        return Ok(StatusCode::NO_CONTENT.into_response());
+    }
+    // A server that stops ends the stream: the caller comes back, to the next server.
+    let events = events.then(move |event| {
+        let (api, id) = (api.clone(), id.clone());
+        async move {
+            let id = end_of(&api, &id).await;
+            let event = sse_event(&event);
+            Ok::<_, Infallible>(id.into_iter().fold(event, sse::Event::id))
+        }
+    });
+    let keep_alive = KeepAlive::new().interval(Duration::from_secs(15));
+    Ok(Sse::new(events).keep_alive(keep_alive).into_response())
+}
+
+/// The id of the last event of a scene to which nothing more will happen.
+async fn end_of(api: &Api, id: &SceneId) -> Option<String> {
+    let status = api.service.get(id).await.ok()?;
+    let over = status.is_settled() && !status.is_refined_now();
+    over.then(|| format!("{}-{}", status.state, status.version))
 }
 
 /// The event's name as SSE's `event`, the whole of it as JSON in `data`.
@@ -220,11 +249,16 @@ fn preferred_wait(headers: &HeaderMap) -> Option<u32> {
     })
 }
 
-/// 1 to 255 printable ASCII characters.
+/// 1 to 255 printable ASCII characters, once.
 fn idempotency_key(headers: &HeaderMap) -> Result<Option<String>> {
-    let Some(value) = headers.get("idempotency-key") else { return Ok(None) };
+    let mut given = headers.get_all("idempotency-key").iter();
+    let Some(value) = given.next() else { return Ok(None) };
+    if given.next().is_some() {
+        return Err(Error::invalid("Idempotency-Key is given twice"));
+    }
+    let printable = value.as_bytes().iter().all(|byte| (b' '..=b'~').contains(byte));
     match value.to_str() {
-        Ok(key) if (1..=255).contains(&key.len()) => Ok(Some(key.to_owned())),
+        Ok(key) if printable && (1..=255).contains(&key.len()) => Ok(Some(key.to_owned())),
         _ => Err(Error::invalid("Idempotency-Key must be 1 to 255 printable ASCII characters")),
     }
 }

@@ -1,18 +1,29 @@
 //! One port for HTTP and gRPC, plain or TLS, and an orderly end.
 
-use std::{future::Future, pin::pin, time::Duration};
+use std::{future::Future, io, pin::pin, time::Duration};
 
 use axum::{
     Router,
     serve::{Listener, ListenerExt},
 };
-use tokio::{net::TcpListener, sync::watch};
+use tokio::{
+    net::{TcpListener, TcpStream},
+    sync::watch,
+};
 
-use super::{app, connection, tls::Tls};
+use super::{
+    app,
+    connection::{self, Patience},
+    tls::Tls,
+};
 use crate::{api::Api, config::Config, error::Result, service::Service};
 
 /// How long connections without a call may take to close.
 const CLOSING: Duration = Duration::from_millis(200);
+/// Bytes of answers that the system takes before it has sent them. By default it takes megabytes at
+/// once, so that a caller who takes them slowly would look like one who takes nothing.
+#[cfg(target_os = "linux")]
+const UNSENT_BYTES: u32 = 256 << 10;
 
 /// HTTP and gRPC, ready to be served. Cloning shares everything.
 #[derive(Clone, Debug)]
@@ -57,44 +68,58 @@ impl Server {
         listener: TcpListener,
         stop: impl Future<Output = ()> + Send + 'static,
     ) -> Result<()> {
-        // Nagle's algorithm against delayed acknowledgements costs a unary call 45 ms.
-        let listener = listener.tap_io(|stream| {
-            if let Err(error) = stream.set_nodelay(true) {
-                tracing::debug!(%error, "TCP_NODELAY refused");
+        let mut listener = listener.tap_io(|stream| {
+            if let Err(error) = prepare(stream) {
+                tracing::debug!(%error, "an option of a socket is refused");
             }
         });
-        match &self.tls {
-            None => run(listener, self.app, self.api, stop).await,
-            Some(tls) => run(tls.listen(listener)?, self.app, self.api, stop).await,
+        let patience = Patience::new(&self.api.service.limits());
+        let drained = async {
+            stop.await;
+            drain(&self.api).await;
+        };
+        let mut drained = pin!(drained);
+        let (stopping, stopped) = watch::channel(false);
+        loop {
+            let (stream, _) = tokio::select! {
+                accepted = listener.accept() => accepted,
+                () = &mut drained => break,
+            };
+            let (app, tls) = (self.app.clone(), self.tls.clone());
+            tokio::spawn(serve_one(stream, tls, app, patience, stopped.clone()));
         }
+        drop((listener, stopped));
+        stopping.send_replace(true);
+        // The open calls had `drain_ms` to end.
+        let _ = tokio::time::timeout(CLOSING, stopping.closed()).await;
+        Ok(())
     }
 }
 
-async fn run<L: Listener>(
-    mut listener: L,
-    app: Router,
-    api: Api,
-    stop: impl Future<Output = ()> + Send + 'static,
-) -> Result<()> {
-    let head_max = Duration::from_millis(api.service.limits().head_timeout_ms);
-    let drained = async {
-        stop.await;
-        drain(&api).await;
-    };
-    let mut drained = pin!(drained);
-    let (stopping, stopped) = watch::channel(false);
-    loop {
-        let (stream, _) = tokio::select! {
-            accepted = listener.accept() => accepted,
-            () = &mut drained => break,
-        };
-        tokio::spawn(connection::serve(stream, app.clone(), head_max, stopped.clone()));
-    }
-    drop((listener, stopped));
-    stopping.send_replace(true);
-    // The open calls had `drain_ms` to end.
-    let _ = tokio::time::timeout(CLOSING, stopping.closed()).await;
+fn prepare(stream: &TcpStream) -> io::Result<()> {
+    // Nagle's algorithm against delayed acknowledgements costs a unary call 45 ms.
+    stream.set_nodelay(true)?;
+    #[cfg(target_os = "linux")]
+    socket2::SockRef::from(stream).set_tcp_notsent_lowat(UNSENT_BYTES)?;
     Ok(())
+}
+
+/// Serves one connection, after its handshake where there is TLS.
+async fn serve_one(
+    stream: TcpStream,
+    tls: Option<Tls>,
+    app: Router,
+    patience: Patience,
+    mut stopping: watch::Receiver<bool>,
+) {
+    let Some(tls) = tls else { return connection::serve(stream, app, patience, stopping).await };
+    let stream = tokio::select! {
+        stream = tls.handshake(stream, patience.head_max) => stream,
+        () = connection::stopped(&mut stopping) => None,
+    };
+    if let Some(stream) = stream {
+        connection::serve(stream, app, patience, stopping).await;
+    }
 }
 
 /// First the server is not ready, then it refuses new calls, then it waits for the open ones.
@@ -106,11 +131,16 @@ async fn drain(api: &Api) {
         tokio::time::sleep(Duration::from_millis(config.drain_notice_ms)).await;
     }
     api.drain.refuse_calls();
+    api.service.stop_waiting();
     let open_calls = api.drain.open_calls();
     if open_calls > 0 {
         tracing::info!(open_calls, ms = config.drain_ms, "draining");
     }
     if !api.drain.wait_for_calls(Duration::from_millis(config.drain_ms)).await {
         tracing::warn!(open_calls = api.drain.open_calls(), "calls are cut off: drain_ms is over");
+    }
+    let refused = api.drain.refused();
+    if refused > 0 {
+        tracing::info!(refused, "calls were refused while the server stopped");
     }
 }

@@ -1,16 +1,12 @@
 //! TLS on the one port: HTTP/1.1, HTTP/2 and gRPC by ALPN.
-//!
-//! Handshakes run beside each other and have a time limit, so that a slow caller delays nobody.
 
 use std::{
-    fmt, io,
-    net::SocketAddr,
+    fmt,
     sync::{Arc, PoisonError, RwLock},
     time::Duration,
 };
 
-use axum::serve::Listener;
-use tokio::{net::TcpStream, sync::mpsc};
+use tokio::net::TcpStream;
 use tokio_rustls::{
     TlsAcceptor,
     rustls::{
@@ -25,11 +21,6 @@ use crate::{
     config::Config,
     error::{Error, Result},
 };
-
-/// Longest handshake.
-const HANDSHAKE_MAX: Duration = Duration::from_secs(10);
-/// Handshakes at the same time, and connections that wait for `accept` after theirs.
-const HANDSHAKES_MAX: usize = 256;
 
 /// The certificate in force. Cloning shares it.
 #[derive(Clone)]
@@ -57,36 +48,21 @@ impl Tls {
         Ok(())
     }
 
-    /// Connections of `listener` after their handshakes.
-    pub(super) fn listen<L>(&self, mut listener: L) -> Result<TlsListener>
-    where
-        L: Listener<Io = TcpStream, Addr = SocketAddr>,
-    {
-        let local = listener
-            .local_addr()
-            .map_err(|e| Error::internal("the listener has no address").caused_by(e))?;
-        let (to, ready) = mpsc::channel(HANDSHAKES_MAX);
-        let tls = self.clone();
-        tokio::spawn(async move {
-            loop {
-                // A place in the channel first: without one, callers stay in the system's queue.
-                let Ok(place) = to.clone().reserve_owned().await else { return };
-                let (stream, from) = tokio::select! {
-                    accepted = listener.accept() => accepted,
-                    () = to.closed() => return,
-                };
-                let server = Arc::clone(&tls.0.read().unwrap_or_else(PoisonError::into_inner));
-                tokio::spawn(async move {
-                    let handshake = TlsAcceptor::from(server).accept(stream);
-                    match tokio::time::timeout(HANDSHAKE_MAX, handshake).await {
-                        Ok(Ok(stream)) => drop(place.send((stream, from))),
-                        Ok(Err(error)) => tracing::debug!(%error, "a handshake failed"),
-                        Err(_) => tracing::debug!("a handshake took too long"),
-                    }
-                });
-            }
-        });
-        Ok(TlsListener { local, ready })
+    /// The connection after its handshake; `None` where that fails or takes too long. It is a part
+    /// of the connection's own task, so that a slow one delays nobody else.
+    pub(super) async fn handshake(
+        &self,
+        stream: TcpStream,
+        longest: Duration,
+    ) -> Option<TlsStream<TcpStream>> {
+        let server = Arc::clone(&self.0.read().unwrap_or_else(PoisonError::into_inner));
+        let handshake = TlsAcceptor::from(server).accept(stream);
+        match tokio::time::timeout(longest, handshake).await {
+            Ok(Ok(stream)) => return Some(stream),
+            Ok(Err(error)) => tracing::debug!(%error, "a handshake failed"),
+            Err(_) => tracing::debug!("a handshake took too long"),
+        }
+        None
     }
 }
 
@@ -111,28 +87,4 @@ fn load(config: &Config) -> Result<Option<Arc<ServerConfig>>> {
         .map_err(|e| wrong("tls_cert and tls_key", e.to_string()))?;
     server.alpn_protocols = vec![b"h2".to_vec(), b"http/1.1".to_vec()];
     Ok(Some(Arc::new(server)))
-}
-
-/// Connections after their handshakes.
-#[derive(Debug)]
-pub(super) struct TlsListener {
-    local: SocketAddr,
-    ready: mpsc::Receiver<(TlsStream<TcpStream>, SocketAddr)>,
-}
-
-impl Listener for TlsListener {
-    type Io = TlsStream<TcpStream>;
-    type Addr = SocketAddr;
-
-    async fn accept(&mut self) -> (Self::Io, Self::Addr) {
-        match self.ready.recv().await {
-            Some(ready) => ready,
-            // The task that sends ends only after this receiver.
-            None => std::future::pending().await,
-        }
-    }
-
-    fn local_addr(&self) -> io::Result<Self::Addr> {
-        Ok(self.local)
-    }
 }

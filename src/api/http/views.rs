@@ -17,6 +17,7 @@ use utoipa::ToSchema;
 use zip::{CompressionMethod, ZipWriter, write::SimpleFileOptions};
 
 use super::{
+    body::held_bytes,
     error::{ApiError, ErrorBody},
     extract::{CallerApi, Id, JsonBody},
     fields::Fields,
@@ -135,14 +136,14 @@ fn multipart(
                      content-length: {length}\r\n\r\n"
                 );
                 part.extend_from_slice(rest.as_bytes());
-                view.bytes
+                held_bytes(view.bytes, view.held)
             }
             Err(error) => {
                 part.extend_from_slice(b"content-type: application/json\r\n\r\n");
-                serde_json::to_vec(&fault(error)).unwrap_or_default()
+                serde_json::to_vec(&fault(error)).unwrap_or_default().into()
             }
         };
-        let pieces = [Bytes::from(part), Bytes::from(body), Bytes::from_static(b"\r\n")];
+        let pieces = [Bytes::from(part), body, Bytes::from_static(b"\r\n")];
         stream::iter(pieces.map(Ok))
     });
     parts.chain(stream::once(async { Ok(Bytes::from(format!("--{BOUNDARY}--\r\n"))) }))
@@ -165,13 +166,16 @@ fn zip(
                 writer.start_file(&name, stored)?;
                 writer.write_all(&view.bytes)?;
                 index.push(index_row(&name, &view));
-                Ok(Some((outbox.take(), (Some((pictures, writer, index)), outbox))))
+                Ok(Some((
+                    held_bytes(outbox.take(), view.held),
+                    (Some((pictures, writer, index)), outbox),
+                )))
             }
             None => {
                 writer.start_file("index.json", stored)?;
                 serde_json::to_writer_pretty(&mut writer, &index)?;
                 writer.finish()?;
-                Ok(Some((outbox.take(), (None, outbox))))
+                Ok(Some((outbox.take().into(), (None, outbox))))
             }
         }
     })
@@ -194,9 +198,8 @@ fn index_row(name: &str, view: &RenderedView) -> serde_json::Value {
 struct Outbox(Arc<Mutex<Vec<u8>>>);
 
 impl Outbox {
-    fn take(&self) -> Bytes {
-        let mut written = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        Bytes::from(std::mem::take(&mut *written))
+    fn take(&self) -> Vec<u8> {
+        std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner))
     }
 }
 

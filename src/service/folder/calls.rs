@@ -17,13 +17,13 @@ use crate::{
     service::{
         Inner, OfflineService, Service,
         create::blocking,
-        export::stream_until,
+        export::Export,
         request::{ScoringOptions, TextOptions},
         schedule::Slot,
         search::{SceneTexts, check_scoring},
         semantics::{Understood, meaning_tag},
         texts,
-        types::{Export, TextView},
+        types::TextView,
         view::{Resolved, hash, words},
     },
 };
@@ -138,7 +138,7 @@ impl Service {
         };
         // Not before: semantics can take minutes.
         let permit = inner.folder_permit()?;
-        let until = Instant::now() + Duration::from_millis(limits.views_timeout_ms);
+        let longest = Duration::from_millis(limits.views_timeout_ms);
         let upload = {
             let (inner, id) = (Arc::clone(&inner), id.clone());
             blocking(move || inner.kept_upload(&id)).await??
@@ -148,8 +148,9 @@ impl Service {
         let etag = words(&(how, upload.is_some(), env!("CARGO_PKG_VERSION")))?;
         let etag = format!("{}-{}", hash(&etag), format.name);
         let runtime = Handle::current();
-        let chunks = stream_until(Some(until), move |to: &mut dyn Write| {
-            let _permit = permit;
+        let shared = Arc::clone(&inner);
+        let write = move |to: &mut dyn Write| {
+            let until = Instant::now() + longest;
             let asked = texts.as_ref().map_or(&[][..], |asked| &asked.texts).to_vec();
             let contents = Contents {
                 scene: &scene,
@@ -161,9 +162,9 @@ impl Service {
             let scene = Arc::clone(&scene);
             let mut views = Scheduled { inner, runtime, scene, texts, until };
             write(format, &contents, &mut views, to).map(drop)
-        });
+        };
         let file_name = format!("{id}.{}", format.ending);
-        Ok(Export { media_type: "application/zip", ..Export::new(file_name, etag, chunks) })
+        Ok(Export::new(&shared, file_name, etag, write).of_folder(permit, longest))
     }
 }
 

@@ -16,6 +16,7 @@ __all__ = [
     "SceneNotFound",
     "NotFound",
     "MethodNotAllowed",
+    "NotAcceptable",
     "UnsupportedMediaType",
     "SceneNotReady",
     "SemanticsOff",
@@ -119,6 +120,12 @@ class MethodNotAllowed(SegSplatError):
     """The path is there, but not with this method."""
 
     code = "method_not_allowed"
+
+
+class NotAcceptable(SegSplatError):
+    """No encoding that ``Accept`` names fits what was asked."""
+
+    code = "not_acceptable"
 
 
 class UnsupportedMediaType(SegSplatError):
