@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::{Service, create::blocking};
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{SceneId, SceneState},
+    scene::{SceneError, SceneId, SceneState},
     store::{Record, not_found},
 };
 
@@ -38,15 +38,18 @@ impl SceneAccess {
         let not_ready = |why: String| Err(Error::new(ErrorCode::SceneNotReady, why));
         match (status.state, &status.error) {
             (SceneState::Done, _) => Ok(self),
-            (_, Some(error)) if error.to_error().code() == ErrorCode::SceneCorrupt => {
-                Err(error.to_error())
-            }
+            (_, Some(error)) if is_of_the_store(error) => Err(error.to_error()),
             (SceneState::Failed, Some(error)) => {
                 not_ready(format!("scene {id} failed with {}: {}", error.code, error.message))
             }
             (state, _) => not_ready(format!("scene {id} is {state}")),
         }
     }
+}
+
+/// Whether it is what is stored of a scene that cannot be read.
+fn is_of_the_store(error: &SceneError) -> bool {
+    matches!(error.to_error().code(), ErrorCode::SceneCorrupt | ErrorCode::OtherVersion)
 }
 
 impl Service {

@@ -109,6 +109,7 @@ impl Inner {
                 let message = format!("scene {} {why}", access.id());
                 return Err(Error::new(ErrorCode::ModelUnavailable, message));
             }
+            self.store.check_semantics(access.id())?;
             tracing::info!(scene = %access.id(), "no semantics of this bundle: made again");
             self.jobs.lose_semantics(access.id())?;
         }

@@ -3,12 +3,15 @@
 //! Any safetensors reader opens it; the digest is the tensor `sha256`. What the arrays mean is in
 //! `__metadata__`: `kind`, `version`, and `json` with the rest. Every byte is under the digest.
 
-use std::io::{self, Write};
+use std::{
+    fmt::Display,
+    io::{self, Write},
+};
 
 use bytemuck::Pod;
 use safetensors::{Dtype, SafeTensors, tensor::Metadata};
 use serde::de::DeserializeOwned;
-use serde_json::json;
+use serde_json::{error::Category, json};
 use sha2::{Digest, Sha256};
 
 use crate::error::{Error, ErrorCode, Result};
@@ -96,6 +99,22 @@ pub(super) fn frame(
     Ok((head, hash.finalize().into()))
 }
 
+/// The error of an object that is whole and of another version of this program, which can read it:
+/// it is left as it is.
+pub(super) fn other_version(what: &str, why: impl Display) -> Error {
+    let message = format!("{what} was written by another version of this program: {why}");
+    Error::new(ErrorCode::OtherVersion, message)
+}
+
+/// The error of JSON that is under a right checksum and cannot be read as what it is to be. JSON
+/// that says other things than this program knows is another version's.
+pub(super) fn unread_json(what: &str, error: &serde_json::Error) -> Error {
+    match error.classify() {
+        Category::Data => other_version(what, error),
+        _ => Error::new(ErrorCode::SceneCorrupt, format!("{what}'s metadata: {error}")),
+    }
+}
+
 /// A container whose digest, kind and version are right.
 pub(super) struct Container<'a> {
     pub(super) sha256: String,
@@ -125,14 +144,14 @@ impl<'a> Container<'a> {
                 .and_then(|words| words.get(name))
                 .ok_or_else(|| corrupt(format!("it has no {name}")))
         };
-        if word("kind")? != label.kind || *word("version")? != label.version.to_string() {
-            return Err(corrupt(format!(
-                "it is {} version {}; this program reads {} version {}",
-                word("kind")?,
-                word("version")?,
-                label.kind,
-                label.version
-            )));
+        let (kind, version) = (word("kind")?, word("version")?);
+        if kind != label.kind {
+            return Err(corrupt(format!("it is {kind} and not {}", label.kind)));
+        }
+        if *version != label.version.to_string() {
+            let own = label.version;
+            let why = format!("it is {kind} version {version}; this program reads version {own}");
+            return Err(other_version(what, why));
         }
         let meta_json = word("json")?.clone();
         let tensors = SafeTensors::deserialize(file).map_err(|e| corrupt(e.to_string()))?;
@@ -141,9 +160,7 @@ impl<'a> Container<'a> {
 
     /// What the file says beside its arrays.
     pub(super) fn header<T: DeserializeOwned>(&self) -> Result<T> {
-        serde_json::from_str(&self.meta_json).map_err(|e| {
-            Error::new(ErrorCode::SceneCorrupt, format!("{}'s metadata: {e}", self.what))
-        })
+        serde_json::from_str(&self.meta_json).map_err(|e| unread_json(self.what, &e))
     }
 
     /// Whether there is an array of this name.

@@ -260,7 +260,8 @@ impl Store {
     /// byte read is checked. Bad semantics are put aside: the scene is whole without them.
     ///
     /// # Errors
-    /// `scene_not_found`, `scene_corrupt` (its file is then put aside), `store_unavailable`.
+    /// `scene_not_found`, `scene_corrupt` (its file is then put aside), `other_version` (it stays),
+    /// `store_unavailable`.
     pub fn scene(&self, id: &SceneId) -> Result<Arc<Scene>> {
         if let Some(scene) = self.cache.find(id) {
             return Ok(scene);
@@ -309,10 +310,7 @@ impl Store {
             own if own == id => Ok(scene),
             other => Err(corrupt(format!("scene {id}: its file holds {other}"))),
         });
-        let scene = checked.inspect_err(|error| {
-            tracing::error!(scene = %id, %error, "a scene file is put aside");
-            self.quarantine(id, SCENE);
-        })?;
+        let scene = checked.inspect_err(|error| self.quarantine(id, SCENE, error))?;
         let scene = Arc::new(self.with_its_semantics(scene)?);
         self.keep(Arc::clone(&scene));
         Ok(scene)
@@ -335,10 +333,19 @@ impl Store {
             Ok(Scene { semantics_sha256: sha256, ..with })
         });
         checked.or_else(|error| {
-            tracing::error!(scene = %id, %error, "semantics are put aside, to be made again");
-            self.quarantine(&id, SEMANTICS);
+            self.quarantine(&id, SEMANTICS, &error);
             Ok(scene)
         })
+    }
+
+    /// Fails with `other_version` where the semantics that are kept of a scene are another
+    /// version's, which is no reason to make them again.
+    pub(crate) fn check_semantics(&self, id: &SceneId) -> Result<()> {
+        let file = self.objects.get("read the scene's semantics", of(id, SEMANTICS))?;
+        match file.map(|file| read_semantics(&file, id)) {
+            Some(Err(error)) if error.code() == ErrorCode::OtherVersion => Err(error),
+            _ => Ok(()),
+        }
     }
 
     /// Forgets the semantics of a scene, as when the networks that made them are not loaded now.
@@ -397,7 +404,13 @@ impl Store {
         Ok(())
     }
 
-    fn quarantine(&self, id: &SceneId, name: &str) {
+    /// Puts a bad object aside; one of another version stays where it is, for that version.
+    fn quarantine(&self, id: &SceneId, name: &str, error: &Error) {
+        if error.code() == ErrorCode::OtherVersion {
+            tracing::error!(scene = %id, %error, "{name} is left as it is");
+            return;
+        }
+        tracing::error!(scene = %id, %error, "{name} is put aside");
         let what = "put a bad object aside";
         if let Err(error) = self.objects.rename(what, of(id, name), of(id, &aside(name))) {
             tracing::error!(scene = %id, %error, "a bad object cannot be put aside");

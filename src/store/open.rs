@@ -204,7 +204,8 @@ pub(super) fn sound(id: &SceneId, file: &[u8]) -> Option<Record> {
     record::unseal(file).ok().filter(|record| record.status.id == *id)
 }
 
-/// The newest record of a scene: its status, else what is pending, else what can be rebuilt.
+/// The newest record of a scene: its status, else what is pending, else what can be rebuilt. One
+/// of another version is told as a failure, and stays where it is for that version.
 pub(super) fn find_record(store: &Store, id: &SceneId) -> Result<Option<Record>> {
     let what = "read a status";
     let mut found = store.objects.get(what, of(id, STATUS))?;
@@ -218,17 +219,22 @@ pub(super) fn find_record(store: &Store, id: &SceneId) -> Result<Option<Record>>
         Ok(_) => Error::new(ErrorCode::SceneCorrupt, "the scene's status is another scene's"),
         Err(error) => error,
     };
+    let failed = |error: &Error| {
+        Record::new(SceneStatus {
+            error: Some(SceneError::from(error)),
+            ..SceneStatus::new(id.clone(), SceneState::Failed, super::now_ms())
+        })
+    };
+    if error.code() == ErrorCode::OtherVersion {
+        tracing::error!(scene = %id, error = %error, "a scene's status is left as it is");
+        return Ok(Some(failed(&error)));
+    }
     tracing::error!(scene = %id, error = %error, "a scene's status is bad; rebuilding it");
     let rebuilt = match from_scene(store, id)? {
         None => from_upload(store, id)?,
         found => found,
     };
-    let rebuilt = rebuilt.unwrap_or_else(|| {
-        Record::new(SceneStatus {
-            error: Some(SceneError::from(&error)),
-            ..SceneStatus::new(id.clone(), SceneState::Failed, super::now_ms())
-        })
-    });
+    let rebuilt = rebuilt.unwrap_or_else(|| failed(&error));
     let put_aside = if is_status {
         let what = "put a bad status aside";
         store.objects.rename(what, of(id, STATUS), of(id, &aside(STATUS)))

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::files::hex;
+use super::{container::unread_json, files::hex};
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{SceneOptions, SceneStatus},
@@ -97,5 +97,5 @@ pub(super) fn unseal(file: &[u8]) -> Result<Record> {
     if sealed.sha256 != hex(&Sha256::digest(&sealed.record)) {
         return Err(corrupt("its checksum does not match its content".to_owned()));
     }
-    serde_json::from_str(&sealed.record).map_err(|e| corrupt(e.to_string()))
+    serde_json::from_str(&sealed.record).map_err(|e| unread_json("the scene's status", &e))
 }

@@ -58,7 +58,7 @@ pub fn write_scene(to: &mut dyn Write, scene: &Scene) -> io::Result<String> {
 /// entries its Gaussians have.
 ///
 /// # Errors
-/// `scene_corrupt` when any byte differs from what was written, or the version is unknown.
+/// `scene_corrupt` when any byte differs from what was written; `other_version`.
 pub fn read_scene(file: &[u8]) -> Result<(Scene, String)> {
     let container = Container::read(file, &LABEL, "the scene file")?;
     let header: Header = container.header()?;

@@ -55,8 +55,8 @@ pub fn write_semantics(
 /// Reads the semantics of scene `id` and gives them with their file's sha256, hex.
 ///
 /// # Errors
-/// `scene_corrupt` when any byte differs from what was written, the version is unknown, or they
-/// are another scene's.
+/// `scene_corrupt` when any byte differs from what was written, or they are another scene's;
+/// `other_version`.
 pub fn read_semantics(file: &[u8], id: &SceneId) -> Result<(Semantics, String)> {
     let corrupt =
         |why: String| Error::new(ErrorCode::SceneCorrupt, format!("the semantics file: {why}"));

@@ -90,8 +90,10 @@ table! {
     StoreUnavailable: "store_unavailable", 503, 14, 6, true;
     /// No usable GPU adapter where one was required.
     GpuUnavailable: "gpu_unavailable", 503, 14, 6, true;
-    /// A stored scene fails its checksum or has an unknown version.
+    /// A stored scene fails its checksum.
     SceneCorrupt: "scene_corrupt", 500, 15, 7, false;
+    /// What is stored is whole, and another version of the program wrote it: that one can read it.
+    OtherVersion: "other_version", 501, 12, 7, false;
     /// A fault of ours.
     Internal: "internal", 500, 13, 1, false;
 }

@@ -30,6 +30,7 @@ __all__ = [
     "StoreUnavailable",
     "GpuUnavailable",
     "SceneCorrupt",
+    "OtherVersion",
     "Internal",
     "ConnectionLost",
     "BadAnswer",
@@ -211,6 +212,12 @@ class SceneCorrupt(SegSplatError):
     """A stored scene fails its checksum or has an unknown version."""
 
     code = "scene_corrupt"
+
+
+class OtherVersion(SegSplatError):
+    """What is stored is whole, and another version of the server wrote it: that one can read it."""
+
+    code = "other_version"
 
 
 class Internal(SegSplatError):
