@@ -4,6 +4,7 @@ import math
 import torch
 import torch.nn.functional as F
 
+from pictures import box_of
 from words_model import SIDE
 
 
@@ -59,15 +60,8 @@ class Augment:
 
         `dim` [B]: whether what lies around is to be seen, and so a margin is wanted.
         """
-        B, R = len(bank), bank.shape[-1]
-        m = mask[:, 0] > 0.5
-        ends = []
-        for axis in (1, 2):
-            line = m.any(axis).float()
-            first = line.argmax(1).float()
-            last = R - line.flip(1).argmax(1).float()
-            ends.append(((first + last) / R - 1, (last - first) / R * 2))
-        (cx, w), (cy, h) = ends
+        B = len(bank)
+        (cx, cy), (w, h) = box_of(mask[:, 0] > 0.5)
         side = torch.maximum(w, h)
         margin = torch.where(dim, 0.1 + self.u(B) * 0.2, (self.u(B) - 0.3).clamp(min=0) * 0.1)
         k = side / 2 * (1 + 2 * margin) * torch.exp((self.u(B) - 0.5) * 0.06)
@@ -78,17 +72,18 @@ class Augment:
         both = F.grid_sample(torch.cat([bank, mask], 1), F.affine_grid(theta, (B, 1, SIDE, SIDE), align_corners=False), align_corners=False)
         return both[:, :3], (both[:, 3:] > 0.5).float()
 
-    def soften(self, x):
-        """Some pictures as if they were small, or far, or out of focus."""
-        order = torch.randperm(len(x), device=self.device, generator=self.gen)
+    def soften(self, x, share=0.45, sizes=6, least=24 / SIDE, span=1.7):
+        """`share` of the pictures [B,3,H,W] as if they were small, or far, or out of focus (`sizes` sizes, from `least` of their own up to e^span
+        times that), and some grainy."""
+        B, _, H, W = x.shape
         out = x.clone()
-        share = order[: int(0.45 * len(x))].chunk(6)
-        for rows in share:
-            n = int(24 * math.exp(float(torch.rand(1, device=self.device, generator=self.gen)) * 1.7))
-            small = F.interpolate(x[rows], (n, n), mode="bilinear", antialias=True)
-            out[rows] = F.interpolate(small, (SIDE, SIDE), mode="bilinear").clamp(0, 1)
-        noise = self.u(len(x), 1, 1, 1) * 0.05 * (self.u(len(x), 1, 1, 1) < 0.4)
-        grain = F.interpolate(torch.randn(len(x), 3, SIDE // 2, SIDE // 2, device=self.device, generator=self.gen), (SIDE, SIDE), mode="bilinear")
+        for rows in torch.randperm(B, device=self.device, generator=self.gen)[: int(share * B)].chunk(sizes):
+            if len(rows):
+                k = least * math.exp(float(self.u(1)) * span)
+                small = F.interpolate(x[rows], (int(H * k), int(W * k)), mode="bilinear", antialias=True)
+                out[rows] = F.interpolate(small, (H, W), mode="bilinear").clamp(0, 1)
+        noise = self.u(B, 1, 1, 1) * 0.05 * (self.u(B, 1, 1, 1) < 0.4)
+        grain = F.interpolate(torch.randn(B, 3, H // 2, W // 2, device=self.device, generator=self.gen), (H, W), mode="bilinear")
         return (out + grain * noise).clamp(0, 1)
 
     def recolour(self, x):
@@ -98,18 +93,3 @@ class Augment:
         gray = x.mean(1, keepdim=True)
         x = gray + (x - gray) * (0.55 + self.u(B, 1, 1, 1) * 0.7)
         return (((x * gain) - 0.4) * c + 0.4).clamp(0, 1)
-
-    def softened(self, x):
-        """Pictures [B,3,H,W] some of which are as if they were small, or far, or out of focus, or grainy."""
-        B, _, H, W = x.shape
-        order = torch.randperm(B, device=self.device, generator=self.gen)
-        out = x.clone()
-        for rows in order[: int(0.3 * B)].chunk(3):
-            if not len(rows):
-                continue
-            k = math.exp(-float(self.u(1)) * 1.3 - 0.15)
-            small = F.interpolate(x[rows], (max(16, round(H * k)), max(16, round(W * k))), mode="bilinear", antialias=True)
-            out[rows] = F.interpolate(small, (H, W), mode="bilinear").clamp(0, 1)
-        noise = self.u(B, 1, 1, 1) * 0.05 * (self.u(B, 1, 1, 1) < 0.4)
-        grain = F.interpolate(torch.randn(B, 3, H // 2, W // 2, device=self.device, generator=self.gen), (H, W), mode="bilinear")
-        return (out + grain * noise).clamp(0, 1)

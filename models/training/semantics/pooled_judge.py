@@ -10,10 +10,8 @@ Sets: `open` (names of withheld.txt), `held` (held-out photographs, other names)
 each cell lies under the mask. *Both*: the sum of the two unit vectors.
 """
 import argparse
-import io
 import json
 import os
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -21,15 +19,11 @@ import torch.nn.functional as F
 from PIL import Image
 
 import cuts
+from pictures import POOL, decoded
 from towers import STRIDE, PooledTower, normalised
 from words_model import SIDE
 
-POOL = ThreadPoolExecutor(min(16, os.cpu_count() or 1))
 KIND = "cuda" if torch.cuda.is_available() else "cpu"
-
-
-def decode(blob, at, i, mode="RGB"):
-    return np.array(Image.open(io.BytesIO(blob[at[i] : at[i + 1]].tobytes())).convert(mode))
 
 
 class Judge:
@@ -56,7 +50,7 @@ class Judge:
         self.photos = sorted({(t["set"], t["photo"]) for t in self.things})
         order = {p: i for i, p in enumerate(self.photos)}
         self.photo = torch.tensor([order[t["set"], t["photo"]] for t in self.things])
-        load = lambda p: (decode(files[p[0]]["blob"], files[p[0]]["offsets"], p[1]), decode(files[p[0]]["mask"], files[p[0]]["mask_at"], p[1], "L"))
+        load = lambda p: (decoded(files[p[0]]["blob"], files[p[0]]["offsets"], p[1]), decoded(files[p[0]]["mask"], files[p[0]]["mask_at"], p[1], "L"))
         self.pictures = list(POOL.map(load, self.photos))
 
         def square(k):

@@ -9,7 +9,6 @@ import os
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from PIL import Image
 
 from masks_model import MaskNet

@@ -4,7 +4,6 @@ A *canvas* is what the tower sees as a whole photo: a turned, scaled, recoloured
 a mosaic of class-labelled photographs. Its things keep an index picture, so that each has a mask however it was
 moved. What is not labelled is never a negative.
 """
-import io
 import math
 import os
 
@@ -13,8 +12,7 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 
-from pooled_judge import POOL, decode
-from words_model import SIDE
+from pictures import POOL, cornered, decoded
 
 TRAIN, HELD, JUDGE = 0, 1, 2  # what a packed photograph is for
 CUTOUTS = ("ikea_cutouts", "objects_photos")
@@ -28,17 +26,9 @@ SHARES = {
     "boxes_doors": 0.03, "boxes_groceries": 0.03, "boxes_misc": 0.02, "human_seg": 0.02, "bsds500": 0.06, "coco_unlabelled": 0.10,
 }
 SHAPES = [(448, 448), (416, 576), (576, 416), (576, 576)]  # few: the library chooses its algorithms for each
+FAR = {"share": 0.3, "sizes": 3, "least": 0.23, "span": 1.3}  # of the pictures, how many are as if seen from afar
 AREA = 40 * 448 * 448  # pixels of the canvases of one step
 MOSAICS, PASTED = 0.2, 0.5  # shares of canvases: mosaics; others with something pasted into them
-
-
-def fitted(a, side, resample=Image.BICUBIC):
-    """A picture in the top left corner of a black square, longer side `side`, and its height and width there."""
-    k = side / max(a.shape[:2])
-    w, h = max(1, round(a.shape[1] * k)), max(1, round(a.shape[0] * k))
-    out = np.zeros((side, side, *a.shape[2:]), np.uint8)
-    out[:h, :w] = np.asarray(Image.fromarray(a).resize((w, h), resample))
-    return out, h, w
 
 
 def boxes_of(label, rows):
@@ -71,12 +61,12 @@ class Photos:
                     of[p].append((r, n))
 
             def one(p):
-                pic, h, w = fitted(decode(z["blob"], z["offsets"], p), STORE)
-                drawn = decode(z["mask"], z["mask_at"], p, "L")
-                label, _, _ = fitted(drawn, STORE, Image.NEAREST)
+                pic, h, w = cornered(decoded(z["blob"], z["offsets"], p), STORE)
+                drawn = decoded(z["mask"], z["mask_at"], p, "L")
+                label, _, _ = cornered(drawn, STORE, Image.NEAREST)
                 rows = of[p]
                 if not rows and extra is not None and f"{name}:{z['key'][p]}" in extra:
-                    label, _, _ = fitted(extra[f"{name}:{z['key'][p]}"], STORE, Image.NEAREST)
+                    label, _, _ = cornered(extra[f"{name}:{z['key'][p]}"], STORE, Image.NEAREST)
                     return pic, label, (h, w), [(-1, n, *b[1:]) for n in np.unique(label[label > 0]) for b in boxes_of(label[:h, :w], [(0, n)])]
                 index = {r: n for r, n in rows}
                 return pic, label, (h, w), [(b[0], index[b[0]], *b[1:]) for b in boxes_of(label[:h, :w], rows)]
@@ -114,7 +104,7 @@ class Photos:
         rows, out = self.things[at], []
         for p, n, _, _, x0, y0, x1, y1, *_ in rows.tolist():
             both = torch.cat([self.pics[p, y0:y1, x0:x1], ((self.labels[p, y0:y1, x0:x1] == n) * 255).byte()[..., None]], -1).cpu().numpy()
-            out.append(torch.from_numpy(fitted(both, size)[0]))
+            out.append(torch.from_numpy(cornered(both, size)[0]))
         return torch.stack(out).to(self.pics.device), rows[:, 2], at
 
 
@@ -124,7 +114,7 @@ def class_labelled(pack, withheld, device, limit=0):
         z = {k: z[k] for k in z.files}
     keep = np.nonzero(~z["held"] & ~withheld[z["label"]])[0]
     keep = keep[:: max(1, len(keep) // limit)] if limit else keep
-    got = list(POOL.map(lambda i: fitted(decode(z["blob"], z["offsets"], i), TILE), keep))
+    got = list(POOL.map(lambda i: cornered(decoded(z["blob"], z["offsets"], i), TILE), keep))
     return (torch.from_numpy(np.stack([g[0] for g in got])).to(device), torch.tensor([g[1:] for g in got], device=device).float(),
             torch.from_numpy(z["label"][keep].astype(np.int64)).to(device))
 
@@ -254,7 +244,7 @@ class Canvases:
         cls = torch.where(kind == 0, self.photos.things[row.clamp(max=len(self.photos.things) - 1), 2],
                           torch.where(kind == 1, self.paste_class[row.clamp(max=len(self.paste_class) - 1)], self.tile_class[row.clamp(max=len(self.tile_class) - 1)]))
         loose = (kind == 0) & (self.photos.things[row.clamp(max=len(self.photos.things) - 1), 3] > 0) | (kind == 2)
-        seen_canvas = self.a.recolour(self.a.softened(canvas))
+        seen_canvas = self.a.recolour(self.a.soften(canvas, **FAR))
         row = torch.where(kind == 1, self.paste_thing[row.clamp(max=len(self.paste_thing) - 1)], row)
         return {"canvas": seen_canvas, "of": of, "masks": masks, "weights": self.spoiled(masks), "class": cls, "kind": kind, "row": row, "loose": loose}
 
@@ -274,7 +264,7 @@ class Canvases:
         theta = torch.stack([torch.stack([side / W, zero, (x0 + x1) / W - 1], -1), torch.stack([zero, side / H, (y0 + y1) / H - 1], -1)], 1)
         both = F.grid_sample(torch.cat([x, m], 1), F.affine_grid(theta, (len(x), 4, 288, 288), align_corners=False), align_corners=False)
         rgb, m = self.a.cut(both[:, :3], self.a.spoil(both[:, 3:]), torch.zeros(len(x), dtype=torch.bool, device=self.device))
-        return self.a.softened(rgb) * m, at
+        return self.a.soften(rgb, **FAR) * m, at
 
     @torch.no_grad()
     def wholes(self, n):
@@ -286,4 +276,4 @@ class Canvases:
         blob = (self.a.u(n, 1, 1, 1) < 0.35)
         mask = torch.where(blob, self.a.blob(n, TILE) * inside, inside.float())
         rgb, m = self.a.cut(x, mask, torch.zeros(n, dtype=torch.bool, device=self.device))
-        return self.a.recolour(self.a.softened(rgb)) * m, pick
+        return self.a.recolour(self.a.soften(rgb, **FAR)) * m, pick

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from words_model import CONTEXT, VOCABULARY, TextTower
+from words_model import CONTEXT, TextTower
 
 FORMS = [
     "a {a}", "the {a}", "{s}", "the {s}", "a photo of a {a}", "a photo of the {a}", "a picture of a {a}", "my {a}", "this {a}", "that {a}", "one {a}", "some {s}", "two {s}",

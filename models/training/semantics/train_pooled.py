@@ -25,7 +25,9 @@ import torch.nn as nn
 import torch.nn.functional as F
 
 from augment import Augment
-from pooled_judge import KIND, NAMES, Judge, decode, table, tower_of
+from losses import Steps, Words, mean_of, saved, which_name, which_words
+from pictures import decoded
+from pooled_judge import KIND, NAMES, Judge, table, tower_of
 from pooled_masks import Everything
 from pooled_photos import AREA, STORE, Canvases, Photos, class_labelled
 from towers import STRIDE, normalised
@@ -33,7 +35,7 @@ from words_model import SIDE
 
 LR = 1e-4
 # Of what is learnt: weights of the whole photo, of the cut, of their sum; of what the teacher says; of false words that no set shows.
-PATHS, HOLD, UNSEEN = (1.0, 0.7, 0.5), 14.0, 0.1
+WAYS, HOLD, UNSEEN = (1.0, 0.7, 0.5), 14.0, 0.1
 CUTS, WHOLES = 112, 48
 JUDGED_EVERY, SAVED_EVERY = 150, 60
 TEACHER = (1.0, 0.35, 0.8, 0.8)  # cut, plain box, whole photo at 448 and at 576
@@ -44,29 +46,20 @@ def autocast():
     return torch.autocast("cuda", dtype=torch.bfloat16, enabled=KIND == "cuda")
 
 
-class Words:
-    """Embeddings of words and what is true of each class."""
+class Seen:
+    """How often each name is shown, over the last thousand steps or so, and which words are true of a class in training."""
 
-    def __init__(self, pack, device):
-        z = np.load(os.path.join(pack, "words.npz"))
-        get = lambda n: torch.from_numpy(z[n]).to(device)
-        self.text, self.canon = F.normalize(get("embed").float(), dim=-1), F.normalize(get("canon").float(), dim=-1)
-        self.truth, self.own, self.withheld = get("truth"), get("own").long(), z["withheld"]
-        self.own_words, self.own_of = torch.unique(self.own, return_inverse=True)
-        self.mass = torch.zeros(len(self.own), device=device)
+    def __init__(self, words, classes):
+        self.words, self.mass = words, torch.zeros(len(words.own), device=words.own.device)
+        true = (words.truth[: len(words.own)][classes] == 1).any(0)
+        self.weight = torch.where(true, 1.0, UNSEEN)
 
     def show(self, cls):
-        """Counts the classes of a batch: what is seen, and how often."""
-        now = torch.bincount(cls[cls >= 0], minlength=len(self.own)).float()
-        self.mass.mul_(0.998).add_(now)
-        prior = torch.zeros(len(self.own_words), device=now.device).index_add_(0, self.own_of, self.mass)
-        self.seen_own = prior > 0
+        self.mass.mul_(0.998).add_(torch.bincount(cls[cls >= 0], minlength=len(self.mass)).float())
+        prior = torch.zeros(len(self.words.own_words), device=cls.device).index_add_(0, self.words.own_of, self.mass)
+        self.names = prior > 0
         prior = prior / prior.sum() + 1e-5
         self.log_prior = prior.log() - prior.log().mean()
-
-    def settle(self, seen):
-        """Words that are true of a class in training; others are hardly ever taught as false."""
-        self.seen_word = (self.truth[: len(self.own)][seen] == 1).any(0)
 
 
 @torch.no_grad()
@@ -129,174 +122,183 @@ def outlined(pack, device, limit):
     with np.load(os.path.join(pack, "photos_coco_unlabelled.npz")) as z:
         z = {k: z[k] for k in z.files}
     for p in range(len(z["key"]))[:: max(1, len(z["key"]) // limit) if limit else 1]:
-        out[f"coco_unlabelled:{z['key'][p]}"] = net.label(decode(z["blob"], z["offsets"], p))
+        out[f"coco_unlabelled:{z['key'][p]}"] = net.label(decoded(z["blob"], z["offsets"], p))
     return out
 
 
 class Student:
-    def __init__(self, tower, device, heat=150):
-        self.tower, self.heat, self.step = tower.requires_grad_(True).train(), heat, 0
+    """The tower that is trained, and what its losses are. Parts: names, words, teacher, of whole photos, of cuts, of their sum."""
+
+    def __init__(self, tower, canvases, words, seen, said_things, said_tiles):
+        self.tower, self.canvases, self.words, self.seen = tower.requires_grad_(True).train(), canvases, words, seen
+        self.said_things, self.said_tiles = said_things, said_tiles
+        device = words.own.device
         self.scale = nn.Parameter(torch.tensor([math.log(36.0), math.log(36.0)], device=device))
         deep = lambda n: n.startswith("_conv_head") or n.startswith("_blocks.") and int(n.split(".")[1]) >= 13
         body = list(tower.body.named_parameters())
-        self.opt = torch.optim.AdamW([
-            {"params": [p for n, p in body if not deep(n)], "k": 0.25},
-            {"params": [p for n, p in body if deep(n)], "k": 0.6},
-            {"params": [*tower.out.parameters(), *tower.near.parameters(), self.scale], "k": 1.2},
-        ], lr=LR, betas=(0.9, 0.99), weight_decay=0.0)
-        self.live = list(tower.state_dict().values())
-        self.mean = {k: v.detach().clone() for k, v in tower.state_dict().items()}
+        groups = [{"params": [p for n, p in body if not deep(n)], "k": 0.25}, {"params": [p for n, p in body if deep(n)], "k": 0.6},
+                  {"params": [*tower.out.parameters(), *tower.near.parameters(), self.scale], "k": 1.2}]
+        self.steps = Steps(tower, [{**g, "weight_decay": 0.0} for g in groups], LR, 150, 0.998)
+        self.sums, self.n = torch.zeros(9, device=device), 0
 
-    def update(self, loss, t):
-        for group in self.opt.param_groups:
-            group["lr"] = LR * group["k"] * min(1, (self.step + 1) / self.heat) * (0.02 + 0.98 * (0.5 + 0.5 * math.cos(math.pi * min(t, 1))))
-        self.opt.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = nn.utils.clip_grad_norm_(self.tower.parameters(), 2.0)
-        if torch.isfinite(norm):
-            self.opt.step()
-        with torch.no_grad():
-            torch._foreach_lerp_(list(self.mean.values()), self.live, 1 - min(0.998, (self.step + 1) / (self.step + 10)))
-        self.step += 1
+    def step(self, t, area, cuts, wholes):
+        loss, parts = self.losses(area, cuts, wholes)
+        self.steps.take(loss, t)
+        self.sums += parts
+        self.n += 1
 
+    def mean_losses(self):
+        v = [round(x, 3) for x in (self.sums / self.n).tolist()]
+        self.sums.zero_()
+        self.n = 0
+        return v
 
-def path_loss(f, cls, target, words, scale):
-    """Losses of unit vectors [K,384]: which of the seen names; which words beat the canon; what the teacher says."""
-    named, c = (cls >= 0).float(), cls.clamp(min=0)
-    some = named.sum().clamp(min=1)
-    sc = scale.exp()
-    cos, want, truth = f @ words.text.T, words.own_of[c], words.truth[c]
-    other = (truth[:, words.own_words] != 0) & ~F.one_hot(want, len(words.own_words)).bool()
-    logits = (sc[0] * cos[:, words.own_words] + words.log_prior).masked_fill(other | ~words.seen_own, -1e4)
-    ce = (F.cross_entropy(logits, want, reduction="none", label_smoothing=0.0) * named).sum() / some
-    margin = (cos - (f @ words.canon.T).amax(1, keepdim=True)) * sc[1].clamp(max=40)
-    pos, neg = (truth == 1).float(), (truth == 0).float() * torch.where(words.seen_word, 1.0, UNSEEN)
-    itself = F.one_hot(words.own_words[want], pos.shape[1]) * pos
-    rest = pos - itself
-    p_loss = (F.softplus(-margin) * (itself + rest / rest.sum(1, keepdim=True).clamp(min=1))).sum(1) / 2
-    near = neg * (margin.detach().sigmoid() + 0.01)
-    n_loss = (F.softplus(margin) * near).sum(1) / near.sum(1).clamp(min=1e-3)
-    bce = ((2 * p_loss + 1.5 * n_loss) * named).sum() / some
-    with torch.no_grad():  # less where the teacher did not know a name that is known
-        knew = ((target * words.text[words.own_words[want]]).sum(1) - (target @ words.canon.T).amax(1)) * 20
-        trust = torch.where(named > 0, 0.05 + 0.5 * knew.sigmoid(), torch.ones_like(knew))
-    hold = (trust * (1 - (f * target).sum(1))).mean()
-    return ce + bce + HOLD * hold, torch.stack([ce, bce, hold]).detach()
+    def losses(self, area, cuts, wholes):
+        b = self.canvases.batch(area)
+        cut, at = self.canvases.cuts(b, cuts)
+        whole, tiles = self.canvases.wholes(wholes)
+        row, is_tile = b["row"], b["kind"] == 2
+        of_tiles, of_things = (said[row.clamp(0, len(said) - 1)] for said in (self.said_tiles, self.said_things))
+        target = torch.where(is_tile[:, None], of_tiles, of_things).float()
+        tile_class = self.canvases.tile_class[tiles]
+        self.seen.show(torch.cat([b["class"], tile_class]))
+        with autocast():
+            context = self.tower.pooled(normalised(b["canvas"]), b["of"], b["weights"])
+            seen = self.tower.cut(normalised(torch.cat([cut, whole])))
+        both = F.normalize(context[at] + seen[: len(at)], dim=-1)
+        ways = [(context, b["class"], target), (seen, torch.cat([b["class"][at], tile_class]), torch.cat([target[at], self.said_tiles[tiles].float()])),
+                (both, b["class"][at], target[at])]
+        got = [self.of_vectors(*w) for w in ways]
+        return sum(k * g[0] for k, g in zip(WAYS, got)), torch.cat([g[1] for g in got])
 
-
-def losses(student, canvases, words, said_things, said_tiles, area, n_cuts, n_wholes):
-    b = canvases.batch(area)
-    cut, at = canvases.cuts(b, n_cuts)
-    whole, tiles = canvases.wholes(n_wholes)
-    row, tile = b["row"].clamp(min=0), b["kind"] == 2
-    target = torch.where(tile[:, None], said_tiles[row.clamp(max=len(said_tiles) - 1)], said_things[row.clamp(max=len(said_things) - 1)]).float()
-    words.show(torch.cat([b["class"], canvases.tile_class[tiles]]))
-    tower = student.tower
-    with autocast():
-        context = tower.pooled(normalised(b["canvas"]), b["of"], b["weights"])
-        seen = tower.cut(normalised(torch.cat([cut, whole])))
-    cls = torch.cat([b["class"][at], canvases.tile_class[tiles]])
-    a, parts_a = path_loss(context, b["class"], target, words, student.scale)
-    c, parts_c = path_loss(seen, cls, torch.cat([target[at], said_tiles[tiles].float()]), words, student.scale)
-    both = F.normalize(context[at] + seen[: len(at)], dim=-1)
-    s, parts_s = path_loss(both, b["class"][at], target[at], words, student.scale)
-    return PATHS[0] * a + PATHS[1] * c + PATHS[2] * s, torch.cat([parts_a, parts_c, parts_s]), len(b["of"])
+    def of_vectors(self, f, cls, target):
+        """Of unit vectors [K,384]: which of the seen names; which words beat the canon; what the teacher says."""
+        w, sc = self.words, self.scale.exp()
+        named, c = (cls >= 0).float(), cls.clamp(min=0)
+        cos, want, truth = f @ w.text.T, w.own_of[c], w.truth[c]
+        ce = mean_of(which_name(cos, want, truth, w.own_words, sc[0], self.seen.log_prior, self.seen.names), named)
+        margin = (cos - (f @ w.canon.T).amax(1, keepdim=True)) * sc[1].clamp(max=40)
+        bce = mean_of(which_words(margin, truth, w.own_words[want], self.seen.weight), named)
+        with torch.no_grad():  # less where the teacher did not know a name that is known
+            knew = ((target * w.text[w.own_words[want]]).sum(1) - (target @ w.canon.T).amax(1)) * 20
+            trust = torch.where(named > 0, 0.05 + 0.5 * knew.sigmoid(), torch.ones_like(knew))
+        hold = (trust * (1 - (f * target).sum(1))).mean()
+        return ce + bce + HOLD * hold, torch.stack([ce, bce, hold]).detach()
 
 
-def main():
+class Run:
+    """The clock, the log, the files and the judge of a run."""
+
+    def __init__(self, args):
+        self.begin, self.args = time.time(), args
+        os.makedirs(args.out, exist_ok=True)
+        self.log = open(os.path.join(args.out, "smoke.jsonl" if args.smoke else "pooled.jsonl"), "w")
+
+    def seconds(self):
+        return time.time() - self.begin
+
+    def tell(self, *what):
+        print(f"[{self.seconds():.0f}s]", *what, flush=True)
+
+    def note(self, **row):
+        self.log.write(json.dumps({"seconds": round(self.seconds(), 1), **row}) + "\n")
+        self.log.flush()
+
+    def judged(self, judge, title, tower):
+        """Figures of a tower; what the best one is chosen by: withheld names right and found at 3 %, choosing scenes right."""
+        before, torch.backends.cudnn.benchmark = torch.backends.cudnn.benchmark, False
+        figures = judge.all(tower)
+        torch.backends.cudnn.benchmark = before
+        table(f"[{self.seconds():.0f}s] {title}", figures)
+        self.note(judge=title, figures=figures, columns=NAMES)
+        both = figures[f"both {judge.sides[0]}"]
+        return sum(both[k][i] for k, i in (("open", 0), ("open", 4), ("scenes", 0)) if k in both)
+
+    def write(self, student, name):
+        saved(student.steps.mean, os.path.join(self.args.out, name))
+
+
+def load(args, run, device):
+    """A student that computes what the bundle's tower does, with its pictures and its teacher's answers, and the judge."""
+    few = (24 if KIND == "cuda" else 1) if args.smoke else 0
+    words = Words(args.pack, device)
+    withheld = words.withheld.cpu().numpy()
+    extra = outlined(args.pack, device, few)
+    run.tell("outlined", len(extra), "photographs without labels, masks", sum(int(m.max()) for m in extra.values()))
+    photos = Photos(args.pack, withheld, device, few, extra)
+    run.tell("photos", len(photos.pics), "things", len(photos.things), "with names", int((photos.things[:, 2] >= 0).sum()))
+    tiles = class_labelled(args.pack, withheld, device, 64 if args.smoke else 0)
+    canvases = Canvases(photos, tiles, Augment(device, args.seed + 1), device)
+    run.tell("class-labelled", len(tiles[0]), "cut-outs", len(canvases.paste))
+    first, chunk = tower_of(args.pack, device), 96 if KIND == "cuda" else 8
+    said_things, said_tiles = teach_things(first, photos, chunk), teach_tiles(first, *tiles[:2], chunk)
+    cls = torch.cat([photos.things[:, 2], tiles[2]])
+    seen = Seen(words, torch.unique(cls[cls >= 0]))
+    run.tell("the teacher has spoken; words of classes in training", int((seen.weight == 1).sum()))
+    judge = Judge(args.pack, device, limit=(60 if KIND == "cuda" else 6) if args.smoke else 0)
+    run.tell("judge", {k: len(v) for k, v in judge.kinds.items()})
+    return Student(tower_of(args.pack, device), canvases, words, seen, said_things, said_tiles), judge, first
+
+
+def train(args, run, student, judge, mixed, best):
+    """Steps until --seconds are nearly over; weights each minute, figures every JUDGED_EVERY seconds."""
+    size = (AREA, CUTS, WHOLES) if KIND == "cuda" else (4 * 448 * 448, 8, 4)
+    stop = run.begin + args.seconds - (2 if args.smoke else END)
+    begin, kept, judged, half = time.time(), time.time(), time.time(), False
+    torch.backends.cudnn.benchmark, torch.backends.cudnn.benchmark_limit = True, 3
+    while time.time() < stop and not (args.smoke and student.steps.step >= 4):
+        t = (time.time() - begin) / (stop - begin)
+        student.step(t, *size)
+        step = student.steps.step
+        if step in (1, 2, 10) or step % (100 if KIND == "cuda" else 2) == 0:
+            v = student.mean_losses()
+            run.tell(f"step {step} photo (ce, bce, hold) {v[:3]} cut {v[3:6]} both {v[6:]} scale {float(student.scale[0].detach().exp()):.1f}")
+            run.note(step=step, losses=v)
+        if time.time() - kept > SAVED_EVERY:
+            kept = time.time()
+            run.write(student, "last.pt")
+        if t > 0.5 and not half:
+            half = True
+            run.write(student, "half.pt")
+        if time.time() - judged > JUDGED_EVERY and not args.smoke and time.time() < stop - 60:
+            run.judged(judge, f"step {step} share 0.5", mixed(0.5))
+            got = run.judged(judge, f"step {step} share 1", mixed(1.0))
+            if got > best:
+                best = got
+                run.write(student, "best.pt")
+            judged = time.time()
+
+
+def arguments():
     ap = argparse.ArgumentParser()
     ap.add_argument("--pack", required=True)
     ap.add_argument("--out", required=True)
     ap.add_argument("--seconds", type=float, required=True, help="of wall-clock in all, preparation and last judgement included")
     ap.add_argument("--smoke", action="store_true", help="a few steps on a tiny subset, to see that all works")
     ap.add_argument("--seed", type=int, default=39)
-    args = ap.parse_args()
-    begin, device = time.time(), torch.device(KIND)
+    return ap.parse_args()
+
+
+def main():
+    args, device = arguments(), torch.device(KIND)
     torch.manual_seed(args.seed)
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
-    os.makedirs(args.out, exist_ok=True)
-    log = open(os.path.join(args.out, "smoke.jsonl" if args.smoke else "pooled.jsonl"), "w")
-    tell = lambda *what: print(f"[{time.time() - begin:.0f}s]", *what, flush=True)
-
-    def note(**row):
-        log.write(json.dumps({"seconds": round(time.time() - begin, 1), **row}) + "\n")
-        log.flush()
-
-    limit = (24 if KIND == "cuda" else 1) if args.smoke else 0
-    words = Words(args.pack, device)
-    extra = outlined(args.pack, device, limit)
-    tell("outlined", len(extra), "photographs without labels, masks", sum(int(m.max()) for m in extra.values()))
-    photos = Photos(args.pack, words.withheld, device, limit, extra)
-    tell("photos", len(photos.pics), "things", len(photos.things), "with names", int((photos.things[:, 2] >= 0).sum()))
-    tiles = class_labelled(args.pack, words.withheld, device, 64 if args.smoke else 0)
-    canvases = Canvases(photos, tiles, Augment(device, args.seed + 1), device)
-    tell("class-labelled", len(tiles[0]), "cut-outs", len(canvases.paste))
-    first = tower_of(args.pack, device)
-    said_things, said_tiles = teach_things(first, photos, 96 if KIND == "cuda" else 8), teach_tiles(first, tiles[0], tiles[1], 256 if KIND == "cuda" else 16)
-    cls = torch.cat([photos.things[:, 2], tiles[2]])
-    words.settle(torch.unique(cls[cls >= 0]))
-    tell("the teacher has spoken; classes in training", len(torch.unique(cls)), "words", int(words.seen_word.sum()))
-    judge = Judge(args.pack, device, limit=(60 if KIND == "cuda" else 6) if args.smoke else 0)
-    tell("judge", {k: len(v) for k, v in judge.kinds.items()})
-
-    def judged(title, tower):
-        figures = judge.all(tower)
-        table(f"[{time.time() - begin:.0f}s] {title}", figures)
-        note(judge=title, figures=figures, columns=NAMES)
-        return sum(figures["both 576"][k][i] for k, i in (("open", 0), ("open", 4), ("scenes", 0)) if k in figures["both 576"])
-
-    tower = tower_of(args.pack, device)
-    student, start = Student(tower, device), {k: v.clone() for k, v in first.state_dict().items()}
-    best = judged("start", first)
+    run = Run(args)
+    student, judge, first = load(args, run, device)
+    start = {k: v.clone() for k, v in first.state_dict().items()}
 
     def mixed(share):
+        """The tower `share` of the way from the start to the mean weights."""
         t = tower_of(args.pack, device)
-        t.load_state_dict({k: start[k] + share * (student.mean[k] - start[k]) for k in start})
+        t.load_state_dict({k: start[k] + share * (student.steps.mean[k] - start[k]) for k in start})
         return t
 
-    def save(name):
-        path = os.path.join(args.out, name)
-        torch.save({k: v.half().cpu() for k, v in student.mean.items()}, path + ".tmp")
-        os.replace(path + ".tmp", path)
-
-    area, n_cuts, n_wholes = (AREA, CUTS, WHOLES) if KIND == "cuda" else (4 * 448 * 448, 8, 4)
-    stop = begin + args.seconds - (2 if args.smoke else END)
-    trained_from, saved, next_judge, half = time.time(), time.time(), time.time() + JUDGED_EVERY, False
-    sums, n = torch.zeros(9, device=device), 0
-    torch.backends.cudnn.benchmark, torch.backends.cudnn.benchmark_limit = True, 3
-    while time.time() < stop and not (args.smoke and student.step >= 4):
-        t = (time.time() - trained_from) / (stop - trained_from)
-        loss, parts, things = losses(student, canvases, words, said_things, said_tiles, area, n_cuts, n_wholes)
-        student.update(loss, t)
-        sums, n = sums + parts, n + 1
-        if student.step in (1, 2, 10) or student.step % (100 if KIND == "cuda" else 2) == 0:
-            v = [round(x, 3) for x in (sums / n).tolist()]
-            tell(f"step {student.step} things {things} photo (ce, bce, hold) {v[:3]} cut {v[3:6]} both {v[6:]} scale {float(student.scale[0].detach().exp()):.1f}")
-            note(step=student.step, losses=v)
-            sums.zero_()
-            n = 0
-        if time.time() - saved > SAVED_EVERY:
-            saved = time.time()
-            save("last.pt")
-        if not half and t > 0.5:
-            half = True
-            save("half.pt")
-        if time.time() > next_judge and not args.smoke and time.time() < stop - 60:
-            torch.backends.cudnn.benchmark = False
-            judged(f"step {student.step} share 0.5", mixed(0.5))
-            got = judged(f"step {student.step} share 1", mixed(1.0))
-            torch.backends.cudnn.benchmark = True
-            if got > best:
-                best = got
-                save("best.pt")
-            save("last.pt")
-            next_judge = time.time() + JUDGED_EVERY
-    save("smoke.pt" if args.smoke else "last.pt")
-    torch.backends.cudnn.benchmark = False
-    for share in ((1.0,) if args.smoke else (1.0, 0.5, 0.75, 0.35)):
-        if share == 1.0 or time.time() < begin + args.seconds - 10:
-            judged(f"end, step {student.step} share {share}", mixed(share))
-    tell("trained", student.step)
+    train(args, run, student, judge, mixed, run.judged(judge, "start", first))
+    run.write(student, "smoke.pt" if args.smoke else "last.pt")
+    for share in (1.0,) if args.smoke else (1.0, 0.5, 0.75, 0.35):
+        if share == 1.0 or run.seconds() < args.seconds - 10:
+            run.judged(judge, f"end, step {student.steps.step} share {share}", mixed(share))
+    run.tell("trained", student.steps.step)
 
 
 if __name__ == "__main__":
