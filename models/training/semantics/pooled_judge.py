@@ -5,7 +5,7 @@
 *Right*: of the photo's own names and 214 everyday words the best is the thing's name or may be said of it; *five*: its name
 is among the best five of them; *found*: its name beats the canon; *absent*: share of the words found that may
 not be said; *at 3 %*: found where the canon is moved until 3 % of those are found (one shift for all things).
-Sets: `open` (names of withheld.txt), `held` (held-out photographs, other names), `scenes` (the posed scenes that choose).
+Sets: `open` (names of withheld.txt; the tower that training begins with saw some of them), `fresh` (those of them in sets that it did not see), `held` (held-out photographs, other names), `scenes` (the posed scenes that choose).
 *Cut*: the square on black. *Context*: the dense output of the whole photo, its longer side as --sides says, weighted by how much of
 each cell lies under the mask. *Both*: the sum of the two unit vectors.
 """
@@ -23,6 +23,8 @@ from pictures import POOL, decoded
 from towers import STRIDE, PooledTower, normalised
 from words_model import SIDE
 
+# Sets that no training before this one saw.
+FRESH = ("rooms_polygons", "pantry_polygons", "tools_polygons", "ikea_cutouts", "objects_photos")
 KIND = "cuda" if torch.cuda.is_available() else "cpu"
 
 
@@ -42,7 +44,8 @@ class Judge:
             state[k, t["asked"]] = t["good"]
         self.state = torch.from_numpy(state).to(device)
         self.label = torch.tensor([t["label_at"] for t in self.things], device=device)
-        self.kinds = {k: torch.tensor([i for i, t in enumerate(self.things) if t["kind"] == k], device=device) for k in ("open", "held", "scenes")}
+        is_kind = {k: lambda t, k=k: t["kind"] == k for k in ("open", "held", "scenes")} | {"fresh": lambda t: t["kind"] == "open" and t["set"] in FRESH}
+        self.kinds = {k: torch.tensor([i for i, t in enumerate(self.things) if of(t)], device=device, dtype=torch.long) for k, of in is_kind.items()}
         files = {}
         for s in sorted({t["set"] for t in self.things}):
             with np.load(os.path.join(pack, f"photos_{s}.npz")) as z:

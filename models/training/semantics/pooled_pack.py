@@ -18,24 +18,22 @@ import json
 import os
 import tarfile
 import zlib
-from collections import Counter, defaultdict
+from collections import Counter
 
 import numpy as np
-import onnx
-import onnxruntime as ort
 from PIL import Image
 
 import cuts
 import naming
 from colours import COLOURS
-from heldout import heldout
-from pack_real import blobs, everyday_names
+from heldout import heldout, withheld_words
+from pack_real import blobs
 from pooled_photos import CUTOUTS, HELD, JUDGE, TRAIN
 from prepare import CALTECH, Vocabulary, labelled, webp
 from towers import folded
-from wordnet import BODILY, GENERAL, WordNet
+from truths import embedded, more_nouns, synonyms, truth_table
+from wordnet import WordNet
 
-HERE = os.path.dirname(os.path.abspath(__file__))
 OUTLINED = (*cuts.SETS, "rooms_polygons", "pantry_polygons", "tools_polygons")
 BOXED = ("boxes_rooms", "boxes_doors", "boxes_groceries", "boxes_misc")
 CHOOSING = ("wooden_sculpture", "blowtorch", "milk_carton")  # these choose; they are never trained on
@@ -126,52 +124,140 @@ def scene(folder):
         yield i, n[:-4], photo, label, [(int(v), w) for v, w in classes.items() if (label == int(v)).any()], False
 
 
-def synonyms(data):
-    """name -> other words for it, of both lists, in both directions."""
-    out = defaultdict(set)
-    for name, also in [*json.load(open(os.path.join(data, "images", "synonyms.json"))).items(), *everyday_names().items()]:
-        out[name] |= set(also)
-    return out
+class Names:
+    """The classes, their words and what is true of them, which are withheld: what words.npz holds."""
+
+    def __init__(self, args, everyday):
+        images, net = os.path.join(args.data, "images"), WordNet(args.wordnet)
+        self.vocab, self.also = Vocabulary(net), synonyms(args.data)
+        add = self.vocab.add
+        z = np.load(os.path.join(images, "imagenet1k_samples.npz"))
+        self.thousand = [add(str(n), str(w)) for n, w in zip(z["class_names"], z["wnid"])]
+        # (set, order, bytes, class) of the class-labelled photographs.
+        self.labelled = [(s, i, jpeg, add(CALTECH.get(w, w.replace("_", " ")) if s == "caltech101" else w, wnid)) for s, i, jpeg, w, wnid in labelled(args.data)]
+        self.index = {n: add(n) for n in sorted({"person"} | drawn_names(images))}
+        for c in self.vocab.classes:
+            c["true"] = list(dict.fromkeys(c["true"] + [self.vocab.word(w) for w in sorted(self.also.get(c["name"], ()))]))
+        for w in sorted(set(everyday.alike) | set(everyday.words) | withheld_words()):
+            self.vocab.word(w)
+        self.colours = [self.vocab.word(c) for c in COLOURS]
+        more_nouns(self.vocab, net, np.random.default_rng(9))
+        self.net, self.everyday = net, everyday
+
+    def write(self, args, bundle):
+        v = self.vocab
+        mine, raw = embedded(args.bundle, bundle, v.words)
+        truth = truth_table(v, self.net, self.everyday, raw, np.array(self.colours))
+        # A class is withheld when a withheld word, or another word for one, is its name, or a withheld word is true of it.
+        listed = withheld_words()
+        away = listed | {s for w in listed for s in self.also.get(w, ())} | {n for n, s in self.also.items() if s & listed}
+        own = np.array([c["own"] for c in v.classes])
+        at = lambda words: sorted(v.index[w] for w in words if w in v.index)
+        self.withheld = (truth[:-1][:, at(listed)] == 1).any(1) | np.isin(own, at(away))
+        np.savez_compressed(os.path.join(args.out, "words.npz"), words=np.array(v.words), embed=mine.astype(np.float16), canon=bundle.texts(bundle.manifest["canon"]),
+                            truth=truth, own=own, thousand=np.array(self.thousand), names=np.array([c["name"] for c in v.classes]), withheld=self.withheld,
+                            colours=np.array(self.colours), everyday=np.array([v.index[w] for w in self.everyday.words]))
+        print("words", len(v.words), "classes", len(v.classes), "withheld", int(self.withheld.sum()), flush=True)
+
+    def open(self, label):
+        """Whether a label is a withheld name."""
+        return label in self.index and bool(self.withheld[self.index[label]])
 
 
-def withheld_words():
-    return {w for row in open(os.path.join(HERE, "withheld.txt")) if not row.startswith("#") for w in row.strip().split(", ") if w}
+def drawn_names(images):
+    """The names under which things are outlined or boxed."""
+    def rows(sets, file, inside):
+        for name in sets:
+            with tarfile.open(os.path.join(images, name + ".tar")) as tar:
+                found = json.load(tar.extractfile([n for n in tar.getnames() if n.endswith(file)][0]))
+            yield from (cuts.plain(s["name"]) for v in found.values() for s in v[inside] if s["name"] != "background")
+
+    return {*rows((*OUTLINED, *CUTOUTS), "segments.json", "segments"), *rows(BOXED, "boxes.json", "boxes")}
 
 
-def embed(bundle_dir, bundle, words):
-    """Embeddings of words, and in the space before it is centred and turned, where likeness means likeness."""
-    model = onnx.load(os.path.join(bundle_dir, bundle.manifest["text"]["file"]))
-    sub = next(n for n in model.graph.node if n.op_type == "Sub" and "centre" in n.input)
-    model.graph.output.append(onnx.helper.make_tensor_value_info(sub.input[0], onnx.TensorProto.FLOAT, None))
-    run = ort.InferenceSession(model.SerializeToString())
-    ids = [bundle.tokens.encode(w.lower()).ids[:24] for w in words]
-    mine, raw, by = [None] * len(words), [None] * len(words), defaultdict(list)
-    for i, t in enumerate(ids):
-        by[len(t)].append(i)
-    for group in by.values():
-        for k in range(0, len(group), 256):
-            part = group[k : k + 256]
-            for i, x, y in zip(part, *run.run(None, {"input_ids": np.array([ids[i] for i in part], np.int64)})):
-                mine[i], raw[i] = x, y
-    return np.stack(mine), np.stack(raw)
+def part_of(name, order, key, is_open):
+    """What a photograph is for; `is_open`: whether something in it has a withheld name."""
+    if name.startswith("scene_"):
+        return JUDGE
+    if name in ("bsds500", "coco_unlabelled"):
+        return TRAIN
+    if heldout(order):
+        return HELD
+    if is_open and (name in CUTOUTS or zlib.crc32(key.encode()) % (4 if name == "rooms_polygons" else 2) == 1):
+        return JUDGE
+    return TRAIN
 
 
-def truth_table(vocab, net, everyday, also, raw, colours):
-    """[classes + 1, words]: 1 true of the class, 0 false, -1 left open."""
-    below = defaultdict(set)
-    for w in vocab.words:
-        offs = [o for o in net.first.get(w, []) if net.kind[o] in BODILY]
-        for o in set().union(*[net.lineage(o) | {o} for o in offs]) if offs else set():
-            below[o].add(vocab.index[w])
-    truth = np.zeros((len(vocab.classes) + 1, len(vocab.words)), np.int8)
-    for i, c in enumerate(vocab.classes):
-        truth[i, raw @ raw[c["own"]] > 0.62] = -1
-        truth[i, sorted(below.get(c["offset"], set()))] = -1
-        said = everyday.alike[c["name"]] | everyday.alike[c["name"].split()[-1]] | everyday.parts[c["name"]] | everyday.parts[c["name"].split()[-1]]
-        truth[i, [vocab.index[w] for w in said & set(vocab.index)]] = -1
-        truth[i, colours] = -1
-        truth[i, c["true"]] = 1
-    return truth
+class Judged:
+    """The things that are judged."""
+
+    def __init__(self, names):
+        self.names, self.things, self.count = names, [], Counter()
+
+    def add(self, name, part, photo, n, label, mask, labels):
+        """Thing `n` of a photo, if it is large enough and its name is wanted."""
+        ys, xs = np.nonzero(mask)
+        if len(ys) < 0.003 * mask.size or max(np.ptp(ys), np.ptp(xs)) + 1 < 16:
+            return
+        kind = "scenes" if name.startswith("scene_") else "open" if self.names.open(label) else "held" if part == HELD else None
+        if kind is None or kind != "scenes" and self.count[name, label] >= JUDGED_A_NAME:
+            return
+        self.count[name, label] += 1
+        everyday = self.names.everyday
+        asked = list(dict.fromkeys(labels + everyday.words))
+        self.things.append({"kind": kind, "set": name, "photo": photo, "index": n, "label": label, "asked": asked, "good": [int(everyday.may_be_said(label, x)) for x in asked]})
+
+    def write(self, args, bundle):
+        texts = sorted({x for j in self.things for x in j["asked"]})
+        order = {x: i for i, x in enumerate(texts)}
+        for j in self.things:
+            j["asked"], j["label_at"] = [order[x] for x in j["asked"]], order[j["label"]]
+        json.dump({"texts": texts, "things": self.things}, open(os.path.join(args.out, "judge.json"), "w"))
+        np.save(os.path.join(args.out, "judge_texts.npy"), embedded(args.bundle, bundle, texts)[0].astype(np.float32))
+        print("judged", Counter(j["kind"] for j in self.things), "names", {k: len({j["label"] for j in self.things if j["kind"] == k}) for k in ("open", "held", "scenes")}, flush=True)
+
+
+def whole(photo, label):
+    """A photograph of a posed scene and its index picture, as bytes, at their own size."""
+    a, b = io.BytesIO(), io.BytesIO()
+    Image.fromarray(photo).save(a, "JPEG", quality=95)
+    Image.fromarray(label).save(b, "PNG")
+    return a.getvalue(), b.getvalue()
+
+
+def pack_set(args, name, found, names, judged):
+    """photos_SET.npz; what is judged of it goes into `judged`."""
+    pics, masks, keys, parts, things = [], [], [], [], []
+    for i, key, photo, label, here, loose in found:
+        part = part_of(name, i, key, any(names.open(w) for _, w in here))
+        a, b = (whole if name.startswith("scene_") else small)(photo, label)
+        pics.append(a), masks.append(b)
+        p, labels = len(keys), sorted({w for _, w in here if w})
+        keys.append(key), parts.append(part)
+        for n, w in here:
+            things.append((p, n, names.index.get(w, -1), loose))
+            if part != TRAIN and not loose and w is not None:
+                judged.add(name, part, p, n, w, label == n, labels)
+    (a, b), (c, d) = blobs(pics), blobs(masks)
+    path = os.path.join(args.out, f"photos_{name}.npz")
+    np.savez(path, blob=a, offsets=b, mask=c, mask_at=d, key=np.array(keys), part=np.array(parts, np.uint8), thing=np.array(things, np.int32).reshape(-1, 4))
+    print(name, len(keys), "parts", np.bincount(parts, minlength=3).tolist(), "things", len(things), os.path.getsize(path) >> 10, "KiB", flush=True)
+
+
+def pack_labelled(args, rows):
+    """labelled.npz: of Tiny ImageNet the first of each class as they are, others with a short side of 128."""
+    count, kept = Counter(), []
+    for name, i, jpeg, c in rows:
+        count[name, c] += 1
+        if name != "tiny_imagenet":
+            img = Image.open(io.BytesIO(jpeg)).convert("RGB")
+            k = min(1, 128 / min(img.size))
+            kept.append((webp(img.resize([max(1, round(x * k)) for x in img.size], Image.BICUBIC), 66), c, heldout(i)))
+        elif count[name, c] <= TINY_A_CLASS:
+            kept.append((jpeg, c, heldout(i)))
+    a, b = blobs([k[0] for k in kept])
+    np.savez(os.path.join(args.out, "labelled.npz"), blob=a, offsets=b, label=np.array([k[1] for k in kept]), held=np.array([k[2] for k in kept]))
+    print("labelled", len(kept), flush=True)
 
 
 def main():
@@ -182,125 +268,21 @@ def main():
     ap.add_argument("--only", nargs="*", help="pack pictures of these sets alone (scene_NAME for a posed scene)")
     args = ap.parse_args()
     os.makedirs(args.out, exist_ok=True)
-    at = lambda n: os.path.join(args.out, n)
     images = os.path.join(args.data, "images")
-    net = WordNet(args.wordnet)
-    vocab, also, everyday = Vocabulary(net), synonyms(args.data), naming.Everyday(net)
-    rng = np.random.default_rng(9)
-
-    # Classes, in one order whatever is packed.
-    z = np.load(os.path.join(images, "imagenet1k_samples.npz"))
-    thousand = [vocab.add(str(n), str(w)) for n, w in zip(z["class_names"], z["wnid"])]
-    rows = []
-    for name, i, jpeg, word, wnid in labelled(args.data):
-        rows.append((name, i, jpeg, vocab.add(CALTECH.get(word, word.replace("_", " ")) if name == "caltech101" else word, wnid)))
-    names = {"person"}
-    for name in (*OUTLINED, *CUTOUTS):
-        with tarfile.open(os.path.join(images, name + ".tar")) as tar:
-            found = json.load(tar.extractfile([n for n in tar.getnames() if n.endswith("segments.json")][0]))
-        names |= {cuts.plain(s["name"]) for v in found.values() for s in v["segments"]} - {"background"}
-    for name in BOXED:
-        with tarfile.open(os.path.join(images, name + ".tar")) as tar:
-            found = json.load(tar.extractfile([n for n in tar.getnames() if n.endswith("boxes.json")][0]))
-        names |= {cuts.plain(b["name"]) for v in found.values() for b in v["boxes"]}
-    index = {n: vocab.add(n) for n in sorted(names)}
-    for c in vocab.classes:
-        c["true"] = list(dict.fromkeys(c["true"] + [vocab.word(w) for w in sorted(also.get(c["name"], ()))]))
-    for w in sorted(set(everyday.alike) | set(everyday.words) | withheld_words()):
-        vocab.word(w)
-    colours = [vocab.word(c) for c in COLOURS]
-    pool = [w for w, offs in net.first.items() if net.kind[offs[0]] in BODILY and len(w) < 16 and w.count(" ") < 2 and w.isascii()]
-    pool.sort(key=lambda w: -len(net.first[w]) + rng.random())
-    for w in pool[:2500]:
-        if w not in GENERAL:
-            vocab.word(w)
-    bundle = naming.Bundle(args.bundle, threads=2)
-    mine, raw = embed(args.bundle, bundle, vocab.words)
-    truth = truth_table(vocab, net, everyday, also, raw, np.array(colours))
-    # A class is withheld when a withheld word, or another word for one, is its name or true of it.
-    away = set(withheld_words())
-    away |= {s for w in withheld_words() for s in also.get(w, ())} | {n for n, s in also.items() if s & withheld_words()}
-    away = sorted(vocab.index[w] for w in away if w in vocab.index)
-    strict = sorted(vocab.index[w] for w in withheld_words())
-    own = np.array([c["own"] for c in vocab.classes])
-    withheld = (truth[:-1][:, strict] == 1).any(1) | np.isin(own, away)
-    np.savez_compressed(at("words.npz"), words=np.array(vocab.words), embed=mine.astype(np.float16), canon=bundle.texts(bundle.manifest["canon"]), truth=truth, own=own,
-                        thousand=np.array(thousand), names=np.array([c["name"] for c in vocab.classes]), withheld=withheld, colours=np.array(colours),
-                        everyday=np.array([vocab.index[w] for w in everyday.words]))
-    print("words", len(vocab.words), "classes", len(vocab.classes), "withheld", int(withheld.sum()), flush=True)
-    np.savez(at("start.npz"), **{k: v.numpy().astype(np.float16) for k, v in folded(os.path.join(args.bundle, bundle.manifest["image"]["file"])).items()})
-
+    names, bundle = Names(args, naming.Everyday(WordNet(args.wordnet))), naming.Bundle(args.bundle, threads=2)
+    names.write(args, bundle)
+    tower = folded(os.path.join(args.bundle, bundle.manifest["image"]["file"]))
+    np.savez(os.path.join(args.out, "start.npz"), **{k: v.numpy().astype(np.float16) for k, v in tower.items()})
     sources = {n: outlined(images, n) for n in (*OUTLINED, *CUTOUTS)} | {n: boxed(images, n) for n in BOXED}
     sources |= {"human_seg": people(images), "bsds500": regions(images), "coco_unlabelled": unlabelled(images)}
     sources |= {"scene_" + n: scene(os.path.join(args.data, "scenes", n)) for n in args.scenes}
-    judged, count = [], Counter()
+    judged = Judged(names)
     for name, found in sources.items():
-        if args.only and name not in args.only:
-            continue
-        pics, masks, keys, parts, things = [], [], [], [], []
-        for i, key, photo, label, things_here, loose in found:
-            open_here = [n for n, w in things_here if w in index and withheld[index[w]]]
-            if name.startswith("scene_"):
-                part = JUDGE
-            elif name in ("bsds500", "coco_unlabelled"):
-                part = TRAIN
-            elif heldout(i):
-                part = HELD
-            elif open_here and (name in CUTOUTS or zlib.crc32(key.encode()) % (4 if name == "rooms_polygons" else 2) == 1):
-                part = JUDGE
-            else:
-                part = TRAIN
-            if name.startswith("scene_"):
-                buf, png = io.BytesIO(), io.BytesIO()
-                Image.fromarray(photo).save(buf, "JPEG", quality=95)
-                Image.fromarray(label).save(png, "PNG")
-                pics.append(buf.getvalue()), masks.append(png.getvalue())
-            else:
-                a, b = small(photo, label)
-                pics.append(a), masks.append(b)
-            p, labels = len(keys), sorted({w for _, w in things_here if w})
-            keys.append(key), parts.append(part)
-            for n, w in things_here:
-                things.append((p, n, index.get(w, -1), loose))
-                area = label == n
-                ys, xs = np.nonzero(area)
-                if part == TRAIN or loose or w is None or len(ys) < 0.003 * area.size or max(np.ptp(ys), np.ptp(xs)) + 1 < 16:
-                    continue
-                is_open = w in index and bool(withheld[index[w]])
-                kind = "scenes" if name.startswith("scene_") else "open" if is_open else "held" if part == HELD else None
-                if kind is None or kind != "scenes" and count[name, w] >= JUDGED_A_NAME:
-                    continue
-                count[name, w] += 1
-                asked = list(dict.fromkeys(labels + everyday.words))
-                judged.append({"kind": kind, "set": name, "photo": p, "index": n, "label": w, "asked": asked, "good": [int(everyday.may_be_said(w, x)) for x in asked]})
-        (a, b), (c, d) = blobs(pics), blobs(masks)
-        np.savez(at(f"photos_{name}.npz"), blob=a, offsets=b, mask=c, mask_at=d, key=np.array(keys), part=np.array(parts, np.uint8), thing=np.array(things, np.int32).reshape(-1, 4))
-        print(name, len(keys), "parts", np.bincount(parts, minlength=3).tolist(), "things", len(things), os.path.getsize(at(f"photos_{name}.npz")) >> 10, "KiB", flush=True)
-    texts = sorted({x for j in judged for x in j["asked"]})
-    emb, _ = embed(args.bundle, bundle, texts)
-    order = {x: i for i, x in enumerate(texts)}
-    for j in judged:
-        j["asked"] = [order[x] for x in j["asked"]]
-        j["label_at"] = order[j["label"]]
-    json.dump({"texts": texts, "things": judged}, open(at("judge.json"), "w"))
-    np.save(at("judge_texts.npy"), emb.astype(np.float32))
-    print("judged", Counter(j["kind"] for j in judged), "names", {k: len({j["label"] for j in judged if j["kind"] == k}) for k in ("open", "held", "scenes")}, flush=True)
-
+        if not args.only or name in args.only:
+            pack_set(args, name, found, names, judged)
+    judged.write(args, bundle)
     if not args.only:
-        count, kept = Counter(), []
-        for name, i, jpeg, c in rows:
-            count[name, c] += 1
-            if name == "tiny_imagenet":
-                if count[name, c] > TINY_A_CLASS:
-                    continue
-                kept.append((jpeg, c, heldout(i)))
-            else:
-                img = Image.open(io.BytesIO(jpeg)).convert("RGB")
-                k = min(1, 128 / min(img.size))
-                kept.append((webp(img.resize([max(1, round(x * k)) for x in img.size], Image.BICUBIC), 66), c, heldout(i)))
-        a, b = blobs([k[0] for k in kept])
-        np.savez(at("labelled.npz"), blob=a, offsets=b, label=np.array([k[1] for k in kept]), held=np.array([k[2] for k in kept]))
-        print("labelled", len(kept), os.path.getsize(at("labelled.npz")) >> 10, "KiB")
+        pack_labelled(args, names.labelled)
 
 
 if __name__ == "__main__":

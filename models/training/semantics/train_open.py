@@ -30,23 +30,19 @@ import torch.nn.functional as F
 
 from colours import dominant_colour
 from cut_banks import KIND, Cuts, Prepared, drawn_bank, stacked
+from heldout import withheld_words
 from losses import Steps, Words, imagined, imagined_loss, mean_of, opinion_loss, saved, which_name, which_words
 from pictures import decode, exact, letterbox
 from salient import Salient
 from towers import fold, folded, lite2_of, normalised, unfold
 from words_model import SIDE, ImageTower
 
-HERE = os.path.dirname(os.path.abspath(__file__))
 SAVE_EVERY = 60  # seconds: a run that is cut off has weights of the last minute
 ABSENT = 0.015  # "found" is also measured at the canon where this share of false words is found
 # Learning rate; weight of the teachers' embedding, of EfficientNet-Lite2's opinion, of false words that no set shows.
 LR, HOLD, OPINION, UNSEEN = 1.6e-4, 10.0, 0.6, 0.1
 IMAGINED = 256  # features of EfficientNet-Lite2's classes, a step
 SHARES = (0.2, 0.35, 0.5, 0.65, 0.8, 1.0)  # of the way to the trained tower that are measured at the end
-
-
-def withheld_words():
-    return {w for row in open(os.path.join(HERE, "withheld.txt")) if not row.startswith("#") for w in row.strip().split(", ") if w}
 
 
 class Measure:
