@@ -101,6 +101,11 @@ impl Store {
         self.shared
     }
 
+    /// Whether a folder of this process is where it was at the start.
+    pub(crate) fn is_in_place(&self) -> bool {
+        self.objects.is_in_place()
+    }
+
     /// Bytes of scenes in memory.
     pub(crate) fn cached_bytes(&self) -> u64 {
         self.cache.weight()

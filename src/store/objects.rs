@@ -26,6 +26,22 @@ const AT_ONCE: usize = 16;
 /// How often a put to a local store is tried again because its folder was removed meanwhile.
 const FOLDER_GONE_MAX: usize = 4;
 
+/// Device and number of a folder.
+type FolderId = (u64, u64);
+
+#[cfg(unix)]
+fn folder_id(folder: &FilePath) -> Option<FolderId> {
+    use std::os::unix::fs::MetadataExt;
+    let found = fs::metadata(folder).ok()?;
+    Some((found.dev(), found.ino()))
+}
+
+/// A folder has no such number here; whether it is there.
+#[cfg(not(unix))]
+fn folder_id(folder: &FilePath) -> Option<FolderId> {
+    folder.is_dir().then_some((0, 0))
+}
+
 /// An object and what tells its versions apart.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Listed {
@@ -39,6 +55,8 @@ pub(super) struct Objects {
     store: Arc<dyn ObjectStore>,
     /// Of a local store: deletions are synced there.
     folder: Option<PathBuf>,
+    /// Which folder that was at the start.
+    own: Option<FolderId>,
     /// Runs the calls; taken when dropped.
     runtime: Option<Runtime>,
     timeout: Duration,
@@ -71,7 +89,14 @@ impl Objects {
             .enable_all()
             .build()
             .map_err(|e| Error::internal("the store's threads do not start").caused_by(e))?;
-        Ok(Self { store, folder, runtime: Some(runtime), timeout })
+        let own = folder.as_deref().and_then(folder_id);
+        Ok(Self { store, folder, own, runtime: Some(runtime), timeout })
+    }
+
+    /// Whether a local store is where it was at the start. A folder that was moved away has its
+    /// lock with it, so nothing may be written to another one of its name.
+    pub(super) fn is_in_place(&self) -> bool {
+        self.folder.as_deref().is_none_or(|folder| folder_id(folder) == self.own)
     }
 
     /// Does `call` on the store's own threads, so that any thread may wait for it.
@@ -100,8 +125,14 @@ impl Objects {
         answer.map_err(|fault| unavailable(what, fault))
     }
 
+    fn unless_moved(&self, what: &str) -> Result<()> {
+        let moved = || fault("the data folder was moved or removed");
+        if self.is_in_place() { Ok(()) } else { Err(unavailable(what, moved())) }
+    }
+
     /// Keeps an object, whatever was there.
     pub(super) fn put(&self, what: &str, path: Path, bytes: impl Into<PutPayload>) -> Result<()> {
+        self.unless_moved(what)?;
         let bytes: PutPayload = bytes.into();
         let file = self.folder.as_ref().map(|folder| folder.join(path.as_ref()));
         self.run(what, |store| async move {
@@ -123,6 +154,7 @@ impl Objects {
 
     /// Keeps an object unless there is one; whether it was kept.
     pub(super) fn create(&self, what: &str, path: Path, bytes: Vec<u8>) -> Result<bool> {
+        self.unless_moved(what)?;
         let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
         self.run(what, |store| async move {
             match store.put_opts(&path, bytes.into(), options).await {

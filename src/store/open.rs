@@ -158,7 +158,7 @@ impl Store {
 /// may hold it for a moment, until the child is another program.
 fn lock(root: &Path) -> Result<fs::File> {
     let prepare = || -> std::io::Result<fs::File> {
-        fs::create_dir_all(root)?;
+        create_private(root)?;
         fs::OpenOptions::new().create(true).truncate(false).write(true).open(root.join("lock"))
     };
     let lock = prepare().map_err(|cause| files::unavailable("open the data folder", cause))?;
@@ -171,6 +171,15 @@ fn lock(root: &Path) -> Result<fs::File> {
         thread::sleep(LOCK_LOOK);
     }
     Ok(lock)
+}
+
+/// Makes a folder, where there is none, that nobody else may read.
+fn create_private(folder: &Path) -> std::io::Result<()> {
+    let mut builder = std::fs::DirBuilder::new();
+    builder.recursive(true);
+    #[cfg(unix)]
+    std::os::unix::fs::DirBuilderExt::mode(&mut builder, 0o700);
+    builder.create(folder)
 }
 
 fn local(root: &Path) -> Result<(PathBuf, LocalFileSystem)> {

@@ -543,6 +543,23 @@ fn a_key_and_a_content_lead_to_their_owners_scene_only() {
     }
 }
 
+#[cfg(unix)]
+#[test]
+fn a_data_folder_is_its_owners_and_a_moved_one_is_not_written_to() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = tempfile::tempdir().unwrap();
+    let (data, away) = (folder.path().join("data"), folder.path().join("away"));
+    let (store, _) = open(&data);
+    assert_eq!(fs::metadata(&data).unwrap().permissions().mode() & 0o777, 0o700);
+    store.put_upload(upload(), &record(1)).unwrap();
+    fs::rename(&data, &away).unwrap();
+    let moved = store.put_upload(upload(), &record(2)).unwrap_err();
+    assert_eq!(moved.code(), ErrorCode::StoreUnavailable);
+    assert!(!data.exists(), "another folder of its name was made");
+    fs::rename(&away, &data).unwrap();
+    store.put_upload(upload(), &record(2)).expect("it is back");
+}
+
 #[test]
 fn one_process_holds_a_folder() {
     let folder = tempfile::tempdir().unwrap();
