@@ -13,7 +13,6 @@ use rayon::prelude::*;
 use super::{
     Service,
     export::stream,
-    npz::NpzWriter,
     request::{FeatureKind, FeaturesSpec, Kind, PictureOptions},
     search::{LabelledView, SceneTexts, Subject, check_scoring},
     types::Export,
@@ -21,6 +20,7 @@ use super::{
 };
 use crate::{
     error::{Error, ErrorCode, Result},
+    formats::npz::NpzWriter,
     limits::Limits,
     render::Kinds,
     scene::{Bank, PixelWeights, SceneId},

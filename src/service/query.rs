@@ -12,7 +12,6 @@ use super::{
     request::{
         Boxes, CameraSpec, Format, Kind, LensSpec, MaskFormat, PictureOptions, PoseSpec, QuerySpec,
     },
-    rle::Rle,
     search::{self, LabelledView, SceneTexts, ScoredText},
     texts,
     times::{ViewTimes, staged},
@@ -21,6 +20,7 @@ use super::{
 };
 use crate::{
     error::Result,
+    formats::rle::Rle,
     limits::Limits,
     render::Kinds,
     scene::SceneId,

@@ -31,13 +31,13 @@ use super::{
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    names::shown,
+    names::{hex, shown},
     render::{
         self, Frame, Kinds, Labels, RenderRequest, Samples,
         plan::{self, NEAR_RANGE, ViewMethod, default_near},
     },
     scene::{Camera, Intrinsics, Method, Preset, Scene, SceneCamera, SceneId},
-    store::{Record, hex},
+    store::Record,
     telemetry::meter,
 };
 

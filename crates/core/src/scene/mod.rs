@@ -29,7 +29,7 @@ pub use gaussians::{BLUR_PX2, Gaussians, RawGaussians, SH_C0, SanitizeReport, So
 pub use geometry::ViewGaussians;
 pub use id::{SCENE_ID_CHARS, SceneId};
 pub use method::{MaskLevel, Method, Preset, SceneOptions, ScoringMethod, with_pairs};
-pub use photo::{Crop, CropShape, Photo, PosedPhoto};
+pub use photo::{Crop, CropShape, Photo, PosedPhoto, photo_label};
 pub use refinement::{Refine, RefineReport, RefineState, RefineStatus};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{
