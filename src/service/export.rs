@@ -12,8 +12,6 @@ use super::{
     Service,
     create::blocking,
     features,
-    folder::FolderFormat,
-    packed::write_packed,
     page::write_page,
     query,
     request::{ExportFormat, QuerySpec, TextOptions, ViewOptions},
@@ -25,8 +23,13 @@ use super::{
 };
 use crate::{
     error::{Error, Result},
+    formats::{
+        folders::FolderFormat,
+        packed::write_packed,
+        splats::{SplatFile, SplatFormat},
+    },
+    render::plan::{default_near, widened},
     scene::{Gaussians, Preset, Scene, SceneId, Semantics},
-    store::splats::{SplatFile, SplatFormat},
 };
 
 /// Parts that wait for the caller to take them.
@@ -79,13 +82,15 @@ impl Service {
             let digest = etag(&semantics_tag(&scene));
             if format == ExportFormat::Packed {
                 let (file_name, etag) = (format!("{id}.segsplat"), format!("{digest}-packed"));
-                let chunks = stream(move |to: &mut dyn Write| write_packed(&scene, to));
+                let chunks = stream(move |to: &mut dyn Write| {
+                    write_packed(&scene, default_near(scene.meta.report.median_depth), to)
+                });
                 return Ok(Export::new(file_name, etag, chunks));
             }
             let splats = splats(format)?;
             let write = move || {
                 let semantics = scene.semantics.as_deref();
-                SplatFile::of_scene(splats, &scene, &scene.gaussians, semantics)
+                scene_splats(splats, &scene, &scene.gaussians, semantics)
             };
             return Ok(gaussians(&id.to_string(), &digest, blocking(write).await??));
         };
@@ -165,7 +170,21 @@ fn part(
     of: &Semantics,
 ) -> Result<SplatFile> {
     let semantics = Semantics { index: gaussians.semantic_index().to_vec(), ..of.clone() };
-    SplatFile::of_scene(splats, scene, gaussians, Some(&semantics))
+    scene_splats(splats, scene, gaussians, Some(&semantics))
+}
+
+/// Some Gaussians of a scene as a file that other programs draw: with the blur that the scene's own
+/// views add to what they magnify.
+///
+/// # Errors
+/// As [`SplatFile::new`].
+pub fn scene_splats(
+    format: &'static SplatFormat,
+    scene: &Scene,
+    gaussians: &Gaussians,
+    semantics: Option<&Semantics>,
+) -> Result<SplatFile> {
+    SplatFile::new(format, widened(scene, gaussians, None)?, semantics)
 }
 
 /// A file with Gaussians; `stem` is its name without the ending.

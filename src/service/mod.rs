@@ -11,15 +11,12 @@ mod features;
 mod folder;
 mod infer;
 mod memory;
-mod npz;
 mod offline;
-mod packed;
 mod page;
 mod pick;
 mod query;
 mod refine;
 mod request;
-mod rle;
 mod schedule;
 mod search;
 mod semantics;
@@ -36,7 +33,7 @@ use futures_util::{Stream, stream};
 use parking_lot::RwLock;
 use tokio::sync::Semaphore;
 
-pub use self::folder::{FOLDER_FORMATS, FolderFormat};
+pub use self::export::scene_splats;
 pub use self::infer::InferSpec;
 pub use self::page::{VIEWER, ViewerPage};
 pub(crate) use self::refine::check_refine;
@@ -48,13 +45,13 @@ pub use self::{
         FeaturesSpec, Format, Kind, LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions,
         PoseSpec, QuerySpec, ScoringOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec,
     },
-    rle::Rle,
     times::ViewTimes,
     types::{
         Created, Export, InstanceBox, KnownWord, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
         QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning, Trust,
     },
 };
+pub use crate::formats::rle::Rle;
 pub use crate::render::{Quality, plan::default_near};
 pub use crate::scene::{
     Density, Event, MaskLevel, Method, Preset, SceneCamera, SceneError, SceneOptions, SceneState,

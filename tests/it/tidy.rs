@@ -55,12 +55,18 @@ const GOLDEN_BYTES_MAX: u64 = 64 << 10;
 const TREE_BYTES_MAX: u64 = 48 << 20;
 
 /// A crate's name and where it may be named.
-const CONFINED: [(&str, &[&str]); 12] = [
+const CONFINED: [(&str, &[&str]); 16] = [
     ("axum", &["src/api/http"]),
     ("tower_http", &["src/api/http"]),
     (
         "utoipa",
-        &["src/api/http", "src/service", "crates/core/src/scene", "crates/render/src/lib.rs"],
+        &[
+            "src/api/http",
+            "src/service",
+            "crates/core/src/scene",
+            "crates/formats/src/rle.rs",
+            "crates/render/src/lib.rs",
+        ],
     ),
     ("tonic", &["src/api/grpc", "lab/src/load"]),
     ("tonic_health", &["src/api/grpc"]),
@@ -69,6 +75,10 @@ const CONFINED: [(&str, &[&str]); 12] = [
     ("ort", &["crates/vision/src/models"]),
     ("wgpu", &["crates/render/src/gpu"]),
     ("object_store", &["src/store"]),
+    ("safetensors", &["crates/formats/src/container", "lab/src/frames"]),
+    ("flate2", &["crates/formats/src"]),
+    ("ruzstd", &["crates/formats/src"]),
+    ("tar", &["crates/formats/src/captures", "lab/src/words"]),
     ("opentelemetry", &["src/telemetry"]),
     ("clap", &["src/cli", "src/config.rs", "src/main.rs", "src/service/request.rs", "lab/src"]),
 ];
