@@ -11,7 +11,7 @@ use crate::{
     error::{Error, Result},
     names::named,
     scene::Preset,
-    service::{FOLDER_FORMATS, FolderFormat, OfflineService, ScoringOptions},
+    service::{FOLDER_FORMATS, FolderFormat, ScoringOptions},
     store::splats::{SplatFile, SplatFormat, endings},
 };
 
@@ -81,8 +81,7 @@ fn folder(args: &Args, format: &FolderFormat, config: &Config, out: &Output) -> 
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
     let photos = args.photos.as_deref();
     let upload = photos.map(|path| reconstruct::upload(path, config)).transpose()?;
-    let semantics = engine::semantics(config, format.texts)?;
-    let service = OfflineService::new(semantics, engine::renderer(config)?, config.limits.clone());
+    let service = engine::offline(config, format.texts)?;
     let unwritable = |e| scene_file::unwritable(&args.output, e);
     // Half a zip is of no use, and what was there before stays until there is a whole one.
     let part = args.output.with_added_extension("part");
