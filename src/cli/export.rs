@@ -9,10 +9,13 @@ use super::{engine, output::Output, reconstruct, scene_file};
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
+    formats::{
+        folders::{FOLDER_FORMATS, FolderFormat},
+        splats::{SplatFormat, endings},
+    },
     names::named,
     scene::Preset,
-    service::{FOLDER_FORMATS, FolderFormat, ScoringOptions},
-    store::splats::{SplatFile, SplatFormat, endings},
+    service::{ScoringOptions, scene_splats},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -67,7 +70,7 @@ fn gaussians(
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
     let count = scene.gaussians.len();
     let semantics = scene.semantics.as_deref();
-    let file = SplatFile::of_scene(format, &scene, &scene.gaussians, semantics)?;
+    let file = scene_splats(format, &scene, &scene.gaussians, semantics)?;
     scene_file::write_splats(&args.output, &file)?;
     let path = args.output.display();
     let value = json!({

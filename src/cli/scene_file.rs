@@ -8,12 +8,12 @@ use std::{
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    limits::Limits,
-    scene::{Scene, SceneOptions},
-    store::{
-        read_scene, read_semantics,
+    formats::{
+        container::{read_scene, read_semantics},
         splats::{SplatFile, SplatFormat, SplatsRead, read_splats},
     },
+    limits::Limits,
+    scene::{Scene, SceneOptions},
 };
 
 /// Name of the scene file where a folder is named.

@@ -21,9 +21,7 @@ use super::{
     Inner, Service,
     create::blocking,
     features,
-    folder::FolderFormat,
     memory::Share,
-    packed::write_packed,
     page::write_page,
     query,
     request::{ExportFormat, QuerySpec, TextOptions, ViewOptions},
@@ -34,8 +32,13 @@ use super::{
 };
 use crate::{
     error::{Error, Result},
+    formats::{
+        folders::FolderFormat,
+        packed::write_packed,
+        splats::{SplatFile, SplatFormat},
+    },
+    render::plan::{default_near, widened},
     scene::{Gaussians, Preset, Scene, SceneId, Semantics},
-    store::splats::{SplatFile, SplatFormat},
 };
 
 /// Parts that wait for the caller to take them.
@@ -188,7 +191,9 @@ impl Service {
             if format == ExportFormat::Packed {
                 let (file_name, etag) = (format!("{id}.segsplat"), format!("{digest}-packed"));
                 let work_bytes = order_bytes(&scene.gaussians);
-                let write = move |to: &mut dyn Write| write_packed(&scene, to);
+                let write = move |to: &mut dyn Write| {
+                    write_packed(&scene, default_near(scene.meta.report.median_depth), to)
+                };
                 let export = Export::new(&self.inner, file_name, etag, write);
                 return Ok(export.working_in(work_bytes));
             }
@@ -196,7 +201,7 @@ impl Service {
             let work_bytes = work_bytes(splats, &scene.gaussians);
             let build = move || {
                 let semantics = scene.semantics.as_deref();
-                SplatFile::of_scene(splats, &scene, &scene.gaussians, semantics)
+                scene_splats(splats, &scene, &scene.gaussians, semantics)
             };
             return Ok(self.gaussians(&id.to_string(), &digest, splats, work_bytes, build));
         };
@@ -300,11 +305,25 @@ fn part(
     of: &Semantics,
 ) -> Result<SplatFile> {
     let semantics = Semantics { index: gaussians.semantic_index().to_vec(), ..of.clone() };
-    SplatFile::of_scene(splats, scene, gaussians, Some(&semantics))
+    scene_splats(splats, scene, gaussians, Some(&semantics))
 }
 
-/// The parts of a file that `write` writes on a blocking thread. A fault ends them. A caller who has
-/// not taken a part at a given time gets no more.
+/// Some Gaussians of a scene as a file that other programs draw: with the blur that the scene's own
+/// views add to what they magnify.
+///
+/// # Errors
+/// As [`SplatFile::new`].
+pub fn scene_splats(
+    format: &'static SplatFormat,
+    scene: &Scene,
+    gaussians: &Gaussians,
+    semantics: Option<&Semantics>,
+) -> Result<SplatFile> {
+    SplatFile::new(format, widened(scene, gaussians, None)?, semantics)
+}
+
+/// The parts of a file that `write` writes on a blocking thread. A fault ends them. A caller who
+/// has not taken a part at a given time gets no more.
 fn stream_until(
     until: Option<Instant>,
     write: impl FnOnce(&mut dyn Write) -> Result<()> + Send + 'static,

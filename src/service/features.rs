@@ -13,7 +13,6 @@ use rayon::prelude::*;
 use super::{
     Service,
     export::Export,
-    npz::NpzWriter,
     request::{FeatureKind, FeaturesSpec, Kind, ViewSpec},
     schedule::Demand,
     search::{LabelledView, SceneTexts, ScoringChoice},
@@ -24,6 +23,7 @@ use super::{
 };
 use crate::{
     error::{Error, ErrorCode, Result},
+    formats::npz::NpzWriter,
     limits::Limits,
     scene::{Bank, PixelWeights, SceneId, Semantics},
 };

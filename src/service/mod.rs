@@ -11,15 +11,12 @@ mod features;
 mod folder;
 mod infer;
 mod memory;
-mod npz;
 mod offline;
-mod packed;
 mod page;
 mod pick;
 mod query;
 mod refine;
 mod request;
-mod rle;
 mod schedule;
 mod search;
 mod semantics;
@@ -36,8 +33,7 @@ use futures_util::{Stream, stream};
 use parking_lot::RwLock;
 use tokio::sync::{Semaphore, watch};
 
-pub use self::export::{Export, ExportBody, ExportPlace};
-pub use self::folder::{FOLDER_FORMATS, FolderFormat};
+pub use self::export::{Export, ExportBody, ExportPlace, scene_splats};
 pub use self::infer::InferSpec;
 pub use self::memory::Share;
 pub use self::page::{VIEWER, ViewerPage};
@@ -50,13 +46,13 @@ pub use self::{
         FeaturesSpec, Format, Kind, LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions,
         PoseSpec, QuerySpec, ScoringOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec,
     },
-    rle::Rle,
     times::ViewTimes,
     types::{
         Created, InstanceBox, KnownWord, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
         QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning, Trust,
     },
 };
+pub use crate::formats::rle::Rle;
 pub use crate::render::{Quality, plan::default_near};
 pub use crate::scene::{
     Density, Event, MaskLevel, Method, Preset, SceneCamera, SceneError, SceneOptions, SceneState,
@@ -278,7 +274,8 @@ impl Service {
         create::blocking(move || inner.jobs.delete(&gone)).await?
     }
 
-    /// What happens to a scene, from its present state to the last event, or until the server stops.
+    /// What happens to a scene, from its present state to the last event, or until the server
+    /// stops.
     ///
     /// # Errors
     /// `scene_not_found`.

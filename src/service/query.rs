@@ -12,7 +12,6 @@ use super::{
     request::{
         Boxes, CameraSpec, Format, Kind, LensSpec, MaskFormat, PoseSpec, QuerySpec, ViewSpec,
     },
-    rle::Rle,
     schedule::Demand,
     search::{LabelledView, SceneTexts, ScoredText, ScoringChoice},
     texts,
@@ -23,6 +22,7 @@ use super::{
 };
 use crate::{
     error::Result,
+    formats::rle::Rle,
     limits::Limits,
     scene::SceneId,
     semantics::{Instance, InstanceOptions, Scorer},

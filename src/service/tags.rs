@@ -6,8 +6,9 @@ use sha2::{Digest, Sha256};
 use super::request::ScoringOptions;
 use crate::{
     error::{Error, Result},
+    names::hex,
     scene::{Preset, Scene, SceneId},
-    store::{Record, hex},
+    store::Record,
 };
 
 /// Values as text: equal text means equal values. Numbers are written to their last bit.

@@ -9,10 +9,10 @@ use utoipa::ToSchema;
 use super::{
     memory::Share,
     request::{Format, Kind},
-    rle::Rle,
     times::ViewTimes,
 };
 use crate::{
+    formats::rle::Rle,
     render::FrameStats,
     scene::{Camera, SceneStatus, ScoringMethod},
 };

@@ -2,9 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{container::unread_json, files::hex};
 use crate::{
     error::{Error, ErrorCode, Result},
+    formats::container::unread_json,
+    names::hex,
     scene::{SceneOptions, SceneStatus},
 };
 use sha2::{Digest, Sha256};

@@ -7,9 +7,10 @@
 use std::{fs, path::Path};
 
 use segsplat::{
+    formats::container::{write_scene, write_semantics},
     limits::Limits,
     scene::{SceneId, SceneState},
-    store::{Place, Record, Store, write_scene, write_semantics},
+    store::{Place, Record, Store},
 };
 use serde_json::Value;
 

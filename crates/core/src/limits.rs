@@ -167,8 +167,8 @@ limits! {
     answer_bytes_min: usize = 128 << 10, restart;
     /// Milliseconds in which `answer_bytes_min` must be taken: 8 kilobytes a second, unless set.
     answer_window_ms: u64 = 16_000, restart;
-    /// Bytes of pictures and other whole answers in memory until their callers have taken them, and
-    /// at most a quarter of `memory_bytes_max`. One answer may take a quarter of what is left, or be
+    /// Bytes of pictures and other whole answers in memory until their callers have taken them; at
+    /// most a quarter of `memory_bytes_max`. One answer may take a quarter of what is left, or be
     /// alone; else it is refused as `overloaded`.
     answers_bytes_max: u64 = 1 << 30;
     /// Exports that are being written or sent. One more is refused as `overloaded`.

@@ -9,9 +9,10 @@ use std::{
 
 use tokio::{runtime::Handle, sync::OwnedSemaphorePermit};
 
-use super::{Contents, FolderFormat, Views, depth_of, masks_of, photo_views, write};
+use super::{Contents, Views, checked_texts, depth_of, masks_of, photo_views, write};
 use crate::{
     error::{Error, ErrorCode, Result},
+    formats::folders::FolderFormat,
     keys::Caller,
     limits::Limits,
     scene::{Preset, Scene, SceneId, Upload},
@@ -112,7 +113,7 @@ impl Service {
         ask: &TextOptions,
     ) -> Result<Export> {
         let (inner, limits) = (Arc::clone(&self.inner), self.limits());
-        let texts = format.checked(&texts::lines(ask), &limits)?;
+        let texts = checked_texts(format, &texts::lines(ask), &limits)?;
         let access = self.scene(id).await?.finished()?;
         let record = access.record();
         let views = photo_views(&limits, &record.status.cameras, record, preset, texts.len())?;
@@ -192,7 +193,7 @@ impl OfflineService {
     ) -> Result<usize> {
         let limits = &self.limits;
         texts::check_scoring(scoring, limits)?;
-        let asked = format.checked(asked, limits)?;
+        let asked = checked_texts(format, asked, limits)?;
         let views = photo_views(limits, &scene.meta.cameras, &**scene, preset, asked.len())?;
         let texts = if asked.is_empty() {
             None
