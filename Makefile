@@ -6,6 +6,7 @@
 #               program that is built already)
 # make page    the page in a headless Chromium, with a real server (SEGSPLAT_BIN as above)
 # make page-long   a scene of 4,000,000 Gaussians in the page: bytes, times and memory
+# make unread   memory, threads and views while hundreds of callers read nothing of their answers
 # make proto   buf: rules of the calls, and whether they break clients of the commit before
 # make judge   other programs read what this one writes, and what is in docker
 # make image   builds the container images and proves what docs/operations.md says of them
@@ -27,7 +28,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-splats judge-three judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: unread client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-splats judge-three judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -89,6 +90,9 @@ page page-long: venv
 		-r tests/page/requirements.txt
 	SEGSPLAT_BIN=$(PROGRAM) $(if $(filter page-long,$@),PAGE_GAUSSIANS=4000000) \
 		$(CLIENT)/venv/bin/python -m pytest $(if $(filter page-long,$@),-s tests/page/test_large.py,tests/page)
+
+unread: $(if $(SEGSPLAT_BIN),,build)
+	python3 tests/tools/unread.py $(abspath $(or $(SEGSPLAT_BIN),$(SEGSPLAT)))
 
 wheel: $(if $(SEGSPLAT_BIN),,build)
 	SEGSPLAT_BIN=$(abspath $(or $(SEGSPLAT_BIN),$(SEGSPLAT))) python3 -m pip wheel --no-deps \
