@@ -171,6 +171,7 @@ async fn nothing_more_is_drawn_for_a_caller_who_has_gone() {
         }
     };
     // One is drawn, and the next one of the call waits behind it.
+    until(&|| renderer.begun.load(Ordering::Acquire) == 1);
     until(&|| server.service.ready().renders == 2);
     drop(pictures);
     until(&|| server.service.ready().renders == 1);

@@ -2,10 +2,10 @@
 
     unread.py PROGRAM [WHAT...]     WHAT: readers, pictures, exports (all by default)
 
-readers: 600 connections ask for an export of 100,000 Gaussians and read nothing, while views are
-asked one after another. pictures: 40 connections ask for 4096 x 4096 pictures as f32 and read
-nothing. exports: 12 connections ask for SOG files of 4,000,000 Gaussians and read nothing. A line for
-each says what came back; the program ends with 1 where a bar is missed.
+readers: 600 connections ask for an export of 100,000 Gaussians and read nothing, while views
+are asked one after another. pictures: 40 connections ask for 4096 x 4096 pictures as f32 and read
+nothing. exports: 12 connections ask for SOG files of 4,000,000 Gaussians and read nothing. A line
+for each says what came back; the program ends with 1 where a bar is missed.
 """
 
 from __future__ import annotations
