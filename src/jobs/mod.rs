@@ -1,9 +1,12 @@
 //! Jobs: a bounded queue, workers, progress for watchers, and a way to stop each job.
 //!
-//! A job makes a scene of an upload, or the semantics of a scene, or refines it. In: an upload,
-//! safe in the store before `Jobs::submit` returns. Out: a scene in the store. Invariant: an
-//! acknowledged scene is made, fails with a code, or is cancelled, over any restart.
+//! A job makes a scene of an upload, or the semantics of a scene, or refines it: `KINDS` lists the
+//! kinds, each of which is one implementation of `JobKind`. In: an upload, safe in the store before
+//! `Jobs::submit` returns. Out: a scene in the store. Invariant: an acknowledged scene is made,
+//! fails with a code, or is cancelled, over any restart.
 
+mod bell;
+mod change;
 mod job;
 mod networks;
 mod photos;
@@ -26,7 +29,7 @@ use std::{
     time::Duration,
 };
 
-use parking_lot::{Condvar, Mutex};
+use parking_lot::Mutex;
 use tokio::sync::watch;
 
 pub use self::networks::{
@@ -36,7 +39,9 @@ pub use self::networks::{
 pub(crate) use self::refine::{budget_ms, refine_options, refiner};
 
 use self::{
-    job::{Kind, Reason, Running},
+    bell::Bell,
+    change::{Attempt, Change, forget_semantics_job},
+    job::{JobKind, Kind, Reason, Running},
     photos::{ReadUpload, ReadUploads},
     queue::{Full, Queue},
     records::Records,
@@ -45,19 +50,35 @@ use self::{
 };
 use crate::{
     error::{Error, ErrorCode, Result},
-    limits::Limits,
+    limits::LiveLimits,
     render::{Renderer, backward::DifferentiableRenderer},
-    scene::{PhotoHash, Refine, SceneId, SceneState, SemanticsMode, SemanticsState, Upload},
+    scene::{
+        PhotoHash, Refine, SceneId, SceneState, SemanticsMode, SemanticsState, SemanticsStatus,
+        Upload,
+    },
     store::{self, KeyUse, Record, Store, not_found},
+    telemetry::meter,
 };
+
+const SCENE: Kind = &scene::MakeScene;
+const SEMANTICS: Kind = &semantics::MakeSemantics;
+const REFINE: Kind = &refine::RefineScene;
+
+/// Every kind of job.
+const KINDS: [Kind; 3] = [SCENE, SEMANTICS, REFINE];
+
+/// Names of the kinds of job, as in metrics.
+pub fn kinds() -> impl Iterator<Item = &'static str> {
+    KINDS.into_iter().map(JobKind::name)
+}
 
 /// The parts that jobs need.
 pub(crate) struct JobParts {
     pub(crate) store: Arc<Store>,
     pub(crate) scenes: Arc<dyn SceneNetworks>,
     pub(crate) semantics: Arc<dyn SemanticNetworks>,
-    /// Caps; those of jobs stay as they are at the start.
-    pub(crate) limits: Limits,
+    /// Caps in force.
+    pub(crate) limits: Arc<LiveLimits>,
     /// Scenes made at the same time, and semantics made at the same time.
     pub(crate) workers: usize,
     /// Whether the photos of finished scenes are kept.
@@ -85,10 +106,10 @@ pub(crate) struct Jobs {
     replicas: Box<dyn Replicas>,
     /// Workers that make scenes and live.
     workers: AtomicUsize,
-    /// Content hashes that workers make scenes of, ids of scenes that they change, and a
-    /// signal when one ends.
-    contents: Mutex<HashSet<String>>,
-    content_free: Condvar,
+    /// Content hashes that workers make scenes of, and ids of scenes that they change.
+    locked: Mutex<HashSet<String>>,
+    /// Wakes threads that wait for a record, a lock, room or the end of a job.
+    bell: Arc<Bell>,
     /// Milliseconds that the last scenes took, smoothed; 0 before the first.
     scene_ms: AtomicU64,
     /// Whether a job ended since freed memory last went back to the system.
@@ -101,19 +122,20 @@ impl Jobs {
     /// stopped. The threads live until [`Self::shut_down`].
     /// Fails with `internal` when a thread cannot be started.
     pub(crate) fn start(parts: JobParts, mut records: Vec<Record>) -> Result<Arc<Self>> {
+        let (limits, bell) = (parts.limits.get(), Arc::<Bell>::default());
         let jobs = Arc::new(Self {
-            records: Records::default(),
-            queue: Queue::new(parts.limits.queued_jobs_max),
-            running: Running::default(),
+            records: Records::new(Arc::clone(&parts.store), Arc::clone(&bell)),
+            queue: Queue::new(limits.queued_jobs_max),
+            running: Running::new(Arc::clone(&bell)),
             uploads: ReadUploads::new(
-                parts.limits.read_uploads_bytes_max,
-                Duration::from_millis(parts.limits.first_text_photos_ms),
+                limits.read_uploads_bytes_max,
+                Duration::from_millis(limits.first_text_photos_ms),
             ),
-            room: Room::new(parts.limits.photos_max),
+            room: Room::new(Arc::clone(&bell)),
             replicas: replicas::of(&parts)?,
             workers: AtomicUsize::new(parts.workers),
-            contents: Mutex::default(),
-            content_free: Condvar::new(),
+            locked: Mutex::default(),
+            bell,
             scene_ms: AtomicU64::new(0),
             freed: AtomicBool::new(false),
             threads: Mutex::default(),
@@ -123,7 +145,8 @@ impl Jobs {
         for record in records {
             jobs.take_up(record);
         }
-        let start = |name: String, life: fn(&Self)| {
+        meter::register_jobs(kinds());
+        let start = |name: String, life: Box<dyn FnOnce(&Self) + Send>| {
             let shared = Arc::clone(&jobs);
             let thread = std::thread::Builder::new().name(name).spawn(move || life(&shared));
             let thread =
@@ -132,14 +155,15 @@ impl Jobs {
             Ok(())
         };
         let start_all = || {
-            for i in 0..jobs.parts.workers {
-                start(format!("scene-{i}"), |jobs| jobs.work(Kind::Scene))?;
-                start(format!("semantics-{i}"), |jobs| jobs.work(Kind::Semantics))?;
+            for kind in KINDS {
+                for i in 0..kind.threads(jobs.parts.workers) {
+                    let name = format!("{}-{i}", kind.name());
+                    start(name, Box::new(move |jobs| jobs.work(kind)))?;
+                }
             }
-            start("refine".to_owned(), |jobs| jobs.work(Kind::Refine))?;
-            start("sweeper".to_owned(), Self::sweep)?;
+            start("sweeper".to_owned(), Box::new(Self::sweep))?;
             if jobs.replicas.name().is_some() {
-                start("replicas".to_owned(), |jobs| jobs.replicas.watch(jobs))?;
+                start("replicas".to_owned(), Box::new(|jobs| jobs.replicas.watch(jobs)))?;
             }
             Ok(())
         };
@@ -154,16 +178,12 @@ impl Jobs {
     /// `invalid_request`, `photo_unreadable`, `limit_exceeded` where the upload cannot be a scene;
     /// `idempotency_key_reused` when the key was used with others; `overloaded` when the queue is
     /// full or the server stops.
-    pub(crate) fn submit(
-        &self,
-        upload: Upload,
-        mut record: Record,
-        limits: &Limits,
-    ) -> Result<SceneId> {
-        let read = ReadUpload::of(&upload, &record.options, limits, &AtomicBool::new(false))?;
+    pub(crate) fn submit(&self, upload: Upload, mut record: Record) -> Result<SceneId> {
+        let (limits, never) = (self.parts.limits.get(), AtomicBool::new(false));
+        let read = ReadUpload::of(&upload, &record.options, &limits, &never)?;
         record.options.semantics = read.semantics(record.options.semantics);
         if record.options.semantics == SemanticsMode::Off {
-            record.status.semantics.state = SemanticsState::Off;
+            record.status.semantics = SemanticsStatus::new(SemanticsState::Off);
         }
         let files = &read.files;
         record.request_sha256 = store::request_sha256(files, &record.options);
@@ -171,7 +191,7 @@ impl Jobs {
         if let Some(earlier) = self.earlier(files, &record)? {
             return Ok(earlier);
         }
-        let reserved = self.queue.reserve(Kind::Scene, record.owner.as_deref());
+        let reserved = self.queue.reserve(SCENE, record.owner.as_deref());
         let place = reserved.map_err(|full| self.overloaded(full))?;
         record.replica = self.replicas.name().map(str::to_owned);
         let id = record.status.id.clone();
@@ -252,7 +272,7 @@ impl Jobs {
     /// Refuses where another scene of this owner would not be queued now.
     /// Fails with `overloaded` when the queue is full or the server stops.
     pub(crate) fn has_room(&self, owner: Option<&str>) -> Result<()> {
-        let reserved = self.queue.reserve(Kind::Scene, owner);
+        let reserved = self.queue.reserve(SCENE, owner);
         reserved.map(drop).map_err(|full| self.overloaded(full))
     }
 
@@ -308,20 +328,16 @@ impl Jobs {
     /// Fails with `scene_not_found`.
     pub(crate) fn delete(&self, id: &SceneId) -> Result<()> {
         let record = self.record(id)?;
-        self.queue.remove(id);
-        self.running.stop(Some(id), Reason::Cancelled);
+        self.queue.remove(id, None);
+        self.running.stop(Reason::Cancelled, |job| job.scene == *id);
+        self.bell.ring();
         let removed = self.parts.store.remove(&record);
         let removed_here = removed.is_ok();
         match removed {
             // A job that was about to end may have removed its own objects first.
             Err(error) if error.code() != ErrorCode::SceneNotFound => {
                 // It still exists, but no job makes it any more.
-                self.records.update(id, |record| {
-                    records::cancel(record);
-                    if record.status.semantics.state == SemanticsState::Running {
-                        record.status.semantics = Default::default();
-                    }
-                });
+                self.records.apply(id, &Change::Stopped)?;
                 return Err(error);
             }
             _ => {}
@@ -338,7 +354,7 @@ impl Jobs {
 
     /// Marks a finished scene as failed: its file turned out to be bad.
     pub(crate) fn spoil(&self, id: &SceneId, error: &Error) {
-        self.fail(Kind::Scene, id, error);
+        self.fail(SCENE, id, error);
     }
 
     /// Bytes of photos in memory, for jobs and for first texts.
@@ -348,7 +364,7 @@ impl Jobs {
 
     /// Scenes that wait for a worker, and scenes that a worker makes.
     pub(crate) fn counts(&self) -> (usize, usize) {
-        (self.queue.len(Kind::Scene), self.running.scenes(Kind::Scene).len())
+        (self.queue.len(SCENE), self.running.scenes(SCENE).len())
     }
 
     /// Whether the networks are open.
@@ -361,16 +377,19 @@ impl Jobs {
         self.parts.scenes.remark()
     }
 
-    /// Whether the queue takes jobs and a worker lives.
+    /// Whether the queue takes jobs, a worker lives, and the store keeps what it is given.
     pub(crate) fn is_open(&self) -> bool {
-        !self.queue.is_closed() && self.workers.load(Ordering::Relaxed) > 0
+        !self.queue.is_closed()
+            && self.workers.load(Ordering::Relaxed) > 0
+            && self.parts.store.keeps()
     }
 
     /// Stops taking jobs, asks running ones to stop, waits for them. They are queued again at the
     /// next start.
     pub(crate) fn shut_down(&self) {
         self.queue.close();
-        self.running.stop(None, Reason::Shutdown);
+        self.running.stop(Reason::Shutdown, |_| true);
+        self.bell.ring();
         for thread in self.threads.lock().drain(..) {
             if thread.join().is_err() {
                 tracing::error!("a worker had panicked");
@@ -381,32 +400,30 @@ impl Jobs {
     /// Continues a scene that an earlier run of the program left.
     fn take_up(&self, mut record: Record) {
         let (id, owner) = (record.status.id.clone(), record.owner.clone());
+        let (queued, ordered) =
+            (Change::Requeued(SCENE, Attempt::Counts), Change::SemanticsOrdered);
+        let now_ms = store::now_ms();
         let unfinished = !record.status.state.is_final();
         if unfinished {
             tracing::info!(scene = %id, attempts = record.attempts, "queued again");
-            scene::requeue(&mut record);
+            queued.apply(&mut record, now_ms);
         }
-        semantics::reset(&mut record);
-        let eager = record.options.semantics == SemanticsMode::Eager
-            && record.status.state == SceneState::Done
-            && record.status.semantics.state == SemanticsState::None
-            && self.parts.semantics.lacks().is_none();
-        if eager {
-            record.status.semantics.state = SemanticsState::Running;
-        }
-        let refined = record.refine.is_some() && record.status.state == SceneState::Done;
+        forget_semantics_job(&mut record);
+        let done = record.status.state == SceneState::Done;
+        let eager = done
+            && record.options.semantics == SemanticsMode::Eager
+            && self.parts.semantics.lacks().is_none()
+            && ordered.apply(&mut record, now_ms);
+        let refined = done && record.refine.is_some();
+        self.records.insert(record.clone());
         if refined {
-            self.mend(&mut record);
+            self.mend(&record);
         }
-        self.records.insert(record);
-        if refined {
-            self.replicas.hold(&id);
-            self.queue.push(Kind::Refine, id.clone(), owner.as_deref());
-        }
-        if eager || unfinished {
-            let kind = if eager { Kind::Semantics } else { Kind::Scene };
-            self.replicas.hold(&id);
-            self.queue.push(kind, id, owner.as_deref());
+        for (kind, waits) in [(REFINE, refined), (SEMANTICS, eager), (SCENE, unfinished)] {
+            if waits {
+                self.replicas.hold(&id);
+                self.queue.push(kind, id.clone(), owner.as_deref());
+            }
         }
     }
 

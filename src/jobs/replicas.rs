@@ -6,23 +6,21 @@
 
 use std::{
     collections::{HashMap, HashSet},
-    sync::atomic::Ordering,
+    sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
 };
 
 use parking_lot::Mutex;
 
 use super::{
-    JobParts, Jobs,
-    job::{Kind, Reason},
-    refine,
-    scene::requeue,
-    semantics,
+    JobParts, Jobs, SCENE,
+    change::{Attempt, Change, forget_refinement, forget_semantics_job},
+    job::Reason,
 };
 use crate::{
     error::Result,
-    limits::Limits,
-    scene::{SceneId, SceneState},
+    limits::LiveLimits,
+    scene::SceneId,
     store::{self, Record, Store},
 };
 
@@ -77,7 +75,7 @@ pub(super) fn of(parts: &JobParts) -> Result<Box<dyn Replicas>> {
     }
     Ok(Box::new(OtherReplicas {
         name: store::new_id()?.to_string(),
-        limits: parts.limits.clone(),
+        limits: Arc::clone(&parts.limits),
         held: Mutex::default(),
         fresh: Mutex::default(),
         listed: Mutex::default(),
@@ -92,7 +90,7 @@ impl Replicas for Alone {}
 /// Replicas that share the store with this one.
 struct OtherReplicas {
     name: String,
-    limits: Limits,
+    limits: Arc<LiveLimits>,
     /// Scenes that this process makes or has queued.
     held: Mutex<HashSet<SceneId>>,
     /// When scenes made elsewhere were last read.
@@ -131,7 +129,7 @@ impl Replicas for OtherReplicas {
     }
 
     fn may_be_stale(&self, id: &SceneId) -> bool {
-        let fresh = Duration::from_millis(self.limits.record_fresh_ms);
+        let fresh = Duration::from_millis(self.limits.get().record_fresh_ms);
         let read = || self.fresh.lock().get(id).copied();
         !self.holds(id) && read().is_none_or(|read| read.elapsed() >= fresh)
     }
@@ -143,7 +141,7 @@ impl Replicas for OtherReplicas {
 
     fn refresh_all(&self, jobs: &Jobs) -> Result<()> {
         let mut listed = self.listed.lock();
-        let fresh = Duration::from_millis(self.limits.record_fresh_ms);
+        let fresh = Duration::from_millis(self.limits.get().record_fresh_ms);
         if listed.at.is_some_and(|at| at.elapsed() < fresh) {
             return Ok(());
         }
@@ -167,9 +165,9 @@ impl Replicas for OtherReplicas {
 
     fn watch(&self, jobs: &Jobs) {
         let mut seen = Seen::default();
-        let every = Duration::from_millis(self.limits.replica_beat_ms.max(1));
         let mut beaten: Option<Instant> = None;
         loop {
+            let every = Duration::from_millis(self.limits.get().replica_beat_ms.max(1));
             if beaten.is_none_or(|at| at.elapsed() >= every) {
                 beaten = Some(Instant::now());
                 if let Err(error) = self.beat(jobs, &mut seen) {
@@ -216,9 +214,9 @@ impl OtherReplicas {
         if jobs.records.find(id).is_some_and(|known| files(&known) != files(&record)) {
             jobs.parts.store.forget(id);
         }
-        semantics::reset(&mut record);
-        refine::reset(&mut record);
-        jobs.records.put(record);
+        forget_semantics_job(&mut record);
+        forget_refinement(&mut record);
+        jobs.records.learn(record, || self.holds(id));
     }
 
     fn lose(&self, jobs: &Jobs, id: &SceneId) {
@@ -234,12 +232,8 @@ impl OtherReplicas {
         let store = &jobs.parts.store;
         seen.count += 1;
         store.beat(&self.name, seen.count)?;
-        let running = jobs.running.scenes(Kind::Scene);
-        for record in running.iter().filter_map(|id| jobs.records.find(id)) {
-            if record.status.state == SceneState::Running && self.holds(&record.status.id) {
-                // One deleted meanwhile is dropped below.
-                let _ = store.put_record(&record);
-            }
+        for id in jobs.running.scenes(SCENE).iter().filter(|id| self.holds(id)) {
+            jobs.records.keep_progress(id);
         }
         for id in store.tombstones()? {
             if self.holds(&id) {
@@ -260,14 +254,15 @@ impl OtherReplicas {
 
     /// Stops the jobs of a scene in this process.
     fn stop(&self, jobs: &Jobs, id: &SceneId) {
-        jobs.queue.remove(id);
-        jobs.running.stop(Some(id), Reason::Cancelled);
+        jobs.queue.remove(id, None);
+        jobs.running.stop(Reason::Cancelled, |job| job.scene == *id);
+        jobs.bell.ring();
         jobs.release(id);
     }
 
     /// Looks at every heartbeat; gives the replicas that live.
     fn alive(&self, jobs: &Jobs, seen: &mut Seen) -> Result<HashSet<String>> {
-        let lease = Duration::from_millis(self.limits.replica_lease_ms);
+        let lease = Duration::from_millis(self.limits.get().replica_lease_ms);
         let beats = jobs.parts.store.beats()?;
         seen.beats.retain(|name, _| beats.iter().any(|(replica, _)| replica == name));
         for (replica, stamp) in beats {
@@ -315,7 +310,7 @@ impl OtherReplicas {
             };
             let idle = jobs.workers.load(Ordering::Relaxed);
             let lives = replica == self.name || alive.contains(&replica);
-            if lives || jobs.queue.len(Kind::Scene) > idle {
+            if lives || jobs.queue.len(SCENE) > idle {
                 continue;
             }
             let heir = store.claim(&id, &replica, &self.name)?;
@@ -335,12 +330,11 @@ impl OtherReplicas {
         }
         tracing::info!(scene = %id, from, "taken over from a dead replica");
         record.replica = Some(self.name.clone());
-        requeue(&mut record);
-        self.hold(id);
-        store.put_record(&record).inspect_err(|_| jobs.release(id))?;
         let owner = record.owner.clone();
-        jobs.records.put(record);
-        jobs.queue.push(Kind::Scene, id.clone(), owner.as_deref());
+        self.hold(id);
+        jobs.records.learn(record, || false);
+        jobs.records.apply(id, &Change::Requeued(SCENE, Attempt::Counts))?;
+        jobs.queue.push(SCENE, id.clone(), owner.as_deref());
         Ok(())
     }
 }
