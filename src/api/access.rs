@@ -156,7 +156,7 @@ impl Access {
         Ok(Self(RwLock::new(Arc::new(InForce::load(config)?))))
     }
 
-    /// Reads the file again; the call that this gives puts it in force and gives the number of keys.
+    /// Reads the file again; the call that this gives puts its keys in force, and gives how many.
     pub(super) fn read_again(&self, config: &Config) -> Result<impl FnOnce() -> usize> {
         let new = InForce::load(config)?;
         Ok(move || {

@@ -66,7 +66,8 @@ impl Jobs {
         self.queue.pop(kind)
     }
 
-    /// Gives back what an ended job had, except where another of its scene runs, waits or may follow.
+    /// Gives back what an ended job had, except where another of its scene runs, waits or may
+    /// follow.
     fn leave(&self, job: &Job) {
         let id = &job.scene;
         if self.running.has(id) {
@@ -215,7 +216,8 @@ impl Jobs {
     }
 
     /// The life of the thread that removes what crashes and deletions left in the store, and photos
-    /// in memory that no text asked for. It also looks whether a store that kept nothing does again.
+    /// in memory that no text asked for. It also looks whether a store that kept nothing does so
+    /// again.
     pub(super) fn sweep(&self) {
         let (mut swept, mut give_back) = (None::<Instant>, Instant::now());
         loop {

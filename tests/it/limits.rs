@@ -22,7 +22,10 @@ use crate::common::{
     process, root,
     server::{PATIENCE, TestServer, upload},
 };
-use crate::refine::{LensedNetworks, upload as six_photos};
+use crate::{
+    refine::{LensedNetworks, upload as six_photos},
+    schedule::{HoldingRenderer, LARGE, sized},
+};
 
 /// What a row asks.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -36,6 +39,8 @@ enum Ask {
     /// Waits for a scene that is never made.
     Wait,
     Get(&'static str),
+    /// Draws a view while a large one is drawn.
+    BesideAView,
     Views,
     /// Asks a text, also one of a scene without semantics.
     Text,
@@ -44,7 +49,7 @@ enum Ask {
 }
 
 /// Limits, a value of each that changes the answer, and what is asked.
-const LIVE: [(&str, u64, Ask); 36] = [
+const LIVE: [(&str, u64, Ask); 33] = [
     ("photos_max", 2, Ask::Photos),
     ("photos_min", 4, Ask::Photos),
     ("upload_bytes_max", 1_000, Ask::Photos),
@@ -64,7 +69,7 @@ const LIVE: [(&str, u64, Ask); 36] = [
     ("view_side_max", 8, Ask::Get("/v1/scenes/ID/view?from=0&width=16&height=12")),
     ("render_timeout_ms", 0, Ask::Get("/v1/scenes/ID/view?from=0&width=16&height=13")),
     ("queued_renders_max", 0, Ask::Get("/v1/scenes/ID/view?from=0&width=16&height=14")),
-    ("queued_pixels_max", 1, Ask::Get("/v1/scenes/ID/view?from=0&width=16&height=15")),
+    ("queued_pixels_max", 1, Ask::BesideAView),
     ("features_bytes_max", 1, Ask::Get("/v1/scenes/ID/features?from=0&kind=features&width=16")),
     ("folder_points_max", 1, Ask::Get("/v1/scenes/ID/export?format=nerfstudio")),
     ("cameras_max", 1, Ask::Views),
@@ -78,16 +83,20 @@ const LIVE: [(&str, u64, Ask); 36] = [
     ("refine_ms_max", 10, Ask::Refine),
     ("refine_steps_max", 1, Ask::Refine),
     ("refine_gaussians_max", 50, Ask::Refine),
-    // The keys take theirs with their file: see `access.rs`.
-    ("key_requests_per_s", 0, Ask::Get("")),
-    ("key_inflight_max", 0, Ask::Get("")),
-    // Seen on a device alone, and read with the two above it.
-    ("refine_device_bytes_max", 0, Ask::Get("")),
 ];
 
-/// Live as well, in threads that no call can watch: read again in each of their rounds.
-const OF_THREADS: [&str; 4] =
-    ["sweep_every_ms", "record_fresh_ms", "replica_beat_ms", "replica_lease_ms"];
+/// Live as well, and not seen by these calls: those of keys, in `access.rs`; one that counts on a
+/// device alone, read with the other limits of refinement; and those of threads, which read them
+/// again in each of their rounds.
+const ELSEWHERE: [&str; 7] = [
+    "key_requests_per_s",
+    "key_inflight_max",
+    "refine_device_bytes_max",
+    "sweep_every_ms",
+    "record_fresh_ms",
+    "replica_beat_ms",
+    "replica_lease_ms",
+];
 
 /// So few steps that each refinement is short.
 fn base() -> Limits {
@@ -97,15 +106,19 @@ fn base() -> Limits {
 struct Asked {
     server: TestServer,
     networks: Arc<LensedNetworks>,
+    renderer: Arc<HoldingRenderer>,
     made: SceneId,
 }
 
 impl Asked {
     async fn start() -> Self {
         let networks = Arc::new(LensedNetworks::default());
-        let given = Arc::clone(&networks);
+        let renderer = HoldingRenderer { concurrency: 2, ..HoldingRenderer::default() };
+        let renderer = Arc::new(renderer);
+        let (given, draws) = (Arc::clone(&networks), Arc::clone(&renderer));
         let server = TestServer::with(|config, parts| {
             parts.scenes = given;
+            parts.renderer = draws;
             parts.semantics = Arc::new(PhotoMeaning::default());
             config.limits = base();
             config.jobs = 2;
@@ -117,7 +130,7 @@ impl Asked {
             CreateScene { upload: sample::upload(&options).unwrap(), ..CreateScene::default() };
         let made = server.service.create_scene(request).await.unwrap().status.id;
         server.finished(&made).await;
-        Self { server, networks, made }
+        Self { server, networks, renderer, made }
     }
 
     /// What a call comes to, without what differs from call to call.
@@ -152,6 +165,19 @@ impl Asked {
                 let (status, bytes) = (answer.status(), answer.bytes().await.unwrap());
                 let fault = serde_json::from_slice::<Value>(&bytes).unwrap_or_default();
                 format!("{status} {} {}", fault["message"], bytes.len())
+            }
+            Ask::BesideAView => {
+                let (service, other) = (self.server.service.clone(), id.clone());
+                let large = tokio::spawn(async move { service.render(&other, sized(LARGE)).await });
+                process::eventually("it is drawn", async || {
+                    (self.renderer.drawing.load(Ordering::Acquire) > 0).then_some(())
+                })
+                .await;
+                let small = self.server.service.render(id, sized(16)).await;
+                self.renderer.go_on.store(true, Ordering::Release);
+                large.await.unwrap().expect("it was there first");
+                self.renderer.go_on.store(false, Ordering::Release);
+                format!("{:?}", small.map(drop))
             }
             Ask::Views => {
                 let body = json!({
@@ -217,7 +243,7 @@ impl Asked {
 #[tokio::test(flavor = "multi_thread")]
 async fn each_live_limit_counts_at_once() {
     let asked = Asked::start().await;
-    for (name, value, ask) in LIVE.into_iter().filter(|(.., ask)| *ask != Ask::Get("")) {
+    for (name, value, ask) in LIVE {
         let held = matches!(ask, Ask::Wait | Ask::Endless);
         asked.networks.0.hold.store(held, Ordering::Release);
         let mut limits = serde_json::to_value(base()).unwrap();
@@ -255,7 +281,7 @@ fn each_limit_is_live_or_waits_for_the_next_start() {
             _ => panic!("{name} is one limit"),
         }
     }
-    let rows = LIVE.iter().map(|(name, ..)| *name).chain(OF_THREADS);
+    let rows = LIVE.iter().map(|(name, ..)| *name).chain(ELSEWHERE);
     assert_eq!(live, rows.collect(), "each live limit has a row here");
     assert!(waits.contains("store_timeout_ms"));
 }
