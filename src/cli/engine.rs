@@ -12,8 +12,8 @@ use crate::{
     service::{KnownWord, ModelInfo, ModelsInfo, Parts},
 };
 
-/// Bundle, networks and renderer as the server runs them. A thread of the engine still opens the
-/// networks; `LateEngine::get` waits for it.
+/// Bundle, networks and renderer as the server runs them. A thread of the loader still opens the
+/// networks; `PipelineLoader::get` waits for it.
 ///
 /// # Errors
 /// `model_unavailable`, `gpu_unavailable`, each with what is missing.

@@ -51,7 +51,7 @@ use self::{
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::LiveLimits,
-    render::{Renderer, backward::DifferentiableRenderer},
+    render::{DifferentiableRenderer, Renderer},
     scene::{
         PhotoHash, Refine, SceneId, SceneState, SemanticsMode, SemanticsState, SemanticsStatus,
         Upload,

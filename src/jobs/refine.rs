@@ -26,7 +26,7 @@ use crate::{
         refinement::{refined, reported, version_of},
     },
     refine::{HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion},
-    render::{backward::DifferentiableRenderer, cpu::CpuRenderer},
+    render::{DifferentiableRenderer, cpu::CpuRenderer},
     scene::{
         PosedPhoto, Refine, RefineReport, RefineState, RefineStatus, Scene, SceneError, SceneId,
         SceneStatus, Stage, Watch,
