@@ -1,6 +1,6 @@
 //! Every change of a scene's record after its creation, by name.
 
-use super::job::Kind;
+use super::kind::Kind;
 use crate::{
     error::Error,
     scene::{

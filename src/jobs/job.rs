@@ -1,92 +1,14 @@
 //! One job: what kind it is, of which scene, and how it is stopped.
 
-use std::{
-    fmt,
-    hash::{Hash, Hasher},
-    sync::{
-        Arc, OnceLock,
-        atomic::{AtomicBool, Ordering},
-    },
+use std::sync::{
+    Arc, OnceLock,
+    atomic::{AtomicBool, Ordering},
 };
 
 use parking_lot::Mutex;
 
-use super::{Jobs, bell::Bell};
-use crate::{
-    error::Result,
-    scene::{SceneError, SceneId, SceneStatus, Stage},
-    store::Record,
-};
-
-/// A kind of job. `super::KINDS` lists all; queue, workers, records and metrics take them from
-/// there.
-pub(super) trait JobKind: Send + Sync {
-    /// Name in metrics, spans and names of threads.
-    fn name(&self) -> &'static str;
-
-    /// What it makes, in messages.
-    fn what(&self) -> &'static str;
-
-    /// Threads of a server that makes so many scenes at a time.
-    fn threads(&self, scenes: usize) -> usize {
-        scenes
-    }
-
-    /// The span of a job.
-    fn span(&self, jobs: &Jobs, id: &SceneId) -> tracing::Span;
-
-    /// Does the whole work.
-    fn run(&self, jobs: &Jobs, job: &Job) -> Result<()>;
-
-    /// Puts the progress of a job into the status of its scene; `fraction` is that of the stage.
-    fn show(&self, status: &mut SceneStatus, stage: Stage, fraction: f32);
-
-    /// Whether the store keeps that the job is to be done. Such a job goes on after a stop of the
-    /// server and when the store works again, and its end is kept.
-    fn lasts(&self) -> bool {
-        true
-    }
-
-    /// How often the job was begun without a result, where it lasts.
-    fn attempts<'a>(&self, _: &'a mut Record) -> Option<&'a mut u32> {
-        None
-    }
-
-    /// A worker begins: one attempt is counted already.
-    fn started(&self, _: &mut Record, _now_ms: u64) {}
-
-    /// The job waits again, from its start.
-    fn requeued(&self, _: &mut Record) {}
-
-    /// The job has failed.
-    fn failed(&self, record: &mut Record, error: SceneError, now_ms: u64);
-
-    /// What else ends when a job has failed.
-    fn after_failure(&self, _: &Jobs, _: &SceneId) {}
-}
-
-/// One of `super::KINDS`.
-pub(super) type Kind = &'static dyn JobKind;
-
-impl PartialEq for dyn JobKind {
-    fn eq(&self, other: &Self) -> bool {
-        self.name() == other.name()
-    }
-}
-
-impl Eq for dyn JobKind {}
-
-impl Hash for dyn JobKind {
-    fn hash<H: Hasher>(&self, to: &mut H) {
-        self.name().hash(to);
-    }
-}
-
-impl fmt::Debug for dyn JobKind {
-    fn fmt(&self, to: &mut fmt::Formatter<'_>) -> fmt::Result {
-        to.write_str(self.name())
-    }
-}
+use super::{bell::Bell, kind::Kind};
+use crate::scene::SceneId;
 
 /// Why a job was stopped.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -11,7 +11,7 @@ use std::{
 
 use parking_lot::{Condvar, Mutex};
 
-use super::{SCENE, job::Kind};
+use super::kind::Kind;
 use crate::scene::SceneId;
 
 /// Whose jobs a lane holds.
@@ -156,10 +156,10 @@ impl Queue {
         });
     }
 
-    /// Jobs that go before the scene `id` now; `None` when it does not wait.
-    pub(crate) fn ahead(&self, id: &SceneId) -> Option<usize> {
+    /// Jobs of a kind that go before that of the scene `id` now; `None` when it does not wait.
+    pub(super) fn ahead(&self, kind: Kind, id: &SceneId) -> Option<usize> {
         let inner = self.inner.lock();
-        let lanes = inner.lanes.iter().filter(|(lane, _)| lane.kind == SCENE);
+        let lanes = inner.lanes.iter().filter(|(lane, _)| lane.kind == kind);
         let lanes: Vec<&VecDeque<SceneId>> = lanes.map(|(_, jobs)| jobs).collect();
         let place = |jobs: &VecDeque<SceneId>| jobs.iter().position(|waiting| waiting == id);
         let (turn, place) =
@@ -199,7 +199,7 @@ impl Queue {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::jobs::SEMANTICS;
+    use crate::jobs::{scene::SCENE, semantics::SEMANTICS};
 
     fn id(byte: u8) -> SceneId {
         SceneId::from_bytes([byte; 16])
@@ -215,7 +215,7 @@ mod tests {
         reserve().unwrap().fill(id(2));
         first.fill(id(1));
         assert!(reserve().is_err(), "both places are filled");
-        assert_eq!((queue.ahead(&id(2)), queue.ahead(&id(1))), (Some(0), Some(1)));
+        assert_eq!((queue.ahead(SCENE, &id(2)), queue.ahead(SCENE, &id(1))), (Some(0), Some(1)));
         assert_eq!(queue.pop(SCENE), Some(id(2)));
         assert!(reserve().is_ok());
     }
@@ -245,7 +245,7 @@ mod tests {
         for (byte, owner) in [(1, "a"), (2, "a"), (3, "a"), (4, "b"), (5, "c"), (6, "b")] {
             queue.push(SCENE, id(byte), Some(owner));
         }
-        let ahead: Vec<_> = (1..=6).map(|byte| queue.ahead(&id(byte)).unwrap()).collect();
+        let ahead: Vec<_> = (1..=6).map(|byte| queue.ahead(SCENE, &id(byte)).unwrap()).collect();
         let order: Vec<_> = (0..6).map(|_| queue.pop(SCENE).unwrap()).collect();
         assert_eq!(order, [1, 4, 5, 2, 6, 3].map(id), "one each in turn, then the rest");
         let place = |byte| order.iter().position(|other| *other == id(byte)).unwrap();
@@ -258,7 +258,7 @@ mod tests {
         let scene = queue.reserve(SCENE, None).unwrap();
         queue.reserve(SEMANTICS, None).unwrap().fill(id(2));
         scene.fill(id(1));
-        assert_eq!((queue.len(SCENE), queue.ahead(&id(2))), (1, None));
+        assert_eq!((queue.len(SCENE), queue.ahead(SCENE, &id(2))), (1, None));
         assert_eq!(queue.pop(SEMANTICS), Some(id(2)));
         assert_eq!(queue.pop(SCENE), Some(id(1)));
     }

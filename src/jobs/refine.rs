@@ -13,10 +13,11 @@ use std::{
 use parking_lot::Mutex;
 
 use super::{
-    Jobs, KINDS, REFINE,
     bell::FOREVER,
     change::{Change, forget_refinement},
-    job::{Job, JobKind, Reason},
+    job::{Job, Reason},
+    kind::{JobKind, Kind},
+    shared::{Jobs, Work},
 };
 use crate::{
     error::Result,
@@ -49,6 +50,8 @@ const TOLD: f32 = 0.01;
 /// Refines a finished scene.
 pub(super) struct RefineScene;
 
+pub(super) const REFINE: Kind = &RefineScene;
+
 impl JobKind for RefineScene {
     fn name(&self) -> &'static str {
         "refine"
@@ -56,18 +59,6 @@ impl JobKind for RefineScene {
 
     fn what(&self) -> &'static str {
         "the scene's refinement"
-    }
-
-    fn threads(&self, _: usize) -> usize {
-        1
-    }
-
-    fn span(&self, _: &Jobs, id: &SceneId) -> tracing::Span {
-        tracing::info_span!("refine", scene = %id)
-    }
-
-    fn run(&self, jobs: &Jobs, job: &Job) -> Result<()> {
-        jobs.refine_scene(job)
     }
 
     fn show(&self, status: &mut SceneStatus, stage: Stage, fraction: f32) {
@@ -85,6 +76,20 @@ impl JobKind for RefineScene {
         forget_refinement(record);
         record.status.refinement =
             RefineStatus { error: Some(error), ..RefineStatus::new(RefineState::Failed) };
+    }
+}
+
+impl Work for RefineScene {
+    fn threads(&self, _: usize) -> usize {
+        1
+    }
+
+    fn span(&self, _: &Jobs, id: &SceneId) -> tracing::Span {
+        tracing::info_span!("refine", scene = %id)
+    }
+
+    fn run(&self, jobs: &Jobs, job: &Job) -> Result<()> {
+        jobs.refine_scene(job)
     }
 }
 
@@ -253,13 +258,15 @@ impl Turns<'_> {
         let Self { jobs, job, resumed } = self;
         let mut resumed = resumed.lock();
         let (worked, begun) = (resumed.elapsed(), Instant::now());
-        let others = || KINDS.into_iter().filter(|kind| *kind != job.kind);
-        let is_made = |kind| jobs.queue.len(kind) > 0 || !jobs.running.scenes(kind).is_empty();
+        let is_made = |kind: Kind| {
+            let makes = jobs.queue.len(kind) > 0 || !jobs.running.scenes(kind).is_empty();
+            makes && kind != job.kind
+        };
         jobs.bell.wait_in_job(&job.cancel, || {
             let left = views_go_first((jobs.parts.drawn)(), worked, begun.elapsed());
             match left.is_zero() {
                 false => Err(left),
-                true if others().any(is_made) => Err(FOREVER),
+                true if jobs.kinds.iter().any(|kind| is_made(*kind)) => Err(FOREVER),
                 true => Ok(()),
             }
         })?;

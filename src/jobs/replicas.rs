@@ -13,9 +13,10 @@ use std::{
 use parking_lot::Mutex;
 
 use super::{
-    JobParts, Jobs, SCENE,
     change::{Attempt, Change, forget_refinement, forget_semantics_job},
     job::Reason,
+    scene::SCENE,
+    shared::{JobParts, Jobs, Replicas},
 };
 use crate::{
     error::Result,
@@ -30,43 +31,6 @@ const WATCH_EVERY: Duration = Duration::from_millis(500);
 const LEASES_TO_FORGET: u32 = 10;
 /// Times of reading that are remembered before all are forgotten.
 const FRESH_MAX: usize = 10_000;
-
-/// How this process shares its scenes with others. Each default is that of a process on its own.
-pub(super) trait Replicas: Send + Sync {
-    /// Name of this process among those that share the store; `None` where it is alone.
-    fn name(&self) -> Option<&str> {
-        None
-    }
-
-    /// From now on this process makes the scene, and its record here is the right one.
-    fn hold(&self, _: &SceneId) {}
-
-    /// From now on this process writes nothing of the scene.
-    fn release(&self, _: &SceneId) {}
-
-    /// Whether the store may know more of this scene than the records.
-    fn may_be_stale(&self, _: &SceneId) -> bool {
-        false
-    }
-
-    /// Reads what the store has of a scene.
-    fn refresh(&self, _: &Jobs, _: &SceneId) -> Result<()> {
-        Ok(())
-    }
-
-    /// Reads what the store has of all scenes.
-    fn refresh_all(&self, _: &Jobs) -> Result<()> {
-        Ok(())
-    }
-
-    /// Whether the call that made this scene was acknowledged.
-    fn is_acknowledged(&self, _: &Store, _: &SceneId) -> Result<bool> {
-        Ok(true)
-    }
-
-    /// The life of the thread that watches the other replicas.
-    fn watch(&self, _: &Jobs) {}
-}
 
 /// The replicas of a store: none where this process alone uses it.
 pub(super) fn of(parts: &JobParts) -> Result<Box<dyn Replicas>> {

@@ -7,11 +7,13 @@ use std::{
 };
 
 use super::{
-    Jobs, REFINE, SEMANTICS,
-    bell::FOREVER,
     change::Change,
-    job::{Job, JobKind, Reason},
+    job::Job,
+    kind::{JobKind, Kind},
     photos::{Content, ReadUpload},
+    refine::REFINE,
+    semantics::SEMANTICS,
+    shared::{Jobs, Work, WorkLock},
 };
 use crate::{
     error::{Error, ErrorCode, Result},
@@ -26,6 +28,8 @@ use crate::{
 /// Makes a scene of an upload.
 pub(super) struct MakeScene;
 
+pub(super) const SCENE: Kind = &MakeScene;
+
 impl JobKind for MakeScene {
     fn name(&self) -> &'static str {
         "scene"
@@ -33,21 +37,6 @@ impl JobKind for MakeScene {
 
     fn what(&self) -> &'static str {
         "the scene"
-    }
-
-    /// It belongs to the trace of the call that created the scene.
-    fn span(&self, jobs: &Jobs, id: &SceneId) -> tracing::Span {
-        let Some(record) = jobs.records.find(id) else { return tracing::Span::none() };
-        let request_id = record.request_id.as_deref();
-        let span = tracing::info_span!("scene", scene = %id, request_id);
-        if let Some(parent) = &record.traceparent {
-            telemetry::follow(&span, parent);
-        }
-        span
-    }
-
-    fn run(&self, jobs: &Jobs, job: &Job) -> Result<()> {
-        jobs.make_scene(job)
     }
 
     fn show(&self, status: &mut SceneStatus, stage: Stage, fraction: f32) {
@@ -85,10 +74,22 @@ impl JobKind for MakeScene {
             status.semantics = SemanticsStatus::default();
         }
     }
+}
 
-    /// Semantics that began early are wanted no more.
-    fn after_failure(&self, jobs: &Jobs, id: &SceneId) {
-        jobs.running.stop(Reason::Cancelled, |job| job.kind == SEMANTICS && job.scene == *id);
+impl Work for MakeScene {
+    /// It belongs to the trace of the call that created the scene.
+    fn span(&self, jobs: &Jobs, id: &SceneId) -> tracing::Span {
+        let Some(record) = jobs.records.find(id) else { return tracing::Span::none() };
+        let request_id = record.request_id.as_deref();
+        let span = tracing::info_span!("scene", scene = %id, request_id);
+        if let Some(parent) = &record.traceparent {
+            telemetry::follow(&span, parent);
+        }
+        span
+    }
+
+    fn run(&self, jobs: &Jobs, job: &Job) -> Result<()> {
+        jobs.make_scene(job)
     }
 }
 
@@ -99,20 +100,6 @@ enum Made {
     /// A scene of the same content.
     Known(Arc<Scene>),
     New(Box<Scene>),
-}
-
-/// Keeps other workers from making a scene of the same content, or from changing the same scene,
-/// until it is dropped.
-pub(super) struct WorkLock<'a> {
-    jobs: &'a Jobs,
-    name: String,
-}
-
-impl Drop for WorkLock<'_> {
-    fn drop(&mut self) {
-        self.jobs.locked.lock().remove(&self.name);
-        self.jobs.bell.ring();
-    }
 }
 
 impl Jobs {
@@ -232,15 +219,6 @@ impl Jobs {
         // Where that one is bad, this one is made.
         let scene = store.scene(&id).ok();
         Ok(scene.filter(|scene| scene.meta.provenance.content_sha256 == content))
-    }
-
-    /// Waits until no other worker here has the lock of this content, or of this scene.
-    /// Fails with `cancelled`.
-    pub(super) fn lock(&self, name: &str, job: &Job) -> Result<WorkLock<'_>> {
-        self.bell.wait_in_job(&job.cancel, || {
-            if self.locked.lock().insert(name.to_owned()) { Ok(()) } else { Err(FOREVER) }
-        })?;
-        Ok(WorkLock { jobs: self, name: name.to_owned() })
     }
 
     /// The scene is kept, and its semantics where it has some: its record is kept, then its

@@ -7,10 +7,11 @@
 use std::sync::Arc;
 
 use super::{
-    Jobs, SEMANTICS,
     bell::FOREVER,
     change::Change,
-    job::{Job, JobKind},
+    job::Job,
+    kind::{JobKind, Kind},
+    shared::{Jobs, Work},
 };
 use crate::{
     error::{Error, ErrorCode, Result},
@@ -23,6 +24,8 @@ use crate::{
 /// Makes the semantics of a scene.
 pub(super) struct MakeSemantics;
 
+pub(super) const SEMANTICS: Kind = &MakeSemantics;
+
 impl JobKind for MakeSemantics {
     fn name(&self) -> &'static str {
         "semantics"
@@ -30,17 +33,6 @@ impl JobKind for MakeSemantics {
 
     fn what(&self) -> &'static str {
         "the scene's semantics"
-    }
-
-    fn span(&self, _: &Jobs, id: &SceneId) -> tracing::Span {
-        tracing::info_span!("semantics", scene = %id)
-    }
-
-    fn run(&self, jobs: &Jobs, job: &Job) -> Result<()> {
-        let made = jobs.make_semantics(job);
-        // A scene that failed meanwhile never has any.
-        let state = jobs.records.find(&job.scene).map(|record| record.status.state);
-        made.or_else(|error| if state == Some(SceneState::Failed) { Ok(()) } else { Err(error) })
     }
 
     fn show(&self, status: &mut SceneStatus, stage: Stage, fraction: f32) {
@@ -58,6 +50,19 @@ impl JobKind for MakeSemantics {
     fn failed(&self, record: &mut Record, error: SceneError, _now_ms: u64) {
         record.status.semantics =
             SemanticsStatus { error: Some(error), ..SemanticsStatus::new(SemanticsState::Failed) };
+    }
+}
+
+impl Work for MakeSemantics {
+    fn span(&self, _: &Jobs, id: &SceneId) -> tracing::Span {
+        tracing::info_span!("semantics", scene = %id)
+    }
+
+    fn run(&self, jobs: &Jobs, job: &Job) -> Result<()> {
+        let made = jobs.make_semantics(job);
+        // A scene that failed meanwhile never has any.
+        let state = jobs.records.find(&job.scene).map(|record| record.status.state);
+        made.or_else(|error| if state == Some(SceneState::Failed) { Ok(()) } else { Err(error) })
     }
 }
 

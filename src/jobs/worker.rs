@@ -3,29 +3,25 @@
 use std::{
     any::Any,
     panic::{AssertUnwindSafe, catch_unwind},
-    sync::{
-        Arc,
-        atomic::Ordering,
-        mpsc::{self, RecvTimeoutError},
-    },
+    sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
 };
 
 use super::{
-    Jobs, NetworkState, SCENE,
     change::{Attempt, Change},
-    job::{Job, Kind, Reason},
-    photos::ReadUpload,
+    job::{Job, Reason},
+    kind::Kind,
+    networks::NetworkState,
+    scene::SCENE,
+    shared::{Jobs, Work, is_used_up},
 };
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{SceneId, SceneState, SceneStatus, SemanticsMode, SemanticsState, Stage, Watch},
+    scene::{SceneId, SceneState, SceneStatus, SemanticsState},
     store::Record,
     telemetry::meter,
 };
 
-/// Starts of one job before it is given up: one that kills the server must not do so forever.
-const ATTEMPTS_MAX: u32 = 3;
 /// Time in which freed memory goes back to the system, after a job and without one. Not at the end
 /// of a job: while it goes, allocations wait, and that is when the callers of the job come back.
 const GIVE_BACK_AFTER_JOB: Duration = Duration::from_secs(1);
@@ -35,7 +31,7 @@ const STORE_LOOK: Duration = Duration::from_secs(1);
 
 impl Jobs {
     /// The life of a worker thread.
-    pub(super) fn work(&self, kind: Kind) {
+    pub(super) fn work(&self, kind: &'static dyn Work) {
         let open = matches!(self.parts.scenes.opened(), NetworkState::Open(_));
         while open && let Some(id) = self.next(kind) {
             let job = self.running.begin(kind, id);
@@ -51,7 +47,7 @@ impl Jobs {
             self.leave(&job);
             self.freed.store(true, Ordering::Relaxed);
         }
-        if kind == SCENE {
+        if kind.name() == SCENE.name() {
             self.workers.fetch_sub(1, Ordering::Relaxed);
         }
     }
@@ -84,70 +80,6 @@ impl Jobs {
         }
     }
 
-    /// Runs `work`, which shows its progress in the record and is stopped when its time is over.
-    pub(super) fn within_time<T>(
-        &self,
-        job: &Job,
-        work: impl FnOnce(Watch<'_>) -> Result<T>,
-    ) -> Result<T> {
-        let limit = self.job_time();
-        let progress = |stage: Stage, fraction: f32| self.show(job, stage, fraction);
-        let watch = Watch { progress: &progress, cancel: &job.cancel };
-        std::thread::scope(|scope| {
-            // Dropped at the end of the work, also by a panic.
-            let (_finished, watchdog) = mpsc::channel::<()>();
-            scope.spawn(move || {
-                if watchdog.recv_timeout(limit) == Err(RecvTimeoutError::Timeout) {
-                    job.stop(Reason::Timeout);
-                }
-            });
-            work(watch)
-        })
-    }
-
-    fn job_time(&self) -> Duration {
-        Duration::from_millis(self.parts.limits.get().scene_timeout_ms)
-    }
-
-    pub(super) fn show(&self, job: &Job, stage: Stage, fraction: f32) {
-        self.records.show_progress(&job.scene, |status| job.kind.show(status, stage, fraction));
-    }
-
-    /// The upload of a job: as the create call read it, else read from the store.
-    pub(super) fn upload(&self, id: &SceneId, watch: Watch<'_>) -> Result<Arc<ReadUpload>> {
-        if let Some(kept) = self.uploads.find(id) {
-            return Ok(kept);
-        }
-        let upload = self.parts.store.upload(id)?;
-        let options = &self.record(id)?.options;
-        ReadUpload::of(&upload, options, &self.parts.limits.get(), watch.cancel).map(Arc::new)
-    }
-
-    /// Forgets the photos of a finished scene where they are not kept, and no job that may come
-    /// needs them.
-    pub(super) fn drop_upload_unless_needed(&self, id: &SceneId) {
-        let Some(record) = self.records.find(id) else { return };
-        let eager = record.options.semantics == SemanticsMode::Eager;
-        let lacks = eager && record.status.semantics.state != SemanticsState::Ready;
-        if !self.parts.keep_photos
-            && !lacks
-            && record.refine.is_none()
-            && let Err(error) = self.parts.store.drop_upload(id)
-        {
-            tracing::warn!(scene = %id, %error, "photos that nothing needs are still kept");
-        }
-    }
-
-    /// Gives up a job that was begun too often.
-    pub(super) fn check_attempts(&self, kind: Kind, record: &Record) -> Result<()> {
-        if attempts(kind, record) < ATTEMPTS_MAX {
-            return Ok(());
-        }
-        let what = kind.what();
-        let message = format!("given up: {what} was begun {ATTEMPTS_MAX} times and not made");
-        Err(Error::internal(message))
-    }
-
     /// What becomes of a job: its name in metrics.
     fn end(&self, job: &Job, result: Result<()>) -> &'static str {
         let Err(error) = result else { return "done" };
@@ -159,9 +91,10 @@ impl Jobs {
                     Ok(()) => Attempt::Counts,
                     Err(_) => Attempt::IsForgotten,
                 };
-                let record = self.records.find(id);
-                let begun = record.as_ref().map_or(0, |record| attempts(kind, record));
-                if record.is_some() && (attempt == Attempt::IsForgotten || begun < ATTEMPTS_MAX) {
+                let may_go_on = |record: &Arc<Record>| {
+                    attempt == Attempt::IsForgotten || !is_used_up(kind, record)
+                };
+                if self.records.find(id).as_ref().is_some_and(may_go_on) {
                     tracing::warn!(scene = %id, %error, "{what} waits for the store");
                     return self.requeue(job, attempt);
                 }
@@ -211,8 +144,12 @@ impl Jobs {
             tracing::info!(scene = %id, code, %error, "{what} failed");
         }
         // One that is deleted meanwhile has no watchers.
-        let _ = self.records.apply(id, &Change::Failed(kind, error));
-        kind.after_failure(self, id);
+        if let Ok(failed) = self.records.apply(id, &Change::Failed(kind, error))
+            && failed.after.status.state == SceneState::Failed
+        {
+            // Those that began early are wanted no more.
+            self.running.stop(Reason::Cancelled, |job| job.scene == *id && !job.kind.lasts());
+        }
     }
 
     /// The life of the thread that removes what crashes and deletions left in the store, and photos
@@ -253,11 +190,6 @@ impl Jobs {
 /// Whether a first text may ask for semantics.
 fn is_open_to_texts(status: &SceneStatus) -> bool {
     status.state == SceneState::Done && status.semantics.state == SemanticsState::None
-}
-
-/// How often a job was begun without a result.
-fn attempts(kind: Kind, record: &Record) -> u32 {
-    kind.attempts(&mut record.clone()).map_or(0, |attempts| *attempts)
 }
 
 /// Gives what is free in the heaps back to the system. The allocator keeps it otherwise.

@@ -308,7 +308,7 @@ impl Service {
                 fraction: semantics.fraction,
             },
             SceneState::Queued => {
-                Event::Queued { ahead: self.inner.jobs.queue.ahead(&status.id).unwrap_or(0) }
+                Event::Queued { ahead: self.inner.jobs.ahead(&status.id).unwrap_or(0) }
             }
             SceneState::Running => Event::Running {
                 stage: status.stage.clone().unwrap_or_else(|| Stage::SCENE[0].name().to_owned()),
