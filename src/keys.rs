@@ -11,7 +11,7 @@ use subtle::{ConditionallySelectable, ConstantTimeEq};
 
 use crate::{
     error::{Error, Result},
-    names::display_names,
+    names::{display_names, hex},
 };
 
 /// Starts every key, so that scanners for leaked secrets can find one.
@@ -225,8 +225,4 @@ pub fn generate() -> Result<String> {
 #[must_use]
 pub fn hash(key: &str) -> String {
     hex(&Sha256::digest(key.as_bytes()))
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }

@@ -10,7 +10,7 @@
 //!
 //! | layer | modules | may use |
 //! |---|---|---|
-//! | L0 the crates below | [`cache`], [`error`], [`limits`], [`scene`], [`render`], [`photos`], [`capture`], [`models`], [`lift`], [`refine`], [`segment`], [`semantics`], [`pipeline`], [`sample`] | their own tables |
+//! | L0 the crates below | [`cache`], [`error`], [`limits`], [`scene`], [`formats`], [`render`], [`photos`], [`capture`], [`models`], [`lift`], [`refine`], [`segment`], [`semantics`], [`pipeline`], [`sample`] | their own tables |
 //! | L0 of the server | [`config`], [`crypto`], [`keys`], [`telemetry`] | L0 |
 //! | L1 | [`store`] | L0 |
 //! | L2 | [`jobs`] | L1 |
@@ -32,6 +32,7 @@ pub mod store;
 pub mod telemetry;
 
 pub use segsplat_core::{cache, error, limits, names, scene};
+pub use segsplat_formats as formats;
 pub use segsplat_render as render;
 pub use segsplat_vision::{
     capture, lift, models, photos, pipeline, refine, sample, segment, semantics,

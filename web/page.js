@@ -869,7 +869,7 @@ async function makeAndKeepFilm() {
 
 async function exportAs(format) {
   const query = new URLSearchParams({ format });
-  if (format === 'html' && state.words.length)
+  if (['html', 'coco', 'labelme'].includes(format) && state.words.length)
     query.set('text', state.words.map((word) => word.text).join('\n'));
   say('writing the file …');
   const answer = await server.call(`/v1/scenes/${state.scene.id}/export?${query}`);

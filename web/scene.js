@@ -1,4 +1,4 @@
-// Reads a packed scene (src/service/packed.rs) as it comes, and sorts it in a worker.
+// Reads a packed scene (crates/formats/src/packed.rs) as it comes, and sorts it in a worker.
 const RECORD = 32,
   MOST = 4 << 20,
   CELLS = [128, 64];

@@ -29,10 +29,9 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use segsplat_core::{error, limits, scene};
+use segsplat_formats::npy;
 use segsplat_render as render;
-use segsplat_vision::{
-    models, photos as photo_files, photos::npy, pipeline, refine, sample, segment,
-};
+use segsplat_vision::{models, photos as photo_files, pipeline, refine, sample, segment};
 
 use self::rows::{Record, Rows};
 use crate::error::Result;

@@ -9,10 +9,13 @@ use super::{engine, output::Output, reconstruct, scene_file};
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
+    formats::{
+        folders::{FOLDER_FORMATS, FolderFormat},
+        splats::{SplatFormat, endings},
+    },
     names::named,
     scene::Preset,
-    service::{FOLDER_FORMATS, FolderFormat, OfflineService, ScoringOptions},
-    store::splats::{SplatFile, SplatFormat, endings},
+    service::{ScoringOptions, scene_splats},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -67,7 +70,7 @@ fn gaussians(
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
     let count = scene.gaussians.len();
     let semantics = scene.semantics.as_deref();
-    let file = SplatFile::of_scene(format, &scene, &scene.gaussians, semantics)?;
+    let file = scene_splats(format, &scene, &scene.gaussians, semantics)?;
     scene_file::write_splats(&args.output, &file)?;
     let path = args.output.display();
     let value = json!({
@@ -81,8 +84,7 @@ fn folder(args: &Args, format: &FolderFormat, config: &Config, out: &Output) -> 
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
     let photos = args.photos.as_deref();
     let upload = photos.map(|path| reconstruct::upload(path, config)).transpose()?;
-    let semantics = engine::semantics(config, format.texts)?;
-    let service = OfflineService::new(semantics, engine::renderer(config)?, config.limits.clone());
+    let service = engine::offline(config, format.texts)?;
     let unwritable = |e| scene_file::unwritable(&args.output, e);
     // Half a zip is of no use, and what was there before stays until there is a whole one.
     let part = args.output.with_added_extension("part");

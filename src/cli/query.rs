@@ -9,12 +9,12 @@ use super::{camera, engine, output::Output, scene_file};
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
+    formats::splats::{SplatFormat, endings},
     names::named,
     service::{
-        Boxes, CameraFields, MaskFormat, OfflineService, QuerySpec, ScoringOptions, TextResult,
-        ViewOptions,
+        Boxes, CameraFields, MaskFormat, QuerySpec, ScoringOptions, TextResult, ViewOptions,
+        scene_splats,
     },
-    store::splats::{SplatFile, SplatFormat, endings},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -59,8 +59,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         ..QuerySpec::default()
     };
     let opened = scene_file::open(&args.scene, &config.limits)?;
-    let semantics = engine::semantics(config, true)?;
-    let service = OfflineService::new(semantics, engine::renderer(config)?, config.limits.clone());
+    let service = engine::offline(config, true)?;
     let mut answer = service.query(&opened.scene, &spec)?;
     let mut text = String::new();
     for (i, found) in answer.results.iter().enumerate() {
@@ -70,7 +69,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         match ending {
             Some(Ending::Gaussians(format)) => {
                 let chosen = service.select(&opened.scene, &found.text, &spec)?;
-                let file = SplatFile::of_scene(format, &opened.scene, &chosen, None)?;
+                let file = scene_splats(format, &opened.scene, &chosen, None)?;
                 scene_file::write_splats(&path, &file)?;
             }
             _ => {

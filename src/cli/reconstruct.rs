@@ -32,8 +32,8 @@ use crate::{
         Density, PhotoHash, PosedPhoto, Preset, Provenance, Refine, RefineReport, Scene, SceneId,
         SceneMeta, SceneOptions, SemanticsMode, Stage, Upload, Watch,
     },
-    service::check_refine,
-    store::{self, splats::SplatFile, write_scene_file, write_semantics_file},
+    service::{check_refine, scene_splats},
+    store::{self, write_scene_file, write_semantics_file},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -232,7 +232,7 @@ fn semantics(name: &str) -> Result<SemanticsMode, String> {
 fn write(path: &Path, scene: &Scene) -> Result<()> {
     let Some(format) = splat_format(path) else { return write_scene_file(path, scene) };
     let semantics = scene.semantics.as_deref();
-    write_splats(path, &SplatFile::of_scene(format, scene, &scene.gaussians, semantics)?)
+    write_splats(path, &scene_splats(format, scene, &scene.gaussians, semantics)?)
 }
 
 fn describe(path: &Path, scene: &Scene, total_ms: f64, out: &Output) -> Result<()> {

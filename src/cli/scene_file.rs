@@ -8,12 +8,12 @@ use std::{
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    limits::Limits,
-    scene::{Scene, SceneOptions},
-    store::{
-        read_scene, read_semantics,
+    formats::{
+        container::{read_scene, read_semantics},
         splats::{SplatFile, SplatFormat, SplatsRead, read_splats},
     },
+    limits::Limits,
+    scene::{Scene, SceneOptions},
 };
 
 /// Name of the scene file where a folder is named.
@@ -22,7 +22,7 @@ const IN_FOLDER: &str = "scene.segsplat";
 /// A scene and where it came from.
 #[derive(Debug)]
 pub(super) struct Opened {
-    pub(super) scene: Scene,
+    pub(super) scene: Arc<Scene>,
     /// `segsplat`, or the name of a format of Gaussians.
     pub(super) format: &'static str,
     /// sha256 of a scene file, hex.
@@ -95,7 +95,7 @@ pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
     if let Some(format) = splat_format(&path) {
         let file = fs_err::File::open(&path).map_err(|e| unreadable(&path, e))?;
         let read = splats_of(&mut BufReader::new(file), &path, limits)?;
-        let scene = read.into_scene(&SceneOptions::default())?;
+        let scene = Arc::new(read.into_scene(&SceneOptions::default())?);
         return Ok(Opened { scene, format: format.name, sha256: None });
     }
     let file = fs_err::read(&path).map_err(|e| unreadable(&path, e))?;
@@ -109,5 +109,5 @@ pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
         Err(e) if e.kind() == io::ErrorKind::NotFound => {}
         Err(e) => return Err(unreadable(&beside, e)),
     }
-    Ok(Opened { scene, format: "segsplat", sha256: Some(sha256) })
+    Ok(Opened { scene: Arc::new(scene), format: "segsplat", sha256: Some(sha256) })
 }

@@ -10,10 +10,11 @@ use parking_lot::Mutex;
 
 use crate::{
     error::{Error, Result},
+    formats::splats::read_splats,
     limits::Limits,
     pipeline::{self, PhotoSet},
     scene::{PhotoHash, Scene, SceneId, SceneOptions, SemanticsMode, Stage, StageTime, Upload},
-    store::{self, splats::read_splats},
+    store,
 };
 
 /// An upload as its jobs need it.

@@ -6,12 +6,10 @@ use std::borrow::Cow;
 
 use image::{ExtendedColorType, ImageEncoder, codecs::webp::WebPEncoder};
 
-use super::{
-    npz,
-    request::{Format, Kind},
-};
+use super::request::{Format, Kind};
 use crate::{
     error::{Error, Result},
+    formats::npy,
     render::{DepthSteps, Frame, levels::level},
     semantics::colour,
 };
@@ -234,7 +232,7 @@ fn numbers(layer: Layer<'_>, width: u32, height: u32) -> Result<Vec<u8>> {
 /// An array in C order.
 fn npy(values: &[f32], shape: &[u32]) -> Vec<u8> {
     let shape: Vec<usize> = shape.iter().map(|side| *side as usize).collect();
-    let mut file = npz::header::<f32>(&shape);
+    let mut file = npy::header::<f32>(&shape);
     file.extend_from_slice(bytemuck::cast_slice(values));
     file
 }

@@ -12,22 +12,24 @@ use super::{
     Service,
     create::blocking,
     features,
-    folder::FolderFormat,
-    packed::write_packed,
     page::write_page,
     query,
-    request::{ExportFormat, QuerySpec, TextOptions},
-    search::{SceneTexts, check_scoring},
-    semantics::meaning_tag,
+    request::{ExportFormat, QuerySpec, TextOptions, ViewOptions},
+    search::ScoringChoice,
+    tags::{etag, semantics_tag},
     texts,
-    times::ViewTimes,
     types::Export,
-    view::{hash, text_words},
+    work::Work,
 };
 use crate::{
     error::{Error, Result},
+    formats::{
+        folders::FolderFormat,
+        packed::write_packed,
+        splats::{SplatFile, SplatFormat},
+    },
+    render::plan::{default_near, widened},
     scene::{Gaussians, Preset, Scene, SceneId, Semantics},
-    store::splats::{SplatFile, SplatFormat},
 };
 
 /// Parts that wait for the caller to take them.
@@ -52,7 +54,7 @@ impl Service {
         ask: &TextOptions,
     ) -> Result<Export> {
         // How texts are scored is checked also where no text is asked.
-        check_scoring(&ask.scoring, &self.limits())?;
+        texts::check_scoring(&ask.scoring, &self.limits())?;
         if let Some(format) = FolderFormat::named(&format.to_string()) {
             return self.folder(id, format, preset, ask).await;
         }
@@ -62,10 +64,9 @@ impl Service {
             if ask.text.is_some() {
                 return Err(texts::not_with("npz"));
             }
-            let understood = inner.understood(&access.finished()?, "npz", ask.wait).await?;
-            let etag = format!("{}-npz", hash(understood.subject().tag));
-            let write =
-                move |to: &mut dyn Write| features::write_semantics(understood.subject(), to);
+            let of = inner.semantic_scene(&access.finished()?, "npz", ask.wait).await?;
+            let etag = format!("{}-npz", etag(&of.tag));
+            let write = move |to: &mut dyn Write| features::write_semantics(&of.semantics, to);
             let file_name = format!("{id}.npz");
             return Ok(Export::new(file_name, etag, stream(write)));
         }
@@ -78,30 +79,31 @@ impl Service {
         let Some(text) = &ask.text else {
             let access = access.finished()?;
             let scene = blocking(move || inner.load(&access)).await??;
-            let digest = hash(&meaning_tag(&scene));
+            let digest = etag(&semantics_tag(&scene));
             if format == ExportFormat::Packed {
                 let (file_name, etag) = (format!("{id}.segsplat"), format!("{digest}-packed"));
-                let chunks = stream(move |to: &mut dyn Write| write_packed(&scene, to));
+                let chunks = stream(move |to: &mut dyn Write| {
+                    write_packed(&scene, default_near(scene.meta.report.median_depth), to)
+                });
                 return Ok(Export::new(file_name, etag, chunks));
             }
             let splats = splats(format)?;
             let write = move || {
                 let semantics = scene.semantics.as_deref();
-                SplatFile::of_scene(splats, &scene, &scene.gaussians, semantics)
+                scene_splats(splats, &scene, &scene.gaussians, semantics)
             };
             return Ok(gaussians(&id.to_string(), &digest, blocking(write).await??));
         };
         inner.can_understand("text")?;
         let text = texts::checked(text, "text", &self.limits())?;
-        let understood = inner.understood(&access.finished()?, "text", ask.wait).await?;
-        let of = understood.subject();
-        let named = preset.unwrap_or(of.scene.meta.report.method.preset);
-        let etag = hash(&text_words(of.tag, Some(&text), (named, &ask.scoring))?);
-        let (scoring, splats) = (ask.scoring.clone(), splats(format)?);
+        let splats = splats(format)?;
+        let of = inner.semantic_scene(&access.finished()?, "text", ask.wait).await?;
+        let how = ScoringChoice { preset, changes: ask.scoring.clone() };
+        let deadline = inner.deadline(&ViewOptions::default());
+        let texts = inner.score(of, how, vec![text], deadline).await?;
+        let etag = etag(&texts.key()?);
         let file = blocking(move || {
-            let of = understood.subject();
-            let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &[text])?;
-            part(splats, of.scene, &texts.gaussians(), of.semantics)
+            part(splats, &texts.of.scene, &texts.gaussians(), &texts.of.semantics)
         })
         .await??;
         Ok(gaussians(&format!("{id}-part"), &etag, file))
@@ -120,7 +122,7 @@ impl Service {
         let access = self.scene(id).await?.finished()?;
         let lines = texts::lines(ask);
         let how = format!("{lines:?} {preset:?} {:?} {}", ask.scoring, env!("CARGO_PKG_VERSION"));
-        let tag = move |scene: &Scene| format!("{}-html", hash(&(meaning_tag(scene) + &how)));
+        let tag = move |scene: &Scene| format!("{}-html", etag(&(semantics_tag(scene) + &how)));
         let file_name = format!("{id}.html");
         if lines.is_empty() {
             let scene = blocking(move || inner.load(&access)).await??;
@@ -130,15 +132,14 @@ impl Service {
         }
         inner.can_understand("text")?;
         let texts = texts::all_checked(&lines, "text", &limits)?;
-        let understood = inner.understood(&access, "text", ask.wait).await?;
-        let (scoring, etag) = (ask.scoring.clone(), tag(understood.subject().scene));
+        let of = inner.semantic_scene(&access, "text", ask.wait).await?;
+        let (how, etag) = (ScoringChoice { preset, changes: ask.scoring.clone() }, tag(&of.scene));
+        let deadline = inner.deadline(&ViewOptions::default());
+        let texts = inner.score(of, how, texts, deadline).await?;
         let chunks = stream(move |to: &mut dyn Write| {
-            let of = understood.subject();
-            let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &texts)?;
-            let spec = QuerySpec::default();
-            let times = ViewTimes::default();
-            let answer = query::answer(&texts, &limits, &spec, None, times, || ())?;
-            write_page(of.scene, Some(&answer), to)
+            let (spec, work) = (QuerySpec::default(), &mut Work::default());
+            let answer = query::answer(&texts, &limits, &spec, None, work)?;
+            write_page(&texts.of.scene, Some(&answer), to)
         });
         Ok(Export::new(file_name, etag, chunks))
     }
@@ -169,7 +170,21 @@ fn part(
     of: &Semantics,
 ) -> Result<SplatFile> {
     let semantics = Semantics { index: gaussians.semantic_index().to_vec(), ..of.clone() };
-    SplatFile::of_scene(splats, scene, gaussians, Some(&semantics))
+    scene_splats(splats, scene, gaussians, Some(&semantics))
+}
+
+/// Some Gaussians of a scene as a file that other programs draw: with the blur that the scene's own
+/// views add to what they magnify.
+///
+/// # Errors
+/// As [`SplatFile::new`].
+pub fn scene_splats(
+    format: &'static SplatFormat,
+    scene: &Scene,
+    gaussians: &Gaussians,
+    semantics: Option<&Semantics>,
+) -> Result<SplatFile> {
+    SplatFile::new(format, widened(scene, gaussians, None)?, semantics)
 }
 
 /// A file with Gaussians; `stem` is its name without the ending.

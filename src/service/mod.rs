@@ -11,29 +11,28 @@ mod features;
 mod folder;
 mod infer;
 mod memory;
-mod npz;
 mod offline;
-mod packed;
 mod page;
 mod pick;
 mod query;
 mod refine;
 mod request;
-mod rle;
 mod schedule;
 mod search;
 mod semantics;
+mod tags;
 mod texts;
 mod times;
 mod types;
 mod view;
+mod work;
 
 use std::{fmt, sync::Arc};
 
 use futures_util::{Stream, stream};
 use tokio::sync::Semaphore;
 
-pub use self::folder::{FOLDER_FORMATS, FolderFormat};
+pub use self::export::scene_splats;
 pub use self::infer::InferSpec;
 pub use self::page::{VIEWER, ViewerPage};
 pub(crate) use self::refine::check_refine;
@@ -45,13 +44,13 @@ pub use self::{
         FeaturesSpec, Format, Kind, LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions,
         PoseSpec, QuerySpec, ScoringOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec,
     },
-    rle::Rle,
     times::ViewTimes,
     types::{
         Created, Export, InstanceBox, KnownWord, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
         QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning, Trust,
     },
 };
+pub use crate::formats::rle::Rle;
 pub use crate::render::{Quality, plan::default_near};
 pub use crate::scene::{
     Density, Event, MaskLevel, Method, Preset, SceneCamera, SceneError, SceneOptions, SceneState,
@@ -107,7 +106,7 @@ struct Inner {
     jobs: Arc<Jobs>,
     /// Networks that run by themselves; the jobs have the same.
     networks: Arc<dyn SceneNetworks>,
-    backend: Backend,
+    backend: Arc<Backend>,
     models: ModelsInfo,
     scheduler: Arc<Scheduler>,
     /// Permits to decode uploads.
@@ -148,7 +147,7 @@ impl Service {
         let (store, records) = Store::open(place, &config.limits)?;
         let store = Arc::new(store);
         let scheduler = Scheduler::new(parts.renderer.concurrency(), &config.limits);
-        let drawn = Arc::clone(&scheduler);
+        let views = Arc::clone(&scheduler);
         let device = Arc::clone(&parts.renderer).differentiable();
         let refine = match config.refine {
             // It takes all processors for a minute after each scene, so it is for calls that ask.
@@ -169,7 +168,7 @@ impl Service {
             renderer: Arc::clone(&parts.renderer),
             refiner,
             threads: config.threads,
-            drawn: Box::new(move || drawn.idle()),
+            drawn: Box::new(move || views.idle()),
         };
         let jobs = Jobs::start(job_parts, records)?;
         let models = ModelsInfo {
@@ -182,7 +181,7 @@ impl Service {
             jobs,
             networks,
             scheduler,
-            backend: Backend::new(parts.renderer, parts.semantics, &config.limits),
+            backend: Arc::new(Backend::new(parts.renderer, parts.semantics, &config.limits)),
             models,
             reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
             folders: Arc::new(Semaphore::new(config.limits.folder_exports_max)),

@@ -10,9 +10,11 @@ use std::{
 use base64::{Engine as _, prelude::BASE64_STANDARD, write::EncoderWriter};
 use sha2::{Digest, Sha256};
 
-use super::{packed::write_packed, types::QueryAnswer};
+use super::types::QueryAnswer;
 use crate::{
     error::{Error, ErrorCode, Result},
+    formats::packed::write_packed,
+    render::plan::default_near,
     scene::Scene,
 };
 
@@ -81,7 +83,7 @@ pub(super) fn write_page(
     put(&texts.replace('<', "\\u003c"))?;
     put(r#"</script><script type="application/octet-stream" id="packed">"#)?;
     let mut coded = EncoderWriter::new(&mut *to, &BASE64_STANDARD);
-    write_packed(scene, &mut coded)?;
+    write_packed(scene, default_near(scene.meta.report.median_depth), &mut coded)?;
     coded.finish().map_err(unwritten)?;
     drop(coded);
     to.write_all(b"</script>").and_then(|()| to.write_all(end.as_bytes())).map_err(unwritten)

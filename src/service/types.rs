@@ -8,10 +8,10 @@ use utoipa::ToSchema;
 
 use super::{
     request::{Format, Kind},
-    rle::Rle,
     times::ViewTimes,
 };
 use crate::{
+    formats::rle::Rle,
     render::FrameStats,
     scene::{Camera, SceneStatus, ScoringMethod},
 };

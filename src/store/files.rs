@@ -9,7 +9,7 @@ use fs_err::{self as fs, File};
 
 use sha2::{Digest, Sha256};
 
-use crate::error::{Error, ErrorCode};
+use crate::names::hex;
 
 /// Ending of files that are being written; after a crash such a file is useless.
 pub(super) const TEMPORARY: &str = "tmp";
@@ -46,21 +46,7 @@ pub(super) fn sync_parent(path: &Path) -> io::Result<()> {
     })
 }
 
-/// A failed file operation as an error for the client, the cause kept for the log.
-pub(super) fn unavailable(what: &str, cause: io::Error) -> Error {
-    Error::new(
-        ErrorCode::StoreUnavailable,
-        format!("the store cannot {what} now: {}", cause.kind()),
-    )
-    .caused_by(cause)
-}
-
 /// sha256 of bytes, lower-case hex.
 pub fn sha256(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
-}
-
-/// Lower-case hex.
-pub(crate) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }

@@ -7,8 +7,10 @@ use std::collections::BTreeMap;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 
-use super::files::hex;
-use crate::scene::{Density, PhotoHash, Provenance, SceneOptions, SemanticsMode};
+use crate::{
+    names::hex,
+    scene::{Density, PhotoHash, Provenance, SceneOptions, SemanticsMode},
+};
 
 /// sha256 over files and options, hex: what an idempotency key stands for.
 pub fn request_sha256(files: &[PhotoHash], options: &SceneOptions) -> String {

@@ -6,9 +6,10 @@ use object_store::path::Path as Name;
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use sha2::{Digest, Sha256};
 
-use super::{Record, Store, files::hex};
+use super::{Record, Store};
 use crate::{
     error::{Error, Result},
+    names::hex,
     scene::SceneId,
 };
 

@@ -16,17 +16,13 @@
 //! while it has a status or a pending record; a sweep removes objects of scenes that have neither.
 //! A bad object is put aside, and the start goes on.
 
-mod container;
 mod files;
 mod hashes;
 mod index;
 mod objects;
 mod open;
 mod record;
-mod scene_file;
-mod semantics_file;
 mod shared;
-pub mod splats;
 mod sweep;
 mod upload_file;
 
@@ -41,21 +37,20 @@ use fs_err as fs;
 use object_store::path::Path as Name;
 use parking_lot::Mutex;
 
+pub(crate) use self::hashes::is_of_request;
 use self::objects::Objects;
-pub(crate) use self::{files::hex, hashes::is_of_request};
 pub use self::{
     files::sha256,
     hashes::{provenance, request_sha256},
     index::KeyUse,
     open::Place,
     record::{Record, RefineOrder},
-    scene_file::{read_scene, write_scene},
-    semantics_file::{read_semantics, write_semantics},
     upload_file::hashes,
 };
 use crate::{
     cache::Cache,
     error::{Error, ErrorCode, Result},
+    formats::container::{read_scene, read_semantics, write_scene, write_semantics},
     scene::{Scene, SceneId, Semantics, Upload},
 };
 
@@ -451,7 +446,7 @@ pub(crate) fn side_by_side<A: Send, B>(
 /// `store_unavailable`.
 pub fn write_scene_file(path: &Path, scene: &Scene) -> Result<()> {
     files::write_atomic(path, |to| write_scene(to, scene).map(drop))
-        .map_err(|cause| files::unavailable("write the scene file", cause))
+        .map_err(|cause| Error::unavailable("write the scene file", cause))
 }
 
 /// Writes the semantics of a scene to any path, whole or not at all; for the command line.
@@ -460,7 +455,7 @@ pub fn write_scene_file(path: &Path, scene: &Scene) -> Result<()> {
 /// `store_unavailable`.
 pub fn write_semantics_file(path: &Path, id: &SceneId, semantics: &Semantics) -> Result<()> {
     files::write_atomic(path, |to| write_semantics(to, id, semantics).map(drop))
-        .map_err(|cause| files::unavailable("write the semantics file", cause))
+        .map_err(|cause| Error::unavailable("write the semantics file", cause))
 }
 
 /// Milliseconds since 1970.

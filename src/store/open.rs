@@ -15,12 +15,13 @@ use object_store::{
 use parking_lot::Mutex;
 
 use super::{
-    Cache, Objects, PROBE, Record, SCENE, STATUS, Store, UPLOAD, aside, files, of, pending, record,
-    scene_file, upload_file,
+    Cache, Objects, PROBE, Record, SCENE, STATUS, Store, UPLOAD, aside, of, pending, record,
+    upload_file,
 };
 use crate::{
     config::Config,
     error::{Error, ErrorCode, Result},
+    formats::container::read_scene,
     limits::Limits,
     scene::{SceneError, SceneId, SceneState, SceneStatus},
 };
@@ -161,7 +162,7 @@ fn lock(root: &Path) -> Result<fs::File> {
         fs::create_dir_all(root)?;
         fs::OpenOptions::new().create(true).truncate(false).write(true).open(root.join("lock"))
     };
-    let lock = prepare().map_err(|cause| files::unavailable("open the data folder", cause))?;
+    let lock = prepare().map_err(|cause| Error::unavailable("open the data folder", cause))?;
     let begun = Instant::now();
     while let Err(cause) = lock.file().try_lock() {
         if begun.elapsed() >= LOCK_WAIT {
@@ -175,7 +176,7 @@ fn lock(root: &Path) -> Result<fs::File> {
 
 fn local(root: &Path) -> Result<(PathBuf, LocalFileSystem)> {
     let folder = fs::canonicalize(root)
-        .map_err(|cause| files::unavailable("open the data folder", cause))?;
+        .map_err(|cause| Error::unavailable("open the data folder", cause))?;
     let local = LocalFileSystem::new_with_prefix(&folder)
         .map_err(|fault| super::objects::unavailable("open the data folder", fault))?;
     Ok((folder, local.with_fsync(true).with_automatic_cleanup(true)))
@@ -244,7 +245,7 @@ pub(super) fn find_record(store: &Store, id: &SceneId) -> Result<Option<Record>>
 
 fn from_scene(store: &Store, id: &SceneId) -> Result<Option<Record>> {
     let Some(file) = store.objects.get("read the scene", of(id, SCENE))? else { return Ok(None) };
-    let Ok((scene, sha256)) = scene_file::read_scene(&file) else { return Ok(None) };
+    let Ok((scene, sha256)) = read_scene(&file) else { return Ok(None) };
     let meta = scene.meta;
     if meta.id != *id {
         return Ok(None);

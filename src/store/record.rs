@@ -2,9 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::files::hex;
 use crate::{
     error::{Error, ErrorCode, Result},
+    names::hex,
     scene::{SceneOptions, SceneStatus},
 };
 use sha2::{Digest, Sha256};

@@ -3,19 +3,16 @@
 use std::io;
 
 use object_store::PutPayload;
-use safetensors::Dtype;
 use serde::{Deserialize, Serialize};
 
-use super::{
-    container::{self, Array, Container, Label},
-    files::sha256,
-};
+use super::files::sha256;
 use crate::{
     error::Result,
+    formats::container::{Container, ContainerArray, ContainerKind, Dtype, frame},
     scene::{PhotoHash, Upload, UploadCameras, UploadFile},
 };
 
-const LABEL: Label = Label { kind: "segsplat-upload", version: 1 };
+const LABEL: ContainerKind = ContainerKind { kind: "segsplat-upload", version: 1 };
 
 #[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -63,9 +60,11 @@ pub(super) fn pack(upload: Upload, record: &super::Record) -> io::Result<PutPayl
     let arrays: Vec<_> = parts
         .iter()
         .enumerate()
-        .map(|(i, (_, _, bytes))| Array::new(format!("part_{i}"), Dtype::U8, &[bytes.len()], bytes))
+        .map(|(i, (_, _, bytes))| {
+            ContainerArray::new(format!("part_{i}"), Dtype::U8, &[bytes.len()], bytes)
+        })
         .collect();
-    let (head, digest) = container::frame(&LABEL, &header, &arrays)?;
+    let (head, digest) = frame(&LABEL, &header, &arrays)?;
     let cameras = upload.cameras.map(|cameras| match cameras {
         UploadCameras::Transforms(json) | UploadCameras::Cameras(json) => json,
     });

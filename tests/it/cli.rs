@@ -8,14 +8,14 @@ use std::{
 
 use segsplat::{
     error::ErrorCode,
+    formats::{
+        container::write_scene,
+        splats::{PLY, SplatFile},
+    },
     models::{NetworkOptions, Runtime},
     scene::{
         Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, Provenance,
         RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
-    },
-    store::{
-        splats::{PLY, SplatFile},
-        write_scene,
     },
 };
 use serde_json::{Value, json};

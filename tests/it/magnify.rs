@@ -1,6 +1,7 @@
 //! Views larger than the network's own pictures: no dot grid, and no change at its own size.
 
 use segsplat::{
+    formats::splats::{GLB, read_splats},
     limits::Limits,
     render::{
         Frame, Kinds, RenderRequest, Renderer,
@@ -11,7 +12,7 @@ use segsplat::{
         Backdrop, Camera, CameraToWorld, Gaussians, HealthReport, Intrinsics, Provenance,
         RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SceneOptions, SourcePixel,
     },
-    store::splats::{GLB, SplatFile, read_splats},
+    service::scene_splats,
 };
 
 const SIDE: u16 = 48;
@@ -103,7 +104,7 @@ fn a_magnified_wall_has_no_dot_grid() {
 fn a_file_has_the_blur_of_magnified_views() {
     let scene = wall();
     let mut files = vec![Vec::new(); 2];
-    let file = SplatFile::of_scene(&GLB, &scene, &scene.gaussians, None).expect("a file");
+    let file = scene_splats(&GLB, &scene, &scene.gaussians, None).expect("a file");
     file.write(&mut files[0]).expect("memory");
     let read = |file: &[u8]| {
         let read = read_splats(&mut &file[..], "a.glb", &Limits::default()).expect("a file");
@@ -123,7 +124,7 @@ fn a_file_has_the_blur_of_magnified_views() {
         assert!(filled > 0.8, "{zoom}: {filled}, without the blur {gap}");
     }
     // It is there once: a file of a file is the same.
-    let file = SplatFile::of_scene(&GLB, &again, &again.gaussians, None).expect("a file");
+    let file = scene_splats(&GLB, &again, &again.gaussians, None).expect("a file");
     file.write(&mut files[1]).expect("memory");
     assert!(read(&files[1]).gaussians.scales() == again.gaussians.scales());
 }

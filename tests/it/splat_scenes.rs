@@ -9,6 +9,10 @@ use std::{
 use flate2::{Compression, write::GzEncoder};
 use segsplat::{
     error::Result,
+    formats::splats::{
+        COMPRESSED_PLY, FORMATS, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
+        read_splats,
+    },
     jobs::{NetworkState, SceneNetworks},
     pipeline::{PhotoSet, Reconstruction},
     render::compare::psnr,
@@ -17,13 +21,7 @@ use segsplat::{
         SemanticsState, Upload, UploadFile, Watch,
     },
     service::ModelsInfo,
-    store::{
-        Place, Store,
-        splats::{
-            COMPRESSED_PLY, FORMATS, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
-            read_splats,
-        },
-    },
+    store::{Place, Store},
 };
 use segsplat_testing::scenes::cloud;
 use serde_json::{Value, json as object};

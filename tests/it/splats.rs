@@ -11,15 +11,15 @@ use flate2::{Compression, read::GzDecoder, write::GzEncoder};
 use glam::DVec3;
 use segsplat::{
     error::{ErrorCode, Result},
+    formats::splats::{
+        COMPRESSED_PLY, FORMATS, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
+        read_splats,
+    },
     limits::Limits,
     render::{Kinds, RenderRequest, Renderer as _, compare::psnr, cpu::CpuRenderer},
     scene::{
         Bank, BankMask, Gaussians, IndexMap, SanitizeReport, SceneOptions, Semantics,
         SemanticsReport,
-    },
-    store::splats::{
-        COMPRESSED_PLY, FORMATS, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
-        read_splats,
     },
 };
 use segsplat_testing::scenes::{camera, cloud};

@@ -7,17 +7,17 @@ use glam::DVec3;
 use object_store::{memory::InMemory, path::Path as Name};
 use segsplat::{
     error::{ErrorCode, Result},
+    formats::{
+        container::{read_scene, read_semantics, write_scene, write_semantics},
+        splats::{PLY, SplatFile, SplatsRead, read_splats},
+    },
     limits::Limits,
     scene::{
         Backdrop, Bank, BankMask, Gaussians, HealthReport, IndexMap, PhotoHash, Provenance,
         RawGaussians, SanitizeReport, Scene, SceneId, SceneMeta, SceneOptions, SceneState,
         SceneStatus, Semantics, SemanticsReport, SourcePixel, Upload, UploadCameras, UploadFile,
     },
-    store::{
-        KeyUse, Place, Record, Store, provenance, read_scene, read_semantics, request_sha256,
-        splats::{PLY, SplatFile, SplatsRead, read_splats},
-        write_scene, write_semantics,
-    },
+    store::{KeyUse, Place, Record, Store, provenance, request_sha256},
 };
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};

@@ -23,6 +23,10 @@ use segsplat::{
     cli::engine,
     config::Config,
     error::{ErrorCode, Result, TABLE},
+    formats::{
+        container::{read_scene, read_semantics, write_scene, write_semantics},
+        splats::{FORMATS, GLB, SOG, SplatFile, read_splats},
+    },
     limits::Limits,
     photos,
     render::cpu::CpuRenderer,
@@ -30,11 +34,6 @@ use segsplat::{
     scene::{
         Backdrop, Bank, HealthReport, IndexMap, Provenance, Scene, SceneId, SceneMeta, Semantics,
         SemanticsReport, Upload, UploadCameras,
-    },
-    store::{
-        read_scene, read_semantics,
-        splats::{FORMATS, GLB, SOG, SplatFile, read_splats},
-        write_scene, write_semantics,
     },
 };
 use segsplat_testing::captures;

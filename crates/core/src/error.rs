@@ -162,6 +162,13 @@ impl Error {
         Self::new(ErrorCode::LimitExceeded, format!("{what}: {value} is over {bound}"))
     }
 
+    /// A file that cannot be read or written now: `what` was to be done. The cause is kept for the
+    /// log.
+    pub fn unavailable(what: &str, cause: std::io::Error) -> Self {
+        let why = format!("the store cannot {what} now: {}", cause.kind());
+        Self::new(ErrorCode::StoreUnavailable, why).caused_by(cause)
+    }
+
     /// A fault of ours.
     pub fn internal(message: impl Into<String>) -> Self {
         Self::new(ErrorCode::Internal, message)

@@ -1,4 +1,5 @@
-//! Names of enums as callers write them. serde has them; this reads and prints them.
+//! Names of enums as callers write them (serde has them; this reads and prints them), and numbers
+//! and bytes as text.
 
 use serde::{
     Deserialize,
@@ -18,6 +19,11 @@ pub fn named<T: for<'de> Deserialize<'de>>(name: &str) -> Result<T, String> {
 pub fn shown(number: f64) -> String {
     let plain = number == 0.0 || !number.is_finite() || (1e-6..1e16).contains(&number.abs());
     if plain { number.to_string() } else { format!("{number:e}") }
+}
+
+/// Bytes as lower-case hexadecimal digits.
+pub fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 /// `Display` by the names that serde gives an enum.

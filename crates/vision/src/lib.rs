@@ -2,7 +2,8 @@
 //!
 //! | layer | modules | may use |
 //! |---|---|---|
-//! | L1 stages | [`photos`], [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`sample`] | `segsplat_core` (and [`segsplat_render::vectorised`]); never each other |
+//! | L1 stages | [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`sample`] | `segsplat_core` (and [`segsplat_render::vectorised`]); never each other |
+//! | L1 stages | [`photos`] | `segsplat_core`, `segsplat_formats` |
 //! | L1 stages | [`refine`] | `segsplat_core`, `segsplat_render` |
 //! | L2 order | [`pipeline`] | L1; the only place that knows their order |
 
@@ -17,14 +18,9 @@ pub mod segment;
 pub mod semantics;
 
 use glam::DVec3;
-use segsplat_core::{error, limits, meter, scene};
+use segsplat_core::{error, limits, meter, names, scene, scene::photo_label};
+use segsplat_formats as formats;
 use segsplat_render::vectorised;
-
-/// How a photo is called in messages: `photo 3 ("images/0003.jpg")`.
-fn photo_label(index: usize, file: &str) -> String {
-    let shown: String = file.chars().take(80).collect();
-    format!("photo {index} ({shown:?})")
-}
 
 /// World point at the centre of Gaussian `i`.
 fn center_of(gaussians: &scene::Gaussians, i: usize) -> DVec3 {

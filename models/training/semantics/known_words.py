@@ -17,8 +17,9 @@ import torch
 import cuts
 from colours import COLOURS, dominant_colour
 from naming import HERE, Bundle, Everyday, collect
-from train_real import SIDE, decode, letterbox
+from pictures import decode, letterbox
 from wordnet import WordNet
+from words_model import SIDE
 
 FEWEST = 5  # things that a figure is trusted from
 GOOD, POOR = (0.7, 0.03), (0.4, 0.1)  # found at least, absent at most; found under, absent over

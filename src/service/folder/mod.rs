@@ -1,92 +1,40 @@
-//! A scene as a folder for other programs, in a zip that is written while it is sent: photos,
-//! cameras, points and depth as COLMAP and nerfstudio have them, masks of texts as COCO and
-//! `LabelMe` have them.
-//!
-//! One table of formats, a module for each. Beside the scene and its upload, one photo or one view
-//! is in memory.
+//! A scene as a folder for other programs: its photos and its views, drawn one after another, for
+//! [`crate::formats::folders`], which writes them.
 
 mod calls;
-mod coco;
-mod colmap;
-mod labelme;
-mod nerfstudio;
-mod outline;
-mod photos;
-mod points;
-mod zipped;
 
 use std::io::Write;
 
-use self::{photos::FolderPhoto, zipped::ZipFolder};
 use super::{
+    encode::{Layer, encode},
     query,
     request::{
         Boxes, CameraSpec, Format, Kind, LensSpec, MaskFormat, PictureOptions, PoseSpec, QuerySpec,
-        ViewOptions,
+        TextOptions, ViewOptions, ViewSpec,
     },
     search::{Backend, SceneTexts},
     texts,
-    times::ViewTimes,
     types::TextView,
     view::{Inputs, Resolved, resolve_one},
+    work::Work,
 };
 use crate::{
     error::{Error, Result},
+    formats::folders::{
+        FolderContents, FolderFormat, FolderMask, FolderPixels, PhotoFile, PutPhoto,
+    },
     limits::Limits,
+    photos::{SentPixels, each},
     render::Kinds,
-    scene::{Preset, Scene, SceneCamera, Upload},
+    scene::{Photo, Preset, Scene, SceneCamera, Upload},
 };
 
-/// A layout of folders.
-#[derive(Debug)]
-pub struct FolderFormat {
-    /// Name in calls.
-    pub name: &'static str,
-    /// Ending of files, without the first dot.
-    pub ending: &'static str,
-    /// Whether it shows what texts select; else it takes none.
-    pub texts: bool,
-    write: fn(&Contents<'_>, &[FolderPhoto], &mut dyn Views, &mut ZipFolder<'_>) -> Result<()>,
-}
-
-/// Photos, cameras, points and depth maps in the layout of COLMAP.
-static COLMAP: FolderFormat =
-    FolderFormat { name: "colmap", ending: "colmap.zip", texts: false, write: colmap::write };
-/// Photos, cameras, points and depth maps in the layout of nerfstudio.
-static NERFSTUDIO: FolderFormat = FolderFormat {
-    name: "nerfstudio",
-    ending: "nerfstudio.zip",
-    texts: false,
-    write: nerfstudio::write,
-};
-/// What texts select in each photo, as COCO's annotations.
-static COCO: FolderFormat =
-    FolderFormat { name: "coco", ending: "coco.zip", texts: true, write: coco::write };
-/// What texts select in each photo, as a JSON of `LabelMe` beside each.
-static LABELME: FolderFormat =
-    FolderFormat { name: "labelme", ending: "labelme.zip", texts: true, write: labelme::write };
-/// All layouts.
-pub static FOLDER_FORMATS: [&FolderFormat; 4] = [&COLMAP, &NERFSTUDIO, &COCO, &LABELME];
-
-impl FolderFormat {
-    /// The format of this name.
-    pub fn named(name: &str) -> Option<&'static Self> {
-        FOLDER_FORMATS.into_iter().find(|format| format.name == name)
-    }
-
-    /// The format that the ending of a file's name says.
-    pub fn of_file(name: &str) -> Option<&'static Self> {
-        let name = name.to_ascii_lowercase();
-        FOLDER_FORMATS.into_iter().find(|format| name.ends_with(&format!(".{}", format.ending)))
-    }
-
-    /// The texts of a call, checked: at least one where the format shows them, else none.
-    fn checked(&self, asked: &[String], limits: &Limits) -> Result<Vec<String>> {
-        match (self.texts, asked.is_empty()) {
-            (true, _) => texts::all_checked(asked, "text", limits),
-            (false, true) => Ok(Vec::new()),
-            (false, false) => Err(texts::not_with(self.name)),
-        }
+/// The texts of a call, checked: at least one where the format shows them, else none.
+fn checked_texts(format: &FolderFormat, asked: &[String], limits: &Limits) -> Result<Vec<String>> {
+    match (format.texts, asked.is_empty()) {
+        (true, _) => texts::all_checked(asked, "text", limits),
+        (false, true) => Ok(Vec::new()),
+        (false, false) => Err(texts::not_with(format.name)),
     }
 }
 
@@ -117,11 +65,57 @@ fn write(
     views: &mut dyn Views,
     to: &mut dyn Write,
 ) -> Result<usize> {
-    let mut zip = ZipFolder::new(to);
-    let photos = photos::write(of, &mut zip)?;
-    (format.write)(of, &photos, views, &mut zip)?;
-    zip.finish()?;
-    Ok(photos.iter().filter(|photo| photo.there).count())
+    let points_max = of.limits.folder_points_max;
+    let contents = FolderContents { scene: of.scene, texts: of.texts, points_max };
+    format.write(&contents, &mut Pixels { of, views }, to)
+}
+
+/// The photos of an upload and the views of a scene, by the number of the photo.
+struct Pixels<'a> {
+    of: &'a Contents<'a>,
+    views: &'a mut dyn Views,
+}
+
+impl FolderPixels for Pixels<'_> {
+    fn photos(&mut self, put: &mut PutPhoto<'_>) -> Result<()> {
+        let Some(upload) = self.of.upload.filter(|upload| upload.splats.is_none()) else {
+            return Ok(());
+        };
+        let mut numbers = 0..;
+        each(upload, self.of.limits, |sent| {
+            let Some(i) = numbers.next() else { return Ok(()) };
+            let [w, h] = [sent.camera.intrinsics.width, sent.camera.intrinsics.height];
+            // Under other limits than those of its time a scene has other photos.
+            let same = |of: &&SceneCamera| {
+                let k = of.camera.intrinsics;
+                of.file == sent.file && [k.width, k.height] == [w, h]
+            };
+            let Some(_) = self.of.scene.meta.cameras.get(i).filter(same) else { return Ok(()) };
+            match sent.pixels {
+                SentPixels::File(bytes) => put(i, PhotoFile::Sent(bytes)),
+                SentPixels::Made(pixels) => put(i, PhotoFile::Png(png(pixels)?)),
+            }
+        })
+    }
+
+    fn depth(&mut self, photo: usize) -> Result<Vec<f32>> {
+        self.views.depth(&self.of.views[photo])
+    }
+
+    fn masks(&mut self, photo: usize) -> Result<Vec<FolderMask>> {
+        let mask =
+            |TextView { mask_rle, area, bbox, .. }| FolderMask { mask: mask_rle, area, bbox };
+        Ok(self.views.masks(&self.of.views[photo])?.into_iter().map(mask).collect())
+    }
+}
+
+fn png(photo: Photo) -> Result<Vec<u8>> {
+    let Photo { width, height, rgb, .. } = photo;
+    let (pixels, rest) = rgb.as_chunks::<3>();
+    if !rest.is_empty() {
+        return Err(Error::internal("a photo has a part of a pixel"));
+    }
+    Ok(encode(Layer::Rgb(pixels.to_vec()), width, height, Format::Png)?.bytes)
 }
 
 /// The views of all photos' cameras at the sizes of the photos.
@@ -138,13 +132,14 @@ fn photo_views<'a>(
     let picture = PictureOptions { format: Format::Npy, ..PictureOptions::default() };
     let view = |of: &SceneCamera| {
         let k = of.camera.intrinsics;
-        let spec = CameraSpec {
+        let camera = CameraSpec {
             pose: PoseSpec::CameraToWorld(of.camera.camera_to_world.to_row_major()),
             lens: LensSpec::Focal { fx: k.fx, fy: Some(k.fy), cx: Some(k.cx), cy: Some(k.cy) },
         };
         let (width, height) = (Some(k.width), Some(k.height));
         let options = ViewOptions { width, height, preset, ..ViewOptions::default() };
-        resolve_one(limits, inputs, spec, Kind::Depth, (&options, &picture))
+        let (picture, text) = (picture.clone(), TextOptions::default());
+        resolve_one(limits, inputs, &ViewSpec { camera, kind: Kind::Depth, options, picture, text })
     };
     let views: Vec<Resolved> = cameras.iter().map(view).collect::<Result<_>>()?;
     let pixels = views.iter().map(Resolved::pixels).sum::<u64>() * texts.max(1) as u64;
@@ -166,15 +161,15 @@ fn depth_of(backend: &Backend, scene: &Scene, view: &Resolved) -> Result<Vec<f32
     frame.depth.ok_or_else(|| Error::internal("the renderer gave no depth"))
 }
 
-/// What each text finds in a view, as a query says it. Calls `drawn` when it is drawn.
+/// What each text finds in a view, as a query says it.
 fn masks_of(
-    texts: &SceneTexts<'_>,
+    texts: &SceneTexts,
     limits: &Limits,
     view: &Resolved,
-    drawn: impl FnOnce(),
+    work: &mut Work,
 ) -> Result<Vec<TextView>> {
     let spec = QuerySpec { boxes: Boxes::None, mask: MaskFormat::Rle, ..QuerySpec::default() };
-    let answer = query::answer(texts, limits, &spec, Some(view), ViewTimes::default(), drawn)?;
+    let answer = query::answer(texts, limits, &spec, Some(view), work)?;
     let lost = || Error::internal("a text has no answer in the view");
     answer.results.into_iter().map(|found| found.view.ok_or_else(lost)).collect()
 }

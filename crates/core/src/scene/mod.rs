@@ -33,7 +33,7 @@ pub use id::{SCENE_ID_CHARS, SceneId};
 pub use method::{
     Density, MaskLevel, Method, Preset, SceneOptions, ScoringMethod, SemanticsMode, with_pairs,
 };
-pub use photo::{Crop, CropShape, Photo, PosedPhoto};
+pub use photo::{Crop, CropShape, Photo, PosedPhoto, photo_label};
 pub use refinement::{Refine, RefineReport, RefineState, RefineStatus};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{

@@ -52,3 +52,9 @@ pub struct PosedPhoto {
     /// photo's: `camera` was scaled to the photo, and the capture report says so.
     pub intrinsics_made_for: Option<[u32; 2]>,
 }
+
+/// How a photo is called in messages: `photo 3 ("images/0003.jpg")`.
+pub fn photo_label(index: usize, file: &str) -> String {
+    let shown: String = file.chars().take(80).collect();
+    format!("photo {index} ({shown:?})")
+}

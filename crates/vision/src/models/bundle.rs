@@ -23,6 +23,7 @@ use crate::{
         onnx::OnnxHeader,
         places,
     },
+    names::hex,
 };
 
 /// Where the bundle that ships with the server lies in one of [`places::folders`].
@@ -316,10 +317,6 @@ pub(super) fn sha256_of(path: &Path) -> std::io::Result<String> {
         hasher.update(&chunk[..read]);
     }
     Ok(hex(&hasher.finalize()))
-}
-
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|b| format!("{b:02x}")).collect()
 }
 
 fn missing(dir: &Path, file: &str, cause: std::io::Error) -> Error {

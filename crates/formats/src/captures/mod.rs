@@ -1,0 +1,414 @@
+//! The files of a capture: camera JSON and photo files, or a capture of any known layout, become
+//! [`FoundPhoto`]s: files of photos with the lens and the pose of each, not decoded.
+//!
+//! Only this module knows the axes and units of each layout; poses come out as OpenCV cameras in
+//! the world of the upload. Faults in names and numbers are refused before a photo is read.
+//!
+//! Photos sent beside a camera JSON each need a camera, but the JSON may describe more cameras than
+//! photos were sent. A capture (a folder, an archive, or files of a form that describe their
+//! cameras themselves) is recognised by its files; cameras without photo and photos without camera
+//! are warned of by name. Of more photos than a scene takes, the best are chosen.
+
+pub(crate) mod cameras;
+mod choose;
+pub(crate) mod folder;
+pub(crate) mod layout;
+mod layouts;
+pub(crate) mod lens;
+pub(crate) mod names;
+
+use std::{
+    borrow::Cow,
+    collections::{HashMap, HashSet},
+    path::Path,
+};
+
+use glam::DVec3;
+
+pub use self::lens::{Base, Lens, LensAtSize, Terms};
+use self::{
+    cameras::{CameraEntry, Cameras},
+    folder::Folder,
+};
+use crate::{
+    error::{Error, Result},
+    limits::Limits,
+    scene::{
+        CameraToWorld, Upload, UploadCameras, UploadFile, Warning, WarningCode,
+        photo_label as label,
+    },
+};
+
+/// Files that one message names.
+const NAMED_MAX: usize = 4;
+/// Names of folders with the photos of cameras, where several have photos of these names: programs
+/// put smaller, larger and cut copies beside them.
+const PHOTO_FOLDERS: [&str; 5] = ["images", "resized_images", "rgb", "input", "blended_images"];
+/// Why photos are left out that a camera file keeps for tests.
+const KEPT_OUT: &str = "kept for tests, or marked as bad, by the capture; left out";
+/// The list of `ScanNet++` of the photos that are kept for tests.
+const TEST_LIST: &str = "train_test_lists.json";
+
+/// As [`find`], of a folder on this machine; also the files of cameras that were read.
+///
+/// # Errors
+/// As [`find`]; also `invalid_request` where the folder has no layout that is known.
+pub fn find_in_dir<'a>(
+    dir: &Path,
+    limits: &'a Limits,
+) -> Result<(FoundPhotos<'a>, Vec<UploadFile>)> {
+    let folder = Folder::of_dir(dir, limits)?;
+    let found = of_folder(&folder, limits)?;
+    let cameras = folder.into_cameras_read().into_iter();
+    Ok((found, cameras.map(|(name, bytes)| UploadFile { name, bytes }).collect()))
+}
+
+/// The photos of an upload with their cameras, by what it holds. An archive is unpacked in memory
+/// under the limits.
+///
+/// # Errors
+/// `invalid_request` for missing, surplus or impossible cameras, `photo_unreadable` for an archive
+/// that is damaged, `limit_exceeded`; each names photo, value and bound.
+pub fn find<'a>(upload: &'a Upload, limits: &'a Limits) -> Result<FoundPhotos<'a>> {
+    let total = upload.size_bytes();
+    if total > limits.upload_bytes_max {
+        return Err(Error::limit("upload bytes", total, limits.upload_bytes_max));
+    }
+    match (&upload.archive, &upload.cameras) {
+        (Some(_), cameras) if !upload.photos.is_empty() || cameras.is_some() => {
+            Err(Error::invalid("send either an archive or camera JSON and photos, not both"))
+        }
+        (Some(archive), _) => of_folder(&Folder::of_archive(archive, limits)?, limits),
+        (None, Some(cameras)) => of_form(cameras, &upload.photos, limits),
+        (None, None) if upload.photos.iter().all(|file| names::is_photo(&file.name)) => {
+            Err(Error::invalid(
+                "upload: no camera description; send a part named transforms or cameras, the \
+                 camera files of a capture, or an archive with them",
+            ))
+        }
+        (None, None) => of_folder(&Folder::of_form(&upload.photos, limits)?, limits),
+    }
+}
+
+fn check_count(photos: usize, limits: &Limits) -> Result<()> {
+    if photos >= limits.photos_min {
+        return Ok(());
+    }
+    let least = limits.photos_min;
+    Err(Error::invalid(match photos {
+        0 => format!("no photos; a scene needs {least} or more"),
+        n => format!("{n} photo; a scene needs at least {least} to see depth"),
+    }))
+}
+
+/// A camera and its photo, before the pixels are touched.
+#[derive(Debug)]
+pub struct FoundPhoto<'a> {
+    /// The photo as the scene calls it.
+    pub name: String,
+    /// The photo as the folder calls it.
+    pub path: String,
+    /// The photo as its camera calls it.
+    pub named: String,
+    /// Lens as written.
+    pub lens: Lens,
+    /// Pose, checked.
+    pub pose: CameraToWorld,
+    /// The file.
+    pub bytes: Cow<'a, [u8]>,
+}
+
+/// The photos that make a scene, not decoded.
+#[derive(Debug)]
+pub struct FoundPhotos<'a> {
+    /// In the order of the cameras.
+    pub photos: Vec<FoundPhoto<'a>>,
+    /// What was not used or not there.
+    pub warnings: Vec<Warning>,
+}
+
+/// The photos of a form whose cameras are one JSON part.
+fn of_form<'a>(
+    cameras: &UploadCameras,
+    files: &'a [UploadFile],
+    limits: &Limits,
+) -> Result<FoundPhotos<'a>> {
+    check_count(files.len(), limits)?;
+    let Cameras { entries, held_out } = match cameras {
+        UploadCameras::Transforms(json) => {
+            limits.check_json("transforms", json)?;
+            cameras::transforms(json)?
+        }
+        UploadCameras::Cameras(json) => {
+            limits.check_json("cameras", json)?;
+            cameras::cameras(json)?
+        }
+    };
+    names::paths(files, limits)?;
+    let sent: Vec<&str> = files.iter().map(|file| file.name.as_str()).collect();
+    let (pairs, _) = paired(&entries, &sent)?;
+    let used: HashSet<usize> = pairs.iter().map(|(_, file)| *file).collect();
+    let held: HashSet<&str> = held_out.iter().map(|file| names::file_name(file)).collect();
+    let is_held = |i: &usize| held.contains(names::file_name(sent[*i]));
+    let (kept_out, lone): (Vec<usize>, Vec<usize>) =
+        (0..files.len()).filter(|i| !used.contains(i)).partition(is_held);
+    if let Some(&i) = lone.first() {
+        return Err(Error::invalid(format!(
+            "{}: no camera has this file; the camera file names {} others",
+            label(i, &files[i].name),
+            entries.len()
+        )));
+    }
+    let size = |file: usize| files[file].bytes.len() as u64;
+    let mut warnings: Vec<Warning> = told(
+        WarningCode::PhotosUnused,
+        kept_out.len(),
+        KEPT_OUT,
+        kept_out.iter().map(|i| sent[*i]),
+    )
+    .into_iter()
+    .collect();
+    let (chosen, warning) = chosen(&entries, pairs, &sent, size, limits)?;
+    warnings.extend(warning);
+    let taken = chosen.into_iter().map(|(entry, file, pose)| {
+        let UploadFile { name, bytes } = &files[file];
+        found(&entries[entry], name.clone(), name.clone(), pose, bytes.into())
+    });
+    Ok(FoundPhotos { photos: taken.collect(), warnings })
+}
+
+/// The photos of a capture.
+fn of_folder<'a>(folder: &Folder<'a>, limits: &Limits) -> Result<FoundPhotos<'a>> {
+    let described = layouts::read(folder)?;
+    let Cameras { mut entries, mut held_out } = described.cameras;
+    let listed = test_list(folder)?;
+    entries.retain(|entry| {
+        let kept = !listed.contains(names::file_name(&entry.file));
+        if !kept {
+            held_out.push(entry.file.clone());
+        }
+        kept
+    });
+    if entries.len() > limits.archive_entries_max {
+        let what = format!("{}: cameras", folder.what);
+        return Err(Error::limit(what, entries.len(), limits.archive_entries_max));
+    }
+    let place = photo_folder(folder, &described.root, &entries)?;
+    let inside = |path: &'_ str| -> Option<String> {
+        let rest =
+            if place.is_empty() { path } else { path.strip_prefix(&place)?.strip_prefix('/')? };
+        names::is_photo(rest).then(|| rest.to_owned())
+    };
+    let sent: Vec<String> = folder.paths().filter_map(inside).collect();
+    let sent: Vec<&str> = sent.iter().map(String::as_str).collect();
+    let (pairs, missing) = paired(&entries, &sent)?;
+    if pairs.is_empty() {
+        let first = entries.first().map_or("", |entry| entry.file.as_str());
+        return Err(Error::invalid(format!(
+            "{}: none of the {} cameras has its photo; the first is {first:?}",
+            folder.what,
+            entries.len()
+        )));
+    }
+    check_count(pairs.len(), limits)?;
+    let mut warnings = Vec::new();
+    let unused = without_camera(&sent, &pairs, &held_out);
+    warnings.extend(told(
+        WarningCode::PhotosMissing,
+        missing.len(),
+        "a camera, but no such photo; left out",
+        missing.iter().map(|i| entries[*i].file.as_str()),
+    ));
+    warnings.extend(told(
+        WarningCode::PhotosUnused,
+        unused.len(),
+        "no camera; left out",
+        unused.iter().copied(),
+    ));
+    warnings.extend(told(
+        WarningCode::PhotosUnused,
+        held_out.len(),
+        KEPT_OUT,
+        held_out.iter().map(String::as_str),
+    ));
+    let size = |file: usize| folder.size(&names::join(&place, sent[file]));
+    let (chosen, warning) = chosen(&entries, pairs, &sent, size, limits)?;
+    warnings.extend(warning);
+    let take = |(entry, file, pose): (usize, usize, CameraToWorld)| {
+        let (name, path) = (sent[file].to_owned(), names::join(&place, sent[file]));
+        let bytes = folder.read(&path)?;
+        Ok(found(&entries[entry], name, path, pose, bytes))
+    };
+    let photos = chosen.into_iter().map(take).collect::<Result<_>>()?;
+    Ok(FoundPhotos { photos, warnings })
+}
+
+fn found<'a>(
+    entry: &CameraEntry,
+    name: String,
+    path: String,
+    pose: CameraToWorld,
+    bytes: Cow<'a, [u8]>,
+) -> FoundPhoto<'a> {
+    FoundPhoto { name, path, named: entry.file.clone(), lens: entry.lens.clone(), pose, bytes }
+}
+
+/// A warning that names files.
+fn told<'a>(
+    code: WarningCode,
+    count: usize,
+    why: &str,
+    files: impl Iterator<Item = &'a str>,
+) -> Option<Warning> {
+    let named: Vec<String> = files.take(NAMED_MAX).map(|file| format!("{file:?}")).collect();
+    if count == 0 {
+        return None;
+    }
+    let more = count - named.len();
+    let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+    let message = format!("{}{more}: {why}", named.join(", "));
+    Some(Warning { code, message, value: count as f64 })
+}
+
+/// File names of the photos that `ScanNet++` keeps for tests.
+fn test_list(folder: &Folder<'_>) -> Result<HashSet<String>> {
+    let Some(path) = folder.paths().find(|path| names::file_name(path) == TEST_LIST) else {
+        return Ok(HashSet::new());
+    };
+    let lists = cameras::object(&folder.read_json(path)?, path)?;
+    let tests = lists.get("test").and_then(|list| list.as_array()).into_iter().flatten();
+    Ok(tests.filter_map(|file| file.as_str()).map(str::to_owned).collect())
+}
+
+/// The folder under which most cameras have their photos, by path with or without its extension.
+///
+/// # Errors
+/// `invalid_request` where two folders are equally good.
+fn photo_folder(folder: &Folder<'_>, root: &str, entries: &[CameraEntry]) -> Result<String> {
+    let wanted: HashSet<String> = entries.iter().map(|entry| names::tail(&entry.file)).collect();
+    let mut counts: HashMap<&str, usize> = HashMap::new();
+    for path in folder.paths() {
+        let Some(stem) = names::stem(path) else { continue };
+        let starts = path.match_indices('/').map(|(at, _)| at + 1);
+        for start in std::iter::once(0).chain(starts) {
+            if wanted.contains(&path[start..])
+                || stem.get(start..).is_some_and(|s| wanted.contains(s))
+            {
+                *counts.entry(path[..start].trim_end_matches('/')).or_default() += 1;
+            }
+        }
+    }
+    let near = |place: &str| {
+        let parts = |path: &str| path.split('/').map(str::to_owned).collect::<Vec<_>>();
+        parts(place).iter().zip(parts(root)).take_while(|(a, b)| *a == b).count()
+    };
+    let known = |place: &str| {
+        let last = names::file_name(place);
+        PHOTO_FOLDERS.len()
+            - PHOTO_FOLDERS.iter().position(|p| *p == last).unwrap_or(PHOTO_FOLDERS.len())
+    };
+    let rank = |place: &str, count: usize| (count, place == root, near(place), known(place));
+    let mut ranked: Vec<_> = counts.iter().map(|(p, count)| (rank(p, *count), *p)).collect();
+    ranked.sort_unstable_by(|a, b| b.cmp(a));
+    match ranked[..] {
+        [] => Ok(root.to_owned()),
+        [(first, a), (second, b), ..] if first == second => Err(Error::invalid(format!(
+            "{}: the cameras have photos in {a:?} and in {b:?}; send one of them",
+            folder.what
+        ))),
+        [(_, place), ..] => Ok(place.to_owned()),
+    }
+}
+
+/// Photos without camera that lie where photos with cameras lie. A picture that is called after a
+/// photo, as `a_mask.png` is after `a.jpg`, belongs to it.
+fn without_camera<'a>(sent: &[&'a str], pairs: &[Pair], held_out: &[String]) -> Vec<&'a str> {
+    let used: HashSet<usize> = pairs.iter().map(|(_, file)| *file).collect();
+    let stems: HashSet<&str> = used.iter().filter_map(|i| names::stem(sent[*i])).collect();
+    let folders: HashSet<&str> = used.iter().map(|i| names::folder(sent[*i])).collect();
+    let held: HashSet<&str> = held_out.iter().map(|file| names::file_name(file)).collect();
+    let belongs = |stem: &str| {
+        let mut ends = stem.match_indices(['_', '.', '-']).map(|(at, _)| at).chain([stem.len()]);
+        ends.any(|end| stems.contains(&stem[..end]))
+    };
+    let lone = |(i, path): (usize, &&'a str)| {
+        let stem = names::stem(path)?;
+        let is_lone = !used.contains(&i)
+            && folders.contains(names::folder(path))
+            && !held.contains(names::file_name(path))
+            && !held.contains(names::file_name(stem))
+            && !belongs(stem);
+        is_lone.then_some(*path)
+    };
+    sent.iter().enumerate().filter_map(lone).collect()
+}
+
+/// The places of a camera and of its photo.
+type Pair = (usize, usize);
+
+/// Cameras with the photo of each, and cameras without one.
+fn paired(entries: &[CameraEntry], sent: &[&str]) -> Result<(Vec<Pair>, Vec<usize>)> {
+    let wanted: Vec<&str> = entries.iter().map(|entry| entry.file.as_str()).collect();
+    let files = names::matched(&wanted, sent)?;
+    let pairs = files.iter().enumerate().filter_map(|(i, file)| Some((i, (*file)?))).collect();
+    let missing = (0..files.len()).filter(|i| files[*i].is_none()).collect();
+    Ok((pairs, missing))
+}
+
+/// Camera, photo and pose of the photos that a scene takes.
+type Chosen = Vec<(usize, usize, CameraToWorld)>;
+
+/// Checks all poses, and chooses the photos of the scene where there are too many.
+fn chosen(
+    entries: &[CameraEntry],
+    pairs: Vec<Pair>,
+    sent: &[&str],
+    size: impl Fn(usize) -> u64,
+    limits: &Limits,
+) -> Result<(Chosen, Option<Warning>)> {
+    let pose =
+        |(i, (entry, _)): (usize, &Pair)| entries[*entry].pose(&label(i, &entries[*entry].file));
+    let poses: Vec<CameraToWorld> = pairs.iter().enumerate().map(pose).collect::<Result<_>>()?;
+    check_places(&poses)?;
+    let all = pairs.into_iter().zip(&poses).map(|((entry, file), pose)| (entry, file, *pose));
+    if poses.len() <= limits.photos_max {
+        return Ok((all.collect(), None));
+    }
+    let all: Chosen = all.collect();
+    let candidates: Vec<choose::Candidate<'_>> = all
+        .iter()
+        .map(|(entry, file, pose)| {
+            let size = size(*file);
+            choose::Candidate { pose, bytes: size, kind: (&entries[*entry].lens).into() }
+        })
+        .collect();
+    let kept = choose::best(&candidates, limits.photos_max);
+    let left_out: Vec<&str> =
+        (0..all.len()).filter(|i| !kept.contains(i)).map(|i| sent[all[i].1]).collect();
+    let why = format!(
+        "left out; a scene takes {} of these {} photos: those that see most from different places, \
+         then the sharpest; `cameras` lists them",
+        limits.photos_max,
+        all.len()
+    );
+    let names = left_out.iter().copied();
+    let warning = told(WarningCode::PhotosUnused, left_out.len(), &why, names);
+    Ok((kept.into_iter().map(|i| all[i]).collect(), warning))
+}
+
+/// Refuses cameras that all stand at one place: they see no depth.
+fn check_places(poses: &[CameraToWorld]) -> Result<()> {
+    let first = poses[0].center();
+    let spread = poses.iter().map(|p| p.center().distance(first)).fold(0.0, f64::max);
+    let reach = poses.iter().map(|p| p.center().length()).fold(0.0, f64::max);
+    // Twelve digits is what a pose in JSON carries beside an origin that far away.
+    let bound = (reach * 1e-12).max(f64::MIN_POSITIVE);
+    if spread <= bound {
+        let DVec3 { x, y, z } = first;
+        return Err(Error::invalid(format!(
+            "all {} cameras stand at one place ({x}, {y}, {z}); depth needs a baseline over 0",
+            poses.len()
+        )));
+    }
+    Ok(())
+}

@@ -1,0 +1,373 @@
+//! Gaussians as files of other programs: one table of formats, a module for each.
+//!
+//! All hold centres, rotations, scales, opacities and colours of every Gaussian. What they lose is
+//! in the module of each. PLY and GLB hold the entries of the bank and the semantics too.
+//!
+//! Axes are those of each format's own specification: PLY and `.splat` are in the axes of the scene
+//! (OpenCV: y down, z forward), SPZ and glTF have y up and z back. `TURN` turns between them.
+
+mod glb;
+mod packed_ply;
+mod ply;
+mod scene;
+mod sog;
+mod splat;
+mod spz;
+
+use std::io::{self, BufRead, Write};
+
+use glam::DVec3;
+
+use crate::{
+    container::write_semantics,
+    error::{Error, Result},
+    limits::Limits,
+    scene::{Gaussians, RawGaussians, SanitizeReport, SceneId, Semantics, SourcePixel},
+};
+
+/// What a file holds.
+#[derive(Clone, Debug)]
+pub struct SplatsRead {
+    /// Its format.
+    pub format: &'static SplatFormat,
+    /// The Gaussians.
+    pub gaussians: Gaussians,
+    /// How many were dropped or changed.
+    pub dropped: SanitizeReport,
+    /// Their semantics, where it has some.
+    pub semantics: Option<Semantics>,
+}
+
+impl SplatsRead {
+    /// What was read, checked. The Gaussians say which entry is whose, also where some are dropped.
+    fn new(
+        format: &'static SplatFormat,
+        raw: RawGaussians,
+        semantics: Option<Semantics>,
+    ) -> Result<Self> {
+        let (gaussians, dropped) = Gaussians::sanitize(raw)?;
+        let index = || gaussians.semantic_index().to_vec();
+        let semantics = semantics.map(|semantics| Semantics { index: index(), ..semantics });
+        Ok(Self { format, gaussians, dropped, semantics })
+    }
+}
+
+/// A format of files.
+#[derive(Debug)]
+pub struct SplatFormat {
+    /// Name in calls.
+    pub name: &'static str,
+    /// Ending of files, without the first dot.
+    pub ending: &'static str,
+    /// Media type.
+    pub media_type: &'static str,
+    /// Whether it holds entries of the bank and the semantics.
+    pub semantics: bool,
+    /// Refuses what the format cannot hold.
+    check: fn(&SplatFile) -> Result<()>,
+    /// Size of the whole file, where it is known before the end.
+    size_bytes: fn(&SplatFile) -> Option<u64>,
+    write: fn(&SplatFile, &mut dyn Write) -> io::Result<()>,
+}
+
+const OCTETS: &str = "application/octet-stream";
+
+/// 3DGS PLY.
+pub static PLY: SplatFormat = SplatFormat {
+    name: "ply",
+    ending: "ply",
+    media_type: OCTETS,
+    semantics: true,
+    check: |_| Ok(()),
+    size_bytes: |file| Some(ply::size_bytes(file)),
+    write: ply::write,
+};
+/// The compressed PLY of `PlayCanvas` and `SuperSplat`.
+pub static COMPRESSED_PLY: SplatFormat = SplatFormat {
+    name: "compressed_ply",
+    ending: "compressed.ply",
+    media_type: OCTETS,
+    semantics: false,
+    check: some,
+    size_bytes: |file| Some(packed_ply::size_bytes(file)),
+    write: packed_ply::write,
+};
+/// SPZ, version 3.
+pub static SPZ: SplatFormat = SplatFormat {
+    name: "spz",
+    ending: "spz",
+    media_type: OCTETS,
+    semantics: false,
+    check: spz::check,
+    size_bytes: |_| None,
+    write: spz::write,
+};
+/// SPZ, version 4.
+pub static SPZ4: SplatFormat = SplatFormat {
+    name: "spz4",
+    ending: "v4.spz",
+    media_type: OCTETS,
+    semantics: false,
+    check: spz::check,
+    size_bytes: |_| None,
+    write: spz::write_4,
+};
+/// The bundle of pictures of `PlayCanvas`.
+pub static SOG: SplatFormat = SplatFormat {
+    name: "sog",
+    ending: "sog",
+    media_type: OCTETS,
+    semantics: false,
+    check: sog::check,
+    size_bytes: |_| None,
+    write: sog::write,
+};
+/// Binary glTF with `KHR_gaussian_splatting`.
+pub static GLB: SplatFormat = SplatFormat {
+    name: "glb",
+    ending: "glb",
+    media_type: "model/gltf-binary",
+    semantics: true,
+    check: glb::check,
+    size_bytes: |file| Some(glb::size_bytes(file)),
+    write: glb::write,
+};
+/// 32 bytes a Gaussian.
+pub static SPLAT: SplatFormat = SplatFormat {
+    name: "splat",
+    ending: "splat",
+    media_type: OCTETS,
+    semantics: false,
+    check: some,
+    size_bytes: |file| Some(splat::size_bytes(file)),
+    write: splat::write,
+};
+/// All formats. Where the ending of one ends that of another, the longer one comes first.
+pub static FORMATS: [&SplatFormat; 7] = [&COMPRESSED_PLY, &PLY, &SPZ4, &SPZ, &SOG, &GLB, &SPLAT];
+
+/// The endings of all formats, for messages.
+pub fn endings() -> String {
+    FORMATS.map(|format| format.ending).join(", ")
+}
+
+impl SplatFormat {
+    /// The format of this name.
+    pub fn named(name: &str) -> Option<&'static Self> {
+        FORMATS.into_iter().find(|format| format.name == name)
+    }
+
+    /// The format that the ending of a file's name says.
+    pub fn of_file(name: &str) -> Option<&'static Self> {
+        let name = name.to_ascii_lowercase();
+        let ends = |format: &&Self| {
+            name.strip_suffix(format.ending).is_some_and(|stem| stem.ends_with('.'))
+        };
+        FORMATS.into_iter().find(ends)
+    }
+}
+
+/// A file to be written.
+#[derive(Debug)]
+pub struct SplatFile {
+    format: &'static SplatFormat,
+    gaussians: Gaussians,
+    /// The container of the semantics; empty where there are none.
+    semantics: Vec<u8>,
+}
+
+impl SplatFile {
+    /// Gaussians as a file, with their semantics where there are some and the format holds them.
+    ///
+    /// # Errors
+    /// `invalid_request` and `limit_exceeded` for a scene that the format cannot hold; `internal`
+    /// when the semantics cannot be packed.
+    pub fn new(
+        format: &'static SplatFormat,
+        gaussians: Gaussians,
+        semantics: Option<&Semantics>,
+    ) -> Result<Self> {
+        let mut packed = Vec::new();
+        if let Some(semantics) = semantics.filter(|_| format.semantics) {
+            write_semantics(&mut packed, &SceneId::from_bytes([0; 16]), semantics)
+                .map_err(|e| Error::internal("the semantics cannot be packed").caused_by(e))?;
+        }
+        let file = Self { format, gaussians, semantics: packed };
+        (format.check)(&file)?;
+        Ok(file)
+    }
+
+    /// Its format.
+    pub fn format(&self) -> &'static SplatFormat {
+        self.format
+    }
+
+    /// Size of the whole file, where it is known before the end.
+    pub fn size_bytes(&self) -> Option<u64> {
+        (self.format.size_bytes)(self)
+    }
+
+    /// Writes the file from its start to its end, in small parts.
+    ///
+    /// # Errors
+    /// Those of `to`.
+    pub fn write(&self, to: &mut dyn Write) -> io::Result<()> {
+        (self.format.write)(self, to)
+    }
+}
+
+/// Reads a file of any of these formats. Its first bytes say which one it is; `.splat` has none, so
+/// `name` must say it. `gaussians_max` and `splats_bytes_max` of `limits` bound what it may claim.
+///
+/// # Errors
+/// `invalid_request` when it is none of these or is damaged, naming what is wrong;
+/// `limit_exceeded`; `store_unavailable` when reading fails. Poisoned Gaussians are no error: they
+/// are dropped or clamped and counted.
+pub fn read_splats(from: &mut dyn BufRead, name: &str, limits: &Limits) -> Result<SplatsRead> {
+    let start = from.fill_buf().map_err(unreadable)?;
+    match start.get(..4).unwrap_or(start) {
+        [b'p', b'l', b'y', ..] => ply::read(from, limits),
+        [0x1f, 0x8b, ..] => spz::read(from, limits),
+        b"glTF" => glb::read(from, limits),
+        b"NGSP" => spz::read_4(from, limits),
+        [b'P', b'K', ..] => sog::read(from, limits),
+        _ if SplatFormat::of_file(name).is_some_and(|named| named.name == SPLAT.name) => {
+            splat::read(from, limits)
+        }
+        other => Err(Error::invalid(format!(
+            "the file is none of Gaussians: it begins with {:?}; PLY, compressed PLY, SPZ, SOG and \
+             GLB are known by their first bytes, .splat by the ending of its name",
+            String::from_utf8_lossy(other)
+        ))),
+    }
+}
+
+/// Refuses more Gaussians of this degree than a scene may have, or than may be in memory.
+fn check_count(what: &str, count: usize, sh_degree: u8, limits: &Limits) -> Result<()> {
+    let (max, bytes_max) = (limits.gaussians_max, limits.splats_bytes_max);
+    if count > max {
+        return Err(Error::limit(what, count, max));
+    }
+    let bytes = Gaussians::bytes_of(count, sh_degree);
+    if bytes > bytes_max {
+        let value = format!("{count} of degree {sh_degree}, {bytes} bytes in memory");
+        return Err(Error::limit(what, value, format!("{bytes_max} bytes")));
+    }
+    Ok(())
+}
+
+/// Most formats hold one Gaussian or more.
+fn some(file: &SplatFile) -> Result<()> {
+    if file.gaussians.is_empty() {
+        let name = file.format.name;
+        return Err(Error::invalid(format!(
+            "{name}: there are no Gaussians to write; PLY can be empty"
+        )));
+    }
+    Ok(())
+}
+
+fn unreadable(cause: io::Error) -> Error {
+    Error::unavailable("read the file", cause)
+}
+
+/// Signs that turn a position from the scene's axes (x right, y down, z forward) to y up and z
+/// back, and back again: half a turn about x.
+const TURN: [f32; 3] = [1.0, -1.0, -1.0];
+/// The same for a quaternion w x y z. It turns the axes of the Gaussian as well, which its
+/// covariance does not see.
+const TURN_QUAT: [f32; 4] = [1.0, 1.0, -1.0, -1.0];
+/// The same for the coefficients of spherical harmonics, degree 0 to 3: the sign that each basis
+/// function gets when y and z change theirs.
+const TURN_SH: [f32; 16] =
+    [1.0, -1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0];
+
+fn times<const N: usize>(a: [f32; N], b: [f32; N]) -> [f32; N] {
+    std::array::from_fn(|i| a[i] * b[i])
+}
+
+/// World position of Gaussian `i`.
+fn world(gaussians: &Gaussians, i: usize) -> DVec3 {
+    gaussians.origin() + DVec3::from_array(gaussians.means()[i].map(f64::from))
+}
+
+/// Gaussians reserved for before any is read: a header may claim anything.
+const RESERVED_MAX: usize = 65_536;
+
+/// Arrays for `count` Gaussians of this degree, none of them read yet.
+fn begun(count: usize, sh_degree: u8) -> RawGaussians {
+    let mut raw = RawGaussians { sh_degree, ..RawGaussians::default() };
+    raw.means.reserve(count.min(RESERVED_MAX));
+    raw
+}
+
+/// The rows that no format but PLY and GLB has.
+fn fill_rest(raw: &mut RawGaussians) {
+    let n = raw.means.len();
+    raw.semantic_index.resize(n, 0);
+    raw.source.resize(n, SourcePixel::default());
+}
+
+/// The error of a read that ended too early, or failed.
+fn cut_short(format: &str, cause: io::Error, read: usize, count: usize, of: &str) -> Error {
+    match cause.kind() {
+        io::ErrorKind::UnexpectedEof => {
+            Error::invalid(format!("{format}: the file ends after {read} of {count} {of}"))
+        }
+        // What the inflater says of damaged bytes.
+        io::ErrorKind::InvalidInput | io::ErrorKind::InvalidData => Error::invalid(format!(
+            "{format}: the compressed bytes are damaged after {read} of {count} {of}"
+        )),
+        _ => unreadable(cause),
+    }
+}
+
+/// `value` of 0..1 as a number of 0..`most`, to the nearest.
+fn steps(value: f32, most: u32) -> u32 {
+    (value.clamp(0.0, 1.0) * most as f32 + 0.5) as u32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_format_is_known_by_name_and_by_the_ending_of_a_file() {
+        for format in FORMATS {
+            assert_eq!(SplatFormat::named(format.name).unwrap().name, format.name);
+            let file = format!("a.{}", format.ending.to_ascii_uppercase());
+            assert_eq!(SplatFormat::of_file(&file).unwrap().name, format.name);
+        }
+        assert!(SplatFormat::of_file("splat").is_none());
+        assert!(SplatFormat::of_file("a.segsplat").is_none());
+    }
+
+    /// The basis as the appendix of `KHR_gaussian_splatting` has it, without its constants: a
+    /// turned direction with turned coefficients has the colour of the direction and coefficients
+    /// before.
+    #[test]
+    fn coefficients_turn_as_their_basis_does() {
+        let basis = |[x, y, z]: [f32; 3]| {
+            let (xx, yy, zz) = (x * x, y * y, z * z);
+            [
+                1.0,
+                -y,
+                z,
+                -x,
+                x * y,
+                -y * z,
+                2.0 * zz - xx - yy,
+                -x * z,
+                xx - yy,
+                -y * (3.0 * xx - yy),
+                x * y * z,
+                -y * (4.0 * zz - xx - yy),
+                z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
+                -x * (4.0 * zz - xx - yy),
+                z * (xx - yy),
+                -x * (xx - 3.0 * yy),
+            ]
+        };
+        let direction = [0.3, -0.5, 0.8];
+        assert_eq!(basis(times(direction, TURN)), times(basis(direction), TURN_SH));
+    }
+}
