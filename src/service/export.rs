@@ -6,28 +6,30 @@ use std::{
     time::Instant,
 };
 
+use futures_util::FutureExt;
 use tokio::{runtime::Handle, sync::mpsc};
 
 use super::{
     Service,
+    access::SceneAccess,
     create::blocking,
     features,
     page::write_page,
     query,
-    request::{ExportFormat, QuerySpec, TextOptions},
+    request::{QuerySpec, TextOptions},
     search::{SceneTexts, check_scoring},
     semantics::meaning_tag,
     texts,
     times::ViewTimes,
-    types::Export,
-    view::{hash, text_words},
+    types::{Export, ExportBody},
+    view::{hash, text_words, words},
 };
 use crate::{
     error::{Error, Result},
     formats::{
-        folders::FolderFormat,
         packed::write_packed,
-        splats::{SplatFile, SplatFormat},
+        splats::{OCTETS, SplatFile, SplatFormat},
+        table::{ExportFormat, FormatKind},
     },
     render::plan::{default_near, widened},
     scene::{Gaussians, Preset, Scene, SceneId, Semantics},
@@ -39,14 +41,13 @@ const PARTS_MAX: usize = 4;
 const PART_BYTES: usize = 256 << 10;
 
 impl Service {
-    /// The scene, or what a text selects of it, as a file for other programs; as `npz` its
-    /// semantics, which are made where they are not there; as `packed` and `html` what the page
-    /// draws; as a folder in a zip what [`FolderFormat`] says. For `html`, `coco` and `labelme`
-    /// each line of the text is a text.
+    /// The scene, or what a text selects of it, as a file for other programs. Semantics are made
+    /// where the format needs them and they are not there. For `html`, `coco` and `labelme` each
+    /// line of the text is a text. Nothing is written before [`Export::begin`].
     ///
     /// # Errors
-    /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; `invalid_request` for a scene that
-    /// the format cannot hold; with a text, and for `npz`, also what [`Service::query`] says.
+    /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; with a text, and for `npz`, also what
+    /// [`Service::query`] says.
     pub async fn export(
         &self,
         id: &SceneId,
@@ -56,45 +57,99 @@ impl Service {
     ) -> Result<Export> {
         // How texts are scored is checked also where no text is asked.
         check_scoring(&ask.scoring, &self.limits())?;
-        if let Some(format) = FolderFormat::named(&format.to_string()) {
-            return self.folder(id, format, preset, ask).await;
-        }
         let access = self.scene(id).await?;
+        let is_part = format.is_splats() && ask.text.is_some();
+        if ask.text.is_some() && !is_part && !format.lines {
+            return Err(texts::not_with(format.name));
+        }
+        let export = match format.kind {
+            FormatKind::Folder(folder) => self.folder(id, (format, folder), preset, ask).await?,
+            FormatKind::Arrays => self.arrays(&access.finished()?, format, ask).await?,
+            FormatKind::Packed => self.packed(access.finished()?).await?,
+            FormatKind::Page => self.page(access.finished()?, preset, ask).await?,
+            FormatKind::Splats(splats) => self.splats(access, splats, preset, ask).await?,
+        };
+        let part = if is_part { "-part" } else { "" };
+        Ok(Export {
+            file_name: format!("{id}{part}.{}", format.ending),
+            media_type: format.media_type,
+            etag: format!("{}-{format}", export.etag),
+            ..export
+        })
+    }
+
+    /// The semantics as arrays.
+    async fn arrays(
+        &self,
+        access: &SceneAccess,
+        format: ExportFormat,
+        ask: &TextOptions,
+    ) -> Result<Export> {
+        let understood = self.inner.understood(access, format.name, ask.wait).await?;
+        let etag = hash(understood.subject().tag);
+        let write = move |to: &mut dyn Write| features::write_semantics(understood.subject(), to);
+        Ok(Export::streamed(etag, write))
+    }
+
+    /// The scene as the page draws it.
+    async fn packed(&self, access: SceneAccess) -> Result<Export> {
         let inner = Arc::clone(&self.inner);
-        if format == ExportFormat::Npz {
-            if ask.text.is_some() {
-                return Err(texts::not_with("npz"));
-            }
-            let understood = inner.understood(&access.finished()?, "npz", ask.wait).await?;
-            let etag = format!("{}-npz", hash(understood.subject().tag));
-            let write =
-                move |to: &mut dyn Write| features::write_semantics(understood.subject(), to);
-            let file_name = format!("{id}.npz");
-            return Ok(Export::new(file_name, etag, stream(write)));
+        let scene = blocking(move || inner.load(&access)).await??;
+        let etag = hash(&meaning_tag(&scene));
+        let near = default_near(scene.meta.report.median_depth);
+        Ok(Export::streamed(etag, move |to: &mut dyn Write| write_packed(&scene, near, to)))
+    }
+
+    /// The page with the scene in it.
+    async fn page(
+        &self,
+        access: SceneAccess,
+        preset: Option<Preset>,
+        ask: &TextOptions,
+    ) -> Result<Export> {
+        let (inner, limits) = (Arc::clone(&self.inner), self.limits());
+        let (lines, scoring) = (texts::lines(ask), ask.scoring.clone());
+        let how = words(&(&lines, preset, &scoring, env!("CARGO_PKG_VERSION")))?;
+        let tag = move |scene: &Scene| hash(&(meaning_tag(scene) + &how));
+        if lines.is_empty() {
+            let scene = blocking(move || inner.load(&access)).await??;
+            let etag = tag(&scene);
+            return Ok(Export::streamed(etag, move |to: &mut dyn Write| {
+                write_page(&scene, None, to)
+            }));
         }
-        if format == ExportFormat::Html {
-            return self.page(id, preset, ask).await;
-        }
-        if format == ExportFormat::Packed && ask.text.is_some() {
-            return Err(texts::not_with("packed"));
-        }
+        inner.can_understand("text")?;
+        let texts = texts::all_checked(&lines, "text", &limits)?;
+        let understood = inner.understood(&access, "text", ask.wait).await?;
+        let etag = tag(understood.subject().scene);
+        Ok(Export::streamed(etag, move |to: &mut dyn Write| {
+            let of = understood.subject();
+            let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &texts)?;
+            let spec = QuerySpec::default();
+            let times = ViewTimes::default();
+            let answer = query::answer(&texts, &limits, &spec, None, times, || ())?;
+            write_page(of.scene, Some(&answer), to)
+        }))
+    }
+
+    /// Gaussians: all of them, or those that a text selects.
+    async fn splats(
+        &self,
+        access: SceneAccess,
+        format: &'static SplatFormat,
+        preset: Option<Preset>,
+        ask: &TextOptions,
+    ) -> Result<Export> {
+        let inner = Arc::clone(&self.inner);
         let Some(text) = &ask.text else {
             let access = access.finished()?;
             let scene = blocking(move || inner.load(&access)).await??;
-            let digest = hash(&meaning_tag(&scene));
-            if format == ExportFormat::Packed {
-                let (file_name, etag) = (format!("{id}.segsplat"), format!("{digest}-packed"));
-                let chunks = stream(move |to: &mut dyn Write| {
-                    write_packed(&scene, default_near(scene.meta.report.median_depth), to)
-                });
-                return Ok(Export::new(file_name, etag, chunks));
-            }
-            let splats = splats(format)?;
-            let write = move || {
+            let etag = hash(&meaning_tag(&scene));
+            let file = move || {
                 let semantics = scene.semantics.as_deref();
-                scene_splats(splats, &scene, &scene.gaussians, semantics)
+                scene_splats(format, &scene, &scene.gaussians, semantics)
             };
-            return Ok(gaussians(&id.to_string(), &digest, blocking(write).await??));
+            return Ok(Export::splats(etag, file));
         };
         inner.can_understand("text")?;
         let text = texts::checked(text, "text", &self.limits())?;
@@ -102,79 +157,46 @@ impl Service {
         let of = understood.subject();
         let named = preset.unwrap_or(of.scene.meta.report.method.preset);
         let etag = hash(&text_words(of.tag, Some(&text), (named, &ask.scoring))?);
-        let (scoring, splats) = (ask.scoring.clone(), splats(format)?);
-        let file = blocking(move || {
+        let scoring = ask.scoring.clone();
+        let file = move || {
             let of = understood.subject();
             let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &[text])?;
-            part(splats, of.scene, &texts.gaussians(), of.semantics)
-        })
-        .await??;
-        Ok(gaussians(&format!("{id}-part"), &etag, file))
-    }
-}
-
-impl Service {
-    /// The page with the scene in it.
-    async fn page(
-        &self,
-        id: &SceneId,
-        preset: Option<Preset>,
-        ask: &TextOptions,
-    ) -> Result<Export> {
-        let (inner, limits) = (Arc::clone(&self.inner), self.limits());
-        let access = self.scene(id).await?.finished()?;
-        let lines = texts::lines(ask);
-        let how = format!("{lines:?} {preset:?} {:?} {}", ask.scoring, env!("CARGO_PKG_VERSION"));
-        let tag = move |scene: &Scene| format!("{}-html", hash(&(meaning_tag(scene) + &how)));
-        let file_name = format!("{id}.html");
-        if lines.is_empty() {
-            let scene = blocking(move || inner.load(&access)).await??;
-            let etag = tag(&scene);
-            let chunks = stream(move |to: &mut dyn Write| write_page(&scene, None, to));
-            return Ok(Export::new(file_name, etag, chunks));
-        }
-        inner.can_understand("text")?;
-        let texts = texts::all_checked(&lines, "text", &limits)?;
-        let understood = inner.understood(&access, "text", ask.wait).await?;
-        let (scoring, etag) = (ask.scoring.clone(), tag(understood.subject().scene));
-        let chunks = stream(move |to: &mut dyn Write| {
-            let of = understood.subject();
-            let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &texts)?;
-            let spec = QuerySpec::default();
-            let times = ViewTimes::default();
-            let answer = query::answer(&texts, &limits, &spec, None, times, || ())?;
-            write_page(of.scene, Some(&answer), to)
-        });
-        Ok(Export::new(file_name, etag, chunks))
+            let gaussians = texts.gaussians();
+            let index = gaussians.semantic_index().to_vec();
+            let semantics = Semantics { index, ..of.semantics.clone() };
+            scene_splats(format, of.scene, &gaussians, Some(&semantics))
+        };
+        Ok(Export::splats(etag, file))
     }
 }
 
 impl Export {
-    /// A file of octets whose size is known when it is written.
-    pub(super) fn new(
-        file_name: String,
+    /// A file of octets without a name, which `write` writes.
+    pub(super) fn streamed(
         etag: String,
-        chunks: mpsc::Receiver<io::Result<Vec<u8>>>,
+        write: impl FnOnce(&mut dyn Write) -> Result<()> + Send + 'static,
     ) -> Self {
-        Self { file_name, media_type: "application/octet-stream", size_bytes: None, etag, chunks }
+        Self::new(etag, async move { Ok(ExportBody { size_bytes: None, chunks: stream(write) }) })
     }
-}
 
-/// The format of files with Gaussians.
-fn splats(format: ExportFormat) -> Result<&'static SplatFormat> {
-    SplatFormat::named(&format.to_string())
-        .ok_or_else(|| Error::internal(format!("{format} is no format of Gaussians")))
-}
+    /// A file of octets without a name.
+    pub(super) fn new(
+        etag: String,
+        begin: impl Future<Output = Result<ExportBody>> + Send + 'static,
+    ) -> Self {
+        Self { file_name: String::new(), media_type: OCTETS, etag, begin: begin.boxed() }
+    }
 
-/// Some Gaussians of a scene with its bank.
-fn part(
-    splats: &'static SplatFormat,
-    scene: &Scene,
-    gaussians: &Gaussians,
-    of: &Semantics,
-) -> Result<SplatFile> {
-    let semantics = Semantics { index: gaussians.semantic_index().to_vec(), ..of.clone() };
-    scene_splats(splats, scene, gaussians, Some(&semantics))
+    /// Gaussians that `file` makes on a thread that may block.
+    fn splats(etag: String, file: impl FnOnce() -> Result<SplatFile> + Send + 'static) -> Self {
+        Self::new(etag, async move {
+            let file = blocking(file).await??;
+            let unwritten = |cause| Error::internal("the file is not whole").caused_by(cause);
+            let size_bytes = file.size_bytes();
+            let chunks = stream(move |to: &mut dyn Write| file.write(to).map_err(unwritten));
+            Ok(ExportBody { size_bytes, chunks })
+        })
+    }
 }
 
 /// Some Gaussians of a scene as a file that other programs draw: with the blur that the scene's own
@@ -189,16 +211,6 @@ pub fn scene_splats(
     semantics: Option<&Semantics>,
 ) -> Result<SplatFile> {
     SplatFile::new(format, widened(scene, gaussians, None)?, semantics)
-}
-
-/// A file with Gaussians; `stem` is its name without the ending.
-fn gaussians(stem: &str, digest: &str, file: SplatFile) -> Export {
-    let &SplatFormat { name, ending, media_type, .. } = file.format();
-    let size_bytes = file.size_bytes();
-    let unwritten = |cause| Error::internal("the file is not whole").caused_by(cause);
-    let chunks = stream(move |to: &mut dyn Write| file.write(to).map_err(unwritten));
-    let (file_name, etag) = (format!("{stem}.{ending}"), format!("{digest}-{name}"));
-    Export { media_type, size_bytes, ..Export::new(file_name, etag, chunks) }
 }
 
 /// The parts of a file that `write` writes on a blocking thread. A fault ends them.

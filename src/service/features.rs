@@ -12,7 +12,6 @@ use rayon::prelude::*;
 
 use super::{
     Service,
-    export::stream,
     request::{FeatureKind, FeaturesSpec, Kind, PictureOptions},
     search::{LabelledView, SceneTexts, Subject, check_scoring},
     types::Export,
@@ -172,7 +171,6 @@ impl Service {
                 })
             })
             .await?;
-        let file_name = format!("{id}-view.npz");
-        Ok(Export::new(file_name, etag, stream(write)))
+        Ok(Export { file_name: format!("{id}-view.npz"), ..Export::streamed(etag, write) })
     }
 }

@@ -21,6 +21,7 @@ mod errors;
 mod faults;
 mod fields;
 mod folders;
+mod formats;
 mod grpc;
 mod hostile;
 mod http;

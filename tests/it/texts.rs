@@ -290,7 +290,9 @@ async fn an_export_of_a_text_holds_what_it_selects() {
     let export = async |text: Option<&str>| {
         let ask = TextOptions { text: text.map(str::to_owned), ..TextOptions::default() };
         let export = service.export(&id, ExportFormat::Ply, None, &ask).await.unwrap();
-        let (size, etag) = (export.size_bytes, export.etag.clone());
+        let etag = export.etag.clone();
+        let export = export.begin().await.unwrap();
+        let size = export.size_bytes;
         let file: Vec<u8> = export.into_stream().map(Result::unwrap).concat().await;
         assert_eq!(size, Some(file.len() as u64));
         let count = String::from_utf8_lossy(&file[..400])
@@ -304,6 +306,11 @@ async fn an_export_of_a_text_holds_what_it_selects() {
     assert_eq!(part * 3, all);
     assert_ne!(etag, whole);
     assert_eq!(export(Some("photo 7")).await.0, 0, "a text that selects nothing");
+    // SOG cannot be empty. Who has the file is told so before it is made, and so not of that.
+    let url = fixture.server.url(&format!("/v1/scenes/{id}/export?format=sog&text=photo%207"));
+    let get = || crate::common::client().get(&url);
+    assert_eq!(get().send().await.unwrap().status(), 400);
+    assert_eq!(get().header("if-none-match", "*").send().await.unwrap().status(), 304);
 }
 
 #[tokio::test(flavor = "multi_thread")]

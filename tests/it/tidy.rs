@@ -62,6 +62,7 @@ const CONFINED: [(&str, &[&str]); 16] = [
             "src/service",
             "crates/core/src/scene",
             "crates/formats/src/rle.rs",
+            "crates/formats/src/table.rs",
             "crates/render/src/lib.rs",
         ],
     ),

@@ -12,7 +12,7 @@ use tokio::{runtime::Handle, sync::OwnedSemaphorePermit};
 use super::{Contents, Views, checked_texts, depth_of, masks_of, photo_views, write};
 use crate::{
     error::{Error, ErrorCode, Result},
-    formats::folders::FolderFormat,
+    formats::{folders::FolderFormat, table::ExportFormat},
     limits::Limits,
     scene::{Preset, Scene, SceneId, Upload},
     service::{
@@ -24,7 +24,7 @@ use crate::{
         search::{SceneTexts, check_scoring},
         semantics::{Understood, meaning_tag},
         texts,
-        types::{Export, TextView},
+        types::{Export, ExportBody, TextView},
         view::{Resolved, hash, words},
     },
 };
@@ -117,7 +117,7 @@ impl Service {
     pub(in crate::service) async fn folder(
         &self,
         id: &SceneId,
-        format: &'static FolderFormat,
+        (format, folder): (ExportFormat, FolderFormat),
         preset: Option<Preset>,
         ask: &TextOptions,
     ) -> Result<Export> {
@@ -147,9 +147,8 @@ impl Service {
         let asked = texts.as_ref().map(|asked| (&asked.texts, &asked.scoring));
         let how = (meaning_tag(&scene), inner.backend.renderer.name(), preset, asked);
         let etag = words(&(how, upload.is_some(), env!("CARGO_PKG_VERSION")))?;
-        let etag = format!("{}-{}", hash(&etag), format.name);
         let runtime = Handle::current();
-        let chunks = stream_until(Some(until), move |to: &mut dyn Write| {
+        let write = move |to: &mut dyn Write| {
             let _permit = permit;
             let asked = texts.as_ref().map_or(&[][..], |asked| &asked.texts).to_vec();
             let contents = Contents {
@@ -161,10 +160,11 @@ impl Service {
             };
             let scene = Arc::clone(&scene);
             let mut views = Scheduled { inner, runtime, scene, texts, until };
-            write(format, &contents, &mut views, to).map(drop)
-        });
-        let file_name = format!("{id}.{}", format.ending);
-        Ok(Export { media_type: "application/zip", ..Export::new(file_name, etag, chunks) })
+            write(folder, &contents, &mut views, to).map(drop)
+        };
+        Ok(Export::new(hash(&etag), async move {
+            Ok(ExportBody { size_bytes: None, chunks: stream_until(Some(until), write) })
+        }))
     }
 }
 
@@ -196,7 +196,7 @@ impl OfflineService {
     pub fn folder(
         &self,
         scene: &Scene,
-        format: &FolderFormat,
+        (format, folder): (ExportFormat, FolderFormat),
         (asked, preset, scoring): (&[String], Option<Preset>, &ScoringOptions),
         upload: Option<&Upload>,
         to: &mut dyn Write,
@@ -212,6 +212,6 @@ impl OfflineService {
             Some(SceneTexts::new(&self.backend, of, (preset, scoring), &asked)?)
         };
         let contents = Contents { scene, views, upload, texts: &asked, limits };
-        write(format, &contents, &mut Alone { service: self, scene, texts, limits }, to)
+        write(folder, &contents, &mut Alone { service: self, scene, texts, limits }, to)
     }
 }

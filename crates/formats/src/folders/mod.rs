@@ -2,11 +2,11 @@
 //! points and depth as COLMAP and nerfstudio have them, masks of texts as COCO and `LabelMe` have
 //! them.
 //!
-//! One table of formats, a module for each. Beside the scene, one photo or one view is in memory.
+//! A module for each format. Beside the scene, one photo or one view is in memory.
 
-mod coco;
-mod labelme;
-mod nerfstudio;
+pub(crate) mod coco;
+pub(crate) mod labelme;
+pub(crate) mod nerfstudio;
 mod outline;
 mod photos;
 mod points;
@@ -19,10 +19,10 @@ pub(crate) use self::{
     points::{FolderPoint, points},
     zipped::ZipFolder,
 };
-use crate::{colmap, error::Result, rle::Rle, scene::Scene};
+use crate::{error::Result, rle::Rle, scene::Scene};
 
 /// Writes what a folder has beside its photos.
-type WriteFolder = fn(
+pub(crate) type WriteFolder = fn(
     &FolderContents<'_>,
     &[FolderPhoto],
     &mut dyn FolderPixels,
@@ -30,61 +30,23 @@ type WriteFolder = fn(
 ) -> Result<()>;
 
 /// A layout of folders.
-#[derive(Debug)]
-pub struct FolderFormat {
-    /// Name in calls.
-    pub name: &'static str,
-    /// Ending of files, without the first dot.
-    pub ending: &'static str,
-    /// Whether it shows what texts select; else it takes none.
-    pub texts: bool,
-    write: WriteFolder,
-}
-
-/// Photos, cameras, points and depth maps in the layout of COLMAP.
-static COLMAP: FolderFormat =
-    FolderFormat { name: "colmap", ending: "colmap.zip", texts: false, write: colmap::write };
-/// Photos, cameras, points and depth maps in the layout of nerfstudio.
-static NERFSTUDIO: FolderFormat = FolderFormat {
-    name: "nerfstudio",
-    ending: "nerfstudio.zip",
-    texts: false,
-    write: nerfstudio::write,
-};
-/// What texts select in each photo, as COCO's annotations.
-static COCO: FolderFormat =
-    FolderFormat { name: "coco", ending: "coco.zip", texts: true, write: coco::write };
-/// What texts select in each photo, as a JSON of `LabelMe` beside each.
-static LABELME: FolderFormat =
-    FolderFormat { name: "labelme", ending: "labelme.zip", texts: true, write: labelme::write };
-/// All layouts.
-pub static FOLDER_FORMATS: [&FolderFormat; 4] = [&COLMAP, &NERFSTUDIO, &COCO, &LABELME];
+#[derive(Clone, Copy, Debug)]
+pub struct FolderFormat(pub(crate) WriteFolder);
 
 impl FolderFormat {
-    /// The format of this name.
-    pub fn named(name: &str) -> Option<&'static Self> {
-        FOLDER_FORMATS.into_iter().find(|format| format.name == name)
-    }
-
-    /// The format that the ending of a file's name says.
-    pub fn of_file(name: &str) -> Option<&'static Self> {
-        let name = name.to_ascii_lowercase();
-        FOLDER_FORMATS.into_iter().find(|format| name.ends_with(&format!(".{}", format.ending)))
-    }
-
     /// Writes the zip; gives how many photos are in it.
     ///
     /// # Errors
     /// Those of `pixels`; `deadline_exceeded` and `store_unavailable` as `to` fails.
     pub fn write(
-        &self,
+        self,
         of: &FolderContents<'_>,
         pixels: &mut dyn FolderPixels,
         to: &mut dyn Write,
     ) -> Result<usize> {
         let mut zip = ZipFolder::new(to);
         let photos = photos::write(&of.scene.meta.cameras, pixels, &mut zip)?;
-        (self.write)(of, &photos, pixels, &mut zip)?;
+        self.0(of, &photos, pixels, &mut zip)?;
         zip.finish()?;
         Ok(photos.iter().filter(|photo| photo.there).count())
     }

@@ -13,9 +13,10 @@ use crate::{
 
 use super::{
     super::{
-        PLY, SplatsRead, begun, check_count, cut_short,
+        SplatsRead, begun, check_count, cut_short,
         packed_ply::{self, BOUNDS, PACKED, PackedLayout},
     },
+    COMPRESSED_PLY, PLY,
     write::SEMANTICS,
 };
 
@@ -30,7 +31,7 @@ const CHUNK: &str = "chunk";
 const SH: &str = "sh";
 
 /// Reads a file, with the semantics after its vertices if there are some.
-pub(in super::super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let header = Header::read(from)?;
     let vertices = header.vertices()?;
     let check = |degree| check_count("PLY: Gaussians", vertices.count, degree, limits);
@@ -38,7 +39,7 @@ pub(in super::super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<
     if header.elements[0].name == CHUNK {
         let layout = header.packed()?;
         check(layout.sh_degree)?;
-        return packed_ply::read(from, &layout);
+        return SplatsRead::new(&COMPRESSED_PLY, packed_ply::read(from, &layout)?, None);
     }
     let layout = Layout::of(vertices)?;
     check(layout.sh_degree)?;
