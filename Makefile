@@ -43,8 +43,10 @@ test: fmt lint doc tests deny
 fmt:
 	$(CARGO) fmt --all --check
 
+# The product alone too: it is built without the feature `testing` of the renderers.
 lint:
 	$(CARGO) clippy --locked --workspace --all-targets -- -D warnings
+	$(CARGO) clippy --locked -- -D warnings
 
 doc:
 	RUSTDOCFLAGS='-D warnings' $(CARGO) doc --locked --workspace --lib --no-deps

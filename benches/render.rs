@@ -10,20 +10,22 @@ use std::hint::black_box;
 use criterion::{Criterion, criterion_group, criterion_main};
 use segsplat::{
     render::{
-        Kinds, Labels, RenderRequest, Renderer,
-        backward::{DifferentiableRenderer as _, FrameGradients, Gradients},
+        DifferentiableRenderer as _, Kinds, Labels, RenderRequest, Renderer,
+        backward::{FrameGradients, Gradients},
         cpu::{
             CpuRenderer,
             bin::{Bins, DepthKeys, bin},
-            lanes::{KernelOptions, Width},
+            cell::{Tile, TileScratch},
+            lanes::KernelOptions,
             paint::Paint,
             project::{Projected, project},
-            rasterize::{Tile, TileScratch, rasterize_tile},
+            rasterize::rasterize_tile,
             shade,
-            store::Part,
+            store::PictureRows,
             tiles::Grid,
         },
         oracle,
+        switches::Width,
         view::View,
     },
     scene::Gaussians,
@@ -129,11 +131,11 @@ impl Stages {
         let mut pairs = Vec::new();
         for tile_y in 0..SIDE / TILE {
             let blends = matches!(request.labels, Labels::Blend(_));
-            let mut out = Part {
+            let mut out = PictureRows {
                 color: request.kinds.color.then(|| color.chunks_mut(width_of).collect()),
                 depth: request.kinds.depth.then(|| depth.chunks_mut(width_of).collect()),
                 blend: blends.then(|| blend.chunks_mut(width_of).collect()),
-                ..Part::default()
+                ..PictureRows::default()
             };
             for tile_x in 0..SIDE / TILE {
                 let id = (tile_y * SIDE / TILE + tile_x) as usize;

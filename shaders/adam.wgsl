@@ -75,8 +75,8 @@ fn main(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
+    own = enter_row(group, groups, local);
     total = views[which].gaussian_count;
-    own = (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
     // A frame that lacked room drew nothing.
     if own >= total || plans[0].needed > views[which].isect_capacity {
         return;
@@ -99,8 +99,8 @@ fn add_earlier(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
+    own = enter_row(group, groups, local);
     total = views[which].gaussian_count;
-    own = (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
     if own >= total {
         return;
     }

@@ -44,10 +44,9 @@ fn main(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    which = group.z;
+    let i = enter_row(group, groups, local);
     let width = views[which].width;
     let words = (width + 1u) / 2u;
-    let i = (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
     if i >= words * views[which].height || views[which].steps_start == NO_PICTURE {
         return;
     }

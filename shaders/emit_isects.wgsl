@@ -34,9 +34,8 @@ fn main(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    which = group.z;
+    let i = enter_row(group, groups, local);
     let total = views[which].gaussian_count;
-    let i = (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
     let first = which * total;
     begin_visits(local);
     var footprint: Footprint;

@@ -98,8 +98,7 @@ fn main(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    which = group.z;
-    let i = (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
+    let i = enter_row(group, groups, local);
     let first = which * views[which].gaussian_count;
     if local == 0u {
         atomicStore(&seen, 0u);

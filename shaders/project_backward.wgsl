@@ -165,9 +165,8 @@ fn main(
     @builtin(num_workgroups) groups: vec3<u32>,
     @builtin(local_invocation_index) local: u32,
 ) {
-    which = group.z;
+    let i = enter_row(group, groups, local);
     let total = views[which].gaussian_count;
-    let i = (group.y * groups.x + group.x) * WORKGROUP_SIZE + local;
     if local == 0u {
         atomicStore(&large_count, 0u);
     }

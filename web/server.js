@@ -53,7 +53,8 @@ const server = {
     });
   },
 
-  // Server-sent events of a scene, by fetch: EventSource cannot send a key. Ends with the last one.
+  // Server-sent events of a scene, by fetch: EventSource cannot send a key. Ends when it is made or
+  // will not be: what follows are better versions of one that is refined.
   async watch(id, event, signal) {
     const answer = await this.call(`/v1/scenes/${id}/events`, { signal });
     const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
@@ -66,7 +67,10 @@ const server = {
       text = blocks.pop();
       for (const block of blocks) {
         const data = block.split('\n').filter((line) => line.startsWith('data:'));
-        if (data.length) event(JSON.parse(data.map((line) => line.slice(5)).join('\n')));
+        if (!data.length) continue;
+        const told = JSON.parse(data.map((line) => line.slice(5)).join('\n'));
+        event(told);
+        if (['done', 'failed', 'cancelled'].includes(told.event)) return reader.cancel();
       }
     }
   },

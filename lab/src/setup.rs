@@ -11,9 +11,8 @@ use crate::{
     error::{Error, Result},
     models::NetworkOptions,
     render::{
-        RendererChoice, RendererOptions, Switches,
-        backward::DifferentiableRenderer,
-        select::{AdapterReport, select},
+        DifferentiableRenderer, RendererChoice, RendererOptions, Switches, options::AdapterReport,
+        select::select,
     },
 };
 

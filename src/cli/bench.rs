@@ -9,10 +9,7 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
     render::{Kinds, RenderRequest, compare::compare_oracle, plan::default_near},
-    service::{
-        CameraFields, CameraSpec, Kind, LensSpec, OfflineService, PictureOptions, PoseSpec,
-        TextOptions, ViewOptions, ViewSpec,
-    },
+    service::{CameraFields, CameraSpec, Kind, LensSpec, PoseSpec, ViewOptions, ViewSpec},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -37,21 +34,12 @@ const FIRST: CameraSpec =
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
-    let renderer = engine::renderer(config)?;
-    let service = OfflineService::new(
-        engine::semantics(config, false)?,
-        std::sync::Arc::clone(&renderer),
-        config.limits.clone(),
-    );
+    let service = engine::offline(config, false)?;
+    let renderer = service.renderer();
     // The first view checks the camera as the server does, and warms up.
     let options = &args.options;
-    let spec = ViewSpec {
-        camera: camera::spec(&args.camera)?.unwrap_or(FIRST),
-        kind: Kind::Color,
-        options: options.clone(),
-        picture: PictureOptions::default(),
-        text: TextOptions::default(),
-    };
+    let camera = camera::spec(&args.camera)?.unwrap_or(FIRST);
+    let spec = ViewSpec::new(camera, Kind::Color, options.clone());
     let first = service.render(&scene, &spec)?;
     let near = options.near.unwrap_or_else(|| default_near(scene.meta.report.median_depth));
     let request = RenderRequest {

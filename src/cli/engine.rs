@@ -9,11 +9,11 @@ use crate::{
     models::Bundle,
     pipeline::{Pipeline, PipelineLoader},
     render::{Renderer, select::select},
-    service::{KnownWord, ModelInfo, ModelsInfo, Parts},
+    service::{KnownWord, ModelInfo, ModelsInfo, OfflineService, Parts},
 };
 
-/// Bundle, networks and renderer as the server runs them. A thread of the engine still opens the
-/// networks; `LateEngine::get` waits for it.
+/// Bundle, networks and renderer as the server runs them. A thread of the loader still opens the
+/// networks; `PipelineLoader::get` waits for it.
 ///
 /// # Errors
 /// `model_unavailable`, `gpu_unavailable`, each with what is missing.
@@ -47,6 +47,14 @@ pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticNetwor
 pub fn renderer(config: &Config) -> Result<Arc<dyn Renderer>> {
     let (renderer, _adapters) = select(&config.renderer())?;
     Ok(renderer)
+}
+
+/// What answers for scenes that lie in files; opens library and bundle only where texts are asked.
+///
+/// # Errors
+/// `model_unavailable`, `gpu_unavailable`.
+pub fn offline(config: &Config, texts: bool) -> Result<OfflineService> {
+    Ok(OfflineService::new(semantics(config, texts)?, renderer(config)?, config.limits.clone()))
 }
 
 /// The description of a bundle for callers.

@@ -16,7 +16,7 @@ use crate::{
     },
     names::named,
     scene::Preset,
-    service::{OfflineService, ScoringOptions, scene_splats},
+    service::{ScoringOptions, scene_splats},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -102,8 +102,7 @@ fn folder(
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
     let photos = args.photos.as_deref();
     let upload = photos.map(|path| reconstruct::upload(path, config)).transpose()?;
-    let semantics = engine::semantics(config, format.0.lines)?;
-    let service = OfflineService::new(semantics, engine::renderer(config)?, config.limits.clone());
+    let service = engine::offline(config, format.0.lines)?;
     let unwritable = |e| scene_file::unwritable(&args.output, e);
     // Half a zip is of no use, and what was there before stays until there is a whole one.
     let part = args.output.with_added_extension("part");

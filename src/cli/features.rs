@@ -9,9 +9,7 @@ use crate::{
     config::{Config, ConfigArgs},
     error::Result,
     names::named,
-    service::{
-        CameraFields, FeatureKind, FeaturesSpec, OfflineService, ScoringOptions, ViewOptions,
-    },
+    service::{CameraFields, FeatureKind, FeaturesSpec, ScoringOptions, ViewOptions},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -45,8 +43,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         wait: None,
     });
     let opened = scene_file::open(&args.scene, &config.limits)?;
-    let semantics = engine::semantics(config, true)?;
-    let service = OfflineService::new(semantics, engine::renderer(config)?, config.limits.clone());
+    let service = engine::offline(config, true)?;
     let unwritable = |e| scene_file::unwritable(&args.output, e);
     let mut file = fs_err::File::create(&args.output).map_err(unwritable)?;
     service.arrays(&opened.scene, spec.as_ref(), &mut file)?;

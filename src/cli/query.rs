@@ -12,8 +12,8 @@ use crate::{
     formats::{splats::SplatFormat, table::ExportFormat},
     names::named,
     service::{
-        Boxes, CameraFields, MaskFormat, OfflineService, QuerySpec, ScoringOptions, TextResult,
-        ViewOptions, scene_splats,
+        Boxes, CameraFields, MaskFormat, QuerySpec, ScoringOptions, TextResult, ViewOptions,
+        scene_splats,
     },
 };
 
@@ -59,8 +59,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         ..QuerySpec::default()
     };
     let opened = scene_file::open(&args.scene, &config.limits)?;
-    let semantics = engine::semantics(config, true)?;
-    let service = OfflineService::new(semantics, engine::renderer(config)?, config.limits.clone());
+    let service = engine::offline(config, true)?;
     let mut answer = service.query(&opened.scene, &spec)?;
     let mut text = String::new();
     for (i, found) in answer.results.iter().enumerate() {

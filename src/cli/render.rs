@@ -1,9 +1,6 @@
 //! `segsplat render`: one view of a scene file, or of a file of Gaussians, as a picture.
 
-use std::{
-    path::{Path, PathBuf},
-    sync::Arc,
-};
+use std::path::{Path, PathBuf};
 
 use serde_json::json;
 
@@ -17,10 +14,7 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
     names::named,
-    service::{
-        CameraFields, Format, Kind, OfflineService, PictureOptions, TextOptions, ViewOptions,
-        ViewSpec,
-    },
+    service::{CameraFields, Format, Kind, PictureOptions, TextOptions, ViewOptions, ViewSpec},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -55,9 +49,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         text: args.text.clone(),
     };
     let opened = scene_file::open(&args.scene, &config.limits)?;
-    let renderer = engine::renderer(config)?;
-    let semantics = engine::semantics(config, spec.kind.needs_semantics())?;
-    let service = OfflineService::new(semantics, Arc::clone(&renderer), config.limits.clone());
+    let service = engine::offline(config, spec.kind.needs_semantics())?;
     let view = service.render(&opened.scene, &spec)?;
     scene_file::write(&args.output, &view.bytes)?;
     let scale = view.depth_scale.map(|scale| format!(", depth = value * {scale:e}"));
@@ -67,7 +59,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         view.width,
         view.height,
         view.times.render_ms,
-        renderer.name(),
+        service.renderer().name(),
         scale.unwrap_or_default()
     );
     let value = json!({
@@ -78,7 +70,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         "format": view.format,
         "depth_scale": view.depth_scale,
         "camera": view.camera,
-        "renderer": renderer.name(),
+        "renderer": service.renderer().name(),
         "render_ms": view.times.render_ms,
         "visible": view.stats.visible,
     });

@@ -23,7 +23,7 @@ const IN_FOLDER: &str = "scene.segsplat";
 /// A scene and where it came from.
 #[derive(Debug)]
 pub(super) struct Opened {
-    pub(super) scene: Scene,
+    pub(super) scene: Arc<Scene>,
     /// `segsplat`, or the name of a format of Gaussians.
     pub(super) format: &'static str,
     /// sha256 of a scene file, hex.
@@ -106,7 +106,7 @@ pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
     if let Some(format) = splat_format(&path) {
         let file = fs_err::File::open(&path).map_err(|e| unreadable(&path, e))?;
         let read = splats_of(&mut BufReader::new(file), &path, limits)?;
-        let scene = read.into_scene(&SceneOptions::default())?;
+        let scene = Arc::new(read.into_scene(&SceneOptions::default())?);
         return Ok(Opened { scene, format: format.name, sha256: None });
     }
     let file = fs_err::read(&path).map_err(|e| unreadable(&path, e))?;
@@ -120,5 +120,5 @@ pub(super) fn open(path: &Path, limits: &Limits) -> Result<Opened> {
         Err(e) if e.kind() == io::ErrorKind::NotFound => {}
         Err(e) => return Err(unreadable(&beside, e)),
     }
-    Ok(Opened { scene, format: "segsplat", sha256: Some(sha256) })
+    Ok(Opened { scene: Arc::new(scene), format: "segsplat", sha256: Some(sha256) })
 }

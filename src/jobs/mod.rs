@@ -46,7 +46,7 @@ use self::{
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
-    render::{Renderer, backward::DifferentiableRenderer},
+    render::{DifferentiableRenderer, Renderer},
     scene::{PhotoHash, Refine, SceneId, SceneState, SemanticsMode, SemanticsState, Upload},
     store::{self, KeyUse, Record, Store, not_found},
 };

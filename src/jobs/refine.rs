@@ -25,7 +25,7 @@ use crate::{
         refinement::{refined, reported, version_of},
     },
     refine::{HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion},
-    render::{backward::DifferentiableRenderer, cpu::CpuRenderer},
+    render::{DifferentiableRenderer, cpu::CpuRenderer},
     scene::{
         PosedPhoto, Refine, RefineReport, RefineState, RefineStatus, Scene, SceneId, Stage, Watch,
         unless_cancelled,

@@ -26,12 +26,6 @@ impl SceneAccess {
         &self.record
     }
 
-    /// The same scene with a newer record.
-    pub(super) fn renewed(&self, record: Arc<Record>) -> Self {
-        debug_assert_eq!(*self.id(), record.status.id, "the record of another scene");
-        Self { record }
-    }
-
     /// The same scene, where it can be rendered.
     pub(super) fn finished(self) -> Result<Self> {
         let (status, id) = (&self.record.status, self.id());

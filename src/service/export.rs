@@ -16,13 +16,12 @@ use super::{
     features,
     page::write_page,
     query,
-    request::{QuerySpec, TextOptions},
-    search::{SceneTexts, check_scoring},
-    semantics::meaning_tag,
+    request::{QuerySpec, TextOptions, ViewOptions},
+    search::ScoringChoice,
+    tags::{cache_key, etag, semantics_tag, text_key},
     texts,
-    times::ViewTimes,
     types::{Export, ExportBody},
-    view::{hash, text_words, words},
+    work::Work,
 };
 use crate::{
     error::{Error, Result},
@@ -56,7 +55,7 @@ impl Service {
         ask: &TextOptions,
     ) -> Result<Export> {
         // How texts are scored is checked also where no text is asked.
-        check_scoring(&ask.scoring, &self.limits())?;
+        texts::check_scoring(&ask.scoring, &self.limits())?;
         let access = self.scene(id).await?;
         let is_part = format.is_splats() && ask.text.is_some();
         if ask.text.is_some() && !is_part && !format.lines {
@@ -85,17 +84,17 @@ impl Service {
         format: ExportFormat,
         ask: &TextOptions,
     ) -> Result<Export> {
-        let understood = self.inner.understood(access, format.name, ask.wait).await?;
-        let etag = hash(understood.subject().tag);
-        let write = move |to: &mut dyn Write| features::write_semantics(understood.subject(), to);
-        Ok(Export::streamed(etag, write))
+        let of = self.inner.semantic_scene(access, format.name, ask.wait).await?;
+        let tag = etag(&of.tag);
+        let write = move |to: &mut dyn Write| features::write_semantics(&of.semantics, to);
+        Ok(Export::streamed(tag, write))
     }
 
     /// The scene as the page draws it.
     async fn packed(&self, access: SceneAccess) -> Result<Export> {
         let inner = Arc::clone(&self.inner);
         let scene = blocking(move || inner.load(&access)).await??;
-        let etag = hash(&meaning_tag(&scene));
+        let etag = etag(&semantics_tag(&scene));
         let near = default_near(scene.meta.report.median_depth);
         Ok(Export::streamed(etag, move |to: &mut dyn Write| write_packed(&scene, near, to)))
     }
@@ -108,27 +107,28 @@ impl Service {
         ask: &TextOptions,
     ) -> Result<Export> {
         let (inner, limits) = (Arc::clone(&self.inner), self.limits());
-        let (lines, scoring) = (texts::lines(ask), ask.scoring.clone());
-        let how = words(&(&lines, preset, &scoring, env!("CARGO_PKG_VERSION")))?;
-        let tag = move |scene: &Scene| hash(&(meaning_tag(scene) + &how));
+        let lines = texts::lines(ask);
+        let how = cache_key(&(&lines, preset, &ask.scoring, env!("CARGO_PKG_VERSION")))?;
+        let tag = move |scene: &Scene| etag(&(semantics_tag(scene) + &how));
         if lines.is_empty() {
             let scene = blocking(move || inner.load(&access)).await??;
-            let etag = tag(&scene);
-            return Ok(Export::streamed(etag, move |to: &mut dyn Write| {
-                write_page(&scene, None, to)
-            }));
+            let tag = tag(&scene);
+            let write = move |to: &mut dyn Write| write_page(&scene, None, to);
+            return Ok(Export::streamed(tag, write));
         }
         inner.can_understand("text")?;
         let texts = texts::all_checked(&lines, "text", &limits)?;
-        let understood = inner.understood(&access, "text", ask.wait).await?;
-        let etag = tag(understood.subject().scene);
-        Ok(Export::streamed(etag, move |to: &mut dyn Write| {
-            let of = understood.subject();
-            let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &texts)?;
-            let spec = QuerySpec::default();
-            let times = ViewTimes::default();
-            let answer = query::answer(&texts, &limits, &spec, None, times, || ())?;
-            write_page(of.scene, Some(&answer), to)
+        let of = inner.semantic_scene(&access, "text", ask.wait).await?;
+        let (how, tag) = (ScoringChoice { preset, changes: ask.scoring.clone() }, tag(&of.scene));
+        Ok(Export::new(tag, async move {
+            let deadline = inner.deadline(&ViewOptions::default());
+            let texts = inner.score(of, how, texts, deadline).await?;
+            let chunks = stream(move |to: &mut dyn Write| {
+                let (spec, work) = (QuerySpec::default(), &mut Work::default());
+                let answer = query::answer(&texts, &limits, &spec, None, work)?;
+                write_page(&texts.of.scene, Some(&answer), to)
+            });
+            Ok(ExportBody { size_bytes: None, chunks })
         }))
     }
 
@@ -144,29 +144,28 @@ impl Service {
         let Some(text) = &ask.text else {
             let access = access.finished()?;
             let scene = blocking(move || inner.load(&access)).await??;
-            let etag = hash(&meaning_tag(&scene));
-            let file = move || {
-                let semantics = scene.semantics.as_deref();
-                scene_splats(format, &scene, &scene.gaussians, semantics)
-            };
-            return Ok(Export::splats(etag, file));
+            let tag = etag(&semantics_tag(&scene));
+            let write =
+                move || scene_splats(format, &scene, &scene.gaussians, scene.semantics.as_deref());
+            return Ok(Export::splats(tag, async { blocking(write).await? }));
         };
         inner.can_understand("text")?;
         let text = texts::checked(text, "text", &self.limits())?;
-        let understood = inner.understood(&access.finished()?, "text", ask.wait).await?;
-        let of = understood.subject();
+        let of = inner.semantic_scene(&access.finished()?, "text", ask.wait).await?;
         let named = preset.unwrap_or(of.scene.meta.report.method.preset);
-        let etag = hash(&text_words(of.tag, Some(&text), (named, &ask.scoring))?);
-        let scoring = ask.scoring.clone();
-        let file = move || {
-            let of = understood.subject();
-            let texts = SceneTexts::new(&inner.backend, of, (preset, &scoring), &[text])?;
-            let gaussians = texts.gaussians();
-            let index = gaussians.semantic_index().to_vec();
-            let semantics = Semantics { index, ..of.semantics.clone() };
-            scene_splats(format, of.scene, &gaussians, Some(&semantics))
-        };
-        Ok(Export::splats(etag, file))
+        let tag = etag(&text_key(&of.tag, Some(&text), named, &ask.scoring)?);
+        let how = ScoringChoice { preset, changes: ask.scoring.clone() };
+        Ok(Export::splats(tag, async move {
+            let deadline = inner.deadline(&ViewOptions::default());
+            let texts = inner.score(of, how, vec![text], deadline).await?;
+            let write = move || {
+                let gaussians = texts.gaussians();
+                let index = gaussians.semantic_index().to_vec();
+                let semantics = Semantics { index, ..(*texts.of.semantics).clone() };
+                scene_splats(format, &texts.of.scene, &gaussians, Some(&semantics))
+            };
+            blocking(write).await?
+        }))
     }
 }
 
@@ -187,10 +186,13 @@ impl Export {
         Self { file_name: String::new(), media_type: OCTETS, etag, begin: begin.boxed() }
     }
 
-    /// Gaussians that `file` makes on a thread that may block.
-    fn splats(etag: String, file: impl FnOnce() -> Result<SplatFile> + Send + 'static) -> Self {
+    /// A file of Gaussians.
+    fn splats(
+        etag: String,
+        file: impl Future<Output = Result<SplatFile>> + Send + 'static,
+    ) -> Self {
         Self::new(etag, async move {
-            let file = blocking(file).await??;
+            let file = file.await?;
             let unwritten = |cause| Error::internal("the file is not whole").caused_by(cause);
             let size_bytes = file.size_bytes();
             let chunks = stream(move |to: &mut dyn Write| file.write(to).map_err(unwritten));

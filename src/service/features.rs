@@ -12,17 +12,20 @@ use rayon::prelude::*;
 
 use super::{
     Service,
-    request::{FeatureKind, FeaturesSpec, Kind, PictureOptions},
-    search::{LabelledView, SceneTexts, Subject, check_scoring},
+    request::{FeatureKind, FeaturesSpec, Kind, ViewSpec},
+    schedule::Demand,
+    search::{LabelledView, SceneTexts, ScoringChoice},
+    tags::{cache_key, etag},
+    texts::check_scoring,
     types::Export,
-    view::{Inputs, Resolved, hash, resolve_one, words},
+    view::{Inputs, Resolved, resolve_one},
+    work::Work,
 };
 use crate::{
     error::{Error, ErrorCode, Result},
     formats::npz::NpzWriter,
     limits::Limits,
-    render::Kinds,
-    scene::{Bank, PixelWeights, SceneId},
+    scene::{Bank, PixelWeights, SceneId, Semantics},
 };
 
 /// The view that is asked for.
@@ -32,19 +35,13 @@ pub(super) fn features_view<'a>(
     spec: &FeaturesSpec,
 ) -> Result<Resolved> {
     check_scoring(&spec.scoring, limits)?;
-    let options = (&spec.options, &PictureOptions::default());
-    resolve_one(limits, inputs, spec.camera, Kind::Semantics, options)
-}
-
-/// The weights of the view, drawn where they are not known.
-pub(super) fn drawn(texts: &SceneTexts<'_>, view: &Resolved) -> Result<Arc<LabelledView>> {
-    let key = view.labels_key(texts.of.tag, &texts.backend.renderer.name())?;
-    Ok(texts.view(&view.request(texts.of.scene, Kinds::NONE), key)?.0)
+    let options = spec.options.clone();
+    resolve_one(limits, inputs, &ViewSpec::new(spec.camera, Kind::Semantics, options))
 }
 
 /// Refuses features of more bytes than the limit.
 pub(super) fn check_size(
-    texts: &SceneTexts<'_>,
+    texts: &SceneTexts,
     view: &LabelledView,
     kind: FeatureKind,
     limits: &Limits,
@@ -60,7 +57,7 @@ pub(super) fn check_size(
 
 /// Writes E or F.
 pub(super) fn write(
-    texts: &SceneTexts<'_>,
+    texts: &SceneTexts,
     view: &LabelledView,
     kind: FeatureKind,
     to: &mut dyn Write,
@@ -111,8 +108,7 @@ fn features(bank: &Bank, weights: &PixelWeights, first: usize, count: usize) -> 
 }
 
 /// Writes the bank, its masks and all indices of a scene.
-pub(super) fn write_semantics(of: Subject<'_>, to: &mut dyn Write) -> Result<()> {
-    let semantics = of.semantics;
+pub(super) fn write_semantics(semantics: &Semantics, to: &mut dyn Write) -> Result<()> {
     let bank = &semantics.bank;
     let masks: Vec<[u32; 3]> =
         semantics.masks.iter().map(|m| [m.photo, m.mask, u32::from(m.entry)]).collect();
@@ -150,27 +146,22 @@ impl Service {
         inner.can_understand("features")?;
         let scene = scene.finished()?;
         let view = features_view(&self.limits(), scene.record(), &spec)?;
-        let understood = inner.understood(&scene, "features", spec.wait).await?;
+        let of = inner.semantic_scene(&scene, "features", spec.wait).await?;
         let deadline = inner.deadline(&spec.options);
-        let (shared, limits, pixels) = (Arc::clone(inner), self.limits(), view.pixels());
-        let renderer = inner.backend.renderer.name();
-        let tag = view.labels_key(understood.subject().tag, &renderer)?;
-        let etag = hash(&words(&(tag, spec.kind, spec.options.preset, &spec.scoring))?);
-        let write = inner
-            .scheduled(deadline, pixels, "the features", move |slot| {
-                let how = (spec.options.preset, &spec.scoring);
-                let texts = SceneTexts::new(&shared.backend, understood.subject(), how, &[])?;
-                let weights = drawn(&texts, &view)?;
-                slot.drawn();
-                check_size(&texts, &weights, spec.kind, &limits)?;
-                drop(texts);
-                Ok(move |to: &mut dyn Write| -> Result<()> {
-                    let how = (spec.options.preset, &spec.scoring);
-                    let texts = SceneTexts::new(&shared.backend, understood.subject(), how, &[])?;
-                    write(&texts, &weights, spec.kind, to)
-                })
-            })
-            .await?;
+        let tag = view.labels_key(&of.tag, &inner.backend.renderer.name())?;
+        let etag = etag(&cache_key(&(tag, spec.kind, spec.options.preset, &spec.scoring))?);
+        let how = ScoringChoice { preset: spec.options.preset, changes: spec.scoring };
+        let texts = inner.score(of, how, Vec::new(), deadline).await?;
+        let (drawn, limits) = (Arc::clone(&texts), self.limits());
+        let demand = Demand::view(&self.caller, view.pixels());
+        let draw = move |work: &mut Work| {
+            let (weights, _new) = view.weights(&drawn)?;
+            work.leave_renderer();
+            check_size(&drawn, &weights, spec.kind, &limits)?;
+            Ok(weights)
+        };
+        let weights = inner.scheduled(demand, deadline, "the features", draw).await?;
+        let write = move |to: &mut dyn Write| write(&texts, &weights, spec.kind, to);
         Ok(Export { file_name: format!("{id}-view.npz"), ..Export::streamed(etag, write) })
     }
 }

@@ -20,10 +20,12 @@ mod request;
 mod schedule;
 mod search;
 mod semantics;
+mod tags;
 mod texts;
 mod times;
 mod types;
 mod view;
+mod work;
 
 use std::{fmt, sync::Arc};
 
@@ -106,7 +108,7 @@ struct Inner {
     jobs: Arc<Jobs>,
     /// Networks that run by themselves; the jobs have the same.
     networks: Arc<dyn SceneNetworks>,
-    backend: Backend,
+    backend: Arc<Backend>,
     models: ModelsInfo,
     scheduler: Arc<Scheduler>,
     /// Permits to decode uploads.
@@ -147,7 +149,7 @@ impl Service {
         let (store, records) = Store::open(place, &config.limits)?;
         let store = Arc::new(store);
         let scheduler = Scheduler::new(parts.renderer.concurrency(), &config.limits);
-        let drawn = Arc::clone(&scheduler);
+        let views = Arc::clone(&scheduler);
         let device = Arc::clone(&parts.renderer).differentiable();
         let refine = match config.refine {
             // It takes all processors for a minute after each scene, so it is for calls that ask.
@@ -167,7 +169,7 @@ impl Service {
             renderer: Arc::clone(&parts.renderer),
             refiner,
             threads: config.threads,
-            drawn: Box::new(move || drawn.idle()),
+            drawn: Box::new(move || views.idle()),
         };
         let jobs = Jobs::start(job_parts, records)?;
         let models = ModelsInfo {
@@ -180,7 +182,7 @@ impl Service {
             jobs,
             networks,
             scheduler,
-            backend: Backend::new(parts.renderer, parts.semantics, &config.limits),
+            backend: Arc::new(Backend::new(parts.renderer, parts.semantics, &config.limits)),
             models,
             reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
             folders: Arc::new(Semaphore::new(config.limits.folder_exports_max)),

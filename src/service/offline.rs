@@ -4,24 +4,25 @@ use std::{io::Write, sync::Arc};
 
 use super::{
     features, pick, query,
-    request::{FeaturesSpec, PickSpec, QuerySpec, ViewSpec},
-    search::{Backend, SceneTexts, Subject, check_scoring},
+    request::{FeaturesSpec, PickSpec, QuerySpec, ScoringOptions, ViewSpec},
+    search::{Backend, SceneTexts, ScoringChoice, SemanticScene},
     texts,
     times::ViewTimes,
     types::{Picked, QueryAnswer, RenderedView},
     view::resolve_one,
+    work::Work,
 };
 use crate::{
     error::{Error, ErrorCode, Result},
     jobs::SemanticNetworks,
     limits::Limits,
     render::Renderer,
-    scene::{Gaussians, Scene},
+    scene::{Gaussians, Preset, Scene},
 };
 
 /// The use cases of [`super::Service`] for scenes that lie in files: no store, jobs or owners.
 pub struct OfflineService {
-    pub(super) backend: Backend,
+    pub(super) backend: Arc<Backend>,
     pub(super) limits: Limits,
 }
 
@@ -38,42 +39,56 @@ impl OfflineService {
         renderer: Arc<dyn Renderer>,
         limits: Limits,
     ) -> Self {
-        Self { backend: Backend::new(renderer, semantics, &limits), limits }
+        Self { backend: Arc::new(Backend::new(renderer, semantics, &limits)), limits }
     }
 
-    pub(super) fn subject<'a>(&self, scene: &'a Scene, what: &str) -> Result<Subject<'a>> {
+    /// What draws the views.
+    pub fn renderer(&self) -> &Arc<dyn Renderer> {
+        &self.backend.renderer
+    }
+
+    /// Scores checked texts for a scene; `what` asks for it.
+    pub(super) fn score(
+        &self,
+        scene: &Arc<Scene>,
+        what: &str,
+        preset: Option<Preset>,
+        changes: &ScoringOptions,
+        texts: &[String],
+    ) -> Result<SceneTexts> {
+        let how = ScoringChoice { preset, changes: changes.clone() };
+        SceneTexts::new(&self.backend, self.semantic_scene(scene, what)?, &how, texts)
+    }
+
+    fn semantic_scene(&self, scene: &Arc<Scene>, what: &str) -> Result<SemanticScene> {
         if let Some(lack) = self.backend.lacks() {
             let message = format!("{what}: the bundle has {lack}");
             return Err(Error::new(ErrorCode::ModelUnavailable, message));
         }
-        let semantics = scene.semantics.as_deref().ok_or_else(|| {
+        SemanticScene::new(Arc::clone(scene)).ok_or_else(|| {
             let message = format!(
                 "{what}: the scene file has no semantics beside it; make it with --semantics eager"
             );
             Error::new(ErrorCode::SemanticsOff, message)
-        })?;
-        Ok(Subject { scene, semantics, tag: scene.meta.id.as_str() })
+        })
     }
 
     /// As [`super::Service::render`].
     ///
     /// # Errors
     /// As there; `semantics_off` where the scene has no semantics.
-    pub fn render(&self, scene: &Scene, spec: &ViewSpec) -> Result<RenderedView> {
+    pub fn render(&self, scene: &Arc<Scene>, spec: &ViewSpec) -> Result<RenderedView> {
         let ask = texts::check_ask(&[spec.kind], &spec.text, &self.limits)?;
-        let options = (&spec.options, &spec.picture);
-        let view = resolve_one(&self.limits, scene, spec.camera, spec.kind, options)?;
+        let view = resolve_one(&self.limits, &**scene, spec)?;
         let texts = if spec.kind.needs_semantics() {
-            let subject = self.subject(scene, &format!("kind={}", spec.kind))?;
-            let text = ask.text.as_slice();
-            let how = (spec.options.preset, &ask.scoring);
-            Some(SceneTexts::new(&self.backend, subject, how, text)?)
+            let (what, preset) = (format!("kind={}", spec.kind), spec.options.preset);
+            Some(self.score(scene, &what, preset, &ask.scoring, ask.text.as_slice())?)
         } else {
             None
         };
-        let tag = scene.meta.id.as_str();
-        let mut views =
-            view.draw(&self.backend, scene, tag, texts.as_ref(), ViewTimes::default(), || ())?;
+        let times = texts.as_ref().map_or_else(ViewTimes::default, SceneTexts::times);
+        let work = &mut Work::default();
+        let mut views = view.draw(&self.backend, scene, texts.as_ref(), times, work)?;
         views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
     }
 
@@ -81,14 +96,12 @@ impl OfflineService {
     ///
     /// # Errors
     /// As there; `semantics_off` where the scene has no semantics.
-    pub fn query(&self, scene: &Scene, spec: &QuerySpec) -> Result<QueryAnswer> {
+    pub fn query(&self, scene: &Arc<Scene>, spec: &QuerySpec) -> Result<QueryAnswer> {
         let texts = texts::all_checked(&spec.texts, "texts", &self.limits)?;
-        let view = query::query_view(&self.limits, scene, spec)?;
-        let subject = self.subject(scene, "query")?;
-        check_scoring(&spec.scoring, &self.limits)?;
-        let how = (spec.options.preset, &spec.scoring);
-        let texts = SceneTexts::new(&self.backend, subject, how, &texts)?;
-        query::answer(&texts, &self.limits, spec, view.as_ref(), ViewTimes::default(), || ())
+        let view = query::query_view(&self.limits, &**scene, spec)?;
+        texts::check_scoring(&spec.scoring, &self.limits)?;
+        let texts = self.score(scene, "query", spec.options.preset, &spec.scoring, &texts)?;
+        query::answer(&texts, &self.limits, spec, view.as_ref(), &mut Work::default())
     }
 
     /// As [`super::Service::pick`], without labels.
@@ -107,16 +120,16 @@ impl OfflineService {
     /// As there; `semantics_off` where the scene has no semantics.
     pub fn arrays(
         &self,
-        scene: &Scene,
+        scene: &Arc<Scene>,
         spec: Option<&FeaturesSpec>,
         to: &mut dyn Write,
     ) -> Result<()> {
-        let subject = self.subject(scene, "arrays")?;
-        let Some(spec) = spec else { return features::write_semantics(subject, to) };
-        let view = features::features_view(&self.limits, scene, spec)?;
-        let how = (spec.options.preset, &spec.scoring);
-        let texts = SceneTexts::new(&self.backend, subject, how, &[])?;
-        let weights = features::drawn(&texts, &view)?;
+        let Some(spec) = spec else {
+            return features::write_semantics(&self.semantic_scene(scene, "arrays")?.semantics, to);
+        };
+        let view = features::features_view(&self.limits, &**scene, spec)?;
+        let texts = self.score(scene, "arrays", spec.options.preset, &spec.scoring, &[])?;
+        let (weights, _new) = view.weights(&texts)?;
         features::check_size(&texts, &weights, spec.kind, &self.limits)?;
         features::write(&texts, &weights, spec.kind, to)
     }
@@ -125,10 +138,9 @@ impl OfflineService {
     ///
     /// # Errors
     /// As [`Self::query`].
-    pub fn select(&self, scene: &Scene, text: &str, spec: &QuerySpec) -> Result<Gaussians> {
+    pub fn select(&self, scene: &Arc<Scene>, text: &str, spec: &QuerySpec) -> Result<Gaussians> {
         let text = texts::checked(text, "text", &self.limits)?;
-        let subject = self.subject(scene, "text")?;
-        let how = (spec.options.preset, &spec.scoring);
-        Ok(SceneTexts::new(&self.backend, subject, how, &[text])?.gaussians())
+        let preset = spec.options.preset;
+        Ok(self.score(scene, "text", preset, &spec.scoring, &[text])?.gaussians())
     }
 }

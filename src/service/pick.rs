@@ -3,13 +3,14 @@
 use std::sync::Arc;
 
 use super::{
-    Inner, Service,
-    request::{Kind, PickSpec, PictureOptions},
-    search::{SceneTexts, check_scoring},
-    semantics::Understood,
+    Service,
+    request::{Kind, PickSpec, ViewSpec},
+    schedule::Demand,
+    search::{SceneTexts, ScoredText, ScoringChoice},
     texts,
     types::{Label, Picked},
     view::{Inputs, Resolved, resolve_one},
+    work::Work,
 };
 use crate::{
     error::{Error, Result},
@@ -25,8 +26,7 @@ pub(super) fn pick_view<'a>(
     inputs: impl Into<Inputs<'a>>,
     spec: &PickSpec,
 ) -> Result<Resolved> {
-    let options = (&spec.options, &PictureOptions::default());
-    resolve_one(limits, inputs, spec.camera, Kind::Alpha, options)
+    resolve_one(limits, inputs, &ViewSpec::new(spec.camera, Kind::Alpha, spec.options.clone()))
 }
 
 /// Depth, point and Gaussian of a pixel of a view.
@@ -65,25 +65,15 @@ pub(super) fn pick(scene: &Scene, view: &Resolved, [x, y]: [f64; 2]) -> Result<P
     Ok(picked)
 }
 
-impl Inner {
-    fn labels(
-        &self,
-        understood: &Understood,
-        spec: &PickSpec,
-        labels: &[String],
-        entry: u16,
-    ) -> Result<Vec<Label>> {
-        let subject = understood.subject();
-        let how = (spec.options.preset, &spec.scoring);
-        let texts = SceneTexts::new(&self.backend, subject, how, labels)?.texts;
-        let score = |scores: &[f32]| scores.get(usize::from(entry)).copied().unwrap_or(0.0);
-        let named = texts
-            .into_iter()
-            .map(|one| Label { relevancy: score(one.scores.relevancies()), text: one.text });
-        let mut named: Vec<Label> = named.collect();
-        named.sort_by(|a, b| b.relevancy.total_cmp(&a.relevancy));
-        Ok(named)
-    }
+/// How well each text names an entry of the bank, the best first.
+fn labels_of(texts: &SceneTexts, entry: u16) -> Vec<Label> {
+    let label = |text: &ScoredText| {
+        let relevancy = text.scores.relevancies().get(usize::from(entry)).copied();
+        Label { relevancy: relevancy.unwrap_or(0.0), text: text.text.clone() }
+    };
+    let mut labels: Vec<Label> = texts.texts.iter().map(label).collect();
+    labels.sort_by(|a, b| b.relevancy.total_cmp(&a.relevancy));
+    labels
 }
 
 impl Service {
@@ -97,32 +87,32 @@ impl Service {
         let inner = &self.inner;
         let scene = scene.finished()?;
         let view = pick_view(&self.limits(), scene.record(), &spec)?;
-        let (labels, understood) = if spec.labels.is_empty() {
-            (Vec::new(), None)
+        let (of, labels) = if spec.labels.is_empty() {
+            (None, Vec::new())
         } else {
             inner.can_understand("labels")?;
-            check_scoring(&spec.scoring, &self.limits())?;
+            texts::check_scoring(&spec.scoring, &self.limits())?;
             let labels = texts::all_checked(&spec.labels, "labels", &self.limits())?;
-            (labels, Some(inner.understood(&scene, "labels", spec.wait).await?))
+            (Some(inner.semantic_scene(&scene, "labels", spec.wait).await?), labels)
         };
         let deadline = inner.deadline(&spec.options);
-        if let Some(understood) = &understood {
-            let how = (spec.options.preset, &spec.scoring);
-            inner.embed(understood, how, &labels, deadline).await?;
-        }
-        let shared = Arc::clone(inner);
-        inner
-            .scheduled(deadline, 1, "the pick", move |_slot| {
-                let scene = match &understood {
-                    Some(understood) => Arc::clone(&understood.scene),
-                    None => shared.load(&scene)?,
-                };
-                let mut picked = pick(&scene, &view, [spec.x, spec.y])?;
-                if let (Some(understood), Some(entry)) = (&understood, picked.entry) {
-                    picked.labels = shared.labels(understood, &spec, &labels, entry)?;
-                }
-                Ok(picked)
-            })
-            .await
+        let how = ScoringChoice { preset: spec.options.preset, changes: spec.scoring };
+        let texts = match of {
+            Some(of) => Some(inner.score(of, how, labels, deadline).await?),
+            None => None,
+        };
+        let (shared, pixel) = (Arc::clone(inner), [spec.x, spec.y]);
+        let pick = move |_: &mut Work| {
+            let scene = match &texts {
+                Some(texts) => Arc::clone(&texts.of.scene),
+                None => shared.load(&scene)?,
+            };
+            let mut picked = pick(&scene, &view, pixel)?;
+            if let (Some(texts), Some(entry)) = (&texts, picked.entry) {
+                picked.labels = labels_of(texts, entry);
+            }
+            Ok(picked)
+        };
+        inner.scheduled(Demand::view(&self.caller, 1), deadline, "the pick", pick).await
     }
 }

@@ -1,7 +1,7 @@
 //! Many texts for one scene: scores of the bank, parts in 3D, and with a camera one drawing of the
 //! view for all of them.
 
-use std::{collections::HashMap, sync::Arc};
+use std::collections::HashMap;
 
 use glam::DMat4;
 use rayon::prelude::*;
@@ -10,19 +10,20 @@ use super::{
     Service,
     encode::{self, Layer},
     request::{
-        Boxes, CameraSpec, Format, Kind, LensSpec, MaskFormat, PictureOptions, PoseSpec, QuerySpec,
+        Boxes, CameraSpec, Format, Kind, LensSpec, MaskFormat, PoseSpec, QuerySpec, ViewSpec,
     },
-    search::{self, LabelledView, SceneTexts, ScoredText},
+    schedule::Demand,
+    search::{LabelledView, SceneTexts, ScoredText, ScoringChoice},
     texts,
     times::{ViewTimes, staged},
     types::{InstanceBox, Peak, QueryAnswer, TextResult, TextView},
     view::{Inputs, Resolved, resolve_one},
+    work::Work,
 };
 use crate::{
     error::Result,
     formats::rle::Rle,
     limits::Limits,
-    render::Kinds,
     scene::SceneId,
     semantics::{Instance, InstanceOptions, Scorer},
 };
@@ -36,21 +37,18 @@ struct Selection {
     parts: Vec<InstanceBox>,
 }
 
-/// Answers the texts; `view` is that of the camera, where one was given. Calls `drawn` when it is
-/// drawn. `times` has the stages before.
+/// Answers the texts; `view` is that of the camera, where one was given.
 pub(super) fn answer(
-    texts: &SceneTexts<'_>,
+    texts: &SceneTexts,
     limits: &Limits,
     spec: &QuerySpec,
     view: Option<&Resolved>,
-    mut times: ViewTimes,
-    drawn: impl FnOnce(),
+    work: &mut Work,
 ) -> Result<QueryAnswer> {
+    let mut times = ViewTimes { queue_ms: work.queue_ms, ..texts.times() };
     let (mut labelled, mut render_ms) = (None, None);
     if let Some(view) = view {
-        let key = view.labels_key(texts.of.tag, &texts.backend.renderer.name())?;
-        let request = view.request(texts.of.scene, Kinds::NONE);
-        let (found, ms) = staged("render", || texts.view(&request, key));
+        let (found, ms) = staged("render", || view.weights(texts));
         let (found, new) = found?;
         times.render_ms = ms;
         render_ms = Some(if new { ms } else { 0.0 });
@@ -60,8 +58,10 @@ pub(super) fn answer(
         *times.score_ms.get_or_insert_default() += ms;
         labelled = Some(found);
     }
-    drawn();
+    work.leave_renderer();
+    let work = &*work;
     let result = |text: &ScoredText, selections: &Selections| -> Result<TextResult> {
+        work.unless_stopped()?;
         let entries = text.selected();
         let selection = selections.get(&entries);
         let view = labelled.as_ref().map(|view| text_view(view, &texts.scorer, text, spec));
@@ -76,7 +76,8 @@ pub(super) fn answer(
         })
     };
     let (results, ms) = staged("encode", || {
-        let selections = selections(texts, limits, spec.boxes);
+        work.unless_stopped()?;
+        let selections = selections(texts, limits, spec.boxes, work)?;
         texts.texts.par_iter().map(|text| result(text, &selections)).collect::<Result<_>>()
     });
     times.encode_ms = ms;
@@ -96,16 +97,21 @@ pub(super) fn query_view<'a>(
     inputs: impl Into<Inputs<'a>>,
     spec: &QuerySpec,
 ) -> Result<Option<Resolved>> {
-    let options = (&spec.options, &PictureOptions::default());
     // The options of a view that is not asked for are checked all the same.
     let any = PoseSpec::CameraToWorld(DMat4::IDENTITY.to_cols_array());
     let camera = spec.camera.unwrap_or(CameraSpec { pose: any, lens: LensSpec::default() });
-    let view = resolve_one(limits, inputs, camera, Kind::Mask, options)?;
+    let of = ViewSpec::new(camera, Kind::Mask, spec.options.clone());
+    let view = resolve_one(limits, inputs, &of)?;
     Ok(spec.camera.map(|_| view))
 }
 
 /// What each set of entries selects; texts that select the same share it.
-fn selections(texts: &SceneTexts<'_>, limits: &Limits, boxes: Boxes) -> Selections {
+fn selections(
+    texts: &SceneTexts,
+    limits: &Limits,
+    boxes: Boxes,
+    work: &Work,
+) -> Result<Selections> {
     let mut sets: Vec<Vec<u16>> = texts.texts.iter().map(ScoredText::selected).collect();
     sets.sort_unstable();
     sets.dedup();
@@ -134,10 +140,11 @@ fn selections(texts: &SceneTexts<'_>, limits: &Limits, boxes: Boxes) -> Selectio
         }
     };
     let selection = |set: Vec<u16>| {
+        work.unless_stopped()?;
         let parts = components.as_deref().map(|of| of.instances(gaussians, &set, &options));
         let parts = parts.into_iter().flatten().take(limits.parts_max).map(boxed).collect();
         let gaussians = set.iter().map(|m| counts[usize::from(*m)]).sum();
-        (set, Selection { gaussians, parts })
+        Ok((set, Selection { gaussians, parts }))
     };
     sets.into_par_iter().map(selection).collect()
 }
@@ -198,29 +205,121 @@ impl Service {
         let inner = &self.inner;
         inner.can_understand("query")?;
         let texts = texts::all_checked(&spec.texts, "texts", &self.limits())?;
-        search::check_scoring(&spec.scoring, &self.limits())?;
+        texts::check_scoring(&spec.scoring, &self.limits())?;
         let scene = scene.finished()?;
         let view = query_view(&self.limits(), scene.record(), &spec)?;
-        let understood = inner.understood(&scene, "query", spec.wait).await?;
+        let of = inner.semantic_scene(&scene, "query", spec.wait).await?;
         let deadline = inner.deadline(&spec.options);
-        let how = (spec.options.preset, &spec.scoring);
-        let embed_ms = inner.embed(&understood, how, &texts, deadline).await?;
-        let shared = Arc::clone(inner);
+        let how = ScoringChoice { preset: spec.options.preset, changes: spec.scoring.clone() };
+        let texts = inner.score(of, how, texts, deadline).await?;
         let pixels = view.as_ref().map_or(0, Resolved::pixels);
-        inner
-            .scheduled(deadline, pixels, "the query", move |slot| {
-                let subject = understood.subject();
-                let how = (spec.options.preset, &spec.scoring);
-                let scored = || SceneTexts::new(&shared.backend, subject, how, &texts);
-                let (texts, ms) = staged("score", scored);
-                let times = ViewTimes {
-                    queue_ms: slot.queue_ms,
-                    load_ms: understood.load_ms,
-                    score_ms: Some(embed_ms + ms),
-                    ..ViewTimes::default()
-                };
-                answer(&texts?, &shared.limits(), &spec, view.as_ref(), times, || slot.drawn())
-            })
-            .await
+        let gaussians = texts.of.scene.gaussians.len();
+        let demand = Demand::view(&self.caller, pixels).with_texts(texts.texts.len(), gaussians);
+        let limits = self.limits();
+        let answer = move |work: &mut Work| answer(&texts, &limits, &spec, view.as_ref(), work);
+        inner.scheduled(demand, deadline, "the query", answer).await
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::{
+        error::ErrorCode,
+        jobs::{NoSemantics, Phrases, SemanticNetworks},
+        render::{Frame, PixelWeights, RenderRequest, Renderer},
+        scene::{
+            Backdrop, Bank, Gaussians, HealthReport, Method, PosedPhoto, Provenance, RawGaussians,
+            Scene, SceneMeta, Semantics, SourcePixel, TextEmbedding, Watch,
+        },
+        service::search::{Backend, SemanticScene},
+    };
+
+    /// Draws views without any weight, and knows every text.
+    struct Blank;
+
+    impl Renderer for Blank {
+        fn name(&self) -> String {
+            "blank".to_owned()
+        }
+
+        fn concurrency(&self) -> usize {
+            1
+        }
+
+        fn render(&self, _: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+            let (width, height) =
+                (request.camera.intrinsics.width, request.camera.intrinsics.height);
+            let weights = Some(PixelWeights::none((width * height) as usize));
+            Ok(Frame { width, height, weights, ..Frame::default() })
+        }
+    }
+
+    impl SemanticNetworks for Blank {
+        fn lacks(&self) -> Option<String> {
+            None
+        }
+
+        fn phrases(&self) -> Result<Phrases> {
+            Ok(Phrases { canon: vec!["thing".to_owned()], tau: 10.0, coverage_floor: 0.0 })
+        }
+
+        fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {
+            let of = |text: &String| TextEmbedding {
+                row: if text == "thing" { vec![0.0, 1.0] } else { vec![1.0, 0.0] },
+                ..TextEmbedding::default()
+            };
+            Ok(texts.iter().map(of).collect())
+        }
+
+        fn make(
+            &self,
+            photos: &[PosedPhoto],
+            method: &Method,
+            scene: &dyn Fn() -> Result<Arc<Scene>>,
+            watch: Watch<'_>,
+        ) -> Result<Semantics> {
+            NoSemantics.make(photos, method, scene, watch)
+        }
+    }
+
+    #[test]
+    fn a_query_whose_caller_has_gone_scores_no_text() {
+        let raw = RawGaussians {
+            means: vec![[0.0, 0.0, 2.0]],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]],
+            scales: vec![[0.1; 3]],
+            opacities: vec![0.9],
+            sh: vec![[0.0; 3]],
+            semantic_index: vec![0],
+            source: vec![SourcePixel::default()],
+            ..RawGaussians::default()
+        };
+        let meta = SceneMeta {
+            id: SceneId::from_bytes([1; 16]),
+            created_ms: 0,
+            cameras: Vec::new(),
+            report: HealthReport::default(),
+            provenance: Provenance::default(),
+        };
+        let scene = Scene::new(meta, Gaussians::sanitize(raw).unwrap().0, Backdrop::default());
+        let bank = Bank { dim: 2, rows: vec![1.0, 0.0] };
+        let semantics = Semantics { bank, index: vec![1], ..Semantics::default() };
+        let scene = Arc::new(scene.with_semantics(Arc::new(semantics)).unwrap());
+        let limits = Limits::default();
+        let backend = Arc::new(Backend::new(Arc::new(Blank), Arc::new(Blank), &limits));
+        let pose = PoseSpec::CameraToWorld(DMat4::IDENTITY.to_cols_array());
+        let camera = Some(CameraSpec { pose, lens: LensSpec::default() });
+        let spec = QuerySpec { camera, ..QuerySpec::default() };
+        let view = query_view(&limits, &*scene, &spec).unwrap();
+        let (of, asked) = (SemanticScene::new(scene).unwrap(), ["chair".to_owned()]);
+        let texts = SceneTexts::new(&backend, of, &ScoringChoice::default(), &asked).unwrap();
+        let answer = |work: &mut Work| answer(&texts, &limits, &spec, view.as_ref(), work);
+        let whole = answer(&mut Work::default()).unwrap();
+        assert_eq!((whole.results.len(), whole.results[0].gaussians), (1, 1));
+        let stopped = answer(&mut Work::stopped()).unwrap_err();
+        assert_eq!(stopped.code(), ErrorCode::Cancelled);
     }
 }

@@ -461,6 +461,21 @@ pub struct ViewSpec {
     pub text: TextOptions,
 }
 
+impl ViewSpec {
+    /// A view without a text, as a PNG.
+    #[must_use]
+    pub fn new(camera: CameraSpec, kind: Kind, options: ViewOptions) -> Self {
+        let (picture, text) = (PictureOptions::default(), TextOptions::default());
+        Self { camera, kind, options, picture, text }
+    }
+}
+
+impl From<ViewSpec> for ViewsSpec {
+    fn from(ViewSpec { camera, kind, options, picture, text }: ViewSpec) -> Self {
+        Self { cameras: vec![camera], kinds: vec![kind], options, picture, text }
+    }
+}
+
 /// Many cameras and kinds; each camera is rendered once for all kinds.
 #[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]
 pub struct ViewsSpec {

@@ -4,14 +4,16 @@
 //! them holds a [`Slot`]. A view gives its slot back when it is drawn, so no slot waits for an
 //! encoder. Its pixels count until the answer is encoded: they bound the memory of all pictures.
 //!
-//! The order is that of fair queuing: a view waits for about as many pixels as it has itself, so
-//! large views do not keep small ones waiting, and small ones do not keep out a large one. While
-//! large views hold every slot, one small view at a time is drawn beside them.
+//! Owners take turns: the next view is one of the owner who had least work done so far, and an owner
+//! may fill half of the queue, so that others always find room. The order of one owner's views is
+//! that of fair queuing: a view waits for about as much work as it is itself, so large views do not
+//! keep small ones waiting, and small ones do not keep out a large one. While large views hold every
+//! slot, one small view at a time is drawn beside them.
 //!
 //! [`Renderer::concurrency`]: crate::render::Renderer::concurrency
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, HashMap},
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -21,17 +23,45 @@ use tokio::sync::oneshot;
 
 use crate::{
     error::{Error, ErrorCode, Result},
+    keys::Caller,
     limits::Limits,
 };
 
 /// Most pixels of a small view.
 const SMALL_PIXELS: u64 = 512 * 512;
-/// A view is taken while its pixels are at most this share of the room in the queue. So a few
-/// large views cannot fill the queue to the last pixel, and small ones still find room.
+/// A view is taken while its work is at most this share of the room in the queue. So a few large
+/// views cannot fill the queue to the last pixel, and small ones still find room.
 const ROOM_SHARE: u64 = 4;
 /// Most views of one caller at the same time, and most pixels of more than one.
 const CALLER_VIEWS: usize = 8;
 const CALLER_PIXELS: u64 = 16 << 20;
+/// Texts that are scored in the time in which their view is drawn.
+const TEXTS_A_DRAWING: u64 = 8;
+
+/// What a call asks of the renderer.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Demand {
+    /// Whose turn it takes.
+    caller: Caller,
+    /// Pixels of its pictures.
+    pixels: u64,
+    /// Its work, in pixels that are drawn in the same time.
+    work: u64,
+}
+
+impl Demand {
+    /// That of a view of so many pixels.
+    pub(super) fn view(caller: &Caller, pixels: u64) -> Self {
+        Self { caller: caller.clone(), pixels, work: pixels }
+    }
+
+    /// With so many texts, which are looked for in all pixels and all Gaussians.
+    pub(super) fn with_texts(self, texts: usize, gaussians: usize) -> Self {
+        let each = self.pixels.saturating_add(gaussians as u64);
+        let scored = each.saturating_mul(texts as u64) / TEXTS_A_DRAWING;
+        Self { work: self.work.saturating_add(scored), ..self }
+    }
+}
 
 /// Gives slots to views, in order.
 #[derive(Debug)]
@@ -44,10 +74,8 @@ pub(super) struct Scheduler {
 
 #[derive(Debug, Default)]
 struct State {
-    /// Views that wait, in the order in which they are drawn: by [`State::clock`] at their arrival
-    /// plus their own pixels, then by arrival.
-    waiting: BTreeMap<(u64, u64), Waiting>,
-    waiting_pixels: u64,
+    /// Owners with views here, and those who had more work done than others.
+    lanes: HashMap<Caller, Lane>,
     /// Views that are drawn or encoded.
     active: usize,
     active_pixels: u64,
@@ -56,14 +84,29 @@ struct State {
     drawing_small: usize,
     /// When the last view came or ended.
     used: Option<Instant>,
+    /// [`Lane::served`] of the view that was started last, before it was started.
+    served: u64,
+    arrivals: u64,
+}
+
+/// The views of one owner.
+#[derive(Debug, Default)]
+struct Lane {
+    /// Views that wait, in the order in which they are drawn: by [`Lane::clock`] at their arrival
+    /// plus their own work, then by arrival.
+    waiting: BTreeMap<(u64, u64), Waiting>,
     /// Place in the order of the view that was started last.
     clock: u64,
-    arrivals: u64,
+    /// Work that was started for this owner. One who comes after a pause is as far as the others.
+    served: u64,
+    /// Views that wait, are drawn or are encoded, and their work.
+    views: usize,
+    work: u64,
 }
 
 #[derive(Debug)]
 struct Waiting {
-    pixels: u64,
+    demand: Demand,
     start: oneshot::Sender<Slot>,
 }
 
@@ -71,19 +114,17 @@ struct Waiting {
 #[derive(Debug)]
 pub(super) struct Slot {
     scheduler: Arc<Scheduler>,
-    pixels: u64,
+    demand: Demand,
     drawing: bool,
-    /// Milliseconds until the view had the slot and a thread.
-    pub(super) queue_ms: f64,
 }
 
 impl Slot {
     /// Says that the view is drawn: the next one is drawn while this one is encoded.
-    pub(super) fn drawn(&mut self) {
+    pub(super) fn leave_renderer(&mut self) {
         if std::mem::take(&mut self.drawing) {
             let mut state = self.scheduler.state.lock();
             state.drawing -= 1;
-            state.drawing_small -= usize::from(self.pixels <= SMALL_PIXELS);
+            state.drawing_small -= usize::from(self.demand.pixels <= SMALL_PIXELS);
             self.scheduler.start_next(&mut state);
         }
     }
@@ -91,11 +132,12 @@ impl Slot {
 
 impl Drop for Slot {
     fn drop(&mut self) {
-        self.drawn();
+        self.leave_renderer();
         let mut state = self.scheduler.state.lock();
         state.used = Some(Instant::now());
         state.active -= 1;
-        state.active_pixels -= self.pixels;
+        state.active_pixels -= self.demand.pixels;
+        state.remove(&self.demand);
         self.scheduler.start_next(&mut state);
     }
 }
@@ -103,6 +145,7 @@ impl Drop for Slot {
 /// Takes a view out of the queue when its caller stops to wait.
 struct Place<'a> {
     scheduler: &'a Scheduler,
+    caller: Caller,
     key: (u64, u64),
     /// Closed after the view has left the queue, so that no slot is lost.
     started: oneshot::Receiver<Slot>,
@@ -111,9 +154,57 @@ struct Place<'a> {
 impl Drop for Place<'_> {
     fn drop(&mut self) {
         let mut state = self.scheduler.state.lock();
-        if let Some(gone) = state.waiting.remove(&self.key) {
-            state.waiting_pixels -= gone.pixels;
+        let lane = state.lanes.get_mut(&self.caller);
+        if let Some(gone) = lane.and_then(|lane| lane.waiting.remove(&self.key)) {
+            state.remove(&gone.demand);
         }
+    }
+}
+
+impl State {
+    /// Views that wait, are drawn or are encoded.
+    fn views(&self) -> usize {
+        self.lanes.values().map(|lane| lane.views).sum()
+    }
+
+    /// Takes a place in the queue, or says why there is none.
+    fn add(&mut self, demand: &Demand, limits: &Limits) -> Result<(), String> {
+        let work = demand.work;
+        let (views, queued) = (self.views(), self.lanes.values().map(|lane| lane.work).sum());
+        let (views_max, work_max) = (limits.queued_renders_max, limits.queued_pixels_max);
+        let lane = self.lanes.entry(demand.caller.clone()).or_default();
+        let mut room = work_max.saturating_sub(queued);
+        // Without owners there is nobody to share with.
+        if demand.caller != Caller::All {
+            let share = views_max.div_ceil(2);
+            if lane.views >= share {
+                return Err(format!("{share} renders of this owner wait already"));
+            }
+            room = room.min((work_max / 2).saturating_sub(lane.work));
+        }
+        if views >= views_max {
+            return Err(format!("{views} renders wait already, the most that may"));
+        }
+        if queued > 0 && work > room / ROOM_SHARE {
+            let why = format!("renders of {queued} pixels wait already; {work} are too many more");
+            return Err(why);
+        }
+        if lane.views == 0 {
+            lane.served = lane.served.max(self.served);
+        }
+        lane.views += 1;
+        lane.work += work;
+        Ok(())
+    }
+
+    /// Gives the place of a view back.
+    fn remove(&mut self, demand: &Demand) {
+        if let Some(lane) = self.lanes.get_mut(&demand.caller) {
+            lane.views -= 1;
+            lane.work -= demand.work;
+        }
+        let served = self.served;
+        self.lanes.retain(|_, lane| lane.views > 0 || lane.served > served);
     }
 }
 
@@ -132,45 +223,39 @@ impl Scheduler {
 
     /// Views that wait, are drawn or are encoded.
     pub(super) fn len(&self) -> usize {
-        let state = self.state.lock();
-        state.waiting.len() + state.active
+        self.state.lock().views()
     }
 
     /// Time since the last view ended, 0 while there are views; `None` before the first.
     pub(super) fn idle(&self) -> Option<Duration> {
         let state = self.state.lock();
-        match state.waiting.len() + state.active {
+        match state.views() {
             0 => state.used.map(|used| used.elapsed()),
             _ => Some(Duration::ZERO),
         }
     }
 
-    /// Waits until a view of so many pixels may be drawn. A caller who goes away gives its place
-    /// back.
-    /// Fails with `overloaded` when too many views, or too many pixels, wait already.
-    pub(super) async fn enter(self: &Arc<Self>, pixels: u64, limits: &Limits) -> Result<Slot> {
+    /// Waits until a view may be drawn. A caller who goes away gives its place back.
+    /// Fails with `overloaded` when too many views, or too much work, wait already.
+    pub(super) async fn enter(
+        self: &Arc<Self>,
+        mut demand: Demand,
+        limits: &Limits,
+    ) -> Result<Slot> {
+        // The heaviest query leaves room for others.
+        demand.work = demand.work.min(limits.queued_pixels_max / 2);
         let (start, started) = oneshot::channel();
         let mut place = {
             let mut state = self.state.lock();
-            let views = state.waiting.len() + state.active;
-            let queued = state.waiting_pixels + state.active_pixels;
-            let room = limits.queued_pixels_max.saturating_sub(queued);
-            let full = if views >= limits.queued_renders_max {
-                Some(format!("{views} renders wait already, the most that may"))
-            } else if queued > 0 && pixels > room / ROOM_SHARE {
-                Some(format!("renders of {queued} pixels wait already; {pixels} are too many more"))
-            } else {
-                None
-            };
-            if let Some(why) = full {
-                return Err(Error::new(ErrorCode::Overloaded, why).retry_after_s(1));
-            }
+            let full = |why| Error::new(ErrorCode::Overloaded, why).retry_after_s(1);
+            state.add(&demand, limits).map_err(full)?;
             state.arrivals += 1;
-            let key = (state.clock.saturating_add(pixels), state.arrivals);
-            state.waiting_pixels += pixels;
-            state.waiting.insert(key, Waiting { pixels, start });
+            let (caller, arrival) = (demand.caller.clone(), state.arrivals);
+            let lane = state.lanes.entry(caller.clone()).or_default();
+            let key = (lane.clock.saturating_add(demand.work), arrival);
+            lane.waiting.insert(key, Waiting { demand, start });
             self.start_next(&mut state);
-            Place { scheduler: self, key, started }
+            Place { scheduler: self, caller, key, started }
         };
         let slot = (&mut place.started).await;
         slot.map_err(|closed| Error::internal("a view was never started").caused_by(closed))
@@ -178,31 +263,39 @@ impl Scheduler {
 
     /// Starts the views that may start.
     fn start_next(self: &Arc<Self>, state: &mut State) {
-        while let Some(key) = self.next(state) {
-            let Some(Waiting { pixels, start }) = state.waiting.remove(&key) else { break };
-            state.waiting_pixels -= pixels;
+        while let Some((caller, key)) = self.next(state) {
+            let Some(lane) = state.lanes.get_mut(&caller) else { break };
+            let Some(Waiting { demand, start }) = lane.waiting.remove(&key) else { break };
+            state.served = state.served.max(lane.served);
+            lane.served = lane.served.saturating_add(demand.work.max(1));
+            lane.clock = lane.clock.max(key.0);
             state.active += 1;
-            state.active_pixels += pixels;
+            state.active_pixels += demand.pixels;
             state.drawing += 1;
-            state.drawing_small += usize::from(pixels <= SMALL_PIXELS);
-            state.clock = state.clock.max(key.0);
+            state.drawing_small += usize::from(demand.pixels <= SMALL_PIXELS);
             // A caller that stops to wait leaves the queue before it closes the channel.
-            let scheduler = Arc::clone(self);
-            let _ = start.send(Slot { scheduler, pixels, drawing: true, queue_ms: 0.0 });
+            let _ = start.send(Slot { scheduler: Arc::clone(self), demand, drawing: true });
         }
     }
 
-    /// The view that may start now.
-    fn next(&self, state: &State) -> Option<(u64, u64)> {
-        let (&first, view) = state.waiting.first_key_value()?;
-        let pixels = state.active_pixels.saturating_add(view.pixels);
+    /// The view that may start now: its owner and its place among theirs.
+    fn next(&self, state: &State) -> Option<(Caller, (u64, u64))> {
+        let is_small = |view: &Waiting| view.demand.pixels <= SMALL_PIXELS;
+        let first = |may: &dyn Fn(&Waiting) -> bool| {
+            let firsts = state.lanes.iter().filter_map(|(caller, lane)| {
+                let (&key, view) = lane.waiting.iter().find(|(_, view)| may(view))?;
+                Some((lane.served, key.1, caller, key, view))
+            });
+            firsts.min_by_key(|(served, arrival, ..)| (*served, *arrival))
+        };
+        let (.., caller, key, view) = first(&|_| true)?;
+        let pixels = state.active_pixels.saturating_add(view.demand.pixels);
         let fits = state.active == 0 || pixels <= self.active_pixels_max;
         if state.drawing < self.concurrency && fits {
-            return Some(first);
+            return Some((caller.clone(), key));
         }
-        let small = |(_, view): &(_, &Waiting)| view.pixels <= SMALL_PIXELS;
-        let (&key, _) = state.waiting.iter().find(small)?;
-        (state.drawing_small == 0).then_some(key)
+        let (.., caller, key, _) = first(&is_small).filter(|_| state.drawing_small == 0)?;
+        Some((caller.clone(), key))
     }
 }
 
@@ -213,6 +306,11 @@ mod tests {
     use super::*;
 
     const HUGE: u64 = 4096 * 4096;
+    const MIDDLE: u64 = 1024 * 1024;
+
+    fn view(pixels: u64) -> Demand {
+        Demand::view(&Caller::All, pixels)
+    }
 
     /// A view that has to wait.
     fn waits<'a>(
@@ -220,8 +318,16 @@ mod tests {
         pixels: u64,
         limits: &'a Limits,
     ) -> BoxFuture<'a, Result<Slot>> {
-        let mut waiting = scheduler.enter(pixels, limits).boxed();
-        assert!(waiting.as_mut().now_or_never().is_none(), "a view of {pixels} pixels waits");
+        waits_for(scheduler, &view(pixels), limits)
+    }
+
+    fn waits_for<'a>(
+        scheduler: &'a Arc<Scheduler>,
+        demand: &Demand,
+        limits: &'a Limits,
+    ) -> BoxFuture<'a, Result<Slot>> {
+        let mut waiting = scheduler.enter(demand.clone(), limits).boxed();
+        assert!(waiting.as_mut().now_or_never().is_none(), "{demand:?} waits");
         waiting
     }
 
@@ -229,9 +335,9 @@ mod tests {
     async fn one_too_many_is_refused_and_places_return() {
         let limits = Limits { queued_renders_max: 2, ..Limits::default() };
         let scheduler = Scheduler::new(1, &limits);
-        let first = scheduler.enter(HUGE, &limits).await.unwrap();
+        let first = scheduler.enter(view(HUGE), &limits).await.unwrap();
         let second = waits(&scheduler, HUGE, &limits);
-        let third = scheduler.enter(1, &limits).await.unwrap_err();
+        let third = scheduler.enter(view(1), &limits).await.unwrap_err();
         assert_eq!((third.code(), third.retry_after()), (ErrorCode::Overloaded, Some(1)));
         assert_eq!(scheduler.len(), 2, "the refused one is not counted");
         drop(second);
@@ -241,16 +347,16 @@ mod tests {
         assert_eq!(scheduler.len(), 1, "the second one has a slot that it has not taken");
         drop(second);
         assert_eq!(scheduler.len(), 0, "and gives it back untaken");
-        let _again = scheduler.enter(HUGE, &limits).await.unwrap();
+        let _again = scheduler.enter(view(HUGE), &limits).await.unwrap();
     }
 
     #[tokio::test]
     async fn a_view_that_is_drawn_holds_no_slot_while_it_is_encoded() {
         let limits = Limits::default();
         let scheduler = Scheduler::new(1, &limits);
-        let mut first = scheduler.enter(HUGE, &limits).await.unwrap();
+        let mut first = scheduler.enter(view(HUGE), &limits).await.unwrap();
         let second = waits(&scheduler, HUGE, &limits);
-        first.drawn();
+        first.leave_renderer();
         let second = second.await.unwrap();
         assert_eq!(scheduler.len(), 2, "one is encoded, one is drawn");
         drop((first, second));
@@ -262,35 +368,39 @@ mod tests {
     async fn pictures_in_memory_stay_within_their_pixels() {
         let limits = Limits { active_pixels_max: 2 * HUGE, ..Limits::default() };
         let scheduler = Scheduler::new(8, &limits);
-        let mut first = scheduler.enter(HUGE, &limits).await.unwrap();
-        let _second = scheduler.enter(HUGE, &limits).await.unwrap();
-        first.drawn();
+        let mut first = scheduler.enter(view(HUGE), &limits).await.unwrap();
+        let _second = scheduler.enter(view(HUGE), &limits).await.unwrap();
+        first.leave_renderer();
         // The first is still being encoded.
         let third = waits(&scheduler, HUGE, &limits);
         drop(first);
         assert!(third.await.is_ok());
         let alone = Scheduler::new(8, &limits);
-        assert!(alone.enter(9 * HUGE, &limits).await.is_ok(), "one alone may be larger than all");
+        assert!(
+            alone.enter(view(9 * HUGE), &limits).await.is_ok(),
+            "one alone may be larger than all"
+        );
     }
 
     #[tokio::test]
     async fn large_views_neither_fill_the_queue_nor_keep_small_ones_waiting() {
         let limits = Limits::default();
         let scheduler = Scheduler::new(1, &limits);
-        let drawn = scheduler.enter(HUGE, &limits).await.unwrap();
+        let drawn = scheduler.enter(view(HUGE), &limits).await.unwrap();
         let mut huge = Vec::new();
         for _ in 0..31 {
-            let mut one = scheduler.enter(HUGE, &limits).boxed();
+            let mut one = scheduler.enter(view(HUGE), &limits).boxed();
             match one.as_mut().now_or_never() {
                 None => huge.push(one),
                 Some(refused) => assert_eq!(refused.unwrap_err().code(), ErrorCode::Overloaded),
             }
         }
         assert!(!huge.is_empty() && huge.len() < 31, "{} huge views wait", huge.len());
-        let small = scheduler.enter(64 * 64, &limits).await.expect("drawn beside the huge one");
+        let small =
+            scheduler.enter(view(64 * 64), &limits).await.expect("drawn beside the huge one");
         // One small view at a time is drawn beside it.
         let other = waits(&scheduler, 64 * 64, &limits);
-        let middle = waits(&scheduler, 1024 * 1024, &limits);
+        let middle = waits(&scheduler, MIDDLE, &limits);
         drop(small);
         drop(other.await.unwrap());
         drop(drawn);
@@ -304,7 +414,7 @@ mod tests {
     async fn a_large_view_waits_for_no_more_pixels_than_its_own() {
         let limits = Limits::default();
         let scheduler = Scheduler::new(1, &limits);
-        let mut slot = scheduler.enter(HUGE, &limits).await.unwrap();
+        let mut slot = scheduler.enter(view(HUGE), &limits).await.unwrap();
         let mut huge = waits(&scheduler, HUGE, &limits);
         let mut before = 0;
         loop {
@@ -318,5 +428,71 @@ mod tests {
             assert!(before < 20, "it starves");
         }
         assert!(huge.as_mut().now_or_never().is_some() && before >= 4, "after {before} small ones");
+    }
+
+    fn of(owner: &str, pixels: u64) -> Demand {
+        Demand::view(&Caller::Owner(owner.into()), pixels)
+    }
+
+    /// Serves so many views, each of whose callers asks again at once; how many were of owner `b`.
+    fn serve<'a>(
+        turns: usize,
+        slot: &mut Option<Slot>,
+        waiting: &mut Vec<(&'static str, BoxFuture<'a, Result<Slot>>)>,
+        again: impl Fn(&'static str) -> BoxFuture<'a, Result<Slot>>,
+    ) -> usize {
+        let mut of_b = 0;
+        for _ in 0..turns {
+            drop(slot.take());
+            let mut all = waiting.iter_mut().enumerate();
+            let started = all.find_map(|(i, (_, one))| Some((i, one.as_mut().now_or_never()?)));
+            let (i, started) = started.expect("one has the slot");
+            *slot = started.ok();
+            let (owner, _) = waiting.remove(i);
+            of_b += usize::from(owner == "b");
+            waiting.push((owner, again(owner)));
+        }
+        of_b
+    }
+
+    #[tokio::test]
+    async fn owners_take_turns() {
+        let limits = Limits::default();
+        let scheduler = Scheduler::new(1, &limits);
+        let again = |owner| waits_for(&scheduler, &of(owner, MIDDLE), &limits);
+        let mut slot = scheduler.enter(of("a", MIDDLE), &limits).await.ok();
+        // Many callers of one owner, and two of another.
+        let owners = ["a"; 20].into_iter().chain(["b"; 2]);
+        let mut waiting: Vec<_> = owners.map(|owner| (owner, again(owner))).collect();
+        assert_eq!(serve(20, &mut slot, &mut waiting, again), 10, "of 20");
+        waiting.retain(|(owner, _)| *owner == "a");
+        assert_eq!(serve(20, &mut slot, &mut waiting, again), 0);
+        // Who was away has no turns saved up.
+        waiting.extend(["b"; 4].map(|owner| (owner, again(owner))));
+        assert_eq!(serve(6, &mut slot, &mut waiting, again), 3, "of 6");
+    }
+
+    #[tokio::test]
+    async fn an_owner_fills_half_of_the_queue() {
+        let limits = Limits { queued_renders_max: 4, ..Limits::default() };
+        let scheduler = Scheduler::new(1, &limits);
+        let _drawn = scheduler.enter(of("a", HUGE), &limits).await.unwrap();
+        let _waits = waits_for(&scheduler, &of("a", MIDDLE), &limits);
+        let refused = scheduler.enter(of("a", MIDDLE), &limits).await.unwrap_err();
+        assert_eq!(refused.code(), ErrorCode::Overloaded, "{refused}");
+        let _other = waits_for(&scheduler, &of("b", MIDDLE), &limits);
+    }
+
+    #[tokio::test]
+    async fn the_work_of_a_query_counts_its_texts() {
+        let limits = Limits::default();
+        let scheduler = Scheduler::new(1, &limits);
+        let heavy = || view(HUGE).with_texts(128, 1_000_000);
+        assert_eq!(heavy().work, HUGE + 16 * (HUGE + 1_000_000));
+        let _one = scheduler.enter(heavy(), &limits).await.expect("alone it is taken");
+        let two = scheduler.enter(heavy(), &limits).await.unwrap_err();
+        assert_eq!(two.code(), ErrorCode::Overloaded, "{two}");
+        let small = scheduler.enter(view(64 * 64).with_texts(8, 100_000), &limits).await;
+        assert!(small.is_ok(), "small views are drawn beside it");
     }
 }

@@ -9,7 +9,12 @@ use std::{
     sync::{Arc, OnceLock},
 };
 
-use super::{request::ScoringOptions, texts, types::TextWarning, view::text_words};
+use super::{
+    request::ScoringOptions,
+    tags::{semantics_tag, text_key},
+    times::{ViewTimes, staged},
+    types::TextWarning,
+};
 use crate::{
     cache::Cache,
     error::{Error, Result},
@@ -20,8 +25,14 @@ use crate::{
     semantics::{Components, InstanceOptions, Scorer, Scoring, TextScores, ViewNorms},
 };
 
-/// The preset by which texts are scored, that of the scene where none is named, and changes of it.
-pub(super) type ScoringChoice<'a> = (Option<Preset>, &'a ScoringOptions);
+/// How a call wants texts to be scored.
+#[derive(Clone, Debug, Default)]
+pub(super) struct ScoringChoice {
+    /// That of the scene where none is named.
+    pub(super) preset: Option<Preset>,
+    /// What is changed of it.
+    pub(super) changes: ScoringOptions,
+}
 
 /// What answers are computed with, and what was kept from earlier texts. Its calls block; they
 /// belong on a blocking thread.
@@ -59,17 +70,6 @@ impl Backend {
         self.networks.lacks()
     }
 
-    /// Whether texts can be scored for a scene without a network. Does not block.
-    pub(super) fn knows(
-        &self,
-        of: Subject<'_>,
-        how: ScoringChoice<'_>,
-        texts: &[String],
-    ) -> Result<bool> {
-        Ok(self.scorers.find(&scorer_key(of, how)?).is_some()
-            && texts.iter().all(|text| self.embeddings.find(text).is_some()))
-    }
-
     /// Embeddings of texts: known ones from memory, all others from one run of the network.
     fn embedded(&self, texts: &[String]) -> Result<Vec<Arc<TextEmbedding>>> {
         let known =
@@ -90,13 +90,8 @@ impl Backend {
         texts.iter().map(|text| found.get(text).cloned().ok_or_else(lost)).collect()
     }
 
-    /// How texts are scored for a scene.
-    fn scoring(
-        &self,
-        of: Subject<'_>,
-        (preset, changes): ScoringChoice<'_>,
-    ) -> Result<ScoringMethod> {
-        let preset = of.preset(preset);
+    /// How texts are scored by a preset with some changes.
+    fn scoring(&self, preset: Preset, changes: &ScoringOptions) -> Result<ScoringMethod> {
         let phrases = self.networks.phrases()?;
         let (tau, floor) = (f64::from(phrases.tau), f64::from(phrases.coverage_floor));
         let method = changes.change(ScoringMethod::of(preset, phrases.canon, tau, floor));
@@ -107,14 +102,15 @@ impl Backend {
     /// How texts are scored for a scene, and its bank ready for that.
     fn scorer(
         &self,
-        of: Subject<'_>,
-        how: ScoringChoice<'_>,
+        of: &SemanticScene,
+        preset: Preset,
+        changes: &ScoringOptions,
     ) -> Result<(ScoringMethod, Arc<Scorer>)> {
-        let key = scorer_key(of, how)?;
+        let key = text_key(&of.tag, None, preset, changes)?;
         if let Some(known) = self.scorers.find(&key) {
             return Ok(known);
         }
-        let method = self.scoring(of, how)?;
+        let method = self.scoring(preset, changes)?;
         let canon = self.embedded(&method.canon)?;
         let canon = canon.iter().map(|embedding| embedding.row.clone()).collect();
         let scoring = Arc::new(Scoring::new(&method, canon)?);
@@ -126,11 +122,6 @@ impl Backend {
         self.scorers.insert(key, made.clone(), bytes);
         Ok(made)
     }
-}
-
-/// Tells the scorer of a scene, its semantics and a choice from all others.
-fn scorer_key(of: Subject<'_>, (preset, changes): ScoringChoice<'_>) -> Result<String> {
-    text_words(of.tag, None, (of.preset(preset), changes))
 }
 
 /// A text, how the bank scores it, and what makes that doubtful.
@@ -199,68 +190,85 @@ impl LabelledView {
     }
 }
 
-/// A scene with its semantics, for texts.
-#[derive(Clone, Copy)]
-pub(super) struct Subject<'a> {
-    pub(super) scene: &'a Scene,
-    pub(super) semantics: &'a Semantics,
+/// A scene with its semantics, ready for texts.
+#[derive(Clone, Debug)]
+pub(super) struct SemanticScene {
+    pub(super) scene: Arc<Scene>,
+    pub(super) semantics: Arc<Semantics>,
     /// Tells this scene with these semantics from all others.
-    pub(super) tag: &'a str,
+    pub(super) tag: String,
+    /// Time until it was ready, milliseconds.
+    pub(super) load_ms: f64,
 }
 
-impl Subject<'_> {
-    /// The preset that is named, else that of the scene.
-    fn preset(&self, named: Option<Preset>) -> Preset {
-        named.unwrap_or(self.scene.meta.report.method.preset)
+impl SemanticScene {
+    /// `None` where the scene has no semantics.
+    pub(super) fn new(scene: Arc<Scene>) -> Option<Self> {
+        let semantics = scene.semantics.clone()?;
+        let tag = semantics_tag(&scene);
+        Some(Self { scene, semantics, tag, load_ms: 0.0 })
     }
 }
 
-/// A scene and its scored texts.
-pub(super) struct SceneTexts<'a> {
-    pub(super) backend: &'a Backend,
-    pub(super) of: Subject<'a>,
+/// A scene and its scored texts. It is made once for a call, and needs no network afterwards.
+pub(super) struct SceneTexts {
+    pub(super) backend: Arc<Backend>,
+    pub(super) of: SemanticScene,
     pub(super) scorer: Arc<Scorer>,
     pub(super) scoring: ScoringMethod,
-    /// The preset and the changes of it.
-    asked: (Preset, ScoringOptions),
+    preset: Preset,
+    changes: ScoringOptions,
     pub(super) texts: Vec<ScoredText>,
+    /// Time of scoring, milliseconds.
+    score_ms: f64,
 }
 
-impl<'a> SceneTexts<'a> {
-    /// Scores checked texts.
+impl SceneTexts {
+    /// Scores checked texts. Networks embed those that are not known. Blocks.
     pub(super) fn new(
-        backend: &'a Backend,
-        of: Subject<'a>,
-        how: ScoringChoice<'_>,
+        backend: &Arc<Backend>,
+        of: SemanticScene,
+        how: &ScoringChoice,
         texts: &[String],
     ) -> Result<Self> {
-        let (scoring, scorer) = backend.scorer(of, how)?;
-        let scored = |(text, embedding): (&String, Arc<TextEmbedding>)| {
-            Ok(ScoredText {
-                text: text.clone(),
-                scores: scorer.text(&embedding.row)?,
-                warnings: warnings(text, &embedding),
-            })
+        let score = || {
+            let preset = how.preset.unwrap_or(of.scene.meta.report.method.preset);
+            let (scoring, scorer) = backend.scorer(&of, preset, &how.changes)?;
+            let scored = |(text, embedding): (&String, Arc<TextEmbedding>)| {
+                Ok(ScoredText {
+                    text: text.clone(),
+                    scores: scorer.text(&embedding.row)?,
+                    warnings: warnings(text, &embedding),
+                })
+            };
+            let embeddings = backend.embedded(texts)?;
+            let texts = texts.iter().zip(embeddings).map(scored).collect::<Result<_>>()?;
+            let (backend, changes) = (Arc::clone(backend), how.changes.clone());
+            Ok(Self { backend, of, scorer, scoring, preset, changes, texts, score_ms: 0.0 })
         };
-        let embeddings = backend.embedded(texts)?;
-        let texts = texts.iter().zip(embeddings).map(scored).collect::<Result<_>>()?;
-        let asked = (of.preset(how.0), how.1.clone());
-        Ok(Self { backend, of, scorer, scoring, asked, texts })
+        let (made, score_ms) = staged("score", score);
+        Ok(Self { score_ms, ..made? })
     }
 
     /// What tells the first text, how it is scored and the scene from all others, in tags.
-    pub(super) fn words(&self) -> Result<String> {
+    pub(super) fn key(&self) -> Result<String> {
         let text = self.texts.first().map(|text| text.text.as_str());
-        text_words(self.of.tag, text, (self.asked.0, &self.asked.1))
+        text_key(&self.of.tag, text, self.preset, &self.changes)
+    }
+
+    /// Times of an answer as far as the texts are scored.
+    pub(super) fn times(&self) -> ViewTimes {
+        let (load_ms, score_ms) = (self.of.load_ms, Some(self.score_ms));
+        ViewTimes { load_ms, score_ms, ..ViewTimes::default() }
     }
 
     /// The connected components of the scene's entries.
     pub(super) fn components(&self, options: &InstanceOptions) -> Arc<Components> {
-        let (kept, tag) = (&self.backend.components, self.of.tag.to_owned());
+        let (kept, tag) = (&self.backend.components, self.of.tag.clone());
         if let Some(known) = kept.find(&tag) {
             return known;
         }
-        let scene = self.of.scene;
+        let scene = &self.of.scene;
         let made = Arc::new(Components::new(&scene.gaussians, &scene.meta.cameras, options));
         kept.insert(tag, Arc::clone(&made), made.size_bytes());
         made
@@ -294,7 +302,7 @@ impl<'a> SceneTexts<'a> {
         view
     }
 
-    /// A view's weights, drawn where they are not known; and whether they were drawn.
+    /// A view's weights, drawn where they are not known; and whether they are new.
     pub(super) fn view(
         &self,
         request: &RenderRequest,
@@ -308,18 +316,6 @@ impl<'a> SceneTexts<'a> {
         let weights =
             frame.weights.ok_or_else(|| Error::internal("the renderer gave no weights"))?;
         Ok((self.keep_view(key, [frame.width, frame.height], weights), true))
-    }
-}
-
-/// Checks the changes of a request before anything is made for it: numbers, and canonical texts as
-/// other texts.
-pub(super) fn check_scoring(changes: &ScoringOptions, limits: &Limits) -> Result<()> {
-    let canon = ScoringMethod::CANON.map(str::to_owned).to_vec();
-    changes.change(ScoringMethod::of(Preset::Paper, canon, 1.0, 0.0)).check()?;
-    if changes.canon.is_empty() {
-        Ok(())
-    } else {
-        texts::all_checked(&changes.canon, "canon", limits).map(drop)
     }
 }
 

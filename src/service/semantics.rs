@@ -13,47 +13,18 @@ use super::{
     Inner, Service,
     access::SceneAccess,
     create::blocking,
-    search::Subject,
-    times::ms,
-    view::{record_tag, scene_tag},
+    search::{SceneTexts, ScoringChoice, SemanticScene},
+    times::{ms, staged},
+    work::Work,
 };
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Scene, SceneId, SceneStatus, Semantics, SemanticsMode, SemanticsState},
+    scene::{Scene, SceneId, SceneStatus, SemanticsMode, SemanticsState},
     store::{Record, not_found},
 };
 
 /// When to ask again for semantics that are being made, seconds.
 const RETRY_AFTER_S: u32 = 2;
-
-/// A scene that is ready for texts.
-#[derive(Clone, Debug)]
-pub(super) struct Understood {
-    pub(super) access: SceneAccess,
-    pub(super) scene: Arc<Scene>,
-    semantics: Arc<Semantics>,
-    /// Tells scene and semantics from any others.
-    tag: String,
-    /// Time until it was ready, milliseconds.
-    pub(super) load_ms: f64,
-}
-
-impl Understood {
-    pub(super) fn subject(&self) -> Subject<'_> {
-        Subject { scene: &self.scene, semantics: &self.semantics, tag: &self.tag }
-    }
-}
-
-/// Tells a version of a scene and its semantics from any others.
-pub(super) fn meaning_tag(scene: &Scene) -> String {
-    format!("{} {}", scene_tag(scene), scene.semantics_sha256)
-}
-
-/// The same of the version that a record names.
-pub(super) fn record_meaning_tag(record: &Record) -> String {
-    let semantics = record.semantics_sha256.as_deref().unwrap_or_default();
-    format!("{} {semantics}", record_tag(record))
-}
 
 impl Inner {
     /// Refuses `what` where the loaded bundle cannot do it.
@@ -91,12 +62,19 @@ impl Inner {
         ))
     }
 
+    /// The scene itself. It is marked as failed when its file is bad. Blocks on the store.
+    pub(super) fn load(&self, access: &SceneAccess) -> Result<Arc<Scene>> {
+        let (scene, _ms) = staged("load", || self.store.scene(access.id()));
+        scene.inspect_err(|error| {
+            if error.code() == ErrorCode::SceneCorrupt {
+                self.jobs.spoil(access.id(), error);
+            }
+        })
+    }
+
     /// The scene with its semantics; `None` where they must be made again: their file was put
     /// aside, or other networks made them, whose embeddings cannot be compared with texts of these.
-    fn loaded_semantics(
-        &self,
-        access: &SceneAccess,
-    ) -> Result<Option<(Arc<Scene>, Arc<Semantics>)>> {
+    fn load_semantics(&self, access: &SceneAccess) -> Result<Option<SemanticScene>> {
         let scene = self.load(access)?;
         let found = self.semantics_of(Arc::clone(&scene));
         if found.is_none() {
@@ -116,25 +94,24 @@ impl Inner {
     }
 
     /// A scene and its semantics, where the loaded bundle made them.
-    fn semantics_of(&self, scene: Arc<Scene>) -> Option<(Arc<Scene>, Arc<Semantics>)> {
-        let semantics = scene.semantics.clone()?;
-        is_of(&semantics.report.bundle_sha256, &self.models.bundle_sha256)
-            .then_some((scene, semantics))
+    fn semantics_of(&self, scene: Arc<Scene>) -> Option<SemanticScene> {
+        let ours = &self.models.bundle_sha256;
+        SemanticScene::new(scene).filter(|of| is_of(&of.semantics.report.bundle_sha256, ours))
     }
 
     /// The scene with its semantics, which are made now where they were not before.
     ///
     /// `wait` bounds how long; after that the error says how far the job is.
-    pub(super) async fn understood(
+    pub(super) async fn semantic_scene(
         self: &Arc<Self>,
-        scene: &SceneAccess,
+        access: &SceneAccess,
         what: &str,
         wait: Option<Duration>,
-    ) -> Result<Understood> {
+    ) -> Result<SemanticScene> {
         let begun = Instant::now();
         self.can_understand(what)?;
-        Self::may_be_asked(scene.record(), what)?;
-        let id = scene.id();
+        Self::may_be_asked(access.record(), what)?;
+        let id = access.id();
         let limits = &self.limits();
         let wait = wait.unwrap_or(Duration::from_millis(limits.text_wait_ms));
         let until =
@@ -158,20 +135,32 @@ impl Inner {
                 (SemanticsState::Failed, Some(error)) => return Err(error.to_error()),
                 _ => return Err(not_yet(&record.status, what)),
             }
-            let access = scene.renewed(record);
             let kept = self.store.scene_in_memory(id).and_then(|scene| self.semantics_of(scene));
             let found = match kept {
                 Some(kept) => Some(kept),
                 None => {
-                    let (inner, asked) = (Arc::clone(self), access.clone());
-                    blocking(move || inner.loaded_semantics(&asked)).await??
+                    let (inner, access) = (Arc::clone(self), access.clone());
+                    blocking(move || inner.load_semantics(&access)).await??
                 }
             };
-            if let Some((scene, semantics)) = found {
-                let (tag, load_ms) = (meaning_tag(&scene), ms(begun));
-                return Ok(Understood { access, scene, semantics, tag, load_ms });
+            if let Some(found) = found {
+                return Ok(SemanticScene { load_ms: ms(begun), ..found });
             }
         }
+    }
+
+    /// Scores checked texts for a scene, before its views wait for the renderer: no view may wait
+    /// for a network there.
+    pub(super) async fn score(
+        &self,
+        of: SemanticScene,
+        how: ScoringChoice,
+        texts: Vec<String>,
+        deadline: Instant,
+    ) -> Result<Arc<SceneTexts>> {
+        let backend = Arc::clone(&self.backend);
+        let score = move |_: &mut Work| SceneTexts::new(&backend, of, &how, &texts).map(Arc::new);
+        self.in_time(deadline, "the text", score).await
     }
 }
 
@@ -218,8 +207,8 @@ impl Service {
     /// them.
     pub async fn understand(&self, id: &SceneId, wait: Option<Duration>) -> Result<SceneStatus> {
         let scene = self.scene(id).await?.finished()?;
-        let understood = self.inner.understood(&scene, "semantics", wait).await?;
-        Ok(self.shown(understood.access.record().status.clone()))
+        self.inner.semantic_scene(&scene, "semantics", wait).await?;
+        self.get(scene.id()).await
     }
 
     /// A status that says whether texts can be answered for the scene now.

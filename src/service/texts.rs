@@ -1,13 +1,11 @@
 //! Checks of the texts of a request: how many, how long, of what.
 
-use super::{
-    request::{Kind, TextOptions},
-    search::check_scoring,
-};
+use super::request::{Kind, ScoringOptions, TextOptions};
 use crate::{
     error::{Error, Result},
     formats::table::ExportFormat,
     limits::Limits,
+    scene::{Preset, ScoringMethod},
 };
 
 /// A text without the blanks around it, within its bounds; `what` names it: `texts[3]`.
@@ -77,4 +75,16 @@ pub(super) fn all_checked(texts: &[String], what: &str, limits: &Limits) -> Resu
     check_count(what, texts.len(), limits.texts_max)?;
     let each = texts.iter().enumerate();
     each.map(|(i, text)| checked(text, &format!("{what}[{i}]"), limits)).collect()
+}
+
+/// Checks the changes of a request before anything is made for it: numbers, and canonical texts as
+/// other texts.
+pub(super) fn check_scoring(changes: &ScoringOptions, limits: &Limits) -> Result<()> {
+    let canon = ScoringMethod::CANON.map(str::to_owned).to_vec();
+    changes.change(ScoringMethod::of(Preset::Paper, canon, 1.0, 0.0)).check()?;
+    if changes.canon.is_empty() {
+        Ok(())
+    } else {
+        all_checked(&changes.canon, "canon", limits).map(drop)
+    }
 }

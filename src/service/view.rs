@@ -1,13 +1,8 @@
 //! Views: request to camera to frame to file, one render a camera, bounded in time and number.
 
-use std::{
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{sync::Arc, time::Instant};
 
 use futures_util::{Stream, StreamExt, stream};
-use serde::Serialize;
-use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
 use tracing::Instrument;
 
@@ -15,30 +10,29 @@ use super::{
     Inner, Service,
     access::SceneAccess,
     camera,
-    create::blocking,
     encode::{self, Layer},
     request::{
-        BackgroundSpec, CameraSpec, Format, Kind, PictureOptions, ScoringOptions, TextOptions,
-        ViewOptions, ViewSpec, ViewsSpec,
+        BackgroundSpec, Format, Kind, PictureOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec,
     },
-    schedule::Slot,
-    search::{Backend, LabelledView, SceneTexts, ScoringChoice},
-    semantics::{Understood, record_meaning_tag},
+    schedule::Demand,
+    search::{Backend, LabelledView, SceneTexts, ScoringChoice, SemanticScene},
+    tags::{cache_key, etag, record_semantics_tag, record_tag, scene_tag, text_key},
     texts,
     times::{ViewTimes, ms, staged},
     types::RenderedView,
+    work::{Task, Work, until},
 };
 use crate::{
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
+    keys::Caller,
     limits::Limits,
-    names::{hex, shown},
+    names::shown,
     render::{
         self, Frame, Kinds, Labels, RenderRequest, Samples,
         plan::{self, NEAR_RANGE, ViewMethod, default_near},
     },
     scene::{Camera, Intrinsics, Method, Preset, Scene, SceneCamera, SceneId},
     store::Record,
-    telemetry::meter,
 };
 
 /// Pictures of a `views` request that wait for the caller to take them.
@@ -80,7 +74,7 @@ impl Resolved {
     /// Tells the labels of this view from those of all others. They do not depend on the
     /// background.
     pub(super) fn labels_key(&self, tag: &str, renderer: &str) -> Result<String> {
-        words(&(tag, renderer, self.camera, &self.options, self.picture.crop))
+        cache_key(&(tag, renderer, self.camera, &self.options, self.picture.crop))
     }
 
     /// A request of these pictures of the scene, without labels.
@@ -116,25 +110,32 @@ impl Resolved {
         Kinds { color: has(Kind::Color), depth: has(Kind::Depth), alpha: has(Kind::Alpha) }
     }
 
-    /// Hash of scene, renderer and request for one kind; `texts` are the words of [`text_words`].
-    fn etag(&self, scene: &str, renderer: &str, kind: Kind, texts: &str) -> Result<String> {
+    /// Hash of scene, renderer and request for one kind; `text` is that of [`text_key`].
+    fn etag(&self, scene: &str, renderer: &str, kind: Kind, text: &str) -> Result<String> {
         let version = env!("CARGO_PKG_VERSION");
         let request = (self.camera, kind, &self.options, &self.picture, self.method.backdrop);
-        Ok(hash(&words(&(scene, version, renderer, request, texts))?))
+        Ok(etag(&cache_key(&(scene, version, renderer, request, text))?))
     }
 
-    /// One drawing for the pixel kinds and, where they are not known, for the labels; and the
-    /// weights where texts need them.
-    fn drawn(
+    /// The weights of this view for texts, drawn where they are not known; and whether they are
+    /// new.
+    pub(super) fn weights(&self, texts: &SceneTexts) -> Result<(Arc<LabelledView>, bool)> {
+        let key = self.labels_key(&texts.of.tag, &texts.backend.renderer.name())?;
+        texts.view(&self.request(&texts.of.scene, Kinds::NONE), key)
+    }
+
+    /// One frame of the pixel kinds and, where they are not known, of the labels; and the weights
+    /// where texts need them.
+    fn frame(
         &self,
         backend: &Backend,
         scene: &Scene,
-        texts: Option<&SceneTexts<'_>>,
+        texts: Option<&SceneTexts>,
     ) -> Result<(Frame, Option<Arc<LabelledView>>)> {
         let mut request = self.request(scene, self.kinds());
         let draw = |request: &RenderRequest| backend.renderer.render(&scene.gaussians, request);
         let Some(texts) = texts else { return Ok((draw(&request)?, None)) };
-        let key = self.labels_key(texts.of.tag, &backend.renderer.name())?;
+        let key = self.labels_key(&texts.of.tag, &backend.renderer.name())?;
         if let Some(known) = texts.known_view(&key) {
             let (width, height) = (known.width, known.height);
             let frame = match request.kinds {
@@ -151,7 +152,7 @@ impl Resolved {
     }
 
     /// A mask alone is drawn as such; all else needs the weights.
-    fn labels(&self, texts: &SceneTexts<'_>) -> Labels {
+    fn labels(&self, texts: &SceneTexts) -> Labels {
         let mask_alone =
             self.kinds.iter().all(|kind| !kind.needs_semantics() || *kind == Kind::Mask);
         let tables = texts.texts.first().map(|text| text.scores.tables()).unwrap_or_default();
@@ -164,24 +165,23 @@ impl Resolved {
         }
     }
 
-    /// The pictures of all kinds; `scene_tag` tells the scene in their tags, `times` has the stages
-    /// before. Calls `drawn` when only scores of pixels and the encoding are left to do.
+    /// The pictures of all kinds; `times` has the stages before.
     pub(super) fn draw(
         &self,
         backend: &Backend,
         scene: &Scene,
-        scene_tag: &str,
-        texts: Option<&SceneTexts<'_>>,
+        texts: Option<&SceneTexts>,
         times: ViewTimes,
-        drawn: impl FnOnce(),
+        work: &mut Work,
     ) -> Result<Vec<RenderedView>> {
-        let (frame, render_ms) = staged("render", || self.drawn(backend, scene, texts));
+        let (frame, render_ms) = staged("render", || self.frame(backend, scene, texts));
         let (mut frame, weights) = frame?;
-        drawn();
+        work.leave_renderer();
         let name = backend.renderer.name();
         let (width, height, format) = (frame.width, frame.height, self.picture.format);
         let view = |&kind: &Kind| -> Result<RenderedView> {
-            let mut times = ViewTimes { render_ms, ..times };
+            work.unless_stopped()?;
+            let mut times = ViewTimes { queue_ms: work.queue_ms, render_ms, ..times };
             let texts = texts.filter(|_| kind.needs_semantics());
             let scored = match (texts, &weights) {
                 (Some(texts), Some(weights)) => {
@@ -201,7 +201,7 @@ impl Resolved {
             let (encoded, ms) = staged("encode", || encode::encode(layer, width, height, format));
             let encoded = encoded?;
             times.encode_ms = ms;
-            let texts = texts.map(SceneTexts::words).transpose()?.unwrap_or_default();
+            let text = texts.map(SceneTexts::key).transpose()?.unwrap_or_default();
             Ok(RenderedView {
                 camera_index: self.camera_index,
                 kind,
@@ -211,21 +211,13 @@ impl Resolved {
                 bytes: encoded.bytes,
                 depth_scale: encoded.depth_scale,
                 camera: self.seen(),
-                etag: self.etag(scene_tag, &name, kind, &texts)?,
+                etag: self.etag(&scene_tag(scene), &name, kind, &text)?,
                 stats: frame.stats,
                 times,
             })
         };
         self.kinds.iter().map(view).collect()
     }
-}
-
-/// A text that is embedded, and the scene that it asks about.
-#[derive(Clone)]
-struct Asked {
-    understood: Understood,
-    ask: TextOptions,
-    embed_ms: f64,
 }
 
 /// A picture that is computed from the weights of a view.
@@ -236,7 +228,7 @@ enum Scored {
 }
 
 impl Scored {
-    fn new(kind: Kind, texts: &SceneTexts<'_>, view: &LabelledView) -> Result<Self> {
+    fn new(kind: Kind, texts: &SceneTexts, view: &LabelledView) -> Result<Self> {
         let (scorer, text) = (&texts.scorer, texts.texts.first());
         match (kind, text) {
             (Kind::Mask, Some(text)) => Ok(Self::Mask(scorer.mask(&text.scores, &view.weights)?)),
@@ -255,31 +247,6 @@ impl Scored {
             Self::Entries(entries) => Layer::Entries(entries),
         }
     }
-}
-
-/// Values as text: equal text means equal values. Numbers are written to their last bit.
-pub(super) fn words(values: &impl Serialize) -> Result<String> {
-    serde_json::to_string(values)
-        .map_err(|e| Error::internal("a request cannot be written down").caused_by(e))
-}
-
-/// 32 hexadecimal digits of the sha256 of a text.
-pub(super) fn hash(words: &str) -> String {
-    hex(&Sha256::digest(words)[..16])
-}
-
-/// Tells a version of a scene from all others, in tags.
-pub(super) fn scene_tag(scene: &Scene) -> String {
-    tag(&scene.sha256, &scene.meta.id)
-}
-
-/// The tag of the version that a record names. Another one may be served a moment later.
-pub(super) fn record_tag(record: &Record) -> String {
-    tag(record.scene_sha256.as_deref().unwrap_or_default(), &record.status.id)
-}
-
-fn tag(sha256: &str, id: &SceneId) -> String {
-    format!("{sha256} {id}")
 }
 
 /// What views of a scene are resolved against.
@@ -311,7 +278,7 @@ impl<'a> From<&'a Scene> for Inputs<'a> {
 impl Inputs<'_> {
     /// How a view is drawn: as the scene was made, or by the preset that is named, with the changes
     /// of the request.
-    fn look(&self, options: &ViewOptions) -> Result<(ViewMethod, Preset)> {
+    fn draw_method(&self, options: &ViewOptions) -> Result<(ViewMethod, Preset)> {
         let own = self.method.cloned().unwrap_or_default();
         let of = options.preset.map_or(own, Method::of);
         let changed = Method {
@@ -328,21 +295,20 @@ impl Inputs<'_> {
 pub(super) fn resolve_one<'a>(
     limits: &Limits,
     inputs: impl Into<Inputs<'a>>,
-    camera: CameraSpec,
-    kind: Kind,
-    options: (&ViewOptions, &PictureOptions),
+    spec: &ViewSpec,
 ) -> Result<Resolved> {
-    let mut all = resolve(limits, inputs.into(), &[camera], &[kind], options)?;
+    let mut all = resolve(limits, inputs, &ViewsSpec::from(spec.clone()))?;
     all.pop().ok_or_else(|| Error::internal("one camera gave no request"))
 }
 
-fn resolve(
+/// The requests of all cameras, each for all kinds.
+fn resolve<'a>(
     limits: &Limits,
-    inputs: Inputs<'_>,
-    cameras: &[CameraSpec],
-    kinds: &[Kind],
-    (options, picture): (&ViewOptions, &PictureOptions),
+    inputs: impl Into<Inputs<'a>>,
+    spec: &ViewsSpec,
 ) -> Result<Vec<Resolved>> {
+    let inputs = inputs.into();
+    let ViewsSpec { cameras, kinds, options, picture, .. } = spec;
     for kind in kinds {
         encode::check(*kind, picture.format)?;
     }
@@ -360,7 +326,7 @@ fn resolve(
         }
         None => default_near(inputs.median_depth),
     };
-    let (method, preset) = inputs.look(options)?;
+    let (method, preset) = inputs.draw_method(options)?;
     let resolved = |(camera_index, spec)| {
         let what = match cameras.len() {
             1 => "camera".to_owned(),
@@ -371,7 +337,7 @@ fn resolve(
         Ok(Resolved {
             camera_index,
             camera,
-            kinds: kinds.to_vec(),
+            kinds: kinds.clone(),
             near,
             method,
             preset,
@@ -394,27 +360,6 @@ fn resolve(
 }
 
 impl Inner {
-    /// The scene itself. It is marked as failed when its file is bad. Blocks on the store.
-    pub(super) fn load(&self, access: &SceneAccess) -> Result<Arc<Scene>> {
-        let (scene, _ms) = staged("load", || self.store.scene(access.id()));
-        scene.inspect_err(|error| {
-            if error.code() == ErrorCode::SceneCorrupt {
-                self.jobs.spoil(access.id(), error);
-            }
-        })
-    }
-
-    /// The scene as the text kinds of a request need it, `None` where it has none of them.
-    async fn understood_for(
-        self: &Arc<Self>,
-        scene: &SceneAccess,
-        kinds: &[Kind],
-        ask: &TextOptions,
-    ) -> Result<Option<Understood>> {
-        let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) else { return Ok(None) };
-        Ok(Some(self.understood(scene, &format!("kind={kind}"), ask.wait).await?))
-    }
-
     /// Checks the text of a request; the bundle first, because no text works without networks.
     fn checked_ask(&self, kinds: &[Kind], ask: &TextOptions) -> Result<TextOptions> {
         if let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) {
@@ -423,134 +368,54 @@ impl Inner {
         texts::check_ask(kinds, ask, &self.limits())
     }
 
-    /// Renders on a blocking thread within the deadline; encodes each kind.
-    async fn render_one(
+    /// The scene as the text kinds of a request need it, `None` where it has none of them.
+    async fn semantics_for(
         self: &Arc<Self>,
-        scene: SceneAccess,
-        view: Resolved,
-        texts: Option<Asked>,
-        deadline: Instant,
-    ) -> Result<Vec<RenderedView>> {
-        let inner = Arc::clone(self);
-        let pixels = view.pixels();
-        let work = move |slot: &mut Slot| {
-            let backend = &inner.backend;
-            let mut times = ViewTimes { queue_ms: slot.queue_ms, ..ViewTimes::default() };
-            let drawn = || slot.drawn();
-            let Some(Asked { understood, ask, embed_ms }) = texts else {
-                let begun = Instant::now();
-                let scene = inner.load(&scene)?;
-                times.load_ms = ms(begun);
-                return view.draw(backend, &scene, &scene_tag(&scene), None, times, drawn);
-            };
-            let subject = understood.subject();
-            let text = ask.text.as_slice();
-            let how = (Some(view.preset), &ask.scoring);
-            let scored = || SceneTexts::new(backend, subject, how, text);
-            let (texts, ms) = staged("score", scored);
-            (times.load_ms, times.score_ms) = (understood.load_ms, Some(embed_ms + ms));
-            let tag = scene_tag(subject.scene);
-            view.draw(backend, subject.scene, &tag, Some(&texts?), times, drawn)
-        };
-        self.scheduled(deadline, pixels, "the view", work).await
+        scene: &SceneAccess,
+        kinds: &[Kind],
+        ask: &TextOptions,
+    ) -> Result<Option<SemanticScene>> {
+        let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) else { return Ok(None) };
+        Ok(Some(self.semantic_scene(scene, &format!("kind={kind}"), ask.wait).await?))
     }
 
-    /// Runs `work` on a blocking thread as soon as the scheduler starts it, within the deadline.
-    /// `pixels` are those of the view that it draws.
-    pub(super) async fn scheduled<T: Send + 'static>(
+    /// The text of a view, scored; `None` where the view needs no semantics.
+    async fn score_ask(
         &self,
-        deadline: Instant,
-        pixels: u64,
-        what: &str,
-        work: impl FnOnce(&mut Slot) -> Result<T> + Send + 'static,
-    ) -> Result<T> {
-        let started = Instant::now();
-        let limits = self.limits();
-        let work = async {
-            let span = tracing::info_span!("stage", stage = "queue");
-            let mut slot = self.scheduler.enter(pixels, &limits).instrument(span).await?;
-            blocking(move || {
-                slot.queue_ms = ms(started);
-                meter::stage("queue", slot.queue_ms / 1e3);
-                work(&mut slot)
-            })
-            .await?
-        };
-        in_time(deadline, what, work).await
-    }
-
-    /// Embeds texts that are not known yet, for no slot may wait for a network. Milliseconds that
-    /// it took.
-    pub(super) async fn embed(
-        self: &Arc<Self>,
-        understood: &Understood,
-        how: ScoringChoice<'_>,
-        texts: &[String],
-        deadline: Instant,
-    ) -> Result<f64> {
-        if self.backend.knows(understood.subject(), how, texts)? {
-            return Ok(0.0);
-        }
-        let (inner, of, texts) = (Arc::clone(self), understood.clone(), texts.to_vec());
-        let (preset, changes) = (how.0, how.1.clone());
-        let embed = move || {
-            SceneTexts::new(&inner.backend, of.subject(), (preset, &changes), &texts).map(drop)
-        };
-        let embed = async { blocking(|| staged("score", embed)).await };
-        let (embedded, ms) = in_time(deadline, "the text", embed).await?;
-        embedded.map(|()| ms)
-    }
-
-    /// The text of a view, embedded; `None` where the view has none.
-    async fn asked(
-        self: &Arc<Self>,
-        understood: Option<Understood>,
+        of: Option<SemanticScene>,
         ask: TextOptions,
         preset: Option<Preset>,
         deadline: Instant,
-    ) -> Result<Option<Asked>> {
-        let Some(understood) = understood else { return Ok(None) };
-        let text = ask.text.as_slice();
-        let how = (preset, &ask.scoring);
-        let embed_ms = self.embed(&understood, how, text, deadline).await?;
-        Ok(Some(Asked { understood, ask, embed_ms }))
+    ) -> Result<Option<Arc<SceneTexts>>> {
+        let Some(of) = of else { return Ok(None) };
+        let how = ScoringChoice { preset, changes: ask.scoring };
+        self.score(of, how, ask.text.into_iter().collect(), deadline).await.map(Some)
     }
 
-    pub(super) fn deadline(&self, options: &ViewOptions) -> Instant {
-        until(options.deadline, self.limits().render_timeout_ms)
+    /// Renders on a blocking thread within the deadline; encodes each kind.
+    async fn render_one(
+        self: &Arc<Self>,
+        access: SceneAccess,
+        view: Resolved,
+        texts: Option<Arc<SceneTexts>>,
+        caller: &Caller,
+        deadline: Instant,
+    ) -> Result<Vec<RenderedView>> {
+        let (inner, demand) = (Arc::clone(self), Demand::view(caller, view.pixels()));
+        let draw = move |work: &mut Work| match texts {
+            Some(texts) => {
+                let scene = &texts.of.scene;
+                view.draw(&inner.backend, scene, Some(&texts), texts.times(), work)
+            }
+            None => {
+                let begun = Instant::now();
+                let scene = inner.load(&access)?;
+                let times = ViewTimes { load_ms: ms(begun), ..ViewTimes::default() };
+                view.draw(&inner.backend, &scene, None, times, work)
+            }
+        };
+        self.scheduled(demand, deadline, "the view", draw).await
     }
-}
-
-/// What `work` gives within the deadline; `what` names it in the error.
-async fn in_time<T>(
-    deadline: Instant,
-    what: &str,
-    work: impl Future<Output = Result<T>>,
-) -> Result<T> {
-    let started = Instant::now();
-    let late = || {
-        let ms = started.elapsed().as_millis();
-        Error::new(ErrorCode::DeadlineExceeded, format!("{what} was not ready after {ms} ms"))
-    };
-    if deadline <= started {
-        return Err(late());
-    }
-    tokio::time::timeout_at(deadline.into(), work).await.map_err(|_elapsed| late())?
-}
-
-/// The caller's deadline, at most `most_ms` from now.
-fn until(deadline: Option<Duration>, most_ms: u64) -> Instant {
-    let most = Duration::from_millis(most_ms);
-    Instant::now() + deadline.map_or(most, |deadline| deadline.min(most))
-}
-
-/// A text of a scene and how it is scored, in tags; `tag` tells scene and semantics.
-pub(super) fn text_words(
-    tag: &str,
-    text: Option<&str>,
-    how: (Preset, &ScoringOptions),
-) -> Result<String> {
-    words(&(tag, text, how))
 }
 
 impl Service {
@@ -562,16 +427,16 @@ impl Service {
     pub async fn view_etag(&self, id: &SceneId, spec: &ViewSpec) -> Result<Option<String>> {
         let (scene, ask, view) = self.checked_view(id, spec).await?;
         let record = scene.record();
-        let texts = match (spec.kind.needs_semantics(), &record.semantics_sha256) {
+        let text = match (spec.kind.needs_semantics(), &record.semantics_sha256) {
             (false, _) => String::new(),
             (true, Some(_)) => {
-                let how = (view.preset, &ask.scoring);
-                text_words(&record_meaning_tag(record), ask.text.as_deref(), how)?
+                let tag = record_semantics_tag(record);
+                text_key(&tag, ask.text.as_deref(), view.preset, &ask.scoring)?
             }
             (true, None) => return Ok(None),
         };
         let name = self.inner.backend.renderer.name();
-        view.etag(&record_tag(record), &name, spec.kind, &texts).map(Some)
+        view.etag(&record_tag(record), &name, spec.kind, &text).map(Some)
     }
 
     /// Renders and encodes one view.
@@ -583,10 +448,10 @@ impl Service {
     pub async fn render(&self, id: &SceneId, spec: ViewSpec) -> Result<RenderedView> {
         let (scene, ask, view) = self.checked_view(id, &spec).await?;
         let inner = &self.inner;
-        let understood = inner.understood_for(&scene, &[spec.kind], &ask).await?;
+        let of = inner.semantics_for(&scene, &[spec.kind], &ask).await?;
         let deadline = inner.deadline(&spec.options);
-        let texts = inner.asked(understood, ask, spec.options.preset, deadline).await?;
-        let mut views = inner.render_one(scene, view, texts, deadline).await?;
+        let texts = inner.score_ask(of, ask, spec.options.preset, deadline).await?;
+        let mut views = inner.render_one(scene, view, texts, &self.caller, deadline).await?;
         views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
     }
 
@@ -599,8 +464,7 @@ impl Service {
         let scene = self.scene(id).await?;
         let ask = self.inner.checked_ask(&[spec.kind], &spec.text)?;
         let scene = scene.finished()?;
-        let options = (&spec.options, &spec.picture);
-        let view = resolve_one(&self.limits(), scene.record(), spec.camera, spec.kind, options)?;
+        let view = resolve_one(&self.limits(), scene.record(), spec)?;
         Ok((scene, ask, view))
     }
 
@@ -623,15 +487,15 @@ impl Service {
         texts::check_count("cameras", spec.cameras.len(), limits.cameras_max)?;
         texts::check_count("kinds", spec.kinds.len(), limits.kinds_max)?;
         let scene = scene.finished()?;
-        let mut kinds = spec.kinds.clone();
+        let mut spec = spec.clone();
         let mut seen = std::collections::HashSet::new();
-        kinds.retain(|kind| seen.insert(*kind));
+        spec.kinds.retain(|kind| seen.insert(*kind));
+        let kinds = spec.kinds.clone();
         let ask = inner.checked_ask(&kinds, &spec.text)?;
         if kinds.iter().any(|kind| kind.needs_semantics()) {
             Inner::may_be_asked(scene.record(), "views")?;
         }
-        let options = (&spec.options, &spec.picture);
-        let all = resolve(limits, scene.record().into(), &spec.cameras, &kinds, options)?;
+        let all = resolve(limits, scene.record(), &spec)?;
         let pixels: u64 = all.iter().map(Resolved::pixels).sum::<u64>() * kinds.len() as u64;
         if pixels > limits.views_pixels_max {
             let (cameras, kinds) = (all.len(), kinds.len());
@@ -641,33 +505,36 @@ impl Service {
         }
         let last = until(spec.options.deadline, limits.views_timeout_ms);
         let at_once = self.inner.scheduler.views_at_once(pixels / (all.len() * kinds.len()) as u64);
-        let preset = spec.options.preset;
+        let (preset, caller) = (spec.options.preset, self.caller.clone());
         let (to, pictures) = mpsc::channel(READY_MAX);
         let task = async move {
             let views = async {
-                let understood = inner.understood_for(&scene, &kinds, &ask).await?;
-                let texts = inner.asked(understood, ask, preset, last).await?;
+                let of = inner.semantics_for(&scene, &kinds, &ask).await?;
+                let texts = inner.score_ask(of, ask, preset, last).await?;
                 // Each on a task of its own: a slot must not wait for a slow reader.
                 let render = |one: Resolved| {
                     let deadline = last.min(inner.deadline(&ViewOptions::default()));
                     let (inner, scene, texts) = (Arc::clone(&inner), scene.clone(), texts.clone());
-                    let views = async move { inner.render_one(scene, one, texts, deadline).await };
-                    tokio::spawn(views.in_current_span())
+                    let caller = caller.clone();
+                    let views =
+                        async move { inner.render_one(scene, one, texts, &caller, deadline).await };
+                    Task::spawn(views.in_current_span())
                 };
                 let mut rendered = stream::iter(all).map(render).buffered(at_once);
                 while let Some(views) = rendered.next().await {
                     let lost = |e| Error::internal("a view was broken off").caused_by(e);
                     for view in views.map_err(lost)?? {
-                        // The caller stopped listening and wants no more.
-                        if to.send(Ok(view)).await.is_err() {
-                            return Ok(());
-                        }
+                        let _ = to.send(Ok(view)).await;
                     }
                 }
                 Ok::<(), Error>(())
             };
-            if let Err(error) = views.await {
-                let _ = to.send(Err(error)).await;
+            tokio::select! {
+                // The caller stopped listening and wants no more.
+                () = to.closed() => {}
+                ended = views => if let Err(error) = ended {
+                    let _ = to.send(Err(error)).await;
+                },
             }
         };
         tokio::spawn(task);

@@ -459,6 +459,94 @@ async fn a_page_that_rebinds_its_name_to_this_machine_calls_nothing() {
     }
 }
 
+/// Content types that a page may send without asking first, and gRPC-Web, which is not served.
+const NOT_GRPC: [Option<&str>; 6] = [
+    None,
+    Some("text/plain"),
+    Some("text/plain;application/grpc"),
+    Some("application/x-www-form-urlencoded"),
+    Some("multipart/form-data; boundary=b"),
+    Some("application/grpc-web+proto"),
+];
+
+#[tokio::test]
+async fn a_page_of_another_origin_writes_through_no_door() {
+    let stand = TestServer::start().await;
+    let own = format!("http://{}", stand.addr);
+    let id = stand.scene().await.id.to_string();
+    let framed = |message: &dyn Fn(&mut Vec<u8>)| {
+        let mut bytes = Vec::new();
+        message(&mut bytes);
+        [&[0][..], &u32::try_from(bytes.len()).unwrap().to_be_bytes(), &bytes].concat()
+    };
+    // Field 1, text: the id of a scene. CreateScene: a header, then a file of Gaussians.
+    let named = framed(&|to| to.extend([&[10, 32], id.as_bytes()].concat()));
+    let header = framed(&|to| to.extend([10, 0]));
+    let calls = [
+        ("POST", "/v1/scenes".to_owned(), Vec::new()),
+        ("POST", format!("/v1/scenes/{id}/refine"), Vec::new()),
+        ("DELETE", format!("/v1/scenes/{id}"), Vec::new()),
+        ("POST", "/segsplat.v1.SceneService/CreateScene".to_owned(), header),
+        ("POST", "/segsplat.v1.SceneService/RefineScene".to_owned(), named.clone()),
+        ("POST", "/segsplat.v1.SceneService/DeleteScene".to_owned(), named),
+    ];
+    let http1 = crate::common::client_builder().http1_only().build().unwrap();
+    let http2 = crate::common::client_builder().http2_prior_knowledge().build().unwrap();
+    for client in [&http1, &http2] {
+        for (method, path, body) in &calls {
+            let rpc = path.contains("Service");
+            for kind in NOT_GRPC.into_iter().chain([Some("application/grpc")]) {
+                for origin in [Some("http://evil.example"), Some("null"), Some(&own), None] {
+                    let what = format!("{method} {path} as {kind:?} of {origin:?}");
+                    let ours = origin.is_none_or(|origin| origin == own);
+                    if ours && (!rpc || kind == Some("application/grpc")) {
+                        continue;
+                    }
+                    let request = client.request(method.parse().unwrap(), stand.url(path));
+                    let request = request.body(body.clone());
+                    let request = origin.iter().fold(request, |r, o| r.header("origin", *o));
+                    let request = kind.iter().fold(request, |r, k| r.header("content-type", *k));
+                    let answer = request.send().await.unwrap();
+                    if rpc && kind == Some("application/grpc") {
+                        assert_eq!(answer.headers()["grpc-status"], "7", "{what}");
+                        assert_eq!(answer.headers()["segsplat-code"], "permission_denied");
+                        continue;
+                    }
+                    let want = if ours { 415 } else { 403 };
+                    let fault = bytes(answer).await.expect_err(&what);
+                    assert_eq!(fault.number, want, "{what}: {fault:?}");
+                }
+            }
+        }
+    }
+    let page = crate::common::client().get(stand.url("/v1/scenes")).send().await.unwrap();
+    let page: serde_json::Value = page.json().await.unwrap();
+    assert_eq!(page["scenes"].as_array().unwrap().len(), 1, "{page}");
+    assert_eq!(page["scenes"][0]["id"], *id, "{page}");
+    for kind in ["application/grpc", "application/grpc+proto", "Application/gRPC; x=1"] {
+        let request = http2.post(stand.url("/segsplat.v1.SceneService/Models"));
+        let request = request.header("content-type", kind).body(framed(&|_| {}));
+        let answer = request.send().await.unwrap();
+        assert_eq!(answer.headers()["content-type"], "application/grpc", "{kind}");
+        assert!(!answer.headers().contains_key("segsplat-code"), "{kind}: {answer:?}");
+    }
+}
+
+#[tokio::test]
+async fn health_and_reflection_take_grpc_alone_too() {
+    let stand = TestServer::start().await;
+    let client = crate::common::client();
+    for service in ["grpc.health.v1.Health/Check", "inference.GRPCInferenceService/ServerLive"] {
+        for kind in NOT_GRPC.into_iter().flatten() {
+            let request = client.post(stand.url(&format!("/{service}")));
+            let answer = request.header("content-type", kind).send().await.unwrap();
+            let fault = bytes(answer).await.unwrap_err();
+            assert_eq!((fault.code.as_str(), fault.number), ("unsupported_media_type", 415));
+            assert!(fault.message.contains("application/grpc"), "{service} as {kind}: {fault:?}");
+        }
+    }
+}
+
 #[tokio::test]
 async fn hosts_that_are_named_may_be_called_and_with_keys_any() {
     let named = TestServer::with(|config, _| {

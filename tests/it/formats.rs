@@ -1,29 +1,20 @@
-//! The table of formats is what each door has: gRPC, the page, the Python client, the docs.
+//! The table of formats is what the docs and the Python client have. `doors_agree.rs` has the
+//! other doors.
 
 use std::{fmt::Write as _, fs};
 
-use segsplat::{
-    api::grpc::pb,
-    formats::table::{ExportFormat, splat_formats},
-    service::VIEWER,
-};
+use segsplat::formats::table::{ExportFormat, splat_formats};
 
 use crate::common::root;
 
 #[test]
-fn grpc_the_page_and_the_docs_have_every_format() {
+fn the_docs_have_every_format_for_other_programs() {
     let docs = fs::read_to_string(root().join("docs/formats.md")).unwrap();
     for format in ExportFormat::all() {
-        let name = format!("EXPORT_FORMAT_{}", format.name.to_ascii_uppercase());
-        assert!(pb::ExportFormat::from_str_name(&name).is_some(), "the proto has no {name}");
-        let option = format!("<option value=\"{}\"", format.name);
-        assert!(VIEWER.html.contains(&option), "the page has no {}", format.name);
         let for_others = format.is_splats() || format.ending.ends_with(".zip");
-        let row = format!("| `{}` |", format.name);
+        let row = format!("| `{format}` |");
         assert!(!for_others || docs.contains(&row), "docs/formats.md has no row {row}");
     }
-    let theirs = (1..).map_while(|number| pb::ExportFormat::try_from(number).ok());
-    assert_eq!(theirs.count(), ExportFormat::all().count(), "the proto has others");
 }
 
 /// The module of the Python client.

@@ -17,6 +17,7 @@ mod colour_words;
 mod common;
 mod containers;
 mod crop;
+mod doors_agree;
 mod errors;
 mod faults;
 mod fields;

@@ -41,7 +41,7 @@ fn service(frame: Frame) -> OfflineService {
 }
 
 /// One Gaussian before two cameras.
-fn scene() -> Scene {
+fn scene() -> Arc<Scene> {
     let raw = RawGaussians {
         means: vec![[0.0, 0.0, 2.0]],
         quats: vec![[1.0, 0.0, 0.0, 0.0]],
@@ -59,7 +59,7 @@ fn scene() -> Scene {
         report: HealthReport { median_depth: 2.0, ..HealthReport::default() },
         provenance: Provenance::default(),
     };
-    Scene::new(meta, Gaussians::sanitize(raw).unwrap().0, Backdrop::default())
+    Arc::new(Scene::new(meta, Gaussians::sanitize(raw).unwrap().0, Backdrop::default()))
 }
 
 /// A view from the first camera.

@@ -50,7 +50,7 @@ fn paper() -> SceneOptions {
     SceneOptions { preset: Preset::Paper, ..SceneOptions::default() }
 }
 
-fn made(engine: &Pipeline, photos: &[PosedPhoto], options: &SceneOptions) -> Scene {
+fn made(engine: &Pipeline, photos: &[PosedPhoto], options: &SceneOptions) -> Arc<Scene> {
     let made: Reconstruction =
         reconstruct(engine, photos, options, &|_, _| (), &NO_CANCEL).unwrap();
     let scene = made.into_scene(SceneId::from_bytes([3; 16]), 0, Provenance::default());
@@ -58,7 +58,7 @@ fn made(engine: &Pipeline, photos: &[PosedPhoto], options: &SceneOptions) -> Sce
     let parts = SemanticsInput { photos, cameras, gaussians };
     let watch = Watch { progress: &|_, _| (), cancel: &NO_CANCEL };
     let semantics = understand(engine, &parts, &scene.meta.report.method, watch).unwrap();
-    scene.with_semantics(Arc::new(semantics)).unwrap()
+    Arc::new(scene.with_semantics(Arc::new(semantics)).unwrap())
 }
 
 /// The mask cut out of its photo: its box as a square, black outside of the mask.

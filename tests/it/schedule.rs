@@ -30,6 +30,8 @@ struct HoldingRenderer {
     /// Views being drawn now, and the most there were.
     drawing: AtomicUsize,
     most: AtomicUsize,
+    /// Views that were begun.
+    begun: AtomicUsize,
 }
 
 impl Renderer for HoldingRenderer {
@@ -44,6 +46,7 @@ impl Renderer for HoldingRenderer {
     fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
         let drawing = self.drawing.fetch_add(1, Ordering::AcqRel) + 1;
         self.most.fetch_max(drawing, Ordering::AcqRel);
+        self.begun.fetch_add(1, Ordering::AcqRel);
         let begun = Instant::now();
         let large = request.camera.intrinsics.width >= LARGE;
         while large && !self.go_on.load(Ordering::Acquire) && begun.elapsed() < PATIENCE {
@@ -152,4 +155,26 @@ async fn a_call_for_many_views_has_a_bound_of_pixels_and_of_time() {
     let answers: Vec<_> = views.expect("a small request").collect().await;
     let codes: Vec<_> = answers.into_iter().map(|view| view.map_err(|e| e.code()).err()).collect();
     assert_eq!(codes, [Some(ErrorCode::DeadlineExceeded)], "no time for all together");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nothing_more_is_drawn_for_a_caller_who_has_gone() {
+    let renderer = Arc::new(HoldingRenderer { concurrency: 1, ..HoldingRenderer::default() });
+    let (server, id) = server(&renderer, |_| ()).await;
+    let pictures = server.service.render_many(&id, &many(&sized(LARGE), 8, &[Kind::Color])).await;
+    let pictures = pictures.expect("a good request");
+    let until = |done: &dyn Fn() -> bool| {
+        let begun = Instant::now();
+        while !done() {
+            assert!(begun.elapsed() < PATIENCE, "not done");
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    };
+    // One is drawn, and the next one of the call waits behind it.
+    until(&|| server.service.ready().renders == 2);
+    drop(pictures);
+    until(&|| server.service.ready().renders == 1);
+    renderer.go_on.store(true, Ordering::Release);
+    until(&|| server.service.ready().renders == 0);
+    assert_eq!(renderer.begun.load(Ordering::Acquire), 1);
 }

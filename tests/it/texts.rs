@@ -10,10 +10,12 @@ use std::{
 use futures_util::StreamExt;
 use segsplat::{
     error::ErrorCode,
+    limits::Limits,
     scene::{Method, Preset, SceneCamera, SceneId, SceneOptions, SemanticsMode, SemanticsState},
     service::{
-        Boxes, CreateScene, ExportFormat, Format, Kind, MaskFormat, PickSpec, PictureOptions,
-        QuerySpec, Rle, ScoringOptions, TextOptions, ViewOptions, ViewSpec,
+        Boxes, CreateScene, ExportFormat, FeatureKind, FeaturesSpec, Format, Kind, MaskFormat,
+        PickSpec, PictureOptions, QuerySpec, Rle, ScoringOptions, TextOptions, ViewOptions,
+        ViewSpec, ViewsSpec,
     },
 };
 
@@ -31,10 +33,15 @@ struct Fixture {
 }
 
 async fn fixture() -> Fixture {
+    fixture_with(|_| ()).await
+}
+
+async fn fixture_with(change: impl FnOnce(&mut Limits)) -> Fixture {
     let meaning = Arc::new(PhotoMeaning::default());
     let renderer = Arc::new(CountingRenderer::default());
     let (given, drawing) = (Arc::clone(&meaning), Arc::clone(&renderer));
-    let server = TestServer::with(|_, parts| {
+    let server = TestServer::with(|config, parts| {
+        change(&mut config.limits);
         parts.semantics = given;
         parts.renderer = drawing;
     });
@@ -162,6 +169,53 @@ async fn a_hundred_texts_take_one_drawing_and_a_known_view_takes_none() {
     let other = QuerySpec { options: wide, ..in_view(&["photo 2"]) };
     service.query(&id, other).await.unwrap();
     assert_eq!(fixture.renderer.counts(), [3, 0, 3], "another method or size is another view");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_nobody_kept_is_asked_once_a_call_and_not_at_the_renderer() {
+    // As after an eviction: no embedding and no bank is kept.
+    let fixture = fixture_with(|limits| {
+        (limits.texts_cached_max, limits.scorers_cache_bytes_max) = (0, 0);
+    });
+    let fixture = fixture.await;
+    let id = &fixture.scene(SemanticsMode::Eager).await;
+    let service = &fixture.server.service;
+    let embedded = || fixture.meaning.embedded.swap(0, Ordering::AcqRel);
+    embedded();
+    let camera = first_view().camera;
+    let options = ViewOptions::default();
+    // The three canonical phrases, and the texts.
+    service.query(id, in_view(&["photo 0", "photo 1"])).await.unwrap();
+    assert_eq!(embedded(), 3 + 2, "a query");
+    service.render(id, view(Kind::Mask, Some("photo 0"), Format::Png)).await.unwrap();
+    assert_eq!(embedded(), 3 + 1, "a view");
+    let mask = view(Kind::Mask, Some("photo 0"), Format::Png);
+    let ViewSpec { options: how, picture, text, .. } = mask;
+    let kinds = vec![Kind::Mask, Kind::Color];
+    let many = ViewsSpec { cameras: vec![camera; 4], kinds, options: how, picture, text };
+    let views: Vec<_> = service.render_many(id, &many).await.unwrap().collect().await;
+    assert!(views.len() == 8 && views.iter().all(Result::is_ok));
+    assert_eq!(embedded(), 3 + 1, "four views with two pictures each");
+    let (scoring, wait) = (ScoringOptions::default(), None);
+    let (labels, own) = (texts(&["photo 0"]), (options.clone(), scoring.clone()));
+    let (x, y) = (8.0, 8.0);
+    let pick = PickSpec { camera, x, y, options: own.0, labels, scoring: own.1, wait };
+    service.pick(id, pick).await.unwrap();
+    assert_eq!(embedded(), 3 + 1, "a pick");
+    let kind = FeatureKind::Weights;
+    let features = FeaturesSpec { camera, options, kind, scoring, wait };
+    let file = service.features(id, features).await.unwrap().begin().await.unwrap();
+    let file: Vec<_> = file.into_stream().collect().await;
+    assert!(file.iter().all(Result::is_ok));
+    assert_eq!(embedded(), 3, "features");
+    for format in [ExportFormat::Ply, ExportFormat::Html, ExportFormat::Coco] {
+        let ask = TextOptions { text: Some("photo 0".to_owned()), ..TextOptions::default() };
+        let file = service.export(id, format, None, &ask).await.unwrap();
+        let file = file.begin().await.unwrap();
+        let file: Vec<_> = file.into_stream().collect().await;
+        assert!(file.iter().all(Result::is_ok));
+        assert_eq!(embedded(), 3 + 1, "{format}");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

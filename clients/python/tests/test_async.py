@@ -46,6 +46,10 @@ def test_the_answers_are_the_same(scene: Scene, url: str, tmp_path: Path) -> Non
             ]
             assert np.allclose(centres, [p.camera.camera_to_world[:3, 3] for p in twin.photos])
             assert [event.event async for event in twin.events()] == ["done"]
+            arrays = await twin.features(width=24)
+            assert np.array_equal(arrays["weights"], scene.features(width=24)["weights"])
+            await twin.refine("off")
+            assert twin.status.refinement == scene.status.refinement
             path = await twin.export(path=tmp_path / "async.ply")
             assert path.read_bytes() == scene.export(path=tmp_path / "sync.ply").read_bytes()
             assert scene.id in [one.id async for one in client.scenes(page=1)]

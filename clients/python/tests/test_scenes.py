@@ -12,7 +12,16 @@ import httpx
 import numpy as np
 import pytest
 
-from segsplat import Cancelled, Client, Event, InvalidRequest, Scene, SceneNotFound, SegSplatError
+from segsplat import (
+    Cancelled,
+    Client,
+    Event,
+    InvalidRequest,
+    Refinement,
+    Scene,
+    SceneNotFound,
+    SegSplatError,
+)
 
 
 def test_a_scene_tells_how_it_was_made(scene: Scene, client: Client) -> None:
@@ -158,7 +167,7 @@ def test_a_description_is_read_before_photos_are_sent(tmp_path: Path, text: str)
         Client("http://127.0.0.1:9").scene(tmp_path / "photos")
 
 
-def test_every_format_of_gaussians(
+def test_every_format_of_a_file(
     scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -170,6 +179,9 @@ def test_every_format_of_gaussians(
         "sog": b"PK",
         "glb": b"glTF",
         "splat": b"",
+        "npz": b"PK",
+        "segsplat": b"",
+        "html": b"<!doctype html>",
     }
     paths = [
         scene.export("ply"),
@@ -179,10 +191,38 @@ def test_every_format_of_gaussians(
         scene.export("sog"),
         scene.export("glb"),
         scene.export("splat"),
+        scene.export("npz"),
+        scene.export("packed"),
+        scene.export("html", text=["box", "carpet"]),
     ]
     for path, (ending, start) in zip(paths, begins.items(), strict=True):
         assert path.name == f"{scene.id}.{ending}"
         assert path.read_bytes().startswith(start) and path.stat().st_size > 1000
+
+
+def test_a_scene_is_refined_while_it_is_served(client: Client, photos: Path) -> None:
+    scene = client.scene(photos, semantics="off", refine="off", votes=False, lambda_=1.5)
+    assert scene.report and scene.report.method["votes"] is False
+    assert (scene.report.method["lambda"], scene.report.method["mask_level"]) == (1.5, "widest")
+    assert (scene.status.version, scene.status.refinement) == (1, Refinement())
+    scene.refine(500)
+    assert (scene.status.state, scene.status.refinement.state) == ("done", "running")
+    assert scene.view(width=32).image.any()
+    scene.wait()  # it is made already
+    events = list(scene.events())
+    assert events[0] == Event("done")
+    assert [event.event for event in events[1:]] == ["version"] * len(events[1:])
+    scene.refresh()
+    assert scene.status.refinement.state == "done" and scene.status.refinement.error is None
+    report = scene.report.refinement
+    assert report and report.steps > 0 and report.gaussians_after == scene.report.gaussians
+    assert [event.version for event in events[-1:] if event.version] in ([], [scene.status.version])
+    scene.refine(600_000)
+    scene.refine("off")
+    assert scene.status.refinement.state != "running"
+    with pytest.raises(InvalidRequest, match="refine is 0 ms"):
+        scene.refine(0)
+    scene.delete()
 
 
 def test_a_file_of_gaussians_is_a_scene(client: Client, scene: Scene, tmp_path: Path) -> None:

@@ -44,6 +44,35 @@ def test_a_query_says_how_it_scored(scene: Scene) -> None:
     assert scene.query("box", masks=False).scoring.unit_rows
 
 
+def test_every_number_of_the_scoring_is_the_callers(scene: Scene) -> None:
+    scoring = scene.query(
+        "box",
+        masks=False,
+        canon=["a wall", "a floor"],
+        unit_rows=False,
+        coverage_floor=0.25,
+        near_best=0.5,
+    ).scoring
+    assert scoring.canon == ("a wall", "a floor") and not scoring.unit_rows
+    assert (scoring.coverage_floor, scoring.near_best) == (0.25, 0.5)
+    whole, chosen = scene.gaussians("box"), scene.gaussians("box", cut=0.9)
+    assert len(chosen.means) < len(whole.means)
+
+
+def test_features_are_the_pixels_over_the_bank(scene: Scene) -> None:
+    weights = scene.features(width=48)
+    height, width = weights["size"]
+    assert (height, width) == (36, 48) and len(weights["offsets"]) == height * width + 1
+    assert weights["offsets"][-1] == len(weights["entries"]) == len(weights["weights"]) > 0
+    dense = scene.features("features", width=48)["features"]
+    assert dense.shape[:2] == (height, width)
+    lengths = np.linalg.norm(dense, axis=2).reshape(-1)
+    shown = np.diff(weights["offsets"].astype(int)) > 0
+    assert np.allclose(lengths[shown], 1, atol=1e-5) and not lengths[~shown].any()
+    with pytest.raises(InvalidRequest):
+        scene.features(width=48, near=-1.0)
+
+
 def test_without_a_camera_the_masks_are_in_the_first_photo(scene: Scene) -> None:
     found = scene.query("box")
     assert found.masks.shape == (1, 240, 320)

@@ -155,3 +155,12 @@ def test_a_scene_of_photos_and_cameras(client: Client, scene: Scene, photos: Pat
     twin = client.scene(cameras, semantics="off")
     assert np.array_equal(twin.view(width=64).image, scene.view(width=64).image)
     twin.delete()
+
+
+def test_single_options_of_a_preset(scene: Scene) -> None:
+    paper = scene.view(width=64, background="black", preset="paper").image
+    single = scene.view(width=64, background="black", front_photos=0, magnify=False).image
+    assert np.array_equal(single, paper)
+    near = {"eye": [0, -1.6, -1.0], "target": [0, -0.6, 0], "width": 64}
+    one = scene.view(**near, front_photos=1).image  # type: ignore[arg-type]
+    assert not np.array_equal(one, scene.view(**near, front_photos=0).image)  # type: ignore[arg-type]

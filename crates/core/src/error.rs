@@ -64,6 +64,8 @@ table! {
     NotFound: "not_found", 404, 5, 3, false;
     /// The path is there, but not with this method.
     MethodNotAllowed: "method_not_allowed", 405, 12, 3, false;
+    /// The content type of a call is not one that it takes.
+    UnsupportedMediaType: "unsupported_media_type", 415, 3, 2, false;
     /// The scene exists but is not done, or its semantics are still being made.
     SceneNotReady: "scene_not_ready", 409, 9, 4, true;
     /// A text was asked of a scene that was made with `semantics=off`.

@@ -4,8 +4,13 @@
 /// Declares numbers that the shaders have too, and lists them as `SHARED`.
 macro_rules! shared {
     ($to:vis $type:ty; $($(#[$doc:meta])+ $name:ident = $value:expr;)+) => {
-        $($(#[$doc])+ $to const $name: $type = $value;)+
+        $(
+            $(#[$doc])+
+            #[cfg_attr(not(feature = "testing"), allow(dead_code, reason = "for shaders alone"))]
+            $to const $name: $type = $value;
+        )+
 
+        #[cfg(feature = "testing")]
         /// These numbers by their names in WGSL.
         pub const SHARED: [(&str, $type); [$(stringify!($name)),+].len()] =
             [$((stringify!($name), $name)),+];

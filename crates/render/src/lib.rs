@@ -3,6 +3,14 @@
 //! [`oracle`] judges the others: f64, pixel by pixel, no tiles. [`cpu`] is the tiled renderer of
 //! the product. [`gpu`] has the same stages in WGSL. All three take a [`RenderRequest`]; [`cpu`]
 //! and [`gpu`] give a [`Frame`].
+//!
+//! The feature `testing` adds what tests and the laboratory look at and change: switches, the
+//! inside of [`gpu`], and the oracles of the backward pass and of training. The product is built
+//! without it.
+#![cfg_attr(
+    not(feature = "testing"),
+    allow(unreachable_pub, reason = "public for the tests' view of the inside")
+)]
 
 pub mod backward;
 pub mod compare;
@@ -11,10 +19,15 @@ pub mod cpu;
 pub mod gpu;
 pub mod labels;
 pub mod levels;
+pub mod options;
 pub mod oracle;
 pub mod plan;
+pub mod renderer;
 pub mod select;
+#[cfg(feature = "testing")]
 pub mod switches;
+#[cfg(not(feature = "testing"))]
+mod switches;
 pub mod train;
 pub mod view;
 
@@ -25,15 +38,17 @@ pub use segsplat_core::scene::PixelWeights;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+#[cfg(feature = "testing")]
+pub use self::switches::{Skip, Switches};
 pub use self::{
     labels::Labels,
     levels::{DepthSteps, Levels},
-    select::{RendererChoice, RendererOptions},
-    switches::{Skip, Switches},
+    options::{RendererChoice, RendererOptions},
+    renderer::{DeviceTimes, DifferentiableRenderer, DispatchTime, Renderer},
 };
 use crate::{
     error::{Error, Result},
-    scene::{Backdrop, Camera, Gaussians, Intrinsics, Region},
+    scene::{Backdrop, Camera, Intrinsics, Region},
 };
 use segsplat_core::{error, limits, scene};
 
@@ -267,65 +282,4 @@ pub fn vectorised<T>(kernel: impl FnOnce() -> T) -> T {
         }
     }
     pulp::Arch::new().dispatch(Kernel(kernel))
-}
-
-/// Time of one dispatch, by the device's own clock.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct DispatchTime {
-    /// Kernel.
-    pub stage: &'static str,
-    /// Milliseconds.
-    pub ms: f64,
-}
-
-/// Times of one frame on a device, by its own clock.
-#[derive(Clone, Debug, Default, PartialEq, Serialize)]
-pub struct DeviceTimes {
-    /// From before the first stage to after the last, no stage marked between: milliseconds.
-    pub total_ms: f64,
-    /// Every dispatch of another frame, in order.
-    pub stages: Vec<DispatchTime>,
-}
-
-/// A renderer of the one model.
-pub trait Renderer: Send + Sync {
-    /// Name for logs, `/v1/models` and benchmarks: `cpu`, or the adapter's own name.
-    fn name(&self) -> String;
-
-    /// Views that it draws at the same time with profit; more callers only wait for one another.
-    fn concurrency(&self) -> usize;
-
-    /// Renders one view.
-    ///
-    /// # Errors
-    /// `limit_exceeded` when the work does not fit the device's limits, `gpu_unavailable`
-    /// when the device is lost, `internal` for a fault of ours. An empty scene is a clean
-    /// background.
-    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame>;
-
-    /// Puts a scene where its views are drawn, so that its first one need not wait for that. Views
-    /// of other scenes do not wait either. Nothing depends on it.
-    ///
-    /// # Errors
-    /// `limit_exceeded` when the device has no room, `gpu_unavailable` when it is lost.
-    fn prepare(&self, _gaussians: &Gaussians) -> Result<()> {
-        Ok(())
-    }
-
-    /// The same renderer where it has a backward pass of its own that is worth its device.
-    fn differentiable(self: Arc<Self>) -> Option<Arc<dyn backward::DifferentiableRenderer>> {
-        None
-    }
-
-    /// Renders one view for the times of it on the device; `None` where none keeps them.
-    ///
-    /// # Errors
-    /// As [`Self::render`].
-    fn device_times(
-        &self,
-        _gaussians: &Gaussians,
-        _request: &RenderRequest,
-    ) -> Result<Option<DeviceTimes>> {
-        Ok(None)
-    }
 }

@@ -3,78 +3,17 @@
 
 use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
-
-use super::{
-    DeviceTimes, Frame, RenderRequest, Renderer,
-    backward::{DifferentiableRenderer, FrameGradients, Gradients},
+use crate::{
+    Frame, RenderRequest,
+    backward::{FrameGradients, Gradients},
     cpu::CpuRenderer,
+    error::{ErrorCode, Result},
     gpu::GpuRenderer,
-    switches::Switches,
+    options::{AdapterReport, RendererChoice, RendererOptions},
+    renderer::{DeviceTimes, DifferentiableRenderer, Renderer},
+    scene::Gaussians,
     train::{Trainer, TrainingSet},
 };
-use crate::{
-    error::{ErrorCode, Result},
-    limits::Limits,
-    scene::Gaussians,
-};
-
-/// Which renderer serves views.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum RendererChoice {
-    /// A hardware adapter where there is one, else the CPU renderer. Never a software adapter.
-    #[default]
-    Auto,
-    /// The CPU renderer.
-    Cpu,
-    /// A wgpu adapter, software ones too when `adapter` names it; refuses to start without.
-    Gpu,
-}
-
-/// Which renderer to open, and its bounds.
-#[derive(Clone, Debug)]
-pub struct RendererOptions {
-    /// Which renderer.
-    pub renderer: RendererChoice,
-    /// Part of the name of the wgpu adapter to use, or of several, with commas between.
-    pub adapter: Option<String>,
-    /// Threads of the CPU renderer; 0: one for each core that the process may use.
-    pub threads: usize,
-    /// Bytes of scenes kept on one GPU device.
-    pub scene_bytes_max: u64,
-    /// For tests and the laboratory.
-    pub switches: Switches,
-}
-
-impl Default for RendererOptions {
-    fn default() -> Self {
-        Self {
-            renderer: RendererChoice::default(),
-            adapter: None,
-            threads: 0,
-            scene_bytes_max: Limits::default().device_scene_bytes_max,
-            switches: Switches::default(),
-        }
-    }
-}
-
-/// A GPU adapter as the driver describes it.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
-pub struct AdapterReport {
-    /// The adapter's own name.
-    pub name: String,
-    /// `DiscreteGpu`, `IntegratedGpu`, `VirtualGpu`, `Cpu` or `Other`.
-    pub kind: String,
-    /// `vulkan`, `metal`, `dx12` or `gl`.
-    pub backend: String,
-    /// Driver and its version.
-    pub driver: String,
-    /// Whether it computes on the processor.
-    pub software: bool,
-    /// Whether it was taken.
-    pub chosen: bool,
-}
 
 /// The renderer that `options` ask for, and the adapters found on the way.
 ///
@@ -210,8 +149,12 @@ impl DifferentiableRenderer for WithCpu {
         self.gpu.backward_times(gaussians, request, by)
     }
 
-    fn trainer<'a>(&'a self, set: &TrainingSet<'a>) -> Result<Option<Box<dyn Trainer + 'a>>> {
-        self.gpu.trainer(set)
+    fn trainer<'a>(
+        &'a self,
+        set: &TrainingSet<'a>,
+        bytes_max: u64,
+    ) -> Result<Option<Box<dyn Trainer + 'a>>> {
+        self.gpu.trainer(set, bytes_max)
     }
 
     fn slow_after_rest(&self) -> bool {

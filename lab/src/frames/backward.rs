@@ -11,8 +11,8 @@ use crate::{
     error::{Error, Result},
     refine::RefineOptions,
     render::{
-        Kinds, RenderRequest,
-        backward::{DifferentiableRenderer, FrameGradients, Gradients, oracle},
+        DifferentiableRenderer, Kinds, RenderRequest,
+        backward::{FrameGradients, Gradients, oracle},
         cpu::CpuRenderer,
         train::{LearningRates, TrainingPhoto, TrainingSet, TrainingStep},
     },
@@ -117,7 +117,7 @@ fn trained(
     let photo = Photo { width: lens.width, height: lens.height, rgb, valid: None };
     let photos = vec![TrainingPhoto { photo: &photo, request: request.clone() }];
     let set = TrainingSet { gaussians, photos, ssim_share: RefineOptions::default().ssim_share };
-    let Some(mut trainer) = renderer.trainer(&set)? else { return Ok(None) };
+    let Some(mut trainer) = renderer.trainer(&set, u64::MAX)? else { return Ok(None) };
     let rates = LearningRates::default();
     let step = TrainingStep { rates, exposure: 5e-3, opacity_min: 0.0 };
     let mut times = Vec::new();

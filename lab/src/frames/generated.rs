@@ -5,30 +5,34 @@ use std::path::Path;
 use safetensors::{Dtype, tensor::TensorView};
 use segsplat_testing::scenes;
 
-use super::Args;
 use crate::{
     error::{Error, Result},
     render::{Background, Frame, RenderRequest},
     scene::{Camera, Gaussians, Intrinsics},
 };
 
-/// The scene and the camera between its two photos.
-pub(super) fn scene(args: &Args) -> Result<(Gaussians, Camera)> {
-    let side = (args.gaussians / 2).isqrt() as u32;
+/// A scene of about so many Gaussians with a bank of so many entries, and the camera between its
+/// two photos.
+pub(super) fn scene(
+    gaussians: usize,
+    bank: u16,
+    [width, height]: [u32; 2],
+) -> Result<(Gaussians, Camera)> {
+    let side = (gaussians / 2).isqrt() as u32;
     let (gaussians, camera) = scenes::two_views(side, 1);
     // The same patches in both photos: (s, t) is the place on the surface.
-    let patches = f64::from(args.bank).sqrt().ceil();
+    let patches = f64::from(bank).sqrt().ceil();
     let patch = |share: f64| (share.clamp(0.0, 0.999) * patches).floor();
     let entry = |i: u32| {
         let shift = if i < side * side { -0.04 } else { 0.04 };
         let place = |pixel: u32| (f64::from(pixel) + 0.5) / f64::from(side);
         let (s, t) = (place(i % side) + shift, place(i / side % side));
-        let label = (patch(s) + patches * patch(t)) as usize % usize::from(args.bank.max(1));
-        if args.bank == 0 { 0 } else { 1 + label as u16 }
+        let label = (patch(s) + patches * patch(t)) as usize % usize::from(bank.max(1));
+        if bank == 0 { 0 } else { 1 + label as u16 }
     };
     let gaussians = gaussians.with_semantic_index((0..2 * side * side).map(entry).collect())?;
-    let square = scenes::camera(args.size, args.size).intrinsics;
-    let (width, cx) = (args.width(), 0.5 * f64::from(args.width()));
+    let square = scenes::camera(height, height).intrinsics;
+    let cx = 0.5 * f64::from(width);
     Ok((gaussians, Camera { intrinsics: Intrinsics { width, cx, ..square }, ..camera }))
 }
 

@@ -119,7 +119,7 @@ impl Args {
 
     /// The generated scene, and the view of it with every picture.
     fn scene(&self) -> Result<(Gaussians, RenderRequest)> {
-        let (gaussians, camera) = scene(self)?;
+        let (gaussians, camera) = scene(self.gaussians, self.bank, [self.width(), self.size])?;
         let request = scenes::request(camera);
         Ok((gaussians, RenderRequest { quality: self.quality, ..request }))
     }

@@ -8,7 +8,7 @@ use std::{
     time::Instant,
 };
 
-use super::{path::Path, views::Bounds};
+use super::path::Path;
 use crate::{
     error::Result,
     limits::Limits,
@@ -20,6 +20,20 @@ use crate::{
     scenes::{make, scene_of, view_request},
     setup::Setup,
 };
+
+/// Where a row ends: at the first of both.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Bounds {
+    pub(super) views: u64,
+    pub(super) seconds: f64,
+}
+
+impl Bounds {
+    /// Views before the measured ones.
+    pub(super) fn warm_up(self, callers: usize) -> u64 {
+        (4 * callers as u64).min(self.views)
+    }
+}
 
 /// The scene and the renderer of this process.
 pub(super) struct Library {

@@ -17,10 +17,7 @@ mod views;
 
 use clap::Subcommand;
 
-use crate::{
-    error::{Error, Result},
-    rows::Rows,
-};
+use crate::{error::Result, rows::Rows};
 
 /// What to ask for.
 #[derive(Debug, Subcommand)]
@@ -40,14 +37,4 @@ pub(crate) fn run(command: &Command, rows: &mut Rows) -> Result<()> {
         Command::Views(args) => views::run(args, rows),
         Command::Scenes(args) => scenes::run(args, rows),
     }
-}
-
-/// A runtime with few threads: the cores belong to the server.
-fn runtime(threads: Option<usize>) -> Result<tokio::runtime::Runtime> {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(threads.unwrap_or(cores / 4).max(1))
-        .enable_all()
-        .build()
-        .map_err(|e| Error::internal("the async runtime does not start").caused_by(e))
 }

@@ -15,8 +15,7 @@ use super::{
     ask::Ask,
     door::Connection,
     photos::{Photos, form},
-    runtime,
-    server::{Server, Servers, create},
+    server::{Server, Servers, create, runtime},
     tally::Tally,
 };
 use crate::{

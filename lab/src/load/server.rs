@@ -27,6 +27,16 @@ const WAIT_MS: u64 = 300_000;
 /// a minute.
 const READY_LOOKS: u32 = 1_800;
 
+/// A runtime with few threads: the cores belong to the server.
+pub(super) fn runtime(threads: Option<usize>) -> Result<tokio::runtime::Runtime> {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(threads.unwrap_or(cores / 4).max(1))
+        .enable_all()
+        .build()
+        .map_err(|e| Error::internal("the async runtime does not start").caused_by(e))
+}
+
 /// Which servers.
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Servers {

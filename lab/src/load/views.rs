@@ -14,11 +14,10 @@ use serde_json::{Value, json};
 use super::{
     ask::Ask,
     door::{Connection, Door},
-    library::Library,
+    library::{Bounds, Library},
     path::Path,
     photos::Photos,
-    runtime,
-    server::{Server, Servers},
+    server::{Server, Servers, runtime},
     tally::Tally,
 };
 use crate::{
@@ -97,20 +96,6 @@ pub(crate) struct Args {
     no_library: bool,
     #[command(flatten)]
     setup: Setup,
-}
-
-/// Where a row ends: at the first of both.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Bounds {
-    pub(super) views: u64,
-    pub(super) seconds: f64,
-}
-
-impl Bounds {
-    /// Views before the measured ones.
-    pub(super) fn warm_up(self, callers: usize) -> u64 {
-        (4 * callers as u64).min(self.views)
-    }
 }
 
 /// Makes a row for each way in, kind, format and number of callers, and each server. Its error is

@@ -10,13 +10,12 @@ pub mod segments;
 
 use std::{
     collections::HashMap,
-    fmt,
     path::{Path, PathBuf},
 };
 
-use image::ImageReader;
 use serde_json::{Value, json};
 
+use self::segments::decode;
 use crate::{
     error::{Error, Result},
     limits::Limits,
@@ -182,13 +181,6 @@ fn embed(path: &Path, towers: &ImageText, names: &mut Names, images_max: usize) 
 /// Indices that training leaves out, of `count` in a file's order.
 fn held_out(count: usize) -> impl Iterator<Item = usize> {
     (0..count).filter(|i| i % HELD_OUT_OF == HELD_OUT_OF - 1)
-}
-
-/// The pixels of an image file.
-fn decode(bytes: &[u8], what: &str) -> Result<image::RgbImage> {
-    let fault = |e: &dyn fmt::Display| Error::invalid(format!("{what}: {e}"));
-    let reader = ImageReader::new(std::io::Cursor::new(bytes)).with_guessed_format();
-    Ok(reader.map_err(|e| fault(&e))?.decode().map_err(|e| fault(&e))?.into_rgb8())
 }
 
 /// A whole photo in the middle of a black square.

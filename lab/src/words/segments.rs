@@ -3,14 +3,15 @@
 
 use std::{
     collections::{BTreeMap, BTreeSet},
+    fmt,
     fs::File,
     io::{BufReader, Read as _},
     path::Path,
 };
 
+use image::ImageReader;
 use serde::Deserialize;
 
-use super::decode;
 use crate::{
     error::{Error, Result},
     scene::{Crop, CropShape, IndexMap, MaskInfo, Photo, PhotoMasks},
@@ -143,4 +144,11 @@ impl SegmentedImage {
         };
         Ok(wanted.iter().enumerate().filter_map(cut).collect())
     }
+}
+
+/// The pixels of an image file.
+pub(super) fn decode(bytes: &[u8], what: &str) -> Result<image::RgbImage> {
+    let fault = |e: &dyn fmt::Display| Error::invalid(format!("{what}: {e}"));
+    let reader = ImageReader::new(std::io::Cursor::new(bytes)).with_guessed_format();
+    Ok(reader.map_err(|e| fault(&e))?.decode().map_err(|e| fault(&e))?.into_rgb8())
 }

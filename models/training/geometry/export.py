@@ -1,6 +1,6 @@
 """Weights to the bundle: ONNX with fp16-stored weights (cast to fp32 at load), and its parity.
 
-    python export.py --weights ema.pt --out ../../embedded/geometry.onnx [--realset realset.pt]
+    python export.py --weights ema.pt --out ../../embedded/geometry.onnx
 
 Prints the largest difference to PyTorch fp32 with the same (fp16-rounded) weights, and what the
 rounding itself changes.

@@ -200,11 +200,11 @@ class World:
         return quat_to_rot(q)
 
     # -- one batch
-    def batch(self, B, V, T, H, W, wide=1.0):
-        """B scenes, V input and T target views of H x W; everything in the model frame.
+    def batch(self, B, V, T, H, W, wide=1.0, zoom=1):
+        """B scenes, V input views of H x W and T target views of `zoom` times that; model frame.
 
-        Returns images [B,V+T,3,H,W], depth [B,V+T,H,W], K [B,V+T,3,3] normalised, c2w [B,V+T,4,4],
-        near/far [B,V].
+        Returns images [B,V,3,H,W], targets [B,T,3,zoom H,zoom W], depth [B,V,H,W], K [B,V+T,3,3]
+        normalised, c2w [B,V+T,4,4], near/far [B,V].
         """
         mode = self.u(B)
         room, table, relief = mode < 0.38, (mode >= 0.38) & (mode < 0.72), (mode >= 0.72) & (mode < 0.84)
@@ -215,16 +215,21 @@ class World:
         b = self.logu(B, lo=lo_b, hi=0.28 + 0.3 * wide)
         cams, K = self.rig(B, V, T, H, W, b, focus, wide)
         inst, lights = self.layout(B, room, table, relief, focus, b, cams)
-        cam16 = torch.cat([cams[:, :, :3].reshape(B, V + T, 12), torch.stack([K[..., 0, 0] * W, K[..., 1, 1] * H, K[..., 0, 2] * W, K[..., 1, 2] * H], -1)], -1)
-        rgb, depth, _ = self.ext.render(lights, inst, self.nodes, self.tris, self.bank, TEX, 8, cam16.contiguous(), H, W)
+        images, depth = self.draw(inst, lights, cams[:, :V], K[:, :V], H, W)
+        targets, _ = self.draw(inst, lights, cams[:, V:], K[:, V:], H * zoom, W * zoom)
         # Model frame.
         scale = torch.cdist(cams[:, :V, :3, 3], cams[:, :V, :3, 3]).flatten(1).amax(1)
         c2w = torch.linalg.inv(cams[:, :1]) @ cams
         c2w[..., :3, 3] /= scale[:, None, None]
         depth = (depth / scale[:, None, None, None]).clamp(max=1e5)
-        near, far = self.near_far(depth[:, :V])
-        rgb = self.photo(rgb, V)
-        return rgb, depth, K, c2w, near, far
+        near, far = self.near_far(depth)
+        images, targets = self.photo(images, targets)
+        return images, targets, depth, K, c2w, near, far
+
+    def draw(self, inst, lights, cams, K, H, W):
+        lens = torch.stack([K[..., 0, 0] * W, K[..., 1, 1] * H, K[..., 0, 2] * W, K[..., 1, 2] * H], -1)
+        cam16 = torch.cat([cams[:, :, :3].reshape(*cams.shape[:2], 12), lens], -1).contiguous()
+        return self.ext.render(lights, inst, self.nodes, self.tris, self.bank, TEX, 8, cam16, H, W)[:2]
 
     def near_far(self, depth):
         B, V = depth.shape[:2]
@@ -241,22 +246,18 @@ class World:
         hi = torch.where(same, hi.amax(1, keepdim=True), hi)
         return 1.0 / hi, 1.0 / lo
 
-    def photo(self, rgb, V):
+    def photo(self, images, targets):
         """What cameras do: slight blur, exposure and white balance for each view, noise."""
-        B, N = rgb.shape[:2]
+        B, V = images.shape[:2]
         s = self.u(B, lo=0.0, hi=0.28) * self.coin(B, p=0.7)
         k1 = torch.stack([s, 1 - 2 * s, s], -1)
         k = (k1[:, :, None] * k1[:, None, :])[:, None]
-        x = rgb.reshape(B, N * 3, *rgb.shape[-2:])
-        pad = F.pad(x, (1, 1, 1, 1), mode="replicate")
-        out = sum(pad[..., i : i + x.shape[-2], j : j + x.shape[-1]] * k[:, :, i, j, None, None] for i in range(3) for j in range(3))
-        rgb = out.reshape_as(rgb)
         on = self.coin(B, 1, 1, p=0.7).float()
         gain = torch.exp((self.n(B, V, 1) * 0.035 + self.n(B, V, 3) * 0.01) * on)
-        gain = torch.cat([gain, gain.mean(1, keepdim=True).expand(-1, N - V, -1)], 1)
-        rgb = rgb * gain[..., None, None]
-        noise = torch.randn(rgb[:, :V].shape, device=self.device, generator=self.gen) * self.u(B, 1, 1, 1, 1, hi=0.012)
-        return torch.cat([rgb[:, :V] + noise, rgb[:, V:]], 1).clamp(0, 1)
+        images = blurred(images, k) * gain[..., None, None]
+        targets = blurred(targets, k) * gain.mean(1, keepdim=True)[..., None, None]
+        noise = torch.randn(images.shape, device=self.device, generator=self.gen) * self.u(B, 1, 1, 1, 1, hi=0.012)
+        return (images + noise).clamp(0, 1), targets.clamp(0, 1)
 
     def rig(self, B, V, T, H, W, b, focus, wide):
         N = V + T
@@ -399,6 +400,13 @@ class World:
     def rot_y(self, a):
         c, s, o, z = torch.cos(a), torch.sin(a), torch.ones_like(a), torch.zeros_like(a)
         return torch.stack([c, z, s, z, o, z, -s, z, c], -1).reshape(*a.shape, 3, 3)
+
+
+def blurred(rgb, k):
+    """Pictures [B,N,3,H,W] under one 3x3 kernel [B,1,3,3] for each scene."""
+    h, w = rgb.shape[-2:]
+    pad = F.pad(rgb.flatten(1, 2), (1, 1, 1, 1), mode="replicate")
+    return sum(pad[..., i : i + h, j : j + w] * k[:, :, i, j, None, None] for i in range(3) for j in range(3)).reshape_as(rgb)
 
 
 def quat_to_rot(q):

@@ -8,4 +8,4 @@ setsid python3 train_text.py --pack "$1" --out /tmp/out --seconds 0 --init "$1/t
   >/tmp/out/text.log 2>&1 </dev/null &
 python3 -c "import views; views.extension()" >/tmp/out/raycast.log 2>&1 || { cat /tmp/out/raycast.log; exit 1; }
 setsid python3 -m torch.distributed.run --nproc-per-node 1 train_words.py --pack "$1" --out /tmp/out --seconds $(($2 - 60)) --lr 2e-4 \
-  --init "$1/words.pt" --space "$1/space.pt" --back "$3" --look "$1/crops.pt" >/tmp/out/words.log 2>&1 </dev/null &
+  --init "$1/words.pt" --space "$1/space.pt" --back "$3" >/tmp/out/words.log 2>&1 </dev/null &

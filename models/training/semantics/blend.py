@@ -11,9 +11,9 @@ import argparse
 
 import torch
 
-from export import fold, state, write
+from export import state, write
 from naming import Bundle
-from train_real import folded
+from towers import fold, folded
 from words_model import SIDE, ImageTower
 
 

@@ -8,7 +8,6 @@ Runtime folds the two when it opens the file, so nothing is slower. Prints the p
 """
 import argparse
 import hashlib
-import json
 import os
 import shutil
 
@@ -19,32 +18,10 @@ import torch
 from onnx import helper, numpy_helper
 
 from masks_model import MaskNet
+from towers import fold
 from words_model import CONTEXT, SIDE, ImageTower, TextTower
 
 MASK_SIDE = 512
-
-
-def fold(module):
-    """Batch norm folded into the convolution before it: what ONNX Runtime would do at each start."""
-    for child in module.modules():
-        names = dict(child.named_children())
-        for conv, bn in [("_conv_stem", "_bn0"), ("_conv_head", "_bn1"), ("_expand_conv", "_bn0"), ("_depthwise_conv", "_bn1"), ("_project_conv", "_bn2")]:
-            if conv in names and bn in names and isinstance(names[bn], torch.nn.BatchNorm2d):
-                _fold(names[conv], names[bn])
-                setattr(child, bn, torch.nn.Identity())
-        if isinstance(child, torch.nn.Sequential):
-            for i in range(len(child) - 1):
-                if isinstance(child[i], torch.nn.Conv2d) and isinstance(child[i + 1], torch.nn.BatchNorm2d):
-                    _fold(child[i], child[i + 1])
-                    child[i + 1] = torch.nn.Identity()
-    return module
-
-
-def _fold(conv, bn):
-    k = bn.weight / torch.sqrt(bn.running_var + bn.eps)
-    bias = bn.bias - bn.running_mean * k + (conv.bias * k if conv.bias is not None else 0)
-    conv.weight.data = conv.weight.data * k[:, None, None, None]
-    conv.bias = torch.nn.Parameter(bias.detach())
 
 
 def small(path, least=2048):

@@ -16,7 +16,7 @@ import numpy as np
 import onnxruntime as ort
 from PIL import Image
 
-from train_real import decode
+from pictures import decode
 
 SIDE, GRID, LEAST = 512, 128, 0.4
 

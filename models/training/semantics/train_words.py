@@ -9,12 +9,10 @@ threshold (the nearest canon phrase), true and open words by WordNet; EfficientN
 the uncut picture; and the turned space must keep what is near what in MiniLM's.
 """
 import argparse
-import io
 import json
 import math
 import os
 import time
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
@@ -25,29 +23,21 @@ from PIL import Image
 
 from colours import dominant_colour
 from lite import Lite2
+from losses import Steps, imagined, imagined_loss, mean_of, opinion_loss, saved, which_name, which_words
 from minilm import MiniLM, embed_all
+from pictures import POOL, decode, letterbox
+from towers import normalised
 from views import KIND, Rooms, extension, join, regions
 from words_model import SIDE, SPACE, ImageTower
 
 STORE = 192
+IMAGINED = 384  # features of EfficientNet-Lite2's classes, a step
 NOTHING = "wall floor ceiling box ball table frame board panel picture cloth plate bar divider partition shelf cube sphere cylinder pole carpet rug curtain".split()
-
-
-def letterbox(img, size):
-    """A picture in the middle of a black square; with it which pixels are the picture."""
-    k = size / max(img.size)
-    small = img.resize((max(1, round(img.width * k)), max(1, round(img.height * k))), Image.BILINEAR)
-    out = Image.new("RGB", (size, size))
-    out.paste(small, ((size - small.width) // 2, (size - small.height) // 2))
-    return np.asarray(out)
 
 
 def photographs(path):
     z = np.load(path)
-    blob, off = z["blob"].tobytes(), z["offsets"]
-    with ThreadPoolExecutor(16) as pool:
-        pics = list(pool.map(lambda i: letterbox(Image.open(io.BytesIO(blob[off[i] : off[i + 1]])).convert("RGB"), STORE), range(len(off) - 1)))
-    return np.stack(pics), z["label"], z["source"]
+    return np.stack(list(POOL.map(lambda a: letterbox(a, STORE, Image.BILINEAR), decode(z)))), z["label"], z["source"]
 
 
 def segments(data, part, words):
@@ -69,9 +59,9 @@ def segments(data, part, words):
                 c = words["person"]
             ys, xs = np.nonzero(mask)
             y0, y1, x0, x1 = ys.min(), ys.max() + 1, xs.min(), xs.max() + 1
-            crop = Image.fromarray(rgb[y0:y1, x0:x1])
-            m = Image.fromarray((mask[y0:y1, x0:x1] * 255).astype(np.uint8)).convert("RGB")
-            pics.append(np.concatenate([letterbox(crop, STORE), letterbox(m, STORE)[..., :1]], -1))
+            m = np.repeat((mask[y0:y1, x0:x1, None] * 255).astype(np.uint8), 3, -1)  # not RGBA: alpha would weigh the colours
+            crop, m = (letterbox(a, STORE, Image.BILINEAR) for a in (rgb[y0:y1, x0:x1], m))
+            pics.append(np.concatenate([crop, m[..., :1]], -1))
             label.append(c)
     return np.stack(pics), np.array(label)
 
@@ -226,38 +216,116 @@ class Pictures:
         return y[:, :3], self.ragged_edge(y[:, 3:], 0.05), torch.stack(cls)
 
 
-def normalised(x):
-    return (x * 255 - 127) / 128
+class Network(nn.Module):
+    """The tower and the space, and all that a step asks of them."""
+
+    def __init__(self, tower, space, words, fc):
+        super().__init__()
+        self.both, self.words, self.fc = nn.ModuleDict({"tower": tower, "space": space}), words, [fc]  # a list: `fc` is not trained
+
+    def forward(self, x):
+        """Of pictures: embeddings, those of imagined features and their classes, EfficientNet-Lite2's logits of the features;
+        the words and the canon in the space, the two scales."""
+        tower, space, fc = self.both["tower"], self.both["space"], self.fc[0]
+        with torch.autocast(KIND, dtype=torch.bfloat16):
+            features = tower.body.head(x)
+            f = tower.embed(features)
+            made, of = imagined(tower.embed, features, fc, IMAGINED)
+            said = fc(features).float()
+        return f, made, of, said, space(self.words.words), F.normalize(space.canon, dim=-1), space.scale.exp()
 
 
-def main():
-    ap = argparse.ArgumentParser()
-    ap.add_argument("--pack", required=True)
-    ap.add_argument("--out", required=True)
-    ap.add_argument("--seconds", type=float, required=True)
-    ap.add_argument("--init", help="words.pt of an earlier run; with it the space is that run's and stays")
-    ap.add_argument("--space", help="space.pt of that run")
-    ap.add_argument("--back", type=float, default=0.0, help="share of the way back from --init to EfficientNet-Lite2 where the run starts")
-    ap.add_argument("--look", help="uint8 crops [K,3,S,S] (torch.save) to show words of, never trained on")
-    ap.add_argument("--lr", type=float, default=4e-4)
-    ap.add_argument("--batch", type=int, nargs=3, default=[160, 64, 48])
-    args = ap.parse_args()
-    rank, world, device = join()
-    torch.manual_seed(50 + rank)
-    torch.backends.cuda.matmul.allow_tf32 = True
-    torch.backends.cudnn.benchmark = True
-    start = time.time()
-    words = Words(args.pack, device)
-    rooms = Rooms(extension(), args.pack, device, 500 + rank)
-    pictures = Pictures(args.pack, words, device, 600 + rank, rooms)
-    held = None
-    if rank == 0:
-        pics, label, _ = photographs(os.path.join(args.pack, "photos_held.npz"))
-        seg, seg_class = segments(args.pack, "heldout", words.data)
-        held = (torch.from_numpy(pics).to(device), torch.from_numpy(label).long().to(device), torch.from_numpy(seg).to(device), torch.from_numpy(seg_class).long().to(device))
-    teacher = Lite2().load(os.path.join(args.pack, "lite2.pt")).to(device).eval().to(memory_format=torch.channels_last)
-    tower = ImageTower()
+def losses(words, pictures, opinion, out, is_cut, near):
+    """All, names, words, EfficientNet-Lite2's opinion, nearness. `pictures`: what the tower sees, masks, classes; `near`: the words as they
+    were near to one another in MiniLM's space."""
+    x, keep, cls = pictures
+    f, made, of, said, text, canon, scale = out
+    named, want, cos = cls != words.nothing, words.own_of[cls.clamp(max=words.nothing - 1)], f @ text.T
+    ce = mean_of(which_name(cos, want, words.truth[cls], words.own_words, scale[0]), named)
+    margin = (cos - (f @ canon.T).amax(1, keepdim=True)) * scale[1].clamp(max=40)
+    truth = words.truth[cls].clone()
+    truth[:, words.colours] = torch.where(is_cut[:, None], dominant_colour(x, keep), -1).to(truth.dtype)
+    bce = which_words(margin, truth, words.own_words[want]).mean()
+    kd = (opinion_loss(scale[0] * cos[:, words.thousand], opinion) * torch.where(is_cut, 0.3, 1.0)).mean()
+    # The features stay what the teacher's last matrix can read, and its classes keep their names.
+    kd = kd + 0.5 * opinion_loss(said / 1.5, opinion).mean()
+    unreal = imagined_loss(made, of, text[words.thousand], canon, scale)
+    # What was near stays near.
+    pick = torch.randint(0, len(text), (768,), device=text.device)
+    keep_near = ((text[pick] @ text[pick].T - near[pick] @ near[pick].T) ** 2).mean()
+    return ce + bce + 0.7 * kd + 0.4 * unreal + 8 * keep_near, ce, bce, kd, keep_near
+
+
+class Held:
+    """Held-out photographs, whole and under a blob, and drawn segments; figures of the mean weights of a network."""
+
+    def __init__(self, pack, words, teacher, device):
+        pics, label, _ = photographs(os.path.join(pack, "photos_held.npz"))
+        seg, seg_class = segments(pack, "heldout", words.data)
+        sized = lambda a: F.interpolate(torch.from_numpy(a).to(device).permute(0, 3, 1, 2).float() / 255, (SIDE, SIDE), mode="bilinear")
+        x, y = sized(pics), sized(seg)
+        label, seg_class = (torch.from_numpy(c).long().to(device) for c in (label, seg_class))
+        blob = blobs(len(x), SIDE, torch.Generator(device=device).manual_seed(3), device)
+        self.sets = {"photos": (x, torch.ones_like(x[:, :1]), label), "photos cut": (x, blob, label), "segments": (y[:, :3], (y[:, 3:] > 0.5).float(), seg_class)}
+        self.words, self.teacher = words, teacher
+        self.named = torch.arange(len(words.words), device=device) < words.data["named"]
+
+    @torch.no_grad()
+    def figures(self, network, mean):
+        """Of each set: the first and the first five of all names, what is found; `untrained`: by the teacher's ten likeliest names."""
+        both = network.both
+        live = {k: v.clone() for k, v in both.state_dict().items()}
+        both.load_state_dict(mean)
+        both.eval()
+        text, canon = both["space"](self.words.words), F.normalize(both["space"].canon, dim=-1)
+        out = {k: self.of_set(both["tower"], text, canon, *v) for k, v in self.sets.items()}
+        both.load_state_dict(live)
+        return out
+
+    def of_set(self, tower, text, canon, x, keep, cls):
+        w = self.words
+        parts = [normalised(a * m) for a, m in zip(x.split(256), keep.split(256))]
+        with torch.autocast(KIND, dtype=torch.bfloat16):
+            f = torch.cat([tower(a) for a in parts])
+            p = torch.cat([self.teacher._fc(self.teacher.head(a)).float() for a in parts]).softmax(-1)
+        top, at = p.topk(10, -1)
+        raw = F.normalize((top[..., None] * w.words[w.thousand][at]).sum(1), dim=-1)
+        want = w.own_of[cls]
+        rank_of = lambda s: (s > s.gather(1, want[:, None])).sum(1)
+        mine, theirs = rank_of(f @ text[w.own_words].T), rank_of(raw @ w.words[w.own_words].T)
+        z = f @ text.T - (f @ canon.T).amax(1, keepdim=True)
+        raw_z = raw @ w.words.T - (raw @ w.canon.T).amax(1, keepdim=True)
+        truth, first = w.truth[cls], lambda rank, k: round(float((rank < k).float().mean()), 3)
+        share = lambda z_, v: round(float((z_ >= 0)[(truth == v) & self.named].float().mean()), 3)
+        return {
+            "top1": first(mine, 1), "top5": first(mine, 5), "untrained": [first(theirs, 1), first(theirs, 5)],
+            "own found": round(float((z.gather(1, w.own_words[want][:, None]) >= 0).float().mean()), 3),
+            "true found": share(z, 1), "false found": share(z, 0), "untrained found": [share(raw_z, 1), share(raw_z, 0)],
+        }
+
+
+class Run:
+    """One process of a run: its device, its log."""
+
+    def __init__(self, args):
+        self.args, self.start = args, time.time()
+        self.rank, _, self.device = join()
+        os.makedirs(args.out, exist_ok=True)
+        self.log = open(os.path.join(args.out, f"words{self.rank}.jsonl"), "w")
+
+    def tell(self, *what):
+        if self.rank == 0:
+            print(*what, flush=True)
+
+    def note(self, **row):
+        self.log.write(json.dumps(row) + "\n")
+        self.log.flush()
+
+
+def begun(args, words):
+    """The tower and the space that a run begins with: EfficientNet-Lite2 and the untrained scoring, or --init."""
     state = torch.load(os.path.join(args.pack, "lite2.pt"), map_location="cpu")
+    tower, space = ImageTower(), Space(words)
     tower.body.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items() if not k.startswith("_fc")})
     # Start where the untrained scoring is: the features that vote for a name point at the name.
     with torch.no_grad():
@@ -265,180 +333,112 @@ def main():
         fc = state["_fc.weight"].float()
         tower.out.weight.copy_((names.T @ (fc - fc.mean(0))) / 60)
         tower.out.bias.zero_()
-    space = Space(words)
     if args.init:
-        begun = {k[6:]: v.float() if v.is_floating_point() else v for k, v in torch.load(args.init, map_location="cpu").items()}
+        init = {k[6:]: v.float() if v.is_floating_point() else v for k, v in torch.load(args.init, map_location="cpu").items()}
         first = tower.state_dict()
-        tower.load_state_dict({k: v + args.back * (first[k] - v) if v.is_floating_point() else v for k, v in begun.items()})
-        space.load_state_dict(torch.load(args.space, map_location=device))
+        tower.load_state_dict({k: v + args.back * (first[k] - v) if v.is_floating_point() else v for k, v in init.items()})
+        space.load_state_dict(torch.load(args.space, map_location=words.words.device))
         space.turn.requires_grad_(False)
         space.canon.requires_grad_(False)
-    fc = teacher.requires_grad_(False)._fc
-    both = nn.ModuleDict({"tower": tower, "space": space}).to(device)
+    return tower, space
 
-    class All(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.both = both
 
-        def forward(self, x):
-            with torch.autocast(KIND, dtype=torch.bfloat16):
-                features = self.both["tower"].body.head(x)
-                f = self.both["tower"].embed(features)
-                # Features as EfficientNet-Lite2 would have of each of its thousand classes: pictures of
-                # most of them are not here, what it knows of them is in its last matrix.
-                n = torch.randint(0, 1000, (384,), device=x.device)
-                base = features.detach()[torch.randint(0, len(features), (384,), device=x.device)].float()
-                push = 6 + 8 * torch.rand(384, 1, device=x.device)
-                made = (0.6 * base + push * fc.weight[n] / fc.weight[n].square().sum(1, keepdim=True)).clamp(min=0)
-                g = self.both["tower"].embed(made)
-                said = fc(features).float()
-            return f, g, n, said, self.both["space"](words.words), F.normalize(self.both["space"].canon, dim=-1), self.both["space"].scale.exp()
+def load(run):
+    """Words, pictures, the held-out sets (of the first process), the teacher, the network."""
+    args, device = run.args, run.device
+    words = Words(args.pack, device)
+    rooms = Rooms(extension(), args.pack, device, 500 + run.rank)
+    pictures = Pictures(args.pack, words, device, 600 + run.rank, rooms)
+    teacher = Lite2().load(os.path.join(args.pack, "lite2.pt")).to(device).eval().requires_grad_(False).to(memory_format=torch.channels_last)
+    held = Held(args.pack, words, teacher, device) if run.rank == 0 else None
+    network = Network(*begun(args, words), words, teacher._fc).to(device).to(memory_format=torch.channels_last)
+    run.tell("ready", round(time.time() - run.start, 1), "photos", len(pictures.photos), "segments", len(pictures.segments))
+    return words, pictures, held, teacher, network
 
-    net = All().to(memory_format=torch.channels_last)
-    ema = {k: v.detach().clone() for k, v in both.state_dict().items()}
-    live = [v for v in both.state_dict().values() if v.is_floating_point()]
-    kept = [ema[k] for k, v in both.state_dict().items() if v.is_floating_point()]
-    heads = [p for n, p in both.named_parameters() if not n.startswith("tower.body")]
-    heads = [p for p in heads if p.requires_grad]
-    opt = torch.optim.AdamW([{"params": list(tower.body.parameters()), "k": 0.5, "weight_decay": 0.03}, {"params": heads, "k": 2.0, "weight_decay": 0.0}], lr=args.lr, betas=(0.9, 0.99))
-    model = torch.nn.parallel.DistributedDataParallel(net, device_ids=[device.index] if device.type == "cuda" else None, broadcast_buffers=False)
-    os.makedirs(args.out, exist_ok=True)
-    log = open(os.path.join(args.out, f"words{rank}.jsonl"), "w")
-    centred = F.normalize(words.words - words.words.mean(0), dim=-1)
-    if rank == 0 and args.init:
-        print("from", args.init, "back", args.back, flush=True)
-    if rank == 0:
-        print("ready", round(time.time() - start, 1), "photos", len(pictures.photos), "segments", len(pictures.segments), flush=True)
-    begin, step, sums, n, done, next_eval = time.time(), 0, torch.zeros(6, device=device), 0, False, 0.4
 
-    @torch.no_grad()
-    def evaluate(tag):
-        keep = {k: v.clone() for k, v in both.state_dict().items()}
-        both.load_state_dict(ema)
-        both.eval()
-        t, canon = space(words.words), F.normalize(space.canon, dim=-1)
-        own = t[words.own_words]
-        out = {}
+def steps_of(network, lr):
+    heads = [p for n, p in network.both.named_parameters() if not n.startswith("tower.body") and p.requires_grad]
+    return Steps(network.both, [{"params": list(network.both["tower"].body.parameters()), "k": 0.5, "weight_decay": 0.03}, {"params": heads, "k": 2.0, "weight_decay": 0.0}],
+                 lr, 200, 0.9985)
 
-        def run(x, keep_mask, cls, name):
-            with torch.autocast(KIND, dtype=torch.bfloat16):
-                f = torch.cat([tower(normalised(a * m)) for a, m in zip(x.split(256), keep_mask.split(256))])
-                p = torch.cat([teacher._fc(teacher.head(normalised(a * m))).float() for a, m in zip(x.split(256), keep_mask.split(256))]).softmax(-1)
-            top, at = p.topk(10, -1)
-            raw = F.normalize((top[..., None] * words.words[words.thousand][at]).sum(1), dim=-1)
-            want = words.own_of[cls]
-            rank_of = lambda s: (s > s.gather(1, want[:, None])).sum(1)
-            mine, theirs = rank_of(f @ own.T), rank_of(raw @ words.words[words.own_words].T)
-            z = f @ t.T - (f @ canon.T).amax(1, keepdim=True)
-            truth = words.truth[cls]
-            raw_z = raw @ words.words.T - (raw @ words.canon.T).amax(1, keepdim=True)
-            named = torch.arange(len(words.words), device=device) < words.data["named"]
-            share = lambda z_, v: round(float((z_ >= 0)[(truth == v) & named].float().mean()), 3)
-            out[name] = {
-                "top1": round(float((mine < 1).float().mean()), 3), "top5": round(float((mine < 5).float().mean()), 3),
-                "untrained": [round(float((theirs < k).float().mean()), 3) for k in (1, 5)],
-                "own found": round(float((z.gather(1, words.own_words[want][:, None]) >= 0).float().mean()), 3),
-                "true found": share(z, 1), "false found": share(z, 0), "untrained found": [share(raw_z, 1), share(raw_z, 0)],
-            }
 
-        x = F.interpolate(held[0].permute(0, 3, 1, 2).float() / 255, (SIDE, SIDE), mode="bilinear")
-        run(x, torch.ones_like(x[:, :1]), held[1], "photos")
-        g = torch.Generator(device=device).manual_seed(3)
-        run(x, blobs(len(x), SIDE, g, device), held[1], "photos cut")
-        y = F.interpolate(held[2].permute(0, 3, 1, 2).float() / 255, (SIDE, SIDE), mode="bilinear")
-        run(y[:, :3], (y[:, 3:] > 0.5).float(), held[3], "segments")
-        print(tag, json.dumps(out), flush=True)
-        log.write(json.dumps({"step": step, "held": out}) + "\n")
-        log.flush()
-        if args.look:
-            crops = torch.load(args.look, map_location=device).float() / 255
-            with torch.autocast(KIND, dtype=torch.bfloat16):
-                f = tower(normalised(crops))
-            for i, row in enumerate(f.float()):
-                score = t[: words.data["named"]] @ row
-                print(i, f"canon {float((canon @ row).max()):.2f}", [(words.data["words"][j], round(float(score[j]), 2)) for j in score.topk(7).indices.tolist()], flush=True)
-        both.load_state_dict(keep)
+def over(seconds, begin, device):
+    """The share of the run that is over, and whether the first process says that it is all."""
+    t = (time.time() - begin) / seconds
+    stop = torch.tensor([float(t >= 1)], device=device)
+    dist.broadcast(stop, 0)
+    return t, bool(stop.item())
 
-    if rank == 0 and args.init:
-        evaluate("start")
-    begin = time.time()
+
+def train(run, words, pictures, teacher, network, steps, measured):
+    args, device = run.args, run.device
+    model = nn.parallel.DistributedDataParallel(network, device_ids=[device.index] if device.type == "cuda" else None, broadcast_buffers=False)
+    near = F.normalize(words.words - words.words.mean(0), dim=-1)
+    is_cut = torch.arange(sum(args.batch), device=device) >= args.batch[0]
+    begin, sums, n, done, next_mark = time.time(), torch.zeros(6, device=device), 0, False, 0.4
     while not done:
-        t = (time.time() - begin) / args.seconds
-        stop = torch.tensor([float(t >= 1)], device=device)
-        dist.broadcast(stop, 0)
-        done = bool(stop.item())
-        for group in opt.param_groups:
-            group["lr"] = args.lr * group["k"] * min(1, (step + 1) / 200) * (0.02 + 0.98 * (0.5 + 0.5 * math.cos(math.pi * min(t, 1))))
-        both.train()
+        t, done = over(args.seconds, begin, device)
+        network.both.train()
         x, keep, cls = pictures.batch(*args.batch)
         with torch.no_grad(), torch.autocast(KIND, dtype=torch.bfloat16):
-            opinion = teacher._fc(teacher.head(normalised(x).contiguous(memory_format=torch.channels_last))).float()
-        f, g, made_of, said, tw, canon, scale = model(normalised(x * keep).contiguous(memory_format=torch.channels_last))
-        named = cls != words.nothing
-        cos = f @ tw.T
-        # 1: which of the names.
-        want = words.own_of[cls.clamp(max=words.nothing - 1)]
-        ce_logits = scale[0] * cos[:, words.own_words]
-        other = words.truth[cls][:, words.own_words] != 0
-        other = other & ~F.one_hot(want, len(words.own_words)).bool()
-        ce = F.cross_entropy(ce_logits.masked_fill(other, -1e4), want, reduction="none", label_smoothing=0.0)
-        ce = (ce * named).sum() / named.sum()
-        # 2: the product's own question, for every word.
-        margin = (cos - (f @ canon.T).amax(1, keepdim=True)) * scale[1].clamp(max=40)
-        truth = words.truth[cls].clone()
-        colour = dominant_colour(x, keep)
-        is_cut = torch.arange(len(cls), device=device) >= args.batch[0]
-        truth[:, words.colours] = torch.where(is_cut[:, None], colour, -1).to(truth.dtype)
-        pos, neg = (truth == 1).float(), (truth == 0).float()
-        # Half of what is true is the name itself, half what it is a kind of.
-        itself = F.one_hot(words.own_words[want], pos.shape[1]) * named[:, None] * pos
-        rest = pos - itself
-        p_loss = F.softplus(-margin) * (itself + rest / rest.sum(1, keepdim=True).clamp(min=1))
-        p_loss = p_loss.sum(1) / 2
-        # Thousands of words are false of a picture: those that come near count most.
-        near = neg * (margin.detach().sigmoid() + 0.01)
-        n_loss = (F.softplus(margin) * near).sum(1) / near.sum(1).clamp(min=1e-3)
-        bce = (2 * p_loss + 1.5 * n_loss).mean()
-        # 3: the teacher's opinion of the whole picture.
-        kd = F.kl_div((scale[0] * cos[:, words.thousand]).log_softmax(-1), (opinion / 1.5).softmax(-1), reduction="none").sum(-1)
-        kd = (kd * torch.where(is_cut, 0.3, 1.0)).mean()
-        # The features stay what the teacher's last matrix can read, and its classes keep their names.
-        kd = kd + 0.5 * F.kl_div((said / 1.5).log_softmax(-1), (opinion / 1.5).softmax(-1), reduction="none").sum(-1).mean()
-        made_cos = g @ tw[words.thousand].T
-        made_margin = made_cos.gather(1, made_of[:, None])[:, 0] - (g @ canon.T).amax(1)
-        made_loss = F.cross_entropy(scale[0] * made_cos, made_of) + F.softplus(-made_margin * scale[1].clamp(max=40)).mean()
-        # 4: what was near stays near.
-        pick = torch.randint(0, len(tw), (768,), device=device)
-        keep_near = ((tw[pick] @ tw[pick].T - centred[pick] @ centred[pick].T) ** 2).mean()
-        loss = ce + bce + 0.7 * kd + 0.4 * made_loss + 8 * keep_near
-        opt.zero_grad(set_to_none=True)
-        loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(both.parameters(), 2.0)
-        if torch.isfinite(norm):
-            opt.step()
-        with torch.no_grad():
-            d = min(0.9985, (step + 1) / (step + 10))
-            torch._foreach_lerp_(kept, live, 1 - d)
-        sums += torch.stack([loss.detach(), ce.detach(), bce.detach(), kd.detach(), keep_near.detach(), scale[0].detach()])
+            opinion = teacher._fc(teacher.head(normalised(x))).float()
+        out = model(normalised(x * keep))
+        parts = losses(words, (x, keep, cls), opinion, out, is_cut, near)
+        steps.take(parts[0], t)
+        sums += torch.stack([p.detach() for p in (*parts, out[-1][0])])
         n += 1
-        step += 1
-        if step % 200 == 0 and rank == 0:
+        if steps.step % 200 == 0:
             s = (sums / n).tolist()
-            print(f"words step {step} {time.time() - begin:.0f}s loss {s[0]:.3f} ce {s[1]:.3f} bce {s[2]:.3f} kd {s[3]:.3f} near {s[4]:.4f} scale {s[5]:.1f}", flush=True)
-            log.write(json.dumps({"step": step, "seconds": round(time.time() - begin, 1), "losses": [round(v, 4) for v in s]}) + "\n")
+            run.tell(f"words step {steps.step} {time.time() - begin:.0f}s loss {s[0]:.3f} ce {s[1]:.3f} bce {s[2]:.3f} kd {s[3]:.3f} near {s[4]:.4f} scale {s[5]:.1f}")
+            run.note(step=steps.step, seconds=round(time.time() - begin, 1), losses=[round(v, 4) for v in s])
             sums.zero_()
             n = 0
-        if t > next_eval:
-            next_eval += 0.7
-            if rank == 0:
-                evaluate(f"at {t:.2f}")
-    if rank == 0:
-        evaluate("end")
-        torch.save({k: v.half().cpu() for k, v in ema.items() if k.startswith("tower.")}, os.path.join(args.out, "words.pt"))
-        torch.save({k[6:]: v.cpu() for k, v in ema.items() if k.startswith("space.")}, os.path.join(args.out, "space.pt.tmp"))
-        os.rename(os.path.join(args.out, "space.pt.tmp"), os.path.join(args.out, "space.pt"))
-        print("words trained", step, flush=True)
+        if t > next_mark:
+            next_mark += 0.7
+            measured(f"at {t:.2f}")
+
+
+def write(out, mean):
+    """The tower in half precision; the space whole, under its name once all is there: the text tower's training waits for it."""
+    saved({k: v for k, v in mean.items() if k.startswith("tower.")}, os.path.join(out, "words.pt"))
+    path = os.path.join(out, "space.pt")
+    torch.save({k[6:]: v.cpu() for k, v in mean.items() if k.startswith("space.")}, path + ".tmp")
+    os.rename(path + ".tmp", path)
+
+
+def arguments():
+    ap = argparse.ArgumentParser()
+    ap.add_argument("--pack", required=True)
+    ap.add_argument("--out", required=True)
+    ap.add_argument("--seconds", type=float, required=True)
+    ap.add_argument("--init", help="words.pt of an earlier run; with it the space is that run's and stays")
+    ap.add_argument("--space", help="space.pt of that run")
+    ap.add_argument("--back", type=float, default=0.0, help="share of the way back from --init to EfficientNet-Lite2 where the run starts")
+    ap.add_argument("--lr", type=float, default=4e-4)
+    ap.add_argument("--batch", type=int, nargs=3, default=[160, 64, 48], help="photographs, drawn segments, cut-outs of rooms")
+    return ap.parse_args()
+
+
+def main():
+    run = Run(arguments())
+    torch.manual_seed(50 + run.rank)
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.benchmark = True
+    words, pictures, held, teacher, network = load(run)
+    steps = steps_of(network, run.args.lr)
+
+    def measured(tag):
+        if held:
+            figures = held.figures(network, steps.mean)
+            run.tell(tag, json.dumps(figures))
+            run.note(step=steps.step, held=figures)
+
+    if run.args.init:
+        measured("start")
+    train(run, words, pictures, teacher, network, steps, measured)
+    measured("end")
+    if run.rank == 0:
+        write(run.args.out, steps.mean)
+    run.tell("words trained", steps.step)
     dist.barrier()
     dist.destroy_process_group()
 

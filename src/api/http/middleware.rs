@@ -58,6 +58,11 @@ impl Transport {
         }
     }
 
+    /// How this request is answered: over HTTP where it comes to gRPC but does not speak it.
+    fn answers(self, request: &Request) -> Self {
+        if is_grpc(request.headers()) { self } else { Self::Http }
+    }
+
     fn deadline(self, request: &Request) -> Result<Option<Duration>> {
         match self {
             Self::Http => deadline_of_query(request.uri().query()),
@@ -109,24 +114,25 @@ async fn within(
     let path = request.uri().path().to_owned();
     let as_problem = asks_for_problem(text_of(request.headers(), "accept"));
     let (mut request, too_slow) = pace.watch(request);
+    let answers = transport.answers(&request);
     let allowed = access.check_hosts(hosts_of(&request));
     let mut response = match allowed.and_then(|()| transport.deadline(&request)) {
-        Err(error) => transport.refusal(error),
+        Err(error) => answers.refusal(error),
         Ok(deadline) => {
             request.extensions_mut().insert(Deadline(deadline));
             match deadline {
                 None => next.run(request).await,
                 Some(max) => {
                     let answered = tokio::time::timeout(max, next.run(request)).await;
-                    answered.unwrap_or_else(|_| transport.refusal(deadline_passed(max)))
+                    answered.unwrap_or_else(|_| answers.refusal(deadline_passed(max)))
                 }
             }
         }
     };
     if too_slow.load(Ordering::Acquire)
-        && (transport == Transport::Grpc || !response.status().is_success())
+        && (answers == Transport::Grpc || !response.status().is_success())
     {
-        response = transport.refusal(pace.error());
+        response = answers.refusal(pace.error());
     }
     let call = match transport {
         Transport::Grpc => {
@@ -148,7 +154,7 @@ async fn within(
     meter::answered(transport.name(), call, code, took);
     if let Some(error) = error {
         log_error(error.error(), Some(ms));
-        if transport == Transport::Http {
+        if answers == Transport::Http {
             response = error.write(response, id, &path, as_problem);
         }
     } else {
@@ -161,28 +167,25 @@ async fn within(
     response
 }
 
-/// Around each HTTP route: checks origin and key, and says which call it is.
+/// Around each HTTP route: [`admit`], and says which call it is.
 pub(super) async fn http_guard(
     State((api, call, scope)): State<(Api, &'static str, Option<Scope>)>,
     request: Request,
     next: Next,
 ) -> Response {
-    let checked = scope.map_or(Ok(()), |_| check_origin(&api, &request));
-    let mut response = match checked {
-        Ok(()) => admit(&api, Transport::Http, scope, request, next).await,
-        Err(error) => Transport::Http.refusal(error),
-    };
+    let mut response = admit(&api, Transport::Http, scope, request, next).await;
     response.extensions_mut().insert(Call(call));
     response
 }
 
-/// Around each gRPC call: checks the key.
+/// Around each gRPC call: [`admit`].
 pub(super) async fn grpc_guard(State(api): State<Api>, request: Request, next: Next) -> Response {
     let (_, scope) = access::of_rpc(request.uri().path());
     admit(&api, Transport::Grpc, scope, request, next).await
 }
 
-/// Checks the key and counts the call as open, until the answer is sent.
+/// The guard of both doors: checks the origin, for gRPC the content type, and the key. Counts the
+/// call as open, until the answer is sent.
 async fn admit(
     api: &Api,
     transport: Transport,
@@ -190,6 +193,11 @@ async fn admit(
     mut request: Request,
     next: Next,
 ) -> Response {
+    let answers = transport.answers(&request);
+    let origin = scope.map_or(Ok(()), |_| check_origin(api, &request));
+    if let Err(error) = origin.and_then(|()| check_content_type(transport, request.headers())) {
+        return answers.refusal(error);
+    }
     let Some(scope) = scope else { return next.run(request).await };
     let admitted = api.drain.open_call().and_then(|call| {
         let shown = request.headers_mut().remove(header::AUTHORIZATION);
@@ -203,8 +211,19 @@ async fn admit(
     });
     match admitted {
         Ok(held) => hold(next.run(request).await, held),
-        Err(error) => transport.refusal(error),
+        Err(error) => answers.refusal(error),
     }
+}
+
+/// Lets only what says that it is gRPC come to a method of gRPC: a page of the web can send bytes
+/// of any other type without asking first.
+fn check_content_type(transport: Transport, headers: &HeaderMap) -> Result<()> {
+    if transport == Transport::Http || is_grpc(headers) {
+        return Ok(());
+    }
+    let given = text_of(headers, header::CONTENT_TYPE.as_str()).unwrap_or_default();
+    let message = format!("content-type is {:?}; it must be application/grpc", short(given));
+    Err(Error::new(ErrorCode::UnsupportedMediaType, message))
 }
 
 /// Every host that a call names: that of its target, which is `:authority` in HTTP/2, and those of
@@ -235,9 +254,12 @@ fn check_origin(api: &Api, request: &Request) -> Result<()> {
     Err(Error::new(ErrorCode::PermissionDenied, message))
 }
 
-/// Whether the caller speaks gRPC.
+/// Whether these are headers of gRPC: `application/grpc`, with a format behind a plus or without.
+/// gRPC-Web is not served.
 pub(super) fn is_grpc(headers: &HeaderMap) -> bool {
-    text_of(headers, "content-type").is_some_and(|value| value.starts_with("application/grpc"))
+    let kind = text_of(headers, header::CONTENT_TYPE.as_str()).unwrap_or_default();
+    let kind = kind.split([';', '+']).next().unwrap_or_default().trim();
+    kind.eq_ignore_ascii_case("application/grpc")
 }
 
 /// The value of a header, where it is text.

@@ -158,6 +158,9 @@ pub(super) struct RefineParams {
 }
 
 /// Refine a scene, or end its refinement
+///
+/// Takes gradient steps on the photos of a finished scene, which is served meanwhile. In gsplat and
+/// Brush "refine" means to densify and prune; that is not what this does.
 #[utoipa::path(
     post, path = "/v1/scenes/{id}/refine", operation_id = "refine_scene", tag = "scenes",
     params(Id, RefineParams),

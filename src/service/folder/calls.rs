@@ -13,40 +13,34 @@ use super::{Contents, Views, checked_texts, depth_of, masks_of, photo_views, wri
 use crate::{
     error::{Error, ErrorCode, Result},
     formats::{folders::FolderFormat, table::ExportFormat},
+    keys::Caller,
     limits::Limits,
     scene::{Preset, Scene, SceneId, Upload},
     service::{
         Inner, OfflineService, Service,
         create::blocking,
         export::stream_until,
-        request::{ScoringOptions, TextOptions},
-        schedule::Slot,
-        search::{SceneTexts, check_scoring},
-        semantics::{Understood, meaning_tag},
+        request::{ScoringOptions, TextOptions, ViewOptions},
+        schedule::Demand,
+        search::{SceneTexts, ScoringChoice},
+        tags::{cache_key, etag, semantics_tag},
         texts,
         types::{Export, ExportBody, TextView},
-        view::{Resolved, hash, words},
+        view::Resolved,
+        work::Work,
     },
 };
 
 /// When to ask again where folders are being written, seconds.
 const RETRY_AFTER_S: u32 = 5;
 
-/// Texts that are asked of a scene, and how they are scored.
-#[derive(Clone)]
-struct Texts {
-    understood: Understood,
-    texts: Vec<String>,
-    preset: Option<Preset>,
-    scoring: ScoringOptions,
-}
-
 /// Views of a server.
 struct Scheduled {
     inner: Arc<Inner>,
     runtime: Handle,
+    caller: Caller,
     scene: Arc<Scene>,
-    texts: Option<Texts>,
+    texts: Option<Arc<SceneTexts>>,
     until: Instant,
 }
 
@@ -54,12 +48,11 @@ impl Scheduled {
     /// Does `work` when it is the view's turn. Blocks.
     fn take_turn<T: Send + 'static>(
         &self,
-        view: &Resolved,
-        work: impl FnOnce(&mut Slot) -> Result<T> + Send + 'static,
+        demand: Demand,
+        work: impl FnOnce(&mut Work) -> Result<T> + Send + 'static,
     ) -> Result<T> {
-        let most = Duration::from_millis(self.inner.limits().render_timeout_ms);
-        let deadline = self.until.min(Instant::now() + most);
-        let turn = self.inner.scheduled(deadline, view.pixels(), "a view of the folder", work);
+        let deadline = self.until.min(self.inner.deadline(&ViewOptions::default()));
+        let turn = self.inner.scheduled(demand, deadline, "a view of the folder", work);
         self.runtime.block_on(turn)
     }
 }
@@ -67,21 +60,19 @@ impl Scheduled {
 impl Views for Scheduled {
     fn depth(&mut self, view: &Resolved) -> Result<Vec<f32>> {
         let (inner, scene, own) = (Arc::clone(&self.inner), Arc::clone(&self.scene), view.clone());
-        self.take_turn(view, move |slot| {
+        let demand = Demand::view(&self.caller, view.pixels());
+        self.take_turn(demand, move |work| {
             let depth = depth_of(&inner.backend, &scene, &own);
-            slot.drawn();
+            work.leave_renderer();
             depth
         })
     }
 
     fn masks(&mut self, view: &Resolved) -> Result<Vec<TextView>> {
-        let Some(asked) = self.texts.clone() else { return Ok(Vec::new()) };
-        let (inner, own) = (Arc::clone(&self.inner), view.clone());
-        self.take_turn(view, move |slot| {
-            let (of, how) = (asked.understood.subject(), (asked.preset, &asked.scoring));
-            let texts = SceneTexts::new(&inner.backend, of, how, &asked.texts)?;
-            masks_of(&texts, &inner.limits(), &own, || slot.drawn())
-        })
+        let Some(texts) = self.texts.clone() else { return Ok(Vec::new()) };
+        let (limits, own) = (self.inner.limits(), view.clone());
+        let demand = Demand::view(&self.caller, view.pixels()).with_texts(texts.texts.len(), 0);
+        self.take_turn(demand, move |work| masks_of(&texts, &limits, &own, work))
     }
 }
 
@@ -126,16 +117,15 @@ impl Service {
         let access = self.scene(id).await?.finished()?;
         let record = access.record();
         let views = photo_views(&limits, &record.status.cameras, record, preset, texts.len())?;
-        let (scene, texts) = if texts.is_empty() {
+        let (scene, scored) = if texts.is_empty() {
             let (inner, access) = (Arc::clone(&inner), access.clone());
             (blocking(move || inner.load(&access)).await??, None)
         } else {
-            let understood = inner.understood(&access, "text", ask.wait).await?;
-            let most = Instant::now() + Duration::from_millis(limits.render_timeout_ms);
-            inner.embed(&understood, (preset, &ask.scoring), &texts, most).await?;
-            let scoring = ask.scoring.clone();
-            let scene = Arc::clone(&understood.scene);
-            (scene, Some(Texts { understood, texts, preset, scoring }))
+            let of = inner.semantic_scene(&access, "text", ask.wait).await?;
+            let how = ScoringChoice { preset, changes: ask.scoring.clone() };
+            let deadline = inner.deadline(&ViewOptions::default());
+            let scored = inner.score(of, how, texts.clone(), deadline).await?;
+            (Arc::clone(&scored.of.scene), Some(scored))
         };
         // Not before: semantics can take minutes.
         let permit = inner.folder_permit()?;
@@ -144,25 +134,24 @@ impl Service {
             let (inner, id) = (Arc::clone(&inner), id.clone());
             blocking(move || inner.kept_upload(&id)).await??
         };
-        let asked = texts.as_ref().map(|asked| (&asked.texts, &asked.scoring));
-        let how = (meaning_tag(&scene), inner.backend.renderer.name(), preset, asked);
-        let etag = words(&(how, upload.is_some(), env!("CARGO_PKG_VERSION")))?;
-        let runtime = Handle::current();
+        let asked = scored.as_ref().map(|_| (&texts, &ask.scoring));
+        let how = (semantics_tag(&scene), inner.backend.renderer.name(), preset, asked);
+        let key = cache_key(&(how, upload.is_some(), env!("CARGO_PKG_VERSION")))?;
+        let (runtime, caller) = (Handle::current(), self.caller.clone());
         let write = move |to: &mut dyn Write| {
             let _permit = permit;
-            let asked = texts.as_ref().map_or(&[][..], |asked| &asked.texts).to_vec();
             let contents = Contents {
                 scene: &scene,
                 views,
                 upload: upload.as_ref(),
-                texts: &asked,
+                texts: &texts,
                 limits: &limits,
             };
             let scene = Arc::clone(&scene);
-            let mut views = Scheduled { inner, runtime, scene, texts, until };
+            let mut views = Scheduled { inner, runtime, caller, scene, texts: scored, until };
             write(folder, &contents, &mut views, to).map(drop)
         };
-        Ok(Export::new(hash(&etag), async move {
+        Ok(Export::new(etag(&key), async move {
             Ok(ExportBody { size_bytes: None, chunks: stream_until(Some(until), write) })
         }))
     }
@@ -172,7 +161,7 @@ impl Service {
 struct Alone<'a> {
     service: &'a OfflineService,
     scene: &'a Scene,
-    texts: Option<SceneTexts<'a>>,
+    texts: Option<SceneTexts>,
     limits: &'a Limits,
 }
 
@@ -183,7 +172,7 @@ impl Views for Alone<'_> {
 
     fn masks(&mut self, view: &Resolved) -> Result<Vec<TextView>> {
         let Some(texts) = &self.texts else { return Ok(Vec::new()) };
-        masks_of(texts, self.limits, view, || ())
+        masks_of(texts, self.limits, view, &mut Work::default())
     }
 }
 
@@ -195,21 +184,20 @@ impl OfflineService {
     /// As there; `semantics_off` for texts of a scene without semantics.
     pub fn folder(
         &self,
-        scene: &Scene,
+        scene: &Arc<Scene>,
         (format, folder): (ExportFormat, FolderFormat),
         (asked, preset, scoring): (&[String], Option<Preset>, &ScoringOptions),
         upload: Option<&Upload>,
         to: &mut dyn Write,
     ) -> Result<usize> {
         let limits = &self.limits;
-        check_scoring(scoring, limits)?;
+        texts::check_scoring(scoring, limits)?;
         let asked = checked_texts(format, asked, limits)?;
-        let views = photo_views(limits, &scene.meta.cameras, scene, preset, asked.len())?;
+        let views = photo_views(limits, &scene.meta.cameras, &**scene, preset, asked.len())?;
         let texts = if asked.is_empty() {
             None
         } else {
-            let of = self.subject(scene, "text")?;
-            Some(SceneTexts::new(&self.backend, of, (preset, scoring), &asked)?)
+            Some(self.score(scene, "text", preset, scoring, &asked)?)
         };
         let contents = Contents { scene, views, upload, texts: &asked, limits };
         write(folder, &contents, &mut Alone { service: self, scene, texts, limits }, to)

@@ -10,13 +10,13 @@ use super::{
     query,
     request::{
         Boxes, CameraSpec, Format, Kind, LensSpec, MaskFormat, PictureOptions, PoseSpec, QuerySpec,
-        ViewOptions,
+        TextOptions, ViewOptions, ViewSpec,
     },
     search::{Backend, SceneTexts},
     texts,
-    times::ViewTimes,
     types::TextView,
     view::{Inputs, Resolved, resolve_one},
+    work::Work,
 };
 use crate::{
     error::{Error, Result},
@@ -133,13 +133,14 @@ fn photo_views<'a>(
     let picture = PictureOptions { format: Format::Npy, ..PictureOptions::default() };
     let view = |of: &SceneCamera| {
         let k = of.camera.intrinsics;
-        let spec = CameraSpec {
+        let camera = CameraSpec {
             pose: PoseSpec::CameraToWorld(of.camera.camera_to_world.to_row_major()),
             lens: LensSpec::Focal { fx: k.fx, fy: Some(k.fy), cx: Some(k.cx), cy: Some(k.cy) },
         };
         let (width, height) = (Some(k.width), Some(k.height));
         let options = ViewOptions { width, height, preset, ..ViewOptions::default() };
-        resolve_one(limits, inputs, spec, Kind::Depth, (&options, &picture))
+        let (picture, text) = (picture.clone(), TextOptions::default());
+        resolve_one(limits, inputs, &ViewSpec { camera, kind: Kind::Depth, options, picture, text })
     };
     let views: Vec<Resolved> = cameras.iter().map(view).collect::<Result<_>>()?;
     let pixels = views.iter().map(Resolved::pixels).sum::<u64>() * texts.max(1) as u64;
@@ -161,15 +162,15 @@ fn depth_of(backend: &Backend, scene: &Scene, view: &Resolved) -> Result<Vec<f32
     frame.depth.ok_or_else(|| Error::internal("the renderer gave no depth"))
 }
 
-/// What each text finds in a view, as a query says it. Calls `drawn` when it is drawn.
+/// What each text finds in a view, as a query says it.
 fn masks_of(
-    texts: &SceneTexts<'_>,
+    texts: &SceneTexts,
     limits: &Limits,
     view: &Resolved,
-    drawn: impl FnOnce(),
+    work: &mut Work,
 ) -> Result<Vec<TextView>> {
     let spec = QuerySpec { boxes: Boxes::None, mask: MaskFormat::Rle, ..QuerySpec::default() };
-    let answer = query::answer(texts, limits, &spec, Some(view), ViewTimes::default(), drawn)?;
+    let answer = query::answer(texts, limits, &spec, Some(view), work)?;
     let lost = || Error::internal("a text has no answer in the view");
     answer.results.into_iter().map(|found| found.view.ok_or_else(lost)).collect()
 }

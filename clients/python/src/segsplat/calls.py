@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import sys
@@ -29,6 +30,7 @@ from .types import (
     Box,
     Camera,
     Event,
+    ExportCall,
     Kind,
     Matches,
     Models,
@@ -106,7 +108,7 @@ def create(
     request = Request(
         "POST",
         "/v1/scenes",
-        params=dict(options),
+        params={name.removesuffix("_"): value for name, value in options.items()},
         upload=parts_of(source),
         headers={"idempotency-key": idempotency_key or str(uuid4())},
     )
@@ -219,20 +221,26 @@ def delete(scene: Handle) -> Flow[None]:
 
 
 def events(scene: Handle, tell: Callable[[Event], None] | None = None) -> Flow[None]:
-    """Items: what happens to the scene, from its present state to its last event."""
+    """Items: what happens to the scene, from its present state to its last event. While it is
+    refined, each better version is one more.
+    """
     again = 0
     while True:
         try:
             request = Request("GET", f"/v1/scenes/{scene.id}/events", stream=ServerSentEvents)
             yield from send(scene.policy, request)
+            made = False
             while (data := (yield Read())) is not None:
                 again, event = 0, parse(Event, _json(data))
-                if tell:
-                    tell(event)
-                else:
+                made = made or event.is_last or event.event == "version"
+                if not tell:
                     yield Item(event)
+                    continue
+                tell(event)
                 if event.is_last:
                     return
+            if made:
+                return
             raise ConnectionLost("the events broke off")
         except ConnectionLost as lost:
             yield from pause(scene.policy, lost, again)
@@ -260,6 +268,17 @@ def wait(scene: Handle, progress: Progress = None) -> Flow[None]:
         kind = SegSplatError.of_code.get(code, SegSplatError)
         raise kind(last[0].message or "the scene was stopped", code=code, scene=scene.id)
     yield from refresh(scene)
+
+
+def refine(scene: Handle, refine: Literal["auto", "off"] | int = "auto") -> Flow[None]:
+    """Brings a finished scene closer to its photos while it is served. Returns at once:
+    `scene.refresh()` and `scene.status.refinement` say how far it is, `scene.events()` each version.
+
+    refine: milliseconds of work; "auto" as long as the server thinks right; "off" ends a refinement.
+    """
+    path = f"/v1/scenes/{scene.id}/refine"
+    answer = yield from send(scene.policy, Request("POST", path, params={"refine": str(refine)}))
+    scene.shown = parse(SceneStatus, _json(answer.body)), scene.shown[1]
 
 
 # Views
@@ -399,12 +418,34 @@ def pick(
     return parse(Picked, _json((yield from send(scene.policy, request)).body))
 
 
+def features(
+    scene: Handle,
+    kind: Literal["weights", "features"] = "weights",
+    **options: Unpack[QueryCall],
+) -> Flow[dict[str, NDArray[Any]]]:
+    """The pixels of a view over the bank, as arrays.
+
+    kind: "weights", E: `size` (height, width), `offsets`, `entries` and `weights`; the entries of
+        pixel i are those from `offsets[i]` to `offsets[i + 1]`. "features", F: `features`
+        [H, W, D] of length 1, zeros where nothing is.
+    from_, eye, camera, width and so on: the view, as in `view`; by default that of the first photo.
+    """
+    spot, rest = _split(dict(options))
+    params = _given({**_camera(spot), **_drawing(rest), "kind": kind})
+    request = Request("GET", f"/v1/scenes/{scene.id}/features", params=params)
+    file = io.BytesIO((yield from send(scene.policy, request)).body)
+    with np.load(file) as arrays:
+        return dict(arrays)
+
+
 # Files
 
 
-def gaussians(scene: Handle, text: str | None = None) -> Flow[Gaussians]:
+def gaussians(
+    scene: Handle, text: str | None = None, **options: Unpack[ExportCall]
+) -> Flow[Gaussians]:
     """The Gaussians of the scene, or those that a text selects, as arrays."""
-    params = _given({"format": "ply", "text": text})
+    params = _given({**_drawing(options), "format": "ply", "text": text})
     request = Request("GET", f"/v1/scenes/{scene.id}/export", params=params)
     return Gaussians.of_ply((yield from send(scene.policy, request)).body)
 
@@ -415,6 +456,7 @@ def export(
     path: str | Path | None = None,
     *,
     text: str | Sequence[str] | None = None,
+    **options: Unpack[ExportCall],
 ) -> Flow[Path]:
     """Writes the scene, or what a text selects of it, to a file as it comes, and tells its path.
 
@@ -426,7 +468,7 @@ def export(
     target = Path(path) if path is not None else Path(f"{scene.id}.{ENDINGS.get(format, format)}")
     part = target.with_name(target.name + ".part")
     lines = text if text is None or isinstance(text, str) else "\n".join(text)
-    params = _given({"format": format, "text": lines})
+    params = _given({**_drawing(options), "format": format, "text": lines})
     request = Request("GET", f"/v1/scenes/{scene.id}/export", params=params, stream=Pieces)
     for again in range(scene.policy.retries + 1):
         try:

@@ -16,6 +16,7 @@ __all__ = [
     "SceneNotFound",
     "NotFound",
     "MethodNotAllowed",
+    "UnsupportedMediaType",
     "SceneNotReady",
     "SemanticsOff",
     "Unauthenticated",
@@ -118,6 +119,12 @@ class MethodNotAllowed(SegSplatError):
     """The path is there, but not with this method."""
 
     code = "method_not_allowed"
+
+
+class UnsupportedMediaType(SegSplatError):
+    """The content type of a call is not one that it takes."""
+
+    code = "unsupported_media_type"
 
 
 class SceneNotReady(SegSplatError):

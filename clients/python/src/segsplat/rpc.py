@@ -38,6 +38,7 @@ SCENES = "segsplat.v1.SceneService"
 METHODS = {
     **{"events": "WatchScene", "view": "RenderView", "views": "RenderViews", "query": "Query"},
     **{"pick": "Pick", "export": "Export", "models": "Models"},
+    **{"refine": "RefineScene", "features": "Features"},
     **{"POST": "CreateScene", "GET": "GetScene", "DELETE": "DeleteScene"},
 }
 SCORING = ("canon", "tau", "cut", "unit_rows", "coverage_floor", "near_best")
@@ -53,7 +54,10 @@ def _pool() -> descriptor_pool.DescriptorPool:
     return pool
 
 
-_SERVICE = _pool().FindServiceByName(SCENES)
+_POOL = _pool()
+_SERVICE = _POOL.FindServiceByName(SCENES)
+#: Options of a scene that a message of their own holds.
+METHOD = _POOL.FindMessageTypeByName("segsplat.v1.Method").fields_by_name.keys()
 
 
 # Requests
@@ -86,10 +90,12 @@ def _upload(
     method: MethodDescriptor, step: Request, fields: Mapping[str, Any]
 ) -> Iterator[Message]:
     """The header with options and cameras, then the files in pieces."""
-    how = {name: _enum(name, fields[name]) for name in ("preset", "density") if name in fields}
+    enums = ("preset", "density", "mask_level", "semantics")
+    fields = {name: _enum(name, v) if name in enums else v for name, v in fields.items()}
+    how = {name: fields[name] for name in METHOD if name in fields}
     header = {name: value for name, value in fields.items() if name not in how}
-    if "semantics" in header:
-        header["semantics"] = _enum("semantics", header["semantics"])
+    if "refine" in header:
+        header["refine"] = str(header["refine"])
     header["idempotency_key"] = step.headers["idempotency-key"]
     described = [part for part in step.upload if part.field in ("transforms", "cameras")]
     header |= {f"{part.field}_json": b"".join(_pieces(part)) for part in described}
@@ -124,7 +130,10 @@ def _nested(method: str, fields: dict[str, Any]) -> dict[str, Any]:
     if scoring := {name: rest.pop(name) for name in SCORING if name in rest}:
         taken["scoring"] = scoring
     if method == "Export":
-        return {**rest, **taken, "format": _enum("export_format", rest["format"])}
+        rest["format"] = _enum("export_format", rest["format"])
+        return {**rest, **taken, **{n: _enum(n, rest[n]) for n in ("preset",) if n in rest}}
+    if method == "Features":
+        taken["kind"] = _enum("feature_kind", rest.pop("kind"))
     if method == "Pick":
         taken["labels"] = rest.pop("label")
     for name in ("kind", "boxes"):
@@ -137,7 +146,7 @@ def _nested(method: str, fields: dict[str, Any]) -> dict[str, Any]:
         taken["cameras"] = [_camera(camera) for camera in rest.pop("cameras")]
     elif method == "Query" and "camera" in rest:
         taken["camera"] = _camera(rest.pop("camera"))
-    elif method in ("RenderView", "Pick"):
+    elif method in ("RenderView", "Pick", "Features"):
         taken["camera"] = _camera(rest)
     own = message_factory.GetMessageClass(_SERVICE.methods_by_name[method].input_type).DESCRIPTOR
     taken |= {name: rest.pop(name) for name in own.fields_by_name if name in rest}
@@ -225,8 +234,15 @@ def _page(fields: dict[str, Any]) -> dict[str, Any]:
     return {**fields, "scenes": [_scene(scene) for scene in fields["scenes"]]}
 
 
+def _models(fields: dict[str, Any]) -> dict[str, Any]:
+    for model in fields["models"]:
+        model["sizes"] = [[size["height"], size["width"]] for size in model["sizes"]]
+    return fields
+
+
 def _event(fields: dict[str, Any]) -> dict[str, Any]:
-    return {**fields, **(fields["error"] or {}), "event": fields["state"]}
+    event = fields["state"] if fields["version"] is None else "version"
+    return {**fields, **(fields["error"] or {}), "event": event}
 
 
 def _found(fields: dict[str, Any]) -> dict[str, Any]:
@@ -255,8 +271,8 @@ def _picture(view: Any) -> tuple[dict[str, str], bytes]:
 
 
 SHAPES: Mapping[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
-    **{"CreateScene": _scene, "GetScene": _scene, "ListScenes": _page},
-    **{"WatchScene": _event, "Query": _found},
+    **{"CreateScene": _scene, "GetScene": _scene, "RefineScene": _scene, "ListScenes": _page},
+    **{"WatchScene": _event, "Query": _found, "Models": _models},
 }
 
 
@@ -264,7 +280,7 @@ def item(method: str, message: Any) -> Any:
     """What the reader of a streamed body would make of it."""
     if method == "RenderViews":
         return _picture(message)
-    return message.data if method == "Export" else json.dumps(_told(method, message))
+    return message.data if method in ("Export", "Features") else json.dumps(_told(method, message))
 
 
 def answer(method: str, message: Any) -> Answer:

@@ -19,6 +19,8 @@ from .png import encode_png
 Floats: TypeAlias = NDArray[np.float64]
 Kind = Literal["color", "depth", "alpha", "semantics", "relevancy", "mask"]
 Preset = Literal["default", "paper"]
+#: Options of a scene by name.
+Method: TypeAlias = dict[str, Any]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
 
 T = TypeVar("T")
@@ -41,6 +43,8 @@ def _value(hint: Any, value: Any) -> Any:
         return None if value is None or value == "" else _value(hint.__args__[0], value)
     if typing.get_origin(hint) is tuple:
         return tuple(_value(hint.__args__[0], one) for one in value)
+    if hint == Method:  # in an order of its own on each wire
+        return dict(sorted(value.items()))
     if hint == Floats:
         return np.asarray(value, np.float64)
     if hint is Camera:
@@ -150,6 +154,12 @@ class Drawing(TypedDict, total=False):
     quality: Literal["exact", "fast"]
     #: "paper" draws and scores as the paper does; that of the scene by default.
     preset: Preset
+    #: Photos whose Gaussians are in front, the nearest ones; 0: those of all. That of the preset by
+    #: default.
+    front_photos: int
+    #: Whether magnified Gaussians are blurred as the network learnt them; that of the preset by
+    #: default.
+    magnify: bool
 
 
 class ViewOptions(Drawing, total=False):
@@ -162,12 +172,20 @@ class ViewOptions(Drawing, total=False):
 
 
 class TextOptions(TypedDict, total=False):
-    """How a text is scored."""
+    """How a text is scored; by default as the preset says."""
 
-    #: Relevancy from which a text selects, 0 to 1; that of the preset by default.
-    cut: float
-    #: Sharpness of the comparison with canonical texts; that of the preset by default.
+    #: Canonical texts that a text is compared with.
+    canon: Sequence[str]
+    #: Sharpness of the comparison.
     tau: float
+    #: Relevancy from which a text selects, 0 to 1.
+    cut: float
+    #: Whether the bank's rows are brought to length 1 before they are blended.
+    unit_rows: bool
+    #: Coverage under which a pixel has no relevancy, 0 to 1.
+    coverage_floor: float
+    #: An entry that fits a text by so much less than the best one (cosine, 0 to 2) is not selected.
+    near_best: float
     #: Seconds to wait for semantics that are being made; the server's limit by default.
     wait: float
 
@@ -181,7 +199,14 @@ class ViewsCall(ViewOptions, TextOptions, total=False):
 
 
 class QueryCall(Viewpoint, Drawing, TextOptions, total=False):
-    """Options of a query or a pick."""
+    """Options of a query, a pick, or features."""
+
+
+class ExportCall(TextOptions, total=False):
+    """Options of a file."""
+
+    #: How texts are scored, and views of a folder drawn; that of the scene by default.
+    preset: Preset
 
 
 class SceneOptions(TypedDict, total=False):
@@ -189,14 +214,50 @@ class SceneOptions(TypedDict, total=False):
 
     #: When texts can be asked: "lazy" from the first one on, "eager" at once, "off" never.
     semantics: Literal["lazy", "eager", "off"]
-    #: "full" keeps one Gaussian a pixel, "thinned" fewer where photos are flat.
-    density: Literal["thinned", "full"]
-    #: "paper" makes, understands, draws and scores the scene as the paper does.
+    #: "paper" makes, understands, draws and scores the scene as the paper does. The options from
+    #: `density` on change single fields of the preset.
     preset: Preset
     #: Photos that the network takes at once.
     max_views: int
     #: Name of the bundle of networks; the loaded one by default.
     bundle: str
+    #: Whether the finished scene is refined: "auto", "off" or milliseconds; as the server is set by
+    #: default.
+    refine: str | int
+    #: "full" keeps one Gaussian a pixel, "thinned" fewer where photos are flat.
+    density: Literal["thinned", "full"]
+    #: Whether Gaussians that add nothing are dropped.
+    prune: bool
+    #: Photos that may keep Gaussians of one surface; 0 keeps those of all.
+    fuse_layers: int
+    #: Whether views have the photos' colours by direction behind them.
+    backdrop: bool
+    #: Masks of a prompt: the widest that passes, or one size alone.
+    mask_level: Literal["widest", "whole", "part", "subpart"]
+    #: Whether prompts are skipped where a mask lies already.
+    skip_covered: bool
+    #: Whether a photo is asked first where masks of earlier photos reappear.
+    seeds: bool
+    #: Whether masks are judged at the photo's own pixels.
+    full_resolution: bool
+    #: Whether masks are also held to each other's pixels and to bounds on their area.
+    mask_filters: bool
+    #: Whether the crop of a mask shows all of it, also where another mask lies on it.
+    crop_whole: bool
+    #: Whether the crop of a mask has the bundle's margin.
+    crop_margin: bool
+    #: Rows of the bank over the mean number of masks of a photo.
+    lambda_: float
+    #: Rows of the bank (M); 0: by `lambda_`.
+    bank_rows: int
+    #: Whether all photos that show a Gaussian vote for its entry.
+    votes: bool
+    #: Least cosine of two entries that become one; 0: no two do.
+    merge_cosine: float
+    #: Photos whose Gaussians are in front in a view; 0: those of all.
+    front_photos: int
+    #: Whether a view that magnifies the photos blurs the Gaussians as the network learnt them.
+    magnify: bool
 
 
 @dataclass(frozen=True)
@@ -230,6 +291,31 @@ class SceneFault:
     message: str
 
 
+@dataclass(frozen=True)
+class DropCount:
+    """Gaussians that were dropped or clamped."""
+
+    #: Stable snake_case reason.
+    reason: str
+    count: int
+
+
+@dataclass(frozen=True)
+class RefineReport:
+    """What a refinement made of a scene."""
+
+    steps: int
+    #: Seconds of work.
+    seconds: float
+    #: Indices of the photos that it did not learn from.
+    held_out: tuple[int, ...]
+    #: PSNR of these photos before and after, dB; None where none was held out.
+    psnr_before: float | None = None
+    psnr_after: float | None = None
+    gaussians_before: int = 0
+    gaussians_after: int = 0
+
+
 @dataclass(frozen=True, eq=False)
 class Report:
     """How the making of a scene went."""
@@ -252,6 +338,30 @@ class Report:
     network_focal_px: tuple[float, ...] = ()
     #: Format of the file of Gaussians that the scene is; None where it was made of photos.
     file_format: str | None = None
+    #: How it was made: the options of the scene, by name.
+    method: Method = dataclasses.field(default_factory=dict)
+    #: Gaussians dropped or clamped.
+    dropped: tuple[DropCount, ...] = ()
+    #: What refinement made of it; None where it was not refined.
+    refinement: RefineReport | None = None
+
+
+@dataclass(frozen=True)
+class SemanticsReport:
+    """How the making of a scene's semantics went."""
+
+    #: [V] masks of each photo.
+    masks: tuple[int, ...]
+    #: Entries of the bank (M).
+    bank_size: int
+    #: Gaussians with an entry.
+    labelled: int
+    #: sha256 of the bundle that made them, hex.
+    bundle_sha256: str
+    stages: tuple[StageTime, ...]
+    execution_provider: str
+    #: How they were made: the options of the scene, by name.
+    method: Method = dataclasses.field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -266,6 +376,19 @@ class Semantics:
     reason: str | None = None
     #: Entries of the bank (M).
     bank_size: int | None = None
+    error: SceneFault | None = None
+    #: Counts and times, once ready.
+    report: SemanticsReport | None = None
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """How far the refinement of a scene is."""
+
+    state: Literal["none", "running", "done", "failed"] = "none"
+    #: Share of its time that is spent, 0 to 1.
+    fraction: float = 0.0
+    #: Why it failed; the scene is served as it was.
     error: SceneFault | None = None
 
 
@@ -286,6 +409,10 @@ class SceneStatus:
     stage: str | None = None
     error: SceneFault | None = None
     report: Report | None = None
+    #: Counts what was served under this id: 0 until it is done, then 1, and one more with each
+    #: better version that refinement publishes.
+    version: int = 0
+    refinement: Refinement = Refinement()
 
 
 @dataclass(frozen=True)
@@ -302,8 +429,9 @@ class Photo:
 class Event:
     """What happens to a scene."""
 
-    #: "done", "failed" and "cancelled" are last.
-    event: State
+    #: "done", "failed" and "cancelled" are last; of a scene that is being refined a "version" each
+    #: follows "done".
+    event: State | Literal["version"]
     #: Stage at work while running.
     stage: str | None = None
     #: Share of the work that is done, 0 to 1.
@@ -314,10 +442,12 @@ class Event:
     code: str | None = None
     #: Why it failed.
     message: str | None = None
+    #: The version that is served, of a "version".
+    version: int | None = None
 
     @property
     def is_last(self) -> bool:
-        """Whether no event follows."""
+        """Whether the scene is made, or will not be. Only versions follow."""
         return self.event in ("done", "failed", "cancelled")
 
 
@@ -339,6 +469,25 @@ class KnownWord:
 
 
 @dataclass(frozen=True)
+class Network:
+    """A network of the bundle."""
+
+    #: What it does: "geometry", "masks.encoder" and so on.
+    name: str
+    #: File in the bundle.
+    file: str
+    #: Of the file, hex.
+    sha256: str
+    size_bytes: int
+    #: Licence of the weights.
+    licence: str
+    #: Photos it takes at once; 0 where it takes none.
+    views_max: int
+    #: Working sizes, [height, width].
+    sizes: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
 class Models:
     """What makes the scenes."""
 
@@ -349,6 +498,8 @@ class Models:
     server_version: str
     #: What was measured of everyday words; empty where the bundle does not say.
     words: tuple[KnownWord, ...] = ()
+    #: Networks of the bundle.
+    models: tuple[Network, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,32 @@ use crate::{
     error::{Error, Result},
     limits::{BANK_ROWS_MAX, CANON_MAX, LAMBDA_RANGE, SCENE_PHOTOS_MAX, TAU_RANGE},
     names::display_names,
-    scene::{Density, Refine, SemanticsMode},
+    scene::Refine,
 };
+
+/// When the semantics of a scene are made.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum SemanticsMode {
+    /// At the first call that needs them.
+    #[default]
+    Lazy,
+    /// As soon as the scene can be viewed.
+    Eager,
+    /// Never.
+    Off,
+}
+
+/// How many of a network's Gaussians a scene keeps.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Density {
+    /// One for up to 16 neighbours where the pictures are flat: same views within a stated error.
+    #[default]
+    Thinned,
+    /// One a pixel.
+    Full,
+}
 
 /// A set of values for every choice.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
@@ -39,7 +63,7 @@ pub enum MaskLevel {
     Subpart,
 }
 
-display_names!(Preset, MaskLevel);
+display_names!(SemanticsMode, Density, Preset, MaskLevel);
 
 impl MaskLevel {
     /// Its place among `levels` masks, which go from parts to the whole; `None`: the most whole

@@ -6,6 +6,7 @@ mod axes;
 mod backdrop;
 mod camera;
 mod capture;
+mod failure;
 mod finished;
 mod gaussians;
 mod geometry;
@@ -24,11 +25,14 @@ pub use axes::{covariance, principal_axes};
 pub use backdrop::Backdrop;
 pub use camera::{Camera, CameraToWorld, Intrinsics, ORTHONORMAL_TOLERANCE, Region};
 pub use capture::{Capture, ViewSet};
+pub use failure::SceneError;
 pub use finished::{PhotoHash, Provenance, Scene, SceneMeta};
 pub use gaussians::{BLUR_PX2, Gaussians, RawGaussians, SH_C0, SanitizeReport, SourcePixel};
 pub use geometry::ViewGaussians;
 pub use id::{SCENE_ID_CHARS, SceneId};
-pub use method::{MaskLevel, Method, Preset, SceneOptions, ScoringMethod, with_pairs};
+pub use method::{
+    Density, MaskLevel, Method, Preset, SceneOptions, ScoringMethod, SemanticsMode, with_pairs,
+};
 pub use photo::{Crop, CropShape, Photo, PosedPhoto, photo_label};
 pub use refinement::{Refine, RefineReport, RefineState, RefineStatus};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
@@ -37,9 +41,6 @@ pub use semantics::{
     PhotoMasks, Semantics, SemanticsReport, TextEmbedding,
 };
 pub use stage::{Stage, Watch, unless_cancelled};
-pub use status::{
-    Density, Event, SceneCamera, SceneError, SceneState, SceneStatus, SemanticsMode,
-    SemanticsState, SemanticsStatus,
-};
+pub use status::{Event, SceneCamera, SceneState, SceneStatus, SemanticsState, SemanticsStatus};
 pub use upload::{Upload, UploadCameras, UploadFile};
 pub use weights::PixelWeights;

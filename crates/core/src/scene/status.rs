@@ -5,40 +5,15 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use crate::{
-    error::{Error, ErrorCode, TABLE},
     names::display_names,
     scene::{
-        Camera, HealthReport, Intrinsics, RefineState, RefineStatus, SceneId, SemanticsReport,
-        principal_axes,
+        Camera, HealthReport, Intrinsics, RefineState, RefineStatus, SceneError, SceneId,
+        SemanticsReport, principal_axes,
     },
 };
 
 /// How far photos are rolled, radians squared: some two degrees.
 const ROLL_VARIANCE: f64 = 1e-3;
-
-/// When the semantics of a scene are made.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum SemanticsMode {
-    /// At the first call that needs them.
-    #[default]
-    Lazy,
-    /// As soon as the scene can be viewed.
-    Eager,
-    /// Never.
-    Off,
-}
-
-/// How many of a network's Gaussians a scene keeps.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum Density {
-    /// One for up to 16 neighbours where the pictures are flat: same views within a stated error.
-    #[default]
-    Thinned,
-    /// One a pixel.
-    Full,
-}
 
 /// Where a scene stands.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
@@ -63,30 +38,7 @@ impl SceneState {
     }
 }
 
-display_names!(SemanticsMode, Density, SceneState, SemanticsState);
-
-/// Why a scene failed: a code of the error table and its message.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-pub struct SceneError {
-    /// Name of a row of the error table.
-    pub code: String,
-    /// Names input, value and bound.
-    pub message: String,
-}
-
-impl From<&Error> for SceneError {
-    fn from(error: &Error) -> Self {
-        Self { code: error.code().name().to_owned(), message: error.message().to_owned() }
-    }
-}
-
-impl SceneError {
-    /// The error this was; a name of no row is `internal`.
-    pub fn to_error(&self) -> Error {
-        let row = TABLE.iter().find(|row| row.name == self.code);
-        Error::new(row.map_or(ErrorCode::Internal, |row| row.code), self.message.clone())
-    }
-}
+display_names!(SceneState, SemanticsState);
 
 /// An input camera of a scene and the photo it belongs to.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]

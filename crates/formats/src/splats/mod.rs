@@ -152,7 +152,7 @@ fn some(file: &SplatFile) -> Result<()> {
     if file.gaussians.is_empty() {
         let name = file.format.name;
         return Err(Error::invalid(format!(
-            "{name}: there are no Gaussians to write; PLY can be empty"
+            "{name}: there are no Gaussians to write; ply can be empty"
         )));
     }
     Ok(())

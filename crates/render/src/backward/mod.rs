@@ -3,7 +3,7 @@
 //!
 //! [`oracle`] judges the others: f64, pixel by pixel. Finite differences of the forward oracle
 //! judge it. [`crate::cpu::backward`] is the tiled kernel, shaders/*_backward.wgsl its twin. A
-//! renderer that has a backward pass is a [`DifferentiableRenderer`].
+//! renderer that has a backward pass is a [`crate::DifferentiableRenderer`].
 //!
 //! For a pixel with Gaussians i front to back, `w_i = alpha_i T_i`, `A = sum w_i` and `B` behind:
 //! the colour is `sum w_i c_i + (1 - A) B`, the depth `sum w_i z_i / A`. With `g` for what the loss
@@ -14,13 +14,13 @@
 //! What is constant has no gradient: which Gaussians count (1/255, the end of a ray, the order, the
 //! near plane), an alpha at its largest, a colour at 0, and what lies behind.
 
+#[cfg(feature = "testing")]
 pub mod oracle;
 
 use crate::{
-    DeviceTimes, Frame, Kinds, RenderRequest, Renderer,
+    Frame, Kinds, Labels, RenderRequest, Samples,
+    constants::{SH_C1, SH_C2, SH_C3},
     error::{Error, Result},
-    scene::Gaussians,
-    train::{Trainer, TrainingSet},
 };
 
 /// What a loss says of a frame: its derivative by each number of the pictures, `[H * W]`; `None`
@@ -64,8 +64,8 @@ impl FrameGradients {
     }
 }
 
-/// Derivatives of a loss by the numbers of Gaussians, in the order of [`Gaussians`]; all finite, 0
-/// where a Gaussian adds to no pixel.
+/// Derivatives of a loss by the numbers of Gaussians, in the order of [`crate::scene::Gaussians`];
+/// all finite, 0 where a Gaussian adds to no pixel.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Gradients<T = f32> {
     /// `[N, 3]` by centres, 1 / world units.
@@ -98,68 +98,14 @@ impl<T: Copy + Default> Gradients<T> {
     }
 }
 
-/// A renderer that also says how a frame depends on the Gaussians.
-pub trait DifferentiableRenderer: Renderer {
-    /// Renders one view, asks `loss` what it says of the frame, and writes what that means for each
-    /// Gaussian into `gradients`, whose old content is lost. Returns the frame: colour, alpha and
-    /// what the request asks for, in f32. Labels of the request are not drawn. Where a device fails
-    /// meanwhile, `loss` is asked again, of the same view.
-    ///
-    /// # Errors
-    /// As [`Renderer::render`]; `limit_exceeded` when the view needs more Gaussian-tile pairs than
-    /// are held at once; whatever `loss` says.
-    fn backward(
-        &self,
-        gaussians: &Gaussians,
-        request: &RenderRequest,
-        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
-        gradients: &mut Gradients,
-    ) -> Result<Frame>;
-
-    /// Draws one view and goes back by `by`, for the times of it on the device; `None` where none
-    /// keeps them.
-    ///
-    /// # Errors
-    /// As [`Self::backward`].
-    fn backward_times(
-        &self,
-        _gaussians: &Gaussians,
-        _request: &RenderRequest,
-        _by: &FrameGradients,
-    ) -> Result<Option<DeviceTimes>> {
-        Ok(None)
-    }
-
-    /// A trainer that keeps photos and Gaussians on a device; `None` where there is none, and
-    /// [`crate::train::HostTrainer`] is the one.
-    ///
-    /// # Errors
-    /// `limit_exceeded` where they do not fit the device; as [`Self::backward`].
-    fn trainer<'a>(&'a self, _set: &TrainingSet<'a>) -> Result<Option<Box<dyn Trainer + 'a>>> {
-        Ok(None)
-    }
-
-    /// Whether it draws on a device whose clocks fall while nothing is drawn: one NVIDIA H200 is
-    /// two to six times as slow in the first half second after that.
-    fn slow_after_rest(&self) -> bool {
-        false
-    }
-}
-
 /// The request as it is drawn for a backward pass.
-pub(crate) fn drawn(request: &RenderRequest) -> RenderRequest {
+pub(crate) fn backward_request(request: &RenderRequest) -> RenderRequest {
     let kinds = Kinds { depth: request.kinds.depth, ..Kinds { depth: false, ..Kinds::ALL } };
-    RenderRequest {
-        kinds,
-        labels: crate::Labels::None,
-        samples: crate::Samples::F32,
-        ..request.clone()
-    }
+    RenderRequest { kinds, labels: Labels::None, samples: Samples::F32, ..request.clone() }
 }
 
 /// Derivatives of the 16 basis functions up to degree 3 by the unit direction (x, y, z).
 pub(crate) fn basis_slopes([x, y, z]: [f64; 3]) -> [[f64; 3]; 16] {
-    use crate::constants::{SH_C1, SH_C2, SH_C3};
     let c1 = f64::from(SH_C1);
     let a = SH_C2.map(f64::from);
     let b = SH_C3.map(f64::from);

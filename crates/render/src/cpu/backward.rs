@@ -17,26 +17,23 @@ use glam::{DMat3, DVec3};
 use rayon::prelude::*;
 
 use super::{
-    CpuRenderer, background,
     bin::{self, Bins, chunk_of},
+    cell::{CELL_X, CELL_Y, CELLS, Numbers, PIXEL_X, PIXEL_Y, PIXELS, Staged, Tile, place},
     footprint::Footprint,
-    lanes::{LaneKernel, Lanes, exp2_neg},
+    lanes::{KernelOptions, LaneKernel, Lanes, exp2_neg},
     paint::Paint,
+    pool::Pool,
     project::Projected,
-    rasterize::{
-        CELL_X, CELL_Y, CELLS, Numbers, PIXEL_X, PIXEL_Y, PIXELS, Rest, SQRT_LOG2_E, Staged, Tile,
-        along_axes, met, place, stage,
-    },
+    rasterize::{Rest, SQRT_LOG2_E, along_axes, met, stage},
     shade,
     tiles::Grid,
 };
 use crate::{
     Frame, RenderRequest,
-    backward::{DifferentiableRenderer, FrameGradients, Gradients, basis_slopes, drawn},
+    backward::{FrameGradients, Gradients, basis_slopes},
     constants::{
         ALPHA_MAX, ALPHA_MIN, BATCH_SIZE, BLUR_PX2, OWN_SIZE, TILE_SIZE, TRANSMITTANCE_MIN,
     },
-    error::{Error, Result},
     scene::Gaussians,
     view::View,
 };
@@ -88,53 +85,12 @@ struct TileSums {
     sums: Vec<Sums>,
 }
 
-impl DifferentiableRenderer for CpuRenderer {
-    fn backward(
-        &self,
-        gaussians: &Gaussians,
-        request: &RenderRequest,
-        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
-        gradients: &mut Gradients,
-    ) -> Result<Frame> {
-        let request = drawn(request);
-        let mut scratch = self.frames.take();
-        let (frame, _) =
-            self.threads.install(|| self.draw_into(gaussians, &request, &mut scratch))?;
-        if frame.stats.intersections > self.isects_max {
-            let what = "backward: Gaussian-tile pairs of a view";
-            return Err(Error::limit(what, frame.stats.intersections, self.isects_max));
-        }
-        let by_frame = loss(&frame)?;
-        by_frame.check_of(&frame)?;
-        gradients.clear(gaussians.len(), gaussians.sh_count());
-        self.threads.install(|| {
-            let view = View::new(gaussians.origin(), &request)?;
-            let behind = background(&view, &request)?;
-            let pass = Pass {
-                renderer: self,
-                gaussians,
-                request: &request,
-                view: &view,
-                grid: Grid::whole(&view, self.options),
-                projected: &scratch.projected,
-                bins: &scratch.bins,
-                pictures: Pictures { frame: &frame, behind: &behind, by: &by_frame },
-            };
-            let tiles = pass.tiles();
-            pass.gather(&tiles, gradients);
-            Ok::<_, Error>(())
-        })?;
-        self.frames.give(scratch);
-        Ok(frame)
-    }
-}
-
 /// A frame, what lies behind it, and what the loss says of it.
 #[derive(Clone, Copy)]
-struct Pictures<'a> {
-    frame: &'a Frame,
-    behind: &'a Frame,
-    by: &'a FrameGradients,
+pub(super) struct Pictures<'a> {
+    pub(super) frame: &'a Frame,
+    pub(super) behind: &'a Frame,
+    pub(super) by: &'a FrameGradients,
 }
 
 impl Pictures<'_> {
@@ -158,25 +114,31 @@ impl Pictures<'_> {
 }
 
 /// One backward pass.
-struct Pass<'a> {
-    renderer: &'a CpuRenderer,
-    gaussians: &'a Gaussians,
-    request: &'a RenderRequest,
-    view: &'a View,
-    grid: Grid,
-    projected: &'a Projected,
-    bins: &'a [Bins],
-    pictures: Pictures<'a>,
+pub(super) struct Pass<'a> {
+    pub(super) options: KernelOptions,
+    pub(super) scratches: &'a Pool<BackwardScratch>,
+    pub(super) gaussians: &'a Gaussians,
+    pub(super) request: &'a RenderRequest,
+    pub(super) view: &'a View,
+    pub(super) grid: Grid,
+    pub(super) projected: &'a Projected,
+    pub(super) bins: &'a [Bins],
+    pub(super) pictures: Pictures<'a>,
 }
 
 impl Pass<'_> {
+    /// Writes what the pictures say of each Gaussian into `gradients`.
+    pub(super) fn run(&self, gradients: &mut Gradients) {
+        self.gather(&self.tiles(), gradients);
+    }
+
     /// What each tile says.
     fn tiles(&self) -> Vec<TileSums> {
-        let paint = Paint::new(self.request, self.view, &[], self.renderer.options);
+        let paint = Paint::new(self.request, self.view, &[], self.options);
         let tiles_x = self.grid.tiles_x();
         let of_tile = |tile: u32| {
             let mut out = TileSums::default();
-            let mut scratch = self.renderer.backwards.take();
+            let mut scratch = self.scratches.take();
             scratch.pairs.clear();
             for bins in self.bins {
                 out.starts.push(scratch.pairs.len() as u32);
@@ -198,7 +160,7 @@ impl Pass<'_> {
                 }
                 let (footprints, scratch) = (&self.projected.footprints[..], &mut scratch);
                 let (pictures, ids, sums) = (self.pictures, &ids[..], &mut out.sums[..]);
-                self.renderer.options.width.run(TileBackward {
+                self.options.width.run(TileBackward {
                     footprints,
                     ids,
                     tile: place,
@@ -208,7 +170,7 @@ impl Pass<'_> {
                     sums,
                 });
             }
-            self.renderer.backwards.give(scratch);
+            self.scratches.give(scratch);
             out
         };
         (0..self.grid.tile_count()).into_par_iter().with_max_len(1).map(of_tile).collect()

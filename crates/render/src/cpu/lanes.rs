@@ -12,41 +12,37 @@ use pulp::Simd;
 #[cfg(target_arch = "x86_64")]
 use pulp::x86::{V3, V4};
 
-use crate::switches::{Skip, Switches};
+use crate::switches::{Skip, Switches, Width};
 
-/// Widths of the kernel, the widest first.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Width {
-    /// 16 lanes: AVX-512.
-    Sixteen,
-    /// 8 lanes: AVX2 and FMA.
-    Eight,
-    /// 4 lanes, of whatever the target has.
-    Four,
+/// How the kernels of a frame run. The default: the widest lanes, and no needless work.
+#[derive(Clone, Copy, Debug)]
+pub struct KernelOptions {
+    /// Lanes.
+    pub width: Width,
+    /// Needless work that is done all the same.
+    pub without: Option<Skip>,
+}
+
+impl KernelOptions {
+    pub(super) fn new(switches: &Switches) -> Self {
+        let width = switches.width().unwrap_or_else(Width::widest);
+        Self { width, without: switches.without() }
+    }
+
+    /// Whether work of this kind is left out.
+    #[inline]
+    pub(super) fn skips(self, skip: Skip) -> bool {
+        skip.applies(self.without)
+    }
+}
+
+impl Default for KernelOptions {
+    fn default() -> Self {
+        Self::new(&Switches::default())
+    }
 }
 
 impl Width {
-    /// All, the widest first.
-    pub const ALL: [Self; 3] = [Self::Sixteen, Self::Eight, Self::Four];
-
-    /// The widest one of this processor.
-    pub fn widest() -> Self {
-        Self::ALL.into_iter().find(|width| width.available()).unwrap_or(Self::Four)
-    }
-
-    /// Whether this processor has this width.
-    pub fn available(self) -> bool {
-        match self {
-            #[cfg(target_arch = "x86_64")]
-            Self::Sixteen => V4::is_available(),
-            #[cfg(target_arch = "x86_64")]
-            Self::Eight => V3::is_available(),
-            #[cfg(not(target_arch = "x86_64"))]
-            Self::Sixteen | Self::Eight => false,
-            Self::Four => true,
-        }
-    }
-
     /// Runs `kernel`, compiled for this width, or for the next one if the processor lacks it.
     #[inline]
     pub(super) fn run<K: LaneKernel>(self, kernel: K) {
@@ -64,34 +60,6 @@ impl Width {
             }
         }
         kernel.run(pulp::Scalar128b);
-    }
-}
-
-/// How the kernels of a frame run. The default: the widest lanes, and no needless work.
-#[derive(Clone, Copy, Debug)]
-pub struct KernelOptions {
-    /// Lanes.
-    pub width: Width,
-    /// Needless work that is done all the same.
-    pub without: Option<Skip>,
-}
-
-impl KernelOptions {
-    pub(super) fn new(switches: &Switches) -> Self {
-        let Switches { width, without, .. } = *switches;
-        Self { width: width.unwrap_or_else(Width::widest), without }
-    }
-
-    /// Whether work of this kind is left out.
-    #[inline]
-    pub(super) fn skips(self, skip: Skip) -> bool {
-        self.without != Some(skip)
-    }
-}
-
-impl Default for KernelOptions {
-    fn default() -> Self {
-        Self::new(&Switches::default())
     }
 }
 

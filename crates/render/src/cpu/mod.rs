@@ -7,9 +7,11 @@
 
 pub mod backward;
 pub mod bin;
+pub mod cell;
 pub mod footprint;
 pub mod lanes;
 pub mod paint;
+mod pool;
 pub mod project;
 pub mod rasterize;
 pub mod shade;
@@ -19,24 +21,26 @@ pub mod tiles;
 
 use std::{ops::Range, time::Instant};
 
-use parking_lot::Mutex;
 use rayon::prelude::*;
 
 use self::{
-    backward::BackwardScratch,
+    backward::{BackwardScratch, Pass, Pictures},
     bin::{Bins, DepthKeys},
+    cell::{Tile, TileScratch},
     footprint::Footprint,
     lanes::KernelOptions,
     paint::Paint,
+    pool::Pool,
     project::Projected,
-    rasterize::{Tile, TileScratch},
-    store::{Cut, Part},
+    store::{Cut, PictureRows},
     tiles::Grid,
 };
 use super::{
-    DeviceTimes, DispatchTime, Frame, Labels, RenderRequest, Renderer,
+    Frame, Labels, RenderRequest,
+    backward::{FrameGradients, Gradients, backward_request},
     constants::{ISECTS_MAX, TILE_SIZE},
     labels::WeightRows,
+    renderer::{DeviceTimes, DifferentiableRenderer, DispatchTime, Renderer},
     switches::Switches,
     view::View,
 };
@@ -93,7 +97,7 @@ impl CpuRenderer {
             frames: Pool::default(),
             tiles: Pool::default(),
             backwards: Pool::default(),
-            isects_max: switches.isects_max.unwrap_or(ISECTS_MAX).into(),
+            isects_max: switches.isects_max().unwrap_or(ISECTS_MAX).into(),
             options: KernelOptions::new(switches),
         })
     }
@@ -194,7 +198,7 @@ fn rasterize(
     let across = (grid.tile_count() as usize / tasks).clamp(1, tiles_x);
     let weighs = *paint.labels == Labels::Weights;
     let side = TILE_SIZE as usize;
-    let band = Part::of(frame, grid.tile_rows.start as usize * side);
+    let band = PictureRows::of(frame, grid.tile_rows.start as usize * side);
     let rows = band.split(grid.tile_rows.len(), Cut::Rows(side));
     let rows = rows.into_par_iter().with_max_len(1).enumerate();
     let drawn = rows.map(|(row, out)| {
@@ -287,6 +291,47 @@ impl Renderer for CpuRenderer {
     }
 }
 
+impl DifferentiableRenderer for CpuRenderer {
+    fn backward(
+        &self,
+        gaussians: &Gaussians,
+        request: &RenderRequest,
+        loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
+        gradients: &mut Gradients,
+    ) -> Result<Frame> {
+        let request = backward_request(request);
+        let mut scratch = self.frames.take();
+        let (frame, _) =
+            self.threads.install(|| self.draw_into(gaussians, &request, &mut scratch))?;
+        if frame.stats.intersections > self.isects_max {
+            let what = "backward: Gaussian-tile pairs of a view";
+            return Err(Error::limit(what, frame.stats.intersections, self.isects_max));
+        }
+        let by_frame = loss(&frame)?;
+        by_frame.check_of(&frame)?;
+        gradients.clear(gaussians.len(), gaussians.sh_count());
+        self.threads.install(|| {
+            let view = View::new(gaussians.origin(), &request)?;
+            let behind = background(&view, &request)?;
+            let pass = Pass {
+                options: self.options,
+                scratches: &self.backwards,
+                gaussians,
+                request: &request,
+                view: &view,
+                grid: Grid::whole(&view, self.options),
+                projected: &scratch.projected,
+                bins: &scratch.bins,
+                pictures: Pictures { frame: &frame, behind: &behind, by: &by_frame },
+            };
+            pass.run(gradients);
+            Ok::<_, Error>(())
+        })?;
+        self.frames.give(scratch);
+        Ok(frame)
+    }
+}
+
 /// Data that the bands of a frame share, and their weights from top to bottom.
 struct Band<'a> {
     keys: DepthKeys<'a>,
@@ -299,18 +344,4 @@ struct Band<'a> {
 struct FrameScratch {
     projected: Projected,
     bins: Vec<Bins>,
-}
-
-/// Values that are used again.
-#[derive(Debug, Default)]
-struct Pool<T>(Mutex<Vec<T>>);
-
-impl<T: Default> Pool<T> {
-    fn take(&self) -> T {
-        self.0.lock().pop().unwrap_or_default()
-    }
-
-    fn give(&self, thing: T) {
-        self.0.lock().push(thing);
-    }
 }

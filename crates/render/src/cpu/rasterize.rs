@@ -13,10 +13,14 @@
 
 use super::{
     bin::value,
+    cell::{
+        CELL, CELL_X, CELL_Y, CELLS, Cell, GROUP, NO_BIN, Numbers, PIXEL_X, PIXEL_Y, PIXELS,
+        Staged, Tile, TileScratch, place,
+    },
     footprint::Footprint,
     lanes::{LaneKernel, Lanes, exp2_neg},
     paint::{CHANNELS, Paint},
-    store::{Part, Store},
+    store::{PictureRows, Store},
 };
 use crate::{
     Labels,
@@ -24,185 +28,12 @@ use crate::{
     switches::Skip,
 };
 
-const SIDE: usize = TILE_SIZE as usize;
-/// Side of a cell, pixels.
-pub(super) const CELL: usize = 4;
-/// Cells in a row of a tile.
-pub(super) const ACROSS: usize = SIDE / CELL;
-/// Cells of a tile.
-pub(super) const CELLS: usize = ACROSS * ACROSS;
-/// Pixels of a cell.
-pub(super) const PIXELS: usize = CELL * CELL;
 /// Pairs of a tile that are sorted first.
 const PORTION: usize = 1024;
-/// Gaussians of a batch: their marks are transposed together.
-const GROUP: usize = 64;
-/// Centres of the cells, relative to the centre of the tile, pixels.
-pub(super) const CELL_X: Numbers = along(ACROSS, false, CELL as f32);
-pub(super) const CELL_Y: Numbers = along(ACROSS, true, CELL as f32);
-/// Centres of a cell's pixels, relative to the centre of the cell.
-pub(super) const PIXEL_X: Numbers = along(CELL, false, 1.0);
-pub(super) const PIXEL_Y: Numbers = along(CELL, true, 1.0);
 /// Powers are exponents of 2: half the squared distance times log2 e.
 pub(super) const SQRT_LOG2_E: f64 = 1.201_122_408_786_449_8;
 /// Slack for the rounding of a cell's bound, in addition to the footprint's slack.
 const POWER_SLACK: f32 = 1e-4;
-
-/// One number for each of 16 pixels or cells, in one line of the cache.
-#[derive(Clone, Copy, Debug, PartialEq)]
-#[repr(C, align(64))]
-pub(super) struct Numbers(pub(super) [f32; 16]);
-
-impl Numbers {
-    pub(super) const ZERO: Self = Self([0.0; 16]);
-    const ONE: Self = Self([1.0; 16]);
-
-    /// Vector `i`.
-    #[inline(always)]
-    pub(super) fn at<S: Lanes>(&self, simd: S, i: usize) -> S::f32s {
-        simd.load(&self.0, i)
-    }
-
-    /// Writes vector `i`.
-    #[inline(always)]
-    pub(super) fn put<S: Lanes>(&mut self, simd: S, i: usize, value: S::f32s) {
-        simd.store(&mut self.0, i, value);
-    }
-}
-
-/// Columns (or rows) of a square of `side` x `side`, `step` apart, counted from its middle.
-const fn along(side: usize, rows: bool, step: f32) -> Numbers {
-    let mut out = [0.0; 16];
-    let mut i = 0;
-    while i < 16 {
-        let k = if rows { i / side } else { i % side };
-        out[i] = (k as f32 - (side - 1) as f32 / 2.0) * step;
-        i += 1;
-    }
-    Numbers(out)
-}
-
-/// Bin of a Gaussian without a bin.
-const NO_BIN: u32 = u32::MAX;
-
-/// A Gaussian of a tile, ready for the blend of all cells. At (x, y), pixels from the centre of the
-/// tile, alpha is the opacity times 2^-(u² + v²) with `u = ux x + uy y + u0` and `v = vy y + v0`.
-/// Where the Gaussian is visible, all terms are small, because the blur bounds `ux`, `uy` and `vy`.
-/// So f32 is precise enough.
-#[derive(Clone, Copy, Debug, Default)]
-#[repr(C, align(64))]
-pub(super) struct Staged {
-    ux: f32,
-    uy: f32,
-    u0: f32,
-    vy: f32,
-    v0: f32,
-    /// Power at which alpha is under 1/255, with slack.
-    power_max: f32,
-    pub(super) opacity: f32,
-    pub(super) channels: [f32; CHANNELS],
-    /// Bin of its entry, if weights are asked for.
-    bin: u32,
-}
-
-/// The pixels of a cell, one row for each number.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Cell {
-    /// Transmittance while the ray goes on, 0 after it has ended.
-    transmittance: Numbers,
-    /// Accumulated opacity.
-    pub(super) alpha: Numbers,
-    /// Accumulated channels.
-    pub(super) channels: [Numbers; CHANNELS],
-}
-
-impl Cell {
-    const CLEAR: Self = Self {
-        transmittance: Numbers::ONE,
-        alpha: Numbers::ZERO,
-        channels: [Numbers::ZERO; CHANNELS],
-    };
-}
-
-/// Scratch of one worker. Its contents are undefined between tiles.
-#[derive(Debug)]
-pub struct TileScratch {
-    /// Pairs of a tile.
-    pub(super) pairs: Vec<u64>,
-    fetched: Vec<Footprint>,
-    staged: Vec<Staged>,
-    marks: [[u64; CELLS]; BATCH_SIZE / GROUP],
-    pub(super) cells: [Cell; CELLS],
-    pub(super) bins: Bins,
-}
-
-impl Default for TileScratch {
-    fn default() -> Self {
-        Self {
-            pairs: Vec::new(),
-            fetched: vec![Footprint::default(); BATCH_SIZE],
-            staged: vec![Staged::default(); BATCH_SIZE],
-            marks: [[0; CELLS]; BATCH_SIZE / GROUP],
-            cells: [Cell::CLEAR; CELLS],
-            bins: Bins::default(),
-        }
-    }
-}
-
-/// Weights of the entries that occur in a tile.
-#[derive(Debug, Default)]
-pub(super) struct Bins {
-    /// Entries that occur, ascending. Bin b belongs to `present[b]`.
-    pub(super) present: Vec<u16>,
-    /// `[65536]` bin of each entry, [`NO_BIN`] if it does not occur; empty before the first tile.
-    bin_of: Vec<u32>,
-    /// `[CELLS, present.len()]` sums.
-    pub(super) sums: Vec<Numbers>,
-}
-
-impl Bins {
-    /// Makes a bin for each entry over 0 of the Gaussians of `pairs`. All sums are 0.
-    fn open(&mut self, pairs: &[u64], entries: &[u16]) {
-        self.bin_of.resize(1 << u16::BITS, NO_BIN);
-        for left in self.present.drain(..) {
-            self.bin_of[usize::from(left)] = NO_BIN;
-        }
-        for &pair in pairs {
-            let entry = entries[value(pair) as usize];
-            let bin = &mut self.bin_of[usize::from(entry)];
-            if entry != 0 && *bin == NO_BIN {
-                *bin = 0;
-                self.present.push(entry);
-            }
-        }
-        self.present.sort_unstable();
-        for (bin, entry) in (0_u32..).zip(&self.present) {
-            self.bin_of[usize::from(*entry)] = bin;
-        }
-        self.sums.clear();
-        self.sums.resize(CELLS * self.present.len(), Numbers::ZERO);
-    }
-
-    /// The sums of a cell, one for each bin.
-    #[inline(always)]
-    fn of_cell(&mut self, cell: usize) -> &mut [Numbers] {
-        let count = self.present.len();
-        &mut self.sums[cell * count..(cell + 1) * count]
-    }
-}
-
-/// Place and size of a tile, pixels.
-#[derive(Clone, Copy, Debug)]
-pub struct Tile {
-    /// First column.
-    pub x: u32,
-    /// First row.
-    pub y: u32,
-    /// Columns inside the picture.
-    pub width: u32,
-    /// Rows inside the picture.
-    pub height: u32,
-}
 
 /// Blends the Gaussians of the pairs, in any order, over the pixels of `tile`, and writes them to
 /// `out` from row 0 and `column` on.
@@ -211,7 +42,7 @@ pub fn rasterize_tile(
     pairs: &mut [u64],
     (tile, column): (Tile, usize),
     (paint, scratch): (&Paint<'_>, &mut TileScratch),
-    out: &mut Part<'_>,
+    out: &mut PictureRows<'_>,
 ) {
     if *paint.labels == Labels::Weights {
         scratch.bins.open(pairs, paint.entries);
@@ -388,12 +219,6 @@ fn clear(cells: &mut [Cell; CELLS], tile: Tile) -> u32 {
         }
     }
     open
-}
-
-/// Column and row in the tile of a pixel of a cell.
-#[inline(always)]
-pub(super) const fn place(cell: usize, pixel: usize) -> (usize, usize) {
-    (cell % ACROSS * CELL + pixel % CELL, cell / ACROSS * CELL + pixel / CELL)
 }
 
 /// The footprint, relative to the tile. Computed in f64; the small results become f32.

@@ -4,12 +4,12 @@
 use std::ops::Range;
 
 use super::{
-    lanes::{LaneKernel, Lanes},
-    paint::{Behind, Paint},
-    rasterize::{
+    cell::{
         ACROSS, CELL, CELL_X, CELL_Y, CELLS, Cell, Numbers, PIXEL_X, PIXEL_Y, PIXELS, Tile,
         TileScratch,
     },
+    lanes::{LaneKernel, Lanes},
+    paint::{Behind, Paint},
     sky::Sky,
 };
 use crate::{
@@ -24,7 +24,7 @@ pub type Pixels<'a, T> = Option<Vec<&'a mut [T]>>;
 
 /// A part of the pictures, row of pixels by row; `None` for kinds not asked for.
 #[derive(Debug, Default)]
-pub struct Part<'a> {
+pub struct PictureRows<'a> {
     /// Colours.
     pub color: Pixels<'a, [f32; 3]>,
     /// Expected depths.
@@ -71,7 +71,7 @@ fn pieces<'a, T>(mut all: Pixels<'a, T>, cut: Cut) -> impl FnMut() -> Pixels<'a,
     }
 }
 
-impl<'a> Part<'a> {
+impl<'a> PictureRows<'a> {
     /// The pictures of a frame from a row of pixels on, without weights.
     pub(super) fn of(frame: &'a mut Frame, first: usize) -> Self {
         fn rows<T>(all: &mut Option<Vec<T>>, (width, first): (usize, usize)) -> Pixels<'_, T> {
@@ -102,7 +102,7 @@ impl<'a> Part<'a> {
         let mut alpha_levels = pieces(self.alpha_levels, cut);
         let mut blend = pieces(self.blend, cut);
         let mut mask = pieces(self.mask, cut);
-        let part = |_| Part {
+        let part = |_| PictureRows {
             color: color(),
             depth: depth(),
             alpha: alpha(),
@@ -123,7 +123,7 @@ pub(super) struct Store<'a, 'b> {
     pub(super) paint: &'a Paint<'a>,
     pub(super) column: usize,
     pub(super) scratch: &'a mut TileScratch,
-    pub(super) out: &'a mut Part<'b>,
+    pub(super) out: &'a mut PictureRows<'b>,
 }
 
 impl LaneKernel for Store<'_, '_> {
@@ -222,7 +222,7 @@ fn write(
     cell: &Cell,
     first: usize,
     (row, to): (usize, Range<usize>),
-    out: &mut Part<'_>,
+    out: &mut PictureRows<'_>,
 ) {
     let [depth_at, label_at, _] = paint.layout();
     let Cell { alpha, channels, .. } = cell;

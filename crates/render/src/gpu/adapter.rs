@@ -9,21 +9,23 @@ use parking_lot::Mutex;
 
 use super::{
     buffers::{DeviceScene, SceneCache},
+    context::{Context, OpenDevice},
     device::Gpu,
-    frame::{Drawing, Tools},
+    drawing::Drawing,
     pipelines::{Kernels, VIEWS_MAX},
     pool::{QueuedView, SUBMISSIONS_MAX, ViewQueue},
     profile::Marks,
     scratch::Scratch,
-    trainer::DeviceTrainer,
+    trainer::{DeviceTrainer, trainer_bytes},
 };
 use crate::{
-    DeviceTimes, DispatchTime, Frame, Labels, RenderRequest, RendererOptions,
+    Frame, Labels, RenderRequest,
     backward::{FrameGradients, Gradients},
     constants::ISECTS_MAX,
-    error::{ErrorCode, Result},
+    error::{Error, ErrorCode, Result},
+    options::{AdapterReport, RendererOptions},
+    renderer::{DeviceTimes, DispatchTime},
     scene::Gaussians,
-    select::AdapterReport,
     train::TrainingSet,
 };
 
@@ -32,54 +34,11 @@ const OPENED_MAX: u32 = 3;
 /// Gaussians of all views of one submission. A view with more of them fills a device alone.
 const BATCH_GAUSSIANS: usize = 4 << 20;
 
-/// A device, its kernels and its scenes. Clones share them.
-#[derive(Clone, Debug)]
-pub(super) struct OpenDevice {
-    pub(super) gpu: Gpu,
-    pub(super) kernels: Arc<Kernels>,
-    scenes: Arc<Mutex<SceneCache>>,
-}
-
-/// A device and scratch buffers for one submission.
-#[derive(Debug)]
-pub(super) struct Context {
-    pub(super) on: OpenDevice,
-    pub(super) scratch: Scratch,
-}
-
-impl Context {
-    /// The tools that draw frames of `scene`.
-    fn tools<'a>(
-        &'a mut self,
-        scene: &'a DeviceScene,
-        isects_max: u32,
-        marks: Option<&'a mut Marks>,
-    ) -> Tools<'a> {
-        let (gpu, kernels, scratch) = (&self.on.gpu, &*self.on.kernels, &mut self.scratch);
-        Tools { gpu, kernels, scratch, scene, isects_max, marks }
-    }
-
-    /// The Gaussians of a backward pass, which no view is expected to draw.
-    fn learnt(&mut self, gaussians: &Gaussians) -> Result<DeviceScene> {
-        let learnt = &mut self.scratch.learnt;
-        let scene = match learnt.take() {
-            Some(scene) if scene.has_shape(gaussians.shape_identity()) => scene,
-            old => DeviceScene::upload(&self.on.gpu, gaussians, old)?,
-        };
-        Ok(learnt.insert(scene).clone())
-    }
-
-    /// The scene of `gaussians`; if `labelled`, with its entries.
-    pub(super) fn scene(&self, gaussians: &Gaussians, labelled: bool) -> Result<DeviceScene> {
-        self.on.scenes.lock().get(&self.on.gpu, gaussians, labelled)
-    }
-}
-
 /// The device of an adapter, and the buffers that no submission uses now.
 #[derive(Debug, Default)]
-struct DeviceState {
+pub(super) struct DeviceState {
     /// `None` after the device was lost.
-    opened: Option<OpenDevice>,
+    pub(super) opened: Option<OpenDevice>,
     idle: Vec<Scratch>,
 }
 
@@ -89,12 +48,12 @@ pub(super) struct Adapter {
     options: RendererOptions,
     adapter: wgpu::Adapter,
     report: AdapterReport,
-    state: Mutex<DeviceState>,
+    pub(super) state: Mutex<DeviceState>,
     /// Shape identities of the device's scenes. Reading them does not wait for an upload.
-    shapes: Mutex<Vec<u64>>,
+    pub(super) shapes: Mutex<Vec<u64>>,
     queue: ViewQueue,
-    submissions: AtomicU64,
-    views: AtomicU64,
+    pub(super) submissions: AtomicU64,
+    pub(super) views: AtomicU64,
 }
 
 impl Adapter {
@@ -132,11 +91,7 @@ impl Adapter {
     }
 
     fn isects_max(&self) -> u32 {
-        self.options.switches.isects_max.unwrap_or(ISECTS_MAX)
-    }
-
-    pub(super) fn scenes_held(&self) -> usize {
-        self.shapes.lock().len()
+        self.options.switches.isects_max().unwrap_or(ISECTS_MAX)
     }
 
     /// Whether the device held the scene of that shape when the last view was drawn.
@@ -147,17 +102,6 @@ impl Adapter {
     /// Views that wait or are being drawn.
     pub(super) fn waiting(&self) -> usize {
         self.queue.len()
-    }
-
-    pub(super) fn submissions(&self) -> (u64, u64) {
-        (self.submissions.load(Ordering::Relaxed), self.views.load(Ordering::Relaxed))
-    }
-
-    /// Marks the device as lost for everyone.
-    pub(super) fn lose_device(&self) {
-        if let Some(opened) = &self.state.lock().opened {
-            opened.gpu.give_up("lost on purpose".to_owned());
-        }
     }
 
     /// Runs `work` on the device. A lost device is opened again first.
@@ -312,8 +256,12 @@ impl Adapter {
         })
     }
 
-    /// A trainer with buffers of its own on the device.
-    pub(super) fn trainer(&self, set: &TrainingSet<'_>) -> Result<DeviceTrainer> {
+    /// A trainer with buffers of its own on the device, of about `bytes_max` bytes at most.
+    pub(super) fn trainer(&self, set: &TrainingSet<'_>, bytes_max: u64) -> Result<DeviceTrainer> {
+        let bytes = trainer_bytes(set);
+        if bytes > bytes_max {
+            return Err(Error::limit("training: bytes of the device", bytes, bytes_max));
+        }
         let on = self.persistently(|context| Ok(context.on.clone()))?;
         DeviceTrainer::new(on, self.isects_max(), set)
     }

@@ -5,12 +5,13 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::{
+    batch_buffers::{BatchBuffers, BufferCopy},
+    bindings::Inputs,
     buffers::GradientRow,
-    frame::{ATTEMPTS_MAX, Drawing, Layout, Tools},
+    drawing::{Drawing, Layout},
+    frame::{ATTEMPTS_MAX, Tools},
     pipelines::{GRADIENT_WORDS, PAIR_SUMS},
     readback,
-    recorder::Recorder,
-    scratch::BatchBuffers,
 };
 use crate::{
     DispatchTime, Frame, Kinds, RenderRequest,
@@ -20,6 +21,16 @@ use crate::{
 
 /// Fewest Gaussians that a thread reads.
 const READ_MIN: usize = 1 << 14;
+
+/// A view of which all stages have left their buffers.
+struct DrawnView {
+    layout: Layout,
+    room: BatchBuffers,
+    /// Columns and rows of tiles.
+    tiles: [u32; 2],
+    /// Gaussian-tile pairs.
+    pairs: u64,
+}
 
 impl Tools<'_> {
     /// Draws a whole view, asks `loss` and writes `gradients`. Also the times of all dispatches,
@@ -40,7 +51,8 @@ impl Tools<'_> {
         let frame = drawing.finish(self.scratch)?;
         let by = loss(&frame)?;
         by.check_of(&frame)?;
-        self.back((&layout, &room, tiles), frame.stats.intersections, &by, gradients)?;
+        let drawn = DrawnView { layout, room, tiles, pairs: frame.stats.intersections };
+        self.back(&drawn, &by, gradients)?;
         times.extend(self.times()?);
         Ok((frame, times))
     }
@@ -64,11 +76,10 @@ impl Tools<'_> {
         Err(Error::limit("backward: Gaussian-tile pairs of a view", needed, capacity_max))
     }
 
-    /// Goes back through a frame of `pairs` Gaussian-tile pairs.
+    /// Goes back through a view.
     fn back(
         &mut self,
-        (layout, room, tiles): (&Layout, &BatchBuffers, [u32; 2]),
-        pairs: u64,
+        DrawnView { layout, room, tiles, pairs }: &DrawnView,
         by: &FrameGradients,
         gradients: &mut Gradients,
     ) -> Result<()> {
@@ -87,18 +98,21 @@ impl Tools<'_> {
             (layout.depth, by.depth.as_deref().map(bytemuck::cast_slice)),
             (layout.alpha, by.alpha.as_deref().map(bytemuck::cast_slice)),
         ];
-        let bindings = &mut self.scratch.bindings;
-        let (kernels, marks) = (self.kernels, self.marks.as_deref_mut());
+        let inputs =
+            Inputs { backward: Some(&backward), ..Inputs::new(self.kernels, room, Some(scene), 1) };
         gpu.scoped("backward", || {
             for (start, bytes) in pictures {
                 if let Some(bytes) = bytes {
                     gpu.queue.write_buffer(&backward.by_pictures, u64::from(start) * 4, bytes);
                 }
             }
-            let (sizes, zeros) = ((1, scene.count), [&backward.sums]);
-            let mut stages = Recorder::new(gpu, kernels, bindings, (room, &zeros), sizes, marks);
-            stages.backward(scene.buffers(), kinds, &backward, tiles);
-            stages.submit(&[(&backward.gradients, 0, &backward.staging, 0, gradient_bytes)])
+            let mut stages = self.recorder(inputs, &[&backward.sums]);
+            stages.backward(kinds, *tiles);
+            stages.submit(&[BufferCopy {
+                from: (&backward.gradients, 0),
+                to: (&backward.staging, 0),
+                bytes: gradient_bytes,
+            }])
         })??;
         gradients.clear(scene.count as usize, scene.sh_count as usize);
         readback::read(gpu, &backward.staging, gradient_bytes, |bytes| take(bytes, gradients))

@@ -1,6 +1,6 @@
 //! Data that host and shaders share: `repr(C)` structs equal to those of
 //! shaders/common/structs.wgsl, and the scenes on the device.
-#![expect(missing_docs, reason = "shaders/common/structs.wgsl describes the fields")]
+#![allow(missing_docs, reason = "shaders/common/structs.wgsl describes the fields")]
 
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
@@ -8,7 +8,6 @@ use rayon::prelude::*;
 use super::{
     device::Gpu,
     pipelines::{GRADIENT_WORDS, LEVELS_RGB, LEVELS_RGBA, NO_PICTURE},
-    recorder::SceneBuffers,
 };
 use crate::{
     Background, Labels, RenderRequest, Samples, Source,
@@ -271,12 +270,6 @@ impl DeviceScene {
     /// Whether these are the Gaussians of that shape.
     pub(super) fn has_shape(&self, shape: u64) -> bool {
         self.shape == shape
-    }
-
-    /// What the stages read.
-    pub(super) fn buffers(&self) -> SceneBuffers<'_> {
-        let Self { gaussians, sh, sh_count, .. } = self;
-        SceneBuffers { gaussians, sh, sh_count: *sh_count }
     }
 
     fn size_bytes(&self) -> u64 {

@@ -8,12 +8,11 @@ use std::sync::{
 };
 
 use parking_lot::Mutex;
-use wgpu::{BufferUsages, ErrorFilter};
+use wgpu::{BufferUsages, ErrorFilter, Features};
 
-use super::profile;
 use crate::{
     error::{Error, ErrorCode, Result},
-    select::AdapterReport,
+    options::AdapterReport,
     switches::{FaultsToCome, Switches},
 };
 
@@ -31,6 +30,9 @@ const UPLOAD_CHUNK: usize = 32 << 20;
 const STORAGE_BUFFERS: u32 = 8;
 /// Bytes of workgroup storage that the kernels need.
 const WORKGROUP_BYTES: u32 = 16 << 10;
+
+/// Features without which the device gives no times.
+const TIMES: Features = Features::TIMESTAMP_QUERY.union(Features::TIMESTAMP_QUERY_INSIDE_PASSES);
 
 const REFUSED: &str = "the GPU adapter refused a device";
 
@@ -151,7 +153,7 @@ impl Gpu {
     /// Errors: `gpu_unavailable` when the adapter refuses or its limits are too small for the
     /// kernels.
     pub(super) fn open(adapter: &wgpu::Adapter, switches: &Switches) -> Result<Self> {
-        let to_come = Arc::clone(&switches.faults);
+        let to_come = switches.faults();
         if FaultsToCome::comes(&to_come.open) {
             return Err(Error::new(ErrorCode::GpuUnavailable, REFUSED));
         }
@@ -174,13 +176,13 @@ impl Gpu {
                 return Err(Error::new(ErrorCode::GpuUnavailable, why));
             }
         }
-        let limits = if switches.portable { wgpu::Limits::default() } else { offered };
+        let limits = if switches.portable() { wgpu::Limits::default() } else { offered };
         let binding_bytes_max =
             limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) & !0xff;
-        let has_times = adapter.features().contains(profile::FEATURES);
+        let has_times = adapter.features().contains(TIMES);
         let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("segsplat"),
-            required_features: (profile::FEATURES | wgpu::Features::SUBGROUP) & adapter.features(),
+            required_features: (TIMES | Features::SUBGROUP) & adapter.features(),
             required_limits: limits,
             ..Default::default()
         }))

@@ -3,88 +3,34 @@
 
 use std::{ops::Range, sync::Arc};
 
-use bytemuck::Pod;
-use glam::DVec3;
 use rayon::prelude::*;
 
 use super::{
+    batch_buffers::{BatchBuffers, BatchSizes, BufferCopy, first_cell},
+    bindings::Inputs,
     buffers::{DeviceScene, PlanRow, SourceRow, ViewRow},
     device::Gpu,
+    drawing::{Drawing, Ended, Layout, ReadBack},
     pipelines::{Kernels, NO_PICTURE, RasterKinds},
     profile::Marks,
     readback,
     recorder::Recorder,
-    scratch::{BatchBuffers, Need, Scratch, WEIGHT_SLOTS_MIN, first_cell},
+    scratch::Scratch,
 };
 use crate::{
-    Background, DepthSteps, Frame, Labels, RenderRequest, Samples,
-    constants::TILE_SIZE,
+    Background, Labels, RenderRequest,
     error::{Error, Result},
-    labels::{BLEND_WIDTH, WeightRows},
+    labels::BLEND_WIDTH,
     scene::Backdrop,
-    view::View,
 };
 
 /// Smallest room, in Gaussian-tile pairs.
 const ISECT_CAPACITY_MIN: u32 = 1 << 16;
 /// How often a band is drawn: the first try may lack room, the second knows what it needs.
 pub(super) const ATTEMPTS_MAX: u32 = 3;
-/// Factor by which the room for weights grows when it is too small.
-const WEIGHT_SLOTS_GROWTH: u32 = 4;
 /// Bytes of a tile pair: key and Gaussian, stored twice.
 const PAIR_BYTES: u64 = 16;
 pub(super) const PLAN_BYTES: u64 = size_of::<PlanRow>() as u64;
-/// Pictures of more bytes than this are copied by all cores.
-const PARALLEL_BYTES: usize = 4 << 20;
-
-/// Places of a band's pictures in the buffers of its batch: first words, or [`NO_PICTURE`].
-pub(super) struct Layout {
-    pub(super) color: u32,
-    /// In f32. Where it is asked for in steps it is not read back: it lies behind all pictures that
-    /// are.
-    pub(super) depth: u32,
-    pub(super) alpha: u32,
-    blend: u32,
-    alpha_bytes: u32,
-    mask: u32,
-    steps: u32,
-    /// Words of the pictures that are read back.
-    words: u64,
-    /// Words of those that are not.
-    inner_words: u64,
-    /// Pixels of the band.
-    pixels: u64,
-    /// Room of a pixel, in weights; 0 if none are asked for.
-    slots: u32,
-    tiles: u32,
-}
-
-impl Layout {
-    pub(super) fn picture_bytes(&self) -> u64 {
-        self.words * 4
-    }
-
-    /// Words: one count for each pixel, then an entry and a weight for each slot.
-    fn slot_bytes(&self) -> u64 {
-        if self.slots == 0 { 0 } else { self.pixels * 4 * (1 + 2 * u64::from(self.slots)) }
-    }
-
-    fn all_bytes(&self) -> u64 {
-        self.picture_bytes() + self.inner_words * 4 + self.slot_bytes()
-    }
-}
-
-/// The band of one view after the read-back, with its pictures and slots.
-type Part<'a, 'b> = (&'a mut Drawing<'b>, &'a Layout, PlanRow, &'a [u8], &'a [u32]);
-
-/// Result of one view of a submission.
-pub(super) struct Ended {
-    /// Counts of the device.
-    pub(super) plan: PlanRow,
-    pub(super) drawn: bool,
-    /// New room of a pixel, in weights, if the old one was too small.
-    more_slots: Option<u32>,
-}
 
 /// Everything that drawing a frame needs.
 pub(super) struct Tools<'a> {
@@ -96,199 +42,143 @@ pub(super) struct Tools<'a> {
     pub(super) marks: Option<&'a mut Marks>,
 }
 
-/// A frame in work. Its bands are drawn from top to bottom.
-pub(super) struct Drawing<'a> {
-    row: ViewRow,
-    request: &'a RenderRequest,
-    frame: Frame,
-    /// Weights of the bands drawn.
-    weights: Vec<WeightRows>,
-    /// Most weights of a pixel in them.
-    weights_max: u32,
+/// The views of a submission: what the device must know of them, and what they need together.
+pub(super) struct Batch {
+    rows: Vec<ViewRow>,
+    /// Columns and rows of tiles of the largest view.
+    grid: [u32; 2],
+    /// Tiles of all views, and one more for each.
+    tiles: u32,
+    /// Tile pairs that each view has room for.
+    capacity: u32,
+    table: Vec<[f32; BLEND_WIDTH]>,
+    sources: Vec<SourceRow>,
+    backdrops: Vec<Arc<Backdrop>>,
+    /// Words of the pictures that are read back.
+    words: u64,
+    /// The same and those that are not, which come after all others.
+    all_words: u64,
+    slot_words: u64,
+    /// Words of the largest picture in steps.
+    step_words: u32,
 }
 
-impl<'a> Drawing<'a> {
-    /// Errors: those of [`View::new`].
+impl Batch {
+    /// One band of each view.
     pub(super) fn new(
-        origin: DVec3,
-        request: &'a RenderRequest,
-        scene: &DeviceScene,
-    ) -> Result<Self> {
-        let view = View::new(origin, request)?;
-        let mut row = ViewRow::of(&view, request);
-        (row.gaussian_count, row.sh_count) = (scene.count, scene.sh_count);
-        // The bands are appended.
-        let frame = Frame::blank([view.width, view.height], request, 0);
-        Ok(Self { row, request, frame, weights: Vec::new(), weights_max: 0 })
-    }
-
-    /// The frame of all bands.
-    pub(super) fn finish(mut self, scratch: &mut Scratch) -> Result<Frame> {
-        if self.request.labels == Labels::Weights {
-            // The next view needs about the same room. One unusual view does not change that.
-            scratch.weight_slots = self.weights_max.next_power_of_two().max(WEIGHT_SLOTS_MIN);
-            self.frame.weights = Some(WeightRows::join(self.weights)?);
-        }
-        // Depth in steps came so from the device, unless it was drawn in bands.
-        let stepped = self.frame.levels.depth.is_some();
-        Ok(if stepped { self.frame } else { self.frame.finish(self.request.samples) })
-    }
-
-    /// All rows of tiles.
-    pub(super) fn whole(&self) -> Range<u32> {
-        0..self.row.tiles_y
-    }
-
-    /// Columns and rows of tiles.
-    pub(super) fn tiles(&self) -> [u32; 2] {
-        [self.row.tiles_x, self.row.tiles_y]
-    }
-
-    /// The row of the whole picture, alone in its submission, with room for `capacity` pairs.
-    pub(super) fn alone(&self, layout: &Layout, capacity: u32) -> ViewRow {
-        let backdrop_start = match self.request.background {
-            Background::Backdrop(_) if self.request.kinds.color => first_cell(0),
-            _ => NO_PICTURE,
-        };
-        ViewRow {
-            isect_capacity: capacity,
-            color_start: layout.color,
-            depth_start: layout.depth,
-            alpha_start: layout.alpha,
-            backdrop_start,
-            ..self.row
-        }
-    }
-
-    pub(super) fn layout(&self, rows: &Range<u32>, slots: u32) -> Layout {
-        let pixel_rows = (rows.end * TILE_SIZE).min(self.row.height) - rows.start * TILE_SIZE;
-        let pixels = u64::from(pixel_rows) * u64::from(self.row.width);
-        let RenderRequest { kinds, labels, samples, .. } = self.request;
-        let exact = *samples == Samples::F32;
-        let mut words = 0;
-        let mut take = |wanted: bool, size: u64| {
-            let start = if wanted { words as u32 } else { NO_PICTURE };
-            words += if wanted { size } else { 0 };
-            start
-        };
-        // Rows of numbers that share words start at whole ones.
-        let packed = |bytes: u32| {
-            u64::from(pixel_rows) * (u64::from(self.row.width) * u64::from(bytes)).div_ceil(4)
-        };
-        // Steps are of one size in all bands.
-        let stepped = kinds.depth && !exact && *rows == self.whole();
-        let color_words = match samples {
-            Samples::F32 => 3 * pixels,
-            Samples::Levels => packed(3),
-            Samples::LevelsRgba => pixels,
-        };
-        let color = take(kinds.color, color_words);
-        let alpha = take(kinds.alpha && exact, pixels);
-        let blend = take(matches!(labels, Labels::Blend(_)), BLEND_WIDTH as u64 * pixels);
-        let alpha_bytes = take(kinds.alpha && !exact, packed(1));
-        let mask = take(matches!(labels, Labels::Mask { .. }), packed(1));
-        let steps = take(stepped, packed(2));
-        let depth = take(kinds.depth && !stepped, pixels);
-        let depth = if stepped { 0 } else { depth };
-        let inner_words = if stepped { pixels } else { 0 };
-        let tiles = self.row.tiles_x * (rows.end - rows.start);
-        Layout {
-            color,
-            depth,
-            alpha,
-            blend,
-            alpha_bytes,
-            mask,
-            steps,
-            words,
-            inner_words,
-            pixels,
-            slots,
-            tiles,
-        }
-    }
-
-    /// Rows of the table to blend. An empty table is one row of zeros.
-    fn table(&self) -> &[[f32; BLEND_WIDTH]] {
-        match self.request.labels.table() {
-            Some([]) => &[[0.0; BLEND_WIDTH]],
-            Some(table) => &table[..table.len().min(1 << u16::BITS)],
-            None => &[],
-        }
-    }
-
-    /// Copies a band out of the read-back, if there was room for all of it.
-    fn take(
-        &mut self,
-        layout: &Layout,
-        plan: PlanRow,
+        drawings: &[Drawing<'_>],
+        bands: &[Range<u32>],
+        layouts: &[Layout],
         capacity: u32,
-        pictures: &[u8],
-        slots: &[u32],
-    ) -> Ended {
-        let mut ended = Ended { plan, drawn: false, more_slots: None };
-        if plan.needed > capacity {
-            return ended;
+    ) -> Self {
+        let mut batch = Self {
+            rows: Vec::with_capacity(drawings.len()),
+            grid: [0; 2],
+            tiles: 0,
+            capacity,
+            table: Vec::new(),
+            sources: Vec::new(),
+            backdrops: Vec::new(),
+            words: 0,
+            all_words: layouts.iter().map(|layout| layout.words).sum(),
+            slot_words: 0,
+            step_words: 0,
+        };
+        for ((drawing, band), layout) in drawings.iter().zip(bands).zip(layouts) {
+            batch.add(drawing, band, layout);
         }
-        let counts = &slots[..slots.len().min(layout.pixels as usize)];
-        let weights = counts.iter().copied().max().unwrap_or(0);
-        if weights > layout.slots {
-            ended.more_slots = Some(layout.slots.saturating_mul(WEIGHT_SLOTS_GROWTH));
-            return ended;
-        }
-        self.store(layout, plan.farthest, pictures, slots);
-        self.weights_max = self.weights_max.max(weights);
-        let stats = &mut self.frame.stats;
-        stats.visible = stats.visible.max(u64::from(plan.visible));
-        stats.intersections += u64::from(plan.isects);
-        Ended { drawn: true, ..ended }
+        batch
     }
 
-    /// Copies the pictures and weights of a band out of the read-back. `farthest` has the bits of
-    /// the largest depth, where depth is in steps.
-    fn store(&mut self, layout: &Layout, farthest: u32, pictures: &[u8], slots: &[u32]) {
-        let pixels = layout.pixels as usize;
-        let width = self.row.width as usize;
-        let all = width * self.row.height as usize;
-        let part = |start: u32, words: usize| {
-            let start = start as usize * 4;
-            &pictures[start..start + pixels * words * 4]
-        };
-        let from = |start: u32| &pictures[start as usize * 4..];
-        let rows = pixels / width;
-        let Frame { color, depth, alpha, levels, blend, mask, .. } = &mut self.frame;
-        if let Some(color) = color {
-            append(color, all, part(layout.color, 3), |color| color);
+    fn add(&mut self, drawing: &Drawing<'_>, band: &Range<u32>, layout: &Layout) {
+        let (row, words) = (&drawing.row, self.words as u32);
+        let after = |start: u32| if start == NO_PICTURE { start } else { start + words };
+        let stepped = layout.steps != NO_PICTURE;
+        let backdrop_start = self.backdrop_start(drawing.request);
+        self.rows.push(ViewRow {
+            row_start: band.start,
+            row_end: band.end,
+            isect_capacity: self.capacity,
+            color_start: after(layout.color),
+            depth_start: if stepped { self.all_words as u32 } else { after(layout.depth) },
+            alpha_start: after(layout.alpha),
+            blend_start: after(layout.blend),
+            alpha_byte_start: after(layout.alpha_bytes),
+            mask_start: after(layout.mask),
+            steps_start: after(layout.steps),
+            backdrop_start,
+            source_start: self.sources.len() as u32,
+            label_rows: drawing.table().len() as u32,
+            table_start: self.table.len() as u32,
+            weight_slots: layout.slots,
+            slot_start: self.slot_words as u32,
+            range_start: self.tiles,
+            pair_start: self.rows.len() as u32 * self.capacity,
+            ..*row
+        });
+        self.grid = [self.grid[0].max(row.tiles_x), self.grid[1].max(band.end - band.start)];
+        self.words += layout.words;
+        self.all_words += layout.inner_words;
+        if stepped {
+            self.step_words = self.step_words.max(row.width.div_ceil(2) * row.height);
         }
-        if let Some(rgb) = &mut levels.rgb {
-            append_rows(rgb, all, from(layout.color), [width, rows]);
+        self.slot_words += layout.slot_bytes() / 4;
+        self.tiles += layout.tiles + 1;
+        self.table.extend_from_slice(drawing.table());
+        self.sources.extend(drawing.request.sources.iter().map(SourceRow::from));
+    }
+
+    /// First cell of the backdrop of a request. Views of one backdrop share it.
+    fn backdrop_start(&mut self, request: &RenderRequest) -> u32 {
+        let Background::Backdrop(wanted) = &request.background else { return NO_PICTURE };
+        if !request.kinds.color {
+            return NO_PICTURE;
         }
-        if let Some(rgba) = &mut levels.rgba {
-            append(rgba, all, part(layout.color, 1), |word: [u8; 4]| word);
+        let known = self.backdrops.iter().position(|one| Arc::ptr_eq(one, wanted));
+        first_cell(known.unwrap_or_else(|| {
+            self.backdrops.push(Arc::clone(wanted));
+            self.backdrops.len() - 1
+        }))
+    }
+
+    /// Bytes that are read back: plans, pictures and slots.
+    fn read_bytes(&self) -> [u64; 3] {
+        [PLAN_BYTES * self.rows.len() as u64, self.words * 4, self.slot_words * 4]
+    }
+
+    /// What the buffers must hold, of a scene of `count` Gaussians.
+    pub(super) fn sizes(&self, count: u32, shades: bool) -> BatchSizes {
+        BatchSizes {
+            views: self.rows.len() as u32,
+            count,
+            capacity: self.capacity,
+            tiles: self.tiles,
+            shades,
+            source_bytes: size_of_val(self.sources.as_slice()) as u64,
+            picture_bytes: self.all_words * 4,
+            table_bytes: size_of_val(self.table.as_slice()) as u64,
+            slot_bytes: self.slot_words * 4,
+            staging_bytes: self.read_bytes().iter().sum(),
         }
-        if let Some(alpha) = &mut levels.alpha {
-            append_rows(alpha, all, from(layout.alpha_bytes), [width, rows]);
+    }
+
+    /// Writes it into `room`, which holds the backdrops `held`.
+    pub(super) fn write(&self, gpu: &Gpu, room: &BatchBuffers, held: &[Arc<Backdrop>]) {
+        room.put_backdrops(gpu, &self.backdrops, held);
+        gpu.queue.write_buffer(&room.views, 0, bytemuck::cast_slice(&self.rows));
+        if !self.table.is_empty() {
+            gpu.queue.write_buffer(&room.table, 0, bytemuck::cast_slice(&self.table));
         }
-        if let Some(alpha) = alpha {
-            append(alpha, all, part(layout.alpha, 1), |alpha| alpha);
+        if !self.sources.is_empty() {
+            gpu.queue.write_buffer(&room.sources, 0, bytemuck::cast_slice(&self.sources));
         }
-        if layout.steps != NO_PICTURE {
-            let mut steps = Vec::new();
-            append_rows(&mut steps, all, from(layout.steps), [width, rows]);
-            levels.depth = Some(DepthSteps { steps, ..DepthSteps::to(f32::from_bits(farthest)) });
-            *depth = None;
-        } else if let Some(depth) = depth {
-            append(depth, all, part(layout.depth, 1), |depth| depth);
-        }
-        if let Some(blend) = blend {
-            append(blend, all, part(layout.blend, BLEND_WIDTH), |row| row);
-        }
-        if let Some(mask) = mask {
-            append_rows(mask, all, from(layout.mask), [width, rows]);
-        }
-        if layout.slots > 0 {
-            self.weights.push(weight_rows(slots, layout, width));
-        }
+    }
+
+    /// The backdrops that the device has after this, where it had those `held`.
+    pub(super) fn held_after(mut self, held: Vec<Arc<Backdrop>>) -> Vec<Arc<Backdrop>> {
+        let written = self.backdrops.len();
+        self.backdrops.extend(held.into_iter().skip(written));
+        self.backdrops
     }
 }
 
@@ -376,196 +266,82 @@ impl Tools<'_> {
         layouts: &[Layout],
         capacity: u32,
     ) -> Result<(Vec<Ended>, BatchBuffers)> {
-        let views = drawings.len() as u32;
-        let mut rows = Vec::with_capacity(drawings.len());
-        let mut grid = [0; 2];
-        let (mut words, mut slot_words, mut tiles, mut step_words) = (0_u64, 0_u64, 0, 0);
-        let mut table: Vec<[f32; BLEND_WIDTH]> = Vec::new();
-        let mut sources: Vec<SourceRow> = Vec::new();
-        let mut backdrops: Vec<Arc<Backdrop>> = Vec::new();
-        // Pictures that are not read back come after all others.
-        let mut inner = layouts.iter().map(|layout| layout.words).sum::<u64>();
-        for (i, ((drawing, band), layout)) in drawings.iter().zip(bands).zip(layouts).enumerate() {
-            let after = |start: u32| match start {
-                NO_PICTURE => NO_PICTURE,
-                start => start + words as u32,
-            };
-            let backdrop_start = match &drawing.request.background {
-                Background::Backdrop(wanted) if drawing.request.kinds.color => {
-                    let known = backdrops.iter().position(|one| Arc::ptr_eq(one, wanted));
-                    first_cell(known.unwrap_or_else(|| {
-                        backdrops.push(Arc::clone(wanted));
-                        backdrops.len() - 1
-                    }))
-                }
-                _ => NO_PICTURE,
-            };
-            rows.push(ViewRow {
-                row_start: band.start,
-                row_end: band.end,
-                isect_capacity: capacity,
-                color_start: after(layout.color),
-                depth_start: match layout.steps {
-                    NO_PICTURE => after(layout.depth),
-                    _ => inner as u32,
-                },
-                alpha_start: after(layout.alpha),
-                blend_start: after(layout.blend),
-                alpha_byte_start: after(layout.alpha_bytes),
-                mask_start: after(layout.mask),
-                steps_start: after(layout.steps),
-                backdrop_start,
-                source_start: sources.len() as u32,
-                label_rows: drawing.table().len() as u32,
-                table_start: table.len() as u32,
-                weight_slots: layout.slots,
-                slot_start: slot_words as u32,
-                range_start: tiles,
-                pair_start: i as u32 * capacity,
-                ..drawing.row
-            });
-            grid = [grid[0].max(drawing.row.tiles_x), grid[1].max(band.end - band.start)];
-            words += layout.words;
-            inner += layout.inner_words;
-            step_words = step_words.max(match layout.steps {
-                NO_PICTURE => 0,
-                _ => drawing.row.width.div_ceil(2) * drawing.row.height,
-            });
-            slot_words += layout.slot_bytes() / 4;
-            tiles += layout.tiles + 1;
-            table.extend_from_slice(drawing.table());
-            sources.extend(drawing.request.sources.iter().map(SourceRow::from));
-        }
-        let plan_bytes = PLAN_BYTES * u64::from(views);
-        let (picture_bytes, slot_bytes) = (words * 4, slot_words * 4);
-        let staging_bytes = plan_bytes + picture_bytes + slot_bytes;
-        let (gpu, scene) = (self.gpu, self.scene);
+        let batch = Batch::new(drawings, bands, layouts, capacity);
         // All have the same.
         let kinds = RasterKinds::from(drawings[0].request);
-        let shades = kinds.color && !self.kernels.flat(scene.sh_count);
-        let room = self.scratch.room(
-            gpu,
-            &Need {
-                views,
-                count: scene.count,
-                capacity,
-                tiles,
-                shades,
-                source_bytes: size_of_val(sources.as_slice()) as u64,
-                picture_bytes: inner * 4,
-                table_bytes: size_of_val(table.as_slice()) as u64,
-                slot_bytes,
-                staging_bytes,
-            },
-        )?;
-        let buffers = scene.buffers();
-        let entries = self.scene.labels.as_ref().map(|labels| &labels.entries);
-        // Nothing is known to be there while an upload may fail.
-        let held = std::mem::take(&mut self.scratch.backdrops);
-        let bindings = &mut self.scratch.bindings;
-        let (kernels, marks) = (self.kernels, self.marks.as_deref_mut());
-        gpu.scoped("render", || {
-            room.put_backdrops(gpu, &backdrops, &held);
-            gpu.queue.write_buffer(&room.views, 0, bytemuck::cast_slice(&rows));
-            if !table.is_empty() {
-                gpu.queue.write_buffer(&room.table, 0, bytemuck::cast_slice(&table));
-            }
-            if !sources.is_empty() {
-                gpu.queue.write_buffer(&room.sources, 0, bytemuck::cast_slice(&sources));
-            }
-            let sizes = (views, scene.count);
-            let mut stages =
-                Recorder::new(gpu, kernels, bindings, (&room, &room.zeros()), sizes, marks);
-            stages.draw(buffers, kinds, entries, grid);
-            if step_words > 0 {
-                stages.depth_steps(step_words);
-            }
-            stages.submit(&[
-                (&room.plans, 0, &room.staging, 0, plan_bytes),
-                (&room.pictures, 0, &room.staging, plan_bytes, picture_bytes),
-                (&room.slots, 0, &room.staging, plan_bytes + picture_bytes, slot_bytes),
-            ])
-        })??;
-        backdrops.extend(held.into_iter().skip(backdrops.len()));
-        self.scratch.backdrops = backdrops;
-        let ended = readback::read(gpu, &room.staging, staging_bytes, |bytes| {
-            let (plans, rest) = bytes.split_at(plan_bytes as usize);
-            let (mut pictures, slots) = rest.split_at(picture_bytes as usize);
-            let mut slots: &[u32] = bytemuck::cast_slice(slots);
-            let plans: Vec<PlanRow> = bytemuck::pod_collect_to_vec(plans);
-            let mut parts = Vec::with_capacity(plans.len());
-            for ((drawing, layout), plan) in drawings.iter_mut().zip(layouts).zip(plans) {
-                let (mine, mine_slots);
-                (mine, pictures) = pictures.split_at(layout.picture_bytes() as usize);
-                (mine_slots, slots) = slots.split_at(layout.slot_bytes() as usize / 4);
-                parts.push((drawing, layout, plan, mine, mine_slots));
-            }
-            let take = |(drawing, layout, plan, mine, mine_slots): Part<'_, '_>| {
-                drawing.take(layout, plan, capacity, mine, mine_slots)
-            };
-            match parts.len() {
-                1 => parts.into_iter().map(take).collect(),
-                _ => parts.into_par_iter().map(take).collect::<Vec<_>>(),
-            }
+        let shades = kinds.color && !self.kernels.flat(self.scene.sh_count);
+        let room = self.scratch.room(self.gpu, &batch.sizes(self.scene.count, shades))?;
+        let parts = batch.read_bytes();
+        self.submit(&room, batch, kinds)?;
+        let ended = readback::read(self.gpu, &room.staging, parts.iter().sum(), |bytes| {
+            take_all(drawings, layouts, capacity, bytes, parts)
         })?;
         self.scratch.isects = ended.iter().map(|ended| ended.plan.needed).max().unwrap_or(0);
         let more_slots = ended.iter().filter_map(|ended| ended.more_slots).max();
         self.scratch.weight_slots = more_slots.unwrap_or(self.scratch.weight_slots);
         Ok((ended, room))
     }
+
+    /// Writes the batch, runs its stages, and copies what is read back.
+    fn submit(&mut self, room: &BatchBuffers, batch: Batch, kinds: RasterKinds) -> Result<()> {
+        // Nothing is known to be there while an upload may fail.
+        let held = std::mem::take(&mut self.scratch.backdrops);
+        let gpu = self.gpu;
+        let inputs = Inputs::new(self.kernels, room, Some(self.scene), batch.rows.len() as u32);
+        let [plan_bytes, picture_bytes, slot_bytes] = batch.read_bytes();
+        let copy = |from, at, bytes| BufferCopy { from: (from, 0), to: (&room.staging, at), bytes };
+        gpu.scoped("render", || {
+            batch.write(gpu, room, &held);
+            let mut stages = self.recorder(inputs, &room.zeros());
+            stages.draw(kinds, batch.grid);
+            if batch.step_words > 0 {
+                stages.depth_steps(batch.step_words);
+            }
+            stages.submit(&[
+                copy(&room.plans, 0, plan_bytes),
+                copy(&room.pictures, plan_bytes, picture_bytes),
+                copy(&room.slots, plan_bytes + picture_bytes, slot_bytes),
+            ])
+        })??;
+        self.scratch.backdrops = batch.held_after(held);
+        Ok(())
+    }
+
+    /// Starts a submission. Sets the buffers `cleared` to zeros.
+    pub(super) fn recorder<'b>(
+        &'b mut self,
+        inputs: Inputs<'b>,
+        cleared: &[&wgpu::Buffer],
+    ) -> Recorder<'b> {
+        let (bindings, marks) = (&mut self.scratch.bindings, self.marks.as_deref_mut());
+        Recorder::new(self.gpu, self.kernels, bindings, inputs, cleared, marks)
+    }
 }
 
-/// Copies the values that `bytes` hold to the end of `to`, which gets `all` values in the end; many
-/// by all cores, for most of the time goes into new pages.
-fn append<F: Pod + Send + Sync, T: Send>(
-    to: &mut Vec<T>,
-    all: usize,
+/// Hands each view its part of what was read back: plans, pictures and slots of so many bytes.
+fn take_all(
+    drawings: &mut [Drawing<'_>],
+    layouts: &[Layout],
+    capacity: u32,
     bytes: &[u8],
-    read: impl Fn(F) -> T + Send + Sync,
-) {
-    let values: &[F] = bytemuck::cast_slice(bytes);
-    to.reserve_exact(all - to.len());
-    if bytes.len() < PARALLEL_BYTES {
-        to.extend(values.iter().map(|value| read(*value)));
-    } else {
-        let values = values.par_iter().with_min_len(PARALLEL_BYTES / 16);
-        to.par_extend(values.map(|value| read(*value)));
+    [plan_bytes, picture_bytes, _]: [u64; 3],
+) -> Vec<Ended> {
+    let (plans, rest) = bytes.split_at(plan_bytes as usize);
+    let (mut all_pictures, all_slots) = rest.split_at(picture_bytes as usize);
+    let mut all_slots: &[u32] = bytemuck::cast_slice(all_slots);
+    let plans: Vec<PlanRow> = bytemuck::pod_collect_to_vec(plans);
+    let mut parts = Vec::with_capacity(plans.len());
+    for ((drawing, layout), plan) in drawings.iter_mut().zip(layouts).zip(plans) {
+        let (pictures, slots);
+        (pictures, all_pictures) = all_pictures.split_at(layout.picture_bytes() as usize);
+        (slots, all_slots) = all_slots.split_at(layout.slot_bytes() as usize / 4);
+        parts.push((drawing, layout, ReadBack { plan, pictures, slots }));
     }
-}
-
-/// Copies rows of numbers that share words to the end of `to`, as [`append`] does.
-fn append_rows<T: Pod + Send + Sync>(
-    to: &mut Vec<T>,
-    all: usize,
-    bytes: &[u8],
-    [width, rows]: [usize; 2],
-) {
-    let stride = (width * size_of::<T>()).next_multiple_of(4);
-    if stride == width * size_of::<T>() {
-        return append(to, all, &bytes[..stride * rows], |value| value);
+    let take = |(drawing, layout, read): (&mut Drawing<'_>, &Layout, ReadBack<'_>)| {
+        drawing.take(layout, capacity, &read)
+    };
+    match parts.len() {
+        1 => parts.into_iter().map(take).collect(),
+        _ => parts.into_par_iter().map(take).collect(),
     }
-    to.reserve_exact(all - to.len());
-    for row in bytes.chunks_exact(stride).take(rows) {
-        to.extend_from_slice(bytemuck::cast_slice(&row[..width * size_of::<T>()]));
-    }
-}
-
-/// The weights of a band's pixels, ascending, out of its slots.
-fn weight_rows(slots: &[u32], layout: &Layout, width: usize) -> WeightRows {
-    let pixels = layout.pixels as usize;
-    let mut rows = WeightRows::new(pixels / width, width);
-    let mut pixel = Vec::with_capacity(layout.slots as usize);
-    for (i, &count) in slots[..pixels].iter().enumerate() {
-        let plane = |slot: usize| pixels * (1 + slot) + i;
-        pixel.clear();
-        pixel.extend((0..count as usize).map(|slot| {
-            let weight = f32::from_bits(slots[plane(2 * slot + 1)]);
-            (slots[plane(2 * slot)] as u16, weight)
-        }));
-        pixel.sort_unstable_by_key(|pair| pair.0);
-        for &(entry, weight) in &pixel {
-            rows.push(i % width, i / width, entry, weight);
-        }
-    }
-    rows
 }

@@ -1,16 +1,20 @@
 //! What the tests of the GPU renderer look at: single stages on given inputs, the structs and
-//! numbers that host and shaders share, and the state of the devices. The product uses none of it.
+//! numbers that host and shaders share, and the state of the devices. The product has none of it.
+
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use bytemuck::{Pod, Zeroable};
 
 use super::{
     GpuRenderer,
-    adapter::{Adapter, OpenDevice},
+    adapter::Adapter,
+    batch_buffers::{BatchBuffers, BatchSizes, BufferCopy},
+    bindings::{Bindings, Inputs},
     buffers::{DeviceScene, narrow},
-    pipelines::{RasterKinds, RasterLabels},
+    context::OpenDevice,
+    pipelines::{Kernel, RasterKinds, RasterLabels},
     readback,
-    recorder::{Bindings, Copy, Recorder, SceneBuffers},
-    scratch::{BatchBuffers, Need},
+    recorder::Recorder,
 };
 pub use super::{
     buffers::{FootprintRow, GaussianRow, PlanRow, SourceRow, TrainingRow, ViewRow},
@@ -55,18 +59,24 @@ impl GpuRenderer {
 impl Internals<'_> {
     /// Scenes kept on all devices now.
     pub fn scenes_held(self) -> usize {
-        self.0.adapters.iter().map(Adapter::scenes_held).sum()
+        self.0.adapters.iter().map(|adapter| adapter.shapes.lock().len()).sum()
     }
 
     /// Submissions so far, and views drawn by them.
     pub fn submissions(self) -> (u64, u64) {
-        let both = self.0.adapters.iter().map(Adapter::submissions);
-        both.fold((0, 0), |sum, one| (sum.0 + one.0, sum.1 + one.1))
+        let of = |count: fn(&Adapter) -> &AtomicU64| {
+            self.0.adapters.iter().map(|one| count(one).load(Ordering::Relaxed)).sum()
+        };
+        (of(|adapter| &adapter.submissions), of(|adapter| &adapter.views))
     }
 
     /// Makes every device seem lost at once, whatever runs on it.
     pub fn lose_devices(self) {
-        self.0.adapters.iter().for_each(Adapter::lose_device);
+        for adapter in &self.0.adapters {
+            if let Some(opened) = &adapter.state.lock().opened {
+                opened.gpu.give_up("lost on purpose".to_owned());
+            }
+        }
     }
 
     /// What the loss says of the picture that a trainer of `set` draws first, `[H * W]` by colour,
@@ -77,7 +87,7 @@ impl Internals<'_> {
         at: usize,
         step: &TrainingStep,
     ) -> Result<Vec<[f32; 3]>> {
-        let mut trainer = self.0.adapters[0].trainer(set)?;
+        let mut trainer = self.0.adapters[0].trainer(set, u64::MAX)?;
         trainer.step(&[at], step)?;
         trainer.by_picture(at)
     }
@@ -96,7 +106,7 @@ impl Internals<'_> {
                 (&room.plans, 0, size_of::<PlanRow>()),
             ];
             let [footprints, touched, tiles, plans] =
-                stage.read(parts, |stages| stages.project(stage.scene()))?;
+                stage.read(parts, |stages| stages.gaussians(Kernel::Project))?;
             Ok(ProjectedRows {
                 footprints: cast(&footprints),
                 touched: cast(&touched),
@@ -146,7 +156,7 @@ impl Internals<'_> {
         self.run(row, 0, Some(gaussians), |stage| {
             stage.write(&stage.room.touched, tiles);
             let parts = [(&stage.room.colors, 0, gaussians.len() * 12)];
-            let [colors] = stage.read(parts, |stages| stages.shade(stage.scene()))?;
+            let [colors] = stage.read(parts, |stages| stages.gaussians(Kernel::Shade))?;
             Ok(cast(&colors))
         })
     }
@@ -168,8 +178,8 @@ impl Internals<'_> {
                 [(&room.lists, 0, rows.tiles.len() * 8), (&room.pairs, 0, total as usize * 16)];
             let [lists, pairs] = stage.read(parts, |stages| {
                 stages.prefix_sum();
-                stages.emit_isects();
-                stages.tile_sort(tiles);
+                stages.gaussians(Kernel::EmitIsects);
+                stages.tiles(Kernel::TileSort, tiles);
             })?;
             let pairs: Vec<[u32; 2]> = cast(&pairs);
             let list = |&[first, end]: &[u32; 2]| pairs[first as usize..end as usize].to_vec();
@@ -199,7 +209,8 @@ impl Internals<'_> {
             stage.write(&room.ends, &starts[1..]);
             stage.write(&room.pairs, &pairs);
             let parts = [(&room.lists, 0, lists.len() * 8), (&room.pairs, 0, pairs.len() * 16)];
-            let [lists, pairs] = stage.read(parts, |stages| stages.tile_sort([tiles, 1]))?;
+            let [lists, pairs] =
+                stage.read(parts, |stages| stages.tiles(Kernel::TileSort, [tiles, 1]))?;
             let pairs: Vec<[u32; 2]> = cast(&pairs);
             let list = |&[first, end]: &[u32; 2]| pairs[first as usize..end as usize].to_vec();
             Ok(cast(&lists).iter().map(list).collect())
@@ -238,7 +249,7 @@ impl Internals<'_> {
             let [pictures] = stage.read([(&room.pictures, 0, size)], |stages| {
                 let labels = RasterLabels::None;
                 let kinds = RasterKinds { color: true, depth: true, bytes: false, labels };
-                stages.rasterize(stage.scene(), kinds, None, tiles);
+                stages.tiles(Kernel::Rasterize(kinds), tiles);
             })?;
             Ok(cast(&pictures))
         })
@@ -253,7 +264,7 @@ impl Internals<'_> {
         work: impl FnOnce(&Stage) -> Result<T>,
     ) -> Result<T> {
         self.0.adapters[0].with_context(|context| {
-            let need = Need {
+            let need = BatchSizes {
                 views: 1,
                 count: row.gaussian_count,
                 capacity: row.isect_capacity,
@@ -261,7 +272,7 @@ impl Internals<'_> {
                 shades: true,
                 source_bytes: u64::from(row.source_count) * size_of::<SourceRow>() as u64,
                 picture_bytes: picture_bytes as u64,
-                ..Need::default()
+                ..BatchSizes::default()
             };
             let scene = gaussians.map(|gaussians| context.scene(gaussians, false)).transpose()?;
             let room = context.scratch.room(&context.on.gpu, &need)?;
@@ -293,13 +304,6 @@ struct Stage {
 }
 
 impl Stage {
-    /// What stages read of the scene. Without one, rasterize reads the colours in the room.
-    fn scene(&self) -> SceneBuffers<'_> {
-        let (gaussians, sh) = (&self.room.footprints, &self.room.colors);
-        let none = SceneBuffers { gaussians, sh, sh_count: 0 };
-        self.scene.as_ref().map_or(none, DeviceScene::buffers)
-    }
-
     fn write<T: Pod>(&self, to: &wgpu::Buffer, values: &[T]) {
         self.on.gpu.queue.write_buffer(to, 0, bytemuck::cast_slice(values));
     }
@@ -315,15 +319,16 @@ impl Stage {
         let usage = wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST;
         let staging = gpu.create_buffer("staging", total, usage)?;
         let mut at = 0;
-        let copies: [Copy<'_>; N] = parts.map(|(buffer, first, size)| {
-            let to = at;
-            at += size as u64;
-            (buffer, first as u64, &staging, to, size as u64)
+        let copies = parts.map(|(buffer, first, size)| {
+            let (to, bytes) = (at, size as u64);
+            at += bytes;
+            BufferCopy { from: (buffer, first as u64), to: (&staging, to), bytes }
         });
+        let (kernels, bindings) = (&*self.on.kernels, &mut Bindings::default());
+        let inputs = Inputs::new(kernels, &self.room, self.scene.as_ref(), 1);
+        let inputs = Inputs { count: self.row.gaussian_count, ..inputs };
         gpu.scoped("stage", || {
-            let (mut bindings, sizes) = (Bindings::default(), (1, self.row.gaussian_count));
-            let (kernels, room) = (&self.on.kernels, (&self.room, [].as_slice()));
-            let mut stages = Recorder::new(gpu, kernels, &mut bindings, room, sizes, None);
+            let mut stages = Recorder::new(gpu, kernels, bindings, inputs, &[], None);
             record(&mut stages);
             stages.submit(&copies)
         })??;

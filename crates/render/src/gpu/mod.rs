@@ -9,9 +9,14 @@
 
 mod adapter;
 mod backward;
+mod batch_buffers;
+mod bindings;
 mod buffers;
+mod context;
 mod device;
+mod drawing;
 mod frame;
+#[cfg(feature = "testing")]
 pub mod internals;
 mod pipelines;
 mod pool;
@@ -24,11 +29,11 @@ mod trainer;
 use std::sync::Arc;
 
 use self::adapter::Adapter;
-pub(crate) use self::trainer::trainer_bytes;
 use super::{
-    DeviceTimes, Frame, RenderRequest, Renderer, RendererOptions,
-    backward::{DifferentiableRenderer, FrameGradients, Gradients, drawn},
-    select::AdapterReport,
+    Frame, RenderRequest,
+    backward::{FrameGradients, Gradients, backward_request},
+    options::{AdapterReport, RendererOptions},
+    renderer::{DeviceTimes, DifferentiableRenderer, Renderer},
     train::{Trainer, TrainingSet},
     view::View,
 };
@@ -151,7 +156,7 @@ impl DifferentiableRenderer for GpuRenderer {
         loss: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
         gradients: &mut Gradients,
     ) -> Result<Frame> {
-        let request = drawn(request);
+        let request = backward_request(request);
         if gaussians.is_empty() {
             let frame =
                 crate::cpu::background(&View::new(gaussians.origin(), &request)?, &request)?;
@@ -171,14 +176,18 @@ impl DifferentiableRenderer for GpuRenderer {
         if gaussians.is_empty() {
             return Ok(None);
         }
-        self.adapter_for(gaussians).backward_times(gaussians, &drawn(request), by)
+        self.adapter_for(gaussians).backward_times(gaussians, &backward_request(request), by)
     }
 
-    fn trainer<'a>(&'a self, set: &TrainingSet<'a>) -> Result<Option<Box<dyn Trainer + 'a>>> {
+    fn trainer<'a>(
+        &'a self,
+        set: &TrainingSet<'a>,
+        bytes_max: u64,
+    ) -> Result<Option<Box<dyn Trainer + 'a>>> {
         if set.gaussians.is_empty() {
             return Ok(None);
         }
-        Ok(Some(Box::new(self.adapter_for(set.gaussians).trainer(set)?)))
+        Ok(Some(Box::new(self.adapter_for(set.gaussians).trainer(set, bytes_max)?)))
     }
 
     fn slow_after_rest(&self) -> bool {

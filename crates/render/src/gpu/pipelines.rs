@@ -239,13 +239,13 @@ impl Kernels {
         let modules = SHADERS
             .iter()
             .map(|shader| {
-                let source = source_of(shader, switches.shaders.as_deref())?;
+                let source = source_of(shader, switches.shaders().as_deref())?;
                 gpu.scoped(shader.stem, || {
                     let described = wgpu::ShaderModuleDescriptor {
                         label: Some(shader.name),
                         source: wgpu::ShaderSource::Wgsl(source),
                     };
-                    if switches.checked {
+                    if switches.checked() {
                         return gpu.device.create_shader_module(described);
                     }
                     let checks = wgpu::ShaderRuntimeChecks::unchecked();
@@ -259,9 +259,9 @@ impl Kernels {
                 })
             })
             .collect::<Result<Vec<_>>>()?;
-        let serial = switches.serial.unwrap_or(software);
+        let serial = switches.serial().unwrap_or(software);
         let pipelines = Mutex::default();
-        let kernels = Self { modules, pipelines, serial, without: switches.without };
+        let kernels = Self { modules, pipelines, serial, without: switches.without() };
         for kernel in Kernel::ALWAYS {
             kernels.get(gpu, kernel)?;
         }
@@ -271,7 +271,7 @@ impl Kernels {
     /// Whether rasterize takes colours out of the harmonics of a scene with `sh_count`, not from
     /// shade.
     pub(super) fn flat(&self, sh_count: u32) -> bool {
-        sh_count == 1 && self.without != Some(Skip::FlatColor)
+        sh_count == 1 && Skip::FlatColor.applies(self.without)
     }
 
     /// The pipeline of a kernel.

@@ -1,13 +1,10 @@
 //! Times of the stages by the device's own clock.
 
-use wgpu::{BufferUsages, Features};
+use wgpu::BufferUsages;
 
 use super::{device::Gpu, readback};
-use crate::{DispatchTime, error::Result};
+use crate::{error::Result, renderer::DispatchTime};
 
-/// Features without which the device gives no times.
-pub(super) const FEATURES: Features =
-    Features::TIMESTAMP_QUERY.union(Features::TIMESTAMP_QUERY_INSIDE_PASSES);
 /// Dispatches of a frame, at most, and its start.
 const MARKS_MAX: u32 = 64;
 

@@ -23,7 +23,7 @@ const NAP_SHARE: u32 = 8;
 
 /// Bytes of a buffer that were asked for and are not here yet.
 #[derive(Debug)]
-pub(super) struct Asked {
+pub(super) struct PendingRead {
     staging: wgpu::Buffer,
     size_bytes: u64,
     mapped: Receiver<Result<(), wgpu::BufferAsyncError>>,
@@ -44,7 +44,7 @@ pub(super) fn read<T>(
 /// Asks for the first `size_bytes` of `staging`, as they are after what was submitted so far. No
 /// submission may use it before they were taken.
 /// Errors: those of the device.
-pub(super) fn ask(gpu: &Gpu, staging: &wgpu::Buffer, size_bytes: u64) -> Result<Asked> {
+pub(super) fn ask(gpu: &Gpu, staging: &wgpu::Buffer, size_bytes: u64) -> Result<PendingRead> {
     let (sender, mapped) = mpsc::channel();
     gpu.scoped("readback", || {
         staging.slice(0..size_bytes).map_async(wgpu::MapMode::Read, move |result| {
@@ -52,13 +52,13 @@ pub(super) fn ask(gpu: &Gpu, staging: &wgpu::Buffer, size_bytes: u64) -> Result<
             let _ = sender.send(result);
         });
     })?;
-    Ok(Asked { staging: staging.clone(), size_bytes, mapped })
+    Ok(PendingRead { staging: staging.clone(), size_bytes, mapped })
 }
 
 /// Waits for what was asked for.
 /// Errors: as [`read`].
-pub(super) fn wait<T>(gpu: &Gpu, asked: Asked, take: impl FnOnce(&[u8]) -> T) -> Result<T> {
-    let Asked { staging, size_bytes, mapped } = asked;
+pub(super) fn wait<T>(gpu: &Gpu, asked: PendingRead, take: impl FnOnce(&[u8]) -> T) -> Result<T> {
+    let PendingRead { staging, size_bytes, mapped } = asked;
     // Not `PollType::Wait`: while one thread waits in the driver, no other can submit (an H200 then
     // stood idle between two callers), and a lone caller is woken later than by its own clock.
     // Others that have work get the processor while this one watches.

@@ -5,10 +5,11 @@ use std::{collections::HashMap, sync::Arc};
 use wgpu::BufferUsages;
 
 use super::{
+    batch_buffers::{BackwardBuffers, BatchBuffers, BatchSizes},
+    bindings::Bindings,
     buffers::{DeviceScene, FootprintRow, PlanRow, ViewRow},
     device::{Gpu, STORAGE},
     pipelines::{BACKDROP_HEIGHT, BACKDROP_WIDTH, VIEWS_MAX},
-    recorder::Bindings,
 };
 use crate::{error::Result, scene::Backdrop};
 
@@ -18,61 +19,6 @@ const VIEW_BYTES: u64 = size_of::<ViewRow>() as u64 * VIEWS_MAX as u64;
 /// Bytes of a backdrop: a word for each cell.
 const BACKDROP_BYTES: u64 = 4 * (BACKDROP_WIDTH * BACKDROP_HEIGHT) as u64;
 const UNIFORM: BufferUsages = BufferUsages::UNIFORM.union(BufferUsages::COPY_DST);
-
-/// Sizes of a batch.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Need {
-    pub(super) views: u32,
-    /// Gaussians of the scene.
-    pub(super) count: u32,
-    /// Tile pairs of each view.
-    pub(super) capacity: u32,
-    /// Tiles of all views, and one more for each view.
-    pub(super) tiles: u32,
-    /// Whether shade has colours to write.
-    pub(super) shades: bool,
-    pub(super) source_bytes: u64,
-    pub(super) picture_bytes: u64,
-    pub(super) table_bytes: u64,
-    pub(super) slot_bytes: u64,
-    pub(super) staging_bytes: u64,
-}
-
-/// The buffers of one batch, each at least as large as needed.
-#[derive(Clone, Debug)]
-pub(super) struct BatchBuffers {
-    pub(super) views: wgpu::Buffer,
-    pub(super) plans: wgpu::Buffer,
-    pub(super) footprints: wgpu::Buffer,
-    /// Tiles that each Gaussian touches.
-    pub(super) touched: wgpu::Buffer,
-    /// Photos of all views.
-    pub(super) sources: wgpu::Buffer,
-    /// Maps of all views, up to [`VIEWS_MAX`].
-    pub(super) backdrops: wgpu::Buffer,
-    pub(super) colors: wgpu::Buffer,
-    pub(super) starts: wgpu::Buffer,
-    pub(super) ends: wgpu::Buffer,
-    /// Two halves of all views.
-    pub(super) pairs: wgpu::Buffer,
-    pub(super) lists: wgpu::Buffer,
-    pub(super) pictures: wgpu::Buffer,
-    pub(super) table: wgpu::Buffer,
-    pub(super) slots: wgpu::Buffer,
-    pub(super) staging: wgpu::Buffer,
-}
-
-/// What a backward pass has beside the buffers of its frame.
-#[derive(Clone, Debug)]
-pub(super) struct BackwardBuffers {
-    /// What the loss says of the pictures, in their places.
-    pub(super) by_pictures: wgpu::Buffer,
-    /// Of each tile pair.
-    pub(super) sums: wgpu::Buffer,
-    /// Of each Gaussian, then of the harmonics.
-    pub(super) gradients: wgpu::Buffer,
-    pub(super) staging: wgpu::Buffer,
-}
 
 /// Buffers of earlier batches, and what the last views needed.
 #[derive(Debug)]
@@ -107,7 +53,7 @@ impl Default for Scratch {
 impl Scratch {
     /// Buffers for `need`.
     /// Errors: `limit_exceeded` when the adapter cannot hold or bind as much.
-    pub(super) fn room(&mut self, gpu: &Gpu, need: &Need) -> Result<BatchBuffers> {
+    pub(super) fn room(&mut self, gpu: &Gpu, need: &BatchSizes) -> Result<BatchBuffers> {
         let (views, count, capacity) =
             (u64::from(need.views), u64::from(need.count), u64::from(need.capacity));
         let footprint_bytes = size_of::<FootprintRow>() as u64;
@@ -177,35 +123,5 @@ impl Scratch {
         let buffer = gpu.create_buffer(label, size_bytes, usage)?;
         self.buffers.insert(label, buffer.clone());
         Ok(buffer)
-    }
-}
-
-/// First cell of backdrop `at` of a batch.
-pub(super) fn first_cell(at: usize) -> u32 {
-    at as u32 * BACKDROP_WIDTH * BACKDROP_HEIGHT
-}
-
-impl BatchBuffers {
-    /// Uploads the backdrops of a batch, unless they are those `held`.
-    pub(super) fn put_backdrops(
-        &self,
-        gpu: &Gpu,
-        wanted: &[Arc<Backdrop>],
-        held: &[Arc<Backdrop>],
-    ) {
-        for (at, backdrop) in wanted.iter().enumerate() {
-            if held.get(at).is_some_and(|held| Arc::ptr_eq(held, backdrop)) {
-                continue;
-            }
-            let word = |&[r, g, b]: &[u8; 3]| u32::from_le_bytes([r, g, b, 0]);
-            let words: Vec<u32> = backdrop.cells().iter().map(word).collect();
-            let start = u64::from(first_cell(at)) * 4;
-            gpu.queue.write_buffer(&self.backdrops, start, bytemuck::cast_slice(&words));
-        }
-    }
-
-    /// What the stages expect to be zeros: plans, and the counts of the tiles.
-    pub(super) fn zeros(&self) -> [&wgpu::Buffer; 2] {
-        [&self.plans, &self.ends]
     }
 }

@@ -9,18 +9,20 @@ use rayon::prelude::*;
 use wgpu::BufferUsages;
 
 use super::{
-    adapter::OpenDevice,
-    buffers::{DeviceScene, GaussianRow, PlanRow, SourceRow, TrainingRow, narrow},
+    batch_buffers::{BatchSizes, BufferCopy, TrainingBuffers},
+    bindings::Inputs,
+    buffers::{DeviceScene, GaussianRow, PlanRow, TrainingRow, narrow},
+    context::OpenDevice,
     device::{Gpu, STORAGE},
-    frame::{ATTEMPTS_MAX, Drawing, Layout, PLAN_BYTES, Tools},
+    drawing::Drawing,
+    frame::{ATTEMPTS_MAX, Batch, PLAN_BYTES, Tools},
     pipelines::{EXPOSURE_WORDS, GRADIENT_WORDS, Kernel, PAIR_SUMS, RasterKinds},
     readback,
-    recorder::Recorder,
-    scratch::{BackwardBuffers, BatchBuffers, Need, Scratch},
+    scratch::Scratch,
 };
 use crate::{
-    Background, Frame, Kinds, RenderRequest,
-    backward::drawn,
+    Frame, Kinds, RenderRequest,
+    backward::backward_request,
     constants::TILE_SIZE,
     error::{Error, Result},
     scene::{Gaussians, Photo},
@@ -36,7 +38,7 @@ const PAIRS_A_GAUSSIAN: u64 = 4;
 const PHOTO_CHUNK_BYTES: u64 = 32 << 20;
 
 /// Bytes that a trainer of `set` takes on a device, about.
-pub(crate) fn trainer_bytes(set: &TrainingSet<'_>) -> u64 {
+pub(super) fn trainer_bytes(set: &TrainingSet<'_>) -> u64 {
     let pixels = |at: &TrainingPhoto<'_>| u64::from(at.photo.width) * u64::from(at.photo.height);
     let most = set.photos.iter().map(pixels).max().unwrap_or(0);
     let numbers = 3 * set.gaussians.sh_count() as u64;
@@ -56,18 +58,6 @@ fn gradient_bytes(count: u64, numbers: u64) -> u64 {
 
 fn moment_bytes(count: u64, numbers: u64) -> u64 {
     4 * count * (1 + 2 * (adam::SHAPE as u64 + numbers))
-}
-
-/// What a step has beside the buffers of a backward pass.
-#[derive(Clone, Debug)]
-pub(super) struct TrainingBuffers {
-    pub(super) row: wgpu::Buffer,
-    /// Pixels of all photos, RGBA.
-    pub(super) photos: wgpu::Buffer,
-    pub(super) exposures: wgpu::Buffer,
-    pub(super) by_windows: wgpu::Buffer,
-    pub(super) partials: wgpu::Buffer,
-    pub(super) moments: wgpu::Buffer,
 }
 
 /// A photo of the trainer.
@@ -106,26 +96,29 @@ pub(super) struct DeviceTrainer {
 /// A submission whose plan is not here yet.
 #[derive(Debug)]
 struct Pending {
-    turn: Turn,
+    photo_step: PhotoStep,
     /// Tile pairs that it had room for.
     capacity: u32,
-    plan: readback::Asked,
+    plan: readback::PendingRead,
 }
 
 /// What a submission does: the photo that it draws, the step, whether it adds what earlier photos
 /// say, and whether it moves the Gaussians.
 #[derive(Clone, Copy, Debug)]
-struct Turn {
+struct PhotoStep {
     at: usize,
     step: TrainingStep,
     adds: bool,
     moves: bool,
 }
 
-/// A turn as the device takes it.
-struct Submission<'a> {
-    target: &'a Target,
+/// A photo's step as the device takes it.
+struct DeviceStep<'a> {
+    request: &'a RenderRequest,
     row: TrainingRow,
+    training: &'a TrainingBuffers,
+    /// What earlier photos of the step say.
+    earlier: Option<&'a wgpu::Buffer>,
     adds: bool,
     moves: bool,
     /// Where its plan goes.
@@ -147,7 +140,7 @@ impl DeviceTrainer {
         let (mut targets, mut pixels, mut most) = (Vec::new(), 0_usize, [0_u32; 2]);
         for TrainingPhoto { photo, request } in &set.photos {
             let start = narrow("pixels of photos", pixels)?;
-            targets.push(Target { request: drawn(request), start });
+            targets.push(Target { request: backward_request(request), start });
             pixels += photo.width as usize * photo.height as usize;
             most = [most[0].max(photo.width), most[1].max(photo.height)];
         }
@@ -197,12 +190,12 @@ impl DeviceTrainer {
         })
     }
 
-    /// Takes a turn, with more room until its tile pairs fit.
-    fn take(&mut self, turn: Turn) -> Result<()> {
+    /// Takes the step of a photo, with more room until its tile pairs fit.
+    fn take(&mut self, photo_step: PhotoStep) -> Result<()> {
         let capacity_max = self.tools().capacity_max(1);
         let mut attempts = 0;
         while attempts < ATTEMPTS_MAX && self.isects <= capacity_max {
-            let submitted = self.submit(turn)?;
+            let submitted = self.submit(photo_step)?;
             if self.had_room(submitted)? {
                 return Ok(());
             }
@@ -214,8 +207,8 @@ impl DeviceTrainer {
     /// Waits for the step that is not known to be done, and takes it again where it lacked room.
     fn settle(&mut self) -> Result<()> {
         let Some(pending) = self.pending.take() else { return Ok(()) };
-        let turn = pending.turn;
-        if self.had_room(pending)? { Ok(()) } else { self.take(turn) }
+        let photo_step = pending.photo_step;
+        if self.had_room(pending)? { Ok(()) } else { self.take(photo_step) }
     }
 
     /// Waits for a submission; whether its tile pairs had room. If not, there is more for the next.
@@ -233,9 +226,9 @@ impl DeviceTrainer {
         Tools { gpu, kernels, scratch, scene, isects_max: *isects_max, marks: None }
     }
 
-    /// Submits a turn, and asks for its plan.
-    fn submit(&mut self, turn: Turn) -> Result<Pending> {
-        let Turn { at, step, adds, moves } = turn;
+    /// Submits the step of a photo, and asks for its plan.
+    fn submit(&mut self, photo_step: PhotoStep) -> Result<Pending> {
+        let PhotoStep { at, step, adds, moves } = photo_step;
         let target = self.targets.get(at).ok_or_else(|| absent(at))?.clone();
         let rates = &step.rates;
         let row = TrainingRow {
@@ -256,12 +249,20 @@ impl DeviceTrainer {
         self.plans.reverse();
         let (plan, training) = (self.plans[0].clone(), self.training.clone());
         let (earlier, origin) = (self.earlier.clone(), self.start.origin());
-        let submission = Submission { target: &target, row, adds, moves, plan: &plan };
+        let step = DeviceStep {
+            request: &target.request,
+            row,
+            training: &training,
+            earlier: earlier.as_ref(),
+            adds,
+            moves,
+            plan: &plan,
+        };
         let mut tools = self.tools();
         let capacity = tools.capacity(1);
-        tools.train(origin, &submission, (&training, earlier.as_ref()), capacity)?;
+        tools.train(origin, &step, capacity)?;
         let plan = readback::ask(&self.on.gpu, &plan, PLAN_BYTES)?;
-        Ok(Pending { turn, capacity, plan })
+        Ok(Pending { photo_step, capacity, plan })
     }
 
     /// Bytes of a buffer.
@@ -319,6 +320,7 @@ impl DeviceTrainer {
     }
 
     /// What the loss says of the last picture, which photo `at` has the size of; `[H * W]`.
+    #[cfg(feature = "testing")]
     pub(super) fn by_picture(&mut self, at: usize) -> Result<Vec<[f32; 3]>> {
         self.settle()?;
         let target = self.targets.get(at).ok_or_else(|| absent(at))?;
@@ -337,19 +339,19 @@ impl Trainer for DeviceTrainer {
         }
         let step = *step;
         if let [at] = *photos {
-            let next = self.submit(Turn { at, step, adds: false, moves: true })?;
+            let next = self.submit(PhotoStep { at, step, adds: false, moves: true })?;
             let Some(last) = self.pending.replace(next) else { return Ok(()) };
-            let turn = last.turn;
+            let photo_step = last.photo_step;
             if !self.had_room(last)? {
                 self.settle()?;
-                self.take(turn)?;
+                self.take(photo_step)?;
             }
             return Ok(());
         }
         // What the last photo moves needs what the others say.
         self.settle()?;
         for (place, &at) in photos.iter().enumerate() {
-            self.take(Turn { at, step, adds: place > 0, moves: place + 1 == photos.len() })?;
+            self.take(PhotoStep { at, step, adds: place > 0, moves: place + 1 == photos.len() })?;
         }
         Ok(())
     }
@@ -440,85 +442,51 @@ fn words(photo: &Photo) -> Vec<[u8; 4]> {
 impl Tools<'_> {
     /// Draws, compares, goes back and moves, in one submission of one view with room for `capacity`
     /// tile pairs. Where the plan says that it needs more, nothing is moved.
-    fn train(
-        &mut self,
-        origin: DVec3,
-        submission: &Submission<'_>,
-        (training, earlier): (&TrainingBuffers, Option<&wgpu::Buffer>),
-        capacity: u32,
-    ) -> Result<()> {
-        let Submission { target: Target { request, .. }, row, adds, moves, plan } = submission;
-        let (gpu, scene, kernels) = (self.gpu, self.scene, self.kernels);
+    fn train(&mut self, origin: DVec3, step: &DeviceStep<'_>, capacity: u32) -> Result<()> {
+        let DeviceStep { request, training, earlier, adds, moves, .. } = *step;
+        let (gpu, scene) = (self.gpu, self.scene);
         let drawing = Drawing::new(origin, request, scene)?;
-        let layout = drawing.layout(&drawing.whole(), 0);
-        let (tiles, kinds) = (drawing.tiles(), RasterKinds::from(request));
-        let sources: Vec<SourceRow> = request.sources.iter().map(SourceRow::from).collect();
+        let (whole, tiles) = (drawing.whole(), drawing.tiles());
+        let layouts = [drawing.layout(&whole, 0)];
         let gradient_bytes = gradient_bytes(scene.count.into(), 3 * u64::from(scene.sh_count));
-        let (room, backward) =
-            self.training_room(&layout, capacity, tiles, &sources, gradient_bytes)?;
-        let view = drawing.alone(&layout, capacity);
-        let backdrop = match &request.background {
-            Background::Backdrop(backdrop) => vec![std::sync::Arc::clone(backdrop)],
-            Background::Color(_) => Vec::new(),
-        };
+        let sums = 4 * u64::from(capacity) * u64::from(PAIR_SUMS);
+        let sizes = [layouts[0].picture_bytes(), sums, gradient_bytes];
+        // First, for both share a staging buffer, which this one needs the larger one of.
+        let backward = self.scratch.backward_room(gpu, sizes)?;
+        let batch = Batch::new(&[drawing], &[whole], &layouts, capacity);
+        let sizes = batch.sizes(scene.count, !self.kernels.flat(scene.sh_count));
+        let room = self.scratch.room(gpu, &BatchSizes { staging_bytes: 0, ..sizes })?;
         let held = std::mem::take(&mut self.scratch.backdrops);
-        let bindings = &mut self.scratch.bindings;
+        let inputs = Inputs {
+            backward: Some(&backward),
+            training: Some(training),
+            earlier,
+            ..Inputs::new(self.kernels, &room, Some(scene), 1)
+        };
         gpu.scoped("training", || {
-            room.put_backdrops(gpu, &backdrop, &held);
-            gpu.queue.write_buffer(&room.views, 0, bytemuck::bytes_of(&view));
-            gpu.queue.write_buffer(&training.row, 0, bytemuck::bytes_of(row));
-            if !sources.is_empty() {
-                gpu.queue.write_buffer(&room.sources, 0, bytemuck::cast_slice(&sources));
-            }
+            batch.write(gpu, &room, &held);
+            gpu.queue.write_buffer(&training.row, 0, bytemuck::bytes_of(&step.row));
             let [plans, ends] = room.zeros();
-            let zeros = [plans, ends, &backward.sums];
-            let sizes = (1, scene.count);
-            let mut stages = Recorder::new(gpu, kernels, bindings, (&room, &zeros), sizes, None);
-            stages.draw(scene.buffers(), kinds, None, tiles);
-            stages.compare(training, &backward, tiles);
-            stages.backward(scene.buffers(), Kinds::COLOR, &backward, tiles);
-            if let (true, Some(earlier)) = (adds, earlier) {
-                stages.add_earlier(earlier, &backward);
+            let mut stages = self.recorder(inputs, &[plans, ends, &backward.sums]);
+            stages.draw(RasterKinds::from(request), tiles);
+            stages.compare(tiles);
+            stages.backward(Kinds::COLOR, tiles);
+            if adds && earlier.is_some() {
+                stages.gaussians(Kernel::AddEarlier);
             }
-            let plan = (&room.plans, 0, *plan, 0, PLAN_BYTES);
-            match (moves, earlier) {
-                (false, Some(earlier)) => {
-                    let kept = (&backward.gradients, 0, earlier, 0, gradient_bytes);
-                    stages.submit(&[plan, kept])
+            let copy = |from, to, bytes| BufferCopy { from: (from, 0), to: (to, 0), bytes };
+            let plan = copy(&room.plans, step.plan, PLAN_BYTES);
+            match earlier {
+                Some(earlier) if !moves => {
+                    stages.submit(&[plan, copy(&backward.gradients, earlier, gradient_bytes)])
                 }
                 _ => {
-                    stages.adam(scene.buffers(), training, &backward);
+                    stages.gaussians(Kernel::Adam);
                     stages.submit(&[plan])
                 }
             }
         })??;
-        self.scratch.backdrops = backdrop;
+        self.scratch.backdrops = batch.held_after(held);
         Ok(())
-    }
-
-    /// The buffers of one submission.
-    fn training_room(
-        &mut self,
-        layout: &Layout,
-        capacity: u32,
-        tiles: [u32; 2],
-        sources: &[SourceRow],
-        gradient_bytes: u64,
-    ) -> Result<(BatchBuffers, BackwardBuffers)> {
-        let need = Need {
-            views: 1,
-            count: self.scene.count,
-            capacity,
-            tiles: tiles[0] * tiles[1] + 1,
-            shades: !self.kernels.flat(self.scene.sh_count),
-            source_bytes: size_of_val(sources) as u64,
-            picture_bytes: layout.picture_bytes(),
-            ..Need::default()
-        };
-        let sums = 4 * u64::from(capacity) * u64::from(PAIR_SUMS);
-        let sizes = [layout.picture_bytes(), sums, gradient_bytes];
-        // First, for both share a staging buffer, which this one needs the larger one of.
-        let backward = self.scratch.backward_room(self.gpu, sizes)?;
-        Ok((self.scratch.room(self.gpu, &need)?, backward))
     }
 }

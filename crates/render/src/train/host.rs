@@ -7,8 +7,8 @@ use super::{
     photo_loss, unit,
 };
 use crate::{
-    Frame, RenderRequest,
-    backward::{DifferentiableRenderer, FrameGradients, Gradients},
+    DifferentiableRenderer, Frame, RenderRequest,
+    backward::{FrameGradients, Gradients},
     error::Result,
     scene::Gaussians,
 };

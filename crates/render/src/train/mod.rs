@@ -10,6 +10,7 @@
 pub mod adam;
 pub mod exposure;
 mod host;
+#[cfg(feature = "testing")]
 pub mod oracle;
 pub mod photo_loss;
 
@@ -22,7 +23,6 @@ pub use self::{
 use crate::{
     Frame, RenderRequest,
     error::{Error, Result},
-    gpu::trainer_bytes,
     scene::{Gaussians, Photo},
 };
 
@@ -63,12 +63,6 @@ impl TrainingSet<'_> {
         }
         Ok(())
     }
-
-    /// Bytes of a device that a trainer of these needs, about: four Gaussian-tile pairs a Gaussian.
-    #[must_use]
-    pub fn device_bytes(&self) -> u64 {
-        trainer_bytes(self)
-    }
 }
 
 /// How a step moves what it moves.
@@ -88,7 +82,7 @@ pub trait Trainer {
     /// Takes one step by the sum of what the photos of these numbers say.
     ///
     /// # Errors
-    /// Those of [`crate::backward::DifferentiableRenderer::backward`]; `internal` for a photo that
+    /// Those of [`crate::DifferentiableRenderer::backward`]; `internal` for a photo that
     /// is not there. After an error the trainer is of no use.
     fn step(&mut self, photos: &[usize], step: &TrainingStep) -> Result<()>;
 

@@ -5,11 +5,11 @@ use std::sync::Arc;
 
 use segsplat_core::scene::{Backdrop, Gaussians, RawGaussians, SourcePixel};
 use segsplat_render::{
-    Background, Kinds, RenderRequest, Source,
-    backward::{DifferentiableRenderer, FrameGradients, Gradients, oracle as backward},
-    cpu::{CpuRenderer, lanes::Width},
+    Background, DifferentiableRenderer, Kinds, RenderRequest, Source,
+    backward::{FrameGradients, Gradients, oracle as backward},
+    cpu::CpuRenderer,
     oracle,
-    switches::Switches,
+    switches::{Switches, Width},
 };
 use segsplat_testing::{
     compare::gradient_errors,

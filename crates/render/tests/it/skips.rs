@@ -6,11 +6,12 @@ use segsplat_render::{
     Background, Frame, Kinds, Labels, RenderRequest, Renderer, Skip, Switches,
     cpu::{
         CpuRenderer,
+        cell::{Tile, TileScratch},
         footprint::Footprint,
         lanes::KernelOptions,
         paint::Paint,
-        rasterize::{Tile, TileScratch, rasterize_tile},
-        store::Part,
+        rasterize::rasterize_tile,
+        store::PictureRows,
     },
     gpu::internals::SHADERS,
     view::View,
@@ -134,7 +135,8 @@ fn tile(footprints: &[Footprint], without: Option<Skip>) -> Vec<[f32; 3]> {
     let paint = Paint::new(&request, &view, &entries, options);
     let mut pairs: Vec<u64> = (0..footprints.len() as u64).collect();
     let mut color = vec![[9.0; 3]; 256];
-    let mut out = Part { color: Some(color.chunks_mut(16).collect()), ..Part::default() };
+    let mut out =
+        PictureRows { color: Some(color.chunks_mut(16).collect()), ..PictureRows::default() };
     let place = Tile { x: 0, y: 0, width: 16, height: 16 };
     let mut scratch = TileScratch::default();
     rasterize_tile(footprints, &mut pairs, (place, 0), (&paint, &mut scratch), &mut out);

@@ -7,10 +7,11 @@ use segsplat_render::{
     cpu::{
         bin::{DepthKeys, bin, pack},
         footprint::Footprint,
-        lanes::{KernelOptions, Width},
+        lanes::KernelOptions,
         project::{Projected, project},
         tiles::{Grid, TileSpans, touched_tiles},
     },
+    switches::Width,
     view::View,
 };
 use segsplat_testing::scenes::{Random, camera, checked, cloud, push, request};

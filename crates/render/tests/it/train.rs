@@ -1,10 +1,12 @@
 //! Steps of training: the loss against its oracle, and the trainer of a device against the one of
 //! the processor.
 
-use segsplat_core::scene::{Gaussians, Photo};
+use segsplat_core::{
+    error::ErrorCode,
+    scene::{Gaussians, Photo},
+};
 use segsplat_render::{
-    Background, Kinds, RenderRequest, Renderer as _,
-    backward::DifferentiableRenderer,
+    Background, DifferentiableRenderer, Kinds, RenderRequest, Renderer as _,
     gpu::GpuRenderer,
     train::{
         HostTrainer, LearningRates, Trainer, TrainingPhoto, TrainingSet, TrainingStep, oracle,
@@ -155,7 +157,7 @@ fn the_shaders_of_the_loss_agree_with_the_oracle() {
                 oracle::photo_loss(&wide(&shown), &wide(&unit(photo)), width, valid, SHARE.into());
             let got = gpu.internals().loss_gradient(&set, at, &step(0.0)).expect("a step");
             check_errors(&format!("photo {at}"), &errors(&got, &want));
-            let mut trainer = gpu.trainer(&set).expect("room").expect("a trainer");
+            let mut trainer = gpu.trainer(&set, u64::MAX).expect("room").expect("a trainer");
             trainer.step(&[at], &step(0.0)).expect("a step");
             let told = trainer.exposures().expect("exposures")[at].1;
             assert!((told - value).abs() < 1e-5, "photo {at}: {told} is not {value}");
@@ -184,7 +186,7 @@ fn judge(gpu: &GpuRenderer, name: &str, set: &TrainingSet<'_>, steps: Steps<'_>)
 
 /// The same, where the device takes the first `steps` in the order of the second.
 fn judge_order(gpu: &GpuRenderer, name: &str, set: &TrainingSet<'_>, steps: [Steps<'_>; 2]) {
-    let mut device = gpu.trainer(set).expect("room").expect("a trainer");
+    let mut device = gpu.trainer(set, u64::MAX).expect("room").expect("a trainer");
     let mut host = HostTrainer::new(gpu, set).expect("a trainer");
     for (photos, opacity_min) in steps[0] {
         device.step(photos, &step(*opacity_min)).expect("a step of the device");
@@ -272,7 +274,7 @@ fn what_was_kept_is_not_moved() {
     let set = set(&start, &photos);
     let gpu = both_kernels().next().expect("an adapter");
     let cpu = cpu();
-    let device = gpu.trainer(&set).expect("room").expect("a trainer");
+    let device = gpu.trainer(&set, u64::MAX).expect("room").expect("a trainer");
     let host = HostTrainer::new(&cpu, &set).expect("a trainer");
     for (name, mut trainer) in [("device", device), ("host", Box::new(host) as Box<dyn Trainer>)] {
         let mut take = |keeps: bool| {
@@ -301,17 +303,18 @@ fn odd_input_is_refused_and_nothing_has_no_trainer() {
     let none = truth.only(|_| false);
     for gpu in both_kernels() {
         let first = set(&truth, &photos);
-        assert!(first.device_bytes() > 4 * 40 * 30, "{} bytes", first.device_bytes());
-        let mut trainer = gpu.trainer(&first).expect("room").expect("a trainer");
+        let told = gpu.trainer(&first, 4 * 40 * 30).map(drop).expect_err("its photos alone");
+        assert_eq!(told.code(), ErrorCode::LimitExceeded, "{told}");
+        let mut trainer = gpu.trainer(&first, u64::MAX).expect("room").expect("a trainer");
         let told = trainer.step(&[1], &step(0.0)).expect_err("no such photo");
         assert!(told.message().contains("photo 1"), "{told}");
-        assert!(gpu.trainer(&set(&none, &photos)).expect("nothing to do").is_none());
+        assert!(gpu.trainer(&set(&none, &photos), u64::MAX).expect("nothing to do").is_none());
     }
     photos[0].1.width = 20;
     let other = set(&truth, &photos);
     let told = HostTrainer::new(&cpu(), &other).map(drop).expect_err("another size");
     assert!(told.message().contains("[20, 30]"), "{told}");
     for gpu in both_kernels() {
-        assert!(gpu.trainer(&other).is_err(), "another size");
+        assert!(gpu.trainer(&other, u64::MAX).is_err(), "another size");
     }
 }

@@ -8,14 +8,15 @@ use segsplat_render::{
     Frame, Kinds, RenderRequest, Renderer,
     cpu::{
         bin,
+        cell::{Tile, TileScratch},
         footprint::Footprint,
         lanes::KernelOptions,
         paint::Paint,
         project,
         project::Projected,
-        rasterize::{Tile, TileScratch, rasterize_tile},
+        rasterize::rasterize_tile,
         shade,
-        store::Part,
+        store::PictureRows,
         tiles::{Grid, TileSpans},
     },
     gpu::internals::FootprintRow,
@@ -294,11 +295,11 @@ fn rasterize_twin() {
             (vec![[0.0; 3]; pixels], vec![0.0; pixels], vec![0.0; pixels]);
         for tile_y in 0..view.tiles_y() {
             let first = (tile_y * 16 * 96) as usize;
-            let mut out = Part {
+            let mut out = PictureRows {
                 color: Some(color[first..].chunks_mut(96).take(16).collect()),
                 depth: Some(depth[first..].chunks_mut(96).take(16).collect()),
                 alpha: Some(alpha[first..].chunks_mut(96).take(16).collect()),
-                ..Part::default()
+                ..PictureRows::default()
             };
             for tile_x in 0..view.tiles_x() {
                 let id = (tile_y * view.tiles_x() + tile_x) as usize;

@@ -3,9 +3,8 @@
 
 use segsplat_core::scene::Gaussians;
 use segsplat_render::{
-    Frame, Labels, PixelWeights, RenderRequest, Renderer, Switches,
-    cpu::{CpuRenderer, lanes::Width},
-    oracle,
+    Frame, Labels, PixelWeights, RenderRequest, Renderer, Switches, cpu::CpuRenderer, oracle,
+    switches::Width,
 };
 
 use segsplat_testing::labels::{labelled, table};

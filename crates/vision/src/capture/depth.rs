@@ -5,7 +5,7 @@ use glam::DVec3;
 use super::{
     gray::{GrayView, Grid},
     pairs::{PairFound, baseline},
-    sweep::Relative,
+    relative::Relative,
 };
 use crate::error::{Error, Result};
 

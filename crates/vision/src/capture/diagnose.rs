@@ -12,12 +12,11 @@ use super::{
     content,
     depth::Ranges,
     gray::GrayView,
-    name,
     pairs::{self, PairFound},
-    warning,
 };
 use crate::{
     error::{Error, Result},
+    photo_label,
     scene::{Camera, CameraToWorld, PosedPhoto, Warning, WarningCode},
 };
 
@@ -429,4 +428,13 @@ fn range_hit(photos: &[PosedPhoto], found: &[PairFound]) -> Option<Warning> {
         100.0 * RANGE_HIT_MAX
     );
     (share > RANGE_HIT_MAX).then(|| warning(WarningCode::DepthRangeHit, share, message))
+}
+
+/// A photo as messages call it.
+pub(super) fn name(photos: &[PosedPhoto], i: usize) -> String {
+    photo_label(i, &photos[i].file)
+}
+
+pub(super) fn warning(code: WarningCode, value: f64, message: String) -> Warning {
+    Warning { code, message, value }
 }

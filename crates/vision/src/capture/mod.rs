@@ -15,6 +15,7 @@ mod depth;
 mod diagnose;
 mod gray;
 mod pairs;
+mod relative;
 mod sets;
 mod sweep;
 mod warp;
@@ -25,9 +26,9 @@ use rayon::prelude::*;
 
 use crate::{
     error::{Error, Result},
-    photo_label,
     scene::{Capture, PosedPhoto, Warning, WarningCode, unless_cancelled},
 };
+use diagnose::{name, warning};
 use gray::GrayView;
 
 pub use sets::view_sets;
@@ -76,15 +77,6 @@ pub fn analyse(photos: &[PosedPhoto], cancel: &AtomicBool) -> Result<Capture> {
         &mut overlap,
     )?);
     Ok(Capture { near_far: ranges.near_far, overlap, median_depth: ranges.median_depth, warnings })
-}
-
-/// A photo as messages call it.
-fn name(photos: &[PosedPhoto], i: usize) -> String {
-    photo_label(i, &photos[i].file)
-}
-
-fn warning(code: WarningCode, value: f64, message: String) -> Warning {
-    Warning { code, message, value }
 }
 
 /// Names photos that are one picture under different poses: at most one of the poses is right.

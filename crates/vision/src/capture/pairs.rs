@@ -6,7 +6,8 @@ use rayon::prelude::*;
 
 use super::{
     gray::{GrayView, Grid},
-    sweep::{Match, Relative, Sweep, consistent, sweep},
+    relative::Relative,
+    sweep::{Match, Sweep, consistent, sweep},
 };
 use crate::{
     error::{Error, Result},

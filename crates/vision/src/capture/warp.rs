@@ -10,7 +10,7 @@ use glam::DVec3;
 
 use super::{
     gray::{GrayView, RADIUS, STRIDE},
-    sweep::Relative,
+    relative::Relative,
 };
 use crate::vectorised;
 

@@ -22,7 +22,7 @@ use crate::{
     lift::{
         fuse::{Fate, fuse},
         sh::ShRotation,
-        union::unite,
+        union::{PIXELS_A_TASK, median, unite},
     },
     point,
     scene::{
@@ -55,9 +55,6 @@ impl Default for Fusion {
 const DEPTH_SLACK: f64 = 2.0;
 /// How far beyond its own picture a Gaussian may lie, as a share of the picture's side.
 const FRAME_SLACK: f64 = 0.1;
-/// Pixels that one thread takes at a time.
-const PIXELS_A_TASK: usize = 1 << 11;
-
 /// A lifted scene.
 #[derive(Clone, Debug)]
 pub struct Lifted {
@@ -329,13 +326,4 @@ fn moved(
 fn center_of(cameras: &[Camera]) -> DVec3 {
     let sum: DVec3 = cameras.iter().map(|camera| camera.camera_to_world.center()).sum();
     if cameras.is_empty() { sum } else { sum / cameras.len() as f64 }
-}
-
-/// Median, 0 of nothing.
-fn median(mut values: Vec<f64>) -> f64 {
-    if values.is_empty() {
-        return 0.0;
-    }
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }

@@ -20,17 +20,15 @@ use std::sync::atomic::AtomicBool;
 
 use rayon::prelude::*;
 
-use super::{
-    PIXELS_A_TASK,
-    fuse::{Fate, Look, Surface, surest_first},
-    median,
-};
+use super::fuse::{Fate, Look, Surface, surest_first};
 use crate::{
     error::Result,
     point,
     scene::{ViewGaussians, unless_cancelled},
 };
 
+/// Pixels that one thread takes at a time.
+pub(super) const PIXELS_A_TASK: usize = 1 << 11;
 /// What a turn of one radian costs against a step of one median depth, in the choice of neighbours.
 const TURN_COST: f64 = 0.5;
 
@@ -204,4 +202,13 @@ fn shape(view: &mut ViewGaussians, options: &UnionOptions) {
     }
     let gain = options.gain as f32;
     view.opacities.iter_mut().for_each(|a| *a = 1.0 - (1.0 - a.clamp(0.0, 1.0)).powf(gain));
+}
+
+/// Median, 0 of nothing.
+pub(super) fn median(mut values: Vec<f64>) -> f64 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
 }

@@ -8,7 +8,7 @@ use crate::{
     models::{
         Bundle, Geometry, ImageText, MaskNetwork, NetworkOptions, ProviderChoice, Runtime,
         geometry, image_text, masks,
-        network::{self, Wanted},
+        network::{self, Signature},
     },
 };
 
@@ -39,9 +39,6 @@ pub struct CheckedFile {
     /// Whether it is the file of the manifest.
     pub fits: bool,
 }
-
-/// A network's file, and the tensors that it must have.
-pub(super) type Signature<'a> = (&'static str, &'a str, Vec<Wanted<'a>>);
 
 /// Looks at the bundle in `dir`; its networks run on the CPU, each with a fixed input: the
 /// geometry at every size with the fewest and the most views, the others alone and in a batch.

@@ -7,11 +7,9 @@ use crate::{
     error::{Error, Result},
     models::{
         Bundle, GeometryManifest, ModelFrame, NetworkOptions, OutputFrame, Provider, Runtime,
-        bucket_for,
-        check::Signature,
-        fit,
+        bucket_for, fit,
         fit::FittedPhoto,
-        network::{Input, Network, Outputs, RunMemory, Side, Spec, Wanted},
+        network::{Input, Network, Outputs, RunMemory, Side, Signature, Spec, Wanted},
         tensors::Numbers,
     },
     scene::{CameraToWorld, Intrinsics, PosedPhoto, ViewGaussians},

@@ -9,9 +9,10 @@ use crate::{
     error::{Error, Result},
     models::{
         Bundle, ImageTextManifest, NetworkOptions, Provider, Runtime,
-        check::Signature,
         manifest::unavailable,
-        network::{Input, Network, Outputs, RunMemory, Side, Spec, Takes, Wanted, fixed},
+        network::{
+            Input, Network, Outputs, RunMemory, Side, Signature, Spec, Takes, Wanted, fixed,
+        },
         resize::{planes, resize},
         tensors::Numbers,
     },

@@ -11,9 +11,8 @@ use crate::{
     error::{Error, Result},
     models::{
         Bundle, MaskAdapter, MasksManifest, NetworkOptions, Provider, Runtime,
-        check::Signature,
         manifest::unavailable,
-        network::{self, Input, Network, Outputs, RunMemory, Side, Spec, Wanted, fixed},
+        network::{self, Input, Network, Outputs, RunMemory, Side, Signature, Spec, Wanted, fixed},
         resize::{planes, resize},
         tensors::Numbers,
     },

@@ -36,7 +36,7 @@ pub use manifest::{
 };
 pub use masks::{MaskNetwork, PhotoEmbedding};
 pub use network::Network;
-pub use options::{NetworkOptions, ProviderChoice};
+pub use options::{NetworkOptions, ProviderChoice, SETUP_COMMAND};
 pub use resize::ResizeFilter;
-pub use runtime::{Provider, Runtime, SETUP_COMMAND};
+pub use runtime::{Provider, Runtime};
 pub use tensors::{NetworkTensors, Tensor, TensorData, TensorKind, TensorSpec};

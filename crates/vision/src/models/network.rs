@@ -380,6 +380,9 @@ pub(super) enum Side {
     MayGive,
 }
 
+/// A network's file, and the tensors that it must have.
+pub(super) type Signature<'a> = (&'static str, &'a str, Vec<Wanted<'a>>);
+
 /// A tensor that a network must have.
 #[derive(Clone, Debug)]
 pub(super) struct Wanted<'a> {

@@ -22,12 +22,11 @@ use tracing::{info, warn};
 use crate::{
     error::Result,
     models::{
-        NetworkOptions, ProviderChoice, bundle::sha256_of, correlate, manifest::unavailable, places,
+        NetworkOptions, ProviderChoice, SETUP_COMMAND, bundle::sha256_of, correlate,
+        manifest::unavailable, places,
     },
 };
 
-/// The one command that gets the library.
-pub const SETUP_COMMAND: &str = "scripts/setup";
 /// File name of the library.
 const LIBRARY: &str = "libonnxruntime.so";
 /// sha256 and name of every accepted build, as `scripts/setup` reads it too.

@@ -6,6 +6,7 @@
 
 mod loader;
 pub mod masks;
+mod networks;
 pub mod refinement;
 pub mod semantics;
 
@@ -47,7 +48,7 @@ pub struct Pipeline {
     bundle: Bundle,
     geometry: Geometry,
     workers: rayon::ThreadPool,
-    lazy: semantics::SemanticNetworks,
+    lazy: networks::SemanticNetworks,
 }
 
 impl Pipeline {
@@ -71,7 +72,7 @@ impl Pipeline {
             .thread_name(|i| format!("pipeline-{i}"))
             .build()
             .map_err(|e| Error::internal("pipeline: no worker threads").caused_by(e))?;
-        let lazy = semantics::SemanticNetworks::new(options);
+        let lazy = networks::SemanticNetworks::new(options);
         let pipeline = Self { runtime, bundle, geometry, workers, lazy };
         // A device takes seconds for its first run, so that no text should wait for it. It is also
         // where a provider that computes the semantics wrong is refused.

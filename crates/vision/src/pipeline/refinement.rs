@@ -9,7 +9,7 @@ use std::{
     time::Duration,
 };
 
-use segsplat_render::{Kinds, RenderRequest, backward::DifferentiableRenderer, plan::default_near};
+use segsplat_render::{DifferentiableRenderer, Kinds, RenderRequest, plan::default_near};
 
 use super::Reconstruction;
 use crate::{

@@ -7,13 +7,12 @@
 
 use std::sync::Arc;
 
-use parking_lot::Mutex;
 use rayon::prelude::*;
 
-use super::{Pipeline, Stages, count, fraction, masks};
+use super::{Pipeline, Stages, count, fraction, masks, networks::opened};
 use crate::{
-    error::{Error, ErrorCode, Result},
-    models::{ImageText, MaskNetwork, NetworkOptions},
+    error::{Error, Result},
+    models::{ImageText, MaskNetwork},
     scene::{
         Bank, BankMask, Crop, CropShape, Gaussians, IndexMap, Method, PhotoMasks, PosedPhoto,
         Preset, SceneCamera, ScoringMethod, Semantics, SemanticsReport, Stage, Watch,
@@ -58,43 +57,6 @@ pub struct SemanticsInput<'a> {
     pub cameras: &'a [SceneCamera],
     /// Its Gaussians.
     pub gaussians: &'a Gaussians,
-}
-
-/// The networks that semantics need, opened at the first use and kept.
-#[derive(Debug)]
-pub(super) struct SemanticNetworks {
-    options: NetworkOptions,
-    masks: Mutex<Option<Arc<MaskNetwork>>>,
-    image_text: Mutex<Option<Arc<ImageText>>>,
-}
-
-impl SemanticNetworks {
-    pub(super) fn new(options: &NetworkOptions) -> Self {
-        Self { options: options.clone(), masks: Mutex::default(), image_text: Mutex::default() }
-    }
-
-    /// Why an open network is not computed where it was to be; one that is being opened says
-    /// nothing yet.
-    pub(super) fn remark(&self) -> Option<String> {
-        let masks = || self.masks.try_lock()?.as_ref()?.remark();
-        masks().or_else(|| self.image_text.try_lock()?.as_ref()?.remark())
-    }
-}
-
-/// The network in `place`; it is opened if it is not there yet. A failure is not kept.
-fn opened<T>(
-    place: &Mutex<Option<Arc<T>>>,
-    what: &str,
-    open: impl FnOnce() -> Result<Option<T>>,
-) -> Result<Arc<T>> {
-    let mut kept = place.lock();
-    if let Some(network) = &*kept {
-        return Ok(Arc::clone(network));
-    }
-    let network = open()?.ok_or_else(|| {
-        Error::new(ErrorCode::ModelUnavailable, format!("the bundle has no {what}"))
-    })?;
-    Ok(Arc::clone(kept.insert(Arc::new(network))))
 }
 
 impl Pipeline {

@@ -20,8 +20,7 @@ use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
 use segsplat_render::{
-    Background, Frame, Kinds, RenderRequest,
-    backward::DifferentiableRenderer,
+    Background, DifferentiableRenderer, Frame, Kinds, RenderRequest,
     compare::psnr,
     plan::{default_near, served, widened},
     train::{
@@ -315,18 +314,16 @@ pub fn refine(
     let extent = if extent.is_finite() && extent > 0.0 { extent as f32 } else { 1.0 };
     let rates = LearningRates { means: options.rates.means * extent, ..options.rates };
     // The device first. What it has no room for, or what is lost with it, is done over.
-    if set.device_bytes() <= options.device_bytes_max {
-        let made = renderer
-            .trainer(&set)
-            .and_then(|trainer| trainer.map(|mut it| work.run(&mut *it, &rates, pace)).transpose());
-        match made {
-            Ok(None) => {}
-            Ok(Some(version)) => return Ok(version),
-            Err(error) if is_of_device(error.code()) => {
-                tracing::warn!(reason = error.message(), "refined on the processor");
-            }
-            Err(error) => return Err(error),
+    let made = renderer
+        .trainer(&set, options.device_bytes_max)
+        .and_then(|trainer| trainer.map(|mut it| work.run(&mut *it, &rates, pace)).transpose());
+    match made {
+        Ok(None) => {}
+        Ok(Some(version)) => return Ok(version),
+        Err(error) if is_of_device(error.code()) => {
+            tracing::warn!(reason = error.message(), "refined on the processor");
         }
+        Err(error) => return Err(error),
     }
     work.run(&mut HostTrainer::new(renderer, &set)?, &rates, pace)
 }

@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 use crate::{
     error::Result,
     scene::Photo,
-    segment::{Bitset, Box2, PromptDecoder, Proposal, Proposals, Settings, decoded, nms},
+    segment::{Bitset, Box2, PromptDecoder, Proposal, Proposals, Settings, decode::decoded, nms},
 };
 
 /// A mask that ends so near to an inner edge of its part is a cut thing, pixels.

@@ -2,13 +2,12 @@
 
 use std::borrow::Cow;
 
-use half::f16;
 use rayon::prelude::*;
 
 use crate::{
     error::{Error, Result},
     scene::{JudgedMasks, MaskJudging, MaskLogits, Photo},
-    segment::{Bitset, Box2, PhotoGrid, Proposal, Settings, photo_grid::Resample},
+    segment::{Bitset, PhotoGrid, Proposal, Settings, photo_grid::Resample, proposal::Patch},
 };
 
 /// Keeps the good masks of one photo.
@@ -22,13 +21,6 @@ pub(super) struct MaskFilter {
     /// Cells without a source in the photo.
     blank: Option<Bitset>,
     settings: Settings,
-}
-
-/// A part of a decoder's grid of logits.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Patch {
-    at: Box2,
-    values: Vec<f16>,
 }
 
 /// What a predicted IoU must be over. As in Segment Anything a threshold of 0 asks nothing, so that
@@ -214,35 +206,6 @@ impl MaskFilter {
             false => Patch::default(),
         };
         Some(Proposal { predicted_iou, stability, logits, ..proposal })
-    }
-}
-
-impl Patch {
-    /// The box and one cell around it, within the grid.
-    fn new(logits: &[f32], [width, height]: [usize; 2], bounds: Box2) -> Self {
-        let last = |cells: usize| u32::try_from(cells).unwrap_or(u32::MAX).saturating_sub(1);
-        let at = Box2 {
-            x0: bounds.x0.saturating_sub(1),
-            y0: bounds.y0.saturating_sub(1),
-            x1: (bounds.x1 + 1).min(last(width)),
-            y1: (bounds.y1 + 1).min(last(height)),
-        };
-        let columns = at.x0 as usize..=at.x1 as usize;
-        let rows = logits.chunks_exact(width).take(at.y1 as usize + 1).skip(at.y0 as usize);
-        let values = rows.flat_map(|row| row[columns.clone()].iter().map(|v| f16::from_f32(*v)));
-        Self { at, values: values.collect() }
-    }
-
-    /// The whole grid, outside where nothing is known.
-    pub(super) fn spread(&self, [width, height]: [usize; 2]) -> Vec<f32> {
-        let mut grid = vec![-1.0; width * height];
-        let columns = (self.at.x1 - self.at.x0 + 1) as usize;
-        let rows = grid.chunks_exact_mut(width).skip(self.at.y0 as usize);
-        for (row, values) in rows.zip(self.values.chunks_exact(columns)) {
-            let out = row.iter_mut().skip(self.at.x0 as usize);
-            out.zip(values).for_each(|(out, v)| *out = v.to_f32());
-        }
-        grid
     }
 }
 

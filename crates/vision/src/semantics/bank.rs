@@ -7,7 +7,7 @@ use std::collections::{HashMap, HashSet};
 
 use rayon::prelude::*;
 
-use super::sum_of;
+use super::rows::sum_of;
 use crate::{
     error::{Error, Result},
     limits::BANK_ROWS_MAX,

@@ -9,7 +9,7 @@ use std::sync::{Arc, OnceLock};
 
 use rayon::prelude::*;
 
-use super::{dot, norm, unit_rows};
+use super::rows::{dot, norm, unit_rows};
 use crate::{
     error::{Error, Result},
     scene::{Bank, PixelWeights, ScoringMethod},

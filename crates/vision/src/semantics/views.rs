@@ -8,6 +8,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 use rustc_hash::FxHashMap;
 
+use super::rows::{dot, norm};
 use crate::{
     center_of,
     scene::{Bank, Camera, Gaussians, IndexMap, Intrinsics, SceneCamera, SourcePixel},
@@ -207,8 +208,8 @@ fn winner(own: u16, votes: &mut [u16]) -> u16 {
 }
 
 fn cosine(bank: &Bank, a: usize, b: usize) -> f64 {
-    let lengths = super::norm(bank.row(a)) * super::norm(bank.row(b));
-    if lengths > 0.0 { super::dot(bank.row(a), bank.row(b)) / lengths } else { 0.0 }
+    let lengths = norm(bank.row(a)) * norm(bank.row(b));
+    if lengths > 0.0 { dot(bank.row(a), bank.row(b)) / lengths } else { 0.0 }
 }
 
 /// Joins groups of rows to one row each: the mean over their embeddings, of which row m had

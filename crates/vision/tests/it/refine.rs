@@ -17,8 +17,8 @@ use segsplat_core::{
     },
 };
 use segsplat_render::{
-    Background, Frame, Kinds, RenderRequest, Renderer,
-    backward::{DifferentiableRenderer, FrameGradients, Gradients},
+    Background, DifferentiableRenderer, Frame, Kinds, RenderRequest, Renderer,
+    backward::{FrameGradients, Gradients},
     cpu::CpuRenderer,
     train::{Trainer, TrainingSet},
 };
@@ -291,8 +291,12 @@ impl DifferentiableRenderer for Full {
         self.0.backward(gaussians, request, loss, gradients)
     }
 
-    fn trainer<'a>(&'a self, set: &TrainingSet<'a>) -> Result<Option<Box<dyn Trainer + 'a>>> {
-        Err(Error::limit("bytes", set.device_bytes(), 0))
+    fn trainer<'a>(
+        &'a self,
+        _set: &TrainingSet<'a>,
+        bytes_max: u64,
+    ) -> Result<Option<Box<dyn Trainer + 'a>>> {
+        Err(Error::limit("bytes", u64::MAX, bytes_max))
     }
 }
 

@@ -14,34 +14,4 @@
 mod read;
 mod write;
 
-use self::{
-    read::read,
-    write::{size_bytes, write},
-};
-use super::{OCTETS, SplatFormat, packed_ply, some};
-
-/// 3DGS PLY.
-pub static PLY: SplatFormat = SplatFormat {
-    name: "ply",
-    ending: "ply",
-    media_type: OCTETS,
-    semantics: true,
-    begins: b"ply",
-    read,
-    check: |_| Ok(()),
-    size_bytes: |file| Some(size_bytes(file)),
-    write,
-};
-
-/// The compressed PLY of `PlayCanvas` and `SuperSplat`.
-pub static COMPRESSED_PLY: SplatFormat = SplatFormat {
-    name: "compressed_ply",
-    ending: "compressed.ply",
-    media_type: OCTETS,
-    semantics: false,
-    begins: b"ply",
-    read,
-    check: some,
-    size_bytes: |file| Some(packed_ply::size_bytes(file)),
-    write: packed_ply::write,
-};
+pub use self::read::{COMPRESSED_PLY, PLY};

@@ -1,0 +1,58 @@
+//! What a submission runs on: an open device, and buffers of its own.
+
+use std::sync::Arc;
+
+use parking_lot::Mutex;
+
+use super::{
+    buffers::{DeviceScene, SceneCache},
+    device::Gpu,
+    frame::Tools,
+    pipelines::Kernels,
+    profile::Marks,
+    scratch::Scratch,
+};
+use crate::{error::Result, scene::Gaussians};
+
+/// A device, its kernels and its scenes. Clones share them.
+#[derive(Clone, Debug)]
+pub(super) struct OpenDevice {
+    pub(super) gpu: Gpu,
+    pub(super) kernels: Arc<Kernels>,
+    pub(super) scenes: Arc<Mutex<SceneCache>>,
+}
+
+/// A device and scratch buffers for one submission.
+#[derive(Debug)]
+pub(super) struct Context {
+    pub(super) on: OpenDevice,
+    pub(super) scratch: Scratch,
+}
+
+impl Context {
+    /// The tools that draw frames of `scene`.
+    pub(super) fn tools<'a>(
+        &'a mut self,
+        scene: &'a DeviceScene,
+        isects_max: u32,
+        marks: Option<&'a mut Marks>,
+    ) -> Tools<'a> {
+        let (gpu, kernels, scratch) = (&self.on.gpu, &*self.on.kernels, &mut self.scratch);
+        Tools { gpu, kernels, scratch, scene, isects_max, marks }
+    }
+
+    /// The Gaussians of a backward pass, which no view is expected to draw.
+    pub(super) fn learnt(&mut self, gaussians: &Gaussians) -> Result<DeviceScene> {
+        let learnt = &mut self.scratch.learnt;
+        let scene = match learnt.take() {
+            Some(scene) if scene.has_shape(gaussians.shape_identity()) => scene,
+            old => DeviceScene::upload(&self.on.gpu, gaussians, old)?,
+        };
+        Ok(learnt.insert(scene).clone())
+    }
+
+    /// The scene of `gaussians`; if `labelled`, with its entries.
+    pub(super) fn scene(&self, gaussians: &Gaussians, labelled: bool) -> Result<DeviceScene> {
+        self.on.scenes.lock().get(&self.on.gpu, gaussians, labelled)
+    }
+}

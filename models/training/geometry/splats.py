@@ -1,0 +1,113 @@
+"""Pictures of the network's Gaussians by gsplat, and how far they are from the photos."""
+import torch
+import torch.nn.functional as F
+
+from model import SH_C0
+
+
+def render(out, c2w, K, H, W):
+    """Pictures [B,T,3,H,W] of the network's Gaussians from cameras c2w [B,T,4,4], K normalised."""
+    from gsplat import rasterization
+
+    g = world_gaussians(out)
+    size = torch.tensor([[W], [H], [1]], device=K.device, dtype=torch.float32)
+    img, _, _ = rasterization(
+        g["means"], g["quats"], g["scales"], g["opacities"], g["colors"],
+        torch.linalg.inv(c2w).contiguous(), (K * size).contiguous(), W, H, near_plane=1e-3, packed=False,
+    )
+    return img[..., :3].permute(0, 1, 4, 2, 3)
+
+
+def world_gaussians(out):
+    m, R, t = out["means"], out["c2w"][..., :3, :3], out["c2w"][..., :3, 3]
+    means = torch.einsum("bvij,bvhwj->bvhwi", R, m) + t[:, :, None, None]
+    return {
+        "means": means.flatten(1, 3), "scales": out["scales"].flatten(1, 3),
+        "quats": quat_mul(rot_to_quat(R)[:, :, None, None].expand_as(out["quats"]), out["quats"]).flatten(1, 3),
+        "opacities": out["opacities"].flatten(1, 3),
+        "colors": (out["sh"][..., 0, :] * SH_C0 + 0.5).clamp(min=0).flatten(1, 3),
+    }
+
+
+def quat_mul(a, b):
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack([
+        aw * bw - ax * bx - ay * by - az * bz, aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx, aw * bz + ax * by - ay * bx + az * bw,
+    ], -1)
+
+
+def rot_to_quat(R):
+    """wxyz; stable for every rotation (largest of the four components first)."""
+    m = R
+    t = torch.stack([
+        1 + m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2], 1 + m[..., 0, 0] - m[..., 1, 1] - m[..., 2, 2],
+        1 - m[..., 0, 0] + m[..., 1, 1] - m[..., 2, 2], 1 - m[..., 0, 0] - m[..., 1, 1] + m[..., 2, 2],
+    ], -1)
+    a, b, c = m[..., 2, 1], m[..., 0, 2], m[..., 1, 0]
+    d, e, f = m[..., 1, 2], m[..., 2, 0], m[..., 0, 1]
+    cand = torch.stack([
+        torch.stack([t[..., 0], a - d, b - e, c - f], -1), torch.stack([a - d, t[..., 1], c + f, b + e], -1),
+        torch.stack([b - e, c + f, t[..., 2], a + d], -1), torch.stack([c - f, b + e, a + d, t[..., 3]], -1),
+    ], -2)
+    best = t.argmax(-1)[..., None, None].expand(*t.shape[:-1], 1, 4)
+    return F.normalize(torch.gather(cand, -2, best)[..., 0, :], dim=-1)
+
+
+_WINDOW = {}
+
+
+def ssim(x, y):
+    """Mean SSIM of each picture, 11x11 Gaussian of sigma 1.5, valid windows. [M,3,H,W] -> [M]."""
+    key = x.device
+    if key not in _WINDOW:
+        g = torch.exp(-((torch.arange(11, device=key) - 5.0) ** 2) / (2 * 1.5**2))
+        _WINDOW[key] = (g / g.sum())[None, None]
+    g = _WINDOW[key]
+    m, c, h, w = x.shape
+
+    def blur(t):
+        t = t.reshape(m * c, 1, *t.shape[-2:])
+        t = F.conv2d(F.conv2d(t, g[..., None]), g[:, :, None])
+        return t.reshape(m, c, *t.shape[-2:])
+
+    mx, my = blur(x), blur(y)
+    vx, vy, vxy = blur(x * x) - mx * mx, blur(y * y) - my * my, blur(x * y) - mx * my
+    s = ((2 * mx * my + 1e-4) * (2 * vxy + 9e-4)) / ((mx * mx + my * my + 1e-4) * (vx + vy + 9e-4))
+    return s.flatten(1).mean(1)
+
+
+def depth_loss(out, depth, near, far):
+    """Inverse depth relative to the searched range at three scales, and cross entropy of the sweep."""
+    inv_lo, inv_hi = 1 / far, 1 / near
+    u = ((1 / depth.clamp(min=1e-4) - inv_lo[..., None, None]) / (inv_hi - inv_lo)[..., None, None]).clamp(-0.1, 1.1)
+    total = 0.5 * (out["u4"] - u[..., 2::4, 2::4]).abs().mean()
+    total = total + 0.7 * (out["u2"] - u[..., 1::2, 1::2]).abs().mean() + (out["u1"] - u).abs().mean()
+    D = out["logits"].shape[2]
+    pos = (u[..., 2::4, 2::4].clamp(0, 1) * (D - 1)).flatten(0, 1)
+    lo = pos.floor().clamp(max=D - 2).long()
+    f = (pos - lo)[:, None]
+    logp = F.log_softmax(out["logits"].flatten(0, 1), 1)
+    ce = -(logp.gather(1, lo[:, None]) * (1 - f) + logp.gather(1, lo[:, None] + 1) * f).mean()
+    return total, ce, (out["u1"] - u).abs().mean()
+
+
+def picture_loss(pic, want, robust=None):
+    """MSE, log MSE (the mean PSNR itself) and SSIM of pictures [M,3,H,W]; also the plain MSE.
+
+    With `robust` an error far over it counts little more than one of its size: what moved, shone
+    or was lit differently in a photo.
+    """
+    err = (pic - want) ** 2
+    plain = err.flatten(1).mean(1)
+    each = plain if robust is None else (err / (1 + err / robust**2)).flatten(1).mean(1)
+    loss = 6 * each.mean() + 0.02 * torch.log(each + 1e-4).mean() + 0.15 * (1 - ssim(pic, want)).mean()
+    return loss, plain.mean().detach()
+
+
+def nearest_views(c2w, k):
+    """k nearest other views by distance of centres. [B,V,4,4] -> [B,V,k]."""
+    d = torch.cdist(c2w[:, :, :3, 3], c2w[:, :, :3, 3])
+    d = d + 1e6 * torch.eye(d.shape[1], device=d.device)
+    return d.argsort(-1)[..., :k]

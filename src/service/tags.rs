@@ -1,0 +1,58 @@
+//! Texts that tell scenes, requests and answers from each other: keys of caches and entity tags.
+
+use serde::Serialize;
+use sha2::{Digest, Sha256};
+
+use super::request::ScoringOptions;
+use crate::{
+    error::{Error, Result},
+    names::hex,
+    scene::{Preset, Scene, SceneId},
+    store::Record,
+};
+
+/// Values as text: equal text means equal values. Numbers are written to their last bit.
+pub(super) fn cache_key(values: &impl Serialize) -> Result<String> {
+    serde_json::to_string(values)
+        .map_err(|e| Error::internal("a request cannot be written down").caused_by(e))
+}
+
+/// The entity tag of what a key tells apart: 32 hexadecimal digits of its sha256.
+pub(super) fn etag(key: &str) -> String {
+    hex(&Sha256::digest(key)[..16])
+}
+
+/// The key of a text of a scene and how it is scored; `tag` tells scene and semantics.
+pub(super) fn text_key(
+    tag: &str,
+    text: Option<&str>,
+    preset: Preset,
+    changes: &ScoringOptions,
+) -> Result<String> {
+    cache_key(&(tag, text, (preset, changes)))
+}
+
+/// Tells a version of a scene from all others.
+pub(super) fn scene_tag(scene: &Scene) -> String {
+    tag(&scene.sha256, &scene.meta.id)
+}
+
+/// The tag of the version that a record names. Another one may be served a moment later.
+pub(super) fn record_tag(record: &Record) -> String {
+    tag(record.scene_sha256.as_deref().unwrap_or_default(), &record.status.id)
+}
+
+/// Tells a version of a scene and its semantics from all others.
+pub(super) fn semantics_tag(scene: &Scene) -> String {
+    format!("{} {}", scene_tag(scene), scene.semantics_sha256)
+}
+
+/// The same of the version that a record names.
+pub(super) fn record_semantics_tag(record: &Record) -> String {
+    let semantics = record.semantics_sha256.as_deref().unwrap_or_default();
+    format!("{} {semantics}", record_tag(record))
+}
+
+fn tag(sha256: &str, id: &SceneId) -> String {
+    format!("{sha256} {id}")
+}
