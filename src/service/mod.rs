@@ -40,17 +40,18 @@ use self::{memory::Memory, schedule::Scheduler, search::Backend};
 pub use self::{
     offline::OfflineService,
     request::{
-        BackgroundSpec, Boxes, CameraFields, CameraSpec, CreateScene, ExportFormat, FeatureKind,
-        FeaturesSpec, Format, Kind, LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions,
-        PoseSpec, QuerySpec, ScoringOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec,
+        BackgroundSpec, Boxes, CameraFields, CameraSpec, CreateScene, FeatureKind, FeaturesSpec,
+        Format, Kind, LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions, PoseSpec,
+        QuerySpec, ScoringOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec,
     },
     times::ViewTimes,
     types::{
-        Created, Export, InstanceBox, KnownWord, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
-        QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning, Trust,
+        Created, Export, ExportBody, InstanceBox, KnownWord, Label, ModelInfo, ModelsInfo, Page,
+        Peak, Picked, QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning,
+        Trust,
     },
 };
-pub use crate::formats::rle::Rle;
+pub use crate::formats::{rle::Rle, table::ExportFormat};
 pub use crate::render::{Quality, plan::default_near};
 pub use crate::scene::{
     Density, Event, MaskLevel, Method, Preset, SceneCamera, SceneError, SceneOptions, SceneState,

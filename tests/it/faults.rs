@@ -53,8 +53,8 @@ fn request(seed: u64) -> CreateScene {
 
 async fn export(service: &Service, id: &SceneId) -> Result<Vec<u8>, ErrorCode> {
     let export = service.export(id, ExportFormat::Ply, None, &ask()).await;
-    let export = export.map_err(|error| error.code())?;
-    Ok(export.into_stream().map(Result::unwrap).concat().await)
+    let body = export.map_err(|error| error.code())?.begin().await;
+    Ok(body.map_err(|error| error.code())?.into_stream().map(Result::unwrap).concat().await)
 }
 
 /// The same of a store that works: a loaded machine may be late, so it is asked again.

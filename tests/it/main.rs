@@ -22,6 +22,7 @@ mod errors;
 mod faults;
 mod fields;
 mod folders;
+mod formats;
 mod grpc;
 mod hostile;
 mod http;
