@@ -142,9 +142,8 @@ impl Stages {
                 let tile = Tile { x: tile_x * TILE, y: tile_y * TILE, width: TILE, height: TILE };
                 pairs.clear();
                 self.bins.iter().for_each(|bins| pairs.extend(bins.of(id)));
-                let place = (tile, (tile_x * TILE) as usize);
-                let tools = (&paint, &mut *scratch);
-                rasterize_tile(&self.projected.footprints, &mut pairs, place, tools, &mut out);
+                let (column, footprints) = ((tile_x * TILE) as usize, &self.projected.footprints);
+                rasterize_tile(footprints, &mut pairs, tile, column, &paint, scratch, &mut out);
             }
         }
         black_box((color, depth, blend));

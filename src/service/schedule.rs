@@ -4,11 +4,11 @@
 //! them holds a [`Slot`]. A view gives its slot back when it is drawn, so no slot waits for an
 //! encoder. Its pixels count until the answer is encoded: they bound the memory of all pictures.
 //!
-//! Owners take turns: the next view is one of the owner who had least work done so far, and an owner
-//! may fill half of the queue, so that others always find room. The order of one owner's views is
-//! that of fair queuing: a view waits for about as much work as it is itself, so large views do not
-//! keep small ones waiting, and small ones do not keep out a large one. While large views hold every
-//! slot, one small view at a time is drawn beside them.
+//! Owners take turns: the next view is one of the owner who had least work done so far, and an
+//! owner may fill half of the queue, so that others always find room. The order of one owner's
+//! views is that of fair queuing: a view waits for about as much work as it is itself, so large
+//! views do not keep small ones waiting, and small ones do not keep out a large one. While large
+//! views hold every slot, one small view at a time is drawn beside them.
 //!
 //! [`Renderer::concurrency`]: crate::render::Renderer::concurrency
 
@@ -478,7 +478,8 @@ mod tests {
         let scheduler = Scheduler::new(1, &limits);
         let _drawn = scheduler.enter(of("a", HUGE), &limits).await.unwrap();
         let _waits = waits_for(&scheduler, &of("a", MIDDLE), &limits);
-        let refused = scheduler.enter(of("a", MIDDLE), &limits).await.unwrap_err();
+        let refused = scheduler.enter(of("a", MIDDLE), &limits).now_or_never();
+        let refused = refused.expect("it does not wait").unwrap_err();
         assert_eq!(refused.code(), ErrorCode::Overloaded, "{refused}");
         let _other = waits_for(&scheduler, &of("b", MIDDLE), &limits);
     }

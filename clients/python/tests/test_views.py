@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 
-from segsplat import Camera, Client, InvalidRequest, Scene, View
+from segsplat import Camera, Client, InvalidRequest, Scene, View, Viewpoint
 from segsplat.types import Kind
 
 
@@ -161,6 +161,6 @@ def test_single_options_of_a_preset(scene: Scene) -> None:
     paper = scene.view(width=64, background="black", preset="paper").image
     single = scene.view(width=64, background="black", front_photos=0, magnify=False).image
     assert np.array_equal(single, paper)
-    near = {"eye": [0, -1.6, -1.0], "target": [0, -0.6, 0], "width": 64}
-    one = scene.view(**near, front_photos=1).image  # type: ignore[arg-type]
-    assert not np.array_equal(one, scene.view(**near, front_photos=0).image)  # type: ignore[arg-type]
+    near: Viewpoint = {"eye": [0, -1.6, -1.0], "target": [0, -0.6, 0]}
+    one = scene.view(**near, width=64, front_photos=1).image
+    assert not np.array_equal(one, scene.view(**near, width=64, front_photos=0).image)

@@ -223,14 +223,12 @@ impl Sources {
         let Some(name) = rest.first() else { return Some((module, None)) };
         let source = &self.0[self.at(&module)?];
         if !source.defined.contains(name) {
-            for (_, passed) in source.used.iter().filter(|(local, _)| local == name) {
+            // Passed on from another file, or from another crate.
+            if let Some((_, passed)) = source.used.iter().find(|(local, _)| local == name) {
                 let mut whole = passed.clone();
                 whole.extend_from_slice(&rest[1..]);
-                if *passed != path && self.start(&module, passed).is_some() {
-                    return self.resolve(&module, &whole);
-                }
-                // A name of another crate.
-                return None;
+                let known = *passed != path && self.start(&module, passed).is_some();
+                return if known { self.resolve(&module, &whole) } else { None };
             }
         }
         Some((module, Some(name.clone())))

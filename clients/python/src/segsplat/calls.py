@@ -272,9 +272,10 @@ def wait(scene: Handle, progress: Progress = None) -> Flow[None]:
 
 def refine(scene: Handle, refine: Literal["auto", "off"] | int = "auto") -> Flow[None]:
     """Brings a finished scene closer to its photos while it is served. Returns at once:
-    `scene.refresh()` and `scene.status.refinement` say how far it is, `scene.events()` each version.
+    `scene.refresh()` and `scene.status.refinement` say how far it is, `scene.events()` tells each
+    version.
 
-    refine: milliseconds of work; "auto" as long as the server thinks right; "off" ends a refinement.
+    refine: milliseconds of work; "auto": as long as the server finds right; "off" ends it.
     """
     path = f"/v1/scenes/{scene.id}/refine"
     answer = yield from send(scene.policy, Request("POST", path, params={"refine": str(refine)}))

@@ -271,7 +271,7 @@ impl TileBackward<'_> {
                 let met = u32::from(met(simd, gaussian)) & open;
                 if met != 0 {
                     let sum = &mut sums[bin::value(pair) as usize];
-                    open = gaussian_back::<S, DEPTH>(simd, gaussian, cells, (met, open), sum);
+                    open = gaussian_back::<S, DEPTH>(simd, gaussian, cells, met, open, sum);
                 }
             }
         }
@@ -311,7 +311,8 @@ fn gaussian_back<S: Lanes, const DEPTH: bool>(
     simd: S,
     gaussian: &Staged,
     cells: &mut [Seeds],
-    (mut met, mut open): (u32, u32),
+    mut met: u32,
+    mut open: u32,
     out: &mut Sums,
 ) -> u32 {
     let zero = simd.splat_f32s(0.0);

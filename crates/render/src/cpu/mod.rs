@@ -32,6 +32,7 @@ use self::{
     paint::Paint,
     pool::Pool,
     project::Projected,
+    rasterize::rasterize_tile,
     store::{Cut, PictureRows},
     tiles::Grid,
 };
@@ -177,8 +178,8 @@ impl CpuRenderer {
             return Ok(());
         }
         frame.stats.intersections += total;
-        let inputs = (&projected.footprints[..], &bins[..]);
-        band.weights.extend(rasterize(grid, &band.paint, inputs, &self.tiles, frame));
+        let footprints = &projected.footprints;
+        band.weights.extend(rasterize(grid, &band.paint, footprints, bins, &self.tiles, frame));
         watch.ended("rasterize");
         Ok(())
     }
@@ -188,7 +189,8 @@ impl CpuRenderer {
 fn rasterize(
     grid: &Grid,
     paint: &Paint<'_>,
-    (footprints, bins): (&[Footprint], &[Bins]),
+    footprints: &[Footprint],
+    bins: &[Bins],
     scratches: &Pool<TileScratch>,
     frame: &mut Frame,
 ) -> Vec<WeightRows> {
@@ -218,9 +220,8 @@ fn rasterize(
                 let mut pairs = std::mem::take(&mut scratch.pairs);
                 pairs.clear();
                 bins.iter().for_each(|bins| pairs.extend(bins.of(row * tiles_x + tile_x)));
-                let place = (tile, (tile_x - first) * side);
-                let tools = (paint, &mut scratch);
-                rasterize::rasterize_tile(footprints, &mut pairs, place, tools, &mut out);
+                let (column, scratch) = ((tile_x - first) * side, &mut scratch);
+                rasterize_tile(footprints, &mut pairs, tile, column, paint, scratch, &mut out);
                 scratch.pairs = pairs;
             }
             scratches.give(scratch);
@@ -240,7 +241,7 @@ pub(super) fn background(view: &View, request: &RenderRequest) -> Result<Frame> 
     let options = KernelOptions::default();
     let grid = Grid::whole(view, options);
     let paint = Paint::new(request, view, &[], options);
-    let weights = rasterize(&grid, &paint, (&[], &[]), &Pool::default(), &mut frame);
+    let weights = rasterize(&grid, &paint, &[], &[], &Pool::default(), &mut frame);
     if request.labels == Labels::Weights {
         frame.weights = Some(WeightRows::join(weights)?);
     }

@@ -40,8 +40,10 @@ const POWER_SLACK: f32 = 1e-4;
 pub fn rasterize_tile(
     footprints: &[Footprint],
     pairs: &mut [u64],
-    (tile, column): (Tile, usize),
-    (paint, scratch): (&Paint<'_>, &mut TileScratch),
+    tile: Tile,
+    column: usize,
+    paint: &Paint<'_>,
+    scratch: &mut TileScratch,
     out: &mut PictureRows<'_>,
 ) {
     if *paint.labels == Labels::Weights {

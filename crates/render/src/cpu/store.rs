@@ -74,20 +74,19 @@ fn pieces<'a, T>(mut all: Pixels<'a, T>, cut: Cut) -> impl FnMut() -> Pixels<'a,
 impl<'a> PictureRows<'a> {
     /// The pictures of a frame from a row of pixels on, without weights.
     pub(super) fn of(frame: &'a mut Frame, first: usize) -> Self {
-        fn rows<T>(all: &mut Option<Vec<T>>, (width, first): (usize, usize)) -> Pixels<'_, T> {
+        fn rows<T>(all: &mut Option<Vec<T>>, width: usize, first: usize) -> Pixels<'_, T> {
             Some(all.as_mut()?.chunks_mut(width).skip(first).collect())
         }
-        let place = (frame.width as usize, first);
-        let levels = &mut frame.levels;
+        let (width, levels) = (frame.width as usize, &mut frame.levels);
         Self {
-            color: rows(&mut frame.color, place),
-            depth: rows(&mut frame.depth, place),
-            alpha: rows(&mut frame.alpha, place),
-            rgb: rows(&mut levels.rgb, place),
-            rgba: rows(&mut levels.rgba, place),
-            alpha_levels: rows(&mut levels.alpha, place),
-            blend: rows(&mut frame.blend, place),
-            mask: rows(&mut frame.mask, place),
+            color: rows(&mut frame.color, width, first),
+            depth: rows(&mut frame.depth, width, first),
+            alpha: rows(&mut frame.alpha, width, first),
+            rgb: rows(&mut levels.rgb, width, first),
+            rgba: rows(&mut levels.rgba, width, first),
+            alpha_levels: rows(&mut levels.alpha, width, first),
+            blend: rows(&mut frame.blend, width, first),
+            mask: rows(&mut frame.mask, width, first),
             weights: None,
         }
     }
@@ -145,12 +144,12 @@ impl LaneKernel for Store<'_, '_> {
             if paint.has_color() {
                 match &paint.behind {
                     Behind::Color(color) => over_color(simd, cell, color),
-                    Behind::Sky(sky) => over_sky(simd, cell, (tile, at), sky, paint.samples),
+                    Behind::Sky(sky) => over_sky(simd, cell, tile, at, sky, paint.samples),
                 }
             }
             for row in 0..rows {
-                let first = column + x;
-                write(paint, cell, row * CELL, (y + row, first..first + columns), out);
+                let to = column + x..column + x + columns;
+                write(paint, cell, &PixelRun { first: row * CELL, row: y + row, to }, out);
             }
         }
         if let Some(weights) = &mut out.weights {
@@ -176,7 +175,8 @@ fn over_color<S: Lanes>(simd: S, cell: &mut Cell, color: &[f32; 3]) {
 fn over_sky<S: Lanes>(
     simd: S,
     cell: &mut Cell,
-    (tile, at): (Tile, usize),
+    tile: Tile,
+    at: usize,
     sky: &Sky<'_>,
     samples: Samples,
 ) {
@@ -215,15 +215,17 @@ fn over_sky<S: Lanes>(
     }
 }
 
-/// Writes a row of a cell, from number `first` of its pixels on, to columns of a row of `out`.
-#[inline(always)]
-fn write(
-    paint: &Paint<'_>,
-    cell: &Cell,
+/// A row of a cell's pixels, from number `first` on, and where it goes.
+struct PixelRun {
     first: usize,
-    (row, to): (usize, Range<usize>),
-    out: &mut PictureRows<'_>,
-) {
+    row: usize,
+    /// Columns.
+    to: Range<usize>,
+}
+
+/// Writes a row of a cell.
+#[inline(always)]
+fn write(paint: &Paint<'_>, cell: &Cell, run: &PixelRun, out: &mut PictureRows<'_>) {
     let [depth_at, label_at, _] = paint.layout();
     let Cell { alpha, channels, .. } = cell;
     let alpha = &alpha.0;
@@ -232,37 +234,32 @@ fn write(
         let at = |k: usize| channels[label_at + k].0[i];
         [at(0), at(1), at(2), at(3)]
     };
-    let place = (row, first, to);
-    put(&mut out.color, &place, color);
-    put(&mut out.depth, &place, |i| match alpha[i] > 0.0 {
+    put(&mut out.color, run, color);
+    put(&mut out.depth, run, |i| match alpha[i] > 0.0 {
         true => channels[depth_at].0[i] / alpha[i],
         false => 0.0,
     });
-    put(&mut out.alpha, &place, |i| alpha[i]);
-    put(&mut out.rgb, &place, |i| {
+    put(&mut out.alpha, run, |i| alpha[i]);
+    put(&mut out.rgb, run, |i| {
         let [r, g, b] = color(i);
         [level(r), level(g), level(b)]
     });
-    put(&mut out.rgba, &place, |i| {
+    put(&mut out.rgba, run, |i| {
         let [r, g, b] = color(i);
         [level(r), level(g), level(b), level(alpha[i])]
     });
-    put(&mut out.alpha_levels, &place, |i| level(alpha[i]));
-    put(&mut out.blend, &place, labels);
+    put(&mut out.alpha_levels, run, |i| level(alpha[i]));
+    put(&mut out.blend, run, labels);
     if let Labels::Mask { coverage_floor, .. } = paint.labels {
-        put(&mut out.mask, &place, |i| u8::from(selected(labels(i), *coverage_floor)) * u8::MAX);
+        put(&mut out.mask, run, |i| u8::from(selected(labels(i), *coverage_floor)) * u8::MAX);
     }
 }
 
-/// Puts what `of` gives for a cell's pixels from `first` on into some columns of a row.
+/// Puts what `of` gives for the pixels of a row where they go.
 #[inline(always)]
-fn put<T>(
-    out: &mut Pixels<'_, T>,
-    (row, first, to): &(usize, usize, Range<usize>),
-    of: impl Fn(usize) -> T,
-) {
+fn put<T>(out: &mut Pixels<'_, T>, run: &PixelRun, of: impl Fn(usize) -> T) {
     if let Some(rows) = out {
-        for (i, pixel) in (*first..).zip(&mut rows[*row][to.clone()]) {
+        for (i, pixel) in (run.first..).zip(&mut rows[run.row][run.to.clone()]) {
             *pixel = of(i);
         }
     }

@@ -1,6 +1,8 @@
 //! The backward pass on the device, in the buffers that the frame left: what the loss says of its
 //! pictures goes up, what that means for each Gaussian comes down.
 
+use std::slice;
+
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -59,14 +61,12 @@ impl Tools<'_> {
 
     /// Draws all rows of tiles in one submission; also where everything is left.
     fn whole(&mut self, drawing: &mut Drawing<'_>) -> Result<(Layout, BatchBuffers)> {
-        let (rows, capacity_max) = (drawing.whole(), self.capacity_max(1));
-        let layout = drawing.layout(&rows, 0);
+        let (layout, capacity_max) = (drawing.layout(drawing.whole(), 0), self.capacity_max(1));
         let (mut needed, mut attempts) = (0, 0);
         while attempts < ATTEMPTS_MAX && needed <= capacity_max {
             let capacity = self.capacity(1);
-            let (alone, band) = (std::slice::from_mut(drawing), std::slice::from_ref(&rows));
-            let (ended, room) =
-                self.attempt(alone, band, std::slice::from_ref(&layout), capacity)?;
+            let (alone, layouts) = (slice::from_mut(drawing), slice::from_ref(&layout));
+            let (ended, room) = self.attempt(alone, layouts, capacity)?;
             if ended[0].drawn {
                 return Ok((layout, room));
             }

@@ -27,6 +27,8 @@ const PARALLEL_BYTES: usize = 4 << 20;
 
 /// Places of a band's pictures in the buffers of its batch: first words, or [`NO_PICTURE`].
 pub(super) struct Layout {
+    /// The band's rows of tiles.
+    pub(super) rows: Range<u32>,
     pub(super) color: u32,
     /// In f32. Where it is asked for in steps it is not read back: it lies behind all pictures that
     /// are.
@@ -127,7 +129,7 @@ impl<'a> Drawing<'a> {
         [self.row.tiles_x, self.row.tiles_y]
     }
 
-    pub(super) fn layout(&self, rows: &Range<u32>, slots: u32) -> Layout {
+    pub(super) fn layout(&self, rows: Range<u32>, slots: u32) -> Layout {
         let pixel_rows = (rows.end * TILE_SIZE).min(self.row.height) - rows.start * TILE_SIZE;
         let pixels = u64::from(pixel_rows) * u64::from(self.row.width);
         let RenderRequest { kinds, labels, samples, .. } = self.request;
@@ -143,7 +145,7 @@ impl<'a> Drawing<'a> {
             u64::from(pixel_rows) * (u64::from(self.row.width) * u64::from(bytes)).div_ceil(4)
         };
         // Steps are of one size in all bands.
-        let stepped = kinds.depth && !exact && *rows == self.whole();
+        let stepped = kinds.depth && !exact && rows == self.whole();
         let color_words = match samples {
             Samples::F32 => 3 * pixels,
             Samples::Levels => packed(3),
@@ -160,6 +162,7 @@ impl<'a> Drawing<'a> {
         let inner_words = if stepped { pixels } else { 0 };
         let tiles = self.row.tiles_x * (rows.end - rows.start);
         Layout {
+            rows,
             color,
             depth,
             alpha,

@@ -1,7 +1,7 @@
 //! One submission: it makes room for the Gaussian-tile pairs of a batch of views, draws them and
 //! reads their pictures back. A view that does not fit is drawn in bands.
 
-use std::{ops::Range, sync::Arc};
+use std::{ops::Range, slice, sync::Arc};
 
 use rayon::prelude::*;
 
@@ -64,13 +64,8 @@ pub(super) struct Batch {
 }
 
 impl Batch {
-    /// One band of each view.
-    pub(super) fn new(
-        drawings: &[Drawing<'_>],
-        bands: &[Range<u32>],
-        layouts: &[Layout],
-        capacity: u32,
-    ) -> Self {
+    /// The bands of the views that `layouts` are for.
+    pub(super) fn new(drawings: &[Drawing<'_>], layouts: &[Layout], capacity: u32) -> Self {
         let mut batch = Self {
             rows: Vec::with_capacity(drawings.len()),
             grid: [0; 2],
@@ -84,20 +79,18 @@ impl Batch {
             slot_words: 0,
             step_words: 0,
         };
-        for ((drawing, band), layout) in drawings.iter().zip(bands).zip(layouts) {
-            batch.add(drawing, band, layout);
-        }
+        drawings.iter().zip(layouts).for_each(|(drawing, layout)| batch.add(drawing, layout));
         batch
     }
 
-    fn add(&mut self, drawing: &Drawing<'_>, band: &Range<u32>, layout: &Layout) {
+    fn add(&mut self, drawing: &Drawing<'_>, layout: &Layout) {
         let (row, words) = (&drawing.row, self.words as u32);
         let after = |start: u32| if start == NO_PICTURE { start } else { start + words };
         let stepped = layout.steps != NO_PICTURE;
         let backdrop_start = self.backdrop_start(drawing.request);
         self.rows.push(ViewRow {
-            row_start: band.start,
-            row_end: band.end,
+            row_start: layout.rows.start,
+            row_end: layout.rows.end,
             isect_capacity: self.capacity,
             color_start: after(layout.color),
             depth_start: if stepped { self.all_words as u32 } else { after(layout.depth) },
@@ -116,7 +109,8 @@ impl Batch {
             pair_start: self.rows.len() as u32 * self.capacity,
             ..*row
         });
-        self.grid = [self.grid[0].max(row.tiles_x), self.grid[1].max(band.end - band.start)];
+        let [columns, rows] = self.grid;
+        self.grid = [columns.max(row.tiles_x), rows.max(layout.rows.len() as u32)];
         self.words += layout.words;
         self.all_words += layout.inner_words;
         if stepped {
@@ -185,7 +179,7 @@ impl Batch {
 impl Tools<'_> {
     /// Draws the tile rows `rows`; halves them while they are over a limit of the adapter.
     pub(super) fn rows(&mut self, drawing: &mut Drawing<'_>, rows: Range<u32>) -> Result<()> {
-        let layout = drawing.layout(&rows, self.weight_slots(drawing));
+        let layout = drawing.layout(rows.clone(), self.weight_slots(drawing));
         let single = rows.end - rows.start == 1;
         let bytes = layout.all_bytes();
         let bytes_max = self.gpu.binding_bytes_max - PLAN_BYTES;
@@ -193,9 +187,8 @@ impl Tools<'_> {
             let (mut needed, mut attempts, capacity_max) = (0, 0, self.capacity_max(1));
             while attempts < ATTEMPTS_MAX && needed <= capacity_max {
                 let capacity = self.capacity(1);
-                let (alone, band) = (std::slice::from_mut(drawing), std::slice::from_ref(&rows));
-                let (ended, _) =
-                    self.attempt(alone, band, std::slice::from_ref(&layout), capacity)?;
+                let (alone, layouts) = (slice::from_mut(drawing), slice::from_ref(&layout));
+                let (ended, _) = self.attempt(alone, layouts, capacity)?;
                 if ended[0].drawn {
                     return Ok(());
                 }
@@ -221,7 +214,7 @@ impl Tools<'_> {
     pub(super) fn together(&mut self, drawings: &mut [Drawing<'_>]) -> Result<Vec<bool>> {
         let layouts: Vec<_> = drawings
             .iter()
-            .map(|drawing| drawing.layout(&drawing.whole(), self.weight_slots(drawing)))
+            .map(|drawing| drawing.layout(drawing.whole(), self.weight_slots(drawing)))
             .collect();
         let bytes = layouts.iter().map(Layout::all_bytes).sum::<u64>();
         let views = drawings.len() as u32;
@@ -229,8 +222,7 @@ impl Tools<'_> {
         if bytes + PLAN_BYTES * u64::from(views) > self.gpu.binding_bytes_max {
             return Ok(vec![false; drawings.len()]);
         }
-        let bands: Vec<_> = drawings.iter().map(Drawing::whole).collect();
-        let (ended, _) = self.attempt(drawings, &bands, &layouts, capacity)?;
+        let (ended, _) = self.attempt(drawings, &layouts, capacity)?;
         Ok(ended.into_iter().map(|ended| ended.drawn).collect())
     }
 
@@ -262,11 +254,10 @@ impl Tools<'_> {
     pub(super) fn attempt(
         &mut self,
         drawings: &mut [Drawing<'_>],
-        bands: &[Range<u32>],
         layouts: &[Layout],
         capacity: u32,
     ) -> Result<(Vec<Ended>, BatchBuffers)> {
-        let batch = Batch::new(drawings, bands, layouts, capacity);
+        let batch = Batch::new(drawings, layouts, capacity);
         // All have the same.
         let kinds = RasterKinds::from(drawings[0].request);
         let shades = kinds.color && !self.kernels.flat(self.scene.sh_count);

@@ -279,7 +279,8 @@ mod tests {
     /// Callers that take all submissions and hold them until `gate` is passed once more.
     fn hold<'scope>(
         scope: &'scope Scope<'scope, '_>,
-        (queue, gate): (&'scope ViewQueue, &'scope Barrier),
+        queue: &'scope ViewQueue,
+        gate: &'scope Barrier,
         answer: fn(&[Arc<QueuedView>]),
     ) -> Vec<ScopedJoinHandle<'scope, Result<Frame>>> {
         let caller = |other| {
@@ -301,7 +302,7 @@ mod tests {
         let (queue, gate) = (ViewQueue::default(), Barrier::new(1 + SUBMISSIONS_MAX));
         let batches = Mutex::new(Vec::new());
         std::thread::scope(|scope| {
-            hold(scope, (&queue, &gate), draw);
+            hold(scope, &queue, &gate, draw);
             let near = [2.0, 3.0, 2.0, 4.0, 5.0, 3.0];
             for (i, near) in near.into_iter().enumerate() {
                 let (queue, batches) = (&queue, &batches);
@@ -330,7 +331,7 @@ mod tests {
         let (queue, gate) = (ViewQueue::default(), Barrier::new(1 + SUBMISSIONS_MAX));
         let again = AtomicBool::new(false);
         std::thread::scope(|scope| {
-            hold(scope, (&queue, &gate), draw);
+            hold(scope, &queue, &gate, draw);
             // Two views that are drawn together, by a caller who goes on after the answers.
             let [first, second] = [2.0, 3.0].map(|near| {
                 let (queue, again) = (&queue, &again);
@@ -363,7 +364,7 @@ mod tests {
     fn a_broken_drawing_is_an_error_for_all_who_wait_and_the_next_is_drawn() {
         let (queue, gate) = (ViewQueue::default(), Barrier::new(1 + SUBMISSIONS_MAX));
         std::thread::scope(|scope| {
-            let broken = hold(scope, (&queue, &gate), |_| {});
+            let broken = hold(scope, &queue, &gate, |_| {});
             let next = scope.spawn(|| queue.render(1, &request(2.0), 8, draw));
             wait_for(&queue, SUBMISSIONS_MAX + 1);
             gate.wait();

@@ -446,14 +446,13 @@ impl Tools<'_> {
         let DeviceStep { request, training, earlier, adds, moves, .. } = *step;
         let (gpu, scene) = (self.gpu, self.scene);
         let drawing = Drawing::new(origin, request, scene)?;
-        let (whole, tiles) = (drawing.whole(), drawing.tiles());
-        let layouts = [drawing.layout(&whole, 0)];
+        let (tiles, layouts) = (drawing.tiles(), [drawing.layout(drawing.whole(), 0)]);
         let gradient_bytes = gradient_bytes(scene.count.into(), 3 * u64::from(scene.sh_count));
         let sums = 4 * u64::from(capacity) * u64::from(PAIR_SUMS);
         let sizes = [layouts[0].picture_bytes(), sums, gradient_bytes];
         // First, for both share a staging buffer, which this one needs the larger one of.
         let backward = self.scratch.backward_room(gpu, sizes)?;
-        let batch = Batch::new(&[drawing], &[whole], &layouts, capacity);
+        let batch = Batch::new(&[drawing], &layouts, capacity);
         let sizes = batch.sizes(scene.count, !self.kernels.flat(scene.sh_count));
         let room = self.scratch.room(gpu, &BatchSizes { staging_bytes: 0, ..sizes })?;
         let held = std::mem::take(&mut self.scratch.backdrops);

@@ -139,7 +139,7 @@ fn tile(footprints: &[Footprint], without: Option<Skip>) -> Vec<[f32; 3]> {
         PictureRows { color: Some(color.chunks_mut(16).collect()), ..PictureRows::default() };
     let place = Tile { x: 0, y: 0, width: 16, height: 16 };
     let mut scratch = TileScratch::default();
-    rasterize_tile(footprints, &mut pairs, (place, 0), (&paint, &mut scratch), &mut out);
+    rasterize_tile(footprints, &mut pairs, place, 0, &paint, &mut scratch, &mut out);
     color
 }
 

@@ -308,9 +308,9 @@ fn rasterize_twin() {
                 let ids = sorted.iter().map(|&isect| radix_sort::value(isect));
                 let mut pairs: Vec<u64> =
                     (0..).zip(ids).map(|(at, id)| bin::pack(at, id)).collect();
-                let place = (tile, tile_x as usize * 16);
-                let tools = (&paint, &mut TileScratch::default());
-                rasterize_tile(&projected.footprints, &mut pairs, place, tools, &mut out);
+                let (column, scratch) = (tile_x as usize * 16, &mut TileScratch::default());
+                let footprints = &projected.footprints;
+                rasterize_tile(footprints, &mut pairs, tile, column, &paint, scratch, &mut out);
             }
         }
         let rows: Vec<_> = projected.footprints.iter().map(to_row).collect();
