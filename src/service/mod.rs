@@ -30,7 +30,6 @@ mod work;
 use std::{fmt, sync::Arc};
 
 use futures_util::{Stream, stream};
-use parking_lot::RwLock;
 use tokio::sync::Semaphore;
 
 pub use self::export::scene_splats;
@@ -63,7 +62,7 @@ use crate::{
     error::{Error, Result},
     jobs::{JobParts, Jobs, NetworkState, SceneNetworks, SemanticNetworks, refiner},
     keys::Caller,
-    limits::Limits,
+    limits::{Limits, LiveLimits},
     render::Renderer,
     scene::{Refine, SceneId, Stage},
     store::{Place, Record, Store},
@@ -102,8 +101,8 @@ impl fmt::Debug for Parts {
 
 struct Inner {
     config: Config,
-    /// Caps in force: those of the configuration, or newer ones.
-    limits: RwLock<Arc<Limits>>,
+    /// Caps in force: those of the configuration, or newer ones. The jobs have the same.
+    limits: Arc<LiveLimits>,
     store: Arc<Store>,
     jobs: Arc<Jobs>,
     /// Networks that run by themselves; the jobs have the same.
@@ -129,7 +128,7 @@ impl fmt::Debug for Inner {
 
 impl Inner {
     fn limits(&self) -> Arc<Limits> {
-        Arc::clone(&self.limits.read())
+        self.limits.get()
     }
 }
 
@@ -158,11 +157,12 @@ impl Service {
         };
         let refiner = refiner(device, config.threads)?;
         let networks = Arc::clone(&parts.scenes);
+        let limits = Arc::new(LiveLimits::new(config.limits.clone()));
         let job_parts = JobParts {
             store: Arc::clone(&store),
             scenes: parts.scenes,
             semantics: Arc::clone(&parts.semantics),
-            limits: config.limits.clone(),
+            limits: Arc::clone(&limits),
             workers: config.workers(),
             keep_photos: config.keep_photos,
             refine,
@@ -189,7 +189,7 @@ impl Service {
             inferences: Arc::new(Semaphore::new(config.limits.inferences_max)),
             key_locks: Default::default(),
             memory: Memory::new(config.limits.memory_bytes_max),
-            limits: RwLock::new(Arc::new(config.limits.clone())),
+            limits,
             config,
         };
         Ok(Self { inner: Arc::new(inner), caller: Caller::All })
@@ -212,9 +212,7 @@ impl Service {
 
     /// Puts other caps in force; names those that only the next start can follow.
     pub fn reload(&self, limits: Limits) -> Vec<&'static str> {
-        let later = self.inner.config.limits.changed_for_next_start(&limits);
-        *self.inner.limits.write() = Arc::new(limits);
-        later
+        self.inner.limits.reload(limits)
     }
 
     /// The status of a scene, with its report and cameras once done.
@@ -310,7 +308,7 @@ impl Service {
                 fraction: semantics.fraction,
             },
             SceneState::Queued => {
-                Event::Queued { ahead: self.inner.jobs.queue.ahead(&status.id).unwrap_or(0) }
+                Event::Queued { ahead: self.inner.jobs.ahead(&status.id).unwrap_or(0) }
             }
             SceneState::Running => Event::Running {
                 stage: status.stage.clone().unwrap_or_else(|| Stage::SCENE[0].name().to_owned()),

@@ -32,6 +32,7 @@ mod keys;
 mod known_words;
 mod licences;
 mod life;
+mod limits;
 mod magnify;
 mod offline;
 mod paper;
