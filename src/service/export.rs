@@ -1,17 +1,12 @@
 //! A scene as a file for other programs, written part by part while it is sent.
-//!
-//! An [`Export`] knows its tag before anything is made. [`Export::begin`] takes a place among the
-//! exports, which is to be held until the file is sent. While a file is written it has a blocking
-//! thread, which waits for the caller: there are no more of them than places.
 
 use std::{
-    fmt,
     io::{self, Write},
     sync::Arc,
-    time::{Duration, Instant},
+    time::Instant,
 };
 
-use futures_util::Stream;
+use futures_util::FutureExt;
 use tokio::{
     runtime::Handle,
     sync::{OwnedSemaphorePermit, mpsc},
@@ -19,23 +14,24 @@ use tokio::{
 
 use super::{
     Inner, Service,
+    access::SceneAccess,
     create::blocking,
     features,
-    memory::Share,
     page::write_page,
     query,
-    request::{ExportFormat, QuerySpec, TextOptions, ViewOptions},
+    request::{QuerySpec, TextOptions, ViewOptions},
     search::ScoringChoice,
-    tags::{etag, semantics_tag},
+    tags::{cache_key, etag, semantics_tag, text_key},
     texts,
+    types::{Export, ExportBody, ExportPlace},
     work::Work,
 };
 use crate::{
     error::{Error, Result},
     formats::{
-        folders::FolderFormat,
         packed::write_packed,
-        splats::{SplatFile, SplatFormat},
+        splats::{OCTETS, SplatFile, SplatFormat},
+        table::{ExportFormat, FormatKind},
     },
     render::plan::{default_near, widened},
     scene::{Gaussians, Preset, Scene, SceneId, Semantics},
@@ -46,115 +42,14 @@ const PARTS_MAX: usize = 4;
 /// Bytes of a part of a file of arrays.
 const PART_BYTES: usize = 256 << 10;
 
-/// Writes a file. Blocks.
-pub(super) type FileWriter = Box<dyn FnOnce(&mut dyn Write) -> Result<()> + Send>;
-/// Makes what a file is written of: its size, where it is known before the end. Blocks.
-type Build = Box<dyn FnOnce() -> Result<(Option<u64>, FileWriter)> + Send>;
-
-/// A file that can be written.
-pub struct Export {
-    /// Proposed file name.
-    pub file_name: String,
-    /// Media type.
-    pub media_type: &'static str,
-    /// Hash of scene and format.
-    pub etag: String,
-    /// Bytes in memory while it is written, beside the scene.
-    work_bytes: u64,
-    /// How long the caller may take, where that is bounded.
-    longest: Option<Duration>,
-    /// The place of a folder.
-    folder: Option<OwnedSemaphorePermit>,
-    build: Build,
-    inner: Arc<Inner>,
-}
-
-impl fmt::Debug for Export {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { file_name, etag, .. } = self;
-        write!(f, "Export({file_name}, {etag})")
-    }
-}
-
-impl Export {
-    /// A file of octets.
-    pub(super) fn new(
-        inner: &Arc<Inner>,
-        file_name: String,
-        etag: String,
-        write: impl FnOnce(&mut dyn Write) -> Result<()> + Send + 'static,
-    ) -> Self {
-        Self {
-            file_name,
-            media_type: "application/octet-stream",
-            etag,
-            work_bytes: 0,
-            longest: None,
-            folder: None,
-            build: Box::new(|| Ok((None, Box::new(write)))),
-            inner: Arc::clone(inner),
-        }
-    }
-
-    /// A zip of a folder, which the caller must take in a time.
-    pub(super) fn of_folder(self, place: OwnedSemaphorePermit, longest: Duration) -> Self {
-        let media_type = "application/zip";
-        Self { media_type, folder: Some(place), longest: Some(longest), ..self }
-    }
-
-    /// The same, which takes so many bytes in memory while it is written.
-    pub(super) fn working_in(self, work_bytes: u64) -> Self {
-        Self { work_bytes, ..self }
-    }
-
-    /// Begins to write the file.
-    ///
-    /// # Errors
-    /// `overloaded` where too many exports are being sent; `invalid_request` and `limit_exceeded`
-    /// for a scene that the format cannot hold.
-    pub async fn begin(self) -> Result<ExportBody> {
-        let Self { work_bytes, longest, folder, build, inner, .. } = self;
-        let shares = inner.memory.export(work_bytes, &inner.limits())?;
-        let place = Arc::new(ExportPlace { _shares: shares, _folder: folder });
-        let (size_bytes, write) = blocking(build).await??;
-        let until = longest.map(|longest| Instant::now() + longest);
-        Ok(ExportBody { size_bytes, place, chunks: stream_until(until, write) })
-    }
-}
-
-/// The place of a file among the exports.
-#[derive(Debug)]
-pub struct ExportPlace {
-    _shares: [Share; 2],
-    _folder: Option<OwnedSemaphorePermit>,
-}
-
-/// A file that is being written.
-#[derive(Debug)]
-pub struct ExportBody {
-    /// Whole size, where it is known before the end.
-    pub size_bytes: Option<u64>,
-    /// Its place, to be held until the last part is sent.
-    pub place: Arc<ExportPlace>,
-    chunks: mpsc::Receiver<io::Result<Vec<u8>>>,
-}
-
-impl ExportBody {
-    /// The parts as a stream; a fault ends it.
-    pub fn into_stream(self) -> impl Stream<Item = io::Result<Vec<u8>>> + Send + 'static {
-        tokio_stream::wrappers::ReceiverStream::new(self.chunks)
-    }
-}
-
 impl Service {
-    /// The scene, or what a text selects of it, as a file for other programs; as `npz` its
-    /// semantics, which are made where they are not there; as `packed` and `html` what the page
-    /// draws; as a folder in a zip what [`FolderFormat`] says. For `html`, `coco` and `labelme`
-    /// each line of the text is a text.
+    /// The scene, or what a text selects of it, as a file for other programs. Semantics are made
+    /// where the format needs them and they are not there. For `html`, `coco` and `labelme` each
+    /// line of the text is a text. Nothing is written before [`Export::begin`].
     ///
     /// # Errors
-    /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; `invalid_request` for a scene that
-    /// the format cannot hold; with a text, and for `npz`, also what [`Service::query`] says.
+    /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; with a text, and for `npz`, also what
+    /// [`Service::query`] says.
     pub async fn export(
         &self,
         id: &SceneId,
@@ -164,117 +59,124 @@ impl Service {
     ) -> Result<Export> {
         // How texts are scored is checked also where no text is asked.
         texts::check_scoring(&ask.scoring, &self.limits())?;
-        if let Some(format) = FolderFormat::named(&format.to_string()) {
-            return self.folder(id, format, preset, ask).await;
-        }
         let access = self.scene(id).await?;
-        let inner = Arc::clone(&self.inner);
-        if format == ExportFormat::Npz {
-            if ask.text.is_some() {
-                return Err(texts::not_with("npz"));
-            }
-            let of = inner.semantic_scene(&access.finished()?, "npz", ask.wait).await?;
-            let etag = format!("{}-npz", etag(&of.tag));
-            let write = move |to: &mut dyn Write| features::write_semantics(&of.semantics, to);
-            return Ok(Export::new(&self.inner, format!("{id}.npz"), etag, write));
+        let is_part = format.is_splats() && ask.text.is_some();
+        if ask.text.is_some() && !is_part && !format.lines {
+            return Err(texts::not_with(format.name));
         }
-        if format == ExportFormat::Html {
-            return self.page(id, preset, ask).await;
-        }
-        if format == ExportFormat::Packed && ask.text.is_some() {
-            return Err(texts::not_with("packed"));
-        }
-        let Some(text) = &ask.text else {
-            let access = access.finished()?;
-            let scene = blocking(move || inner.load(&access)).await??;
-            let digest = etag(&semantics_tag(&scene));
-            if format == ExportFormat::Packed {
-                let (file_name, etag) = (format!("{id}.segsplat"), format!("{digest}-packed"));
-                let work_bytes = order_bytes(&scene.gaussians);
-                let write = move |to: &mut dyn Write| {
-                    write_packed(&scene, default_near(scene.meta.report.median_depth), to)
-                };
-                let export = Export::new(&self.inner, file_name, etag, write);
-                return Ok(export.working_in(work_bytes));
-            }
-            let splats = splats(format)?;
-            let work_bytes = work_bytes(splats, &scene.gaussians);
-            let build = move || {
-                let semantics = scene.semantics.as_deref();
-                scene_splats(splats, &scene, &scene.gaussians, semantics)
-            };
-            return Ok(self.gaussians(&id.to_string(), &digest, splats, work_bytes, build));
+        let export = match format.kind {
+            FormatKind::Folder(folder) => self.folder(id, (format, folder), preset, ask).await?,
+            FormatKind::Arrays => self.arrays(&access.finished()?, format, ask).await?,
+            FormatKind::Packed => self.packed(access.finished()?).await?,
+            FormatKind::Page => self.page(access.finished()?, preset, ask).await?,
+            FormatKind::Splats(splats) => self.splats(access, splats, preset, ask).await?,
         };
-        inner.can_understand("text")?;
-        let text = texts::checked(text, "text", &self.limits())?;
-        let splats = splats(format)?;
-        let of = inner.semantic_scene(&access.finished()?, "text", ask.wait).await?;
-        let how = ScoringChoice { preset, changes: ask.scoring.clone() };
-        let deadline = inner.deadline(&ViewOptions::default());
-        let texts = inner.score(of, how, vec![text], deadline).await?;
-        let etag = etag(&texts.key()?);
-        let work_bytes = work_bytes(splats, &texts.of.scene.gaussians);
-        let build = move || part(splats, &texts.of.scene, &texts.gaussians(), &texts.of.semantics);
-        Ok(self.gaussians(&format!("{id}-part"), &etag, splats, work_bytes, build))
+        let part = if is_part { "-part" } else { "" };
+        Ok(Export {
+            file_name: format!("{id}{part}.{}", format.ending),
+            media_type: format.media_type,
+            etag: format!("{}-{format}", export.etag),
+            ..export
+        })
     }
 
-    /// A file with Gaussians; `stem` is its name without the ending.
-    fn gaussians(
+    /// The semantics as arrays.
+    async fn arrays(
         &self,
-        stem: &str,
-        digest: &str,
-        format: &'static SplatFormat,
-        work_bytes: u64,
-        build: impl FnOnce() -> Result<SplatFile> + Send + 'static,
-    ) -> Export {
-        let &SplatFormat { name, ending, media_type, .. } = format;
-        let unwritten = |cause| Error::internal("the file is not whole").caused_by(cause);
-        let build: Build = Box::new(move || {
-            let file = build()?;
-            let size_bytes = file.size_bytes();
-            let write = move |to: &mut dyn Write| file.write(to).map_err(unwritten);
-            Ok((size_bytes, Box::new(write)))
-        });
-        let (file_name, etag) = (format!("{stem}.{ending}"), format!("{digest}-{name}"));
-        let octets = Export::new(&self.inner, file_name, etag, |_| Ok(()));
-        Export { media_type, work_bytes, build, ..octets }
+        access: &SceneAccess,
+        format: ExportFormat,
+        ask: &TextOptions,
+    ) -> Result<Export> {
+        let of = self.inner.semantic_scene(access, format.name, ask.wait).await?;
+        let tag = etag(&of.tag);
+        let write = move |to: &mut dyn Write| features::write_semantics(&of.semantics, to);
+        Ok(Export::streamed(tag, write).placed(&self.inner, 0, None))
     }
-}
 
-impl Service {
+    /// The scene as the page draws it.
+    async fn packed(&self, access: SceneAccess) -> Result<Export> {
+        let inner = Arc::clone(&self.inner);
+        let scene = blocking(move || inner.load(&access)).await??;
+        let etag = etag(&semantics_tag(&scene));
+        let near = default_near(scene.meta.report.median_depth);
+        let work_bytes = order_bytes(&scene.gaussians);
+        let write = move |to: &mut dyn Write| write_packed(&scene, near, to);
+        Ok(Export::streamed(etag, write).placed(&self.inner, work_bytes, None))
+    }
+
     /// The page with the scene in it.
     async fn page(
         &self,
-        id: &SceneId,
+        access: SceneAccess,
         preset: Option<Preset>,
         ask: &TextOptions,
     ) -> Result<Export> {
         let (inner, limits) = (Arc::clone(&self.inner), self.limits());
-        let access = self.scene(id).await?.finished()?;
         let lines = texts::lines(ask);
-        let how = format!("{lines:?} {preset:?} {:?} {}", ask.scoring, env!("CARGO_PKG_VERSION"));
-        let tag = move |scene: &Scene| format!("{}-html", etag(&(semantics_tag(scene) + &how)));
-        let file_name = format!("{id}.html");
+        let how = cache_key(&(&lines, preset, &ask.scoring, env!("CARGO_PKG_VERSION")))?;
+        let tag = move |scene: &Scene| etag(&(semantics_tag(scene) + &how));
         if lines.is_empty() {
             let scene = blocking(move || inner.load(&access)).await??;
-            let (etag, work_bytes) = (tag(&scene), order_bytes(&scene.gaussians));
+            let (tag, work_bytes) = (tag(&scene), order_bytes(&scene.gaussians));
             let write = move |to: &mut dyn Write| write_page(&scene, None, to);
-            let export = Export::new(&self.inner, file_name, etag, write);
-            return Ok(export.working_in(work_bytes));
+            return Ok(Export::streamed(tag, write).placed(&self.inner, work_bytes, None));
         }
         inner.can_understand("text")?;
         let texts = texts::all_checked(&lines, "text", &limits)?;
         let of = inner.semantic_scene(&access, "text", ask.wait).await?;
-        let (how, etag) = (ScoringChoice { preset, changes: ask.scoring.clone() }, tag(&of.scene));
-        let deadline = inner.deadline(&ViewOptions::default());
-        let texts = inner.score(of, how, texts, deadline).await?;
-        let work_bytes = order_bytes(&texts.of.scene.gaussians);
-        let write = move |to: &mut dyn Write| {
-            let (spec, work) = (QuerySpec::default(), &mut Work::default());
-            let answer = query::answer(&texts, &limits, &spec, None, work)?;
-            write_page(&texts.of.scene, Some(&answer), to)
+        let (how, tag) = (ScoringChoice { preset, changes: ask.scoring.clone() }, tag(&of.scene));
+        let work_bytes = order_bytes(&of.scene.gaussians);
+        let export = Export::new(tag, async move {
+            let deadline = inner.deadline(&ViewOptions::default());
+            let texts = inner.score(of, how, texts, deadline).await?;
+            let chunks = stream(move |to: &mut dyn Write| {
+                let (spec, work) = (QuerySpec::default(), &mut Work::default());
+                let answer = query::answer(&texts, &limits, &spec, None, work)?;
+                write_page(&texts.of.scene, Some(&answer), to)
+            });
+            Ok(ExportBody { size_bytes: None, place: None, chunks })
+        });
+        Ok(export.placed(&self.inner, work_bytes, None))
+    }
+
+    /// Gaussians: all of them, or those that a text selects.
+    async fn splats(
+        &self,
+        access: SceneAccess,
+        format: &'static SplatFormat,
+        preset: Option<Preset>,
+        ask: &TextOptions,
+    ) -> Result<Export> {
+        let inner = Arc::clone(&self.inner);
+        let Some(text) = &ask.text else {
+            let access = access.finished()?;
+            let scene = blocking(move || inner.load(&access)).await??;
+            let tag = etag(&semantics_tag(&scene));
+            let work_bytes = work_bytes(format, &scene.gaussians);
+            let write =
+                move || scene_splats(format, &scene, &scene.gaussians, scene.semantics.as_deref());
+            let export = Export::splats(tag, async { blocking(write).await? });
+            return Ok(export.placed(&self.inner, work_bytes, None));
         };
-        Ok(Export::new(&self.inner, file_name, etag, write).working_in(work_bytes))
+        inner.can_understand("text")?;
+        let text = texts::checked(text, "text", &self.limits())?;
+        let of = inner.semantic_scene(&access.finished()?, "text", ask.wait).await?;
+        let named = preset.unwrap_or(of.scene.meta.report.method.preset);
+        let tag = etag(&text_key(&of.tag, Some(&text), named, &ask.scoring)?);
+        let how = ScoringChoice { preset, changes: ask.scoring.clone() };
+        let work_bytes = work_bytes(format, &of.scene.gaussians);
+        let export = Export::splats(tag, async move {
+            let deadline = inner.deadline(&ViewOptions::default());
+            let texts = inner.score(of, how, vec![text], deadline).await?;
+            let write = move || {
+                let gaussians = texts.gaussians();
+                let index = gaussians.semantic_index().to_vec();
+                let semantics = Semantics { index, ..(*texts.of.semantics).clone() };
+                scene_splats(format, &texts.of.scene, &gaussians, Some(&semantics))
+            };
+            blocking(write).await?
+        });
+        Ok(export.placed(&self.inner, work_bytes, None))
     }
 }
 
@@ -291,21 +193,55 @@ fn work_bytes(format: &SplatFormat, gaussians: &Gaussians) -> u64 {
     Gaussians::bytes_of(gaussians.len(), gaussians.sh_degree()) + of_one * gaussians.len() as u64
 }
 
-/// The format of files with Gaussians.
-fn splats(format: ExportFormat) -> Result<&'static SplatFormat> {
-    SplatFormat::named(&format.to_string())
-        .ok_or_else(|| Error::internal(format!("{format} is no format of Gaussians")))
-}
+impl Export {
+    /// A file of octets without a name, which `write` writes.
+    pub(super) fn streamed(
+        etag: String,
+        write: impl FnOnce(&mut dyn Write) -> Result<()> + Send + 'static,
+    ) -> Self {
+        Self::new(etag, async move {
+            Ok(ExportBody { size_bytes: None, place: None, chunks: stream(write) })
+        })
+    }
 
-/// Some Gaussians of a scene with its bank.
-fn part(
-    splats: &'static SplatFormat,
-    scene: &Scene,
-    gaussians: &Gaussians,
-    of: &Semantics,
-) -> Result<SplatFile> {
-    let semantics = Semantics { index: gaussians.semantic_index().to_vec(), ..of.clone() };
-    scene_splats(splats, scene, gaussians, Some(&semantics))
+    /// A file of octets without a name.
+    pub(super) fn new(
+        etag: String,
+        begin: impl Future<Output = Result<ExportBody>> + Send + 'static,
+    ) -> Self {
+        Self { file_name: String::new(), media_type: OCTETS, etag, begin: begin.boxed() }
+    }
+
+    /// The same, which takes a place among the exports when it begins: of so many bytes in memory
+    /// while it is written, beside the scene, and that of a folder.
+    pub(super) fn placed(
+        self,
+        inner: &Arc<Inner>,
+        work_bytes: u64,
+        folder: Option<OwnedSemaphorePermit>,
+    ) -> Self {
+        let (inner, begin) = (Arc::clone(inner), self.begin);
+        let begin = async move {
+            let shares = inner.memory.export(work_bytes, &inner.limits())?;
+            let place = ExportPlace { _shares: shares, _folder: folder };
+            Ok(ExportBody { place: Some(Arc::new(place)), ..begin.await? })
+        };
+        Self { begin: begin.boxed(), ..self }
+    }
+
+    /// A file of Gaussians.
+    fn splats(
+        etag: String,
+        file: impl Future<Output = Result<SplatFile>> + Send + 'static,
+    ) -> Self {
+        Self::new(etag, async move {
+            let file = file.await?;
+            let unwritten = |cause| Error::internal("the file is not whole").caused_by(cause);
+            let size_bytes = file.size_bytes();
+            let chunks = stream(move |to: &mut dyn Write| file.write(to).map_err(unwritten));
+            Ok(ExportBody { size_bytes, place: None, chunks })
+        })
+    }
 }
 
 /// Some Gaussians of a scene as a file that other programs draw: with the blur that the scene's own
@@ -322,9 +258,15 @@ pub fn scene_splats(
     SplatFile::new(format, widened(scene, gaussians, None)?, semantics)
 }
 
-/// The parts of a file that `write` writes on a blocking thread. A fault ends them. A caller who
-/// has not taken a part at a given time gets no more.
-fn stream_until(
+/// The parts of a file that `write` writes on a blocking thread. A fault ends them.
+pub(super) fn stream(
+    write: impl FnOnce(&mut dyn Write) -> Result<()> + Send + 'static,
+) -> mpsc::Receiver<io::Result<Vec<u8>>> {
+    stream_until(None, write)
+}
+
+/// As [`stream`]; a caller who has not taken a part at a given time gets no more.
+pub(super) fn stream_until(
     until: Option<Instant>,
     write: impl FnOnce(&mut dyn Write) -> Result<()> + Send + 'static,
 ) -> mpsc::Receiver<io::Result<Vec<u8>>> {
@@ -384,7 +326,7 @@ mod tests {
     async fn what_is_written_at_once_comes_in_parts() {
         let sent: Vec<u8> = (0..3 * PART_BYTES + 9).map(|i| (i % 251) as u8).collect();
         let written = sent.clone();
-        let mut chunks = stream_until(None, move |to: &mut dyn Write| {
+        let mut chunks = stream(move |to: &mut dyn Write| {
             to.write_all(&written).map_err(|e| Error::internal("broken off").caused_by(e))
         });
         let mut taken = Vec::new();

@@ -12,12 +12,12 @@ use rayon::prelude::*;
 
 use super::{
     Service,
-    export::Export,
     request::{FeatureKind, FeaturesSpec, Kind, ViewSpec},
     schedule::Demand,
     search::{LabelledView, SceneTexts, ScoringChoice},
     tags::{cache_key, etag},
     texts::check_scoring,
+    types::Export,
     view::{Inputs, Resolved, resolve_one},
     work::Work,
 };
@@ -164,7 +164,7 @@ impl Service {
         let (offsets, entries) = (&weights.weights.offsets, &weights.weights.entries);
         let work_bytes = 4 * offsets.len() as u64 + 6 * entries.len() as u64;
         let write = move |to: &mut dyn Write| write(&texts, &weights, spec.kind, to);
-        let file_name = format!("{id}-view.npz");
-        Ok(Export::new(inner, file_name, etag, write).working_in(work_bytes))
+        let export = Export::streamed(etag, write).placed(inner, work_bytes, None);
+        Ok(Export { file_name: format!("{id}-view.npz"), ..export })
     }
 }

@@ -1,9 +1,11 @@
 //! What the use cases answer: plain data. The requests are in `request.rs`.
 
-use std::{fmt, sync::Arc};
+use std::{fmt, io, sync::Arc};
 
 use base64::{Engine as _, prelude::BASE64_STANDARD};
+use futures_util::future::BoxFuture;
 use serde::{Deserialize, Serialize, Serializer};
+use tokio::sync::OwnedSemaphorePermit;
 use utoipa::ToSchema;
 
 use super::{
@@ -12,6 +14,7 @@ use super::{
     times::ViewTimes,
 };
 use crate::{
+    error::Result,
     formats::rle::Rle,
     render::FrameStats,
     scene::{Camera, SceneStatus, ScoringMethod},
@@ -220,6 +223,61 @@ impl fmt::Debug for RenderedView {
         let Self { camera_index, kind, format, width, height, bytes, .. } = self;
         write!(f, "RenderedView(camera {camera_index}, {kind:?} as {format:?}, ")?;
         write!(f, "{width}x{height}, {} bytes)", bytes.len())
+    }
+}
+
+/// A file for other programs, not begun.
+pub struct Export {
+    /// Proposed file name.
+    pub file_name: String,
+    /// Media type.
+    pub media_type: &'static str,
+    /// Hash of scene and format.
+    pub etag: String,
+    pub(super) begin: BoxFuture<'static, Result<ExportBody>>,
+}
+
+impl fmt::Debug for Export {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Export({}, {})", self.file_name, self.etag)
+    }
+}
+
+impl Export {
+    /// Makes the file and begins to write it.
+    ///
+    /// # Errors
+    /// `overloaded` where too many exports are being sent; `invalid_request` and `limit_exceeded` for a scene that the format cannot hold; with a text
+    /// also those of its network.
+    pub async fn begin(self) -> Result<ExportBody> {
+        self.begin.await
+    }
+}
+
+/// The place of a file among the exports.
+#[derive(Debug)]
+pub struct ExportPlace {
+    pub(super) _shares: [Share; 2],
+    pub(super) _folder: Option<OwnedSemaphorePermit>,
+}
+
+/// A file being written. While it is, it has a blocking thread, which waits for the caller: there
+/// are no more of them than places.
+#[derive(Debug)]
+pub struct ExportBody {
+    /// Whole size, where it is known before the end.
+    pub size_bytes: Option<u64>,
+    /// Its place among the exports, to be held until the last part is sent.
+    pub place: Option<Arc<ExportPlace>>,
+    pub(super) chunks: tokio::sync::mpsc::Receiver<io::Result<Vec<u8>>>,
+}
+
+impl ExportBody {
+    /// The parts as a stream; a fault ends it.
+    pub fn into_stream(
+        self,
+    ) -> impl futures_util::Stream<Item = io::Result<Vec<u8>>> + Send + 'static {
+        tokio_stream::wrappers::ReceiverStream::new(self.chunks)
     }
 }
 

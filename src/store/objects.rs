@@ -7,7 +7,11 @@
 use std::{
     future::Future,
     path::{Path as FilePath, PathBuf},
-    sync::{Arc, mpsc},
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+        mpsc,
+    },
     time::Duration,
 };
 
@@ -60,6 +64,8 @@ pub(super) struct Objects {
     /// Runs the calls; taken when dropped.
     runtime: Option<Runtime>,
     timeout: Duration,
+    /// Bytes of the last object that was not kept; 0 once as many were kept again.
+    refused: AtomicUsize,
 }
 
 impl std::fmt::Debug for Objects {
@@ -89,14 +95,19 @@ impl Objects {
             .enable_all()
             .build()
             .map_err(|e| Error::internal("the store's threads do not start").caused_by(e))?;
-        let own = folder.as_deref().and_then(folder_id);
-        Ok(Self { store, folder, own, runtime: Some(runtime), timeout })
+        let (own, refused) = (folder.as_deref().and_then(folder_id), AtomicUsize::new(0));
+        Ok(Self { store, folder, own, runtime: Some(runtime), timeout, refused })
     }
 
-    /// Whether a local store is where it was at the start. A folder that was moved away has its
-    /// lock with it, so nothing may be written to another one of its name.
-    pub(super) fn is_in_place(&self) -> bool {
-        self.folder.as_deref().is_none_or(|folder| folder_id(folder) == self.own)
+    /// Fails where a local store is not the folder of the start any more. One that was moved away
+    /// has its lock with it, so nothing may be written to another one of its name.
+    fn unless_moved(&self, what: &str) -> Result<()> {
+        match &self.folder {
+            Some(folder) if folder_id(folder) != self.own => {
+                Err(unavailable(what, fault("the data folder was moved or removed")))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Does `call` on the store's own threads, so that any thread may wait for it.
@@ -125,44 +136,74 @@ impl Objects {
         answer.map_err(|fault| unavailable(what, fault))
     }
 
-    fn unless_moved(&self, what: &str) -> Result<()> {
-        let moved = || fault("the data folder was moved or removed");
-        if self.is_in_place() { Ok(()) } else { Err(unavailable(what, moved())) }
-    }
-
     /// Keeps an object, whatever was there.
     pub(super) fn put(&self, what: &str, path: Path, bytes: impl Into<PutPayload>) -> Result<()> {
-        self.unless_moved(what)?;
         let bytes: PutPayload = bytes.into();
+        let size = bytes.content_length();
         let file = self.folder.as_ref().map(|folder| folder.join(path.as_ref()));
-        self.run(what, |store| async move {
-            let mut tries = 0..FOLDER_GONE_MAX;
-            let kept = loop {
-                match store.put(&path, bytes.clone()).await {
-                    Err(fault) if folder_is_gone(&fault) && tries.next().is_some() => {}
-                    kept => break kept.map(drop),
+        let kept = self.unless_moved(what).and_then(|()| {
+            self.run(what, |store| async move {
+                let mut tries = 0..FOLDER_GONE_MAX;
+                let kept = loop {
+                    match store.put(&path, bytes.clone()).await {
+                        Err(fault) if folder_is_gone(&fault) && tries.next().is_some() => {}
+                        kept => break kept.map(drop),
+                    }
+                };
+                // A local store makes the object's folder first. One that holds others stays.
+                if let (Err(_), Some(file)) = (&kept, file) {
+                    let _ = tokio::task::spawn_blocking(move || file.parent().map(fs::remove_dir))
+                        .await;
                 }
-            };
-            // A local store makes the object's folder first. One that holds others stays.
-            if let (Err(_), Some(file)) = (&kept, file) {
-                let _ =
-                    tokio::task::spawn_blocking(move || file.parent().map(fs::remove_dir)).await;
+                kept
+            })
+        });
+        self.note(size, kept)
+    }
+
+    /// Notes whether an object of so many bytes was kept.
+    fn note<T>(&self, size: usize, kept: Result<T>) -> Result<T> {
+        match &kept {
+            Err(_) => self.refused.store(size.max(1), Ordering::Release),
+            Ok(_) if size >= self.refused.load(Ordering::Acquire) => {
+                self.refused.store(0, Ordering::Release);
             }
-            kept
-        })
+            Ok(_) => {}
+        }
+        kept
+    }
+
+    /// Whether the last object was kept, or one as large since.
+    pub(super) fn keeps(&self) -> bool {
+        self.refused.load(Ordering::Acquire) == 0
+    }
+
+    /// Keeps an object and removes it: of a folder, whose disk may be full, one as large as that
+    /// which was not kept.
+    pub(super) fn probe(&self, path: Path) -> Result<()> {
+        let refused = self.refused.load(Ordering::Acquire);
+        let size = if self.folder.is_some() { refused } else { refused.min(1) };
+        let (what, zeros) = ("keep anything", vec![0_u8; size]);
+        self.put(what, path.clone(), zeros)?;
+        self.delete(what, path)?;
+        self.refused.store(0, Ordering::Release);
+        Ok(())
     }
 
     /// Keeps an object unless there is one; whether it was kept.
     pub(super) fn create(&self, what: &str, path: Path, bytes: Vec<u8>) -> Result<bool> {
-        self.unless_moved(what)?;
         let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
-        self.run(what, |store| async move {
-            match store.put_opts(&path, bytes.into(), options).await {
-                Ok(_) => Ok(true),
-                Err(Fault::AlreadyExists { .. } | Fault::Precondition { .. }) => Ok(false),
-                Err(fault) => Err(fault),
-            }
-        })
+        let size = bytes.len();
+        let kept = self.unless_moved(what).and_then(|()| {
+            self.run(what, |store| async move {
+                match store.put_opts(&path, bytes.into(), options).await {
+                    Ok(_) => Ok(true),
+                    Err(Fault::AlreadyExists { .. } | Fault::Precondition { .. }) => Ok(false),
+                    Err(fault) => Err(fault),
+                }
+            })
+        });
+        self.note(size, kept)
     }
 
     /// An object's bytes; `None` where there is none.

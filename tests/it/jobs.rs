@@ -387,8 +387,8 @@ async fn an_export_has_the_size_it_says() {
     let server = TestServer::start().await;
     let id = server.scene().await.id;
     let export = server.service.export(&id, ExportFormat::Ply, None, &ask()).await.unwrap();
-    let file = export.begin().await.unwrap();
-    let size = file.size_bytes;
-    let file = file.into_stream().map(Result::unwrap).concat().await;
+    let export = export.begin().await.unwrap();
+    let size = export.size_bytes;
+    let file = export.into_stream().map(Result::unwrap).concat().await;
     assert_eq!(size, Some(file.len() as u64));
 }

@@ -337,13 +337,13 @@ async fn export(api: Api, request: pb::ExportRequest) -> Result<Chunks> {
 /// A file in pieces.
 async fn chunks(export: Export) -> Result<Chunks> {
     let file_name = export.file_name.clone();
-    let file = export.begin().await?;
-    let first = pb::ExportChunk { size_bytes: file.size_bytes, file_name, ..Default::default() };
+    let body = export.begin().await?;
+    let first = pb::ExportChunk { size_bytes: body.size_bytes, file_name, ..Default::default() };
     let piece = |data: io::Result<Vec<u8>>| match data {
         Ok(data) => Ok(pb::ExportChunk { data: data.into(), ..Default::default() }),
         Err(e) => Err(logged(&Error::internal("the file broke off").caused_by(e))),
     };
-    let place = Held::new(Arc::clone(&file.place));
-    let pieces = file.into_stream().map(piece);
-    Ok((stream::once(async { Ok(first) }).chain(pieces).boxed(), Some(place)))
+    let place = body.place.clone().map(Held::new);
+    let pieces = body.into_stream().map(piece);
+    Ok((stream::once(async { Ok(first) }).chain(pieces).boxed(), place))
 }
