@@ -9,14 +9,13 @@ use std::{
 use tokio::{runtime::Handle, sync::mpsc};
 
 use super::{
-    Service,
-    create::blocking,
-    features,
+    Service, arrays,
     page::write_page,
     query,
     request::{ExportFormat, QuerySpec, TextOptions, ViewOptions},
     search::ScoringChoice,
     tags::{etag, semantics_tag},
+    tasks::blocking,
     texts,
     types::Export,
     work::Work,
@@ -66,7 +65,7 @@ impl Service {
             }
             let of = inner.semantic_scene(&access.finished()?, "npz", ask.wait).await?;
             let etag = format!("{}-npz", etag(&of.tag));
-            let write = move |to: &mut dyn Write| features::write_semantics(&of.semantics, to);
+            let write = move |to: &mut dyn Write| arrays::write_semantics(&of.semantics, to);
             let file_name = format!("{id}.npz");
             return Ok(Export::new(file_name, etag, stream(write)));
         }

@@ -12,6 +12,7 @@ use rayon::prelude::*;
 
 use super::{
     Service,
+    arrays::unwritten,
     export::stream,
     request::{FeatureKind, FeaturesSpec, Kind, ViewSpec},
     schedule::Demand,
@@ -23,10 +24,10 @@ use super::{
     work::Work,
 };
 use crate::{
-    error::{Error, ErrorCode, Result},
+    error::{Error, Result},
     formats::npz::NpzWriter,
     limits::Limits,
-    scene::{Bank, PixelWeights, SceneId, Semantics},
+    scene::{Bank, PixelWeights, SceneId},
 };
 
 /// The view that is asked for.
@@ -106,30 +107,6 @@ fn features(bank: &Bank, weights: &PixelWeights, first: usize, count: usize) -> 
         }
     });
     row
-}
-
-/// Writes the bank, its masks and all indices of a scene.
-pub(super) fn write_semantics(semantics: &Semantics, to: &mut dyn Write) -> Result<()> {
-    let bank = &semantics.bank;
-    let masks: Vec<[u32; 3]> =
-        semantics.masks.iter().map(|m| [m.photo, m.mask, u32::from(m.entry)]).collect();
-    let write = || -> io::Result<()> {
-        let mut npz = NpzWriter::new(to);
-        npz.array("bank", &[bank.len(), bank.dim], &bank.rows)?;
-        npz.array("sizes", &[bank.len()], &semantics.row_sizes())?;
-        npz.array("masks", &[masks.len(), 3], masks.as_flattened())?;
-        npz.array("index", &[semantics.index.len()], &semantics.index)?;
-        for (i, map) in semantics.photos.iter().enumerate() {
-            let shape = [map.height as usize, map.width as usize];
-            npz.array(&format!("photo_{i:03}"), &shape, &map.index)?;
-        }
-        npz.finish()
-    };
-    write().map_err(unwritten)
-}
-
-fn unwritten(cause: io::Error) -> Error {
-    Error::new(ErrorCode::StoreUnavailable, "the arrays cannot be written").caused_by(cause)
 }
 
 impl Service {

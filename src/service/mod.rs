@@ -3,6 +3,7 @@
 //! [`Service`] is a cheap clone; its calls are async and never do heavy work on the async threads.
 
 mod access;
+mod arrays;
 mod camera;
 mod create;
 mod encode;
@@ -21,6 +22,7 @@ mod schedule;
 mod search;
 mod semantics;
 mod tags;
+mod tasks;
 mod texts;
 mod times;
 mod types;
@@ -240,7 +242,7 @@ impl Service {
         let after = page.after.as_deref().map(parse_cursor).transpose()?;
         let inner = Arc::clone(&self.inner);
         if inner.store.is_shared() {
-            create::blocking(move || inner.jobs.refresh_all()).await??;
+            tasks::blocking(move || inner.jobs.refresh_all()).await??;
         }
         let (records, more) = self
             .inner
@@ -261,7 +263,7 @@ impl Service {
     pub async fn delete(&self, id: &SceneId) -> Result<()> {
         let scene = self.scene(id).await?;
         let (inner, gone) = (Arc::clone(&self.inner), scene.id().clone());
-        create::blocking(move || inner.jobs.delete(&gone)).await?
+        tasks::blocking(move || inner.jobs.delete(&gone)).await?
     }
 
     /// What happens to a scene, from its present state to the last event.
