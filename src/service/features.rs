@@ -12,8 +12,6 @@ use rayon::prelude::*;
 
 use super::{
     Service,
-    arrays::unwritten,
-    export::stream,
     request::{FeatureKind, FeaturesSpec, Kind, ViewSpec},
     schedule::Demand,
     search::{LabelledView, SceneTexts, ScoringChoice},
@@ -24,10 +22,10 @@ use super::{
     work::Work,
 };
 use crate::{
-    error::{Error, Result},
+    error::{Error, ErrorCode, Result},
     formats::npz::NpzWriter,
     limits::Limits,
-    scene::{Bank, PixelWeights, SceneId},
+    scene::{Bank, PixelWeights, SceneId, Semantics},
 };
 
 /// The view that is asked for.
@@ -109,6 +107,30 @@ fn features(bank: &Bank, weights: &PixelWeights, first: usize, count: usize) -> 
     row
 }
 
+/// Writes the bank, its masks and all indices of a scene.
+pub(super) fn write_semantics(semantics: &Semantics, to: &mut dyn Write) -> Result<()> {
+    let bank = &semantics.bank;
+    let masks: Vec<[u32; 3]> =
+        semantics.masks.iter().map(|m| [m.photo, m.mask, u32::from(m.entry)]).collect();
+    let write = || -> io::Result<()> {
+        let mut npz = NpzWriter::new(to);
+        npz.array("bank", &[bank.len(), bank.dim], &bank.rows)?;
+        npz.array("sizes", &[bank.len()], &semantics.row_sizes())?;
+        npz.array("masks", &[masks.len(), 3], masks.as_flattened())?;
+        npz.array("index", &[semantics.index.len()], &semantics.index)?;
+        for (i, map) in semantics.photos.iter().enumerate() {
+            let shape = [map.height as usize, map.width as usize];
+            npz.array(&format!("photo_{i:03}"), &shape, &map.index)?;
+        }
+        npz.finish()
+    };
+    write().map_err(unwritten)
+}
+
+fn unwritten(cause: io::Error) -> Error {
+    Error::new(ErrorCode::StoreUnavailable, "the arrays cannot be written").caused_by(cause)
+}
+
 impl Service {
     /// The pixels of a view over the bank, as an npz file. `weights`: E as `size` (height, width),
     /// `offsets` `[H * W + 1]`, `entries` and `weights`; the entries of pixel i are those from
@@ -139,7 +161,7 @@ impl Service {
             Ok(weights)
         };
         let weights = inner.scheduled(demand, deadline, "the features", draw).await?;
-        let chunks = stream(move |to: &mut dyn Write| write(&texts, &weights, spec.kind, to));
-        Ok(Export::new(format!("{id}-view.npz"), etag, chunks))
+        let write = move |to: &mut dyn Write| write(&texts, &weights, spec.kind, to);
+        Ok(Export { file_name: format!("{id}-view.npz"), ..Export::streamed(etag, write) })
     }
 }

@@ -3,7 +3,7 @@
 use std::{io::Write, sync::Arc};
 
 use super::{
-    arrays, features, pick, query,
+    features, pick, query,
     request::{FeaturesSpec, PickSpec, QuerySpec, ScoringOptions, ViewSpec},
     search::{Backend, SceneTexts, ScoringChoice, SemanticScene},
     texts,
@@ -125,7 +125,7 @@ impl OfflineService {
         to: &mut dyn Write,
     ) -> Result<()> {
         let Some(spec) = spec else {
-            return arrays::write_semantics(&self.semantic_scene(scene, "arrays")?.semantics, to);
+            return features::write_semantics(&self.semantic_scene(scene, "arrays")?.semantics, to);
         };
         let view = features::features_view(&self.limits, &**scene, spec)?;
         let texts = self.score(scene, "arrays", spec.options.preset, &spec.scoring, &[])?;

@@ -9,9 +9,9 @@ use std::{
 use flate2::{Compression, write::GzEncoder};
 use segsplat::{
     error::Result,
-    formats::splats::{
-        COMPRESSED_PLY, FORMATS, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
-        read_splats,
+    formats::{
+        splats::{COMPRESSED_PLY, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat},
+        table::{read_splats, splat_formats},
     },
     jobs::{NetworkState, SceneNetworks},
     pipeline::{PhotoSet, Reconstruction},
@@ -163,7 +163,7 @@ async fn a_file_is_a_scene_like_any_other() {
     let events = client().get(server.url(&format!("/v1/scenes/{id}/events")));
     let events = events.send().await.unwrap().text().await.unwrap();
     assert!(events.starts_with("event: done"), "{events}");
-    for format in FORMATS {
+    for format in splat_formats() {
         assert!(!door.export_as(id, format.name).await.unwrap().is_empty());
     }
     assert!(!door.export_as(id, "packed").await.unwrap().is_empty());

@@ -11,9 +11,9 @@ use flate2::{Compression, read::GzDecoder, write::GzEncoder};
 use glam::DVec3;
 use segsplat::{
     error::{ErrorCode, Result},
-    formats::splats::{
-        COMPRESSED_PLY, FORMATS, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
-        read_splats,
+    formats::{
+        splats::{COMPRESSED_PLY, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat},
+        table::{read_splats, splat_formats},
     },
     limits::Limits,
     render::{Kinds, RenderRequest, Renderer as _, compare::psnr, cpu::CpuRenderer},
@@ -291,7 +291,7 @@ fn a_far_scene_is_exact_or_refused() {
     assert!(rotation < 1e-7, "it is scaled to length 1 once more: {rotation}");
     let error = SplatFile::new(&SPZ, far, None).unwrap_err();
     assert!(error.message().contains("8388607"), "{error}");
-    for format in FORMATS.into_iter().filter(|format| format.name != PLY.name) {
+    for format in splat_formats().filter(|format| format.name != PLY.name) {
         let error = SplatFile::new(format, Gaussians::default(), None).unwrap_err();
         assert!(error.message().contains("no Gaussians to write"), "{error}");
     }
@@ -850,7 +850,7 @@ async fn both_doors_give_every_format() {
     let scene = json(created.send().await.unwrap()).await.unwrap();
     let id = scene["id"].as_str().unwrap();
     let mut sizes = Vec::new();
-    for format in FORMATS {
+    for format in splat_formats() {
         let url = stand.url(&format!("/v1/scenes/{id}/export?format={}", format.name));
         let answer = client().get(&url).send().await.unwrap();
         let headers = answer.headers();
@@ -880,7 +880,7 @@ fn the_command_line_turns_each_format_into_each_other() {
         (done.status.code(), json)
     };
     for from in [&PLY, &GLB, &SPLAT, &SPZ, &SPZ4, &SOG, &COMPRESSED_PLY] {
-        for to in FORMATS {
+        for to in splat_formats() {
             let (source, target) = (at(from), folder.path().join(format!("b.{}", to.ending)));
             let words = ["export".as_ref(), source.as_os_str(), "-o".as_ref(), target.as_os_str()];
             let (code, told) = run(&words);

@@ -27,13 +27,39 @@ use ruzstd::{
 };
 
 use super::{
-    SPZ, SPZ4, SplatFile, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count, cut_short,
-    fill_rest, some, times, unreadable, world,
+    OCTETS, SplatFile, SplatFormat, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count,
+    cut_short, fill_rest, some, times, unreadable, world,
 };
 use crate::{
     error::{Error, Result},
     limits::Limits,
     scene::{Gaussians, RawGaussians},
+};
+
+/// SPZ, version 3.
+pub static SPZ: SplatFormat = SplatFormat {
+    name: "spz",
+    ending: "spz",
+    media_type: OCTETS,
+    semantics: false,
+    begins: &[0x1f, 0x8b],
+    read,
+    check,
+    size_bytes: |_| None,
+    write,
+};
+
+/// SPZ, version 4.
+pub static SPZ4: SplatFormat = SplatFormat {
+    name: "spz4",
+    ending: "v4.spz",
+    media_type: OCTETS,
+    semantics: false,
+    begins: &MAGIC,
+    read: read_4,
+    check,
+    size_bytes: |_| None,
+    write: write_4,
 };
 
 const MAGIC: [u8; 4] = *b"NGSP";
@@ -52,7 +78,7 @@ const REST_MAX: u64 = 1 << 20;
 /// Steps of 1/128 that a coefficient of degree 1, and of a higher one, is rounded to.
 const SH_BUCKETS: [i32; 2] = [8, 16];
 
-pub(super) fn check(file: &SplatFile) -> Result<()> {
+fn check(file: &SplatFile) -> Result<()> {
     some(file)?;
     bits(&file.gaussians).map(drop)
 }
@@ -121,7 +147,7 @@ fn head(gaussians: &Gaussians, version: u32, bits: u32, streams: u8) -> io::Resu
     Ok(head)
 }
 
-pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
     let bits = bits(gaussians).map_err(io::Error::other)?;
     let mut to = GzEncoder::new(to, Compression::default());
@@ -131,7 +157,7 @@ pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
 }
 
 /// The table of the streams is before them, so that all are packed before the first is written.
-pub(super) fn write_4(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+fn write_4(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
     let bits = bits(gaussians).map_err(io::Error::other)?;
     let (mut table, mut packed) = (Vec::new(), Vec::new());
@@ -244,7 +270,7 @@ impl Head {
 }
 
 /// Versions 1 to 3.
-pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let mut from = Blocks { from: GzDecoder::new(from), count: 0 };
     let head = Head::read(from.row(0, "bytes of the header")?, [1, 3], limits)?;
     let raw = head.read_blocks(&mut from)?;
@@ -256,7 +282,7 @@ pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead
 }
 
 /// Version 4.
-pub(super) fn read_4(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn read_4(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let mut from = Blocks { from, count: HEAD_4_BYTES };
     let head = Head::read(from.row(0, "bytes of the header")?, [4, 4], limits)?;
     let rest: [u8; 16] = from.row(16, "bytes of the header")?;
