@@ -184,7 +184,8 @@ pub fn scene_splats(
     gaussians: &Gaussians,
     semantics: Option<&Semantics>,
 ) -> Result<SplatFile> {
-    SplatFile::new(format, widened(scene, gaussians, None)?, semantics)
+    let file = SplatFile::new(format, widened(scene, gaussians, None)?, semantics)?;
+    Ok(file.antialiased(scene.meta.report.antialiased))
 }
 
 /// A file with Gaussians; `stem` is its name without the ending.
