@@ -141,7 +141,7 @@ impl Inner {
             ..Record::new(status)
         });
         let photos = upload.photos.len();
-        let queued = self.jobs.submit(upload, record, &self.limits())?;
+        let queued = self.jobs.submit(upload, record)?;
         let replayed = queued != id;
         if !replayed {
             tracing::info!(scene = %id, photos, "queued");

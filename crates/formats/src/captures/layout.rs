@@ -1,12 +1,12 @@
-//! What all readers of layouts share: how a layout is recognised and read, and small readers of
-//! numbers and poses.
+//! What all readers of layouts share: how a layout is recognised and read, cameras as they are
+//! written, and small readers of numbers and poses.
 
 use glam::{DMat3, DQuat, DVec3};
 
-use super::{
-    cameras::{CameraEntry, Cameras},
+pub(crate) use super::{
+    cameras::{self, CameraEntry, PoseAxes, number, object},
     folder::Folder,
-    lens::Lens,
+    lens::{Base, Lens, Terms},
     names,
 };
 use crate::error::{Error, Result};
@@ -27,12 +27,12 @@ pub(crate) trait Layout: Sync {
 pub(crate) struct Described {
     /// The folder that the files of the cameras are looked for from.
     pub(crate) root: String,
-    pub(crate) cameras: Cameras,
+    pub(crate) cameras: cameras::Cameras,
 }
 
 impl Described {
     pub(crate) fn new(root: &str, entries: Vec<CameraEntry>) -> Self {
-        Self { root: root.to_owned(), cameras: Cameras { entries, held_out: Vec::new() } }
+        Self { root: root.to_owned(), cameras: cameras::Cameras { entries, held_out: Vec::new() } }
     }
 }
 

@@ -7,12 +7,9 @@
 use std::collections::HashMap;
 
 use crate::{
-    captures::{
-        cameras::{CameraEntry, PoseAxes},
-        folder::Folder,
-        layout::{Described, Layout, count, inverse, numbers, pinhole, rotation, text},
-        lens::{Base, Lens, Terms},
-        names,
+    captures::layout::{
+        Base, CameraEntry, Described, Folder, Layout, Lens, PoseAxes, Terms, count, inverse, names,
+        numbers, pinhole, rotation, text,
     },
     error::{Error, Result},
 };

@@ -24,14 +24,27 @@ use serde::Deserialize;
 use serde_json::json;
 
 use super::{
-    GLB, SplatFile, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count, cut_short, fill_rest,
-    some, spz, times, unreadable,
+    SplatFile, SplatFormat, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count, cut_short,
+    fill_rest, some, spz, times, unreadable,
 };
 use crate::{
     container::read_semantics,
     error::{Error, Result},
     limits::Limits,
     scene::{Gaussians, RawGaussians, SH_C0, SceneId, Semantics},
+};
+
+/// Binary glTF with `KHR_gaussian_splatting`.
+pub static GLB: SplatFormat = SplatFormat {
+    name: "glb",
+    ending: "glb",
+    media_type: "model/gltf-binary",
+    semantics: true,
+    begins: b"glTF",
+    read,
+    check,
+    size_bytes: |file| Some(size_bytes(file)),
+    write,
 };
 
 const MAGIC: u32 = u32::from_le_bytes(*b"glTF");
@@ -188,11 +201,11 @@ fn turned(at: DVec3) -> DVec3 {
     at * DVec3::from_array(TURN.map(f64::from))
 }
 
-pub(super) fn size_bytes(file: &SplatFile) -> u64 {
+fn size_bytes(file: &SplatFile) -> u64 {
     (12 + 8 + document(file).len() + 8 + binary_bytes(file)) as u64
 }
 
-pub(super) fn check(file: &SplatFile) -> Result<()> {
+fn check(file: &SplatFile) -> Result<()> {
     some(file)?;
     match u32::try_from(size_bytes(file)) {
         Ok(_) => Ok(()),
@@ -200,7 +213,7 @@ pub(super) fn check(file: &SplatFile) -> Result<()> {
     }
 }
 
-pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
     let (document, binary) = (document(file), binary_bytes(file));
     let whole = 12 + 8 + document.len() + 8 + binary;
@@ -339,7 +352,7 @@ fn chunk(from: &mut dyn BufRead, kind: u32, name: &str, bytes_max: usize) -> Res
     Ok(chunk)
 }
 
-pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let mut head = [0; 12];
     from.read_exact(&mut head).map_err(|e| cut_short("GLB", e, 0, 12, "bytes of the header"))?;
     let version = u32::from_le_bytes([head[4], head[5], head[6], head[7]]);

@@ -12,10 +12,10 @@ use std::{
     io::{self, Read, Write},
 };
 
-use super::{COMPRESSED_PLY, SplatFile, SplatsRead, begun, cut_short, fill_rest, steps, world};
+use super::{SplatFile, begun, cut_short, fill_rest, steps, world};
 use crate::{
     error::Result,
-    scene::{Gaussians, SH_C0},
+    scene::{Gaussians, RawGaussians, SH_C0},
 };
 
 /// Gaussians of a chunk.
@@ -201,7 +201,7 @@ pub(super) struct PackedLayout {
 }
 
 /// Reads what follows the header.
-pub(super) fn read(from: &mut dyn Read, layout: &PackedLayout) -> Result<SplatsRead> {
+pub(super) fn read(from: &mut dyn Read, layout: &PackedLayout) -> Result<RawGaussians> {
     let [of_chunk, of_vertex, of_sh] = layout.strides;
     let n = layout.count;
     let mut rows = |stride: usize, i: usize, count: usize, of: &str| -> Result<Vec<u8>> {
@@ -258,5 +258,5 @@ pub(super) fn read(from: &mut dyn Read, layout: &PackedLayout) -> Result<SplatsR
         }
     }
     fill_rest(&mut raw);
-    SplatsRead::new(&COMPRESSED_PLY, raw, None)
+    Ok(raw)
 }

@@ -30,12 +30,25 @@ use zip::{
 };
 
 use super::{
-    SOG, SplatFile, SplatsRead, begun, check_count, fill_rest, packed_ply::morton_order, some,
-    steps, unreadable, world,
+    OCTETS, SplatFile, SplatFormat, SplatsRead, begun, check_count, fill_rest,
+    packed_ply::morton_order, some, steps, unreadable, world,
 };
 use crate::{
     error::{Error, Result},
     limits::Limits,
+};
+
+/// The bundle of pictures of `PlayCanvas`.
+pub static SOG: SplatFormat = SplatFormat {
+    name: "sog",
+    ending: "sog",
+    media_type: OCTETS,
+    semantics: false,
+    begins: b"PK",
+    read,
+    check,
+    size_bytes: |_| None,
+    write,
 };
 
 /// Name of the renderer that compensates opacity, in `meta.json`.
@@ -67,7 +80,7 @@ fn sides(count: usize) -> [usize; 2] {
     [width, (count.div_ceil(width)).next_multiple_of(4)]
 }
 
-pub(super) fn check(file: &SplatFile) -> Result<()> {
+fn check(file: &SplatFile) -> Result<()> {
     some(file)?;
     let count = file.gaussians.len();
     let longest = sides(count).into_iter().max().unwrap_or(0);
@@ -189,7 +202,7 @@ fn webp([width, height]: [usize; 2], pixels: impl Iterator<Item = [u8; 4]>) -> i
     Ok(webp)
 }
 
-pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
     let (n, k) = (gaussians.len(), gaussians.sh_count());
     let order = morton_order(gaussians);
@@ -396,7 +409,7 @@ fn looked_up(table: &[f32], at: u8) -> f32 {
     table.get(usize::from(at)).copied().unwrap_or(0.0)
 }
 
-pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let mut zip = Vec::new();
     let max = limits.splats_bytes_max;
     from.take(max.saturating_add(1)).read_to_end(&mut zip).map_err(unreadable)?;

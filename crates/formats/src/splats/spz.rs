@@ -27,13 +27,39 @@ use ruzstd::{
 };
 
 use super::{
-    SPZ, SPZ4, SplatFile, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count, cut_short,
-    fill_rest, places::Coarse, some, times, unreadable, world,
+    OCTETS, SplatFile, SplatFormat, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count,
+    cut_short, fill_rest, places::Coarse, some, times, unreadable, world,
 };
 use crate::{
     error::{Error, Result},
     limits::Limits,
     scene::{Gaussians, RawGaussians},
+};
+
+/// SPZ, version 3.
+pub static SPZ: SplatFormat = SplatFormat {
+    name: "spz",
+    ending: "spz",
+    media_type: OCTETS,
+    semantics: false,
+    begins: &[0x1f, 0x8b],
+    read,
+    check,
+    size_bytes: |_| None,
+    write,
+};
+
+/// SPZ, version 4.
+pub static SPZ4: SplatFormat = SplatFormat {
+    name: "spz4",
+    ending: "v4.spz",
+    media_type: OCTETS,
+    semantics: false,
+    begins: &MAGIC,
+    read: read_4,
+    check,
+    size_bytes: |_| None,
+    write: write_4,
 };
 
 const MAGIC: [u8; 4] = *b"NGSP";
@@ -52,7 +78,7 @@ const REST_MAX: u64 = 1 << 20;
 /// Steps of 1/128 that a coefficient of degree 1, and of a higher one, is rounded to.
 const SH_BUCKETS: [i32; 2] = [8, 16];
 
-pub(super) fn check(file: &SplatFile) -> Result<()> {
+fn check(file: &SplatFile) -> Result<()> {
     some(file)?;
     let step = 0.5_f64.powi(bits(&file.gaussians)? as i32);
     let coarse = Coarse::of(&file.gaussians, |_| step);
@@ -124,7 +150,7 @@ fn head(file: &SplatFile, version: u32, bits: u32, streams: u8) -> io::Result<Ve
     Ok(head)
 }
 
-pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
     let bits = bits(gaussians).map_err(io::Error::other)?;
     let mut to = GzEncoder::new(to, Compression::default());
@@ -134,7 +160,7 @@ pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
 }
 
 /// The table of the streams is before them, so that all are packed before the first is written.
-pub(super) fn write_4(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+fn write_4(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
     let bits = bits(gaussians).map_err(io::Error::other)?;
     let (mut table, mut packed) = (Vec::new(), Vec::new());
@@ -250,13 +276,13 @@ impl Head {
 }
 
 /// Versions 1 to 3.
-pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let (raw, antialiased) = unpacked(from, limits)?;
     Ok(SplatsRead::new(&SPZ, raw, None)?.antialiased(antialiased))
 }
 
 /// Version 4.
-pub(super) fn read_4(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn read_4(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let (raw, antialiased) = unpacked_4(from, limits)?;
     Ok(SplatsRead::new(&SPZ4, raw, None)?.antialiased(antialiased))
 }

@@ -2,12 +2,7 @@
 //! `ScanNet++` (`dslr/nerfstudio/transforms.json`), and our own.
 
 use crate::{
-    captures::{
-        cameras,
-        folder::Folder,
-        layout::{Described, Layout, called},
-        names,
-    },
+    captures::layout::{Described, Folder, Layout, called, cameras, names},
     error::Result,
 };
 

@@ -7,11 +7,9 @@
 use std::collections::BTreeSet;
 
 use crate::{
-    captures::{
-        cameras::{CameraEntry, PoseAxes},
-        folder::Folder,
-        layout::{Described, Layout, inverse_of_rows, numbers, pinhole, text},
-        names,
+    captures::layout::{
+        CameraEntry, Described, Folder, Layout, PoseAxes, inverse_of_rows, names, numbers, pinhole,
+        text,
     },
     error::{Error, Result},
 };

@@ -20,5 +20,4 @@
 mod read;
 mod write;
 
-pub(super) use read::read;
-pub(super) use write::{size_bytes, write};
+pub use self::read::{COMPRESSED_PLY, PLY};

@@ -13,10 +13,37 @@ use crate::{
 
 use super::{
     super::{
-        PLY, SplatsRead, begun, check_count, cut_short,
+        OCTETS, SplatFormat, SplatsRead, begun, check_count, cut_short,
         packed_ply::{self, BOUNDS, PACKED, PackedLayout},
+        some,
     },
-    write::SEMANTICS,
+    write::{SEMANTICS, size_bytes, write},
+};
+
+/// 3DGS PLY.
+pub static PLY: SplatFormat = SplatFormat {
+    name: "ply",
+    ending: "ply",
+    media_type: OCTETS,
+    semantics: true,
+    begins: b"ply",
+    read,
+    check: |_| Ok(()),
+    size_bytes: |file| Some(size_bytes(file)),
+    write,
+};
+
+/// The compressed PLY of `PlayCanvas` and `SuperSplat`.
+pub static COMPRESSED_PLY: SplatFormat = SplatFormat {
+    name: "compressed_ply",
+    ending: "compressed.ply",
+    media_type: OCTETS,
+    semantics: false,
+    begins: b"ply",
+    read,
+    check: some,
+    size_bytes: |file| Some(packed_ply::size_bytes(file)),
+    write: packed_ply::write,
 };
 
 /// Longest header, bytes.
@@ -30,7 +57,7 @@ const CHUNK: &str = "chunk";
 const SH: &str = "sh";
 
 /// Reads a file, with the semantics after its vertices if there are some.
-pub(in super::super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let header = Header::read(from)?;
     let vertices = header.vertices()?;
     let check = |degree| check_count("PLY: Gaussians", vertices.count, degree, limits);
@@ -38,7 +65,7 @@ pub(in super::super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<
     if header.elements[0].name == CHUNK {
         let layout = header.packed()?;
         check(layout.sh_degree)?;
-        let read = packed_ply::read(from, &layout)?;
+        let read = SplatsRead::new(&COMPRESSED_PLY, packed_ply::read(from, &layout)?, None)?;
         return Ok(read.antialiased(header.antialiased));
     }
     let layout = Layout::of(vertices)?;

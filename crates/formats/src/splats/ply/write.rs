@@ -9,12 +9,12 @@ pub(super) const SEMANTICS: &str = "segsplat_semantics_bytes";
 /// Opacity 1 has no finite logit; this one reads back as 1 within f32's step.
 const OPACITY_MAX: f64 = 1.0 - 5e-8;
 
-pub(in super::super) fn size_bytes(file: &SplatFile) -> u64 {
+pub(super) fn size_bytes(file: &SplatFile) -> u64 {
     let vertices = file.gaussians.len() * vertex_bytes(file);
     (header(file).len() + vertices + file.semantics.len()) as u64
 }
 
-pub(in super::super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     to.write_all(header(file).as_bytes())?;
     let mut row = Vec::new();
     for i in 0..file.gaussians.len() {
