@@ -212,7 +212,8 @@ pub fn scene_splats(
     gaussians: &Gaussians,
     semantics: Option<&Semantics>,
 ) -> Result<SplatFile> {
-    SplatFile::new(format, widened(scene, gaussians, None)?, semantics)
+    let file = SplatFile::new(format, widened(scene, gaussians, None)?, semantics)?;
+    Ok(file.antialiased(scene.meta.report.antialiased))
 }
 
 /// The parts of a file that `write` writes on a blocking thread. A fault ends them.

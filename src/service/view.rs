@@ -100,7 +100,7 @@ impl Resolved {
                     Samples::Levels
                 }
             },
-            antialiased: self.options.antialiased,
+            antialiased: self.options.antialiased.unwrap_or(scene.meta.report.antialiased),
             near: self.near,
             quality: self.options.quality,
         }
