@@ -15,13 +15,13 @@ use tokio::{
 use super::{
     Inner, Service,
     access::SceneAccess,
-    create::blocking,
     features,
     page::write_page,
     query,
     request::{QuerySpec, TextOptions, ViewOptions},
     search::ScoringChoice,
     tags::{cache_key, etag, semantics_tag, text_key},
+    tasks::blocking,
     texts,
     types::{Export, ExportBody, ExportPlace},
     work::Work,
@@ -255,7 +255,8 @@ pub fn scene_splats(
     gaussians: &Gaussians,
     semantics: Option<&Semantics>,
 ) -> Result<SplatFile> {
-    SplatFile::new(format, widened(scene, gaussians, None)?, semantics)
+    let file = SplatFile::new(format, widened(scene, gaussians, None)?, semantics)?;
+    Ok(file.antialiased(scene.meta.report.antialiased))
 }
 
 /// The parts of a file that `write` writes on a blocking thread. A fault ends them.
