@@ -12,13 +12,13 @@ use tokio::{runtime::Handle, sync::mpsc};
 use super::{
     Service,
     access::SceneAccess,
-    create::blocking,
     features,
     page::write_page,
     query,
     request::{QuerySpec, TextOptions, ViewOptions},
     search::ScoringChoice,
     tags::{cache_key, etag, semantics_tag, text_key},
+    tasks::blocking,
     texts,
     types::{Export, ExportBody},
     work::Work,
@@ -212,7 +212,8 @@ pub fn scene_splats(
     gaussians: &Gaussians,
     semantics: Option<&Semantics>,
 ) -> Result<SplatFile> {
-    SplatFile::new(format, widened(scene, gaussians, None)?, semantics)
+    let file = SplatFile::new(format, widened(scene, gaussians, None)?, semantics)?;
+    Ok(file.antialiased(scene.meta.report.antialiased))
 }
 
 /// The parts of a file that `write` writes on a blocking thread. A fault ends them.

@@ -326,9 +326,10 @@ pub struct ViewOptions {
     /// Height, pixels. By default as the width.
     #[arg(long)]
     pub height: Option<u32>,
-    /// Antialiased: opacity compensated for the blur of small Gaussians (gsplat's mode).
-    #[arg(long)]
-    pub antialiased: bool,
+    /// Antialiased: opacity compensated for the blur of small Gaussians (gsplat's mode). By default
+    /// as the scene's file of Gaussians says, else not.
+    #[arg(long, num_args = 0..=1, require_equals = true, default_missing_value = "true")]
+    pub antialiased: Option<bool>,
     /// Near plane, world units. By default 0.01 of the scene's median depth.
     #[arg(long)]
     pub near: Option<f32>,

@@ -93,7 +93,7 @@ fn report(report: HealthReport) -> pb::HealthReport {
     message!(HealthReport from report
         {
             photos, views_used, gaussians, median_depth, overlap, network_focal_px,
-            execution_provider
+            execution_provider, antialiased
         }
         dropped: report.dropped.into_iter().map(drop_count).collect(),
         depth_near,

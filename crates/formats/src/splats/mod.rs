@@ -6,8 +6,11 @@
 //! Axes are those of each format's own specification: PLY and `.splat` are in the axes of the scene
 //! (OpenCV: y down, z forward), SPZ and glTF have y up and z back. `TURN` turns between them.
 
+#[cfg(test)]
+mod foreign;
 mod glb;
 mod packed_ply;
+mod places;
 mod ply;
 mod scene;
 mod sog;
@@ -18,6 +21,7 @@ use std::io::{self, BufRead, Write};
 
 use glam::DVec3;
 
+use self::places::Coarse;
 pub use self::{
     glb::GLB,
     ply::{COMPRESSED_PLY, PLY},
@@ -39,6 +43,9 @@ pub struct SplatsRead {
     pub format: &'static SplatFormat,
     /// The Gaussians.
     pub gaussians: Gaussians,
+    /// Whether they were made for a renderer that compensates opacity for the blur of small
+    /// Gaussians.
+    pub antialiased: bool,
     /// How many were dropped or changed.
     pub dropped: SanitizeReport,
     /// Their semantics, where it has some.
@@ -49,13 +56,20 @@ impl SplatsRead {
     /// What was read, checked. The Gaussians say which entry is whose, also where some are dropped.
     fn new(
         format: &'static SplatFormat,
-        raw: RawGaussians,
+        mut raw: RawGaussians,
         semantics: Option<Semantics>,
     ) -> Result<Self> {
+        raw.scales.iter_mut().for_each(thickened);
+        raw.quats.iter_mut().for_each(turnable);
         let (gaussians, dropped) = Gaussians::sanitize(raw)?;
         let index = || gaussians.semantic_index().to_vec();
         let semantics = semantics.map(|semantics| Semantics { index: index(), ..semantics });
-        Ok(Self { format, gaussians, dropped, semantics })
+        Ok(Self { format, gaussians, antialiased: false, dropped, semantics })
+    }
+
+    /// The same for that renderer, or not.
+    fn antialiased(self, antialiased: bool) -> Self {
+        Self { antialiased, ..self }
     }
 }
 
@@ -89,6 +103,10 @@ pub const OCTETS: &str = "application/octet-stream";
 pub struct SplatFile {
     format: &'static SplatFormat,
     gaussians: Gaussians,
+    /// Whether opacity is to be compensated for the blur of small Gaussians.
+    antialiased: bool,
+    /// The step of f32 positions, where it is too coarse for this scene.
+    coarse: Option<Coarse>,
     /// The container of the semantics; empty where there are none.
     semantics: Vec<u8>,
 }
@@ -109,9 +127,17 @@ impl SplatFile {
             write_semantics(&mut packed, &SceneId::from_bytes([0; 16]), semantics)
                 .map_err(|e| Error::internal("the semantics cannot be packed").caused_by(e))?;
         }
-        let file = Self { format, gaussians, semantics: packed };
+        let coarse = Coarse::in_f32(&gaussians);
+        let file = Self { format, gaussians, antialiased: false, coarse, semantics: packed };
         (format.check)(&file)?;
         Ok(file)
+    }
+
+    /// The same, marked for a renderer that compensates opacity for the blur of small Gaussians,
+    /// or not. `.splat` has no place for the mark.
+    #[must_use]
+    pub fn antialiased(self, antialiased: bool) -> Self {
+        Self { antialiased, ..self }
     }
 
     /// Its format.
@@ -158,8 +184,33 @@ fn some(file: &SplatFile) -> Result<()> {
     Ok(())
 }
 
+/// The same for formats that have positions as f32 of the world: refuses what lies too far off.
+fn some_near(file: &SplatFile) -> Result<()> {
+    some(file)?;
+    file.coarse.map_or(Ok(()), |coarse| Err(coarse.refused(file.format)))
+}
+
 pub(crate) fn unreadable(cause: io::Error) -> Error {
     Error::unavailable("read the file", cause)
+}
+
+/// What a scale of 0 becomes: so small a share of the smallest one of the same Gaussian.
+const FLAT: f32 = 1e-3;
+
+/// Flat Gaussians, as 2DGS makes them, and points are drawn: 0 gets a thickness that no view shows.
+fn thickened(scales: &mut [f32; 3]) {
+    let others = scales.iter().copied().filter(|scale| *scale > 0.0);
+    let least = FLAT * others.fold(f32::INFINITY, f32::min);
+    let thin =
+        if least.is_finite() { least.max(Gaussians::SCALE_MIN) } else { Gaussians::SCALE_MIN };
+    scales.iter_mut().filter(|scale| **scale == 0.0).for_each(|scale| *scale = thin);
+}
+
+/// A rotation of zeros turns nothing, as in 3DGS.
+fn turnable(quat: &mut [f32; 4]) {
+    if *quat == [0.0; 4] {
+        quat[0] = 1.0;
+    }
 }
 
 /// Signs that turn a position from the scene's axes (x right, y down, z forward) to y up and z

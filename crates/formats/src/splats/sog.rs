@@ -17,6 +17,7 @@ use std::{
     io::{self, BufRead, Cursor, Read, Write},
 };
 
+use glam::DVec3;
 use image::{
     ExtendedColorType, ImageDecoder, ImageEncoder,
     codecs::webp::{WebPDecoder, WebPEncoder},
@@ -50,6 +51,8 @@ pub static SOG: SplatFormat = SplatFormat {
     write,
 };
 
+/// Name of the renderer that compensates opacity, in `meta.json`.
+const ANTIALIASED: &str = "antialiased";
 /// Numbers of a table.
 const TABLE: usize = 256;
 /// Most files of a bundle, and bytes of its `meta.json`.
@@ -264,6 +267,9 @@ fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
         "quats": { "files": ["quats.webp"] },
         "sh0": { "codebook": colors, "files": ["sh0.webp"] },
     });
+    if file.antialiased {
+        meta["model"] = json!(ANTIALIASED);
+    }
     if k > 1 {
         let dim = 3 * (k - 1);
         let rest = gaussians.sh().chunks_exact(k).flat_map(|row| row[1..].as_flattened());
@@ -304,6 +310,8 @@ struct Meta {
     version: Option<u32>,
     #[serde(default)]
     count: usize,
+    /// `antialiased` or `2dgs`, where it is not the usual one.
+    model: Option<serde_json::Value>,
     means: Option<Bounded>,
     scales: Option<Table>,
     quats: Option<Files>,
@@ -433,10 +441,21 @@ fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let mut raw = begun(n, degree);
     let [low, high] = [0, 1].map(|of| bundle.picture(&means.files[of], n));
     let (low, high) = (low?.1, high?.1);
+    // Far scenes are kept near the bound next to zero, where f32 is fine enough.
+    let origin: [f64; 3] = std::array::from_fn(|a| match [means.mins[a], means.maxs[a]] {
+        [min, _] if min > 0.0 => unlog(min),
+        [_, max] if max < 0.0 => unlog(max),
+        _ => 0.0,
+    });
+    raw.origin = DVec3::from_array(origin);
+    if !raw.origin.is_finite() {
+        return Err(bad("the bounds of the positions are not finite"));
+    }
     for (low, high) in low.iter().zip(&high).take(n) {
         raw.means.push(std::array::from_fn(|a| {
             let share = f64::from(u16::from_le_bytes([low[a], high[a]])) / 65_535.0;
-            unlog(means.mins[a] + (means.maxs[a] - means.mins[a]) * share) as f32
+            let at = unlog(means.mins[a] + (means.maxs[a] - means.mins[a]) * share);
+            (at - origin[a]) as f32
         }));
     }
     drop((low, high));
@@ -460,7 +479,8 @@ fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
         bundle.read_harmonics(&harmonics, &mut raw.sh, n)?;
     }
     fill_rest(&mut raw);
-    SplatsRead::new(&SOG, raw, None)
+    let antialiased = meta.model.is_some_and(|model| model == ANTIALIASED);
+    Ok(SplatsRead::new(&SOG, raw, None)?.antialiased(antialiased))
 }
 
 impl Bundle<'_> {

@@ -8,8 +8,8 @@
 use std::io::{self, BufRead, Write};
 
 use super::{
-    OCTETS, SplatFile, SplatFormat, SplatsRead, begun, check_count, cut_short, fill_rest, some,
-    steps, world,
+    OCTETS, SplatFile, SplatFormat, SplatsRead, begun, check_count, cut_short, fill_rest,
+    some_near, steps, world,
 };
 use crate::{
     error::{Error, Result},
@@ -25,7 +25,7 @@ pub static SPLAT: SplatFormat = SplatFormat {
     semantics: false,
     begins: b"",
     read,
-    check: some,
+    check: some_near,
     size_bytes: |file| Some(size_bytes(file)),
     write,
 };
