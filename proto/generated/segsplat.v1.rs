@@ -1599,33 +1599,36 @@ impl Kind {
 pub enum ExportFormat {
     /// As EXPORT_FORMAT_PLY.
     Unspecified = 0,
-    /// Standard 3DGS PLY.
+    /// Standard 3DGS PLY with `semantic_index` as an extra attribute and, after the vertices, the
+    /// semantics where they are made.
     Ply = 1,
-    /// The semantics as NumPy arrays.
+    /// The semantics as `NumPy` arrays: the bank, the row of each mask, the entry of each Gaussian and
+    /// of each cell of the photos.
     Npz = 2,
-    /// The scene as the page draws it: 32 bytes a Gaussian.
+    /// The scene as the page draws it: 32 bytes a Gaussian, those that cover most first.
     Packed = 3,
-    /// The page with the scene in it; text may have several texts, one a line.
+    /// The page with the scene in it, as one file for a disk. It shows the texts of `text`, one a
+    /// line, and needs no server.
     Html = 4,
-    /// The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian.
+    /// The compressed PLY of `PlayCanvas` and `SuperSplat`: 16 bytes a Gaussian.
     CompressedPly = 5,
     /// SPZ, version 3: under 16 bytes a Gaussian.
     Spz = 6,
-    /// Binary glTF with KHR_gaussian_splatting, the entries of the bank and the semantics.
+    /// Binary glTF with `KHR_gaussian_splatting`, the entries of the bank and the semantics.
     Glb = 7,
-    /// .splat: 32 bytes a Gaussian.
+    /// `.splat`: 32 bytes a Gaussian.
     Splat = 8,
     /// SPZ, version 4, which fewer programs read.
     Spz4 = 9,
-    /// SOG, the bundle of pictures of PlayCanvas, without harmonics over degree 0.
+    /// SOG, the bundle of pictures of `PlayCanvas`, without harmonics over degree 0.
     Sog = 10,
-    /// A zip of a folder as COLMAP has it: photos, cameras, points and depth maps.
+    /// A folder as COLMAP has it, in a zip: photos, cameras, points and depth maps.
     Colmap = 11,
     /// The same as nerfstudio has it.
     Nerfstudio = 12,
-    /// A zip with what texts, one a line, select in each photo, as COCO's annotations.
+    /// What each line of `text` selects in each photo as COCO's annotations, in a zip.
     Coco = 13,
-    /// The same as a JSON with polygons for LabelMe beside each photo.
+    /// The same as a JSON with polygons for `LabelMe` beside each photo.
     Labelme = 14,
 }
 impl ExportFormat {

@@ -1,5 +1,5 @@
-//! The table of formats is what the docs and the Python client have. `doors_agree.rs` has the
-//! other doors.
+//! The table of formats is what the docs, the proto and the Python client have. `doors_agree.rs`
+//! has the other doors.
 
 use std::{fmt::Write as _, fs};
 
@@ -17,6 +17,47 @@ fn the_docs_have_every_format_for_other_programs() {
     }
 }
 
+/// A paragraph whose lines have at most 100 columns, each after the first behind `indent`.
+fn paragraph(start: &str, text: &str, indent: &str) -> String {
+    let (mut lines, mut line) = (String::new(), start.to_owned());
+    for word in text.split_whitespace() {
+        if line.len() + 1 + word.len() > 100 {
+            writeln!(lines, "{line}").unwrap();
+            line = indent.to_owned();
+        }
+        let gap = if line.ends_with(' ') { "" } else { " " };
+        write!(line, "{gap}{word}").unwrap();
+    }
+    lines + &line + "\n"
+}
+
+/// Writes a file where docs are updated; whether it has this text.
+fn kept(path: &str, text: &str) {
+    let path = root().join(path);
+    if std::env::var_os("UPDATE_DOCS").is_some() {
+        fs::write(&path, text).unwrap();
+    }
+    let written = fs::read_to_string(&path).unwrap_or_default();
+    assert_eq!(written, text, "{} differs: UPDATE_DOCS=1 writes it", path.display());
+}
+
+#[test]
+fn the_proto_has_the_table() {
+    let path = "proto/segsplat/v1/scene.proto";
+    let proto = fs::read_to_string(root().join(path)).unwrap();
+    let (before, rest) = proto.split_once("enum ExportFormat {\n").expect("the enum");
+    let (_, after) = rest.split_once("}\n").expect("its end");
+    let mut formats: Vec<ExportFormat> = ExportFormat::all().collect();
+    formats.sort_by_key(|format| *format as i32);
+    let mut text = "  // As EXPORT_FORMAT_PLY.\n  EXPORT_FORMAT_UNSPECIFIED = 0;\n".to_owned();
+    for format in formats {
+        text += &paragraph("  //", format.help, "  // ");
+        let name = format.name.to_ascii_uppercase();
+        writeln!(text, "  EXPORT_FORMAT_{name} = {};", format as i32).unwrap();
+    }
+    kept(path, &format!("{before}enum ExportFormat {{\n{text}}}\n{after}"));
+}
+
 /// The module of the Python client.
 fn python() -> String {
     let mut text = String::from(
@@ -24,15 +65,7 @@ fn python() -> String {
          formats` writes\nit.\n\n",
     );
     for format in ExportFormat::all() {
-        let words = format.help.trim().split(' ');
-        let (mut line, mut width) = (format!("{}:", format.name), format.name.len() + 1);
-        for word in words {
-            let fits = width + 1 + word.len() <= 100;
-            let (gap, start) = if fits { (" ", width + 1) } else { ("\n    ", 4) };
-            write!(line, "{gap}{word}").unwrap();
-            width = start + word.len();
-        }
-        writeln!(text, "{line}").unwrap();
+        text += &paragraph(&format!("{format}:"), format.help, "    ");
     }
     text += "\"\"\"\n\nfrom typing import Literal, TypeAlias\n\n";
     text += "#: Formats of `export`.\nExportFormat: TypeAlias = Literal[\n";
@@ -52,11 +85,5 @@ fn python() -> String {
 
 #[test]
 fn the_python_client_has_the_table() {
-    let path = root().join("clients/python/src/segsplat/formats.py");
-    let text = python();
-    if std::env::var_os("UPDATE_DOCS").is_some() {
-        fs::write(&path, &text).unwrap();
-    }
-    let written = fs::read_to_string(&path).unwrap_or_default();
-    assert_eq!(written, text, "{} differs: UPDATE_DOCS=1 writes it", path.display());
+    kept("clients/python/src/segsplat/formats.py", &python());
 }

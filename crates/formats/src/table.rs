@@ -25,66 +25,80 @@ use crate::{
 use FormatKind::{Arrays, Folder, Packed, Page, Splats};
 
 macro_rules! formats {
-    ($($(#[doc = $help:literal])+ $format:ident: $name:expr, $title:literal, $ending:expr,
-        $media_type:expr, $lines:literal, $kind:expr;)+) => {
-        /// A format that scenes are exported in.
+    ($($(#[doc = $help:literal])+ $format:ident = $number:literal: $name:expr, $title:literal,
+        $ending:expr, $media_type:expr, $lines:literal, $kind:expr;)+) => {
+        /// A format that scenes are exported in; its number is that of gRPC.
         #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
         #[serde(rename_all = "snake_case")]
         pub enum ExportFormat {
             #[default]
-            $($(#[doc = $help])+ $format,)+
+            $($(#[doc = $help])+ $format = $number,)+
         }
 
-        /// The one table, in the order of the formats.
-        static TABLE: [FormatRow; [$(ExportFormat::$format),+].len()] = [$(FormatRow {
-            format: ExportFormat::$format,
-            name: $name,
-            title: $title,
-            ending: $ending,
-            media_type: $media_type,
-            help: concat!($($help),+),
-            lines: $lines,
-            kind: $kind,
-        }),+];
+        impl ExportFormat {
+            /// All formats, the default first.
+            pub fn all() -> impl Iterator<Item = Self> {
+                [$(Self::$format),+].into_iter()
+            }
+
+            fn row(self) -> &'static FormatRow {
+                match self {
+                    $(Self::$format => {
+                        static ROW: FormatRow = FormatRow {
+                            name: $name,
+                            title: $title,
+                            ending: $ending,
+                            media_type: $media_type,
+                            help: concat!($($help),+),
+                            lines: $lines,
+                            kind: $kind,
+                        };
+                        &ROW
+                    })+
+                }
+            }
+        }
     };
 }
 
-// Format: name, title, ending, media type, whether each line of a text is one, what writes it. The
-// first is the default. Those of Gaussians have columns in their own files.
+// Format and its number over gRPC, which never changes: name, title, ending, media type, whether
+// each line of a text is one, what writes it. The first is the default. Those of Gaussians have
+// columns in their own files.
 formats! {
     /// Standard 3DGS PLY with `semantic_index` as an extra attribute and, after the vertices, the
     /// semantics where they are made.
-    Ply: PLY.name, "PLY", PLY.ending, PLY.media_type, false, Splats(&PLY);
+    Ply = 1: PLY.name, "PLY", PLY.ending, PLY.media_type, false, Splats(&PLY);
     /// The compressed PLY of `PlayCanvas` and `SuperSplat`: 16 bytes a Gaussian.
-    CompressedPly: COMPRESSED_PLY.name, "compressed PLY", COMPRESSED_PLY.ending,
+    CompressedPly = 5: COMPRESSED_PLY.name, "compressed PLY", COMPRESSED_PLY.ending,
         COMPRESSED_PLY.media_type, false, Splats(&COMPRESSED_PLY);
     /// SPZ, version 3: under 16 bytes a Gaussian.
-    Spz: SPZ.name, "SPZ", SPZ.ending, SPZ.media_type, false, Splats(&SPZ);
+    Spz = 6: SPZ.name, "SPZ", SPZ.ending, SPZ.media_type, false, Splats(&SPZ);
     /// SPZ, version 4, which fewer programs read.
-    Spz4: SPZ4.name, "SPZ 4", SPZ4.ending, SPZ4.media_type, false, Splats(&SPZ4);
+    Spz4 = 9: SPZ4.name, "SPZ 4", SPZ4.ending, SPZ4.media_type, false, Splats(&SPZ4);
     /// SOG, the bundle of pictures of `PlayCanvas`, without harmonics over degree 0.
-    Sog: SOG.name, "SOG", SOG.ending, SOG.media_type, false, Splats(&SOG);
+    Sog = 10: SOG.name, "SOG", SOG.ending, SOG.media_type, false, Splats(&SOG);
     /// Binary glTF with `KHR_gaussian_splatting`, the entries of the bank and the semantics.
-    Glb: GLB.name, "GLB", GLB.ending, GLB.media_type, false, Splats(&GLB);
+    Glb = 7: GLB.name, "GLB", GLB.ending, GLB.media_type, false, Splats(&GLB);
     /// `.splat`: 32 bytes a Gaussian.
-    Splat: SPLAT.name, ".splat", SPLAT.ending, SPLAT.media_type, false, Splats(&SPLAT);
+    Splat = 8: SPLAT.name, ".splat", SPLAT.ending, SPLAT.media_type, false, Splats(&SPLAT);
     /// The semantics as `NumPy` arrays: the bank, the row of each mask, the entry of each Gaussian
     /// and of each cell of the photos.
-    Npz: "npz", "semantics (npz)", "npz", OCTETS, false, Arrays;
+    Npz = 2: "npz", "semantics (npz)", "npz", OCTETS, false, Arrays;
     /// The scene as the page draws it: 32 bytes a Gaussian, those that cover most first.
-    Packed: "packed", "packed", "segsplat", OCTETS, false, Packed;
+    Packed = 3: "packed", "packed", "segsplat", OCTETS, false, Packed;
     /// The page with the scene in it, as one file for a disk. It shows the texts of `text`, one a
     /// line, and needs no server.
-    Html: "html", "one HTML file", "html", OCTETS, true, Page;
+    Html = 4: "html", "one HTML file", "html", OCTETS, true, Page;
     /// A folder as COLMAP has it, in a zip: photos, cameras, points and depth maps.
-    Colmap: "colmap", "COLMAP (zip)", "colmap.zip", ZIP, false, Folder(FolderFormat(colmap::write));
+    Colmap = 11: "colmap", "COLMAP (zip)", "colmap.zip", ZIP, false,
+        Folder(FolderFormat(colmap::write));
     /// The same as nerfstudio has it.
-    Nerfstudio: "nerfstudio", "nerfstudio (zip)", "nerfstudio.zip", ZIP, false,
+    Nerfstudio = 12: "nerfstudio", "nerfstudio (zip)", "nerfstudio.zip", ZIP, false,
         Folder(FolderFormat(nerfstudio::write));
     /// What each line of `text` selects in each photo as COCO's annotations, in a zip.
-    Coco: "coco", "COCO (zip)", "coco.zip", ZIP, true, Folder(FolderFormat(coco::write));
+    Coco = 13: "coco", "COCO (zip)", "coco.zip", ZIP, true, Folder(FolderFormat(coco::write));
     /// The same as a JSON with polygons for `LabelMe` beside each photo.
-    Labelme: "labelme", "LabelMe (zip)", "labelme.zip", ZIP, true,
+    Labelme = 14: "labelme", "LabelMe (zip)", "labelme.zip", ZIP, true,
         Folder(FolderFormat(labelme::write));
 }
 
@@ -93,7 +107,6 @@ display_names!(ExportFormat);
 /// A row of the table.
 #[derive(Clone, Copy, Debug)]
 pub struct FormatRow {
-    format: ExportFormat,
     /// Name in calls.
     pub name: &'static str,
     /// Name for people.
@@ -131,16 +144,11 @@ impl Deref for ExportFormat {
     type Target = FormatRow;
 
     fn deref(&self) -> &FormatRow {
-        &TABLE[*self as usize]
+        self.row()
     }
 }
 
 impl ExportFormat {
-    /// All formats, the default first.
-    pub fn all() -> impl Iterator<Item = Self> {
-        TABLE.iter().map(|row| row.format)
-    }
-
     /// The format of this name.
     pub fn named(name: &str) -> Option<Self> {
         Self::all().find(|format| format.name == name)
@@ -162,17 +170,17 @@ impl ExportFormat {
 
     /// Names for people, or endings, of some formats, for messages.
     pub fn listed(some: impl Fn(&Self) -> bool, of: fn(&FormatRow) -> &str) -> String {
-        let some = Self::all().filter(some).map(|format| of(&TABLE[format as usize]));
+        let some = Self::all().filter(some).map(|format| of(format.row()));
         some.collect::<Vec<_>>().join(", ")
     }
 }
 
 impl PartialSchema for ExportFormat {
     fn schema() -> RefOr<Schema> {
-        let each = TABLE.iter().map(|row| format!("\n- `{}`: {}", row.name, row.help.trim()));
+        let each = Self::all().map(|of| format!("\n- `{of}`: {}", of.help.trim()));
         let schema = ObjectBuilder::new()
             .schema_type(Type::String)
-            .enum_values(Some(TABLE.iter().map(|row| row.name)))
+            .enum_values(Some(Self::all().map(|of| of.row().name)))
             .description(Some(format!("File format of an export.\n{}", each.collect::<String>())));
         schema.into()
     }
@@ -182,7 +190,7 @@ impl ToSchema for ExportFormat {}
 
 /// The formats of Gaussians.
 pub fn splat_formats() -> impl Iterator<Item = &'static SplatFormat> {
-    TABLE.iter().filter_map(|row| match row.kind {
+    ExportFormat::all().filter_map(|format| match format.kind {
         Splats(format) => Some(format),
         _ => None,
     })

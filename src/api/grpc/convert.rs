@@ -496,15 +496,13 @@ both_ways! {
     MaskFormat = MaskFormat { Rle, Png, None }
 }
 
-/// Formats have the same names in the table and in the message.
+/// The table of formats has the numbers of the message.
 impl FromNumber for ExportFormat {
     fn from_number(number: i32) -> Option<Self> {
-        match pb::ExportFormat::try_from(number).ok()? {
-            pb::ExportFormat::Unspecified => Some(Self::default()),
-            theirs => {
-                let name = theirs.as_str_name().strip_prefix("EXPORT_FORMAT_")?;
-                Self::named(&name.to_ascii_lowercase())
-            }
+        if number == 0 {
+            Some(Self::default())
+        } else {
+            Self::all().find(|of| *of as i32 == number)
         }
     }
 }
