@@ -1,6 +1,8 @@
 //! What all readers of layouts share: how a layout is recognised and read, and small readers of
 //! numbers and poses.
 
+use std::borrow::Cow;
+
 use glam::{DMat3, DQuat, DVec3};
 
 use super::{
@@ -36,9 +38,10 @@ impl Described {
     }
 }
 
-/// The files of this name.
+/// The files of this name, in any case.
 pub(crate) fn called(folder: &Folder<'_>, name: &str) -> Vec<String> {
-    folder.paths().filter(|path| names::file_name(path) == name).map(str::to_owned).collect()
+    let is_called = |path: &&str| names::file_name(path).eq_ignore_ascii_case(name);
+    folder.paths().filter(is_called).map(str::to_owned).collect()
 }
 
 /// Camera-to-world, row-major, of a rotation and a centre.
@@ -89,15 +92,39 @@ pub(crate) fn count(entries: usize, max: usize, path: &str) -> Result<()> {
     Err(Error::limit(format!("{path}: entries"), format!("more than {max}"), max))
 }
 
-/// The text of a camera file.
-pub(crate) fn text<'a>(bytes: &'a [u8], path: &str) -> Result<&'a str> {
-    std::str::from_utf8(bytes)
-        .map_err(|e| Error::invalid(format!("{path}: not UTF-8 text")).caused_by(e))
+/// The text of a camera file: UTF-8, or UTF-16 with its mark.
+pub(crate) fn text<'a>(bytes: &'a [u8], path: &str) -> Result<Cow<'a, str>> {
+    let units = |of: fn([u8; 2]) -> u16| -> Vec<u16> {
+        bytes[2..].as_chunks::<2>().0.iter().map(|pair| of(*pair)).collect()
+    };
+    let units = match bytes {
+        [0xFF, 0xFE, ..] => units(u16::from_le_bytes),
+        [0xFE, 0xFF, ..] => units(u16::from_be_bytes),
+        _ => {
+            let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
+            return std::str::from_utf8(bytes)
+                .map(Cow::Borrowed)
+                .map_err(|e| Error::invalid(format!("{path}: not UTF-8 text")).caused_by(e));
+        }
+    };
+    String::from_utf16(&units)
+        .map(Cow::Owned)
+        .map_err(|e| Error::invalid(format!("{path}: not UTF-16 text")).caused_by(e))
 }
 
 /// The numbers of a text between spaces; `None` where a word is none.
 pub(crate) fn numbers(text: &str) -> Option<Vec<f64>> {
-    text.split_ascii_whitespace().map(|word| word.parse().ok()).collect()
+    text.split_whitespace().map(number).collect()
+}
+
+/// A number as programs of any locale write it: a comma may stand for the point where there is no
+/// point, and U+2212 for the minus.
+pub(crate) fn number(word: &str) -> Option<f64> {
+    word.parse().ok().or_else(|| {
+        let has_one_comma = word.matches(',').count() == 1 && !word.contains('.');
+        let plain = word.replace('\u{2212}', "-");
+        if has_one_comma { plain.replace(',', ".") } else { plain }.parse().ok()
+    })
 }
 
 /// The numbers of a line, exactly `N`.

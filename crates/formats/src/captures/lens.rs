@@ -6,6 +6,7 @@
 //! θ' = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸). [`Terms`] has the form that holds these and all
 //! other models of COLMAP.
 
+use super::places::Sizes;
 use crate::{
     error::{Error, Result},
     limits::FOCAL_RANGE,
@@ -159,6 +160,9 @@ impl Lens {
     ///
     /// Intrinsics written for another size of the same aspect are scaled to the photo; another
     /// aspect is refused: it is unknown what was cropped.
+    ///
+    /// # Errors
+    /// `invalid_request`, which names `what`, the number and its bound.
     pub fn at_size(&self, width: u32, height: u32, what: &str) -> Result<LensAtSize> {
         let stated = self.stated_size(what)?;
         let [w, h] = stated.unwrap_or([width, height]);
@@ -212,6 +216,16 @@ impl Lens {
         let terms = self.bending(what)?;
         let terms = (!terms.is_none()).then_some(terms);
         Ok(LensAtSize { intrinsics, made_for, terms })
+    }
+
+    /// How the size that is written fits that of a photo.
+    pub(crate) fn sizes(&self, photo: [u32; 2]) -> Sizes {
+        match self.stated_size("") {
+            Ok(None) => Sizes::Fit,
+            Ok(Some(stated)) if stated == photo => Sizes::Fit,
+            Ok(Some(stated)) if same_aspect(stated, photo) => Sizes::Scaled,
+            _ => Sizes::Contradict,
+        }
     }
 
     /// The distortion, all numbers finite.
