@@ -1,13 +1,17 @@
 // What was dropped: photos and their cameras, and what is wrong with each, before it is sent.
 const PHOTO = /\.(jpe?g|png|webp)$/i,
   ARCHIVE = /\.(zip|tar)$/i,
-  SPLATS = /\.(ply|spz|sog|glb|splat)$/i,
   // Files of cameras that the server knows by their paths (docs/captures.md).
   CAMERAS = /(\.(json|txt|bin|npy|traj|pincam)|(^|\/)metadata)$/i,
   HIDDEN = /(^|\/)\./,
   UNREAD_FILE = /(^|\/)(points3D|rigs|frames|project)\.[^/]*$/i,
   UNREAD_FOLDER = /(^|\/)((lowres_|highres_)?depth|confidence)\//i,
   unread = (path) => UNREAD_FILE.test(path) || UNREAD_FOLDER.test(path);
+// The formats of Gaussians stand in the list of exports.
+const isSplats = (path) =>
+  [...$('export').options].some(
+    ({ dataset }) => dataset.splats && path.toLowerCase().endsWith('.' + dataset.splats),
+  );
 const fileName = (path) => path.split('/').pop();
 
 // All files of a drop, with the paths that they have in dropped folders.
@@ -49,7 +53,7 @@ async function readCapture(files) {
     return { form, rows, faults };
   }
   const photos = files.filter(({ path }) => PHOTO.test(path));
-  const splats = files.find(({ path }) => SPLATS.test(path));
+  const splats = files.find(({ path }) => isSplats(path));
   // COLMAP's points beside photos are no scene.
   if (splats && !photos.length) {
     form.append('splats', splats.file, fileName(splats.path));

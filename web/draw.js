@@ -15,7 +15,7 @@ const PROJECT = `#version 300 es
 precision highp float; precision highp int; precision highp usampler2D; precision highp sampler2D;
 uniform usampler2D packed; uniform sampler2D photos;
 uniform mat3 turn; uniform vec3 eye; uniform vec4 lens; uniform vec2 size;
-uniform float near, extent;
+uniform float near, extent; uniform bool antialiased;
 layout(location = 0) out vec4 place; layout(location = 1) out vec4 axes;
 float half15(uint q) { return (float(q & 0x7fffu) / 32767. - .5) * 1.41421356; }
 void main() {
@@ -59,6 +59,8 @@ void main() {
   vec3 area = cross(row0, row1);
   float small = (dot(area, area) + .3 * (xx - .3 + yy - .3) + .09) / large;
   axes = vec4(axis * sqrt(large), vec2(-axis.y, axis.x) * sqrt(small));
+  // What the blur adds to small ones, taken off again.
+  if (antialiased) opacity *= sqrt(dot(area, area) / (large * small));
   place = vec4(f * t.xy + lens.zw, t.z / extent, opacity);
 }`;
 
@@ -443,6 +445,7 @@ class Drawing {
     gl.uniform2f(project.size, width, height);
     gl.uniform1f(project.near, header.near);
     gl.uniform1f(project.extent, header.unit);
+    gl.uniform1i(project.antialiased, header.antialiased ? 1 : 0);
     gl.bindVertexArray(this.none);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.viewport(0, 0, width, height);

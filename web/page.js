@@ -867,9 +867,9 @@ async function makeAndKeepFilm() {
   }
 }
 
-async function exportAs(format) {
+async function exportAs({ value: format, dataset }) {
   const query = new URLSearchParams({ format });
-  if (['html', 'coco', 'labelme'].includes(format) && state.words.length)
+  if ('lines' in dataset && state.words.length)
     query.set('text', state.words.map((word) => word.text).join('\n'));
   say('writing the file …');
   const answer = await server.call(`/v1/scenes/${state.scene.id}/export?${query}`);
@@ -932,9 +932,9 @@ function bind() {
   };
   $('film-stop').onclick = () => state.filming?.abort();
   $('export').onchange = ready(() => {
-    const format = $('export').value;
+    const format = $('export').selectedOptions[0];
     $('export').value = '';
-    if (format) exportAs(format).catch(failed);
+    if (format.value) exportAs(format).catch(failed);
   });
   $('ask').onsubmit = (e) => {
     e.preventDefault();

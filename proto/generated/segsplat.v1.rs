@@ -132,9 +132,10 @@ pub struct ViewOptions {
     /// Background colour, 0..1; left out: the scene's backdrop.
     #[prost(message, optional, tag = "4")]
     pub background: ::core::option::Option<Vec3>,
-    /// Opacity compensated for the blur of the picture's pixels.
-    #[prost(bool, tag = "5")]
-    pub antialiased: bool,
+    /// Opacity compensated for the blur of the picture's pixels; left out: as the scene's file of
+    /// Gaussians says.
+    #[prost(bool, optional, tag = "5")]
+    pub antialiased: ::core::option::Option<bool>,
     /// Near plane, world units; left out: 0.01 of the scene's median depth.
     #[prost(float, optional, tag = "6")]
     pub near: ::core::option::Option<f32>,
@@ -936,6 +937,10 @@ pub struct HealthReport {
     /// Format of the file of Gaussians that the scene is; empty where it was made of photos.
     #[prost(string, tag = "15")]
     pub file_format: ::prost::alloc::string::String,
+    /// Whether that file was made for a renderer that compensates opacity for the blur of small
+    /// Gaussians: views are drawn so unless they say otherwise.
+    #[prost(bool, tag = "16")]
+    pub antialiased: bool,
 }
 /// How many Gaussians were dropped or clamped for one reason.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]

@@ -156,12 +156,14 @@ impl Access {
         Ok(Self(RwLock::new(Arc::new(InForce::load(config)?))))
     }
 
-    /// Reads the file again and returns the number of keys. On an error the old keys stay.
-    pub(super) fn reload(&self, config: &Config) -> Result<usize> {
+    /// Reads the file again; the call that this gives puts its keys in force, and gives how many.
+    pub(super) fn read_again(&self, config: &Config) -> Result<impl FnOnce() -> usize> {
         let new = InForce::load(config)?;
-        let count = new.keys.as_ref().map_or(0, |(_, quotas)| quotas.len());
-        *self.0.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(new);
-        Ok(count)
+        Ok(move || {
+            let count = new.keys.as_ref().map_or(0, |(_, quotas)| quotas.len());
+            *self.0.write().unwrap_or_else(PoisonError::into_inner) = Arc::new(new);
+            count
+        })
     }
 
     /// Whether callers need a key.

@@ -57,18 +57,17 @@ impl Api {
         self.service.networks_ready() && !self.drain.is_stopping()
     }
 
-    /// Puts the keys and limits of `config` in force. On an error nothing changes.
-    ///
-    /// # Errors
-    /// `invalid_request` when the keys file cannot be used.
-    pub fn reload(&self, config: &Config) -> Result<()> {
-        let keys = self.access.reload(config)?;
-        let later = self.service.reload(config.limits.clone());
-        tracing::info!(keys, "keys and limits are read again");
-        if !later.is_empty() {
-            tracing::warn!(limits = ?later, "these limits change only with the next start");
-        }
-        Ok(())
+    /// Reads what `config` names again; the call that this gives puts its keys and limits in force.
+    fn read_again(&self, config: &Config) -> Result<impl FnOnce()> {
+        let put_keys = self.access.read_again(config)?;
+        let limits = config.limits.clone();
+        Ok(move || {
+            let (keys, later) = (put_keys(), self.service.reload(limits));
+            tracing::info!(keys, "keys and limits are read again");
+            if !later.is_empty() {
+                tracing::warn!(limits = ?later, "these limits change only with the next start");
+            }
+        })
     }
 }
 

@@ -43,7 +43,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let first = service.render(&scene, &spec)?;
     let near = options.near.unwrap_or_else(|| default_near(scene.meta.report.median_depth));
     let request = RenderRequest {
-        antialiased: options.antialiased,
+        antialiased: options.antialiased.unwrap_or(scene.meta.report.antialiased),
         quality: options.quality,
         ..RenderRequest::plain(first.camera, Kinds::ALL, near)
     };

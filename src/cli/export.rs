@@ -10,8 +10,9 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
     formats::{
-        folders::{FOLDER_FORMATS, FolderFormat},
-        splats::{SplatFormat, endings},
+        folders::FolderFormat,
+        splats::SplatFormat,
+        table::{ExportFormat, FormatKind},
     },
     names::named,
     scene::Preset,
@@ -20,17 +21,14 @@ use crate::{
 
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
-    /// Scene file, a folder with one, or a file of Gaussians (PLY, compressed PLY, SPZ, SOG, GLB,
-    /// .splat)
+    #[arg(help = scene_file::scene_help())]
     scene: PathBuf,
-    /// File to write; its ending is the format: ply, compressed.ply, spz, v4.spz, sog, glb, splat;
-    /// of a folder colmap.zip, nerfstudio.zip, coco.zip, labelme.zip
-    #[arg(short, long, value_name = "FILE")]
+    #[arg(short, long, value_name = "FILE", help = output_help())]
     output: PathBuf,
     /// What the scene was made of, a folder or an archive, for a folder with its photos
     #[arg(long, value_name = "PATH")]
     photos: Option<PathBuf>,
-    /// What to look for, for coco.zip and labelme.zip; may be given many times
+    /// What to look for, for a folder with masks; may be given many times
     #[arg(long = "text", value_name = "TEXT")]
     texts: Vec<String>,
     /// How it is drawn and texts are scored: default or paper; by default as the scene was made
@@ -44,21 +42,36 @@ pub(super) struct Args {
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let name = args.output.file_name().unwrap_or_default().to_string_lossy();
-    if let Some(format) = FolderFormat::of_file(&name) {
-        return folder(args, format, config, out);
-    }
-    let format = scene_file::splat_format(&args.output).ok_or_else(|| {
-        let folders = FOLDER_FORMATS.map(|format| format.ending).join(", ");
-        let (endings, path) = (endings(), args.output.display());
-        let why = format!("the ending must be that of a format: {endings}, {folders}");
-        Error::invalid(format!("{path}: {why}"))
-    })?;
+    let format = ExportFormat::of_file(&name);
+    let splats = match format.map(|format| (format, format.kind)) {
+        Some((format, FormatKind::Folder(write))) => {
+            return folder(args, (format, write), config, out);
+        }
+        Some((_, FormatKind::Splats(splats))) => splats,
+        _ => {
+            let (gaussians, folders) = endings();
+            let path = args.output.display();
+            let why = format!("the ending must be that of a format: {gaussians}, {folders}");
+            return Err(Error::invalid(format!("{path}: {why}")));
+        }
+    };
     if args.photos.is_some() || !args.texts.is_empty() {
-        let name = format.name;
+        let name = splats.name;
         let why = format!("--photos and --text go with folders, not with {name}");
         return Err(Error::invalid(why));
     }
-    gaussians(args, format, config, out)
+    gaussians(args, splats, config, out)
+}
+
+/// Endings of files of Gaussians, and of folders.
+fn endings() -> (String, String) {
+    let of = |some: fn(&ExportFormat) -> bool| ExportFormat::listed(some, |row| row.ending);
+    (of(|of| of.is_splats()), of(|of| matches!(of.kind, FormatKind::Folder(_))))
+}
+
+fn output_help() -> String {
+    let (gaussians, folders) = endings();
+    format!("File to write; its ending is the format: {gaussians}; of a folder {folders}")
 }
 
 fn gaussians(
@@ -80,11 +93,16 @@ fn gaussians(
     out.answer(&format!("{path}: {count} Gaussians as {}", format.name), &value)
 }
 
-fn folder(args: &Args, format: &FolderFormat, config: &Config, out: &Output) -> Result<()> {
+fn folder(
+    args: &Args,
+    format: (ExportFormat, FolderFormat),
+    config: &Config,
+    out: &Output,
+) -> Result<()> {
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
     let photos = args.photos.as_deref();
     let upload = photos.map(|path| reconstruct::upload(path, config)).transpose()?;
-    let service = engine::offline(config, format.texts)?;
+    let service = engine::offline(config, format.0.lines)?;
     let unwritable = |e| scene_file::unwritable(&args.output, e);
     // Half a zip is of no use, and what was there before stays until there is a whole one.
     let part = args.output.with_added_extension("part");
@@ -94,7 +112,7 @@ fn folder(args: &Args, format: &FolderFormat, config: &Config, out: &Output) -> 
     let photos = written.inspect_err(|_| drop(fs_err::remove_file(&part)))?;
     let size_bytes = file.metadata().map_err(unwritable)?.len();
     fs_err::rename(&part, &args.output).map_err(unwritable)?;
-    let (path, name, views) = (args.output.display(), format.name, scene.meta.cameras.len());
+    let (path, name, views) = (args.output.display(), format.0.name, scene.meta.cameras.len());
     let value = json!({
         "output": path.to_string(), "format": name, "views": views, "photos": photos,
         "size_bytes": size_bytes,

@@ -10,8 +10,7 @@ use crate::{config::Config, error::Result, scene::Gaussians};
 
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
-    /// Scene file, a folder with one, or a file of Gaussians (PLY, compressed PLY, SPZ, SOG, GLB,
-    /// .splat)
+    #[arg(help = scene_file::scene_help())]
     scene: PathBuf,
 }
 

@@ -65,8 +65,7 @@ enum Command {
     Query(Box<query::Args>),
     /// Write the bank of a scene, or the pixels of a view over it, as an npz file
     Features(Box<features::Args>),
-    /// Write a scene for other programs: PLY, SPZ, SOG, GLB, .splat, COLMAP, nerfstudio, COCO,
-    /// labelme
+    /// Write a scene for other programs: Gaussians, or a folder with photos and depth or masks
     Export(Box<export::Args>),
     /// Show what is in a scene file
     Inspect(inspect::Args),

@@ -9,7 +9,7 @@ use super::{camera, engine, output::Output, scene_file};
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
-    formats::splats::{SplatFormat, endings},
+    formats::{splats::SplatFormat, table::ExportFormat},
     names::named,
     service::{
         Boxes, CameraFields, MaskFormat, QuerySpec, ScoringOptions, TextResult, ViewOptions,
@@ -97,7 +97,7 @@ fn ending_of(path: &Path) -> Result<Ending> {
         return Ok(Ending::Png);
     }
     scene_file::splat_format(path).map(Ending::Gaussians).ok_or_else(|| {
-        let endings = endings();
+        let endings = ExportFormat::listed(|of| of.is_splats(), |row| row.ending);
         let path = path.display();
         Error::invalid(format!(
             "{path}: the ending must be png (for the mask) or one of {endings} (for the Gaussians)"

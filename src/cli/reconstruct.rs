@@ -15,12 +15,14 @@ use super::{
     engine,
     output::Output,
     scene_file::{
-        path_of, semantics_path, splat_format, splats_of, unreadable, unwritable, write_splats,
+        path_of, semantics_path, splat_format, splat_titles, splats_of, unreadable, unwritable,
+        write_splats,
     },
 };
 use crate::{
     config::{Config, ConfigArgs},
     error::{Error, ErrorCode, Result},
+    formats::table::ExportFormat,
     jobs::{budget_ms, refine_options, refiner},
     names::named,
     pipeline::{
@@ -38,12 +40,12 @@ use crate::{
 
 #[derive(Clone, Debug, clap::Args)]
 pub(super) struct Args {
-    /// Folder of a capture (docs/captures.md has the layouts), a zip or tar of one, or a file of
-    /// Gaussians (PLY, compressed PLY, SPZ, SOG, GLB, .splat), which keeps its semantics
+    #[arg(help = format!("Folder of a capture (docs/captures.md has the layouts), a zip or tar of \
+        one, or a file of Gaussians ({}), which keeps its semantics", splat_titles()))]
     photos: PathBuf,
-    /// Scene file to write; with the ending ply, compressed.ply, spz, v4.spz, sog, glb or splat
-    /// that format
     #[arg(short, long, value_name = "FILE")]
+    #[arg(help = format!("Scene file to write; with an ending of these that format: {}",
+        ExportFormat::listed(|of| of.is_splats(), |row| row.ending)))]
     output: PathBuf,
     /// Views that the network takes at once [default: 4]
     #[arg(long)]

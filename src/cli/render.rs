@@ -20,8 +20,7 @@ use crate::{
 #[derive(Clone, Debug, clap::Args)]
 #[command(allow_negative_numbers = true)]
 pub(super) struct Args {
-    /// Scene file, a folder with one, or a file of Gaussians (PLY, compressed PLY, SPZ, SOG, GLB,
-    /// .splat)
+    #[arg(help = scene_file::scene_help())]
     scene: PathBuf,
     /// Picture to write; its ending (png, jpg, webp, npy, rgb8, rgba8, grey8) is the format
     #[arg(short, long, value_name = "FILE")]

@@ -10,7 +10,8 @@ use crate::{
     error::{Error, ErrorCode, Result},
     formats::{
         container::{read_scene, read_semantics},
-        splats::{SplatFile, SplatFormat, SplatsRead, read_splats},
+        splats::{SplatFile, SplatFormat, SplatsRead},
+        table::{ExportFormat, read_splats, splat_format_of},
     },
     limits::Limits,
     scene::{Scene, SceneOptions},
@@ -42,9 +43,19 @@ pub(super) fn path_of(path: &Path) -> PathBuf {
     if path.is_dir() { path.join(IN_FOLDER) } else { path.to_owned() }
 }
 
+/// What a command reads, for its help.
+pub(super) fn scene_help() -> String {
+    format!("Scene file, a folder with one, or a file of Gaussians ({})", splat_titles())
+}
+
+/// The formats of Gaussians, for help.
+pub(super) fn splat_titles() -> String {
+    ExportFormat::listed(|of| of.is_splats(), |row| row.title)
+}
+
 /// The format of Gaussians that the ending of a file says.
 pub(super) fn splat_format(path: &Path) -> Option<&'static SplatFormat> {
-    SplatFormat::of_file(&path.file_name()?.to_string_lossy())
+    splat_format_of(&path.file_name()?.to_string_lossy())
 }
 
 /// Writes Gaussians as a file for other programs.

@@ -50,6 +50,11 @@ pub trait SceneNetworks: Send + Sync {
         NetworkState::Open("")
     }
 
+    /// Waits until they are open, or are known to stay closed.
+    fn opened(&self) -> NetworkState {
+        self.state()
+    }
+
     /// Why a network is not computed where it was to be; `None` where all are.
     fn remark(&self) -> Option<String> {
         None
@@ -189,6 +194,12 @@ impl SceneNetworks for PipelineNetworks {
             Some(Ok(engine)) => NetworkState::Open(engine.geometry().provider().name()),
             Some(Err(_)) => NetworkState::Broken,
         }
+    }
+
+    fn opened(&self) -> NetworkState {
+        // Waits for the thread that opens them.
+        let _ = self.0.get();
+        self.state()
     }
 
     fn remark(&self) -> Option<String> {

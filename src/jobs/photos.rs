@@ -10,7 +10,7 @@ use parking_lot::Mutex;
 
 use crate::{
     error::{Error, Result},
-    formats::splats::read_splats,
+    formats::table::read_splats,
     limits::Limits,
     pipeline::{self, PhotoSet},
     scene::{PhotoHash, Scene, SceneId, SceneOptions, SemanticsMode, Stage, StageTime, Upload},

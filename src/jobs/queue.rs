@@ -11,7 +11,7 @@ use std::{
 
 use parking_lot::{Condvar, Mutex};
 
-use super::job::Kind;
+use super::kind::Kind;
 use crate::scene::SceneId;
 
 /// Whose jobs a lane holds.
@@ -130,7 +130,7 @@ impl Queue {
             Some((_, jobs)) => jobs.push_back(id),
             None => inner.lanes.push_back((lane, VecDeque::from([id]))),
         }
-        // Workers of the other kind may wait too.
+        // Workers of other kinds may wait too.
         self.changed.notify_all();
     }
 
@@ -148,26 +148,18 @@ impl Queue {
         }
     }
 
-    /// Takes the waiting jobs of a scene out.
-    pub(super) fn remove(&self, id: &SceneId) {
-        self.inner.lock().lanes.retain_mut(|(_, jobs)| {
-            jobs.retain(|other| other != id);
-            !jobs.is_empty()
-        });
-    }
-
-    /// Takes the waiting job of one kind that a scene has out.
-    pub(super) fn remove_kind(&self, kind: Kind, id: &SceneId) {
+    /// Takes the waiting jobs of a scene out; only those of a kind where one is given.
+    pub(super) fn remove(&self, id: &SceneId, kind: Option<Kind>) {
         self.inner.lock().lanes.retain_mut(|(lane, jobs)| {
-            jobs.retain(|other| lane.kind != kind || other != id);
+            jobs.retain(|other| kind.is_some_and(|kind| lane.kind != kind) || other != id);
             !jobs.is_empty()
         });
     }
 
-    /// Jobs that go before the scene `id` now; `None` when it does not wait.
-    pub(crate) fn ahead(&self, id: &SceneId) -> Option<usize> {
+    /// Jobs of a kind that go before that of the scene `id` now; `None` when it does not wait.
+    pub(super) fn ahead(&self, kind: Kind, id: &SceneId) -> Option<usize> {
         let inner = self.inner.lock();
-        let lanes = inner.lanes.iter().filter(|(lane, _)| lane.kind == Kind::Scene);
+        let lanes = inner.lanes.iter().filter(|(lane, _)| lane.kind == kind);
         let lanes: Vec<&VecDeque<SceneId>> = lanes.map(|(_, jobs)| jobs).collect();
         let place = |jobs: &VecDeque<SceneId>| jobs.iter().position(|waiting| waiting == id);
         let (turn, place) =
@@ -207,6 +199,7 @@ impl Queue {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::jobs::{scene::SCENE, semantics::SEMANTICS};
 
     fn id(byte: u8) -> SceneId {
         SceneId::from_bytes([byte; 16])
@@ -215,45 +208,45 @@ mod tests {
     #[test]
     fn a_reserved_place_counts_and_comes_back() {
         let queue = Queue::new(2);
-        let reserve = || queue.reserve(Kind::Scene, None);
+        let reserve = || queue.reserve(SCENE, None);
         let (first, second) = (reserve().unwrap(), reserve().unwrap());
         assert_eq!(reserve().unwrap_err(), Full::All(2), "both places are promised");
         drop(second);
         reserve().unwrap().fill(id(2));
         first.fill(id(1));
         assert!(reserve().is_err(), "both places are filled");
-        assert_eq!((queue.ahead(&id(2)), queue.ahead(&id(1))), (Some(0), Some(1)));
-        assert_eq!(queue.pop(Kind::Scene), Some(id(2)));
+        assert_eq!((queue.ahead(SCENE, &id(2)), queue.ahead(SCENE, &id(1))), (Some(0), Some(1)));
+        assert_eq!(queue.pop(SCENE), Some(id(2)));
         assert!(reserve().is_ok());
     }
 
     #[test]
     fn a_removed_job_is_not_given_out() {
         let queue = Queue::new(8);
-        (1..=3).for_each(|byte| queue.push(Kind::Scene, id(byte), None));
-        queue.remove(&id(2));
-        assert_eq!((queue.pop(Kind::Scene), queue.pop(Kind::Scene)), (Some(id(1)), Some(id(3))));
+        (1..=3).for_each(|byte| queue.push(SCENE, id(byte), None));
+        queue.remove(&id(2), None);
+        assert_eq!((queue.pop(SCENE), queue.pop(SCENE)), (Some(id(1)), Some(id(3))));
     }
 
     #[test]
     fn closing_wakes_a_waiting_worker_and_refuses_new_jobs() {
         let queue = Queue::new(8);
         std::thread::scope(|scope| {
-            let worker = scope.spawn(|| queue.pop(Kind::Scene));
+            let worker = scope.spawn(|| queue.pop(SCENE));
             queue.close();
             assert_eq!(worker.join().unwrap(), None);
         });
-        assert_eq!(queue.reserve(Kind::Scene, None).unwrap_err(), Full::Closed);
+        assert_eq!(queue.reserve(SCENE, None).unwrap_err(), Full::Closed);
     }
 
     #[test]
     fn owners_take_turns_and_the_places_ahead_are_those_that_go_before() {
         let queue = Queue::new(20);
         for (byte, owner) in [(1, "a"), (2, "a"), (3, "a"), (4, "b"), (5, "c"), (6, "b")] {
-            queue.push(Kind::Scene, id(byte), Some(owner));
+            queue.push(SCENE, id(byte), Some(owner));
         }
-        let ahead: Vec<_> = (1..=6).map(|byte| queue.ahead(&id(byte)).unwrap()).collect();
-        let order: Vec<_> = (0..6).map(|_| queue.pop(Kind::Scene).unwrap()).collect();
+        let ahead: Vec<_> = (1..=6).map(|byte| queue.ahead(SCENE, &id(byte)).unwrap()).collect();
+        let order: Vec<_> = (0..6).map(|_| queue.pop(SCENE).unwrap()).collect();
         assert_eq!(order, [1, 4, 5, 2, 6, 3].map(id), "one each in turn, then the rest");
         let place = |byte| order.iter().position(|other| *other == id(byte)).unwrap();
         assert_eq!(ahead, (1..=6).map(place).collect::<Vec<_>>());
@@ -262,18 +255,18 @@ mod tests {
     #[test]
     fn each_kind_has_its_own_places_and_turns() {
         let queue = Queue::new(1);
-        let scene = queue.reserve(Kind::Scene, None).unwrap();
-        queue.reserve(Kind::Semantics, None).unwrap().fill(id(2));
+        let scene = queue.reserve(SCENE, None).unwrap();
+        queue.reserve(SEMANTICS, None).unwrap().fill(id(2));
         scene.fill(id(1));
-        assert_eq!((queue.len(Kind::Scene), queue.ahead(&id(2))), (1, None));
-        assert_eq!(queue.pop(Kind::Semantics), Some(id(2)));
-        assert_eq!(queue.pop(Kind::Scene), Some(id(1)));
+        assert_eq!((queue.len(SCENE), queue.ahead(SCENE, &id(2))), (1, None));
+        assert_eq!(queue.pop(SEMANTICS), Some(id(2)));
+        assert_eq!(queue.pop(SCENE), Some(id(1)));
     }
 
     #[test]
     fn one_owner_leaves_places_for_others() {
         let queue = Queue::new(4);
-        let reserve = |owner| queue.reserve(Kind::Scene, owner);
+        let reserve = |owner| queue.reserve(SCENE, owner);
         let _being_written = reserve(Some("a")).unwrap();
         reserve(Some("a")).unwrap().fill(id(1));
         assert_eq!(reserve(Some("a")).unwrap_err(), Full::Share(2));

@@ -1,10 +1,9 @@
 //! The job that refines a finished scene. The scene is served meanwhile; the better version takes
 //! its place in one step.
 //!
-//! It goes behind everything else: before each step it waits until no scene and no semantics are
-//! made and no view was drawn for a moment. Where views never end it has a fourth of the time. It
-//! holds no slot and no room. What it still has to do is in the record, so that a start begins it
-//! again.
+//! It goes behind everything else: before each step it waits until no other job waits or runs and
+//! no view was drawn for a moment. Where views never end it has a fourth of the time. It holds no
+//! slot and no room. What it still has to do is in the record, so that a start begins it again.
 
 use std::{
     sync::Arc,
@@ -14,11 +13,14 @@ use std::{
 use parking_lot::Mutex;
 
 use super::{
-    Jobs,
-    job::{Job, Kind, Reason},
+    bell::FOREVER,
+    change::{Change, forget_refinement},
+    job::{Job, Reason},
+    kind::{JobKind, Kind},
+    shared::{Jobs, Work},
 };
 use crate::{
-    error::{Error, Result},
+    error::Result,
     limits::Limits,
     pipeline::{
         PhotoSet,
@@ -27,15 +29,12 @@ use crate::{
     refine::{HOLDS_OUT_FROM, RefineBudget, RefineOptions, RefinedVersion},
     render::{DifferentiableRenderer, cpu::CpuRenderer},
     scene::{
-        PosedPhoto, Refine, RefineReport, RefineState, RefineStatus, Scene, SceneId, Stage, Watch,
-        unless_cancelled,
+        PosedPhoto, Refine, RefineReport, RefineState, RefineStatus, Scene, SceneError, SceneId,
+        SceneStatus, Stage, Watch,
     },
-    store::{self, Record, RefineOrder},
+    store::{Record, RefineOrder},
 };
 
-/// Starts without a better version before a refinement is given up: one that kills the server must
-/// not do so forever.
-const ATTEMPTS_MAX: u32 = 3;
 /// Processor time that `auto` takes, and the least and most milliseconds of it.
 const AUTO_CPU_MS: u64 = 120_000;
 const AUTO_MS: [u64; 2] = [10_000, 60_000];
@@ -45,10 +44,54 @@ const QUIET: Duration = Duration::from_millis(250);
 /// step takes a millisecond of a device, and a tenth of a second of a processor.
 const WAITS: u32 = 3;
 const PATIENCE: Duration = Duration::from_secs(1);
-/// Time between two looks at whether it may go on.
-const LOOK: Duration = Duration::from_millis(10);
 /// A change of the fraction that watchers are told.
 const TOLD: f32 = 0.01;
+
+/// Refines a finished scene.
+pub(super) struct RefineScene;
+
+pub(super) const REFINE: Kind = &RefineScene;
+
+impl JobKind for RefineScene {
+    fn name(&self) -> &'static str {
+        "refine"
+    }
+
+    fn what(&self) -> &'static str {
+        "the scene's refinement"
+    }
+
+    fn show(&self, status: &mut SceneStatus, stage: Stage, fraction: f32) {
+        // The parts of its start are none of a refinement's own time.
+        if stage == Stage::Refine {
+            status.refinement.fraction = fraction;
+        }
+    }
+
+    fn attempts<'a>(&self, record: &'a mut Record) -> Option<&'a mut u32> {
+        record.refine.as_mut().map(|order| &mut order.attempts)
+    }
+
+    fn failed(&self, record: &mut Record, error: SceneError, _now_ms: u64) {
+        forget_refinement(record);
+        record.status.refinement =
+            RefineStatus { error: Some(error), ..RefineStatus::new(RefineState::Failed) };
+    }
+}
+
+impl Work for RefineScene {
+    fn threads(&self, _: usize) -> usize {
+        1
+    }
+
+    fn span(&self, _: &Jobs, id: &SceneId) -> tracing::Span {
+        tracing::info_span!("refine", scene = %id)
+    }
+
+    fn run(&self, jobs: &Jobs, job: &Job) -> Result<()> {
+        jobs.refine_scene(job)
+    }
+}
 
 /// What refines where views are drawn on a device that can, or on none.
 ///
@@ -87,14 +130,6 @@ pub(crate) fn budget_ms(refine: Refine, photos: usize, threads: usize) -> Option
     }
 }
 
-/// Forgets a refinement that another process has.
-pub(super) fn reset(record: &mut Record) {
-    record.refine = None;
-    if record.status.is_refined_now() {
-        record.status.refinement = RefineStatus::default();
-    }
-}
-
 impl Jobs {
     /// Queues the refinement of a finished scene, or ends it; one that is on its way stays.
     /// Fails with `scene_not_found`; `overloaded` when too many wait, or the server stops;
@@ -108,9 +143,11 @@ impl Jobs {
         if record.refine.is_some() {
             return Ok(());
         }
-        let reserved = self.queue.reserve(Kind::Refine, record.owner.as_deref());
+        let reserved = self.queue.reserve(REFINE, record.owner.as_deref());
         let place = reserved.map_err(|full| self.overloaded(full))?;
-        if self.order(id, Some(RefineOrder { ms, attempts: 0 }))? {
+        let order = RefineOrder { ms, attempts: 0 };
+        // Of many callers one is the first.
+        if self.records.apply(id, &Change::RefineOrdered(order))?.is_any() {
             self.replicas.hold(id);
             place.fill(id.clone());
         }
@@ -118,84 +155,42 @@ impl Jobs {
     }
 
     fn end_refinement(&self, id: &SceneId) -> Result<()> {
-        self.queue.remove_kind(Kind::Refine, id);
-        self.running.stop_kind(Kind::Refine, id, Reason::Cancelled);
-        self.order(id, None).map(drop)
-    }
-
-    /// Keeps what is to be refined, in the record and in the store; whether it was otherwise.
-    fn order(&self, id: &SceneId, order: Option<RefineOrder>) -> Result<bool> {
-        let mut kept = Ok(false);
-        self.records.update(id, |record| {
-            // Under the record's lock: of many callers one is the first.
-            if record.refine.is_some() == order.is_some() {
-                return;
-            }
-            let before = record.clone();
-            record.refine = order;
-            let state = match (&order, &record.status.report) {
-                (Some(_), _) => RefineState::Running,
-                (None, Some(report)) if report.refinement.is_some() => RefineState::Done,
-                (None, _) => RefineState::None,
-            };
-            record.status.refinement = RefineStatus::new(state);
-            kept = self.parts.store.put_record(record).map(|()| true);
-            if kept.is_err() {
-                *record = before;
-            }
-        });
-        kept
-    }
-
-    /// Keeps a record of the job. A refinement that is ended meanwhile stays ended in the store.
-    fn keep_beside_orders(&self, record: &Record) -> Result<()> {
-        self.parts.store.put_record(record)?;
-        match self.records.find(&record.status.id) {
-            Some(now) if now.refine.is_some() != record.refine.is_some() => {
-                self.parts.store.put_record(&now)
-            }
-            _ => Ok(()),
-        }
+        self.queue.remove(id, Some(REFINE));
+        self.running.stop(Reason::Cancelled, |job| job.kind == REFINE && job.scene == *id);
+        self.records.apply(id, &Change::RefineEnded(None)).map(drop)
     }
 
     /// The refinement that a scene is to have once it is done, where its create call or the
     /// configuration asks for one and the queue has room.
-    pub(super) fn first_order(&self, done: &Record) -> Option<RefineOrder> {
-        let report = done.status.report.as_ref()?;
+    pub(super) fn first_order(&self, record: &Record, scene: &Scene) -> Option<RefineOrder> {
+        let report = &scene.meta.report;
         if report.refinement.is_some() || report.file_format.is_some() {
             return None; // a copy of a scene that was refined, or one without photos
         }
-        let how = done.options.refine.unwrap_or(self.parts.refine);
-        let ms = budget_ms(how, done.status.cameras.len(), self.parts.threads)?;
-        self.queue.reserve(Kind::Refine, done.owner.as_deref()).ok()?;
+        let how = record.options.refine.unwrap_or(self.parts.refine);
+        let ms = budget_ms(how, scene.meta.cameras.len(), self.parts.threads)?;
+        self.queue.reserve(REFINE, record.owner.as_deref()).ok()?;
         Some(RefineOrder { ms, attempts: 0 })
     }
 
     /// Where a version was published and its record was not: the record of that version.
-    pub(super) fn mend(&self, record: &mut Record) {
+    pub(super) fn mend(&self, record: &Record) {
         let id = &record.status.id;
         let Ok(scene) = self.parts.store.scene(id) else { return };
-        if record.scene_sha256.as_ref() != Some(&scene.sha256) {
-            shows(record, &scene);
-            self.keep_record(record);
+        if record.scene_sha256.as_ref() != Some(&scene.sha256)
+            && let Err(error) = self.records.apply(id, &Change::Published(&scene))
+        {
+            tracing::error!(scene = %id, %error, "its status is not kept");
         }
     }
 
-    pub(super) fn refine_scene(&self, job: &Job) -> Result<()> {
+    fn refine_scene(&self, job: &Job) -> Result<()> {
         let id = &job.scene;
-        let begun = self.records.update(id, |record| {
-            if let Some(order) = &mut record.refine {
-                order.attempts += 1;
-            }
-        });
-        let Some(record) = begun else { return Ok(()) };
+        let record = self.record(id)?;
         let Some(order) = record.refine else { return Ok(()) };
-        self.keep_beside_orders(&record)?;
-        if order.attempts > ATTEMPTS_MAX {
-            return Err(Error::internal(format!(
-                "given up: the server stopped {ATTEMPTS_MAX} times without a better version"
-            )));
-        }
+        self.check_attempts(job.kind, &record)?;
+        self.records.apply(id, &Change::Started(job.kind))?;
+        self.mend(&record);
         let turns = Turns { jobs: self, job, resumed: Mutex::new(Instant::now()) };
         let progress = |_: Stage, _: f32| drop(turns.give_way());
         let watch = Watch { progress: &progress, cancel: &job.cancel };
@@ -203,7 +198,7 @@ impl Jobs {
         let scene = self.parts.store.scene(id)?;
         let upload = self.upload(id, watch)?;
         let PhotoSet { photos, warnings, .. } = upload.photos()?;
-        let options = refine_options(order.ms, &self.parts.limits);
+        let options = refine_options(order.ms, &self.parts.limits.get());
         let mut remake = |photos: Vec<PosedPhoto>| {
             let photos = PhotoSet { photos, warnings: warnings.clone(), read_ms: 0.0 };
             self.parts.scenes.make_for_refinement(&photos, &record.options, watch)
@@ -231,49 +226,19 @@ impl Jobs {
         let _lock = self.lock(id.as_str(), job)?;
         let served = store.scene(id)?;
         let scene = store.put_version(version_of(start, &served, version)?)?;
-        let Some(mut record) = self.records.find(id).map(Arc::unwrap_or_clone) else {
-            return Ok(());
-        };
-        let change = |record: &mut Record| {
-            shows(record, &scene);
-            record.status.version += 1;
-            if let Some(order) = &mut record.refine {
-                order.attempts = 0;
-            }
-        };
-        change(&mut record);
-        store.put_status(&record)?;
-        if let Some(shown) = self.records.update(id, change) {
-            self.keep_beside_orders(&shown)?;
-        }
+        let published = self.records.apply(id, &Change::Published(&scene))?.after;
         let psnr = version.report.psnr_after;
-        tracing::info!(scene = %id, version = record.status.version, psnr, "refined");
+        tracing::info!(scene = %id, version = published.status.version, psnr, "refined");
         Ok(())
     }
 
     fn finish_refinement(&self, job: &Job, found: &RefineReport) -> Result<()> {
-        let (id, store) = (&job.scene, &self.parts.store);
+        let id = &job.scene;
         let _lock = self.lock(id.as_str(), job)?;
-        let Some(mut record) = self.records.find(id).map(Arc::unwrap_or_clone) else {
-            return Ok(());
-        };
-        let found = reported(record.status.cameras.len(), found);
-        let change = |record: &mut Record| {
-            record.refine = None;
-            record.status.refinement =
-                RefineStatus { fraction: 1.0, ..RefineStatus::new(RefineState::Done) };
-            // Where no version was better, the record alone says what came out.
-            if let Some(report) = &mut record.status.report {
-                report.refinement.get_or_insert_with(|| found.clone());
-            }
-        };
-        change(&mut record);
-        store.put_status(&record)?;
-        self.records.update(id, change);
+        let found = reported(self.record(id)?.status.cameras.len(), found);
+        self.records.apply(id, &Change::RefineEnded(Some(&found)))?;
         tracing::info!(scene = %id, steps = found.steps, "refinement is over");
-        if !self.parts.keep_photos && record.status.is_settled() {
-            store.drop_upload(id)?;
-        }
+        self.drop_upload_unless_needed(id);
         Ok(())
     }
 }
@@ -293,17 +258,20 @@ impl Turns<'_> {
         let Self { jobs, job, resumed } = self;
         let mut resumed = resumed.lock();
         let (worked, begun) = (resumed.elapsed(), Instant::now());
-        loop {
-            unless_cancelled(&job.cancel)?;
-            let made = [Kind::Scene, Kind::Semantics];
-            let makes = |kind| jobs.queue.len(kind) > 0 || !jobs.running.scenes(kind).is_empty();
+        let is_made = |kind: Kind| {
+            let makes = jobs.queue.len(kind) > 0 || !jobs.running.scenes(kind).is_empty();
+            makes && kind != job.kind
+        };
+        jobs.bell.wait_in_job(&job.cancel, || {
             let left = views_go_first((jobs.parts.drawn)(), worked, begun.elapsed());
-            if left.is_zero() && !made.into_iter().any(makes) {
-                *resumed = Instant::now();
-                return Ok(());
+            match left.is_zero() {
+                false => Err(left),
+                true if jobs.kinds.iter().any(|kind| is_made(*kind)) => Err(FOREVER),
+                true => Ok(()),
             }
-            std::thread::sleep(if left.is_zero() { LOOK } else { left.min(LOOK) });
-        }
+        })?;
+        *resumed = Instant::now();
+        Ok(())
     }
 }
 
@@ -312,14 +280,6 @@ impl Turns<'_> {
 fn views_go_first(drawn: Option<Duration>, worked: Duration, waited: Duration) -> Duration {
     let quiet = drawn.map_or(Duration::ZERO, |ago| QUIET.saturating_sub(ago));
     quiet.min((worked * WAITS).min(PATIENCE).saturating_sub(waited))
-}
-
-/// The record says what the scene says of itself.
-fn shows(record: &mut Record, scene: &Scene) {
-    record.scene_sha256 = Some(scene.sha256.clone());
-    record.status.report = Some(scene.meta.report.clone());
-    record.status.cameras.clone_from(&scene.meta.cameras);
-    record.status.updated_ms = store::now_ms();
 }
 
 #[cfg(test)]

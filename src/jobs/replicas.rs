@@ -6,23 +6,22 @@
 
 use std::{
     collections::{HashMap, HashSet},
-    sync::atomic::Ordering,
+    sync::{Arc, atomic::Ordering},
     time::{Duration, Instant},
 };
 
 use parking_lot::Mutex;
 
 use super::{
-    JobParts, Jobs,
-    job::{Kind, Reason},
-    refine,
-    scene::requeue,
-    semantics,
+    change::{Attempt, Change, forget_refinement, forget_semantics_job},
+    job::Reason,
+    scene::SCENE,
+    shared::{JobParts, Jobs, Replicas},
 };
 use crate::{
     error::Result,
-    limits::Limits,
-    scene::{SceneId, SceneState},
+    limits::LiveLimits,
+    scene::SceneId,
     store::{self, Record, Store},
 };
 
@@ -33,43 +32,6 @@ const LEASES_TO_FORGET: u32 = 10;
 /// Times of reading that are remembered before all are forgotten.
 const FRESH_MAX: usize = 10_000;
 
-/// How this process shares its scenes with others. Each default is that of a process on its own.
-pub(super) trait Replicas: Send + Sync {
-    /// Name of this process among those that share the store; `None` where it is alone.
-    fn name(&self) -> Option<&str> {
-        None
-    }
-
-    /// From now on this process makes the scene, and its record here is the right one.
-    fn hold(&self, _: &SceneId) {}
-
-    /// From now on this process writes nothing of the scene.
-    fn release(&self, _: &SceneId) {}
-
-    /// Whether the store may know more of this scene than the records.
-    fn may_be_stale(&self, _: &SceneId) -> bool {
-        false
-    }
-
-    /// Reads what the store has of a scene.
-    fn refresh(&self, _: &Jobs, _: &SceneId) -> Result<()> {
-        Ok(())
-    }
-
-    /// Reads what the store has of all scenes.
-    fn refresh_all(&self, _: &Jobs) -> Result<()> {
-        Ok(())
-    }
-
-    /// Whether the call that made this scene was acknowledged.
-    fn is_acknowledged(&self, _: &Store, _: &SceneId) -> Result<bool> {
-        Ok(true)
-    }
-
-    /// The life of the thread that watches the other replicas.
-    fn watch(&self, _: &Jobs) {}
-}
-
 /// The replicas of a store: none where this process alone uses it.
 pub(super) fn of(parts: &JobParts) -> Result<Box<dyn Replicas>> {
     if !parts.store.is_shared() {
@@ -77,7 +39,7 @@ pub(super) fn of(parts: &JobParts) -> Result<Box<dyn Replicas>> {
     }
     Ok(Box::new(OtherReplicas {
         name: store::new_id()?.to_string(),
-        limits: parts.limits.clone(),
+        limits: Arc::clone(&parts.limits),
         held: Mutex::default(),
         fresh: Mutex::default(),
         listed: Mutex::default(),
@@ -92,7 +54,7 @@ impl Replicas for Alone {}
 /// Replicas that share the store with this one.
 struct OtherReplicas {
     name: String,
-    limits: Limits,
+    limits: Arc<LiveLimits>,
     /// Scenes that this process makes or has queued.
     held: Mutex<HashSet<SceneId>>,
     /// When scenes made elsewhere were last read.
@@ -131,7 +93,7 @@ impl Replicas for OtherReplicas {
     }
 
     fn may_be_stale(&self, id: &SceneId) -> bool {
-        let fresh = Duration::from_millis(self.limits.record_fresh_ms);
+        let fresh = Duration::from_millis(self.limits.get().record_fresh_ms);
         let read = || self.fresh.lock().get(id).copied();
         !self.holds(id) && read().is_none_or(|read| read.elapsed() >= fresh)
     }
@@ -143,7 +105,7 @@ impl Replicas for OtherReplicas {
 
     fn refresh_all(&self, jobs: &Jobs) -> Result<()> {
         let mut listed = self.listed.lock();
-        let fresh = Duration::from_millis(self.limits.record_fresh_ms);
+        let fresh = Duration::from_millis(self.limits.get().record_fresh_ms);
         if listed.at.is_some_and(|at| at.elapsed() < fresh) {
             return Ok(());
         }
@@ -167,9 +129,9 @@ impl Replicas for OtherReplicas {
 
     fn watch(&self, jobs: &Jobs) {
         let mut seen = Seen::default();
-        let every = Duration::from_millis(self.limits.replica_beat_ms.max(1));
         let mut beaten: Option<Instant> = None;
         loop {
+            let every = Duration::from_millis(self.limits.get().replica_beat_ms.max(1));
             if beaten.is_none_or(|at| at.elapsed() >= every) {
                 beaten = Some(Instant::now());
                 if let Err(error) = self.beat(jobs, &mut seen) {
@@ -216,9 +178,9 @@ impl OtherReplicas {
         if jobs.records.find(id).is_some_and(|known| files(&known) != files(&record)) {
             jobs.parts.store.forget(id);
         }
-        semantics::reset(&mut record);
-        refine::reset(&mut record);
-        jobs.records.put(record);
+        forget_semantics_job(&mut record);
+        forget_refinement(&mut record);
+        jobs.records.learn(record, || self.holds(id));
     }
 
     fn lose(&self, jobs: &Jobs, id: &SceneId) {
@@ -234,12 +196,8 @@ impl OtherReplicas {
         let store = &jobs.parts.store;
         seen.count += 1;
         store.beat(&self.name, seen.count)?;
-        let running = jobs.running.scenes(Kind::Scene);
-        for record in running.iter().filter_map(|id| jobs.records.find(id)) {
-            if record.status.state == SceneState::Running && self.holds(&record.status.id) {
-                // One deleted meanwhile is dropped below.
-                let _ = store.put_record(&record);
-            }
+        for id in jobs.running.scenes(SCENE).iter().filter(|id| self.holds(id)) {
+            jobs.records.keep_progress(id);
         }
         for id in store.tombstones()? {
             if self.holds(&id) {
@@ -260,14 +218,15 @@ impl OtherReplicas {
 
     /// Stops the jobs of a scene in this process.
     fn stop(&self, jobs: &Jobs, id: &SceneId) {
-        jobs.queue.remove(id);
-        jobs.running.stop(Some(id), Reason::Cancelled);
+        jobs.queue.remove(id, None);
+        jobs.running.stop(Reason::Cancelled, |job| job.scene == *id);
+        jobs.bell.ring();
         jobs.release(id);
     }
 
     /// Looks at every heartbeat; gives the replicas that live.
     fn alive(&self, jobs: &Jobs, seen: &mut Seen) -> Result<HashSet<String>> {
-        let lease = Duration::from_millis(self.limits.replica_lease_ms);
+        let lease = Duration::from_millis(self.limits.get().replica_lease_ms);
         let beats = jobs.parts.store.beats()?;
         seen.beats.retain(|name, _| beats.iter().any(|(replica, _)| replica == name));
         for (replica, stamp) in beats {
@@ -315,7 +274,7 @@ impl OtherReplicas {
             };
             let idle = jobs.workers.load(Ordering::Relaxed);
             let lives = replica == self.name || alive.contains(&replica);
-            if lives || jobs.queue.len(Kind::Scene) > idle {
+            if lives || jobs.queue.len(SCENE) > idle {
                 continue;
             }
             let heir = store.claim(&id, &replica, &self.name)?;
@@ -335,12 +294,11 @@ impl OtherReplicas {
         }
         tracing::info!(scene = %id, from, "taken over from a dead replica");
         record.replica = Some(self.name.clone());
-        requeue(&mut record);
-        self.hold(id);
-        store.put_record(&record).inspect_err(|_| jobs.release(id))?;
         let owner = record.owner.clone();
-        jobs.records.put(record);
-        jobs.queue.push(Kind::Scene, id.clone(), owner.as_deref());
+        self.hold(id);
+        jobs.records.learn(record, || false);
+        jobs.records.apply(id, &Change::Requeued(SCENE, Attempt::Counts))?;
+        jobs.queue.push(SCENE, id.clone(), owner.as_deref());
         Ok(())
     }
 }

@@ -1,24 +1,18 @@
 //! Photos at work at the same time, over all jobs: many small scenes run side by side, and large
 //! ones take no more memory together than the largest one alone.
 
-use std::{
-    sync::atomic::{AtomicBool, Ordering},
-    time::Duration,
-};
+use std::sync::{Arc, atomic::AtomicBool};
 
-use parking_lot::{Condvar, Mutex};
+use parking_lot::Mutex;
 
-use crate::{error::Result, scene::unless_cancelled};
-
-/// Time between two looks at whether a waiting job is cancelled.
-const CANCEL_LOOK: Duration = Duration::from_millis(50);
+use super::bell::{Bell, FOREVER};
+use crate::error::Result;
 
 /// Room for photos.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(super) struct Room {
-    photos_max: usize,
     taken: Mutex<usize>,
-    given_back: Condvar,
+    bell: Arc<Bell>,
 }
 
 /// Room that a job has; given back when dropped.
@@ -29,20 +23,27 @@ pub(super) struct Taken<'a> {
 }
 
 impl Room {
-    pub(super) fn new(photos_max: usize) -> Self {
-        Self { photos_max, taken: Mutex::default(), given_back: Condvar::new() }
+    pub(super) fn new(bell: Arc<Bell>) -> Self {
+        Self { taken: Mutex::default(), bell }
     }
 
-    /// Waits for room; a job of more photos than there is room for has it all.
+    /// Waits for room among `photos_max`; a job of more photos than that has it all.
     /// Fails with `cancelled`.
-    pub(super) fn take(&self, photos: usize, cancel: &AtomicBool) -> Result<Taken<'_>> {
-        let photos = photos.min(self.photos_max);
-        let mut taken = self.taken.lock();
-        while *taken + photos > self.photos_max && !cancel.load(Ordering::Acquire) {
-            self.given_back.wait_for(&mut taken, CANCEL_LOOK);
-        }
-        unless_cancelled(cancel)?;
-        *taken += photos;
+    pub(super) fn take(
+        &self,
+        photos: usize,
+        photos_max: usize,
+        cancel: &AtomicBool,
+    ) -> Result<Taken<'_>> {
+        let photos = photos.min(photos_max);
+        self.bell.wait_in_job(cancel, || {
+            let mut taken = self.taken.lock();
+            if *taken + photos > photos_max {
+                return Err(FOREVER);
+            }
+            *taken += photos;
+            Ok(())
+        })?;
         Ok(Taken { room: self, photos })
     }
 }
@@ -50,25 +51,27 @@ impl Room {
 impl Drop for Taken<'_> {
     fn drop(&mut self) {
         *self.room.taken.lock() -= self.photos;
-        self.room.given_back.notify_all();
+        self.room.bell.ring();
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::{sync::atomic::Ordering, time::Duration};
+
     use super::*;
 
     #[test]
     fn a_job_waits_until_its_photos_have_room_or_it_is_cancelled() {
-        let (room, on, off) = (Room::new(8), AtomicBool::new(false), AtomicBool::new(true));
-        let (six, two) = (room.take(6, &on).unwrap(), room.take(2, &on).unwrap());
-        assert!(room.take(1, &off).is_err(), "cancelled while it waits");
+        let (room, on, off) = (Room::default(), AtomicBool::new(false), AtomicBool::new(true));
+        let (six, two) = (room.take(6, 8, &on).unwrap(), room.take(2, 8, &on).unwrap());
+        assert!(room.take(1, 8, &off).is_err(), "cancelled while it waits");
         drop(two);
-        assert!(room.take(2, &on).is_ok(), "there is room again");
+        assert!(room.take(2, 8, &on).is_ok(), "there is room again");
         let got = AtomicBool::new(false);
         std::thread::scope(|scope| {
             let all = scope.spawn(|| {
-                let taken = room.take(64, &on);
+                let taken = room.take(64, 8, &on);
                 got.store(true, Ordering::Release);
                 taken.map(|taken| taken.photos)
             });

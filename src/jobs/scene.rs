@@ -7,77 +7,115 @@ use std::{
 };
 
 use super::{
-    Jobs,
-    job::{Job, Kind},
+    change::Change,
+    job::Job,
+    kind::{JobKind, Kind},
     photos::{Content, ReadUpload},
+    refine::REFINE,
+    semantics::SEMANTICS,
+    shared::{Jobs, Work, WorkLock},
 };
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{
-        Provenance, RefineState, RefineStatus, Scene, SceneId, SceneMeta, SceneState,
-        SemanticsMode, SemanticsState, SemanticsStatus, Stage, unless_cancelled,
+        Provenance, Scene, SceneError, SceneId, SceneMeta, SceneState, SceneStatus, SemanticsMode,
+        SemanticsState, SemanticsStatus, Stage,
     },
     store::{self, Record},
-    telemetry::meter,
+    telemetry::{self, meter},
 };
 
-/// Starts of one job before it is given up: a scene that kills the server must not do so forever.
-const ATTEMPTS_MAX: u32 = 3;
+/// Makes a scene of an upload.
+pub(super) struct MakeScene;
 
-/// Makes an unfinished record that of a queued scene.
-pub(super) fn requeue(record: &mut Record) {
-    record.status.state = SceneState::Queued;
-    record.status.stage = None;
-    record.status.fraction = 0.0;
+pub(super) const SCENE: Kind = &MakeScene;
+
+impl JobKind for MakeScene {
+    fn name(&self) -> &'static str {
+        "scene"
+    }
+
+    fn what(&self) -> &'static str {
+        "the scene"
+    }
+
+    fn show(&self, status: &mut SceneStatus, stage: Stage, fraction: f32) {
+        // The store may not have kept its start yet.
+        if status.state == SceneState::Queued {
+            status.state = SceneState::Running;
+        }
+        status.stage = Some(stage.name().to_owned());
+        status.fraction = stage.overall(fraction);
+    }
+
+    fn attempts<'a>(&self, record: &'a mut Record) -> Option<&'a mut u32> {
+        Some(&mut record.attempts)
+    }
+
+    fn started(&self, record: &mut Record, now_ms: u64) {
+        record.status.state = SceneState::Running;
+        record.status.updated_ms = now_ms;
+    }
+
+    fn requeued(&self, record: &mut Record) {
+        record.status.state = SceneState::Queued;
+        record.status.stage = None;
+        record.status.fraction = 0.0;
+    }
+
+    fn failed(&self, record: &mut Record, error: SceneError, now_ms: u64) {
+        let status = &mut record.status;
+        status.state = SceneState::Failed;
+        status.stage = None;
+        status.updated_ms = now_ms;
+        status.error = Some(error);
+        // It never has any.
+        if status.semantics.state == SemanticsState::Running {
+            status.semantics = SemanticsStatus::default();
+        }
+    }
+}
+
+impl Work for MakeScene {
+    /// It belongs to the trace of the call that created the scene.
+    fn span(&self, jobs: &Jobs, id: &SceneId) -> tracing::Span {
+        let Some(record) = jobs.records.find(id) else { return tracing::Span::none() };
+        let request_id = record.request_id.as_deref();
+        let span = tracing::info_span!("scene", scene = %id, request_id);
+        if let Some(parent) = &record.traceparent {
+            telemetry::follow(&span, parent);
+        }
+        span
+    }
+
+    fn run(&self, jobs: &Jobs, job: &Job) -> Result<()> {
+        jobs.make_scene(job)
+    }
 }
 
 /// What a job found or made.
 enum Made {
-    /// The scene that an earlier attempt kept, and its digest.
-    Kept(Arc<Scene>, String),
+    /// The scene that an earlier attempt kept.
+    Kept(Arc<Scene>),
     /// A scene of the same content.
     Known(Arc<Scene>),
     New(Box<Scene>),
 }
 
-/// Keeps other workers from making a scene of the same content, or from changing the same scene,
-/// until it is dropped.
-pub(super) struct WorkLock<'a> {
-    jobs: &'a Jobs,
-    name: String,
-}
-
-impl Drop for WorkLock<'_> {
-    fn drop(&mut self) {
-        self.jobs.contents.lock().remove(&self.name);
-        self.jobs.content_free.notify_all();
-    }
-}
-
 impl Jobs {
-    pub(super) fn make_scene(&self, job: &Job) -> Result<()> {
+    fn make_scene(&self, job: &Job) -> Result<()> {
         let (begun, id) = (Instant::now(), &job.scene);
-        let Some(record) = self.records.update(id, |record| {
-            record.attempts += 1;
-            record.status.state = SceneState::Running;
-            record.status.updated_ms = store::now_ms();
-        }) else {
-            return Ok(());
-        };
-        let waited_ms = record.status.updated_ms.saturating_sub(record.status.created_ms);
+        let record = self.record(id)?;
+        self.check_attempts(job.kind, &record)?;
+        let waited_ms = store::now_ms().saturating_sub(record.status.created_ms);
         meter::stage("wait", Duration::from_millis(waited_ms).as_secs_f64());
-        if record.attempts > ATTEMPTS_MAX {
-            return Err(Error::internal(format!(
-                "given up: the server stopped {ATTEMPTS_MAX} times while making this scene"
-            )));
-        }
         // Its start is kept while the work begins, and before anything that ends it.
-        let started = || self.parts.store.put_record(&record);
+        let started = || self.records.apply(id, &Change::Started(job.kind));
         let (started, made) = store::side_by_side(started, || self.find_or_make(job, &record));
         started?;
         let (made, _lock) = made?;
         let scene = match made {
-            Made::Kept(scene, digest) => return self.finish(&scene, digest, None),
+            Made::Kept(scene) => return self.finish(&scene),
             Made::Known(known) => {
                 tracing::info!(scene = %id, of = %known.meta.id, "copied: the same content");
                 let created_ms = record.status.created_ms;
@@ -102,11 +140,11 @@ impl Jobs {
     fn find_or_make(&self, job: &Job, record: &Record) -> Result<(Made, Option<WorkLock<'_>>)> {
         let (id, store) = (&job.scene, &self.parts.store);
         // What was kept of a file may lack its semantics, which are kept after it.
-        if record.attempts > 1
-            && let Some((scene, digest)) = self.kept_scene(id)?
+        if (record.attempts > 0 || store.scene_in_memory(id).is_some())
+            && let Some(scene) = self.kept_scene(id)?
             && scene.meta.report.file_format.is_none()
         {
-            return Ok((Made::Kept(scene, digest), None));
+            return Ok((Made::Kept(scene), None));
         }
         let (files, of_photos) = match self.uploads.find(id) {
             Some(upload) => (upload.files.clone(), upload.photos().is_ok()),
@@ -125,8 +163,9 @@ impl Jobs {
         let scene = self.within_time(job, |watch| {
             (watch.progress)(Stage::Photos, 0.0);
             let upload = self.upload(id, watch)?;
-            let room = upload.room(&self.parts.limits);
-            let _room = self.room.take(room, watch.cancel)?;
+            let limits = self.parts.limits.get();
+            let room = upload.room(&limits);
+            let _room = self.room.take(room, limits.photos_max, watch.cancel)?;
             let Content::Photos(photos) = &upload.content else {
                 self.uploads.forget(id);
                 return of_file(upload, id, created_ms, provenance);
@@ -134,7 +173,9 @@ impl Jobs {
             match record.options.semantics {
                 SemanticsMode::Eager => {
                     self.uploads.keep(id, Arc::clone(&upload));
-                    self.understand_early(record);
+                    if self.parts.semantics.begin_early(&record.options.method()) {
+                        self.understand_early(id)?;
+                    }
                 }
                 SemanticsMode::Lazy => self.uploads.leave(id, Arc::clone(&upload)),
                 SemanticsMode::Off => self.uploads.forget(id),
@@ -147,24 +188,20 @@ impl Jobs {
 
     /// Keeps a scene with the semantics that it has, and its record.
     fn keep(&self, scene: Scene) -> Result<()> {
-        let (id, semantics) = (scene.meta.id.clone(), scene.semantics.clone());
-        let (mut scene, digest) = self.parts.store.put_scene(scene)?;
-        let mut semantics_digest = None;
+        let semantics = scene.semantics.clone();
+        let mut scene = self.parts.store.put_scene(scene)?;
         if let Some(semantics) = semantics {
             let semantics = Arc::unwrap_or_clone(semantics);
-            let kept = self.parts.store.put_semantics(&id, semantics, |_| Ok(()))?;
-            (scene, semantics_digest) = (kept.0, Some(kept.1));
+            let packed = self.parts.store.pack_semantics(&scene.meta.id, semantics)?;
+            scene = self.parts.store.put_semantics(packed)?;
         }
-        self.finish(&scene, digest, semantics_digest)
+        self.finish(&scene)
     }
 
-    /// The scene that an earlier attempt kept before it was cut off, and its digest.
-    fn kept_scene(&self, id: &SceneId) -> Result<Option<(Arc<Scene>, String)>> {
+    /// The scene that an earlier attempt kept before it was cut off.
+    fn kept_scene(&self, id: &SceneId) -> Result<Option<Arc<Scene>>> {
         match self.parts.store.scene(id) {
-            Ok(scene) => {
-                let digest = self.parts.store.scene_digest(id)?;
-                Ok(digest.map(|digest| (scene, digest)))
-            }
+            Ok(scene) => Ok(Some(scene)),
             Err(e) if matches!(e.code(), ErrorCode::SceneNotFound | ErrorCode::SceneCorrupt) => {
                 Ok(None)
             }
@@ -184,82 +221,36 @@ impl Jobs {
         Ok(scene.filter(|scene| scene.meta.provenance.content_sha256 == content))
     }
 
-    /// Waits until no other worker here has the lock of this content, or of this scene.
-    /// Fails with `cancelled`.
-    pub(super) fn lock(&self, name: &str, job: &Job) -> Result<WorkLock<'_>> {
-        let mut names = self.contents.lock();
-        while names.contains(name) {
-            unless_cancelled(&job.cancel)?;
-            self.content_free.wait_for(&mut names, Duration::from_millis(50));
-        }
-        names.insert(name.to_owned());
-        Ok(WorkLock { jobs: self, name: name.to_owned() })
-    }
-
-    /// The scene is kept under its digest, and its semantics under theirs: its record is kept, then
-    /// its watchers are told, then what a start would tidy up too is tidied up.
-    fn finish(&self, scene: &Scene, digest: String, semantics: Option<String>) -> Result<()> {
+    /// The scene is kept, and its semantics where it has some: its record is kept, then its
+    /// watchers are told, then what a start would tidy up too is tidied up.
+    fn finish(&self, scene: &Scene) -> Result<()> {
         let (store, meta, id) = (&self.parts.store, &scene.meta, &scene.meta.id);
-        // In the store first: a watcher who sees `done` may stop the machine.
-        let Some(mut done) = self.records.find(id).map(Arc::unwrap_or_clone) else {
-            return Ok(());
-        };
-        let content = &meta.provenance.content_sha256;
-        done.scene_sha256 = Some(digest);
-        done.content_sha256 = Some(content.clone()).filter(|hash| !hash.is_empty());
-        done.replica = None;
-        done.status.state = SceneState::Done;
-        done.status.stage = None;
-        done.status.fraction = 1.0;
-        done.status.updated_ms = store::now_ms();
-        done.status.report = Some(meta.report.clone());
-        done.status.cameras.clone_from(&meta.cameras);
-        done.status.version = 1;
-        done.refine = self.first_order(&done);
-        if done.refine.is_some() {
-            done.status.refinement = RefineStatus::new(RefineState::Running);
-        }
-        if let (Some(digest), Some(semantics)) = (semantics, &scene.semantics) {
-            done.semantics_sha256 = Some(digest);
-            done.status.semantics = SemanticsStatus::ready(semantics.report.clone());
-        }
-        store.put_status(&done)?;
-        // In one change, so that no watcher takes `done` for the end.
-        let ready = done.status.semantics.state == SemanticsState::Ready;
-        let eager = done.options.semantics == SemanticsMode::Eager && !ready;
-        let (owner, refined) = (done.owner.clone(), done.refine.is_some());
-        let mut waiting = false;
-        self.records.update(id, |record| {
-            // They may be under way already, or have failed.
-            waiting = eager && record.status.semantics.state == SemanticsState::None;
-            let begun = std::mem::take(&mut record.status.semantics);
-            *record = done;
-            if waiting {
-                record.status.semantics = SemanticsStatus::new(SemanticsState::Running);
-            } else if eager {
-                record.status.semantics = begun;
-            }
-        });
+        let record = self.record(id)?;
+        let order = self.first_order(&record, scene);
+        // The pending record goes later: nobody waits for that.
+        let made = Change::Made(scene, order);
+        let made = self.records.apply_with(id, &made, |record| store.put_status(record))?;
         tracing::info!(scene = %id, "done");
-        if refined {
-            self.queue.push(Kind::Refine, id.clone(), owner.as_deref());
+        let owner = record.owner.as_deref();
+        let semantics = [&made.before, &made.after].map(|record| record.status.semantics.state);
+        if order.is_some() {
+            self.queue.push(REFINE, id.clone(), owner);
         }
-        if waiting {
-            self.queue.push(Kind::Semantics, id.clone(), owner.as_deref());
+        if semantics == [SemanticsState::None, SemanticsState::Running] {
+            self.queue.push(SEMANTICS, id.clone(), owner);
         }
         // The scene is there, whatever comes of these. The content first: the next job with this
         // content begins when this one ends.
+        let content = &meta.provenance.content_sha256;
         let noted = match content.is_empty() {
             true => Ok(()),
-            false => store.put_content(owner.as_deref(), content, id),
+            false => store.put_content(owner, content, id),
         };
         if let Err(error) = noted.and_then(|()| store.settle(id)) {
             tracing::warn!(scene = %id, %error, "left for the next start");
         }
         self.prepare(scene);
-        if !eager && !refined && !self.parts.keep_photos {
-            store.drop_upload(id)?;
-        }
+        self.drop_upload_unless_needed(id);
         Ok(())
     }
 

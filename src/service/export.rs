@@ -6,27 +6,29 @@ use std::{
     time::Instant,
 };
 
+use futures_util::FutureExt;
 use tokio::{runtime::Handle, sync::mpsc};
 
 use super::{
     Service,
-    create::blocking,
+    access::SceneAccess,
     features,
     page::write_page,
     query,
-    request::{ExportFormat, QuerySpec, TextOptions, ViewOptions},
+    request::{QuerySpec, TextOptions, ViewOptions},
     search::ScoringChoice,
-    tags::{etag, semantics_tag},
+    tags::{cache_key, etag, semantics_tag, text_key},
+    tasks::blocking,
     texts,
-    types::Export,
+    types::{Export, ExportBody},
     work::Work,
 };
 use crate::{
     error::{Error, Result},
     formats::{
-        folders::FolderFormat,
         packed::write_packed,
-        splats::{SplatFile, SplatFormat},
+        splats::{OCTETS, SplatFile, SplatFormat},
+        table::{ExportFormat, FormatKind},
     },
     render::plan::{default_near, widened},
     scene::{Gaussians, Preset, Scene, SceneId, Semantics},
@@ -38,14 +40,13 @@ const PARTS_MAX: usize = 4;
 const PART_BYTES: usize = 256 << 10;
 
 impl Service {
-    /// The scene, or what a text selects of it, as a file for other programs; as `npz` its
-    /// semantics, which are made where they are not there; as `packed` and `html` what the page
-    /// draws; as a folder in a zip what [`FolderFormat`] says. For `html`, `coco` and `labelme`
-    /// each line of the text is a text.
+    /// The scene, or what a text selects of it, as a file for other programs. Semantics are made
+    /// where the format needs them and they are not there. For `html`, `coco` and `labelme` each
+    /// line of the text is a text. Nothing is written before [`Export::begin`].
     ///
     /// # Errors
-    /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; `invalid_request` for a scene that
-    /// the format cannot hold; with a text, and for `npz`, also what [`Service::query`] says.
+    /// `scene_not_found`, `scene_not_ready`, `scene_corrupt`; with a text, and for `npz`, also what
+    /// [`Service::query`] says.
     pub async fn export(
         &self,
         id: &SceneId,
@@ -55,122 +56,149 @@ impl Service {
     ) -> Result<Export> {
         // How texts are scored is checked also where no text is asked.
         texts::check_scoring(&ask.scoring, &self.limits())?;
-        if let Some(format) = FolderFormat::named(&format.to_string()) {
-            return self.folder(id, format, preset, ask).await;
-        }
         let access = self.scene(id).await?;
-        let inner = Arc::clone(&self.inner);
-        if format == ExportFormat::Npz {
-            if ask.text.is_some() {
-                return Err(texts::not_with("npz"));
-            }
-            let of = inner.semantic_scene(&access.finished()?, "npz", ask.wait).await?;
-            let etag = format!("{}-npz", etag(&of.tag));
-            let write = move |to: &mut dyn Write| features::write_semantics(&of.semantics, to);
-            let file_name = format!("{id}.npz");
-            return Ok(Export::new(file_name, etag, stream(write)));
+        let is_part = format.is_splats() && ask.text.is_some();
+        if ask.text.is_some() && !is_part && !format.lines {
+            return Err(texts::not_with(format.name));
         }
-        if format == ExportFormat::Html {
-            return self.page(id, preset, ask).await;
-        }
-        if format == ExportFormat::Packed && ask.text.is_some() {
-            return Err(texts::not_with("packed"));
-        }
-        let Some(text) = &ask.text else {
-            let access = access.finished()?;
-            let scene = blocking(move || inner.load(&access)).await??;
-            let digest = etag(&semantics_tag(&scene));
-            if format == ExportFormat::Packed {
-                let (file_name, etag) = (format!("{id}.segsplat"), format!("{digest}-packed"));
-                let chunks = stream(move |to: &mut dyn Write| {
-                    write_packed(&scene, default_near(scene.meta.report.median_depth), to)
-                });
-                return Ok(Export::new(file_name, etag, chunks));
-            }
-            let splats = splats(format)?;
-            let write = move || {
-                let semantics = scene.semantics.as_deref();
-                scene_splats(splats, &scene, &scene.gaussians, semantics)
-            };
-            return Ok(gaussians(&id.to_string(), &digest, blocking(write).await??));
+        let export = match format.kind {
+            FormatKind::Folder(folder) => self.folder(id, (format, folder), preset, ask).await?,
+            FormatKind::Arrays => self.arrays(&access.finished()?, format, ask).await?,
+            FormatKind::Packed => self.packed(access.finished()?).await?,
+            FormatKind::Page => self.page(access.finished()?, preset, ask).await?,
+            FormatKind::Splats(splats) => self.splats(access, splats, preset, ask).await?,
         };
-        inner.can_understand("text")?;
-        let text = texts::checked(text, "text", &self.limits())?;
-        let splats = splats(format)?;
-        let of = inner.semantic_scene(&access.finished()?, "text", ask.wait).await?;
-        let how = ScoringChoice { preset, changes: ask.scoring.clone() };
-        let deadline = inner.deadline(&ViewOptions::default());
-        let texts = inner.score(of, how, vec![text], deadline).await?;
-        let etag = etag(&texts.key()?);
-        let file = blocking(move || {
-            part(splats, &texts.of.scene, &texts.gaussians(), &texts.of.semantics)
+        let part = if is_part { "-part" } else { "" };
+        Ok(Export {
+            file_name: format!("{id}{part}.{}", format.ending),
+            media_type: format.media_type,
+            etag: format!("{}-{format}", export.etag),
+            ..export
         })
-        .await??;
-        Ok(gaussians(&format!("{id}-part"), &etag, file))
     }
-}
 
-impl Service {
+    /// The semantics as arrays.
+    async fn arrays(
+        &self,
+        access: &SceneAccess,
+        format: ExportFormat,
+        ask: &TextOptions,
+    ) -> Result<Export> {
+        let of = self.inner.semantic_scene(access, format.name, ask.wait).await?;
+        let tag = etag(&of.tag);
+        let write = move |to: &mut dyn Write| features::write_semantics(&of.semantics, to);
+        Ok(Export::streamed(tag, write))
+    }
+
+    /// The scene as the page draws it.
+    async fn packed(&self, access: SceneAccess) -> Result<Export> {
+        let inner = Arc::clone(&self.inner);
+        let scene = blocking(move || inner.load(&access)).await??;
+        let etag = etag(&semantics_tag(&scene));
+        let near = default_near(scene.meta.report.median_depth);
+        Ok(Export::streamed(etag, move |to: &mut dyn Write| write_packed(&scene, near, to)))
+    }
+
     /// The page with the scene in it.
     async fn page(
         &self,
-        id: &SceneId,
+        access: SceneAccess,
         preset: Option<Preset>,
         ask: &TextOptions,
     ) -> Result<Export> {
         let (inner, limits) = (Arc::clone(&self.inner), self.limits());
-        let access = self.scene(id).await?.finished()?;
         let lines = texts::lines(ask);
-        let how = format!("{lines:?} {preset:?} {:?} {}", ask.scoring, env!("CARGO_PKG_VERSION"));
-        let tag = move |scene: &Scene| format!("{}-html", etag(&(semantics_tag(scene) + &how)));
-        let file_name = format!("{id}.html");
+        let how = cache_key(&(&lines, preset, &ask.scoring, env!("CARGO_PKG_VERSION")))?;
+        let tag = move |scene: &Scene| etag(&(semantics_tag(scene) + &how));
         if lines.is_empty() {
             let scene = blocking(move || inner.load(&access)).await??;
-            let etag = tag(&scene);
-            let chunks = stream(move |to: &mut dyn Write| write_page(&scene, None, to));
-            return Ok(Export::new(file_name, etag, chunks));
+            let tag = tag(&scene);
+            let write = move |to: &mut dyn Write| write_page(&scene, None, to);
+            return Ok(Export::streamed(tag, write));
         }
         inner.can_understand("text")?;
         let texts = texts::all_checked(&lines, "text", &limits)?;
         let of = inner.semantic_scene(&access, "text", ask.wait).await?;
-        let (how, etag) = (ScoringChoice { preset, changes: ask.scoring.clone() }, tag(&of.scene));
-        let deadline = inner.deadline(&ViewOptions::default());
-        let texts = inner.score(of, how, texts, deadline).await?;
-        let chunks = stream(move |to: &mut dyn Write| {
-            let (spec, work) = (QuerySpec::default(), &mut Work::default());
-            let answer = query::answer(&texts, &limits, &spec, None, work)?;
-            write_page(&texts.of.scene, Some(&answer), to)
-        });
-        Ok(Export::new(file_name, etag, chunks))
+        let (how, tag) = (ScoringChoice { preset, changes: ask.scoring.clone() }, tag(&of.scene));
+        Ok(Export::new(tag, async move {
+            let deadline = inner.deadline(&ViewOptions::default());
+            let texts = inner.score(of, how, texts, deadline).await?;
+            let chunks = stream(move |to: &mut dyn Write| {
+                let (spec, work) = (QuerySpec::default(), &mut Work::default());
+                let answer = query::answer(&texts, &limits, &spec, None, work)?;
+                write_page(&texts.of.scene, Some(&answer), to)
+            });
+            Ok(ExportBody { size_bytes: None, chunks })
+        }))
+    }
+
+    /// Gaussians: all of them, or those that a text selects.
+    async fn splats(
+        &self,
+        access: SceneAccess,
+        format: &'static SplatFormat,
+        preset: Option<Preset>,
+        ask: &TextOptions,
+    ) -> Result<Export> {
+        let inner = Arc::clone(&self.inner);
+        let Some(text) = &ask.text else {
+            let access = access.finished()?;
+            let scene = blocking(move || inner.load(&access)).await??;
+            let tag = etag(&semantics_tag(&scene));
+            let write =
+                move || scene_splats(format, &scene, &scene.gaussians, scene.semantics.as_deref());
+            return Ok(Export::splats(tag, async { blocking(write).await? }));
+        };
+        inner.can_understand("text")?;
+        let text = texts::checked(text, "text", &self.limits())?;
+        let of = inner.semantic_scene(&access.finished()?, "text", ask.wait).await?;
+        let named = preset.unwrap_or(of.scene.meta.report.method.preset);
+        let tag = etag(&text_key(&of.tag, Some(&text), named, &ask.scoring)?);
+        let how = ScoringChoice { preset, changes: ask.scoring.clone() };
+        Ok(Export::splats(tag, async move {
+            let deadline = inner.deadline(&ViewOptions::default());
+            let texts = inner.score(of, how, vec![text], deadline).await?;
+            let write = move || {
+                let gaussians = texts.gaussians();
+                let index = gaussians.semantic_index().to_vec();
+                let semantics = Semantics { index, ..(*texts.of.semantics).clone() };
+                scene_splats(format, &texts.of.scene, &gaussians, Some(&semantics))
+            };
+            blocking(write).await?
+        }))
     }
 }
 
 impl Export {
-    /// A file of octets whose size is known when it is written.
-    pub(super) fn new(
-        file_name: String,
+    /// A file of octets without a name, which `write` writes.
+    pub(super) fn streamed(
         etag: String,
-        chunks: mpsc::Receiver<io::Result<Vec<u8>>>,
+        write: impl FnOnce(&mut dyn Write) -> Result<()> + Send + 'static,
     ) -> Self {
-        Self { file_name, media_type: "application/octet-stream", size_bytes: None, etag, chunks }
+        Self::new(etag, async move { Ok(ExportBody { size_bytes: None, chunks: stream(write) }) })
     }
-}
 
-/// The format of files with Gaussians.
-fn splats(format: ExportFormat) -> Result<&'static SplatFormat> {
-    SplatFormat::named(&format.to_string())
-        .ok_or_else(|| Error::internal(format!("{format} is no format of Gaussians")))
-}
+    /// A file of octets without a name.
+    pub(super) fn new(
+        etag: String,
+        begin: impl Future<Output = Result<ExportBody>> + Send + 'static,
+    ) -> Self {
+        Self { file_name: String::new(), media_type: OCTETS, etag, begin: begin.boxed() }
+    }
 
-/// Some Gaussians of a scene with its bank.
-fn part(
-    splats: &'static SplatFormat,
-    scene: &Scene,
-    gaussians: &Gaussians,
-    of: &Semantics,
-) -> Result<SplatFile> {
-    let semantics = Semantics { index: gaussians.semantic_index().to_vec(), ..of.clone() };
-    scene_splats(splats, scene, gaussians, Some(&semantics))
+    /// A file of Gaussians.
+    fn splats(
+        etag: String,
+        file: impl Future<Output = Result<SplatFile>> + Send + 'static,
+    ) -> Self {
+        Self::new(etag, async move {
+            let file = file.await?;
+            let unwritten = |cause| Error::internal("the file is not whole").caused_by(cause);
+            let size_bytes = file.size_bytes();
+            let chunks = stream(move |to: &mut dyn Write| file.write(to).map_err(unwritten));
+            Ok(ExportBody { size_bytes, chunks })
+        })
+    }
 }
 
 /// Some Gaussians of a scene as a file that other programs draw: with the blur that the scene's own
@@ -184,17 +212,8 @@ pub fn scene_splats(
     gaussians: &Gaussians,
     semantics: Option<&Semantics>,
 ) -> Result<SplatFile> {
-    SplatFile::new(format, widened(scene, gaussians, None)?, semantics)
-}
-
-/// A file with Gaussians; `stem` is its name without the ending.
-fn gaussians(stem: &str, digest: &str, file: SplatFile) -> Export {
-    let &SplatFormat { name, ending, media_type, .. } = file.format();
-    let size_bytes = file.size_bytes();
-    let unwritten = |cause| Error::internal("the file is not whole").caused_by(cause);
-    let chunks = stream(move |to: &mut dyn Write| file.write(to).map_err(unwritten));
-    let (file_name, etag) = (format!("{stem}.{ending}"), format!("{digest}-{name}"));
-    Export { media_type, size_bytes, ..Export::new(file_name, etag, chunks) }
+    let file = SplatFile::new(format, widened(scene, gaussians, None)?, semantics)?;
+    Ok(file.antialiased(scene.meta.report.antialiased))
 }
 
 /// The parts of a file that `write` writes on a blocking thread. A fault ends them.

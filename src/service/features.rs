@@ -12,7 +12,6 @@ use rayon::prelude::*;
 
 use super::{
     Service,
-    export::stream,
     request::{FeatureKind, FeaturesSpec, Kind, ViewSpec},
     schedule::Demand,
     search::{LabelledView, SceneTexts, ScoringChoice},
@@ -162,7 +161,7 @@ impl Service {
             Ok(weights)
         };
         let weights = inner.scheduled(demand, deadline, "the features", draw).await?;
-        let chunks = stream(move |to: &mut dyn Write| write(&texts, &weights, spec.kind, to));
-        Ok(Export::new(format!("{id}-view.npz"), etag, chunks))
+        let write = move |to: &mut dyn Write| write(&texts, &weights, spec.kind, to);
+        Ok(Export { file_name: format!("{id}-view.npz"), ..Export::streamed(etag, write) })
     }
 }

@@ -21,6 +21,7 @@ mod schedule;
 mod search;
 mod semantics;
 mod tags;
+mod tasks;
 mod texts;
 mod times;
 mod types;
@@ -30,7 +31,6 @@ mod work;
 use std::{fmt, sync::Arc};
 
 use futures_util::{Stream, stream};
-use parking_lot::RwLock;
 use tokio::sync::Semaphore;
 
 pub use self::export::scene_splats;
@@ -41,17 +41,18 @@ use self::{memory::Memory, schedule::Scheduler, search::Backend};
 pub use self::{
     offline::OfflineService,
     request::{
-        BackgroundSpec, Boxes, CameraFields, CameraSpec, CreateScene, ExportFormat, FeatureKind,
-        FeaturesSpec, Format, Kind, LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions,
-        PoseSpec, QuerySpec, ScoringOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec,
+        BackgroundSpec, Boxes, CameraFields, CameraSpec, CreateScene, FeatureKind, FeaturesSpec,
+        Format, Kind, LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions, PoseSpec,
+        QuerySpec, ScoringOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec,
     },
     times::ViewTimes,
     types::{
-        Created, Export, InstanceBox, KnownWord, Label, ModelInfo, ModelsInfo, Page, Peak, Picked,
-        QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning, Trust,
+        Created, Export, ExportBody, InstanceBox, KnownWord, Label, ModelInfo, ModelsInfo, Page,
+        Peak, Picked, QueryAnswer, Readiness, RenderedView, TextResult, TextView, TextWarning,
+        Trust,
     },
 };
-pub use crate::formats::rle::Rle;
+pub use crate::formats::{rle::Rle, table::ExportFormat};
 pub use crate::render::{Quality, plan::default_near};
 pub use crate::scene::{
     Density, Event, MaskLevel, Method, Preset, SceneCamera, SceneError, SceneOptions, SceneState,
@@ -62,7 +63,7 @@ use crate::{
     error::{Error, Result},
     jobs::{JobParts, Jobs, NetworkState, SceneNetworks, SemanticNetworks, refiner},
     keys::Caller,
-    limits::Limits,
+    limits::{Limits, LiveLimits},
     render::Renderer,
     scene::{Refine, SceneId, Stage},
     store::{Place, Record, Store},
@@ -101,8 +102,8 @@ impl fmt::Debug for Parts {
 
 struct Inner {
     config: Config,
-    /// Caps in force: those of the configuration, or newer ones.
-    limits: RwLock<Arc<Limits>>,
+    /// Caps in force: those of the configuration, or newer ones. The jobs have the same.
+    limits: Arc<LiveLimits>,
     store: Arc<Store>,
     jobs: Arc<Jobs>,
     /// Networks that run by themselves; the jobs have the same.
@@ -128,7 +129,7 @@ impl fmt::Debug for Inner {
 
 impl Inner {
     fn limits(&self) -> Arc<Limits> {
-        Arc::clone(&self.limits.read())
+        self.limits.get()
     }
 }
 
@@ -157,11 +158,12 @@ impl Service {
         };
         let refiner = refiner(device, config.threads)?;
         let networks = Arc::clone(&parts.scenes);
+        let limits = Arc::new(LiveLimits::new(config.limits.clone()));
         let job_parts = JobParts {
             store: Arc::clone(&store),
             scenes: parts.scenes,
             semantics: Arc::clone(&parts.semantics),
-            limits: config.limits.clone(),
+            limits: Arc::clone(&limits),
             workers: config.workers(),
             keep_photos: config.keep_photos,
             refine,
@@ -188,7 +190,7 @@ impl Service {
             inferences: Arc::new(Semaphore::new(config.limits.inferences_max)),
             key_locks: Default::default(),
             memory: Memory::new(config.limits.memory_bytes_max),
-            limits: RwLock::new(Arc::new(config.limits.clone())),
+            limits,
             config,
         };
         Ok(Self { inner: Arc::new(inner), caller: Caller::All })
@@ -211,9 +213,7 @@ impl Service {
 
     /// Puts other caps in force; names those that only the next start can follow.
     pub fn reload(&self, limits: Limits) -> Vec<&'static str> {
-        let later = self.inner.config.limits.changed_for_next_start(&limits);
-        *self.inner.limits.write() = Arc::new(limits);
-        later
+        self.inner.limits.reload(limits)
     }
 
     /// The status of a scene, with its report and cameras once done.
@@ -240,7 +240,7 @@ impl Service {
         let after = page.after.as_deref().map(parse_cursor).transpose()?;
         let inner = Arc::clone(&self.inner);
         if inner.store.is_shared() {
-            create::blocking(move || inner.jobs.refresh_all()).await??;
+            tasks::blocking(move || inner.jobs.refresh_all()).await??;
         }
         let (records, more) = self
             .inner
@@ -261,7 +261,7 @@ impl Service {
     pub async fn delete(&self, id: &SceneId) -> Result<()> {
         let scene = self.scene(id).await?;
         let (inner, gone) = (Arc::clone(&self.inner), scene.id().clone());
-        create::blocking(move || inner.jobs.delete(&gone)).await?
+        tasks::blocking(move || inner.jobs.delete(&gone)).await?
     }
 
     /// What happens to a scene, from its present state to the last event.
@@ -309,7 +309,7 @@ impl Service {
                 fraction: semantics.fraction,
             },
             SceneState::Queued => {
-                Event::Queued { ahead: self.inner.jobs.queue.ahead(&status.id).unwrap_or(0) }
+                Event::Queued { ahead: self.inner.jobs.ahead(&status.id).unwrap_or(0) }
             }
             SceneState::Running => Event::Running {
                 stage: status.stage.clone().unwrap_or_else(|| Stage::SCENE[0].name().to_owned()),

@@ -13,7 +13,7 @@ use sha2::{Digest, Sha256};
 use super::types::QueryAnswer;
 use crate::{
     error::{Error, ErrorCode, Result},
-    formats::packed::write_packed,
+    formats::{packed::write_packed, table::ExportFormat},
     render::plan::default_near,
     scene::Scene,
 };
@@ -58,8 +58,26 @@ fn policy(connect: &str) -> String {
 /// The document before and after the place of a scene.
 fn around_data() -> [String; 2] {
     let (start, end) = SHELL.split_once("<!--scene-->").unwrap_or((SHELL, ""));
-    let filled = |part: &str| part.replace("/*style*/", STYLE).replace("/*script*/", SCRIPT);
+    let splats = ExportFormat::listed(|format| format.is_splats(), |row| row.title);
+    let filled = |part: &str| {
+        let part = part.replace("<!--formats-->", &options()).replace("<!--splats-->", &splats);
+        part.replace("/*style*/", STYLE).replace("/*script*/", SCRIPT)
+    };
     [filled(start), filled(end)]
+}
+
+/// The formats of exports for the page's list: the ending of files of Gaussians, which the page
+/// takes too, and whether the file shows texts.
+fn options() -> String {
+    let option = |format: ExportFormat| {
+        let data = match format.is_splats() {
+            true => format!(r#" data-splats="{}""#, format.ending),
+            false if format.lines => " data-lines".to_owned(),
+            false => String::new(),
+        };
+        format!(r#"<option value="{format}"{data}>{}</option>"#, format.title)
+    };
+    ExportFormat::all().map(option).collect()
 }
 
 /// Writes the page with a scene, and what some texts found in it.
@@ -104,7 +122,7 @@ mod tests {
             let hash = BASE64_STANDARD.encode(Sha256::digest(text));
             assert!(policy.contains(&format!("'sha256-{hash}'")), "{open}");
         }
-        for mark in ["<!--policy", "<!--scene", "/*style*/", "/*script*/", "://", " style="] {
+        for mark in ["<!--", "/*style*/", "/*script*/", "://", " style="] {
             // Names of XML languages are no addresses.
             let html = html.replace("http://www.w3.org/", "");
             assert!(!html.contains(mark), "{mark}");

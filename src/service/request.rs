@@ -136,44 +136,6 @@ pub enum MaskFormat {
     None,
 }
 
-/// File format of an export.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum ExportFormat {
-    /// Standard 3DGS PLY with `semantic_index` as an extra attribute and, after the vertices, the
-    /// semantics where they are made.
-    #[default]
-    Ply,
-    /// The compressed PLY of `PlayCanvas` and `SuperSplat`: 16 bytes a Gaussian.
-    CompressedPly,
-    /// SPZ, version 3: under 16 bytes a Gaussian.
-    Spz,
-    /// SPZ, version 4, which fewer programs read.
-    Spz4,
-    /// SOG, the bundle of pictures of `PlayCanvas`, without harmonics over degree 0.
-    Sog,
-    /// Binary glTF with `KHR_gaussian_splatting`, the entries of the bank and the semantics.
-    Glb,
-    /// `.splat`: 32 bytes a Gaussian.
-    Splat,
-    /// The semantics as `NumPy` arrays: the bank, the row of each mask, the entry of each Gaussian
-    /// and of each cell of the photos.
-    Npz,
-    /// The scene as the page draws it: 32 bytes a Gaussian, those that cover most first.
-    Packed,
-    /// The page with the scene in it, as one file for a disk. It shows the texts of `text`, one a
-    /// line, and needs no server.
-    Html,
-    /// A folder as COLMAP has it, in a zip: photos, cameras, points and depth maps.
-    Colmap,
-    /// The same as nerfstudio has it.
-    Nerfstudio,
-    /// What each line of `text` selects in each photo as COCO's annotations, in a zip.
-    Coco,
-    /// The same as a JSON with polygons for `LabelMe` beside each photo.
-    Labelme,
-}
-
 /// What the pixels of a view are described by.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
@@ -185,7 +147,7 @@ pub enum FeatureKind {
     Features,
 }
 
-display_names!(Kind, Format, Boxes, MaskFormat, ExportFormat, FeatureKind);
+display_names!(Kind, Format, Boxes, MaskFormat, FeatureKind);
 
 /// A camera as its separate fields: one pose, at most one lens.
 #[derive(
@@ -364,9 +326,10 @@ pub struct ViewOptions {
     /// Height, pixels. By default as the width.
     #[arg(long)]
     pub height: Option<u32>,
-    /// Antialiased: opacity compensated for the blur of small Gaussians (gsplat's mode).
-    #[arg(long)]
-    pub antialiased: bool,
+    /// Antialiased: opacity compensated for the blur of small Gaussians (gsplat's mode). By default
+    /// as the scene's file of Gaussians says, else not.
+    #[arg(long, num_args = 0..=1, require_equals = true, default_missing_value = "true")]
+    pub antialiased: Option<bool>,
     /// Near plane, world units. By default 0.01 of the scene's median depth.
     #[arg(long)]
     pub near: Option<f32>,

@@ -3,6 +3,7 @@
 use super::request::{Kind, ScoringOptions, TextOptions};
 use crate::{
     error::{Error, Result},
+    formats::table::ExportFormat,
     limits::Limits,
     scene::{Preset, ScoringMethod},
 };
@@ -56,9 +57,8 @@ pub(super) fn lines(ask: &TextOptions) -> Vec<String> {
 
 /// The refusal of a text of an export whose format, `name`, takes none.
 pub(super) fn not_with(name: &str) -> Error {
-    Error::invalid(format!(
-        "text goes with the formats of Gaussians, html, coco and labelme, not with {name}"
-    ))
+    let names = ExportFormat::listed(|format| format.lines, |row| row.name);
+    Error::invalid(format!("text goes with the formats of Gaussians, {names}, not with {name}"))
 }
 
 /// Refuses a list that is empty or longer than `max`; `what` names it.

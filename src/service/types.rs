@@ -3,6 +3,7 @@
 use std::{fmt, io};
 
 use base64::{Engine as _, prelude::BASE64_STANDARD};
+use futures_util::future::BoxFuture;
 use serde::{Deserialize, Serialize, Serializer};
 use utoipa::ToSchema;
 
@@ -11,6 +12,7 @@ use super::{
     times::ViewTimes,
 };
 use crate::{
+    error::Result,
     formats::rle::Rle,
     render::FrameStats,
     scene::{Camera, SceneStatus, ScoringMethod},
@@ -220,21 +222,43 @@ impl fmt::Debug for RenderedView {
     }
 }
 
-/// A file being written.
-#[derive(Debug)]
+/// A file for other programs, not begun.
 pub struct Export {
     /// Proposed file name.
     pub file_name: String,
     /// Media type.
     pub media_type: &'static str,
-    /// Whole size, where it is known before the end.
-    pub size_bytes: Option<u64>,
     /// Hash of scene and format.
     pub etag: String,
-    pub(super) chunks: tokio::sync::mpsc::Receiver<io::Result<Vec<u8>>>,
+    pub(super) begin: BoxFuture<'static, Result<ExportBody>>,
+}
+
+impl fmt::Debug for Export {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Export({}, {})", self.file_name, self.etag)
+    }
 }
 
 impl Export {
+    /// Makes the file and begins to write it.
+    ///
+    /// # Errors
+    /// `invalid_request` and `limit_exceeded` for a scene that the format cannot hold; with a text
+    /// also those of its network.
+    pub async fn begin(self) -> Result<ExportBody> {
+        self.begin.await
+    }
+}
+
+/// A file being written.
+#[derive(Debug)]
+pub struct ExportBody {
+    /// Whole size, where it is known before the end.
+    pub size_bytes: Option<u64>,
+    pub(super) chunks: tokio::sync::mpsc::Receiver<io::Result<Vec<u8>>>,
+}
+
+impl ExportBody {
     /// The parts as a stream; a fault ends it.
     pub fn into_stream(
         self,

@@ -9,6 +9,7 @@
 //! pending/ID                    the record of what is not over; gone soon after there is a status
 //! keys/HASH  contents/HASH      scene of an idempotency key, and of a content hash
 //! replicas/R claims/ID.R deleted/ID   only where replicas share the store: see `shared`
+//! probe/ID                      for a moment: whether a store that kept nothing does again
 //! ```
 //!
 //! An object is there whole or not at all, and every byte read is under a checksum. A scene exists
@@ -57,6 +58,7 @@ const UPLOAD: &str = "upload.segsplat";
 const STATUS: &str = "status.json";
 const SCENE: &str = "scene.segsplat";
 const SEMANTICS: &str = "semantics.segsplat";
+const PROBE: &str = "probe";
 const QUARANTINED: &str = "quarantined";
 
 /// The scenes of one folder or bucket. Calls block on it; all are safe from any thread.
@@ -77,6 +79,20 @@ pub struct Store {
     _lock: Option<fs::File>,
 }
 
+/// The file of a scene's semantics before it is put, and the scene that carries them.
+#[derive(Debug)]
+pub(crate) struct PackedSemantics {
+    scene: Arc<Scene>,
+    file: Vec<u8>,
+}
+
+impl PackedSemantics {
+    /// sha256 of the file, hex.
+    pub(crate) fn file_sha256(&self) -> &str {
+        &self.scene.semantics_sha256
+    }
+}
+
 fn of(id: &SceneId, name: &str) -> Name {
     Name::from(format!("scenes/{id}/{name}"))
 }
@@ -94,6 +110,17 @@ impl Store {
     /// Whether other processes use the same scenes.
     pub(crate) fn is_shared(&self) -> bool {
         self.shared
+    }
+
+    /// Whether what was put last was kept, or something as large since. Never blocks.
+    pub(crate) fn keeps(&self) -> bool {
+        self.objects.keeps()
+    }
+
+    /// Looks whether the store keeps things again.
+    /// Fails with `store_unavailable` where it does not.
+    pub(crate) fn probe(&self) -> Result<()> {
+        self.objects.probe(Name::from(format!("{PROBE}/{}", new_id()?)))
     }
 
     /// Bytes of scenes in memory.
@@ -181,74 +208,80 @@ impl Store {
         self.objects.put("keep the scene's status", path, sealed)
     }
 
-    /// Keeps a finished scene, also in memory; gives it and the sha256 of its file, hex.
+    /// Keeps a finished scene, also in memory; gives it as it is kept.
     ///
     /// Where another replica was faster, its file stays and is the scene.
     ///
     /// # Errors
     /// `store_unavailable`; `scene_not_found` when the scene was deleted.
-    pub fn put_scene(&self, scene: Scene) -> Result<(Arc<Scene>, String)> {
-        let (id, what) = (scene.meta.id.clone(), "keep the scene");
-        let mut file = Vec::with_capacity(scene.gaussians.size_bytes() as usize + (64 << 10));
-        let mut digest = write_scene(&mut file, &scene)
-            .map_err(|e| Error::internal("the scene cannot be packed").caused_by(e))?;
-        let mut scene = Arc::new(Scene { sha256: digest.clone(), ..scene });
-        if !self.shared {
-            self.objects.put(what, of(&id, SCENE), file)?;
-        } else if !self.objects.create(what, of(&id, SCENE), file.clone())? {
-            let theirs = self.objects.get("read the scene", of(&id, SCENE))?;
-            match theirs.map(|theirs| read_scene(&theirs)) {
-                Some(Ok((theirs, sha256))) if theirs.meta.id == id => {
-                    (scene, digest) = (Arc::new(theirs), sha256);
-                }
-                _ => self.objects.put(what, of(&id, SCENE), file)?,
+    pub fn put_scene(&self, scene: Scene) -> Result<Arc<Scene>> {
+        let what = "keep the scene";
+        self.put_packed(scene, |path, file| {
+            if !self.shared {
+                return self.objects.put(what, path, file).map(|()| None);
             }
-        }
-        self.unless_deleted(&id)?;
-        self.keep(Arc::clone(&scene));
-        Ok((scene, digest))
+            if self.objects.create(what, path.clone(), file.clone())? {
+                return Ok(None);
+            }
+            let theirs = self.objects.get("read the scene", path.clone())?;
+            match theirs.map(|theirs| read_scene(&theirs)) {
+                Some(Ok((theirs, _))) if of(&theirs.meta.id, SCENE) == path => Ok(Some(theirs)),
+                _ => self.objects.put(what, path, file).map(|()| None),
+            }
+        })
     }
 
     /// Keeps another version of a finished scene in place of the one before, also in memory; gives
-    /// it. A start finds the one or the other, whole.
+    /// it as it is kept. A start finds the one or the other, whole.
     ///
     /// # Errors
     /// `store_unavailable`; `scene_not_found` when the scene was deleted.
     pub fn put_version(&self, scene: Scene) -> Result<Arc<Scene>> {
-        let (id, what) = (scene.meta.id.clone(), "keep a version of the scene");
+        let what = "keep a version of the scene";
+        self.put_packed(scene, |path, file| self.objects.put(what, path, file).map(|()| None))
+    }
+
+    /// Packs a scene and puts its file; `put` gives the scene that is kept in its place.
+    fn put_packed(
+        &self,
+        scene: Scene,
+        put: impl FnOnce(Name, Vec<u8>) -> Result<Option<Scene>>,
+    ) -> Result<Arc<Scene>> {
+        let id = scene.meta.id.clone();
         let mut file = Vec::with_capacity(scene.gaussians.size_bytes() as usize + (64 << 10));
         let sha256 = write_scene(&mut file, &scene)
             .map_err(|e| Error::internal("the scene cannot be packed").caused_by(e))?;
-        self.objects.put(what, of(&id, SCENE), file)?;
+        let kept = put(of(&id, SCENE), file)?;
         self.unless_deleted(&id)?;
-        let scene = Arc::new(Scene { sha256, ..scene });
+        let scene = Arc::new(kept.unwrap_or(Scene { sha256, ..scene }));
         self.keep(Arc::clone(&scene));
         Ok(scene)
     }
 
-    /// Keeps the semantics of a scene, and does `beside` with their file's sha256, hex, at the same
-    /// time; gives the scene that carries them, the sha256, and what `beside` gave.
-    /// Fails as [`Self::scene`] and as `beside`; `scene_corrupt` also when they are of other
-    /// Gaussians.
-    pub(crate) fn put_semantics<T>(
+    /// Packs the semantics of a scene, to be put.
+    /// Fails as [`Self::scene`]; `scene_corrupt` also when they are of other Gaussians.
+    pub(crate) fn pack_semantics(
         &self,
         id: &SceneId,
         semantics: Semantics,
-        beside: impl FnOnce(&str) -> Result<T>,
-    ) -> Result<(Arc<Scene>, String, T)> {
+    ) -> Result<PackedSemantics> {
         let semantics = Arc::new(semantics);
         let scene = self.scene(id)?.with_semantics(Arc::clone(&semantics))?;
         let mut file = Vec::new();
-        let digest = write_semantics(&mut file, id, &semantics)
+        let semantics_sha256 = write_semantics(&mut file, id, &semantics)
             .map_err(|e| Error::internal("the semantics cannot be packed").caused_by(e))?;
-        let scene = Arc::new(Scene { semantics_sha256: digest.clone(), ..scene });
-        let put = || self.objects.put("keep the scene's semantics", of(id, SEMANTICS), file);
-        let (kept, beside) = side_by_side(put, || beside(&digest));
-        kept?;
-        let beside = beside?;
+        Ok(PackedSemantics { scene: Arc::new(Scene { semantics_sha256, ..scene }), file })
+    }
+
+    /// Keeps the semantics of a scene; gives the scene that carries them.
+    /// Fails with `store_unavailable`; `scene_not_found` when the scene was deleted.
+    pub(crate) fn put_semantics(&self, packed: PackedSemantics) -> Result<Arc<Scene>> {
+        let PackedSemantics { scene, file } = packed;
+        let id = &scene.meta.id;
+        self.objects.put("keep the scene's semantics", of(id, SEMANTICS), file)?;
         self.unless_deleted(id)?;
         self.keep(Arc::clone(&scene));
-        Ok((scene, digest, beside))
+        Ok(scene)
     }
 
     /// A finished scene, from memory or the store, with its semantics where they were made; every
@@ -272,12 +305,6 @@ impl Store {
     /// The scene where it is in memory. Never blocks on the store.
     pub(crate) fn scene_in_memory(&self, id: &SceneId) -> Option<Arc<Scene>> {
         self.cache.find(id)
-    }
-
-    /// sha256 of a scene's file as it is kept, hex; `None` where there is none that is sound.
-    pub(crate) fn scene_digest(&self, id: &SceneId) -> Result<Option<String>> {
-        let file = self.objects.get("read the scene", of(id, SCENE))?;
-        Ok(file.and_then(|file| read_scene(&file).ok()).map(|(_, sha256)| sha256))
     }
 
     fn keep(&self, scene: Arc<Scene>) {

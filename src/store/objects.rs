@@ -7,7 +7,11 @@
 use std::{
     future::Future,
     path::{Path as FilePath, PathBuf},
-    sync::{Arc, mpsc},
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+        mpsc,
+    },
     time::Duration,
 };
 
@@ -42,6 +46,8 @@ pub(super) struct Objects {
     /// Runs the calls; taken when dropped.
     runtime: Option<Runtime>,
     timeout: Duration,
+    /// Bytes of the last object that was not kept; 0 once as many were kept again.
+    refused: AtomicUsize,
 }
 
 impl std::fmt::Debug for Objects {
@@ -71,7 +77,8 @@ impl Objects {
             .enable_all()
             .build()
             .map_err(|e| Error::internal("the store's threads do not start").caused_by(e))?;
-        Ok(Self { store, folder, runtime: Some(runtime), timeout })
+        let refused = AtomicUsize::new(0);
+        Ok(Self { store, folder, runtime: Some(runtime), timeout, refused })
     }
 
     /// Does `call` on the store's own threads, so that any thread may wait for it.
@@ -103,8 +110,9 @@ impl Objects {
     /// Keeps an object, whatever was there.
     pub(super) fn put(&self, what: &str, path: Path, bytes: impl Into<PutPayload>) -> Result<()> {
         let bytes: PutPayload = bytes.into();
+        let size = bytes.content_length();
         let file = self.folder.as_ref().map(|folder| folder.join(path.as_ref()));
-        self.run(what, |store| async move {
+        let kept = self.run(what, |store| async move {
             let mut tries = 0..FOLDER_GONE_MAX;
             let kept = loop {
                 match store.put(&path, bytes.clone()).await {
@@ -118,19 +126,51 @@ impl Objects {
                     tokio::task::spawn_blocking(move || file.parent().map(fs::remove_dir)).await;
             }
             kept
-        })
+        });
+        self.note(size, kept)
+    }
+
+    /// Notes whether an object of so many bytes was kept.
+    fn note<T>(&self, size: usize, kept: Result<T>) -> Result<T> {
+        match &kept {
+            Err(_) => self.refused.store(size.max(1), Ordering::Release),
+            Ok(_) if size >= self.refused.load(Ordering::Acquire) => {
+                self.refused.store(0, Ordering::Release);
+            }
+            Ok(_) => {}
+        }
+        kept
+    }
+
+    /// Whether the last object was kept, or one as large since.
+    pub(super) fn keeps(&self) -> bool {
+        self.refused.load(Ordering::Acquire) == 0
+    }
+
+    /// Keeps an object and removes it: of a folder, whose disk may be full, one as large as that
+    /// which was not kept.
+    pub(super) fn probe(&self, path: Path) -> Result<()> {
+        let refused = self.refused.load(Ordering::Acquire);
+        let size = if self.folder.is_some() { refused } else { refused.min(1) };
+        let (what, zeros) = ("keep anything", vec![0_u8; size]);
+        self.put(what, path.clone(), zeros)?;
+        self.delete(what, path)?;
+        self.refused.store(0, Ordering::Release);
+        Ok(())
     }
 
     /// Keeps an object unless there is one; whether it was kept.
     pub(super) fn create(&self, what: &str, path: Path, bytes: Vec<u8>) -> Result<bool> {
         let options = PutOptions { mode: PutMode::Create, ..PutOptions::default() };
-        self.run(what, |store| async move {
+        let size = bytes.len();
+        let kept = self.run(what, |store| async move {
             match store.put_opts(&path, bytes.into(), options).await {
                 Ok(_) => Ok(true),
                 Err(Fault::AlreadyExists { .. } | Fault::Precondition { .. }) => Ok(false),
                 Err(fault) => Err(fault),
             }
-        })
+        });
+        self.note(size, kept)
     }
 
     /// An object's bytes; `None` where there is none.

@@ -15,7 +15,8 @@ use object_store::{
 use parking_lot::Mutex;
 
 use super::{
-    Cache, Objects, Record, SCENE, STATUS, Store, UPLOAD, aside, of, pending, record, upload_file,
+    Cache, Objects, PROBE, Record, SCENE, STATUS, Store, UPLOAD, aside, of, pending, record,
+    upload_file,
 };
 use crate::{
     config::Config,
@@ -32,8 +33,8 @@ const LOCK_WAIT: Duration = Duration::from_secs(1);
 const LOCK_LOOK: Duration = Duration::from_millis(20);
 
 /// All that a store puts into its folder or bucket lies under these.
-const PREFIXES: [&str; 7] =
-    ["scenes", "pending", "keys", "contents", "replicas", "claims", "deleted"];
+const PREFIXES: [&str; 8] =
+    ["scenes", "pending", "keys", "contents", "replicas", "claims", "deleted", PROBE];
 
 /// Where scenes are kept.
 #[derive(Clone, Debug)]

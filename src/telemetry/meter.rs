@@ -43,11 +43,6 @@ impl Metrics {
             "Jobs ended, by kind and outcome",
             &["kind", "outcome"]
         )?;
-        for kind in ["scene", "semantics"] {
-            for outcome in ["done", "failed", "cancelled", "requeued"] {
-                jobs.with_label_values(&[kind, outcome]);
-            }
-        }
         let gauge = |name: &str, help: &str| register_gauge!(name, help);
         Ok(Self {
             requests: register_int_counter_vec!(
@@ -87,6 +82,15 @@ static METRICS: LazyLock<Metrics> =
 pub fn register_call(transport: &'static str, call: &'static str) {
     METRICS.requests.with_label_values(&[transport, call, "ok"]);
     METRICS.request_seconds.with_label_values(&[transport, call]);
+}
+
+/// Registers kinds of jobs before the first of them ends.
+pub fn register_jobs(kinds: impl Iterator<Item = &'static str>) {
+    for kind in kinds {
+        for outcome in ["done", "failed", "cancelled", "requeued"] {
+            METRICS.jobs.with_label_values(&[kind, outcome]);
+        }
+    }
 }
 
 /// Counts an answered call; `code` is a name of the error table, or `ok`.

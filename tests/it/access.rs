@@ -11,6 +11,7 @@ use segsplat::{
     },
     error::TABLE,
     keys::{Scope, hash},
+    limits::Limits,
 };
 
 use crate::common::{
@@ -315,6 +316,19 @@ async fn keys_read_again_count_at_once_and_a_bad_file_changes_nothing() {
     std::fs::write(&path, text).unwrap();
     server.reload(&config).unwrap();
     assert_eq!(status().await, StatusCode::UNAUTHORIZED);
+    // The limits of keys that say none of their own come with the keys.
+    let other = async || {
+        let request = crate::common::client().get(&url).bearer_auth("other");
+        request.send().await.unwrap().status()
+    };
+    assert_eq!(other().await, StatusCode::OK);
+    config.limits.key_inflight_max = 0;
+    server.reload(&config).unwrap();
+    assert_eq!(other().await, StatusCode::TOO_MANY_REQUESTS);
+    config.limits = Limits { key_requests_per_s: 1, ..Limits::default() };
+    server.reload(&config).unwrap();
+    let many = futures_util::future::join_all((0..20).map(|_| other())).await;
+    assert!(many.contains(&StatusCode::OK) && many.contains(&StatusCode::TOO_MANY_REQUESTS));
     config.keys = None;
     server.reload(&config).unwrap();
     assert_eq!(status().await, StatusCode::OK, "callers need no key any more");

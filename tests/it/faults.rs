@@ -13,14 +13,16 @@ use object_store::{ObjectStore, local::LocalFileSystem};
 use segsplat::{
     error::ErrorCode,
     sample::{self, SampleOptions},
-    scene::{SceneId, SceneState, Upload},
-    service::{CreateScene, ExportFormat, PageRequest, Service, TextOptions},
+    scene::{Refine, RefineState, SceneId, SceneOptions, SceneState, SemanticsMode, Upload},
+    service::{CreateScene, ExportFormat, PageRequest, QuerySpec, Service, TextOptions},
     store::Place,
 };
 
 use crate::common::{
+    doors::form,
     faults::{FaultStore, Wrong},
-    process::long,
+    meaning::PhotoMeaning,
+    process::{eventually, long},
     server::{PATIENCE, TestServer, WallNetworks},
 };
 
@@ -51,8 +53,8 @@ fn request(seed: u64) -> CreateScene {
 
 async fn export(service: &Service, id: &SceneId) -> Result<Vec<u8>, ErrorCode> {
     let export = service.export(id, ExportFormat::Ply, None, &ask()).await;
-    let export = export.map_err(|error| error.code())?;
-    Ok(export.into_stream().map(Result::unwrap).concat().await)
+    let body = export.map_err(|error| error.code())?.begin().await;
+    Ok(body.map_err(|error| error.code())?.into_stream().map(Result::unwrap).concat().await)
 }
 
 /// The same of a store that works: a loaded machine may be late, so it is asked again.
@@ -227,6 +229,132 @@ async fn a_full_store_refuses_uploads_serves_what_it_has_and_recovers_by_deletin
         assert!(export(&server.service, id).await.as_ref() == Ok(file), "{id}");
     }
     assert_eq!(export(&server.service, &id).await, Err(ErrorCode::SceneNotFound));
+}
+
+/// A server on a store that a plan holds, and its folder.
+async fn on_faults(
+    folder: &Path,
+    change: impl FnOnce(&mut segsplat::config::Config, &mut segsplat::service::Parts),
+) -> (Arc<FaultStore>, TestServer) {
+    let local = LocalFileSystem::new_with_prefix(folder).unwrap();
+    let local: Arc<dyn ObjectStore> = Arc::new(local.with_automatic_cleanup(true));
+    let faults = Arc::new(FaultStore::new(local, Duration::ZERO));
+    let place = Place::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
+    let server = TestServer::at(&place, change).await;
+    (faults, server)
+}
+
+/// Asks for what needs no call to the store that is held; each call is answered meanwhile.
+async fn all_answer(server: &TestServer, faults: &FaultStore, ids: [&SceneId; 2]) {
+    eventually("a call to the store is held", async || {
+        (faults.held.load(Ordering::Acquire) > 0).then_some(())
+    })
+    .await;
+    let client = crate::common::client();
+    let paths = ids.map(|id| format!("/v1/scenes/{id}"));
+    let paths = ["/healthz", "/readyz", "/v1/scenes"].into_iter().chain(paths.iter().map(|p| &**p));
+    let asked = paths.map(|path| client.get(server.url(path)).send());
+    let created = client.post(server.url("/v1/scenes")).multipart(form(&upload(77))).send();
+    let (answers, created) = tokio::join!(futures_util::future::join_all(asked), created);
+    for answer in answers {
+        let answer = answer.unwrap();
+        assert_eq!(answer.status(), 200, "{}", answer.url());
+    }
+    assert!(created.unwrap().status().is_success());
+    assert!(faults.held.load(Ordering::Acquire) > 0, "all were answered while it was held");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn nobody_waits_while_the_store_keeps_the_order_of_a_refinement() {
+    let folder = tempfile::tempdir().unwrap();
+    // Where a reader waits, it waits so long, and the test fails.
+    let (faults, server) =
+        on_faults(folder.path(), |config, _| config.limits.store_timeout_ms = 20_000).await;
+    let id = server.service.create_scene(request(1)).await.unwrap().status.id;
+    let other = server.service.create_scene(request(2)).await.unwrap().status.id;
+    let status = format!("scenes/{id}/status.json");
+    faults
+        .plan(move |what, path| (what == "put" && path.as_ref() == status).then_some(Wrong::Held));
+    let (service, asked) = (server.service.clone(), id.clone());
+    let order = tokio::spawn(async move { service.refine(&asked, Refine::Ms(600_000)).await });
+    all_answer(&server, &faults, [&id, &other]).await;
+    let shown = server.service.get(&id).await.unwrap().refinement.state;
+    assert_eq!(shown, RefineState::None, "what is not kept is not shown");
+    faults.let_go();
+    assert_eq!(order.await.unwrap().unwrap().refinement.state, RefineState::Running);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 4)]
+async fn nobody_waits_while_the_store_forgets_semantics() {
+    let folder = tempfile::tempdir().unwrap();
+    let (faults, server) = on_faults(folder.path(), |config, parts| {
+        config.limits.store_timeout_ms = 20_000;
+        parts.semantics = Arc::new(PhotoMeaning::default());
+    })
+    .await;
+    let options = SceneOptions { semantics: SemanticsMode::Eager, ..SceneOptions::default() };
+    let eager = CreateScene { options, ..request(1) };
+    let id = server.service.create_scene(eager).await.unwrap().status.id;
+    let other = server.service.create_scene(request(2)).await.unwrap().status.id;
+    let server = server.restart().await;
+    let file = folder.path().join("scenes").join(id.as_str()).join("semantics.segsplat");
+    std::fs::remove_file(file).expect("they are made");
+    faults.plan(|what, _| (what == "delete").then_some(Wrong::Held));
+    let (service, asked) = (server.service.clone(), id.clone());
+    let spec = QuerySpec { texts: vec!["photo 0".to_owned()], ..QuerySpec::default() };
+    let text = tokio::spawn(async move { service.query(&asked, spec).await });
+    all_answer(&server, &faults, [&id, &other]).await;
+    faults.let_go();
+    assert!(text.await.unwrap().unwrap().results[0].gaussians > 0, "they are made again");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_scene_that_was_taken_waits_while_the_disk_is_full_and_is_made_after() {
+    let (folder, networks) = (tempfile::tempdir().unwrap(), Arc::new(WallNetworks::default()));
+    networks.hold.store(true, Ordering::Release);
+    let given = Arc::clone(&networks);
+    let (faults, server) = on_faults(folder.path(), |_, parts| parts.scenes = given).await;
+    let taken = CreateScene { wait: None, ..request(1) };
+    let id = server.service.create_scene(taken).await.unwrap().status.id;
+    eventually("it is being made", async || {
+        (networks.calls.load(Ordering::Acquire) > 0).then_some(())
+    })
+    .await;
+    let client = crate::common::client();
+    let ready = async || {
+        let answer = client.get(server.url("/readyz")).send().await.unwrap();
+        answer.status() == 200
+    };
+    assert!(ready().await);
+    faults.plan(|what, _| (what == "put").then_some(Wrong::Full));
+    networks.hold.store(false, Ordering::Release);
+    eventually("not ready, and the scene waits", async || {
+        let status = server.service.get(&id).await.unwrap();
+        assert!(status.error.is_none(), "{status:?}");
+        (!ready().await && status.state == SceneState::Queued).then_some(())
+    })
+    .await;
+    // It is tried again and again, and none of that counts as an attempt.
+    tokio::time::sleep(Duration::from_secs(5)).await;
+    let status = server.service.get(&id).await.unwrap();
+    assert_eq!((status.state, ready().await), (SceneState::Queued, false), "{status:?}");
+    faults.plan(|_, _| None);
+    assert_eq!(server.finished(&id).await.state, SceneState::Done);
+    eventually("ready again", async || ready().await.then_some(())).await;
+    let server = server.restart().await;
+    assert_eq!(server.service.get(&id).await.unwrap().state, SceneState::Done, "it is kept");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_scene_that_a_working_store_never_keeps_fails_with_the_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    let (faults, server) = on_faults(folder.path(), |_, _| {}).await;
+    let refuse = |path: &object_store::path::Path| path.as_ref().ends_with("scene.segsplat");
+    faults.plan(move |what, path| (what == "put" && refuse(path)).then_some(Wrong::Fails));
+    let made = server.service.create_scene(request(1)).await.unwrap().status;
+    assert_eq!(made.state, SceneState::Failed);
+    assert_eq!(made.error.unwrap().code, "store_unavailable");
+    assert!(server.service.ready().ready, "it keeps other things");
 }
 
 #[tokio::test(flavor = "multi_thread")]

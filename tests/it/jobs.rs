@@ -387,6 +387,7 @@ async fn an_export_has_the_size_it_says() {
     let server = TestServer::start().await;
     let id = server.scene().await.id;
     let export = server.service.export(&id, ExportFormat::Ply, None, &ask()).await.unwrap();
+    let export = export.begin().await.unwrap();
     let size = export.size_bytes;
     let file = export.into_stream().map(Result::unwrap).concat().await;
     assert_eq!(size, Some(file.len() as u64));

@@ -125,6 +125,15 @@ impl SceneNetworks for Late {
         all[usize::from(self.state.load(Ordering::Acquire))]
     }
 
+    fn opened(&self) -> NetworkState {
+        let begun = Instant::now();
+        while self.state() == NetworkState::Opening {
+            assert!(begun.elapsed() < crate::common::server::PATIENCE, "nobody opens them");
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        self.state()
+    }
+
     fn make(
         &self,
         photos: &PhotoSet,

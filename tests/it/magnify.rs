@@ -1,7 +1,7 @@
 //! Views larger than the network's own pictures: no dot grid, and no change at its own size.
 
 use segsplat::{
-    formats::splats::{GLB, read_splats},
+    formats::{splats::GLB, table::read_splats},
     limits::Limits,
     render::{
         Frame, Kinds, RenderRequest, Renderer,

@@ -25,7 +25,7 @@ use crate::common::{
 
 /// The stand-in, whose pictures are the photos themselves: Gaussians know their pixels.
 #[derive(Debug, Default)]
-struct LensedNetworks(WallNetworks);
+pub(crate) struct LensedNetworks(pub(crate) WallNetworks);
 
 impl SceneNetworks for LensedNetworks {
     fn identity(&self) -> String {
@@ -49,7 +49,7 @@ impl SceneNetworks for LensedNetworks {
 /// So long that steps end it, or a test does.
 const LONG: Refine = Refine::Ms(600_000);
 
-fn upload() -> Upload {
+pub(crate) fn upload() -> Upload {
     let options = SampleOptions { photos: 6, width: 64, height: 48, seed: 5 };
     sample::upload(&options).expect("the options are in range")
 }

@@ -19,19 +19,19 @@ use segsplat::{
 use crate::common::server::{PATIENCE, PointRenderer, TestServer, first_view};
 
 /// Side of a large view, pixels.
-const LARGE: u32 = 1024;
+pub(crate) const LARGE: u32 = 1024;
 
 /// [`PointRenderer`] that draws `concurrency` views at the same time, and holds large ones back
 /// until it is told to go on.
 #[derive(Debug, Default)]
-struct HoldingRenderer {
-    concurrency: usize,
-    go_on: AtomicBool,
+pub(crate) struct HoldingRenderer {
+    pub(crate) concurrency: usize,
+    pub(crate) go_on: AtomicBool,
     /// Views being drawn now, and the most there were.
-    drawing: AtomicUsize,
-    most: AtomicUsize,
+    pub(crate) drawing: AtomicUsize,
+    pub(crate) most: AtomicUsize,
     /// Views that were begun.
-    begun: AtomicUsize,
+    pub(crate) begun: AtomicUsize,
 }
 
 impl Renderer for HoldingRenderer {
@@ -58,7 +58,7 @@ impl Renderer for HoldingRenderer {
     }
 }
 
-fn sized(side: u32) -> ViewSpec {
+pub(crate) fn sized(side: u32) -> ViewSpec {
     let options = ViewOptions { width: Some(side), height: Some(side), ..ViewOptions::default() };
     ViewSpec { options, ..first_view() }
 }

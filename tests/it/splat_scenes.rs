@@ -9,9 +9,9 @@ use std::{
 use flate2::{Compression, write::GzEncoder};
 use segsplat::{
     error::Result,
-    formats::splats::{
-        COMPRESSED_PLY, FORMATS, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat,
-        read_splats,
+    formats::{
+        splats::{COMPRESSED_PLY, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat},
+        table::{read_splats, splat_formats},
     },
     jobs::{NetworkState, SceneNetworks},
     pipeline::{PhotoSet, Reconstruction},
@@ -163,12 +163,44 @@ async fn a_file_is_a_scene_like_any_other() {
     let events = client().get(server.url(&format!("/v1/scenes/{id}/events")));
     let events = events.send().await.unwrap().text().await.unwrap();
     assert!(events.starts_with("event: done"), "{events}");
-    for format in FORMATS {
+    for format in splat_formats() {
         assert!(!door.export_as(id, format.name).await.unwrap().is_empty());
     }
     assert!(!door.export_as(id, "packed").await.unwrap().is_empty());
     door.delete(id).await.unwrap();
     assert_eq!(door.get(id).await.unwrap_err().code, "scene_not_found");
+    server.stop().await;
+}
+
+/// A scene of a file for antialiased views is drawn so unless a view says otherwise, and leaves so.
+#[tokio::test]
+async fn the_mode_of_a_file_is_that_of_its_views_and_exports() {
+    let server = CpuServer::start().await;
+    let mut file = Vec::new();
+    let made = SplatFile::new(&PLY, cloud(300, 0, 3), None).unwrap().antialiased(true);
+    made.write(&mut file).unwrap();
+    let text = String::from_utf8_lossy(&file[..90]).into_owned();
+    assert!(text.contains("comment SplatRenderMode: mip\n"), "{text}");
+    let scene = post(&server, &upload("a.ply", file), "").await.unwrap();
+    let id = scene["id"].as_str().unwrap();
+    assert_eq!(scene["report"]["antialiased"], true);
+    for door in doors::both(server.addr).await {
+        let drawn = async |given: Option<&str>| {
+            let ask = Ask::first().with("width", "64").with("format", "rgb8");
+            let ask = given.into_iter().fold(ask, |ask, given| ask.with("antialiased", given));
+            door.view(id, &ask).await.unwrap()
+        };
+        let (usual, on, off) =
+            (drawn(None).await, drawn(Some("true")).await, drawn(Some("false")).await);
+        assert!(usual == on && usual != off);
+    }
+    let door = doors::http(server.addr);
+    for format in splat_formats() {
+        let out = door.export_as(id, format.name).await.unwrap();
+        let name = format!("a.{}", format.ending);
+        let back = read_splats(&mut &out[..], &name, &server.service.limits()).unwrap();
+        assert_eq!(back.antialiased, format.name != SPLAT.name, "{}", format.name);
+    }
     server.stop().await;
 }
 

@@ -9,7 +9,8 @@ use segsplat::{
     error::{ErrorCode, Result},
     formats::{
         container::{read_scene, read_semantics, write_scene, write_semantics},
-        splats::{PLY, SplatFile, SplatsRead, read_splats},
+        splats::{PLY, SplatFile, SplatsRead},
+        table::read_splats,
     },
     limits::Limits,
     scene::{

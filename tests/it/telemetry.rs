@@ -180,8 +180,14 @@ async fn every_metric_is_in_the_manual_and_the_manual_knows_no_other() {
     let rows = rows.filter(|(name, _)| name.starts_with("segsplat_") || name.starts_with("proc"));
     let told = rows.map(|(name, rest)| (name, rest.split(' ').next().unwrap()));
     assert_eq!(told.collect::<BTreeSet<_>>(), served);
-    let done = "segsplat_jobs_total{kind=\"scene\",outcome=\"done\"}";
-    assert!(text.contains(done), "{text}");
+    let jobs = manual.lines().find(|line| line.contains("`segsplat_jobs_total`")).unwrap();
+    for kind in segsplat::jobs::kinds() {
+        assert!(jobs.contains(&format!("`{kind}`")), "the manual names {kind}");
+        for outcome in ["done", "failed", "cancelled", "requeued"] {
+            let line = format!("segsplat_jobs_total{{kind=\"{kind}\",outcome=\"{outcome}\"}}");
+            assert!(text.contains(&line), "{line} is served from the start");
+        }
+    }
 }
 
 #[test]

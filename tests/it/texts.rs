@@ -204,12 +204,14 @@ async fn what_nobody_kept_is_asked_once_a_call_and_not_at_the_renderer() {
     assert_eq!(embedded(), 3 + 1, "a pick");
     let kind = FeatureKind::Weights;
     let features = FeaturesSpec { camera, options, kind, scoring, wait };
-    let file: Vec<_> = service.features(id, features).await.unwrap().into_stream().collect().await;
+    let file = service.features(id, features).await.unwrap().begin().await.unwrap();
+    let file: Vec<_> = file.into_stream().collect().await;
     assert!(file.iter().all(Result::is_ok));
     assert_eq!(embedded(), 3, "features");
     for format in [ExportFormat::Ply, ExportFormat::Html, ExportFormat::Coco] {
         let ask = TextOptions { text: Some("photo 0".to_owned()), ..TextOptions::default() };
         let file = service.export(id, format, None, &ask).await.unwrap();
+        let file = file.begin().await.unwrap();
         let file: Vec<_> = file.into_stream().collect().await;
         assert!(file.iter().all(Result::is_ok));
         assert_eq!(embedded(), 3 + 1, "{format}");
@@ -342,7 +344,9 @@ async fn an_export_of_a_text_holds_what_it_selects() {
     let export = async |text: Option<&str>| {
         let ask = TextOptions { text: text.map(str::to_owned), ..TextOptions::default() };
         let export = service.export(&id, ExportFormat::Ply, None, &ask).await.unwrap();
-        let (size, etag) = (export.size_bytes, export.etag.clone());
+        let etag = export.etag.clone();
+        let export = export.begin().await.unwrap();
+        let size = export.size_bytes;
         let file: Vec<u8> = export.into_stream().map(Result::unwrap).concat().await;
         assert_eq!(size, Some(file.len() as u64));
         let count = String::from_utf8_lossy(&file[..400])
@@ -356,6 +360,11 @@ async fn an_export_of_a_text_holds_what_it_selects() {
     assert_eq!(part * 3, all);
     assert_ne!(etag, whole);
     assert_eq!(export(Some("photo 7")).await.0, 0, "a text that selects nothing");
+    // SOG cannot be empty. Who has the file is told so before it is made, and so not of that.
+    let url = fixture.server.url(&format!("/v1/scenes/{id}/export?format=sog&text=photo%207"));
+    let get = || crate::common::client().get(&url);
+    assert_eq!(get().send().await.unwrap().status(), 400);
+    assert_eq!(get().header("if-none-match", "*").send().await.unwrap().status(), 304);
 }
 
 #[tokio::test(flavor = "multi_thread")]

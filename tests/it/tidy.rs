@@ -65,6 +65,7 @@ const CONFINED: [(&str, &[&str]); 16] = [
             "src/service",
             "crates/core/src/scene",
             "crates/formats/src/rle.rs",
+            "crates/formats/src/table.rs",
             "crates/render/src/lib.rs",
         ],
     ),
@@ -251,16 +252,10 @@ fn modules_use_only_the_layers_below() {
 
 /// What files may take for now, although it closes a circle: where their names start, and from
 /// which file. Empty when what is being rebuilt is done.
-const OPENED_SOON: [(&str, &str); 9] = [
-    ("crates/vision/src/photos/layouts/", "crates/vision/src/photos/layouts/mod.rs"),
+const OPENED_SOON: [(&str, &str); 3] = [
     ("src/api/", "src/api/mod.rs"),
     ("src/api/http/error.rs", "src/api/http/middleware.rs"),
-    ("src/jobs/", "src/jobs/mod.rs"),
     ("src/service/", "src/service/mod.rs"),
-    ("src/service/create.rs", "src/service/refine.rs"),
-    ("src/service/features.rs", "src/service/export.rs"),
-    ("src/service/folder/", "src/service/folder/mod.rs"),
-    ("src/store/splats/", "src/store/splats/mod.rs"),
 ];
 
 #[test]

@@ -1,9 +1,10 @@
 //! TLS: one port, HTTP/1.1, HTTP/2 and gRPC by ALPN; slow handshakes hold nobody up.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use reqwest::{Certificate, Version};
-use tokio::net::TcpStream;
+use segsplat::{api::Server, keys::hash};
+use tokio::net::{TcpListener, TcpStream};
 
 use crate::common::cpu_server::{CpuServer, PlaneNetworks};
 
@@ -21,11 +22,16 @@ impl Files {
 /// A certificate for `localhost`, signed by itself.
 fn files() -> Files {
     let folder = tempfile::tempdir().unwrap();
-    let made = rcgen::generate_simple_self_signed(vec!["localhost".to_owned()]).unwrap();
-    std::fs::write(folder.path().join("cert.pem"), made.cert.pem()).unwrap();
-    std::fs::write(folder.path().join("key.pem"), made.signing_key.serialize_pem()).unwrap();
-    let root = Certificate::from_pem(made.cert.pem().as_bytes()).unwrap();
+    let root = write_certificate(folder.path());
     Files { folder, root }
+}
+
+/// Writes a new certificate and its key into a folder.
+fn write_certificate(folder: &Path) -> Certificate {
+    let made = rcgen::generate_simple_self_signed(vec!["localhost".to_owned()]).unwrap();
+    std::fs::write(folder.join("cert.pem"), made.cert.pem()).unwrap();
+    std::fs::write(folder.join("key.pem"), made.signing_key.serialize_pem()).unwrap();
+    Certificate::from_pem(made.cert.pem().as_bytes()).unwrap()
 }
 
 async fn stand(files: &Files) -> CpuServer {
@@ -95,4 +101,59 @@ async fn a_certificate_that_cannot_be_used_is_named_and_its_key_is_not_shown() {
         assert!(!error.message().contains("SECRET"), "{error}");
         std::fs::write(files.path(name), good).unwrap();
     }
+}
+
+/// A file with one key of this secret.
+fn write_key(path: &Path, secret: &str) {
+    let sha256 = hash(secret);
+    let text = format!("[[key]]\nname = \"a\"\nsha256 = \"{sha256}\"\nscopes = [\"read\"]\n");
+    std::fs::write(path, text).unwrap();
+}
+
+#[tokio::test]
+async fn keys_limits_and_certificate_change_together_or_not_at_all() {
+    let files = files();
+    let keys = files.path("keys.toml");
+    write_key(&keys, "old");
+    let (cert, key) = (files.path("cert.pem"), files.path("key.pem"));
+    let stand = CpuServer::with(PlaneNetworks::default(), |config| {
+        (config.tls_cert, config.tls_key) = (Some(cert), Some(key));
+        config.keys = Some(keys.clone());
+    })
+    .await;
+    let server = Server::new(stand.service.clone()).unwrap();
+    let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let port = listener.local_addr().unwrap().port();
+    tokio::spawn(server.clone().serve(listener, std::future::pending()));
+    // What a new connection that trusts this certificate is told with this key; `None`: it meets
+    // another certificate.
+    let status = async |root: &Certificate, secret: &str| {
+        let client = crate::common::client_builder().tls_certs_only([root.clone()]);
+        let url = format!("https://localhost:{port}/v1/scenes");
+        let answer = client.build().unwrap().get(url).bearer_auth(secret).send().await;
+        answer.ok().map(|answer| answer.status().as_u16())
+    };
+    let page_max = || stand.service.limits().page_max;
+    let mut config = stand.service.config().clone();
+    let old_page = page_max();
+    assert_eq!(status(&files.root, "old").await, Some(200));
+    config.limits.page_max = 7;
+    for bad in ["keys.toml", "cert.pem", "key.pem"] {
+        // All are new, and one of them cannot be used.
+        let new_root = write_certificate(files.folder.path());
+        write_key(&keys, "new");
+        std::fs::write(files.path(bad), "rubbish").unwrap();
+        server.reload(&config).expect_err(bad);
+        assert_eq!(status(&files.root, "old").await, Some(200), "{bad}");
+        assert_eq!(status(&files.root, "new").await, Some(401), "{bad}");
+        assert_eq!(status(&new_root, "old").await, None, "{bad}");
+        assert_eq!(page_max(), old_page, "{bad}");
+    }
+    let new_root = write_certificate(files.folder.path());
+    write_key(&keys, "new");
+    server.reload(&config).unwrap();
+    assert_eq!(status(&new_root, "new").await, Some(200));
+    assert_eq!(status(&new_root, "old").await, Some(401));
+    assert_eq!(status(&files.root, "new").await, None, "new connections get the new certificate");
+    assert_eq!(page_max(), 7);
 }

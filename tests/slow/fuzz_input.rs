@@ -25,7 +25,8 @@ use segsplat::{
     error::{ErrorCode, Result, TABLE},
     formats::{
         container::{read_scene, read_semantics, write_scene, write_semantics},
-        splats::{FORMATS, GLB, SOG, SplatFile, read_splats},
+        splats::{GLB, SOG, SplatFile},
+        table::{read_splats, splat_formats},
     },
     limits::Limits,
     photos,
@@ -394,7 +395,7 @@ fn containers_of_scenes_and_semantics() {
 
 #[test]
 fn files_of_gaussians() {
-    for format in FORMATS {
+    for format in splat_formats() {
         let file = SplatFile::new(format, cloud(20, 1, 3), Some(&semantics())).unwrap();
         let mut bytes = Vec::new();
         file.write(&mut bytes).unwrap();

@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from segsplat import AsyncClient, AsyncScene, Client, Event, Models, Scene, SceneStatus
-from segsplat.calls import ExportFormat
+from segsplat.formats import ExportFormat
 from segsplat.types import SceneOptions
 
 #: Methods of a client or a scene by the calls of the document.

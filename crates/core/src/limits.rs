@@ -1,6 +1,9 @@
 //! Every limit in one place, with its unit and its reason. The server's configuration file sets
 //! them.
 
+use std::sync::Arc;
+
+use parking_lot::RwLock;
 use serde::{Deserialize, Serialize};
 
 use crate::error::{Error, Result};
@@ -32,7 +35,8 @@ pub const FOV_RANGE: [f64; 2] = [0.1, 170.0];
 pub const FOCAL_RANGE: [f64; 2] = [1.0, 1e6];
 
 /// Declares the limits: name, type and default; `restart` where a new number counts only after a
-/// restart, because it sizes something at start.
+/// restart, because it sizes something at start. All others are read from [`LiveLimits`] at each
+/// use.
 macro_rules! limits {
     ($($(#[$doc:meta])+ $name:ident: $type:ty = $default:expr $(, $restart:ident)?;)+) => {
         /// Caps on what a caller may send or ask for.
@@ -49,13 +53,15 @@ macro_rules! limits {
         }
 
         impl Limits {
-            /// Names of the limits that differ in `new` and count only after a restart.
-            pub fn changed_for_next_start(&self, new: &Self) -> Vec<&'static str> {
+            /// Gives each limit that counts only after a restart the number that it has in
+            /// `start`; names those that had another.
+            fn hold_to_start(&mut self, start: &Self) -> Vec<&'static str> {
                 let mut names = Vec::new();
                 $($(
                     let $restart = stringify!($name);
-                    if self.$name != new.$name {
+                    if self.$name != start.$name {
                         names.push($restart);
+                        self.$name = start.$name;
                     }
                 )?)+
                 names
@@ -74,7 +80,7 @@ limits! {
     /// Bytes of all uploads being received; one more byte is refused as `overloaded`.
     uploads_bytes_max: usize = 1 << 30, restart;
     /// Bytes of one JSON part (`transforms`, `cameras`) or JSON body.
-    json_bytes_max: usize = 8 << 20;
+    json_bytes_max: usize = 8 << 20, restart;
     /// Values in one JSON part or body, counted before it is read: eight megabytes of empty objects
     /// would take hundreds of megabytes. 64 cameras have some 2,000.
     json_values_max: usize = 250_000;
@@ -116,7 +122,7 @@ limits! {
     /// Bytes of the features (F) of one view: 1024 x 512 pixels of 512 numbers.
     features_bytes_max: u64 = 1 << 30;
     /// Bytes kept of the parts of scenes that were looked for to give boxes.
-    pieces_cache_bytes_max: u64 = 128 << 20;
+    pieces_cache_bytes_max: u64 = 128 << 20, restart;
     /// Parts of one text's selection that an answer lists, the largest first.
     parts_max: usize = 64;
     /// Bytes of photos that the create call read, kept in memory for the jobs of their scenes. A
@@ -154,7 +160,7 @@ limits! {
     /// Bytes of scenes kept in memory.
     cache_bytes_max: u64 = 4 << 30, restart;
     /// Bytes of scenes kept on one GPU device: what a card of 8 GB has to spare beside its frames.
-    device_scene_bytes_max: u64 = 2 << 30;
+    device_scene_bytes_max: u64 = 2 << 30, restart;
     /// Milliseconds in which the head of a request must come, from the connection's start or the
     /// end of the call before it. A connection that sends none in this time is closed.
     head_timeout_ms: u64 = 10_000, restart;
@@ -165,7 +171,7 @@ limits! {
     /// Milliseconds one render may take.
     render_timeout_ms: u64 = 30_000;
     /// Milliseconds one scene may take.
-    scene_timeout_ms: u64 = 600_000, restart;
+    scene_timeout_ms: u64 = 600_000;
     /// Milliseconds of work that one refinement may be given.
     refine_ms_max: u64 = 600_000;
     /// Steps of one refinement: those of ten minutes on 64 cores.
@@ -182,7 +188,7 @@ limits! {
     /// Calls of one API key that may be open at the same time, where it says no number of its own.
     key_inflight_max: usize = 128;
     /// Milliseconds one call to the store may take.
-    store_timeout_ms: u64 = 60_000;
+    store_timeout_ms: u64 = 60_000, restart;
     /// Milliseconds between two looks for what a crash left in the store.
     sweep_every_ms: u64 = 600_000;
     /// Milliseconds for which a replica believes what it read of a scene made elsewhere.
@@ -193,7 +199,7 @@ limits! {
     replica_lease_ms: u64 = 10_000;
     /// Resident bytes of the process beyond which uploads are refused as `overloaded`; 0: four
     /// fifths of what the machine or the container has.
-    memory_bytes_max: u64 = 0;
+    memory_bytes_max: u64 = 0, restart;
     /// Scenes on one page of a list.
     page_max: usize = 100;
     /// Gaussians in one scene, made of photos or read from a file.
@@ -201,6 +207,33 @@ limits! {
     /// Bytes that the Gaussians of a file that is sent may take in memory: what a small packed file
     /// with many of them meets. As many as `gaussians_max` of degree 0, 4.4 million of degree 3.
     splats_bytes_max: u64 = 1 << 30;
+}
+
+/// The limits in force. Who follows a reload reads them here at each use.
+#[derive(Debug)]
+pub struct LiveLimits {
+    start: Limits,
+    now: RwLock<Arc<Limits>>,
+}
+
+impl LiveLimits {
+    /// The limits of the start.
+    pub fn new(start: Limits) -> Self {
+        Self { now: RwLock::new(Arc::new(start.clone())), start }
+    }
+
+    /// The limits now.
+    pub fn get(&self) -> Arc<Limits> {
+        Arc::clone(&self.now.read())
+    }
+
+    /// Puts others in force, but for those that count only after a restart; names those of them
+    /// that differ.
+    pub fn reload(&self, mut new: Limits) -> Vec<&'static str> {
+        let later = new.hold_to_start(&self.start);
+        *self.now.write() = Arc::new(new);
+        later
+    }
 }
 
 impl Limits {

@@ -3,6 +3,7 @@
 //!
 //! | module | what |
 //! |---|---|
+//! | [`table`] | all formats that scenes are exported in |
 //! | [`splats`] | Gaussians: PLY, compressed PLY, SPZ, SOG, GLB, `.splat`, in and out |
 //! | [`captures`] | photos and cameras of any layout, in: which photo has which lens and pose |
 //! | [`folders`] | a scene as a zip of a folder, out: COLMAP, nerfstudio, COCO, `LabelMe` |
@@ -19,5 +20,6 @@ pub mod npz;
 pub mod packed;
 pub mod rle;
 pub mod splats;
+pub mod table;
 
 use segsplat_core::{error, limits, names, scene};

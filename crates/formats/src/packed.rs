@@ -39,6 +39,8 @@ struct Header<'a> {
     sh_degree: u8,
     front_photos: u32,
     magnify: bool,
+    /// Whether opacity is compensated for the blur of small Gaussians.
+    antialiased: bool,
     backdrop: bool,
     /// Whether entries of the bank are known.
     understood: bool,
@@ -66,6 +68,7 @@ pub fn write_packed(scene: &Scene, near: f32, to: &mut dyn Write) -> Result<()> 
         sh_degree: gaussians.sh_degree(),
         front_photos: report.method.front_photos,
         magnify: report.method.magnify,
+        antialiased: report.antialiased,
         backdrop: report.method.backdrop,
         understood: scene.semantics.is_some(),
         cameras: &scene.meta.cameras,

@@ -93,7 +93,7 @@ fn report(report: HealthReport) -> pb::HealthReport {
     message!(HealthReport from report
         {
             photos, views_used, gaussians, median_depth, overlap, network_focal_px,
-            execution_provider
+            execution_provider, antialiased
         }
         dropped: report.dropped.into_iter().map(drop_count).collect(),
         depth_near,
@@ -494,8 +494,17 @@ both_ways! {
     FeatureKind = FeatureKind { Weights, Features }
     Boxes = Boxes { Oriented, Upright, Aligned, None }
     MaskFormat = MaskFormat { Rle, Png, None }
-    ExportFormat = ExportFormat {
-        Ply, Npz, Packed, Html, CompressedPly, Spz, Spz4, Sog, Glb, Splat, Colmap, Nerfstudio, Coco,
-        Labelme
+}
+
+/// Formats have the same names in the table and in the message.
+impl FromNumber for ExportFormat {
+    fn from_number(number: i32) -> Option<Self> {
+        match pb::ExportFormat::try_from(number).ok()? {
+            pb::ExportFormat::Unspecified => Some(Self::default()),
+            theirs => {
+                let name = theirs.as_str_name().strip_prefix("EXPORT_FORMAT_")?;
+                Self::named(&name.to_ascii_lowercase())
+            }
+        }
     }
 }

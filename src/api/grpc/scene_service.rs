@@ -145,7 +145,7 @@ impl pb::scene_service_server::SceneService for Api {
     ) -> Answer<Self::FeaturesStream> {
         answer(self, request, |api, request| async move {
             let id = request.scene_id.parse()?;
-            Ok(chunks(api.service.features(&id, convert::features(request)?).await?))
+            chunks(api.service.features(&id, convert::features(request)?).await?).await
         })
         .await
     }
@@ -287,19 +287,17 @@ async fn export(api: Api, request: pb::ExportRequest) -> Result<Many<pb::ExportC
     let text = convert::text(request.text, request.scoring, request.semantics_wait_ms);
     let format = convert::value("format", request.format)?;
     let preset = convert::given("preset", request.preset)?;
-    Ok(chunks(api.service.export(&id, format, preset, &text).await?))
+    chunks(api.service.export(&id, format, preset, &text).await?).await
 }
 
 /// A file in pieces.
-fn chunks(export: Export) -> Many<pb::ExportChunk> {
-    let first = pb::ExportChunk {
-        size_bytes: export.size_bytes,
-        file_name: export.file_name.clone(),
-        ..Default::default()
-    };
+async fn chunks(export: Export) -> Result<Many<pb::ExportChunk>> {
+    let file_name = export.file_name.clone();
+    let body = export.begin().await?;
+    let first = pb::ExportChunk { size_bytes: body.size_bytes, file_name, ..Default::default() };
     let piece = |data: io::Result<Vec<u8>>| match data {
         Ok(data) => Ok(pb::ExportChunk { data: data.into(), ..Default::default() }),
         Err(e) => Err(logged(&Error::internal("the file broke off").caused_by(e))),
     };
-    stream::once(async { Ok(first) }).chain(export.into_stream().map(piece)).boxed()
+    Ok(stream::once(async { Ok(first) }).chain(body.into_stream().map(piece)).boxed())
 }

@@ -430,7 +430,7 @@ mod tests {
         let camera: CameraFields = query.take().unwrap();
         assert_eq!((camera.from, camera.eye), (Some(1), Some([0.0, 1.0, 2.5])));
         let options: ViewOptions = query.take().unwrap();
-        assert_eq!((options.width, options.antialiased), (Some(8), true));
+        assert_eq!((options.width, options.antialiased), (Some(8), Some(true)));
         let picture: PictureOptions = query.take().unwrap();
         assert_eq!(picture.background, BackgroundSpec::Color([1.0, 0.0, 0.0]));
         assert_eq!(<[u32; 4]>::from(picture.crop.unwrap()), [1, 2, 3, 4]);

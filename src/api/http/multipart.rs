@@ -51,9 +51,8 @@ pub(super) struct UploadForm {
     /// all other parts.
     #[schema(content_media_type = "application/octet-stream")]
     archive: Option<String>,
-    /// A file of Gaussians (PLY, compressed PLY, SPZ, SOG, GLB with `KHR_gaussian_splatting`,
-    /// `.splat`), instead of all other parts. A `.splat` is known by the ending of the file's name
-    /// alone.
+    /// A file of Gaussians, of any format of Gaussians that `export` writes, instead of all other
+    /// parts. A `.splat` is known by the ending of the file's name alone.
     #[schema(content_media_type = "application/octet-stream")]
     splats: Option<String>,
     /// Any other part is a photo, or a camera file of a capture, named by its part or file. Without

@@ -1,6 +1,6 @@
 //! One rendered view, and the scene as a file.
 
-use std::time::Duration;
+use std::{collections::BTreeMap, time::Duration};
 
 use axum::{
     Extension,
@@ -9,7 +9,10 @@ use axum::{
     response::{IntoResponse, Response},
 };
 use serde::Deserialize;
-use utoipa::IntoParams;
+use utoipa::{
+    IntoParams, IntoResponses, PartialSchema,
+    openapi::{self, RefOr, content::ContentBuilder, response::ResponseBuilder},
+};
 
 use super::{
     error::ApiError,
@@ -42,11 +45,7 @@ pub(super) struct ViewParams {
 #[serde(default)]
 #[into_params(parameter_in = Query)]
 pub(super) struct ExportParams {
-    /// `ply` (default), `compressed_ply`, `spz`, `spz4`, `sog`, `glb` or `splat`: Gaussians for
-    /// other programs; `npz`: the semantics as arrays; `packed`: the scene as the page draws it;
-    /// `html`: the page with the scene in it, and what it shows of each line of `text`; `colmap`
-    /// and `nerfstudio`: a zip of a folder with photos, cameras, points and depth maps; `coco` and
-    /// `labelme`: a zip with what each line of `text` selects in each photo.
+    /// What the file is; `ply` by default.
     #[param(inline)]
     format: ExportFormat,
     /// How a text is scored: `default` or `paper`. By default as the scene was made.
@@ -102,18 +101,12 @@ pub(super) async fn view(
 
 /// The scene, or what a text selects of it, as a file
 #[utoipa::path(
-    get, path = "/v1/scenes/{id}/export", operation_id = "export", tag = "views",
+    get,
+    path = "/v1/scenes/{id}/export",
+    operation_id = "export",
+    tag = "views",
     params(Id, ExportParams, TextOptions, ScoringOptions),
-    responses((
-        status = 200,
-        content(
-            (Vec<u8> = "application/octet-stream"),
-            (Vec<u8> = "model/gltf-binary"),
-            (Vec<u8> = "application/zip"),
-        ),
-        description = "Gaussians as PLY, compressed PLY, SPZ, GLB or .splat, an npz of arrays, \
-            the packed scene, an HTML page, or a zip of a folder"
-    ))
+    responses(ExportFile)
 )]
 pub(super) async fn export(
     CallerApi(api): CallerApi,
@@ -124,7 +117,7 @@ pub(super) async fn export(
     let ExportParams { format, preset } = fields.take()?;
     let ask = text(&mut fields)?;
     fields.finish()?;
-    Ok(file(&headers, api.service.export(&id, format, preset, &ask).await?))
+    file(&headers, api.service.export(&id, format, preset, &ask).await?).await
 }
 
 /// The pixels of a view over the bank, as arrays
@@ -150,13 +143,28 @@ pub(super) async fn features(
     let wait = wait_ms.map(Duration::from_millis);
     let spec = FeaturesSpec { camera, options, kind, scoring: scoring(f)?, wait };
     fields.finish()?;
-    Ok(file(&headers, api.service.features(&id, spec).await?))
+    file(&headers, api.service.features(&id, spec).await?).await
+}
+
+/// The answer of an export, by the table of formats.
+struct ExportFile;
+
+impl IntoResponses for ExportFile {
+    fn responses() -> BTreeMap<String, RefOr<openapi::Response>> {
+        let titles: Vec<&str> = ExportFormat::all().map(|format| format.title).collect();
+        let mut answer = ResponseBuilder::new().description(titles.join(", "));
+        for format in ExportFormat::all() {
+            let content = ContentBuilder::new().schema(Some(<Vec<u8> as PartialSchema>::schema()));
+            answer = answer.content(format.media_type, content.build());
+        }
+        BTreeMap::from([("200".to_owned(), answer.build().into())])
+    }
 }
 
 /// A file that is written while it is sent, unless the caller has it.
-fn file(headers: &HeaderMap, export: Export) -> Response {
+async fn file(headers: &HeaderMap, export: Export) -> Result<Response, ApiError> {
     if let Some(answer) = not_modified(headers, &export.etag) {
-        return answer;
+        return Ok(answer);
     }
     let disposition = format!("attachment; filename=\"{}\"", export.file_name);
     let headers = [
@@ -167,12 +175,13 @@ fn file(headers: &HeaderMap, export: Export) -> Response {
         (header::ETAG, quoted(&export.etag)),
         (header::CACHE_CONTROL, "private, no-cache".to_owned()),
     ];
-    let size = export.size_bytes.map(|bytes| [(header::CONTENT_LENGTH, bytes.to_string())]);
-    let body = Body::from_stream(export.into_stream());
-    match size {
+    let body = export.begin().await?;
+    let size = body.size_bytes.map(|bytes| [(header::CONTENT_LENGTH, bytes.to_string())]);
+    let body = Body::from_stream(body.into_stream());
+    Ok(match size {
         Some(size) => (headers, size, body).into_response(),
         None => (headers, body).into_response(),
-    }
+    })
 }
 
 /// The changes of how texts are scored, from a query string.

@@ -36,15 +36,19 @@ impl Server {
         Ok(Self { app: app(&api)?, api, tls })
     }
 
-    /// Puts keys, limits and certificate of `config` in force. On an error the old ones stay.
+    /// Puts keys, limits and certificate of `config` in force: all of them, or on an error none.
     ///
     /// # Errors
     /// `invalid_request` when keys or certificate cannot be used.
     pub fn reload(&self, config: &Config) -> Result<()> {
-        if let Some(tls) = &self.tls {
-            tls.reload(config)?;
+        // All are read before the first of them is changed.
+        let put_tls = self.tls.as_ref().map(|tls| tls.read_again(config)).transpose()?;
+        let put_others = self.api.read_again(config)?;
+        if let Some(put_tls) = put_tls {
+            put_tls();
         }
-        self.api.reload(config)
+        put_others();
+        Ok(())
     }
 
     /// Serves on `listener` until `stop` resolves, then drains: not ready any more, after

@@ -48,13 +48,13 @@ impl Tls {
         Ok(server.map(|server| Self(Arc::new(RwLock::new(server)))))
     }
 
-    /// Reads the files again. On an error the old certificate stays.
-    pub(super) fn reload(&self, config: &Config) -> Result<()> {
+    /// Reads the files again; the call that this gives puts them in force.
+    pub(super) fn read_again(&self, config: &Config) -> Result<impl FnOnce() + use<>> {
         let server = load(config)?.ok_or_else(|| {
             Error::invalid("tls_cert: TLS cannot be switched off while the server runs")
         })?;
-        *self.0.write().unwrap_or_else(PoisonError::into_inner) = server;
-        Ok(())
+        let in_force = Arc::clone(&self.0);
+        Ok(move || *in_force.write().unwrap_or_else(PoisonError::into_inner) = server)
     }
 
     /// Connections of `listener` after their handshakes.

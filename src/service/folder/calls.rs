@@ -12,20 +12,20 @@ use tokio::{runtime::Handle, sync::OwnedSemaphorePermit};
 use super::{Contents, Views, checked_texts, depth_of, masks_of, photo_views, write};
 use crate::{
     error::{Error, ErrorCode, Result},
-    formats::folders::FolderFormat,
+    formats::{folders::FolderFormat, table::ExportFormat},
     keys::Caller,
     limits::Limits,
     scene::{Preset, Scene, SceneId, Upload},
     service::{
         Inner, OfflineService, Service,
-        create::blocking,
         export::stream_until,
         request::{ScoringOptions, TextOptions, ViewOptions},
         schedule::Demand,
         search::{SceneTexts, ScoringChoice},
         tags::{cache_key, etag, semantics_tag},
+        tasks::blocking,
         texts,
-        types::{Export, TextView},
+        types::{Export, ExportBody, TextView},
         view::Resolved,
         work::Work,
     },
@@ -108,7 +108,7 @@ impl Service {
     pub(in crate::service) async fn folder(
         &self,
         id: &SceneId,
-        format: &'static FolderFormat,
+        (format, folder): (ExportFormat, FolderFormat),
         preset: Option<Preset>,
         ask: &TextOptions,
     ) -> Result<Export> {
@@ -137,9 +137,8 @@ impl Service {
         let asked = scored.as_ref().map(|_| (&texts, &ask.scoring));
         let how = (semantics_tag(&scene), inner.backend.renderer.name(), preset, asked);
         let key = cache_key(&(how, upload.is_some(), env!("CARGO_PKG_VERSION")))?;
-        let etag = format!("{}-{}", etag(&key), format.name);
         let (runtime, caller) = (Handle::current(), self.caller.clone());
-        let chunks = stream_until(Some(until), move |to: &mut dyn Write| {
+        let write = move |to: &mut dyn Write| {
             let _permit = permit;
             let contents = Contents {
                 scene: &scene,
@@ -150,10 +149,11 @@ impl Service {
             };
             let scene = Arc::clone(&scene);
             let mut views = Scheduled { inner, runtime, caller, scene, texts: scored, until };
-            write(format, &contents, &mut views, to).map(drop)
-        });
-        let file_name = format!("{id}.{}", format.ending);
-        Ok(Export { media_type: "application/zip", ..Export::new(file_name, etag, chunks) })
+            write(folder, &contents, &mut views, to).map(drop)
+        };
+        Ok(Export::new(etag(&key), async move {
+            Ok(ExportBody { size_bytes: None, chunks: stream_until(Some(until), write) })
+        }))
     }
 }
 
@@ -185,7 +185,7 @@ impl OfflineService {
     pub fn folder(
         &self,
         scene: &Arc<Scene>,
-        format: &FolderFormat,
+        (format, folder): (ExportFormat, FolderFormat),
         (asked, preset, scoring): (&[String], Option<Preset>, &ScoringOptions),
         upload: Option<&Upload>,
         to: &mut dyn Write,
@@ -200,6 +200,6 @@ impl OfflineService {
             Some(self.score(scene, "text", preset, scoring, &asked)?)
         };
         let contents = Contents { scene, views, upload, texts: &asked, limits };
-        write(format, &contents, &mut Alone { service: self, scene, texts, limits }, to)
+        write(folder, &contents, &mut Alone { service: self, scene, texts, limits }, to)
     }
 }

@@ -20,8 +20,9 @@ use super::{
 };
 use crate::{
     error::{Error, Result},
-    formats::folders::{
-        FolderContents, FolderFormat, FolderMask, FolderPixels, PhotoFile, PutPhoto,
+    formats::{
+        folders::{FolderContents, FolderFormat, FolderMask, FolderPixels, PhotoFile, PutPhoto},
+        table::ExportFormat,
     },
     limits::Limits,
     photos::{SentPixels, each},
@@ -30,8 +31,8 @@ use crate::{
 };
 
 /// The texts of a call, checked: at least one where the format shows them, else none.
-fn checked_texts(format: &FolderFormat, asked: &[String], limits: &Limits) -> Result<Vec<String>> {
-    match (format.texts, asked.is_empty()) {
+fn checked_texts(format: ExportFormat, asked: &[String], limits: &Limits) -> Result<Vec<String>> {
+    match (format.lines, asked.is_empty()) {
         (true, _) => texts::all_checked(asked, "text", limits),
         (false, true) => Ok(Vec::new()),
         (false, false) => Err(texts::not_with(format.name)),
@@ -60,14 +61,14 @@ trait Views {
 
 /// Writes the zip; how many photos are in it.
 fn write(
-    format: &FolderFormat,
+    folder: FolderFormat,
     of: &Contents<'_>,
     views: &mut dyn Views,
     to: &mut dyn Write,
 ) -> Result<usize> {
     let points_max = of.limits.folder_points_max;
     let contents = FolderContents { scene: of.scene, texts: of.texts, points_max };
-    format.write(&contents, &mut Pixels { of, views }, to)
+    folder.write(&contents, &mut Pixels { of, views }, to)
 }
 
 /// The photos of an upload and the views of a scene, by the number of the photo.

@@ -172,7 +172,7 @@ impl Ask {
             height: self.number("height"),
             format: format.into(),
             background: self.numbers("background").map(|v| pb::Vec3 { x: v[0], y: v[1], z: v[2] }),
-            antialiased: self.get("antialiased") == Some("true"),
+            antialiased: self.get("antialiased").map(|given| given == "true"),
             near: self.number("near"),
             preset: preset(self.get("preset")).into(),
             front_photos: self.number("front_photos"),

@@ -9,11 +9,15 @@ use std::{
     time::Duration,
 };
 
-use futures_util::{StreamExt, TryStreamExt, stream::BoxStream};
+use futures_util::{
+    StreamExt, TryStreamExt,
+    stream::{self, BoxStream},
+};
 use object_store::{
     CopyOptions, Error, GetOptions, GetResult, ListResult, MultipartUpload, ObjectMeta,
     ObjectStore, PutMultipartOptions, PutOptions, PutPayload, PutResult, Result, path::Path,
 };
+use tokio::sync::Semaphore;
 
 /// What goes wrong with a call.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,10 +30,28 @@ pub(crate) enum Wrong {
     Tears,
     /// It hangs, and does its work long after its caller has gone.
     Stalls,
+    /// It hangs until the test lets go.
+    Held,
     /// There is no room.
     Full,
     /// A local store misses a folder that a deletion emptied and removed meanwhile.
     NoFolder,
+}
+
+/// A call that is held, until it goes on or its caller gives it up.
+struct Held(Arc<AtomicUsize>);
+
+impl Held {
+    fn begin(count: Arc<AtomicUsize>) -> Self {
+        count.fetch_add(1, Ordering::AcqRel);
+        Self(count)
+    }
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::AcqRel);
+    }
 }
 
 type Plan = Box<dyn FnMut(&str, &Path) -> Option<Wrong> + Send>;
@@ -41,12 +63,31 @@ pub(crate) struct FaultStore {
     plan: Mutex<Plan>,
     pub(crate) wrongs: AtomicUsize,
     stall: Duration,
+    /// Calls that are held now.
+    pub(crate) held: Arc<AtomicUsize>,
+    /// Closed when the test lets go.
+    gate: Arc<Semaphore>,
 }
 
 impl FaultStore {
     pub(crate) fn new(inner: Arc<dyn ObjectStore>, stall: Duration) -> Self {
         let plan: Plan = Box::new(|_, _| None);
-        Self { inner, plan: Mutex::new(plan), wrongs: AtomicUsize::new(0), stall }
+        let (held, gate) = (Arc::default(), Arc::new(Semaphore::new(0)));
+        Self { inner, plan: Mutex::new(plan), wrongs: AtomicUsize::new(0), stall, held, gate }
+    }
+
+    /// Lets all held calls go on, also those that come later.
+    pub(crate) fn let_go(&self) {
+        self.gate.close();
+    }
+
+    /// Waits until the test lets go.
+    fn hold(&self) -> impl Future<Output = ()> + Send + use<> {
+        let (held, gate) = (Arc::clone(&self.held), Arc::clone(&self.gate));
+        async move {
+            let _one = Held::begin(held);
+            drop(gate.acquire().await);
+        }
     }
 
     pub(crate) fn plan(&self, plan: impl FnMut(&str, &Path) -> Option<Wrong> + Send + 'static) {
@@ -89,6 +130,10 @@ impl ObjectStore for FaultStore {
             None => self.inner.put_opts(location, payload, opts).await,
             Some(Wrong::Fails) => Err(error(ErrorKind::ConnectionReset)),
             Some(Wrong::Full) => Err(error(ErrorKind::StorageFull)),
+            Some(Wrong::Held) => {
+                self.hold().await;
+                self.inner.put_opts(location, payload, opts).await
+            }
             Some(Wrong::NoFolder) => Err(error(ErrorKind::NotFound)),
             Some(Wrong::Lost) => {
                 self.inner.put_opts(location, payload, opts).await?;
@@ -142,6 +187,15 @@ impl ObjectStore for FaultStore {
         match wrong {
             None | Some(Wrong::Full | Wrong::NoFolder | Wrong::Tears | Wrong::Stalls) => {
                 inner.delete_stream(locations)
+            }
+            Some(Wrong::Held) => {
+                let held = self.hold();
+                stream::once(async move {
+                    held.await;
+                    inner.delete_stream(locations)
+                })
+                .flatten()
+                .boxed()
             }
             Some(Wrong::Fails) => locations
                 .and_then(|_| async { Err(error(std::io::ErrorKind::ConnectionReset)) })

@@ -23,6 +23,7 @@ from .errors import (
     SegSplatError,
     error_of,
 )
+from .formats import ENDINGS, SPLATS, ExportFormat
 from .gaussians import Gaussians
 from .progress import show_bar
 from .types import (
@@ -61,16 +62,6 @@ from .wire import (
 if TYPE_CHECKING:
     from viser import ViserServer
 
-#: Endings of files of Gaussians.
-SPLATS = (".ply", ".spz", ".sog", ".glb", ".splat")
-#: Formats of `export`, and the endings of those that are not called so.
-ExportFormat: TypeAlias = Literal[
-    "ply", "compressed_ply", "spz", "spz4", "sog", "glb", "splat", "npz", "packed", "html",
-    "colmap", "nerfstudio", "coco", "labelme",
-]  # fmt: skip
-ENDINGS = {"compressed_ply": "compressed.ply", "spz4": "v4.spz", "packed": "segsplat"} | {
-    name: f"{name}.zip" for name in ("colmap", "nerfstudio", "coco", "labelme")
-}
 #: Cameras of one call; more go as more calls.
 CAMERAS_MAX = 64
 
@@ -470,16 +461,12 @@ def export(
 ) -> Flow[Path]:
     """Writes the scene, or what a text selects of it, to a file as it comes, and tells its path.
 
-    format: "ply", as 3DGS writes it; "compressed_ply" (PlayCanvas, SuperSplat), "spz" (version 3),
-        "spz4", "sog", "glb" (KHR_gaussian_splatting) and "splat" for other programs. "npz": the
-        semantics as arrays; "packed": the scene as the page draws it; "html": the page with the
-        scene in it. A zip of a folder: "colmap" and "nerfstudio" with photos, cameras, points and
-        depth maps, "coco" and "labelme" with what texts select in each photo.
+    format: Gaussians for other programs, a zip of a folder, arrays or the page: `segsplat.formats`
+        says what each is.
     path: by default the scene's id with the ending of the format, in the current folder.
-    text: several texts for "html", "coco" and "labelme", one for files of Gaussians.
+    text: several texts for "html", "coco" and "labelme", one for the formats of Gaussians.
     """
-    ending = ENDINGS.get(format, format)
-    target = Path(path) if path is not None else Path(f"{scene.id}.{ending}")
+    target = Path(path) if path is not None else Path(f"{scene.id}.{ENDINGS.get(format, format)}")
     part = target.with_name(target.name + ".part")
     lines = text if text is None or isinstance(text, str) else "\n".join(text)
     params = _given({**_drawing(options), "format": format, "text": lines})

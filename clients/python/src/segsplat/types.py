@@ -146,7 +146,7 @@ class Drawing(TypedDict, total=False):
     width: int
     #: Pixels.
     height: int
-    #: Opacity compensated for the blur of small Gaussians.
+    #: Opacity compensated for the blur of small Gaussians; as the scene's file says by default.
     antialiased: bool
     #: Near plane, world units.
     near: float
@@ -338,6 +338,8 @@ class Report:
     network_focal_px: tuple[float, ...] = ()
     #: Format of the file of Gaussians that the scene is; None where it was made of photos.
     file_format: str | None = None
+    #: Whether that file was made for antialiased views, which are then the default.
+    antialiased: bool = False
     #: How it was made: the options of the scene, by name.
     method: Method = dataclasses.field(default_factory=dict)
     #: Gaussians dropped or clamped.

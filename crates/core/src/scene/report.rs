@@ -76,6 +76,11 @@ pub struct HealthReport {
     /// Format of the file of Gaussians that the scene is; none where it was made of photos.
     #[serde(skip_serializing_if = "Option::is_none", default)]
     pub file_format: Option<String>,
+    /// Whether that file was made for a renderer that compensates opacity for the blur of small
+    /// Gaussians: views are drawn so unless they say otherwise.
+    #[serde(default)]
+    #[schema(required = true)]
+    pub antialiased: bool,
     /// How it was made.
     #[serde(default)]
     #[schema(required = true)]

@@ -7,7 +7,7 @@ use glam::DVec3;
 use segsplat_core::{
     cache::Cache,
     error::TABLE,
-    limits::Limits,
+    limits::{Limits, LiveLimits},
     names::shown,
     scene::{Backdrop, Gaussians, RawGaussians, SourcePixel},
 };
@@ -123,11 +123,14 @@ fn values_of_a_json_text_are_counted_outside_of_its_strings() {
 
 #[test]
 fn limits_that_size_something_at_start_need_a_restart() {
-    let (old, mut new) = (Limits::default(), Limits::default());
+    let (live, mut new) = (LiveLimits::new(Limits::default()), Limits::default());
     new.photos_max += 1;
-    assert!(old.changed_for_next_start(&new).is_empty(), "read for each call");
-    (new.cache_bytes_max, new.uploads_bytes_max) = (1, 1);
-    assert_eq!(old.changed_for_next_start(&new), ["uploads_bytes_max", "cache_bytes_max"]);
+    assert!(live.reload(new.clone()).is_empty(), "read for each call");
+    assert_eq!(*live.get(), new);
+    let before = new.clone();
+    (new.cache_bytes_max, new.uploads_bytes_max, new.page_max) = (1, 1, 7);
+    assert_eq!(live.reload(new), ["uploads_bytes_max", "cache_bytes_max"]);
+    assert_eq!(*live.get(), Limits { page_max: 7, ..before }, "only what counts now has changed");
 }
 
 #[test]

@@ -12,7 +12,7 @@ use std::collections::HashSet;
 use glam::DMat3;
 use serde_json::{Map, Value};
 
-use super::{layout, lens::Lens};
+use super::{lens::Lens, numbers};
 use crate::{
     error::{Error, Result},
     scene::{CameraToWorld, photo_label as label},
@@ -141,7 +141,7 @@ pub(crate) fn object(bytes: &[u8], part: &str) -> Result<Fields> {
 
 /// The value of a JSON text; `part` names it in messages.
 pub(crate) fn json(bytes: &[u8], part: &str) -> Result<Value> {
-    let text = layout::text(bytes, part)?;
+    let text = numbers::text(bytes, part)?;
     let parsed = serde_json::from_str(&text).or_else(|e| {
         // Python writes NaN and Infinity, which JSON has not: read them so that the message can
         // name the photo whose number it is.
@@ -318,7 +318,7 @@ fn gaussian_splatting_entry(i: usize, entry: &Fields, _top: &Fields) -> Result<C
     };
     let size = [needed("width")?, needed("height")?];
     let centre = [0.5 * size[0], 0.5 * size[1]];
-    let lens = layout::pinhole([needed("fx")?, needed("fy")?, centre[0], centre[1]], Some(size));
+    let lens = numbers::pinhole([needed("fx")?, needed("fy")?, centre[0], centre[1]], Some(size));
     let row = |value: Option<&Value>| -> Option<[f64; 3]> {
         let numbers: Vec<f64> =
             value?.as_array()?.iter().map(Value::as_f64).collect::<Option<_>>()?;
@@ -328,7 +328,7 @@ fn gaussian_splatting_entry(i: usize, entry: &Fields, _top: &Fields) -> Result<C
     let rows = [0, 1, 2].map(|at| row(rotation.and_then(|rows| rows.get(at))));
     let pose = match (rows, row(entry.get("position"))) {
         ([Some(x), Some(y), Some(z)], Some(centre)) => {
-            Ok(layout::pose(DMat3::from_cols_array_2d(&[x, y, z]).transpose(), centre.into()))
+            Ok(numbers::pose(DMat3::from_cols_array_2d(&[x, y, z]).transpose(), centre.into()))
         }
         _ => Err(format!("{what}: rotation must be 3 rows of 3 numbers, position 3 numbers")),
     };

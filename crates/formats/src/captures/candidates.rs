@@ -12,12 +12,12 @@ use std::{
 };
 
 use super::{
-    Pair,
     cameras::{CameraEntry, Cameras},
     folder::Folder,
     layouts::{self, Seen},
-    names, paired,
-    places::{self, Place, Sizes},
+    lens::Sizes,
+    names,
+    places::{self, Place},
 };
 use crate::{
     error::{Error, Result},
@@ -28,6 +28,18 @@ use crate::{
 const READ_MAX: usize = 16;
 /// Cameras that one message names.
 const NAMED_MAX: usize = 3;
+
+/// The places of a camera and of its photo.
+pub(super) type Pair = (usize, usize);
+
+/// Cameras with the photo of each, and cameras without one.
+pub(super) fn paired(entries: &[CameraEntry], sent: &[&str]) -> Result<(Vec<Pair>, Vec<usize>)> {
+    let wanted: Vec<&str> = entries.iter().map(|entry| entry.file.as_str()).collect();
+    let files = names::matched(&wanted, sent)?;
+    let pairs = files.iter().enumerate().filter_map(|(i, file)| Some((i, (*file)?))).collect();
+    let missing = (0..files.len()).filter(|i| files[*i].is_none()).collect();
+    Ok((pairs, missing))
+}
 
 /// Cameras of a folder, and the photos of them.
 pub(super) struct Candidate {

@@ -6,7 +6,6 @@
 //! θ' = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸). [`Terms`] has the form that holds these and all
 //! other models of COLMAP.
 
-use super::places::Sizes;
 use crate::{
     error::{Error, Result},
     limits::FOCAL_RANGE,
@@ -18,6 +17,19 @@ const PERSPECTIVE: [&str; 6] =
     ["PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"];
 /// Models whose radial terms act on the angle.
 const FISHEYE: [&str; 3] = ["OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"];
+
+/// How the sizes of cameras fit those of photos, the worst first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Sizes {
+    /// Another aspect: the photos would be refused.
+    Contradict,
+    /// Photos that cannot be read.
+    Unknown,
+    /// The same aspect.
+    Scaled,
+    /// The same, or the cameras state none.
+    Fit,
+}
 
 /// A lens as written; what is absent is `None`, what is not a number is NaN.
 #[derive(Clone, Debug, Default)]
@@ -162,7 +174,7 @@ impl Lens {
     /// aspect is refused: it is unknown what was cropped.
     ///
     /// # Errors
-    /// `invalid_request`, which names `what`, the number and its bound.
+    /// `invalid_request`, which names the number that is impossible.
     pub fn at_size(&self, width: u32, height: u32, what: &str) -> Result<LensAtSize> {
         let stated = self.stated_size(what)?;
         let [w, h] = stated.unwrap_or([width, height]);

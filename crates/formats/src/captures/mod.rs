@@ -18,6 +18,7 @@ pub(crate) mod layout;
 mod layouts;
 pub(crate) mod lens;
 pub(crate) mod names;
+mod numbers;
 mod places;
 
 use std::{
@@ -32,7 +33,7 @@ pub use self::lens::{Base, Lens, LensAtSize, Terms};
 pub use self::names::decoded as decoded_name;
 use self::{
     cameras::{CameraEntry, Cameras},
-    candidates::{Best, Candidate},
+    candidates::{Best, Candidate, Pair, paired},
     folder::Folder,
 };
 use crate::{
@@ -317,18 +318,6 @@ fn without_camera<'a>(sent: &[&'a str], pairs: &[Pair], held_out: &[String]) -> 
         is_lone.then_some(*path)
     };
     sent.iter().enumerate().filter_map(lone).collect()
-}
-
-/// The places of a camera and of its photo.
-type Pair = (usize, usize);
-
-/// Cameras with the photo of each, and cameras without one.
-fn paired(entries: &[CameraEntry], sent: &[&str]) -> Result<(Vec<Pair>, Vec<usize>)> {
-    let wanted: Vec<&str> = entries.iter().map(|entry| entry.file.as_str()).collect();
-    let files = names::matched(&wanted, sent)?;
-    let pairs = files.iter().enumerate().filter_map(|(i, file)| Some((i, (*file)?))).collect();
-    let missing = (0..files.len()).filter(|i| files[*i].is_none()).collect();
-    Ok((pairs, missing))
 }
 
 /// Camera, photo and pose of the photos that a scene takes.

@@ -10,6 +10,7 @@ use std::{
 use super::{
     cameras::CameraEntry,
     folder::Folder,
+    lens::Sizes,
     names::{self, Ending, Spelling, Tails},
 };
 use crate::error::{Error, Result};
@@ -27,19 +28,6 @@ const SIZED_MAX: usize = 3;
 const PLACES_MAX: usize = 8;
 /// Bytes of a photo in which its size must be written.
 const HEAD_BYTES_MAX: usize = 256 << 10;
-
-/// How the sizes of cameras fit those of photos, the worst first.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Sizes {
-    /// Another aspect: the photos would be refused.
-    Contradict,
-    /// Photos that cannot be read.
-    Unknown,
-    /// The same aspect.
-    Scaled,
-    /// The same, or the cameras state none.
-    Fit,
-}
 
 /// Folders that hold the photos of cameras.
 #[derive(Debug)]

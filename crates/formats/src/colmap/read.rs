@@ -7,12 +7,9 @@
 use std::collections::HashMap;
 
 use crate::{
-    captures::{
-        cameras::{CameraEntry, PoseAxes},
-        folder::Folder,
-        layout::{Described, Layout, count, inverse, number, numbers, pinhole, rotation, text},
-        lens::{Base, Lens, Terms},
-        names,
+    captures::layout::{
+        Base, CameraEntry, Described, Folder, Layout, Lens, PoseAxes, Terms, count, inverse, names,
+        number_of, numbers, pinhole, rotation, text,
     },
     error::{Error, Result},
 };
@@ -238,8 +235,8 @@ fn images_txt(text: &str, path: &str, lenses: &Lenses, max: usize) -> Result<Vec
         count(entries.len(), max, path)?;
         let (words, name) = first_words::<9>(line);
         let turn_and_place: Option<Vec<f64>> =
-            words[1..8].iter().map(|word| number(word)).collect();
-        let (image, camera) = (number(words[0]), words[8].parse());
+            words[1..8].iter().map(|word| number_of(word)).collect();
+        let (image, camera) = (number_of(words[0]), words[8].parse());
         let (Some(_), Some(&[w, x, y, z, tx, ty, tz]), Ok(camera), false) =
             (image, turn_and_place.as_deref(), camera, name.is_empty())
         else {
@@ -256,7 +253,7 @@ fn images_txt(text: &str, path: &str, lenses: &Lenses, max: usize) -> Result<Vec
 fn are_points(line: &str) -> bool {
     let words: Vec<&str> = line.split_whitespace().collect();
     words.len().is_multiple_of(3)
-        && words.iter().all(|word| number(word).is_some())
+        && words.iter().all(|word| number_of(word).is_some())
         && words.iter().skip(2).step_by(3).all(|word| word.parse::<i64>().is_ok())
 }
 

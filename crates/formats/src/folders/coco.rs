@@ -21,7 +21,7 @@ struct Annotation<'a> {
     iscrowd: u8,
 }
 
-pub(super) fn write(
+pub(crate) fn write(
     of: &FolderContents<'_>,
     photos: &[FolderPhoto],
     pixels: &mut dyn FolderPixels,

@@ -25,7 +25,7 @@ struct Shape<'a> {
     mask: Option<String>,
 }
 
-pub(super) fn write(
+pub(crate) fn write(
     of: &FolderContents<'_>,
     photos: &[FolderPhoto],
     pixels: &mut dyn FolderPixels,

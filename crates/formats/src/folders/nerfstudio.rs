@@ -15,7 +15,7 @@ const DEPTH_UNIT: f64 = 0.001;
 /// Points that are put together before they are written.
 const PART: usize = 4096;
 
-pub(super) fn write(
+pub(crate) fn write(
     of: &FolderContents<'_>,
     photos: &[FolderPhoto],
     pixels: &mut dyn FolderPixels,

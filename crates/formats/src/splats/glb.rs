@@ -6,8 +6,12 @@
 //! entry of the bank. `extras.segsplat.semantics` of the document is the number of a buffer view
 //! with the container of the semantics, where they are made. Axes: y up, z back, as glTF has them.
 //!
+//! `extras.segsplat.antialiased` says that opacity is to be compensated for the blur of small
+//! Gaussians.
+//!
 //! Read are all primitives of the scene that have the extension, with attributes of any of its
-//! types. Refused by name: compressed and sparse attributes, other files, other kernels and colour
+//! types, or with an SPZ of any version in a buffer view, whose axes are those of the node. Refused
+//! by name: attributes in other compressions, sparse ones, other files, other kernels and colour
 //! spaces, scales of nodes that differ between axes, and turned nodes with harmonics over degree 0.
 
 use std::{
@@ -20,20 +24,39 @@ use serde::Deserialize;
 use serde_json::json;
 
 use super::{
-    GLB, SplatFile, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count, cut_short, some,
-    times, unreadable,
+    SplatFile, SplatFormat, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count, cut_short,
+    fill_rest, some, spz, times, unreadable,
 };
 use crate::{
     container::read_semantics,
     error::{Error, Result},
     limits::Limits,
-    scene::{Gaussians, RawGaussians, SH_C0, SceneId, Semantics, SourcePixel},
+    scene::{Gaussians, RawGaussians, SH_C0, SceneId, Semantics},
+};
+
+/// Binary glTF with `KHR_gaussian_splatting`.
+pub static GLB: SplatFormat = SplatFormat {
+    name: "glb",
+    ending: "glb",
+    media_type: "model/gltf-binary",
+    semantics: true,
+    begins: b"glTF",
+    read,
+    check,
+    size_bytes: |file| Some(size_bytes(file)),
+    write,
 };
 
 const MAGIC: u32 = u32::from_le_bytes(*b"glTF");
 const JSON: u32 = u32::from_le_bytes(*b"JSON");
 const BIN: u32 = u32::from_le_bytes(*b"BIN\0");
 const EXTENSION: &str = "KHR_gaussian_splatting";
+/// Extensions by which the Gaussians of a primitive are an SPZ in a buffer view, the newest first.
+const SPZS: [&str; 3] = [
+    "KHR_gaussian_splatting_compression_spz_2",
+    "KHR_gaussian_splatting_compression_spz",
+    "KHR_spz_gaussian_splats_compression",
+];
 const INDEX: &str = "_SEMANTIC_INDEX";
 /// Largest JSON that is read, bytes.
 const JSON_BYTES_MAX: usize = 8 << 20;
@@ -160,8 +183,11 @@ fn document(file: &SplatFile) -> Vec<u8> {
         "buffers": [{ "byteLength": binary_bytes(file) }],
         "accessors": accessors,
     });
+    if file.antialiased {
+        document["extras"]["segsplat"]["antialiased"] = json!(true);
+    }
     if !file.semantics.is_empty() {
-        document["extras"] = json!({ "segsplat": { "semantics": views.len() } });
+        document["extras"]["segsplat"]["semantics"] = json!(views.len());
         let bytes = file.semantics.len();
         views.push(json!({ "buffer": 0, "byteOffset": offset, "byteLength": bytes }));
     }
@@ -175,11 +201,11 @@ fn turned(at: DVec3) -> DVec3 {
     at * DVec3::from_array(TURN.map(f64::from))
 }
 
-pub(super) fn size_bytes(file: &SplatFile) -> u64 {
+fn size_bytes(file: &SplatFile) -> u64 {
     (12 + 8 + document(file).len() + 8 + binary_bytes(file)) as u64
 }
 
-pub(super) fn check(file: &SplatFile) -> Result<()> {
+fn check(file: &SplatFile) -> Result<()> {
     some(file)?;
     match u32::try_from(size_bytes(file)) {
         Ok(_) => Ok(()),
@@ -187,7 +213,7 @@ pub(super) fn check(file: &SplatFile) -> Result<()> {
     }
 }
 
-pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
     let (document, binary) = (document(file), binary_bytes(file));
     let whole = 12 + 8 + document.len() + 8 + binary;
@@ -264,12 +290,15 @@ struct Mesh {
     primitives: Vec<Primitive>,
 }
 
+/// What an extension says of a primitive.
+type Extension = serde_json::Value;
+
 #[derive(Deserialize)]
 struct Primitive {
     #[serde(default)]
     attributes: BTreeMap<String, usize>,
     #[serde(default)]
-    extensions: BTreeMap<String, serde_json::Value>,
+    extensions: BTreeMap<String, Extension>,
 }
 
 #[derive(Deserialize)]
@@ -323,7 +352,7 @@ fn chunk(from: &mut dyn BufRead, kind: u32, name: &str, bytes_max: usize) -> Res
     Ok(chunk)
 }
 
-pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let mut head = [0; 12];
     from.read_exact(&mut head).map_err(|e| cut_short("GLB", e, 0, 12, "bytes of the header"))?;
     let version = u32::from_le_bytes([head[4], head[5], head[6], head[7]]);
@@ -334,7 +363,8 @@ pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead
     let document: Document =
         serde_json::from_slice(&json).map_err(|e| bad(format!("JSON: {e}")))?;
     let binary = chunk(from, BIN, "the binary chunk", u32::MAX as usize)?;
-    let other = document.extensions_required.iter().find(|name| *name != EXTENSION);
+    let is_read = |name: &str| name == EXTENSION || SPZS.contains(&name);
+    let other = document.extensions_required.iter().find(|name| !is_read(name));
     if let Some(name) = other {
         return Err(bad(format!("it needs the extension {name:?}, which is not read")));
     }
@@ -343,7 +373,8 @@ pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead
         return Err(bad(format!("a buffer is in the other file {uri:?}; one file is read")));
     }
     let file = Opened { document, binary, limits };
-    SplatsRead::new(&GLB, file.gaussians()?, file.semantics()?)
+    let (raw, antialiased) = file.gaussians()?;
+    Ok(SplatsRead::new(&GLB, raw, file.semantics()?)?.antialiased(antialiased))
 }
 
 /// A file whose JSON is read.
@@ -354,13 +385,16 @@ struct Opened<'a> {
 }
 
 impl Opened<'_> {
-    fn gaussians(&self) -> Result<RawGaussians> {
+    /// All Gaussians, and whether opacity is to be compensated: where the document or any
+    /// primitive says so.
+    fn gaussians(&self) -> Result<(RawGaussians, bool)> {
         let nodes = &self.document.nodes;
         let scene = self.document.scenes.get(self.document.scene);
         let scene = scene.ok_or_else(|| bad(format!("no scene {}", self.document.scene)))?;
         let mut open: Vec<_> =
             scene.nodes.iter().rev().map(|&node| (node, DAffine3::IDENTITY, 0)).collect();
         let (mut raw, mut seen) = (None::<RawGaussians>, 0);
+        let mut antialiased = self.document.extras["segsplat"]["antialiased"] == true;
         while let Some((at, above, depth)) = open.pop() {
             seen += 1;
             if seen > NODES_MAX || depth > DEPTH_MAX {
@@ -373,28 +407,27 @@ impl Opened<'_> {
             let mesh =
                 self.document.meshes.get(mesh).ok_or_else(|| bad(format!("no mesh {mesh}")))?;
             for primitive in &mesh.primitives {
-                if let Some(extension) = primitive.extensions.get(EXTENSION) {
-                    understood(extension)?;
-                    self.push(primitive, &Place::of(place)?, &mut raw)?;
-                }
+                let Some(extension) = primitive.extensions.get(EXTENSION) else { continue };
+                understood(primitive, extension)?;
+                let (own, is_so) = self.own(primitive, extension)?;
+                antialiased |= is_so;
+                self.push(own, &Place::of(place)?, &mut raw)?;
             }
         }
-        raw.ok_or_else(|| bad(format!("no primitive of the scene has {EXTENSION}")))
+        let raw = raw.ok_or_else(|| bad(format!("no primitive of the scene has {EXTENSION}")))?;
+        Ok((raw, antialiased))
     }
 
-    /// Adds the Gaussians of a primitive.
-    fn push(
-        &self,
-        primitive: &Primitive,
-        place: &Place,
-        into: &mut Option<RawGaussians>,
-    ) -> Result<()> {
+    /// The Gaussians of a primitive about its node, and whether they say that opacity is to be
+    /// compensated.
+    fn own(&self, primitive: &Primitive, extension: &Extension) -> Result<(RawGaussians, bool)> {
+        if let Some(view) = enclosed(primitive, extension) {
+            let (_, file) = self.view(view)?;
+            return spz::enclosed(file, self.limits).map_err(|e| bad(e.message()));
+        }
         let has = |j: usize| primitive.attributes.contains_key(&sh_name(j));
         let sh_degree = (1..=3_u8).take_while(|d| has(usize::from(*d).pow(2))).count() as u8;
         let k = (usize::from(sh_degree) + 1).pow(2);
-        if sh_degree > 0 && place.rotation.xyz().length() > 1e-6 {
-            return Err(bad("a turned node has harmonics over degree 0, which are not turned"));
-        }
         let of = |name: &str, width| -> Result<Vec<f32>> {
             let at = primitive.attributes.get(name);
             let at = at.ok_or_else(|| bad(format!("a primitive has no {name}")))?;
@@ -403,17 +436,7 @@ impl Opened<'_> {
         let own = |name: &str, width| of(&format!("{EXTENSION}:{name}"), width);
         let positions = of("POSITION", 3)?;
         let n = positions.len() / 3;
-        let raw = into.get_or_insert_with(|| RawGaussians {
-            origin: turned(place.translation),
-            ..begun(n, sh_degree)
-        });
-        if raw.sh_degree != sh_degree {
-            let other = raw.sh_degree;
-            return Err(bad(format!(
-                "primitives have harmonics of degree {other} and {sh_degree}"
-            )));
-        }
-        check_count("GLB: Gaussians", raw.means.len() + n, sh_degree, self.limits)?;
+        check_count("GLB: Gaussians", n, sh_degree, self.limits)?;
         let (rotations, scales) = (own("ROTATION", 4)?, own("SCALE", 3)?);
         let opacities = own("OPACITY", 1)?;
         let sh = (0..k).map(|j| of(&sh_name(j), 3)).collect::<Result<Vec<_>>>()?;
@@ -424,30 +447,69 @@ impl Opened<'_> {
         if let Some(other) = lengths.into_iter().find(|other| *other != n) {
             return Err(bad(format!("a primitive has {n} positions and {other} of another array")));
         }
-        let shift = place.translation - turned(raw.origin);
+        let mut raw = begun(n, sh_degree);
         let row = |column: &[f32], i: usize| [column[3 * i], column[3 * i + 1], column[3 * i + 2]];
         for i in 0..n {
-            let mean = DVec3::from_array(row(&positions, i).map(f64::from));
-            let mean = place.rotation * (mean * place.scale) + shift;
-            raw.means.push(times(mean.as_vec3().to_array(), TURN));
+            raw.means.push(times(row(&positions, i), TURN));
             let q = &rotations[4 * i..4 * i + 4];
-            let quat = if place.rotation == DQuat::IDENTITY {
-                [q[3], q[0], q[1], q[2]]
-            } else {
-                let [x, y, z, w] = [0, 1, 2, 3].map(|k| f64::from(q[k]));
-                let quat = (place.rotation * DQuat::from_xyzw(x, y, z, w)).as_quat();
-                [quat.w, quat.x, quat.y, quat.z]
-            };
-            raw.quats.push(times(quat, TURN_QUAT));
-            raw.scales.push(row(&scales, i).map(|s| (f64::from(s) * place.scale) as f32));
-            raw.opacities.push(opacities[i]);
+            raw.quats.push(times([q[3], q[0], q[1], q[2]], TURN_QUAT));
+            raw.scales.push(row(&scales, i));
             for (column, sign) in sh.iter().zip(TURN_SH) {
                 raw.sh.push(row(column, i).map(|c| c * sign));
             }
-            // The cast saturates; an index that is none becomes the background.
-            raw.semantic_index.push(index.as_ref().map_or(0, |index| index[i] as u16));
-            raw.source.push(SourcePixel::default());
         }
+        raw.opacities = opacities;
+        // The cast saturates; an index that is none becomes the background.
+        raw.semantic_index =
+            index.unwrap_or_default().into_iter().map(|entry| entry as u16).collect();
+        fill_rest(&mut raw);
+        Ok((raw, false))
+    }
+
+    /// Adds the Gaussians of a primitive, placed as its node is.
+    fn push(
+        &self,
+        own: RawGaussians,
+        place: &Place,
+        into: &mut Option<RawGaussians>,
+    ) -> Result<()> {
+        let sh_degree = own.sh_degree;
+        if sh_degree > 0 && place.rotation.xyz().length() > 1e-6 {
+            return Err(bad("a turned node has harmonics over degree 0, which are not turned"));
+        }
+        let raw = into.get_or_insert_with(|| RawGaussians {
+            origin: turned(place.translation),
+            ..begun(own.means.len(), sh_degree)
+        });
+        if raw.sh_degree != sh_degree {
+            let other = raw.sh_degree;
+            return Err(bad(format!(
+                "primitives have harmonics of degree {other} and {sh_degree}"
+            )));
+        }
+        let all = raw.means.len() + own.means.len();
+        check_count("GLB: Gaussians", all, sh_degree, self.limits)?;
+        let shift = place.translation - turned(raw.origin);
+        for mean in own.means {
+            let mean = DVec3::from_array(times(mean, TURN).map(f64::from));
+            let mean = place.rotation * (mean * place.scale) + shift;
+            raw.means.push(times(mean.as_vec3().to_array(), TURN));
+        }
+        for quat in own.quats {
+            let [w, x, y, z] = times(quat, TURN_QUAT).map(f64::from);
+            raw.quats.push(if place.rotation == DQuat::IDENTITY {
+                quat
+            } else {
+                let quat = (place.rotation * DQuat::from_xyzw(x, y, z, w)).as_quat();
+                times([quat.w, quat.x, quat.y, quat.z], TURN_QUAT)
+            });
+        }
+        let scaled = |scale: [f32; 3]| scale.map(|s| (f64::from(s) * place.scale) as f32);
+        raw.scales.extend(own.scales.into_iter().map(scaled));
+        raw.opacities.extend(own.opacities);
+        raw.sh.extend(own.sh);
+        raw.semantic_index.extend(own.semantic_index);
+        raw.source.extend(own.source);
         Ok(())
     }
 
@@ -524,11 +586,21 @@ impl Opened<'_> {
     }
 }
 
+/// The number of the buffer view with the SPZ that the primitive is.
+fn enclosed(primitive: &Primitive, extension: &Extension) -> Option<usize> {
+    let inner = SPZS.iter().map(|name| &extension["extensions"][name]["bufferView"]);
+    let beside =
+        SPZS.iter().filter_map(|name| Some(&primitive.extensions.get(*name)?["bufferView"]));
+    inner.chain(beside).find_map(|view| usize::try_from(view.as_u64()?).ok())
+}
+
 /// Refuses what other kernels and colour spaces would make of the numbers.
-fn understood(extension: &serde_json::Value) -> Result<()> {
+fn understood(primitive: &Primitive, extension: &Extension) -> Result<()> {
     for (name, known) in [("kernel", "ellipse"), ("colorSpace", "srgb_rec709_display")] {
         match extension[name].as_str() {
             Some(value) if value == known => {}
+            // Files with SPZ are older than these words.
+            None if enclosed(primitive, extension).is_some() => {}
             other => {
                 let other: String = other.unwrap_or_default().chars().take(80).collect();
                 return Err(bad(format!("{name} is {other:?}; {known:?} is read")));

@@ -1,4 +1,4 @@
-//! Gaussians as files of other programs: one table of formats, a module for each.
+//! Gaussians as files of other programs, a module for each format.
 //!
 //! All hold centres, rotations, scales, opacities and colours of every Gaussian. What they lose is
 //! in the module of each. PLY and GLB hold the entries of the bank and the semantics too.
@@ -6,8 +6,11 @@
 //! Axes are those of each format's own specification: PLY and `.splat` are in the axes of the scene
 //! (OpenCV: y down, z forward), SPZ and glTF have y up and z back. `TURN` turns between them.
 
+#[cfg(test)]
+mod foreign;
 mod glb;
 mod packed_ply;
+mod places;
 mod ply;
 mod scene;
 mod sog;
@@ -18,6 +21,14 @@ use std::io::{self, BufRead, Write};
 
 use glam::DVec3;
 
+use self::places::Coarse;
+pub use self::{
+    glb::GLB,
+    ply::{COMPRESSED_PLY, PLY},
+    sog::SOG,
+    splat::SPLAT,
+    spz::{SPZ, SPZ4},
+};
 use crate::{
     container::write_semantics,
     error::{Error, Result},
@@ -32,6 +43,9 @@ pub struct SplatsRead {
     pub format: &'static SplatFormat,
     /// The Gaussians.
     pub gaussians: Gaussians,
+    /// Whether they were made for a renderer that compensates opacity for the blur of small
+    /// Gaussians.
+    pub antialiased: bool,
     /// How many were dropped or changed.
     pub dropped: SanitizeReport,
     /// Their semantics, where it has some.
@@ -42,13 +56,20 @@ impl SplatsRead {
     /// What was read, checked. The Gaussians say which entry is whose, also where some are dropped.
     fn new(
         format: &'static SplatFormat,
-        raw: RawGaussians,
+        mut raw: RawGaussians,
         semantics: Option<Semantics>,
     ) -> Result<Self> {
+        raw.scales.iter_mut().for_each(thickened);
+        raw.quats.iter_mut().for_each(turnable);
         let (gaussians, dropped) = Gaussians::sanitize(raw)?;
         let index = || gaussians.semantic_index().to_vec();
         let semantics = semantics.map(|semantics| Semantics { index: index(), ..semantics });
-        Ok(Self { format, gaussians, dropped, semantics })
+        Ok(Self { format, gaussians, antialiased: false, dropped, semantics })
+    }
+
+    /// The same for that renderer, or not.
+    fn antialiased(self, antialiased: bool) -> Self {
+        Self { antialiased, ..self }
     }
 }
 
@@ -63,6 +84,10 @@ pub struct SplatFormat {
     pub media_type: &'static str,
     /// Whether it holds entries of the bank and the semantics.
     pub semantics: bool,
+    /// First bytes of a file; empty where only the ending of its name tells.
+    pub(crate) begins: &'static [u8],
+    /// Reads what begins so.
+    pub(crate) read: fn(&mut dyn BufRead, &Limits) -> Result<SplatsRead>,
     /// Refuses what the format cannot hold.
     check: fn(&SplatFile) -> Result<()>,
     /// Size of the whole file, where it is known before the end.
@@ -70,107 +95,18 @@ pub struct SplatFormat {
     write: fn(&SplatFile, &mut dyn Write) -> io::Result<()>,
 }
 
-const OCTETS: &str = "application/octet-stream";
-
-/// 3DGS PLY.
-pub static PLY: SplatFormat = SplatFormat {
-    name: "ply",
-    ending: "ply",
-    media_type: OCTETS,
-    semantics: true,
-    check: |_| Ok(()),
-    size_bytes: |file| Some(ply::size_bytes(file)),
-    write: ply::write,
-};
-/// The compressed PLY of `PlayCanvas` and `SuperSplat`.
-pub static COMPRESSED_PLY: SplatFormat = SplatFormat {
-    name: "compressed_ply",
-    ending: "compressed.ply",
-    media_type: OCTETS,
-    semantics: false,
-    check: some,
-    size_bytes: |file| Some(packed_ply::size_bytes(file)),
-    write: packed_ply::write,
-};
-/// SPZ, version 3.
-pub static SPZ: SplatFormat = SplatFormat {
-    name: "spz",
-    ending: "spz",
-    media_type: OCTETS,
-    semantics: false,
-    check: spz::check,
-    size_bytes: |_| None,
-    write: spz::write,
-};
-/// SPZ, version 4.
-pub static SPZ4: SplatFormat = SplatFormat {
-    name: "spz4",
-    ending: "v4.spz",
-    media_type: OCTETS,
-    semantics: false,
-    check: spz::check,
-    size_bytes: |_| None,
-    write: spz::write_4,
-};
-/// The bundle of pictures of `PlayCanvas`.
-pub static SOG: SplatFormat = SplatFormat {
-    name: "sog",
-    ending: "sog",
-    media_type: OCTETS,
-    semantics: false,
-    check: sog::check,
-    size_bytes: |_| None,
-    write: sog::write,
-};
-/// Binary glTF with `KHR_gaussian_splatting`.
-pub static GLB: SplatFormat = SplatFormat {
-    name: "glb",
-    ending: "glb",
-    media_type: "model/gltf-binary",
-    semantics: true,
-    check: glb::check,
-    size_bytes: |file| Some(glb::size_bytes(file)),
-    write: glb::write,
-};
-/// 32 bytes a Gaussian.
-pub static SPLAT: SplatFormat = SplatFormat {
-    name: "splat",
-    ending: "splat",
-    media_type: OCTETS,
-    semantics: false,
-    check: some,
-    size_bytes: |file| Some(splat::size_bytes(file)),
-    write: splat::write,
-};
-/// All formats. Where the ending of one ends that of another, the longer one comes first.
-pub static FORMATS: [&SplatFormat; 7] = [&COMPRESSED_PLY, &PLY, &SPZ4, &SPZ, &SOG, &GLB, &SPLAT];
-
-/// The endings of all formats, for messages.
-pub fn endings() -> String {
-    FORMATS.map(|format| format.ending).join(", ")
-}
-
-impl SplatFormat {
-    /// The format of this name.
-    pub fn named(name: &str) -> Option<&'static Self> {
-        FORMATS.into_iter().find(|format| format.name == name)
-    }
-
-    /// The format that the ending of a file's name says.
-    pub fn of_file(name: &str) -> Option<&'static Self> {
-        let name = name.to_ascii_lowercase();
-        let ends = |format: &&Self| {
-            name.strip_suffix(format.ending).is_some_and(|stem| stem.ends_with('.'))
-        };
-        FORMATS.into_iter().find(ends)
-    }
-}
+/// Media type of files that have none of their own.
+pub const OCTETS: &str = "application/octet-stream";
 
 /// A file to be written.
 #[derive(Debug)]
 pub struct SplatFile {
     format: &'static SplatFormat,
     gaussians: Gaussians,
+    /// Whether opacity is to be compensated for the blur of small Gaussians.
+    antialiased: bool,
+    /// The step of f32 positions, where it is too coarse for this scene.
+    coarse: Option<Coarse>,
     /// The container of the semantics; empty where there are none.
     semantics: Vec<u8>,
 }
@@ -191,9 +127,17 @@ impl SplatFile {
             write_semantics(&mut packed, &SceneId::from_bytes([0; 16]), semantics)
                 .map_err(|e| Error::internal("the semantics cannot be packed").caused_by(e))?;
         }
-        let file = Self { format, gaussians, semantics: packed };
+        let coarse = Coarse::in_f32(&gaussians);
+        let file = Self { format, gaussians, antialiased: false, coarse, semantics: packed };
         (format.check)(&file)?;
         Ok(file)
+    }
+
+    /// The same, marked for a renderer that compensates opacity for the blur of small Gaussians,
+    /// or not. `.splat` has no place for the mark.
+    #[must_use]
+    pub fn antialiased(self, antialiased: bool) -> Self {
+        Self { antialiased, ..self }
     }
 
     /// Its format.
@@ -212,32 +156,6 @@ impl SplatFile {
     /// Those of `to`.
     pub fn write(&self, to: &mut dyn Write) -> io::Result<()> {
         (self.format.write)(self, to)
-    }
-}
-
-/// Reads a file of any of these formats. Its first bytes say which one it is; `.splat` has none, so
-/// `name` must say it. `gaussians_max` and `splats_bytes_max` of `limits` bound what it may claim.
-///
-/// # Errors
-/// `invalid_request` when it is none of these or is damaged, naming what is wrong;
-/// `limit_exceeded`; `store_unavailable` when reading fails. Poisoned Gaussians are no error: they
-/// are dropped or clamped and counted.
-pub fn read_splats(from: &mut dyn BufRead, name: &str, limits: &Limits) -> Result<SplatsRead> {
-    let start = from.fill_buf().map_err(unreadable)?;
-    match start.get(..4).unwrap_or(start) {
-        [b'p', b'l', b'y', ..] => ply::read(from, limits),
-        [0x1f, 0x8b, ..] => spz::read(from, limits),
-        b"glTF" => glb::read(from, limits),
-        b"NGSP" => spz::read_4(from, limits),
-        [b'P', b'K', ..] => sog::read(from, limits),
-        _ if SplatFormat::of_file(name).is_some_and(|named| named.name == SPLAT.name) => {
-            splat::read(from, limits)
-        }
-        other => Err(Error::invalid(format!(
-            "the file is none of Gaussians: it begins with {:?}; PLY, compressed PLY, SPZ, SOG and \
-             GLB are known by their first bytes, .splat by the ending of its name",
-            String::from_utf8_lossy(other)
-        ))),
     }
 }
 
@@ -260,14 +178,39 @@ fn some(file: &SplatFile) -> Result<()> {
     if file.gaussians.is_empty() {
         let name = file.format.name;
         return Err(Error::invalid(format!(
-            "{name}: there are no Gaussians to write; PLY can be empty"
+            "{name}: there are no Gaussians to write; ply can be empty"
         )));
     }
     Ok(())
 }
 
-fn unreadable(cause: io::Error) -> Error {
+/// The same for formats that have positions as f32 of the world: refuses what lies too far off.
+fn some_near(file: &SplatFile) -> Result<()> {
+    some(file)?;
+    file.coarse.map_or(Ok(()), |coarse| Err(coarse.refused(file.format)))
+}
+
+pub(crate) fn unreadable(cause: io::Error) -> Error {
     Error::unavailable("read the file", cause)
+}
+
+/// What a scale of 0 becomes: so small a share of the smallest one of the same Gaussian.
+const FLAT: f32 = 1e-3;
+
+/// Flat Gaussians, as 2DGS makes them, and points are drawn: 0 gets a thickness that no view shows.
+fn thickened(scales: &mut [f32; 3]) {
+    let others = scales.iter().copied().filter(|scale| *scale > 0.0);
+    let least = FLAT * others.fold(f32::INFINITY, f32::min);
+    let thin =
+        if least.is_finite() { least.max(Gaussians::SCALE_MIN) } else { Gaussians::SCALE_MIN };
+    scales.iter_mut().filter(|scale| **scale == 0.0).for_each(|scale| *scale = thin);
+}
+
+/// A rotation of zeros turns nothing, as in 3DGS.
+fn turnable(quat: &mut [f32; 4]) {
+    if *quat == [0.0; 4] {
+        quat[0] = 1.0;
+    }
 }
 
 /// Signs that turn a position from the scene's axes (x right, y down, z forward) to y up and z
@@ -329,17 +272,6 @@ fn steps(value: f32, most: u32) -> u32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn a_format_is_known_by_name_and_by_the_ending_of_a_file() {
-        for format in FORMATS {
-            assert_eq!(SplatFormat::named(format.name).unwrap().name, format.name);
-            let file = format!("a.{}", format.ending.to_ascii_uppercase());
-            assert_eq!(SplatFormat::of_file(&file).unwrap().name, format.name);
-        }
-        assert!(SplatFormat::of_file("splat").is_none());
-        assert!(SplatFormat::of_file("a.segsplat").is_none());
-    }
 
     /// The basis as the appendix of `KHR_gaussian_splatting` has it, without its constants: a
     /// turned direction with turned coefficients has the colour of the direction and coefficients

@@ -12,10 +12,10 @@ use std::{
     io::{self, Read, Write},
 };
 
-use super::{COMPRESSED_PLY, SplatFile, SplatsRead, begun, cut_short, fill_rest, steps, world};
+use super::{SplatFile, begun, cut_short, fill_rest, steps, world};
 use crate::{
     error::Result,
-    scene::{Gaussians, SH_C0},
+    scene::{Gaussians, RawGaussians, SH_C0},
 };
 
 /// Gaussians of a chunk.
@@ -46,7 +46,9 @@ pub(super) const PACKED: [&str; 4] =
 /// Largest |logarithm| of a scale.
 const LN_SCALE_MAX: f32 = 20.0;
 
-fn header(gaussians: &Gaussians) -> String {
+fn header(file: &SplatFile) -> String {
+    let gaussians = &file.gaussians;
+    let mode = if file.antialiased { "comment SplatRenderMode: mip\n" } else { "" };
     let (n, rest) = (gaussians.len(), 3 * (gaussians.sh_count() - 1));
     let floats = BOUNDS.map(|name| format!("property float {name}\n")).concat();
     let words = PACKED.map(|name| format!("property uint {name}\n")).concat();
@@ -54,14 +56,15 @@ fn header(gaussians: &Gaussians) -> String {
     let sh = if rest == 0 { String::new() } else { format!("element sh {n}\n{bytes}") };
     let chunks = n.div_ceil(CHUNK);
     format!(
-        "ply\nformat binary_little_endian 1.0\nelement chunk {chunks}\n{floats}element vertex {n}\n\
+        "ply\nformat binary_little_endian 1.0\n{mode}element chunk {chunks}\n{floats}\
+         element vertex {n}\n\
          {words}{sh}end_header\n"
     )
 }
 
 pub(super) fn size_bytes(file: &SplatFile) -> u64 {
     let (n, rest) = (file.gaussians.len(), 3 * (file.gaussians.sh_count() - 1));
-    (header(&file.gaussians).len() + n.div_ceil(CHUNK) * 4 * BOUNDS.len() + n * (16 + rest)) as u64
+    (header(file).len() + n.div_ceil(CHUNK) * 4 * BOUNDS.len() + n * (16 + rest)) as u64
 }
 
 /// Position, logarithms of scales and colour of a Gaussian: what lies within the bounds of its
@@ -91,7 +94,7 @@ fn bounds(gaussians: &Gaussians, chunk: &[u32]) -> Bounds {
 pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
     let order = morton_order(gaussians);
-    to.write_all(header(gaussians).as_bytes())?;
+    to.write_all(header(file).as_bytes())?;
     for chunk in order.chunks(CHUNK) {
         for bound in bounds(gaussians, chunk).as_flattened().as_flattened() {
             to.write_all(&bound.to_le_bytes())?;
@@ -198,7 +201,7 @@ pub(super) struct PackedLayout {
 }
 
 /// Reads what follows the header.
-pub(super) fn read(from: &mut dyn Read, layout: &PackedLayout) -> Result<SplatsRead> {
+pub(super) fn read(from: &mut dyn Read, layout: &PackedLayout) -> Result<RawGaussians> {
     let [of_chunk, of_vertex, of_sh] = layout.strides;
     let n = layout.count;
     let mut rows = |stride: usize, i: usize, count: usize, of: &str| -> Result<Vec<u8>> {
@@ -255,5 +258,5 @@ pub(super) fn read(from: &mut dyn Read, layout: &PackedLayout) -> Result<SplatsR
         }
     }
     fill_rest(&mut raw);
-    SplatsRead::new(&COMPRESSED_PLY, raw, None)
+    Ok(raw)
 }

@@ -38,7 +38,7 @@ impl SplatsRead {
     /// are not those of the Gaussians, and for options that need photos; `limit_exceeded` for a
     /// bank of too many rows.
     pub fn into_scene(self, options: &SceneOptions) -> Result<Scene> {
-        let Self { format, gaussians, dropped, semantics } = self;
+        let Self { format, gaussians, antialiased, dropped, semantics } = self;
         check_options(format, options, semantics.is_some())?;
         let counts = dropped.counts().into_iter().filter(|(_, count)| *count > 0);
         let dropped: Vec<DropCount> =
@@ -62,6 +62,7 @@ impl SplatsRead {
         }
         let report = HealthReport {
             file_format: Some(name.to_owned()),
+            antialiased,
             method: options.method(),
             gaussians: gaussians.len() as u64,
             dropped,
@@ -112,15 +113,7 @@ fn check_options(format: &SplatFormat, options: &SceneOptions, has_semantics: bo
 /// A camera that sees the Gaussians, of which there is one at least, and its distance from their
 /// middle, world units.
 fn overview(gaussians: &Gaussians) -> Result<(Camera, f64)> {
-    let means = gaussians.means();
-    let middle: [f32; 3] =
-        std::array::from_fn(|k| quantile(means.iter().map(|mean| mean[k]).collect(), 0.5));
-    let middle = DVec3::from_array(middle.map(f64::from));
-    let away = |mean: &[f32; 3]| DVec3::from_array(mean.map(f64::from)).distance(middle) as f32;
-    let radius = quantile(means.iter().map(away).collect(), SEEN);
-    // Gaussians in one place are as large as the widest of them.
-    let widest = gaussians.scales().iter().flatten().fold(0.0, |a: f32, b| a.max(*b));
-    let radius = f64::from(if radius > 0.0 { radius } else { 3.0 * widest });
+    let (middle, radius) = reach(gaussians);
     let half = HALF_FOV.to_radians();
     let distance = radius / half.sin();
     let DVec3 { x, y, z } = gaussians.origin() + middle - DVec3::Z * distance;
@@ -131,6 +124,20 @@ fn overview(gaussians: &Gaussians) -> Result<(Camera, f64)> {
     let focal = h / 2.0 / half.tan();
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: w / 2.0, cy: h / 2.0, width, height };
     Ok((Camera { intrinsics, camera_to_world }, distance))
+}
+
+/// The median centre of the Gaussians, of which there is one at least, about their origin, and the
+/// radius of the sphere about it that has nine of ten.
+pub(super) fn reach(gaussians: &Gaussians) -> (DVec3, f64) {
+    let means = gaussians.means();
+    let middle: [f32; 3] =
+        std::array::from_fn(|k| quantile(means.iter().map(|mean| mean[k]).collect(), 0.5));
+    let middle = DVec3::from_array(middle.map(f64::from));
+    let away = |mean: &[f32; 3]| DVec3::from_array(mean.map(f64::from)).distance(middle) as f32;
+    let radius = quantile(means.iter().map(away).collect(), SEEN);
+    // Gaussians in one place are as large as the widest of them.
+    let widest = gaussians.scales().iter().flatten().fold(0.0, |a: f32, b| a.max(*b));
+    (middle, f64::from(if radius > 0.0 { radius } else { 3.0 * widest }))
 }
 
 /// The number that this share of all, of which there is one at least, is not over.

@@ -17,6 +17,7 @@ use std::{
     io::{self, BufRead, Cursor, Read, Write},
 };
 
+use glam::DVec3;
 use image::{
     ExtendedColorType, ImageDecoder, ImageEncoder,
     codecs::webp::{WebPDecoder, WebPEncoder},
@@ -29,14 +30,29 @@ use zip::{
 };
 
 use super::{
-    SOG, SplatFile, SplatsRead, begun, check_count, fill_rest, packed_ply::morton_order, some,
-    steps, unreadable, world,
+    OCTETS, SplatFile, SplatFormat, SplatsRead, begun, check_count, fill_rest,
+    packed_ply::morton_order, some, steps, unreadable, world,
 };
 use crate::{
     error::{Error, Result},
     limits::Limits,
 };
 
+/// The bundle of pictures of `PlayCanvas`.
+pub static SOG: SplatFormat = SplatFormat {
+    name: "sog",
+    ending: "sog",
+    media_type: OCTETS,
+    semantics: false,
+    begins: b"PK",
+    read,
+    check,
+    size_bytes: |_| None,
+    write,
+};
+
+/// Name of the renderer that compensates opacity, in `meta.json`.
+const ANTIALIASED: &str = "antialiased";
 /// Numbers of a table.
 const TABLE: usize = 256;
 /// Most files of a bundle, and bytes of its `meta.json`.
@@ -64,7 +80,7 @@ fn sides(count: usize) -> [usize; 2] {
     [width, (count.div_ceil(width)).next_multiple_of(4)]
 }
 
-pub(super) fn check(file: &SplatFile) -> Result<()> {
+fn check(file: &SplatFile) -> Result<()> {
     some(file)?;
     let count = file.gaussians.len();
     let longest = sides(count).into_iter().max().unwrap_or(0);
@@ -186,7 +202,7 @@ fn webp([width, height]: [usize; 2], pixels: impl Iterator<Item = [u8; 4]>) -> i
     Ok(webp)
 }
 
-pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
     let (n, k) = (gaussians.len(), gaussians.sh_count());
     let order = morton_order(gaussians);
@@ -251,6 +267,9 @@ pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
         "quats": { "files": ["quats.webp"] },
         "sh0": { "codebook": colors, "files": ["sh0.webp"] },
     });
+    if file.antialiased {
+        meta["model"] = json!(ANTIALIASED);
+    }
     if k > 1 {
         let dim = 3 * (k - 1);
         let rest = gaussians.sh().chunks_exact(k).flat_map(|row| row[1..].as_flattened());
@@ -291,6 +310,8 @@ struct Meta {
     version: Option<u32>,
     #[serde(default)]
     count: usize,
+    /// `antialiased` or `2dgs`, where it is not the usual one.
+    model: Option<serde_json::Value>,
     means: Option<Bounded>,
     scales: Option<Table>,
     quats: Option<Files>,
@@ -388,7 +409,7 @@ fn looked_up(table: &[f32], at: u8) -> f32 {
     table.get(usize::from(at)).copied().unwrap_or(0.0)
 }
 
-pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let mut zip = Vec::new();
     let max = limits.splats_bytes_max;
     from.take(max.saturating_add(1)).read_to_end(&mut zip).map_err(unreadable)?;
@@ -420,10 +441,21 @@ pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead
     let mut raw = begun(n, degree);
     let [low, high] = [0, 1].map(|of| bundle.picture(&means.files[of], n));
     let (low, high) = (low?.1, high?.1);
+    // Far scenes are kept near the bound next to zero, where f32 is fine enough.
+    let origin: [f64; 3] = std::array::from_fn(|a| match [means.mins[a], means.maxs[a]] {
+        [min, _] if min > 0.0 => unlog(min),
+        [_, max] if max < 0.0 => unlog(max),
+        _ => 0.0,
+    });
+    raw.origin = DVec3::from_array(origin);
+    if !raw.origin.is_finite() {
+        return Err(bad("the bounds of the positions are not finite"));
+    }
     for (low, high) in low.iter().zip(&high).take(n) {
         raw.means.push(std::array::from_fn(|a| {
             let share = f64::from(u16::from_le_bytes([low[a], high[a]])) / 65_535.0;
-            unlog(means.mins[a] + (means.maxs[a] - means.mins[a]) * share) as f32
+            let at = unlog(means.mins[a] + (means.maxs[a] - means.mins[a]) * share);
+            (at - origin[a]) as f32
         }));
     }
     drop((low, high));
@@ -447,7 +479,8 @@ pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead
         bundle.read_harmonics(&harmonics, &mut raw.sh, n)?;
     }
     fill_rest(&mut raw);
-    SplatsRead::new(&SOG, raw, None)
+    let antialiased = meta.model.is_some_and(|model| model == ANTIALIASED);
+    Ok(SplatsRead::new(&SOG, raw, None)?.antialiased(antialiased))
 }
 
 impl Bundle<'_> {

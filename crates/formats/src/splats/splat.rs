@@ -7,20 +7,36 @@
 
 use std::io::{self, BufRead, Write};
 
-use super::{SPLAT, SplatFile, SplatsRead, begun, check_count, cut_short, fill_rest, steps, world};
+use super::{
+    OCTETS, SplatFile, SplatFormat, SplatsRead, begun, check_count, cut_short, fill_rest,
+    some_near, steps, world,
+};
 use crate::{
     error::{Error, Result},
     limits::Limits,
     scene::SH_C0,
 };
 
+/// 32 bytes a Gaussian.
+pub static SPLAT: SplatFormat = SplatFormat {
+    name: "splat",
+    ending: "splat",
+    media_type: OCTETS,
+    semantics: false,
+    begins: b"",
+    read,
+    check: some_near,
+    size_bytes: |file| Some(size_bytes(file)),
+    write,
+};
+
 const BYTES: usize = 32;
 
-pub(super) fn size_bytes(file: &SplatFile) -> u64 {
+fn size_bytes(file: &SplatFile) -> u64 {
     (file.gaussians.len() * BYTES) as u64
 }
 
-pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
     for i in 0..gaussians.len() {
         let mut row = [0; BYTES];
@@ -40,7 +56,7 @@ pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     Ok(())
 }
 
-pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let mut raw = begun(0, 0);
     let mut row = [0; BYTES];
     while !from.fill_buf().map_err(super::unreadable)?.is_empty() {

@@ -27,13 +27,39 @@ use ruzstd::{
 };
 
 use super::{
-    SPZ, SPZ4, SplatFile, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count, cut_short,
-    fill_rest, some, times, unreadable, world,
+    OCTETS, SplatFile, SplatFormat, SplatsRead, TURN, TURN_QUAT, TURN_SH, begun, check_count,
+    cut_short, fill_rest, places::Coarse, some, times, unreadable, world,
 };
 use crate::{
     error::{Error, Result},
     limits::Limits,
     scene::{Gaussians, RawGaussians},
+};
+
+/// SPZ, version 3.
+pub static SPZ: SplatFormat = SplatFormat {
+    name: "spz",
+    ending: "spz",
+    media_type: OCTETS,
+    semantics: false,
+    begins: &[0x1f, 0x8b],
+    read,
+    check,
+    size_bytes: |_| None,
+    write,
+};
+
+/// SPZ, version 4.
+pub static SPZ4: SplatFormat = SplatFormat {
+    name: "spz4",
+    ending: "v4.spz",
+    media_type: OCTETS,
+    semantics: false,
+    begins: &MAGIC,
+    read: read_4,
+    check,
+    size_bytes: |_| None,
+    write: write_4,
 };
 
 const MAGIC: [u8; 4] = *b"NGSP";
@@ -52,9 +78,11 @@ const REST_MAX: u64 = 1 << 20;
 /// Steps of 1/128 that a coefficient of degree 1, and of a higher one, is rounded to.
 const SH_BUCKETS: [i32; 2] = [8, 16];
 
-pub(super) fn check(file: &SplatFile) -> Result<()> {
+fn check(file: &SplatFile) -> Result<()> {
     some(file)?;
-    bits(&file.gaussians).map(drop)
+    let step = 0.5_f64.powi(bits(&file.gaussians)? as i32);
+    let coarse = Coarse::of(&file.gaussians, |_| step);
+    coarse.map_or(Ok(()), |coarse| Err(coarse.refused(file.format)))
 }
 
 /// Bits behind the point that the farthest Gaussian leaves.
@@ -113,25 +141,26 @@ const BLOCKS: [Block; 6] = [
 
 /// The 16 bytes that a file of any version begins with. The last one is the number of streams,
 /// from version 4 on.
-fn head(gaussians: &Gaussians, version: u32, bits: u32, streams: u8) -> io::Result<Vec<u8>> {
+fn head(file: &SplatFile, version: u32, bits: u32, streams: u8) -> io::Result<Vec<u8>> {
+    let gaussians = &file.gaussians;
     let count = u32::try_from(gaussians.len()).map_err(io::Error::other)?;
     let words = [u32::from_le_bytes(MAGIC), version, count];
     let mut head: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
-    head.extend([gaussians.sh_degree(), bits as u8, 0, streams]);
+    head.extend([gaussians.sh_degree(), bits as u8, u8::from(file.antialiased), streams]);
     Ok(head)
 }
 
-pub(super) fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+fn write(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
     let bits = bits(gaussians).map_err(io::Error::other)?;
     let mut to = GzEncoder::new(to, Compression::default());
-    to.write_all(&head(gaussians, 3, bits, 0)?)?;
+    to.write_all(&head(file, 3, bits, 0)?)?;
     BLOCKS.iter().try_for_each(|block| block(gaussians, bits, &mut to))?;
     to.finish().map(drop)
 }
 
 /// The table of the streams is before them, so that all are packed before the first is written.
-pub(super) fn write_4(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
+fn write_4(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
     let gaussians = &file.gaussians;
     let bits = bits(gaussians).map_err(io::Error::other)?;
     let (mut table, mut packed) = (Vec::new(), Vec::new());
@@ -144,7 +173,7 @@ pub(super) fn write_4(file: &SplatFile, to: &mut dyn Write) -> io::Result<()> {
             packed.push(stream);
         }
     }
-    to.write_all(&head(gaussians, 4, bits, packed.len() as u8)?)?;
+    to.write_all(&head(file, 4, bits, packed.len() as u8)?)?;
     to.write_all(&(HEAD_4_BYTES as u32).to_le_bytes())?;
     to.write_all(&[0; 12])?;
     table.iter().try_for_each(|size| to.write_all(&size.to_le_bytes()))?;
@@ -196,6 +225,8 @@ struct Head {
     sh_degree: u8,
     /// Steps of a position in a unit.
     unit: f64,
+    /// Whether the renderer compensates opacity for the blur of small Gaussians.
+    antialiased: bool,
     /// Whether records of extensions are in the file.
     extended: bool,
     streams: u8,
@@ -223,8 +254,9 @@ impl Head {
         if bits > 30 {
             return Err(bad(format!("{bits} bits behind the point; 0 to 30 are read")));
         }
-        let (unit, extended) = (f64::from(1_u32 << bits), flags & 2 != 0);
-        Ok(Self { version, count, sh_degree, unit, extended, streams })
+        let [antialiased, extended] = [1, 2].map(|flag| flags & flag != 0);
+        let unit = f64::from(1_u32 << bits);
+        Ok(Self { version, count, sh_degree, unit, antialiased, extended, streams })
     }
 
     fn read_blocks<R: Read>(&self, blocks: &mut Blocks<R>) -> Result<RawGaussians> {
@@ -244,7 +276,28 @@ impl Head {
 }
 
 /// Versions 1 to 3.
-pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+    let (raw, antialiased) = unpacked(from, limits)?;
+    Ok(SplatsRead::new(&SPZ, raw, None)?.antialiased(antialiased))
+}
+
+/// Version 4.
+fn read_4(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+    let (raw, antialiased) = unpacked_4(from, limits)?;
+    Ok(SplatsRead::new(&SPZ4, raw, None)?.antialiased(antialiased))
+}
+
+/// The Gaussians of a file in a file, of any version, and whether they are for a renderer that
+/// compensates opacity.
+pub(super) fn enclosed(mut file: &[u8], limits: &Limits) -> Result<(RawGaussians, bool)> {
+    if file.starts_with(&MAGIC) {
+        unpacked_4(&mut file, limits)
+    } else {
+        unpacked(&mut file, limits)
+    }
+}
+
+fn unpacked(from: &mut dyn BufRead, limits: &Limits) -> Result<(RawGaussians, bool)> {
     let mut from = Blocks { from: GzDecoder::new(from), count: 0 };
     let head = Head::read(from.row(0, "bytes of the header")?, [1, 3], limits)?;
     let raw = head.read_blocks(&mut from)?;
@@ -252,11 +305,10 @@ pub(super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead
     if head.extended {
         check_extensions(&rest)?;
     }
-    SplatsRead::new(&SPZ, raw, None)
+    Ok((raw, head.antialiased))
 }
 
-/// Version 4.
-pub(super) fn read_4(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn unpacked_4(from: &mut dyn BufRead, limits: &Limits) -> Result<(RawGaussians, bool)> {
     let mut from = Blocks { from, count: HEAD_4_BYTES };
     let head = Head::read(from.row(0, "bytes of the header")?, [4, 4], limits)?;
     let rest: [u8; 16] = from.row(16, "bytes of the header")?;
@@ -303,7 +355,7 @@ pub(super) fn read_4(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRe
         }
     }
     let raw = head.read_blocks(&mut Blocks { from: &blocks[..], count: 0 })?;
-    SplatsRead::new(&SPZ4, raw, None)
+    Ok((raw, head.antialiased))
 }
 
 /// Refuses records that change what the numbers mean; others are skipped, as the reference does.

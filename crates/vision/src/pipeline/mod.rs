@@ -331,6 +331,7 @@ fn run(
     let report = HealthReport {
         photos: count(photos.len()),
         file_format: None,
+        antialiased: false,
         method,
         views_used: count(used(&sets, photos.len())),
         gaussians: lifted.gaussians.len() as u64,

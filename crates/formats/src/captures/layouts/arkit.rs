@@ -9,11 +9,9 @@
 use glam::{DMat3, DVec3};
 
 use crate::{
-    captures::{
-        cameras::{CameraEntry, PoseAxes},
-        folder::Folder,
-        layout::{Described, Layout, called, count, inverse, numbers_of, pinhole, text},
-        names,
+    captures::layout::{
+        CameraEntry, Described, Folder, Layout, PoseAxes, called, count, inverse, names,
+        numbers_of, pinhole, text,
     },
     error::Result,
 };

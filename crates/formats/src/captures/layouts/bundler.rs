@@ -9,12 +9,9 @@
 use glam::DMat3;
 
 use crate::{
-    captures::{
-        cameras::{CameraEntry, PoseAxes},
-        folder::Folder,
-        layout::{Described, Layout, count, inverse, number, text},
-        lens::Lens,
-        names,
+    captures::layout::{
+        CameraEntry, Described, Folder, Layout, Lens, PoseAxes, count, inverse, names, number_of,
+        text,
     },
     error::{Error, Result},
 };
@@ -55,7 +52,7 @@ impl Layout for Bundler {
         let text_of = text(&bytes, at)?;
         let (_, body) = text_of.split_once('\n').ok_or_else(|| wrong("it is empty"))?;
         let mut words = body.split_whitespace();
-        let mut next = || words.next().and_then(number).ok_or_else(|| wrong("it is cut short"));
+        let mut next = || words.next().and_then(number_of).ok_or_else(|| wrong("it is cut short"));
         let (cameras, _points) = (next()?, next()?);
         let is_list = |path: &&str| {
             let name = names::file_name(path);

@@ -2,12 +2,7 @@
 //! `ScanNet++` (`dslr/nerfstudio/transforms.json`), our own, and what a training of 3DGS leaves.
 
 use crate::{
-    captures::{
-        cameras,
-        folder::Folder,
-        layout::{Described, Layout, called},
-        names,
-    },
+    captures::layout::{Described, Folder, Layout, called, cameras, names},
     error::Result,
 };
 

@@ -5,12 +5,7 @@
 //! README, "Using your own poses without running COLMAP").
 
 use crate::{
-    captures::{
-        cameras::{CameraEntry, PoseAxes},
-        folder::Folder,
-        layout::{Described, Layout, called, pinhole},
-        names,
-    },
+    captures::layout::{CameraEntry, Described, Folder, Layout, PoseAxes, called, names, pinhole},
     error::{Error, Result},
     npy::Array,
 };

@@ -7,11 +7,9 @@
 use std::collections::BTreeSet;
 
 use crate::{
-    captures::{
-        cameras::{CameraEntry, PoseAxes},
-        folder::Folder,
-        layout::{Described, Layout, inverse_of_rows, number, numbers, pinhole, text},
-        names,
+    captures::layout::{
+        CameraEntry, Described, Folder, Layout, PoseAxes, inverse_of_rows, names, number_of,
+        numbers, pinhole, text,
     },
     error::{Error, Result},
 };
@@ -43,7 +41,7 @@ impl Layout for MvsNet {
             let (pose, after) = after.split_once("intrinsic").ok_or_else(wrong)?;
             let is_pose = |m: &Vec<f64>| m.len() == 16 && m[12..] == [0.0, 0.0, 0.0, 1.0];
             let pose = numbers(pose).filter(is_pose).ok_or_else(wrong)?;
-            let k: Option<Vec<f64>> = after.split_whitespace().take(9).map(number).collect();
+            let k: Option<Vec<f64>> = after.split_whitespace().take(9).map(number_of).collect();
             let k = k.filter(|k| k.len() == 9).ok_or_else(wrong)?;
             let lens = pinhole([k[0], k[4], k[2], k[5]], None);
             let stem = names::file_name(path).trim_end_matches(ENDING);

@@ -10,12 +10,9 @@ use glam::{DMat3, DVec3};
 use serde_json::Value;
 
 use crate::{
-    captures::{
-        cameras::{CameraEntry, Fields, PoseAxes, json, number},
-        folder::Folder,
-        layout::{Described, Layout, called, inverse, pinhole},
-        lens::Lens,
-        names,
+    captures::layout::{
+        CameraEntry, Described, Fields, Folder, Layout, Lens, PoseAxes, called, inverse, json,
+        names, number, pinhole,
     },
     error::{Error, Result},
 };

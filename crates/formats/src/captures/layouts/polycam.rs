@@ -9,11 +9,8 @@
 use std::collections::BTreeSet;
 
 use crate::{
-    captures::{
-        cameras::{CameraEntry, PoseAxes, number, object},
-        folder::Folder,
-        layout::{Described, Layout, pinhole},
-        names,
+    captures::layout::{
+        CameraEntry, Described, Folder, Layout, PoseAxes, names, number, object, pinhole,
     },
     error::{Error, Result},
 };

@@ -5,12 +5,9 @@
 //! format"). A photo is called by its time.
 
 use crate::{
-    captures::{
-        cameras::{CameraEntry, PoseAxes},
-        folder::Folder,
-        layout::{Described, Layout, count, inverse_of_rows, numbers_of, pinhole, text},
-        lens::Lens,
-        names,
+    captures::layout::{
+        CameraEntry, Described, Folder, Layout, Lens, PoseAxes, count, inverse_of_rows, names,
+        numbers_of, pinhole, text,
     },
     error::{Error, Result},
 };

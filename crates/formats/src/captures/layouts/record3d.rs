@@ -10,11 +10,9 @@
 use serde_json::Value;
 
 use crate::{
-    captures::{
-        cameras::{CameraEntry, PoseAxes, number, object},
-        folder::Folder,
-        layout::{Described, Layout, pinhole, pose, rotation},
-        names,
+    captures::layout::{
+        CameraEntry, Described, Folder, Layout, PoseAxes, names, number, object, pinhole, pose,
+        rotation,
     },
     error::{Error, Result},
 };

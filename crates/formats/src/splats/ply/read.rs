@@ -8,19 +8,46 @@ use crate::{
     container::read_semantics,
     error::{Error, Result},
     limits::Limits,
-    scene::{RawGaussians, SceneId, Semantics, SourcePixel},
+    scene::{RawGaussians, SH_C0, SceneId, Semantics, SourcePixel},
 };
 
 use super::{
     super::{
-        PLY, SplatsRead, begun, check_count, cut_short,
+        OCTETS, SplatFormat, SplatsRead, begun, check_count, cut_short,
         packed_ply::{self, BOUNDS, PACKED, PackedLayout},
+        some,
     },
-    write::SEMANTICS,
+    write::{SEMANTICS, size_bytes, write},
+};
+
+/// 3DGS PLY.
+pub static PLY: SplatFormat = SplatFormat {
+    name: "ply",
+    ending: "ply",
+    media_type: OCTETS,
+    semantics: true,
+    begins: b"ply",
+    read,
+    check: |_| Ok(()),
+    size_bytes: |file| Some(size_bytes(file)),
+    write,
+};
+
+/// The compressed PLY of `PlayCanvas` and `SuperSplat`.
+pub static COMPRESSED_PLY: SplatFormat = SplatFormat {
+    name: "compressed_ply",
+    ending: "compressed.ply",
+    media_type: OCTETS,
+    semantics: false,
+    begins: b"ply",
+    read,
+    check: some,
+    size_bytes: |file| Some(packed_ply::size_bytes(file)),
+    write: packed_ply::write,
 };
 
 /// Longest header, bytes.
-const HEADER_BYTES_MAX: u64 = 64 << 10;
+const HEADER_BYTES_MAX: u64 = 1 << 20;
 /// Most attributes of a vertex: 62 are standard.
 const ATTRIBUTES_MAX: usize = 256;
 /// Most bytes of semantics after the vertices, an eighth of what a scene may have.
@@ -30,7 +57,7 @@ const CHUNK: &str = "chunk";
 const SH: &str = "sh";
 
 /// Reads a file, with the semantics after its vertices if there are some.
-pub(in super::super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
+fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     let header = Header::read(from)?;
     let vertices = header.vertices()?;
     let check = |degree| check_count("PLY: Gaussians", vertices.count, degree, limits);
@@ -38,19 +65,20 @@ pub(in super::super) fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<
     if header.elements[0].name == CHUNK {
         let layout = header.packed()?;
         check(layout.sh_degree)?;
-        return packed_ply::read(from, &layout);
+        let read = SplatsRead::new(&COMPRESSED_PLY, packed_ply::read(from, &layout)?, None)?;
+        return Ok(read.antialiased(header.antialiased));
     }
     let layout = Layout::of(vertices)?;
     check(layout.sh_degree)?;
-    let mut raw = begun(vertices.count, layout.sh_degree);
+    let (mut raw, mut placed) = (begun(vertices.count, layout.sh_degree), false);
     let mut vertex = vec![0; vertices.stride()];
     for i in 0..vertices.count {
         from.read_exact(&mut vertex)
             .map_err(|cause| cut_short("PLY", cause, i, vertices.count, "Gaussians"))?;
-        layout.push(&header, vertices, &vertex, &mut raw);
+        layout.push(&header, vertices, &vertex, (&mut raw, &mut placed));
     }
     let semantics = header.semantics.map(|bytes| semantics_after(from, bytes)).transpose()?;
-    SplatsRead::new(&PLY, raw, semantics)
+    Ok(SplatsRead::new(&PLY, raw, semantics)?.antialiased(header.antialiased))
 }
 
 /// The container of `bytes` bytes that follows the vertices.
@@ -104,6 +132,15 @@ impl Scalar {
         }
     }
 
+    /// The number that stands for 1 where a whole range is 0..1.
+    fn most(self) -> f64 {
+        match self {
+            Self::Unsigned(size) => 256_f64.powi(size as i32) - 1.0,
+            Self::Signed(size) => 256_f64.powi(size as i32) / 2.0 - 1.0,
+            Self::F32 | Self::F64 => 1.0,
+        }
+    }
+
     /// The value at the start of `bytes`, which hold at least [`Self::size`].
     fn value(self, bytes: &[u8], big_endian: bool) -> f64 {
         let (mut word, size) = ([0; 8], self.size());
@@ -144,6 +181,21 @@ struct Header {
     elements: Vec<Element>,
     /// Bytes of semantics after the vertices.
     semantics: Option<u64>,
+    /// Whether a comment says that the renderer compensates opacity.
+    antialiased: bool,
+}
+
+/// What a comment says of that renderer: `SplatRenderMode: mip` (Brush, splat-transform) or
+/// `antialiased 1` (Postshot).
+fn mode(comment: &str) -> Option<bool> {
+    let words = comment.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty());
+    let words: Vec<String> = words.map(str::to_ascii_lowercase).collect();
+    match [words.first()?, words.get(1)?].map(String::as_str) {
+        _ if words.len() > 2 => None,
+        ["splatrendermode", mode] => Some(mode == "mip"),
+        ["antialiased", is] => Some(matches!(is, "1" | "true")),
+        _ => None,
+    }
 }
 
 impl Header {
@@ -158,14 +210,13 @@ impl Header {
                     "{what} is missing in the first {HEADER_BYTES_MAX} bytes"
                 )));
             }
-            String::from_utf8(line)
-                .map(|text| text.trim_end().to_owned())
-                .map_err(|_not_text| bad("the header is not text"))
+            // A comment may be in any encoding.
+            Ok(String::from_utf8_lossy(&line).trim_end().to_owned())
         };
         if line("the line `ply`")? != "ply" {
             return Err(bad("the file does not begin with the line `ply`"));
         }
-        let (mut big_endian, mut semantics) = (None, None);
+        let (mut big_endian, mut semantics, mut antialiased) = (None, None, false);
         let mut elements: Vec<Element> = Vec::new();
         let mut is_read = false;
         loop {
@@ -179,7 +230,12 @@ impl Header {
                             bad(format!("bytes of semantics {:?}: {e}", shown(bytes)))
                         })?);
                 }
-                [] | ["comment" | "obj_info", ..] => {}
+                ["comment" | "obj_info", ..] => {
+                    let (_, comment) =
+                        line.trim_start().split_once([' ', '\t']).unwrap_or_default();
+                    antialiased = mode(comment).unwrap_or(antialiased);
+                }
+                [] => {}
                 ["format", "binary_little_endian", "1.0"] => big_endian = Some(false),
                 ["format", "binary_big_endian", "1.0"] => big_endian = Some(true),
                 ["format", ..] => {
@@ -219,7 +275,7 @@ impl Header {
             }
         }
         let big_endian = big_endian.ok_or_else(|| bad("the header has no `format`"))?;
-        Ok(Self { big_endian, elements, semantics })
+        Ok(Self { big_endian, elements, semantics, antialiased })
     }
 
     fn vertices(&self) -> Result<&Element> {
@@ -327,14 +383,31 @@ fn shown(text: &str) -> String {
     text.chars().take(80).collect()
 }
 
+/// Names of colours that are no harmonics.
+const LEVELS: [[&str; 3]; 3] =
+    [["red", "green", "blue"], ["diffuse_red", "diffuse_green", "diffuse_blue"], ["r", "g", "b"]];
+/// Scale of Gaussians without one, world units, as viewers of the web have it.
+const SCALE: f32 = 0.01;
+
+/// A number of a vertex.
+#[derive(Clone, Copy)]
+enum Number {
+    /// As it is.
+    Plain(usize),
+    /// A level: the whole range of an integer is 0..1.
+    Level(usize),
+}
+
 /// Which attribute is what.
 struct Layout {
     position: [usize; 3],
-    dc: [usize; 3],
+    color: [Number; 3],
     rest: Vec<usize>,
-    opacity: usize,
-    scale: [usize; 3],
-    rotation: [usize; 4],
+    /// A logit, or a level; where there is none it is 1.
+    opacity: Option<Number>,
+    /// One for all axes; of two axes, of a flat Gaussian; or of three. None: [`SCALE`].
+    scale: Vec<usize>,
+    rotation: Option<[usize; 4]>,
     semantic_index: Option<usize>,
     sh_degree: u8,
 }
@@ -353,17 +426,45 @@ impl Layout {
         };
         Ok(Self {
             position: vertices.require(["x", "y", "z"])?,
-            dc: vertices.require(["f_dc_0", "f_dc_1", "f_dc_2"])?,
+            color: Self::color(vertices)?,
             rest,
-            opacity: vertices.require(["opacity"])?[0],
-            scale: vertices.require(["scale_0", "scale_1", "scale_2"])?,
-            rotation: vertices.require(["rot_0", "rot_1", "rot_2", "rot_3"])?,
+            opacity: (vertices.find("opacity").map(Number::Plain))
+                .or_else(|| vertices.find("alpha").map(Number::Level)),
+            scale: Self::scale(vertices)?,
+            rotation: (vertices.find("rot_0"))
+                .map(|_| vertices.require(["rot_0", "rot_1", "rot_2", "rot_3"]))
+                .transpose()?,
             semantic_index: vertices.find("semantic_index"),
             sh_degree,
         })
     }
 
-    fn push(&self, header: &Header, vertices: &Element, vertex: &[u8], raw: &mut RawGaussians) {
+    fn color(vertices: &Element) -> Result<[Number; 3]> {
+        let levels = LEVELS.into_iter().find(|names| vertices.find(names[0]).is_some());
+        match levels.filter(|_| vertices.find("f_dc_0").is_none()) {
+            Some(names) => Ok(vertices.require(names)?.map(Number::Level)),
+            None => Ok(vertices.require(["f_dc_0", "f_dc_1", "f_dc_2"])?.map(Number::Plain)),
+        }
+    }
+
+    fn scale(vertices: &Element) -> Result<Vec<usize>> {
+        let has = |name: &str| vertices.find(name).is_some();
+        Ok(match [has("scale_0"), has("scale_1"), has("scale_2")] {
+            [false, false, false] => Vec::new(),
+            [_, false, false] => vertices.require(["scale_0"])?.to_vec(),
+            [.., false] => vertices.require(["scale_0", "scale_1"])?.to_vec(),
+            _ => vertices.require(["scale_0", "scale_1", "scale_2"])?.to_vec(),
+        })
+    }
+
+    /// Adds a vertex; `placed` is whether a vertex before it had a place.
+    fn push(
+        &self,
+        header: &Header,
+        vertices: &Element,
+        vertex: &[u8],
+        (raw, placed): (&mut RawGaussians, &mut bool),
+    ) {
         let attributes = &vertices.attributes;
         let value = |attribute: usize| {
             let Attribute { scalar, offset, .. } = attributes[attribute];
@@ -372,15 +473,29 @@ impl Layout {
         let narrow = |attribute| value(attribute) as f32;
         let position = DVec3::from_array(self.position.map(value));
         let wide = self.position.iter().any(|&i| attributes[i].scalar == Scalar::F64);
-        if raw.means.is_empty() && wide && position.is_finite() {
+        if wide && !*placed && position.is_finite() {
             // f64 positions are kept near the first one, where f32 is fine enough.
-            raw.origin = position;
+            (raw.origin, *placed) = (position, true);
         }
         raw.means.push((position - raw.origin).as_vec3().to_array());
-        raw.quats.push(self.rotation.map(narrow));
-        raw.scales.push(self.scale.map(|i| value(i).exp() as f32));
-        raw.opacities.push((1.0 / (1.0 + (-value(self.opacity)).exp())) as f32);
-        raw.sh.push(self.dc.map(narrow));
+        let level = |i: usize| value(i) / attributes[i].scalar.most();
+        raw.quats.push(self.rotation.map_or([1.0, 0.0, 0.0, 0.0], |rotation| rotation.map(narrow)));
+        let scale = |i: usize| value(i).exp() as f32;
+        raw.scales.push(match self.scale[..] {
+            [x, y, z] => [x, y, z].map(scale),
+            [x, y] => [scale(x), scale(y), 0.0],
+            [all] => [scale(all); 3],
+            _ => [SCALE; 3],
+        });
+        raw.opacities.push(match self.opacity {
+            Some(Number::Plain(i)) => (1.0 / (1.0 + (-value(i)).exp())) as f32,
+            Some(Number::Level(i)) => level(i) as f32,
+            None => 1.0,
+        });
+        raw.sh.push(self.color.map(|number| match number {
+            Number::Plain(i) => narrow(i),
+            Number::Level(i) => ((level(i) - 0.5) / f64::from(SH_C0)) as f32,
+        }));
         let each = self.rest.len() / 3;
         for coefficient in 0..each {
             raw.sh.push([0, 1, 2].map(|channel| narrow(self.rest[channel * each + coefficient])));
