@@ -21,6 +21,7 @@ use crate::{
         upload::{UploadBuilder, UploadGuard},
     },
     error::{Error, Result},
+    formats::captures::decoded_name,
     scene::{SceneOptions, Upload, UploadCameras},
 };
 
@@ -179,7 +180,12 @@ async fn parts(
                 body.progressed();
                 continue;
             }
-            _ => upload.begin_photo(&photo_name(&name, field.file_name())?)?,
+            _ => {
+                let disposition = field.headers().get("content-disposition");
+                let extended = disposition.and_then(|value| extended_name(value.as_bytes()));
+                let file = extended.as_deref().or_else(|| field.file_name());
+                upload.begin_photo(&photo_name(&name, file)?)?;
+            }
         }
         while let Some(piece) = field.chunk().await.map_err(broken)? {
             body.progressed();
@@ -257,6 +263,18 @@ fn photo_name(part: &str, file: Option<&str>) -> Result<String> {
     }
 }
 
+/// The value of `filename*=UTF-8''…`, which is meant where `filename` is there too (RFC 6266).
+fn extended_name(disposition: &[u8]) -> Option<String> {
+    let text = std::str::from_utf8(disposition).ok()?;
+    let at = text.to_ascii_lowercase().find("filename*")?;
+    let value = text[at + "filename*".len()..].trim_start().strip_prefix('=')?;
+    let value = value.split(';').next()?.trim().trim_matches('"');
+    let (charset, value) = value.split_once('\'')?;
+    let (_language, value) = value.split_once('\'')?;
+    let is_utf8 = charset.eq_ignore_ascii_case("utf-8");
+    is_utf8.then(|| decoded_name(value).unwrap_or_else(|| value.to_owned()))
+}
+
 async fn text(field: &mut Field<'_>) -> Result<String> {
     let mut bytes = Vec::new();
     while let Some(piece) = field.chunk().await.map_err(broken)? {
@@ -273,4 +291,23 @@ async fn text(field: &mut Field<'_>) -> Result<String> {
 fn broken(error: axum::extract::multipart::MultipartError) -> Error {
     Error::invalid(format!("upload: the multipart body is damaged: {}", error.body_text()))
         .caused_by(error)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::extended_name;
+
+    #[test]
+    fn the_extended_name_of_a_file_is_decoded() {
+        for (header, want) in [
+            ("form-data; name=\"photo\"; filename*=UTF-8''K%C3%BCche%200.jpg", Some("Küche 0.jpg")),
+            ("form-data; filename=\"=?x?=\"; FileName* = utf-8'de'a%2Fb.jpg; x=1", Some("a/b.jpg")),
+            ("form-data; filename*=\"UTF-8''plain.jpg\"", Some("plain.jpg")),
+            ("form-data; filename=\"a.jpg\"", None),
+            ("form-data; filename*=utf-7''a.jpg", None),
+            ("form-data; filename*=a.jpg", None),
+        ] {
+            assert_eq!(extended_name(header.as_bytes()).as_deref(), want, "{header}");
+        }
+    }
 }

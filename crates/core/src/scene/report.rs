@@ -33,6 +33,8 @@ pub enum WarningCode {
     PhotosMissing,
     /// Several photos are one picture, under different poses.
     SamePicture,
+    /// The capture holds cameras of several kinds or places; the message says which were taken.
+    CamerasChosen,
 }
 
 crate::names::display_names!(WarningCode);

@@ -1,5 +1,5 @@
-//! Cameras as every reader gives them, and the two camera JSONs: nerfstudio / instant-ngp
-//! `transforms.json` and our own `cameras`.
+//! Cameras as every reader gives them, and the camera JSONs: nerfstudio / instant-ngp
+//! `transforms.json`, our own `cameras` and that of 3DGS.
 //!
 //! What `transforms.json` says beside its frames: `applied_transform` and `applied_scale` tell how
 //! the file's world was made of another one. The poses have them already, and the scene keeps the
@@ -9,9 +9,10 @@
 
 use std::collections::HashSet;
 
+use glam::DMat3;
 use serde_json::{Map, Value};
 
-use super::lens::Lens;
+use super::{lens::Lens, numbers};
 use crate::{
     error::{Error, Result},
     scene::{CameraToWorld, photo_label as label},
@@ -90,9 +91,16 @@ pub(crate) fn transforms(bytes: &[u8]) -> Result<Cameras> {
     Ok(cameras)
 }
 
-/// Our own JSON, whose size was checked.
+/// A `cameras.json`, whose size was checked: our own, or the list that a training of 3DGS leaves.
 pub(crate) fn cameras(bytes: &[u8]) -> Result<Cameras> {
-    list(&object(bytes, "cameras")?, "cameras", "cameras", cameras_entry)
+    match json(bytes, "cameras")? {
+        Value::Object(top) => list(&top, "cameras", "cameras", cameras_entry),
+        list @ Value::Array(_) => {
+            let top = Fields::from_iter([("cameras".to_owned(), list)]);
+            self::list(&top, "cameras", "cameras", gaussian_splatting_entry)
+        }
+        other => Err(Error::invalid(format!("cameras: {}, not a JSON object", kind(&other)))),
+    }
 }
 
 /// A JSON object.
@@ -125,19 +133,21 @@ fn list(
 
 /// The object of a JSON text; `part` names it in messages.
 pub(crate) fn object(bytes: &[u8], part: &str) -> Result<Fields> {
-    let text = std::str::from_utf8(bytes)
-        .map_err(|e| Error::invalid(format!("{part}: not UTF-8 text")).caused_by(e))?;
-    let text = text.strip_prefix('\u{feff}').unwrap_or(text);
-    let parsed = serde_json::from_str(text).or_else(|e| {
+    match json(bytes, part)? {
+        Value::Object(map) => Ok(map),
+        other => Err(Error::invalid(format!("{part}: {}, not a JSON object", kind(&other)))),
+    }
+}
+
+/// The value of a JSON text; `part` names it in messages.
+pub(crate) fn json(bytes: &[u8], part: &str) -> Result<Value> {
+    let text = numbers::text(bytes, part)?;
+    let parsed = serde_json::from_str(&text).or_else(|e| {
         // Python writes NaN and Infinity, which JSON has not: read them so that the message can
         // name the photo whose number it is.
-        without_bare_nan(text).map_or(Err(e), |text| serde_json::from_str(&text))
+        without_bare_nan(&text).map_or(Err(e), |text| serde_json::from_str(&text))
     });
-    match parsed {
-        Ok(Value::Object(map)) => Ok(map),
-        Ok(other) => Err(Error::invalid(format!("{part}: {}, not a JSON object", kind(&other)))),
-        Err(e) => Err(Error::invalid(format!("{part}: not valid JSON ({e})"))),
-    }
+    parsed.map_err(|e| Error::invalid(format!("{part}: not valid JSON ({e})")))
 }
 
 /// The text with bare `NaN`, `Infinity`, `-Infinity` as `null`; `None` when there are none.
@@ -292,6 +302,36 @@ fn cameras_entry(i: usize, entry: &Fields, _top: &Fields) -> Result<CameraEntry>
     };
     read_distortion(&mut lens, fields, &what)?;
     let pose = matrix(entry.get("camera_to_world"), "camera_to_world", &what);
+    Ok(CameraEntry { file, lens, axes: PoseAxes::OpenCv, pose })
+}
+
+/// One entry of the list that 3DGS writes beside a training (`camera_to_JSON` in its
+/// `utils/camera_utils.py`): camera-to-world in OpenCV axes, the principal point in the middle.
+fn gaussian_splatting_entry(i: usize, entry: &Fields, _top: &Fields) -> Result<CameraEntry> {
+    let unnamed = format!("cameras: [{i}]");
+    let file = text(entry, "img_name", &unnamed)?
+        .ok_or_else(|| Error::invalid(format!("{unnamed}: img_name is missing")))?;
+    let what = label(i, &file);
+    let needed = |key: &str| {
+        number(entry, key, &what)?
+            .ok_or_else(|| Error::invalid(format!("{what}: {key} is missing")))
+    };
+    let size = [needed("width")?, needed("height")?];
+    let centre = [0.5 * size[0], 0.5 * size[1]];
+    let lens = numbers::pinhole([needed("fx")?, needed("fy")?, centre[0], centre[1]], Some(size));
+    let row = |value: Option<&Value>| -> Option<[f64; 3]> {
+        let numbers: Vec<f64> =
+            value?.as_array()?.iter().map(Value::as_f64).collect::<Option<_>>()?;
+        numbers.try_into().ok()
+    };
+    let rotation = entry.get("rotation").and_then(Value::as_array);
+    let rows = [0, 1, 2].map(|at| row(rotation.and_then(|rows| rows.get(at))));
+    let pose = match (rows, row(entry.get("position"))) {
+        ([Some(x), Some(y), Some(z)], Some(centre)) => {
+            Ok(numbers::pose(DMat3::from_cols_array_2d(&[x, y, z]).transpose(), centre.into()))
+        }
+        _ => Err(format!("{what}: rotation must be 3 rows of 3 numbers, position 3 numbers")),
+    };
     Ok(CameraEntry { file, lens, axes: PoseAxes::OpenCv, pose })
 }
 

@@ -63,14 +63,20 @@ enum Source<'a> {
 }
 
 impl<'a> Folder<'a> {
-    /// The parts of a form, each with its path as name.
+    /// The parts of a form, each with its path as name, without the encodings of HTTP clients where
+    /// `decoded`.
     ///
     /// # Errors
     /// `invalid_request` for names that leave the folder or come twice, `limit_exceeded` for names
     /// that are too long.
-    pub(crate) fn of_form(sent: &'a [UploadFile], limits: &'a Limits) -> Result<Self> {
+    pub(crate) fn of_form(
+        sent: &'a [UploadFile],
+        decoded: bool,
+        limits: &'a Limits,
+    ) -> Result<Self> {
         let mut folder = Self::new("upload", Source::Form(sent), limits);
-        for (at, (file, path)) in sent.iter().zip(names::paths(sent, limits)?).enumerate() {
+        for (at, (file, path)) in sent.iter().zip(names::paths(sent, decoded, limits)?).enumerate()
+        {
             folder.insert(path, Stored { size: file.bytes.len() as u64, at })?;
         }
         Ok(folder)
@@ -250,14 +256,9 @@ impl<'a> Folder<'a> {
         Ok(bytes)
     }
 
-    /// Forgets which files of cameras were read from a disk: they were only looked into.
-    pub(crate) fn forget_cameras_read(&self) {
-        self.cameras_read.borrow_mut().clear();
-    }
-
-    /// The files of cameras that were read from a disk, by path.
-    pub(crate) fn into_cameras_read(self) -> BTreeMap<String, Vec<u8>> {
-        self.cameras_read.into_inner()
+    /// The files of cameras that were read from a disk since the last call, by path.
+    pub(crate) fn take_cameras_read(&self) -> BTreeMap<String, Vec<u8>> {
+        self.cameras_read.take()
     }
 
     /// A file whole.
@@ -292,6 +293,37 @@ impl<'a> Folder<'a> {
                 self.unpack(path, size, file).map(Cow::Owned)
             }
         }
+    }
+
+    /// The first bytes of a file, at most `max`.
+    ///
+    /// # Errors
+    /// As [`Self::read`].
+    pub(crate) fn head(&self, path: &str, max: usize) -> Result<Vec<u8>> {
+        let Some(&Stored { size, at }) = self.files.get(path) else {
+            return Err(Error::invalid(format!("{}: there is no {path:?}", self.what)));
+        };
+        let size = size.min(max as u64);
+        let wanted = usize::try_from(size).unwrap_or(max);
+        let mut head = Vec::new();
+        let damaged = |e| Error::photo(format!("{}: {path:?} is damaged", self.what)).caused_by(e);
+        match &self.source {
+            Source::Form(sent) => head.extend(sent[at].bytes.iter().take(wanted)),
+            Source::Tar(bytes) => head.extend(bytes[at..].iter().take(wanted)),
+            Source::Zip(bytes, entries) => {
+                self.count(path, size)?;
+                let mut body = Cursor::new(*bytes);
+                let entry = entries[at].as_ref();
+                let entry = entry.with_reader(&mut body, ZipReadOptions::new());
+                let entry = entry.map_err(std::io::Error::other).map_err(damaged)?;
+                entry.take(size).read_to_end(&mut head).map_err(damaged)?;
+            }
+            Source::Disk(dir) => {
+                let file = fs_err::File::open(dir.join(path)).map_err(damaged)?;
+                file.take(size).read_to_end(&mut head).map_err(damaged)?;
+            }
+        }
+        Ok(head)
     }
 
     /// Reads one file whole. The size that is listed must be left of the limit. Not one byte more

@@ -1,13 +1,14 @@
-//! What all readers of layouts share: how a layout is recognised and read, cameras as they are
-//! written, and small readers of numbers and poses.
-
-use glam::{DMat3, DQuat, DVec3};
+//! What all readers of layouts share: how a layout is recognised and read, and cameras as they are
+//! written.
 
 pub(crate) use super::{
-    cameras::{self, CameraEntry, PoseAxes, number, object},
+    cameras::{self, CameraEntry, Fields, PoseAxes, json, number, object},
     folder::Folder,
     lens::{Base, Lens, Terms},
     names,
+    numbers::{
+        inverse, inverse_of_rows, number_of, numbers, numbers_of, pinhole, pose, rotation, text,
+    },
 };
 use crate::error::{Error, Result};
 
@@ -36,49 +37,10 @@ impl Described {
     }
 }
 
-/// The files of this name.
+/// The files of this name, in any case.
 pub(crate) fn called(folder: &Folder<'_>, name: &str) -> Vec<String> {
-    folder.paths().filter(|path| names::file_name(path) == name).map(str::to_owned).collect()
-}
-
-/// Camera-to-world, row-major, of a rotation and a centre.
-pub(crate) fn pose(rotation: DMat3, centre: DVec3) -> [f64; 16] {
-    let [x, y, z] = rotation.transpose().to_cols_array_2d();
-    let row = |r: [f64; 3], t: f64| [r[0], r[1], r[2], t];
-    let rows = [row(x, centre.x), row(y, centre.y), row(z, centre.z), [0.0, 0.0, 0.0, 1.0]];
-    let mut flat = [0.0; 16];
-    flat.copy_from_slice(rows.as_flattened());
-    flat
-}
-
-/// Camera-to-world, row-major, of a world-to-camera rotation and translation.
-pub(crate) fn inverse(rotation: DMat3, translation: DVec3) -> [f64; 16] {
-    let turned = rotation.transpose();
-    pose(turned, -(turned * translation))
-}
-
-/// Camera-to-world, row-major, of the first twelve numbers of a row-major world-to-camera matrix.
-pub(crate) fn inverse_of_rows(m: &[f64]) -> [f64; 16] {
-    let rotation = DMat3::from_cols_array(&[m[0], m[4], m[8], m[1], m[5], m[9], m[2], m[6], m[10]]);
-    inverse(rotation, DVec3::new(m[3], m[7], m[11]))
-}
-
-/// The rotation of a quaternion w x y z of any length but 0.
-pub(crate) fn rotation([w, x, y, z]: [f64; 4]) -> DMat3 {
-    DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize())
-}
-
-/// A pinhole lens; `size` is width and height where they are written.
-pub(crate) fn pinhole([fx, fy, cx, cy]: [f64; 4], size: Option<[f64; 2]>) -> Lens {
-    Lens {
-        fx: Some(fx),
-        fy: Some(fy),
-        cx: Some(cx),
-        cy: Some(cy),
-        width: size.map(|[width, _]| width),
-        height: size.map(|[_, height]| height),
-        ..Lens::default()
-    }
+    let is_called = |path: &&str| names::file_name(path).eq_ignore_ascii_case(name);
+    folder.paths().filter(is_called).map(str::to_owned).collect()
 }
 
 /// Refuses one entry more of a file than the limit, before memory is taken for it.
@@ -87,24 +49,4 @@ pub(crate) fn count(entries: usize, max: usize, path: &str) -> Result<()> {
         return Ok(());
     }
     Err(Error::limit(format!("{path}: entries"), format!("more than {max}"), max))
-}
-
-/// The text of a camera file.
-pub(crate) fn text<'a>(bytes: &'a [u8], path: &str) -> Result<&'a str> {
-    std::str::from_utf8(bytes)
-        .map_err(|e| Error::invalid(format!("{path}: not UTF-8 text")).caused_by(e))
-}
-
-/// The numbers of a text between spaces; `None` where a word is none.
-pub(crate) fn numbers(text: &str) -> Option<Vec<f64>> {
-    text.split_ascii_whitespace().map(|word| word.parse().ok()).collect()
-}
-
-/// The numbers of a line, exactly `N`.
-pub(crate) fn numbers_of<const N: usize>(line: &str, path: &str, at: usize) -> Result<[f64; N]> {
-    let wrong = || {
-        let shown: String = line.chars().take(60).collect();
-        Error::invalid(format!("{path}: line {at} must be {N} numbers, it is {shown:?}"))
-    };
-    numbers(line).and_then(|numbers| numbers.try_into().ok()).ok_or_else(wrong)
 }

@@ -18,6 +18,19 @@ const PERSPECTIVE: [&str; 6] =
 /// Models whose radial terms act on the angle.
 const FISHEYE: [&str; 3] = ["OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"];
 
+/// How the sizes of cameras fit those of photos, the worst first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Sizes {
+    /// Another aspect: the photos would be refused.
+    Contradict,
+    /// Photos that cannot be read.
+    Unknown,
+    /// The same aspect.
+    Scaled,
+    /// The same, or the cameras state none.
+    Fit,
+}
+
 /// A lens as written; what is absent is `None`, what is not a number is NaN.
 #[derive(Clone, Debug, Default)]
 pub struct Lens {
@@ -215,6 +228,16 @@ impl Lens {
         let terms = self.bending(what)?;
         let terms = (!terms.is_none()).then_some(terms);
         Ok(LensAtSize { intrinsics, made_for, terms })
+    }
+
+    /// How the size that is written fits that of a photo.
+    pub(crate) fn sizes(&self, photo: [u32; 2]) -> Sizes {
+        match self.stated_size("") {
+            Ok(None) => Sizes::Fit,
+            Ok(Some(stated)) if stated == photo => Sizes::Fit,
+            Ok(Some(stated)) if same_aspect(stated, photo) => Sizes::Scaled,
+            _ => Sizes::Contradict,
+        }
     }
 
     /// The distortion, all numbers finite.

@@ -6,28 +6,34 @@
 //!
 //! Photos sent beside a camera JSON each need a camera, but the JSON may describe more cameras than
 //! photos were sent. A capture (a folder, an archive, or files of a form that describe their
-//! cameras themselves) is recognised by its files; cameras without photo and photos without camera
-//! are warned of by name. Of more photos than a scene takes, the best are chosen.
+//! cameras themselves) is recognised by its files, and of several cameras the best are taken;
+//! cameras without photo and photos without camera are warned of by name. Of more photos than a
+//! scene takes, the best are chosen.
 
 pub(crate) mod cameras;
+mod candidates;
 mod choose;
 pub(crate) mod folder;
 pub(crate) mod layout;
 mod layouts;
 pub(crate) mod lens;
 pub(crate) mod names;
+mod numbers;
+mod places;
 
 use std::{
     borrow::Cow,
-    collections::{HashMap, HashSet},
+    collections::{BTreeMap, HashSet},
     path::Path,
 };
 
 use glam::DVec3;
 
 pub use self::lens::{Base, Lens, LensAtSize, Terms};
+pub use self::names::decoded as decoded_name;
 use self::{
     cameras::{CameraEntry, Cameras},
+    candidates::{Best, Candidate, Pair, paired},
     folder::Folder,
 };
 use crate::{
@@ -41,9 +47,6 @@ use crate::{
 
 /// Files that one message names.
 const NAMED_MAX: usize = 4;
-/// Names of folders with the photos of cameras, where several have photos of these names: programs
-/// put smaller, larger and cut copies beside them.
-const PHOTO_FOLDERS: [&str; 5] = ["images", "resized_images", "rgb", "input", "blended_images"];
 /// Why photos are left out that a camera file keeps for tests.
 const KEPT_OUT: &str = "kept for tests, or marked as bad, by the capture; left out";
 /// The list of `ScanNet++` of the photos that are kept for tests.
@@ -57,9 +60,8 @@ pub fn find_in_dir<'a>(
     dir: &Path,
     limits: &'a Limits,
 ) -> Result<(FoundPhotos<'a>, Vec<UploadFile>)> {
-    let folder = Folder::of_dir(dir, limits)?;
-    let found = of_folder(&folder, limits)?;
-    let cameras = folder.into_cameras_read().into_iter();
+    let (found, cameras) = of_folder(&Folder::of_dir(dir, limits)?, limits)?;
+    let cameras = cameras.into_iter();
     Ok((found, cameras.map(|(name, bytes)| UploadFile { name, bytes }).collect()))
 }
 
@@ -78,7 +80,9 @@ pub fn find<'a>(upload: &'a Upload, limits: &'a Limits) -> Result<FoundPhotos<'a
         (Some(_), cameras) if !upload.photos.is_empty() || cameras.is_some() => {
             Err(Error::invalid("send either an archive or camera JSON and photos, not both"))
         }
-        (Some(archive), _) => of_folder(&Folder::of_archive(archive, limits)?, limits),
+        (Some(archive), _) => {
+            of_folder(&Folder::of_archive(archive, limits)?, limits).map(|(found, _)| found)
+        }
         (None, Some(cameras)) => of_form(cameras, &upload.photos, limits),
         (None, None) if upload.photos.iter().all(|file| names::is_photo(&file.name)) => {
             Err(Error::invalid(
@@ -86,7 +90,13 @@ pub fn find<'a>(upload: &'a Upload, limits: &'a Limits) -> Result<FoundPhotos<'a
                  camera files of a capture, or an archive with them",
             ))
         }
-        (None, None) => of_folder(&Folder::of_form(&upload.photos, limits)?, limits),
+        (None, None) => {
+            let mut folder = Folder::of_form(&upload.photos, false, limits)?;
+            if layouts::find(&folder).is_empty() {
+                folder = Folder::of_form(&upload.photos, true, limits).unwrap_or(folder);
+            }
+            of_folder(&folder, limits).map(|(found, _)| found)
+        }
     }
 }
 
@@ -144,7 +154,7 @@ fn of_form<'a>(
             cameras::cameras(json)?
         }
     };
-    names::paths(files, limits)?;
+    names::paths(files, false, limits)?;
     let sent: Vec<&str> = files.iter().map(|file| file.name.as_str()).collect();
     let (pairs, _) = paired(&entries, &sent)?;
     let used: HashSet<usize> = pairs.iter().map(|(_, file)| *file).collect();
@@ -177,52 +187,47 @@ fn of_form<'a>(
     Ok(FoundPhotos { photos: taken.collect(), warnings })
 }
 
-/// The photos of a capture.
-fn of_folder<'a>(folder: &Folder<'a>, limits: &Limits) -> Result<FoundPhotos<'a>> {
-    let described = layouts::read(folder)?;
-    let Cameras { mut entries, mut held_out } = described.cameras;
-    let listed = test_list(folder)?;
-    entries.retain(|entry| {
-        let kept = !listed.contains(names::file_name(&entry.file));
-        if !kept {
-            held_out.push(entry.file.clone());
-        }
-        kept
-    });
-    if entries.len() > limits.archive_entries_max {
-        let what = format!("{}: cameras", folder.what);
-        return Err(Error::limit(what, entries.len(), limits.archive_entries_max));
-    }
-    let place = photo_folder(folder, &described.root, &entries)?;
-    let inside = |path: &'_ str| -> Option<String> {
-        let rest =
-            if place.is_empty() { path } else { path.strip_prefix(&place)?.strip_prefix('/')? };
-        names::is_photo(rest).then(|| rest.to_owned())
-    };
-    let sent: Vec<String> = folder.paths().filter_map(inside).collect();
+/// The photos of a capture, and the files of cameras that were read from a disk.
+fn of_folder<'a>(
+    folder: &Folder<'a>,
+    limits: &Limits,
+) -> Result<(FoundPhotos<'a>, BTreeMap<String, Vec<u8>>)> {
+    let tests = test_list(folder)?;
+    let mut files = folder.take_cameras_read();
+    let Best { candidate, warning } = candidates::best(folder, &tests)?;
+    files.extend(candidate.files);
+    let Candidate { entries, held_out, place, sent, pairs, missing, .. } = candidate;
+    let (place, what) = (place.top, folder.what);
     let sent: Vec<&str> = sent.iter().map(String::as_str).collect();
-    let (pairs, missing) = paired(&entries, &sent)?;
     if pairs.is_empty() {
-        let first = entries.first().map_or("", |entry| entry.file.as_str());
-        return Err(Error::invalid(format!(
-            "{}: none of the {} cameras has its photo; the first is {first:?}",
-            folder.what,
-            entries.len()
-        )));
+        return Err(Error::invalid(no_photos(folder, &entries)));
     }
     check_count(pairs.len(), limits)?;
-    let mut warnings = Vec::new();
     let unused = without_camera(&sent, &pairs, &held_out);
+    let (cameras, photos) = (entries.len(), pairs.len() + unused.len());
+    // A capture may be sent in part, and COLMAP leaves photos out: one side may be left over, but
+    // where most of both are, their names do not fit.
+    if 2 * pairs.len() < cameras.min(photos) {
+        return Err(Error::invalid(format!(
+            "{what}: only {} of {cameras} cameras have their photo, and {} of {photos} photos have \
+             no camera: their names do not fit, as {:?} of a camera and the photo {:?}",
+            pairs.len(),
+            unused.len(),
+            entries[missing[0]].file,
+            unused[0]
+        )));
+    }
+    let mut warnings: Vec<Warning> = warning.into_iter().collect();
     warnings.extend(told(
         WarningCode::PhotosMissing,
         missing.len(),
-        "a camera, but no such photo; left out",
+        &format!("{} of {cameras} cameras have no such photo; left out", missing.len()),
         missing.iter().map(|i| entries[*i].file.as_str()),
     ));
     warnings.extend(told(
         WarningCode::PhotosUnused,
         unused.len(),
-        "no camera; left out",
+        &format!("{} of {photos} photos have no camera; left out", unused.len()),
         unused.iter().copied(),
     ));
     warnings.extend(told(
@@ -240,7 +245,19 @@ fn of_folder<'a>(folder: &Folder<'a>, limits: &Limits) -> Result<FoundPhotos<'a>
         Ok(found(&entries[entry], name, path, pose, bytes))
     };
     let photos = chosen.into_iter().map(take).collect::<Result<_>>()?;
-    Ok(FoundPhotos { photos, warnings })
+    Ok((FoundPhotos { photos, warnings }, files))
+}
+
+/// The message where no camera has its photo.
+fn no_photos(folder: &Folder<'_>, entries: &[CameraEntry]) -> String {
+    let (what, cameras) = (folder.what, entries.len());
+    let first = entries.first().map_or("", |entry| entry.file.as_str());
+    let mut photos = folder.paths().filter(|path| names::is_photo(path));
+    let photos = match photos.next() {
+        Some(photo) => format!("{photo:?} is one of {} photos", 1 + photos.count()),
+        None => "no file has the name of a photo (.jpg, .png, .webp)".to_owned(),
+    };
+    format!("{what}: none of the {cameras} cameras has its photo; the first is {first:?}; {photos}")
 }
 
 fn found<'a>(
@@ -280,46 +297,6 @@ fn test_list(folder: &Folder<'_>) -> Result<HashSet<String>> {
     Ok(tests.filter_map(|file| file.as_str()).map(str::to_owned).collect())
 }
 
-/// The folder under which most cameras have their photos, by path with or without its extension.
-///
-/// # Errors
-/// `invalid_request` where two folders are equally good.
-fn photo_folder(folder: &Folder<'_>, root: &str, entries: &[CameraEntry]) -> Result<String> {
-    let wanted: HashSet<String> = entries.iter().map(|entry| names::tail(&entry.file)).collect();
-    let mut counts: HashMap<&str, usize> = HashMap::new();
-    for path in folder.paths() {
-        let Some(stem) = names::stem(path) else { continue };
-        let starts = path.match_indices('/').map(|(at, _)| at + 1);
-        for start in std::iter::once(0).chain(starts) {
-            if wanted.contains(&path[start..])
-                || stem.get(start..).is_some_and(|s| wanted.contains(s))
-            {
-                *counts.entry(path[..start].trim_end_matches('/')).or_default() += 1;
-            }
-        }
-    }
-    let near = |place: &str| {
-        let parts = |path: &str| path.split('/').map(str::to_owned).collect::<Vec<_>>();
-        parts(place).iter().zip(parts(root)).take_while(|(a, b)| *a == b).count()
-    };
-    let known = |place: &str| {
-        let last = names::file_name(place);
-        PHOTO_FOLDERS.len()
-            - PHOTO_FOLDERS.iter().position(|p| *p == last).unwrap_or(PHOTO_FOLDERS.len())
-    };
-    let rank = |place: &str, count: usize| (count, place == root, near(place), known(place));
-    let mut ranked: Vec<_> = counts.iter().map(|(p, count)| (rank(p, *count), *p)).collect();
-    ranked.sort_unstable_by(|a, b| b.cmp(a));
-    match ranked[..] {
-        [] => Ok(root.to_owned()),
-        [(first, a), (second, b), ..] if first == second => Err(Error::invalid(format!(
-            "{}: the cameras have photos in {a:?} and in {b:?}; send one of them",
-            folder.what
-        ))),
-        [(_, place), ..] => Ok(place.to_owned()),
-    }
-}
-
 /// Photos without camera that lie where photos with cameras lie. A picture that is called after a
 /// photo, as `a_mask.png` is after `a.jpg`, belongs to it.
 fn without_camera<'a>(sent: &[&'a str], pairs: &[Pair], held_out: &[String]) -> Vec<&'a str> {
@@ -341,18 +318,6 @@ fn without_camera<'a>(sent: &[&'a str], pairs: &[Pair], held_out: &[String]) -> 
         is_lone.then_some(*path)
     };
     sent.iter().enumerate().filter_map(lone).collect()
-}
-
-/// The places of a camera and of its photo.
-type Pair = (usize, usize);
-
-/// Cameras with the photo of each, and cameras without one.
-fn paired(entries: &[CameraEntry], sent: &[&str]) -> Result<(Vec<Pair>, Vec<usize>)> {
-    let wanted: Vec<&str> = entries.iter().map(|entry| entry.file.as_str()).collect();
-    let files = names::matched(&wanted, sent)?;
-    let pairs = files.iter().enumerate().filter_map(|(i, file)| Some((i, (*file)?))).collect();
-    let missing = (0..files.len()).filter(|i| files[*i].is_none()).collect();
-    Ok((pairs, missing))
 }
 
 /// Camera, photo and pose of the photos that a scene takes.

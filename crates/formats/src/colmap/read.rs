@@ -2,14 +2,14 @@
 //!
 //! Numbers of camera models: COLMAP's `src/colmap/scene/reconstruction_io_binary.cc`. `rigs` and
 //! `frames` (COLMAP 3.12 and later) are not needed: `images` has the pose of every image beside
-//! them. Points are skipped. Of several models the one with most images is read.
+//! them. Points are skipped.
 
 use std::collections::HashMap;
 
 use crate::{
     captures::layout::{
         Base, CameraEntry, Described, Folder, Layout, Lens, PoseAxes, Terms, count, inverse, names,
-        numbers, pinhole, rotation, text,
+        number_of, numbers, pinhole, rotation, text,
     },
     error::{Error, Result},
 };
@@ -46,19 +46,13 @@ impl Layout for Colmap {
     }
 
     fn find(&self, folder: &Folder<'_>) -> Vec<String> {
-        models(folder).into_iter().take(1).map(|(model, _)| model).collect()
+        models(folder).into_iter().map(|(model, _)| model).collect()
     }
 
-    fn read(&self, folder: &Folder<'_>, _: &str) -> Result<Described> {
-        let mut largest: Option<Described> = None;
-        for (model, ending) in models(folder) {
-            let described = read_model(folder, &model, ending)?;
-            let images = |d: &Described| d.cameras.entries.len();
-            if largest.as_ref().is_none_or(|largest| images(&described) > images(largest)) {
-                largest = Some(described);
-            }
-        }
-        largest.ok_or_else(|| Error::invalid("COLMAP: no model"))
+    fn read(&self, folder: &Folder<'_>, at: &str) -> Result<Described> {
+        let model = models(folder).into_iter().find(|(model, _)| model == at);
+        let (model, ending) = model.ok_or_else(|| Error::invalid("COLMAP: no model"))?;
+        read_model(folder, &model, ending)
     }
 }
 
@@ -88,8 +82,8 @@ fn read_model(folder: &Folder<'_>, model: &str, ending: &str) -> Result<Describe
         let lenses = cameras_bin(&camera_bytes, &cameras, max)?;
         images_bin(&image_bytes, &images, &lenses, max)?
     } else {
-        let lenses = cameras_txt(text(&camera_bytes, &cameras)?, &cameras, max)?;
-        images_txt(text(&image_bytes, &images)?, &images, &lenses, max)?
+        let lenses = cameras_txt(&text(&camera_bytes, &cameras)?, &cameras, max)?;
+        images_txt(&text(&image_bytes, &images)?, &images, &lenses, max)?
     };
     Ok(Described::new(model, entries))
 }
@@ -147,7 +141,8 @@ impl<'a> Bytes<'a> {
         let end = self.rest.iter().position(|byte| *byte == 0).ok_or_else(|| self.cut())?;
         let (name, rest) = self.rest.split_at(end);
         self.rest = &rest[1..];
-        text(name, self.path)
+        std::str::from_utf8(name)
+            .map_err(|e| Error::invalid(format!("{}: not UTF-8 text", self.path)).caused_by(e))
     }
 
     /// Nothing may be left.
@@ -210,7 +205,7 @@ fn cameras_txt(text: &str, path: &str, max: usize) -> Result<Lenses> {
             continue;
         }
         count(lenses.len(), max, path)?;
-        let mut words = line.split_ascii_whitespace();
+        let mut words = line.split_whitespace();
         let id = words.next().and_then(|id| id.parse().ok());
         let model = words.next().unwrap_or_default();
         let values = numbers(&words.collect::<Vec<_>>().join(" "));
@@ -223,32 +218,54 @@ fn cameras_txt(text: &str, path: &str, max: usize) -> Result<Lenses> {
     Ok(lenses)
 }
 
+/// Images and their points. COLMAP writes two lines an image, and reads the line after an image as
+/// its points whatever it is. Here a line is known by its words, so that neither blank lines nor
+/// missing points shift those after them.
 fn images_txt(text: &str, path: &str, lenses: &Lenses, max: usize) -> Result<Vec<CameraEntry>> {
-    let (mut lines, mut entries) = (text.lines().enumerate(), Vec::new());
-    while let Some((i, line)) = lines.next() {
+    let mut entries = Vec::new();
+    let mut after_image = false;
+    for (i, line) in text.lines().enumerate() {
         let line = line.trim();
         if line.is_empty() || line.starts_with('#') {
             continue;
         }
+        if std::mem::take(&mut after_image) && are_points(line) {
+            continue;
+        }
         count(entries.len(), max, path)?;
-        // A name may have spaces.
-        let mut words = line.splitn(10, ' ');
-        let mut next = || words.next().unwrap_or_default();
-        let _image = next();
-        let mut number = || next().parse::<f64>().ok();
-        let turn_and_place: Option<Vec<f64>> = (0..7).map(|_| number()).collect();
-        let (camera, name) = (next().parse().ok(), next().trim());
-        let (Some(&[w, x, y, z, tx, ty, tz]), Some(camera), false) =
-            (turn_and_place.as_deref(), camera, name.is_empty())
+        let (words, name) = first_words::<9>(line);
+        let turn_and_place: Option<Vec<f64>> =
+            words[1..8].iter().map(|word| number_of(word)).collect();
+        let (image, camera) = (number_of(words[0]), words[8].parse());
+        let (Some(_), Some(&[w, x, y, z, tx, ty, tz]), Ok(camera), false) =
+            (image, turn_and_place.as_deref(), camera, name.is_empty())
         else {
             let why = "is no image; it must be number, quaternion, translation, camera and name";
             return Err(Error::invalid(format!("{path}: line {} {why}", i + 1)));
         };
         entries.push(entry(name, [w, x, y, z], [tx, ty, tz], camera, lenses, path)?);
-        // Its points, which may be none.
-        lines.next();
+        after_image = true;
     }
     Ok(entries)
+}
+
+/// Whether a line is x, y and the number of its point in space, or -1, for each point of an image.
+fn are_points(line: &str) -> bool {
+    let words: Vec<&str> = line.split_whitespace().collect();
+    words.len().is_multiple_of(3)
+        && words.iter().all(|word| number_of(word).is_some())
+        && words.iter().skip(2).step_by(3).all(|word| word.parse::<i64>().is_ok())
+}
+
+/// The first words of a line, empty where there are less, and the rest: a name may have spaces.
+fn first_words<const N: usize>(line: &str) -> ([&str; N], &str) {
+    let mut rest = line;
+    let words = std::array::from_fn(|_| {
+        let (word, after) = rest.split_once(char::is_whitespace).unwrap_or((rest, ""));
+        rest = after.trim_start();
+        word
+    });
+    (words, rest)
 }
 
 fn insert(lenses: &mut Lenses, id: u32, lens: Lens, path: &str) -> Result<()> {
@@ -357,13 +374,13 @@ mod tests {
         let lenses = cameras_bin(CAMERAS[0], "b", max).unwrap();
         let binary = images_bin(IMAGES[0], "b", &lenses, max).unwrap();
         let [cameras, images] = [CAMERAS[1], IMAGES[1]].map(|bytes| text(bytes, "t").unwrap());
-        let lenses = cameras_txt(cameras, "t", max).unwrap();
-        let in_text = images_txt(images, "t", &lenses, max).unwrap();
+        let lenses = cameras_txt(&cameras, "t", max).unwrap();
+        let in_text = images_txt(&images, "t", &lenses, max).unwrap();
         for refused in [
             cameras_bin(CAMERAS[0], "b", 16).map(drop),
-            cameras_txt(cameras, "t", 16).map(drop),
+            cameras_txt(&cameras, "t", 16).map(drop),
             images_bin(IMAGES[0], "b", &lenses, 16).map(drop),
-            images_txt(images, "t", &lenses, 16).map(drop),
+            images_txt(&images, "t", &lenses, 16).map(drop),
         ] {
             assert!(refused.unwrap_err().message().contains("more than 16"));
         }

@@ -122,7 +122,6 @@ fn damaged_zips_are_refused_by_name() {
         (named("C:\\evil.png"), "relative path"),
         (named(&"a".repeat(5_000)), "bytes of the name"),
         (renamed("images/000x.png", b"images/0000.png"), "two entries"),
-        (renamed("b/transforms.jsoN", b"b/transforms.json"), "two camera files"),
         (link.finish().unwrap().into_inner(), "link"),
     ];
     refused("zip", good.clone(), cases);
@@ -204,7 +203,6 @@ fn damaged_tars_are_refused_by_name() {
         (entry("C:\\evil.png"), "relative path"),
         (entry(""), "relative path"),
         (entry("images/0000.png"), "two entries"),
-        (entry("b/transforms.json"), "two camera files"),
         ([header(b"\xff\xfe", b'0', &octal(0)), good.clone()].concat(), "not UTF-8"),
         (first("l", b'L', &octal(long.len() as u64), long.as_bytes()), "bytes of the name"),
         (first("l", b'L', &octal((8 << 30) - 1), b"x"), "damaged"),

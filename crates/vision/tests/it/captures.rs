@@ -123,22 +123,30 @@ fn both(a: &str, b: &str) -> Vec<UploadFile> {
 fn of_cameras_made_of_one_another_the_first_are_read_and_mixtures_are_refused() {
     for (a, b) in [("transforms", "colmap_bin"), ("transforms", "llff"), ("colmap_txt", "llff")] {
         let mut files = both(a, b);
-        // The other's cameras are not even looked at.
+        // Whatever is wrong with the other's cameras.
         let other = captures::described_by(b);
         files.iter_mut().find(|file| file.name == other).unwrap().bytes.truncate(30);
         assert_eq!(read(files).unwrap().photos.len(), 3, "{a} and {b}");
     }
+    // Cameras of the same photos: the better layout, with a word on the other.
+    for (a, b, first) in
+        [("transforms", "cameras", "transforms.json"), ("cameras", "colmap_bin", "sparse/0")]
+    {
+        let read = read(both(a, b)).unwrap();
+        let [warning] = &read.warnings[..] else { panic!("{a} and {b}: {:?}", read.warnings) };
+        assert_eq!((warning.code, warning.value), (WarningCode::CamerasChosen, 1.0));
+        let taken = format!("cameras from {first:?}");
+        assert!(warning.message.contains(&taken), "{}", warning.message);
+    }
     for (a, b, words) in [
         ("polycam", "record3d", ["Polycam", "Record3D"]),
-        ("transforms", "cameras", ["transforms.json", "cameras.json"]),
-        ("cameras", "colmap_bin", ["COLMAP", "cameras.json"]),
         ("mvsnet", "arkitscenes", ["MVSNet", "ARKitScenes"]),
         ("llff", "realestate", ["LLFF", "RealEstate10K"]),
     ] {
         let error = read(both(a, b)).unwrap_err();
         let message = error.message();
         assert_eq!(error.code(), ErrorCode::InvalidRequest, "{message}");
-        assert!(message.contains("two camera files"), "{message}");
+        assert!(message.contains("two captures"), "{message}");
         assert!(words.iter().all(|word| message.contains(word)), "{message}");
     }
     let nothing = vec![UploadFile { name: "notes.txt".to_owned(), bytes: b"hello".to_vec() }];
@@ -171,6 +179,9 @@ fn of_several_models_of_colmap_the_largest_is_read() {
     // Two folders of which nothing says which is meant.
     for file in &mut files {
         file.name = file.name.replacen("images/", "left/", 1).replacen("images_2/", "right/", 1);
+        if file.name.starts_with("right/") {
+            file.bytes.clone_from(&pngs[0].bytes);
+        }
     }
     files.retain(|file| !file.name.starts_with("images_4"));
     let error = read(files).unwrap_err();

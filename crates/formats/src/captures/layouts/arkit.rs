@@ -89,7 +89,7 @@ impl Layout for ArKitScenes {
                     continue;
                 };
                 let bytes = folder.read_cameras(lens)?;
-                let [w, h, fx, fy, cx, cy] = numbers_of(text(&bytes, lens)?, lens, 1)?;
+                let [w, h, fx, fy, cx, cy] = numbers_of(&text(&bytes, lens)?, lens, 1)?;
                 let lens = pinhole([fx, fy, cx, cy], Some([w, h]));
                 let file = format!("{dir}/{}", names::file_name(photo));
                 entries.push(CameraEntry::new(file, lens, PoseAxes::OpenCv, *pose));

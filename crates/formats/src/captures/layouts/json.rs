@@ -1,5 +1,5 @@
 //! Captures that have one camera JSON: nerfstudio, instant-ngp, `NeRF` scenes of Blender,
-//! `ScanNet++` (`dslr/nerfstudio/transforms.json`), and our own.
+//! `ScanNet++` (`dslr/nerfstudio/transforms.json`), our own, and what a training of 3DGS leaves.
 
 use crate::{
     captures::layout::{Described, Folder, Layout, called, cameras, names},
@@ -7,7 +7,7 @@ use crate::{
 };
 
 pub(super) struct Transforms;
-pub(super) struct OurCameras;
+pub(super) struct CamerasJson;
 
 impl Layout for Transforms {
     fn name(&self) -> &'static str {
@@ -26,7 +26,7 @@ impl Layout for Transforms {
     }
 }
 
-impl Layout for OurCameras {
+impl Layout for CamerasJson {
     fn name(&self) -> &'static str {
         "cameras.json"
     }

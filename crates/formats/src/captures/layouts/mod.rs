@@ -2,73 +2,87 @@
 //! by a look into a file where names are not enough.
 
 mod arkit;
+mod bundler;
 mod json;
 mod llff;
 mod mvs;
+mod opensfm;
 mod polycam;
 mod realestate;
 mod record3d;
 
-use super::{
-    folder::Folder,
-    layout::{Described, Layout},
-};
-use crate::{
-    colmap::Colmap,
-    error::{Error, Result},
-};
+use super::{folder::Folder, layout::Layout, names};
+use crate::colmap::Colmap;
 
-/// All readers. Cameras of the first three are often made of those of the next, beside them.
-static LAYOUTS: [&dyn Layout; 9] = [
-    &json::Transforms,
-    &Colmap,
-    &llff::Llff,
-    &json::OurCameras,
-    &polycam::Polycam,
-    &record3d::Record3d,
-    &arkit::ArKitScenes,
-    &mvs::MvsNet,
-    &realestate::RealEstate,
+/// A file of cameras in a folder, or the folder of several.
+#[derive(Clone)]
+pub(super) struct Seen {
+    pub(super) layout: &'static dyn Layout,
+    /// Where the cameras are.
+    pub(super) at: String,
+    /// How late it comes of equally good ones: programs make cameras of the first three of one
+    /// another and keep both; a training writes the last.
+    pub(super) class: usize,
+}
+
+impl Seen {
+    /// Folders around it.
+    pub(super) fn depth(&self) -> usize {
+        if self.at.is_empty() { 0 } else { self.at.split('/').count() }
+    }
+}
+
+/// All readers with their classes.
+static LAYOUTS: [(&dyn Layout, usize); 11] = [
+    (&json::Transforms, 0),
+    (&Colmap, 1),
+    (&llff::Llff, 2),
+    (&polycam::Polycam, 3),
+    (&record3d::Record3d, 3),
+    (&arkit::ArKitScenes, 3),
+    (&mvs::MvsNet, 3),
+    (&realestate::RealEstate, 3),
+    (&opensfm::OpenSfm, 3),
+    (&bundler::Bundler, 3),
+    (&json::CamerasJson, 4),
 ];
-/// The layouts at the head of [`LAYOUTS`] of which one is taken before those after it.
-const ONE_OF_ANOTHER: usize = 3;
 
-/// Finds which layout a folder has, and reads its cameras.
-///
-/// A `transforms.json` is taken before COLMAP's files and these before `poses_bounds.npy`: programs
-/// make one of the other and keep both. All other mixtures are refused.
-///
-/// # Errors
-/// `invalid_request` where it has no layout that is known, or several, and as the reader.
-pub(super) fn read(folder: &Folder<'_>) -> Result<Described> {
-    let mut found: Vec<(&dyn Layout, String)> = Vec::new();
-    let mut made_of_another = false;
-    for (i, layout) in LAYOUTS.iter().enumerate() {
-        if i < ONE_OF_ANOTHER && made_of_another {
-            continue;
-        }
-        let places = layout.find(folder);
-        made_of_another |= !places.is_empty();
-        found.extend(places.into_iter().map(|at| (*layout, at)));
+/// What captures are made of that are not read: a piece of a file's name, and the program with what
+/// to do.
+const NOT_READ: [(&str, &str); 7] = [
+    (".rcproj", "RealityCapture's project"),
+    (".csv", "a table, as RealityCapture exports cameras"),
+    (".xml", "XML, as Metashape exports cameras"),
+    (".psx", "Metashape's project"),
+    (".db", "COLMAP's database, which holds no poses"),
+    ("groundtruth.txt", "TUM's trajectory"),
+    (".mvs", "OpenMVS's scene"),
+];
+
+/// All cameras in the folder, those of better classes and then of less deep folders first.
+pub(super) fn find(folder: &Folder<'_>) -> Vec<Seen> {
+    let mut all: Vec<Seen> = Vec::new();
+    for (layout, class) in LAYOUTS {
+        all.extend(layout.find(folder).into_iter().map(|at| Seen { layout, at, class }));
     }
-    let what = folder.what;
-    match &found[..] {
-        [(layout, at)] => {
-            folder.forget_cameras_read();
-            layout.read(folder, at)
-        }
-        [(a, at_a), (b, at_b), ..] => Err(Error::invalid(format!(
-            "{what}: two camera files, {at_a:?} ({}) and {at_b:?} ({}); a scene has one",
-            a.name(),
-            b.name()
-        ))),
-        [] => {
-            let others = LAYOUTS.map(|layout| layout.name()).join(", ");
-            Err(Error::invalid(format!(
-                "{what}: no transforms.json and no cameras.json in it, nor another layout with \
-                 cameras; {} files were looked at, and these layouts are known: {others}",
-                folder.paths().count()
-            )))
-        }
-    }
+    all.sort_by_key(|seen| (seen.class, seen.depth()));
+    all
+}
+
+/// The message where no cameras were found.
+pub(super) fn none(folder: &Folder<'_>) -> String {
+    let known = LAYOUTS.map(|(layout, _)| layout.name()).join(", ");
+    let not_read = folder.paths().find_map(|path| {
+        let name = names::file_name(path).to_lowercase();
+        NOT_READ.iter().find(|(ending, _)| name.ends_with(ending)).map(|(_, of)| (path, of))
+    });
+    let not_read = not_read.map_or_else(String::new, |(path, of)| {
+        format!("; {path:?} is {of}, which is not read: export the cameras as COLMAP's text")
+    });
+    format!(
+        "{}: no transforms.json and no cameras.json in it, nor another layout with cameras; {} \
+         files were looked at, and these layouts are known: {known}{not_read}",
+        folder.what,
+        folder.paths().count()
+    )
 }

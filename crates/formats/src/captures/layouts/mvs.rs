@@ -8,8 +8,8 @@ use std::collections::BTreeSet;
 
 use crate::{
     captures::layout::{
-        CameraEntry, Described, Folder, Layout, PoseAxes, inverse_of_rows, names, numbers, pinhole,
-        text,
+        CameraEntry, Described, Folder, Layout, PoseAxes, inverse_of_rows, names, number_of,
+        numbers, pinhole, text,
     },
     error::{Error, Result},
 };
@@ -36,12 +36,12 @@ impl Layout for MvsNet {
             let bytes = folder.read_cameras(path)?;
             let wrong =
                 || Error::invalid(format!("{path}: no `extrinsic` 4x4 and `intrinsic` 3x3"));
-            let (_, after) = text(&bytes, path)?.split_once("extrinsic").ok_or_else(wrong)?;
+            let text = text(&bytes, path)?;
+            let (_, after) = text.split_once("extrinsic").ok_or_else(wrong)?;
             let (pose, after) = after.split_once("intrinsic").ok_or_else(wrong)?;
             let is_pose = |m: &Vec<f64>| m.len() == 16 && m[12..] == [0.0, 0.0, 0.0, 1.0];
             let pose = numbers(pose).filter(is_pose).ok_or_else(wrong)?;
-            let k: Option<Vec<f64>> =
-                after.split_ascii_whitespace().take(9).map(|word| word.parse().ok()).collect();
+            let k: Option<Vec<f64>> = after.split_whitespace().take(9).map(number_of).collect();
             let k = k.filter(|k| k.len() == 9).ok_or_else(wrong)?;
             let lens = pinhole([k[0], k[4], k[2], k[5]], None);
             let stem = names::file_name(path).trim_end_matches(ENDING);
