@@ -24,10 +24,10 @@ const LIMITS = {
 };
 const NO_CAMERAS =
   'No cameras: add a transforms.json, a cameras.json, or the folder of a capture with them. ' +
-  'For photos alone, three lines of Python find their cameras (pip install pycolmap): ' +
-  'pycolmap.extract_features("photos/database.db", "photos/images"); ' +
-  'pycolmap.match_exhaustive("photos/database.db"); ' +
-  'pycolmap.incremental_mapping("photos/database.db", "photos/images", "photos/sparse"). ' +
+  'For photos alone, three lines of Python find their cameras (pip install pycolmap):\n' +
+  'pycolmap.extract_features("photos/database.db", "photos/images")\n' +
+  'pycolmap.match_exhaustive("photos/database.db")\n' +
+  'pycolmap.incremental_mapping("photos/database.db", "photos/images", "photos/sparse")\n' +
   'Then drop the folder "photos". The page docs/captures.md of this program says more.';
 const fileName = (path) => path.split('/').pop();
 

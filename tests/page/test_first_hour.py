@@ -138,7 +138,7 @@ def test_a_word_says_how_well_it_fits_and_how_well_it_is_known(
     chips = page.locator("#words li")
     expect(chips.nth(0).locator(".score")).to_contain_text(shown[trust["box"]])
     expect(chips.nth(1).locator(".score")).to_contain_text("not in the list")
-    expect(page.locator("#says")).to_contain_text(f'"zxqv" is not among the {len(trust)} words')
+    expect(page.locator("#says")).to_contain_text(f'"zxqv" is not in the list of {len(trust)} words')
     words = page.evaluate("segsplat.state.words")
     body = json.dumps({"texts": ["a box"], "boxes": "upright"}).encode()
     with urllib.request.urlopen(f"{url}/v1/scenes/{scene}/query", body) as answer:
