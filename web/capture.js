@@ -1,4 +1,5 @@
-// What was dropped: photos and their cameras, and what is wrong with each, before it is sent.
+// What was dropped: photos and their cameras, what is wrong with each, and what is made smaller,
+// before it is sent.
 const PHOTO = /\.(jpe?g|png|webp)$/i,
   ARCHIVE = /\.(zip|tar)$/i,
   // Files of cameras that the server knows by their paths (docs/captures.md).
@@ -12,6 +13,26 @@ const isSplats = (path) =>
   [...$('export').options].some(
     ({ dataset }) => dataset.splats && path.toLowerCase().endsWith('.' + dataset.splats),
   );
+// Photos of formats that are not read.
+const OTHER_PHOTO = /\.(hei[cf]|avif|tiff?|bmp|dng|jxl)$/i;
+const AS_JPEG =
+  'export it as JPEG (iPhone: Settings, Camera, Formats, Most Compatible; a Mac: Preview, Export)';
+// The server's limits as it ships (crates/core/src/limits.rs): photos of a scene, bytes of an
+// upload, pixels of a photo, and what it keeps: a photo's longer side, pixels of all photos.
+const LIMITS = {
+  photos: 64,
+  bytes: 256 * 2 ** 20,
+  pixels: 24_000_000,
+  side: 2048,
+  kept: 50_000_000,
+};
+const NO_CAMERAS =
+  'No cameras: add a transforms.json, a cameras.json, or the folder of a capture with them. ' +
+  'For photos alone, three lines of Python find their cameras (pip install pycolmap):\n' +
+  'pycolmap.extract_features("photos/database.db", "photos/images")\n' +
+  'pycolmap.match_exhaustive("photos/database.db")\n' +
+  'pycolmap.incremental_mapping("photos/database.db", "photos/images", "photos/sparse")\n' +
+  'Then drop the folder "photos". The page docs/captures.md of this program says more.';
 const fileName = (path) => path.split('/').pop();
 
 // All files of a drop, with the paths that they have in dropped folders.
@@ -40,26 +61,31 @@ async function dropped(transfer) {
   return files;
 }
 
-// The form to send, a row for each photo with what is wrong with it, and faults of the whole.
-async function readCapture(files) {
+// The form to send, a row for each photo with what is wrong with it, faults of the whole, which stop
+// it, and notes, which do not. `at` is told what is done meanwhile.
+async function readCapture(files, at) {
   files = files.filter(({ path }) => !HIDDEN.test(path));
-  const form = new FormData(),
-    rows = [],
-    faults = [];
+  const capture = { form: new FormData(), rows: [], faults: [], notes: [] },
+    { form, rows, faults, notes } = capture;
+  const alone = (field, { path, file }) => {
+    form.append(field, file, fileName(path));
+    rows.push({ name: path, faults: [] });
+    return capture;
+  };
   const archive = files.find(({ path }) => ARCHIVE.test(path));
-  if (archive) {
-    form.append('archive', archive.file, fileName(archive.path));
-    rows.push({ name: archive.path, faults: [] });
-    return { form, rows, faults };
-  }
+  if (archive) return alone('archive', archive);
   const photos = files.filter(({ path }) => PHOTO.test(path));
   const splats = files.find(({ path }) => isSplats(path));
   // COLMAP's points beside photos are no scene.
-  if (splats && !photos.length) {
-    form.append('splats', splats.file, fileName(splats.path));
-    rows.push({ name: splats.path, faults: [] });
-    return { form, rows, faults };
-  }
+  if (splats && !photos.length) return alone('splats', splats);
+  const others = files.filter(({ path }) => OTHER_PHOTO.test(path) && !unread(path));
+  if (others.length) {
+    const first = others[0].path,
+      kind = first.split('.').pop().toUpperCase(),
+      rest = others.length > 1 ? ` and ${others.length - 1} more` : '';
+    const told = photos.length ? notes : faults;
+    told.push(`${first}${rest}: ${kind} is a format that is not read; ${AS_JPEG}.`);
+  } else if (!photos.length) faults.push('No photos: add PNG, JPEG or WebP files.');
   const find = (test) => files.find(({ path }) => test.test(fileName(path)));
   const described = files.filter(({ path }) => CAMERAS.test(path) && !unread(path));
   const json =
@@ -69,71 +95,171 @@ async function readCapture(files) {
   if (!json && described.length) {
     // The server reads it, and says what is wrong with it.
     const shown = photos.filter(({ path }) => !unread(path));
-    for (const { path, file } of [...shown, ...described]) form.append(path, file, path);
     for (const { path } of shown) rows.push({ name: path, faults: [] });
-    if (!shown.length) faults.push('No photos: add PNG, JPEG or WebP files.');
-    return { form, rows, faults };
+    // COLMAP says the size of its photos, so they may be made smaller. Not all layouts do.
+    const isColmap = described.some(({ path }) => /(^|\/)cameras\.(bin|txt)$/.test(path));
+    const sent = await fit(shown, isColmap, notes, at);
+    for (const { path, file } of [...sent, ...described]) form.append(path, file, path);
+    return capture;
   }
-  let list = [],
-    part = 'cameras',
-    body = null;
+  if (!json) {
+    faults.push(NO_CAMERAS);
+    return capture;
+  }
+  let read, list, part;
   try {
-    if (json) {
-      const text = await json.file.text(),
-        read = JSON.parse(text);
-      part = Array.isArray(read.cameras) ? 'cameras' : 'transforms';
-      list = read.frames || read.cameras;
-      body = text;
-      if (!Array.isArray(list) || !list.length) throw new Error('it has no list "frames"');
-      list = list.map((entry) => ({
-        file: String(entry.file_path ?? entry.file ?? ''),
-        pose: entry.transform_matrix ?? entry.camera_to_world,
-      }));
-    } else {
-      faults.push(
-        'No cameras: add a transforms.json, a cameras.json, or the folder of a capture with them.',
-      );
-    }
+    read = JSON.parse(await json.file.text());
+    part = Array.isArray(read.cameras) ? 'cameras' : 'transforms';
+    list = read.frames || read.cameras;
+    if (!Array.isArray(list) || !list.length) throw new Error('it has no list "frames"');
   } catch (error) {
-    faults.push(`${json.path}: ${error.message}`);
-    list = [];
+    faults.unshift(`${json.path}: ${error.message}`);
+    return capture;
   }
-  const taken = new Set();
-  const stem = (path) => path.replace(/\.[^./]*$/, '');
-  for (const { file, pose } of list) {
-    const wanted = file.replace(/^(\.\.?\/)+/, '');
-    const fits = [
-      (path) => path === wanted || path.endsWith('/' + wanted),
-      (path) => fileName(path) === fileName(wanted),
-      (path) => stem(fileName(path)) === fileName(wanted),
-    ];
-    const photo = fits
-      .map((fit) => photos.find(({ path }) => !taken.has(path) && fit(path)))
-      .find((found) => found);
-    const row = { name: file || '(no name)', faults: [] };
+  const [found, lost] = await paired(list, photos, rows);
+  if (lost.length) {
+    const why = `${lost.length} of ${list.length} cameras have no photo here`;
+    if (found.length) notes.push(`${why}, as ${lost[0]}: they are left out.`);
+    else if (photos.length) faults.push(`${why}; the first is ${lost[0]}.`);
+  }
+  for (const { path, file, entry, size } of await fit(found, true, notes, at)) {
+    // The lens is of the size that the photo had; cameras.json always says it.
+    if (size && part === 'transforms') {
+      entry.w ??= read.w ?? size[0];
+      entry.h ??= read.h ?? size[1];
+    }
+    form.append(path, file, path);
+  }
+  form.append(part, new Blob([JSON.stringify(read)], { type: 'application/json' }), `${part}.json`);
+  return capture;
+}
+
+// The photos that cameras name, each with its row, and the names of those that are not there.
+async function paired(list, photos, rows) {
+  const taken = new Set(),
+    found = [],
+    lost = [],
+    stem = (path) => path.replace(/\.[^./]*$/, '');
+  const names = list.map((entry) => String(entry.file_path ?? entry.file ?? '')),
+    photoOf = names.map(() => null);
+  // Whole paths are settled first for all, so that a shared file name never takes a photo.
+  for (const fits of [
+    (path, wanted) => path === wanted || path.endsWith('/' + wanted),
+    (path, wanted) => fileName(path) === fileName(wanted),
+    (path, wanted) => stem(fileName(path)) === fileName(wanted),
+  ]) {
+    for (const [i, name] of names.entries()) {
+      const wanted = name.replace(/^(\.\.?\/)+/, '');
+      photoOf[i] ||= photos.find(({ path }) => !taken.has(path) && fits(path, wanted));
+      if (photoOf[i]) taken.add(photoOf[i].path);
+    }
+  }
+  for (const [i, entry] of list.entries()) {
+    const name = names[i],
+      photo = photoOf[i],
+      pose = entry.transform_matrix ?? entry.camera_to_world;
+    const row = { name: name || '(no name)', faults: [] };
     rows.push(row);
+    if (!photo) {
+      row.note = 'no photo; it is left out';
+      lost.push(row.name);
+      continue;
+    }
     const numbers = pose && pose.flat ? pose.flat(2) : [];
     if (![12, 16].includes(numbers.length) || !numbers.every(Number.isFinite)) {
       row.faults.push('its pose is not a 4 by 4 matrix of numbers');
     }
-    if (!photo) {
-      row.faults.push('the photo is missing');
-      continue;
-    }
-    taken.add(photo.path);
+    found.push({ path: name.replace(/^(\.\.?\/)+/, ''), file: photo.file, entry, row });
     try {
       (await createImageBitmap(photo.file)).close();
     } catch {
       row.faults.push('it cannot be read as a picture');
     }
-    form.append(file, photo.file, file);
   }
   for (const { path } of photos) {
-    if (!taken.has(path) && list.length) {
-      rows.push({ name: path, faults: [], note: 'no camera; it is left out' });
-    }
+    if (!taken.has(path)) rows.push({ name: path, faults: [], note: 'no camera; it is left out' });
   }
-  if (!photos.length) faults.push('No photos: add PNG, JPEG or WebP files.');
-  if (body) form.append(part, new Blob([body], { type: 'application/json' }), `${part}.json`);
-  return { form, rows, faults };
+  return [found, lost];
+}
+
+// The photos as they are sent. An upload over the limit has some of them, evenly, and where that is
+// not enough all are made smaller; so are photos of too many pixels. None gets smaller than the
+// server keeps it.
+async function fit(photos, mayShrink, notes, at = () => {}) {
+  const bytes = (some) => some.reduce((sum, { file }) => sum + file.size, 0),
+    mb = (n) => `${(n / 1e6).toPrecision(2 + (n > 1e8))} MB`,
+    before = bytes(photos);
+  let sent = photos;
+  if (before > LIMITS.bytes && photos.length > LIMITS.photos) {
+    const step = (photos.length - 1) / (LIMITS.photos - 1);
+    sent = Array.from({ length: LIMITS.photos }, (_, i) => photos[Math.round(i * step)]);
+    notes.push(
+      `${photos.length} photos have ${mb(before)}; ${sent.length} are sent, evenly chosen: a scene ` +
+        'takes no more.',
+    );
+  }
+  if (!mayShrink) return sent;
+  const all = bytes(sent) > LIMITS.bytes,
+    fitted = [];
+  let made = 0;
+  for (const [i, photo] of sent.entries()) {
+    if (all) at(`making photos smaller: ${i + 1} of ${sent.length}`);
+    const small = await smaller(photo.file, all, sent.length).catch(() => null);
+    if (small) made++;
+    fitted.push({ ...photo, ...small });
+  }
+  if (made) {
+    const size = `${mb(bytes(sent))} became ${mb(bytes(fitted))}`;
+    notes.push(
+      `${made} photo${made === 1 ? ' was' : 's were'} made smaller before sending, to what the ` +
+        `server keeps of a photo: ${size}.`,
+    );
+  }
+  return fitted;
+}
+
+// A photo as small as the server keeps one of so many, and its size before; null where it may go as
+// it is.
+async function smaller(file, always, count) {
+  // A photo of fewer bytes a pixel than this is a plain area.
+  if (!always && file.size < LIMITS.pixels / 50) return null;
+  const [plain, exif] = await asStored(file),
+    whole = await createImageBitmap(plain),
+    { width, height } = whole,
+    pixels = width * height,
+    kept = LIMITS.kept / Math.min(count, LIMITS.photos),
+    scale = Math.min(1, LIMITS.side / Math.max(width, height), Math.sqrt(kept / pixels));
+  if (scale === 1 || (!always && pixels <= LIMITS.pixels)) {
+    whole.close();
+    return null;
+  }
+  const canvas = new OffscreenCanvas(Math.round(width * scale), Math.round(height * scale)),
+    pen = canvas.getContext('2d');
+  pen.imageSmoothingQuality = 'high';
+  pen.drawImage(whole, 0, 0, canvas.width, canvas.height);
+  whole.close();
+  const type = plain.type || 'image/jpeg',
+    coded = await canvas.convertToBlob({ type, quality: 0.95 });
+  const parts = exif ? [coded.slice(0, 2), exif, coded.slice(2)] : [coded];
+  return { file: new Blob(parts, { type }), size: [width, height] };
+}
+
+// A JPEG without its EXIF block, and the block: the browser turns a picture by it, and cameras are
+// of the picture as stored.
+async function asStored(file) {
+  const head = new DataView(await file.slice(0, 1 << 18).arrayBuffer()),
+    is = (at, word) => at + 4 <= head.byteLength && head.getUint32(at) === word;
+  if (head.byteLength < 4 || head.getUint16(0) !== 0xffd8) return [file, null];
+  for (let at = 2; at + 4 <= head.byteLength && head.getUint8(at) === 0xff; ) {
+    const mark = head.getUint8(at + 1),
+      end = at + 2 + head.getUint16(at + 2);
+    if (mark === 0xda) break;
+    if (mark === 0xe1 && is(at + 4, 0x45786966))
+      return [
+        new Blob([file.slice(0, at), file.slice(end)], { type: 'image/jpeg' }),
+        file.slice(at, end),
+      ];
+    at = end;
+  }
+  return [file, null];
 }

@@ -156,6 +156,7 @@ class Drawing {
     this.lost = false;
     this.sent = this.done = this.stale = 0; // numbers of sorts
     this.waiting = [];
+    this.asking = []; // who waits for what the worker measures, in turn
     this.gl = canvas.getContext('webgl2', { alpha: false, antialias: false });
     canvas.addEventListener('webglcontextlost', (e) => {
       e.preventDefault();
@@ -168,7 +169,8 @@ class Drawing {
       lost(false);
     });
     this.worker = startSorter();
-    this.worker.onmessage = ({ data }) => this.sorted(data);
+    this.worker.onmessage = ({ data }) =>
+      data.measured ? this.asking.shift()(data.measured) : this.sorted(data);
     this.setup();
   }
 
@@ -347,6 +349,27 @@ class Drawing {
     this.words = words;
     this.floor = floor;
     this.changed();
+  }
+
+  // The parts of a word, the best first: each with the mean relevancy of its Gaussians as its score,
+  // and a box without the farthest of them. Boxes are in the world, Gaussians about the origin.
+  async partsOf({ parts, scores, entries }) {
+    const origin = this.header.origin,
+      boxes = parts.map((part) => ({ ...part, center: add(part.center, origin, -1) }));
+    this.worker.postMessage({ parts: boxes, scores, selected: entries });
+    const found = await new Promise((go) => this.asking.push(go));
+    const better = parts.map((part, i) => {
+      if (!found[i]) return { ...part, score: 0 };
+      const { score, ends } = found[i],
+        shift = ends.map(([low, high], k) => (0.5 * (low + high)) * part.size[k]);
+      return {
+        ...part,
+        score,
+        center: part.axes.reduce((at, axis, k) => add(at, axis, shift[k]), part.center),
+        size: ends.map(([low, high], k) => (high - low) * part.size[k]),
+      };
+    });
+    return better.sort((a, b) => b.score - a.score);
   }
 
   sorted({ order, drawn, number, known, ms }) {

@@ -27,6 +27,14 @@ const STAGES = {
   bank: 'joining what is alike',
   assign: 'marking the Gaussians',
 };
+// What is known of a word, for people.
+const TRUST = {
+  good: 'known well',
+  fair: 'known fairly',
+  poor: 'known poorly',
+  unmeasured: 'not measured',
+};
+const BOXES = 24; // of a word
 const KINDS = ['colour', 'depth', 'alpha', 'mask'];
 const NAMES = [
   'chair',
@@ -136,10 +144,21 @@ function over(width, height) {
     pen = canvas.getContext('2d');
   canvas.width = width * dense;
   canvas.height = height * dense;
+  pen.clearRect(0, 0, canvas.width, canvas.height); // not every device clears by the size alone
   pen.scale(dense, dense);
   const { camera, scene } = state,
     [x, y, z] = axesOf(camera),
     focal = focalOf(camera, height);
+  const framed = frames.get(camera);
+  if (framed) {
+    const { width: w, height: h, fx, fy } = framed.intrinsics,
+      [across, down] = [(focal * w) / fx, (focal * h) / fy];
+    pen.beginPath();
+    pen.rect(0, 0, width, height);
+    pen.rect((width - across) / 2, (height - down) / 2, across, down);
+    pen.fillStyle = '#000b';
+    pen.fill('evenodd');
+  }
   const near = 1e-3 * length(add(camera.target, camera.eye, -1));
   const seen = (p) => {
     const d = add(p, camera.eye, -1);
@@ -191,7 +210,9 @@ function over(width, height) {
     }
   }
   state.words.forEach((word, k) => {
-    for (const { center, axes, size } of word.parts.slice(0, 24)) {
+    for (const part of word.parts.slice(0, BOXES)) {
+      const { center, axes, size } = part;
+      pen.globalAlpha = strengthOf(part, word);
       const corner = (i) =>
         axes.reduce((p, axis, j) => add(p, axis, ((i >> j) & 1 ? 0.5 : -0.5) * size[j]), center);
       const edges = [];
@@ -201,6 +222,7 @@ function over(width, height) {
       draw(css(k), edges);
     }
   });
+  pen.globalAlpha = 1;
   if (state.marks.length) {
     if (state.marks.length > 1) draw('#ff0', [state.marks]);
     for (const mark of state.marks) {
@@ -215,6 +237,11 @@ function over(width, height) {
     }
   }
 }
+// How strongly a part is drawn: those that fit less than the best one are dimmer.
+const strengthOf = (part, word) => {
+  const best = word.parts[0].score - 0.5;
+  return best > 0 ? 0.25 + 0.75 * Math.max(0, Math.min(1, (part.score - 0.5) / best)) : 1;
+};
 const css = (k) => `rgb(${WORDS[k].map((v) => Math.round(255 * v))})`;
 
 // ---- the camera -----------------------------------------------------------------------------
@@ -231,6 +258,19 @@ function look(camera, still) {
   $('view').dataset.state = 'busy';
   invalidate();
 }
+
+// The camera of a photo, with so wide a field of view that the whole photo is in the canvas.
+function framing(photo) {
+  const { width, height, fx, fy } = photo.intrinsics,
+    { clientWidth, clientHeight } = $('stage'),
+    sides = clientWidth ? ((width / fx) * clientHeight) / clientWidth : 0,
+    fov = (2 * Math.atan(Math.max(height / fy, sides) / 2) * 180) / Math.PI;
+  const camera = { ...cameraOf(photo, state.scene.unit), fov };
+  frames.set(camera, photo);
+  return camera;
+}
+// The photos of cameras: while one is looked through, what its photo does not show is dark.
+const frames = new WeakMap();
 
 // The axis of a turn to the side, and of a turntable: the scene's up. A level horizon stays level.
 const axisOf = (camera) => state.upright || unit(camera.up);
@@ -297,12 +337,13 @@ function flyTo(goal) {
     if (flyTo.now !== flight) return;
     const t = still ? 1 : Math.min(1, (performance.now() - begun) / 700),
       s = t * t * (3 - 2 * t);
-    look({
+    const between = {
       eye: mix(from.eye, goal.eye, s),
       target: mix(from.target, goal.target, s),
       up: unit(mix(from.up, goal.up, s)),
       fov: from.fov + s * (goal.fov - from.fov),
-    });
+    };
+    look(t < 1 ? between : goal);
     if (t < 1) requestAnimationFrame(step);
   };
   step();
@@ -405,8 +446,8 @@ async function clicked(event) {
     [width, height] = drawing.size;
   const x = ((event.clientX - box.left) / box.width) * width,
     y = ((event.clientY - box.top) / box.height) * height;
-  const local = drawing.pointAt(x, y);
   if (state.alone) {
+    const local = drawing.pointAt(x, y);
     if (!local) {
       $('picked').textContent = 'Nothing is there.';
       return;
@@ -463,6 +504,7 @@ async function find(text) {
   text = text.trim();
   if (!text || !state.scene) return;
   if (state.words.some((word) => word.text === text)) return;
+  const scene = state.scene.id;
   let result = state.known.find((one) => one.text === text),
     floor = state.floor || 0;
   if (!result) {
@@ -471,12 +513,11 @@ async function find(text) {
         `This file knows: ${state.known.map((one) => one.text).join(', ') || 'no words'}.`,
       );
     say('looking …');
-    const id = state.scene.id,
+    const id = scene,
       stop = new AbortController();
-    // The first text has the semantics made, and their stages come as events meanwhile.
-    if (!state.understood) server.watch(id, (e) => progress(e), stop.signal).catch(() => {});
+    if (!state.understood) watchUnderstanding(id, stop.signal);
     try {
-      const body = JSON.stringify({ texts: [text] });
+      const body = JSON.stringify({ texts: [text], boxes: 'upright' });
       const answer = await server.json(`/v1/scenes/${id}/query`, { method: 'POST', body });
       if (state.scene.id !== id) return; // another scene was opened meanwhile
       result = answer.results[0];
@@ -489,16 +530,61 @@ async function find(text) {
     // Entries of the Gaussians are new: once.
     if (!state.understood) await load(id, state.camera);
   }
+  const [parts, known] = await Promise.all([drawing.partsOf(result), knownWord(text)]);
+  if (state.scene?.id !== scene) return;
   if (state.words.length === WORDS.length) state.words.shift();
-  state.words.push({ ...result, cut: Number($('cut').value) });
+  const score = Math.max(0, ...result.scores);
+  state.words.push({ ...result, parts, score, known, cut: Number($('cut').value) });
   showWords();
-  const parts = result.parts.length;
+  const n = parts.length,
+    where = `${count(result.gaussians)} Gaussians in ${n} part${n === 1 ? '' : 's'}`;
   say(
     [
-      `${text}: ${count(result.gaussians)} Gaussians in ${parts} part${parts === 1 ? '' : 's'}`,
+      `${text}: ${result.gaussians ? where : `not found, the best score is ${score.toFixed(2)}`}`,
+      ...doubtsOf(text, known),
       ...result.warnings.map((warning) => warning.message),
     ].join('\n'),
   );
+}
+
+// The first text has the semantics made, and their stages come as events. The events of a finished
+// scene end at once, which it is until the question has come: they are asked for again until it is
+// answered.
+async function watchUnderstanding(id, signal) {
+  while (!signal.aborted) {
+    await server.watch(id, progress, signal).catch(() => {});
+    await new Promise((go) => setTimeout(go, 200));
+  }
+}
+
+// What was measured of the last word of a text: { trust, words } with how many words were. Null
+// where the server does not say, trust null of a word that was not measured.
+async function knownWord(text) {
+  if (state.alone) return null;
+  knownWord.all ||= server.json('/v1/models').then((models) => models.words || []);
+  const all = await knownWord.all.catch(() => {
+    knownWord.all = null;
+    return [];
+  });
+  if (!all.length) return null;
+  const asked = text.toLowerCase(),
+    last = asked.split(/\s+/).pop();
+  const is = (name) => all.find(({ word }) => word.toLowerCase() === name);
+  const found = is(asked) || is(last) || is(last.replace(/s$/, ''));
+  return { trust: found?.trust || null, word: found?.word, words: all.length };
+}
+
+// What makes an answer doubtful, as far as was measured.
+function doubtsOf(text, known) {
+  if (!known || known.trust === 'good' || known.trust === 'fair') return [];
+  if (!known.trust)
+    return [
+      `Warning: "${text}" is not in the list of ${known.words} words that the server was measured ` +
+        'with: what is shown may be something else.',
+    ];
+  return known.trust === 'poor'
+    ? [`Warning: "${known.word}" is known poorly: much of it is missed, or much else is shown.`]
+    : [`How well "${known.word}" is known was not measured.`];
 }
 
 function showWords() {
@@ -512,15 +598,18 @@ function showWords() {
       remove.onclick = () => {
         state.words.splice(k, 1);
         showWords();
+        say(shown());
       };
       const parts = make(
         'div',
         { className: 'parts' },
         ...word.parts.slice(0, 8).map((part, i) => {
-          const go = make('button', { textContent: `part ${i + 1}` });
+          const score = part.score.toFixed(2),
+            go = make('button', { textContent: `part ${i + 1}: ${score}` });
+          go.classList.toggle('weak', strengthOf(part, word) < 0.6);
           go.setAttribute(
             'aria-label',
-            `Fly to part ${i + 1} of ${word.text}, ${part.gaussians} Gaussians`,
+            `Fly to part ${i + 1}: ${score} of ${word.text}, ${part.gaussians} Gaussians`,
           );
           go.onclick = () => {
             const away = Math.max(1.2 * length(part.size), 0.1 * state.scene.unit);
@@ -530,7 +619,15 @@ function showWords() {
           return go;
         }),
       );
-      return make('li', {}, swatch, make('strong', { textContent: word.text }), ' ', remove, parts);
+      const trust = word.known && (TRUST[word.known.trust] || 'not in the list');
+      const score = make('span', {
+        className: 'score',
+        textContent: word.gaussians ? word.score.toFixed(2) : 'not found',
+        title: 'The best relevancy of anything in the scene; from 0.5 on it is found',
+      });
+      if (trust) score.append(`, ${trust}`);
+      const name = make('strong', { textContent: word.text });
+      return make('li', {}, swatch, name, ' ', score, ' ', remove, parts);
     }),
   );
   remember();
@@ -607,7 +704,7 @@ async function open(id, camera, words = []) {
   watching?.abort();
   watching = new AbortController();
   const { signal } = watching;
-  if (made !== id) showCapture({ rows: [], faults: [] }); // they are of another scene
+  if (made !== id) showCapture({ rows: [], faults: [], notes: [] }); // they are of another scene
   const path = `/v1/scenes/${encodeURIComponent(id)}`;
   let scene = await server.json(path);
   if (scene.state === 'queued' || scene.state === 'running') {
@@ -674,7 +771,7 @@ async function take(stream, camera) {
       document.body.classList.add('shown');
       const taken = drawing.begin(header, backdrop, most);
       state.upright = uprightOf(header.cameras);
-      state.home = cameraOf(header.cameras[0], header.unit);
+      state.home = framing(header.cameras[0]);
       $('photo').replaceChildren(
         make('option', { textContent: 'go to …', value: '' }),
         ...header.cameras.map((one, i) => make('option', { textContent: one.file, value: i })),
@@ -748,6 +845,7 @@ let rows = [],
   made = null; // the scene of these rows
 function showCapture(capture) {
   rows = capture.rows;
+  $('notes').replaceChildren(...capture.notes.map((text) => make('li', { textContent: text })));
   $('faults').replaceChildren(...capture.faults.map((text) => make('li', { textContent: text })));
   $('photos').replaceChildren(
     ...rows.map((row) => {
@@ -770,7 +868,8 @@ function blame(message) {
 
 async function upload(files) {
   if (!files.length) return;
-  const capture = await readCapture(files);
+  say('looking at the files …');
+  const capture = await readCapture(files, say);
   showCapture(capture);
   const wrong = capture.rows.filter((row) => row.faults.length).length;
   if (capture.faults.length || wrong) {
@@ -889,7 +988,7 @@ function bind() {
   };
   $('photo').onchange = ready(() => {
     const photo = state.scene.cameras[Number($('photo').value)];
-    if ($('photo').value !== '' && photo) flyTo(cameraOf(photo, state.scene.unit));
+    if ($('photo').value !== '' && photo) flyTo(framing(photo));
   });
   const toggle = (id, name) =>
     ready(() => {
@@ -1046,6 +1145,7 @@ globalThis.segsplat = {
   state,
   look,
   find,
+  limits: LIMITS,
   cameraOf,
   matrixOf,
   focalOf,

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import itertools
+import json
 import re
 from pathlib import Path
+from typing import Any
 
-from segsplat import calls
-from served import ROOT
+import numpy as np
+import pytest
+from PIL import Image
+from served import ROOT, run
+
+from segsplat import Client, calls, photos
+from segsplat.wire import Part
 
 FOLDERS = ["", "images/", "depth/", "a/lowres_depth/", "highres_depth/b/", "confidence/",
            "sparse/0/", ".git/", "a/.cache/"]
@@ -36,3 +44,129 @@ def test_the_page_and_the_package_send_the_same_files() -> None:
         assert calls._belongs(Path(name)) == page, name
         sent += page
     assert sent > 100, sent
+
+
+def capture(tmp_path: Path, count: int, size: str = "640x480") -> dict[str, Any]:
+    """Writes a capture whose lens does not say for which size it is; gives its cameras."""
+    run("sample", "--photos", str(count), "--size", size, "-o", tmp_path)
+    told: dict[str, Any] = json.loads((tmp_path / "transforms.json").read_text())
+    for scope in [told, *told["frames"]]:
+        scope.pop("w", None)
+        scope.pop("h", None)
+    (tmp_path / "transforms.json").write_text(json.dumps(told))
+    return told
+
+
+def test_a_list_of_more_cameras_than_photos_is_sent_with_a_warning(
+    client: Client, tmp_path: Path
+) -> None:
+    told = capture(tmp_path, 4, "256x192")
+    gone = tmp_path / told["frames"][1]["file_path"]
+    gone.rename(gone.with_suffix(".heic"))
+    with pytest.warns(UserWarning, match=r"1 of 4 cameras have no photo .*0001\.png.*HEIC is a"):
+        scene = client.scene(tmp_path, semantics="off")
+    assert [Path(photo.file).name for photo in scene.photos] == ["0000.png", "0002.png", "0003.png"]
+    scene.delete()
+
+
+def test_photos_are_found_as_the_server_finds_them(client: Client, tmp_path: Path) -> None:
+    told = capture(tmp_path, 2, "256x192")
+    # Without their ending, and from another folder.
+    told["frames"][0]["file_path"] = "./images/0000"
+    told["frames"][1]["file_path"] = "../elsewhere/0001.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(told))
+    scene = client.scene(tmp_path, semantics="off")
+    assert len(scene.photos) == 2
+    scene.delete()
+
+
+def test_a_shared_file_name_never_takes_a_photo(tmp_path: Path) -> None:
+    for name in ["b/1.png", "c/2.png"]:
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).touch()
+    assert calls._matched(tmp_path, ["a/1.png", "b/1.png", "x/2", "../../gone.png"]) == [
+        None,
+        tmp_path / "b/1.png",
+        tmp_path / "c/2.png",
+        None,
+    ]
+
+
+def test_photos_alone_are_told_what_finds_their_cameras(tmp_path: Path) -> None:
+    (tmp_path / "IMG_1.HEIC").touch()
+    (tmp_path / "a.png").touch()
+    with pytest.raises(FileNotFoundError, match=r"IMG_1\.HEIC: HEIC is a format.*as JPEG") as alone:
+        calls.parts_of(tmp_path)
+    assert "pycolmap.incremental_mapping(" in str(alone.value)
+    with pytest.raises(FileNotFoundError, match="there is no such file or folder"):
+        calls.parts_of(tmp_path / "none")
+
+
+def test_the_limits_are_those_of_the_server_and_of_the_page() -> None:
+    rust = (ROOT / "crates/core/src/limits.rs").read_text()
+    page = (ROOT / "web/capture.js").read_text()
+    for ours, theirs, shown in [
+        (photos.PHOTOS_MAX, "photos_max", "photos"),
+        (photos.UPLOAD_BYTES_MAX, "upload_bytes_max", "bytes"),
+        (photos.PHOTO_PIXELS_MAX, "photo_pixels_max", "pixels"),
+        (photos.SIDE_KEPT, "photo_side_kept_max", "side"),
+        (photos.PIXELS_KEPT, "photos_pixels_kept_max", "kept"),
+    ]:
+        limit = re.search(rf"\b{theirs}: \w+ = ([0-9_< ]+)", rust)
+        in_page = re.search(rf"^  {shown}: ([0-9_* ]+),$", page, re.M)
+        assert limit and in_page
+        assert eval(limit[1]) == ours == eval(in_page[1]), theirs
+
+
+def test_too_many_and_too_large_photos_are_chosen_and_made_smaller(
+    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = capture(tmp_path, 7)
+    for i, frame in enumerate(told["frames"]):
+        # As a phone writes them: they say how it was held.
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        whole = Image.open(tmp_path / frame["file_path"]).convert("RGB")
+        whole.save(tmp_path / f"{i}.jpg", quality=95, exif=exif)
+        frame["file_path"] = f"{i}.jpg"
+    (tmp_path / "transforms.json").write_text(json.dumps(told))
+    monkeypatch.setattr(photos, "PHOTOS_MAX", 4)
+    monkeypatch.setattr(photos, "UPLOAD_BYTES_MAX", (tmp_path / "0.jpg").stat().st_size)
+    monkeypatch.setattr(photos, "PIXELS_KEPT", 4 * 320 * 240)
+    with pytest.warns(UserWarning) as said:
+        scene = client.scene(tmp_path, semantics="off")
+    assert [str(one.message)[:28] for one in said] == [
+        "7 photos have 1 MB; 4 are se",
+        "4 photos were made smaller b",
+    ]
+    assert [photo.file for photo in scene.photos] == ["0.jpg", "2.jpg", "4.jpg", "6.jpg"]
+    lens = {**told, **told["frames"][0]}
+    want = np.array([lens[name] for name in ("fl_x", "fl_y", "cx", "cy")]) / 2
+    for photo in scene.photos:
+        assert (photo.camera.width, photo.camera.height) == (320, 240), "the photo was turned"
+        k = photo.camera.K
+        assert np.allclose([k[0, 0], k[1, 1], k[0, 2], k[1, 2]], want)
+    # One photo of too many pixels is made smaller by itself.
+    monkeypatch.setattr(photos, "UPLOAD_BYTES_MAX", 1 << 30)
+    monkeypatch.setattr(photos, "PHOTO_PIXELS_MAX", 640 * 480 - 1)
+    sent, sizes = photos.fit([Part("photo", "0.jpg", tmp_path / "0.jpg")])
+    assert sizes == {} and isinstance(sent[0].content, Path), "the server keeps it as it is"
+    monkeypatch.setattr(photos, "SIDE_KEPT", 320)
+    with pytest.warns(UserWarning, match="1 photos were made smaller"):
+        sent, sizes = photos.fit([Part("photo", "0.jpg", tmp_path / "0.jpg")])
+    assert sizes == {"0.jpg": (640, 480)} and isinstance(sent[0].content, bytes)
+    small = Image.open(io.BytesIO(sent[0].content))
+    assert small.size == (320, 240) and small.getexif()[0x0112] == 6
+    scene.delete()
+
+
+def test_masks_fit_the_photo_that_was_asked(client: Client, tmp_path: Path) -> None:
+    capture(tmp_path, 2)
+    scene = client.scene(tmp_path)
+    assert scene.query("box", from_=1).masks.shape == (1, 480, 640)
+    assert client.get(scene.id).query("box").masks.shape == (1, 480, 640)
+    assert scene.query("box", from_=1, width=64).masks.shape == (1, 48, 64)
+    assert scene.query("box", from_=0, to=1, t=0.5).masks.shape[2] == 384
+    listed = next(one for one in client.scenes() if one.id == scene.id)
+    assert listed.query("box", from_=1).masks.shape == (1, 480, 640)
+    scene.delete()

@@ -245,6 +245,10 @@ def test_a_server_that_is_not_there(slept: list[float]) -> None:
     with pytest.raises(segsplat.ConnectionLost, match="ConnectError"):
         Client("http://127.0.0.1:9", retries=2).get("0" * 32)
     assert len(slept) == 2
+    for url in ["http://127.0.0.1:9", "grpc://127.0.0.1:9"]:
+        told = f"{url} cannot be reached.*segsplat serve"
+        with pytest.raises(segsplat.ConnectionLost, match=told):
+            Client(url, retries=0).get("0" * 32)
 
 
 @pytest.mark.parametrize("version", ["0.2.0", "1.1.0"])

@@ -77,6 +77,11 @@ def test_without_a_camera_the_masks_are_in_the_first_photo(scene: Scene) -> None
     found = scene.query("box")
     assert found.masks.shape == (1, 240, 320)
     assert np.array_equal(found[0].mask, scene.query("box", camera=scene.photos[0].camera)[0].mask)
+    assert [match.text for match in scene.query(["box", "floor"], "wall", masks=False)] == [
+        "box",
+        "floor",
+        "wall",
+    ]
     alone = scene.query("box", masks=False)
     assert alone.camera is None and alone[0].mask.size == 0
     assert alone[0].scores.tolist() == found[0].scores.tolist()

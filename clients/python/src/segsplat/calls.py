@@ -5,7 +5,10 @@ from __future__ import annotations
 import io
 import json
 import os
+import posixpath
+import re
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -25,6 +28,7 @@ from .errors import (
 )
 from .formats import ENDINGS, SPLATS, ExportFormat
 from .gaussians import Gaussians
+from .photos import fit
 from .progress import show_bar
 from .types import (
     Box,
@@ -69,6 +73,17 @@ CAMERAS_MAX = 64
 #: read.
 PHOTOS = frozenset({".png", ".jpg", ".jpeg", ".webp"})
 CAMERAS = frozenset({".json", ".txt", ".bin", ".npy", ".traj", ".pincam"})
+#: Photos of formats that are not read, and what to do.
+OTHER_PHOTOS = frozenset({".heic", ".heif", ".avif", ".tif", ".tiff", ".bmp", ".dng", ".jxl"})
+AS_JPEG = (
+    "export it as JPEG (iPhone: Settings, Camera, Formats, Most Compatible; a Mac: Preview, Export)"
+)
+#: What finds the cameras of photos alone.
+FIND_CAMERAS = """for photos alone, these lines find their cameras (pip install pycolmap):
+    pycolmap.extract_features("photos/database.db", "photos/images")
+    pycolmap.match_exhaustive("photos/database.db")
+    pycolmap.incremental_mapping("photos/database.db", "photos/images", "photos/sparse")
+docs/captures.md says more"""
 NOT_READ = frozenset({"points3D", "rigs", "frames", "project"})
 DEPTHS = frozenset({"depth", "confidence", "lowres_depth", "highres_depth"})
 
@@ -127,23 +142,89 @@ def parts_of(source: Source) -> list[Part]:
         told = zip(names, source.values(), strict=True)
         cameras = [{"file": name, **camera.to_json()} for name, camera in told]
         parts = [Part("cameras", "cameras.json", json.dumps({"cameras": cameras}).encode())]
-        return parts + [Part("photo", *one) for one in zip(names, files, strict=True)]
+        return parts + fit([Part("photo", *one) for one in zip(names, files, strict=True)])[0]
     path = Path(source)
     if path.suffix.lower() in SPLATS and not path.is_dir():
         return [Part("splats", path.name, path)]
     if path.is_file():
         return [Part("archive", path.name, path)]
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file or folder")
     for field in ("transforms", "cameras"):
-        described = path / f"{field}.json"
-        if described.is_file():
-            photos = [_photo(path, name) for name in _files_of(described)]
-            return [Part(field, described.name, described), *photos]
+        if (path / f"{field}.json").is_file():
+            return _described(path, field)
     files = sorted(file for file in path.rglob("*") if _belongs(file.relative_to(path)))
-    if not any(file.suffix.lower() not in PHOTOS for file in files):
+    parts = [Part("photo", file.relative_to(path).as_posix(), file) for file in files]
+    photos = [part for part in parts if Path(part.name).suffix.lower() in PHOTOS]
+    cameras_of = [part for part in parts if part not in photos]
+    if not cameras_of:
         raise FileNotFoundError(
             f"{path}: no archive, no file of Gaussians and no folder with files of cameras"
+            f"{_unread(path)}; {FIND_CAMERAS}"
         )
-    return [Part("photo", file.relative_to(path).as_posix(), file) for file in files]
+    # COLMAP says the size of its photos, so they may be made smaller. Not all layouts do.
+    is_colmap = any(Path(part.name).name in ("cameras.bin", "cameras.txt") for part in cameras_of)
+    return [*fit(photos, is_colmap)[0], *cameras_of]
+
+
+def _described(folder: Path, field: str) -> list[Part]:
+    """The parts of a folder with one file of cameras, and those of its photos that are there."""
+    file = folder / f"{field}.json"
+    read, entries, names = _entries_of(file)
+    found = _matched(folder, names)
+    lost = [name for name, photo in zip(names, found, strict=True) if photo is None]
+    told = f"{file}: {len(lost)} of {len(names)} cameras have no photo in the folder"
+    if len(lost) == len(names):
+        raise InvalidRequest(f"{told}; the first is {lost[0]!r}{_unread(folder)}")
+    if lost:
+        why = f"{told}, as {lost[0]!r}: they are left out{_unread(folder)}"
+        warnings.warn(why, stacklevel=2)
+    there = [
+        (entry, Part("photo", photo.relative_to(folder).as_posix(), photo))
+        for entry, photo in zip(entries, found, strict=True)
+        if photo
+    ]
+    photos, sizes = fit([part for _, part in there])
+    if not sizes or field == "cameras":
+        return [Part(field, file.name, file), *photos]
+    for entry, part in there:
+        # The lens is of the size that the photo had.
+        for side, length in zip("wh", sizes.get(part.name, ()), strict=False):
+            entry.setdefault(side, read.get(side, length))
+    return [Part(field, file.name, json.dumps(read).encode()), *photos]
+
+
+def _matched(folder: Path, names: Sequence[str]) -> list[Path | None]:
+    """The photo of each name: by its path, else by the end of its path, with or without the ending,
+    as the server finds it. All lie in the folder: a description from elsewhere sends no others.
+    """
+    files = sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTOS)
+    wanted = [re.sub(r"^(\.\.?/)+", "", name.replace("\\", "/")) for name in names]
+    found: list[Path | None] = [None] * len(names)
+    free = {file: file.relative_to(folder).as_posix() for file in files}
+    # Whole paths are settled first for all, so that a shared file name never takes a photo.
+    for level in (str, _stem, posixpath.basename, lambda path: _stem(posixpath.basename(path))):
+        places = {level(path): file for file, path in free.items()}
+        for i, name in enumerate(wanted):
+            key = name if level in (str, _stem) else posixpath.basename(name)
+            if found[i] is None and places.get(key) in free:
+                found[i] = places[key]
+                del free[places[key]]
+    return found
+
+
+def _stem(path: str) -> str:
+    """A path without the ending."""
+    return posixpath.splitext(path)[0]
+
+
+def _unread(folder: Path) -> str:
+    """Names a photo of a format that is not read; empty where there is none."""
+    others = sorted(file for file in folder.rglob("*") if file.suffix.lower() in OTHER_PHOTOS)
+    if not others:
+        return ""
+    kind = others[0].suffix[1:].upper()
+    return f"; {others[0].name}: {kind} is a format that is not read; {AS_JPEG}"
 
 
 def _belongs(file: Path) -> bool:
@@ -153,22 +234,15 @@ def _belongs(file: Path) -> bool:
     return known and not hidden and file.stem not in NOT_READ
 
 
-def _photo(folder: Path, name: str) -> Part:
-    """A photo, which lies in the folder: a description from elsewhere must not send other files."""
-    if Path(name).is_absolute() or ".." in Path(name).parts:
-        raise InvalidRequest(
-            f"photo {name!r}: the path must be relative and stay inside the folder"
-        )
-    return Part("photo", name, folder / name)
-
-
-def _files_of(described: Path) -> list[str]:
-    """The photos that a camera description names."""
+def _entries_of(described: Path) -> tuple[dict[str, Any], list[dict[str, Any]], list[str]]:
+    """A camera description, its entries, and the photo that each names."""
     try:
         cameras = json.loads(described.read_bytes())
-        if "frames" in cameras:
-            return [frame["file_path"] for frame in cameras["frames"]]
-        return [camera["file"] for camera in cameras["cameras"]]
+        key, name = ("frames", "file_path") if "frames" in cameras else ("cameras", "file")
+        names = [str(entry[name]) for entry in cameras[key]]
+        if not names:
+            raise ValueError("it names no photos")
+        return cameras, cameras[key], names
     except (ValueError, KeyError, TypeError) as wrong:
         raise InvalidRequest(f"{described.name}: {type(wrong).__name__}: {wrong}") from wrong
 
@@ -378,27 +452,36 @@ def _views(
 
 def query(
     scene: Handle,
-    *texts: str,
+    *texts: str | Sequence[str],
     masks: bool = True,
     boxes: Literal["oriented", "upright", "aligned", "none"] = "oriented",
     **options: Unpack[QueryCall],
 ) -> Flow[Matches]:
     """Asks where things are: boxes and Gaussians in 3D, and masks in one view.
 
-    texts: 1 to 128.
+    texts: 1 to 128, one by one or as lists.
     masks: False asks in 3D alone, which draws nothing.
     boxes: along the part's own axes, the same with the last axis up, along the axes of the world,
         or none.
     from_, eye, camera, width and so on: the view of the masks, as in `view`; by default that of the
-        first photo.
+        first photo. Of a photo, here or by `from_`, the masks have the photo's size unless `width`
+        or `height` says another.
     """
     spot, rest = _split(dict(options))
-    fields = {**_drawing(rest), "texts": texts, "boxes": boxes, "mask": "rle" if masks else "none"}
+    asked = [one for text in texts for one in ([text] if isinstance(text, str) else text)]
+    fields = {**_drawing(rest), "texts": asked, "boxes": boxes, "mask": "rle" if masks else "none"}
     if masks:
         camera = _camera(spot)
         # The size belongs to the drawing.
         fields.update({side: camera.pop(side) for side in ("width", "height") if side in camera})
         fields["camera"] = camera
+        if not spot.keys() - {"from_"} and not rest.keys() & {"width", "height"}:
+            if not scene.shown[1]:
+                yield from refresh(scene)
+            photos = scene.shown[1]
+            if spot.get("from_", 0) in range(len(photos)):
+                photo = photos[spot.get("from_", 0)].camera
+                fields.update(width=photo.width, height=photo.height)
     request = Request("POST", f"/v1/scenes/{scene.id}/query", json=_given(fields))
     return Matches(_json((yield from send(scene.policy, request)).body))
 

@@ -19,7 +19,7 @@ from typing_extensions import Self, Unpack
 from . import calls
 from ._version import __version__
 from .calls import Handle, Progress, Shown, Source
-from .errors import ConnectionLost
+from .errors import ConnectionLost, unreachable
 from .types import Event, Models, Photo, Report, SceneOptions, SceneStatus
 from .view import View
 from .wire import Answer, Flow, Item, Policy, Read, Reader, Request, Run, Sleep, Step
@@ -117,6 +117,9 @@ def _reader(step: Request, response: httpx.Response) -> Reader | None:
 def _lost(error: httpx.TransportError) -> ConnectionLost:
     broken = httpx.NetworkError | httpx.RemoteProtocolError | httpx.ConnectTimeout
     message = f"{type(error).__name__}: {error}"
+    if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
+        url = error.request.url
+        return unreachable(f"{url.scheme}://{url.netloc.decode()}", message)
     return ConnectionLost(message, retry=isinstance(error, broken))
 
 

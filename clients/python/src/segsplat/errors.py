@@ -243,6 +243,14 @@ class VersionWarning(UserWarning):
     """The server's version is not the one that this client was written for."""
 
 
+def unreachable(url: str, why: str) -> ConnectionLost:
+    """The error of a server that is not there."""
+    return ConnectionLost(
+        f"{url} cannot be reached ({why}): start the server with `segsplat serve`, or name another "
+        "with Client(url) or SEGSPLAT_URL"
+    )
+
+
 def error_of(status: int, headers: Mapping[str, str], body: bytes) -> SegSplatError:
     """The error of an answer with a status of 400 or more, or of a part in a stream."""
     after = headers.get("retry-after", "")

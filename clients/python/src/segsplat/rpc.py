@@ -27,7 +27,14 @@ from google.protobuf.descriptor import FieldDescriptor, MethodDescriptor
 from google.protobuf.message import Message
 from typing_extensions import Self
 
-from .errors import BadAnswer, ConnectionLost, InvalidRequest, SegSplatError, error_of
+from .errors import (
+    BadAnswer,
+    ConnectionLost,
+    InvalidRequest,
+    SegSplatError,
+    error_of,
+    unreachable,
+)
 from .wire import Answer, Part, Read, Request, Sleep, Step
 
 #: Bytes of a photo in one message; the largest answer, as the server has it.
@@ -326,6 +333,7 @@ class Door:
         """As `Client` has them. `timeout` is that of a whole call; one that streams has none, but
         its connection is asked every half a minute whether it lives.
         """
+        self._url = base_url
         scheme, _, address = base_url.rstrip("/").partition("://")
         options = [
             ("grpc.max_receive_message_length", MESSAGE_BYTES_MAX),
@@ -378,7 +386,12 @@ class Door:
 
     def fault(self, error: Any) -> Exception:
         """What the caller is told of a call that did not succeed."""
-        return self._unread or fault(error)
+        if self._unread:
+            return self._unread
+        told = fault(error)
+        if isinstance(told, ConnectionLost) and "failed to connect" in told.message:
+            return unreachable(self._url, told.message)
+        return told
 
 
 class Line:
