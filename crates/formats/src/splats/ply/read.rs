@@ -271,6 +271,9 @@ impl Header {
                     Some(element) => push_attribute(&mut element.attributes, scalar, name)?,
                     None => return Err(bad("a property stands before the first element")),
                 },
+                _ if line.contains(char::REPLACEMENT_CHARACTER) => {
+                    return Err(bad("the header is not text"));
+                }
                 _ => return Err(bad(format!("header line {:?} is not known", shown(&line)))),
             }
         }
