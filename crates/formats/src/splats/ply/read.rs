@@ -15,7 +15,7 @@ use super::{
     super::{
         OCTETS, SplatFormat, SplatsRead, begun, check_count, cut_short,
         packed_ply::{self, BOUNDS, PACKED, PackedLayout},
-        some,
+        some_near,
     },
     write::{SEMANTICS, size_bytes, write},
 };
@@ -41,7 +41,7 @@ pub static COMPRESSED_PLY: SplatFormat = SplatFormat {
     semantics: false,
     begins: b"ply",
     read,
-    check: some,
+    check: some_near,
     size_bytes: |file| Some(packed_ply::size_bytes(file)),
     write: packed_ply::write,
 };
