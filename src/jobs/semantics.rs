@@ -59,10 +59,16 @@ impl Work for MakeSemantics {
     }
 
     fn run(&self, jobs: &Jobs, job: &Job) -> Result<()> {
+        // A scene that failed, or fails meanwhile, never has any.
+        let has_failed = || {
+            let record = jobs.records.find(&job.scene);
+            record.is_some_and(|record| record.status.state == SceneState::Failed)
+        };
+        if has_failed() {
+            return Ok(());
+        }
         let made = jobs.make_semantics(job);
-        // A scene that failed meanwhile never has any.
-        let state = jobs.records.find(&job.scene).map(|record| record.status.state);
-        made.or_else(|error| if state == Some(SceneState::Failed) { Ok(()) } else { Err(error) })
+        made.or_else(|error| if has_failed() { Ok(()) } else { Err(error) })
     }
 }
 

@@ -4,7 +4,7 @@ use std::{sync::Arc, time::Duration};
 
 use sha2::{Digest, Sha256};
 
-use super::{Inner, Service, refine, request::CreateScene, types::Created};
+use super::{Inner, Service, refine, request::CreateScene, tasks::blocking, types::Created};
 use crate::{
     error::{Error, Result},
     keys::Caller,
@@ -154,16 +154,6 @@ impl Inner {
         let place = Sha256::digest(key)[0] as usize % KEY_LOCKS;
         &self.key_locks[place]
     }
-}
-
-/// Runs long work on a blocking thread.
-pub(super) async fn blocking<T: Send + 'static>(
-    work: impl FnOnce() -> T + Send + 'static,
-) -> Result<T> {
-    let span = tracing::Span::current();
-    tokio::task::spawn_blocking(move || span.in_scope(work))
-        .await
-        .map_err(|e| Error::internal("the work was broken off").caused_by(e))
 }
 
 fn check_request(

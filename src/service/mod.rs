@@ -21,6 +21,7 @@ mod schedule;
 mod search;
 mod semantics;
 mod tags;
+mod tasks;
 mod texts;
 mod times;
 mod types;
@@ -239,7 +240,7 @@ impl Service {
         let after = page.after.as_deref().map(parse_cursor).transpose()?;
         let inner = Arc::clone(&self.inner);
         if inner.store.is_shared() {
-            create::blocking(move || inner.jobs.refresh_all()).await??;
+            tasks::blocking(move || inner.jobs.refresh_all()).await??;
         }
         let (records, more) = self
             .inner
@@ -260,7 +261,7 @@ impl Service {
     pub async fn delete(&self, id: &SceneId) -> Result<()> {
         let scene = self.scene(id).await?;
         let (inner, gone) = (Arc::clone(&self.inner), scene.id().clone());
-        create::blocking(move || inner.jobs.delete(&gone)).await?
+        tasks::blocking(move || inner.jobs.delete(&gone)).await?
     }
 
     /// What happens to a scene, from its present state to the last event.

@@ -12,8 +12,8 @@ use std::{
 use super::{
     Inner, Service,
     access::SceneAccess,
-    create::blocking,
     search::{SceneTexts, ScoringChoice, SemanticScene},
+    tasks::blocking,
     times::{ms, staged},
     work::Work,
 };

@@ -17,10 +17,11 @@ use super::{
     schedule::Demand,
     search::{Backend, LabelledView, SceneTexts, ScoringChoice, SemanticScene},
     tags::{cache_key, etag, record_semantics_tag, record_tag, scene_tag, text_key},
+    tasks::Task,
     texts,
     times::{ViewTimes, ms, staged},
     types::RenderedView,
-    work::{Task, Work, until},
+    work::{Work, until},
 };
 use crate::{
     error::{Error, Result},

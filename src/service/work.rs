@@ -2,23 +2,20 @@
 //! deadline. Work whose caller has gone or whose deadline is over stops at its next step.
 
 use std::{
-    pin::Pin,
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
     },
-    task::{Context, Poll},
     time::{Duration, Instant},
 };
 
-use tokio::task::{JoinError, JoinHandle};
 use tracing::Instrument;
 
 use super::{
     Inner,
-    create::blocking,
     request::ViewOptions,
     schedule::{Demand, Slot},
+    tasks::blocking,
     times::ms,
 };
 use crate::{
@@ -55,30 +52,6 @@ impl Work {
         if let Some(slot) = &mut self.slot {
             slot.leave_renderer();
         }
-    }
-}
-
-/// A task that ends when nobody waits for it any more.
-#[derive(Debug)]
-pub(super) struct Task<T>(JoinHandle<T>);
-
-impl<T: Send + 'static> Task<T> {
-    pub(super) fn spawn(work: impl Future<Output = T> + Send + 'static) -> Self {
-        Self(tokio::spawn(work))
-    }
-}
-
-impl<T> Future for Task<T> {
-    type Output = Result<T, JoinError>;
-
-    fn poll(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Self::Output> {
-        Pin::new(&mut self.0).poll(context)
-    }
-}
-
-impl<T> Drop for Task<T> {
-    fn drop(&mut self) {
-        self.0.abort();
     }
 }
 

@@ -69,7 +69,7 @@ const LIVE: [(&str, u64, Ask); 33] = [
     ("view_side_max", 8, Ask::Get("/v1/scenes/ID/view?from=0&width=16&height=12")),
     ("render_timeout_ms", 0, Ask::Get("/v1/scenes/ID/view?from=0&width=16&height=13")),
     ("queued_renders_max", 0, Ask::Get("/v1/scenes/ID/view?from=0&width=16&height=14")),
-    ("queued_pixels_max", 1, Ask::BesideAView),
+    ("queued_pixels_max", 2_000, Ask::BesideAView),
     ("features_bytes_max", 1, Ask::Get("/v1/scenes/ID/features?from=0&kind=features&width=16")),
     ("folder_points_max", 1, Ask::Get("/v1/scenes/ID/export?format=nerfstudio")),
     ("cameras_max", 1, Ask::Views),

@@ -146,7 +146,8 @@ def tower_of(pack, device, weights=None, share=1.0):
     if weights:
         theirs, mine = torch.load(weights, map_location=device), tower.state_dict()
         tower.load_state_dict({k: v + share * (theirs[k].to(v.dtype) - v) for k, v in mine.items()})
-    return tower.to(memory_format=torch.channels_last).requires_grad_(False)
+    # In the plain layout: in the other one cuDNN compiles each depthwise convolution anew for each size.
+    return tower.requires_grad_(False)
 
 
 class OnnxTower:

@@ -16,7 +16,7 @@ NORMS = [("_conv_stem", "_bn0"), ("_conv_head", "_bn1"), ("_expand_conv", "_bn0"
 
 def normalised(x):
     """Pictures 0..1 as the tower takes them."""
-    return ((x * 255 - 127) / 128).contiguous(memory_format=torch.channels_last)
+    return ((x * 255 - 127) / 128)
 
 
 def pairs(body):

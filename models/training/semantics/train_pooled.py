@@ -206,9 +206,7 @@ class Run:
 
     def judged(self, judge, title, tower):
         """Figures of a tower; what the best one is chosen by: withheld names right and found at 3 %, choosing scenes right."""
-        before, torch.backends.cudnn.benchmark = torch.backends.cudnn.benchmark, False
         figures = judge.all(tower)
-        torch.backends.cudnn.benchmark = before
         table(f"[{self.seconds():.0f}s] {title}", figures)
         self.note(judge=title, figures=figures, columns=NAMES)
         both = figures[f"both {judge.sides[0]}"]
@@ -245,7 +243,6 @@ def train(args, run, student, judge, mixed, best):
     size = (AREA, CUTS, WHOLES) if KIND == "cuda" else (4 * 448 * 448, 8, 4)
     stop = run.begin + args.seconds - (2 if args.smoke else END)
     begin, kept, judged, half = time.time(), time.time(), time.time(), False
-    torch.backends.cudnn.benchmark, torch.backends.cudnn.benchmark_limit = True, 3
     while time.time() < stop and not (args.smoke and student.steps.step >= 4):
         t = (time.time() - begin) / (stop - begin)
         student.step(t, *size)

@@ -18,12 +18,12 @@ use crate::{
     scene::{Preset, Scene, SceneId, Upload},
     service::{
         Inner, OfflineService, Service,
-        create::blocking,
         export::stream_until,
         request::{ScoringOptions, TextOptions, ViewOptions},
         schedule::Demand,
         search::{SceneTexts, ScoringChoice},
         tags::{cache_key, etag, semantics_tag},
+        tasks::blocking,
         texts,
         types::{Export, ExportBody, TextView},
         view::Resolved,

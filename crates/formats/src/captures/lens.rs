@@ -159,6 +159,9 @@ impl Lens {
     ///
     /// Intrinsics written for another size of the same aspect are scaled to the photo; another
     /// aspect is refused: it is unknown what was cropped.
+    ///
+    /// # Errors
+    /// `invalid_request`, which names the number that is impossible.
     pub fn at_size(&self, width: u32, height: u32, what: &str) -> Result<LensAtSize> {
         let stated = self.stated_size(what)?;
         let [w, h] = stated.unwrap_or([width, height]);
