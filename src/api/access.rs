@@ -288,11 +288,11 @@ mod tests {
         let access = Access::new(&config).unwrap();
         let admit = |name: &str| access.admit(Some(&format!("Bearer {name}")), Scope::Read);
         let open = admit("a").unwrap();
-        access.reload(&config).unwrap();
+        access.read_again(&config).unwrap()();
         assert!(admit("a").unwrap_err().message().contains("1 calls open"));
         assert!(admit("b").is_ok(), "another key");
         write("inflight_max = 2");
-        access.reload(&config).unwrap();
+        access.read_again(&config).unwrap()();
         let second = admit("a").unwrap();
         assert!(admit("a").is_err(), "the call from before counts");
         drop((open, second));

@@ -56,11 +56,10 @@ impl Drop for Share {
 }
 
 impl Budget {
-    /// Takes `size`, if it is the only one or `fits` says so of what is taken already; else says
-    /// how much that is.
+    /// Takes `size` where `fits` says so of what is taken already; else says how much that is.
     fn take(self: &Arc<Self>, size: u64, fits: impl FnOnce(u64) -> bool) -> Result<Share, u64> {
         let mut taken = self.taken.lock();
-        if *taken > 0 && !fits(*taken) {
+        if !fits(*taken) {
             return Err(*taken);
         }
         *taken += size;
@@ -107,7 +106,7 @@ impl Memory {
             self.admit(usize::try_from(bytes).unwrap_or(usize::MAX))?;
         }
         let max = limits.answers_bytes_max.min(self.bytes_max / ANSWERS_SHARE);
-        let fits = |taken: u64| bytes <= max.saturating_sub(taken) / ROOM_SHARE;
+        let fits = |taken: u64| taken == 0 || bytes <= max.saturating_sub(taken) / ROOM_SHARE;
         self.answers.take(bytes, fits).map_err(|taken| {
             let message = format!(
                 "answers of {} MiB are not sent yet; {} MiB more are too many of {} MiB",
@@ -128,8 +127,9 @@ impl Memory {
         let place = places.take(1, |taken| taken < most as u64).map_err(|taken| {
             refused(format!("{taken} exports are being sent already; {most} may be"))
         })?;
-        let bytes = bytes.min(bytes_max / 4 * 3);
-        let bytes = memory.take(bytes, |taken| taken + bytes <= bytes_max).map_err(|taken| {
+        let bytes = bytes.min((bytes_max / 4 * 3).max(1));
+        let fits = |taken: u64| taken == 0 || taken + bytes <= bytes_max;
+        let bytes = memory.take(bytes, fits).map_err(|taken| {
             let [taken, more, max] = [taken, bytes, bytes_max].map(|bytes| bytes >> 20);
             refused(format!("exports take {taken} MiB already; {more} MiB more are over {max} MiB"))
         })?;

@@ -247,8 +247,8 @@ impl Export {
     /// Makes the file and begins to write it.
     ///
     /// # Errors
-    /// `overloaded` where too many exports are being sent; `invalid_request` and `limit_exceeded` for a scene that the format cannot hold; with a text
-    /// also those of its network.
+    /// `overloaded` where too many exports are being sent; `invalid_request` and `limit_exceeded`
+    /// for a scene that the format cannot hold; with a text also those of its network.
     pub async fn begin(self) -> Result<ExportBody> {
         self.begin.await
     }

@@ -7,6 +7,7 @@ use reqwest::{Client, RequestBuilder, Response};
 use segsplat::{
     config::Config,
     keys::hash,
+    limits::Limits,
     scene::{SceneId, Upload, UploadFile},
 };
 use tempfile::TempDir;
@@ -169,8 +170,10 @@ async fn a_server_that_stops_waits_until_its_answers_are_taken() {
 
 #[tokio::test]
 async fn answers_that_nobody_takes_are_bounded_in_bytes() {
-    let server = TestServer::with(|config, _| config.limits.answers_bytes_max = 5 << 20).await;
+    let server = TestServer::start().await;
     let id = server.scene().await.id;
+    // The limit is live.
+    server.service.reload(Limits { answers_bytes_max: 5 << 20, ..Limits::default() });
     let [_, http2] = clients();
     // Each on a connection of its own.
     let other = || clients()[1].clone();
@@ -254,6 +257,21 @@ async fn exports_hold_their_places_until_they_are_taken() {
         unread(format, export(format)).await;
         drop(second);
     }
+}
+
+#[tokio::test]
+async fn exports_that_nobody_takes_are_bounded_in_bytes() {
+    let (server, id) = of_splats(|_| {}).await;
+    let url = server.url(&format!("/v1/scenes/{id}/export?format=sog"));
+    let export = || clients()[1].clone().get(&url);
+    let first = unread("the first", export()).await;
+    let second = unread("the second", export()).await;
+    // The limit is live.
+    server.service.reload(Limits { exports_bytes_max: 100, ..Limits::default() });
+    let fault = refused(export()).await;
+    assert_eq!((fault.code.as_str(), fault.number), ("overloaded", 429), "{fault:?}");
+    drop((first, second));
+    unread("alone", export()).await;
 }
 
 #[tokio::test]

@@ -49,7 +49,7 @@ enum Ask {
 }
 
 /// Limits, a value of each that changes the answer, and what is asked.
-const LIVE: [(&str, u64, Ask); 33] = [
+const LIVE: [(&str, u64, Ask); 34] = [
     ("photos_max", 2, Ask::Photos),
     ("photos_min", 4, Ask::Photos),
     ("upload_bytes_max", 1_000, Ask::Photos),
@@ -72,6 +72,7 @@ const LIVE: [(&str, u64, Ask); 33] = [
     ("queued_pixels_max", 2_000, Ask::BesideAView),
     ("features_bytes_max", 1, Ask::Get("/v1/scenes/ID/features?from=0&kind=features&width=16")),
     ("folder_points_max", 1, Ask::Get("/v1/scenes/ID/export?format=nerfstudio")),
+    ("exports_max", 0, Ask::Get("/v1/scenes/ID/export")),
     ("cameras_max", 1, Ask::Views),
     ("kinds_max", 1, Ask::Views),
     ("views_pixels_max", 10, Ask::Views),
@@ -85,10 +86,13 @@ const LIVE: [(&str, u64, Ask); 33] = [
     ("refine_gaussians_max", 50, Ask::Refine),
 ];
 
-/// Live as well, and not seen by these calls: those of keys, in `access.rs`; one that counts on a
+/// Live as well, and not seen by these calls: those of keys, in `access.rs`, and of answers that are
+/// not sent yet, in `answers.rs`; one that counts on a
 /// device alone, read with the other limits of refinement; and those of threads, which read them
 /// again in each of their rounds.
-const ELSEWHERE: [&str; 7] = [
+const ELSEWHERE: [&str; 9] = [
+    "answers_bytes_max",
+    "exports_bytes_max",
     "key_requests_per_s",
     "key_inflight_max",
     "refine_device_bytes_max",

@@ -481,7 +481,7 @@ fn damaged_plys_are_refused_by_name() {
         (Vec::new(), "none of Gaussians"),
         (b"plyx\n".to_vec(), "does not begin"),
         ([b"ply".to_vec(), vec![b'a'; 1 << 20]].concat(), "is missing in the first"),
-        (b"ply\n\xff\xfe\n".to_vec(), "is not known"),
+        (b"ply\n\xff\xfe\n".to_vec(), "not text"),
         (re("format binary_little_endian 1.0\n", ""), "no `format`"),
         (re("binary_little_endian", "ascii"), "only binary"),
         (re("element vertex 30", "element vertex -3"), "number of vertices"),

@@ -94,11 +94,10 @@ fn a_ply_has_double_positions_where_float_loses_and_says_so() {
         assert_eq!(text.contains("comment step 0.5 of float positions is over 0.00"), is_double);
     }
     // A first vertex without a place does not take the places of the others.
-    let file = bytes_of(&SplatFile::new(&PLY, room(UTM), None).unwrap());
+    let mut file = bytes_of(&SplatFile::new(&PLY, room(UTM), None).unwrap());
     let head = file.windows(11).position(|w| w == b"end_header\n").unwrap() + 11;
-    let mut poisoned = file.clone();
-    poisoned[head..head + 8].copy_from_slice(&f64::NAN.to_le_bytes());
-    let back = read(&PLY, &poisoned).unwrap();
+    file[head..head + 8].copy_from_slice(&f64::NAN.to_le_bytes());
+    let back = read(&PLY, &file).unwrap();
     assert_eq!((back.gaussians.len(), back.dropped.not_finite), (COUNT - 1, 1));
     assert!(moved(&back.gaussians, &room(UTM).only(|i| i > 0)) < 1e-6);
 }
@@ -262,7 +261,7 @@ fn flat_round_and_degenerate_gaussians_are_drawn() {
 }
 
 /// A GLB whose node holds a file in a buffer view.
-fn enclosing(spz: &[u8], extensions: serde_json::Value, node: serde_json::Value) -> Vec<u8> {
+fn enclosing(spz: &[u8], extensions: &serde_json::Value, node: &serde_json::Value) -> Vec<u8> {
     let names: Vec<&String> = extensions.as_object().unwrap().keys().collect();
     let document = json!({
         "asset": { "version": "2.0" }, "scene": 0, "scenes": [{ "nodes": [0] }], "nodes": [node],
@@ -307,8 +306,8 @@ fn an_spz_in_a_glb_is_read() {
         let file = SplatFile::new(format, room(DVec3::ZERO), None).unwrap().antialiased(true);
         let spz = bytes_of(&file);
         let alone = read(format, &spz).unwrap().gaussians;
-        for extensions in [new(words.clone()), new(json!({})), old.clone()] {
-            let back = read(&GLB, &enclosing(&spz, extensions, json!({ "mesh": 0 }))).unwrap();
+        for extensions in [&new(words.clone()), &new(json!({})), &old] {
+            let back = read(&GLB, &enclosing(&spz, extensions, &json!({ "mesh": 0 }))).unwrap();
             assert!(back.antialiased);
             assert_eq!(back.gaussians.means(), alone.means());
             assert_eq!(back.gaussians.scales(), alone.scales());
@@ -317,17 +316,17 @@ fn an_spz_in_a_glb_is_read() {
         }
         // It lies where its node lies: y up, z back.
         let node = json!({ "mesh": 0, "translation": [1e6, 2.0, 3.0], "scale": [2.0, 2.0, 2.0] });
-        let back = read(&GLB, &enclosing(&spz, new(words.clone()), node)).unwrap().gaussians;
+        let back = read(&GLB, &enclosing(&spz, &new(words.clone()), &node)).unwrap().gaussians;
         for i in 0..COUNT {
             let wanted = 2.0 * world(&alone, i) + DVec3::new(1e6, -2.0, -3.0);
             assert!(world(&back, i).distance(wanted) < 1e-5);
             assert_eq!(back.scales()[i], alone.scales()[i].map(|s| 2.0 * s));
         }
-        let cut = enclosing(&spz[..spz.len() / 2], new(words.clone()), json!({ "mesh": 0 }));
+        let cut = enclosing(&spz[..spz.len() / 2], &new(words.clone()), &json!({ "mesh": 0 }));
         let refused = read(&GLB, &cut).unwrap_err();
         assert!(refused.message().starts_with("GLB: SPZ: "), "{refused}");
     }
     let other = new(json!({ "kernel": "cube" }));
-    let refused = read(&GLB, &enclosing(&[], other, json!({ "mesh": 0 }))).unwrap_err();
+    let refused = read(&GLB, &enclosing(&[], &other, &json!({ "mesh": 0 }))).unwrap_err();
     assert!(refused.message().contains("kernel is \"cube\""), "{refused}");
 }

@@ -19,9 +19,7 @@ mod spz;
 
 use std::io::{self, BufRead, Write};
 
-use glam::DVec3;
-
-use self::places::Coarse;
+use self::places::{Coarse, world};
 pub use self::{
     glb::GLB,
     ply::{COMPRESSED_PLY, PLY},
@@ -187,7 +185,7 @@ fn some(file: &SplatFile) -> Result<()> {
 /// The same for formats that have positions as f32 of the world: refuses what lies too far off.
 fn some_near(file: &SplatFile) -> Result<()> {
     some(file)?;
-    file.coarse.map_or(Ok(()), |coarse| Err(coarse.refused(file.format)))
+    file.coarse.map_or(Ok(()), |coarse| Err(coarse.refused(file.format.name)))
 }
 
 pub(crate) fn unreadable(cause: io::Error) -> Error {
@@ -226,11 +224,6 @@ const TURN_SH: [f32; 16] =
 
 fn times<const N: usize>(a: [f32; N], b: [f32; N]) -> [f32; N] {
     std::array::from_fn(|i| a[i] * b[i])
-}
-
-/// World position of Gaussian `i`.
-fn world(gaussians: &Gaussians, i: usize) -> DVec3 {
-    gaussians.origin() + DVec3::from_array(gaussians.means()[i].map(f64::from))
 }
 
 /// Gaussians reserved for before any is read: a header may claim anything.

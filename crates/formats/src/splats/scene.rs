@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use glam::DVec3;
 
-use super::{SplatFormat, SplatsRead};
+use super::{SplatFormat, SplatsRead, places::reach};
 use crate::{
     error::{Error, Result},
     limits::BANK_ROWS_MAX,
@@ -24,8 +24,6 @@ const OVERVIEW: &str = "overview";
 const SIZE: [u32; 2] = [512, 384];
 /// Half of its vertical field of view, degrees.
 const HALF_FOV: f64 = 30.0;
-/// Share of the Gaussians that it sees at least.
-const SEEN: f64 = 0.9;
 /// Largest coordinate of that camera: that of any camera of a request.
 const COORDINATE_MAX: f64 = 1e9;
 
@@ -124,26 +122,6 @@ fn overview(gaussians: &Gaussians) -> Result<(Camera, f64)> {
     let focal = h / 2.0 / half.tan();
     let intrinsics = Intrinsics { fx: focal, fy: focal, cx: w / 2.0, cy: h / 2.0, width, height };
     Ok((Camera { intrinsics, camera_to_world }, distance))
-}
-
-/// The median centre of the Gaussians, of which there is one at least, about their origin, and the
-/// radius of the sphere about it that has nine of ten.
-pub(super) fn reach(gaussians: &Gaussians) -> (DVec3, f64) {
-    let means = gaussians.means();
-    let middle: [f32; 3] =
-        std::array::from_fn(|k| quantile(means.iter().map(|mean| mean[k]).collect(), 0.5));
-    let middle = DVec3::from_array(middle.map(f64::from));
-    let away = |mean: &[f32; 3]| DVec3::from_array(mean.map(f64::from)).distance(middle) as f32;
-    let radius = quantile(means.iter().map(away).collect(), SEEN);
-    // Gaussians in one place are as large as the widest of them.
-    let widest = gaussians.scales().iter().flatten().fold(0.0, |a: f32, b| a.max(*b));
-    (middle, f64::from(if radius > 0.0 { radius } else { 3.0 * widest }))
-}
-
-/// The number that this share of all, of which there is one at least, is not over.
-fn quantile(mut numbers: Vec<f32>, share: f64) -> f32 {
-    let at = ((numbers.len() - 1) as f64 * share) as usize;
-    *numbers.select_nth_unstable_by(at, f32::total_cmp).1
 }
 
 #[cfg(test)]

@@ -82,7 +82,7 @@ fn check(file: &SplatFile) -> Result<()> {
     some(file)?;
     let step = 0.5_f64.powi(bits(&file.gaussians)? as i32);
     let coarse = Coarse::of(&file.gaussians, |_| step);
-    coarse.map_or(Ok(()), |coarse| Err(coarse.refused(file.format)))
+    coarse.map_or(Ok(()), |coarse| Err(coarse.refused(file.format.name)))
 }
 
 /// Bits behind the point that the farthest Gaussian leaves.

@@ -12,10 +12,10 @@
 //! Positions are world coordinates. Where the step of f32 is too coarse for the scene, `x y z` are
 //! `double`, and a comment says so.
 //!
-//! The mode of the renderer is a comment: `SplatRenderMode: mip` is written; `antialiased 1` is read
-//! too. Files of nearly Gaussians are read: colours as `red green blue` instead of harmonics, one or
-//! two scales instead of three, and what is missing as viewers have it (opacity 1, scales of 0.01,
-//! not turned).
+//! The mode of the renderer is a comment: `SplatRenderMode: mip` is written, `antialiased 1` is
+//! read too. Files of nearly Gaussians are read: colours as `red green blue` instead of harmonics,
+//! one or two scales instead of three, and what is missing as viewers have it (opacity 1, scales of
+//! 0.01, not turned).
 
 mod read;
 mod write;

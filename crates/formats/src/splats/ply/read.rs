@@ -15,7 +15,7 @@ use super::{
     super::{
         OCTETS, SplatFormat, SplatsRead, begun, check_count, cut_short,
         packed_ply::{self, BOUNDS, PACKED, PackedLayout},
-        some,
+        some_near,
     },
     write::{SEMANTICS, size_bytes, write},
 };
@@ -41,7 +41,7 @@ pub static COMPRESSED_PLY: SplatFormat = SplatFormat {
     semantics: false,
     begins: b"ply",
     read,
-    check: some,
+    check: some_near,
     size_bytes: |file| Some(packed_ply::size_bytes(file)),
     write: packed_ply::write,
 };
@@ -271,6 +271,9 @@ impl Header {
                     Some(element) => push_attribute(&mut element.attributes, scalar, name)?,
                     None => return Err(bad("a property stands before the first element")),
                 },
+                _ if line.contains(char::REPLACEMENT_CHARACTER) => {
+                    return Err(bad("the header is not text"));
+                }
                 _ => return Err(bad(format!("header line {:?} is not known", shown(&line)))),
             }
         }
