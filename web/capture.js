@@ -61,8 +61,8 @@ async function dropped(transfer) {
   return files;
 }
 
-// The form to send, a row for each photo with what is wrong with it, faults of the whole, which stop
-// it, and notes, which do not. `at` is told what is done meanwhile.
+// The form to send, a row for each photo with what is wrong with it, faults of the whole, which
+// stop it, and notes, which do not. `at` is told what is done meanwhile.
 async function readCapture(files, at) {
   files = files.filter(({ path }) => !HIDDEN.test(path));
   const capture = { form: new FormData(), rows: [], faults: [], notes: [] },
@@ -194,8 +194,8 @@ async function fit(photos, mayShrink, notes, at = () => {}) {
     const step = (photos.length - 1) / (LIMITS.photos - 1);
     sent = Array.from({ length: LIMITS.photos }, (_, i) => photos[Math.round(i * step)]);
     notes.push(
-      `${photos.length} photos have ${mb(before)}; ${sent.length} are sent, evenly chosen: a scene ` +
-        'takes no more.',
+      `${photos.length} photos have ${mb(before)}; ${sent.length} are sent, evenly chosen: ` +
+        'a scene takes no more.',
     );
   }
   if (!mayShrink) return sent;

@@ -351,8 +351,9 @@ class Drawing {
     this.changed();
   }
 
-  // The parts of a word, the best first: each with the mean relevancy of its Gaussians as its score,
-  // and a box without the farthest of them. Boxes are in the world, Gaussians about the origin.
+  // The parts of a word, the best first: each with the mean relevancy of its Gaussians as its
+  // score, and a box without the farthest of them. Boxes are in the world, Gaussians about the
+  // origin.
   async partsOf({ parts, scores, entries }) {
     const origin = this.header.origin,
       boxes = parts.map((part) => ({ ...part, center: add(part.center, origin, -1) }));

@@ -579,8 +579,8 @@ function doubtsOf(text, known) {
   if (!known || known.trust === 'good' || known.trust === 'fair') return [];
   if (!known.trust)
     return [
-      `Warning: "${text}" is not in the list of ${known.words} words that the server was measured ` +
-        'with: what is shown may be something else.',
+      `Warning: "${text}" is not in the list of ${known.words} words that the server was ` +
+        'measured with: what is shown may be something else.',
     ];
   return known.trust === 'poor'
     ? [`Warning: "${known.word}" is known poorly: much of it is missed, or much else is shown.`]

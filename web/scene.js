@@ -46,9 +46,9 @@ async function readPacked(stream, head, part) {
   }
 }
 
-// Runs in the worker, which has all places. A counting sort of 16 bits, farthest first: a key is the
-// upper bits of the f32 depth; what is behind has the top bit. And what the Gaussians in the boxes
-// of a word's parts tell: how well they fit, and where nearly all of them are.
+// Runs in the worker, which has all places. A counting sort of 16 bits, farthest first: a key is
+// the upper bits of the f32 depth; what is behind has the top bit. And what the Gaussians in the
+// boxes of a word's parts tell: how well they fit, and where nearly all of them are.
 function sorter() {
   const BINS = 256,
     OUTSIDE = 0.02; // share of Gaussians beyond each side of a box
@@ -77,8 +77,8 @@ function sorter() {
         let inside = true;
         for (let k = 0; k < 3 && inside; k++) {
           const [x, y, z, c, size] = rows[p][k];
-          const along =
-            x * (places[3 * i] - c[0]) + y * (places[3 * i + 1] - c[1]) + z * (places[3 * i + 2] - c[2]);
+          let along = x * (places[3 * i] - c[0]) + y * (places[3 * i + 1] - c[1]);
+          along += z * (places[3 * i + 2] - c[2]);
           at[k] = (along / size + 0.5) * BINS;
           inside = at[k] > -1 && at[k] < BINS + 1;
         }

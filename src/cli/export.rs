@@ -41,6 +41,7 @@ pub(super) struct Args {
 }
 
 pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
+    scene_file::has_folder(&args.output)?;
     let name = args.output.file_name().unwrap_or_default().to_string_lossy();
     let format = ExportFormat::of_file(&name);
     let splats = match format.map(|format| (format, format.kind)) {

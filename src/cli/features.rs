@@ -42,6 +42,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         scoring: args.scoring.clone(),
         wait: None,
     });
+    scene_file::has_folder(&args.output)?;
     let opened = scene_file::open(&args.scene, &config.limits)?;
     let service = engine::offline(config, true)?;
     let unwritable = |e| scene_file::unwritable(&args.output, e);

@@ -15,6 +15,7 @@ use crate::{
 };
 
 #[derive(Clone, Debug, clap::Args)]
+#[command(mut_args(|arg| arg.global(true)))]
 pub(super) struct Args {
     #[command(subcommand)]
     action: Action,

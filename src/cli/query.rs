@@ -58,6 +58,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         scoring: args.scoring.clone(),
         ..QuerySpec::default()
     };
+    args.output.as_deref().map_or(Ok(()), scene_file::has_folder)?;
     let opened = scene_file::open(&args.scene, &config.limits)?;
     let service = engine::offline(config, true)?;
     let mut answer = service.query(&opened.scene, &spec)?;

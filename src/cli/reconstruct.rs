@@ -15,8 +15,8 @@ use super::{
     engine,
     output::Output,
     scene_file::{
-        path_of, semantics_path, splat_format, splat_titles, splats_of, unreadable, unwritable,
-        write_splats,
+        path_to_write, semantics_path, splat_format, splat_titles, splats_of, unreadable,
+        unwritable, write_splats,
     },
 };
 use crate::{
@@ -82,8 +82,9 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let options = options.with(&args.method)?;
     options.method().check()?;
     check_refine(args.refine, &config.limits)?;
+    let path = path_to_write(&args.output)?;
     if !args.photos.is_dir() && splat_format(&args.photos).is_some() {
-        return import(args, config, &options, out);
+        return import(args, &path, config, &options, out);
     }
     let engine = Pipeline::open(&config.networks())?;
     let eager = args.semantics == SemanticsMode::Eager;
@@ -105,7 +106,6 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         Some(ms) => refine(&engine, made, &photos, (ms, &options), config, watch)?,
         None => made,
     };
-    let path = path_of(&args.output);
     let for_others = splat_format(&path).is_some();
     write(&path, &scene)?;
     if eager {
@@ -156,7 +156,13 @@ fn refine(
 }
 
 /// A file of Gaussians becomes a scene file. No network is needed.
-fn import(args: &Args, config: &Config, options: &SceneOptions, out: &Output) -> Result<()> {
+fn import(
+    args: &Args,
+    path: &Path,
+    config: &Config,
+    options: &SceneOptions,
+    out: &Output,
+) -> Result<()> {
     let begun = Instant::now();
     let file = fs_err::read(&args.photos).map_err(|e| unreadable(&args.photos, e))?;
     let sha256 = store::sha256(&file);
@@ -168,14 +174,13 @@ fn import(args: &Args, config: &Config, options: &SceneOptions, out: &Output) ->
     let provenance = store::provenance(vec![PhotoHash { file: name, sha256 }], &options, "");
     let (id, created_ms) = (id_of(&provenance), store::now_ms());
     let scene = Scene { meta: SceneMeta { id, created_ms, provenance, ..scene.meta }, ..scene };
-    let path = path_of(&args.output);
-    write(&path, &scene)?;
+    write(path, &scene)?;
     match &scene.semantics {
-        _ if splat_format(&path).is_some() => {}
-        Some(made) => write_semantics_file(&semantics_path(&path), &scene.meta.id, made)?,
-        None => remove(&semantics_path(&path))?,
+        _ if splat_format(path).is_some() => {}
+        Some(made) => write_semantics_file(&semantics_path(path), &scene.meta.id, made)?,
+        None => remove(&semantics_path(path))?,
     }
-    describe(&path, &scene, begun.elapsed().as_secs_f64() * 1e3, out)
+    describe(path, &scene, begun.elapsed().as_secs_f64() * 1e3, out)
 }
 
 /// The same files have the same id.

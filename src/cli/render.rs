@@ -48,6 +48,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
         picture: PictureOptions { format: format_of(&args.output)?, ..args.picture.clone() },
         text: args.text.clone(),
     };
+    scene_file::has_folder(&args.output)?;
     let opened = scene_file::open(&args.scene, &config.limits)?;
     let service = engine::offline(config, spec.kind.needs_semantics())?;
     let view = service.render(&opened.scene, &spec)?;

@@ -53,6 +53,37 @@ pub(super) fn splat_titles() -> String {
     ExportFormat::listed(|of| of.is_splats(), |row| row.title)
 }
 
+/// The path of a scene file to write, or of a file of Gaussians.
+///
+/// # Errors
+/// `invalid_request` for an ending of something else, or where there is no such folder.
+pub(super) fn path_to_write(path: &Path) -> Result<PathBuf> {
+    let path = path_of(path);
+    let ending = ending(&path);
+    if splat_format(&path).is_none() && !["", "segsplat"].contains(&&*ending) {
+        let (path, titles) = (path.display(), splat_titles());
+        let why = format!("the ending must be segsplat (a scene file) or one of {titles}");
+        return Err(Error::invalid(format!("{path}: {why}")));
+    }
+    has_folder(&path)?;
+    Ok(path)
+}
+
+/// Checks that the folder of a file to write is there, before the work that the file is for.
+///
+/// # Errors
+/// `invalid_request`.
+pub(super) fn has_folder(path: &Path) -> Result<()> {
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+    match folder {
+        Some(folder) if !folder.is_dir() => {
+            let (path, folder) = (path.display(), folder.display());
+            Err(Error::invalid(format!("{path}: there is no folder {folder}; make it first")))
+        }
+        _ => Ok(()),
+    }
+}
+
 /// The format of Gaussians that the ending of a file says.
 pub(super) fn splat_format(path: &Path) -> Option<&'static SplatFormat> {
     splat_format_of(&path.file_name()?.to_string_lossy())

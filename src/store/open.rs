@@ -167,7 +167,8 @@ fn lock(root: &Path) -> Result<fs::File> {
     while let Err(cause) = lock.file().try_lock() {
         if begun.elapsed() >= LOCK_WAIT {
             let code = ErrorCode::StoreUnavailable;
-            return Err(Error::new(code, "another process uses the data folder").caused_by(cause));
+            let why = format!("another process uses the data folder {}", root.display());
+            return Err(Error::new(code, why).caused_by(cause));
         }
         thread::sleep(LOCK_LOOK);
     }

@@ -229,6 +229,52 @@ fn errors_name_what_is_wrong_and_exit_by_the_table() {
 }
 
 #[test]
+fn an_output_that_cannot_be_written_is_refused_before_any_work() {
+    let folder = files();
+    let at = |name: &str| folder.path().join(name);
+    let (scene, invalid) = (at("scene.segsplat"), ErrorCode::InvalidRequest);
+    let nowhere = |name: &str| at("none").join(name).to_str().unwrap().to_owned();
+    // The input is not there either, and is not looked at.
+    let input = at("no-photos");
+    let reconstruct = |output: &str, want: &str| {
+        refused(&["reconstruct", text(&input), "-o", output], invalid, want);
+    };
+    reconstruct(text(&at("x.jpg")), "x.jpg: the ending must be segsplat");
+    let lacks = format!("there is no folder {}; make it first", at("none").display());
+    reconstruct(&nowhere("x.segsplat"), &lacks);
+    let view = ["--camera", "0", CPU[0], CPU[1]];
+    for line in [
+        &[&["render", text(&input), "-o", &nowhere("x.png")], &view[..]].concat()[..],
+        &[&["query", text(&input), "box", "-o", &nowhere("x.png")], &view[..]].concat(),
+        &["features", text(&input), "-o", &nowhere("x.npz")],
+        &["export", text(&input), "-o", &nowhere("x.ply")],
+        &["export", text(&input), "-o", &nowhere("x.colmap.zip")],
+    ] {
+        refused(line, invalid, &lacks);
+    }
+    // A name without an ending, and a folder, are scene files as before.
+    for output in [at("plain"), folder.path().to_owned()] {
+        ok(&["reconstruct", text(&at("plate.ply")), "-o", text(&output)]);
+    }
+    assert!(at("plain").is_file() && scene.is_file());
+}
+
+#[test]
+fn a_folder_without_cameras_is_named_with_what_finds_them() {
+    if !with_network() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let photos = folder.path().join("only photos");
+    ok(&["sample", "-o", text(&photos), "--photos", "2", "--size", "40x30"]);
+    std::fs::remove_file(photos.join("transforms.json")).unwrap();
+    let scene = folder.path().join("x.segsplat");
+    let line = ["reconstruct", text(&photos), "-o", text(&scene)];
+    refused(&line, ErrorCode::InvalidRequest, &format!("{}: no transforms.json", photos.display()));
+    refused(&line, ErrorCode::InvalidRequest, "pycolmap");
+}
+
+#[test]
 fn a_sample_is_written_as_asked() {
     let folder = tempfile::tempdir().unwrap();
     let line = ["sample", "-o", text(folder.path()), "--photos", "3", "--size", "40x30"];
@@ -339,6 +385,11 @@ fn models_say_their_licences_and_views_only_where_they_take_some() {
         "{listed}"
     );
     assert!(!listed.contains("up to 0 views"), "{listed}");
+    // The bundle is named before the action or after it.
+    let bundle = ["--bundle", "tests/fixtures/plane"];
+    let before = ok(&[&["models"], &bundle[..], &["list"]].concat());
+    assert_eq!(before, ok(&[&["models", "list"], &bundle[..]].concat()));
+    assert!(before.contains("plane.onnx"), "{before}");
     for model in ok_json(&["models", "list"])["models"].as_array().unwrap() {
         let licence = model["licence"].as_str().unwrap();
         for said in ["research", "CamVid CC BY-NC", "COCO", "models/cards/"] {
@@ -456,6 +507,10 @@ fn serve_says_where_it_listens_and_ends_at_sigterm() {
         .block_on(crate::common::client().get(format!("{url}/readyz")).send())
         .expect("it answers");
     assert!(ready.status().is_success(), "{}", ready.status());
+    let data = text(folder.path());
+    let line = ["serve", "--listen", "127.0.0.1:0", "--data-dir", data, CPU[0], CPU[1]];
+    let used = format!("another process uses the data folder {data}");
+    refused(&line, ErrorCode::StoreUnavailable, &used);
     assert!(signal(child.0.id(), "TERM"));
     assert!(child.0.wait().unwrap().success(), "a stop that was asked for is no failure");
 }

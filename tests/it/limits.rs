@@ -86,10 +86,9 @@ const LIVE: [(&str, u64, Ask); 34] = [
     ("refine_gaussians_max", 50, Ask::Refine),
 ];
 
-/// Live as well, and not seen by these calls: those of keys, in `access.rs`, and of answers that are
-/// not sent yet, in `answers.rs`; one that counts on a
-/// device alone, read with the other limits of refinement; and those of threads, which read them
-/// again in each of their rounds.
+/// Live as well, and not seen by these calls: those of keys, in `access.rs`, and of answers that
+/// are not sent yet, in `answers.rs`; one that counts on a device alone, read with the other limits
+/// of refinement; and those of threads, which read them again in each of their rounds.
 const ELSEWHERE: [&str; 9] = [
     "answers_bytes_max",
     "exports_bytes_max",

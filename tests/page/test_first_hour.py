@@ -1,4 +1,4 @@
-"""What a person meets in the first hour: files of a phone, the first word, words that are not known."""
+"""What a person meets in the first hour: files of a phone, the first word, unknown words."""
 
 from __future__ import annotations
 
@@ -138,7 +138,8 @@ def test_a_word_says_how_well_it_fits_and_how_well_it_is_known(
     chips = page.locator("#words li")
     expect(chips.nth(0).locator(".score")).to_contain_text(shown[trust["box"]])
     expect(chips.nth(1).locator(".score")).to_contain_text("not in the list")
-    expect(page.locator("#says")).to_contain_text(f'"zxqv" is not in the list of {len(trust)} words')
+    said = f'"zxqv" is not in the list of {len(trust)} words'
+    expect(page.locator("#says")).to_contain_text(said)
     words = page.evaluate("segsplat.state.words")
     body = json.dumps({"texts": ["a box"], "boxes": "upright"}).encode()
     with urllib.request.urlopen(f"{url}/v1/scenes/{scene}/query", body) as answer:

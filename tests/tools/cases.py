@@ -1,11 +1,11 @@
-"""Sends folders as people have them, each with a fault or an oddity that was reported in public, over
-HTTP (a tar as archive) and through the command line, and compares with the right value of each.
+"""Sends folders as people have them, each with a fault or an oddity that was reported in public,
+over HTTP (a tar as archive) and through the command line, and compares with the right values.
 
 python3 cases.py [FOLDER] [--only NAME]... [--door http|cli]
 
-FOLDER holds the folders by the names of ROWS. `SEGSPLAT_BIN` names the program (`served.py`). A table
-is written, and the exit code is 1 where a value is not right. PSNR needs Pillow; without it it is not
-looked at.
+FOLDER holds the folders by the names of ROWS. `SEGSPLAT_BIN` names the program (`served.py`). A
+table is written, and the exit code is 1 where a value is not right. PSNR needs Pillow; without it,
+PSNR is left out.
 """
 
 from __future__ import annotations

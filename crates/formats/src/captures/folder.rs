@@ -35,8 +35,8 @@ const PACKED: [(&[u8], &str); 6] = [
 
 /// Files by path, `/` between its parts.
 pub(crate) struct Folder<'a> {
-    /// What it is in messages: `archive`, `upload` or `folder`.
-    pub(crate) what: &'static str,
+    /// What it is in messages: `archive`, `upload`, or the path of a folder.
+    pub(crate) what: String,
     files: BTreeMap<String, Stored>,
     source: Source<'a>,
     pub(crate) limits: &'a Limits,
@@ -169,11 +169,12 @@ impl<'a> Folder<'a> {
     /// # Errors
     /// `invalid_request` where it cannot be listed, `limit_exceeded` for too many files.
     pub(crate) fn of_dir(dir: &Path, limits: &'a Limits) -> Result<Self> {
-        let mut folder = Self::new("folder", Source::Disk(dir.to_owned()), limits);
+        let what = dir.display().to_string();
+        let mut folder = Self::new(what.as_str(), Source::Disk(dir.to_owned()), limits);
         let mut open = vec![(String::new(), 0)];
         while let Some((inside, depth)) = open.pop() {
             let unlisted =
-                |e| Error::invalid(format!("folder: {inside:?} cannot be listed")).caused_by(e);
+                |e| Error::invalid(format!("{what}: {inside:?} cannot be listed")).caused_by(e);
             for entry in fs_err::read_dir(dir.join(&inside)).map_err(unlisted)? {
                 let entry = entry.map_err(unlisted)?;
                 let name = entry.file_name();
@@ -197,13 +198,20 @@ impl<'a> Folder<'a> {
         Ok(folder)
     }
 
-    fn new(what: &'static str, source: Source<'a>, limits: &'a Limits) -> Self {
+    fn new(what: impl Into<String>, source: Source<'a>, limits: &'a Limits) -> Self {
         let (files, unpacked) = (BTreeMap::new(), Cell::new(0));
-        Self { what, files, source, limits, unpacked, cameras_read: RefCell::default() }
+        Self {
+            what: what.into(),
+            files,
+            source,
+            limits,
+            unpacked,
+            cameras_read: RefCell::default(),
+        }
     }
 
     fn insert(&mut self, path: String, file: Stored) -> Result<()> {
-        let what = self.what;
+        let what = &self.what;
         if self.has(&path) {
             return Err(Error::invalid(format!("{what}: two entries are called {path:?}")));
         }
@@ -330,7 +338,7 @@ impl<'a> Folder<'a> {
     /// is unpacked.
     fn unpack(&self, path: &str, listed: u64, from: impl Read) -> Result<Vec<u8>> {
         self.count(path, listed)?;
-        let what = self.what;
+        let what = &self.what;
         let mut bytes = Vec::new();
         from.take(listed.saturating_add(1)).read_to_end(&mut bytes).map_err(|e| {
             Error::photo(format!("{what}: {path:?} is damaged or cut short")).caused_by(e)

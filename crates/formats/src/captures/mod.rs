@@ -197,7 +197,7 @@ fn of_folder<'a>(
     let Best { candidate, warning } = candidates::best(folder, &tests)?;
     files.extend(candidate.files);
     let Candidate { entries, held_out, place, sent, pairs, missing, .. } = candidate;
-    let (place, what) = (place.top, folder.what);
+    let (place, what) = (place.top, &folder.what);
     let sent: Vec<&str> = sent.iter().map(String::as_str).collect();
     if pairs.is_empty() {
         return Err(Error::invalid(no_photos(folder, &entries)));
@@ -250,7 +250,7 @@ fn of_folder<'a>(
 
 /// The message where no camera has its photo.
 fn no_photos(folder: &Folder<'_>, entries: &[CameraEntry]) -> String {
-    let (what, cameras) = (folder.what, entries.len());
+    let (what, cameras) = (&folder.what, entries.len());
     let first = entries.first().map_or("", |entry| entry.file.as_str());
     let mut photos = folder.paths().filter(|path| names::is_photo(path));
     let photos = match photos.next() {

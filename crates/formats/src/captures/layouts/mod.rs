@@ -81,7 +81,8 @@ pub(super) fn none(folder: &Folder<'_>) -> String {
     });
     format!(
         "{}: no transforms.json and no cameras.json in it, nor another layout with cameras; {} \
-         files were looked at, and these layouts are known: {known}{not_read}",
+         files were looked at, and these layouts are known: {known}{not_read}. Where there are \
+         photos alone, docs/captures.md has the three lines of pycolmap that find their cameras",
         folder.what,
         folder.paths().count()
     )
