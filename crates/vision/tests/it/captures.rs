@@ -185,7 +185,7 @@ fn of_several_models_of_colmap_the_largest_is_read() {
     }
     files.retain(|file| !file.name.starts_with("images_4"));
     let error = read(files).unwrap_err();
-    assert!(error.message().contains("\"right\" and in \"left\""), "{error}");
+    assert!(error.message().contains("in \"left\" and in \"right\""), "{error}");
 }
 
 /// Code, value and message of all warnings.
@@ -443,7 +443,7 @@ fn damaged_models_of_colmap_are_refused() {
     let mut lines: Vec<String> =
         (0..10).map(|count| words[..count].join(" ")).filter(|line| !line.is_empty()).collect();
     for at in 1..9 {
-        for word in ["nan", "inf", "x", "1,5"] {
+        for word in ["nan", "inf", "x", "1,5,0"] {
             let mut words = words.clone();
             words[at] = word;
             lines.push(words.join(" "));
