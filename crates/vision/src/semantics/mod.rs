@@ -1,8 +1,8 @@
 //! From masks and embeddings to meaning: crops, the bank, an entry for each Gaussian, scores of a
 //! text.
 //!
-//! In: photos, their masks and one embedding for each mask. Out: a [`Bank`] of few rows, the entry
-//! of each Gaussian, and for a text embedding the tables, maps and instances in 3D that answer
+//! In: photos, their masks and one embedding for each mask. Out: a
+//! [`Bank`](segsplat_core::scene::Bank) of few rows, the entry of each Gaussian, and for a text embedding the tables, maps and instances in 3D that answer
 //! "where is it?". This module knows no network, no renderer and no word.
 //!
 //! The formulas are the short forms of `docs/conventions.md`: no pixel gets a feature of the
