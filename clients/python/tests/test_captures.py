@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 from served import ROOT, run
 
-from segsplat import Client, calls, photos
+from segsplat import Client, calls, formats, photos
 from segsplat.wire import Part
 
 FOLDERS = ["", "images/", "depth/", "a/lowres_depth/", "highres_depth/b/", "confidence/",
@@ -35,7 +35,7 @@ def rule(name: str) -> re.Pattern[str]:
 def test_the_page_and_the_package_send_the_same_files() -> None:
     photo, cameras = map(rule, ["PHOTO", "CAMERAS"])
     left_out = [*map(rule, ["HIDDEN", "UNREAD_FILE", "UNREAD_FOLDER"])]
-    endings = [*sorted(calls.PHOTOS | calls.CAMERAS), *calls.SPLATS, *OTHERS]
+    endings = [*sorted(calls.PHOTOS | calls.CAMERAS), *formats.SPLATS, *OTHERS]
     sent = 0
     for folder, stem, ending in itertools.product(FOLDERS, STEMS, endings):
         name = folder + stem + ending
