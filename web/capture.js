@@ -1,6 +1,6 @@
 // What was dropped: photos and their cameras, what is wrong with each, and what is made smaller,
 // before it is sent.
-const PHOTO = /\.(jpe?g|png|webp)$/i,
+const PHOTO = /\.(jpe?g|jfif|png|webp)$/i,
   ARCHIVE = /\.(zip|tar)$/i,
   // Files of cameras that the server knows by their paths (docs/captures.md).
   CAMERAS = /(\.(json|txt|bin|npy|traj|pincam)|(^|\/)metadata)$/i,

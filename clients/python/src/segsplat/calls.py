@@ -71,7 +71,7 @@ CAMERAS_MAX = 64
 
 #: Endings of photos and of files of cameras; files of COLMAP and folders of phones that are not
 #: read.
-PHOTOS = frozenset({".png", ".jpg", ".jpeg", ".webp"})
+PHOTOS = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp"})
 CAMERAS = frozenset({".json", ".txt", ".bin", ".npy", ".traj", ".pincam"})
 #: Photos of formats that are not read, and what to do.
 OTHER_PHOTOS = frozenset({".heic", ".heif", ".avif", ".tif", ".tiff", ".bmp", ".dng", ".jxl"})

@@ -23,7 +23,7 @@ use crate::{
 };
 
 /// Extensions tried where a camera's file has none, as instant-ngp does.
-const EXTENSIONS: [&str; 4] = ["png", "jpg", "jpeg", "webp"];
+const EXTENSIONS: [&str; 5] = ["png", "jpg", "jpeg", "jfif", "webp"];
 
 /// A relative path with `/` between parts, or `None` when it is empty, absolute, holds a NUL or
 /// leaves the folder.

@@ -2,7 +2,8 @@
 //! text.
 //!
 //! In: photos, their masks and one embedding for each mask. Out: a
-//! [`Bank`](segsplat_core::scene::Bank) of few rows, the entry of each Gaussian, and for a text embedding the tables, maps and instances in 3D that answer
+//! [`Bank`](segsplat_core::scene::Bank) of few rows, the entry of each Gaussian, and for a text
+//! embedding the tables, maps and instances in 3D that answer
 //! "where is it?". This module knows no network, no renderer and no word.
 //!
 //! The formulas are the short forms of `docs/conventions.md`: no pixel gets a feature of the
