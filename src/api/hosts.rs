@@ -7,10 +7,9 @@
 
 use std::net::IpAddr;
 
-use super::short;
 use crate::{
     config::Config,
-    error::{Error, ErrorCode, Result},
+    error::{Error, ErrorCode, Result, short},
 };
 
 /// The hosts that calls may name.

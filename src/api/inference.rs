@@ -1,8 +1,7 @@
 //! What the Open Inference Protocol, version 2, calls tensors: the same over HTTP and gRPC.
 
-use super::short;
 use crate::{
-    error::{Error, Result},
+    error::{Error, Result, short},
     models::{TensorData, TensorKind},
 };
 

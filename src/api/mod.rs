@@ -109,8 +109,3 @@ fn server_timing<'a>(stages: impl Iterator<Item = (&'a str, f64)>) -> String {
     let times = stages.map(|(stage, ms)| format!("{stage};dur={ms:.2}"));
     times.collect::<Vec<_>>().join(", ")
 }
-
-/// The first characters of a text from a caller, for messages.
-fn short(text: &str) -> String {
-    text.chars().take(80).collect()
-}

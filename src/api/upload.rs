@@ -11,9 +11,8 @@ use std::{
     },
 };
 
-use super::short;
 use crate::{
-    error::{Error, ErrorCode, Result},
+    error::{Error, ErrorCode, Result, short},
     limits::Limits,
     scene::{Upload, UploadCameras, UploadFile},
     telemetry::meter,

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::{Service, tasks::blocking};
+use super::{shared::Service, tasks::blocking};
 use crate::{
     error::{Error, ErrorCode, Result},
     scene::{SceneError, SceneId, SceneState},

@@ -4,7 +4,13 @@ use std::{sync::Arc, time::Duration};
 
 use sha2::{Digest, Sha256};
 
-use super::{Inner, Service, refine, request::CreateScene, tasks::blocking, types::Created};
+use super::{
+    refine,
+    request::CreateScene,
+    shared::{KEY_LOCKS, Service, Shared},
+    tasks::blocking,
+    types::Created,
+};
 use crate::{
     error::{Error, Result},
     keys::Caller,
@@ -13,9 +19,6 @@ use crate::{
     store::{self, Record},
     telemetry,
 };
-
-/// Locks that calls with one idempotency key share with few others.
-pub(super) const KEY_LOCKS: usize = 16;
 
 /// A create call that waits. When its caller goes away before it has the id, and nobody else
 /// watches the scene, the scene is deleted.
@@ -130,7 +133,7 @@ impl Service {
     }
 }
 
-impl Inner {
+impl Shared {
     fn submit_here(
         &self,
         upload: Upload,

@@ -13,13 +13,13 @@ use tokio::{
 };
 
 use super::{
-    Inner, Service,
     access::SceneAccess,
     features,
     page::write_page,
     query,
     request::{QuerySpec, TextOptions, ViewOptions},
     search::ScoringChoice,
+    shared::{Service, Shared},
     tags::{cache_key, etag, semantics_tag, text_key},
     tasks::blocking,
     texts,
@@ -216,7 +216,7 @@ impl Export {
     /// while it is written, beside the scene, and that of a folder.
     pub(super) fn placed(
         self,
-        inner: &Arc<Inner>,
+        inner: &Arc<Shared>,
         work_bytes: u64,
         folder: Option<OwnedSemaphorePermit>,
     ) -> Self {

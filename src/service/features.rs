@@ -11,10 +11,10 @@ use std::{
 use rayon::prelude::*;
 
 use super::{
-    Service,
     request::{FeatureKind, FeaturesSpec, Kind, ViewSpec},
     schedule::Demand,
     search::{LabelledView, SceneTexts, ScoringChoice},
+    shared::Service,
     tags::{cache_key, etag},
     texts::check_scoring,
     types::Export,

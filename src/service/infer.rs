@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use super::{Service, tasks::blocking};
+use super::{shared::Service, tasks::blocking};
 use crate::{
-    error::{Error, ErrorCode, Result},
+    error::{Error, ErrorCode, Result, short},
     jobs::NetworkState,
     models::{NetworkTensors, Tensor},
     pipeline::NETWORKS,
@@ -81,9 +81,8 @@ impl Service {
         if names.contains(&name) {
             return Ok(());
         }
-        let shown: String = name.chars().take(80).collect();
         let names = if names.is_empty() { "none".to_owned() } else { names.join(", ") };
-        let why = format!("no network {shown:?}; the bundle has {names}");
+        let why = format!("no network {:?}; the bundle has {names}", short(name));
         Err(Error::new(ErrorCode::NotFound, why))
     }
 }

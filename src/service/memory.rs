@@ -7,7 +7,6 @@ use fs_err as fs;
 use parking_lot::Mutex;
 use tokio::{sync::Notify, time::Instant};
 
-use super::{Inner, Service};
 use crate::{
     error::{Error, ErrorCode, Result},
     limits::Limits,
@@ -100,8 +99,8 @@ impl Memory {
         Err(Error::new(ErrorCode::Overloaded, message).retry_after_s(RETRY_AFTER_S))
     }
 
-    /// Bytes for an answer.
-    fn answer(&self, bytes: u64, limits: &Limits) -> Result<Share> {
+    /// Bytes for an answer, which are taken until they are sent.
+    pub(super) fn answer(&self, bytes: u64, limits: &Limits) -> Result<Share> {
         if bytes >= LARGE_ANSWER_BYTES {
             self.admit(usize::try_from(bytes).unwrap_or(usize::MAX))?;
         }
@@ -116,6 +115,24 @@ impl Memory {
             );
             Error::new(ErrorCode::Overloaded, message).retry_after_s(1)
         })
+    }
+
+    /// The same, where the caller can wait for room.
+    pub(super) async fn answer_by(
+        &self,
+        bytes: u64,
+        limits: &Limits,
+        until: Instant,
+    ) -> Result<Share> {
+        loop {
+            let freed = self.answers.freed.notified();
+            match self.answer(bytes, limits) {
+                Err(error) if Instant::now() >= until => return Err(error),
+                // There may be room in the memory without a word from the budget.
+                Err(_) => drop(tokio::time::timeout(LOOK_AGAIN, freed).await),
+                share => return share,
+            }
+        }
     }
 
     /// A place for an export that takes so many bytes while it is written.
@@ -134,36 +151,6 @@ impl Memory {
             refused(format!("exports take {taken} MiB already; {more} MiB more are over {max} MiB"))
         })?;
         Ok([place, bytes])
-    }
-}
-
-impl Inner {
-    /// Bytes for an answer, which are taken until they are sent.
-    pub(super) fn answer_bytes(&self, bytes: u64) -> Result<Share> {
-        self.memory.answer(bytes, &self.limits())
-    }
-
-    /// The same, where the caller can wait for room.
-    pub(super) async fn answer_bytes_by(&self, bytes: u64, until: Instant) -> Result<Share> {
-        loop {
-            let freed = self.memory.answers.freed.notified();
-            match self.answer_bytes(bytes) {
-                Err(error) if Instant::now() >= until => return Err(error),
-                // There may be room in the memory without a word from the budget.
-                Err(_) => drop(tokio::time::timeout(LOOK_AGAIN, freed).await),
-                share => return share,
-            }
-        }
-    }
-}
-
-impl Service {
-    /// Bytes of a whole answer, which are taken until it is sent.
-    ///
-    /// # Errors
-    /// `overloaded` where too many bytes wait for their callers already.
-    pub fn answer_bytes(&self, bytes: u64) -> Result<Share> {
-        self.inner.answer_bytes(bytes)
     }
 }
 

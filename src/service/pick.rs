@@ -3,10 +3,10 @@
 use std::sync::Arc;
 
 use super::{
-    Service,
     request::{Kind, PickSpec, ViewSpec},
     schedule::Demand,
     search::{SceneTexts, ScoredText, ScoringChoice},
+    shared::Service,
     texts,
     types::{Label, Picked},
     view::{Inputs, Resolved, resolve_one},

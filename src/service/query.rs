@@ -7,13 +7,13 @@ use glam::DMat4;
 use rayon::prelude::*;
 
 use super::{
-    Service,
     encode::{self, Layer},
     request::{
         Boxes, CameraSpec, Format, Kind, LensSpec, MaskFormat, PoseSpec, QuerySpec, ViewSpec,
     },
     schedule::Demand,
     search::{LabelledView, SceneTexts, ScoredText, ScoringChoice},
+    shared::Service,
     texts,
     times::{ViewTimes, staged},
     types::{InstanceBox, Peak, QueryAnswer, TextResult, TextView},

@@ -10,9 +10,9 @@ use std::{
 };
 
 use super::{
-    Inner, Service,
     access::SceneAccess,
     search::{SceneTexts, ScoringChoice, SemanticScene},
+    shared::{Service, Shared},
     tasks::blocking,
     times::{ms, staged},
     work::Work,
@@ -26,7 +26,7 @@ use crate::{
 /// When to ask again for semantics that are being made, seconds.
 const RETRY_AFTER_S: u32 = 2;
 
-impl Inner {
+impl Shared {
     /// Refuses `what` where the loaded bundle cannot do it.
     pub(super) fn can_understand(&self, what: &str) -> Result<()> {
         let Some(lack) = self.backend.lacks() else { return Ok(()) };

@@ -7,7 +7,6 @@ use tokio::sync::mpsc;
 use tracing::Instrument;
 
 use super::{
-    Inner, Service,
     access::SceneAccess,
     camera,
     encode::{self, Layer},
@@ -17,6 +16,7 @@ use super::{
     },
     schedule::Demand,
     search::{Backend, LabelledView, SceneTexts, ScoringChoice, SemanticScene},
+    shared::{Service, Shared},
     tags::{cache_key, etag, record_semantics_tag, record_tag, scene_tag, text_key},
     tasks::Task,
     texts,
@@ -368,7 +368,7 @@ fn resolve<'a>(
     cameras.iter().enumerate().map(resolved).collect()
 }
 
-impl Inner {
+impl Shared {
     /// Checks the text of a request; the bundle first, because no text works without networks.
     fn checked_ask(&self, kinds: &[Kind], ask: &TextOptions) -> Result<TextOptions> {
         if let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) {
@@ -427,7 +427,7 @@ impl Inner {
         };
         let inner = Arc::clone(self);
         let draw = move |work: &mut Work| {
-            let held = held.map_or_else(|| inner.answer_bytes(bytes_max), Ok)?;
+            let held = held.map_or_else(|| inner.memory.answer(bytes_max, &inner.limits()), Ok)?;
             Ok(holding(draw(work)?, held))
         };
         self.scheduled(demand, deadline, "the view", draw).await
@@ -518,7 +518,7 @@ impl Service {
         let kinds = spec.kinds.clone();
         let ask = inner.checked_ask(&kinds, &spec.text)?;
         if kinds.iter().any(|kind| kind.needs_semantics()) {
-            Inner::may_be_asked(scene.record(), "views")?;
+            Shared::may_be_asked(scene.record(), "views")?;
         }
         let all = resolve(limits, scene.record(), &spec)?;
         let pixels: u64 = all.iter().map(Resolved::pixels).sum::<u64>() * kinds.len() as u64;
@@ -541,7 +541,10 @@ impl Service {
                 let held = |one: Resolved| {
                     let inner = Arc::clone(&inner);
                     async move {
-                        let held = inner.answer_bytes_by(one.bytes_max(), last.into()).await?;
+                        let held = inner
+                            .memory
+                            .answer_by(one.bytes_max(), &inner.limits(), last.into())
+                            .await?;
                         Ok::<_, Error>((one, Some(held)))
                     }
                 };

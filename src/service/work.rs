@@ -12,9 +12,9 @@ use std::{
 use tracing::Instrument;
 
 use super::{
-    Inner,
     request::ViewOptions,
     schedule::{Demand, Slot},
+    shared::Shared,
     tasks::blocking,
     times::ms,
 };
@@ -64,7 +64,7 @@ impl Drop for StopOnDrop {
     }
 }
 
-impl Inner {
+impl Shared {
     /// Runs `work` on a blocking thread within the deadline. `what` names it in the error.
     pub(super) async fn in_time<T: Send + 'static>(
         &self,

@@ -124,6 +124,11 @@ pub struct Error {
     source: Option<Box<dyn std::error::Error + Send + Sync>>,
 }
 
+/// The first characters of a text from a caller or a file, for messages.
+pub fn short(text: &str) -> String {
+    text.chars().take(80).collect()
+}
+
 impl Error {
     /// An error of `code` with a message for the client.
     pub fn new(code: ErrorCode, message: impl Into<String>) -> Self {

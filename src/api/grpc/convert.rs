@@ -4,8 +4,7 @@ use std::time::Duration;
 
 use super::pb;
 use crate::{
-    api::short,
-    error::{Error, Result},
+    error::{Error, Result, short},
     scene::{
         CameraToWorld, DropCount, HealthReport, Intrinsics, Refine, RefineReport, RefineState,
         ScoringMethod, SemanticsReport, StageTime, Warning,

@@ -20,9 +20,8 @@ use crate::{
         inference::{
             EXTENSIONS, PLATFORM, SERVER, datatype, kind_of, of_bytes, shape_of, to_bytes,
         },
-        short,
     },
-    error::{Error, ErrorCode, Result},
+    error::{Error, ErrorCode, Result, short},
     models::{Tensor, TensorData, TensorKind, TensorSpec},
     service::InferSpec,
 };

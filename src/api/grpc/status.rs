@@ -7,8 +7,8 @@ use tonic::{
 };
 
 use crate::{
-    api::{log_error, short},
-    error::{Error, ErrorCode, TABLE},
+    api::log_error,
+    error::{Error, ErrorCode, TABLE, short},
 };
 
 /// Metadata key of the table's code.

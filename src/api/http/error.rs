@@ -13,13 +13,10 @@ use axum::{
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::middleware;
+use super::headers::is_grpc;
 use crate::{
-    api::{
-        grpc::{self, retry_after_s},
-        short,
-    },
-    error::{Error, ErrorCode},
+    api::grpc::{self, retry_after_s},
+    error::{Error, ErrorCode, short},
     scene::SceneId,
 };
 
@@ -196,7 +193,7 @@ impl ApiError {
 
 /// Answer of a path that no route has; gRPC callers get gRPC's own `UNIMPLEMENTED`.
 pub(super) async fn no_such_route(request: Request) -> Response {
-    if middleware::is_grpc(request.headers()) {
+    if is_grpc(request.headers()) {
         return grpc::unimplemented(request.uri().path()).map(Body::new);
     }
     let message = format!("no such route: {} {}", request.method(), short(request.uri().path()));

@@ -21,10 +21,7 @@ use serde::{
     forward_to_deserialize_any,
 };
 
-use crate::{
-    api::short,
-    error::{Error, Result},
-};
+use crate::error::{Error, Result, short};
 
 /// What was given for a name.
 #[derive(Clone, Debug)]

@@ -13,7 +13,7 @@ use axum::{
 use flate2::{Compression, write::GzEncoder};
 use http_body::Body as _;
 
-use super::{error::ApiError, middleware::text_of};
+use super::{error::ApiError, headers::text_of};
 use crate::error::Error;
 
 /// Fewer bytes go in one packet anyway; more would take a processor too long.

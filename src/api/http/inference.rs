@@ -14,7 +14,7 @@ use serde_json::{Map, Value};
 use utoipa::ToSchema;
 
 use super::{
-    error::ApiError, extract::CallerApi, fields::Fields, health::status, middleware::text_of,
+    error::ApiError, extract::CallerApi, fields::Fields, headers::text_of, health::status,
     multipart::read_on,
 };
 use crate::{
@@ -23,10 +23,9 @@ use crate::{
         inference::{
             EXTENSIONS, PLATFORM, SERVER, datatype, kind_of, of_bytes, shape_of, to_bytes,
         },
-        short,
         upload::UploadGuard,
     },
-    error::{Error, Result},
+    error::{Error, Result, short},
     limits::Limits,
     models::{Tensor, TensorData, TensorKind, TensorSpec},
     service::InferSpec,

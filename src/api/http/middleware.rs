@@ -17,10 +17,11 @@ use tracing::{Instrument, Span, field::Empty};
 use super::{
     body::{Pace, hold},
     error::{ApiError, asks_for_problem},
+    headers::{is_grpc, text_of},
 };
 use crate::{
-    api::{Api, Held, access, access::Access, grpc, log_error, request_id, short},
-    error::{Error, ErrorCode, Result},
+    api::{Api, Held, access, access::Access, grpc, log_error, request_id},
+    error::{Error, ErrorCode, Result, short},
     keys::Scope,
     telemetry::{self, meter},
 };
@@ -273,19 +274,6 @@ fn check_origin(api: &Api, request: &Request) -> Result<()> {
     let message =
         format!("a page of {:?} calls; to allow it, name it in cors_origins", short(origin));
     Err(Error::new(ErrorCode::PermissionDenied, message))
-}
-
-/// Whether these are headers of gRPC: `application/grpc`, with a format behind a plus or without.
-/// gRPC-Web is not served.
-pub(super) fn is_grpc(headers: &HeaderMap) -> bool {
-    let kind = text_of(headers, header::CONTENT_TYPE.as_str()).unwrap_or_default();
-    let kind = kind.split([';', '+']).next().unwrap_or_default().trim();
-    kind.eq_ignore_ascii_case("application/grpc")
-}
-
-/// The value of a header, where it is text.
-pub(super) fn text_of<'a>(headers: &'a HeaderMap, name: &str) -> Option<&'a str> {
-    headers.get(name)?.to_str().ok()
 }
 
 fn set(headers: &mut HeaderMap, name: &'static str, text: &str) {

@@ -10,6 +10,7 @@ mod error;
 mod extract;
 mod fields;
 mod gzip;
+mod headers;
 mod health;
 mod inference;
 mod middleware;

@@ -14,13 +14,13 @@ use axum::{
 use futures_util::{Stream, StreamExt, stream};
 use utoipa::ToSchema;
 
-use super::{error::ApiError, fields::Fields, middleware::text_of};
+use super::{error::ApiError, fields::Fields, headers::text_of};
 use crate::{
     api::{
-        Api, short,
+        Api,
         upload::{UploadBuilder, UploadGuard},
     },
-    error::{Error, Result},
+    error::{Error, Result, short},
     formats::captures::decoded_name,
     scene::{SceneOptions, Upload, UploadCameras},
 };

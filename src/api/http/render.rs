@@ -18,11 +18,12 @@ use super::{
     error::ApiError,
     extract::{CallerApi, Id},
     fields::Fields,
-    middleware::{Deadline, text_of},
+    headers::text_of,
+    middleware::Deadline,
 };
 use crate::{
-    api::{Held, server_timing, short},
-    error::{Error, ErrorCode, Result},
+    api::{Held, server_timing},
+    error::{Error, ErrorCode, Result, short},
     service::{
         CameraFields, CameraSpec, Export, ExportFormat, FeatureKind, FeaturesSpec, Format, Kind,
         PictureOptions, Preset, RenderedView, ScoringOptions, TextOptions, ViewOptions, ViewSpec,

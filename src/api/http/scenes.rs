@@ -19,7 +19,7 @@ use super::{
     error::ApiError,
     extract::{CallerApi, Id},
     fields::Fields,
-    middleware::text_of,
+    headers::text_of,
     multipart::{ArchiveBody, UploadForm, read_upload},
 };
 use crate::{

@@ -21,7 +21,8 @@ use super::{
     error::{ApiError, ErrorBody},
     extract::{CallerApi, Id, JsonBody},
     fields::Fields,
-    middleware::{Deadline, text_of},
+    headers::text_of,
+    middleware::Deadline,
     render::{camera, content_type, view_headers},
 };
 use crate::{

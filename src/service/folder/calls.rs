@@ -17,11 +17,12 @@ use crate::{
     limits::Limits,
     scene::{Preset, Scene, SceneId, Upload},
     service::{
-        Inner, OfflineService, Service,
+        OfflineService,
         export::stream_until,
         request::{ScoringOptions, TextOptions, ViewOptions},
         schedule::Demand,
         search::{SceneTexts, ScoringChoice},
+        shared::{Service, Shared},
         tags::{cache_key, etag, semantics_tag},
         tasks::blocking,
         texts,
@@ -36,7 +37,7 @@ const RETRY_AFTER_S: u32 = 5;
 
 /// Views of a server.
 struct Scheduled {
-    inner: Arc<Inner>,
+    inner: Arc<Shared>,
     runtime: Handle,
     caller: Caller,
     scene: Arc<Scene>,
@@ -76,7 +77,7 @@ impl Views for Scheduled {
     }
 }
 
-impl Inner {
+impl Shared {
     /// A permit to write a folder.
     fn folder_permit(&self) -> Result<OwnedSemaphorePermit> {
         Arc::clone(&self.folders).try_acquire_owned().map_err(|_| {

@@ -2,7 +2,7 @@
 
 use serde::Deserialize;
 
-use crate::scene::Camera;
+use crate::{error::short, scene::Camera};
 
 /// 8-bit sRGB pixels, row-major, with the pixels that have a source.
 #[derive(Clone, Debug)]
@@ -55,6 +55,5 @@ pub struct PosedPhoto {
 
 /// How a photo is called in messages: `photo 3 ("images/0003.jpg")`.
 pub fn photo_label(index: usize, file: &str) -> String {
-    let shown: String = file.chars().take(80).collect();
-    format!("photo {index} ({shown:?})")
+    format!("photo {index} ({:?})", short(file))
 }

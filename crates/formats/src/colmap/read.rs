@@ -11,7 +11,7 @@ use crate::{
         Base, CameraEntry, Described, Folder, Layout, Lens, PoseAxes, Terms, count, inverse, names,
         number_of, numbers, pinhole, rotation, text,
     },
-    error::{Error, Result},
+    error::{Error, Result, short},
 };
 
 pub(crate) struct Colmap;
@@ -284,8 +284,8 @@ fn entry(
     path: &str,
 ) -> Result<CameraEntry> {
     let lens = lenses.get(&camera).ok_or_else(|| {
-        let shown: String = name.chars().take(80).collect();
-        Error::invalid(format!("{path}: {shown:?} has camera {camera}, which is not there"))
+        let name = short(name);
+        Error::invalid(format!("{path}: {name:?} has camera {camera}, which is not there"))
     })?;
     let pose = inverse(rotation(turn), translation.into());
     Ok(CameraEntry::new(name.to_owned(), lens.clone(), PoseAxes::OpenCv, pose))

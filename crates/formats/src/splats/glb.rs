@@ -29,7 +29,7 @@ use super::{
 };
 use crate::{
     container::read_semantics,
-    error::{Error, Result},
+    error::{Error, Result, short},
     limits::Limits,
     scene::{Gaussians, RawGaussians, SH_C0, SceneId, Semantics},
 };
@@ -369,7 +369,7 @@ fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
         return Err(bad(format!("it needs the extension {name:?}, which is not read")));
     }
     if let Some(uri) = document.buffers.iter().find_map(|buffer| buffer.uri.as_deref()) {
-        let uri: String = uri.chars().take(80).collect();
+        let uri = short(uri);
         return Err(bad(format!("a buffer is in the other file {uri:?}; one file is read")));
     }
     let file = Opened { document, binary, limits };
@@ -602,7 +602,7 @@ fn understood(primitive: &Primitive, extension: &Extension) -> Result<()> {
             // Files with SPZ are older than these words.
             None if enclosed(primitive, extension).is_some() => {}
             other => {
-                let other: String = other.unwrap_or_default().chars().take(80).collect();
+                let other = short(other.unwrap_or_default());
                 return Err(bad(format!("{name} is {other:?}; {known:?} is read")));
             }
         }

@@ -34,7 +34,7 @@ use super::{
     packed_ply::morton_order, some, steps, unreadable, world,
 };
 use crate::{
-    error::{Error, Result},
+    error::{Error, Result, short},
     limits::Limits,
 };
 
@@ -355,7 +355,7 @@ struct Bundle<'a> {
 impl Bundle<'_> {
     /// A file of the bundle, not over so many bytes.
     fn file(&self, wanted: &str, bytes_max: u64) -> Result<Vec<u8>> {
-        let shown: String = wanted.chars().take(80).collect();
+        let shown = short(wanted);
         let damaged = || bad("the zip is damaged or cut short");
         let config = zip::read::Config::default();
         let mut zip = ZipIterable::try_new(Cursor::new(self.zip), config).map_err(|_| damaged())?;
@@ -383,7 +383,7 @@ impl Bundle<'_> {
 
     /// Columns and pixels of a picture that has so many pixels at least.
     fn picture(&self, name: &str, pixels_min: usize) -> Result<(usize, Vec<[u8; 4]>)> {
-        let shown: String = name.chars().take(80).collect();
+        let shown = short(name);
         let webp = self.file(name, self.limits.splats_bytes_max)?;
         let damaged = || bad(format!("{shown:?} is no WebP picture that can be read"));
         let decoder = WebPDecoder::new(Cursor::new(&webp)).map_err(|_| damaged())?;
@@ -494,7 +494,7 @@ impl Bundle<'_> {
         let rows = of.count.div_ceil(CENTROIDS_A_ROW);
         let (width, centroids) = self.picture(&of.files[0], wanted * rows)?;
         if width != wanted {
-            let name: String = of.files[0].chars().take(80).collect();
+            let name = short(&of.files[0]);
             return Err(bad(format!("{name:?} is {width} pixels wide; it must be {wanted}")));
         }
         let (_, labels) = self.picture(&of.files[1], n)?;

@@ -4,7 +4,7 @@
 //! can be an index into its weights. So a tensor must have the sizes and the numbers that the
 //! program's own runs may have. [`TensorSpec`] says which.
 
-use crate::error::{Error, Result};
+use crate::error::{Error, Result, short};
 
 /// Largest size of a dimension that neither file nor manifest bounds.
 const FREE_MAX: usize = 64;
@@ -172,7 +172,7 @@ impl NetworkTensors {
     pub(super) fn check(&self, given: &[Tensor]) -> Result<()> {
         let names = || self.inputs.iter().map(|input| &*input.name).collect::<Vec<_>>().join(", ");
         for (i, tensor) in given.iter().enumerate() {
-            let name = shown(&tensor.name);
+            let name = short(&tensor.name);
             if given[..i].iter().any(|before| before.name == tensor.name) {
                 return Err(Error::invalid(format!("input {name:?} is given twice")));
             }
@@ -221,19 +221,14 @@ impl NetworkTensors {
         let chosen = |(i, name): (usize, &String)| {
             let name = name.as_str();
             if only[..i].iter().any(|before| before == name) {
-                return Err(Error::invalid(format!("output {:?} is asked twice", shown(name))));
+                return Err(Error::invalid(format!("output {:?} is asked twice", short(name))));
             }
             self.outputs.iter().find(|output| output.name == name).ok_or_else(|| {
                 let all: Vec<&str> = self.outputs.iter().map(|output| &*output.name).collect();
                 let must = format!("the network gives {}", all.join(", "));
-                Error::invalid(format!("output {:?} is unknown; {must}", shown(name)))
+                Error::invalid(format!("output {:?} is unknown; {must}", short(name)))
             })
         };
         only.iter().enumerate().map(chosen).collect()
     }
-}
-
-/// The first characters of a name from a caller, for messages.
-fn shown(name: &str) -> String {
-    name.chars().take(80).collect()
 }

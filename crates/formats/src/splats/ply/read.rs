@@ -6,7 +6,7 @@ use glam::DVec3;
 
 use crate::{
     container::read_semantics,
-    error::{Error, Result},
+    error::{Error, Result, short},
     limits::Limits,
     scene::{RawGaussians, SH_C0, SceneId, Semantics, SourcePixel},
 };
@@ -227,7 +227,7 @@ impl Header {
                 ["comment", name, bytes] if name == SEMANTICS => {
                     semantics =
                         Some(bytes.parse().map_err(|e| {
-                            bad(format!("bytes of semantics {:?}: {e}", shown(bytes)))
+                            bad(format!("bytes of semantics {:?}: {e}", short(bytes)))
                         })?);
                 }
                 ["comment" | "obj_info", ..] => {
@@ -239,7 +239,7 @@ impl Header {
                 ["format", "binary_little_endian", "1.0"] => big_endian = Some(false),
                 ["format", "binary_big_endian", "1.0"] => big_endian = Some(true),
                 ["format", ..] => {
-                    return Err(bad(format!("`{}`; only binary is read", shown(&line))));
+                    return Err(bad(format!("`{}`; only binary is read", short(&line))));
                 }
                 ["element", name, number] => {
                     let names: Vec<&str> = elements.iter().map(|e| e.name.as_str()).collect();
@@ -248,7 +248,7 @@ impl Header {
                         ([] | [CHUNK], _) => {
                             return Err(bad(format!(
                                 "`{}` stands before the vertices",
-                                shown(&line)
+                                short(&line)
                             )));
                         }
                         // What follows the vertices is not read.
@@ -257,7 +257,7 @@ impl Header {
                     if is_read {
                         let what = if name == "vertex" { "vertices" } else { name };
                         let count = number.parse().map_err(|e| {
-                            bad(format!("number of {what} {:?}: {e}", shown(number)))
+                            bad(format!("number of {what} {:?}: {e}", short(number)))
                         })?;
                         elements.push(Element {
                             name: name.to_owned(),
@@ -274,7 +274,7 @@ impl Header {
                 _ if line.contains(char::REPLACEMENT_CHARACTER) => {
                     return Err(bad("the header is not text"));
                 }
-                _ => return Err(bad(format!("header line {:?} is not known", shown(&line)))),
+                _ => return Err(bad(format!("header line {:?} is not known", short(&line)))),
             }
         }
         let big_endian = big_endian.ok_or_else(|| bad("the header has no `format`"))?;
@@ -368,10 +368,10 @@ impl Element {
 
 fn push_attribute(attributes: &mut Vec<Attribute>, scalar: &str, name: &str) -> Result<()> {
     let scalar = Scalar::parse(scalar).ok_or_else(|| {
-        bad(format!("type {:?} of {:?} is not known", shown(scalar), shown(name)))
+        bad(format!("type {:?} of {:?} is not known", short(scalar), short(name)))
     })?;
     if attributes.iter().any(|attribute| attribute.name == name) {
-        return Err(bad(format!("the vertices have {:?} twice", shown(name))));
+        return Err(bad(format!("the vertices have {:?} twice", short(name))));
     }
     if attributes.len() == ATTRIBUTES_MAX {
         return Err(Error::limit("PLY: attributes of a vertex", "one more", ATTRIBUTES_MAX));
@@ -379,11 +379,6 @@ fn push_attribute(attributes: &mut Vec<Attribute>, scalar: &str, name: &str) -> 
     let offset = attributes.last().map_or(0, |last| last.offset + last.scalar.size());
     attributes.push(Attribute { name: name.to_owned(), scalar, offset });
     Ok(())
-}
-
-/// The start of a word of the file, for a message.
-fn shown(text: &str) -> String {
-    text.chars().take(80).collect()
 }
 
 /// Names of colours that are no harmonics.

@@ -1,0 +1,243 @@
+//! What every call of the service works with: [`Service`], its parts, its start and its end.
+
+use std::{fmt, sync::Arc};
+
+use tokio::sync::{Semaphore, watch};
+
+use super::{
+    memory::{Memory, Share},
+    schedule::Scheduler,
+    search::Backend,
+    types::{ModelsInfo, Readiness},
+};
+use crate::{
+    config::Config,
+    error::Result,
+    jobs::{JobParts, Jobs, NetworkState, SceneNetworks, SemanticNetworks, refiner},
+    keys::Caller,
+    limits::{Limits, LiveLimits},
+    render::Renderer,
+    scene::Refine,
+    store::{Place, Store},
+};
+
+/// Uploads decoded at the same time: each may hold `limits.photos_max` photos in memory.
+const UPLOADS_READ_MAX: usize = 2;
+/// Locks that calls with one idempotency key share with few others.
+pub(super) const KEY_LOCKS: usize = 16;
+
+/// The use cases, for one caller. Cloning shares everything.
+///
+/// A scene that the caller may not see is in no way different from one that does not exist.
+#[derive(Clone, Debug)]
+pub struct Service {
+    pub(super) inner: Arc<Shared>,
+    pub(super) caller: Caller,
+}
+
+/// What the service works with.
+#[derive(Clone)]
+pub struct Parts {
+    /// Make scenes of photos.
+    pub scenes: Arc<dyn SceneNetworks>,
+    /// Make semantics of scenes, and embeddings of texts.
+    pub semantics: Arc<dyn SemanticNetworks>,
+    /// Draws views of scenes.
+    pub renderer: Arc<dyn Renderer>,
+    /// What `/v1/models` says; the renderer and the version are filled in.
+    pub models: ModelsInfo,
+}
+
+impl fmt::Debug for Parts {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Parts").field("renderer", &self.renderer.name()).finish_non_exhaustive()
+    }
+}
+
+/// What all clones of a [`Service`] share.
+pub(super) struct Shared {
+    pub(super) config: Config,
+    /// Caps in force: those of the configuration, or newer ones. The jobs have the same.
+    pub(super) limits: Arc<LiveLimits>,
+    pub(super) store: Arc<Store>,
+    pub(super) jobs: Arc<Jobs>,
+    /// Networks that run by themselves; the jobs have the same.
+    pub(super) networks: Arc<dyn SceneNetworks>,
+    pub(super) backend: Arc<Backend>,
+    pub(super) models: ModelsInfo,
+    pub(super) scheduler: Arc<Scheduler>,
+    /// Permits to decode uploads.
+    pub(super) reading: Arc<Semaphore>,
+    /// Permits to write folders.
+    pub(super) folders: Arc<Semaphore>,
+    /// Permits to run networks.
+    pub(super) inferences: Arc<Semaphore>,
+    pub(super) key_locks: [tokio::sync::Mutex<()>; KEY_LOCKS],
+    pub(super) memory: Memory,
+    /// Whether callers who wait for what is being made are answered at once.
+    pub(super) stopping: watch::Sender<bool>,
+}
+
+impl fmt::Debug for Shared {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Shared").field("config", &self.config).finish_non_exhaustive()
+    }
+}
+
+impl Shared {
+    pub(super) fn limits(&self) -> Arc<Limits> {
+        self.limits.get()
+    }
+
+    /// Resolves when nobody waits any more for what is being made.
+    pub(super) async fn stopped_waiting(&self) {
+        // The sender lives as long as `self`.
+        let _ = self.stopping.subscribe().wait_for(|&stopping| stopping).await;
+    }
+}
+
+impl Drop for Shared {
+    fn drop(&mut self) {
+        self.jobs.shut_down();
+    }
+}
+
+impl Service {
+    /// Opens the store at `place`, queues unfinished jobs again and starts the workers. Blocks on
+    /// the store.
+    ///
+    /// # Errors
+    /// `store_unavailable` when the store cannot be used.
+    pub fn open(place: &Place, config: Config, parts: Parts) -> Result<Self> {
+        let (store, records) = Store::open(place, &config.limits)?;
+        let store = Arc::new(store);
+        let scheduler = Scheduler::new(parts.renderer.concurrency(), &config.limits);
+        let views = Arc::clone(&scheduler);
+        let device = Arc::clone(&parts.renderer).differentiable();
+        let refine = match config.refine {
+            // It takes all processors for a minute after each scene, so it is for calls that ask.
+            Refine::Auto if device.is_none() => Refine::Off,
+            how => how,
+        };
+        let refiner = refiner(device, config.threads)?;
+        let networks = Arc::clone(&parts.scenes);
+        let limits = Arc::new(LiveLimits::new(config.limits.clone()));
+        let job_parts = JobParts {
+            store: Arc::clone(&store),
+            scenes: parts.scenes,
+            semantics: Arc::clone(&parts.semantics),
+            limits: Arc::clone(&limits),
+            workers: config.workers(),
+            keep_photos: config.keep_photos,
+            refine,
+            renderer: Arc::clone(&parts.renderer),
+            refiner,
+            threads: config.threads,
+            drawn: Box::new(move || views.idle()),
+        };
+        let jobs = Jobs::start(job_parts, records)?;
+        let models = ModelsInfo {
+            renderer: parts.renderer.name(),
+            server_version: env!("CARGO_PKG_VERSION").to_owned(),
+            ..parts.models
+        };
+        let inner = Shared {
+            store,
+            jobs,
+            networks,
+            scheduler,
+            backend: Arc::new(Backend::new(parts.renderer, parts.semantics, &config.limits)),
+            models,
+            reading: Arc::new(Semaphore::new(UPLOADS_READ_MAX)),
+            folders: Arc::new(Semaphore::new(config.limits.folder_exports_max)),
+            inferences: Arc::new(Semaphore::new(config.limits.inferences_max)),
+            key_locks: Default::default(),
+            memory: Memory::new(config.limits.memory_bytes_max),
+            stopping: watch::Sender::default(),
+            limits,
+            config,
+        };
+        Ok(Self { inner: Arc::new(inner), caller: Caller::All })
+    }
+
+    /// The same service for another caller.
+    pub fn for_caller(&self, caller: Caller) -> Self {
+        Self { inner: Arc::clone(&self.inner), caller }
+    }
+
+    /// The caps in force.
+    pub fn limits(&self) -> Arc<Limits> {
+        self.inner.limits()
+    }
+
+    /// The configuration of the start.
+    pub fn config(&self) -> &Config {
+        &self.inner.config
+    }
+
+    /// Puts other caps in force; names those that only the next start can follow.
+    pub fn reload(&self, limits: Limits) -> Vec<&'static str> {
+        self.inner.limits.reload(limits)
+    }
+
+    /// From now on nobody waits for what is being made: calls that do are answered with what there
+    /// is.
+    pub fn stop_waiting(&self) {
+        self.inner.stopping.send_replace(true);
+    }
+
+    /// Name of the bundle.
+    pub fn bundle(&self) -> &str {
+        &self.inner.models.bundle
+    }
+
+    /// What makes and renders the scenes.
+    pub fn models(&self) -> ModelsInfo {
+        let mut models = self.inner.models.clone();
+        match self.inner.jobs.networks() {
+            NetworkState::Open("") => {}
+            NetworkState::Open(provider) => provider.clone_into(&mut models.execution_provider),
+            state => state.name().clone_into(&mut models.execution_provider),
+        }
+        if let Some(remark) = self.inner.jobs.remark() {
+            let provider = &mut models.execution_provider;
+            *provider = format!("{provider} ({remark})");
+        }
+        models
+    }
+
+    /// Whether new jobs are taken, and how many there are.
+    pub fn ready(&self) -> Readiness {
+        let (jobs_queued, jobs_running) = self.inner.jobs.counts();
+        Readiness {
+            ready: self.inner.jobs.is_open(),
+            networks: self.inner.jobs.networks().name(),
+            jobs_queued,
+            jobs_running,
+            renders: self.inner.scheduler.len(),
+        }
+    }
+
+    /// Bytes of a whole answer, which are taken until it is sent.
+    ///
+    /// # Errors
+    /// `overloaded` where too many bytes wait for their callers already.
+    pub fn answer_bytes(&self, bytes: u64) -> Result<Share> {
+        self.inner.memory.answer(bytes, &self.inner.limits())
+    }
+
+    /// Bytes of scenes in memory.
+    pub fn cached_bytes(&self) -> u64 {
+        self.inner.store.cached_bytes()
+    }
+
+    /// Bytes of photos in memory, for jobs and for first texts.
+    pub fn photos_bytes(&self) -> u64 {
+        self.inner.jobs.photos_bytes()
+    }
+
+    /// Takes no more jobs and stops the running ones; the next start continues them. Blocks.
+    pub fn shut_down(&self) {
+        self.inner.jobs.shut_down();
+    }
+}
