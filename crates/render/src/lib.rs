@@ -4,9 +4,8 @@
 //! the product. [`gpu`] has the same stages in WGSL. All three take a [`RenderRequest`]; [`cpu`]
 //! and [`gpu`] give a [`Frame`].
 //!
-//! The feature `testing` adds what tests and the laboratory look at and change: switches, the
-//! inside of [`gpu`], and the oracles of the backward pass and of training. The product is built
-//! without it.
+//! The feature `testing` adds what tests and the laboratory look at and change: switches, and
+//! the inside of [`gpu`]. The product is built without it.
 #![cfg_attr(
     not(feature = "testing"),
     allow(unreachable_pub, reason = "public for the tests' view of the inside")

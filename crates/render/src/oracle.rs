@@ -181,29 +181,34 @@ pub fn contributions(
 
 /// A Gaussian on the picture.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Splat {
-    pub(crate) mean: DVec2,
-    pub(crate) conic: DMat2,
+pub struct Splat {
+    /// Its centre, pixels.
+    pub mean: DVec2,
+    /// The inverse of its covariance.
+    pub conic: DMat2,
     /// Beyond this height alpha is under 1/255 by more than the width of a cliff.
     half_height: f64,
-    pub(crate) opacity: f64,
+    /// After its compensation for the blur.
+    pub opacity: f64,
     /// Whether it is drawn behind all those that are not.
     behind: bool,
-    pub(crate) depth: f64,
-    pub(crate) color: DVec3,
+    /// `t.z`, world units.
+    pub depth: f64,
+    /// Before any background.
+    pub color: DVec3,
     entry: u16,
 }
 
 impl Splat {
     /// Front to back: t.z narrowed to f32 is the key of the model. For a stable sort, so that ties
     /// stay in the order of the scene.
-    pub(crate) fn order(&self, other: &Self) -> Ordering {
+    pub fn order(&self, other: &Self) -> Ordering {
         let depths = (self.depth as f32).total_cmp(&(other.depth as f32));
         self.behind.cmp(&other.behind).then(depths)
     }
 
     /// Alpha at a place of the picture.
-    pub(crate) fn alpha(&self, at: DVec2) -> f64 {
+    pub fn alpha(&self, at: DVec2) -> f64 {
         let d = at - self.mean;
         let power = 0.5 * d.dot(self.conic * d);
         (self.opacity * (-power).exp()).min(f64::from(ALPHA_MAX))
@@ -216,7 +221,8 @@ impl Splat {
     }
 }
 
-pub(crate) fn splat(
+/// Gaussian `i` on the picture; `None` where it adds to no pixel.
+pub fn splat(
     gaussians: &Gaussians,
     i: usize,
     request: &RenderRequest,
@@ -304,7 +310,7 @@ fn color(sh: &[[f32; 3]], direction: DVec3) -> DVec3 {
 }
 
 /// The 16 basis functions up to degree 3 at a unit direction.
-pub(crate) fn basis(DVec3 { x, y, z }: DVec3) -> [f64; 16] {
+pub fn basis(DVec3 { x, y, z }: DVec3) -> [f64; 16] {
     let c1 = f64::from(SH_C1);
     let c2 = SH_C2.map(f64::from);
     let c3 = SH_C3.map(f64::from);

@@ -3,7 +3,7 @@
 
 use std::time::Instant;
 
-use segsplat_testing::{compare::gradient_errors, scenes::Random};
+use segsplat_testing::{backward, compare::gradient_errors, scenes::Random};
 use serde_json::json;
 
 use super::{Args, Drawing, Reference, generated::dump};
@@ -12,7 +12,7 @@ use crate::{
     refine::RefineOptions,
     render::{
         DifferentiableRenderer, Kinds, RenderRequest,
-        backward::{FrameGradients, Gradients, oracle},
+        backward::{FrameGradients, Gradients},
         cpu::CpuRenderer,
         train::{LearningRates, TrainingPhoto, TrainingSet, TrainingStep},
     },
@@ -64,7 +64,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             gradient_errors(&found, &want)
         }
         Reference::Oracle if gaussians.len().saturating_mul(pixels) <= ORACLE_MAX => {
-            gradient_errors(&found, &oracle::gradients(&gaussians, &request, &by)?)
+            gradient_errors(&found, &backward::gradients(&gaussians, &request, &by)?)
         }
         Reference::Oracle => {
             let work = gaussians.len().saturating_mul(pixels);

@@ -1,5 +1,5 @@
-//! What the tests of all crates share: generated scenes, comparison of pictures, places of files,
-//! and how a test reports that it was skipped.
+//! What the tests of all crates share: generated scenes, comparison of pictures, the oracles of
+//! the backward pass and of the loss, places of files, and how a test reports that it was skipped.
 #![allow(
     clippy::expect_used,
     clippy::missing_panics_doc,
@@ -8,10 +8,12 @@
     reason = "helpers of tests are tests too"
 )]
 
+pub mod backward;
 pub mod captures;
 pub mod compare;
 pub mod frames;
 pub mod labels;
+pub mod loss;
 pub mod scenes;
 
 use std::path::{Path, PathBuf};

@@ -6,8 +6,6 @@
 //! Axes are those of each format's own specification: PLY and `.splat` are in the axes of the scene
 //! (OpenCV: y down, z forward), SPZ and glTF have y up and z back. `TURN` turns between them.
 
-#[cfg(test)]
-mod foreign;
 mod glb;
 mod packed_ply;
 mod places;

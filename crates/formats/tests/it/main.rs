@@ -7,3 +7,4 @@
 )]
 
 mod captures;
+mod foreign;

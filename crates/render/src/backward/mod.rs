@@ -1,8 +1,8 @@
 //! The backward pass of the one model: from what a loss says of a frame to what it says of the
 //! Gaussians.
 //!
-//! [`oracle`] judges the others: f64, pixel by pixel. Finite differences of the forward oracle
-//! judge it. [`crate::cpu::backward`] is the tiled kernel, shaders/*_backward.wgsl its twin. A
+//! An oracle in `tests/support` judges the others: f64, pixel by pixel. Finite differences of the
+//! forward oracle judge it. [`crate::cpu::backward`] is the tiled kernel, shaders/*_backward.wgsl its twin. A
 //! renderer that has a backward pass is a [`crate::DifferentiableRenderer`].
 //!
 //! For a pixel with Gaussians i front to back, `w_i = alpha_i T_i`, `A = sum w_i` and `B` behind:
@@ -13,9 +13,6 @@
 //!
 //! What is constant has no gradient: which Gaussians count (1/255, the end of a ray, the order, the
 //! near plane), an alpha at its largest, a colour at 0, and what lies behind.
-
-#[cfg(feature = "testing")]
-pub mod oracle;
 
 use crate::{
     Frame, Kinds, Labels, RenderRequest, Samples,
@@ -105,7 +102,7 @@ pub(crate) fn backward_request(request: &RenderRequest) -> RenderRequest {
 }
 
 /// Derivatives of the 16 basis functions up to degree 3 by the unit direction (x, y, z).
-pub(crate) fn basis_slopes([x, y, z]: [f64; 3]) -> [[f64; 3]; 16] {
+pub fn basis_slopes([x, y, z]: [f64; 3]) -> [[f64; 3]; 16] {
     let c1 = f64::from(SH_C1);
     let a = SH_C2.map(f64::from);
     let b = SH_C3.map(f64::from);

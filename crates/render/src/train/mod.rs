@@ -5,13 +5,11 @@
 //! photos show ([`LearningRates`]). A [`Trainer`] is where that runs. [`HostTrainer`] does all but
 //! the drawing on the processor. The GPU renderer has one on the device (`shaders/photo_loss.wgsl`,
 //! `exposure.wgsl`, `adam.wgsl`): photos and Gaussians go up once, and only what is asked for comes
-//! back. [`oracle`] judges the loss.
+//! back. An oracle in `tests/support` judges the loss.
 
 pub mod adam;
 pub mod exposure;
 mod host;
-#[cfg(feature = "testing")]
-pub mod oracle;
 pub mod photo_loss;
 
 pub use self::{

@@ -6,12 +6,13 @@ use std::sync::Arc;
 use segsplat_core::scene::{Backdrop, Gaussians, RawGaussians, SourcePixel};
 use segsplat_render::{
     Background, DifferentiableRenderer, Kinds, RenderRequest, Source,
-    backward::{FrameGradients, Gradients, oracle as backward},
+    backward::{FrameGradients, Gradients},
     cpu::CpuRenderer,
     oracle,
     switches::{Switches, Width},
 };
 use segsplat_testing::{
+    backward,
     compare::gradient_errors,
     scenes::{Random, camera, checked, cloud, push, request, two_views},
 };

@@ -9,11 +9,14 @@ use segsplat_render::{
     Background, DifferentiableRenderer, Kinds, RenderRequest, Renderer as _,
     gpu::GpuRenderer,
     train::{
-        HostTrainer, LearningRates, Trainer, TrainingPhoto, TrainingSet, TrainingStep, oracle,
-        photo_loss, unit,
+        HostTrainer, LearningRates, Trainer, TrainingPhoto, TrainingSet, TrainingStep, photo_loss,
+        unit,
     },
 };
-use segsplat_testing::scenes::{Random, camera, checked, cloud, look, request};
+use segsplat_testing::{
+    loss,
+    scenes::{Random, camera, checked, cloud, look, request},
+};
 
 use crate::common::{both_kernels, cpu};
 
@@ -51,7 +54,7 @@ fn the_oracle_of_the_loss_agrees_with_finite_differences() {
     let (shown, photo) = (random_picture(pixels, 3), random_picture(pixels, 4));
     let valid: Vec<bool> = (0..pixels).map(|i| i % 9 != 4).collect();
     for valid in [None, Some(&valid[..])] {
-        let of = |shown: &[[f64; 3]]| oracle::photo_loss(shown, &photo, width, valid, 0.2);
+        let of = |shown: &[[f64; 3]]| loss::photo_loss(shown, &photo, width, valid, 0.2);
         let (_, gradient) = of(&shown);
         for i in (0..pixels).step_by(5) {
             let moved = |by: f64| {
@@ -77,7 +80,7 @@ fn the_kernel_of_the_loss_agrees_with_the_oracle() {
     for valid in [None, Some(&valid[..])] {
         let got = photo_loss(&shown, &photo, width, valid, SHARE);
         let (value, gradient) =
-            oracle::photo_loss(&wide(&shown), &wide(&photo), width, valid, SHARE.into());
+            loss::photo_loss(&wide(&shown), &wide(&photo), width, valid, SHARE.into());
         assert!((got.value - value).abs() < 1e-6, "{} is not {value}", got.value);
         check_errors("kernel", &errors(&got.gradient, &gradient));
     }
@@ -154,7 +157,7 @@ fn the_shaders_of_the_loss_agree_with_the_oracle() {
             let valid = photo.valid.as_deref();
             let width = photo.width as usize;
             let (value, want) =
-                oracle::photo_loss(&wide(&shown), &wide(&unit(photo)), width, valid, SHARE.into());
+                loss::photo_loss(&wide(&shown), &wide(&unit(photo)), width, valid, SHARE.into());
             let got = gpu.internals().loss_gradient(&set, at, &step(0.0)).expect("a step");
             check_errors(&format!("photo {at}"), &errors(&got, &want));
             let mut trainer = gpu.trainer(&set, u64::MAX).expect("room").expect("a trainer");

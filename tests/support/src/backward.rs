@@ -5,13 +5,17 @@
 use glam::{DMat2, DMat3, DQuat, DVec2, DVec3};
 use rayon::prelude::*;
 
-use super::{FrameGradients, Gradients, basis_slopes};
-use crate::{
-    Background, RenderRequest,
-    constants::{ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FRUSTUM_MARGIN, OWN_SIZE, TRANSMITTANCE_MIN},
+use segsplat_core::{
     error::Result,
-    oracle::{self, Splat},
     scene::{Gaussians, Intrinsics},
+};
+use segsplat_render::{
+    Background, RenderRequest,
+    backward::{FrameGradients, Gradients, basis_slopes},
+    constants::{
+        ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FRUSTUM_MARGIN, OWN_SIZE, SH_OFFSET, TRANSMITTANCE_MIN,
+    },
+    oracle::{self, Splat},
 };
 
 /// Derivatives by the numbers of a Gaussian on the picture.
@@ -281,7 +285,7 @@ fn of_color(
     let weights = oracle::basis(direction);
     let sum: DVec3 =
         own.iter().zip(weights).map(|(&c, weight)| weight * DVec3::from(c.map(f64::from))).sum();
-    let color = sum + f64::from(crate::constants::SH_OFFSET);
+    let color = sum + f64::from(SH_OFFSET);
     let by_color = DVec3::select(color.cmpgt(DVec3::ZERO), by_color, DVec3::ZERO);
     let slopes = basis_slopes(direction.into());
     let mut by_direction = DVec3::ZERO;

@@ -6,13 +6,13 @@ use std::io::Cursor;
 use glam::DVec3;
 use serde_json::json;
 
-use super::{
-    COMPRESSED_PLY, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat, SplatsRead, world,
-};
-use crate::{
+use segsplat_core::{
     error::{ErrorCode, Result},
     limits::Limits,
     scene::{Gaussians, RawGaussians, SH_C0, SourcePixel},
+};
+use segsplat_formats::{
+    splats::{COMPRESSED_PLY, GLB, PLY, SOG, SPLAT, SPZ, SPZ4, SplatFile, SplatFormat, SplatsRead},
     table::{read_splats, splat_formats},
 };
 
@@ -46,6 +46,11 @@ fn bytes_of(file: &SplatFile) -> Vec<u8> {
 fn read(format: &SplatFormat, bytes: &[u8]) -> Result<SplatsRead> {
     let name = format!("a.{}", format.ending);
     read_splats(&mut Cursor::new(bytes), &name, &Limits::default())
+}
+
+/// World position of Gaussian `i`.
+fn world(gaussians: &Gaussians, i: usize) -> DVec3 {
+    gaussians.origin() + DVec3::from_array(gaussians.means()[i].map(f64::from))
 }
 
 /// How far the places of what comes back are from those that went in, at most; of formats with an
