@@ -9,9 +9,9 @@ use serde_json::{Value, json};
 
 use crate::{
     error::Result,
-    metrics::{clamped, psnr, to_unit},
+    metrics::{clamped, psnr},
     pipeline::Pipeline,
-    render::{Kinds, Renderer, cpu::CpuRenderer, plan::served},
+    render::{Kinds, Renderer, cpu::CpuRenderer, plan::served, train::unit},
     rows::{Rows, median, ms},
     scene::{Camera, CameraToWorld, Density, PosedPhoto, Scene, SceneOptions},
     scenes::{is_posed, make, scene_of, squares, use_of, view_request},
@@ -79,7 +79,7 @@ fn compare(
             }
         }
     }
-    let (truth, valid) = (to_unit(&target.photo), target.photo.valid.as_deref());
+    let (truth, valid) = (unit(&target.photo), target.photo.valid.as_deref());
     let pairs = || views[0].iter().zip(&views[1]);
     let differences = pairs().flat_map(|(a, b)| a.iter().flatten().zip(b.iter().flatten()));
     let [full, thinned] = [0, 1].map(|i| scenes[i].gaussians.len());

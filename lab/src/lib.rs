@@ -20,7 +20,6 @@ pub mod rows;
 pub mod scenes;
 pub mod semantics;
 mod setup;
-mod stages;
 pub mod triples;
 pub mod warp;
 pub mod words;
@@ -68,8 +67,6 @@ enum Command {
     Backward(frames::Args),
     /// Time frames without each kind of skipped work
     Skips(frames::Args),
-    /// Time each stage from photos to a view
-    Stages(stages::Args),
     /// Ask a server for views and scenes, as its callers do
     #[command(subcommand)]
     Load(load::Command),
@@ -112,7 +109,6 @@ pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
         Command::Frames(args) => frames::run(args, &mut rows)?,
         Command::Backward(args) => frames::backward::run(args, &mut rows)?,
         Command::Skips(args) => frames::skips::run(args, &mut rows)?,
-        Command::Stages(args) => stages::run(args, &mut rows)?,
         Command::Load(command) => load::run(command, &mut rows)?,
         Command::Report(args) => report::run(args)?,
     }

@@ -5,7 +5,7 @@
 //! are whole photos of one set of Gaussians over the backdrop, without layers.
 
 use std::{
-    path::{Path, PathBuf},
+    path::PathBuf,
     sync::Arc,
     time::{Duration, Instant},
 };
@@ -14,8 +14,9 @@ use serde_json::json;
 
 use crate::{
     error::{Error, Result},
+    grid,
     limits::Limits,
-    metrics::{clamped, psnr, to_unit},
+    metrics::{clamped, psnr},
     photo_files,
     pipeline::{Pipeline, refinement::refined},
     refine::{held_out, split},
@@ -23,6 +24,7 @@ use crate::{
     render::{
         Background, Frame, Kinds, RenderRequest, Switches,
         plan::{default_near, served},
+        train::unit,
     },
     rows::{Rows, ms, progress},
     scene::{Camera, Gaussians, PosedPhoto, SceneOptions},
@@ -98,12 +100,13 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             Some(dir) => {
                 let file = dir.join(format!("{name}-{}-{what}.png", given.len()));
                 let size = targets[0].camera.intrinsics;
-                save(&file, size.width, size.height, &clamped(frame.color))
+                let saved = grid::color(&clamped(frame.color), size.width).save(file);
+                saved.map_err(|e| Error::internal(format!("a picture: {e}")))
             }
             None => Ok(()),
         };
         let camera = targets[0].camera;
-        let photo = Frame { color: Some(to_unit(&targets[0].photo)), ..Frame::default() };
+        let photo = Frame { color: Some(unit(&targets[0].photo)), ..Frame::default() };
         picture("photo", photo)?;
         picture("served", as_served(camera)?)?;
         let plain = json!({
@@ -176,21 +179,12 @@ fn given(all: &[PosedPhoto], count: usize) -> (Vec<PosedPhoto>, Vec<PosedPhoto>)
     (targets.iter().map(pick).collect(), given)
 }
 
-/// Writes a picture of colours in 0..1 as a PNG.
-fn save(file: &Path, width: u32, height: u32, color: &[[f32; 3]]) -> Result<()> {
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..255")]
-    let bytes = color.as_flattened().iter().map(|v| (v * 255.0).round() as u8).collect();
-    let failed = |why: &dyn std::fmt::Display| Error::internal(format!("a picture: {why}"));
-    let picture = image::RgbImage::from_raw(width, height, bytes);
-    picture.ok_or_else(|| failed(&"its size"))?.save(file).map_err(|e| failed(&e))
-}
-
 /// Mean PSNR of what `draw` gives at the targets' cameras.
 fn mean_psnr(targets: &[PosedPhoto], draw: impl Fn(Camera) -> Result<Frame>) -> Result<f64> {
     let mut sum = 0.0;
     for target in targets {
         let frame = draw(target.camera)?;
-        let truth = to_unit(&target.photo);
+        let truth = unit(&target.photo);
         sum += psnr(&clamped(frame.color), &truth, target.photo.valid.as_deref());
     }
     Ok(sum / targets.len() as f64)

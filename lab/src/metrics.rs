@@ -1,7 +1,6 @@
 //! PSNR and SSIM on RGB in 0..1.
 
 pub use crate::render::compare::psnr;
-use crate::scene::Photo;
 
 /// Side of SSIM's window, pixels.
 const WINDOW: usize = 11;
@@ -10,12 +9,6 @@ const SIGMA: f64 = 1.5;
 /// SSIM's constants for a range of 1.
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
-
-/// Pixels of a photo as RGB in 0..1.
-#[must_use]
-pub fn to_unit(photo: &Photo) -> Vec<[f32; 3]> {
-    photo.rgb.chunks_exact(3).map(|c| [c[0], c[1], c[2]].map(|v| f32::from(v) / 255.0)).collect()
-}
 
 /// Colours as a picture of 8 bits holds them: within 0 and 1.
 pub(crate) fn clamped(color: Option<Vec<[f32; 3]>>) -> Vec<[f32; 3]> {

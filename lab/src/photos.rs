@@ -13,13 +13,13 @@ use serde_json::{Value, json};
 use crate::{
     error::{Error, Result},
     grid,
-    metrics::{clamped, psnr, ssim, to_unit},
+    metrics::{clamped, psnr, ssim},
     pipeline::{
         Pipeline,
         refinement::{refined, version_of},
     },
     refinements::Variant,
-    render::{Kinds, Renderer, cpu::CpuRenderer, plan::served},
+    render::{Kinds, Renderer, cpu::CpuRenderer, plan::served, train::unit},
     rows::{Rows, each, means, ms, progress},
     scene::{PosedPhoto, Preset, Scene, SceneOptions},
     scenes::{
@@ -143,7 +143,7 @@ fn judge(
         let request = view_request(target.camera, kinds, report.median_depth);
         renderer.render(&scene.gaussians, &served(scene, request))
     };
-    let (truth, valid) = (to_unit(&target.photo), target.photo.valid.as_deref());
+    let (truth, valid) = (unit(&target.photo), target.photo.valid.as_deref());
     let frame = view(&scene)?;
     let color = clamped(frame.color);
     let pair = triple.pair.map(|i| &squares[i]);

@@ -2,10 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::{
-    metrics::{psnr, to_unit},
-    scene::PosedPhoto,
-};
+use crate::{metrics::psnr, render::train::unit, scene::PosedPhoto};
 
 /// Depths tried, geometric from the first to the last, in baselines.
 const DEPTHS: i32 = 24;
@@ -18,7 +15,7 @@ const FARTHEST: f64 = 30.0;
 /// border repeated.
 #[must_use]
 pub fn hindsight_warp(target: &PosedPhoto, inputs: &[&PosedPhoto], baseline: f64) -> f64 {
-    let truth = to_unit(&target.photo);
+    let truth = unit(&target.photo);
     let tries: Vec<(&PosedPhoto, i32)> =
         inputs.iter().flat_map(|input| (0..DEPTHS).map(move |step| (*input, step))).collect();
     let ratio: f64 = FARTHEST / NEAREST;

@@ -2,11 +2,11 @@
 
 use segsplat_core::scene::{Camera, CameraToWorld, Intrinsics, PosedPhoto};
 use segsplat_lab::{
-    metrics::{psnr, ssim, to_unit},
+    metrics::{psnr, ssim},
     rows::means,
     warp::{hindsight_warp, warp},
 };
-use segsplat_render::compare::PSNR_MAX;
+use segsplat_render::{compare::PSNR_MAX, train::unit};
 use serde_json::json;
 
 use crate::posed;
@@ -70,6 +70,6 @@ fn a_wall_at_a_tried_depth_is_met() {
     let target = wall(0.1, depth);
     let best = hindsight_warp(&target, &[&wall(0.0, depth), &wall(0.2, depth)], baseline);
     let other = warp(&target, &wall(0.0, depth), depth * 2.0);
-    let off = psnr(&other, &to_unit(&target.photo), None);
+    let off = psnr(&other, &unit(&target.photo), None);
     assert!(best > off + 5.0, "{best} dB at the right depth, {off} at another");
 }

@@ -1,9 +1,10 @@
 //! A view as a caller asks for it.
 
+use reqwest::header;
 use segsplat::api::grpc::pb;
-use serde_json::json;
+use serde_json::{Value, json};
 
-use super::door::{Answer, Call, Connection};
+use super::door::{Answer, Connection, answer};
 use crate::{
     error::{Error, Result},
     scene::Camera,
@@ -32,13 +33,11 @@ impl Ask {
     ) -> Result<Answer> {
         match connection {
             Connection::Grpc(_) => connection.render(self.message(camera)?).await,
-            _ => {
-                let target = self.target(camera);
-                let call = match etag {
-                    Some(etag) => Call::get_unless(target, etag),
-                    None => Call::get(target),
-                };
-                connection.call(call).await
+            Connection::Http(..) => {
+                let request = connection.get(&self.target(camera))?;
+                let unless = etag.map(|etag| (header::IF_NONE_MATCH, etag));
+                answer(unless.into_iter().fold(request, |r, (name, etag)| r.header(name, etag)))
+                    .await
             }
         }
     }
@@ -49,10 +48,12 @@ impl Ask {
         connection: &mut Connection,
         cameras: &[Camera],
     ) -> Result<Answer> {
-        let (http, request) = (!matches!(connection, Connection::Grpc(_)), self.messages(cameras)?);
-        let answer = match http {
-            true => connection.call(self.posted(cameras)).await?.parted()?,
-            false => connection.render_many(request).await?,
+        let answer = match connection {
+            Connection::Grpc(_) => connection.render_many(self.messages(cameras)?).await?,
+            Connection::Http(..) => {
+                let request = connection.post(&format!("/v1/scenes/{}/views", self.scene))?;
+                answer(request.json(&self.posted(cameras))).await?.parted()?
+            }
         };
         if answer.bytes.len() != cameras.len() {
             let (views, cameras) = (answer.bytes.len(), cameras.len());
@@ -61,7 +62,7 @@ impl Ask {
         Ok(answer)
     }
 
-    fn posted(&self, cameras: &[Camera]) -> Call {
+    fn posted(&self, cameras: &[Camera]) -> Value {
         let fields = cameras.iter().map(|camera| {
             let lens = camera.intrinsics;
             let pose = camera.camera_to_world.to_row_major();
@@ -82,8 +83,7 @@ impl Ask {
         if self.takes_text() {
             body["text"] = json!(self.text);
         }
-        let target = format!("/v1/scenes/{}/views", self.scene);
-        Call::post(target, body.to_string().into_bytes(), "application/json".to_owned())
+        body
     }
 
     fn messages(&self, cameras: &[Camera]) -> Result<pb::RenderViewsRequest> {

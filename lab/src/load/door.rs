@@ -1,17 +1,12 @@
-//! Connections to a server: HTTP/1.1 and HTTP/2 by hyper, gRPC by tonic. One connection at a time
+//! Connections to a server: HTTP/1.1 and HTTP/2 by reqwest, gRPC by tonic. One connection at a time
 //! belongs to a caller; HTTP/2 and gRPC share one between some.
 
-use http_body_util::{BodyExt as _, Full};
-use hyper::{
-    Method, Request,
-    body::Bytes,
-    client::conn::{http1, http2},
-    header,
-};
-use hyper_util::rt::{TokioExecutor, TokioIo};
+use reqwest::{Client, RequestBuilder, StatusCode, header};
 use serde_json::Value;
-use tokio::net::TcpStream;
-use tonic::transport::{Channel, Endpoint};
+use tonic::{
+    codegen::Bytes,
+    transport::{Channel, Endpoint},
+};
 
 use segsplat::api::grpc::pb::{self, scene_service_client::SceneServiceClient};
 
@@ -51,41 +46,14 @@ impl Door {
     pub(super) async fn connect(self, address: &str, callers: usize) -> Result<Vec<Connection>> {
         let mut connections: Vec<Connection> = Vec::new();
         for caller in 0..callers {
-            let shared = (caller % self.callers() != 0)
-                .then(|| connections.last().and_then(Connection::share))
-                .flatten();
+            let shared = connections.last().filter(|_| caller % self.callers() != 0).cloned();
             connections.push(match (shared, self) {
                 (Some(shared), _) => shared,
-                (None, Self::Http1) => Connection::http1(address).await?,
-                (None, Self::Http2) => Connection::http2(address).await?,
                 (None, Self::Grpc) => Connection::grpc(address).await?,
+                (None, _) => Connection::http(address, self)?,
             });
         }
         Ok(connections)
-    }
-}
-
-/// An HTTP call.
-#[derive(Debug)]
-pub(super) struct Call {
-    method: Method,
-    target: String,
-    body: Vec<u8>,
-    headers: Vec<(header::HeaderName, String)>,
-}
-
-impl Call {
-    pub(super) fn get(target: String) -> Self {
-        Self { method: Method::GET, target, body: Vec::new(), headers: Vec::new() }
-    }
-
-    /// The same, answered with 304 where the server's tag is this one.
-    pub(super) fn get_unless(target: String, etag: String) -> Self {
-        Self { headers: vec![(header::IF_NONE_MATCH, etag)], ..Self::get(target) }
-    }
-
-    pub(super) fn post(target: String, body: Vec<u8>, kind: String) -> Self {
-        Self { method: Method::POST, target, body, headers: vec![(header::CONTENT_TYPE, kind)] }
     }
 }
 
@@ -139,10 +107,10 @@ impl Answer {
 }
 
 /// One caller's way to the server.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) enum Connection {
-    Http1(http1::SendRequest<Full<Bytes>>, String),
-    Http2(http2::SendRequest<Full<Bytes>>, String),
+    /// With the server's URL.
+    Http(Client, String),
     Grpc(SceneServiceClient<Channel>),
 }
 
@@ -150,26 +118,18 @@ fn broken(e: impl std::error::Error + Send + Sync + 'static) -> Error {
     Error::invalid("the connection to the server broke").caused_by(e)
 }
 
-async fn stream(address: &str) -> Result<TokioIo<TcpStream>> {
-    let stream = TcpStream::connect(address).await.map_err(broken)?;
-    stream.set_nodelay(true).map_err(broken)?;
-    Ok(TokioIo::new(stream))
-}
-
 impl Connection {
-    pub(super) async fn http1(address: &str) -> Result<Self> {
-        let (to, connection) = http1::handshake(stream(address).await?).await.map_err(broken)?;
-        tokio::spawn(connection);
-        Ok(Self::Http1(to, address.to_owned()))
-    }
-
-    async fn http2(address: &str) -> Result<Self> {
-        let mut builder = http2::Builder::new(TokioExecutor::new());
-        builder.initial_stream_window_size(WINDOW_BYTES);
-        builder.initial_connection_window_size(8 * WINDOW_BYTES);
-        let (to, connection) = builder.handshake(stream(address).await?).await.map_err(broken)?;
-        tokio::spawn(connection);
-        Ok(Self::Http2(to, address.to_owned()))
+    pub(super) fn http(address: &str, door: Door) -> Result<Self> {
+        segsplat::crypto::install();
+        let client = Client::builder().no_proxy().tcp_nodelay(true);
+        let client = match door {
+            Door::Http2 => client
+                .http2_prior_knowledge()
+                .http2_initial_stream_window_size(WINDOW_BYTES)
+                .http2_initial_connection_window_size(8 * WINDOW_BYTES),
+            _ => client.http1_only(),
+        };
+        Ok(Self::Http(client.build().map_err(broken)?, format!("http://{address}")))
     }
 
     async fn grpc(address: &str) -> Result<Self> {
@@ -185,65 +145,21 @@ impl Connection {
         Ok(Self::Grpc(client.max_decoding_message_size(MESSAGE_BYTES_MAX)))
     }
 
-    fn share(&self) -> Option<Self> {
+    pub(super) fn get(&self, target: &str) -> Result<RequestBuilder> {
+        let (client, server) = self.client()?;
+        Ok(client.get(format!("{server}{target}")))
+    }
+
+    pub(super) fn post(&self, target: &str) -> Result<RequestBuilder> {
+        let (client, server) = self.client()?;
+        Ok(client.post(format!("{server}{target}")))
+    }
+
+    fn client(&self) -> Result<(&Client, &str)> {
         match self {
-            Self::Http1(..) => None,
-            Self::Http2(to, address) => Some(Self::Http2(to.clone(), address.clone())),
-            Self::Grpc(client) => Some(Self::Grpc(client.clone())),
+            Self::Http(client, server) => Ok((client, server)),
+            Self::Grpc(_) => Err(Error::internal("an HTTP call over gRPC")),
         }
-    }
-
-    /// Makes a call over HTTP. A refusal is an error with the server's words.
-    pub(super) async fn call(&mut self, call: Call) -> Result<Answer> {
-        let (http2, address) = match &*self {
-            Self::Http1(_, address) => (false, address),
-            Self::Http2(_, address) => (true, address),
-            Self::Grpc(_) => return Err(Error::internal("an HTTP call over gRPC")),
-        };
-        let target = if http2 { format!("http://{address}{}", call.target) } else { call.target };
-        let mut request = Request::builder().method(call.method).uri(target);
-        if !http2 {
-            request = request.header(header::HOST, address.as_str());
-        }
-        for (name, value) in call.headers {
-            request = request.header(name, value);
-        }
-        let request = request.body(Full::new(Bytes::from(call.body))).map_err(broken)?;
-        let response = match self {
-            Self::Http1(to, _) => {
-                to.ready().await.map_err(broken)?;
-                to.send_request(request).await
-            }
-            Self::Http2(to, _) => {
-                to.ready().await.map_err(broken)?;
-                to.send_request(request).await
-            }
-            Self::Grpc(_) => return Err(Error::internal("an HTTP call over gRPC")),
-        };
-        let (head, mut body) = response.map_err(broken)?.into_parts();
-        let mut bytes = Vec::new();
-        while let Some(frame) = body.frame().await {
-            bytes.extend(frame.map_err(broken)?.into_data().ok());
-        }
-        let text = |value: &header::HeaderValue| value.to_str().unwrap_or_default().to_owned();
-        let answer = Answer {
-            bytes,
-            timing: head.headers.get_all("server-timing").iter().map(text).collect(),
-            etag: head.headers.get(header::ETAG).map(text),
-        };
-        if head.status.is_success() || head.status.as_u16() == 304 {
-            return Ok(answer);
-        }
-        let said: Value = serde_json::from_slice(&answer.body()).unwrap_or_default();
-        let (code, why) = (&said["code"], &said["message"]);
-        Err(Error::new(ErrorCode::InvalidRequest, format!("{} {code} {why}", head.status)))
-    }
-
-    /// Makes a call whose answer is JSON.
-    pub(super) async fn json(&mut self, call: Call) -> Result<Value> {
-        let answer = self.call(call).await?.body();
-        let unlike = |e| Error::internal("the server's answer is no JSON").caused_by(e);
-        serde_json::from_slice(&answer).map_err(unlike)
     }
 
     /// Asks for many views over gRPC.
@@ -272,6 +188,32 @@ impl Connection {
         let view = answer.into_inner();
         Ok(Answer { bytes: vec![view.data], timing, etag: Some(view.etag) })
     }
+}
+
+/// Makes a call over HTTP. A refusal is an error with the server's words.
+pub(super) async fn answer(request: RequestBuilder) -> Result<Answer> {
+    let mut response = request.send().await.map_err(broken)?;
+    let text = |value: &header::HeaderValue| value.to_str().unwrap_or_default().to_owned();
+    let (status, headers) = (response.status(), response.headers());
+    let timing = headers.get_all("server-timing").iter().map(text).collect();
+    let etag = headers.get(header::ETAG).map(text);
+    let mut bytes = Vec::new();
+    while let Some(chunk) = response.chunk().await.map_err(broken)? {
+        bytes.push(chunk);
+    }
+    let answer = Answer { bytes, timing, etag };
+    if status.is_success() || status == StatusCode::NOT_MODIFIED {
+        return Ok(answer);
+    }
+    let said: Value = serde_json::from_slice(&answer.body()).unwrap_or_default();
+    let (code, why) = (&said["code"], &said["message"]);
+    Err(Error::new(ErrorCode::InvalidRequest, format!("{status} {code} {why}")))
+}
+
+/// Makes a call whose answer is JSON.
+pub(super) async fn json(request: RequestBuilder) -> Result<Value> {
+    let unlike = |e| Error::internal("the server's answer is no JSON").caused_by(e);
+    serde_json::from_slice(&answer(request).await?.body()).map_err(unlike)
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use reqwest::multipart::{Form, Part};
 use serde_json::json;
 
 use crate::{
@@ -13,8 +14,6 @@ use crate::{
 /// How far the cameras of one upload are from those of the next, world units: a server may know an
 /// upload that comes again.
 const APART: f64 = 1e-9;
-/// Between the parts of a form.
-const BOUNDARY: &str = "segsplat-lab-5f0c6d1e";
 
 /// Photos of a folder, each as a file and a camera.
 #[derive(Debug)]
@@ -69,24 +68,16 @@ impl Photos {
     }
 }
 
-/// The body of `POST /v1/scenes`, and its content type.
-pub(super) fn form(upload: &Upload) -> (Vec<u8>, String) {
-    let cameras = match &upload.cameras {
-        Some(UploadCameras::Cameras(json) | UploadCameras::Transforms(json)) => json.as_slice(),
-        None => &[],
+/// The body of `POST /v1/scenes`.
+pub(super) fn form(upload: Upload) -> Form {
+    let file = |name: String, bytes: Vec<u8>| Part::bytes(bytes).file_name(name);
+    let cameras = match upload.cameras {
+        Some(UploadCameras::Cameras(json) | UploadCameras::Transforms(json)) => json,
+        None => Vec::new(),
     };
-    let photos = upload.photos.iter();
-    let photos = photos.map(|photo| ("photo", photo.name.as_str(), photo.bytes.as_slice()));
-    let mut body = Vec::new();
-    for (part, name, bytes) in [("cameras", "cameras.json", cameras)].into_iter().chain(photos) {
-        let head = format!(
-            "--{BOUNDARY}\r\ncontent-disposition: form-data; name=\"{part}\"; \
-             filename=\"{name}\"\r\n\r\n"
-        );
-        body.extend_from_slice(head.as_bytes());
-        body.extend_from_slice(bytes);
-        body.extend_from_slice(b"\r\n");
-    }
-    body.extend_from_slice(format!("--{BOUNDARY}--\r\n").as_bytes());
-    (body, format!("multipart/form-data; boundary={BOUNDARY}"))
+    let form = Form::new().part("cameras", file("cameras.json".to_owned(), cameras));
+    upload
+        .photos
+        .into_iter()
+        .fold(form, |form, UploadFile { name, bytes }| form.part("photo", file(name, bytes)))
 }

@@ -13,14 +13,15 @@ use serde_json::json;
 
 use super::{
     ask::Ask,
-    door::Connection,
-    photos::{Photos, form},
+    door::{Connection, Door},
+    photos::Photos,
     server::{Server, Servers, create, runtime},
     tally::Tally,
 };
 use crate::{
     error::{Error, Result},
     rows::{Rows, progress},
+    scene::Upload,
     setup::Setup,
 };
 
@@ -122,7 +123,7 @@ async fn post(
     let (next, begun) = (Arc::new(AtomicUsize::new(0)), Instant::now());
     let mut tasks = Vec::new();
     for _ in 0..callers {
-        let mut connection = Connection::http1(&server.address).await?;
+        let mut connection = Connection::http(&server.address, Door::Http1)?;
         let (args, photos, next) = (args.clone(), Arc::clone(photos), Arc::clone(&next));
         tasks.push(tokio::spawn(async move {
             let mut times = Times::default();
@@ -131,8 +132,8 @@ async fn post(
                 if n >= scenes_max || begun.elapsed().as_secs_f64() > seconds {
                     return Ok::<_, Error>(times);
                 }
-                let form = form(&photos.upload(first + n, args.photos)?);
-                one(&args, &mut connection, form, &mut times).await;
+                let upload = photos.upload(first + n, args.photos)?;
+                one(&args, &mut connection, upload, &mut times).await;
             }
         }));
     }
@@ -147,9 +148,9 @@ async fn post(
 }
 
 /// One scene, and the mask of its first text from the first camera.
-async fn one(args: &Args, connection: &mut Connection, form: (Vec<u8>, String), times: &mut Times) {
-    let (begun, bytes) = (Instant::now(), form.0.len());
-    let scene = match create(connection, form, &args.semantics).await {
+async fn one(args: &Args, connection: &mut Connection, upload: Upload, times: &mut Times) {
+    let (begun, bytes) = (Instant::now(), upload.size_bytes());
+    let scene = match create(connection, upload, &args.semantics).await {
         Ok(scene) => scene,
         Err(error) => return times.done.failed(error.message().to_owned()),
     };

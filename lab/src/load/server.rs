@@ -7,11 +7,10 @@ use std::{
     time::Duration,
 };
 
-use serde_json::Value;
 use tempfile::TempDir;
 
 use super::{
-    door::{Call, Connection},
+    door::{Connection, Door, json},
     photos::form,
 };
 use crate::{
@@ -122,11 +121,11 @@ impl Servers {
 
 impl Server {
     async fn wait_until_ready(&mut self) -> Result<()> {
-        let mut connection = Connection::http1(&self.address).await?;
+        let connection = Connection::http(&self.address, Door::Http1)?;
         for _ in 0..READY_LOOKS {
-            let state = connection.json(Call::get("/readyz".to_owned())).await;
+            let state = json(connection.get("/readyz")?).await;
             if state.is_ok_and(|state| state["networks"] == "open") {
-                let models = connection.json(Call::get("/v1/models".to_owned())).await?;
+                let models = json(connection.get("/v1/models")?).await?;
                 models["renderer"].as_str().unwrap_or("?").clone_into(&mut self.renderer);
                 return Ok(());
             }
@@ -137,19 +136,19 @@ impl Server {
 
     /// Posts an upload and waits for the scene, and for its semantics where it has them `eager`.
     pub(super) async fn create(&self, upload: &Upload, semantics: &str) -> Result<SceneStatus> {
-        let mut connection = Connection::http1(&self.address).await?;
-        create(&mut connection, form(upload), semantics).await
+        let connection = Connection::http(&self.address, Door::Http1)?;
+        create(&connection, upload.clone(), semantics).await
     }
 }
 
-/// Posts a form on a connection and waits for the scene.
+/// Posts an upload on a connection and waits for the scene.
 pub(super) async fn create(
-    connection: &mut Connection,
-    (body, kind): (Vec<u8>, String),
+    connection: &Connection,
+    upload: Upload,
     semantics: &str,
 ) -> Result<SceneStatus> {
     let target = format!("/v1/scenes?semantics={semantics}&wait_ms={WAIT_MS}");
-    let answer: Value = connection.json(Call::post(target, body, kind)).await?;
+    let answer = json(connection.post(&target)?.multipart(form(upload))).await?;
     let unlike = |e| Error::internal("the server's answer is no scene").caused_by(e);
     let status: SceneStatus = serde_json::from_value(answer).map_err(unlike)?;
     if status.state != SceneState::Done {
