@@ -161,7 +161,7 @@ impl Keys {
     /// The key that a caller shows and its index. The time does not depend on which key it is.
     #[must_use]
     pub fn find(&self, shown: &str) -> Option<(usize, &Key)> {
-        let digest = hash(shown);
+        let digest = key_sha256(shown);
         let mut found = u32::MAX;
         for (i, key) in (0_u32..).zip(&self.0) {
             found.conditional_assign(&i, digest.as_bytes().ct_eq(key.sha256.as_bytes()));
@@ -223,6 +223,6 @@ pub fn generate() -> Result<String> {
 
 /// What the keys file holds of a key: its sha256, hex.
 #[must_use]
-pub fn hash(key: &str) -> String {
+pub fn key_sha256(key: &str) -> String {
     hex(&Sha256::digest(key.as_bytes()))
 }

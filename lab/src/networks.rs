@@ -74,9 +74,9 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         let photos = SampleOptions { photos: views, width: 256, height: 256, ..Default::default() };
         let photos = sample::photos(&photos)?;
         let geometry = |network: &Geometry| geometry(network, &photos);
-        let mut turns: Vec<Turn<'_>> =
+        let mut turns: Vec<TimedRun<'_>> =
             vec![Box::new(|| geometry(&cpu)), Box::new(|| geometry(&device))];
-        turns.extend(other.iter().map(|other| Box::new(|| geometry(other)) as Turn<'_>));
+        turns.extend(other.iter().map(|other| Box::new(|| geometry(other)) as TimedRun<'_>));
         push(&format!("geometry, {views} views"), take(&turns, args.runs)?)?;
     }
     let open = |options| -> Result<_> {
@@ -138,7 +138,7 @@ fn geometry(network: &Geometry, photos: &[PosedPhoto]) -> Result<Vec<f32>> {
 }
 
 /// One of those that are timed beside each other.
-type Turn<'a> = Box<dyn Fn() -> Result<Vec<f32>> + 'a>;
+type TimedRun<'a> = Box<dyn Fn() -> Result<Vec<f32>> + 'a>;
 
 struct Timed {
     row: Value,
@@ -146,7 +146,7 @@ struct Timed {
 }
 
 /// Runs all in turns. The first is the CPU, the second the provider, the third the other bundle.
-fn take(turns: &[Turn<'_>], runs: usize) -> Result<Timed> {
+fn take(turns: &[TimedRun<'_>], runs: usize) -> Result<Timed> {
     let mut firsts = Vec::new();
     let mut answers = Vec::new();
     for turn in turns {

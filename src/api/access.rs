@@ -250,14 +250,14 @@ impl Access {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::keys::hash;
+    use crate::keys::key_sha256;
 
     #[test]
     fn each_key_has_a_rate_and_permits_and_permits_return() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("keys.toml");
         let rest = "scopes = [\"read\"]\nrequests_per_s = 3\ninflight_max = 2";
-        let text = format!("[[key]]\nname = \"a\"\nsha256 = \"{}\"\n{rest}", hash("secret"));
+        let text = format!("[[key]]\nname = \"a\"\nsha256 = \"{}\"\n{rest}", key_sha256("secret"));
         std::fs::write(&path, text).unwrap();
         let access = Access::new(&Config { keys: Some(path), ..Config::default() }).unwrap();
         let shown = Some("Bearer secret");
@@ -277,7 +277,7 @@ mod tests {
         let path = folder.path().join("keys.toml");
         let write = |rest: &str| {
             let entry = |name: &str| {
-                let sha256 = hash(name);
+                let sha256 = key_sha256(name);
                 format!("[[key]]\nname = \"{name}\"\nsha256 = \"{sha256}\"\n{rest}\n")
             };
             let of = |name| entry(name) + "scopes = [\"read\"]\n";

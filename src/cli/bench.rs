@@ -9,7 +9,7 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
     render::{Kinds, RenderRequest, compare::compare_oracle, plan::default_near},
-    service::{CameraFields, CameraSpec, Kind, LensSpec, PoseSpec, ViewOptions, ViewSpec},
+    service::{CameraFields, CameraSpec, LensSpec, PictureKind, PoseSpec, ViewOptions, ViewSpec},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -39,7 +39,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     // The first view checks the camera as the server does, and warms up.
     let options = &args.options;
     let camera = camera::spec(&args.camera)?.unwrap_or(FIRST);
-    let spec = ViewSpec::new(camera, Kind::Color, options.clone());
+    let spec = ViewSpec::new(camera, PictureKind::Color, options.clone());
     let first = service.render(&scene, &spec)?;
     let near = options.near.unwrap_or_else(|| default_near(scene.meta.report.median_depth));
     let request = RenderRequest {

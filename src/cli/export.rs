@@ -16,7 +16,7 @@ use crate::{
     },
     names::named,
     scene::Preset,
-    service::{ScoringOptions, scene_splats},
+    service::{FolderSpec, ScoringOptions, scene_splats},
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -46,7 +46,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let format = ExportFormat::of_file(&name);
     let splats = match format.map(|format| (format, format.kind)) {
         Some((format, FormatKind::Folder(write))) => {
-            return folder(args, (format, write), config, out);
+            return folder(args, format, write, config, out);
         }
         Some((_, FormatKind::Splats(splats))) => splats,
         _ => {
@@ -96,24 +96,26 @@ fn gaussians(
 
 fn folder(
     args: &Args,
-    format: (ExportFormat, FolderFormat),
+    format: ExportFormat,
+    folder: FolderFormat,
     config: &Config,
     out: &Output,
 ) -> Result<()> {
     let scene = scene_file::open(&args.scene, &config.limits)?.scene;
     let photos = args.photos.as_deref();
     let upload = photos.map(|path| reconstruct::upload(path, config)).transpose()?;
-    let service = engine::offline(config, format.0.lines)?;
+    let service = engine::offline(config, format.lines)?;
     let unwritable = |e| scene_file::unwritable(&args.output, e);
     // Half a zip is of no use, and what was there before stays until there is a whole one.
     let part = args.output.with_added_extension("part");
     let mut file = fs_err::File::create(&part).map_err(unwritable)?;
-    let how = (&args.texts[..], args.preset, &args.scoring);
-    let written = service.folder(&scene, format, how, upload.as_ref(), &mut file);
+    let (texts, preset, scoring) = (&args.texts[..], args.preset, &args.scoring);
+    let spec = FolderSpec { format, folder, texts, preset, scoring, upload: upload.as_ref() };
+    let written = service.folder(&scene, &spec, &mut file);
     let photos = written.inspect_err(|_| drop(fs_err::remove_file(&part)))?;
     let size_bytes = file.metadata().map_err(unwritable)?.len();
     fs_err::rename(&part, &args.output).map_err(unwritable)?;
-    let (path, name, views) = (args.output.display(), format.0.name, scene.meta.cameras.len());
+    let (path, name, views) = (args.output.display(), format.name, scene.meta.cameras.len());
     let value = json!({
         "output": path.to_string(), "format": name, "views": views, "photos": photos,
         "size_bytes": size_bytes,

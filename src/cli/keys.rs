@@ -56,7 +56,7 @@ pub(super) fn run(args: &Args, out: &Output) -> Result<()> {
                 .take(KEY_BYTES_MAX)
                 .read_to_string(&mut key)
                 .map_err(|e| Error::invalid("the key is not text").caused_by(e))?;
-            let hash = keys::hash(key.trim());
+            let hash = keys::key_sha256(key.trim());
             out.answer(&hash, &json!({ "sha256": hash }))
         }
     }
@@ -73,7 +73,7 @@ fn new(
     keys::check_name("owner", owner.unwrap_or(name))?;
     let key = keys::generate()?;
     let owner_line = owner.map(|owner| format!("owner = \"{owner}\"\n")).unwrap_or_default();
-    let sha256 = keys::hash(&key);
+    let sha256 = keys::key_sha256(&key);
     let lines = format!(
         "[[key]]\nname = \"{name}\"\n{owner_line}sha256 = \"{sha256}\"\nscopes = [\"{scope}\"]\n"
     );

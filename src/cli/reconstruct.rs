@@ -103,7 +103,7 @@ pub(super) fn run(args: &Args, config: &Config, out: &Output) -> Result<()> {
     let id = id_of(&provenance);
     let made = made.into_scene(id, store::now_ms(), provenance);
     let mut scene = match budget_ms(args.refine, photos.photos.len(), config.threads) {
-        Some(ms) => refine(&engine, made, &photos, (ms, &options), config, watch)?,
+        Some(ms) => refine(&engine, made, &photos, ms, &options, config, watch)?,
         None => made,
     };
     let for_others = splat_format(&path).is_some();
@@ -133,7 +133,8 @@ fn refine(
     engine: &Pipeline,
     scene: Scene,
     photos: &PhotoSet,
-    (ms, options): (u64, &SceneOptions),
+    ms: u64,
+    options: &SceneOptions,
     config: &Config,
     watch: Watch<'_>,
 ) -> Result<Scene> {

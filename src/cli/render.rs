@@ -14,7 +14,9 @@ use crate::{
     config::{Config, ConfigArgs},
     error::{Error, Result},
     names::named,
-    service::{CameraFields, Format, Kind, PictureOptions, TextOptions, ViewOptions, ViewSpec},
+    service::{
+        CameraFields, Format, PictureKind, PictureOptions, TextOptions, ViewOptions, ViewSpec,
+    },
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -32,8 +34,8 @@ pub(super) struct Args {
     #[command(flatten)]
     picture: PictureOptions,
     /// What to draw: color, depth, alpha, semantics, relevancy or mask
-    #[arg(long, default_value = "color", value_parser = named::<Kind>)]
-    kind: Kind,
+    #[arg(long, default_value = "color", value_parser = named::<PictureKind>)]
+    kind: PictureKind,
     #[command(flatten)]
     text: TextOptions,
     #[command(flatten)]

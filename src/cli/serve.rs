@@ -14,7 +14,7 @@ use crate::{
     error::{Error, Result},
     pipeline::PipelineLoader,
     service::Service,
-    store::Place,
+    store::StoreLocation,
 };
 
 #[derive(Clone, Debug, clap::Args)]
@@ -55,7 +55,7 @@ pub(super) fn run(
     let (models, data_dir) = (parts.models.clone(), config.data_dir.clone());
     let scheme = if config.tls_cert.is_some() { "https" } else { "http" };
     let (renderer, listen) = (parts.renderer.name(), config.listen);
-    let service = Service::open(&Place::of(&config)?, config, parts)?;
+    let service = Service::open(&StoreLocation::of(&config)?, config, parts)?;
     let served = runtime.block_on(async {
         let listener = TcpListener::bind(listen).await.map_err(|e| {
             Error::invalid(format!("listen: {listen} cannot be used: {e}")).caused_by(e)

@@ -32,12 +32,12 @@ impl Lane {
 pub(crate) struct Queue {
     /// Jobs of one kind that may wait.
     waiting_max: usize,
-    inner: Mutex<Inner>,
+    state: Mutex<QueueState>,
     changed: Condvar,
 }
 
 #[derive(Debug, Default)]
-struct Inner {
+struct QueueState {
     /// Lanes that have jobs; of each kind the one whose turn it is in front.
     lanes: VecDeque<(Lane, VecDeque<SceneId>)>,
     /// Places promised to uploads that are being written.
@@ -58,14 +58,14 @@ pub(super) enum Full {
 
 /// A place in the queue; given back when dropped unused.
 #[derive(Debug)]
-pub(super) struct Place<'a> {
+pub(super) struct ReservedPlace<'a> {
     queue: &'a Queue,
     lane: Lane,
 }
 
-impl Drop for Place<'_> {
+impl Drop for ReservedPlace<'_> {
     fn drop(&mut self) {
-        let reserved = &mut self.queue.inner.lock().reserved;
+        let reserved = &mut self.queue.state.lock().reserved;
         if let Some(count) = reserved.get_mut(&self.lane) {
             *count -= 1;
         }
@@ -73,14 +73,14 @@ impl Drop for Place<'_> {
     }
 }
 
-impl Place<'_> {
+impl ReservedPlace<'_> {
     /// Puts a job into the place.
     pub(super) fn fill(self, id: SceneId) {
         self.queue.push(self.lane.kind, id, self.lane.owner.as_deref());
     }
 }
 
-impl Inner {
+impl QueueState {
     /// Jobs that wait and places that are promised, of the lanes that `is` names.
     fn taken(&self, is: impl Fn(&Lane) -> bool) -> usize {
         let waiting = self.lanes.iter().filter(|(lane, _)| is(lane)).map(|(_, jobs)| jobs.len());
@@ -101,34 +101,38 @@ impl Inner {
 
 impl Queue {
     pub(super) fn new(waiting_max: usize) -> Self {
-        Self { waiting_max, inner: Mutex::default(), changed: Condvar::new() }
+        Self { waiting_max, state: Mutex::default(), changed: Condvar::new() }
     }
 
     /// A place for a job of `owner`.
-    pub(super) fn reserve(&self, kind: Kind, owner: Option<&str>) -> Result<Place<'_>, Full> {
+    pub(super) fn reserve(
+        &self,
+        kind: Kind,
+        owner: Option<&str>,
+    ) -> Result<ReservedPlace<'_>, Full> {
         let lane = Lane::of(kind, owner);
-        let mut inner = self.inner.lock();
+        let mut state = self.state.lock();
         let share = self.waiting_max.div_ceil(2);
-        if inner.closed {
+        if state.closed {
             return Err(Full::Closed);
         }
-        if inner.taken(|other| other.kind == kind) >= self.waiting_max {
+        if state.taken(|other| other.kind == kind) >= self.waiting_max {
             return Err(Full::All(self.waiting_max));
         }
         // Without owners there is nobody to share with.
-        if owner.is_some() && inner.taken(|other| *other == lane) >= share {
+        if owner.is_some() && state.taken(|other| *other == lane) >= share {
             return Err(Full::Share(share));
         }
-        *inner.reserved.entry(lane.clone()).or_default() += 1;
-        Ok(Place { queue: self, lane })
+        *state.reserved.entry(lane.clone()).or_default() += 1;
+        Ok(ReservedPlace { queue: self, lane })
     }
 
     /// Adds a job beyond any bound: one that was acknowledged before a restart.
     pub(super) fn push(&self, kind: Kind, id: SceneId, owner: Option<&str>) {
-        let (mut inner, lane) = (self.inner.lock(), Lane::of(kind, owner));
-        match inner.lanes.iter_mut().find(|(other, _)| *other == lane) {
+        let (mut state, lane) = (self.state.lock(), Lane::of(kind, owner));
+        match state.lanes.iter_mut().find(|(other, _)| *other == lane) {
             Some((_, jobs)) => jobs.push_back(id),
-            None => inner.lanes.push_back((lane, VecDeque::from([id]))),
+            None => state.lanes.push_back((lane, VecDeque::from([id]))),
         }
         // Workers of other kinds may wait too.
         self.changed.notify_all();
@@ -136,21 +140,21 @@ impl Queue {
 
     /// The next job of a kind; waits for one. `None` once the queue is closed.
     pub(super) fn pop(&self, kind: Kind) -> Option<SceneId> {
-        let mut inner = self.inner.lock();
+        let mut state = self.state.lock();
         loop {
-            if inner.closed {
+            if state.closed {
                 return None;
             }
-            if let Some(id) = inner.next(kind) {
+            if let Some(id) = state.next(kind) {
                 return Some(id);
             }
-            self.changed.wait(&mut inner);
+            self.changed.wait(&mut state);
         }
     }
 
     /// Takes the waiting jobs of a scene out; only those of a kind where one is given.
     pub(super) fn remove(&self, id: &SceneId, kind: Option<Kind>) {
-        self.inner.lock().lanes.retain_mut(|(lane, jobs)| {
+        self.state.lock().lanes.retain_mut(|(lane, jobs)| {
             jobs.retain(|other| kind.is_some_and(|kind| lane.kind != kind) || other != id);
             !jobs.is_empty()
         });
@@ -158,8 +162,8 @@ impl Queue {
 
     /// Jobs of a kind that go before that of the scene `id` now; `None` when it does not wait.
     pub(super) fn ahead(&self, kind: Kind, id: &SceneId) -> Option<usize> {
-        let inner = self.inner.lock();
-        let lanes = inner.lanes.iter().filter(|(lane, _)| lane.kind == kind);
+        let state = self.state.lock();
+        let lanes = state.lanes.iter().filter(|(lane, _)| lane.kind == kind);
         let lanes: Vec<&VecDeque<SceneId>> = lanes.map(|(_, jobs)| jobs).collect();
         let place = |jobs: &VecDeque<SceneId>| jobs.iter().position(|waiting| waiting == id);
         let (turn, place) =
@@ -173,26 +177,26 @@ impl Queue {
 
     /// Jobs of a kind that wait.
     pub(super) fn len(&self, kind: Kind) -> usize {
-        let inner = self.inner.lock();
-        let lanes = inner.lanes.iter().filter(|(lane, _)| lane.kind == kind);
+        let state = self.state.lock();
+        let lanes = state.lanes.iter().filter(|(lane, _)| lane.kind == kind);
         lanes.map(|(_, jobs)| jobs.len()).sum()
     }
 
     /// Lets no worker take another job.
     pub(super) fn close(&self) {
-        self.inner.lock().closed = true;
+        self.state.lock().closed = true;
         self.changed.notify_all();
     }
 
     /// Pauses the calling thread for `time`, less when the queue is closed; whether it is.
     pub(super) fn pause(&self, time: Duration) -> bool {
-        let mut inner = self.inner.lock();
-        self.changed.wait_while_for(&mut inner, |inner| !inner.closed, time);
-        inner.closed
+        let mut state = self.state.lock();
+        self.changed.wait_while_for(&mut state, |state| !state.closed, time);
+        state.closed
     }
 
     pub(super) fn is_closed(&self) -> bool {
-        self.inner.lock().closed
+        self.state.lock().closed
     }
 }
 

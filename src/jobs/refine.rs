@@ -191,7 +191,7 @@ impl Jobs {
         self.check_attempts(job.kind, &record)?;
         self.records.apply(id, &Change::Started(job.kind))?;
         self.mend(&record);
-        let turns = Turns { jobs: self, job, resumed: Mutex::new(Instant::now()) };
+        let turns = GivesWay { jobs: self, job, resumed: Mutex::new(Instant::now()) };
         let progress = |_: Stage, _: f32| drop(turns.give_way());
         let watch = Watch { progress: &progress, cancel: &job.cancel };
         turns.give_way()?;
@@ -244,14 +244,14 @@ impl Jobs {
 }
 
 /// When a refinement works and when it waits.
-struct Turns<'a> {
+struct GivesWay<'a> {
     jobs: &'a Jobs,
     job: &'a Job,
     /// The end of its last wait.
     resumed: Mutex<Instant>,
 }
 
-impl Turns<'_> {
+impl GivesWay<'_> {
     /// Waits until nothing else is to be done, or nothing but views and those for long enough.
     /// Fails with `cancelled`.
     fn give_way(&self) -> Result<()> {
@@ -263,7 +263,7 @@ impl Turns<'_> {
             makes && kind != job.kind
         };
         jobs.bell.wait_in_job(&job.cancel, || {
-            let left = views_go_first((jobs.parts.drawn)(), worked, begun.elapsed());
+            let left = views_go_first((jobs.parts.since_last_view)(), worked, begun.elapsed());
             match left.is_zero() {
                 false => Err(left),
                 true if jobs.kinds.iter().any(|kind| is_made(*kind)) => Err(FOREVER),
@@ -277,8 +277,8 @@ impl Turns<'_> {
 
 /// How much longer views go first: the last was drawn some time ago, and the refinement waits since
 /// it `worked` so long.
-fn views_go_first(drawn: Option<Duration>, worked: Duration, waited: Duration) -> Duration {
-    let quiet = drawn.map_or(Duration::ZERO, |ago| QUIET.saturating_sub(ago));
+fn views_go_first(last_view: Option<Duration>, worked: Duration, waited: Duration) -> Duration {
+    let quiet = last_view.map_or(Duration::ZERO, |ago| QUIET.saturating_sub(ago));
     quiet.min((worked * WAITS).min(PATIENCE).saturating_sub(waited))
 }
 
@@ -298,8 +298,8 @@ mod tests {
     #[test]
     fn views_without_end_leave_a_fourth_of_the_time() {
         let ms = Duration::from_millis;
-        let left = |drawn: Option<u64>, worked, waited| {
-            views_go_first(drawn.map(ms), ms(worked), ms(waited)).as_millis()
+        let left = |last_view: Option<u64>, worked, waited| {
+            views_go_first(last_view.map(ms), ms(worked), ms(waited)).as_millis()
         };
         assert_eq!(left(None, 100, 0), 0, "nobody looks");
         assert_eq!([left(Some(250), 100, 0), left(Some(240), 100, 0)], [0, 10], "a quiet moment");

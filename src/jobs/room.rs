@@ -17,7 +17,7 @@ pub(super) struct Room {
 
 /// Room that a job has; given back when dropped.
 #[derive(Debug)]
-pub(super) struct Taken<'a> {
+pub(super) struct RoomShare<'a> {
     room: &'a Room,
     photos: usize,
 }
@@ -34,7 +34,7 @@ impl Room {
         photos: usize,
         photos_max: usize,
         cancel: &AtomicBool,
-    ) -> Result<Taken<'_>> {
+    ) -> Result<RoomShare<'_>> {
         let photos = photos.min(photos_max);
         self.bell.wait_in_job(cancel, || {
             let mut taken = self.taken.lock();
@@ -44,11 +44,11 @@ impl Room {
             *taken += photos;
             Ok(())
         })?;
-        Ok(Taken { room: self, photos })
+        Ok(RoomShare { room: self, photos })
     }
 }
 
-impl Drop for Taken<'_> {
+impl Drop for RoomShare<'_> {
     fn drop(&mut self) {
         *self.room.taken.lock() -= self.photos;
         self.room.bell.ring();

@@ -106,7 +106,7 @@ pub(crate) struct JobParts {
     pub(crate) refiner: Arc<dyn DifferentiableRenderer>,
     pub(crate) threads: usize,
     /// How long ago a view was drawn, waited or was encoded; `None`: never.
-    pub(crate) drawn: Box<dyn Fn() -> Option<Duration> + Send + Sync>,
+    pub(crate) since_last_view: Box<dyn Fn() -> Option<Duration> + Send + Sync>,
 }
 
 /// The queue, its workers and the state of every scene. The calls block on the store and fail

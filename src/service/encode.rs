@@ -6,7 +6,7 @@ use std::borrow::Cow;
 
 use image::{ExtendedColorType, ImageEncoder, codecs::webp::WebPEncoder};
 
-use super::request::{Format, Kind};
+use super::request::{Format, PictureKind};
 use crate::{
     error::{Error, Result},
     formats::npy,
@@ -50,43 +50,44 @@ pub(super) enum Layer<'a> {
 }
 
 /// Takes a picture out of a frame.
-pub(super) fn layer(frame: &mut Frame, kind: Kind) -> Result<Layer<'static>> {
+pub(super) fn layer(frame: &mut Frame, kind: PictureKind) -> Result<Layer<'static>> {
     let Frame { color, depth, alpha, mask, levels, .. } = frame;
     let layer = match kind {
-        Kind::Color => color
+        PictureKind::Color => color
             .take()
             .map(Layer::Color)
             .or_else(|| levels.rgb.take().map(Layer::Rgb))
             .or_else(|| levels.rgba.take().map(Layer::Rgba)),
-        Kind::Depth => {
+        PictureKind::Depth => {
             depth.take().map(Layer::Depth).or_else(|| levels.depth.take().map(Layer::Steps))
         }
-        Kind::Alpha => alpha
+        PictureKind::Alpha => alpha
             .take()
             .map(|alpha| Layer::Share(alpha.into()))
             .or_else(|| levels.alpha.take().map(Layer::Levels)),
-        Kind::Mask => mask.take().map(Layer::Levels),
-        Kind::Semantics | Kind::Relevancy => None,
+        PictureKind::Mask => mask.take().map(Layer::Levels),
+        PictureKind::Semantics | PictureKind::Relevancy => None,
     };
     layer.ok_or_else(|| Error::internal(format!("the renderer gave no {kind}")))
 }
 
 /// Refuses pairs of kind and format that would lose the picture, or that have other samples.
-pub(super) fn check(kind: Kind, format: Format) -> Result<()> {
+pub(super) fn check(kind: PictureKind, format: Format) -> Result<()> {
     let refused = |why: &str| Err(Error::invalid(format!("kind={kind} {why}")));
     match (kind, format) {
         (_, Format::Png | Format::Npy) => Ok(()),
-        (Kind::Depth, _) => Err(Error::invalid(
+        (PictureKind::Depth, _) => Err(Error::invalid(
             "depth does not fit 8 bits: ask for png (16-bit, with its scale) or npy (float32)",
         )),
-        (Kind::Mask | Kind::Semantics, Format::Jpeg) => {
+        (PictureKind::Mask | PictureKind::Semantics, Format::Jpeg) => {
             refused("does not survive JPEG: ask for png, webp or npy")
         }
-        (Kind::Alpha | Kind::Relevancy | Kind::Mask, Format::Rgb8 | Format::Rgba8) => {
-            refused("has one sample a pixel: ask for grey8")
-        }
-        (Kind::Semantics, Format::Rgba8) => refused("has no alpha: ask for rgb8"),
-        (Kind::Color | Kind::Semantics, Format::Grey8) => {
+        (
+            PictureKind::Alpha | PictureKind::Relevancy | PictureKind::Mask,
+            Format::Rgb8 | Format::Rgba8,
+        ) => refused("has one sample a pixel: ask for grey8"),
+        (PictureKind::Semantics, Format::Rgba8) => refused("has no alpha: ask for rgb8"),
+        (PictureKind::Color | PictureKind::Semantics, Format::Grey8) => {
             refused("has three samples a pixel: ask for rgb8")
         }
         _ => Ok(()),

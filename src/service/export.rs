@@ -65,7 +65,7 @@ impl Service {
             return Err(texts::not_with(format.name));
         }
         let export = match format.kind {
-            FormatKind::Folder(folder) => self.folder(id, (format, folder), preset, ask).await?,
+            FormatKind::Folder(folder) => self.folder(id, format, folder, preset, ask).await?,
             FormatKind::Arrays => self.arrays(&access.finished()?, format, ask).await?,
             FormatKind::Packed => self.packed(access.finished()?).await?,
             FormatKind::Page => self.page(access.finished()?, preset, ask).await?,

@@ -11,7 +11,7 @@ use std::{
 use rayon::prelude::*;
 
 use super::{
-    request::{FeatureKind, FeaturesSpec, Kind, ViewSpec},
+    request::{FeatureKind, FeaturesSpec, PictureKind, ViewSpec},
     schedule::Demand,
     search::{LabelledView, SceneTexts, ScoringChoice},
     shared::Service,
@@ -36,7 +36,7 @@ pub(super) fn features_view<'a>(
 ) -> Result<Resolved> {
     check_scoring(&spec.scoring, limits)?;
     let options = spec.options.clone();
-    resolve_one(limits, inputs, &ViewSpec::new(spec.camera, Kind::Semantics, options))
+    resolve_one(limits, inputs, &ViewSpec::new(spec.camera, PictureKind::Semantics, options))
 }
 
 /// Refuses features of more bytes than the limit.

@@ -33,13 +33,14 @@ mod work;
 pub(crate) use self::refine::check_refine;
 pub use self::{
     export::scene_splats,
+    folder::FolderSpec,
     infer::InferSpec,
     memory::Share,
     offline::OfflineService,
     page::{VIEWER, ViewerPage},
     request::{
         BackgroundSpec, Boxes, CameraFields, CameraSpec, CreateScene, FeatureKind, FeaturesSpec,
-        Format, Kind, LensSpec, MaskFormat, PageRequest, PickSpec, PictureOptions, PoseSpec,
+        Format, LensSpec, MaskFormat, PageRequest, PickSpec, PictureKind, PictureOptions, PoseSpec,
         QuerySpec, ScoringOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec,
     },
     shared::{Parts, Service},

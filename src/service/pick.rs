@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::{
-    request::{Kind, PickSpec, ViewSpec},
+    request::{PickSpec, PictureKind, ViewSpec},
     schedule::Demand,
     search::{SceneTexts, ScoredText, ScoringChoice},
     shared::Service,
@@ -26,7 +26,11 @@ pub(super) fn pick_view<'a>(
     inputs: impl Into<Inputs<'a>>,
     spec: &PickSpec,
 ) -> Result<Resolved> {
-    resolve_one(limits, inputs, &ViewSpec::new(spec.camera, Kind::Alpha, spec.options.clone()))
+    resolve_one(
+        limits,
+        inputs,
+        &ViewSpec::new(spec.camera, PictureKind::Alpha, spec.options.clone()),
+    )
 }
 
 /// Depth, point and Gaussian of a pixel of a view.

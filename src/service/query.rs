@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::{
     encode::{self, Layer},
     request::{
-        Boxes, CameraSpec, Format, Kind, LensSpec, MaskFormat, PoseSpec, QuerySpec, ViewSpec,
+        Boxes, CameraSpec, Format, LensSpec, MaskFormat, PictureKind, PoseSpec, QuerySpec, ViewSpec,
     },
     schedule::Demand,
     search::{LabelledView, SceneTexts, ScoredText, ScoringChoice},
@@ -100,7 +100,7 @@ pub(super) fn query_view<'a>(
     // The options of a view that is not asked for are checked all the same.
     let any = PoseSpec::CameraToWorld(DMat4::IDENTITY.to_cols_array());
     let camera = spec.camera.unwrap_or(CameraSpec { pose: any, lens: LensSpec::default() });
-    let of = ViewSpec::new(camera, Kind::Mask, spec.options.clone());
+    let of = ViewSpec::new(camera, PictureKind::Mask, spec.options.clone());
     let view = resolve_one(limits, inputs, &of)?;
     Ok(spec.camera.map(|_| view))
 }

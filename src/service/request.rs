@@ -43,7 +43,8 @@ pub struct PageRequest {
 /// Which picture.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
-pub enum Kind {
+#[schema(as = Kind)]
+pub enum PictureKind {
     /// sRGB colour over the background.
     #[default]
     Color,
@@ -59,7 +60,7 @@ pub enum Kind {
     Mask,
 }
 
-impl Kind {
+impl PictureKind {
     /// Whether it answers a text.
     pub fn takes_text(self) -> bool {
         matches!(self, Self::Relevancy | Self::Mask)
@@ -147,7 +148,7 @@ pub enum FeatureKind {
     Features,
 }
 
-display_names!(Kind, Format, Boxes, MaskFormat, FeatureKind);
+display_names!(PictureKind, Format, Boxes, MaskFormat, FeatureKind);
 
 /// A camera as its separate fields: one pose, at most one lens.
 #[derive(
@@ -453,7 +454,7 @@ pub struct ViewSpec {
     /// Camera.
     pub camera: CameraSpec,
     /// Picture.
-    pub kind: Kind,
+    pub kind: PictureKind,
     /// How it is rendered.
     pub options: ViewOptions,
     /// How it is encoded.
@@ -465,7 +466,7 @@ pub struct ViewSpec {
 impl ViewSpec {
     /// A view without a text, as a PNG.
     #[must_use]
-    pub fn new(camera: CameraSpec, kind: Kind, options: ViewOptions) -> Self {
+    pub fn new(camera: CameraSpec, kind: PictureKind, options: ViewOptions) -> Self {
         let (picture, text) = (PictureOptions::default(), TextOptions::default());
         Self { camera, kind, options, picture, text }
     }
@@ -485,7 +486,7 @@ pub struct ViewsSpec {
     pub cameras: Vec<CameraSpec>,
     /// Pictures of each camera; colour by default.
     #[serde(default)]
-    pub kinds: Vec<Kind>,
+    pub kinds: Vec<PictureKind>,
     /// How they are rendered.
     #[serde(flatten)]
     pub options: ViewOptions,

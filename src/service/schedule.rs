@@ -143,7 +143,7 @@ impl Drop for Slot {
 }
 
 /// Takes a view out of the queue when its caller stops to wait.
-struct Place<'a> {
+struct WaitingView<'a> {
     scheduler: &'a Scheduler,
     caller: Caller,
     key: (u64, u64),
@@ -151,7 +151,7 @@ struct Place<'a> {
     started: oneshot::Receiver<Slot>,
 }
 
-impl Drop for Place<'_> {
+impl Drop for WaitingView<'_> {
     fn drop(&mut self) {
         let mut state = self.scheduler.state.lock();
         let lane = state.lanes.get_mut(&self.caller);
@@ -255,7 +255,7 @@ impl Scheduler {
             let key = (lane.clock.saturating_add(demand.work), arrival);
             lane.waiting.insert(key, Waiting { demand, start });
             self.start_next(&mut state);
-            Place { scheduler: self, caller, key, started }
+            WaitingView { scheduler: self, caller, key, started }
         };
         let slot = (&mut place.started).await;
         slot.map_err(|closed| Error::internal("a view was never started").caused_by(closed))

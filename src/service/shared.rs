@@ -18,7 +18,7 @@ use crate::{
     limits::{Limits, LiveLimits},
     render::Renderer,
     scene::Refine,
-    store::{Place, Store},
+    store::{Store, StoreLocation},
 };
 
 /// Uploads decoded at the same time: each may hold `limits.photos_max` photos in memory.
@@ -108,7 +108,7 @@ impl Service {
     ///
     /// # Errors
     /// `store_unavailable` when the store cannot be used.
-    pub fn open(place: &Place, config: Config, parts: Parts) -> Result<Self> {
+    pub fn open(place: &StoreLocation, config: Config, parts: Parts) -> Result<Self> {
         let (store, records) = Store::open(place, &config.limits)?;
         let store = Arc::new(store);
         let scheduler = Scheduler::new(parts.renderer.concurrency(), &config.limits);
@@ -133,7 +133,7 @@ impl Service {
             renderer: Arc::clone(&parts.renderer),
             refiner,
             threads: config.threads,
-            drawn: Box::new(move || views.idle()),
+            since_last_view: Box::new(move || views.idle()),
         };
         let jobs = Jobs::start(job_parts, records)?;
         let models = ModelsInfo {

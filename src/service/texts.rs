@@ -1,6 +1,6 @@
 //! Checks of the texts of a request: how many, how long, of what.
 
-use super::request::{Kind, ScoringOptions, TextOptions};
+use super::request::{PictureKind, ScoringOptions, TextOptions};
 use crate::{
     error::{Error, Result},
     formats::table::ExportFormat,
@@ -30,7 +30,11 @@ pub(super) fn checked(text: &str, what: &str, limits: &Limits) -> Result<String>
 
 /// Refuses a text without a kind that takes one, and such a kind without a text; gives the text
 /// checked.
-pub(super) fn check_ask(kinds: &[Kind], ask: &TextOptions, limits: &Limits) -> Result<TextOptions> {
+pub(super) fn check_ask(
+    kinds: &[PictureKind],
+    ask: &TextOptions,
+    limits: &Limits,
+) -> Result<TextOptions> {
     check_scoring(&ask.scoring, limits)?;
     let takes = kinds.iter().find(|kind| kind.takes_text());
     let text = match (&ask.text, takes) {

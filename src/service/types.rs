@@ -10,7 +10,7 @@ use utoipa::ToSchema;
 
 use super::{
     memory::Share,
-    request::{Format, Kind},
+    request::{Format, PictureKind},
     times::ViewTimes,
 };
 use crate::{
@@ -183,7 +183,7 @@ pub struct RenderedView {
     /// Index of its camera in the request.
     pub camera_index: usize,
     /// Picture.
-    pub kind: Kind,
+    pub kind: PictureKind,
     /// Encoding.
     pub format: Format,
     /// Width, pixels.

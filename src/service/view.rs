@@ -12,7 +12,8 @@ use super::{
     encode::{self, Layer},
     memory::Share,
     request::{
-        BackgroundSpec, Format, Kind, PictureOptions, TextOptions, ViewOptions, ViewSpec, ViewsSpec,
+        BackgroundSpec, Format, PictureKind, PictureOptions, TextOptions, ViewOptions, ViewSpec,
+        ViewsSpec,
     },
     schedule::Demand,
     search::{Backend, LabelledView, SceneTexts, ScoringChoice, SemanticScene},
@@ -45,7 +46,7 @@ const READY_MAX: usize = 2;
 pub(super) struct Resolved {
     camera_index: usize,
     camera: Camera,
-    kinds: Vec<Kind>,
+    kinds: Vec<PictureKind>,
     near: f32,
     method: ViewMethod,
     /// The preset that was named, or that of the scene.
@@ -115,11 +116,15 @@ impl Resolved {
 
     fn kinds(&self) -> Kinds {
         let has = |kind| self.kinds.contains(&kind);
-        Kinds { color: has(Kind::Color), depth: has(Kind::Depth), alpha: has(Kind::Alpha) }
+        Kinds {
+            color: has(PictureKind::Color),
+            depth: has(PictureKind::Depth),
+            alpha: has(PictureKind::Alpha),
+        }
     }
 
     /// Hash of scene, renderer and request for one kind; `text` is that of [`text_key`].
-    fn etag(&self, scene: &str, renderer: &str, kind: Kind, text: &str) -> Result<String> {
+    fn etag(&self, scene: &str, renderer: &str, kind: PictureKind, text: &str) -> Result<String> {
         let version = env!("CARGO_PKG_VERSION");
         let request = (self.camera, kind, &self.options, &self.picture, self.method.backdrop);
         Ok(etag(&cache_key(&(scene, version, renderer, request, text))?))
@@ -162,7 +167,7 @@ impl Resolved {
     /// A mask alone is drawn as such; all else needs the weights.
     fn labels(&self, texts: &SceneTexts) -> Labels {
         let mask_alone =
-            self.kinds.iter().all(|kind| !kind.needs_semantics() || *kind == Kind::Mask);
+            self.kinds.iter().all(|kind| !kind.needs_semantics() || *kind == PictureKind::Mask);
         let tables = texts.texts.first().map(|text| text.scores.tables()).unwrap_or_default();
         match <[_; 1]>::try_from(tables) {
             Ok([table]) if mask_alone && texts.scorer.scoring().is_signed() => {
@@ -187,7 +192,7 @@ impl Resolved {
         work.leave_renderer();
         let name = backend.renderer.name();
         let (width, height, format) = (frame.width, frame.height, self.picture.format);
-        let view = |&kind: &Kind| -> Result<RenderedView> {
+        let view = |&kind: &PictureKind| -> Result<RenderedView> {
             work.unless_stopped()?;
             let mut times = ViewTimes { queue_ms: work.queue_ms, render_ms, ..times };
             let texts = texts.filter(|_| kind.needs_semantics());
@@ -237,14 +242,16 @@ enum Scored {
 }
 
 impl Scored {
-    fn new(kind: Kind, texts: &SceneTexts, view: &LabelledView) -> Result<Self> {
+    fn new(kind: PictureKind, texts: &SceneTexts, view: &LabelledView) -> Result<Self> {
         let (scorer, text) = (&texts.scorer, texts.texts.first());
         match (kind, text) {
-            (Kind::Mask, Some(text)) => Ok(Self::Mask(scorer.mask(&text.scores, &view.weights)?)),
-            (Kind::Relevancy, Some(text)) => {
+            (PictureKind::Mask, Some(text)) => {
+                Ok(Self::Mask(scorer.mask(&text.scores, &view.weights)?))
+            }
+            (PictureKind::Relevancy, Some(text)) => {
                 Ok(Self::Relevancy(view.relevancy(scorer, &text.scores)?))
             }
-            (Kind::Semantics, _) => Ok(Self::Entries(view.strongest(scorer))),
+            (PictureKind::Semantics, _) => Ok(Self::Entries(view.strongest(scorer))),
             _ => Err(Error::internal(format!("kind={kind} was not drawn"))),
         }
     }
@@ -370,7 +377,7 @@ fn resolve<'a>(
 
 impl Shared {
     /// Checks the text of a request; the bundle first, because no text works without networks.
-    fn checked_ask(&self, kinds: &[Kind], ask: &TextOptions) -> Result<TextOptions> {
+    fn checked_ask(&self, kinds: &[PictureKind], ask: &TextOptions) -> Result<TextOptions> {
         if let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) {
             self.can_understand(&format!("kind={kind}"))?;
         }
@@ -381,7 +388,7 @@ impl Shared {
     async fn semantics_for(
         self: &Arc<Self>,
         scene: &SceneAccess,
-        kinds: &[Kind],
+        kinds: &[PictureKind],
         ask: &TextOptions,
     ) -> Result<Option<SemanticScene>> {
         let Some(kind) = kinds.iter().find(|kind| kind.needs_semantics()) else { return Ok(None) };
@@ -406,7 +413,8 @@ impl Shared {
     async fn render_one(
         self: &Arc<Self>,
         access: SceneAccess,
-        (view, held): (Resolved, Option<Share>),
+        view: Resolved,
+        held: Option<Share>,
         texts: Option<Arc<SceneTexts>>,
         caller: &Caller,
         deadline: Instant,
@@ -475,8 +483,7 @@ impl Service {
         let of = inner.semantics_for(&scene, &[spec.kind], &ask).await?;
         let deadline = inner.deadline(&spec.options);
         let texts = inner.score_ask(of, ask, spec.options.preset, deadline).await?;
-        let mut views =
-            inner.render_one(scene, (view, None), texts, &self.caller, deadline).await?;
+        let mut views = inner.render_one(scene, view, None, texts, &self.caller, deadline).await?;
         views.pop().ok_or_else(|| Error::internal("a render gave no picture"))
     }
 
@@ -545,16 +552,17 @@ impl Service {
                             .memory
                             .answer_by(one.bytes_max(), &inner.limits(), last.into())
                             .await?;
-                        Ok::<_, Error>((one, Some(held)))
+                        Ok::<_, Error>((one, held))
                     }
                 };
                 // Each on a task of its own: a slot must not wait for a slow reader.
-                let render = |one: (Resolved, Option<Share>)| {
+                let render = |(one, held): (Resolved, Share)| {
                     let deadline = last.min(inner.deadline(&ViewOptions::default()));
                     let (inner, scene, texts) = (Arc::clone(&inner), scene.clone(), texts.clone());
                     let caller = caller.clone();
-                    let views =
-                        async move { inner.render_one(scene, one, texts, &caller, deadline).await };
+                    let views = async move {
+                        inner.render_one(scene, one, Some(held), texts, &caller, deadline).await
+                    };
                     Task::spawn(views.in_current_span())
                         .map_err(|e| Error::internal("a view was broken off").caused_by(e))
                 };

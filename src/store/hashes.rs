@@ -14,7 +14,7 @@ use crate::{
 
 /// sha256 over files and options, hex: what an idempotency key stands for.
 pub fn request_sha256(files: &[PhotoHash], options: &SceneOptions) -> String {
-    hash(files, &canonical(options))
+    sha256_of_files(files, &canonical(options))
 }
 
 /// What a scene is made of: photos and cameras in their order, options, and the networks by the
@@ -23,7 +23,7 @@ pub fn provenance(files: Vec<PhotoHash>, options: &SceneOptions, networks: &str)
     let program_version = env!("CARGO_PKG_VERSION").to_owned();
     let rest = format!("{} {networks} {program_version}", canonical(options));
     Provenance {
-        content_sha256: hash(&files, &rest),
+        content_sha256: sha256_of_files(&files, &rest),
         files,
         bundle_sha256: networks.to_owned(),
         options: options.clone(),
@@ -33,10 +33,11 @@ pub fn provenance(files: Vec<PhotoHash>, options: &SceneOptions, networks: &str)
 
 /// Whether a kept hash is that of this request, also where an earlier program wrote it.
 pub(crate) fn is_of_request(kept: &str, files: &[PhotoHash], options: &SceneOptions) -> bool {
-    kept == request_sha256(files, options) || kept == hash(files, &before_canonical(options))
+    kept == request_sha256(files, options)
+        || kept == sha256_of_files(files, &before_canonical(options))
 }
 
-fn hash(files: &[PhotoHash], rest: &str) -> String {
+fn sha256_of_files(files: &[PhotoHash], rest: &str) -> String {
     let mut hash = Sha256::new();
     for file in files {
         // The length of the name first, so that no two lists of files read the same.

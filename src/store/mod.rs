@@ -43,7 +43,7 @@ pub use self::{
     files::sha256,
     hashes::{provenance, request_sha256},
     index::KeyUse,
-    open::Place,
+    open::StoreLocation,
     record::{Record, RefineOrder},
     upload_file::hashes,
 };

@@ -38,7 +38,7 @@ const PREFIXES: [&str; 8] =
 
 /// Where scenes are kept.
 #[derive(Clone, Debug)]
-pub enum Place {
+pub enum StoreLocation {
     /// A folder that this process alone uses.
     Folder(PathBuf),
     /// Objects that other replicas use too.
@@ -47,7 +47,7 @@ pub enum Place {
     Own(Arc<dyn ObjectStore>),
 }
 
-impl Place {
+impl StoreLocation {
     /// What the configuration names: an S3-compatible bucket, else the data folder.
     ///
     /// # Errors
@@ -97,18 +97,22 @@ impl Store {
     ///
     /// # Errors
     /// `store_unavailable` when the place cannot be used, or another process uses the folder.
-    pub fn open(place: &Place, limits: &Limits) -> Result<(Self, Vec<Record>)> {
+    pub fn open(place: &StoreLocation, limits: &Limits) -> Result<(Self, Vec<Record>)> {
         let timeout = Duration::from_millis(limits.store_timeout_ms);
         let (objects, shared, lock) = match place {
-            Place::Folder(root) => {
+            StoreLocation::Folder(root) => {
                 let lock = lock(root)?;
                 // The folder may hold other things: only ours are touched.
                 PREFIXES.iter().for_each(|ours| clear_cut_off(&root.join(ours)));
                 let (folder, local) = local(root)?;
                 (Objects::new(Arc::new(local), Some(folder), timeout)?, false, Some(lock))
             }
-            Place::Shared(store) => (Objects::new(Arc::clone(store), None, timeout)?, true, None),
-            Place::Own(store) => (Objects::new(Arc::clone(store), None, timeout)?, false, None),
+            StoreLocation::Shared(store) => {
+                (Objects::new(Arc::clone(store), None, timeout)?, true, None)
+            }
+            StoreLocation::Own(store) => {
+                (Objects::new(Arc::clone(store), None, timeout)?, false, None)
+            }
         };
         let store = Self {
             objects,

@@ -16,7 +16,7 @@ const LABEL: ContainerKind = ContainerKind { kind: "segsplat-upload", version: 1
 
 #[derive(Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-enum Part {
+enum UploadPart {
     Transforms,
     Cameras,
     Archive,
@@ -28,17 +28,17 @@ enum Part {
 struct Header {
     record: super::Record,
     /// Part and name of each array, in order.
-    parts: Vec<(Part, String)>,
+    parts: Vec<(UploadPart, String)>,
 }
 
-fn parts(upload: &Upload) -> Vec<(Part, &str, &[u8])> {
+fn parts(upload: &Upload) -> Vec<(UploadPart, &str, &[u8])> {
     let cameras = upload.cameras.iter().map(|cameras| match cameras {
-        UploadCameras::Transforms(json) => (Part::Transforms, "transforms.json", &json[..]),
-        UploadCameras::Cameras(json) => (Part::Cameras, "cameras.json", &json[..]),
+        UploadCameras::Transforms(json) => (UploadPart::Transforms, "transforms.json", &json[..]),
+        UploadCameras::Cameras(json) => (UploadPart::Cameras, "cameras.json", &json[..]),
     });
-    let archive = upload.archive.iter().map(|bytes| (Part::Archive, "archive", &bytes[..]));
-    let photos = upload.photos.iter().map(|p| (Part::Photo, p.name.as_str(), &p.bytes[..]));
-    let splats = upload.splats.iter().map(|s| (Part::Splats, s.name.as_str(), &s.bytes[..]));
+    let archive = upload.archive.iter().map(|bytes| (UploadPart::Archive, "archive", &bytes[..]));
+    let photos = upload.photos.iter().map(|p| (UploadPart::Photo, p.name.as_str(), &p.bytes[..]));
+    let splats = upload.splats.iter().map(|s| (UploadPart::Splats, s.name.as_str(), &s.bytes[..]));
     cameras.chain(archive).chain(photos).chain(splats).collect()
 }
 
@@ -83,11 +83,11 @@ pub(super) fn read(file: &[u8]) -> Result<(Upload, super::Record)> {
     for (i, (part, name)) in header.parts.into_iter().enumerate() {
         let bytes = container.rows(&format!("part_{i}"), Dtype::U8)?;
         match part {
-            Part::Transforms => upload.cameras = Some(UploadCameras::Transforms(bytes)),
-            Part::Cameras => upload.cameras = Some(UploadCameras::Cameras(bytes)),
-            Part::Archive => upload.archive = Some(bytes),
-            Part::Photo => upload.photos.push(UploadFile { name, bytes }),
-            Part::Splats => upload.splats = Some(UploadFile { name, bytes }),
+            UploadPart::Transforms => upload.cameras = Some(UploadCameras::Transforms(bytes)),
+            UploadPart::Cameras => upload.cameras = Some(UploadCameras::Cameras(bytes)),
+            UploadPart::Archive => upload.archive = Some(bytes),
+            UploadPart::Photo => upload.photos.push(UploadFile { name, bytes }),
+            UploadPart::Splats => upload.splats = Some(UploadFile { name, bytes }),
         }
     }
     Ok((upload, header.record))

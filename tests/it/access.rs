@@ -10,7 +10,7 @@ use segsplat::{
         http::routes,
     },
     error::TABLE,
-    keys::{Scope, hash},
+    keys::{Scope, key_sha256},
     limits::Limits,
 };
 
@@ -53,7 +53,7 @@ fn secret(name: &str) -> String {
 
 fn write_keys(path: &Path, rest: &str) {
     let entry = |(name, owner, scope): &(&str, &str, &str)| {
-        let sha256 = hash(&secret(name));
+        let sha256 = key_sha256(&secret(name));
         format!(
             "[[key]]\nname = \"{name}\"\nowner = \"{owner}\"\nsha256 = \"{sha256}\"\n\
              scopes = [\"{scope}\"]\n{rest}\n"
@@ -311,7 +311,7 @@ async fn keys_read_again_count_at_once_and_a_bad_file_changes_nothing() {
     std::fs::write(&path, "rubbish").unwrap();
     assert!(server.reload(&config).is_err());
     assert_eq!(status().await, StatusCode::OK, "the old keys stay");
-    let other = hash("other");
+    let other = key_sha256("other");
     let text = format!("[[key]]\nname = \"b\"\nsha256 = \"{other}\"\nscopes = [\"read\"]");
     std::fs::write(&path, text).unwrap();
     server.reload(&config).unwrap();

@@ -6,7 +6,7 @@ use std::time::Duration;
 use reqwest::{Client, RequestBuilder, Response};
 use segsplat::{
     config::Config,
-    keys::hash,
+    keys::key_sha256,
     limits::Limits,
     scene::{SceneId, Upload, UploadFile},
 };
@@ -40,7 +40,7 @@ async fn one_at_a_time(change: impl FnOnce(&mut Config)) -> (TempDir, TestServer
     let path = folder.path().join("keys.toml");
     let key = format!(
         "[[key]]\nname = \"k\"\nsha256 = \"{}\"\nscopes = [\"admin\"]\ninflight_max = 1",
-        hash("secret")
+        key_sha256("secret")
     );
     std::fs::write(&path, key).unwrap();
     let server = TestServer::with(|config, _| {

@@ -15,7 +15,7 @@ use segsplat::{
     sample::{self, SampleOptions},
     scene::{Refine, RefineState, SceneId, SceneOptions, SceneState, SemanticsMode, Upload},
     service::{CreateScene, ExportFormat, PageRequest, QuerySpec, Service, TextOptions},
-    store::Place,
+    store::StoreLocation,
 };
 
 use crate::common::{
@@ -106,7 +106,7 @@ async fn a_store_that_fails_tears_and_stalls_loses_nothing_it_acknowledged() {
     let local = LocalFileSystem::new_with_prefix(folder.path()).unwrap();
     let local: Arc<dyn ObjectStore> = Arc::new(local.with_automatic_cleanup(true));
     let faults = Arc::new(FaultStore::new(local, Duration::from_millis(700)));
-    let place = Place::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
+    let place = StoreLocation::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
     let mut server = TestServer::at(&place, |config, _| {
         config.limits.store_timeout_ms = 500;
         config.limits.cache_bytes_max = 100_000;
@@ -201,7 +201,7 @@ async fn a_full_store_refuses_uploads_serves_what_it_has_and_recovers_by_deletin
     let local = LocalFileSystem::new_with_prefix(folder.path()).unwrap();
     let local: Arc<dyn ObjectStore> = Arc::new(local.with_automatic_cleanup(true));
     let faults = Arc::new(FaultStore::new(local, Duration::ZERO));
-    let place = Place::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
+    let place = StoreLocation::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
     let server = TestServer::at(&place, |_, _| {}).await;
     let mut whole = Vec::new();
     for seed in 0..3 {
@@ -239,7 +239,7 @@ async fn on_faults(
     let local = LocalFileSystem::new_with_prefix(folder).unwrap();
     let local: Arc<dyn ObjectStore> = Arc::new(local.with_automatic_cleanup(true));
     let faults = Arc::new(FaultStore::new(local, Duration::ZERO));
-    let place = Place::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
+    let place = StoreLocation::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
     let server = TestServer::at(&place, change).await;
     (faults, server)
 }
@@ -363,7 +363,7 @@ async fn a_deletion_counts_where_the_job_removed_its_own_record_first() {
     let local = LocalFileSystem::new_with_prefix(folder.path()).unwrap();
     let local: Arc<dyn ObjectStore> = Arc::new(local.with_automatic_cleanup(true));
     let faults = Arc::new(FaultStore::new(local, Duration::ZERO));
-    let place = Place::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
+    let place = StoreLocation::Own(Arc::clone(&faults) as Arc<dyn ObjectStore>);
     let networks = Arc::new(WallNetworks::default());
     networks.hold.store(true, Ordering::Release);
     let given = Arc::clone(&networks);

@@ -483,7 +483,7 @@ async fn a_run_needs_a_key_that_writes() {
     let path = folder.path().join("keys.toml");
     let keys: BTreeMap<&str, &str> = [("reader", "read"), ("writer", "write")].into();
     let row = |(name, scope): (&str, &str)| {
-        let hash = segsplat::keys::hash(name);
+        let hash = segsplat::keys::key_sha256(name);
         format!("[[key]]\nname = \"{name}\"\nsha256 = \"{hash}\"\nscopes = [\"{scope}\"]\n")
     };
     std::fs::write(&path, keys.into_iter().map(row).collect::<String>()).unwrap();

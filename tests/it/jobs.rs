@@ -14,10 +14,10 @@ use segsplat::{
     sample::{self, SampleOptions},
     scene::{Density, Event, SceneId, SceneOptions, SceneState, SceneStatus, SemanticsMode, Stage},
     service::{
-        BackgroundSpec, CameraSpec, CreateScene, ExportFormat, Kind, LensSpec, PageRequest,
+        BackgroundSpec, CameraSpec, CreateScene, ExportFormat, LensSpec, PageRequest, PictureKind,
         PictureOptions, PoseSpec, Service, TextOptions, ViewOptions, ViewsSpec,
     },
-    store::{self, Place, Record, Store},
+    store::{self, Record, Store, StoreLocation},
 };
 use serde_json::json;
 use sha2::{Digest, Sha256};
@@ -295,7 +295,7 @@ async fn a_key_that_an_earlier_program_kept_still_answers_for_its_scene() {
 #[tokio::test(flavor = "multi_thread")]
 async fn pages_go_from_the_newest_and_miss_none_when_scenes_come_and_go() {
     let folder = tempfile::tempdir().unwrap();
-    let place = Place::Folder(folder.path().to_owned());
+    let place = StoreLocation::Folder(folder.path().to_owned());
     let keep = |byte: u8, created_ms: u64| {
         let id = SceneId::from_bytes([byte; 16]);
         let owner = byte.is_multiple_of(2).then(|| "even".to_owned());
@@ -331,7 +331,7 @@ async fn views_come_camera_by_camera_and_tags_tell_pictures_apart() {
     let id = server.scene().await.id;
     let spec = ViewsSpec {
         cameras: vec![first_camera(); 3],
-        kinds: vec![Kind::Depth, Kind::Color, Kind::Depth],
+        kinds: vec![PictureKind::Depth, PictureKind::Color, PictureKind::Depth],
         options: ViewOptions::default(),
         picture: PictureOptions::default(),
         text: TextOptions::default(),
@@ -340,7 +340,10 @@ async fn views_come_camera_by_camera_and_tags_tell_pictures_apart() {
     let order: Vec<_> =
         views.iter().map(|v| v.as_ref().unwrap()).map(|v| (v.camera_index, v.kind)).collect();
     assert_eq!(order.len(), 6, "a kind named twice is drawn once");
-    assert_eq!(order[..3], [(0, Kind::Depth), (0, Kind::Color), (1, Kind::Depth)]);
+    assert_eq!(
+        order[..3],
+        [(0, PictureKind::Depth), (0, PictureKind::Color), (1, PictureKind::Depth)]
+    );
 
     let one = first_view();
     let tag = server.service.view_etag(&id, &one).await.unwrap();

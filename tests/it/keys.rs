@@ -1,12 +1,12 @@
 //! The file of API keys: which keys it holds, what it refuses.
 
-use segsplat::keys::{Keys, Scope, generate, hash};
+use segsplat::keys::{Keys, Scope, generate, key_sha256};
 
 const READ: &str = "scopes = [\"read\"]";
 
 fn file(rows: &[(&str, &str, &str)]) -> String {
     let row = |(name, key, rest): &(&str, &str, &str)| {
-        format!("[[key]]\nname = \"{name}\"\nsha256 = \"{}\"\n{rest}\n", hash(key))
+        format!("[[key]]\nname = \"{name}\"\nsha256 = \"{}\"\n{rest}\n", key_sha256(key))
     };
     rows.iter().map(row).collect()
 }
@@ -25,7 +25,7 @@ fn a_key_is_found_by_itself_alone() {
     let (at, found) = keys.find(&second).unwrap();
     assert_eq!(at, 1);
     assert_eq!((&*found.name, &*found.owner, found.scope), ("b", "team", Scope::Write));
-    for wrong in ["", "a", &first[1..], &hash(&first), &format!("{first} ")] {
+    for wrong in ["", "a", &first[1..], &key_sha256(&first), &format!("{first} ")] {
         assert!(keys.find(wrong).is_none(), "{wrong:?} is let in");
     }
 }
@@ -44,7 +44,7 @@ fn an_owner_sees_its_own_and_admin_sees_all() {
 
 #[test]
 fn a_wrong_file_is_refused_without_showing_its_hashes() {
-    let sha = hash("x");
+    let sha = key_sha256("x");
     for (text, want) in [
         (String::new(), "no [[key]]"),
         (format!("[[key]]\nname = \"a\"\nsha256 = \"{sha}\"\nscopes = []"), "scopes is empty"),

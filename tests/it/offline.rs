@@ -13,7 +13,7 @@ use segsplat::{
         RawGaussians, Scene, SceneCamera, SceneId, SceneMeta, SourcePixel,
     },
     service::{
-        BackgroundSpec, CameraFields, CameraSpec, Format, Kind, LensSpec, OfflineService,
+        BackgroundSpec, CameraFields, CameraSpec, Format, LensSpec, OfflineService, PictureKind,
         PictureOptions, PoseSpec, QuerySpec, RenderedView, Rle, TextOptions, ViewOptions, ViewSpec,
     },
 };
@@ -63,7 +63,7 @@ fn scene() -> Arc<Scene> {
 }
 
 /// A view from the first camera.
-fn view(kind: Kind) -> ViewSpec {
+fn view(kind: PictureKind) -> ViewSpec {
     ViewSpec {
         camera: between(0.0),
         kind,
@@ -110,7 +110,7 @@ fn sized(width: Option<u32>, height: Option<u32>) -> ViewOptions {
 
 fn resolved(spec: &CameraSpec, options: &ViewOptions) -> Result<Camera> {
     let alpha = Frame { width: 1, height: 1, alpha: Some(vec![0.0]), ..Frame::default() };
-    let spec = ViewSpec { camera: *spec, options: options.clone(), ..view(Kind::Alpha) };
+    let spec = ViewSpec { camera: *spec, options: options.clone(), ..view(PictureKind::Alpha) };
     Ok(render(alpha, &spec)?.camera)
 }
 
@@ -264,13 +264,13 @@ fn frame() -> Frame {
     }
 }
 
-fn encode(frame: Frame, kind: Kind, format: Format) -> Result<RenderedView> {
+fn encode(frame: Frame, kind: PictureKind, format: Format) -> Result<RenderedView> {
     let background = BackgroundSpec::Color([0.0; 3]);
     let picture = PictureOptions { format, background, ..PictureOptions::default() };
     render(frame, &ViewSpec { picture, ..view(kind) })
 }
 
-fn decoded(kind: Kind, format: Format) -> image::DynamicImage {
+fn decoded(kind: PictureKind, format: Format) -> image::DynamicImage {
     image::load_from_memory(&encode(frame(), kind, format).unwrap().bytes).unwrap()
 }
 
@@ -278,20 +278,21 @@ fn decoded(kind: Kind, format: Format) -> image::DynamicImage {
 fn colour_is_clamped_and_rounded_and_nan_is_black() {
     let want = [0, 0, 128, 255, 255, 0, 51, 64, 255];
     for format in [Format::Png, Format::Webp] {
-        assert_eq!(decoded(Kind::Color, format).to_rgb8().as_raw()[..], want, "{format:?}");
+        assert_eq!(decoded(PictureKind::Color, format).to_rgb8().as_raw()[..], want, "{format:?}");
     }
 }
 
 #[test]
 fn depth_png_times_its_scale_is_the_depth() {
-    let scale = encode(frame(), Kind::Depth, Format::Png).unwrap().depth_scale.unwrap();
-    let steps = decoded(Kind::Depth, Format::Png).to_luma16();
+    let scale = encode(frame(), PictureKind::Depth, Format::Png).unwrap().depth_scale.unwrap();
+    let steps = decoded(PictureKind::Depth, Format::Png).to_luma16();
     let depths: Vec<f64> = steps.as_raw().iter().map(|&v| f64::from(v) * scale).collect();
     for (got, want) in depths.iter().zip([0.0, 2.0, 4.0]) {
         assert!((got - want).abs() <= scale / 2.0, "{got} is not {want}");
     }
     let of = |depth: [f32; 3]| {
-        encode(Frame { depth: Some(depth.to_vec()), ..frame() }, Kind::Depth, Format::Png).unwrap()
+        encode(Frame { depth: Some(depth.to_vec()), ..frame() }, PictureKind::Depth, Format::Png)
+            .unwrap()
     };
     let near = image::load_from_memory(&of([1e-9, 1.0, 1.0]).bytes).unwrap().to_luma16();
     assert_eq!(near.as_raw()[0], 1, "there, though near");
@@ -300,7 +301,7 @@ fn depth_png_times_its_scale_is_the_depth() {
 
 #[test]
 fn npy_holds_every_bit() {
-    let file = encode(frame(), Kind::Color, Format::Npy).unwrap().bytes;
+    let file = encode(frame(), PictureKind::Color, Format::Npy).unwrap().bytes;
     assert_eq!(file.len() % 4, 0);
     let header_end = file.iter().position(|&b| b == b'\n').unwrap() + 1;
     assert_eq!(header_end % 64, 0);
@@ -314,10 +315,10 @@ fn npy_holds_every_bit() {
 #[test]
 fn depth_is_not_squeezed_into_8_bits() {
     for format in [Format::Jpeg, Format::Webp] {
-        let error = encode(frame(), Kind::Depth, format).unwrap_err();
+        let error = encode(frame(), PictureKind::Depth, format).unwrap_err();
         assert!(error.message().contains("npy"), "{error}");
     }
-    assert_eq!(decoded(Kind::Alpha, Format::Png).to_luma8().as_raw()[..], [0, 128, 255]);
+    assert_eq!(decoded(PictureKind::Alpha, Format::Png).to_luma8().as_raw()[..], [0, 128, 255]);
 }
 
 fn mask(rows: &[&str]) -> (Vec<bool>, u32, u32) {

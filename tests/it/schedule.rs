@@ -13,7 +13,7 @@ use segsplat::{
     error::{ErrorCode, Result},
     render::{Frame, RenderRequest, Renderer},
     scene::{Gaussians, SceneId},
-    service::{Kind, ViewOptions, ViewSpec, ViewsSpec},
+    service::{PictureKind, ViewOptions, ViewSpec, ViewsSpec},
 };
 
 use crate::common::server::{PATIENCE, PointRenderer, TestServer, first_view};
@@ -63,7 +63,7 @@ pub(crate) fn sized(side: u32) -> ViewSpec {
     ViewSpec { options, ..first_view() }
 }
 
-fn many(spec: &ViewSpec, cameras: usize, kinds: &[Kind]) -> ViewsSpec {
+fn many(spec: &ViewSpec, cameras: usize, kinds: &[PictureKind]) -> ViewsSpec {
     ViewsSpec {
         cameras: vec![spec.camera; cameras],
         kinds: kinds.to_vec(),
@@ -126,7 +126,8 @@ async fn large_views_do_not_starve_a_small_one() {
 async fn views_of_one_call_reach_the_renderer_together_and_come_in_their_order() {
     let renderer = Arc::new(HoldingRenderer { concurrency: 4, ..HoldingRenderer::default() });
     let (server, id) = server(&renderer, |_| ()).await;
-    let pictures = server.service.render_many(&id, &many(&sized(LARGE), 5, &[Kind::Color])).await;
+    let pictures =
+        server.service.render_many(&id, &many(&sized(LARGE), 5, &[PictureKind::Color])).await;
     let let_go = async {
         let begun = Instant::now();
         while renderer.drawing.load(Ordering::Acquire) < 4 && begun.elapsed() < PATIENCE / 6 {
@@ -146,7 +147,7 @@ async fn views_of_one_call_reach_the_renderer_together_and_come_in_their_order()
 async fn a_call_for_many_views_has_a_bound_of_pixels_and_of_time() {
     let renderer = Arc::new(HoldingRenderer { concurrency: 1, ..HoldingRenderer::default() });
     let (server, id) = server(&renderer, |limits| limits.views_timeout_ms = 0).await;
-    let kinds = [Kind::Color, Kind::Depth, Kind::Alpha];
+    let kinds = [PictureKind::Color, PictureKind::Depth, PictureKind::Alpha];
     let refused = server.service.render_many(&id, &many(&sized(4096), 64, &kinds)).await;
     let error = refused.err().expect("3.2 billion pixels");
     assert_eq!(error.code(), ErrorCode::LimitExceeded);
@@ -161,7 +162,8 @@ async fn a_call_for_many_views_has_a_bound_of_pixels_and_of_time() {
 async fn nothing_more_is_drawn_for_a_caller_who_has_gone() {
     let renderer = Arc::new(HoldingRenderer { concurrency: 1, ..HoldingRenderer::default() });
     let (server, id) = server(&renderer, |limits| limits.render_timeout_ms = 600_000).await;
-    let pictures = server.service.render_many(&id, &many(&sized(LARGE), 8, &[Kind::Color])).await;
+    let pictures =
+        server.service.render_many(&id, &many(&sized(LARGE), 8, &[PictureKind::Color])).await;
     let pictures = pictures.expect("a good request");
     let until = |done: &dyn Fn() -> bool| {
         let begun = Instant::now();

@@ -21,7 +21,7 @@ use segsplat::{
         SemanticsState, Upload, UploadFile, Watch,
     },
     service::ModelsInfo,
-    store::{Place, Store},
+    store::{Store, StoreLocation},
 };
 use segsplat_testing::scenes::cloud;
 use serde_json::{Value, json as object};
@@ -390,7 +390,7 @@ impl SceneNetworks for Closed {
 }
 
 /// Opens a server on this place; `closed`: it makes nothing.
-async fn server_at(place: &Place, closed: bool) -> TestServer {
+async fn server_at(place: &StoreLocation, closed: bool) -> TestServer {
     TestServer::at(place, |_, parts| {
         parts.semantics = Arc::new(PhotoMeaning::default());
         parts.models = models();
@@ -406,7 +406,7 @@ async fn server_at(place: &Place, closed: bool) -> TestServer {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_file_that_was_acknowledged_is_a_scene_after_any_restart() {
     let folder = tempfile::tempdir().unwrap();
-    let place = Place::Folder(folder.path().join("data"));
+    let place = StoreLocation::Folder(folder.path().join("data"));
     let server = server_at(&place, true).await;
     let door = doors::http(server.addr);
     let mut ids = Vec::new();

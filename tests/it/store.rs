@@ -18,7 +18,7 @@ use segsplat::{
         RawGaussians, SanitizeReport, Scene, SceneId, SceneMeta, SceneOptions, SceneState,
         SceneStatus, Semantics, SemanticsReport, SourcePixel, Upload, UploadCameras, UploadFile,
     },
-    store::{KeyUse, Place, Record, Store, provenance, request_sha256},
+    store::{KeyUse, Record, Store, StoreLocation, provenance, request_sha256},
 };
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
@@ -115,7 +115,7 @@ fn file_of(scene: &Scene) -> Vec<u8> {
 }
 
 fn open(root: &Path) -> (Store, Vec<Record>) {
-    Store::open(&Place::Folder(root.to_owned()), &Limits::default()).unwrap()
+    Store::open(&StoreLocation::Folder(root.to_owned()), &Limits::default()).unwrap()
 }
 
 #[test]
@@ -398,7 +398,7 @@ fn uploads_arrive_beside_deletions() {
             left -= u32::from(hit);
             hit.then_some(Wrong::NoFolder)
         });
-        let (store, _) = Store::open(&Place::Own(faults), &Limits::default()).unwrap();
+        let (store, _) = Store::open(&StoreLocation::Own(faults), &Limits::default()).unwrap();
         let put = store.put_upload(upload(), &record(1));
         assert_eq!(put.is_ok(), arrives, "{gone} times: {:?}", put.err());
         assert_eq!(store.upload(&id(1)).is_ok(), arrives, "{gone} times");
@@ -411,7 +411,7 @@ fn a_sweep_leaves_an_upload_whose_record_is_on_its_way() {
     let faults = Arc::new(FaultStore::new(Arc::new(InMemory::new()), stall));
     let is_record = |what: &str, path: &Name| what == "put" && path.as_ref().starts_with("pending");
     faults.plan(move |what, path| is_record(what, path).then_some(Wrong::Stalls));
-    let place = Place::Own(faults);
+    let place = StoreLocation::Own(faults);
     let (store, _) = Store::open(&place, &Limits::default()).unwrap();
     std::thread::scope(|scope| {
         let put = scope.spawn(|| store.put_upload(upload(), &record(1)));
@@ -565,8 +565,8 @@ fn a_data_folder_is_its_owners_and_a_moved_one_is_not_written_to() {
 fn one_process_holds_a_folder() {
     let folder = tempfile::tempdir().unwrap();
     let (store, _) = open(folder.path());
-    let second =
-        Store::open(&Place::Folder(folder.path().to_owned()), &Limits::default()).unwrap_err();
+    let second = Store::open(&StoreLocation::Folder(folder.path().to_owned()), &Limits::default())
+        .unwrap_err();
     assert_eq!(second.code(), ErrorCode::StoreUnavailable);
     drop(store);
     open(folder.path());

@@ -10,7 +10,7 @@ use segsplat::{
     formats::container::{write_scene, write_semantics},
     limits::Limits,
     scene::{SceneId, SceneState},
-    store::{Place, Record, Store},
+    store::{Record, Store, StoreLocation},
 };
 use serde_json::Value;
 
@@ -51,8 +51,9 @@ fn files(folder: &Path) -> Vec<(String, Vec<u8>)> {
 /// A copy of the folder, opened; the one scene in it.
 fn opened(folder: &Path) -> (Store, Record, SceneId) {
     copied(&root().join(KEPT), folder);
-    let (store, mut records) = Store::open(&Place::Folder(folder.to_owned()), &Limits::default())
-        .expect("the folder is whole");
+    let (store, mut records) =
+        Store::open(&StoreLocation::Folder(folder.to_owned()), &Limits::default())
+            .expect("the folder is whole");
     assert_eq!(records.len(), 1);
     let record = records.remove(0);
     let id = record.status.id.clone();
@@ -81,7 +82,7 @@ fn what_the_released_format_holds_is_read_to_the_last_file() {
 async fn a_scene_of_the_released_format_is_served() {
     let folder = tempfile::tempdir().unwrap();
     copied(&root().join(KEPT), folder.path());
-    let server = TestServer::at(&Place::Folder(folder.path().to_owned()), |_, _| {}).await;
+    let server = TestServer::at(&StoreLocation::Folder(folder.path().to_owned()), |_, _| {}).await;
     let list: Value = crate::common::client()
         .get(server.url("/v1/scenes"))
         .send()

@@ -8,7 +8,7 @@ use std::{
     time::Duration,
 };
 
-use segsplat::{keys::hash, scene::Stage, telemetry::meter::stages};
+use segsplat::{keys::key_sha256, scene::Stage, telemetry::meter::stages};
 use serde_json::Value;
 
 use crate::common::{
@@ -81,7 +81,7 @@ async fn metrics_are_the_admins_unless_they_are_opened() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("keys.toml");
     let entry = |name: &str, scope: &str| {
-        let sha256 = hash(name);
+        let sha256 = key_sha256(name);
         format!("[[key]]\nname = \"{name}\"\nsha256 = \"{sha256}\"\nscopes = [\"{scope}\"]\n")
     };
     std::fs::write(&path, entry("boss", "admin") + &entry("other", "write")).unwrap();
@@ -227,7 +227,7 @@ async fn spans_go_to_the_collector_as_a_part_of_the_callers_trace() {
     let folder = tempfile::tempdir().unwrap();
     let keys = folder.path().join("keys.toml");
     let entry = "[[key]]\nname = \"boss\"\nscopes = [\"admin\"]\nsha256 = ";
-    std::fs::write(&keys, format!("{entry}\"{}\"\n", hash("very secret"))).unwrap();
+    std::fs::write(&keys, format!("{entry}\"{}\"\n", key_sha256("very secret"))).unwrap();
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let collector = format!("http://{}", listener.local_addr().unwrap());
     let collected = tokio::task::spawn_blocking(move || collect(&listener));

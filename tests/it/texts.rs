@@ -13,8 +13,8 @@ use segsplat::{
     limits::Limits,
     scene::{Method, Preset, SceneCamera, SceneId, SceneOptions, SemanticsMode, SemanticsState},
     service::{
-        Boxes, CreateScene, ExportFormat, FeatureKind, FeaturesSpec, Format, Kind, MaskFormat,
-        PickSpec, PictureOptions, QuerySpec, Rle, ScoringOptions, TextOptions, ViewOptions,
+        Boxes, CreateScene, ExportFormat, FeatureKind, FeaturesSpec, Format, MaskFormat, PickSpec,
+        PictureKind, PictureOptions, QuerySpec, Rle, ScoringOptions, TextOptions, ViewOptions,
         ViewSpec, ViewsSpec,
     },
 };
@@ -66,7 +66,7 @@ fn in_view(asked: &[&str]) -> QuerySpec {
     QuerySpec { texts: texts(asked), camera: Some(view.camera), ..QuerySpec::default() }
 }
 
-fn view(kind: Kind, text: Option<&str>, format: Format) -> ViewSpec {
+fn view(kind: PictureKind, text: Option<&str>, format: Format) -> ViewSpec {
     let ask = TextOptions { text: text.map(str::to_owned), ..TextOptions::default() };
     let picture = PictureOptions { format, ..PictureOptions::default() };
     ViewSpec { kind, picture, text: ask, ..first_view() }
@@ -152,10 +152,12 @@ async fn a_hundred_texts_take_one_drawing_and_a_known_view_takes_none() {
     assert_eq!(again.render_ms, Some(0.0));
     assert_eq!(again.results, answer.results);
     service.query(&id, in_view(&["photo 2"])).await.unwrap();
-    for (kind, text) in [(Kind::Mask, Some("photo 0")), (Kind::Relevancy, Some("new"))] {
+    for (kind, text) in
+        [(PictureKind::Mask, Some("photo 0")), (PictureKind::Relevancy, Some("new"))]
+    {
         service.render(&id, view(kind, text, Format::Png)).await.unwrap();
     }
-    service.render(&id, view(Kind::Semantics, None, Format::Png)).await.unwrap();
+    service.render(&id, view(PictureKind::Semantics, None, Format::Png)).await.unwrap();
     assert_eq!(fixture.renderer.counts(), [1, 0, 1], "E of the view answers every text");
     assert_eq!(fixture.meaning.embedded.load(Ordering::Acquire), 106, "three new words");
     let paper = {
@@ -187,11 +189,11 @@ async fn what_nobody_kept_is_asked_once_a_call_and_not_at_the_renderer() {
     // The three canonical phrases, and the texts.
     service.query(id, in_view(&["photo 0", "photo 1"])).await.unwrap();
     assert_eq!(embedded(), 3 + 2, "a query");
-    service.render(id, view(Kind::Mask, Some("photo 0"), Format::Png)).await.unwrap();
+    service.render(id, view(PictureKind::Mask, Some("photo 0"), Format::Png)).await.unwrap();
     assert_eq!(embedded(), 3 + 1, "a view");
-    let mask = view(Kind::Mask, Some("photo 0"), Format::Png);
+    let mask = view(PictureKind::Mask, Some("photo 0"), Format::Png);
     let ViewSpec { options: how, picture, text, .. } = mask;
-    let kinds = vec![Kind::Mask, Kind::Color];
+    let kinds = vec![PictureKind::Mask, PictureKind::Color];
     let many = ViewsSpec { cameras: vec![camera; 4], kinds, options: how, picture, text };
     let views: Vec<_> = service.render_many(id, &many).await.unwrap().collect().await;
     assert!(views.len() == 8 && views.iter().all(Result::is_ok));
@@ -223,7 +225,7 @@ async fn a_mask_alone_is_a_blend_and_equals_the_mask_of_the_entries() {
     let fixture = fixture().await;
     let id = fixture.scene(SemanticsMode::Lazy).await;
     let service = &fixture.server.service;
-    let mask = || view(Kind::Mask, Some("photo 0"), Format::Png);
+    let mask = || view(PictureKind::Mask, Some("photo 0"), Format::Png);
     assert_eq!(service.view_etag(&id, &mask()).await.unwrap(), None, "nobody knows it yet");
     let blended = service.render(&id, mask()).await.unwrap();
     assert_eq!(fixture.renderer.counts(), [1, 1, 0]);
@@ -237,7 +239,8 @@ async fn a_mask_alone_is_a_blend_and_equals_the_mask_of_the_entries() {
     other.text.text = Some("photo 1".to_owned());
     assert_ne!(service.view_etag(&id, &other).await.unwrap().unwrap(), blended.etag);
 
-    let numbers = service.render(&id, view(Kind::Semantics, None, Format::Npy)).await.unwrap();
+    let numbers =
+        service.render(&id, view(PictureKind::Semantics, None, Format::Npy)).await.unwrap();
     let entries: Vec<f32> =
         numbers.bytes[128..].chunks(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
     assert!(entries.iter().all(|m| [0.0, 1.0, 2.0, 3.0].contains(m)));
@@ -543,7 +546,7 @@ async fn views_are_drawn_while_texts_wait_for_a_network() {
     let ask = || service.query(&id, in_view(&["photo 0"]));
     let mask = || {
         let text = TextOptions { text: Some("photo 1".to_owned()), ..TextOptions::default() };
-        service.render(&id, ViewSpec { kind: Kind::Mask, text, ..first_view() })
+        service.render(&id, ViewSpec { kind: PictureKind::Mask, text, ..first_view() })
     };
     let texts = async { tokio::join!(ask(), mask()) };
     let color = async {

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use futures_util::future::join_all;
 use reqwest::{Certificate, Version};
-use segsplat::{api::Server, keys::hash};
+use segsplat::{api::Server, keys::key_sha256};
 use tokio::net::{TcpListener, TcpStream};
 
 use crate::common::cpu_server::{CpuServer, PlaneNetworks};
@@ -112,7 +112,7 @@ async fn a_certificate_that_cannot_be_used_is_named_and_its_key_is_not_shown() {
             renderer: std::sync::Arc::new(crate::common::server::PointRenderer),
             models: segsplat::service::ModelsInfo::default(),
         };
-        let place = segsplat::store::Place::of(&config).unwrap();
+        let place = segsplat::store::StoreLocation::of(&config).unwrap();
         let service = segsplat::service::Service::open(&place, config, parts).unwrap();
         let error = segsplat::api::Server::new(service).expect_err("refused");
         assert!(error.message().contains(want), "{error}");
@@ -123,7 +123,7 @@ async fn a_certificate_that_cannot_be_used_is_named_and_its_key_is_not_shown() {
 
 /// A file with one key of this secret.
 fn write_key(path: &Path, secret: &str) {
-    let sha256 = hash(secret);
+    let sha256 = key_sha256(secret);
     let text = format!("[[key]]\nname = \"a\"\nsha256 = \"{sha256}\"\nscopes = [\"read\"]\n");
     std::fs::write(path, text).unwrap();
 }

@@ -7,11 +7,11 @@ use parking_lot::Mutex;
 /// Values by key. It gives out clones, which must be cheap. Any thread may use it.
 #[derive(Debug)]
 pub struct Cache<K, V> {
-    inner: Mutex<Inner<K, V>>,
+    entries: Mutex<Entries<K, V>>,
 }
 
 #[derive(Debug)]
-struct Inner<K, V> {
+struct Entries<K, V> {
     values: HashMap<K, Kept<V>>,
     weight: u64,
     weight_max: u64,
@@ -22,35 +22,35 @@ struct Inner<K, V> {
 struct Kept<V> {
     value: V,
     weight: u64,
-    /// [`Inner::uses`] at its last use.
+    /// [`Entries::uses`] at its last use.
     used: u64,
 }
 
 impl<K: Clone + Eq + Hash, V: Clone> Cache<K, V> {
     /// Keeps values of at most `weight_max` together, in the unit of [`Self::insert`].
     pub fn new(weight_max: u64) -> Self {
-        let inner = Inner { values: HashMap::new(), weight: 0, weight_max, uses: 0 };
-        Self { inner: Mutex::new(inner) }
+        let entries = Entries { values: HashMap::new(), weight: 0, weight_max, uses: 0 };
+        Self { entries: Mutex::new(entries) }
     }
 
     /// Changes the most that it keeps.
     pub fn set_weight_max(&self, weight_max: u64) {
-        let mut inner = self.inner.lock();
-        inner.weight_max = weight_max;
-        inner.make_room(0);
+        let mut entries = self.entries.lock();
+        entries.weight_max = weight_max;
+        entries.make_room(0);
     }
 
     /// Weight of all values.
     pub fn weight(&self) -> u64 {
-        self.inner.lock().weight
+        self.entries.lock().weight
     }
 
     /// The value of a key.
     pub fn find(&self, key: &K) -> Option<V> {
-        let mut inner = self.inner.lock();
-        inner.uses += 1;
-        let now = inner.uses;
-        let kept = inner.values.get_mut(key)?;
+        let mut entries = self.entries.lock();
+        entries.uses += 1;
+        let now = entries.uses;
+        let kept = entries.values.get_mut(key)?;
         kept.used = now;
         Some(kept.value.clone())
     }
@@ -58,32 +58,32 @@ impl<K: Clone + Eq + Hash, V: Clone> Cache<K, V> {
     /// Keeps a value in place of the key's old one. A value heavier than the whole cache is not
     /// kept.
     pub fn insert(&self, key: K, value: V, weight: u64) {
-        let mut inner = self.inner.lock();
-        inner.remove(&key);
-        if weight > inner.weight_max {
+        let mut entries = self.entries.lock();
+        entries.remove(&key);
+        if weight > entries.weight_max {
             return;
         }
-        inner.make_room(weight);
-        inner.uses += 1;
-        inner.weight += weight;
-        let used = inner.uses;
-        inner.values.insert(key, Kept { value, weight, used });
+        entries.make_room(weight);
+        entries.uses += 1;
+        entries.weight += weight;
+        let used = entries.uses;
+        entries.values.insert(key, Kept { value, weight, used });
     }
 
     /// Drops the value of a key.
     pub fn remove(&self, key: &K) {
-        self.inner.lock().remove(key);
+        self.entries.lock().remove(key);
     }
 
     /// Drops every value for which `keep` is false.
     pub fn retain(&self, keep: impl Fn(&V) -> bool) {
-        let mut inner = self.inner.lock();
-        inner.values.retain(|_, kept| keep(&kept.value));
-        inner.weight = inner.values.values().map(|kept| kept.weight).sum();
+        let mut entries = self.entries.lock();
+        entries.values.retain(|_, kept| keep(&kept.value));
+        entries.weight = entries.values.values().map(|kept| kept.weight).sum();
     }
 }
 
-impl<K: Clone + Eq + Hash, V> Inner<K, V> {
+impl<K: Clone + Eq + Hash, V> Entries<K, V> {
     fn remove(&mut self, key: &K) {
         self.weight -= self.values.remove(key).map_or(0, |kept| kept.weight);
     }

@@ -48,7 +48,7 @@ impl View {
     /// beyond memory.
     pub fn new(origin: DVec3, request: &RenderRequest) -> Result<Self> {
         let lens = request.camera.intrinsics.validated("camera")?;
-        let drawn = match request.crop {
+        let cropped = match request.crop {
             None => lens,
             Some(crop) => lens.part(crop.inside(lens.width, lens.height, "camera")?),
         };
@@ -67,9 +67,9 @@ impl View {
             source.check(i)?;
         }
         request.labels.check()?;
-        let pixels = u64::from(drawn.width) * u64::from(drawn.height);
-        if pixels > PIXELS_MAX || drawn.width.max(drawn.height) > SIDE_MAX {
-            let size = format!("{}x{}", drawn.width, drawn.height);
+        let pixels = u64::from(cropped.width) * u64::from(cropped.height);
+        if pixels > PIXELS_MAX || cropped.width.max(cropped.height) > SIDE_MAX {
+            let size = format!("{}x{}", cropped.width, cropped.height);
             let bound = format!("{PIXELS_MAX} in all or {SIDE_MAX} a side");
             return Err(Error::limit("camera: pixels of the picture", size, bound));
         }
@@ -88,12 +88,12 @@ impl View {
             translation: -(rotation * center),
             center,
             focal,
-            principal: [drawn.cx, drawn.cy],
+            principal: [cropped.cx, cropped.cy],
             slope_min: [low(0), low(1)],
             slope_max: [high(0), high(1)],
             near: f64::from(request.near),
-            width: drawn.width,
-            height: drawn.height,
+            width: cropped.width,
+            height: cropped.height,
         })
     }
 

@@ -11,8 +11,8 @@ use crate::{
     },
     service::{
         BackgroundSpec, Boxes, CameraSpec, Density, Event, ExportFormat, FeatureKind, FeaturesSpec,
-        Format, InstanceBox, Kind, KnownWord, Label, LensSpec, MaskFormat, MaskLevel, Method,
-        ModelInfo, ModelsInfo, Peak, PickSpec, Picked, PictureOptions, PoseSpec, Preset, Quality,
+        Format, InstanceBox, KnownWord, Label, LensSpec, MaskFormat, MaskLevel, Method, ModelInfo,
+        ModelsInfo, Peak, PickSpec, Picked, PictureKind, PictureOptions, PoseSpec, Preset, Quality,
         QueryAnswer, QuerySpec, RenderedView, SceneCamera, SceneError, SceneOptions, SceneState,
         SceneStatus, ScoringOptions, SemanticsMode, SemanticsState, SemanticsStatus, TextOptions,
         TextResult, TextView, TextWarning, Trust, ViewOptions,
@@ -485,7 +485,7 @@ to_number! {
 both_ways! {
     SemanticsMode = Semantics { Lazy, Eager, Off }
     Density = Density { Thinned, Full }
-    Kind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }
+    PictureKind = Kind { Color, Depth, Alpha, Semantics, Relevancy, Mask }
     Format = Format { Png, Jpeg, Webp, Npy, Rgb8, Rgba8, Grey8 }
     Quality = Quality { Exact, Fast }
     Preset = Preset { Default, Paper }

@@ -19,8 +19,8 @@ use crate::{
     error::{Error, ErrorCode, Result},
     scene::{SceneId, Upload, UploadCameras},
     service::{
-        CreateScene, Export, Kind, PageRequest, SceneStatus, SemanticsMode, ViewSpec, ViewTimes,
-        ViewsSpec,
+        CreateScene, Export, PageRequest, PictureKind, SceneStatus, SemanticsMode, ViewSpec,
+        ViewTimes, ViewsSpec,
     },
 };
 
@@ -305,7 +305,7 @@ async fn render_many(api: Api, request: pb::RenderViewsRequest) -> Result<Many<p
     let id = request.scene_id.parse()?;
     let text = convert::text(request.text, request.scoring, request.semantics_wait_ms);
     let kinds = match request.kinds.as_slice() {
-        [] => vec![Kind::Color],
+        [] => vec![PictureKind::Color],
         kinds => kinds.iter().map(|kind| convert::value("kind", *kind)).collect::<Result<_>>()?,
     };
     let cameras = request.cameras.into_iter().enumerate();

@@ -404,7 +404,9 @@ impl<'de> Deserializer<'de> for Value {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::service::{BackgroundSpec, Boxes, CameraFields, Kind, PictureOptions, ViewOptions};
+    use crate::service::{
+        BackgroundSpec, Boxes, CameraFields, PictureKind, PictureOptions, ViewOptions,
+    };
 
     // The messages are tested over HTTP, in `tests/it/fields.rs`.
     #[test]
@@ -442,7 +444,7 @@ mod tests {
         let mut body = Fields::of_json(json).unwrap();
         let cameras: Vec<CameraFields> = body.value("cameras").unwrap().unwrap();
         assert_eq!((cameras[0].from, cameras[1].eye), (Some(0), Some([0.0, 0.0, 1.5])));
-        assert_eq!(body.value::<Vec<Kind>>("kinds").unwrap(), Some(vec![Kind::Mask]));
+        assert_eq!(body.value::<Vec<PictureKind>>("kinds").unwrap(), Some(vec![PictureKind::Mask]));
         assert_eq!(body.value::<Boxes>("boxes").unwrap(), Some(Boxes::None));
         assert_eq!(body.value::<bool>("relevancy").unwrap(), Some(true));
         assert_eq!(body.take::<ViewOptions>().unwrap().near, Some(1.0));

@@ -25,8 +25,9 @@ use crate::{
     api::{Held, server_timing},
     error::{Error, ErrorCode, Result, short},
     service::{
-        CameraFields, CameraSpec, Export, ExportFormat, FeatureKind, FeaturesSpec, Format, Kind,
-        PictureOptions, Preset, RenderedView, ScoringOptions, TextOptions, ViewOptions, ViewSpec,
+        CameraFields, CameraSpec, Export, ExportFormat, FeatureKind, FeaturesSpec, Format,
+        PictureKind, PictureOptions, Preset, RenderedView, ScoringOptions, TextOptions,
+        ViewOptions, ViewSpec,
     },
 };
 
@@ -43,7 +44,7 @@ pub(super) struct ViewParams {
     /// `color` (default), `depth`, `alpha`, `semantics` (a fixed colour for each entry of the
     /// bank), `relevancy` or `mask` (of a text).
     #[param(inline)]
-    kind: Kind,
+    kind: PictureKind,
 }
 
 /// What an export is.
@@ -257,9 +258,9 @@ fn spec_of(mut fields: Fields, accept: Option<&str>) -> Result<ViewSpec> {
 }
 
 /// The encoding of `Accept` with the highest weight that fits the kind; PNG where any will do.
-fn negotiate(accept: Option<&str>, kind: Kind) -> Result<Format> {
+fn negotiate(accept: Option<&str>, kind: PictureKind) -> Result<Format> {
     let Some(accept) = accept else { return Ok(Format::Png) };
-    let lossy = !matches!(kind, Kind::Depth | Kind::Semantics | Kind::Mask);
+    let lossy = !matches!(kind, PictureKind::Depth | PictureKind::Semantics | PictureKind::Mask);
     let mut best: Option<(f32, Format)> = None;
     for range in accept.split(',') {
         let range = range.to_ascii_lowercase();
@@ -267,7 +268,7 @@ fn negotiate(accept: Option<&str>, kind: Kind) -> Result<Format> {
         let format = match pieces.next().unwrap_or_default() {
             "image/png" | "image/*" | "*/*" => Format::Png,
             "image/jpeg" if lossy => Format::Jpeg,
-            "image/webp" if kind != Kind::Depth => Format::Webp,
+            "image/webp" if kind != PictureKind::Depth => Format::Webp,
             "application/x-npy" => Format::Npy,
             "application/x-rgb8" => Format::Rgb8,
             "application/x-rgba8" => Format::Rgba8,
@@ -286,7 +287,7 @@ fn negotiate(accept: Option<&str>, kind: Kind) -> Result<Format> {
             "Accept is {:?}; a kind={kind} picture can be image/png{}{}, application/x-npy",
             short(accept),
             if lossy { ", image/jpeg" } else { "" },
-            if kind == Kind::Depth { "" } else { ", image/webp" },
+            if kind == PictureKind::Depth { "" } else { ", image/webp" },
         );
         Error::new(ErrorCode::NotAcceptable, message)
     })

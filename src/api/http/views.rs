@@ -28,7 +28,9 @@ use super::{
 use crate::{
     api::request_id,
     error::{Error, Result},
-    service::{CameraFields, Format, Kind, RenderedView, TextOptions, ViewOptions, ViewsSpec},
+    service::{
+        CameraFields, Format, PictureKind, RenderedView, TextOptions, ViewOptions, ViewsSpec,
+    },
 };
 
 /// Between the parts of a multipart answer; the pictures' own bytes cannot hold it by accident.
@@ -62,7 +64,7 @@ impl ViewsBody {
         let cameras = cameras.map(|(i, fields)| camera(fields, &format!("cameras[{i}]")));
         let spec = ViewsSpec {
             cameras: cameras.collect::<Result<_>>()?,
-            kinds: f.value("kinds")?.unwrap_or_else(|| vec![Kind::Color]),
+            kinds: f.value("kinds")?.unwrap_or_else(|| vec![PictureKind::Color]),
             options: f.take()?,
             picture: f.take()?,
             text: TextOptions { scoring: f.take()?, ..f.take()? },

@@ -109,7 +109,8 @@ impl Service {
     pub(in crate::service) async fn folder(
         &self,
         id: &SceneId,
-        (format, folder): (ExportFormat, FolderFormat),
+        format: ExportFormat,
+        folder: FolderFormat,
         preset: Option<Preset>,
         ask: &TextOptions,
     ) -> Result<Export> {
@@ -159,6 +160,23 @@ impl Service {
     }
 }
 
+/// A folder of a scene in a file.
+#[derive(Clone, Copy, Debug)]
+pub struct FolderSpec<'a> {
+    /// Its row in the table of formats.
+    pub format: ExportFormat,
+    /// The folder of that row.
+    pub folder: FolderFormat,
+    /// Texts whose masks are to be in it.
+    pub texts: &'a [String],
+    /// How views are drawn and texts are scored; absent: as the scene was made.
+    pub preset: Option<Preset>,
+    /// Changes of the scoring.
+    pub scoring: &'a ScoringOptions,
+    /// What the scene was made of, where its photos are to be in it.
+    pub upload: Option<&'a Upload>,
+}
+
 /// Views of a scene in a file.
 struct Alone<'a> {
     service: &'a OfflineService,
@@ -179,22 +197,20 @@ impl Views for Alone<'_> {
 }
 
 impl OfflineService {
-    /// As [`Service::export`] of a folder, written to `to`; `upload` is what the scene was made of,
-    /// where its photos are to be in it. Gives how many photos are in it.
+    /// As [`Service::export`] of a folder, written to `to`. Gives how many photos are in it.
     ///
     /// # Errors
     /// As there; `semantics_off` for texts of a scene without semantics.
     pub fn folder(
         &self,
         scene: &Arc<Scene>,
-        (format, folder): (ExportFormat, FolderFormat),
-        (asked, preset, scoring): (&[String], Option<Preset>, &ScoringOptions),
-        upload: Option<&Upload>,
+        spec: &FolderSpec<'_>,
         to: &mut dyn Write,
     ) -> Result<usize> {
-        let limits = &self.limits;
+        let (limits, &FolderSpec { format, folder, texts, preset, scoring, upload }) =
+            (&self.limits, spec);
         texts::check_scoring(scoring, limits)?;
-        let asked = checked_texts(format, asked, limits)?;
+        let asked = checked_texts(format, texts, limits)?;
         let views = photo_views(limits, &scene.meta.cameras, &**scene, preset, asked.len())?;
         let texts = if asked.is_empty() {
             None

@@ -3,14 +3,16 @@
 
 mod calls;
 
+pub use self::calls::FolderSpec;
+
 use std::io::Write;
 
 use super::{
     encode::{Layer, encode},
     query,
     request::{
-        Boxes, CameraSpec, Format, Kind, LensSpec, MaskFormat, PictureOptions, PoseSpec, QuerySpec,
-        TextOptions, ViewOptions, ViewSpec,
+        Boxes, CameraSpec, Format, LensSpec, MaskFormat, PictureKind, PictureOptions, PoseSpec,
+        QuerySpec, TextOptions, ViewOptions, ViewSpec,
     },
     search::{Backend, SceneTexts},
     texts,
@@ -140,7 +142,11 @@ fn photo_views<'a>(
         let (width, height) = (Some(k.width), Some(k.height));
         let options = ViewOptions { width, height, preset, ..ViewOptions::default() };
         let (picture, text) = (picture.clone(), TextOptions::default());
-        resolve_one(limits, inputs, &ViewSpec { camera, kind: Kind::Depth, options, picture, text })
+        resolve_one(
+            limits,
+            inputs,
+            &ViewSpec { camera, kind: PictureKind::Depth, options, picture, text },
+        )
     };
     let views: Vec<Resolved> = cameras.iter().map(view).collect::<Result<_>>()?;
     let pixels = views.iter().map(Resolved::pixels).sum::<u64>() * texts.max(1) as u64;

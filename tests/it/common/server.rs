@@ -26,10 +26,10 @@ use segsplat::{
         SceneOptions, SceneStatus, SourcePixel, Stage, Upload, UploadCameras, Watch,
     },
     service::{
-        CameraSpec, CreateScene, Kind, LensSpec, ModelsInfo, Parts, PictureOptions, PoseSpec,
-        Service, TextOptions, ViewOptions, ViewSpec,
+        CameraSpec, CreateScene, LensSpec, ModelsInfo, Parts, PictureKind, PictureOptions,
+        PoseSpec, Service, TextOptions, ViewOptions, ViewSpec,
     },
-    store::Place,
+    store::StoreLocation,
 };
 use segsplat_testing::frames::{behind, rounded};
 use tempfile::TempDir;
@@ -44,7 +44,7 @@ pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 pub(crate) struct TestServer {
     pub(crate) addr: SocketAddr,
     pub(crate) service: Service,
-    place: Place,
+    place: StoreLocation,
     config: Config,
     parts: Parts,
     folder: TempDir,
@@ -64,11 +64,17 @@ impl TestServer {
     }
 
     /// As [`Self::with`], its scenes at this place.
-    pub(crate) async fn at(place: &Place, change: impl FnOnce(&mut Config, &mut Parts)) -> Self {
+    pub(crate) async fn at(
+        place: &StoreLocation,
+        change: impl FnOnce(&mut Config, &mut Parts),
+    ) -> Self {
         Self::placed(Some(place.clone()), change).await
     }
 
-    async fn placed(place: Option<Place>, change: impl FnOnce(&mut Config, &mut Parts)) -> Self {
+    async fn placed(
+        place: Option<StoreLocation>,
+        change: impl FnOnce(&mut Config, &mut Parts),
+    ) -> Self {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let mut config = Config::default();
         config.data_dir = folder.path().join("data");
@@ -81,11 +87,11 @@ impl TestServer {
             models: ModelsInfo::default(),
         };
         change(&mut config, &mut parts);
-        let place = place.unwrap_or_else(|| Place::Folder(config.data_dir.clone()));
+        let place = place.unwrap_or_else(|| StoreLocation::Folder(config.data_dir.clone()));
         Self::serve(place, config, parts, folder).await
     }
 
-    async fn serve(place: Place, config: Config, parts: Parts, folder: TempDir) -> Self {
+    async fn serve(place: StoreLocation, config: Config, parts: Parts, folder: TempDir) -> Self {
         let service = Service::open(&place, config.clone(), parts.clone());
         let service = service.expect("the place is usable");
         let listener = TcpListener::bind("127.0.0.1:0").await.expect("a free port");
@@ -167,7 +173,7 @@ pub(crate) fn first_view() -> ViewSpec {
     let camera = CameraSpec { pose, lens: LensSpec::OfScene };
     ViewSpec {
         camera,
-        kind: Kind::Color,
+        kind: PictureKind::Color,
         options: ViewOptions::default(),
         picture: PictureOptions::default(),
         text: TextOptions::default(),

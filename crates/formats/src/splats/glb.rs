@@ -411,7 +411,7 @@ impl Opened<'_> {
                 understood(primitive, extension)?;
                 let (own, is_so) = self.own(primitive, extension)?;
                 antialiased |= is_so;
-                self.push(own, &Place::of(place)?, &mut raw)?;
+                self.push(own, &NodeTransform::of(place)?, &mut raw)?;
             }
         }
         let raw = raw.ok_or_else(|| bad(format!("no primitive of the scene has {EXTENSION}")))?;
@@ -470,7 +470,7 @@ impl Opened<'_> {
     fn push(
         &self,
         own: RawGaussians,
-        place: &Place,
+        place: &NodeTransform,
         into: &mut Option<RawGaussians>,
     ) -> Result<()> {
         let sh_degree = own.sh_degree;
@@ -624,13 +624,13 @@ impl Node {
 }
 
 /// Where a node lies: scaled alike along all axes, then turned, then moved.
-struct Place {
+struct NodeTransform {
     scale: f64,
     rotation: DQuat,
     translation: DVec3,
 }
 
-impl Place {
+impl NodeTransform {
     fn of(affine: DAffine3) -> Result<Self> {
         let wrong = || bad("a node is scaled differently along its axes, mirrored or not finite");
         let columns = [affine.matrix3.x_axis, affine.matrix3.y_axis, affine.matrix3.z_axis];

@@ -124,17 +124,17 @@ impl CpuRenderer {
         request: &RenderRequest,
         scratch: &mut FrameScratch,
     ) -> Result<(Frame, Vec<DispatchTime>)> {
-        let mut watch = Watch::new();
+        let mut clock = StageClock::new();
         let view = View::new(gaussians.origin(), request)?;
         let pixels = view.width as usize * view.height as usize;
         let mut frame = Frame::blank([view.width, view.height], request, pixels);
         let options = self.options;
-        watch.ended("begin");
+        clock.ended("begin");
         project::project(gaussians, request, &view, options, &mut scratch.projected);
-        watch.ended("project");
+        clock.ended("project");
         if request.kinds.color {
             shade::shade(gaussians, &view, options, &mut scratch.projected);
-            watch.ended("shade");
+            clock.ended("shade");
         }
         let seen = scratch.projected.tiles_per_gauss.par_iter().with_min_len(1 << 14);
         frame.stats.visible = seen.filter(|&&tiles| tiles > 0).count() as u64;
@@ -143,13 +143,13 @@ impl CpuRenderer {
             paint: Paint::new(request, &view, gaussians.semantic_index(), options),
             weights: Vec::new(),
         };
-        self.draw_band(&Grid::whole(&view, options), &mut band, scratch, &mut frame, &mut watch)?;
+        self.draw_band(&Grid::whole(&view, options), &mut band, scratch, &mut frame, &mut clock)?;
         if request.labels == Labels::Weights {
             frame.weights = Some(WeightRows::join(band.weights)?);
         }
         let frame = frame.finish(request.samples);
-        watch.ended("end");
-        Ok((frame, watch.stages))
+        clock.ended("end");
+        Ok((frame, clock.stages))
     }
 
     /// Draws the rows of tiles of `grid`; halves them while their pairs are over the budget.
@@ -159,11 +159,11 @@ impl CpuRenderer {
         band: &mut Band<'_>,
         scratch: &mut FrameScratch,
         frame: &mut Frame,
-        watch: &mut Watch,
+        clock: &mut StageClock,
     ) -> Result<()> {
         let FrameScratch { projected, bins } = scratch;
         let total = bin::bin(projected, band.keys, grid, self.isects_max, bins);
-        watch.ended("bin");
+        clock.ended("bin");
         let Range { start, end } = grid.tile_rows;
         if total > self.isects_max {
             if end - start == 1 {
@@ -173,14 +173,14 @@ impl CpuRenderer {
             let middle = start.midpoint(end);
             for tile_rows in [start..middle, middle..end] {
                 let part = Grid { tile_rows, ..grid.clone() };
-                self.draw_band(&part, band, scratch, frame, watch)?;
+                self.draw_band(&part, band, scratch, frame, clock)?;
             }
             return Ok(());
         }
         frame.stats.intersections += total;
         let footprints = &projected.footprints;
         band.weights.extend(rasterize(grid, &band.paint, footprints, bins, &self.tiles, frame));
-        watch.ended("rasterize");
+        clock.ended("rasterize");
         Ok(())
     }
 }
@@ -249,12 +249,12 @@ pub(super) fn background(view: &View, request: &RenderRequest) -> Result<Frame> 
 }
 
 /// How long stages take.
-struct Watch {
+struct StageClock {
     begun: Instant,
     stages: Vec<DispatchTime>,
 }
 
-impl Watch {
+impl StageClock {
     fn new() -> Self {
         Self { begun: Instant::now(), stages: Vec::new() }
     }

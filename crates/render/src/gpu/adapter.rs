@@ -278,9 +278,9 @@ impl Adapter {
         let start = |request: &&'a RenderRequest| Drawing::new(gaussians.origin(), request, &scene);
         let mut drawings = requests.iter().map(start).collect::<Result<Vec<_>>>()?;
         let mut tools = context.tools(&scene, self.isects_max(), None);
-        let drawn = tools.together(&mut drawings)?;
-        let frames = drawings.into_iter().zip(drawn).map(|(drawing, drawn)| {
-            drawn.then(|| drawing.finish(&mut context.scratch)).transpose()
+        let complete = tools.together(&mut drawings)?;
+        let frames = drawings.into_iter().zip(complete).map(|(drawing, complete)| {
+            complete.then(|| drawing.finish(&mut context.scratch)).transpose()
         });
         frames.collect()
     }

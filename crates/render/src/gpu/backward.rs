@@ -67,7 +67,7 @@ impl Tools<'_> {
             let capacity = self.capacity(1);
             let (alone, layouts) = (slice::from_mut(drawing), slice::from_ref(&layout));
             let (ended, room) = self.attempt(alone, layouts, capacity)?;
-            if ended[0].drawn {
+            if ended[0].complete {
                 return Ok((layout, room));
             }
             needed = ended[0].plan.needed;

@@ -76,7 +76,7 @@ pub(super) struct ReadBack<'a> {
 pub(super) struct Ended {
     /// Counts of the device.
     pub(super) plan: PlanRow,
-    pub(super) drawn: bool,
+    pub(super) complete: bool,
     /// New room of a pixel, in weights, if the old one was too small.
     pub(super) more_slots: Option<u32>,
 }
@@ -190,7 +190,7 @@ impl<'a> Drawing<'a> {
     /// Copies a band out of the read-back, if there was room for all of it.
     pub(super) fn take(&mut self, layout: &Layout, capacity: u32, read: &ReadBack<'_>) -> Ended {
         let ReadBack { plan, slots, .. } = *read;
-        let mut ended = Ended { plan, drawn: false, more_slots: None };
+        let mut ended = Ended { plan, complete: false, more_slots: None };
         if plan.needed > capacity {
             return ended;
         }
@@ -205,7 +205,7 @@ impl<'a> Drawing<'a> {
         let stats = &mut self.frame.stats;
         stats.visible = stats.visible.max(u64::from(plan.visible));
         stats.intersections += u64::from(plan.isects);
-        Ended { drawn: true, ..ended }
+        Ended { complete: true, ..ended }
     }
 
     /// Copies the pictures and weights of a band out of the read-back.

@@ -189,7 +189,7 @@ impl Tools<'_> {
                 let capacity = self.capacity(1);
                 let (alone, layouts) = (slice::from_mut(drawing), slice::from_ref(&layout));
                 let (ended, _) = self.attempt(alone, layouts, capacity)?;
-                if ended[0].drawn {
+                if ended[0].complete {
                     return Ok(());
                 }
                 needed = ended[0].plan.needed;
@@ -223,7 +223,7 @@ impl Tools<'_> {
             return Ok(vec![false; drawings.len()]);
         }
         let (ended, _) = self.attempt(drawings, &layouts, capacity)?;
-        Ok(ended.into_iter().map(|ended| ended.drawn).collect())
+        Ok(ended.into_iter().map(|ended| ended.complete).collect())
     }
 
     /// Room of a pixel, in weights: what the last views needed, at most one for each entry.

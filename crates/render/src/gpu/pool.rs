@@ -108,7 +108,7 @@ struct ViewsWaiting {
     /// In the order of arrival.
     views: VecDeque<Arc<QueuedView>>,
     /// Being drawn.
-    drawn: Vec<Arc<QueuedView>>,
+    at_work: Vec<Arc<QueuedView>>,
     /// Submissions at work, at most [`SUBMISSIONS_MAX`].
     submissions: usize,
     /// Largest recent number of requests at once. It falls by one with each submission.
@@ -117,7 +117,7 @@ struct ViewsWaiting {
 
 impl ViewsWaiting {
     fn len(&self) -> usize {
-        self.views.len() + self.drawn.len()
+        self.views.len() + self.at_work.len()
     }
 
     /// Lets the callers that have waited longest draw, while submissions are free. Views that join
@@ -157,7 +157,7 @@ impl Drop for ActiveBatch<'_> {
         }
         let mut waiting = self.queue.waiting.lock();
         let mine = |view: &Arc<QueuedView>| self.batch.iter().any(|other| Arc::ptr_eq(view, other));
-        waiting.drawn.retain(|view| !mine(view));
+        waiting.at_work.retain(|view| !mine(view));
         waiting.submissions -= 1;
         waiting.start_next();
     }
@@ -190,7 +190,7 @@ impl ViewQueue {
     /// The view of `request`, and whether it is new.
     fn enter(&self, scene: u64, request: &RenderRequest) -> (Arc<QueuedView>, bool) {
         let mut waiting = self.waiting.lock();
-        let mut known = waiting.views.iter().chain(&waiting.drawn);
+        let mut known = waiting.views.iter().chain(&waiting.at_work);
         if let Some(view) = known.find(|view| view.equals(scene, request) && view.share()) {
             return (Arc::clone(view), false);
         }
@@ -234,7 +234,7 @@ impl ViewQueue {
             !taken && !Arc::ptr_eq(other, view)
         });
         waiting.crowd = waiting.len().max(waiting.crowd.saturating_sub(1)).max(1);
-        waiting.drawn.extend_from_slice(&batch);
+        waiting.at_work.extend_from_slice(&batch);
         waiting.start_next();
         ActiveBatch { queue: self, batch }
     }

@@ -419,8 +419,8 @@ fn put_photos(gpu: &Gpu, to: &wgpu::Buffer, photos: &[TrainingPhoto<'_>]) -> Res
     gpu.scoped("photos to learn", || {
         let (mut start, mut unsent) = (0, 0);
         for TrainingPhoto { photo, .. } in photos {
-            let words = words(photo);
-            let bytes: &[u8] = bytemuck::cast_slice(&words);
+            let pixels = rgba_of(photo);
+            let bytes: &[u8] = bytemuck::cast_slice(&pixels);
             gpu.queue.write_buffer(to, start, bytes);
             start += bytes.len() as u64;
             unsent += bytes.len() as u64;
@@ -433,7 +433,7 @@ fn put_photos(gpu: &Gpu, to: &wgpu::Buffer, photos: &[TrainingPhoto<'_>]) -> Res
 }
 
 /// Pixels as the shaders read them: RGBA, A = 0 where none is known.
-fn words(photo: &Photo) -> Vec<[u8; 4]> {
+fn rgba_of(photo: &Photo) -> Vec<[u8; 4]> {
     let known = |i: usize| photo.valid.as_ref().is_none_or(|valid| valid[i]);
     let pixels = photo.rgb.chunks_exact(3).enumerate();
     pixels.map(|(i, c)| [c[0], c[1], c[2], if known(i) { 255 } else { 0 }]).collect()

@@ -135,7 +135,8 @@ impl Mistake {
 pub(super) fn warnings(
     photos: &[PosedPhoto],
     views: &[GrayView],
-    (found, answer): (&[PairFound], &Agreement),
+    found: &[PairFound],
+    answer: &Agreement,
     ranges: &Ranges,
     overlap: &mut [Vec<f64>],
 ) -> Result<Vec<Warning>> {

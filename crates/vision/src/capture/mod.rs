@@ -72,7 +72,8 @@ pub fn analyse(photos: &[PosedPhoto], cancel: &AtomicBool) -> Result<Capture> {
     warnings.extend(diagnose::warnings(
         photos,
         &views,
-        (&found, &agreement?),
+        &found,
+        &agreement?,
         &ranges,
         &mut overlap,
     )?);

@@ -167,8 +167,8 @@ fn joined(
     [a, b]: [&GrayView; 2],
     [(forward, there), (backward, back)]: &[(Sweep, Relative); 2],
 ) -> PairFound {
-    let first = consistent((a, b), (there, back), forward, backward);
-    let second = consistent((b, a), (back, there), backward, forward);
+    let first = consistent(a, b, there, back, forward, backward);
+    let second = consistent(b, a, back, there, backward, forward);
     let matches = [supported(a, &first), supported(b, &second)];
     let sweeps = [forward, backward];
     let share = |count: usize, of: usize| count as f64 / of.max(1) as f64;

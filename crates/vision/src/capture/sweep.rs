@@ -135,8 +135,10 @@ fn scores(
 
 /// Keeps the matches that lead back to where they came from.
 pub(super) fn consistent(
-    (reference, source): (&GrayView, &GrayView),
-    (there, back): (&Relative, &Relative),
+    reference: &GrayView,
+    source: &GrayView,
+    there: &Relative,
+    back: &Relative,
     forward: &Sweep,
     backward: &Sweep,
 ) -> Vec<Match> {

@@ -73,7 +73,7 @@ pub fn check(dir: &Path, options: &NetworkOptions) -> Result<BundleCheck> {
         let mut run = |name, signatures: &[Signature<'_>], work: &dyn Fn() -> Result<f64>| {
             let before = faults.len();
             for (what, file, wanted) in signatures.iter().filter(|(_, file, _)| whole(file)) {
-                faults.extend(network::misfits(runtime, &bundle, options, (what, file), wanted));
+                faults.extend(network::misfits(runtime, &bundle, options, what, file, wanted));
             }
             if faults.len() > before || !signatures.iter().all(|(_, file, _)| whole(file)) {
                 return;

@@ -11,7 +11,7 @@ use crate::{
         Bundle, ImageTextManifest, NetworkOptions, Provider, Runtime,
         manifest::unavailable,
         network::{
-            Input, Network, Outputs, RunMemory, Side, Signature, Spec, Takes, Wanted, fixed,
+            FileSignature, Input, Network, Outputs, RunMemory, Side, Signature, Spec, Wanted, fixed,
         },
         resize::{planes, resize},
         tensors::Numbers,
@@ -119,10 +119,10 @@ impl ImageText {
         let text = Network::open(runtime, bundle, options, &spec)?;
         Ok(Some(Self {
             // A device looks for its fastest kernels again at each new shape.
-            crops: size(image.takes(), &manifest.image.input, 0)
+            crops: size(image.signature(), &manifest.image.input, 0)
                 .or((image.provider() != Provider::Cpu).then_some(manifest.image.batch)),
-            tokens: size(text.takes(), &manifest.text.input_ids, 1),
-            texts: size(text.takes(), &manifest.text.input_ids, 0),
+            tokens: size(text.signature(), &manifest.text.input_ids, 1),
+            texts: size(text.signature(), &manifest.text.input_ids, 0),
             unknown: tokenizer.token_to_id(&manifest.text.unknown),
             image,
             text,
@@ -385,7 +385,7 @@ fn text_signature(manifest: &ImageTextManifest, ids: usize) -> Vec<Wanted<'_>> {
 }
 
 /// A dimension of an input, where the file fixes it.
-fn size(takes: &Takes, input: &str, axis: usize) -> Option<usize> {
+fn size(takes: &FileSignature, input: &str, axis: usize) -> Option<usize> {
     takes.get(input)?.shape.get(axis).copied().and_then(fixed)
 }
 

@@ -45,7 +45,7 @@ pub struct MaskNetwork {
     manifest: MasksManifest,
     encoder: Network,
     decoder: Network,
-    takes: Takes,
+    takes: DecoderInputs,
 }
 
 /// A photo as the encoder saw it.
@@ -58,7 +58,7 @@ pub struct PhotoEmbedding {
 
 /// What the decoder's file takes.
 #[derive(Clone, Debug)]
-struct Takes {
+struct DecoderInputs {
     /// The signature `efficient_sam`.
     efficient: bool,
     /// Prompts a run.
@@ -129,7 +129,7 @@ impl MaskNetwork {
             memory: RunMemory::Kept,
             tolerance: manifest.tolerance,
             probe: &|found| {
-                let takes = Takes::of(found, &manifest, points.len())?;
+                let takes = DecoderInputs::of(found, &manifest, points.len())?;
                 let points = &points[..takes.batch.min(points.len())];
                 Ok(takes.inputs(&manifest, &seen, points, None))
             },
@@ -139,7 +139,7 @@ impl MaskNetwork {
             Provider::Cpu => points.len().min(CPU_PROMPTS),
             Provider::Cuda | Provider::Webgpu => points.len(),
         };
-        let takes = Takes::of(decoder.takes(), &manifest, most)?;
+        let takes = DecoderInputs::of(decoder.signature(), &manifest, most)?;
         let mut network = Self { encoder, decoder, takes, manifest: manifest.clone() };
         if network.judges().is_some()
             && network.provider() != Provider::Cpu
@@ -411,9 +411,9 @@ impl MaskNetwork {
     }
 }
 
-impl Takes {
+impl DecoderInputs {
     /// Reads the inputs of the decoder's file; `most` prompts a run where it leaves that free.
-    fn of(file: &network::Takes, manifest: &MasksManifest, most: usize) -> Result<Self> {
+    fn of(file: &network::FileSignature, manifest: &MasksManifest, most: usize) -> Result<Self> {
         let names = &manifest.decoder;
         let efficient = manifest.adapter == MaskAdapter::EfficientSam;
         let wanted = if efficient { 4 } else { 3 };
@@ -438,10 +438,11 @@ impl Takes {
                 .get(&names.mask_input)
                 .map(|taken| taken.shape.iter().map(|&n| fixed(n).unwrap_or(1)).collect()),
             has_mask: file.get(&names.has_mask_input).is_some(),
-            size: file.get(&names.orig_im_size).map(network::Taken::whole),
+            size: file.get(&names.orig_im_size).map(network::FileTensor::whole),
             judged: file.get(PHOTO_ROWS).zip(file.get(PHOTO_COLUMNS)).and_then(
                 |(rows, columns)| {
-                    let side = |taken: &network::Taken, axis: usize| fixed(*taken.shape.get(axis)?);
+                    let side =
+                        |taken: &network::FileTensor, axis: usize| fixed(*taken.shape.get(axis)?);
                     Some([side(columns, 0)?, side(rows, 1)?])
                 },
             ),

@@ -268,7 +268,7 @@ impl Drop for Lent<'_> {
 
 /// A tensor of a file.
 #[derive(Clone, Debug)]
-pub(super) struct Taken {
+pub(super) struct FileTensor {
     name: String,
     /// -1 where it is free; empty where the file says nothing.
     pub(super) shape: Vec<i64>,
@@ -277,7 +277,7 @@ pub(super) struct Taken {
     kind: TensorElementType,
 }
 
-impl Taken {
+impl FileTensor {
     fn of(outlet: &Outlet) -> Self {
         let (shape, symbols, kind) = match outlet.dtype() {
             ValueType::Tensor { ty, shape, dimension_symbols } => {
@@ -325,25 +325,25 @@ impl Taken {
 
 /// The inputs and outputs of a file.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Takes {
-    inputs: Vec<Taken>,
-    outputs: Vec<Taken>,
+pub(super) struct FileSignature {
+    inputs: Vec<FileTensor>,
+    outputs: Vec<FileTensor>,
 }
 
-impl Takes {
+impl FileSignature {
     fn of(session: &Session) -> Self {
-        let all = |outlets: &[Outlet]| outlets.iter().map(Taken::of).collect();
+        let all = |outlets: &[Outlet]| outlets.iter().map(FileTensor::of).collect();
         Self { inputs: all(session.inputs()), outputs: all(session.outputs()) }
     }
 
     /// The input of this name; `None` where the file has none.
-    pub(super) fn get(&self, name: &str) -> Option<&Taken> {
+    pub(super) fn get(&self, name: &str) -> Option<&FileTensor> {
         self.inputs.iter().find(|taken| taken.name == name)
     }
 
     /// The tensors with what callers must keep to.
     fn tensors(&self, wanted: &[Wanted<'_>]) -> NetworkTensors {
-        let specs = |of: &[Taken], sides: [Side; 2]| -> Vec<TensorSpec> {
+        let specs = |of: &[FileTensor], sides: [Side; 2]| -> Vec<TensorSpec> {
             let wanted = |name: &str| {
                 wanted.iter().find(|want| want.name == name && sides.contains(&want.side))
             };
@@ -358,7 +358,7 @@ impl Takes {
     /// What the file has otherwise than the manifest says, all of it.
     fn misfits(&self, wanted: &[Wanted<'_>]) -> Vec<String> {
         let mut faults: Vec<String> = wanted.iter().filter_map(|want| want.misfit(self)).collect();
-        let known = |taken: &&Taken| wanted.iter().any(|want| want.name == taken.name);
+        let known = |taken: &&FileTensor| wanted.iter().any(|want| want.name == taken.name);
         faults.extend(
             self.inputs
                 .iter()
@@ -420,10 +420,10 @@ impl<'a> Wanted<'a> {
         Self { numbers, ..self }
     }
 
-    fn misfit(&self, takes: &Takes) -> Option<String> {
+    fn misfit(&self, file: &FileSignature) -> Option<String> {
         let (word, all) = match self.side {
-            Side::Input | Side::MayTake => ("input", &takes.inputs),
-            Side::Output | Side::MayGive => ("output", &takes.outputs),
+            Side::Input | Side::MayTake => ("input", &file.inputs),
+            Side::Output | Side::MayGive => ("output", &file.outputs),
         };
         let name = self.name;
         let Some(found) = all.iter().find(|taken| taken.name == name) else {
@@ -507,7 +507,7 @@ pub(super) struct Spec<'a> {
     /// The largest relative difference of an output to the CPU's, root of mean squares.
     pub(super) tolerance: f64,
     /// The fixed input of the comparison.
-    pub(super) probe: &'a dyn Fn(&Takes) -> Result<Vec<Input<'a>>>,
+    pub(super) probe: &'a dyn Fn(&FileSignature) -> Result<Vec<Input<'a>>>,
 }
 
 /// Opens sessions of one network.
@@ -528,7 +528,7 @@ impl Opener {
     /// A session a job on the CPU, or one that all jobs wait for where the network is large or the
     /// threads are few. On CUDA [`CUDA_SESSIONS`] of a small network: its kernels are many and
     /// short, so that one job's run leaves the device idle. Else one session on a device.
-    fn open(&self, provider: Provider) -> ort::Result<(Pool, Takes)> {
+    fn open(&self, provider: Provider) -> ort::Result<(Pool, FileSignature)> {
         let (count, threads) = match provider {
             Provider::Cpu if self.shared => (1, self.options.threads),
             Provider::Cpu => shares(self.options.threads, self.options.jobs),
@@ -551,9 +551,9 @@ impl Opener {
             self.runtime.session(file, provider, threads, weights, arithmetic, keeps_memory)
         };
         let sessions: Vec<Session> = (0..count).map(session).collect::<ort::Result<_>>()?;
-        let takes = sessions.first().map(Takes::of).unwrap_or_default();
+        let file = sessions.first().map(FileSignature::of).unwrap_or_default();
         let runners = sessions.into_iter().map(|session| Box::new(session) as Box<dyn Runner>);
-        Ok((Pool::new(runners.collect()), takes))
+        Ok((Pool::new(runners.collect()), file))
     }
 
     /// The CPU's own answer in f32 from the file that devices run.
@@ -577,7 +577,7 @@ type OpenCpu = Box<dyn Fn() -> Result<Pool> + Send + Sync>;
 /// A network, ready to run from any thread.
 pub struct Network {
     what: &'static str,
-    takes: Takes,
+    file: FileSignature,
     tensors: NetworkTensors,
     pool: Pool,
     provider: Provider,
@@ -623,9 +623,9 @@ impl Network {
             let opened = opener.open(provider).map_err(|e| {
                 unavailable(format!("{what}: {name} does not open {}", spec.file)).caused_by(e)
             });
-            let checked = opened.and_then(|(pool, takes)| {
-                let misfits = takes.misfits(&spec.signature);
-                let tensors = takes.tensors(&spec.signature);
+            let checked = opened.and_then(|(pool, file)| {
+                let misfits = file.misfits(&spec.signature);
+                let tensors = file.tensors(&spec.signature);
                 if !misfits.is_empty() {
                     let (file, all) = (spec.file, misfits.join("; and "));
                     return Err(unavailable(format!("{what}: {file} {all}")));
@@ -634,14 +634,14 @@ impl Network {
                     let reference = opener.reference().map_err(|e| {
                         unavailable(format!("{what}: cpu does not open {}", spec.file)).caused_by(e)
                     })?;
-                    let probe = (spec.probe)(&takes)?;
+                    let probe = (spec.probe)(&file)?;
                     let off = check(spec, name, &pool, &reference, &probe)?;
                     info!(network = what, provider = name, off, "held to the CPU's answer");
                 }
-                Ok((pool, takes, tensors))
+                Ok((pool, file, tensors))
             });
             match checked {
-                Ok((pool, takes, tensors)) => {
+                Ok((pool, file, tensors)) => {
                     info!(network = what, provider = name, "open");
                     let open_cpu = move || {
                         let opened = opener.open(Provider::Cpu).map(|(pool, _)| pool);
@@ -652,7 +652,7 @@ impl Network {
                     return Ok(Self {
                         tensors,
                         refused: refused.map(|e: Error| e.message().to_owned()),
-                        ..Self::of(what, provider, pool, takes, Box::new(open_cpu))
+                        ..Self::of(what, provider, pool, file, Box::new(open_cpu))
                     });
                 }
                 Err(error) => {
@@ -671,12 +671,12 @@ impl Network {
         what: &'static str,
         provider: Provider,
         pool: Pool,
-        takes: Takes,
+        file: FileSignature,
         open_cpu: OpenCpu,
     ) -> Self {
         Self {
             what,
-            takes,
+            file,
             tensors: NetworkTensors::default(),
             pool,
             provider,
@@ -687,9 +687,9 @@ impl Network {
         }
     }
 
-    /// What the file takes.
-    pub(super) fn takes(&self) -> &Takes {
-        &self.takes
+    /// The tensors of its file.
+    pub(super) fn signature(&self) -> &FileSignature {
+        &self.file
     }
 
     /// Its tensors, for [`Self::infer`].
@@ -835,12 +835,13 @@ pub(super) fn misfits(
     runtime: &Runtime,
     bundle: &Bundle,
     options: &NetworkOptions,
-    (what, file): (&str, &str),
+    what: &str,
+    file: &str,
     wanted: &[Wanted<'_>],
 ) -> Vec<String> {
     let path = bundle.path(file);
     match runtime.session(&path, Provider::Cpu, options.threads, None, Arithmetic::Fast, false) {
-        Ok(session) => Takes::of(&session)
+        Ok(session) => FileSignature::of(&session)
             .misfits(wanted)
             .into_iter()
             .map(|fault| format!("{what}: {file} {fault}"))
@@ -986,8 +987,8 @@ mod tests {
     fn the_cpu_answers_for_a_provider_that_is_gone() {
         let gone = |fake: Option<f32>| {
             let cpu = || Ok(pool([Some(7.0)]));
-            let takes = Takes::default();
-            Network::of("fake network", Provider::Cuda, pool([fake]), takes, Box::new(cpu))
+            let file = FileSignature::default();
+            Network::of("fake network", Provider::Cuda, pool([fake]), file, Box::new(cpu))
         };
         let answer =
             |network: &Network| network.run(&[], |outputs| Ok(outputs.get("answer")?.1[0]));
@@ -1007,9 +1008,9 @@ mod tests {
     #[test]
     fn a_failure_of_the_cpu_is_an_error() {
         let none = || Ok(pool([]));
-        let takes = Takes::default();
+        let file = FileSignature::default();
         let network =
-            Network::of("fake network", Provider::Cpu, pool([None]), takes, Box::new(none));
+            Network::of("fake network", Provider::Cpu, pool([None]), file, Box::new(none));
         let error = network.run(&[], |_| Ok(())).unwrap_err();
         assert_eq!(error.code(), ErrorCode::Internal, "{error}");
         assert_eq!(network.provider(), Provider::Cpu);

@@ -71,8 +71,8 @@ pub fn refined(
     let sized: Vec<PosedPhoto> = photos.iter().map(|photo| at_side(photo, options.side)).collect();
     // The scene without the photos `held`, and what its refinement begins with.
     let mut begin = |held: &[usize]| -> Result<(Scene, Gaussians)> {
-        let made = awake(renderer, scene, || remake(split(photos, held).0))?;
-        let (start, first) = start_of(scene, held, made)?;
+        let (learnt, one_set) = awake(renderer, scene, || remake(split(photos, held).0))?;
+        let (start, first) = start_of(scene, held, learnt, one_set)?;
         // The proof leaves room for those of the photos that it lacks.
         let all = options.gaussians_max.saturating_mul(photos.len() - held.len());
         let gaussians_max = all / photos.len().max(1);
@@ -80,10 +80,10 @@ pub fn refined(
         Ok((start, gaussians))
     };
     let mut part = |start: (&Scene, &Gaussians), held: &[usize], budget, [begin, end]: [f32; 2]| {
-        let (learnt, out) = split(&sized, held);
+        let (learnt, held_out) = split(&sized, held);
         let mut pace = |spent: f32| pace(begin + (end - begin) * spent);
         let options = RefineOptions { budget, ..*options };
-        refine::refine(renderer, start, (&learnt[..], &out[..]), &options, &mut pace)
+        refine::refine(renderer, start.0, start.1, &learnt, &held_out, &options, &mut pace)
     };
     let RefineBudget { steps, time } = options.budget;
     if held.is_empty() {
@@ -103,7 +103,7 @@ pub fn refined(
     }
     let differs = |at: &dyn Fn(usize) -> usize| {
         let photos: Vec<PosedPhoto> = held.iter().map(|&i| sized[at(i)].clone()).collect();
-        mean_difference(renderer, (&start, &proof.gaussians), &photos)
+        mean_difference(renderer, &start, &proof.gaussians, &photos)
     };
     // The photo before each is learnt.
     let overfit = differs(&|i| i)? / differs(&|i| i - 1)?;
@@ -181,7 +181,8 @@ fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
 fn start_of(
     scene: &Scene,
     held: &[usize],
-    (learnt, one_set): (Reconstruction, Gaussians),
+    learnt: Reconstruction,
+    one_set: Gaussians,
 ) -> Result<(Scene, Gaussians)> {
     let kept = |i: &usize| !held.contains(i);
     let numbers: Vec<usize> = (0..scene.meta.cameras.len()).filter(kept).collect();

@@ -174,7 +174,8 @@ pub fn split(photos: &[PosedPhoto], held: &[usize]) -> (Vec<PosedPhoto>, Vec<Pos
 /// What the renderer says.
 pub fn mean_difference(
     renderer: &dyn DifferentiableRenderer,
-    (start, gaussians): (&Scene, &Gaussians),
+    start: &Scene,
+    gaussians: &Gaussians,
     photos: &[PosedPhoto],
 ) -> Result<f64> {
     let mut sum = 0.0;
@@ -209,14 +210,14 @@ pub fn rate_factor(steps_a_photo: f32) -> f32 {
 }
 
 /// A held-out photo.
-struct Look {
+struct HeldOutPhoto {
     camera: Camera,
     /// `[H * W]` 0..1.
     rgb: Vec<[f32; 3]>,
     valid: Option<Vec<bool>>,
 }
 
-impl Look {
+impl HeldOutPhoto {
     fn new(posed: &PosedPhoto) -> Self {
         let rgb = unit(&posed.photo);
         Self { camera: posed.camera, rgb, valid: posed.photo.valid.clone() }
@@ -253,7 +254,7 @@ struct Refinement<'a> {
     start: &'a Scene,
     options: &'a RefineOptions,
     learnt: &'a [PosedPhoto],
-    looks: Vec<Look>,
+    held_out: Vec<HeldOutPhoto>,
     report: RefineReport,
 }
 
@@ -280,8 +281,10 @@ pub fn ready(start: &Scene, first: &Gaussians, options: &RefineOptions) -> Resul
 /// `invalid_request` for options out of range; what the renderer or `pace` says.
 pub fn refine(
     renderer: &dyn DifferentiableRenderer,
-    (start, gaussians): (&Scene, &Gaussians),
-    (learnt, held_out): (&[PosedPhoto], &[PosedPhoto]),
+    start: &Scene,
+    gaussians: &Gaussians,
+    learnt: &[PosedPhoto],
+    held_out: &[PosedPhoto],
     options: &RefineOptions,
     pace: &mut dyn FnMut(f32) -> Result<()>,
 ) -> Result<RefinedVersion> {
@@ -294,7 +297,7 @@ pub fn refine(
         start,
         options,
         learnt,
-        looks: held_out.par_iter().map(Look::new).collect(),
+        held_out: held_out.par_iter().map(HeldOutPhoto::new).collect(),
         report: RefineReport::default(),
     };
     work.report = match &start.meta.report.refinement {
@@ -343,7 +346,7 @@ impl Refinement<'_> {
         let options = self.options;
         let begun = Instant::now();
         let mut clock = Clock { budget: options.budget, begun, waited: Duration::ZERO };
-        let watched = !self.looks.is_empty();
+        let watched = !self.held_out.is_empty();
         let few = !watched && self.learnt.len() < HOLDS_OUT_FROM;
         let mut best: Option<RefineReport> = None;
         let (mut order, mut random) = (Vec::<usize>::new(), options.seed);
@@ -357,7 +360,8 @@ impl Refinement<'_> {
             if last || (watched && spent * LOOKS as f32 >= (looked + 1) as f32) {
                 looked += 1;
                 waited += 1;
-                let after = self.look(|camera| trainer.render(&plain_view(self.start, camera)))?;
+                let after =
+                    self.held_out_psnr(|camera| trainer.render(&plain_view(self.start, camera)))?;
                 if after > highest {
                     (highest, waited) = (after, 0);
                 }
@@ -412,7 +416,8 @@ impl Refinement<'_> {
         let (scene, count) = (self.start, self.start.gaussians.len() as u64);
         let near = default_near(scene.meta.report.median_depth);
         let view = |camera| served(scene, RenderRequest::plain(camera, Kinds::COLOR, near));
-        let psnr = self.look(|camera| self.renderer.render(&scene.gaussians, &view(camera)))?;
+        let psnr =
+            self.held_out_psnr(|camera| self.renderer.render(&scene.gaussians, &view(camera)))?;
         let counts = RefineReport {
             gaussians_before: count,
             gaussians_after: count,
@@ -422,14 +427,14 @@ impl Refinement<'_> {
     }
 
     /// Mean PSNR of what `draw` gives on the held-out photos, colours as 8 bits hold them.
-    fn look(&self, mut draw: impl FnMut(Camera) -> Result<Frame>) -> Result<Option<f64>> {
+    fn held_out_psnr(&self, mut draw: impl FnMut(Camera) -> Result<Frame>) -> Result<Option<f64>> {
         let mut sum = 0.0;
-        for look in &self.looks {
-            let mut color = draw(look.camera)?.color.unwrap_or_default();
+        for photo in &self.held_out {
+            let mut color = draw(photo.camera)?.color.unwrap_or_default();
             color.iter_mut().flatten().for_each(|v| *v = v.clamp(0.0, 1.0));
-            sum += psnr(&color, &look.rgb, look.valid.as_deref());
+            sum += psnr(&color, &photo.rgb, photo.valid.as_deref());
         }
-        Ok((!self.looks.is_empty()).then(|| sum / self.looks.len() as f64))
+        Ok((!self.held_out.is_empty()).then(|| sum / self.held_out.len() as f64))
     }
 }
 

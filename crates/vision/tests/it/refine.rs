@@ -102,10 +102,9 @@ fn refined(
 ) -> RefinedVersion {
     let (learnt, out) = split(photos, &held_out(photos.len()));
     let options = RefineOptions { budget: RefineBudget::steps(steps), ..RefineOptions::default() };
-    let photos = (&learnt[..], &out[..]);
     let scene = scene(start, 3.0);
     let gaussians = ready(&scene, start, &options).expect("Gaussians");
-    refine(renderer, (&scene, &gaussians), photos, &options, &mut |_| Ok(())).expect("refined")
+    refine(renderer, &scene, &gaussians, &learnt, &out, &options, &mut |_| Ok(())).expect("refined")
 }
 
 fn cpu() -> CpuRenderer {
@@ -181,7 +180,7 @@ fn it_goes_on_from_the_proof_where_that_explains_photos_that_it_did_not_learn() 
     let held = held_out(photos.len());
     let differs = |(scene, found): &(Scene, Refined)| {
         let (_, version) = found.version.as_ref().expect("a better version");
-        mean_difference(&cpu(), (scene, &version.gaussians), &photos).expect("views")
+        mean_difference(&cpu(), scene, &version.gaussians, &photos).expect("views")
     };
     // Whether the Gaussians of held-out photos are behind the others.
     let joined = |found: &Refined| {
@@ -327,7 +326,7 @@ fn a_cancelled_refinement_stops_and_odd_input_is_taken_or_refused() {
         };
         let scene = scene(start, f64::NAN);
         let gaussians = ready(&scene, start, options)?;
-        refine(&cpu, (&scene, &gaussians), (photos, &[]), options, &mut pace)
+        refine(&cpu, &scene, &gaussians, photos, &[], options, &mut pace)
     };
     let options = RefineOptions { budget: RefineBudget::steps(30), ..RefineOptions::default() };
     let told = run(&truth, &photos, &options, true).expect_err("cancelled");

@@ -75,7 +75,7 @@ fn read(from: &mut dyn BufRead, limits: &Limits) -> Result<SplatsRead> {
     for i in 0..vertices.count {
         from.read_exact(&mut vertex)
             .map_err(|cause| cut_short("PLY", cause, i, vertices.count, "Gaussians"))?;
-        layout.push(&header, vertices, &vertex, (&mut raw, &mut placed));
+        layout.push(&header, vertices, &vertex, &mut raw, &mut placed);
     }
     let semantics = header.semantics.map(|bytes| semantics_after(from, bytes)).transpose()?;
     Ok(SplatsRead::new(&PLY, raw, semantics)?.antialiased(header.antialiased))
@@ -461,7 +461,8 @@ impl Layout {
         header: &Header,
         vertices: &Element,
         vertex: &[u8],
-        (raw, placed): (&mut RawGaussians, &mut bool),
+        raw: &mut RawGaussians,
+        placed: &mut bool,
     ) {
         let attributes = &vertices.attributes;
         let value = |attribute: usize| {
