@@ -24,7 +24,7 @@ use tokio::{sync::oneshot, task::JoinHandle};
 
 use crate::common::{
     doors::{Door, Options, both, fault_of},
-    process::{Start, can_serve, long},
+    process::{Start, can_serve, eventually, long, signal},
     root,
     server::{TestServer, WallNetworks, upload},
 };
@@ -331,4 +331,66 @@ async fn ready_comes_long_before_the_networks_are_open() {
         assert!(ready < Duration::from_secs(1), "ready after {ready:?}");
         assert!(end < Duration::from_millis(300), "idle end in {end:?}");
     }
+}
+
+/// What a server says to `GET /v1/scenes?limit=2` with each of these keys.
+async fn statuses(url: &str, keys: [&str; 2]) -> [u16; 2] {
+    let client = crate::common::client();
+    let mut found = [0; 2];
+    for (status, key) in found.iter_mut().zip(keys) {
+        let call = client.get(format!("{url}/v1/scenes?limit=2")).bearer_auth(key);
+        *status = call.send().await.expect("an answer").status().as_u16();
+    }
+    found
+}
+
+#[tokio::test]
+async fn a_hangup_with_a_bad_file_changes_nothing_and_with_good_files_everything() {
+    if !can_serve() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let write = |name: &str, text: &str| std::fs::write(path(name), text).unwrap();
+    let key = |secret: &str| {
+        let sha256 = segsplat::keys::key_sha256(secret);
+        format!("[[key]]\nname = \"a\"\nsha256 = \"{sha256}\"\nscopes = [\"read\"]\n")
+    };
+    let config = |page_max: u32| {
+        let keys = path("keys.toml");
+        format!("keys = {:?}\n[limits]\npage_max = {page_max}\n", keys.display().to_string())
+    };
+    write("keys.toml", &key("old"));
+    write("config.toml", &config(2));
+    let start = Start::on(&path("data")).log(path("log"));
+    let start = start.arg("--config").arg(&path("config.toml").display().to_string());
+    let server = start.start();
+    // How often it was said that nothing is changed, and that something is.
+    let said = |what: &str| std::fs::read_to_string(path("log")).unwrap().matches(what).count();
+    let (refused, changed) = ("are not changed", "are read again");
+    let hangup = async |what: &str| {
+        let before = said(what);
+        assert!(signal(server.id(), "HUP"));
+        eventually(what, async || (said(what) > before).then_some(())).await;
+    };
+    assert_eq!(statuses(&server.url, ["old", "new"]).await, [200, 401]);
+    // Keys and limits are new, and the page is too short for the call: only all of it could count.
+    let good = config(1);
+    for (keys, config) in [
+        (key("new"), "rubbish".to_owned()),
+        (key("new"), format!("{good}page_min = 1\n")),
+        (key("new"), format!("{good}photos_min = 1\n")),
+        (key("new"), format!("tls_cert = \"cert.pem\"\n{good}")),
+        ("rubbish".to_owned(), good.clone()),
+    ] {
+        write("keys.toml", &keys);
+        write("config.toml", &config);
+        hangup(refused).await;
+        assert_eq!(statuses(&server.url, ["old", "new"]).await, [200, 401], "{config} {keys}");
+    }
+    write("keys.toml", &key("new"));
+    write("config.toml", &good);
+    hangup(changed).await;
+    assert_eq!(statuses(&server.url, ["old", "new"]).await, [401, 400], "all of it counts");
+    assert!(server.stop());
 }

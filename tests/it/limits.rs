@@ -3,16 +3,30 @@
 
 use std::{
     collections::BTreeSet,
-    sync::{Arc, atomic::Ordering},
+    sync::{
+        Arc,
+        atomic::{AtomicU64, Ordering},
+    },
     time::Duration,
 };
 
+use futures_util::TryStreamExt as _;
+use object_store::{ObjectStore as _, ObjectStoreExt as _, memory::InMemory, path::Path as Name};
 use segsplat::{
+    error::{Error, Result},
     limits::{Limits, LiveLimits},
     photos,
+    render::{
+        DifferentiableRenderer, Frame, RenderRequest, Renderer,
+        backward::{FrameGradients, Gradients},
+        train::{Trainer, TrainingSet},
+    },
     sample::{self, SampleOptions},
-    scene::{RefineState, SceneId, Upload, UploadFile},
-    service::CreateScene,
+    scene::{
+        Gaussians, Refine, RefineState, SceneId, SceneState, SemanticsState, Upload, UploadFile,
+    },
+    service::{CreateScene, QuerySpec},
+    store::StoreLocation,
 };
 use segsplat_testing::captures::{self, zipped};
 use serde_json::{Value, json};
@@ -20,7 +34,7 @@ use serde_json::{Value, json};
 use crate::common::{
     meaning::PhotoMeaning,
     process, root,
-    server::{PATIENCE, TestServer, upload},
+    server::{PATIENCE, PointRenderer, TestServer, WallNetworks, upload},
 };
 use crate::{
     refine::{LensedNetworks, upload as six_photos},
@@ -87,8 +101,8 @@ const LIVE: [(&str, u64, Ask); 34] = [
 ];
 
 /// Live as well, and not seen by these calls: those of keys, in `access.rs`, and of answers that
-/// are not sent yet, in `answers.rs`; one that counts on a device alone, read with the other limits
-/// of refinement; and those of threads, which read them again in each of their rounds.
+/// are not sent yet, in `answers.rs`; one that counts on a device alone, and those of threads and
+/// of replicas, by tests of their own below.
 const ELSEWHERE: [&str; 9] = [
     "answers_bytes_max",
     "exports_bytes_max",
@@ -292,4 +306,193 @@ fn each_limit_is_live_or_waits_for_the_next_start() {
     let rows = LIVE.iter().map(|(name, ..)| *name).chain(ELSEWHERE);
     assert_eq!(live, rows.collect(), "each live limit has a row here");
     assert!(waits.contains("store_timeout_ms"));
+}
+
+/// A device that takes no photos to learn, and keeps what it was told to use at most.
+#[derive(Debug, Default)]
+struct Device {
+    bytes_max: AtomicU64,
+}
+
+impl Renderer for Device {
+    fn name(&self) -> String {
+        PointRenderer.name()
+    }
+
+    fn concurrency(&self) -> usize {
+        1
+    }
+
+    fn render(&self, gaussians: &Gaussians, request: &RenderRequest) -> Result<Frame> {
+        PointRenderer.render(gaussians, request)
+    }
+
+    fn differentiable(self: Arc<Self>) -> Option<Arc<dyn DifferentiableRenderer>> {
+        Some(self)
+    }
+}
+
+impl DifferentiableRenderer for Device {
+    fn backward(
+        &self,
+        _: &Gaussians,
+        _: &RenderRequest,
+        _: &mut dyn FnMut(&Frame) -> Result<FrameGradients>,
+        _: &mut Gradients,
+    ) -> Result<Frame> {
+        Err(Error::internal("no backward pass"))
+    }
+
+    fn trainer<'a>(
+        &'a self,
+        _: &TrainingSet<'a>,
+        bytes_max: u64,
+    ) -> Result<Option<Box<dyn Trainer + 'a>>> {
+        self.bytes_max.store(bytes_max, Ordering::Release);
+        Err(Error::internal("no trainer"))
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_device_is_told_the_bytes_of_now() {
+    let device = Arc::new(Device::default());
+    let given = Arc::clone(&device);
+    let server = TestServer::with(|config, parts| {
+        parts.scenes = Arc::new(LensedNetworks::default());
+        parts.renderer = given;
+        config.limits = base();
+    })
+    .await;
+    let request =
+        CreateScene { upload: six_photos(), wait: Some(PATIENCE), ..CreateScene::default() };
+    let id = server.service.create_scene(request).await.unwrap().status.id;
+    for bytes in [70_001, 70_002] {
+        server.service.reload(Limits { refine_device_bytes_max: bytes, ..base() });
+        server.service.refine(&id, Refine::Ms(600_000)).await.unwrap();
+        process::eventually("the refinement ends", async || {
+            let state = server.service.get(&id).await.unwrap().refinement.state;
+            (state != RefineState::Running).then_some(())
+        })
+        .await;
+        assert_eq!(device.bytes_max.load(Ordering::Acquire), bytes);
+    }
+}
+
+/// Longer than any test.
+const DAY_MS: u64 = 86_400_000;
+
+/// Limits of a replica that looks at the others once, at its start.
+fn unhurried() -> Limits {
+    let (beat, lease, fresh) = (DAY_MS, DAY_MS, DAY_MS);
+    Limits {
+        replica_beat_ms: beat,
+        replica_lease_ms: lease,
+        record_fresh_ms: fresh,
+        ..Limits::default()
+    }
+}
+
+/// A store in memory, for replicas.
+fn shared() -> (Arc<InMemory>, StoreLocation) {
+    let objects = Arc::new(InMemory::new());
+    (Arc::clone(&objects), StoreLocation::Shared(objects))
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_record_of_another_replica_is_read_again_when_the_limit_says_so() {
+    let (_objects, place) = shared();
+    let meaning = || Arc::new(PhotoMeaning::default());
+    let one = TestServer::at(&place, |_, parts| parts.semantics = meaning()).await;
+    let other = TestServer::at(&place, |config, parts| {
+        parts.semantics = meaning();
+        config.limits = unhurried();
+    })
+    .await;
+    let id = one.scene().await.id;
+    let seen = async || other.service.get(&id).await.unwrap().semantics.state;
+    assert_eq!(seen().await, SemanticsState::None);
+    let texts = vec!["photo 0".to_owned()];
+    let spec = QuerySpec { texts, wait: Some(PATIENCE), ..QuerySpec::default() };
+    one.service.query(&id, spec).await.unwrap();
+    assert_eq!(seen().await, SemanticsState::None, "what was read counts for a day");
+    other.service.reload(Limits { record_fresh_ms: 0, ..unhurried() });
+    assert_eq!(seen().await, SemanticsState::Ready);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_replica_looks_at_the_others_when_the_limit_says_so() {
+    let (_objects, place) = shared();
+    let one = TestServer::at(&place, |_, _| {}).await;
+    let other = TestServer::at(&place, |config, _| config.limits = unhurried()).await;
+    let id = one.scene().await.id;
+    other.service.get(&id).await.unwrap();
+    one.service.delete(&id).await.unwrap();
+    other.service.reload(Limits { replica_beat_ms: 10, ..unhurried() });
+    process::eventually("the scene is gone", async || other.service.get(&id).await.err()).await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_silent_replica_is_replaced_when_the_limit_says_so() {
+    let (objects, place) = shared();
+    let networks = Arc::new(WallNetworks::default());
+    networks.hold.store(true, Ordering::Release);
+    let given = Arc::clone(&networks);
+    let silent = TestServer::at(&place, |config, parts| {
+        parts.scenes = given;
+        config.limits = unhurried();
+    })
+    .await;
+    let patient = Limits { replica_beat_ms: 10, ..unhurried() };
+    let heir = TestServer::at(&place, |config, _| config.limits = patient.clone()).await;
+    let request = CreateScene { upload: upload(), ..CreateScene::default() };
+    let id = silent.service.create_scene(request).await.unwrap().status.id;
+    // The larger count of heartbeats is that of the heir.
+    let beats = async || {
+        let names: Vec<Name> = objects
+            .list(Some(&Name::from("replicas")))
+            .map_ok(|object| object.location)
+            .try_collect()
+            .await
+            .unwrap();
+        let mut most = 0_u64;
+        for name in names {
+            let count = objects.get(&name).await.unwrap().bytes().await.unwrap();
+            most = most.max(std::str::from_utf8(&count).unwrap().parse().unwrap());
+        }
+        most
+    };
+    let before = beats().await;
+    process::eventually("beats", async || (beats().await > before + 3).then_some(())).await;
+    let state = async || heir.service.get(&id).await.unwrap().state;
+    assert_ne!(state().await, SceneState::Done, "a replica may be silent for a day");
+    heir.service.reload(Limits { replica_lease_ms: 1, ..patient.clone() });
+    process::eventually("the heir makes it", async || {
+        (state().await == SceneState::Done).then_some(())
+    })
+    .await;
+    networks.hold.store(false, Ordering::Release);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_belongs_to_no_scene_goes_when_the_limit_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let left = |byte: u8| {
+        let id = SceneId::from_bytes([byte; 16]);
+        let path = folder.path().join("scenes").join(id.as_str());
+        std::fs::create_dir_all(&path).unwrap();
+        std::fs::write(path.join("left"), "x").unwrap();
+        path.join("left")
+    };
+    let gone = async |path: std::path::PathBuf| {
+        process::eventually("it is swept", async || (!path.exists()).then_some(())).await;
+    };
+    let rare = Limits { sweep_every_ms: DAY_MS, ..Limits::default() };
+    let first = left(1);
+    let place = StoreLocation::Folder(folder.path().to_owned());
+    let server = TestServer::at(&place, |config, _| config.limits = rare.clone()).await;
+    gone(first).await;
+    // The sweep of the start has listed what there was before this one.
+    let second = left(2);
+    server.service.reload(Limits { sweep_every_ms: 0, ..rare });
+    gone(second).await;
 }

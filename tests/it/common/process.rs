@@ -3,7 +3,7 @@
 
 use std::{
     io::{BufRead, BufReader},
-    path::Path,
+    path::{Path, PathBuf},
     process::{Child, Command, Stdio},
     time::{Duration, Instant},
 };
@@ -48,13 +48,14 @@ pub(crate) struct Start {
     within: Vec<String>,
     args: Vec<String>,
     env: Vec<(String, String)>,
+    log: Option<PathBuf>,
 }
 
 impl Start {
     /// A server on this data folder, with the fixture bundle `plane`.
     pub(crate) fn on(data: &Path) -> Self {
-        let (within, args, env) = Default::default();
-        let start = Self { bundle: "plane", within, args, env };
+        let (within, args, env, log) = Default::default();
+        let start = Self { bundle: "plane", within, args, env, log };
         start.arg("--data-dir").arg(&data.display().to_string())
     }
 
@@ -78,6 +79,11 @@ impl Start {
         self
     }
 
+    /// With its log in this file.
+    pub(crate) fn log(self, file: PathBuf) -> Self {
+        Self { log: Some(file), ..self }
+    }
+
     /// Starts it and waits until it listens; its log goes to `$SEGSPLAT_TEST_LOG`, else nowhere.
     /// `$SEGSPLAT_TEST_BINARY` is started in place of the program built with the tests.
     pub(crate) fn start(&self) -> Process {
@@ -91,7 +97,8 @@ impl Start {
             command.env_remove(name);
         }
         let bundle = root().join("tests/fixtures").join(self.bundle);
-        let log = std::env::var_os("SEGSPLAT_TEST_LOG").map_or_else(Stdio::null, |path| {
+        let log = std::env::var_os("SEGSPLAT_TEST_LOG").map(PathBuf::from);
+        let log = self.log.clone().or(log).map_or_else(Stdio::null, |path| {
             let file = std::fs::OpenOptions::new().create(true).append(true).open(path);
             file.expect("the log can be written").into()
         });

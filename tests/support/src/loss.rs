@@ -7,7 +7,8 @@ const VARIANCE: f64 = 1.5 * 1.5;
 const C1: f64 = 0.01 * 0.01;
 const C2: f64 = 0.03 * 0.03;
 
-/// [`segsplat_render::train::photo_loss()`] in f64: its value, and its derivative by each number of the picture.
+/// [`segsplat_render::train::photo_loss()`] in f64: its value, and its derivative by each number of
+/// the picture.
 #[must_use]
 pub fn photo_loss(
     picture: &[[f64; 3]],
