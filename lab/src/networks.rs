@@ -87,17 +87,11 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     let photo = sample::photos(&SampleOptions { photos: 2, ..Default::default() })?.remove(0).photo;
     let seen = Arc::new(cpu.0.encode(&photo)?);
     let encode = |network: &MaskNetwork| network.encode(&photo).map(|seen| seen.numbers());
-    push(
-        "mask encoder",
-        take(&[Box::new(|| encode(&cpu.0)), Box::new(|| encode(&device.0))], args.runs)?,
-    )?;
+    push("mask encoder", take_both([&cpu.0, &device.0], &encode, args.runs)?)?;
     let points: Vec<[f32; 2]> =
         (0..64).map(|i| [(i % 8) as f32 / 8.0 + 0.06, (i / 8) as f32 / 8.0 + 0.06]).collect();
     let decode = |network: &MaskNetwork| Ok(network.decode(&seen, &points)?.logits);
-    push(
-        "mask decoder, 64 points",
-        take(&[Box::new(|| decode(&cpu.0)), Box::new(|| decode(&device.0))], args.runs)?,
-    )?;
+    push("mask decoder, 64 points", take_both([&cpu.0, &device.0], &decode, args.runs)?)?;
     let crop = |i: usize| Crop {
         width: 128,
         height: 128,
@@ -105,15 +99,12 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
     };
     let crops: Vec<Crop> = (0..40).map(crop).collect();
     let embed = |towers: &ImageText| towers.embed_images(&crops);
-    push(
-        "image tower, 40 crops",
-        take(&[Box::new(|| embed(&cpu.1)), Box::new(|| embed(&device.1))], args.runs)?,
-    )?;
+    push("image tower, 40 crops", take_both([&cpu.1, &device.1], &embed, args.runs)?)?;
     let texts = ["a red mug on the table".to_owned()];
     let read = |towers: &ImageText| {
         Ok(towers.embed_texts(&texts)?.into_iter().flat_map(|text| text.row).collect())
     };
-    push("text tower", take(&[Box::new(|| read(&cpu.1)), Box::new(|| read(&device.1))], args.runs)?)
+    push("text tower", take_both([&cpu.1, &device.1], &read, args.runs)?)
 }
 
 /// Means, scales, colours and opacities of all views.
@@ -143,6 +134,11 @@ type TimedRun<'a> = Box<dyn Fn() -> Result<Vec<f32>> + 'a>;
 struct Timed {
     row: Value,
     error: Value,
+}
+
+/// Runs what the CPU and the provider both have.
+fn take_both<T>(both: [&T; 2], run: &dyn Fn(&T) -> Result<Vec<f32>>, runs: usize) -> Result<Timed> {
+    take(&both.map(|network| Box::new(move || run(network)) as TimedRun<'_>), runs)
 }
 
 /// Runs all in turns. The first is the CPU, the second the provider, the third the other bundle.

@@ -33,13 +33,6 @@ impl<K: Clone + Eq + Hash, V: Clone> Cache<K, V> {
         Self { entries: Mutex::new(entries) }
     }
 
-    /// Changes the most that it keeps.
-    pub fn set_weight_max(&self, weight_max: u64) {
-        let mut entries = self.entries.lock();
-        entries.weight_max = weight_max;
-        entries.make_room(0);
-    }
-
     /// Weight of all values.
     pub fn weight(&self) -> u64 {
         self.entries.lock().weight

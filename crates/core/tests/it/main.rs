@@ -37,15 +37,6 @@ fn the_least_recently_used_leaves_first_and_weights_are_given_back() {
 }
 
 #[test]
-fn a_smaller_bound_drops_what_no_longer_fits() {
-    let cache = Cache::new(10);
-    (0..10).for_each(|key| cache.insert(key, (), 1));
-    cache.set_weight_max(3);
-    let left: Vec<i32> = (0..10).filter(|key| cache.find(key).is_some()).collect();
-    assert_eq!(left, [7, 8, 9], "the last three");
-}
-
-#[test]
 fn gaussians_with_other_entries_have_the_same_arrays() {
     let raw = RawGaussians {
         means: vec![[0.0; 3], [1.0; 3]],

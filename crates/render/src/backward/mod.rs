@@ -2,8 +2,8 @@
 //! Gaussians.
 //!
 //! An oracle in `tests/support` judges the others: f64, pixel by pixel. Finite differences of the
-//! forward oracle judge it. [`crate::cpu::backward`] is the tiled kernel, shaders/*_backward.wgsl its twin. A
-//! renderer that has a backward pass is a [`crate::DifferentiableRenderer`].
+//! forward oracle judge it. [`crate::cpu::backward`] is the tiled kernel, shaders/*_backward.wgsl
+//! its twin. A renderer that has a backward pass is a [`crate::DifferentiableRenderer`].
 //!
 //! For a pixel with Gaussians i front to back, `w_i = alpha_i T_i`, `A = sum w_i` and `B` behind:
 //! the colour is `sum w_i c_i + (1 - A) B`, the depth `sum w_i z_i / A`. With `g` for what the loss
