@@ -1,6 +1,6 @@
 //! The CPU renderer against the f64 oracle: strict inside, flips counted at cliffs.
 
-use segsplat_core::scene::{Gaussians, RawGaussians};
+use segsplat_core::scene::{Camera, Gaussians, RawGaussians};
 use segsplat_render::{RenderRequest, Renderer, constants, cpu::CpuRenderer, oracle};
 
 use segsplat_testing::{
@@ -29,6 +29,14 @@ fn judge(name: &str, gaussians: &Gaussians, request: &RenderRequest) -> Differen
         found.flips
     );
     found
+}
+
+/// A camera of 128 x 128 with a field of view.
+pub(crate) fn lens(degrees: f64) -> Camera {
+    let mut camera = camera(128, 128);
+    let focal = 64.0 / (degrees.to_radians() / 2.0).tan();
+    (camera.intrinsics.fx, camera.intrinsics.fy) = (focal, focal);
+    camera
 }
 
 #[test]
@@ -106,8 +114,9 @@ fn the_antialiased_mode_agrees_and_differs_from_the_plain_one() {
     assert_ne!(pictures[0], pictures[1], "antialiased must change the picture");
 }
 
-/// Needles, giants, specks, opaque walls and faint fog, at the edges of tiles and picture.
-fn extremes() -> Gaussians {
+/// Needles, giants, specks, walls and faint fog, at the edges of tiles and picture. Walls are
+/// `opaque`, or have half of that.
+fn extremes(opaque: bool) -> Gaussians {
     let mut random = Random(51);
     let mut raw = RawGaussians::default();
     for i in 0..400 {
@@ -126,7 +135,8 @@ fn extremes() -> Gaussians {
             _ => random.range(0.02, 0.6),
         };
         let color = [(); 3].map(|()| random.range(-3.0, 3.0));
-        push(&mut raw, mean, random.quat(), scale, opacity * 0.5 + 0.002, &[color]);
+        let opacity = if opaque { opacity } else { opacity * 0.5 + 0.002 };
+        push(&mut raw, mean, random.quat(), scale, opacity, &[color]);
     }
     checked(raw)
 }
@@ -135,9 +145,45 @@ fn extremes() -> Gaussians {
 fn needles_giants_and_specks_agree() {
     for (width, height) in [(1, 1), (15, 17), (130, 70), (257, 31)] {
         let request = request(camera(width, height));
-        let found = judge(&format!("extremes {width}x{height}"), &extremes(), &request);
-        assert_eq!(found.pixels as u32, width * height, "every pixel is judged");
+        for opaque in [false, true] {
+            let name = format!("extremes {width}x{height}, opaque: {opaque}");
+            let found = judge(&name, &extremes(opaque), &request);
+            assert_eq!(found.pixels as u32, width * height, "every pixel is judged");
+        }
     }
+}
+
+#[test]
+fn lenses_of_all_widths_and_uneven_ones_agree() {
+    let gaussians = cloud(4_000, 1, 40);
+    for degrees in [0.1_f64, 1.0, 133.0, 160.0, 170.0, 175.0] {
+        judge(&format!("{degrees} degrees"), &gaussians, &request(lens(degrees)));
+    }
+    for (fx, fy, cx, cy) in
+        [(1e5, 1.0, -2e4, 30.0), (0.01, 300.0, 50.0, 2e3), (1e6, 1e6, -3e5, 2e5)]
+    {
+        let mut camera = camera(96, 64);
+        let lens = &mut camera.intrinsics;
+        (lens.fx, lens.fy, lens.cx, lens.cy) = (fx, fy, cx, cy);
+        judge(&format!("fx {fx} fy {fy} cx {cx} cy {cy}"), &gaussians, &request(camera));
+    }
+}
+
+#[test]
+fn the_near_plane_passes_through_a_scene_one_gaussian_at_a_time() {
+    let gaussians = cloud(60, 0, 5);
+    let mut depths: Vec<f32> = gaussians.means().iter().map(|mean| mean[2] + 0.125).collect();
+    depths.sort_by(f32::total_cmp);
+    let mut before = u64::MAX;
+    // At a centre, which stays, and behind it.
+    for near in depths.into_iter().skip(4).step_by(5).flat_map(|depth| [depth, depth.next_up()]) {
+        let request = RenderRequest { near, ..request(camera(48, 32)) };
+        judge(&format!("near {near}"), &gaussians, &request);
+        let visible = cpu().render(&gaussians, &request).expect("a picture").stats.visible;
+        assert!(visible <= before, "near {near}: {visible} visible, {before} before");
+        before = visible;
+    }
+    assert_eq!(before, 0, "the last one is left out");
 }
 
 #[test]

@@ -20,11 +20,14 @@ use segsplat_render::{
         tiles::{Grid, TileSpans},
     },
     gpu::internals::FootprintRow,
+    oracle,
     view::View,
 };
 
-use crate::common::{both_kernels, gpu, judge, open, same};
+use crate::common::{both_kernels, cpu, gpu, judge, open, same};
+use crate::oracle::lens;
 use crate::reference::{emit_isects, prefix_sum, radix_sort, tile_ranges};
+use segsplat_testing::compare::{Tolerance, compare, oracle_samples, samples};
 use segsplat_testing::scenes::{
     BACKGROUND, Random, camera, checked, cloud, look, push, request, two_views,
 };
@@ -448,4 +451,33 @@ fn scenes_are_uploaded_once() {
         gpu.render(scene, &request(camera(32, 32))).expect("a picture");
     }
     assert_eq!(gpu.internals().scenes_held(), 2, "clones share their upload");
+}
+
+#[test]
+fn lenses_of_all_widths_agree() {
+    let gaussians = cloud(4_000, 1, 40);
+    for gpu in both_kernels() {
+        for degrees in [0.1, 1.0, 133.0, 160.0, 170.0, 175.0] {
+            judge(gpu, &format!("{degrees} degrees"), &gaussians, &request(lens(degrees)));
+        }
+    }
+}
+
+/// Equal depths are no cliff: the order of the scene decides.
+#[test]
+fn equal_depths_are_drawn_in_the_order_of_the_scene() {
+    let mut raw = cloud(600, 0, 44).into_raw();
+    raw.means.iter_mut().for_each(|mean| mean[2] = 4.0);
+    raw.scales.iter_mut().flatten().for_each(|scale| *scale = scale.clamp(0.05, 0.4));
+    let gaussians = checked(raw);
+    let request = request(camera(64, 48));
+    let truth = oracle::render(&gaussians, &request).expect("the truth");
+    let cliff: Vec<bool> = truth.iter().map(|pixel| pixel.cliff.same_order()).collect();
+    let cpu = cpu();
+    let renderers = both_kernels().map(|gpu| gpu as &dyn Renderer);
+    for renderer in renderers.chain([&cpu as &dyn Renderer]) {
+        let frame = samples(&renderer.render(&gaussians, &request).expect("a picture"));
+        compare(&frame, &oracle_samples(&truth), &cliff, Tolerance::ORACLE)
+            .unwrap_or_else(|told| panic!("{}: {told}", renderer.name()));
+    }
 }

@@ -1,9 +1,12 @@
 //! Scenes of many Gaussians.
 
-use segsplat_render::{RenderRequest, Renderer};
+use segsplat_render::{RenderRequest, Renderer, oracle};
+use segsplat_testing::{
+    compare::{Tolerance, compare, oracle_samples, samples},
+    scenes::{Random, request, two_views},
+};
 
-use crate::common::{both_kernels, judge, open};
-use segsplat_testing::scenes::{Random, request, two_views};
+use crate::common::{both_kernels, cpu, judge, open};
 
 #[test]
 fn pictures_of_131072_gaussians_are_the_same() {
@@ -47,4 +50,27 @@ fn a_hundred_million_pairs_are_sorted() {
         want.sort_unstable();
         assert!(got == want, "{} pairs: order differs", want.len());
     }
+}
+
+/// 10,008,338 Gaussians, at sampled pixels: long form (`RUN_SLOW_TESTS=1`).
+#[test]
+fn ten_million_gaussians_agree_with_the_oracle() {
+    if std::env::var_os("RUN_SLOW_TESTS").is_none() {
+        println!("skipped: RUN_SLOW_TESTS is not set");
+        return;
+    }
+    let (gaussians, mut camera) = two_views(2_237, 1);
+    assert_eq!(gaussians.len(), 10_008_338);
+    camera.intrinsics = camera.intrinsics.resized(480, 480);
+    let request = request(camera);
+    let mut random = Random(9);
+    let pixels: Vec<[u32; 2]> =
+        (0..256).map(|_| [(); 2].map(|()| (random.bits() % 480) as u32)).collect();
+    let truth = oracle::render_pixels(&gaussians, &request, &pixels).expect("the truth");
+    let cpu = cpu();
+    let all = samples(&cpu.render(&gaussians, &request).expect("a picture"));
+    let got: Vec<_> = pixels.iter().map(|[x, y]| all[(y * 480 + x) as usize]).collect();
+    let cliff: Vec<bool> = truth.iter().map(|pixel| pixel.cliff.same_order()).collect();
+    let bound = Tolerance { flips: 0.1, ..Tolerance::ORACLE };
+    compare(&got, &oracle_samples(&truth), &cliff, bound).expect("the same pixels");
 }
