@@ -105,8 +105,8 @@ fn back(i: u32, footprint: Footprint) {
     // The derivative by the covariance is -(a u + b v)² / 2 as a matrix, summed: here times axes.
     var by_u = -(found[3] * along_a + found[4] * along_b);
     var by_v = -(found[4] * along_a + found[5] * along_b);
-    // The opacity goes with √(det less blurred / det): by the covariance that is half the difference
-    // of the inverses, that of the blurs · inverse less blurred · inverse / 2.
+    // The opacity goes with √(det less blurred / det): by the covariance that is half the
+    // difference of the inverses, that of the blurs · inverse less blurred · inverse / 2.
     var by_opacity = -found[0] / footprint.opacity;
     var by_size = 0.0;
     if views[which].antialiased != 0u || square < 1.0 {
