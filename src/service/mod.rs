@@ -48,9 +48,9 @@ pub use self::{
     },
     times::ViewTimes,
     types::{
-        Created, Export, ExportBody, ExportPlace, InstanceBox, KnownWord, Label, ModelInfo,
-        ModelsInfo, Page, Peak, Picked, QueryAnswer, Readiness, RenderedView, TextResult, TextView,
-        TextWarning, Trust,
+        CallerLimits, Created, Export, ExportBody, ExportPlace, InstanceBox, KnownWord, Label,
+        ModelInfo, ModelsInfo, Page, Peak, Picked, QueryAnswer, Readiness, RenderedView,
+        TextResult, TextView, TextWarning, Trust,
     },
 };
 pub use crate::formats::{rle::Rle, table::ExportFormat};
@@ -351,7 +351,8 @@ impl Service {
 
     /// What makes and renders the scenes.
     pub fn models(&self) -> ModelsInfo {
-        let mut models = self.inner.models.clone();
+        let mut models =
+            ModelsInfo { limits: (&*self.limits()).into(), ..self.inner.models.clone() };
         match self.inner.jobs.networks() {
             NetworkState::Open("") => {}
             NetworkState::Open(provider) => provider.clone_into(&mut models.execution_provider),
