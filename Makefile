@@ -6,7 +6,8 @@
 #               program that is built already)
 # make page    the page in a headless Chromium, with a real server (SEGSPLAT_BIN as above)
 # make page-long   a scene of 4,000,000 Gaussians in the page: bytes, times and memory
-# make unread   memory, threads and views while hundreds of callers read nothing of their answers
+# make unread   memory, threads and views while hundreds of callers read nothing of their answers; the
+#               share of views of two callers beside three hundred of another key
 # make proto   buf: rules of the calls, and whether they break clients of the commit before
 # make judge   other programs read what this one writes, and what is in docker
 # make image   builds the container images and proves what docs/operations.md says of them
