@@ -1241,6 +1241,32 @@ pub struct ModelsResponse {
     /// Version of this server.
     #[prost(string, tag = "7")]
     pub server_version: ::prost::alloc::string::String,
+    /// What a caller may send and ask for.
+    #[prost(message, optional, tag = "8")]
+    pub limits: ::core::option::Option<CallerLimits>,
+}
+/// The limits in force that a caller must know before a call: what to choose of many photos, how
+/// small to make large ones, how many cameras to ask for at once.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct CallerLimits {
+    /// Photos of a scene.
+    #[prost(uint64, tag = "1")]
+    pub photos_max: u64,
+    /// Bytes of an upload.
+    #[prost(uint64, tag = "2")]
+    pub upload_bytes_max: u64,
+    /// Pixels of a photo as it is sent.
+    #[prost(uint64, tag = "3")]
+    pub photo_pixels_max: u64,
+    /// Longer side of a photo as the server keeps it, pixels.
+    #[prost(uint32, tag = "4")]
+    pub photo_side_kept_max: u32,
+    /// Pixels of all photos of a scene as the server keeps them.
+    #[prost(uint64, tag = "5")]
+    pub photos_pixels_kept_max: u64,
+    /// Cameras of one call for views.
+    #[prost(uint64, tag = "6")]
+    pub cameras_max: u64,
 }
 /// One network.
 #[derive(Clone, PartialEq, ::prost::Message)]

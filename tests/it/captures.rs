@@ -12,7 +12,8 @@ use segsplat_testing::captures::{self, zipped};
 use crate::common::{
     client,
     cpu_server::{CpuServer, upload},
-    doors::{Ask, Fault, Options, bytes, form, grpc, http, json},
+    doors::{self, Ask, Fault, Options, bytes, form, grpc, http, json},
+    root,
 };
 
 /// The sample as COLMAP writes it, with a photo that has no camera.
@@ -57,6 +58,48 @@ async fn a_capture_is_recognised_at_every_door() {
         pictures.push(door.view(&scene.0, &Ask::first()).await.unwrap());
     }
     assert!(pictures.iter().all(|picture| *picture == pictures[0]), "the same scene");
+}
+
+/// README's lines that find the cameras of photos alone.
+fn lines_of_the_readme() -> Vec<String> {
+    let readme = std::fs::read_to_string(root().join("README.md")).unwrap();
+    let lines: Vec<_> =
+        readme.lines().filter(|line| line.starts_with("pycolmap.")).map(str::to_owned).collect();
+    assert_eq!(lines.len(), 3, "{lines:?}");
+    lines
+}
+
+#[tokio::test]
+async fn photos_alone_are_told_at_every_door_what_finds_their_cameras() {
+    let stand = CpuServer::start().await;
+    let photos = upload().photos;
+    let archive = Some(zipped(&photos, "photos/"));
+    let both = [Upload { photos, ..Upload::default() }, Upload { archive, ..Upload::default() }];
+    for upload in &both {
+        for door in doors::both(stand.addr).await {
+            let fault = door.create(upload, &Options::wait()).await.expect_err("no cameras");
+            assert_eq!(fault.code, "invalid_request");
+            for line in lines_of_the_readme() {
+                assert!(fault.message.contains(&line), "{door:?}: {}", fault.message);
+            }
+        }
+    }
+}
+
+#[test]
+fn the_page_the_client_and_the_documents_have_the_same_lines() {
+    let files = [
+        "web/capture.js",
+        "clients/python/src/segsplat/calls.py",
+        "packaging/wheel/README.md",
+        "docs/captures.md",
+    ];
+    for file in files {
+        let text = std::fs::read_to_string(root().join(file)).unwrap();
+        for line in lines_of_the_readme() {
+            assert!(text.contains(&line), "{file} lacks {line}");
+        }
+    }
 }
 
 #[tokio::test]

@@ -7,6 +7,7 @@
 //! target as they are.
 
 pub mod labels;
+pub mod pca;
 pub mod tally;
 mod views;
 
@@ -59,7 +60,8 @@ pub(crate) struct Args {
     /// `--method tau=20`, `--method 'canon=["object"]'`; docs/method.md has all
     #[arg(long, value_name = "NAME=VALUE")]
     method: Vec<String>,
-    /// Folder for picture grids, one a scene
+    /// Folder for picture grids, one a scene: photo, view, E and F of the view by their principal
+    /// components, labels, what the texts select
     #[arg(long, value_name = "DIR")]
     pictures: Option<PathBuf>,
 }
@@ -212,8 +214,8 @@ fn judge(
     Ok((row, tallies))
 }
 
-/// One target's pictures: photo, view, labels, then for each preset the best selecting text of
-/// the scene and of the flat baseline.
+/// One target's pictures: photo, view, E and F of the view, labels, then for each preset the best
+/// selecting text of the scene and of the flat baseline.
 fn shown(
     scene: &LabelledScene,
     frame: &LabelledFrame,
@@ -243,7 +245,8 @@ fn shown(
         tinted(&|p| tally::best_selected(classes, p))
     });
     let mut all = vec![grid::photo(photo)];
-    let drawn = [seen.color.clone(), labelled].into_iter().chain(best);
+    let [weights, features] = [seen.banks[0].weights_shown(), seen.banks[0].features_shown()];
+    let drawn = [seen.color.clone(), weights, features, labelled].into_iter().chain(best);
     all.extend(drawn.map(|picture| grid::color(&picture, photo.width)));
     let height = (photo.height * PICTURE_WIDTH / photo.width.max(1)).max(1);
     all.iter().map(|p| image::imageops::thumbnail(p, PICTURE_WIDTH, height)).collect()

@@ -6,7 +6,7 @@ use std::sync::{Arc, atomic::AtomicBool};
 use segsplat_vision::semantics::{Cutter, Scorer, Scoring};
 use serde_json::{Value, json};
 
-use super::tally::TextMap;
+use super::{pca, tally::TextMap};
 use crate::{
     error::{Error, Result},
     models::ImageText,
@@ -150,6 +150,38 @@ impl<'a> Tools<'a> {
 }
 
 impl BankView {
+    /// E, the weights of each pixel over the bank, as colours.
+    pub(super) fn weights_shown(&self) -> Vec<[f32; 3]> {
+        pca::colours(self.weights.pixels(), |pixel| {
+            let mut row = vec![0.0; self.bank.len()];
+            for (m, weight) in self.entries(pixel) {
+                row[m] = weight;
+            }
+            (self.weights.coverage(pixel) > 0.0).then_some(row)
+        })
+    }
+
+    /// F, the feature of each pixel at length 1, as colours.
+    pub(super) fn features_shown(&self) -> Vec<[f32; 3]> {
+        pca::colours(self.weights.pixels(), |pixel| {
+            let mut row = vec![0.0_f32; self.bank.dim];
+            for (m, weight) in self.entries(pixel) {
+                row.iter_mut().zip(self.bank.row(m)).for_each(|(sum, v)| *sum += weight * v);
+            }
+            let length = row.iter().map(|v| v * v).sum::<f32>().sqrt();
+            (length > 0.0).then(|| row.into_iter().map(|v| v / length).collect())
+        })
+    }
+
+    /// Rows of the bank that a pixel shows, with their weights.
+    fn entries(&self, pixel: usize) -> impl Iterator<Item = (usize, f32)> {
+        let row = |(entry, weight): (u16, f32)| {
+            let m = usize::from(entry).checked_sub(1).filter(|m| *m < self.bank.len())?;
+            Some((m, weight))
+        };
+        self.weights.pixel(pixel).filter_map(row)
+    }
+
     /// The product's masks, and scores by which texts can be compared at a pixel.
     ///
     /// At one pixel all texts share the feature's length, so the smallest `E . B(q - c)` over the

@@ -10,12 +10,12 @@ use crate::{
         ScoringMethod, SemanticsReport, StageTime, Warning,
     },
     service::{
-        BackgroundSpec, Boxes, CameraSpec, Density, Event, ExportFormat, FeatureKind, FeaturesSpec,
-        Format, InstanceBox, KnownWord, Label, LensSpec, MaskFormat, MaskLevel, Method, ModelInfo,
-        ModelsInfo, Peak, PickSpec, Picked, PictureKind, PictureOptions, PoseSpec, Preset, Quality,
-        QueryAnswer, QuerySpec, RenderedView, SceneCamera, SceneError, SceneOptions, SceneState,
-        SceneStatus, ScoringOptions, SemanticsMode, SemanticsState, SemanticsStatus, TextOptions,
-        TextResult, TextView, TextWarning, Trust, ViewOptions,
+        BackgroundSpec, Boxes, CallerLimits, CameraSpec, Density, Event, ExportFormat, FeatureKind,
+        FeaturesSpec, Format, InstanceBox, KnownWord, Label, LensSpec, MaskFormat, MaskLevel,
+        Method, ModelInfo, ModelsInfo, Peak, PickSpec, Picked, PictureKind, PictureOptions,
+        PoseSpec, Preset, Quality, QueryAnswer, QuerySpec, RenderedView, SceneCamera, SceneError,
+        SceneOptions, SceneState, SceneStatus, ScoringOptions, SemanticsMode, SemanticsState,
+        SemanticsStatus, TextOptions, TextResult, TextView, TextWarning, Trust, ViewOptions,
     },
 };
 
@@ -425,8 +425,17 @@ pub(super) fn models(info: ModelsInfo) -> pb::ModelsResponse {
             trust: pb::Trust::from(known.trust).into(),
         )
     };
+    let limits = |limits: CallerLimits| {
+        message!(CallerLimits from limits
+            { photo_pixels_max, photo_side_kept_max, photos_pixels_kept_max }
+            photos_max: limits.photos_max as u64,
+            upload_bytes_max: limits.upload_bytes_max as u64,
+            cameras_max: limits.cameras_max as u64,
+        )
+    };
     message!(ModelsResponse from info
         { bundle, bundle_sha256, execution_provider, renderer, server_version }
+        limits: Some(limits(info.limits)),
         models: info.models.into_iter().map(model).collect(),
         words: info.words.into_iter().map(word).collect(),
     )

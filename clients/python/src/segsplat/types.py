@@ -490,6 +490,24 @@ class Network:
 
 
 @dataclass(frozen=True)
+class CallerLimits:
+    """What a caller may send and ask for."""
+
+    #: Photos of a scene.
+    photos_max: int
+    #: Bytes of an upload.
+    upload_bytes_max: int
+    #: Pixels of a photo as it is sent.
+    photo_pixels_max: int
+    #: Longer side of a photo as the server keeps it, pixels.
+    photo_side_kept_max: int
+    #: Pixels of all photos of a scene as the server keeps them.
+    photos_pixels_kept_max: int
+    #: Cameras of one call for views.
+    cameras_max: int
+
+
+@dataclass(frozen=True)
 class Models:
     """What makes the scenes."""
 
@@ -502,6 +520,8 @@ class Models:
     words: tuple[KnownWord, ...] = ()
     #: Networks of the bundle.
     models: tuple[Network, ...] = ()
+    #: What a caller may send and ask for; None of a server that does not say.
+    limits: CallerLimits | None = None
 
 
 @dataclass(frozen=True, eq=False)

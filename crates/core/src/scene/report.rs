@@ -35,6 +35,8 @@ pub enum WarningCode {
     SamePicture,
     /// The capture holds cameras of several kinds or places; the message says which were taken.
     CamerasChosen,
+    /// The lens of a photo leaves little of it: its distortion cannot be that of a camera.
+    LensLeavesLittle,
 }
 
 crate::names::display_names!(WarningCode);

@@ -85,10 +85,11 @@ pub fn find<'a>(upload: &'a Upload, limits: &'a Limits) -> Result<FoundPhotos<'a
         }
         (None, Some(cameras)) => of_form(cameras, &upload.photos, limits),
         (None, None) if upload.photos.iter().all(|file| names::is_photo(&file.name)) => {
-            Err(Error::invalid(
+            Err(Error::invalid(format!(
                 "upload: no camera description; send a part named transforms or cameras, the \
-                 camera files of a capture, or an archive with them",
-            ))
+                 camera files of a capture, or an archive with them; {}",
+                layouts::FIND_CAMERAS
+            )))
         }
         (None, None) => {
             let mut folder = Folder::of_form(&upload.photos, false, limits)?;

@@ -126,7 +126,7 @@ fn extremes() -> Gaussians {
             _ => random.range(0.02, 0.6),
         };
         let color = [(); 3].map(|()| random.range(-3.0, 3.0));
-        push(&mut raw, mean, random.quat(), scale, opacity * 0.5 + 0.002, &[color]);
+        push(&mut raw, mean, random.quat(), scale, opacity, &[color]);
     }
     checked(raw)
 }

@@ -18,11 +18,14 @@ use crate::{
     formats::captures::{FoundPhoto, FoundPhotos, LensAtSize, find, find_in_dir},
     limits::Limits,
     photo_label as label,
-    scene::{Camera, Photo, PosedPhoto, Warning, unless_cancelled},
+    scene::{Camera, Photo, PosedPhoto, Warning, WarningCode, unless_cancelled},
 };
 
 /// Photos of the largest size that are decoded at the same time, some 7 bytes a pixel each.
 const DECODED_TOGETHER: u64 = 2;
+
+/// Share of its pixels that a photo keeps when the distortion of a real lens is removed, 0 to 1.
+const LENS_LEAVES_MIN: f64 = 0.5;
 
 /// The photos of an upload with their cameras.
 #[derive(Clone, Debug)]
@@ -104,19 +107,23 @@ impl<'f, 'a> Undecoded<'f, 'a> {
         self.headers.iter().map(|(_, header, _)| header.size()).collect()
     }
 
-    /// A photo, reduced and without the distortion of its lens.
-    fn read(&self, i: usize, limits: &Limits) -> Result<PosedPhoto> {
+    /// A photo, reduced and without the distortion of its lens, and the share of its pixels that
+    /// the lens left, 0 to 1.
+    fn read(&self, i: usize, limits: &Limits) -> Result<(PosedPhoto, f64)> {
         let (found, (label, header, lens)) = (&self.found[i], &self.headers[i]);
         let photo = decode::pixels(&found.bytes, header, label, limits)?;
         // The lens after the size: its terms are of rays, not of pixels.
         let (photo, intrinsics) = decode::at_most(photo, lens.intrinsics, self.side_max);
+        let before = valid_pixels(&photo).max(1);
         let photo = undistort::undistort(photo, lens, intrinsics);
-        Ok(PosedPhoto {
+        let left = valid_pixels(&photo) as f64 / before as f64;
+        let photo = PosedPhoto {
             file: found.name.clone(),
             photo,
             camera: Camera { intrinsics, camera_to_world: found.pose },
             intrinsics_made_for: lens.made_for,
-        })
+        };
+        Ok((photo, left))
     }
 
     /// Whether [`Self::read`] gives the pixels of the file as they are.
@@ -164,7 +171,7 @@ pub fn each(
             let camera = Camera { intrinsics: photos.headers[i].2.intrinsics, camera_to_world };
             see(SentPhoto { file, camera, pixels: SentPixels::File(&photo.bytes) })?;
         } else {
-            let PosedPhoto { photo, camera, .. } = photos.read(i, limits)?;
+            let (PosedPhoto { photo, camera, .. }, _) = photos.read(i, limits)?;
             see(SentPhoto { file, camera, pixels: SentPixels::Made(photo) })?;
         }
     }
@@ -179,13 +186,41 @@ fn decoded(found: &FoundPhotos<'_>, limits: &Limits, cancel: &AtomicBool) -> Res
         undecoded.read(i, limits)
     };
     let mut photos = Vec::with_capacity(found.photos.len());
+    let mut left = Vec::with_capacity(found.photos.len());
     for together in decoded_together(&undecoded.sizes(), limits.photo_pixels_max) {
-        let some: Vec<Result<PosedPhoto>> = together.into_par_iter().map(read).collect();
+        let some: Vec<Result<(PosedPhoto, f64)>> = together.into_par_iter().map(read).collect();
         for photo in some {
-            photos.push(photo?);
+            let (photo, share) = photo?;
+            photos.push(photo);
+            left.push(share);
         }
     }
-    Ok(ReadPhotos { photos, warnings: found.warnings.clone() })
+    let warnings = found.warnings.iter().cloned().chain(little_left(&photos, &left)).collect();
+    Ok(ReadPhotos { photos, warnings })
+}
+
+fn valid_pixels(photo: &Photo) -> usize {
+    match &photo.valid {
+        Some(valid) => valid.iter().filter(|valid| **valid).count(),
+        None => photo.rgb.len() / 3,
+    }
+}
+
+/// The warning of photos of which their lens leaves less than [`LENS_LEAVES_MIN`].
+fn little_left(photos: &[PosedPhoto], left: &[f64]) -> Option<Warning> {
+    let little = || (0..left.len()).filter(|&i| left[i] < LENS_LEAVES_MIN);
+    let worst = little().min_by(|&a, &b| left[a].total_cmp(&left[b]))?;
+    let (percent, least) = (left[worst] * 100.0, LENS_LEAVES_MIN * 100.0);
+    let others = match little().count() - 1 {
+        0 => String::new(),
+        n => format!(", of {n} more photos also less than {least} %"),
+    };
+    let message = format!(
+        "{}: the distortion of its lens leaves {percent:.0} % of the pixels{others}; check k1 to \
+         k6, p1 and p2",
+        label(worst, &photos[worst].file)
+    );
+    Some(Warning { code: WarningCode::LensLeavesLittle, message, value: left[worst] })
 }
 
 /// Longer side at which the photos of a scene are kept, so that all of them fit the limits.

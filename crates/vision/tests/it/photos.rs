@@ -10,7 +10,7 @@ use image::{DynamicImage, ImageBuffer, ImageFormat, Rgb, RgbImage};
 use segsplat_core::{
     error::ErrorCode,
     limits::Limits,
-    scene::{PosedPhoto, Upload, UploadCameras, UploadFile},
+    scene::{PosedPhoto, Upload, UploadCameras, UploadFile, WarningCode},
 };
 use segsplat_vision::{
     photos,
@@ -661,6 +661,26 @@ fn the_fold_of_a_strong_lens_makes_no_pixels() {
         let (x, y) = ((i % 120) as f64 - 59.5, (i / 120) as f64 - 44.5);
         let off = x.hypot(y) / 100.0 - 1.0 / 2.7_f64.sqrt();
         assert!(off.abs() < 2e-3 || valid == (off < 0.0), "pixel {i}, {off} from the fold");
+    }
+}
+
+#[test]
+fn a_lens_that_leaves_little_of_a_photo_is_said_to() {
+    for (k1, left) in [(50.0, Some(0.15)), (-50.0, Some(0.02)), (0.15, None), (-0.12, None)] {
+        let mut told = transforms();
+        let frame = &mut told["frames"][1];
+        frame["k1"] = json!(k1);
+        let upload = with_transforms(&told, sent().1);
+        let read = photos::read_until(&upload, &Limits::default(), &AtomicBool::new(false));
+        let warnings = read.unwrap().warnings;
+        let Some(left) = left else {
+            assert!(warnings.is_empty(), "{k1}: {warnings:?}");
+            continue;
+        };
+        let [warning] = &warnings[..] else { panic!("{k1}: {warnings:?}") };
+        assert_eq!(warning.code, WarningCode::LensLeavesLittle);
+        assert!(warning.message.starts_with("photo 1 ("), "{k1}: {}", warning.message);
+        assert!((warning.value - left).abs() < 0.02, "{k1}: {}", warning.value);
     }
 }
 

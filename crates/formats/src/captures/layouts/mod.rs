@@ -69,6 +69,13 @@ pub(super) fn find(folder: &Folder<'_>) -> Vec<Seen> {
     all
 }
 
+/// What finds the cameras of photos alone; README and docs/captures.md have the same lines.
+pub(super) const FIND_CAMERAS: &str = r#"photos alone: these lines find cameras (pip install pycolmap):
+pycolmap.extract_features("photos/database.db", "photos/images")
+pycolmap.match_exhaustive("photos/database.db")
+pycolmap.incremental_mapping("photos/database.db", "photos/images", "photos/sparse")
+Then send the folder "photos". docs/captures.md says more"#;
+
 /// The message where no cameras were found.
 pub(super) fn none(folder: &Folder<'_>) -> String {
     let known = LAYOUTS.map(|(layout, _)| layout.name()).join(", ");
@@ -81,8 +88,7 @@ pub(super) fn none(folder: &Folder<'_>) -> String {
     });
     format!(
         "{}: no transforms.json and no cameras.json in it, nor another layout with cameras; {} \
-         files were looked at, and these layouts are known: {known}{not_read}. Where there are \
-         photos alone, docs/captures.md has the three lines of pycolmap that find their cameras",
+         files were looked at, and these layouts are known: {known}{not_read}; {FIND_CAMERAS}",
         folder.what,
         folder.paths().count()
     )
