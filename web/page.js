@@ -578,7 +578,7 @@ async function find(text) {
     where = `${count(result.gaussians)} Gaussians in ${n} part${n === 1 ? '' : 's'}`;
   say(
     [
-      `${text}: ${result.gaussians ? where : `not found, the best score is ${score.toFixed(2)}`}`,
+      `${text}: ${result.found ? where : `not found, the best score is ${score.toFixed(2)}`}`,
       ...doubtsOf(text, known),
       ...result.warnings.map((warning) => warning.message),
     ].join('\n'),

@@ -313,6 +313,9 @@ pub struct Scoring {
     /// An entry that fits a text by so much less than the best one (cosine, 0..2) is not selected.
     #[prost(double, optional, tag = "6")]
     pub near_best: ::core::option::Option<f64>,
+    /// Difference of cosines to the canonical texts at which the relevancy is 0.5.
+    #[prost(double, optional, tag = "7")]
+    pub margin: ::core::option::Option<f64>,
 }
 /// Texts asked of a scene.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -391,6 +394,9 @@ pub struct TextResult {
     /// What it found in the view.
     #[prost(message, optional, tag = "7")]
     pub view: ::core::option::Option<TextView>,
+    /// Whether the scene has what the text names: some Gaussian is selected.
+    #[prost(bool, tag = "8")]
+    pub found: bool,
 }
 /// A connected part of a selection and its box, world frame of the upload.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -660,6 +666,9 @@ pub struct Method {
     /// Whether a view that magnifies the photos blurs the Gaussians as the network learnt them.
     #[prost(bool, optional, tag = "18")]
     pub magnify: ::core::option::Option<bool>,
+    /// Whether the embedding of a mask is also that of its place in the whole photo.
+    #[prost(bool, optional, tag = "19")]
+    pub context: ::core::option::Option<bool>,
 }
 /// One message of the upload.
 #[derive(Clone, PartialEq, ::prost::Message)]

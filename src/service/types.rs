@@ -69,6 +69,8 @@ pub struct TextResult {
     pub scores: Vec<f32>,
     /// Entries selected: those whose relevancy is at the cut or over it.
     pub entries: Vec<u16>,
+    /// Whether the scene has what the text names: some Gaussian is selected.
+    pub found: bool,
     /// Gaussians selected.
     pub gaussians: u64,
     /// Connected parts of the selection, the largest first.

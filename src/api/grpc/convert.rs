@@ -215,7 +215,8 @@ macro_rules! method_fields {
     ($same:ident) => {
         $same! {
             prune, fuse_layers, backdrop, skip_covered, seeds, full_resolution, mask_filters,
-            crop_whole, crop_margin, lambda, bank_rows, votes, merge_cosine, front_photos, magnify
+            crop_whole, crop_margin, context, lambda, bank_rows, votes, merge_cosine, front_photos,
+            magnify
         }
     };
 }
@@ -256,9 +257,9 @@ pub(super) fn scene_options(header: &pb::CreateSceneHeader) -> Result<SceneOptio
 
 /// Changes of how texts are scored.
 fn scoring(scoring: Option<pb::Scoring>) -> ScoringOptions {
-    let pb::Scoring { canon, tau, cut, unit_rows, coverage_floor, near_best } =
+    let pb::Scoring { canon, tau, cut, unit_rows, coverage_floor, near_best, margin } =
         scoring.unwrap_or_default();
-    ScoringOptions { canon, tau, cut, unit_rows, coverage_floor, near_best }
+    ScoringOptions { canon, tau, cut, unit_rows, coverage_floor, near_best, margin }
 }
 
 fn scored(method: ScoringMethod) -> pb::Scoring {
@@ -269,6 +270,7 @@ fn scored(method: ScoringMethod) -> pb::Scoring {
         unit_rows: Some(method.unit_rows),
         coverage_floor: Some(method.coverage_floor),
         near_best: Some(method.near_best),
+        margin: Some(method.margin),
     }
 }
 
@@ -351,7 +353,7 @@ pub(super) fn answer(answer: QueryAnswer) -> pb::QueryResponse {
 
 fn result(found: TextResult) -> pb::TextResult {
     let warning = |TextWarning { code, message }: TextWarning| pb::TextWarning { code, message };
-    message!(TextResult from found { text, scores, gaussians }
+    message!(TextResult from found { text, scores, found, gaussians }
         entries: found.entries.into_iter().map(u32::from).collect(),
         parts: found.parts.into_iter().map(part).collect(),
         warnings: found.warnings.into_iter().map(warning).collect(),

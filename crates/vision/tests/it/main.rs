@@ -17,6 +17,7 @@ mod capture;
 mod captures;
 mod check;
 mod colours;
+mod context;
 mod crops;
 mod fit;
 mod frame;

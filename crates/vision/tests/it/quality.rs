@@ -294,3 +294,23 @@ fn the_towers_name_what_is_drawn() {
         words.len()
     );
 }
+
+#[test]
+fn words_that_are_cut_into_letters_are_not_known() {
+    let Some(runtime) = runtime() else { return };
+    let towers = ImageText::open(&runtime, &bundle(), &network_options()).unwrap().unwrap();
+    let unknown = |text: &str| {
+        let text = towers.embed_texts(&[text.to_owned()]).unwrap().remove(0);
+        [text.unknown, text.tokens]
+    };
+    for nonsense in ["zxqv", "QZKWJX", "vbnhtr xkcd"] {
+        let [unknown, tokens] = unknown(nonsense);
+        assert!(unknown == tokens && tokens > 1, "{nonsense}: {unknown} of {tokens}");
+    }
+    let [some, all] = unknown("red zxqv");
+    assert!(some > 1 && some < all, "{some} of {all}");
+    for word in ["chair", "a photo of a blowtorch", "toy duck", "Game controller", "tv", "monstera"]
+    {
+        assert_eq!(unknown(word)[0], 0, "{word}");
+    }
+}
