@@ -249,7 +249,7 @@ impl ImageText {
         let resized = resize(&photo.rgb, from, placed, tower.resize);
         let pixels = planes(&resized, placed, placed, tower.mean, tower.std);
         // A file or a device that fixes the number of pictures gets the same one in each place.
-        let count = size(self.image.takes(), &tower.input, 0).unwrap_or(1);
+        let count = size(self.image.signature(), &tower.input, 0).unwrap_or(1);
         let input =
             Input::new(&tower.input, &[count, 3, placed[1], placed[0]], pixels.repeat(count));
         let [columns, rows] = placed.map(|side| side / dense.cell as usize);
