@@ -1,9 +1,10 @@
-"""Writes crates/render/tests/it/adam.csv: what PyTorch's Adam makes of a few Gaussians and of an exposure.
+"""Writes crates/render/tests/it/adam.csv: PyTorch's Adam on a few Gaussians and an exposure.
 
     python tests/tools/adam_vectors.py
 
-Needs torch (CPU). crates/render/tests/it/adam.rs takes the same steps and compares. In f64, with autograd through the
-logarithms of scales and the logits of opacities; each Gaussian has an optimizer of its own, which steps when it is seen.
+Needs torch (CPU). crates/render/tests/it/adam.rs takes the same steps and compares. In f64, with
+autograd through the logarithms of scales and the logits of opacities; each Gaussian has an
+optimizer of its own, which steps when it is seen.
 """
 
 import csv
@@ -12,8 +13,11 @@ from pathlib import Path
 import torch
 
 STEPS, GAUSSIANS, SH = 24, 3, 4
-RATES = {"means": 1e-2, "quats": 2e-3, "scales": 5e-3, "opacities": 5e-2, "sh": 2.5e-3, "sh_rest": 1.25e-4}
-# Sizes of the gradients of each number: from those whose squares are no f32 to those whose squares are large.
+RATES = {
+    "means": 1e-2, "quats": 2e-3, "scales": 5e-3,
+    "opacities": 5e-2, "sh": 2.5e-3, "sh_rest": 1.25e-4,
+}
+# Sizes of the gradients of each number: squares of some are no f32, those of others are large.
 SIZES = [1.0, 1e-3, 1e6] + [1e-2] * 4 + [10.0, 1e-8, 1e-14] + [1e-4]
 SIZES += [1.0, 1e-10, 1e15, 1e-12, 1e-14, 1e-15, 1e-16, 1e-18, 1e-20, 1e-25, 1e-30, 1e10]
 OUT = Path(__file__).parents[2] / "crates/render/tests/it/adam.csv"
@@ -50,7 +54,8 @@ def gaussians() -> list[list[float]]:
         sh = torch.zeros(3, dtype=f64, requires_grad=True)
         sh_rest = torch.zeros(3 * (SH - 1), dtype=f64, requires_grad=True)
         numbers = [means, quats, scales, opacity, sh, sh_rest]
-        groups = [{"params": [p], "lr": rate} for p, rate in zip(numbers, RATES.values(), strict=True)]
+        pairs = zip(numbers, RATES.values(), strict=True)
+        groups = [{"params": [p], "lr": rate} for p, rate in pairs]
         states.append((numbers, torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)))
     random = Random(7)
     for step in range(STEPS):
@@ -73,11 +78,12 @@ def gaussians() -> list[list[float]]:
 
 def exposure() -> list[float]:
     """Gains, then biases, of a photo that is darker than what is drawn."""
-    random = Random(8)
-    color = torch.tensor([[0.5 + 0.5 * random.unit() for _ in range(3)] for _ in range(8)], dtype=torch.float64)
-    photo = torch.tensor([[8 * at + c for c in range(3)] for at in range(8)], dtype=torch.float64) / 255
-    gain = torch.ones(3, dtype=torch.float64, requires_grad=True)
-    bias = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    random, f64 = Random(8), torch.float64
+    color = [[0.5 + 0.5 * random.unit() for _ in range(3)] for _ in range(8)]
+    color = torch.tensor(color, dtype=f64)
+    photo = torch.tensor([[8 * at + c for c in range(3)] for at in range(8)], dtype=f64) / 255
+    gain = torch.ones(3, dtype=f64, requires_grad=True)
+    bias = torch.zeros(3, dtype=f64, requires_grad=True)
     optimizer = torch.optim.Adam([gain, bias], lr=5e-3, betas=(0.9, 0.999), eps=1e-15)
     for _ in range(STEPS):
         optimizer.zero_grad()
@@ -89,6 +95,7 @@ def exposure() -> list[float]:
 
 with OUT.open("w", newline="") as file:
     rows = csv.writer(file, lineterminator="\n")
-    file.write("# PyTorch's Adam: each Gaussian's numbers, then an exposure's (tests/tools/adam_vectors.py)\n")
+    file.write("# PyTorch's Adam: each Gaussian's numbers, then an exposure's")
+    file.write(" (tests/tools/adam_vectors.py)\n")
     for row in [*gaussians(), exposure()]:
         rows.writerow([f"{value:.9e}" for value in row])
