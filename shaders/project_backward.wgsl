@@ -59,9 +59,6 @@ fn back(i: u32, footprint: Footprint) {
     let a = vec2(2.0, -2.0 * footprint.conic_shear) * footprint.conic_x;
     let b = 2.0 * footprint.conic_y;
     let by_place = -(a * found[1] + vec2(0.0, b * found[2]));
-    var by_xx = -0.5 * a.x * a.x * found[3];
-    var by_xy = -0.5 * a.x * (a.y * found[3] + b * found[4]);
-    var by_yy = -0.5 * (a.y * a.y * found[3] + 2.0 * a.y * b * found[4] + b * b * found[5]);
 
     let t = camera_point(gaussian.mean);
     let per_z = 1.0 / t.z;
@@ -82,46 +79,45 @@ fn back(i: u32, footprint: Footprint) {
             lost_by_z = -2.0 * BLUR_PX2 * least / views[which].own_focal;
         }
     }
-    let scale = sqrt(gaussian.scale * gaussian.scale + lost);
+    let squares = gaussian.scale * gaussian.scale + lost;
     let rotation = rotation_of(gaussian.quat);
     let turned_x = views[which].rotation_x.xyz * rotation;
     let turned_y = views[which].rotation_y.xyz * rotation;
     let turned_z = views[which].rotation_z.xyz * rotation;
-    // Rows of J W R, then of M.
+    // Rows of J W R: a column is what an axis of the Gaussian is on the picture.
     let sharp_x = (turned_x - turned_z * bounded.x) * focal.x;
     let sharp_y = (turned_y - turned_z * bounded.y) * focal.y;
-    let m_x = sharp_x * scale;
-    let m_y = sharp_y * scale;
-    var opacity = -found[0] / footprint.opacity;
+    // a and b along each axis. a is (row x - shear · row y) of J W R: a difference of what is long
+    // in needles. It is taken apart (Cauchy-Binet), with 1 / (variance of y) = b² / 2.
+    let normal = cross(sharp_x, sharp_y);
+    let beside = cross(squares * sharp_y, normal);
+    let along_a = (a.x * 0.5 * b * b) * (BLUR_PX2 * sharp_x + beside);
+    let along_b = b * sharp_y;
+    // The derivative by the covariance is -(a u + b v)² / 2 as a matrix, summed: here times axes.
+    var by_u = -(found[3] * along_a + found[4] * along_b);
+    var by_v = -(found[4] * along_a + found[5] * along_b);
     if views[which].antialiased != 0u {
-        let xx = dot(m_x, m_x);
-        let xy = dot(m_x, m_y);
-        let yy = dot(m_y, m_y);
-        let normal = cross(m_x, m_y);
-        let sharp_det = dot(normal, normal);
-        let det = sharp_det + BLUR_PX2 * (xx + yy) + BLUR_PX2 * BLUR_PX2;
-        let share = sqrt(sharp_det / det);
-        if sharp_det > 0.0 {
-            let half = 0.5 * opacity * gaussian.opacity;
-            let narrow = half / (sqrt(sharp_det) * sqrt(det));
-            let wide = half * share / det;
-            by_xx += narrow * yy - wide * (yy + BLUR_PX2);
-            by_xy -= (narrow - wide) * xy;
-            by_yy += narrow * xx - wide * (xx + BLUR_PX2);
+        // The opacity goes with √(det sharp / det): by the covariance that is half the difference
+        // of the inverses, blur · inverse sharp · inverse / 2, of axes of at most 1.
+        let largest = max(max(squares.x, squares.y), squares.z);
+        let unit = squares / largest;
+        let areas = unit.yzx * unit.zxy * normal * normal;
+        let by_share = -0.5 * BLUR_PX2 * found[0] / (largest * (areas.x + areas.y + areas.z));
+        if is_finite(by_share) {
+            let skewed = sharp_y + footprint.conic_shear * sharp_x;
+            by_u += (by_share * a.x) * cross(unit * skewed, normal);
+            by_v += (by_share * b) * cross(normal, unit * sharp_x);
         }
-        opacity *= share;
     }
-    let by_m_x = 2.0 * (by_xx * m_x + by_xy * m_y);
-    let by_m_y = 2.0 * (by_xy * m_x + by_yy * m_y);
-    let by_scale = by_m_x * sharp_x + by_m_y * sharp_y;
-    let by_sharp_x = by_m_x * scale;
-    let by_sharp_y = by_m_y * scale;
-    // J W R: its rows are rows of W R times the focal length over z, less the slope's share.
+    let by_square = 0.5 * (along_a * by_u + along_b * by_v);
+    let by_sharp_x = a.x * squares * by_u;
+    let by_sharp_y = squares * (a.y * by_u + b * by_v);
+    // By two axes each: 1 and 2, 2 and 0, 0 and 1.
+    let mixed = along_a.yzx * by_u.zxy + along_b.yzx * by_v.zxy;
     let by_x = by_sharp_x * focal.x;
     let by_y = by_sharp_y * focal.y;
-    let by_z = -(by_x * bounded.x + by_y * bounded.y);
     let by_slope = vec2(-dot(by_x, turned_z), -dot(by_y, turned_z));
-    let by_lost = dot(by_scale, 0.5 / scale);
+    let by_lost = by_square.x + by_square.y + by_square.z;
     let free = select(vec2(0.0), by_slope * per_z, bounded == slope);
     let by_t = by_place * focal + free;
     let by_depth = found[9] + by_lost * lost_by_z - dot(by_t, slope)
@@ -129,30 +125,19 @@ fn back(i: u32, footprint: Footprint) {
     let by_mean = by_t.x * views[which].rotation_x.xyz + by_t.y * views[which].rotation_y.xyz
         + by_depth * views[which].rotation_z.xyz + by_lost * lost_by_mean;
 
-    // By R, as columns, then by the quaternion: sums and differences of the two numbers beside the
-    // diagonal.
-    let r_x = views[which].rotation_x.xyz;
-    let r_y = views[which].rotation_y.xyz;
-    let r_z = views[which].rotation_z.xyz;
-    let c0 = r_x * by_x.x + r_y * by_y.x + r_z * by_z.x;
-    let c1 = r_x * by_x.y + r_y * by_y.y + r_z * by_z.y;
-    let c2 = r_x * by_x.z + r_y * by_y.z + r_z * by_z.z;
-    let both = vec3(c1.z + c2.y, c2.x + c0.z, c0.y + c1.x);
-    let apart = vec3(c1.z - c2.y, c2.x - c0.z, c0.y - c1.x);
-    let unit = gaussian.quat;
-    let v = unit.yzw;
-    let by_vector = unit.x * apart - 2.0 * v * vec3(c1.y + c2.z, c0.x + c2.z, c0.x + c1.y)
-        + v.yzx * both.zxy + v.zxy * both.yzx;
-    let by_unit = vec4(dot(v, apart), by_vector);
-    let by_quat = 2.0 * (by_unit - unit * dot(by_unit, unit));
-    let by_own = by_scale * gaussian.scale / scale;
+    // A turn about one axis moves variance between the other two: nothing where they are equal.
+    let scale = gaussian.scale;
+    let by_turn = mixed * ((scale.yzx - scale.zxy) * (scale.yzx + scale.zxy));
+    let v = gaussian.quat.yzw;
+    let by_quat = 2.0 * vec4(-dot(v, by_turn), gaussian.quat.x * by_turn + cross(v, by_turn));
+    let by_own = 2.0 * scale * by_square;
 
     let to = i * GRADIENT_WORDS;
     for (var k = 0u; k < 3u; k++) {
         put(to + k, by_mean[k]);
         put(to + 8u + k, by_own[k]);
     }
-    put(to + 3u, opacity);
+    put(to + 3u, -found[0] / gaussian.opacity);
     for (var k = 0u; k < 4u; k++) {
         put(to + 4u + k, by_quat[k]);
     }

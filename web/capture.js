@@ -1,6 +1,6 @@
 // What was dropped: photos and their cameras, what is wrong with each, and what is made smaller,
 // before it is sent.
-const PHOTO = /\.(jpe?g|jfif|png|webp)$/i,
+const PHOTO = /\.(jpe?g|jfif|png|webp|tiff?|bmp)$/i,
   ARCHIVE = /\.(zip|tar)$/i,
   // Files of cameras that the server knows by their paths (docs/captures.md).
   CAMERAS = /(\.(json|txt|bin|npy|traj|pincam)|(^|\/)metadata)$/i,
@@ -14,7 +14,9 @@ const isSplats = (path) =>
     ({ dataset }) => dataset.splats && path.toLowerCase().endsWith('.' + dataset.splats),
   );
 // Photos of formats that are not read.
-const OTHER_PHOTO = /\.(hei[cf]|avif|tiff?|bmp|dng|jxl)$/i;
+const OTHER_PHOTO = /\.(hei[cf]|avif|dng|jxl)$/i;
+// Photos that the server reads and browsers do not.
+const ONLY_SERVER = /\.tiff?$/i;
 const AS_JPEG =
   'export it as JPEG (iPhone: Settings, Camera, Formats, Most Compatible; a Mac: Preview, Export)';
 const NO_CAMERAS =
@@ -121,8 +123,22 @@ async function readCapture(files, at) {
     }
     form.append(path, file, path);
   }
+  for (const [path, file] of masksOf(list, files)) form.append(path, file, path);
   form.append(part, new Blob([JSON.stringify(read)], { type: 'application/json' }), `${part}.json`);
   return capture;
+}
+
+const MASK = /(^|\/)masks?\/.+$/i;
+
+// The masks that cameras name: the server knows whose they are.
+function masksOf(list, files) {
+  const masks = new Map();
+  for (const entry of list) {
+    const name = String(entry.mask_path ?? '').replace(/^(\.\.?\/)+/, ''),
+      found = name && files.find(({ path }) => `/${path}`.endsWith(`/${name}`));
+    if (found) masks.set(name, found.file);
+  }
+  return masks;
 }
 
 // The photos that cameras name, each with its row, and the names of those that are not there.
@@ -162,13 +178,14 @@ async function paired(list, photos, rows) {
     }
     found.push({ path: name.replace(/^(\.\.?\/)+/, ''), file: photo.file, entry, row });
     try {
-      (await createImageBitmap(photo.file)).close();
+      if (!ONLY_SERVER.test(photo.path)) (await createImageBitmap(photo.file)).close();
     } catch {
       row.faults.push('it cannot be read as a picture');
     }
   }
   for (const { path } of photos) {
-    if (!taken.has(path)) rows.push({ name: path, faults: [], note: 'no camera; it is left out' });
+    if (taken.has(path) || MASK.test(path)) continue;
+    rows.push({ name: path, faults: [], note: 'no camera; it is left out' });
   }
   return [found, lost];
 }
@@ -216,7 +233,8 @@ async function fit(photos, mayShrink, notes, at = () => {}) {
 // where it may go as it is.
 async function smaller(file, limits, always, kept) {
   // A photo of fewer bytes a pixel than this is a plain area.
-  if (!always && file.size < limits.photo_pixels_max / 50) return null;
+  const isPlain = file.size < limits.photo_pixels_max / 50;
+  if (ONLY_SERVER.test(file.name) || (!always && isPlain)) return null;
   const [plain, exif] = await asStored(file),
     whole = await createImageBitmap(plain),
     { width, height } = whole,

@@ -1,6 +1,6 @@
-"""The loaders on a small folder of the exact layout, `chunk`: three photos of the generated room, as
-pixelSplat stores them, written by `torch.save`. `python -m pytest benches/published` runs them; what
-compares with torch and scikit-image does so where they are installed. `SEGSPLAT_BIN` names the
+"""The loaders on a small folder of the exact layout, `chunk`: three photos of the generated room,
+as pixelSplat stores them, written by `torch.save`. `python -m pytest benches/published` runs them;
+what compares with torch and scikit-image does so where they are installed. `SEGSPLAT_BIN` names the
 program of the evaluation."""
 
 import json

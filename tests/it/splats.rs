@@ -280,8 +280,8 @@ fn a_glb_is_what_its_specification_asks() {
     assert_eq!(document["nodes"][0]["translation"], node);
 }
 
-/// A far scene keeps its f64 origin in a GLB and its places as f64 in a PLY; SPZ says what it cannot
-/// hold.
+/// A far scene keeps its f64 origin in a GLB and its places as f64 in a PLY; SPZ says what it
+/// cannot hold.
 #[test]
 fn a_far_scene_is_exact_or_refused() {
     let mut raw = cloud(50, 0, 2).into_raw();

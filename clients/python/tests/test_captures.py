@@ -174,3 +174,24 @@ def test_masks_fit_the_photo_that_was_asked(client: Client, tmp_path: Path) -> N
     listed = next(one for one in client.scenes() if one.id == scene.id)
     assert listed.query("box", from_=1).masks.shape == (1, 480, 640)
     scene.delete()
+
+
+def test_masks_are_sent_with_their_photos(tmp_path: Path) -> None:
+    told = capture(tmp_path, 2, "64x48")
+    names = [frame["file_path"] for frame in told["frames"]]
+    stems = [Path(name).stem for name in names]
+    for path in [f"masks/{stems[0]}.png", "alphas/second.png", "depths/second.png"]:
+        (tmp_path / path).parent.mkdir(exist_ok=True)
+        Image.new("L", (64, 48)).save(tmp_path / path)
+    # A photo that lies elsewhere is not taken for its mask.
+    told["frames"][0]["file_path"] = f"/elsewhere/{Path(names[0]).name}"
+    told["frames"][1]["mask_path"] = "./alphas/second.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(told))
+    sent = [part.name for part in calls.parts_of(tmp_path)]
+    # `masks` without a word of it may be labels.
+    assert sent == ["transforms.json", *names, "alphas/second.png"]
+    more = calls.masks_in(tmp_path / "alphas")
+    assert [(part.field, part.name) for part in more] == [("photo", "masks/second.png")]
+    assert calls.masks_in(None) == []
+    with pytest.raises(FileNotFoundError, match="no folder with masks"):
+        calls.masks_in(tmp_path / "none")

@@ -9,7 +9,7 @@ import posixpath
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from uuid import uuid4
@@ -70,10 +70,12 @@ if TYPE_CHECKING:
 
 #: Endings of photos and of files of cameras; files of COLMAP and folders of phones that are not
 #: read.
-PHOTOS = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp"})
+PHOTOS = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", ".bmp"})
 CAMERAS = frozenset({".json", ".txt", ".bin", ".npy", ".traj", ".pincam"})
 #: Photos of formats that are not read, and what to do.
-OTHER_PHOTOS = frozenset({".heic", ".heif", ".avif", ".tif", ".tiff", ".bmp", ".dng", ".jxl"})
+OTHER_PHOTOS = frozenset({".heic", ".heif", ".avif", ".dng", ".jxl"})
+#: Folders of masks.
+MASKS = re.compile(r"masks?(_\d+)?", re.IGNORECASE)
 AS_JPEG = (
     "export it as JPEG (iPhone: Settings, Camera, Formats, Most Compatible; a Mac: Preview, Export)"
 )
@@ -117,6 +119,7 @@ def create(
     source: Source,
     options: SceneOptions,
     idempotency_key: str | None,
+    masks: str | Path | None = None,
 ) -> Flow[Shown]:
     """Uploads photos. A second try never makes a second scene: both carry one key."""
     if not policy.limits:
@@ -125,7 +128,7 @@ def create(
         "POST",
         "/v1/scenes",
         params={name.removesuffix("_"): value for name, value in options.items()},
-        upload=parts_of(source, policy.limits),
+        upload=parts_of(source, policy.limits) + masks_in(masks),
         headers={"idempotency-key": idempotency_key or str(uuid4())},
     )
     answer = yield from send(policy, request)
@@ -173,6 +176,17 @@ def parts_of(source: Source, limits: CallerLimits | None = None) -> list[Part]:
     return [*fit(photos, limits, is_colmap)[0], *cameras_of]
 
 
+def masks_in(folder: str | Path | None) -> list[Part]:
+    """The parts of a folder with masks, each named as its photo."""
+    if folder is None:
+        return []
+    top = Path(folder)
+    files = sorted(file for file in top.rglob("*") if file.suffix.lower() in PHOTOS)
+    if not files:
+        raise FileNotFoundError(f"{top}: no folder with masks of photos")
+    return [Part("photo", f"masks/{file.relative_to(top).as_posix()}", file) for file in files]
+
+
 def _described(folder: Path, field: str, limits: CallerLimits | None) -> list[Part]:
     """The parts of a folder with one file of cameras, and those of its photos that are there."""
     file = folder / f"{field}.json"
@@ -191,6 +205,7 @@ def _described(folder: Path, field: str, limits: CallerLimits | None) -> list[Pa
         if photo
     ]
     photos, sizes = fit([part for _, part in there], limits)
+    photos += _masks_of(folder, entries, {part.name for _, part in there})
     if not sizes or field == "cameras":
         return [Part(field, file.name, file), *photos]
     for entry, part in there:
@@ -208,6 +223,7 @@ def _matched(folder: Path, names: Sequence[str]) -> list[Path | None]:
     wanted = [re.sub(r"^(\.\.?/)+", "", name.replace("\\", "/")) for name in names]
     found: list[Path | None] = [None] * len(names)
     free = {file: file.relative_to(folder).as_posix() for file in files}
+    free = {file: path for file, path in free.items() if not _is_mask(path)} or free
     # Whole paths are settled first for all, so that a shared file name never takes a photo.
     for level in (str, _stem, posixpath.basename, lambda path: _stem(posixpath.basename(path))):
         places = {level(path): file for file, path in free.items()}
@@ -217,6 +233,24 @@ def _matched(folder: Path, names: Sequence[str]) -> list[Path | None]:
                 found[i] = places[key]
                 del free[places[key]]
     return found
+
+
+def _masks_of(folder: Path, entries: Sequence[Mapping[str, Any]], photos: Set[str]) -> list[Part]:
+    """The masks that a description names: the server knows whose they are."""
+    said = (str(entry.get("mask_path") or "") for entry in entries)
+    named = {name.replace("\\", "/") for name in said if name}
+    ends = tuple("/" + re.sub(r"^(\.\.?/)+", "", name) for name in named)
+    parts = []
+    for file in sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTOS):
+        path = file.relative_to(folder).as_posix()
+        if path not in photos and f"/{path}".endswith(ends):
+            parts.append(Part("photo", path, file))
+    return parts
+
+
+def _is_mask(path: str) -> bool:
+    """Whether a file lies in a folder of masks."""
+    return any(MASKS.fullmatch(part) for part in path.split("/")[:-1])
 
 
 def _stem(path: str) -> str:

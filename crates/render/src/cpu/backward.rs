@@ -407,11 +407,8 @@ impl Pass<'_> {
         let [uu, uv, vv] = [uu, uv, vv].map(|sum| sum / (SQRT_LOG2_E * SQRT_LOG2_E));
         let (cx, cy) = (f64::from(footprint.conic_x), f64::from(footprint.conic_y));
         // dpower/dplace = a u + b v, for a step of the pixel against the centre.
-        let (a, b) = ([2.0 * cx, -2.0 * cx * footprint.conic_shear], [0.0, 2.0 * cy]);
-        let by_place = [-(a[0] * u), -(a[1] * u + b[1] * v)];
-        let by_xx = -0.5 * a[0] * a[0] * uu;
-        let by_xy = -0.5 * (a[0] * a[1] * uu + a[0] * b[1] * uv);
-        let by_yy = -0.5 * (a[1] * a[1] * uu + 2.0 * a[1] * b[1] * uv + b[1] * b[1] * vv);
+        let (a, b) = ([2.0 * cx, -2.0 * cx * footprint.conic_shear], 2.0 * cy);
+        let by_place = [-(a[0] * u), -(a[1] * u + b * v)];
 
         let mean = DVec3::from(gaussians.means()[i].map(f64::from));
         let t = view.rotation * mean + view.translation;
@@ -421,44 +418,42 @@ impl Pass<'_> {
         let bounded: [f64; 2] =
             std::array::from_fn(|k| slope[k].max(view.slope_min[k]).min(view.slope_max[k]));
         let [qw, qx, qy, qz] = gaussians.quats()[i].map(f64::from);
-        let turn = rotation([qw, qx, qy, qz]);
-        let turned = view.rotation * turn;
+        let turned = view.rotation * rotation([qw, qx, qy, qz]);
         let (lost, by_width, by_z) = self.lost(i, mean, t.z);
-        let given = gaussians.scales()[i].map(f64::from);
-        let scales = given.map(|scale| (scale * scale + lost).sqrt());
-        // Rows of J W R, then of M.
+        let scales = DVec3::from(gaussians.scales()[i].map(f64::from));
+        let squares = scales * scales + lost;
+        // Rows of J W R: a column is what an axis of the Gaussian is on the picture.
         let row =
             |k: usize, focal: f64| (turned.row(k) - turned.row(2) * bounded[k]) * (focal * per_z);
         let sharp = [row(0, fx), row(1, fy)];
-        let scale = DVec3::from(scales);
-        let m = sharp.map(|row| row * scale);
-        let (xx, xy, yy) = (m[0].dot(m[0]), m[0].dot(m[1]), m[1].dot(m[1]));
-        let mut opacity = -by_power / f64::from(footprint.opacity);
-        let (mut by_xx, mut by_xy, mut by_yy) = (by_xx, by_xy, by_yy);
-        if request.antialiased {
-            let blur = f64::from(BLUR_PX2);
-            let sharp_det = m[0].cross(m[1]).length_squared();
-            let det = sharp_det + blur * (xx + yy) + blur * blur;
-            let share = (sharp_det / det).sqrt();
-            if sharp_det > 0.0 {
-                let half = 0.5 * opacity * f64::from(gaussians.opacities()[i]);
-                let (narrow, wide) = (half / (sharp_det * det).sqrt(), half * share / det);
-                by_xx += narrow * yy - wide * (yy + blur);
-                by_xy -= (narrow - wide) * xy;
-                by_yy += narrow * xx - wide * (xx + blur);
-            }
-            opacity *= share;
+        // a and b along each axis. a is (row x - shear · row y) of J W R: a difference of what is
+        // long in needles. It is taken apart (Cauchy-Binet), with 1 / (variance of y) = b² / 2.
+        let normal = sharp[0].cross(sharp[1]);
+        let beside = (squares * sharp[1]).cross(normal);
+        let blur = f64::from(BLUR_PX2);
+        let along_a = (blur * sharp[0] + beside) * (a[0] * 0.5 * b * b);
+        let along_b = sharp[1] * b;
+        // The derivative by the covariance is -(a u + b v)² / 2 as a matrix, summed: here times
+        // axes.
+        let mut by_u = -(uu * along_a + uv * along_b);
+        let mut by_v = -(uv * along_a + vv * along_b);
+        // The opacity goes with √(det sharp / det): by the covariance that is half the difference
+        // of the inverses, blur · inverse sharp · inverse / 2.
+        let sharp_det = (after(squares) * before(squares)).dot(normal * normal);
+        if request.antialiased && sharp_det > 0.0 {
+            let by_share = -0.5 * blur * by_power / sharp_det;
+            let skewed = sharp[1] + footprint.conic_shear * sharp[0];
+            by_u += by_share * a[0] * (squares * skewed).cross(normal);
+            by_v += by_share * b * normal.cross(squares * sharp[0]);
         }
-        let by_m = [2.0 * (by_xx * m[0] + by_xy * m[1]), 2.0 * (by_xy * m[0] + by_yy * m[1])];
-        let by_scale = by_m[0] * sharp[0] + by_m[1] * sharp[1];
-        let by_sharp = by_m.map(|row| row * scale);
+        let by_square = 0.5 * (along_a * by_u + along_b * by_v);
+        let by_sharp = [squares * by_u * a[0], squares * (by_u * a[1] + by_v * b)];
+        // By two axes each: 1 and 2, 2 and 0, 0 and 1.
+        let mixed = after(along_a) * before(by_u) + after(along_b) * before(by_v);
         // J W R: its rows are rows of W R times the focal length over z, less the slope's share.
-        let by_row = [by_sharp[0] * (fx * per_z), by_sharp[1] * (fy * per_z)];
-        let by_row_z = -(by_row[0] * bounded[0] + by_row[1] * bounded[1]);
-        let by_turned = DMat3::from_cols(by_row[0], by_row[1], by_row_z).transpose();
-        let by_turn = view.rotation.transpose() * by_turned;
-        let by_bound: [f64; 2] = std::array::from_fn(|k| -by_row[k].dot(turned.row(2)));
-        let by_lost: f64 = (0..3).map(|k| by_scale[k] / (2.0 * scales[k])).sum();
+        let by_bound =
+            [0, 1].map(|k: usize| -view.focal[k] * per_z * by_sharp[k].dot(turned.row(2)));
+        let by_lost = by_square.element_sum();
         let mut by_t = DVec3::new(by_place[0] * fx * per_z, by_place[1] * fy * per_z, 0.0);
         for k in 0..2 {
             if bounded[k] == slope[k] {
@@ -468,13 +463,16 @@ impl Pass<'_> {
         }
         by_t.z -= (by_sharp[0].dot(sharp[0]) + by_sharp[1].dot(sharp[1])) * per_z;
         by_t.z += by_depth + by_lost * by_z;
+        // A turn about one axis moves variance between the other two: nothing where they are equal.
+        let (next, last) = (after(scales), before(scales));
+        let by_turn = mixed * (next - last) * (next + last);
         let (color, basis, by_place) = self.color(i, mean, [red, green, blue]);
         let by_mean = view.rotation.transpose() * by_t + by_width * by_lost + by_place;
         Back {
             mean: by_mean.into(),
-            quat: of_rotation([qw, qx, qy, qz], &by_turn),
-            scales: std::array::from_fn(|k| by_scale[k] * given[k] / scales[k]),
-            opacity,
+            quat: of_turn([qw, qx, qy, qz], by_turn),
+            scales: (2.0 * scales * by_square).into(),
+            opacity: -by_power / f64::from(gaussians.opacities()[i]),
             color,
             basis,
         }
@@ -529,22 +527,21 @@ fn rotation([w, x, y, z]: [f64; 4]) -> DMat3 {
     )
 }
 
-/// By the quaternion, at right angles to it, from what is known by its rotation.
-fn of_rotation(quat: [f64; 4], by: &DMat3) -> [f64; 4] {
-    let length = quat.iter().map(|v| v * v).sum::<f64>().sqrt();
-    let [w, x, y, z] = quat.map(|v| v / length);
-    let at = |row: usize, column: usize| by.col(column)[row];
-    // Sums and differences of the two numbers beside the diagonal.
-    let [yz, zx, xy] = [at(2, 1) + at(1, 2), at(0, 2) + at(2, 0), at(1, 0) + at(0, 1)];
-    let [dx, dy, dz] = [at(2, 1) - at(1, 2), at(0, 2) - at(2, 0), at(1, 0) - at(0, 1)];
-    let [xx, yy, zz] = [at(0, 0), at(1, 1), at(2, 2)];
-    let by = [
-        x * dx + y * dy + z * dz,
-        w * dx - 2.0 * x * (yy + zz) + y * xy + z * zx,
-        w * dy + x * xy - 2.0 * y * (xx + zz) + z * yz,
-        w * dz + x * zx + y * yz - 2.0 * z * (xx + yy),
-    ];
-    let along: f64 = by.iter().zip([w, x, y, z]).map(|(by, q)| by * q).sum();
-    let unit = [w, x, y, z];
-    std::array::from_fn(|k| 2.0 * (by[k] - unit[k] * along) / length)
+/// By the quaternion, at right angles to it, from what is known by turns about the Gaussian's axes.
+fn of_turn(quat: [f64; 4], by: DVec3) -> [f64; 4] {
+    let square: f64 = quat.iter().map(|v| v * v).sum();
+    let [w, x, y, z] = quat.map(|v| 2.0 * v / square);
+    let v = DVec3::new(x, y, z);
+    let by_v = w * by + v.cross(by);
+    [-v.dot(by), by_v.x, by_v.y, by_v.z]
+}
+
+/// The numbers of the axes after each: y, z, x.
+fn after(DVec3 { x, y, z }: DVec3) -> DVec3 {
+    DVec3::new(y, z, x)
+}
+
+/// The numbers of the axes before each: z, x, y.
+fn before(DVec3 { x, y, z }: DVec3) -> DVec3 {
+    DVec3::new(z, x, y)
 }

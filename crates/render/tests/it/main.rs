@@ -7,6 +7,7 @@
     reason = "helpers of tests are tests too"
 )]
 
+mod adam;
 mod backward;
 #[path = "../common/mod.rs"]
 mod common;

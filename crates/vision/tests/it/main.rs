@@ -15,6 +15,7 @@ mod bitset;
 mod bundle;
 mod capture;
 mod captures;
+mod cases;
 mod check;
 mod colours;
 mod context;

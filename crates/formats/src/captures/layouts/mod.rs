@@ -5,6 +5,7 @@ mod arkit;
 mod bundler;
 mod json;
 mod llff;
+mod metashape;
 mod mvs;
 mod opensfm;
 mod polycam;
@@ -33,7 +34,7 @@ impl Seen {
 }
 
 /// All readers with their classes.
-static LAYOUTS: [(&dyn Layout, usize); 11] = [
+static LAYOUTS: [(&dyn Layout, usize); 12] = [
     (&json::Transforms, 0),
     (&Colmap, 1),
     (&llff::Llff, 2),
@@ -44,6 +45,7 @@ static LAYOUTS: [(&dyn Layout, usize); 11] = [
     (&realestate::RealEstate, 3),
     (&opensfm::OpenSfm, 3),
     (&bundler::Bundler, 3),
+    (&metashape::Metashape, 3),
     (&json::CamerasJson, 4),
 ];
 
@@ -52,7 +54,7 @@ static LAYOUTS: [(&dyn Layout, usize); 11] = [
 const NOT_READ: [(&str, &str); 7] = [
     (".rcproj", "RealityCapture's project"),
     (".csv", "a table, as RealityCapture exports cameras"),
-    (".xml", "XML, as Metashape exports cameras"),
+    (".xml", "XML, and not the cameras that Metashape exports"),
     (".psx", "Metashape's project"),
     (".db", "COLMAP's database, which holds no poses"),
     ("groundtruth.txt", "TUM's trajectory"),
