@@ -6,7 +6,8 @@
 #               program that is built already)
 # make page    the page in a headless Chromium, with a real server (SEGSPLAT_BIN as above)
 # make page-long   a scene of 4,000,000 Gaussians in the page: bytes, times and memory
-# make unread   memory, threads and views while hundreds of callers read nothing of their answers
+# make unread   memory, threads and views while hundreds of callers read nothing of their answers; the
+#               share of views of two callers beside three hundred of another key
 # make proto   buf: rules of the calls, and whether they break clients of the commit before
 # make judge   other programs read what this one writes, and what is in docker
 # make image   builds the container images and proves what docs/operations.md says of them
@@ -28,7 +29,7 @@ PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: unread client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-splats judge-three judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: unread client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-published judge-splats judge-three judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -105,7 +106,7 @@ judge-tools: venv
 		--prefix $(JUDGE) @playcanvas/splat-transform@3.7.0 gltf-validator@2.0.0-dev.3.10 \
 		dclint@3.1.0 three@0.187.0
 
-judge: judge-containers judge-folders judge-inference judge-splats judge-three judge-compose
+judge: judge-containers judge-folders judge-inference judge-published judge-splats judge-three judge-compose
 
 judge-splats: judge-tools
 	$(CLIENT)/venv/bin/python tests/tools/judge_splats.py $(PROGRAM) $(CLIENT)/venv/bin/node \
@@ -138,6 +139,10 @@ judge-venv: venv
 
 judge-folders: judge-venv
 	$(JUDGE)/venv/bin/python tests/tools/judge_folders.py $(PROGRAM)
+
+# The loaders of published evaluations, and one run of RealEstate10K's on a small folder.
+judge-published: judge-venv
+	SEGSPLAT_BIN=$(PROGRAM) $(JUDGE)/venv/bin/python -m pytest -q benches/published
 
 judge-inference: judge-venv
 	SEGSPLAT_BIN=$(PROGRAM) $(JUDGE)/venv/bin/python tests/tools/judge_inference.py

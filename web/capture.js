@@ -1,6 +1,6 @@
 // What was dropped: photos and their cameras, what is wrong with each, and what is made smaller,
 // before it is sent.
-const PHOTO = /\.(jpe?g|jfif|png|webp)$/i,
+const PHOTO = /\.(jpe?g|jfif|png|webp|tiff?|bmp)$/i,
   ARCHIVE = /\.(zip|tar)$/i,
   // Files of cameras that the server knows by their paths (docs/captures.md).
   CAMERAS = /(\.(json|txt|bin|npy|traj|pincam)|(^|\/)metadata)$/i,
@@ -14,18 +14,11 @@ const isSplats = (path) =>
     ({ dataset }) => dataset.splats && path.toLowerCase().endsWith('.' + dataset.splats),
   );
 // Photos of formats that are not read.
-const OTHER_PHOTO = /\.(hei[cf]|avif|tiff?|bmp|dng|jxl)$/i;
+const OTHER_PHOTO = /\.(hei[cf]|avif|dng|jxl)$/i;
+// Photos that the server reads and browsers do not.
+const ONLY_SERVER = /\.tiff?$/i;
 const AS_JPEG =
   'export it as JPEG (iPhone: Settings, Camera, Formats, Most Compatible; a Mac: Preview, Export)';
-// The server's limits as it ships (crates/core/src/limits.rs): photos of a scene, bytes of an
-// upload, pixels of a photo, and what it keeps: a photo's longer side, pixels of all photos.
-const LIMITS = {
-  photos: 64,
-  bytes: 256 * 2 ** 20,
-  pixels: 24_000_000,
-  side: 2048,
-  kept: 50_000_000,
-};
 const NO_CAMERAS =
   'No cameras: add a transforms.json, a cameras.json, or the folder of a capture with them. ' +
   'For photos alone, three lines of Python find their cameras (pip install pycolmap):\n' +
@@ -130,8 +123,22 @@ async function readCapture(files, at) {
     }
     form.append(path, file, path);
   }
+  for (const [path, file] of masksOf(list, files)) form.append(path, file, path);
   form.append(part, new Blob([JSON.stringify(read)], { type: 'application/json' }), `${part}.json`);
   return capture;
+}
+
+const MASK = /(^|\/)masks?\/.+$/i;
+
+// The masks that cameras name: the server knows whose they are.
+function masksOf(list, files) {
+  const masks = new Map();
+  for (const entry of list) {
+    const name = String(entry.mask_path ?? '').replace(/^(\.\.?\/)+/, ''),
+      found = name && files.find(({ path }) => `/${path}`.endsWith(`/${name}`));
+    if (found) masks.set(name, found.file);
+  }
+  return masks;
 }
 
 // The photos that cameras name, each with its row, and the names of those that are not there.
@@ -171,13 +178,14 @@ async function paired(list, photos, rows) {
     }
     found.push({ path: name.replace(/^(\.\.?\/)+/, ''), file: photo.file, entry, row });
     try {
-      (await createImageBitmap(photo.file)).close();
+      if (!ONLY_SERVER.test(photo.path)) (await createImageBitmap(photo.file)).close();
     } catch {
       row.faults.push('it cannot be read as a picture');
     }
   }
   for (const { path } of photos) {
-    if (!taken.has(path)) rows.push({ name: path, faults: [], note: 'no camera; it is left out' });
+    if (taken.has(path) || MASK.test(path)) continue;
+    rows.push({ name: path, faults: [], note: 'no camera; it is left out' });
   }
   return [found, lost];
 }
@@ -188,23 +196,26 @@ async function paired(list, photos, rows) {
 async function fit(photos, mayShrink, notes, at = () => {}) {
   const bytes = (some) => some.reduce((sum, { file }) => sum + file.size, 0),
     mb = (n) => `${(n / 1e6).toPrecision(2 + (n > 1e8))} MB`,
-    before = bytes(photos);
+    before = bytes(photos),
+    { limits } = await server.models(),
+    most = limits.photos_max;
   let sent = photos;
-  if (before > LIMITS.bytes && photos.length > LIMITS.photos) {
-    const step = (photos.length - 1) / (LIMITS.photos - 1);
-    sent = Array.from({ length: LIMITS.photos }, (_, i) => photos[Math.round(i * step)]);
+  if (before > limits.upload_bytes_max && photos.length > most) {
+    const step = (photos.length - 1) / Math.max(most - 1, 1);
+    sent = Array.from({ length: most }, (_, i) => photos[Math.round(i * step)]);
     notes.push(
       `${photos.length} photos have ${mb(before)}; ${sent.length} are sent, evenly chosen: ` +
         'a scene takes no more.',
     );
   }
   if (!mayShrink) return sent;
-  const all = bytes(sent) > LIMITS.bytes,
+  const all = bytes(sent) > limits.upload_bytes_max,
+    kept = limits.photos_pixels_kept_max / Math.min(sent.length, most),
     fitted = [];
   let made = 0;
   for (const [i, photo] of sent.entries()) {
     if (all) at(`making photos smaller: ${i + 1} of ${sent.length}`);
-    const small = await smaller(photo.file, all, sent.length).catch(() => null);
+    const small = await smaller(photo.file, limits, all, kept).catch(() => null);
     if (small) made++;
     fitted.push({ ...photo, ...small });
   }
@@ -218,18 +229,19 @@ async function fit(photos, mayShrink, notes, at = () => {}) {
   return fitted;
 }
 
-// A photo as small as the server keeps one of so many, and its size before; null where it may go as
-// it is.
-async function smaller(file, always, count) {
+// A photo as small as the server keeps one, with so many pixels at most, and its size before; null
+// where it may go as it is.
+async function smaller(file, limits, always, kept) {
   // A photo of fewer bytes a pixel than this is a plain area.
-  if (!always && file.size < LIMITS.pixels / 50) return null;
+  const isPlain = file.size < limits.photo_pixels_max / 50;
+  if (ONLY_SERVER.test(file.name) || (!always && isPlain)) return null;
   const [plain, exif] = await asStored(file),
     whole = await createImageBitmap(plain),
     { width, height } = whole,
     pixels = width * height,
-    kept = LIMITS.kept / Math.min(count, LIMITS.photos),
-    scale = Math.min(1, LIMITS.side / Math.max(width, height), Math.sqrt(kept / pixels));
-  if (scale === 1 || (!always && pixels <= LIMITS.pixels)) {
+    side = limits.photo_side_kept_max / Math.max(width, height),
+    scale = Math.min(1, side, Math.sqrt(kept / pixels));
+  if (scale === 1 || (!always && pixels <= limits.photo_pixels_max)) {
     whole.close();
     return null;
   }

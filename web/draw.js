@@ -177,7 +177,7 @@ class Drawing {
     });
     this.worker = startSorter();
     this.worker.onmessage = ({ data }) =>
-      data.measured ? this.asking.shift()(data.measured) : this.sorted(data);
+      'measured' in data ? this.asking.shift()(data.measured) : this.sorted(data);
     this.setup();
   }
 
@@ -378,6 +378,23 @@ class Drawing {
       };
     });
     return better.sort((a, b) => b.score - a.score);
+  }
+
+  // The thing at a point of the world: its entry, of how many, its Gaussians, and a box along these
+  // axes; null where nothing has an entry.
+  async thingAt(point, entry, axes) {
+    const { origin, unit } = this.header;
+    const place = add(point, origin, -1);
+    this.worker.postMessage({ place, entry, axes, reach: 0.02 * unit });
+    const found = await new Promise((go) => this.asking.push(go));
+    if (!found) return null;
+    const { ends, ...rest } = found,
+      size = ends.map(([low, high]) => high - low),
+      center = axes.reduce(
+        (at, axis, k) => add(at, axis, 0.5 * (ends[k][0] + ends[k][1])),
+        origin,
+      );
+    return { ...rest, center, size, axes };
   }
 
   sorted({ order, drawn, number, known, ms }) {

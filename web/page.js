@@ -82,6 +82,7 @@ const state = {
   known: [],
   kept: [],
   marks: [],
+  things: 0,
   frusta: false,
   measuring: false,
   scale: 1,
@@ -455,6 +456,7 @@ async function clicked(event) {
     if (state.measuring) return mark(local);
     const depth = dot(add(local, state.camera.eye, -1), axesOf(state.camera)[2]);
     $('picked').textContent = `${depth.toPrecision(3)} from the camera`;
+    if (state.understood) offer(local);
     return;
   }
   const query = new URLSearchParams({
@@ -466,7 +468,7 @@ async function clicked(event) {
     y,
   });
   if (state.understood && !state.measuring) {
-    for (const name of new Set([...state.words.map((word) => word.text), ...NAMES]))
+    for (const name of new Set([...textsShown(), ...NAMES]))
       query.append('label', name);
   }
   if (!state.measuring) $('picked').textContent = 'looking …';
@@ -488,7 +490,43 @@ async function clicked(event) {
   $('picked').textContent =
     `${what} ${found.depth.toPrecision(3)} from the camera, at ` +
     `${found.point.map((v) => v.toPrecision(4)).join(', ')}.`;
+  if (found.entry) offer(found.point, found.entry);
 }
+
+// Behind what is said of a click: the thing that was clicked can be shown without a word.
+function offer(point, entry) {
+  const button = make('button', { type: 'button', textContent: 'Select this thing' });
+  button.onclick = () => select(point, entry).catch(failed);
+  $('picked').append(' ', button);
+}
+
+// Shows what is at a point as words are shown: all that the scene takes for the same, and a box
+// around what touches the point.
+async function select(point, entry) {
+  const up = axisOf(state.camera),
+    right = unit(cross(up, axesOf(state.camera)[2]));
+  const scene = state.scene,
+    found = await drawing.thingAt(point, entry, [right, cross(right, up), up]);
+  if (!found || state.scene !== scene) return;
+  const scores = Array.from({ length: found.bank }, (_, m) => Number(m + 1 === found.entry));
+  state.things += 1;
+  if (state.words.length === WORDS.length) state.words.shift();
+  state.words.push({
+    text: `thing ${state.things}`,
+    isThing: true,
+    scores,
+    entries: [found.entry],
+    gaussians: found.gaussians,
+    parts: [{ ...found, score: 1 }],
+    score: 1,
+    cut: Number($('cut').value),
+  });
+  showWords();
+  say(`Thing ${state.things}: ${count(found.gaussians)} Gaussians in one piece.`);
+}
+
+// The texts of the words that are shown; things that were clicked have none.
+const textsShown = () => state.words.filter((word) => !word.isThing).map((word) => word.text);
 
 function mark(point) {
   state.marks = state.marks.length === 1 ? [...state.marks, point] : [point];
@@ -540,7 +578,7 @@ async function find(text) {
     where = `${count(result.gaussians)} Gaussians in ${n} part${n === 1 ? '' : 's'}`;
   say(
     [
-      `${text}: ${result.gaussians ? where : `not found, the best score is ${score.toFixed(2)}`}`,
+      `${text}: ${result.found ? where : `not found, the best score is ${score.toFixed(2)}`}`,
       ...doubtsOf(text, known),
       ...result.warnings.map((warning) => warning.message),
     ].join('\n'),
@@ -561,11 +599,10 @@ async function watchUnderstanding(id, signal) {
 // where the server does not say, trust null of a word that was not measured.
 async function knownWord(text) {
   if (state.alone) return null;
-  knownWord.all ||= server.json('/v1/models').then((models) => models.words || []);
-  const all = await knownWord.all.catch(() => {
-    knownWord.all = null;
-    return [];
-  });
+  const all = await server.models().then(
+    ({ words }) => words,
+    () => [],
+  );
   if (!all.length) return null;
   const asked = text.toLowerCase(),
     last = asked.split(/\s+/).pop();
@@ -620,9 +657,10 @@ function showWords() {
         }),
       );
       const trust = word.known && (TRUST[word.known.trust] || 'not in the list');
+      const told = word.isThing ? 'clicked' : word.score.toFixed(2);
       const score = make('span', {
         className: 'score',
-        textContent: word.gaussians ? word.score.toFixed(2) : 'not found',
+        textContent: word.gaussians ? told : 'not found',
         title: 'The best relevancy of anything in the scene; from 0.5 on it is found',
       });
       if (trust) score.append(`, ${trust}`);
@@ -734,7 +772,7 @@ async function open(id, camera, words = []) {
 
 // Nothing of the scene before stays beside another one.
 function forget() {
-  Object.assign(state, { words: [], known: [], kept: [], marks: [] });
+  Object.assign(state, { words: [], known: [], kept: [], marks: [], things: 0 });
   for (const id of ['words', 'kept', 'picked']) $(id).replaceChildren();
 }
 
@@ -810,7 +848,7 @@ function fragment() {
     parts = new URLSearchParams();
   if (!state.alone) parts.set('scene', state.scene.id);
   parts.set('pose', [...eye, ...target, ...up, fov].map((v) => Number(v.toPrecision(9))).join(','));
-  for (const word of state.words) parts.append('text', word.text);
+  for (const text of textsShown()) parts.append('text', text);
   if (state.kind) parts.set('kind', KINDS[state.kind]);
   return `#${parts}`;
 }
@@ -968,8 +1006,8 @@ async function makeAndKeepFilm() {
 
 async function exportAs({ value: format, dataset }) {
   const query = new URLSearchParams({ format });
-  if ('lines' in dataset && state.words.length)
-    query.set('text', state.words.map((word) => word.text).join('\n'));
+  const texts = textsShown();
+  if ('lines' in dataset && texts.length) query.set('text', texts.join('\n'));
   say('writing the file …');
   const answer = await server.call(`/v1/scenes/${state.scene.id}/export?${query}`);
   const name = /filename="([^"]+)"/.exec(answer.headers.get('content-disposition') || '');
@@ -1145,7 +1183,6 @@ globalThis.segsplat = {
   state,
   look,
   find,
-  limits: LIMITS,
   cameraOf,
   matrixOf,
   focalOf,

@@ -95,6 +95,52 @@ function sorter() {
       return { score: score / total, ends };
     });
   };
+  // The Gaussians of an entry that touch each other around a place, as far as `reach` from one to
+  // the next: how many they are, and the two ends along each axis of where nearly all of them are.
+  // Without an entry it is that of the Gaussian nearest to the place.
+  const thing = ({ place, entry, axes, reach }) => {
+    let nearest = -1,
+      least = Infinity,
+      bank = 0;
+    for (let i = 0; i < known; i++) {
+      bank = Math.max(bank, entries[i]);
+      if (!entries[i] || (entry && entries[i] !== entry)) continue;
+      let away = 0;
+      for (let k = 0; k < 3; k++) away += (places[3 * i + k] - place[k]) ** 2;
+      if (away < least) [nearest, least] = [i, away];
+    }
+    if (nearest < 0) return null;
+    const of = entries[nearest],
+      cellOf = (i) => [0, 1, 2].map((k) => Math.floor(places[3 * i + k] / reach)),
+      cells = new Map();
+    for (let i = 0; i < known; i++) {
+      if (entries[i] !== of) continue;
+      const key = cellOf(i).join();
+      if (cells.has(key)) cells.get(key).push(i);
+      else cells.set(key, [i]);
+    }
+    const open = [cellOf(nearest)],
+      found = [];
+    while (open.length) {
+      const at = open.pop(),
+        here = cells.get(at.join());
+      if (!here) continue;
+      cells.delete(at.join());
+      for (const i of here) found.push(i);
+      for (let n = 0; n < 27; n++) {
+        const step = [n % 3, Math.floor(n / 3) % 3, Math.floor(n / 9)];
+        open.push(at.map((cell, k) => cell + step[k] - 1));
+      }
+    }
+    const ends = axes.map((axis) => {
+      const along = Float32Array.from(found, (i) =>
+        axis.reduce((sum, a, k) => sum + a * places[3 * i + k], 0),
+      ).sort();
+      const out = Math.floor(OUTSIDE * along.length);
+      return [along[out], along[along.length - 1 - out]];
+    });
+    return { entry: of, bank, gaussians: found.length, ends };
+  };
   let places = new Float32Array(0),
     photos = new Uint16Array(0),
     entries = new Uint16Array(0),
@@ -103,6 +149,8 @@ function sorter() {
   onmessage = ({ data }) => {
     if (data.parts) {
       postMessage({ measured: measured(data) });
+    } else if (data.place) {
+      postMessage({ measured: thing(data) });
     } else if (data.count !== undefined) {
       places = new Float32Array(3 * data.count);
       photos = new Uint16Array(data.count);

@@ -28,6 +28,15 @@ const server = {
     return this.call(path, options).then((answer) => answer.json());
   },
 
+  // What the server says of itself, asked once.
+  models() {
+    this.told ||= this.json('/v1/models').catch((error) => {
+      this.told = null;
+      throw error;
+    });
+    return this.told;
+  },
+
   // Posts a form and tells the share that is sent.
   send(path, form, sent) {
     return new Promise((resolve, reject) => {

@@ -1,16 +1,19 @@
 """Feed-forward LangSplat beside our bank, on the same Gaussians, masks and embeddings.
 
-    python langsplat_ff.py SEGSPLAT SCENES OUT [--bundle DIR --only A,B --iterations 2000]
+    python langsplat_ff.py SEGSPLAT SCENES OUT [--bundle DIR --only A,B --recipe langsplat]
 
 SEGSPLAT is the program, SCENES a folder of labelled scene folders (`masks/classes.json`, photos
 without distortion), OUT takes a row a scene. A scene is made twice of the photos nearest to its
 first labelled photo, with `preset=paper`: once with the paper's bank, once with
 `bank_rows=4096`, so that each embedding of a mask is a row of its own. LangSplat (arXiv
 2312.16084) without its training of the scene takes the second: its autoencoder (D to 3 and
-back, its widths, its loss and its rate of learning) is trained on the embeddings, each Gaussian
-gets the three numbers of its mask, a view blends them, and the decoder gives each pixel its
-feature. Both are scored by one function: LERF's relevancy, cut at 0.5. What differs is the bank
-against the autoencoder.
+back, its widths and its loss) is trained on the embeddings, each Gaussian gets the three numbers
+of its mask, a view blends them, and the decoder gives each pixel its feature. Both are scored by
+one function: LERF's relevancy, cut at 0.5. What differs is the bank against the autoencoder.
+
+`--recipe paper` (the default) trains the autoencoder as SegSplat's paper does: AdamW, 2e-2,
+batches of 2, 2,000 steps. `--recipe langsplat` has LangSplat's own rate, Adam 7e-4, with all
+embeddings in each step; the rows of 2026-11-22 have it.
 
 Needs torch, numpy, onnxruntime, tokenizers, pillow."""
 
@@ -34,7 +37,11 @@ from tokenizers import Tokenizer
 # LangSplat's own: autoencoder/train.py and test.py, for CLIP's 512 numbers.
 ENCODER = [256, 128, 64, 32, 3]
 DECODER = [16, 32, 64, 128, 256, 256]
-RATE = 7e-4
+# How the autoencoder is trained: optimiser, rate, embeddings of a step (all: None).
+RECIPES = {
+    "paper": (torch.optim.AdamW, 2e-2, 2),
+    "langsplat": (torch.optim.Adam, 7e-4, None),
+}
 
 
 def run(program, bundle, *line):
@@ -99,16 +106,28 @@ class Autoencoder(torch.nn.Module):
         return torch.nn.functional.normalize(self.decoder(codes), dim=-1)
 
 
-def train(rows, iterations, seed):
+def batches(count, size, seed):
+    """Indices of the rows of each step, without end: all rows in a new order, some at a time. What
+    is left of an order is fewer than a step needs, so it is left out.
+    """
+    order = torch.Generator().manual_seed(seed)
+    size = min(size or count, count)
+    while True:
+        yield from torch.randperm(count, generator=order)[: count // size * size].split(size)
+
+
+def train(rows, recipe, iterations, seed):
     """The autoencoder of these embeddings `[N, D]`, and its seconds."""
     torch.manual_seed(seed)
     model, rows = Autoencoder(rows.shape[1]), torch.from_numpy(rows)
-    optimiser = torch.optim.Adam(model.parameters(), lr=RATE)
+    kind, rate, size = RECIPES[recipe]
+    optimiser = kind(model.parameters(), lr=rate)
     begun = time.perf_counter()
-    for _ in range(iterations):
-        found = model.decode(model.encode(rows))
-        apart = ((found - rows) ** 2).sum(dim=1).mean()
-        angle = (1 - torch.nn.functional.cosine_similarity(found, rows, dim=0)).mean()
+    for _, chosen in zip(range(iterations), batches(len(rows), size, seed)):
+        some = rows[chosen]
+        found = model.decode(model.encode(some))
+        apart = ((found - some) ** 2).sum(dim=1).mean()
+        angle = (1 - torch.nn.functional.cosine_similarity(found, some, dim=0)).mean()
         loss = apart + 1e-3 * angle
         optimiser.zero_grad()
         loss.backward()
@@ -245,7 +264,7 @@ def scene(args, texts, folder):
     }
 
     each, view = unit(files["each", "bank"]["bank"]), files["each", "view"]
-    model, train_s = train(each, args.iterations, args.seed)
+    model, train_s = train(each, args.recipe, args.iterations, args.seed)
     with torch.no_grad():
         codes, encode_s = timed(lambda: model.encode(torch.from_numpy(each)))
 
@@ -285,12 +304,13 @@ def main():
     parser.add_argument("--bundle", type=pathlib.Path, default=pathlib.Path("models/embedded"))
     parser.add_argument("--only", help="names of scenes, separated by commas")
     parser.add_argument("--photos", type=int, default=2)
+    parser.add_argument("--recipe", choices=RECIPES, default="paper")
     parser.add_argument("--iterations", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     parser.add_argument("--table", default="langsplat-ff")
-    parser.add_argument("--commit", required=True)
-    parser.add_argument("--machine", required=True)
+    parser.add_argument("--commit", default="")
+    parser.add_argument("--machine", default="this machine")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     texts, rows = Texts(args.bundle), []
@@ -309,7 +329,8 @@ def main():
     mean |= {key: statistics.fmean(row[key] for row in rows) for key in ("gaussians", "classes")}
     rows.append({"scene": "**mean of scenes**", **mean})
     command = (
-        f"langsplat_ff.py segsplat SCENES OUT --photos {args.photos} --iterations {args.iterations}"
+        f"langsplat_ff.py segsplat SCENES OUT --photos {args.photos} --recipe {args.recipe} "
+        f"--iterations {args.iterations}"
     )
     with args.out.open("a") as file:
         for row in rows:

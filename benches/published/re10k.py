@@ -1,14 +1,14 @@
 """RealEstate10K as DepthSplat and the paper evaluate it: two photos in, views between them out.
 
-    python re10k.py SEGSPLAT DATA INDEX OUT [--bundle DIR --count N --lpips FILE.onnx]
+    python re10k.py SEGSPLAT DATA INDEX OUT [--bundle DIR --provider cuda --count N --lpips FILE]
 
 DATA is the folder `test` of pixelSplat's conversion: `*.torch`, each a list of sequences, and
 `index.json` (sequence to file). INDEX is DepthSplat's `assets/evaluation_index_re10k.json`:
 sequence to `context` and `target` frames. Photos are resized by Lanczos and cropped to 256 x
-256 as there. Scenes are made with `preset=paper`. PSNR, SSIM as scikit-image counts it
-(Gaussian weights, window 11), and LPIPS where `--lpips` names an ONNX file of two inputs
-`[1,3,H,W]` in -1 to 1 with one number as output. OUT takes a row a sequence and their mean;
-`segsplat-lab report --beside paper-views=OUT` prints it below the paper's rows.
+256 as there. One server makes all scenes, with `preset=paper`, and draws all target views of a
+scene in one call. PSNR, SSIM as scikit-image counts it (Gaussian weights, window 11), and LPIPS
+where `--lpips` names a file of `models/export/perceptual.py`. OUT takes a row a sequence and
+their mean; `segsplat-lab report --beside paper-views=OUT` prints it below the paper's rows.
 
 Needs numpy, pillow, scipy."""
 
@@ -17,10 +17,13 @@ import io
 import json
 import pathlib
 import statistics
-import subprocess
+import sys
 import tempfile
 import time
 import tomllib
+import urllib.error
+import urllib.request
+import zipfile
 
 import numpy as np
 from PIL import Image
@@ -28,7 +31,14 @@ from scipy.ndimage import gaussian_filter
 
 from torchfile import load
 
+ROOT = pathlib.Path(__file__).parents[2]
+sys.path += [str(ROOT / "scripts"), str(ROOT / "tests/tools")]
+from form import form  # noqa: E402
+from served import served  # noqa: E402
+
 SIDE = 256
+# Views of one call.
+CAMERAS = 32
 
 
 class Sequence:
@@ -99,51 +109,59 @@ def ssim(a, b):
     return float(found[pad:-pad, pad:-pad].mean())
 
 
-def run(args, *line):
-    command = [args.segsplat, *map(str, line), "--bundle", args.bundle, "--json"]
-    return json.loads(subprocess.run(command, stdout=subprocess.PIPE, check=True, text=True).stdout)
+def call(url, body=None, content="application/json", method=None):
+    request = urllib.request.Request(url, body, {"content-type": content}, method=method)
+    try:
+        with urllib.request.urlopen(request) as answer:
+            return answer.read()
+    except urllib.error.HTTPError as error:
+        raise SystemExit(f"{url}: {error.read().decode()}") from None
 
 
-def judged(args, perceptual, name, frames, context, targets):
+def png(picture):
+    file = io.BytesIO()
+    Image.fromarray(picture).save(file, "PNG")
+    return file.getvalue()
+
+
+def judged(url, perceptual, name, frames, context, targets):
     """The row of one sequence."""
-    with tempfile.TemporaryDirectory() as place:
-        place = pathlib.Path(place)
-        cameras = []
-        for at in context:
-            lens, pose = frames.camera(at)
-            Image.fromarray(frames.picture(at)).save(place / f"{at:05}.png")
-            lens |= {"width": SIDE, "height": SIDE}
-            cameras.append({"file": f"{at:05}.png", "intrinsics": lens, "camera_to_world": pose})
-        (place / "cameras.json").write_text(json.dumps({"cameras": cameras}))
-        scene = place / "scene.segsplat"
-        made = run(args, "reconstruct", place, "-o", scene, "--preset", "paper")
-        figures = []
-        for at in targets:
-            lens, pose = frames.camera(at)
-            out = place / "view.png"
-            run(
-                args,
-                "render",
-                scene,
-                "-o",
-                out,
-                "--camera-to-world=" + ",".join(map(repr, pose)),
-                "--width",
-                SIDE,
-                "--height",
-                SIDE,
-                *[f"--{key}={value}" for key, value in lens.items()],
-            )
+    cameras, photos = [], []
+    for at in context:
+        lens, pose = frames.camera(at)
+        photos.append(("photo", f"{at:05}.png", png(frames.picture(at))))
+        lens |= {"width": SIDE, "height": SIDE}
+        cameras.append({"file": f"{at:05}.png", "intrinsics": lens, "camera_to_world": pose})
+    told = json.dumps({"cameras": cameras}).encode()
+    body, content = form([("cameras", "cameras.json", told), *photos])
+    ask = "preset=paper&semantics=off&refine=off&wait_ms=600000"
+    scene = json.loads(call(f"{url}/v1/scenes?{ask}", body, content))
+    if scene["state"] != "done":
+        raise SystemExit(f"{name}: {scene['error']}")
+    scene_url = f"{url}/v1/scenes/{scene['id']}"
+    figures = []
+    for first in range(0, len(targets), CAMERAS):
+        some = targets[first : first + CAMERAS]
+        views = [frames.camera(at) for at in some]
+        views = [{**lens, "camera_to_world": pose} for lens, pose in views]
+        ask = {"cameras": views, "width": SIDE, "height": SIDE, "format": "png", "container": "zip"}
+        answer = call(f"{scene_url}/views", json.dumps(ask).encode())
+        with zipfile.ZipFile(io.BytesIO(answer)) as archive:
+            drawn = [archive.read(one) for one in archive.namelist() if one.endswith(".png")]
+        assert len(drawn) == len(some), f"{name}: {len(drawn)} of {len(some)} views"
+        for at, view in zip(some, drawn):
             truth = frames.picture(at) / 255
-            view = np.array(Image.open(out).convert("RGB")) / 255
+            view = np.array(Image.open(io.BytesIO(view)).convert("RGB")) / 255
             figures.append({"psnr": psnr(truth, view), "ssim": ssim(truth, view)})
             if perceptual:
                 figures[-1]["lpips"] = perceptual(truth, view)
+    call(scene_url, method="DELETE")
     means = {key: statistics.fmean(row[key] for row in figures) for key in figures[0]}
     return {
         "sequence": name,
         "views": len(figures),
-        "gaussians": made["report"]["gaussians"],
+        "gaussians": scene["report"]["gaussians"],
+        "provider": scene["report"]["execution_provider"],
         **means,
     }
 
@@ -171,22 +189,27 @@ def networks(bundle):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("segsplat")
+    parser.add_argument("segsplat", type=pathlib.Path)
     parser.add_argument("data", type=pathlib.Path)
     parser.add_argument("index", type=pathlib.Path)
     parser.add_argument("out", type=pathlib.Path)
     parser.add_argument("--bundle", default="models/embedded")
+    parser.add_argument("--provider", default="auto", help="of the server's networks")
     parser.add_argument("--count", type=int, help="sequences, the first ones [default: all]")
     parser.add_argument("--lpips")
     parser.add_argument("--machine", default="this machine")
     parser.add_argument("--commit", default="")
     args = parser.parse_args()
     perceptual, rows = lpips(args.lpips) if args.lpips else None, []
-    for sequence in sequences(args.data, json.loads(args.index.read_text())):
-        if len(rows) == args.count:
-            break
-        rows.append(judged(args, perceptual, *sequence))
-        print(json.dumps(rows[-1]), flush=True)
+    with tempfile.TemporaryDirectory() as place:
+        flags = ["--bundle", pathlib.Path(args.bundle).absolute(), "--provider", args.provider]
+        program, data = args.segsplat.absolute(), pathlib.Path(place) / "data"
+        with served(data, *flags, program=program) as url:
+            for sequence in sequences(args.data, json.loads(args.index.read_text())):
+                if len(rows) == args.count:
+                    break
+                rows.append(judged(url, perceptual, *sequence))
+                print(json.dumps(rows[-1]), flush=True)
     if not rows:
         raise SystemExit(f"{args.data} holds no sequence of {args.index}")
     keys = [key for key in ("psnr", "ssim", "lpips") if key in rows[0]]

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use segsplat_core::error::Result;
+use segsplat_lab::semantics::pca;
 use segsplat_testing::root;
 use serde_json::{Value, json};
 
@@ -122,7 +123,68 @@ fn words_find_their_boxes_in_a_view_and_a_word_for_nothing_does_not() {
     // "red" is in the scene, so it is no absent word.
     let words = judged["scene"]["absent_words"].as_array().unwrap();
     assert_eq!((words.len(), &words[0]["word"]), (1, &json!("blue")));
-    assert_eq!(std::fs::read_dir(grids).unwrap().count(), 1);
+    let grid = std::fs::read_dir(grids).unwrap().map(|file| file.unwrap().path());
+    let [grid] = &grid.collect::<Vec<_>>()[..] else { panic!("one grid") };
+    grids_show_e_and_f(&image::open(grid).unwrap().to_rgb8());
+}
+
+#[test]
+fn one_scene_of_spread_photos_is_asked_at_every_target() {
+    let dir = folder();
+    let Some(rows) = judged(dir.path(), &["--spread", "--targets", "1"]) else { return };
+    let row = &rows.unwrap()[0];
+    let [target] = &row["targets"].as_array().unwrap()[..] else { panic!("{row}") };
+    assert_eq!(target["target"], json!("images/0.png"), "{row}");
+    assert_eq!(target["inputs"], json!(["images/1.png", "images/2.png"]), "{row}");
+    assert_eq!((&row["spread"], &row["default"]["flat"]["miou"]), (&json!(true), &Value::Null));
+    assert!(row["default"]["scene"]["miou"].as_f64().unwrap() > 0.4, "{row}");
+    let fault = judged(dir.path(), &["--spread"]).unwrap().unwrap_err();
+    assert!(fault.message().contains("0 photos are no target"), "{fault}");
+}
+
+/// Of the middle photo: photo, view, E, F, labels, the scene's texts, the flat ones.
+fn grids_show_e_and_f(grid: &image::RgbImage) {
+    let (width, height) = (grid.width() / 7, grid.height() / 3);
+    assert_eq!(grid.width() % 7, 0);
+    // The red box, the green one, and the wall between and above them.
+    let places = [(0.28, 0.5), (0.72, 0.5), (0.5, 0.08)];
+    for column in [2, 3] {
+        let at = |(x, y): (f64, f64)| {
+            let x = f64::from(width * column) + x * f64::from(width);
+            let pixel = grid.get_pixel(x as u32, height + (y * f64::from(height)) as u32);
+            pixel.0.map(i32::from)
+        };
+        let apart = |a: [i32; 3], b: [i32; 3]| (0..3).map(|c| (a[c] - b[c]).abs()).max().unwrap();
+        let [red, green, wall] = places.map(at);
+        for (a, b) in [(red, green), (red, wall), (green, wall)] {
+            assert!(apart(a, b) > 60, "column {column}: {red:?}, {green:?}, {wall:?}");
+        }
+        // One thing has one colour.
+        assert!(apart(red, at((0.25, 0.55))) < 60, "column {column}");
+    }
+}
+
+#[test]
+fn components_are_ordered_by_how_far_rows_differ_in_them() {
+    // Three groups: far apart along the first number, less along the fifth.
+    let row = |i: usize| {
+        let far = [0.0, 9.0, 4.0][i % 3] + 0.01 * (i as f32 * 0.7).sin();
+        let less = [0.0, 0.0, 2.0][i % 3] + 0.01 * (i as f32 * 0.3).cos();
+        (i != 5).then(|| vec![far, 1.0, 1.0, 1.0, less])
+    };
+    let found = pca::colours(300, row);
+    assert_eq!(found[5], [0.0; 3], "it has no row");
+    let of = |i: usize| found[i];
+    for group in 0..3 {
+        for same in (group..300).step_by(3).filter(|i| *i != 5) {
+            let off = (0..2).map(|c| (of(same)[c] - of(group)[c]).abs()).fold(0.0, f32::max);
+            assert!(off < 0.05, "{same}: {:?}, {:?}", of(same), of(group));
+        }
+    }
+    assert!(of(0)[0] < 0.05 && of(1)[0] > 0.95 && (0.3..0.6).contains(&of(3 + 2 + 3)[0]));
+    assert!((of(2)[1] - of(0)[1]).abs() > 0.8, "{:?}, {:?}", of(2), of(0));
+    assert_eq!(found, pca::colours(300, row), "the same rows, the same colours");
+    assert_eq!(pca::colours(2, |_| None), [[0.0; 3]; 2]);
 }
 
 #[test]

@@ -313,6 +313,9 @@ pub struct Scoring {
     /// An entry that fits a text by so much less than the best one (cosine, 0..2) is not selected.
     #[prost(double, optional, tag = "6")]
     pub near_best: ::core::option::Option<f64>,
+    /// Difference of cosines to the canonical texts at which the relevancy is 0.5.
+    #[prost(double, optional, tag = "7")]
+    pub margin: ::core::option::Option<f64>,
 }
 /// Texts asked of a scene.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -391,6 +394,9 @@ pub struct TextResult {
     /// What it found in the view.
     #[prost(message, optional, tag = "7")]
     pub view: ::core::option::Option<TextView>,
+    /// Whether the scene has what the text names: some Gaussian is selected.
+    #[prost(bool, tag = "8")]
+    pub found: bool,
 }
 /// A connected part of a selection and its box, world frame of the upload.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -660,6 +666,9 @@ pub struct Method {
     /// Whether a view that magnifies the photos blurs the Gaussians as the network learnt them.
     #[prost(bool, optional, tag = "18")]
     pub magnify: ::core::option::Option<bool>,
+    /// Whether the embedding of a mask is also that of its place in the whole photo.
+    #[prost(bool, optional, tag = "19")]
+    pub context: ::core::option::Option<bool>,
 }
 /// One message of the upload.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1241,6 +1250,32 @@ pub struct ModelsResponse {
     /// Version of this server.
     #[prost(string, tag = "7")]
     pub server_version: ::prost::alloc::string::String,
+    /// What a caller may send and ask for.
+    #[prost(message, optional, tag = "8")]
+    pub limits: ::core::option::Option<CallerLimits>,
+}
+/// The limits in force that a caller must know before a call: what to choose of many photos, how
+/// small to make large ones, how many cameras to ask for at once.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct CallerLimits {
+    /// Photos of a scene.
+    #[prost(uint64, tag = "1")]
+    pub photos_max: u64,
+    /// Bytes of an upload.
+    #[prost(uint64, tag = "2")]
+    pub upload_bytes_max: u64,
+    /// Pixels of a photo as it is sent.
+    #[prost(uint64, tag = "3")]
+    pub photo_pixels_max: u64,
+    /// Longer side of a photo as the server keeps it, pixels.
+    #[prost(uint32, tag = "4")]
+    pub photo_side_kept_max: u32,
+    /// Pixels of all photos of a scene as the server keeps them.
+    #[prost(uint64, tag = "5")]
+    pub photos_pixels_kept_max: u64,
+    /// Cameras of one call for views.
+    #[prost(uint64, tag = "6")]
+    pub cameras_max: u64,
 }
 /// One network.
 #[derive(Clone, PartialEq, ::prost::Message)]

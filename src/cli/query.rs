@@ -120,15 +120,17 @@ fn numbered(path: &Path, i: usize, count: usize) -> PathBuf {
 fn describe(text: &mut String, found: &TextResult) {
     // Writing to a string does not fail.
     let best = found.scores.iter().copied().fold(0.0, f32::max);
-    let _ = writeln!(
-        text,
-        "{:?}: {} Gaussians in {} parts, {} of {} entries, best score {best:.2}",
-        found.text,
-        found.gaussians,
-        found.parts.len(),
-        found.entries.len(),
-        found.scores.len(),
-    );
+    let of = match found.found {
+        false => "not found".to_owned(),
+        true => format!(
+            "{} Gaussians in {} parts, {} of {} entries",
+            found.gaussians,
+            found.parts.len(),
+            found.entries.len(),
+            found.scores.len(),
+        ),
+    };
+    let _ = writeln!(text, "{:?}: {of}, best score {best:.2}", found.text);
     for part in &found.parts {
         let [x, y, z] = part.center;
         let [a, b, c] = part.size;

@@ -53,24 +53,76 @@ impl Bell {
 
 #[cfg(test)]
 mod tests {
-    use std::sync::atomic::Ordering;
+    use std::{
+        sync::{Arc, atomic::Ordering, mpsc},
+        thread,
+    };
 
     use super::*;
 
+    /// How long a test waits for what must come.
+    const PATIENCE: Duration = Duration::from_secs(60);
+
+    /// What `wait` gives in a thread of its own.
+    fn waiting<T: Send + 'static>(
+        bell: &Arc<Bell>,
+        wait: impl FnOnce(&Bell) -> T + Send + 'static,
+    ) -> mpsc::Receiver<T> {
+        let (bell, (tell, told)) = (Arc::clone(bell), mpsc::channel());
+        thread::spawn(move || tell.send(wait(&bell)));
+        told
+    }
+
     #[test]
-    fn a_ring_wakes_who_waits_and_none_is_missed() {
-        let (bell, open, stop) = (Bell::default(), AtomicBool::new(false), AtomicBool::new(false));
-        let look = || if open.load(Ordering::Acquire) { Ok(7) } else { Err(FOREVER) };
-        std::thread::scope(|scope| {
-            let waits = scope.spawn(|| bell.wait(look));
-            open.store(true, Ordering::Release);
-            bell.ring();
-            assert_eq!(waits.join().unwrap(), 7);
-            let stopped = scope.spawn(|| bell.wait_in_job::<()>(&stop, || Err(FOREVER)));
-            stop.store(true, Ordering::Release);
-            bell.ring();
-            assert!(stopped.join().unwrap().is_err(), "cancelled");
+    fn a_ring_wakes_who_has_looked_and_waits() {
+        let (bell, open) = (Arc::<Bell>::default(), Arc::<AtomicBool>::default());
+        let (looks, looked) = mpsc::channel();
+        let is_open = Arc::clone(&open);
+        let found = waiting(&bell, move |bell| {
+            bell.wait(|| {
+                let found = is_open.load(Ordering::Acquire);
+                looks.send(()).unwrap();
+                if found { Ok(7) } else { Err(FOREVER) }
+            })
         });
+        looked.recv_timeout(PATIENCE).expect("it looks at once");
+        open.store(true, Ordering::Release);
+        bell.ring();
+        assert_eq!(found.recv_timeout(PATIENCE), Ok(7), "it is woken");
+    }
+
+    #[test]
+    fn a_ring_between_the_look_and_the_wait_is_not_missed() {
+        let bell = Arc::<Bell>::default();
+        let found = waiting(&bell, |bell| {
+            let mut looks = 0;
+            bell.wait(|| {
+                looks += 1;
+                if looks == 2 {
+                    return Ok(looks);
+                }
+                bell.ring();
+                Err(FOREVER)
+            })
+        });
+        assert_eq!(found.recv_timeout(PATIENCE), Ok(2));
+    }
+
+    #[test]
+    fn a_job_that_is_stopped_waits_no_more_and_a_time_that_is_over_is_a_look() {
+        let (bell, stop) = (Arc::<Bell>::default(), Arc::<AtomicBool>::default());
+        let (looks, looked) = mpsc::channel();
+        let is_stopped = Arc::clone(&stop);
+        let stopped = waiting(&bell, move |bell| {
+            bell.wait_in_job::<()>(&is_stopped, || {
+                looks.send(()).unwrap();
+                Err(FOREVER)
+            })
+        });
+        looked.recv_timeout(PATIENCE).expect("it looks at once");
+        stop.store(true, Ordering::Release);
+        bell.ring();
+        assert!(stopped.recv_timeout(PATIENCE).expect("it is woken").is_err(), "cancelled");
         let mut looks = 0;
         let late = || {
             looks += 1;

@@ -32,6 +32,9 @@ pub(super) enum Change<'a> {
     RefineEnded(Option<&'a RefineReport>),
     /// A job has failed.
     Failed(Kind, &'a Error),
+    /// A job needs what another version of the program wrote: it is shown as failed, and the store
+    /// keeps that it is to be done.
+    Left(Kind, &'a Error),
     /// A job waits again from its start. The attempt counts where the job itself may be the reason.
     Requeued(Kind, Attempt),
     /// All jobs of the scene are stopped: it was to be deleted.
@@ -60,7 +63,7 @@ pub(super) enum Kept {
 impl Change<'_> {
     pub(super) fn kept(&self) -> Kept {
         match self {
-            Self::SemanticsOrdered | Self::Stopped => Kept::No,
+            Self::SemanticsOrdered | Self::Stopped | Self::Left(..) => Kept::No,
             Self::Failed(kind, _) | Self::Requeued(kind, _) if kind.lasts() => Kept::Tried,
             Self::Failed(..) | Self::Requeued(..) => Kept::No,
             _ => Kept::First,
@@ -121,7 +124,9 @@ impl Change<'_> {
                 }
                 refine_ended(record, *report);
             }
-            Self::Failed(kind, error) => kind.failed(record, SceneError::from(*error), now_ms),
+            Self::Failed(kind, error) | Self::Left(kind, error) => {
+                kind.failed(record, SceneError::from(*error), now_ms);
+            }
             Self::Requeued(kind, attempt) => {
                 if let (Attempt::IsForgotten, Some(attempts)) = (attempt, kind.attempts(record)) {
                     *attempts = attempts.saturating_sub(1);

@@ -106,6 +106,8 @@ pub struct Phrases {
     pub tau: f32,
     /// Coverage under which a pixel has no semantics, 0..1.
     pub coverage_floor: f32,
+    /// Difference of cosines at which the relevancy is 0.5.
+    pub margin: f32,
 }
 
 /// Makes the semantics of scenes, and embeds texts.
@@ -244,6 +246,7 @@ impl SemanticNetworks for PipelineNetworks {
             canon: manifest.canon.clone(),
             tau: manifest.tau,
             coverage_floor: manifest.coverage_floor,
+            margin: manifest.margin,
         })
     }
 

@@ -100,6 +100,10 @@ impl Jobs {
                 }
                 None
             }
+            None if kind.lasts() && error.code() == ErrorCode::OtherVersion => {
+                tracing::error!(scene = %id, %error, "{what} waits for that version");
+                return self.leave_to_another_version(job, &error);
+            }
             None => None,
             Some(Reason::Cancelled) => {
                 // Watchers are told that the scene is deleted.
@@ -132,6 +136,18 @@ impl Jobs {
             self.queue.push(kind, id.clone(), queued.after.owner.as_deref());
         }
         "requeued"
+    }
+
+    /// The store keeps the job as it was before it began, for a program that reads what it needs;
+    /// watchers here are told the failure.
+    fn leave_to_another_version(&self, job: &Job, error: &Error) -> &'static str {
+        let (kind, id) = (job.kind, &job.scene);
+        let before = Change::Requeued(kind, Attempt::IsForgotten);
+        for change in [before, Change::Left(kind, error)] {
+            // A scene that is deleted meanwhile needs nothing.
+            let _ = self.records.apply(id, &change);
+        }
+        "failed"
     }
 
     /// Makes a failure known to watchers; that of a job that lasts also to the store.

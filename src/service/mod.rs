@@ -46,9 +46,9 @@ pub use self::{
     shared::{Parts, Service},
     times::ViewTimes,
     types::{
-        Created, Export, ExportBody, ExportPlace, InstanceBox, KnownWord, Label, ModelInfo,
-        ModelsInfo, Page, Peak, Picked, QueryAnswer, Readiness, RenderedView, TextResult, TextView,
-        TextWarning, Trust,
+        CallerLimits, Created, Export, ExportBody, ExportPlace, InstanceBox, KnownWord, Label,
+        ModelInfo, ModelsInfo, Page, Peak, Picked, QueryAnswer, Readiness, RenderedView,
+        TextResult, TextView, TextWarning, Trust,
     },
 };
 pub use crate::formats::{rle::Rle, table::ExportFormat};

@@ -68,6 +68,7 @@ pub(super) fn answer(
         Ok(TextResult {
             text: text.text.clone(),
             scores: text.scores.relevancies().iter().skip(1).copied().collect(),
+            found: selection.is_some_and(|selection| selection.gaussians > 0),
             gaussians: selection.map_or(0, |selection| selection.gaussians),
             parts: selection.map_or_else(Vec::new, |selection| selection.parts.clone()),
             entries,
@@ -263,7 +264,8 @@ mod tests {
         }
 
         fn phrases(&self) -> Result<Phrases> {
-            Ok(Phrases { canon: vec!["thing".to_owned()], tau: 10.0, coverage_floor: 0.0 })
+            let canon = vec!["thing".to_owned()];
+            Ok(Phrases { canon, tau: 10.0, coverage_floor: 0.0, margin: 0.0 })
         }
 
         fn embed_texts(&self, texts: &[String]) -> Result<Vec<TextEmbedding>> {

@@ -383,6 +383,9 @@ pub struct ScoringOptions {
     /// selected.
     #[arg(long)]
     pub near_best: Option<f64>,
+    /// Difference of cosines to the canonical texts at which the relevancy is 0.5, -2 to 2.
+    #[arg(long)]
+    pub margin: Option<f64>,
 }
 
 impl ScoringOptions {
@@ -395,6 +398,7 @@ impl ScoringOptions {
             unit_rows: self.unit_rows.unwrap_or(of.unit_rows),
             coverage_floor: self.coverage_floor.unwrap_or(of.coverage_floor),
             near_best: self.near_best.unwrap_or(of.near_best),
+            margin: self.margin.unwrap_or(of.margin),
         }
     }
 }

@@ -18,7 +18,7 @@ use super::{
 use crate::{
     cache::Cache,
     error::{Error, Result},
-    jobs::SemanticNetworks,
+    jobs::{Phrases, SemanticNetworks},
     limits::Limits,
     render::{Labels, PixelWeights, RenderRequest, Renderer},
     scene::{Gaussians, Preset, Scene, ScoringMethod, Semantics, TextEmbedding},
@@ -92,9 +92,9 @@ impl Backend {
 
     /// How texts are scored by a preset with some changes.
     fn scoring(&self, preset: Preset, changes: &ScoringOptions) -> Result<ScoringMethod> {
-        let phrases = self.networks.phrases()?;
-        let (tau, floor) = (f64::from(phrases.tau), f64::from(phrases.coverage_floor));
-        let method = changes.change(ScoringMethod::of(preset, phrases.canon, tau, floor));
+        let Phrases { canon, tau, coverage_floor, margin } = self.networks.phrases()?;
+        let [tau, floor, margin] = [tau, coverage_floor, margin].map(f64::from);
+        let method = changes.change(ScoringMethod::of(preset, canon, tau, floor, margin));
         method.check()?;
         Ok(method)
     }
@@ -235,9 +235,11 @@ impl SceneTexts {
             let preset = how.preset.unwrap_or(of.scene.meta.report.method.preset);
             let (scoring, scorer) = backend.scorer(&of, preset, &how.changes)?;
             let scored = |(text, embedding): (&String, Arc<TextEmbedding>)| {
+                let scores = scorer.text(&embedding.row)?;
+                let silent = embedding.unknown > 0 && embedding.unknown >= embedding.tokens;
                 Ok(ScoredText {
                     text: text.clone(),
-                    scores: scorer.text(&embedding.row)?,
+                    scores: if silent { scores.silent() } else { scores },
                     warnings: warnings(text, &embedding),
                 })
             };
@@ -324,7 +326,7 @@ fn warnings(text: &str, embedding: &TextEmbedding) -> Vec<TextWarning> {
     let mut warnings = Vec::new();
     let (tokens, unknown) = (embedding.tokens, embedding.unknown);
     if unknown > 0 && unknown >= tokens {
-        let message = format!("the text tower knows no word of {text:?}; its scores mean nothing");
+        let message = format!("the text tower knows no word of {text:?}, so it finds nothing");
         warnings.push(warning("unknown_words", message));
     } else if unknown > 0 {
         let message = format!("the text tower does not know {unknown} of {tokens} pieces of it");

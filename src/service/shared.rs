@@ -193,7 +193,8 @@ impl Service {
 
     /// What makes and renders the scenes.
     pub fn models(&self) -> ModelsInfo {
-        let mut models = self.inner.models.clone();
+        let mut models =
+            ModelsInfo { limits: (&*self.limits()).into(), ..self.inner.models.clone() };
         match self.inner.jobs.networks() {
             NetworkState::Open("") => {}
             NetworkState::Open(provider) => provider.clone_into(&mut models.execution_provider),

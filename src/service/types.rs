@@ -16,6 +16,7 @@ use super::{
 use crate::{
     error::Result,
     formats::rle::Rle,
+    limits::Limits,
     render::FrameStats,
     scene::{Camera, SceneStatus, ScoringMethod},
 };
@@ -68,6 +69,8 @@ pub struct TextResult {
     pub scores: Vec<f32>,
     /// Entries selected: those whose relevancy is at the cut or over it.
     pub entries: Vec<u16>,
+    /// Whether the scene has what the text names: some Gaussian is selected.
+    pub found: bool,
     /// Gaussians selected.
     pub gaussians: u64,
     /// Connected parts of the selection, the largest first.
@@ -299,6 +302,45 @@ pub struct ModelsInfo {
     pub renderer: String,
     /// Version of this server.
     pub server_version: String,
+    /// What a caller may send and ask for.
+    pub limits: CallerLimits,
+}
+
+/// The limits in force that a caller must know before a call: what to choose of many photos, how
+/// small to make large ones, how many cameras to ask for at once.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct CallerLimits {
+    /// Photos of a scene.
+    pub photos_max: usize,
+    /// Bytes of an upload.
+    pub upload_bytes_max: usize,
+    /// Pixels of a photo as it is sent.
+    pub photo_pixels_max: u64,
+    /// Longer side of a photo as the server keeps it, pixels.
+    pub photo_side_kept_max: u32,
+    /// Pixels of all photos of a scene as the server keeps them.
+    pub photos_pixels_kept_max: u64,
+    /// Cameras of one call for views.
+    pub cameras_max: usize,
+}
+
+impl From<&Limits> for CallerLimits {
+    fn from(limits: &Limits) -> Self {
+        Self {
+            photos_max: limits.photos_max,
+            upload_bytes_max: limits.upload_bytes_max,
+            photo_pixels_max: limits.photo_pixels_max,
+            photo_side_kept_max: limits.photo_side_kept_max,
+            photos_pixels_kept_max: limits.photos_pixels_kept_max,
+            cameras_max: limits.cameras_max,
+        }
+    }
+}
+
+impl Default for CallerLimits {
+    fn default() -> Self {
+        Self::from(&Limits::default())
+    }
 }
 
 /// One network.

@@ -260,6 +260,22 @@ fn an_output_that_cannot_be_written_is_refused_before_any_work() {
 }
 
 #[test]
+fn bench_says_the_time_of_a_view_and_its_error() {
+    let folder = files();
+    let scene = folder.path().join("scene.segsplat");
+    let line = ["bench", text(&scene), "--frames", "3", "--width", "64", "--height", "48"];
+    let told = ok_json(&[&line[..], &CPU].concat());
+    let number = |place: &str| told.pointer(place).and_then(Value::as_f64).expect(place);
+    assert_eq!([number("/width"), number("/height"), number("/frames")], [64.0, 48.0, 3.0]);
+    assert!(number("/gaussians") > 0.0 && number("/visible") > 0.0, "{told}");
+    assert!(number("/min_ms") > 0.0 && number("/min_ms") <= number("/median_ms"), "{told}");
+    // Held to the oracle, not to itself: some rounding, and no fault.
+    assert!(number("/error/max") > 0.0 && number("/error/max") < 1e-3, "{told}");
+    assert_eq!(number("/error/faults"), 0.0);
+    assert_eq!(told["renderer"], "cpu");
+}
+
+#[test]
 fn a_folder_without_cameras_is_named_with_what_finds_them() {
     if !with_network() {
         return;

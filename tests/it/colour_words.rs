@@ -127,13 +127,20 @@ async fn a_word_finds_its_thing_at_a_pose_between_the_photos() {
 
     let query = server.url(&format!("/v1/scenes/{id}/query"));
     let asked = json!({ "texts": ["red", "zzz"], "camera": { "from": 0 }, "boxes": "aligned" });
-    let answer = body(client.post(query).json(&asked).send().await.unwrap()).await.unwrap();
+    let sent = client.post(query.clone()).json(&asked).send().await.unwrap();
+    let answer = body(sent).await.unwrap();
     let [red, unknown] = [&answer["results"][0], &answer["results"][1]];
     let part = &red["parts"][0];
     let size = |axis: usize| part["size"][axis].as_f64().unwrap();
     assert!(size(0) > 0.6 && size(0) < 2.4 && size(1) > 0.6 && size(1) < 2.4, "{part}");
     assert!(red["view"]["peak"]["relevancy"].as_f64().unwrap() > 0.5, "{red}");
     assert_eq!(unknown["warnings"][0]["code"], "unknown_words", "{unknown}");
+    assert_eq!([&red["found"], &unknown["found"]], [&json!(true), &json!(false)], "{answer}");
+    // Where every entry is near enough, a text that says nothing still finds nothing.
+    let asked = json!({ "texts": ["green", "zzz"], "margin": -2.0, "near_best": 2.0 });
+    let answer = body(client.post(query).json(&asked).send().await.unwrap()).await.unwrap();
+    let found = [0, 1].map(|i| answer["results"][i]["found"].as_bool().unwrap());
+    assert_eq!(found, [true, false], "{answer}");
 
     let shown = client.get(server.url(&format!("/v1/scenes/{id}"))).send().await.unwrap();
     let semantics = body(shown).await.unwrap()["semantics"].clone();

@@ -16,7 +16,18 @@ fn the_models_answer_and_the_page_of_words_say_the_same() {
     let page = std::fs::read_to_string(root().join("docs/words.md")).unwrap();
     for known in &words {
         let trust = serde_json::to_value(known.trust).unwrap();
-        let row = format!("\n| {} | {} |", known.word, trust.as_str().unwrap());
+        let found = |count: u32, share: Option<f32>| match share {
+            Some(share) => format!("{count}, {:.0} %", 100.0 * share),
+            None => "-".to_owned(),
+        };
+        let row = format!(
+            "\n| {} | {} | {} | {} | {:.1} % |\n",
+            known.word,
+            trust.as_str().unwrap(),
+            found(known.things, known.things_found),
+            found(known.photographs, known.photographs_found),
+            100.0 * known.absent,
+        );
         assert!(page.contains(&row), "docs/words.md: no row {row:?}");
         let KnownWord { things_found, photographs_found, absent, .. } = known;
         let shares = [*things_found, *photographs_found, Some(*absent)];

@@ -280,7 +280,8 @@ fn a_glb_is_what_its_specification_asks() {
     assert_eq!(document["nodes"][0]["translation"], node);
 }
 
-/// A far scene keeps its f64 origin in a GLB; SPZ says what it cannot hold.
+/// A far scene keeps its f64 origin in a GLB and its places as f64 in a PLY; SPZ says what it
+/// cannot hold.
 #[test]
 fn a_far_scene_is_exact_or_refused() {
     let mut raw = cloud(50, 0, 2).into_raw();
@@ -289,6 +290,9 @@ fn a_far_scene_is_exact_or_refused() {
     let [position, .., rotation, color, rest] = differences(&far, &round_trip(&GLB, &far));
     assert_eq!((position, color, rest), (0.0, 0.0, 0.0));
     assert!(rotation < 1e-7, "it is scaled to length 1 once more: {rotation}");
+    let [position, ..] = differences(&far, &round_trip(&PLY, &far));
+    // Rounded to f32 about the origin that the reader chooses.
+    assert!(position < 1e-6, "PLY: {position}");
     let error = SplatFile::new(&SPZ, far, None).unwrap_err();
     assert!(error.message().contains("8388607"), "{error}");
     for format in splat_formats().filter(|format| format.name != PLY.name) {

@@ -159,7 +159,7 @@ fn every_truncation_and_flipped_bit_is_found() {
 }
 
 /// A container with another header, and with its checksum made right again.
-fn reheaded(file: &[u8], change: impl FnOnce(&mut Value)) -> Vec<u8> {
+pub(crate) fn reheaded(file: &[u8], change: impl FnOnce(&mut Value)) -> Vec<u8> {
     let end = 8 + u64::from_le_bytes(file[..8].try_into().unwrap()) as usize;
     let mut header = serde_json::from_slice(&file[8..end]).unwrap();
     change(&mut header);

@@ -9,12 +9,18 @@ use std::{fs, path::Path};
 use segsplat::{
     formats::container::{write_scene, write_semantics},
     limits::Limits,
-    scene::{SceneId, SceneState},
+    scene::{SceneId, SceneState, SceneStatus},
     store::{Record, Store, StoreLocation},
 };
 use serde_json::Value;
 
-use crate::common::{root, server::TestServer};
+use crate::{
+    common::{
+        root,
+        server::{TestServer, upload},
+    },
+    store::reheaded,
+};
 
 const KEPT: &str = "tests/fixtures/stored/0.1.0";
 
@@ -94,6 +100,35 @@ async fn a_scene_of_the_released_format_is_served() {
     let id = list["scenes"][0]["id"].as_str().expect("it is listed");
     let view = server.url(&format!("/v1/scenes/{id}/view?from=0&width=64&height=48"));
     assert_eq!(crate::common::client().get(view).send().await.unwrap().status(), 200);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_scene_that_is_not_made_waits_for_the_version_that_reads_its_photos() {
+    let folder = tempfile::tempdir().unwrap();
+    let place = StoreLocation::Folder(folder.path().to_owned());
+    let (store, _) = Store::open(&place, &Limits::default()).unwrap();
+    let id = SceneId::from_bytes([7; 16]);
+    let queued = Record::new(SceneStatus::new(id.clone(), SceneState::Queued, 1));
+    store.put_upload(upload(), &queued).unwrap();
+    drop(store);
+    let file = folder.path().join("scenes").join(id.as_str()).join("upload.segsplat");
+    let ours = fs::read(&file).unwrap();
+    let other = reheaded(&ours, |header| header["__metadata__"]["version"] = "2".into());
+    fs::write(&file, &other).unwrap();
+    // Oftener than a job may be begun.
+    for _ in 0..4 {
+        let server = TestServer::at(&place, |_, _| {}).await;
+        let status = server.finished(&id).await;
+        let error = status.error.expect("why it is not made");
+        assert_eq!((status.state, error.code.as_str()), (SceneState::Failed, "other_version"));
+        assert!(error.message.contains("segsplat-upload version 2"), "{error:?}");
+        server.stop().await;
+        assert!(fs::read(&file).unwrap() == other, "its photos are left as they are");
+    }
+    fs::write(&file, ours).unwrap();
+    let server = TestServer::at(&place, |_, _| {}).await;
+    assert_eq!(server.finished(&id).await.state, SceneState::Done);
+    server.stop().await;
 }
 
 /// What `old` has and `new` has not, or has in another form.

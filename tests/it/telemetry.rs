@@ -16,6 +16,7 @@ use crate::common::{
     doors::{Ask, Options, both, both_with, bytes},
     process::{Start, can_serve},
     root,
+    server::PATIENCE,
 };
 
 async fn metrics(stand: &CpuServer) -> String {
@@ -248,6 +249,29 @@ async fn spans_go_to_the_collector_as_a_part_of_the_callers_trace() {
     assert!(has(&0x0af7_6519_16cd_43dd_8448_eb21_1c80_319c_u128.to_be_bytes()));
     assert!(has(&0xb7ad_6b71_6920_3331_u64.to_be_bytes()));
     assert!(!has(b"very secret"), "a key went out");
+}
+
+#[tokio::test]
+async fn a_collector_that_never_answers_takes_nothing_from_callers_and_the_server_ends() {
+    if !can_serve() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    // The system takes its connections; nobody reads them.
+    let silent = TcpListener::bind("127.0.0.1:0").unwrap();
+    let collector = format!("http://{}", silent.local_addr().unwrap());
+    let server = Start::on(&folder.path().join("data")).arg("--otlp").arg(&collector).start();
+    let client = crate::common::client();
+    let form = crate::common::doors::form(&upload());
+    let call = client.post(server.url("/v1/scenes?wait_ms=60000")).multipart(form);
+    assert_eq!(call.send().await.unwrap().status(), 201);
+    // More spans than the exporter holds.
+    for _ in 0..3_000 {
+        assert_eq!(client.get(server.url("/healthz")).send().await.unwrap().status(), 200);
+    }
+    let ended = tokio::task::spawn_blocking(|| server.stop());
+    assert!(tokio::time::timeout(PATIENCE, ended).await.expect("it ends").unwrap(), "it ends well");
+    drop(silent);
 }
 
 /// The trace, span and parent of the span of this name, as protobuf has them one after the other.

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use futures_util::future::join_all;
-use reqwest::{Certificate, Version};
+use reqwest::{Certificate, Version, tls};
 use segsplat::{api::Server, keys::key_sha256};
 use tokio::net::{TcpListener, TcpStream};
 
@@ -73,6 +73,20 @@ async fn one_port_speaks_http_1_http_2_and_grpc_over_tls() {
     let strange = crate::common::client_builder().tls_certs_only([]).build().unwrap();
     assert!(strange.get(url("/readyz")).send().await.is_err(), "the certificate is not checked");
     drop(silent);
+    stand.stop().await;
+}
+
+#[tokio::test]
+async fn tls_1_2_and_tls_1_3_are_spoken() {
+    let files = files();
+    let stand = stand(&files).await;
+    let url = format!("https://localhost:{}/readyz", stand.addr.port());
+    for version in [tls::Version::TLS_1_2, tls::Version::TLS_1_3] {
+        let client = crate::common::client_builder().tls_certs_only([files.root.clone()]);
+        let client = client.tls_version_min(version).tls_version_max(version).build().unwrap();
+        let answer = client.get(&url).send().await;
+        assert!(answer.is_ok_and(|answer| answer.status() == 200), "{version:?}");
+    }
     stand.stop().await;
 }
 

@@ -16,13 +16,13 @@ use segsplat::{
     error::{ErrorCode, Result},
     pipeline::{
         Pipeline, reconstruct,
-        semantics::{SemanticsInput, SemanticsTools, understand, understand_with},
+        semantics::{Context, SemanticsInput, SemanticsTools, understand, understand_with},
     },
     sample::{self, SampleOptions},
     scene::{
-        Camera, CameraToWorld, Crop, CropShape, Gaussians, IndexMap, Intrinsics, MaskInfo, Method,
-        Photo, PhotoMasks, PosedPhoto, Preset, RawGaussians, SceneCamera, SceneOptions, Semantics,
-        SourcePixel, Stage, Watch,
+        Camera, CameraToWorld, Crop, CropShape, DenseFeatures, Gaussians, IndexMap, Intrinsics,
+        MaskInfo, Method, Photo, PhotoMasks, PosedPhoto, Preset, RawGaussians, SceneCamera,
+        SceneOptions, Semantics, SourcePixel, Stage, Watch,
     },
     semantics::Scorer,
 };
@@ -125,6 +125,7 @@ fn tools<'a>(masks: Masks<'a>, embed: Embed<'a>) -> Tools<'a> {
         crop_margin: 0.1,
         crop_shape: CropShape::Square,
         batch: 3,
+        context: None,
     }
 }
 
@@ -183,6 +184,49 @@ fn masks_of_several_photos_fill_a_batch() {
     };
     made(&wall, &tools(masks, embed), &Method::default()).unwrap();
     assert_eq!(batches.into_inner().unwrap(), [3, 1], "two masks each of two photos");
+}
+
+#[test]
+fn the_place_in_the_whole_photo_is_added_to_each_crop() {
+    let wall = wall();
+    let masks: Masks<'_> = &|_| {
+        let mut masks = vec![two_masks(0), PhotoMasks::default()];
+        masks[0].masks[0].area = 0.5;
+        masks[0].masks[1].area = 0.001;
+        Ok(masks)
+    };
+    let asked = Mutex::new(Vec::new());
+    // Blue everywhere.
+    let dense = |photo: &Photo| {
+        asked.lock().unwrap().push(photo.width);
+        Ok(Some(DenseFeatures { columns: 1, rows: 1, data: vec![0.0, 0.0, 3.0] }))
+    };
+    let (large, none) = (|area: f64| f64::from(u8::from(area > 0.01)), |_: f64| 0.0);
+    let context = Some(Context { dense: &dense, weight: &large });
+    let told = Mutex::new(Vec::new());
+    let watch = Watch {
+        progress: &|stage, share| told.lock().unwrap().push((stage, share)),
+        cancel: &NO_CANCEL,
+    };
+    let with = SemanticsTools { context, ..tools(masks, &colour_of) };
+    let method = Method { bank_rows: 2, merge_cosine: 0.0, ..Method::default() };
+    let whole = understand_with(&with, &wall.parts(), &method, watch).unwrap();
+    assert_eq!(*asked.lock().unwrap(), [32], "a photo without masks is not looked at");
+    let told = told.into_inner().unwrap();
+    let embed = told.iter().filter(|(stage, _)| *stage == Stage::Embed).map(|(_, share)| *share);
+    assert_eq!(
+        embed.collect::<Vec<f32>>(),
+        [0.0, 0.0, 2.0 / 7.0, 1.0],
+        "begin, crops, the photo, end"
+    );
+    let rows = [0, 15].map(|i| whole.bank.row(usize::from(whole.index[i]) - 1));
+    let half = 0.5_f32.sqrt();
+    assert!([0, 2].iter().all(|i| (rows[0][*i] - half).abs() < 0.03), "{rows:?}");
+    assert!(rows[1][2] < 0.1, "a small mask keeps its crop's: {rows:?}");
+    let context = Some(Context { dense: &dense, weight: &none });
+    let with = SemanticsTools { context, ..tools(masks, &colour_of) };
+    made(&wall, &with, &method).unwrap();
+    assert_eq!(asked.lock().unwrap().len(), 1, "no photo is looked at for nothing");
 }
 
 #[test]

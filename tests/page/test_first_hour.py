@@ -8,7 +8,7 @@ import urllib.request
 from pathlib import Path
 
 import numpy as np
-from acts import drop, sample, settled, until
+from acts import drop, pixels, sample, settled, until
 from PIL import Image
 from playwright.sync_api import Page, Route, expect
 from served import run
@@ -89,8 +89,13 @@ def test_too_many_and_too_large_photos_are_chosen_and_made_smaller(
         scope.pop("w", None), scope.pop("h", None)
     told |= lens
     sizes = sum(len(data) for data in files.values())
-    page.evaluate("(bytes) => Object.assign(segsplat.limits, "
-                  "{ photos: 4, bytes, kept: 4 * 320 * 240 })", sizes // 4)
+    def told_less(route: Route) -> None:
+        told = route.fetch().json()
+        told["limits"] |= {"photos_max": 4, "upload_bytes_max": sizes // 4,
+                           "photos_pixels_kept_max": 4 * 320 * 240}
+        route.fulfill(json=told)
+
+    page.route("**/v1/models", told_less)
     drop(page, {**files, "transforms.json": json.dumps(told).encode()})
     scene = shown_scene(page, url)
     assert [camera["file"] for camera in scene["cameras"]] == ["0.jpg", "2.jpg", "4.jpg", "6.jpg"]
@@ -214,3 +219,36 @@ def test_the_whole_photo_is_in_the_canvas_and_what_it_does_not_show_is_dark(
     assert lines(page) == 0
     page.keyboard.press("Home")
     assert lines(page) > 0
+
+
+def test_a_thing_is_selected_by_a_click_without_a_word(page: Page, url: str, scene: str) -> None:
+    page.goto(f"{url}/#scene={scene}")
+    settled(page)
+    page.focus("#view")
+    page.keyboard.press("w")
+    with page.expect_response("**/pick?*") as asked:
+        page.locator("#view").click(position={"x": 360, "y": 130})
+    found = asked.value.json()
+    page.get_by_role("button", name="Select this thing").click()
+    expect(page.locator("#words li strong")).to_have_text(["thing 1"])
+    expect(page.locator("#words .score")).to_have_text("clicked")
+    [word] = page.evaluate("segsplat.state.words")
+    assert word["entries"] == [found["entry"]]
+    assert word["scores"][found["entry"] - 1] == 1 and sum(word["scores"]) == 1
+    # What was clicked lies in its box, but for the farthest Gaussians.
+    [box] = word["parts"]
+    assert 10 < box["gaussians"] == word["gaussians"]
+    off = np.array(box["axes"]) @ (np.array(found["point"]) - box["center"])
+    assert (abs(off) < 0.6 * np.array(box["size"]) + 0.05).all(), (off, box)
+    assert lines(page) > 100
+    # It is shown as a word is, and is no text of the link.
+    page.select_option("#kind", "3")
+    white = pixels(page)
+    high, wide = white.shape[:2]
+    width, height = page.evaluate("[view.clientWidth, view.clientHeight]")
+    assert white[round(130 / height * high), round(360 / width * wide)].min() == 255
+    assert 0.001 < (white[..., 0] == 255).mean() < 0.9
+    assert "text=" not in page.evaluate("location.hash")
+    page.click("#words button[aria-label='Remove thing 1']")
+    clear = "getContext('2d').getImageData(0, 0, over.width, over.height).data.every((v) => !v)"
+    until(page, f"over.{clear}")

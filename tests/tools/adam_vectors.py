@@ -1,4 +1,4 @@
-"""Writes crates/render/tests/it/adam.csv: what PyTorch makes of a few Gaussians and an exposure.
+"""Writes crates/render/tests/it/adam.csv: PyTorch's Adam on a few Gaussians and an exposure.
 
     python tests/tools/adam_vectors.py
 
@@ -13,10 +13,11 @@ from pathlib import Path
 import torch
 
 STEPS, GAUSSIANS, SH = 24, 3, 4
-# Rates of means, quaternions, scales, opacities, harmonics of degree 0 and higher ones.
-RATES = [1e-2, 2e-3, 5e-3, 5e-2, 2.5e-3, 1.25e-4]
-# Sizes of the gradients of each number: from those whose squares are no f32 to those whose squares
-# are large.
+RATES = {
+    "means": 1e-2, "quats": 2e-3, "scales": 5e-3,
+    "opacities": 5e-2, "sh": 2.5e-3, "sh_rest": 1.25e-4,
+}
+# Sizes of the gradients of each number: squares of some are no f32, those of others are large.
 SIZES = [1.0, 1e-3, 1e6] + [1e-2] * 4 + [10.0, 1e-8, 1e-14] + [1e-4]
 SIZES += [1.0, 1e-10, 1e15, 1e-12, 1e-14, 1e-15, 1e-16, 1e-18, 1e-20, 1e-25, 1e-30, 1e10]
 OUT = Path(__file__).parents[2] / "crates/render/tests/it/adam.csv"
@@ -53,8 +54,8 @@ def gaussians() -> list[list[float]]:
         sh = torch.zeros(3, dtype=f64, requires_grad=True)
         sh_rest = torch.zeros(3 * (SH - 1), dtype=f64, requires_grad=True)
         numbers = [means, quats, scales, opacity, sh, sh_rest]
-        rates = zip(numbers, RATES, strict=True)
-        groups = [{"params": [number], "lr": rate} for number, rate in rates]
+        pairs = zip(numbers, RATES.values(), strict=True)
+        groups = [{"params": [p], "lr": rate} for p, rate in pairs]
         states.append((numbers, torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)))
     random = Random(7)
     for step in range(STEPS):
@@ -77,10 +78,9 @@ def gaussians() -> list[list[float]]:
 
 def exposure() -> list[float]:
     """Gains, then biases, of a photo that is darker than what is drawn."""
-    random = Random(8)
-    f64 = torch.float64
-    drawn = [[0.5 + 0.5 * random.unit() for _ in range(3)] for _ in range(8)]
-    color = torch.tensor(drawn, dtype=f64)
+    random, f64 = Random(8), torch.float64
+    color = [[0.5 + 0.5 * random.unit() for _ in range(3)] for _ in range(8)]
+    color = torch.tensor(color, dtype=f64)
     photo = torch.tensor([[8 * at + c for c in range(3)] for at in range(8)], dtype=f64) / 255
     gain = torch.ones(3, dtype=f64, requires_grad=True)
     bias = torch.zeros(3, dtype=f64, requires_grad=True)
@@ -95,7 +95,7 @@ def exposure() -> list[float]:
 
 with OUT.open("w", newline="") as file:
     rows = csv.writer(file, lineterminator="\n")
-    what = "PyTorch's Adam: each Gaussian's numbers, then an exposure's"
-    file.write(f"# {what} (tests/tools/adam_vectors.py)\n")
+    file.write("# PyTorch's Adam: each Gaussian's numbers, then an exposure's")
+    file.write(" (tests/tools/adam_vectors.py)\n")
     for row in [*gaussians(), exposure()]:
         rows.writerow([f"{value:.9e}" for value in row])

@@ -1,20 +1,24 @@
-"""Answers that nobody reads: memory, threads and views beside them. `make unread` runs it.
+"""Callers that take more than their part: memory, threads and views beside them. `make unread` runs
+it.
 
-    unread.py PROGRAM [WHAT...]     WHAT: readers, pictures, exports (all by default)
+    unread.py PROGRAM [WHAT...]     WHAT: readers, pictures, exports, crowd (all by default)
 
 readers: 600 connections ask for an export of 100,000 Gaussians and read nothing, while views
 are asked one after another. pictures: 40 connections ask for 4096 x 4096 pictures as f32 and read
-nothing. exports: 12 connections ask for SOG files of 4,000,000 Gaussians and read nothing. A line
-for each says what came back; the program ends with 1 where a bar is missed.
+nothing. exports: 12 connections ask for SOG files of 4,000,000 Gaussians and read nothing. crowd:
+300 callers of one key and two of another ask for views, each for the next one when it has one. A
+line for each says what came back; the program ends with 1 where a bar is missed.
 """
 
 from __future__ import annotations
 
+import asyncio
 import json
 import random
 import socket
 import statistics
 import struct
+import subprocess
 import sys
 import tempfile
 import time
@@ -30,6 +34,10 @@ from form import form  # noqa: E402
 
 MIB = 1 << 20
 VIEWS = 100
+POSE = "camera_to_world=1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1&fov=60"
+#: Seconds of the crowd, and callers of its two keys.
+CROWD_S = 20
+CROWD = {"many": 300, "few": 2}
 missed: list[str] = []
 
 
@@ -45,10 +53,10 @@ def splat_file(count: int) -> bytes:
     return (one * (count * 32 // len(one) + 1))[:count * 32]
 
 
-def made(url: str, count: int) -> str:
+def made(url: str, count: int, key: str = "") -> str:
     body, kind = form([("splats", "a.splat", splat_file(count))])
-    request = urllib.request.Request(f"{url}/v1/scenes?wait_ms=600000", body,
-                                     {"content-type": kind})
+    headers = {"content-type": kind, **({"authorization": f"Bearer {key}"} if key else {})}
+    request = urllib.request.Request(f"{url}/v1/scenes?wait_ms=600000", body, headers)
     with urllib.request.urlopen(request) as answer:
         scene = json.load(answer)
     assert scene["state"] == "done", scene
@@ -104,11 +112,10 @@ def heads(asked: list[socket.socket]) -> Counter[str]:
 def views(url: str, scene: str) -> list[float]:
     """Milliseconds of views, one after another."""
     took = []
-    pose = "camera_to_world=1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1&fov=60"
     for _ in range(VIEWS):
         begun = time.monotonic()
         with urllib.request.urlopen(
-                f"{url}/v1/scenes/{scene}/view?{pose}&width=256&height=256", timeout=60) as answer:
+                f"{url}/v1/scenes/{scene}/view?{POSE}&width=256&height=256", timeout=60) as answer:
             answer.read()
         took.append(1e3 * (time.monotonic() - begun))
     return took
@@ -153,8 +160,7 @@ def readers(url: str, pid: int) -> None:
 
 def pictures(url: str, pid: int) -> None:
     scene = made(url, 1_000)
-    pose = "camera_to_world=1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1&fov=60"
-    path = f"/v1/scenes/{scene}/view?{pose}&width=4096&height=4096&format=npy"
+    path = f"/v1/scenes/{scene}/view?{POSE}&width=4096&height=4096&format=npy"
     asked, peak = unread(url, path, 40), 0
     end = time.monotonic() + 60
     while time.monotonic() < end:
@@ -182,15 +188,72 @@ def exports(url: str, pid: int) -> None:
         one.close()
 
 
+async def caller(port: int, head: bytes, end: float, said: Counter[str],
+                 took: list[float]) -> None:
+    """Asks for a view again and again on one connection, and comes back when it is told to."""
+    read, write = await asyncio.open_connection("127.0.0.1", port)
+    while time.monotonic() < end:
+        begun = time.monotonic()
+        write.write(head)
+        lines = (await read.readuntil(b"\r\n\r\n")).decode().lower().split("\r\n")
+        headers = dict(line.split(": ", 1) for line in lines[1:] if line)
+        await read.readexactly(int(headers["content-length"]))
+        if time.monotonic() >= end:
+            break
+        said[lines[0].split()[1]] += 1
+        if lines[0].split()[1] == "200":
+            took.append(1e3 * (time.monotonic() - begun))
+        await asyncio.sleep(float(headers.get("retry-after", 0)))
+    write.close()
+
+
+def crowd(url: str, keys: dict[str, str]) -> None:
+    port = int(url.rsplit(":", 1)[1])
+    said = {name: Counter[str]() for name in CROWD}
+    took: dict[str, list[float]] = {name: [] for name in CROWD}
+    heads = {
+        name: (f"GET /v1/scenes/{made(url, 100_000, keys[name])}/view?{POSE}&width=256&height=256 "
+               f"HTTP/1.1\r\nhost: 127.0.0.1\r\nauthorization: Bearer {keys[name]}\r\n\r\n")
+        for name in CROWD
+    }
+
+    async def all_call() -> None:
+        end = time.monotonic() + CROWD_S
+        await asyncio.gather(*(
+            caller(port, heads[name].encode(), end, said[name], took[name])
+            for name, count in CROWD.items() for _ in range(count)))
+
+    asyncio.run(all_call())
+    views = {name: said[name]["200"] for name in CROWD}
+    share = 100 * views["few"] / max(sum(views.values()), 1)
+    print(f"{CROWD['many']} callers of one key: {dict(said['many'])}, p50 "
+          f"{statistics.median(took['many']):.0f} ms; {CROWD['few']} of another: "
+          f"{dict(said['few'])}, p50 {statistics.median(took['few']):.0f} ms; the few have "
+          f"{share:.0f} % of the views")
+    bar("% of the views for the many", 100 - share, 70)
+
+
+def keys_of(program: Path, file: Path) -> dict[str, str]:
+    """Secrets of the crowd's owners, which the program puts into a file of keys."""
+    def new(name: str) -> str:
+        line = [program, "keys", "new", name, "--scope", "write", "--keys", file]
+        done = subprocess.run(line, stdout=subprocess.PIPE, check=True, text=True)
+        return done.stdout.strip().splitlines()[-1]
+
+    return {name: new(name) for name in CROWD}
+
+
 def main() -> None:
     program = Path(sys.argv[1]).absolute()
     known = {"readers": readers, "pictures": pictures, "exports": exports}
-    for name in sys.argv[2:] or known:
+    for name in sys.argv[2:] or [*known, "crowd"]:
         with tempfile.TemporaryDirectory() as folder:
-            data = Path(folder) / "data"
-            flags = ["--renderer", "cpu", "--bundle", "tests/fixtures/plane"]
+            data, file = Path(folder) / "data", Path(folder) / "keys.toml"
+            flags: list[str | Path] = ["--renderer", "cpu", "--bundle", "tests/fixtures/plane"]
+            keys = keys_of(program, file) if name == "crowd" else {}
+            flags += ["--keys", file] if keys else []
             with served(data, *flags, program=program) as url:
-                known[name](url, process(url))
+                crowd(url, keys) if keys else known[name](url, process(url))
     for what in missed:
         print(f"missed: {what}")
     sys.exit(bool(missed))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import itertools
 import json
@@ -102,20 +103,13 @@ def test_photos_alone_are_told_what_finds_their_cameras(tmp_path: Path) -> None:
         calls.parts_of(tmp_path / "none")
 
 
-def test_the_limits_are_those_of_the_server_and_of_the_page() -> None:
+def test_the_limits_are_those_that_the_server_says(client: Client) -> None:
+    limits = client.models().limits
     rust = (ROOT / "crates/core/src/limits.rs").read_text()
-    page = (ROOT / "web/capture.js").read_text()
-    for ours, theirs, shown in [
-        (photos.PHOTOS_MAX, "photos_max", "photos"),
-        (photos.UPLOAD_BYTES_MAX, "upload_bytes_max", "bytes"),
-        (photos.PHOTO_PIXELS_MAX, "photo_pixels_max", "pixels"),
-        (photos.SIDE_KEPT, "photo_side_kept_max", "side"),
-        (photos.PIXELS_KEPT, "photos_pixels_kept_max", "kept"),
-    ]:
-        limit = re.search(rf"\b{theirs}: \w+ = ([0-9_< ]+)", rust)
-        in_page = re.search(rf"^  {shown}: ([0-9_* ]+),$", page, re.M)
-        assert limit and in_page
-        assert eval(limit[1]) == ours == eval(in_page[1]), theirs
+    assert limits
+    for name, told in dataclasses.asdict(limits).items():
+        limit = re.search(rf"\b{name}: \w+ = ([0-9_< ]+)", rust)
+        assert limit and eval(limit[1]) == told, name
 
 
 def test_too_many_and_too_large_photos_are_chosen_and_made_smaller(
@@ -130,9 +124,16 @@ def test_too_many_and_too_large_photos_are_chosen_and_made_smaller(
         whole.save(tmp_path / f"{i}.jpg", quality=95, exif=exif)
         frame["file_path"] = f"{i}.jpg"
     (tmp_path / "transforms.json").write_text(json.dumps(told))
-    monkeypatch.setattr(photos, "PHOTOS_MAX", 4)
-    monkeypatch.setattr(photos, "UPLOAD_BYTES_MAX", (tmp_path / "0.jpg").stat().st_size)
-    monkeypatch.setattr(photos, "PIXELS_KEPT", 4 * 320 * 240)
+    limits = client.models().limits
+    assert limits
+    few = dataclasses.replace(
+        limits,
+        photos_max=4,
+        upload_bytes_max=(tmp_path / "0.jpg").stat().st_size,
+        photos_pixels_kept_max=4 * 320 * 240,
+    )
+    # What this server would have said.
+    monkeypatch.setattr(client.policy, "limits", few)
     with pytest.warns(UserWarning) as said:
         scene = client.scene(tmp_path, semantics="off")
     assert [str(one.message)[:28] for one in said] == [
@@ -147,13 +148,12 @@ def test_too_many_and_too_large_photos_are_chosen_and_made_smaller(
         k = photo.camera.K
         assert np.allclose([k[0, 0], k[1, 1], k[0, 2], k[1, 2]], want)
     # One photo of too many pixels is made smaller by itself.
-    monkeypatch.setattr(photos, "UPLOAD_BYTES_MAX", 1 << 30)
-    monkeypatch.setattr(photos, "PHOTO_PIXELS_MAX", 640 * 480 - 1)
-    sent, sizes = photos.fit([Part("photo", "0.jpg", tmp_path / "0.jpg")])
+    one = [Part("photo", "0.jpg", tmp_path / "0.jpg")]
+    kept = dataclasses.replace(limits, photo_pixels_max=640 * 480 - 1)
+    sent, sizes = photos.fit(one, kept)
     assert sizes == {} and isinstance(sent[0].content, Path), "the server keeps it as it is"
-    monkeypatch.setattr(photos, "SIDE_KEPT", 320)
     with pytest.warns(UserWarning, match="1 photos were made smaller"):
-        sent, sizes = photos.fit([Part("photo", "0.jpg", tmp_path / "0.jpg")])
+        sent, sizes = photos.fit(one, dataclasses.replace(kept, photo_side_kept_max=320))
     assert sizes == {"0.jpg": (640, 480)} and isinstance(sent[0].content, bytes)
     small = Image.open(io.BytesIO(sent[0].content))
     assert small.size == (320, 240) and small.getexif()[0x0112] == 6
@@ -167,6 +167,31 @@ def test_masks_fit_the_photo_that_was_asked(client: Client, tmp_path: Path) -> N
     assert client.get(scene.id).query("box").masks.shape == (1, 480, 640)
     assert scene.query("box", from_=1, width=64).masks.shape == (1, 48, 64)
     assert scene.query("box", from_=0, to=1, t=0.5).masks.shape[2] == 384
+    # A pixel of a mask is that of a pick.
+    picked = scene.pick(600.5, 440.5, from_=1)
+    there = scene.view("depth", from_=1, width=640)
+    assert picked.depth == pytest.approx(float(there.depth[440, 600]))
     listed = next(one for one in client.scenes() if one.id == scene.id)
     assert listed.query("box", from_=1).masks.shape == (1, 480, 640)
     scene.delete()
+
+
+def test_masks_are_sent_with_their_photos(tmp_path: Path) -> None:
+    told = capture(tmp_path, 2, "64x48")
+    names = [frame["file_path"] for frame in told["frames"]]
+    stems = [Path(name).stem for name in names]
+    for path in [f"masks/{stems[0]}.png", "alphas/second.png", "depths/second.png"]:
+        (tmp_path / path).parent.mkdir(exist_ok=True)
+        Image.new("L", (64, 48)).save(tmp_path / path)
+    # A photo that lies elsewhere is not taken for its mask.
+    told["frames"][0]["file_path"] = f"/elsewhere/{Path(names[0]).name}"
+    told["frames"][1]["mask_path"] = "./alphas/second.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(told))
+    sent = [part.name for part in calls.parts_of(tmp_path)]
+    # `masks` without a word of it may be labels.
+    assert sent == ["transforms.json", *names, "alphas/second.png"]
+    more = calls.masks_in(tmp_path / "alphas")
+    assert [(part.field, part.name) for part in more] == [("photo", "masks/second.png")]
+    assert calls.masks_in(None) == []
+    with pytest.raises(FileNotFoundError, match="no folder with masks"):
+        calls.masks_in(tmp_path / "none")

@@ -84,7 +84,9 @@ limits! {
     /// Values in one JSON part or body, counted before it is read: eight megabytes of empty objects
     /// would take hundreds of megabytes. 64 cameras have some 2,000.
     json_values_max: usize = 250_000;
-    /// Pixels of one photo, read from the header before decoding.
+    /// Pixels of one photo that are decoded, read from the header before. A larger JPEG is decoded
+    /// at a half or a quarter of its sides, a larger photo of another format if its pixels take no
+    /// more than 8 bytes for each of these.
     photo_pixels_max: u64 = 24_000_000;
     /// Longer side in pixels to which a photo is reduced after decoding: no stage looks closer.
     photo_side_kept_max: u32 = 2_048;

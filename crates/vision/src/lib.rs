@@ -3,7 +3,7 @@
 //! | layer | modules | may use |
 //! |---|---|---|
 //! | L1 stages | [`capture`], [`models`], [`lift`], [`segment`], [`semantics`], [`sample`] | `segsplat_core` (and [`segsplat_render::vectorised`]); never each other |
-//! | L1 stages | [`photos`] | `segsplat_core`, `segsplat_formats` |
+//! | L1 stages | [`photos`] | `segsplat_core`, `segsplat_formats`, [`capture`] (which turn of photos fits) |
 //! | L1 stages | [`refine`] | `segsplat_core`, `segsplat_render` |
 //! | L2 order | [`pipeline`] | L1; the only place that knows their order |
 

@@ -7,6 +7,7 @@
 //! target as they are.
 
 pub mod labels;
+pub mod pca;
 pub mod tally;
 mod views;
 
@@ -19,7 +20,7 @@ use serde_json::{Value, json};
 use self::{
     labels::{LabelledFrame, LabelledScene, NOT_SEEN},
     tally::{Tally, TextMap},
-    views::{Seen, Tools, Way},
+    views::{Made, Seen, Tools, Way},
 };
 use crate::{
     error::{Error, Result},
@@ -49,6 +50,9 @@ pub(crate) struct Args {
     /// Least projected overlap of each two photos put in, 0 to 1; the paper's inputs have 0.6
     #[arg(long, default_value_t = 0.0)]
     overlap: f64,
+    /// Photos put in are spread over those that are no target; one scene is made for all targets
+    #[arg(long, conflicts_with = "overlap")]
+    spread: bool,
     /// Words for what is in no scene, separated by commas
     #[arg(long, value_delimiter = ',', default_value = ABSENT)]
     absent: Vec<String>,
@@ -59,7 +63,8 @@ pub(crate) struct Args {
     /// `--method tau=20`, `--method 'canon=["object"]'`; docs/method.md has all
     #[arg(long, value_name = "NAME=VALUE")]
     method: Vec<String>,
-    /// Folder for picture grids, one a scene
+    /// Folder for picture grids, one a scene: photo, view, E and F of the view by their principal
+    /// components, labels, what the texts select
     #[arg(long, value_name = "DIR")]
     pictures: Option<PathBuf>,
 }
@@ -113,6 +118,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
         row["networks"] = json!(networks);
         row["photos"] = json!(args.inputs.photos);
         row["overlap"] = json!(args.overlap);
+        row["spread"] = json!(args.spread);
         let first = args.preset.first().copied().unwrap_or_default().to_string();
         let miou = row[first]["scene"]["miou"].as_f64().unwrap_or(f64::NAN);
         let scene = row["scene"].as_str().unwrap_or_default();
@@ -174,18 +180,38 @@ fn judge(
         most => scene.frames.len().div_ceil(most).max(1),
     };
     let (mut targets, mut left_out, mut pictures) = (Vec::new(), Vec::new(), Vec::new());
+    let asked: Vec<usize> = scene.frames.iter().step_by(every).map(|frame| frame.photo).collect();
+    let given = spread(scene.photos.len(), &asked, args.inputs.photos);
+    if args.spread && given.len() < 2 {
+        let count = given.len();
+        let message = format!("{name}: {count} photos are no target; spread needs 2 or more");
+        return Err(Error::invalid(message));
+    }
+    let make = |way| tools.make(&scene.photos, &given, way);
+    let all = ways.iter().filter(|_| args.spread).map(make).collect::<Result<Vec<Made>>>();
+    let all = all.map_err(|e| Error::new(e.code(), format!("{name}: {e}")).caused_by(e))?;
     for frame in scene.frames.iter().step_by(every) {
         let file = &scene.photos[frame.photo].file;
         let fault =
             |e: Error| Error::new(e.code(), format!("{name}, target {file}: {e}")).caused_by(e);
-        let Some(inputs) = inputs(&scene.photos, frame.photo, args.inputs.photos, args.overlap)
-        else {
+        let inputs = match args.spread {
+            true => Some(Vec::new()),
+            false => inputs(&scene.photos, frame.photo, args.inputs.photos, args.overlap),
+        };
+        let Some(inputs) = inputs else {
             left_out.push(file);
             continue;
         };
         let (mut all_maps, mut color) = (Vec::new(), None);
-        for (tallies, way) in tallies.iter_mut().zip(ways) {
-            let seen = tools.see(&scene.photos, frame.photo, &inputs, way).map_err(fault)?;
+        for (at, (tallies, way)) in tallies.iter_mut().zip(ways).enumerate() {
+            let target = &scene.photos[frame.photo];
+            let seen = match all.get(at) {
+                Some(made) => tools.see(made, target, false),
+                None => tools
+                    .make(&scene.photos, &inputs, way)
+                    .and_then(|made| tools.see(&made, target, true)),
+            };
+            let seen = seen.map_err(fault)?;
             for (tally, bank) in tallies.iter_mut().zip(&seen.banks) {
                 let maps = bank.maps(&way.scoring, &texts)?;
                 tally.add(&frame.label, &maps);
@@ -212,8 +238,15 @@ fn judge(
     Ok((row, tallies))
 }
 
-/// One target's pictures: photo, view, labels, then for each preset the best selecting text of
-/// the scene and of the flat baseline.
+/// `count` of the photos that are not `asked`, evenly spread; all of them where there are no more.
+fn spread(photos: usize, asked: &[usize], count: usize) -> Vec<usize> {
+    let others: Vec<usize> = (0..photos).filter(|photo| !asked.contains(photo)).collect();
+    let count = count.min(others.len());
+    (0..count).map(|i| others[(2 * i + 1) * others.len() / (2 * count)]).collect()
+}
+
+/// One target's pictures: photo, view, E and F of the view, labels, then for each preset the best
+/// selecting text of the scene and of the flat baseline.
 fn shown(
     scene: &LabelledScene,
     frame: &LabelledFrame,
@@ -243,7 +276,8 @@ fn shown(
         tinted(&|p| tally::best_selected(classes, p))
     });
     let mut all = vec![grid::photo(photo)];
-    let drawn = [seen.color.clone(), labelled].into_iter().chain(best);
+    let [weights, features] = [seen.banks[0].weights_shown(), seen.banks[0].features_shown()];
+    let drawn = [seen.color.clone(), weights, features, labelled].into_iter().chain(best);
     all.extend(drawn.map(|picture| grid::color(&picture, photo.width)));
     let height = (photo.height * PICTURE_WIDTH / photo.width.max(1)).max(1);
     all.iter().map(|p| image::imageops::thumbnail(p, PICTURE_WIDTH, height)).collect()

@@ -3,10 +3,10 @@
 
 use std::sync::{Arc, atomic::AtomicBool};
 
-use segsplat_vision::semantics::{Cutter, Scorer, Scoring};
+use segsplat_vision::semantics::{Cutter, Scorer, Scoring, add_context, contexts};
 use serde_json::{Value, json};
 
-use super::tally::TextMap;
+use super::{pca, tally::TextMap};
 use crate::{
     error::{Error, Result},
     models::ImageText,
@@ -17,7 +17,10 @@ use crate::{
     render::{
         Kinds, Labels, PixelWeights, RenderRequest, Renderer, cpu::CpuRenderer, plan::served,
     },
-    scene::{Bank, Camera, Crop, Method, PhotoMasks, PosedPhoto, SceneOptions, Watch},
+    scene::{
+        Bank, Camera, Crop, Method, PhotoMasks, PosedPhoto, Scene, SceneOptions, SemanticsReport,
+        Watch,
+    },
     scenes::{make, scene_of, view_request},
 };
 
@@ -34,6 +37,15 @@ pub(super) struct Way {
     pub(super) scoring: Arc<Scoring>,
 }
 
+/// A scene with its meaning.
+pub(super) struct Made {
+    given: Vec<PosedPhoto>,
+    method: Method,
+    scene: Scene,
+    bank: Bank,
+    meaning: SemanticsReport,
+}
+
 /// One target, seen from its inputs.
 pub(super) struct Seen {
     /// The view's colours, for pictures.
@@ -41,8 +53,8 @@ pub(super) struct Seen {
     /// Files of the target and its inputs, the nearest first; how semantics and the stages before
     /// went; the mean sum of the weights of a pixel of the target over the bank, 0 to 1.
     pub(super) report: Value,
-    /// The view of the scene, and the nearest photo taken for the target.
-    pub(super) banks: [BankView; 2],
+    /// The view of the scene, and the nearest photo taken for the target, where that was asked for.
+    pub(super) banks: Vec<BankView>,
 }
 
 /// A bank and the weights of each pixel of the target over it.
@@ -61,14 +73,8 @@ impl<'a> Tools<'a> {
         Ok(self.towers.embed_texts(texts)?.into_iter().map(|text| text.row).collect())
     }
 
-    /// Makes the scene of `inputs` and looks at it from the target's camera.
-    pub(super) fn see(
-        &self,
-        photos: &[PosedPhoto],
-        target: usize,
-        inputs: &[usize],
-        way: &Way,
-    ) -> Result<Seen> {
+    /// Makes the scene of `inputs`, and its meaning.
+    pub(super) fn make(&self, photos: &[PosedPhoto], inputs: &[usize], way: &Way) -> Result<Made> {
         let given: Vec<PosedPhoto> = inputs.iter().map(|&i| photos[i].clone()).collect();
         let cancel = AtomicBool::new(false);
         let reconstruction = make(self.engine, &given, &way.options)?;
@@ -81,29 +87,32 @@ impl<'a> Tools<'a> {
         let watch = Watch { progress: &|_, _| (), cancel: &cancel };
         let meaning = understand(self.engine, &parts, &method, watch)?;
         let gaussians = reconstruction.gaussians.with_semantic_index(meaning.index)?;
-        let plain =
-            view_request(photos[target].camera, Kinds::COLOR, reconstruction.report.median_depth);
-        let request = RenderRequest { labels: Labels::Weights, ..plain };
         let scene = scene_of(Reconstruction { gaussians, ..reconstruction });
-        let frame = self.renderer.render(&scene.gaussians, &served(&scene, request))?;
+        Ok(Made { given, method, scene, bank: meaning.bank, meaning: meaning.report })
+    }
+
+    /// Looks at a scene from the target's camera; with `flat` also at its first photo alone.
+    pub(super) fn see(&self, made: &Made, target: &PosedPhoto, flat: bool) -> Result<Seen> {
+        let Made { given, method, scene, bank, meaning } = made;
+        let plain = view_request(target.camera, Kinds::COLOR, scene.meta.report.median_depth);
+        let request = RenderRequest { labels: Labels::Weights, ..plain };
+        let frame = self.renderer.render(&scene.gaussians, &served(scene, request))?;
         let weights = frame.weights.ok_or_else(|| Error::internal("the view has no weights"))?;
         let weight: f64 = weights.weights.iter().map(|w| f64::from(*w)).sum();
         let report = json!({
-            "target": photos[target].file,
+            "target": target.file,
             "inputs": given.iter().map(|photo| &photo.file).collect::<Vec<_>>(),
-            "semantics": meaning.report,
+            "semantics": meaning,
             "stages": scene.meta.report.stages,
             "coverage": weight / weights.pixels().max(1) as f64,
             "warnings": scene.meta.report.warnings.len(),
         });
-        Ok(Seen {
-            color: frame.color.unwrap_or_default(),
-            banks: [
-                BankView { bank: meaning.bank, weights },
-                self.flat(&given[0], &photos[target].camera, &method, &cancel)?,
-            ],
-            report,
-        })
+        let mut banks = vec![BankView { bank: bank.clone(), weights }];
+        if let Some(nearest) = given.first().filter(|_| flat) {
+            let cancel = AtomicBool::new(false);
+            banks.push(self.flat(nearest, &target.camera, method, &cancel)?);
+        }
+        Ok(Seen { color: frame.color.unwrap_or_default(), banks, report })
     }
 
     /// The masks of one photo, each with a row of its own, laid over a picture of the size of the
@@ -131,7 +140,15 @@ impl<'a> Tools<'a> {
         let shape = manifest.image.crop_shape;
         let cut = |k: usize| cutter.cut(k, margin, shape).unwrap_or_else(black);
         let crops: Vec<Crop> = (0..masks.masks.len()).map(cut).collect();
-        let rows = self.towers.embed_images(&crops)?;
+        let mut rows = self.towers.embed_images(&crops)?;
+        let dense = manifest.image.dense.as_ref().filter(|_| method.context);
+        if let Some((dense, features)) = dense.zip(self.towers.dense(&photo.photo)?) {
+            let contexts = contexts(&features, masks);
+            let both = rows.chunks_exact_mut(manifest.dim).zip(contexts.chunks(manifest.dim));
+            for ((row, context), mask) in both.zip(&masks.masks) {
+                add_context(row, context, dense.weight(mask.area));
+            }
+        }
         let lens = target.intrinsics;
         let mut weights = PixelWeights { offsets: vec![0], ..PixelWeights::default() };
         for y in 0..lens.height {
@@ -150,6 +167,38 @@ impl<'a> Tools<'a> {
 }
 
 impl BankView {
+    /// E, the weights of each pixel over the bank, as colours.
+    pub(super) fn weights_shown(&self) -> Vec<[f32; 3]> {
+        pca::colours(self.weights.pixels(), |pixel| {
+            let mut row = vec![0.0; self.bank.len()];
+            for (m, weight) in self.entries(pixel) {
+                row[m] = weight;
+            }
+            (self.weights.coverage(pixel) > 0.0).then_some(row)
+        })
+    }
+
+    /// F, the feature of each pixel at length 1, as colours.
+    pub(super) fn features_shown(&self) -> Vec<[f32; 3]> {
+        pca::colours(self.weights.pixels(), |pixel| {
+            let mut row = vec![0.0_f32; self.bank.dim];
+            for (m, weight) in self.entries(pixel) {
+                row.iter_mut().zip(self.bank.row(m)).for_each(|(sum, v)| *sum += weight * v);
+            }
+            let length = row.iter().map(|v| v * v).sum::<f32>().sqrt();
+            (length > 0.0).then(|| row.into_iter().map(|v| v / length).collect())
+        })
+    }
+
+    /// Rows of the bank that a pixel shows, with their weights.
+    fn entries(&self, pixel: usize) -> impl Iterator<Item = (usize, f32)> {
+        let row = |(entry, weight): (u16, f32)| {
+            let m = usize::from(entry).checked_sub(1).filter(|m| *m < self.bank.len())?;
+            Some((m, weight))
+        };
+        self.weights.pixel(pixel).filter_map(row)
+    }
+
     /// The product's masks, and scores by which texts can be compared at a pixel.
     ///
     /// At one pixel all texts share the feature's length, so the smallest `E . B(q - c)` over the

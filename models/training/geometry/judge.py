@@ -168,7 +168,7 @@ class Judge:
         nb = nearest_views(c2w, min(len(views) - 1, 3))
         with torch.autocast(self.device.type, dtype=torch.bfloat16):
             out = net(img, K, c2w, put(near / s), put(far / s), nb)
-        out["c2w"] = c2w
+        out["c2w"], out["fx"] = c2w, K[..., 0, 0]
         pics = [render(out, tgt, Kt, side, side)[0, 0].clamp(0, 1) for side in (SIDE, 2 * SIDE)]
         want = [x[target].float() / 255 for x in (scene.small, scene.large)]
         psnr = [-10 * math.log10(max(((p - w) ** 2).mean().item(), 1e-9)) for p, w in zip(pics, want)]

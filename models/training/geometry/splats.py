@@ -5,23 +5,46 @@ import torch.nn.functional as F
 from model import SH_C0
 
 
+BLUR = 0.3  # square pixels that the renderer adds
+OWN_SIZE = 1.25  # up to this magnification a view counts as of the photos' own size
+
+
 def render(out, c2w, K, H, W):
     """Pictures [B,T,3,H,W] of the network's Gaussians from cameras c2w [B,T,4,4], K normalised."""
     from gsplat import rasterization
 
+    B, T = c2w.shape[:2]
     g = world_gaussians(out)
     size = torch.tensor([[W], [H], [1]], device=K.device, dtype=torch.float32)
+    views = torch.linalg.inv(c2w).flatten(0, 1).contiguous()  # [B*T,4,4]
+    K = (K * size).flatten(0, 1).contiguous()
+    g = {k: v.repeat_interleave(T, 0) for k, v in g.items()}
+    g["scales"] = (g["scales"] ** 2 + lost_blur(g["means"], g.pop("width"), views, K)[..., None]).sqrt()
     img, _, _ = rasterization(
         g["means"], g["quats"], g["scales"], g["opacities"], g["colors"],
-        torch.linalg.inv(c2w).contiguous(), (K * size).contiguous(), W, H, near_plane=1e-3, packed=False,
+        views[:, None], K[:, None], W, H, near_plane=1e-3, packed=False,
     )
-    return img[..., :3].permute(0, 1, 4, 2, 3)
+    return img[..., :3].permute(0, 1, 4, 2, 3).reshape(B, T, 3, H, W)
+
+
+@torch.no_grad()
+def lost_blur(means, width, views, K):
+    """Variance [M,N] that the product adds to Gaussians that a view magnifies: crates/render/src/plan.rs.
+
+    means [M,N,3] of the world, width [M,N] of their source pixels, views [M,4,4] world to camera.
+    """
+    z = torch.einsum("mj,mnj->mn", views[:, 2, :3], means) + views[:, 2, 3:]
+    focal = torch.maximum(K[:, 0, 0], K[:, 1, 1])[:, None]
+    p = width * focal / z.clamp(min=1e-6)
+    return torch.where((p > OWN_SIZE) & (z > 1e-3), BLUR * width**2 * (1 - 1 / p**2), torch.zeros_like(p))
 
 
 def world_gaussians(out):
     m, R, t = out["means"], out["c2w"][..., :3, :3], out["c2w"][..., :3, 3]
     means = torch.einsum("bvij,bvhwj->bvhwi", R, m) + t[:, :, None, None]
+    width = m[..., 2] / (out["fx"][:, :, None, None] * m.shape[3])
     return {
+        "width": width.flatten(1, 3),
         "means": means.flatten(1, 3), "scales": out["scales"].flatten(1, 3),
         "quats": quat_mul(rot_to_quat(R)[:, :, None, None].expand_as(out["quats"]), out["quats"]).flatten(1, 3),
         "opacities": out["opacities"].flatten(1, 3),

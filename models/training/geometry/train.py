@@ -29,8 +29,8 @@ from splats import depth_loss, nearest_views, picture_loss, render
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 SHAPES = [(256, 256)] * 7 + [(224, 288), (288, 224), (192, 320), (320, 192)]
-VIEWS, VIEW_SHARES = [2, 3, 4, 6, 8], [0.45, 0.1, 0.2, 0.1, 0.15]
-ZOOM_SHARE = 0.35
+VIEWS, VIEW_SHARES = [2, 3, 4, 6, 8], [0.5, 0.08, 0.18, 0.09, 0.15]
+ZOOM_SHARE = 0.3
 ROBUST = 0.35
 PART = 15 << 20  # bytes of one file of weights
 
@@ -227,7 +227,7 @@ class Trainer:
             dl, ce, err = depth_loss(out, depth, near, far)
             loss = dl + 0.05 * ce
         if not depth_only:
-            out["c2w"] = c2w[:, :V]
+            out["c2w"], out["fx"] = c2w[:, :V], K[:, :V, 0, 0]
             pic = render(out, c2w[:, V:], K[:, V:], H * zoom, W * zoom).flatten(0, 1)
             want = targets.flatten(0, 1)
             if mask is not None:  # where no input looks there is nothing to learn

@@ -17,7 +17,7 @@ import torch
 import cuts
 from colours import COLOURS, dominant_colour
 from naming import HERE, Bundle, Everyday, collect
-from pictures import decode, letterbox
+from pictures import decoded, letterbox
 from wordnet import WordNet
 from words_model import SIDE
 
@@ -59,14 +59,14 @@ def main():
     words = [w for v in groups.values() for w in v]
     text, canon = bundle.texts(words), bundle.texts(bundle.manifest["canon"])
 
-    # Cut things, as the server cuts them, and whole photographs in a black square.
+    # Things as the server sees them, and whole photographs in a black square.
     rows = collect(args.data, "choosing")
-    squares = [cuts.square(*r[3], margin=bundle.manifest["image"].get("crop_margin", 0.0)) for r in rows]
-    held, packed = np.load(os.path.join(args.pack, "held.npz")), np.load(os.path.join(args.pack, "words.npz"))
-    whole = [letterbox(a, SIDE) for a in decode(held)]
-    labels = [r[2] for r in rows] + [str(packed["words"][packed["own"][c]]) for c in held["label"]]
-    seen = bundle.pictures(squares + whole)
-    beats = seen @ text.T >= (seen @ canon.T).max(1, keepdims=True)
+    held, packed = np.load(os.path.join(args.pack, "labelled.npz")), np.load(os.path.join(args.pack, "words.npz"))
+    at = np.flatnonzero(held["held"])
+    whole = [letterbox(decoded(held["blob"], held["offsets"], i), SIDE) for i in at]
+    labels = [r[2] for r in rows] + [str(packed["words"][packed["own"][c]]) for c in held["label"][at]]
+    seen = np.concatenate([bundle.things(rows, bundle.manifest["image"].get("crop_margin", 0.0)), bundle.pictures(whole)])
+    beats = seen @ text.T >= (seen @ canon.T).max(1, keepdims=True) + bundle.manifest.get("margin", 0.0)
     thing = np.arange(len(labels)) < len(rows)
 
     # 1 true, 0 false, -1 open.
@@ -105,7 +105,8 @@ def main():
 
 
 def page(path, groups, count, things, photographs):
-    percent = lambda v: "-" if v is None else f"{100 * v:.0f} %"
+    of_100 = lambda v: float(np.float32(100) * np.float32(v))  # as the server has it
+    percent = lambda v: "-" if v is None else f"{of_100(v):.0f} %"
     lines = [
         "# Words that the embedded bundle knows", "",
         f"Measured on {things} things that were cut out along their labelled outlines and {photographs} whole photographs; no training saw them.",
@@ -113,9 +114,8 @@ def page(path, groups, count, things, photographs):
         f"the share for which it does so, too. *Good*: found in at least {GOOD[0]:.0%}, absent in at most {GOOD[1]:.0%}. *Poor*: found in under",
         f"{POOR[0]:.0%}, or absent in over {POOR[1]:.0%}. *Unmeasured*: fewer than {FEWEST} things and photographs show it. By things where there",
         "are enough, else by photographs. The server says the same in `GET /v1/models`, field `words`.", "",
-        "The photographs are of the sets that the towers were trained on: in your rooms expect less. Ask with the bare name: of the things the",
-        'bare name finds 84 %, "a X" 75 %, "a photo of a X" 54 %. A word that is not on this page is unmeasured, too. Made by',
-        "`models/training/semantics/known_words.py`.", "",
+        "The photographs are of the sets that the towers were trained on: in your rooms expect less. The bare name and a sentence (\"a photo of a",
+        'X") find the same things. A word that is not on this page is unmeasured, too. Made by `models/training/semantics/known_words.py`.', "",
         ", ".join(f"{n} {t}" for t, n in count.items()) + ".", "",
     ]
     for kind, rows in groups.items():
@@ -123,7 +123,7 @@ def page(path, groups, count, things, photographs):
         order = {t: i for i, t in enumerate(count)}
         for r in sorted(rows, key=lambda r: (order[r["trust"]], r["word"])):
             pair = lambda n: f"{r[n]}, {percent(r[n + '_found'])}" if r[n] else "-"
-            lines.append(f"| {r['word']} | {r['trust']} | {pair('things')} | {pair('photographs')} | {100 * r['absent']:.1f} % |")
+            lines.append(f"| {r['word']} | {r['trust']} | {pair('things')} | {pair('photographs')} | {of_100(r['absent']):.1f} % |")
         lines.append("")
     open(path, "w").write("\n".join(lines).rstrip() + "\n")
 

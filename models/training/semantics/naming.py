@@ -92,6 +92,37 @@ class Bundle:
             rows.append(self.image.run(None, {"images": ((x - mean) / std).transpose(0, 3, 1, 2).astype(np.float32)})[0])
         return np.concatenate(rows)
 
+    def things(self, rows, margin=0.0, dim=0.0, context=True):
+        """Unit rows of things as the server sees them: the cut, and their place in the whole photo where the bundle gives it."""
+        seen = self.pictures([cuts.square(*r[3], margin=margin, dim=dim) for r in rows])
+        of = self.manifest["image"].get("dense")
+        if context and of:
+            last, features = None, None
+            for row, (photo, mask) in zip(seen, (r[3] for r in rows)):
+                weight = max([(a, w) for a, w in of["weights"] if mask.mean() >= a], default=(0, 0))[1]
+                if not weight:
+                    continue
+                if photo is not last:
+                    last, features = photo, self.dense(photo, of)
+                row += weight * self.context(features, mask)
+        return seen / np.linalg.norm(seen, axis=1, keepdims=True)
+
+    def dense(self, photo, of):
+        """Features [D,rows,columns] of a whole photo."""
+        k = of["side"] / max(photo.shape[:2])
+        h, w = (max(1, round(v * k / of["cell"])) * of["cell"] for v in photo.shape[:2])
+        mean, std = (np.array(self.manifest["image"][k], np.float32) for k in ("mean", "std"))
+        x = (np.asarray(Image.fromarray(photo).resize((w, h), Image.BILINEAR), np.float32) / 255 - mean) / std
+        return self.image.run([of["output"]], {"images": x.transpose(2, 0, 1)[None].astype(np.float32)})[0][0]
+
+    @staticmethod
+    def context(features, mask):
+        """The unit mean of features under a mask, by the share of each cell that lies under it."""
+        into = lambda n, cells: np.maximum(0, np.minimum(np.arange(1, n + 1)[None] * cells / n, np.arange(1, cells + 1)[:, None]) - np.maximum(np.arange(n)[None] * cells / n, np.arange(cells)[:, None]))
+        share = into(mask.shape[0], features.shape[1]) @ mask @ into(mask.shape[1], features.shape[2]).T
+        mean = (features * share).sum((1, 2))
+        return mean / max(np.linalg.norm(mean), 1e-9)
+
 
 def collect(data, split, masks=None, most=10**9):
     """[(group, key, label, square maker, the photo's labels)] of a split."""
@@ -115,12 +146,12 @@ def collect(data, split, masks=None, most=10**9):
     return out[:most]
 
 
-def scores(bundle, rows, everyday, margin=0.0, dim=0.0):
+def scores(bundle, rows, everyday, margin=0.0, dim=0.0, context=True):
     """The words, each thing's score of each of them, and the score that a word must reach."""
     names = sorted({n for r in rows for n in r[4]} | set(everyday.words))
     text, canon = bundle.texts(names), bundle.texts(bundle.manifest["canon"])
-    seen = bundle.pictures([cuts.square(*r[3], margin=margin, dim=dim) for r in rows])
-    return names, seen @ text.T, (seen @ canon.T).max(1)
+    seen = bundle.things(rows, margin, dim, context)
+    return names, seen @ text.T, (seen @ canon.T).max(1) + bundle.manifest.get("margin", 0.0)
 
 
 def evaluate(rows, everyday, scored, shift=0.0):
@@ -154,6 +185,7 @@ def main():
     ap.add_argument("--masks", help="folder with further labelled scenes")
     ap.add_argument("--image", help="another image tower than the bundle's")
     ap.add_argument("--margin", type=float)
+    ap.add_argument("--cut", action="store_true", help="the cut alone, without the whole photo")
     ap.add_argument("--dim", type=float, default=0.0)
     ap.add_argument("--shift", type=float, nargs="+", default=[0.0], help="added to the canon's score, to see the trade")
     ap.add_argument("--detail", action="store_true")
@@ -164,7 +196,7 @@ def main():
     print("everyday words", len(everyday.words))
     for split in args.split:
         rows = collect(args.data, split, args.masks)
-        scored = scores(bundle, rows, everyday, margin, args.dim)
+        scored = scores(bundle, rows, everyday, margin, args.dim, not args.cut)
         for shift in args.shift:
             figures, said = evaluate(rows, everyday, scored, shift)
             if args.detail:

@@ -10,12 +10,12 @@ use crate::{
         ScoringMethod, SemanticsReport, StageTime, Warning,
     },
     service::{
-        BackgroundSpec, Boxes, CameraSpec, Density, Event, ExportFormat, FeatureKind, FeaturesSpec,
-        Format, InstanceBox, KnownWord, Label, LensSpec, MaskFormat, MaskLevel, Method, ModelInfo,
-        ModelsInfo, Peak, PickSpec, Picked, PictureKind, PictureOptions, PoseSpec, Preset, Quality,
-        QueryAnswer, QuerySpec, RenderedView, SceneCamera, SceneError, SceneOptions, SceneState,
-        SceneStatus, ScoringOptions, SemanticsMode, SemanticsState, SemanticsStatus, TextOptions,
-        TextResult, TextView, TextWarning, Trust, ViewOptions,
+        BackgroundSpec, Boxes, CallerLimits, CameraSpec, Density, Event, ExportFormat, FeatureKind,
+        FeaturesSpec, Format, InstanceBox, KnownWord, Label, LensSpec, MaskFormat, MaskLevel,
+        Method, ModelInfo, ModelsInfo, Peak, PickSpec, Picked, PictureKind, PictureOptions,
+        PoseSpec, Preset, Quality, QueryAnswer, QuerySpec, RenderedView, SceneCamera, SceneError,
+        SceneOptions, SceneState, SceneStatus, ScoringOptions, SemanticsMode, SemanticsState,
+        SemanticsStatus, TextOptions, TextResult, TextView, TextWarning, Trust, ViewOptions,
     },
 };
 
@@ -215,7 +215,8 @@ macro_rules! method_fields {
     ($same:ident) => {
         $same! {
             prune, fuse_layers, backdrop, skip_covered, seeds, full_resolution, mask_filters,
-            crop_whole, crop_margin, lambda, bank_rows, votes, merge_cosine, front_photos, magnify
+            crop_whole, crop_margin, context, lambda, bank_rows, votes, merge_cosine, front_photos,
+            magnify
         }
     };
 }
@@ -256,9 +257,9 @@ pub(super) fn scene_options(header: &pb::CreateSceneHeader) -> Result<SceneOptio
 
 /// Changes of how texts are scored.
 fn scoring(scoring: Option<pb::Scoring>) -> ScoringOptions {
-    let pb::Scoring { canon, tau, cut, unit_rows, coverage_floor, near_best } =
+    let pb::Scoring { canon, tau, cut, unit_rows, coverage_floor, near_best, margin } =
         scoring.unwrap_or_default();
-    ScoringOptions { canon, tau, cut, unit_rows, coverage_floor, near_best }
+    ScoringOptions { canon, tau, cut, unit_rows, coverage_floor, near_best, margin }
 }
 
 fn scored(method: ScoringMethod) -> pb::Scoring {
@@ -269,6 +270,7 @@ fn scored(method: ScoringMethod) -> pb::Scoring {
         unit_rows: Some(method.unit_rows),
         coverage_floor: Some(method.coverage_floor),
         near_best: Some(method.near_best),
+        margin: Some(method.margin),
     }
 }
 
@@ -351,7 +353,7 @@ pub(super) fn answer(answer: QueryAnswer) -> pb::QueryResponse {
 
 fn result(found: TextResult) -> pb::TextResult {
     let warning = |TextWarning { code, message }: TextWarning| pb::TextWarning { code, message };
-    message!(TextResult from found { text, scores, gaussians }
+    message!(TextResult from found { text, scores, found, gaussians }
         entries: found.entries.into_iter().map(u32::from).collect(),
         parts: found.parts.into_iter().map(part).collect(),
         warnings: found.warnings.into_iter().map(warning).collect(),
@@ -425,8 +427,17 @@ pub(super) fn models(info: ModelsInfo) -> pb::ModelsResponse {
             trust: pb::Trust::from(known.trust).into(),
         )
     };
+    let limits = |limits: CallerLimits| {
+        message!(CallerLimits from limits
+            { photo_pixels_max, photo_side_kept_max, photos_pixels_kept_max }
+            photos_max: limits.photos_max as u64,
+            upload_bytes_max: limits.upload_bytes_max as u64,
+            cameras_max: limits.cameras_max as u64,
+        )
+    };
     message!(ModelsResponse from info
         { bundle, bundle_sha256, execution_provider, renderer, server_version }
+        limits: Some(limits(info.limits)),
         models: info.models.into_iter().map(model).collect(),
         words: info.words.into_iter().map(word).collect(),
     )

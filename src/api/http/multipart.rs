@@ -36,6 +36,9 @@ const OPTION_BYTES_MAX: usize = 256;
 /// Options that may come as text parts as well as in the query string.
 const OPTIONS: [&[&str]; 2] = [SceneOptions::NAMES, &["bundle", "wait_ms"]];
 
+/// The part that each mask of a photo is sent as, and the folder that masks are in.
+const MASKS: &str = "masks";
+
 /// Parts of the upload, for `/openapi.json`: no value has this type, parts are read as they come.
 #[derive(ToSchema)]
 #[expect(dead_code, reason = "read by the derive alone")]
@@ -55,6 +58,10 @@ pub(super) struct UploadForm {
     /// parts. A `.splat` is known by the ending of the file's name alone.
     #[schema(content_media_type = "application/octet-stream")]
     splats: Option<String>,
+    /// A mask of a photo, its file named as the photo (`0001.png` or `0001.jpg.png`): what is black
+    /// in it takes no part in the scene. Parts and files of a folder `masks` are masks, too.
+    #[schema(content_media_type = "image/*")]
+    masks: Option<Vec<String>>,
     /// Any other part is a photo, or a camera file of a capture, named by its part or file. Without
     /// `transforms` and `cameras` the files' paths tell the layout.
     #[schema(content_media_type = "image/*")]
@@ -184,7 +191,8 @@ async fn parts(
                 let disposition = field.headers().get("content-disposition");
                 let extended = disposition.and_then(|value| extended_name(value.as_bytes()));
                 let file = extended.as_deref().or_else(|| field.file_name());
-                upload.begin_photo(&photo_name(&name, file)?)?;
+                let in_masks = file.filter(|_| name == MASKS).map(in_masks);
+                upload.begin_photo(&photo_name(&name, in_masks.as_deref().or(file))?)?;
             }
         }
         while let Some(piece) = field.chunk().await.map_err(broken)? {
@@ -243,6 +251,12 @@ impl WatchedBody {
     }
 }
 
+/// The path of the file of a part that is a mask.
+fn in_masks(file: &str) -> String {
+    let is_there = file.strip_prefix(MASKS).is_some_and(|rest| rest.starts_with(['/', '\\']));
+    if is_there { file.to_owned() } else { format!("{MASKS}/{file}") }
+}
+
 /// The name of a file is that of its part where it has an extension or a folder, else that of its
 /// file. A part with neither is no photo.
 fn photo_name(part: &str, file: Option<&str>) -> Result<String> {
@@ -255,8 +269,8 @@ fn photo_name(part: &str, file: Option<&str>) -> Result<String> {
         // Its length is refused with the bound.
         None if part.len() > OPTION_BYTES_MAX => Ok(part.to_owned()),
         None => Err(Error::invalid(format!(
-            "upload: unknown part {:?}; there are transforms, cameras, archive, splats, {}, and \
-             photos, each with the name of its file",
+            "upload: unknown part {:?}; there are transforms, cameras, archive, splats, masks, {}, \
+             and photos, each with the name of its file",
             short(part),
             OPTIONS.concat().join(", ")
         ))),

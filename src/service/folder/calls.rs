@@ -9,73 +9,27 @@ use std::{
 
 use tokio::{runtime::Handle, sync::OwnedSemaphorePermit};
 
-use super::{Contents, Views, checked_texts, depth_of, masks_of, photo_views, write};
+use super::{Pixels, Turns, checked_texts, photo_views};
 use crate::{
     error::{Error, ErrorCode, Result},
     formats::{folders::FolderFormat, table::ExportFormat},
     keys::Caller,
-    limits::Limits,
     scene::{Preset, Scene, SceneId, Upload},
     service::{
         OfflineService,
         export::stream_until,
         request::{ScoringOptions, TextOptions, ViewOptions},
-        schedule::Demand,
-        search::{SceneTexts, ScoringChoice},
+        search::ScoringChoice,
         shared::{Service, Shared},
         tags::{cache_key, etag, semantics_tag},
         tasks::blocking,
         texts,
-        types::{Export, ExportBody, TextView},
-        view::Resolved,
-        work::Work,
+        types::{Export, ExportBody},
     },
 };
 
 /// When to ask again where folders are being written, seconds.
 const RETRY_AFTER_S: u32 = 5;
-
-/// Views of a server.
-struct Scheduled {
-    inner: Arc<Shared>,
-    runtime: Handle,
-    caller: Caller,
-    scene: Arc<Scene>,
-    texts: Option<Arc<SceneTexts>>,
-    until: Instant,
-}
-
-impl Scheduled {
-    /// Does `work` when it is the view's turn. Blocks.
-    fn take_turn<T: Send + 'static>(
-        &self,
-        demand: Demand,
-        work: impl FnOnce(&mut Work) -> Result<T> + Send + 'static,
-    ) -> Result<T> {
-        let deadline = self.until.min(self.inner.deadline(&ViewOptions::default()));
-        let turn = self.inner.scheduled(demand, deadline, "a view of the folder", work);
-        self.runtime.block_on(turn)
-    }
-}
-
-impl Views for Scheduled {
-    fn depth(&mut self, view: &Resolved) -> Result<Vec<f32>> {
-        let (inner, scene, own) = (Arc::clone(&self.inner), Arc::clone(&self.scene), view.clone());
-        let demand = Demand::view(&self.caller, view.pixels());
-        self.take_turn(demand, move |work| {
-            let depth = depth_of(&inner.backend, &scene, &own);
-            work.leave_renderer();
-            depth
-        })
-    }
-
-    fn masks(&mut self, view: &Resolved) -> Result<Vec<TextView>> {
-        let Some(texts) = self.texts.clone() else { return Ok(Vec::new()) };
-        let (limits, own) = (self.inner.limits(), view.clone());
-        let demand = Demand::view(&self.caller, view.pixels()).with_texts(texts.texts.len(), 0);
-        self.take_turn(demand, move |work| masks_of(&texts, &limits, &own, work))
-    }
-}
 
 impl Shared {
     /// A permit to write a folder.
@@ -141,16 +95,17 @@ impl Service {
         let key = cache_key(&(how, upload.is_some(), env!("CARGO_PKG_VERSION")))?;
         let (runtime, caller) = (Handle::current(), self.caller.clone());
         let write = move |to: &mut dyn Write| {
-            let contents = Contents {
-                scene: &scene,
+            let mut pixels = Pixels {
+                scene,
+                backend: Arc::clone(&inner.backend),
+                limits,
+                caller,
                 views,
                 upload: upload.as_ref(),
-                texts: &texts,
-                limits: &limits,
+                scored,
+                turns: Some(Turns { inner, runtime, until }),
             };
-            let scene = Arc::clone(&scene);
-            let mut views = Scheduled { inner, runtime, caller, scene, texts: scored, until };
-            write(folder, &contents, &mut views, to).map(drop)
+            pixels.write(folder, &texts, to).map(drop)
         };
         let export = Export::new(etag(&key), async move {
             let chunks = stream_until(Some(until), write);
@@ -177,25 +132,6 @@ pub struct FolderSpec<'a> {
     pub upload: Option<&'a Upload>,
 }
 
-/// Views of a scene in a file.
-struct Alone<'a> {
-    service: &'a OfflineService,
-    scene: &'a Scene,
-    texts: Option<SceneTexts>,
-    limits: &'a Limits,
-}
-
-impl Views for Alone<'_> {
-    fn depth(&mut self, view: &Resolved) -> Result<Vec<f32>> {
-        depth_of(&self.service.backend, self.scene, view)
-    }
-
-    fn masks(&mut self, view: &Resolved) -> Result<Vec<TextView>> {
-        let Some(texts) = &self.texts else { return Ok(Vec::new()) };
-        masks_of(texts, self.limits, view, &mut Work::default())
-    }
-}
-
 impl OfflineService {
     /// As [`Service::export`] of a folder, written to `to`. Gives how many photos are in it.
     ///
@@ -212,12 +148,20 @@ impl OfflineService {
         texts::check_scoring(scoring, limits)?;
         let asked = checked_texts(format, texts, limits)?;
         let views = photo_views(limits, &scene.meta.cameras, &**scene, preset, asked.len())?;
-        let texts = if asked.is_empty() {
-            None
-        } else {
-            Some(self.score(scene, "text", preset, scoring, &asked)?)
+        let scored = match asked[..] {
+            [] => None,
+            _ => Some(Arc::new(self.score(scene, "text", preset, scoring, &asked)?)),
         };
-        let contents = Contents { scene, views, upload, texts: &asked, limits };
-        write(folder, &contents, &mut Alone { service: self, scene, texts, limits }, to)
+        let mut pixels = Pixels {
+            scene: Arc::clone(scene),
+            backend: Arc::clone(&self.backend),
+            limits: Arc::new(limits.clone()),
+            caller: Caller::All,
+            views,
+            upload,
+            scored,
+            turns: None,
+        };
+        pixels.write(folder, &asked, to)
     }
 }

@@ -5,7 +5,9 @@ mod calls;
 
 pub use self::calls::FolderSpec;
 
-use std::io::Write;
+use std::{io::Write, sync::Arc, time::Instant};
+
+use tokio::runtime::Handle;
 
 use super::{
     encode::{Layer, encode},
@@ -14,9 +16,11 @@ use super::{
         Boxes, CameraSpec, Format, LensSpec, MaskFormat, PictureKind, PictureOptions, PoseSpec,
         QuerySpec, TextOptions, ViewOptions, ViewSpec,
     },
+    schedule::Demand,
     search::{Backend, SceneTexts},
+    shared::Shared,
     texts,
-    types::TextView,
+    types::{TextResult, TextView},
     view::{Inputs, Resolved, resolve_one},
     work::Work,
 };
@@ -26,6 +30,7 @@ use crate::{
         folders::{FolderContents, FolderFormat, FolderMask, FolderPixels, PhotoFile, PutPhoto},
         table::ExportFormat,
     },
+    keys::Caller,
     limits::Limits,
     photos::{SentPixels, each},
     render::Kinds,
@@ -41,51 +46,64 @@ fn checked_texts(format: ExportFormat, asked: &[String], limits: &Limits) -> Res
     }
 }
 
-/// What a folder is made of.
-struct Contents<'a> {
-    scene: &'a Scene,
+/// The photos of an upload and the views of a scene, by the number of the photo.
+struct Pixels<'a> {
+    scene: Arc<Scene>,
+    backend: Arc<Backend>,
+    limits: Arc<Limits>,
+    caller: Caller,
     /// The view of each photo's camera, at the size of the photo.
     views: Vec<Resolved>,
     /// Photos as sent; none where they are not kept.
     upload: Option<&'a Upload>,
-    texts: &'a [String],
-    limits: &'a Limits,
+    /// The texts of the masks, where there are some.
+    scored: Option<Arc<SceneTexts>>,
+    /// Where views wait for those of others; absent: they are drawn at once.
+    turns: Option<Turns>,
 }
 
-/// What draws the views of a folder, one after another.
-trait Views {
-    /// `[H * W]` depth, world units, 0 where nothing is.
-    fn depth(&mut self, view: &Resolved) -> Result<Vec<f32>>;
-
-    /// What each text finds, its mask as run lengths.
-    fn masks(&mut self, view: &Resolved) -> Result<Vec<TextView>>;
+/// When the views of a server are drawn: each waits for its turn with all others.
+struct Turns {
+    inner: Arc<Shared>,
+    runtime: Handle,
+    until: Instant,
 }
 
-/// Writes the zip; how many photos are in it.
-fn write(
-    folder: FolderFormat,
-    of: &Contents<'_>,
-    views: &mut dyn Views,
-    to: &mut dyn Write,
-) -> Result<usize> {
-    let points_max = of.limits.folder_points_max;
-    let contents = FolderContents { scene: of.scene, texts: of.texts, points_max };
-    folder.write(&contents, &mut Pixels { of, views }, to)
-}
+impl Pixels<'_> {
+    /// Writes the zip; how many photos are in it.
+    fn write(
+        &mut self,
+        folder: FolderFormat,
+        texts: &[String],
+        to: &mut dyn Write,
+    ) -> Result<usize> {
+        let (scene, points_max) = (&*Arc::clone(&self.scene), self.limits.folder_points_max);
+        folder.write(&FolderContents { scene, texts, points_max }, self, to)
+    }
 
-/// The photos of an upload and the views of a scene, by the number of the photo.
-struct Pixels<'a> {
-    of: &'a Contents<'a>,
-    views: &'a mut dyn Views,
+    /// Does the work of a view, which scores so many texts, when it is its turn. Blocks.
+    fn draw<T: Send + 'static>(
+        &self,
+        view: &Resolved,
+        texts: usize,
+        work: impl FnOnce(&mut Work) -> Result<T> + Send + 'static,
+    ) -> Result<T> {
+        let Some(Turns { inner, runtime, until }) = &self.turns else {
+            return work(&mut Work::default());
+        };
+        let demand = Demand::view(&self.caller, view.pixels()).with_texts(texts, 0);
+        let deadline = (*until).min(inner.deadline(&ViewOptions::default()));
+        runtime.block_on(inner.scheduled(demand, deadline, "a view of the folder", work))
+    }
 }
 
 impl FolderPixels for Pixels<'_> {
     fn photos(&mut self, put: &mut PutPhoto<'_>) -> Result<()> {
-        let Some(upload) = self.of.upload.filter(|upload| upload.splats.is_none()) else {
+        let Some(upload) = self.upload.filter(|upload| upload.splats.is_none()) else {
             return Ok(());
         };
         let mut numbers = 0..;
-        each(upload, self.of.limits, |sent| {
+        each(upload, &self.limits, |sent| {
             let Some(i) = numbers.next() else { return Ok(()) };
             let [w, h] = [sent.camera.intrinsics.width, sent.camera.intrinsics.height];
             // Under other limits than those of its time a scene has other photos.
@@ -93,7 +111,7 @@ impl FolderPixels for Pixels<'_> {
                 let k = of.camera.intrinsics;
                 of.file == sent.file && [k.width, k.height] == [w, h]
             };
-            let Some(_) = self.of.scene.meta.cameras.get(i).filter(same) else { return Ok(()) };
+            let Some(_) = self.scene.meta.cameras.get(i).filter(same) else { return Ok(()) };
             match sent.pixels {
                 SentPixels::File(bytes) => put(i, PhotoFile::Sent(bytes)),
                 SentPixels::Made(pixels) => put(i, PhotoFile::Png(png(pixels)?)),
@@ -102,13 +120,22 @@ impl FolderPixels for Pixels<'_> {
     }
 
     fn depth(&mut self, photo: usize) -> Result<Vec<f32>> {
-        self.views.depth(&self.of.views[photo])
+        let view = self.views[photo].clone();
+        let (backend, scene) = (Arc::clone(&self.backend), Arc::clone(&self.scene));
+        let kinds = Kinds { depth: true, ..Kinds::NONE };
+        self.draw(&self.views[photo], 0, move |work| {
+            let frame = backend.renderer.render(&scene.gaussians, &view.request(&scene, kinds))?;
+            work.leave_renderer();
+            frame.depth.ok_or_else(|| Error::internal("the renderer gave no depth"))
+        })
     }
 
     fn masks(&mut self, photo: usize) -> Result<Vec<FolderMask>> {
-        let mask =
-            |TextView { mask_rle, area, bbox, .. }| FolderMask { mask: mask_rle, area, bbox };
-        Ok(self.views.masks(&self.of.views[photo])?.into_iter().map(mask).collect())
+        let Some(texts) = self.scored.clone() else { return Ok(Vec::new()) };
+        let (limits, view) = (Arc::clone(&self.limits), self.views[photo].clone());
+        self.draw(&self.views[photo], texts.texts.len(), move |work| {
+            masks_of(&texts, &limits, &view, work)
+        })
     }
 }
 
@@ -161,22 +188,19 @@ fn photo_views<'a>(
     Ok(views)
 }
 
-/// The depth of a view.
-fn depth_of(backend: &Backend, scene: &Scene, view: &Resolved) -> Result<Vec<f32>> {
-    let kinds = Kinds { depth: true, ..Kinds::NONE };
-    let frame = backend.renderer.render(&scene.gaussians, &view.request(scene, kinds))?;
-    frame.depth.ok_or_else(|| Error::internal("the renderer gave no depth"))
-}
-
 /// What each text finds in a view, as a query says it.
 fn masks_of(
     texts: &SceneTexts,
     limits: &Limits,
     view: &Resolved,
     work: &mut Work,
-) -> Result<Vec<TextView>> {
+) -> Result<Vec<FolderMask>> {
     let spec = QuerySpec { boxes: Boxes::None, mask: MaskFormat::Rle, ..QuerySpec::default() };
     let answer = query::answer(texts, limits, &spec, Some(view), work)?;
-    let lost = || Error::internal("a text has no answer in the view");
-    answer.results.into_iter().map(|found| found.view.ok_or_else(lost)).collect()
+    let mask = |found: TextResult| {
+        let lost = || Error::internal("a text has no answer in the view");
+        let TextView { mask_rle, area, bbox, .. } = found.view.ok_or_else(lost)?;
+        Ok(FolderMask { mask: mask_rle, area, bbox })
+    };
+    answer.results.into_iter().map(mask).collect()
 }

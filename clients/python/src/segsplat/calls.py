@@ -9,7 +9,7 @@ import posixpath
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from uuid import uuid4
@@ -32,6 +32,7 @@ from .photos import fit
 from .progress import show_bar
 from .types import (
     Box,
+    CallerLimits,
     Camera,
     Event,
     ExportCall,
@@ -59,6 +60,7 @@ from .wire import (
     Read,
     Request,
     ServerSentEvents,
+    meet,
     pause,
     send,
 )
@@ -66,15 +68,14 @@ from .wire import (
 if TYPE_CHECKING:
     from viser import ViserServer
 
-#: Cameras of one call; more go as more calls.
-CAMERAS_MAX = 64
-
 #: Endings of photos and of files of cameras; files of COLMAP and folders of phones that are not
 #: read.
-PHOTOS = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp"})
+PHOTOS = frozenset({".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", ".bmp"})
 CAMERAS = frozenset({".json", ".txt", ".bin", ".npy", ".traj", ".pincam"})
 #: Photos of formats that are not read, and what to do.
-OTHER_PHOTOS = frozenset({".heic", ".heif", ".avif", ".tif", ".tiff", ".bmp", ".dng", ".jxl"})
+OTHER_PHOTOS = frozenset({".heic", ".heif", ".avif", ".dng", ".jxl"})
+#: Folders of masks.
+MASKS = re.compile(r"masks?(_\d+)?", re.IGNORECASE)
 AS_JPEG = (
     "export it as JPEG (iPhone: Settings, Camera, Formats, Most Compatible; a Mac: Preview, Export)"
 )
@@ -118,21 +119,28 @@ def create(
     source: Source,
     options: SceneOptions,
     idempotency_key: str | None,
+    masks: str | Path | None = None,
 ) -> Flow[Shown]:
     """Uploads photos. A second try never makes a second scene: both carry one key."""
+    if not policy.limits:
+        yield from meet(policy)
     request = Request(
         "POST",
         "/v1/scenes",
         params={name.removesuffix("_"): value for name, value in options.items()},
-        upload=parts_of(source),
+        upload=parts_of(source, policy.limits) + masks_in(masks),
         headers={"idempotency-key": idempotency_key or str(uuid4())},
     )
     answer = yield from send(policy, request)
     return parse(SceneStatus, _json(answer.body)), ()
 
 
-def parts_of(source: Source) -> list[Part]:
-    """The parts of an upload. Photos are read while they are sent."""
+def parts_of(source: Source, limits: CallerLimits | None = None) -> list[Part]:
+    """The parts of an upload. Photos are read while they are sent.
+
+    limits: those of the server, for which photos are chosen and made smaller; None: all go as they
+        are.
+    """
     if isinstance(source, Mapping):
         if not source:
             raise InvalidRequest("there are no photos")
@@ -142,7 +150,8 @@ def parts_of(source: Source) -> list[Part]:
         told = zip(names, source.values(), strict=True)
         cameras = [{"file": name, **camera.to_json()} for name, camera in told]
         parts = [Part("cameras", "cameras.json", json.dumps({"cameras": cameras}).encode())]
-        return parts + fit([Part("photo", *one) for one in zip(names, files, strict=True)])[0]
+        photos = [Part("photo", *one) for one in zip(names, files, strict=True)]
+        return parts + fit(photos, limits)[0]
     path = Path(source)
     if path.suffix.lower() in SPLATS and not path.is_dir():
         return [Part("splats", path.name, path)]
@@ -152,7 +161,7 @@ def parts_of(source: Source) -> list[Part]:
         raise FileNotFoundError(f"{path}: there is no such file or folder")
     for field in ("transforms", "cameras"):
         if (path / f"{field}.json").is_file():
-            return _described(path, field)
+            return _described(path, field, limits)
     files = sorted(file for file in path.rglob("*") if _belongs(file.relative_to(path)))
     parts = [Part("photo", file.relative_to(path).as_posix(), file) for file in files]
     photos = [part for part in parts if Path(part.name).suffix.lower() in PHOTOS]
@@ -164,10 +173,21 @@ def parts_of(source: Source) -> list[Part]:
         )
     # COLMAP says the size of its photos, so they may be made smaller. Not all layouts do.
     is_colmap = any(Path(part.name).name in ("cameras.bin", "cameras.txt") for part in cameras_of)
-    return [*fit(photos, is_colmap)[0], *cameras_of]
+    return [*fit(photos, limits, is_colmap)[0], *cameras_of]
 
 
-def _described(folder: Path, field: str) -> list[Part]:
+def masks_in(folder: str | Path | None) -> list[Part]:
+    """The parts of a folder with masks, each named as its photo."""
+    if folder is None:
+        return []
+    top = Path(folder)
+    files = sorted(file for file in top.rglob("*") if file.suffix.lower() in PHOTOS)
+    if not files:
+        raise FileNotFoundError(f"{top}: no folder with masks of photos")
+    return [Part("photo", f"masks/{file.relative_to(top).as_posix()}", file) for file in files]
+
+
+def _described(folder: Path, field: str, limits: CallerLimits | None) -> list[Part]:
     """The parts of a folder with one file of cameras, and those of its photos that are there."""
     file = folder / f"{field}.json"
     read, entries, names = _entries_of(file)
@@ -184,7 +204,8 @@ def _described(folder: Path, field: str) -> list[Part]:
         for entry, photo in zip(entries, found, strict=True)
         if photo
     ]
-    photos, sizes = fit([part for _, part in there])
+    photos, sizes = fit([part for _, part in there], limits)
+    photos += _masks_of(folder, entries, {part.name for _, part in there})
     if not sizes or field == "cameras":
         return [Part(field, file.name, file), *photos]
     for entry, part in there:
@@ -202,6 +223,7 @@ def _matched(folder: Path, names: Sequence[str]) -> list[Path | None]:
     wanted = [re.sub(r"^(\.\.?/)+", "", name.replace("\\", "/")) for name in names]
     found: list[Path | None] = [None] * len(names)
     free = {file: file.relative_to(folder).as_posix() for file in files}
+    free = {file: path for file, path in free.items() if not _is_mask(path)} or free
     # Whole paths are settled first for all, so that a shared file name never takes a photo.
     for level in (str, _stem, posixpath.basename, lambda path: _stem(posixpath.basename(path))):
         places = {level(path): file for file, path in free.items()}
@@ -211,6 +233,24 @@ def _matched(folder: Path, names: Sequence[str]) -> list[Path | None]:
                 found[i] = places[key]
                 del free[places[key]]
     return found
+
+
+def _masks_of(folder: Path, entries: Sequence[Mapping[str, Any]], photos: Set[str]) -> list[Part]:
+    """The masks that a description names: the server knows whose they are."""
+    said = (str(entry.get("mask_path") or "") for entry in entries)
+    named = {name.replace("\\", "/") for name in said if name}
+    ends = tuple("/" + re.sub(r"^(\.\.?/)+", "", name) for name in named)
+    parts = []
+    for file in sorted(file for file in folder.rglob("*") if file.suffix.lower() in PHOTOS):
+        path = file.relative_to(folder).as_posix()
+        if path not in photos and f"/{path}".endswith(ends):
+            parts.append(Part("photo", path, file))
+    return parts
+
+
+def _is_mask(path: str) -> bool:
+    """Whether a file lies in a folder of masks."""
+    return any(MASKS.fullmatch(part) for part in path.split("/")[:-1])
 
 
 def _stem(path: str) -> str:
@@ -400,8 +440,13 @@ def views(
         on: the camera's options of `view`.
     """
     cameras = [_camera(dict(spot)) for spot in viewpoints]
-    for start in range(0, len(cameras), CAMERAS_MAX):
-        batch = cameras[start : start + CAMERAS_MAX]
+    if not scene.policy.limits:
+        yield from meet(scene.policy)
+    limits = scene.policy.limits
+    # More go as more calls.
+    most = limits.cameras_max if limits else len(cameras)
+    for start in range(0, len(cameras), most or 1):
+        batch = cameras[start : start + most]
         yield from _views(scene, batch, _kinds(kinds), text, _drawing(dict(options)), None)
 
 
@@ -475,13 +520,7 @@ def query(
         # The size belongs to the drawing.
         fields.update({side: camera.pop(side) for side in ("width", "height") if side in camera})
         fields["camera"] = camera
-        if not spot.keys() - {"from_"} and not rest.keys() & {"width", "height"}:
-            if not scene.shown[1]:
-                yield from refresh(scene)
-            photos = scene.shown[1]
-            if spot.get("from_", 0) in range(len(photos)):
-                photo = photos[spot.get("from_", 0)].camera
-                fields.update(width=photo.width, height=photo.height)
+        fields.update((yield from _size_of_photo(scene, spot, rest)))
     request = Request("POST", f"/v1/scenes/{scene.id}/query", json=_given(fields))
     return Matches(_json((yield from send(scene.policy, request)).body))
 
@@ -493,10 +532,12 @@ def pick(
 
     x, y: pixels of the view; the centre of the first is (0.5, 0.5).
     labels: texts that may name it.
-    from_, eye, camera, width and so on: the view, as in `view`; by default that of the first photo.
+    from_, eye, camera, width and so on: the view, as in `query`: a pixel of a photo, or of a mask
+        of it, is that of the view.
     """
     spot, rest = _split(dict(options))
     fields = {**_camera(spot), **_drawing(rest), "x": x, "y": y, "label": list(labels)}
+    fields.update((yield from _size_of_photo(scene, spot, rest)))
     params = _given(fields)
     request = Request("GET", f"/v1/scenes/{scene.id}/pick", params=params)
     return parse(Picked, _json((yield from send(scene.policy, request)).body))
@@ -512,7 +553,8 @@ def features(
     kind: "weights", E: `size` (height, width), `offsets`, `entries` and `weights`; the entries of
         pixel i are those from `offsets[i]` to `offsets[i + 1]`. "features", F: `features`
         [H, W, D] of length 1, zeros where nothing is.
-    from_, eye, camera, width and so on: the view, as in `view`; by default that of the first photo.
+    from_, eye, camera, width and so on: the view, as in `view`; by default that of the first photo,
+        at most 384 pixels wide or high: the features of a whole photo take gigabytes.
     """
     spot, rest = _split(dict(options))
     params = _given({**_camera(spot), **_drawing(rest), "kind": kind})
@@ -520,6 +562,21 @@ def features(
     file = io.BytesIO((yield from send(scene.policy, request)).body)
     with np.load(file) as arrays:
         return dict(arrays)
+
+
+def _size_of_photo(
+    scene: Handle, spot: Mapping[str, Any], rest: Mapping[str, Any]
+) -> Flow[dict[str, int]]:
+    """Width and height of the photo that a view is of, where it is of one and no size is given."""
+    if spot.keys() - {"from_"} or rest.keys() & {"width", "height"}:
+        return {}
+    if not scene.shown[1]:
+        yield from refresh(scene)
+    photos, which = scene.shown[1], spot.get("from_", 0)
+    if which not in range(len(photos)):
+        return {}
+    camera = photos[which].camera
+    return {"width": camera.width, "height": camera.height}
 
 
 # Files

@@ -213,6 +213,7 @@ class Client(_Connection):
         self,
         source: Source,
         *,
+        masks: str | Path | None = None,
         wait: bool = True,
         progress: Progress = None,
         idempotency_key: str | None = None,
@@ -223,12 +224,15 @@ class Client(_Connection):
         source: a folder with a capture: `transforms.json`, COLMAP, Polycam and others, which the
             server recognises; a zip or tar of one; `{"photo.jpg": Camera(...)}`; or a file of
             Gaussians (PLY, SPZ, SOG, GLB, .splat), which needs no photos.
+        masks: a folder with masks, each named as its photo (`0001.png` or `0001.jpg.png`): what is
+            black in them takes no part in the scene. Those that a `transforms.json` names, and
+            those in a folder `masks` beside COLMAP's cameras, are found without it.
         wait: False gives the scene at once; `scene.wait()` waits for it.
         progress: True shows a bar; a function is told of each event; by default a bar on terminals.
         idempotency_key: calls with one key make one scene; by default a new key for each call.
         semantics, density, preset, max_views, bundle: how the scene is made, see `SceneOptions`.
         """
-        made = calls.create(self.policy, source, options, idempotency_key)
+        made = calls.create(self.policy, source, options, idempotency_key, masks)
         scene = Scene(self, self._run(made))
         if wait:
             scene.wait(progress)
@@ -287,13 +291,14 @@ class AsyncClient(_Connection):
         self,
         source: Source,
         *,
+        masks: str | Path | None = None,
         wait: bool = True,
         progress: Progress = None,
         idempotency_key: str | None = None,
         **options: Unpack[SceneOptions],
     ) -> AsyncScene:
         """As `Client.scene`. Photos are read from disk in pieces between the network's turns."""
-        made = calls.create(self.policy, source, options, idempotency_key)
+        made = calls.create(self.policy, source, options, idempotency_key, masks)
         scene = AsyncScene(self, await self._run(made))
         if wait:
             await scene.wait(progress)

@@ -11,43 +11,43 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
+from .types import CallerLimits
 from .wire import Part
-
-#: The server's limits as it ships: photos of a scene, bytes of an upload, pixels of a photo.
-PHOTOS_MAX = 64
-UPLOAD_BYTES_MAX = 256 << 20
-PHOTO_PIXELS_MAX = 24_000_000
-#: What it keeps: a photo's longer side, and pixels of all photos together.
-SIDE_KEPT = 2_048
-PIXELS_KEPT = 50_000_000
 
 #: Width and height of a photo before it was made smaller, by its name.
 Sizes = dict[str, tuple[int, int]]
 
 
-def fit(photos: Sequence[Part], may_shrink: bool = True) -> tuple[list[Part], Sizes]:
+def fit(
+    photos: Sequence[Part], limits: CallerLimits | None, may_shrink: bool = True
+) -> tuple[list[Part], Sizes]:
     """The photos as they are sent. An upload over the limit has some of them, evenly chosen, and
     where that is not enough all are made smaller; so are photos of too many pixels. None gets
     smaller than the server keeps it. A warning tells what was done.
 
+    limits: those of the server; None: the photos go as they are.
     may_shrink: whether the cameras say for which size of the photos they are.
     """
     sent, before = list(photos), _bytes(photos)
-    if before > UPLOAD_BYTES_MAX and len(sent) > PHOTOS_MAX:
-        step = (len(photos) - 1) / (PHOTOS_MAX - 1)
-        sent = [photos[round(i * step)] for i in range(PHOTOS_MAX)]
+    if not limits:
+        return sent, {}
+    most = limits.photos_max
+    if before > limits.upload_bytes_max and len(sent) > most:
+        step = (len(photos) - 1) / max(most - 1, 1)
+        sent = [photos[round(i * step)] for i in range(most)]
         _tell(
-            f"{len(photos)} photos have {before / 1e6:.0f} MB; {PHOTOS_MAX} are sent, evenly "
-            "chosen: a scene takes no more"
+            f"{len(photos)} photos have {before / 1e6:.0f} MB; {most} are sent, evenly chosen: a "
+            "scene takes no more"
         )
     if not may_shrink:
         return sent, {}
-    every = _bytes(sent) > UPLOAD_BYTES_MAX
+    every = _bytes(sent) > limits.upload_bytes_max
+    pixels = limits.photos_pixels_kept_max / max(min(len(sent), most), 1)
     sizes: Sizes = {}
     fitted: list[Part] = []
     for part in sent:
-        small = _smaller(part.content, every, len(sent)) if isinstance(part.content, Path) else None
-        if small:
+        path = part.content if isinstance(part.content, Path) else None
+        if path and (small := _smaller(path, limits, every, pixels)):
             part, sizes[part.name] = dataclasses.replace(part, content=small[0]), small[1]
         fitted.append(part)
     if sizes:
@@ -68,9 +68,11 @@ def _tell(what: str) -> None:
     warnings.warn(what, stacklevel=2)
 
 
-def _smaller(path: Path, every: bool, count: int) -> tuple[bytes, tuple[int, int]] | None:
-    """A photo as small as the server keeps one of so many, and its size before; None where it goes
-    as it is.
+def _smaller(
+    path: Path, limits: CallerLimits, every: bool, pixels: float
+) -> tuple[bytes, tuple[int, int]] | None:
+    """A photo as small as the server keeps one, with so many pixels at most, and its size before;
+    None where it goes as it is.
     """
     try:
         from PIL import Image
@@ -81,9 +83,9 @@ def _smaller(path: Path, every: bool, count: int) -> tuple[bytes, tuple[int, int
     try:
         with Image.open(path) as image:
             width, height = image.size
-            kept = PIXELS_KEPT / min(count, PHOTOS_MAX)
-            scale = min(1, SIDE_KEPT / max(width, height), math.sqrt(kept / (width * height)))
-            if scale == 1 or (not every and width * height <= PHOTO_PIXELS_MAX):
+            side = limits.photo_side_kept_max / max(width, height)
+            scale = min(1, side, math.sqrt(pixels / (width * height)))
+            if scale == 1 or (not every and width * height <= limits.photo_pixels_max):
                 return None
             size = (round(width * scale), round(height * scale))
             kind, exif = image.format, image.info.get("exif", b"")

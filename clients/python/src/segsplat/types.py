@@ -186,6 +186,8 @@ class TextOptions(TypedDict, total=False):
     coverage_floor: float
     #: An entry that fits a text by so much less than the best one (cosine, 0 to 2) is not selected.
     near_best: float
+    #: Difference of cosines to the canonical texts at which the relevancy is 0.5, -2 to 2.
+    margin: float
     #: Seconds to wait for semantics that are being made; the server's limit by default.
     wait: float
 
@@ -246,6 +248,8 @@ class SceneOptions(TypedDict, total=False):
     crop_whole: bool
     #: Whether the crop of a mask has the bundle's margin.
     crop_margin: bool
+    #: Whether the embedding of a mask is also that of its place in the whole photo.
+    context: bool
     #: Rows of the bank over the mean number of masks of a photo.
     lambda_: float
     #: Rows of the bank (M); 0: by `lambda_`.
@@ -490,6 +494,24 @@ class Network:
 
 
 @dataclass(frozen=True)
+class CallerLimits:
+    """What a caller may send and ask for."""
+
+    #: Photos of a scene.
+    photos_max: int
+    #: Bytes of an upload.
+    upload_bytes_max: int
+    #: Pixels of a photo as it is sent.
+    photo_pixels_max: int
+    #: Longer side of a photo as the server keeps it, pixels.
+    photo_side_kept_max: int
+    #: Pixels of all photos of a scene as the server keeps them.
+    photos_pixels_kept_max: int
+    #: Cameras of one call for views.
+    cameras_max: int
+
+
+@dataclass(frozen=True)
 class Models:
     """What makes the scenes."""
 
@@ -502,6 +524,8 @@ class Models:
     words: tuple[KnownWord, ...] = ()
     #: Networks of the bundle.
     models: tuple[Network, ...] = ()
+    #: What a caller may send and ask for; None of a server that does not say.
+    limits: CallerLimits | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -551,6 +575,8 @@ class Match:
     scores: Floats
     #: Entries selected, counted from 1.
     entries: tuple[int, ...]
+    #: Whether the scene has what the text names: some Gaussian is selected.
+    found: bool
     #: Gaussians selected.
     gaussians: int
     #: One box for each connected part, the largest first.
@@ -575,6 +601,7 @@ class Match:
             text=data["text"],
             scores=np.asarray(data["scores"], np.float64),
             entries=tuple(data["entries"]),
+            found=data["found"],
             gaussians=data["gaussians"],
             boxes=tuple(parse(Box, part) for part in data["parts"]),
             warnings=tuple(parse(Doubt, one) for one in data["warnings"]),
@@ -602,6 +629,8 @@ class Scoring:
     cut: float
     #: An entry that fits a text by so much less than the best one (cosine) was not selected.
     near_best: float
+    #: Difference of cosines to the canonical texts at which the relevancy is 0.5.
+    margin: float
 
 
 class Matches(Sequence[Match]):

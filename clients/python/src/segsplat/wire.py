@@ -18,6 +18,7 @@ from typing import Any, Generic, Protocol, TypeAlias, TypeVar
 
 from ._version import __version__
 from .errors import BadAnswer, ConnectionLost, SegSplatError, VersionWarning, error_of
+from .types import CallerLimits, parse
 
 #: Waiting times of a lost connection, seconds.
 BACKOFF_S = (0.25, 0.5, 1.0, 2.0)
@@ -117,13 +118,14 @@ class Policy:
     retry_wait_max: float
     #: Whether the server's version is yet to be looked at.
     version_unseen: bool = True
+    #: What the server takes at once; None where it has not said.
+    limits: CallerLimits | None = None
 
 
 def send(policy: Policy, request: Request) -> Flow[Answer]:
     """Sends a request, again after the time that the server names, or when the connection broke."""
     if policy.version_unseen:
-        policy.version_unseen = False
-        yield from check_version()
+        yield from meet(policy)
     for again in itertools.count():
         try:
             answer: Answer = yield request
@@ -146,11 +148,16 @@ def pause(policy: Policy, error: SegSplatError, again: int) -> Flow[None]:
     yield Sleep(wait)
 
 
-def check_version() -> Flow[None]:
-    """Warns where the server is of another version. A server that does not say is left alone."""
+def meet(policy: Policy) -> Flow[None]:
+    """Learns the limits of the server, and warns where it is of another version. A server that does
+    not say is left alone.
+    """
+    policy.version_unseen = False
     try:
         answer: Answer = yield Request("GET", "/v1/models")
-        server = str(json.loads(answer.body)["server_version"])
+        told = json.loads(answer.body)
+        server = str(told["server_version"])
+        policy.limits = parse(CallerLimits, told["limits"]) if told.get("limits") else None
     except (SegSplatError, ValueError, KeyError, TypeError):
         return
     if server.split(".")[:2] != __version__.split(".")[:2]:

@@ -175,6 +175,9 @@ method! {
     crop_whole: bool = false, true;
     /// Whether the crop of a mask has the bundle's margin.
     crop_margin: bool = true, false;
+    /// Whether the embedding of a mask is also that of its place in the whole photo, where the
+    /// bundle's image tower gives one.
+    context: bool = true, false;
     /// Rows of the bank over the mean number of masks of a photo.
     lambda: f64 = 1.2, 1.2;
     /// Rows of the bank (M); 0: by `lambda`.
@@ -250,6 +253,8 @@ pub struct ScoringMethod {
     pub tau: f64,
     /// Coverage under which a pixel has no relevancy, 0..1.
     pub coverage_floor: f64,
+    /// Difference of cosines to the canonical texts at which the relevancy is 0.5, -2 to 2.
+    pub margin: f64,
     /// Relevancy from which a text selects, 0..1.
     pub cut: f64,
     /// An entry that fits a text by so much less than the best one (cosine, 0..2) is not selected.
@@ -269,13 +274,20 @@ impl ScoringMethod {
     pub const NEAR_BEST_MAX: f64 = 2.0;
 
     /// The values of a preset; `default` takes those of the bundle.
-    pub fn of(preset: Preset, canon: Vec<String>, tau: f64, coverage_floor: f64) -> Self {
+    pub fn of(
+        preset: Preset,
+        canon: Vec<String>,
+        tau: f64,
+        coverage_floor: f64,
+        margin: f64,
+    ) -> Self {
         match preset {
             Preset::Default => Self {
                 unit_rows: true,
                 canon,
                 tau,
                 coverage_floor,
+                margin,
                 cut: Self::CUT,
                 near_best: Self::NEAR_BEST,
             },
@@ -284,6 +296,7 @@ impl ScoringMethod {
                 canon: Self::CANON.map(str::to_owned).to_vec(),
                 tau: Self::TAU,
                 coverage_floor: 0.0,
+                margin: 0.0,
                 cut: Self::CUT,
                 near_best: Self::NEAR_BEST_MAX,
             },
@@ -303,6 +316,7 @@ impl ScoringMethod {
         }
         within("tau", self.tau, TAU_RANGE)?;
         within("coverage_floor", self.coverage_floor, [0.0, 1.0])?;
+        within("margin", self.margin, [-2.0, 2.0])?;
         within("cut", self.cut, [0.0, 1.0])?;
         within("near_best", self.near_best, [0.0, Self::NEAR_BEST_MAX])
     }
@@ -348,7 +362,7 @@ mod tests {
         assert_eq!(lambda, "lambda is 0; it must be 0.01 to 100");
         assert!(bad(Method { lambda: f64::NAN, ..Method::default() }).contains("lambda is NaN"));
         assert!(bad(Method { bank_rows: 5000, ..Method::default() }).contains("0 to 4096"));
-        let scoring = ScoringMethod::of(Preset::Paper, Vec::new(), 0.0, 0.0);
+        let scoring = ScoringMethod::of(Preset::Paper, Vec::new(), 0.0, 0.0, 0.0);
         scoring.check().unwrap();
         assert!(ScoringMethod { cut: 1.5, ..scoring.clone() }.check().is_err());
         assert!(ScoringMethod { canon: Vec::new(), ..scoring }.check().is_err());

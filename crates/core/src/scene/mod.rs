@@ -37,8 +37,8 @@ pub use photo::{Crop, CropShape, Photo, PosedPhoto, photo_label};
 pub use refinement::{Refine, RefineReport, RefineState, RefineStatus};
 pub use report::{DropCount, HealthReport, StageTime, Warning, WarningCode};
 pub use semantics::{
-    Bank, BankMask, IndexMap, JudgedMasks, MaskInfo, MaskJudging, MaskLogits, OverlapNms,
-    PhotoMasks, Semantics, SemanticsReport, TextEmbedding,
+    Bank, BankMask, DenseFeatures, IndexMap, JudgedMasks, MaskInfo, MaskJudging, MaskLogits,
+    OverlapNms, PhotoMasks, Semantics, SemanticsReport, TextEmbedding,
 };
 pub use stage::{Stage, Watch, unless_cancelled};
 pub use status::{Event, SceneCamera, SceneState, SceneStatus, SemanticsState, SemanticsStatus};

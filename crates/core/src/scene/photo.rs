@@ -13,7 +13,10 @@ pub struct Photo {
     pub height: u32,
     /// `[height * width * 3]`, sRGB as stored.
     pub rgb: Vec<u8>,
-    /// `[height * width]`, false where undistortion found no source; `None` when all have one.
+    /// `[height * width]`, the photo's mask: false where a pixel takes no part in the scene: when
+    /// undistortion found no source for it, it is transparent, or the mask that was sent leaves it
+    /// out. `None` when all take part. Gaussians, steps of refinement and names come from valid
+    /// pixels alone.
     pub valid: Option<Vec<bool>>,
 }
 

@@ -35,6 +35,19 @@ pub enum WarningCode {
     SamePicture,
     /// The capture holds cameras of several kinds or places; the message says which were taken.
     CamerasChosen,
+    /// Photos that were turned as their EXIF orientation says, that could be and were not, or that
+    /// fit their cameras only when they are turned.
+    PhotosTurned,
+    /// Photos with a mask: what it leaves out takes no part in the scene.
+    MasksUsed,
+    /// Photos too large to be decoded whole, which were read at a smaller scale.
+    PhotosReduced,
+    /// Keys of a camera file that change what its numbers mean and are not read.
+    KeysUnread,
+    /// Rotations with a scale, which was taken out.
+    PosesScaled,
+    /// A lens that leaves most of a photo without a source, or that seems to be undone already.
+    LensDoubtful,
 }
 
 crate::names::display_names!(WarningCode);

@@ -108,6 +108,17 @@ pub struct JudgedMasks {
     pub predicted_iou: Vec<f32>,
 }
 
+/// Features of a photo on a coarse grid over all of it; cells need not be square.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct DenseFeatures {
+    /// Columns.
+    pub columns: usize,
+    /// Rows.
+    pub rows: usize,
+    /// `[D * rows * columns]`. The mean over cells is an embedding, of any length.
+    pub data: Vec<f32>,
+}
+
 /// A text as the text tower sees it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TextEmbedding {

@@ -7,15 +7,15 @@
 //! of a scene: `test_frames`, those of `test_filenames` and `val_filenames` that are not in
 //! `train_filenames`, and those of `ScanNet++` with `is_bad`.
 
-use std::collections::HashSet;
+use std::collections::{BTreeSet, HashSet};
 
 use glam::DMat3;
 use serde_json::{Map, Value};
 
-use super::{lens::Lens, numbers};
+use super::{keys, lens::Lens, numbers, once::Once};
 use crate::{
     error::{Error, Result},
-    scene::{CameraToWorld, photo_label as label},
+    scene::{CameraToWorld, ORTHONORMAL_TOLERANCE, photo_label as label},
 };
 
 /// Axes of the camera in an uploaded pose.
@@ -34,6 +34,8 @@ pub(crate) struct CameraEntry {
     pub(crate) file: String,
     /// Lens as written.
     pub(crate) lens: Lens,
+    /// Path of its photo's mask as written.
+    pub(crate) mask: Option<String>,
     axes: PoseAxes,
     /// Camera-to-world, row-major, as written.
     pose: std::result::Result<[f64; 16], String>,
@@ -42,16 +44,33 @@ pub(crate) struct CameraEntry {
 impl CameraEntry {
     /// A camera of a photo; `pose` is camera-to-world, row-major.
     pub(crate) fn new(file: String, lens: Lens, axes: PoseAxes, pose: [f64; 16]) -> Self {
-        Self { file, lens, axes, pose: Ok(pose) }
+        Self { file, lens, mask: None, axes, pose: Ok(pose) }
     }
 
-    /// The pose, checked.
+    /// The pose, checked; without the scale of its rotation, where it has one.
     pub(crate) fn pose(&self, what: &str) -> Result<CameraToWorld> {
-        let pose = self.pose.clone().map_err(Error::invalid)?;
+        let mut pose = self.pose.clone().map_err(Error::invalid)?;
+        if let Some(scale) = self.scale() {
+            for row in 0..3 {
+                pose[4 * row..4 * row + 3].iter_mut().for_each(|v| *v /= scale);
+            }
+        }
         match self.axes {
             PoseAxes::OpenGl => CameraToWorld::from_opengl_row_major(&pose, what),
             PoseAxes::OpenCv => CameraToWorld::from_row_major(&pose, what),
         }
+    }
+
+    /// The scale of a pose whose rotation is one times a number: a similarity. The rays of a camera
+    /// go the same ways whatever that number is, from the same centre.
+    pub(crate) fn scale(&self) -> Option<f64> {
+        let m = self.pose.as_ref().ok()?;
+        let r = DMat3::from_cols_array(&[m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]]);
+        let scale = r.determinant().abs().cbrt();
+        let off = (r * r.transpose() * (1.0 / (scale * scale)) - DMat3::IDENTITY).to_cols_array();
+        let is_similar = off.iter().all(|v| v.abs() <= ORTHONORMAL_TOLERANCE);
+        let is_scaled = (scale * scale - 1.0).abs() > ORTHONORMAL_TOLERANCE;
+        (is_scaled && is_similar).then_some(scale)
     }
 }
 
@@ -62,6 +81,8 @@ pub(crate) struct Cameras {
     pub(crate) entries: Vec<CameraEntry>,
     /// Photos that it keeps for tests.
     pub(crate) held_out: Vec<String>,
+    /// Keys that change what is meant and are not read.
+    pub(crate) unread: BTreeSet<String>,
 }
 
 /// A `transforms.json`, whose size was checked.
@@ -120,15 +141,21 @@ fn list(
         }
         None => return Err(Error::invalid(format!("{part}: the list `{list_key}` is missing"))),
     };
+    keys::check(top, part)?;
+    let mut unread: BTreeSet<String> = keys::unread(top).collect();
     let entry = |(i, value): (usize, &Value)| match value {
-        Value::Object(fields) => read(i, fields, top),
+        Value::Object(fields) => {
+            keys::check(fields, &format!("{part}: {list_key}[{i}]"))?;
+            unread.extend(keys::unread(fields));
+            read(i, fields, top)
+        }
         other => {
             let kind = kind(other);
             Err(Error::invalid(format!("{part}: {list_key}[{i}] is {kind}, not an object")))
         }
     };
     let entries = list.iter().enumerate().map(entry).collect::<Result<_>>()?;
-    Ok(Cameras { entries, held_out: Vec::new() })
+    Ok(Cameras { entries, held_out: Vec::new(), unread })
 }
 
 /// The object of a JSON text; `part` names it in messages.
@@ -139,7 +166,7 @@ pub(crate) fn object(bytes: &[u8], part: &str) -> Result<Fields> {
     }
 }
 
-/// The value of a JSON text; `part` names it in messages.
+/// The value of a JSON text, in which no key has two values; `part` names it in messages.
 pub(crate) fn json(bytes: &[u8], part: &str) -> Result<Value> {
     let text = numbers::text(bytes, part)?;
     let parsed = serde_json::from_str(&text).or_else(|e| {
@@ -147,7 +174,8 @@ pub(crate) fn json(bytes: &[u8], part: &str) -> Result<Value> {
         // name the photo whose number it is.
         without_bare_nan(&text).map_or(Err(e), |text| serde_json::from_str(&text))
     });
-    parsed.map_err(|e| Error::invalid(format!("{part}: not valid JSON ({e})")))
+    let value = parsed.map(|Once(value)| value);
+    value.map_err(|e| Error::invalid(format!("{part}: not valid JSON ({e})")))
 }
 
 /// The text with bare `NaN`, `Infinity`, `-Infinity` as `null`; `None` when there are none.
@@ -274,7 +302,8 @@ fn transforms_frame(i: usize, frame: &Fields, top: &Fields) -> Result<CameraEntr
         read_distortion(&mut lens, scope, &what)?;
     }
     let pose = matrix(frame.get("transform_matrix"), "transform_matrix", &what);
-    Ok(CameraEntry { file, lens, axes: PoseAxes::OpenGl, pose })
+    let mask = text(frame, "mask_path", &what)?;
+    Ok(CameraEntry { file, lens, mask, axes: PoseAxes::OpenGl, pose })
 }
 
 /// One entry of our own JSON.
@@ -302,7 +331,8 @@ fn cameras_entry(i: usize, entry: &Fields, _top: &Fields) -> Result<CameraEntry>
     };
     read_distortion(&mut lens, fields, &what)?;
     let pose = matrix(entry.get("camera_to_world"), "camera_to_world", &what);
-    Ok(CameraEntry { file, lens, axes: PoseAxes::OpenCv, pose })
+    let mask = text(entry, "mask_path", &what)?;
+    Ok(CameraEntry { file, lens, mask, axes: PoseAxes::OpenCv, pose })
 }
 
 /// One entry of the list that 3DGS writes beside a training (`camera_to_JSON` in its
@@ -332,7 +362,7 @@ fn gaussian_splatting_entry(i: usize, entry: &Fields, _top: &Fields) -> Result<C
         }
         _ => Err(format!("{what}: rotation must be 3 rows of 3 numbers, position 3 numbers")),
     };
-    Ok(CameraEntry { file, lens, axes: PoseAxes::OpenCv, pose })
+    Ok(CameraEntry { file, lens, mask: None, axes: PoseAxes::OpenCv, pose })
 }
 
 fn read_distortion(lens: &mut Lens, scope: &Fields, what: &str) -> Result<()> {
@@ -343,8 +373,8 @@ fn read_distortion(lens: &mut Lens, scope: &Fields, what: &str) -> Result<()> {
     if lens.model.is_none() {
         lens.model = text(scope, "camera_model", what)?;
     }
-    if let Some(Value::Bool(fisheye)) = scope.get("is_fisheye") {
-        lens.is_fisheye = lens.is_fisheye.or(Some(*fisheye));
+    if let Some(fisheye) = scope.get("is_fisheye") {
+        lens.is_fisheye = lens.is_fisheye.or(Some(keys::says_something(fisheye)));
     }
     Ok(())
 }

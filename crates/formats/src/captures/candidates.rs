@@ -8,7 +8,7 @@
 
 use std::{
     cmp::Reverse,
-    collections::{BTreeMap, HashSet},
+    collections::{BTreeMap, BTreeSet, HashSet},
 };
 
 use super::{
@@ -46,6 +46,8 @@ pub(super) struct Candidate {
     seen: Seen,
     pub(super) entries: Vec<CameraEntry>,
     pub(super) held_out: Vec<String>,
+    /// Keys of the camera file that are not read.
+    pub(super) unread: BTreeSet<String>,
     pub(super) place: Place,
     /// Paths of the photos, from the top of the place.
     pub(super) sent: Vec<String>,
@@ -62,7 +64,7 @@ impl Candidate {
         folder.take_cameras_read();
         let described = seen.layout.read(folder, &seen.at)?;
         let files = folder.take_cameras_read();
-        let Cameras { mut entries, mut held_out } = described.cameras;
+        let Cameras { mut entries, mut held_out, unread } = described.cameras;
         entries.retain(|entry| {
             let kept = !tests.contains(names::file_name(&entry.file));
             if !kept {
@@ -76,14 +78,20 @@ impl Candidate {
         }
         let place = places::find(folder, &described.root, &entries)?;
         let inside = |path: &'_ str| {
-            let is_there = names::is_photo(path) && place.dirs.contains(names::folder(path));
+            let is_there = folder.is_photo(path) && place.dirs.contains(names::folder(path));
             let rest = path.strip_prefix(&place.top).unwrap_or(path);
             is_there.then(|| rest.trim_start_matches('/').to_owned())
         };
         let sent: Vec<String> = folder.paths().filter_map(inside).collect();
         let names: Vec<&str> = sent.iter().map(String::as_str).collect();
         let (pairs, missing) = paired(&entries, &names)?;
-        Ok(Self { seen: seen.clone(), entries, held_out, place, sent, pairs, missing, files })
+        let seen = seen.clone();
+        Ok(Self { seen, entries, held_out, unread, place, sent, pairs, missing, files })
+    }
+
+    /// Whether a folder `masks` beside its photos holds their masks.
+    pub(super) fn has_mask_folder(&self) -> bool {
+        self.seen.layout.has_mask_folder()
     }
 
     /// How good it is beside one with `most` photos.
@@ -119,8 +127,10 @@ impl Candidate {
         if self.seen.class == other.seen.class
             && self.seen.layout.name() == other.seen.layout.name()
         {
-            return self.seen.depth() == other.seen.depth()
-                && model(&self.seen) != model(&other.seen);
+            // `dense/sparse` is a model of what `sparse/0` is one of.
+            let (own, of_other) = (model(&self.seen), model(&other.seen));
+            let is_of_same = own.ends_with(&of_other) || of_other.ends_with(&own);
+            return self.seen.depth() == other.seen.depth() && !is_of_same;
         }
         let (own, of_other) = (self.stems(), other.stems());
         2 * own.intersection(&of_other).count() < of_other.len()

@@ -219,9 +219,21 @@ impl<'a> Folder<'a> {
         Ok(())
     }
 
+    /// Whether it is the parts of a form.
+    pub(crate) fn is_form(&self) -> bool {
+        matches!(self.source, Source::Form(_))
+    }
+
     /// All paths, sorted.
     pub(crate) fn paths(&self) -> impl Iterator<Item = &str> {
         self.files.keys().map(String::as_str)
+    }
+
+    /// Whether a file is a photo: by its extension; where that is none or of a format that is not
+    /// read, by what the file holds.
+    pub(crate) fn is_photo(&self, path: &str) -> bool {
+        let may_be = names::is_other_photo(path) || !names::file_name(path).contains('.');
+        names::is_photo(path) || may_be && self.head(path, 16).is_ok_and(|head| is_read(&head))
     }
 
     /// Whether there is a file of this path.
@@ -359,6 +371,13 @@ impl<'a> Folder<'a> {
         self.unpacked.set(all);
         Ok(())
     }
+}
+
+/// Whether a file that begins so is a photo of a format that is read. No TIFF: raw files of cameras
+/// begin as such.
+fn is_read(head: &[u8]) -> bool {
+    use image::ImageFormat::{Bmp, Jpeg, Png, WebP};
+    image::guess_format(head).is_ok_and(|format| matches!(format, Bmp | Jpeg | Png | WebP))
 }
 
 fn over(path: &str, bytes: u64, limits: &Limits) -> Error {

@@ -7,7 +7,8 @@ pub(crate) use super::{
     lens::{Base, Lens, Terms},
     names,
     numbers::{
-        inverse, inverse_of_rows, number_of, numbers, numbers_of, pinhole, pose, rotation, text,
+        Decimals, inverse, inverse_of_rows, number_of, numbers, numbers_of, pinhole, pose,
+        rotation, text,
     },
 };
 use crate::error::{Error, Result};
@@ -16,6 +17,11 @@ use crate::error::{Error, Result};
 pub(crate) trait Layout: Sync {
     /// Its name in messages.
     fn name(&self) -> &'static str;
+
+    /// Whether a folder `masks` beside the photos holds their masks.
+    fn has_mask_folder(&self) -> bool {
+        false
+    }
 
     /// Where each capture of this layout begins: a camera file, or the folder of several.
     fn find(&self, folder: &Folder<'_>) -> Vec<String>;
@@ -33,7 +39,8 @@ pub(crate) struct Described {
 
 impl Described {
     pub(crate) fn new(root: &str, entries: Vec<CameraEntry>) -> Self {
-        Self { root: root.to_owned(), cameras: cameras::Cameras { entries, held_out: Vec::new() } }
+        let cameras = cameras::Cameras { entries, ..cameras::Cameras::default() };
+        Self { root: root.to_owned(), cameras }
     }
 }
 

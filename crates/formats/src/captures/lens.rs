@@ -16,11 +16,12 @@ use crate::{
 const PERSPECTIVE: [&str; 6] =
     ["PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"];
 /// Models whose radial terms act on the angle.
-const FISHEYE: [&str; 3] = ["OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"];
+const FISHEYE: [&str; 5] =
+    ["OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE"];
 
 /// How the sizes of cameras fit those of photos, the worst first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(crate) enum Sizes {
+pub enum Sizes {
     /// Another aspect: the photos would be refused.
     Contradict,
     /// Photos that cannot be read.
@@ -178,6 +179,7 @@ impl Lens {
     pub fn at_size(&self, width: u32, height: u32, what: &str) -> Result<LensAtSize> {
         let stated = self.stated_size(what)?;
         let [w, h] = stated.unwrap_or([width, height]);
+        let terms = self.bending(what)?;
         let focal = |name: &str, focal: Option<f64>, angle: Option<f64>, side: u32| {
             if let Some(focal) = focal {
                 return Ok(Some(focal));
@@ -221,17 +223,18 @@ impl Lens {
         if made_for.is_some() && !same_aspect([w, h], [width, height]) {
             return Err(Error::invalid(format!(
                 "{what}: intrinsics are for {w}x{h} px, the photo is {width}x{height} px as \
-                 stored (EXIF orientation is ignored): another aspect, so nothing says how they fit"
+                 stored, and its EXIF orientation does not make it fit: another aspect, so nothing \
+                 says how they fit"
             )));
         }
         let intrinsics = written.resized(width, height);
-        let terms = self.bending(what)?;
         let terms = (!terms.is_none()).then_some(terms);
         Ok(LensAtSize { intrinsics, made_for, terms })
     }
 
     /// How the size that is written fits that of a photo.
-    pub(crate) fn sizes(&self, photo: [u32; 2]) -> Sizes {
+    #[must_use]
+    pub fn sizes(&self, photo: [u32; 2]) -> Sizes {
         match self.stated_size("") {
             Ok(None) => Sizes::Fit,
             Ok(Some(stated)) if stated == photo => Sizes::Fit,
@@ -265,14 +268,15 @@ impl Lens {
     }
 
     fn is_fisheye_model(&self, what: &str) -> Result<bool> {
+        let is_one = |all: &[&str], model: &str| all.iter().any(|m| m.eq_ignore_ascii_case(model));
         let named = match self.model.as_deref() {
             None => false,
-            Some(model) if PERSPECTIVE.contains(&model) => false,
-            Some(model) if FISHEYE.contains(&model) => true,
+            Some(model) if is_one(&PERSPECTIVE, model) => false,
+            Some(model) if is_one(&FISHEYE, model) => true,
             Some(other) => {
                 let other: String = other.chars().take(40).collect();
                 return Err(Error::invalid(format!(
-                    "{what}: camera_model {other:?} is not one of {}, {}",
+                    "{what}: camera_model {other:?} is not read; there are {}, {}",
                     PERSPECTIVE.join(", "),
                     FISHEYE.join(", ")
                 )));
@@ -313,7 +317,8 @@ fn finite(what: &str, name: &str, value: Option<f64>) -> Result<Option<f64>> {
 }
 
 /// Whether one size is the other scaled, up to one pixel of rounding in the smaller.
-fn same_aspect(a: [u32; 2], b: [u32; 2]) -> bool {
+#[must_use]
+pub fn same_aspect(a: [u32; 2], b: [u32; 2]) -> bool {
     let [aw, ah] = a.map(f64::from);
     let [bw, bh] = b.map(f64::from);
     let (small, big) = if aw * ah < bw * bh { ([aw, ah], [bw, bh]) } else { ([bw, bh], [aw, ah]) };

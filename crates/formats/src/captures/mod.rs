@@ -14,27 +14,32 @@ pub(crate) mod cameras;
 mod candidates;
 mod choose;
 pub(crate) mod folder;
+mod keys;
 pub(crate) mod layout;
 mod layouts;
 pub(crate) mod lens;
+mod masks;
 pub(crate) mod names;
 mod numbers;
+mod once;
 mod places;
 
 use std::{
     borrow::Cow,
-    collections::{BTreeMap, HashSet},
+    collections::{BTreeMap, BTreeSet, HashMap, HashSet},
     path::Path,
 };
 
 use glam::DVec3;
 
-pub use self::lens::{Base, Lens, LensAtSize, Terms};
+pub use self::lens::{Base, Lens, LensAtSize, Sizes, Terms, same_aspect};
+pub use self::masks::FoundMask;
 pub use self::names::decoded as decoded_name;
 use self::{
     cameras::{CameraEntry, Cameras},
     candidates::{Best, Candidate, Pair, paired},
     folder::Folder,
+    masks::Masks,
 };
 use crate::{
     error::{Error, Result},
@@ -85,10 +90,11 @@ pub fn find<'a>(upload: &'a Upload, limits: &'a Limits) -> Result<FoundPhotos<'a
         }
         (None, Some(cameras)) => of_form(cameras, &upload.photos, limits),
         (None, None) if upload.photos.iter().all(|file| names::is_photo(&file.name)) => {
-            Err(Error::invalid(
+            Err(Error::invalid(format!(
                 "upload: no camera description; send a part named transforms or cameras, the \
-                 camera files of a capture, or an archive with them",
-            ))
+                 camera files of a capture, or an archive with them; {}",
+                layouts::FIND_CAMERAS
+            )))
         }
         (None, None) => {
             let mut folder = Folder::of_form(&upload.photos, false, limits)?;
@@ -126,6 +132,8 @@ pub struct FoundPhoto<'a> {
     pub pose: CameraToWorld,
     /// The file.
     pub bytes: Cow<'a, [u8]>,
+    /// Its mask, where it has one.
+    pub mask: Option<FoundMask<'a>>,
 }
 
 /// The photos that make a scene, not decoded.
@@ -143,8 +151,7 @@ fn of_form<'a>(
     files: &'a [UploadFile],
     limits: &Limits,
 ) -> Result<FoundPhotos<'a>> {
-    check_count(files.len(), limits)?;
-    let Cameras { entries, held_out } = match cameras {
+    let Cameras { entries, held_out, unread } = match cameras {
         UploadCameras::Transforms(json) => {
             limits.check_json("transforms", json)?;
             cameras::transforms(json)?
@@ -155,6 +162,16 @@ fn of_form<'a>(
         }
     };
     names::paths(files, false, limits)?;
+    let masks = Masks::of(files.iter().map(|file| file.name.as_str()), true);
+    let placed: HashSet<&str> = masks.placed().collect();
+    let photos: HashSet<String> =
+        entries.iter().filter_map(|entry| names::normalise(&entry.file)).collect();
+    let named: HashSet<&str> = (entries.iter().filter_map(|entry| entry.mask.as_deref()))
+        .filter_map(|name| masks.named(name, |path| photos.contains(path)))
+        .collect();
+    let is_mask = |file: &&UploadFile| placed.contains(&*file.name) || named.contains(&*file.name);
+    let (masked, files): (Vec<&UploadFile>, Vec<&UploadFile>) = files.iter().partition(is_mask);
+    check_count(files.len(), limits)?;
     let sent: Vec<&str> = files.iter().map(|file| file.name.as_str()).collect();
     let (pairs, _) = paired(&entries, &sent)?;
     let used: HashSet<usize> = pairs.iter().map(|(_, file)| *file).collect();
@@ -178,13 +195,26 @@ fn of_form<'a>(
     )
     .into_iter()
     .collect();
-    let (chosen, warning) = chosen(&entries, pairs, &sent, size, limits)?;
-    warnings.extend(warning);
-    let taken = chosen.into_iter().map(|(entry, file, pose)| {
+    let (chosen, more) = chosen(&entries, pairs, &sent, size, limits)?;
+    warnings.extend(more);
+    warnings.extend(unread_keys(&unread));
+    let masks_sent: HashMap<&str, &'a [u8]> =
+        masked.iter().map(|file| (&*file.name, &*file.bytes)).collect();
+    let taken: Vec<&str> = chosen.iter().map(|(_, file, _)| sent[*file]).collect();
+    let (of_each, missing) = masks_of(&masks, &entries, &chosen, &taken);
+    warnings.extend(missing);
+    let take = |((entry, file, pose), mask): ((usize, usize, CameraToWorld), Option<Mask<'_>>)| {
         let UploadFile { name, bytes } = &files[file];
-        found(&entries[entry], name.clone(), name.clone(), pose, bytes.into())
-    });
-    Ok(FoundPhotos { photos: taken.collect(), warnings })
+        let mask = mask.and_then(|(path, marks_left_out)| {
+            let bytes = Cow::Borrowed(*masks_sent.get(path)?);
+            Some(FoundMask { path: path.to_owned(), bytes, marks_left_out })
+        });
+        FoundPhoto {
+            mask,
+            ..found(&entries[entry], name.clone(), name.clone(), pose, bytes.into())
+        }
+    };
+    Ok(FoundPhotos { photos: chosen.into_iter().zip(of_each).map(take).collect(), warnings })
 }
 
 /// The photos of a capture, and the files of cameras that were read from a disk.
@@ -195,15 +225,18 @@ fn of_folder<'a>(
     let tests = test_list(folder)?;
     let mut files = folder.take_cameras_read();
     let Best { candidate, warning } = candidates::best(folder, &tests)?;
+    let masks = Masks::of(folder.paths(), candidate.has_mask_folder() || folder.is_form());
     files.extend(candidate.files);
-    let Candidate { entries, held_out, place, sent, pairs, missing, .. } = candidate;
+    let Candidate { entries, held_out, unread, place, sent, pairs, missing, .. } = candidate;
     let (place, what) = (place.top, &folder.what);
     let sent: Vec<&str> = sent.iter().map(String::as_str).collect();
     if pairs.is_empty() {
         return Err(Error::invalid(no_photos(folder, &entries)));
     }
     check_count(pairs.len(), limits)?;
-    let unused = without_camera(&sent, &pairs, &held_out);
+    let are_masks: HashSet<&str> = masks.placed().collect();
+    let mut unused = without_camera(&sent, &pairs, &held_out);
+    unused.retain(|path| !are_masks.contains(&*names::join(&place, path)));
     let (cameras, photos) = (entries.len(), pairs.len() + unused.len());
     // A capture may be sent in part, and COLMAP leaves photos out: one side may be left over, but
     // where most of both are, their names do not fit.
@@ -221,7 +254,11 @@ fn of_folder<'a>(
     warnings.extend(told(
         WarningCode::PhotosMissing,
         missing.len(),
-        &format!("{} of {cameras} cameras have no such photo; left out", missing.len()),
+        &format!(
+            "{} of {cameras} cameras have no such photo; left out{}",
+            missing.len(),
+            not_read(folder)
+        ),
         missing.iter().map(|i| entries[*i].file.as_str()),
     ));
     warnings.extend(told(
@@ -237,14 +274,27 @@ fn of_folder<'a>(
         held_out.iter().map(String::as_str),
     ));
     let size = |file: usize| folder.size(&names::join(&place, sent[file]));
-    let (chosen, warning) = chosen(&entries, pairs, &sent, size, limits)?;
-    warnings.extend(warning);
-    let take = |(entry, file, pose): (usize, usize, CameraToWorld)| {
+    let (chosen, more) = chosen(&entries, pairs, &sent, size, limits)?;
+    warnings.extend(more);
+    warnings.extend(unread_keys(&unread));
+    let taken: Vec<String> =
+        chosen.iter().map(|(_, file, _)| names::join(&place, sent[*file])).collect();
+    let taken: Vec<&str> = taken.iter().map(String::as_str).collect();
+    let (of_each, no_mask) = masks_of(&masks, &entries, &chosen, &taken);
+    warnings.extend(no_mask);
+    let take = |((entry, file, pose), mask): ((usize, usize, CameraToWorld), Option<Mask<'_>>)| {
         let (name, path) = (sent[file].to_owned(), names::join(&place, sent[file]));
         let bytes = folder.read(&path)?;
-        Ok(found(&entries[entry], name, path, pose, bytes))
+        let mask = match mask {
+            Some((path, marks_left_out)) => {
+                let bytes = folder.read(path)?;
+                Some(FoundMask { path: path.to_owned(), bytes, marks_left_out })
+            }
+            None => None,
+        };
+        Ok(FoundPhoto { mask, ..found(&entries[entry], name, path, pose, bytes) })
     };
-    let photos = chosen.into_iter().map(take).collect::<Result<_>>()?;
+    let photos = chosen.into_iter().zip(of_each).map(take).collect::<Result<_>>()?;
     Ok((FoundPhotos { photos, warnings }, files))
 }
 
@@ -252,12 +302,28 @@ fn of_folder<'a>(
 fn no_photos(folder: &Folder<'_>, entries: &[CameraEntry]) -> String {
     let (what, cameras) = (&folder.what, entries.len());
     let first = entries.first().map_or("", |entry| entry.file.as_str());
-    let mut photos = folder.paths().filter(|path| names::is_photo(path));
+    let mut photos = folder.paths().filter(|path| folder.is_photo(path));
     let photos = match photos.next() {
         Some(photo) => format!("{photo:?} is one of {} photos", 1 + photos.count()),
-        None => "no file has the name of a photo (.jpg, .png, .webp)".to_owned(),
+        None => "no file has the name of a photo (.jpg, .png, .webp, .tif, .bmp)".to_owned(),
     };
-    format!("{what}: none of the {cameras} cameras has its photo; the first is {first:?}; {photos}")
+    let others = not_read(folder);
+    format!(
+        "{what}: none of the {cameras} cameras has its photo; the first is {first:?}; \
+         {photos}{others}"
+    )
+}
+
+/// Names photos of formats that are not read, with what to do; empty where there are none.
+fn not_read(folder: &Folder<'_>) -> String {
+    let is_other = |path: &&str| names::is_other_photo(path) && !folder.is_photo(path);
+    let mut others = folder.paths().filter(is_other);
+    let Some(first) = others.next() else { return String::new() };
+    format!(
+        "; {} files are photos of formats that are not read, as {first:?}: save them as JPEG \
+         (iPhone: Settings > Camera > Formats > Most Compatible)",
+        1 + others.count()
+    )
 }
 
 fn found<'a>(
@@ -267,7 +333,44 @@ fn found<'a>(
     pose: CameraToWorld,
     bytes: Cow<'a, [u8]>,
 ) -> FoundPhoto<'a> {
-    FoundPhoto { name, path, named: entry.file.clone(), lens: entry.lens.clone(), pose, bytes }
+    let (named, lens) = (entry.file.clone(), entry.lens.clone());
+    FoundPhoto { name, path, named, lens, pose, bytes, mask: None }
+}
+
+/// A mask by its path, and whether it marks what is left out.
+type Mask<'a> = (&'a str, bool);
+
+/// The mask of each photo that is taken: that which its camera names, else that which lies where
+/// masks lie. A warning names those that are not there.
+fn masks_of<'a>(
+    masks: &Masks<'a>,
+    entries: &[CameraEntry],
+    chosen: &Chosen,
+    taken: &[&str],
+) -> (Vec<Option<Mask<'a>>>, Option<Warning>) {
+    let photos: HashSet<&str> = taken.iter().copied().collect();
+    let (mut of_each, mut missing) = (Vec::new(), Vec::new());
+    for ((entry, ..), photo) in chosen.iter().zip(taken) {
+        let name = entries[*entry].mask.as_deref();
+        let named = name.and_then(|name| masks.named(name, |path| photos.contains(path)));
+        let mask = named.map(|path| (path, false)).or_else(|| masks.of_photo(photo));
+        if let (Some(name), None) = (name, mask) {
+            missing.push(name);
+        }
+        of_each.push(mask);
+    }
+    let why = format!(
+        "{} of {} photos have no such mask; they are used whole",
+        missing.len(),
+        taken.len()
+    );
+    (of_each, told(WarningCode::MasksUsed, missing.len(), &why, missing.into_iter()))
+}
+
+/// Names keys of camera files that are not read.
+fn unread_keys(keys: &BTreeSet<String>) -> Option<Warning> {
+    let why = "keys of the camera file that are not read, though they say what is meant by others";
+    told(WarningCode::KeysUnread, keys.len(), why, keys.iter().map(String::as_str))
 }
 
 /// A warning that names files.
@@ -330,14 +433,21 @@ fn chosen(
     sent: &[&str],
     size: impl Fn(usize) -> u64,
     limits: &Limits,
-) -> Result<(Chosen, Option<Warning>)> {
+) -> Result<(Chosen, Vec<Warning>)> {
     let pose =
         |(i, (entry, _)): (usize, &Pair)| entries[*entry].pose(&label(i, &entries[*entry].file));
     let poses: Vec<CameraToWorld> = pairs.iter().enumerate().map(pose).collect::<Result<_>>()?;
     check_places(&poses)?;
+    let scaled: Vec<&CameraEntry> =
+        pairs.iter().map(|(entry, _)| &entries[*entry]).filter(|e| e.scale().is_some()).collect();
+    let scale = scaled.first().and_then(|entry| entry.scale()).unwrap_or(1.0);
+    let why = format!("rotations times a number, as {scale:.4}, which was taken out");
+    let files = scaled.iter().map(|entry| entry.file.as_str());
+    let mut warnings: Vec<Warning> =
+        told(WarningCode::PosesScaled, scaled.len(), &why, files).into_iter().collect();
     let all = pairs.into_iter().zip(&poses).map(|((entry, file), pose)| (entry, file, *pose));
     if poses.len() <= limits.photos_max {
-        return Ok((all.collect(), None));
+        return Ok((all.collect(), warnings));
     }
     let all: Chosen = all.collect();
     let candidates: Vec<choose::Candidate<'_>> = all
@@ -357,8 +467,8 @@ fn chosen(
         all.len()
     );
     let names = left_out.iter().copied();
-    let warning = told(WarningCode::PhotosUnused, left_out.len(), &why, names);
-    Ok((kept.into_iter().map(|i| all[i]).collect(), warning))
+    warnings.extend(told(WarningCode::PhotosUnused, left_out.len(), &why, names));
+    Ok((kept.into_iter().map(|i| all[i]).collect(), warnings))
 }
 
 /// Refuses cameras that all stand at one place: they see no depth.

@@ -22,8 +22,12 @@ use crate::{
     scene::{UploadFile, photo_label as label},
 };
 
-/// Extensions tried where a camera's file has none, as instant-ngp does.
-const EXTENSIONS: [&str; 5] = ["png", "jpg", "jpeg", "jfif", "webp"];
+/// Extensions of photos, which are also tried where a camera's file has none, as instant-ngp does.
+/// What a file is its bytes say.
+const EXTENSIONS: [&str; 9] = ["png", "jpg", "jpeg", "jfif", "jpe", "webp", "tif", "tiff", "bmp"];
+/// Extensions of photos that are not read, where the file holds what its name says.
+const OTHERS: [&str; 12] =
+    ["heic", "heif", "hif", "avif", "jxl", "jp2", "gif", "dng", "cr2", "cr3", "nef", "arw"];
 
 /// A relative path with `/` between parts, or `None` when it is empty, absolute, holds a NUL or
 /// leaves the folder.
@@ -74,6 +78,12 @@ pub(crate) fn paths(files: &[UploadFile], decode: bool, limits: &Limits) -> Resu
 /// Whether the name has the extension of a photo.
 pub(crate) fn is_photo(path: &str) -> bool {
     stem(path).is_some()
+}
+
+/// Whether the name has the extension of a photo of a format that is not read.
+pub(crate) fn is_other_photo(path: &str) -> bool {
+    let extension = path.rsplit_once('.').map_or("", |(_, extension)| extension);
+    OTHERS.iter().any(|other| extension.eq_ignore_ascii_case(other))
 }
 
 /// The folder of a file, without a slash at its end; empty at the top.
@@ -139,7 +149,9 @@ impl Ending {
     /// The parts of a photo's path as this level compares them.
     pub(crate) fn of_photo(self, mut parts: Vec<String>) -> Vec<String> {
         if let (Self::Absent | Self::Other, Some(last)) = (self, parts.last_mut()) {
-            *last = stem(last).unwrap_or(last).to_owned();
+            let is_other = is_other_photo(last);
+            let bare = if is_other { Some(without_extension(last)) } else { stem(last) };
+            *last = bare.unwrap_or(last).to_owned();
         }
         parts
     }

@@ -5,7 +5,10 @@ use std::borrow::Cow;
 use glam::{DMat3, DQuat, DVec3};
 
 use super::lens::Lens;
-use crate::error::{Error, Result};
+use crate::{
+    error::{Error, Result},
+    scene::ORTHONORMAL_TOLERANCE,
+};
 
 /// Camera-to-world, row-major, of a rotation and a centre.
 pub(crate) fn pose(rotation: DMat3, centre: DVec3) -> [f64; 16] {
@@ -17,9 +20,12 @@ pub(crate) fn pose(rotation: DMat3, centre: DVec3) -> [f64; 16] {
     flat
 }
 
-/// Camera-to-world, row-major, of a world-to-camera rotation and translation.
+/// Camera-to-world, row-major, of a world-to-camera rotation and translation. A rotation times a
+/// number gives one divided by it.
 pub(crate) fn inverse(rotation: DMat3, translation: DVec3) -> [f64; 16] {
-    let turned = rotation.transpose();
+    let det = rotation.determinant().abs();
+    let is_rotation = (det - 1.0).abs() <= ORTHONORMAL_TOLERANCE || det < 1e-6;
+    let turned = rotation.transpose() * if is_rotation { 1.0 } else { det.powf(-2.0 / 3.0) };
     pose(turned, -(turned * translation))
 }
 
@@ -70,6 +76,35 @@ pub(crate) fn text<'a>(bytes: &'a [u8], path: &str) -> Result<Cow<'a, str>> {
 /// The numbers of a text between spaces; `None` where a word is none.
 pub(crate) fn numbers(text: &str) -> Option<Vec<f64>> {
     text.split_whitespace().map(number_of).collect()
+}
+
+/// Which mark of decimals the lines of a file have. A file has one: where both are there, a comma
+/// may as well stand between two numbers or between thousands.
+#[derive(Default)]
+pub(crate) struct Decimals {
+    /// The first line with a comma, and that with a point.
+    seen: [Option<usize>; 2],
+}
+
+impl Decimals {
+    /// Looks at the numbers of a line.
+    ///
+    /// # Errors
+    /// `invalid_request` where the file has commas and points.
+    pub(crate) fn see(&mut self, words: &[&str], path: &str, line: usize) -> Result<()> {
+        for (first, mark) in self.seen.iter_mut().zip([',', '.']) {
+            if words.iter().any(|word| word.contains(mark)) {
+                first.get_or_insert(line);
+            }
+        }
+        match self.seen {
+            [Some(comma), Some(point)] => Err(Error::invalid(format!(
+                "{path}: line {comma} has commas in its numbers and line {point} has points: one \
+                 of them may be no mark of decimals; write points in all"
+            ))),
+            _ => Ok(()),
+        }
+    }
 }
 
 /// A number as programs of any locale write it: a comma may stand for the point where there is no

@@ -75,7 +75,7 @@ fn votes<'a>(folder: &'a Folder<'_>, entries: &[CameraEntry]) -> Vec<(String, Vo
             .map(|entry| ending.of_camera(Spelling::Decoded.parts(&entry.file)))
             .collect();
         let wanted = Tails::new(parts.iter().enumerate().map(|(i, parts)| (i, &parts[..])));
-        for path in folder.paths().filter(|path| names::is_photo(path)) {
+        for path in folder.paths().filter(|path| folder.is_photo(path)) {
             let parts = ending.of_photo(Spelling::Decoded.parts(path));
             let (length, Some(camera)) = wanted.longest(&parts) else { continue };
             let before = path.split('/').count().saturating_sub(length);

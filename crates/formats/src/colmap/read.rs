@@ -8,8 +8,8 @@ use std::collections::HashMap;
 
 use crate::{
     captures::layout::{
-        Base, CameraEntry, Described, Folder, Layout, Lens, PoseAxes, Terms, count, inverse, names,
-        number_of, numbers, pinhole, rotation, text,
+        Base, CameraEntry, Decimals, Described, Folder, Layout, Lens, PoseAxes, Terms, count,
+        inverse, names, number_of, numbers, pinhole, rotation, text,
     },
     error::{Error, Result, short},
 };
@@ -43,6 +43,10 @@ const POINT_BYTES: u64 = 24;
 impl Layout for Colmap {
     fn name(&self) -> &'static str {
         "COLMAP"
+    }
+
+    fn has_mask_folder(&self) -> bool {
+        true
     }
 
     fn find(&self, folder: &Folder<'_>) -> Vec<String> {
@@ -198,7 +202,7 @@ fn images_bin(bytes: &[u8], path: &str, lenses: &Lenses, max: usize) -> Result<V
 }
 
 fn cameras_txt(text: &str, path: &str, max: usize) -> Result<Lenses> {
-    let mut lenses = Lenses::new();
+    let (mut lenses, mut decimals) = (Lenses::new(), Decimals::default());
     for (i, line) in text.lines().enumerate() {
         let line = line.trim();
         if line.is_empty() || line.starts_with('#') {
@@ -208,7 +212,9 @@ fn cameras_txt(text: &str, path: &str, max: usize) -> Result<Lenses> {
         let mut words = line.split_whitespace();
         let id = words.next().and_then(|id| id.parse().ok());
         let model = words.next().unwrap_or_default();
-        let values = numbers(&words.collect::<Vec<_>>().join(" "));
+        let words: Vec<&str> = words.collect();
+        decimals.see(&words, path, i + 1)?;
+        let values = numbers(&words.join(" "));
         let (Some(id), Some([width, height, values @ ..])) = (id, values.as_deref()) else {
             let why = format!("{path}: line {} is no camera", i + 1);
             return Err(Error::invalid(why));
@@ -222,7 +228,7 @@ fn cameras_txt(text: &str, path: &str, max: usize) -> Result<Lenses> {
 /// its points whatever it is. Here a line is known by its words, so that neither blank lines nor
 /// missing points shift those after them.
 fn images_txt(text: &str, path: &str, lenses: &Lenses, max: usize) -> Result<Vec<CameraEntry>> {
-    let mut entries = Vec::new();
+    let (mut entries, mut decimals) = (Vec::new(), Decimals::default());
     let mut after_image = false;
     for (i, line) in text.lines().enumerate() {
         let line = line.trim();
@@ -234,6 +240,7 @@ fn images_txt(text: &str, path: &str, lenses: &Lenses, max: usize) -> Result<Vec
         }
         count(entries.len(), max, path)?;
         let (words, name) = first_words::<9>(line);
+        decimals.see(&words[1..8], path, i + 1)?;
         let turn_and_place: Option<Vec<f64>> =
             words[1..8].iter().map(|word| number_of(word)).collect();
         let (image, camera) = (number_of(words[0]), words[8].parse());

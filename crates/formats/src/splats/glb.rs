@@ -244,26 +244,17 @@ fn bad(why: impl std::fmt::Display) -> Error {
 
 // The parts of a document that are read.
 
-#[derive(Deserialize)]
-#[serde(rename_all = "camelCase")]
+#[derive(Default, Deserialize)]
+#[serde(default, rename_all = "camelCase")]
 struct Document {
-    #[serde(default)]
     extensions_required: Vec<String>,
-    #[serde(default)]
     scene: usize,
-    #[serde(default)]
     scenes: Vec<GltfScene>,
-    #[serde(default)]
     nodes: Vec<Node>,
-    #[serde(default)]
     meshes: Vec<Mesh>,
-    #[serde(default)]
     buffers: Vec<Buffer>,
-    #[serde(default)]
     buffer_views: Vec<BufferView>,
-    #[serde(default)]
     accessors: Vec<Accessor>,
-    #[serde(default)]
     extras: serde_json::Value,
 }
 
@@ -293,11 +284,10 @@ struct Mesh {
 /// What an extension says of a primitive.
 type Extension = serde_json::Value;
 
-#[derive(Deserialize)]
+#[derive(Default, Deserialize)]
+#[serde(default)]
 struct Primitive {
-    #[serde(default)]
     attributes: BTreeMap<String, usize>,
-    #[serde(default)]
     extensions: BTreeMap<String, Extension>,
 }
 

@@ -110,11 +110,11 @@ impl CpuRenderer {
         request: &RenderRequest,
     ) -> Result<(Frame, Vec<DispatchTime>)> {
         let mut scratch = self.frames.take();
-        let drawn = self.draw_into(gaussians, request, &mut scratch)?;
+        let timed = self.draw_into(gaussians, request, &mut scratch)?;
         if gaussians.len() <= KEPT_GAUSSIANS_MAX {
             self.frames.give(scratch);
         }
-        Ok(drawn)
+        Ok(timed)
     }
 
     /// The same; footprints, and the pairs of the last band, stay in `scratch`.
@@ -203,12 +203,12 @@ fn rasterize(
     let band = PictureRows::of(frame, grid.tile_rows.start as usize * side);
     let rows = band.split(grid.tile_rows.len(), Cut::Rows(side));
     let rows = rows.into_par_iter().with_max_len(1).enumerate();
-    let drawn = rows.map(|(row, out)| {
+    let weights = rows.filter_map(|(row, out)| {
         let y = (grid.tile_rows.start + row as u32) * TILE_SIZE;
         let height = TILE_SIZE.min(grid.height - y);
         let parts = out.split(tiles_x.div_ceil(across), Cut::Columns(across * side));
         let parts = parts.into_par_iter().with_max_len(1).enumerate();
-        let drawn = parts.map(|(part, mut out)| {
+        let across_row = parts.filter_map(|(part, mut out)| {
             let first = part * across;
             let last = tiles_x.min(first + across);
             let columns = (grid.width as usize).min(last * side) - first * side;
@@ -227,11 +227,9 @@ fn rasterize(
             scratches.give(scratch);
             out.weights
         });
-        let drawn: Vec<Option<WeightRows>> = drawn.collect();
-        WeightRows::beside(drawn.into_iter().flatten().collect())
+        WeightRows::beside(across_row.collect())
     });
-    let drawn: Vec<Option<WeightRows>> = drawn.collect();
-    drawn.into_iter().flatten().collect()
+    weights.collect()
 }
 
 /// A view without Gaussians.

@@ -1,6 +1,6 @@
-//! Steps of training against those of another implementation: `adam.csv` has what the Adam of
-//! `PyTorch` makes of the same gradients (`tests/tools/adam_vectors.py`). The trainer of a device is
-//! held to the one of the processor in `train.rs`.
+//! Steps of training against those of another implementation: `adam.csv` has what `PyTorch`'s Adam
+//! makes of the same gradients (`tests/tools/adam_vectors.py`). The trainer of a device is held to
+//! the one of the processor in `train.rs`.
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 

@@ -64,10 +64,10 @@ fn few(random: &mut Random, sh_degree: u8) -> RawGaussians {
 }
 
 /// Every number of Gaussian `i` with its step: place, step, derivative of the oracle.
-type Place = fn(&mut RawGaussians, usize) -> &mut f32;
+type Parameter = fn(&mut RawGaussians, usize) -> &mut f32;
 
-fn places(sh_count: usize) -> Vec<(&'static str, usize, Place)> {
-    let mut all: Vec<(&'static str, usize, Place)> = Vec::new();
+fn places(sh_count: usize) -> Vec<(&'static str, usize, Parameter)> {
+    let mut all: Vec<(&'static str, usize, Parameter)> = Vec::new();
     for k in 0..3 {
         all.push(("mean", k, |raw, at| &mut raw.means[at / 3][at % 3]));
         all.push(("scale", k, |raw, at| &mut raw.scales[at / 3][at % 3]));

@@ -22,6 +22,14 @@ fn two_different_images_must_fail() {
         assert!(told.starts_with("pixel 77"), "{name}: {told}");
     }
     compare(&want[1..], &want, &none, Tolerance::ORACLE).expect_err("another size");
+    // A little everywhere is more than a little somewhere.
+    let all = vec![grey(0.5 + 1e-4); 2_000];
+    let told = compare(&all, &want, &none, Tolerance::ORACLE).expect_err("all are off");
+    assert!(told.ends_with("in the mean, over 2e-5"), "{told}");
+    // A scene of a millionth of the size is held as much.
+    let tiny = |depth: f64| vec![Sample { depth, ..grey(0.5) }; 2];
+    let (far, near) = (tiny(1.001e-6), tiny(1e-6));
+    compare(&far, &near, &none[..2], Tolerance::ORACLE).expect_err("the depth of a tiny scene");
 }
 
 #[test]

@@ -8,7 +8,7 @@ use segsplat_testing::{
 };
 
 /// Two drawings of one f32 model whose sums of places are rounded apart.
-const ROUNDING: Tolerance = Tolerance { interior: 1e-5, ..Tolerance::ORACLE };
+const ROUNDING: Tolerance = Tolerance { interior: 1e-5, flips: 1e-3, mean: 1e-5 };
 
 #[test]
 fn a_part_is_that_part_of_the_whole_picture() {

@@ -14,7 +14,10 @@ use segsplat_render::{
 };
 
 use crate::common::{gpu, open};
-use segsplat_testing::scenes::{BACKGROUND, camera, checked, cloud, look, push, request};
+use segsplat_testing::{
+    compare::{Sample, Tolerance, compare, samples},
+    scenes::{BACKGROUND, camera, checked, cloud, look, push, request},
+};
 
 /// No rotation.
 const UPRIGHT: [f32; 4] = [1.0, 0.0, 0.0, 0.0];
@@ -127,13 +130,16 @@ fn a_scene_a_millionth_as_large_is_the_same_picture() {
     };
     let at = |near: f32| RenderRequest { near, ..request(camera(60, 40)) };
     let cpu = CpuRenderer::new(2).expect("two threads");
-    let want = cpu.render(&shrink(1.0), &at(0.05)).expect("a picture").alpha.expect("alpha");
+    let want = samples(&cpu.render(&shrink(1.0), &at(0.05)).expect("a picture"));
     // Powers of two, so that the numbers are the same but for their exponent.
     for by in [2.0_f32.powi(-20), 2.0_f32.powi(12)] {
         each(&shrink(by), &at(0.05 * by), |name, frame| {
-            for (got, want) in frame.alpha.iter().flatten().zip(&want) {
-                assert!((got - want).abs() < 2e-3, "{name}: {got}, not {want}, {by:e} as large");
-            }
+            let depth = |sample: Sample| Sample { depth: sample.depth / f64::from(by), ..sample };
+            let got: Vec<Sample> = samples(frame).into_iter().map(depth).collect();
+            let none = vec![false; want.len()];
+            let same = Tolerance { interior: 2e-3, flips: 0.0, mean: 1e-4 };
+            compare(&got, &want, &none, same)
+                .unwrap_or_else(|told| panic!("{name}, {by:e} as large: {told}"));
         });
     }
 }

@@ -18,7 +18,7 @@ use segsplat_testing::{
     scenes::{Random, camera, checked, cloud, look, request},
 };
 
-use crate::common::{both_kernels, cpu, gpu};
+use crate::common::{both_kernels, cpu};
 
 const SHARE: f32 = 0.2;
 
@@ -275,7 +275,7 @@ fn what_was_kept_is_not_moved() {
     let truth = cloud(400, 0, 6);
     let (photos, start) = (photos(&truth, &[[48, 32]]), disturbed(&truth));
     let set = set(&start, &photos);
-    let Some(gpu) = gpu() else { return };
+    let Some(gpu) = both_kernels().next() else { return };
     let cpu = cpu();
     let device = gpu.trainer(&set, u64::MAX).expect("room").expect("a trainer");
     let host = HostTrainer::new(&cpu, &set).expect("a trainer");

@@ -73,7 +73,7 @@ fn the_portable_form_agrees_with_the_widest_to_rounding() {
         assert!(got == again, "{name}: two threads and one");
         let truth = oracle::render(&gaussians, &request).expect("the truth");
         let cliff: Vec<bool> = truth.iter().map(|p| p.cliff.same_order()).collect();
-        let tolerance = Tolerance { interior: BOUND, ..Tolerance::ORACLE };
+        let tolerance = Tolerance { interior: BOUND, flips: 1e-3, mean: BOUND };
         let found = compare(&samples(&got), &samples(&want), &cliff, tolerance)
             .unwrap_or_else(|told| panic!("{name}: {told}"));
         println!("{name}: max {:.2e}, mean {:.2e}, {} flips", found.max, found.mean, found.flips);

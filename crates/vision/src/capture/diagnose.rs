@@ -17,7 +17,7 @@ use super::{
 use crate::{
     error::{Error, Result},
     photo_label,
-    scene::{Camera, CameraToWorld, PosedPhoto, Warning, WarningCode},
+    scene::{Camera, CameraToWorld, Intrinsics, PosedPhoto, Warning, WarningCode},
 };
 
 /// Pairs that witness for or against a mistake.
@@ -27,7 +27,7 @@ const AREA: f64 = 6_000.0;
 /// A correction must agree on this share at least,
 const ALTERNATIVE_MIN: f64 = 0.15;
 /// on this many times what the given cameras agree on (a small motion says little of a focal
-/// length, so there less must do),
+/// length, and half a turn keeps the lines that matches lie on, so there less must do),
 const ALTERNATIVE_RATIO: f64 = 1.5;
 const FOCAL_RATIO: f64 = 1.2;
 /// and by this much more.
@@ -68,6 +68,8 @@ enum Mistake {
     Focal(f64),
     /// All of K times this.
     Resolution(f64),
+    /// The photos turned by this many quarters clockwise against their cameras.
+    Turned(u8),
 }
 
 impl Mistake {
@@ -88,6 +90,11 @@ impl Mistake {
             Self::Focal(s) => (k.fx, k.fy) = (k.fx * s, k.fy * s),
             Self::Resolution(s) => {
                 (k.fx, k.fy, k.cx, k.cy) = (k.fx * s, k.fy * s, k.cx * s, k.cy * s);
+            }
+            Self::Turned(quarters) => {
+                for _ in 0..quarters {
+                    camera = turned(&camera)?;
+                }
             }
         }
         Ok(camera)
@@ -125,9 +132,39 @@ impl Mistake {
                 );
                 (WarningCode::IntrinsicsScale, what, s)
             }
+            Self::Turned(quarters) => {
+                let degrees = 90 * u32::from(quarters);
+                let what = format!(
+                    "the photos look turned by {degrees} degrees clockwise against their cameras: \
+                     turn them back (their EXIF orientation may say the same), or find their \
+                     cameras again"
+                );
+                (WarningCode::PhotosTurned, what, corrected)
+            }
         };
         warning(code, value, format!("{what}; {figures}"))
     }
+}
+
+/// The camera of a photo that was turned by a quarter clockwise.
+fn turned(camera: &Camera) -> Result<Camera> {
+    let k = camera.intrinsics;
+    // The x axis of the turned photo is the y axis of the other backwards, its y axis the x axis.
+    let intrinsics = Intrinsics {
+        fx: k.fy,
+        fy: k.fx,
+        cx: f64::from(k.height) - k.cy,
+        cy: k.cx,
+        width: k.height,
+        height: k.width,
+    };
+    let m = camera.camera_to_world.to_row_major();
+    let row = |r: usize| [-m[4 * r + 1], m[4 * r], m[4 * r + 2], m[4 * r + 3]];
+    let rows = [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]];
+    let mut flat = [0.0; 16];
+    flat.copy_from_slice(rows.as_flattened());
+    let camera_to_world = CameraToWorld::from_row_major(&flat, "turned pose")?;
+    Ok(Camera { intrinsics, camera_to_world })
 }
 
 /// What looks wrong. Photos that share nothing, and cameras that see nothing in common, are
@@ -209,6 +246,13 @@ fn mean_agreement(found: &[PairFound]) -> f64 {
     found.iter().map(PairFound::best).sum::<f64>() / found.len().max(1) as f64
 }
 
+/// How well the photos agree under the given cameras.
+pub(super) fn agreement_as_given(views: &[GrayView], cancel: &AtomicBool) -> Result<f64> {
+    let views: Vec<GrayView> = views.par_iter().map(|v| v.reduced(AREA)).collect();
+    let cameras: Vec<Camera> = views.iter().map(|v| v.camera).collect();
+    Ok(mean_agreement(&pairs::compare(&views, &witnesses(&cameras)?, cancel)?))
+}
+
 /// How well the photos agree under the given cameras and under the usual mistakes.
 pub(super) struct Agreement {
     /// Agreement under the given cameras.
@@ -246,14 +290,23 @@ pub(super) fn agreement(
         }
     }
     let wins = |&(mistake, share): &(Mistake, f64)| {
-        let ratio =
-            if matches!(mistake, Mistake::Focal(_)) { FOCAL_RATIO } else { ALTERNATIVE_RATIO };
+        let ratio = if matches!(mistake, Mistake::Focal(_) | Mistake::Turned(_)) {
+            FOCAL_RATIO
+        } else {
+            ALTERNATIVE_RATIO
+        };
         share >= ALTERNATIVE_MIN && share >= ratio * given && share >= given + ALTERNATIVE_GAIN
     };
     let mut tried = vec![Mistake::Axes, Mistake::Inverted, Mistake::InvertedAndAxes];
     tried.extend(RATIOS.map(Mistake::Focal));
+    // By a quarter only where a photo keeps its size.
+    let is_square = |view: &GrayView| view.width == view.height;
+    let quarters = if views.iter().all(is_square) { 1..=3 } else { 2..=2 };
+    tried.extend(quarters.map(Mistake::Turned));
     let shares: Vec<(Mistake, f64)> = tried.into_par_iter().map(under).collect::<Result<_>>()?;
-    let rival = shares.iter().map(|s| s.1).fold(0.0, f64::max);
+    // Photos on their side may agree by more than chance.
+    let chance = shares.iter().filter(|(mistake, _)| !matches!(mistake, Mistake::Turned(_)));
+    let rival = chance.map(|s| s.1).fold(0.0, f64::max);
     let mistake = shares.into_iter().filter(wins).max_by(|a, b| a.1.total_cmp(&b.1));
     Ok(Agreement { given, rival, mistake })
 }

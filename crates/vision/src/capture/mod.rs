@@ -80,6 +80,16 @@ pub fn analyse(photos: &[PosedPhoto], cancel: &AtomicBool) -> Result<Capture> {
     Ok(Capture { near_far: ranges.near_far, overlap, median_depth: ranges.median_depth, warnings })
 }
 
+/// How well photos agree under their cameras: the share of their matchable pixels that neighbours
+/// find again in each other, 0..1, of a few pairs.
+///
+/// # Errors
+/// `invalid_request` where all cameras stand at one place; `cancelled`.
+pub fn agreement(photos: &[PosedPhoto], cancel: &AtomicBool) -> Result<f64> {
+    let views: Vec<GrayView> = photos.par_iter().map(GrayView::new).collect();
+    diagnose::agreement_as_given(&views, cancel)
+}
+
 /// Names photos that are one picture under different poses: at most one of the poses is right.
 ///
 /// # Errors

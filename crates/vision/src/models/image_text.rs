@@ -1,9 +1,13 @@
 //! The image tower and the text tower: crops and texts to embeddings of length 1 in one space.
 
-use std::{collections::BTreeMap, sync::Arc};
+use std::{
+    collections::{BTreeMap, HashSet},
+    sync::Arc,
+};
 
 use rayon::prelude::*;
-use tokenizers::Tokenizer;
+use serde::Deserialize;
+use tokenizers::{Encoding, Tokenizer};
 
 use crate::{
     error::{Error, Result},
@@ -16,7 +20,7 @@ use crate::{
         resize::{planes, resize},
         tensors::Numbers,
     },
-    scene::{Crop, TextEmbedding},
+    scene::{Crop, DenseFeatures, Photo, TextEmbedding},
 };
 
 /// Names of the two files in messages.
@@ -31,6 +35,8 @@ pub struct ImageText {
     text: Network,
     tokenizer: Tokenizer,
     unknown: Option<u32>,
+    /// Words of the bundle's list of everyday words, single and in lower case.
+    known: HashSet<String>,
     /// Crops a run of the image tower, where its file or a device fixes them.
     crops: Option<usize>,
     /// Tokens a run of the text tower, where its file fixes them.
@@ -124,6 +130,7 @@ impl ImageText {
             tokens: size(text.signature(), &manifest.text.input_ids, 1),
             texts: size(text.signature(), &manifest.text.input_ids, 0),
             unknown: tokenizer.token_to_id(&manifest.text.unknown),
+            known: known_words(bundle, &manifest)?,
             image,
             text,
             tokenizer: tokenizer.clone(),
@@ -138,6 +145,8 @@ impl ImageText {
     /// a number that is not finite.
     pub(super) fn try_out(&self) -> Result<()> {
         let crop = Crop { width: 3, height: 2, rgb: (0..18).map(|i| i * 13).collect() };
+        let Crop { width, height, rgb } = crop.clone();
+        self.dense(&Photo { width, height, rgb, valid: None })?;
         let text = |i: usize| format!("a photo of {} boxes", i + 1);
         for count in [1, self.manifest.image.batch + 1] {
             self.embed_images(&vec![crop.clone(); count])?;
@@ -202,7 +211,7 @@ impl ImageText {
         pixels.par_chunks_exact_mut(3 * side * side).zip(crops).for_each(|(out, crop)| {
             let from = [crop.width, crop.height].map(|side| side as usize);
             let resized = resize(&crop.rgb, from, [side; 2], tower.resize);
-            out.copy_from_slice(&planes(&resized, [side; 2], side, tower.mean, tower.std));
+            out.copy_from_slice(&planes(&resized, [side; 2], [side; 2], tower.mean, tower.std));
         });
         PreparedCrops { crops: crops.len(), pixels }
     }
@@ -220,10 +229,47 @@ impl ImageText {
             let count = pixels.len() / each;
             let input = Input::new(&tower.input, &[count, 3, side, side], pixels);
             let read = |outputs: &dyn Outputs| self.rows(outputs, &tower.output, count, IMAGE);
-            rows.extend(self.image.run(&[input], read)?);
+            rows.extend(self.image.run_for(&[input], &[&tower.output], read)?);
         }
         rows.truncate(prepared.crops * self.manifest.dim);
         Ok(rows)
+    }
+
+    /// The features of a whole photo, whose means under masks are their contexts; `None` where the
+    /// image tower has none.
+    ///
+    /// # Errors
+    /// `internal` when the network fails, or answers with another shape than its manifest says or
+    /// with a number that is not finite.
+    pub fn dense(&self, photo: &Photo) -> Result<Option<DenseFeatures>> {
+        let tower = &self.manifest.image;
+        let Some(dense) = &tower.dense else { return Ok(None) };
+        let placed = dense.fitted([photo.width, photo.height]).map(|side| side as usize);
+        let from = [photo.width, photo.height].map(|side| side as usize);
+        let resized = resize(&photo.rgb, from, placed, tower.resize);
+        let pixels = planes(&resized, placed, placed, tower.mean, tower.std);
+        // A file or a device that fixes the number of pictures gets the same one in each place.
+        let count = size(self.image.signature(), &tower.input, 0).unwrap_or(1);
+        let input =
+            Input::new(&tower.input, &[count, 3, placed[1], placed[0]], pixels.repeat(count));
+        let [columns, rows] = placed.map(|side| side / dense.cell as usize);
+        let each = self.manifest.dim * rows * columns;
+        let read = |outputs: &dyn Outputs| {
+            let (shape, data) = outputs.get(&dense.output)?;
+            let wanted = [count, self.manifest.dim, rows, columns];
+            if shape != wanted {
+                return Err(Error::internal(format!(
+                    "{IMAGE}: {:?} is {shape:?}, not {wanted:?}",
+                    dense.output
+                )));
+            }
+            let data = data[..each].to_vec();
+            match data.iter().all(|v| v.is_finite()) {
+                true => Ok(Some(DenseFeatures { columns, rows, data })),
+                false => Err(Error::internal(format!("{IMAGE}: a feature is not finite"))),
+            }
+        };
+        self.image.run_for(&[input], &[&dense.output], read)
     }
 
     fn crops_a_run(&self) -> usize {
@@ -264,7 +310,7 @@ impl ImageText {
     fn read(&self, text: &str) -> Result<Tokens> {
         let tower = &self.manifest.text;
         let context = self.tokens.map_or(tower.context, |fixed| fixed.min(tower.context));
-        let encoding = self.tokenizer.encode_fast(text, true).map_err(|e| {
+        let encoding = self.tokenizer.encode(text, true).map_err(|e| {
             Error::invalid(format!("text {text:?} cannot be read by the tokenizer: {e}"))
         })?;
         let special = encoding.get_special_tokens_mask();
@@ -275,7 +321,10 @@ impl ImageText {
                 "text {text:?} holds nothing that the text tower reads; write words"
             )));
         }
-        let unknown = words().filter(|(id, _)| self.unknown == Some(**id)).count();
+        let mut unknown = words().filter(|(id, _)| self.unknown == Some(**id)).count();
+        if unknown == 0 {
+            unknown = self.in_short_pieces(text, &encoding);
+        }
         let whole = encoding.get_ids();
         let cut = whole.len() > context;
         let mut ids: Vec<i64> = whole.iter().take(context).map(|&id| i64::from(id)).collect();
@@ -286,6 +335,31 @@ impl ImageText {
             *last = i64::from(*end);
         }
         Ok(Tokens { ids, count, unknown, cut })
+    }
+
+    /// Pieces of words that are cut into very short ones and that the bundle's list does not have:
+    /// the tower has not learnt them.
+    fn in_short_pieces(&self, text: &str, encoding: &Encoding) -> usize {
+        let least = self.manifest.text.piece_letters;
+        if least <= 0.0 {
+            return 0;
+        }
+        // Of each word its pieces and its place in the text.
+        let mut words: BTreeMap<u32, (usize, [usize; 2])> = BTreeMap::new();
+        for (word, (from, to)) in encoding.get_word_ids().iter().zip(encoding.get_offsets()) {
+            let Some(word) = word else { continue };
+            let (pieces, at) = words.entry(*word).or_insert((0, [*from, *to]));
+            *pieces += 1;
+            *at = [at[0].min(*from), at[1].max(*to)];
+        }
+        let short = |(pieces, [from, to]): &(usize, [usize; 2])| {
+            let word = text.get(*from..*to).unwrap_or_default().to_lowercase();
+            *pieces > 1
+                && word.chars().all(char::is_alphabetic)
+                && (word.chars().count() as f32) < least * *pieces as f32
+                && !self.known.contains(&word)
+        };
+        words.values().filter(|word| short(word)).map(|(pieces, _)| pieces).sum()
     }
 
     /// Rows of texts of at most `length` ids, in one run; a file of fixed batch gets its last one
@@ -361,12 +435,19 @@ pub(super) fn signatures(manifest: &ImageTextManifest) -> Vec<Signature<'_>> {
 }
 
 fn image_signature(manifest: &ImageTextManifest) -> Vec<Wanted<'_>> {
-    let (tower, side) = (&manifest.image, manifest.image.size as usize);
-    let square = vec![vec![], vec![3], vec![side], vec![side]];
-    vec![
-        Wanted::new(Side::Input, &tower.input, square).at_most(&[tower.batch.min(CPU_CROPS)]),
-        Wanted::new(Side::Output, &tower.output, vec![vec![], vec![manifest.dim]]),
-    ]
+    let (tower, mut sides) = (&manifest.image, vec![manifest.image.size as usize]);
+    let mut dense = None;
+    if let Some(of) = &tower.dense {
+        let cell = of.cell as usize;
+        sides.extend((1..=of.side as usize / cell).map(|cells| cells * cell));
+        let cells = vec![vec![], vec![manifest.dim], vec![], vec![]];
+        dense = Some(Wanted::new(Side::Output, &of.output, cells));
+    }
+    let pictures = vec![vec![], vec![3], sides.clone(), sides];
+    let taken = Wanted::new(Side::Input, &tower.input, pictures);
+    let output = Wanted::new(Side::Output, &tower.output, vec![vec![], vec![manifest.dim]]);
+    let taken = taken.at_most(&[tower.batch.min(CPU_CROPS)]);
+    [taken, output].into_iter().chain(dense).collect()
 }
 
 /// `ids`: ids of the tokenizer.
@@ -387,6 +468,22 @@ fn text_signature(manifest: &ImageTextManifest, ids: usize) -> Vec<Wanted<'_>> {
 /// A dimension of an input, where the file fixes it.
 fn size(takes: &FileSignature, input: &str, axis: usize) -> Option<usize> {
     takes.get(input)?.shape.get(axis).copied().and_then(fixed)
+}
+
+/// The words of the list that the bundle measured, one by one.
+fn known_words(bundle: &Bundle, manifest: &ImageTextManifest) -> Result<HashSet<String>> {
+    #[derive(Deserialize)]
+    struct Row {
+        word: String,
+    }
+    let Some(words) = &manifest.words else { return Ok(HashSet::new()) };
+    let refused = |why: String| unavailable(format!("{}: {why}", words.file));
+    let bytes =
+        fs_err::read(bundle.path(&words.file)).map_err(|e| refused(e.kind().to_string()))?;
+    let rows: Vec<Row> = serde_json::from_slice(&bytes).map_err(|e| refused(e.to_string()))?;
+    let single =
+        |row: Row| -> Vec<String> { row.word.split_whitespace().map(str::to_lowercase).collect() };
+    Ok(rows.into_iter().flat_map(single).collect())
 }
 
 /// The tokenizer's file, whose own truncation and padding are switched off: both are done here.

@@ -32,6 +32,10 @@ const POINTS_PER_BATCH_MAX: u32 = 1_024;
 const TOLERANCE_MAX: f64 = 0.1;
 /// Crops in one run of an image tower.
 const BATCH_MAX: usize = 256;
+/// Steps of the weight of a context.
+const WEIGHTS_MAX: usize = 16;
+/// Largest weight of a context beside the crop's.
+const WEIGHT_MAX: f64 = 100.0;
 /// Numbers of one embedding.
 const DIM_MAX: usize = 4_096;
 /// Tokens of one text.
@@ -353,6 +357,9 @@ pub struct ImageTextManifest {
     pub tau: f32,
     /// Phrases that a text must beat.
     pub canon: Vec<String>,
+    /// By how much (difference of cosines); less than 0: it may also be a little under them.
+    #[serde(default)]
+    pub margin: f32,
     /// Coverage under which a pixel means nothing, 0..1.
     #[serde(default = "defaults::coverage_floor")]
     pub coverage_floor: f32,
@@ -402,10 +409,67 @@ pub struct ImageTowerManifest {
     /// a file of f16 needs more than the default.
     #[serde(default = "defaults::tolerance")]
     pub tolerance: f64,
+    /// What it says of whole photos; absent where it takes crops only.
+    pub dense: Option<DenseManifest>,
+}
+
+/// The dense output of an image tower, which also takes whole photos.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DenseManifest {
+    /// Output: `[B, dim, H / cell, W / cell]` f32. Its mean under a mask is the mask's context, an
+    /// embedding of any length.
+    pub output: String,
+    /// Longer side of a photo, pixels.
+    pub side: u32,
+    /// Side of a cell of the output, pixels; both sides of a photo are whole multiples of it.
+    pub cell: u32,
+    /// `[area, weight]`: how much the context of a mask of at least this area (share of the photo)
+    /// weighs beside its crop, which weighs 1. Areas ascend; under the first the weight is 0.
+    pub weights: Vec<[f64; 2]>,
+}
+
+impl DenseManifest {
+    /// Weight of the context of a mask of this area, share of the photo.
+    #[must_use]
+    pub fn weight(&self, area: f64) -> f64 {
+        let step = self.weights.iter().rev().find(|[least, _]| area >= *least);
+        step.map_or(0.0, |[_, weight]| *weight)
+    }
+
+    /// Width and height at which a photo of `[width, height]` pixels goes in.
+    #[must_use]
+    pub fn fitted(&self, photo: [u32; 2]) -> [u32; 2] {
+        let longer = f64::from(photo[0].max(photo[1]).max(1));
+        photo.map(|side| {
+            let cells = f64::from(side) / longer * f64::from(self.side) / f64::from(self.cell);
+            #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "few")]
+            let cells = cells.round_ties_even().max(1.0) as u32;
+            cells * self.cell
+        })
+    }
+
+    fn validate(&self, faults: &mut Faults) {
+        let key = "image_text.image.dense";
+        faults.range(&format!("{key}.cell"), self.cell, 1..=BUCKET_SIDE_MAX);
+        faults.range(&format!("{key}.side"), self.side, self.cell.max(1)..=BUCKET_SIDE_MAX);
+        let fine = |[area, weight]: &[f64; 2]| {
+            (0.0..=1.0).contains(area) && (0.0..=WEIGHT_MAX).contains(weight)
+        };
+        let count = (1..=WEIGHTS_MAX).contains(&self.weights.len());
+        let ascend = self.weights.is_sorted_by(|a, b| a[0] < b[0]);
+        if !count || !ascend || !self.weights.iter().all(fine) {
+            let must = format!(
+                "hold 1 to {WEIGHTS_MAX} pairs [area, weight], areas ascending in 0 to 1 and \
+                 weights 0 to {WEIGHT_MAX}"
+            );
+            faults.wrong(&format!("{key}.weights"), &self.weights, &must);
+        }
+    }
 }
 
 /// The text tower.
-#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TextTowerManifest {
     /// File in the bundle's folder.
@@ -425,6 +489,10 @@ pub struct TextTowerManifest {
     /// Token of a word that is not known.
     #[serde(default = "defaults::unknown")]
     pub unknown: String,
+    /// A word that the tokenizer cuts into pieces of fewer letters than this, on average, counts as
+    /// not known, unless `words` has it; 0: none does.
+    #[serde(default)]
+    pub piece_letters: f32,
     /// Input: `[B, T]` i64.
     pub input_ids: String,
     /// Input: `[B, T]` i64, 1 for a token and 0 for padding; absent where the network has none.
@@ -588,9 +656,14 @@ impl ImageTextManifest {
             faults.wrong("image_text.canon", &self.canon, "hold 1 or more phrases");
         }
         faults.range("image_text.coverage_floor", self.coverage_floor, 0.0..=1.0);
+        faults.range("image_text.margin", self.margin, -2.0..=2.0);
         faults.range("image_text.image.crop_margin", image.crop_margin, 0.0..=4.0);
         faults.range("image_text.image.tolerance", image.tolerance, 0.0..=TOLERANCE_MAX);
         faults.range("image_text.image.batch", image.batch, 1..=BATCH_MAX);
+        if let Some(dense) = &image.dense {
+            dense.validate(faults);
+        }
         faults.range("image_text.text.context", text.context, 1..=CONTEXT_MAX);
+        faults.range("image_text.text.piece_letters", text.piece_letters, 0.0..=100.0);
     }
 }

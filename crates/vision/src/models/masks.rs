@@ -534,7 +534,7 @@ fn image(manifest: &MasksManifest, photo: &Photo) -> Vec<f32> {
     let placed = placed(manifest, photo).map(|side| side as usize);
     let from = [photo.width, photo.height].map(|side| side as usize);
     let pixels = resize(&photo.rgb, from, placed, manifest.resize);
-    planes(&pixels, placed, manifest.size as usize, manifest.mean, manifest.std)
+    planes(&pixels, placed, [manifest.size as usize; 2], manifest.mean, manifest.std)
 }
 
 /// Each file with its tensors.

@@ -31,8 +31,9 @@ pub use frame::ModelFrame;
 pub use geometry::{Geometry, GeometryInput};
 pub use image_text::{ImageText, PreparedCrops};
 pub use manifest::{
-    GeometryManifest, ImageTextManifest, ImageTowerManifest, MaskAdapter, MaskDecoderManifest,
-    MaskEncoderManifest, MasksManifest, OutputFrame, PlainFile, TextTowerManifest, Translation,
+    DenseManifest, GeometryManifest, ImageTextManifest, ImageTowerManifest, MaskAdapter,
+    MaskDecoderManifest, MaskEncoderManifest, MasksManifest, OutputFrame, PlainFile,
+    TextTowerManifest, Translation,
 };
 pub use masks::{MaskNetwork, PhotoEmbedding};
 pub use network::Network;

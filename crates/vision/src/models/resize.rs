@@ -133,11 +133,11 @@ fn narrow(sum: i32) -> u8 {
     (sum >> WEIGHT_BITS).clamp(0, 255) as u8
 }
 
-/// `[3, side, side]` f32, normalised; the picture lies in the top left corner, the rest is 0.
+/// `[3, rows, columns]` f32, normalised; the picture lies in the top left corner, the rest is 0.
 pub(super) fn planes(
     rgb: &[u8],
     [width, height]: [usize; 2],
-    side: usize,
+    [columns, rows]: [usize; 2],
     mean: [f32; 3],
     std: [f32; 3],
 ) -> Vec<f32> {
@@ -145,10 +145,10 @@ pub(super) fn planes(
         (0..=u8::MAX).map(move |level| (f32::from(level) / 255.0 - mean[c]) / std[c]).collect()
     };
     let levels: [Vec<f32>; 3] = [0, 1, 2].map(of_level);
-    let mut planes = vec![0.0; 3 * side * side];
-    let lines = planes.par_chunks_exact_mut(side).with_min_len(LINES_A_TASK).enumerate();
+    let mut planes = vec![0.0; 3 * rows * columns];
+    let lines = planes.par_chunks_exact_mut(columns).with_min_len(LINES_A_TASK).enumerate();
     lines.for_each(|(at, out)| {
-        let (c, y) = (at / side, at % side);
+        let (c, y) = (at / rows, at % rows);
         if y < height {
             let line = &rgb[y * width * 3..(y + 1) * width * 3];
             for (v, pixel) in out.iter_mut().zip(line.chunks_exact(3)) {
@@ -208,7 +208,8 @@ mod tests {
 
     #[test]
     fn planes_are_padded_right_and_bottom_after_normalisation() {
-        let planes = planes(&[255, 0, 51, 0, 255, 51], [2, 1], 3, [0.5, 0.0, 0.2], [0.5, 1.0, 1.0]);
+        let planes =
+            planes(&[255, 0, 51, 0, 255, 51], [2, 1], [3, 3], [0.5, 0.0, 0.2], [0.5, 1.0, 1.0]);
         let rows: Vec<&[f32]> = planes.chunks(3).collect();
         assert_eq!(rows[0], [1.0, -1.0, 0.0], "red");
         assert_eq!(rows[3], [0.0, 1.0, 0.0], "green");

@@ -1,9 +1,13 @@
-//! Decodes JPEG, PNG and WebP. The header and the limits are checked before the pixels.
+//! Decodes photos. The header and the limits are checked before the pixels. A JPEG too large to be
+//! decoded whole is decoded at a half or a quarter of its size.
 
 use std::io::Cursor;
 
-use image::{ImageFormat, ImageReader, imageops};
+use image::{
+    DynamicImage, ImageDecoder, ImageFormat, ImageReader, imageops, metadata::Orientation,
+};
 
+use super::kinds;
 use crate::{
     error::{Error, Result},
     limits::Limits,
@@ -16,14 +20,48 @@ pub(super) struct Header {
     format: ImageFormat,
     pub(super) width: u32,
     pub(super) height: u32,
+    /// How EXIF says that the photo is to be turned to be upright.
+    pub(super) orientation: Orientation,
+    /// The photo is decoded at one over this of its size.
+    pub(super) reduction: u32,
 }
 
 impl Header {
-    /// Width and height, pixels.
+    /// Width and height, pixels, as stored.
     pub(super) fn size(&self) -> [u32; 2] {
         [self.width, self.height]
     }
+
+    /// Width and height, pixels, after a turn.
+    pub(super) fn size_after(&self, turn: Orientation) -> [u32; 2] {
+        let [w, h] = self.size();
+        if swaps_sides(turn) { [h, w] } else { [w, h] }
+    }
+
+    /// Width and height at which it is decoded, pixels.
+    fn decoded_size(&self) -> [u32; 2] {
+        self.size().map(|side| side.div_ceil(self.reduction))
+    }
+
+    /// Pixels that are decoded.
+    pub(super) fn decoded_pixels(&self) -> u64 {
+        self.decoded_size().map(u64::from).into_iter().product()
+    }
 }
+
+/// Whether a turn makes width of height.
+pub(super) fn swaps_sides(turn: Orientation) -> bool {
+    turn.to_exif() >= 5
+}
+
+/// Reductions that a JPEG can be decoded at.
+const REDUCTIONS: [u32; 3] = [1, 2, 4];
+/// Bytes that decoding a photo takes at most, for each pixel of the largest that is taken in any
+/// format: four channels of 16 bits.
+const BYTES_A_PIXEL: u64 = 8;
+/// Progressive JPEGs are kept whole as coefficients while they are decoded, so of these no more
+/// pixels are taken than this many times the limit.
+const PROGRESSIVE_TIMES: u64 = 2;
 
 /// A decoder that takes memory for the deepest pixel (RGBA of 16 bits) and working space at most.
 fn reader<'a>(
@@ -32,7 +70,8 @@ fn reader<'a>(
     limits: &Limits,
 ) -> ImageReader<Cursor<&'a [u8]>> {
     let mut bounds = image::Limits::default();
-    bounds.max_alloc = Some(limits.photo_pixels_max.saturating_mul(8).saturating_add(64 << 20));
+    let pixels = limits.photo_pixels_max.saturating_mul(BYTES_A_PIXEL);
+    bounds.max_alloc = Some(pixels.saturating_add(64 << 20));
     let mut reader = ImageReader::with_format(Cursor::new(bytes), format);
     reader.limits(bounds);
     reader
@@ -43,39 +82,63 @@ pub(super) fn header(bytes: &[u8], what: &str, limits: &Limits) -> Result<Header
     if bytes.is_empty() {
         return Err(Error::photo(format!("{what}: the file is empty")));
     }
-    let guessed = image::guess_format(bytes);
-    let Ok(format @ (ImageFormat::Jpeg | ImageFormat::Png | ImageFormat::WebP)) = guessed else {
-        return Err(Error::photo(format!("{what}: not a JPEG, PNG or WebP file")));
+    let format = kinds::of(bytes).map_err(|why| Error::photo(format!("{what}: {why}")))?;
+    let damaged = |e: image::ImageError| {
+        let name = kinds::name(format);
+        Error::photo(format!("{what}: the {name} header is damaged")).caused_by(e)
     };
     // The PNG decoder refuses absurd sizes by memory; the size itself is the better message.
-    let (width, height) = match png_size(bytes, format) {
+    let of_png = png_size(bytes, format);
+    let (width, height) = match of_png {
         Some(size) => size,
-        None => reader(bytes, format, limits).into_dimensions().map_err(|e| {
-            Error::photo(format!("{what}: the {} header is damaged", name(format))).caused_by(e)
-        })?,
+        None => reader(bytes, format, limits).into_dimensions().map_err(damaged)?,
     };
     if width == 0 || height == 0 {
         return Err(Error::photo(format!("{what}: {width}x{height} px; no side may be 0")));
     }
-    if u64::from(width) * u64::from(height) > limits.photo_pixels_max {
-        let bound = format!("{} px", limits.photo_pixels_max);
+    let orientation = match format {
+        ImageFormat::Png => png_orientation(bytes),
+        // What cannot be read of it says nothing.
+        _ => reader(bytes, format, limits).into_decoder().and_then(|mut d| d.orientation()).ok(),
+    };
+    let orientation = orientation.unwrap_or(Orientation::NoTransforms);
+    let (pixels, max) = (u64::from(width) * u64::from(height), limits.photo_pixels_max);
+    let reduction = match format {
+        _ if pixels <= max => Some(1),
+        ImageFormat::Jpeg => {
+            let header = |reduction| Header { format, width, height, orientation, reduction };
+            let fits = |reduction: &u32| header(*reduction).decoded_pixels() <= max;
+            let taken = !is_progressive(bytes) || pixels <= PROGRESSIVE_TIMES * max;
+            REDUCTIONS.into_iter().find(fits).filter(|_| taken)
+        }
+        _ => {
+            let color = reader(bytes, format, limits).into_decoder().map(|d| d.color_type());
+            // Other pixels become RGB beside themselves.
+            let taken = |color: image::ColorType| match color {
+                image::ColorType::Rgb8 => 3,
+                _ => u64::from(color.bytes_per_pixel()) + 4,
+            };
+            let bytes = color.map_or(u64::MAX, |color| pixels.saturating_mul(taken(color)));
+            (bytes <= max.saturating_mul(BYTES_A_PIXEL)).then_some(1)
+        }
+    };
+    let Some(reduction) = reduction else {
+        let bound = match format {
+            ImageFormat::Jpeg if is_progressive(bytes) => {
+                format!("{} px of a progressive JPEG; save it as a baseline JPEG", 2 * max)
+            }
+            ImageFormat::Jpeg => format!("{} px of a JPEG", max.saturating_mul(16)),
+            _ => format!("{max} px of a {}; as JPEG larger ones are read", kinds::name(format)),
+        };
         return Err(Error::limit(what, format!("{width}x{height} px"), bound));
-    }
+    };
     if format == ImageFormat::Jpeg && !jpeg_ends(bytes) {
         return Err(Error::photo(format!(
             "{what}: the JPEG is cut short ({} bytes, no end marker)",
             bytes.len()
         )));
     }
-    Ok(Header { format, width, height })
-}
-
-fn name(format: ImageFormat) -> &'static str {
-    match format {
-        ImageFormat::Jpeg => "JPEG",
-        ImageFormat::Png => "PNG",
-        _ => "WebP",
-    }
+    Ok(Header { format, width, height, orientation, reduction })
 }
 
 /// Width and height of a PNG's first chunk.
@@ -85,6 +148,19 @@ fn png_size(bytes: &[u8], format: ImageFormat) -> Option<(u32, u32)> {
     }
     let word = |at: usize| Some(u32::from_be_bytes(bytes.get(at..at + 4)?.try_into().ok()?));
     Some((word(16)?, word(20)?))
+}
+
+/// How a PNG's EXIF chunk says that it is to be turned.
+fn png_orientation(bytes: &[u8]) -> Option<Orientation> {
+    let mut rest = bytes.get(8..)?;
+    loop {
+        let (length, named) = rest.split_first_chunk::<4>()?;
+        let end = (u32::from_be_bytes(*length) as usize).saturating_add(12);
+        if named.starts_with(b"eXIf") {
+            return Orientation::from_exif_chunk(rest.get(8..end - 4)?);
+        }
+        rest = rest.get(end..)?;
+    }
 }
 
 /// A PNG's signature and those of its chunks that make the picture. Others can be packed texts and
@@ -107,6 +183,21 @@ fn picture_of_png(bytes: &[u8]) -> Vec<u8> {
 /// Whether the JPEG's data reaches its end-of-image marker. The decoder fills a missing rest with
 /// grey and reports no error.
 fn jpeg_ends(bytes: &[u8]) -> bool {
+    has_marker(bytes, |marker| marker == 0xD9)
+}
+
+/// Whether all scans of a JPEG must be there before a pixel is: it has several.
+fn is_progressive(bytes: &[u8]) -> bool {
+    let mut scans = 0;
+    let is_so = |marker| {
+        scans += usize::from(marker == 0xDA);
+        marker == 0xC2 || scans > 1
+    };
+    has_marker(bytes, is_so)
+}
+
+/// Whether a marker of a JPEG is one of those looked for.
+fn has_marker(bytes: &[u8], mut is_one: impl FnMut(u8) -> bool) -> bool {
     let mut at = 2;
     let mut in_scan = false;
     while at + 1 < bytes.len() {
@@ -118,7 +209,8 @@ fn jpeg_ends(bytes: &[u8]) -> bool {
             continue;
         }
         match bytes[at + 1] {
-            0xD9 => return true,
+            marker if !matches!(marker, 0xFF | 0x00) && is_one(marker) => return true,
+            0xD9 => return false,
             0xFF => at += 1,
             0x00 | 0x01 | 0xD0..=0xD8 => at += 2,
             marker => {
@@ -134,22 +226,18 @@ fn jpeg_ends(bytes: &[u8]) -> bool {
     false
 }
 
-/// The pixels as 8-bit RGB. Grey is repeated, 16 bits are rounded to 8, and pixels that are more
-/// transparent than not are no part of the photo (not valid).
-pub(super) fn pixels(bytes: &[u8], header: &Header, what: &str, limits: &Limits) -> Result<Photo> {
-    let bare = (header.format == ImageFormat::Png).then(|| picture_of_png(bytes));
-    let bytes = bare.as_deref().unwrap_or(bytes);
-    let decoded = reader(bytes, header.format, limits).decode().map_err(|e| {
-        let format = name(header.format);
-        Error::photo(format!("{what}: the {format} data is damaged or cut short")).caused_by(e)
-    })?;
+/// The pixels as 8-bit RGB, after a turn. Grey is repeated, 16 bits are rounded to 8, and pixels
+/// that are more transparent than not are no part of the photo (not valid).
+pub(super) fn pixels(
+    bytes: &[u8],
+    header: &Header,
+    turn: Orientation,
+    what: &str,
+    limits: &Limits,
+) -> Result<Photo> {
+    let mut decoded = decoded(bytes, header, what, limits)?;
+    decoded.apply_orientation(turn);
     let (width, height) = (decoded.width(), decoded.height());
-    if (width, height) != (header.width, header.height) {
-        return Err(Error::photo(format!(
-            "{what}: the header says {}x{} px, the data {width}x{height} px",
-            header.width, header.height
-        )));
-    }
     if !decoded.color().has_alpha() {
         return Ok(Photo { width, height, rgb: decoded.into_rgb8().into_raw(), valid: None });
     }
@@ -158,6 +246,73 @@ pub(super) fn pixels(bytes: &[u8], header: &Header, what: &str, limits: &Limits)
     let rgb = rgba.pixels().flat_map(|p| [p.0[0], p.0[1], p.0[2]]).collect();
     let valid = valid.contains(&false).then_some(valid);
     Ok(Photo { width, height, rgb, valid })
+}
+
+/// The pixels of a mask that are kept.
+pub(super) struct Kept {
+    /// Width and height, pixels.
+    pub(super) size: [u32; 2],
+    /// `[height * width]`
+    pub(super) pixels: Vec<bool>,
+}
+
+/// The pixels of a mask that are not black and not transparent. The black of a JPEG is not exact:
+/// there they are those over half of white.
+pub(super) fn kept(bytes: &[u8], header: &Header, what: &str, limits: &Limits) -> Result<Kept> {
+    let decoded = decoded(bytes, header, what, limits)?;
+    let least = if header.format == ImageFormat::Jpeg { 1 << 15 } else { 1 };
+    let size = [decoded.width(), decoded.height()];
+    // 16 bits, so that a 1 of 65,535 is no 0.
+    let luma = decoded.into_luma_alpha16();
+    let pixels = luma.pixels().map(|p| p.0[0] >= least && p.0[1] >= 1 << 15).collect();
+    Ok(Kept { size, pixels })
+}
+
+/// The picture as stored.
+fn decoded(bytes: &[u8], header: &Header, what: &str, limits: &Limits) -> Result<DynamicImage> {
+    let bare = (header.format == ImageFormat::Png).then(|| picture_of_png(bytes));
+    let bytes = bare.as_deref().unwrap_or(bytes);
+    let damaged = || {
+        let format = kinds::name(header.format);
+        Error::photo(format!("{what}: the {format} data is damaged or cut short"))
+    };
+    let decoded = match header.reduction {
+        1 => reader(bytes, header.format, limits).decode().map_err(|e| damaged().caused_by(e))?,
+        _ => reduced_jpeg(bytes, header).map_err(|e| damaged().caused_by(e))?.ok_or_else(|| {
+            Error::photo(format!("{what}: a large JPEG of other colours than RGB and grey"))
+        })?,
+    };
+    let [width, height] = [decoded.width(), decoded.height()];
+    if [width, height] != header.decoded_size() {
+        return Err(Error::photo(format!(
+            "{what}: the header says {}x{} px, the data {width}x{height} px",
+            header.width, header.height
+        )));
+    }
+    Ok(decoded)
+}
+
+/// A JPEG decoded at a part of its size, by fewer frequencies of each block; `None` for CMYK.
+fn reduced_jpeg(
+    bytes: &[u8],
+    header: &Header,
+) -> std::result::Result<Option<DynamicImage>, jpeg_decoder::Error> {
+    let mut decoder = jpeg_decoder::Decoder::new(bytes);
+    let [width, height] = header.decoded_size();
+    let side = |side: u32| u16::try_from(side).unwrap_or(u16::MAX);
+    decoder.scale(side(width), side(height))?;
+    let pixels = decoder.decode()?;
+    let Some(info) = decoder.info() else { return Ok(None) };
+    let (width, height) = (u32::from(info.width), u32::from(info.height));
+    Ok(match info.pixel_format {
+        jpeg_decoder::PixelFormat::L8 => {
+            image::GrayImage::from_raw(width, height, pixels).map(DynamicImage::from)
+        }
+        jpeg_decoder::PixelFormat::RGB24 => {
+            image::RgbImage::from_raw(width, height, pixels).map(DynamicImage::from)
+        }
+        _ => None,
+    })
 }
 
 /// The photo with its longer side at most `side_max`, intrinsics following exactly.

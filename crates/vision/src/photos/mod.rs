@@ -1,28 +1,38 @@
 //! Photos in: what `formats` finds in an upload or a folder is decoded into [`PosedPhoto`]s.
 //!
 //! Photos of a lens become photos of a pinhole camera, intrinsics those of the size of the photo.
-//! Faults in headers are refused before a pixel is decoded. Pixels are taken as stored: EXIF
-//! orientation is ignored, as COLMAP ignores it.
+//! Faults in headers are refused before a pixel is decoded. Pixels are taken as stored, as COLMAP
+//! takes them, but where the cameras are those of the photos that EXIF turns ([`turns`]). What a
+//! mask leaves out is not valid.
 
 mod decode;
+mod kinds;
+mod mask;
+mod turns;
 mod undistort;
 
-use std::{ops::Range, path::Path, sync::atomic::AtomicBool};
+use std::{collections::BTreeMap, ops::Range, path::Path, sync::atomic::AtomicBool};
 
+use image::metadata::Orientation;
 use rayon::prelude::*;
 
-use self::decode::Header;
+use self::{
+    decode::Header,
+    turns::{SIDE_COMPARED, Way},
+};
 pub use crate::scene::{Upload, UploadCameras, UploadFile};
 use crate::{
     error::Result,
     formats::captures::{FoundPhoto, FoundPhotos, LensAtSize, find, find_in_dir},
     limits::Limits,
     photo_label as label,
-    scene::{Camera, Photo, PosedPhoto, Warning, unless_cancelled},
+    scene::{Camera, Photo, PosedPhoto, Warning, WarningCode, unless_cancelled},
 };
 
 /// Photos of the largest size that are decoded at the same time, some 7 bytes a pixel each.
 const DECODED_TOGETHER: u64 = 2;
+/// Share of a photo that undoing a lens may leave without source.
+const LENS_TAKES_MAX: f64 = 0.5;
 
 /// The photos of an upload with their cameras.
 #[derive(Clone, Debug)]
@@ -72,58 +82,186 @@ pub fn read_dir_until(
 ) -> Result<(ReadPhotos, Upload)> {
     let (found, cameras) = find_in_dir(dir, limits)?;
     let read = decoded(&found, limits, cancel)?;
-    let file = |of: FoundPhoto<'_>| UploadFile { name: of.path, bytes: of.bytes.into_owned() };
-    let photos = found.photos.into_iter().map(file).chain(cameras).collect();
+    let (mut photos, mut masks) = (Vec::new(), BTreeMap::new());
+    for of in found.photos {
+        photos.push(UploadFile { name: of.path, bytes: of.bytes.into_owned() });
+        // Several photos may have one mask.
+        masks.extend(of.mask.map(|mask| (mask.path, mask.bytes.into_owned())));
+    }
+    let masks = masks.into_iter().map(|(name, bytes)| UploadFile { name, bytes });
+    photos.extend(cameras.into_iter().chain(masks));
     Ok((read, Upload { photos, ..Upload::default() }))
 }
 
-/// The photos of a scene whose headers are read, and whose pixels are not.
+/// A photo whose header is read, and whose pixels are not.
 struct Undecoded<'f, 'a> {
-    found: &'f [FoundPhoto<'a>],
-    /// Name in messages, header and lens of each.
-    headers: Vec<(String, Header, LensAtSize)>,
-    /// Longer side at which they are kept.
-    side_max: u32,
+    found: &'f FoundPhoto<'a>,
+    /// Its name in messages.
+    label: String,
+    header: Header,
+    /// How it is turned before anything else.
+    turn: Orientation,
+    /// The lens of the turned photo.
+    lens: LensAtSize,
 }
 
 impl<'f, 'a> Undecoded<'f, 'a> {
-    fn new(found: &'f FoundPhotos<'a>, limits: &Limits) -> Result<Self> {
-        let found = &found.photos[..];
-        let header = |(i, photo): (usize, &FoundPhoto<'_>)| {
-            let label = label(i, &photo.named);
-            let header = decode::header(&photo.bytes, &label, limits)?;
-            let lens = photo.lens.at_size(header.width, header.height, &label)?;
-            Ok((label, header, lens))
+    fn new(
+        found: &'f FoundPhoto<'a>,
+        label: String,
+        header: Header,
+        turn: Orientation,
+    ) -> Result<Self> {
+        let [width, height] = header.size_after(turn);
+        let lens = found.lens.at_size(width, height, &label)?;
+        Ok(Self { found, label, header, turn, lens })
+    }
+
+    fn size(&self) -> [u32; 2] {
+        self.header.size_after(self.turn)
+    }
+
+    /// The photo with its longer side at most `side_max`, without what its mask leaves out and
+    /// without the distortion of its lens; also the shares of its pixels that these two took.
+    fn read(&self, side_max: u32, limits: &Limits) -> Result<(PosedPhoto, [f64; 2])> {
+        let (found, lens) = (self.found, &self.lens);
+        let photo = decode::pixels(&found.bytes, &self.header, self.turn, &self.label, limits)?;
+        let before = valid_share(&photo);
+        let photo = match &found.mask {
+            Some(mask) => mask::applied(photo, mask, &self.label, limits)?,
+            None => photo,
         };
-        let headers: Vec<_> = found.iter().enumerate().map(header).collect::<Result<_>>()?;
-        let sizes: Vec<[u32; 2]> = headers.iter().map(|(_, header, _)| header.size()).collect();
-        Ok(Self { found, side_max: side_kept(&sizes, limits), headers })
-    }
-
-    fn sizes(&self) -> Vec<[u32; 2]> {
-        self.headers.iter().map(|(_, header, _)| header.size()).collect()
-    }
-
-    /// A photo, reduced and without the distortion of its lens.
-    fn read(&self, i: usize, limits: &Limits) -> Result<PosedPhoto> {
-        let (found, (label, header, lens)) = (&self.found[i], &self.headers[i]);
-        let photo = decode::pixels(&found.bytes, header, label, limits)?;
+        let unmasked = valid_share(&photo);
+        // A large JPEG is decoded smaller than its header says.
+        let intrinsics = lens.intrinsics.resized(photo.width, photo.height);
         // The lens after the size: its terms are of rays, not of pixels.
-        let (photo, intrinsics) = decode::at_most(photo, lens.intrinsics, self.side_max);
+        let (photo, intrinsics) = decode::at_most(photo, intrinsics, side_max);
+        let reduced = valid_share(&photo);
         let photo = undistort::undistort(photo, lens, intrinsics);
-        Ok(PosedPhoto {
+        let taken = [before - unmasked, reduced - valid_share(&photo)];
+        let posed = PosedPhoto {
             file: found.name.clone(),
             photo,
             camera: Camera { intrinsics, camera_to_world: found.pose },
             intrinsics_made_for: lens.made_for,
-        })
+        };
+        Ok((posed, taken))
     }
 
     /// Whether [`Self::read`] gives the pixels of the file as they are.
-    fn is_as_sent(&self, i: usize) -> bool {
-        let (_, header, lens) = &self.headers[i];
-        header.width.max(header.height) <= self.side_max && lens.terms.is_none()
+    fn is_as_sent(&self, side_max: u32) -> bool {
+        let [width, height] = self.size();
+        width.max(height) <= side_max
+            && self.header.reduction == 1
+            && self.turn == Orientation::NoTransforms
+            && self.lens.terms.is_none()
     }
+}
+
+fn valid_share(photo: &Photo) -> f64 {
+    photo.valid.as_ref().map_or(1.0, |valid| {
+        valid.iter().filter(|valid| **valid).count() as f64 / valid.len().max(1) as f64
+    })
+}
+
+/// The photos of a scene whose headers are read, and whose pixels are not.
+struct AllUndecoded<'f, 'a> {
+    photos: Vec<Undecoded<'f, 'a>>,
+    /// Longer side at which they are kept.
+    side_max: u32,
+    /// What was done that nobody asked for.
+    warnings: Vec<Warning>,
+}
+
+impl<'f, 'a> AllUndecoded<'f, 'a> {
+    fn new(found: &'f FoundPhotos<'a>, limits: &Limits, cancel: &AtomicBool) -> Result<Self> {
+        let header = |(i, photo): (usize, &FoundPhoto<'_>)| {
+            let label = label(i, &photo.named);
+            let header = decode::header(&photo.bytes, &label, limits)?;
+            Ok((label, header))
+        };
+        let headers: Vec<(String, Header)> =
+            found.photos.iter().enumerate().map(header).collect::<Result<_>>()?;
+        let all = || found.photos.iter().zip(&headers);
+        let ways: Vec<Option<Way>> =
+            all().map(|(photo, (_, header))| turns::way(header, &photo.lens)).collect();
+        let photos = |either: bool| -> Result<Vec<Undecoded<'f, 'a>>> {
+            let photo = |((photo, (label, header)), way): ((&'f _, &(String, Header)), _)| {
+                let is_turned = way == &Some(Way::Turned) || either && way == &Some(Way::Either);
+                let turn = if is_turned { header.orientation } else { Orientation::NoTransforms };
+                Undecoded::new(photo, label.clone(), *header, turn)
+            };
+            all().zip(&ways).map(photo).collect()
+        };
+        let small = |either: bool| -> Result<Vec<PosedPhoto>> {
+            let photos = photos(either)?;
+            let sizes: Vec<u64> = photos.iter().map(|one| one.header.decoded_pixels()).collect();
+            let read = |i: usize| {
+                unless_cancelled(cancel)?;
+                photos[i].read(SIDE_COMPARED, limits).map(|(photo, _)| photo)
+            };
+            let mut all = Vec::new();
+            for together in decoded_together(&sizes, limits.photo_pixels_max) {
+                let some: Vec<Result<_>> = together.into_par_iter().map(read).collect();
+                all.extend(some.into_iter().collect::<Result<Vec<_>>>()?);
+            }
+            Ok(all)
+        };
+        let names: Vec<&str> = found.photos.iter().map(|photo| &*photo.named).collect();
+        let (either, turned) = turns::settled(&names, &ways, small, cancel)?;
+        let photos = photos(either)?;
+        let sizes: Vec<[u32; 2]> = photos.iter().map(Undecoded::size).collect();
+        let mut warnings: Vec<Warning> = turned.into_iter().collect();
+        warnings.extend(large(&photos, limits));
+        warnings.extend(undone_lens(&photos));
+        Ok(Self { side_max: side_kept(&sizes, limits), photos, warnings })
+    }
+}
+
+/// Names photos over the size up to which all formats are read.
+fn large(photos: &[Undecoded<'_, '_>], limits: &Limits) -> Option<Warning> {
+    let pixels = |[w, h]: [u32; 2]| u64::from(w) * u64::from(h);
+    let is_large = |one: &&Undecoded<'_, '_>| pixels(one.size()) > limits.photo_pixels_max;
+    let large: Vec<&Undecoded<'_, '_>> = photos.iter().filter(is_large).collect();
+    let first = large.first()?;
+    let [width, height] = first.size();
+    let how = match first.header.reduction {
+        1 => "decoded whole and reduced".to_owned(),
+        by => format!("decoded at a {} of their sides", if by == 2 { "half" } else { "quarter" }),
+    };
+    let message = format!(
+        "{}: {width}x{height} px, over {} px ({} of {} photos): {how}; no stage looks closer than \
+         {} px a side",
+        first.label,
+        limits.photo_pixels_max,
+        large.len(),
+        photos.len(),
+        limits.photo_side_kept_max
+    );
+    Some(Warning { code: WarningCode::PhotosReduced, message, value: large.len() as f64 })
+}
+
+/// Names photos whose lens bends rays and was made for about their size: undoing a lens changes the
+/// size of a photo a little, so that they may be undone already.
+fn undone_lens(photos: &[Undecoded<'_, '_>]) -> Option<Warning> {
+    let about = |one: &&Undecoded<'_, '_>| {
+        let ([width, _], Some([made_for, _])) = (one.size(), one.lens.made_for) else {
+            return false;
+        };
+        let ratio = f64::from(width) / f64::from(made_for);
+        one.lens.terms.is_some() && (0.8..1.25).contains(&ratio)
+    };
+    let doubtful: Vec<&Undecoded<'_, '_>> = photos.iter().filter(about).collect();
+    let first = doubtful.first()?;
+    let ([width, height], [w, h]) = (first.size(), first.lens.made_for?);
+    let message = format!(
+        "{}: its lens bends rays and is of {w}x{h} px, the photo is {width}x{height} px ({} of {} \
+         photos): photos whose distortion was undone have such sizes, and cameras of their own",
+        first.label,
+        doubtful.len(),
+        photos.len()
+    );
+    Some(Warning { code: WarningCode::LensDoubtful, message, value: doubtful.len() as f64 })
 }
 
 /// A photo of an upload as its scene has it.
@@ -157,14 +295,14 @@ pub fn each(
     mut see: impl FnMut(SentPhoto<'_>) -> Result<()>,
 ) -> Result<()> {
     let found = find(upload, limits)?;
-    let photos = Undecoded::new(&found, limits)?;
-    for (i, photo) in found.photos.iter().enumerate() {
-        let (file, camera_to_world) = (photo.name.as_str(), photo.pose);
-        if photos.is_as_sent(i) {
-            let camera = Camera { intrinsics: photos.headers[i].2.intrinsics, camera_to_world };
-            see(SentPhoto { file, camera, pixels: SentPixels::File(&photo.bytes) })?;
+    let all = AllUndecoded::new(&found, limits, &AtomicBool::new(false))?;
+    for one in &all.photos {
+        let (file, camera_to_world) = (one.found.name.as_str(), one.found.pose);
+        if one.is_as_sent(all.side_max) {
+            let camera = Camera { intrinsics: one.lens.intrinsics, camera_to_world };
+            see(SentPhoto { file, camera, pixels: SentPixels::File(&one.found.bytes) })?;
         } else {
-            let PosedPhoto { photo, camera, .. } = photos.read(i, limits)?;
+            let (PosedPhoto { photo, camera, .. }, _) = one.read(all.side_max, limits)?;
             see(SentPhoto { file, camera, pixels: SentPixels::Made(photo) })?;
         }
     }
@@ -173,19 +311,55 @@ pub fn each(
 
 /// Decodes the photos, a few at a time, and removes the distortion of their lenses.
 fn decoded(found: &FoundPhotos<'_>, limits: &Limits, cancel: &AtomicBool) -> Result<ReadPhotos> {
-    let undecoded = Undecoded::new(found, limits)?;
+    let all = AllUndecoded::new(found, limits, cancel)?;
     let read = |i: usize| {
         unless_cancelled(cancel)?;
-        undecoded.read(i, limits)
+        all.photos[i].read(all.side_max, limits)
     };
-    let mut photos = Vec::with_capacity(found.photos.len());
-    for together in decoded_together(&undecoded.sizes(), limits.photo_pixels_max) {
-        let some: Vec<Result<PosedPhoto>> = together.into_par_iter().map(read).collect();
-        for photo in some {
-            photos.push(photo?);
+    let (mut photos, mut taken) = (Vec::new(), Vec::new());
+    let sizes: Vec<u64> = all.photos.iter().map(|one| one.header.decoded_pixels()).collect();
+    for together in decoded_together(&sizes, limits.photo_pixels_max) {
+        let some: Vec<Result<_>> = together.into_par_iter().map(read).collect();
+        for one in some {
+            let (photo, shares) = one?;
+            photos.push(photo);
+            taken.push(shares);
         }
     }
-    Ok(ReadPhotos { photos, warnings: found.warnings.clone() })
+    let mut warnings = [found.warnings.clone(), all.warnings.clone()].concat();
+    warnings.extend(masked(&all.photos, &taken));
+    warnings.extend(bent_away(&all.photos, &taken));
+    Ok(ReadPhotos { photos, warnings })
+}
+
+/// Says how much masks leave out.
+fn masked(photos: &[Undecoded<'_, '_>], taken: &[[f64; 2]]) -> Option<Warning> {
+    let masks = photos.iter().filter_map(|one| one.found.mask.as_ref());
+    let (count, first) = (masks.clone().count(), masks.map(|mask| &mask.path).next()?);
+    let share = taken.iter().map(|[masked, _]| masked).sum::<f64>() / count as f64;
+    let message = format!(
+        "{count} of {} photos have masks, as {:?}, which leave {:.1} % of their pixels out of the \
+         scene",
+        photos.len(),
+        first.chars().take(80).collect::<String>(),
+        100.0 * share
+    );
+    (share > 0.0).then_some(Warning { code: WarningCode::MasksUsed, message, value: share })
+}
+
+/// Names photos of which a lens leaves less than half.
+fn bent_away(photos: &[Undecoded<'_, '_>], taken: &[[f64; 2]]) -> Option<Warning> {
+    let bad = photos.iter().zip(taken).filter(|(_, [_, by_lens])| *by_lens > LENS_TAKES_MAX);
+    let count = bad.clone().count();
+    let (worst, [_, share]) = bad.max_by(|a, b| a.1[1].total_cmp(&b.1[1]))?;
+    let message = format!(
+        "{}: the distortion of its lens leaves {:.0} % of its pixels ({count} of {} photos have \
+         less than half); check k1 to k6, p1 and p2",
+        worst.label,
+        100.0 * (1.0 - share),
+        photos.len()
+    );
+    Some(Warning { code: WarningCode::LensDoubtful, message, value: *share })
 }
 
 /// Longer side at which the photos of a scene are kept, so that all of them fit the limits.
@@ -213,12 +387,11 @@ fn side_kept(sizes: &[[u32; 2]], limits: &Limits) -> u32 {
     side
 }
 
-/// Photos one after another in groups that are decoded side by side: the pixels of a group are at
-/// most [`DECODED_TOGETHER`] of the largest photos that may come.
-fn decoded_together(sizes: &[[u32; 2]], photo_pixels_max: u64) -> Vec<Range<usize>> {
+/// Photos one after another in groups that are decoded side by side, by their pixels: those of a
+/// group are at most [`DECODED_TOGETHER`] of the largest photos that may come.
+fn decoded_together(sizes: &[u64], photo_pixels_max: u64) -> Vec<Range<usize>> {
     let (mut groups, mut begun, mut pixels): (Vec<Range<usize>>, usize, u64) = (Vec::new(), 0, 0);
-    for (i, [w, h]) in sizes.iter().enumerate() {
-        let own = u64::from(*w) * u64::from(*h);
+    for (i, own) in sizes.iter().enumerate() {
         if i > begun && pixels + own > DECODED_TOGETHER.saturating_mul(photo_pixels_max) {
             groups.push(begun..i);
             (begun, pixels) = (i, 0);
@@ -256,9 +429,9 @@ mod tests {
 
     #[test]
     fn no_more_than_two_of_the_largest_photos_are_decoded_together() {
-        let groups = |sizes: &[[u32; 2]]| decoded_together(sizes, 100);
-        assert_eq!(groups(&[[10, 10]; 5]), [0..2, 2..4, 4..5]);
-        assert_eq!(groups(&[[5, 5]; 9]), [0..8, 8..9], "small ones side by side");
-        assert_eq!(groups(&[[30, 30], [1, 1]]), [0..1, 1..2], "one over the bound goes alone");
+        let groups = |sizes: &[u64]| decoded_together(sizes, 100);
+        assert_eq!(groups(&[100; 5]), [0..2, 2..4, 4..5]);
+        assert_eq!(groups(&[25; 9]), [0..8, 8..9], "small ones side by side");
+        assert_eq!(groups(&[900, 1]), [0..1, 1..2], "one over the bound goes alone");
     }
 }

@@ -14,12 +14,15 @@ use crate::{
     error::{Error, Result},
     models::{ImageText, MaskNetwork},
     scene::{
-        Bank, BankMask, Crop, CropShape, Gaussians, IndexMap, Method, PhotoMasks, PosedPhoto,
-        Preset, SceneCamera, ScoringMethod, Semantics, SemanticsReport, Stage, Watch,
-        unless_cancelled,
+        Bank, BankMask, Crop, CropShape, DenseFeatures, Gaussians, IndexMap, Method, Photo,
+        PhotoMasks, PosedPhoto, Preset, SceneCamera, ScoringMethod, Semantics, SemanticsReport,
+        Stage, Watch, unless_cancelled,
     },
     semantics::{self, Clusters, Cutter, Scoring, Views},
 };
+
+/// Crops that take an image tower as long as a whole photo, about.
+const CROPS_A_PHOTO: usize = 5;
 
 /// Gives the masks of each photo. Its argument takes the fraction that is done, 0..1.
 pub type MasksOfPhotos<'a> = dyn Fn(&(dyn Fn(f32) + Sync)) -> Result<Vec<PhotoMasks>> + Sync + 'a;
@@ -40,11 +43,28 @@ pub struct SemanticsTools<'a, P> {
     pub crop_shape: CropShape,
     /// Crops that are embedded together, and so in memory together.
     pub batch: usize,
+    /// What sees whole photos; `None`: crops alone.
+    pub context: Option<Context<'a>>,
+}
+
+/// What an image tower says of whole photos.
+#[derive(Clone, Copy)]
+pub struct Context<'a> {
+    /// The features of a photo; `None` where there are none.
+    pub dense: &'a (dyn Fn(&Photo) -> Result<Option<DenseFeatures>> + Sync),
+    /// How much the context of a mask of this area (share of its photo) weighs beside its crop.
+    pub weight: &'a (dyn Fn(f64) -> f64 + Sync),
 }
 
 impl<P> std::fmt::Debug for SemanticsTools<'_, P> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("SemanticsTools").field("dim", &self.dim).finish_non_exhaustive()
+    }
+}
+
+impl std::fmt::Debug for Context<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Context").finish_non_exhaustive()
     }
 }
 
@@ -86,7 +106,8 @@ impl Pipeline {
         let towers = self.image_text()?;
         let manifest = towers.manifest();
         let (tau, floor) = (f64::from(manifest.tau), f64::from(manifest.coverage_floor));
-        Ok(ScoringMethod::of(preset, manifest.canon.clone(), tau, floor))
+        let margin = f64::from(manifest.margin);
+        Ok(ScoringMethod::of(preset, manifest.canon.clone(), tau, floor, margin))
     }
 
     /// The same, ready to score.
@@ -131,6 +152,8 @@ pub fn label_photos(
     let (network, towers) = (pipeline.masks()?, pipeline.image_text()?);
     let settings = masks::settings(network.manifest(), method);
     let image = &towers.manifest().image;
+    let weight = |area: f64| image.dense.as_ref().map_or(0.0, |dense| dense.weight(area));
+    let context = Context { dense: &|photo| towers.dense(photo), weight: &weight };
     let tools = SemanticsTools {
         masks: &|progress| {
             masks::photo_masks(&network, photos, seeds, &settings, progress, watch.cancel)
@@ -141,6 +164,7 @@ pub fn label_photos(
         crop_margin: if method.crop_margin { f64::from(image.crop_margin) } else { 0.0 },
         crop_shape: image.crop_shape,
         batch: image.batch,
+        context: (method.context && image.dense.is_some()).then_some(context),
     };
     // Not on a thread of the pool: one that waits for a network would be missing there, and one
     // that waits for its own tasks might begin another job.
@@ -182,7 +206,21 @@ fn label_photos_with<P: Send>(
             photos.len()
         )));
     }
-    let embedded = stages.run(Stage::Embed, || embed(tools, photos, &masks, watch))?;
+    let embedded = stages.run(Stage::Embed, || {
+        let crops: usize = masks.iter().map(|of| of.masks.len()).sum();
+        let shown = masks.iter().filter(|of| !of.masks.is_empty()).count();
+        let whole = tools.context.map_or(0, |_| CROPS_A_PHOTO * shown);
+        let step = |done| {
+            (watch.progress)(Stage::Embed, fraction(done, crops + whole));
+            unless_cancelled(watch.cancel)
+        };
+        let mut found = embed(tools, photos, &masks, &step)?;
+        if let Some(context) = &tools.context {
+            let step = |seen| step(crops + CROPS_A_PHOTO * seen);
+            add_contexts(&mut found, tools.dim, context, photos, &masks, &step)?;
+        }
+        Ok(found)
+    })?;
     let labels = stages.run(Stage::Bank, || {
         let wanted = match method.bank_rows as usize {
             0 => semantics::rows_wanted(embedded.of.len(), photos.len(), method.lambda),
@@ -260,11 +298,12 @@ struct Embedded {
 
 /// Cuts and embeds the masks of all photos, a batch at a time; only the last batch is not full. A
 /// mask without pixels, or whose embedding has no length, has no meaning and stays background.
+/// `step` is told how many crops are done.
 fn embed<P: Send>(
     tools: &SemanticsTools<'_, P>,
     photos: &[PosedPhoto],
     masks: &[PhotoMasks],
-    watch: Watch<'_>,
+    step: &dyn Fn(usize) -> Result<()>,
 ) -> Result<Embedded> {
     let mut found = Embedded::default();
     let both = photos.par_iter().zip(masks);
@@ -283,8 +322,7 @@ fn embed<P: Send>(
     let batches: Vec<&[[usize; 2]]> = all.chunks(size).collect();
     let mut next = batches.first().map(|batch| prepare(batch));
     for (i, batch) in batches.iter().enumerate() {
-        unless_cancelled(watch.cancel)?;
-        (watch.progress)(Stage::Embed, fraction(i * size, all.len()));
+        step(i * size)?;
         let (of, prepared) = next.take().unwrap_or_else(|| prepare(batch));
         let rows = std::thread::scope(|scope| {
             let ahead = batches.get(i + 1).map(|batch| scope.spawn(|| prepare(batch)));
@@ -309,6 +347,35 @@ fn embed<P: Send>(
         }
     }
     Ok(found)
+}
+
+/// Adds to the embedding of each mask its context in the whole photo. A photo none of whose masks
+/// has a context that weighs something is not looked at. `step` is told how many photos are done.
+fn add_contexts(
+    found: &mut Embedded,
+    dim: usize,
+    context: &Context<'_>,
+    photos: &[PosedPhoto],
+    masks: &[PhotoMasks],
+    step: &dyn Fn(usize) -> Result<()>,
+) -> Result<()> {
+    let weight = |photo: usize, k: usize| (context.weight)(masks[photo].masks[k].area);
+    let mut rows = found.rows.chunks_exact_mut(dim.max(1));
+    for (seen, of) in found.of.chunk_by(|a, b| a[0] == b[0]).enumerate() {
+        step(seen)?;
+        let rows: Vec<&mut [f32]> = rows.by_ref().take(of.len()).collect();
+        if of.iter().all(|&[photo, k]| weight(photo, k) <= 0.0) {
+            continue;
+        }
+        let photo = of[0][0];
+        let Some(features) = (context.dense)(&photos[photo].photo)? else { return Ok(()) };
+        let contexts = semantics::contexts(&features, &masks[photo]);
+        for (row, &[photo, k]) in rows.into_iter().zip(of) {
+            let own = contexts.get(k * dim..(k + 1) * dim).unwrap_or_default();
+            semantics::add_context(row, own, weight(photo, k));
+        }
+    }
+    Ok(())
 }
 
 /// The bank, what the photos say, and the row of each mask.

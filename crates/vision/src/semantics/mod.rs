@@ -11,6 +11,7 @@
 
 mod assign;
 mod bank;
+mod context;
 mod crops;
 mod instances;
 mod palette;
@@ -21,6 +22,7 @@ mod views;
 pub use self::{
     assign::{from_source, relabel},
     bank::{Clusters, bank, rows_wanted},
+    context::{add_context, contexts},
     crops::Cutter,
     instances::{Box3, Components, Instance, InstanceOptions},
     palette::{colour, palette_table},

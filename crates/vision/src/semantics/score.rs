@@ -30,7 +30,9 @@ pub struct Scoring {
     canon: Vec<Vec<f32>>,
     tau: f64,
     coverage_floor: f64,
-    /// Least difference of cosines that is selected: the relevancy there is the cut.
+    /// Difference of cosines that counts as none.
+    zero: f64,
+    /// Least difference of cosines over `zero` that is selected: the relevancy there is the cut.
     margin: f64,
     /// Difference of cosines by which an entry may fit a text less than the best entry does.
     near_best: f64,
@@ -54,10 +56,11 @@ impl Scoring {
                 method.canon.len()
             )));
         }
-        let ScoringMethod { unit_rows, tau, coverage_floor, cut, near_best, .. } = *method;
+        let ScoringMethod { unit_rows, tau, coverage_floor, margin: zero, cut, near_best, .. } =
+            *method;
         // Exactly 0 for a cut of 0.5.
         let margin = (cut / (1.0 - cut)).ln() / tau;
-        Ok(Self { unit_rows, canon, tau, coverage_floor, margin, near_best })
+        Ok(Self { unit_rows, canon, tau, coverage_floor, zero, margin, near_best })
     }
 
     /// A pixel with less coverage has relevancy 0.
@@ -113,6 +116,21 @@ pub struct TextScores {
 }
 
 impl TextScores {
+    /// The row, counted from 0, fits the text less than the canon does.
+    fn leave_out(&mut self, row: usize) {
+        let score = LEFT_OUT * self.norms[row];
+        self.groups.iter_mut().for_each(|rows| rows[row + 1] = [1.0, score, score, score]);
+        self.nearer[row + 1] = u64::MAX;
+    }
+
+    /// The scores of a text that says nothing: no entry fits it.
+    #[must_use]
+    pub fn silent(mut self) -> Self {
+        (0..self.norms.len()).for_each(|row| self.leave_out(row));
+        self.relevancies.fill(0.0);
+        self
+    }
+
     /// Tables to blend, one for each group of three phrases: `[M + 1]` rows of the coverage and
     /// three scores. A pixel is selected where its coverage reaches the floor, no blended score is
     /// under 0 and not all of them are 0.
@@ -257,7 +275,10 @@ impl Scorer {
                 self.bank.dim
             )));
         }
-        let own = scores(&self.bank, embedding);
+        let mut own = scores(&self.bank, embedding);
+        own.iter_mut()
+            .zip(&*self.norms)
+            .for_each(|(score, norm)| *score -= self.scoring.zero * norm);
         let group = |canon: &[Vec<f64>]| -> Vec<[f64; 4]> {
             let row = |m: usize| {
                 let [a, b, c] = [0, 1, 2].map(|g| own[m] - canon.get(g).unwrap_or(&canon[0])[m]);
@@ -286,9 +307,7 @@ impl Scorer {
         for (row, lead) in leads.iter_mut().enumerate() {
             if *lead >= 0.0 && *lead < best - self.scoring.near_best {
                 *lead = LEFT_OUT;
-                let score = LEFT_OUT * self.norms[row];
-                text.groups.iter_mut().for_each(|rows| rows[row + 1] = [1.0, score, score, score]);
-                text.nearer[row + 1] = u64::MAX;
+                text.leave_out(row);
             }
         }
         text.relevancies.extend(leads.iter().map(|lead| self.sharpen(*lead)));
@@ -431,7 +450,7 @@ mod tests {
         let bank = Bank { dim: 2, rows: rows.concat() };
         let canon: Vec<[f32; 2]> = [3, 17, 31, 45, 59].map(around).to_vec();
         let canon = canon.iter().map(|c| c.to_vec()).collect();
-        let method = ScoringMethod::of(Preset::Paper, Vec::new(), 10.0, 0.05);
+        let method = ScoringMethod::of(Preset::Paper, Vec::new(), 10.0, 0.05, 0.0);
         let names = (0..5).map(|c: u8| c.to_string()).collect();
         let scoring = Scoring::new(&ScoringMethod { canon: names, ..method }, canon).unwrap();
         let scorer = Scorer::new(&bank, Arc::new(scoring)).unwrap();

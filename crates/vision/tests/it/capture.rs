@@ -431,3 +431,24 @@ fn a_set_of_fixed_size_takes_photos_that_share_nothing_where_no_others_are_left(
     assert_eq!(filled.len(), 1, "{filled:?}");
     assert_eq!(filled[0].views.len(), 4, "{filled:?}");
 }
+
+#[test]
+fn photos_that_are_turned_against_their_cameras_are_told() {
+    for (width, height, quarters) in [(200, 150, 2), (160, 160, 1), (160, 160, 2), (160, 160, 3)] {
+        let options = SampleOptions { photos: 4, width, height, seed: 3 };
+        let mut posed = sample::photos(&options).unwrap();
+        for posed in &mut posed {
+            let rgb = std::mem::take(&mut posed.photo.rgb);
+            let mut picture = image::RgbImage::from_raw(width, height, rgb).unwrap();
+            for _ in 0..quarters {
+                picture = image::imageops::rotate90(&picture);
+            }
+            posed.photo.rgb = picture.into_raw();
+        }
+        let warnings = analyse(&posed).unwrap().warnings;
+        let turned = warnings.iter().find(|w| w.code == WarningCode::PhotosTurned);
+        let degrees = format!("by {} degrees clockwise", 90 * quarters);
+        let message = turned.map_or("", |w| &w.message);
+        assert!(message.contains(&degrees), "{width}x{height}, {quarters}: {warnings:?}");
+    }
+}

@@ -2,7 +2,10 @@
 
 use std::path::Path;
 
-use segsplat_core::{error::ErrorCode, scene::Crop};
+use segsplat_core::{
+    error::ErrorCode,
+    scene::{Crop, Photo},
+};
 use segsplat_testing::{opened, root};
 use segsplat_vision::models::{Bundle, BundleCheck, Geometry, ImageText, Runtime, check};
 use sha2::{Digest, Sha256};
@@ -14,6 +17,13 @@ const MANIFEST: &str = "bundle.toml";
 /// A dimension named V in an ONNX file, and in as many bytes one of size 2.
 const V: &[u8] = b"\x0a\x03\x12\x01V";
 const TWO: &[u8] = b"\x0a\x03\x08\x82\x00";
+/// What a manifest says of `image_dense.onnx`.
+const DENSE: &str = "[image_text.image.dense]
+output = \"dense\"
+side = 32
+cell = 4
+weights = [[0.1, 0.5], [0.5, 2.0]]
+";
 /// The colours, which `image_external.onnx` keeps in a file of their own.
 const DATA: &str = "image_external.onnx.data";
 
@@ -30,6 +40,9 @@ fn with_image(file: &str) -> TempDir {
     }
     replace(&dir, "\"image.onnx\"", &format!("\"{file}\""));
     rehash(&dir, "image.onnx", file);
+    if file == "image_dense.onnx" {
+        replace(&dir, "[image_text.text]", &format!("{DENSE}\n[image_text.text]"));
+    }
     if file == "image_external.onnx" {
         let sha256 = sha256(&dir.path().join(DATA));
         let lines = format!("\"{file}\"\ndata = \"{DATA}\"\ndata_sha256 = \"{sha256}\"");
@@ -157,7 +170,8 @@ fn a_manifest_names_all_that_is_out_of_range() {
 
 #[test]
 fn a_right_bundle_is_run_and_nothing_is_found() {
-    for dir in ["image.onnx", "image_half.onnx", "image_external.onnx"].map(with_image) {
+    let towers = ["image.onnx", "image_half.onnx", "image_external.onnx", "image_dense.onnx"];
+    for dir in towers.map(with_image) {
         let Some(found) = checked(&dir) else { return };
         assert_eq!(found.faults, Vec::<String>::new(), "{found:?}");
         let ran: Vec<&str> = found.ran.iter().map(|(name, _)| *name).collect();
@@ -165,6 +179,49 @@ fn a_right_bundle_is_run_and_nothing_is_found() {
         assert!(found.files.iter().all(|file| file.fits && file.bytes > 0), "{found:?}");
         assert_eq!(found.files[0].opset, Some(17));
     }
+}
+
+#[test]
+fn a_tower_with_a_dense_output_gives_features_of_a_whole_photo() {
+    let dir = with_image("image_dense.onnx");
+    let Some(runtime) = opened(Runtime::load(&network_options())) else { return };
+    let open = |dir: &TempDir| {
+        let bundle = Bundle::open(dir.path()).unwrap();
+        ImageText::open(&runtime, &bundle, &network_options())
+    };
+    let towers = open(&dir).unwrap().unwrap();
+    // Red to the left, blue to the right; 80 x 38 pixels become 32 x 16.
+    let row = (0..80).flat_map(|x| if x < 40 { [255, 0, 0] } else { [0, 0, 255] });
+    let rgb = row.collect::<Vec<u8>>().repeat(38);
+    let photo = Photo { width: 80, height: 38, rgb, valid: None };
+    let dense = towers.dense(&photo).unwrap().unwrap();
+    assert_eq!((dense.columns, dense.rows, dense.data.len()), (8, 4, 8 * 32));
+    let channel = |c: usize, column: usize| dense.data[c * 32 + 8 + column];
+    assert!((channel(0, 1) - 1.0).abs() < 1e-6 && channel(2, 1).abs() < 1e-6, "red: {dense:?}");
+    assert!((channel(2, 6) - 1.0).abs() < 1e-6 && channel(0, 6).abs() < 1e-6, "blue");
+    let plain = rows(&with_image("image.onnx")).unwrap();
+    assert_eq!(rows(&dir).unwrap(), plain, "crops are embedded as before");
+
+    let of = &towers.manifest().image.dense.clone().unwrap();
+    assert_eq!([0.0, 0.1, 0.4, 0.5, 1.0].map(|area| of.weight(area)), [0.0, 0.5, 0.5, 2.0, 2.0]);
+    assert_eq!(of.fitted([1000, 3]), [32, 4], "no side is under a cell");
+    let none = open(&with_image("image.onnx")).unwrap().unwrap();
+    assert_eq!(none.dense(&photo).unwrap(), None, "a tower without it");
+
+    // A file that takes crops alone, another output, and weights that do not ascend.
+    let crops = with_image("image.onnx");
+    replace(&crops, "[image_text.text]", &format!("{DENSE}\n[image_text.text]"));
+    let error = open(&crops).unwrap_err();
+    assert!(error.message().contains("[-1, 3, 16, 16], not f32 [any, 3, 4..32, 4..32]"), "{error}");
+    assert!(error.message().contains("has no output \"dense\""), "{error}");
+    replace(&dir, "cell = 4", "cell = 8");
+    let towers = open(&dir).unwrap().unwrap();
+    let error = towers.dense(&photo).unwrap_err();
+    assert!(error.message().contains("is [1, 8, 4, 8], not [1, 8, 2, 4]"), "{error}");
+    replace(&dir, "[[0.1, 0.5], [0.5, 2.0]]", "[[0.5, 0.5], [0.1, 2.0]]");
+    replace(&dir, "side = 32", "side = 4");
+    let named = ["image_text.image.dense.side is 4; it must be 8 to", "dense.weights is [[0.5"];
+    refused(&dir, &named);
 }
 
 #[test]

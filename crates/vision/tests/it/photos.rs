@@ -10,7 +10,7 @@ use image::{DynamicImage, ImageBuffer, ImageFormat, Rgb, RgbImage};
 use segsplat_core::{
     error::ErrorCode,
     limits::Limits,
-    scene::{PosedPhoto, Upload, UploadCameras, UploadFile},
+    scene::{PosedPhoto, Upload, UploadCameras, UploadFile, WarningCode},
 };
 use segsplat_vision::{
     photos,
@@ -118,7 +118,7 @@ fn too_few_photos_are_refused() {
 #[test]
 fn impossible_cameras_are_refused_by_photo_and_value() {
     type Spoil = fn(&mut Value);
-    let cases: [(Spoil, &[&str]); 22] = [
+    let cases: [(Spoil, &[&str]); 23] = [
         (|f| f["transform_matrix"] = Value::Null, &["transform_matrix", "4 rows of 4"]),
         (|f| drop(f.as_object_mut().unwrap().remove("transform_matrix")), &["missing"]),
         (|f| f["transform_matrix"][0] = json!([1, 2, 3]), &["4 rows of 4"]),
@@ -133,6 +133,11 @@ fn impossible_cameras_are_refused_by_photo_and_value() {
         (|f| (f["w"], f["h"]) = (json!(36), json!(48)), &["36x48", "EXIF"]),
         (|f| f["w"] = json!(-48), &["width", "-48"]),
         (|f| f["camera_model"] = json!("EQUIRECTANGULAR"), &["EQUIRECTANGULAR", "OPENCV_FISHEYE"]),
+        // The model before the lens that it needs not.
+        (
+            |f| (without(f, &["fl_x", "fl_y"]), f["camera_model"] = json!("VR180_L")).1,
+            &["VR180_L", "OPENCV_FISHEYE"],
+        ),
         (|f| f["k1"] = Value::Null, &["k1 is NaN"]),
         (|f| f["fl_x"] = Value::Null, &["fx is NaN"]),
         (|f| f["cx"] = Value::Null, &["cx is NaN"]),
@@ -483,7 +488,9 @@ fn damaged_photos_are_named() {
         with_transforms(&transforms(), files)
     };
     let unreadable = ErrorCode::PhotoUnreadable;
-    refused(&spoilt(b"just text".to_vec()), unreadable, &["photo 2", "not a JPEG, PNG or WebP"]);
+    refused(&spoilt(b"just text".to_vec()), unreadable, &["photo 2", "JPEG, PNG, WebP, TIFF"]);
+    let heic = b"\0\0\0\x18ftypheic\0\0\0\0mif1heic".to_vec();
+    refused(&spoilt(heic), unreadable, &["photo 2", "HEIC", "save it as JPEG", "Most Compatible"]);
     refused(&spoilt(vec![]), unreadable, &["photo 2", "empty"]);
     let half = files[2].bytes[..files[2].bytes.len() / 2].to_vec();
     refused(&spoilt(half), unreadable, &["photo 2", "cut short"]);
@@ -521,12 +528,12 @@ fn read_last(bytes: Vec<u8>, change: &Value, limits: &Limits) -> PosedPhoto {
 }
 
 #[test]
-fn the_three_formats_and_all_depths_are_read() {
+fn the_formats_and_all_depths_are_read() {
     let decoded = |image: &DynamicImage, format| {
         read_last(encoded(image, format), &json!({}), &Limits::default()).photo
     };
     let rgb = DynamicImage::from(gradient());
-    for format in [ImageFormat::Png, ImageFormat::WebP] {
+    for format in [ImageFormat::Png, ImageFormat::WebP, ImageFormat::Tiff, ImageFormat::Bmp] {
         assert_eq!(decoded(&rgb, format).rgb, gradient().into_raw(), "{format:?}");
     }
     let photo = decoded(&rgb, ImageFormat::Jpeg);
@@ -665,6 +672,26 @@ fn the_fold_of_a_strong_lens_makes_no_pixels() {
 }
 
 #[test]
+fn a_lens_that_leaves_little_of_a_photo_is_said_to() {
+    for (k1, left) in [(50.0, Some(0.15)), (-50.0, Some(0.02)), (0.15, None), (-0.12, None)] {
+        let mut told = transforms();
+        let frame = &mut told["frames"][1];
+        frame["k1"] = json!(k1);
+        let upload = with_transforms(&told, sent().1);
+        let read = photos::read_until(&upload, &Limits::default(), &AtomicBool::new(false));
+        let warnings = read.unwrap().warnings;
+        let Some(left) = left else {
+            assert!(warnings.is_empty(), "{k1}: {warnings:?}");
+            continue;
+        };
+        let [warning] = &warnings[..] else { panic!("{k1}: {warnings:?}") };
+        assert_eq!(warning.code, WarningCode::LensDoubtful);
+        assert!(warning.message.starts_with("photo 1 ("), "{k1}: {}", warning.message);
+        assert!((1.0 - warning.value - left).abs() < 0.02, "{k1}: {}", warning.value);
+    }
+}
+
+#[test]
 fn a_folder_is_read_with_the_distortion_of_its_lens_undone() {
     let got = photos::read_dir(&room::folder(), &Limits::default()).unwrap();
     assert_eq!(got.len(), room::PHOTOS);
@@ -695,5 +722,166 @@ fn real_scenes_are_read_with_their_distortion_undone() {
                 assert!(share > 0.95, "{scene}: {share} of the pixels have a source");
             }
         }
+    }
+}
+
+/// A JPEG whose EXIF says how it is to be turned.
+fn with_orientation(image: &DynamicImage, orientation: u8) -> Vec<u8> {
+    let mut jpeg = Cursor::new(Vec::new());
+    image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 97).encode_image(image).unwrap();
+    let tiff = [
+        &b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0"[..],
+        &[orientation, 0, 0, 0, 0, 0, 0, 0],
+    ]
+    .concat();
+    let length = (tiff.len() as u16 + 8).to_be_bytes();
+    let jpeg = jpeg.into_inner();
+    [&jpeg[..2], b"\xFF\xE1", &length, b"Exif\0\0", &tiff, &jpeg[2..]].concat()
+}
+
+/// Mean difference of the pixels of two photos, of 255.
+fn off(a: &[u8], b: &[u8]) -> f64 {
+    assert_eq!(a.len(), b.len());
+    a.iter().zip(b).map(|(a, b)| f64::from(a.abs_diff(*b))).sum::<f64>() / a.len() as f64
+}
+
+#[test]
+fn photos_are_turned_where_their_cameras_are_those_of_the_upright_ones() {
+    type Turn = fn(&DynamicImage) -> DynamicImage;
+    let upright: Turn = DynamicImage::clone;
+    let cases: [([u32; 2], u8, Turn, bool, bool); 6] = [
+        // The sizes of the cameras tell.
+        ([160, 120], 6, DynamicImage::rotate270, true, true),
+        ([160, 120], 8, DynamicImage::rotate90, true, true),
+        // Only the pixels tell.
+        ([160, 120], 3, DynamicImage::rotate180, true, true),
+        ([144, 144], 6, DynamicImage::rotate270, true, true),
+        // Cameras of the stored pixels.
+        ([160, 120], 3, upright, false, false),
+        ([160, 120], 6, upright, false, false),
+    ];
+    for ([width, height], orientation, turn, is_turned, is_told) in cases {
+        let posed = sample::photos(&SampleOptions { photos: 3, width, height, seed: 5 }).unwrap();
+        let mut files = sample::png_files(&posed).unwrap();
+        for (file, posed) in files.iter_mut().zip(&posed) {
+            let image = RgbImage::from_raw(width, height, posed.photo.rgb.clone()).unwrap();
+            file.bytes = with_orientation(&turn(&image.into()), orientation);
+        }
+        let json = UploadCameras::Transforms(sample::transforms_json(&posed));
+        let upload = upload(json, files);
+        let what = format!("{width}x{height}, {orientation}, {is_turned}");
+        let read =
+            photos::read_until(&upload, &Limits::default(), &AtomicBool::new(false)).unwrap();
+        let codes: Vec<WarningCode> = read.warnings.iter().map(|w| w.code).collect();
+        let told = if is_told { vec![WarningCode::PhotosTurned] } else { vec![] };
+        assert_eq!(codes, told, "{what}");
+        for (got, want) in read.photos.iter().zip(&posed) {
+            assert_eq!(got.camera.intrinsics, want.camera.intrinsics, "{what}");
+            let off = off(&got.photo.rgb, &want.photo.rgb);
+            assert!(off < 3.0, "{what}: {off} of 255");
+        }
+        // One at a time they are the same.
+        photos::each(&upload, &Limits::default(), |one| {
+            let is_file = matches!(one.pixels, photos::SentPixels::File(_));
+            assert_eq!(is_file, !is_turned, "{what}");
+            Ok(())
+        })
+        .unwrap();
+    }
+}
+
+#[test]
+fn what_a_mask_leaves_out_is_not_valid() {
+    let (posed, files) = sent();
+    let mut json = transforms();
+    json["frames"][1]["mask_path"] = json!("C:\\masks\\second.png");
+    // Half of the size: the left third, the right third, and a single row.
+    let mask = |kept: fn(u32, u32) -> bool| {
+        image::GrayImage::from_fn(24, 18, |x, y| image::Luma([u8::from(kept(x, y))])).into()
+    };
+    let png = |kept| encoded(&mask(kept), ImageFormat::Png);
+    let stem = |i: usize| files[i].name.trim_end_matches(".png").replace("images/", "");
+    let masks = [
+        (format!("masks/{}.png", stem(0)), png(|x, _| x >= 8)),
+        ("other/masks/second.png".to_owned(), png(|x, _| x < 16)),
+        (format!("images/dynamic_mask_{}.png", stem(2)), png(|_, y| y == 0)),
+    ];
+    let masks = masks.map(|(name, bytes)| UploadFile { name, bytes });
+    let is_left_out: [fn(u32, u32) -> bool; 3] = [|x, _| x < 16, |x, _| x >= 32, |_, y| y < 2];
+    let whole = with_transforms(&json, files.iter().chain(&masks).cloned().collect());
+    let transforms = UploadFile { name: "transforms.json".into(), bytes: json.to_string().into() };
+    let as_files = files.iter().chain(&masks).chain([&transforms]).cloned().collect();
+    let as_files = Upload { photos: as_files, ..Upload::default() };
+    for upload in [whole, as_files] {
+        let read =
+            photos::read_until(&upload, &Limits::default(), &AtomicBool::new(false)).unwrap();
+        let [warning] = &read.warnings[..] else { panic!("{:?}", read.warnings) };
+        assert_eq!(warning.code, WarningCode::MasksUsed);
+        let share = (1.0 / 3.0 + 1.0 / 3.0 + 2.0 / 36.0) / 3.0;
+        assert!((warning.value - share).abs() < 1e-9, "{warning:?}");
+        assert_eq!(read.photos.len(), 3);
+        for ((got, want), is_left_out) in read.photos.iter().zip(&posed).zip(is_left_out) {
+            assert_eq!(got.photo.rgb, want.photo.rgb);
+            let valid = got.photo.valid.as_ref().unwrap();
+            for (i, valid) in (0..).zip(valid) {
+                assert_eq!(*valid, !is_left_out(i % 48, i / 48), "{} pixel {i}", got.file);
+            }
+        }
+    }
+    let bytes = encoded(&RgbImage::new(30, 30).into(), ImageFormat::Png);
+    let square = UploadFile { bytes, ..masks[0].clone() };
+    let files = files.iter().chain([&square]).cloned().collect();
+    let words = ["photo 0", "masks/", "30x30", "48x36", "aspect"];
+    refused(&with_transforms(&self::transforms(), files), ErrorCode::InvalidRequest, &words);
+}
+
+#[test]
+fn a_mask_that_is_named_and_not_there_is_told() {
+    let mut json = transforms();
+    json["frames"][1]["mask_path"] = json!("masks/lost.png");
+    let upload = with_transforms(&json, sent().1);
+    let read = photos::read_until(&upload, &Limits::default(), &AtomicBool::new(false)).unwrap();
+    let [warning] = &read.warnings[..] else { panic!("{:?}", read.warnings) };
+    assert_eq!((warning.code, warning.value), (WarningCode::MasksUsed, 1.0));
+    assert!(warning.message.contains("masks/lost.png"), "{warning:?}");
+    assert!(read.photos.iter().all(|posed| posed.photo.valid.is_none()));
+}
+
+#[test]
+fn a_jpeg_over_the_limit_is_read_at_a_part_of_its_size() {
+    let limits = Limits { photo_pixels_max: 48 * 36, ..Limits::default() };
+    for (times, part, told) in [(1, 1, 0), (2, 2, 1), (4, 4, 1), (5, 0, 0)] {
+        let (posed, mut files) = sent();
+        let image = RgbImage::from_raw(48, 36, posed[2].photo.rgb.clone()).unwrap();
+        let filter = image::imageops::FilterType::CatmullRom;
+        let large = DynamicImage::from(image).resize_exact(48 * times, 36 * times, filter);
+        files[2].bytes = encoded(&large, ImageFormat::Jpeg);
+        let upload = with_transforms(&transforms(), files);
+        let read = photos::read_until(&upload, &limits, &AtomicBool::new(false));
+        if part == 0 {
+            let error = read.unwrap_err();
+            assert_eq!(error.code(), ErrorCode::LimitExceeded);
+            let bound = format!("{} px of a JPEG", 16 * 48 * 36);
+            assert!(error.message().contains(&bound), "{error}");
+            continue;
+        }
+        let read = read.unwrap();
+        let codes: Vec<WarningCode> = read.warnings.iter().map(|w| w.code).collect();
+        assert_eq!(codes, vec![WarningCode::PhotosReduced; told], "{times}");
+        let got = &read.photos[2];
+        assert_eq!([got.photo.width, got.photo.height], [48 * times / part, 36 * times / part]);
+        assert_eq!(got.camera.intrinsics.fx, posed[2].camera.intrinsics.fx);
+        let off = off(&got.photo.rgb, &posed[2].photo.rgb);
+        assert!(off < 9.0, "{times}: {off} of 255");
+    }
+    // Of other formats what takes no more memory: 3 bytes a pixel of 8.
+    for (times, is_read) in [(1.6, true), (1.7, false)] {
+        let (width, height) = ((48.0 * times) as u32, (36.0 * times) as u32);
+        let (_, mut files) = sent();
+        files[2].bytes = encoded(&RgbImage::new(width, height).into(), ImageFormat::Png);
+        let mut json = transforms();
+        without(&mut json["frames"][2], &["w", "h"]);
+        let read = photos::read(&with_transforms(&json, files), &limits);
+        assert_eq!(read.is_ok(), is_read, "{width}x{height}: {:?}", read.err());
     }
 }

@@ -6,7 +6,7 @@ use std::{
         atomic::{AtomicUsize, Ordering},
     },
     thread,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use segsplat_core::{
@@ -214,9 +214,15 @@ fn a_device_that_would_rest_draws_while_the_networks_work() {
         let meanwhile = AtomicUsize::new(0);
         let made = || {
             let before = renderer.drawn.load(Ordering::SeqCst);
-            thread::sleep(Duration::from_millis(300));
-            let drawn = renderer.drawn.load(Ordering::SeqCst) - before;
-            meanwhile.fetch_add(drawn, Ordering::SeqCst);
+            let drawn = || renderer.drawn.load(Ordering::SeqCst) - before;
+            // One that would rest draws until the networks are done; the other one gets the time
+            // for a view and draws none.
+            let patience = if rests { Duration::from_secs(60) } else { Duration::from_millis(300) };
+            let begun = Instant::now();
+            while drawn() < 2 && begun.elapsed() < patience {
+                thread::sleep(Duration::from_millis(2));
+            }
+            meanwhile.fetch_add(drawn(), Ordering::SeqCst);
         };
         refined_whole(&renderer, &photos, (0.0, usize::MAX), &made);
         let drawn = meanwhile.into_inner();

@@ -18,7 +18,7 @@ fn scoring(profile: Preset, canon: &[[f32; 2]]) -> Arc<Scoring> {
 
 fn new(preset: Preset, canon: Vec<Vec<f32>>, tau: f64, floor: f64) -> Result<Scoring> {
     let names: Vec<String> = (0..canon.len()).map(|c| c.to_string()).collect();
-    let method = ScoringMethod::of(preset, names.clone(), tau, floor);
+    let method = ScoringMethod::of(preset, names.clone(), tau, floor, 0.0);
     Scoring::new(&ScoringMethod { canon: names, tau, ..method }, canon)
 }
 
@@ -26,7 +26,7 @@ fn new(preset: Preset, canon: Vec<Vec<f32>>, tau: f64, floor: f64) -> Result<Sco
 fn all_over_the_canon(canon: &[[f32; 2]]) -> Arc<Scoring> {
     let names: Vec<String> = (0..canon.len()).map(|c| c.to_string()).collect();
     let near_best = ScoringMethod::NEAR_BEST_MAX;
-    let method = ScoringMethod::of(Preset::Default, names, 10.0, 0.05);
+    let method = ScoringMethod::of(Preset::Default, names, 10.0, 0.05, 0.0);
     let canon = canon.iter().map(|c| c.to_vec()).collect();
     Arc::new(Scoring::new(&ScoringMethod { near_best, ..method }, canon).unwrap())
 }
@@ -217,7 +217,7 @@ fn a_cut_selects_from_its_relevancy_on_and_no_less() {
     let bank = Bank { dim: 2, rows: [X, [0.6, 0.8], Y].concat() };
     let view = view(&[&[(1, 0.5)], &[(2, 0.9)], &[(1, 0.2), (2, 0.3)], &[(3, 0.7)], &[]]);
     let with = |cut: f64| {
-        let method = ScoringMethod::of(Preset::Paper, Vec::new(), 10.0, 0.0);
+        let method = ScoringMethod::of(Preset::Paper, Vec::new(), 10.0, 0.0, 0.0);
         let method = ScoringMethod { canon: vec!["y".to_owned()], cut, ..method };
         let scoring = Arc::new(Scoring::new(&method, vec![Y.to_vec()]).unwrap());
         let scorer = Scorer::new(&bank, scoring).unwrap();
@@ -257,4 +257,38 @@ fn an_entry_far_under_the_best_one_of_its_text_is_left_out() {
     };
     assert_eq!(selected(Preset::Default), [true, true, false, true]);
     assert_eq!(selected(Preset::Paper), [true; 4]);
+}
+
+#[test]
+fn a_margin_moves_what_counts_as_the_canon_in_tables_masks_and_relevancies_alike() {
+    // Unit rows whose cosines with the text are over those with the canon by 0.2, 0 and -0.2.
+    let towards = |angle: f32| [angle.cos(), angle.sin()];
+    let middle = std::f32::consts::FRAC_PI_4;
+    let rows = [-0.141_9, 0.0, 0.141_9].map(|off| towards(middle + off));
+    let bank = Bank { dim: 2, rows: rows.map(|row| row.map(|v| 3.0 * v)).concat() };
+    let selected = |margin: f64| {
+        let names = vec!["y".to_owned()];
+        let method = ScoringMethod::of(Preset::Default, names, 10.0, 0.05, margin);
+        let method = ScoringMethod { near_best: 2.0, ..method };
+        let scorer =
+            Scorer::new(&bank, Scoring::new(&method, vec![Y.to_vec()]).unwrap().into()).unwrap();
+        let text = scorer.text(&X).unwrap();
+        let pixels = view(&[&[(1, 0.9)], &[(2, 0.9)], &[(3, 0.9)], &[(1, 0.5), (3, 0.4)]]);
+        let norms = scorer.norms(&pixels).unwrap();
+        let relevancy = scorer.relevancy(&text, &pixels, &norms).unwrap();
+        let mask = scorer.mask(&text, &pixels).unwrap();
+        assert_eq!(relevancy.iter().map(|v| *v >= 0.5).collect::<Vec<_>>(), mask, "{margin}");
+        let entries = [1, 2, 3].map(|m| text.selects(m));
+        assert_eq!(entries[..], mask[..3], "{margin}");
+        (mask, text.relevancies()[1])
+    };
+    let (plain, sure) = selected(0.0);
+    assert_eq!(plain, [true, false, false, true]);
+    assert!((f64::from(sure) - 1.0 / (1.0 + (-2.0_f64).exp())).abs() < 1e-3, "{sure}");
+    assert_eq!(selected(-0.1).0, [true, true, false, true]);
+    assert_eq!(selected(-0.25).0, [true; 4]);
+    let (strict, sure) = selected(0.1);
+    assert_eq!(strict, [true, false, false, false]);
+    assert!((f64::from(sure) - 1.0 / (1.0 + (-1.0_f64).exp())).abs() < 1e-3, "{sure}");
+    assert_eq!(selected(0.25).0, [false; 4]);
 }

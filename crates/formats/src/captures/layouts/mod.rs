@@ -5,6 +5,7 @@ mod arkit;
 mod bundler;
 mod json;
 mod llff;
+mod metashape;
 mod mvs;
 mod opensfm;
 mod polycam;
@@ -33,7 +34,7 @@ impl Seen {
 }
 
 /// All readers with their classes.
-static LAYOUTS: [(&dyn Layout, usize); 11] = [
+static LAYOUTS: [(&dyn Layout, usize); 12] = [
     (&json::Transforms, 0),
     (&Colmap, 1),
     (&llff::Llff, 2),
@@ -44,6 +45,7 @@ static LAYOUTS: [(&dyn Layout, usize); 11] = [
     (&realestate::RealEstate, 3),
     (&opensfm::OpenSfm, 3),
     (&bundler::Bundler, 3),
+    (&metashape::Metashape, 3),
     (&json::CamerasJson, 4),
 ];
 
@@ -52,7 +54,7 @@ static LAYOUTS: [(&dyn Layout, usize); 11] = [
 const NOT_READ: [(&str, &str); 7] = [
     (".rcproj", "RealityCapture's project"),
     (".csv", "a table, as RealityCapture exports cameras"),
-    (".xml", "XML, as Metashape exports cameras"),
+    (".xml", "XML, and not the cameras that Metashape exports"),
     (".psx", "Metashape's project"),
     (".db", "COLMAP's database, which holds no poses"),
     ("groundtruth.txt", "TUM's trajectory"),
@@ -69,6 +71,13 @@ pub(super) fn find(folder: &Folder<'_>) -> Vec<Seen> {
     all
 }
 
+/// What finds the cameras of photos alone; README and docs/captures.md have the same lines.
+pub(super) const FIND_CAMERAS: &str = r#"photos alone: these find cameras (pip install pycolmap):
+pycolmap.extract_features("photos/database.db", "photos/images")
+pycolmap.match_exhaustive("photos/database.db")
+pycolmap.incremental_mapping("photos/database.db", "photos/images", "photos/sparse")
+Then send the folder "photos". docs/captures.md says more"#;
+
 /// The message where no cameras were found.
 pub(super) fn none(folder: &Folder<'_>) -> String {
     let known = LAYOUTS.map(|(layout, _)| layout.name()).join(", ");
@@ -81,8 +90,7 @@ pub(super) fn none(folder: &Folder<'_>) -> String {
     });
     format!(
         "{}: no transforms.json and no cameras.json in it, nor another layout with cameras; {} \
-         files were looked at, and these layouts are known: {known}{not_read}. Where there are \
-         photos alone, docs/captures.md has the three lines of pycolmap that find their cameras",
+         files were looked at, and these layouts are known: {known}{not_read}; {FIND_CAMERAS}",
         folder.what,
         folder.paths().count()
     )
