@@ -73,7 +73,8 @@ class Walk:
 
     def shell(self, lines: str) -> str:
         """Runs lines of the README where they stand, in the root; what they print."""
-        lines = lines.replace(f"127.0.0.1:{PORT}", self.host).replace("/tmp/", f"{self.made}/")
+        lines = lines.replace(f"127.0.0.1:{PORT}", self.host)
+        lines = lines.replace("/tmp/photos", f"{self.made}/photos")
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", lines], cwd=ROOT, env=self.env,
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
