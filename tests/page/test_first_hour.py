@@ -166,7 +166,7 @@ def test_a_word_says_how_well_it_fits_and_how_well_it_is_known(
 def test_a_word_that_is_nowhere_is_not_found(page: Page, url: str, scene: str) -> None:
     def nothing(route: Route) -> None:
         told = route.fetch().json()
-        told["results"][0] |= {"gaussians": 0, "parts": [], "entries": []}
+        told["results"][0] |= {"found": False, "gaussians": 0, "parts": [], "entries": []}
         told["results"][0]["scores"] = [0.31] * len(told["results"][0]["scores"])
         route.fulfill(json=told)
 
