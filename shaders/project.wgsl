@@ -11,16 +11,28 @@
 // Photos of the views.
 @group(0) @binding(6) var<storage, read> sources: array<Source>;
 
-// Scales with what the blur lost given back, where the view shows the Gaussian larger than its
-// photo did (crates/render/src/plan.rs).
-fn magnified(gaussian: Gaussian, source: Source, depth: f32) -> vec3<f32> {
+// How a view blurs a Gaussian that it shows larger or smaller than its photo did
+// (crates/render/src/plan.rs).
+struct Blur {
+    // Variance that is added to each axis, world units².
+    lost: f32,
+    // The blur that it was learnt with, as large as the view shows it, and the one that is drawn.
+    learnt: f32,
+    drawn: f32,
+}
+
+fn blur_of(gaussian: Gaussian, source: Source, depth: f32) -> Blur {
     let width = max(dot(gaussian.mean - source.center, source.axis), 0.0) * source.scale;
     let p = width * views[which].own_focal / depth;
-    if !(p > 1.0) {
-        return gaussian.scale;
+    if p > 1.0 {
+        return Blur(BLUR_PX2 * width * width * (1.0 - 1.0 / (p * p)), BLUR_PX2, BLUR_PX2);
     }
-    let lost = BLUR_PX2 * width * width * (1.0 - 1.0 / (p * p));
-    return sqrt(gaussian.scale * gaussian.scale + lost);
+    let size = p * (OWN_SIZE * OWN_SIZE);
+    if !(size < 1.0 && width > 0.0) || views[which].antialiased != 0u {
+        return Blur(0.0, BLUR_PX2, BLUR_PX2);
+    }
+    let learnt = BLUR_PX2 * size * size;
+    return Blur(0.0, learnt, learnt + PIXEL_PX2 * (1.0 - size * size));
 }
 
 // EWA projection of Gaussian i; opacity 0 when it cannot be seen.
@@ -32,9 +44,13 @@ fn project_one(i: u32) -> Footprint {
         return footprint;
     }
     var scale = gaussian.scale;
+    var blur = Blur(0.0, BLUR_PX2, BLUR_PX2);
     if gaussian.source < views[which].source_count {
         let source = sources[views[which].source_start + gaussian.source];
-        scale = magnified(gaussian, source, t.z);
+        blur = blur_of(gaussian, source, t.z);
+        if blur.lost > 0.0 {
+            scale = sqrt(scale * scale + blur.lost);
+        }
         footprint.depth = select(t.z, -t.z, source.behind != 0u);
     }
     let slope = t.xy / t.z;
@@ -51,19 +67,23 @@ fn project_one(i: u32) -> Footprint {
 
     let xx = dot(m0, m0);
     let yy = dot(m1, m1);
-    let var_y = yy + BLUR_PX2;
+    let var_y = yy + blur.drawn;
     // det(M Mᵀ) / var_y as a sum of squares (Cauchy-Binet): it cannot cancel or go negative, and
     // divided by var_y it stays in f32's range.
     let sharp = cross(m0, m1 * inverseSqrt(var_y));
     let sharp_x = dot(sharp, sharp);
     // Variance of x given y: det / var_y.
-    let given_x = sharp_x + BLUR_PX2 * ((xx + BLUR_PX2) / var_y + yy / var_y);
+    let given_x = sharp_x + blur.drawn * ((xx + blur.drawn) / var_y + yy / var_y);
     if !(is_finite(xx) && is_finite(yy) && is_finite(given_x) && given_x > 0.0) {
         return footprint;
     }
     var opacity = gaussian.opacity;
     if views[which].antialiased != 0u {
         opacity *= sqrt(sharp_x / given_x);
+    } else if blur.learnt < BLUR_PX2 {
+        // Its sum over the picture stays, less what is under the least alpha.
+        let learnt_x = sharp_x + blur.learnt * ((xx + blur.learnt) / var_y + yy / var_y);
+        opacity -= (1.0 - sqrt(learnt_x / given_x)) * (opacity - ALPHA_MIN);
     }
     if !(opacity >= ALPHA_MIN) {
         return footprint;

@@ -65,20 +65,29 @@ fn back(i: u32, footprint: Footprint) {
     let focal = views[which].focal * per_z;
     let slope = t.xy * per_z;
     let bounded = clamp(slope, views[which].slope_min, views[which].slope_max);
-    // The variance that the blur lost, and its derivatives by the centre and by t.z.
+    // The variance that the blur lost, or the square of the size where it is under 1, with its
+    // derivatives by the centre and by t.z.
     var lost = 0.0;
-    var lost_by_mean = vec3(0.0);
-    var lost_by_z = 0.0;
+    var square = 1.0;
+    var blur_by_mean = vec3(0.0);
+    var blur_by_z = 0.0;
     if gaussian.source < views[which].source_count {
         let source = sources[views[which].source_start + gaussian.source];
         let width = max(dot(gaussian.mean - source.center, source.axis), 0.0) * source.scale;
         let least = t.z / views[which].own_focal;
         if width > least {
             lost = BLUR_PX2 * (width - least) * (width + least);
-            lost_by_mean = source.axis * (2.0 * BLUR_PX2 * width * source.scale);
-            lost_by_z = -2.0 * BLUR_PX2 * least / views[which].own_focal;
+            blur_by_mean = source.axis * (2.0 * BLUR_PX2 * width * source.scale);
+            blur_by_z = -2.0 * BLUR_PX2 * least / views[which].own_focal;
+        }
+        let size = width / least * (OWN_SIZE * OWN_SIZE);
+        if size < 1.0 && width > 0.0 && views[which].antialiased == 0u {
+            square = size * size;
+            blur_by_mean = source.axis * (2.0 * square / width * source.scale);
+            blur_by_z = -2.0 * square * per_z;
         }
     }
+    let drawn = BLUR_PX2 * square + PIXEL_PX2 * (1.0 - square);
     let squares = gaussian.scale * gaussian.scale + lost;
     let rotation = rotation_of(gaussian.quat);
     let turned_x = views[which].rotation_x.xyz * rotation;
@@ -91,22 +100,34 @@ fn back(i: u32, footprint: Footprint) {
     // in needles. It is taken apart (Cauchy-Binet), with 1 / (variance of y) = b² / 2.
     let normal = cross(sharp_x, sharp_y);
     let beside = cross(squares * sharp_y, normal);
-    let along_a = (a.x * 0.5 * b * b) * (BLUR_PX2 * sharp_x + beside);
+    let along_a = (a.x * 0.5 * b * b) * (drawn * sharp_x + beside);
     let along_b = b * sharp_y;
     // The derivative by the covariance is -(a u + b v)² / 2 as a matrix, summed: here times axes.
     var by_u = -(found[3] * along_a + found[4] * along_b);
     var by_v = -(found[4] * along_a + found[5] * along_b);
-    if views[which].antialiased != 0u {
-        // The opacity goes with √(det sharp / det): by the covariance that is half the difference
-        // of the inverses, blur · inverse sharp · inverse / 2, of axes of at most 1.
-        let largest = max(max(squares.x, squares.y), squares.z);
-        let unit = squares / largest;
-        let areas = unit.yzx * unit.zxy * normal * normal;
-        let by_share = -0.5 * BLUR_PX2 * found[0] / (largest * (areas.x + areas.y + areas.z));
-        if is_finite(by_share) {
+    // The opacity goes with √(det less blurred / det): by the covariance that is half the difference
+    // of the inverses, that of the blurs · inverse less blurred · inverse / 2.
+    var by_opacity = -found[0] / footprint.opacity;
+    var by_size = 0.0;
+    if views[which].antialiased != 0u || square < 1.0 {
+        let inner = select(BLUR_PX2 * square, 0.0, views[which].antialiased != 0u);
+        let least = select(ALPHA_MIN, 0.0, views[which].antialiased != 0u);
+        let areas = squares.yzx * squares.zxy * normal * normal;
+        let wide = dot(squares, sharp_x * sharp_x + sharp_y * sharp_y);
+        let per_det = 1.0 / (areas.x + areas.y + areas.z + inner * (wide + inner));
+        if is_finite(per_det) {
+            let by_log = by_opacity * (footprint.opacity - least);
+            let by_share = 0.5 * by_log * (drawn - inner) * per_det;
             let skewed = sharp_y + footprint.conic_shear * sharp_x;
-            by_u += (by_share * a.x) * cross(unit * skewed, normal);
-            by_v += (by_share * b) * cross(normal, unit * sharp_x);
+            by_u += by_share * (inner * along_a + a.x * cross(squares * skewed, normal));
+            by_v += by_share * (inner * along_b + b * cross(normal, squares * sharp_x));
+            let by_drawn = dot(a, a) * (found[3] + 0.5 * by_log) + 2.0 * a.y * b * found[4]
+                + b * b * (found[5] + 0.5 * by_log);
+            by_size = 0.5 * (BLUR_PX2 * by_log * (wide + 2.0 * inner) * per_det
+                - (BLUR_PX2 - PIXEL_PX2) * by_drawn);
+            if gaussian.opacity > least {
+                by_opacity *= (footprint.opacity - least) / (gaussian.opacity - least);
+            }
         }
     }
     let by_square = 0.5 * (along_a * by_u + along_b * by_v);
@@ -117,13 +138,13 @@ fn back(i: u32, footprint: Footprint) {
     let by_x = by_sharp_x * focal.x;
     let by_y = by_sharp_y * focal.y;
     let by_slope = vec2(-dot(by_x, turned_z), -dot(by_y, turned_z));
-    let by_lost = by_square.x + by_square.y + by_square.z;
+    let by_blur = select(by_size, by_square.x + by_square.y + by_square.z, lost > 0.0);
     let free = select(vec2(0.0), by_slope * per_z, bounded == slope);
     let by_t = by_place * focal + free;
-    let by_depth = found[9] + by_lost * lost_by_z - dot(by_t, slope)
+    let by_depth = found[9] + by_blur * blur_by_z - dot(by_t, slope)
         - (dot(by_sharp_x, sharp_x) + dot(by_sharp_y, sharp_y)) * per_z;
     let by_mean = by_t.x * views[which].rotation_x.xyz + by_t.y * views[which].rotation_y.xyz
-        + by_depth * views[which].rotation_z.xyz + by_lost * lost_by_mean;
+        + by_depth * views[which].rotation_z.xyz + by_blur * blur_by_mean;
 
     // A turn about one axis moves variance between the other two: nothing where they are equal.
     let scale = gaussian.scale;
@@ -137,7 +158,7 @@ fn back(i: u32, footprint: Footprint) {
         put(to + k, by_mean[k]);
         put(to + 8u + k, by_own[k]);
     }
-    put(to + 3u, -found[0] / gaussian.opacity);
+    put(to + 3u, by_opacity);
     for (var k = 0u; k < 4u; k++) {
         put(to + 4u + k, by_quat[k]);
     }

@@ -36,12 +36,14 @@ void main() {
     1. - 2. * (q.z * q.z + q.w * q.w), 2. * (q.y * q.z + q.x * q.w), 2. * (q.y * q.w - q.x * q.z),
     2. * (q.y * q.z - q.x * q.w), 1. - 2. * (q.y * q.y + q.w * q.w), 2. * (q.z * q.w + q.x * q.y),
     2. * (q.y * q.w + q.x * q.z), 2. * (q.z * q.w - q.x * q.y), 1. - 2. * (q.y * q.y + q.z * q.z));
-  // What the blur lost where the view magnifies the photo.
+  // What the blur lost where the view magnifies the photo, or the blur where it shows it smaller.
   int photo = int(b.w & 0xffffu);
   vec4 p0 = texelFetch(photos, ivec2(0, photo), 0), p1 = texelFetch(photos, ivec2(1, photo), 0);
   float wide = max(dot(mean - p0.xyz, p1.xyz), 0.) * p0.w;
   float p = wide * max(lens.x, lens.y) / t.z / 1.25;
   if (p > 1.) s = sqrt(s * s + .3 * wide * wide * (1. - 1. / (p * p)));
+  float seen = wide > 0. && !antialiased ? min(p * 1.5625, 1.) : 1.;
+  float learnt = .3 * seen * seen, blur = learnt + (1. - seen * seen) / 12.;
   // The Jacobian at the centre, clamped to the widened frustum.
   vec2 margin = .15 * size / lens.xy;
   vec2 c = clamp(t.xy / t.z, -lens.zw / lens.xy - margin, (size - lens.zw) / lens.xy + margin);
@@ -49,7 +51,7 @@ void main() {
   mat3 scaled = mat3(m[0] * s.x, m[1] * s.y, m[2] * s.z);
   vec2 f = lens.xy / t.z;
   vec3 row0 = vec3(f.x, 0., -f.x * c.x) * scaled, row1 = vec3(0., f.y, -f.y * c.y) * scaled;
-  float xx = dot(row0, row0) + .3, xy = dot(row0, row1), yy = dot(row1, row1) + .3;
+  float xx = dot(row0, row0) + blur, xy = dot(row0, row1), yy = dot(row1, row1) + blur;
   float middle = .5 * (xx + yy), apart = length(vec2(.5 * (xx - yy), xy));
   float angle = .5 * atan(2. * xy, xx - yy);
   if (apart == 0.) angle = 0.;
@@ -57,10 +59,15 @@ void main() {
   // The smaller one as a product over the larger: it stays exact for needles.
   float large = middle + apart;
   vec3 area = cross(row0, row1);
-  float small = (dot(area, area) + .3 * (xx - .3 + yy - .3) + .09) / large;
+  float sharp = dot(area, area), wides = xx + yy - 2. * blur;
+  float small = (sharp + blur * (wides + blur)) / large;
   axes = vec4(axis * sqrt(large), vec2(-axis.y, axis.x) * sqrt(small));
   // What the blur adds to small ones, taken off again.
-  if (antialiased) opacity *= sqrt(dot(area, area) / (large * small));
+  if (antialiased) opacity *= sqrt(sharp / (large * small));
+  else if (seen < 1.) {
+    float share = sqrt((sharp + learnt * (wides + learnt)) / (large * small));
+    opacity -= (1. - share) * (opacity - 1. / 255.);
+  }
   place = vec4(f * t.xy + lens.zw, t.z / extent, opacity);
 }`;
 

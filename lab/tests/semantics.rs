@@ -128,6 +128,20 @@ fn words_find_their_boxes_in_a_view_and_a_word_for_nothing_does_not() {
     grids_show_e_and_f(&image::open(grid).unwrap().to_rgb8());
 }
 
+#[test]
+fn one_scene_of_spread_photos_is_asked_at_every_target() {
+    let dir = folder();
+    let Some(rows) = judged(dir.path(), &["--spread", "--targets", "1"]) else { return };
+    let row = &rows.unwrap()[0];
+    let [target] = &row["targets"].as_array().unwrap()[..] else { panic!("{row}") };
+    assert_eq!(target["target"], json!("images/0.png"), "{row}");
+    assert_eq!(target["inputs"], json!(["images/1.png", "images/2.png"]), "{row}");
+    assert_eq!((&row["spread"], &row["default"]["flat"]["miou"]), (&json!(true), &Value::Null));
+    assert!(row["default"]["scene"]["miou"].as_f64().unwrap() > 0.4, "{row}");
+    let fault = judged(dir.path(), &["--spread"]).unwrap().unwrap_err();
+    assert!(fault.message().contains("0 photos are no target"), "{fault}");
+}
+
 /// Of the middle photo: photo, view, E, F, labels, the scene's texts, the flat ones.
 fn grids_show_e_and_f(grid: &image::RgbImage) {
     let (width, height) = (grid.width() / 7, grid.height() / 3);

@@ -28,6 +28,11 @@ shared! { pub f32;
     /// Added to both numbers on the diagonal of the 2D covariance, px²: a Gaussian covers at least
     /// a pixel.
     BLUR_PX2 = crate::scene::BLUR_PX2;
+    /// Magnification up to which a Gaussian counts as seen at the network's own size.
+    OWN_SIZE = 1.25;
+    /// Variance of a pixel along each axis, px²: its square is the filter of what a view shows
+    /// smaller than it was learnt.
+    PIXEL_PX2 = 1.0 / 12.0;
     /// Share of the view's half-extent by which the frustum is widened before the Jacobian is
     /// taken: beyond it the affine approximation of the perspective map explodes.
     FRUSTUM_MARGIN = 0.3;
@@ -58,8 +63,6 @@ pub const SH_C3: [f32; 7] = [
     -0.590_043_6,
 ];
 
-/// Magnification up to which a Gaussian counts as seen at the network's own size.
-pub const OWN_SIZE: f32 = 1.25;
 /// Bit of a depth key that puts a Gaussian behind all those without it: depths are over 0, so the
 /// sign of their f32 is free.
 pub const BEHIND_BIT: u32 = 1 << 31;

@@ -13,8 +13,8 @@ use rayon::prelude::*;
 use super::{
     Background, Labels, RenderRequest, Source,
     constants::{
-        ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FRUSTUM_MARGIN, OWN_SIZE, SH_C0, SH_C1, SH_C2, SH_C3,
-        SH_OFFSET, TRANSMITTANCE_MIN,
+        ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FRUSTUM_MARGIN, OWN_SIZE, PIXEL_PX2, SH_C0, SH_C1, SH_C2,
+        SH_C3, SH_OFFSET, TRANSMITTANCE_MIN,
     },
     labels::BLEND_WIDTH,
 };
@@ -262,14 +262,18 @@ pub fn splat(
     let (row0, row1) = (a.row(0), a.row(1));
     let sharp_det = row0.cross(row1).length_squared();
     let (xx, xy, yy) = (row0.dot(row0), row0.dot(row1), row1.dot(row1));
-    let blur = f64::from(BLUR_PX2);
-    let det = sharp_det + blur * (xx + yy) + blur * blur;
+    let Blur { learnt, drawn: blur } = Blur::of(source, mean, t.z, lens, request.antialiased);
+    let blurred = |blur: f64| sharp_det + blur * (xx + yy) + blur * blur;
+    let det = blurred(blur);
     if det <= 0.0 || !det.is_finite() {
         return None;
     }
     let mut opacity = f64::from(gaussians.opacities()[i]);
     if request.antialiased {
         opacity *= (sharp_det / det).max(0.0).sqrt();
+    } else {
+        let least = f64::from(ALPHA_MIN);
+        opacity -= (1.0 - (blurred(learnt) / det).sqrt()) * (opacity - least);
     }
     if opacity < f64::from(ALPHA_MIN) {
         return None;
@@ -290,11 +294,42 @@ pub fn splat(
     })
 }
 
+/// The variances that are added to a Gaussian on the picture, px²: see [`crate::plan`].
+#[derive(Clone, Copy, Debug)]
+pub struct Blur {
+    /// The blur that it was learnt with, as large as the view shows it.
+    pub learnt: f64,
+    /// What is added to it.
+    pub drawn: f64,
+}
+
+impl Blur {
+    /// Of a Gaussian at `mean` and `depth` of the view.
+    pub fn of(
+        source: Option<&Source>,
+        mean: DVec3,
+        depth: f64,
+        lens: &Intrinsics,
+        antialiased: bool,
+    ) -> Self {
+        let width = source.map_or(0.0, |source| source_width(source, mean));
+        let size = (width * lens.fx.max(lens.fy) / depth * f64::from(OWN_SIZE)).min(1.0);
+        let smaller = if width > 0.0 && !antialiased { 1.0 - size * size } else { 0.0 };
+        let learnt = f64::from(BLUR_PX2) * (1.0 - smaller);
+        Self { learnt, drawn: learnt + f64::from(PIXEL_PX2) * smaller }
+    }
+}
+
+/// Width of a Gaussian's source pixel in the world.
+pub fn source_width(source: &Source, mean: DVec3) -> f64 {
+    let [center, axis] = [source.center, source.axis].map(|v| DVec3::from(v.map(f64::from)));
+    (mean - center).dot(axis).max(0.0) * f64::from(source.scale)
+}
+
 /// What the blur lost of a Gaussian's variance, where a view shows it larger than its photo did:
 /// see [`crate::plan`].
 fn blur_lost(source: &Source, mean: DVec3, depth: f64, lens: &Intrinsics) -> f64 {
-    let [center, axis] = [source.center, source.axis].map(|v| DVec3::from(v.map(f64::from)));
-    let width = (mean - center).dot(axis).max(0.0) * f64::from(source.scale);
+    let width = source_width(source, mean);
     let p = width * lens.fx.max(lens.fy) / depth / f64::from(OWN_SIZE);
     if p > 1.0 { f64::from(BLUR_PX2) * width.powi(2) * (1.0 - 1.0 / (p * p)) } else { 0.0 }
 }

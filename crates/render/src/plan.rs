@@ -14,6 +14,13 @@
 //! depth in the photo times [`Source::scale`]; a magnification up to [`OWN_SIZE`] counts as none.
 //! [`widened`] adds it for good, for files and for refinement.
 //!
+//! **Views from afar.** A Gaussian that is shown smaller than in its own photo, by `s` under 1 with
+//! `s = 1.25 w f / t.z`, was learnt with a blur of `0.3 s²` of the view's pixels. It is drawn with
+//! that and with the variance of a pixel's square, `(1 - s²) / 12`. Its opacity falls by
+//! the ratio of the two areas, so what it adds to the picture is kept, also under the least alpha
+//! that counts: `o - (1 - √(det learnt / det drawn)) (o - 1/255)`. The antialiased mode has a rule
+//! of its own instead.
+//!
 //! **Backdrop.** Rays that meet no Gaussian show the photos' colours by direction.
 //!
 //! Each of the three is a field of [`ViewMethod`] and can be left out.

@@ -182,6 +182,11 @@ fn judge(
     let (mut targets, mut left_out, mut pictures) = (Vec::new(), Vec::new(), Vec::new());
     let asked: Vec<usize> = scene.frames.iter().step_by(every).map(|frame| frame.photo).collect();
     let given = spread(scene.photos.len(), &asked, args.inputs.photos);
+    if args.spread && given.len() < 2 {
+        let count = given.len();
+        let message = format!("{name}: {count} photos are no target; spread needs 2 or more");
+        return Err(Error::invalid(message));
+    }
     let make = |way| tools.make(&scene.photos, &given, way);
     let all = ways.iter().filter(|_| args.spread).map(make).collect::<Result<Vec<Made>>>();
     let all = all.map_err(|e| Error::new(e.code(), format!("{name}: {e}")).caused_by(e))?;

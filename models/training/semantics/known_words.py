@@ -105,7 +105,8 @@ def main():
 
 
 def page(path, groups, count, things, photographs):
-    percent = lambda v: "-" if v is None else f"{100 * v:.0f} %"
+    of_100 = lambda v: float(np.float32(100) * np.float32(v))  # as the server has it
+    percent = lambda v: "-" if v is None else f"{of_100(v):.0f} %"
     lines = [
         "# Words that the embedded bundle knows", "",
         f"Measured on {things} things that were cut out along their labelled outlines and {photographs} whole photographs; no training saw them.",
@@ -122,7 +123,7 @@ def page(path, groups, count, things, photographs):
         order = {t: i for i, t in enumerate(count)}
         for r in sorted(rows, key=lambda r: (order[r["trust"]], r["word"])):
             pair = lambda n: f"{r[n]}, {percent(r[n + '_found'])}" if r[n] else "-"
-            lines.append(f"| {r['word']} | {r['trust']} | {pair('things')} | {pair('photographs')} | {100 * r['absent']:.1f} % |")
+            lines.append(f"| {r['word']} | {r['trust']} | {pair('things')} | {pair('photographs')} | {of_100(r['absent']):.1f} % |")
         lines.append("")
     open(path, "w").write("\n".join(lines).rstrip() + "\n")
 

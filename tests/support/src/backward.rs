@@ -13,9 +13,10 @@ use segsplat_render::{
     Background, RenderRequest,
     backward::{FrameGradients, Gradients, basis_slopes},
     constants::{
-        ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FRUSTUM_MARGIN, OWN_SIZE, SH_OFFSET, TRANSMITTANCE_MIN,
+        ALPHA_MAX, ALPHA_MIN, BLUR_PX2, FRUSTUM_MARGIN, OWN_SIZE, PIXEL_PX2, SH_OFFSET,
+        TRANSMITTANCE_MIN,
     },
-    oracle::{self, Splat},
+    oracle::{self, Blur, Splat, source_width},
 };
 
 /// Derivatives by the numbers of a Gaussian on the picture.
@@ -185,10 +186,18 @@ fn back(
     let own = f64::from(OWN_SIZE) / fx.max(fy);
     let source = request.sources.get(usize::from(gaussians.source()[i].view));
     let (mut lost, mut lost_by_mean, mut lost_by_z) = (0.0, DVec3::ZERO, 0.0);
+    // The square of the size of what is shown smaller, which the blur depends on.
+    let Blur { learnt, drawn } = Blur::of(source, mean, z, lens, request.antialiased);
+    let (mut size_by_mean, mut size_by_z) = (DVec3::ZERO, 0.0);
     if let Some(source) = source {
-        let [center, axis] = [source.center, source.axis].map(|v| DVec3::from(v.map(f64::from)));
+        let axis = DVec3::from(source.axis.map(f64::from));
         let scale = f64::from(source.scale);
-        let width = (mean - center).dot(axis).max(0.0) * scale;
+        let width = source_width(source, mean);
+        if learnt < f64::from(BLUR_PX2) {
+            let size = learnt / f64::from(BLUR_PX2);
+            size_by_mean = axis * (2.0 * size / width * scale);
+            size_by_z = -2.0 * size / z;
+        }
         if width > own * z {
             let blur = f64::from(BLUR_PX2);
             lost = blur * (width * width - (own * z).powi(2));
@@ -206,19 +215,26 @@ fn back(
         |m: DMat2| DMat3::from_cols(m.x_axis.extend(0.0), m.y_axis.extend(0.0), DVec3::ZERO);
     let mut by_covariance = by.covariance;
     let mut by_opacity = by.opacity;
-    if request.antialiased {
+    let mut by_size = 0.0;
+    if request.antialiased || learnt < f64::from(BLUR_PX2) {
         let (row0, row1) = (a.row(0), a.row(1));
         let sharp_det = row0.cross(row1).length_squared();
         let (xx, xy, yy) = (row0.dot(row0), row0.dot(row1), row1.dot(row1));
-        let blur = f64::from(BLUR_PX2);
-        let det = sharp_det + blur * (xx + yy) + blur * blur;
-        let share = (sharp_det / det).max(0.0).sqrt();
         let adjugate =
             |blur: f64| DMat2::from_cols(DVec2::new(yy + blur, -xy), DVec2::new(-xy, xx + blur));
-        if sharp_det > 0.0 {
-            let by_share = by.opacity * f64::from(gaussians.opacities()[i]);
-            let slope = adjugate(0.0) / (sharp_det * det).sqrt() - adjugate(blur) * (share / det);
-            by_covariance += slope * (0.5 * by_share);
+        let trace = |of: DMat2| of.x_axis.x + of.y_axis.y;
+        let (inner, least) =
+            if request.antialiased { (0.0, 0.0) } else { (learnt, f64::from(ALPHA_MIN)) };
+        let blurred = |blur: f64| sharp_det + blur * (xx + yy) + blur * blur;
+        let (kept, det) = (blurred(inner), blurred(drawn));
+        let share = (kept / det).max(0.0).sqrt();
+        if kept > 0.0 {
+            let by_share = by.opacity * (f64::from(gaussians.opacities()[i]) - least);
+            let by_kept = adjugate(inner) * (0.5 * by_share / (kept * det).sqrt());
+            let by_det = adjugate(drawn) * (-0.5 * by_share * share / det);
+            by_covariance += by_kept + by_det;
+            let (blur, pixel) = (f64::from(BLUR_PX2), f64::from(PIXEL_PX2));
+            by_size = blur * trace(by_kept) + (blur - pixel) * trace(by.covariance + by_det);
         }
         by_opacity *= share;
     }
@@ -238,13 +254,13 @@ fn back(
     let by_t = DVec3::new(
         by.mean.x * fx / z + by_slope[0] / z,
         by.mean.y * fy / z + by_slope[1] / z,
-        by.depth + by_lost * lost_by_z
+        by.depth + by_lost * lost_by_z + by_size * size_by_z
             - (by.mean.x * fx * t.x + by.mean.y * fy * t.y + by_slope[0] * t.x + by_slope[1] * t.y)
                 / (z * z)
             - (by_jacobian.row(0).x * fx + by_jacobian.row(1).y * fy) / (z * z)
             + (by_jacobian.row(0).z * fx * slope_x + by_jacobian.row(1).z * fy * slope_y) / (z * z),
     );
-    let mut by_mean = w.transpose() * by_t + lost_by_mean * by_lost;
+    let mut by_mean = w.transpose() * by_t + lost_by_mean * by_lost + size_by_mean * by_size;
     by_mean += of_color(gaussians, i, from_eye, by.color, &mut out.sh);
     out.means[i] = by_mean.into();
     out.scales[i] = std::array::from_fn(|k| by_scales[k] * scales[k] / widened[k]);

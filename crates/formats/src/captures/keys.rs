@@ -76,7 +76,7 @@ pub(super) fn check(fields: &Map<String, Value>, what: &str) -> Result<()> {
         let text = value.as_str().unwrap_or_default().to_lowercase();
         let of_value = matches!(&*name, "camera_type" | "projection" | "projection_type");
         let is = |word: &&str| name.contains(*word) || of_value && text.contains(*word);
-        if NOT_FLAT.iter().any(|word| is(&word)) {
+        if NOT_FLAT.iter().any(is) {
             let shown: String = value.to_string().chars().take(40).collect();
             return Err(Error::invalid(format!(
                 "{what}: {key} is {shown}: such pictures are not flat, and only pictures of \

@@ -91,14 +91,9 @@ impl Decimals {
     ///
     /// # Errors
     /// `invalid_request` where the file has commas and points.
-    pub(crate) fn see<'a>(
-        &mut self,
-        words: impl Iterator<Item = &'a str> + Clone,
-        path: &str,
-        line: usize,
-    ) -> Result<()> {
+    pub(crate) fn see(&mut self, words: &[&str], path: &str, line: usize) -> Result<()> {
         for (first, mark) in self.seen.iter_mut().zip([',', '.']) {
-            if words.clone().any(|word| word.contains(mark)) {
+            if words.iter().any(|word| word.contains(mark)) {
                 first.get_or_insert(line);
             }
         }

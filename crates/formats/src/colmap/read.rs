@@ -212,8 +212,9 @@ fn cameras_txt(text: &str, path: &str, max: usize) -> Result<Lenses> {
         let mut words = line.split_whitespace();
         let id = words.next().and_then(|id| id.parse().ok());
         let model = words.next().unwrap_or_default();
-        decimals.see(words.clone(), path, i + 1)?;
-        let values = numbers(&words.collect::<Vec<_>>().join(" "));
+        let words: Vec<&str> = words.collect();
+        decimals.see(&words, path, i + 1)?;
+        let values = numbers(&words.join(" "));
         let (Some(id), Some([width, height, values @ ..])) = (id, values.as_deref()) else {
             let why = format!("{path}: line {} is no camera", i + 1);
             return Err(Error::invalid(why));
@@ -239,7 +240,7 @@ fn images_txt(text: &str, path: &str, lenses: &Lenses, max: usize) -> Result<Vec
         }
         count(entries.len(), max, path)?;
         let (words, name) = first_words::<9>(line);
-        decimals.see(words[1..8].iter().copied(), path, i + 1)?;
+        decimals.see(&words[1..8], path, i + 1)?;
         let turn_and_place: Option<Vec<f64>> =
             words[1..8].iter().map(|word| number_of(word)).collect();
         let (image, camera) = (number_of(words[0]), words[8].parse());

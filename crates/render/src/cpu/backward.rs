@@ -32,7 +32,8 @@ use crate::{
     Frame, RenderRequest,
     backward::{FrameGradients, Gradients, basis_slopes},
     constants::{
-        ALPHA_MAX, ALPHA_MIN, BATCH_SIZE, BLUR_PX2, OWN_SIZE, TILE_SIZE, TRANSMITTANCE_MIN,
+        ALPHA_MAX, ALPHA_MIN, BATCH_SIZE, BLUR_PX2, OWN_SIZE, PIXEL_PX2, TILE_SIZE,
+        TRANSMITTANCE_MIN,
     },
     scene::Gaussians,
     view::View,
@@ -386,6 +387,18 @@ fn gaussian_back<S: Lanes, const DEPTH: bool>(
     open
 }
 
+/// How a view blurs a Gaussian: nothing is lost, or what was learnt is what is drawn.
+struct Blur {
+    /// Variance that is added to each axis, world units².
+    lost: f64,
+    /// The blur that it was learnt with, as large as the view shows it, px².
+    learnt: f64,
+    /// The blur that is drawn, px².
+    drawn: f64,
+    /// Derivatives by the centre and by t.z: of what is lost, or of the square of the size.
+    slope: (DVec3, f64),
+}
+
 /// Derivatives by the numbers of a Gaussian, before they become f32.
 struct Back {
     mean: [f64; 3],
@@ -419,7 +432,7 @@ impl Pass<'_> {
             std::array::from_fn(|k| slope[k].max(view.slope_min[k]).min(view.slope_max[k]));
         let [qw, qx, qy, qz] = gaussians.quats()[i].map(f64::from);
         let turned = view.rotation * rotation([qw, qx, qy, qz]);
-        let (lost, by_width, by_z) = self.lost(i, mean, t.z);
+        let Blur { lost, learnt, drawn, slope: slope_of_blur } = self.blur(i, mean, t.z);
         let scales = DVec3::from(gaussians.scales()[i].map(f64::from));
         let squares = scales * scales + lost;
         // Rows of J W R: a column is what an axis of the Gaussian is on the picture.
@@ -430,21 +443,36 @@ impl Pass<'_> {
         // long in needles. It is taken apart (Cauchy-Binet), with 1 / (variance of y) = b² / 2.
         let normal = sharp[0].cross(sharp[1]);
         let beside = (squares * sharp[1]).cross(normal);
-        let blur = f64::from(BLUR_PX2);
-        let along_a = (blur * sharp[0] + beside) * (a[0] * 0.5 * b * b);
+        let along_a = (drawn * sharp[0] + beside) * (a[0] * 0.5 * b * b);
         let along_b = sharp[1] * b;
         // The derivative by the covariance is -(a u + b v)² / 2 as a matrix, summed: here times
         // axes.
         let mut by_u = -(uu * along_a + uv * along_b);
         let mut by_v = -(uv * along_a + vv * along_b);
-        // The opacity goes with √(det sharp / det): by the covariance that is half the difference
-        // of the inverses, blur · inverse sharp · inverse / 2.
+        // The opacity goes with √(det less blurred / det): by the covariance that is half the
+        // difference of the inverses, that of the blurs · inverse less blurred · inverse / 2.
+        let opacity = f64::from(gaussians.opacities()[i]);
+        let shown = f64::from(footprint.opacity);
+        let (inner, least) =
+            if request.antialiased { (0.0, 0.0) } else { (learnt, f64::from(ALPHA_MIN)) };
         let sharp_det = (after(squares) * before(squares)).dot(normal * normal);
-        if request.antialiased && sharp_det > 0.0 {
-            let by_share = -0.5 * blur * by_power / sharp_det;
+        let wide = squares.dot(sharp[0] * sharp[0] + sharp[1] * sharp[1]);
+        let det = sharp_det + inner * (wide + inner);
+        let mut by_opacity = -by_power / shown;
+        let mut by_size = 0.0;
+        if inner < drawn && det > 0.0 {
+            let by_log = -by_power * (shown - least) / shown;
+            let by_share = 0.5 * by_log * (drawn - inner) / det;
             let skewed = sharp[1] + footprint.conic_shear * sharp[0];
-            by_u += by_share * a[0] * (squares * skewed).cross(normal);
-            by_v += by_share * b * normal.cross(squares * sharp[0]);
+            by_u += by_share * (inner * along_a + a[0] * (squares * skewed).cross(normal));
+            by_v += by_share * (inner * along_b + b * normal.cross(squares * sharp[0]));
+            by_opacity *= (shown - least) / (opacity - least);
+            // The blurs go with the square of the size, where it is under 1.
+            let (blur, pixel) = (f64::from(BLUR_PX2), f64::from(PIXEL_PX2));
+            let long = a[0] * a[0] + a[1] * a[1];
+            let by_drawn = -0.5
+                * (long * (uu + 0.5 * by_log) + 2.0 * a[1] * b * uv + b * b * (vv + 0.5 * by_log));
+            by_size = blur * 0.5 * by_log * (wide + 2.0 * inner) / det + (blur - pixel) * by_drawn;
         }
         let by_square = 0.5 * (along_a * by_u + along_b * by_v);
         let by_sharp = [squares * by_u * a[0], squares * (by_u * a[1] + by_v * b)];
@@ -453,7 +481,8 @@ impl Pass<'_> {
         // J W R: its rows are rows of W R times the focal length over z, less the slope's share.
         let by_bound =
             [0, 1].map(|k: usize| -view.focal[k] * per_z * by_sharp[k].dot(turned.row(2)));
-        let by_lost = by_square.element_sum();
+        // The variances that the place decides: what was lost, or the square of the size.
+        let by_variance = if lost > 0.0 { by_square.element_sum() } else { by_size };
         let mut by_t = DVec3::new(by_place[0] * fx * per_z, by_place[1] * fy * per_z, 0.0);
         for k in 0..2 {
             if bounded[k] == slope[k] {
@@ -462,36 +491,50 @@ impl Pass<'_> {
             by_t.z -= by_t[k] * slope[k];
         }
         by_t.z -= (by_sharp[0].dot(sharp[0]) + by_sharp[1].dot(sharp[1])) * per_z;
-        by_t.z += by_depth + by_lost * by_z;
+        by_t.z += by_depth + by_variance * slope_of_blur.1;
         // A turn about one axis moves variance between the other two: nothing where they are equal.
         let (next, last) = (after(scales), before(scales));
         let by_turn = mixed * (next - last) * (next + last);
         let (color, basis, by_place) = self.color(i, mean, [red, green, blue]);
-        let by_mean = view.rotation.transpose() * by_t + by_width * by_lost + by_place;
+        let by_mean = view.rotation.transpose() * by_t + slope_of_blur.0 * by_variance + by_place;
         Back {
             mean: by_mean.into(),
             quat: of_turn([qw, qx, qy, qz], by_turn),
             scales: (2.0 * scales * by_square).into(),
-            opacity: -by_power / f64::from(gaussians.opacities()[i]),
+            opacity: by_opacity,
             color,
             basis,
         }
     }
 
-    /// The variance that the blur lost, and its derivatives by the centre and by t.z. See
-    /// [`crate::plan`].
-    fn lost(&self, i: usize, mean: DVec3, z: f64) -> (f64, DVec3, f64) {
+    /// How the view blurs Gaussian `i`. See [`crate::plan`].
+    fn blur(&self, i: usize, mean: DVec3, z: f64) -> Blur {
+        let blur = f64::from(BLUR_PX2);
+        let plain = Blur { lost: 0.0, learnt: blur, drawn: blur, slope: (DVec3::ZERO, 0.0) };
         let source = self.request.sources.get(usize::from(self.gaussians.source()[i].view));
-        let Some(source) = source else { return (0.0, DVec3::ZERO, 0.0) };
+        let Some(source) = source else { return plain };
         let [center, axis] = [source.center, source.axis].map(|v| DVec3::from(v.map(f64::from)));
-        let (scale, blur) = (f64::from(source.scale), f64::from(BLUR_PX2));
+        let scale = f64::from(source.scale);
         let width = (mean - center).dot(axis).max(0.0) * scale;
-        let least = f64::from(OWN_SIZE) / self.view.focal[0].max(self.view.focal[1]);
-        if width <= least * z {
-            return (0.0, DVec3::ZERO, 0.0);
+        let focal = self.view.focal[0].max(self.view.focal[1]);
+        let own = f64::from(OWN_SIZE);
+        let (least, size) = (own / focal, width * focal * own / z);
+        if width > least * z {
+            let lost = blur * (width * width - (least * z).powi(2));
+            let slope = (axis * (2.0 * blur * width * scale), -2.0 * blur * least * least * z);
+            return Blur { lost, slope, ..plain };
         }
-        let lost = blur * (width * width - (least * z).powi(2));
-        (lost, axis * (2.0 * blur * width * scale), -2.0 * blur * least * least * z)
+        if width == 0.0 || size >= 1.0 || self.request.antialiased {
+            return plain;
+        }
+        let square = size * size;
+        let learnt = blur * square;
+        Blur {
+            learnt,
+            drawn: learnt + f64::from(PIXEL_PX2) * (1.0 - square),
+            slope: (axis * (2.0 * square / width * scale), -2.0 * square / z),
+            ..plain
+        }
     }
 
     /// By the sums of the harmonics, the weight of each coefficient in them, and by the centre.

@@ -12,7 +12,7 @@ use super::{
 };
 use crate::{
     RenderRequest, Source,
-    constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK, OWN_SIZE},
+    constants::{ALPHA_MIN, BLUR_PX2, FOOTPRINT_SLACK, OWN_SIZE, PIXEL_PX2},
     scene::Gaussians,
     view::View,
 };
@@ -209,13 +209,20 @@ impl Block {
             // Rows of M = J W R diag(scales), so that the 2D covariance is M Mᵀ.
             let quat = [at(&self.quat[0]), at(&self.quat[1]), at(&self.quat[2]), at(&self.quat[3])];
             let columns = rotation(number(1.0), number(2.0), quat);
-            // What the blur lost: see `plan`.
-            let mut lost = number(0.0);
+            // What the blur lost or has too much: see `plan`.
+            let (mut lost, mut learnt, mut drawn) = (number(0.0), blur, blur);
             if magnifies {
                 let width = at(&self.width);
                 let p = width * number(larger_focal) * per_z;
                 let share = (number(1.0) - number(1.0) / (p * p)).only(p.at_least(number(1.0)));
                 lost = blur * width * width * share;
+                let size = (p * number(f64::from(OWN_SIZE).powi(2))).min(number(1.0));
+                let smaller = number(1.0) - size * size;
+                // The antialiased mode has a rule of its own.
+                let known = width.at_least(number(f64::MIN_POSITIVE));
+                let smaller = if antialiased { number(0.0) } else { smaller.only(known) };
+                learnt = blur * (number(1.0) - smaller);
+                drawn = learnt + number(f64::from(PIXEL_PX2)) * smaller;
             }
             let mut local = w;
             for (k, column) in columns.into_iter().enumerate() {
@@ -238,12 +245,19 @@ impl Block {
                 m0[0] * m1[1] - m0[1] * m1[0],
             ];
             let det_sharp = dot(cross, cross);
-            let det = det_sharp + blur * (xx + yy) + blur * blur;
-            let var_y = yy + blur;
+            let det = det_sharp + drawn * (xx + yy) + drawn * drawn;
+            let var_y = yy + drawn;
             let half = number(0.5);
             if antialiased {
                 let share = (det_sharp / det).sqrt();
                 (at(&self.opacity) * share).put(&mut self.opacity, i);
+            } else if magnifies {
+                // Its sum over the picture stays, less what is under the least alpha.
+                let det_learnt = det_sharp + learnt * (xx + yy) + learnt * learnt;
+                let opacity = at(&self.opacity);
+                let over = opacity - number(f64::from(ALPHA_MIN));
+                let gone = (number(1.0) - (det_learnt / det).sqrt()) * over;
+                (opacity - gone).put(&mut self.opacity, i);
             }
             for (k, (center, slope)) in self.center.iter_mut().zip(slope).enumerate() {
                 let place = number(view.focal[k]) * slope + number(view.principal[k]);

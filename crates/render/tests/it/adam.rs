@@ -1,4 +1,4 @@
-//! Steps of training against those of another implementation: `adam.csv` has what PyTorch's Adam
+//! Steps of training against those of another implementation: `adam.csv` has what `PyTorch`'s Adam
 //! makes of the same gradients (`tests/tools/adam_vectors.py`). The trainer of a device is held to
 //! the one of the processor in `train.rs`.
 

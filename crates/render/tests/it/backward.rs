@@ -180,12 +180,12 @@ fn check_differences(name: &str, raw: &RawGaussians, request: &RenderRequest) {
     assert!(nonzero * 2 > checked_numbers, "{name}: most numbers count");
 }
 
-/// Photos that magnify, one of them behind.
-fn sources() -> Arc<[Source]> {
+/// Photos of a pixel of `scale` at depth 1, one of them behind: large pixels magnify.
+fn sources(scale: f32) -> Arc<[Source]> {
     let source = |x: f32, behind: bool| Source {
         center: [x, 0.1, -4.0],
         axis: [0.0, 0.0, 1.0],
-        scale: 0.05,
+        scale,
         behind,
     };
     [source(0.0, false), source(0.3, true)].into()
@@ -208,7 +208,8 @@ fn the_oracle_agrees_with_finite_differences() {
         ("plain", 0, (|_| ()) as fn(&mut RenderRequest)),
         ("sky, degree 2", 2, |request| request.background = sky()),
         ("antialiased, degree 1", 1, |request| request.antialiased = true),
-        ("layers and magnification", 0, |request| request.sources = sources()),
+        ("layers and magnification", 0, |request| request.sources = sources(0.05)),
+        ("shown smaller", 0, |request| request.sources = sources(0.02)),
     ] {
         let raw = few(&mut Random(3 + u64::from(sh_degree)), sh_degree);
         let mut request = small(9, 8);
@@ -264,8 +265,10 @@ fn judge_all(renderer: &dyn DifferentiableRenderer) {
     for (i, source) in raw.source.iter_mut().enumerate() {
         *source = SourcePixel { view: (i % 3) as u16, ..*source };
     }
-    let request = RenderRequest { sources: sources(), ..small(64, 48) };
-    judge("layers and magnification", renderer, &checked(raw), &request);
+    for (name, scale) in [("layers and magnification", 0.05), ("shown smaller", 0.003)] {
+        let request = RenderRequest { sources: sources(scale), ..small(64, 48) };
+        judge(name, renderer, &checked(raw.clone()), &request);
+    }
     // Most of 130 tiles each.
     let large = fog(200, 1.2, [0.4, 0.05]);
     judge("large ones", renderer, &large, &small(200, 150));

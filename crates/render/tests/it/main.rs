@@ -26,6 +26,7 @@ mod props;
 mod reference;
 mod shader_layout;
 mod skips;
+mod smaller;
 mod stages;
 mod train;
 mod twins;

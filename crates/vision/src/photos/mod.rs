@@ -344,18 +344,19 @@ fn masked(photos: &[Undecoded<'_, '_>], taken: &[[f64; 2]]) -> Option<Warning> {
         first.chars().take(80).collect::<String>(),
         100.0 * share
     );
-    (share > 0.0).then(|| Warning { code: WarningCode::MasksUsed, message, value: share })
+    (share > 0.0).then_some(Warning { code: WarningCode::MasksUsed, message, value: share })
 }
 
 /// Names photos of which a lens leaves less than half.
 fn bent_away(photos: &[Undecoded<'_, '_>], taken: &[[f64; 2]]) -> Option<Warning> {
     let bad = photos.iter().zip(taken).filter(|(_, [_, by_lens])| *by_lens > LENS_TAKES_MAX);
-    let (count, (first, [_, share])) = (bad.clone().count(), bad.clone().next()?);
+    let count = bad.clone().count();
+    let (worst, [_, share]) = bad.max_by(|a, b| a.1[1].total_cmp(&b.1[1]))?;
     let message = format!(
-        "{}: its lens leaves {:.0} % of its pixels without a source ({count} of {} photos): its \
-         distortion is probably wrong",
-        first.label,
-        100.0 * share,
+        "{}: the distortion of its lens leaves {:.0} % of its pixels ({count} of {} photos have \
+         less than half); check k1 to k6, p1 and p2",
+        worst.label,
+        100.0 * (1.0 - share),
         photos.len()
     );
     Some(Warning { code: WarningCode::LensDoubtful, message, value: *share })

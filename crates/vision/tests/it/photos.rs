@@ -885,14 +885,3 @@ fn a_jpeg_over_the_limit_is_read_at_a_part_of_its_size() {
         assert_eq!(read.is_ok(), is_read, "{width}x{height}: {:?}", read.err());
     }
 }
-
-#[test]
-fn a_lens_that_leaves_little_of_a_photo_is_told() {
-    let mut json = transforms();
-    json["frames"][1]["k1"] = json!(50);
-    let upload = with_transforms(&json, sent().1);
-    let read = photos::read_until(&upload, &Limits::default(), &AtomicBool::new(false)).unwrap();
-    let [warning] = &read.warnings[..] else { panic!("{:?}", read.warnings) };
-    assert_eq!(warning.code, WarningCode::LensDoubtful);
-    assert!(warning.value > 0.5 && warning.message.contains("photo 1 ("), "{warning:?}");
-}

@@ -235,7 +235,7 @@ fn lens(
     };
     for name in ["b2", "p3", "p4"] {
         let is_there = |of: &&Element| of.text.trim().parse() != Ok(0.0_f64);
-        if sensor.all(name).iter().any(|of| is_there(&of)) {
+        if sensor.all(name).iter().any(is_there) {
             unread.insert(name.to_owned());
         }
     }
