@@ -59,7 +59,7 @@ fn views_of_many_photos_are_those_of_the_cpu() {
                 draw(gpu, &scene, &other).color != frame.color
             };
             assert_eq!(with(&|row| row.behind = false), photos > 4, "{name}: layers");
-            assert_eq!(with(&|row| row.scale = 0.0), coarse > 1.25, "{name}: magnification");
+            assert!(with(&|row| row.scale = 0.0), "{name}: size");
         }
     }
 }
