@@ -2,7 +2,7 @@
 //!
 //! Photos of a lens become photos of a pinhole camera, intrinsics those of the size of the photo.
 //! Faults in headers are refused before a pixel is decoded. Pixels are taken as stored, as COLMAP
-//! takes them, but where the cameras are those of the photos that EXIF turns ([`turns`]). What a
+//! takes them, but where the cameras are those of the photos that EXIF turns (`turns`). What a
 //! mask leaves out is not valid.
 
 mod decode;
