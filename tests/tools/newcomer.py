@@ -131,13 +131,22 @@ def in_python(walk: Walk) -> None:
     assert size_of(ROOT / "view.png")[0] > 300 and len(levels(ROOT / "view.png")) > 100
 
 
+def objects_in(text: str) -> Iterator[dict]:
+    """The JSON objects of an output, which `curl` prints one right after the other."""
+    decoder, at = json.JSONDecoder(), text.find("{")
+    while at >= 0:
+        value, end = decoder.raw_decode(text, at)
+        yield value
+        at = text.find("{", end)
+
+
 def over_http(walk: Walk) -> None:
     said = walk.shell(blocks("Over HTTP")[0])
     photos = walk.made / "photos"
     for name in ["view.png", "part.png", "there.png", "mask.png"]:
         assert len(levels(photos / name)) > 1, f"{name} shows nothing"
     assert size_of(photos / "part.png") == (64, 64)
-    answers = [json.loads(line) for line in said.splitlines() if line.startswith("{")]
+    answers = list(objects_in(said))
     [found] = [one for one in answers if "results" in one]
     assert [one["text"] for one in found["results"]] == ["carpet", "ball"]
     assert all(one["gaussians"] > 0 for one in found["results"]), found
