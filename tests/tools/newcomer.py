@@ -243,4 +243,5 @@ def main() -> None:
             the_wheel(walk)
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -15,7 +15,7 @@ use zip::{ZipReadOptions, read::OwnedZipFileEntry, unstable::read::ZipIterable};
 
 use super::names;
 use crate::{
-    error::{Error, Result},
+    error::{Error, Result, short},
     limits::Limits,
     scene::UploadFile,
 };
@@ -406,7 +406,7 @@ fn entry_path(
     let name = std::str::from_utf8(name).map_err(|e| {
         Error::invalid(format!("archive: the name of entry {count} is not UTF-8")).caused_by(e)
     })?;
-    let shown: String = name.chars().take(80).collect();
+    let shown = short(name);
     if name.len() > limits.file_name_bytes_max {
         let what = format!("archive: bytes of the name {shown:?}");
         return Err(Error::limit(what, name.len(), limits.file_name_bytes_max));

@@ -2,7 +2,7 @@
 //! the photo, as what has no source behind a lens: no stage takes Gaussians, steps or names of it.
 
 use crate::{
-    error::{Error, Result},
+    error::{Error, Result, short},
     formats::captures::{FoundMask, same_aspect},
     limits::Limits,
     scene::Photo,
@@ -22,7 +22,7 @@ pub(super) fn applied(
     what: &str,
     limits: &Limits,
 ) -> Result<Photo> {
-    let what = format!("{what}: its mask {:?}", mask.path.chars().take(80).collect::<String>());
+    let what = format!("{what}: its mask {:?}", short(&mask.path));
     let header = decode::header(&mask.bytes, &what, limits)?;
     let ([w, h], size) = (header.size(), [photo.width, photo.height]);
     if !same_aspect([w, h], size) {

@@ -22,7 +22,7 @@ use self::{
 };
 pub use crate::scene::{Upload, UploadCameras, UploadFile};
 use crate::{
-    error::Result,
+    error::{Result, short},
     formats::captures::{FoundPhoto, FoundPhotos, LensAtSize, find, find_in_dir},
     limits::Limits,
     photo_label as label,
@@ -194,18 +194,8 @@ impl<'f, 'a> AllUndecoded<'f, 'a> {
             all().zip(&ways).map(photo).collect()
         };
         let small = |either: bool| -> Result<Vec<PosedPhoto>> {
-            let photos = photos(either)?;
-            let sizes: Vec<u64> = photos.iter().map(|one| one.header.decoded_pixels()).collect();
-            let read = |i: usize| {
-                unless_cancelled(cancel)?;
-                photos[i].read(SIDE_COMPARED, limits).map(|(photo, _)| photo)
-            };
-            let mut all = Vec::new();
-            for together in decoded_together(&sizes, limits.photo_pixels_max) {
-                let some: Vec<Result<_>> = together.into_par_iter().map(read).collect();
-                all.extend(some.into_iter().collect::<Result<Vec<_>>>()?);
-            }
-            Ok(all)
+            let read = read_all(&photos(either)?, SIDE_COMPARED, limits, cancel)?;
+            Ok(read.into_iter().map(|(photo, _)| photo).collect())
         };
         let names: Vec<&str> = found.photos.iter().map(|photo| &*photo.named).collect();
         let (either, turned) = turns::settled(&names, &ways, small, cancel)?;
@@ -309,23 +299,31 @@ pub fn each(
     Ok(())
 }
 
-/// Decodes the photos, a few at a time, and removes the distortion of their lenses.
-fn decoded(found: &FoundPhotos<'_>, limits: &Limits, cancel: &AtomicBool) -> Result<ReadPhotos> {
-    let all = AllUndecoded::new(found, limits, cancel)?;
+/// [`Undecoded::read`] of all photos, a few at a time.
+fn read_all(
+    photos: &[Undecoded<'_, '_>],
+    side_max: u32,
+    limits: &Limits,
+    cancel: &AtomicBool,
+) -> Result<Vec<(PosedPhoto, [f64; 2])>> {
     let read = |i: usize| {
         unless_cancelled(cancel)?;
-        all.photos[i].read(all.side_max, limits)
+        photos[i].read(side_max, limits)
     };
-    let (mut photos, mut taken) = (Vec::new(), Vec::new());
-    let sizes: Vec<u64> = all.photos.iter().map(|one| one.header.decoded_pixels()).collect();
+    let sizes: Vec<u64> = photos.iter().map(|one| one.header.decoded_pixels()).collect();
+    let mut all = Vec::with_capacity(photos.len());
     for together in decoded_together(&sizes, limits.photo_pixels_max) {
         let some: Vec<Result<_>> = together.into_par_iter().map(read).collect();
-        for one in some {
-            let (photo, shares) = one?;
-            photos.push(photo);
-            taken.push(shares);
-        }
+        all.extend(some.into_iter().collect::<Result<Vec<_>>>()?);
     }
+    Ok(all)
+}
+
+/// Decodes the photos, and removes the distortion of their lenses.
+fn decoded(found: &FoundPhotos<'_>, limits: &Limits, cancel: &AtomicBool) -> Result<ReadPhotos> {
+    let all = AllUndecoded::new(found, limits, cancel)?;
+    let read = read_all(&all.photos, all.side_max, limits, cancel)?;
+    let (photos, taken): (Vec<_>, Vec<_>) = read.into_iter().unzip();
     let mut warnings = [found.warnings.clone(), all.warnings.clone()].concat();
     warnings.extend(masked(&all.photos, &taken));
     warnings.extend(bent_away(&all.photos, &taken));
@@ -341,7 +339,7 @@ fn masked(photos: &[Undecoded<'_, '_>], taken: &[[f64; 2]]) -> Option<Warning> {
         "{count} of {} photos have masks, as {:?}, which leave {:.1} % of their pixels out of the \
          scene",
         photos.len(),
-        first.chars().take(80).collect::<String>(),
+        short(first),
         100.0 * share
     );
     (share > 0.0).then_some(Warning { code: WarningCode::MasksUsed, message, value: share })

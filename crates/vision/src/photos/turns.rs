@@ -12,7 +12,7 @@ use image::metadata::Orientation;
 use super::decode::Header;
 use crate::{
     capture,
-    error::Result,
+    error::{Result, short},
     formats::captures::{Lens, Sizes},
     scene::{PosedPhoto, Warning, WarningCode},
 };
@@ -94,7 +94,7 @@ fn warned(names: &[&str], ways: &[Option<Way>], all: bool, why: &str) -> Option<
         |way: &Option<Way>| *way == Some(Way::Turned) || all && *way == Some(Way::Either);
     let meant: Vec<&str> =
         names.iter().zip(ways).filter(|(_, w)| is_meant(w)).map(|(n, _)| *n).collect();
-    let first: String = meant.first()?.chars().take(80).collect();
+    let first = short(meant.first()?);
     let (count, of) = (meant.len(), names.len());
     let message =
         format!("{count} of {of} photos, as {first:?}, have an EXIF orientation and {why}");

@@ -5,7 +5,7 @@
 
 use rayon::prelude::*;
 
-use super::rows::norm;
+use super::rows::scale_to_unit;
 use crate::scene::{DenseFeatures, PhotoMasks};
 
 /// `[masks * dim]` contexts of length 1: the mean of the features under each mask, each cell
@@ -80,15 +80,4 @@ pub fn add_context(crop: &mut [f32], context: &[f32], weight: f64) {
     if scale_to_unit(&mut both) {
         crop.copy_from_slice(&both);
     }
-}
-
-/// Whether it had a length.
-fn scale_to_unit(row: &mut [f32]) -> bool {
-    let length = norm(row);
-    if length <= 0.0 {
-        return false;
-    }
-    #[expect(clippy::cast_possible_truncation, reason = "embeddings are f32")]
-    row.iter_mut().for_each(|v| *v = (f64::from(*v) / length) as f32);
-    true
 }

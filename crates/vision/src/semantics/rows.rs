@@ -30,15 +30,22 @@ pub(super) fn sum_of<B: Copy + Into<f64>>(
     (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
 }
 
+/// Scales a row to length 1; whether it had a length. A row of zeros stays zero.
+pub(super) fn scale_to_unit(row: &mut [f32]) -> bool {
+    let length = norm(row);
+    let has_length = length > 0.0;
+    if has_length {
+        #[expect(clippy::cast_possible_truncation, reason = "rows are f32")]
+        row.iter_mut().for_each(|v| *v = (f64::from(*v) / length) as f32);
+    }
+    has_length
+}
+
 /// The rows scaled to length 1. A row of zeros stays zero.
 pub(super) fn unit_rows(bank: &Bank) -> Vec<f32> {
     let mut rows = bank.rows.clone();
     for row in rows.chunks_exact_mut(bank.dim.max(1)) {
-        let length = norm(row);
-        if length > 0.0 {
-            #[expect(clippy::cast_possible_truncation, reason = "rows are f32")]
-            row.iter_mut().for_each(|v| *v = (f64::from(*v) / length) as f32);
-        }
+        scale_to_unit(row);
     }
     rows
 }
