@@ -1,10 +1,12 @@
-//! Writes the tables of `docs/benchmarks.md` from the rows of `benches/runs/*.jsonl`.
+//! Writes the tables of `docs/benchmarks.md` and `docs/published.md` from the rows of
+//! `benches/runs/*.jsonl`.
 //!
 //! `benches/tables.toml` describes each table: the columns, each a heading and a template such as
 //! `{gaussians:,}` or `{device.total_ms:.3} ms`. A table takes the rows whose `table` is its name,
 //! in the order of the files. With `key` and `pivot`, rows of one key become one line, and a
-//! template names the row by the value of its pivot: `{2.psnr:.2}`. The page has a table between
-//! `<!-- table: NAME -->` and `<!-- end -->`.
+//! template names the row by the value of its pivot: `{2.psnr:.2}`. A page has a table between
+//! `<!-- table: NAME -->` and `<!-- end -->`. A table without columns is on none: its rows are for
+//! `today`.
 //!
 //! A row is *older* where a group of files that its table depends on is no longer what it was when
 //! the row was measured ([`crate::sources`]). A table shows the rows of this tree; where it has
@@ -32,6 +34,11 @@ use crate::{
     tables::{Line, Pick, Table, Tables},
 };
 
+/// The pages with tables.
+const PAGES: [&str; 2] = ["docs/benchmarks.md", "docs/published.md"];
+/// What is around a table on a page.
+const BEGIN: &str = "<!-- table: ";
+const END: &str = "<!-- end -->";
 /// The first table of the page, which is made of [`Line`]s.
 const TODAY: &str = "today";
 
@@ -75,24 +82,25 @@ pub(crate) fn run(args: &Args) -> Result<()> {
     if args.retire {
         retire(&args.root)?;
     }
-    let path = args.root.join("docs/benchmarks.md");
-    let fault = |e| Error::invalid("docs/benchmarks.md: cannot be read").caused_by(e);
-    let old = fs_err::read_to_string(&path).map_err(fault)?;
-    let new = page(&args.root, &old)?;
     if args.check {
         older(&args.root)?.iter().for_each(|row| progress(row));
     }
-    if new == old {
-        return Ok(());
+    let mut wrong = Vec::new();
+    for page in pages(&args.root)?.into_iter().filter(|page| page.old != page.new) {
+        if args.check {
+            wrong.push(format!("{}: {}", page.name, differ(&page.old, &page.new).join(", ")));
+        } else {
+            fs_err::write(args.root.join(page.name), page.new)
+                .map_err(|e| Error::invalid("the page: no write").caused_by(e))?;
+        }
     }
-    if args.check {
-        let tables = differ(&old, &new).join(", ");
-        return Err(Error::invalid(format!(
-            "docs/benchmarks.md does not say what rows and tree say, in the tables {tables}: make \
-             report"
-        )));
+    match wrong.is_empty() {
+        true => Ok(()),
+        false => Err(Error::invalid(format!(
+            "tables do not say what rows and tree say: make report ({})",
+            wrong.join("; ")
+        ))),
     }
-    fs_err::write(&path, new).map_err(|e| Error::invalid("the page: no write").caused_by(e))
 }
 
 #[expect(clippy::print_stdout, reason = "it is the answer of the program")]
@@ -171,10 +179,10 @@ const RETIRED: &str = "docs/measurements/runs";
 /// Names of the tables that two pages have with different texts.
 fn differ(old: &str, new: &str) -> Vec<String> {
     let blocks = |page: &str| -> BTreeMap<String, String> {
-        let blocks = page.split("<!-- table: ").skip(1);
+        let blocks = page.split(BEGIN).skip(1);
         let pair = |block: &str| {
             let (name, rest) = block.split_once(" -->")?;
-            Some((name.to_owned(), rest.split("<!-- end -->").next()?.to_owned()))
+            Some((name.to_owned(), rest.split(END).next()?.to_owned()))
         };
         blocks.filter_map(pair).collect()
     };
@@ -182,19 +190,57 @@ fn differ(old: &str, new: &str) -> Vec<String> {
     new.into_iter().filter(|(name, text)| old.get(name) != Some(text)).map(|(n, _)| n).collect()
 }
 
-/// The page with its tables made anew from the files under `root`.
+/// A page, as it is and as the rows and the tree have it.
+#[derive(Debug)]
+pub struct Page {
+    /// Its path in the repository.
+    pub name: &'static str,
+    /// Its text.
+    pub old: String,
+    /// Its text with the tables made anew.
+    pub new: String,
+}
+
+/// The pages with their tables made anew from the files under `root`: each table is on one.
 ///
 /// # Errors
 /// As `run`.
-pub fn page(root: &Path, old: &str) -> Result<String> {
-    let (tables, tree) = (Tables::read(root)?, Tree::read(root)?);
-    let rows = runs(&root.join(RUNS))?;
-    let published = published(root)?;
-    let mut blocks = Vec::new();
-    if !tables.line.is_empty() {
-        blocks.push((TODAY, today(&tables, &rows, &tree)?));
+pub fn pages(root: &Path) -> Result<Vec<Page>> {
+    let mut blocks = blocks(root)?;
+    let mut pages = Vec::new();
+    for name in PAGES.into_iter().filter(|name| root.join(name).is_file()) {
+        let fault = |e| Error::invalid(format!("{name}: cannot be read")).caused_by(e);
+        let old = fs_err::read_to_string(root.join(name)).map_err(fault)?;
+        let mut new = String::new();
+        let mut rest = old.as_str();
+        while let Some((before, after)) = rest.split_once(BEGIN) {
+            let wrong = |what: &str| Error::invalid(format!("{name}: {what}"));
+            let (table, after) =
+                after.split_once(" -->\n").ok_or_else(|| wrong("a table has no name"))?;
+            let text = blocks.remove(table);
+            let text = text.ok_or_else(|| wrong(&format!("there is no table {table}, or two")))?;
+            let (_, after) = after.split_once(END).ok_or_else(|| wrong("a table has no end"))?;
+            new.extend([before, BEGIN, table, " -->\n", &text, END]);
+            rest = after;
+        }
+        new.push_str(rest);
+        pages.push(Page { name, old, new });
     }
-    for table in &tables.table {
+    match blocks.keys().next() {
+        None => Ok(pages),
+        Some(table) => Err(Error::invalid(format!("no page has the table {table}"))),
+    }
+}
+
+/// The text of each table by its name.
+fn blocks(root: &Path) -> Result<BTreeMap<String, String>> {
+    let (tables, tree) = (Tables::read(root)?, Tree::read(root)?);
+    let (rows, published) = (runs(&root.join(RUNS))?, published(root)?);
+    let mut blocks = BTreeMap::new();
+    if !tables.line.is_empty() {
+        blocks.insert(TODAY.to_owned(), today(&tables, &rows, &tree)?);
+    }
+    for table in tables.table.iter().filter(|table| !table.columns.is_empty()) {
         let text = match &table.ours {
             None => {
                 let rows = table.shown(&rows, &tree);
@@ -202,33 +248,18 @@ pub fn page(root: &Path, old: &str) -> Result<String> {
             }
             Some(ours) => {
                 let ours = ours.rows.as_ref().map(|name| newest(rows.get(name), table, &tree));
+                let ours = ours.unwrap_or_default();
                 let theirs = published.get(&table.name).cloned().unwrap_or_default();
                 if theirs.is_empty() {
                     let name = &table.name;
                     return Err(Error::invalid(format!("there are no rows of table {name}")));
                 }
-                let ours = ours.unwrap_or_default();
                 table.mark(&ours, &tree) + &table.write(&theirs, &ours)
             }
         };
-        blocks.push((&table.name, text));
+        blocks.insert(table.name.clone(), text);
     }
-    let mut page = old.to_owned();
-    for (name, text) in &blocks {
-        let begin = format!("<!-- table: {name} -->\n");
-        let place = page
-            .split_once(&begin)
-            .and_then(|(before, rest)| Some((before, rest.split_once("<!-- end -->")?.1)));
-        let Some((before, after)) = place else {
-            return Err(Error::invalid(format!("the page has no table {name}")));
-        };
-        page = format!("{before}{begin}{text}<!-- end -->{after}");
-    }
-    let placed = page.matches("<!-- table: ").count();
-    if placed != blocks.len() {
-        return Err(Error::invalid(format!("{placed} tables on the page")));
-    }
-    Ok(page)
+    Ok(blocks)
 }
 
 /// The table of published figures that `TABLE=FILE` names, with the file's rows below them.
@@ -279,7 +310,11 @@ fn today(tables: &Tables, rows: &Grouped, tree: &Tree) -> Result<String> {
 
 /// Whether the value at a path of the row is this one.
 fn has(row: &Value, path: &str, value: &Value) -> bool {
-    at(row, path).is_some_and(|found| cell(found, "") == cell(value, ""))
+    let same = |found: &Value| match (found.as_f64(), value.as_f64()) {
+        (Some(found), Some(value)) => found == value,
+        _ => found == value,
+    };
+    at(row, path).is_some_and(same)
 }
 
 /// The rows of this tree; all of them where none is.
