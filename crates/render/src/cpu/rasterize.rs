@@ -261,8 +261,8 @@ pub(super) fn met<S: Lanes>(simd: S, gaussian: &Staged) -> u16 {
     for i in 0..CELLS / S::F32_LANES {
         let (x, y) = (CELL_X.at(simd, i), CELL_Y.at(simd, i));
         let (u, v) = along_axes(simd, gaussian, x, y);
-        let du = simd.max_f32s(simd.sub_f32s(simd.abs_f32s(u), wide), zero);
-        let dv = simd.max_f32s(simd.sub_f32s(simd.abs_f32s(v), tall), zero);
+        let du = simd.max_f32s(simd.sub_f32s(simd.abs(u), wide), zero);
+        let dv = simd.max_f32s(simd.sub_f32s(simd.abs(v), tall), zero);
         let nearest = simd.fused(du, du, simd.mul_f32s(dv, dv));
         let near = simd.less_than_or_equal_f32s(nearest, simd.splat_f32s(gaussian.power_max));
         bits |= simd.bits(near) << (i * S::F32_LANES);
