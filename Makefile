@@ -14,7 +14,6 @@
 # make bench   benchmarks            make eval   quality on posed photo scenes (DATA=folder)
 # make eval-scenes   labelled scenes of held-out things, rendered to target/eval/scenes (g++, PYTHON)
 # make report   the tables of docs/benchmarks.md from benches/runs
-# make plots   docs/plots from docs/measurements/runs (PYTHON with matplotlib)
 # make test-long   the random tests with many more cases, and the slow ones
 # make fuzz    every reader of bytes from outside, FUZZ_SECONDS=600 each
 
@@ -24,12 +23,12 @@ TARGET := $(or $(CARGO_TARGET_DIR),target)
 SEGSPLAT := $(TARGET)/release/segsplat
 DATA ?= $(or $(SEGSPLAT_SHARED_DATA),../shared/data)/scenes
 ARGS ?=
-# With numpy, pillow and trimesh for `make eval-scenes`, matplotlib for `make plots`.
+# With numpy, pillow and trimesh for `make eval-scenes`.
 PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: unread client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-published judge-splats judge-three judge-tools demo serve check test test-long fuzz bench eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: unread client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-published judge-splats judge-three judge-tools demo serve check test test-long fuzz bench eval eval-scenes report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -172,9 +171,6 @@ report:
 eval-scenes:
 	$(PYTHON) models/training/semantics/eval_scenes.py --data $(dir $(DATA)) \
 		--out $(TARGET)/eval/scenes
-
-plots:
-	$(PYTHON) benches/plots.py docs/measurements/runs docs/plots
 
 build: setup
 	$(CARGO) build --locked --release

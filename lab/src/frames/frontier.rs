@@ -8,18 +8,18 @@ use serde_json::json;
 use super::{Args, Drawing, generated::scene};
 use crate::{
     error::{Error, Result},
-    render::{Frame, Kinds, RenderRequest, Renderer, compare::differences, compare::psnr},
+    render::{
+        Frame, Kinds, RenderRequest, Renderer,
+        compare::{differences, psnr},
+    },
     rows::{Rows, median},
     scene::{Camera, CameraToWorld, Gaussians},
 };
 
-/// Rounds in which every error is timed.
-const ROUNDS: usize = 5;
-
-/// Levels of 255 from one value to the next: what a picture may differ by.
+/// Errors to time, and of what.
 #[derive(Clone, Debug, clap::Args)]
 pub(crate) struct FrontierArgs {
-    /// Errors to ask for, levels of 255; times are over that of 0
+    /// Errors to ask for, levels of 255; the first is what the others are compared with
     #[arg(long, value_delimiter = ',', default_value = "0,0.5,1,2,4,8,16,32")]
     errors: Vec<f32>,
     #[command(flatten)]
@@ -57,7 +57,7 @@ fn six(args: &Args) -> Result<[(&'static str, Gaussians, RenderRequest); 6]> {
     ])
 }
 
-/// Makes a row for each scene and error. Times are medians, of the device where it has a clock,
+/// Makes a row for each scene and error. Times are the least, of the device where it has a clock,
 /// else of a call; `ratio` is the time of the first error over that of this one. Differences are to
 /// the first error's picture, in levels of 255.
 ///
@@ -103,22 +103,23 @@ pub(crate) fn run(args: &FrontierArgs, rows: &mut Rows) -> Result<()> {
     Ok(())
 }
 
-/// The time of each request, milliseconds: medians of rounds in which each is drawn in turn.
+/// The time of each request, milliseconds: the least of rounds in which each is drawn in turn, which
+/// a busy machine changes least.
 fn times(
     renderer: &dyn Renderer,
     gaussians: &Gaussians,
     requests: &[RenderRequest],
     frames: usize,
 ) -> Result<Vec<f64>> {
-    let mut rounds = vec![Vec::new(); requests.len()];
-    for _ in 0..ROUNDS {
-        for (request, times) in requests.iter().zip(&mut rounds) {
+    let mut least = vec![f64::INFINITY; requests.len()];
+    for _ in 0..frames {
+        for (request, least) in requests.iter().zip(&mut least) {
             let drawing = Drawing { renderer, gaussians, request };
-            times.push(match drawing.device_times(frames.div_ceil(ROUNDS))? {
+            *least = least.min(match drawing.device_times(1)? {
                 Some(device) => device.total_ms,
-                None => median(drawing.times(frames.div_ceil(ROUNDS))?),
+                None => median(drawing.times(1)?),
             });
         }
     }
-    Ok(rounds.into_iter().map(median).collect())
+    Ok(least)
 }
