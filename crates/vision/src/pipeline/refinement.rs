@@ -14,14 +14,13 @@ use segsplat_render::{DifferentiableRenderer, Kinds, RenderRequest, plan::defaul
 use super::Reconstruction;
 use crate::{
     error::Result,
-    models::{ResizeFilter, fit},
     refine::{
-        self, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, fewer, held_out,
-        mean_difference, ready, split,
+        self, RefineBudget, RefineOptions, RefinedVersion, UNWATCHED_STEPS_MAX, at_side, fewer,
+        held_out, mean_difference, ready, split,
     },
     scene::{
-        Camera, Gaussians, HealthReport, Method, Photo, PosedPhoto, RefineReport, Scene,
-        SceneCamera, SceneMeta, Semantics,
+        Camera, Gaussians, HealthReport, Method, PosedPhoto, RefineReport, Scene, SceneCamera,
+        SceneMeta, Semantics,
     },
     semantics::{Views, from_source},
 };
@@ -74,29 +73,33 @@ pub fn refined(
         let (learnt, one_set) = awake(renderer, scene, || remake(split(photos, held).0))?;
         let (start, first) = start_of(scene, held, learnt, one_set)?;
         // The proof leaves room for those of the photos that it lacks.
-        let all = options.gaussians_max.saturating_mul(photos.len() - held.len());
-        let gaussians_max = all / photos.len().max(1);
-        let gaussians = ready(&start, &first, &RefineOptions { gaussians_max, ..*options })?;
+        let all = options.gaussians_first.saturating_mul(photos.len() - held.len());
+        let gaussians_first = all / photos.len().max(1);
+        let gaussians = ready(&start, &first, &RefineOptions { gaussians_first, ..*options })?;
         Ok((start, gaussians))
     };
-    let mut part = |start: (&Scene, &Gaussians), held: &[usize], budget, [begin, end]: [f32; 2]| {
+    let mut part = |start: (&Scene, &Gaussians),
+                    held: &[usize],
+                    options: &RefineOptions,
+                    [begin, end]: [f32; 2]| {
         let (learnt, held_out) = split(&sized, held);
         let mut pace = |spent: f32| pace(begin + (end - begin) * spent);
-        let options = RefineOptions { budget, ..*options };
-        refine::refine(renderer, start.0, start.1, &learnt, &held_out, &options, &mut pace)
+        refine::refine(renderer, start.0, start.1, &learnt, &held_out, options, &mut pace)
     };
     let RefineBudget { steps, time } = options.budget;
     if held.is_empty() {
         let (start, gaussians) = begin(&[])?;
         let budget = RefineBudget { steps: steps.min(UNWATCHED_STEPS_MAX), time };
-        let version = part((&start, &gaussians), &[], budget, [0.0, 1.0])?;
+        let options = RefineOptions { budget, ..*options };
+        let version = part((&start, &gaussians), &[], &options, [0.0, 1.0])?;
         let report = version.report.clone();
         return Ok(Refined { report, overfit: None, version: Some((start, version)) });
     }
     let share = options.proof_share.clamp(0.01, 0.99);
     let budget = RefineBudget { steps, time: of_time(time, share) };
     let (start, gaussians) = begin(&held)?;
-    let proof = part((&start, &gaussians), &held, budget, [0.0, share])?;
+    let proof_options = RefineOptions { budget, ..*options };
+    let proof = part((&start, &gaussians), &held, &proof_options, [0.0, share])?;
     let earlier = scene.meta.report.refinement.as_ref().and_then(|report| report.psnr_after);
     if proof.report.steps == 0 || proof.report.psnr_after <= earlier {
         return Ok(Refined { report: proof.report, overfit: None, version: None });
@@ -110,15 +113,19 @@ pub fn refined(
     let more = ((1.0 - share) / share).max(1.0);
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few steps")]
     let as_many = (proof.report.steps as f32 * more).round() as u32;
-    let budget = RefineBudget::steps(as_many.min(steps));
+    let mut options = RefineOptions {
+        budget: RefineBudget { steps: as_many.min(steps), time: of_time(time, 1.0 - share) },
+        ..*options
+    };
     let (start, mut gaussians) = begin(&[])?;
     if overfit <= f64::from(options.overfit_max) {
         let of_held = |i: usize| held.contains(&usize::from(gaussians.source()[i].view));
         let room = options.gaussians_max.saturating_sub(proof.gaussians.len());
         let more = fewer(&gaussians.only(of_held), room, options.seed)?;
         gaussians = proof.gaussians.joined(&more)?;
+        options.coarse_share = 0.0;
     }
-    let mut version = part((&start, &gaussians), &[], budget, [share, 1.0])?;
+    let mut version = part((&start, &gaussians), &[], &options, [share, 1.0])?;
     version.report = RefineReport {
         seconds: proof.report.seconds + version.report.seconds,
         psnr_before: proof.report.psnr_before,
@@ -157,22 +164,6 @@ fn awake<T>(renderer: &dyn DifferentiableRenderer, scene: &Scene, work: impl FnO
 /// A share of a time that may be endless.
 fn of_time(time: Duration, share: f32) -> Duration {
     Duration::try_from_secs_f64(time.as_secs_f64() * f64::from(share)).unwrap_or(Duration::MAX)
-}
-
-/// A photo whose longer side is `side` pixels, or as it is if that is shorter.
-fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
-    let (width, height) = (posed.photo.width, posed.photo.height);
-    let longer = width.max(height);
-    if longer <= side {
-        return posed.clone();
-    }
-    let scaled = |length: u32| (length * side).div_ceil(longer).max(1);
-    let size = [scaled(height), scaled(width)];
-    let fitted = fit(&posed.photo, &posed.camera, size, ResizeFilter::default());
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..255")]
-    let rgb = fitted.rgb.iter().map(|v| (v * 255.0).round() as u8).collect();
-    let photo = Photo { width: scaled(width), height: scaled(height), rgb, valid: fitted.valid };
-    PosedPhoto { photo, camera: fitted.camera, ..posed.clone() }
 }
 
 /// What refinement begins with: `learnt` and `one_set` were made of the photos of `scene` less

@@ -32,7 +32,8 @@ pub use segsplat_render::train::LearningRates;
 
 use crate::{
     error::{Error, ErrorCode, Result},
-    scene::{Camera, Gaussians, PosedPhoto, RefineReport, Scene},
+    models::{ResizeFilter, fit},
+    scene::{Camera, Gaussians, Photo, PosedPhoto, RefineReport, Scene},
 };
 
 /// Fewest photos of which one is held out.
@@ -43,8 +44,13 @@ pub const HELD_OUT_EVERY: usize = 8;
 pub const UNWATCHED_STEPS_MAX: u32 = 30;
 /// Looks at the held-out photos in a whole budget.
 const LOOKS: u32 = 10;
-/// Looks without a better version after which it stops.
-const PATIENCE: u32 = 3;
+/// Shares of the budget between which Gaussians are added, how many times, and photos that say
+/// where: docs/adr/0070.
+const GROWS_BETWEEN: [f32; 2] = [0.1, 0.6];
+const GROWTHS: u32 = 8;
+const GROWTH_PHOTOS: usize = 8;
+/// Photos with a longer side under this have no smaller copies that come first.
+const COARSE_SIDE_MIN: u32 = 480;
 /// How far numbers move at first, `means` as a share of the median depth. 3DGS takes 30,000 steps
 /// that move less: docs/adr/0041.
 const RATES: LearningRates = LearningRates {
@@ -96,7 +102,16 @@ pub struct RefineOptions {
     /// How far numbers move; `means` as a share of the scene's median depth.
     pub rates: LearningRates,
     /// Most Gaussians to begin with: of more, this many are chosen at random and made wider.
+    pub gaussians_first: usize,
+    /// Most Gaussians for each pixel of a photo: as many are added where the scene differs from the
+    /// photos.
+    pub gaussians_a_pixel: f32,
+    /// Most Gaussians at all.
     pub gaussians_max: usize,
+    /// Share of the budget in which photos are learnt at half their size, 0..1.
+    pub coarse_share: f32,
+    /// Looks at the held-out photos without a better version after which it stops.
+    pub patience: u32,
     /// Gaussians under this opacity are dropped.
     pub opacity_min: f32,
     /// Steps between two times of dropping.
@@ -123,7 +138,11 @@ impl Default for RefineOptions {
             batch: 1,
             side: 640,
             rates: RATES,
-            gaussians_max: 150_000,
+            gaussians_first: 150_000,
+            gaussians_a_pixel: 0.5,
+            gaussians_max: 1_000_000,
+            coarse_share: 0.3,
+            patience: LOOKS,
             opacity_min: 0.01,
             prune_every: 50,
             ssim_share: 0.2,
@@ -164,6 +183,22 @@ pub fn split(photos: &[PosedPhoto], held: &[usize]) -> (Vec<PosedPhoto>, Vec<Pos
         kept.map(|(_, photo)| photo.clone()).collect()
     };
     (of(false), of(true))
+}
+
+/// A photo whose longer side is `side` pixels, or as it is if that is shorter.
+pub(crate) fn at_side(posed: &PosedPhoto, side: u32) -> PosedPhoto {
+    let (width, height) = (posed.photo.width, posed.photo.height);
+    let longer = width.max(height);
+    if longer <= side {
+        return posed.clone();
+    }
+    let scaled = |length: u32| (length * side).div_ceil(longer).max(1);
+    let size = [scaled(height), scaled(width)];
+    let fitted = fit(&posed.photo, &posed.camera, size, ResizeFilter::default());
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0..255")]
+    let rgb = fitted.rgb.iter().map(|v| (v * 255.0).round() as u8).collect();
+    let photo = Photo { width: scaled(width), height: scaled(height), rgb, valid: fitted.valid };
+    PosedPhoto { photo, camera: fitted.camera, ..posed.clone() }
 }
 
 /// Mean absolute difference of what `gaussians` show, over what is behind those of `start`, and the
@@ -255,6 +290,10 @@ struct Refinement<'a> {
     options: &'a RefineOptions,
     learnt: &'a [PosedPhoto],
     held_out: Vec<HeldOutPhoto>,
+    /// Whether the trainer has smaller copies of the photos behind them.
+    has_coarse: bool,
+    /// Gaussians that it begins with.
+    first: usize,
     report: RefineReport,
 }
 
@@ -265,7 +304,7 @@ struct Refinement<'a> {
 /// `internal` where they cannot be Gaussians any more.
 pub fn ready(start: &Scene, first: &Gaussians, options: &RefineOptions) -> Result<Gaussians> {
     let all = widened(start, first, Some(options.side))?;
-    fewer(&all, options.gaussians_max, options.seed)
+    fewer(&all, options.gaussians_first.min(options.gaussians_max), options.seed)
 }
 
 /// Refines `gaussians` on the photos that are learnt and watches the held-out ones. `start` is what
@@ -288,8 +327,9 @@ pub fn refine(
     options: &RefineOptions,
     pace: &mut dyn FnMut(f32) -> Result<()>,
 ) -> Result<RefinedVersion> {
-    if options.batch == 0 || options.prune_every == 0 || options.gaussians_max == 0 {
-        return Err(Error::invalid("refine: batch, prune_every and gaussians_max must be over 0"));
+    let over_0 = [options.gaussians_first, options.gaussians_max, options.batch];
+    if options.prune_every == 0 || over_0.contains(&0) {
+        return Err(Error::invalid("refine: batch, prune_every, gaussians_* must be over 0"));
     }
     let extent = start.meta.report.median_depth;
     let mut work = Refinement {
@@ -298,6 +338,8 @@ pub fn refine(
         options,
         learnt,
         held_out: held_out.par_iter().map(HeldOutPhoto::new).collect(),
+        has_coarse: false,
+        first: gaussians.len(),
         report: RefineReport::default(),
     };
     work.report = match &start.meta.report.refinement {
@@ -307,12 +349,15 @@ pub fn refine(
     if learnt.is_empty() || gaussians.is_empty() {
         return Ok(work.unrefined());
     }
-    let photos = learnt.iter().map(|posed| TrainingPhoto {
+    // Behind the photos their smaller copies.
+    let coarse = coarse_copies(learnt, options);
+    let photos = learnt.iter().chain(&coarse).map(|posed| TrainingPhoto {
         photo: &posed.photo,
         request: plain_view(start, posed.camera),
     });
-    let ssim_share = options.ssim_share;
-    let set = TrainingSet { gaussians, photos: photos.collect(), ssim_share };
+    work.has_coarse = !coarse.is_empty();
+    let (ssim_share, gaussians_max) = (options.ssim_share, most_gaussians(learnt, options));
+    let set = TrainingSet { gaussians, photos: photos.collect(), ssim_share, gaussians_max };
     #[expect(clippy::cast_possible_truncation, reason = "a length")]
     let extent = if extent.is_finite() && extent > 0.0 { extent as f32 } else { 1.0 };
     let rates = LearningRates { means: options.rates.means * extent, ..options.rates };
@@ -329,6 +374,25 @@ pub fn refine(
         Err(error) => return Err(error),
     }
     work.run(&mut HostTrainer::new(renderer, &set)?, &rates, pace)
+}
+
+/// The photos at half their size, where they are learnt so at first and are large enough.
+fn coarse_copies(photos: &[PosedPhoto], options: &RefineOptions) -> Vec<PosedPhoto> {
+    let longer = |posed: &PosedPhoto| posed.photo.width.max(posed.photo.height);
+    let least = photos.iter().map(longer).min().unwrap_or(0) / 2;
+    if options.coarse_share <= 0.0 || least < COARSE_SIDE_MIN {
+        return Vec::new();
+    }
+    photos.par_iter().map(|posed| at_side(posed, longer(posed) / 2)).collect()
+}
+
+/// Most Gaussians that such photos can tell apart.
+fn most_gaussians(photos: &[PosedPhoto], options: &RefineOptions) -> usize {
+    let pixels = |posed: &PosedPhoto| posed.photo.width as usize * posed.photo.height as usize;
+    let most = photos.iter().map(pixels).max().unwrap_or(0);
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a number of them")]
+    let shown = (most as f32 * options.gaussians_a_pixel) as usize;
+    options.gaussians_max.min(shown.max(options.gaussians_first))
 }
 
 /// Whether a device was at fault.
@@ -351,6 +415,8 @@ impl Refinement<'_> {
         let mut best: Option<RefineReport> = None;
         let (mut order, mut random) = (Vec::<usize>::new(), options.seed);
         let (mut steps, mut looked, mut waited, mut highest) = (0_u32, 0, 0, None);
+        let (mut grown, first, count) = (0, self.first, self.learnt.len());
+        let most = most_gaussians(self.learnt, options);
         loop {
             let spent = clock.spent(steps);
             let paused = Instant::now();
@@ -378,18 +444,28 @@ impl Refinement<'_> {
                     let served = self.report.clone();
                     best = Some(RefineReport { steps, seconds, psnr_after: after, ..served });
                 }
-                if last || waited >= PATIENCE {
+                if last || waited >= options.patience {
                     break;
                 }
             }
-            let expected = steps as f32 / spent / self.learnt.len() as f32;
+            let due = growths_due(spent);
+            if due > grown && !few {
+                grown = due;
+                let more = most.saturating_sub(first) * grown as usize / GROWTHS as usize;
+                let mut photos = shuffled(count, &mut random);
+                photos.truncate(GROWTH_PHOTOS);
+                let now = trainer.grow(&photos, first + more)?;
+                tracing::debug!(steps, gaussians = now, "grown");
+            }
+            let expected = steps as f32 / spent / count as f32;
             let rate = LAST_RATE.powf(spent) * if few { 1.0 } else { rate_factor(expected) };
+            let coarse = self.has_coarse && spent < options.coarse_share;
             let mut photos = Vec::with_capacity(options.batch);
             while photos.len() < options.batch {
                 if order.is_empty() {
-                    order = shuffled(self.learnt.len(), &mut random);
+                    order = shuffled(count, &mut random);
                 }
-                photos.extend(order.pop());
+                photos.extend(order.pop().map(|i| if coarse { count + i } else { i }));
             }
             steps += 1;
             let prunes = steps.is_multiple_of(options.prune_every);
@@ -436,6 +512,14 @@ impl Refinement<'_> {
         }
         Ok((!self.held_out.is_empty()).then(|| sum / self.held_out.len() as f64))
     }
+}
+
+/// How many times Gaussians are to be added until `spent`.
+fn growths_due(spent: f32) -> u32 {
+    let [begin, end] = GROWS_BETWEEN;
+    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few")]
+    let due = ((spent - begin) / (end - begin) * (GROWTHS - 1) as f32 + 1.0).max(0.0) as u32;
+    if spent < begin { 0 } else { due.min(GROWTHS) }
 }
 
 /// The next number of a row that looks random (`SplitMix64`, Steele et al. 2014).
