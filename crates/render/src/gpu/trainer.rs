@@ -3,6 +3,7 @@
 //! the device has the one before. One that lacked room for its tile pairs moved nothing, and is
 //! taken again after the one that was under way.
 
+use bytemuck::Zeroable;
 use glam::DVec3;
 use rayon::prelude::*;
 use wgpu::BufferUsages;
@@ -88,6 +89,8 @@ pub(super) struct DeviceTrainer {
     origins: Origins,
     /// As they are now. A place without a Gaussian has opacity 0: one was dropped, or none came yet.
     scene: DeviceScene,
+    /// Places from the first on, behind which none had a Gaussian yet.
+    used: usize,
     /// As they were when they were kept.
     kept: Option<Kept>,
     training: TrainingBuffers,
@@ -205,6 +208,7 @@ impl DeviceTrainer {
             sh_degree: set.gaussians.sh_degree(),
             origins: Origins { source, semantic_index },
             scene,
+            used: set.gaussians.len(),
             kept: None,
             training,
             earlier: None,
@@ -314,15 +318,15 @@ impl DeviceTrainer {
         readback::read(gpu, &staging, total, take)
     }
 
-    /// Bytes of the rows and of the harmonics.
-    fn sizes(&self) -> [u64; 2] {
-        let (count, k) = (u64::from(self.scene.count), u64::from(self.scene.sh_count));
-        [size_of::<GaussianRow>() as u64 * count, 12 * k * count]
+    /// Bytes of the rows and of the harmonics of so many places.
+    fn sizes(&self, places: usize) -> [u64; 2] {
+        let (places, k) = (places as u64, u64::from(self.scene.sh_count));
+        [size_of::<GaussianRow>() as u64 * places, 12 * k * places]
     }
 
-    /// Rows and harmonics of all places.
+    /// Rows and harmonics of the places that are used.
     fn read_places(&mut self, rows: &wgpu::Buffer, sh: &wgpu::Buffer) -> Result<Places> {
-        let [row_bytes, sh_bytes] = self.sizes();
+        let [row_bytes, sh_bytes] = self.sizes(self.used);
         self.read(&[(rows, 0, row_bytes), (sh, 0, sh_bytes)], |bytes| {
             let (rows, sh) = bytes.split_at(row_bytes as usize);
             (bytemuck::pod_collect_to_vec(rows), bytemuck::pod_collect_to_vec(sh))
@@ -357,7 +361,7 @@ impl DeviceTrainer {
             self.take(PhotoStep { at, step, adds: place > 0, moves: false, blames: true })?;
         }
         let (count, k) = (u64::from(self.scene.count), self.scene.sh_count as usize);
-        let by_colours = (&earlier, gradient_bytes(count, 0), self.sizes()[1]);
+        let by_colours = (&earlier, gradient_bytes(count, 0), self.sizes(self.used)[1]);
         self.read(&[by_colours], |bytes| {
             let by: Vec<[f32; 3]> = bytemuck::pod_collect_to_vec(bytes);
             by.par_chunks(k).with_min_len(1 << 12).map(|by| by[0].iter().sum()).collect()
@@ -415,16 +419,21 @@ impl Trainer for DeviceTrainer {
         self.settle()?;
         let (now, k) = (self.scene.clone(), self.scene.sh_count as usize);
         let (mut rows, mut sh) = self.read_places(&now.gaussians, &now.sh)?;
-        let mut free = (0..rows.len()).filter(|&i| !is_there(&rows[i])).collect::<Vec<_>>();
+        let mut free: Vec<usize> = (0..rows.len()).filter(|&i| !is_there(&rows[i])).collect();
         let there = rows.len() - free.len();
+        free.extend(rows.len()..now.count as usize);
         free.truncate(until.saturating_sub(there));
         if free.is_empty() {
             return Ok(there);
         }
         let parents = most_blamed(&self.blame(photos)?, free.len());
-        let counts = (&self.training.moments.clone(), 0, 4 * rows.len() as u64);
+        let free = &free[..parents.len()];
+        self.used = free.last().map_or(0, |last| last + 1).max(rows.len());
+        rows.resize(self.used, GaussianRow::zeroed());
+        sh.resize(self.used * k, [0.0; 3]);
+        let counts = (&self.training.moments.clone(), 0, 4 * self.used as u64);
         let mut counts: Vec<f32> = self.read(&[counts], bytemuck::pod_collect_to_vec)?;
-        for (&i, &to) in parents.iter().zip(&free) {
+        for (&i, &to) in parents.iter().zip(free) {
             let [one, other] = halves(rows[i].mean, rows[i].quat, rows[i].scale);
             (rows[i].mean, rows[i].scale) = one;
             rows[to] = GaussianRow { mean: other.0, scale: other.1, ..rows[i] };
@@ -460,7 +469,8 @@ impl Trainer for DeviceTrainer {
 
     fn keep(&mut self) -> Result<()> {
         self.settle()?;
-        let (gpu, sizes, origins) = (&self.on.gpu, self.sizes(), self.origins.clone());
+        let places = self.scene.count as usize;
+        let (gpu, sizes, origins) = (&self.on.gpu, self.sizes(places), self.origins.clone());
         let kept = match self.kept.take() {
             Some(kept) => Kept { origins, ..kept },
             None => Kept {

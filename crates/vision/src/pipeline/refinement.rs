@@ -113,8 +113,13 @@ pub fn refined(
     let more = ((1.0 - share) / share).max(1.0);
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few steps")]
     let as_many = (proof.report.steps as f32 * more).round() as u32;
+    // All the time that is left, unless the proof became worse again.
+    let is_timed = time < Duration::MAX && !proof.is_peak;
     let mut options = RefineOptions {
-        budget: RefineBudget { steps: as_many.min(steps), time: of_time(time, 1.0 - share) },
+        budget: RefineBudget {
+            steps: if is_timed { steps } else { as_many.min(steps) },
+            time: of_time(time, 1.0 - share),
+        },
         ..*options
     };
     let (start, mut gaussians) = begin(&[])?;

@@ -44,11 +44,11 @@ pub const HELD_OUT_EVERY: usize = 8;
 pub const UNWATCHED_STEPS_MAX: u32 = 30;
 /// Looks at the held-out photos in a whole budget.
 const LOOKS: u32 = 10;
-/// Shares of the budget between which Gaussians are added, how many times, and photos that say
-/// where: docs/adr/0070.
-const GROWS_BETWEEN: [f32; 2] = [0.1, 0.6];
-const GROWTHS: u32 = 8;
-const GROWTH_PHOTOS: usize = 8;
+/// Shares of the budget between which Gaussians are added, steps between two times, what share of
+/// them comes each time, and photos that say where: docs/adr/0070.
+const GROWS_BETWEEN: [f32; 2] = [0.1, 0.7];
+const GROWS_EVERY: u32 = 100;
+const GROWTH_PHOTOS: usize = 4;
 /// Photos with a longer side under this have no smaller copies that come first.
 const COARSE_SIDE_MIN: u32 = 480;
 /// How far numbers move at first, `means` as a share of the median depth. 3DGS takes 30,000 steps
@@ -108,6 +108,8 @@ pub struct RefineOptions {
     pub gaussians_a_pixel: f32,
     /// Most Gaussians at all.
     pub gaussians_max: usize,
+    /// Share of the Gaussians that is added at a time.
+    pub growth: f32,
     /// Share of the budget in which photos are learnt at half their size, 0..1.
     pub coarse_share: f32,
     /// Looks at the held-out photos without a better version after which it stops.
@@ -141,6 +143,7 @@ impl Default for RefineOptions {
             gaussians_first: 150_000,
             gaussians_a_pixel: 0.5,
             gaussians_max: 1_000_000,
+            growth: 0.08,
             coarse_share: 0.3,
             patience: LOOKS,
             opacity_min: 0.01,
@@ -162,6 +165,8 @@ pub struct RefinedVersion {
     pub gaussians: Gaussians,
     /// How good it is; which photos are held out is for the caller to say.
     pub report: RefineReport,
+    /// Whether what came after it in the budget was worse.
+    pub is_peak: bool,
 }
 
 /// Numbers of the photos that are held out of `count`: the fourth and every eighth from there on,
@@ -413,9 +418,10 @@ impl Refinement<'_> {
         let watched = !self.held_out.is_empty();
         let few = !watched && self.learnt.len() < HOLDS_OUT_FROM;
         let mut best: Option<RefineReport> = None;
+        let mut is_peak;
         let (mut order, mut random) = (Vec::<usize>::new(), options.seed);
         let (mut steps, mut looked, mut waited, mut highest) = (0_u32, 0, 0, None);
-        let (mut grown, first, count) = (0, self.first, self.learnt.len());
+        let (mut grows_at, mut now, count) = (0, self.first, self.learnt.len());
         let most = most_gaussians(self.learnt, options);
         loop {
             let spent = clock.spent(steps);
@@ -444,28 +450,30 @@ impl Refinement<'_> {
                     let served = self.report.clone();
                     best = Some(RefineReport { steps, seconds, psnr_after: after, ..served });
                 }
+                is_peak = !better;
                 if last || waited >= options.patience {
                     break;
                 }
             }
-            let due = growths_due(spent);
-            if due > grown && !few {
-                grown = due;
-                let more = most.saturating_sub(first) * grown as usize / GROWTHS as usize;
-                let mut photos = shuffled(count, &mut random);
-                photos.truncate(GROWTH_PHOTOS);
-                let now = trainer.grow(&photos, first + more)?;
+            let coarse = self.has_coarse && spent < options.coarse_share;
+            let of_size = |i: usize| if coarse { count + i } else { i };
+            let [from, to] = GROWS_BETWEEN;
+            if steps >= grows_at && (from..to).contains(&spent) && !few {
+                grows_at = steps + GROWS_EVERY;
+                let photos = shuffled(count, &mut random).into_iter().map(of_size);
+                let photos: Vec<usize> = photos.take(GROWTH_PHOTOS).collect();
+                now = trainer
+                    .grow(&photos, most.min(now + (now as f32 * options.growth) as usize))?;
                 tracing::debug!(steps, gaussians = now, "grown");
             }
             let expected = steps as f32 / spent / count as f32;
             let rate = LAST_RATE.powf(spent) * if few { 1.0 } else { rate_factor(expected) };
-            let coarse = self.has_coarse && spent < options.coarse_share;
             let mut photos = Vec::with_capacity(options.batch);
             while photos.len() < options.batch {
                 if order.is_empty() {
                     order = shuffled(count, &mut random);
                 }
-                photos.extend(order.pop().map(|i| if coarse { count + i } else { i }));
+                photos.extend(order.pop().map(of_size));
             }
             steps += 1;
             let prunes = steps.is_multiple_of(options.prune_every);
@@ -479,12 +487,16 @@ impl Refinement<'_> {
         let Some(report) = best else { return Ok(self.unrefined()) };
         let gaussians = trainer.kept()?;
         let report = RefineReport { gaussians_after: gaussians.len() as u64, ..report };
-        Ok(RefinedVersion { gaussians, report })
+        Ok(RefinedVersion { gaussians, report, is_peak })
     }
 
     /// The scene that came in.
     fn unrefined(&self) -> RefinedVersion {
-        RefinedVersion { gaussians: self.start.gaussians.clone(), report: self.report.clone() }
+        RefinedVersion {
+            gaussians: self.start.gaussians.clone(),
+            report: self.report.clone(),
+            is_peak: true,
+        }
     }
 
     /// The report of the scene before any step: as it is served, in layers where it has some.
@@ -512,14 +524,6 @@ impl Refinement<'_> {
         }
         Ok((!self.held_out.is_empty()).then(|| sum / self.held_out.len() as f64))
     }
-}
-
-/// How many times Gaussians are to be added until `spent`.
-fn growths_due(spent: f32) -> u32 {
-    let [begin, end] = GROWS_BETWEEN;
-    #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few")]
-    let due = ((spent - begin) / (end - begin) * (GROWTHS - 1) as f32 + 1.0).max(0.0) as u32;
-    if spent < begin { 0 } else { due.min(GROWTHS) }
 }
 
 /// The next number of a row that looks random (`SplitMix64`, Steele et al. 2014).
