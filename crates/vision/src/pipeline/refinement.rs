@@ -30,6 +30,11 @@ use crate::{
 const AWAKE_EVERY: Duration = Duration::from_millis(4);
 const AWAKE_SIDE: u32 = 64;
 
+/// Longer side at which photos are learnt on a processor, pixels.
+const PROCESSOR_SIDE: u32 = 640;
+/// About what a Gaussian of degree 0 takes on a device, with moments, gradients and tile pairs.
+const DEVICE_BYTES_A_GAUSSIAN: u64 = 600;
+
 /// What a refinement came to.
 #[derive(Clone, Debug)]
 pub struct Refined {
@@ -67,6 +72,7 @@ pub fn refined(
     pace: &mut dyn FnMut(f32) -> Result<()>,
 ) -> Result<Refined> {
     let held = held_out(photos.len());
+    let options = &fitted(options, photos, renderer.is_device());
     let sized: Vec<PosedPhoto> = photos.iter().map(|photo| at_side(photo, options.side)).collect();
     // The scene without the photos `held`, and what its refinement begins with.
     let mut begin = |held: &[usize]| -> Result<(Scene, Gaussians)> {
@@ -141,9 +147,32 @@ pub fn refined(
     Ok(Refined { report, overfit: Some(overfit), version: Some((start, version)) })
 }
 
+/// The options with a side and a number of Gaussians for which there is time and room: a half of a
+/// device's bytes is for the photos and their smaller copies, a half for the Gaussians.
+fn fitted(options: &RefineOptions, photos: &[PosedPhoto], is_device: bool) -> RefineOptions {
+    if !is_device {
+        return RefineOptions { side: options.side.min(PROCESSOR_SIDE), ..*options };
+    }
+    let half = options.device_bytes_max / 2;
+    let pixels = |side: u32| -> f64 {
+        let of = |posed: &PosedPhoto| {
+            let [w, h] = [posed.photo.width, posed.photo.height].map(f64::from);
+            w * h * (f64::from(side) / w.max(h)).min(1.0).powi(2)
+        };
+        photos.iter().map(of).sum()
+    };
+    let bytes = |side: u32| 5.0 * pixels(side);
+    let mut side = options.side;
+    while side > PROCESSOR_SIDE && bytes(side) > half as f64 {
+        side = (side * 7 / 8).max(PROCESSOR_SIDE);
+    }
+    let room = usize::try_from(half / DEVICE_BYTES_A_GAUSSIAN).unwrap_or(usize::MAX);
+    RefineOptions { side, gaussians_max: options.gaussians_max.min(room.max(1)), ..*options }
+}
+
 /// Does `work`, and meanwhile draws a small view now and then, where a device would else rest.
 fn awake<T>(renderer: &dyn DifferentiableRenderer, scene: &Scene, work: impl FnOnce() -> T) -> T {
-    let Some(photo) = scene.meta.cameras.first().filter(|_| renderer.slow_after_rest()) else {
+    let Some(photo) = scene.meta.cameras.first().filter(|_| renderer.is_device()) else {
         return work();
     };
     let near = default_near(scene.meta.report.median_depth);

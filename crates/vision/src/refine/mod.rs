@@ -3,7 +3,9 @@
 //! In: a scene and photos. Out: better Gaussians. The steps are those of
 //! [`segsplat_render::train`], on the renderer's device where that has room for them, else on the
 //! processor. A gain and a bias for each photo and channel take up its exposure. Gaussians that
-//! become transparent are dropped as it goes.
+//! become transparent are dropped as it goes, and others are split where the scene differs from the
+//! photos ([`segsplat_render::train::Trainer::grow`]). Large photos are learnt at half their size
+//! first.
 //!
 //! **Held out.** Of five photos and more, every eighth is held out ([`held_out`]): the steps never
 //! see it, and a version counts as better only where its PSNR on these photos is over that of the
@@ -96,8 +98,8 @@ pub struct RefineOptions {
     pub budget: RefineBudget,
     /// Photos of a step.
     pub batch: usize,
-    /// Longer side at which the photos are learnt, pixels: what is learnt smaller than it is shown
-    /// has gaps.
+    /// Longer side at which the photos are learnt at most, pixels: what is learnt smaller than it is
+    /// shown has gaps.
     pub side: u32,
     /// How far numbers move; `means` as a share of the scene's median depth.
     pub rates: LearningRates,
@@ -108,7 +110,8 @@ pub struct RefineOptions {
     pub gaussians_a_pixel: f32,
     /// Most Gaussians at all.
     pub gaussians_max: usize,
-    /// Share of the Gaussians that is added at a time.
+    /// Share of the Gaussians that is added at a time; 0: none is, and none in the place of those
+    /// that are dropped.
     pub growth: f32,
     /// Share of the budget in which photos are learnt at half their size, 0..1.
     pub coarse_share: f32,
@@ -138,12 +141,12 @@ impl Default for RefineOptions {
         Self {
             budget: RefineBudget::steps(400),
             batch: 1,
-            side: 640,
+            side: 1_600,
             rates: RATES,
             gaussians_first: 150_000,
             gaussians_a_pixel: 0.5,
             gaussians_max: 1_000_000,
-            growth: 0.08,
+            growth: 0.04,
             coarse_share: 0.3,
             patience: LOOKS,
             opacity_min: 0.01,
@@ -151,7 +154,7 @@ impl Default for RefineOptions {
             ssim_share: 0.2,
             proof_share: 0.25,
             overfit_max: 1.5,
-            device_bytes_max: 1 << 30,
+            device_bytes_max: 2 << 30,
             seed: 1,
         }
     }
@@ -160,8 +163,8 @@ impl Default for RefineOptions {
 /// A version of a scene.
 #[derive(Clone, Debug)]
 pub struct RefinedVersion {
-    /// Its Gaussians: a part of those that came in, moved, in their order. Entries and sources came
-    /// with them.
+    /// Its Gaussians: those that came in, moved, less those that were dropped, and those that came
+    /// by growth. Entries and sources came with them.
     pub gaussians: Gaussians,
     /// How good it is; which photos are held out is for the caller to say.
     pub report: RefineReport,
@@ -458,7 +461,8 @@ impl Refinement<'_> {
             let coarse = self.has_coarse && spent < options.coarse_share;
             let of_size = |i: usize| if coarse { count + i } else { i };
             let [from, to] = GROWS_BETWEEN;
-            if steps >= grows_at && (from..to).contains(&spent) && !few {
+            let grows = options.growth > 0.0 && (from..to).contains(&spent) && !few;
+            if grows && steps >= grows_at {
                 grows_at = steps + GROWS_EVERY;
                 let photos = shuffled(count, &mut random).into_iter().map(of_size);
                 let photos: Vec<usize> = photos.take(GROWTH_PHOTOS).collect();
