@@ -74,13 +74,15 @@ pub fn refined(
     let held = held_out(photos.len());
     let options = &fitted(options, photos, renderer.is_device());
     let sized: Vec<PosedPhoto> = photos.iter().map(|photo| at_side(photo, options.side)).collect();
+    // The proof leaves room for the Gaussians of the photos that it lacks.
+    let share_of = |all: usize, held: &[usize]| {
+        all.saturating_mul(photos.len() - held.len()) / photos.len().max(1)
+    };
     // The scene without the photos `held`, and what its refinement begins with.
     let mut begin = |held: &[usize]| -> Result<(Scene, Gaussians)> {
         let (learnt, one_set) = awake(renderer, scene, || remake(split(photos, held).0))?;
         let (start, first) = start_of(scene, held, learnt, one_set)?;
-        // The proof leaves room for those of the photos that it lacks.
-        let all = options.gaussians_first.saturating_mul(photos.len() - held.len());
-        let gaussians_first = all / photos.len().max(1);
+        let gaussians_first = share_of(options.gaussians_first.min(options.gaussians_max), held);
         let gaussians = ready(&start, &first, &RefineOptions { gaussians_first, ..*options })?;
         Ok((start, gaussians))
     };
@@ -104,7 +106,8 @@ pub fn refined(
     let share = options.proof_share.clamp(0.01, 0.99);
     let budget = RefineBudget { steps, time: of_time(time, share) };
     let (start, gaussians) = begin(&held)?;
-    let proof_options = RefineOptions { budget, ..*options };
+    let gaussians_max = share_of(options.gaussians_max, &held);
+    let proof_options = RefineOptions { budget, gaussians_max, ..*options };
     let proof = part((&start, &gaussians), &held, &proof_options, [0.0, share])?;
     let earlier = scene.meta.report.refinement.as_ref().and_then(|report| report.psnr_after);
     if proof.report.steps == 0 || proof.report.psnr_after <= earlier {
