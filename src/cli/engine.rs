@@ -46,7 +46,7 @@ pub fn offline(config: &Config, texts: bool) -> Result<OfflineService> {
         (Arc::new(NoSemantics), Vec::new());
     if texts {
         let engine = Pipeline::open(&config.networks())?;
-        words = known_words(engine.bundle())?;
+        words = engine.bundle().words()?;
         networks = Arc::new(PipelineNetworks(Arc::new(engine.into())));
     }
     Ok(OfflineService::new(networks, renderer(config)?, &words, config.limits.clone()))

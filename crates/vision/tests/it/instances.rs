@@ -223,7 +223,7 @@ fn an_upright_box_follows_two_sides_of_a_thing() {
 fn the_score_of_a_part_is_that_of_an_entry_that_is_more_than_an_edge() {
     let sites = patch(0, 0..40, 0..10, 4.0);
     // Entry 3 has 12 of 400 Gaussians, entry 2 a quarter.
-    let entry = |i: usize| if i < 12 { 3 } else { 1 + u16::from(i % 4 == 0) };
+    let entry = |i: usize| if i < 12 { 3 } else { 1 + u16::from(i.is_multiple_of(4)) };
     let scene = gaussians(&sites).with_semantic_index((0..400).map(entry).collect()).unwrap();
     let options = InstanceOptions::default();
     let found =
