@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use crate::{
     config::Config,
-    error::{Error, ErrorCode, Result},
+    error::Result,
     jobs::{NoSemantics, PipelineNetworks, SemanticNetworks},
     models::Bundle,
     pipeline::{Pipeline, PipelineLoader},
     render::{Renderer, select::select},
-    service::{KnownWord, ModelInfo, ModelsInfo, OfflineService, Parts},
+    service::{ModelInfo, ModelsInfo, OfflineService, Parts},
 };
 
 /// Bundle, networks and renderer as the server runs them. A thread of the loader still opens the
@@ -28,18 +28,6 @@ pub fn parts(config: &Config) -> Result<(Parts, Arc<PipelineLoader>)> {
     Ok((Parts { scenes: networks, semantics, renderer, models }, engine))
 }
 
-/// What makes semantics; opens library and bundle only where `needed`.
-///
-/// # Errors
-/// `model_unavailable`.
-pub fn semantics(config: &Config, needed: bool) -> Result<Arc<dyn SemanticNetworks>> {
-    if !needed {
-        return Ok(Arc::new(NoSemantics));
-    }
-    let engine = Pipeline::open(&config.networks())?;
-    Ok(Arc::new(PipelineNetworks(Arc::new(engine.into()))))
-}
-
 /// The renderer that the configuration asks for.
 ///
 /// # Errors
@@ -54,7 +42,14 @@ pub fn renderer(config: &Config) -> Result<Arc<dyn Renderer>> {
 /// # Errors
 /// `model_unavailable`, `gpu_unavailable`.
 pub fn offline(config: &Config, texts: bool) -> Result<OfflineService> {
-    Ok(OfflineService::new(semantics(config, texts)?, renderer(config)?, config.limits.clone()))
+    let (mut networks, mut words): (Arc<dyn SemanticNetworks>, _) =
+        (Arc::new(NoSemantics), Vec::new());
+    if texts {
+        let engine = Pipeline::open(&config.networks())?;
+        words = known_words(engine.bundle())?;
+        networks = Arc::new(PipelineNetworks(Arc::new(engine.into())));
+    }
+    Ok(OfflineService::new(networks, renderer(config)?, &words, config.limits.clone()))
 }
 
 /// The description of a bundle for callers.
@@ -86,20 +81,8 @@ pub fn models_info(bundle: &Bundle, execution_provider: &str) -> Result<ModelsIn
         bundle: bundle.name().to_owned(),
         bundle_sha256: bundle.sha256().to_owned(),
         models: models.collect(),
-        words: known_words(bundle)?,
+        words: bundle.words()?,
         execution_provider: execution_provider.to_owned(),
         ..ModelsInfo::default()
     })
-}
-
-/// What the bundle says of everyday words.
-fn known_words(bundle: &Bundle) -> Result<Vec<KnownWord>> {
-    let Some(named) = bundle.image_text().and_then(|towers| towers.words.as_ref()) else {
-        return Ok(Vec::new());
-    };
-    let refused = |why: String| {
-        Error::new(ErrorCode::ModelUnavailable, format!("model bundle: {}: {why}", named.file))
-    };
-    let text = fs_err::read(bundle.path(&named.file)).map_err(|e| refused(e.kind().to_string()))?;
-    serde_json::from_slice(&text).map_err(|e| refused(e.to_string()))
 }

@@ -262,8 +262,9 @@ fn an_output_that_cannot_be_written_is_refused_before_any_work() {
 
 #[test]
 fn bench_says_the_time_of_a_view_and_its_error() {
-    let folder = files();
+    let folder = tempfile::tempdir().unwrap();
     let scene = folder.path().join("scene.segsplat");
+    ok(&["reconstruct", "tests/fixtures/splats/source.ply", "-o", text(&scene)]);
     let line = ["bench", text(&scene), "--frames", "3", "--width", "64", "--height", "48"];
     let told = ok_json(&[&line[..], &CPU].concat());
     let number = |place: &str| told.pointer(place).and_then(Value::as_f64).expect(place);
