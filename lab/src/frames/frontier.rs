@@ -90,6 +90,7 @@ pub(crate) fn run(args: &FrontierArgs, rows: &mut Rows) -> Result<()> {
             let row = json!({
                 "renderer": renderer.name(),
                 "scene": scene,
+                "asked": asked.to_string(),
                 "gaussians": gaussians.len(),
                 "width": picture.width,
                 "height": picture.height,

@@ -455,13 +455,9 @@ impl Trainer for DeviceTrainer {
 
     fn render(&mut self, request: &RenderRequest) -> Result<Frame> {
         self.settle()?;
-<<<<<<< HEAD
         // How bright its colours have become is not known here.
         let request = &RenderRequest { error: 0.0, ..request.clone() };
-        let mut drawing = Drawing::new(self.start.origin(), request, &self.scene)?;
-=======
         let mut drawing = Drawing::new(self.origin, request, &self.scene)?;
->>>>>>> w/sharp
         let rows = drawing.whole();
         self.tools().rows(&mut drawing, rows)?;
         drawing.finish(&mut self.scratch)
