@@ -310,6 +310,7 @@ impl DeviceScene {
             shape: source.shape_identity(),
             count: narrow("gaussians", places)?,
             sh_count: source.sh_count() as u32,
+            brightest: brightest(source),
             gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows), None)?,
             sh: gpu.upload("sh", bytemuck::cast_slice(&sh), None)?,
             labels: None,
