@@ -335,7 +335,8 @@ pub struct ViewOptions {
     #[arg(long)]
     pub near: Option<f32>,
     /// Largest difference to the exact picture, levels of 255, that is accepted for less time: 0 to
-    /// 32, `exact` (0, default) or `fast` (2). Views with depth are exact. `quality` is its old name.
+    /// 32, `exact` (0, default) or `fast` (2). Views with depth are exact. Its old name is
+    /// `quality`.
     #[arg(long, alias = "quality", default_value = "exact", value_name = "LEVELS")]
     #[serde(alias = "quality")]
     #[param(value_type = String)]
