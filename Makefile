@@ -17,7 +17,6 @@
 # make bench-gpu   the same of what needs a GPU. Both: BENCH=--list prints the commands; SEGSPLAT_LAB and
 #               SEGSPLAT_BIN name programs that are built already
 # make report   the tables of docs/benchmarks.md from benches/runs
-# make plots   docs/plots from docs/measurements/runs (PYTHON with matplotlib)
 # make test-long   the random tests with many more cases, and the slow ones
 # make fuzz    every reader of bytes from outside, FUZZ_SECONDS=600 each
 
@@ -27,12 +26,12 @@ TARGET := $(or $(CARGO_TARGET_DIR),target)
 SEGSPLAT := $(TARGET)/release/segsplat
 DATA ?= $(or $(SEGSPLAT_SHARED_DATA),../shared/data)/scenes
 ARGS ?=
-# With numpy, pillow and trimesh for `make eval-scenes`, matplotlib for `make plots`.
+# With numpy, pillow and trimesh for `make eval-scenes`.
 PYTHON ?= python3
 # The software Vulkan adapter, where `scripts/setup --ci` found one.
 ADAPTER := if [ -f $(TARGET)/tools/env ]; then . $(abspath $(TARGET))/tools/env; fi;
 
-.PHONY: unread client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-published judge-splats judge-three judge-tools demo serve check test test-long fuzz bench bench-all bench-gpu lab eval eval-scenes plots report setup build fmt lint doc tests deny
+.PHONY: unread client venv page page-long wheel image proto judge judge-venv judge-compose judge-containers judge-folders judge-inference judge-published judge-splats judge-three judge-tools demo serve check test test-long fuzz bench bench-all bench-gpu lab eval eval-scenes report setup build fmt lint doc tests deny
 
 demo: build
 	python3 scripts/demo.py --segsplat $(SEGSPLAT) --out $(TARGET)/demo
@@ -186,9 +185,6 @@ report:
 eval-scenes:
 	$(PYTHON) models/training/semantics/eval_scenes.py --data $(dir $(DATA)) \
 		--out $(TARGET)/eval/scenes
-
-plots:
-	$(PYTHON) benches/plots.py docs/measurements/runs docs/plots
 
 build: setup
 	$(CARGO) build --locked --release
