@@ -132,15 +132,16 @@ impl CpuRenderer {
         clock.ended("begin");
         project::project(gaussians, request, &view, options, &mut scratch.projected);
         clock.ended("project");
+        let mut brightest = 0.0;
         if request.kinds.color {
-            shade::shade(gaussians, &view, options, &mut scratch.projected);
+            brightest = shade::shade(gaussians, &view, options, &mut scratch.projected);
             clock.ended("shade");
         }
         let seen = scratch.projected.tiles_per_gauss.par_iter().with_min_len(1 << 14);
         frame.stats.visible = seen.filter(|&&tiles| tiles > 0).count() as u64;
         let mut band = Band {
             keys: DepthKeys::new(gaussians, &request.sources),
-            paint: Paint::new(request, &view, gaussians.semantic_index(), options),
+            paint: Paint::new(request, &view, gaussians.semantic_index(), brightest, options),
             weights: Vec::new(),
         };
         self.draw_band(&Grid::whole(&view, options), &mut band, scratch, &mut frame, &mut clock)?;
@@ -238,7 +239,7 @@ pub(super) fn background(view: &View, request: &RenderRequest) -> Result<Frame> 
     let mut frame = Frame::blank([view.width, view.height], request, pixels);
     let options = KernelOptions::default();
     let grid = Grid::whole(view, options);
-    let paint = Paint::new(request, view, &[], options);
+    let paint = Paint::new(request, view, &[], 0.0, options);
     let weights = rasterize(&grid, &paint, &[], &[], &Pool::default(), &mut frame);
     if request.labels == Labels::Weights {
         frame.weights = Some(WeightRows::join(weights)?);

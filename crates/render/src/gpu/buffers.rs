@@ -11,7 +11,8 @@ use super::{
 };
 use crate::{
     Background, Labels, RenderRequest, Samples, Source,
-    constants::{HALF_LEVEL, OWN_SIZE},
+    budget::{Budget, RayEnd, brightest},
+    constants::{HALF_LEVEL, OWN_SIZE, TRANSMITTANCE_MIN},
     error::{Error, ErrorCode, Result},
     scene::Gaussians,
     view::View,
@@ -28,6 +29,7 @@ pub struct ViewRow {
     pub center: [f32; 4],
     pub center_low: [f32; 4],
     pub background: [f32; 4],
+    pub ray_end: [f32; 4],
     pub focal: [f32; 2],
     pub principal: [f32; 2],
     pub slope_min: [f32; 2],
@@ -135,7 +137,7 @@ pub struct TrainingRow {
     pub ssim_share: f32,
     pub photo: u32,
     pub photo_start: u32,
-    pub rest: u32,
+    pub blames: u32,
 }
 
 /// What `project_backward` writes of each Gaussian: [`GRADIENT_WORDS`] numbers.
@@ -172,6 +174,7 @@ impl ViewRow {
             center: row(high(view.center)),
             center_low: row(low(view.center)),
             background: [background[0], background[1], background[2], 0.0],
+            ray_end: [TRANSMITTANCE_MIN, 0.0, 0.0, 0.0],
             focal: narrow(view.focal),
             principal: narrow(view.principal),
             slope_min: narrow(view.slope_min),
@@ -197,13 +200,14 @@ impl ViewRow {
     }
 
     /// The row of a request, of which `view` is the camera. The caller sets also where the view's
-    /// photos, its table and its backdrop start.
-    pub fn of(view: &View, request: &RenderRequest) -> Self {
+    /// photos, its table and its backdrop start. Colours are at most `brightest`.
+    pub fn of(view: &View, request: &RenderRequest, brightest: f32) -> Self {
         let background = match &request.background {
             Background::Color(color) => *color,
             Background::Backdrop(_) => [0.0; 3],
         };
         let exact = request.samples == Samples::F32;
+        let ray_end = RayEnd::new(Budget::of(request).rays, request, brightest);
         let [first, across, down] = view.rays().map(|[x, y, z]| [x, y, z, 0.0]);
         Self {
             levels: match request.samples {
@@ -218,6 +222,7 @@ impl ViewRow {
             },
             own_focal: (view.focal[0].max(view.focal[1]) / f64::from(OWN_SIZE)) as f32,
             source_count: request.sources.len() as u32,
+            ray_end: [ray_end.transmittance, ray_end.behind, 0.0, 0.0],
             ray_first: first,
             ray_across: across,
             ray_down: down,
@@ -234,6 +239,8 @@ pub(super) struct DeviceScene {
     pub(super) count: u32,
     /// Spherical harmonics of each Gaussian.
     pub(super) sh_count: u32,
+    /// A bound of their colours.
+    pub(super) brightest: f32,
     /// `[N]` of [`GaussianRow`].
     pub(super) gaussians: wgpu::Buffer,
     /// `[N, K, 3]` f32.
@@ -281,26 +288,46 @@ impl DeviceScene {
     /// Errors: `limit_exceeded` when it does not fit the adapter's limits or memory.
     pub(super) fn upload(gpu: &Gpu, source: &Gaussians, old: Option<Self>) -> Result<Self> {
         let (old_gaussians, old_sh) = old.map(|old| (old.gaussians, old.sh)).unzip();
-        let rows: Vec<GaussianRow> = (0..source.len())
-            .into_par_iter()
-            .with_min_len(1 << 14)
-            .map(|i| GaussianRow {
-                mean: source.means()[i],
-                opacity: source.opacities()[i],
-                quat: source.quats()[i],
-                scale: source.scales()[i],
-                source: source.source()[i].view.into(),
-            })
-            .collect();
+        let rows = rows_of(source);
         Ok(Self {
             shape: source.shape_identity(),
             count: narrow("gaussians", source.len())?,
             sh_count: source.sh_count() as u32,
+            brightest: brightest(source),
             gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows), old_gaussians)?,
             sh: gpu.upload("sh", bytemuck::cast_slice(source.sh()), old_sh)?,
             labels: None,
         })
     }
+
+    /// Uploads `source` with so many places, those behind its Gaussians with opacity 0.
+    /// Errors: as [`Self::upload`].
+    pub(super) fn with_places(gpu: &Gpu, source: &Gaussians, places: usize) -> Result<Self> {
+        let (mut rows, mut sh) = (rows_of(source), source.sh().to_vec());
+        rows.resize(places, GaussianRow::zeroed());
+        sh.resize(places * source.sh_count(), [0.0; 3]);
+        Ok(Self {
+            shape: source.shape_identity(),
+            count: narrow("gaussians", places)?,
+            sh_count: source.sh_count() as u32,
+            brightest: brightest(source),
+            gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows), None)?,
+            sh: gpu.upload("sh", bytemuck::cast_slice(&sh), None)?,
+            labels: None,
+        })
+    }
+}
+
+/// Gaussians as the shaders read them.
+fn rows_of(source: &Gaussians) -> Vec<GaussianRow> {
+    let row = |i: usize| GaussianRow {
+        mean: source.means()[i],
+        opacity: source.opacities()[i],
+        quat: source.quats()[i],
+        scale: source.scales()[i],
+        source: source.source()[i].view.into(),
+    };
+    (0..source.len()).into_par_iter().with_min_len(1 << 14).map(row).collect()
 }
 
 /// Scenes on the device, the most recently drawn last.

@@ -127,7 +127,7 @@ impl ImageText {
             },
         };
         let text = Network::open(runtime, bundle, options, &spec)?;
-        let words = listed_words(bundle, &manifest)?;
+        let words: Vec<ListedWord> = bundle.words()?;
         Ok(Some(Self {
             // A device looks for its fastest kernels again at each new shape.
             crops: size(image.signature(), &manifest.image.input, 0)
@@ -505,15 +505,6 @@ struct ListedWord {
 
 fn yes() -> bool {
     true
-}
-
-/// The list of words that the bundle measured.
-fn listed_words(bundle: &Bundle, manifest: &ImageTextManifest) -> Result<Vec<ListedWord>> {
-    let Some(words) = &manifest.words else { return Ok(Vec::new()) };
-    let refused = |why: String| unavailable(format!("{}: {why}", words.file));
-    let bytes =
-        fs_err::read(bundle.path(&words.file)).map_err(|e| refused(e.kind().to_string()))?;
-    serde_json::from_slice(&bytes).map_err(|e| refused(e.to_string()))
 }
 
 /// The tokenizer's file, whose own truncation and padding are switched off: both are done here.
