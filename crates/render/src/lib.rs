@@ -12,6 +12,7 @@
 )]
 
 pub mod backward;
+pub mod blocks;
 pub mod compare;
 pub mod constants;
 pub mod cpu;
