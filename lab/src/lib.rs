@@ -67,6 +67,8 @@ enum Command {
     Backward(frames::Args),
     /// Time frames without each kind of skipped work
     Skips(frames::Args),
+    /// What views cost that show little of a scene, with and without blocks
+    Aims(frames::Args),
     /// Ask a server for views and scenes, as its callers do
     #[command(subcommand)]
     Load(load::Command),
@@ -109,6 +111,7 @@ pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
         Command::Frames(args) => frames::run(args, &mut rows)?,
         Command::Backward(args) => frames::backward::run(args, &mut rows)?,
         Command::Skips(args) => frames::skips::run(args, &mut rows)?,
+        Command::Aims(args) => frames::aims::run(args, &mut rows)?,
         Command::Load(command) => load::run(command, &mut rows)?,
         Command::Report(args) => report::run(args)?,
     }

@@ -1,7 +1,8 @@
 //! Stage 1: Gaussians to footprints; some are dropped. Shader: `shaders/project.wgsl`
 //!
-//! In: means, quats, scales, opacities of the Gaussians that are shown, `[N]`. Out: [`Footprint`] `[N]`. A dropped Gaussian touches
-//! no tile (`tiles_per_gauss` is 0). All arithmetic is f64; the results become f32 at the end.
+//! In: means, quats, scales, opacities `[N]` of the Gaussians shown. Out: [`Footprint`] `[N]`. A
+//! dropped Gaussian touches no tile (`tiles_per_gauss` is 0). All arithmetic is f64; the results
+//! become f32 at the end.
 
 use rayon::prelude::*;
 
@@ -34,8 +35,8 @@ pub struct Projected {
     pub tiles_per_gauss: Vec<u32>,
 }
 
-/// Projects the Gaussians that are shown for `request`, of which `view` is the camera. `tiles_per_gauss[i]` is 0
-/// if Gaussian i is dropped.
+/// Projects the Gaussians that are shown for `request`, of which `view` is the camera.
+/// `tiles_per_gauss[i]` is 0 if Gaussian i of them is dropped.
 pub fn project(
     gaussians: &Gaussians,
     request: &RenderRequest,
