@@ -145,6 +145,7 @@ pub(crate) fn run(args: &Args, rows: &mut Rows) -> Result<()> {
             let found = refined(renderer, &scene, &given, &options, &mut remake, &mut pace)?;
             let refine_ms = ms(begun) - rested.as_secs_f64() * 1e3;
             row["refine"] = json!(text);
+            row["asked_s"] = json!(variant.asked_s());
             row["refine_ms"] = json!(refine_ms);
             row["step_ms"] = json!(refine_ms / f64::from(paces.max(1)));
             row["steps_made"] = json!(paces);

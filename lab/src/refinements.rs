@@ -77,6 +77,11 @@ impl Variant {
         if self.layers { (made.clone(), made.gaussians) } else { (made, one_set) }
     }
 
+    /// Seconds that it was given; none where it counts steps.
+    pub(crate) fn asked_s(&self) -> Option<f64> {
+        (self.ms < u64::MAX).then_some(self.ms as f64 / 1e3)
+    }
+
     /// The options of the product with these in their place.
     pub(crate) fn options(&self) -> RefineOptions {
         let plain = RefineOptions::default();

@@ -142,7 +142,7 @@ pub struct ViewOptions {
     /// The part of every picture that is drawn; left out: all of it. For views alone.
     #[prost(message, optional, tag = "7")]
     pub crop: ::core::option::Option<Region>,
-    /// How closely to keep to the rendering model.
+    /// Name of an error, for clients that know no `error`.
     #[prost(enumeration = "Quality", tag = "8")]
     pub quality: i32,
     /// How it is drawn and texts are scored; left out: as the scene was made.
@@ -155,6 +155,10 @@ pub struct ViewOptions {
     /// preset.
     #[prost(bool, optional, tag = "11")]
     pub magnify: ::core::option::Option<bool>,
+    /// Largest difference to the exact picture that is accepted for less time, levels of 255: 0
+    /// (exact) to 32; left out: that of `quality`. Views with depth are exact.
+    #[prost(float, optional, tag = "12")]
+    pub error: ::core::option::Option<f32>,
 }
 /// A part of a picture, pixels of the whole one.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -259,15 +263,15 @@ impl Preset {
         }
     }
 }
-/// How closely a renderer keeps to the model.
+/// Names of two errors.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Quality {
     /// As QUALITY_EXACT.
     Unspecified = 0,
-    /// f32 all through.
+    /// An error of 0.
     Exact = 1,
-    /// Faster, within the bound that the documentation states.
+    /// An error of 2 levels.
     Fast = 2,
 }
 impl Quality {
@@ -1164,6 +1168,9 @@ pub struct View {
     /// Gaussians that passed culling.
     #[prost(uint64, tag = "12")]
     pub visible: u64,
+    /// Bound of its difference to the exact picture, levels of 255.
+    #[prost(float, tag = "13")]
+    pub error: f32,
 }
 /// Which scene to write, and how.
 #[derive(Clone, PartialEq, ::prost::Message)]

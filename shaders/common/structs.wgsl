@@ -13,6 +13,9 @@ struct View {
     center: vec4<f32>,
     center_low: vec4<f32>,
     background: vec4<f32>,
+    // A ray goes no farther when its transmittance is x or less; then y is behind it
+    // (crates/render/src/budget.rs).
+    ray_end: vec4<f32>,
     // Pixels.
     focal: vec2<f32>,
     principal: vec2<f32>,

@@ -4,12 +4,12 @@ use std::sync::Arc;
 
 use crate::{
     config::Config,
-    error::{Error, ErrorCode, Result},
+    error::Result,
     jobs::{NoSemantics, PipelineNetworks, SemanticNetworks},
     models::Bundle,
     pipeline::{Pipeline, PipelineLoader},
     render::{Renderer, select::select},
-    service::{KnownWord, ModelInfo, ModelsInfo, OfflineService, Parts},
+    service::{ModelInfo, ModelsInfo, OfflineService, Parts},
 };
 
 /// Bundle, networks and renderer as the server runs them. A thread of the loader still opens the
@@ -86,20 +86,8 @@ pub fn models_info(bundle: &Bundle, execution_provider: &str) -> Result<ModelsIn
         bundle: bundle.name().to_owned(),
         bundle_sha256: bundle.sha256().to_owned(),
         models: models.collect(),
-        words: known_words(bundle)?,
+        words: bundle.words()?,
         execution_provider: execution_provider.to_owned(),
         ..ModelsInfo::default()
     })
-}
-
-/// What the bundle says of everyday words.
-fn known_words(bundle: &Bundle) -> Result<Vec<KnownWord>> {
-    let Some(named) = bundle.image_text().and_then(|towers| towers.words.as_ref()) else {
-        return Ok(Vec::new());
-    };
-    let refused = |why: String| {
-        Error::new(ErrorCode::ModelUnavailable, format!("model bundle: {}: {why}", named.file))
-    };
-    let text = fs_err::read(bundle.path(&named.file)).map_err(|e| refused(e.kind().to_string()))?;
-    serde_json::from_slice(&text).map_err(|e| refused(e.to_string()))
 }

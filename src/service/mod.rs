@@ -52,7 +52,10 @@ pub use self::{
     },
 };
 pub use crate::formats::{rle::Rle, table::ExportFormat};
-pub use crate::render::{Quality, plan::default_near};
+pub use crate::render::{
+    budget::{ERROR_FAST, MaxError},
+    plan::default_near,
+};
 pub use crate::scene::{
     Density, Event, MaskLevel, Method, Preset, SceneCamera, SceneError, SceneOptions, SceneState,
     SceneStatus, SemanticsMode, SemanticsState, SemanticsStatus, Upload, UploadCameras, UploadFile,

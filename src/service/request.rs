@@ -10,7 +10,7 @@ use utoipa::{IntoParams, ToSchema};
 use crate::{
     error::{Error, Result},
     names::{display_names, named},
-    render::Quality,
+    render::budget::MaxError,
     scene::{Preset, Region, SceneOptions, ScoringMethod, Upload},
 };
 
@@ -334,10 +334,13 @@ pub struct ViewOptions {
     /// Near plane, world units. By default 0.01 of the scene's median depth.
     #[arg(long)]
     pub near: Option<f32>,
-    /// `exact` (default), or `fast` within a stated error.
-    #[arg(long, default_value = "exact", value_parser = named::<Quality>)]
-    #[param(inline)]
-    pub quality: Quality,
+    /// Largest difference to the exact picture, levels of 255, that is accepted for less time: 0 to
+    /// 32, `exact` (0, default) or `fast` (2). Views with depth are exact. `quality` is its old name.
+    #[arg(long, alias = "quality", default_value = "exact", value_name = "LEVELS")]
+    #[serde(alias = "quality")]
+    #[param(value_type = String)]
+    #[schema(value_type = serde_json::Value)]
+    pub error: MaxError,
     /// How it is drawn and texts are scored: `default` or `paper`. By default as the scene was
     /// made.
     #[arg(long, value_parser = named::<Preset>)]

@@ -21,7 +21,14 @@ async fn messages_name_the_field_the_value_and_what_it_must_be() {
             "view?from=0&width=4294967296",
             "width is \"4294967296\"; it must be a whole number".to_owned(),
         ),
-        ("view?from=0&quality=best", "quality is \"best\"; it must be exact or fast".to_owned()),
+        (
+            "view?from=0&error=best",
+            "error is \"best\"; it must be a number of levels, exact or fast".to_owned(),
+        ),
+        (
+            "view?from=0&quality=best",
+            "quality is \"best\"; it must be a number of levels, exact or fast".to_owned(),
+        ),
         ("view?eye=1,2", format!("eye has 2 numbers; {numbers}")),
         ("view?up=0,%201,x", "up is \"x\"; it must be a number".to_owned()),
         ("view?from=0&from=1", "from is given twice".to_owned()),

@@ -266,9 +266,12 @@ async fn a_collector_that_never_answers_takes_nothing_from_callers_and_the_serve
     let call = client.post(server.url("/v1/scenes?wait_ms=60000")).multipart(form);
     assert_eq!(call.send().await.unwrap().status(), 201);
     // More spans than the exporter holds.
-    for _ in 0..3_000 {
-        assert_eq!(client.get(server.url("/healthz")).send().await.unwrap().status(), 200);
-    }
+    let calls = async {
+        for _ in 0..3_000 {
+            assert_eq!(client.get(server.url("/healthz")).send().await.unwrap().status(), 200);
+        }
+    };
+    tokio::time::timeout(5 * PATIENCE, calls).await.expect("callers wait for the collector");
     let ended = tokio::task::spawn_blocking(|| server.stop());
     assert!(tokio::time::timeout(PATIENCE, ended).await.expect("it ends").unwrap(), "it ends well");
     drop(silent);

@@ -150,8 +150,9 @@ class Drawing(TypedDict, total=False):
     antialiased: bool
     #: Near plane, world units.
     near: float
-    #: "fast" may leave out precision within a stated bound.
-    quality: Literal["exact", "fast"]
+    #: Largest difference to the exact picture that is accepted for less time, levels of 255: 0 to
+    #: 32, "exact" (0) or "fast" (2). Views with depth are exact.
+    error: float | Literal["exact", "fast"]
     #: "paper" draws and scores as the paper does; that of the scene by default.
     preset: Preset
     #: Photos whose Gaussians are in front, the nearest ones; 0: those of all. That of the preset by

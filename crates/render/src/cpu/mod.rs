@@ -145,8 +145,9 @@ impl CpuRenderer {
         clock.ended("cull");
         project::project(gaussians, request, &view, options, &mut scratch.projected);
         clock.ended("project");
+        let mut brightest = 0.0;
         if request.kinds.color {
-            shade::shade(gaussians, &view, options, &mut scratch.projected);
+            brightest = shade::shade(gaussians, &view, options, &mut scratch.projected);
             clock.ended("shade");
         }
         let seen = scratch.projected.tiles_per_gauss.par_iter().with_min_len(1 << 14);
@@ -157,7 +158,7 @@ impl CpuRenderer {
         };
         let mut band = Band {
             keys: DepthKeys::new(gaussians, &request.sources),
-            paint: Paint::new(request, &view, &entries, options),
+            paint: Paint::new(request, &view, &entries, brightest, options),
             weights: Vec::new(),
         };
         self.draw_band(&Grid::whole(&view, options), &mut band, scratch, &mut frame, &mut clock)?;
@@ -255,7 +256,7 @@ pub(super) fn background(view: &View, request: &RenderRequest) -> Result<Frame> 
     let mut frame = Frame::blank([view.width, view.height], request, pixels);
     let options = KernelOptions::default();
     let grid = Grid::whole(view, options);
-    let paint = Paint::new(request, view, &[], options);
+    let paint = Paint::new(request, view, &[], 0.0, options);
     let weights = rasterize(&grid, &paint, &[], &[], &Pool::default(), &mut frame);
     if request.labels == Labels::Weights {
         frame.weights = Some(WeightRows::join(weights)?);

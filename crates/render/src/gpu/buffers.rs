@@ -12,7 +12,8 @@ use super::{
 use crate::{
     Background, Labels, RenderRequest, Samples, Source,
     blocks::{Blocks, Bounds, Frustum},
-    constants::{HALF_LEVEL, OWN_SIZE},
+    budget::{Budget, RayEnd, brightest},
+    constants::{HALF_LEVEL, OWN_SIZE, TRANSMITTANCE_MIN},
     error::{Error, ErrorCode, Result},
     scene::Gaussians,
     view::View,
@@ -29,6 +30,7 @@ pub struct ViewRow {
     pub center: [f32; 4],
     pub center_low: [f32; 4],
     pub background: [f32; 4],
+    pub ray_end: [f32; 4],
     pub focal: [f32; 2],
     pub principal: [f32; 2],
     pub slope_min: [f32; 2],
@@ -196,6 +198,7 @@ impl ViewRow {
             center: row(high(view.center)),
             center_low: row(low(view.center)),
             background: [background[0], background[1], background[2], 0.0],
+            ray_end: [TRANSMITTANCE_MIN, 0.0, 0.0, 0.0],
             focal: narrow(view.focal),
             principal: narrow(view.principal),
             slope_min: narrow(view.slope_min),
@@ -221,8 +224,8 @@ impl ViewRow {
     }
 
     /// The row of a request, of which `view` is the camera. The caller sets also where the view's
-    /// photos, its table and its backdrop start.
-    pub fn of(view: &View, request: &RenderRequest) -> Self {
+    /// photos, its table and its backdrop start. Colours are at most `brightest`.
+    pub fn of(view: &View, request: &RenderRequest, brightest: f32) -> Self {
         let background = match &request.background {
             Background::Color(color) => *color,
             Background::Backdrop(_) => [0.0; 3],
@@ -230,6 +233,7 @@ impl ViewRow {
         let exact = request.samples == Samples::F32;
         let frustum = Frustum::new(view, request);
         let wide = |(v, w): (glam::DVec3, f64)| v.extend(w).as_vec4().to_array();
+        let ray_end = RayEnd::new(Budget::of(request).rays, request, brightest);
         let [first, across, down] = view.rays().map(|[x, y, z]| [x, y, z, 0.0]);
         Self {
             levels: match request.samples {
@@ -244,6 +248,7 @@ impl ViewRow {
             },
             own_focal: (view.focal[0].max(view.focal[1]) / f64::from(OWN_SIZE)) as f32,
             source_count: request.sources.len() as u32,
+            ray_end: [ray_end.transmittance, ray_end.behind, 0.0, 0.0],
             ray_first: first,
             ray_across: across,
             ray_down: down,
@@ -263,6 +268,8 @@ pub(super) struct DeviceScene {
     pub(super) count: u32,
     /// Spherical harmonics of each Gaussian.
     pub(super) sh_count: u32,
+    /// A bound of their colours.
+    pub(super) brightest: f32,
     /// `[N]` of [`GaussianRow`].
     pub(super) gaussians: wgpu::Buffer,
     /// `[N, K, 3]` f32.
@@ -364,6 +371,7 @@ impl DeviceScene {
             shape: source.shape_identity(),
             count: narrow("gaussians", source.len())?,
             sh_count: source.sh_count() as u32,
+            brightest: brightest(source),
             gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows), old_gaussians)?,
             sh: gpu.upload("sh", bytemuck::cast_slice(source.sh()), old_sh)?,
             blocks: None,

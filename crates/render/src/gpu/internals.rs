@@ -22,6 +22,7 @@ pub use super::{
 };
 use crate::{
     RenderRequest,
+    budget::brightest,
     error::Result,
     scene::Gaussians,
     train::{Trainer as _, TrainingSet, TrainingStep},
@@ -291,7 +292,7 @@ fn scene_row(gaussians: &Gaussians, request: &RenderRequest) -> Result<ViewRow> 
     Ok(ViewRow {
         gaussian_count: narrow("gaussians", gaussians.len())?,
         sh_count: gaussians.sh_count() as u32,
-        ..ViewRow::of(&view, request)
+        ..ViewRow::of(&view, request, brightest(gaussians))
     })
 }
 

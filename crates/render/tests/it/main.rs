@@ -15,7 +15,7 @@ mod common;
 mod compare;
 mod compose;
 mod crop;
-mod fast;
+mod error;
 mod fuzz;
 mod label_twins;
 mod labels;

@@ -139,7 +139,7 @@ fn tile(footprints: &[Footprint], without: Option<Skip>) -> Vec<[f32; 3]> {
     let entries = vec![0; footprints.len()];
     let options = KernelOptions { without, ..KernelOptions::default() };
     let view = View::new(glam::DVec3::ZERO, &request).expect("a view");
-    let paint = Paint::new(&request, &view, &entries, options);
+    let paint = Paint::new(&request, &view, &entries, 0.0, options);
     let mut pairs: Vec<u64> = (0..footprints.len() as u64).collect();
     let mut color = vec![[9.0; 3]; 256];
     let mut out =

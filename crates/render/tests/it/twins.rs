@@ -293,7 +293,7 @@ fn rasterize_twin() {
         tile_ranges::tile_ranges(&isects, grid.tile_count(), &mut ranges);
 
         let entries = gaussians.semantic_index();
-        let paint = Paint::new(&request, &view, entries, KernelOptions::default());
+        let paint = Paint::new(&request, &view, entries, 0.0, KernelOptions::default());
         let pixels = 96 * 96;
         let (mut color, mut depth, mut alpha) =
             (vec![[0.0; 3]; pixels], vec![0.0; pixels], vec![0.0; pixels]);

@@ -7,9 +7,10 @@ use std::{
     io::Read,
     ops::RangeInclusive,
     path::{Path, PathBuf},
+    sync::{Arc, OnceLock},
 };
 
-use serde::Deserialize;
+use serde::{Deserialize, de::DeserializeOwned};
 use sha2::{Digest, Sha256};
 
 use crate::{
@@ -43,6 +44,8 @@ pub struct Bundle {
     dir: PathBuf,
     sha256: String,
     manifest: BundleManifest,
+    /// The file of measured words, once it was asked for.
+    words: Arc<OnceLock<Vec<u8>>>,
 }
 
 #[derive(Clone, Debug, Deserialize)]
@@ -146,7 +149,8 @@ impl Bundle {
             image_text.validate(&mut faults);
         }
         let sha256 = hex(&Sha256::digest(&text));
-        Ok((Self { dir: dir.to_owned(), sha256, manifest }, faults.0))
+        let bundle = Self { dir: dir.to_owned(), sha256, manifest, words: Arc::default() };
+        Ok((bundle, faults.0))
     }
 
     /// Checks every file's sha256 again.
@@ -281,6 +285,27 @@ impl Bundle {
             }
         }
         files
+    }
+
+    /// The words that were measured, as rows of any fields; none where the bundle names no such
+    /// file. It is read once.
+    ///
+    /// # Errors
+    /// `model_unavailable` when the file cannot be read or lacks a field.
+    pub fn words<T: DeserializeOwned>(&self) -> Result<Vec<T>> {
+        let Some(named) = self.image_text().and_then(|towers| towers.words.as_ref()) else {
+            return Ok(Vec::new());
+        };
+        let refused = |why: String| unavailable(format!("model bundle: {}: {why}", named.file));
+        let bytes = match self.words.get() {
+            Some(bytes) => bytes,
+            None => {
+                let read = fs_err::read(self.path(&named.file));
+                let read = read.map_err(|e| refused(e.kind().to_string()))?;
+                self.words.get_or_init(|| read)
+            }
+        };
+        serde_json::from_slice(bytes).map_err(|e| refused(e.to_string()))
     }
 
     /// Bytes of a network: its file and the weights beside it.

@@ -130,7 +130,7 @@ impl ImageText {
             tokens: size(text.signature(), &manifest.text.input_ids, 1),
             texts: size(text.signature(), &manifest.text.input_ids, 0),
             unknown: tokenizer.token_to_id(&manifest.text.unknown),
-            known: known_words(bundle, &manifest)?,
+            known: known_words(bundle)?,
             image,
             text,
             tokenizer: tokenizer.clone(),
@@ -471,19 +471,14 @@ fn size(takes: &FileSignature, input: &str, axis: usize) -> Option<usize> {
 }
 
 /// The words of the list that the bundle measured, one by one.
-fn known_words(bundle: &Bundle, manifest: &ImageTextManifest) -> Result<HashSet<String>> {
+fn known_words(bundle: &Bundle) -> Result<HashSet<String>> {
     #[derive(Deserialize)]
     struct Row {
         word: String,
     }
-    let Some(words) = &manifest.words else { return Ok(HashSet::new()) };
-    let refused = |why: String| unavailable(format!("{}: {why}", words.file));
-    let bytes =
-        fs_err::read(bundle.path(&words.file)).map_err(|e| refused(e.kind().to_string()))?;
-    let rows: Vec<Row> = serde_json::from_slice(&bytes).map_err(|e| refused(e.to_string()))?;
     let single =
         |row: Row| -> Vec<String> { row.word.split_whitespace().map(str::to_lowercase).collect() };
-    Ok(rows.into_iter().flat_map(single).collect())
+    Ok(bundle.words()?.into_iter().flat_map(single).collect())
 }
 
 /// The tokenizer's file, whose own truncation and padding are switched off: both are done here.
