@@ -118,7 +118,8 @@ fn steps<'a>(args: &Args, tables: &'a Tables) -> Result<Vec<Step<'a>>> {
     Ok(tables.table.iter().filter(asked).flat_map(of).collect())
 }
 
-/// Refuses a program that was built from other files than are here: its rows would be older at once.
+/// Refuses a program that was built from other files than are here: its rows would be older at
+/// once.
 fn current(steps: &[Step<'_>], tree: &Tree) -> Result<()> {
     let built = Value::Object(built_from());
     let groups: BTreeSet<String> = steps.iter().flat_map(|step| step.table.of.clone()).collect();

@@ -69,7 +69,8 @@ fn templates_take_values_as_they_say() {
     let values = json!({ "n": 1_234_567, "a": { "b": [0.5, 2.0e-4] }, "s": "x", "none": null });
     let dir = repository(columns, &[row(&values)]);
     let wanted = "| all | none | no path |\n| --- | --- | --- |\n\
-                  | x: 1,234,567, 1234567, 50.0 %, 2.0e-4, 0.50 ms |  |  |\n\nCommit c; m; 2026-02-28.\n";
+                  | x: 1,234,567, 1234567, 50.0 %, 2.0e-4, 0.50 ms |  |  |\n\n\
+                  Commit c; m; 2026-02-28.\n";
     assert_eq!(table(dir.path()).unwrap(), wanted, "where a value is missing the cell is empty");
 }
 
@@ -118,7 +119,8 @@ fn rows_of_another_tree_are_named_and_marked() {
 fn the_first_table_has_figures_of_others() {
     let line = |task, is: &str| {
         format!(
-            "[[line]]\ntask = '{task}'\ntime = {{ table = 't', is = {is}, show = '{{ms:.1}} ms' }}\n\
+            "[[line]]\ntask = '{task}'\ntime = {{ table = 't', is = {is}, \
+             show = '{{ms:.1}} ms' }}\n\
              error = {{ table = 't', show = '{{db}} dB' }}\n"
         )
     };
@@ -177,7 +179,8 @@ fn published_rows_stand_with_their_source_and_ours_below_them() {
     let theirs = "| method | iou |\n| --- | --- |\n| theirs | 50.0 % |\n";
     // A row without networks is no line.
     let wanted = format!(
-        "{theirs}| ours, small | 25.0 % |\n\nPublished: a paper, table 1. Ours: commit c; m; 2026-02-28.\n"
+        "{theirs}| ours, small | 25.0 % |\n\nPublished: a paper, table 1. \
+         Ours: commit c; m; 2026-02-28.\n"
     );
     assert_eq!(table(dir.path()).unwrap(), wanted);
     let file = dir.path().join("run.jsonl");

@@ -167,6 +167,6 @@ struct Training {
     // The photo, and its first pixel in `photos`.
     photo: u32,
     photo_start: u32,
-    // Not used: a uniform block has whole rows of four.
-    rest: u32,
+    // Whether pixels say how far they are from the photo, not what the loss is by them.
+    blames: u32,
 }

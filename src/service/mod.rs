@@ -28,6 +28,7 @@ mod texts;
 mod times;
 mod types;
 mod view;
+mod words;
 mod work;
 
 pub(crate) use self::refine::check_refine;

@@ -35,7 +35,7 @@ async fn messages_name_the_field_the_value_and_what_it_must_be() {
         (
             "export?limti=1",
             "unknown parameter \"limti\"; this call takes format, preset, canon, tau, cut, \
-             unit_rows, coverage_floor, near_best, margin, text, wait_ms"
+             unit_rows, coverage_floor, near_best, margin, rivals, text, wait_ms"
                 .to_owned(),
         ),
         // Without a text too.

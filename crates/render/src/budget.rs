@@ -4,10 +4,11 @@
 //! ([`RenderRequest::error`]). [`Budget`] is the one place that says which part each spender gets.
 //! What each does is true for every scene: the parts together are never over what was asked.
 //!
-//! **Rays end early.** When the transmittance of a ray is T, what is behind adds between `T low` and
-//! `T high`: a blend of colours that lie between `low` and `high`, the least and the largest colour
-//! of the scene and of its background. A ray that ends there takes the middle, and is wrong by at
-//! most `T (high - low) / 2`. Sums of labels have no such middle: they are wrong by at most T.
+//! **Rays end early.** When the transmittance of a ray is T, what is behind adds between `T low`
+//! and `T high`: a blend of colours that lie between `low` and `high`, the least and the largest
+//! colour of the scene and of its background. A ray that ends there takes the middle, and is wrong
+//! by at most `T (high - low) / 2`. Sums of labels have no such middle: they are wrong by at most
+//! T.
 
 use std::str::FromStr;
 

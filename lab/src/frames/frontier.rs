@@ -26,8 +26,8 @@ pub(crate) struct FrontierArgs {
     frames: Args,
 }
 
-/// The generated scene; the same seen large; from far away; walls of eight photos behind each other;
-/// a cloud whose colours depend on the direction; and sheets that light passes.
+/// The generated scene; the same seen large; from far away; walls of eight photos behind each
+/// other; a cloud whose colours depend on the direction; and sheets that light passes.
 fn six(args: &Args) -> Result<[(&'static str, Gaussians, RenderRequest); 6]> {
     let (photos, camera) = scene(args.gaussians, 0, [args.width(), args.size])?;
     let colors = |camera| RenderRequest { kinds: Kinds::COLOR, ..scenes::request(camera) };
@@ -90,6 +90,7 @@ pub(crate) fn run(args: &FrontierArgs, rows: &mut Rows) -> Result<()> {
             let row = json!({
                 "renderer": renderer.name(),
                 "scene": scene,
+                "asked": asked.to_string(),
                 "gaussians": gaussians.len(),
                 "width": picture.width,
                 "height": picture.height,
@@ -103,8 +104,8 @@ pub(crate) fn run(args: &FrontierArgs, rows: &mut Rows) -> Result<()> {
     Ok(())
 }
 
-/// The time of each request, milliseconds: the least of rounds in which each is drawn in turn, which
-/// a busy machine changes least.
+/// The time of each request, milliseconds: the least of rounds in which each is drawn in turn. A
+/// busy machine changes it least.
 fn times(
     renderer: &dyn Renderer,
     gaussians: &Gaussians,

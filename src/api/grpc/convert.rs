@@ -261,9 +261,9 @@ pub(super) fn scene_options(header: &pb::CreateSceneHeader) -> Result<SceneOptio
 
 /// Changes of how texts are scored.
 fn scoring(scoring: Option<pb::Scoring>) -> ScoringOptions {
-    let pb::Scoring { canon, tau, cut, unit_rows, coverage_floor, near_best, margin } =
+    let pb::Scoring { canon, tau, cut, unit_rows, coverage_floor, near_best, margin, rivals } =
         scoring.unwrap_or_default();
-    ScoringOptions { canon, tau, cut, unit_rows, coverage_floor, near_best, margin }
+    ScoringOptions { canon, tau, cut, unit_rows, coverage_floor, near_best, margin, rivals }
 }
 
 fn scored(method: ScoringMethod) -> pb::Scoring {
@@ -275,6 +275,7 @@ fn scored(method: ScoringMethod) -> pb::Scoring {
         coverage_floor: Some(method.coverage_floor),
         near_best: Some(method.near_best),
         margin: Some(method.margin),
+        rivals: Some(method.rivals),
     }
 }
 
@@ -358,6 +359,8 @@ pub(super) fn answer(answer: QueryAnswer) -> pb::QueryResponse {
 fn result(found: TextResult) -> pb::TextResult {
     let warning = |TextWarning { code, message }: TextWarning| pb::TextWarning { code, message };
     message!(TextResult from found { text, scores, found, gaussians }
+        word: found.word.unwrap_or_default(),
+        trust: found.trust.map(|trust| trust.to_string()).unwrap_or_default(),
         entries: found.entries.into_iter().map(u32::from).collect(),
         parts: found.parts.into_iter().map(part).collect(),
         warnings: found.warnings.into_iter().map(warning).collect(),
@@ -372,6 +375,7 @@ fn point([x, y, z]: [f64; 3]) -> pb::Vec3 {
 fn part(part: InstanceBox) -> pb::Part {
     pb::Part {
         gaussians: part.gaussians,
+        score: part.score,
         center: Some(point(part.center)),
         axes: part.axes.iter().copied().map(point).collect(),
         size: Some(point(part.size)),

@@ -48,7 +48,7 @@ METHODS = {
     **{"refine": "RefineScene", "features": "Features"},
     **{"POST": "CreateScene", "GET": "GetScene", "DELETE": "DeleteScene"},
 }
-SCORING = ("canon", "tau", "cut", "unit_rows", "coverage_floor", "near_best", "margin")
+SCORING = ("canon", "tau", "cut", "unit_rows", "coverage_floor", "near_best", "margin", "rivals")
 NAMED = {"black": "#000000", "white": "#ffffff"}
 
 

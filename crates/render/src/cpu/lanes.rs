@@ -100,8 +100,8 @@ pub(super) trait Lanes: Simd {
         self.mul_add_f64s(a, b, c)
     }
 
-    /// `|a|`. That of `pulp` is a call for each vector: its `not_f32s` is not compiled for the width
-    /// of the caller.
+    /// `|a|`. That of `pulp` is a call for each vector: its `not_f32s` is not compiled for the
+    /// width of the caller.
     #[inline(always)]
     fn abs(self, a: Self::f32s) -> Self::f32s {
         self.max_f32s(a, self.sub_f32s(self.splat_f32s(0.0), a))

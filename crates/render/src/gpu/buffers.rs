@@ -161,7 +161,7 @@ pub struct TrainingRow {
     pub ssim_share: f32,
     pub photo: u32,
     pub photo_start: u32,
-    pub rest: u32,
+    pub blames: u32,
 }
 
 /// What `project_backward` writes of each Gaussian: [`GRADIENT_WORDS`] numbers.
@@ -356,17 +356,7 @@ impl DeviceScene {
     /// Errors: `limit_exceeded` when it does not fit the adapter's limits or memory.
     pub(super) fn upload(gpu: &Gpu, source: &Gaussians, old: Option<Self>) -> Result<Self> {
         let (old_gaussians, old_sh) = old.map(|old| (old.gaussians, old.sh)).unzip();
-        let rows: Vec<GaussianRow> = (0..source.len())
-            .into_par_iter()
-            .with_min_len(1 << 14)
-            .map(|i| GaussianRow {
-                mean: source.means()[i],
-                opacity: source.opacities()[i],
-                quat: source.quats()[i],
-                scale: source.scales()[i],
-                source: source.source()[i].view.into(),
-            })
-            .collect();
+        let rows = rows_of(source);
         Ok(Self {
             shape: source.shape_identity(),
             count: narrow("gaussians", source.len())?,
@@ -378,6 +368,36 @@ impl DeviceScene {
             labels: None,
         })
     }
+
+    /// Uploads `source` with so many places, those behind its Gaussians with opacity 0.
+    /// Errors: as [`Self::upload`].
+    pub(super) fn with_places(gpu: &Gpu, source: &Gaussians, places: usize) -> Result<Self> {
+        let (mut rows, mut sh) = (rows_of(source), source.sh().to_vec());
+        rows.resize(places, GaussianRow::zeroed());
+        sh.resize(places * source.sh_count(), [0.0; 3]);
+        Ok(Self {
+            shape: source.shape_identity(),
+            count: narrow("gaussians", places)?,
+            sh_count: source.sh_count() as u32,
+            brightest: brightest(source),
+            gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows), None)?,
+            sh: gpu.upload("sh", bytemuck::cast_slice(&sh), None)?,
+            blocks: None,
+            labels: None,
+        })
+    }
+}
+
+/// Gaussians as the shaders read them.
+fn rows_of(source: &Gaussians) -> Vec<GaussianRow> {
+    let row = |i: usize| GaussianRow {
+        mean: source.means()[i],
+        opacity: source.opacities()[i],
+        quat: source.quats()[i],
+        scale: source.scales()[i],
+        source: source.source()[i].view.into(),
+    };
+    (0..source.len()).into_par_iter().with_min_len(1 << 14).map(row).collect()
 }
 
 /// Scenes on the device, the most recently drawn last.

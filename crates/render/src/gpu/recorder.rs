@@ -164,11 +164,13 @@ impl<'a> Recorder<'a> {
     }
 
     /// Compares the picture of one whole view of `tiles` (columns, rows) with its photo: what that
-    /// says of the picture, and the step of the photo's exposure.
-    pub(super) fn compare(&mut self, [columns, rows]: [u32; 2]) {
+    /// says of the picture, and, where it `moves`, the step of the photo's exposure.
+    pub(super) fn compare(&mut self, [columns, rows]: [u32; 2], moves: bool) {
         self.tiles(Kernel::LossWindows, [3 * columns, rows]);
         self.tiles(Kernel::PhotoLoss, [3 * columns, rows]);
-        self.dispatch(Kernel::Exposure, [1, 1]);
+        if moves {
+            self.dispatch(Kernel::Exposure, [1, 1]);
+        }
     }
 }
 

@@ -17,6 +17,7 @@ mod compose;
 mod crop;
 mod error;
 mod fuzz;
+mod growth;
 mod label_twins;
 mod labels;
 mod one_pass;

@@ -172,7 +172,7 @@ fn structs_lie_in_memory_as_the_shaders_say() {
                 ssim_share,
                 photo,
                 photo_start,
-                rest,
+                blames,
             ]
         ),
     ];
