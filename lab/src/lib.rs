@@ -77,6 +77,8 @@ enum Command {
     Backward(frames::Args),
     /// Time frames without each kind of skipped work
     Skips(frames::Args),
+    /// What views cost that show little of a scene, with and without blocks
+    Aims(frames::Args),
     /// Time frames that may differ from the exact ones by so much
     Frontier(frames::frontier::FrontierArgs),
     /// Ask a server for views and scenes, as its callers do
@@ -125,6 +127,7 @@ pub fn run(cli: &Cli) -> Result<Vec<serde_json::Value>> {
         Command::Frames(args) => frames::run(args, &mut rows)?,
         Command::Backward(args) => frames::backward::run(args, &mut rows)?,
         Command::Skips(args) => frames::skips::run(args, &mut rows)?,
+        Command::Aims(args) => frames::aims::run(args, &mut rows)?,
         Command::Frontier(args) => frames::frontier::run(args, &mut rows)?,
         Command::Load(command) => load::run(command, &mut rows)?,
         Command::Bench(args) => bench::run(args, &cli.record)?,

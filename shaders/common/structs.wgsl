@@ -74,6 +74,17 @@ struct View {
     ray_first: vec4<f32>,
     ray_across: vec4<f32>,
     ray_down: vec4<f32>,
+    // Inner normals of the planes through the camera beyond which nothing touches the picture; w:
+    // how far a scale of 1 moves them.
+    sides: array<vec4<f32>, 4>,
+    // A ball around the cameras of the photos; w is its radius.
+    photos: vec4<f32>,
+    // What a magnified view adds to a scale at most, for each unit of the distance from a photo.
+    photos_widen: f32,
+    // Blocks of the scene; 0: every Gaussian is projected.
+    block_count: u32,
+    // Not used: a row has a multiple of four.
+    rest: vec2<u32>,
 }
 
 // A photo that Gaussians were seen in.
@@ -86,6 +97,18 @@ struct Source {
     axis: vec3<f32>,
     // Not 0: its Gaussians are behind all of the others.
     behind: u32,
+}
+
+// Gaussians that are close together.
+struct Block {
+    // Middle of the box of their centres.
+    center: vec3<f32>,
+    // Largest scale.
+    reach: f32,
+    // Half the sides of the box.
+    half: vec3<f32>,
+    // Not used.
+    rest: u32,
 }
 
 struct Gaussian {
@@ -122,6 +145,8 @@ struct Plan {
     visible: atomic<u32>,
     // Bits of the largest depth, where depth is asked for in steps.
     farthest: atomic<u32>,
+    // Rows that cull has left.
+    rows: atomic<u32>,
 }
 
 // A step of training.

@@ -12,6 +12,7 @@
 )]
 
 pub mod backward;
+pub mod blocks;
 pub mod budget;
 pub mod compare;
 pub mod constants;

@@ -4,6 +4,7 @@
 //! cameras a fifth of the depth apart, drawn from between them. Its Gaussians have bank entries in
 //! patches, as things do: `--labels` times labels beside colour.
 
+pub(crate) mod aims;
 pub(crate) mod backward;
 pub(crate) mod frontier;
 mod generated;

@@ -27,13 +27,14 @@ pub fn shade(
 ) -> f32 {
     let flat = gaussians.sh_count() == 1 && options.skips(Skip::FlatColor);
     let coefficients = gaussians.sh_count();
-    let chunks = projected.footprints.par_chunks_mut(CHUNK);
-    let chunks = chunks.zip(projected.tiles_per_gauss.par_chunks(CHUNK)).enumerate();
+    let Projected { shown, footprints, tiles_per_gauss, .. } = projected;
+    let chunks = footprints.par_chunks_mut(CHUNK);
+    let chunks = chunks.zip(tiles_per_gauss.par_chunks(CHUNK)).enumerate();
     let brightest = chunks.map(|(chunk, (footprints, tiles))| {
         let mut brightest = 0.0_f32;
         for (k, (footprint, &tiles)) in footprints.iter_mut().zip(tiles).enumerate() {
             if tiles > 0 {
-                let i = chunk * CHUNK + k;
+                let i = shown.id(chunk * CHUNK + k);
                 let sh = &gaussians.sh()[i * coefficients..(i + 1) * coefficients];
                 footprint.color = if flat {
                     sh[0].map(|value| (SH_OFFSET + SH_C0 * value).max(0.0))

@@ -11,6 +11,7 @@ use super::{
 };
 use crate::{
     Background, Labels, RenderRequest, Samples, Source,
+    blocks::{Blocks, Bounds, Frustum},
     budget::{Budget, RayEnd, brightest},
     constants::{HALF_LEVEL, OWN_SIZE, TRANSMITTANCE_MIN},
     error::{Error, ErrorCode, Result},
@@ -69,6 +70,11 @@ pub struct ViewRow {
     pub ray_first: [f32; 4],
     pub ray_across: [f32; 4],
     pub ray_down: [f32; 4],
+    pub sides: [[f32; 4]; 4],
+    pub photos: [f32; 4],
+    pub photos_widen: f32,
+    pub block_count: u32,
+    pub rest: [u32; 2],
 }
 
 /// `Source` of the shaders.
@@ -85,6 +91,23 @@ impl From<&Source> for SourceRow {
     fn from(source: &Source) -> Self {
         let Source { center, axis, scale, behind } = *source;
         Self { center, scale, axis, behind: u32::from(behind) }
+    }
+}
+
+/// `Block` of the shaders.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Pod, Zeroable)]
+pub struct BlockRow {
+    pub center: [f32; 3],
+    pub reach: f32,
+    pub half: [f32; 3],
+    pub rest: u32,
+}
+
+impl From<&Bounds> for BlockRow {
+    fn from(bounds: &Bounds) -> Self {
+        let Bounds { center, half, reach } = *bounds;
+        Self { center, reach, half, rest: 0 }
     }
 }
 
@@ -120,6 +143,7 @@ pub struct PlanRow {
     pub needed: u32,
     pub visible: u32,
     pub farthest: u32,
+    pub rows: u32,
 }
 
 /// `Training` of the shaders: a step of training.
@@ -207,6 +231,8 @@ impl ViewRow {
             Background::Backdrop(_) => [0.0; 3],
         };
         let exact = request.samples == Samples::F32;
+        let frustum = Frustum::new(view, request);
+        let wide = |(v, w): (glam::DVec3, f64)| v.extend(w).as_vec4().to_array();
         let ray_end = RayEnd::new(Budget::of(request).rays, request, brightest);
         let [first, across, down] = view.rays().map(|[x, y, z]| [x, y, z, 0.0]);
         Self {
@@ -226,6 +252,9 @@ impl ViewRow {
             ray_first: first,
             ray_across: across,
             ray_down: down,
+            sides: frustum.sides.map(wide),
+            photos: wide(frustum.photos),
+            photos_widen: frustum.widens as f32,
             ..Self::new(view, background, request.antialiased)
         }
     }
@@ -245,8 +274,31 @@ pub(super) struct DeviceScene {
     pub(super) gaussians: wgpu::Buffer,
     /// `[N, K, 3]` f32.
     pub(super) sh: wgpu::Buffer,
+    pub(super) blocks: Option<DeviceBlocks>,
     /// Uploaded when a request first asks for labels.
     pub(super) labels: Option<DeviceLabels>,
+}
+
+/// The blocks of a scene on the device.
+#[derive(Clone, Debug)]
+pub(super) struct DeviceBlocks {
+    count: u32,
+    /// Of [`BlockRow`].
+    pub(super) bounds: wgpu::Buffer,
+    /// `[N]` Gaussians, block after block.
+    pub(super) order: wgpu::Buffer,
+}
+
+impl DeviceBlocks {
+    fn upload(gpu: &Gpu, source: &Gaussians) -> Result<Self> {
+        let blocks = Blocks::of(source);
+        let rows: Vec<BlockRow> = blocks.bounds.iter().map(BlockRow::from).collect();
+        Ok(Self {
+            count: rows.len() as u32,
+            bounds: gpu.upload("blocks", bytemuck::cast_slice(&rows), None)?,
+            order: gpu.upload("order of blocks", bytemuck::cast_slice(&blocks.order), None)?,
+        })
+    }
 }
 
 /// Entries of the Gaussians on the device.
@@ -281,10 +333,26 @@ impl DeviceScene {
 
     fn size_bytes(&self) -> u64 {
         let labels = self.labels.as_ref().map_or(0, |labels| labels.entries.size());
-        self.gaussians.size() + self.sh.size() + labels
+        let blocks = self.blocks.as_ref().map_or(0, |blocks| blocks.order.size());
+        self.gaussians.size() + self.sh.size() + labels + blocks
     }
 
-    /// Uploads `source`, into the buffers of `old` where they have room.
+    /// Number of its blocks; 0 if it has none.
+    pub(super) fn block_count(&self) -> u32 {
+        self.blocks.as_ref().map_or(0, |blocks| blocks.count)
+    }
+
+    /// Uploads `source` for views, with blocks if it has `blocks_from` Gaussians or more.
+    /// Errors: as [`Self::upload`].
+    pub(super) fn for_views(gpu: &Gpu, source: &Gaussians, blocks_from: usize) -> Result<Self> {
+        let mut scene = Self::upload(gpu, source, None)?;
+        if source.len() >= blocks_from {
+            scene.blocks = Some(DeviceBlocks::upload(gpu, source)?);
+        }
+        Ok(scene)
+    }
+
+    /// Uploads `source` without blocks, into the buffers of `old` where they have room.
     /// Errors: `limit_exceeded` when it does not fit the adapter's limits or memory.
     pub(super) fn upload(gpu: &Gpu, source: &Gaussians, old: Option<Self>) -> Result<Self> {
         let (old_gaussians, old_sh) = old.map(|old| (old.gaussians, old.sh)).unzip();
@@ -296,6 +364,7 @@ impl DeviceScene {
             brightest: brightest(source),
             gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows), old_gaussians)?,
             sh: gpu.upload("sh", bytemuck::cast_slice(source.sh()), old_sh)?,
+            blocks: None,
             labels: None,
         })
     }
@@ -313,6 +382,7 @@ impl DeviceScene {
             brightest: brightest(source),
             gaussians: gpu.upload("gaussians", bytemuck::cast_slice(&rows), None)?,
             sh: gpu.upload("sh", bytemuck::cast_slice(&sh), None)?,
+            blocks: None,
             labels: None,
         })
     }
@@ -335,11 +405,13 @@ fn rows_of(source: &Gaussians) -> Vec<GaussianRow> {
 pub(super) struct SceneCache {
     scenes: Vec<DeviceScene>,
     bytes_max: u64,
+    blocks_from: usize,
 }
 
 impl SceneCache {
-    pub(super) fn new(bytes_max: u64) -> Self {
-        Self { scenes: Vec::new(), bytes_max }
+    /// For `bytes_max` bytes of scenes, with blocks from so many Gaussians on.
+    pub(super) fn new(bytes_max: u64, blocks_from: usize) -> Self {
+        Self { scenes: Vec::new(), bytes_max, blocks_from }
     }
 
     /// The scene of `source`, uploaded once; if `labelled`, with the entries of `source`.
@@ -367,11 +439,11 @@ impl SceneCache {
 
     /// Uploads a scene. Others leave to make room, the least recently drawn first.
     fn upload(&mut self, gpu: &Gpu, source: &Gaussians) -> Result<DeviceScene> {
-        let scene = match DeviceScene::upload(gpu, source, None) {
+        let scene = match DeviceScene::for_views(gpu, source, self.blocks_from) {
             // The other scenes may hold the memory: drop them and try once more.
             Err(error) if error.code() == ErrorCode::LimitExceeded && !self.scenes.is_empty() => {
                 self.clear(gpu);
-                DeviceScene::upload(gpu, source, None)?
+                DeviceScene::for_views(gpu, source, self.blocks_from)?
             }
             other => other?,
         };

@@ -17,7 +17,7 @@ use super::{
     recorder::Recorder,
 };
 pub use super::{
-    buffers::{FootprintRow, GaussianRow, PlanRow, SourceRow, TrainingRow, ViewRow},
+    buffers::{BlockRow, FootprintRow, GaussianRow, PlanRow, SourceRow, TrainingRow, ViewRow},
     pipelines::{SHADERS, SHARED, Shader},
 };
 use crate::{

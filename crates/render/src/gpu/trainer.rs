@@ -566,7 +566,7 @@ impl Tools<'_> {
         // First, for both share a staging buffer, which this one needs the larger one of.
         let backward = self.scratch.backward_room(gpu, sizes)?;
         let batch = Batch::new(&[drawing], &layouts, capacity);
-        let sizes = batch.sizes(scene.count, !self.kernels.flat(scene.sh_count));
+        let sizes = batch.sizes(scene, !self.kernels.flat(scene.sh_count));
         let room = self.scratch.room(gpu, &BatchSizes { staging_bytes: 0, ..sizes })?;
         let held = std::mem::take(&mut self.scratch.backdrops);
         let inputs = Inputs {
@@ -578,7 +578,7 @@ impl Tools<'_> {
         gpu.scoped("training", || {
             batch.write(gpu, &room, &held);
             gpu.queue.write_buffer(&training.row, 0, bytemuck::bytes_of(&step.row));
-            let [plans, ends] = room.zeros();
+            let [plans, ends, _] = room.zeros();
             let mut stages = self.recorder(inputs, &[plans, ends, &backward.sums]);
             stages.draw(RasterKinds::from(request), tiles);
             stages.compare(tiles, !blames);

@@ -9,6 +9,7 @@
 
 mod adam;
 mod backward;
+mod blocks;
 #[path = "../common/mod.rs"]
 mod common;
 mod compare;

@@ -244,7 +244,8 @@ fn emit_isects_twin() {
         };
         let (tile_spans, tiles_per_gauss) = rows.clone().map(seen).unzip();
         let footprints = all.footprints.iter().map(to_footprint).collect();
-        let projected = Projected { footprints, tile_spans, tiles_per_gauss };
+        let projected =
+            Projected { footprints, tile_spans, tiles_per_gauss, ..Projected::default() };
         let order = depth_order(&projected);
         let (mut offsets, mut want) = (Vec::new(), Vec::new());
         let counts =
