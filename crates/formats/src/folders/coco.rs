@@ -33,7 +33,7 @@ pub(crate) fn write(
         "info": info(of),
         "licenses": [],
         "categories": of.texts.iter().enumerate().map(category).collect::<Vec<Value>>(),
-        "images": photos.iter().enumerate().map(image).collect::<Vec<Value>>(),
+        "images": photos.iter().enumerate().map(|(i, photo)| image(i, photo)).collect::<Vec<Value>>(),
     });
     zip.begin_text("annotations.json")?;
     let (mut id, mut list) = (0, zip.begin_list(&head, "annotations")?);
@@ -62,7 +62,7 @@ fn info(of: &FolderContents<'_>) -> Value {
     })
 }
 
-fn image((i, photo): (usize, &FolderPhoto)) -> Value {
+fn image(i: usize, photo: &FolderPhoto) -> Value {
     let Intrinsics { width, height, .. } = photo.camera.intrinsics;
     json!({ "id": i + 1, "file_name": photo.file, "width": width, "height": height })
 }
